@@ -1,0 +1,1 @@
+"""Nouns and array mathematics: no files, no network, no terminal."""

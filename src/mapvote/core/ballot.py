@@ -1,0 +1,176 @@
+"""Ballot <-> bytes: all that passes between vehicle and server (DESIGN 2).
+
+A msgpack envelope of zstd-compressed planes. Reading checks every size before it allocates; planes that
+a newer format adds are ignored, required fields that are missing are refused.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from typing import Annotated, Any
+
+import msgspec
+import numpy as np
+from backports import zstd
+from numpy.typing import NDArray
+
+from mapvote.core.grid import TILE_CELLS, TileIndex
+from mapvote.core.types import F32, N_STATES, NO_VOTE, U8, U16, U64, MapvoteError
+
+FORMAT_VERSION = 1
+MAX_TILES = 4096
+MAX_POINTS_PER_CELL = 64
+"""One new point per voxel of a column: no honest ballot has more."""
+MAX_TILE_INDEX = 1 << 20
+ZSTD_LEVEL = 19
+_CELLS = TILE_CELLS * TILE_CELLS
+
+Id = Annotated[str, msgspec.Meta(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$")]
+"""Vehicle and drive names: 1-64 of letters, digits, dot, underscore, dash; they appear in URLs and file names."""
+
+
+class BallotTile(msgspec.Struct, frozen=True, kw_only=True):
+    """One tile's votes. Planes are compressed; see :func:`states_of` and its neighbours."""
+
+    tile: tuple[int, int]
+    states: bytes | None = None
+    """(256, 256) uint8 CellState or NO_VOTE: two-stage."""
+    tally: bytes | None = None
+    """(5, 256, 256) uint16 votes in VOTE_UNITs, class-major: one-stage."""
+    gone: bytes | None = None
+    """(256, 256) uint64: which voxels of a changed-empty cell are gone (delete mask)."""
+    new_points: bytes | None = None
+    """(m, 3) float32 from the tile's corner, sorted by voxel key: one per 0.3 m voxel of changed-occupied cells."""
+    free: bytes | None = None
+    """(256, 256) uint64: voxels that this drive's rays passed through."""
+
+
+class Ballot(msgspec.Struct, frozen=True, kw_only=True):
+    """What one vehicle says after one drive. Self-contained."""
+
+    format_version: int = FORMAT_VERSION
+    map_id: str
+    base: dict[str, str]
+    """Content hash of every tile the votes were cast against, by "row,col"; "" for a tile the map lacked."""
+    vehicle: Id
+    drive: Id
+    start_ns: int
+    end_ns: int
+    method: str
+    settings_hash: str
+    scans: int
+    """Scans in the drive."""
+    scans_localised: int
+    """Scans that voted; the others abstained because the vehicle was not sure where it was."""
+    median_sigma_m: float
+    """Median position sigma of the scans that voted."""
+    tiles: list[BallotTile]
+
+
+def tile_key(tile: TileIndex) -> str:
+    """The name of a tile in manifests and ballots: "row,col"."""
+    return f"{tile[0]},{tile[1]}"
+
+
+def pack_plane(plane: U8 | U16 | U64 | F32) -> bytes:
+    """An array's little-endian C-order bytes, zstd-compressed."""
+    little = np.ascontiguousarray(plane.astype(plane.dtype.newbyteorder("<"), copy=False))
+    return zstd.compress(little.tobytes(), ZSTD_LEVEL)
+
+
+def _unpack(data: bytes, limit: int, what: str) -> bytes:
+    """Decompress at most ``limit`` bytes; MapvoteError beyond it or on damage (a decompression bomb stops here)."""
+    decompressor = zstd.ZstdDecompressor()
+    try:
+        raw = decompressor.decompress(data, max_length=limit + 1)
+    except zstd.ZstdError as error:
+        raise MapvoteError(f"ballot: {what} is damaged ({error}); send the ballot again") from error
+    if len(raw) > limit or not decompressor.eof or decompressor.unused_data:
+        raise MapvoteError(f"ballot: {what} is truncated or larger than {limit} bytes when decompressed")
+    return raw
+
+
+def _plane(data: bytes, dtype: str, shape: tuple[int, ...], what: str) -> NDArray[Any]:
+    size = int(np.prod(shape)) * np.dtype(dtype).itemsize
+    raw = _unpack(data, size, what)
+    if len(raw) != size:
+        raise MapvoteError(f"ballot: {what} has {len(raw)} bytes, expected {size}")
+    return np.frombuffer(raw, dtype=dtype).reshape(shape)
+
+
+def unpack_states(data: bytes) -> U8:
+    """(256, 256) uint8; MapvoteError if damaged or not a CellState."""
+    states = _plane(data, "<u1", (TILE_CELLS, TILE_CELLS), "states")
+    if np.any((states >= N_STATES) & (states != NO_VOTE)):
+        raise MapvoteError("ballot: states holds a value that is no cell state")
+    return states
+
+
+def unpack_tally(data: bytes) -> U16:
+    """(256, 256, 5) uint16; MapvoteError if damaged."""
+    return np.moveaxis(_plane(data, "<u2", (N_STATES, TILE_CELLS, TILE_CELLS), "tally"), 0, -1)
+
+
+def unpack_words(data: bytes, what: str) -> U64:
+    """(256, 256) uint64; MapvoteError if damaged."""
+    return _plane(data, "<u8", (TILE_CELLS, TILE_CELLS), what)
+
+
+def unpack_points(data: bytes) -> F32:
+    """(m, 3) float32 from the tile's corner; MapvoteError if damaged, not finite or outside the tile."""
+    raw = _unpack(data, _CELLS * MAX_POINTS_PER_CELL * 12, "new_points")
+    if len(raw) % 12:
+        raise MapvoteError(f"ballot: new_points has {len(raw)} bytes, not a multiple of 12")
+    points = np.frombuffer(raw, dtype="<f4").reshape(-1, 3)
+    side = np.float32(TILE_CELLS * 0.3)
+    inside = np.isfinite(points).all() and (points[:, :2] >= 0).all() and (points[:, :2] < side).all()
+    if not inside or (np.abs(points[:, 2]) > 1e5).any():
+        raise MapvoteError("ballot: new_points holds a point outside its tile or not finite")
+    return points
+
+
+def encode(ballot: Ballot) -> bytes:
+    """The ballot as one self-contained file."""
+    return msgspec.msgpack.encode(ballot)
+
+
+def decode(data: bytes) -> Ballot:
+    """Check the envelope; planes are checked when unpacked (:func:`validate` does all). MapvoteError if unusable."""
+    try:
+        ballot = msgspec.msgpack.decode(data, type=Ballot)
+    except msgspec.DecodeError as error:  # ValidationError is one too
+        raise MapvoteError(f"ballot: not readable ({error}); was it written by this version of mapvote?") from error
+    if ballot.format_version < 1 or ballot.format_version > FORMAT_VERSION:
+        raise MapvoteError(f"ballot: format {ballot.format_version}; this version reads up to {FORMAT_VERSION}")
+    indices = [t.tile for t in ballot.tiles]
+    if len(indices) > MAX_TILES or len(set(indices)) != len(indices):
+        raise MapvoteError(f"ballot: {len(indices)} tiles; at most {MAX_TILES}, each once")
+    for tile in ballot.tiles:
+        if max(abs(tile.tile[0]), abs(tile.tile[1])) > MAX_TILE_INDEX:
+            raise MapvoteError(f"ballot: tile {tile.tile} lies outside any map")
+        if (tile.states is None) == (tile.tally is None):
+            raise MapvoteError(f"ballot: tile {tile.tile} needs either states or a tally")
+        if tile_key(tile.tile) not in ballot.base:
+            raise MapvoteError(f"ballot: tile {tile.tile} has no base hash")
+    if ballot.start_ns > ballot.end_ns:
+        raise MapvoteError("ballot: ends before it starts; check the drive's clock")
+    return ballot
+
+
+def validate(ballot: Ballot) -> None:
+    """Unpack every plane once; MapvoteError on the first that is damaged or impossible."""
+    for tile in ballot.tiles:
+        if tile.states is not None:
+            unpack_states(tile.states)
+        if tile.tally is not None:
+            unpack_tally(tile.tally)
+        for what, words in (("gone", tile.gone), ("free", tile.free)):
+            if words is not None:
+                unpack_words(words, what)
+        if tile.new_points is not None:
+            unpack_points(tile.new_points)
+
+
+def content_hash(tile_points: F32) -> str:
+    """SHA-256 of a tile's points: free space learned later changes no published point (DESIGN 2)."""
+    return hashlib.sha256(np.ascontiguousarray(tile_points, dtype="<f4").tobytes()).hexdigest()

@@ -1,0 +1,115 @@
+"""Columns of evidence: every 0.3 m cell is one 64-bit word, bit i = voxel i of that column (METHOD 4).
+
+Voxels lie on the world lattice: layer = floor(z / 0.3). Bit 0 is the layer that holds the ground of the
+cell (``base``), so words follow the terrain and 64 bits reach 19.2 m above the road; the top bit
+stands for everything from there upwards. Neighbouring cells are compared by shifting by their bases' difference.
+"""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Grid, tile_grid
+from mapvote.core.points import _lower_envelope
+from mapvote.core.types import F32, F64, I32, I64, PointMap, Reference
+
+GROUND_MARGIN_M = 0.3
+"""Points lower than this above the ground are ground: they never make a cell occupied (METHOD 2)."""
+TOP_BIT = 63
+
+
+def base_layers(ground_z: F32) -> I32:
+    """(rows, cols) lattice layer of bit 0: floor(ground_z / 0.3), unknown cells filled from the nearest known one."""
+    known = np.isfinite(ground_z)
+    if not known.any():
+        return np.zeros(ground_z.shape, dtype=np.int32)
+    low = np.where(known, ground_z, np.inf).astype(np.float64)
+    _lower_envelope(low, 0.02 * CELL_SIZE, 0.02 * CELL_SIZE * np.sqrt(2.0))
+    filled = np.where(known, ground_z.astype(np.float64), low)
+    return np.floor(filled / CELL_SIZE).astype(np.int32)
+
+
+@numba.njit(cache=True, nogil=True)
+def fill_columns(
+    rows: I64,
+    cols: I64,
+    z: F64,
+    ground_z: F32,
+    base: I32,
+    margin: float,
+    words: NDArray[np.uint64],
+    counts: I32,
+    bottom_z: F32,
+    top_z: F32,
+) -> None:
+    """Enter points (cell indices inside the window, z in map metres) above ``ground + margin`` into the planes.
+
+    Points of cells whose ground is unknown are measured from the filled base. Planes are changed in place.
+    """
+    for i in range(len(z)):
+        r, c = rows[i], cols[i]
+        if r < 0 or c < 0 or r >= words.shape[0] or c >= words.shape[1]:
+            continue
+        g = ground_z[r, c]
+        if np.isnan(g):
+            g = base[r, c] * CELL_SIZE
+        if z[i] - g < margin:
+            continue
+        bit = int(np.floor(z[i] / CELL_SIZE)) - base[r, c]
+        bit = min(max(bit, 0), TOP_BIT)
+        words[r, c] |= np.uint64(1) << np.uint64(bit)
+        counts[r, c] += 1
+        bottom_z[r, c] = min(bottom_z[r, c], z[i])
+        top_z[r, c] = max(top_z[r, c], z[i])
+
+
+def reference_window(point_map: PointMap, grid: Grid) -> Reference:
+    """The map's planes over ``grid`` (any window; what lies outside every tile is unknown and empty)."""
+    ground_z = np.full(grid.shape, np.nan, dtype=np.float32)
+    free = np.zeros(grid.shape, dtype=np.uint64)
+    learned = False
+    clouds = []
+    for tile in grid.tiles():
+        if tile not in point_map.tiles:
+            continue
+        content = point_map.tiles[tile]
+        window = tile_grid(point_map.lattice, tile)
+        common = window.intersection(grid)
+        ground_z[common.slices_in(grid)] = content.ground_z[common.slices_in(window)]
+        if content.free is not None:
+            learned = True
+            free[common.slices_in(grid)] = content.free[common.slices_in(window)]
+        clouds.append(map_points(window, content.points))
+    base = base_layers(ground_z)
+    occupied = np.zeros(grid.shape, dtype=np.uint64)
+    counts = np.zeros(grid.shape, dtype=np.int32)
+    bottom_z = np.full(grid.shape, np.inf, dtype=np.float32)
+    top_z = np.full(grid.shape, -np.inf, dtype=np.float32)
+    for cloud in clouds:
+        rows, cols, _ = grid.indices_of(cloud)
+        fill_columns(rows, cols, cloud[:, 2], ground_z, base, GROUND_MARGIN_M, occupied, counts, bottom_z, top_z)
+    return Reference(grid, ground_z, base, occupied, counts, bottom_z, top_z, free if learned else None)
+
+
+def map_points(window: Grid, tile_points: F32) -> F64:
+    """A tile's points (n, 3) from its corner to map metres, float64."""
+    out = tile_points.astype(np.float64)
+    out[:, 0] += window.x0
+    out[:, 1] += window.y0
+    return out
+
+
+def tile_points(window: Grid, points: F64) -> F32:
+    """Points (n, 3) in map metres to float32 from the tile's corner, kept inside the half-open tile.
+
+    Rounding to float32 must not carry a point over the tile's far edge, nor into the next cell's tile.
+    """
+    local = points.astype(np.float64).copy()
+    local[:, 0] -= window.x0
+    local[:, 1] -= window.y0
+    out = local.astype(np.float32)
+    edge = np.nextafter(np.float32(TILE_CELLS * CELL_SIZE), np.float32(0.0))
+    out[:, :2] = np.clip(out[:, :2], np.float32(0.0), edge)
+    return out

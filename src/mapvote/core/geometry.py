@@ -1,0 +1,101 @@
+"""Rigid motions as (4, 4) float64 matrices: ``T_a_b`` takes coordinates in frame b to frame a.
+
+Tangent vectors are (6,) float64, translation first: ``(x, y, z, rx, ry, rz)`` in metres and
+radians, applied on the left (``exp(xi) @ T``). Source: Barfoot, State Estimation for Robotics, ch. 8.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+F64 = NDArray[np.float64]
+
+
+def transform(T_a_b: F64, points_b: NDArray[np.floating]) -> F64:
+    """Points (n, 3) of frame b in frame a, float64 whatever came in."""
+    out: F64 = points_b.astype(np.float64) @ T_a_b[:3, :3].T + T_a_b[:3, 3]
+    return out
+
+
+def inverse(T_a_b: F64) -> F64:
+    """T_b_a of T_a_b, by the transpose of the rotation (exact for rigid motions)."""
+    T = np.eye(4)
+    T[:3, :3] = T_a_b[:3, :3].T
+    T[:3, 3] = -T[:3, :3] @ T_a_b[:3, 3]
+    return T
+
+
+def hat(v: ArrayLike) -> F64:
+    """The (3, 3) cross-product matrix of a (3,) vector."""
+    x, y, z = np.asarray(v, dtype=np.float64)
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+
+
+def exp(xi: ArrayLike) -> F64:
+    """SE(3) exponential of a (6,) tangent vector (Barfoot 8.33)."""
+    xi = np.asarray(xi, dtype=np.float64)
+    rho, phi = xi[:3], xi[3:]
+    angle = float(np.linalg.norm(phi))
+    W = hat(phi)
+    if angle < 1e-8:
+        R, V = np.eye(3) + W + 0.5 * W @ W, np.eye(3) + 0.5 * W
+    else:
+        s, c = np.sin(angle), np.cos(angle)
+        R = np.eye(3) + (s / angle) * W + ((1 - c) / angle**2) * W @ W
+        V = np.eye(3) + ((1 - c) / angle**2) * W + ((angle - s) / angle**3) * W @ W
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = R, V @ rho
+    return T
+
+
+def log(T: F64) -> F64:
+    """The (6,) tangent vector of T; inverse of :func:`exp` for rotations below pi."""
+    R = T[:3, :3]
+    vee = np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
+    angle = float(np.arctan2(0.5 * np.linalg.norm(vee), 0.5 * (np.trace(R) - 1.0)))
+    if angle < 1e-8:
+        phi = 0.5 * vee
+        V_inv = np.eye(3) - 0.5 * hat(phi)
+    else:
+        if np.pi - angle < 1e-6:  # vee vanishes: take the axis from R + I instead
+            S = 0.5 * (R + np.eye(3))
+            k = int(np.argmax(np.diag(S)))
+            axis = S[:, k] / np.sqrt(S[k, k])
+            axis = axis if float(axis @ vee) >= 0 else -axis
+        else:
+            axis = vee / np.linalg.norm(vee)
+        phi = angle * axis
+        half = 0.5 * angle
+        W = hat(phi)
+        V_inv = np.eye(3) - 0.5 * W + (1 - half / np.tan(half)) / angle**2 * W @ W
+    return np.concatenate([V_inv @ T[:3, 3], phi])
+
+
+def interpolate(T_0: F64, T_1: F64, alpha: float) -> F64:
+    """The motion a share ``alpha`` of the way from T_0 to T_1 at constant twist; extrapolates outside [0, 1]."""
+    return T_0 @ exp(alpha * log(inverse(T_0) @ T_1))
+
+
+def from_xyz_rpy(x: float, y: float, z: float, roll: float = 0.0, pitch: float = 0.0, yaw: float = 0.0) -> F64:
+    """Metres and radians; R = Rz(yaw) Ry(pitch) Rx(roll)."""
+    cr, sr, cp, sp, cy, sy = np.cos(roll), np.sin(roll), np.cos(pitch), np.sin(pitch), np.cos(yaw), np.sin(yaw)
+    T = np.eye(4)
+    T[:3, :3] = [
+        [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
+        [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
+        [-sp, cp * sr, cp * cr],
+    ]
+    T[:3, 3] = x, y, z
+    return T
+
+
+def rotation_angle(T: F64) -> float:
+    """Magnitude of the rotation of T, radians in [0, pi]."""
+    return float(np.linalg.norm(log(T)[3:]))
+
+
+def is_rigid(T: F64, tolerance: float = 1e-3) -> bool:
+    """Whether T is finite, its rotation orthonormal within ``tolerance`` and right-handed."""
+    R = T[:3, :3]
+    return bool(np.all(np.isfinite(T)) and np.allclose(R @ R.T, np.eye(3), atol=tolerance) and np.linalg.det(R) > 0)

@@ -1,0 +1,53 @@
+"""LiDAR models: everything that a threshold may be derived from (paper II for the HDL-32E)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True, slots=True)
+class Sensor:
+    """A spinning LiDAR. Beams are listed from the top down; azimuths are counter-clockwise from x forward."""
+
+    name: str
+    elevations_deg: tuple[float, ...]
+    azimuth_step_deg: float
+    rate_hz: float = 10.0
+    min_range_m: float = 1.0
+    max_range_m: float = 100.0
+    range_sigma_m: float = 0.02
+
+    @property
+    def beams(self) -> int:
+        return len(self.elevations_deg)
+
+    @property
+    def azimuths(self) -> int:
+        """Firings in one revolution."""
+        return round(360.0 / self.azimuth_step_deg)
+
+    @property
+    def fov_top_deg(self) -> float:
+        """Elevation of the highest beam."""
+        return max(self.elevations_deg)
+
+    @property
+    def fov_bottom_deg(self) -> float:
+        """Elevation of the lowest beam."""
+        return min(self.elevations_deg)
+
+
+def _even(top_deg: float, bottom_deg: float, beams: int) -> tuple[float, ...]:
+    return tuple(float(e) for e in np.linspace(top_deg, bottom_deg, beams).round(4))
+
+
+SENSORS: dict[str, Sensor] = {
+    s.name: s
+    for s in (
+        Sensor("vlp16", _even(15.0, -15.0, 16), 0.2),
+        Sensor("hdl32e", _even(10.67, -30.67, 32), 0.16),
+        Sensor("hdl64e", _even(2.0, -8.33, 32) + _even(-8.83, -24.33, 32), 0.1728, max_range_m=120.0),
+    )
+}

@@ -1,0 +1,142 @@
+"""The nouns, all on one page. Shapes, dtypes and frames are written beside the arrays.
+
+Frames: ``map`` (the world), ``base`` (the vehicle), ``lidar``. SI units, else the unit is in the name.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from enum import IntEnum
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapvote.core.grid import Grid, Lattice, TileIndex
+from mapvote.core.sensors import Sensor
+
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+U8 = NDArray[np.uint8]
+U16 = NDArray[np.uint16]
+U64 = NDArray[np.uint64]
+I32 = NDArray[np.int32]
+I64 = NDArray[np.int64]
+Bool = NDArray[np.bool_]
+
+
+class MapvoteError(Exception):
+    """What a user can mend: the message says what, where and how. Printed without a traceback, exit code 1."""
+
+
+class CellState(IntEnum):
+    """The five classes of paper III-A; the value is the column of a tally."""
+
+    UNCHANGED_OCCUPIED = 0
+    UNCHANGED_EMPTY = 1
+    CHANGED_OCCUPIED = 2
+    CHANGED_EMPTY = 3
+    UNDETERMINED = 4
+
+
+N_STATES = len(CellState)
+NO_VOTE = 255
+"""In a uint8 state grid: never seen, or invalid. Not the same as UNDETERMINED."""
+
+
+@dataclass(frozen=True, slots=True)
+class Scan:
+    """One revolution. ``stamp_ns`` is the moment in whose lidar frame the points are, once de-skewed."""
+
+    stamp_ns: int
+    points: F32
+    """(n, 3) lidar frame; finite, beyond the sensor's minimum range."""
+    time_s: F32 | None = None
+    """(n,) when each point was measured, relative to ``stamp_ns``; None if already motion-compensated."""
+    intensity: F32 | None = None
+    """(n,) in [0, 1], where known."""
+
+
+@dataclass(frozen=True, slots=True)
+class Drive:
+    """A recorded drive, streamed: scans are read one by one, never all at once."""
+
+    path: Path
+    vehicle: str
+    drive_id: str
+    sensor: Sensor
+    stamps_ns: I64
+    """(n,) strictly increasing."""
+    read_scan: Callable[[int], Scan]
+    """Scan i of this drive; raises MapvoteError naming the file and the defect."""
+    T_map_lidar_prior: F64 | None = None
+    """(n, 4, 4) what the vehicle believed (GNSS/INS), or None."""
+    prior_sigma_m: float = 1.0
+    prior_sigma_deg: float = 1.0
+    T_base_lidar: F64 = field(default_factory=lambda: np.eye(4))
+
+    def __len__(self) -> int:
+        return len(self.stamps_ns)
+
+    def __iter__(self) -> Iterator[Scan]:
+        return (self.read_scan(i) for i in range(len(self)))
+
+
+@dataclass(frozen=True, slots=True)
+class Registration:
+    """A pose and how far to trust it (METHOD 5: a lost vehicle must never demolish a street)."""
+
+    T_map_lidar: F64
+    covariance: F64
+    """(6, 6) of the left tangent vector (translation first), metres and radians."""
+    score: float
+    """Mean NDT likelihood of the points used, in [0, 1]."""
+    inlier_share: float
+    """Share of the points used that fell into a populated voxel and agreed with it."""
+    iterations: int
+    converged: bool
+
+
+@dataclass(frozen=True, slots=True)
+class MapTile:
+    """76.8 m x 76.8 m of map. ``points`` are the product; the planes are what the map knows besides."""
+
+    points: F32
+    """(n, 3): x, y from the tile's lower-left corner, z in map metres."""
+    ground_z: F32
+    """(256, 256) height of the ground, map metres; NaN where unknown. Fixed when the map is first built."""
+    free: U64 | None = None
+    """(256, 256) column words of voxels known to be free (see core.columns), or None if never learned."""
+
+
+@dataclass(frozen=True, slots=True)
+class PointMap:
+    """A whole map. Edited tiles make a new PointMap; tiles themselves never change."""
+
+    map_id: str
+    lattice: Lattice
+    tiles: Mapping[TileIndex, MapTile]
+    georeference: Mapping[str, str] = field(default_factory=dict)
+    """Free text carried along (CRS, projector, origin)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Reference:
+    """The partial reference map R_i (paper III-A) as planes over one window."""
+
+    grid: Grid
+    ground_z: F32
+    """(rows, cols) map metres, NaN where unknown."""
+    base: I32
+    """(rows, cols) lattice layer of bit 0 of each column: floor(ground_z / 0.3); smooth, filled where unknown."""
+    occupied: U64
+    """(rows, cols) column words of the map's obstacle points (above ground)."""
+    counts: I32
+    """(rows, cols) obstacle points of the map in each cell."""
+    bottom_z: F32
+    """(rows, cols) lowest obstacle point of the map in the cell, map metres; +inf where none."""
+    top_z: F32
+    """(rows, cols) highest obstacle point of the map in the cell, map metres; -inf where none."""
+    free: U64 | None
+    """(rows, cols) column words known to be free, or None if this map never learned them."""

@@ -1,0 +1,1 @@
+"""Truth, metrics, cases and the report (paper V)."""

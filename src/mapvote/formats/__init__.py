@@ -1,0 +1,1 @@
+"""Maps and drives in other people's file formats."""

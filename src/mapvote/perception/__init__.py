@@ -1,0 +1,1 @@
+"""One scan becomes evidence (paper II, III): localise, remove moving objects, see, classify."""
