@@ -36,7 +36,7 @@ class VotingSettings(Section):
     method: Literal["paper", "columns"] = "paper"
     weighted: bool = Field(default=True, description="multiple votes per scan by Eq. (1); false: one vote per scan")
     two_stage: bool = Field(default=True, description="the vehicle decides its cells; false: it sends its tally")
-    skip_tall_cells: bool = Field(default=True, description="case 5: no vote where the map begins above the field of view")
+    skip_tall_cells: bool = Field(default=True, description="case 5: no vote where the map begins above the view")
     occlusion: Occlusion = "first_hit"
     a: float = 2.0
     b: float = 3.0

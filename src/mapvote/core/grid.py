@@ -67,10 +67,10 @@ class Grid:
         col -= self.col0
         return row, col, (row >= 0) & (row < self.rows) & (col >= 0) & (col < self.cols)
 
-    def centres(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def centres(self) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
         """(x of each column, y of each row), map metres."""
-        x: NDArray[np.float64] = self.x0 + (np.arange(self.cols) + 0.5) * CELL_SIZE
-        y: NDArray[np.float64] = self.y0 + (np.arange(self.rows) + 0.5) * CELL_SIZE
+        x: NDArray[np.floating] = self.x0 + (np.arange(self.cols, dtype=np.float64) + 0.5) * CELL_SIZE
+        y: NDArray[np.floating] = self.y0 + (np.arange(self.rows, dtype=np.float64) + 0.5) * CELL_SIZE
         return x, y
 
     def intersection(self, other: Grid) -> Grid:
