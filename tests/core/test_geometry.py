@@ -1,0 +1,52 @@
+"""SE(3): the group laws, and that log undoes exp."""
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+from mapvote.core import geometry
+
+metres = st.floats(-100.0, 100.0)
+angles = st.floats(-1.7, 1.7)  # |phi| < sqrt(3) * 1.7 < pi: where log is the inverse of exp
+twists = st.tuples(metres, metres, metres, angles, angles, angles).map(np.array)
+
+
+@given(twists)
+def test_log_undoes_exp(xi: np.ndarray) -> None:
+    T = geometry.exp(xi)
+    assert geometry.is_rigid(T)
+    np.testing.assert_allclose(geometry.log(T), xi, atol=1e-6)
+
+
+@given(twists)
+def test_inverse_is_the_motion_back(xi: np.ndarray) -> None:
+    T = geometry.exp(xi)
+    np.testing.assert_allclose(geometry.inverse(T) @ T, np.eye(4), atol=1e-9)
+    np.testing.assert_allclose(geometry.inverse(T), geometry.exp(-xi), atol=1e-9)
+
+
+@given(twists, twists)
+def test_interpolation_meets_both_ends_and_moves_at_constant_twist(a: np.ndarray, b: np.ndarray) -> None:
+    T_0, T_1 = geometry.exp(a), geometry.exp(a) @ geometry.exp(0.5 * b)
+    np.testing.assert_allclose(geometry.interpolate(T_0, T_1, 0.0), T_0, atol=1e-8)
+    np.testing.assert_allclose(geometry.interpolate(T_0, T_1, 1.0), T_1, atol=1e-6)
+    half = geometry.interpolate(T_0, T_1, 0.5)
+    np.testing.assert_allclose(geometry.interpolate(T_0, half, 2.0), T_1, atol=1e-6)
+
+
+def test_half_a_turn_has_a_logarithm() -> None:
+    for axis in np.eye(3):
+        xi = np.concatenate([np.zeros(3), np.pi * axis])
+        T = geometry.exp(xi)
+        np.testing.assert_allclose(geometry.exp(geometry.log(T)), T, atol=1e-6)
+        assert abs(geometry.rotation_angle(T) - np.pi) < 1e-6
+
+
+def test_yaw_turns_x_towards_y() -> None:
+    T_map_lidar = geometry.from_xyz_rpy(10.0, 0.0, 2.0, yaw=np.pi / 2)
+    np.testing.assert_allclose(geometry.transform(T_map_lidar, np.array([[1.0, 0.0, 0.0]])), [[10.0, 1.0, 2.0]])
+
+
+def test_a_mirror_or_a_nan_is_not_rigid() -> None:
+    assert not geometry.is_rigid(np.diag([1.0, -1.0, 1.0, 1.0]))
+    assert not geometry.is_rigid(np.full((4, 4), np.nan))

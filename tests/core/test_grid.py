@@ -1,0 +1,66 @@
+"""The one lattice: half-open cells, windows that are slices of one another, tiles that cover without overlap."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Grid, Lattice, tile_grid, tile_of_cells, window_around
+
+small = st.integers(-2000, 2000)
+sizes = st.integers(1, 600)
+grids = st.builds(Grid, st.just(Lattice(0.9, -1.2)), small, small, sizes, sizes)
+
+
+def test_the_paper_street_has_514_900_cells() -> None:
+    """570 m x 81.3 m at 0.3 m (METHOD 1)."""
+    assert round(570.0 / CELL_SIZE) * round(81.3 / CELL_SIZE) == 514_900
+
+
+def test_a_point_on_a_cell_border_belongs_to_the_upper_cell() -> None:
+    rows, cols = Lattice().cells_of(np.array([[0.0, 0.0], [0.29999, 0.30001], [-1e-9, 0.6]]))
+    assert cols.tolist() == [0, 0, -1]
+    assert rows.tolist() == [0, 1, 2]
+
+
+@given(grids, grids)
+def test_intersection_and_union_bound_both(a: Grid, b: Grid) -> None:
+    union, common = a.union(b), a.intersection(b)
+    a.slices_in(union)
+    b.slices_in(union)
+    if common.rows and common.cols:
+        common.slices_in(a)
+        common.slices_in(b)
+    assert a.intersection(a) == a == a.union(a)
+    assert (common.rows, common.cols) == (b.intersection(a).rows, b.intersection(a).cols)
+
+
+@given(grids)
+def test_tiles_cover_a_window_once(grid: Grid) -> None:
+    seen = np.zeros(grid.shape, dtype=np.int64)
+    for tile in grid.tiles():
+        common = tile_grid(grid.lattice, tile).intersection(grid)
+        seen[common.slices_in(grid)] += 1
+    assert (seen == 1).all()
+
+
+@given(small, small)
+def test_a_cell_lies_in_the_tile_that_is_computed_for_it(row: int, col: int) -> None:
+    tile_row, tile_col = tile_of_cells(np.array([row]), np.array([col]))
+    tile = tile_grid(Lattice(), (int(tile_row[0]), int(tile_col[0])))
+    assert tile.row0 <= row < tile.row0 + TILE_CELLS
+    assert tile.col0 <= col < tile.col0 + TILE_CELLS
+
+
+def test_the_vehicle_stands_in_the_middle_cell_of_its_window() -> None:
+    grid = window_around(Lattice(), 12.34, -56.78, 80.0)
+    rows, cols, inside = grid.indices_of(np.array([[12.34, -56.78]]))
+    assert grid.shape == (267, 267)
+    assert (rows[0], cols[0], inside[0]) == (133, 133, True)
+
+
+def test_grids_of_different_lattices_never_mix() -> None:
+    with pytest.raises(ValueError, match="different lattices"):
+        Grid(Lattice(), 0, 0, 5, 5).intersection(Grid(Lattice(0.15), 0, 0, 5, 5))
+    with pytest.raises(ValueError, match="not inside"):
+        Grid(Lattice(), 0, 0, 5, 5).slices_in(Grid(Lattice(), 1, 0, 5, 5))

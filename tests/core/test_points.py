@@ -1,0 +1,39 @@
+"""Voxels partition a cloud; the ground follows the road and stays under walls."""
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+from mapvote.core.grid import Grid, Lattice
+from mapvote.core.points import ground_surface, voxel_downsample, voxel_keys
+
+
+@given(st.integers(0, 2**31), st.integers(1, 400))
+def test_downsampling_keeps_one_point_of_every_voxel(seed: int, n: int) -> None:
+    points = np.random.default_rng(seed).uniform(-3.0, 3.0, (n, 3))
+    keys = voxel_keys(points, 0.0, 0.0)
+    kept = voxel_downsample(points, 0.3)
+    assert len(set(keys[kept].tolist())) == len(kept) == len(set(keys.tolist()))
+    np.testing.assert_array_equal(voxel_downsample(points[kept], 0.3), np.arange(len(kept)))
+
+
+def _cloud(z: np.ndarray, xy: np.ndarray) -> np.ndarray:
+    return np.column_stack([xy, z])
+
+
+def test_the_ground_follows_a_ramp_and_ignores_a_wall_and_an_awning() -> None:
+    rng = np.random.default_rng(0)
+    xy = rng.uniform(0.0, 30.0, (40_000, 2))
+    road = _cloud(0.10 * xy[:, 0], xy)
+    wall = np.column_stack([np.full(4000, 15.05), rng.uniform(0, 30, 4000), 1.5 + rng.uniform(0.2, 6.0, 4000)])
+    awning = _cloud(4.0 + 0 * xy[:2000, 0], np.column_stack([rng.uniform(20, 22, 2000), rng.uniform(5, 9, 2000)]))
+    ground = ground_surface(np.vstack([road, wall, awning]), Grid(Lattice(), 0, 0, 100, 100))
+    x = 0.3 * (np.arange(100) + 0.5)
+    assert np.isfinite(ground).all()
+    assert np.abs(ground - 0.10 * x[None, :]).max() < 0.06
+
+
+def test_ground_far_from_any_point_is_unknown() -> None:
+    ground = ground_surface(np.array([[0.5, 0.5, 7.0]]), Grid(Lattice(), 0, 0, 100, 100), reach_m=3.0)
+    assert ground[1, 1] == 7.0
+    assert np.isnan(ground[50, 50])
