@@ -34,6 +34,14 @@ def test_the_ground_follows_a_ramp_and_ignores_a_wall_and_an_awning() -> None:
 
 
 def test_ground_far_from_any_point_is_unknown() -> None:
-    ground = ground_surface(np.array([[0.5, 0.5, 7.0]]), Grid(Lattice(), 0, 0, 100, 100), reach_m=3.0)
+    patch = np.array([[0.5, 0.5, 7.0], [0.8, 0.5, 7.0], [0.5, 0.8, 7.0]])
+    ground = ground_surface(patch, Grid(Lattice(), 0, 0, 100, 100), reach_m=3.0)
     assert ground[1, 1] == 7.0
     assert np.isnan(ground[50, 50])
+
+
+def test_a_reflection_below_the_road_does_not_sink_the_ground() -> None:
+    xy = np.random.default_rng(1).uniform(0.0, 30.0, (40_000, 2))
+    reflections = np.array([[9.0, 9.0, -5.4], [10.1, 9.6, -4.6], [21.0, 3.0, -23.0]])
+    ground = ground_surface(np.vstack([_cloud(0.0 * xy[:, 0], xy), reflections]), Grid(Lattice(), 0, 0, 100, 100))
+    assert np.abs(ground).max() < 0.01

@@ -41,9 +41,12 @@ def exp(xi: ArrayLike) -> F64:
     if angle < 1e-8:
         R, V = np.eye(3) + W + 0.5 * W @ W, np.eye(3) + 0.5 * W
     else:
-        s, c = np.sin(angle), np.cos(angle)
-        R = np.eye(3) + (s / angle) * W + ((1 - c) / angle**2) * W @ W
-        V = np.eye(3) + ((1 - c) / angle**2) * W + ((angle - s) / angle**3) * W @ W
+        s, half_chord = (
+            np.sin(angle) / angle,
+            2.0 * (np.sin(0.5 * angle) / angle) ** 2,
+        )  # 1 - cos cancels at small angles
+        R = np.eye(3) + s * W + half_chord * W @ W
+        V = np.eye(3) + half_chord * W + ((1 - s) / angle**2) * W @ W
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = R, V @ rho
     return T

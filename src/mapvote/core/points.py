@@ -70,15 +70,38 @@ def _lower_envelope(z: F64, straight: float, diagonal: float) -> None:
             z[r, c] = best
 
 
+@numba.njit(cache=True, nogil=True)
+def _supported(low: F64, tolerance: float, neighbours: int) -> F64:
+    """``low`` without the cells that fewer than ``neighbours`` of their 24 next cells agree with (inf instead).
+
+    A reflection below the road is one point far below all others, and the envelope would follow it down a cone.
+    """
+    rows, cols = low.shape
+    out = np.full_like(low, np.inf)
+    for r in range(rows):
+        for c in range(cols):
+            if not np.isfinite(low[r, c]):
+                continue
+            found = 0
+            for i in range(max(r - 2, 0), min(r + 3, rows)):
+                for j in range(max(c - 2, 0), min(c + 3, cols)):
+                    found += abs(low[i, j] - low[r, c]) <= tolerance
+            if found > neighbours:  # the cell itself is one of them
+                out[r, c] = low[r, c]
+    return out
+
+
 def ground_surface(points: NDArray[np.floating], grid: Grid, max_grade: float = 0.15, reach_m: float = 3.0) -> F32:
     """Height of the ground in every cell of ``grid``, (rows, cols) float32 in the points' frame, NaN where unknown.
 
     ``points`` (n, 3) in map metres. A cell farther than ``reach_m`` from any point is unknown. Only points inside
-    ``grid`` are used: give a grid with a margin and cut it, so that windows agree where they meet.
+    ``grid`` are used: give a grid with a margin and cut it, so that windows agree where they meet. A cell whose lowest
+    point has no two neighbours (of 24) within 0.3 m of its height is measured wrongly and not used.
     """
     rows, cols, inside = grid.indices_of(points)
     low = np.full(grid.shape, np.inf)
     _lowest(rows, cols, points[:, 2].astype(np.float64), inside, low)
+    low = _supported(low, CELL_SIZE, 2)
     distance = np.where(np.isfinite(low), 0.0, np.inf)
     _lower_envelope(distance, CELL_SIZE, CELL_SIZE * np.sqrt(2.0))
     _lower_envelope(low, max_grade * CELL_SIZE, max_grade * CELL_SIZE * np.sqrt(2.0))
