@@ -44,4 +44,4 @@ def test_a_reflection_below_the_road_does_not_sink_the_ground() -> None:
     xy = np.random.default_rng(1).uniform(0.0, 30.0, (40_000, 2))
     reflections = np.array([[9.0, 9.0, -5.4], [10.1, 9.6, -4.6], [21.0, 3.0, -23.0]])
     ground = ground_surface(np.vstack([_cloud(0.0 * xy[:, 0], xy), reflections]), Grid(Lattice(), 0, 0, 100, 100))
-    assert np.abs(ground).max() < 0.01
+    assert np.abs(ground).max() < 0.07  # one cell of grade: the cells with reflections are filled in
