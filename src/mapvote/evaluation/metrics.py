@@ -1,0 +1,214 @@
+"""Scores against the truth: cells (paper V, Tables II-IV), points of the map, objects.
+
+Every ratio is 0.0 where nothing is counted (0/0 = 0), so that no score is ever NaN.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+from scipy.spatial import cKDTree
+
+from mapvote.core.types import F64, NO_VOTE, U8, Bool, CellState
+
+CLASSES = ("unchanged", "changed_occupied", "changed_empty")
+"""The paper's three scored classes; the position is the value in a truth grid (DESIGN 6)."""
+UNSCORED = 255
+"""In a truth grid: this cell is not counted."""
+
+
+def ratio(part: float | np.integer, whole: float | np.integer) -> float:
+    """part / whole, 0.0 where whole is 0."""
+    return float(part / whole) if whole else 0.0
+
+
+def harmonic_mean(p: float, r: float) -> float:
+    """2 p r / (p + r), the F1 score of one class; 0.0 if both are 0."""
+    return ratio(2.0 * p * r, p + r)
+
+
+@dataclass(frozen=True, slots=True)
+class Scores:
+    """Precision and recall of the three classes, in the order of :data:`CLASSES`."""
+
+    precision: tuple[float, float, float]
+    recall: tuple[float, float, float]
+
+    @property
+    def f1(self) -> tuple[float, float, float]:
+        p, r = self.precision, self.recall
+        return harmonic_mean(p[0], r[0]), harmonic_mean(p[1], r[1]), harmonic_mean(p[2], r[2])
+
+    @property
+    def macro_f1(self) -> float:
+        """Unweighted mean of the three F1: what Table IV holds (METHOD 1)."""
+        return sum(self.f1) / 3.0
+
+    @property
+    def kim_f1(self) -> float:
+        """Harmonic mean of mean precision and mean recall, as Kim et al. [15] report it."""
+        return harmonic_mean(sum(self.precision) / 3.0, sum(self.recall) / 3.0)
+
+    def to_dict(self) -> dict[str, object]:
+        """R of ``evaluate --json`` (DESIGN 6)."""
+        return {
+            "precision": dict(zip(CLASSES, self.precision, strict=True)),
+            "recall": dict(zip(CLASSES, self.recall, strict=True)),
+            "f1": dict(zip(CLASSES, self.f1, strict=True)),
+            "macro_f1": self.macro_f1,
+            "kim_f1": self.kim_f1,
+        }
+
+
+def classes_of(states: U8) -> U8:
+    """Five states to the three scored classes (METHOD 2): undetermined and never seen count as unchanged."""
+    out = np.zeros(states.shape, dtype=np.uint8)
+    out[states == CellState.CHANGED_OCCUPIED] = 1
+    out[states == CellState.CHANGED_EMPTY] = 2
+    return out
+
+
+def confusion(states: U8, truth: U8) -> NDArray[np.int64]:
+    """(3, 3) cells by [truth class, decided class]; truth 255 is not counted. ValueError on different shapes."""
+    if states.shape != truth.shape:
+        raise ValueError(f"states {states.shape} and truth {truth.shape} are not the same window")
+    scored = truth != UNSCORED
+    pairs = truth[scored].astype(np.int64) * 3 + classes_of(states)[scored]
+    return np.bincount(pairs, minlength=9).reshape(3, 3)
+
+
+def score_cells(states: U8, truth: U8) -> Scores:
+    """Precision and recall of decided ``states`` (CellState or NO_VOTE) against ``truth`` (0, 1, 2 or 255)."""
+    table = confusion(states, truth)
+    right, decided, true = np.diag(table), table.sum(axis=0), table.sum(axis=1)
+    p = [ratio(right[k], decided[k]) for k in range(3)]
+    r = [ratio(right[k], true[k]) for k in range(3)]
+    return Scores((p[0], p[1], p[2]), (r[0], r[1], r[2]))
+
+
+def determined(states: U8) -> Bool:
+    """Cells with one of the four states that say something: neither undetermined nor never seen."""
+    return (states != CellState.UNDETERMINED) & (states != NO_VOTE)
+
+
+def coverage(vehicle_states: Sequence[U8], truth: U8) -> float:
+    """Share of the scored truth cells that at least one vehicle determined."""
+    seen = np.zeros(truth.shape, dtype=np.bool_)
+    for states in vehicle_states:
+        seen |= determined(states)
+    scored = truth != UNSCORED
+    return ratio(np.count_nonzero(seen & scored), np.count_nonzero(scored))
+
+
+@dataclass(frozen=True, slots=True)
+class MapScores:
+    """What the update did to the points (shares of points, or of surface samples for ``new_added``)."""
+
+    stale_deleted: float
+    """Old map points of removed surfaces that are gone."""
+    valid_deleted: float
+    """Old map points of standing surfaces that are gone: the damage done."""
+    new_added: float
+    """Samples of reachable new surface with a point of the updated map within reach."""
+    added_false: float
+    """Added points that lie on no surface of the new world."""
+    stale_points: int
+    valid_points: int
+    new_samples: int
+    added_points: int
+
+    def to_dict(self) -> dict[str, float | int]:
+        """Plain numbers for JSON."""
+        return {name: getattr(self, name) for name in self.__slots__}
+
+
+def score_map(
+    old_points: F64, new_points: F64, kept: F64, added: F64, removed: F64, *, reach_m: float = 0.3
+) -> MapScores:
+    """Compare the map before and after with noise-free surface samples of the two worlds.
+
+    ``old_points`` and ``new_points`` (n, 3) are the obstacle points of the map before and after the update;
+    a point survives if its coordinates are found again bit for bit. ``kept``, ``added`` and ``removed`` (m, 3) are
+    surface samples, map metres: standing in both worlds, only in the new one, only in the old one. An old point
+    is stale if a removed sample lies within ``reach_m`` and no kept or added one nearer; valid if the nearest
+    sample within reach is a kept one. Points near no surface (trails, noise) are neither.
+    """
+    to_kept, to_added, to_removed = (_distance(old_points, surface) for surface in (kept, added, removed))
+    stale = (to_removed <= reach_m) & (to_removed < np.minimum(to_kept, to_added))
+    valid = (to_kept <= reach_m) & (to_kept <= to_removed)
+    survived, fresh = _same_rows(old_points, new_points)
+    new_world = np.minimum(_distance(fresh, kept), _distance(fresh, added))
+    reached = _distance(added, new_points) <= reach_m
+    return MapScores(
+        stale_deleted=ratio(np.count_nonzero(stale & ~survived), np.count_nonzero(stale)),
+        valid_deleted=ratio(np.count_nonzero(valid & ~survived), np.count_nonzero(valid)),
+        new_added=ratio(np.count_nonzero(reached), len(added)),
+        added_false=ratio(np.count_nonzero(new_world > reach_m), len(fresh)),
+        stale_points=int(np.count_nonzero(stale)),
+        valid_points=int(np.count_nonzero(valid)),
+        new_samples=len(added),
+        added_points=len(fresh),
+    )
+
+
+def _distance(points: F64, surface: F64) -> F64:
+    """(n,) metres from each point to the nearest sample; inf where there is none."""
+    if not len(points) or not len(surface):
+        return np.full(len(points), np.inf)
+    distance: F64 = cKDTree(surface).query(points, distance_upper_bound=2.0)[0]
+    return distance
+
+
+def _same_rows(old: F64, new: F64) -> tuple[Bool, F64]:
+    """(which rows of ``old`` are in ``new``, the rows of ``new`` that are not in ``old``), compared bit for bit."""
+    record = np.dtype((np.void, 24))
+    a, b = (np.ascontiguousarray(p, dtype=np.float64).view(record).ravel() for p in (old, new))
+    return np.isin(a, b), new[~np.isin(b, a)]
+
+
+@dataclass(frozen=True, slots=True)
+class ObjectScores:
+    """Connected changes against the truth (issue 3, "objects")."""
+
+    found: tuple[bool, ...]
+    """Per true object: at least half of its changed truth cells were decided so."""
+    recall: tuple[float, ...]
+    """Per true object: share of its changed truth cells decided so."""
+    false_m2: tuple[float, ...]
+    """Area of each decided object that touches no truth of its class, largest first."""
+
+    def to_dict(self) -> dict[str, object]:
+        """Plain lists for JSON."""
+        return {"found": list(self.found), "recall": list(self.recall), "false_m2": list(self.false_m2)}
+
+
+def score_objects(
+    states: U8, truth: U8, objects: Sequence[Mapping[str, object]], cell_size: float, *, min_m2: float = 1.0
+) -> ObjectScores:
+    """``objects`` give ``cells`` (rows, cols) bool over the window and ``kind``: "built" or "demolished".
+
+    A decided object is an 8-connected group of cells of one changed class of at least ``min_m2``; it is false if
+    no truth cell of its class, nor an unscored one, lies within two cells of it (a wall one cell off is no invention).
+    Objects with no truth cell (never reachable by a ray) are not asked for.
+    """
+    decided = classes_of(states)
+    recalls = []
+    for item in objects:
+        kind = 1 if item["kind"] == "built" else 2
+        wanted = np.asarray(item["cells"], dtype=np.bool_) & (truth == kind)
+        if wanted.any():
+            recalls.append(ratio(np.count_nonzero(wanted & (decided == kind)), np.count_nonzero(wanted)))
+    neighbours = np.ones((3, 3), dtype=np.bool_)
+    false = []
+    for kind in (1, 2):
+        labels, count = ndimage.label(decided == kind, structure=neighbours)
+        near = ndimage.binary_dilation((truth == kind) | (truth == UNSCORED), structure=neighbours, iterations=2)
+        sizes = np.bincount(labels.ravel(), minlength=count + 1)[1:] * cell_size**2
+        touched = np.bincount(labels[near], minlength=count + 1)[1:] > 0
+        false += [float(size) for size, real in zip(sizes, touched, strict=True) if size >= min_m2 and not real]
+    found = tuple(share >= 0.5 for share in recalls)
+    return ObjectScores(found, tuple(recalls), tuple(round(area, 2) for area in sorted(false, reverse=True)))
