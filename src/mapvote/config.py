@@ -5,10 +5,17 @@ Ratios, not scan counts: nothing here needs retuning for another scan rate or nu
 
 from __future__ import annotations
 
+import difflib
 import hashlib
-from typing import Literal
+import os
+import tomllib
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from mapvote.core.types import MapvoteError
 
 
 class Section(BaseModel):
@@ -75,3 +82,64 @@ CASES: dict[str, dict[str, bool]] = {
     "5": {"weighted": True, "two_stage": True, "skip_tall_cells": True},
 }
 """The paper's five cases as settings of the one rule (paper V)."""
+
+
+ENV_PREFIX = "MAPVOTE_"
+
+
+def did_you_mean(key: str, known: Iterable[str]) -> str:
+    """ "; did you mean 'x'?" for the known name nearest to ``key``, or "" if none is near."""
+    near = difflib.get_close_matches(key, list(known), n=1, cutoff=0.5)
+    return f"; did you mean {near[0]!r}?" if near else ""
+
+
+def load_settings(path: Path | str | None = None, env: Mapping[str, str] | None = None) -> Settings:
+    """The defaults, changed by the TOML file at ``path``, changed by the environment (``MAPVOTE_VOTING__N_MIN=4``).
+
+    Raises MapvoteError naming the file or variable, the key, and the nearest key that exists.
+    """
+    return load_with_sources(path, env)[0]
+
+
+def load_with_sources(
+    path: Path | str | None = None, env: Mapping[str, str] | None = None
+) -> tuple[Settings, dict[str, str]]:
+    """As :func:`load_settings`, and by "section.key" where each value that is not a default came from."""
+    values: dict[str, dict[str, Any]] = {}
+    sources: dict[str, str] = {}
+    for section, key, value, source in (*_from_file(path), *_from_env(os.environ if env is None else env)):
+        if section not in Settings.model_fields:
+            raise MapvoteError(f"{source}: unknown section {section!r}{did_you_mean(section, Settings.model_fields)}")
+        known = type(getattr(Settings(), section)).model_fields
+        if key not in known:
+            raise MapvoteError(f"{source}: unknown setting {section}.{key}{did_you_mean(key, known)}")
+        values.setdefault(section, {})[key] = value
+        sources[f"{section}.{key}"] = source
+    try:
+        return Settings.model_validate(values), sources
+    except ValidationError as error:
+        first = error.errors()[0]
+        name = ".".join(str(part) for part in first["loc"][:2])
+        raise MapvoteError(f"{sources[name]}: {name} = {first['input']!r}: {first['msg']}") from error
+
+
+def _from_file(path: Path | str | None) -> Iterable[tuple[str, str, Any, str]]:
+    if path is None:
+        return
+    try:
+        tables = tomllib.loads(Path(path).read_text())
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise MapvoteError(f"{path}: settings cannot be read ({error})") from error
+    for section, table in tables.items():
+        if not isinstance(table, dict):
+            raise MapvoteError(f"{path}: {section} = {table!r} stands outside a section; put it under its [section]")
+        for key, value in table.items():
+            yield section, key, value, str(path)
+
+
+def _from_env(env: Mapping[str, str]) -> Iterable[tuple[str, str, Any, str]]:
+    """Variables MAPVOTE_SECTION__KEY; pydantic turns their text into numbers."""
+    for name in sorted(env):
+        section, found, key = name.removeprefix(ENV_PREFIX).lower().partition("__")
+        if name.startswith(ENV_PREFIX) and found:
+            yield section, key, env[name], name

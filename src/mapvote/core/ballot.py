@@ -6,15 +6,15 @@ a newer format adds are ignored, required fields that are missing are refused.
 
 from __future__ import annotations
 
-import hashlib
-from typing import Annotated, Any
+from typing import Annotated
 
 import msgspec
 import numpy as np
-from backports import zstd
-from numpy.typing import NDArray
 
 from mapvote.core.grid import TILE_CELLS, TileIndex
+from mapvote.core.planes import pack_plane as pack_plane
+from mapvote.core.planes import unpack_bytes, unpack_plane
+from mapvote.core.tilecode import content_hash as content_hash
 from mapvote.core.types import F32, N_STATES, NO_VOTE, U8, U16, U64, MapvoteError
 
 FORMAT_VERSION = 1
@@ -22,7 +22,6 @@ MAX_TILES = 4096
 MAX_POINTS_PER_CELL = 64
 """One new point per voxel of a column: no honest ballot has more."""
 MAX_TILE_INDEX = 1 << 20
-ZSTD_LEVEL = 19
 _CELLS = TILE_CELLS * TILE_CELLS
 
 Id = Annotated[str, msgspec.Meta(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$")]
@@ -72,35 +71,9 @@ def tile_key(tile: TileIndex) -> str:
     return f"{tile[0]},{tile[1]}"
 
 
-def pack_plane(plane: U8 | U16 | U64 | F32) -> bytes:
-    """An array's little-endian C-order bytes, zstd-compressed."""
-    little = np.ascontiguousarray(plane.astype(plane.dtype.newbyteorder("<"), copy=False))
-    return zstd.compress(little.tobytes(), ZSTD_LEVEL)
-
-
-def _unpack(data: bytes, limit: int, what: str) -> bytes:
-    """Decompress at most ``limit`` bytes; MapvoteError beyond it or on damage (a decompression bomb stops here)."""
-    decompressor = zstd.ZstdDecompressor()
-    try:
-        raw = decompressor.decompress(data, max_length=limit + 1)
-    except zstd.ZstdError as error:
-        raise MapvoteError(f"ballot: {what} is damaged ({error}); send the ballot again") from error
-    if len(raw) > limit or not decompressor.eof or decompressor.unused_data:
-        raise MapvoteError(f"ballot: {what} is truncated or larger than {limit} bytes when decompressed")
-    return raw
-
-
-def _plane(data: bytes, dtype: str, shape: tuple[int, ...], what: str) -> NDArray[Any]:
-    size = int(np.prod(shape)) * np.dtype(dtype).itemsize
-    raw = _unpack(data, size, what)
-    if len(raw) != size:
-        raise MapvoteError(f"ballot: {what} has {len(raw)} bytes, expected {size}")
-    return np.frombuffer(raw, dtype=dtype).reshape(shape)
-
-
 def unpack_states(data: bytes) -> U8:
     """(256, 256) uint8; MapvoteError if damaged or not a CellState."""
-    states = _plane(data, "<u1", (TILE_CELLS, TILE_CELLS), "states")
+    states = unpack_plane(data, "<u1", (TILE_CELLS, TILE_CELLS), "ballot: states")
     if np.any((states >= N_STATES) & (states != NO_VOTE)):
         raise MapvoteError("ballot: states holds a value that is no cell state")
     return states
@@ -108,17 +81,17 @@ def unpack_states(data: bytes) -> U8:
 
 def unpack_tally(data: bytes) -> U16:
     """(256, 256, 5) uint16; MapvoteError if damaged."""
-    return np.moveaxis(_plane(data, "<u2", (N_STATES, TILE_CELLS, TILE_CELLS), "tally"), 0, -1)
+    return np.moveaxis(unpack_plane(data, "<u2", (N_STATES, TILE_CELLS, TILE_CELLS), "ballot: tally"), 0, -1)
 
 
 def unpack_words(data: bytes, what: str) -> U64:
     """(256, 256) uint64; MapvoteError if damaged."""
-    return _plane(data, "<u8", (TILE_CELLS, TILE_CELLS), what)
+    return unpack_plane(data, "<u8", (TILE_CELLS, TILE_CELLS), f"ballot: {what}")
 
 
 def unpack_points(data: bytes) -> F32:
     """(m, 3) float32 from the tile's corner; MapvoteError if damaged, not finite or outside the tile."""
-    raw = _unpack(data, _CELLS * MAX_POINTS_PER_CELL * 12, "new_points")
+    raw = unpack_bytes(data, _CELLS * MAX_POINTS_PER_CELL * 12, "ballot: new_points")
     if len(raw) % 12:
         raise MapvoteError(f"ballot: new_points has {len(raw)} bytes, not a multiple of 12")
     points = np.frombuffer(raw, dtype="<f4").reshape(-1, 3)
@@ -169,8 +142,3 @@ def validate(ballot: Ballot) -> None:
                 unpack_words(words, what)
         if tile.new_points is not None:
             unpack_points(tile.new_points)
-
-
-def content_hash(tile_points: F32) -> str:
-    """SHA-256 of a tile's points: free space learned later changes no published point (DESIGN 2)."""
-    return hashlib.sha256(np.ascontiguousarray(tile_points, dtype="<f4").tobytes()).hexdigest()

@@ -1,0 +1,44 @@
+"""Arrays <-> bytes: raw little-endian planes under zstd, sizes checked before anything is allocated."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from backports import zstd
+from numpy.typing import NDArray
+
+from mapvote.core.types import MapvoteError
+
+ZSTD_LEVEL = 19
+"""For ballots, which travel by radio. Tiles of noisy float32 gain nothing above level 3."""
+
+
+def pack_plane(plane: NDArray[Any], level: int = ZSTD_LEVEL) -> bytes:
+    """An array's little-endian C-order bytes, zstd-compressed."""
+    little = np.ascontiguousarray(plane.astype(plane.dtype.newbyteorder("<"), copy=False))
+    return zstd.compress(little.tobytes(), level)
+
+
+def unpack_bytes(data: bytes, limit: int, what: str) -> bytes:
+    """Decompress at most ``limit`` bytes; MapvoteError beyond it or on damage (a decompression bomb stops here)."""
+    decompressor = zstd.ZstdDecompressor()
+    try:
+        raw = decompressor.decompress(data, max_length=limit + 1)
+    except zstd.ZstdError as error:
+        raise MapvoteError(f"{what} is damaged ({error}); fetch or send it again") from error
+    if len(raw) > limit or not decompressor.eof or decompressor.unused_data:
+        raise MapvoteError(f"{what} is truncated or larger than {limit} bytes when decompressed")
+    return raw
+
+
+def unpack_plane(data: bytes, dtype: str, shape: tuple[int, ...], what: str) -> NDArray[Any]:
+    """The array that :func:`pack_plane` took; ``dtype`` little-endian, e.g. "<u8". MapvoteError if damaged.
+
+    ``what`` names the plane in messages, e.g. "ballot: states".
+    """
+    size = int(np.prod(shape)) * np.dtype(dtype).itemsize
+    raw = unpack_bytes(data, size, what)
+    if len(raw) != size:
+        raise MapvoteError(f"{what} has {len(raw)} bytes, expected {size}")
+    return np.frombuffer(raw, dtype=dtype).reshape(shape)

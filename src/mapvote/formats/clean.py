@@ -1,0 +1,106 @@
+"""What every scan passes before it becomes a Scan: points that are no measurements are dropped and counted aloud."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapvote.core.sensors import Sensor
+from mapvote.core.types import F32, I64, MapvoteError, Scan
+
+log = logging.getLogger("mapvote.formats")
+
+MAX_BAD_SHARE = 0.05
+"""A scan with more broken points than this is refused: it is damaged, or not the format it claims to be."""
+FAR_M = 2000.0
+"""No LiDAR of ours measures farther; float64 or integers read as float32 do."""
+
+
+@dataclass(slots=True)
+class BadPoints:
+    """Running count over one drive. Warns at the 1st, 2nd, 4th, 8th ... scan concerned: heard, but not a flood."""
+
+    where: str
+    scans: int = 0
+    points: int = 0
+    seen: set[int] = field(default_factory=set)
+
+    def count(self, index: int, n: int) -> None:
+        if n == 0 or index in self.seen:
+            return
+        self.seen.add(index)
+        self.scans += 1
+        self.points += n
+        if self.scans & (self.scans - 1) == 0:
+            log.warning(
+                "%s: dropped %d points that are not finite or beyond %.0f m, in %d scans so far",
+                self.where,
+                self.points,
+                FAR_M,
+                self.scans,
+            )
+
+
+def clean_scan(
+    where: str,
+    index: int,
+    stamp_ns: int,
+    points: F32,
+    *,
+    sensor: Sensor,
+    bad_points: BadPoints,
+    intensity: F32 | None = None,
+    time_s: F32 | None = None,
+    no_return: NDArray[np.bool_] | None = None,
+) -> Scan:
+    """A Scan of the usable points (n, 3), in their order.
+
+    Dropped in silence, because the format says so: ``no_return`` (n,), rays that hit nothing; and points nearer than
+    the sensor can measure. Dropped and counted: not finite, or beyond 2 km. MapvoteError if these are more than 5 %,
+    or if nothing is left.
+    """
+    p = points.astype(np.float64)
+    distance = np.sqrt((p * p).sum(axis=1))
+    measured = np.ones(len(points), dtype=bool) if no_return is None else ~no_return
+    good = distance < FAR_M  # False for NaN too
+    bad = int((measured & ~good).sum())
+    if bad > MAX_BAD_SHARE * max(int(measured.sum()), 1):
+        raise MapvoteError(
+            f"{where}: {bad} of {int(measured.sum())} points are not finite or beyond {FAR_M:.0f} m, more than "
+            f"{MAX_BAD_SHARE:.0%}: the file is damaged, in millimetres, or not float32 x, y, z, intensity"
+        )
+    bad_points.count(index, bad)
+    keep = measured & good & (distance >= sensor.min_range_m - 5.0 * sensor.range_sigma_m)
+    if not keep.any():
+        raise MapvoteError(f"{where}: no usable point among {len(points)}; leave this scan out with --scans")
+    return Scan(
+        stamp_ns=stamp_ns,
+        points=np.ascontiguousarray(points[keep], dtype=np.float32),
+        time_s=None if time_s is None else np.ascontiguousarray(time_s[keep], dtype=np.float32),
+        intensity=None if intensity is None else unit_intensity(intensity[keep]),
+    )
+
+
+def unit_intensity(intensity: NDArray[np.number]) -> F32:
+    """Intensity in [0, 1]: 8-bit values (any above 1) are divided by 255 and cut there; not a number becomes 0."""
+    out = np.nan_to_num(intensity.astype(np.float32), nan=0.0, posinf=0.0, neginf=0.0)
+    if len(out) and float(out.max()) > 1.0:
+        out = out / np.float32(255.0)
+    return np.clip(out, 0.0, 1.0)
+
+
+def spinning_time_s(points: F32, rate_hz: float) -> F32:
+    """When each point (n, 3) was measured, relative to the middle of the revolution, by its azimuth.
+
+    The sensor turns clockwise seen from above and faces forward at the stamp: -azimuth / (2 pi rate).
+    """
+    azimuth = np.arctan2(points[:, 1], points[:, 0])
+    return (-azimuth / (2.0 * np.pi * rate_hz)).astype(np.float32)
+
+
+def stamps_from_rate(n: int, rate_hz: float, start_ns: int) -> I64:
+    """(n,) stamps of scans taken evenly."""
+    return start_ns + np.round(np.arange(n) * (1e9 / rate_hz)).astype(np.int64)

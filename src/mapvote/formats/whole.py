@@ -1,0 +1,69 @@
+"""Outputs appear whole or not at all: written beside their place under a hidden name, then renamed."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from mapvote.core.types import MapvoteError
+
+
+def _hidden(path: Path, role: str) -> Path:
+    return path.with_name(f".{path.name}.{os.getpid()}.{role}")
+
+
+def _sync(path: Path) -> None:
+    """Have the disk hold ``path`` before its name says so."""
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+@contextmanager
+def whole_file(path: Path | str) -> Iterator[Path]:
+    """Gives a hidden path to write to; on leaving without an error it becomes ``path``, replacing what was there."""
+    path = Path(path)
+    partial = _hidden(path, "partial")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        yield partial
+        _sync(partial)
+        os.replace(partial, path)
+    except OSError as error:
+        raise MapvoteError(f"{path}: cannot be written ({error.strerror or error}); nothing was changed") from error
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+@contextmanager
+def whole_folder(path: Path | str, *, sign: str) -> Iterator[Path]:
+    """Gives a hidden empty folder to fill; on leaving without an error it becomes ``path``.
+
+    A folder that is there already is replaced only if it is empty or holds a file named ``sign`` (so that a
+    mistyped path destroys nothing): MapvoteError otherwise.
+    """
+    path = Path(path)
+    if path.exists() and not (path.is_dir() and ((path / sign).is_file() or not any(path.iterdir()))):
+        raise MapvoteError(f"{path}: exists and has no {sign}, so it is not replaced; remove it or choose another path")
+    partial, old = _hidden(path, "partial"), _hidden(path, "old")
+    try:
+        shutil.rmtree(partial, ignore_errors=True)
+        partial.mkdir(parents=True)
+        yield partial
+        for entry in sorted(partial.rglob("*")):
+            _sync(entry)
+        if path.exists():
+            os.replace(path, old)
+        os.replace(partial, path)
+    except OSError as error:
+        if old.exists() and not path.exists():
+            os.replace(old, path)
+        raise MapvoteError(f"{path}: cannot be written ({error.strerror or error}); nothing was changed") from error
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+        shutil.rmtree(old, ignore_errors=True)
