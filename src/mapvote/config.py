@@ -22,8 +22,29 @@ class Section(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
+class NdtLevel(Section):
+    """One step of the coarse-to-fine search."""
+
+    voxel_m: float = Field(gt=0, description="side of the NDT voxels")
+    floor_m: float = Field(gt=0, description="standard deviation added to every voxel's distribution, isotropic")
+    points_m: float = Field(gt=0, description="the scan is thinned to one point per voxel of this side")
+    iterations: int = Field(gt=0, description="most Gauss-Newton steps at this level")
+
+
 class NdtSettings(Section):
-    """perception/ndt.py (METHOD 5)."""
+    """perception/ndt.py and perception/tracking.py (METHOD 5)."""
+
+    levels: tuple[NdtLevel, ...] = (
+        NdtLevel(voxel_m=3.0, floor_m=0.5, points_m=1.0, iterations=15),
+        NdtLevel(voxel_m=2.0, floor_m=0.25, points_m=1.0, iterations=15),
+        NdtLevel(voxel_m=1.0, floor_m=0.1, points_m=0.5, iterations=15),
+    )
+    half_window_m: float = Field(default=96.0, description="half the side of the NDT map kept around the vehicle")
+    below_m: float = Field(default=24.0, description="how far that window reaches below the vehicle")
+    above_m: float = Field(default=40.0, description="and above it")
+    recentre_m: float = Field(default=24.0, description="the window moves when the vehicle is this far off its middle")
+    min_points: int = Field(default=3, description="a voxel with fewer points has no distribution")
+    covariance_scale: float = Field(default=5.0, description="what neighbouring residuals have in common, calibrated")
 
 
 class MovingSettings(Section):

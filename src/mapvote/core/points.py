@@ -34,6 +34,39 @@ def voxel_downsample(points: NDArray[np.floating], size: float, x0: float = 0.0,
 
 
 @numba.njit(cache=True, nogil=True)
+def _thin(points: NDArray[np.float32], size: float) -> I64:
+    """Indices of the first point in each voxel of side ``size``, in input order (open addressing, linear probing)."""
+    slots = 1024
+    while slots < 2 * len(points):
+        slots *= 2
+    table = np.zeros(slots, dtype=np.int64)
+    keep = np.empty(len(points), dtype=np.int64)
+    n = 0
+    scale = 1.0 / size
+    for i in range(len(points)):
+        ix = np.int64(np.floor(points[i, 0] * scale)) + (1 << 20)
+        iy = np.int64(np.floor(points[i, 1] * scale)) + (1 << 20)
+        iz = np.int64(np.floor(points[i, 2] * scale)) + (1 << 20)
+        key = (ix << 42) | (iy << 21) | iz
+        slot = ((key * np.int64(-7046029254386353131)) >> 20) & (slots - 1)
+        while table[slot] != 0 and table[slot] != key:
+            slot = (slot + 1) & (slots - 1)
+        if table[slot] == 0:
+            table[slot] = key
+            keep[n] = i
+            n += 1
+    return keep[:n]
+
+
+def thin(points: NDArray[np.floating], size: float) -> I64:
+    """Indices (m,) of the first of (n, 3) points in each voxel of side ``size``, ascending. Within 2^20 voxels of 0.
+
+    Does in a millisecond what :func:`voxel_downsample` does on the lattice; for scans, in their own frame.
+    """
+    return _thin(np.ascontiguousarray(points, dtype=np.float32), size)
+
+
+@numba.njit(cache=True, nogil=True)
 def _lowest(rows: I64, cols: I64, z: F64, inside: NDArray[np.bool_], out: F64) -> None:
     for i in range(len(z)):
         if inside[i] and z[i] < out[rows[i], cols[i]]:

@@ -89,7 +89,7 @@ class Registration:
 
     T_map_lidar: F64
     covariance: F64
-    """(6, 6) of the left tangent vector (translation first), metres and radians."""
+    """(6, 6) of the pose error (rho, phi) in map axes about the sensor: t' = t + rho, R' = exp(phi) R."""
     score: float
     """Mean NDT likelihood of the points used, in [0, 1]."""
     inlier_share: float
