@@ -65,7 +65,12 @@ class VotingSettings(Section):
     weighted: bool = Field(default=True, description="multiple votes per scan by Eq. (1); false: one vote per scan")
     two_stage: bool = Field(default=True, description="the vehicle decides its cells; false: it sends its tally")
     skip_tall_cells: bool = Field(default=True, description="case 5: no vote where the map begins above the view")
-    occlusion: Occlusion = "first_hit"
+    tall_rule: Literal["bottom", "height"] = Field(
+        default="bottom",
+        description='what case 5 skips: "bottom", cells where the map begins above the view at that range; '
+        '"height", the literal reading: cells where the map reaches higher than the scan\'s points',
+    )
+    occlusion: Occlusion = Field(default="first_hit", description="what counts as seen to be empty (METHOD 2)")
     a: float = 2.0
     b: float = 3.0
     k: float = 0.5

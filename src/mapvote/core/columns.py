@@ -93,6 +93,21 @@ def reference_window(point_map: PointMap, grid: Grid) -> Reference:
     return Reference(grid, ground_z, base, occupied, counts, bottom_z, top_z, free if learned else None)
 
 
+def cut_reference(outer: Reference, window: Grid) -> Reference:
+    """The planes of ``outer`` over ``window``, which lies inside it; views, nothing is copied."""
+    cut = window.slices_in(outer.grid)
+    return Reference(
+        window,
+        outer.ground_z[cut],
+        outer.base[cut],
+        outer.occupied[cut],
+        outer.counts[cut],
+        outer.bottom_z[cut],
+        outer.top_z[cut],
+        None if outer.free is None else outer.free[cut],
+    )
+
+
 def map_points(window: Grid, tile_points: F32) -> F64:
     """A tile's points (n, 3) from its corner to map metres, float64."""
     out = tile_points.astype(np.float64)

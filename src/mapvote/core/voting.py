@@ -51,7 +51,7 @@ def decide(tally: I32) -> U8:
     """
     best = tally.max(axis=-1)
     winners = (tally == best[..., None]).sum(axis=-1)
-    states = tally.argmax(axis=-1).astype(np.uint8)
+    states = np.asarray(tally.argmax(axis=-1), dtype=np.uint8)
     states[winners > 1] = CellState.UNDETERMINED
     states[best <= 0] = NO_VOTE
     return states

@@ -1,0 +1,69 @@
+"""The votes and new points of one drive, kept tile by tile so that memory follows the road, not its length in scans."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from mapvote.core.columns import tile_points
+from mapvote.core.grid import TILE_CELLS, Grid, Lattice, TileIndex, tile_grid, tile_of_cells
+from mapvote.core.points import voxel_keys
+from mapvote.core.types import F32, F64, I32, N_STATES, U8, Bool
+from mapvote.core.voting import cast
+
+_COMPACT_AT = 200_000
+
+
+class Tally:
+    """Votes per cell and class over a drive: :func:`mapvote.core.voting.cast` on the tiles that a window touches."""
+
+    def __init__(self, lattice: Lattice) -> None:
+        self.lattice = lattice
+        self.tiles: dict[TileIndex, I32] = {}
+        """(256, 256, 5) int32 in VOTE_UNITs."""
+
+    def add(self, grid: Grid, states: U8, weights: I32) -> None:
+        """Cast one scan's ``states`` (rows, cols of ``grid``) with ``weights``."""
+        for tile in grid.tiles():
+            window = tile_grid(self.lattice, tile)
+            common = window.intersection(grid)
+            if tile not in self.tiles:
+                self.tiles[tile] = np.zeros((TILE_CELLS, TILE_CELLS, N_STATES), dtype=np.int32)
+            inner, outer = common.slices_in(window), common.slices_in(grid)
+            cast(self.tiles[tile][inner], states[outer], weights[outer])
+
+
+class NewPoints:
+    """One point per 0.3 m voxel, the first that was offered: candidates for changed-occupied cells."""
+
+    def __init__(self, lattice: Lattice) -> None:
+        self.lattice = lattice
+        self._points = np.zeros((0, 3))
+        self._waiting: list[F64] = []
+        self._count = 0
+
+    def offer(self, points_map: F64) -> None:
+        """Points (n, 3), map metres."""
+        if len(points_map):
+            self._waiting.append(points_map)
+            self._count += len(points_map)
+            if self._count > _COMPACT_AT:
+                self._compact()
+
+    def _compact(self) -> None:
+        every = np.concatenate([self._points, *self._waiting])
+        keys = voxel_keys(every, self.lattice.x0, self.lattice.y0)
+        _, first = np.unique(keys, return_index=True)  # sorted by key; the earliest of each
+        self._points, self._waiting, self._count = every[first], [], 0
+
+    def by_tile(self) -> dict[TileIndex, F64]:
+        """Points (m, 3) in map metres of each tile, sorted by voxel key."""
+        self._compact()
+        rows, cols = tile_of_cells(*self.lattice.cells_of(self._points))
+        tiles = sorted({(int(r), int(c)) for r, c in zip(*np.unique([rows, cols], axis=1), strict=True)})
+        return {(r, c): self._points[(rows == r) & (cols == c)] for r, c in tiles}
+
+
+def points_in(window: Grid, points_map: F64, wanted: Bool) -> F32:
+    """Those of ``points_map`` (n, 3) that lie in ``wanted`` (256, 256) cells of a tile, float32 from its corner."""
+    rows, cols, _ = window.indices_of(points_map)
+    return tile_points(window, points_map[wanted[rows, cols]])
