@@ -1,1 +1,5 @@
-"""A street, its traffic and its LiDAR (paper V): the truth comes from here."""
+"""Streets, LiDARs and drives that never existed, with the truth beside them (paper V)."""
+
+from mapvote.simulation.drives import simulate
+
+__all__ = ["simulate"]

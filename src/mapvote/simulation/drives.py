@@ -1,0 +1,180 @@
+"""``simulate``: a scenario and a seed become drive folders, and the truth apart from them (paper V)."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import shutil
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mapvote.core.columns import GROUND_MARGIN_M
+from mapvote.core.grid import CELL_SIZE
+from mapvote.core.sensors import SENSORS, Sensor
+from mapvote.core.types import F64, I32, MapvoteError
+from mapvote.formats.kitti import DriveWriter, write_poses
+from mapvote.simulation.actors import Traffic, make_traffic
+from mapvote.simulation.lidar import Caster, measure, sweep
+from mapvote.simulation.routes import Route, make_routes
+from mapvote.simulation.scenario import Scenario, load_scenario
+from mapvote.simulation.truth import count_hits, ground_cells, truth_grid, write_truth
+from mapvote.simulation.world import Role, World, make_world
+
+_CHUNK = 40
+"""Scans per task: small enough to keep two processes busy to the end."""
+
+Progress = Callable[[int, int], None]
+"""Called with (scans done, scans in all)."""
+
+
+def simulate(
+    scenario: str | Path,
+    out: Path,
+    seed: int = 1,
+    *,
+    progress: Progress | None = None,
+    overrides: Mapping[str, Any] | None = None,
+    workers: int | None = None,
+) -> None:
+    """Write the drive folders ``out``/survey_1.., ``out``/v1.. and ``out``/truth; ``out`` appears whole.
+
+    ``scenario`` is a name (:func:`mapvote.simulation.scenario.names`) or a TOML file, ``overrides`` replace its
+    fields. The bytes written depend on scenario and seed only, not on ``workers`` (default: one process per core
+    for long drives). MapvoteError if ``out`` exists or the scenario is not valid.
+    """
+    out = Path(out)
+    if out.exists():
+        raise MapvoteError(f"{out}: exists already; remove it or choose another folder")
+    spec = load_scenario(scenario, overrides)
+    stage = _stage(spec, seed)
+    partial = out.with_name(f".{out.name}.partial")
+    shutil.rmtree(partial, ignore_errors=True)
+    partial.mkdir(parents=True)
+    try:
+        writers = [_writer(partial, route, stage).open() for route in stage.routes]
+        for route in stage.routes:
+            (partial / "truth" / route.name / "moving").mkdir(parents=True)
+        survey, vehicles = _drive_all(spec, seed, partial, progress, workers)
+        for index, (route, writer) in enumerate(zip(stage.routes, writers, strict=True)):
+            writer.close(route.stamps_ns, route.priors(np.random.default_rng([seed, 4, index])))
+            write_poses(partial / "truth" / route.name / "poses.txt", route.poses(route.time_s))
+        write_truth(partial / "truth", stage.world, list(stage.routes), stage.sensor, spec, survey, vehicles)
+        os.replace(partial, out)
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+
+
+@dataclass(frozen=True)
+class Stage:
+    """Everything that a scenario and a seed decide, the same in every process."""
+
+    scenario: Scenario
+    seed: int
+    sensor: Sensor
+    world: World
+    routes: tuple[Route, ...]
+    ground: F64
+    """(rows, cols) of the scored window."""
+
+
+@lru_cache(maxsize=1)
+def _stage(scenario: Scenario, seed: int) -> Stage:
+    world = make_world(scenario, seed)
+    sensor = replace(SENSORS[scenario.sensor], rate_hz=scenario.rate_hz)
+    routes = tuple(make_routes(scenario, world.terrain, seed))
+    return Stage(scenario, seed, sensor, world, routes, ground_cells(world, truth_grid(scenario)))
+
+
+@lru_cache(maxsize=1)
+def _street(scenario: Scenario, seed: int, drive: int) -> tuple[Caster, Traffic]:
+    """What stands and what moves during one drive."""
+    stage = _stage(scenario, seed)
+    route = stage.routes[drive]
+    still = Caster(*stage.world.mesh(stage.world.standing(route.vehicle)))
+    duration = route.scans / route.rate_hz
+    rng = np.random.default_rng([seed, 5, drive])
+    return still, make_traffic(scenario, stage.world.terrain, route.lane, duration, rng)
+
+
+def _writer(folder: Path, route: Route, stage: Stage) -> DriveWriter:
+    mount = np.eye(4)
+    mount[2, 3] = route.mount_height_m
+    return DriveWriter(
+        folder / route.name,
+        vehicle=route.name,
+        sensor=stage.sensor,
+        start_ns=route.start_ns,
+        prior_sigma_m=route.prior_sigma_m,
+        prior_sigma_deg=route.prior_sigma_deg,
+        T_base_lidar=mount,
+        motion_compensated=not stage.scenario.motion_distortion,
+    )
+
+
+def _drive_all(
+    scenario: Scenario, seed: int, folder: Path, progress: Progress | None, workers: int | None
+) -> tuple[I32, I32]:
+    """Drive every route; (survey, vehicles) counts (roles, rows, cols) of the recorded points that stand still."""
+    routes = _stage(scenario, seed).routes
+    tasks = [
+        (scenario, seed, folder, drive, first, min(first + _CHUNK, route.scans))
+        for drive, route in enumerate(routes)
+        for first in range(0, route.scans, _CHUNK)
+    ]
+    scans = sum(route.scans for route in routes)
+    count = workers or (os.cpu_count() or 1 if scans > 400 else 1)
+    totals = np.zeros((2, len(Role), *truth_grid(scenario).shape), dtype=np.int32)
+    done = 0
+    for task, (where, hits) in zip(tasks, _results(tasks, count), strict=True):
+        totals[0 if routes[task[3]].vehicle is None else 1].ravel()[where] += hits
+        done += task[5] - task[4]
+        if progress:
+            progress(done, scans)
+    return totals[0], totals[1]
+
+
+_Task = tuple[Scenario, int, Path, int, int, int]
+
+
+def _results(tasks: list[_Task], workers: int) -> Iterator[tuple[I32, I32]]:
+    """Results in the order of the tasks, from this process or from spawned ones."""
+    if workers == 1:
+        yield from map(_drive, tasks)
+        return
+    with ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn")) as pool:
+        yield from pool.map(_drive, tasks)
+
+
+def _drive(task: _Task) -> tuple[I32, I32]:
+    """Simulate and write some scans of one drive; (flat index, count) of the hits by role and cell."""
+    scenario, seed, folder, drive, first, last = task
+    stage = _stage(scenario, seed)
+    still, traffic = _street(scenario, seed, drive)
+    route, sensor, roles = stage.routes[drive], stage.sensor, stage.world.roles()
+    writer = _writer(folder, route, stage)
+    counts = np.zeros((len(Role), *stage.ground.shape), dtype=np.int32)
+    for index in range(first, last):
+        rng = np.random.default_rng(np.random.SeedSequence([seed, 6, drive, index]))
+        stamp_s = index / route.rate_hz
+        rays = sweep(sensor, route.poses, stamp_s, rng.uniform(), scenario.motion_distortion)
+        ranges, objects, cosine = still.cast(rays.origins, rays.directions)
+        T_map_lidar = route.poses(np.array([stamp_s]))[0]
+        turning = sensor.rate_hz if scenario.motion_distortion else None
+        bodies = Caster(*traffic.mesh(stamp_s, T_map_lidar, turning, sensor.max_range_m))
+        near, _, body_cosine = bodies.cast(rays.origins, rays.directions)
+        moving = near < ranges
+        ranges, cosine = np.where(moving, near, ranges), np.where(moving, body_cosine, cosine)
+        noisy, kept = measure(sensor, ranges, cosine, rng)
+        writer.write_scan(index, (noisy[:, None] * rays.directions_lidar)[kept], cosine[kept])
+        np.save(folder / "truth" / route.name / "moving" / f"{index:06d}.npy", moving[kept])
+        solid = kept & ~moving
+        points = (rays.origins + ranges[:, None] * rays.directions)[solid]
+        count_hits(points, objects[solid], roles, stage.ground, CELL_SIZE, GROUND_MARGIN_M, counts)
+    where = np.flatnonzero(counts).astype(np.int32)
+    return where, counts.ravel()[where]

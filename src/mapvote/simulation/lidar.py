@@ -1,0 +1,92 @@
+"""A spinning LiDAR on Embree: rays, noise, drop-outs, and motion within the revolution (paper II).
+
+The sensor turns clockwise seen from above. The stamp is the middle of the revolution, when it faces
+forward; the ray at azimuth phi leaves at ``-phi / (2 pi) / rate`` from the stamp.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from embreex.mesh_construction import TriangleMesh
+from embreex.rtcore_scene import EmbreeScene
+
+from mapvote.core.sensors import Sensor
+from mapvote.core.types import F32, F64, I32, Bool
+
+NOTHING = -1
+"""Object id of a ray that meets nothing."""
+_BASE_DROP = 0.008
+_FAINT = 0.035
+
+
+class Caster:
+    """Triangles (n, 3, 3) float32 to shoot at, each owned by an object (n,) int32."""
+
+    def __init__(self, triangles: F32, owners: I32) -> None:
+        self._owners = np.append(owners, np.int32(NOTHING))
+        self._scene = EmbreeScene()
+        if len(triangles):
+            TriangleMesh(self._scene, np.ascontiguousarray(triangles, dtype=np.float32))
+        self._empty = len(triangles) == 0
+
+    def cast(self, origins: F32, directions: F32) -> tuple[F32, I32, F32]:
+        """First hits of rays (n, 3), unit directions: range (n,) (inf if none), object id (n,), |cos of incidence|."""
+        if self._empty:
+            n = len(origins)
+            return np.full(n, np.inf, np.float32), np.full(n, NOTHING, np.int32), np.ones(n, np.float32)
+        hit = self._scene.run(origins, directions, output=1)
+        normals = hit["Ng"]
+        length = np.sqrt(np.einsum("ij,ij->i", normals, normals)) + 1e-12
+        cosine = np.abs(np.einsum("ij,ij->i", normals, directions)) / length
+        missed = hit["primID"] < 0
+        ranges = np.where(missed, np.float32(np.inf), hit["tfar"])
+        return ranges, self._owners[hit["primID"]], cosine.astype(np.float32)
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """The rays of one revolution in firing order."""
+
+    origins: F32
+    """(rays, 3) map frame."""
+    directions: F32
+    """(rays, 3) unit, map frame."""
+    directions_lidar: F32
+    """(rays, 3) unit, in the sensor's frame at the moment of firing."""
+
+
+def sweep(
+    sensor: Sensor, T_map_lidar_at: Callable[[F64], F64], stamp_s: float, phase: float, distortion: bool
+) -> Sweep:
+    """Rays of the revolution whose middle is ``stamp_s``; ``T_map_lidar_at`` takes (n,) seconds to (n, 4, 4).
+
+    ``phase`` in [0, 1) turns the firing pattern by a share of the azimuth step, as it drifts from scan to scan.
+    Without ``distortion`` all rays leave from the pose at the stamp.
+    """
+    step = 2.0 * np.pi / sensor.azimuths
+    azimuth = np.pi - (np.arange(sensor.azimuths) + 1.0 - phase) * step
+    elevation = np.radians(np.array(sensor.elevations_deg))
+    local = np.empty((sensor.azimuths, sensor.beams, 3), dtype=np.float32)
+    local[..., 0] = np.outer(np.cos(azimuth), np.cos(elevation))
+    local[..., 1] = np.outer(np.sin(azimuth), np.cos(elevation))
+    local[..., 2] = np.sin(elevation)
+    turning_s = -azimuth / (2.0 * np.pi) / sensor.rate_hz
+    T = T_map_lidar_at(stamp_s + (turning_s if distortion else np.zeros(1)))
+    rotation = np.ascontiguousarray(np.swapaxes(T[:, :3, :3], 1, 2), dtype=np.float32)
+    directions = np.matmul(local, rotation)
+    origins = np.broadcast_to(T[:, None, :3, 3].astype(np.float32), local.shape)
+    return Sweep(np.ascontiguousarray(origins).reshape(-1, 3), directions.reshape(-1, 3), local.reshape(-1, 3))
+
+
+def measure(sensor: Sensor, ranges: F32, cosine: F32, rng: np.random.Generator) -> tuple[F32, Bool]:
+    """Noisy ranges (n,) and which rays give a point: in range, not too faint, not dropped by chance."""
+    n = len(ranges)
+    noisy = ranges + np.float32(sensor.range_sigma_m) * rng.standard_normal(n, dtype=np.float32)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        strength = cosine * (sensor.max_range_m / np.maximum(ranges, 5.0)) ** 2
+        chance = _BASE_DROP + np.exp(-strength / _FAINT)
+    kept = rng.random(n, dtype=np.float32) >= chance
+    return noisy, kept & (noisy > sensor.min_range_m) & (ranges < sensor.max_range_m)

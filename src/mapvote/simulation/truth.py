@@ -1,0 +1,196 @@
+"""What really changed, from the simulator alone (METHOD 3): two definitions, cell by cell.
+
+**strict** comes from a noise-free survey: dense rays from the true poses of all drives, into the street
+before and the street after. A cell gained if a built body's surface lies in it where nothing was before, and
+lost if a demolished body's did where nothing is now. **provenance** comes from the object ids of the points that
+the drives recorded: lost, if most survey points in the cell fell on removed bodies; gained, if it has at least
+:data:`SUPPORT` points of new surface (fewer: unscored, and counted).
+
+In both, a cell whose only surface is old but was never seen by the surveys is unscored: it is no change of the
+world, and the map cannot know it. So are cells of cars that some passes met and others did not, where a majority
+of passes contradicts the survey. Points less than 0.3 m above the ground count for nothing.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numba
+import numpy as np
+from scipy.spatial import ConvexHull
+
+from mapvote.core.columns import GROUND_MARGIN_M
+from mapvote.core.grid import CELL_SIZE, Grid, Lattice
+from mapvote.core.points import voxel_downsample
+from mapvote.core.sensors import Sensor
+from mapvote.core.types import F32, F64, I32, U8
+from mapvote.simulation.lidar import NOTHING, Caster
+from mapvote.simulation.routes import Route
+from mapvote.simulation.scenario import Scenario
+from mapvote.simulation.shapes import sample
+from mapvote.simulation.world import Role, World
+
+UNCHANGED, CHANGED_OCCUPIED, CHANGED_EMPTY, UNSCORED = 0, 1, 2, 255
+SUPPORT = 20
+"""Points, pooled over the drives at 10 Hz, that make a surface well supported (in proportion at other rates)."""
+_STEP_M = 1.5
+_REACH_M = 50.0
+_AZIMUTH_STEP_DEG = 0.3
+
+
+def truth_grid(scenario: Scenario) -> Grid:
+    """The scored window: the road in its middle, lower-left corner at map (0, 0)."""
+    return Grid(Lattice(), 0, 0, round(scenario.width_m / CELL_SIZE), round(scenario.length_m / CELL_SIZE))
+
+
+def ground_cells(world: World, grid: Grid) -> F64:
+    """(rows, cols) height of the ground at the cells' centres."""
+    x, y = grid.centres()
+    return world.terrain.height(x[None, :], y[:, None])
+
+
+@numba.njit(cache=True, nogil=True)
+def count_hits(points: F32, objects: I32, roles: I32, ground: F64, size: float, margin: float, counts: I32) -> None:
+    """Add points (n, 3) in the grid's own frame to ``counts`` (roles, rows, cols) by the role of the object hit."""
+    for i in range(len(points)):
+        if objects[i] <= 0:  # the ground, or nothing
+            continue
+        c, r = int(np.floor(points[i, 0] / size)), int(np.floor(points[i, 1] / size))
+        if r < 0 or c < 0 or r >= ground.shape[0] or c >= ground.shape[1]:
+            continue
+        if points[i, 2] - ground[r, c] >= margin:
+            counts[roles[objects[i]], r, c] += 1
+
+
+def dense_survey(world: World, routes: list[Route], sensor: Sensor, grid: Grid) -> tuple[I32, I32, F32, U8]:
+    """Counts of noise-free hits (roles, rows, cols) before and after, and surface samples (m, 3) with their role.
+
+    Only rays towards bodies that changed are cast: elsewhere nothing could change.
+    """
+    roles, ground = world.roles(), ground_cells(world, grid)
+    changed = [i for i, role in enumerate(roles) if role in (Role.ADDED, Role.REMOVED)]
+    circles = np.array([_circle(world.bodies[i].triangles) for i in changed]).reshape(-1, 3)
+    counts, samples, labels = [], [], []
+    for gone in (Role.ADDED, Role.REMOVED):
+        hits = np.zeros((len(Role), *grid.shape), dtype=np.int32)
+        ids = [i for i, role in enumerate(roles) if role in (Role.KEPT, Role.ADDED, Role.REMOVED) and role != gone]
+        caster = Caster(*world.mesh(ids))
+        found = []
+        for route in routes:
+            for T in route.poses(np.arange(0.0, route.length / route.speed, _STEP_M / route.speed)):
+                directions = _towards(T, circles, sensor)
+                if not len(directions):
+                    continue
+                origins = np.broadcast_to(T[:3, 3].astype(np.float32), directions.shape)
+                ranges, objects, _ = caster.cast(np.ascontiguousarray(origins), directions)
+                met = objects != NOTHING
+                points, objects = (origins + ranges[:, None] * directions)[met], objects[met]
+                count_hits(points, objects, roles, ground, CELL_SIZE, GROUND_MARGIN_M, hits)
+                found.append(points[np.isin(objects, changed)])
+        cloud = np.concatenate(found) if found else np.zeros((0, 3), np.float32)
+        samples.append(cloud[voxel_downsample(cloud, 0.1)])
+        labels.append(np.full(len(samples[-1]), Role.REMOVED if gone == Role.ADDED else Role.ADDED, dtype=np.uint8))
+        counts.append(hits)
+    return counts[0], counts[1], np.concatenate(samples), np.concatenate(labels)
+
+
+def _circle(triangles: F64) -> tuple[float, float, float]:
+    low, high = triangles.min(axis=(0, 1)), triangles.max(axis=(0, 1))
+    middle = 0.5 * (low + high)
+    return float(middle[0]), float(middle[1]), float(0.5 * np.hypot(*(high - low)[:2])) + 0.3
+
+
+def _towards(T_map_lidar: F64, circles: F64, sensor: Sensor) -> F32:
+    """(n, 3) unit directions in the map frame, at twice the sensor's vertical resolution, that may meet a circle."""
+    offset = circles[:, :2] - T_map_lidar[:2, 3]
+    distance = np.hypot(offset[:, 0], offset[:, 1])
+    near = distance - circles[:, 2] < _REACH_M
+    azimuth = np.radians(np.arange(-180.0, 180.0, _AZIMUTH_STEP_DEG))
+    wanted = np.zeros(len(azimuth), dtype=bool)
+    for (dx, dy), d, radius in zip(offset[near], distance[near], circles[near, 2], strict=True):
+        half = np.pi if d <= radius else np.arcsin(radius / d)
+        turn = azimuth - np.arctan2(dy, dx)
+        wanted |= np.abs((turn + np.pi) % (2 * np.pi) - np.pi) <= half
+    azimuth = azimuth[wanted] - np.arctan2(T_map_lidar[1, 0], T_map_lidar[0, 0])
+    elevation = np.radians(np.linspace(sensor.fov_bottom_deg, sensor.fov_top_deg, 2 * sensor.beams - 1))
+    local = np.empty((len(azimuth), len(elevation), 3))
+    local[..., 0] = np.outer(np.cos(azimuth), np.cos(elevation))
+    local[..., 1] = np.outer(np.sin(azimuth), np.cos(elevation))
+    local[..., 2] = np.sin(elevation)
+    return (local.reshape(-1, 3) @ T_map_lidar[:3, :3].T).astype(np.float32)
+
+
+def judge(before: I32, after: I32, survey: I32, vehicles: I32, rate_hz: float) -> tuple[U8, U8, dict[str, int]]:
+    """(strict, provenance, numbers of unscored cells by reason).
+
+    All inputs (roles, rows, cols) counts: noise-free hits before and after, points recorded by surveys and vehicles.
+    """
+    support = max(1, round(SUPPORT * rate_hz / 10.0))
+    mapped = survey[[Role.KEPT, Role.REMOVED]].sum(axis=0) > 0
+    old_unseen = ((vehicles[Role.KEPT] > 0) | (after[Role.KEPT] > 0)) & ~mapped
+    unclear = (survey[Role.UNCLEAR] > 0) | (vehicles[Role.UNCLEAR] > 0)
+
+    empty_now = (after[Role.KEPT] == 0) & (after[Role.ADDED] == 0) & (vehicles[Role.KEPT] == 0)
+    lost = (before[Role.REMOVED] > 0) & (before[Role.KEPT] == 0) & (survey[Role.KEPT] == 0) & empty_now
+    gained = (after[Role.ADDED] > 0) & (before[[Role.KEPT, Role.REMOVED]].sum(axis=0) == 0) & ~mapped & ~old_unseen
+    never_mapped = lost & ~mapped
+    strict = np.full(lost.shape, UNCHANGED, dtype=np.uint8)
+    strict[gained] = CHANGED_OCCUPIED
+    strict[lost] = CHANGED_EMPTY
+    strict[old_unseen | unclear | never_mapped] = UNSCORED
+
+    empty_now = (vehicles[Role.KEPT] == 0) & (vehicles[Role.ADDED] < support)
+    lost = (survey[Role.REMOVED] > survey[Role.KEPT]) & empty_now
+    gained = (vehicles[Role.ADDED] > 0) & ~mapped & (vehicles[Role.KEPT] == 0)
+    weak = (lost & (survey[Role.REMOVED] < support)) | (gained & (vehicles[Role.ADDED] < support))
+    provenance = np.full(lost.shape, UNCHANGED, dtype=np.uint8)
+    provenance[gained] = CHANGED_OCCUPIED
+    provenance[lost] = CHANGED_EMPTY
+    provenance[old_unseen | unclear | weak] = UNSCORED
+    reasons = {
+        "old_surface_never_surveyed": int(old_unseen.sum()),
+        "cars_of_some_passes": int(unclear.sum()),
+        "removed_but_never_surveyed": int(never_mapped.sum()),
+        "weakly_supported": int(weak.sum()),
+    }
+    return strict, provenance, reasons
+
+
+def write_truth(
+    folder: Path, world: World, routes: list[Route], sensor: Sensor, scenario: Scenario, survey: I32, vehicles: I32
+) -> None:
+    """truth.npz, surface.npz and objects.json into ``folder``."""
+    grid = truth_grid(scenario)
+    before, after, points, labels = dense_survey(world, routes, sensor, grid)
+    strict, provenance, unscored = judge(before, after, survey, vehicles, scenario.rate_hz)
+    np.savez_compressed(
+        folder / "truth.npz", strict=strict, provenance=provenance, x0=grid.x0, y0=grid.y0, cell_size=CELL_SIZE
+    )
+    rng = np.random.default_rng(0)
+    kept = [b.triangles for i, b in enumerate(world.bodies) if b.role == Role.KEPT and i > 0]
+    old = sample(np.concatenate(kept), 0.2, rng).astype(np.float32)
+    x, y, _ = old.T
+    old = old[(x > -20) & (x < scenario.length_m + 20) & (y > -20) & (y < scenario.width_m + 20)]
+    np.savez_compressed(
+        folder / "surface.npz",
+        points=np.concatenate([old, points]),
+        label=np.concatenate([np.full(len(old), Role.KEPT, dtype=np.uint8), labels]),
+    )
+    objects = [_describe(i, world) for i, b in enumerate(world.bodies) if b.role in (Role.ADDED, Role.REMOVED)]
+    summary = {"scenario": scenario.name, "cells": strict.size, "unscored": unscored, "objects": objects}
+    (folder / "objects.json").write_text(json.dumps(summary, indent=1) + "\n")
+
+
+def _describe(index: int, world: World) -> dict[str, object]:
+    body = world.bodies[index]
+    corners = body.triangles.reshape(-1, 3)
+    hull = corners[ConvexHull(corners[:, :2]).vertices, :2]
+    ground = float(world.terrain.height(*hull.mean(axis=0)))
+    return {
+        "id": index,
+        "what": body.kind,
+        "kind": "built" if body.role == Role.ADDED else "demolished",
+        "footprint": hull.round(3).tolist(),
+        "height_m": round(float(corners[:, 2].max()) - ground, 3),
+    }
