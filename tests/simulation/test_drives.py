@@ -7,9 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
-from mapvote.core.geometry import transform
-from mapvote.core.types import MapvoteError
+from mapvote.core.geometry import inverse, log, transform
+from mapvote.core.types import F64, MapvoteError
 from mapvote.simulation import simulate
 
 FEW = {"length_m": 30.0, "speed_kmh": 90.0, "vehicles": 2, "changes": []}
@@ -36,21 +37,43 @@ def test_every_drive_has_scans_times_priors_and_true_poses(corner: Path) -> None
         assert 60_000 < len(moving) < 72_000, "about 70,000 points a scan (paper II)"
 
 
-def test_the_points_of_a_built_building_lie_on_its_surface(corner: Path) -> None:
-    surface = np.load(corner / "truth" / "surface.npz")
-    added = surface["points"][surface["label"] == 1]
-    poses = np.loadtxt(corner / "truth" / "v1" / "poses.txt").reshape(-1, 3, 4)
-    cells = {tuple(c) for c in np.floor(added[:, :2] / 0.3).astype(int)}
+def deskewed(root: Path, drive: str, index: int) -> F64:
+    """(n, 3) map points of a scan, each moved from where the sensor was when it measured (constant twist)."""
+    points = np.fromfile(root / drive / f"velodyne/{index:06d}.bin", "<f4").reshape(-1, 4)[:, :3].astype(float)
+    time_s = -np.arctan2(points[:, 1], points[:, 0]) / (2 * np.pi) / 10.0
+    poses = np.loadtxt(root / "truth" / drive / "poses.txt").reshape(-1, 3, 4)
+    twist = log(inverse(square(poses[index - 1])) @ square(poses[index + 1])) / 0.2
+    points += time_s[:, None] * (twist[:3] + np.cross(twist[3:], points))
+    return transform(square(poses[index]), points)
+
+
+def square(T: F64) -> F64:
+    return np.vstack([T, [0, 0, 0, 1]])
+
+
+def test_only_vehicles_meet_what_was_built_after_the_survey(corner: Path) -> None:
+    gained = np.load(corner / "truth" / "truth.npz")["strict"] == 1
     hits = {"survey_1": 0, "v1": 0}
     for name in hits:
-        poses = np.loadtxt(corner / "truth" / name / "poses.txt").reshape(-1, 3, 4)
-        for i in range(0, 33, 8):
-            points = np.fromfile(corner / name / f"velodyne/{i:06d}.bin", "<f4").reshape(-1, 4)[:, :3]
-            T = np.vstack([poses[i], [0, 0, 0, 1]])
-            here = transform(T, points)
-            high = here[here[:, 2] > added[:, 2].min() + 1.0]
-            hits[name] += sum(tuple(c) in cells for c in np.floor(high[:, :2] / 0.3).astype(int))
-    assert hits["v1"] > 20 * max(hits["survey_1"], 1), "only vehicles meet what was built after the survey"
+        for i in range(1, 32, 8):
+            here = deskewed(corner, name, i)
+            cells = np.floor(here[here[:, 2] > 1.0, :2] / 0.3).astype(int)
+            cells = cells[((cells >= 0) & (cells < (120, 200))).all(axis=1)]
+            hits[name] += int(gained[cells[:, 1], cells[:, 0]].sum())
+    assert hits["v1"] > 5000
+    assert hits["survey_1"] < 0.005 * hits["v1"]
+
+
+def test_the_sensor_moves_while_it_turns(corner: Path) -> None:
+    surface = np.load(corner / "truth" / "surface.npz")
+    tree = cKDTree(surface["points"][surface["label"] != 2])
+    still = ~np.load(corner / "truth" / "v2" / "moving" / "000015.npy")
+    clean = deskewed(corner, "v2", 15)
+    raw = np.fromfile(corner / "v2/velodyne/000015.bin", "<f4").reshape(-1, 4)[:, :3]
+    skewed = transform(square(np.loadtxt(corner / "truth" / "v2" / "poses.txt").reshape(-1, 3, 4)[15]), raw)
+    high = still & (clean[:, 2] > 1.0) & (abs(clean[:, 0] - 18) < 25) & (abs(clean[:, 1] - 30) < 25)
+    assert np.quantile(tree.query(clean[high])[0], 0.95) < 0.25
+    assert np.quantile(tree.query(skewed[high])[0], 0.95) > 0.3
 
 
 def test_truth_names_what_was_built_and_demolished(corner: Path) -> None:
@@ -86,8 +109,8 @@ def test_bad_scenarios_say_what_is_wrong(tmp_path: Path) -> None:
         simulate("corner", tmp_path / "x", overrides={"trafic": {}})
     with pytest.raises(MapvoteError, match="choose one of"):
         simulate("cornr", tmp_path / "x")
+    crowded = [{"kind": "built", "side": "north", "from_m": 5, "to_m": 25, "count": 9}]
     with pytest.raises(MapvoteError, match="do not fit"):
-        crowded = [{"kind": "built", "side": "north", "from_m": 5, "to_m": 25, "count": 9}]
         simulate("corner", tmp_path / "x", overrides={"changes": crowded})
     assert list(tmp_path.iterdir()) == [], "nothing half-written"
     (tmp_path / "old").mkdir()

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import typer
 
+from mapvote.cli import science
+
 
 def register(app: typer.Typer) -> None:
     """Add every verb to ``app``. Modules import nothing heavy at their top."""
+    science.register(app)

@@ -73,8 +73,10 @@ def sweep(
     local[..., 0] = np.outer(np.cos(azimuth), np.cos(elevation))
     local[..., 1] = np.outer(np.sin(azimuth), np.cos(elevation))
     local[..., 2] = np.sin(elevation)
-    turning_s = -azimuth / (2.0 * np.pi) / sensor.rate_hz
-    T = T_map_lidar_at(stamp_s + (turning_s if distortion else np.zeros(1)))
+    time_s: F64 = np.zeros(1)
+    if distortion:
+        time_s = -azimuth / (2.0 * np.pi) / sensor.rate_hz
+    T = T_map_lidar_at(stamp_s + time_s)
     rotation = np.ascontiguousarray(np.swapaxes(T[:, :3, :3], 1, 2), dtype=np.float32)
     directions = np.matmul(local, rotation)
     origins = np.broadcast_to(T[:, None, :3, 3].astype(np.float32), local.shape)
