@@ -22,7 +22,11 @@ FANS = 2048
 """Fans in a turn (0.18 deg, a firing or two): two cross every cell at 40 m. A fan's direction is its rays' mean."""
 CLEARANCE_M = 0.45
 """A ray proves emptiness only up to here before its own hit: half a voxel's diagonal, range noise and pose error."""
+FULL_RANGE_M = 25.0
+"""Nearer than this every second fan suffices for two to a cell, nearer than half of it every fourth, and so on."""
 INFINITY = np.float32(np.inf)
+_RANGE_STEP_M = 0.25
+_RANGE_STEPS = 512
 
 
 class Sight(IntEnum):
@@ -127,6 +131,7 @@ def _gather(
     n = len(points)
     fan = np.empty(n, np.int32)
     reach = np.empty(n, np.float32)
+    nearer = np.zeros(_RANGE_STEPS + 1, np.int32)  # how many rays end at or beyond each range step, to sort by range
     start = np.zeros(FANS + 1, np.int32)
     direction = np.zeros((FANS, 2))
     nearest = np.full(FANS, INFINITY, np.float32)
@@ -134,12 +139,13 @@ def _gather(
     for i in range(n):
         dx, dy = points[i, 0] - origin[0], points[i, 1] - origin[1]
         h = np.sqrt(dx * dx + dy * dy)
+        reach[i] = h
+        nearer[_RANGE_STEPS - 1 - min(int(h / _RANGE_STEP_M), _RANGE_STEPS - 1) + 1] += 1
         if h < CELL_SIZE:
             fan[i] = -1
             continue
         f = _fan_of(dx, dy)
         fan[i] = f
-        reach[i] = h
         start[f + 1] += 1
         direction[f, 0] += dx / h
         direction[f, 1] += dy / h
@@ -153,17 +159,24 @@ def _gather(
         if norm > 0.0:
             direction[f, 0] /= norm
             direction[f, 1] /= norm
+    for k in range(_RANGE_STEPS):
+        nearer[k + 1] += nearer[k]
+    order = np.empty(n, np.int32)
+    for i in range(n):
+        k = _RANGE_STEPS - 1 - min(int(reach[i] / _RANGE_STEP_M), _RANGE_STEPS - 1)
+        order[nearer[k]] = i
+        nearer[k] += 1
     slope = np.empty(start[FANS], np.float32)
     stop = np.empty(start[FANS], np.float32)
     filled = start[:FANS].copy()
-    for i in range(n):
+    for i in order:
         if fan[i] < 0:
             continue
         h = reach[i]
         rise = np.float32((points[i, 2] - origin[2]) / (CELL_SIZE * h))
         end = np.float32(h - clearance / np.sqrt(1.0 + (CELL_SIZE * rise) ** 2))
         k = filled[fan[i]]
-        while k > start[fan[i]] and stop[k - 1] < end:  # insertion: a fan has a few dozen rays
+        while k > start[fan[i]] and stop[k - 1] < end:  # nearly in order: they come by range
             stop[k] = stop[k - 1]
             slope[k] = slope[k - 1]
             k -= 1
@@ -212,6 +225,10 @@ def _walk(
         width_c = far if dx == 0.0 else CELL_SIZE / abs(dx)
         width_r = far if dy == 0.0 else CELL_SIZE / abs(dy)
         t0 = 0.0
+        marks_from, turn = FULL_RANGE_M, f
+        while turn % 2 == 0 and marks_from > CELL_SIZE:
+            marks_from, turn = 0.5 * marks_from, turn // 2
+        marks_from = 0.0 if marks_from <= CELL_SIZE else marks_from
         while 0 <= r < rows and 0 <= c < cols:
             t1 = min(next_c, next_r)
             level = 1 if t0 > farthest[f] else (2 if t0 > nearest[f] else 3)
@@ -219,7 +236,7 @@ def _walk(
                 sight[r, c] = level
             while active > 0 and fan_stop[active - 1] <= t0:
                 active -= 1
-            if active > 0:
+            if active > 0 and t1 > marks_from:
                 passed[r, c] |= _voxels_between(
                     fan_slope, fan_stop, active, height, np.float32(t0), np.float32(t1), base[r, c] - layer
                 )
