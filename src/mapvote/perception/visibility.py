@@ -169,7 +169,8 @@ def _gather(
     slope = np.empty(start[FANS], np.float32)
     stop = np.empty(start[FANS], np.float32)
     filled = start[:FANS].copy()
-    for i in order:
+    for at in range(n):
+        i = int(order[at])
         if fan[i] < 0:
             continue
         h = reach[i]
