@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import typer
 
-from mapvote.cli import science
+from mapvote.cli import files, science
 
 
 def register(app: typer.Typer) -> None:
     """Add every verb to ``app``. Modules import nothing heavy at their top."""
     science.register(app)
+    files.register(app)
