@@ -50,7 +50,9 @@ class NdtSettings(Section):
 class MovingSettings(Section):
     """perception/moving.py ([9])."""
 
-    past_s: float = Field(default=2.0, gt=0, description="how far back a scan may be asked whether it saw through a voxel")
+    past_s: float = Field(
+        default=2.0, gt=0, description="how far back a scan may be asked whether it saw through a voxel"
+    )
     lookahead_s: float = Field(default=1.0, ge=0, le=1.0, description="how late a scan is decided")
     looks_past: int = Field(default=8, ge=1, description="scans asked before")
     looks_ahead: int = Field(default=5, ge=0, description="scans asked after")
@@ -58,6 +60,7 @@ class MovingSettings(Section):
     pixel_deg: float = Field(default=0.3, gt=0, description="direction pixel of the free-space look-up")
     tilt_deg: float = Field(default=4.0, ge=0, description="pitch and roll of the vehicle to allow for")
     margin_m: float = Field(default=0.4, gt=0, description="a ray that ends this far behind a voxel saw through it")
+    height_m: float = Field(default=0.12, gt=0, description="rays this far above and below a voxel bear witness to it")
     min_free: int = Field(default=2, ge=1, description="scans that saw through a voxel before it can be called brief")
     free_share: float = Field(default=0.5, description="share of the scans able to see a voxel that saw through it")
     min_voxels: int = Field(default=3, ge=1, description="brief voxels a moving object has at least")

@@ -6,9 +6,10 @@ from the other scans of a short window; those that saw through it (free) are wei
 those that saw something in it (hit), and those that could not see it do not count. Structure that has only
 just come into view was never seen through, so it is not called moving.
 
-Whether a scan saw through a voxel is one look-up in that scan's range image, which keeps per
-direction the *nearest* return around it: a voxel counts as free only if every ray past it, to all sides, went on behind it.
-Thin things, edges and foliage thus stay. It needs no map, only poses, so it serves SLAM and voting alike.
+Whether a scan saw through a voxel is one look-up in that scan's range image. The voxel is free only if every ray
+close to it, to all sides, went on behind it, so thin things, edges and foliage stay; and only if, over the window,
+rays went through both just below and just above the place, because a ray over a roof says nothing about the roof.
+It needs no map, only poses, so it serves SLAM and voting alike.
 
 Online: a scan is decided after at most ``lookahead_s`` (1 s), because what a vehicle ahead of
 us hides is seen through only once it has driven on. Nothing older than ``past_s`` is used or kept.
@@ -68,7 +69,7 @@ def _turn(x: float, y: float) -> float:
 
 @numba.njit(cache=True, nogil=True)
 def _range_image(points: F64, origin: F64, turns: int, slopes: int, slope_min: float, slope_step: float) -> F32:
-    """(turns, slopes) nearest horizontal range among all returns in each 3 x 3 neighbourhood of directions."""
+    """(turns, slopes) nearest horizontal range among the returns in each direction and to its left and right."""
     raw = np.full((turns, slopes), NOTHING, dtype=np.float32)
     for i in range(len(points)):
         x, y, z = points[i, 0] - origin[0], points[i, 1] - origin[1], points[i, 2] - origin[2]
@@ -81,21 +82,17 @@ def _range_image(points: F64, origin: F64, turns: int, slopes: int, slope_min: f
         a = int(_turn(x, y) * turns) % turns
         if rho < raw[a, b]:
             raw[a, b] = rho
-    across = raw.copy()
+    out = np.empty_like(raw)
     for a in range(turns):
         left, right = (a - 1) % turns, (a + 1) % turns
         for b in range(slopes):
-            across[a, b] = min(raw[a, b], min(raw[left, b], raw[right, b]))
-    out = across.copy()
-    for a in range(turns):
-        for b in range(1, slopes - 1):
-            out[a, b] = min(across[a, b], min(across[a, b - 1], across[a, b + 1]))
+            out[a, b] = min(raw[a, b], min(raw[left, b], raw[right, b]))
     return out
 
 
 @numba.njit(cache=True, nogil=True)
 def _voxels(points: F64, obstacle: Bool, origin: F64, reach: float, cell: float) -> tuple[I32, I64, I32]:
-    """(voxel_of (n,), first point of each voxel (m,), points in each voxel (m,)), voxels in order of their first point."""
+    """(voxel_of (n,), first point of each voxel (m,), points in each voxel (m,)), in order of first points."""
     n = len(points)
     size = 1024
     while size < 2 * n:
@@ -129,9 +126,22 @@ def _voxels(points: F64, obstacle: Bool, origin: F64, reach: float, cell: float)
 
 @numba.njit(cache=True, nogil=True)
 def _look(
-    samples: F64, nearest: F32, origin: F64, slope_min: float, slope_step: float, margin: float, free: I32, hit: I32
+    samples: F64,
+    nearest: F32,
+    origin: F64,
+    slope_min: float,
+    slope_step: float,
+    margin: float,
+    height: float,
+    free: I32,
+    hit: I32,
+    sides: NDArray[np.uint8],
 ) -> None:
-    """Ask one scan about each sample: did it see through it, did it hit it, or neither? Counts go up in place."""
+    """Ask one scan about each sample: did it see through it, did it hit it, or neither? Counts go up in place.
+
+    Rays within ``height`` above and below the sample bear witness. ``sides`` keeps whether a ray went through
+    below (1) and above (2): a ray that only ever passes over a roof proves nothing about the roof.
+    """
     turns, slopes = nearest.shape
     for i in range(len(samples)):
         x, y, z = samples[i, 0] - origin[0], samples[i, 1] - origin[1], samples[i, 2] - origin[2]
@@ -139,13 +149,24 @@ def _look(
         if rho < 0.5 or z / rho < slope_min:
             continue
         b = int((z / rho - slope_min) / slope_step)
-        if b >= slopes:
+        around = min(max(int(height / (rho * slope_step)), 2), 8)
+        if b < around or b + around >= slopes:
             continue
-        r = nearest[int(_turn(x, y) * turns) % turns, b]
+        a = int(_turn(x, y) * turns) % turns
+        below, above = NOTHING, NOTHING
+        for k in range(b - around, b):
+            below = min(below, nearest[a, k])
+        for k in range(b + 1, b + around + 1):
+            above = min(above, nearest[a, k])
+        r = min(nearest[a, b], min(below, above))
         if np.isinf(r) or r < rho - margin:
             continue
         if r > rho + margin:
             free[i] += 1
+            if not np.isinf(below):
+                sides[i] |= 1
+            if not np.isinf(above):
+                sides[i] |= 2
         else:
             hit[i] += 1
 
@@ -254,7 +275,7 @@ class MovingFilter:
         self._slope_min = float(np.tan(np.radians(max(sensor.fov_bottom_deg - tilt, -60.0))))
         slope_max = float(np.tan(np.radians(min(sensor.fov_top_deg + tilt, 60.0))))
         self._turns = round(360.0 / max(2.0 * sensor.azimuth_step_deg, settings.pixel_deg))
-        self._slope_step = float(np.tan(np.radians(settings.pixel_deg)))
+        self._slope_step = float(np.tan(np.radians(0.5 * settings.pixel_deg)))
         self._slopes = int(np.ceil((slope_max - self._slope_min) / self._slope_step))
         self._window: deque[_Scan] = deque()
         self._pushed = 0
@@ -300,10 +321,22 @@ class MovingFilter:
         s, scan = self.settings, self._window[at]
         free = np.zeros(len(scan.samples), dtype=np.int32)
         hit = np.zeros(len(scan.samples), dtype=np.int32)
+        sides = np.zeros(len(scan.samples), dtype=np.uint8)
         for other in self._witnesses(at):
-            _look(scan.samples, other.nearest, other.origin_map, self._slope_min, self._slope_step, s.margin_m, free, hit)
+            _look(
+                scan.samples,
+                other.nearest,
+                other.origin_map,
+                self._slope_min,
+                self._slope_step,
+                s.margin_m,
+                s.height_m,
+                free,
+                hit,
+                sides,
+            )
         seen = free + hit >= s.min_free
-        brief = (free >= s.min_free) & (free >= s.free_share * (free + hit))
+        brief = (sides == 3) & (free >= s.min_free) & (free >= s.free_share * (free + hit))
         half = int(np.ceil(s.reach_m / CELL_SIZE)) + 2
         cells = np.floor(scan.samples[:, :2] / CELL_SIZE).astype(np.int64)
         cells -= np.floor(scan.origin_map[:2] / CELL_SIZE).astype(np.int64) - half
