@@ -45,6 +45,13 @@ class NdtSettings(Section):
     recentre_m: float = Field(default=24.0, description="the window moves when the vehicle is this far off its middle")
     min_points: int = Field(default=3, description="a voxel with fewer points has no distribution")
     covariance_scale: float = Field(default=5.0, description="what neighbouring residuals have in common, calibrated")
+    min_inlier_share: float = Field(default=0.6, description="below it the vehicle abstains")
+    max_sigma_m: float = Field(default=0.15, description="abstain when the pose is less certain than this")
+    prior_gate: float = Field(default=5.0, description="abstain this many sigma from the prior (plus gate_m)")
+    gate_m: float = Field(default=1.0, description="slack of that gate, for errors the sigma does not cover")
+    acceleration_mps2: float = Field(default=3.0, description="how fast a prediction by constant velocity goes stale")
+    hypothesis_step_m: float = Field(default=1.0, description="spacing of the guesses when the vehicle is lost")
+    hypothesis_reach_m: float = Field(default=10.0, description="farthest guess from the seed")
 
 
 class MovingSettings(Section):
