@@ -45,6 +45,8 @@ class NdtSettings(Section):
     recentre_m: float = Field(default=24.0, description="the window moves when the vehicle is this far off its middle")
     min_points: int = Field(default=3, description="a voxel with fewer points has no distribution")
     covariance_scale: float = Field(default=5.0, description="what neighbouring residuals have in common, calibrated")
+    map_sigma_m: float = Field(default=0.01, description="what the map itself is off by around a scan, position")
+    map_sigma_deg: float = Field(default=0.03, description="the same, rotation")
     min_inlier_share: float = Field(default=0.6, description="below it the vehicle abstains")
     max_sigma_m: float = Field(default=0.15, description="abstain when the pose is less certain than this")
     prior_gate: float = Field(default=5.0, description="abstain this many sigma from the prior (plus gate_m)")
@@ -77,6 +79,10 @@ class MovingSettings(Section):
 
 class MappingSettings(Section):
     """mapping.py: NDT SLAM."""
+
+    ndt_points_m: float = Field(default=0.3, description="scans enter the NDT map thinned to one point per such voxel")
+    min_inlier_share: float = Field(default=0.4, description="as ndt.min_inlier_share, while the map is still growing")
+    precise_prior_m: float = Field(default=0.1, description="a prior at least this good holds the map's frame")
 
 
 Occlusion = Literal["first_hit", "farthest_return", "column"]
