@@ -85,10 +85,11 @@ def make_traffic(
 
 
 def _lanes(scenario: Scenario, terrain: Terrain, own_lane: str, clock: F64, rng: np.random.Generator) -> list[Track]:
-    """Each lane flows at one speed, so nobody runs into anybody; the vehicle's own lane keeps a gap for it."""
+    """Each lane flows at one speed of its own, so nobody runs into anybody; the vehicle's lane keeps a gap for it."""
     tracks = []
     for name, (direction, offset) in LANES.items():
-        speed = scenario.speed_kmh / 3.6 * (1.0 if name == own_lane else rng.uniform(0.75, 1.2))
+        factor = 1.0 + rng.choice([-1.0, 1.0]) * rng.uniform(0.08, 0.25)  # nobody stays alongside for the whole drive
+        speed = scenario.speed_kmh / 3.6 * (1.0 if name == own_lane else factor)
         entry = 0.0 if direction > 0 else scenario.length_m
         turns = scenario.crossing_m is not None and "outer" in name and name != own_lane
         for ahead in _spots(scenario.traffic.car_spacing_m, 11.0, speed * clock[-1], scenario.length_m, rng):

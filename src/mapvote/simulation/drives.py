@@ -186,10 +186,10 @@ def _drive(task: _Task) -> tuple[I32, I32]:
         moving = near < ranges
         ranges, cosine = np.where(moving, near, ranges), np.where(moving, body_cosine, cosine)
         noisy, kept = measure(sensor, ranges, cosine, rng)
-        writer.write_scan(index, (noisy[:, None] * rays.directions_lidar)[kept], cosine[kept])
+        writer.write_scan(index, noisy[kept, None] * rays.directions_lidar[kept], cosine[kept])
         np.save(folder / "truth" / route.name / "moving" / f"{index:06d}.npy", moving[kept])
         solid = kept & ~moving
-        points = (rays.origins + ranges[:, None] * rays.directions)[solid]
+        points = rays.origins[solid] + ranges[solid, None] * rays.directions[solid]
         count_hits(points, objects[solid], roles, stage.ground, CELL_SIZE, GROUND_MARGIN_M, counts)
     where = np.flatnonzero(counts).astype(np.int32)
     return where, counts.ravel()[where]

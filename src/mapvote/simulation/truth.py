@@ -97,7 +97,7 @@ def dense_survey(world: World, route: Route, sensor: Sensor, grid: Grid) -> tupl
             origins = np.ascontiguousarray(np.broadcast_to(T[:3, 3].astype(np.float32), directions.shape))
             ranges, objects, _ = caster.cast(origins, directions)
             met = objects != NOTHING
-            points, objects = (origins + ranges[:, None] * directions)[met], objects[met]
+            points, objects = origins[met] + ranges[met, None] * directions[met], objects[met]
             count_hits(points, objects, roles, ground, CELL_SIZE, GROUND_MARGIN_M, hits[when])
             found.append(points[roles[objects] == role])
         cloud = np.concatenate(found)
