@@ -37,7 +37,7 @@ class NdtSettings(Section):
     levels: tuple[NdtLevel, ...] = (
         NdtLevel(voxel_m=3.0, floor_m=0.5, points_m=1.0, iterations=15),
         NdtLevel(voxel_m=2.0, floor_m=0.25, points_m=1.0, iterations=15),
-        NdtLevel(voxel_m=1.0, floor_m=0.1, points_m=0.5, iterations=15),
+        NdtLevel(voxel_m=1.0, floor_m=0.1, points_m=0.7, iterations=15),
     )
     half_window_m: float = Field(default=96.0, description="half the side of the NDT map kept around the vehicle")
     below_m: float = Field(default=24.0, description="how far that window reaches below the vehicle")
@@ -83,6 +83,11 @@ class MappingSettings(Section):
     ndt_points_m: float = Field(default=0.3, description="scans enter the NDT map thinned to one point per such voxel")
     min_inlier_share: float = Field(default=0.4, description="as ndt.min_inlier_share, while the map is still growing")
     precise_prior_m: float = Field(default=0.1, description="a prior at least this good holds the map's frame")
+    prior_slack: float = Field(default=5.0, description="widens that prior's sigma: its errors are alike for a while")
+    link_sigma_m: float = Field(default=0.003, description="random error of the motion from scan to scan")
+    link_sigma_deg: float = Field(default=0.01, description="the same, rotation")
+    revisit_m: float = Field(default=10.0, description="a scan this near to a much older one is linked to it")
+    revisit_s: float = Field(default=10.0, description="and much older means this, within a drive")
 
 
 Occlusion = Literal["first_hit", "farthest_return", "column"]

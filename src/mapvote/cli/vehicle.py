@@ -64,4 +64,4 @@ def _tell(report: BuildReport, out: Path) -> None:
             line += f"; off its prior by {d.median_m:.3f} m (median), {d.max_m:.3f} m (most), {d.median_deg:.2f} deg"
         typer.echo(line)
     frame = "held in its frame by a precise prior" if report.held_by_prior else "not held by any precise prior"
-    typer.echo(f"{out}: {report.voxels} points, {frame}")
+    typer.echo(f"{out}: {report.points} points, {frame}")

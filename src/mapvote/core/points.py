@@ -34,6 +34,13 @@ def voxel_downsample(points: NDArray[np.floating], size: float, x0: float = 0.0,
 
 
 @numba.njit(cache=True, nogil=True)
+def scattered(key: np.int64) -> np.int64:
+    """A hash of a voxel key whose low bits depend on all three indices (Fibonacci hashing, high half folded in)."""
+    h = key * np.int64(-7046029254386353131)
+    return h ^ (h >> 32)
+
+
+@numba.njit(cache=True, nogil=True)
 def _thin(points: NDArray[np.float32], size: float, table: I64) -> I64:
     """Indices of the first point in each voxel of side ``size`` (open addressing, linear probing).
 
@@ -52,7 +59,7 @@ def _thin(points: NDArray[np.float32], size: float, table: I64) -> I64:
         if key == last:  # neighbours in a scan mostly share a voxel
             continue
         last = key
-        slot = ((key * np.int64(-7046029254386353131)) >> 20) & mask
+        slot = scattered(key) & mask
         while table[slot] != 0 and table[slot] != key:
             slot = (slot + 1) & mask
         if table[slot] == 0:

@@ -11,13 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapvote.core.grid import CELL_SIZE, Lattice
+from mapvote.core.points import scattered
 from mapvote.core.types import F64, I32, I64, Bool
 
 
 @numba.njit(cache=True, nogil=True)
 def _slot_of(key: np.int64, table_keys: I64) -> np.int64:
     mask = len(table_keys) - 1
-    slot = ((key * np.int64(-7046029254386353131)) >> 20) & mask
+    slot = scattered(key) & mask
     while table_keys[slot] != 0 and table_keys[slot] != key:
         slot = (slot + 1) & mask
     return slot

@@ -153,7 +153,7 @@ def refine(
     last = len(ndt_map.levels) - 1
     for i in range(first_level, last + 1):
         grid = ndt_map.levels[i]
-        tolerance = 0.01 * grid.level.floor_m
+        tolerance = (0.01 if i == last else 0.05) * grid.level.floor_m
         converged = False
         for _ in range(grid.level.iterations):
             iterations += 1
