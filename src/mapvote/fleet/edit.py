@@ -1,0 +1,129 @@
+"""Delete and add points of one tile (paper IV, last paragraphs of DESIGN 4). Everything else stays bit-identical."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numba
+import numpy as np
+
+from mapvote.core.columns import GROUND_MARGIN_M, TOP_BIT, base_layers, map_points
+from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Grid
+from mapvote.core.types import F32, F64, I32, I64, U64, Bool, MapTile
+
+CELLS = TILE_CELLS * TILE_CELLS
+
+
+def empty_tile() -> MapTile:
+    """A tile where the map has nothing: no points, ground unknown."""
+    shape = (TILE_CELLS, TILE_CELLS)
+    return MapTile(np.empty((0, 3), dtype=np.float32), np.full(shape, np.nan, dtype=np.float32))
+
+
+def cells_of(grid: Grid, points: F32) -> I64:
+    """(n,) flat cell index within the tile of points from its corner; the outermost cells take what rounding moved."""
+    rows, cols, _ = grid.indices_of(map_points(grid, points))
+    flat: I64 = np.clip(rows, 0, TILE_CELLS - 1) * TILE_CELLS + np.clip(cols, 0, TILE_CELLS - 1)
+    return flat
+
+
+def columns_of(tile: MapTile, grid: Grid) -> tuple[I64, I64, Bool]:
+    """(cell, bit, obstacle) of every point of a tile: flat cell, bit of its column word, above the ground or not.
+
+    The same reckoning as :func:`mapvote.core.columns.fill_columns`, by which vehicles see the map.
+    """
+    cell = cells_of(grid, tile.points)
+    base = base_layers(tile.ground_z).reshape(-1)[cell]
+    ground = tile.ground_z.reshape(-1)[cell].astype(np.float64)
+    ground = np.where(np.isnan(ground), base * CELL_SIZE, ground)
+    z = tile.points[:, 2].astype(np.float64)
+    bit = np.clip(np.floor(z / CELL_SIZE).astype(np.int64) - base, 0, TOP_BIT)
+    return cell, bit, z - ground >= GROUND_MARGIN_M
+
+
+def obstacle_bits(tile: MapTile, grid: Grid) -> U64:
+    """(256, 256) column words of the tile's obstacle points."""
+    cell, bit, obstacle = columns_of(tile, grid)
+    words = np.zeros(CELLS, dtype=np.uint64)
+    np.bitwise_or.at(words, cell[obstacle], np.uint64(1) << bit[obstacle].astype(np.uint64))
+    return words.reshape(TILE_CELLS, TILE_CELLS)
+
+
+def delete_points(tile: MapTile, grid: Grid, gone: U64) -> tuple[MapTile, int]:
+    """The tile without the obstacle points whose voxel is marked in ``gone`` (256, 256), and how many went.
+
+    Ground points are never deleted. Where the ground is unknown, vehicle and server share no base layer for their
+    words, so any mark takes the whole column.
+    """
+    if not len(tile.points):
+        return tile, 0
+    cell, bit, obstacle = columns_of(tile, grid)
+    known = np.isfinite(tile.ground_z).reshape(-1)
+    words = np.where(known | (gone.reshape(-1) == 0), gone.reshape(-1), ~np.uint64(0))[cell]
+    dropped = obstacle & ((words >> bit.astype(np.uint64)) & np.uint64(1)).astype(np.bool_)
+    if not dropped.any():
+        return tile, 0
+    return replace(tile, points=tile.points[~dropped]), int(dropped.sum())
+
+
+def add_points(tile: MapTile, grid: Grid, points: F32, cells: I64, voters: I32, min_votes: int) -> tuple[MapTile, int]:
+    """The tile with one representative per voxel that at least ``min_votes`` voters support, and how many came.
+
+    ``points`` (m, 3) from the tile's corner, ``cells`` (m,) flat, ``voters`` (m,) small integers. A voter supports
+    a voxel with a point in it or in the voxel above or below. Voxels that already hold a point of the map stay as
+    they are. New points follow the old ones, ordered by cell and height.
+    """
+    layers = np.floor(points[:, 2].astype(np.float64) / CELL_SIZE).astype(np.int64)
+    own_layers = np.floor(tile.points[:, 2].astype(np.float64) / CELL_SIZE).astype(np.int64)
+    taken = np.isin(_voxel(cells, layers), _voxel(cells_of(grid, tile.points), own_layers))
+    order = np.lexsort((points[:, 2], points[:, 1], points[:, 0], layers, cells))
+    chosen = _representatives(
+        points[order].astype(np.float64), cells[order], layers[order], voters[order], taken[order], min_votes
+    )
+    if not len(chosen):
+        return tile, 0
+    return replace(tile, points=np.concatenate([tile.points, points[order[chosen]]])), len(chosen)
+
+
+def _voxel(cells: I64, layers: I64) -> I64:
+    return cells * (1 << 24) + layers + (1 << 23)
+
+
+@numba.njit(cache=True, nogil=True)
+def _representatives(points: F64, cells: I64, layers: I64, voters: I32, taken: Bool, min_votes: int) -> I64:
+    """Indices of one point per supported voxel: the one nearest to the mean of all offered there, ties to the first.
+
+    Arrays are sorted by cell, layer, then coordinates, so the result does not depend on who was counted first.
+    """
+    n = len(cells)
+    out = np.empty(n, dtype=np.int64)
+    found = 0
+    seen = np.full(0 if n == 0 else voters.max() + 1, -1, dtype=np.int64)
+    start = 0
+    while start < n:
+        stop = start + 1
+        while stop < n and cells[stop] == cells[start] and layers[stop] == layers[start]:
+            stop += 1
+        support = 0
+        i = start
+        while i > 0 and cells[i - 1] == cells[start] and layers[i - 1] >= layers[start] - 1:
+            i -= 1
+        while i < n and cells[i] == cells[start] and layers[i] <= layers[start] + 1:
+            if seen[voters[i]] != start:
+                seen[voters[i]] = start
+                support += 1
+            i += 1
+        if support >= min_votes and not taken[start]:
+            mean = np.zeros(3)
+            for j in range(start, stop):
+                mean += points[j]
+            mean /= stop - start
+            best, nearest = start, np.inf
+            for j in range(start, stop):
+                distance = np.sum((points[j] - mean) ** 2)
+                if distance < nearest:
+                    best, nearest = j, distance
+            out[found] = best
+            found += 1
+        start = stop
+    return out[:found]

@@ -1,0 +1,265 @@
+"""Ballots of a tile -> decisions -> edited tile (paper IV, DESIGN 4). Pure: no files, no database, no clock.
+
+The order in which votes are given never matters: drives of a vehicle fold by a commutative rule, tallies are
+integer sums, and of several points for one voxel the same one is always taken.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from mapvote.config import FuseSettings
+from mapvote.core.grid import TILE_CELLS, Grid, Lattice, TileIndex, tile_grid
+from mapvote.core.types import F32, I32, I64, N_STATES, NO_VOTE, U8, U16, U64, Bool, CellState, MapTile
+from mapvote.core.voting import VOTE_UNIT, count_votes, decide, decide_change
+from mapvote.fleet.edit import CELLS, add_points, cells_of, delete_points, empty_tile, obstacle_bits
+
+Rule = Literal["paper", "columns"]
+DAY_NS = 86_400_000_000_000
+CHANGES = (CellState.CHANGED_OCCUPIED, CellState.CHANGED_EMPTY)
+
+
+@dataclass(frozen=True, slots=True)
+class TileVote:
+    """What one drive, or one vehicle after :func:`fold`, says about one tile."""
+
+    vehicle: str
+    end_ns: int
+    digest: str
+    """Hash of the ballot: breaks ties between drives that end at the same moment."""
+    states: U8 | None = None
+    """(256, 256): two-stage."""
+    tally: U16 | None = None
+    """(256, 256, 5): one-stage."""
+    gone: U64 | None = None
+    """(256, 256) column words to delete where the vote is changed-empty; None: the whole column above ground."""
+    new_points: F32 | None = None
+    """(m, 3) from the tile's corner; used only where the vote is changed-occupied."""
+    free: U64 | None = None
+    """(256, 256) column words that rays passed through."""
+
+    def spoken(self) -> Bool:
+        """(256, 256) where this vote says anything at all."""
+        if self.states is not None:
+            return self.states != NO_VOTE
+        assert self.tally is not None
+        return np.asarray(self.tally.any(axis=-1))
+
+    def supports(self, change: CellState) -> Bool:
+        """(256, 256) where this vote is, or in one stage also counts, for ``change``."""
+        if self.states is not None:
+            return self.states == change
+        assert self.tally is not None
+        return self.tally[..., change] > 0
+
+
+@dataclass(frozen=True, slots=True)
+class Decision:
+    """What the vehicles decided about one tile, and what came of it."""
+
+    states: U8
+    """(256, 256) CellState or NO_VOTE."""
+    tally: I32
+    """(256, 256, 5) in VOTE_UNITs."""
+    vehicles: int
+    added: int
+    """Points added to the tile."""
+    deleted: int
+    """Points deleted from the tile."""
+
+
+def select(votes: Iterable[TileVote], settings: FuseSettings) -> list[TileVote]:
+    """The votes inside the window (DESIGN 4): drives within ``max_age_days`` of the newest on this tile, then those
+    of the ``latest_vehicles`` vehicles that passed last. Ties between vehicles go to the later name."""
+    votes = list(votes)
+    if not votes:
+        return []
+    newest = max(v.end_ns for v in votes)
+    recent = [v for v in votes if newest - v.end_ns <= settings.max_age_days * DAY_NS]
+    last: dict[str, int] = {}
+    for vote in recent:
+        last[vote.vehicle] = max(last.get(vote.vehicle, vote.end_ns), vote.end_ns)
+    ranked = sorted(last, key=lambda vehicle: (last[vehicle], vehicle), reverse=True)
+    chosen = set(ranked[: settings.latest_vehicles])
+    return [v for v in recent if v.vehicle in chosen]
+
+
+def restrict(vote: TileVote, counts: Bool | None) -> TileVote:
+    """The vote with every cell outside ``counts`` (256, 256) silenced; None means that all of it counts."""
+    if counts is None or counts.all():
+        return vote
+    return replace(
+        vote,
+        states=None if vote.states is None else np.where(counts, vote.states, np.uint8(NO_VOTE)),
+        tally=None if vote.tally is None else np.where(counts[..., None], vote.tally, np.uint16(0)),
+        free=None if vote.free is None else np.where(counts, vote.free, np.uint64(0)),
+    )
+
+
+def fold(drives: Sequence[TileVote], grid: Grid) -> TileVote:
+    """One vehicle's drives as one vote: in every cell the drive that ended last speaks, ties by hash; a drive that
+    is silent there never overrides. Passed-through voxels add up. Commutative, and idempotent for one drive.
+
+    ``grid`` is the tile's window (:func:`mapvote.core.grid.tile_grid`).
+    """
+    if len(drives) == 1:
+        return drives[0]
+    ordered = sorted(drives, key=lambda drive: (drive.end_ns, drive.digest))
+    source = np.full((TILE_CELLS, TILE_CELLS), -1, dtype=np.int32)
+    for i, drive in enumerate(ordered):
+        source[drive.spoken()] = i
+    states = None if ordered[0].states is None else np.full(source.shape, NO_VOTE, dtype=np.uint8)
+    tally = None if ordered[0].tally is None else np.zeros((*source.shape, N_STATES), dtype=np.uint16)
+    gone = np.zeros(source.shape, dtype=np.uint64)
+    free = np.zeros(source.shape, dtype=np.uint64)
+    points: list[F32] = []
+    for i, drive in enumerate(ordered):
+        mine = source == i
+        if states is not None and drive.states is not None:
+            states[mine] = drive.states[mine]
+        if tally is not None and drive.tally is not None:
+            tally[mine] = drive.tally[mine]
+        gone[mine] = drive.gone[mine] if drive.gone is not None else ~np.uint64(0)
+        if drive.free is not None:
+            free |= drive.free
+        if drive.new_points is not None:
+            points.append(drive.new_points[mine.ravel()[cells_of(grid, drive.new_points)]])
+    return TileVote(
+        vehicle=ordered[-1].vehicle,
+        end_ns=ordered[-1].end_ns,
+        digest=ordered[-1].digest,
+        states=states,
+        tally=tally,
+        gone=gone,
+        new_points=np.concatenate(points) if points else None,
+        free=free if any(drive.free is not None for drive in drives) else None,
+    )
+
+
+def count(votes: Sequence[TileVote], rule: Rule, min_votes: int) -> tuple[U8, I32]:
+    """(states, tally) of one vote per vehicle: the rule of core.voting, then the quorum (DESIGN 4, "enough votes").
+
+    ``paper``: undetermined competes and a plain majority decides. ``columns``: undetermined abstains and a change
+    needs a majority of the vehicles that determined the cell. A change with fewer than ``min_votes`` vehicles behind
+    it is undetermined.
+    """
+    if not votes:
+        return (
+            np.full((TILE_CELLS, TILE_CELLS), NO_VOTE, dtype=np.uint8),
+            np.zeros((TILE_CELLS, TILE_CELLS, N_STATES), dtype=np.int32),
+        )
+    planes = [v.states.reshape(-1) for v in votes if v.states is not None]
+    if planes:
+        tally = count_votes(np.stack(planes)).reshape(TILE_CELLS, TILE_CELLS, N_STATES)
+        supporters = tally // VOTE_UNIT if min_votes > 1 else tally
+    else:
+        tallies = [v.tally for v in votes if v.tally is not None]
+        tally = np.sum(tallies, axis=0, dtype=np.int32)
+        supporters = np.sum([t > 0 for t in tallies], axis=0, dtype=np.int32)
+    states = decide(tally) if rule == "paper" else decide_change(tally)
+    if min_votes > 1:
+        for change in CHANGES:
+            states[(states == change) & (supporters[..., change] < min_votes)] = CellState.UNDETERMINED
+    return states, tally
+
+
+def fuse_tile(
+    lattice: Lattice,
+    index: TileIndex,
+    tile: MapTile | None,
+    drives: Iterable[TileVote],
+    rule: Rule,
+    settings: FuseSettings,
+) -> tuple[Decision, MapTile | None]:
+    """Decide one tile and edit it. A tile that does not change is returned as the same object (None if there was none).
+
+    ``drives`` are the votes that count on this tile (see :func:`select`, :func:`restrict`), any order.
+    """
+    grid = tile_grid(lattice, index)
+    by_vehicle: dict[str, list[TileVote]] = {}
+    for drive in drives:
+        by_vehicle.setdefault(drive.vehicle, []).append(drive)
+    votes = [fold(by_vehicle[vehicle], grid) for vehicle in sorted(by_vehicle)]
+    states, tally = count(votes, rule, settings.min_votes)
+    before = tile if tile is not None else empty_tile()
+    edited, deleted = before, 0
+    if (states == CellState.CHANGED_EMPTY).any():
+        gone = supported_words(votes, states, settings.min_votes)
+        edited, deleted = delete_points(edited, grid, gone)
+    added = 0
+    if (states == CellState.CHANGED_OCCUPIED).any():
+        edited, added = add_points(edited, grid, *_offered(votes, states, grid), settings.min_votes)
+    edited = _learn_free(edited, grid, votes, settings.min_votes, points_added=added > 0)
+    unchanged = edited is before
+    return Decision(states, tally, len(votes), added, deleted), tile if unchanged else edited
+
+
+def supported_words(votes: Sequence[TileVote], states: U8, min_votes: int) -> U64:
+    """(256, 256) delete mask: in cells decided changed-empty, the voxels that ``min_votes`` voters for it mark."""
+    cells = np.flatnonzero(states == CellState.CHANGED_EMPTY)
+    whole_column = np.full(len(cells), ~np.uint64(0))
+    marked = [
+        np.where(
+            vote.supports(CellState.CHANGED_EMPTY).reshape(-1)[cells],
+            whole_column if vote.gone is None else vote.gone.reshape(-1)[cells],
+            np.uint64(0),
+        )
+        for vote in votes
+    ]
+    out = np.zeros(CELLS, dtype=np.uint64)
+    out[cells] = at_least(np.stack(marked), min_votes)
+    return out.reshape(states.shape)
+
+
+def _offered(votes: Sequence[TileVote], states: U8, grid: Grid) -> tuple[F32, I64, I32]:
+    """(points, cells, voters) offered for cells decided changed-occupied, by vehicles that voted so there."""
+    wanted = states == CellState.CHANGED_OCCUPIED
+    points, cells, voters = [np.empty((0, 3), np.float32)], [np.empty(0, np.int64)], [np.empty(0, np.int32)]
+    for i, vote in enumerate(votes):
+        if vote.new_points is None or not len(vote.new_points):
+            continue
+        flat = cells_of(grid, vote.new_points)
+        keep = (wanted & vote.supports(CellState.CHANGED_OCCUPIED)).reshape(-1)[flat]
+        points.append(vote.new_points[keep])
+        cells.append(flat[keep])
+        voters.append(np.full(int(keep.sum()), i, dtype=np.int32))
+    return np.concatenate(points), np.concatenate(cells), np.concatenate(voters)
+
+
+def _learn_free(tile: MapTile, grid: Grid, votes: Sequence[TileVote], min_votes: int, points_added: bool) -> MapTile:
+    """Known-free columns with the voxels that at least ``min_votes`` vehicles passed through, minus the occupied ones.
+
+    Free space is remembered once learned; a voxel that holds a point of the map is never free.
+    """
+    passed = [v.free for v in votes if v.free is not None]
+    if not passed and (tile.free is None or not points_added):
+        return tile
+    free = tile.free if tile.free is not None else np.zeros((TILE_CELLS, TILE_CELLS), dtype=np.uint64)
+    if len(passed) >= min_votes:
+        free = free | at_least(np.stack(passed), min_votes)
+    free = free & ~obstacle_bits(tile, grid)
+    return tile if tile.free is not None and np.array_equal(free, tile.free) else replace(tile, free=free)
+
+
+def at_least(words: U64, k: int) -> U64:
+    """Bits set in at least ``k`` of ``words`` (n, ...): a bitwise running count, no loop over bits or cells."""
+    reached = [np.zeros(words.shape[1:], dtype=np.uint64) for _ in range(k)]
+    for word in words:
+        for level in range(k - 1, 0, -1):
+            reached[level] |= reached[level - 1] & word
+        reached[0] |= word
+    return reached[k - 1]
+
+
+def states_over(lattice: Lattice, decisions: Mapping[TileIndex, Decision]) -> tuple[U8, Grid]:
+    """Decided states (rows, cols) over the smallest window of whole tiles that holds them all; elsewhere NO_VOTE."""
+    rows, cols = [t[0] for t in decisions] or [0], [t[1] for t in decisions] or [0]
+    grid = tile_grid(lattice, (min(rows), min(cols))).union(tile_grid(lattice, (max(rows), max(cols))))
+    states = np.full(grid.shape, NO_VOTE, dtype=np.uint8)
+    for index, decision in decisions.items():
+        states[tile_grid(lattice, index).slices_in(grid)] = decision.states
+    return states, grid

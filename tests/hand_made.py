@@ -1,0 +1,100 @@
+"""Small maps and ballots made by hand: tiles of a few walls, vehicles that say what a test wants them to say."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from mapvote.core.ballot import Ballot, BallotTile, pack_plane, tile_key
+from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Lattice, TileIndex
+from mapvote.core.types import F32, NO_VOTE, U8, U16, U64, MapTile, PointMap
+from mapvote.fleet.update import base_hash
+
+Cell = tuple[int, int]
+SHAPE = (TILE_CELLS, TILE_CELLS)
+
+
+def wall(cells: list[Cell], heights: list[float]) -> F32:
+    """One point in the middle of each (cell, height) voxel, from the tile's corner."""
+    points = [((c + 0.5) * CELL_SIZE, (r + 0.5) * CELL_SIZE, z) for r, c in cells for z in heights]
+    return np.array(points, dtype=np.float32).reshape(-1, 3)
+
+
+def make_tile(points: F32, ground: float = 0.0) -> MapTile:
+    return MapTile(points, np.full(SHAPE, ground, dtype=np.float32))
+
+
+def make_map(tiles: Mapping[TileIndex, MapTile]) -> PointMap:
+    return PointMap("test-map", Lattice(), dict(tiles))
+
+
+def states_plane(cells: Mapping[Cell, int] | None = None, fill: int = NO_VOTE) -> U8:
+    plane = np.full(SHAPE, fill, dtype=np.uint8)
+    for cell, state in (cells or {}).items():
+        plane[cell] = state
+    return plane
+
+
+def words_plane(cells: Mapping[Cell, int]) -> U64:
+    plane = np.zeros(SHAPE, dtype=np.uint64)
+    for cell, word in cells.items():
+        plane[cell] = word
+    return plane
+
+
+@dataclass
+class Say:
+    """What a ballot says about one tile."""
+
+    states: U8 | None = None
+    tally: U16 | None = None
+    gone: U64 | None = None
+    new_points: F32 | None = None
+    free: U64 | None = None
+
+    def packed(self, tile: TileIndex) -> BallotTile:
+        return BallotTile(
+            tile=tile,
+            states=None if self.states is None else pack_plane(self.states),
+            tally=None if self.tally is None else pack_plane(np.moveaxis(self.tally, -1, 0)),
+            gone=None if self.gone is None else pack_plane(self.gone),
+            new_points=None if self.new_points is None else pack_plane(self.new_points),
+            free=None if self.free is None else pack_plane(self.free),
+        )
+
+
+def make_ballot(
+    point_map: PointMap,
+    says: Mapping[TileIndex, Say],
+    vehicle: str = "v1",
+    drive: str = "d1",
+    end_ns: int = 1_000_000_000,
+    method: str = "columns",
+    settings_hash: str = "s",
+    map_id: str | None = None,
+    base: Mapping[TileIndex, str] | None = None,
+) -> Ballot:
+    hashes = {tile: base_hash(point_map.tiles.get(tile)) for tile in says} | dict(base or {})
+    return Ballot(
+        map_id=map_id or point_map.map_id,
+        base={tile_key(tile): digest for tile, digest in hashes.items()},
+        vehicle=vehicle,
+        drive=drive,
+        start_ns=end_ns - 1_000_000_000,
+        end_ns=end_ns,
+        method=method,
+        settings_hash=settings_hash,
+        scans=10,
+        scans_localised=10,
+        median_sigma_m=0.01,
+        tiles=[say.packed(tile) for tile, say in says.items()],
+    )
+
+
+def two_walls() -> PointMap:
+    """Two neighbouring tiles: a wall of three cells in each, and ground points everywhere it stands."""
+    cells = [(10, 10), (10, 11), (10, 12)]
+    points = np.concatenate([wall(cells, [0.05]), wall(cells, [0.45, 0.75, 1.05])])
+    return make_map({(0, 0): make_tile(points), (0, 1): make_tile(points.copy())})
