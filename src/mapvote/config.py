@@ -37,7 +37,7 @@ class NdtSettings(Section):
     levels: tuple[NdtLevel, ...] = (
         NdtLevel(voxel_m=3.0, floor_m=0.5, points_m=1.0, iterations=15),
         NdtLevel(voxel_m=2.0, floor_m=0.25, points_m=1.0, iterations=15),
-        NdtLevel(voxel_m=1.0, floor_m=0.1, points_m=0.5, iterations=15),
+        NdtLevel(voxel_m=1.0, floor_m=0.1, points_m=0.7, iterations=15),
     )
     half_window_m: float = Field(default=96.0, description="half the side of the NDT map kept around the vehicle")
     below_m: float = Field(default=24.0, description="how far that window reaches below the vehicle")
@@ -45,14 +45,49 @@ class NdtSettings(Section):
     recentre_m: float = Field(default=24.0, description="the window moves when the vehicle is this far off its middle")
     min_points: int = Field(default=3, description="a voxel with fewer points has no distribution")
     covariance_scale: float = Field(default=5.0, description="what neighbouring residuals have in common, calibrated")
+    map_sigma_m: float = Field(default=0.01, description="what the map itself is off by around a scan, position")
+    map_sigma_deg: float = Field(default=0.03, description="the same, rotation")
+    min_inlier_share: float = Field(default=0.6, description="below it the vehicle abstains")
+    max_sigma_m: float = Field(default=0.15, description="abstain when the pose is less certain than this")
+    prior_gate: float = Field(default=5.0, description="abstain this many sigma from the prior (plus gate_m)")
+    gate_m: float = Field(default=1.0, description="slack of that gate, for errors the sigma does not cover")
+    acceleration_mps2: float = Field(default=3.0, description="how fast a prediction by constant velocity goes stale")
+    hypothesis_step_m: float = Field(default=1.0, description="spacing of the guesses when the vehicle is lost")
+    hypothesis_reach_m: float = Field(default=10.0, description="farthest guess from the seed")
 
 
 class MovingSettings(Section):
     """perception/moving.py ([9])."""
 
+    past_s: float = Field(
+        default=2.0, gt=0, description="how far back a scan may be asked whether it saw through a voxel"
+    )
+    lookahead_s: float = Field(default=1.0, ge=0, le=1.0, description="how late a scan is decided")
+    looks_past: int = Field(default=8, ge=1, description="scans asked before")
+    looks_ahead: int = Field(default=5, ge=0, description="scans asked after")
+    reach_m: float = Field(default=50.0, gt=0, description="points farther away are never called moving")
+    pixel_deg: float = Field(default=0.3, gt=0, description="direction pixel of the free-space look-up")
+    tilt_deg: float = Field(default=4.0, ge=0, description="pitch and roll of the vehicle to allow for")
+    margin_m: float = Field(default=0.4, gt=0, description="a ray that ends this far behind a voxel saw through it")
+    height_m: float = Field(default=0.12, gt=0, description="rays this far above and below a voxel bear witness to it")
+    min_free: int = Field(default=2, ge=1, description="scans that saw through a voxel before it can be called brief")
+    free_share: float = Field(default=0.5, description="share of the scans able to see a voxel that saw through it")
+    min_voxels: int = Field(default=3, ge=1, description="brief voxels a moving object has at least")
+    share_whole: float = Field(default=0.5, description="brief share at which connected cells move together")
+    share_part: float = Field(default=0.7, description="the same for what remains beside static cells")
+
 
 class MappingSettings(Section):
     """mapping.py: NDT SLAM."""
+
+    ndt_points_m: float = Field(default=0.3, description="scans enter the NDT map thinned to one point per such voxel")
+    min_inlier_share: float = Field(default=0.4, description="as ndt.min_inlier_share, while the map is still growing")
+    precise_prior_m: float = Field(default=0.1, description="a prior at least this good holds the map's frame")
+    prior_slack: float = Field(default=5.0, description="widens that prior's sigma: its errors are alike for a while")
+    link_sigma_m: float = Field(default=0.003, description="random error of the motion from scan to scan")
+    link_sigma_deg: float = Field(default=0.01, description="the same, rotation")
+    revisit_m: float = Field(default=10.0, description="a scan this near to a much older one is linked to it")
+    revisit_s: float = Field(default=10.0, description="and much older means this, within a drive")
 
 
 Occlusion = Literal["first_hit", "farthest_return", "column"]

@@ -112,3 +112,12 @@ def test_points_are_obstacles_above_the_margin_and_outside_the_window_nothing() 
     assert obstacle.tolist() == [False, True, False]
     assert cell[0] == cell[1] >= 0
     assert cell[2] == -1
+
+
+def test_ranges_on_the_edge_of_a_sorting_step_are_sorted_all_the_same() -> None:
+    reach = np.concatenate([np.arange(1, 60) * 0.25 + e for e in (-1e-9, 0.0, 1e-9)])
+    points = np.column_stack([reach, np.full(len(reach), 1e-5), np.full(len(reach), 1.8)])
+    view = see(
+        points, np.array([0.0, 0.0, 1.8]), np.ones(len(reach), bool), np.zeros(len(reach), bool), flat_reference()
+    )
+    assert view.counts.sum() > 0

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import typer
 
-from mapvote.cli import science, server
+from mapvote.cli import files, science, server, vehicle
 
 
 def register(app: typer.Typer) -> None:
     """Add every verb to ``app``. Modules import nothing heavy at their top."""
     science.register(app)
+    vehicle.register(app)
+    files.register(app)
     server.register(app)

@@ -34,28 +34,41 @@ def voxel_downsample(points: NDArray[np.floating], size: float, x0: float = 0.0,
 
 
 @numba.njit(cache=True, nogil=True)
-def _thin(points: NDArray[np.float32], size: float) -> I64:
-    """Indices of the first point in each voxel of side ``size``, in input order (open addressing, linear probing)."""
-    slots = 1024
-    while slots < 2 * len(points):
-        slots *= 2
-    table = np.zeros(slots, dtype=np.int64)
-    keep = np.empty(len(points), dtype=np.int64)
+def scattered(key: np.int64) -> np.int64:
+    """A hash of a voxel key whose low bits depend on all three indices (Fibonacci hashing, high half folded in)."""
+    h = key * np.int64(-7046029254386353131)
+    return h ^ (h >> 32)
+
+
+@numba.njit(cache=True, nogil=True)
+def _thin(points: NDArray[np.float32], size: float, table: I64) -> I64:
+    """Indices of the first point in each voxel of side ``size`` (open addressing, linear probing).
+
+    ``table`` (2^k,) holds zeros; the answer is empty when it became half full and a larger one is needed.
+    """
+    mask = len(table) - 1
+    keep = np.empty(len(table) // 2, dtype=np.int64)
     n = 0
     scale = 1.0 / size
+    last = np.int64(0)
     for i in range(len(points)):
-        ix = np.int64(np.floor(points[i, 0] * scale)) + (1 << 20)
-        iy = np.int64(np.floor(points[i, 1] * scale)) + (1 << 20)
-        iz = np.int64(np.floor(points[i, 2] * scale)) + (1 << 20)
+        ix = np.int64(points[i, 0] * scale + 1048576.0)
+        iy = np.int64(points[i, 1] * scale + 1048576.0)
+        iz = np.int64(points[i, 2] * scale + 1048576.0)
         key = (ix << 42) | (iy << 21) | iz
-        slot = ((key * np.int64(-7046029254386353131)) >> 20) & (slots - 1)
+        if key == last:  # neighbours in a scan mostly share a voxel
+            continue
+        last = key
+        slot = scattered(key) & mask
         while table[slot] != 0 and table[slot] != key:
-            slot = (slot + 1) & (slots - 1)
+            slot = (slot + 1) & mask
         if table[slot] == 0:
+            if n == len(keep):
+                return keep[:0]
             table[slot] = key
             keep[n] = i
             n += 1
-    return keep[:n]
+    return keep[:n].copy()
 
 
 def thin(points: NDArray[np.floating], size: float) -> I64:
@@ -63,7 +76,13 @@ def thin(points: NDArray[np.floating], size: float) -> I64:
 
     Does in a millisecond what :func:`voxel_downsample` does on the lattice; for scans, in their own frame.
     """
-    return _thin(np.ascontiguousarray(points, dtype=np.float32), size)
+    cloud = np.ascontiguousarray(points, dtype=np.float32)
+    slots = 1 << 15
+    while True:
+        keep = _thin(cloud, size, np.zeros(slots, dtype=np.int64))
+        if len(keep) or len(cloud) == 0:
+            return keep
+        slots *= 2
 
 
 @numba.njit(cache=True, nogil=True)

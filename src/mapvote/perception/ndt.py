@@ -153,12 +153,12 @@ def refine(
     last = len(ndt_map.levels) - 1
     for i in range(first_level, last + 1):
         grid = ndt_map.levels[i]
-        tolerance = 0.01 * grid.level.floor_m
+        tolerance = (0.01 if i == last else 0.05) * grid.level.floor_m
         converged = False
         for _ in range(grid.level.iterations):
             iterations += 1
             H, g, M, score, inlier_share = _equations(grid, clouds[i], T)
-            covariance, step = _solve(H, g, M, ndt_map.settings.covariance_scale)
+            covariance, step = _solve(H, g, M, ndt_map.settings)
             if prior is not None and i == last:
                 covariance, step = _fuse(covariance, step, prior, T)
             T = _moved(T, _clamped(step, 0.5 * grid.level.voxel_m))
@@ -178,16 +178,18 @@ def _equations(grid: NdtGrid, points: F64, T: F64) -> tuple[F64, F64, F64, float
     return normal_equations(points, R, t, grid.lowest, grid.level.voxel_m, grid.index, grid.cells)
 
 
-def _solve(H: F64, g: F64, M: F64, scale: float) -> tuple[F64, F64]:
+def _solve(H: F64, g: F64, M: F64, settings: NdtSettings) -> tuple[F64, F64]:
     """Covariance and step of the NDT alone.
 
     The covariance is the robust ("sandwich") estimate H^-1 M H^-1, M being the scatter of the points' own
-    gradients, times ``scale`` for what neighbouring points have in common. A direction that nothing fixes gets
-    a small curvature, hence a large variance and no step, instead of a singular matrix.
+    gradients, times ``covariance_scale`` for what neighbouring points have in common, plus what the map itself is
+    off by. A direction that nothing fixes gets a small curvature, hence a large variance and no step, instead of a
+    singular matrix.
     """
     floor = 1e-6 * max(float(np.trace(H)), 1.0) * np.eye(6)
     H_inv = _inverse(H + floor)
-    return scale * (H_inv @ (M + floor) @ H_inv), -H_inv @ g
+    map_variance = np.diag([settings.map_sigma_m**2] * 3 + [np.radians(settings.map_sigma_deg) ** 2] * 3)
+    return settings.covariance_scale * (H_inv @ (M + floor) @ H_inv) + map_variance, -H_inv @ g
 
 
 def _fuse(covariance: F64, step: F64, prior: PosePrior, T: F64) -> tuple[F64, F64]:

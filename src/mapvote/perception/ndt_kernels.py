@@ -15,6 +15,8 @@ from mapvote.core.types import F64, I32, I64
 
 INLIER_E = 7.81
 """Squared Mahalanobis distance below which a point agrees with a voxel: 95 % of chi-square, 3 degrees of freedom."""
+FLATNESS = 0.08
+"""A voxel whose points spread less than this share of its side in height is a flat patch."""
 CUTOFF_E = 25.0
 """Beyond this a voxel's pull on a point, exp(-e / 2), is nothing."""
 
@@ -46,6 +48,24 @@ def _diagonalise(A: F64, V: F64) -> None:
                 vp, vq = V[k, p], V[k, q]
                 V[k, p] = c * vp - s * vq
                 V[k, q] = s * vp + c * vq
+
+
+@numba.njit(cache=True, nogil=True)
+def _order(A: F64, V: F64) -> None:
+    """Eigenvalues (diagonal of A) and eigenvectors (columns of V) in ascending order."""
+    for p, q in ((0, 1), (1, 2), (0, 1)):
+        if A[p, p] > A[q, q]:
+            A[p, p], A[q, q] = A[q, q], A[p, p]
+            for k in range(3):
+                V[k, p], V[k, q] = V[k, q], V[k, p]
+
+
+@numba.njit(cache=True, nogil=True)
+def _upright(V: F64) -> None:
+    """The first column becomes the upward direction across the last one."""
+    x, y, z = V[0, 2], V[1, 2], V[2, 2]
+    length = np.sqrt(max(1.0 - z * z, 1e-12))
+    V[0, 0], V[1, 0], V[2, 0] = -x * z / length, -y * z / length, (1.0 - z * z) / length
 
 
 @numba.njit(cache=True, nogil=True)
@@ -99,6 +119,7 @@ def add(
     # filling, less two standard deviations of its sample variance, is taken off; otherwise the rhythm of the voxels
     # would hold a vehicle in place on a bare road.
     A, V = np.empty((3, 3)), np.empty((3, 3))
+    flat = FLATNESS * size
     for j in range(n_touched):
         k = touched[j]
         sums[k, 10] = 0.0
@@ -109,11 +130,19 @@ def add(
         mx, my, mz = sums[k, 1] / m, sums[k, 2] / m, sums[k, 3] / m
         A[0, 0], A[0, 1], A[0, 2] = sums[k, 4] / m - mx * mx, sums[k, 5] / m - mx * my, sums[k, 6] / m - mx * mz
         A[1, 1], A[1, 2], A[2, 2] = sums[k, 7] / m - my * my, sums[k, 8] / m - my * mz, sums[k, 9] / m - mz * mz
+        var_z = A[2, 2]
         _diagonalise(A, V)
         cells[k, 0], cells[k, 1], cells[k, 2] = mx, my, mz
         cells[k, 3:] = 0.0
         even_variance = size * size / 12.0 * max(0.0, 1.0 - 2.0 * np.sqrt(0.8 / m))
         even = 1.0 / (even_variance + floor_m * floor_m)
+        _order(A, V)
+        if var_z < flat * flat:
+            # A flat patch knows its height only. One ring on the road is a line, thin to all sides: taken at face
+            # value it would hold the next scan's rings where the last ones were.
+            if A[1, 1] < flat * flat:
+                _upright(V)
+            A[1, 1] = A[2, 2] = np.inf
         for d in range(3):
             b = max(0.0, 1.0 / (max(A[d, d], 0.0) + floor_m * floor_m) - even)
             cells[k, 3] += b * V[0, d] * V[0, d]

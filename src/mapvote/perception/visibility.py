@@ -119,6 +119,12 @@ def _fan_of(dx: float, dy: float) -> int:
     return int(angle * (FANS / (2.0 * np.pi))) % FANS
 
 
+@numba.njit(cache=True, nogil=True, inline="always")
+def _range_step(reach: np.float32) -> int:
+    """Counted from the far end: 0 is the farthest."""
+    return _RANGE_STEPS - 1 - min(int(reach / _RANGE_STEP_M), _RANGE_STEPS - 1)
+
+
 @numba.njit(cache=True, nogil=True)
 def _gather(
     points: F64, obstacle: NDArray[np.bool_], origin: F64, clearance: float
@@ -140,7 +146,7 @@ def _gather(
         dx, dy = points[i, 0] - origin[0], points[i, 1] - origin[1]
         h = np.sqrt(dx * dx + dy * dy)
         reach[i] = h
-        nearer[_RANGE_STEPS - 1 - min(int(h / _RANGE_STEP_M), _RANGE_STEPS - 1) + 1] += 1
+        nearer[_range_step(reach[i]) + 1] += 1  # of the rounded range, as it is asked for below
         if h < CELL_SIZE:
             fan[i] = -1
             continue
@@ -163,7 +169,7 @@ def _gather(
         nearer[k + 1] += nearer[k]
     order = np.empty(n, np.int32)
     for i in range(n):
-        k = _RANGE_STEPS - 1 - min(int(reach[i] / _RANGE_STEP_M), _RANGE_STEPS - 1)
+        k = _range_step(reach[i])
         order[nearer[k]] = i
         nearer[k] += 1
     slope = np.empty(start[FANS], np.float32)

@@ -5,8 +5,9 @@ from __future__ import annotations
 import multiprocessing
 import os
 import shutil
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -17,13 +18,13 @@ import numpy as np
 from mapvote.core.columns import GROUND_MARGIN_M
 from mapvote.core.grid import CELL_SIZE
 from mapvote.core.sensors import SENSORS, Sensor
-from mapvote.core.types import F64, I32, MapvoteError
+from mapvote.core.types import F32, F64, I32, U8, MapvoteError
 from mapvote.formats.kitti import DriveWriter, write_poses
 from mapvote.simulation.actors import Traffic, make_traffic
 from mapvote.simulation.lidar import Caster, measure, sweep
 from mapvote.simulation.routes import Route, make_routes
 from mapvote.simulation.scenario import Scenario, load_scenario
-from mapvote.simulation.truth import count_hits, ground_cells, truth_grid, write_truth
+from mapvote.simulation.truth import count_hits, dense_survey, ground_cells, truth_grid, write_truth
 from mapvote.simulation.world import Role, World, make_world
 
 _CHUNK = 40
@@ -60,11 +61,13 @@ def simulate(
         writers = [_writer(partial, route, stage).open() for route in stage.routes]
         for route in stage.routes:
             (partial / "truth" / route.name / "moving").mkdir(parents=True)
-        survey, vehicles = _drive_all(spec, seed, partial, progress, workers)
-        for index, (route, writer) in enumerate(zip(stage.routes, writers, strict=True)):
-            writer.close(route.stamps_ns, route.priors(np.random.default_rng([seed, 4, index])))
-            write_poses(partial / "truth" / route.name / "poses.txt", route.poses(route.time_s))
-        write_truth(partial / "truth", stage.world, list(stage.routes), stage.sensor, spec, survey, vehicles)
+        with _pool(workers or _processes(stage)) as run:
+            dense = run(_survey, [(spec, seed, drive) for drive in range(len(stage.routes))])
+            survey, vehicles = _drive_all(stage, partial, run, progress)
+            for index, (route, writer) in enumerate(zip(stage.routes, writers, strict=True)):
+                writer.close(route.stamps_ns, route.priors(np.random.default_rng([seed, 4, index])))
+                write_poses(partial / "truth" / route.name / "poses.txt", route.poses(route.time_s))
+            write_truth(partial / "truth", stage.world, spec, list(dense), survey, vehicles)
         os.replace(partial, out)
     finally:
         shutil.rmtree(partial, ignore_errors=True)
@@ -117,38 +120,50 @@ def _writer(folder: Path, route: Route, stage: Stage) -> DriveWriter:
     )
 
 
-def _drive_all(
-    scenario: Scenario, seed: int, folder: Path, progress: Progress | None, workers: int | None
-) -> tuple[I32, I32]:
+_Run = Callable[[Callable[[Any], Any], list[Any]], Iterable[Any]]
+
+
+@contextmanager
+def _pool(workers: int) -> Iterator[_Run]:
+    """A map over tasks whose results come in the order of the tasks: in this process or in spawned ones."""
+    if workers == 1:
+        yield map
+        return
+    with ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn")) as pool:
+        yield pool.map
+
+
+def _processes(stage: Stage) -> int:
+    """One per core where a drive is long enough to pay for starting them."""
+    return (os.cpu_count() or 1) if sum(route.scans for route in stage.routes) > 400 else 1
+
+
+def _drive_all(stage: Stage, folder: Path, run: _Run, progress: Progress | None) -> tuple[I32, I32]:
     """Drive every route; (survey, vehicles) counts (roles, rows, cols) of the recorded points that stand still."""
-    routes = _stage(scenario, seed).routes
     tasks = [
-        (scenario, seed, folder, drive, first, min(first + _CHUNK, route.scans))
-        for drive, route in enumerate(routes)
+        (stage.scenario, stage.seed, folder, drive, first, min(first + _CHUNK, route.scans))
+        for drive, route in enumerate(stage.routes)
         for first in range(0, route.scans, _CHUNK)
     ]
-    scans = sum(route.scans for route in routes)
-    count = workers or (os.cpu_count() or 1 if scans > 400 else 1)
-    totals = np.zeros((2, len(Role), *truth_grid(scenario).shape), dtype=np.int32)
+    scans = sum(route.scans for route in stage.routes)
+    totals = np.zeros((2, len(Role), *stage.ground.shape), dtype=np.int32)
     done = 0
-    for task, (where, hits) in zip(tasks, _results(tasks, count), strict=True):
-        totals[0 if routes[task[3]].vehicle is None else 1].ravel()[where] += hits
+    for task, (where, hits) in zip(tasks, run(_drive, tasks), strict=True):
+        totals[0 if stage.routes[task[3]].vehicle is None else 1].ravel()[where] += hits
         done += task[5] - task[4]
         if progress:
             progress(done, scans)
     return totals[0], totals[1]
 
 
+def _survey(task: tuple[Scenario, int, int]) -> tuple[I32, F32, U8]:
+    """The noise-free survey of one route, for the truth."""
+    scenario, seed, drive = task
+    stage = _stage(scenario, seed)
+    return dense_survey(stage.world, stage.routes[drive], stage.sensor, truth_grid(scenario))
+
+
 _Task = tuple[Scenario, int, Path, int, int, int]
-
-
-def _results(tasks: list[_Task], workers: int) -> Iterator[tuple[I32, I32]]:
-    """Results in the order of the tasks, from this process or from spawned ones."""
-    if workers == 1:
-        yield from map(_drive, tasks)
-        return
-    with ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn")) as pool:
-        yield from pool.map(_drive, tasks)
 
 
 def _drive(task: _Task) -> tuple[I32, I32]:
@@ -171,10 +186,10 @@ def _drive(task: _Task) -> tuple[I32, I32]:
         moving = near < ranges
         ranges, cosine = np.where(moving, near, ranges), np.where(moving, body_cosine, cosine)
         noisy, kept = measure(sensor, ranges, cosine, rng)
-        writer.write_scan(index, (noisy[:, None] * rays.directions_lidar)[kept], cosine[kept])
+        writer.write_scan(index, noisy[kept, None] * rays.directions_lidar[kept], cosine[kept])
         np.save(folder / "truth" / route.name / "moving" / f"{index:06d}.npy", moving[kept])
         solid = kept & ~moving
-        points = (rays.origins + ranges[:, None] * rays.directions)[solid]
+        points = rays.origins[solid] + ranges[solid, None] * rays.directions[solid]
         count_hits(points, objects[solid], roles, stage.ground, CELL_SIZE, GROUND_MARGIN_M, counts)
     where = np.flatnonzero(counts).astype(np.int32)
     return where, counts.ravel()[where]

@@ -75,7 +75,7 @@ def sweep(
     local[..., 2] = np.sin(elevation)
     time_s: F64 = np.zeros(1)
     if distortion:
-        time_s = -azimuth / (2.0 * np.pi) / sensor.rate_hz
+        time_s = np.asarray(-azimuth / (2.0 * np.pi) / sensor.rate_hz, dtype=np.float64)
     T = T_map_lidar_at(stamp_s + time_s)
     rotation = np.ascontiguousarray(np.swapaxes(T[:, :3, :3], 1, 2), dtype=np.float32)
     directions = np.matmul(local, rotation)

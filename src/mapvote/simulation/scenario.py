@@ -31,7 +31,7 @@ class Change(_Table):
 class Traffic(_Table):
     """Mean distances between moving bodies on a lane, a kerb side, a sidewalk, metres; 0 = none of them."""
 
-    car_spacing_m: float = Field(default=20.0, ge=0)
+    car_spacing_m: float = Field(default=30.0, ge=0)
     two_wheeler_spacing_m: float = Field(default=35.0, ge=0)
     pedestrian_spacing_m: float = Field(default=14.0, ge=0)
 

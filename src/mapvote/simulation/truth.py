@@ -14,6 +14,8 @@ of passes contradicts the survey. Points less than 0.3 m above the ground count 
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
+from enum import IntEnum
 from pathlib import Path
 
 import numba
@@ -35,8 +37,20 @@ UNCHANGED, CHANGED_OCCUPIED, CHANGED_EMPTY, UNSCORED = 0, 1, 2, 255
 SUPPORT = 20
 """Points, pooled over the drives at 10 Hz, that make a surface well supported (in proportion at other rates)."""
 _STEP_M = 1.5
+"""Between poses of the noise-free survey."""
 _REACH_M = 50.0
 _AZIMUTH_STEP_DEG = 0.3
+_SAMPLE_M = 0.1
+_KEPT_SAMPLE_M = 0.25
+
+
+class Reason(IntEnum):
+    """Why a cell is unscored, in ``reason`` of truth.npz; the first applies to provenance only."""
+
+    WEAKLY_SUPPORTED = 1
+    REMOVED_NEVER_SURVEYED = 2
+    OLD_NEVER_SURVEYED = 3
+    CAR_OF_SOME_PASSES = 4
 
 
 def truth_grid(scenario: Scenario) -> Grid:
@@ -63,36 +77,33 @@ def count_hits(points: F32, objects: I32, roles: I32, ground: F64, size: float, 
             counts[roles[objects[i]], r, c] += 1
 
 
-def dense_survey(world: World, routes: list[Route], sensor: Sensor, grid: Grid) -> tuple[I32, I32, F32, U8]:
-    """Counts of noise-free hits (roles, rows, cols) before and after, and surface samples (m, 3) with their role.
+def dense_survey(world: World, route: Route, sensor: Sensor, grid: Grid) -> tuple[I32, F32, U8]:
+    """Noise-free rays from the true poses of one route, into the street before and the street after.
 
+    Gives counts (2, roles, rows, cols) of hits, and samples (m, 3) of surfaces that came or went, with their role (m,).
     Only rays towards bodies that changed are cast: elsewhere nothing could change.
     """
     roles, ground = world.roles(), ground_cells(world, grid)
     changed = [i for i, role in enumerate(roles) if role in (Role.ADDED, Role.REMOVED)]
     circles = np.array([_circle(world.bodies[i].triangles) for i in changed]).reshape(-1, 3)
-    counts, samples, labels = [], [], []
-    for gone in (Role.ADDED, Role.REMOVED):
-        hits = np.zeros((len(Role), *grid.shape), dtype=np.int32)
-        ids = [i for i, role in enumerate(roles) if role in (Role.KEPT, Role.ADDED, Role.REMOVED) and role != gone]
-        caster = Caster(*world.mesh(ids))
-        found = []
-        for route in routes:
-            for T in route.poses(np.arange(0.0, route.length / route.speed, _STEP_M / route.speed)):
-                directions = _towards(T, circles, sensor)
-                if not len(directions):
-                    continue
-                origins = np.broadcast_to(T[:3, 3].astype(np.float32), directions.shape)
-                ranges, objects, _ = caster.cast(np.ascontiguousarray(origins), directions)
-                met = objects != NOTHING
-                points, objects = (origins + ranges[:, None] * directions)[met], objects[met]
-                count_hits(points, objects, roles, ground, CELL_SIZE, GROUND_MARGIN_M, hits)
-                found.append(points[np.isin(objects, changed)])
-        cloud = np.concatenate(found) if found else np.zeros((0, 3), np.float32)
-        samples.append(cloud[voxel_downsample(cloud, 0.1)])
-        labels.append(np.full(len(samples[-1]), Role.REMOVED if gone == Role.ADDED else Role.ADDED, dtype=np.uint8))
-        counts.append(hits)
-    return counts[0], counts[1], np.concatenate(samples), np.concatenate(labels)
+    poses = route.poses(np.arange(0.0, route.length / route.speed, _STEP_M / route.speed))
+    hits = np.zeros((2, len(Role), *grid.shape), dtype=np.int32)
+    samples, labels = [], []
+    for when, role in enumerate((Role.REMOVED, Role.ADDED)):
+        caster = Caster(*world.mesh([i for i, r in enumerate(roles) if r in (Role.KEPT, role)]))
+        found = [np.zeros((0, 3), dtype=np.float32)]
+        for T in poses:
+            directions = _towards(T, circles, sensor)
+            origins = np.ascontiguousarray(np.broadcast_to(T[:3, 3].astype(np.float32), directions.shape))
+            ranges, objects, _ = caster.cast(origins, directions)
+            met = objects != NOTHING
+            points, objects = origins[met] + ranges[met, None] * directions[met], objects[met]
+            count_hits(points, objects, roles, ground, CELL_SIZE, GROUND_MARGIN_M, hits[when])
+            found.append(points[roles[objects] == role])
+        cloud = np.concatenate(found)
+        samples.append(cloud[voxel_downsample(cloud, _SAMPLE_M)])
+        labels.append(np.full(len(samples[-1]), role, dtype=np.uint8))
+    return hits, np.concatenate(samples), np.concatenate(labels)
 
 
 def _circle(triangles: F64) -> tuple[float, float, float]:
@@ -121,64 +132,75 @@ def _towards(T_map_lidar: F64, circles: F64, sensor: Sensor) -> F32:
     return (local.reshape(-1, 3) @ T_map_lidar[:3, :3].T).astype(np.float32)
 
 
-def judge(before: I32, after: I32, survey: I32, vehicles: I32, rate_hz: float) -> tuple[U8, U8, dict[str, int]]:
-    """(strict, provenance, numbers of unscored cells by reason).
+def judge(dense: I32, survey: I32, vehicles: I32, rate_hz: float) -> tuple[U8, U8, U8]:
+    """(strict, provenance, reason why a cell is unscored), each (rows, cols).
 
-    All inputs (roles, rows, cols) counts: noise-free hits before and after, points recorded by surveys and vehicles.
+    ``dense`` (2, roles, rows, cols): noise-free hits before and after; ``survey`` and ``vehicles`` (roles, rows, cols):
+    points recorded by survey drives and by voting vehicles.
     """
+    before, after = dense
     support = max(1, round(SUPPORT * rate_hz / 10.0))
-    mapped = survey[[Role.KEPT, Role.REMOVED]].sum(axis=0) > 0
-    old_unseen = ((vehicles[Role.KEPT] > 0) | (after[Role.KEPT] > 0)) & ~mapped
+    mapped = (survey[Role.KEPT] > 0) | (survey[Role.REMOVED] > 0)
+    old_now = (after[Role.KEPT] > 0) | (vehicles[Role.KEPT] > 0)
     unclear = (survey[Role.UNCLEAR] > 0) | (vehicles[Role.UNCLEAR] > 0)
 
-    empty_now = (after[Role.KEPT] == 0) & (after[Role.ADDED] == 0) & (vehicles[Role.KEPT] == 0)
-    lost = (before[Role.REMOVED] > 0) & (before[Role.KEPT] == 0) & (survey[Role.KEPT] == 0) & empty_now
-    gained = (after[Role.ADDED] > 0) & (before[[Role.KEPT, Role.REMOVED]].sum(axis=0) == 0) & ~mapped & ~old_unseen
-    never_mapped = lost & ~mapped
+    old_before = (before[Role.KEPT] > 0) | (survey[Role.KEPT] > 0)
+    lost = (before[Role.REMOVED] > 0) & ~old_before & ~old_now & (after[Role.ADDED] == 0)
+    gained = (after[Role.ADDED] > 0) & (before[Role.REMOVED] == 0) & ~old_before & ~old_now & ~mapped
     strict = np.full(lost.shape, UNCHANGED, dtype=np.uint8)
     strict[gained] = CHANGED_OCCUPIED
     strict[lost] = CHANGED_EMPTY
-    strict[old_unseen | unclear | never_mapped] = UNSCORED
 
-    empty_now = (vehicles[Role.KEPT] == 0) & (vehicles[Role.ADDED] < support)
-    lost = (survey[Role.REMOVED] > survey[Role.KEPT]) & empty_now
-    gained = (vehicles[Role.ADDED] > 0) & ~mapped & (vehicles[Role.KEPT] == 0)
-    weak = (lost & (survey[Role.REMOVED] < support)) | (gained & (vehicles[Role.ADDED] < support))
+    lost_points = (survey[Role.REMOVED] > survey[Role.KEPT]) & ~(vehicles[Role.KEPT] > 0)
+    lost_points &= vehicles[Role.ADDED] < support
+    new_points = (vehicles[Role.ADDED] > 0) & ~mapped & ~old_now
     provenance = np.full(lost.shape, UNCHANGED, dtype=np.uint8)
-    provenance[gained] = CHANGED_OCCUPIED
-    provenance[lost] = CHANGED_EMPTY
-    provenance[old_unseen | unclear | weak] = UNSCORED
-    reasons = {
-        "old_surface_never_surveyed": int(old_unseen.sum()),
-        "cars_of_some_passes": int(unclear.sum()),
-        "removed_but_never_surveyed": int(never_mapped.sum()),
-        "weakly_supported": int(weak.sum()),
-    }
-    return strict, provenance, reasons
+    provenance[new_points] = CHANGED_OCCUPIED
+    provenance[lost_points] = CHANGED_EMPTY
+    weak = (lost_points & (survey[Role.REMOVED] < support)) | (new_points & (vehicles[Role.ADDED] < support))
+
+    reason = np.zeros(lost.shape, dtype=np.uint8)
+    reason[weak] = Reason.WEAKLY_SUPPORTED
+    reason[lost & ~mapped] = Reason.REMOVED_NEVER_SURVEYED
+    reason[old_now & ~mapped] = Reason.OLD_NEVER_SURVEYED
+    reason[unclear] = Reason.CAR_OF_SOME_PASSES
+    strict[reason > Reason.WEAKLY_SUPPORTED] = UNSCORED
+    provenance[reason != 0] = UNSCORED
+    return strict, provenance, reason
 
 
 def write_truth(
-    folder: Path, world: World, routes: list[Route], sensor: Sensor, scenario: Scenario, survey: I32, vehicles: I32
+    folder: Path,
+    world: World,
+    scenario: Scenario,
+    dense: Sequence[tuple[I32, F32, U8]],
+    survey: I32,
+    vehicles: I32,
 ) -> None:
-    """truth.npz, surface.npz and objects.json into ``folder``."""
+    """truth.npz, surface.npz and objects.json into ``folder``; ``dense`` holds :func:`dense_survey` of each route."""
     grid = truth_grid(scenario)
-    before, after, points, labels = dense_survey(world, routes, sensor, grid)
-    strict, provenance, unscored = judge(before, after, survey, vehicles, scenario.rate_hz)
+    hits: I32 = np.stack([counts for counts, _, _ in dense]).sum(axis=0, dtype=np.int32)
+    strict, provenance, reason = judge(hits, survey, vehicles, scenario.rate_hz)
     np.savez_compressed(
-        folder / "truth.npz", strict=strict, provenance=provenance, x0=grid.x0, y0=grid.y0, cell_size=CELL_SIZE
+        folder / "truth.npz",
+        strict=strict,
+        provenance=provenance,
+        reason=reason,
+        x0=grid.x0,
+        y0=grid.y0,
+        cell_size=CELL_SIZE,
     )
-    rng = np.random.default_rng(0)
-    kept = [b.triangles for i, b in enumerate(world.bodies) if b.role == Role.KEPT and i > 0]
-    old = sample(np.concatenate(kept), 0.2, rng).astype(np.float32)
-    x, y, _ = old.T
-    old = old[(x > -20) & (x < scenario.length_m + 20) & (y > -20) & (y < scenario.width_m + 20)]
-    np.savez_compressed(
-        folder / "surface.npz",
-        points=np.concatenate([old, points]),
-        label=np.concatenate([np.full(len(old), Role.KEPT, dtype=np.uint8), labels]),
-    )
+    stays = [b.triangles for i, b in enumerate(world.bodies) if b.role == Role.KEPT and i > 0]
+    kept = sample(np.concatenate(stays), _KEPT_SAMPLE_M, np.random.default_rng(0)).astype(np.float32)
+    near = (kept[:, :2] > -20.0) & (kept[:, :2] < (scenario.length_m + 20.0, scenario.width_m + 20.0))
+    kept = kept[near.all(axis=1)]
+    changed, roles = np.concatenate([d[1] for d in dense]), np.concatenate([d[2] for d in dense])
+    first = voxel_downsample(changed, _SAMPLE_M)
+    label = np.concatenate([np.full(len(kept), Role.KEPT, dtype=np.uint8), roles[first]])
+    np.savez(folder / "surface.npz", points=np.concatenate([kept, changed[first]]), label=label)
     objects = [_describe(i, world) for i, b in enumerate(world.bodies) if b.role in (Role.ADDED, Role.REMOVED)]
-    summary = {"scenario": scenario.name, "cells": strict.size, "unscored": unscored, "objects": objects}
+    unscored = {r.name.lower(): int((reason == r).sum()) for r in Reason}
+    summary = {"scenario": scenario.name, "cells": reason.size, "unscored": unscored, "objects": objects}
     (folder / "objects.json").write_text(json.dumps(summary, indent=1) + "\n")
 
 

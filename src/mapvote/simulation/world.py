@@ -175,17 +175,20 @@ def _kerbside(scenario: Scenario, side: Side, terrain: Terrain, rng: np.random.G
     """Trees, lamps, signs, furniture and guard rails on the sidewalk."""
     clutter = scenario.clutter
     rows = (
-        ("tree", clutter.tree_spacing_m, KERB_M + 1.0, furniture.tree),
+        ("tree", clutter.tree_spacing_m, KERB_M + 0.9, furniture.tree),
         ("pole", clutter.pole_spacing_m, KERB_M + 0.5, furniture.pole),
         ("sign", clutter.sign_spacing_m, KERB_M + 0.45, furniture.sign),
-        ("furniture", clutter.furniture_spacing_m, KERB_M + 2.2, furniture.street_box),
+        ("furniture", clutter.furniture_spacing_m, KERB_M + 0.85, furniture.street_box),
     )
-    bodies = []
+    bodies: list[Body] = []
+    taken: list[float] = []
     for low, high in side.spans:
         for kind, spacing, v, make in rows:
             s = low + rng.uniform(0.2, 1.0) * spacing if spacing else high
             while s < high - 1.0:
-                bodies.append(Body(kind, side.put(make(rng), s, v, terrain)))
+                if all(abs(s - other) > 1.6 for other in taken):
+                    bodies.append(Body(kind, side.put(make(rng), s, v, terrain)))
+                    taken.append(s)
                 s += spacing * rng.uniform(0.7, 1.3)
         s = low
         while s < high - 20.0:

@@ -1,0 +1,44 @@
+"""Settings: defaults, then a file, then the environment; what is misspelt is named."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from mapvote.config import Settings, load_settings, load_with_sources
+from mapvote.core.types import MapvoteError
+
+
+def test_nothing_said_means_defaults() -> None:
+    assert load_settings(env={}) == Settings()
+
+
+def test_the_environment_wins_over_the_file_and_each_source_is_known(tmp_path: Path) -> None:
+    file = tmp_path / "s.toml"
+    file.write_text("[voting]\nn_min = 7\na = 1.5\n")
+    settings, sources = load_with_sources(file, {"MAPVOTE_VOTING__N_MIN": "4", "MAPVOTE_KEY": "secret", "HOME": "/"})
+    assert (settings.voting.n_min, settings.voting.a, settings.voting.b) == (4, 1.5, 3.0)
+    assert sources == {"voting.n_min": "MAPVOTE_VOTING__N_MIN", "voting.a": str(file)}
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("[votting]\nn_min = 7\n", "unknown section 'votting'; did you mean 'voting'"),
+        ("[voting]\nn_minn = 7\n", r"unknown setting voting\.n_minn; did you mean 'n_min'"),
+        ("[voting]\nn_min = 'many'\n", r"voting\.n_min = 'many'"),
+        ("n_min = 7\n", "outside a section"),
+        ("[voting\n", "cannot be read"),
+    ],
+)
+def test_a_file_that_cannot_be_meant_is_an_error(tmp_path: Path, text: str, message: str) -> None:
+    file = tmp_path / "s.toml"
+    file.write_text(text)
+    with pytest.raises(MapvoteError, match=message):
+        load_settings(file, {})
+
+
+def test_a_misspelt_variable_is_an_error() -> None:
+    with pytest.raises(MapvoteError, match="MAPVOTE_VOTING__NMIN: unknown setting"):
+        load_settings(env={"MAPVOTE_VOTING__NMIN": "3"})

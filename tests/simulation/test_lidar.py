@@ -1,0 +1,127 @@
+"""The LiDAR against geometry worked out by other means."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from mapvote.core.sensors import SENSORS
+from mapvote.core.types import F32, F64
+from mapvote.simulation import shapes
+from mapvote.simulation.drives import _stage
+from mapvote.simulation.lidar import NOTHING, Caster, measure, sweep
+from mapvote.simulation.scenario import load_scenario
+
+
+def at(T: F64) -> F64:
+    return np.broadcast_to(T, (1, 4, 4)).astype(np.float64)
+
+
+def box_ranges(origins: F64, directions: F64, low: F64, high: F64) -> F64:
+    """Where rays (n, 3) enter the box, by the slab method (Kay and Kajiya 1986); inf where they miss it."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        a, b = (low - origins) / directions, (high - origins) / directions
+    enter, leave = np.minimum(a, b).max(axis=1), np.maximum(a, b).min(axis=1)
+    return np.where((enter <= leave) & (enter > 0), enter, np.inf)
+
+
+def triangle_ranges(origin: F64, directions: F64, triangles: F64) -> F64:
+    """First hits of rays (n, 3) from one origin, every ray against every triangle (Moller and Trumbore 1997)."""
+    e1, e2, t = triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0], origin - triangles[:, 0]
+    q = np.cross(t, e1)
+    along = np.einsum("ij,ij->i", e2, q)
+    nearest = np.full(len(directions), np.inf)
+    for i, d in enumerate(directions):
+        p = np.cross(d, e2)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            inverse = 1.0 / np.einsum("ij,ij->i", e1, p)
+            u, v, r = inverse * np.einsum("ij,ij->i", t, p), inverse * (q @ d), inverse * along
+        hit = (u >= 0) & (v >= 0) & (u + v <= 1) & (r > 0)
+        if hit.any():
+            nearest[i] = r[hit].min()
+    return nearest
+
+
+def test_rays_meet_boxes_where_the_slab_method_says() -> None:
+    rng = np.random.default_rng(0)
+    lows = np.column_stack([rng.uniform(-60, 60, (250, 2)), rng.uniform(-3, 4, 250)])
+    highs = lows + rng.uniform(0.3, 8.0, (250, 3))
+    away = (np.maximum(lows[:, :2], -highs[:, :2]).max(axis=1) > 1.0).nonzero()[0]
+    boxes = [shapes.box(*np.column_stack([lows[i], highs[i]]).ravel()) for i in away]
+    caster = Caster(shapes.join(boxes).astype(np.float32), np.repeat(np.arange(len(away)), 12).astype(np.int32))
+    rays = sweep(SENSORS["hdl32e"], lambda t: at(np.eye(4)), 0.0, 0.3, distortion=False)
+    ranges, objects, _ = caster.cast(rays.origins, rays.directions)
+    each = np.stack(
+        [box_ranges(rays.origins.astype(float), rays.directions.astype(float), lows[i], highs[i]) for i in away]
+    )
+    expected = each.min(axis=0)
+    both = np.isfinite(expected) & np.isfinite(ranges)
+    assert both.mean() > 0.25
+    wrong = np.isfinite(expected) != np.isfinite(ranges)
+    wrong[both] = np.abs(expected[both] - ranges[both]) > 0.01
+    assert wrong.mean() < 0.001
+    assert np.mean(objects[both] == each.argmin(axis=0)[both]) > 0.999
+
+
+def test_rays_meet_a_whole_street_where_brute_force_says() -> None:
+    stage = _stage(load_scenario("corner"), 3)
+    triangles, owners = stage.world.mesh(stage.world.standing(0))
+    T = stage.routes[2].poses(np.array([1.5]))
+    rays = sweep(stage.sensor, lambda t: T, 0.0, 0.0, distortion=False)
+    some = np.random.default_rng(1).choice(len(rays.directions), 1500, replace=False)
+    ranges, _, _ = Caster(triangles, owners).cast(rays.origins[some], rays.directions[some])
+    expected = triangle_ranges(T[0, :3, 3], rays.directions[some].astype(float), triangles.astype(float))
+    both = np.isfinite(expected) & np.isfinite(ranges)
+    assert both.mean() > 0.9
+    assert np.sum(np.isfinite(expected) != np.isfinite(ranges)) <= 1
+    assert np.sum(np.abs(expected[both] - ranges[both]) > 0.01) <= 1
+
+
+@pytest.mark.parametrize("name", ["vlp16", "hdl32e", "hdl64e"])
+def test_a_sweep_fires_every_beam_at_every_azimuth_clockwise(name: str) -> None:
+    sensor = SENSORS[name]
+    rays = sweep(sensor, lambda t: at(np.eye(4)), 0.0, 0.5, distortion=False)
+    assert len(rays.directions) == sensor.beams * sensor.azimuths
+    np.testing.assert_allclose(np.linalg.norm(rays.directions, axis=1), 1.0, atol=1e-6)
+    elevations = np.degrees(np.arcsin(rays.directions[: sensor.beams, 2]))
+    np.testing.assert_allclose(elevations, sensor.elevations_deg, atol=1e-4)
+    azimuth = np.arctan2(rays.directions[:: sensor.beams, 1], rays.directions[:: sensor.beams, 0])
+    assert np.all(np.diff(azimuth) < 0), "seen from above, the sensor turns clockwise"
+
+
+def test_within_the_revolution_rays_leave_from_where_the_sensor_is() -> None:
+    def moving(time_s: F64) -> F64:
+        T = np.tile(np.eye(4), (len(time_s), 1, 1))
+        T[:, 0, 3] = 11.0 * time_s
+        return T
+
+    sensor = SENSORS["hdl32e"]
+    rays = sweep(sensor, moving, 2.0, 0.0, distortion=True)
+    azimuth = np.arctan2(rays.directions_lidar[:, 1], rays.directions_lidar[:, 0])
+    expected = 11.0 * (2.0 - azimuth / (2 * np.pi) / sensor.rate_hz)
+    ahead = np.abs(azimuth) < 3.1  # -pi and pi are the same direction, fired at both ends
+    np.testing.assert_allclose(rays.origins[ahead, 0], expected[ahead], atol=1e-4)
+
+
+def test_ranges_carry_two_centimetres_of_noise_and_some_returns_are_lost() -> None:
+    sensor = SENSORS["hdl32e"]
+    rng = np.random.default_rng(2)
+    ranges = np.full(50_000, 20.0, dtype=np.float32)
+    ones: F32 = np.ones_like(ranges)
+    noisy, kept = measure(sensor, ranges, ones, rng)
+    assert np.std(noisy - ranges) == pytest.approx(0.02, rel=0.05)
+    assert 0.98 < kept.mean() < 1.0
+    _, far = measure(sensor, np.full_like(ranges, 80.0), 0.05 * ones, rng)
+    assert far.mean() < 0.95, "a grazed road far away often gives nothing back"
+    _, beyond = measure(sensor, np.full_like(ranges, 101.0), ones, rng)
+    _, close = measure(sensor, np.full_like(ranges, 0.5), ones, rng)
+    assert not beyond.any()
+    assert not close.any()
+
+
+def test_nothing_to_hit_is_no_hit() -> None:
+    caster = Caster(np.zeros((0, 3, 3), dtype=np.float32), np.zeros(0, dtype=np.int32))
+    up: F32 = np.array([[0, 0, 1]], dtype=np.float32)
+    ranges, objects, _ = caster.cast(np.zeros_like(up), up)
+    assert np.isinf(ranges[0])
+    assert objects[0] == NOTHING
