@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import Any
+
 import numpy as np
 import pytest
 
 from mapvote.config import Settings, VotingSettings
-from mapvote.core.ballot import decode, encode, unpack_points, unpack_states, unpack_tally, validate
+from mapvote.core.ballot import decode, encode, unpack_points, unpack_states, unpack_tally, unpack_words, validate
+from mapvote.core.columns import reference_window
 from mapvote.core.grid import TILE_CELLS, tile_grid
 from mapvote.core.sensors import SENSORS
 from mapvote.core.tiling import map_from_points
-from mapvote.core.types import F64, CellState, MapvoteError, PointMap, Registration, Scan
-from mapvote.vehicle import Vehicle, trust_prior
+from mapvote.core.types import F64, Bool, CellState, MapvoteError, PointMap, Registration, Scan
+from mapvote.perception.ndt import PosePrior
+from mapvote.perception.tracking import Fix
+from mapvote.vehicle import Vehicle
 
 RNG = np.random.default_rng(7)
 SENSOR_HEIGHT = 1.8
@@ -44,6 +50,31 @@ def scan_of(x: float, i: int) -> tuple[Scan, F64]:
     return Scan(i * 10**8, (points - T_map_lidar[:3, 3]).astype(np.float32)), T_map_lidar
 
 
+def exactly(scan: Scan, prior: PosePrior | None) -> Fix:
+    """The prior is the truth."""
+    assert prior is not None
+    return Fix(Registration(prior.T_map_lidar, np.zeros((6, 6)), 1.0, 1.0, 0, True), scan.points, True)
+
+
+class NothingMoves:
+    """A street without traffic, decided at once."""
+
+    def __init__(self) -> None:
+        self.count = 0
+
+    def push(self, points_map: F64, origin_map: F64, obstacle: Bool, stamp_ns: int) -> list[tuple[int, Bool]]:
+        self.count += 1
+        return [(self.count - 1, np.zeros(len(points_map), dtype=np.bool_))]
+
+    def flush(self) -> list[tuple[int, Bool]]:
+        return []
+
+
+def make(point_map: PointMap, settings: Settings | None = None, **more: Any) -> Vehicle:
+    given = {"localise": exactly, "movers": NothingMoves(), **more}
+    return Vehicle("v1", SENSORS["hdl32e"], point_map, settings, **given)
+
+
 def drive(vehicle: Vehicle) -> Vehicle:
     for i in range(6):
         vehicle.observe(*scan_of(-1.0 + 0.1 * i, i))
@@ -62,7 +93,7 @@ def state_at(vehicle: Vehicle, x: float, y: float, voting: VotingSettings | None
 
 
 def test_a_ballot_tells_what_was_built_and_taken_down() -> None:
-    vehicle = drive(Vehicle("v1", SENSORS["hdl32e"], street_map()))
+    vehicle = drive(make(street_map()))
     assert state_at(vehicle, 8.25, 3.5) == CellState.CHANGED_OCCUPIED
     assert state_at(vehicle, 8.25, -1.5) == CellState.CHANGED_EMPTY
     assert state_at(vehicle, 20.25, -2.0) == CellState.UNCHANGED_OCCUPIED
@@ -71,7 +102,7 @@ def test_a_ballot_tells_what_was_built_and_taken_down() -> None:
 
 
 def test_new_points_lie_in_changed_occupied_cells_one_to_a_voxel() -> None:
-    vehicle = drive(Vehicle("v1", SENSORS["hdl32e"], street_map()))
+    vehicle = drive(make(street_map()))
     total = 0
     for tile in vehicle.ballot().tiles:
         if tile.new_points is None:
@@ -91,7 +122,7 @@ def test_two_vehicles_with_the_same_scans_say_the_same_bytes() -> None:
     point_map = street_map()
     said = []
     for _ in range(2):
-        vehicle = Vehicle("v1", SENSORS["hdl32e"], point_map)
+        vehicle = make(point_map)
         for scan, pose in scans:
             vehicle.observe(scan, pose)
         said.append(encode(vehicle.ballot()))
@@ -104,8 +135,8 @@ def test_several_voters_share_one_pass_and_one_stage_ballots_carry_the_tally() -
     column = plain.model_copy(update={"occlusion": "column"})
     scans = [scan_of(-1.0 + 0.1 * i, i) for i in range(4)]
     point_map = street_map()
-    together = Vehicle("v1", SENSORS["hdl32e"], point_map, voters=[plain, column])
-    alone = Vehicle("v1", SENSORS["hdl32e"], point_map, Settings(voting=column))
+    together = make(point_map, voters=[plain, column])
+    alone = make(point_map, Settings(voting=column))
     for scan, pose in scans:
         together.observe(scan, pose)
         alone.observe(scan, pose)
@@ -119,10 +150,10 @@ def test_several_voters_share_one_pass_and_one_stage_ballots_carry_the_tally() -
 
 
 def test_a_lost_scan_casts_no_vote() -> None:
-    def lost_at_first(scan: Scan, prior: F64 | None) -> Registration | None:
-        return None if scan.stamp_ns < 2 * 10**8 else trust_prior(scan, prior)
+    def lost_at_first(scan: Scan, prior: PosePrior | None) -> Fix:
+        return replace(exactly(scan, prior), trusted=scan.stamp_ns >= 2 * 10**8)
 
-    vehicle = Vehicle("v1", SENSORS["hdl32e"], street_map(), localise=lost_at_first)
+    vehicle = make(street_map(), localise=lost_at_first)
     for i in range(2):
         vehicle.observe(*scan_of(-1.0, i))
     with pytest.raises(MapvoteError, match="none of 2 scans could be localised"):
@@ -131,3 +162,40 @@ def test_a_lost_scan_casts_no_vote() -> None:
     assert vehicle.report.lost == [0, 1]
     assert vehicle.ballot().scans_localised == 1
     assert vehicle.ballot().scans == 3
+
+
+def test_the_moving_object_filter_delays_votes_but_loses_none() -> None:
+    point_map = street_map()
+    vehicle = make(point_map, movers=None)
+    for i in range(6):
+        vehicle.observe(*scan_of(-1.0 + 0.1 * i, i))
+    assert len(vehicle.report.stage_s.get("vote", [])) < 6
+    vehicle.ballot()
+    assert len(vehicle.report.stage_s["vote"]) == 6
+
+
+COLUMNS = VotingSettings(method="columns")
+
+
+def test_columns_tell_what_was_taken_down_and_which_voxels_are_gone() -> None:
+    vehicle = drive(make(street_map(), Settings(voting=COLUMNS)))
+    assert state_at(vehicle, 8.25, -1.5) == CellState.CHANGED_EMPTY
+    assert state_at(vehicle, 20.25, -2.0) == CellState.UNCHANGED_OCCUPIED
+    for tile in vehicle.ballot().tiles:
+        assert tile.gone is not None
+        assert tile.states is not None
+        gone, states = unpack_words(tile.gone, "gone"), unpack_states(tile.states)
+        window = tile_grid(vehicle.point_map.lattice, tile.tile)
+        mapped = reference_window(vehicle.point_map, window).occupied
+        assert not (gone & ~mapped).any()
+        assert (gone[states != CellState.CHANGED_EMPTY] == 0).all()
+
+
+def test_columns_believe_new_things_only_where_the_map_knew_free_space() -> None:
+    unknown = street_map()
+    tiles = {t: replace(tile, free=np.zeros((256, 256), np.uint64)) for t, tile in unknown.tiles.items()}
+    known = {t: replace(tile, free=np.full((256, 256), ~np.uint64(0))) for t, tile in unknown.tiles.items()}
+    for free, state in ((tiles, CellState.UNCHANGED_EMPTY), (known, CellState.CHANGED_OCCUPIED)):
+        vehicle = drive(make(replace(unknown, tiles=free), Settings(voting=COLUMNS)))
+        assert state_at(vehicle, 8.25, 3.5) in (state, CellState.UNDETERMINED)
+    assert state_at(vehicle, 8.25, 3.5) == CellState.CHANGED_OCCUPIED

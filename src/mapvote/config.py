@@ -111,6 +111,23 @@ class VotingSettings(Section):
     k: float = 0.5
     n_min: int = 5
     window_m: float = Field(default=80.0, description="side of the local grid (paper III-A)")
+    rules: str = Field(
+        default="ABCDEFG", pattern=r"^A?B?C?D?E?F?G?$", description="columns: which of METHOD 4's rules hold (ablation)"
+    )
+    empty_votes: float = Field(
+        default=0.1, description="columns, F: votes of a ray through a voxel against a hit in it"
+    )
+    gone_votes: float = Field(
+        default=0.25, description="columns, E: votes of a ray through a mapped voxel against a hit"
+    )
+    min_scans: int = Field(default=1, description="columns, G: scans that must have hit a new voxel")
+    min_support: int = Field(
+        default=2, description="columns, G: hits (scans by voxels) that make a cell changed-occupied"
+    )
+    min_cells: int = Field(default=4, description="columns, G: smaller groups of changed cells are dropped")
+    wide_sigma_m: float = Field(
+        default=0.1, description="columns: a pose less certain than this makes a hit speak for two cells around it"
+    )
 
 
 class FuseSettings(Section):

@@ -1,40 +1,78 @@
 """The vehicle's side (paper III): scans go in one by one, a ballot comes out.
 
 One pass over a drive can serve several voters (the paper's five cases, other occlusion rules, columns): what a scan
-saw is worked out once, and each voter classifies and counts by its own settings.
+saw is worked out once, and each voter counts by its own settings.
 """
 
 from __future__ import annotations
 
 import time
-from collections import defaultdict, deque
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from typing import Protocol
 
 import numpy as np
 
 from mapvote.config import Settings, VotingSettings
 from mapvote.core.ballot import Ballot, BallotTile, content_hash, pack_plane, tile_key
-from mapvote.core.columns import cut_reference, reference_window
+from mapvote.core.columns import cut_reference, dilated, reference_window
 from mapvote.core.geometry import transform
 from mapvote.core.grid import TILE_CELLS, TileIndex, tile_grid, window_around
 from mapvote.core.sensors import Sensor
-from mapvote.core.types import F64, Bool, CellState, Drive, MapvoteError, PointMap, Reference, Registration, Scan
-from mapvote.core.voting import decide, to_wire
-from mapvote.perception.classify import classify_paper
-from mapvote.perception.tally import NewPoints, Tally, points_in
+from mapvote.core.types import (
+    F64,
+    I32,
+    I64,
+    U64,
+    Bool,
+    CellState,
+    Drive,
+    MapvoteError,
+    PointMap,
+    Reference,
+    Registration,
+    Scan,
+)
+from mapvote.core.voting import to_wire
+from mapvote.perception.deskew import deskew, twist_between
+from mapvote.perception.moving import MovingFilter
+from mapvote.perception.ndt import PosePrior
+from mapvote.perception.tally import NewPoints, points_in, select
+from mapvote.perception.tracking import Fix, MapWindow, Tracker
 from mapvote.perception.visibility import find_obstacles, see
+from mapvote.perception.voters import Seen, TileVotes, make_voter
 
-Localise = Callable[[Scan, F64 | None], Registration | None]
-"""(scan, T_map_lidar prior or None) -> where the scan was taken, or None when lost (the scan then casts no vote)."""
+Localise = Callable[[Scan, PosePrior | None], Fix]
+"""Where was this scan taken? ``Tracker.localise`` by NDT, or :class:`GivenPoses`. An untrusted fix casts no vote."""
 
 
-def trust_prior(scan: Scan, T_map_lidar_prior: F64 | None) -> Registration | None:
-    """The prior as it is: for poses that need no improvement, or to measure what localisation is worth."""
-    if T_map_lidar_prior is None:
-        return None
-    return Registration(T_map_lidar_prior, np.zeros((6, 6)), 1.0, 1.0, 0, True)
+class Movers(Protocol):
+    """Which points move: :class:`mapvote.perception.moving.MovingFilter`, or anything with its two methods."""
+
+    def push(self, points_map: F64, origin_map: F64, obstacle: Bool, stamp_ns: int) -> list[tuple[int, Bool]]: ...
+
+    def flush(self) -> list[tuple[int, Bool]]: ...
+
+
+class GivenPoses:
+    """Poses that need no improvement: the prior as it is, or the truth, to measure what localisation is worth."""
+
+    def __init__(self, stamps_ns: I64, T_map_lidar: F64) -> None:
+        """``stamps_ns`` (n,) ascending and ``T_map_lidar`` (n, 4, 4): a pose for every scan that will come."""
+        self._poses = {int(stamp): i for i, stamp in enumerate(stamps_ns)}
+        self._stamps_ns, self._T_map_lidar = stamps_ns, T_map_lidar
+
+    def __call__(self, scan: Scan, prior: PosePrior | None) -> Fix:
+        i = self._poses[scan.stamp_ns]
+        j, k = max(i - 1, 0), min(i + 1, len(self._stamps_ns) - 1)
+        twist = np.zeros(6)
+        if k > j:
+            seconds = 1e-9 * float(self._stamps_ns[k] - self._stamps_ns[j])
+            twist = twist_between(self._T_map_lidar[j], self._T_map_lidar[k], seconds)
+        registration = Registration(self._T_map_lidar[i], np.zeros((6, 6)), 1.0, 1.0, 0, True)
+        return Fix(registration, deskew(scan, twist), True)
 
 
 @dataclass(slots=True)
@@ -46,31 +84,38 @@ class DriveReport:
     """Indices of scans that abstained because the vehicle was not sure where it was."""
     sigmas_m: list[float] = field(default_factory=list)
     """Position sigma of each scan that voted."""
-    T_map_lidar: list[F64 | None] = field(default_factory=list)
-    """Pose of every scan, None where lost."""
-    stage_s: dict[str, list[float]] = field(default_factory=lambda: defaultdict(list))
+    T_map_lidar: list[F64] = field(default_factory=list)
+    """Pose of every scan; of a lost one the best guess."""
+    stage_s: dict[str, list[float]] = field(default_factory=dict)
     """Seconds of every scan by stage: localise, ground, moving, see, vote."""
 
     @contextmanager
     def timed(self, stage: str) -> Iterator[None]:
         start = time.perf_counter()
         yield
-        self.stage_s[stage].append(time.perf_counter() - start)
+        self.stage_s.setdefault(stage, []).append(time.perf_counter() - start)
 
 
 @dataclass(frozen=True, slots=True)
-class _Seen:
+class _Waiting:
     """A localised scan that waits for the moving-object filter to decide."""
 
     points_map: F64
     origin_map: F64
+    sigma_m: float
+    reference: Reference
+    near: U64
+    obstacle: Bool
+    cell: I32
 
 
 class Vehicle:
     """One vehicle on one drive.
 
-    ``voters``: the settings of every voter, default only ``settings.voting``. ``localise``: see :data:`Localise`.
-    Memory is bounded by the road driven: tallies by tile, and the reference of the tiles around the vehicle.
+    ``voters``: the settings of every voter, default only ``settings.voting``. ``localise``: default NDT in
+    ``point_map``. ``movers``: default the occupancy filter of :mod:`mapvote.perception.moving`. The prior's
+    sigmas say how far ``observe``'s prior may be off. Memory is bounded by the road driven: counters by tile, and the
+    reference of the tiles around the vehicle.
     """
 
     def __init__(
@@ -82,79 +127,94 @@ class Vehicle:
         *,
         drive_id: str = "drive",
         voters: Sequence[VotingSettings] | None = None,
-        localise: Localise = trust_prior,
+        localise: Localise | None = None,
+        movers: Movers | None = None,
+        prior_sigma_m: float = 1.0,
+        prior_sigma_deg: float = 1.0,
     ) -> None:
         self.name, self.sensor, self.point_map, self.drive_id = name, sensor, point_map, drive_id
         self.settings = settings or Settings()
-        self.localise = localise
+        self.localise = localise or Tracker(MapWindow(point_map, self.settings.ndt), self.settings.ndt).localise
+        self.movers = movers or MovingFilter(sensor, self.settings.moving)
+        self.prior_sigmas = prior_sigma_m, float(np.radians(prior_sigma_deg))
         self.report = DriveReport()
-        lattice = point_map.lattice
-        self._voters = {_tally_key(v): (v, Tally(lattice)) for v in voters or [self.settings.voting]}
-        self._new_points = NewPoints(lattice)
-        self._waiting: deque[_Seen] = deque()
-        self._around: Reference | None = None
+        wanted = {_counts_as(v): v for v in voters or [self.settings.voting]}
+        self._first = (voters or [self.settings.voting])[0]
+        self._voters = {key: make_voter(v, sensor, point_map) for key, v in wanted.items()}
+        self._new_points = NewPoints(point_map.lattice)
+        self._waiting: deque[_Waiting] = deque()
+        self._around: tuple[Reference, U64] | None = None
         self._stamps_ns: list[int] = []
 
     def observe(self, scan: Scan, T_map_lidar_prior: F64 | None = None) -> None:
-        """One scan: localise, remove moving objects, see, classify, vote. A lost scan casts no vote."""
-        index = self.report.scans
-        self.report.scans += 1
+        """One scan: localise, find what moves, see, vote. Votes may wait a second until it is known what moved."""
+        report, index = self.report, self.report.scans
+        report.scans += 1
         self._stamps_ns.append(scan.stamp_ns)
-        with self.report.timed("localise"):
-            registration = self.localise(scan, T_map_lidar_prior)
-        self.report.T_map_lidar.append(registration.T_map_lidar if registration else None)
-        if registration is None:
-            self.report.lost.append(index)
+        prior = None if T_map_lidar_prior is None else PosePrior(T_map_lidar_prior, *self.prior_sigmas)
+        with report.timed("localise"):
+            fix = self.localise(scan, prior)
+        T_map_lidar = fix.registration.T_map_lidar
+        report.T_map_lidar.append(T_map_lidar)
+        if not fix.trusted:
+            report.lost.append(index)
             return
-        self.report.sigmas_m.append(float(np.sqrt(np.trace(registration.covariance[:3, :3]))))
-        T_map_lidar = registration.T_map_lidar
-        self._waiting.append(_Seen(transform(T_map_lidar, scan.points), T_map_lidar[:3, 3].copy()))
-        self._vote(self._waiting.popleft(), np.zeros(len(scan.points), dtype=np.bool_))
+        sigma_m = float(np.sqrt(np.linalg.eigvalsh(fix.registration.covariance[:3, :3])[-1]))
+        report.sigmas_m.append(sigma_m)
+        with report.timed("ground"):
+            points_map, origin_map = transform(T_map_lidar, fix.points), T_map_lidar[:3, 3].copy()
+            reference, near = self._reference_at(origin_map)
+            obstacle, cell = find_obstacles(points_map, reference)
+        self._waiting.append(_Waiting(points_map, origin_map, sigma_m, reference, near, obstacle, cell))
+        with report.timed("moving"):
+            decided = self.movers.push(points_map, origin_map, obstacle, scan.stamp_ns)
+        for _, moving in decided:
+            self._vote(self._waiting.popleft(), moving)
 
-    def _vote(self, seen: _Seen, moving: Bool) -> None:
+    def _vote(self, scan: _Waiting, moving: Bool) -> None:
         with self.report.timed("see"):
-            reference = self._reference_at(seen.origin_map)
-            obstacle, cell = find_obstacles(seen.points_map, reference)
-            view = see(seen.points_map, seen.origin_map, obstacle, moving, reference, cell)
+            view = see(scan.points_map, scan.origin_map, scan.obstacle, moving, scan.reference, scan.cell)
         with self.report.timed("vote"):
-            new = np.zeros(view.grid.shape, dtype=np.bool_)
-            for voting, tally in self._voters.values():
-                states, weights = classify_paper(view, reference, seen.origin_map, self.sensor, voting)
-                tally.add(view.grid, states, weights)
-                new |= states == CellState.CHANGED_OCCUPIED
-            wanted = obstacle & ~moving & (cell >= 0)
-            wanted[wanted] = new.ravel()[cell[wanted]]
-            self._new_points.offer(seen.points_map[wanted])
+            seen = Seen(view, scan.reference, scan.near, scan.origin_map, scan.sigma_m)
+            new = np.zeros(view.grid.shape, dtype=np.uint64)
+            for voter in self._voters.values():
+                new |= voter.add(seen)
+            base = np.ascontiguousarray(scan.reference.base).ravel()
+            chosen = select(scan.points_map, scan.cell, scan.obstacle & ~moving, new.ravel(), base)
+            self._new_points.offer(scan.points_map[chosen])
 
-    def _reference_at(self, origin_map: F64) -> Reference:
-        """The partial reference map R_i: the 80 m window around the sensor, cut from the tiles around it."""
+    def _reference_at(self, origin_map: F64) -> tuple[Reference, U64]:
+        """The partial reference map R_i, the 80 m window around the sensor, and what its voxels explain."""
         lattice = self.point_map.lattice
         window = window_around(lattice, origin_map[0], origin_map[1], self.settings.voting.window_m)
-        if self._around is None or window.intersection(self._around.grid) != window:
+        if self._around is None or window.intersection(self._around[0].grid) != window:
             row, col = window.row0 + window.rows // 2, window.col0 + window.cols // 2
             centre = tile_grid(lattice, (row // TILE_CELLS, col // TILE_CELLS))
-            self._around = reference_window(self.point_map, centre.padded(max(TILE_CELLS, window.rows)))
-        return cut_reference(self._around, window)
+            around = reference_window(self.point_map, centre.padded(max(TILE_CELLS, window.rows)))
+            self._around = around, dilated(around.occupied, around.base, 1)
+        around, near = self._around
+        return cut_reference(around, window), near[window.slices_in(around.grid)]
 
     def ballot(self, voting: VotingSettings | None = None) -> Ballot:
         """What this vehicle says so far, by the voter with these settings (default: the first).
 
         Raises MapvoteError if no scan voted, or no voter has these settings.
         """
-        voting = voting or next(iter(self._voters.values()))[0]
-        if _tally_key(voting) not in self._voters:
+        voting = voting or self._first
+        if _counts_as(voting) not in self._voters:
             raise MapvoteError("no voter of this vehicle has these settings; name them when the Vehicle is made")
         if len(self.report.lost) == self.report.scans:
             raise MapvoteError(
                 f"{self.name}: none of {self.report.scans} scans could be localised in map {self.point_map.map_id}; "
                 "is the drive on this map, and its prior in the map's frame?"
             )
-        tally = self._voters[_tally_key(voting)][1]
+        for _, moving in self.movers.flush():
+            self._vote(self._waiting.popleft(), moving)
         points = self._new_points.by_tile()
-        tiles = [self._tile(t, tally, points.get(t), voting) for t in sorted(tally.tiles) if tally.tiles[t].any()]
+        votes = self._voters[_counts_as(voting)].votes()
         return Ballot(
             map_id=self.point_map.map_id,
-            base={tile_key(t.tile): self._base_hash(t.tile) for t in tiles},
+            base={tile_key(tile): self._base_hash(tile) for tile in votes},
             vehicle=self.name,
             drive=self.drive_id,
             start_ns=self._stamps_ns[0],
@@ -164,29 +224,38 @@ class Vehicle:
             scans=self.report.scans,
             scans_localised=self.report.scans - len(self.report.lost),
             median_sigma_m=float(np.median(self.report.sigmas_m)),
-            tiles=tiles,
+            tiles=[self._tile(t, v, points.get(t), voting.two_stage) for t, v in votes.items()],
         )
 
-    def _tile(self, tile: TileIndex, tally: Tally, points: F64 | None, voting: VotingSettings) -> BallotTile:
-        votes = tally.tiles[tile]
-        states = decide(votes)
+    def _tile(self, tile: TileIndex, votes: TileVotes, points: F64 | None, two_stage: bool) -> BallotTile:
+        """One-stage, the server decides: then every cell that got such a vote may need its points and its mask."""
+        changed = {
+            change: votes.states == change if two_stage else votes.tally[..., change] > 0
+            for change in (CellState.CHANGED_OCCUPIED, CellState.CHANGED_EMPTY)
+        }
         new_points = None
-        if points is not None:  # one-stage: the server decides, so every cell that got such a vote may need its points
-            wanted = (
-                states == CellState.CHANGED_OCCUPIED if voting.two_stage else votes[..., CellState.CHANGED_OCCUPIED] > 0
-            )
-            kept = points_in(tile_grid(tally.lattice, tile), points, wanted)
+        if points is not None:
+            window = tile_grid(self.point_map.lattice, tile)
+            base = reference_window(self.point_map, window).base
+            new = np.where(changed[CellState.CHANGED_OCCUPIED], votes.new, np.uint64(0))
+            kept = points_in(window, points, new, base)
             new_points = pack_plane(kept) if len(kept) else None
-        if voting.two_stage:
-            return BallotTile(tile=tile, states=pack_plane(states), new_points=new_points)
-        return BallotTile(tile=tile, tally=pack_plane(np.moveaxis(to_wire(votes), -1, 0)), new_points=new_points)
+        gone = None if votes.gone is None else np.where(changed[CellState.CHANGED_EMPTY], votes.gone, np.uint64(0))
+        return BallotTile(
+            tile=tile,
+            states=pack_plane(votes.states) if two_stage else None,
+            tally=None if two_stage else pack_plane(np.moveaxis(to_wire(votes.tally), -1, 0)),
+            gone=None if gone is None else pack_plane(gone),
+            new_points=new_points,
+            free=None if votes.free is None else pack_plane(votes.free),
+        )
 
     def _base_hash(self, tile: TileIndex) -> str:
         return content_hash(self.point_map.tiles[tile].points) if tile in self.point_map.tiles else ""
 
 
-def _tally_key(voting: VotingSettings) -> VotingSettings:
-    """Voters that differ only in who decides (one stage or two) count alike and share a tally."""
+def _counts_as(voting: VotingSettings) -> VotingSettings:
+    """Voters that differ only in who decides (one stage or two) count alike and share their counters."""
     return voting.model_copy(update={"two_stage": True})
 
 
@@ -195,11 +264,20 @@ def vote_drive(
     point_map: PointMap,
     settings: Settings | None = None,
     *,
-    localise: Localise = trust_prior,
+    localise: Localise | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> tuple[Ballot, DriveReport]:
     """Every scan of ``drive`` observed by one Vehicle. ``progress(done, total)`` is called after each scan."""
-    vehicle = Vehicle(drive.vehicle, drive.sensor, point_map, settings, drive_id=drive.drive_id, localise=localise)
+    vehicle = Vehicle(
+        drive.vehicle,
+        drive.sensor,
+        point_map,
+        settings,
+        drive_id=drive.drive_id,
+        localise=localise,
+        prior_sigma_m=drive.prior_sigma_m,
+        prior_sigma_deg=drive.prior_sigma_deg,
+    )
     for i, scan in enumerate(drive):
         prior = None if drive.T_map_lidar_prior is None else drive.T_map_lidar_prior[i]
         vehicle.observe(scan, prior)

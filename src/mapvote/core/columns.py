@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Grid, tile_grid
 from mapvote.core.points import _lower_envelope
-from mapvote.core.types import F32, F64, I32, I64, PointMap, Reference
+from mapvote.core.types import F32, F64, I32, I64, U64, PointMap, Reference
 
 GROUND_MARGIN_M = 0.3
 """Points lower than this above the ground are ground: they never make a cell occupied (METHOD 2)."""
@@ -127,4 +127,34 @@ def tile_points(window: Grid, points: F64) -> F32:
     out = local.astype(np.float32)
     edge = np.nextafter(np.float32(TILE_CELLS * CELL_SIZE), np.float32(0.0))
     out[:, :2] = np.clip(out[:, :2], np.float32(0.0), edge)
+    return out
+
+
+@numba.njit(cache=True, nogil=True, inline="always")
+def shifted(word: np.uint64, layers: int) -> np.uint64:
+    """A column seen from a base ``layers`` lower (layers > 0: bits move up, what passes bit 63 is gone)."""
+    if layers >= 64 or layers <= -64:
+        return np.uint64(0)
+    return word << np.uint64(layers) if layers >= 0 else word >> np.uint64(-layers)
+
+
+@numba.njit(cache=True, nogil=True)
+def neighbourhood(words: U64, base: I32, r: int, c: int, reach: int) -> np.uint64:
+    """Voxels of column (r, c) within ``reach`` cells (a square) and one layer of a set bit; bases may differ."""
+    rows, cols = words.shape
+    near = np.uint64(0)
+    for i in range(max(r - reach, 0), min(r + reach + 1, rows)):
+        for j in range(max(c - reach, 0), min(c + reach + 1, cols)):
+            if words[i, j]:
+                near |= shifted(words[i, j], base[i, j] - base[r, c])
+    return near | (near << np.uint64(1)) | (near >> np.uint64(1))
+
+
+@numba.njit(cache=True, nogil=True)
+def dilated(words: U64, base: I32, reach: int) -> U64:
+    """:func:`neighbourhood` of every column, (rows, cols)."""
+    out = np.empty_like(words)
+    for r in range(words.shape[0]):
+        for c in range(words.shape[1]):
+            out[r, c] = neighbourhood(words, base, r, c, reach)
     return out

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import numba
 import numpy as np
 
 from mapvote.core.columns import tile_points
-from mapvote.core.grid import TILE_CELLS, Grid, Lattice, TileIndex, tile_grid, tile_of_cells
+from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Grid, Lattice, TileIndex, tile_grid, tile_of_cells
 from mapvote.core.points import voxel_keys
-from mapvote.core.types import F32, F64, I32, N_STATES, U8, Bool
+from mapvote.core.types import F32, F64, I32, N_STATES, U8, U64, Bool
 from mapvote.core.voting import cast
 
 _COMPACT_AT = 200_000
@@ -30,6 +31,17 @@ class Tally:
                 self.tiles[tile] = np.zeros((TILE_CELLS, TILE_CELLS, N_STATES), dtype=np.int32)
             inner, outer = common.slices_in(window), common.slices_in(grid)
             cast(self.tiles[tile][inner], states[outer], weights[outer])
+
+
+@numba.njit(cache=True, nogil=True)
+def select(points: F64, cell: I32, stationary: Bool, words: U64, base: I32) -> Bool:
+    """(n,) which of the ``stationary`` points (n, 3) lie in a voxel of ``words`` (cells,); ``cell`` (n,) -1 outside."""
+    out = np.zeros(len(points), dtype=np.bool_)
+    for i in range(len(points)):
+        if stationary[i] and cell[i] >= 0 and words[cell[i]]:
+            bit = int(np.floor(points[i, 2] / CELL_SIZE)) - base[cell[i]]
+            out[i] = (words[cell[i]] >> np.uint64(min(max(bit, 0), 63))) & np.uint64(1) != 0
+    return out
 
 
 class NewPoints:
@@ -63,7 +75,9 @@ class NewPoints:
         return {(r, c): self._points[(rows == r) & (cols == c)] for r, c in tiles}
 
 
-def points_in(window: Grid, points_map: F64, wanted: Bool) -> F32:
-    """Those of ``points_map`` (n, 3) that lie in ``wanted`` (256, 256) cells of a tile, float32 from its corner."""
+def points_in(window: Grid, points_map: F64, words: U64, base: I32) -> F32:
+    """Those of ``points_map`` (n, 3) that lie in voxels of ``words`` (256, 256) of a tile, float32 from its corner."""
     rows, cols, _ = window.indices_of(points_map)
-    return tile_points(window, points_map[wanted[rows, cols]])
+    cell = (rows * window.cols + cols).astype(np.int32)
+    wanted = select(points_map, cell, np.ones(len(points_map), np.bool_), words.ravel(), base.ravel())
+    return tile_points(window, points_map[wanted])

@@ -1,0 +1,105 @@
+"""From the evidence of a drive to votes (METHOD 4, rules C to G): sums over the voxels that matter in each cell.
+
+A cell's votes are numbers of (scan, voxel) pairs: mapped voxels struck speak for unchanged-occupied, mapped voxels
+seen through for changed-empty, free voxels struck for changed-occupied, and seen through for unchanged-empty. What is
+observed is weighed against what was observable, so neither scan rate nor beams need retuning.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+from scipy import ndimage
+
+from mapvote.config import VotingSettings
+from mapvote.core.types import I32, U8, U64, Bool, CellState
+from mapvote.core.voting import VOTE_UNIT, decide
+from mapvote.perception.evidence import PLANES, count_of
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """What a drive says of a window."""
+
+    tally: I32
+    """(rows, cols, 5) votes in VOTE_UNITs."""
+    gone: U64
+    """(rows, cols) mapped voxels that are there no more, should the cell be changed-empty."""
+    new: U64
+    """(rows, cols) voxels of new surface, should it be changed-occupied."""
+
+    def states(self) -> U8:
+        return decide(self.tally)
+
+
+@numba.njit(cache=True, nogil=True)
+def _weigh(
+    planes: U64, occupied: U64, near: U64, free: U64, by_height: bool, empty_votes: float, gone_votes: float,
+    min_scans: int, min_support: int, tally: I32, gone: U64, new: U64,
+) -> None:  # fmt: skip
+    for r in range(occupied.shape[0]):
+        for c in range(occupied.shape[1]):
+            cell, mapped = planes[r, c], occupied[r, c]
+            through, struck = np.uint64(0), np.uint64(0)
+            for k in range(PLANES):
+                through |= cell[k]
+                struck |= cell[PLANES + k]
+            if not through | struck:
+                continue
+            candidates = struck & ~mapped & ~near[r, c] & free[r, c]
+            kept, lost, found, refuted, rays = 0, 0, 0, 0, 0
+            for bit in range(64):
+                one = np.uint64(1) << np.uint64(bit)
+                if not (through | struck) & one:
+                    continue
+                t, s = count_of(cell, 0, bit), count_of(cell, PLANES, bit)
+                rays = max(rays, t)
+                if mapped & one:
+                    kept += s
+                    lost += t
+                    if gone_votes * t > s:
+                        gone[r, c] |= one
+                elif candidates & one and s >= min_scans and s > empty_votes * t:
+                    new[r, c] |= one
+                    found += s
+                    refuted += t
+            if kept or found < min_support:
+                found, refuted, new[r, c] = 0, 0, 0
+            if lost and not kept:
+                gone[r, c] |= mapped & ~struck  # what no ray reached goes with what it stood on
+            votes = tally[r, c]
+            votes[0] = kept * VOTE_UNIT
+            votes[1] = round(empty_votes * VOTE_UNIT * (refuted if by_height and found else 0 if mapped else rays))
+            votes[2] = found * VOTE_UNIT
+            votes[3] = round(lost * gone_votes * VOTE_UNIT)
+            votes[4] = 1 if not (votes[0] or votes[1] or votes[2] or votes[3]) else 0
+
+
+def weigh(planes: U64, occupied: U64, near: U64, free: U64 | None, settings: VotingSettings) -> Verdict:
+    """Votes of a window from its counters ``planes`` (rows, cols, 2 * PLANES) and the map's words (rows, cols).
+
+    ``near``: what the map's voxels explain (rule C); ``free``: what the map knows to be free (rule D), or None.
+    """
+    shape, rules = occupied.shape, settings.rules
+    everything = np.full(shape, ~np.uint64(0))
+    tally, gone, new = np.zeros((*shape, 5), np.int32), np.zeros(shape, np.uint64), np.zeros(shape, np.uint64)
+    _weigh(
+        planes, occupied, near if "C" in rules else np.where(occupied, everything, np.uint64(0)),
+        free if "D" in rules and free is not None else everything,
+        "F" in rules, settings.empty_votes if "F" in rules else 1.0, settings.gone_votes if "E" in rules else 1.0,
+        settings.min_scans if "G" in rules else 1, settings.min_support if "G" in rules else 1, tally, gone, new,
+    )  # fmt: skip
+    return Verdict(tally, gone, new)
+
+
+def drop_specks(states: U8, min_cells: int) -> Bool:
+    """(rows, cols) changed cells whose 8-connected component of equal state has fewer than ``min_cells`` (rule G)."""
+    specks = np.zeros(states.shape, dtype=np.bool_)
+    for change in (CellState.CHANGED_OCCUPIED, CellState.CHANGED_EMPTY):
+        label, _ = ndimage.label(states == change, structure=np.ones((3, 3)))
+        size = np.bincount(label.ravel())
+        size[0] = min_cells
+        specks |= size[label] < min_cells
+    return specks

@@ -1,0 +1,131 @@
+"""Two ways to count a drive, one interface: the paper's votes per scan, and columns of evidence (METHOD 4).
+
+A voter takes in scan after scan and gives, tile by tile, the same thing: a tally, and what would go and come.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from mapvote.config import VotingSettings
+from mapvote.core.columns import cut_reference, dilated, reference_window
+from mapvote.core.grid import TileIndex, tile_grid
+from mapvote.core.sensors import Sensor
+from mapvote.core.types import F64, I32, U8, U64, Bool, CellState, PointMap, Reference
+from mapvote.core.voting import decide
+from mapvote.perception.classify import classify_paper
+from mapvote.perception.evidence import Evidence, free_words
+from mapvote.perception.tally import Tally
+from mapvote.perception.verdict import drop_specks, weigh
+from mapvote.perception.visibility import ScanView
+
+ALL_BITS = ~np.uint64(0)
+
+
+@dataclass(frozen=True, slots=True)
+class Seen:
+    """What one localised scan saw."""
+
+    view: ScanView
+    reference: Reference
+    near: U64
+    """(rows, cols) what the map's voxels explain: their neighbourhood."""
+    origin_map: F64
+    sigma_m: float
+    """Standard deviation of the position, metres."""
+
+
+@dataclass(frozen=True, slots=True)
+class TileVotes:
+    """What a voter says of one tile."""
+
+    tally: I32
+    """(256, 256, 5) votes in VOTE_UNITs."""
+    states: U8
+    """(256, 256) decided by this vehicle alone."""
+    gone: U64 | None
+    """(256, 256) map voxels that are there no more where the cell is changed-empty; None: all of them."""
+    new: U64
+    """(256, 256) voxels whose points are new where the cell is changed-occupied."""
+    free: U64 | None
+    """(256, 256) voxels seen to be free; None: not asked."""
+
+
+class PaperVoter:
+    """Paper III: every scan classifies every cell and casts its votes."""
+
+    def __init__(self, voting: VotingSettings, sensor: Sensor, point_map: PointMap) -> None:
+        self.voting, self.sensor = voting, sensor
+        self._tally = Tally(point_map.lattice)
+
+    def add(self, seen: Seen) -> U64:
+        """Cast one scan's votes; returns (rows, cols) words of voxels whose points may be new."""
+        states, weights = classify_paper(seen.view, seen.reference, seen.origin_map, self.sensor, self.voting)
+        self._tally.add(seen.view.grid, states, weights)
+        return np.where(states == CellState.CHANGED_OCCUPIED, ALL_BITS, np.uint64(0))
+
+    def votes(self) -> dict[TileIndex, TileVotes]:
+        """Every tile with a vote, in ascending order."""
+        out = {}
+        for tile, tally in sorted(self._tally.tiles.items()):
+            if tally.any():
+                new = np.where(tally[..., CellState.CHANGED_OCCUPIED] > 0, ALL_BITS, np.uint64(0))
+                out[tile] = TileVotes(tally, decide(tally), None, new, None)
+        return out
+
+
+class ColumnVoter:
+    """METHOD 4: evidence per voxel over the drive, weighed at its end."""
+
+    def __init__(self, voting: VotingSettings, point_map: PointMap) -> None:
+        self.voting, self.point_map = voting, point_map
+        self.evidence = Evidence(point_map.lattice, by_ray="A" in voting.rules, veto="B" in voting.rules)
+
+    def add(self, seen: Seen) -> U64:
+        """Count one scan; returns (rows, cols) words of voxels whose points may be new."""
+        self.evidence.add(seen.view, seen.reference, reach=2 if seen.sigma_m > self.voting.wide_sigma_m else 1)
+        explained = seen.near if "C" in self.voting.rules else seen.reference.occupied
+        new = seen.view.hit & ~explained
+        free = seen.reference.free
+        return new if free is None or "D" not in self.voting.rules else new & free
+
+    def votes(self) -> dict[TileIndex, TileVotes]:
+        """Every tile with evidence, in ascending order."""
+        out = {}
+        for tile, planes in sorted(self.evidence.tiles.items()):
+            window = tile_grid(self.point_map.lattice, tile)
+            around = reference_window(self.point_map, window.padded(1))
+            near = dilated(around.occupied, around.base, 1)[1:-1, 1:-1]
+            here = cut_reference(around, window)
+            verdict = weigh(planes, here.occupied, near, here.free, self.voting)
+            if verdict.tally.any():
+                free = free_words(planes, here.occupied)
+                out[tile] = TileVotes(verdict.tally, verdict.states(), verdict.gone, verdict.new, free)
+        if "G" in self.voting.rules:
+            specks = {tile: self._specks(tile, out) for tile in out}
+            for tile, small in specks.items():
+                out[tile].states[small] = CellState.UNDETERMINED
+        return out
+
+    def _specks(self, tile: TileIndex, votes: dict[TileIndex, TileVotes]) -> Bool:
+        """Rule G on one tile, with enough of its neighbours that a component across the edge counts in full."""
+        lattice, halo = self.point_map.lattice, self.voting.min_cells
+        window = tile_grid(lattice, tile)
+        wide = window.padded(halo)
+        states = np.full(wide.shape, CellState.UNDETERMINED, dtype=np.uint8)
+        for other in wide.tiles():
+            if other in votes:
+                grid = tile_grid(lattice, other)
+                common = grid.intersection(wide)
+                states[common.slices_in(wide)] = votes[other].states[common.slices_in(grid)]
+        return drop_specks(states, halo)[window.slices_in(wide)]
+
+
+Voter = PaperVoter | ColumnVoter
+
+
+def make_voter(voting: VotingSettings, sensor: Sensor, point_map: PointMap) -> Voter:
+    """The voter that ``voting.method`` names."""
+    return ColumnVoter(voting, point_map) if voting.method == "columns" else PaperVoter(voting, sensor, point_map)
