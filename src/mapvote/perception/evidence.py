@@ -112,8 +112,8 @@ class Evidence:
 def free_words(planes: U64, occupied: U64) -> U64:
     """(rows, cols) voxels that were seen through in two scans or more, never struck, and that the map does not hold."""
     out = np.zeros(occupied.shape, dtype=np.uint64)
-    for r in range(out.shape[0]):
-        for c in range(out.shape[1]):
+    for r in range(occupied.shape[0]):
+        for c in range(occupied.shape[1]):
             struck, often = occupied[r, c], np.uint64(0)
             for k in range(PLANES):
                 struck |= planes[r, c, _STRUCK + k]
