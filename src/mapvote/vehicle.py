@@ -219,7 +219,7 @@ class Vehicle:
             drive=self.drive_id,
             start_ns=self._stamps_ns[0],
             end_ns=self._stamps_ns[-1],
-            method=f"{voting.method}-{'two-stage' if voting.two_stage else 'one-stage'}",
+            method=voting.method,
             settings_hash=self.settings.model_copy(update={"voting": voting}).digest(),
             scans=self.report.scans,
             scans_localised=self.report.scans - len(self.report.lost),
