@@ -89,7 +89,8 @@ class Stage:
 @lru_cache(maxsize=1)
 def _stage(scenario: Scenario, seed: int) -> Stage:
     world = make_world(scenario, seed)
-    sensor = replace(SENSORS[scenario.sensor], rate_hz=scenario.rate_hz)
+    model = SENSORS[scenario.sensor]
+    sensor = replace(model, rate_hz=max(model.rate_hz, scenario.rate_hz))
     routes = tuple(make_routes(scenario, world.terrain, seed))
     return Stage(scenario, seed, sensor, world, routes, ground_cells(world, truth_grid(scenario)))
 

@@ -60,7 +60,9 @@ class Scenario(_Table):
     vehicles: int = Field(default=3, ge=1, le=10)
     vehicle_lanes: tuple[str, ...] = ("east outer", "east inner", "west inner")
     sensor: str = "hdl32e"
-    rate_hz: float = Field(default=10.0, gt=0)
+    rate_hz: float = Field(
+        default=10.0, gt=0, description="scans recorded per second; the sensor turns no slower than its model"
+    )
     mount_height_m: float = 1.9
     motion_distortion: bool = True
     max_grade: float = Field(default=0.03, ge=0, le=0.12)
