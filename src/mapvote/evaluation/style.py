@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +11,7 @@ from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 
 from mapvote.core.types import NO_VOTE, U8, CellState
+from mapvote.formats.whole import whole_file
 
 INK, PAPER_WHITE, FAINT = "#22303c", "#ffffff", "#8795a1"
 NEW, GONE, STANDING, EMPTY, UNSURE = "#d7263d", "#1673c4", "#51687c", "#e6ecf1", "#f2c230"
@@ -65,7 +65,5 @@ def save(figure: Figure, path: Path) -> None:
     """PNG without dates or versions in it, whole or not at all: same picture, same bytes."""
     import matplotlib
 
-    sibling = path.with_name(f".{path.name}.part")
-    with matplotlib.rc_context(_FONT):
-        figure.savefig(sibling, format="png", dpi=140, metadata={"Software": None})
-    os.replace(sibling, path)
+    with matplotlib.rc_context(_FONT), whole_file(path) as partial:
+        figure.savefig(partial, format="png", dpi=140, metadata={"Software": None})
