@@ -35,7 +35,9 @@ def _percent(value: float, digits: int = 1) -> str:
     return f"{100 * value:.{digits}f} %"
 
 
-def _class_table(result: Result, title: str, metric: str, truth: str, printed: Mapping[str, tuple[float, ...]]) -> Table:
+def _class_table(
+    result: Result, title: str, metric: str, truth: str, printed: Mapping[str, tuple[float, ...]]
+) -> Table:
     table = Table(title=f"{title} ({truth} truth)", box=box.SIMPLE_HEAD, title_justify="left", title_style="bold")
     table.add_column("")
     for name in CLASSES:
@@ -82,8 +84,8 @@ def _map_table(result: Result) -> Iterator[Table]:
     if not rows:
         return
     table = Table(title="The updated map", box=box.SIMPLE_HEAD, title_justify="left", title_style="bold")
-    for heading in ("", "stale points deleted", "valid points deleted", "new surface added", "added points that are on no surface",
-                    "objects found", "false objects"):  # fmt: skip
+    for heading in ("", "stale deleted", "valid deleted", "new surface added", "added on no surface", "objects found",
+                    "false objects"):  # fmt: skip
         table.add_column(heading, justify="right" if heading else "left")
     for case, entry in rows.items():
         scores, objects = entry["map"], entry["objects"]
