@@ -15,12 +15,12 @@ from mapvote.core.types import NO_VOTE, CellState
 from mapvote.evaluation import paper
 from mapvote.evaluation.metrics import (
     UNSCORED,
+    MapJudge,
     Scores,
     classes_of,
     confusion,
     coverage,
     score_cells,
-    score_map,
     score_objects,
 )
 
@@ -97,9 +97,10 @@ def wall(x: float) -> np.ndarray:
 def test_map_scores_of_a_perfect_update_and_of_none() -> None:
     kept, added, removed = wall(0.0), wall(5.0), wall(10.0)
     old, new = np.vstack([kept, removed]), np.vstack([kept, added])
-    perfect = score_map(old, new, kept, added, removed)
+    judge = MapJudge(old, kept, added, removed)
+    perfect = judge.score(new)
     assert (perfect.stale_deleted, perfect.valid_deleted, perfect.new_added, perfect.added_false) == (1, 0, 1, 0)
-    nothing = score_map(old, old, kept, added, removed)
+    nothing = judge.score(old)
     assert (nothing.stale_deleted, nothing.valid_deleted, nothing.new_added, nothing.added_false) == (0, 0, 0, 0)
     assert nothing.stale_points == len(removed)
     assert nothing.valid_points == len(kept)
@@ -109,14 +110,14 @@ def test_map_scores_count_damage_and_inventions() -> None:
     kept, added, removed = wall(0.0), wall(5.0), wall(10.0)
     old = np.vstack([kept, removed])
     broken = np.vstack([kept[:50], removed, wall(20.0)])
-    scores = score_map(old, broken, kept, added, removed)
+    scores = MapJudge(old, kept, added, removed).score(broken)
     assert scores.valid_deleted == 0.5
     assert scores.added_false == 1.0
 
 
 def test_map_scores_of_empty_maps_are_zero_not_nan() -> None:
     empty = np.zeros((0, 3))
-    scores = score_map(empty, empty, empty, empty, empty)
+    scores = MapJudge(empty, empty, empty, empty).score(empty)
     assert set(scores.to_dict().values()) == {0}
 
 

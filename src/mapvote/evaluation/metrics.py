@@ -126,44 +126,48 @@ class MapScores:
         return {name: getattr(self, name) for name in self.__slots__}
 
 
-def score_map(
-    old_points: F64, new_points: F64, kept: F64, added: F64, removed: F64, *, reach_m: float = 0.3
-) -> MapScores:
-    """Compare the map before and after with noise-free surface samples of the two worlds.
+class MapJudge:
+    """Compares maps with noise-free surface samples of the two worlds; what the old map is worth is asked once.
 
-    ``old_points`` and ``new_points`` (n, 3) are the obstacle points of the map before and after the update;
-    a point survives if its coordinates are found again bit for bit. ``kept``, ``added`` and ``removed`` (m, 3) are
-    surface samples, map metres: standing in both worlds, only in the new one, only in the old one. An old point
-    is stale if a removed sample lies within ``reach_m`` and no kept or added one nearer; valid if the nearest
+    ``old_points`` (n, 3) are the obstacle points of the map before the update. ``kept``, ``added`` and ``removed``
+    (m, 3) are surface samples, map metres: standing in both worlds, only in the new one, only in the old one. An old
+    point is stale if a removed sample lies within ``reach_m`` and no kept or added one nearer; valid if the nearest
     sample within reach is a kept one. Points near no surface (trails, noise) are neither.
     """
-    to_kept, to_added, to_removed = (_distance(old_points, surface) for surface in (kept, added, removed))
-    stale = (to_removed <= reach_m) & (to_removed < np.minimum(to_kept, to_added))
-    valid = (to_kept <= reach_m) & (to_kept <= to_removed)
-    survived, fresh = _same_rows(old_points, new_points)
-    new_world = np.minimum(_distance(fresh, kept), _distance(fresh, added))
-    reached = _distance(added, new_points) <= reach_m
-    return MapScores(
-        stale_deleted=ratio(np.count_nonzero(stale & ~survived), np.count_nonzero(stale)),
-        valid_deleted=ratio(np.count_nonzero(valid & ~survived), np.count_nonzero(valid)),
-        new_added=ratio(np.count_nonzero(reached), len(added)),
-        added_false=ratio(np.count_nonzero(new_world > reach_m), len(fresh)),
-        stale_points=int(np.count_nonzero(stale)),
-        valid_points=int(np.count_nonzero(valid)),
-        new_samples=len(added),
-        added_points=len(fresh),
-    )
+
+    def __init__(self, old_points: F64, kept: F64, added: F64, removed: F64, *, reach_m: float = 0.3) -> None:
+        self._old, self._added, self._reach_m = old_points, added, reach_m
+        self._now = cKDTree(np.concatenate([kept, added]))
+        to_removed = _distance(old_points, cKDTree(removed))
+        to_kept, to_now = _distance(old_points, cKDTree(kept)), _distance(old_points, self._now)
+        self.stale = (to_removed <= reach_m) & (to_removed < to_now)
+        self.valid = (to_kept <= reach_m) & (to_kept <= to_removed)
+
+    def score(self, new_points: F64) -> MapScores:
+        """``new_points`` (n, 3): the obstacle points of the updated map; an old one survives if found bit for bit."""
+        survived, fresh = same_rows(self._old, new_points)
+        reached = _distance(self._added, cKDTree(new_points)) <= self._reach_m
+        return MapScores(
+            stale_deleted=ratio(np.count_nonzero(self.stale & ~survived), np.count_nonzero(self.stale)),
+            valid_deleted=ratio(np.count_nonzero(self.valid & ~survived), np.count_nonzero(self.valid)),
+            new_added=ratio(np.count_nonzero(reached), len(self._added)),
+            added_false=ratio(np.count_nonzero(_distance(fresh, self._now) > self._reach_m), len(fresh)),
+            stale_points=int(np.count_nonzero(self.stale)),
+            valid_points=int(np.count_nonzero(self.valid)),
+            new_samples=len(self._added),
+            added_points=len(fresh),
+        )
 
 
-def _distance(points: F64, surface: F64) -> F64:
-    """(n,) metres from each point to the nearest sample; inf where there is none."""
-    if not len(points) or not len(surface):
+def _distance(points: F64, surface: cKDTree) -> F64:
+    """(n,) metres from each point to the nearest sample; inf beyond a metre or where there is none."""
+    if not len(points) or not surface.n:
         return np.full(len(points), np.inf)
-    distance: F64 = cKDTree(surface).query(points, distance_upper_bound=2.0)[0]
+    distance: F64 = surface.query(points, distance_upper_bound=1.0)[0]
     return distance
 
 
-def _same_rows(old: F64, new: F64) -> tuple[Bool, F64]:
+def same_rows(old: F64, new: F64) -> tuple[Bool, F64]:
     """(which rows of ``old`` are in ``new``, the rows of ``new`` that are not in ``old``), compared bit for bit."""
     record = np.dtype((np.void, 24))
     a, b = (np.ascontiguousarray(p, dtype=np.float64).view(record).ravel() for p in (old, new))
