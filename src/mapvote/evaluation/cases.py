@@ -1,0 +1,182 @@
+"""The paper's five cases, the other occlusion rules and our own method, from one pass over each drive (paper V).
+
+All of them are settings of the one rule. A vehicle's pass gives one ballot a voter; the server's rule then decides,
+and the decided cells are scored. Ballots are cached, so that a run that was cut short goes on where it stopped.
+"""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from mapvote.config import CASES, FuseSettings, Settings, VotingSettings
+from mapvote.core.ballot import Ballot, decode, encode, unpack_states, unpack_tally
+from mapvote.core.grid import Grid, TileIndex, tile_grid
+from mapvote.core.types import F64, NO_VOTE, U8, PointMap
+from mapvote.core.voting import decide
+from mapvote.evaluation.scene import BALLOTS_FROM, Progress, Scene, key_of, sources_digest
+from mapvote.evaluation.truth import lay_on
+from mapvote.fleet.fuse import Decision, states_over
+from mapvote.fleet.update import update_map
+from mapvote.formats.whole import whole_folder
+from mapvote.vehicle import Vehicle, trust_prior
+
+OCCLUSIONS = ("first_hit", "farthest_return", "column")
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """One line of the tables: a vote and how it is fused."""
+
+    name: str
+    voting: VotingSettings
+    min_votes: int
+
+
+def paper_cases(settings: Settings) -> dict[str, Case]:
+    """Cases 1 to 5 under ``first_hit``, named "1".., and under the other occlusion rules, named "1 column".. ."""
+    cases = {}
+    for occlusion in OCCLUSIONS:
+        for number, booleans in CASES.items():
+            name = number if occlusion == OCCLUSIONS[0] else f"{number} {occlusion}"
+            voting = settings.voting.model_copy(update={"method": "paper", "occlusion": occlusion, **booleans})
+            cases[name] = Case(name, voting, min_votes=1)
+    return cases
+
+
+def choose_cases(settings: Settings, wanted: Sequence[str]) -> list[Case]:
+    """The cases by name; "all" is every one there is."""
+    every = paper_cases(settings)
+    return list(every.values()) if "all" in wanted else [every[name] for name in wanted]
+
+
+@dataclass(frozen=True, slots=True)
+class Pass:
+    """What one vehicle brought home."""
+
+    vehicle: str
+    ballots: dict[str, Ballot]
+    """By case."""
+    sizes: dict[str, int]
+    """Bytes of each ballot as it is sent."""
+    T_map_lidar: F64
+    """(n, 4, 4) where the vehicle believed to be; NaN where it abstained."""
+    stage_ms: dict[str, float]
+    """Median milliseconds a scan by stage."""
+
+
+def passes(scene: Scene, cases: Sequence[Case], workers: int, progress: Progress | None = None) -> list[Pass]:
+    """Every voting vehicle's pass, in order of their numbers; those that the cache lacks are driven, in parallel."""
+    names = scene.drive_names("v")
+    missing = [name for name in names if not pass_folder(scene, cases, name).exists()]
+    done = len(names) - len(missing)
+    if progress:
+        progress("voting", done, len(names))
+    if workers > 1 and len(missing) > 1:
+        with ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn")) as pool:
+            for finished in as_completed([pool.submit(drive_once, scene, cases, name) for name in missing]):
+                finished.result()
+                done += 1
+                if progress:
+                    progress("voting", done, len(names))
+    else:
+        for name in missing:
+            drive_once(scene, cases, name)
+            done += 1
+            if progress:
+                progress("voting", done, len(names))
+    return [_read_pass(scene, cases, name) for name in names]
+
+
+def pass_folder(scene: Scene, cases: Sequence[Case], vehicle: str) -> Any:
+    """Where a vehicle's ballots lie in the cache."""
+    key = key_of(sources_digest(BALLOTS_FROM), *(case.voting.model_dump_json() for case in cases))
+    return scene.work / f"votes-{key}" / vehicle
+
+
+def drive_once(scene: Scene, cases: Sequence[Case], name: str) -> None:
+    """One vehicle's drive with a voter for every case; ballots and poses into the cache, whole or not at all."""
+    drive, point_map = scene.drive(name), scene.point_map
+    vehicle = Vehicle(
+        drive.vehicle, drive.sensor, point_map, scene.settings,
+        drive_id=drive.drive_id, voters=[case.voting for case in cases], localise=trust_prior,
+    )  # fmt: skip
+    for i, scan in enumerate(drive):
+        vehicle.observe(scan, None if drive.T_map_lidar_prior is None else drive.T_map_lidar_prior[i])
+    report = vehicle.report
+    poses = np.full((len(drive), 4, 4), np.nan)
+    for i, T in enumerate(report.T_map_lidar):
+        if T is not None:
+            poses[i] = T
+    with whole_folder(pass_folder(scene, cases, name), sign="pass.json") as folder:
+        for case in cases:
+            (folder / f"{case.name}.ballot").write_bytes(encode(vehicle.ballot(case.voting)))
+        np.save(folder / "poses.npy", poses)
+        stages = {stage: 1000.0 * float(np.median(seconds)) for stage, seconds in report.stage_s.items()}
+        (folder / "pass.json").write_text(json.dumps(stages))
+
+
+def _read_pass(scene: Scene, cases: Sequence[Case], name: str) -> Pass:
+    folder = pass_folder(scene, cases, name)
+    raw = {case.name: (folder / f"{case.name}.ballot").read_bytes() for case in cases}
+    return Pass(
+        vehicle=name,
+        ballots={case: decode(data) for case, data in raw.items()},
+        sizes={case: len(data) for case, data in raw.items()},
+        T_map_lidar=np.load(folder / "poses.npy"),
+        stage_ms=json.loads((folder / "pass.json").read_text()),
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What the server made of one case's ballots."""
+
+    updated: PointMap
+    states: U8
+    """Decided, over the truth's window."""
+    vehicle_states: list[U8]
+    """Each vehicle's own decision, over the truth's window."""
+    decisions: Mapping[TileIndex, Decision]
+    seconds: float
+    """Spent on fusing."""
+
+
+def fuse_case(
+    point_map: PointMap, ballots: Sequence[Ballot], min_votes: int, fuse: FuseSettings, window: Grid
+) -> Outcome:
+    """The server's side of one case (paper IV): decide every cell, edit the map."""
+    start = time.perf_counter()
+    settings = fuse.model_copy(update={"min_votes": min_votes})
+    updated, decisions = update_map(point_map, ballots, settings)
+    seconds = time.perf_counter() - start
+    states, grid = states_over(point_map.lattice, decisions)
+    own = [lay_on(*ballot_states(ballot, point_map), window) for ballot in ballots]
+    return Outcome(updated, lay_on(states, grid, window), own, decisions, seconds)
+
+
+def ballot_states(ballot: Ballot, point_map: PointMap) -> tuple[U8, Grid]:
+    """What the vehicle itself decided, (rows, cols) over the window of its tiles, two-stage or one-stage."""
+    tiles = {tile.tile: tile for tile in ballot.tiles}
+    grids = [tile_grid(point_map.lattice, index) for index in tiles]
+    window = grids[0]
+    for grid in grids[1:]:
+        window = window.union(grid)
+    out = np.full(window.shape, NO_VOTE, dtype=np.uint8)
+    for grid, states in zip(grids, _decided(tiles.values()), strict=True):
+        out[grid.slices_in(window)] = states
+    return out, window
+
+
+def _decided(tiles: Any) -> Iterator[U8]:
+    for tile in tiles:
+        yield (
+            unpack_states(tile.states) if tile.states is not None else decide(unpack_tally(tile.tally).astype(np.int32))
+        )

@@ -1,0 +1,148 @@
+"""``mapvote evaluate``: a scenario and a seed become Tables II-IV and what else there is to measure (paper V)."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from mapvote.core.ballot import Ballot
+from mapvote.core.grid import CELL_SIZE, Grid
+from mapvote.core.types import F64, PointMap
+from mapvote.evaluation.cases import Case, Outcome, Pass, fuse_case, passes
+from mapvote.evaluation.metrics import MapJudge, coverage, score_cells, score_objects
+from mapvote.evaluation.nearest import map_obstacles
+from mapvote.evaluation.scene import Progress, Scene
+from mapvote.evaluation.truth import Truth, pose_errors, rigid_between
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """The numbers, and what pictures need."""
+
+    result: dict[str, Any]
+    """What ``--json`` writes (DESIGN 6)."""
+    scene: Scene
+    truth: Truth
+    window: Grid
+    first_map: PointMap
+    outcomes: Mapping[str, Outcome]
+    drives: Sequence[Pass]
+
+
+def evaluate(scene: Scene, cases: Sequence[Case], progress: Progress | None = None) -> Evaluation:
+    """Run what the cache lacks, decide and score every case. Two processes where there are two cores."""
+    started = time.perf_counter()
+    scene.prepare(progress)
+    prepared = time.perf_counter()
+    drives = passes(scene, cases, min(2, os.cpu_count() or 1), progress)
+    voted = time.perf_counter()
+    truth, first_map = scene.truth, scene.point_map
+    window = truth.grid_on(first_map.lattice)
+    judge = MapJudge(map_obstacles(first_map), *_above_ground(first_map, truth))
+    objects = [{"kind": o["kind"], "cells": truth.cells_of(o["footprint"])} for o in truth.objects]
+    outcomes, entries = {}, {}
+    for i, case in enumerate(cases):
+        if progress:
+            progress("scoring", i, len(cases))
+        ballots = [drive.ballots[case.name] for drive in drives]
+        outcome = fuse_case(first_map, ballots, case.min_votes, scene.settings.fuse, window)
+        outcomes[case.name] = outcome
+        entries[case.name] = {
+            **score_outcome(outcome, truth, objects),
+            "map": judge.score(map_obstacles(outcome.updated)).to_dict(),
+            "bytes_per_vehicle": [drive.sizes[case.name] for drive in drives],
+            "state_bytes_per_vehicle": [_state_bytes(ballot) for ballot in ballots],
+        }
+    first = entries[cases[0].name]
+    result = {
+        "scenario": scene.scenario,
+        "seed": scene.seed,
+        "poses": "truth" if scene.truth_poses else "ndt",
+        "cells": int(truth.strict.size),
+        "coverage": first["coverage"],
+        "settings": scene.settings.model_dump(mode="json"),
+        "map_shift": map_shift(scene, truth),
+        "localisation": localisation(scene, truth, drives),
+        "cases": entries,
+        "timings": {
+            "prepare_s": prepared - started,
+            "vote_s": voted - prepared,
+            "score_s": time.perf_counter() - voted,
+            "stages_ms": {drive.vehicle: drive.stage_ms for drive in drives},
+            "fuse_s": {name: outcome.seconds for name, outcome in outcomes.items()},
+        },
+    }
+    return Evaluation(result, scene, truth, window, first_map, outcomes, drives)
+
+
+def score_outcome(outcome: Outcome, truth: Truth, objects: Sequence[Mapping[str, object]]) -> dict[str, Any]:
+    """R for both truths, coverage, objects."""
+    return {
+        "strict": score_cells(outcome.states, truth.strict).to_dict(),
+        "provenance": score_cells(outcome.states, truth.provenance).to_dict(),
+        "coverage": coverage(outcome.vehicle_states, truth.strict),
+        "objects": score_objects(outcome.states, truth.strict, objects, CELL_SIZE).to_dict(),
+    }
+
+
+def _above_ground(first_map: PointMap, truth: Truth) -> tuple[F64, F64, F64]:
+    """Surface samples that could be obstacle points: at least 0.3 m above the map's ground, where that is known."""
+    from mapvote.core.columns import GROUND_MARGIN_M, reference_window
+
+    reference = reference_window(first_map, truth.grid_on(first_map.lattice))
+    chosen = []
+    for samples in truth.surfaces():
+        rows, cols, inside = reference.grid.indices_of(samples)
+        ground = reference.ground_z[rows.clip(0, reference.grid.rows - 1), cols.clip(0, reference.grid.cols - 1)]
+        low = inside & (samples[:, 2] - ground < GROUND_MARGIN_M)
+        chosen.append(samples[~low])
+    return chosen[0], chosen[1], chosen[2]
+
+
+def _state_bytes(ballot: Ballot) -> int:
+    """Bytes of the votes alone, without new points and other planes."""
+    return sum(len(tile.states or tile.tally or b"") for tile in ballot.tiles)
+
+
+def map_shift(scene: Scene, truth: Truth) -> dict[str, float]:
+    """How far the first map lies from the truth: mean offset of the survey's poses, and the 95 % of their distances."""
+    names = scene.drive_names("survey_")
+    offset = np.concatenate([scene.survey_poses(n)[:, :3, 3] - truth.poses(n)[:, :3, 3] for n in names])
+    mean = offset.mean(axis=0)
+    return {
+        "mean_m": float(np.linalg.norm(mean)),
+        "x_m": float(mean[0]),
+        "y_m": float(mean[1]),
+        "z_m": float(mean[2]),
+        "p95_m": float(np.percentile(np.linalg.norm(offset, axis=1), 95)),
+    }
+
+
+def localisation(scene: Scene, truth: Truth, drives: Sequence[Pass]) -> dict[str, dict[str, float]]:
+    """Each vehicle's pose errors in the map's frame (the survey's trajectory rigidly aligned to its truth)."""
+    names = scene.drive_names("survey_")
+    T_map_world = rigid_between(
+        np.concatenate([scene.survey_poses(n) for n in names]), np.concatenate([truth.poses(n) for n in names])
+    )
+    return {d.vehicle: error_summary(d.T_map_lidar, T_map_world @ truth.poses(d.vehicle)) for d in drives}
+
+
+def error_summary(T_found: F64, T_true: F64) -> dict[str, float]:
+    """Errors over the scans that were localised (rows that are not NaN), and how many there were."""
+    there = np.isfinite(T_found).all(axis=(1, 2))
+    metres, radians = pose_errors(T_found[there], T_true[there])
+    if not there.any():
+        metres, radians = np.zeros(1), np.zeros(1)
+    return {
+        "scans": len(T_found),
+        "localised": int(there.sum()),
+        "median_m": float(np.median(metres)),
+        "p99_m": float(np.percentile(metres, 99)),
+        "max_m": float(metres.max()),
+        "median_deg": float(np.degrees(np.median(radians))),
+    }
