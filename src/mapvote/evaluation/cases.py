@@ -12,6 +12,7 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,14 +20,14 @@ import numpy as np
 from mapvote.config import CASES, FuseSettings, Settings, VotingSettings
 from mapvote.core.ballot import Ballot, decode, encode, unpack_states, unpack_tally
 from mapvote.core.grid import Grid, TileIndex, tile_grid
-from mapvote.core.types import F64, NO_VOTE, U8, PointMap
+from mapvote.core.types import F64, NO_VOTE, U8, MapvoteError, PointMap
 from mapvote.core.voting import decide
 from mapvote.evaluation.scene import BALLOTS_FROM, Progress, Scene, key_of, sources_digest
 from mapvote.evaluation.truth import lay_on
 from mapvote.fleet.fuse import Decision, states_over
 from mapvote.fleet.update import update_map
 from mapvote.formats.whole import whole_folder
-from mapvote.vehicle import Vehicle, trust_prior
+from mapvote.vehicle import GivenPoses, Vehicle
 
 OCCLUSIONS = ("first_hit", "farthest_return", "column")
 
@@ -51,10 +52,31 @@ def paper_cases(settings: Settings) -> dict[str, Case]:
     return cases
 
 
-def choose_cases(settings: Settings, wanted: Sequence[str]) -> list[Case]:
-    """The cases by name; "all" is every one there is."""
-    every = paper_cases(settings)
-    return list(every.values()) if "all" in wanted else [every[name] for name in wanted]
+def column_cases(settings: Settings) -> dict[str, Case]:
+    """Our own method: as it is, decided by the server alone, and growing rule by rule (METHOD 4, the ablation)."""
+
+    def columns(name: str, **changes: Any) -> Case:
+        voting = settings.voting.model_copy(update={"method": "columns", **changes})
+        return Case(name, voting, settings.fuse.min_votes)
+
+    whole = columns("columns")
+    cases = [whole, columns("columns one-stage", two_stage=False)]
+    rules = whole.voting.rules
+    cases += [columns(f"columns {rules[:n]}", rules=rules[:n]) for n in range(1, len(rules))]
+    return {case.name: case for case in cases}
+
+
+def choose_cases(settings: Settings, wanted: str) -> list[Case]:
+    """Cases by comma-separated names: 1 to 5, "1 column" and its like, columns, or "all" that there is.
+
+    MapvoteError names one that there is not.
+    """
+    every = {**paper_cases(settings), **column_cases(settings)}
+    names = list(every) if wanted == "all" else [name.strip() for name in wanted.split(",")]
+    for name in names:
+        if name not in every:
+            raise MapvoteError(f"no case {name!r}: choose from all, {', '.join(every)}")
+    return [every[name] for name in names]
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,7 +117,7 @@ def passes(scene: Scene, cases: Sequence[Case], workers: int, progress: Progress
     return [_read_pass(scene, cases, name) for name in names]
 
 
-def pass_folder(scene: Scene, cases: Sequence[Case], vehicle: str) -> Any:
+def pass_folder(scene: Scene, cases: Sequence[Case], vehicle: str) -> Path:
     """Where a vehicle's ballots lie in the cache."""
     key = key_of(sources_digest(BALLOTS_FROM), *(case.voting.model_dump_json() for case in cases))
     return scene.work / f"votes-{key}" / vehicle
@@ -106,15 +128,17 @@ def drive_once(scene: Scene, cases: Sequence[Case], name: str) -> None:
     drive, point_map = scene.drive(name), scene.point_map
     vehicle = Vehicle(
         drive.vehicle, drive.sensor, point_map, scene.settings,
-        drive_id=drive.drive_id, voters=[case.voting for case in cases], localise=trust_prior,
+        drive_id=drive.drive_id, voters=[case.voting for case in cases],
+        localise=GivenPoses(drive.stamps_ns, scene.truth.poses(name)) if scene.truth_poses else None,
+        prior_sigma_m=drive.prior_sigma_m, prior_sigma_deg=drive.prior_sigma_deg,
     )  # fmt: skip
     for i, scan in enumerate(drive):
         vehicle.observe(scan, None if drive.T_map_lidar_prior is None else drive.T_map_lidar_prior[i])
-    report = vehicle.report
+    report, lost = vehicle.report, set(vehicle.report.lost)
     poses = np.full((len(drive), 4, 4), np.nan)
-    for i, T in enumerate(report.T_map_lidar):
-        if T is not None:
-            poses[i] = T
+    for i, T_map_lidar in enumerate(report.T_map_lidar):
+        if i not in lost:
+            poses[i] = T_map_lidar
     with whole_folder(pass_folder(scene, cases, name), sign="pass.json") as folder:
         for case in cases:
             (folder / f"{case.name}.ballot").write_bytes(encode(vehicle.ballot(case.voting)))
