@@ -138,6 +138,20 @@ class FuseSettings(Section):
     max_age_days: float = 30.0
 
 
+class GateSettings(Section):
+    """fleet/gate.py: when a new version may be published, judged by a reference drive."""
+
+    reach_m: float = Field(default=50.0, gt=0, description="scans farther from every change see no difference")
+    max_scans: int = Field(default=60, gt=0, description="scans compared at most, spread evenly")
+    min_scans: int = Field(default=20, ge=10, description="with fewer the gate abstains")
+    block_scans: int = Field(default=5, ge=1, le=5, description="neighbouring scans that count as one observation")
+    start_m: float = Field(default=0.3, gt=0, description="guesses start this far around the prior pose")
+    tolerance_found: float = Field(default=0.02, ge=0, description="allowed loss of the share of scans localised")
+    tolerance_inlier_share: float = Field(default=0.01, ge=0, description="allowed loss of inlier share")
+    tolerance_score: float = Field(default=0.01, ge=0, description="allowed loss of the NDT score")
+    tolerance_scatter_m: float = Field(default=0.02, ge=0, description="allowed growth of the poses' scatter")
+
+
 class Settings(Section):
     """All of them. ``mapvote config`` prints this page."""
 
@@ -146,6 +160,7 @@ class Settings(Section):
     mapping: MappingSettings = MappingSettings()
     voting: VotingSettings = VotingSettings()
     fuse: FuseSettings = FuseSettings()
+    gate: GateSettings = GateSettings()
 
     def digest(self) -> str:
         """SHA-256 of the canonical JSON: ballots of one round must agree on it."""
