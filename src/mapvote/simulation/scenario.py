@@ -80,7 +80,8 @@ def names() -> list[str]:
 
 
 def load_scenario(scenario: str | Path, overrides: Mapping[str, Any] | None = None) -> Scenario:
-    """A scenario by name or TOML file; ``overrides`` replace fields. MapvoteError names a key that does not exist."""
+    """A scenario by name or TOML file; ``overrides`` replace fields, key by key in its
+    tables. MapvoteError names a key that does not exist."""
     path = Path(scenario)
     if path.suffix == ".toml":
         if not path.is_file():
@@ -91,7 +92,10 @@ def load_scenario(scenario: str | Path, overrides: Mapping[str, Any] | None = No
     else:
         raise MapvoteError(f"no scenario '{scenario}': choose one of {', '.join(names())} or give a .toml file")
     try:
-        found = Scenario.model_validate({**tomllib.loads(text), **(overrides or {})})
+        table = tomllib.loads(text)
+        for key, value in (overrides or {}).items():
+            table[key] = {**table.get(key, {}), **value} if isinstance(value, Mapping) else value
+        found = Scenario.model_validate(table)
     except tomllib.TOMLDecodeError as error:
         raise MapvoteError(f"scenario {scenario}: not TOML ({error})") from error
     except ValidationError as error:
