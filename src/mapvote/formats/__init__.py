@@ -1,6 +1,6 @@
 """Maps and drives in everybody's file formats: open a drive, read a map, write a map.
 
-``DRIVES`` and ``MAPS`` list the formats in the order in which they are tried; each is recognised by what lies at
+``DRIVES`` and ``CLOUDS`` list the formats in the order in which they are tried; each is recognised by what lies at
 the path, never by asking.
 """
 
@@ -9,19 +9,42 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
+
+from mapvote.core.tiling import all_points
 from mapvote.core.types import Drive, MapvoteError, PointMap
+from mapvote.formats.autoware import PROJECTOR, is_autoware, read_autoware, write_autoware
+from mapvote.formats.cloud import Cloud, to_map
 from mapvote.formats.drive import DriveOptions
 from mapvote.formats.kitti import DriveWriter, is_kitti_folder, open_kitti, read_T_map_lidar
+from mapvote.formats.las import is_las, read_las, write_las
 from mapvote.formats.mapfolder import is_map_folder, read_map_folder, write_map_folder
+from mapvote.formats.pcd import is_pcd, read_pcd, write_pcd
+from mapvote.formats.ply import is_ply, read_ply, write_ply
 
-__all__ = ["DRIVES", "MAPS", "DriveWriter", "open_drive", "read_T_map_lidar", "read_map", "write_map"]
+__all__ = [
+    "CLOUDS",
+    "DRIVES",
+    "DriveWriter",
+    "export_map",
+    "open_drive",
+    "read_T_map_lidar",
+    "read_cloud",
+    "read_map",
+    "write_map",
+    "write_pcd",
+]
 
 DRIVES: dict[str, tuple[Callable[[Path], bool], Callable[[Path, DriveOptions], Drive]]] = {
     "KITTI drive folder": (is_kitti_folder, open_kitti),
 }
-MAPS: dict[str, tuple[Callable[[Path], bool], Callable[[Path], PointMap]]] = {
-    "mapvote map": (is_map_folder, read_map_folder),
+CLOUDS: dict[str, tuple[Callable[[Path], bool], Callable[[Path], Cloud]]] = {
+    "Autoware tile folder": (is_autoware, read_autoware),
+    "PCD file": (is_pcd, read_pcd),
+    "LAS or LAZ file": (is_las, read_las),
+    "PLY file": (is_ply, read_ply),
 }
+"""Maps that are only points."""
 
 
 def open_drive(
@@ -57,15 +80,49 @@ def read_map(path: Path | str) -> PointMap:
     Raises MapvoteError if there is no map at ``path`` or it is damaged.
     """
     path = Path(path)
-    for recognised, read_format in MAPS.values():
+    if is_map_folder(path):
+        return read_map_folder(path)
+    return to_map(str(path), read_cloud(path))
+
+
+def read_cloud(path: Path | str) -> Cloud:
+    """The points of a PCD, LAS, LAZ or PLY file or an Autoware folder as they stand, and what a map drops of them.
+
+    Raises MapvoteError if there is none at ``path`` or it is damaged.
+    """
+    path = Path(path)
+    for recognised, read_format in CLOUDS.values():
         if recognised(path):
             return read_format(path)
-    raise MapvoteError(f"{path}: {_what_is_there(path)}; a map is one of: {', '.join(MAPS)}")
+    raise MapvoteError(f"{path}: {_what_is_there(path)}; a map is one of: mapvote map, {', '.join(CLOUDS)}")
 
 
 def write_map(point_map: PointMap, path: Path | str) -> None:
     """Write a mapvote map folder, whole or not at all. An older mapvote map there is replaced, anything else is not."""
     write_map_folder(point_map, Path(path))
+
+
+def export_map(point_map: PointMap, path: Path | str, offset: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> str:
+    """Write a map's points for others: .pcd, .las, .laz, .ply, else an Autoware folder. Returns the format's name.
+
+    ``offset`` (metres) is subtracted from every point, for formats of float32. Whole or not at all.
+    """
+    path = Path(path)
+    points = all_points(point_map) - np.array(offset)
+    suffix = path.suffix.lower()
+    if suffix == ".pcd":
+        write_pcd(path, points)
+        return "PCD file"
+    if suffix in (".las", ".laz"):
+        write_las(path, points, wkt=point_map.georeference.get("wkt"))
+        return "LAS or LAZ file"
+    if suffix == ".ply":
+        write_ply(path, points)
+        return "PLY file"
+    if suffix:
+        raise MapvoteError(f"{path}: no format for {suffix}; use .pcd, .las, .laz, .ply, or a folder for Autoware")
+    write_autoware(path, points, projector=point_map.georeference.get(PROJECTOR))
+    return "Autoware tile folder"
 
 
 def _what_is_there(path: Path) -> str:

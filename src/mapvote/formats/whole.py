@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from mapvote.core.types import MapvoteError
@@ -37,7 +37,8 @@ def whole_file(path: Path | str) -> Iterator[Path]:
     except OSError as error:
         raise MapvoteError(f"{path}: cannot be written ({error.strerror or error}); nothing was changed") from error
     finally:
-        partial.unlink(missing_ok=True)
+        with suppress(OSError):
+            partial.unlink(missing_ok=True)
 
 
 @contextmanager
