@@ -112,14 +112,18 @@ class VotingSettings(Section):
     n_min: int = 5
     window_m: float = Field(default=80.0, description="side of the local grid (paper III-A)")
     rules: str = Field(
-        default="ABCDEFG", pattern=r"^A?B?C?D?E?F?G?$", description="columns: which of METHOD 4's rules hold (ablation)"
+        default="ABCDEFGH", pattern=r"^A?B?C?D?E?F?G?H?$", description="columns: which of its rules hold (ablation)"
     )
     empty_votes: float = Field(
-        default=0.1, description="columns, F: votes of a ray through a voxel against a hit in it"
+        default=0.05, description="columns, F: votes of a ray through a voxel, against one for a hit in it"
     )
     gone_votes: float = Field(
-        default=0.25, description="columns, E: votes of a ray through a mapped voxel against a hit"
+        default=0.125, description="columns, E: votes of a ray through a mapped voxel, against one for a hit near it"
     )
+    clear_share: float = Field(
+        default=0.3, description="columns, E: share of the scans with rays through a cell that saw through what it held"
+    )
+    fall_cells: int = Field(default=15, description="columns, H: how far what is gone takes unseen cells with it")
     min_scans: int = Field(default=1, description="columns, G: scans that must have hit a new voxel")
     min_support: int = Field(
         default=2, description="columns, G: hits (scans by voxels) that make a cell changed-occupied"

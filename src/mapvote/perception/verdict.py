@@ -1,4 +1,4 @@
-"""From the evidence of a drive to votes (METHOD 4, rules C to G): sums over the voxels that matter in each cell.
+"""From the evidence of a drive to votes (METHOD 4, rules C to G, and H): sums over the voxels that matter in each cell.
 
 A cell's votes are numbers of (scan, voxel) pairs: mapped voxels struck speak for unchanged-occupied, mapped voxels
 seen through for changed-empty, free voxels struck for changed-occupied, and seen through for unchanged-empty. What is
@@ -29,15 +29,27 @@ class Verdict:
     """(rows, cols) mapped voxels that are there no more, should the cell be changed-empty."""
     new: U64
     """(rows, cols) voxels of new surface, should it be changed-occupied."""
+    adrift: Bool
+    """(rows, cols) mapped cells whose voxels no ray reached, while rays passed under them (rule H)."""
 
     def states(self) -> U8:
         return decide(self.tally)
 
 
 @numba.njit(cache=True, nogil=True)
+def _ones(word: np.uint64) -> int:
+    """How many bits are set."""
+    count = 0
+    while word:
+        word &= word - np.uint64(1)
+        count += 1
+    return count
+
+
+@numba.njit(cache=True, nogil=True)
 def _weigh(
     planes: U64, occupied: U64, near: U64, free: U64, by_height: bool, empty_votes: float, gone_votes: float,
-    min_scans: int, min_support: int, tally: I32, gone: U64, new: U64,
+    clear_share: float, min_scans: int, min_support: int, tally: I32, gone: U64, new: U64, adrift: Bool,
 ) -> None:  # fmt: skip
     for r in range(occupied.shape[0]):
         for c in range(occupied.shape[1]):
@@ -49,7 +61,7 @@ def _weigh(
             if not through | struck:
                 continue
             candidates = struck & ~mapped & ~near[r, c] & free[r, c]
-            kept, lost, found, refuted, rays = 0, 0, 0, 0, 0
+            kept, lost, found, refuted, rays, clear = 0, 0, 0, 0, 0, 0
             for bit in range(64):
                 one = np.uint64(1) << np.uint64(bit)
                 if not (through | struck) & one:
@@ -59,6 +71,7 @@ def _weigh(
                 if mapped & one:
                     kept += s
                     lost += t
+                    clear = max(clear, t)
                     if gone_votes * t > s:
                         gone[r, c] |= one
                 elif candidates & one and s >= min_scans and s > empty_votes * t:
@@ -67,6 +80,11 @@ def _weigh(
                     refuted += t
             if kept or found < min_support:
                 found, refuted, new[r, c] = 0, 0, 0
+            if mapped and not (kept or lost):
+                under = (mapped & (~mapped + np.uint64(1))) - np.uint64(1)  # below the lowest voxel
+                adrift[r, c] = 2 * _ones(under & through) >= _ones(under) > 0
+            if clear < clear_share * rays:  # hardly ever seen through: foliage, or the end of the view
+                lost = 0
             if lost and not kept:
                 gone[r, c] |= mapped & ~struck  # what no ray reached goes with what it stood on
             votes = tally[r, c]
@@ -84,14 +102,33 @@ def weigh(planes: U64, occupied: U64, near: U64, free: U64 | None, settings: Vot
     """
     shape, rules = occupied.shape, settings.rules
     everything = np.full(shape, ~np.uint64(0))
-    tally, gone, new = np.zeros((*shape, 5), np.int32), np.zeros(shape, np.uint64), np.zeros(shape, np.uint64)
+    tally, adrift = np.zeros((*shape, 5), np.int32), np.zeros(shape, np.bool_)
+    gone, new = np.zeros(shape, np.uint64), np.zeros(shape, np.uint64)
     _weigh(
         planes, occupied, near if "C" in rules else np.where(occupied, everything, np.uint64(0)),
         free if "D" in rules and free is not None else everything,
         "F" in rules, settings.empty_votes if "F" in rules else 1.0, settings.gone_votes if "E" in rules else 1.0,
-        settings.min_scans if "G" in rules else 1, settings.min_support if "G" in rules else 1, tally, gone, new,
+        settings.clear_share if "E" in rules else 0.0, settings.min_scans if "G" in rules else 1,
+        settings.min_support if "G" in rules else 1, tally, gone, new, adrift,
     )  # fmt: skip
-    return Verdict(tally, gone, new)
+    return Verdict(tally, gone, new, adrift)
+
+
+def fallen(states: U8, adrift: Bool, reach: int) -> Bool:
+    """(rows, cols) cells of rule H: what stood on things that are gone, and no ray could reach, is gone with them.
+
+    A group of ``adrift`` cells falls if a changed-empty cell lies within ``reach`` cells of it and none that the scans
+    found occupied touches it: the roof of a demolished house, too high for the sensor once nothing is behind it.
+    """
+    group, count = ndimage.label(adrift, structure=np.ones((3, 3)))
+    lost = ndimage.distance_transform_cdt(states != CellState.CHANGED_EMPTY, "chessboard") <= reach
+    if not (states == CellState.CHANGED_EMPTY).any():
+        lost = np.zeros_like(adrift)
+    kept = ndimage.binary_dilation(states == CellState.UNCHANGED_OCCUPIED, np.ones((3, 3)))
+    falls = np.bincount(group[lost], minlength=count + 1) > 0
+    falls &= np.bincount(group[kept], minlength=count + 1) == 0
+    falls[0] = False
+    return np.asarray(falls[group])
 
 
 def drop_specks(states: U8, min_cells: int) -> Bool:

@@ -6,22 +6,27 @@ A voter takes in scan after scan and gives, tile by tile, the same thing: a tall
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from mapvote.config import VotingSettings
 from mapvote.core.columns import cut_reference, dilated, reference_window
-from mapvote.core.grid import TileIndex, tile_grid
+from mapvote.core.grid import Grid, TileIndex, tile_grid
 from mapvote.core.sensors import Sensor
-from mapvote.core.types import F64, I32, U8, U64, Bool, CellState, PointMap, Reference
-from mapvote.core.voting import decide
+from mapvote.core.types import F64, I32, NO_VOTE, U8, U64, Bool, CellState, PointMap, Reference
+from mapvote.core.voting import decide, one_hot
 from mapvote.perception.classify import classify_paper
 from mapvote.perception.evidence import Evidence, free_words
 from mapvote.perception.tally import Tally
-from mapvote.perception.verdict import drop_specks, weigh
+from mapvote.perception.verdict import drop_specks, fallen, weigh
 from mapvote.perception.visibility import ScanView
 
 ALL_BITS = ~np.uint64(0)
+_HALO = 64
+"""Cells around a tile that rule H looks at: 19 m, a house."""
+Plane = Any
+"""An array of one tile or window, of any type."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,7 +98,7 @@ class ColumnVoter:
 
     def votes(self) -> dict[TileIndex, TileVotes]:
         """Every tile with evidence, in ascending order."""
-        out = {}
+        out, adrift, mapped = {}, {}, {}
         for tile, planes in sorted(self.evidence.tiles.items()):
             window = tile_grid(self.point_map.lattice, tile)
             around = reference_window(self.point_map, window.padded(1))
@@ -103,24 +108,49 @@ class ColumnVoter:
             if verdict.tally.any():
                 free = free_words(planes, here.occupied)
                 out[tile] = TileVotes(verdict.tally, verdict.states(), verdict.gone, verdict.new, free)
+                adrift[tile] = verdict.adrift
+                mapped[tile] = here.occupied
+        if "H" in self.voting.rules:
+            self._drop_what_fell(out, adrift, mapped)
         if "G" in self.voting.rules:
-            specks = {tile: self._specks(tile, out) for tile in out}
-            for tile, small in specks.items():
-                out[tile].states[small] = CellState.UNDETERMINED
+            self._drop_specks(out)
         return out
 
-    def _specks(self, tile: TileIndex, votes: dict[TileIndex, TileVotes]) -> Bool:
-        """Rule G on one tile, with enough of its neighbours that a component across the edge counts in full."""
-        lattice, halo = self.point_map.lattice, self.voting.min_cells
-        window = tile_grid(lattice, tile)
-        wide = window.padded(halo)
-        states = np.full(wide.shape, CellState.UNDETERMINED, dtype=np.uint8)
-        for other in wide.tiles():
-            if other in votes:
-                grid = tile_grid(lattice, other)
+    def _drop_what_fell(
+        self, votes: dict[TileIndex, TileVotes], adrift: dict[TileIndex, Bool], mapped: dict[TileIndex, U64]
+    ) -> None:
+        """Rule H, with enough of a tile's neighbours that groups across its edge are judged alike from both sides."""
+        states = {tile: v.states for tile, v in votes.items()}
+        fell = {}
+        for tile in votes:
+            wide = tile_grid(self.point_map.lattice, tile).padded(_HALO)
+            near = (self._around(states, wide, NO_VOTE), self._around(adrift, wide, False))
+            fell[tile] = fallen(*near, self.voting.fall_cells)[_HALO:-_HALO, _HALO:-_HALO]
+        for tile, cells in fell.items():
+            votes[tile].states[cells] = CellState.CHANGED_EMPTY
+            votes[tile].tally[cells] = one_hot(np.array(CellState.CHANGED_EMPTY, dtype=np.uint8))
+            gone = votes[tile].gone
+            assert gone is not None
+            gone[cells] = mapped[tile][cells]
+
+    def _drop_specks(self, votes: dict[TileIndex, TileVotes]) -> None:
+        """Rule G, with the cells around a tile, so that a component across its edge counts in full."""
+        states = {tile: v.states.copy() for tile, v in votes.items()}
+        halo = self.voting.min_cells
+        for tile, v in votes.items():
+            wide = self._around(states, tile_grid(self.point_map.lattice, tile).padded(halo), NO_VOTE)
+            v.states[drop_specks(wide, halo)[halo:-halo, halo:-halo]] = CellState.UNDETERMINED
+
+    def _around(self, planes: dict[TileIndex, Plane], wide: Grid, elsewhere: int) -> Plane:
+        """The planes of several tiles as one window."""
+        first = next(iter(planes.values()))
+        out = np.full(wide.shape, elsewhere, dtype=first.dtype)
+        for tile in wide.tiles():
+            if tile in planes:
+                grid = tile_grid(self.point_map.lattice, tile)
                 common = grid.intersection(wide)
-                states[common.slices_in(wide)] = votes[other].states[common.slices_in(grid)]
-        return drop_specks(states, halo)[window.slices_in(wide)]
+                out[common.slices_in(wide)] = planes[tile][common.slices_in(grid)]
+        return out
 
 
 Voter = PaperVoter | ColumnVoter
