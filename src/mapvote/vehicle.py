@@ -48,6 +48,10 @@ Localise = Callable[[Scan, PosePrior | None], Fix]
 """Where was this scan taken? ``Tracker.localise`` by NDT, or :class:`GivenPoses`. An untrusted fix casts no vote."""
 
 
+Watch = Callable[[F64, F64, Bool, Bool], None]
+"""Told of every scan that votes: (points (n, 3) and sensor (3,) in map metres, above ground (n,), moving (n,))."""
+
+
 class Movers(Protocol):
     """Which points move: :class:`mapvote.perception.moving.MovingFilter`, or anything with its two methods."""
 
@@ -113,7 +117,8 @@ class Vehicle:
     """One vehicle on one drive.
 
     ``voters``: the settings of every voter, default only ``settings.voting``. ``localise``: default NDT in
-    ``point_map``. ``movers``: default the occupancy filter of :mod:`mapvote.perception.moving`. The prior's
+    ``point_map``. ``movers``: default the occupancy filter of :mod:`mapvote.perception.moving`. ``watch``: whoever
+    wants to see the scans that vote, for measurements and pictures. The prior's
     sigmas say how far ``observe``'s prior may be off. Memory is bounded by the road driven: counters by tile, and the
     reference of the tiles around the vehicle.
     """
@@ -129,12 +134,14 @@ class Vehicle:
         voters: Sequence[VotingSettings] | None = None,
         localise: Localise | None = None,
         movers: Movers | None = None,
+        watch: Watch | None = None,
         prior_sigma_m: float = 1.0,
         prior_sigma_deg: float = 1.0,
     ) -> None:
         self.name, self.sensor, self.point_map, self.drive_id = name, sensor, point_map, drive_id
         self.settings = settings or Settings()
         self.localise = localise or Tracker(MapWindow(point_map, self.settings.ndt), self.settings.ndt).localise
+        self.watch = watch
         self.movers = movers or MovingFilter(sensor, self.settings.moving)
         self.prior_sigmas = prior_sigma_m, float(np.radians(prior_sigma_deg))
         self.report = DriveReport()
@@ -172,6 +179,8 @@ class Vehicle:
             self._vote(self._waiting.popleft(), moving)
 
     def _vote(self, scan: _Waiting, moving: Bool) -> None:
+        if self.watch:
+            self.watch(scan.points_map, scan.origin_map, scan.obstacle, moving)
         with self.report.timed("see"):
             view = see(scan.points_map, scan.origin_map, scan.obstacle, moving, scan.reference, scan.cell)
         with self.report.timed("vote"):

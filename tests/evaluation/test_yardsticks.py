@@ -74,7 +74,7 @@ def test_evidence_finds_them_too_and_says_nothing_about_what_is_hidden(old_map: 
     for vehicle in vehicles:
         for _ in range(3):
             vehicle.push(points, ORIGIN, obstacle, np.zeros(len(points), np.bool_))
-        assert len(vehicle.cpu_s) == 3
+        assert vehicle.memory_bytes == 60 * 100 * 64 * 8
     states = combine(vehicles, reference)
     assert (states[32, columns(14, 20)] == CellState.CHANGED_EMPTY).all()
     assert (states[22, columns(8, 14)] == CellState.CHANGED_OCCUPIED).all()

@@ -2,15 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from mapvote.cli.options import Config
+
+if TYPE_CHECKING:
+    from rich.progress import TaskID
+
 
 def register(app: typer.Typer) -> None:
-    """Add simulate."""
+    """Add simulate and evaluate."""
     app.command()(simulate)
+    app.command()(evaluate)
 
 
 def simulate(
@@ -29,3 +37,56 @@ def simulate(
     typer.echo(
         f"{out}: drives {', '.join(sorted(p.name for p in out.iterdir() if p.name != 'truth'))}; truth in truth/"
     )
+
+
+def evaluate(
+    scenario: Annotated[str, typer.Argument(help="paper, street, junction, corner, or a .toml file")],
+    seed: Annotated[int, typer.Option(help="layout, clutter, traffic and noise")] = 1,
+    case: Annotated[
+        str, typer.Option(help='1..5, "1 column", columns, yardsticks, several by commas, or all')
+    ] = "1,2,3,4,5,columns",
+    poses: Annotated[str, typer.Option(help="ndt: the vehicles localise; truth: they are told where they are")] = "ndt",
+    json: Annotated[Path | None, typer.Option(help="write all numbers to this file")] = None,
+    cache: Annotated[Path | None, typer.Option(help="where drives, maps and ballots are kept")] = None,
+    sensor: Annotated[str | None, typer.Option(help="vlp16, hdl32e or hdl64e instead of the scenario's")] = None,
+    config: Config = None,
+) -> None:
+    """Simulate, map, vote, and score: Tables II to IV of the paper with its figures beside ours."""
+    from rich.console import Console
+
+    from mapvote.config import load_settings
+    from mapvote.evaluation.cases import choose_cases
+    from mapvote.evaluation.evaluate import evaluate as run
+    from mapvote.evaluation.report import as_json, tables, write_text
+    from mapvote.evaluation.scene import Scene, default_cache
+
+    if poses not in ("ndt", "truth"):
+        raise typer.BadParameter(f"{poses!r}: choose ndt or truth", param_hint="--poses")
+    settings = load_settings(config)
+    cases, with_yardsticks = choose_cases(settings, case)
+    overrides = {"sensor": sensor} if sensor else {}
+    scene = Scene(scenario, seed, settings, cache or default_cache(), overrides, truth_poses=poses == "truth")
+    with _stages() as told:
+        result = run(scene, cases, with_yardsticks, told).result
+    for table in tables(result):
+        Console(width=140).print(table)
+    if json is not None:
+        write_text(as_json(result), json)
+        typer.echo(f"{json}: all numbers")
+
+
+@contextmanager
+def _stages() -> Iterator[Callable[[str, int, int], None]]:
+    """A progress bar for each stage as it begins; the first run also compiles, which the first bar says."""
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+    columns = TextColumn("{task.description:<24}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
+    with Progress(*columns) as bar:
+        tasks: dict[str, TaskID] = {}
+
+        def told(stage: str, done: int, total: int) -> None:
+            if stage not in tasks:
+                tasks[stage] = bar.add_task(stage, total=total)
+            bar.update(tasks[stage], completed=done, total=total)
+
+        yield told

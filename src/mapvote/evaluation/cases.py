@@ -66,17 +66,22 @@ def column_cases(settings: Settings) -> dict[str, Case]:
     return {case.name: case for case in cases}
 
 
-def choose_cases(settings: Settings, wanted: str) -> list[Case]:
-    """Cases by comma-separated names: 1 to 5, "1 column" and its like, columns, or "all" that there is.
+YARDSTICKS = ("nearest", "evidence")
 
-    MapvoteError names one that there is not.
+
+def choose_cases(settings: Settings, wanted: str) -> tuple[list[Case], bool]:
+    """Cases by comma-separated names (1 to 5, "1 column" and its like, columns, yardsticks, or "all" that there is),
+    and whether the yardsticks are wanted. MapvoteError names one that there is not, or says that no vote is left.
     """
     every = {**paper_cases(settings), **column_cases(settings)}
-    names = list(every) if wanted == "all" else [name.strip() for name in wanted.split(",")]
+    names = [*every, "yardsticks"] if wanted == "all" else [name.strip() for name in wanted.split(",")]
     for name in names:
-        if name not in every:
-            raise MapvoteError(f"no case {name!r}: choose from all, {', '.join(every)}")
-    return [every[name] for name in names]
+        if name not in every and name not in ("yardsticks", *YARDSTICKS):
+            raise MapvoteError(f"no case {name!r}: choose from all, yardsticks, {', '.join(every)}")
+    chosen = [every[name] for name in names if name in every]
+    if not chosen:
+        raise MapvoteError("the yardsticks are measured beside a vote: name a case too, as in --case 1,yardsticks")
+    return chosen, len(chosen) < len(names)
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,12 +12,13 @@ import numpy as np
 
 from mapvote.core.ballot import Ballot
 from mapvote.core.grid import CELL_SIZE, Grid
-from mapvote.core.types import F64, PointMap
+from mapvote.core.types import F64, U8, PointMap
 from mapvote.evaluation.cases import Case, Outcome, Pass, fuse_case, passes
 from mapvote.evaluation.metrics import MapJudge, coverage, score_cells, score_objects
 from mapvote.evaluation.nearest import map_obstacles
 from mapvote.evaluation.scene import Progress, Scene
 from mapvote.evaluation.truth import Truth, pose_errors, rigid_between
+from mapvote.evaluation.yardsticks import yardsticks
 
 
 @dataclass(frozen=True)
@@ -34,14 +35,18 @@ class Evaluation:
     drives: Sequence[Pass]
 
 
-def evaluate(scene: Scene, cases: Sequence[Case], progress: Progress | None = None) -> Evaluation:
+def evaluate(
+    scene: Scene, cases: Sequence[Case], with_yardsticks: bool = False, progress: Progress | None = None
+) -> Evaluation:
     """Run what the cache lacks, decide and score every case. Two processes where there are two cores."""
     started = time.perf_counter()
     scene.prepare(progress)
     prepared = time.perf_counter()
-    drives = passes(scene, cases, min(2, os.cpu_count() or 1), progress)
+    workers = min(2, os.cpu_count() or 1)
+    drives = passes(scene, cases, workers, progress)
     voted = time.perf_counter()
     truth, first_map = scene.truth, scene.point_map
+    beams = scene.drive(drives[0].vehicle).sensor.beams
     window = truth.grid_on(first_map.lattice)
     judge = MapJudge(map_obstacles(first_map), *_above_ground(first_map, truth))
     objects = [{"kind": o["kind"], "cells": truth.cells_of(o["footprint"])} for o in truth.objects]
@@ -53,18 +58,27 @@ def evaluate(scene: Scene, cases: Sequence[Case], progress: Progress | None = No
         outcome = fuse_case(first_map, ballots, case.min_votes, scene.settings.fuse, window)
         outcomes[case.name] = outcome
         entries[case.name] = {
-            **score_outcome(outcome, truth, objects),
+            **score_states(outcome.states, outcome.vehicle_states, truth, objects),
             "map": judge.score(map_obstacles(outcome.updated)).to_dict(),
             "bytes_per_vehicle": [drive.sizes[case.name] for drive in drives],
             "state_bytes_per_vehicle": [_state_bytes(ballot) for ballot in ballots],
         }
-    first = entries[cases[0].name]
+    scored = time.perf_counter()
+    costs = {}
+    if with_yardsticks:
+        measured, costs["case 5"] = yardsticks(scene, drives, workers, progress)
+        for name, yardstick in measured.items():
+            costs[name] = yardstick.cost
+            entries[name] = {
+                **score_states(yardstick.states, yardstick.vehicle_states, truth, objects),
+                "bytes_per_vehicle": [],
+            }
     result = {
         "scenario": scene.scenario,
         "seed": scene.seed,
         "poses": "truth" if scene.truth_poses else "ndt",
         "cells": int(truth.strict.size),
-        "coverage": first["coverage"],
+        "coverage": entries[cases[-1].name if "columns" not in entries else "columns"]["coverage"],
         "settings": scene.settings.model_dump(mode="json"),
         "map_shift": map_shift(scene, truth),
         "localisation": localisation(scene, truth, drives),
@@ -72,7 +86,9 @@ def evaluate(scene: Scene, cases: Sequence[Case], progress: Progress | None = No
         "timings": {
             "prepare_s": prepared - started,
             "vote_s": voted - prepared,
-            "score_s": time.perf_counter() - voted,
+            "score_s": scored - voted,
+            "yardsticks_s": time.perf_counter() - scored,
+            "methods": {name: {"beams": beams, **cost} for name, cost in costs.items()},
             "stages_ms": {drive.vehicle: drive.stage_ms for drive in drives},
             "fuse_s": {name: outcome.seconds for name, outcome in outcomes.items()},
         },
@@ -80,13 +96,15 @@ def evaluate(scene: Scene, cases: Sequence[Case], progress: Progress | None = No
     return Evaluation(result, scene, truth, window, first_map, outcomes, drives)
 
 
-def score_outcome(outcome: Outcome, truth: Truth, objects: Sequence[Mapping[str, object]]) -> dict[str, Any]:
-    """R for both truths, coverage, objects."""
+def score_states(
+    states: U8, vehicle_states: Sequence[U8], truth: Truth, objects: Sequence[Mapping[str, object]]
+) -> dict[str, Any]:
+    """R for both truths, coverage, objects; all states over the truth's window."""
     return {
-        "strict": score_cells(outcome.states, truth.strict).to_dict(),
-        "provenance": score_cells(outcome.states, truth.provenance).to_dict(),
-        "coverage": coverage(outcome.vehicle_states, truth.strict),
-        "objects": score_objects(outcome.states, truth.strict, objects, CELL_SIZE).to_dict(),
+        "strict": score_cells(states, truth.strict).to_dict(),
+        "provenance": score_cells(states, truth.provenance).to_dict(),
+        "coverage": coverage(vehicle_states, truth.strict),
+        "objects": score_objects(states, truth.strict, objects, CELL_SIZE).to_dict(),
     }
 
 

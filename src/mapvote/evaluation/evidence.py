@@ -9,7 +9,6 @@ unknown, so that the present can outvote the past.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
 
 import numba
@@ -168,8 +167,6 @@ class EvidenceMap:
         self._hits = np.zeros(voxels, dtype=np.uint16)
         self._passes = np.zeros(voxels, dtype=np.uint16)
         self._touched = np.zeros(voxels, dtype=np.int32)
-        self.cpu_s: list[float] = []
-        """CPU seconds of each scan."""
 
     @property
     def memory_bytes(self) -> int:
@@ -178,19 +175,12 @@ class EvidenceMap:
 
     def push(self, points_map: F64, origin_map: F64, obstacle: Bool, moving: Bool) -> None:
         """One scan: points (n, 3) and sensor (3,) in map metres; movers' rays prove what they passed, nothing more."""
-        start = time.thread_time()
         grid = self._reference.grid
         counts = self._hits, self._passes, self._touched
         n = _march(
             points_map, origin_map, obstacle & ~moving, self._reference.base, grid.x0, grid.y0, self._reach, *counts
         )
         _absorb(self._hits, self._passes, self._touched, n, self.occupied, self.free)
-        self.cpu_s.append(time.thread_time() - start)
-
-    def release_scratch(self) -> None:
-        """Give back what only pushing needs."""
-        self._hits = self._passes = np.zeros(0, dtype=np.uint16)
-        self._touched = np.zeros(0, dtype=np.int32)
 
 
 def combine(vehicles: Sequence[EvidenceMap], reference: Reference) -> U8:

@@ -129,12 +129,10 @@ def _cost_table(result: Result) -> Iterator[Table]:
     if not costs:
         return
     table = Table(title="Cost on the vehicle", box=box.SIMPLE_HEAD, title_justify="left", title_style="bold")
-    for heading in ("", "beams", "CPU a scan, median", "memory of its grid"):
+    for heading in ("", "beams", "ms a scan, median", "memory of its grid"):
         table.add_column(heading, justify="right" if heading else "left")
     for name, entry in costs.items():
-        table.add_row(
-            name, str(entry["beams"]), f"{entry['cpu_ms_per_scan']:.1f} ms", f"{entry['memory_bytes'] / 1e6:.1f} MB"
-        )
+        table.add_row(name, str(entry["beams"]), f"{entry['ms_per_scan']:.1f}", f"{entry['memory_bytes'] / 1e6:.1f} MB")
     yield table
 
 
