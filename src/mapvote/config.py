@@ -240,3 +240,14 @@ def _from_env(env: Mapping[str, str]) -> Iterable[tuple[str, str, Any, str]]:
         section, found, key = name.removeprefix(ENV_PREFIX).lower().partition("__")
         if name.startswith(ENV_PREFIX) and found:
             yield section, key, env[name], name
+
+
+def choose_case(settings: Settings, case: str) -> Settings:
+    """``settings`` with the vote of one of the paper's cases, "1" to "5", or of "columns". MapvoteError for another."""
+    if case == "columns":
+        chosen: dict[str, object] = {"method": "columns"}
+    elif case in CASES:
+        chosen = {"method": "paper", **CASES[case]}
+    else:
+        raise MapvoteError(f"no case {case!r}; choose columns or one of {', '.join(CASES)}")
+    return settings.model_copy(update={"voting": settings.voting.model_copy(update=chosen)})

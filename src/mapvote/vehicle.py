@@ -42,7 +42,7 @@ from mapvote.perception.ndt import PosePrior
 from mapvote.perception.tally import NewPoints, points_in, select
 from mapvote.perception.tracking import Fix, MapWindow, Tracker
 from mapvote.perception.visibility import find_obstacles, see
-from mapvote.perception.voters import Seen, TileVotes, make_voter
+from mapvote.perception.voters import Panel, Seen, TileVotes
 
 Localise = Callable[[Scan, PosePrior | None], Fix]
 """Where was this scan taken? ``Tracker.localise`` by NDT, or :class:`GivenPoses`. An untrusted fix casts no vote."""
@@ -145,9 +145,9 @@ class Vehicle:
         self.movers = movers or MovingFilter(sensor, self.settings.moving)
         self.prior_sigmas = prior_sigma_m, float(np.radians(prior_sigma_deg))
         self.report = DriveReport()
-        wanted = {_counts_as(v): v for v in voters or [self.settings.voting]}
-        self._first = (voters or [self.settings.voting])[0]
-        self._voters = {key: make_voter(v, sensor, point_map) for key, v in wanted.items()}
+        votings = voters or [self.settings.voting]
+        self._first = votings[0]
+        self._panel = Panel([_counts_as(voting) for voting in votings], sensor, point_map)
         self._new_points = NewPoints(point_map.lattice)
         self._waiting: deque[_Waiting] = deque()
         self._around: tuple[Reference, U64] | None = None
@@ -185,9 +185,7 @@ class Vehicle:
             view = see(scan.points_map, scan.origin_map, scan.obstacle, moving, scan.reference, scan.cell)
         with self.report.timed("vote"):
             seen = Seen(view, scan.reference, scan.near, scan.origin_map, scan.sigma_m)
-            new = np.zeros(view.grid.shape, dtype=np.uint64)
-            for voter in self._voters.values():
-                new |= voter.add(seen)
+            new = self._panel.add(seen)
             base = np.ascontiguousarray(scan.reference.base).ravel()
             chosen = select(scan.points_map, scan.cell, scan.obstacle & ~moving, new.ravel(), base)
             self._new_points.offer(scan.points_map[chosen])
@@ -210,7 +208,7 @@ class Vehicle:
         Raises MapvoteError if no scan voted, or no voter has these settings.
         """
         voting = voting or self._first
-        if _counts_as(voting) not in self._voters:
+        if _counts_as(voting) not in self._panel.voters:
             raise MapvoteError("no voter of this vehicle has these settings; name them when the Vehicle is made")
         if len(self.report.lost) == self.report.scans:
             raise MapvoteError(
@@ -220,7 +218,7 @@ class Vehicle:
         for _, moving in self.movers.flush():
             self._vote(self._waiting.popleft(), moving)
         points = self._new_points.by_tile()
-        votes = self._voters[_counts_as(voting)].votes()
+        votes = self._panel.voters[_counts_as(voting)].votes()
         return Ballot(
             map_id=self.point_map.map_id,
             base={tile_key(tile): self._base_hash(tile) for tile in votes},

@@ -1,4 +1,4 @@
-"""The verbs of mapping and driving: build."""
+"""The verbs of mapping and driving: build, vote."""
 
 from __future__ import annotations
 
@@ -7,14 +7,17 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from mapvote.cli.options import Config, Mount, Prior, Rate, Scans, SensorName, Topic
+from mapvote.cli.options import Config, Mount, Prior, Rate, Scans, SensorName, Topic, Vehicle
 
 if TYPE_CHECKING:
+    from mapvote.core.ballot import Ballot
     from mapvote.mapping import BuildReport
+    from mapvote.vehicle import DriveReport
 
 
 def register(app: typer.Typer) -> None:
     app.command()(build)
+    app.command()(vote)
 
 
 def build(
@@ -65,3 +68,63 @@ def _tell(report: BuildReport, out: Path) -> None:
         typer.echo(line)
     frame = "held in its frame by a precise prior" if report.held_by_prior else "not held by any precise prior"
     typer.echo(f"{out}: {report.points} points, {frame}")
+
+
+def vote(
+    drive_path: Annotated[Path, typer.Argument(help="one drive of a place that the map shows", metavar="DRIVE")],
+    map_path: Annotated[Path, typer.Option("--map", help="map folder, PCD file or Autoware folder")],
+    out: Annotated[Path, typer.Option(help="the ballot to write")],
+    vehicle: Vehicle = None,
+    case: Annotated[
+        str | None, typer.Option(help="columns, or the paper's case 1 to 5; default: the settings' [voting]")
+    ] = None,
+    trust_prior: Annotated[bool, typer.Option(help="take the prior for the pose, do not localise")] = False,
+    scans: Scans = None,
+    prior: Prior = None,
+    rate: Rate = None,
+    sensor: SensorName = None,
+    mount: Mount = None,
+    topic: Topic = None,
+    config: Config = None,
+) -> None:
+    """Drive once: localise, remove moving objects, compare with the map, and write one ballot."""
+    from rich.progress import Progress
+
+    from mapvote.config import choose_case, load_with_sources
+    from mapvote.core.ballot import encode
+    from mapvote.core.types import MapvoteError
+    from mapvote.formats import open_drive, read_map
+    from mapvote.formats.whole import whole_file
+    from mapvote.vehicle import GivenPoses, vote_drive
+
+    settings, _ = load_with_sources(config)
+    if case is not None:
+        settings = choose_case(settings, case)
+    drive = open_drive(
+        drive_path, scans=scans, prior=prior, rate_hz=rate, sensor=sensor, vehicle=vehicle, mount=mount, topic=topic
+    )
+    localise = None
+    if trust_prior:
+        if drive.T_map_lidar_prior is None:
+            raise MapvoteError(f"{drive_path}: has no prior to trust; give one with --prior, or let it be localised")
+        localise = GivenPoses(drive.stamps_ns, drive.T_map_lidar_prior)
+    point_map = read_map(map_path)
+    with Progress(transient=True) as bar:
+        task = bar.add_task("voting", total=len(drive))
+        ballot, report = vote_drive(
+            drive, point_map, settings, localise=localise, progress=lambda done, _: bar.update(task, completed=done)
+        )
+    data = encode(ballot)
+    with whole_file(out) as partial:
+        partial.write_bytes(data)
+    _tell_votes(ballot, report, out, len(data))
+
+
+def _tell_votes(ballot: Ballot, report: DriveReport, out: Path, size: int) -> None:
+    typer.echo(
+        f"{ballot.vehicle}: {ballot.scans_localised} of {ballot.scans} scans localised "
+        f"(median sigma {ballot.median_sigma_m:.3f} m), the others abstain"
+    )
+    stages = ", ".join(f"{stage} {1000.0 * sorted(s)[len(s) // 2]:.1f}" for stage, s in report.stage_s.items())
+    typer.echo(f"milliseconds a scan (median): {stages}")
+    typer.echo(f"{out}: {len(ballot.tiles)} tiles, {size / 1000.0:.1f} kB")

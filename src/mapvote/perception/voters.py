@@ -5,6 +5,7 @@ A voter takes in scan after scan and gives, tile by tile, the same thing: a tall
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -84,13 +85,12 @@ class PaperVoter:
 class ColumnVoter:
     """METHOD 4: evidence per voxel over the drive, weighed at its end."""
 
-    def __init__(self, voting: VotingSettings, point_map: PointMap) -> None:
-        self.voting, self.point_map = voting, point_map
-        self.evidence = Evidence(point_map.lattice, by_ray="A" in voting.rules, veto="B" in voting.rules)
+    def __init__(self, voting: VotingSettings, point_map: PointMap, evidence: Evidence) -> None:
+        """``evidence`` is shared with other voters of this map, and filled by whoever made it."""
+        self.voting, self.point_map, self.evidence = voting, point_map, evidence
 
     def add(self, seen: Seen) -> U64:
-        """Count one scan; returns (rows, cols) words of voxels whose points may be new."""
-        self.evidence.add(seen.view, seen.reference, reach=2 if seen.sigma_m > self.voting.wide_sigma_m else 1)
+        """Take note of one scan; returns (rows, cols) words of voxels whose points may be new."""
         explained = seen.near if "C" in self.voting.rules else seen.reference.occupied
         new = seen.view.hit & ~explained
         free = seen.reference.free
@@ -156,6 +156,26 @@ class ColumnVoter:
 Voter = PaperVoter | ColumnVoter
 
 
-def make_voter(voting: VotingSettings, sensor: Sensor, point_map: PointMap) -> Voter:
-    """The voter that ``voting.method`` names."""
-    return ColumnVoter(voting, point_map) if voting.method == "columns" else PaperVoter(voting, sensor, point_map)
+class Panel:
+    """The voters of one vehicle, by their settings. Voters that count alike share their counters."""
+
+    def __init__(self, votings: Sequence[VotingSettings], sensor: Sensor, point_map: PointMap) -> None:
+        self._evidence: dict[tuple[bool, bool, float], Evidence] = {}
+        self.voters: dict[VotingSettings, Voter] = {}
+        for voting in votings:
+            if voting.method == "columns":
+                by_ray, veto = "A" in voting.rules, "B" in voting.rules
+                fresh = Evidence(point_map.lattice, by_ray, veto)
+                evidence = self._evidence.setdefault((by_ray, veto, voting.wide_sigma_m), fresh)
+                self.voters[voting] = ColumnVoter(voting, point_map, evidence)
+            else:
+                self.voters[voting] = PaperVoter(voting, sensor, point_map)
+
+    def add(self, seen: Seen) -> U64:
+        """One scan for every voter; returns (rows, cols) words of voxels whose points may be new for any of them."""
+        for (_, _, wide_sigma_m), evidence in self._evidence.items():
+            evidence.add(seen.view, seen.reference, reach=2 if seen.sigma_m > wide_sigma_m else 1)
+        new = np.zeros(seen.view.grid.shape, dtype=np.uint64)
+        for voter in self.voters.values():
+            new |= voter.add(seen)
+        return new
