@@ -25,8 +25,6 @@ CLEARANCE_M = 0.45
 FULL_RANGE_M = 25.0
 """Nearer than this every second fan suffices for two to a cell, nearer than half of it every fourth, and so on."""
 INFINITY = np.float32(np.inf)
-_RANGE_STEP_M = 0.25
-_RANGE_STEPS = 512
 
 
 class Sight(IntEnum):
@@ -103,26 +101,34 @@ def _enter_hits(points: F64, cell: I32, keep: NDArray[np.bool_], base: I32, coun
             counts[k] += 1
 
 
-@numba.njit(cache=True, nogil=True)
-def _fan_of(dx: float, dy: float) -> int:
-    """Which fan a direction belongs to. atan by a polynomial good to 1e-4 rad: it only sorts, it measures nothing."""
-    ax, ay = abs(dx), abs(dy)
-    a = min(ax, ay) / max(ax, ay)
-    s = a * a
-    angle = ((-0.0464964749 * s + 0.15931422) * s - 0.327622764) * s * a + a
-    if ay > ax:
-        angle = 0.5 * np.pi - angle
-    if dx < 0:
-        angle = np.pi - angle
-    if dy < 0:
-        angle = 2.0 * np.pi - angle
-    return int(angle * (FANS / (2.0 * np.pi))) % FANS
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _rays(points: F64, origin: F64, clearance: float) -> tuple[F32, F32, F32, I32]:
+    """(reach, slope, stop, fan) of every ray, each (n,): see :func:`_gather`. Free of branches, so that it vectorises.
 
-
-@numba.njit(cache=True, nogil=True, inline="always")
-def _range_step(reach: np.float32) -> int:
-    """Counted from the far end: 0 is the farthest."""
-    return _RANGE_STEPS - 1 - min(int(reach / _RANGE_STEP_M), _RANGE_STEPS - 1)
+    atan by a polynomial good to 1e-4 rad: it only sorts rays into fans, it measures nothing.
+    """
+    n = len(points)
+    reach, slope, stop = np.empty(n, np.float32), np.empty(n, np.float32), np.empty(n, np.float32)
+    fan = np.empty(n, np.int32)
+    one, zero, turn = np.float32(1.0), np.float32(0.0), np.float32(FANS)
+    c1, c2, c3 = np.float32(-0.0464964749), np.float32(0.15931422), np.float32(-0.327622764)
+    to_turns = np.float32(0.5 / np.pi)
+    for i in range(n):
+        dx, dy = np.float32(points[i, 0] - origin[0]), np.float32(points[i, 1] - origin[1])
+        dz = np.float32(points[i, 2] - origin[2])
+        h = np.sqrt(dx * dx + dy * dy)
+        reach[i] = h
+        slope[i] = dz / (np.float32(CELL_SIZE) * h)
+        stop[i] = h - np.float32(clearance) * h / np.sqrt(h * h + dz * dz)
+        ax, ay = abs(dx), abs(dy)
+        q = min(ax, ay) / max(ax, ay)
+        s = q * q
+        angle = (((c1 * s + c2) * s + c3) * s * q + q) * to_turns
+        angle = np.float32(0.25) - angle if ay > ax else angle
+        angle = np.float32(0.5) - angle if dx < zero else angle
+        angle = one - angle if dy < zero else angle
+        fan[i] = min(max(np.int32(angle * turn), np.int32(0)), np.int32(FANS - 1))
+    return reach, slope, stop, fan
 
 
 @numba.njit(cache=True, nogil=True)
@@ -134,29 +140,19 @@ def _gather(
     ``slope`` voxels of height per metre of horizontal way; ``stop`` horizontal metres to the end of what the ray
     proves, descending within a fan; ``nearest`` obstacle and ``farthest`` return of each fan, horizontal metres.
     """
-    n = len(points)
-    fan = np.empty(n, np.int32)
-    reach = np.empty(n, np.float32)
-    nearer = np.zeros(_RANGE_STEPS + 1, np.int32)  # how many rays end at or beyond each range step, to sort by range
+    reach, rise, end, fan = _rays(points, origin, clearance)
     start = np.zeros(FANS + 1, np.int32)
     direction = np.zeros((FANS, 2))
     nearest = np.full(FANS, INFINITY, np.float32)
     farthest = np.zeros(FANS, np.float32)
-    for i in range(n):
-        dx, dy = points[i, 0] - origin[0], points[i, 1] - origin[1]
-        h = np.sqrt(dx * dx + dy * dy)
-        reach[i] = h
-        nearer[_range_step(reach[i]) + 1] += 1  # of the rounded range, as it is asked for below
-        if h < CELL_SIZE:
-            fan[i] = -1
+    for i in range(len(points)):
+        h, f = reach[i], fan[i]
+        if not h >= CELL_SIZE:  # the sensor's own cell proves nothing
             continue
-        f = _fan_of(dx, dy)
-        fan[i] = f
         start[f + 1] += 1
-        direction[f, 0] += dx / h
-        direction[f, 1] += dy / h
-        if h > farthest[f]:
-            farthest[f] = h
+        direction[f, 0] += (points[i, 0] - origin[0]) / h
+        direction[f, 1] += (points[i, 1] - origin[1]) / h
+        farthest[f] = max(farthest[f], h)
         if obstacle[i] and h < nearest[f]:
             nearest[f] = h
     for f in range(FANS):
@@ -165,31 +161,21 @@ def _gather(
         if norm > 0.0:
             direction[f, 0] /= norm
             direction[f, 1] /= norm
-    for k in range(_RANGE_STEPS):
-        nearer[k + 1] += nearer[k]
-    order = np.empty(n, np.int32)
-    for i in range(n):
-        k = _range_step(reach[i])
-        order[nearer[k]] = i
-        nearer[k] += 1
     slope = np.empty(start[FANS], np.float32)
     stop = np.empty(start[FANS], np.float32)
     filled = start[:FANS].copy()
-    for at in range(n):
-        i = int(order[at])
-        if fan[i] < 0:
+    for i in range(len(points)):
+        if not reach[i] >= CELL_SIZE:
             continue
-        h = reach[i]
-        rise = np.float32((points[i, 2] - origin[2]) / (CELL_SIZE * h))
-        end = np.float32(h - clearance / np.sqrt(1.0 + (CELL_SIZE * rise) ** 2))
-        k = filled[fan[i]]
-        while k > start[fan[i]] and stop[k - 1] < end:  # nearly in order: they come by range
+        f = fan[i]
+        k = filled[f]
+        while k > start[f] and stop[k - 1] < end[i]:  # insertion: a fan has a few dozen rays, mostly in order
             stop[k] = stop[k - 1]
             slope[k] = slope[k - 1]
             k -= 1
-        stop[k] = end
-        slope[k] = rise
-        filled[fan[i]] += 1
+        stop[k] = end[i]
+        slope[k] = rise[i]
+        filled[f] += 1
     return start, slope, stop, direction, nearest, farthest
 
 
