@@ -17,10 +17,13 @@ from mapvote.formats.autoware import PROJECTOR, is_autoware, read_autoware, writ
 from mapvote.formats.cloud import Cloud, to_map
 from mapvote.formats.drive import DriveOptions
 from mapvote.formats.kitti import DriveWriter, is_kitti_folder, open_kitti, read_T_map_lidar
+from mapvote.formats.kitti_raw import is_kitti_raw, open_kitti_raw
 from mapvote.formats.las import is_las, read_las, write_las
 from mapvote.formats.mapfolder import is_map_folder, read_map_folder, write_map_folder
 from mapvote.formats.pcd import is_pcd, read_pcd, write_pcd
+from mapvote.formats.pcd_drive import is_pcd_drive, open_pcd_drive
 from mapvote.formats.ply import is_ply, read_ply, write_ply
+from mapvote.formats.rosbag import is_rosbag, open_rosbag
 
 __all__ = [
     "CLOUDS",
@@ -37,6 +40,9 @@ __all__ = [
 
 DRIVES: dict[str, tuple[Callable[[Path], bool], Callable[[Path, DriveOptions], Drive]]] = {
     "KITTI drive folder": (is_kitti_folder, open_kitti),
+    "KITTI raw recording": (is_kitti_raw, open_kitti_raw),
+    "ROS bag": (is_rosbag, open_rosbag),
+    "folder of PCD scans": (is_pcd_drive, open_pcd_drive),
 }
 CLOUDS: dict[str, tuple[Callable[[Path], bool], Callable[[Path], Cloud]]] = {
     "Autoware tile folder": (is_autoware, read_autoware),

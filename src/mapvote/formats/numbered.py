@@ -66,15 +66,27 @@ def read_times_ns(file: Path) -> I64:
 
 
 def read_stamps(folder: Path, files: list[Path], about: DriveFile, options: DriveOptions) -> I64:
-    """(n,) stamps from times.txt, else evenly at the rate of the caller or drive.toml; MapvoteError if neither."""
+    """(n,) stamps: from times.txt, else evenly at the rate given, else from names like 1317042145.964.pcd.
+
+    MapvoteError if there is none of them.
+    """
     table = folder / "times.txt"
     if table.is_file():
         times_ns = read_times_ns(table)
         return about.start_ns + times_ns[lines_of_scans(len(times_ns), files, table)]
     rate_hz = options.rate_hz or about.rate_hz
+    if rate_hz is None and all(number_of(f) > 1e8 for f in files):
+        return np.array([_stamp_in_name_ns(f) for f in files], dtype=np.int64)
     if rate_hz is None:
         raise MapvoteError(f"{table}: missing; write one line of seconds a scan, or give --rate HZ (10 for KITTI)")
     return stamps_from_rate(len(files), rate_hz, about.start_ns)
+
+
+def _stamp_in_name_ns(file: Path) -> int:
+    """A file named by its time since 1970: seconds, or a whole number of milli-, micro- or nanoseconds."""
+    number = Decimal(re.findall(r"\d+(?:\.\d+)?", file.stem)[-1])
+    power = next(p for p in (0, 3, 6, 9) if number < Decimal(10) ** (10 + p) or p == 9)
+    return int(number * 10 ** (9 - power))
 
 
 def prior_file(folder: Path, about: DriveFile, options: DriveOptions) -> Path | None:
