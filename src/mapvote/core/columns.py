@@ -10,6 +10,7 @@ from __future__ import annotations
 import numba
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Grid, tile_grid
 from mapvote.core.points import _lower_envelope
@@ -91,6 +92,27 @@ def reference_window(point_map: PointMap, grid: Grid) -> Reference:
         rows, cols, _ = grid.indices_of(cloud)
         fill_columns(rows, cols, cloud[:, 2], ground_z, base, GROUND_MARGIN_M, occupied, counts, bottom_z, top_z)
     return Reference(grid, ground_z, base, occupied, counts, bottom_z, top_z, free if learned else None)
+
+
+def above_ground_points(point_map: PointMap, grid: Grid) -> U64:
+    """(rows, cols) all bits where the map holds a ground point in the cell or next to it, else none.
+
+    A stand-in for the known-free columns of a map that came without: whoever measured the ground there looked through
+    the air above it, so an obstacle would most likely be in the map. Where there is no ground point, nobody can say.
+    """
+    wide = grid.padded(1)
+    seen = np.zeros(wide.shape, dtype=np.bool_)
+    for tile in wide.tiles():
+        if tile in point_map.tiles:
+            window = tile_grid(point_map.lattice, tile)
+            content = point_map.tiles[tile]
+            rows, cols, inside = window.indices_of(map_points(window, content.points))
+            low = content.points[:, 2] - content.ground_z[rows * inside, cols * inside] < GROUND_MARGIN_M
+            r, c = rows[low & inside] + window.row0 - wide.row0, cols[low & inside] + window.col0 - wide.col0
+            here = (r >= 0) & (c >= 0) & (r < wide.rows) & (c < wide.cols)
+            seen[r[here], c[here]] = True
+    near = ndimage.binary_dilation(seen, structure=np.ones((3, 3)))[1:-1, 1:-1]
+    return np.where(near, ~np.uint64(0), np.uint64(0))
 
 
 def cut_reference(outer: Reference, window: Grid) -> Reference:

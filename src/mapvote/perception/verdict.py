@@ -95,10 +95,10 @@ def _weigh(
             votes[4] = 1 if not (votes[0] or votes[1] or votes[2] or votes[3]) else 0
 
 
-def weigh(planes: U64, occupied: U64, near: U64, free: U64 | None, settings: VotingSettings) -> Verdict:
+def weigh(planes: U64, occupied: U64, near: U64, free: U64, settings: VotingSettings) -> Verdict:
     """Votes of a window from its counters ``planes`` (rows, cols, 2 * PLANES) and the map's words (rows, cols).
 
-    ``near``: what the map's voxels explain (rule C); ``free``: what the map knows to be free (rule D), or None.
+    ``near``: what the map's voxels explain (rule C); ``free``: what the map knows to be free (rule D).
     """
     shape, rules = occupied.shape, settings.rules
     everything = np.full(shape, ~np.uint64(0))
@@ -106,7 +106,7 @@ def weigh(planes: U64, occupied: U64, near: U64, free: U64 | None, settings: Vot
     gone, new = np.zeros(shape, np.uint64), np.zeros(shape, np.uint64)
     _weigh(
         planes, occupied, near if "C" in rules else np.where(occupied, everything, np.uint64(0)),
-        free if "D" in rules and free is not None else everything,
+        free if "D" in rules else everything,
         "F" in rules, settings.empty_votes if "F" in rules else 1.0, settings.gone_votes if "E" in rules else 1.0,
         settings.clear_share if "E" in rules else 0.0, settings.min_scans if "G" in rules else 1,
         settings.min_support if "G" in rules else 1, tally, gone, new, adrift,

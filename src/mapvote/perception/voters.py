@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from mapvote.config import VotingSettings
-from mapvote.core.columns import cut_reference, dilated, reference_window
+from mapvote.core.columns import above_ground_points, cut_reference, dilated, reference_window
 from mapvote.core.grid import Grid, TileIndex, tile_grid
 from mapvote.core.sensors import Sensor
 from mapvote.core.types import F64, I32, NO_VOTE, U8, U64, Bool, CellState, PointMap, Reference
@@ -104,7 +104,8 @@ class ColumnVoter:
             around = reference_window(self.point_map, window.padded(1))
             near = dilated(around.occupied, around.base, 1)[1:-1, 1:-1]
             here = cut_reference(around, window)
-            verdict = weigh(planes, here.occupied, near, here.free, self.voting)
+            known = here.free if here.free is not None else above_ground_points(self.point_map, window)
+            verdict = weigh(planes, here.occupied, near, known, self.voting)
             if verdict.tally.any():
                 free = free_words(planes, here.occupied)
                 out[tile] = TileVotes(verdict.tally, verdict.states(), verdict.gone, verdict.new, free)

@@ -1,0 +1,120 @@
+"""What a drive's evidence amounts to, rule by rule (METHOD 4, C to H)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from mapvote.config import VotingSettings
+from mapvote.core.types import NO_VOTE, U64, CellState
+from mapvote.perception.evidence import PLANES
+from mapvote.perception.verdict import Verdict, drop_specks, fallen, weigh
+
+UO, UE, CO, CE, UN = CellState
+FREE = ~np.uint64(0)
+
+
+def cell(through: dict[int, int], struck: dict[int, int]) -> U64:
+    """Counters (1, 1, 2 * PLANES) of one cell: scans by voxel."""
+    planes = np.zeros((1, 1, 2 * PLANES), np.uint64)
+    for first, counts in ((0, through), (PLANES, struck)):
+        for bit, count in counts.items():
+            for k in range(PLANES):
+                planes[0, 0, first + k] |= np.uint64((count >> k & 1) << bit)
+    return planes
+
+
+def judge(through: dict[int, int], struck: dict[int, int], occupied: int = 0, **more: Any) -> Verdict:
+    near, free = more.pop("near", 0), more.pop("free", int(FREE))
+    settings = VotingSettings(method="columns", **more)
+    occupied_word, near_word, free_word = (np.full((1, 1), w, np.uint64) for w in (occupied, near, free))
+    return weigh(cell(through, struck), occupied_word, near_word, free_word, settings)
+
+
+def state(*args: Any, **more: Any) -> int:
+    return int(judge(*args, **more).states()[0, 0])
+
+
+def test_a_mapped_voxel_struck_is_unchanged_and_seen_through_is_gone() -> None:
+    assert state({}, {3: 5}, occupied=0b1000) == UO
+    assert state({3: 20}, {}, occupied=0b1000) == CE
+    assert state({}, {}, occupied=0b1000) == NO_VOTE
+
+
+def test_rule_e_a_few_hits_outweigh_many_rays_that_grazed_past() -> None:
+    assert state({3: 20}, {3: 4}, occupied=0b1000) == UO
+    assert state({3: 20}, {3: 4}, occupied=0b1000, rules="ABCDFG") == CE
+
+
+def test_rule_e_what_is_hardly_ever_seen_through_is_not_called_gone() -> None:
+    through = {1: 40, 12: 3}
+    assert state(through, {}, occupied=1 << 12) == UN
+    assert state(through, {}, occupied=1 << 12, rules="ABCDFG") == CE
+
+
+def test_rule_c_what_the_map_explains_is_not_new() -> None:
+    assert state({}, {4: 9}) == CO
+    assert state({}, {4: 9}, near=1 << 4) != CO
+    assert state({}, {4: 9}, near=1 << 4, rules="ABDEFG") == CO
+
+
+def test_rule_d_new_only_where_the_map_knew_free_space() -> None:
+    assert state({}, {4: 9}, free=0) != CO
+    assert state({}, {4: 9}, free=0, rules="ABCEFG") == CO
+
+
+def test_rule_f_only_rays_at_the_height_of_the_new_thing_speak_against_it() -> None:
+    assert state({9: 100}, {4: 4}) == CO
+    assert state({4: 100}, {4: 4}) != CO
+    assert state({9: 100}, {4: 4}, rules="ABCDEG") == UE
+
+
+def test_rule_g_a_single_hit_is_not_enough() -> None:
+    assert state({}, {4: 1}) != CO
+    assert state({}, {4: 1}, rules="ABCDEF") == CO
+
+
+def test_a_wall_keeps_its_voxels_when_the_awning_above_it_is_taken_down() -> None:
+    verdict = judge({9: 30, 10: 30}, {2: 40, 3: 40}, occupied=0b110_0000_1100)
+    assert verdict.states()[0, 0] == UO
+    assert verdict.gone[0, 0] == 0b110_0000_0000
+
+
+def test_what_no_ray_reached_goes_with_the_column_it_stood_on() -> None:
+    verdict = judge({2: 30, 3: 30}, {}, occupied=0b1_0000_0000_1100)
+    assert verdict.states()[0, 0] == CE
+    assert verdict.gone[0, 0] == 0b1_0000_0000_1100
+
+
+def test_the_verdict_is_a_tally_that_two_vehicles_may_add() -> None:
+    one, other = judge({3: 20}, {}, occupied=0b1000), judge({}, {3: 9}, occupied=0b1000)
+    assert (one.tally + other.tally).argmax() == UO
+
+
+def test_rule_g_drops_components_of_fewer_than_four_cells() -> None:
+    states = np.full((8, 8), UE, np.uint8)
+    states[0, 0:3] = CO
+    states[4:6, 4:6] = CE
+    specks = drop_specks(states, 4)
+    assert specks.sum() == 3
+    assert specks[0, 0:3].all()
+
+
+def test_rule_h_a_roof_falls_with_its_walls_but_not_beside_one_that_stands() -> None:
+    adrift = np.zeros((20, 40), bool)
+    adrift[8:12, 8:12] = True
+    adrift[8:12, 30:34] = True
+    states = np.full(adrift.shape, UN, np.uint8)
+    states[8:12, 4] = CE
+    assert fallen(states, adrift, 10)[8:12, 8:12].all()
+    assert not fallen(states, adrift, 10)[:, 30:].any(), "too far from anything that is gone"
+    states[12, 12] = UO
+    assert not fallen(states, adrift, 10).any(), "it touches what still stands"
+    assert not fallen(np.full_like(states, UN), adrift, 10).any()
+
+
+def test_what_hangs_in_the_air_over_rays_is_adrift() -> None:
+    assert judge(dict.fromkeys(range(10), 9), {}, occupied=1 << 12).adrift[0, 0]
+    assert not judge({0: 9}, {}, occupied=1 << 12).adrift[0, 0]
+    assert not judge(dict.fromkeys(range(14), 9), {}, occupied=1 << 12).adrift[0, 0]
