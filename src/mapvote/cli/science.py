@@ -16,7 +16,8 @@ if TYPE_CHECKING:
 
 
 def register(app: typer.Typer) -> None:
-    """Add simulate and evaluate."""
+    """Add demo, simulate and evaluate."""
+    app.command()(demo)
     app.command()(simulate)
     app.command()(evaluate)
 
@@ -90,3 +91,38 @@ def _stages() -> Iterator[Callable[[str, int, int], None]]:
             bar.update(tasks[stage], completed=done, total=total)
 
         yield told
+
+
+def demo(
+    out: Annotated[Path, typer.Option(help="folder for maps, tables, pictures and report.html")] = Path("out"),
+    quick: Annotated[
+        bool, typer.Option("--quick", help="a street corner instead of a street: a minute at most")
+    ] = False,
+) -> None:
+    """The whole story on a simulated street: build a map, let three vehicles vote, update it, tell how good it is."""
+    from rich.console import Console
+
+    from mapvote.evaluation.demo import CASE, commands
+    from mapvote.evaluation.demo import demo as run
+
+    console = Console(soft_wrap=True)
+    console.print("The first run compiles its kernels, which takes some seconds in each stage.", style="dim")
+    with _stages() as told:
+        evaluation, story = run(out, quick, told)
+    console.print("\n[bold]What changed[/]", highlight=False)
+    for area, deleted, added in story.areas:
+        console.print(
+            f"  {area.name}: {area.objects} {area.kind}; {deleted} points deleted, {added} added", highlight=False
+        )
+    f1 = evaluation.result["cases"][CASE]["strict"]["macro_f1"]
+    console.print(
+        f"  in all {story.deleted} points deleted, {story.added} added; "
+        f"{story.found} of {story.objects} changed objects found, {story.false_objects} false; F1 {f1:.3f}",
+        highlight=False,
+    )
+    console.print("\n[bold]Where to look[/]")
+    console.print(f"  {out / 'report.html'}: the story with pictures and tables", highlight=False)
+    console.print(f"  {out / 'map_before.pcd'} and {out / 'map_after.pcd'}: the maps", highlight=False)
+    console.print(f"  {out / 'tables.txt'}, results.json, results.csv, pictures/", highlight=False)
+    console.print("\n[bold]What to try next[/]")
+    console.print("".join(f"  {line}\n" for line in commands(evaluation, out).splitlines()), highlight=False)

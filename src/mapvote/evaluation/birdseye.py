@@ -100,12 +100,13 @@ def draw(
     *,
     paths: Sequence[tuple[str, F64]] = (),
     legend: Sequence[tuple[str, str]] = (),
+    size_m: float = 0.2,
 ) -> Figure:
     """Panels (title, points (n, 3), colours (n, 3)) from one camera; ``paths`` of vehicles (name, points (m, 3))."""
     width = 13.0
     figure, axes = style.new_figure(width, 0.62 * width / len(panels) + 0.6, 1, len(panels))
     for axis, (title, points, colours) in zip(axes[0], panels, strict=True):
-        axis.imshow(render(points, colours, camera), interpolation="antialiased")
+        axis.imshow(render(points, colours, camera, size_m), interpolation="antialiased")
         for i, (_, path) in enumerate(paths):
             pixels, depth = camera.project(path)
             seen = depth > 2.0

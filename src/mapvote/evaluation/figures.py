@@ -47,6 +47,7 @@ def _thicken(cells: Bool) -> Bool:
 
 def _panel(axis: Any, image: np.ndarray, grid: Grid, title: str, **how: Any) -> None:
     axis.imshow(image, origin="lower", extent=_extent(grid), interpolation="nearest", **how)
+    axis.autoscale(False)
     axis.set_title(title, loc="left")
     axis.set_ylabel("y (m)")
 
@@ -85,8 +86,8 @@ def street(
     figure, axes = _stack(grid, 2)
     axes = axes.ravel()
     for axis, points, marked, colour, title in (
-        (axes[0], old_points, deleted, style.GONE, "(a) First map; points that the vehicles voted away in blue"),
-        (axes[1], updated_points, added, style.NEW, "(b) Updated map; points that the vehicles added in red"),
+        (axes[0], old_points, deleted, style.GONE, "(a) First map, deleted points in blue"),
+        (axes[1], updated_points, added, style.NEW, "(b) Updated map, added points in red"),
     ):
         image = _from_above(points, grid)
         rows, cols, inside = grid.indices_of(marked)
