@@ -88,9 +88,8 @@ def commands(evaluation: Evaluation, out: Path) -> str:
     drives = evaluation.scene.folder
     vehicles = [drive.vehicle for drive in evaluation.drives]
     ballots = " ".join(f"{v}.ballot" for v in vehicles)
-    votes = "\n".join(
-        f"mapvote vote {drives / v} --map {out / 'map_before'} --vehicle {v} --out {v}.ballot" for v in vehicles
-    )
+    before = out / "map_before"
+    votes = "\n".join(f"mapvote vote {drives / v} --map {before} --vehicle {v} --out {v}.ballot" for v in vehicles)
     return (
         f"# the same steps by hand, on the drives of this demo\n{votes}\n"
         f"mapvote update {before} {ballots} --out updated\n\n"
