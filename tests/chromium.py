@@ -88,8 +88,11 @@ class Chromium:
             self._note(answer)
 
     def open(self, url: str) -> None:
-        """Load a page anew, even if only its fragment differs."""
+        """Load a page anew, even if only its fragment differs; what the last one did is forgotten."""
         self.call("Page.navigate", url="about:blank")
+        self.wait("location.href === 'about:blank'")
+        self.errors.clear()
+        self.requests.clear()
         self.call("Page.navigate", url=url)
 
     def run(self, script: str) -> Any:

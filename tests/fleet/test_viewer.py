@@ -5,7 +5,9 @@ from __future__ import annotations
 import json
 import threading
 from collections.abc import Iterator
+from copy import deepcopy
 from dataclasses import dataclass, field
+from functools import cache
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib.resources import files
 from typing import Any
@@ -47,6 +49,7 @@ def street(*houses: np.ndarray) -> PointMap:
     return map_from_points(np.concatenate([road, *houses]), map_id="street")
 
 
+@cache
 def make_world() -> tuple[PointMap, PointMap]:
     rng = np.random.default_rng(1)
     stays = [
@@ -91,6 +94,7 @@ def spoken(vehicle: str, state: str, end: str, why: str | None = None) -> dict[s
     return {"vehicle": vehicle, "drive": "d1", "state": state, "end": end, "counts": why is None, "why": why}
 
 
+@cache
 def world_answers() -> dict[str, Any]:
     before, after = make_world()
     versions = [
@@ -150,7 +154,7 @@ def world_answers() -> dict[str, Any]:
 
 @pytest.fixture
 def server() -> Iterator[FakeServer]:
-    fake = FakeServer(world_answers())
+    fake = FakeServer(deepcopy(world_answers()))
 
     class Handler(BaseHTTPRequestHandler):
         def do_GET(self) -> None:
@@ -193,8 +197,6 @@ def text(browser: Chromium, selector: str) -> str:
 
 
 def open_page(browser: Chromium, server: FakeServer, fragment: str = "") -> None:
-    browser.errors.clear()
-    browser.requests.clear()
     browser.open(server.url + fragment)
     browser.wait("!document.querySelector('#content').hidden && document.querySelector('#tally').innerText")
 
@@ -296,7 +298,6 @@ def test_a_new_server_says_what_is_missing(browser: Chromium, server: FakeServer
 
 def test_the_key_is_asked_for_kept_in_the_tab_and_never_in_a_url(browser: Chromium, server: FakeServer) -> None:
     server.key = KEY
-    browser.requests.clear()
     browser.open(server.url)
     browser.wait("!document.querySelector('#key-form').hidden && document.activeElement.id === 'key'")
     browser.type("wrong")

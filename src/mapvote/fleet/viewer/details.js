@@ -1,0 +1,112 @@
+// One change, or one cell and the votes behind it.
+
+import * as api from "./api.js";
+import { $, dot, element, facts, link, number, when } from "./dom.js";
+import { state } from "./page.js";
+
+const STATES = {
+  unchanged_occupied: "unchanged, occupied",
+  unchanged_empty: "unchanged, empty",
+  changed_occupied: "changed, now occupied",
+  changed_empty: "changed, now empty",
+  undetermined: "undetermined",
+};
+const CHANGE = { changed_occupied: "built", changed_empty: "demolished" };
+let asking = null;
+
+// A feature as the view draws it: polygons and the box around them.
+export function drawable(feature) {
+  const g = feature.geometry;
+  const polygons = g.type === "Polygon" ? [g.coordinates] : g.coordinates;
+  const corners = polygons.flatMap((p) => p[0]);
+  const xs = corners.map((c) => c[0]), ys = corners.map((c) => c[1]);
+  const box = [Math.min(...xs), Math.min(...ys), Math.max(...xs), Math.max(...ys)];
+  return { id: feature.id, kind: feature.properties.kind, polygons, box };
+}
+
+export function showChange(id) {
+  const feature = state.features.find((f) => f.id === id);
+  if (!feature) return;
+  const p = feature.properties, [x, y] = drawable(feature).polygons[0][0][0];
+  location.replace(`#change=${encodeURIComponent(id)}`);
+  asking = null;
+  mark(id);
+  state.view.select(id);
+  details(p.kind === "built" ? "Built" : "Demolished", p.kind, [
+    facts([
+      ["area", `${p.area_m2.toFixed(2)} m\u00b2 (${p.cells} cells)`],
+      ["height", `${p.height_m.toFixed(1)} m above ground`],
+      ["points", `${p.points} ${p.kind === "built" ? "added" : "deleted"}`],
+      ["votes for it", p.votes_median ? `${number(p.votes_median)} (fewest ${p.votes_min})` : "unknown"],
+      ["first seen", when(p.first_seen)],
+      ["last seen", when(p.last_seen)],
+      [p.versions.length > 1 ? "versions" : "version", p.versions.join(", ") || "unknown"],
+    ]),
+    link("Who voted here?", () => showCell([x + 0.15, y + 0.15])),
+  ]);
+}
+
+export async function showCell([x, y]) {
+  location.replace(`#cell=${x.toFixed(2)},${y.toFixed(2)}`);
+  mark(null);
+  const { x0, y0 } = state.manifest.lattice;
+  const corner = [x0 + Math.floor((x - x0) / 0.3) * 0.3, y0 + Math.floor((y - y0) / 0.3) * 0.3];
+  state.view.select(null, corner);
+  const title = `Cell at x ${(corner[0] + 0.15).toFixed(2)}, y ${(corner[1] + 0.15).toFixed(2)}`;
+  const mine = (asking = Symbol());
+  let answer;
+  try {
+    answer = await api.cell(x, y);
+  } catch (error) {
+    return details(title, null, [element("p", {}, [error.message])]);
+  }
+  if (asking !== mine) return;  // something else was chosen meanwhile
+  const vote = (v) =>
+    element("li", { className: v.counts ? "" : "silent" }, [
+      element("div", { className: "head" }, [element("b", {}, [`${v.vehicle} / ${v.drive}`]), element("time", {}, [when(v.end)])]),
+      element("div", {}, [CHANGE[v.state] && dot(CHANGE[v.state]), STATES[v.state] ?? v.state]),
+      !v.counts && element("div", {}, [`does not count: ${v.why || "no reason given"}`]),
+    ]);
+  const decided = answer.decisions.map((d) => `Version ${d.version} decided: ${STATES[d.state] ?? d.state}.`);
+  details(title, null, [
+    answer.votes.length
+      ? element("ol", { className: "votes" }, answer.votes.map(vote))
+      : element("p", { className: "hint" }, ["No vehicle has voted on this cell."]),
+    ...decided.map((text) => element("p", { className: "hint" }, [text])),
+  ]);
+}
+
+function details(title, kind, content) {
+  $("details").replaceChildren(
+    element("button", { className: "close", title: "Close", onclick: closeDetails }, ["\u00d7"]),
+    element("h3", {}, [kind && dot(kind), title]),
+    ...content,
+  );
+  $("details").hidden = false;
+}
+
+export function closeDetails() {
+  $("details").hidden = true;
+  mark(null);
+  state.view.select(null);
+}
+
+function mark(id) {
+  for (const button of $("changes").querySelectorAll("button"))
+    button.setAttribute("aria-current", String(button.parentElement.id === `item-${id}`));
+}
+
+// A link to one change or one cell.
+export function follow() {
+  const [, what, value] = location.hash.match(/^#(change|cell)=(.+)$/) ?? [];
+  if (what === "change") {
+    const feature = state.features.find((f) => f.id === decodeURIComponent(value));
+    if (feature) state.view.fit(drawable(feature).box, 0.38);
+    showChange(decodeURIComponent(value));
+  } else if (what === "cell") {
+    const where = value.split(",").map(Number);
+    if (where.length !== 2 || !where.every(Number.isFinite)) return;
+    state.view.fit([where[0] - 10, where[1] - 10, where[0] + 10, where[1] + 10]);
+    showCell(where);
+  }
+}
