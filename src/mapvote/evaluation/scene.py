@@ -20,6 +20,7 @@ import numpy as np
 
 import mapvote
 from mapvote.config import Settings
+from mapvote.core.columns import GROUND_MARGIN_M
 from mapvote.core.types import F64, Drive, PointMap
 from mapvote.evaluation.truth import Truth, read_truth
 from mapvote.formats import open_drive, read_map, write_map
@@ -31,7 +32,10 @@ from mapvote.simulation.scenario import load_scenario
 Progress = Callable[[str, int, int], None]
 """Called with (what is being done, done, in all)."""
 
-_DRIVES_FROM = ("core", "formats", "simulation")
+_DRIVES_FROM = (
+    "simulation", "core/geometry.py", "core/grid.py", "core/points.py", "core/sensors.py", "formats/kitti.py",
+)  # fmt: skip
+"""What the bytes of drives and truth depend on; most work on the program leaves gigabytes of drives as they are."""
 _MAP_FROM = ("core", "formats", "perception", "mapping.py")
 BALLOTS_FROM = (*_MAP_FROM, "vehicle.py")
 
@@ -76,7 +80,7 @@ class Scene:
         """Drives and truth."""
         text = load_scenario(self.scenario, self.overrides).model_dump_json()
         name = f"{Path(self.scenario).stem}-{self.seed}"
-        return self.cache / f"{name}-{key_of(text, sources_digest(_DRIVES_FROM))}"
+        return self.cache / f"{name}-{key_of(text, sources_digest(_DRIVES_FROM), GROUND_MARGIN_M)}"
 
     @property
     def work(self) -> Path:
