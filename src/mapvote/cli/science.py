@@ -23,7 +23,7 @@ def register(app: typer.Typer) -> None:
 
 
 def simulate(
-    scenario: Annotated[str, typer.Argument(help="paper, street, junction, corner, or a .toml file")],
+    scenario: Annotated[str, typer.Argument(help="paper, clear, street, junction, corner, or a .toml file")],
     out: Annotated[Path, typer.Argument(help="folder to write; it must not exist")],
     seed: Annotated[int, typer.Option(help="layout, clutter, traffic and noise")] = 1,
 ) -> None:
@@ -41,7 +41,7 @@ def simulate(
 
 
 def evaluate(
-    scenario: Annotated[str, typer.Argument(help="paper, street, junction, corner, or a .toml file")],
+    scenario: Annotated[str, typer.Argument(help="paper, clear, street, junction, corner, or a .toml file")],
     seed: Annotated[int, typer.Option(help="layout, clutter, traffic and noise")] = 1,
     case: Annotated[
         str, typer.Option(help='1..5, "1 column", columns, yardsticks, several by commas, or all')
