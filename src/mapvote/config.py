@@ -135,11 +135,15 @@ class VotingSettings(Section):
 
 
 class FuseSettings(Section):
-    """fleet/fuse.py: which votes count, how many are enough (DESIGN 4)."""
+    """fleet/fuse.py: which votes count, how many are enough (DESIGN 4). A version records the ones it was made by."""
 
-    min_votes: int = 2
-    latest_vehicles: int = 9
-    max_age_days: float = 30.0
+    min_votes: int = Field(default=2, ge=1, description="vehicles that a change needs: k + 1 against k liars")
+    latest_vehicles: int = Field(default=9, ge=1, description="only the last so many vehicles on a tile count")
+    max_age_days: float = Field(default=30.0, gt=0, description="and drives so much older than its newest do not")
+    min_age_s: float = Field(default=0.0, ge=0, description="a ballot waits so long before it counts (time to un-vote)")
+    max_deleted_share: float = Field(
+        default=0.5, ge=0, le=1, description="hold a version that deletes more of the points of the tiles it touches"
+    )
 
 
 class GateSettings(Section):
@@ -156,6 +160,15 @@ class GateSettings(Section):
     tolerance_scatter_m: float = Field(default=0.02, ge=0, description="allowed growth of the poses' scatter")
 
 
+class ServerSettings(Section):
+    """fleet/app.py: what the server lets in."""
+
+    max_body_bytes: int = Field(default=16_000_000, description="largest request body")
+    ballots_per_minute: float = Field(default=600.0, gt=0, description="of one vehicle, on average")
+    burst: int = Field(default=60, ge=1, description="ballots of one vehicle at once")
+    batch: int = Field(default=64, ge=1, description="ballots written in one transaction at most")
+
+
 class Settings(Section):
     """All of them. ``mapvote config`` prints this page."""
 
@@ -164,6 +177,7 @@ class Settings(Section):
     mapping: MappingSettings = MappingSettings()
     voting: VotingSettings = VotingSettings()
     fuse: FuseSettings = FuseSettings()
+    server: ServerSettings = ServerSettings()
     gate: GateSettings = GateSettings()
 
     def digest(self) -> str:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, Protocol, TypeVar
 
 import numpy as np
 
@@ -72,7 +72,19 @@ class Decision:
     """Points deleted from the tile."""
 
 
-def select(votes: Iterable[TileVote], settings: FuseSettings) -> list[TileVote]:
+class Dated(Protocol):
+    """Anything that a vehicle said at a moment."""
+
+    @property
+    def vehicle(self) -> str: ...
+    @property
+    def end_ns(self) -> int: ...
+
+
+D = TypeVar("D", bound=Dated)
+
+
+def select(votes: Iterable[D], settings: FuseSettings) -> list[D]:
     """The votes inside the window (DESIGN 4): drives within ``max_age_days`` of the newest on this tile, then those
     of the ``latest_vehicles`` vehicles that passed last. Ties between vehicles go to the later name."""
     votes = list(votes)

@@ -1,0 +1,41 @@
+"""What the server refuses, by reason. The app's one table turns each class into a status code."""
+
+from __future__ import annotations
+
+from mapvote.core.types import MapvoteError
+
+
+class Unauthorised(MapvoteError):
+    """No key, or one that is unknown or revoked."""
+
+
+class Forbidden(MapvoteError):
+    """A good key, but not for this."""
+
+
+class NotFound(MapvoteError):
+    """There is no such version, tile, ballot or key."""
+
+
+class Conflict(MapvoteError):
+    """The request does not fit the state of the store: stale base, other method, somebody else published first."""
+
+
+class Held(Conflict):
+    """A version that the policy does not let through."""
+
+    def __init__(self, reasons: list[str]) -> None:
+        super().__init__("the version is held: " + "; ".join(reasons))
+        self.reasons = reasons
+
+
+class TooLarge(MapvoteError):
+    """Beyond a limit on size."""
+
+
+class TooMany(MapvoteError):
+    """Beyond the rate limit of a key; try again later."""
+
+
+class Unavailable(MapvoteError):
+    """The database cannot be written or reached now; nothing was changed, try again."""

@@ -1,0 +1,148 @@
+"""The tables (DESIGN 4). One store holds one map. Times are nanoseconds since 1970, hashes SHA-256 in hex.
+
+Nothing that was voted or published is ever overwritten: a ballot that is replaced or withdrawn is marked with the
+event that did so, so that any past round can be fused again (un-vote by replay).
+"""
+
+from __future__ import annotations
+
+import sqlalchemy as sa
+
+metadata = sa.MetaData(
+    naming_convention={
+        "ix": "ix_%(column_0_label)s",
+        "uq": "uq_%(table_name)s_%(column_0_name)s",
+        "fk": "fk_%(table_name)s_%(column_0_name)s_%(referred_table_name)s",
+        "pk": "pk_%(table_name)s",
+    }
+)
+_Seq = sa.BigInteger().with_variant(sa.Integer, "sqlite")
+_Hash = sa.String(64)
+
+maps = sa.Table(
+    "maps",
+    metadata,
+    sa.Column("map_id", sa.String(200), primary_key=True),
+    sa.Column("x0", sa.Double, nullable=False),
+    sa.Column("y0", sa.Double, nullable=False),
+    sa.Column("georeference", sa.JSON, nullable=False),
+    sa.Column("method", sa.String(64)),
+)
+"""``method``: how the standing ballots were cast; null while there are none. One round never mixes methods."""
+
+keys = sa.Table(
+    "keys",
+    metadata,
+    sa.Column("name", sa.String(64), primary_key=True),
+    sa.Column("role", sa.String(16), primary_key=True),
+    sa.Column("hash", _Hash, primary_key=True),
+    sa.Column("created_ns", sa.BigInteger, nullable=False),
+    sa.Column("revoked_ns", sa.BigInteger),
+    sa.UniqueConstraint("hash"),
+)
+"""``role``: vehicle or operator; only the hash of a key is kept."""
+
+events = sa.Table(
+    "events",
+    metadata,
+    sa.Column("seq", _Seq, primary_key=True, autoincrement=True),
+    sa.Column("at_ns", sa.BigInteger, nullable=False),
+    sa.Column("kind", sa.String(16), nullable=False),
+    sa.Column("actor", sa.String(80), nullable=False),
+    sa.Column("detail", sa.String(400), nullable=False),
+    sqlite_autoincrement=True,
+)
+"""The log, and the one order of everything: writers take turns, so ``seq`` grows in the order of commits."""
+
+blobs = sa.Table(
+    "blobs",
+    metadata,
+    sa.Column("hash", _Hash, primary_key=True),
+    sa.Column("data", sa.LargeBinary, nullable=False),
+)
+"""Content-addressed planes of tiles: zstd frames, named by the hash of what is inside."""
+
+versions = sa.Table(
+    "versions",
+    metadata,
+    sa.Column("number", sa.Integer, primary_key=True, autoincrement=False),
+    sa.Column("parent", sa.Integer),
+    sa.Column("kind", sa.String(16), nullable=False),
+    sa.Column("target", sa.Integer),
+    sa.Column("created_ns", sa.BigInteger, nullable=False),
+    sa.Column("published_by", sa.String(80), nullable=False),
+    sa.Column("reason", sa.String(400), nullable=False),
+    sa.Column("mark", sa.BigInteger, nullable=False),
+    sa.Column("policy", sa.JSON, nullable=False),
+)
+"""``mark``: the last event that the version knew of. ``target``: the version that a rollback or replay starts from."""
+
+version_tiles = sa.Table(
+    "version_tiles",
+    metadata,
+    sa.Column("version", sa.Integer, sa.ForeignKey("versions.number"), primary_key=True),
+    sa.Column("row", sa.Integer, primary_key=True),
+    sa.Column("col", sa.Integer, primary_key=True),
+    sa.Column("points", _Hash),
+    sa.Column("ground", _Hash),
+    sa.Column("free", _Hash),
+    sa.Index("ix_version_tiles_tile", "row", "col", "version"),
+)
+"""Only tiles that the version set; a tile that it does not name is as in its parent. Null points: no such tile."""
+
+ballots = sa.Table(
+    "ballots",
+    metadata,
+    sa.Column("seq", sa.BigInteger, sa.ForeignKey("events.seq"), primary_key=True, autoincrement=False),
+    sa.Column("first_seq", sa.BigInteger, nullable=False),
+    sa.Column("gone_seq", sa.BigInteger),
+    sa.Column("vehicle", sa.String(64), nullable=False),
+    sa.Column("drive", sa.String(64), nullable=False),
+    sa.Column("digest", _Hash, nullable=False),
+    sa.Column("start_ns", sa.BigInteger, nullable=False),
+    sa.Column("end_ns", sa.BigInteger, nullable=False),
+    sa.Column("received_ns", sa.BigInteger, nullable=False),
+    sa.Column("settings_hash", sa.String(128), nullable=False),
+    sa.Index("ix_ballots_drive", "vehicle", "drive"),
+)
+"""``first_seq``: when this drive was first heard of; ``gone_seq``: the event that replaced or withdrew this ballot."""
+
+ballot_tiles = sa.Table(
+    "ballot_tiles",
+    metadata,
+    sa.Column("row", sa.Integer, primary_key=True),
+    sa.Column("col", sa.Integer, primary_key=True),
+    sa.Column("ballot", sa.BigInteger, sa.ForeignKey("ballots.seq"), primary_key=True),
+    sa.Column("base", sa.String(64), nullable=False),
+    sa.Column("states", sa.LargeBinary),
+    sa.Column("tally", sa.LargeBinary),
+    sa.Column("gone", sa.LargeBinary),
+    sa.Column("new_points", sa.LargeBinary),
+    sa.Column("free", sa.LargeBinary),
+    sa.Index("ix_ballot_tiles_ballot", "ballot"),
+)
+
+decisions = sa.Table(
+    "decisions",
+    metadata,
+    sa.Column("version", sa.Integer, sa.ForeignKey("versions.number"), primary_key=True),
+    sa.Column("row", sa.Integer, primary_key=True),
+    sa.Column("col", sa.Integer, primary_key=True),
+    sa.Column("states", sa.LargeBinary, nullable=False),
+    sa.Column("tally", sa.LargeBinary, nullable=False),
+    sa.Column("vehicles", sa.Integer, nullable=False),
+    sa.Column("added", sa.Integer, nullable=False),
+    sa.Column("deleted", sa.Integer, nullable=False),
+)
+"""``tally``: (65536, 5) int32 in VOTE_UNITs, compressed."""
+
+bars = sa.Table(
+    "bars",
+    metadata,
+    sa.Column("version", sa.Integer, sa.ForeignKey("versions.number"), primary_key=True),
+    sa.Column("row", sa.Integer, primary_key=True),
+    sa.Column("col", sa.Integer, primary_key=True),
+    sa.Column("seq", sa.BigInteger, nullable=False),
+    sa.Column("cells", sa.LargeBinary, nullable=False),
+)
+"""A rollback: change votes on ``cells`` (65536 packed bits) from drives first heard of before ``seq`` count no more."""
