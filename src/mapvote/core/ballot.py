@@ -6,6 +6,7 @@ a newer format adds are ignored, required fields that are missing are refused.
 
 from __future__ import annotations
 
+import math
 from typing import Annotated
 
 import msgspec
@@ -26,6 +27,10 @@ _CELLS = TILE_CELLS * TILE_CELLS
 
 Id = Annotated[str, msgspec.Meta(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$")]
 """Vehicle and drive names: 1-64 of letters, digits, dot, underscore, dash; they appear in URLs and file names."""
+_Text = Annotated[str, msgspec.Meta(pattern=r"^[^\x00-\x1f]*$", max_length=200)]
+"""No control characters: some databases refuse them, and no log should print them."""
+_Hash = Annotated[str, msgspec.Meta(pattern=r"^[0-9a-f]{0,64}$")]
+_Count = Annotated[int, msgspec.Meta(ge=0, le=1 << 31)]
 
 
 class BallotTile(msgspec.Struct, frozen=True, kw_only=True):
@@ -48,18 +53,18 @@ class Ballot(msgspec.Struct, frozen=True, kw_only=True):
     """What one vehicle says after one drive. Self-contained."""
 
     format_version: int = FORMAT_VERSION
-    map_id: str
-    base: dict[str, str]
+    map_id: _Text
+    base: dict[str, _Hash]
     """Content hash of every tile the votes were cast against, by "row,col"; "" for a tile the map lacked."""
     vehicle: Id
     drive: Id
     start_ns: int
     end_ns: int
-    method: str
-    settings_hash: str
-    scans: int
+    method: _Text
+    settings_hash: _Text
+    scans: _Count
     """Scans in the drive."""
-    scans_localised: int
+    scans_localised: _Count
     """Scans that voted; the others abstained because the vehicle was not sure where it was."""
     median_sigma_m: float
     """Median position sigma of the scans that voted."""
@@ -111,7 +116,7 @@ def decode(data: bytes) -> Ballot:
     """Check the envelope; planes are checked when unpacked (:func:`validate` does all). MapvoteError if unusable."""
     try:
         ballot = msgspec.msgpack.decode(data, type=Ballot)
-    except msgspec.DecodeError as error:  # ValidationError is one too
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:  # ValidationError is a DecodeError
         raise MapvoteError(f"ballot: not readable ({error}); was it written by this version of mapvote?") from error
     if ballot.format_version < 1 or ballot.format_version > FORMAT_VERSION:
         raise MapvoteError(f"ballot: format {ballot.format_version}; this version reads up to {FORMAT_VERSION}")
@@ -127,6 +132,8 @@ def decode(data: bytes) -> Ballot:
             raise MapvoteError(f"ballot: tile {tile.tile} has no base hash")
     if ballot.start_ns > ballot.end_ns:
         raise MapvoteError("ballot: ends before it starts; check the drive's clock")
+    if not math.isfinite(ballot.median_sigma_m):
+        raise MapvoteError("ballot: median_sigma_m is not finite")
     return ballot
 
 

@@ -55,7 +55,7 @@ def decode_tile(data: bytes, what: str = "tile") -> MapTile:
     """The tile that :func:`encode_tile` took; ``what`` names it in the MapvoteError if it is not usable."""
     try:
         file = msgspec.msgpack.decode(data, type=_TileFile)
-    except msgspec.DecodeError as error:
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise MapvoteError(f"{what}: not a map tile ({error}); fetch it again") from error
     if not 1 <= file.tile_version <= TILE_VERSION:
         raise MapvoteError(f"{what}: tile format {file.tile_version}, but this mapvote reads up to {TILE_VERSION}")
