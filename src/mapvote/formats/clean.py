@@ -70,7 +70,7 @@ def clean_scan(
     if bad > MAX_BAD_SHARE * max(int(measured.sum()), 1):
         raise MapvoteError(
             f"{where}: {bad} of {int(measured.sum())} points are not finite or beyond {FAR_M:.0f} m, more than "
-            f"{MAX_BAD_SHARE:.0%}: the file is damaged, in millimetres, or not float32 x, y, z, intensity"
+            f"{MAX_BAD_SHARE:.0%}: {_likely_cause(distance[measured])}"
         )
     bad_points.count(index, bad)
     keep = measured & good & (distance >= sensor.min_range_m - 5.0 * sensor.range_sigma_m)
@@ -82,6 +82,15 @@ def clean_scan(
         time_s=None if time_s is None else np.ascontiguousarray(time_s[keep], dtype=np.float32),
         intensity=None if intensity is None else unit_intensity(intensity[keep]),
     )
+
+
+def _likely_cause(distance: NDArray[np.float64]) -> str:
+    finite = distance[np.isfinite(distance)]
+    farthest = float(np.quantile(finite, 0.99)) if len(finite) else 0.0
+    if len(finite) > 0.9 * len(distance) and farthest < 300_000.0:
+        unit, factor = ("millimetres", 1000) if farthest > 15_000.0 else ("centimetres", 100)
+        return f"they look like {unit} (the farthest {farthest:.0f}); divide x, y, z by {factor}"
+    return "the file is damaged, or not float32 x, y, z, intensity"
 
 
 def unit_intensity(intensity: NDArray[np.number]) -> F32:

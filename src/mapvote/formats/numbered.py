@@ -13,6 +13,8 @@ from mapvote.core.types import F64, I64, MapvoteError
 from mapvote.formats.clean import stamps_from_rate
 from mapvote.formats.drive import DriveFile, DriveOptions
 
+_LATEST_NS = 230 * 366 * 86_400 * 10**9
+
 
 def scan_files(folder: Path, suffix: str) -> list[Path]:
     """The files ``folder``/*``suffix`` in the order of the last number in their names; MapvoteError if none."""
@@ -62,6 +64,8 @@ def read_times_ns(file: Path) -> I64:
                 out.append(int((Decimal(text) * 10**9).to_integral_value()))
         except (InvalidOperation, ValueError, OverflowError) as error:
             raise MapvoteError(f"{file}:{number}: not a time in seconds: {text!r}") from error
+    if any(abs(ns) > _LATEST_NS for ns in out):
+        raise MapvoteError(f"{file}: times after the year 2200: they are not seconds (nanoseconds?); convert them")
     return np.array(out, dtype=np.int64)
 
 

@@ -1,0 +1,104 @@
+"""What is in this file: a title and rows of text for a map, a drive or a ballot."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+
+from mapvote.core.ballot import Ballot, decode, unpack_points, unpack_states
+from mapvote.core.grid import CELL_SIZE, TILE_CELLS
+from mapvote.core.tiling import all_points
+from mapvote.core.types import CellState, Drive, MapvoteError, PointMap
+from mapvote.formats import CLOUDS, DRIVES, open_drive, read_cloud, read_map
+from mapvote.formats.cloud import to_map
+from mapvote.formats.mapfolder import is_map_folder
+
+Rows = list[tuple[str, str]]
+
+
+def describe(path: Path, *, rate_hz: float | None = None, topic: str | None = None) -> tuple[str, Rows]:
+    """(title, rows of name and value) of whatever lies at ``path``; MapvoteError if it is nothing of ours."""
+    if is_map_folder(path):
+        return "mapvote map", _map(read_map(path))
+    for kind, (recognised, _) in CLOUDS.items():
+        if recognised(path):
+            cloud = read_cloud(path)
+            fields = [("other fields", ", ".join(cloud.dropped) or "none"), ("stored as", str(cloud.points.dtype))]
+            return kind, _map(to_map(str(path), cloud)) + fields
+    for kind, (recognised, _) in DRIVES.items():
+        if recognised(path):
+            return f"drive, {kind}", _drive(open_drive(path, rate_hz=rate_hz, topic=topic))
+    if path.is_file():
+        data = path.read_bytes()
+        try:
+            return "ballot", _ballot(decode(data), len(data))
+        except MapvoteError as error:
+            raise MapvoteError(f"{path}: neither map nor drive, and no ballot: {error}") from error
+    return "", _map(read_map(path))  # raises, and says what is there
+
+
+def _map(point_map: PointMap) -> Rows:
+    points = all_points(point_map)
+    low, high = points.min(axis=0), points.max(axis=0)
+    tiles = point_map.tiles.values()
+    learned = [t.free for t in tiles if t.free is not None]
+    known = float(np.mean([np.isfinite(t.ground_z).mean() for t in tiles]))
+    rows = [
+        ("map id", point_map.map_id),
+        ("points", f"{len(points):,}"),
+        ("tiles", f"{len(point_map.tiles)} of {TILE_CELLS * CELL_SIZE:.1f} m"),
+        ("x", f"{low[0]:.2f} to {high[0]:.2f} m"),
+        ("y", f"{low[1]:.2f} to {high[1]:.2f} m"),
+        ("z", f"{low[2]:.2f} to {high[2]:.2f} m"),
+        ("lattice", f"cells of {CELL_SIZE} m from ({point_map.lattice.x0}, {point_map.lattice.y0})"),
+        ("ground", f"known in {known:.0%} of the tiles' cells"),
+        ("known free", f"learned in {len(learned)} tiles" if learned else "never learned"),
+    ]
+    return rows + [(f"georeference: {name}", text.strip()) for name, text in point_map.georeference.items()]
+
+
+def _drive(drive: Drive) -> Rows:
+    seconds = (drive.stamps_ns[-1] - drive.stamps_ns[0]) * 1e-9
+    start = datetime.fromtimestamp(int(drive.stamps_ns[0]) // 10**9, UTC)
+    first = drive.read_scan(0)
+    T = drive.T_map_lidar_prior
+    rows = [
+        ("vehicle", drive.vehicle),
+        ("drive", drive.drive_id),
+        ("sensor", f"{drive.sensor.name}, {drive.sensor.beams} beams, {drive.sensor.rate_hz:g} Hz"),
+        ("scans", f"{len(drive)} in {seconds:.1f} s, the first with {len(first.points):,} points"),
+        ("starts", f"{start:%Y-%m-%d %H:%M:%S} UTC" if start.year > 1990 else "time of day unknown"),
+        ("point times", "none: taken as motion-compensated" if first.time_s is None else "yes: scans are de-skewed"),
+        ("mounted at", ", ".join(f"{v:.2f}" for v in drive.T_base_lidar[:3, 3]) + " m (T_base_lidar)"),
+    ]
+    if T is None:
+        return [*rows, ("prior", "none")]
+    length_m = float(np.linalg.norm(np.diff(T[:, :3, 3], axis=0), axis=1).sum())
+    about = f"{length_m:.0f} m driven, sigma {drive.prior_sigma_m:g} m and {drive.prior_sigma_deg:g} deg"
+    ends = " to ".join("({:.1f}, {:.1f}, {:.1f})".format(*T[i, :3, 3]) for i in (0, -1))
+    return [*rows, ("prior", about), ("from", ends)]
+
+
+def _ballot(ballot: Ballot, size: int) -> Rows:
+    counts = np.zeros(len(CellState), dtype=np.int64)
+    for tile in ballot.tiles:
+        if tile.states is not None:
+            counts += np.bincount(unpack_states(tile.states).ravel(), minlength=256)[: len(CellState)]
+    new = sum(len(unpack_points(t.new_points)) for t in ballot.tiles if t.new_points is not None)
+    planes = [p for p in ("states", "tally", "gone", "free", "new_points") if any(getattr(t, p) for t in ballot.tiles)]
+    seconds = (ballot.end_ns - ballot.start_ns) * 1e-9
+    rows = [
+        ("vehicle", ballot.vehicle),
+        ("drive", f"{ballot.drive}, {seconds:.1f} s"),
+        ("map id", ballot.map_id),
+        ("method", f"{ballot.method}, settings {ballot.settings_hash[:16]}"),
+        ("scans", f"{ballot.scans_localised} of {ballot.scans} voted, median sigma {ballot.median_sigma_m:.3f} m"),
+        ("tiles", str(len(ballot.tiles))),
+        ("planes", ", ".join(planes)),
+        ("new points", f"{new:,}"),
+        ("size", f"{size:,} bytes"),
+    ]
+    states = [(s.name.lower().replace("_", " "), f"{counts[s]:,} cells") for s in CellState]
+    return rows + (states if any(t.states is not None for t in ballot.tiles) else [("votes", "undecided tally")])

@@ -1,0 +1,69 @@
+"""Do drive and map belong together?"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from mapvote.core import geometry
+from mapvote.core.columns import map_points
+from mapvote.core.grid import CELL_SIZE, TILE_CELLS, tile_grid
+from mapvote.core.points import voxel_downsample, voxel_keys
+from mapvote.core.types import F32, F64, PointMap, Scan
+from mapvote.formats.doctor.finding import Finding
+
+
+def check_overlap(T: F64, scans: dict[int, Scan], point_map: PointMap) -> list[Finding]:
+    """Does the prior lie on the map, at the right height, and do the scans' points fall on the map's?"""
+    windows = [tile_grid(point_map.lattice, t) for t in point_map.tiles]
+    side = TILE_CELLS * CELL_SIZE
+    low = np.array([[w.x0, w.y0] for w in windows])
+    outside_m = np.array(
+        [np.linalg.norm(np.maximum(np.maximum(low - p, p - low - side), 0), axis=1).min() for p in T[:, :2, 3]]
+    )
+    share = float((outside_m == 0).mean())
+    if share == 0:
+        a, b = low.min(axis=0), low.max(axis=0) + side
+        what = (
+            f"drive and map do not overlap: the drive starts at ({T[0, 0, 3]:.0f}, {T[0, 1, 3]:.0f}), "
+            f"the map covers ({a[0]:.0f}, {a[1]:.0f}) to ({b[0]:.0f}, {b[1]:.0f}), {outside_m.min():.0f} m away"
+        )
+        return [
+            Finding("error", what, "have prior and map the same frame and origin (for oxts: origin in drive.toml)?")
+        ]
+    found = []
+    if share < 0.95:
+        found.append(Finding("note", f"{1 - share:.0%} of the drive lies outside the map", "there it cannot vote"))
+    heights, hits = [], []
+    for i, scan in scans.items():
+        if outside_m[i] == 0:
+            height_m, hit = _on_map(T[i], scan.points, point_map)
+            heights.append(height_m)
+            hits.append(hit)
+    height_m = float(np.nanmedian(heights)) if np.isfinite(heights).any() else np.nan
+    if np.isfinite(height_m) and not -0.5 < height_m < 6.0:
+        what = f"by the prior the sensor is {height_m:.1f} m above the map's ground"
+        found.append(
+            Finding("error", what, "one height is above the ellipsoid, the other above the sea, or z is missing")
+        )
+    elif np.median(hits) < 0.2:
+        what = f"only {np.median(hits):.0%} of a scan falls on the map (within 1 m) where the prior puts it"
+        found.append(Finding("warning", what, "the prior is some metres off, or it is another place's map"))
+    return found
+
+
+def _on_map(T_map_lidar: F64, points: F32, point_map: PointMap) -> tuple[float, float]:
+    """(height of the sensor above the map's ground, NaN if unknown; share of the scan in 1 m voxels of the map)."""
+    lattice = point_map.lattice
+    local = points[np.linalg.norm(points, axis=1) < 30.0]
+    placed = geometry.transform(T_map_lidar, local[voxel_downsample(local, 0.5)])
+    row, col = lattice.cells_of(T_map_lidar[None, :2, 3])
+    home = (int(row[0]) // TILE_CELLS, int(col[0]) // TILE_CELLS)
+    near = [k for k in point_map.tiles if max(abs(k[0] - home[0]), abs(k[1] - home[1])) <= 1]
+    cloud = np.concatenate([map_points(tile_grid(lattice, k), point_map.tiles[k].points) for k in near])
+    occupied = np.unique(voxel_keys(cloud, lattice.x0, lattice.y0, 1.0))
+    hit = float(np.isin(voxel_keys(placed, lattice.x0, lattice.y0, 1.0), occupied).mean())
+    tile = point_map.tiles.get(home)
+    if tile is None:
+        return np.nan, hit
+    ground = tile.ground_z[int(row[0]) % TILE_CELLS, int(col[0]) % TILE_CELLS]
+    return float(T_map_lidar[2, 3] - ground), hit

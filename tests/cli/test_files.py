@@ -1,0 +1,122 @@
+"""info, doctor, import, export and config, as a user types them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import typer
+from scipy.spatial import cKDTree
+from typer.testing import CliRunner
+
+from mapvote.cli import files
+from mapvote.core.ballot import Ballot, BallotTile, encode, pack_plane
+from mapvote.core.sensors import SENSORS
+from mapvote.core.tiling import all_points, map_from_points
+from mapvote.core.types import F64, MapvoteError
+from mapvote.formats import DriveWriter, read_map, write_map, write_pcd
+
+
+@pytest.fixture
+def run(monkeypatch: pytest.MonkeyPatch) -> CliRunner:
+    monkeypatch.setenv("COLUMNS", "200")
+    return CliRunner()
+
+
+def app() -> typer.Typer:
+    app = typer.Typer()
+    files.register(app)
+    return app
+
+
+def cloud() -> F64:
+    return np.random.default_rng(1).uniform([-50, -50, 0], [50, 50, 5], (4000, 3))
+
+
+def invoke(run: CliRunner, *args: str | Path, code: int = 0) -> str:
+    result = run.invoke(app(), [str(a) for a in args])
+    if isinstance(result.exception, MapvoteError):
+        raise result.exception
+    assert result.exit_code == code, result.output
+    return result.output
+
+
+def test_import_then_info_then_export_keeps_every_point(tmp_path: Path, run: CliRunner) -> None:
+    write_pcd(tmp_path / "a.pcd", cloud())
+    assert "4000 points in 4 tiles" in invoke(run, "import", tmp_path / "a.pcd", "--out", tmp_path / "m")
+    told = invoke(run, "info", tmp_path / "m")
+    assert "mapvote map" in told
+    assert "4,000" in told
+    for name in ("b.pcd", "b.las", "b.ply", "autoware"):
+        told = invoke(run, "export", tmp_path / "m", tmp_path / name)
+        assert "4000 points" in told
+        assert "dropped: ground heights" in told
+        away, partner = cKDTree(all_points(read_map(tmp_path / name))).query(all_points(read_map(tmp_path / "m")))
+        assert away.max() < 1e-4
+        assert len(set(partner.tolist())) == 4000
+        assert "4,000" in invoke(run, "info", tmp_path / name)
+    with pytest.raises(MapvoteError, match="three numbers"):
+        invoke(run, "export", tmp_path / "m", tmp_path / "c.pcd", "--offset", "1,2")
+    invoke(run, "export", tmp_path / "m", tmp_path / "c.ply", "--offset", "100,0,0")
+    assert all_points(read_map(tmp_path / "c.ply"))[:, 0].max() < 0
+
+
+def test_info_of_a_drive_and_doctor(tmp_path: Path, run: CliRunner) -> None:
+    writer = DriveWriter(tmp_path / "d", "car-7", SENSORS["vlp16"], start_ns=10**18).open()
+    for i in range(4):
+        writer.write_scan(i, cloud().astype(np.float32))
+    writer.close(10**18 + np.arange(4) * 10**8)
+    told = invoke(run, "info", tmp_path / "d")
+    for word in ("car-7", "vlp16, 16 beams, 10 Hz", "4 in 0.3 s", "prior       │ none"):
+        assert word in told
+    assert "no prior" in invoke(run, "doctor", tmp_path / "d")
+    (tmp_path / "d" / "velodyne" / "000000.bin").write_bytes(b"12345")
+    assert "not a multiple of 16" in invoke(run, "doctor", tmp_path / "d", code=1)
+
+
+def test_info_of_a_ballot(tmp_path: Path, run: CliRunner) -> None:
+    states = np.full((256, 256), 255, dtype=np.uint8)
+    states[:3, :7] = 2
+    ballot = Ballot(
+        map_id="m",
+        base={"0,0": ""},
+        vehicle="v9",
+        drive="d",
+        start_ns=0,
+        end_ns=10**9,
+        method="paper",
+        settings_hash="x",
+        scans=10,
+        scans_localised=9,
+        median_sigma_m=0.02,
+        tiles=[BallotTile(tile=(0, 0), states=pack_plane(states))],
+    )
+    (tmp_path / "b.ballot").write_bytes(encode(ballot))
+    told = invoke(run, "info", tmp_path / "b.ballot")
+    for word in ("v9", "9 of 10 voted", "changed occupied", "21 cells"):
+        assert word in told
+
+
+def test_info_of_nonsense_is_one_clear_error(tmp_path: Path, run: CliRunner) -> None:
+    (tmp_path / "x.bin").write_bytes(b"nonsense")
+    with pytest.raises(MapvoteError, match="neither map nor drive, and no ballot"):
+        invoke(run, "info", tmp_path / "x.bin")
+    with pytest.raises(MapvoteError, match="nothing is there"):
+        invoke(run, "info", tmp_path / "y")
+
+
+def test_config_tells_value_and_source(tmp_path: Path, run: CliRunner) -> None:
+    (tmp_path / "s.toml").write_text("[voting]\nn_min = 7\n")
+    told = invoke(run, "config", "--config", tmp_path / "s.toml")
+    line = next(line for line in told.splitlines() if "voting.n_min" in line)
+    assert " 7 " in line
+    assert "default" not in line
+    toml = invoke(run, "config", "--toml")
+    (tmp_path / "all.toml").write_text(toml)
+    assert invoke(run, "config", "--toml", "--config", tmp_path / "all.toml") == toml
+
+
+def test_an_existing_map_can_be_read_by_every_verb(tmp_path: Path, run: CliRunner) -> None:
+    write_map(map_from_points(cloud()), tmp_path / "m")
+    assert "never learned" in invoke(run, "info", tmp_path / "m")
