@@ -21,6 +21,10 @@ from mapvote.perception.ndt import NdtMap, PosePrior, build_ndt, fitness, refine
 
 _REFINED = 3
 """How many of the best guesses are refined when the vehicle is lost."""
+_RECONSIDERED = 8
+"""The same, when a scan fits worse than the ones before it."""
+_POOR = 0.9
+"""Share of the usual score below which other places are tried."""
 _YAWS_RAD = np.radians([0.0, -3.0, 3.0])
 _ROUNDS = 2
 """How often a scan is de-skewed anew with the motion just found, while that still changes."""
@@ -77,6 +81,10 @@ class Tracker:
         """Motion per second in the lidar frame (velocity, angular velocity), from the last two trusted poses."""
         self.last_pose: F64 | None = None
         self.last_stamp_ns = 0
+        self._measured = False
+        """Whether ``twist`` was measured from two poses, so that it predicts the next."""
+        self._usual_score = 0.0
+        """What trusted scans scored lately: far less than that means the wrong place, however sure it looks."""
 
     def localise(self, scan: Scan, prior: PosePrior | None = None) -> Fix:
         """The pose of the next scan. Without any prior, ever, the first pose is taken to be near the map's origin."""
@@ -85,6 +93,8 @@ class Tracker:
         twist = self.twist if self._knows_motion(scan) else self._guess_motion(ndt_map, scan, seed, prior)
         first_level = 0 if self.last_pose is None or reach > 0.5 * self.settings.hypothesis_step_m else 1
         result = refine(ndt_map, self._clouds(scan, twist), seed, prior, first_level)
+        if result.score < _POOR * self._usual_score:
+            result = self._reconsider(ndt_map, self._clouds(scan, twist), scan.stamp_ns, result, prior)
         if not self._is_trusted(result, prior):
             centre = prior.T_map_lidar if prior is not None else seed
             result = self._search(ndt_map, self._clouds(scan, twist), centre, reach, prior)
@@ -97,6 +107,8 @@ class Tracker:
         trusted = self._is_trusted(result, prior)
         if trusted:
             self._accept(result.T_map_lidar, scan.stamp_ns, twist)
+            rate = 0.2 if self._usual_score else 1.0
+            self._usual_score += rate * (result.score - self._usual_score)
         return Fix(result, deskew(scan, twist), trusted)
 
     def _clouds(self, scan: Scan, twist: F64) -> list[F64]:
@@ -122,7 +134,8 @@ class Tracker:
         """The first guess and how far it may be off: by constant velocity while that is fresher than the prior."""
         if self.last_pose is not None:
             age = 1e-9 * (stamp_ns - self.last_stamp_ns)
-            drift = 0.5 * self.settings.acceleration_mps2 * age**2
+            known = self._measured or bool(self.twist.any())
+            drift = 0.5 * self.settings.acceleration_mps2 * age**2 if known else age * float(_SPEEDS_MPS[-1])
             if prior is None or drift < prior.sigma_m:
                 return self.last_pose @ exp(age * self.twist), drift
         if prior is None:
@@ -137,6 +150,21 @@ class Tracker:
             off = float(np.linalg.norm(result.T_map_lidar[:3, 3] - prior.T_map_lidar[:3, 3]))
             good = off <= s.prior_gate * prior.sigma_m + s.gate_m
         return good
+
+    def _reconsider(
+        self, ndt_map: NdtMap, clouds: list[F64], stamp_ns: int, result: Registration, prior: PosePrior | None
+    ) -> Registration:
+        """The best of ``result``, the prior's place, and every speed that a vehicle may have had since the last scan.
+
+        A street looks alike along itself: a scan that fits worse than usual may have settled one house too early.
+        """
+        guesses = [] if prior is None else [prior.T_map_lidar]
+        if self.last_pose is not None:
+            age = 1e-9 * (stamp_ns - self.last_stamp_ns)
+            guesses += [self.last_pose @ from_xyz_rpy(age * speed, 0.0, 0.0) for speed in _SPEEDS_MPS]
+        ranked = sorted(guesses, key=lambda guess: -fitness(ndt_map, clouds[:1], guess))[:_RECONSIDERED]
+        found = [result, *(refine(ndt_map, clouds, guess, prior) for guess in ranked)]
+        return max(found, key=lambda registration: registration.score)
 
     def _search(
         self, ndt_map: NdtMap, clouds: list[F64], centre: F64, reach: float, prior: PosePrior | None
@@ -162,6 +190,7 @@ class Tracker:
     def _accept(self, T_map_lidar: F64, stamp_ns: int, twist: F64) -> None:
         found = self._motion_to(T_map_lidar, stamp_ns)
         self.twist = twist if found is None else found
+        self._measured = self._measured or found is not None
         self.last_pose, self.last_stamp_ns = T_map_lidar, stamp_ns
 
 

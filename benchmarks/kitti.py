@@ -1,0 +1,88 @@
+"""A real street that did not change: KITTI drive 0001 against the map of its own other blocks (docs/results.md).
+
+    python benchmarks/kitti.py [--data ../shared/data/kitti] [--out out/kitti]
+
+Prints localisation errors and false changes for the prior as given, disturbed by 0.5 m / 2 deg, and with nothing but
+the first pose; for 64 beams and every other one of them. Draws the ten largest false changes of columns.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from mapvote.config import Settings
+from mapvote.evaluation.cases import choose_cases
+from mapvote.evaluation.real import RealRun, as_given, disturbed, largest_false_changes, run_real
+from mapvote.evaluation.real_figures import draw_false_changes
+
+CASES = "1,1 column,5,columns"
+RUNS: dict[str, dict[str, Any]] = {
+    "prior as given": {"change_prior": as_given},
+    "prior disturbed 0.5 m / 2 deg": {"change_prior": disturbed},
+    "first pose only": {"first_pose_only": True},
+    "prior as given, 32 beams": {"thin": True},
+    "prior disturbed, 32 beams": {"change_prior": disturbed, "thin": True},
+}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--data", type=Path, default=Path("../shared/data/kitti"))
+    parser.add_argument("--out", type=Path, default=Path("out/kitti"))
+    parser.add_argument("--block", type=int, default=12, help="scans in a block (default 12)")
+    arguments = parser.parse_args()
+    settings, console = Settings(), Console(width=150)
+    cases, _ = choose_cases(settings, CASES)
+    runs = {
+        name: run_real(arguments.data / "2011_09_26_0001", cases, settings, block=arguments.block, **options)
+        for name, options in RUNS.items()
+    }
+    console.print(localisation(runs))
+    console.print(false_changes(runs, [case.name for case in cases]))
+    run = runs["prior as given"]
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    for case in ("1", "columns"):
+        found = largest_false_changes(run, case)
+        table = Table("class", "x, m", "y, m", "m2", "on a mover", title=f"Ten largest false changes, {case}")
+        for item in found:
+            mover = "yes" if item.on_mover else "no"
+            table.add_row(item.kind, f"{item.x:.1f}", f"{item.y:.1f}", f"{item.m2:.2f}", mover)
+        console.print(table)
+        draw_false_changes(run, case, found, arguments.out / f"false_changes_{case}.png")
+
+
+def localisation(runs: dict[str, RealRun]) -> Table:
+    table = Table(
+        "run", "scans", "lost", "median, m", "99 %, m", "max, m", "median, deg", "prior's median, m",
+        title="Localisation against poses.txt, the map's trajectory rigidly aligned to it",
+    )  # fmt: skip
+    for name, run in runs.items():
+        table.add_row(
+            name, str(run.scans), str(run.scans - len(run.error_m)), f"{np.median(run.error_m):.3f}",
+            f"{np.percentile(run.error_m, 99):.3f}", f"{run.error_m.max():.3f}", f"{np.median(run.error_deg):.3f}",
+            f"{np.median(run.prior_error_m):.3f}",
+        )  # fmt: skip
+    return table
+
+
+def false_changes(runs: dict[str, RealRun], cases: list[str]) -> Table:
+    table = Table("run", title="Determined cells decided as changed, % (movers apart / movers included)")
+    for case in cases:
+        table.add_column(case, justify="right")
+    for name, run in runs.items():
+        shares = [
+            f"{100 * run.changed_share(c, with_movers=False):.3f} / {100 * run.changed_share(c, with_movers=True):.3f}"
+            for c in cases
+        ]
+        table.add_row(name, *shares)
+    return table
+
+
+if __name__ == "__main__":
+    main()
