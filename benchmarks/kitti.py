@@ -17,10 +17,13 @@ from rich.console import Console
 from rich.table import Table
 
 from mapvote.config import Settings
-from mapvote.evaluation.cases import choose_cases
+from mapvote.evaluation.cases import Case, choose_cases
+from mapvote.evaluation.inject import Injection, score_injection
 from mapvote.evaluation.real import RealRun, as_given, disturbed, largest_false_changes, run_real
 from mapvote.evaluation.real_figures import draw_false_changes
+from mapvote.formats import read_T_map_lidar
 
+DRAWS = (1, 2, 3)
 CASES = "1,1 column,5,columns"
 RUNS: dict[str, dict[str, Any]] = {
     "prior as given": {"change_prior": as_given},
@@ -45,6 +48,7 @@ def main() -> None:
     }
     console.print(localisation(runs))
     console.print(false_changes(runs, [case.name for case in cases]))
+    console.print(injections(arguments.data / "2011_09_26_0001", cases, settings, arguments.block))
     run = runs["prior as given"]
     arguments.out.mkdir(parents=True, exist_ok=True)
     for case in ("1", "columns"):
@@ -55,6 +59,32 @@ def main() -> None:
             table.add_row(item.kind, f"{item.x:.1f}", f"{item.y:.1f}", f"{item.m2:.2f}", mover)
         console.print(table)
         draw_false_changes(run, case, found, arguments.out / f"false_changes_{case}.png")
+
+
+def injections(folder: Path, cases: list[Case], settings: Settings, block: int) -> Table:
+    """Ten objects cut out of the map and ten phantoms put in, three random draws, pooled."""
+    path_xy = read_T_map_lidar(folder / "prior.txt", folder)[:, :2, 3]
+    table = Table(
+        "case", "kind", "cell recall", "objects half found", "precision within 1.5 m",
+        title=f"Injected changes, draws {DRAWS}",
+    )  # fmt: skip
+    drawn = []
+    for seed in DRAWS:
+        injection = Injection(seed, path_xy)
+        drawn.append((injection, run_real(folder, cases, settings, block=block, edit=injection)))
+    for case in cases:
+        for kind in ("built", "demolished"):
+            scores = [score_injection(injection, run.states[case.name], kind) for injection, run in drawn]
+            table.add_row(
+                case.name, kind, _spread([s.cell_recall for s in scores]),
+                f"{sum(s.found for s in scores)} of {sum(s.objects for s in scores)}",
+                _spread([s.precision_near for s in scores]),
+            )  # fmt: skip
+    return table
+
+
+def _spread(values: list[float]) -> str:
+    return f"{np.mean(values):.3f} ({min(values):.3f} to {max(values):.3f})"
 
 
 def localisation(runs: dict[str, RealRun]) -> Table:

@@ -142,22 +142,22 @@ def run_real(
     change_prior: Disturb = as_given,
     first_pose_only: bool = False,
     thin: bool = False,
-    edit: Callable[[PointMap], PointMap] | None = None,
+    edit: Callable[[PointMap, Grid, Bool], PointMap] | None = None,
 ) -> RealRun:
     """Map from every other block of the drive at ``folder``, three vehicles from the rest, every case decided.
 
-    ``edit`` changes the finished map (injected changes); ``poses.txt`` is read for scoring only.
+    ``edit(map, window, movers)`` changes the finished map (injected changes); ``poses.txt`` is read for scoring only.
     """
     n = len(open_drive(folder))
     mapped, voting = split(n, block)
     survey = open_drive(folder, scans=mapped)
     point_map, built = build_map([survey], settings)
-    point_map = edit(point_map) if edit else point_map
     reference = read_T_map_lidar(folder / "poses.txt", folder)
     T_map_world = rigid_between(built.tracks[0].T_map_lidar, reference[_indices(mapped, n)])
 
     grid = _window(point_map, reference)
     movers = _moving_cells(survey, built.tracks[0].T_map_lidar, point_map, grid, settings)
+    point_map = edit(point_map, grid, movers) if edit else point_map
     ballots: dict[str, list[Ballot]] = {case.name: [] for case in cases}
     reports, metres, degrees, prior_metres = [], [], [], []
     for k, scans in enumerate(voting):
