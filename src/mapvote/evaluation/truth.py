@@ -17,6 +17,7 @@ from mapvote.formats.poses import read_poses
 _KEPT, _ADDED, _REMOVED = 0, 1, 2
 _AROUND_M = 0.6
 """Walls stand on the outline of a footprint: cells this far outside it still belong to the object."""
+_ARM_M = 2.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,16 +94,18 @@ def lay_on(states: U8, grid: Grid, window: Grid) -> U8:
 
 
 def rigid_between(T_map_a: F64, T_world_a: F64) -> F64:
-    """T_map_world (4, 4) that best carries one trajectory (n, 4, 4) onto the other, from positions and rotations.
+    """T_map_world (4, 4) that best carries one trajectory (n, 4, 4) onto the other, least squares (Kabsch 1976).
 
-    The rotation is the mean of the relative rotations (chordal), which a straight road does not leave open as
-    positions alone would; the translation then carries the mean position (Hartley et al. 2013, Rotation Averaging).
+    Each pose stands for its position and for points 2 m along its axes, so that a straight road, whose positions
+    leave the turn about it open, still fixes all six degrees of freedom.
     """
-    relative = np.einsum("nij,nkj->ik", T_map_a[:, :3, :3], T_world_a[:, :3, :3])
-    u, _, vt = np.linalg.svd(relative)
+    to, of = T_map_a[:, :3, 3].mean(axis=0), T_world_a[:, :3, 3].mean(axis=0)
+    spread = (T_map_a[:, :3, 3] - to).T @ (T_world_a[:, :3, 3] - of)
+    spread += _ARM_M**2 * np.einsum("nij,nkj->ik", T_map_a[:, :3, :3], T_world_a[:, :3, :3])
+    u, _, vt = np.linalg.svd(spread)
     T = np.eye(4)
     T[:3, :3] = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
-    T[:3, 3] = T_map_a[:, :3, 3].mean(axis=0) - T[:3, :3] @ T_world_a[:, :3, 3].mean(axis=0)
+    T[:3, 3] = to - T[:3, :3] @ of
     return T
 
 
