@@ -19,6 +19,7 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass
+from itertools import zip_longest
 
 import numba
 import numpy as np
@@ -44,8 +45,6 @@ class _Scan:
     """(n,) index into ``samples`` of each point, -1 for points that cannot be moving (ground, out of reach)."""
     samples: F64
     """(m, 3) one obstacle point per voxel, map metres."""
-    weight: I32
-    """(m,) points in the voxel."""
 
 
 @numba.njit(cache=True, nogil=True, inline="always")
@@ -70,38 +69,38 @@ def _turn(x: float, y: float) -> float:
 @numba.njit(cache=True, nogil=True)
 def _range_image(points: F64, origin: F64, turns: int, slopes: int, slope_min: float, slope_step: float) -> F32:
     """(turns, slopes) nearest horizontal range among the returns in each direction and to its left and right."""
-    raw = np.full((turns, slopes), NOTHING, dtype=np.float32)
+    out = np.full((turns, slopes), NOTHING, dtype=np.float32)
+    per_slope = 1.0 / slope_step
     for i in range(len(points)):
         x, y, z = points[i, 0] - origin[0], points[i, 1] - origin[1], points[i, 2] - origin[2]
-        rho = np.sqrt(x * x + y * y)
+        rho = np.float32(np.sqrt(x * x + y * y))
         if rho < 0.5:
             continue
-        b = int((z / rho - slope_min) / slope_step)
-        if z / rho < slope_min or b >= slopes:
+        row = (z / rho - slope_min) * per_slope
+        if row < 0.0 or row >= slopes:
             continue
-        a = int(_turn(x, y) * turns) % turns
-        if rho < raw[a, b]:
-            raw[a, b] = rho
-    out = np.empty_like(raw)
-    for a in range(turns):
-        left, right = (a - 1) % turns, (a + 1) % turns
-        for b in range(slopes):
-            out[a, b] = min(raw[a, b], min(raw[left, b], raw[right, b]))
+        b = int(row)
+        a = min(int(_turn(x, y) * turns), turns - 1)
+        left = a - 1 if a > 0 else turns - 1
+        right = a + 1 if a + 1 < turns else 0
+        out[left, b] = min(out[left, b], rho)
+        out[a, b] = min(out[a, b], rho)
+        out[right, b] = min(out[right, b], rho)
     return out
 
 
 @numba.njit(cache=True, nogil=True)
-def _voxels(points: F64, obstacle: Bool, origin: F64, reach: float, cell: float) -> tuple[I32, I64, I32]:
-    """(voxel_of (n,), first point of each voxel (m,), points in each voxel (m,)), in order of first points."""
+def _voxels(points: F64, obstacle: Bool, origin: F64, reach: float, cell: float) -> tuple[I32, I64]:
+    """(voxel_of (n,), first point of each voxel (m,)), voxels in order of their first points; -1 for no voxel."""
     n = len(points)
     size = 1024
-    while size < 2 * n:
+    while size < 2 * obstacle.sum():
         size *= 2
     table = np.full(size, -1, dtype=np.int32)
     keys = np.empty(n, dtype=np.int64)
     first = np.empty(n, dtype=np.int64)
-    weight = np.zeros(n, dtype=np.int32)
     voxel_of = np.full(n, -1, dtype=np.int32)
+    per_cell = 1.0 / cell
     m = 0
     for i in range(n):
         if not obstacle[i]:
@@ -109,9 +108,11 @@ def _voxels(points: F64, obstacle: Bool, origin: F64, reach: float, cell: float)
         x, y = points[i, 0] - origin[0], points[i, 1] - origin[1]
         if x * x + y * y > reach * reach:
             continue
-        ix, iy, iz = np.floor(points[i, 0] / cell), np.floor(points[i, 1] / cell), np.floor(points[i, 2] / cell)
-        key = ((int(ix) + (1 << 20)) << 42) | ((int(iy) + (1 << 20)) << 21) | (int(iz) + (1 << 20))
-        slot = ((key * 0x9E3779B97F4A7C1) >> 20) & (size - 1)
+        ix = int(np.floor(points[i, 0] * per_cell)) + (1 << 20)
+        iy = int(np.floor(points[i, 1] * per_cell)) + (1 << 20)
+        iz = int(np.floor(points[i, 2] * per_cell)) + (1 << 20)
+        key = (ix << 42) | (iy << 21) | iz
+        slot = (ix + 389 * iy + 7919 * iz) & (size - 1)
         while table[slot] >= 0 and keys[table[slot]] != key:
             slot = (slot + 1) & (size - 1)
         if table[slot] < 0:
@@ -120,8 +121,7 @@ def _voxels(points: F64, obstacle: Bool, origin: F64, reach: float, cell: float)
             first[m] = i
             m += 1
         voxel_of[i] = table[slot]
-        weight[table[slot]] += 1
-    return voxel_of, first[:m].copy(), weight[:m].copy()
+    return voxel_of, first[:m].copy()
 
 
 @numba.njit(cache=True, nogil=True)
@@ -133,42 +133,56 @@ def _look(
     slope_step: float,
     margin: float,
     height: float,
+    enough: int,
     free: I32,
     hit: I32,
     sides: NDArray[np.uint8],
-) -> None:
-    """Ask one scan about each sample: did it see through it, did it hit it, or neither? Counts go up in place.
+    waiting: I32,
+) -> int:
+    """Ask one scan about the ``waiting`` samples: did it see through, did it hit, or neither? Counts go up in place.
 
     Rays within ``height`` above and below the sample bear witness. ``sides`` keeps whether a ray went through
-    below (1) and above (2): a ray that only ever passes over a roof proves nothing about the roof.
+    below (1) and above (2): a ray that only ever passes over a roof proves nothing about the roof. A sample of which
+    ``enough`` scans said the same, and none the contrary, waits no longer; ``waiting`` is compacted in place
+    and its new length returned.
     """
     turns, slopes = nearest.shape
-    for i in range(len(samples)):
+    per_slope = 1.0 / slope_step
+    left = 0
+    for w in range(len(waiting)):
+        i = waiting[w]
+        waiting[left] = i
+        left += 1
         x, y, z = samples[i, 0] - origin[0], samples[i, 1] - origin[1], samples[i, 2] - origin[2]
         rho = np.sqrt(x * x + y * y)
-        if rho < 0.5 or z / rho < slope_min:
+        if rho < 0.5:
             continue
-        b = int((z / rho - slope_min) / slope_step)
-        around = min(max(int(height / (rho * slope_step)), 2), 8)
+        row = (z / rho - slope_min) * per_slope
+        around = min(max(int(height / rho * per_slope), 2), 8)
+        b = int(np.floor(row))
         if b < around or b + around >= slopes:
             continue
-        a = int(_turn(x, y) * turns) % turns
+        a = min(int(_turn(x, y) * turns), turns - 1)
         below, above = NOTHING, NOTHING
-        for k in range(b - around, b):
-            below = min(below, nearest[a, k])
-        for k in range(b + 1, b + around + 1):
-            above = min(above, nearest[a, k])
+        for k in range(1, around + 1):
+            if nearest[a, b - k] < below:
+                below = nearest[a, b - k]
+            if nearest[a, b + k] < above:
+                above = nearest[a, b + k]
         r = min(nearest[a, b], min(below, above))
-        if np.isinf(r) or r < rho - margin:
+        if r == NOTHING or r < rho - margin:
             continue
         if r > rho + margin:
             free[i] += 1
-            if not np.isinf(below):
+            if below < NOTHING:
                 sides[i] |= 1
-            if not np.isinf(above):
+            if above < NOTHING:
                 sides[i] |= 2
         else:
             hit[i] += 1
+        if (free[i] == 0 and hit[i] >= enough) or (hit[i] == 0 and free[i] >= enough and sides[i] == 3):
+            left -= 1
+    return left
 
 
 @numba.njit(cache=True, nogil=True)
@@ -211,7 +225,6 @@ def _together(
     side: int,
     seen: Bool,
     brief: Bool,
-    weight: I32,
     min_voxels: int,
     share_whole: float,
     share_part: float,
@@ -293,8 +306,8 @@ class MovingFilter:
         points = np.ascontiguousarray(points_map, dtype=np.float64)
         origin = np.asarray(origin_map, dtype=np.float64)
         nearest = _range_image(points, origin, self._turns, self._slopes, self._slope_min, self._slope_step)
-        voxel_of, first, weight = _voxels(points, obstacle, origin, self.settings.reach_m, CELL_SIZE)
-        self._window.append(_Scan(stamp_ns, origin, nearest, voxel_of, points[first], weight))
+        voxel_of, first = _voxels(points, obstacle, origin, self.settings.reach_m, CELL_SIZE)
+        self._window.append(_Scan(stamp_ns, origin, nearest, voxel_of, points[first]))
         self._pushed += 1
         return self._decide(stamp_ns - round(self.settings.lookahead_s * 1e9))
 
@@ -322,8 +335,9 @@ class MovingFilter:
         free = np.zeros(len(scan.samples), dtype=np.int32)
         hit = np.zeros(len(scan.samples), dtype=np.int32)
         sides = np.zeros(len(scan.samples), dtype=np.uint8)
+        waiting = np.arange(len(scan.samples), dtype=np.int32)
         for other in self._witnesses(at):
-            _look(
+            left = _look(
                 scan.samples,
                 other.nearest,
                 other.origin_map,
@@ -331,31 +345,38 @@ class MovingFilter:
                 self._slope_step,
                 s.margin_m,
                 s.height_m,
+                s.enough,
                 free,
                 hit,
                 sides,
+                waiting,
             )
+            waiting = waiting[:left]
         seen = free + hit >= s.min_free
         brief = (sides == 3) & (free >= s.min_free) & (free >= s.free_share * (free + hit))
         half = int(np.ceil(s.reach_m / CELL_SIZE)) + 2
         cells = np.floor(scan.samples[:, :2] / CELL_SIZE).astype(np.int64)
         cells -= np.floor(scan.origin_map[:2] / CELL_SIZE).astype(np.int64) - half
         moves = _together(
-            cells[:, 1], cells[:, 0], 2 * half + 1, seen, brief, scan.weight, s.min_voxels, s.share_whole, s.share_part
+            cells[:, 1], cells[:, 0], 2 * half + 1, seen, brief, s.min_voxels, s.share_whole, s.share_part
         )
         mask = scan.voxel_of >= 0
         mask[mask] = moves[scan.voxel_of[mask]]
         return mask
 
     def _witnesses(self, at: int) -> list[_Scan]:
-        """Up to ``looks`` other scans spread evenly over the time before, and over the time after, scan ``at``."""
-        before = list(self._window)[:at]
-        after = list(self._window)[at + 1 :]
-        return _spread(before, self.settings.looks_past) + _spread(after, self.settings.looks_ahead)
+        """Up to ``looks`` other scans spread evenly over the time before, and over the time after, scan ``at``.
+
+        Those before and after take turns, the farthest first: they are the likeliest to settle a voxel soon.
+        """
+        scans = list(self._window)
+        before = _spread(scans[:at], self.settings.looks_past)
+        after = _spread(scans[:at:-1], self.settings.looks_ahead)
+        return [s for pair in zip_longest(before, after) for s in pair if s is not None]
 
 
 def _spread(scans: list[_Scan], count: int) -> list[_Scan]:
-    """At most ``count`` of them, evenly spread, the last one always among them."""
+    """At most ``count`` of them, evenly spread, the first always among them."""
     if len(scans) <= count:
         return scans
-    return [scans[-1 - (k * len(scans)) // count] for k in range(count)]
+    return [scans[(k * len(scans)) // count] for k in range(count)]
