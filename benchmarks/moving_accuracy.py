@@ -202,7 +202,7 @@ def draw(points: F32, obstacle: Bool, moving: Bool, things: list[dict[str, objec
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scenes", nargs="*", help="SCENARIO:SEED, or a folder that mapvote simulate wrote")
-    parser.add_argument("--cache", type=Path, default=Path("/tmp/mapvote_moving"), help="where simulated drives are kept")
+    parser.add_argument("--cache", type=Path, default=Path("/tmp/mapvote_moving"), help="where drives are kept")
     parser.add_argument("--stride", type=int, default=1, help="use every so many scans (2 of 10 Hz is 5 Hz)")
     parser.add_argument("--sensor", help="simulate with this sensor instead of the scenario's")
     parser.add_argument("--pose-noise", type=float, default=0.0, metavar="M", help="sigma of white noise on positions")

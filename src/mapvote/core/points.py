@@ -123,22 +123,30 @@ def _lower_envelope(z: F64, straight: float, diagonal: float) -> None:
 
 
 @numba.njit(cache=True, nogil=True)
-def _supported(low: F64, tolerance: float, neighbours: int) -> F64:
-    """``low`` without the cells that fewer than ``neighbours`` of their 24 next cells agree with (inf instead).
+def _supported(low: F64, reach: int, grade: float, share: float) -> F64:
+    """``low`` without the cells that hardly any of the known cells within ``reach`` cells agree with (inf instead).
 
-    A reflection below the road is one point far below all others, and the envelope would follow it down a cone.
+    Agreement: within 0.3 m, and ``grade`` (metres per cell) times the distance more; by at least 2 cells and a
+    ``share`` of them. Reflections below the road come singly or in small clusters far below all
+    others, and the envelope would follow each down a cone.
     """
     rows, cols = low.shape
+    plenty = share * (2 * reach + 1) ** 2
     out = np.full_like(low, np.inf)
     for r in range(rows):
         for c in range(cols):
             if not np.isfinite(low[r, c]):
                 continue
-            found = 0
-            for i in range(max(r - 2, 0), min(r + 3, rows)):
-                for j in range(max(c - 2, 0), min(c + 3, cols)):
-                    found += abs(low[i, j] - low[r, c]) <= tolerance
-            if found > neighbours:  # the cell itself is one of them
+            known, agree = 0, 0
+            for i in range(max(r - reach, 0), min(r + reach + 1, rows)):
+                for j in range(max(c - reach, 0), min(c + reach + 1, cols)):
+                    if np.isfinite(low[i, j]):
+                        known += 1
+                        apart = max(abs(i - r), abs(j - c))
+                        agree += abs(low[i, j] - low[r, c]) <= CELL_SIZE + grade * apart
+                if agree >= plenty:
+                    break
+            if agree > 2 and agree >= share * known:  # the cell itself is one of them
                 out[r, c] = low[r, c]
     return out
 
@@ -147,13 +155,13 @@ def ground_surface(points: NDArray[np.floating], grid: Grid, max_grade: float = 
     """Height of the ground in every cell of ``grid``, (rows, cols) float32 in the points' frame, NaN where unknown.
 
     ``points`` (n, 3) in map metres. A cell farther than ``reach_m`` from any point is unknown. Only points inside
-    ``grid`` are used: give a grid with a margin and cut it, so that windows agree where they meet. A cell whose lowest
-    point has no two neighbours (of 24) within 0.3 m of its height is measured wrongly and not used.
+    ``grid`` are used: give a grid with a margin and cut it, so that windows agree where they meet. A cell
+    with whose lowest point less than a fifth of the known cells within 2.1 m agree is measured wrongly and not used.
     """
     rows, cols, inside = grid.indices_of(points)
     low = np.full(grid.shape, np.inf)
     _lowest(rows, cols, points[:, 2].astype(np.float64), inside, low)
-    low = _supported(low, CELL_SIZE, 2)
+    low = _supported(low, 7, max_grade * CELL_SIZE, 0.2)
     distance = np.where(np.isfinite(low), 0.0, np.inf)
     _lower_envelope(distance, CELL_SIZE, CELL_SIZE * np.sqrt(2.0))
     _lower_envelope(low, max_grade * CELL_SIZE, max_grade * CELL_SIZE * np.sqrt(2.0))
