@@ -1,0 +1,181 @@
+"""Kill the server's process at random moments, again and again, and see whether anything acknowledged was lost.
+
+    python benchmarks/crash.py --kills 200 --database sqlite
+    python benchmarks/crash.py --kills 200 --database postgresql
+
+A child takes in ballots on one thread and publishes on another; the parent kills it with SIGKILL at a random moment
+(with PostgreSQL, every fourth time the database server itself), then opens the store as a new process would and checks:
+every acknowledged ballot is there, every version is whole, the next publish succeeds. Ends with 1 at the first failure.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import os
+import random
+import signal
+import sys
+import tempfile
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+import sqlalchemy as sa
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+
+from hand_made import Say, make_ballot, make_map, make_tile, states_plane, wall
+from mapvote.config import FuseSettings
+from mapvote.core.ballot import Ballot, encode
+from mapvote.core.grid import TileIndex
+from mapvote.core.types import CellState, MapvoteError
+from mapvote.fleet import schema
+from mapvote.fleet.errors import Conflict, Unavailable
+from mapvote.fleet.intake import Receipt, accept, examine
+from mapvote.fleet.publish import publish
+from mapvote.fleet.store import Store
+from postgres_cluster import PostgresCluster
+
+POLICY = FuseSettings(min_votes=2, max_deleted_share=1.0)
+TILES = [(row, col) for row in range(2) for col in range(4)]
+CELLS = [(r, c) for r in range(10, 40, 3) for c in range(10, 40, 3)]
+HEIGHTS = [0.45, 0.75, 1.05]
+S = 1_000_000_000
+
+
+def first_map(url: str) -> None:
+    """A store of eight tiles with a hundred pillars each."""
+    tile = make_tile(np.concatenate([wall(CELLS, [0.05]), wall(CELLS, HEIGHTS)]))
+    Store.create(url, make_map(dict.fromkeys(TILES, tile))).close()
+
+
+def votes_on(store: Store, tile: TileIndex, cell: tuple[int, int], turn: str) -> list[Ballot]:
+    """Two vehicles that agree: what stands in the cell is gone, or, where nothing stands, it is back."""
+    content = store.tile(store.current(), tile)
+    assert content is not None
+    point_map, points = make_map({tile: content}), content.points
+    inside = (np.floor(points[:, 1] / 0.3) == cell[0]) & (np.floor(points[:, 0] / 0.3) == cell[1])
+    stands = bool((inside & (points[:, 2] > 0.3)).any())
+    state = CellState.CHANGED_EMPTY if stands else CellState.CHANGED_OCCUPIED
+    say = Say(states_plane({cell: state}), new_points=None if stands else wall([cell], HEIGHTS))
+    now = store.clock()
+    return [make_ballot(point_map, {tile: say}, f"v{i}", f"{turn}.{i}", now - S + i) for i in range(2)]
+
+
+def work(url: str, seed: int, acknowledge: int) -> None:
+    """Take in ballots and publish until killed; one line per acknowledged ballot goes to ``acknowledge``."""
+    store = Store.open(url)
+    rng = random.Random(seed)
+
+    def publish_for_ever() -> None:
+        while True:
+            with contextlib.suppress(Unavailable):  # the database may be gone already
+                publish(store, POLICY)
+            time.sleep(0.002)
+
+    threading.Thread(target=publish_for_ever, daemon=True).start()
+    os.write(acknowledge, b"ready\n")
+    turn = 0
+    while True:
+        turn += 1
+        ballots = votes_on(store, rng.choice(TILES), rng.choice(CELLS), f"{seed}.{turn}")
+        for receipt in accept(store, [examine(encode(ballot)) for ballot in ballots]):
+            if isinstance(receipt, Receipt):
+                os.write(acknowledge, f"{receipt.vehicle} {receipt.drive}\n".encode())
+            elif not isinstance(receipt, Conflict):  # published meanwhile: an honest refusal
+                raise receipt
+
+
+def killed_once(url: str, seed: int, moment_s: float, cluster: PostgresCluster | None) -> list[tuple[str, str]]:
+    """Start a worker, kill it (or the database under it) after ``moment_s``; what it had acknowledged."""
+    reading, writing = os.pipe()
+    child = os.fork()
+    if child == 0:
+        os.close(reading)
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+        try:
+            work(url, seed, writing)
+        finally:
+            os._exit(7)
+    os.close(writing)
+    with os.fdopen(reading) as lines:
+        if lines.readline() != "ready\n":
+            raise SystemExit(f"kill {seed}: the worker ended before it began (status {os.waitpid(child, 0)[1]})")
+        time.sleep(moment_s)
+        if cluster is not None:
+            cluster.stop(crash=True)
+        os.kill(child, signal.SIGKILL)
+        acknowledged = [(words[0], words[1]) for line in lines if len(words := line.split()) == 2]
+    status = os.waitpid(child, 0)[1]
+    if cluster is not None:
+        cluster.start()
+    elif os.WTERMSIG(status) != signal.SIGKILL:
+        raise SystemExit(f"kill {seed}: the worker ended by itself (status {status})")
+    return acknowledged
+
+
+def check(url: str, acknowledged: set[tuple[str, str]], whole: set[int]) -> int:
+    """Open the store anew, look at everything, publish; the newest version. SystemExit says what is wrong."""
+    store = Store.open(url)
+    try:
+        with store.database.reading() as connection:
+            if store.database.is_sqlite:
+                verdict = connection.exec_driver_sql("PRAGMA integrity_check").scalar_one()
+                if verdict != "ok":
+                    raise SystemExit(f"SQLite is damaged: {verdict}")
+            b = schema.ballots.c
+            known = {(row.vehicle, row.drive) for row in connection.execute(sa.select(b.vehicle, b.drive))}
+        lost = acknowledged - known
+        if lost:
+            raise SystemExit(f"{len(lost)} acknowledged ballots are lost, for example {sorted(lost)[0]}")
+        versions = [version.number for version in store.versions()]
+        if versions != list(range(1, len(versions) + 1)):
+            raise SystemExit(f"versions have gaps: {versions}")
+        for number in versions:
+            if number not in whole:
+                if len(store.point_map(number).tiles) != len(TILES):  # every plane is checked against its hash
+                    raise SystemExit(f"version {number} lacks tiles")
+                whole.add(number)
+        publish(store, POLICY)
+        return store.current()
+    except MapvoteError as error:
+        raise SystemExit(f"after the kill: {type(error).__name__}: {error}") from error
+    finally:
+        store.close()
+
+
+def run(url: str, kills: int, seed: int, cluster: PostgresCluster | None) -> None:
+    """``kills`` rounds on one store; prints a line at the end."""
+    first_map(url)
+    rng = random.Random(seed)
+    acknowledged: set[tuple[str, str]] = set()
+    whole: set[int] = set()
+    newest = 1
+    for i in range(kills):
+        power_cut = cluster if cluster is not None and i % 4 == 3 else None
+        acknowledged |= set(killed_once(url, seed * 1000 + i, rng.uniform(0.0, 0.5), power_cut))
+        newest = check(url, acknowledged, whole)
+    print(f"{kills} kills: {len(acknowledged)} acknowledged ballots, all there; {newest} versions, all whole")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--kills", type=int, default=20)
+    parser.add_argument("--database", choices=("sqlite", "postgresql"), default="sqlite")
+    parser.add_argument("--seed", type=int, default=1)
+    options = parser.parse_args()
+    if options.database == "sqlite":
+        with tempfile.TemporaryDirectory() as folder:
+            run(f"sqlite:///{folder}/store.db", options.kills, options.seed, None)
+        return
+    cluster = PostgresCluster()
+    try:
+        run(cluster.create("crash"), options.kills, options.seed, cluster)
+    finally:
+        cluster.close()
+
+
+if __name__ == "__main__":
+    main()
