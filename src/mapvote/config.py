@@ -47,7 +47,7 @@ class NdtSettings(Section):
     covariance_scale: float = Field(default=5.0, description="what neighbouring residuals have in common, calibrated")
     map_sigma_m: float = Field(default=0.01, description="what the map itself is off by around a scan, position")
     map_sigma_deg: float = Field(default=0.03, description="the same, rotation")
-    min_inlier_share: float = Field(default=0.6, description="below it the vehicle abstains")
+    min_inlier_share: float = Field(default=0.55, description="below it the vehicle abstains; lost scans have about .4")
     max_sigma_m: float = Field(default=0.15, description="abstain when the pose is less certain than this")
     prior_gate: float = Field(default=5.0, description="abstain this many sigma from the prior (plus gate_m)")
     gate_m: float = Field(default=1.0, description="slack of that gate, for errors the sigma does not cover")

@@ -145,7 +145,7 @@ class Tracker:
     def _is_trusted(self, result: Registration, prior: PosePrior | None) -> bool:
         s = self.settings
         sigma_m = float(np.sqrt(np.linalg.eigvalsh(result.covariance[:3, :3])[-1]))
-        good = result.inlier_share >= s.min_inlier_share and sigma_m <= s.max_sigma_m
+        good = result.converged and result.inlier_share >= s.min_inlier_share and sigma_m <= s.max_sigma_m
         if good and prior is not None:
             off = float(np.linalg.norm(result.T_map_lidar[:3, 3] - prior.T_map_lidar[:3, 3]))
             good = off <= s.prior_gate * prior.sigma_m + s.gate_m
