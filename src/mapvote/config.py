@@ -47,7 +47,7 @@ class NdtSettings(Section):
     covariance_scale: float = Field(default=5.0, description="what neighbouring residuals have in common, calibrated")
     map_sigma_m: float = Field(default=0.01, description="what the map itself is off by around a scan, position")
     map_sigma_deg: float = Field(default=0.03, description="the same, rotation")
-    min_inlier_share: float = Field(default=0.55, description="below it the vehicle abstains; lost scans have about .4")
+    min_inlier_share: float = Field(default=0.5, description="below it the vehicle abstains; lost scans have about .4")
     max_sigma_m: float = Field(default=0.15, description="abstain when the pose is less certain than this")
     prior_gate: float = Field(default=5.0, description="abstain this many sigma from the prior (plus gate_m)")
     gate_m: float = Field(default=1.0, description="slack of that gate, for errors the sigma does not cover")
@@ -88,6 +88,8 @@ class MappingSettings(Section):
     link_sigma_m: float = Field(default=0.003, description="random error of the motion from scan to scan")
     link_sigma_deg: float = Field(default=0.01, description="the same, rotation")
     revisit_m: float = Field(default=10.0, description="a scan this near to a much older one is linked to it")
+    trail_min_through: int = Field(default=3, description="scans that saw through a voxel before it can be a trail")
+    trail_share: float = Field(default=0.3, description="a voxel struck in fewer of the scans able to is a trail")
     revisit_s: float = Field(default=10.0, description="and much older means this, within a drive")
 
 

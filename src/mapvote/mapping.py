@@ -3,12 +3,12 @@
 Two passes. The first finds where the vehicles were: each scan is registered to the NDT map grown so far, drives
 one after the other into the same map; then all poses are settled together, so that precise priors (a survey
 vehicle's RTK) hold the map in their frame and coarse ones only start the search. The second reads the scans again and
-lays them at their settled poses: de-skewed, without moving objects, one point per 0.3 m voxel.
+lays them at their settled poses: de-skewed, without moving objects, one point per 0.3 m voxel (perception.laying).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,7 +22,8 @@ from mapvote.core.posegraph import Anchors, Links, optimise
 from mapvote.core.tiling import map_from_points
 from mapvote.core.types import F64, I64, Bool, Drive, MapvoteError, PointMap
 from mapvote.core.voxels import VoxelCloud
-from mapvote.perception.deskew import deskew, twist_between
+from mapvote.perception.deskew import twist_between
+from mapvote.perception.laying import Layer
 from mapvote.perception.ndt import NdtMap, PosePrior
 from mapvote.perception.tracking import Tracker
 
@@ -80,13 +81,13 @@ def build_map(
     found = [surveyor.follow(drive, count) for drive in drives]
     registered = [mask for _, mask in found]
     poses = settle(drives, [T for T, _ in found], registered, settings.mapping)
-    cloud = VoxelCloud(Lattice())
+    layer = Layer(map_from_points(surveyor.draft.points()[0], lattice=surveyor.draft.lattice), settings)
     for drive, T_map_lidar, mask in zip(drives, poses, registered, strict=True):
-        lay(drive, T_map_lidar, mask, cloud, count)
-    points, _ = cloud.points()
+        layer.lay(drive, T_map_lidar, mask, count)
+    point_map = layer.finish()
     tracks = tuple(_track(drive, T, mask) for drive, T, mask in zip(drives, poses, registered, strict=True))
     held = any(_is_precise(drive, settings.mapping) for drive in drives)
-    return map_from_points(points, lattice=cloud.lattice), BuildReport(tracks, len(points), held)
+    return point_map, BuildReport(tracks, sum(len(tile.points) for tile in point_map.tiles.values()), held)
 
 
 class _Surveyor:
@@ -96,6 +97,8 @@ class _Surveyor:
         self.mapping = settings.mapping
         self.ndt = settings.ndt.model_copy(update={"min_inlier_share": settings.mapping.min_inlier_share})
         self.ndt_map: NdtMap | None = None
+        self.draft = VoxelCloud(Lattice())
+        """A thinned cloud of everything, for the ground that the second pass needs."""
 
     def follow(self, drive: Drive, count: Callable[[], None]) -> tuple[F64, Bool]:
         """(poses (n, 4, 4), registered (n,)) of one drive, each scan entered once it is registered."""
@@ -106,10 +109,12 @@ class _Surveyor:
         poses, registered = [], []
         for i, scan in enumerate(drive):
             prior = _prior(drive, i)
-            if self.ndt_map is None:
+            fix = None if self.ndt_map is None else tracker.localise(scan, prior)
+            if fix is None:
                 fix = tracker.begin(scan, np.eye(4) if prior is None else prior.T_map_lidar)
-            else:
-                fix = tracker.localise(scan, prior)
+            elif prior is not None and not fix.trusted and _is_precise(drive, self.mapping):
+                # A surveyor enters where no drive has been yet: a precise prior is as good as a registration.
+                fix = tracker.begin(scan, prior.T_map_lidar)
             poses.append(fix.registration.T_map_lidar)
             registered.append(fix.trusted)
             if fix.trusted:
@@ -132,6 +137,7 @@ class _Surveyor:
     def _enter(self, points_map: F64, position: F64) -> None:
         spread = thin(points_map - position, self.mapping.ndt_points_m)
         self._map_around(position).add(points_map[spread])
+        self.draft.add(points_map[spread])
 
 
 def settle(drives: Sequence[Drive], poses: list[F64], registered: list[Bool], settings: MappingSettings) -> list[F64]:
@@ -176,32 +182,6 @@ def settle(drives: Sequence[Drive], poses: list[F64], registered: list[Bool], se
         if drive.T_map_lidar_prior is not None and _is_precise(drive, settings)
     ]
     return np.split(optimise(T, links, anchors), starts[1:-1])
-
-
-def lay(drive: Drive, T_map_lidar: F64, registered: Bool, cloud: VoxelCloud, count: Callable[[], None]) -> None:
-    """The second pass over one drive: every registered scan at its settled pose into ``cloud``."""
-    for points_map, skip in _static(drive, T_map_lidar, registered, count):
-        cloud.add(points_map, skip)
-
-
-def _static(
-    drive: Drive, T_map_lidar: F64, registered: Bool, count: Callable[[], None]
-) -> Iterator[tuple[F64, Bool | None]]:
-    """(points (n, 3) map metres, which of them move (n,)) of every registered scan."""
-    for i, scan in enumerate(drive):
-        count()
-        if registered[i]:
-            twist = _twist_at(drive, T_map_lidar, i)
-            yield transform(T_map_lidar[i], deskew(scan, twist)), None
-
-
-def _twist_at(drive: Drive, T_map_lidar: F64, i: int) -> F64:
-    """Motion per second of scan i, from the poses before and after it."""
-    before, after = max(i - 1, 0), min(i + 1, len(drive) - 1)
-    if before == after:
-        return np.zeros(6)
-    seconds = 1e-9 * float(drive.stamps_ns[after] - drive.stamps_ns[before])
-    return twist_between(T_map_lidar[before], T_map_lidar[after], seconds)
 
 
 def _apart(stamps_ns: I64, i: int, j: int, settings: MappingSettings) -> bool:

@@ -1,0 +1,142 @@
+"""Scans at known poses become a map: points without moving objects, ground, known-free columns (METHOD 4 D, remedy 2).
+
+A draft of the map gives the ground and says which voxels anything ever struck. Every voxel's scans are then counted:
+in how many was it struck, in how many seen through. What was struck only rarely by scans that could have struck it is
+the trail of something that moved and escaped the filter: it leaves the map, and its voxels are unknown, not free.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numba
+import numpy as np
+
+from mapvote.config import Settings
+from mapvote.core.columns import TOP_BIT, cut_reference, reference_window, shifted
+from mapvote.core.geometry import transform
+from mapvote.core.grid import CELL_SIZE, TILE_CELLS, TileIndex, tile_grid, window_around
+from mapvote.core.tiling import map_from_points
+from mapvote.core.types import F64, I32, I64, U64, Bool, Drive, PointMap, Reference
+from mapvote.core.voxels import VoxelCloud
+from mapvote.perception.deskew import deskew, twist_between
+from mapvote.perception.evidence import PLANES, Evidence, count_of, free_words
+from mapvote.perception.moving import MovingFilter
+from mapvote.perception.visibility import find_obstacles, see
+
+
+@dataclass(frozen=True, slots=True)
+class _Waiting:
+    """A scan that waits for the moving-object filter to decide."""
+
+    points_map: F64
+    origin_map: F64
+    obstacle: Bool
+    cell: I32
+    reference: Reference
+
+
+class Layer:
+    """Collects the scans of all drives, then gives the map."""
+
+    def __init__(self, draft: PointMap, settings: Settings) -> None:
+        self.draft, self.settings = draft, settings
+        self.cloud = VoxelCloud(draft.lattice)
+        self.evidence = Evidence(draft.lattice)
+        self._around: Reference | None = None
+
+    def lay(self, drive: Drive, T_map_lidar: F64, registered: Bool, count: Callable[[], None]) -> None:
+        """Enter every registered scan of one drive at its pose (n, 4, 4). ``count`` is called after each scan read."""
+        movers = MovingFilter(drive.sensor, self.settings.moving)
+        waiting: deque[_Waiting] = deque()
+        for i, scan in enumerate(drive):
+            if registered[i]:
+                points = deskew(scan, motion_at(drive.stamps_ns, T_map_lidar, i))
+                points_map, origin_map = transform(T_map_lidar[i], points), T_map_lidar[i, :3, 3].copy()
+                reference = self._reference_at(origin_map)
+                obstacle, cell = find_obstacles(points_map, reference)
+                waiting.append(_Waiting(points_map, origin_map, obstacle, cell, reference))
+                for _, moving in movers.push(points_map, origin_map, obstacle, scan.stamp_ns):
+                    self._enter(waiting.popleft(), moving)
+            count()
+        for _, moving in movers.flush():
+            self._enter(waiting.popleft(), moving)
+
+    def _enter(self, scan: _Waiting, moving: Bool) -> None:
+        self.cloud.add(scan.points_map, moving)
+        view = see(scan.points_map, scan.origin_map, scan.obstacle, moving, scan.reference, scan.cell)
+        self.evidence.add(view, scan.reference)
+
+    def _reference_at(self, origin_map: F64) -> Reference:
+        lattice = self.draft.lattice
+        window = window_around(lattice, origin_map[0], origin_map[1], self.settings.voting.window_m)
+        if self._around is None or window.intersection(self._around.grid) != window:
+            row, col = window.row0 + window.rows // 2, window.col0 + window.cols // 2
+            centre = tile_grid(lattice, (row // TILE_CELLS, col // TILE_CELLS))
+            self._around = reference_window(self.draft, centre.padded(max(TILE_CELLS, window.rows)))
+        return cut_reference(self._around, window)
+
+    def finish(self) -> PointMap:
+        """The map of everything laid."""
+        points, _ = self.cloud.points()
+        point_map = map_from_points(points[~self._trails(points)], lattice=self.draft.lattice)
+        tiles = {tile: replace(content, free=self._free(tile, point_map)) for tile, content in point_map.tiles.items()}
+        return replace(point_map, tiles=tiles)
+
+    def _trails(self, points: F64) -> Bool:
+        """Which points (n, 3) lie in voxels that were struck in too few of the scans that could have struck them."""
+        trail = np.zeros(len(points), dtype=np.bool_)
+        rows, cols = self.draft.lattice.cells_of(points)
+        for tile, planes in self.evidence.tiles.items():
+            reference = reference_window(self.draft, tile_grid(self.draft.lattice, tile))
+            r, c = rows - reference.grid.row0, cols - reference.grid.col0
+            here = np.flatnonzero((r >= 0) & (r < TILE_CELLS) & (c >= 0) & (c < TILE_CELLS))
+            here = here[find_obstacles(points[here], reference)[0]]
+            r, c = r[here], c[here]
+            bits = np.floor(points[here, 2] / CELL_SIZE).astype(np.int64) - reference.base[r, c]
+            through, struck = _counts(planes, r, c, bits)
+            s = self.settings.mapping
+            trail[here] = (through >= s.trail_min_through) & (struck < s.trail_share * (struck + through))
+        return trail
+
+    def _free(self, tile: TileIndex, point_map: PointMap) -> U64:
+        """Known-free columns of one tile of the finished map, on its own ground."""
+        grid = tile_grid(self.draft.lattice, tile)
+        if tile not in self.evidence.tiles:
+            return np.zeros(grid.shape, dtype=np.uint64)
+        before, after = reference_window(self.draft, grid), reference_window(point_map, grid)
+        free = free_words(self.evidence.tiles[tile], np.zeros(grid.shape, dtype=np.uint64))
+        out = _rebased(free, before.base, after.base) & ~after.occupied
+        out[np.isnan(after.ground_z)] = 0
+        return out
+
+
+def motion_at(stamps_ns: I64, T_map_lidar: F64, i: int) -> F64:
+    """(6,) motion per second of scan i in its lidar frame, from the poses (n, 4, 4) before and after it."""
+    before, after = max(i - 1, 0), min(i + 1, len(stamps_ns) - 1)
+    if before == after:
+        return np.zeros(6)
+    seconds = 1e-9 * float(stamps_ns[after] - stamps_ns[before])
+    return twist_between(T_map_lidar[before], T_map_lidar[after], seconds)
+
+
+@numba.njit(cache=True, nogil=True)
+def _counts(planes: U64, rows: I64, cols: I64, bits: I64) -> tuple[I64, I64]:
+    """(seen through, struck) of voxels (row, col, bit) of a tile; voxels outside the columns have 0 and 0."""
+    through, struck = np.zeros(len(bits), dtype=np.int64), np.zeros(len(bits), dtype=np.int64)
+    for i in range(len(bits)):
+        if 0 <= bits[i] < TOP_BIT:
+            through[i] = count_of(planes[rows[i], cols[i]], 0, bits[i])
+            struck[i] = count_of(planes[rows[i], cols[i]], PLANES, bits[i])
+    return through, struck
+
+
+@numba.njit(cache=True, nogil=True)
+def _rebased(words: U64, before: I32, after: I32) -> U64:
+    out = np.empty_like(words)
+    for r in range(words.shape[0]):
+        for c in range(words.shape[1]):
+            out[r, c] = shifted(words[r, c], before[r, c] - after[r, c])
+    return out
