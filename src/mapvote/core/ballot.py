@@ -25,11 +25,11 @@ MAX_POINTS_PER_CELL = 64
 MAX_TILE_INDEX = 1 << 20
 _CELLS = TILE_CELLS * TILE_CELLS
 
-Id = Annotated[str, msgspec.Meta(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$")]
+Id = Annotated[str, msgspec.Meta(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}\Z")]
 """Vehicle and drive names: 1-64 of letters, digits, dot, underscore, dash; they appear in URLs and file names."""
-_Text = Annotated[str, msgspec.Meta(pattern=r"^[^\x00-\x1f]*$", max_length=200)]
+_Text = Annotated[str, msgspec.Meta(pattern=r"^[^\x00-\x1f]*\Z", max_length=200)]
 """No control characters: some databases refuse them, and no log should print them."""
-_Hash = Annotated[str, msgspec.Meta(pattern=r"^[0-9a-f]{0,64}$")]
+_Hash = Annotated[str, msgspec.Meta(pattern=r"^[0-9a-f]{0,64}\Z")]
 _Count = Annotated[int, msgspec.Meta(ge=0, le=1 << 31)]
 
 
@@ -137,15 +137,21 @@ def decode(data: bytes) -> Ballot:
     return ballot
 
 
-def validate(ballot: Ballot) -> None:
-    """Unpack every plane once; MapvoteError on the first that is damaged or impossible."""
+def validate(ballot: Ballot, max_bytes: int | None = None) -> None:
+    """Unpack every plane once; MapvoteError on the first that is damaged or impossible.
+
+    ``max_bytes``: also refuse a ballot whose planes are larger than that, together and decompressed.
+    """
+    size = 0
     for tile in ballot.tiles:
         if tile.states is not None:
-            unpack_states(tile.states)
+            size += unpack_states(tile.states).nbytes
         if tile.tally is not None:
-            unpack_tally(tile.tally)
+            size += unpack_tally(tile.tally).nbytes
         for what, words in (("gone", tile.gone), ("free", tile.free)):
             if words is not None:
-                unpack_words(words, what)
+                size += unpack_words(words, what).nbytes
         if tile.new_points is not None:
-            unpack_points(tile.new_points)
+            size += unpack_points(tile.new_points).nbytes
+        if max_bytes is not None and size > max_bytes:
+            raise MapvoteError(f"ballot: larger than {max_bytes} bytes when decompressed; send a shorter drive")

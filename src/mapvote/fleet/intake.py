@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,15 +13,17 @@ from mapvote.core.ballot import Ballot, BallotTile, decode, tile_key, validate
 from mapvote.core.grid import TileIndex, tile_grid
 from mapvote.core.types import MapvoteError
 from mapvote.fleet import schema
-from mapvote.fleet.content import same_cells, unpack_points_plane
+from mapvote.fleet.content import TileHashes, same_cells, unpack_points_plane
 from mapvote.fleet.errors import Conflict, NotFound
 from mapvote.fleet.fuse import DAY_NS
-from mapvote.fleet.store import Store, current_version, load_blob, log_event, names, tiles_of
+from mapvote.fleet.store import Store, current_version, load_blob, log_event, names, next_seq, tiles_of
 from mapvote.fleet.update import rule_of, staged, tile_vote
 
 MAX_CLOCK_AHEAD_NS = DAY_NS
 """A drive may end this much after the server's own time: clocks differ, but a vehicle from the future would make all
 other votes look old."""
+MAX_UNPACKED_BYTES = 512 << 20
+"""All planes of one ballot together, decompressed: some ten kilometres of street."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +50,7 @@ class Receipt:
 def examine(data: bytes) -> Incoming:
     """Decode a ballot and unpack every plane once; MapvoteError on the first defect. Touches no database."""
     ballot = decode(data)
-    validate(ballot)
+    validate(ballot, MAX_UNPACKED_BYTES)
     if not ballot.tiles:
         raise MapvoteError("ballot: votes on no tile")
     rule_of(ballot.method)
@@ -63,14 +65,15 @@ def accept(store: Store, ballots: Sequence[Incoming]) -> list[Receipt | MapvoteE
     Conflict: other map or method, unknown base, or no cell counts any more. Unavailable is raised for all.
     """
     with store.database.reading() as connection:
-        before = [_refusal(store, connection, incoming) for incoming in ballots]
-    if all(before):
-        return [error for error in before if error is not None]
-    with store.database.writing() as connection:
-        return [
-            error if error is not None else _insert(store, connection, incoming)
-            for incoming, error in zip(ballots, before, strict=True)
-        ]
+        current = tiles_of(connection, current_version(connection).number)
+        results: list[Receipt | MapvoteError | None] = [_refusal(store, connection, b, current) for b in ballots]
+    sound = [i for i, error in enumerate(results) if error is None]
+    if sound:
+        with store.database.writing() as connection:
+            receipts = _insert(connection, [ballots[i] for i in sound], store.clock())
+        for i, receipt in zip(sound, receipts, strict=True):
+            results[i] = receipt
+    return [result for result in results if result is not None]
 
 
 def withdraw(store: Store, vehicle: str, drive: str | None = None, *, by: str) -> int:
@@ -92,13 +95,14 @@ def withdraw(store: Store, vehicle: str, drive: str | None = None, *, by: str) -
     return int(withdrawn)
 
 
-def _refusal(store: Store, connection: sa.Connection, incoming: Incoming) -> MapvoteError | None:
+def _refusal(
+    store: Store, connection: sa.Connection, incoming: Incoming, current: Mapping[TileIndex, TileHashes]
+) -> MapvoteError | None:
     ballot = incoming.ballot
     if ballot.map_id != store.map_id:
         return Conflict(f"this server keeps map {store.map_id!r}, the ballot votes on {ballot.map_id!r}")
     if ballot.end_ns > store.clock() + MAX_CLOCK_AHEAD_NS:
         return MapvoteError("ballot: the drive ends in the future; set the vehicle's clock")
-    current = tiles_of(connection, current_version(connection).number)
     unknown: list[TileIndex] = []
     counts = False
     for tile in ballot.tiles:
@@ -134,36 +138,66 @@ def _counts_somewhere(
     return bool((tile_vote(ballot, tile, "").spoken() & same).any())
 
 
-def _insert(store: Store, connection: sa.Connection, incoming: Incoming) -> Receipt | MapvoteError:
-    ballot, b = incoming.ballot, schema.ballots
-    method = connection.execute(sa.select(schema.maps.c.method)).scalar_one()
-    if method is None:
-        connection.execute(schema.maps.update().values(method=incoming.method))
-    elif method != incoming.method:
-        return Conflict(f"this round votes by {method}, the ballot by {incoming.method}: one round never mixes methods")
-    mine = (b.c.vehicle == ballot.vehicle) & (b.c.drive == ballot.drive)
-    known = connection.execute(sa.select(b.c.seq, b.c.first_seq, b.c.gone_seq, b.c.digest).where(mine)).all()
-    standing = [row for row in known if row.gone_seq is None]
-    if standing and standing[0].digest == incoming.digest:
-        return Receipt(ballot.vehicle, ballot.drive, False, True, standing[0].seq)
-    now = store.clock()
-    seq = log_event(connection, now, "ballot", ballot.vehicle, ballot.drive)
-    if standing:
-        connection.execute(b.update().where(b.c.seq == standing[0].seq).values(gone_seq=seq))
-    row: dict[str, Any] = {
-        "seq": seq,
-        "first_seq": min((row.first_seq for row in known), default=seq),
-        "vehicle": ballot.vehicle,
-        "drive": ballot.drive,
-        "digest": incoming.digest,
-        "start_ns": ballot.start_ns,
-        "end_ns": ballot.end_ns,
-        "received_ns": now,
-        "settings_hash": ballot.settings_hash[:128],
-    }
-    connection.execute(b.insert(), [row])
-    connection.execute(schema.ballot_tiles.insert(), [_tile_row(seq, ballot, tile) for tile in ballot.tiles])
-    return Receipt(ballot.vehicle, ballot.drive, not standing, False, seq)
+def _insert(connection: sa.Connection, ballots: Sequence[Incoming], now: int) -> list[Receipt | MapvoteError]:
+    b = schema.ballots
+    method = agreed = connection.execute(sa.select(schema.maps.c.method)).scalar_one()
+    drives = sa.tuple_(b.c.vehicle, b.c.drive).in_({(i.ballot.vehicle, i.ballot.drive) for i in ballots})
+    query = sa.select(b.c.vehicle, b.c.drive, b.c.seq, b.c.first_seq, b.c.gone_seq, b.c.digest).where(drives)
+    first: dict[tuple[str, str], int] = {}
+    standing: dict[tuple[str, str], tuple[int, str]] = {}
+    for row in connection.execute(query.order_by(b.c.seq)):
+        first.setdefault((row.vehicle, row.drive), row.first_seq)
+        if row.gone_seq is None:
+            standing[row.vehicle, row.drive] = row.seq, row.digest
+    seq = next_seq(connection)
+    results: list[Receipt | MapvoteError] = []
+    rows: dict[int, dict[str, Any]] = {}
+    tiles: list[dict[str, Any]] = []
+    replaced: list[dict[str, int]] = []
+    for incoming in ballots:
+        ballot, key = incoming.ballot, (incoming.ballot.vehicle, incoming.ballot.drive)
+        method = method or incoming.method
+        if method != incoming.method:
+            theirs = f"this round votes by {method}, the ballot by {incoming.method}"
+            results.append(Conflict(f"{theirs}: one round never mixes methods"))
+            continue
+        old = standing.get(key)
+        if old is not None and old[1] == incoming.digest:
+            results.append(Receipt(*key, created=False, repeated=True, seq=old[0]))
+            continue
+        if old is not None:
+            replaced.append({"old": old[0], "by": seq})
+        first.setdefault(key, seq)
+        standing[key] = seq, incoming.digest
+        rows[seq] = {
+            "seq": seq,
+            "first_seq": first[key],
+            "gone_seq": None,
+            "vehicle": ballot.vehicle,
+            "drive": ballot.drive,
+            "digest": incoming.digest,
+            "start_ns": ballot.start_ns,
+            "end_ns": ballot.end_ns,
+            "received_ns": now,
+            "settings_hash": ballot.settings_hash[:128],
+        }
+        tiles += [_tile_row(seq, ballot, tile) for tile in ballot.tiles]
+        results.append(Receipt(*key, created=old is None, repeated=False, seq=seq))
+        seq += 1
+    if rows:
+        log = [
+            {"seq": s, "at_ns": now, "kind": "ballot", "actor": row["vehicle"], "detail": row["drive"]}
+            for s, row in rows.items()
+        ]
+        connection.execute(schema.events.insert(), log)
+        connection.execute(b.insert(), list(rows.values()))
+        connection.execute(schema.ballot_tiles.insert(), tiles)
+    if replaced:
+        mark = b.update().where(b.c.seq == sa.bindparam("old")).values(gone_seq=sa.bindparam("by"))
+        connection.execute(mark, replaced)
+    if method != agreed:
+        connection.execute(schema.maps.update().values(method=method))
+    return results
 
 
 def _tile_row(seq: int, ballot: Ballot, tile: BallotTile) -> dict[str, Any]:

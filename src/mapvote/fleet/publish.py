@@ -99,7 +99,7 @@ def publish(
     number = newest.number + 1
     why = reason + (f" (in spite of: {'; '.join(held)})" if held else "")
     version = Version(number, newest.number, "publish", None, store.clock(), by, why[:400], mark, policy)
-    _write(store, version, {f.index: f.hashes for f in changed}, [f.planes for f in changed], fused)
+    write_version(store, version, {f.index: f.hashes for f in changed}, [f.planes for f in changed], fused)
     return replace(outcome, version=number, published=True)
 
 
@@ -135,16 +135,17 @@ def rollback(store: Store, to: int, *, by: str = "operator", reason: str = "") -
     version = Version(
         number, newest.number, "rollback", to, store.clock(), by, reason[:400], newest.mark, dict(target.policy)
     )
-    return _write(store, version, {index: then.get(index) for index in differ}, [], (), barred)
+    return write_version(store, version, {index: then.get(index) for index in differ}, [], (), barred)
 
 
-def _write(
+def write_version(
     store: Store,
     version: Version,
     tiles: Mapping[TileIndex, TileHashes | None],
     planes: Sequence[Mapping[str, bytes]],
-    fused: Sequence[Fused],
+    fused: Sequence[Fused] = (),
     barred: Mapping[TileIndex, bytes] | None = None,
+    unvoted: str | None = None,
 ) -> Version:
     """The one transaction by which a version appears; Conflict if its parent is the newest no more."""
     try:
@@ -168,6 +169,10 @@ def _write(
                     for i, c in barred.items()
                 ]
                 connection.execute(schema.bars.insert(), r)
+            if unvoted is not None:
+                b = schema.ballots
+                mine = (b.c.vehicle == unvoted) & b.c.gone_seq.is_(None)
+                connection.execute(b.update().where(mine).values(gone_seq=seq))
     except IntegrityError as error:
         raise Conflict(
             f"version {version.number} was published by somebody else meanwhile; look at it first"

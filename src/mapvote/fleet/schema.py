@@ -16,7 +16,6 @@ metadata = sa.MetaData(
         "pk": "pk_%(table_name)s",
     }
 )
-_Seq = sa.BigInteger().with_variant(sa.Integer, "sqlite")
 _Hash = sa.String(64)
 
 maps = sa.Table(
@@ -45,12 +44,11 @@ keys = sa.Table(
 events = sa.Table(
     "events",
     metadata,
-    sa.Column("seq", _Seq, primary_key=True, autoincrement=True),
+    sa.Column("seq", sa.BigInteger, primary_key=True, autoincrement=False),
     sa.Column("at_ns", sa.BigInteger, nullable=False),
     sa.Column("kind", sa.String(16), nullable=False),
     sa.Column("actor", sa.String(80), nullable=False),
     sa.Column("detail", sa.String(400), nullable=False),
-    sqlite_autoincrement=True,
 )
 """The log, and the one order of everything: writers take turns, so ``seq`` grows in the order of commits."""
 

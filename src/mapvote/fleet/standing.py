@@ -92,7 +92,6 @@ def counting_votes(
     """
     chosen = select(stored_votes(connection, index, asked), asked.settings)
     barred = bars_on(connection, index, asked.mark) if bars is None else bars
-    planes = _planes(connection, index, [vote.seq for vote in chosen])
 
     @cache
     def unchanged(base: str) -> Bool | None:
@@ -101,8 +100,7 @@ def counting_votes(
         return None if same.all() else same
 
     votes = []
-    for stored in chosen:
-        vote = _vote(stored, planes[stored.seq])
+    for stored, vote in zip(chosen, read_votes(connection, index, chosen), strict=True):
         votes.append(silence(restrict(vote, unchanged(stored.base)), stored.first_seq, barred))
     return votes
 
@@ -119,6 +117,12 @@ def silence(vote: TileVote, first_seq: int, bars: Sequence[Bar]) -> TileVote:
 def _stands_at(mark: int) -> sa.ColumnElement[bool]:
     b = schema.ballots
     return (b.c.seq <= mark) & (b.c.gone_seq.is_(None) | (b.c.gone_seq > mark))
+
+
+def read_votes(connection: sa.Connection, index: TileIndex, stored: Sequence[StoredVote]) -> list[TileVote]:
+    """The planes of stored votes, in their order, nothing silenced."""
+    planes = _planes(connection, index, [vote.seq for vote in stored])
+    return [_vote(vote, planes[vote.seq]) for vote in stored]
 
 
 def _planes(connection: sa.Connection, index: TileIndex, ballots: Sequence[int]) -> dict[int, Any]:

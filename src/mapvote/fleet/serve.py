@@ -1,0 +1,101 @@
+"""Run the app on an address: logs, keys where they must be, a graceful stop."""
+
+from __future__ import annotations
+
+import ipaddress
+import logging
+import socket
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import structlog
+import uvicorn
+
+from mapvote.config import Settings
+from mapvote.core.types import MapvoteError, PointMap
+from mapvote.fleet import keys
+from mapvote.fleet.app import create_app
+from mapvote.fleet.gate import gate as localise_in_both
+from mapvote.fleet.publish import Gate
+from mapvote.fleet.store import Store, url_of
+from mapvote.formats import open_drive, read_map
+
+
+def open_or_create(where: str, map_path: Path | None) -> Store:
+    """The store at a path or URL; a new one from ``map_path`` if there is none yet. MapvoteError otherwise."""
+    try:
+        return Store.open(url_of(where))
+    except MapvoteError:
+        if map_path is None:
+            raise
+    return Store.create(url_of(where), read_map(map_path))
+
+
+def reference_gate(drive_path: Path, settings: Settings) -> Gate:
+    """A gate that holds a version in which a reference drive localises worse; what cannot be told is let through."""
+    drive = open_drive(drive_path)
+
+    def reasons(old: PointMap, new: PointMap) -> Sequence[str]:
+        result = localise_in_both(old, new, drive, settings.gate, settings.ndt)
+        structlog.get_logger("mapvote").info("gate", verdict=result.verdict, reasons=list(result.reasons))
+        return list(result.reasons) if result.verdict == "hold" else []
+
+    return reasons
+
+
+def is_loopback(host: str) -> bool:
+    """Whether only this machine can reach ``host``."""
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
+
+
+def serve(
+    store: Store,
+    settings: Settings,
+    *,
+    host: str = "127.0.0.1",
+    port: int = 8080,
+    gate: Gate | None = None,
+    ready: Callable[[str], object] = lambda url: None,
+) -> None:
+    """Serve until SIGINT or SIGTERM; requests under way are answered and ballots taken in are written first.
+
+    ``ready`` is told the address once it listens. MapvoteError if the address is taken, or beyond loopback while no
+    operator has a key. Without any key at all, on loopback, nobody needs one.
+    """
+    valid = [key for key in keys.listed(store) if key.revoked_ns is None]
+    if not is_loopback(host) and not any(key.role == "operator" for key in valid):
+        raise MapvoteError(f"{host} can be reached from elsewhere: issue keys first (mapvote keys STORE issue NAME)")
+    app = create_app(store, settings, need_keys=bool(valid) or not is_loopback(host), gate=gate)
+    listener = socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET)
+    try:
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        listener.bind((host, port))
+    except OSError as error:
+        listener.close()
+        raise MapvoteError(f"cannot listen on {host}:{port} ({error.strerror}): choose another --port") from error
+    shown = f"[{host}]" if ":" in host else host
+    ready(f"http://{shown}:{listener.getsockname()[1]}")
+    config = uvicorn.Config(
+        app, access_log=False, log_level="warning", timeout_graceful_shutdown=20, server_header=False
+    )
+    with listener:
+        uvicorn.Server(config).run(sockets=[listener])
+
+
+def log_as_json() -> None:
+    """One JSON object a line on stderr, from us and from the libraries."""
+    structlog.configure(
+        processors=[
+            structlog.processors.add_log_level,
+            structlog.processors.TimeStamper(fmt="iso", utc=True),
+            structlog.processors.format_exc_info,
+            structlog.processors.JSONRenderer(),
+        ],
+        logger_factory=structlog.PrintLoggerFactory(sys.stderr),
+        cache_logger_on_first_use=True,
+    )
+    logging.basicConfig(level=logging.WARNING, stream=sys.stderr, format='{"event": "%(name)s: %(message)s"}')
