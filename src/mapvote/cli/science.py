@@ -57,6 +57,7 @@ def evaluate(
 
     from mapvote.config import load_settings
     from mapvote.evaluation.cases import choose_cases
+    from mapvote.evaluation.conditions import Conditions
     from mapvote.evaluation.evaluate import evaluate as run
     from mapvote.evaluation.report import as_json, tables, write_text
     from mapvote.evaluation.scene import Scene, default_cache
@@ -66,7 +67,9 @@ def evaluate(
     settings = load_settings(config)
     cases, with_yardsticks = choose_cases(settings, case)
     overrides = {"sensor": sensor} if sensor else {}
-    scene = Scene(scenario, seed, settings, cache or default_cache(), overrides, truth_poses=poses == "truth")
+    scene = Scene(
+        scenario, seed, settings, cache or default_cache(), overrides, Conditions(true_poses=poses == "truth")
+    )
     with _stages() as told:
         result = run(scene, cases, with_yardsticks, told).result
     for table in tables(result):

@@ -20,14 +20,17 @@ import numpy as np
 from mapvote.config import CASES, FuseSettings, Settings, VotingSettings
 from mapvote.core.ballot import Ballot, decode, encode, unpack_states, unpack_tally
 from mapvote.core.grid import Grid, TileIndex, tile_grid
-from mapvote.core.types import F64, NO_VOTE, U8, MapvoteError, PointMap
+from mapvote.core.types import F64, NO_VOTE, U8, Drive, MapvoteError, PointMap
 from mapvote.core.voting import decide
+from mapvote.evaluation.conditions import TrueMovers, shaken
 from mapvote.evaluation.scene import BALLOTS_FROM, Progress, Scene, key_of, sources_digest
 from mapvote.evaluation.truth import lay_on
 from mapvote.fleet.fuse import Decision, states_over
 from mapvote.fleet.update import update_map
+from mapvote.formats import open_drive
 from mapvote.formats.whole import whole_folder
-from mapvote.vehicle import GivenPoses, Vehicle
+from mapvote.perception.tracking import MapWindow, Tracker
+from mapvote.vehicle import GivenPoses, Localise, Vehicle
 
 OCCLUSIONS = ("first_hit", "farthest_return", "column")
 
@@ -124,7 +127,8 @@ def passes(scene: Scene, cases: Sequence[Case], workers: int, progress: Progress
 
 def pass_folder(scene: Scene, cases: Sequence[Case], vehicle: str) -> Path:
     """Where a vehicle's ballots lie in the cache."""
-    key = key_of(sources_digest(BALLOTS_FROM), *(case.voting.model_dump_json() for case in cases))
+    made_by = sources_digest(BALLOTS_FROM), scene.conditions
+    key = key_of(*made_by, *(f"{case.name} {case.voting.model_dump_json()}" for case in cases))
     return scene.work / f"votes-{key}" / vehicle
 
 
@@ -134,7 +138,8 @@ def drive_once(scene: Scene, cases: Sequence[Case], name: str) -> None:
     vehicle = Vehicle(
         drive.vehicle, drive.sensor, point_map, scene.settings,
         drive_id=drive.drive_id, voters=[case.voting for case in cases],
-        localise=GivenPoses(drive.stamps_ns, scene.truth.poses(name)) if scene.truth_poses else None,
+        localise=_localise(scene, drive, point_map),
+        movers=TrueMovers(scene.truth, open_drive(scene.folder / name)) if scene.conditions.true_moving else None,
         prior_sigma_m=drive.prior_sigma_m, prior_sigma_deg=drive.prior_sigma_deg,
     )  # fmt: skip
     for i, scan in enumerate(drive):
@@ -150,6 +155,20 @@ def drive_once(scene: Scene, cases: Sequence[Case], name: str) -> None:
         np.save(folder / "poses.npy", poses)
         stages = {stage: 1000.0 * float(np.median(seconds)) for stage, seconds in report.stage_s.items()}
         (folder / "pass.json").write_text(json.dumps(stages))
+
+
+def _localise(scene: Scene, drive: Drive, point_map: PointMap) -> Localise:
+    """By NDT, or by the truth; with noise if the scene's conditions say so."""
+    conditions, ndt = scene.conditions, scene.settings.ndt
+    if conditions.true_poses:
+        assert drive.T_map_lidar_prior is not None
+        localise: Localise = GivenPoses(drive.stamps_ns, drive.T_map_lidar_prior)
+    else:
+        localise = Tracker(MapWindow(point_map, ndt), ndt).localise
+    if conditions.noise_m or conditions.noise_deg:
+        number = scene.drive_names("v").index(drive.path.name)
+        localise = shaken(localise, drive.stamps_ns, conditions, (scene.seed, number))
+    return localise
 
 
 def _read_pass(scene: Scene, cases: Sequence[Case], name: str) -> Pass:

@@ -47,19 +47,16 @@ def evaluate(
     voted = time.perf_counter()
     truth, first_map = scene.truth, scene.point_map
     beams = scene.drive(drives[0].vehicle).sensor.beams
-    window = truth.grid_on(first_map.lattice)
-    judge = MapJudge(map_obstacles(first_map), *_above_ground(first_map, truth))
-    objects = [{"kind": o["kind"], "cells": truth.cells_of(o["footprint"])} for o in truth.objects]
+    jury = Jury(first_map, truth)
     outcomes, entries = {}, {}
     for i, case in enumerate(cases):
         if progress:
             progress("scoring", i, len(cases))
         ballots = [drive.ballots[case.name] for drive in drives]
-        outcome = fuse_case(first_map, ballots, case.min_votes, scene.settings.fuse, window)
+        outcome = fuse_case(first_map, ballots, case.min_votes, scene.settings.fuse, jury.window)
         outcomes[case.name] = outcome
         entries[case.name] = {
-            **score_states(outcome.states, outcome.vehicle_states, truth, objects),
-            "map": judge.score(map_obstacles(outcome.updated)).to_dict(),
+            **jury.of_update(outcome),
             "bytes_per_vehicle": [drive.sizes[case.name] for drive in drives],
             "state_bytes_per_vehicle": [_state_bytes(ballot) for ballot in ballots],
         }
@@ -70,18 +67,18 @@ def evaluate(
         for name, yardstick in measured.items():
             costs[name] = yardstick.cost
             entries[name] = {
-                **score_states(yardstick.states, yardstick.vehicle_states, truth, objects),
+                **jury.of_states(yardstick.states, yardstick.vehicle_states),
                 "bytes_per_vehicle": [],
             }
     result = {
         "scenario": scene.scenario,
         "seed": scene.seed,
-        "poses": "truth" if scene.truth_poses else "ndt",
+        "poses": "truth" if scene.conditions.true_poses else "ndt",
         "cells": int(truth.strict.size),
         "coverage": entries[cases[-1].name if "columns" not in entries else "columns"]["coverage"],
         "settings": scene.settings.model_dump(mode="json"),
-        "map_shift": map_shift(scene, truth),
-        "localisation": localisation(scene, truth, drives),
+        "map_shift": map_shift(scene),
+        "localisation": localisation(scene, drives),
         "cases": entries,
         "timings": {
             "prepare_s": prepared - started,
@@ -93,19 +90,32 @@ def evaluate(
             "fuse_s": {name: outcome.seconds for name, outcome in outcomes.items()},
         },
     }
-    return Evaluation(result, scene, truth, window, first_map, outcomes, drives)
+    return Evaluation(result, scene, truth, jury.window, first_map, outcomes, drives)
 
 
-def score_states(
-    states: U8, vehicle_states: Sequence[U8], truth: Truth, objects: Sequence[Mapping[str, object]]
-) -> dict[str, Any]:
-    """R for both truths, coverage, objects; all states over the truth's window."""
-    return {
-        "strict": score_cells(states, truth.strict).to_dict(),
-        "provenance": score_cells(states, truth.provenance).to_dict(),
-        "coverage": coverage(vehicle_states, truth.strict),
-        "objects": score_objects(states, truth.strict, objects, CELL_SIZE).to_dict(),
-    }
+class Jury:
+    """Scores whatever was decided about one first map against one truth."""
+
+    def __init__(self, first_map: PointMap, truth: Truth) -> None:
+        self.truth = truth
+        self.window = truth.grid_on(first_map.lattice)
+        self._points = MapJudge(map_obstacles(first_map), *_above_ground(first_map, truth))
+        self._objects = [{"kind": o["kind"], "cells": truth.cells_of(o["footprint"])} for o in truth.objects]
+
+    def of_states(self, states: U8, vehicle_states: Sequence[U8]) -> dict[str, Any]:
+        """R for both truths, coverage, objects; all states over the truth's window."""
+        strict, provenance = self.truth.strict, self.truth.provenance
+        return {
+            "strict": score_cells(states, strict).to_dict(),
+            "provenance": score_cells(states, provenance).to_dict(),
+            "coverage": coverage(vehicle_states, strict),
+            "objects": score_objects(states, strict, self._objects, CELL_SIZE).to_dict(),
+        }
+
+    def of_update(self, outcome: Outcome) -> dict[str, Any]:
+        """The same, and what became of the map's points."""
+        points = self._points.score(map_obstacles(outcome.updated)).to_dict()
+        return {**self.of_states(outcome.states, outcome.vehicle_states), "map": points}
 
 
 def _above_ground(first_map: PointMap, truth: Truth) -> tuple[F64, F64, F64]:
@@ -127,10 +137,10 @@ def _state_bytes(ballot: Ballot) -> int:
     return sum(len(tile.states or tile.tally or b"") for tile in ballot.tiles)
 
 
-def map_shift(scene: Scene, truth: Truth) -> dict[str, float]:
+def map_shift(scene: Scene) -> dict[str, float]:
     """How far the first map lies from the truth: mean offset of the survey's poses, and the 95 % of their distances."""
     names = scene.drive_names("survey_")
-    offset = np.concatenate([scene.survey_poses(n)[:, :3, 3] - truth.poses(n)[:, :3, 3] for n in names])
+    offset = np.concatenate([scene.survey_poses(n)[:, :3, 3] - scene.true_poses(n)[:, :3, 3] for n in names])
     mean = offset.mean(axis=0)
     return {
         "mean_m": float(np.linalg.norm(mean)),
@@ -141,13 +151,13 @@ def map_shift(scene: Scene, truth: Truth) -> dict[str, float]:
     }
 
 
-def localisation(scene: Scene, truth: Truth, drives: Sequence[Pass]) -> dict[str, dict[str, float]]:
+def localisation(scene: Scene, drives: Sequence[Pass]) -> dict[str, dict[str, float]]:
     """Each vehicle's pose errors in the map's frame (the survey's trajectory rigidly aligned to its truth)."""
     names = scene.drive_names("survey_")
     T_map_world = rigid_between(
-        np.concatenate([scene.survey_poses(n) for n in names]), np.concatenate([truth.poses(n) for n in names])
+        np.concatenate([scene.survey_poses(n) for n in names]), np.concatenate([scene.true_poses(n) for n in names])
     )
-    return {d.vehicle: error_summary(d.T_map_lidar, T_map_world @ truth.poses(d.vehicle)) for d in drives}
+    return {d.vehicle: error_summary(d.T_map_lidar, T_map_world @ scene.true_poses(d.vehicle)) for d in drives}
 
 
 def error_summary(T_found: F64, T_true: F64) -> dict[str, float]:

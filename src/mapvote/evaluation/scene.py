@@ -7,6 +7,7 @@ that was cut short goes on where it stopped and a changed program never meets an
 from __future__ import annotations
 
 import hashlib
+import inspect
 import json
 import os
 import shutil
@@ -21,9 +22,12 @@ import numpy as np
 import mapvote
 from mapvote.config import Settings
 from mapvote.core.columns import GROUND_MARGIN_M
+from mapvote.core.points import voxel_downsample
 from mapvote.core.types import F64, Drive, PointMap
+from mapvote.evaluation.conditions import Conditions, with_true_ground
 from mapvote.evaluation.truth import Truth, read_truth
 from mapvote.formats import open_drive, read_map, write_map
+from mapvote.formats.drive import parse_scans
 from mapvote.formats.whole import whole_file
 from mapvote.mapping import build_map
 from mapvote.simulation import simulate
@@ -32,10 +36,10 @@ from mapvote.simulation.scenario import load_scenario
 Progress = Callable[[str, int, int], None]
 """Called with (what is being done, done, in all)."""
 
-_DRIVES_FROM = (
-    "simulation", "core/geometry.py", "core/grid.py", "core/points.py", "core/sensors.py", "formats/kitti.py",
-)  # fmt: skip
+_DRIVES_FROM = ("simulation", "core/geometry.py", "core/grid.py", "core/sensors.py", "formats/kitti.py")
 """What the bytes of drives and truth depend on; most work on the program leaves gigabytes of drives as they are."""
+_DROPPED = "dropped"
+"""A file of this name says that the scans were deleted to free the disk."""
 _MAP_FROM = ("core", "formats", "perception", "mapping.py")
 BALLOTS_FROM = (*_MAP_FROM, "vehicle.py")
 
@@ -72,30 +76,28 @@ class Scene:
     settings: Settings
     cache: Path
     overrides: Mapping[str, Any] = field(default_factory=dict)
-    truth_poses: bool = False
-    """Give survey and vehicles their true poses: what localisation costs is then left out."""
+    conditions: Conditions = field(default_factory=Conditions)
+    """What the drives are put through besides; see there."""
 
     @property
     def folder(self) -> Path:
         """Drives and truth."""
         text = load_scenario(self.scenario, self.overrides).model_dump_json()
-        name = f"{Path(self.scenario).stem}-{self.seed}"
-        return self.cache / f"{name}-{key_of(text, sources_digest(_DRIVES_FROM), GROUND_MARGIN_M)}"
+        name, thinning = f"{Path(self.scenario).stem}-{self.seed}", inspect.getsource(voxel_downsample)
+        return self.cache / f"{name}-{key_of(text, sources_digest(_DRIVES_FROM), GROUND_MARGIN_M, thinning)}"
 
     @property
     def work(self) -> Path:
         """What was made of the drives with these settings."""
-        s = self.settings
-        made_by = (
-            sources_digest(_MAP_FROM),
-            s.ndt.model_dump_json(),
-            s.moving.model_dump_json(),
-            s.mapping.model_dump_json(),
-        )
-        return self.folder / f"made-{'truth' if self.truth_poses else 'ndt'}-{key_of(*made_by)}"
+        s, c = self.settings, self.conditions
+        settings = [part.model_dump_json() for part in (s.ndt, s.moving, s.mapping)]
+        key = key_of(sources_digest(_MAP_FROM), *settings, c.scans, c.true_poses, c.true_ground)
+        return self.folder.with_name(f"{self.folder.name}-made") / key
 
     def prepare(self, progress: Progress | None = None) -> None:
         """Simulate the drives and build the first map, unless the cache holds them."""
+        if (self.folder / _DROPPED).exists():
+            shutil.rmtree(self.folder)
         if not self.folder.exists():
             told = (lambda done, total: progress("simulating", done, total)) if progress else None
             partial = self.folder.with_name(f".{self.folder.name}.{os.getpid()}")
@@ -108,7 +110,15 @@ class Scene:
             for track in report.tracks:
                 with whole_file(self.work / f"{track.vehicle}.npy") as partial, partial.open("wb") as file:
                     np.save(file, track.T_map_lidar)
+            if self.conditions.true_ground:
+                point_map = with_true_ground(point_map, self.scenario, self.seed, self.overrides)
             write_map(point_map, self.work / "map")
+
+    def drop_drives(self) -> None:
+        """Free the disk: keep the truth and what was made of the drives; whoever needs them simulates them again."""
+        (self.folder / _DROPPED).touch()
+        for scans in (*self.folder.glob("*/velodyne"), *self.folder.glob("truth/*/moving")):
+            shutil.rmtree(scans)
 
     def drive_names(self, prefix: str) -> list[str]:
         """Drives of the surveys ("survey_") or of the voting vehicles ("v"), in order of their numbers."""
@@ -117,9 +127,15 @@ class Scene:
 
     def drive(self, name: str) -> Drive:
         """A drive with its own prior, or with its true poses for a prior."""
-        prior = str(self.folder / "truth" / name / "poses.txt") if self.truth_poses else None
-        drive = open_drive(self.folder / name, prior=prior)
-        return replace(drive, prior_sigma_m=0.001, prior_sigma_deg=0.001) if self.truth_poses else drive
+        c = self.conditions
+        prior = str(self.folder / "truth" / name / "poses.txt") if c.true_poses else None
+        drive = open_drive(self.folder / name, scans=c.scans, prior=prior)
+        return replace(drive, prior_sigma_m=0.001, prior_sigma_deg=0.001) if c.true_poses else drive
+
+    def true_poses(self, name: str) -> F64:
+        """(n, 4, 4) where the drive's scans were really taken."""
+        poses = self.truth.poses(name)
+        return poses[parse_scans(self.conditions.scans, len(poses), name)]
 
     @property
     def truth(self) -> Truth:

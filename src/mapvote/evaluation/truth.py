@@ -15,6 +15,7 @@ from mapvote.core.types import F64, NO_VOTE, U8, Bool, MapvoteError
 from mapvote.formats.poses import read_poses
 
 _KEPT, _ADDED, _REMOVED = 0, 1, 2
+_OLD_NEVER_SURVEYED = 3
 _AROUND_M = 0.6
 """Walls stand on the outline of a footprint: cells this far outside it still belong to the object."""
 _ARM_M = 2.0
@@ -29,6 +30,8 @@ class Truth:
     y0: float
     strict: U8
     provenance: U8
+    reason: U8
+    """Why a cell is unscored (docs/simulation.md)."""
     objects: tuple[dict[str, Any], ...]
     """``kind`` "built" or "demolished", ``footprint`` [[x, y], ..], ``height_m``."""
 
@@ -49,6 +52,11 @@ class Truth:
     def moving(self, drive: str, scan: int) -> Bool:
         """(n,) which points of the scan's file hit a body that moves."""
         return np.asarray(np.load(self.folder / drive / "moving" / f"{scan:06d}.npy"), dtype=np.bool_)
+
+    def with_old_surfaces(self) -> tuple[U8, U8]:
+        """(strict, provenance) in which old surfaces that no survey saw count as unchanged, as another judge may."""
+        old = self.reason == _OLD_NEVER_SURVEYED
+        return np.where(old, np.uint8(0), self.strict), np.where(old, np.uint8(0), self.provenance)
 
     def surfaces(self) -> tuple[F64, F64, F64]:
         """(kept, added, removed): noise-free surface samples (n, 3), map metres."""
@@ -77,12 +85,12 @@ def read_truth(scene: Path) -> Truth:
     folder = scene / "truth"
     try:
         with np.load(folder / "truth.npz") as file:
-            strict, provenance = file["strict"], file["provenance"]
+            strict, provenance, reason = file["strict"], file["provenance"], file["reason"]
             x0, y0 = float(file["x0"]), float(file["y0"])
         objects = json.loads((folder / "objects.json").read_text())["objects"]
     except (OSError, KeyError, ValueError) as error:
         raise MapvoteError(f"{folder}: no usable truth ({error}); simulate the scene again") from error
-    return Truth(folder, x0, y0, strict, provenance, tuple(objects))
+    return Truth(folder, x0, y0, strict, provenance, reason, tuple(objects))
 
 
 def lay_on(states: U8, grid: Grid, window: Grid) -> U8:

@@ -1,0 +1,71 @@
+"""The experiment matrix: every case, every condition, over seeds; tables in Markdown and all numbers in JSON.
+
+    python benchmarks/matrix.py --seeds 2,3,4,5,6 --out out/matrix            # everything (docs/results.md)
+    python benchmarks/matrix.py --scenario corner --seeds 1 --experiments main # minutes
+
+A run that was cut short goes on where it stopped; what is done is written after every experiment. Seed 1 of `paper` is
+for development: report on others.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+
+from mapvote.config import load_settings
+from mapvote.evaluation import demands, matrix_tables
+from mapvote.evaluation.matrix import EXPERIMENTS, Matrix
+from mapvote.evaluation.scene import default_cache
+from mapvote.formats.whole import whole_file
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--scenario", default="paper", help="a scenario's name or file (default paper)")
+    parser.add_argument("--seeds", default="2,3,4,5,6", help="comma-separated (default 2,3,4,5,6)")
+    parser.add_argument("--experiments", help=f"comma-separated, of: {', '.join(EXPERIMENTS)} (default all)")
+    parser.add_argument("--out", type=Path, default=Path("out/matrix"))
+    parser.add_argument("--cache", type=Path, default=default_cache(), help="where drives, maps and ballots are kept")
+    parser.add_argument("--config", type=Path, help="settings (TOML)")
+    parser.add_argument("--workers", type=int, default=2, help="drives at a time")
+    parser.add_argument("--drop-drives", action="store_true", help="delete scans (3 GB a seed) once they are done with")
+    parser.add_argument("--tables-only", action="store_true", help="only write what earlier runs measured")
+    arguments = parser.parse_args()
+    seeds = tuple(int(seed) for seed in arguments.seeds.split(","))
+    names = list(EXPERIMENTS) if arguments.experiments is None else arguments.experiments.split(",")
+    unknown = [name for name in names if name not in EXPERIMENTS]
+    if unknown:
+        parser.error(f"no experiment {unknown[0]!r}; choose from {', '.join(EXPERIMENTS)}")
+    console = Console(width=220)
+    matrix = Matrix(
+        arguments.scenario, seeds, arguments.cache, load_settings(arguments.config), workers=arguments.workers
+    )
+    results: dict[str, dict[int, dict[str, Any]]] = {}
+    for name in names:
+        for seed in seeds:
+            if arguments.tables_only and not matrix.result_file(name, seed).is_file():
+                continue
+            console.print(f"{name}, {arguments.scenario} {seed}")
+            results.setdefault(name, {})[seed] = matrix.run(name, seed)
+            if arguments.drop_drives:
+                matrix.drop_drives(names, seed)
+            write(results, arguments.out)
+    console.print((arguments.out / "matrix.md").read_text(), markup=False)
+
+
+def write(results: dict[str, dict[int, dict[str, Any]]], out: Path) -> None:
+    """matrix.json and matrix.md into ``out``."""
+    titles = {name: f"{name} (seeds {', '.join(str(seed) for seed in by_seed)})" for name, by_seed in results.items()}
+    text = "\n".join(f"### {titles[name]}\n\n{matrix_tables.table(results, name)}" for name in results)
+    with whole_file(out / "matrix.md") as partial:
+        partial.write_text(f"## What must hold\n\n{demands.table(results)}\n## Experiments\n\n{text}")
+    with whole_file(out / "matrix.json") as partial:
+        partial.write_text(json.dumps(results, indent=1, allow_nan=False) + "\n")
+
+
+if __name__ == "__main__":
+    main()
