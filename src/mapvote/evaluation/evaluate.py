@@ -14,10 +14,11 @@ from mapvote.core.ballot import Ballot
 from mapvote.core.grid import CELL_SIZE, Grid
 from mapvote.core.types import F64, U8, PointMap
 from mapvote.evaluation.cases import Case, Outcome, Pass, fuse_case, passes
+from mapvote.evaluation.changed_areas import in_changed_areas, survey_anew
 from mapvote.evaluation.metrics import MapJudge, coverage, score_cells, score_objects
 from mapvote.evaluation.nearest import map_obstacles
 from mapvote.evaluation.scene import Progress, Scene
-from mapvote.evaluation.truth import Truth, pose_errors, rigid_between
+from mapvote.evaluation.truth import Truth, error_summary, rigid_between
 from mapvote.evaluation.yardsticks import yardsticks
 
 
@@ -48,6 +49,7 @@ def evaluate(
     truth, first_map = scene.truth, scene.point_map
     beams = scene.drive(drives[0].vehicle).sensor.beams
     jury = Jury(first_map, truth)
+    best = "columns" if any(case.name == "columns" for case in cases) else cases[0].name
     outcomes, entries = {}, {}
     for i, case in enumerate(cases):
         if progress:
@@ -60,9 +62,15 @@ def evaluate(
             "bytes_per_vehicle": [drive.sizes[case.name] for drive in drives],
             "state_bytes_per_vehicle": [_state_bytes(ballot) for ballot in ballots],
         }
+    T_map_world = map_frame(scene)
+    maps = {
+        "old map": (first_map, T_map_world),
+        f"updated map ({best})": (outcomes[best].updated, T_map_world),
+    }
     scored = time.perf_counter()
     costs = {}
     if with_yardsticks:
+        maps["map surveyed anew"] = survey_anew(scene, drives[0].vehicle, progress)
         measured, costs["case 5"] = yardsticks(scene, drives, workers, progress)
         for name, yardstick in measured.items():
             costs[name] = yardstick.cost
@@ -75,10 +83,13 @@ def evaluate(
         "seed": scene.seed,
         "poses": "truth" if scene.conditions.true_poses else "ndt",
         "cells": int(truth.strict.size),
-        "coverage": entries[cases[-1].name if "columns" not in entries else "columns"]["coverage"],
+        "coverage": entries[best]["coverage"],
         "settings": scene.settings.model_dump(mode="json"),
         "map_shift": map_shift(scene),
-        "localisation": localisation(scene, drives),
+        "localisation": {
+            d.vehicle: error_summary(d.T_map_lidar, T_map_world @ scene.true_poses(d.vehicle)) for d in drives
+        },
+        "changed_areas": in_changed_areas(scene, truth, drives[0].vehicle, maps),
         "cases": entries,
         "timings": {
             "prepare_s": prepared - started,
@@ -151,26 +162,8 @@ def map_shift(scene: Scene) -> dict[str, float]:
     }
 
 
-def localisation(scene: Scene, drives: Sequence[Pass]) -> dict[str, dict[str, float]]:
-    """Each vehicle's pose errors in the map's frame (the survey's trajectory rigidly aligned to its truth)."""
+def map_frame(scene: Scene) -> F64:
+    """T_map_world: the truth's frame in the map's, by the survey's trajectory."""
     names = scene.drive_names("survey_")
-    T_map_world = rigid_between(
-        np.concatenate([scene.survey_poses(n) for n in names]), np.concatenate([scene.true_poses(n) for n in names])
-    )
-    return {d.vehicle: error_summary(d.T_map_lidar, T_map_world @ scene.true_poses(d.vehicle)) for d in drives}
-
-
-def error_summary(T_found: F64, T_true: F64) -> dict[str, float]:
-    """Errors over the scans that were localised (rows that are not NaN), and how many there were."""
-    there = np.isfinite(T_found).all(axis=(1, 2))
-    metres, radians = pose_errors(T_found[there], T_true[there])
-    if not there.any():
-        metres, radians = np.zeros(1), np.zeros(1)
-    return {
-        "scans": len(T_found),
-        "localised": int(there.sum()),
-        "median_m": float(np.median(metres)),
-        "p99_m": float(np.percentile(metres, 99)),
-        "max_m": float(metres.max()),
-        "median_deg": float(np.degrees(np.median(radians))),
-    }
+    believed = np.concatenate([scene.survey_poses(n) for n in names])
+    return rigid_between(believed, np.concatenate([scene.true_poses(n) for n in names]))

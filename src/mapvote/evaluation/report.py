@@ -75,7 +75,7 @@ def tables(result: Result) -> Iterator[Table]:
         )
     yield f1
     yield from _map_table(result)
-    yield from _localisation_table(result)
+    yield from _localisation_tables(result)
     yield from _cost_table(result)
 
 
@@ -102,26 +102,28 @@ def _map_table(result: Result) -> Iterator[Table]:
     yield table
 
 
-def _localisation_table(result: Result) -> Iterator[Table]:
-    localisation = result.get("localisation")
-    if not localisation:
-        return
-    table = Table(
-        title="Localisation against the true poses", box=box.SIMPLE_HEAD, title_justify="left", title_style="bold"
-    )
-    for heading in ("", "scans", "localised", "median", "99 %", "largest", "median angle"):
-        table.add_column(heading, justify="right" if heading else "left")
-    for name, entry in localisation.items():
-        table.add_row(
-            name,
-            str(entry["scans"]),
-            _percent(ratio(entry["localised"], entry["scans"])),
-            f"{100 * entry['median_m']:.1f} cm",
-            f"{100 * entry['p99_m']:.1f} cm",
-            f"{100 * entry['max_m']:.1f} cm",
-            f"{entry['median_deg']:.3f}°",
-        )
-    yield table
+def _localisation_tables(result: Result) -> Iterator[Table]:
+    titles = {
+        "localisation": "Localisation against the true poses, in the map's frame",
+        "changed_areas": "What the map is for: one vehicle's scans within 30 m of a change",
+    }
+    for key, title in titles.items():
+        if not result.get(key):
+            continue
+        table = Table(title=title, box=box.SIMPLE_HEAD, title_justify="left", title_style="bold")
+        for heading in ("", "scans", "localised", "median", "99 %", "largest", "median angle"):
+            table.add_column(heading, justify="right" if heading else "left")
+        for name, entry in result[key].items():
+            table.add_row(
+                name,
+                str(entry["scans"]),
+                _percent(ratio(entry["localised"], entry["scans"])),
+                f"{100 * entry['median_m']:.1f} cm",
+                f"{100 * entry['p99_m']:.1f} cm",
+                f"{100 * entry['max_m']:.1f} cm",
+                f"{entry['median_deg']:.3f}°",
+            )
+        yield table
 
 
 def _cost_table(result: Result) -> Iterator[Table]:

@@ -122,3 +122,19 @@ def pose_errors(T_found: F64, T_true: F64) -> tuple[F64, F64]:
     metres = np.linalg.norm(T_found[:, :3, 3] - T_true[:, :3, 3], axis=1)
     cosines = [0.5 * (np.trace((inverse(a) @ b)[:3, :3]) - 1.0) for a, b in zip(T_found, T_true, strict=True)]
     return metres, np.arccos(np.clip(cosines, -1.0, 1.0))
+
+
+def error_summary(T_found: F64, T_true: F64) -> dict[str, float]:
+    """Errors over the scans that were localised (rows that are not NaN), and how many there were."""
+    there = np.isfinite(T_found).all(axis=(1, 2))
+    metres, radians = pose_errors(T_found[there], T_true[there])
+    if not there.any():
+        metres, radians = np.zeros(1), np.zeros(1)
+    return {
+        "scans": len(T_found),
+        "localised": int(there.sum()),
+        "median_m": float(np.median(metres)),
+        "p99_m": float(np.percentile(metres, 99)),
+        "max_m": float(metres.max()),
+        "median_deg": float(np.degrees(np.median(radians))),
+    }

@@ -1,0 +1,146 @@
+"""The whole evaluation on the smallest street: from nothing to tables, twice the same, and once more from the cache."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from mapvote.config import Settings
+from mapvote.core.geometry import exp, from_xyz_rpy
+from mapvote.core.grid import Lattice
+from mapvote.core.types import MapvoteError
+from mapvote.evaluation import report
+from mapvote.evaluation.cases import choose_cases
+from mapvote.evaluation.evaluate import Evaluation, evaluate
+from mapvote.evaluation.page import Section, page
+from mapvote.evaluation.scene import Scene
+from mapvote.evaluation.truth import error_summary, pose_errors, rigid_between
+
+SLOWER = {"rate_hz": 4.0}
+"""Fewer scans than a real LiDAR gives: a test asks whether it works, not how well."""
+
+
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("cache")
+
+
+@pytest.fixture(scope="module")
+def corner(cache: Path) -> Evaluation:
+    settings = Settings()
+    return evaluate(Scene("corner", 3, settings, cache, SLOWER), choose_cases(settings, "1,3,5,columns")[0])
+
+
+def without_timings(result: Any) -> str:
+    return report.as_json({key: value for key, value in result.items() if key != "timings"})
+
+
+def test_the_json_is_as_designed_and_never_nan(corner: Evaluation) -> None:
+    result = json.loads(report.as_json(corner.result))
+    assert result["cells"] == corner.truth.strict.size
+    assert 0.0 < result["coverage"] <= 1.0
+    for case in ("1", "3", "5", "columns"):
+        entry = result["cases"][case]
+        assert len(entry["bytes_per_vehicle"]) == 3
+        for truth in ("strict", "provenance"):
+            for metric in ("precision", "recall", "f1"):
+                values = entry[truth][metric]
+                assert set(values) == {"unchanged", "changed_occupied", "changed_empty"}
+                assert all(math.isfinite(v) and 0 <= v <= 1 for v in values.values())
+            assert entry[truth]["macro_f1"] == pytest.approx(np.mean(list(entry[truth]["f1"].values())))
+
+
+def test_a_second_run_comes_from_the_cache_and_says_the_same(corner: Evaluation, cache: Path) -> None:
+    stages: list[str] = []
+    again = evaluate(
+        corner.scene, choose_cases(Settings(), "1,3,5,columns")[0], progress=lambda s, *_: stages.append(s)
+    )
+    assert without_timings(again.result) == without_timings(corner.result)
+    assert not {"simulating", "mapping"} & set(stages)
+
+
+def test_one_stage_costs_more_bytes_than_two(corner: Evaluation) -> None:
+    cases = corner.result["cases"]
+    assert min(cases["3"]["state_bytes_per_vehicle"]) > 5 * max(cases["1"]["state_bytes_per_vehicle"])
+
+
+def test_columns_find_what_changed(corner: Evaluation) -> None:
+    columns = corner.result["cases"]["columns"]
+    assert all(columns["objects"]["found"])
+    assert columns["map"]["stale_deleted"] > 0.5
+    assert columns["map"]["valid_deleted"] < 0.01
+
+
+def test_tables_show_every_case_and_the_papers_figures(corner: Evaluation) -> None:
+    text = report.as_text(corner.result)
+    for shown in ("Table II", "Table III", "Table IV", "case 5", "columns", "0.850", "0.645", "What the map is for"):
+        assert shown in text
+    lines = report.as_csv(corner.result).splitlines()
+    assert lines[0] == "case,truth,metric,class,value"
+    assert len(lines) > 4 * 2 * 11
+
+
+def test_a_misspelt_case_is_named() -> None:
+    with pytest.raises(MapvoteError, match="no case 'colums'"):
+        choose_cases(Settings(), "1,colums")
+    with pytest.raises(MapvoteError, match="beside a vote"):
+        choose_cases(Settings(), "yardsticks")
+
+
+def test_no_truth_no_score(tmp_path: Path) -> None:
+    from mapvote.evaluation.truth import read_truth
+
+    with pytest.raises(MapvoteError, match="no usable truth"):
+        read_truth(tmp_path)
+
+
+def test_a_map_off_the_truths_lattice_is_refused(corner: Evaluation) -> None:
+    with pytest.raises(MapvoteError, match="off the map's lattice"):
+        corner.truth.grid_on(Lattice(0.1, 0.0))
+
+
+def test_trajectories_are_aligned_along_a_straight_road() -> None:
+    rng = np.random.default_rng(0)
+    truth = np.array([from_xyz_rpy(x, 0.0, 1.9) for x in np.arange(0.0, 500.0, 5.0)])
+    T_map_world = from_xyz_rpy(3.0, -2.0, 0.5, 0.01, -0.02, 0.3)
+    found = np.array([T_map_world @ T @ exp(rng.normal(0.0, 0.0002, 6)) for T in truth])
+    metres, radians = pose_errors(found, rigid_between(found, truth) @ truth)
+    assert metres.max() < 0.002
+    assert radians.max() < 0.002
+
+
+def test_abstentions_are_counted_not_averaged() -> None:
+    truth = np.tile(np.eye(4), (4, 1, 1))
+    found = truth.copy()
+    found[1, 0, 3], found[3] = 0.1, np.nan
+    summary = error_summary(found, truth)
+    assert (summary["scans"], summary["localised"]) == (4, 3)
+    assert summary["max_m"] == pytest.approx(0.1)
+    assert error_summary(np.full((2, 4, 4), np.nan), truth[:2])["median_m"] == 0.0
+
+
+def test_the_page_needs_nothing_else_and_escapes_what_it_is_given() -> None:
+    html = page("A <b> title", "lead & more", [("3", "facts")], [Section("One", ["<script>alert(1)</script>"])])
+    assert "<script" not in html
+    assert "A &lt;b&gt; title" in html
+    assert "http://" not in html
+    assert "https://" not in html
+
+
+@pytest.mark.slow
+def test_the_demo_tells_its_story(tmp_path: Path) -> None:
+    from mapvote.evaluation.demo import demo
+
+    evaluation, story = demo(tmp_path / "out", quick=True)
+    assert story.found == story.objects > 0
+    for name in ("report.html", "tables.txt", "results.json", "results.csv", "map_before.pcd", "map_after.pcd"):
+        assert (tmp_path / "out" / name).stat().st_size > 100
+    html = (tmp_path / "out" / "report.html").read_text()
+    assert html.count("data:image/png;base64,") == len(list((tmp_path / "out" / "pictures").glob("*.png")))
+    assert "https://" not in html
+    assert evaluation.result["poses"] == "ndt"
