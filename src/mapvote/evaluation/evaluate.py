@@ -86,9 +86,7 @@ def evaluate(
         "coverage": entries[best]["coverage"],
         "settings": scene.settings.model_dump(mode="json"),
         "map_shift": map_shift(scene),
-        "localisation": {
-            d.vehicle: error_summary(d.T_map_lidar, T_map_world @ scene.true_poses(d.vehicle)) for d in drives
-        },
+        "localisation": localisation(scene, drives),
         "changed_areas": in_changed_areas(scene, truth, drives[0].vehicle, maps),
         "cases": entries,
         "timings": {
@@ -167,3 +165,9 @@ def map_frame(scene: Scene) -> F64:
     names = scene.drive_names("survey_")
     believed = np.concatenate([scene.survey_poses(n) for n in names])
     return rigid_between(believed, np.concatenate([scene.true_poses(n) for n in names]))
+
+
+def localisation(scene: Scene, drives: Sequence[Pass]) -> dict[str, dict[str, float]]:
+    """Each vehicle's pose errors in the map's frame."""
+    T_map_world = map_frame(scene)
+    return {d.vehicle: error_summary(d.T_map_lidar, T_map_world @ scene.true_poses(d.vehicle)) for d in drives}
