@@ -74,6 +74,7 @@ def serve(
     try:
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         listener.bind((host, port))
+        listener.listen(1024)  # from here on nobody is turned away, even before the app has started
     except OSError as error:
         listener.close()
         raise MapvoteError(f"cannot listen on {host}:{port} ({error.strerror}): choose another --port") from error

@@ -1,0 +1,165 @@
+"""How many ballots a second a real server process acknowledges durably, and how long one waits.
+
+    python benchmarks/server_load.py --seconds 20 --connections 24
+    python benchmarks/server_load.py --database postgresql
+
+Every connection is a vehicle of its own that sends one ballot of about 20 kB after another and waits for each answer.
+An answer comes only once the transaction that holds the ballot is on disk (SQLite: WAL, synchronous=FULL; PostgreSQL:
+fsync and synchronous_commit on). Server and senders share this machine; the senders are raw sockets, so that they take
+little of it. Afterwards every acknowledged ballot is looked up in the store.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import itertools
+import json
+import os
+import sys
+import tempfile
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import sqlalchemy as sa
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+
+from hand_made import Say, make_ballot, make_map, make_tile, states_plane, wall
+from live_server import serving
+from mapvote.core.ballot import Ballot, encode
+from mapvote.core.types import CellState, PointMap
+from mapvote.fleet import schema
+from mapvote.fleet.store import Store
+from postgres_cluster import PostgresCluster
+
+TILES = [(0, col) for col in range(8)]
+CELLS = [(r, c) for r in range(10, 40, 3) for c in range(10, 40, 3)]
+
+
+def typical_ballot() -> Ballot:
+    """About 20 kB: eight tiles of states with noisy borders and a few hundred new points, as after a 500 m drive."""
+    rng = np.random.default_rng(1)
+    point_map = first_map()
+    says = {}
+    for tile in TILES:
+        states = states_plane(fill=CellState.UNCHANGED_EMPTY)
+        ragged = rng.random(states.shape) < 0.023
+        states[ragged] = rng.integers(0, 5, int(ragged.sum()))
+        cells = [(int(r), int(c)) for r, c in rng.integers(0, 256, (20, 2))]
+        says[tile] = Say(states, new_points=wall(cells, [0.45, 0.75]))
+    return make_ballot(point_map, says, "vehicle", "drive", end_ns=time.time_ns())
+
+
+def first_map() -> PointMap:
+    """Eight tiles with a hundred pillars each."""
+    tile = make_tile(np.concatenate([wall(CELLS, [0.05]), wall(CELLS, [0.45, 0.75, 1.05])]))
+    return make_map(dict.fromkeys(TILES, tile))
+
+
+@dataclass
+class Load:
+    """What the senders saw."""
+
+    waits_s: list[float] = field(default_factory=list)
+    acknowledged: set[tuple[str, str]] = field(default_factory=set)
+    refused: list[str] = field(default_factory=list)
+
+
+async def send(address: tuple[str, int], ballot: Ballot, prefix: str, stop_s: float, load: Load) -> None:
+    """One connection, one vehicle, one drive after another until ``stop_s``."""
+    reader, writer = await asyncio.open_connection(*address)
+    for turn in itertools.count():
+        if time.perf_counter() > stop_s:
+            break
+        drive = f"{prefix}{turn}"
+        body = encode(msgspec.structs.replace(ballot, drive=drive))
+        head = f"PUT /v1/ballots/{ballot.vehicle}/{drive} HTTP/1.1\r\nHost: x\r\nContent-Length: {len(body)}\r\n\r\n"
+        start = time.perf_counter()
+        writer.write(head.encode() + body)
+        header = (await reader.readuntil(b"\r\n\r\n")).decode().lower()
+        answer = await reader.readexactly(int(header.split("content-length:")[1].split("\r\n")[0]))
+        if header.startswith("http/1.1 201"):
+            load.waits_s.append(time.perf_counter() - start)
+            load.acknowledged.add((ballot.vehicle, drive))
+        else:
+            load.refused.append(f"{header.splitlines()[0]} {answer.decode()}")
+    writer.close()
+
+
+async def send_all(url: str, ballot: Ballot, connections: int, seconds: float, prefix: str) -> Load:
+    """All senders at once for so long."""
+    host, port = url.removeprefix("http://").split(":")
+    load, stop_s = Load(), time.perf_counter() + seconds
+    vehicles = [msgspec.structs.replace(ballot, vehicle=f"v{i}") for i in range(connections)]
+    await asyncio.gather(*(send((host, int(port)), vehicle, prefix, stop_s, load) for vehicle in vehicles))
+    return load
+
+
+def cpu_seconds(pid: int) -> float:
+    """Processor time that a process has used so far."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+def measure(store_name: str, database_url: str, connections: int, seconds: float, folder: Path) -> dict[str, Any]:
+    """Start a server on a new store, load it, look up what it acknowledged; SystemExit if anything is missing."""
+    Store.create(database_url, first_map()).close()
+    config = folder / "server.toml"
+    config.write_text("[server]\nballots_per_minute = 1e9\nburst = 1000000\n")
+    ballot = typical_ballot()
+    with serving(store_name, "--config", config, log=folder / "log") as (url, server):
+        asyncio.run(send_all(url, ballot, connections, 2.0, "warm"))
+        start, cpu_s = time.perf_counter(), cpu_seconds(server.pid)
+        load = asyncio.run(send_all(url, ballot, connections, seconds, "d"))
+        took, cpu_s = time.perf_counter() - start, cpu_seconds(server.pid) - cpu_s
+    if load.refused:
+        raise SystemExit(f"{len(load.refused)} ballots refused, for example: {load.refused[0]}")
+    store = Store.open(database_url)
+    with store.database.reading() as connection:
+        b = schema.ballots.c
+        there = {(row.vehicle, row.drive) for row in connection.execute(sa.select(b.vehicle, b.drive))}
+    store.close()
+    if not load.acknowledged <= there:
+        raise SystemExit(f"{len(load.acknowledged - there)} acknowledged ballots are not in the store")
+    p50, p99 = np.percentile(load.waits_s, [50, 99])
+    return {
+        "ballots_per_s": round(len(load.waits_s) / took),
+        "p50_ms": round(1e3 * p50, 1),
+        "p99_ms": round(1e3 * p99, 1),
+        "max_ms": round(1e3 * max(load.waits_s), 1),
+        "server_cpu_ms_per_ballot": round(1e3 * cpu_s / len(load.waits_s), 2),
+        "ballots": len(load.waits_s),
+        "ballot_bytes": len(encode(ballot)),
+        "connections": connections,
+        "cores": len(os.sched_getaffinity(0)),
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seconds", type=float, default=15.0)
+    parser.add_argument("--connections", type=int, default=24)
+    parser.add_argument("--database", choices=("sqlite", "postgresql"), default="sqlite")
+    options = parser.parse_args()
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        if options.database == "sqlite":
+            store = str(folder / "store.db")
+            found = measure(store, f"sqlite:///{store}", options.connections, options.seconds, folder)
+        else:
+            cluster = PostgresCluster()
+            try:
+                url = cluster.create("load")
+                found = measure(url, url, options.connections, options.seconds, folder)
+            finally:
+                cluster.close()
+    print(json.dumps({"database": options.database} | found))
+
+
+if __name__ == "__main__":
+    main()
