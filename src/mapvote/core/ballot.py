@@ -79,7 +79,7 @@ def tile_key(tile: TileIndex) -> str:
 def unpack_states(data: bytes) -> U8:
     """(256, 256) uint8; MapvoteError if damaged or not a CellState."""
     states = unpack_plane(data, "<u1", (TILE_CELLS, TILE_CELLS), "ballot: states")
-    if np.any((states >= N_STATES) & (states != NO_VOTE)):
+    if (states - np.uint8(N_STATES)).min() < NO_VOTE - N_STATES:  # wraps: 0 ... 4 and 255 come out highest
         raise MapvoteError("ballot: states holds a value that is no cell state")
     return states
 
@@ -101,8 +101,10 @@ def unpack_points(data: bytes) -> F32:
         raise MapvoteError(f"ballot: new_points has {len(raw)} bytes, not a multiple of 12")
     points = np.frombuffer(raw, dtype="<f4").reshape(-1, 3)
     side = np.float32(TILE_CELLS * 0.3)
-    inside = np.isfinite(points).all() and (points[:, :2] >= 0).all() and (points[:, :2] < side).all()
-    if not inside or (np.abs(points[:, 2]) > 1e5).any():
+    if not len(points):
+        return points
+    low, high = points.min(axis=0), points.max(axis=0)  # NaN comes through, and no comparison with it holds
+    if not (low[0] >= 0 and low[1] >= 0 and high[0] < side and high[1] < side and low[2] >= -1e5 and high[2] <= 1e5):
         raise MapvoteError("ballot: new_points holds a point outside its tile or not finite")
     return points
 

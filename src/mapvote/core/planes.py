@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -37,7 +38,7 @@ def unpack_plane(data: bytes, dtype: str, shape: tuple[int, ...], what: str) -> 
 
     ``what`` names the plane in messages, e.g. "ballot: states".
     """
-    size = int(np.prod(shape)) * np.dtype(dtype).itemsize
+    size = math.prod(shape) * np.dtype(dtype).itemsize
     raw = unpack_bytes(data, size, what)
     if len(raw) != size:
         raise MapvoteError(f"{what} has {len(raw)} bytes, expected {size}")
