@@ -133,6 +133,16 @@ def test_many_nan_points_are_refused(tmp_path: Path) -> None:
         list(open_drive(tmp_path / "d"))
 
 
+def test_the_likely_cause_is_named_only_where_it_is_likely(tmp_path: Path) -> None:
+    spoil(make(tmp_path / "d") / "velodyne" / "000001.bin", 0.06)
+    with pytest.raises(MapvoteError, match=r"24 of 400 .* damaged, or not float32"):
+        list(open_drive(tmp_path / "d"))
+    rows = np.fromfile(tmp_path / "d" / "velodyne" / "000002.bin", dtype="<f4").reshape(-1, 4)
+    (rows * [1000, 1000, 1000, 1]).astype("<f4").tofile(tmp_path / "d" / "velodyne" / "000002.bin")
+    with pytest.raises(MapvoteError, match="look like millimetres"):
+        open_drive(tmp_path / "d").read_scan(2)
+
+
 def test_unsorted_times_are_named(tmp_path: Path) -> None:
     (make(tmp_path / "d") / "times.txt").write_text("0.0\n0.1\n0.3\n0.2\n0.4\n0.5\n")
     with pytest.raises(MapvoteError, match=r"scan 3 .* does not come after scan 2"):

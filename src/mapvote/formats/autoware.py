@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from mapvote.core.types import F64, MapvoteError
 from mapvote.formats.cloud import Cloud, warn_of_float32
 from mapvote.formats.pcd import read_pcd, save_pcd
+from mapvote.formats.text import read_text
 from mapvote.formats.whole import whole_folder
 
 METADATA = "pointcloud_map_metadata.yaml"
@@ -59,7 +60,7 @@ def read_autoware(path: Path) -> Cloud:
         clouds.append(cloud.points)
         dropped.update(cloud.dropped)
     projector = path / PROJECTOR
-    georeference = {PROJECTOR: projector.read_text()} if projector.is_file() else {}
+    georeference = {PROJECTOR: read_text(projector)} if projector.is_file() else {}
     return Cloud(np.concatenate(clouds), tuple(sorted(dropped)), georeference)
 
 
@@ -89,8 +90,8 @@ def write_autoware(path: Path, points: F64, *, side_m: int = SIDE_M, projector: 
 
 def _read_yaml(file: Path) -> dict[Any, Any]:
     try:
-        table = yaml.safe_load(file.read_text())
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        table = yaml.safe_load(read_text(file))
+    except (yaml.YAMLError, ValueError) as error:
         raise MapvoteError(f"{file}: cannot be read ({error})") from error
     if not isinstance(table, dict):
         raise MapvoteError(f"{file}: not Autoware's metadata; {CONTENT}")

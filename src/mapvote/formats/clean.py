@@ -87,7 +87,7 @@ def clean_scan(
 def _likely_cause(distance: NDArray[np.float64]) -> str:
     finite = distance[np.isfinite(distance)]
     farthest = float(np.quantile(finite, 0.99)) if len(finite) else 0.0
-    if len(finite) > 0.9 * len(distance) and farthest < 300_000.0:
+    if len(finite) > 0.9 * len(distance) and FAR_M < farthest < 300_000.0:
         unit, factor = ("millimetres", 1000) if farthest > 15_000.0 else ("centimetres", 100)
         return f"they look like {unit} (the farthest {farthest:.0f}); divide x, y, z by {factor}"
     return "the file is damaged, or not float32 x, y, z, intensity"

@@ -16,6 +16,7 @@ from mapvote.config import did_you_mean
 from mapvote.core import geometry
 from mapvote.core.sensors import SENSORS, Sensor
 from mapvote.core.types import F64, I64, Drive, MapvoteError, Scan
+from mapvote.formats.text import read_text
 
 ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 
@@ -60,8 +61,8 @@ def read_drive_file(folder: Path) -> DriveFile:
     if not file.is_file():
         return DriveFile()
     try:
-        table = tomllib.loads(file.read_text())
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        table = tomllib.loads(read_text(file))
+    except tomllib.TOMLDecodeError as error:
         raise MapvoteError(f"{file}: not valid TOML ({error})") from error
     for key in table:
         if key not in DriveFile.__struct_fields__:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,8 @@ from mapvote.formats.whole import whole_file
 
 STEP_M = 0.0001
 """Coordinates are whole multiples of this from the file's offset: exact to 0.05 mm over 400 km."""
+MAX_POINTS_PER_BYTE = 16
+"""Real LAZ files need a byte or more for a point."""
 _CHUNK = 1_000_000
 
 
@@ -24,6 +27,7 @@ def is_las(path: Path) -> bool:
 def read_las(path: Path) -> Cloud:
     """The points of a LAS or LAZ file as float64, and its coordinate system as WKT where it has one."""
     laspy = require("laspy", "las", str(path))
+    _check_counts(path)
     try:
         with laspy.open(path) as file:
             points = np.empty((file.header.point_count, 3))
@@ -41,6 +45,29 @@ def read_las(path: Path) -> Cloud:
         raise MapvoteError(f"{path}: cut off: {done} points, but its header says {len(points)}; copy it again")
     others = other_fields(tuple(n.lower() for n in names))
     return Cloud(points, others, {"wkt": wkt[0]} if wkt else {})
+
+
+def _check_counts(path: Path) -> None:
+    """MapvoteError if the header counts more than the file has room for: laspy would believe it and hang.
+
+    Offsets of the LAS 1.4 specification: 25 minor version, 96 start of the points, 100 VLRs, 107 points (to 1.3),
+    243 EVLRs and 247 points (1.4).
+    """
+    try:
+        size = path.stat().st_size
+        with path.open("rb") as stream:
+            header = stream.read(255).ljust(255, b"\0")
+    except OSError as error:
+        raise MapvoteError(f"{path}: cannot be read ({error.strerror or error})") from error
+    start, vlrs = struct.unpack_from("<II", header, 96)
+    evlrs, points = (
+        struct.unpack_from("<IQ", header, 243) if header[25] >= 4 else (0, struct.unpack_from("<I", header, 107)[0])
+    )
+    room = max(size - start, 0) * MAX_POINTS_PER_BYTE
+    if header[:4] != b"LASF" or start > size or vlrs * 54 > size or evlrs * 60 > size or points > room:
+        raise MapvoteError(
+            f"{path}: not a whole LAS or LAZ file (its header promises more than it holds); copy it again"
+        )
 
 
 def write_las(path: Path, points: NDArray[np.floating], *, wkt: str | None = None) -> None:

@@ -88,7 +88,7 @@ def read_manifest(path: Path) -> Manifest:
     file = path / MANIFEST
     try:
         manifest = msgspec.json.decode(file.read_bytes(), type=Manifest)
-    except (OSError, msgspec.DecodeError) as error:
+    except (OSError, msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise MapvoteError(f"{file}: not a readable map manifest ({error}); copy the map again") from error
     if manifest.format != FORMAT or not 1 <= manifest.format_version <= FORMAT_VERSION:
         raise MapvoteError(

@@ -12,6 +12,7 @@ import numpy as np
 from mapvote.core.types import F64, I64, MapvoteError
 from mapvote.formats.clean import stamps_from_rate
 from mapvote.formats.drive import DriveFile, DriveOptions
+from mapvote.formats.text import read_text
 
 _LATEST_NS = 230 * 366 * 86_400 * 10**9
 
@@ -51,7 +52,7 @@ def lines_of_scans(n_lines: int, files: list[Path], table: Path) -> I64:
 def read_times_ns(file: Path) -> I64:
     """(n,) nanoseconds from a file of seconds, or of KITTI's date and time, one a line; exact to the last digit."""
     out = []
-    for number, line in enumerate(file.read_text().splitlines(), 1):
+    for number, line in enumerate(read_text(file).splitlines(), 1):
         text = line.strip()
         if not text:
             continue
@@ -65,7 +66,7 @@ def read_times_ns(file: Path) -> I64:
         except (InvalidOperation, ValueError, OverflowError) as error:
             raise MapvoteError(f"{file}:{number}: not a time in seconds: {text!r}") from error
     if any(abs(ns) > _LATEST_NS for ns in out):
-        raise MapvoteError(f"{file}: times after the year 2200: they are not seconds (nanoseconds?); convert them")
+        raise MapvoteError(f"{file}: times after the year 2200: they are milli-, micro- or nanoseconds? Write seconds")
     return np.array(out, dtype=np.int64)
 
 

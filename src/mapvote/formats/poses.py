@@ -8,16 +8,14 @@ import numpy as np
 
 from mapvote.core import geometry
 from mapvote.core.types import F64, MapvoteError
+from mapvote.formats.text import read_text
 
 EARTH_RADIUS_M = 6378137.0
 
 
 def read_numbers(file: Path, columns: int) -> F64:
     """(n, columns) float64 of a text file of numbers; MapvoteError names the line that is not one."""
-    try:
-        lines = file.read_text().splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise MapvoteError(f"{file}: cannot be read ({error})") from error
+    lines = read_text(file).splitlines()
     rows = [(number, line.replace(",", " ").split()) for number, line in enumerate(lines, 1) if line.strip()]
     out = np.empty((len(rows), columns))
     for i, (number, words) in enumerate(rows):
@@ -30,7 +28,7 @@ def read_numbers(file: Path, columns: int) -> F64:
 
 def read_poses(file: Path) -> F64:
     """(n, 4, 4) from rows of 12 numbers (3 x 4) or 16 (4 x 4), as they stand in the file. MapvoteError if not rigid."""
-    first = next((line for line in file.read_text().splitlines() if line.strip()), "") if file.is_file() else ""
+    first = next((line for line in read_text(file).splitlines() if line.strip()), "")
     columns = 16 if len(first.replace(",", " ").split()) == 16 else 12
     rows = read_numbers(file, columns)
     T = np.tile(np.eye(4), (len(rows), 1, 1))
@@ -58,7 +56,7 @@ def check_rigid(T: F64, where: str) -> None:
 def read_calib(file: Path) -> dict[str, F64]:
     """The lines "name: numbers" of a KITTI calibration file; names without numbers are left out."""
     out = {}
-    for line in file.read_text().splitlines():
+    for line in read_text(file).splitlines():
         name, colon, numbers = line.partition(":")
         try:
             out[name.strip()] = np.array([float(word) for word in numbers.split()])
