@@ -161,7 +161,7 @@ def create_app(
     guard = Guard(store, need_keys)
     app.include_router(router)
     app.add_exception_handler(MapvoteError, _refuse)
-
+    app.add_exception_handler(400, _unreadable)
     app.add_middleware(Watch, guard=guard, metrics=metrics)
     return app
 
@@ -178,6 +178,11 @@ def _refuse(request: Request, error: Exception) -> Response:
     if status == 401:
         headers["WWW-Authenticate"] = 'Bearer, Basic realm="mapvote", charset="UTF-8"'
     return JSONResponse(content, status, headers)
+
+
+def _unreadable(request: Request, error: Exception) -> Response:
+    """A body that is no JSON at all, not even text: FastAPI answers 400, but everything unusable is 422 here."""
+    return _refuse(request, MapvoteError("the body is no JSON in UTF-8"))
 
 
 def _secret_of(authorization: str | None) -> str | None:
