@@ -47,12 +47,12 @@ class Camera:
         return pixels, depth
 
 
-def shades(points: F64, ground_z: float) -> F32:
-    """(n, 3) grey-blue by height: pale ground, darker walls."""
-    share = np.clip((points[:, 2:] - ground_z - 0.2) / 9.0, 0.0, 1.0)
+def shades(height: F64) -> F32:
+    """(n, 3) grey-blue by height above ground (n,), metres: pale ground, darker walls."""
+    share = np.clip((height[:, None] - 0.2) / 9.0, 0.0, 1.0)
     low, high = np.array(to_rgb("#a9b8c4")), np.array(to_rgb("#33506a"))
     colours = low + (high - low) * share
-    colours[points[:, 2] < ground_z + 0.3] = to_rgb("#d3dade")
+    colours[height < 0.3] = to_rgb("#d3dade")
     return colours.astype(np.float32)
 
 

@@ -62,6 +62,8 @@ def evaluate(
             "bytes_per_vehicle": [drive.sizes[case.name] for drive in drives],
             "state_bytes_per_vehicle": [_state_bytes(ballot) for ballot in ballots],
         }
+    if progress:
+        progress("scoring", len(cases), len(cases))
     T_map_world = map_frame(scene)
     maps = {
         "old map": (first_map, T_map_world),

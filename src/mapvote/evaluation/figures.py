@@ -25,14 +25,13 @@ def _extent(grid: Grid) -> tuple[float, float, float, float]:
     return grid.x0, grid.x0 + grid.cols * CELL_SIZE, grid.y0, grid.y0 + grid.rows * CELL_SIZE
 
 
-def _from_above(points: F64, grid: Grid) -> np.ndarray:
+def _from_above(points: F64, height: F64, grid: Grid) -> np.ndarray:
     """(rows, cols, 3): highest point of each cell as a shade; white where there is none."""
     rows, cols, inside = grid.indices_of(points)
     top = np.full(grid.shape, -np.inf)
-    np.maximum.at(top, (rows[inside], cols[inside]), points[inside, 2])
+    np.maximum.at(top, (rows[inside], cols[inside]), height[inside])
     known = np.isfinite(top)
-    base = np.percentile(top[known], 20) if known.any() else 0.0
-    share = np.clip((top - base) / 10.0, 0.0, 1.0)[..., None]
+    share = np.clip(top / 10.0, 0.0, 1.0)[..., None]
     share[~known] = 0.0
     low, high = np.array([0.83, 0.86, 0.89]), np.array([0.16, 0.25, 0.34])
     image = low + (high - low) * np.sqrt(share)
@@ -69,8 +68,8 @@ def _stack(grid: Grid, panels: int, width: float = 13.0) -> tuple[Figure, Any]:
 
 
 def street(
-    old_points: F64,
-    updated_points: F64,
+    old: tuple[F64, F64],
+    updated: tuple[F64, F64],
     added: F64,
     deleted: F64,
     grid: Grid,
@@ -81,15 +80,15 @@ def street(
 ) -> Figure:
     """The street from above (Figure 6): the old map with what was deleted, the new one with what was added.
 
-    Points (n, 3) map metres; ``areas`` (name, corner-to-corner (2, 2) box); ``paths`` of vehicles (name, (m, 3)).
+    ``old`` and ``updated``: points (n, 3), map metres, and their heights above ground (n,); ``areas`` (name, corner-to-corner (2, 2) box); ``paths`` of vehicles (name, (m, 3)).
     """
     figure, axes = _stack(grid, 2)
     axes = axes.ravel()
-    for axis, points, marked, colour, title in (
-        (axes[0], old_points, deleted, style.GONE, "(a) First map, deleted points in blue"),
-        (axes[1], updated_points, added, style.NEW, "(b) Updated map, added points in red"),
+    for axis, (points, height), marked, colour, title in (
+        (axes[0], old, deleted, style.GONE, "(a) First map, deleted points in blue"),
+        (axes[1], updated, added, style.NEW, "(b) Updated map, added points in red"),
     ):
-        image = _from_above(points, grid)
+        image = _from_above(points, height, grid)
         rows, cols, inside = grid.indices_of(marked)
         cells = np.zeros(grid.shape, dtype=np.bool_)
         cells[rows[inside], cols[inside]] = True

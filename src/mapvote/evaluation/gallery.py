@@ -12,11 +12,12 @@ from matplotlib.figure import Figure
 from mapvote.core.geometry import transform
 from mapvote.core.grid import window_around
 from mapvote.core.tiling import all_points
-from mapvote.core.types import F32, F64, U8, CellState
+from mapvote.core.types import F32, F64, U8, Bool, CellState, PointMap
 from mapvote.evaluation import birdseye, figures, style
 from mapvote.evaluation.cases import YARDSTICKS, ballot_states, paper_cases
 from mapvote.evaluation.evaluate import Evaluation
 from mapvote.evaluation.metrics import UNSCORED, same_rows
+from mapvote.evaluation.nearest import heights
 from mapvote.evaluation.report import case_name
 from mapvote.evaluation.truth import lay_on
 from mapvote.simulation.scenario import load_scenario
@@ -60,12 +61,17 @@ def gallery(evaluation: Evaluation, case: str, folder: Path) -> list[tuple[Path,
     areas = areas_of(evaluation)
     outlines = [(o["kind"], np.asarray(o["footprint"])) for o in evaluation.truth.objects]
     boxes = [(area.name, area.box) for area in areas]
-    street = figures.street(old, new, added, deleted, evaluation.window, outlines=outlines, areas=boxes, paths=paths)
+    street = figures.street(
+        (old, heights(evaluation.first_map, old)), (new, heights(evaluation.first_map, new)), added, deleted,
+        evaluation.window, outlines=outlines, areas=boxes, paths=paths,
+    )  # fmt: skip
     pictures = [("street", street, f"The street from above before and after the vote ({case_name(case)}): Figure 6.")]
     for area in areas:
         verb, figure = ("added in red", 7) if area.kind == "built" else ("deleted in blue", 8)
         caption = f"{area.name.capitalize()} in bird's-eye view, points {verb}: Figure {figure}."
-        pictures.append((area.name.replace(" ", "_"), _area(area, old, survived, new, added, paths), caption))
+        pictures.append(
+            (area.name.replace(" ", "_"), _area(evaluation.first_map, area, old, survived, added, paths), caption)
+        )
     nearest = _scan_near(evaluation, areas)
     v = evaluation.scene.settings.voting
     decided = {n: evaluation.outcomes[n].states for n in ("1", "5", "columns") if n in evaluation.outcomes}
@@ -114,7 +120,9 @@ def _paths(evaluation: Evaluation) -> list[tuple[str, F64]]:
     return out
 
 
-def _area(area: Area, old: F64, survived: np.ndarray, new: F64, added: F64, paths: list[tuple[str, F64]]) -> Figure:
+def _area(
+    first_map: PointMap, area: Area, old: F64, survived: Bool, added: F64, paths: list[tuple[str, F64]]
+) -> Figure:
     """Before and after, from across the road; what stands on the near side of it is left out of the way."""
     road_y = float(np.mean(np.concatenate([path[:, 1] for _, path in paths])))
     middle = area.box.mean(axis=0)
@@ -123,17 +131,17 @@ def _area(area: Area, old: F64, survived: np.ndarray, new: F64, added: F64, path
     low[1], high[1] = (road_y - 9.0, high[1]) if north else (low[1], road_y + 9.0)
     ground_z = float(np.median(np.concatenate([path[:, 2] for _, path in paths])))
 
-    def inside(points: F64) -> np.ndarray:
+    def inside(points: F64) -> Bool:
         return ((points[:, :2] > low) & (points[:, :2] < high)).all(axis=1)
 
-    def coloured(points: F64, marked: np.ndarray, colour: str) -> tuple[F64, F32]:
+    def coloured(points: F64, marked: Bool, colour: str) -> tuple[F64, F32]:
         here = inside(points)
-        colours = birdseye.shades(points[here], ground_z)
+        colours = birdseye.shades(heights(first_map, points[here]))
         colours[marked[here]] = to_rgb(colour)
         return points[here], colours
 
-    fresh = np.concatenate([np.zeros(len(new) - len(added), np.bool_), np.ones(len(added), np.bool_)])
     kept_first = np.concatenate([old[survived], added])
+    fresh = np.arange(len(kept_first)) >= int(survived.sum())
     width = float(area.box[1, 0] - area.box[0, 0])
     target = float(middle[0]), float(0.6 * middle[1] + 0.4 * road_y), ground_z + 2.0
     camera = birdseye.Camera(target, 30.0 + 0.85 * width, -72.0 if north else 72.0, 34.0)
@@ -161,7 +169,7 @@ def _scan(evaluation: Evaluation, index: int) -> Figure:
     scan, moving = drive.read_scan(index), evaluation.truth.moving(evaluation.drives[0].vehicle, index)
     points = transform(T_map_lidar, scan.points)
     ground_z = float(T_map_lidar[2, 3] - drive.T_base_lidar[2, 3])
-    colours = birdseye.shades(points, ground_z)
+    colours = birdseye.shades(heights(evaluation.first_map, points))
     if len(moving) == len(points):
         colours[moving] = to_rgb(MOVER)
     near = np.linalg.norm(points[:, :2] - T_map_lidar[:2, 3], axis=1) < 45.0

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
-from mapvote.core.columns import GROUND_MARGIN_M, map_points
+from mapvote.core.columns import GROUND_MARGIN_M, map_points, reference_window
 from mapvote.core.grid import CELL_SIZE, Grid, tile_grid
 from mapvote.core.points import voxel_downsample
 from mapvote.core.types import F64, NO_VOTE, U8, Bool, CellState, PointMap
@@ -28,6 +28,17 @@ def map_obstacles(point_map: PointMap) -> F64:
         ground = content.ground_z[rows.clip(0, window.rows - 1), cols.clip(0, window.cols - 1)]
         clouds.append(points[inside & (points[:, 2] - ground >= GROUND_MARGIN_M)])
     return np.concatenate(clouds) if clouds else np.zeros((0, 3))
+
+
+def heights(point_map: PointMap, points: F64) -> F64:
+    """(n,) metres above the map's ground of points (n, 3); above the nearest known ground where it is unknown."""
+    lattice = point_map.lattice
+    rows, cols = lattice.cells_of(points) if len(points) else (np.zeros(1, np.int64), np.zeros(1, np.int64))
+    row, col = int(rows.min()), int(cols.min())
+    window = Grid(lattice, row, col, int(rows.max()) - row + 1, int(cols.max()) - col + 1)
+    reference = reference_window(point_map, window)
+    filled = np.where(np.isnan(reference.ground_z), (reference.base + 0.5) * CELL_SIZE, reference.ground_z)
+    return points[:, 2] - filled[rows - row, cols - col] if len(points) else np.zeros(0)
 
 
 class NearestNeighbour:
