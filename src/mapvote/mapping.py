@@ -103,9 +103,7 @@ class _Surveyor:
     def follow(self, drive: Drive, count: Callable[[], None]) -> tuple[F64, Bool]:
         """(poses (n, 4, 4), registered (n,)) of one drive, each scan entered once it is registered."""
         tracker = Tracker(self._map_around, self.ndt)
-        if drive.T_map_lidar_prior is not None and len(drive) > 1:
-            seconds = 1e-9 * float(drive.stamps_ns[1] - drive.stamps_ns[0])
-            tracker.twist = twist_between(drive.T_map_lidar_prior[0], drive.T_map_lidar_prior[1], seconds)
+        tracker.twist = _first_motion(drive, self.mapping)
         poses, registered = [], []
         for i, scan in enumerate(drive):
             prior = _prior(drive, i)
@@ -186,6 +184,16 @@ def settle(drives: Sequence[Drive], poses: list[F64], registered: list[Bool], se
 
 def _apart(stamps_ns: I64, i: int, j: int, settings: MappingSettings) -> bool:
     return bool(abs(int(stamps_ns[j]) - int(stamps_ns[i])) > 1e9 * settings.revisit_s)
+
+
+def _first_motion(drive: Drive, settings: MappingSettings) -> F64:
+    """(6,) motion per second of the first scan by the prior: to the next scan, or over a second if it is coarse."""
+    if drive.T_map_lidar_prior is None or len(drive) < 2:
+        return np.zeros(6)
+    seconds = 1e-9 * (drive.stamps_ns - drive.stamps_ns[0]).astype(np.float64)
+    k = 1 if _is_precise(drive, settings) else max(1, int(np.searchsorted(seconds, 1.0)))
+    k = min(k, len(drive) - 1)
+    return twist_between(drive.T_map_lidar_prior[0], drive.T_map_lidar_prior[k], float(seconds[k]))
 
 
 def _prior(drive: Drive, i: int) -> PosePrior | None:

@@ -10,28 +10,10 @@ from mapvote.core.geometry import exp, from_xyz_rpy, inverse, rotation_angle, tr
 from mapvote.core.types import F64, Scan
 from mapvote.perception.deskew import deskew, twist_between
 from mapvote.perception.ndt import NdtMap, PosePrior, build_ndt, register
+from streets import street, surface
 
 SETTINGS = NdtSettings()
 T_TRUE = from_xyz_rpy(3.0, -1.0, 1.8, 0.01, -0.015, 0.3)
-
-
-def surface(rng: np.random.Generator, n: int, low: tuple[float, ...], high: tuple[float, ...]) -> F64:
-    """Points on an axis-parallel rectangle (one coordinate the same in both corners), with 2 cm noise."""
-    return np.asarray(rng.uniform(low, high, (n, 3)) + rng.normal(0, 0.02, (n, 3)))
-
-
-def street(seed: int, density: float = 1.0) -> F64:
-    """A road between two house fronts with gaps and side walls, poles along the kerbs."""
-    rng = np.random.default_rng(seed)
-    pieces = [surface(rng, int(12_000 * density), (-45, -12, 0), (45, 12, 0))]
-    for x in (-40, -22, -3, 17):
-        for y in (-12, 12):
-            pieces.append(surface(rng, int(1500 * density), (x, y, 0), (x + 14, y, 8)))
-            pieces.append(surface(rng, int(400 * density), (x, min(y, 1.5 * y), 0), (x, max(y, 1.5 * y), 8)))
-    for x in range(-40, 45, 13):
-        pole = rng.uniform((0, 0, 0), (2 * np.pi, 1, 6), (int(120 * density), 3))
-        pieces.append(np.column_stack([x + 0.15 * np.cos(pole[:, 0]), 7 + 0.15 * np.sin(pole[:, 0]), pole[:, 2]]))
-    return np.concatenate(pieces)
 
 
 @pytest.fixture(scope="module")

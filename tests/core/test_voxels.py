@@ -1,0 +1,46 @@
+"""The growing cloud is plain bookkeeping: means and counts per voxel, whatever the order of growth."""
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from mapvote.core.grid import CELL_SIZE, Lattice
+from mapvote.core.points import voxel_downsample, voxel_keys
+from mapvote.core.voxels import VoxelCloud
+
+
+@settings(max_examples=15, deadline=None)
+@given(st.integers(0, 2**31), st.floats(0.5, 40), st.sampled_from([0.0, 5e5]))
+def test_every_voxel_holds_the_mean_of_its_points_and_counts_its_scans(seed: int, spread: float, offset: float) -> None:
+    rng = np.random.default_rng(seed)
+    lattice = Lattice(offset + 0.3, offset - 0.6)
+    scans = [rng.normal((offset, offset, 0.0), spread, (500, 3)) for _ in range(4)]
+    cloud = VoxelCloud(lattice)
+    for scan in scans:
+        cloud.add(scan)
+    points, met = cloud.points()
+    keys = voxel_keys(np.concatenate(scans), lattice.x0, lattice.y0)
+    unique, inverse = np.unique(keys, return_inverse=True)
+    sums = np.zeros((len(unique), 3))
+    np.add.at(sums, inverse, np.concatenate(scans))
+    np.testing.assert_allclose(points, sums / np.bincount(inverse)[:, None], atol=1e-6)
+    expected = sum(np.isin(unique, voxel_keys(scan, lattice.x0, lattice.y0)).astype(int) for scan in scans)
+    np.testing.assert_array_equal(met, expected)
+
+
+def test_skipped_points_leave_no_trace() -> None:
+    rng = np.random.default_rng(1)
+    points = rng.uniform(-5, 5, (1000, 3))
+    skip = points[:, 0] > 0
+    some, half = VoxelCloud(Lattice()), VoxelCloud(Lattice())
+    some.add(points, skip)
+    half.add(points[~skip])
+    np.testing.assert_array_equal(some.points()[0], half.points()[0])
+
+
+def test_it_grows_past_its_first_table() -> None:
+    rng = np.random.default_rng(2)
+    points = rng.uniform(-60, 60, (100_000, 3))
+    cloud = VoxelCloud(Lattice())
+    cloud.add(points)
+    assert len(cloud) == len(voxel_downsample(points, CELL_SIZE))
