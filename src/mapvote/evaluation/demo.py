@@ -9,9 +9,11 @@ import numpy as np
 
 from mapvote.config import Settings
 from mapvote.core.tiling import all_points
+from mapvote.core.types import MapvoteError
 from mapvote.evaluation.cases import choose_cases
 from mapvote.evaluation.evaluate import Evaluation, evaluate
 from mapvote.evaluation.gallery import Area, areas_of, gallery
+from mapvote.evaluation.loopback import Round, vote_by_http
 from mapvote.evaluation.metrics import same_rows
 from mapvote.evaluation.page import Section, page
 from mapvote.evaluation.report import as_csv, as_json, as_text, case_name, tables, write_text
@@ -38,6 +40,10 @@ class Story:
     found: int
     objects: int
     false_objects: int
+    version: int
+    """Of the map that the server published."""
+    held: str
+    """What the server wanted an operator to look at first."""
 
 
 def demo(out: Path, quick: bool = False, progress: Progress | None = None) -> tuple[Evaluation, Story]:
@@ -49,25 +55,34 @@ def demo(out: Path, quick: bool = False, progress: Progress | None = None) -> tu
     scene = Scene(QUICK_SCENARIO if quick else SCENARIO, SEED, settings, out / "work")
     cases, _ = choose_cases(settings, f"1,2,3,4,5,{CASE}")
     evaluation = evaluate(scene, cases, progress=progress)
+    write_map(evaluation.first_map, out / "map_before")
     if progress:
+        progress("a server's round", 0, 1)
+    done = vote_by_http(
+        [drive.ballots[CASE] for drive in evaluation.drives], out / "map_before", out / "work" / "server"
+    )
+    updated = done.updated
+    if not np.array_equal(all_points(updated), all_points(evaluation.outcomes[CASE].updated)):
+        raise MapvoteError("the server's map is not the one that the offline rule makes; please report this bug")
+    if progress:
+        progress("a server's round", 1, 1)
         progress("drawing", 0, 1)
-    updated = evaluation.outcomes[CASE].updated
     for name, point_map in (("map_before", evaluation.first_map), ("map_after", updated)):
-        write_map(point_map, out / name)
         with whole_file(out / f"{name}.pcd") as partial:
             write_pcd(partial, all_points(point_map))
     pictures = gallery(evaluation, CASE, out / "pictures")
     write_text(as_text(evaluation.result), out / "tables.txt")
     write_text(as_json(evaluation.result), out / "results.json")
     write_text(as_csv(evaluation.result), out / "results.csv")
-    story = tell(evaluation)
+    write_map(updated, out / "map_after")
+    story = tell(evaluation, done)
     write_text(report_page(evaluation, story, pictures, out), out / "report.html")
     if progress:
         progress("drawing", 1, 1)
     return evaluation, story
 
 
-def tell(evaluation: Evaluation) -> Story:
+def tell(evaluation: Evaluation, done: Round) -> Story:
     """Count what the vote changed, area by area."""
     old, new = all_points(evaluation.first_map), all_points(evaluation.outcomes[CASE].updated)
     survived, added = same_rows(old, new)
@@ -79,7 +94,14 @@ def tell(evaluation: Evaluation) -> Story:
     areas = [(area, inside(deleted, area), inside(added, area)) for area in areas_of(evaluation)]
     objects = evaluation.result["cases"][CASE]["objects"]
     return Story(
-        len(deleted), len(added), areas, sum(objects["found"]), len(objects["found"]), len(objects["false_m2"])
+        len(deleted),
+        len(added),
+        areas,
+        sum(objects["found"]),
+        len(objects["found"]),
+        len(objects["false_m2"]),
+        done.version,
+        done.held,
     )
 
 
@@ -98,6 +120,7 @@ def commands(evaluation: Evaluation, out: Path) -> str:
         "mapvote build MY_DRIVE --out my_map\n"
         "mapvote vote ANOTHER_DRIVE --map my_map --vehicle car_1 --out car_1.ballot\n"
         "mapvote update my_map car_1.ballot car_2.ballot --out my_map_updated\n"
+        "mapvote serve store.db --map my_map    # the server that vehicles talk to\n"
     )
 
 
@@ -144,7 +167,12 @@ def report_page(evaluation: Evaluation, story: Story, pictures: list[tuple[Path,
         ),
         Section(
             "What the server decided",
-            ["Undetermined and never seen cells keep what the map has."],
+            [
+                "A mapvote server in a process of its own took the ballots by HTTP, decided every cell and published "
+                f"version {story.version} of the map, which the vehicles then download. Undetermined and never seen "
+                "cells keep what the map has.",
+                *([f"It held the version first, for an operator to look: {story.held}"] if story.held else []),
+            ],
             [drawn["states"]],
         ),
         Section(

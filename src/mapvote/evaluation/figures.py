@@ -80,7 +80,8 @@ def street(
 ) -> Figure:
     """The street from above (Figure 6): the old map with what was deleted, the new one with what was added.
 
-    ``old`` and ``updated``: points (n, 3), map metres, and their heights above ground (n,); ``areas`` (name, corner-to-corner (2, 2) box); ``paths`` of vehicles (name, (m, 3)).
+    ``old`` and ``updated``: points (n, 3), map metres, and their heights above ground (n,); ``areas`` (name,
+    corner-to-corner (2, 2) box); ``paths`` of vehicles (name, (m, 3)).
     """
     figure, axes = _stack(grid, 2)
     axes = axes.ravel()
