@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,21 +14,31 @@ from mapvote.core.points import ground_surface
 from mapvote.core.types import F32, F64, MapTile, MapvoteError, PointMap
 
 _EXTENT_M = 1e7
+_CHUNK = 1_000_000
+"""Points looked at together: a large cloud is never copied as a whole."""
 
 
-def cut_tiles(points_map: F64, lattice: Lattice) -> dict[TileIndex, F64]:
-    """Points (n, 3) by tile, map metres, input order kept inside each tile; tiles in ascending order."""
-    tile_row, tile_col = tile_of_cells(*lattice.cells_of(points_map))
-    order = np.lexsort((tile_col, tile_row))
-    row, col = tile_row[order], tile_col[order]
-    starts = np.flatnonzero(np.r_[True, (np.diff(row) != 0) | (np.diff(col) != 0)])
-    pieces = np.split(order, starts[1:])
-    return {(int(row[s]), int(col[s])): points_map[piece] for s, piece in zip(starts, pieces, strict=True)}
+def cut_tiles(points_map: NDArray[np.floating], lattice: Lattice) -> Iterator[tuple[TileIndex, NDArray[np.floating]]]:
+    """Points (n, 3) tile by tile, map metres, input order kept inside each tile; tiles in ascending order."""
+    tiles = np.empty((len(points_map), 2), dtype=np.int32)
+    for start in range(0, len(points_map), _CHUNK):
+        piece = slice(start, start + _CHUNK)
+        tiles[piece, 0], tiles[piece, 1] = tile_of_cells(*lattice.cells_of(points_map[piece]))
+    order = np.lexsort((tiles[:, 1], tiles[:, 0]))
+    seams = np.flatnonzero((tiles[order[1:]] != tiles[order[:-1]]).any(axis=1)) + 1
+    for piece_of_order in np.split(order, seams):
+        row, col = tiles[piece_of_order[0]].tolist()
+        yield (row, col), points_map[piece_of_order]
 
 
-def tile_ground(clouds: Mapping[TileIndex, F64], tile: TileIndex, lattice: Lattice) -> F32:
-    """Ground of one tile, (256, 256) float32, from its points and its eight neighbours', so that tiles agree."""
-    near = [clouds[key] for dr in (-1, 0, 1) for dc in (-1, 0, 1) if (key := (tile[0] + dr, tile[1] + dc)) in clouds]
+def tile_ground(stored: Mapping[TileIndex, F32], tile: TileIndex, lattice: Lattice) -> F32:
+    """Ground of one tile, (256, 256) float32, from its points and its eight neighbours', so that tiles agree.
+
+    ``stored``: each tile's points (n, 3) from its corner, as the map keeps them, so that a map read back lays the
+    same ground.
+    """
+    around = [(tile[0] + dr, tile[1] + dc) for dr in (-1, 0, 1) for dc in (-1, 0, 1)]
+    near = [map_points(tile_grid(lattice, key), stored[key]) for key in around if key in stored]
     window = tile_grid(lattice, tile)
     halo = window.padded(TILE_CELLS)
     return ground_surface(np.concatenate(near), halo)[window.slices_in(halo)].copy()
@@ -46,24 +56,25 @@ def map_from_points(
     ``map_id`` defaults to a hash of the points and the lattice. Raises MapvoteError if there are no points, or if
     some are not finite or lie beyond 10,000 km.
     """
-    points = np.ascontiguousarray(points_map, dtype=np.float64)
     lattice = lattice or Lattice()
+    points = np.asarray(points_map)
     if points.ndim != 2 or points.shape[1] != 3 or len(points) == 0:
         raise MapvoteError(f"a map needs points: got an array of shape {points.shape}, expected (n, 3) with n > 0")
-    bad = ~(np.abs(points) < _EXTENT_M).all(axis=1)
-    if bad.any():
-        raise MapvoteError(
-            f"{int(bad.sum())} of {len(points)} map points are not finite or beyond 10,000 km "
-            f"(first: point {int(np.argmax(bad))}); remove them first"
-        )
-    # The ground is measured on the points as they are stored, so that a map read back lays the same ground.
-    stored = {tile: tile_points(tile_grid(lattice, tile), p) for tile, p in cut_tiles(points, lattice).items()}
-    clouds = {tile: map_points(tile_grid(lattice, tile), p) for tile, p in stored.items()}
-    tiles = {tile: MapTile(stored[tile], tile_ground(clouds, tile, lattice)) for tile in stored}
-    if map_id is None:
-        digest = hashlib.sha256(np.array([lattice.x0, lattice.y0]).tobytes() + points.tobytes())
-        map_id = digest.hexdigest()[:16]
-    return PointMap(map_id, lattice, tiles, dict(georeference or {}))
+    digest = hashlib.sha256(np.array([lattice.x0, lattice.y0]).tobytes())
+    for start in range(0, len(points), _CHUNK):
+        piece = np.ascontiguousarray(points[start : start + _CHUNK], dtype=np.float64)
+        bad = ~(np.abs(piece) < _EXTENT_M).all(axis=1)
+        if bad.any():
+            raise MapvoteError(
+                f"{int(bad.sum())} of {len(piece)} map points are not finite or beyond 10,000 km "
+                f"(first: point {start + int(np.argmax(bad))}); remove them first"
+            )
+        digest.update(piece.tobytes())
+    stored = {
+        tile: tile_points(tile_grid(lattice, tile), p.astype(np.float64)) for tile, p in cut_tiles(points, lattice)
+    }
+    tiles = {tile: MapTile(stored[tile], tile_ground(stored, tile, lattice)) for tile in stored}
+    return PointMap(map_id or digest.hexdigest()[:16], lattice, tiles, dict(georeference or {}))
 
 
 def all_points(point_map: PointMap) -> F64:

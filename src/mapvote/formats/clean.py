@@ -62,8 +62,8 @@ def clean_scan(
     the sensor can measure. Dropped and counted: not finite, or beyond 2 km. MapvoteError if these are more than 5 %,
     or if nothing is left.
     """
-    p = points.astype(np.float64)
-    distance = np.sqrt((p * p).sum(axis=1))
+    x, y, z = (points[:, axis].astype(np.float64) for axis in range(3))
+    distance = np.sqrt(x * x + y * y + z * z)
     measured = np.ones(len(points), dtype=bool) if no_return is None else ~no_return
     good = distance < FAR_M  # False for NaN too
     bad = int((measured & ~good).sum())

@@ -68,7 +68,7 @@ def to_map(where: str, cloud: Cloud) -> PointMap:
     points = cloud.points
     if len(points) == 0:
         raise MapvoteError(f"{where}: holds no points; a map needs some")
-    bad = ~np.isfinite(points).all(axis=1)
+    bad = ~(np.isfinite(points[:, 0]) & np.isfinite(points[:, 1]) & np.isfinite(points[:, 2]))
     n_bad = int(bad.sum())
     if n_bad > MAX_BAD_SHARE * len(points):
         raise MapvoteError(
