@@ -136,6 +136,7 @@ def world_answers() -> dict[str, Any]:
                 for r, c in after.tiles
             ]
         },
+        "vehicles": {"vehicles": []},
         "cells": lambda query: {
             "x": float(query["x"][0]),
             "y": float(query["y"][0]),

@@ -26,7 +26,7 @@ GateDrive = Annotated[Path | None, typer.Option(help="reference drive that must 
 
 def register(app: typer.Typer) -> None:
     """Add the server's verbs to ``app``."""
-    for verb in (update, serve, publish, rollback, log, unvote, keys, changes):
+    for verb in (update, serve, publish, rollback, log, unvote, keys, vehicles, changes):
         app.command()(verb)
 
 
@@ -236,6 +236,29 @@ def keys(
             print(f"{store_keys.revoke(opened, name)} keys of {name} revoked")
         else:
             raise MapvoteError("keys: say list, issue NAME or revoke NAME")
+
+
+def vehicles(store: StoreName, config: Config = None) -> None:
+    """Which vehicles contradict the others far more than chance, and where."""
+    from rich.console import Console
+    from rich.table import Table
+
+    from mapvote.config import load_settings
+    from mapvote.fleet.explain import vehicle_standings
+
+    settings = load_settings(config)
+    with _opened(store) as opened:
+        found = vehicle_standings(opened, settings.fuse)
+    table = Table("vehicle", "verdict", "cells compared", "contradictions", "of the others", "p", "the largest")
+    for s in found:
+        places = "; ".join(f"{e.says} at {e.x:.1f}, {e.y:.1f} ({e.cells} cells)" for e in s.evidence[:3])
+        table.add_row(
+            s.vehicle, s.verdict, str(s.cells), str(s.objects), str(s.others_objects), f"{s.p_value:.2g}", places
+        )
+    Console().print(table)
+    print(
+        "Compared where others agree both before and after a vehicle passed; the first and the last cannot be judged."
+    )
 
 
 def changes(

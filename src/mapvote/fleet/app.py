@@ -175,9 +175,11 @@ def _refuse(request: Request, error: Exception) -> Response:
         content["reasons"] = error.reasons
     if status in (429, 503):
         headers["Retry-After"] = "1"
-    if status == 401:
-        headers["WWW-Authenticate"] = 'Bearer, Basic realm="mapvote", charset="UTF-8"'
-    return JSONResponse(content, status, headers)
+    response = JSONResponse(content, status, headers)
+    if status == 401:  # two lines: browsers read one challenge a line, and ask for a password only for Basic
+        response.headers.append("WWW-Authenticate", 'Basic realm="mapvote: the key is the password", charset="UTF-8"')
+        response.headers.append("WWW-Authenticate", "Bearer")
+    return response
 
 
 def _unreadable(request: Request, error: Exception) -> Response:

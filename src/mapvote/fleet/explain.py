@@ -11,14 +11,16 @@ import sqlalchemy as sa
 from backports import zstd
 
 from mapvote.config import FuseSettings
-from mapvote.core.grid import TILE_CELLS, TileIndex
+from mapvote.core.grid import TILE_CELLS, TileIndex, tile_grid
 from mapvote.core.types import NO_VOTE, U8, CellState, MapvoteError
+from mapvote.core.voting import decide
 from mapvote.fleet import schema
 from mapvote.fleet.changes import Decided, change_objects, changed_cells, to_geojson
+from mapvote.fleet.consensus import Compared, Spoken, Standing, compare, judge
 from mapvote.fleet.content import unpack_points_plane
-from mapvote.fleet.fuse import TileVote, select
+from mapvote.fleet.fuse import TileVote, fold, select
 from mapvote.fleet.rounds import unpack_tally_plane
-from mapvote.fleet.standing import Round, counting_votes, read_votes, stored_votes
+from mapvote.fleet.standing import Round, counting_votes, read_votes, standing_tiles, stored_votes
 from mapvote.fleet.store import Store, current_version, load_blob, load_tile, tiles_of, version_of
 
 _FOREVER = (1 << 63) - 1
@@ -147,6 +149,25 @@ def coverage(store: Store) -> list[dict[str, Any]]:
     ]
 
 
+def vehicle_standings(store: Store, settings: FuseSettings) -> list[Standing]:
+    """How each vehicle stands to what the others say, over every vote inside the window, in order of name.
+
+    What is compared is the world (occupied or empty now), so votes on an older base count here too.
+    """
+    asked = Round(_FOREVER, settings, _FOREVER)
+    with store.database.reading() as connection:
+        compared: list[Compared] = []
+        for index in standing_tiles(connection, _FOREVER):
+            chosen = select(stored_votes(connection, index, asked), settings)
+            drives: dict[str, list[TileVote]] = {}
+            for vote in read_votes(connection, index, chosen):
+                drives.setdefault(vote.vehicle, []).append(vote)
+            grid = tile_grid(store.lattice, index)
+            folded = [fold(mine, grid) for mine in drives.values()]
+            compared += compare(index, [Spoken(vote.vehicle, vote.end_ns, _decided_states(vote)) for vote in folded])
+    return judge(compared, store.lattice)
+
+
 def events(store: Store, limit: int = 100) -> list[dict[str, Any]]:
     """The last events, newest first."""
     query = sa.select(schema.events).order_by(schema.events.c.seq.desc()).limit(limit)
@@ -156,6 +177,13 @@ def events(store: Store, limit: int = 100) -> list[dict[str, Any]]:
 
 def _states(data: bytes) -> U8:
     return np.frombuffer(zstd.decompress(data), dtype=np.uint8).reshape(TILE_CELLS, TILE_CELLS)
+
+
+def _decided_states(vote: TileVote) -> U8:
+    if vote.states is not None:
+        return vote.states
+    assert vote.tally is not None
+    return decide(vote.tally.astype(np.int32))
 
 
 def _said(vote: TileVote, cell: tuple[int, int]) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import html
+from dataclasses import asdict
 from datetime import UTC, datetime
 from importlib import resources
 from typing import Annotated, Any
@@ -16,7 +17,7 @@ from mapvote.config import FuseSettings
 from mapvote.core.ballot import tile_key
 from mapvote.core.types import MapvoteError
 from mapvote.fleet.errors import Forbidden, NotFound
-from mapvote.fleet.explain import changes_between, coverage, explain_cell
+from mapvote.fleet.explain import changes_between, coverage, explain_cell, vehicle_standings
 from mapvote.fleet.intake import examine, withdraw
 from mapvote.fleet.limits import read_body
 from mapvote.fleet.publish import publish, rollback
@@ -80,6 +81,7 @@ _DOCS = """<!doctype html><meta charset=utf-8><title>mapvote API</title>
 <style>body{font:15px sans-serif;margin:2em}td,th{padding:.4em .8em;text-align:left;border-top:1px solid #ccc}</style>
 <h1>mapvote API</h1><p>For machines: <a href=openapi.json>openapi.json</a></p>
 <table><tr><th>Method<th>Path<th>What<th>How<th>Answers</tr>ROWS</table>"""
+_MOST_EVIDENCE = 50
 router = APIRouter()
 
 
@@ -237,6 +239,14 @@ def fresh(request: Request) -> dict[str, Any]:
             for t in tiles
         ]
     }
+
+
+@router.get("/v1/vehicles", responses=_problems(403), summary="Who contradicts the others")
+def vehicles(request: Request) -> dict[str, Any]:
+    """How every vehicle stands to what the others say before and after it, with the places where it differs."""
+    _operator(request)
+    found = vehicle_standings(_store(request), request.app.state.settings.fuse)
+    return {"vehicles": [asdict(s) | {"evidence": [asdict(e) for e in s.evidence[:_MOST_EVIDENCE]]} for s in found]}
 
 
 @router.get("/healthz", responses=_problems(), summary="Can the store be read?")

@@ -1,6 +1,7 @@
 // The server's answers (DESIGN 5). Every request goes to this server only; the key lives in this tab only.
 
 const STORAGE = "mapvote-key";
+const BASE = location.origin + location.pathname;  // without a user and password that the address may hold
 
 export class Refused extends Error {
   constructor(status, message) {
@@ -20,7 +21,7 @@ async function ask(path, parameters = {}) {
   const headers = key.get() ? { Authorization: `Bearer ${key.get()}` } : {};
   let answer;
   try {
-    answer = await fetch(`v1/${path}${query ? "?" + query : ""}`, { headers });
+    answer = await fetch(`${BASE}v1/${path}${query ? "?" + query : ""}`, { headers });
   } catch {
     throw new Refused(0, "The server does not answer. Is it running?");
   }
@@ -41,6 +42,7 @@ export const manifest = async () => (await ask("map")).json();
 export const versions = async () => (await ask("map/versions")).json();
 export const changes = async (from, to) => (await ask("changes", { from, to })).json();
 export const coverage = async () => (await ask("coverage")).json();
+export const vehicles = async () => (await ask("vehicles")).json();
 export const cell = async (x, y) => (await ask("cells", { x: x.toFixed(3), y: y.toFixed(3) })).json();
 
 // (n, 3) points of a tile from its corner. The plane travels as zstd, which the browser undoes as a content encoding.

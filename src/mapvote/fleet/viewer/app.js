@@ -5,6 +5,7 @@ import { showTiles } from "./coverage.js";
 import { closeDetails, drawable, follow, showCell, showChange } from "./details.js";
 import { $, dot, element, link, notice, when } from "./dom.js";
 import { state } from "./page.js";
+import { showVehicles } from "./vehicles.js";
 import { TILE, View } from "./view.js";
 
 let queue = Promise.resolve();
@@ -35,6 +36,7 @@ async function start() {
   view.fit(extent(view.tiles));
   await showRange();
   follow();
+  showVehicles();
 }
 
 function refuse(error) {
