@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 
 import numba
 import numpy as np
+from scipy import ndimage
 
 from mapvote.config import Settings
 from mapvote.core.columns import TOP_BIT, cut_reference, reference_window, shifted
@@ -25,6 +26,9 @@ from mapvote.perception.deskew import deskew, twist_between
 from mapvote.perception.evidence import PLANES, Evidence, count_of, free_words
 from mapvote.perception.moving import MovingFilter
 from mapvote.perception.visibility import find_obstacles, see
+
+ROAD_M = 0.1
+"""Points this low above the ground are the road itself, also under a car."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,7 +69,7 @@ class Layer:
             self._enter(waiting.popleft(), moving)
 
     def _enter(self, scan: _Waiting, moving: Bool) -> None:
-        self.cloud.add(scan.points_map, moving)
+        self.cloud.add(scan.points_map, moving | _beneath(scan, moving))
         view = see(scan.points_map, scan.origin_map, scan.obstacle, moving, scan.reference, scan.cell)
         self.evidence.add(view, scan.reference)
 
@@ -111,6 +115,19 @@ class Layer:
         out = _rebased(free, before.base, after.base) & ~after.occupied
         out[np.isnan(after.ground_z)] = 0
         return out
+
+
+def _beneath(scan: _Waiting, moving: Bool) -> Bool:
+    """Points (n,) too low to be obstacles, in or next to cells where something moves: wheels and bumpers, not road."""
+    inside = scan.cell >= 0
+    cells = np.zeros(scan.reference.grid.shape, dtype=np.bool_)
+    cells.ravel()[scan.cell[moving & inside]] = True
+    cells = ndimage.binary_dilation(cells, np.ones((3, 3)))
+    low = np.zeros(len(moving), dtype=np.bool_)
+    near = np.flatnonzero(inside)
+    near = near[cells.ravel()[scan.cell[near]]]
+    low[near] = scan.points_map[near, 2] - scan.reference.ground_z.ravel()[scan.cell[near]] > ROAD_M
+    return low & ~scan.obstacle
 
 
 def motion_at(stamps_ns: I64, T_map_lidar: F64, i: int) -> F64:
