@@ -105,10 +105,9 @@ def run(
     kept: dict[int, tuple[F32, Bool]] = {}
     for i in range(len(drive)):
         scan = drive.read_scan(i)
-        noise = rng.normal(size=6) * np.repeat([pose_noise_m, pose_noise_m / 30.0], 3)
-        T = exp(noise * [1, 1, 0.5, 0.3, 0.3, 1]) @ T_map_lidar[i] if pose_noise_m else T_map_lidar[i]
-        if pose_noise_m:
-            T[:3, 3] = T_map_lidar[i][:3, 3] + noise[:3]
+        T = T_map_lidar[i].copy()
+        T[:3, :3] = exp(np.r_[0.0, 0.0, 0.0, rng.normal(size=3) * pose_noise_m / 30.0])[:3, :3] @ T[:3, :3]
+        T[:3, 3] += rng.normal(size=3) * pose_noise_m
         kept[i] = scan.points, obstacles(transform(T_map_lidar[i], scan.points), grid, ground_z)
         points_map = transform(T, scan.points)
         start = time.process_time()
@@ -157,17 +156,21 @@ def score_kitti(path: Path, settings: MovingSettings, pictures: Path | None) -> 
     things = {f["frame"]: f["objects"] for f in frames}
     drive = open_drive(path)
     seconds: list[float] = []
-    per_thing: dict[str, list[float]] = {}
+    T_map_lidar = poses_of(path / "poses.txt")
+    counts: dict[str, list[int]] = {}
+    track: dict[str, list[F64]] = {}
     total = removed = elsewhere = ahead = 0
-    for i, points, obstacle, moving in run(drive, poses_of(path / "poses.txt"), settings, seconds):
+    for i, points, obstacle, moving in run(drive, T_map_lidar, settings, seconds):
         labelled = np.zeros(len(points), dtype=bool)
         for thing in things.get(i, []):
             within = inside(points, thing) & obstacle
             labelled |= within
-            row = per_thing.setdefault(f"{thing['cls']} {thing['id'][:4]}", [0, 0, 0.0])
+            name = f"{thing['cls']} {thing['id'][:4]}"
+            row = counts.setdefault(name, [0, 0])
             row[0] += int(within.sum())
             row[1] += int((within & moving).sum())
-            row[2] += float(np.hypot(*np.mean(thing["footprint"], axis=0)[:2])) / 30
+            centre = np.mean(np.array(thing["footprint"])[:4], axis=0)
+            track.setdefault(name, []).append(transform(T_map_lidar[i], centre[None])[0])
         stray = moving & ~labelled
         view = (points[:, 0] > 0) & (np.abs(points[:, 1]) < points[:, 0] * np.tan(np.radians(40.0)))
         total += int(obstacle.sum())
@@ -177,8 +180,9 @@ def score_kitti(path: Path, settings: MovingSettings, pictures: Path | None) -> 
         if pictures is not None and i % 6 == 5:
             draw(points, obstacle, moving, things.get(i, []), pictures / f"{path.name}_{i:06d}.png")
     print(f"{path.name}: {total:,} obstacle points in {len(drive)} scans, {removed:,} removed")
-    for name, (count, found, _) in sorted(per_thing.items()):
-        print(f"  {name:18} {int(count):7,} points, recall {found / max(count, 1):.3f}")
+    for name, (count, found) in sorted(counts.items()):
+        way = float(np.hypot(*(track[name][-1] - track[name][0])[:2]))
+        print(f"  {name:16} moved {way:5.1f} m: {count:7,} points, {found / max(count, 1):.3f} of them removed")
     print(f"  removed outside every labelled box: {elsewhere:,}, {elsewhere / total:.2%} of obstacle points;")
     print(f"  of these in the camera's view, the only part that is labelled: {ahead:,}, {ahead / total:.3%}")
     print(f"  median {1e3 * float(np.median(seconds)):.2f} ms a scan")
@@ -205,7 +209,9 @@ def main() -> None:
     parser.add_argument("--cache", type=Path, default=Path("/tmp/mapvote_moving"), help="where drives are kept")
     parser.add_argument("--stride", type=int, default=1, help="use every so many scans (2 of 10 Hz is 5 Hz)")
     parser.add_argument("--sensor", help="simulate with this sensor instead of the scenario's")
-    parser.add_argument("--pose-noise", type=float, default=0.0, metavar="M", help="sigma of white noise on positions")
+    parser.add_argument(
+        "--pose-noise", type=float, default=0.0, metavar="M", help="sigma of white noise, and a 30th in radians"
+    )
     parser.add_argument("--kitti", type=Path, nargs="*", default=[], help="real drives with poses.txt")
     parser.add_argument("--pictures", type=Path, help="write pictures of the real drives here")
     parser.add_argument("--set", nargs="*", default=[], metavar="KEY=VALUE", help="settings of the filter")

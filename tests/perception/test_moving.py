@@ -121,6 +121,17 @@ def test_a_scan_is_decided_within_the_look_ahead_and_no_later_scan_changes_it() 
     assert order == list(range(len(street.scans)))
 
 
+def test_nothing_older_than_the_window_is_used() -> None:
+    sensor = coarse("hdl32e")
+    settings = MovingSettings(past_s=1.0, lookahead_s=0.5)
+    street = Street(sensor, 10.0, 2.5, [ONCOMING])
+    whole = street.run(sensor, settings)
+    street.scans = street.scans[5:]
+    late = street.run(sensor, settings)
+    for index in range(10, len(late)):  # a second of history behind it
+        np.testing.assert_array_equal(late[index], whole[index + 5])
+
+
 def test_only_obstacle_points_are_called_moving_and_an_empty_scan_is_no_trouble() -> None:
     sensor = coarse("hdl32e")
     street = Street(sensor, 10.0, 2.0, [ONCOMING])
