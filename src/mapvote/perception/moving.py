@@ -12,7 +12,10 @@ rays went through both just below and just above the place, because a ray over a
 It needs no map, only poses, so it serves SLAM and voting alike.
 
 Online: a scan is decided after at most ``lookahead_s`` (1 s), because what a vehicle ahead of
-us hides is seen through only once it has driven on. Nothing older than ``past_s`` is used or kept.
+us hides is seen through only once it has driven on. Nothing older than ``past_s`` before it is used.
+
+What it cannot tell: a car that waits through the whole window is static, one farther than ``reach_m`` is never called
+moving, and what only the sky lies behind is judged by the cells it is connected to (rays without return are unknown).
 """
 
 from __future__ import annotations
