@@ -131,6 +131,9 @@ class VotingSettings(Section):
     min_support: int = Field(
         default=2, description="columns, G: hits (scans by voxels) that make a cell changed-occupied"
     )
+    min_height_m: float = Field(
+        default=0.6, description="columns, G: a cell whose map rises no higher than this is never changed-empty"
+    )
     min_cells: int = Field(default=4, description="columns, G: smaller groups of changed cells are dropped")
     wide_sigma_m: float = Field(
         default=0.1, description="columns: a pose less certain than this makes a hit speak for two cells around it"

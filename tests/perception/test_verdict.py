@@ -26,10 +26,11 @@ def cell(through: dict[int, int], struck: dict[int, int]) -> U64:
 
 
 def judge(through: dict[int, int], struck: dict[int, int], occupied: int = 0, **more: Any) -> Verdict:
-    near, free = more.pop("near", 0), more.pop("free", int(FREE))
+    near, free, low_there = more.pop("near", 0), more.pop("free", int(FREE)), more.pop("low", False)
     settings = VotingSettings(method="columns", **more)
     occupied_word, near_word, free_word = (np.full((1, 1), w, np.uint64) for w in (occupied, near, free))
-    return weigh(cell(through, struck), occupied_word, near_word, free_word, settings)
+    low = np.full((1, 1), low_there)
+    return weigh(cell(through, struck), occupied_word, near_word, free_word, low, settings)
 
 
 def state(*args: Any, **more: Any) -> int:
@@ -73,6 +74,13 @@ def test_rule_f_only_rays_at_the_height_of_the_new_thing_speak_against_it() -> N
 def test_rule_g_a_single_hit_is_not_enough() -> None:
     assert state({}, {4: 1}) != CO
     assert state({}, {4: 1}, rules="ABCDEF") == CO
+
+
+def test_rule_g_what_hardly_rises_above_the_ground_is_never_called_gone() -> None:
+    assert state({1: 40}, {}, occupied=0b10) == CE
+    assert state({1: 40}, {}, occupied=0b10, low=True) == UN
+    assert state({1: 40}, {}, occupied=0b10, low=True, rules="ABCDEF") == CE
+    assert state({}, {1: 40}, occupied=0b10, low=True) == UO
 
 
 def test_a_wall_keeps_its_voxels_when_the_awning_above_it_is_taken_down() -> None:

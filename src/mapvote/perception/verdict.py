@@ -48,7 +48,7 @@ def _ones(word: np.uint64) -> int:
 
 @numba.njit(cache=True, nogil=True)
 def _weigh(
-    planes: U64, occupied: U64, near: U64, free: U64, by_height: bool, empty_votes: float, gone_votes: float,
+    planes: U64, occupied: U64, near: U64, free: U64, low: Bool, by_height: bool, empty_votes: float, gone_votes: float,
     clear_share: float, min_scans: int, min_support: int, tally: I32, gone: U64, new: U64, adrift: Bool,
 ) -> None:  # fmt: skip
     for r in range(occupied.shape[0]):
@@ -83,8 +83,8 @@ def _weigh(
             if mapped and not (kept or lost):
                 under = (mapped & (~mapped + np.uint64(1))) - np.uint64(1)  # below the lowest voxel
                 adrift[r, c] = 2 * _ones(under & through) >= _ones(under) > 0
-            if clear < clear_share * rays:  # hardly ever seen through: foliage, or the end of the view
-                lost = 0
+            if low[r, c] or clear < clear_share * rays:
+                lost = 0  # hardly ever seen through: foliage, or the end of the view
             if lost and not kept:
                 gone[r, c] |= mapped & ~struck  # what no ray reached goes with what it stood on
             votes = tally[r, c]
@@ -95,10 +95,11 @@ def _weigh(
             votes[4] = 1 if not (votes[0] or votes[1] or votes[2] or votes[3]) else 0
 
 
-def weigh(planes: U64, occupied: U64, near: U64, free: U64, settings: VotingSettings) -> Verdict:
+def weigh(planes: U64, occupied: U64, near: U64, free: U64, low: Bool, settings: VotingSettings) -> Verdict:
     """Votes of a window from its counters ``planes`` (rows, cols, 2 * PLANES) and the map's words (rows, cols).
 
-    ``near``: what the map's voxels explain (rule C); ``free``: what the map knows to be free (rule D).
+    ``near``: what the map's voxels explain (rule C); ``free``: what the map knows to be free (rule D); ``low``: cells
+    whose map hardly rises above the ground (rule G: kerbs, grass, trails of cars' bumpers are never called gone).
     """
     shape, rules = occupied.shape, settings.rules
     everything = np.full(shape, ~np.uint64(0))
@@ -106,7 +107,7 @@ def weigh(planes: U64, occupied: U64, near: U64, free: U64, settings: VotingSett
     gone, new = np.zeros(shape, np.uint64), np.zeros(shape, np.uint64)
     _weigh(
         planes, occupied, near if "C" in rules else np.where(occupied, everything, np.uint64(0)),
-        free if "D" in rules else everything,
+        free if "D" in rules else everything, low if "G" in rules else np.zeros(shape, np.bool_),
         "F" in rules, settings.empty_votes if "F" in rules else 1.0, settings.gone_votes if "E" in rules else 1.0,
         settings.clear_share if "E" in rules else 0.0, settings.min_scans if "G" in rules else 1,
         settings.min_support if "G" in rules else 1, tally, gone, new, adrift,

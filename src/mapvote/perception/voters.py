@@ -105,7 +105,8 @@ class ColumnVoter:
             near = dilated(around.occupied, around.base, 1)[1:-1, 1:-1]
             here = cut_reference(around, window)
             known = here.free if here.free is not None else above_ground_points(self.point_map, window)
-            verdict = weigh(planes, here.occupied, near, known, self.voting)
+            low = here.top_z - here.ground_z < self.voting.min_height_m
+            verdict = weigh(planes, here.occupied, near, known, low, self.voting)
             if verdict.tally.any():
                 free = free_words(planes, here.occupied)
                 out[tile] = TileVotes(verdict.tally, verdict.states(), verdict.gone, verdict.new, free)
