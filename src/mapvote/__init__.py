@@ -1,1 +1,53 @@
-"""mapvote keeps 3D point-cloud maps true: vehicles vote on what has changed."""
+"""mapvote keeps 3D point-cloud maps true: vehicles vote on what has changed.
+
+The public names below are imported when they are first used, so that ``import mapvote`` costs nothing.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from mapvote.config import Settings as Settings
+    from mapvote.config import load_settings as load_settings
+    from mapvote.core.ballot import Ballot as Ballot
+    from mapvote.core.types import CellState as CellState
+    from mapvote.core.types import Drive as Drive
+    from mapvote.core.types import MapvoteError as MapvoteError
+    from mapvote.core.types import PointMap as PointMap
+    from mapvote.core.types import Scan as Scan
+    from mapvote.fleet.update import update_map as update_map
+    from mapvote.formats import open_drive as open_drive
+    from mapvote.formats import read_map as read_map
+    from mapvote.formats import write_map as write_map
+    from mapvote.mapping import build_map as build_map
+    from mapvote.simulation import simulate as simulate
+    from mapvote.vehicle import Vehicle as Vehicle
+    from mapvote.vehicle import vote_drive as vote_drive
+
+_HOME = {
+    "Ballot": "core.ballot",
+    "CellState": "core.types",
+    "Drive": "core.types",
+    "MapvoteError": "core.types",
+    "PointMap": "core.types",
+    "Scan": "core.types",
+    "Settings": "config",
+    "Vehicle": "vehicle",
+    "build_map": "mapping",
+    "load_settings": "config",
+    "open_drive": "formats",
+    "read_map": "formats",
+    "simulate": "simulation",
+    "update_map": "fleet.update",
+    "vote_drive": "vehicle",
+    "write_map": "formats",
+}
+__all__ = sorted(_HOME)
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME:
+        raise AttributeError(f"module 'mapvote' has no attribute {name!r}")
+    return getattr(import_module(f"mapvote.{_HOME[name]}"), name)

@@ -1,0 +1,20 @@
+"""Ten lines of Python are the README's promise: the names they use are there, and importing the package is cheap."""
+
+import subprocess
+import sys
+
+import pytest
+
+import mapvote
+
+
+def test_every_public_name_is_there() -> None:
+    for name in mapvote.__all__:
+        assert getattr(mapvote, name) is not None
+    with pytest.raises(AttributeError, match="no attribute 'no_such_name'"):
+        mapvote.no_such_name  # noqa: B018
+
+
+def test_importing_the_package_loads_nothing_heavy() -> None:
+    code = "import sys, mapvote; print('numba' in sys.modules, 'numpy' in sys.modules)"
+    assert subprocess.check_output([sys.executable, "-c", code], text=True).split() == ["False", "False"]
