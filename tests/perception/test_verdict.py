@@ -65,6 +65,11 @@ def test_rule_d_new_only_where_the_map_knew_free_space() -> None:
     assert state({}, {4: 9}, free=0, rules="ABCEFG") == CO
 
 
+def test_rule_d_the_top_of_a_new_house_comes_with_it_though_the_map_knew_nothing_up_there() -> None:
+    assert judge({}, {4: 9, 30: 3}, free=1 << 4).new[0, 0] == 1 << 4 | 1 << 30
+    assert judge({}, {30: 9}, free=1 << 4).new[0, 0] == 0
+
+
 def test_rule_f_only_rays_at_the_height_of_the_new_thing_speak_against_it() -> None:
     assert state({9: 100}, {4: 4}) == CO
     assert state({4: 100}, {4: 4}) != CO

@@ -60,7 +60,8 @@ def _weigh(
                 struck |= cell[PLANES + k]
             if not through | struck:
                 continue
-            candidates = struck & ~mapped & ~near[r, c] & free[r, c]
+            strange, beyond = struck & ~mapped & ~near[r, c], np.uint64(0)
+            candidates = strange & free[r, c]
             kept, lost, found, refuted, rays, clear = 0, 0, 0, 0, 0, 0
             for bit in range(64):
                 one = np.uint64(1) << np.uint64(bit)
@@ -74,12 +75,17 @@ def _weigh(
                     clear = max(clear, t)
                     if gone_votes * t > s:
                         gone[r, c] |= one
-                elif candidates & one and s >= min_scans and s > empty_votes * t:
-                    new[r, c] |= one
-                    found += s
-                    refuted += t
+                elif strange & one and s >= min_scans and s > empty_votes * t:
+                    if candidates & one:
+                        new[r, c] |= one
+                        found += s
+                        refuted += t
+                    else:
+                        beyond |= one
             if kept or found < min_support:
                 found, refuted, new[r, c] = 0, 0, 0
+            else:  # a new thing's upper parts, where the map knew nothing, come with it
+                new[r, c] |= beyond
             if mapped and not (kept or lost):
                 under = (mapped & (~mapped + np.uint64(1))) - np.uint64(1)  # below the lowest voxel
                 adrift[r, c] = 2 * _ones(under & through) >= _ones(under) > 0

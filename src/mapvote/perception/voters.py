@@ -91,10 +91,7 @@ class ColumnVoter:
 
     def add(self, seen: Seen) -> U64:
         """Take note of one scan; returns (rows, cols) words of voxels whose points may be new."""
-        explained = seen.near if "C" in self.voting.rules else seen.reference.occupied
-        new = seen.view.hit & ~explained
-        free = seen.reference.free
-        return new if free is None or "D" not in self.voting.rules else new & free
+        return seen.view.hit & ~(seen.near if "C" in self.voting.rules else seen.reference.occupied)
 
     def votes(self) -> dict[TileIndex, TileVotes]:
         """Every tile with evidence, in ascending order."""
