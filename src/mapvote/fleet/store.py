@@ -59,8 +59,11 @@ class Manifest:
 
 
 def url_of(store: str) -> str:
-    """The database URL of what the command line calls STORE: a URL, or the path of an SQLite file."""
-    return store if "://" in store else f"sqlite:///{Path(store)}"
+    """The database URL of what the command line calls STORE: a URL, or the path of an SQLite file.
+
+    The path is made absolute: workers may run in another folder.
+    """
+    return store if "://" in store else f"sqlite:///{Path(store).absolute()}"
 
 
 def now_ns() -> int:

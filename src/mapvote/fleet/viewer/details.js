@@ -65,14 +65,14 @@ export async function showCell([x, y]) {
     element("li", { className: v.counts ? "" : "silent" }, [
       element("div", { className: "head" }, [element("b", {}, [`${v.vehicle} / ${v.drive}`]), element("time", {}, [when(v.end)])]),
       element("div", {}, [CHANGE[v.state] && dot(CHANGE[v.state]), STATES[v.state] ?? v.state]),
-      !v.counts && element("div", {}, [`does not count: ${v.why || "no reason given"}`]),
+      !v.counts && element("div", { className: "why" }, [`does not count: ${v.why || "no reason given"}`]),
     ]);
   const decided = answer.decisions.map((d) => `Version ${d.version} decided: ${STATES[d.state] ?? d.state}.`);
   details(title, null, [
+    ...decided.map((text) => element("p", {}, [text])),
     answer.votes.length
       ? element("ol", { className: "votes" }, answer.votes.map(vote))
       : element("p", { className: "hint" }, ["No vehicle has voted on this cell."]),
-    ...decided.map((text) => element("p", { className: "hint" }, [text])),
   ]);
 }
 
