@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from mapvote.core.ballot import Ballot
+from mapvote.core.columns import GROUND_MARGIN_M, reference_window
 from mapvote.core.grid import CELL_SIZE, Grid
 from mapvote.core.types import F64, U8, PointMap
 from mapvote.evaluation.cases import Case, Outcome, Pass, fuse_case, passes
@@ -131,8 +132,6 @@ class Jury:
 
 def _above_ground(first_map: PointMap, truth: Truth) -> tuple[F64, F64, F64]:
     """Surface samples that could be obstacle points: at least 0.3 m above the map's ground, where that is known."""
-    from mapvote.core.columns import GROUND_MARGIN_M, reference_window
-
     reference = reference_window(first_map, truth.grid_on(first_map.lattice))
     chosen = []
     for samples in truth.surfaces():
