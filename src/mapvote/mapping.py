@@ -98,7 +98,7 @@ class _Surveyor:
         self.ndt = settings.ndt.model_copy(update={"min_inlier_share": settings.mapping.min_inlier_share})
         self.ndt_map: NdtMap | None = None
         self.draft = VoxelCloud(Lattice())
-        """A thinned cloud of everything, for the ground that the second pass needs."""
+        """A cloud of everything, for the ground and the occupied voxels that the second pass needs."""
 
     def follow(self, drive: Drive, count: Callable[[], None]) -> tuple[F64, Bool]:
         """(poses (n, 4, 4), registered (n,)) of one drive, each scan entered once it is registered."""
@@ -135,7 +135,7 @@ class _Surveyor:
     def _enter(self, points_map: F64, position: F64) -> None:
         spread = thin(points_map - position, self.mapping.ndt_points_m)
         self._map_around(position).add(points_map[spread])
-        self.draft.add(points_map[spread])
+        self.draft.add(points_map)
 
 
 def settle(drives: Sequence[Drive], poses: list[F64], registered: list[Bool], settings: MappingSettings) -> list[F64]:

@@ -76,9 +76,9 @@ def test_rule_f_only_rays_at_the_height_of_the_new_thing_speak_against_it() -> N
     assert state({9: 100}, {4: 4}, rules="ABCDEG") == UE
 
 
-def test_rule_g_a_single_hit_is_not_enough() -> None:
-    assert state({}, {4: 1}) != CO
-    assert state({}, {4: 1}, rules="ABCDEF") == CO
+def test_rule_g_may_ask_for_more_than_a_single_hit() -> None:
+    assert state({}, {4: 1}, min_support=2) != CO
+    assert state({}, {4: 1}, min_support=2, rules="ABCDEF") == CO
 
 
 def test_rule_g_what_hardly_rises_above_the_ground_is_never_called_gone() -> None:

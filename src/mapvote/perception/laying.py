@@ -85,19 +85,26 @@ class Layer:
     def finish(self) -> PointMap:
         """The map of everything laid."""
         points, _ = self.cloud.points()
-        point_map = map_from_points(points[~self._trails(points)], lattice=self.draft.lattice)
+        points = points[~self._trails(points, self.draft)]
+        # Trails lift the draft's ground; above the true one stand the undersides of cars that had passed for ground.
+        points = points[~self._trails(points, map_from_points(points, lattice=self.draft.lattice))]
+        point_map = map_from_points(points, lattice=self.draft.lattice)
         tiles = {tile: replace(content, free=self._free(tile, point_map)) for tile, content in point_map.tiles.items()}
         return replace(point_map, tiles=tiles)
 
-    def _trails(self, points: F64) -> Bool:
-        """Which points (n, 3) lie in voxels that were struck in too few of the scans that could have struck them."""
+    def _trails(self, points: F64, ground: PointMap) -> Bool:
+        """Which points (n, 3) lie in voxels that were struck in too few of the scans that could have struck them.
+
+        Only points that stand above the ground of ``ground`` are judged.
+        """
         trail = np.zeros(len(points), dtype=np.bool_)
         rows, cols = self.draft.lattice.cells_of(points)
         for tile, planes in self.evidence.tiles.items():
             reference = reference_window(self.draft, tile_grid(self.draft.lattice, tile))
+            standing = reference_window(ground, reference.grid)
             r, c = rows - reference.grid.row0, cols - reference.grid.col0
             here = np.flatnonzero((r >= 0) & (r < TILE_CELLS) & (c >= 0) & (c < TILE_CELLS))
-            here = here[find_obstacles(points[here], reference)[0]]
+            here = here[find_obstacles(points[here], standing)[0]]
             r, c = r[here], c[here]
             bits = np.floor(points[here, 2] / CELL_SIZE).astype(np.int64) - reference.base[r, c]
             through, struck = _counts(planes, r, c, bits)

@@ -56,7 +56,7 @@ class TileVotes:
     new: U64
     """(256, 256) voxels whose points are new where the cell is changed-occupied."""
     free: U64 | None
-    """(256, 256) voxels seen to be free; None: not asked."""
+    """(256, 256) voxels seen to be free in cells where the map knew of none; None: not asked."""
 
 
 class PaperVoter:
@@ -106,6 +106,8 @@ class ColumnVoter:
             verdict = weigh(planes, here.occupied, near, known, low, self.voting)
             if verdict.tally.any():
                 free = free_words(planes, here.occupied)
+                if here.free is not None:
+                    free[here.free != 0] = 0  # what the map knows need not be sent
                 out[tile] = TileVotes(verdict.tally, verdict.states(), verdict.gone, verdict.new, free)
                 adrift[tile] = verdict.adrift
                 mapped[tile] = here.occupied
