@@ -70,7 +70,10 @@ class NothingMoves:
         return []
 
 
-def make(point_map: PointMap, settings: Settings | None = None, **more: Any) -> Vehicle:
+PAPER = Settings(voting=VotingSettings(method="paper"))
+
+
+def make(point_map: PointMap, settings: Settings = PAPER, **more: Any) -> Vehicle:
     given = {"localise": exactly, "movers": NothingMoves(), **more}
     return Vehicle("v1", SENSORS["hdl32e"], point_map, settings, **given)
 
@@ -131,7 +134,7 @@ def test_two_vehicles_with_the_same_scans_say_the_same_bytes() -> None:
 
 
 def test_several_voters_share_one_pass_and_one_stage_ballots_carry_the_tally() -> None:
-    plain = VotingSettings(skip_tall_cells=False)
+    plain = VotingSettings(method="paper", skip_tall_cells=False)
     column = plain.model_copy(update={"occlusion": "column"})
     scans = [scan_of(-1.0 + 0.1 * i, i) for i in range(4)]
     point_map = street_map()

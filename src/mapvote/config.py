@@ -99,7 +99,7 @@ Occlusion = Literal["first_hit", "farthest_return", "column"]
 class VotingSettings(Section):
     """The paper's rule, and which of its cases (paper III, V). ``method = "columns"`` is METHOD 4."""
 
-    method: Literal["paper", "columns"] = "paper"
+    method: Literal["paper", "columns"] = "columns"
     weighted: bool = Field(default=True, description="multiple votes per scan by Eq. (1); false: one vote per scan")
     two_stage: bool = Field(default=True, description="the vehicle decides its cells; false: it sends its tally")
     skip_tall_cells: bool = Field(default=True, description="case 5: no vote where the map begins above the view")
