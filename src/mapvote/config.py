@@ -89,7 +89,7 @@ class MappingSettings(Section):
     link_sigma_deg: float = Field(default=0.01, description="the same, rotation")
     revisit_m: float = Field(default=10.0, description="a scan this near to a much older one is linked to it")
     trail_min_through: int = Field(default=3, description="scans that saw through a voxel before it can be a trail")
-    trail_share: float = Field(default=0.3, description="a voxel struck in fewer of the scans able to is a trail")
+    trail_share: float = Field(default=0.45, description="a voxel struck in fewer of the scans able to is a trail")
     revisit_s: float = Field(default=10.0, description="and much older means this, within a drive")
 
 
@@ -118,7 +118,7 @@ class VotingSettings(Section):
         default="ABCDEFGH", pattern=r"^A?B?C?D?E?F?G?H?$", description="columns: which of its rules hold (ablation)"
     )
     empty_votes: float = Field(
-        default=0.05, description="columns, F: votes of a ray through a voxel, against one for a hit in it"
+        default=0.1, description="columns, F: votes of a ray through a voxel, against one for a hit in it"
     )
     gone_votes: float = Field(
         default=0.125, description="columns, E: votes of a ray through a mapped voxel, against one for a hit near it"
@@ -129,7 +129,7 @@ class VotingSettings(Section):
     fall_cells: int = Field(default=15, description="columns, H: how far what is gone takes unseen cells with it")
     min_scans: int = Field(default=1, description="columns, G: scans that must have hit a new voxel")
     min_support: int = Field(
-        default=2, description="columns, G: hits (scans by voxels) that make a cell changed-occupied"
+        default=1, description="columns, G: hits (scans by voxels) that make a cell changed-occupied"
     )
     min_height_m: float = Field(
         default=0.6, description="columns, G: a cell whose map rises no higher than this is never changed-empty"
