@@ -28,6 +28,7 @@ def main() -> None:
     parser.add_argument("--scenario", default="paper", help="a scenario's name or file (default paper)")
     parser.add_argument("--seeds", default="2,3,4,5,6", help="comma-separated (default 2,3,4,5,6)")
     parser.add_argument("--experiments", help=f"comma-separated, of: {', '.join(EXPERIMENTS)} (default all)")
+    parser.add_argument("--cases", help='instead of all, in main and liars: "1,1 column,columns" takes half the time')
     parser.add_argument("--out", type=Path, default=Path("out/matrix"))
     parser.add_argument("--cache", type=Path, default=default_cache(), help="where drives, maps and ballots are kept")
     parser.add_argument("--config", type=Path, help="settings (TOML)")
@@ -42,7 +43,12 @@ def main() -> None:
         parser.error(f"no experiment {unknown[0]!r}; choose from {', '.join(EXPERIMENTS)}")
     console = Console(width=220)
     matrix = Matrix(
-        arguments.scenario, seeds, arguments.cache, load_settings(arguments.config), workers=arguments.workers
+        arguments.scenario,
+        seeds,
+        arguments.cache,
+        load_settings(arguments.config),
+        workers=arguments.workers,
+        cases=arguments.cases,
     )
     results: dict[str, dict[int, dict[str, Any]]] = {}
     for name in names:
@@ -54,7 +60,8 @@ def main() -> None:
             if arguments.drop_drives:
                 matrix.drop_drives(names, seed)
             write(results, arguments.out)
-    console.print((arguments.out / "matrix.md").read_text(), markup=False)
+    print(demands.table(results))
+    print(f"{arguments.out / 'matrix.md'}: every table; matrix.json beside it: all numbers")
 
 
 def write(results: dict[str, dict[int, dict[str, Any]]], out: Path) -> None:
