@@ -173,6 +173,24 @@ def test_odd_keys_are_refused(site: Site, key: str) -> None:
     assert answer.status_code in (400, 401, 431)
 
 
+@pytest.mark.parametrize(
+    ("path", "body"),
+    [
+        ("rollback", {"to": 1 << 80}),
+        ("rollback", {"to": 1, "reason": "a\x00b"}),
+        ("publish", {"parent": -(1 << 64)}),
+        ("publish", {"reason": "a\nb"}),
+        ("publish", {"reason": "a" * 201}),
+        ("publish", {"no such thing": 1}),
+    ],
+)
+def test_an_operators_slip_is_422(site: Site, path: str, body: dict[str, Any]) -> None:
+    headers = {"Authorization": f"Bearer {site.operator}"}
+    before = site.state()
+    assert httpx2.post(f"{site.url}/v1/{path}", json=body, headers=headers).status_code == 422
+    assert site.state() == before
+
+
 def schemathesis(site: Site, examples: int) -> None:
     """Generated requests against the OpenAPI document: what is answered must be what is declared, and never a 500."""
     program = Path(sys.executable).parent / "schemathesis"

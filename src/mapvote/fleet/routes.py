@@ -23,6 +23,11 @@ from mapvote.fleet.limits import read_body
 from mapvote.fleet.publish import publish, rollback
 from mapvote.fleet.store import Manifest, Store
 
+_LEAST, _MOST = -(1 << 31), (1 << 31) - 1
+"""What a database can compare a version's number with."""
+_PLAIN = r"^[^\x00-\x1f]*$"
+"""No control characters: PostgreSQL stores no NUL."""
+
 
 class Problem(BaseModel):
     """What went wrong, and how to mend it."""
@@ -45,8 +50,10 @@ class PublishAsk(BaseModel):
     model_config = ConfigDict(extra="forbid")
     dry_run: bool = False
     override: bool = Field(default=False, description="publish in spite of the reasons to hold it")
-    parent: int | None = Field(default=None, description="only if this is still the newest version")
-    reason: str = Field(default="", max_length=200)
+    parent: int | None = Field(
+        default=None, ge=_LEAST, le=_MOST, description="only if this is still the newest version"
+    )
+    reason: str = Field(default="", max_length=200, pattern=_PLAIN)
     min_votes: int | None = Field(default=None, ge=1, le=1000, description="instead of the server's setting")
 
 
@@ -65,8 +72,8 @@ class RollbackAsk(BaseModel):
     """Which version shall be the map again."""
 
     model_config = ConfigDict(extra="forbid")
-    to: int
-    reason: str = Field(default="", max_length=200)
+    to: int = Field(ge=_LEAST, le=_MOST)
+    reason: str = Field(default="", max_length=200, pattern=_PLAIN)
 
 
 def _problems(*codes: int) -> dict[int | str, dict[str, Any]]:
