@@ -88,6 +88,14 @@ def test_rule_g_what_hardly_rises_above_the_ground_is_never_called_gone() -> Non
     assert state({}, {1: 40}, occupied=0b10, low=True) == UO
 
 
+def test_rule_h_a_roof_that_hardly_any_ray_reached_is_adrift_and_one_that_was_struck_is_not() -> None:
+    below = dict.fromkeys(range(1, 20), 30)
+    assert judge(below, {}, occupied=1 << 20).adrift[0, 0]
+    assert judge({**below, 20: 3}, {}, occupied=1 << 20).adrift[0, 0]
+    assert not judge({**below, 20: 3}, {20: 1}, occupied=1 << 20).adrift[0, 0]
+    assert not judge({**below, 20: 30}, {}, occupied=1 << 20).adrift[0, 0]  # seen through clearly: gone by itself
+
+
 def test_a_wall_keeps_its_voxels_when_the_awning_above_it_is_taken_down() -> None:
     verdict = judge({9: 30, 10: 30}, {2: 40, 3: 40}, occupied=0b110_0000_1100)
     assert verdict.states()[0, 0] == UO

@@ -30,7 +30,7 @@ class Verdict:
     new: U64
     """(rows, cols) voxels of new surface, should it be changed-occupied."""
     adrift: Bool
-    """(rows, cols) mapped cells whose voxels no ray reached, while rays passed under them (rule H)."""
+    """(rows, cols) mapped cells whose voxels no ray struck and hardly any reached, while rays passed below (rule H)."""
 
     def states(self) -> U8:
         return decide(self.tally)
@@ -86,11 +86,11 @@ def _weigh(
                 found, refuted, new[r, c] = 0, 0, 0
             else:  # a new thing's upper parts, where the map knew nothing, come with it
                 new[r, c] |= beyond
-            if mapped and not (kept or lost):
-                under = (mapped & (~mapped + np.uint64(1))) - np.uint64(1)  # below the lowest voxel
-                adrift[r, c] = 2 * _ones(under & through) >= _ones(under) > 0
             if low[r, c] or clear < clear_share * rays:
                 lost = 0  # hardly ever seen through: foliage, or the end of the view
+            if mapped and not (kept or lost or low[r, c]):
+                under = (mapped & (~mapped + np.uint64(1))) - np.uint64(1)  # below the lowest voxel
+                adrift[r, c] = 2 * _ones(under & through) >= _ones(under) > 0
             if lost and not kept:
                 gone[r, c] |= mapped & ~struck  # what no ray reached goes with what it stood on
             votes = tally[r, c]
