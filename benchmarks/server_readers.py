@@ -12,6 +12,7 @@ from __future__ import annotations
 import argparse
 import asyncio
 import json
+import random
 import sys
 import tempfile
 import time
@@ -75,7 +76,7 @@ class Seen:
     hashes: dict[int, frozenset[str]] = field(default_factory=dict)
 
 
-async def read_until(address: tuple[str, int], done: asyncio.Event, seen: Seen) -> None:
+async def read_until(address: tuple[str, int], done: asyncio.Event, seen: Seen, pause_s: float) -> None:
     """Fetch the manifest again and again; SystemExit if one version ever shows two faces."""
     while not done.is_set():
         start = time.perf_counter()
@@ -88,18 +89,19 @@ async def read_until(address: tuple[str, int], done: asyncio.Event, seen: Seen) 
         if seen.hashes.setdefault(manifest["version"], hashes) != hashes:
             raise SystemExit(f"version {manifest['version']} is a mixture: two readers saw different tiles")
         seen.versions[manifest["version"]] += 1
+        await asyncio.sleep(random.uniform(0.0, 2.0 * pause_s))
 
 
-async def publish_while_read(address: tuple[str, int], readers: int) -> tuple[Seen, float]:
+async def publish_while_read(address: tuple[str, int], readers: int, pause_s: float) -> tuple[Seen, float]:
     seen, done = Seen(), asyncio.Event()
-    reading = [asyncio.create_task(read_until(address, done, seen)) for _ in range(readers)]
-    await asyncio.sleep(1.0)
+    reading = [asyncio.create_task(read_until(address, done, seen, pause_s)) for _ in range(readers)]
+    await asyncio.sleep(2.0 * pause_s + 1.0)
     start = time.perf_counter()
     status, content = await ask(address, "POST", "/v1/publish", b'{"override": true}')
     took = time.perf_counter() - start
     if status != 200 or not json.loads(content)["published"]:
         raise SystemExit(f"publish: {status} {content[:300]!r}")
-    await asyncio.sleep(1.0)
+    await asyncio.sleep(2.0 * pause_s + 1.0)
     done.set()
     await asyncio.gather(*reading)
     return seen, took
@@ -112,7 +114,7 @@ async def publish_at_once(address: tuple[str, int], publishers: int) -> Counter[
     return Counter([status for status, _ in await asyncio.gather(*asked)])
 
 
-def with_readers(store_name: str, url: str, tiles: int, readers: int, folder: Path) -> dict[str, Any]:
+def with_readers(store_name: str, url: str, tiles: int, readers: int, pause_s: float, folder: Path) -> dict[str, Any]:
     """One publish of ``tiles`` tiles while ``readers`` read."""
     point_map = big_map(tiles)
     store = Store.create(url, point_map)
@@ -120,13 +122,14 @@ def with_readers(store_name: str, url: str, tiles: int, readers: int, folder: Pa
     store.close()
     with serving(store_name, log=folder / "log") as (address, _):
         host, port = address.removeprefix("http://").split(":")
-        seen, took = asyncio.run(publish_while_read((host, int(port)), readers))
+        seen, took = asyncio.run(publish_while_read((host, int(port)), readers, pause_s))
     if set(seen.versions) != {1, 2} or seen.hashes[1] & seen.hashes[2]:
         raise SystemExit(f"readers saw versions {dict(seen.versions)}; every tile should differ between 1 and 2")
     p50, p99 = np.percentile(seen.waits_s, [50, 99])
     return {
         "tiles": tiles,
         "readers": readers,
+        "pause_s": pause_s,
         "publish_s": round(took, 2),
         "manifests_read": len(seen.waits_s),
         "mixtures": 0,
@@ -154,19 +157,20 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--tiles", type=int, default=1000)
     parser.add_argument("--readers", type=int, default=100)
+    parser.add_argument("--pause", type=float, default=2.0, help="seconds between a reader's requests, on average")
     parser.add_argument("--database", choices=("sqlite", "postgresql"), default="sqlite")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         if options.database == "sqlite":
             big, small = str(folder / "big.db"), str(folder / "small.db")
-            found = with_readers(big, f"sqlite:///{big}", options.tiles, options.readers, folder)
+            found = with_readers(big, f"sqlite:///{big}", options.tiles, options.readers, options.pause, folder)
             rivals = with_rivals(small, f"sqlite:///{small}", folder)
         else:
             cluster = PostgresCluster()
             try:
                 big, small = cluster.create("big"), cluster.create("small")
-                found = with_readers(big, big, options.tiles, options.readers, folder)
+                found = with_readers(big, big, options.tiles, options.readers, options.pause, folder)
                 rivals = with_rivals(small, small, folder)
             finally:
                 cluster.close()
