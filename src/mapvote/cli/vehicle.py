@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -11,6 +12,8 @@ from mapvote.cli.options import Config, Mount, Prior, Rate, Scans, SensorName, T
 
 if TYPE_CHECKING:
     from mapvote.core.ballot import Ballot
+    from mapvote.core.types import PointMap
+    from mapvote.fleet.client import MapClient
     from mapvote.mapping import BuildReport
     from mapvote.vehicle import DriveReport
 
@@ -72,8 +75,10 @@ def _tell(report: BuildReport, out: Path) -> None:
 
 def vote(
     drive_path: Annotated[Path, typer.Argument(help="one drive of a place that the map shows", metavar="DRIVE")],
-    map_path: Annotated[Path, typer.Option("--map", help="map folder, PCD file or Autoware folder")],
-    out: Annotated[Path, typer.Option(help="the ballot to write")],
+    where: Annotated[str, typer.Option("--map", help="map folder, PCD file, Autoware folder, or a server's URL")],
+    out: Annotated[Path | None, typer.Option(help="the ballot to write")] = None,
+    send: Annotated[str | None, typer.Option(metavar="URL", help="send it there; kept for later if away")] = None,
+    key: Annotated[str | None, typer.Option(envvar="MAPVOTE_KEY", help="the vehicle's key at that server")] = None,
     vehicle: Vehicle = None,
     case: Annotated[
         str | None, typer.Option(help="columns, or the paper's case 1 to 5; default: the settings' [voting]")
@@ -97,6 +102,8 @@ def vote(
     from mapvote.formats.whole import whole_file
     from mapvote.vehicle import GivenPoses, vote_drive
 
+    if out is None and send is None:
+        raise MapvoteError("vote: say where the ballot goes: --out FILE, --send URL, or both")
     settings, _ = load_with_sources(config)
     if case is not None:
         settings = choose_case(settings, case)
@@ -108,23 +115,49 @@ def vote(
         if drive.T_map_lidar_prior is None:
             raise MapvoteError(f"{drive_path}: has no prior to trust; give one with --prior, or let it be localised")
         localise = GivenPoses(drive.stamps_ns, drive.T_map_lidar_prior)
-    point_map = read_map(map_path)
+    point_map = _fetch(where, key) if "://" in where else read_map(where)
     with Progress(transient=True) as bar:
         task = bar.add_task("voting", total=len(drive))
         ballot, report = vote_drive(
             drive, point_map, settings, localise=localise, progress=lambda done, _: bar.update(task, completed=done)
         )
     data = encode(ballot)
-    with whole_file(out) as partial:
-        partial.write_bytes(data)
+    if out is not None:
+        with whole_file(out) as partial:
+            partial.write_bytes(data)
     _tell_votes(ballot, report, out, len(data))
+    if send is not None:
+        _send(send, key, data)
 
 
-def _tell_votes(ballot: Ballot, report: DriveReport, out: Path, size: int) -> None:
+def _client(url: str, key: str | None) -> MapClient:
+    from mapvote.fleet.client import MapClient
+
+    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    return MapClient(url, key=key, home=cache / "mapvote")
+
+
+def _fetch(url: str, key: str | None) -> PointMap:
+    with _client(url, key) as client:
+        return client.fetch()
+
+
+def _send(url: str, key: str | None, data: bytes) -> None:
+    """Send what waits in the spool, then this ballot."""
+    with _client(url, key) as client:
+        for name, result in client.flush().items():
+            typer.echo(f"{name} from the spool: {result}")
+        result = client.send(data)
+    typer.echo(
+        f"{url}: {result}" if result != "spooled" else f"{url} is away: the ballot waits, the next vote sends it"
+    )
+
+
+def _tell_votes(ballot: Ballot, report: DriveReport, out: Path | None, size: int) -> None:
     typer.echo(
         f"{ballot.vehicle}: {ballot.scans_localised} of {ballot.scans} scans localised "
         f"(median sigma {ballot.median_sigma_m:.3f} m), the others abstain"
     )
     stages = ", ".join(f"{stage} {1000.0 * sorted(s)[len(s) // 2]:.1f}" for stage, s in report.stage_s.items())
     typer.echo(f"milliseconds a scan (median): {stages}")
-    typer.echo(f"{out}: {len(ballot.tiles)} tiles, {size / 1000.0:.1f} kB")
+    typer.echo(f"{out or 'ballot'}: {len(ballot.tiles)} tiles, {size / 1000.0:.1f} kB")
