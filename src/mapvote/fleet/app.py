@@ -145,7 +145,7 @@ def create_app(
         yield
         await app.state.batcher.close()
         if own is not None:
-            own.shutdown()
+            own.shutdown(cancel_futures=True)
 
     app = FastAPI(
         title="mapvote",
