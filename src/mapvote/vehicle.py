@@ -17,9 +17,9 @@ import numpy as np
 
 from mapvote.config import Settings, VotingSettings
 from mapvote.core.ballot import Ballot, BallotTile, content_hash, pack_plane, tile_key
-from mapvote.core.columns import cut_reference, dilated, reference_window
+from mapvote.core.columns import Surroundings, dilated, reference_window
 from mapvote.core.geometry import transform
-from mapvote.core.grid import TILE_CELLS, TileIndex, tile_grid, window_around
+from mapvote.core.grid import TileIndex, tile_grid
 from mapvote.core.sensors import Sensor
 from mapvote.core.types import (
     F64,
@@ -150,7 +150,8 @@ class Vehicle:
         self._panel = Panel([_counts_as(voting) for voting in votings], sensor, point_map)
         self._new_points = NewPoints(point_map.lattice)
         self._waiting: deque[_Waiting] = deque()
-        self._around: tuple[Reference, U64] | None = None
+        self._surroundings = Surroundings(point_map, self.settings.voting.window_m)
+        self._near: tuple[Reference, U64] | None = None
         self._stamps_ns: list[int] = []
 
     def observe(self, scan: Scan, T_map_lidar_prior: F64 | None = None) -> None:
@@ -192,15 +193,10 @@ class Vehicle:
 
     def _reference_at(self, origin_map: F64) -> tuple[Reference, U64]:
         """The partial reference map R_i, the 80 m window around the sensor, and what its voxels explain."""
-        lattice = self.point_map.lattice
-        window = window_around(lattice, origin_map[0], origin_map[1], self.settings.voting.window_m)
-        if self._around is None or window.intersection(self._around[0].grid) != window:
-            row, col = window.row0 + window.rows // 2, window.col0 + window.cols // 2
-            centre = tile_grid(lattice, (row // TILE_CELLS, col // TILE_CELLS))
-            around = reference_window(self.point_map, centre.padded(max(TILE_CELLS, window.rows)))
-            self._around = around, dilated(around.occupied, around.base, 1)
-        around, near = self._around
-        return cut_reference(around, window), near[window.slices_in(around.grid)]
+        reference, outer = self._surroundings.at(origin_map)
+        if self._near is None or self._near[0] is not outer:
+            self._near = outer, dilated(outer.occupied, outer.base, 1)
+        return reference, self._near[1][reference.grid.slices_in(outer.grid)]
 
     def ballot(self, voting: VotingSettings | None = None) -> Ballot:
         """What this vehicle says so far, by the voter with these settings (default: the first).

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Grid, tile_grid
+from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Grid, tile_grid, window_around
 from mapvote.core.points import _lower_envelope
 from mapvote.core.types import F32, F64, I32, I64, U64, PointMap, Reference
 
@@ -128,6 +128,25 @@ def cut_reference(outer: Reference, window: Grid) -> Reference:
         outer.top_z[cut],
         None if outer.free is None else outer.free[cut],
     )
+
+
+class Surroundings:
+    """The reference around a vehicle on the move: laid out over the tiles about it, anew only when it has left them."""
+
+    def __init__(self, point_map: PointMap, window_m: float) -> None:
+        self.point_map, self.window_m = point_map, window_m
+        self.outer: Reference | None = None
+        """The planes last laid out; windows are views into them."""
+
+    def at(self, origin_map: F64) -> tuple[Reference, Reference]:
+        """(the partial reference map R_i, ``window_m`` wide around ``origin_map`` (3,); the planes it is cut from)."""
+        lattice = self.point_map.lattice
+        window = window_around(lattice, origin_map[0], origin_map[1], self.window_m)
+        if self.outer is None or window.intersection(self.outer.grid) != window:
+            row, col = window.row0 + window.rows // 2, window.col0 + window.cols // 2
+            centre = tile_grid(lattice, (row // TILE_CELLS, col // TILE_CELLS))
+            self.outer = reference_window(self.point_map, centre.padded(max(TILE_CELLS, window.rows)))
+        return cut_reference(self.outer, window), self.outer
 
 
 def map_points(window: Grid, tile_points: F32) -> F64:

@@ -16,9 +16,9 @@ import numpy as np
 from scipy import ndimage
 
 from mapvote.config import Settings
-from mapvote.core.columns import TOP_BIT, cut_reference, reference_window, shifted
+from mapvote.core.columns import TOP_BIT, Surroundings, reference_window, shifted
 from mapvote.core.geometry import transform
-from mapvote.core.grid import CELL_SIZE, TILE_CELLS, TileIndex, tile_grid, window_around
+from mapvote.core.grid import CELL_SIZE, TILE_CELLS, TileIndex, tile_grid
 from mapvote.core.tiling import map_from_points
 from mapvote.core.types import F64, I32, I64, U64, Bool, Drive, PointMap, Reference
 from mapvote.core.voxels import VoxelCloud
@@ -49,7 +49,7 @@ class Layer:
         self.draft, self.settings = draft, settings
         self.cloud = VoxelCloud(draft.lattice)
         self.evidence = Evidence(draft.lattice)
-        self._around: Reference | None = None
+        self._surroundings = Surroundings(draft, settings.voting.window_m)
 
     def lay(self, drive: Drive, T_map_lidar: F64, registered: Bool, count: Callable[[], None]) -> None:
         """Enter every registered scan of one drive at its pose (n, 4, 4). ``count`` is called after each scan read."""
@@ -59,7 +59,7 @@ class Layer:
             if registered[i]:
                 points = deskew(scan, motion_at(drive.stamps_ns, T_map_lidar, i))
                 points_map, origin_map = transform(T_map_lidar[i], points), T_map_lidar[i, :3, 3].copy()
-                reference = self._reference_at(origin_map)
+                reference, _ = self._surroundings.at(origin_map)
                 obstacle, cell = find_obstacles(points_map, reference)
                 waiting.append(_Waiting(points_map, origin_map, obstacle, cell, reference))
                 for _, moving in movers.push(points_map, origin_map, obstacle, scan.stamp_ns):
@@ -72,15 +72,6 @@ class Layer:
         self.cloud.add(scan.points_map, moving | _beneath(scan, moving))
         view = see(scan.points_map, scan.origin_map, scan.obstacle, moving, scan.reference, scan.cell)
         self.evidence.add(view, scan.reference)
-
-    def _reference_at(self, origin_map: F64) -> Reference:
-        lattice = self.draft.lattice
-        window = window_around(lattice, origin_map[0], origin_map[1], self.settings.voting.window_m)
-        if self._around is None or window.intersection(self._around.grid) != window:
-            row, col = window.row0 + window.rows // 2, window.col0 + window.cols // 2
-            centre = tile_grid(lattice, (row // TILE_CELLS, col // TILE_CELLS))
-            self._around = reference_window(self.draft, centre.padded(max(TILE_CELLS, window.rows)))
-        return cut_reference(self._around, window)
 
     def finish(self) -> PointMap:
         """The map of everything laid."""
