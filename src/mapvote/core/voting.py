@@ -6,6 +6,8 @@ not depend on their order. A decided ballot is a one-hot tally; the server alway
 
 from __future__ import annotations
 
+from typing import Any
+
 import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,6 +16,7 @@ from mapvote.core.types import I32, N_STATES, NO_VOTE, U8, U16, CellState
 
 VOTE_UNIT = 16
 """One vote in the units of a tally: Eq. (1) is rounded to sixteenths."""
+_UO, _UE, _CO, _CE, _UN = (int(state) for state in CellState)
 
 
 def vote_weight(n: ArrayLike, a: float = 2.0, b: float = 3.0, k: float = 0.5, n_min: int = 5) -> NDArray[np.float64]:
@@ -44,35 +47,57 @@ def cast(tally: I32, states: U8, weights: I32) -> None:
                 tally[r, c, states[r, c]] += weights[r, c]
 
 
-def decide(tally: I32) -> U8:
-    """The class with most votes; ties are UNDETERMINED, no votes at all NO_VOTE (paper III-B, IV).
+@numba.njit(cache=True, nogil=True)
+def verdict(uo: int, ue: int, co: int, ce: int, un: int, abstain: bool) -> int:
+    """The rule: the class with most votes wins, a tie is UNDETERMINED, no votes are NO_VOTE (paper III-B, IV).
 
-    ``tally`` (..., 5) -> states (...) uint8.
+    Votes by :class:`CellState`. With ``abstain``, UNDETERMINED does not compete, and a change also needs more than
+    half of all other votes (DESIGN 4, "enough votes").
     """
-    best = tally.max(axis=-1)
-    winners = (tally == best[..., None]).sum(axis=-1)
-    states = np.asarray(tally.argmax(axis=-1), dtype=np.uint8)
-    states[winners > 1] = CellState.UNDETERMINED
-    states[best <= 0] = NO_VOTE
+    best = max(max(uo, ue), max(co, ce))
+    if not abstain:
+        best = max(best, un)
+    if best <= 0:
+        return _UN if un > 0 else NO_VOTE
+    ties = int(uo == best) + int(ue == best) + int(co == best) + int(ce == best) + int(un == best and not abstain)
+    if ties > 1:
+        return _UN
+    short = abstain and 2 * best <= uo + ue + co + ce
+    if co == best:
+        return _UN if short else _CO
+    if ce == best:
+        return _UN if short else _CE
+    return _UO if uo == best else _UE if ue == best else _UN
+
+
+@numba.njit(cache=True, nogil=True)
+def decide_cells(tally: NDArray[Any], backers: NDArray[Any], abstain: bool, min_votes: int) -> U8:
+    """:func:`verdict` of every cell; a change that fewer than ``min_votes`` back is UNDETERMINED. Numbers of any type.
+
+    ``tally`` (5, cells); ``backers`` (5, cells) in the same units as ``min_votes`` -> (cells,) uint8.
+    """
+    states = np.empty(tally.shape[1], dtype=np.uint8)
+    for c in range(tally.shape[1]):
+        s = verdict(
+            np.int64(tally[0, c]), np.int64(tally[1, c]), np.int64(tally[2, c]), np.int64(tally[3, c]),
+            np.int64(tally[4, c]), abstain,
+        )  # fmt: skip
+        if s in (_CO, _CE) and backers[s, c] < min_votes:
+            s = _UN
+        states[c] = s
     return states
+
+
+def decide(tally: I32) -> U8:
+    """:func:`verdict` where UNDETERMINED competes: ``tally`` (..., 5) -> states (...) uint8."""
+    planes = tally.reshape(-1, N_STATES).T
+    return decide_cells(planes, planes, False, 0).reshape(tally.shape[:-1])
 
 
 def decide_change(tally: I32, min_votes: int = 1) -> U8:
-    """As :func:`decide`, but UNDETERMINED abstains, and a change also needs a majority of the vehicles that
-    determined the cell and ``min_votes`` of them (DESIGN 4, "enough votes"). For one-hot tallies.
-
-    A cell for which only UNDETERMINED was voted is UNDETERMINED; a change short of votes is UNDETERMINED.
-    """
-    determined = tally.copy()
-    determined[..., CellState.UNDETERMINED] = 0
-    states = decide(determined)
-    states[(states == NO_VOTE) & (tally[..., CellState.UNDETERMINED] > 0)] = CellState.UNDETERMINED
-    total = determined.sum(axis=-1)
-    for change in (CellState.CHANGED_OCCUPIED, CellState.CHANGED_EMPTY):
-        votes = tally[..., change]
-        short = (votes < min_votes * VOTE_UNIT) | (2 * votes <= total)
-        states[(states == change) & short] = CellState.UNDETERMINED
-    return states
+    """:func:`verdict` where UNDETERMINED abstains, and a change needs ``min_votes`` votes. For one-hot tallies."""
+    planes = tally.reshape(-1, N_STATES).T
+    return decide_cells(planes, planes, True, min_votes * VOTE_UNIT).reshape(tally.shape[:-1])
 
 
 def one_hot(states: U8) -> I32:
@@ -84,28 +109,28 @@ def one_hot(states: U8) -> I32:
 
 
 @numba.njit(cache=True, nogil=True)
-def count_votes(states: U8) -> I32:
-    """The sum of ``one_hot(states[v])`` over voters v without building any of them: the server's hot loop.
+def add_states(states: U8, tally: NDArray[Any]) -> None:
+    """Add one voter's decided ``states`` (cells,) to ``tally`` (5, cells), a vote each: the server's hot loop.
 
-    ``states`` (voters, cells) uint8, C-contiguous -> (cells, 5) int32. Blocks of cells stay in the first cache.
+    The same as adding ``one_hot(states)``, plane by plane, which the compiler turns into vector instructions.
     """
-    voters, cells = states.shape
-    tally = np.empty((cells, N_STATES), dtype=np.int32)
-    block = 2048
-    counts = np.empty((N_STATES, block), dtype=np.uint16)
-    for start in range(0, cells, block):
-        width = min(block, cells - start)
-        counts[:, :] = 0
-        for v in range(voters):
-            row = states[v, start : start + width]
-            for state in range(N_STATES):
-                plane = counts[state]
-                for c in range(width):
-                    plane[c] += np.uint16(row[c] == state)
-        for c in range(width):
-            for state in range(N_STATES):
-                tally[start + c, state] = np.int32(counts[state, c]) * VOTE_UNIT
-    return tally
+    for state in range(N_STATES):
+        plane = tally[state]
+        for c in range(len(states)):
+            plane[c] += VOTE_UNIT * (states[c] == state)
+
+
+@numba.njit(cache=True, nogil=True)
+def add_tally(votes: U16, abstain: bool, tally: I32, backers: I32) -> None:
+    """Add one voter's tally ``votes`` (5, cells) to ``tally`` (5, cells), and one to ``backers`` (5, cells) for the
+    class that its own votes decide: who counted a class now and then does not stand behind it."""
+    for c in range(votes.shape[1]):
+        uo, ue, co, ce, un = votes[0, c], votes[1, c], votes[2, c], votes[3, c], votes[4, c]
+        state = verdict(np.int64(uo), np.int64(ue), np.int64(co), np.int64(ce), np.int64(un), abstain)
+        if state != NO_VOTE:
+            backers[state, c] += 1
+            for k in range(N_STATES):
+                tally[k, c] += votes[k, c]
 
 
 def to_wire(tally: I32) -> U16:

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from mapvote.core.ballot import content_hash
 from mapvote.core.grid import TILE_CELLS, Grid
 from mapvote.core.types import F32, I64, U64, Bool, MapTile, MapvoteError
-from mapvote.fleet.edit import CELLS, cells_of
+from mapvote.fleet.edit import cells_of
+from mapvote.fleet.words import CELLS
 
 _ZSTD_LEVEL = 3
 _MAX_POINTS_BYTES = CELLS * 64 * 12 * 4

@@ -10,8 +10,7 @@ import numpy as np
 from mapvote.core.columns import GROUND_MARGIN_M, TOP_BIT, base_layers, map_points
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Grid
 from mapvote.core.types import F32, F64, I32, I64, U64, Bool, MapTile
-
-CELLS = TILE_CELLS * TILE_CELLS
+from mapvote.fleet.words import CELLS
 
 
 def empty_tile() -> MapTile:
@@ -73,9 +72,15 @@ def add_points(tile: MapTile, grid: Grid, points: F32, cells: I64, voters: I32, 
     a voxel with a point in it or in the voxel above or below. Voxels that already hold a point of the map stay as
     they are. New points follow the old ones, ordered by cell and height.
     """
+    if not len(points):
+        return tile, 0
     layers = np.floor(points[:, 2].astype(np.float64) / CELL_SIZE).astype(np.int64)
-    own_layers = np.floor(tile.points[:, 2].astype(np.float64) / CELL_SIZE).astype(np.int64)
-    taken = np.isin(_voxel(cells, layers), _voxel(cells_of(grid, tile.points), own_layers))
+    touched = np.zeros(CELLS, dtype=np.bool_)
+    touched[cells] = True
+    own_cells = cells_of(grid, tile.points)
+    near = touched[own_cells]
+    own_layers = np.floor(tile.points[near, 2].astype(np.float64) / CELL_SIZE).astype(np.int64)
+    taken = np.isin(_voxel(cells, layers), _voxel(own_cells[near], own_layers))
     order = np.lexsort((points[:, 2], points[:, 1], points[:, 0], layers, cells))
     chosen = _representatives(
         points[order].astype(np.float64), cells[order], layers[order], voters[order], taken[order], min_votes

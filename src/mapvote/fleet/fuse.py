@@ -8,15 +8,17 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, Protocol, TypeVar
+from typing import Any, Literal, Protocol, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mapvote.config import FuseSettings
 from mapvote.core.grid import TILE_CELLS, Grid, Lattice, TileIndex, tile_grid
 from mapvote.core.types import F32, I32, I64, N_STATES, NO_VOTE, U8, U16, U64, Bool, CellState, MapTile
-from mapvote.core.voting import VOTE_UNIT, count_votes, decide, decide_change
-from mapvote.fleet.edit import CELLS, add_points, cells_of, delete_points, empty_tile, obstacle_bits
+from mapvote.core.voting import VOTE_UNIT, add_states, add_tally, decide_cells
+from mapvote.fleet.edit import add_points, cells_of, delete_points, empty_tile, obstacle_bits
+from mapvote.fleet.words import CELLS, Words, at_least, union
 
 Rule = Literal["paper", "columns"]
 DAY_NS = 86_400_000_000_000
@@ -35,12 +37,12 @@ class TileVote:
     """(256, 256): two-stage."""
     tally: U16 | None = None
     """(256, 256, 5): one-stage."""
-    gone: U64 | None = None
-    """(256, 256) column words to delete where the vote is changed-empty; None: the whole column above ground."""
+    gone: Words | None = None
+    """Column words to delete where the vote is changed-empty; None: the whole column above ground."""
     new_points: F32 | None = None
     """(m, 3) from the tile's corner; used only where the vote is changed-occupied."""
-    free: U64 | None = None
-    """(256, 256) column words that rays passed through."""
+    free: Words | None = None
+    """Column words that rays passed through."""
 
     def spoken(self) -> Bool:
         """(256, 256) where this vote says anything at all."""
@@ -49,12 +51,20 @@ class TileVote:
         assert self.tally is not None
         return np.asarray(self.tally.any(axis=-1))
 
-    def supports(self, change: CellState) -> Bool:
-        """(256, 256) where this vote is, or in one stage also counts, for ``change``."""
+    def supports(self, change: CellState, cells: NDArray[np.intp]) -> Bool:
+        """(n,) at which of the flat ``cells`` this vote is, or in one stage also counts, for ``change``."""
         if self.states is not None:
-            return self.states == change
+            return np.asarray(self.states.reshape(-1)[cells] == int(change))
         assert self.tally is not None
-        return self.tally[..., change] > 0
+        return np.asarray(self.tally[cells // TILE_CELLS, cells % TILE_CELLS, int(change)] > 0)
+
+    def deletes(self, among: Bool) -> Words:
+        """The voxels that this vote says are gone, of the (256, 256) cells ``among``."""
+        if self.gone is not None:
+            marked = self.gone.within(among)
+            return marked.at(self.supports(CellState.CHANGED_EMPTY, marked.cells))
+        cells = np.flatnonzero(among)
+        return Words.whole(cells[self.supports(CellState.CHANGED_EMPTY, cells)])
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,8 +73,8 @@ class Decision:
 
     states: U8
     """(256, 256) CellState or NO_VOTE."""
-    tally: I32
-    """(256, 256, 5) in VOTE_UNITs."""
+    tally: NDArray[Any]
+    """(256, 256, 5) in VOTE_UNITs, see :func:`count`."""
     vehicles: int
     added: int
     """Points added to the tile."""
@@ -108,7 +118,7 @@ def restrict(vote: TileVote, counts: Bool | None) -> TileVote:
         vote,
         states=None if vote.states is None else np.where(counts, vote.states, np.uint8(NO_VOTE)),
         tally=None if vote.tally is None else np.where(counts[..., None], vote.tally, np.uint16(0)),
-        free=None if vote.free is None else np.where(counts, vote.free, np.uint64(0)),
+        free=None if vote.free is None else vote.free.within(counts),
     )
 
 
@@ -126,8 +136,7 @@ def fold(drives: Sequence[TileVote], grid: Grid) -> TileVote:
         source[drive.spoken()] = i
     states = None if ordered[0].states is None else np.full(source.shape, NO_VOTE, dtype=np.uint8)
     tally = None if ordered[0].tally is None else np.zeros((*source.shape, N_STATES), dtype=np.uint16)
-    gone = np.zeros(source.shape, dtype=np.uint64)
-    free = np.zeros(source.shape, dtype=np.uint64)
+    gone: list[Words] = []
     points: list[F32] = []
     for i, drive in enumerate(ordered):
         mine = source == i
@@ -135,48 +144,50 @@ def fold(drives: Sequence[TileVote], grid: Grid) -> TileVote:
             states[mine] = drive.states[mine]
         if tally is not None and drive.tally is not None:
             tally[mine] = drive.tally[mine]
-        gone[mine] = drive.gone[mine] if drive.gone is not None else ~np.uint64(0)
-        if drive.free is not None:
-            free |= drive.free
+        gone.append(drive.deletes(mine))
         if drive.new_points is not None:
             points.append(drive.new_points[mine.ravel()[cells_of(grid, drive.new_points)]])
+    free = [drive.free for drive in ordered if drive.free is not None]
     return TileVote(
         vehicle=ordered[-1].vehicle,
         end_ns=ordered[-1].end_ns,
         digest=ordered[-1].digest,
         states=states,
         tally=tally,
-        gone=gone,
+        gone=union(gone),
         new_points=np.concatenate(points) if points else None,
-        free=free if any(drive.free is not None for drive in drives) else None,
+        free=union(free) if free else None,
     )
 
 
-def count(votes: Sequence[TileVote], rule: Rule, min_votes: int) -> tuple[U8, I32]:
+def count(votes: Sequence[TileVote], rule: Rule, min_votes: int) -> tuple[U8, NDArray[Any]]:
     """(states, tally) of one vote per vehicle: the rule of core.voting, then the quorum (DESIGN 4, "enough votes").
 
     ``paper``: undetermined competes and a plain majority decides. ``columns``: undetermined abstains and a change
-    needs a majority of the vehicles that determined the cell. A change with fewer than ``min_votes`` vehicles behind
-    it is undetermined.
+    needs a majority of the vehicles that determined the cell. A change that fewer than ``min_votes`` vehicles back is
+    undetermined; in one stage a vehicle backs what its own tally alone would decide. The tally is (256, 256, 5) in
+    VOTE_UNITs, class by class in memory, uint16 where no sum can exceed that.
     """
-    if not votes:
-        return (
-            np.full((TILE_CELLS, TILE_CELLS), NO_VOTE, dtype=np.uint8),
-            np.zeros((TILE_CELLS, TILE_CELLS, N_STATES), dtype=np.int32),
-        )
-    planes = [v.states.reshape(-1) for v in votes if v.states is not None]
-    if planes:
-        tally = count_votes(np.stack(planes)).reshape(TILE_CELLS, TILE_CELLS, N_STATES)
-        supporters = tally // VOTE_UNIT if min_votes > 1 else tally
+    abstain = rule == "columns"
+    quorum = min_votes if min_votes > 1 else 0
+    one_stage = any(vote.tally is not None for vote in votes)
+    small = not one_stage and len(votes) * VOTE_UNIT <= np.iinfo(np.uint16).max
+    tally = np.zeros((N_STATES, CELLS), dtype=np.uint16 if small else np.int32)
+    if one_stage:
+        backers = np.zeros((N_STATES, CELLS), dtype=np.int32)
+        for vote in votes:
+            assert vote.tally is not None
+            add_tally(
+                np.ascontiguousarray(np.moveaxis(vote.tally, -1, 0)).reshape(N_STATES, -1), abstain, tally, backers
+            )
+        states = decide_cells(tally, backers, abstain, quorum)
     else:
-        tallies = [v.tally for v in votes if v.tally is not None]
-        tally = np.sum(tallies, axis=0, dtype=np.int32)
-        supporters = np.sum([t > 0 for t in tallies], axis=0, dtype=np.int32)
-    states = decide(tally) if rule == "paper" else decide_change(tally)
-    if min_votes > 1:
-        for change in CHANGES:
-            states[(states == change) & (supporters[..., change] < min_votes)] = CellState.UNDETERMINED
-    return states, tally
+        for vote in votes:
+            assert vote.states is not None
+            add_states(np.ascontiguousarray(vote.states).reshape(-1), tally)
+        states = decide_cells(tally, tally, abstain, quorum * VOTE_UNIT)
+    shape = (TILE_CELLS, TILE_CELLS)
+    return states.reshape(shape), np.moveaxis(tally.reshape(N_STATES, *shape), 0, -1)
 
 
 def fuse_tile(
@@ -212,33 +223,23 @@ def fuse_tile(
 
 def supported_words(votes: Sequence[TileVote], states: U8, min_votes: int) -> U64:
     """(256, 256) delete mask: in cells decided changed-empty, the voxels that ``min_votes`` voters for it mark."""
-    cells = np.flatnonzero(states == CellState.CHANGED_EMPTY)
-    whole_column = np.full(len(cells), ~np.uint64(0))
-    marked = [
-        np.where(
-            vote.supports(CellState.CHANGED_EMPTY).reshape(-1)[cells],
-            whole_column if vote.gone is None else vote.gone.reshape(-1)[cells],
-            np.uint64(0),
-        )
-        for vote in votes
-    ]
-    out = np.zeros(CELLS, dtype=np.uint64)
-    out[cells] = at_least(np.stack(marked), min_votes)
-    return out.reshape(states.shape)
+    decided = states == CellState.CHANGED_EMPTY
+    return at_least([vote.deletes(decided) for vote in votes], min_votes)
 
 
 def _offered(votes: Sequence[TileVote], states: U8, grid: Grid) -> tuple[F32, I64, I32]:
     """(points, cells, voters) offered for cells decided changed-occupied, by vehicles that voted so there."""
-    wanted = states == CellState.CHANGED_OCCUPIED
+    wanted = (states == CellState.CHANGED_OCCUPIED).reshape(-1)
     points, cells, voters = [np.empty((0, 3), np.float32)], [np.empty(0, np.int64)], [np.empty(0, np.int32)]
     for i, vote in enumerate(votes):
         if vote.new_points is None or not len(vote.new_points):
             continue
         flat = cells_of(grid, vote.new_points)
-        keep = (wanted & vote.supports(CellState.CHANGED_OCCUPIED)).reshape(-1)[flat]
+        keep = np.flatnonzero(wanted[flat])
+        keep = keep[vote.supports(CellState.CHANGED_OCCUPIED, flat[keep])]
         points.append(vote.new_points[keep])
         cells.append(flat[keep])
-        voters.append(np.full(int(keep.sum()), i, dtype=np.int32))
+        voters.append(np.full(len(keep), i, dtype=np.int32))
     return np.concatenate(points), np.concatenate(cells), np.concatenate(voters)
 
 
@@ -252,19 +253,9 @@ def _learn_free(tile: MapTile, grid: Grid, votes: Sequence[TileVote], min_votes:
         return tile
     free = tile.free if tile.free is not None else np.zeros((TILE_CELLS, TILE_CELLS), dtype=np.uint64)
     if len(passed) >= min_votes:
-        free = free | at_least(np.stack(passed), min_votes)
+        free = free | at_least(passed, min_votes)
     free = free & ~obstacle_bits(tile, grid)
     return tile if tile.free is not None and np.array_equal(free, tile.free) else replace(tile, free=free)
-
-
-def at_least(words: U64, k: int) -> U64:
-    """Bits set in at least ``k`` of ``words`` (n, ...): a bitwise running count, no loop over bits or cells."""
-    reached = [np.zeros(words.shape[1:], dtype=np.uint64) for _ in range(k)]
-    for word in words:
-        for level in range(k - 1, 0, -1):
-            reached[level] |= reached[level - 1] & word
-        reached[0] |= word
-    return reached[k - 1]
 
 
 def states_over(lattice: Lattice, decisions: Mapping[TileIndex, Decision]) -> tuple[U8, Grid]:

@@ -132,7 +132,7 @@ decisions = sa.Table(
     sa.Column("added", sa.Integer, nullable=False),
     sa.Column("deleted", sa.Integer, nullable=False),
 )
-"""``tally``: (65536, 5) int32 in VOTE_UNITs, compressed."""
+"""``tally``: (5, 65536) uint16 or int32 in VOTE_UNITs, compressed."""
 
 bars = sa.Table(
     "bars",

@@ -16,11 +16,11 @@ from mapvote.core.ballot import (
     unpack_points,
     unpack_states,
     unpack_tally,
-    unpack_words,
 )
 from mapvote.core.grid import TileIndex
 from mapvote.core.types import MapTile, MapvoteError, PointMap
 from mapvote.fleet.fuse import Decision, Rule, TileVote, fuse_tile, select
+from mapvote.fleet.words import Words
 
 
 def tile_vote(ballot: Ballot, tile: BallotTile, digest: str) -> TileVote:
@@ -31,9 +31,9 @@ def tile_vote(ballot: Ballot, tile: BallotTile, digest: str) -> TileVote:
         digest=digest,
         states=None if tile.states is None else unpack_states(tile.states),
         tally=None if tile.tally is None else unpack_tally(tile.tally),
-        gone=None if tile.gone is None else unpack_words(tile.gone, "gone"),
+        gone=None if tile.gone is None else Words.unpack(tile.gone, "gone"),
         new_points=None if tile.new_points is None else unpack_points(tile.new_points),
-        free=None if tile.free is None else unpack_words(tile.free, "free"),
+        free=None if tile.free is None else Words.unpack(tile.free, "free"),
     )
 
 

@@ -1,0 +1,102 @@
+"""Column words of one tile, only those that are not zero: masks and free space mark few of a tile's 65,536 cells."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from mapvote.core.grid import TILE_CELLS
+from mapvote.core.planes import pieces
+from mapvote.core.types import U64, Bool, MapvoteError
+
+CELLS = TILE_CELLS * TILE_CELLS
+EVERY_BIT = ~np.uint64(0)
+
+
+@dataclass(frozen=True, slots=True)
+class Words:
+    """The words of some cells; all others are zero."""
+
+    cells: NDArray[np.intp]
+    """(n,) flat cells of the tile, ascending."""
+    words: U64
+    """(n,)"""
+
+    @classmethod
+    def of(cls, plane: U64) -> Words:
+        """From a (256, 256) plane."""
+        flat = plane.reshape(-1)
+        return cls(*_not_zero(np.ascontiguousarray(flat), 0))
+
+    @classmethod
+    def whole(cls, cells: NDArray[np.intp]) -> Words:
+        """Every bit of the flat ``cells``."""
+        return cls(cells, np.full(len(cells), EVERY_BIT))
+
+    @classmethod
+    def unpack(cls, data: bytes, what: str) -> Words:
+        """From a packed (256, 256) plane of a ballot, without ever holding the plane. MapvoteError if damaged."""
+        cells, words, start = [], [], 0
+        for piece in pieces(data, CELLS * 8, f"ballot: {what}"):
+            if len(piece) % 8:
+                raise MapvoteError(f"ballot: {what} does not hold whole words")
+            found, these = _not_zero(np.frombuffer(piece, dtype="<u8"), start)
+            cells.append(found)
+            words.append(these)
+            start += len(piece) // 8
+        if start != CELLS:
+            raise MapvoteError(f"ballot: {what} has {start} words, expected {CELLS}")
+        return cls(np.concatenate(cells), np.concatenate(words))
+
+    def within(self, cells: Bool) -> Words:
+        """Only those of the (256, 256) cells given."""
+        return self.at(cells.reshape(-1)[self.cells])
+
+    def at(self, keep: Bool) -> Words:
+        """Only those where ``keep`` (n,) is set."""
+        return Words(self.cells[keep], self.words[keep])
+
+
+def union(marked: Sequence[Words]) -> Words:
+    """The bits that any of ``marked`` sets."""
+    return Words.of(at_least(marked, 1))
+
+
+def at_least(marked: Sequence[Words], k: int) -> U64:
+    """(256, 256) the bits that at least ``k`` of ``marked`` set: a bitwise running count, no loop over bits."""
+    reached = np.zeros((k, CELLS), dtype=np.uint64)
+    for mine in marked:
+        _mark(reached, mine.cells, mine.words)
+    return reached[k - 1].reshape(TILE_CELLS, TILE_CELLS)
+
+
+@numba.njit(cache=True, nogil=True)
+def _not_zero(words: U64, start: int) -> tuple[NDArray[np.intp], U64]:
+    """Indices of the words that are not zero, counted from ``start``, and those words."""
+    n = 0
+    for i in range(len(words)):
+        n += words[i] != 0
+    cells, out = np.empty(n, dtype=np.intp), np.empty(n, dtype=np.uint64)
+    if n == 0:
+        return cells, out
+    n = 0
+    for i in range(len(words)):
+        if words[i] != 0:
+            cells[n] = start + i
+            out[n] = words[i]
+            n += 1
+    return cells, out
+
+
+@numba.njit(cache=True, nogil=True)
+def _mark(reached: U64, cells: NDArray[np.intp], words: U64) -> None:
+    """One more voter: bits that ``reached[i]`` had are now in ``reached[i + 1]`` where it sets them too."""
+    for i in range(len(cells)):
+        cell, word = cells[i], words[i]
+        for level in range(reached.shape[0] - 1, 0, -1):
+            reached[level, cell] |= reached[level - 1, cell] & word
+        reached[0, cell] |= word
