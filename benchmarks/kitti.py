@@ -65,7 +65,7 @@ def injections(folder: Path, cases: list[Case], settings: Settings, block: int) 
     """Ten objects cut out of the map and ten phantoms put in, three random draws, pooled."""
     path_xy = read_T_map_lidar(folder / "prior.txt", folder)[:, :2, 3]
     table = Table(
-        "case", "kind", "cell recall", "objects half found", "precision within 1.5 m",
+        "case", "kind", "cell recall", "objects half found", "recall of every cut cell", "precision within 1.5 m",
         title=f"Injected changes, draws {DRAWS}",
     )  # fmt: skip
     drawn = []
@@ -74,10 +74,11 @@ def injections(folder: Path, cases: list[Case], settings: Settings, block: int) 
         drawn.append((injection, run_real(folder, cases, settings, block=block, edit=injection)))
     for case in cases:
         for kind in ("built", "demolished"):
-            scores = [score_injection(injection, run.states[case.name], kind) for injection, run in drawn]
+            scores = [score_injection(injection, run.states[case.name], kind, run.reached) for injection, run in drawn]
             table.add_row(
                 case.name, kind, _spread([s.cell_recall for s in scores]),
                 f"{sum(s.found for s in scores)} of {sum(s.objects for s in scores)}",
+                _spread([s.recall_of_all for s in scores]),
                 _spread([s.precision_near for s in scores]),
             )  # fmt: skip
     return table

@@ -24,6 +24,8 @@ NEAR_CELLS = 5
 """1.5 m: precision is counted this close to the injections, because over a street it depends on their number."""
 _CHUNK_M = (1.5, 3.0)
 _PATH_M = (4.0, 25.0)
+_ROOM_CELLS = 8
+"""2.4 m: half the diagonal of the largest phantom, which must not stand in anything, nor beyond the window."""
 _TRIES = 20_000
 
 
@@ -74,8 +76,9 @@ class Injection:
         if kind == "built":
             wanted = (reference.counts >= 4) & (reference.top_z - reference.ground_z >= 1.0) & ~movers
         else:
-            clear = ~ndimage.binary_dilation((reference.occupied != 0) | movers, np.ones((3, 3)), iterations=6)
-            wanted = clear & np.isfinite(reference.ground_z)
+            taken_cells = (reference.occupied != 0) | movers
+            near = ndimage.binary_dilation(taken_cells, np.ones((3, 3)), iterations=_ROOM_CELLS, border_value=1)
+            wanted = ~near & np.isfinite(reference.ground_z)
             if reference.free is not None:
                 wanted &= (reference.free & np.uint64(0b111110)) == np.uint64(0b111110)
         rows, cols = np.nonzero(wanted)
@@ -142,24 +145,34 @@ class InjectionScores:
     """How well one case found the injected objects of one kind."""
 
     cell_recall: float
+    """Share of the true cells found: the reached ones, as the strict truth of simulation has it (METHOD 3)."""
     found: int
-    """Objects of which at least half of the cells were found."""
+    """Objects of which at least half of those cells were found."""
     objects: int
+    """Objects with such a cell."""
+    recall_of_all: float
+    """The same share of every cell that was cut out of the map, met again by a ray or not."""
     precision_near: float
     """Share of the cells decided so within 1.5 m of an injection of this kind that are right."""
 
 
-def score_injection(injection: Injection, states: U8, kind: str) -> InjectionScores:
-    """``states`` (rows, cols) as decided, over the injection's window."""
+def score_injection(injection: Injection, states: U8, kind: str, reached: Bool) -> InjectionScores:
+    """``states`` (rows, cols) as decided and ``reached`` (rows, cols), both over the injection's window.
+
+    A map holds thin and half-hidden cells that no ray of the vehicles meets again. Nobody can find these *built*, so
+    recall counts the cut cells in which a vehicle's scan met something (``reached``), whatever the method made of it.
+    Of phantoms every cell counts.
+    """
     state, value = (CellState.CHANGED_OCCUPIED, 1) if kind == "built" else (CellState.CHANGED_EMPTY, 2)
     true, decided = injection.truth == value, states == state
     near = ndimage.binary_dilation(true, np.ones((3, 3)), iterations=NEAR_CELLS)
-    shares = [
-        ratio(np.count_nonzero(decided & cells), np.count_nonzero(cells)) for k, cells in injection.cells if k == kind
-    ]
+    asked = reached if kind == "built" else np.ones_like(reached)
+    objects = [cells & asked for k, cells in injection.cells if k == kind and (cells & asked).any()]
+    shares = [ratio(np.count_nonzero(decided & cells), np.count_nonzero(cells)) for cells in objects]
     return InjectionScores(
-        cell_recall=ratio(np.count_nonzero(decided & true), np.count_nonzero(true)),
+        cell_recall=ratio(np.count_nonzero(decided & true & asked), np.count_nonzero(true & asked)),
         found=sum(share >= 0.5 for share in shares),
         objects=len(shares),
+        recall_of_all=ratio(np.count_nonzero(decided & true), np.count_nonzero(true)),
         precision_near=ratio(np.count_nonzero(decided & true), np.count_nonzero(decided & near)),
     )

@@ -16,8 +16,8 @@ from scipy import ndimage
 
 from mapvote.config import Settings
 from mapvote.core.ballot import Ballot
-from mapvote.core.columns import GROUND_MARGIN_M, reference_window
-from mapvote.core.geometry import exp
+from mapvote.core.columns import Surroundings, reference_window
+from mapvote.core.geometry import exp, transform
 from mapvote.core.grid import CELL_SIZE, Grid, window_around
 from mapvote.core.types import F64, I64, U8, Bool, CellState, Drive, MapvoteError, PointMap, Scan
 from mapvote.evaluation.cases import Case, fuse_case
@@ -26,6 +26,7 @@ from mapvote.evaluation.truth import pose_errors, rigid_between
 from mapvote.formats import open_drive, read_T_map_lidar
 from mapvote.mapping import build_map
 from mapvote.perception.moving import MovingFilter
+from mapvote.perception.visibility import find_obstacles
 from mapvote.vehicle import DriveReport, Vehicle
 
 VEHICLES = 3
@@ -115,6 +116,8 @@ class RealRun:
     """Decided by each case, over ``grid``."""
     movers: Bool
     """Cells in or next to which something moved, by the filter on the map's and the vehicles' scans."""
+    reached: Bool
+    """Cells in which a scan of some vehicle met something above the ground, at the reference poses."""
     reports: Sequence[DriveReport]
     error_m: F64
     """Of every scan that was localised, against the reference in the map's frame."""
@@ -158,6 +161,7 @@ def run_real(
     grid = _window(point_map, reference)
     movers = _moving_cells(survey, built.tracks[0].T_map_lidar, point_map, grid, settings)
     point_map = edit(point_map, grid, movers) if edit else point_map
+    reached = np.zeros(grid.shape, dtype=np.bool_)
     ballots: dict[str, list[Ballot]] = {case.name: [] for case in cases}
     reports, metres, degrees, prior_metres = [], [], [], []
     for k, scans in enumerate(voting):
@@ -166,6 +170,7 @@ def run_real(
         drive = change_prior(every_other_beam(drive) if thin else drive)
         vehicle, noted = _drive(drive, point_map, settings, cases, grid, first_pose_only)
         movers |= noted
+        reached |= _reached_cells(drive, T_true, point_map, grid, settings.voting.window_m)
         for case in cases:
             ballots[case.name].append(vehicle.ballot(case.voting))
         there = np.setdiff1d(np.arange(len(drive)), vehicle.report.lost)
@@ -180,7 +185,7 @@ def run_real(
         for case in cases
     }
     return RealRun(
-        point_map, grid, states, ndimage.binary_dilation(movers, np.ones((3, 3))), reports,
+        point_map, grid, states, ndimage.binary_dilation(movers, np.ones((3, 3))), reached, reports,
         np.concatenate(metres), np.concatenate(degrees), np.concatenate(prior_metres), sum(r.scans for r in reports),
     )  # fmt: skip
 
@@ -204,14 +209,23 @@ def _drive(
 def _moving_cells(survey: Drive, T_map_lidar: F64, point_map: PointMap, grid: Grid, settings: Settings) -> Bool:
     """Cells in which something moved while the map was made."""
     movers = MoverCells(MovingFilter(survey.sensor, settings.moving), grid)
-    ground_z = reference_window(point_map, grid).ground_z
-    for i, scan in enumerate(survey):
-        points = scan.points.astype(np.float64) @ T_map_lidar[i, :3, :3].T + T_map_lidar[i, :3, 3]
-        rows, cols, inside = grid.indices_of(points)
-        height = points[:, 2] - ground_z[rows.clip(0, grid.rows - 1), cols.clip(0, grid.cols - 1)]
-        movers.push(points, T_map_lidar[i, :3, 3], inside & (height >= GROUND_MARGIN_M), scan.stamp_ns)
+    reference = reference_window(point_map, grid)
+    for scan, T in zip(survey, T_map_lidar, strict=True):
+        points = transform(T, scan.points)
+        movers.push(points, T[:3, 3], find_obstacles(points, reference)[0], scan.stamp_ns)
     movers.flush()
     return movers.cells
+
+
+def _reached_cells(drive: Drive, T_map_lidar: F64, point_map: PointMap, grid: Grid, window_m: float) -> Bool:
+    """Cells in which a scan of ``drive`` met something above the ground, no farther off than a vehicle looks."""
+    reached = np.zeros(grid.shape, dtype=np.bool_)
+    surroundings = Surroundings(point_map, window_m)
+    for scan, T in zip(drive, T_map_lidar, strict=True):
+        points = transform(T, scan.points)
+        rows, cols, inside = grid.indices_of(points[find_obstacles(points, surroundings.at(T[:3, 3])[0])[0]])
+        reached[rows[inside], cols[inside]] = True
+    return reached
 
 
 def _indices(scans: str, n: int) -> I64:
