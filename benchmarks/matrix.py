@@ -29,6 +29,7 @@ def main() -> None:
     parser.add_argument("--seeds", default="2,3,4,5,6", help="comma-separated (default 2,3,4,5,6)")
     parser.add_argument("--experiments", help=f"comma-separated, of: {', '.join(EXPERIMENTS)} (default all)")
     parser.add_argument("--cases", help='instead of all, in main and liars: "1,1 column,columns" takes half the time')
+    parser.add_argument("--parked", type=int, help="cars parked during each pass in parked (default 12; corner: 2)")
     parser.add_argument("--out", type=Path, default=Path("out/matrix"))
     parser.add_argument("--cache", type=Path, default=default_cache(), help="where drives, maps and ballots are kept")
     parser.add_argument("--config", type=Path, help="settings (TOML)")
@@ -49,6 +50,7 @@ def main() -> None:
         load_settings(arguments.config),
         workers=arguments.workers,
         cases=arguments.cases,
+        parked=arguments.parked,
     )
     results: dict[str, dict[int, dict[str, Any]]] = {}
     for name in names:

@@ -75,8 +75,8 @@ def test_the_table_has_a_line_a_round_and_a_cell_a_figure() -> None:
 @pytest.mark.slow
 def test_the_whole_machinery_on_a_corner_twice_and_without_the_drives(tmp_path: Path) -> None:
     """Every kind of experiment runs, a second run repeats the numbers from the cache, and scans can be dropped."""
-    names = ["main", "liars", "noise", "2 Hz", "all true"]  # "parked" needs more room than a corner has
-    matrix = Matrix("corner", (1,), tmp_path, Settings(), workers=1)
+    names = ["main", "liars", "imported", "noise", "2 Hz", "parked", "all true"]
+    matrix = Matrix("corner", (1,), tmp_path, Settings(), workers=1, parked=2)
     results = {name: {1: matrix.run(name, 1)} for name in names}
     text = demands.table(results)
     asked = {demand.what for demand in DEMANDS if demand.experiment in names and demand.values(results)}
@@ -84,6 +84,8 @@ def test_the_whole_machinery_on_a_corner_twice_and_without_the_drives(tmp_path: 
     assert all(what in text for what in asked)
     main = results["main"][1]["rounds"]
     assert main["columns"]["provenance"]["macro_f1"] > main["1 column"]["provenance"]["macro_f1"]
+    own, *_, taught = results["imported"][1]["rounds"].values()  # known-free columns learned as good as our own
+    assert taught["provenance"]["macro_f1"] >= own["provenance"]["macro_f1"] - 0.01
     scene = matrix.scene(EXPERIMENTS["main"], 1)
     matrix.drop_drives(names, 1)
     assert not list(scene.folder.glob("*/velodyne"))

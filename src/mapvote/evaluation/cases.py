@@ -102,9 +102,19 @@ class Pass:
     """Median milliseconds a scan by stage."""
 
 
-def passes(scene: Scene, cases: Sequence[Case], workers: int, progress: Progress | None = None) -> list[Pass]:
-    """Every voting vehicle's pass, in order of their numbers; those that the cache lacks are driven, in parallel."""
-    names = scene.drive_names("v")
+def have_voted(scene: Scene, cases: Sequence[Case], who: str = "v") -> bool:
+    """Whether the cache holds the first map and every ballot of the drives called ``who``...: no scan is needed."""
+    if not (scene.work / "map").exists():
+        return False
+    return all(pass_folder(scene, cases, name).exists() for name in scene.drive_names(who))
+
+
+def passes(
+    scene: Scene, cases: Sequence[Case], workers: int, progress: Progress | None = None, who: str = "v"
+) -> list[Pass]:
+    """The passes of all drives called ``who``..., in order of their numbers; those that the cache lacks are driven,
+    in parallel."""
+    names = scene.drive_names(who)
     missing = [name for name in names if not pass_folder(scene, cases, name).exists()]
     done = len(names) - len(missing)
     if progress:
@@ -127,7 +137,7 @@ def passes(scene: Scene, cases: Sequence[Case], workers: int, progress: Progress
 
 def pass_folder(scene: Scene, cases: Sequence[Case], vehicle: str) -> Path:
     """Where a vehicle's ballots lie in the cache."""
-    made_by = sources_digest(BALLOTS_FROM), scene.conditions
+    made_by = sources_digest(BALLOTS_FROM), scene.conditions, scene.map_name
     key = key_of(*made_by, *(f"{case.name} {case.voting.model_dump_json()}" for case in cases))
     return scene.work / f"votes-{key}" / vehicle
 

@@ -17,18 +17,20 @@ import numpy as np
 
 from mapvote.config import Settings
 from mapvote.core.ballot import Ballot
-from mapvote.core.types import PointMap
+from mapvote.core.types import U8, PointMap
 from mapvote.evaluation.attack import ATTACKS
-from mapvote.evaluation.cases import Case, Pass, choose_cases, fuse_case, pass_folder, passes
+from mapvote.evaluation.cases import Case, Outcome, Pass, choose_cases, fuse_case, have_voted, passes
 from mapvote.evaluation.conditions import Conditions
 from mapvote.evaluation.evaluate import Jury, localisation, map_shift
+from mapvote.evaluation.imported import CHAINS, in_turn
 from mapvote.evaluation.metrics import UNSCORED, determined, ratio, score_cells
 from mapvote.evaluation.scene import BALLOTS_FROM, Progress, Scene, key_of, sources_digest
 from mapvote.formats.whole import whole_file
 
 _SCORES_FROM = (
     *BALLOTS_FROM, "fleet", "simulation", "evaluation/attack.py", "evaluation/cases.py", "evaluation/conditions.py",
-    "evaluation/evaluate.py", "evaluation/matrix.py", "evaluation/metrics.py", "evaluation/truth.py",
+    "evaluation/evaluate.py", "evaluation/imported.py", "evaluation/matrix.py", "evaluation/metrics.py",
+    "evaluation/truth.py",
 )  # fmt: skip
 
 
@@ -49,6 +51,11 @@ def as_sent(drives: Sequence[Pass], cases: Sequence[Case], first_map: PointMap) 
     """Every case, all vehicles."""
     for case in cases:
         yield Round(case.name, case.min_votes, [drive.ballots[case.name] for drive in drives])
+
+
+def columns_alone(drives: Sequence[Pass], cases: Sequence[Case], first_map: PointMap) -> Iterator[Round]:
+    """Our own method, all vehicles."""
+    return as_sent(drives, [case for case in cases if case.name == "columns"], first_map)
 
 
 def growing(drives: Sequence[Pass], cases: Sequence[Case], first_map: PointMap) -> Iterator[Round]:
@@ -80,6 +87,8 @@ class Experiment:
     """Of the scenario."""
     conditions: Conditions = field(default_factory=Conditions)
     rounds: Rounds = as_sent
+    chains: Mapping[str, Sequence[str]] = field(default_factory=dict)
+    """Besides, columns on the first map without its known-free columns: who votes in turn; see ``imported.in_turn``."""
 
 
 _BOTH = "1 column,columns"
@@ -89,6 +98,7 @@ _TEN = {"vehicles": 10}
 EXPERIMENTS: Mapping[str, Experiment] = {
     "main": Experiment("all"),
     "liars": Experiment("all", rounds=with_liars),
+    "imported": Experiment("all", rounds=columns_alone, chains=CHAINS),
     "noise": Experiment(_BOTH, conditions=Conditions(noise_m=0.1, noise_deg=0.2)),
     "noise told": Experiment(_BOTH, conditions=Conditions(noise_m=0.1, noise_deg=0.2, noise_told=True)),
     "2 Hz": Experiment(_BOTH, conditions=Conditions(scans="::5")),
@@ -117,11 +127,15 @@ class Matrix:
     workers: int = 2
     cases: str | None = None
     """Instead of all that there are, where an experiment is on all: fewer cases, less time."""
+    parked: int | None = None
+    """Instead of twelve, where an experiment parks cars: a short street has no room for them."""
 
     def scene(self, experiment: Experiment, seed: int) -> Scene:
         """The drives of one experiment."""
-        overrides, conditions = experiment.overrides, experiment.conditions
-        return Scene(self.scenario, seed, self.settings, self.cache, overrides, conditions)
+        overrides = dict(experiment.overrides)
+        if self.parked is not None and "temporary_cars" in overrides:
+            overrides["temporary_cars"] = self.parked
+        return Scene(self.scenario, seed, self.settings, self.cache, overrides, experiment.conditions)
 
     def result_file(self, name: str, seed: int) -> Path:
         """Where the result of an experiment on one seed is kept."""
@@ -142,7 +156,7 @@ class Matrix:
     def _measure(self, experiment: Experiment, seed: int, progress: Progress | None) -> dict[str, Any]:
         scene = self.scene(experiment, seed)
         cases, _ = choose_cases(self.settings, self._cases(experiment))
-        if not _has_voted(scene, cases):
+        if not have_voted(scene, cases):
             scene.prepare(progress)
         drives = passes(scene, cases, self.workers, progress)
         first_map = scene.point_map
@@ -152,7 +166,10 @@ class Matrix:
             if progress:
                 progress("scoring", i, 0)
             outcome = fuse_case(first_map, turn.ballots, turn.min_votes, self.settings.fuse, jury.window)
-            entries[turn.name] = {**jury.of_update(outcome), **_as_others_may_judge(outcome.states, jury)}
+            entries[turn.name] = _judged(outcome, jury)
+        for name, voters in experiment.chains.items():
+            [columns] = [case for case in cases if case.name == "columns"]
+            entries[name] = _judged(in_turn(scene, columns, voters, jury.window, self.workers, progress), jury)
         return {
             "scenario": self.scenario,
             "seed": seed,
@@ -176,14 +193,11 @@ class Matrix:
                 scene.drop_drives()
 
 
-def _has_voted(scene: Scene, cases: Sequence[Case]) -> bool:
-    """Whether the cache holds the map and every ballot, so that no drive is needed."""
-    if not (scene.work / "map").exists():
-        return False
-    return all(pass_folder(scene, cases, name).exists() for name in scene.drive_names("v"))
+def _judged(outcome: Outcome, jury: Jury) -> dict[str, Any]:
+    return {**jury.of_update(outcome), **_as_others_may_judge(outcome.states, jury)}
 
 
-def _as_others_may_judge(states: Any, jury: Jury) -> dict[str, Any]:
+def _as_others_may_judge(states: U8, jury: Jury) -> dict[str, Any]:
     """R with old surfaces that no survey saw counted as unchanged, and the share of cells that the fleet determined."""
     strict, provenance = jury.truth.with_old_surfaces()
     scored = jury.truth.strict != UNSCORED

@@ -78,6 +78,8 @@ class Scene:
     overrides: Mapping[str, Any] = field(default_factory=dict)
     conditions: Conditions = field(default_factory=Conditions)
     """What the drives are put through besides; see there."""
+    map_name: str = "map"
+    """The folder in ``work`` of the map that is voted on: the first map, or one that was made of it."""
 
     @property
     def folder(self) -> Path:
@@ -144,8 +146,8 @@ class Scene:
 
     @property
     def point_map(self) -> PointMap:
-        """The first map."""
-        return read_map(self.work / "map")
+        """The map that is voted on."""
+        return read_map(self.work / self.map_name)
 
     def survey_poses(self, name: str) -> F64:
         """(n, 4, 4) where the SLAM believes the survey vehicle was."""
