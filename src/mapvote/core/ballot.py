@@ -10,9 +10,10 @@ import math
 from typing import Annotated
 
 import msgspec
+import numba
 import numpy as np
 
-from mapvote.core.grid import TILE_CELLS, TileIndex
+from mapvote.core.grid import CELL_SIZE, TILE_CELLS, TileIndex
 from mapvote.core.planes import pack_plane as pack_plane
 from mapvote.core.planes import unpack_bytes, unpack_plane
 from mapvote.core.tilecode import content_hash as content_hash
@@ -79,7 +80,7 @@ def tile_key(tile: TileIndex) -> str:
 def unpack_states(data: bytes) -> U8:
     """(256, 256) uint8; MapvoteError if damaged or not a CellState."""
     states = unpack_plane(data, "<u1", (TILE_CELLS, TILE_CELLS), "ballot: states")
-    if (states - np.uint8(N_STATES)).min() < NO_VOTE - N_STATES:  # wraps: 0 ... 4 and 255 come out highest
+    if not _all_states(states.reshape(-1)):
         raise MapvoteError("ballot: states holds a value that is no cell state")
     return states
 
@@ -100,13 +101,26 @@ def unpack_points(data: bytes) -> F32:
     if len(raw) % 12:
         raise MapvoteError(f"ballot: new_points has {len(raw)} bytes, not a multiple of 12")
     points = np.frombuffer(raw, dtype="<f4").reshape(-1, 3)
-    side = np.float32(TILE_CELLS * 0.3)
-    if not len(points):
-        return points
-    low, high = points.min(axis=0), points.max(axis=0)  # NaN comes through, and no comparison with it holds
-    if not (low[0] >= 0 and low[1] >= 0 and high[0] < side and high[1] < side and low[2] >= -1e5 and high[2] <= 1e5):
+    if not _all_inside(points, np.float32(TILE_CELLS * CELL_SIZE)):
         raise MapvoteError("ballot: new_points holds a point outside its tile or not finite")
     return points
+
+
+@numba.njit(cache=True, nogil=True)
+def _all_states(values: U8) -> bool:
+    sound = True
+    for value in values:  # without a way out: that the compiler turns into vectors
+        sound &= (value < N_STATES) | (value == NO_VOTE)
+    return sound
+
+
+@numba.njit(cache=True, nogil=True)
+def _all_inside(points: F32, side: np.float32) -> bool:
+    """Whether all points (m, 3) are finite and within a tile; NaN fails every comparison."""
+    sound = True
+    for x, y, z in points:
+        sound &= 0 <= x < side and 0 <= y < side and abs(z) <= 1e5
+    return sound
 
 
 def encode(ballot: Ballot) -> bytes:

@@ -1,49 +1,57 @@
-"""Many ballots, one fsync: those that arrive while one transaction is being written go into the next one together."""
+"""Many requests, one piece of work: those that arrive while one batch is being worked on go into the next together.
+
+So a hundred ballots cost one fsync, and a hundred keys one query.
+"""
 
 from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable, Sequence
+from typing import Generic, TypeVar
 
-from mapvote.core.types import MapvoteError
-from mapvote.fleet.intake import Incoming, Receipt
-
-Accept = Callable[[Sequence[Incoming]], Sequence[Receipt | MapvoteError]]
+Asked = TypeVar("Asked")
+Answer = TypeVar("Answer")
 
 
-class Batcher:
-    """Acknowledges a ballot only once the transaction that holds it is on disk. Lives on one event loop."""
+class Batcher(Generic[Asked, Answer]):
+    """Calls ``work`` in a thread, one batch after another. Lives on one event loop.
 
-    def __init__(self, accept: Accept, limit: int) -> None:
-        self._accept = accept
+    ``work`` gives one answer for each item, in order; an exception among the answers is raised to whoever asked. If
+    ``work`` itself raises, everybody in the batch hears it.
+    """
+
+    def __init__(self, work: Callable[[Sequence[Asked]], Sequence[Answer | Exception]], limit: int) -> None:
+        self._work = work
         self._limit = limit
-        self._waiting: list[tuple[Incoming, asyncio.Future[Receipt]]] = []
-        self._writer: asyncio.Task[None] | None = None
+        self._waiting: list[tuple[Asked, asyncio.Future[Answer]]] = []
+        self._worker: asyncio.Task[None] | None = None
 
-    async def put(self, incoming: Incoming) -> Receipt:
-        """Store one ballot; raises what was wrong with it."""
-        future: asyncio.Future[Receipt] = asyncio.get_running_loop().create_future()
-        self._waiting.append((incoming, future))
-        if self._writer is None or self._writer.done():
-            self._writer = asyncio.create_task(self._write())
+    async def put(self, item: Asked) -> Answer:
+        """The answer to one item, once the batch that holds it is done."""
+        future: asyncio.Future[Answer] = asyncio.get_running_loop().create_future()
+        self._waiting.append((item, future))
+        if self._worker is None or self._worker.done():
+            self._worker = asyncio.create_task(self._run())
         return await future
 
     async def close(self) -> None:
-        """Wait until everything that was taken in is written."""
-        while self._writer is not None and not self._writer.done():
-            await self._writer
+        """Wait until everything that was taken in is done."""
+        while self._worker is not None and not self._worker.done():
+            await self._worker
 
-    async def _write(self) -> None:
+    async def _run(self) -> None:
         while self._waiting:
+            await asyncio.sleep(0)  # who arrived in the same moment comes along
             some, self._waiting = self._waiting[: self._limit], self._waiting[self._limit :]
+            answers: Sequence[Answer | Exception]
             try:
-                results = await asyncio.to_thread(self._accept, [incoming for incoming, _ in some])
-            except Exception as error:  # the whole transaction failed: each sender hears it
-                results = [error] * len(some)  # type: ignore[list-item]
-            for (_, future), result in zip(some, results, strict=True):
+                answers = await asyncio.to_thread(self._work, [item for item, _ in some])
+            except Exception as error:
+                answers = [error] * len(some)
+            for (_, future), answer in zip(some, answers, strict=True):
                 if future.cancelled():
                     continue
-                if isinstance(result, Exception):
-                    future.set_exception(result)
+                if isinstance(answer, Exception):
+                    future.set_exception(answer)
                 else:
-                    future.set_result(result)
+                    future.set_result(answer)

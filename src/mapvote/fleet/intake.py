@@ -12,9 +12,10 @@ import sqlalchemy as sa
 from mapvote.core.ballot import Ballot, BallotTile, decode, tile_key, validate
 from mapvote.core.grid import TileIndex, tile_grid
 from mapvote.core.types import MapvoteError
-from mapvote.fleet import schema
+from mapvote.fleet import keys, schema
 from mapvote.fleet.content import TileHashes, same_cells, unpack_points_plane
-from mapvote.fleet.errors import Conflict, NotFound
+from mapvote.fleet.database import insert_rows
+from mapvote.fleet.errors import Conflict, NotFound, Unauthorised
 from mapvote.fleet.fuse import DAY_NS
 from mapvote.fleet.store import Store, current_version, load_blob, log_event, names, next_seq, tiles_of
 from mapvote.fleet.update import rule_of, staged, tile_vote
@@ -33,6 +34,8 @@ class Incoming:
     ballot: Ballot
     digest: str
     method: str
+    key_hash: str | None = None
+    """Of the key that it came with; None where no key is needed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,7 +50,7 @@ class Receipt:
     seq: int
 
 
-def examine(data: bytes) -> Incoming:
+def examine(data: bytes, key_hash: str | None = None) -> Incoming:
     """Decode a ballot and unpack every plane once; MapvoteError on the first defect. Touches no database."""
     ballot = decode(data)
     validate(ballot, MAX_UNPACKED_BYTES)
@@ -56,24 +59,56 @@ def examine(data: bytes) -> Incoming:
     rule_of(ballot.method)
     if any((tile.states is None) != (ballot.tiles[0].states is None) for tile in ballot.tiles):
         raise MapvoteError("ballot: some tiles hold states and some a tally; a ballot is either two-stage or one-stage")
-    return Incoming(ballot, hashlib.sha256(data).hexdigest(), f"{ballot.method}, {staged(ballot)}")
+    return Incoming(ballot, hashlib.sha256(data).hexdigest(), f"{ballot.method}, {staged(ballot)}", key_hash)
 
 
-def accept(store: Store, ballots: Sequence[Incoming]) -> list[Receipt | MapvoteError]:
-    """Store ballots in one durable transaction, each on its own merits: a receipt, or why it was refused.
+def examine_all(received: Sequence[tuple[bytes, str | None]]) -> list[Incoming | Exception]:
+    """:func:`examine` for each; what was wrong in the place of one that is unsound."""
+    found: list[Incoming | Exception] = []
+    for data, key_hash in received:
+        try:
+            found.append(examine(data, key_hash))
+        except MapvoteError as error:
+            found.append(error)
+    return found
 
-    Conflict: other map or method, unknown base, or no cell counts any more. Unavailable is raised for all.
-    """
-    with store.database.reading() as connection:
-        current = tiles_of(connection, current_version(connection).number)
-        results: list[Receipt | MapvoteError | None] = [_refusal(store, connection, b, current) for b in ballots]
-    sound = [i for i, error in enumerate(results) if error is None]
-    if sound:
-        with store.database.writing() as connection:
-            receipts = _insert(connection, [ballots[i] for i in sound], store.clock())
-        for i, receipt in zip(sound, receipts, strict=True):
-            results[i] = receipt
-    return [result for result in results if result is not None]
+
+class Intake:
+    """Takes ballots into a store; remembers the newest version's tiles, which never change."""
+
+    def __init__(self, store: Store) -> None:
+        self._store = store
+        self._current: tuple[int, Mapping[TileIndex, TileHashes]] = (0, {})
+
+    def accept(self, ballots: Sequence[Incoming]) -> list[Receipt | Exception]:
+        """Store ballots in one durable transaction, each on its own merits: a receipt, or why it was refused.
+
+        Unauthorised: its key was revoked meanwhile. Conflict: other map or method, unknown base, or no cell counts any
+        more. Unavailable is raised for all.
+        """
+        store, results = self._store, list[Receipt | Exception | None]()
+        with store.database.reading() as connection:
+            newest = current_version(connection).number
+            if newest != self._current[0]:
+                self._current = newest, tiles_of(connection, newest)
+            valid = keys.of(connection, {ballot.key_hash for ballot in ballots if ballot.key_hash is not None})
+            for ballot in ballots:
+                if ballot.key_hash is not None and ballot.key_hash not in valid:
+                    results.append(Unauthorised(keys.UNKNOWN))
+                else:
+                    results.append(_refusal(store, connection, ballot, self._current[1]))
+        sound = [i for i, error in enumerate(results) if error is None]
+        if sound:
+            with store.database.writing() as connection:
+                receipts = _insert(connection, [ballots[i] for i in sound], store.clock())
+            for i, receipt in zip(sound, receipts, strict=True):
+                results[i] = receipt
+        return [result for result in results if result is not None]
+
+
+def accept(store: Store, ballots: Sequence[Incoming]) -> list[Receipt | Exception]:
+    """:meth:`Intake.accept`, once."""
+    return Intake(store).accept(ballots)
 
 
 def withdraw(store: Store, vehicle: str, drive: str | None = None, *, by: str) -> int:
@@ -138,7 +173,7 @@ def _counts_somewhere(
     return bool((tile_vote(ballot, tile, "").spoken() & same).any())
 
 
-def _insert(connection: sa.Connection, ballots: Sequence[Incoming], now: int) -> list[Receipt | MapvoteError]:
+def _insert(connection: sa.Connection, ballots: Sequence[Incoming], now: int) -> list[Receipt | Exception]:
     b = schema.ballots
     method = agreed = connection.execute(sa.select(schema.maps.c.method)).scalar_one()
     drives = sa.tuple_(b.c.vehicle, b.c.drive).in_({(i.ballot.vehicle, i.ballot.drive) for i in ballots})
@@ -150,9 +185,10 @@ def _insert(connection: sa.Connection, ballots: Sequence[Incoming], now: int) ->
         if row.gone_seq is None:
             standing[row.vehicle, row.drive] = row.seq, row.digest
     seq = next_seq(connection)
-    results: list[Receipt | MapvoteError] = []
-    rows: dict[int, dict[str, Any]] = {}
-    tiles: list[dict[str, Any]] = []
+    results: list[Receipt | Exception] = []
+    log: list[tuple[Any, ...]] = []
+    rows: list[tuple[Any, ...]] = []
+    tiles: list[tuple[Any, ...]] = []
     replaced: list[dict[str, int]] = []
     for incoming in ballots:
         ballot, key = incoming.ballot, (incoming.ballot.vehicle, incoming.ballot.drive)
@@ -169,29 +205,16 @@ def _insert(connection: sa.Connection, ballots: Sequence[Incoming], now: int) ->
             replaced.append({"old": old[0], "by": seq})
         first.setdefault(key, seq)
         standing[key] = seq, incoming.digest
-        rows[seq] = {
-            "seq": seq,
-            "first_seq": first[key],
-            "gone_seq": None,
-            "vehicle": ballot.vehicle,
-            "drive": ballot.drive,
-            "digest": incoming.digest,
-            "start_ns": ballot.start_ns,
-            "end_ns": ballot.end_ns,
-            "received_ns": now,
-            "settings_hash": ballot.settings_hash[:128],
-        }
+        log.append((seq, now, "ballot", *key))
+        times = ballot.start_ns, ballot.end_ns, now
+        rows.append((seq, first[key], None, *key, incoming.digest, *times, ballot.settings_hash[:128]))
         tiles += [_tile_row(seq, ballot, tile) for tile in ballot.tiles]
         results.append(Receipt(*key, created=old is None, repeated=False, seq=seq))
         seq += 1
     if rows:
-        log = [
-            {"seq": s, "at_ns": now, "kind": "ballot", "actor": row["vehicle"], "detail": row["drive"]}
-            for s, row in rows.items()
-        ]
-        connection.execute(schema.events.insert(), log)
-        connection.execute(b.insert(), list(rows.values()))
-        connection.execute(schema.ballot_tiles.insert(), tiles)
+        insert_rows(connection, schema.events, log)
+        insert_rows(connection, b, rows)
+        insert_rows(connection, schema.ballot_tiles, tiles)
     if replaced:
         mark = b.update().where(b.c.seq == sa.bindparam("old")).values(gone_seq=sa.bindparam("by"))
         connection.execute(mark, replaced)
@@ -200,15 +223,7 @@ def _insert(connection: sa.Connection, ballots: Sequence[Incoming], now: int) ->
     return results
 
 
-def _tile_row(seq: int, ballot: Ballot, tile: BallotTile) -> dict[str, Any]:
-    return {
-        "ballot": seq,
-        "row": tile.tile[0],
-        "col": tile.tile[1],
-        "base": ballot.base[tile_key(tile.tile)],
-        "states": tile.states,
-        "tally": tile.tally,
-        "gone": tile.gone,
-        "new_points": tile.new_points,
-        "free": tile.free,
-    }
+def _tile_row(seq: int, ballot: Ballot, tile: BallotTile) -> tuple[Any, ...]:
+    """In the order of the table's columns."""
+    base = ballot.base[tile_key(tile.tile)]
+    return *tile.tile, seq, base, tile.states, tile.tally, tile.gone, tile.new_points, tile.free

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import re
 import secrets
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -16,6 +17,7 @@ from mapvote.fleet.errors import NotFound, Unauthorised
 from mapvote.fleet.store import Store, log_event
 
 Role = Literal["vehicle", "operator"]
+UNKNOWN = "this key is unknown or revoked: ask the operator for a new one (mapvote keys)"
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 
 
@@ -64,15 +66,21 @@ def listed(store: Store) -> list[Key]:
         return [Key(*row) for row in rows]
 
 
-def check(store: Store, secret: str) -> Key:
-    """Whose key this is; Unauthorised if it is unknown or revoked."""
-    k = schema.keys
-    query = sa.select(k.c.name, k.c.role, k.c.created_ns, k.c.revoked_ns).where(k.c.hash == hash_of(secret))
+def check(store: Store, hashes: Sequence[str]) -> list[Key | Exception]:
+    """Whose keys these are, by :func:`hash_of`; Unauthorised in the place of one that is unknown or revoked."""
     with store.database.reading() as connection:
-        row = connection.execute(query).one_or_none()
-    if row is None or row.revoked_ns is not None:
-        raise Unauthorised("this key is unknown or revoked: ask the operator for a new one (mapvote keys)")
-    return Key(*row)
+        valid = of(connection, set(hashes))
+    return [valid[digest] if digest in valid else Unauthorised(UNKNOWN) for digest in hashes]
+
+
+def of(connection: sa.Connection, hashes: Collection[str]) -> dict[str, Key]:
+    """The valid keys among these, by :func:`hash_of`."""
+    if not hashes:
+        return {}
+    k = schema.keys
+    query = sa.select(k.c.hash, k.c.name, k.c.role, k.c.created_ns, k.c.revoked_ns)
+    rows = connection.execute(query.where(k.c.hash.in_(hashes), k.c.revoked_ns.is_(None)))
+    return {row.hash: Key(row.name, row.role, row.created_ns, row.revoked_ns) for row in rows}
 
 
 def hash_of(secret: str) -> str:
