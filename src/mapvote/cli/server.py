@@ -26,7 +26,7 @@ GateDrive = Annotated[Path | None, typer.Option(help="reference drive that must 
 
 def register(app: typer.Typer) -> None:
     """Add the server's verbs to ``app``."""
-    for verb in (update, serve, publish, rollback, log, unvote, keys, vehicles, changes):
+    for verb in (update, serve, publish, rollback, log, unvote, upgrade, keys, vehicles, changes):
         app.command()(verb)
 
 
@@ -213,6 +213,19 @@ def unvote(
             return
         done = replay_without(opened, vehicle, dry_run=not yes)
     _print_outcome(done, "published" if done.published else "only shown: --yes publishes it")
+
+
+def upgrade(store: StoreName) -> None:
+    """Bring a store that an older mapvote wrote to the schema of this one. Stop the server and make a backup first."""
+    from mapvote.fleet.migrate import upgrade as upgrade_schema
+    from mapvote.fleet.store import existing, url_of
+
+    database = existing(url_of(store))
+    try:
+        before, after = upgrade_schema(database)
+    finally:
+        database.close()
+    print(f"schema {after}: nothing to do" if before == after else f"schema {before} is now {after}")
 
 
 def keys(

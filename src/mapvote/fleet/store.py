@@ -20,7 +20,7 @@ import sqlalchemy as sa
 from mapvote.core.ballot import Id, tile_key
 from mapvote.core.grid import Lattice, TileIndex
 from mapvote.core.types import MapTile, MapvoteError, PointMap
-from mapvote.fleet import schema
+from mapvote.fleet import migrate, schema
 from mapvote.fleet.content import TileHashes, pack_tile, unpack_tile
 from mapvote.fleet.database import Database
 from mapvote.fleet.errors import NotFound, Unavailable
@@ -66,6 +66,15 @@ def url_of(store: str) -> str:
     return store if "://" in store else f"sqlite:///{Path(store).absolute()}"
 
 
+def existing(url: str) -> Database:
+    """The database at ``url``; MapvoteError if that is an SQLite file which is not there."""
+    database = Database(url)
+    file = database.url.database
+    if database.is_sqlite and file and file != ":memory:" and not Path(file).exists():
+        raise MapvoteError(f"{file}: no such store; create one with `mapvote serve {file} --map MAP`")
+    return database
+
+
 def now_ns() -> int:
     """The server's clock."""
     return time.time_ns()
@@ -78,9 +87,8 @@ class Store:
         self.database = database
         self.clock = clock
         with database.reading() as connection:
-            row = connection.execute(sa.select(schema.maps)).one_or_none()
-        if row is None:
-            raise MapvoteError(f"{database.url.render_as_string()}: holds no map yet")
+            migrate.check(connection)
+            row = connection.execute(sa.select(schema.maps)).one()
         self.map_id: str = row.map_id
         self.lattice = Lattice(row.x0, row.y0)
         self.georeference: Mapping[str, str] = row.georeference
@@ -91,7 +99,9 @@ class Store:
         database = Database(url)
         try:
             with database.writing() as connection:
-                schema.metadata.create_all(connection)
+                if migrate.revision_of(connection) is None:
+                    migrate.run_migrations(connection)
+                migrate.check(connection)
                 if connection.execute(sa.select(schema.maps.c.map_id)).first() is not None:
                     raise MapvoteError(f"{database.url.render_as_string()}: holds a map already; open it instead")
                 origin = {"x0": point_map.lattice.x0, "y0": point_map.lattice.y0}
@@ -109,16 +119,16 @@ class Store:
 
     @classmethod
     def open(cls, url: str, *, clock: Callable[[], int] = now_ns) -> Store:
-        """An existing store; MapvoteError if there is none."""
-        database = Database(url)
-        file = database.url.database
-        if database.is_sqlite and file and file != ":memory:" and not Path(file).exists():
-            raise MapvoteError(f"{file}: no such store; create one with `mapvote serve {file} --map MAP`")
+        """An existing store; MapvoteError if there is none, or it has the schema of another mapvote."""
+        database = existing(url)
         try:
             return cls(database, clock)
         except Unavailable as error:
             database.close()
-            raise MapvoteError(f"{database.url.render_as_string()}: is no mapvote store ({error})") from error
+            raise MapvoteError(f"{database.url.render_as_string()}: cannot be opened as a store ({error})") from error
+        except BaseException:
+            database.close()
+            raise
 
     def close(self) -> None:
         """Close every connection."""
