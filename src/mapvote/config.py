@@ -126,6 +126,7 @@ class VotingSettings(Section):
     clear_share: float = Field(
         default=0.3, description="columns, E: share of the scans with rays through a cell that saw through what it held"
     )
+    join_cells: int = Field(default=6, ge=1, description="columns, C: how far a new thing reaches along mapped cells")
     fall_cells: int = Field(default=15, description="columns, H: how far what is gone takes unseen cells with it")
     min_scans: int = Field(default=1, description="columns, G: scans that must have hit a new voxel")
     min_support: int = Field(

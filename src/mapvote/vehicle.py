@@ -17,7 +17,7 @@ import numpy as np
 
 from mapvote.config import Settings, VotingSettings
 from mapvote.core.ballot import Ballot, BallotTile, content_hash, pack_plane, tile_key
-from mapvote.core.columns import Surroundings, dilated, reference_window
+from mapvote.core.columns import Surroundings, reference_window
 from mapvote.core.geometry import transform
 from mapvote.core.grid import TileIndex, tile_grid
 from mapvote.core.sensors import Sensor
@@ -25,7 +25,6 @@ from mapvote.core.types import (
     F64,
     I32,
     I64,
-    U64,
     Bool,
     CellState,
     Drive,
@@ -43,6 +42,10 @@ from mapvote.perception.tally import NewPoints, points_in, select
 from mapvote.perception.tracking import Fix, MapWindow, Tracker
 from mapvote.perception.visibility import find_obstacles, see
 from mapvote.perception.voters import Panel, Seen, TileVotes
+
+POINTS_REACH_M = 70.0
+"""New points are taken up to here, farther than votes are cast: a tile's width around the vehicle is laid out."""
+
 
 Localise = Callable[[Scan, PosePrior | None], Fix]
 """Where was this scan taken? ``Tracker.localise`` by NDT, or :class:`GivenPoses`. An untrusted fix casts no vote."""
@@ -108,7 +111,7 @@ class _Waiting:
     origin_map: F64
     sigma_m: float
     reference: Reference
-    near: U64
+    outer: Reference
     obstacle: Bool
     cell: I32
 
@@ -151,7 +154,6 @@ class Vehicle:
         self._new_points = NewPoints(point_map.lattice)
         self._waiting: deque[_Waiting] = deque()
         self._surroundings = Surroundings(point_map, self.settings.voting.window_m)
-        self._near: tuple[Reference, U64] | None = None
         self._stamps_ns: list[int] = []
 
     def observe(self, scan: Scan, T_map_lidar_prior: F64 | None = None) -> None:
@@ -171,9 +173,9 @@ class Vehicle:
         report.sigmas_m.append(sigma_m)
         with report.timed("ground"):
             points_map, origin_map = transform(T_map_lidar, fix.points), T_map_lidar[:3, 3].copy()
-            reference, near = self._reference_at(origin_map)
+            reference, outer = self._surroundings.at(origin_map)
             obstacle, cell = find_obstacles(points_map, reference)
-        self._waiting.append(_Waiting(points_map, origin_map, sigma_m, reference, near, obstacle, cell))
+        self._waiting.append(_Waiting(points_map, origin_map, sigma_m, reference, outer, obstacle, cell))
         with report.timed("moving"):
             decided = self.movers.push(points_map, origin_map, obstacle, scan.stamp_ns)
         for _, moving in decided:
@@ -185,18 +187,12 @@ class Vehicle:
         with self.report.timed("see"):
             view = see(scan.points_map, scan.origin_map, scan.obstacle, moving, scan.reference, scan.cell)
         with self.report.timed("vote"):
-            seen = Seen(view, scan.reference, scan.near, scan.origin_map, scan.sigma_m)
+            seen = Seen(view, scan.reference, scan.origin_map, scan.sigma_m)
             new = self._panel.add(seen)
             base = np.ascontiguousarray(scan.reference.base).ravel()
             chosen = select(scan.points_map, scan.cell, scan.obstacle & ~moving, new.ravel(), base)
             self._new_points.offer(scan.points_map[chosen])
-
-    def _reference_at(self, origin_map: F64) -> tuple[Reference, U64]:
-        """The partial reference map R_i, the 80 m window around the sensor, and what its voxels explain."""
-        reference, outer = self._surroundings.at(origin_map)
-        if self._near is None or self._near[0] is not outer:
-            self._near = outer, dilated(outer.occupied, outer.base, 1)
-        return reference, self._near[1][reference.grid.slices_in(outer.grid)]
+            self._new_points.offer(_strange_beyond(scan))
 
     def ballot(self, voting: VotingSettings | None = None) -> Ballot:
         """What this vehicle says so far, by the voter with these settings (default: the first).
@@ -255,6 +251,18 @@ class Vehicle:
 
     def _base_hash(self, tile: TileIndex) -> str:
         return content_hash(self.point_map.tiles[tile].points) if tile in self.point_map.tiles else ""
+
+
+def _strange_beyond(scan: _Waiting) -> F64:
+    """(m, 3) obstacle points outside the local grid, within reach, in voxels that the map does not hold.
+
+    They cast no vote. But the upper storeys of what is new can be seen only from afar, below the sensor's top beam.
+    """
+    off = scan.points_map[:, :2] - scan.origin_map[:2]
+    far = scan.points_map[(scan.cell < 0) & (np.hypot(off[:, 0], off[:, 1]) < POINTS_REACH_M)]
+    obstacle, cell = find_obstacles(far, scan.outer)
+    base = np.ascontiguousarray(scan.outer.base).ravel()
+    return far[select(far, cell, obstacle, (~scan.outer.occupied).ravel(), base)]
 
 
 def _counts_as(voting: VotingSettings) -> VotingSettings:

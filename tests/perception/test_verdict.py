@@ -9,7 +9,7 @@ import numpy as np
 from mapvote.config import VotingSettings
 from mapvote.core.types import NO_VOTE, U64, CellState
 from mapvote.perception.evidence import PLANES
-from mapvote.perception.verdict import Verdict, drop_specks, fallen, weigh
+from mapvote.perception.verdict import Verdict, drop_specks, fallen, unexplained, weigh
 
 UO, UE, CO, CE, UN = CellState
 FREE = ~np.uint64(0)
@@ -33,31 +33,60 @@ def judge(through: dict[int, int], struck: dict[int, int], occupied: int = 0, **
     return weigh(cell(through, struck), occupied_word, near_word, free_word, low, settings)
 
 
+def around(through: dict[int, int]) -> dict[int, int]:
+    """The same rays through the voxels above and below too, as they are where nothing stands."""
+    return {bit + step: n for step in (-1, 1, 0) for bit, n in through.items()}
+
+
 def state(*args: Any, **more: Any) -> int:
     return int(judge(*args, **more).states()[0, 0])
 
 
 def test_a_mapped_voxel_struck_is_unchanged_and_seen_through_is_gone() -> None:
     assert state({}, {3: 5}, occupied=0b1000) == UO
-    assert state({3: 20}, {}, occupied=0b1000) == CE
+    assert state(around({3: 20}), {}, occupied=0b1000) == CE
     assert state({}, {}, occupied=0b1000) == NO_VOTE
 
 
+def test_rule_a_rays_that_graze_a_slab_without_crossing_it_say_nothing() -> None:
+    assert state({11: 40, 12: 20}, {}, occupied=1 << 12) == UN, "never a ray above it: an awning seen from below"
+    assert state({12: 20, 13: 40}, {}, occupied=1 << 12) == UN, "never a ray below it: a hedge seen from above"
+    assert state({11: 40, 12: 20, 13: 40}, {}, occupied=1 << 12) == CE
+    assert state({12: 20, 13: 40}, {}, occupied=1 << 12, rules="BCDEFGH") == CE
+    assert state({1: 20, 2: 40}, {}, occupied=0b10) == CE, "below the lowest voxel is the ground"
+
+
 def test_rule_e_a_few_hits_outweigh_many_rays_that_grazed_past() -> None:
-    assert state({3: 20}, {3: 4}, occupied=0b1000) == UO
-    assert state({3: 20}, {3: 4}, occupied=0b1000, rules="ABCDFG") == CE
+    assert state(around({3: 20}), {3: 4}, occupied=0b1000) == UO
+    assert state(around({3: 20}), {3: 4}, occupied=0b1000, rules="ABCDFG") == CE
 
 
 def test_rule_e_what_is_hardly_ever_seen_through_is_not_called_gone() -> None:
-    through = {1: 40, 12: 3}
+    through = {1: 40, **around({12: 3})}
     assert state(through, {}, occupied=1 << 12) == UN
     assert state(through, {}, occupied=1 << 12, rules="ABCDFG") == CE
 
 
-def test_rule_c_what_the_map_explains_is_not_new() -> None:
-    assert state({}, {4: 9}) == CO
-    assert state({}, {4: 9}, near=1 << 4) != CO
-    assert state({}, {4: 9}, near=1 << 4, rules="ABDEFG") == CO
+def test_rule_c_sets_apart_what_lies_only_next_to_mapped_voxels() -> None:
+    assert not judge({}, {4: 9}).beside[0, 0]
+    assert judge({}, {4: 9}, near=1 << 4).beside[0, 0]
+    assert not judge({}, {4: 9, 7: 9}, near=1 << 4).beside[0, 0], "part of it stands free"
+    assert not judge({}, {4: 9}, near=1 << 4, rules="ABDEFG").beside[0, 0]
+
+
+def test_rule_c_a_new_wall_keeps_the_cells_that_touch_an_old_one_and_a_ghost_along_it_is_dropped() -> None:
+    states = np.full((12, 12), UE, np.uint8)
+    states[2, 2:10] = states[8, 2:6] = CO
+    beside = np.zeros(states.shape, bool)
+    beside[2, 2:5] = beside[8] = True
+    dropped = unexplained(states, beside, 2)
+    assert list(np.flatnonzero(dropped[2])) == [2], "3 and 4 are within two cells of where it stands free"
+    assert list(np.flatnonzero(dropped[8])) == [2, 3, 4, 5]
+    assert dropped.sum() == 5
+
+
+def test_a_cell_that_the_map_has_points_in_is_never_changed_occupied() -> None:
+    assert state({}, {9: 9}, occupied=0b1000) != CO
 
 
 def test_rule_d_new_only_where_the_map_knew_free_space() -> None:
@@ -66,7 +95,10 @@ def test_rule_d_new_only_where_the_map_knew_free_space() -> None:
 
 
 def test_rule_d_the_top_of_a_new_house_comes_with_it_though_the_map_knew_nothing_up_there() -> None:
-    assert judge({}, {4: 9, 30: 3}, free=1 << 4).new[0, 0] == 1 << 4 | 1 << 30
+    new = judge({}, {4: 9, 30: 3}, free=1 << 4 | 1 << 40).new[0, 0]
+    assert new & np.uint64(1 << 4 | 1 << 30) == 1 << 4 | 1 << 30
+    assert not new & np.uint64(0b1111), "nothing below it"
+    assert not new & np.uint64(1 << 40), "nor where the map knew the air to be free and nothing was struck"
     assert judge({}, {30: 9}, free=1 << 4).new[0, 0] == 0
 
 
@@ -82,9 +114,9 @@ def test_rule_g_may_ask_for_more_than_a_single_hit() -> None:
 
 
 def test_rule_g_what_hardly_rises_above_the_ground_is_never_called_gone() -> None:
-    assert state({1: 40}, {}, occupied=0b10) == CE
-    assert state({1: 40}, {}, occupied=0b10, low=True) == UN
-    assert state({1: 40}, {}, occupied=0b10, low=True, rules="ABCDEF") == CE
+    assert state({1: 40, 2: 40}, {}, occupied=0b10) == CE
+    assert state({1: 40, 2: 40}, {}, occupied=0b10, low=True) == UN
+    assert state({1: 40, 2: 40}, {}, occupied=0b10, low=True, rules="ABCDEF") == CE
     assert state({}, {1: 40}, occupied=0b10, low=True) == UO
 
 
@@ -93,17 +125,19 @@ def test_rule_h_a_roof_that_hardly_any_ray_reached_is_adrift_and_one_that_was_st
     assert judge(below, {}, occupied=1 << 20).adrift[0, 0]
     assert judge({**below, 20: 3}, {}, occupied=1 << 20).adrift[0, 0]
     assert not judge({**below, 20: 3}, {20: 1}, occupied=1 << 20).adrift[0, 0]
-    assert not judge({**below, 20: 30}, {}, occupied=1 << 20).adrift[0, 0]  # seen through clearly: gone by itself
+    assert not judge({**below, 20: 30, 21: 30}, {}, occupied=1 << 20).adrift[
+        0, 0
+    ]  # seen through clearly: gone by itself
 
 
 def test_a_wall_keeps_its_voxels_when_the_awning_above_it_is_taken_down() -> None:
-    verdict = judge({9: 30, 10: 30}, {2: 40, 3: 40}, occupied=0b110_0000_1100)
+    verdict = judge({8: 30, 9: 30, 10: 30, 11: 30}, {2: 40, 3: 40}, occupied=0b110_0000_1100)
     assert verdict.states()[0, 0] == UO
     assert verdict.gone[0, 0] == 0b110_0000_0000
 
 
 def test_what_no_ray_reached_goes_with_the_column_it_stood_on() -> None:
-    verdict = judge({2: 30, 3: 30}, {}, occupied=0b1_0000_0000_1100)
+    verdict = judge({1: 30, 2: 30, 3: 30, 4: 30}, {}, occupied=0b1_0000_0000_1100)
     assert verdict.states()[0, 0] == CE
     assert verdict.gone[0, 0] == 0b1_0000_0000_1100
 
@@ -130,8 +164,10 @@ def test_rule_h_a_roof_falls_with_its_walls_but_not_beside_one_that_stands() -> 
     states[8:12, 4] = CE
     assert fallen(states, adrift, 10)[8:12, 8:12].all()
     assert not fallen(states, adrift, 10)[:, 30:].any(), "too far from anything that is gone"
-    states[12, 12] = UO
-    assert not fallen(states, adrift, 10).any(), "it touches what still stands"
+    states[8:12, 13] = UO
+    falls = fallen(states, adrift, 10)[8:12, 8:12]
+    assert falls[:, 0].all(), "nearer to what is gone"
+    assert not falls[:, 1:].any(), "nearer to what still stands: the roof of the house next to it"
     assert not fallen(np.full_like(states, UN), adrift, 10).any()
 
 

@@ -12,13 +12,15 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from mapvote.core.columns import neighbourhood
+from mapvote.core.columns import TOP_BIT, neighbourhood
 from mapvote.core.grid import TILE_CELLS, Lattice, TileIndex, tile_grid
 from mapvote.core.types import F32, I32, U8, U64, Reference
 from mapvote.perception.visibility import ScanView, Sight
 
 PLANES = 7
 """Counts up to 127 scans; a cell that would pass it is halved as a whole, which keeps its ratios."""
+OPEN_SHARE = 0.1
+"""A voxel is open if the voxels above and below it were seen through in more than this share of its own times."""
 _THROUGH, _STRUCK = 0, PLANES
 _BEHIND = int(Sight.BEHIND)
 
@@ -57,6 +59,19 @@ def count_of(planes: U64, first: int, bit: int) -> int:
     for k in range(PLANES):
         value |= int((planes[first + k] >> np.uint64(bit)) & np.uint64(1)) << k
     return value
+
+
+@numba.njit(cache=True, nogil=True)
+def is_open(planes: U64, bit: int) -> bool:
+    """Whether rays went through a voxel from side to side, and did not only graze it along a slab.
+
+    A roof, an awning or a ceiling is thinner than a voxel: rays that graze it pass through its voxel, but of the voxels
+    above and below they reach only one. The ground bounds the lowest voxel, the end of the word the highest.
+    """
+    through = count_of(planes, _THROUGH, bit)
+    above = count_of(planes, _THROUGH, bit + 1) if bit + 1 < TOP_BIT else through
+    below = count_of(planes, _THROUGH, bit - 1) if bit > 1 else through
+    return min(above, below) > OPEN_SHARE * through
 
 
 @numba.njit(cache=True, nogil=True)

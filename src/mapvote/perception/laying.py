@@ -23,7 +23,7 @@ from mapvote.core.tiling import map_from_points
 from mapvote.core.types import F64, I32, I64, U64, Bool, Drive, PointMap, Reference
 from mapvote.core.voxels import VoxelCloud
 from mapvote.perception.deskew import deskew, twist_between
-from mapvote.perception.evidence import PLANES, Evidence, count_of, free_words
+from mapvote.perception.evidence import PLANES, Evidence, count_of, free_words, is_open
 from mapvote.perception.moving import MovingFilter
 from mapvote.perception.visibility import find_obstacles, see
 
@@ -86,7 +86,8 @@ class Layer:
     def _trails(self, points: F64, ground: PointMap) -> Bool:
         """Which points (n, 3) lie in voxels that were struck in too few of the scans that could have struck them.
 
-        Only points that stand above the ground of ``ground`` are judged.
+        Only points that stand above the ground of ``ground`` are judged, and only voxels that rays crossed from side to
+        side: what merely grazes a thin slab says nothing against it.
         """
         trail = np.zeros(len(points), dtype=np.bool_)
         rows, cols = self.draft.lattice.cells_of(points)
@@ -98,9 +99,8 @@ class Layer:
             here = here[find_obstacles(points[here], standing)[0]]
             r, c = r[here], c[here]
             bits = np.floor(points[here, 2] / CELL_SIZE).astype(np.int64) - reference.base[r, c]
-            through, struck = _counts(planes, r, c, bits)
             s = self.settings.mapping
-            trail[here] = (through >= s.trail_min_through) & (struck < s.trail_share * (struck + through))
+            trail[here] = _are_trails(planes, r, c, bits, s.trail_min_through, s.trail_share)
         return trail
 
     def _free(self, tile: TileIndex, point_map: PointMap) -> U64:
@@ -138,14 +138,16 @@ def motion_at(stamps_ns: I64, T_map_lidar: F64, i: int) -> F64:
 
 
 @numba.njit(cache=True, nogil=True)
-def _counts(planes: U64, rows: I64, cols: I64, bits: I64) -> tuple[I64, I64]:
-    """(seen through, struck) of voxels (row, col, bit) of a tile; voxels outside the columns have 0 and 0."""
-    through, struck = np.zeros(len(bits), dtype=np.int64), np.zeros(len(bits), dtype=np.int64)
+def _are_trails(planes: U64, rows: I64, cols: I64, bits: I64, min_through: int, share: float) -> Bool:
+    """(n,) of voxels (row, col, bit) of a tile; those outside the columns are none."""
+    out = np.zeros(len(bits), dtype=np.bool_)
     for i in range(len(bits)):
         if 0 <= bits[i] < TOP_BIT:
-            through[i] = count_of(planes[rows[i], cols[i]], 0, bits[i])
-            struck[i] = count_of(planes[rows[i], cols[i]], PLANES, bits[i])
-    return through, struck
+            cell = planes[rows[i], cols[i]]
+            through, struck = count_of(cell, 0, bits[i]), count_of(cell, PLANES, bits[i])
+            rarely = through >= min_through and struck < share * (struck + through)
+            out[i] = rarely and is_open(cell, bits[i])
+    return out
 
 
 @numba.njit(cache=True, nogil=True)

@@ -16,7 +16,8 @@ from scipy import ndimage
 from mapvote.config import VotingSettings
 from mapvote.core.types import I32, U8, U64, Bool, CellState
 from mapvote.core.voting import VOTE_UNIT, decide
-from mapvote.perception.evidence import PLANES, count_of
+from mapvote.perception.classify import below_top
+from mapvote.perception.evidence import PLANES, count_of, is_open
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,8 +30,10 @@ class Verdict:
     """(rows, cols) mapped voxels that are there no more, should the cell be changed-empty."""
     new: U64
     """(rows, cols) voxels of new surface, should it be changed-occupied."""
+    beside: Bool
+    """(rows, cols) cells all of whose new voxels lie next to mapped ones (rule C)."""
     adrift: Bool
-    """(rows, cols) mapped cells whose voxels no ray struck and hardly any reached, while rays passed below (rule H)."""
+    """(rows, cols) mapped cells whose voxels no ray struck and hardly any crossed, while rays passed below (rule H)."""
 
     def states(self) -> U8:
         return decide(self.tally)
@@ -48,8 +51,9 @@ def _ones(word: np.uint64) -> int:
 
 @numba.njit(cache=True, nogil=True)
 def _weigh(
-    planes: U64, occupied: U64, near: U64, free: U64, low: Bool, by_height: bool, empty_votes: float, gone_votes: float,
-    clear_share: float, min_scans: int, min_support: int, tally: I32, gone: U64, new: U64, adrift: Bool,
+    planes: U64, occupied: U64, near: U64, free: U64, low: Bool, crossed: bool, by_height: bool, empty_votes: float,
+    gone_votes: float, clear_share: float, min_scans: int, min_support: int,
+    tally: I32, gone: U64, new: U64, beside: Bool, adrift: Bool,
 ) -> None:  # fmt: skip
     for r in range(occupied.shape[0]):
         for c in range(occupied.shape[1]):
@@ -60,8 +64,7 @@ def _weigh(
                 struck |= cell[PLANES + k]
             if not through | struck:
                 continue
-            strange, beyond = struck & ~mapped & ~near[r, c], np.uint64(0)
-            candidates = strange & free[r, c]
+            strange, beyond = np.uint64(0) if mapped else struck, np.uint64(0)
             kept, lost, found, refuted, rays, clear = 0, 0, 0, 0, 0, 0
             for bit in range(64):
                 one = np.uint64(1) << np.uint64(bit)
@@ -71,21 +74,23 @@ def _weigh(
                 rays = max(rays, t)
                 if mapped & one:
                     kept += s
-                    lost += t
-                    clear = max(clear, t)
-                    if gone_votes * t > s:
-                        gone[r, c] |= one
+                    if not crossed or is_open(cell, bit):
+                        lost += t
+                        clear = max(clear, t)
+                        if gone_votes * t > s:
+                            gone[r, c] |= one
                 elif strange & one and s >= min_scans and s > empty_votes * t:
-                    if candidates & one:
+                    if free[r, c] & one:
                         new[r, c] |= one
                         found += s
                         refuted += t
-                    else:
+                    elif not near[r, c] & one:
                         beyond |= one
             if kept or found < min_support:
                 found, refuted, new[r, c] = 0, 0, 0
             else:  # a new thing's upper parts, where the map knew nothing, come with it
-                new[r, c] |= beyond
+                beside[r, c] = not new[r, c] & ~near[r, c]
+                new[r, c] |= beyond | ~(below_top(new[r, c]) | free[r, c])
             if low[r, c] or clear < clear_share * rays:
                 lost = 0  # hardly ever seen through: foliage, or the end of the view
             if mapped and not (kept or lost or low[r, c]):
@@ -104,36 +109,48 @@ def _weigh(
 def weigh(planes: U64, occupied: U64, near: U64, free: U64, low: Bool, settings: VotingSettings) -> Verdict:
     """Votes of a window from its counters ``planes`` (rows, cols, 2 * PLANES) and the map's words (rows, cols).
 
-    ``near``: what the map's voxels explain (rule C); ``free``: what the map knows to be free (rule D); ``low``: cells
-    whose map hardly rises above the ground (rule G: kerbs, grass, trails of cars' bumpers are never called gone).
+    ``near``: voxels in which a hit may belong to a mapped voxel next to them (rule C); ``free``: what the map knows to
+    be free (rule D); ``low``: cells whose map hardly rises above the ground (rule G: kerbs, grass, trails of cars'
+    bumpers are never called gone). A cell that the map has points in is never changed-occupied (paper III-A).
     """
     shape, rules = occupied.shape, settings.rules
     everything = np.full(shape, ~np.uint64(0))
-    tally, adrift = np.zeros((*shape, 5), np.int32), np.zeros(shape, np.bool_)
+    tally, beside, adrift = np.zeros((*shape, 5), np.int32), np.zeros(shape, np.bool_), np.zeros(shape, np.bool_)
     gone, new = np.zeros(shape, np.uint64), np.zeros(shape, np.uint64)
     _weigh(
-        planes, occupied, near if "C" in rules else np.where(occupied, everything, np.uint64(0)),
-        free if "D" in rules else everything, low if "G" in rules else np.zeros(shape, np.bool_),
+        planes, occupied, near if "C" in rules else np.zeros(shape, np.uint64),
+        free if "D" in rules else everything, low if "G" in rules else np.zeros(shape, np.bool_), "A" in rules,
         "F" in rules, settings.empty_votes if "F" in rules else 1.0, settings.gone_votes if "E" in rules else 1.0,
         settings.clear_share if "E" in rules else 0.0, settings.min_scans if "G" in rules else 1,
-        settings.min_support if "G" in rules else 1, tally, gone, new, adrift,
+        settings.min_support if "G" in rules else 1, tally, gone, new, beside, adrift,
     )  # fmt: skip
-    return Verdict(tally, gone, new, adrift)
+    return Verdict(tally, gone, new, beside, adrift)
+
+
+def unexplained(states: U8, beside: Bool, reach: int) -> Bool:
+    """(rows, cols) cells of ``beside`` that rule C gives up: an error of pose puts hits next to what is mapped, and
+    there alone. A new thing that touches an old one also stands where nothing explains it: the cells next to it that
+    are ``reach`` cells or less from such a place belong to it."""
+    changed = states == CellState.CHANGED_OCCUPIED
+    core = changed & ~beside
+    joined = ndimage.binary_dilation(core, np.ones((3, 3)), iterations=reach, mask=changed)
+    return np.asarray(changed & ~(core | joined))
 
 
 def fallen(states: U8, adrift: Bool, reach: int) -> Bool:
     """(rows, cols) cells of rule H: what stood on things that are gone, and no ray could reach, is gone with them.
 
-    A group of ``adrift`` cells falls if a changed-empty cell lies within ``reach`` cells of it and none that the scans
-    found occupied touches it: the roof of a demolished house, too high for the sensor once nothing is behind it.
+    The roof of a demolished house, too high for the sensor once nothing is behind it. An ``adrift`` cell goes with the
+    changed-empty or the unchanged-occupied cell that is nearer, so that of two roofs that meet only one falls; a
+    connected group of those that go falls if a changed-empty cell lies within ``reach`` cells of it.
     """
-    group, count = ndimage.label(adrift, structure=np.ones((3, 3)))
-    lost = ndimage.distance_transform_cdt(states != CellState.CHANGED_EMPTY, "chessboard") <= reach
-    if not (states == CellState.CHANGED_EMPTY).any():
-        lost = np.zeros_like(adrift)
-    kept = ndimage.binary_dilation(states == CellState.UNCHANGED_OCCUPIED, np.ones((3, 3)))
-    falls = np.bincount(group[lost], minlength=count + 1) > 0
-    falls &= np.bincount(group[kept], minlength=count + 1) == 0
+    gone, kept = states == CellState.CHANGED_EMPTY, states == CellState.UNCHANGED_OCCUPIED
+    if not gone.any():
+        return np.zeros_like(adrift)
+    to_gone = ndimage.distance_transform_cdt(~gone, "chessboard")
+    goes = adrift & (to_gone < ndimage.distance_transform_cdt(~kept, "chessboard")) if kept.any() else adrift
+    group, count = ndimage.label(goes, structure=np.ones((3, 3)))
+    falls = np.bincount(group[to_gone <= reach], minlength=count + 1) > 0
     falls[0] = False
     return np.asarray(falls[group])
 

@@ -20,7 +20,7 @@ from mapvote.core.voting import decide, one_hot
 from mapvote.perception.classify import classify_paper
 from mapvote.perception.evidence import Evidence, free_words
 from mapvote.perception.tally import Tally
-from mapvote.perception.verdict import drop_specks, fallen, weigh
+from mapvote.perception.verdict import drop_specks, fallen, unexplained, weigh
 from mapvote.perception.visibility import ScanView
 
 ALL_BITS = ~np.uint64(0)
@@ -36,8 +36,6 @@ class Seen:
 
     view: ScanView
     reference: Reference
-    near: U64
-    """(rows, cols) what the map's voxels explain: their neighbourhood."""
     origin_map: F64
     sigma_m: float
     """Standard deviation of the position, metres."""
@@ -91,11 +89,12 @@ class ColumnVoter:
 
     def add(self, seen: Seen) -> U64:
         """Take note of one scan; returns (rows, cols) words of voxels whose points may be new."""
-        return seen.view.hit & ~(seen.near if "C" in self.voting.rules else seen.reference.occupied)
+        return seen.view.hit & ~seen.reference.occupied
 
     def votes(self) -> dict[TileIndex, TileVotes]:
         """Every tile with evidence, in ascending order."""
-        out, adrift, mapped = {}, {}, {}
+        out: dict[TileIndex, TileVotes] = {}
+        beside, adrift, mapped = {}, {}, {}
         for tile, planes in sorted(self.evidence.tiles.items()):
             window = tile_grid(self.point_map.lattice, tile)
             around = reference_window(self.point_map, window.padded(1))
@@ -109,13 +108,26 @@ class ColumnVoter:
                 if here.free is not None:
                     free[here.free != 0] = 0  # what the map knows need not be sent
                 out[tile] = TileVotes(verdict.tally, verdict.states(), verdict.gone, verdict.new, free)
-                adrift[tile] = verdict.adrift
+                beside[tile], adrift[tile] = verdict.beside, verdict.adrift
                 mapped[tile] = here.occupied
+        if "C" in self.voting.rules:
+            self._drop_explained(out, beside)
         if "H" in self.voting.rules:
             self._drop_what_fell(out, adrift, mapped)
         if "G" in self.voting.rules:
             self._drop_specks(out)
         return out
+
+    def _drop_explained(self, votes: dict[TileIndex, TileVotes], beside: dict[TileIndex, Bool]) -> None:
+        """Rule C, with the cells around a tile, so that what touches across its edge is joined from both sides."""
+        states = {tile: v.states.copy() for tile, v in votes.items()}
+        halo = self.voting.join_cells
+        for tile, v in votes.items():
+            wide = tile_grid(self.point_map.lattice, tile).padded(halo)
+            near = self._around(states, wide, NO_VOTE), self._around(beside, wide, False)
+            cells = unexplained(*near, halo)[halo:-halo, halo:-halo]
+            v.states[cells] = CellState.UNDETERMINED
+            v.tally[cells] = one_hot(np.array(CellState.UNDETERMINED, dtype=np.uint8))
 
     def _drop_what_fell(
         self, votes: dict[TileIndex, TileVotes], adrift: dict[TileIndex, Bool], mapped: dict[TileIndex, U64]
