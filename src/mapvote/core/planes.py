@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import math
+import threading
 from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
+import zstandard
 from backports import zstd
 from numpy.typing import NDArray
 
 from mapvote.core.types import MapvoteError
 
+_own = threading.local()
 PIECE = 1 << 17
 ZSTD_LEVEL = 19
 """For ballots, which travel by radio. Tiles of noisy float32 gain nothing above level 3."""
@@ -44,8 +47,28 @@ def pieces(data: bytes, limit: int, what: str) -> Iterator[bytes]:
 
 
 def unpack_bytes(data: bytes, limit: int, what: str) -> bytes:
-    """Decompress at most ``limit`` bytes; MapvoteError beyond it or on damage (a decompression bomb stops here)."""
+    """Decompress at most ``limit`` bytes; MapvoteError beyond it or on damage (a decompression bomb stops here).
+
+    A frame says how large it is, and one that says so is written into a buffer of that size, never beyond.
+    """
+    try:
+        size = zstandard.frame_content_size(data)
+        if 0 <= size <= limit:
+            return _decompressor().decompress(data, read_across_frames=False, allow_extra_data=False)
+    except zstandard.ZstdError as error:
+        raise MapvoteError(f"{what} is damaged ({error}); fetch or send it again") from error
+    if size > limit:
+        raise MapvoteError(f"{what} is larger than {limit} bytes when decompressed")
     return b"".join(pieces(data, limit, what))
+
+
+def _decompressor() -> zstandard.ZstdDecompressor:
+    """One for each thread, used again and again: making one takes as long as unpacking a small plane, and
+    backports.zstd makes one for each frame."""
+    if not hasattr(_own, "decompressor"):
+        _own.decompressor = zstandard.ZstdDecompressor()
+    decompressor: zstandard.ZstdDecompressor = _own.decompressor
+    return decompressor
 
 
 def unpack_plane(data: bytes, dtype: str, shape: tuple[int, ...], what: str) -> NDArray[Any]:
