@@ -64,5 +64,6 @@ def create_app(
         app.include_router(part.router)
     app.add_exception_handler(MapvoteError, refuse)
     app.add_exception_handler(400, unreadable)
+    app.add_middleware(routes.StraightToVote)
     app.add_middleware(Watch, guard=guard, metrics=metrics)
     return app

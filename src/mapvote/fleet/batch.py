@@ -40,12 +40,13 @@ class Batcher(Generic[Asked, Answer]):
             await self._worker
 
     async def _run(self) -> None:
+        loop = asyncio.get_running_loop()
         while self._waiting:
             await asyncio.sleep(0)  # who arrived in the same moment comes along
             some, self._waiting = self._waiting[: self._limit], self._waiting[self._limit :]
             answers: Sequence[Answer | Exception]
             try:
-                answers = await asyncio.to_thread(self._work, [item for item, _ in some])
+                answers = await loop.run_in_executor(None, self._work, [item for item, _ in some])
             except Exception as error:
                 answers = [error] * len(some)
             for (_, future), answer in zip(some, answers, strict=True):

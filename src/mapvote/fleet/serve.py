@@ -82,7 +82,12 @@ def serve(
     shown = f"[{host}]" if ":" in host else host
     ready(f"http://{shown}:{listener.getsockname()[1]}")
     config = uvicorn.Config(
-        app, access_log=False, log_level="warning", timeout_graceful_shutdown=20, server_header=False
+        app,
+        access_log=False,
+        proxy_headers=False,
+        log_level="warning",
+        timeout_graceful_shutdown=20,
+        server_header=False,
     )
     with listener:
         uvicorn.Server(config).run(sockets=[listener])
