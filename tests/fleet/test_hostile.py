@@ -16,7 +16,7 @@ import msgspec
 import pytest
 import sqlalchemy as sa
 
-from hand_made import Say, make_ballot, states_plane, two_walls, wall, words_plane
+from hand_made import SETTINGS, Say, make_ballot, states_plane, two_walls, wall, words_plane
 from live_server import serving
 from mapvote.core.ballot import MAX_TILE_INDEX, encode
 from mapvote.core.types import CellState
@@ -24,7 +24,13 @@ from mapvote.fleet import keys, schema
 from mapvote.fleet.store import Store
 from mutants import bomb, mutants
 
-CONFIG = "[server]\nballots_per_minute = 1e9\nburst = 1000000\nmax_body_bytes = 300000\n"
+CONFIG = f"""
+[server]
+ballots_per_minute = 1e9
+burst = 1000000
+max_body_bytes = 300000
+settings_hash = "{SETTINGS}"
+"""
 
 
 class Site:
@@ -121,6 +127,7 @@ def test_10_000_mutated_ballots(site: Site) -> None:
         (changed(end_ns=(1 << 64) - 1), 422, "future"),
         (changed(start_ns=-(1 << 63)), None, ""),
         (changed(settings_hash="a\x00b"), 422, "not readable"),
+        (changed(settings_hash="0" * 64), 409, "fleet's configuration"),
         (changed(method="evidence"), 422, "evidence"),
         (changed(base={"0,0": "f" * 64, "0,1": "f" * 64}), 409, "fetch"),
         (changed(base={}), 422, "base hash"),

@@ -6,6 +6,7 @@ import itertools
 import threading
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ from mapvote.core.ballot import Ballot, encode
 from mapvote.core.types import CellState, MapvoteError, PointMap
 from mapvote.fleet.errors import Conflict, Held, NotFound, Unavailable
 from mapvote.fleet.fuse import DAY_NS
-from mapvote.fleet.intake import Receipt, accept, examine, withdraw
+from mapvote.fleet.intake import Intake, Receipt, accept, examine, withdraw
 from mapvote.fleet.publish import publish, rollback
 from mapvote.fleet.store import Store
 from mapvote.fleet.update import update_map
@@ -159,13 +160,31 @@ def test_withdrawn_before_publication_it_is_as_if_never_cast(store: Store) -> No
         withdraw(store, "d", by="operator")
 
 
-def test_a_round_never_mixes_methods(store: Store) -> None:
+@pytest.mark.parametrize("other", [{"method": "paper"}, {"settings_hash": "0" * 64}])
+def test_a_round_never_mixes_methods_or_settings(store: Store, other: Any) -> None:
+    """The first ballot decides how a round votes; once none stands, another may begin."""
     base = store.point_map()
-    send(store, says(base, "a", EMPTY))
-    with pytest.raises(Conflict, match="never mixes methods"):
-        send(store, says(base, "b", EMPTY, method="paper"))
-    withdraw(store, "a", by="a")
-    send(store, says(base, "b", EMPTY, method="paper"))
+    send(store, says(base, "a", EMPTY), says(base, "b", EMPTY))
+    with pytest.raises(Conflict, match=r"never mixes methods or settings; vote again as the round does"):
+        send(store, says(base, "c", EMPTY, **other))
+    with pytest.raises(Conflict):
+        send(store, says(base, "a", EMPTY, **other))
+    assert withdraw(store, "a", by="a") == 1
+    with pytest.raises(Conflict):
+        send(store, says(base, "c", EMPTY, **other))
+    assert withdraw(store, None, by="operator") == 1
+    send(store, says(base, "c", EMPTY, **other), says(base, "d", EMPTY, **other))
+    assert publish(store, POLICY).deleted == 3
+
+
+def test_an_operator_may_say_which_settings_the_fleet_votes_by(store: Store) -> None:
+    """Then no first ballot, right or wrong, decides for the others."""
+    intake, base = Intake(store, "ab" * 16), store.point_map()
+    ballots = [says(base, "a", EMPTY), says(base, "b", EMPTY, settings_hash="ab" * 32)]
+    refused, taken = intake.accept([examine(encode(ballot)) for ballot in ballots])
+    assert isinstance(refused, Conflict)
+    assert "fleet's configuration" in str(refused)
+    assert isinstance(taken, Receipt)
 
 
 def test_another_map_is_refused_and_so_is_the_future(store: Store) -> None:

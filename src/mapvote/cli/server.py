@@ -195,7 +195,8 @@ def log(
 
 def unvote(
     store: StoreName,
-    vehicle: Annotated[str, typer.Argument(help="whose votes go")],
+    vehicle: Annotated[str | None, typer.Argument(help="whose votes go")] = None,
+    everybody: Annotated[bool, typer.Option("--all", help="every vehicle's: begins a new round")] = False,
     drive: Annotated[str | None, typer.Option(help="only this drive; else all of them")] = None,
     replay: Annotated[bool, typer.Option(help="also take it out of what is published, in a new version")] = False,
     yes: Annotated[bool, typer.Option(help="with --replay: publish; else only show the difference")] = False,
@@ -205,11 +206,14 @@ def unvote(
     from mapvote.fleet.intake import withdraw
     from mapvote.fleet.replay import replay as replay_without
 
-    if replay and drive is not None:
-        raise MapvoteError("unvote: --replay takes out a whole vehicle; leave out --drive")
+    if (vehicle is None) != everybody:
+        raise MapvoteError("unvote: say whose votes go: a VEHICLE, or --all")
+    if replay and (vehicle is None or drive is not None):
+        raise MapvoteError("unvote: --replay takes out one whole vehicle; leave out --all and --drive")
     with _opened(store) as opened:
-        if not replay:
-            print(f"{withdraw(opened, vehicle, drive, by='operator')} ballots of {vehicle} withdrawn")
+        if not replay or vehicle is None:
+            whose = vehicle or "all vehicles"
+            print(f"{withdraw(opened, vehicle, drive, by='operator')} ballots of {whose} withdrawn")
             return
         done = replay_without(opened, vehicle, dry_run=not yes)
     _print_outcome(done, "published" if done.published else "only shown: --yes publishes it")

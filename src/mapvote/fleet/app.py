@@ -41,7 +41,7 @@ def create_app(
         own = ThreadPoolExecutor(2, "fuse") if executor is None else None
         app.state.executor = executor or own
         app.state.examiner = Batcher(examine_all, settings.server.batch)
-        app.state.writer = Batcher(Intake(store).accept, settings.server.batch)
+        app.state.writer = Batcher(Intake(store, settings.server.settings_hash).accept, settings.server.batch)
         yield
         await app.state.examiner.close()
         await app.state.writer.close()

@@ -33,7 +33,8 @@ class Incoming:
 
     ballot: Ballot
     digest: str
-    method: str
+    cast_by: str
+    """Method, stage and settings: all ballots of a round agree on them."""
     key_hash: str | None = None
     """Of the key that it came with; None where no key is needed."""
 
@@ -59,7 +60,8 @@ def examine(data: bytes, key_hash: str | None = None) -> Incoming:
     rule_of(ballot.method)
     if any((tile.states is None) != (ballot.tiles[0].states is None) for tile in ballot.tiles):
         raise MapvoteError("ballot: some tiles hold states and some a tally; a ballot is either two-stage or one-stage")
-    return Incoming(ballot, hashlib.sha256(data).hexdigest(), f"{ballot.method}, {staged(ballot)}", key_hash)
+    cast_by = f"{ballot.method}, {staged(ballot)}, settings {ballot.settings_hash[:32]}"
+    return Incoming(ballot, hashlib.sha256(data).hexdigest(), cast_by, key_hash)
 
 
 def examine_all(received: Sequence[tuple[bytes, str | None]]) -> list[Incoming | Exception]:
@@ -74,17 +76,21 @@ def examine_all(received: Sequence[tuple[bytes, str | None]]) -> list[Incoming |
 
 
 class Intake:
-    """Takes ballots into a store; remembers the newest version's tiles, which never change."""
+    """Takes ballots into a store; remembers the newest version's tiles, which never change.
 
-    def __init__(self, store: Store) -> None:
+    ``settings_hash``: refuse ballots cast by other settings; without it the first ballot of a round decides.
+    """
+
+    def __init__(self, store: Store, settings_hash: str = "") -> None:
         self._store = store
+        self._settings_hash = settings_hash
         self._current: tuple[int, Mapping[TileIndex, TileHashes]] = (0, {})
 
     def accept(self, ballots: Sequence[Incoming]) -> list[Receipt | Exception]:
         """Store ballots in one durable transaction, each on its own merits: a receipt, or why it was refused.
 
-        Unauthorised: its key was revoked meanwhile. Conflict: other map or method, unknown base, or no cell counts any
-        more. Unavailable is raised for all.
+        Unauthorised: its key was revoked meanwhile. Conflict: other map, method or settings, unknown base, or no cell
+        counts any more. Unavailable is raised for all.
         """
         store, results = self._store, list[Receipt | Exception | None]()
         with store.database.reading() as connection:
@@ -95,6 +101,10 @@ class Intake:
             for ballot in ballots:
                 if ballot.key_hash is not None and ballot.key_hash not in valid:
                     results.append(Unauthorised(keys.UNKNOWN))
+                elif not ballot.ballot.settings_hash.startswith(self._settings_hash):
+                    ours, theirs = self._settings_hash[:16], ballot.ballot.settings_hash[:16]
+                    why = f"this server's fleet votes by settings {ours}, the ballot was cast by {theirs}"
+                    results.append(Conflict(f"{why}: vote again with the fleet's configuration (mapvote config)"))
                 else:
                     results.append(_refusal(store, connection, ballot, self._current[1]))
         sound = [i for i, error in enumerate(results) if error is None]
@@ -111,19 +121,23 @@ def accept(store: Store, ballots: Sequence[Incoming]) -> list[Receipt | Exceptio
     return Intake(store).accept(ballots)
 
 
-def withdraw(store: Store, vehicle: str, drive: str | None = None, *, by: str) -> int:
-    """Un-vote before publication: one drive of a vehicle, or all; how many ballots were withdrawn.
+def withdraw(store: Store, vehicle: str | None, drive: str | None = None, *, by: str) -> int:
+    """Un-vote before publication: one drive of a vehicle, or all, or (None) every vehicle's; how many ballots.
 
+    Once no ballot stands a new round begins, which may vote by another method or other settings.
     NotFound if there is none. What earlier versions made of them stays: see :func:`mapvote.fleet.publish.replay`.
     """
     b = schema.ballots
-    mine = (b.c.vehicle == vehicle) & b.c.gone_seq.is_(None)
+    whose = f"{vehicle or '*'}/{drive or '*'}"
+    mine: sa.ColumnElement[bool] = b.c.gone_seq.is_(None)
+    if vehicle is not None:
+        mine &= b.c.vehicle == vehicle
     if drive is not None:
         mine &= b.c.drive == drive
     with store.database.writing() as connection:
         if connection.execute(sa.select(b.c.seq).where(mine)).first() is None:
-            raise NotFound(f"there is no standing ballot {vehicle}/{drive if drive is not None else '*'}")
-        seq = log_event(connection, store.clock(), "withdraw", by, f"{vehicle}/{drive if drive is not None else '*'}")
+            raise NotFound(f"there is no standing ballot {whose}")
+        seq = log_event(connection, store.clock(), "withdraw", by, whose)
         withdrawn = connection.execute(b.update().where(mine).values(gone_seq=seq)).rowcount
         if connection.execute(sa.select(b.c.seq).where(b.c.gone_seq.is_(None)).limit(1)).first() is None:
             connection.execute(schema.maps.update().values(method=None))
@@ -192,10 +206,11 @@ def _insert(connection: sa.Connection, ballots: Sequence[Incoming], now: int) ->
     replaced: list[dict[str, int]] = []
     for incoming in ballots:
         ballot, key = incoming.ballot, (incoming.ballot.vehicle, incoming.ballot.drive)
-        method = method or incoming.method
-        if method != incoming.method:
-            theirs = f"this round votes by {method}, the ballot by {incoming.method}"
-            results.append(Conflict(f"{theirs}: one round never mixes methods"))
+        method = method or incoming.cast_by
+        if method != incoming.cast_by:
+            theirs = f"this round votes by {method}, the ballot by {incoming.cast_by}"
+            mend = "vote again as the round does, or ask the operator for a new one (mapvote unvote STORE --all)"
+            results.append(Conflict(f"{theirs}: one round never mixes methods or settings; {mend}"))
             continue
         old = standing.get(key)
         if old is not None and old[1] == incoming.digest:

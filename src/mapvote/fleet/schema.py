@@ -27,7 +27,8 @@ maps = sa.Table(
     sa.Column("georeference", sa.JSON, nullable=False),
     sa.Column("method", sa.String(64)),
 )
-"""``method``: how the standing ballots were cast; null while there are none. One round never mixes methods."""
+"""``method``: how the standing ballots were cast (method, stage, settings); null while there are none: one round never
+mixes them."""
 
 keys = sa.Table(
     "keys",
