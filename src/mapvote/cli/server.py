@@ -209,7 +209,7 @@ def unvote(
     if (vehicle is None) != everybody:
         raise MapvoteError("unvote: say whose votes go: a VEHICLE, or --all")
     if replay and (vehicle is None or drive is not None):
-        raise MapvoteError("unvote: --replay takes out one whole vehicle; leave out --all and --drive")
+        raise MapvoteError("unvote: --replay takes out one whole vehicle; leave out --drive and --all")
     with _opened(store) as opened:
         if not replay or vehicle is None:
             whose = vehicle or "all vehicles"
