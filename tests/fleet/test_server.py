@@ -13,10 +13,13 @@ import pytest
 
 from hand_made import Say, make_ballot, states_plane, two_walls
 from live_server import mapvote, serving
+from mapvote.config import FuseSettings
 from mapvote.core.ballot import Ballot, encode
 from mapvote.core.types import CellState, MapvoteError, PointMap
 from mapvote.fleet import keys
 from mapvote.fleet.client import MapClient
+from mapvote.fleet.intake import accept, examine
+from mapvote.fleet.publish import publish
 from mapvote.fleet.store import Store
 
 CELL = (10, 10)
@@ -135,6 +138,25 @@ def test_tiles_are_immutable_and_cacheable(site: Site) -> None:
     assert "immutable" in answer.headers["cache-control"]
     headers = {"Authorization": f"Bearer {site.a}", "If-None-Match": answer.headers["etag"]}
     assert httpx2.get(f"{site.url}/v1/tiles/{digest}", headers=headers).status_code == 304
+
+
+def test_a_manifest_is_sent_again_only_when_the_map_is_a_new_one(tmp_path: Path) -> None:
+    """Also when another process published it."""
+    store = Store.create(f"sqlite:///{tmp_path / 's.db'}", two_walls())
+    with serving(tmp_path / "s.db", log=tmp_path / "log") as (url, _), httpx2.Client(base_url=url) as http:
+        first = http.get("/v1/map")
+        known = {"If-None-Match": first.headers["etag"]}
+        again = http.get("/v1/map", headers=known)
+        assert (again.status_code, again.content) == (304, b"")
+        assert http.get("/v1/map?since=1", headers=known).json()["tiles"] == {}
+        ballots = [says(store.point_map(), vehicle) for vehicle in ("a", "b")]
+        accept(store, [examine(encode(ballot)) for ballot in ballots])
+        assert publish(store, FuseSettings(max_deleted_share=1.0)).version == 2
+        new = http.get("/v1/map", headers=known)
+        assert (new.status_code, new.json()["version"]) == (200, 2)
+        assert list(http.get("/v1/map?since=1").json()["tiles"]) == ["0,0"]
+        assert http.get("/v1/map/versions/1", headers=known).status_code == 304
+    store.close()
 
 
 def test_metrics_and_logs_hold_no_secret(site: Site) -> None:

@@ -16,9 +16,13 @@ from mapvote.fleet.batch import Batcher
 from mapvote.fleet.guard import Guard
 from mapvote.fleet.intake import Intake, examine_all
 from mapvote.fleet.limits import RateLimit
+from mapvote.fleet.manifests import Manifests
 from mapvote.fleet.publish import Gate
 from mapvote.fleet.store import Store
 from mapvote.fleet.watch import Metrics, Watch
+
+_READERS = 1024
+"""Readers answered by one look at the newest version."""
 
 
 def create_app(
@@ -42,6 +46,7 @@ def create_app(
         app.state.executor = executor or own
         app.state.examiner = Batcher(examine_all, settings.server.batch)
         app.state.writer = Batcher(Intake(store, settings.server.settings_hash).accept, settings.server.batch)
+        app.state.newest = Batcher(manifests.newest, _READERS)
         yield
         await app.state.examiner.close()
         await app.state.writer.close()
@@ -57,6 +62,7 @@ def create_app(
         redoc_url=None,
     )
     app.state.store, app.state.settings, app.state.gate = store, settings, gate
+    app.state.manifests = manifests = Manifests(store)
     app.state.metrics = metrics = Metrics()
     app.state.limit = RateLimit(settings.server.ballots_per_minute, settings.server.burst)
     guard = Guard(store, need_keys)

@@ -14,24 +14,28 @@ from fastapi import APIRouter, Path, Request, Response
 from fastapi.concurrency import run_in_threadpool
 from starlette.types import ASGIApp, Receive, Scope, Send
 
-from mapvote.core.ballot import tile_key
 from mapvote.core.types import MapvoteError
 from mapvote.fleet.answers import Name, Number, Stored, VersionQuery, iso, problems
 from mapvote.fleet.guard import own
 from mapvote.fleet.intake import Incoming, examine, withdraw
 from mapvote.fleet.limits import read_body
-from mapvote.fleet.store import Manifest
 
 _BYTES: dict[str, Any] = {"application/octet-stream": {"schema": {"type": "string", "format": "binary"}}}
+_AS_YOU_HAVE: dict[int | str, dict[str, Any]] = {304: {"description": "as you have"}}
 _SMALL_BYTES = 1 << 18
 """Ballots up to this size are examined many at once; a larger one would keep them waiting."""
 router = APIRouter()
 
 
-@router.get("/v1/map", responses=problems(404), summary="Manifest of the newest version")
-def newest(request: Request, since: VersionQuery | None = None) -> dict[str, Any]:
+@router.get(
+    "/v1/map",
+    response_model=dict[str, Any],
+    responses=problems(404) | _AS_YOU_HAVE,
+    summary="Manifest of the newest version",
+)
+async def newest(request: Request, since: VersionQuery | None = None) -> Response:
     """Tiles with the hashes of their planes; with ``since``, only what changed after that version."""
-    return _manifest(request.app.state.store.manifest(since=since))
+    return await _manifest(request, None, since)
 
 
 @router.get("/v1/map/versions", responses=problems(), summary="All versions")
@@ -44,15 +48,20 @@ def versions(request: Request) -> dict[str, Any]:
     return {"versions": listed}
 
 
-@router.get("/v1/map/versions/{number}", responses=problems(404), summary="Manifest of one version")
-def one_version(request: Request, number: Number, since: VersionQuery | None = None) -> dict[str, Any]:
+@router.get(
+    "/v1/map/versions/{number}",
+    response_model=dict[str, Any],
+    responses=problems(404) | _AS_YOU_HAVE,
+    summary="Manifest of one version",
+)
+async def one_version(request: Request, number: Number, since: VersionQuery | None = None) -> Response:
     """As ``/v1/map``, of any version; one that does not exist is 404."""
-    return _manifest(request.app.state.store.manifest(number, since=since))
+    return await _manifest(request, number, since)
 
 
 @router.get(
     "/v1/tiles/{digest}",
-    responses=problems(404) | {200: {"content": {"application/octet-stream": {}}}, 304: {"description": "as you have"}},
+    responses=problems(404) | _AS_YOU_HAVE | {200: {"content": {"application/octet-stream": {}}}},
     response_class=Response,
     summary="One plane of a tile",
 )
@@ -124,15 +133,12 @@ async def unvote(request: Request, vehicle: Name, drive: Name) -> dict[str, int]
     return {"withdrawn": await run_in_threadpool(withdraw, request.app.state.store, vehicle, drive, by=by)}
 
 
-def _manifest(manifest: Manifest) -> dict[str, Any]:
-    tiles = {
-        tile_key(index): {"points": h.points, "ground": h.ground, "free": h.free} for index, h in manifest.tiles.items()
-    }
-    return {
-        "map_id": manifest.map_id,
-        "version": manifest.version,
-        "lattice": {"x0": manifest.lattice.x0, "y0": manifest.lattice.y0},
-        "georeference": dict(manifest.georeference),
-        "tiles": tiles,
-        "removed": [tile_key(index) for index in manifest.removed],
-    }
+async def _manifest(request: Request, number: int | None, since: int | None) -> Response:
+    state = request.app.state
+    number = await state.newest.put(None) if number is None else number
+    etag = f'"{number}"' if since is None else f'"{number}-{since}"'
+    headers = {"ETag": etag, "Cache-Control": "private, no-cache"}
+    content = state.manifests.ready(number, since) or await run_in_threadpool(state.manifests.make, number, since)
+    if request.headers.get("if-none-match") == etag:
+        return Response(status_code=304, headers=headers)
+    return Response(content, media_type="application/json", headers=headers)
