@@ -88,6 +88,9 @@ class MappingSettings(Section):
     link_sigma_m: float = Field(default=0.003, description="random error of the motion from scan to scan")
     link_sigma_deg: float = Field(default=0.01, description="the same, rotation")
     revisit_m: float = Field(default=10.0, description="a scan this near to a much older one is linked to it")
+    reach_m: float = Field(
+        default=80.0, description="farther returns do not enter the map; the moving-object filter looks as far"
+    )
     trail_min_through: int = Field(default=3, description="scans that saw through a voxel before it can be a trail")
     trail_share: float = Field(default=0.45, description="a voxel struck in fewer of the scans able to is a trail")
     revisit_s: float = Field(default=10.0, description="and much older means this, within a drive")

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from mapvote.evaluation.attack import ATTACKS
+from mapvote.evaluation.imported import TAUGHT
 from mapvote.evaluation.matrix_tables import FIGURES, Results, rounds_of, spread
 
 
@@ -98,6 +99,8 @@ DEMANDS: Sequence[Demand] = (
     _loss("pose noise: F1 changed-empty", "noise", "empty", 0.03, 0.01),
     _loss("pose noise, told: macro provenance", "noise told", "provenance", 0.06, 0.02),
     _loss("pose noise, told: F1 changed-empty", "noise told", "empty", 0.03, 0.01),
+    _loss("imported map, taught: macro strict", "imported", "strict", 0.01, 0.0, (TAUGHT,)),
+    _loss("imported map, taught: macro provenance", "imported", "provenance", 0.01, 0.0, (TAUGHT,)),
     *_liars("liars", 1),
     *_liars("many liars", 1),
     *_liars("many liars", 2),

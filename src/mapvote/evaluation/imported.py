@@ -16,10 +16,11 @@ from mapvote.evaluation.cases import Case, Outcome, fuse_case, have_voted, passe
 from mapvote.evaluation.scene import BALLOTS_FROM, Progress, Scene, key_of, sources_digest
 from mapvote.formats import write_map
 
+TAUGHT = "columns, imported, taught on the old street"
 CHAINS: Mapping[str, Sequence[str]] = {
     "columns, imported": ("v",),
     "columns, imported, the same vehicles again": ("v", "v"),
-    "columns, imported, taught on the old street": ("survey_", "v"),
+    TAUGHT: ("survey_", "v"),
 }
 """Who votes in turn, by the first letters of the drives' names. The simulated vehicles all drive in the changed street;
 only the survey's drives know the old one, so they stand for a fleet that votes before anything changes."""

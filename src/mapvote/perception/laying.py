@@ -3,6 +3,9 @@
 A draft of the map gives the ground and says which voxels anything ever struck. Every voxel's scans are then counted:
 in how many was it struck, in how many seen through. What was struck only rarely by scans that could have struck it is
 the trail of something that moved and escaped the filter: it leaves the map, and its voxels are unknown, not free.
+
+What enters the map has been before the filter, at whatever range: a car that drives ahead of the surveyor, too far off
+for the counting, would else leave its trail unchallenged. Returns from beyond the filter's reach are left out.
 """
 
 from __future__ import annotations
@@ -49,17 +52,19 @@ class Layer:
         self.draft, self.settings = draft, settings
         self.cloud = VoxelCloud(draft.lattice)
         self.evidence = Evidence(draft.lattice)
-        self._surroundings = Surroundings(draft, settings.voting.window_m)
+        self._around = Surroundings(draft, 2.0 * settings.mapping.reach_m)
+        self._near = Surroundings(draft, settings.voting.window_m)
 
     def lay(self, drive: Drive, T_map_lidar: F64, registered: Bool, count: Callable[[], None]) -> None:
         """Enter every registered scan of one drive at its pose (n, 4, 4). ``count`` is called after each scan read."""
-        movers = MovingFilter(drive.sensor, self.settings.moving)
+        reach = {"reach_m": self.settings.mapping.reach_m}
+        movers = MovingFilter(drive.sensor, self.settings.moving.model_copy(update=reach))
         waiting: deque[_Waiting] = deque()
         for i, scan in enumerate(drive):
             if registered[i]:
                 points = deskew(scan, motion_at(drive.stamps_ns, T_map_lidar, i))
                 points_map, origin_map = transform(T_map_lidar[i], points), T_map_lidar[i, :3, 3].copy()
-                reference, _ = self._surroundings.at(origin_map)
+                reference, _ = self._around.at(origin_map)
                 obstacle, cell = find_obstacles(points_map, reference)
                 waiting.append(_Waiting(points_map, origin_map, obstacle, cell, reference))
                 for _, moving in movers.push(points_map, origin_map, obstacle, scan.stamp_ns):
@@ -69,9 +74,11 @@ class Layer:
             self._enter(waiting.popleft(), moving)
 
     def _enter(self, scan: _Waiting, moving: Bool) -> None:
-        self.cloud.add(scan.points_map, moving | _beneath(scan, moving))
-        view = see(scan.points_map, scan.origin_map, scan.obstacle, moving, scan.reference, scan.cell)
-        self.evidence.add(view, scan.reference)
+        offset = scan.points_map[:, :2] - scan.origin_map[:2]
+        far = np.einsum("ij,ij->i", offset, offset) > self.settings.mapping.reach_m**2
+        self.cloud.add(scan.points_map, moving | _beneath(scan, moving) | far)
+        near, _ = self._near.at(scan.origin_map)
+        self.evidence.add(see(scan.points_map, scan.origin_map, scan.obstacle, moving, near), near)
 
     def finish(self) -> PointMap:
         """The map of everything laid."""
