@@ -2,22 +2,28 @@
 
 from __future__ import annotations
 
+import io
+import os
 import struct
+import subprocess
+import sys
 from pathlib import Path
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from mapvote.core.types import MapvoteError
+from mapvote.formats import laz_apart
 from mapvote.formats.cloud import Cloud, other_fields
 from mapvote.formats.extras import require
+from mapvote.formats.laz_apart import Head, read_points
 from mapvote.formats.whole import whole_file
 
 STEP_M = 0.0001
 """Coordinates are whole multiples of this from the file's offset: exact to 0.05 mm over 400 km."""
 MAX_POINTS_PER_BYTE = 16
 """Real LAZ files need a byte or more for a point."""
-_CHUNK = 1_000_000
 
 
 def is_las(path: Path) -> bool:
@@ -26,32 +32,44 @@ def is_las(path: Path) -> bool:
 
 def read_las(path: Path) -> Cloud:
     """The points of a LAS or LAZ file as float64, and its coordinate system as WKT where it has one."""
-    laspy = require("laspy", "las", str(path))
-    _check_counts(path)
+    require("laspy", "las", str(path))
+    compressed = _check_counts(path)
     try:
-        with laspy.open(path) as file:
-            points = np.empty((file.header.point_count, 3))
-            done = 0
-            for chunk in file.chunk_iterator(_CHUNK):
-                points[done : done + len(chunk)] = np.column_stack([chunk.x, chunk.y, chunk.z])
-                done += len(chunk)
-            wkt = [v.string for v in file.header.vlrs if type(v).__name__ == "WktCoordinateSystemVlr"]
-            names = tuple(file.header.point_format.dimension_names)
+        head, points = _read_apart(path) if compressed else read_points(str(path))
     except OSError as error:
         raise MapvoteError(f"{path}: cannot be read ({error.strerror or error})") from error
     except Exception as error:  # laspy and lazrs raise their own, numpy's and struct's
         raise MapvoteError(f"{path}: not a whole LAS or LAZ file ({error}); copy or export it again") from error
-    if done != len(points):
-        raise MapvoteError(f"{path}: cut off: {done} points, but its header says {len(points)}; copy it again")
-    others = other_fields(tuple(n.lower() for n in names))
-    return Cloud(points, others, {"wkt": wkt[0]} if wkt else {})
+    if head.points != head.promised:
+        raise MapvoteError(f"{path}: cut off: {head.points} points, but its header says {head.promised}; copy it again")
+    others = other_fields(tuple(n.lower() for n in head.dimensions))
+    return Cloud(points, others, {"wkt": head.wkt} if head.wkt else {})
 
 
-def _check_counts(path: Path) -> None:
-    """MapvoteError if the header counts more than the file has room for: laspy would believe it and hang.
+def _read_apart(path: Path) -> tuple[Head, NDArray[np.float64]]:
+    """:func:`read_points` in a process of its own, which a damaged LAZ file may end; ValueError if it does."""
+    command = [sys.executable, laz_apart.__file__, str(path)]
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, env=environment) as child:
+        assert isinstance(child.stdout, io.BufferedReader)
+        line = child.stdout.readline()
+        if not line:
+            raise ValueError("the LAZ reader crashed on it")
+        head = msgspec.json.decode(line, type=Head)
+        if head.refusal:
+            raise ValueError(head.refusal)
+        points = np.empty((head.points, 3))
+        if child.stdout.readinto(points.reshape(-1).data) != points.nbytes:
+            raise ValueError("the LAZ reader stopped half way; is there enough memory?")
+    return head, points
 
-    Offsets of the LAS 1.4 specification: 25 minor version, 96 start of the points, 100 VLRs, 107 points (to 1.3),
-    243 EVLRs and 247 points (1.4).
+
+def _check_counts(path: Path) -> bool:
+    """Whether the points are compressed (LAZ). MapvoteError if the header counts more than the file has room for:
+    laspy would believe it and hang.
+
+    Offsets of the LAS 1.4 specification: 25 minor version, 96 start of the points, 100 VLRs, 104 point format (LAZ
+    sets a high bit), 107 points (to 1.3), 243 EVLRs and 247 points (1.4).
     """
     try:
         size = path.stat().st_size
@@ -68,6 +86,7 @@ def _check_counts(path: Path) -> None:
         raise MapvoteError(
             f"{path}: not a whole LAS or LAZ file (its header promises more than it holds); copy it again"
         )
+    return bool(header[104] & 0xC0)
 
 
 def write_las(path: Path, points: NDArray[np.floating], *, wkt: str | None = None) -> None:
