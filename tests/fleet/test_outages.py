@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import os
 import subprocess
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -23,20 +21,6 @@ from postgres_cluster import PostgresCluster
 
 S = 1_000_000_000
 POLICY = FuseSettings(max_deleted_share=1.0)
-
-
-@pytest.fixture
-def small_disk(tmp_path: Path) -> Iterator[Path]:
-    """A file system of 16 MB of its own; only root may mount one."""
-    disk = tmp_path / "disk"
-    disk.mkdir()
-    mounted = os.getuid() == 0 and subprocess.run(
-        ["mount", "-t", "tmpfs", "-o", "size=16m", "tmpfs", str(disk)], capture_output=True, check=False
-    )
-    if not mounted or mounted.returncode:
-        pytest.skip("only root can mount a small disk to fill")
-    yield disk
-    subprocess.run(["umount", "-l", str(disk)], check=True)
 
 
 def vote(store: Store, drive: str, vehicle: str = "v1") -> None:
