@@ -42,16 +42,16 @@ def create_app(
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
-        own = ThreadPoolExecutor(2, "fuse") if executor is None else None
+        own = ThreadPoolExecutor(2, "fuse")
         app.state.executor = executor or own
+        app.state.threads, app.state.stopping = own, False
         app.state.examiner = Batcher(examine_all, settings.server.batch)
         app.state.writer = Batcher(Intake(store, settings.server.settings_hash).accept, settings.server.batch)
         app.state.newest = Batcher(manifests.newest, _READERS)
         yield
         await app.state.examiner.close()
         await app.state.writer.close()
-        if own is not None:
-            own.shutdown(cancel_futures=True)
+        own.shutdown(cancel_futures=True)
 
     app = FastAPI(
         title="mapvote",

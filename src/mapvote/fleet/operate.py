@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from concurrent.futures import CancelledError
+from contextlib import contextmanager
 from dataclasses import asdict
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Query, Request
+from starlette.datastructures import State
 
 from mapvote.config import FuseSettings
 from mapvote.core.ballot import tile_key
 from mapvote.fleet.answers import LEAST, MOST, PublishAsk, Published, RollbackAsk, iso, problems
+from mapvote.fleet.errors import Unavailable
 from mapvote.fleet.explain import changes_between, coverage, explain_cell, vehicle_standings
 from mapvote.fleet.guard import operator
 from mapvote.fleet.publish import publish, rollback
@@ -26,7 +31,7 @@ def publish_now(request: Request, ask: PublishAsk) -> Published:
     policy: FuseSettings = state.settings.fuse
     if ask.min_votes is not None:
         policy = policy.model_copy(update={"min_votes": ask.min_votes})
-    with state.metrics.publish_seconds.time():
+    with state.metrics.publish_seconds.time(), _unless_stopping(state):
         done = publish(
             state.store,
             policy,
@@ -105,3 +110,14 @@ def vehicles(request: Request) -> dict[str, Any]:
     operator(request)
     found = vehicle_standings(request.app.state.store, request.app.state.settings.fuse)
     return {"vehicles": [asdict(s) | {"evidence": [asdict(e) for e in s.evidence[:_MOST_EVIDENCE]]} for s in found]}
+
+
+@contextmanager
+def _unless_stopping(state: State) -> Iterator[None]:
+    """A stopping server takes away the threads that fuse: what they had not begun is cancelled, more is refused."""
+    try:
+        yield
+    except (CancelledError, RuntimeError) as error:
+        if not state.stopping:
+            raise
+        raise Unavailable("the server is stopping, nothing was published: ask again once it is back") from error

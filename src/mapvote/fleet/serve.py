@@ -22,6 +22,9 @@ from mapvote.fleet.publish import Gate
 from mapvote.fleet.store import Store, url_of
 from mapvote.formats import open_drive, read_map
 
+_PATIENCE_S = 5
+"""How long a stopping server waits for answers under way. Ballots take milliseconds."""
+
 
 def open_or_create(where: str, map_path: Path | None) -> Store:
     """The store at a path or URL; a new one from ``map_path`` if there is none yet. MapvoteError otherwise."""
@@ -64,6 +67,8 @@ def serve(
 ) -> None:
     """Serve until SIGINT or SIGTERM; requests under way are answered and ballots taken in are written first.
 
+    A publish that is still fusing is answered 503; one that is being written is finished.
+
     ``ready`` is told the address once it listens. MapvoteError if the address is taken, or beyond loopback while no
     operator has a key. Without any key at all, on loopback, nobody needs one.
     """
@@ -86,11 +91,21 @@ def serve(
         access_log=False,
         proxy_headers=False,
         log_level="warning",
-        timeout_graceful_shutdown=20,
+        timeout_graceful_shutdown=_PATIENCE_S,
         server_header=False,
     )
     with listener:
-        uvicorn.Server(config).run(sockets=[listener])
+        _Server(config).run(sockets=[listener])
+
+
+class _Server(uvicorn.Server):
+    """Lets go of a publish under way when it is told to stop: what waits to be fused is dropped."""
+
+    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+        state = self.config.app.state  # type: ignore[union-attr]
+        state.stopping = True
+        state.threads.shutdown(wait=False, cancel_futures=True)
+        await super().shutdown(sockets)
 
 
 def log_as_json() -> None:
