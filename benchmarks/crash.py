@@ -6,6 +6,9 @@
 A child takes in ballots on one thread and publishes on another; the parent kills it with SIGKILL at a random moment
 (with PostgreSQL, every fourth time the database server itself), then opens the store as a new process would and checks:
 every acknowledged ballot is there, every version is whole, the next publish succeeds. Ends with 1 at the first failure.
+
+With ``--server`` what is killed is `mapvote serve` itself, to which vehicles send ballots by HTTP while an operator
+publishes again and again (benchmarks/crash_server.py). That takes some seconds a kill.
 """
 
 from __future__ import annotations
@@ -19,6 +22,7 @@ import sys
 import tempfile
 import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -30,7 +34,7 @@ from hand_made import Say, make_ballot, make_map, make_tile, states_plane, wall
 from mapvote.config import FuseSettings
 from mapvote.core.ballot import Ballot, encode
 from mapvote.core.grid import TileIndex
-from mapvote.core.types import CellState, MapvoteError
+from mapvote.core.types import CellState, MapTile, MapvoteError
 from mapvote.fleet import schema
 from mapvote.fleet.errors import Conflict, Unavailable
 from mapvote.fleet.intake import Receipt, accept, examine
@@ -43,6 +47,8 @@ TILES = [(row, col) for row in range(2) for col in range(4)]
 CELLS = [(r, c) for r in range(10, 40, 3) for c in range(10, 40, 3)]
 HEIGHTS = [0.45, 0.75, 1.05]
 S = 1_000_000_000
+Kill = Callable[[str, int, float, "PostgresCluster | None"], list[tuple[str, str]]]
+"""(database URL, seed, moment_s, the cluster to kill too) -> (vehicle, drive) of what was acknowledged before."""
 
 
 def first_map(url: str) -> None:
@@ -51,17 +57,22 @@ def first_map(url: str) -> None:
     Store.create(url, make_map(dict.fromkeys(TILES, tile))).close()
 
 
-def votes_on(store: Store, tile: TileIndex, cell: tuple[int, int], turn: str) -> list[Ballot]:
+def votes_on(content: MapTile, tile: TileIndex, cell: tuple[int, int], vehicle: str, drive: str) -> list[Ballot]:
     """Two vehicles that agree: what stands in the cell is gone, or, where nothing stands, it is back."""
-    content = store.tile(store.current(), tile)
-    assert content is not None
     point_map, points = make_map({tile: content}), content.points
     inside = (np.floor(points[:, 1] / 0.3) == cell[0]) & (np.floor(points[:, 0] / 0.3) == cell[1])
     stands = bool((inside & (points[:, 2] > 0.3)).any())
     state = CellState.CHANGED_EMPTY if stands else CellState.CHANGED_OCCUPIED
     say = Say(states_plane({cell: state}), new_points=None if stands else wall([cell], HEIGHTS))
-    now = store.clock()
-    return [make_ballot(point_map, {tile: say}, f"v{i}", f"{turn}.{i}", now - S + i) for i in range(2)]
+    now = time.time_ns()
+    return [make_ballot(point_map, {tile: say}, f"{vehicle}{i}", drive, now - S + i) for i in range(2)]
+
+
+def tile_now(store: Store, tile: TileIndex) -> MapTile:
+    """A tile of the newest version."""
+    content = store.tile(store.current(), tile)
+    assert content is not None
+    return content
 
 
 def work(url: str, seed: int, acknowledge: int) -> None:
@@ -75,14 +86,15 @@ def work(url: str, seed: int, acknowledge: int) -> None:
                 publish(store, POLICY)
             time.sleep(0.002)
 
-    for ballot in votes_on(store, TILES[0], CELLS[0], "warm"):  # compiled code is loaded before the clock starts
-        examine(encode(ballot))
+    for ballot in votes_on(tile_now(store, TILES[0]), TILES[0], CELLS[0], "warm", "warm"):
+        examine(encode(ballot))  # compiled code is loaded before the clock starts
     threading.Thread(target=publish_for_ever, daemon=True).start()
     os.write(acknowledge, b"ready\n")
     turn = 0
     while True:
         turn += 1
-        ballots = votes_on(store, rng.choice(TILES), rng.choice(CELLS), f"{seed}.{turn}")
+        tile = rng.choice(TILES)
+        ballots = votes_on(tile_now(store, tile), tile, rng.choice(CELLS), "v", f"{seed}.{turn}")
         for receipt in accept(store, [examine(encode(ballot)) for ballot in ballots]):
             if isinstance(receipt, Receipt):
                 os.write(acknowledge, f"{receipt.vehicle} {receipt.drive}\n".encode())
@@ -148,7 +160,7 @@ def check(url: str, acknowledged: set[tuple[str, str]], whole: set[int]) -> int:
         store.close()
 
 
-def run(url: str, kills: int, seed: int, cluster: PostgresCluster | None) -> None:
+def run(url: str, kills: int, seed: int, cluster: PostgresCluster | None, kill: Kill) -> None:
     """``kills`` rounds on one store; prints a line at the end."""
     first_map(url)
     rng = random.Random(seed)
@@ -157,7 +169,7 @@ def run(url: str, kills: int, seed: int, cluster: PostgresCluster | None) -> Non
     newest = 1
     for i in range(kills):
         power_cut = cluster if cluster is not None and i % 4 == 3 else None
-        acknowledged |= set(killed_once(url, seed * 1000 + i, rng.uniform(0.0, 0.5), power_cut))
+        acknowledged |= set(kill(url, seed * 1000 + i, rng.uniform(0.0, 0.5), power_cut))
         newest = check(url, acknowledged, whole)
     print(f"{kills} kills: {len(acknowledged)} acknowledged ballots, all there; {newest} versions, all whole")
 
@@ -166,15 +178,19 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--kills", type=int, default=20)
     parser.add_argument("--database", choices=("sqlite", "postgresql"), default="sqlite")
+    parser.add_argument("--server", action="store_true", help="kill `mapvote serve` under HTTP load")
     parser.add_argument("--seed", type=int, default=1)
     options = parser.parse_args()
+    kill: Kill = killed_once
+    if options.server:
+        from crash_server import killed_server as kill
     if options.database == "sqlite":
         with tempfile.TemporaryDirectory() as folder:
-            run(f"sqlite:///{folder}/store.db", options.kills, options.seed, None)
+            run(f"sqlite:///{folder}/store.db", options.kills, options.seed, None, kill)
         return
     cluster = PostgresCluster()
     try:
-        run(cluster.create("crash"), options.kills, options.seed, cluster)
+        run(cluster.create("crash"), options.kills, options.seed, cluster, kill)
     finally:
         cluster.close()
 

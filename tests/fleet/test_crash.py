@@ -15,8 +15,8 @@ from postgres_cluster import programs
 ROOT = Path(__file__).parents[2]
 
 
-def crash(kills: int, database: str) -> None:
-    command = [sys.executable, "benchmarks/crash.py", "--kills", str(kills), "--database", database]
+def crash(kills: int, database: str, *more: str) -> None:
+    command = [sys.executable, "benchmarks/crash.py", "--kills", str(kills), "--database", database, *more]
     environment = os.environ | {"PYTHONPATH": str(ROOT / "src")}
     done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=600, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
@@ -31,8 +31,10 @@ def test_three_kills() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("more", [(), ("--server",)])
 @pytest.mark.parametrize("database", ["sqlite", "postgresql"])
-def test_twenty_kills(database: str) -> None:
+def test_twenty_kills(database: str, more: tuple[str, ...]) -> None:
+    """Of a process that calls the store, and of a server under load by HTTP."""
     if database == "postgresql" and programs() is None:
         pytest.skip("PostgreSQL's server is not installed: apt-get install postgresql")
-    crash(20, database)
+    crash(20, database, *more)

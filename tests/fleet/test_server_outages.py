@@ -1,9 +1,7 @@
-"""A real server process that is killed, and one whose database goes away: what it acknowledged is there afterwards."""
+"""A real server process whose database goes away: what it acknowledged is there afterwards (kills: test_crash.py)."""
 
 from __future__ import annotations
 
-import random
-import threading
 import time
 from pathlib import Path
 
@@ -32,48 +30,6 @@ def ballot(vehicle: str, drive: str) -> bytes:
 
 def put(http: httpx2.Client, vehicle: str, drive: str) -> httpx2.Response:
     return http.request("PUT", f"/v1/ballots/{vehicle}/{drive}", content=ballot(vehicle, drive))
-
-
-def send_until_dead(url: str, vehicle: str, turn: int, acknowledged: set[tuple[str, str]]) -> None:
-    """One drive after another, and a publish now and then, until the server is gone."""
-    with httpx2.Client(base_url=url, timeout=10.0) as http:
-        for i in range(10_000):
-            try:
-                answer = put(http, vehicle, f"d{turn}.{i}")
-                if i % 10 == 9:
-                    http.request("POST", "/v1/publish", json={"override": True})
-            except httpx2.TransportError:
-                return
-            if answer.status_code in (200, 201):
-                acknowledged.add((vehicle, f"d{turn}.{i}"))
-
-
-def test_a_server_killed_while_it_takes_in_ballots_loses_none_that_it_acknowledged(
-    database_url: str, tmp_path: Path
-) -> None:
-    Store.create(database_url, two_walls()).close()
-    rng = random.Random(1)
-    acknowledged: set[tuple[str, str]] = set()
-    for turn in range(3):
-        with serving(database_url, log=tmp_path / "log") as (url, process):
-            senders = [
-                threading.Thread(target=send_until_dead, args=(url, f"v{i}", turn, acknowledged)) for i in range(8)
-            ]
-            for sender in senders:
-                sender.start()
-            time.sleep(1.0 + rng.random())
-            process.kill()
-            for sender in senders:
-                sender.join()
-    assert len(acknowledged) > 30
-    store = Store.open(database_url)
-    with store.database.reading() as connection:
-        b = schema.ballots.c
-        known = {(row.vehicle, row.drive) for row in connection.execute(sa.select(b.vehicle, b.drive))}
-    assert acknowledged <= known
-    for version in store.versions():
-        assert set(store.point_map(version.number).tiles) == set(two_walls().tiles)
-    store.close()
 
 
 def test_a_database_gone_for_ten_seconds_is_503_and_then_all_is_well(
