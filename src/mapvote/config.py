@@ -131,6 +131,9 @@ class VotingSettings(Section):
     )
     join_cells: int = Field(default=6, ge=1, description="columns, C: how far a new thing reaches along mapped cells")
     fall_cells: int = Field(default=15, description="columns, H: how far what is gone takes unseen cells with it")
+    brief_share: float = Field(
+        default=0.35, description="columns, G: a new voxel struck in fewer of the scans able to was only passed by"
+    )
     min_scans: int = Field(default=1, description="columns, G: scans that must have hit a new voxel")
     min_support: int = Field(
         default=1, description="columns, G: hits (scans by voxels) that make a cell changed-occupied"

@@ -29,8 +29,9 @@ def judge(through: dict[int, int], struck: dict[int, int], occupied: int = 0, **
     near, free, low_there = more.pop("near", 0), more.pop("free", int(FREE)), more.pop("low", False)
     settings = VotingSettings(method="columns", **more)
     occupied_word, near_word, free_word = (np.full((1, 1), w, np.uint64) for w in (occupied, near, free))
-    low = np.full((1, 1), low_there)
-    return weigh(cell(through, struck), occupied_word, near_word, free_word, low, settings)
+    low, base = np.full((1, 1), low_there), np.zeros((3, 3), np.int32)
+    planes = np.pad(cell(through, struck), ((1, 1), (1, 1), (0, 0)))
+    return weigh(planes, base, occupied_word, near_word, free_word, low, settings)
 
 
 def around(through: dict[int, int]) -> dict[int, int]:
@@ -106,6 +107,13 @@ def test_rule_f_only_rays_at_the_height_of_the_new_thing_speak_against_it() -> N
     assert state({9: 100}, {4: 4}) == CO
     assert state({4: 100}, {4: 4}) != CO
     assert state({9: 100}, {4: 4}, rules="ABCDEG") == UE
+
+
+def test_rule_g_what_was_struck_in_few_of_the_scans_that_saw_through_it_has_only_passed_by() -> None:
+    assert state(around({4: 12}), {4: 4}) != CO
+    assert state(around({4: 12}), {4: 4}, rules="ABCDEF") == CO
+    assert state(around({4: 12}), {4: 4, 5: 9}) == CO, "what is next to it was struck often: an edge"
+    assert state({4: 12, 5: 30}, {4: 4}) == CO, "rays only grazed it: a slab"
 
 
 def test_rule_g_may_ask_for_more_than_a_single_hit() -> None:

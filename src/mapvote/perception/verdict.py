@@ -14,6 +14,7 @@ import numpy as np
 from scipy import ndimage
 
 from mapvote.config import VotingSettings
+from mapvote.core.columns import TOP_BIT
 from mapvote.core.types import I32, U8, U64, Bool, CellState
 from mapvote.core.voting import VOTE_UNIT, decide
 from mapvote.perception.classify import below_top
@@ -50,14 +51,28 @@ def _ones(word: np.uint64) -> int:
 
 
 @numba.njit(cache=True, nogil=True)
+def _is_brief(planes: U64, base: I32, r: int, c: int, bit: int, share: float) -> bool:
+    """Whether rays went through a voxel from side to side in so many scans, and struck it or any voxel next to it in so
+    few, that what they met there did not stay: a car that escaped the moving-object filter."""
+    through = count_of(planes[r, c], 0, bit)
+    struck = 0
+    for i in range(r - 1, r + 2):
+        for j in range(c - 1, c + 2):
+            for k in range(bit - 1 + base[r, c] - base[i, j], bit + 2 + base[r, c] - base[i, j]):
+                if 0 <= k < TOP_BIT:
+                    struck = max(struck, count_of(planes[i, j], PLANES, k))
+    return struck < share * (struck + through) and is_open(planes[r, c], bit)
+
+
+@numba.njit(cache=True, nogil=True)
 def _weigh(
-    planes: U64, occupied: U64, near: U64, free: U64, low: Bool, crossed: bool, by_height: bool, empty_votes: float,
-    gone_votes: float, clear_share: float, min_scans: int, min_support: int,
+    planes: U64, base: I32, occupied: U64, near: U64, free: U64, low: Bool, crossed: bool, by_height: bool,
+    empty_votes: float, gone_votes: float, clear_share: float, brief_share: float, min_scans: int, min_support: int,
     tally: I32, gone: U64, new: U64, beside: Bool, adrift: Bool,
 ) -> None:  # fmt: skip
     for r in range(occupied.shape[0]):
         for c in range(occupied.shape[1]):
-            cell, mapped = planes[r, c], occupied[r, c]
+            cell, mapped = planes[r + 1, c + 1], occupied[r, c]
             through, struck = np.uint64(0), np.uint64(0)
             for k in range(PLANES):
                 through |= cell[k]
@@ -80,6 +95,8 @@ def _weigh(
                         if gone_votes * t > s:
                             gone[r, c] |= one
                 elif strange & one and s >= min_scans and s > empty_votes * t:
+                    if _is_brief(planes, base, r + 1, c + 1, bit, brief_share):
+                        continue
                     if free[r, c] & one:
                         new[r, c] |= one
                         found += s
@@ -106,22 +123,25 @@ def _weigh(
             votes[4] = 1 if not (votes[0] or votes[1] or votes[2] or votes[3]) else 0
 
 
-def weigh(planes: U64, occupied: U64, near: U64, free: U64, low: Bool, settings: VotingSettings) -> Verdict:
-    """Votes of a window from its counters ``planes`` (rows, cols, 2 * PLANES) and the map's words (rows, cols).
+def weigh(planes: U64, base: I32, occupied: U64, near: U64, free: U64, low: Bool, settings: VotingSettings) -> Verdict:
+    """Votes of a window (rows, cols) from its counters and the map's words.
 
-    ``near``: voxels in which a hit may belong to a mapped voxel next to them (rule C); ``free``: what the map knows to
-    be free (rule D); ``low``: cells whose map hardly rises above the ground (rule G: kerbs, grass, trails of cars'
-    bumpers are never called gone). A cell that the map has points in is never changed-occupied (paper III-A).
+    ``planes`` (rows + 2, cols + 2, 2 * PLANES) and ``base`` (rows + 2, cols + 2), the layers of their bits 0, have the
+    cells around the window too. ``near``: voxels in which a hit may belong to a mapped voxel next to them (rule C);
+    ``free``: what the map knows to be free (rule D); ``low``: cells whose map hardly rises above the ground (rule G:
+    kerbs, grass, trails of cars' bumpers are never called gone). A cell that the map has points in is never
+    changed-occupied (paper III-A).
     """
     shape, rules = occupied.shape, settings.rules
     everything = np.full(shape, ~np.uint64(0))
     tally, beside, adrift = np.zeros((*shape, 5), np.int32), np.zeros(shape, np.bool_), np.zeros(shape, np.bool_)
     gone, new = np.zeros(shape, np.uint64), np.zeros(shape, np.uint64)
     _weigh(
-        planes, occupied, near if "C" in rules else np.zeros(shape, np.uint64),
+        planes, base, occupied, near if "C" in rules else np.zeros(shape, np.uint64),
         free if "D" in rules else everything, low if "G" in rules else np.zeros(shape, np.bool_), "A" in rules,
         "F" in rules, settings.empty_votes if "F" in rules else 1.0, settings.gone_votes if "E" in rules else 1.0,
-        settings.clear_share if "E" in rules else 0.0, settings.min_scans if "G" in rules else 1,
+        settings.clear_share if "E" in rules else 0.0, settings.brief_share if "G" in rules else 0.0,
+        settings.min_scans if "G" in rules else 1,
         settings.min_support if "G" in rules else 1, tally, gone, new, beside, adrift,
     )  # fmt: skip
     return Verdict(tally, gone, new, beside, adrift)

@@ -98,11 +98,12 @@ class ColumnVoter:
         for tile, planes in sorted(self.evidence.tiles.items()):
             window = tile_grid(self.point_map.lattice, tile)
             around = reference_window(self.point_map, window.padded(1))
+            counts = self._around(self.evidence.tiles, around.grid, 0)
             near = dilated(around.occupied, around.base, 1)[1:-1, 1:-1]
             here = cut_reference(around, window)
             known = here.free if here.free is not None else above_ground_points(self.point_map, window)
             low = here.top_z - here.ground_z < self.voting.min_height_m
-            verdict = weigh(planes, here.occupied, near, known, low, self.voting)
+            verdict = weigh(counts, around.base, here.occupied, near, known, low, self.voting)
             if verdict.tally.any():
                 free = free_words(planes, here.occupied)
                 if here.free is not None:
@@ -157,7 +158,7 @@ class ColumnVoter:
     def _around(self, planes: dict[TileIndex, Plane], wide: Grid, elsewhere: int) -> Plane:
         """The planes of several tiles as one window."""
         first = next(iter(planes.values()))
-        out = np.full(wide.shape, elsewhere, dtype=first.dtype)
+        out = np.full((*wide.shape, *first.shape[2:]), elsewhere, dtype=first.dtype)
         for tile in wide.tiles():
             if tile in planes:
                 grid = tile_grid(self.point_map.lattice, tile)
