@@ -1,9 +1,10 @@
-"""A real street that did not change: KITTI drive 0001 against the map of its own other blocks (docs/results.md).
+"""A real street that did not change: KITTI drives against the map of their own other blocks (docs/results.md).
 
     python benchmarks/kitti.py [--data ../shared/data/kitti] [--out out/kitti]
 
 Prints localisation errors and false changes for the prior as given, disturbed by 0.5 m / 2 deg, and with nothing but
-the first pose; for 64 beams and every other one of them. Draws the ten largest false changes of columns.
+the first pose; for 64 beams and every other one of them. Then changes injected into the map of drive 0001, found or
+not. Draws the ten largest false changes, and the injected objects of the first draw.
 """
 
 from __future__ import annotations
@@ -20,17 +21,20 @@ from mapvote.config import Settings
 from mapvote.evaluation.cases import Case, choose_cases
 from mapvote.evaluation.inject import Injection, score_injection
 from mapvote.evaluation.real import RealRun, as_given, disturbed, largest_false_changes, run_real
-from mapvote.evaluation.real_figures import draw_false_changes
+from mapvote.evaluation.real_figures import draw_false_changes, draw_injections
 from mapvote.formats import read_T_map_lidar
 
 DRAWS = (1, 2, 3)
 CASES = "1,1 column,5,columns"
-RUNS: dict[str, dict[str, Any]] = {
-    "prior as given": {"change_prior": as_given},
-    "prior disturbed 0.5 m / 2 deg": {"change_prior": disturbed},
-    "first pose only": {"first_pose_only": True},
-    "prior as given, 32 beams": {"thin": True},
-    "prior disturbed, 32 beams": {"change_prior": disturbed, "thin": True},
+STREET, ROUNDABOUT = "2011_09_26_0001", "2011_09_26_0005"
+RUNS: dict[str, tuple[str, dict[str, Any]]] = {
+    "prior as given": (STREET, {"change_prior": as_given}),
+    "prior disturbed 0.5 m / 2 deg": (STREET, {"change_prior": disturbed}),
+    "first pose only": (STREET, {"first_pose_only": True}),
+    "prior as given, 32 beams": (STREET, {"thin": True}),
+    "prior disturbed, 32 beams": (STREET, {"change_prior": disturbed, "thin": True}),
+    "0005, prior as given": (ROUNDABOUT, {"change_prior": as_given}),
+    "0005, prior as given, 32 beams": (ROUNDABOUT, {"thin": True}),
 }
 
 
@@ -43,14 +47,16 @@ def main() -> None:
     settings, console = Settings(), Console(width=150)
     cases, _ = choose_cases(settings, CASES)
     runs = {
-        name: run_real(arguments.data / "2011_09_26_0001", cases, settings, block=arguments.block, **options)
-        for name, options in RUNS.items()
+        name: run_real(arguments.data / drive, cases, settings, block=arguments.block, **options)
+        for name, (drive, options) in RUNS.items()
     }
     console.print(localisation(runs))
     console.print(false_changes(runs, [case.name for case in cases]))
-    console.print(injections(arguments.data / "2011_09_26_0001", cases, settings, arguments.block))
-    run = runs["prior as given"]
     arguments.out.mkdir(parents=True, exist_ok=True)
+    drawn = injected(arguments.data / STREET, cases, settings, arguments.block)
+    console.print(injections(drawn, cases))
+    draw_injections(drawn[0][1], "columns", drawn[0][0], arguments.out / "injected_columns.png")
+    run = runs["prior as given"]
     for case in ("1", "columns"):
         found = largest_false_changes(run, case)
         table = Table("class", "x, m", "y, m", "m2", "on a mover", title=f"Ten largest false changes, {case}")
@@ -61,17 +67,21 @@ def main() -> None:
         draw_false_changes(run, case, found, arguments.out / f"false_changes_{case}.png")
 
 
-def injections(folder: Path, cases: list[Case], settings: Settings, block: int) -> Table:
-    """Ten objects cut out of the map and ten phantoms put in, three random draws, pooled."""
+def injected(folder: Path, cases: list[Case], settings: Settings, block: int) -> list[tuple[Injection, RealRun]]:
+    """Ten objects cut out of the map and ten phantoms put in, in each of three random draws."""
     path_xy = read_T_map_lidar(folder / "prior.txt", folder)[:, :2, 3]
-    table = Table(
-        "case", "kind", "cell recall", "objects half found", "recall of every cut cell", "precision within 1.5 m",
-        title=f"Injected changes, draws {DRAWS}",
-    )  # fmt: skip
     drawn = []
     for seed in DRAWS:
         injection = Injection(seed, path_xy)
         drawn.append((injection, run_real(folder, cases, settings, block=block, edit=injection)))
+    return drawn
+
+
+def injections(drawn: list[tuple[Injection, RealRun]], cases: list[Case]) -> Table:
+    table = Table(
+        "case", "kind", "cell recall", "objects half found", "recall of every cut cell", "precision within 1.5 m",
+        title=f"Injected changes, draws {DRAWS}, pooled",
+    )  # fmt: skip
     for case in cases:
         for kind in ("built", "demolished"):
             scores = [score_injection(injection, run.states[case.name], kind, run.reached) for injection, run in drawn]
