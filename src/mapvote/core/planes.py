@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -15,7 +14,6 @@ from numpy.typing import NDArray
 from mapvote.core.types import MapvoteError
 
 _own = threading.local()
-PIECE = 1 << 17
 ZSTD_LEVEL = 19
 """For ballots, which travel by radio. Tiles of noisy float32 gain nothing above level 3."""
 
@@ -24,26 +22,6 @@ def pack_plane(plane: NDArray[Any], level: int = ZSTD_LEVEL) -> bytes:
     """An array's little-endian C-order bytes, zstd-compressed."""
     little = np.ascontiguousarray(plane.astype(plane.dtype.newbyteorder("<"), copy=False))
     return zstd.compress(little.tobytes(), level)
-
-
-def pieces(data: bytes, limit: int, what: str) -> Iterator[bytes]:
-    """Decompress at most ``limit`` bytes, PIECE bytes at a time, the last piece excepted; MapvoteError as below.
-
-    Small pieces are reused by the allocator; whole planes of half a megabyte cost more in page faults than in zstd.
-    """
-    decompressor, size = zstd.ZstdDecompressor(), 0
-    piece = data
-    while not decompressor.eof:
-        try:
-            piece = decompressor.decompress(data if not size else b"", max_length=PIECE)
-        except zstd.ZstdError as error:
-            raise MapvoteError(f"{what} is damaged ({error}); fetch or send it again") from error
-        size += len(piece)
-        if size > limit or not piece:
-            break
-        yield piece
-    if size > limit or not decompressor.eof or decompressor.unused_data:
-        raise MapvoteError(f"{what} is truncated or larger than {limit} bytes when decompressed")
 
 
 def unpack_bytes(data: bytes, limit: int, what: str) -> bytes:
@@ -59,7 +37,19 @@ def unpack_bytes(data: bytes, limit: int, what: str) -> bytes:
         raise MapvoteError(f"{what} is damaged ({error}); fetch or send it again") from error
     if size > limit:
         raise MapvoteError(f"{what} is larger than {limit} bytes when decompressed")
-    return b"".join(pieces(data, limit, what))
+    return _unpack_unsaid(data, limit, what)
+
+
+def _unpack_unsaid(data: bytes, limit: int, what: str) -> bytes:
+    """A frame that does not say how large it is."""
+    decompressor = zstd.ZstdDecompressor()
+    try:
+        raw = decompressor.decompress(data, max_length=limit + 1)
+    except zstd.ZstdError as error:
+        raise MapvoteError(f"{what} is damaged ({error}); fetch or send it again") from error
+    if len(raw) > limit or not decompressor.eof or decompressor.unused_data:
+        raise MapvoteError(f"{what} is truncated or larger than {limit} bytes when decompressed")
+    return raw
 
 
 def _decompressor() -> zstandard.ZstdDecompressor:

@@ -9,7 +9,7 @@ import numpy as np
 
 from mapvote.core.columns import GROUND_MARGIN_M, TOP_BIT, base_layers, map_points
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Grid
-from mapvote.core.types import F32, F64, I32, I64, U64, Bool, MapTile
+from mapvote.core.types import F32, I32, I64, U64, Bool, MapTile
 from mapvote.fleet.words import CELLS
 
 
@@ -81,54 +81,73 @@ def add_points(tile: MapTile, grid: Grid, points: F32, cells: I64, voters: I32, 
     near = touched[own_cells]
     own_layers = np.floor(tile.points[near, 2].astype(np.float64) / CELL_SIZE).astype(np.int64)
     taken = np.isin(_voxel(cells, layers), _voxel(own_cells[near], own_layers))
-    order = np.lexsort((points[:, 2], points[:, 1], points[:, 0], layers, cells))
-    chosen = _representatives(
-        points[order].astype(np.float64), cells[order], layers[order], voters[order], taken[order], min_votes
-    )
+    voxels = _voxel(cells, layers)
+    order = np.argsort(voxels)
+    chosen = _representatives(points, voxels, voters, taken, order, min_votes)
     if not len(chosen):
         return tile, 0
-    return replace(tile, points=np.concatenate([tile.points, points[order[chosen]]])), len(chosen)
+    return replace(tile, points=np.concatenate([tile.points, points[chosen]])), len(chosen)
 
 
 def _voxel(cells: I64, layers: I64) -> I64:
+    """One number for each voxel, ascending by cell, then layer; neighbours above each other differ by one."""
     return cells * (1 << 24) + layers + (1 << 23)
 
 
 @numba.njit(cache=True, nogil=True)
-def _representatives(points: F64, cells: I64, layers: I64, voters: I32, taken: Bool, min_votes: int) -> I64:
-    """Indices of one point per supported voxel: the one nearest to the mean of all offered there, ties to the first.
+def _representatives(points: F32, voxels: I64, voters: I32, taken: Bool, order: I64, min_votes: int) -> I64:
+    """Indices of one point per supported voxel, ascending by voxel: the one nearest to the mean of all offered there,
+    of several the first by x, y, z.
 
-    Arrays are sorted by cell, layer, then coordinates, so the result does not depend on who was counted first.
+    ``order`` sorts ``voxels``; within a voxel any order gives the same: the mean is a sum of whole micrometres.
     """
-    n = len(cells)
+    n = len(voxels)
     out = np.empty(n, dtype=np.int64)
     found = 0
     seen = np.full(0 if n == 0 else voters.max() + 1, -1, dtype=np.int64)
-    start = 0
+    low, start = 0, 0
     while start < n:
+        voxel = voxels[order[start]]
         stop = start + 1
-        while stop < n and cells[stop] == cells[start] and layers[stop] == layers[start]:
+        while stop < n and voxels[order[stop]] == voxel:
             stop += 1
+        while voxels[order[low]] < voxel - 1:
+            low += 1
         support = 0
-        i = start
-        while i > 0 and cells[i - 1] == cells[start] and layers[i - 1] >= layers[start] - 1:
-            i -= 1
-        while i < n and cells[i] == cells[start] and layers[i] <= layers[start] + 1:
-            if seen[voters[i]] != start:
-                seen[voters[i]] = start
+        i = low
+        while i < n and voxels[order[i]] <= voxel + 1:
+            if seen[voters[order[i]]] != start:
+                seen[voters[order[i]]] = start
                 support += 1
             i += 1
-        if support >= min_votes and not taken[start]:
-            mean = np.zeros(3)
-            for j in range(start, stop):
-                mean += points[j]
-            mean /= stop - start
-            best, nearest = start, np.inf
-            for j in range(start, stop):
-                distance = np.sum((points[j] - mean) ** 2)
-                if distance < nearest:
-                    best, nearest = j, distance
-            out[found] = best
+        if support >= min_votes and not taken[order[start]]:
+            out[found] = _nearest_to_mean(points, order[start:stop])
             found += 1
         start = stop
     return out[:found]
+
+
+@numba.njit(cache=True, nogil=True)
+def _nearest_to_mean(points: F32, some: I64) -> int:
+    mean = np.zeros(3)
+    for k in range(3):
+        total = 0
+        for i in some:
+            total += int(np.round(np.float64(points[i, k]) * 1e6))
+        mean[k] = total / (1e6 * len(some))
+    best, nearest = some[0], np.inf
+    for i in some:
+        distance = 0.0
+        for k in range(3):
+            distance += (np.float64(points[i, k]) - mean[k]) ** 2
+        if distance < nearest or (distance == nearest and _before(points[i], points[best])):
+            best, nearest = i, distance
+    return best
+
+
+@numba.njit(cache=True, nogil=True)
+def _before(a: F32, b: F32) -> bool:
+    for k in range(3):
+        if a[k] != b[k]:
+            return a[k] < b[k]
+    return False

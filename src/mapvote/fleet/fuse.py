@@ -229,18 +229,18 @@ def supported_words(votes: Sequence[TileVote], states: U8, min_votes: int) -> U6
 
 def _offered(votes: Sequence[TileVote], states: U8, grid: Grid) -> tuple[F32, I64, I32]:
     """(points, cells, voters) offered for cells decided changed-occupied, by vehicles that voted so there."""
-    wanted = (states == CellState.CHANGED_OCCUPIED).reshape(-1)
-    points, cells, voters = [np.empty((0, 3), np.float32)], [np.empty(0, np.int64)], [np.empty(0, np.int32)]
-    for i, vote in enumerate(votes):
-        if vote.new_points is None or not len(vote.new_points):
-            continue
-        flat = cells_of(grid, vote.new_points)
-        keep = np.flatnonzero(wanted[flat])
-        keep = keep[vote.supports(CellState.CHANGED_OCCUPIED, flat[keep])]
-        points.append(vote.new_points[keep])
-        cells.append(flat[keep])
-        voters.append(np.full(len(keep), i, dtype=np.int32))
-    return np.concatenate(points), np.concatenate(cells), np.concatenate(voters)
+    offers = [np.empty((0, 3), np.float32) if vote.new_points is None else vote.new_points for vote in votes]
+    points = np.concatenate(offers)
+    cells = cells_of(grid, points)
+    voters = np.repeat(np.arange(len(votes), dtype=np.int32), [len(offer) for offer in offers])
+    wanted = np.flatnonzero((states == CellState.CHANGED_OCCUPIED).reshape(-1)[cells])
+    first = np.searchsorted(voters[wanted], np.arange(len(votes) + 1))
+    meant = [
+        mine[vote.supports(CellState.CHANGED_OCCUPIED, cells[mine])]
+        for vote, mine in zip(votes, np.split(wanted, first[1:-1]), strict=True)
+    ]
+    keep = np.concatenate(meant)
+    return points[keep], cells[keep], voters[keep]
 
 
 def _learn_free(tile: MapTile, grid: Grid, votes: Sequence[TileVote], min_votes: int, points_added: bool) -> MapTile:

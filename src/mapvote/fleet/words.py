@@ -10,11 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapvote.core.grid import TILE_CELLS
-from mapvote.core.planes import pieces
-from mapvote.core.types import U64, Bool, MapvoteError
+from mapvote.core.planes import unpack_plane
+from mapvote.core.types import U64, Bool
 
 CELLS = TILE_CELLS * TILE_CELLS
 EVERY_BIT = ~np.uint64(0)
+_BLOCK = 64
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,7 +31,7 @@ class Words:
     def of(cls, plane: U64) -> Words:
         """From a (256, 256) plane."""
         flat = plane.reshape(-1)
-        return cls(*_not_zero(np.ascontiguousarray(flat), 0))
+        return cls(*_not_zero(np.ascontiguousarray(flat)))
 
     @classmethod
     def whole(cls, cells: NDArray[np.intp]) -> Words:
@@ -39,18 +40,9 @@ class Words:
 
     @classmethod
     def unpack(cls, data: bytes, what: str) -> Words:
-        """From a packed (256, 256) plane of a ballot, without ever holding the plane. MapvoteError if damaged."""
-        cells, words, start = [], [], 0
-        for piece in pieces(data, CELLS * 8, f"ballot: {what}"):
-            if len(piece) % 8:
-                raise MapvoteError(f"ballot: {what} does not hold whole words")
-            found, these = _not_zero(np.frombuffer(piece, dtype="<u8"), start)
-            cells.append(found)
-            words.append(these)
-            start += len(piece) // 8
-        if start != CELLS:
-            raise MapvoteError(f"ballot: {what} has {start} words, expected {CELLS}")
-        return cls(np.concatenate(cells), np.concatenate(words))
+        """From a packed (256, 256) plane of a ballot; MapvoteError if damaged."""
+        plane = unpack_plane(data, "<u8", (CELLS,), f"ballot: {what}")
+        return cls(*_not_zero(plane))
 
     def within(self, cells: Bool) -> Words:
         """Only those of the (256, 256) cells given."""
@@ -75,21 +67,24 @@ def at_least(marked: Sequence[Words], k: int) -> U64:
 
 
 @numba.njit(cache=True, nogil=True)
-def _not_zero(words: U64, start: int) -> tuple[NDArray[np.intp], U64]:
-    """Indices of the words that are not zero, counted from ``start``, and those words."""
+def _not_zero(words: U64) -> tuple[NDArray[np.intp], U64]:
+    """Indices of the words (a multiple of 64) that are not zero, and those words."""
+    blocks = len(words) // _BLOCK
+    filled = np.zeros(blocks, dtype=np.uint64)
     n = 0
-    for i in range(len(words)):
-        n += words[i] != 0
+    for b in range(blocks):  # most blocks are empty, and that is seen with vector instructions
+        for i in range(b * _BLOCK, (b + 1) * _BLOCK):
+            filled[b] |= words[i]
+        n += _BLOCK if filled[b] else 0
     cells, out = np.empty(n, dtype=np.intp), np.empty(n, dtype=np.uint64)
-    if n == 0:
-        return cells, out
     n = 0
-    for i in range(len(words)):
-        if words[i] != 0:
-            cells[n] = start + i
-            out[n] = words[i]
-            n += 1
-    return cells, out
+    for b in range(blocks):
+        if filled[b]:
+            for i in range(b * _BLOCK, (b + 1) * _BLOCK):
+                cells[n] = i
+                out[n] = words[i]
+                n += words[i] != 0
+    return cells[:n].copy(), out[:n].copy()
 
 
 @numba.njit(cache=True, nogil=True)
