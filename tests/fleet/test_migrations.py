@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import sqlite3
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -18,12 +18,17 @@ import sqlalchemy as sa
 from alembic.autogenerate import compare_metadata
 from alembic.migration import MigrationContext
 from alembic.script import ScriptDirectory
+from typer.testing import CliRunner
 
+from hand_made import Say, make_ballot, states_plane, two_walls
+from mapvote.cli import app, verbs
 from mapvote.config import FuseSettings
+from mapvote.core.ballot import encode
 from mapvote.core.types import CellState, MapvoteError
 from mapvote.fleet import keys, migrate, schema
 from mapvote.fleet.database import Database
 from mapvote.fleet.explain import explain_cell
+from mapvote.fleet.intake import Receipt, accept, examine
 from mapvote.fleet.publish import publish
 from mapvote.fleet.store import Store
 
@@ -76,7 +81,10 @@ def test_the_first_schema_becomes_todays_without_loss(first_store: str) -> None:
     with database_at(first_store) as database:
         assert migrate.upgrade(database) == (migrate.FIRST, migrate.HEAD)
         assert migrate.upgrade(database) == (migrate.HEAD, migrate.HEAD)
-    assert content(first_store) == before
+    after = content(first_store)
+    ((*rest, method),) = before.pop("maps")
+    assert after.pop("maps") == [(*rest, f"{method}, settings s")], "the round under way names the settings it votes by"
+    assert after == before
 
     store = Store.open(first_store)
     assert [version.kind for version in store.versions()] == ["import", "publish", "rollback", "publish"]
@@ -86,6 +94,10 @@ def test_the_first_schema_becomes_todays_without_loss(first_store: str) -> None:
         ("operator", "ann", True),
         ("vehicle", "v1", False),
     ]
+    say = {(0, 0): Say(states_plane({(10, 12): CellState.CHANGED_EMPTY}))}
+    ballot = make_ballot(maps[-1], say, "v6", "d1", end_ns=1_700_000_100 * 10**9, settings_hash="s")
+    (receipt,) = accept(store, [examine(encode(ballot))])
+    assert isinstance(receipt, Receipt), "a ballot like those that stand is taken in"
     done = publish(store, FuseSettings())
     assert (done.version, done.deleted) == (5, 3), "the round under way ends as it would have"
     story = explain_cell(store, 12.5 * 0.3, 10.5 * 0.3, FuseSettings())
@@ -116,6 +128,33 @@ def test_head_is_the_last_of_one_line_of_revisions() -> None:
     scripts = ScriptDirectory(str(Path(migrate.__file__).parent / "migrations"))
     assert scripts.get_heads() == [migrate.HEAD]
     assert scripts.get_bases() == [migrate.FIRST]
+
+
+def test_an_older_store_is_refused_until_it_is_upgraded(first_store: str) -> None:
+    refusal = r"schema 0001 of an older mapvote.*mapvote upgrade STORE"
+    with pytest.raises(MapvoteError, match=refusal):
+        Store.open(first_store)
+    with pytest.raises(MapvoteError, match=refusal):
+        Store.create(first_store, two_walls())
+    if not app.registered_commands:
+        verbs.register(app)
+    for says in (f"schema 0001 is now {migrate.HEAD}", "nothing to do"):
+        done = CliRunner().invoke(app, ["upgrade", first_store], catch_exceptions=False)
+        assert done.exit_code == 0
+        assert says in done.output
+    Store.open(first_store).close()
+
+
+def test_an_upgrade_that_fails_leaves_the_old_store(first_store: str) -> None:
+    before = content(first_store)
+    with database_at(first_store) as database:
+        with suppress(ZeroDivisionError), database.writing() as connection:
+            migrate.run_migrations(connection)
+            assert migrate.revision_of(connection) == migrate.HEAD
+            raise ZeroDivisionError
+        with database.reading() as connection:
+            assert migrate.revision_of(connection) == migrate.FIRST
+    assert content(first_store) == before
 
 
 def test_a_store_of_a_newer_mapvote_is_refused_and_left_alone(first_store: str) -> None:

@@ -60,11 +60,8 @@ class TileVote:
 
     def deletes(self, among: Bool) -> Words:
         """The voxels that this vote says are gone, of the (256, 256) cells ``among``."""
-        if self.gone is not None:
-            marked = self.gone.within(among)
-            return marked.at(self.supports(CellState.CHANGED_EMPTY, marked.cells))
-        cells = np.flatnonzero(among)
-        return Words.whole(cells[self.supports(CellState.CHANGED_EMPTY, cells)])
+        marked = Words.whole(np.flatnonzero(among)) if self.gone is None else self.gone.within(among)
+        return marked.at(self.supports(CellState.CHANGED_EMPTY, marked.cells))
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,7 +15,7 @@ from mapvote.core.types import MapvoteError
 from mapvote.fleet.database import Database
 
 FIRST = "0001"
-HEAD = "0001"
+HEAD = "0002"
 """The revision that :mod:`mapvote.fleet.schema` describes."""
 
 

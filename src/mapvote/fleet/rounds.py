@@ -67,9 +67,12 @@ def fuse_stored(task: Task, database: Database | None = None) -> Fused:
     In another process, where there is no ``database`` at hand, one is opened by ``task.url`` and kept.
     """
     with (database or _database(task.url)).reading() as connection:
-        tile = load_tile(connection, task.tile) if isinstance(task.tile, TileHashes) else task.tile
-        points = None if tile is None else tile.points
-        votes = counting_votes(connection, task.lattice, task.index, points, task.asked, task.bars)
+        stored = task.tile if isinstance(task.tile, TileHashes) else None
+        tile = (
+            task.tile if isinstance(task.tile, MapTile) else None if stored is None else load_tile(connection, stored)
+        )
+        points, digest = None if tile is None else tile.points, None if stored is None else stored.points
+        votes = counting_votes(connection, task.lattice, task.index, points, task.asked, task.bars, digest)
     decision, edited = fuse_tile(task.lattice, task.index, tile, votes, task.rule, task.asked.settings)
     changed = edited is not tile and edited is not None
     hashes, planes = pack_tile(edited) if changed and edited is not None else (None, {})

@@ -87,16 +87,20 @@ def counting_votes(
     points: F32 | None,
     asked: Round,
     bars: Sequence[Bar] | None = None,
+    digest: str | None = None,
 ) -> list[TileVote]:
     """The votes that count on a tile whose points are now ``points``, each restricted to the cells where it counts.
 
-    ``bars``: instead of those recorded.
+    ``bars``: instead of those recorded. ``digest``: the hash of ``points``, where it is known: votes with that base
+    need no comparison.
     """
     chosen = select(stored_votes(connection, index, asked), asked.settings)
     barred = bars_on(connection, index, asked.mark) if bars is None else bars
 
     @cache
     def unchanged(base: str) -> Bool | None:
+        if base == digest:
+            return None
         old = None if not base else unpack_points_plane(load_blob(connection, base), base)
         same = same_cells(old, points, tile_grid(lattice, index))
         return None if same.all() else same
