@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import typer
 
-from mapvote.cli import files, science, server, vehicle
+from mapvote.cli import files, science, server, update, vehicle, watch
 
 
 def register(app: typer.Typer) -> None:
@@ -12,4 +12,6 @@ def register(app: typer.Typer) -> None:
     science.register(app)
     vehicle.register(app)
     files.register(app)
+    update.register(app)
     server.register(app)
+    watch.register(app)

@@ -1,0 +1,97 @@
+"""The offline server: ballots in files, the updated map in a folder (paper IV)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from mapvote.core.grid import TileIndex
+    from mapvote.core.types import U8
+    from mapvote.fleet.fuse import Decision
+
+
+def register(app: typer.Typer) -> None:
+    """Add the verb to ``app``."""
+    app.command()(update)
+
+
+def update(
+    map_path: Annotated[Path, typer.Argument(metavar="MAP", help="map folder, PCD file or Autoware folder")],
+    ballot_files: Annotated[list[Path], typer.Argument(metavar="BALLOT...", help="ballots of one round")],
+    out: Annotated[Path | None, typer.Option(help="where the updated map goes")] = None,
+    dry_run: Annotated[bool, typer.Option(help="decide and report, write no map")] = False,
+    cells: Annotated[Path | None, typer.Option(help="also write the decided states to this .npz")] = None,
+    min_votes: Annotated[
+        int | None,
+        typer.Option(
+            min=1, help="vehicles that a change needs; default 1 for the paper's rule, else as in the settings"
+        ),
+    ] = None,
+) -> None:
+    """Fuse ballots offline and edit the map: add, delete, keep."""
+    from mapvote.config import FuseSettings
+    from mapvote.core.ballot import decode
+    from mapvote.core.types import MapvoteError
+    from mapvote.fleet.fuse import states_over
+    from mapvote.fleet.update import update_map
+    from mapvote.formats import read_map, write_map
+
+    if out is None and not dry_run:
+        raise MapvoteError("update: say where the updated map goes (--out MAP), or --dry-run to only look")
+    ballots = []
+    for file in ballot_files:
+        try:
+            ballots.append(decode(file.read_bytes()))
+        except OSError as error:
+            raise MapvoteError(f"{file}: cannot be read ({error.strerror})") from error
+        except MapvoteError as error:
+            raise MapvoteError(f"{file}: {error}") from error
+    settings = FuseSettings()
+    paper = bool(ballots) and ballots[0].method == "paper"
+    settings = settings.model_copy(update={"min_votes": min_votes or (1 if paper else settings.min_votes)})
+    before = read_map(map_path)
+    after, decisions = update_map(before, ballots, settings)
+    if cells is not None:
+        states, grid = states_over(before.lattice, decisions)
+        _write_cells(cells, states, grid.x0, grid.y0)
+    if out is not None and not dry_run:
+        write_map(after, out)
+    _report(decisions, len({ballot.vehicle for ballot in ballots}), settings.min_votes, None if dry_run else out)
+
+
+def _write_cells(path: Path, states: U8, x0: float, y0: float) -> None:
+    """Decided states over the window of all ballots (DESIGN 6), written whole or not at all."""
+    import numpy as np
+
+    from mapvote.core.grid import CELL_SIZE
+    from mapvote.formats.whole import whole_file
+
+    with whole_file(path) as part, part.open("wb") as file:
+        np.savez_compressed(file, states=states, x0=x0, y0=y0, cell_size=CELL_SIZE)
+
+
+def _report(decisions: dict[TileIndex, Decision], vehicles: int, min_votes: int, out: Path | None) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    from mapvote.core.types import CellState
+
+    console = Console()
+    table = Table("tile", "vehicles", "changed-occupied cells", "changed-empty cells", "points added", "points deleted")
+    for index, d in decisions.items():
+        occupied = int((d.states == CellState.CHANGED_OCCUPIED).sum())
+        empty = int((d.states == CellState.CHANGED_EMPTY).sum())
+        if occupied or empty:
+            table.add_row(
+                *(str(v) for v in (f"{index[0]},{index[1]}", d.vehicles, occupied, empty, d.added, d.deleted))
+            )
+    if table.row_count:
+        console.print(table)
+    added, deleted = sum(d.added for d in decisions.values()), sum(d.deleted for d in decisions.values())
+    console.print(f"{vehicles} vehicles, {len(decisions)} tiles: {added} points added, {deleted} deleted")
+    if vehicles < min_votes:
+        console.print(f"A change needs {min_votes} vehicles and {vehicles} voted, so nothing can change: --min-votes 1")
+    console.print(f"updated map: {out}" if out is not None else "dry run: no map written")
