@@ -169,11 +169,14 @@ def test_metrics_and_logs_hold_no_secret(site: Site) -> None:
         assert secret not in log + text
 
 
-def test_a_revoked_key_stops_working(site: Site) -> None:
+def test_a_revoked_key_stops_working_at_once(site: Site) -> None:
     issued = subprocess.run(mapvote("keys", site.store, "issue", "c"), capture_output=True, text=True, check=True)
     key = issued.stdout.strip()
     assert site.ask("GET", "/v1/map", key).status_code == 200
+    ballots = [encode(says(two_walls(), "c", drive, CellState.UNCHANGED_OCCUPIED)) for drive in ("d1", "d2")]
+    assert site.ask("PUT", "/v1/ballots/c/d1", key, content=ballots[0]).status_code == 201
     subprocess.run(mapvote("keys", site.store, "revoke", "c"), capture_output=True, check=True)
+    assert site.ask("PUT", "/v1/ballots/c/d2", key, content=ballots[1]).status_code == 401
     assert site.ask("GET", "/v1/map", key).status_code == 401
 
 

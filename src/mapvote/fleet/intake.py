@@ -17,7 +17,7 @@ from mapvote.fleet.content import TileHashes, same_cells, unpack_points_plane
 from mapvote.fleet.database import insert_rows
 from mapvote.fleet.errors import Conflict, NotFound, Unauthorised
 from mapvote.fleet.fuse import DAY_NS
-from mapvote.fleet.store import Store, current_version, load_blob, log_event, names, next_seq, tiles_of
+from mapvote.fleet.store import Store, current_number, load_blob, log_event, names, next_seq, tiles_of
 from mapvote.fleet.update import rule_of, staged, tile_vote
 
 MAX_CLOCK_AHEAD_NS = DAY_NS
@@ -94,7 +94,7 @@ class Intake:
         """
         store, results = self._store, list[Receipt | Exception | None]()
         with store.database.reading() as connection:
-            newest = current_version(connection).number
+            newest = current_number(connection)
             if newest != self._current[0]:
                 self._current = newest, tiles_of(connection, newest)
             valid = keys.of(connection, {ballot.key_hash for ballot in ballots if ballot.key_hash is not None})

@@ -137,7 +137,7 @@ class Store:
     def current(self) -> int:
         """Number of the newest version."""
         with self.database.reading() as connection:
-            return current_version(connection).number
+            return current_number(connection)
 
     def versions(self) -> list[Version]:
         """All versions, oldest first."""
@@ -151,7 +151,7 @@ class Store:
         NotFound if there is no such version.
         """
         with self.database.reading() as connection:
-            number = current_version(connection).number if number is None else number
+            number = current_number(connection) if number is None else number
             for wanted in (number, since):
                 if wanted is not None:
                     version_of(connection, wanted)
@@ -178,10 +178,15 @@ class Store:
     def point_map(self, number: int | None = None) -> PointMap:
         """A whole version."""
         with self.database.reading() as connection:
-            number = current_version(connection).number if number is None else number
+            number = current_number(connection) if number is None else number
             version_of(connection, number)
             tiles = {index: load_tile(connection, hashes) for index, hashes in tiles_of(connection, number).items()}
         return PointMap(self.map_id, self.lattice, tiles, self.georeference)
+
+
+def current_number(connection: sa.Connection) -> int:
+    """Number of the newest version."""
+    return int(connection.execute(sa.select(sa.func.max(schema.versions.c.number))).scalar_one())
 
 
 def current_version(connection: sa.Connection) -> Version:
@@ -194,7 +199,7 @@ def version_of(connection: sa.Connection, number: int) -> Version:
     """One version; NotFound, naming the newest, if there is none of that number."""
     row = connection.execute(sa.select(schema.versions).where(schema.versions.c.number == number)).one_or_none()
     if row is None:
-        newest = current_version(connection).number
+        newest = current_number(connection)
         raise NotFound(f"there is no version {number}; the newest is {newest}: fetch it whole")
     return Version(**row._mapping)
 
