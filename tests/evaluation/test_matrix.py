@@ -21,7 +21,13 @@ def entry(macro: float, valid: float = 0.0) -> dict[str, Any]:
         "strict": {"macro_f1": macro, "f1": classes},
         "provenance": {"macro_f1": macro},
         "strict_old_unchanged": {"macro_f1": macro},
-        "map": {"stale_deleted": 1.0, "valid_deleted": valid, "new_added": 1.0, "added_false": 0.0},
+        "map": {
+            "stale_deleted": 1.0,
+            "stale_apart_deleted": 1.0,
+            "valid_deleted": valid,
+            "new_added": 1.0,
+            "added_false": 0.0,
+        },
         "coverage": 0.9,
         "objects": {"found": [True, False], "false_m2": [2.5, 1.5]},
     }

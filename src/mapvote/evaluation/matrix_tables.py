@@ -55,6 +55,7 @@ FIGURES: Mapping[str, Figure] = {
     "empty": Figure("F1 ch.-empty strict", lambda e: e["strict"]["f1"]["changed_empty"]),
     "strict_old": Figure("macro strict, old surfaces unchanged", lambda e: e["strict_old_unchanged"]["macro_f1"]),
     "stale": Figure("stale deleted", lambda e: e["map"]["stale_deleted"], percent=True),
+    "stale_apart": Figure("stale, .6 m off what stands", lambda e: e["map"]["stale_apart_deleted"], percent=True),
     "valid": Figure("valid deleted", lambda e: e["map"]["valid_deleted"], more_is_better=False, percent=True),
     "new": Figure("new added", lambda e: e["map"]["new_added"], percent=True),
     "false": Figure("added on no surface", lambda e: e["map"]["added_false"], more_is_better=False, percent=True),

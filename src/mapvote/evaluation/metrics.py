@@ -17,6 +17,8 @@ from mapvote.core.types import F64, NO_VOTE, U8, Bool, CellState
 
 CLASSES = ("unchanged", "changed_occupied", "changed_empty")
 """The paper's three scored classes; the position is the value in a truth grid (DESIGN 6)."""
+APART_M = 0.6
+"""Two cells: a hit speaks for mapped voxels up to one cell away, so within two nobody can tell old from new."""
 UNSCORED = 255
 """In a truth grid: this cell is not counted."""
 
@@ -110,6 +112,8 @@ class MapScores:
 
     stale_deleted: float
     """Old map points of removed surfaces that are gone."""
+    stale_apart_deleted: float
+    """The same, of points :data:`APART_M` or more from everything that stands: nearer ones share its voxels' reach."""
     valid_deleted: float
     """Old map points of standing surfaces that are gone: the damage done."""
     new_added: float
@@ -142,6 +146,7 @@ class MapJudge:
         to_kept, to_now = _distance(old_points, cKDTree(kept)), _distance(old_points, self._now)
         self.stale = (to_removed <= reach_m) & (to_removed < to_now)
         self.valid = (to_kept <= reach_m) & (to_kept <= to_removed)
+        self._apart = self.stale & (to_now >= APART_M)
 
     def score(self, new_points: F64) -> MapScores:
         """``new_points`` (n, 3): the obstacle points of the updated map; an old one survives if found bit for bit."""
@@ -149,6 +154,7 @@ class MapJudge:
         reached = _distance(self._added, cKDTree(new_points)) <= self._reach_m
         return MapScores(
             stale_deleted=ratio(np.count_nonzero(self.stale & ~survived), np.count_nonzero(self.stale)),
+            stale_apart_deleted=ratio(np.count_nonzero(self._apart & ~survived), np.count_nonzero(self._apart)),
             valid_deleted=ratio(np.count_nonzero(self.valid & ~survived), np.count_nonzero(self.valid)),
             new_added=ratio(np.count_nonzero(reached), len(self._added)),
             added_false=ratio(np.count_nonzero(_distance(fresh, self._now) > self._reach_m), len(fresh)),
