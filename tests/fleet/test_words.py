@@ -24,7 +24,9 @@ def test_packed_or_not_they_are_the_plane(seed: int, share: float) -> None:
     for words in (Words.of(plane), Words.unpack(pack_plane(plane), "gone")):
         assert words.words.all()
         assert np.array_equal(at_least([words], 1), plane)
-        assert np.array_equal(at_least([words.within(inside)], 1), np.where(inside, plane, np.uint64(0)))
+        for some in (words.within(inside), words.where(Words.whole(inside))):
+            assert np.array_equal(at_least([some], 1), np.where(inside, plane, np.uint64(0)))
+        assert not len(words.where(Words.whole(np.zeros(SHAPE, np.bool_))).cells)
 
 
 @given(words=st.lists(st.integers(0, 2**64 - 1), min_size=1, max_size=8), k=st.integers(1, 5))

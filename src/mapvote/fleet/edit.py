@@ -10,7 +10,7 @@ import numpy as np
 from mapvote.core.columns import GROUND_MARGIN_M, TOP_BIT, base_layers, map_points
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Grid
 from mapvote.core.types import F32, I32, I64, U64, Bool, MapTile
-from mapvote.fleet.words import CELLS
+from mapvote.fleet.words import CELLS, EVERY_BIT
 
 
 def empty_tile() -> MapTile:
@@ -26,25 +26,28 @@ def cells_of(grid: Grid, points: F32) -> I64:
     return flat
 
 
-def columns_of(tile: MapTile, grid: Grid) -> tuple[I64, I64, Bool]:
-    """(cell, bit, obstacle) of every point of a tile: flat cell, bit of its column word, above the ground or not.
+def columns_of(points: F32, cells: I64, ground_z: F32) -> tuple[I64, Bool]:
+    """(bit, obstacle) of points that lie in the flat ``cells`` of a tile: bit of the column word, above the ground.
 
     The same reckoning as :func:`mapvote.core.columns.fill_columns`, by which vehicles see the map.
     """
-    cell = cells_of(grid, tile.points)
-    base = base_layers(tile.ground_z).reshape(-1)[cell]
-    ground = tile.ground_z.reshape(-1)[cell].astype(np.float64)
-    ground = np.where(np.isnan(ground), base * CELL_SIZE, ground)
-    z = tile.points[:, 2].astype(np.float64)
+    ground = ground_z.reshape(-1)[cells].astype(np.float64)
+    unknown = ~np.isfinite(ground)
+    base = np.floor(np.where(unknown, 0.0, ground) / CELL_SIZE).astype(np.int64)
+    if unknown.any():  # only then it takes the whole tile to tell
+        base[unknown] = base_layers(ground_z).reshape(-1)[cells[unknown]]
+    ground = np.where(unknown, base * CELL_SIZE, ground)
+    z = points[:, 2].astype(np.float64)
     bit = np.clip(np.floor(z / CELL_SIZE).astype(np.int64) - base, 0, TOP_BIT)
-    return cell, bit, z - ground >= GROUND_MARGIN_M
+    return bit, z - ground >= GROUND_MARGIN_M
 
 
 def obstacle_bits(tile: MapTile, grid: Grid) -> U64:
     """(256, 256) column words of the tile's obstacle points."""
-    cell, bit, obstacle = columns_of(tile, grid)
+    cells = cells_of(grid, tile.points)
+    bit, obstacle = columns_of(tile.points, cells, tile.ground_z)
     words = np.zeros(CELLS, dtype=np.uint64)
-    np.bitwise_or.at(words, cell[obstacle], np.uint64(1) << bit[obstacle].astype(np.uint64))
+    np.bitwise_or.at(words, cells[obstacle], np.uint64(1) << bit[obstacle].astype(np.uint64))
     return words.reshape(TILE_CELLS, TILE_CELLS)
 
 
@@ -54,15 +57,16 @@ def delete_points(tile: MapTile, grid: Grid, gone: U64) -> tuple[MapTile, int]:
     Ground points are never deleted. Where the ground is unknown, vehicle and server share no base layer for their
     words, so any mark takes the whole column.
     """
-    if not len(tile.points):
+    cells = cells_of(grid, tile.points)
+    marked = np.flatnonzero(gone.reshape(-1)[cells])
+    cells = cells[marked]
+    bit, obstacle = columns_of(tile.points[marked], cells, tile.ground_z)
+    known = np.isfinite(tile.ground_z.reshape(-1)[cells])
+    words = np.where(known, gone.reshape(-1)[cells], EVERY_BIT)
+    dropped = marked[obstacle & ((words >> bit.astype(np.uint64)) & np.uint64(1)).astype(np.bool_)]
+    if not len(dropped):
         return tile, 0
-    cell, bit, obstacle = columns_of(tile, grid)
-    known = np.isfinite(tile.ground_z).reshape(-1)
-    words = np.where(known | (gone.reshape(-1) == 0), gone.reshape(-1), ~np.uint64(0))[cell]
-    dropped = obstacle & ((words >> bit.astype(np.uint64)) & np.uint64(1)).astype(np.bool_)
-    if not dropped.any():
-        return tile, 0
-    return replace(tile, points=tile.points[~dropped]), int(dropped.sum())
+    return replace(tile, points=np.delete(tile.points, dropped, axis=0)), len(dropped)
 
 
 def add_points(tile: MapTile, grid: Grid, points: F32, cells: I64, voters: I32, min_votes: int) -> tuple[MapTile, int]:

@@ -58,9 +58,9 @@ class TileVote:
         assert self.tally is not None
         return np.asarray(self.tally[cells // TILE_CELLS, cells % TILE_CELLS, int(change)] > 0)
 
-    def deletes(self, among: Bool) -> Words:
-        """The voxels that this vote says are gone, of the (256, 256) cells ``among``."""
-        marked = Words.whole(np.flatnonzero(among)) if self.gone is None else self.gone.within(among)
+    def deletes(self, among: Words) -> Words:
+        """The voxels that this vote says are gone, of the cells that ``among`` names."""
+        marked = among if self.gone is None else self.gone.where(among)
         return marked.at(self.supports(CellState.CHANGED_EMPTY, marked.cells))
 
 
@@ -141,7 +141,7 @@ def fold(drives: Sequence[TileVote], grid: Grid) -> TileVote:
             states[mine] = drive.states[mine]
         if tally is not None and drive.tally is not None:
             tally[mine] = drive.tally[mine]
-        gone.append(drive.deletes(mine))
+        gone.append(drive.deletes(Words.whole(mine)))
         if drive.new_points is not None:
             points.append(drive.new_points[mine.ravel()[cells_of(grid, drive.new_points)]])
     free = [drive.free for drive in ordered if drive.free is not None]
@@ -220,7 +220,7 @@ def fuse_tile(
 
 def supported_words(votes: Sequence[TileVote], states: U8, min_votes: int) -> U64:
     """(256, 256) delete mask: in cells decided changed-empty, the voxels that ``min_votes`` voters for it mark."""
-    decided = states == CellState.CHANGED_EMPTY
+    decided = Words.whole(states == CellState.CHANGED_EMPTY)
     return at_least([vote.deletes(decided) for vote in votes], min_votes)
 
 

@@ -34,9 +34,10 @@ class Words:
         return cls(*_not_zero(np.ascontiguousarray(flat)))
 
     @classmethod
-    def whole(cls, cells: NDArray[np.intp]) -> Words:
-        """Every bit of the flat ``cells``."""
-        return cls(cells, np.full(len(cells), EVERY_BIT))
+    def whole(cls, cells: Bool) -> Words:
+        """Every bit of the (256, 256) cells given."""
+        flat = np.flatnonzero(cells)
+        return cls(flat, np.full(len(flat), EVERY_BIT))
 
     @classmethod
     def unpack(cls, data: bytes, what: str) -> Words:
@@ -47,6 +48,12 @@ class Words:
     def within(self, cells: Bool) -> Words:
         """Only those of the (256, 256) cells given."""
         return self.at(cells.reshape(-1)[self.cells])
+
+    def where(self, others: Words) -> Words:
+        """Only those of cells that ``others`` names too."""
+        near = np.searchsorted(others.cells, self.cells)
+        near[near == len(others.cells)] = 0
+        return self.at(others.cells[near] == self.cells if len(others.cells) else near > 0)
 
     def at(self, keep: Bool) -> Words:
         """Only those where ``keep`` (n,) is set."""
