@@ -70,6 +70,8 @@ def write(results: dict[str, dict[int, dict[str, Any]]], out: Path) -> None:
     """matrix.json and matrix.md into ``out``."""
     titles = {name: f"{name} (seeds {', '.join(str(seed) for seed in by_seed)})" for name, by_seed in results.items()}
     text = "\n".join(f"### {titles[name]}\n\n{matrix_tables.table(results, name)}" for name in results)
+    if "main" in results:
+        text += f"\n### main, class by class\n\n{matrix_tables.class_table(results, 'main')}"
     with whole_file(out / "matrix.md") as partial:
         partial.write_text(f"## What must hold\n\n{demands.table(results)}\n## Experiments\n\n{text}")
     with whole_file(out / "matrix.json") as partial:

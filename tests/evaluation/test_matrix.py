@@ -12,13 +12,13 @@ from mapvote.config import Settings
 from mapvote.evaluation import demands
 from mapvote.evaluation.demands import DEMANDS, Demand
 from mapvote.evaluation.matrix import EXPERIMENTS, Matrix
-from mapvote.evaluation.matrix_tables import FIGURES, Spread, spread, table
+from mapvote.evaluation.matrix_tables import FIGURES, Spread, class_table, spread, table
 
 
 def entry(macro: float, valid: float = 0.0) -> dict[str, Any]:
-    classes = {"changed_occupied": macro, "changed_empty": macro}
+    classes = {"unchanged": macro, "changed_occupied": macro, "changed_empty": macro}
     return {
-        "strict": {"macro_f1": macro, "f1": classes},
+        "strict": {"macro_f1": macro, "f1": classes, "precision": classes, "recall": classes},
         "provenance": {"macro_f1": macro},
         "strict_old_unchanged": {"macro_f1": macro},
         "map": {
@@ -76,6 +76,11 @@ def test_the_table_has_a_line_a_round_and_a_cell_a_figure() -> None:
     assert len(lines) == 3
     assert lines[2].startswith("| a | 0.600 ± 0.141 (0.500) |")
     assert {line.count("|") for line in lines} == {len(FIGURES) + 2}
+
+
+def test_precision_and_recall_are_means_over_the_seeds_class_by_class() -> None:
+    text = class_table({"main": {2: of_rounds(a=entry(0.5)), 3: of_rounds(a=entry(1.0))}}, "main")
+    assert "| a | 0.7500 / 0.7500 | 0.750 / 0.750 | 0.750 / 0.750 |" in text
 
 
 @pytest.mark.slow

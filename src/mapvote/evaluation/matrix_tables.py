@@ -7,6 +7,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from mapvote.evaluation.metrics import CLASSES
+
 Entry = Mapping[str, Any]
 Results = Mapping[str, Mapping[int, Mapping[str, Any]]]
 """By experiment and seed: what :meth:`mapvote.evaluation.matrix.Matrix.run` gave."""
@@ -91,5 +93,20 @@ def table(results: Results, experiment: str) -> str:
         for figure in FIGURES.values():
             s = spread([figure.of(e) for e in entries.values()], figure.more_is_better)
             cells.append(figure.text(s))
+        lines.append(f"| {name} | " + " | ".join(cells) + " |")
+    return "\n".join(lines) + "\n"
+
+
+def class_table(results: Results, experiment: str) -> str:
+    """Markdown: precision / recall of the paper's three classes (Tables II and III), means over the seeds, strict."""
+    head = "| | " + " | ".join(f"{name.replace('_', '-')} P / R" for name in CLASSES) + " |"
+    lines = [head, "|---" * (len(CLASSES) + 1) + "|"]
+    for name, entries in rounds_of(results, experiment).items():
+        cells = []
+        for k in CLASSES:
+            p, r = (
+                statistics.fmean(e["strict"][which][k] for e in entries.values()) for which in ("precision", "recall")
+            )
+            cells.append(f"{p:.4f} / {r:.4f}" if k == CLASSES[0] else f"{p:.3f} / {r:.3f}")
         lines.append(f"| {name} | " + " | ".join(cells) + " |")
     return "\n".join(lines) + "\n"
