@@ -2,6 +2,7 @@
 
 Starts from the version before its first vote and goes through every later version again, by the policy recorded in
 each and with the ballots that stood at its moment, without the vehicle. The result is published as one new version.
+A round that made no version because of the vehicle left no trace: the next publish makes up for it.
 """
 
 from __future__ import annotations
