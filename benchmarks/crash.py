@@ -36,8 +36,9 @@ from mapvote.core.ballot import Ballot, encode
 from mapvote.core.grid import TileIndex
 from mapvote.core.types import CellState, MapTile, MapvoteError
 from mapvote.fleet import schema
+from mapvote.fleet.ballotbox import Receipt
 from mapvote.fleet.errors import Conflict, Unavailable
-from mapvote.fleet.intake import Receipt, accept, examine
+from mapvote.fleet.intake import accept, examine
 from mapvote.fleet.publish import publish
 from mapvote.fleet.store import Store
 from postgres_cluster import PostgresCluster

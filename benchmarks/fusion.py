@@ -35,8 +35,9 @@ from mapvote.config import FuseSettings
 from mapvote.core.ballot import encode
 from mapvote.core.grid import TileIndex
 from mapvote.core.types import NO_VOTE, U8, CellState, PointMap
+from mapvote.fleet.ballotbox import Receipt
 from mapvote.fleet.fuse import DAY_NS
-from mapvote.fleet.intake import Receipt, accept, examine
+from mapvote.fleet.intake import accept, examine
 from mapvote.fleet.publish import publish
 from mapvote.fleet.store import Store
 

@@ -29,7 +29,8 @@ from hand_made import Say, make_ballot, make_map, make_tile, states_plane, wall
 from live_server import serving
 from mapvote.core.ballot import encode
 from mapvote.core.types import CellState, PointMap
-from mapvote.fleet.intake import Receipt, accept, examine
+from mapvote.fleet.ballotbox import Receipt
+from mapvote.fleet.intake import accept, examine
 from mapvote.fleet.store import Store
 from postgres_cluster import PostgresCluster
 

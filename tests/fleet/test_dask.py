@@ -20,7 +20,8 @@ from mapvote.config import FuseSettings
 from mapvote.core.ballot import encode
 from mapvote.core.types import CellState
 from mapvote.fleet import schema
-from mapvote.fleet.intake import Receipt, accept, examine
+from mapvote.fleet.ballotbox import Receipt
+from mapvote.fleet.intake import accept, examine
 from mapvote.fleet.publish import publish
 from mapvote.fleet.store import Store
 

@@ -26,9 +26,10 @@ from mapvote.config import FuseSettings
 from mapvote.core.ballot import encode
 from mapvote.core.types import CellState, MapvoteError
 from mapvote.fleet import keys, migrate, schema
+from mapvote.fleet.ballotbox import Receipt
 from mapvote.fleet.database import Database
 from mapvote.fleet.explain import explain_cell
-from mapvote.fleet.intake import Receipt, accept, examine
+from mapvote.fleet.intake import accept, examine
 from mapvote.fleet.publish import publish
 from mapvote.fleet.store import Store
 

@@ -13,8 +13,9 @@ from hand_made import Say, make_ballot, states_plane, two_walls
 from mapvote.config import FuseSettings
 from mapvote.core.ballot import encode
 from mapvote.core.types import CellState, MapvoteError
+from mapvote.fleet.ballotbox import Receipt
 from mapvote.fleet.errors import Unavailable
-from mapvote.fleet.intake import Receipt, accept, examine
+from mapvote.fleet.intake import accept, examine
 from mapvote.fleet.publish import publish
 from mapvote.fleet.store import Store
 from postgres_cluster import PostgresCluster

@@ -20,8 +20,9 @@ from mapvote.config import FuseSettings
 from mapvote.core.ballot import encode
 from mapvote.core.types import CellState, MapvoteError, PointMap
 from mapvote.fleet import publish as publishing
+from mapvote.fleet.ballotbox import Receipt
 from mapvote.fleet.errors import Conflict, NotFound
-from mapvote.fleet.intake import Receipt, accept, examine
+from mapvote.fleet.intake import accept, examine
 from mapvote.fleet.publish import publish, rollback
 from mapvote.fleet.replay import replay
 from mapvote.fleet.store import Store

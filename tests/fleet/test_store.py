@@ -15,9 +15,10 @@ from hand_made import Say, make_ballot, states_plane, two_walls
 from mapvote.config import FuseSettings
 from mapvote.core.ballot import Ballot, encode
 from mapvote.core.types import CellState, MapvoteError, PointMap
+from mapvote.fleet.ballotbox import Receipt, withdraw
 from mapvote.fleet.errors import Conflict, Held, NotFound, Unavailable
 from mapvote.fleet.fuse import DAY_NS
-from mapvote.fleet.intake import Intake, Receipt, accept, examine, withdraw
+from mapvote.fleet.intake import Intake, accept, examine
 from mapvote.fleet.publish import publish, rollback
 from mapvote.fleet.store import Store
 from mapvote.fleet.update import update_map

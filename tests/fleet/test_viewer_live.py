@@ -15,8 +15,9 @@ from mapvote.config import FuseSettings
 from mapvote.core.ballot import encode
 from mapvote.core.types import CellState
 from mapvote.fleet import keys
+from mapvote.fleet.ballotbox import Receipt
 from mapvote.fleet.explain import vehicle_standings
-from mapvote.fleet.intake import Receipt, accept, examine
+from mapvote.fleet.intake import accept, examine
 from mapvote.fleet.publish import publish
 from mapvote.fleet.store import Store
 

@@ -99,7 +99,7 @@ def unvote(
 ) -> None:
     """Withdraw a vehicle's votes, from what is to come or (--replay) from every version."""
     from mapvote.core.types import MapvoteError
-    from mapvote.fleet.intake import withdraw
+    from mapvote.fleet.ballotbox import withdraw
     from mapvote.fleet.replay import replay as replay_without
 
     if (vehicle is None) != everybody:

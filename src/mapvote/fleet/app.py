@@ -14,7 +14,7 @@ from mapvote.fleet import operate, pages, routes
 from mapvote.fleet.answers import refuse, unreadable
 from mapvote.fleet.batch import Batcher
 from mapvote.fleet.guard import Guard
-from mapvote.fleet.intake import Intake, examine_all
+from mapvote.fleet.intake import Intake
 from mapvote.fleet.limits import RateLimit
 from mapvote.fleet.manifests import Manifests
 from mapvote.fleet.publish import Gate
@@ -45,8 +45,9 @@ def create_app(
         own = ThreadPoolExecutor(2, "fuse")
         app.state.executor = executor or own
         app.state.threads, app.state.stopping = own, False
-        app.state.examiner = Batcher(examine_all, settings.server.batch)
-        app.state.writer = Batcher(Intake(store, settings.server.settings_hash).accept, settings.server.batch)
+        app.state.intake = intake = Intake(store, settings.server.settings_hash)
+        app.state.examiner = Batcher(intake.look_at, settings.server.batch)
+        app.state.writer = Batcher(intake.write, settings.server.batch)
         app.state.newest = Batcher(manifests.newest, _READERS)
         yield
         await app.state.examiner.close()

@@ -14,10 +14,10 @@ from fastapi import APIRouter, Path, Request, Response
 from fastapi.concurrency import run_in_threadpool
 from starlette.types import ASGIApp, Receive, Scope, Send
 
-from mapvote.core.types import MapvoteError
 from mapvote.fleet.answers import Name, Number, Stored, VersionQuery, iso, problems
+from mapvote.fleet.ballotbox import Incoming, withdraw
 from mapvote.fleet.guard import own
-from mapvote.fleet.intake import Incoming, examine, withdraw
+from mapvote.fleet.intake import Intake, Sent
 from mapvote.fleet.limits import read_body
 
 _BYTES: dict[str, Any] = {"application/octet-stream": {"schema": {"type": "string", "format": "binary"}}}
@@ -95,20 +95,20 @@ async def vote(request: Request, vehicle: Name, drive: Name) -> Response:
     state = request.app.state
     limit = state.settings.server.max_body_bytes
     body = await read_body(request.stream(), request.headers.get("content-length"), limit)
-    incoming: Incoming
-    if len(body) <= _SMALL_BYTES:
-        incoming = await state.examiner.put((body, request.state.key_hash))
-    else:
-        incoming = await run_in_threadpool(examine, body, request.state.key_hash)
-    theirs = incoming.ballot
-    if (theirs.vehicle, theirs.drive) != (vehicle, drive):
-        sent = f"{vehicle[:64]}/{drive[:64]}"
-        raise MapvoteError(f"the ballot is of {theirs.vehicle}/{theirs.drive}, not {sent}")
+    sent = Sent(body, vehicle, drive, request.state.key_hash)
+    incoming = await (state.examiner.put(sent) if len(body) <= _SMALL_BYTES else _apart(state.intake, sent))
     receipt = await state.writer.put(incoming)
     result = "repeated" if receipt.repeated else "created" if receipt.created else "replaced"
     state.metrics.ballots.labels(result).inc()
     answer = msgspec.json.encode({"vehicle": vehicle, "drive": drive, "result": result})
     return Response(answer, 201 if receipt.created else 200, media_type="application/json")
+
+
+async def _apart(intake: Intake, sent: Sent) -> Incoming:
+    (found,) = await run_in_threadpool(intake.look_at, [sent])
+    if isinstance(found, Exception):
+        raise found
+    return found
 
 
 class StraightToVote:
