@@ -151,6 +151,12 @@ class FuseSettings(Section):
     """fleet/fuse.py: which votes count, how many are enough (DESIGN 4). A version records the ones it was made by."""
 
     min_votes: int = Field(default=2, ge=1, description="vehicles that a change needs: k + 1 against k liars")
+    max_contradiction: float = Field(
+        default=0.5,
+        gt=0,
+        le=1,
+        description="who opposes the others in more of a tile is not heard there; 1: everyone is",
+    )
     latest_vehicles: int = Field(default=9, ge=1, description="only the last so many vehicles on a tile count")
     max_age_days: float = Field(default=30.0, gt=0, description="and drives so much older than its newest do not")
     min_age_s: float = Field(default=0.0, ge=0, description="a ballot waits so long before it counts (time to un-vote)")

@@ -18,7 +18,7 @@ from mapvote.fleet import schema
 from mapvote.fleet.changes import Decided, change_objects, changed_cells, to_geojson
 from mapvote.fleet.consensus import Compared, Spoken, Standing, compare, judge
 from mapvote.fleet.content import unpack_points_plane
-from mapvote.fleet.fuse import TileVote, fold, select
+from mapvote.fleet.fuse import TileVote, count, fold, select, unheard
 from mapvote.fleet.rounds import unpack_tally_plane
 from mapvote.fleet.standing import Round, counting_votes, read_votes, standing_tiles, stored_votes
 from mapvote.fleet.store import Store, current_version, load_blob, load_tile, tiles_of, version_of
@@ -71,6 +71,7 @@ def explain_cell(store: Store, x: float, y: float, settings: FuseSettings) -> Ce
         old_enough = [vote for vote in everyone if vote.received_ns <= asked.received_by_ns]
         inside = {vote.seq for vote in select(old_enough, settings)}
         counting = {v.digest: v for v in counting_votes(connection, store.lattice, index, points, asked)}
+        silenced = _silenced(store, index, list(counting.values()), settings)
         plain = read_votes(connection, index, everyone)
         query = sa.select(schema.decisions.c.version, schema.decisions.c.states)
         query = query.where(schema.decisions.c.row == index[0], schema.decisions.c.col == index[1])
@@ -89,9 +90,20 @@ def explain_cell(store: Store, x: float, y: float, settings: FuseSettings) -> Ce
             why = f"older than {settings.max_age_days:g} days or not among the last {settings.latest_vehicles} vehicles"
         elif not counts:
             why = "the cell has changed since its base, or a rollback has barred it"
+        elif vote.vehicle in silenced:
+            counts, why = False, "opposes the others over most of this tile"
         votes.append(CellVote(stored.vehicle, stored.drive, _said(vote, cell), stored.end_ns, counts, why))
     story = [(version, state_name(int(states[cell]))) for version, states in decided if states[cell] != NO_VOTE]
     return CellStory(row, col, votes, story)
+
+
+def _silenced(store: Store, index: TileIndex, drives: list[TileVote], settings: FuseSettings) -> set[str]:
+    """Vehicles that are not heard on a tile, of the votes that count there."""
+    by_vehicle: dict[str, list[TileVote]] = {}
+    for drive in drives:
+        by_vehicle.setdefault(drive.vehicle, []).append(drive)
+    votes = [fold(mine, tile_grid(store.lattice, index)) for mine in by_vehicle.values()]
+    return unheard(votes, count(votes, "columns", settings.min_votes)[1], settings)
 
 
 def changes_between(store: Store, old: int, new: int, min_cells: int = 1) -> dict[str, Any]:

@@ -18,6 +18,7 @@ from mapvote.core.grid import TILE_CELLS, Grid, Lattice, TileIndex, tile_grid
 from mapvote.core.types import F32, I32, I64, N_STATES, NO_VOTE, U8, U16, U64, Bool, CellState, MapTile
 from mapvote.core.voting import VOTE_UNIT, add_states, add_tally, decide_cells
 from mapvote.fleet.edit import add_points, cells_of, delete_points, empty_tile, obstacle_bits
+from mapvote.fleet.hearing import contradicts
 from mapvote.fleet.words import CELLS, Words, at_least, union
 
 Rule = Literal["paper", "columns"]
@@ -205,6 +206,10 @@ def fuse_tile(
         by_vehicle.setdefault(drive.vehicle, []).append(drive)
     votes = [fold(by_vehicle[vehicle], grid) for vehicle in sorted(by_vehicle)]
     states, tally = count(votes, rule, settings.min_votes)
+    silenced = unheard(votes, tally, settings)
+    if silenced:
+        votes = [vote for vote in votes if vote.vehicle not in silenced]
+        states, tally = count(votes, rule, settings.min_votes)
     before = tile if tile is not None else empty_tile()
     edited, deleted = before, 0
     if (states == CellState.CHANGED_EMPTY).any():
@@ -216,6 +221,20 @@ def fuse_tile(
     edited = _learn_free(edited, grid, votes, settings.min_votes, points_added=added > 0)
     unchanged = edited is before
     return Decision(states, tally, len(votes), added, deleted), tile if unchanged else edited
+
+
+def unheard(votes: Sequence[TileVote], tally: NDArray[Any], settings: FuseSettings) -> set[str]:
+    """Vehicles that contradict the others on this tile (:mod:`mapvote.fleet.hearing`). ``votes`` one a vehicle, and
+    ``tally`` (256, 256, 5) their sum. Of those that send tallies nobody is judged: theirs do not weigh alike."""
+    if settings.min_votes < 2 or settings.max_contradiction >= 1.0:
+        return set()
+    planes = np.moveaxis(tally, -1, 0).reshape(N_STATES, -1)
+    return {
+        vote.vehicle
+        for vote in votes
+        if vote.states is not None
+        and contradicts(np.ascontiguousarray(vote.states).reshape(-1), planes, settings.max_contradiction)
+    }
 
 
 def supported_words(votes: Sequence[TileVote], states: U8, min_votes: int) -> U64:
@@ -243,10 +262,13 @@ def _offered(votes: Sequence[TileVote], states: U8, grid: Grid) -> tuple[F32, I6
 def _learn_free(tile: MapTile, grid: Grid, votes: Sequence[TileVote], min_votes: int, points_added: bool) -> MapTile:
     """Known-free columns with the voxels that at least ``min_votes`` vehicles passed through, minus the occupied ones.
 
-    Free space is remembered once learned; a voxel that holds a point of the map is never free.
+    Free space is remembered once learned; a voxel that holds a point of the map is never free. Until enough vehicles
+    have passed, a tile that never learned stays so: no free voxel at all would say that nothing new can be known there.
     """
     passed = [v.free for v in votes if v.free is not None]
-    if not passed and (tile.free is None or not points_added):
+    if tile.free is None and len(passed) < max(min_votes, 1):
+        return tile
+    if not passed and not points_added:
         return tile
     free = tile.free if tile.free is not None else np.zeros((TILE_CELLS, TILE_CELLS), dtype=np.uint64)
     if len(passed) >= min_votes:

@@ -1,0 +1,83 @@
+"""Who is not heard: a vehicle that says the opposite of the others nearly everywhere."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from hand_made import SHAPE
+from mapvote.config import FuseSettings
+from mapvote.core.grid import Lattice
+from mapvote.core.types import NO_VOTE, U8, CellState
+from mapvote.fleet.fuse import TileVote, count, fuse_tile, unheard
+
+UO, UE, CO, CE, UN = CellState
+OPPOSITE = np.array([CE, CO, UE, UO, UN], dtype=np.uint8)
+
+
+def honest(seed: int, errors: float = 0.03) -> U8:
+    """A street of walls and road as one vehicle sees it: a tenth not determined, some per cent wrong."""
+    street = np.where(np.arange(SHAPE[1]) % 16 == 0, UO, UE).astype(np.uint8)
+    states = np.broadcast_to(street, SHAPE).copy()
+    chance = np.random.default_rng(seed).uniform(size=SHAPE)
+    states[chance < 0.1] = UN
+    wrong = chance > 1.0 - errors
+    states[wrong] = OPPOSITE[states[wrong]]
+    return states
+
+
+def named(planes: list[U8]) -> list[TileVote]:
+    return [TileVote(f"v{i}", 0, f"v{i}", states=states) for i, states in enumerate(planes)]
+
+
+def silenced(votes: list[TileVote], **policy: float) -> set[str]:
+    return unheard(votes, count(votes, "columns", 2)[1], FuseSettings(**policy))  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("k", [1, 2, 3])
+def test_k_that_invert_everything_are_not_heard_among_k_plus_1_that_do_not(k: int) -> None:
+    planes = [honest(i) for i in range(k + 1)] + [OPPOSITE[honest(99)]] * k
+    assert silenced(named(planes)) == {f"v{i}" for i in range(k + 1, 2 * k + 1)}
+    assert silenced(named(planes), max_contradiction=1.0) == set()
+
+
+def test_a_liar_cannot_second_the_error_of_one_honest_vehicle() -> None:
+    planes = [honest(i) for i in range(2)] + [OPPOSITE[honest(2)]]
+    lattice, policy = Lattice(), FuseSettings(min_votes=2)
+    decided = fuse_tile(lattice, (0, 0), None, named(planes), "columns", policy)[0].states
+    without = fuse_tile(lattice, (0, 0), None, named(planes[:2]), "columns", policy)[0].states
+    assert np.array_equal(decided, without)
+
+
+def test_a_vehicle_that_saw_a_block_come_down_is_heard() -> None:
+    news = honest(3)
+    news[:80, ::16] = CE  # a third of all walls are gone
+    assert silenced(named([honest(1), honest(2), news])) == set()
+
+
+def test_vehicles_that_disagree_with_each_other_silence_nobody() -> None:
+    rng = np.random.default_rng(5)
+    assert silenced(named([rng.integers(0, 5, SHAPE, dtype=np.uint8) for _ in range(5)])) == set()
+
+
+def test_two_vehicles_alone_are_both_heard() -> None:
+    assert silenced(named([honest(1), OPPOSITE[honest(2)]])) == set()
+
+
+def test_a_few_cells_say_nothing_about_a_vehicle() -> None:
+    def only(states: U8) -> U8:
+        few = np.full(SHAPE, NO_VOTE, dtype=np.uint8)
+        few[:20, :20] = states[:20, :20]
+        return few
+
+    planes = [honest(1), honest(2), only(OPPOSITE[honest(3)])]
+    assert silenced(named(planes)) == set()
+
+
+@settings(max_examples=10, deadline=None)
+@given(st.permutations(range(5)))
+def test_the_order_of_ballots_does_not_decide_who_is_heard(order: list[int]) -> None:
+    votes = named([honest(1), honest(2), OPPOSITE[honest(3)], honest(4, errors=0.3), OPPOSITE[honest(5)]])
+    assert silenced([votes[i] for i in order]) == silenced(votes)
