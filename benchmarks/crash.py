@@ -172,6 +172,8 @@ def run(url: str, kills: int, seed: int, cluster: PostgresCluster | None, kill: 
         power_cut = cluster if cluster is not None and i % 4 == 3 else None
         acknowledged |= set(kill(url, seed * 1000 + i, rng.uniform(0.0, 0.5), power_cut))
         newest = check(url, acknowledged, whole)
+        if i % 10 == 9:
+            print(f"{i + 1} kills, {len(acknowledged)} acknowledged ballots", file=sys.stderr)
     print(f"{kills} kills: {len(acknowledged)} acknowledged ballots, all there; {newest} versions, all whole")
 
 

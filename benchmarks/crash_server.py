@@ -71,16 +71,18 @@ def killed_server(url: str, seed: int, moment_s: float, cluster: PostgresCluster
         folder = Path(name)
         with serving(store, log=folder / "log") as (address, process):
             traffic = Traffic(address, seed, folder)
-            if not traffic.begun.wait(60.0):
-                raise SystemExit(f"kill {seed}: nothing was acknowledged: {(folder / 'log').read_text()[-2000:]}")
-            time.sleep(moment_s)
-            if cluster is not None:
-                cluster.stop(crash=True)
-            if process.poll() is not None:
-                raise SystemExit(f"kill {seed}: the server ended by itself: {(folder / 'log').read_text()[-2000:]}")
-            process.kill()
-            process.wait()
-            traffic.end()
+            try:
+                if not traffic.begun.wait(60.0):
+                    raise SystemExit(f"kill {seed}: nothing was acknowledged: {(folder / 'log').read_text()[-2000:]}")
+                time.sleep(moment_s)
+                if cluster is not None:
+                    cluster.stop(crash=True)
+                if process.poll() is not None:
+                    raise SystemExit(f"kill {seed}: the server ended by itself: {(folder / 'log').read_text()[-2000:]}")
+            finally:
+                process.kill()
+                process.wait()
+                traffic.end()
         if "Traceback" in (folder / "log").read_text():
             raise SystemExit(f"kill {seed}: the server stumbled: {(folder / 'log').read_text()[-4000:]}")
     if cluster is not None:
