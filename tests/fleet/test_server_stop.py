@@ -55,13 +55,13 @@ def test_a_stop_under_load_is_soon_and_loses_nothing(tmp_path: Path, after_s: fl
     accept(store, [examine(encode(gone_everywhere(point_map, vehicle))) for vehicle in ("a", "b")])
     acknowledged: set[tuple[str, str]] = set()
     published: list[int] = []
+    connected = threading.Event()
 
     def publish(url: str) -> None:
-        try:
-            answer = httpx2.post(f"{url}/v1/publish", json={"override": True}, timeout=60.0)
-            published.append(answer.status_code)
-        except httpx2.TransportError:
-            published.append(0)
+        with httpx2.Client(base_url=url, timeout=60.0) as http:
+            assert http.get("/healthz").status_code == 200
+            connected.set()
+            published.append(http.request("POST", "/v1/publish", json={"override": True}).status_code)
 
     with serving(tmp_path / "s.db", log=tmp_path / "log") as (url, process):
         senders = [
@@ -73,6 +73,7 @@ def test_a_stop_under_load_is_soon_and_loses_nothing(tmp_path: Path, after_s: fl
             time.sleep(0.01)
         publisher = threading.Thread(target=publish, args=(url,))
         publisher.start()
+        assert connected.wait(30.0)
         time.sleep(after_s)
         process.terminate()
         start = time.monotonic()
