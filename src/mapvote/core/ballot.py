@@ -7,6 +7,7 @@ a newer format adds are ignored, required fields that are missing are refused.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Annotated
 
 import msgspec
@@ -15,7 +16,7 @@ import numpy as np
 
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, TileIndex
 from mapvote.core.planes import pack_plane as pack_plane
-from mapvote.core.planes import unpack_bytes, unpack_plane
+from mapvote.core.planes import unpack_bytes, unpack_frames, unpack_plane
 from mapvote.core.tilecode import content_hash as content_hash
 from mapvote.core.types import F32, N_STATES, NO_VOTE, U8, U16, U64, MapvoteError
 
@@ -79,7 +80,15 @@ def tile_key(tile: TileIndex) -> str:
 
 def unpack_states(data: bytes) -> U8:
     """(256, 256) uint8; MapvoteError if damaged or not a CellState."""
-    states = unpack_plane(data, "<u1", (TILE_CELLS, TILE_CELLS), "ballot: states")
+    return _checked(unpack_plane(data, "<u1", (TILE_CELLS, TILE_CELLS), "ballot: states"))
+
+
+def unpack_many_states(planes: Sequence[bytes]) -> U8:
+    """(n, 256, 256) uint8: the states of n ballots that the server took in; MapvoteError as :func:`unpack_states`."""
+    return _checked(unpack_frames(planes, _CELLS, "ballot: states").reshape(-1, TILE_CELLS, TILE_CELLS))
+
+
+def _checked(states: U8) -> U8:
     if not _all_states(states.reshape(-1)):
         raise MapvoteError("ballot: states holds a value that is no cell state")
     return states

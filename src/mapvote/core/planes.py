@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import threading
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -11,9 +12,11 @@ import zstandard
 from backports import zstd
 from numpy.typing import NDArray
 
-from mapvote.core.types import MapvoteError
+from mapvote.core.types import U8, MapvoteError
 
 _own = threading.local()
+_BATCH = 32
+"""Frames unpacked in one call: a larger buffer goes back to the system each time and costs page faults."""
 ZSTD_LEVEL = 19
 """For ballots, which travel by radio. Tiles of noisy float32 gain nothing above level 3."""
 
@@ -59,6 +62,25 @@ def _decompressor() -> zstandard.ZstdDecompressor:
         _own.decompressor = zstandard.ZstdDecompressor()
     decompressor: zstandard.ZstdDecompressor = _own.decompressor
     return decompressor
+
+
+def unpack_frames(frames: Sequence[bytes], size: int, what: str) -> U8:
+    """(n, size) uint8: n frames of ``size`` bytes each, in few calls, during which other threads run.
+
+    MapvoteError if one is damaged, or smaller or larger than that; nothing beyond ``size`` is ever written. What
+    follows a frame is ignored: :func:`unpack_bytes` looks at that when a ballot comes in.
+    """
+    out = np.empty((len(frames), size), dtype=np.uint8)
+    for start in range(0, len(frames), _BATCH):
+        some: list[bytes | bytearray | memoryview] = list(frames[start : start + _BATCH])
+        sizes = np.full(len(some), size, dtype="<u8").tobytes()
+        try:
+            found = _decompressor().multi_decompress_to_buffer(some, decompressed_sizes=sizes, threads=1)
+        except zstandard.ZstdError as error:
+            raise MapvoteError(f"{what} is damaged ({error}); fetch or send it again") from error
+        for i in range(len(some)):
+            out[start + i] = np.frombuffer(found[i], dtype=np.uint8)  # type: ignore[call-overload]
+    return out
 
 
 def unpack_plane(data: bytes, dtype: str, shape: tuple[int, ...], what: str) -> NDArray[Any]:

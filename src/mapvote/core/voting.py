@@ -16,6 +16,8 @@ from mapvote.core.types import I32, N_STATES, NO_VOTE, U8, U16, CellState
 
 VOTE_UNIT = 16
 """One vote in the units of a tally: Eq. (1) is rounded to sixteenths."""
+_CACHED_CELLS = 4096
+_BYTE_MAX = 255
 _UO, _UE, _CO, _CE, _UN = (int(state) for state in CellState)
 
 
@@ -110,14 +112,25 @@ def one_hot(states: U8) -> I32:
 
 @numba.njit(cache=True, nogil=True)
 def add_states(states: U8, tally: NDArray[Any]) -> None:
-    """Add one voter's decided ``states`` (cells,) to ``tally`` (5, cells), a vote each: the server's hot loop.
+    """Add the decided ``states`` (n, cells) of n voters to ``tally`` (5, cells), a vote each: the server's hot loop.
 
-    The same as adding ``one_hot(states)``, plane by plane, which the compiler turns into vector instructions.
+    The same as adding ``one_hot`` of each. Votes are counted in bytes first, as many voters as a byte can count and as
+    many cells as stay in the cache: the compiler turns that into vector instructions.
     """
-    for state in range(N_STATES):
-        plane = tally[state]
-        for c in range(len(states)):
-            plane[c] += VOTE_UNIT * (states[c] == state)
+    voters, cells = states.shape
+    counts = np.empty((N_STATES, _CACHED_CELLS), dtype=np.uint8)
+    for start in range(0, cells, _CACHED_CELLS):
+        for first in range(0, voters, _BYTE_MAX):
+            counts[:] = 0
+            for own in states[first : first + _BYTE_MAX, start : start + _CACHED_CELLS]:
+                for state in range(N_STATES):
+                    count = counts[state, : len(own)]
+                    for c in range(len(own)):
+                        count[c] += own[c] == state
+            for state in range(N_STATES):
+                plane = tally[state, start : start + _CACHED_CELLS]
+                for c in range(len(plane)):
+                    plane[c] += VOTE_UNIT * counts[state, c]
 
 
 @numba.njit(cache=True, nogil=True)

@@ -18,10 +18,12 @@ from mapvote.core.grid import TILE_CELLS, Grid, Lattice, TileIndex, tile_grid
 from mapvote.core.types import F32, I32, I64, N_STATES, NO_VOTE, U8, U16, U64, Bool, CellState, MapTile
 from mapvote.core.voting import VOTE_UNIT, add_states, add_tally, decide_cells
 from mapvote.fleet.edit import add_points, cells_of, delete_points, empty_tile, obstacle_bits
-from mapvote.fleet.hearing import contradicts
+from mapvote.fleet.hearing import ASKED, contradicting
 from mapvote.fleet.words import CELLS, Words, at_least, union
 
 Rule = Literal["paper", "columns"]
+_BATCH = 32
+"""Votes counted in one call: their states are copied side by side, into no more than stays in the cache."""
 DAY_NS = 86_400_000_000_000
 CHANGES = (CellState.CHANGED_OCCUPIED, CellState.CHANGED_EMPTY)
 
@@ -104,6 +106,8 @@ def select(votes: Iterable[D], settings: FuseSettings) -> list[D]:
     for vote in recent:
         last[vote.vehicle] = max(last.get(vote.vehicle, vote.end_ns), vote.end_ns)
     ranked = sorted(last, key=lambda vehicle: (last[vehicle], vehicle), reverse=True)
+    if len(ranked) <= settings.latest_vehicles:
+        return recent
     chosen = set(ranked[: settings.latest_vehicles])
     return [v for v in recent if v.vehicle in chosen]
 
@@ -180,12 +184,17 @@ def count(votes: Sequence[TileVote], rule: Rule, min_votes: int) -> tuple[U8, ND
             )
         states = decide_cells(tally, backers, abstain, quorum)
     else:
-        for vote in votes:
-            assert vote.states is not None
-            add_states(np.ascontiguousarray(vote.states).reshape(-1), tally)
+        for start in range(0, len(votes), _BATCH):
+            add_states(_states_of(votes[start : start + _BATCH]), tally)
         states = decide_cells(tally, tally, abstain, quorum * VOTE_UNIT)
     shape = (TILE_CELLS, TILE_CELLS)
     return states.reshape(shape), np.moveaxis(tally.reshape(N_STATES, *shape), 0, -1)
+
+
+def _states_of(votes: Sequence[TileVote], cells: slice = slice(None)) -> U8:
+    """(votes, cells) what each vehicle decided, in some or all of the flat cells; nothing in one stage."""
+    planes = [vote.states.reshape(-1)[cells] for vote in votes if vote.states is not None]
+    return np.stack(planes) if planes else np.empty((0, CELLS), dtype=np.uint8)[:, cells]
 
 
 def fuse_tile(
@@ -229,12 +238,8 @@ def unheard(votes: Sequence[TileVote], tally: NDArray[Any], settings: FuseSettin
     if settings.min_votes < 2 or settings.max_contradiction >= 1.0:
         return set()
     planes = np.moveaxis(tally, -1, 0).reshape(N_STATES, -1)
-    return {
-        vote.vehicle
-        for vote in votes
-        if vote.states is not None
-        and contradicts(np.ascontiguousarray(vote.states).reshape(-1), planes, settings.max_contradiction)
-    }
+    found = contradicting(_states_of(votes, ASKED), planes[:, ASKED], settings.max_contradiction)
+    return {votes[int(i)].vehicle for i in np.flatnonzero(found)}
 
 
 def supported_words(votes: Sequence[TileVote], states: U8, min_votes: int) -> U64:
@@ -246,6 +251,8 @@ def supported_words(votes: Sequence[TileVote], states: U8, min_votes: int) -> U6
 def _offered(votes: Sequence[TileVote], states: U8, grid: Grid) -> tuple[F32, I64, I32]:
     """(points, cells, voters) offered for cells decided changed-occupied, by vehicles that voted so there."""
     offers = [np.empty((0, 3), np.float32) if vote.new_points is None else vote.new_points for vote in votes]
+    if not any(map(len, offers)):
+        return np.empty((0, 3), np.float32), np.empty(0, np.int64), np.empty(0, np.int32)
     points = np.concatenate(offers)
     cells = cells_of(grid, points)
     voters = np.repeat(np.arange(len(votes), dtype=np.int32), [len(offer) for offer in offers])

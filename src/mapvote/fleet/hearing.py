@@ -11,41 +11,59 @@ from __future__ import annotations
 from typing import Any
 
 import numba
+import numpy as np
 from numpy.typing import NDArray
 
-from mapvote.core.types import U8, CellState
+from mapvote.core.types import U8, Bool, CellState
 from mapvote.core.voting import VOTE_UNIT
 
-_STRIDE = 13
-"""Every so many cells are asked, enough for a share; it divides no tile's side, so that no column is left out."""
+ASKED = slice(None, None, 13)
+"""The flat cells asked, enough for a share; the stride divides no tile's side, so that no column is left out."""
 _MIN_ASKED = 64
 """With fewer cells that the others agree on, nobody is judged: 75 m2."""
 _UN = int(CellState.UNDETERMINED)
+_ASKED, _AGREED, _OPPOSED = 0b1, 0b10, 0b100
 
 
 @numba.njit(cache=True, nogil=True)
-def contradicts(states: U8, tally: NDArray[Any], most: float) -> bool:
-    """Whether one vehicle's ``states`` (cells,) oppose the others in more than ``most`` of the cells they agree on.
+def contradicting(states: U8, tally: NDArray[Any], most: float) -> Bool:
+    """(n,) which vehicles' ``states`` (n, asked) oppose the others in more than ``most`` of the cells they agree on.
 
-    ``tally`` (5, cells) in VOTE_UNITs of all vehicles, this one included, a vote each. The others agree on a cell if at
-    least two of them determined it, more than half of those alike; nothing is said of a vehicle unless they agree on
-    most cells that two of them determined, so that k liars cannot make an honest vehicle look like one.
+    ``tally`` (5, asked) in VOTE_UNITs of all these vehicles, a vote each. Nothing is said of a vehicle unless the
+    others agree on most cells that two of them determined, so that k liars cannot make an honest vehicle look like one.
     """
-    asked, agreed, opposed = 0, 0, 0
-    for c in range(0, len(states), _STRIDE):
-        own = states[c]
-        if own >= _UN:  # undetermined, or no vote
-            continue
-        total, best, best_state = 0, 0, 0
-        for state in range(_UN):
-            votes = int(tally[state, c]) - (VOTE_UNIT if state == own else 0)
-            total += votes
-            if votes > best:
-                best, best_state = votes, state
-        if total < 2 * VOTE_UNIT:
-            continue
-        asked += 1
-        if 2 * best > total:
-            agreed += 1
-            opposed += int(best_state != own)
-    return agreed >= _MIN_ASKED and 2 * agreed > asked and opposed > most * agreed
+    found = np.zeros(len(states), dtype=np.bool_)
+    others = _others(tally)
+    for vehicle in range(len(states)):
+        own = states[vehicle]
+        asked, agreed, opposed = 0, 0, 0
+        for i in range(len(others)):
+            said = others[i, own[i] & 7]
+            asked += said & 1
+            agreed += (said >> 1) & 1
+            opposed += said >> 2
+        found[vehicle] = agreed >= _MIN_ASKED and 2 * agreed > asked and opposed > most * agreed
+    return found
+
+
+@numba.njit(cache=True, nogil=True)
+def _others(tally: NDArray[Any]) -> U8:
+    """(asked, 8) what the others say of a cell, by the last three bits of what a vehicle says there itself.
+
+    _ASKED if at least two of them determined it, _AGREED if more than half of those alike, _OPPOSED if not as it says.
+    Nothing to a vehicle that left the cell undetermined (4) or has no vote there (7).
+    """
+    said = np.zeros((tally.shape[1], 8), dtype=np.uint8)
+    for i in range(len(said)):
+        for own in range(_UN):
+            total, best, best_state = 0, 0, 0
+            for state in range(_UN):
+                votes = int(tally[state, i]) - (VOTE_UNIT if state == own else 0)
+                total += votes
+                if votes > best:
+                    best, best_state = votes, state
+            if total >= 2 * VOTE_UNIT:
+                said[i, own] = _ASKED
+                if 2 * best > total:
+                    said[i, own] |= _AGREED if best_state == own else _AGREED | _OPPOSED
+    return said

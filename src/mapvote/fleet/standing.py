@@ -8,14 +8,14 @@ from __future__ import annotations
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from functools import cache
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 import sqlalchemy as sa
 
 from mapvote.config import FuseSettings
-from mapvote.core.ballot import unpack_points, unpack_states, unpack_tally
-from mapvote.core.grid import TILE_CELLS, Lattice, TileIndex, tile_grid
+from mapvote.core.ballot import unpack_many_states, unpack_points, unpack_tally
+from mapvote.core.grid import Lattice, TileIndex, tile_grid
 from mapvote.core.types import F32, U8, Bool, CellState
 from mapvote.fleet import schema
 from mapvote.fleet.content import same_cells, unpack_cells, unpack_points_plane
@@ -56,6 +56,37 @@ class StoredVote:
     base: str
 
 
+class _Planes(NamedTuple):
+    """What a ballot holds of a tile, compressed."""
+
+    states: bytes | None
+    tally: bytes | None
+    gone: bytes | None
+    new_points: bytes | None
+    free: bytes | None
+
+
+def _stands_at(mark: int | sa.BindParameter[int]) -> sa.ColumnElement[bool]:
+    b = schema.ballots
+    return (b.c.seq <= mark) & (b.c.gone_seq.is_(None) | (b.c.gone_seq > mark))
+
+
+# Asked for every tile of a round: building such a statement takes SQLAlchemy as long as the database takes to answer.
+_B, _T, _R = schema.ballots, schema.ballot_tiles, schema.bars
+_ROW, _COL, _MARK = (sa.bindparam(name, type_=sa.BigInteger) for name in ("row", "col", "mark"))
+_VOTES_ON = (
+    sa.select(_B.c.seq, _B.c.first_seq, _B.c.vehicle, _B.c.drive, _B.c.end_ns, _B.c.received_ns, _B.c.digest, _T.c.base)
+    .join(_T, _T.c.ballot == _B.c.seq)
+    .where(_T.c.row == _ROW, _T.c.col == _COL, _stands_at(_MARK))
+    .where(_B.c.received_ns <= sa.bindparam("received_by", type_=sa.BigInteger))
+    .order_by(_B.c.seq)
+)
+_BARS_ON = sa.select(_R.c.seq, _R.c.cells).where(_R.c.row == _ROW, _R.c.col == _COL, _R.c.seq <= _MARK)
+_PLANES_OF = sa.select(_T.c.ballot, _T.c.states, _T.c.tally, _T.c.gone, _T.c.new_points, _T.c.free).where(
+    _T.c.row == _ROW, _T.c.col == _COL, _T.c.ballot.in_(sa.bindparam("ballots", expanding=True))
+)
+
+
 def standing_tiles(connection: sa.Connection, mark: int, since: int | None = None) -> list[TileIndex]:
     """Tiles that standing ballots vote on, ascending; with ``since``, those where a ballot came or went after it."""
     b, t = schema.ballots, schema.ballot_tiles
@@ -66,18 +97,15 @@ def standing_tiles(connection: sa.Connection, mark: int, since: int | None = Non
 
 def stored_votes(connection: sa.Connection, index: TileIndex, asked: Round) -> list[StoredVote]:
     """Every standing vote on a tile, in no order that matters."""
-    b, t = schema.ballots, schema.ballot_tiles
-    columns = [b.c.seq, b.c.first_seq, b.c.vehicle, b.c.drive, b.c.end_ns, b.c.received_ns, b.c.digest, t.c.base]
-    query = sa.select(*columns).join(t, t.c.ballot == b.c.seq).where(t.c.row == index[0], t.c.col == index[1])
-    query = query.where(_stands_at(asked.mark), b.c.received_ns <= asked.received_by_ns).order_by(b.c.seq)
-    return [StoredVote(*row) for row in connection.execute(query) if row.vehicle not in asked.without]
+    asked_of = {"row": index[0], "col": index[1], "mark": asked.mark, "received_by": asked.received_by_ns}
+    found = [StoredVote(*row) for row in connection.execute(_VOTES_ON, asked_of).all()]
+    return [vote for vote in found if vote.vehicle not in asked.without]
 
 
 def bars_on(connection: sa.Connection, index: TileIndex, mark: int) -> list[Bar]:
     """What rollbacks up to ``mark`` silenced on a tile."""
-    r = schema.bars
-    query = sa.select(r.c.seq, r.c.cells).where(r.c.row == index[0], r.c.col == index[1], r.c.seq <= mark)
-    return [Bar(row.seq, unpack_cells(row.cells)) for row in connection.execute(query)]
+    found = connection.execute(_BARS_ON, {"row": index[0], "col": index[1], "mark": mark})
+    return [Bar(seq, unpack_cells(cells)) for seq, cells in found]
 
 
 def counting_votes(
@@ -123,37 +151,31 @@ def silence(vote: TileVote, first_seq: int, bars: Sequence[Bar]) -> TileVote:
     return vote
 
 
-def _stands_at(mark: int) -> sa.ColumnElement[bool]:
-    b = schema.ballots
-    return (b.c.seq <= mark) & (b.c.gone_seq.is_(None) | (b.c.gone_seq > mark))
-
-
 def read_votes(connection: sa.Connection, index: TileIndex, stored: Sequence[StoredVote]) -> list[TileVote]:
     """The planes of stored votes, in their order, nothing silenced."""
-    planes = _planes(connection, index, [vote.seq for vote in stored])
-    # One block for all states: thousands of small planes, freed at once, go back to the system and cost page faults.
-    block = np.empty((len(stored), TILE_CELLS, TILE_CELLS), dtype=np.uint8)
-    return [_vote(vote, planes[vote.seq], room) for vote, room in zip(stored, block, strict=True)]
+    found = _planes(connection, index, [vote.seq for vote in stored])
+    planes = [found[vote.seq] for vote in stored]
+    decided = iter(unpack_many_states([mine.states for mine in planes if mine.states is not None]))
+    return [
+        _vote(vote, mine, None if mine.states is None else next(decided))
+        for vote, mine in zip(stored, planes, strict=True)
+    ]
 
 
-def _planes(connection: sa.Connection, index: TileIndex, ballots: Sequence[int]) -> dict[int, Any]:
-    t = schema.ballot_tiles
-    out: dict[int, Any] = {}
+def _planes(connection: sa.Connection, index: TileIndex, ballots: Sequence[int]) -> dict[int, _Planes]:
+    out: dict[int, _Planes] = {}
     for start in range(0, len(ballots), 500):  # SQLite's limit on variables in one statement
-        some = ballots[start : start + 500]
-        query = sa.select(t).where(t.c.row == index[0], t.c.col == index[1], t.c.ballot.in_(some))
-        out |= {row.ballot: row for row in connection.execute(query)}
+        asked_of = {"row": index[0], "col": index[1], "ballots": ballots[start : start + 500]}
+        out |= {ballot: _Planes(*planes) for ballot, *planes in connection.execute(_PLANES_OF, asked_of).all()}
     return out
 
 
-def _vote(stored: StoredVote, planes: Any, room: U8) -> TileVote:
-    if planes.states is not None:
-        room[:] = unpack_states(planes.states)
+def _vote(stored: StoredVote, planes: _Planes, states: U8 | None) -> TileVote:
     return TileVote(
         vehicle=stored.vehicle,
         end_ns=stored.end_ns,
         digest=stored.digest,
-        states=None if planes.states is None else room,
+        states=states,
         tally=None if planes.tally is None else unpack_tally(planes.tally),
         gone=None if planes.gone is None else Words.unpack(planes.gone, "gone"),
         new_points=None if planes.new_points is None else unpack_points(planes.new_points),

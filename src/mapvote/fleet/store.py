@@ -58,6 +58,9 @@ class Manifest:
     """With ``since``: tiles that the older version had and this one has not."""
 
 
+_BLOB = sa.select(schema.blobs.c.data).where(schema.blobs.c.hash == sa.bindparam("digest"))
+
+
 def url_of(store: str) -> str:
     """The database URL of what the command line calls STORE: a URL, or the path of an SQLite file.
 
@@ -224,7 +227,7 @@ def load_tile(connection: sa.Connection, hashes: TileHashes) -> MapTile:
 
 def load_blob(connection: sa.Connection, digest: str) -> bytes:
     """One plane, still compressed; NotFound if no version ever held it."""
-    data = connection.execute(sa.select(schema.blobs.c.data).where(schema.blobs.c.hash == digest)).scalar_one_or_none()
+    data = connection.execute(_BLOB, {"digest": digest}).scalar_one_or_none()
     if data is None:
         raise NotFound(f"no tile plane has the hash {digest[:64]!r}; take the hashes from a manifest")
     return bytes(data)
