@@ -25,6 +25,7 @@ from mapvote.core.types import (
     F64,
     I32,
     I64,
+    U64,
     Bool,
     CellState,
     Drive,
@@ -112,6 +113,8 @@ class _Waiting:
     sigma_m: float
     reference: Reference
     outer: Reference
+    unmapped: U64
+    """Over ``outer``: voxels that the map does not hold."""
     obstacle: Bool
     cell: I32
 
@@ -154,6 +157,8 @@ class Vehicle:
         self._new_points = NewPoints(point_map.lattice)
         self._waiting: deque[_Waiting] = deque()
         self._surroundings = Surroundings(point_map, self.settings.voting.window_m)
+        self._outer: Reference | None = None
+        self._unmapped: U64 = np.zeros((0, 0), dtype=np.uint64)
         self._stamps_ns: list[int] = []
 
     def observe(self, scan: Scan, T_map_lidar_prior: F64 | None = None) -> None:
@@ -174,8 +179,12 @@ class Vehicle:
         with report.timed("ground"):
             points_map, origin_map = transform(T_map_lidar, fix.points), T_map_lidar[:3, 3].copy()
             reference, outer = self._surroundings.at(origin_map)
+            if self._outer is not outer:
+                self._outer, self._unmapped = outer, ~outer.occupied
             obstacle, cell = find_obstacles(points_map, reference)
-        self._waiting.append(_Waiting(points_map, origin_map, sigma_m, reference, outer, obstacle, cell))
+        self._waiting.append(
+            _Waiting(points_map, origin_map, sigma_m, reference, outer, self._unmapped, obstacle, cell)
+        )
         with report.timed("moving"):
             decided = self.movers.push(points_map, origin_map, obstacle, scan.stamp_ns)
         for _, moving in decided:
@@ -258,11 +267,12 @@ def _strange_beyond(scan: _Waiting) -> F64:
 
     They cast no vote. But the upper storeys of what is new can be seen only from afar, below the sensor's top beam.
     """
-    off = scan.points_map[:, :2] - scan.origin_map[:2]
-    far = scan.points_map[(scan.cell < 0) & (np.hypot(off[:, 0], off[:, 1]) < POINTS_REACH_M)]
+    outside = scan.points_map[scan.cell < 0]
+    off = outside[:, :2] - scan.origin_map[:2]
+    far = outside[np.einsum("ij,ij->i", off, off) < POINTS_REACH_M**2]
     obstacle, cell = find_obstacles(far, scan.outer)
     base = np.ascontiguousarray(scan.outer.base).ravel()
-    return far[select(far, cell, obstacle, (~scan.outer.occupied).ravel(), base)]
+    return far[select(far, cell, obstacle, scan.unmapped.ravel(), base)]
 
 
 def _counts_as(voting: VotingSettings) -> VotingSettings:
