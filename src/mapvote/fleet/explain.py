@@ -18,7 +18,7 @@ from mapvote.fleet import schema
 from mapvote.fleet.changes import Decided, change_objects, changed_cells, to_geojson
 from mapvote.fleet.consensus import Compared, Spoken, Standing, compare, judge
 from mapvote.fleet.content import unpack_points_plane
-from mapvote.fleet.fuse import TileVote, count, fold, select, unheard
+from mapvote.fleet.fuse import TileVote, count, one_each, select, unheard
 from mapvote.fleet.rounds import unpack_tally_plane
 from mapvote.fleet.standing import Round, counting_votes, read_votes, standing_tiles, stored_votes
 from mapvote.fleet.store import Store, current_version, load_blob, load_tile, tiles_of, version_of
@@ -99,10 +99,7 @@ def explain_cell(store: Store, x: float, y: float, settings: FuseSettings) -> Ce
 
 def _silenced(store: Store, index: TileIndex, drives: list[TileVote], settings: FuseSettings) -> set[str]:
     """Vehicles that are not heard on a tile, of the votes that count there."""
-    by_vehicle: dict[str, list[TileVote]] = {}
-    for drive in drives:
-        by_vehicle.setdefault(drive.vehicle, []).append(drive)
-    votes = [fold(mine, tile_grid(store.lattice, index)) for mine in by_vehicle.values()]
+    votes = one_each(drives, tile_grid(store.lattice, index))
     return unheard(votes, count(votes, "columns", settings.min_votes)[1], settings)
 
 
@@ -171,11 +168,7 @@ def vehicle_standings(store: Store, settings: FuseSettings) -> list[Standing]:
         compared: list[Compared] = []
         for index in standing_tiles(connection, _FOREVER):
             chosen = select(stored_votes(connection, index, asked), settings)
-            drives: dict[str, list[TileVote]] = {}
-            for vote in read_votes(connection, index, chosen):
-                drives.setdefault(vote.vehicle, []).append(vote)
-            grid = tile_grid(store.lattice, index)
-            folded = [fold(mine, grid) for mine in drives.values()]
+            folded = one_each(read_votes(connection, index, chosen), tile_grid(store.lattice, index))
             compared += compare(index, [Spoken(vote.vehicle, vote.end_ns, _decided_states(vote)) for vote in folded])
     return judge(compared, store.lattice)
 

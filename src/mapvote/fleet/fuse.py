@@ -162,6 +162,14 @@ def fold(drives: Sequence[TileVote], grid: Grid) -> TileVote:
     )
 
 
+def one_each(drives: Iterable[TileVote], grid: Grid) -> list[TileVote]:
+    """One vote a vehicle, by name: :func:`fold` of all its drives on the tile whose window is ``grid``."""
+    by_vehicle: dict[str, list[TileVote]] = {}
+    for drive in drives:
+        by_vehicle.setdefault(drive.vehicle, []).append(drive)
+    return [fold(by_vehicle[vehicle], grid) for vehicle in sorted(by_vehicle)]
+
+
 def count(votes: Sequence[TileVote], rule: Rule, min_votes: int) -> tuple[U8, NDArray[Any]]:
     """(states, tally) of one vote per vehicle: the rule of core.voting, then the quorum (DESIGN 4, "enough votes").
 
@@ -210,10 +218,7 @@ def fuse_tile(
     ``drives`` are the votes that count on this tile (see :func:`select`, :func:`restrict`), any order.
     """
     grid = tile_grid(lattice, index)
-    by_vehicle: dict[str, list[TileVote]] = {}
-    for drive in drives:
-        by_vehicle.setdefault(drive.vehicle, []).append(drive)
-    votes = [fold(by_vehicle[vehicle], grid) for vehicle in sorted(by_vehicle)]
+    votes = one_each(drives, grid)
     states, tally = count(votes, rule, settings.min_votes)
     silenced = unheard(votes, tally, settings)
     if silenced:

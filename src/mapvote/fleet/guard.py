@@ -22,7 +22,7 @@ class Guard:
     """Keys come as ``Authorization: Bearer KEY``, or Basic with the key as password (browsers).
 
     Every request's key is looked up in the store, many in one query: a revoked key works no longer, not even once. A
-    ballot's key is looked up with the ballot itself (:meth:`mapvote.fleet.intake.Intake.accept`): until then it is
+    ballot's key is looked up with the ballot itself (:meth:`mapvote.fleet.intake.Intake.look_at`): until then it is
     enough to know whose it was, which never changes.
     """
 
