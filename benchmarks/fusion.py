@@ -36,10 +36,10 @@ from mapvote.core.ballot import encode
 from mapvote.core.grid import TileIndex
 from mapvote.core.types import NO_VOTE, U8, CellState, PointMap
 from mapvote.fleet.ballotbox import Receipt
-from mapvote.fleet.fuse import DAY_NS
 from mapvote.fleet.intake import accept, examine
 from mapvote.fleet.publish import publish
 from mapvote.fleet.store import Store
+from mapvote.fleet.votes import DAY_NS
 
 SHAPE = (256, 256)
 HOUSE = [(r, c) for r in range(100, 118) for c in (40, 57)] + [(r, c) for r in (100, 117) for c in range(40, 58)]

@@ -118,7 +118,7 @@ class VotingSettings(Section):
     n_min: int = 5
     window_m: float = Field(default=80.0, description="side of the local grid (paper III-A)")
     rules: str = Field(
-        default="ABCDEFGH", pattern=r"^A?B?C?D?E?F?G?H?$", description="columns: which of its rules hold (ablation)"
+        default="ABCDEFGHI", pattern=r"^A?B?C?D?E?F?G?H?I?$", description="columns: which of its rules hold (ablation)"
     )
     empty_votes: float = Field(
         default=0.1, description="columns, F: votes of a ray through a voxel, against one for a hit in it"
@@ -156,6 +156,12 @@ class FuseSettings(Section):
         gt=0,
         le=1,
         description="who opposes the others in more of a tile is not heard there; 1: everyone is",
+    )
+    max_denial: float = Field(
+        default=0.9,
+        gt=0,
+        le=1,
+        description="nor is who denies a larger share of the changes decided on the tile; 1: everyone is",
     )
     latest_vehicles: int = Field(default=9, ge=1, description="only the last so many vehicles on a tile count")
     max_age_days: float = Field(default=30.0, gt=0, description="and drives so much older than its newest do not")

@@ -248,7 +248,9 @@ class Vehicle:
             new = np.where(changed[CellState.CHANGED_OCCUPIED], votes.new, np.uint64(0))
             kept = points_in(window, points, new, base)
             new_points = pack_plane(kept) if len(kept) else None
-        gone = None if votes.gone is None else np.where(changed[CellState.CHANGED_EMPTY], votes.gone, np.uint64(0))
+        gone, left = votes.gone, np.uint64(0) if votes.remnants is None else votes.remnants
+        if gone is not None:
+            gone = np.where(changed[CellState.CHANGED_EMPTY], gone, left)
         return BallotTile(
             tile=tile,
             states=pack_plane(votes.states) if two_stage else None,

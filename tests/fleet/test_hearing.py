@@ -11,7 +11,8 @@ from hand_made import SHAPE
 from mapvote.config import FuseSettings
 from mapvote.core.grid import Lattice
 from mapvote.core.types import NO_VOTE, U8, CellState
-from mapvote.fleet.fuse import TileVote, count, fuse_tile, unheard
+from mapvote.fleet.fuse import count, fuse_tile, hear, unheard
+from mapvote.fleet.votes import TileVote
 
 UO, UE, CO, CE, UN = CellState
 OPPOSITE = np.array([CE, CO, UE, UO, UN], dtype=np.uint8)
@@ -33,7 +34,7 @@ def named(planes: list[U8]) -> list[TileVote]:
 
 
 def silenced(votes: list[TileVote], **policy: float) -> set[str]:
-    return unheard(votes, count(votes, "columns", 2)[1], FuseSettings(**policy))  # type: ignore[arg-type]
+    return unheard(votes, *count(votes, "columns", 2), FuseSettings(**policy))  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("k", [1, 2, 3])
@@ -81,3 +82,29 @@ def test_a_few_cells_say_nothing_about_a_vehicle() -> None:
 def test_the_order_of_ballots_does_not_decide_who_is_heard(order: list[int]) -> None:
     votes = named([honest(1), honest(2), OPPOSITE[honest(3)], honest(4, errors=0.3), OPPOSITE[honest(5)]])
     assert silenced([votes[i] for i in order]) == silenced(votes)
+
+
+def news_of(states: U8) -> U8:
+    """The same street after a block of walls came down."""
+    states = states.copy()
+    walls = states[:80, ::16]
+    walls[walls == UO] = CE
+    return states
+
+
+@pytest.mark.parametrize("k", [1, 2, 3])
+def test_who_denies_every_change_is_not_heard_and_the_quorum_is_what_it_would_be_without(k: int) -> None:
+    planes = [news_of(honest(i, 0.01)) for i in range(k + 1)] + [honest(50 + i, 0.01) for i in range(k)]
+    votes, policy = named(planes), FuseSettings(min_votes=k + 1)
+    heard, states, _, quorum = hear(votes, "columns", policy)
+    assert [vote.vehicle for vote in heard] == [f"v{i}" for i in range(k + 1)]
+    assert quorum == 2, "one less for each, but nobody is believed alone"
+    assert np.array_equal(states, count(votes[: k + 1], "columns", 2)[0])
+    assert len(hear(votes, "columns", policy.model_copy(update={"max_denial": 1.0}))[0]) == 2 * k + 1
+
+
+def test_who_missed_half_of_the_changes_is_heard() -> None:
+    half = honest(3)
+    half[:40] = news_of(half)[:40]
+    votes = named([news_of(honest(1)), news_of(honest(2)), half])
+    assert len(hear(votes, "columns", FuseSettings(min_votes=2))[0]) == 3

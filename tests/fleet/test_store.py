@@ -11,17 +11,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hand_made import Say, make_ballot, states_plane, two_walls
+from hand_made import Say, make_ballot, states_plane, two_walls, words_plane
 from mapvote.config import FuseSettings
 from mapvote.core.ballot import Ballot, encode
-from mapvote.core.types import CellState, MapvoteError, PointMap
+from mapvote.core.types import U64, CellState, MapvoteError, PointMap
 from mapvote.fleet.ballotbox import Receipt, withdraw
 from mapvote.fleet.errors import Conflict, Held, NotFound, Unavailable
-from mapvote.fleet.fuse import DAY_NS
 from mapvote.fleet.intake import Intake, accept, examine
 from mapvote.fleet.publish import publish, rollback
 from mapvote.fleet.store import Store
 from mapvote.fleet.update import update_map
+from mapvote.fleet.votes import DAY_NS
 
 EMPTY, KEEPS = CellState.CHANGED_EMPTY, CellState.UNCHANGED_OCCUPIED
 POLICY = FuseSettings(min_votes=2)
@@ -45,10 +45,16 @@ def send(store: Store, *ballots: Ballot) -> list[Receipt]:
 
 
 def says(
-    point_map: PointMap, vehicle: str, state: int, cell: tuple[int, int] = CELL, day: float = 0, **more: object
+    point_map: PointMap,
+    vehicle: str,
+    state: int,
+    cell: tuple[int, int] = CELL,
+    day: float = 0,
+    gone: U64 | None = None,
+    **more: object,
 ) -> Ballot:
     drive = str(more.pop("drive", f"d{next(_count)}"))
-    say = {(0, 0): Say(states_plane({cell: state}))}
+    say = {(0, 0): Say(states_plane({cell: state}), gone=gone)}
     return make_ballot(point_map, say, vehicle, drive, end_ns=DAY_NS + round(day * DAY_NS), **more)  # type: ignore[arg-type]
 
 
@@ -147,6 +153,22 @@ def test_a_rollback_does_not_come_back_by_itself_but_by_new_votes(store: Store) 
     send(store, says(base, "d", EMPTY, day=1))
     assert publish(store, POLICY).published
     assert heights(store) == 0
+
+
+def test_rolled_back_remnants_stay_until_new_votes_come(store: Store) -> None:
+    base = store.point_map()
+
+    def mark(vehicle: str, day: float) -> Ballot:
+        return says(base, vehicle, KEEPS, day=day, gone=words_plane({CELL: 0b10}))
+
+    old = [mark(v, 0) for v in "ab"]
+    send(store, *old)
+    assert publish(store, POLICY).deleted == 1
+    rollback(store, 1, reason="it still stands")
+    send(store, *old)
+    assert not publish(store, POLICY).published
+    send(store, *[mark(v, 1) for v in "cd"])
+    assert publish(store, POLICY).deleted == 1
 
 
 def test_withdrawn_before_publication_it_is_as_if_never_cast(store: Store) -> None:

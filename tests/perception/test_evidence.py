@@ -10,7 +10,7 @@ from hypothesis.extra.numpy import arrays
 from mapvote.core.columns import dilated, neighbourhood, shifted
 from mapvote.core.grid import CELL_SIZE, Grid, Lattice
 from mapvote.core.types import Reference
-from mapvote.perception.evidence import PLANES, Evidence, count_of, free_words
+from mapvote.perception.evidence import PLANES, STRUCK_ITSELF, THROUGH_ITSELF, Evidence, count_of, free_words
 from mapvote.perception.visibility import ScanView, Sight
 
 SIDE = 5
@@ -90,6 +90,23 @@ def test_a_hit_two_cells_away_counts_only_for_an_uncertain_pose() -> None:
         evidence.add(view_of(hit, middle(0b100)), reference_of(middle(0b100)), reach)
         cell = evidence.tiles[(0, 0)][AT]
         assert (count_of(cell, 0, 2), count_of(cell, PLANES, 2)) == counts
+
+
+def test_a_mapped_voxel_also_keeps_what_befell_it_alone() -> None:
+    hit = NOTHING.copy()
+    hit[3, 3] = 0b100
+    evidence = Evidence(Lattice())
+    evidence.add(view_of(hit, middle(0b110)), reference_of(middle(0b1100)))
+    cell = evidence.tiles[(0, 0)][AT]
+    assert (cell[STRUCK_ITSELF], cell[THROUGH_ITSELF]) == (0, 0b100), "the hit lies next to it, the ray went through it"
+    evidence.add(view_of(middle(0b1100), middle(0b100)), reference_of(middle(0b1100)))
+    assert (cell[STRUCK_ITSELF], cell[THROUGH_ITSELF]) == (0b1100, 0b100)
+
+
+def test_a_scan_that_is_unsure_of_its_pose_says_of_no_single_voxel_that_a_ray_went_through() -> None:
+    evidence = Evidence(Lattice())
+    evidence.add(view_of(NOTHING, middle(0b100)), reference_of(middle(0b100)), 2)
+    assert evidence.tiles[(0, 0)][AT][THROUGH_ITSELF] == 0
 
 
 def test_without_rule_a_a_visible_cell_is_seen_through_whole() -> None:

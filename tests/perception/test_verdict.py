@@ -1,23 +1,26 @@
-"""What a drive's evidence amounts to, rule by rule (METHOD 4, C to H)."""
+"""What a drive's evidence amounts to, rule by rule (METHOD 4, C to I)."""
 
 from __future__ import annotations
 
 from typing import Any
 
 import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
 
 from mapvote.config import VotingSettings
 from mapvote.core.types import NO_VOTE, U64, CellState
-from mapvote.perception.evidence import PLANES
-from mapvote.perception.verdict import Verdict, drop_specks, fallen, unexplained, weigh
+from mapvote.perception.evidence import PLANES, STRUCK_ITSELF, THROUGH_ITSELF, WORDS
+from mapvote.perception.verdict import Verdict, drop_specks, fallen, remnants, unexplained, weigh
 
 UO, UE, CO, CE, UN = CellState
 FREE = ~np.uint64(0)
 
 
 def cell(through: dict[int, int], struck: dict[int, int]) -> U64:
-    """Counters (1, 1, 2 * PLANES) of one cell: scans by voxel."""
-    planes = np.zeros((1, 1, 2 * PLANES), np.uint64)
+    """Counters (1, 1, WORDS) of one cell: scans by voxel."""
+    planes = np.zeros((1, 1, WORDS), np.uint64)
     for first, counts in ((0, through), (PLANES, struck)):
         for bit, count in counts.items():
             for k in range(PLANES):
@@ -183,3 +186,35 @@ def test_what_hangs_in_the_air_over_rays_is_adrift() -> None:
     assert judge(dict.fromkeys(range(10), 9), {}, occupied=1 << 12).adrift[0, 0]
     assert not judge({0: 9}, {}, occupied=1 << 12).adrift[0, 0]
     assert not judge(dict.fromkeys(range(14), 9), {}, occupied=1 << 12).adrift[0, 0]
+
+
+def test_only_voxels_never_struck_and_once_seen_through_are_loose() -> None:
+    planes, one = np.zeros((3, 3, WORDS), np.uint64), np.ones((1, 1), np.uint64)
+    planes[1, 1, THROUGH_ITSELF], planes[1, 1, STRUCK_ITSELF] = 0b110, 0b100
+    for low, loose in ((False, 0b010), (True, 0)):
+        seen = weigh(planes, np.zeros((3, 3), np.int32), one, one, one, np.full((1, 1), low), VotingSettings())
+        assert seen.loose[0, 0] == loose
+
+
+def test_rule_i_what_touches_a_gone_thing_goes_with_it_voxel_by_voxel() -> None:
+    gone, loose, base = np.zeros((5, 9), np.uint64), np.zeros((5, 9), np.uint64), np.zeros((5, 9), np.int32)
+    gone[2, 0] = 0b1000
+    loose[2, 1], loose[3, 2], loose[2, 4] = 0b1010, 0b10000, 0b1000
+    base[3, 2] = -1
+    found = remnants(gone, loose, base)
+    assert found[2, 1] == 0b1000, "next to it; two layers below it, not"
+    assert found[3, 2] == 0b10000, "next to what goes: its bits count from a layer below"
+    assert found[2, 4] == 0, "a gap of a cell"
+    assert not remnants(np.zeros_like(gone), loose, base).any()
+
+
+words = arrays(np.uint64, (6, 6), elements=st.integers(0, 255))
+
+
+@given(words, words, arrays(np.int32, (6, 6), elements=st.integers(-2, 2)))
+def test_remnants_are_loose_and_finding_them_twice_finds_no_more(gone: U64, loose: U64, base: Any) -> None:
+    found = remnants(gone, loose, base)
+    assert not (found & ~loose).any()
+    assert not (found & gone).any()
+    assert not remnants(gone | found, loose, base).any()
+    assert np.array_equal(remnants(gone[::-1], loose[::-1], base[::-1])[::-1], found)

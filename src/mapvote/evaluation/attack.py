@@ -94,15 +94,16 @@ ATTACKS: Mapping[str, Attack] = {
 
 
 def _claim(ballot: Ballot, point_map: PointMap, lie: Callable[[U8, Bool], U8]) -> Ballot:
-    """The ballot with ``lie``'s states; whole columns gone where changed-empty, false points where changed-occupied."""
+    """The ballot with ``lie``'s states; all that is mapped gone, false points where changed-occupied."""
 
     def told(tile: BallotTile) -> BallotTile:
         if tile.states is None:
             raise ValueError("liars need two-stage ballots")
         grid = tile_grid(point_map.lattice, tile.tile)
         mapped = point_map.tiles.get(tile.tile) or empty_tile()
-        states = lie(unpack_states(tile.states), obstacle_bits(mapped, grid) != 0)
-        gone = np.where(states == CellState.CHANGED_EMPTY, _ALL, np.uint64(0))
+        occupied = obstacle_bits(mapped, grid) != 0
+        states = lie(unpack_states(tile.states), occupied)
+        gone = np.where(occupied | (states == CellState.CHANGED_EMPTY), _ALL, np.uint64(0))
         ground_z = np.nan_to_num(mapped.ground_z, nan=0.0)
         points = made_up(states == CellState.CHANGED_OCCUPIED, ground_z)
         return msgspec.structs.replace(

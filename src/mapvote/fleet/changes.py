@@ -156,6 +156,7 @@ def change_objects(changed: Iterable[ChangedCells], min_cells: int = 1) -> list[
             continue
         kind = KINDS[int(states[mine[0]])]
         made_in = sorted({int(v) for v in versions[mine]} - {0})
+        told = votes[mine][versions[mine] > 0] if made_in else votes[mine]  # remnants in cells that stand have no votes
         seen_first, seen_last = int(first[mine].min()), int(last[mine].max())
         out.append(
             ChangeObject(
@@ -165,8 +166,8 @@ def change_objects(changed: Iterable[ChangedCells], min_cells: int = 1) -> list[
                 cells=len(mine),
                 height_m=float(top[mine].max()),
                 points=int(points[mine].sum()),
-                votes_min=int(votes[mine].min()),
-                votes_median=float(np.median(votes[mine])),
+                votes_min=int(told.min()),
+                votes_median=float(np.median(told)),
                 first_seen_ns=None if seen_first == _NEVER else seen_first,
                 last_seen_ns=None if seen_last == _UNTIL else seen_last,
                 versions=made_in,

@@ -18,10 +18,11 @@ from mapvote.fleet import schema
 from mapvote.fleet.changes import Decided, change_objects, changed_cells, to_geojson
 from mapvote.fleet.consensus import Compared, Spoken, Standing, compare, judge
 from mapvote.fleet.content import unpack_points_plane
-from mapvote.fleet.fuse import TileVote, count, one_each, select, unheard
+from mapvote.fleet.fuse import count, unheard
 from mapvote.fleet.rounds import unpack_tally_plane
 from mapvote.fleet.standing import Round, counting_votes, read_votes, standing_tiles, stored_votes
 from mapvote.fleet.store import Store, current_version, load_blob, load_tile, tiles_of, version_of
+from mapvote.fleet.votes import TileVote, one_each, select
 
 _FOREVER = (1 << 63) - 1
 
@@ -91,7 +92,7 @@ def explain_cell(store: Store, x: float, y: float, settings: FuseSettings) -> Ce
         elif not counts:
             why = "the cell has changed since its base, or a rollback has barred it"
         elif vote.vehicle in silenced:
-            counts, why = False, "opposes the others over most of this tile"
+            counts, why = False, "opposes the others over most of this tile, or denies nearly all that changed on it"
         votes.append(CellVote(stored.vehicle, stored.drive, _said(vote, cell), stored.end_ns, counts, why))
     story = [(version, state_name(int(states[cell]))) for version, states in decided if states[cell] != NO_VOTE]
     return CellStory(row, col, votes, story)
@@ -100,7 +101,7 @@ def explain_cell(store: Store, x: float, y: float, settings: FuseSettings) -> Ce
 def _silenced(store: Store, index: TileIndex, drives: list[TileVote], settings: FuseSettings) -> set[str]:
     """Vehicles that are not heard on a tile, of the votes that count there."""
     votes = one_each(drives, tile_grid(store.lattice, index))
-    return unheard(votes, count(votes, "columns", settings.min_votes)[1], settings)
+    return unheard(votes, *count(votes, "columns", settings.min_votes), settings)
 
 
 def changes_between(store: Store, old: int, new: int, min_cells: int = 1) -> dict[str, Any]:

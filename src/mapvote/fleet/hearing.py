@@ -1,9 +1,12 @@
-"""Who is not heard on a tile: a vehicle that says the opposite of the others nearly everywhere (DESIGN 4, liars).
+"""Who is not heard on a tile: a vehicle that says the opposite of the others nearly everywhere, or nearly wherever
+something changed (DESIGN 4, liars).
 
 A majority of 2k + 1 vehicles outvotes k that lie, but a change also needs only k + 1 to back it, and the k who lie lend
 their votes to whatever error a single honest vehicle makes. Where the others agree among themselves over most of a
 tile and one of them contradicts it over most of that, its votes say nothing of the world. An honest vehicle differs
-in some per cent of the cells; a demolished block is some per cent of a tile.
+in some per cent of the cells; a demolished block is some per cent of a tile. A vehicle that denies nearly every change
+which a quorum decided replays the old street, or saw it last: it would cost every change that an honest vehicle missed.
+Whoever is found out is one of the k that the quorum of k + 1 guards against, so that k is smaller by one.
 """
 
 from __future__ import annotations
@@ -20,7 +23,7 @@ from mapvote.core.voting import VOTE_UNIT
 ASKED = slice(None, None, 13)
 """The flat cells asked, enough for a share; the stride divides no tile's side, so that no column is left out."""
 _MIN_ASKED = 64
-"""With fewer cells that the others agree on, nobody is judged: 75 m2."""
+"""With fewer cells to go by nobody is judged: 75 m2 that the others agree on, or 6 m2 of changes."""
 _UN = int(CellState.UNDETERMINED)
 _ASKED, _AGREED, _OPPOSED = 0b1, 0b10, 0b100
 
@@ -44,6 +47,17 @@ def contradicting(states: U8, tally: NDArray[Any], most: float) -> Bool:
             opposed += said >> 2
         found[vehicle] = agreed >= _MIN_ASKED and 2 * agreed > asked and opposed > most * agreed
     return found
+
+
+def denying(states: U8, decided: U8, most: float) -> Bool:
+    """(n,) which vehicles' ``states`` (n, cells) deny more than ``most`` of the changes that were ``decided`` (cells,).
+
+    Nothing is said of a vehicle that determined fewer than 64 of these cells.
+    """
+    determined = states < _UN
+    denied = (determined & (states != decided)).sum(axis=1)
+    asked = determined.sum(axis=1)
+    return np.asarray((asked >= _MIN_ASKED) & (denied > most * asked))
 
 
 @numba.njit(cache=True, nogil=True)

@@ -16,11 +16,11 @@ import sqlalchemy as sa
 from mapvote.config import FuseSettings
 from mapvote.core.ballot import unpack_many_states, unpack_points, unpack_tally
 from mapvote.core.grid import Lattice, TileIndex, tile_grid
-from mapvote.core.types import F32, U8, Bool, CellState
+from mapvote.core.types import F32, U8, Bool
 from mapvote.fleet import schema
 from mapvote.fleet.content import same_cells, unpack_cells, unpack_points_plane
-from mapvote.fleet.fuse import TileVote, restrict, select
 from mapvote.fleet.store import load_blob
+from mapvote.fleet.votes import TileVote, restrict, select
 from mapvote.fleet.words import Words
 
 
@@ -144,9 +144,8 @@ def silence(vote: TileVote, first_seq: int, bars: Sequence[Bar]) -> TileVote:
     for bar in bars:
         if first_seq < bar.seq:
             cells = np.flatnonzero(bar.cells)
-            change = vote.supports(CellState.CHANGED_OCCUPIED, cells) | vote.supports(CellState.CHANGED_EMPTY, cells)
             counts = np.ones(bar.cells.shape, dtype=np.bool_)
-            counts.reshape(-1)[cells[change]] = False
+            counts.reshape(-1)[cells[vote.alters(cells)]] = False
             vote = restrict(vote, counts)
     return vote
 

@@ -19,7 +19,8 @@ from mapvote.core.ballot import (
 )
 from mapvote.core.grid import TileIndex
 from mapvote.core.types import MapTile, MapvoteError, PointMap
-from mapvote.fleet.fuse import Decision, Rule, TileVote, fuse_tile, select
+from mapvote.fleet.fuse import Decision, Rule, fuse_tile
+from mapvote.fleet.votes import TileVote, select
 from mapvote.fleet.words import Words
 
 

@@ -11,11 +11,12 @@ from numpy.typing import NDArray
 
 from mapvote.core.grid import TILE_CELLS
 from mapvote.core.planes import unpack_plane
-from mapvote.core.types import U64, Bool
+from mapvote.core.types import I32, U64, Bool
 
 CELLS = TILE_CELLS * TILE_CELLS
 EVERY_BIT = ~np.uint64(0)
 _BLOCK = 64
+_BITS = np.arange(64, dtype=np.uint64)
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,6 +72,20 @@ def at_least(marked: Sequence[Words], k: int) -> U64:
     for mine in marked:
         _mark(reached, mine.cells, mine.words)
     return reached[k - 1].reshape(TILE_CELLS, TILE_CELLS)
+
+
+def counted(marked: Sequence[Words]) -> tuple[NDArray[np.intp], I32]:
+    """(cells (n,), how many of ``marked`` set each of their bits (n, 64)), for a few cells."""
+    cells = np.unique(np.concatenate([mine.cells for mine in marked]))
+    counts = np.zeros((len(cells), 64), dtype=np.int32)
+    for mine in marked:
+        counts[np.searchsorted(cells, mine.cells)] += ((mine.words[:, None] >> _BITS) & np.uint64(1)).astype(np.int32)
+    return cells, counts
+
+
+def packed(bits: Bool) -> U64:
+    """(n,) words of bits (n, 64)."""
+    return np.asarray((bits.astype(np.uint64) << _BITS).sum(axis=1, dtype=np.uint64))
 
 
 @numba.njit(cache=True, nogil=True)

@@ -4,6 +4,8 @@ Two counters a voxel, kept as bit planes: plane k of a cell is a 64-bit word tha
 counts of its 64 voxels, so that one scan adds to a whole column with a few word operations. A voxel that the map
 holds counts as struck if anything near it was hit (8 neighbouring cells, one layer up or down), and
 then not as seen through, whatever grazed past it in the same scan; any other voxel must be hit itself.
+Two more words a cell say of its mapped voxels, whatever lies next to them, whether a hit ever fell into them and
+whether a ray ever went through (rule I).
 Cells whose ground the map does not know gather nothing: heights would mean nothing there, and the map knows nothing.
 """
 
@@ -22,6 +24,9 @@ PLANES = 7
 OPEN_SHARE = 0.1
 """A voxel is open if the voxels above and below it were seen through in more than this share of its own times."""
 _THROUGH, _STRUCK = 0, PLANES
+STRUCK_ITSELF, THROUGH_ITSELF = 2 * PLANES, 2 * PLANES + 1
+WORDS = 2 * PLANES + 2
+"""Words a cell: the two counters, and what is said of mapped voxels themselves."""
 _BEHIND = int(Sight.BEHIND)
 
 
@@ -90,6 +95,10 @@ def _gather(
                 near = neighbourhood(hit, base, r, c, reach) & mapped if veto else hit[r, c] & mapped
                 if not by_ray and sight[r, c] >= _BEHIND and not hit[r, c]:
                     through |= mapped
+                itself = hit[r, c] & mapped
+                planes[i, j, STRUCK_ITSELF] |= itself
+                if reach == 1:  # where a scan is not sure of its pose, single voxels mean nothing
+                    planes[i, j, THROUGH_ITSELF] |= passed[r, c] & mapped & ~itself
                 struck = (struck & ~mapped) | near
                 through &= ~near
             if through or struck:
@@ -101,7 +110,7 @@ def _gather(
 
 
 class Evidence:
-    """Counters of a drive by tile: (256, 256, 2 * PLANES) uint64, seen through first, struck after."""
+    """Counters of a drive by tile: (256, 256, WORDS) uint64, seen through first, struck after, then the last two."""
 
     def __init__(self, lattice: Lattice, by_ray: bool = True, veto: bool = True) -> None:
         """``by_ray`` (rule A): a mapped voxel is seen through only by a ray through it, else wherever the cell was
@@ -115,7 +124,7 @@ class Evidence:
             window = tile_grid(self.lattice, tile)
             common = window.intersection(view.grid)
             if tile not in self.tiles:
-                self.tiles[tile] = np.zeros((TILE_CELLS, TILE_CELLS, 2 * PLANES), dtype=np.uint64)
+                self.tiles[tile] = np.zeros((TILE_CELLS, TILE_CELLS, WORDS), dtype=np.uint64)
             row0, col0 = common.row0 - view.grid.row0, common.col0 - view.grid.col0
             _gather(
                 self.tiles[tile][common.slices_in(window)], common.shape, row0, col0, view.hit, view.passed, view.sight,

@@ -1,4 +1,4 @@
-"""From the evidence of a drive to votes (METHOD 4, rules C to G, and H): sums over the voxels that matter in each cell.
+"""From the evidence of a drive to votes (METHOD 4, rules C to I): sums over the voxels that matter in each cell.
 
 A cell's votes are numbers of (scan, voxel) pairs: mapped voxels struck speak for unchanged-occupied, mapped voxels
 seen through for changed-empty, free voxels struck for changed-occupied, and seen through for unchanged-empty. What is
@@ -14,11 +14,11 @@ import numpy as np
 from scipy import ndimage
 
 from mapvote.config import VotingSettings
-from mapvote.core.columns import TOP_BIT
+from mapvote.core.columns import TOP_BIT, neighbourhood
 from mapvote.core.types import I32, U8, U64, Bool, CellState
 from mapvote.core.voting import VOTE_UNIT, decide
 from mapvote.perception.classify import below_top
-from mapvote.perception.evidence import PLANES, count_of, is_open
+from mapvote.perception.evidence import PLANES, STRUCK_ITSELF, THROUGH_ITSELF, count_of, is_open
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,6 +35,8 @@ class Verdict:
     """(rows, cols) cells all of whose new voxels lie next to mapped ones (rule C)."""
     adrift: Bool
     """(rows, cols) mapped cells whose voxels no ray struck and hardly any crossed, while rays passed below (rule H)."""
+    loose: U64
+    """(rows, cols) mapped voxels into which no hit ever fell, and through which a ray went (rule I)."""
 
     def states(self) -> U8:
         return decide(self.tally)
@@ -126,7 +128,7 @@ def _weigh(
 def weigh(planes: U64, base: I32, occupied: U64, near: U64, free: U64, low: Bool, settings: VotingSettings) -> Verdict:
     """Votes of a window (rows, cols) from its counters and the map's words.
 
-    ``planes`` (rows + 2, cols + 2, 2 * PLANES) and ``base`` (rows + 2, cols + 2), the layers of their bits 0, have the
+    ``planes`` (rows + 2, cols + 2, WORDS) and ``base`` (rows + 2, cols + 2), the layers of their bits 0, have the
     cells around the window too. ``near``: voxels in which a hit may belong to a mapped voxel next to them (rule C);
     ``free``: what the map knows to be free (rule D); ``low``: cells whose map hardly rises above the ground (rule G:
     kerbs, grass, trails of cars' bumpers are never called gone). A cell that the map has points in is never
@@ -144,7 +146,9 @@ def weigh(planes: U64, base: I32, occupied: U64, near: U64, free: U64, low: Bool
         settings.min_scans if "G" in rules else 1,
         settings.min_support if "G" in rules else 1, tally, gone, new, beside, adrift,
     )  # fmt: skip
-    return Verdict(tally, gone, new, beside, adrift)
+    here = planes[1:-1, 1:-1]
+    loose = np.where(low, np.uint64(0), here[..., THROUGH_ITSELF] & ~here[..., STRUCK_ITSELF])
+    return Verdict(tally, gone, new, beside, adrift, loose)
 
 
 def unexplained(states: U8, beside: Bool, reach: int) -> Bool:
@@ -173,6 +177,30 @@ def fallen(states: U8, adrift: Bool, reach: int) -> Bool:
     falls = np.bincount(group[to_gone <= reach], minlength=count + 1) > 0
     falls[0] = False
     return np.asarray(falls[group])
+
+
+@numba.njit(cache=True, nogil=True)
+def remnants(gone: U64, loose: U64, base: I32) -> U64:
+    """(rows, cols) rule I: voxels of ``loose`` that touch one of ``gone``, or another that does (26 neighbours).
+
+    What is left of a demolished thing beside something that stands: hits on that veto it (rule B), but none ever fell
+    into its own voxels, and rays went through them. ``base`` (rows, cols): the layers of the words' bits 0.
+    """
+    rows, cols = gone.shape
+    found, reached = np.zeros_like(gone), gone.copy()
+    grown = True
+    while grown:
+        grown = False
+        for r in range(rows):
+            for c in range(cols):
+                left = loose[r, c] & ~reached[r, c]
+                if left:
+                    more = left & neighbourhood(reached, base, r, c, 1)
+                    if more:
+                        found[r, c] |= more
+                        reached[r, c] |= more
+                        grown = True
+    return found
 
 
 def drop_specks(states: U8, min_cells: int) -> Bool:

@@ -6,7 +6,7 @@ A voter takes in scan after scan and gives, tile by tile, the same thing: a tall
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -20,12 +20,12 @@ from mapvote.core.voting import decide, one_hot
 from mapvote.perception.classify import classify_paper
 from mapvote.perception.evidence import Evidence, free_words
 from mapvote.perception.tally import Tally
-from mapvote.perception.verdict import drop_specks, fallen, unexplained, weigh
+from mapvote.perception.verdict import Verdict, drop_specks, fallen, remnants, unexplained, weigh
 from mapvote.perception.visibility import ScanView
 
 ALL_BITS = ~np.uint64(0)
 _HALO = 64
-"""Cells around a tile that rule H looks at: 19 m, a house."""
+"""Cells around a tile that rules H and I look at: 19 m, a house."""
 Plane = Any
 """An array of one tile or window, of any type."""
 
@@ -51,6 +51,8 @@ class TileVotes:
     """(256, 256) decided by this vehicle alone."""
     gone: U64 | None
     """(256, 256) map voxels that are there no more where the cell is changed-empty; None: all of them."""
+    remnants: U64 | None
+    """(256, 256) map voxels that are there no more though the rest of the cell stands; None: not asked."""
     new: U64
     """(256, 256) voxels whose points are new where the cell is changed-occupied."""
     free: U64 | None
@@ -76,7 +78,7 @@ class PaperVoter:
         for tile, tally in sorted(self._tally.tiles.items()):
             if tally.any():
                 new = np.where(tally[..., CellState.CHANGED_OCCUPIED] > 0, ALL_BITS, np.uint64(0))
-                out[tile] = TileVotes(tally, decide(tally), None, new, None)
+                out[tile] = TileVotes(tally, decide(tally), None, None, new, None)
         return out
 
 
@@ -94,7 +96,8 @@ class ColumnVoter:
     def votes(self) -> dict[TileIndex, TileVotes]:
         """Every tile with evidence, in ascending order."""
         out: dict[TileIndex, TileVotes] = {}
-        beside, adrift, mapped = {}, {}, {}
+        said: dict[TileIndex, Verdict] = {}
+        maps: dict[TileIndex, Reference] = {}
         for tile, planes in sorted(self.evidence.tiles.items()):
             window = tile_grid(self.point_map.lattice, tile)
             around = reference_window(self.point_map, window.padded(1))
@@ -108,15 +111,16 @@ class ColumnVoter:
                 free = free_words(planes, here.occupied)
                 if here.free is not None:
                     free[here.free != 0] = 0  # what the map knows need not be sent
-                out[tile] = TileVotes(verdict.tally, verdict.states(), verdict.gone, verdict.new, free)
-                beside[tile], adrift[tile] = verdict.beside, verdict.adrift
-                mapped[tile] = here.occupied
+                out[tile] = TileVotes(verdict.tally, verdict.states(), verdict.gone, None, verdict.new, free)
+                said[tile], maps[tile] = verdict, here
         if "C" in self.voting.rules:
-            self._drop_explained(out, beside)
+            self._drop_explained(out, {tile: verdict.beside for tile, verdict in said.items()})
         if "H" in self.voting.rules:
-            self._drop_what_fell(out, adrift, mapped)
+            self._drop_what_fell(out, {tile: verdict.adrift for tile, verdict in said.items()}, maps)
         if "G" in self.voting.rules:
             self._drop_specks(out)
+        if "I" in self.voting.rules:
+            self._drop_remnants(out, {tile: verdict.loose for tile, verdict in said.items()}, maps)
         return out
 
     def _drop_explained(self, votes: dict[TileIndex, TileVotes], beside: dict[TileIndex, Bool]) -> None:
@@ -131,7 +135,7 @@ class ColumnVoter:
             v.tally[cells] = one_hot(np.array(CellState.UNDETERMINED, dtype=np.uint8))
 
     def _drop_what_fell(
-        self, votes: dict[TileIndex, TileVotes], adrift: dict[TileIndex, Bool], mapped: dict[TileIndex, U64]
+        self, votes: dict[TileIndex, TileVotes], adrift: dict[TileIndex, Bool], maps: dict[TileIndex, Reference]
     ) -> None:
         """Rule H, with enough of a tile's neighbours that groups across its edge are judged alike from both sides."""
         states = {tile: v.states for tile, v in votes.items()}
@@ -145,7 +149,7 @@ class ColumnVoter:
             votes[tile].tally[cells] = one_hot(np.array(CellState.CHANGED_EMPTY, dtype=np.uint8))
             gone = votes[tile].gone
             assert gone is not None
-            gone[cells] = mapped[tile][cells]
+            gone[cells] = maps[tile].occupied[cells]
 
     def _drop_specks(self, votes: dict[TileIndex, TileVotes]) -> None:
         """Rule G, with the cells around a tile, so that a component across its edge counts in full."""
@@ -154,6 +158,28 @@ class ColumnVoter:
         for tile, v in votes.items():
             wide = self._around(states, tile_grid(self.point_map.lattice, tile).padded(halo), NO_VOTE)
             v.states[drop_specks(wide, halo)[halo:-halo, halo:-halo]] = CellState.UNDETERMINED
+
+    def _drop_remnants(
+        self, votes: dict[TileIndex, TileVotes], loose: dict[TileIndex, U64], maps: dict[TileIndex, Reference]
+    ) -> None:
+        """Rule I, with enough of a tile's neighbours. A cell of which nothing is left that way is changed-empty."""
+        base = {tile: here.base for tile, here in maps.items()}
+        gone: dict[TileIndex, U64] = {}
+        for tile, v in votes.items():
+            assert v.gone is not None
+            gone[tile] = np.where(v.states == CellState.CHANGED_EMPTY, v.gone, np.uint64(0))
+        for tile, v in votes.items():
+            wide = tile_grid(self.point_map.lattice, tile).padded(_HALO)
+            near = self._around(gone, wide, 0), self._around(loose, wide, 0), self._around(base, wide, 0)
+            left = remnants(*near)[_HALO:-_HALO, _HALO:-_HALO]
+            nothing_left = (left | gone[tile]) == maps[tile].occupied
+            fell = (left != 0) & nothing_left & (v.states != CellState.CHANGED_EMPTY)
+            v.states[fell] = CellState.CHANGED_EMPTY
+            v.tally[fell] = one_hot(np.array(CellState.CHANGED_EMPTY, dtype=np.uint8))
+            down = v.states == CellState.CHANGED_EMPTY
+            assert v.gone is not None
+            v.gone[down] |= left[down]
+            votes[tile] = replace(v, remnants=np.where(down, np.uint64(0), left))
 
     def _around(self, planes: dict[TileIndex, Plane], wide: Grid, elsewhere: int) -> Plane:
         """The planes of several tiles as one window."""
