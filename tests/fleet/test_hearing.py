@@ -11,7 +11,7 @@ from hand_made import SHAPE
 from mapvote.config import FuseSettings
 from mapvote.core.grid import Lattice
 from mapvote.core.types import NO_VOTE, U8, CellState
-from mapvote.fleet.fuse import count, fuse_tile, hear, unheard
+from mapvote.fleet.fuse import count, fuse_tile, hear
 from mapvote.fleet.votes import TileVote
 
 UO, UE, CO, CE, UN = CellState
@@ -34,7 +34,8 @@ def named(planes: list[U8]) -> list[TileVote]:
 
 
 def silenced(votes: list[TileVote], **policy: float) -> set[str]:
-    return unheard(votes, *count(votes, "columns", 2), FuseSettings(**policy))  # type: ignore[arg-type]
+    heard = hear(votes, "columns", FuseSettings(**policy))[0]  # type: ignore[arg-type]
+    return {vote.vehicle for vote in votes} - {vote.vehicle for vote in heard}
 
 
 @pytest.mark.parametrize("k", [1, 2, 3])
@@ -108,3 +109,14 @@ def test_who_missed_half_of_the_changes_is_heard() -> None:
     half[:40] = news_of(half)[:40]
     votes = named([news_of(honest(1)), news_of(honest(2)), half])
     assert len(hear(votes, "columns", FuseSettings(min_votes=2))[0]) == 3
+
+
+def test_three_liars_silence_no_honest_vehicle_where_few_others_look() -> None:
+    """In half of the tile three who lie are the majority of those who determined anything."""
+    planes = [honest(i) for i in range(4)]
+    for plane in planes[1:]:
+        plane[:, 64:] = NO_VOTE
+    lies = [np.where(honest(9) == UO, CE, CO).astype(np.uint8)] * 3
+    heard, _, _, quorum = hear(named([*planes, *lies]), "columns", FuseSettings(min_votes=4))
+    assert {f"v{i}" for i in range(4)} <= {vote.vehicle for vote in heard}
+    assert quorum == max(2, 4 - (7 - len(heard)))

@@ -18,7 +18,7 @@ from mapvote.fleet import schema
 from mapvote.fleet.changes import Decided, change_objects, changed_cells, to_geojson
 from mapvote.fleet.consensus import Compared, Spoken, Standing, compare, judge
 from mapvote.fleet.content import unpack_points_plane
-from mapvote.fleet.fuse import count, unheard
+from mapvote.fleet.fuse import hear
 from mapvote.fleet.rounds import unpack_tally_plane
 from mapvote.fleet.standing import Round, counting_votes, read_votes, standing_tiles, stored_votes
 from mapvote.fleet.store import Store, current_version, load_blob, load_tile, tiles_of, version_of
@@ -101,7 +101,7 @@ def explain_cell(store: Store, x: float, y: float, settings: FuseSettings) -> Ce
 def _silenced(store: Store, index: TileIndex, drives: list[TileVote], settings: FuseSettings) -> set[str]:
     """Vehicles that are not heard on a tile, of the votes that count there."""
     votes = one_each(drives, tile_grid(store.lattice, index))
-    return unheard(votes, *count(votes, "columns", settings.min_votes), settings)
+    return {vote.vehicle for vote in votes} - {vote.vehicle for vote in hear(votes, "columns", settings)[0]}
 
 
 def changes_between(store: Store, old: int, new: int, min_cells: int = 1) -> dict[str, Any]:

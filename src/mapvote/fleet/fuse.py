@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from mapvote.config import FuseSettings
 from mapvote.core.grid import TILE_CELLS, Grid, Lattice, TileIndex, tile_grid
-from mapvote.core.types import F32, I32, I64, N_STATES, NO_VOTE, U8, U64, CellState, MapTile
+from mapvote.core.types import F32, I32, I64, N_STATES, NO_VOTE, U8, U64, Bool, CellState, MapTile
 from mapvote.core.voting import VOTE_UNIT, add_states, add_tally, decide_cells
 from mapvote.fleet.edit import add_points, cells_of, delete_points, empty_tile, obstacle_bits
 from mapvote.fleet.hearing import ASKED, contradicting, denying
@@ -110,31 +110,36 @@ def hear(
     """(the votes that are heard, states, tally, quorum), of one vote a vehicle on a tile; see :func:`count`.
 
     The quorum falls by one for each that is not heard, for it is one of those that the quorum guards against, but
-    nobody is ever believed alone.
+    nobody is ever believed alone. Of those that send tallies nobody is judged: theirs do not weigh alike.
     """
-    states, tally = count(votes, rule, settings.min_votes)
-    silenced = unheard(votes, states, tally, settings)
-    if not silenced:
-        return votes, states, tally, settings.min_votes
-    heard = [vote for vote in votes if vote.vehicle not in silenced]
-    quorum = max(2, settings.min_votes - len(silenced))
-    return heard, *count(heard, rule, quorum), quorum
+    heard, quorum = list(votes), settings.min_votes
+    states, tally = count(heard, rule, quorum)
+    if quorum < 2 or any(vote.states is None for vote in heard):
+        return heard, states, tally, quorum
+    for judged in (_contradicting, _denying):
+        found = judged(heard, states, tally, quorum, settings)
+        if found.any():
+            heard = [vote for vote, out in zip(heard, found, strict=True) if not out]
+            quorum = max(2, quorum - int(found.sum()))
+            states, tally = count(heard, rule, quorum)
+    return heard, states, tally, quorum
 
 
-def unheard(votes: Sequence[TileVote], states: U8, tally: NDArray[Any], settings: FuseSettings) -> set[str]:
-    """Vehicles that contradict the others on this tile (:mod:`mapvote.fleet.hearing`). ``votes`` one a vehicle;
-    ``states`` (256, 256) and ``tally`` (256, 256, 5) what they decide. Of those that send tallies nobody is judged:
-    theirs do not weigh alike."""
-    if settings.min_votes < 2 or not all(vote.states is not None for vote in votes):
-        return set()
-    found = np.zeros(len(votes), dtype=np.bool_)
-    if settings.max_contradiction < 1.0:
-        planes = np.moveaxis(tally, -1, 0).reshape(N_STATES, -1)
-        found |= contradicting(_states_of(votes, ASKED), planes[:, ASKED], settings.max_contradiction)
+def _contradicting(
+    votes: Sequence[TileVote], states: U8, tally: NDArray[Any], quorum: int, settings: FuseSettings
+) -> Bool:
+    if settings.max_contradiction >= 1.0:
+        return np.zeros(len(votes), dtype=np.bool_)
+    planes = np.moveaxis(tally, -1, 0).reshape(N_STATES, -1)
+    asked = _states_of(votes, ASKED)
+    return np.asarray(contradicting(asked, planes[:, ASKED], settings.max_contradiction, quorum))
+
+
+def _denying(votes: Sequence[TileVote], states: U8, tally: NDArray[Any], quorum: int, settings: FuseSettings) -> Bool:
     changed = np.flatnonzero((states == CellState.CHANGED_OCCUPIED) | (states == CellState.CHANGED_EMPTY))
-    if settings.max_denial < 1.0 and len(changed):
-        found |= denying(_states_of(votes, changed), states.reshape(-1)[changed], settings.max_denial)
-    return {votes[int(i)].vehicle for i in np.flatnonzero(found)}
+    if settings.max_denial >= 1.0 or not len(changed):
+        return np.zeros(len(votes), dtype=np.bool_)
+    return denying(_states_of(votes, changed), states.reshape(-1)[changed], settings.max_denial)
 
 
 def supported_words(votes: Sequence[TileVote], states: U8, min_votes: int) -> U64 | None:

@@ -1,12 +1,12 @@
 """Who is not heard on a tile: a vehicle that says the opposite of the others nearly everywhere, or nearly wherever
 something changed (DESIGN 4, liars).
 
-A majority of 2k + 1 vehicles outvotes k that lie, but a change also needs only k + 1 to back it, and the k who lie lend
-their votes to whatever error a single honest vehicle makes. Where the others agree among themselves over most of a
-tile and one of them contradicts it over most of that, its votes say nothing of the world. An honest vehicle differs
-in some per cent of the cells; a demolished block is some per cent of a tile. A vehicle that denies nearly every change
-which a quorum decided replays the old street, or saw it last: it would cost every change that an honest vehicle missed.
-Whoever is found out is one of the k that the quorum of k + 1 guards against, so that k is smaller by one.
+A majority of 2k + 1 vehicles outvotes k that lie, but a change also needs k + 1 to back it: k who lie lend their votes
+to whatever error a single honest vehicle makes, or cost every change that one honest vehicle missed. So a vehicle is
+not heard where it contradicts what k + 1 others agree on over most of a tile, or denies nearly every change that k + 1
+backed there (it replays the old street, or saw it last). Of k + 1 at least one is honest, so k who lie can make no
+honest vehicle look so. An honest vehicle differs from another in some per cent of the cells; a demolished block is
+some per cent of a tile. Whoever is found out was one of the k, which is smaller by one without it.
 """
 
 from __future__ import annotations
@@ -29,14 +29,14 @@ _ASKED, _AGREED, _OPPOSED = 0b1, 0b10, 0b100
 
 
 @numba.njit(cache=True, nogil=True)
-def contradicting(states: U8, tally: NDArray[Any], most: float) -> Bool:
+def contradicting(states: U8, tally: NDArray[Any], most: float, quorum: int) -> Bool:
     """(n,) which vehicles' ``states`` (n, asked) oppose the others in more than ``most`` of the cells they agree on.
 
-    ``tally`` (5, asked) in VOTE_UNITs of all these vehicles, a vote each. Nothing is said of a vehicle unless the
-    others agree on most cells that two of them determined, so that k liars cannot make an honest vehicle look like one.
+    ``tally`` (5, asked) in VOTE_UNITs of all these vehicles, a vote each. Nothing is said of a vehicle unless a
+    majority of the others, and at least ``quorum``, agree on most cells that so many of them determined.
     """
     found = np.zeros(len(states), dtype=np.bool_)
-    others = _others(tally)
+    others = _others(tally, quorum)
     for vehicle in range(len(states)):
         own = states[vehicle]
         asked, agreed, opposed = 0, 0, 0
@@ -61,10 +61,11 @@ def denying(states: U8, decided: U8, most: float) -> Bool:
 
 
 @numba.njit(cache=True, nogil=True)
-def _others(tally: NDArray[Any]) -> U8:
+def _others(tally: NDArray[Any], quorum: int) -> U8:
     """(asked, 8) what the others say of a cell, by the last three bits of what a vehicle says there itself.
 
-    _ASKED if at least two of them determined it, _AGREED if more than half of those alike, _OPPOSED if not as it says.
+    _ASKED if ``quorum`` of them determined it, _AGREED if more than half of those, and as many, alike, _OPPOSED if not
+    as it says.
     Nothing to a vehicle that left the cell undetermined (4) or has no vote there (7).
     """
     said = np.zeros((tally.shape[1], 8), dtype=np.uint8)
@@ -76,8 +77,8 @@ def _others(tally: NDArray[Any]) -> U8:
                 total += votes
                 if votes > best:
                     best, best_state = votes, state
-            if total >= 2 * VOTE_UNIT:
+            if total >= quorum * VOTE_UNIT:
                 said[i, own] = _ASKED
-                if 2 * best > total:
+                if 2 * best > total and best >= quorum * VOTE_UNIT:
                     said[i, own] |= _AGREED if best_state == own else _AGREED | _OPPOSED
     return said

@@ -20,6 +20,8 @@ from mapvote.core.voting import VOTE_UNIT, decide
 from mapvote.perception.classify import below_top
 from mapvote.perception.evidence import PLANES, STRUCK_ITSELF, THROUGH_ITSELF, count_of, is_open
 
+_LOWEST, _HIGHEST = np.uint64(0b11), np.uint64(3) << np.uint64(TOP_BIT - 1)
+
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
@@ -36,7 +38,7 @@ class Verdict:
     adrift: Bool
     """(rows, cols) mapped cells whose voxels no ray struck and hardly any crossed, while rays passed below (rule H)."""
     loose: U64
-    """(rows, cols) mapped voxels into which no hit ever fell, and through which a ray went (rule I)."""
+    """(rows, cols) mapped voxels into which no hit ever fell, and through which rays went (rule I)."""
 
     def states(self) -> U8:
         return decide(self.tally)
@@ -146,9 +148,18 @@ def weigh(planes: U64, base: I32, occupied: U64, near: U64, free: U64, low: Bool
         settings.min_scans if "G" in rules else 1,
         settings.min_support if "G" in rules else 1, tally, gone, new, beside, adrift,
     )  # fmt: skip
-    here = planes[1:-1, 1:-1]
-    loose = np.where(low, np.uint64(0), here[..., THROUGH_ITSELF] & ~here[..., STRUCK_ITSELF])
+    loose = np.where(low, np.uint64(0), _loose(planes[1:-1, 1:-1]))
     return Verdict(tally, gone, new, beside, adrift, loose)
+
+
+def _loose(planes: U64) -> U64:
+    """(rows, cols) mapped voxels into which no hit ever fell, and through which rays went, as through the voxels above
+    and below them: grazing a roof says nothing (rule A). The ground bounds the lowest, the end of the word the highest.
+    """
+    itself = planes[..., THROUGH_ITSELF]
+    through = np.bitwise_or.reduce(planes[..., :PLANES], axis=-1) | itself
+    below, above = through << np.uint64(1) | _LOWEST, through >> np.uint64(1) | _HIGHEST
+    return np.asarray(itself & ~planes[..., STRUCK_ITSELF] & below & above)
 
 
 def unexplained(states: U8, beside: Bool, reach: int) -> Bool:
