@@ -29,7 +29,7 @@ def entry(macro: float, valid: float = 0.0) -> dict[str, Any]:
             "added_false": 0.0,
         },
         "coverage": 0.9,
-        "objects": {"found": [True, False], "false_m2": [2.5, 1.5]},
+        "objects": {"found": [True, False], "met": [True, True], "false_m2": [2.5, 1.5]},
     }
 
 

@@ -137,8 +137,19 @@ def test_an_object_is_found_by_half_of_its_cells_and_inventions_are_measured() -
     ]
     scores = score_objects(states, truth, objects, 0.3)
     assert scores.found == (True, False)
+    assert scores.met == (True, True), "1.8 and 1.4 m2 in one piece"
     assert scores.recall == (0.5, 0.4)
     assert scores.false_m2 == (2.25,)
+
+
+def test_an_object_is_met_by_one_connected_change_and_not_by_scattered_cells() -> None:
+    truth = np.zeros((40, 40), np.uint8)
+    truth[5:25, 5:25] = 1
+    objects = [{"kind": "built", "cells": truth == 1}]
+    scattered = np.where((np.indices(truth.shape) % 3 == 0).all(axis=0), CellState.CHANGED_OCCUPIED, 1).astype(np.uint8)
+    assert score_objects(scattered, truth, objects, 0.3).met == (False,)
+    scattered[10:14, 10:13] = CellState.CHANGED_OCCUPIED
+    assert score_objects(scattered, truth, objects, 0.3).met == (True,)
 
 
 def test_scores_are_values() -> None:

@@ -115,7 +115,8 @@ DEMANDS: Sequence[Demand] = (
     _more_vehicles(3, 5),
     _more_vehicles(5, 7),
     _more_vehicles(7, 10),
-    Demand("objects found", "main", _COLUMNS, "found", 1.0, 1.0, 1.0),
+    Demand("objects found (a connected change of 1 m2)", "main", _COLUMNS, "met", 1.0, 1.0, 1.0),
+    Demand("objects found by half of their cells", "main", _COLUMNS, "found", 1.0, 1.0, 1.0),
     Demand("false objects above 2 m2", "main", _COLUMNS, "false_objects", 0.0, 0.0, 0.0),
 )  # fmt: skip
 

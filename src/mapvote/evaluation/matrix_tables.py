@@ -41,9 +41,8 @@ class Figure:
         return " ± ".join(f"{scale * x:.{digits}f}" for x in (s.mean, s.deviation)) + f" ({scale * s.worst:.{digits}f})"
 
 
-def _found(entry: Entry) -> float:
-    found = entry["objects"]["found"]
-    return sum(found) / len(found) if found else 1.0
+def _share(of: list[bool]) -> float:
+    return sum(of) / len(of) if of else 1.0
 
 
 def _false_objects(entry: Entry) -> float:
@@ -62,7 +61,8 @@ FIGURES: Mapping[str, Figure] = {
     "new": Figure("new added", lambda e: e["map"]["new_added"], percent=True),
     "false": Figure("added on no surface", lambda e: e["map"]["added_false"], more_is_better=False, percent=True),
     "coverage": Figure("determined by a vehicle", lambda e: e["coverage"], percent=True),
-    "found": Figure("objects found", _found, percent=True),
+    "met": Figure("objects found", lambda e: _share(e["objects"]["met"]), percent=True),
+    "found": Figure("half of them found", lambda e: _share(e["objects"]["found"]), percent=True),
     "false_objects": Figure("false objects > 2 m2", _false_objects, more_is_better=False),
 }
 

@@ -186,6 +186,8 @@ class ObjectScores:
 
     found: tuple[bool, ...]
     """Per true object: at least half of its changed truth cells were decided so."""
+    met: tuple[bool, ...]
+    """Per true object: a connected change of ``min_m2`` was decided on its truth cells (all of them, if less)."""
     recall: tuple[float, ...]
     """Per true object: share of its changed truth cells decided so."""
     false_m2: tuple[float, ...]
@@ -193,7 +195,12 @@ class ObjectScores:
 
     def to_dict(self) -> dict[str, object]:
         """Plain lists for JSON."""
-        return {"found": list(self.found), "recall": list(self.recall), "false_m2": list(self.false_m2)}
+        return {
+            "found": list(self.found),
+            "met": list(self.met),
+            "recall": list(self.recall),
+            "false_m2": list(self.false_m2),
+        }
 
 
 def score_objects(
@@ -206,13 +213,16 @@ def score_objects(
     Objects with no truth cell (never reachable by a ray) are not asked for.
     """
     decided = classes_of(states)
-    recalls = []
+    neighbours = np.ones((3, 3), dtype=np.bool_)
+    recalls, met = [], []
     for item in objects:
         kind = 1 if item["kind"] == "built" else 2
         wanted = np.asarray(item["cells"], dtype=np.bool_) & (truth == kind)
         if wanted.any():
-            recalls.append(ratio(np.count_nonzero(wanted & (decided == kind)), np.count_nonzero(wanted)))
-    neighbours = np.ones((3, 3), dtype=np.bool_)
+            right = wanted & (decided == kind)
+            recalls.append(ratio(np.count_nonzero(right), np.count_nonzero(wanted)))
+            pieces = np.bincount(ndimage.label(right, structure=neighbours)[0].ravel())[1:]
+            met.append(max(pieces, default=0) * cell_size**2 >= min(min_m2, np.count_nonzero(wanted) * cell_size**2))
     false = []
     for kind in (1, 2):
         labels, count = ndimage.label(decided == kind, structure=neighbours)
@@ -221,4 +231,6 @@ def score_objects(
         touched = np.bincount(labels[near], minlength=count + 1)[1:] > 0
         false += [float(size) for size, real in zip(sizes, touched, strict=True) if size >= min_m2 and not real]
     found = tuple(share >= 0.5 for share in recalls)
-    return ObjectScores(found, tuple(recalls), tuple(round(area, 2) for area in sorted(false, reverse=True)))
+    return ObjectScores(
+        found, tuple(met), tuple(recalls), tuple(round(area, 2) for area in sorted(false, reverse=True))
+    )
