@@ -14,7 +14,7 @@ import numpy as np
 from scipy import ndimage
 
 from mapvote.config import VotingSettings
-from mapvote.core.columns import TOP_BIT, neighbourhood
+from mapvote.core.columns import TOP_BIT, dilated, neighbourhood
 from mapvote.core.types import I32, U8, U64, Bool, CellState
 from mapvote.core.voting import VOTE_UNIT, decide
 from mapvote.perception.classify import below_top
@@ -188,6 +188,12 @@ def fallen(states: U8, adrift: Bool, reach: int) -> Bool:
     falls = np.bincount(group[to_gone <= reach], minlength=count + 1) > 0
     falls[0] = False
     return np.asarray(falls[group])
+
+
+def beside_new(planes: U64, occupied: U64, base: I32) -> U64:
+    """(rows, cols) voxels in which, or next to which, something was struck where the map holds nothing."""
+    struck = np.bitwise_or.reduce(planes[..., PLANES : 2 * PLANES], axis=-1)
+    return dilated(struck & ~occupied, base, 1)
 
 
 @numba.njit(cache=True, nogil=True)

@@ -20,7 +20,7 @@ from mapvote.core.voting import decide, one_hot
 from mapvote.perception.classify import classify_paper
 from mapvote.perception.evidence import Evidence, free_words
 from mapvote.perception.tally import Tally
-from mapvote.perception.verdict import Verdict, drop_specks, fallen, remnants, unexplained, weigh
+from mapvote.perception.verdict import Verdict, beside_new, drop_specks, fallen, remnants, unexplained, weigh
 from mapvote.perception.visibility import ScanView
 
 ALL_BITS = ~np.uint64(0)
@@ -97,6 +97,7 @@ class ColumnVoter:
         """Every tile with evidence, in ascending order."""
         out: dict[TileIndex, TileVotes] = {}
         said: dict[TileIndex, Verdict] = {}
+        crowded: dict[TileIndex, U64] = {}
         maps: dict[TileIndex, Reference] = {}
         for tile, planes in sorted(self.evidence.tiles.items()):
             window = tile_grid(self.point_map.lattice, tile)
@@ -113,6 +114,7 @@ class ColumnVoter:
                     free[here.free != 0] = 0  # what the map knows need not be sent
                 out[tile] = TileVotes(verdict.tally, verdict.states(), verdict.gone, None, verdict.new, free)
                 said[tile], maps[tile] = verdict, here
+                crowded[tile] = beside_new(counts, around.occupied, around.base)[1:-1, 1:-1]
         if "C" in self.voting.rules:
             self._drop_explained(out, {tile: verdict.beside for tile, verdict in said.items()})
         if "H" in self.voting.rules:
@@ -120,7 +122,7 @@ class ColumnVoter:
         if "G" in self.voting.rules:
             self._drop_specks(out)
         if "I" in self.voting.rules:
-            self._drop_remnants(out, {tile: verdict.loose for tile, verdict in said.items()}, maps)
+            self._drop_remnants(out, {tile: verdict.loose for tile, verdict in said.items()}, crowded, maps)
         return out
 
     def _drop_explained(self, votes: dict[TileIndex, TileVotes], beside: dict[TileIndex, Bool]) -> None:
@@ -160,9 +162,14 @@ class ColumnVoter:
             v.states[drop_specks(wide, halo)[halo:-halo, halo:-halo]] = CellState.UNDETERMINED
 
     def _drop_remnants(
-        self, votes: dict[TileIndex, TileVotes], loose: dict[TileIndex, U64], maps: dict[TileIndex, Reference]
+        self,
+        votes: dict[TileIndex, TileVotes],
+        loose: dict[TileIndex, U64],
+        crowded: dict[TileIndex, U64],
+        maps: dict[TileIndex, Reference],
     ) -> None:
-        """Rule I, with enough of a tile's neighbours. A cell of which nothing is left that way is changed-empty."""
+        """Rule I, with enough of a tile's neighbours. A cell of which nothing is left that way is changed-empty, unless
+        new hits lie next to what went: they may be what stands there, put beside it by an error of pose."""
         base = {tile: here.base for tile, here in maps.items()}
         gone: dict[TileIndex, U64] = {}
         for tile, v in votes.items():
@@ -172,7 +179,7 @@ class ColumnVoter:
             wide = tile_grid(self.point_map.lattice, tile).padded(_HALO)
             near = self._around(gone, wide, 0), self._around(loose, wide, 0), self._around(base, wide, 0)
             left = remnants(*near)[_HALO:-_HALO, _HALO:-_HALO]
-            nothing_left = (left | gone[tile]) == maps[tile].occupied
+            nothing_left = ((left | gone[tile]) == maps[tile].occupied) & (left & crowded[tile] == 0)
             fell = (left != 0) & nothing_left & (v.states != CellState.CHANGED_EMPTY)
             v.states[fell] = CellState.CHANGED_EMPTY
             v.tally[fell] = one_hot(np.array(CellState.CHANGED_EMPTY, dtype=np.uint8))
