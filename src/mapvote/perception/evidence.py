@@ -95,14 +95,14 @@ def _gather(
                 near = neighbourhood(hit, base, r, c, reach) & mapped if veto else hit[r, c] & mapped
                 if not by_ray and sight[r, c] >= _BEHIND and not hit[r, c]:
                     through |= mapped
-                itself = hit[r, c] & mapped
-                planes[i, j, STRUCK_ITSELF] |= itself
-                if reach == 1:  # where a scan is not sure of its pose, single voxels mean nothing
-                    planes[i, j, THROUGH_ITSELF] |= passed[r, c] & mapped & ~itself
                 struck = (struck & ~mapped) | near
                 through &= ~near
             if through or struck:
                 cell = planes[i, j]
+                if mapped:
+                    cell[STRUCK_ITSELF] |= hit[r, c] & mapped
+                    if reach == 1:  # where a scan is not sure of its pose, single voxels mean nothing
+                        cell[THROUGH_ITSELF] |= passed[r, c] & mapped & ~hit[r, c]
                 if _is_full(cell, _THROUGH, through) or _is_full(cell, _STRUCK, struck):
                     _halve(cell)
                 _add(cell, _THROUGH, through)
