@@ -11,6 +11,8 @@ from __future__ import annotations
 
 import argparse
 import json
+import time
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +35,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("out/matrix"))
     parser.add_argument("--cache", type=Path, default=default_cache(), help="where drives, maps and ballots are kept")
     parser.add_argument("--config", type=Path, help="settings (TOML)")
-    parser.add_argument("--workers", type=int, default=2, help="drives at a time")
+    parser.add_argument("--workers", type=int, default=2, help="experiments at a time, each on one core")
     parser.add_argument("--drop-drives", action="store_true", help="delete scans (3 GB a seed) once they are done with")
     parser.add_argument("--tables-only", action="store_true", help="only write what earlier runs measured")
     arguments = parser.parse_args()
@@ -53,15 +55,18 @@ def main() -> None:
         parked=arguments.parked,
     )
     results: dict[str, dict[int, dict[str, Any]]] = {}
-    for name in names:
-        for seed in seeds:
-            if arguments.tables_only and not matrix.result_file(name, seed).is_file():
-                continue
-            console.print(f"{name}, {arguments.scenario} {seed}")
-            results.setdefault(name, {})[seed] = matrix.run(name, seed)
-            if arguments.drop_drives:
-                matrix.drop_drives(names, seed)
-            write(results, arguments.out)
+    started = time.monotonic()
+    if arguments.tables_only:
+        done = [(name, seed) for name in names for seed in seeds if matrix.result_file(name, seed).is_file()]
+        ended: Iterable[tuple[str, int, dict[str, Any]]] = ((n, seed, matrix.run(n, seed)) for n, seed in done)
+    else:
+        ended = matrix.run_all(names)
+    for name, seed, result in ended:
+        results.setdefault(name, {})[seed] = result
+        console.print(f"{(time.monotonic() - started) / 60:6.1f} min  {name}, {arguments.scenario} {seed}")
+        if arguments.drop_drives:
+            matrix.drop_drives(names, seed)
+        write({name: dict(sorted(results[name].items())) for name in names if name in results}, arguments.out)
     print(demands.table(results))
     print(f"{arguments.out / 'matrix.md'}: every table; matrix.json beside it: all numbers")
 

@@ -7,8 +7,10 @@ short goes on where it stopped, and experiments that share drives, maps or ballo
 from __future__ import annotations
 
 import json
+import multiprocessing
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from dataclasses import dataclass, field, replace
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -142,6 +144,22 @@ class Matrix:
         experiment = EXPERIMENTS[name]
         key = key_of(sources_digest(_SCORES_FROM), self.settings.model_dump_json(), self._cases(experiment))
         return self.scene(experiment, seed).work / "results" / f"{name.replace(' ', '-')}-{key}.json"
+
+    def run_all(self, names: Sequence[str]) -> Iterator[tuple[str, int, dict[str, Any]]]:
+        """(experiment, seed, result) of every experiment on every seed, as each ends: ``workers`` at a time, each on
+        one core, the first of ``names`` first. Two of one seed never run together: they share drives, map and ballots.
+        """
+        alone = replace(self, workers=1)
+        waiting = [(name, seed) for name in names for seed in self.seeds]
+        running: dict[Future[dict[str, Any]], tuple[str, int]] = {}
+        with ProcessPoolExecutor(self.workers, mp_context=multiprocessing.get_context("spawn")) as pool:
+            while waiting or running:
+                for name, seed in list(waiting):
+                    if len(running) < self.workers and all(seed != other for _, other in running.values()):
+                        running[pool.submit(alone.run, name, seed)] = (name, seed)
+                        waiting.remove((name, seed))
+                for ended in wait(running, return_when=FIRST_COMPLETED).done:
+                    yield *running.pop(ended), ended.result()
 
     def run(self, name: str, seed: int, progress: Progress | None = None) -> dict[str, Any]:
         """The result of one experiment on one seed: entries by round, as in ``evaluate --json``, and the poses'."""
