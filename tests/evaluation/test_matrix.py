@@ -88,7 +88,7 @@ def test_the_whole_machinery_on_a_corner_twice_and_without_the_drives(tmp_path: 
     """Every kind of experiment runs, a second run repeats the numbers from the cache, and scans can be dropped."""
     names = ["main", "liars", "imported", "noise", "2 Hz", "parked", "all true"]
     matrix = Matrix("corner", (1,), tmp_path, Settings(), workers=1, parked=2)
-    results = {name: {1: matrix.run(name, 1)} for name in names}
+    results = {name: {seed: result} for name, seed, result in matrix.run_all(names)}
     text = demands.table(results)
     asked = {demand.what for demand in DEMANDS if demand.experiment in names and demand.values(results)}
     assert asked == {demand.what for demand in DEMANDS if demand.experiment in names}
