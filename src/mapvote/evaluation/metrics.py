@@ -222,7 +222,8 @@ def score_objects(
             right = wanted & (decided == kind)
             recalls.append(ratio(np.count_nonzero(right), np.count_nonzero(wanted)))
             pieces = np.bincount(ndimage.label(right, structure=neighbours)[0].ravel())[1:]
-            met.append(max(pieces, default=0) * cell_size**2 >= min(min_m2, np.count_nonzero(wanted) * cell_size**2))
+            least = min(min_m2, np.count_nonzero(wanted) * cell_size**2)
+            met.append(bool(max(pieces, default=0) * cell_size**2 >= least))
     false = []
     for kind in (1, 2):
         labels, count = ndimage.label(decided == kind, structure=neighbours)

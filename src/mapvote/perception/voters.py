@@ -6,28 +6,24 @@ A voter takes in scan after scan and gives, tile by tile, the same thing: a tall
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 
 from mapvote.config import VotingSettings
 from mapvote.core.columns import above_ground_points, cut_reference, dilated, reference_window
-from mapvote.core.grid import Grid, TileIndex, tile_grid
+from mapvote.core.grid import TileIndex, tile_grid
 from mapvote.core.sensors import Sensor
-from mapvote.core.types import F64, I32, NO_VOTE, U8, U64, Bool, CellState, PointMap, Reference
-from mapvote.core.voting import decide, one_hot
+from mapvote.core.types import F64, I32, U8, U64, CellState, PointMap, Reference
+from mapvote.core.voting import decide
 from mapvote.perception.classify import classify_paper
 from mapvote.perception.evidence import Evidence, free_words
 from mapvote.perception.tally import Tally
-from mapvote.perception.verdict import Verdict, beside_new, drop_specks, fallen, remnants, unexplained, weigh
+from mapvote.perception.together import Judged, around, settle
+from mapvote.perception.verdict import beside_new, weigh
 from mapvote.perception.visibility import ScanView
 
 ALL_BITS = ~np.uint64(0)
-_HALO = 64
-"""Cells around a tile that rules H and I look at: 19 m, a house."""
-Plane = Any
-"""An array of one tile or window, of any type."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,109 +91,33 @@ class ColumnVoter:
 
     def votes(self) -> dict[TileIndex, TileVotes]:
         """Every tile with evidence, in ascending order."""
-        out: dict[TileIndex, TileVotes] = {}
-        said: dict[TileIndex, Verdict] = {}
-        crowded: dict[TileIndex, U64] = {}
-        maps: dict[TileIndex, Reference] = {}
-        for tile, planes in sorted(self.evidence.tiles.items()):
-            window = tile_grid(self.point_map.lattice, tile)
-            around = reference_window(self.point_map, window.padded(1))
-            counts = self._around(self.evidence.tiles, around.grid, 0)
-            near = dilated(around.occupied, around.base, 1)[1:-1, 1:-1]
-            here = cut_reference(around, window)
-            known = here.free if here.free is not None else above_ground_points(self.point_map, window)
-            low = here.top_z - here.ground_z < self.voting.min_height_m
-            verdict = weigh(counts, around.base, here.occupied, near, known, low, self.voting)
-            if verdict.tally.any():
-                free = free_words(planes, here.occupied)
-                if here.free is not None:
-                    free[here.free != 0] = 0  # what the map knows need not be sent
-                out[tile] = TileVotes(verdict.tally, verdict.states(), verdict.gone, None, verdict.new, free)
-                said[tile], maps[tile] = verdict, here
-                crowded[tile] = beside_new(counts, around.occupied, around.base)[1:-1, 1:-1]
-        if "C" in self.voting.rules:
-            self._drop_explained(out, {tile: verdict.beside for tile, verdict in said.items()})
-        if "H" in self.voting.rules:
-            self._drop_what_fell(out, {tile: verdict.adrift for tile, verdict in said.items()}, maps)
-        if "G" in self.voting.rules:
-            self._drop_specks(out)
-        if "I" in self.voting.rules:
-            self._drop_remnants(out, {tile: verdict.loose for tile, verdict in said.items()}, crowded, maps)
+        judged: dict[TileIndex, Judged] = {}
+        for tile in sorted(self.evidence.tiles):
+            found = self._judge(tile)
+            if found.verdict.tally.any():
+                judged[tile] = found
+        settle(judged, self.point_map.lattice, self.voting)
+        out = {}
+        for tile, found in judged.items():
+            here, verdict = found.here, found.verdict
+            free = free_words(self.evidence.tiles[tile], here.occupied)
+            if here.free is not None:
+                free[here.free != 0] = 0  # what the map knows need not be sent
+            out[tile] = TileVotes(verdict.tally, found.states, verdict.gone, found.remnants, verdict.new, free)
         return out
 
-    def _drop_explained(self, votes: dict[TileIndex, TileVotes], beside: dict[TileIndex, Bool]) -> None:
-        """Rule C, with the cells around a tile, so that what touches across its edge is joined from both sides."""
-        states = {tile: v.states.copy() for tile, v in votes.items()}
-        halo = self.voting.join_cells
-        for tile, v in votes.items():
-            wide = tile_grid(self.point_map.lattice, tile).padded(halo)
-            near = self._around(states, wide, NO_VOTE), self._around(beside, wide, False)
-            cells = unexplained(*near, halo)[halo:-halo, halo:-halo]
-            v.states[cells] = CellState.UNDETERMINED
-            v.tally[cells] = one_hot(np.array(CellState.UNDETERMINED, dtype=np.uint8))
-
-    def _drop_what_fell(
-        self, votes: dict[TileIndex, TileVotes], adrift: dict[TileIndex, Bool], maps: dict[TileIndex, Reference]
-    ) -> None:
-        """Rule H, with enough of a tile's neighbours that groups across its edge are judged alike from both sides."""
-        states = {tile: v.states for tile, v in votes.items()}
-        fell = {}
-        for tile in votes:
-            wide = tile_grid(self.point_map.lattice, tile).padded(_HALO)
-            near = (self._around(states, wide, NO_VOTE), self._around(adrift, wide, False))
-            fell[tile] = fallen(*near, self.voting.fall_cells)[_HALO:-_HALO, _HALO:-_HALO]
-        for tile, cells in fell.items():
-            votes[tile].states[cells] = CellState.CHANGED_EMPTY
-            votes[tile].tally[cells] = one_hot(np.array(CellState.CHANGED_EMPTY, dtype=np.uint8))
-            gone = votes[tile].gone
-            assert gone is not None
-            gone[cells] = maps[tile].occupied[cells]
-
-    def _drop_specks(self, votes: dict[TileIndex, TileVotes]) -> None:
-        """Rule G, with the cells around a tile, so that a component across its edge counts in full."""
-        states = {tile: v.states.copy() for tile, v in votes.items()}
-        halo = self.voting.min_cells
-        for tile, v in votes.items():
-            wide = self._around(states, tile_grid(self.point_map.lattice, tile).padded(halo), NO_VOTE)
-            v.states[drop_specks(wide, halo)[halo:-halo, halo:-halo]] = CellState.UNDETERMINED
-
-    def _drop_remnants(
-        self,
-        votes: dict[TileIndex, TileVotes],
-        loose: dict[TileIndex, U64],
-        crowded: dict[TileIndex, U64],
-        maps: dict[TileIndex, Reference],
-    ) -> None:
-        """Rule I, with enough of a tile's neighbours. A cell of which nothing is left that way is changed-empty, unless
-        new hits lie next to what went: they may be what stands there, put beside it by an error of pose."""
-        base = {tile: here.base for tile, here in maps.items()}
-        gone: dict[TileIndex, U64] = {}
-        for tile, v in votes.items():
-            assert v.gone is not None
-            gone[tile] = np.where(v.states == CellState.CHANGED_EMPTY, v.gone, np.uint64(0))
-        for tile, v in votes.items():
-            wide = tile_grid(self.point_map.lattice, tile).padded(_HALO)
-            near = self._around(gone, wide, 0), self._around(loose, wide, 0), self._around(base, wide, 0)
-            left = remnants(*near)[_HALO:-_HALO, _HALO:-_HALO]
-            nothing_left = ((left | gone[tile]) == maps[tile].occupied) & (left & crowded[tile] == 0)
-            fell = (left != 0) & nothing_left & (v.states != CellState.CHANGED_EMPTY)
-            v.states[fell] = CellState.CHANGED_EMPTY
-            v.tally[fell] = one_hot(np.array(CellState.CHANGED_EMPTY, dtype=np.uint8))
-            down = v.states == CellState.CHANGED_EMPTY
-            assert v.gone is not None
-            v.gone[down] |= left[down]
-            votes[tile] = replace(v, remnants=np.where(down, np.uint64(0), left))
-
-    def _around(self, planes: dict[TileIndex, Plane], wide: Grid, elsewhere: int) -> Plane:
-        """The planes of several tiles as one window."""
-        first = next(iter(planes.values()))
-        out = np.full((*wide.shape, *first.shape[2:]), elsewhere, dtype=first.dtype)
-        for tile in wide.tiles():
-            if tile in planes:
-                grid = tile_grid(self.point_map.lattice, tile)
-                common = grid.intersection(wide)
-                out[common.slices_in(wide)] = planes[tile][common.slices_in(grid)]
-        return out
+    def _judge(self, tile: TileIndex) -> Judged:
+        """What the tile's own evidence says, cell by cell."""
+        window = tile_grid(self.point_map.lattice, tile)
+        outer = reference_window(self.point_map, window.padded(1))
+        counts = around(self.point_map.lattice, self.evidence.tiles, outer.grid, 0)
+        near = dilated(outer.occupied, outer.base, 1)[1:-1, 1:-1]
+        here = cut_reference(outer, window)
+        known = here.free if here.free is not None else above_ground_points(self.point_map, window)
+        low = here.top_z - here.ground_z < self.voting.min_height_m
+        verdict = weigh(counts, outer.base, here.occupied, near, known, low, self.voting)
+        crowded = beside_new(counts, outer.occupied, outer.base)[1:-1, 1:-1]
+        return Judged(here, verdict, verdict.states(), crowded, np.zeros_like(verdict.gone))
 
 
 Voter = PaperVoter | ColumnVoter
