@@ -17,6 +17,7 @@ from mapvote.core.ballot import Ballot, encode
 from mapvote.core.types import U64, CellState, MapvoteError, PointMap
 from mapvote.fleet.ballotbox import Receipt, withdraw
 from mapvote.fleet.errors import Conflict, Held, NotFound, Unavailable
+from mapvote.fleet.explain import explain_cell
 from mapvote.fleet.intake import Intake, accept, examine
 from mapvote.fleet.publish import publish, rollback
 from mapvote.fleet.store import Store
@@ -163,6 +164,8 @@ def test_rolled_back_remnants_stay_until_new_votes_come(store: Store) -> None:
 
     old = [mark(v, 0) for v in "ab"]
     send(store, *old)
+    story = explain_cell(store, (CELL[1] + 0.5) * 0.3, (CELL[0] + 0.5) * 0.3, POLICY)
+    assert [(v.state, v.marks, v.counts) for v in story.votes] == [("unchanged_occupied", 1, True)] * 2
     assert publish(store, POLICY).deleted == 1
     rollback(store, 1, reason="it still stands")
     send(store, *old)

@@ -35,6 +35,8 @@ class CellVote:
     drive: str
     state: str
     """Lower case; no_vote where it says nothing."""
+    marks: int | None
+    """Voxels of the map that it says are gone here, of a changed cell or beside what stands; None: it sent no mask."""
     end_ns: int
     counts: bool
     why: str
@@ -93,7 +95,8 @@ def explain_cell(store: Store, x: float, y: float, settings: FuseSettings) -> Ce
             why = "the cell has changed since its base, or a rollback has barred it"
         elif vote.vehicle in silenced:
             counts, why = False, "opposes the others over most of this tile, or denies nearly all that changed on it"
-        votes.append(CellVote(stored.vehicle, stored.drive, _said(vote, cell), stored.end_ns, counts, why))
+        said, marks = _said(vote, cell), _marks(vote, cell)
+        votes.append(CellVote(stored.vehicle, stored.drive, said, marks, stored.end_ns, counts, why))
     story = [(version, state_name(int(states[cell]))) for version, states in decided if states[cell] != NO_VOTE]
     return CellStory(row, col, votes, story)
 
@@ -197,3 +200,10 @@ def _said(vote: TileVote, cell: tuple[int, int]) -> str:
         return state_name(int(vote.states[cell]))
     assert vote.tally is not None
     return state_name(int(vote.tally[cell].argmax())) if vote.tally[cell].any() else "no_vote"
+
+
+def _marks(vote: TileVote, cell: tuple[int, int]) -> int | None:
+    if vote.gone is None:
+        return None
+    mine = vote.gone.words[vote.gone.cells == cell[0] * TILE_CELLS + cell[1]]
+    return int(mine[0]).bit_count() if len(mine) else 0

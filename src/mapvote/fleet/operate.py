@@ -82,6 +82,7 @@ def cell(request: Request, x: float, y: float) -> dict[str, Any]:
             "vehicle": v.vehicle,
             "drive": v.drive,
             "state": v.state,
+            "marks": v.marks,
             "end": iso(v.end_ns),
             "counts": v.counts,
             "why": v.why,

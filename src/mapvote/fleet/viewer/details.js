@@ -65,6 +65,8 @@ export async function showCell([x, y]) {
     element("li", { className: v.counts ? "" : "silent" }, [
       element("div", { className: "head" }, [element("b", {}, [`${v.vehicle} / ${v.drive}`]), element("time", {}, [when(v.end)])]),
       element("div", {}, [CHANGE[v.state] && dot(CHANGE[v.state]), STATES[v.state] ?? v.state]),
+      v.marks > 0 && v.state === "unchanged_occupied"
+        && element("div", {}, [`but ${v.marks} of its voxels ${v.marks > 1 ? "are" : "is"} gone`]),
       !v.counts && element("div", { className: "why" }, [`does not count: ${v.why || "no reason given"}`]),
     ]);
   const decided = answer.decisions.map((d) => `Version ${d.version} decided: ${STATES[d.state] ?? d.state}.`);
