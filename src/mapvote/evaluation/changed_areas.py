@@ -9,6 +9,7 @@ import numpy as np
 
 from mapvote.core.geometry import exp
 from mapvote.core.types import F64, I64, Drive, PointMap
+from mapvote.evaluation.conditions import ar1
 from mapvote.evaluation.scene import Progress, Scene
 from mapvote.evaluation.truth import Truth, error_summary, rigid_between
 from mapvote.formats import read_map, write_map
@@ -48,7 +49,7 @@ def localise_in(drive: Drive, scans: I64, point_map: PointMap, scene: Scene) -> 
 def survey_anew(scene: Scene, without: str, progress: Progress | None = None) -> tuple[PointMap, F64]:
     """A map of today's street by our own SLAM from the drives of all vehicles but one, given a survey vehicle's RTK,
     and T_map_world: the truth's frame in its own."""
-    folder = scene.work / f"anew-without-{without}"
+    folder = scene.work / f"surveyed-anew-without-{without}"
     names = [name for name in scene.drive_names("v") if name != without]
     if not folder.exists():
         told = (lambda done, total: progress("surveying anew", done, total)) if progress else None
@@ -61,10 +62,12 @@ def survey_anew(scene: Scene, without: str, progress: Progress | None = None) ->
 
 
 def _with_rtk(scene: Scene, name: str) -> Drive:
+    """The drive with a survey vehicle's prior. Its error is smooth, as the first survey's: white noise averages out."""
     rng = np.random.default_rng([scene.seed, *name.encode()])
-    sigma = np.array([_RTK_M] * 3 + [np.radians(_RTK_DEG)] * 3)
-    T = np.array([T @ exp(rng.normal(0.0, sigma)) for T in scene.true_poses(name)])
-    return replace(scene.drive(name), T_map_lidar_prior=T, prior_sigma_m=_RTK_M, prior_sigma_deg=_RTK_DEG)
+    drive, sigma = scene.drive(name), np.array([_RTK_M] * 3 + [np.radians(_RTK_DEG)] * 3)
+    errors = ar1(drive.stamps_ns, sigma, rng)
+    T = np.array([T @ exp(error) for T, error in zip(scene.true_poses(name), errors, strict=True)])
+    return replace(drive, T_map_lidar_prior=T, prior_sigma_m=_RTK_M, prior_sigma_deg=_RTK_DEG)
 
 
 def in_changed_areas(
