@@ -18,9 +18,9 @@ from mapvote.fleet import schema
 from mapvote.fleet.changes import Decided, change_objects, changed_cells, to_geojson
 from mapvote.fleet.consensus import Compared, Spoken, Standing, compare, judge
 from mapvote.fleet.content import unpack_points_plane
-from mapvote.fleet.fuse import hear
+from mapvote.fleet.fuse import Rule, hear
 from mapvote.fleet.rounds import unpack_tally_plane
-from mapvote.fleet.standing import Round, counting_votes, read_votes, standing_tiles, stored_votes
+from mapvote.fleet.standing import Round, counting_votes, read_votes, rule_in_use, standing_tiles, stored_votes
 from mapvote.fleet.store import Store, current_version, load_blob, load_tile, tiles_of, version_of
 from mapvote.fleet.votes import TileVote, one_each, select
 
@@ -74,7 +74,8 @@ def explain_cell(store: Store, x: float, y: float, settings: FuseSettings) -> Ce
         old_enough = [vote for vote in everyone if vote.received_ns <= asked.received_by_ns]
         inside = {vote.seq for vote in select(old_enough, settings)}
         counting = {v.digest: v for v in counting_votes(connection, store.lattice, index, points, asked)}
-        silenced = _silenced(store, index, list(counting.values()), settings)
+        rule = rule_in_use(connection) or "columns"
+        silenced = _silenced(store, index, list(counting.values()), rule, settings)
         plain = read_votes(connection, index, everyone)
         query = sa.select(schema.decisions.c.version, schema.decisions.c.states)
         query = query.where(schema.decisions.c.row == index[0], schema.decisions.c.col == index[1])
@@ -101,10 +102,10 @@ def explain_cell(store: Store, x: float, y: float, settings: FuseSettings) -> Ce
     return CellStory(row, col, votes, story)
 
 
-def _silenced(store: Store, index: TileIndex, drives: list[TileVote], settings: FuseSettings) -> set[str]:
+def _silenced(store: Store, index: TileIndex, drives: list[TileVote], rule: Rule, settings: FuseSettings) -> set[str]:
     """Vehicles that are not heard on a tile, of the votes that count there."""
     votes = one_each(drives, tile_grid(store.lattice, index))
-    return {vote.vehicle for vote in votes} - {vote.vehicle for vote in hear(votes, "columns", settings)[0]}
+    return {vote.vehicle for vote in votes} - {vote.vehicle for vote in hear(votes, rule, settings)[0]}
 
 
 def changes_between(store: Store, old: int, new: int, min_cells: int = 1) -> dict[str, Any]:

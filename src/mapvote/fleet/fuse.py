@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from mapvote.config import FuseSettings
 from mapvote.core.grid import TILE_CELLS, Grid, Lattice, TileIndex, tile_grid
-from mapvote.core.types import F32, I32, I64, N_STATES, NO_VOTE, U8, U64, Bool, CellState, MapTile
+from mapvote.core.types import F32, I32, I64, N_STATES, NO_VOTE, U8, U64, Bool, CellState, MapTile, MapvoteError
 from mapvote.core.voting import VOTE_UNIT, add_states, add_tally, decide_cells
 from mapvote.fleet.edit import add_points, cells_of, delete_points, empty_tile, obstacle_bits
 from mapvote.fleet.hearing import ASKED, contradicting, denying
@@ -40,6 +40,15 @@ class Decision:
     """Points added to the tile."""
     deleted: int
     """Points deleted from the tile."""
+
+
+def rule_of(method: str) -> Rule:
+    """The server's half of a ballot's method; MapvoteError for one that this version does not know."""
+    if method == "paper":
+        return "paper"
+    if method == "columns":
+        return "columns"
+    raise MapvoteError(f"ballot: method {method!r} is unknown; this version fuses 'paper' and 'columns'")
 
 
 def count(votes: Sequence[TileVote], rule: Rule, min_votes: int) -> tuple[U8, NDArray[Any]]:

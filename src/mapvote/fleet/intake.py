@@ -15,8 +15,9 @@ from mapvote.fleet import keys, schema
 from mapvote.fleet.ballotbox import Incoming, Receipt, put_in
 from mapvote.fleet.content import TileHashes, same_cells, unpack_points_plane
 from mapvote.fleet.errors import Conflict, Unauthorised
+from mapvote.fleet.fuse import rule_of
 from mapvote.fleet.store import Store, current_number, load_blob, names, tiles_of
-from mapvote.fleet.update import rule_of, staged, tile_vote
+from mapvote.fleet.update import staged, tile_vote
 from mapvote.fleet.votes import DAY_NS
 
 MAX_CLOCK_AHEAD_NS = DAY_NS

@@ -19,7 +19,7 @@ from mapvote.fleet import schema
 from mapvote.fleet.content import TileHashes, pack_cells, same_cells, unpack_tile
 from mapvote.fleet.errors import Conflict, Held
 from mapvote.fleet.rounds import Fused, Task, fuse_round
-from mapvote.fleet.standing import Round, standing_tiles
+from mapvote.fleet.standing import Round, rule_in_use, standing_tiles
 from mapvote.fleet.store import (
     Store,
     Version,
@@ -32,7 +32,6 @@ from mapvote.fleet.store import (
     version_of,
     version_row,
 )
-from mapvote.fleet.update import rule_of
 
 Gate = Callable[[PointMap, PointMap], Sequence[str]]
 """Looks at (old map, new map) and gives the reasons to hold the new one; none lets it through."""
@@ -77,12 +76,12 @@ def publish(
             raise Conflict(f"the newest version is {newest.number}, not {parent}: look at it, then publish")
         mark = connection.execute(sa.select(sa.func.max(schema.events.c.seq))).scalar_one()
         hashes = tiles_of(connection, newest.number)
-        method = connection.execute(sa.select(schema.maps.c.method)).scalar_one()
+        in_use = rule_in_use(connection)
         policy = settings.model_dump(mode="json")
         nothing_but_votes = newest.kind == "publish" and newest.policy == policy and settings.min_age_s == 0
-        dirty = standing_tiles(connection, mark, newest.mark if nothing_but_votes else None) if method else []
+        dirty = standing_tiles(connection, mark, newest.mark if nothing_but_votes else None) if in_use else []
     asked = Round(mark, settings, store.clock() - round(settings.min_age_s * 1e9))
-    rule = rule_of(method.split(",")[0]) if method else "columns"
+    rule = in_use or "columns"
     tasks = [Task(url_text(store), store.lattice, index, hashes.get(index), asked, rule) for index in dirty]
     fused = fuse_round(tasks, store.database, executor)
     changed = [f for f in fused if f.hashes is not None]

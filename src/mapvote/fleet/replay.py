@@ -19,11 +19,11 @@ from mapvote.core.types import F32, MapTile
 from mapvote.fleet import schema
 from mapvote.fleet.content import TileHashes, pack_tile, same_cells
 from mapvote.fleet.errors import NotFound
+from mapvote.fleet.fuse import Rule
 from mapvote.fleet.publish import Outcome, url_text, write_version
 from mapvote.fleet.rounds import Task, fuse_round
-from mapvote.fleet.standing import Bar, Round, bars_on, standing_tiles
+from mapvote.fleet.standing import Bar, Round, bars_on, rule_in_use, standing_tiles
 from mapvote.fleet.store import Store, Version, load_tile, tiles_of
-from mapvote.fleet.update import rule_of
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,7 +45,7 @@ def replay(
         b = schema.ballots
         first = connection.execute(sa.select(sa.func.min(b.c.first_seq)).where(b.c.vehicle == vehicle)).scalar_one()
         mark = connection.execute(sa.select(sa.func.max(schema.events.c.seq))).scalar_one()
-        method = connection.execute(sa.select(schema.maps.c.method)).scalar_one()
+        rule = rule_in_use(connection)
     if first is None:
         raise NotFound(f"{vehicle!r} never voted here")
     history = store.versions()
@@ -57,7 +57,7 @@ def replay(
     kept = history[start - 1].mark  # rollbacks up to here hold as recorded, later ones are drawn anew
     bars: dict[TileIndex, list[Bar]] = {}
     for version in history[start:]:
-        states[version.number] = _again(store, version, states, bars, kept, without, method, executor)
+        states[version.number] = _again(store, version, states, bars, kept, without, rule, executor)
     tiles: dict[TileIndex, TileHashes | None] = {}
     planes: list[Mapping[str, bytes]] = []
     added = deleted = 0
@@ -85,7 +85,7 @@ def _again(
     bars: dict[TileIndex, list[Bar]],
     kept: int,
     without: set[str],
-    method: str | None,
+    rule: Rule | None,
     executor: Executor | None,
 ) -> _State:
     """What a version would have been."""
@@ -98,7 +98,7 @@ def _again(
             differ = ~same_cells(_points(now), _points(then), tile_grid(store.lattice, index))
             bars.setdefault(index, []).append(Bar(version.mark, differ))
         return target
-    if version.kind != "publish" or method is None:
+    if version.kind != "publish" or rule is None:
         return before
     policy = FuseSettings.model_validate(version.policy)
     asked = Round(version.mark, policy, version.created_ns - round(policy.min_age_s * 1e9), frozenset(without))
@@ -110,9 +110,7 @@ def _again(
             if tile is None and index in hashes:
                 tile = load_tile(connection, hashes[index])
             barred = (*bars_on(connection, index, kept), *bars.get(index, ()))
-            tasks.append(
-                Task(url_text(store), store.lattice, index, tile, asked, rule_of(method.split(",")[0]), barred)
-            )
+            tasks.append(Task(url_text(store), store.lattice, index, tile, asked, rule, barred))
     edited = {f.index: f.tile for f in fuse_round(tasks, store.database, executor) if f.hashes and f.tile is not None}
     return _State(before.root, dict(before.edited) | edited)
 

@@ -19,6 +19,7 @@ from mapvote.core.grid import Lattice, TileIndex, tile_grid
 from mapvote.core.types import F32, U8, Bool
 from mapvote.fleet import schema
 from mapvote.fleet.content import same_cells, unpack_cells, unpack_points_plane
+from mapvote.fleet.fuse import Rule, rule_of
 from mapvote.fleet.store import load_blob
 from mapvote.fleet.votes import TileVote, restrict, select
 from mapvote.fleet.words import Words
@@ -85,6 +86,12 @@ _BARS_ON = sa.select(_R.c.seq, _R.c.cells).where(_R.c.row == _ROW, _R.c.col == _
 _PLANES_OF = sa.select(_T.c.ballot, _T.c.states, _T.c.tally, _T.c.gone, _T.c.new_points, _T.c.free).where(
     _T.c.row == _ROW, _T.c.col == _COL, _T.c.ballot.in_(sa.bindparam("ballots", expanding=True))
 )
+
+
+def rule_in_use(connection: sa.Connection) -> Rule | None:
+    """The rule by which standing ballots are decided; None until one has come."""
+    method = connection.execute(sa.select(schema.maps.c.method)).scalar_one()
+    return rule_of(method.split(",")[0]) if method else None
 
 
 def standing_tiles(connection: sa.Connection, mark: int, since: int | None = None) -> list[TileIndex]:

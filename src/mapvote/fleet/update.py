@@ -19,7 +19,7 @@ from mapvote.core.ballot import (
 )
 from mapvote.core.grid import TileIndex
 from mapvote.core.types import MapTile, MapvoteError, PointMap
-from mapvote.fleet.fuse import Decision, Rule, fuse_tile
+from mapvote.fleet.fuse import Decision, Rule, fuse_tile, rule_of
 from mapvote.fleet.votes import TileVote, select
 from mapvote.fleet.words import Words
 
@@ -36,15 +36,6 @@ def tile_vote(ballot: Ballot, tile: BallotTile, digest: str) -> TileVote:
         new_points=None if tile.new_points is None else unpack_points(tile.new_points),
         free=None if tile.free is None else Words.unpack(tile.free, "free"),
     )
-
-
-def rule_of(method: str) -> Rule:
-    """The server's half of a ballot's method; MapvoteError for one that this version does not know."""
-    if method == "paper":
-        return "paper"
-    if method == "columns":
-        return "columns"
-    raise MapvoteError(f"ballot: method {method!r} is unknown; this version fuses 'paper' and 'columns'")
 
 
 def base_hash(tile: MapTile | None) -> str:
