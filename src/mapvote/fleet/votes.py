@@ -77,7 +77,7 @@ class TileVote:
     def remnants(self, standing: Bool) -> Words:
         """The voxels that this vote says are gone though the cell stands, of the (256, 256) cells ``standing``."""
         if self.gone is None:
-            return Words.whole(np.zeros_like(standing))
+            return Words.none()
         marked = self.gone.within(standing)
         stands = self.supports(CellState.UNCHANGED_OCCUPIED, marked.cells)
         return marked.at(stands & ~self.supports(CellState.CHANGED_EMPTY, marked.cells))

@@ -29,6 +29,11 @@ class Words:
     """(n,)"""
 
     @classmethod
+    def none(cls) -> Words:
+        """No word at all."""
+        return cls(np.empty(0, dtype=np.intp), np.empty(0, dtype=np.uint64))
+
+    @classmethod
     def of(cls, plane: U64) -> Words:
         """From a (256, 256) plane."""
         flat = plane.reshape(-1)
