@@ -96,7 +96,7 @@ def fuse_tile(
 ) -> tuple[Decision, MapTile | None]:
     """Decide one tile and edit it. A tile that does not change is returned as the same object (None if there was none).
 
-    ``drives`` are the votes that count on this tile (see :func:`select`, :func:`restrict`), any order.
+    ``drives`` are the votes that count on this tile (``select``, ``restrict`` in fleet/votes.py), any order.
     """
     grid = tile_grid(lattice, index)
     votes, states, tally, quorum = hear(one_each(drives, grid), rule, settings)
