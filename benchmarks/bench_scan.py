@@ -19,8 +19,8 @@ import numpy as np
 from mapvote.config import Settings, choose_case
 from mapvote.core.types import Drive, PointMap
 from mapvote.formats import open_drive
-from mapvote.mapping import build_map
 from mapvote.simulation import simulate
+from mapvote.slam.build import build_map
 from mapvote.vehicle import DriveReport, vote_drive
 
 STAGES = ("localise", "ground", "moving", "see", "vote")

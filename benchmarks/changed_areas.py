@@ -14,17 +14,17 @@ import json
 from pathlib import Path
 
 from mapvote.config import load_settings
-from mapvote.evaluation.cases import choose_cases, fuse_case, passes
-from mapvote.evaluation.changed_areas import in_changed_areas, survey_anew
-from mapvote.evaluation.evaluate import map_frame
-from mapvote.evaluation.scene import Scene, default_cache
-from mapvote.formats.whole import whole_file
+from mapvote.evaluation.experiments.cases import choose_cases, fuse_case, passes
+from mapvote.evaluation.experiments.changed_areas import in_changed_areas, survey_anew
+from mapvote.evaluation.experiments.pose_errors import map_frame
+from mapvote.evaluation.experiments.scene import Scene, default_cache
+from mapvote.formats.atomic import whole_file
 
 OLD, UPDATED, ANEW = "old map", "updated map", "map surveyed anew"
 
 
 def measure(scene: Scene, workers: int) -> dict[str, dict[str, float]]:
-    """Errors by map, as :func:`mapvote.evaluation.truth.error_summary` gives them."""
+    """Errors by map, as :func:`mapvote.evaluation.scoring.truth.error_summary` gives them."""
     scene.prepare()
     cases, _ = choose_cases(scene.settings, "all")
     drives = passes(scene, cases, workers)

@@ -31,16 +31,16 @@ import sqlalchemy as sa
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
 from hand_made import Say, make_ballot, make_map, make_tile, states_plane, wall
+from mapvote.codec.ballot import Ballot, encode
 from mapvote.config import FuseSettings
-from mapvote.core.ballot import Ballot, encode
 from mapvote.core.grid import TileIndex
 from mapvote.core.types import CellState, MapTile, MapvoteError
-from mapvote.fleet import schema
-from mapvote.fleet.ballotbox import Receipt
-from mapvote.fleet.errors import Conflict, Unavailable
-from mapvote.fleet.intake import accept, examine
-from mapvote.fleet.publish import publish
-from mapvote.fleet.store import Store
+from mapvote.server.errors import Conflict, Unavailable
+from mapvote.server.store import schema
+from mapvote.server.store.admission import accept, examine
+from mapvote.server.store.ballots import Receipt
+from mapvote.server.store.publish import publish
+from mapvote.server.store.store import Store
 from postgres_cluster import PostgresCluster
 
 POLICY = FuseSettings(min_votes=2, max_deleted_share=1.0)

@@ -12,8 +12,8 @@ import httpx2
 
 from crash import CELLS, TILES, votes_on
 from live_server import serving
+from mapvote.client import MapClient
 from mapvote.core.types import MapvoteError
-from mapvote.fleet.client import MapClient
 from postgres_cluster import PostgresCluster
 
 VEHICLES = 4

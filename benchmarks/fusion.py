@@ -31,15 +31,15 @@ from backports import zstd
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
 from hand_made import Cell, Say, make_ballot, make_map, make_tile, wall
+from mapvote.codec.ballot import encode
 from mapvote.config import FuseSettings
-from mapvote.core.ballot import encode
 from mapvote.core.grid import TileIndex
 from mapvote.core.types import NO_VOTE, U8, CellState, PointMap
-from mapvote.fleet.ballotbox import Receipt
-from mapvote.fleet.intake import accept, examine
-from mapvote.fleet.publish import publish
-from mapvote.fleet.store import Store
-from mapvote.fleet.votes import DAY_NS
+from mapvote.fusion.tile_vote import DAY_NS
+from mapvote.server.store.admission import accept, examine
+from mapvote.server.store.ballots import Receipt
+from mapvote.server.store.publish import publish
+from mapvote.server.store.store import Store
 
 SHAPE = (256, 256)
 HOUSE = [(r, c) for r in range(100, 118) for c in (40, 57)] + [(r, c) for r in (100, 117) for c in range(40, 58)]

@@ -18,10 +18,10 @@ from rich.console import Console
 from rich.table import Table
 
 from mapvote.config import Settings
-from mapvote.evaluation.cases import Case, choose_cases
-from mapvote.evaluation.inject import Injection, score_injection
-from mapvote.evaluation.real import RealRun, as_given, disturbed, largest_false_changes, run_real
-from mapvote.evaluation.real_figures import draw_false_changes, draw_injections
+from mapvote.evaluation.experiments.cases import Case, choose_cases
+from mapvote.evaluation.experiments.inject import Injection, score_injection
+from mapvote.evaluation.experiments.real_drive import RealRun, as_given, disturbed, largest_false_changes, run_real
+from mapvote.evaluation.reporting.real_figures import draw_false_changes, draw_injections
 from mapvote.formats import read_T_map_lidar
 
 DRAWS = (1, 2, 3)

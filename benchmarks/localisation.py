@@ -21,12 +21,12 @@ from mapvote.config import Settings
 from mapvote.core.geometry import exp, inverse, log, rotation_angle
 from mapvote.core.types import F64, PointMap
 from mapvote.formats import open_drive, read_T_map_lidar
-from mapvote.mapping import build_map
-from mapvote.perception.deskew import deskew
-from mapvote.perception.laying import motion_at
-from mapvote.perception.ndt import PosePrior, register
-from mapvote.perception.tracking import MapWindow, Tracker
+from mapvote.localisation.deskew import deskew
+from mapvote.localisation.ndt import PosePrior, register
+from mapvote.localisation.tracker import MapWindow, Tracker
 from mapvote.simulation import simulate
+from mapvote.slam.accumulate import motion_at
+from mapvote.slam.build import build_map
 
 SETTINGS = Settings()
 

@@ -19,10 +19,10 @@ from typing import Any
 from rich.console import Console
 
 from mapvote.config import load_settings
-from mapvote.evaluation import demands, matrix_tables
-from mapvote.evaluation.matrix import EXPERIMENTS, Matrix
-from mapvote.evaluation.scene import default_cache
-from mapvote.formats.whole import whole_file
+from mapvote.evaluation.experiments.matrix import EXPERIMENTS, Matrix
+from mapvote.evaluation.experiments.scene import default_cache
+from mapvote.evaluation.reporting import matrix_tables, requirements
+from mapvote.formats.atomic import whole_file
 
 
 def main() -> None:
@@ -67,7 +67,7 @@ def main() -> None:
         if arguments.drop_drives:
             matrix.drop_drives(names, seed)
         write({name: dict(sorted(results[name].items())) for name in names if name in results}, arguments.out)
-    print(demands.table(results))
+    print(requirements.table(results))
     print(f"{arguments.out / 'matrix.md'}: every table; matrix.json beside it: all numbers")
 
 
@@ -78,7 +78,7 @@ def write(results: dict[str, dict[int, dict[str, Any]]], out: Path) -> None:
     if "main" in results:
         text += f"\n### main, class by class\n\n{matrix_tables.class_table(results, 'main')}"
     with whole_file(out / "matrix.md") as partial:
-        partial.write_text(f"## What must hold\n\n{demands.table(results)}\n## Experiments\n\n{text}")
+        partial.write_text(f"## What must hold\n\n{requirements.table(results)}\n## Experiments\n\n{text}")
     with whole_file(out / "matrix.json") as partial:
         partial.write_text(json.dumps(results, indent=1, allow_nan=False) + "\n")
 

@@ -23,10 +23,11 @@ from mapvote.config import MovingSettings
 from mapvote.core.columns import GROUND_MARGIN_M
 from mapvote.core.geometry import exp, transform
 from mapvote.core.grid import Grid, Lattice
-from mapvote.core.points import ground_surface, voxel_downsample
+from mapvote.core.ground import ground_surface
 from mapvote.core.types import F32, F64, Bool, Drive
+from mapvote.core.voxels import voxel_downsample
 from mapvote.formats import open_drive
-from mapvote.perception.moving import MovingFilter
+from mapvote.perception.moving_objects import MovingFilter
 from mapvote.simulation import simulate
 
 

@@ -49,7 +49,13 @@ def main() -> None:
         note(result)
     streets = out / "corner"
     mapvote("simulate", "corner", streets, "--seed", "3")
-    _round(mapvote, note, out / "corner_3", sorted(streets.glob("survey_*")), [(d, ()) for d in sorted(streets.glob("v[0-9]"))])
+    _round(
+        mapvote,
+        note,
+        out / "corner_3",
+        sorted(streets.glob("survey_*")),
+        [(d, ()) for d in sorted(streets.glob("v[0-9]"))],
+    )
     for drive in sorted(arguments.kitti.glob("*"))[: 0 if arguments.quick else 2]:
         _round(
             mapvote,

@@ -34,11 +34,11 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
 from hand_made import Say, make_ballot, make_map, make_tile, states_plane, wall
 from live_server import serving
-from mapvote.core.ballot import Ballot, encode
+from mapvote.codec.ballot import Ballot, encode
 from mapvote.core.types import CellState, PointMap
-from mapvote.fleet import schema
-from mapvote.fleet.keys import issue
-from mapvote.fleet.store import Store
+from mapvote.server.store import schema
+from mapvote.server.store.keys import issue
+from mapvote.server.store.store import Store
 from postgres_cluster import PostgresCluster
 
 TILES = [(0, col) for col in range(8)]

@@ -27,11 +27,11 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
 from hand_made import Say, make_ballot, make_map, make_tile, states_plane, wall
 from live_server import serving
-from mapvote.core.ballot import encode
+from mapvote.codec.ballot import encode
 from mapvote.core.types import CellState, PointMap
-from mapvote.fleet.ballotbox import Receipt
-from mapvote.fleet.intake import accept, examine
-from mapvote.fleet.store import Store
+from mapvote.server.store.admission import accept, examine
+from mapvote.server.store.ballots import Receipt
+from mapvote.server.store.store import Store
 from postgres_cluster import PostgresCluster
 
 PILLARS = [(10, 10), (10, 20)]
@@ -69,7 +69,7 @@ def vote_away(store: Store, point_map: PointMap, pillar: tuple[int, int], drive:
 
 
 @dataclass
-class Seen:
+class Observation:
     """What the readers got."""
 
     versions: Counter[int] = field(default_factory=Counter)
@@ -77,7 +77,7 @@ class Seen:
     hashes: dict[int, frozenset[str]] = field(default_factory=dict)
 
 
-async def read_until(address: tuple[str, int], done: asyncio.Event, seen: Seen, pause_s: float) -> None:
+async def read_until(address: tuple[str, int], done: asyncio.Event, seen: Observation, pause_s: float) -> None:
     """Fetch the manifest again and again; SystemExit if one version ever shows two faces."""
     while not done.is_set():
         start = time.perf_counter()
@@ -93,8 +93,8 @@ async def read_until(address: tuple[str, int], done: asyncio.Event, seen: Seen, 
         await asyncio.sleep(random.uniform(0.0, 2.0 * pause_s))
 
 
-async def publish_while_read(address: tuple[str, int], readers: int, pause_s: float) -> tuple[Seen, float]:
-    seen, done = Seen(), asyncio.Event()
+async def publish_while_read(address: tuple[str, int], readers: int, pause_s: float) -> tuple[Observation, float]:
+    seen, done = Observation(), asyncio.Event()
     reading = [asyncio.create_task(read_until(address, done, seen, pause_s)) for _ in range(readers)]
     await asyncio.sleep(2.0 * pause_s + 1.0)
     start = time.perf_counter()

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mapvote.core.ballot import Ballot, BallotTile, pack_plane, tile_key
+from mapvote.codec.ballot import Ballot, BallotTile, pack_plane, tile_key
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Lattice, TileIndex
 from mapvote.core.types import F32, NO_VOTE, U8, U16, U64, MapTile, PointMap
-from mapvote.fleet.update import base_hash
+from mapvote.fusion.offline import base_hash
 
 Cell = tuple[int, int]
 SETTINGS = "5e771465" * 8

@@ -8,15 +8,15 @@ from typing import Any
 import numpy as np
 import pytest
 
+from mapvote.codec.ballot import decode, encode, unpack_points, unpack_states, unpack_tally, unpack_words, validate
 from mapvote.config import Settings, VotingSettings
-from mapvote.core.ballot import decode, encode, unpack_points, unpack_states, unpack_tally, unpack_words, validate
-from mapvote.core.columns import reference_window
 from mapvote.core.grid import TILE_CELLS, tile_grid
+from mapvote.core.reference import reference_window
 from mapvote.core.sensors import SENSORS
-from mapvote.core.tiling import map_from_points
+from mapvote.core.tile import map_from_points
 from mapvote.core.types import F64, Bool, CellState, MapvoteError, PointMap, Registration, Scan
-from mapvote.perception.ndt import PosePrior
-from mapvote.perception.tracking import Fix
+from mapvote.localisation.ndt import PosePrior
+from mapvote.localisation.tracker import Fix
 from mapvote.vehicle import Vehicle
 
 RNG = np.random.default_rng(7)

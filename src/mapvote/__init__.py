@@ -9,25 +9,25 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from mapvote.codec.ballot import Ballot as Ballot
     from mapvote.config import Settings as Settings
     from mapvote.config import load_settings as load_settings
-    from mapvote.core.ballot import Ballot as Ballot
     from mapvote.core.types import CellState as CellState
     from mapvote.core.types import Drive as Drive
     from mapvote.core.types import MapvoteError as MapvoteError
     from mapvote.core.types import PointMap as PointMap
     from mapvote.core.types import Scan as Scan
-    from mapvote.fleet.update import update_map as update_map
     from mapvote.formats import open_drive as open_drive
     from mapvote.formats import read_map as read_map
     from mapvote.formats import write_map as write_map
-    from mapvote.mapping import build_map as build_map
+    from mapvote.fusion.offline import update_map as update_map
     from mapvote.simulation import simulate as simulate
+    from mapvote.slam.build import build_map as build_map
     from mapvote.vehicle import Vehicle as Vehicle
     from mapvote.vehicle import vote_drive as vote_drive
 
 _HOME = {
-    "Ballot": "core.ballot",
+    "Ballot": "codec.ballot",
     "CellState": "core.types",
     "Drive": "core.types",
     "MapvoteError": "core.types",
@@ -35,12 +35,12 @@ _HOME = {
     "Scan": "core.types",
     "Settings": "config",
     "Vehicle": "vehicle",
-    "build_map": "mapping",
+    "build_map": "slam.build",
     "load_settings": "config",
     "open_drive": "formats",
     "read_map": "formats",
     "simulate": "simulation",
-    "update_map": "fleet.update",
+    "update_map": "fusion.offline",
     "vote_drive": "vehicle",
     "write_map": "formats",
 }

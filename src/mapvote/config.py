@@ -32,7 +32,7 @@ class NdtLevel(Section):
 
 
 class NdtSettings(Section):
-    """perception/ndt.py and perception/tracking.py (METHOD 5)."""
+    """localisation/ndt.py and localisation/tracker.py (METHOD 5)."""
 
     levels: tuple[NdtLevel, ...] = (
         NdtLevel(voxel_m=3.0, floor_m=0.5, points_m=1.0, iterations=15),
@@ -57,7 +57,7 @@ class NdtSettings(Section):
 
 
 class MovingSettings(Section):
-    """perception/moving.py ([9])."""
+    """perception/moving_objects.py ([9])."""
 
     past_s: float = Field(
         default=2.0, gt=0, description="how far back a scan may be asked whether it saw through a voxel"
@@ -79,7 +79,7 @@ class MovingSettings(Section):
 
 
 class MappingSettings(Section):
-    """mapping.py: NDT SLAM."""
+    """slam/build.py: NDT SLAM."""
 
     ndt_points_m: float = Field(default=0.3, description="scans enter the NDT map thinned to one point per such voxel")
     min_inlier_share: float = Field(default=0.4, description="as ndt.min_inlier_share, while the map is still growing")
@@ -148,7 +148,7 @@ class VotingSettings(Section):
 
 
 class FuseSettings(Section):
-    """fleet/fuse.py: which votes count, how many are enough (DESIGN 4). A version records the ones it was made by."""
+    """fusion/fuse.py: which votes count, how many are enough (DESIGN 4). A version records the ones it was made by."""
 
     min_votes: int = Field(default=2, ge=1, description="vehicles that a change needs: k + 1 against k liars")
     max_contradiction: float = Field(
@@ -172,7 +172,7 @@ class FuseSettings(Section):
 
 
 class GateSettings(Section):
-    """fleet/gate.py: when a new version may be published, judged by a reference drive."""
+    """server/insight/localisation_gate.py: when a new version may be published, judged by a reference drive."""
 
     reach_m: float = Field(default=50.0, gt=0, description="scans farther from every change see no difference")
     max_scans: int = Field(default=60, gt=0, description="scans compared at most, spread evenly")
@@ -186,7 +186,7 @@ class GateSettings(Section):
 
 
 class ServerSettings(Section):
-    """fleet/app.py: what the server lets in."""
+    """server/http/app.py: what the server lets in."""
 
     max_body_bytes: int = Field(default=16_000_000, description="largest request body")
     ballots_per_minute: float = Field(default=600.0, gt=0, description="of one vehicle, on average")

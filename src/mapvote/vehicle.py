@@ -15,16 +15,15 @@ from typing import Protocol
 
 import numpy as np
 
+from mapvote.codec.ballot import Ballot, BallotTile, content_hash, pack_plane, tile_key
 from mapvote.config import Settings, VotingSettings
-from mapvote.core.ballot import Ballot, BallotTile, content_hash, pack_plane, tile_key
-from mapvote.core.columns import Surroundings, reference_window
 from mapvote.core.geometry import transform
 from mapvote.core.grid import TileIndex, tile_grid
+from mapvote.core.reference import LocalMap, reference_window
 from mapvote.core.sensors import Sensor
 from mapvote.core.types import (
     F64,
     I32,
-    I64,
     U64,
     Bool,
     CellState,
@@ -32,17 +31,16 @@ from mapvote.core.types import (
     MapvoteError,
     PointMap,
     Reference,
-    Registration,
     Scan,
 )
 from mapvote.core.voting import to_wire
-from mapvote.perception.deskew import deskew, twist_between
-from mapvote.perception.moving import MovingFilter
-from mapvote.perception.ndt import PosePrior
-from mapvote.perception.tally import NewPoints, points_in, select
-from mapvote.perception.tracking import Fix, MapWindow, Tracker
-from mapvote.perception.visibility import find_obstacles, see
-from mapvote.perception.voters import Panel, Seen, TileVotes
+from mapvote.detection.new_points import NewPoints, points_in, select
+from mapvote.detection.voters import Detectors
+from mapvote.detection.votes import Observation, TileVotes
+from mapvote.localisation.ndt import PosePrior
+from mapvote.localisation.tracker import Fix, MapWindow, Tracker
+from mapvote.perception.moving_objects import MovingFilter
+from mapvote.perception.raycast import cast_rays, find_obstacles
 
 POINTS_REACH_M = 70.0
 """New points are taken up to here, farther than votes are cast: a tile's width around the vehicle is laid out."""
@@ -57,30 +55,11 @@ Watch = Callable[[F64, F64, Bool, Bool], None]
 
 
 class Movers(Protocol):
-    """Which points move: :class:`mapvote.perception.moving.MovingFilter`, or anything with its two methods."""
+    """Which points move: :class:`mapvote.perception.moving_objects.MovingFilter`, or anything with its two methods."""
 
     def push(self, points_map: F64, origin_map: F64, obstacle: Bool, stamp_ns: int) -> list[tuple[int, Bool]]: ...
 
     def flush(self) -> list[tuple[int, Bool]]: ...
-
-
-class GivenPoses:
-    """Poses that need no improvement: the prior as it is, or the truth, to measure what localisation is worth."""
-
-    def __init__(self, stamps_ns: I64, T_map_lidar: F64) -> None:
-        """``stamps_ns`` (n,) ascending and ``T_map_lidar`` (n, 4, 4): a pose for every scan that will come."""
-        self._poses = {int(stamp): i for i, stamp in enumerate(stamps_ns)}
-        self._stamps_ns, self._T_map_lidar = stamps_ns, T_map_lidar
-
-    def __call__(self, scan: Scan, prior: PosePrior | None) -> Fix:
-        i = self._poses[scan.stamp_ns]
-        j, k = max(i - 1, 0), min(i + 1, len(self._stamps_ns) - 1)
-        twist = np.zeros(6)
-        if k > j:
-            seconds = 1e-9 * float(self._stamps_ns[k] - self._stamps_ns[j])
-            twist = twist_between(self._T_map_lidar[j], self._T_map_lidar[k], seconds)
-        registration = Registration(self._T_map_lidar[i], np.zeros((6, 6)), 1.0, 1.0, 0, True)
-        return Fix(registration, deskew(scan, twist), True)
 
 
 @dataclass(slots=True)
@@ -123,10 +102,10 @@ class Vehicle:
     """One vehicle on one drive.
 
     ``voters``: the settings of every voter, default only ``settings.voting``. ``localise``: default NDT in
-    ``point_map``. ``movers``: default the occupancy filter of :mod:`mapvote.perception.moving`. ``watch``: whoever
-    wants to see the scans that vote, for measurements and pictures. The prior's
-    sigmas say how far ``observe``'s prior may be off. Memory is bounded by the road driven: counters by tile, and the
-    reference of the tiles around the vehicle.
+    ``point_map``. ``movers``: default the occupancy filter of :mod:`mapvote.perception.moving_objects`.
+    ``watch``: whoever wants to see the scans that vote, for measurements and pictures. The prior's sigmas say how far
+    ``observe``'s prior may be off. Memory is bounded by the road driven: counters by tile, and the reference of the
+    tiles around the vehicle.
     """
 
     def __init__(
@@ -153,10 +132,10 @@ class Vehicle:
         self.report = DriveReport()
         votings = voters or [self.settings.voting]
         self._first = votings[0]
-        self._panel = Panel([_counts_as(voting) for voting in votings], sensor, point_map)
+        self._panel = Detectors([_counts_as(voting) for voting in votings], sensor, point_map)
         self._new_points = NewPoints(point_map.lattice)
         self._waiting: deque[_Waiting] = deque()
-        self._surroundings = Surroundings(point_map, self.settings.voting.window_m)
+        self._surroundings = LocalMap(point_map, self.settings.voting.window_m)
         self._outer: Reference | None = None
         self._unmapped: U64 = np.zeros((0, 0), dtype=np.uint64)
         self._stamps_ns: list[int] = []
@@ -194,9 +173,9 @@ class Vehicle:
         if self.watch:
             self.watch(scan.points_map, scan.origin_map, scan.obstacle, moving)
         with self.report.timed("see"):
-            view = see(scan.points_map, scan.origin_map, scan.obstacle, moving, scan.reference, scan.cell)
+            view = cast_rays(scan.points_map, scan.origin_map, scan.obstacle, moving, scan.reference, scan.cell)
         with self.report.timed("vote"):
-            seen = Seen(view, scan.reference, scan.origin_map, scan.sigma_m)
+            seen = Observation(view, scan.reference, scan.origin_map, scan.sigma_m)
             new = self._panel.add(seen)
             base = np.ascontiguousarray(scan.reference.base).ravel()
             chosen = select(scan.points_map, scan.cell, scan.obstacle & ~moving, new.ravel(), base)

@@ -6,16 +6,16 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from mapvote.cli import app, verbs
+from mapvote.cli import app, register
 from mapvote.core.geometry import from_xyz_rpy
 from mapvote.core.sensors import SENSORS
-from mapvote.core.tiling import map_from_points
+from mapvote.core.tile import map_from_points
 from mapvote.core.types import MapvoteError
 from mapvote.evaluation.loopback import running_server
 from mapvote.formats import DriveWriter, write_map
 
 if not app.registered_commands:
-    verbs.register(app)
+    register(app)
 
 
 def street(wall_y: float) -> np.ndarray:

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from mapvote.config import Settings, choose_case
-from mapvote.core.columns import above_ground_points
 from mapvote.core.grid import Grid
-from mapvote.core.tiling import map_from_points
+from mapvote.core.reference import above_ground_points
+from mapvote.core.tile import map_from_points
 from mapvote.core.types import MapvoteError
 
 

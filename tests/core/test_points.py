@@ -5,7 +5,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mapvote.core.grid import Grid, Lattice
-from mapvote.core.points import ground_surface, voxel_downsample, voxel_keys
+from mapvote.core.ground import ground_surface
+from mapvote.core.voxels import voxel_downsample, voxel_keys
 
 
 @given(st.integers(0, 2**31), st.integers(1, 400))

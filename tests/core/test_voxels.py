@@ -5,8 +5,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mapvote.core.grid import CELL_SIZE, Lattice
-from mapvote.core.points import voxel_downsample, voxel_keys
-from mapvote.core.voxels import VoxelCloud
+from mapvote.core.voxels import VoxelCloud, voxel_downsample, voxel_keys
 
 
 @settings(max_examples=15, deadline=None)

@@ -14,12 +14,12 @@ from mapvote.config import Settings
 from mapvote.core.geometry import exp, from_xyz_rpy
 from mapvote.core.grid import Lattice
 from mapvote.core.types import MapvoteError
-from mapvote.evaluation import report
-from mapvote.evaluation.cases import choose_cases
 from mapvote.evaluation.evaluate import Evaluation, evaluate
-from mapvote.evaluation.page import Section, page
-from mapvote.evaluation.scene import Scene
-from mapvote.evaluation.truth import error_summary, pose_errors, rigid_between
+from mapvote.evaluation.experiments.cases import choose_cases
+from mapvote.evaluation.experiments.scene import Scene
+from mapvote.evaluation.reporting import tables
+from mapvote.evaluation.reporting.html import Section, page
+from mapvote.evaluation.scoring.truth import error_summary, pose_errors, rigid_between
 
 SLOWER = {"rate_hz": 4.0}
 """Fewer scans than a real LiDAR gives: a test asks whether it works, not how well."""
@@ -37,11 +37,11 @@ def corner(cache: Path) -> Evaluation:
 
 
 def without_timings(result: Any) -> str:
-    return report.as_json({key: value for key, value in result.items() if key != "timings"})
+    return tables.as_json({key: value for key, value in result.items() if key != "timings"})
 
 
 def test_the_json_is_as_designed_and_never_nan(corner: Evaluation) -> None:
-    result = json.loads(report.as_json(corner.result))
+    result = json.loads(tables.as_json(corner.result))
     assert result["cells"] == corner.truth.strict.size
     assert 0.0 < result["coverage"] <= 1.0
     for case in ("1", "3", "5", "columns"):
@@ -77,10 +77,10 @@ def test_columns_find_what_changed(corner: Evaluation) -> None:
 
 
 def test_tables_show_every_case_and_the_papers_figures(corner: Evaluation) -> None:
-    text = report.as_text(corner.result)
+    text = tables.as_text(corner.result)
     for shown in ("Table II", "Table III", "Table IV", "case 5", "columns", "0.850", "0.645", "What the map is for"):
         assert shown in text
-    lines = report.as_csv(corner.result).splitlines()
+    lines = tables.as_csv(corner.result).splitlines()
     assert lines[0] == "case,truth,metric,class,value"
     assert len(lines) > 4 * 2 * 11
 
@@ -93,7 +93,7 @@ def test_a_misspelt_case_is_named() -> None:
 
 
 def test_no_truth_no_score(tmp_path: Path) -> None:
-    from mapvote.evaluation.truth import read_truth
+    from mapvote.evaluation.scoring.truth import read_truth
 
     with pytest.raises(MapvoteError, match="no usable truth"):
         read_truth(tmp_path)

@@ -10,12 +10,13 @@ import pytest
 from mapvote.config import Settings
 from mapvote.core.geometry import from_xyz_rpy
 from mapvote.core.sensors import SENSORS
-from mapvote.core.tiling import all_points, map_from_points
+from mapvote.core.tile import all_points, map_from_points
 from mapvote.core.types import MapvoteError, Scan
 from mapvote.evaluation.loopback import running_server, vote_by_http
-from mapvote.fleet.update import update_map
 from mapvote.formats import write_map
-from mapvote.vehicle import GivenPoses, Vehicle
+from mapvote.fusion.offline import update_map
+from mapvote.localisation.tracker import GivenPoses
+from mapvote.vehicle import Vehicle
 
 
 def wall(y: float) -> np.ndarray:

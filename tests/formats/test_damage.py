@@ -17,10 +17,10 @@ from hypothesis import strategies as st
 
 from live_server import mapvote
 from mapvote.core.sensors import SENSORS
-from mapvote.core.tiling import map_from_points
+from mapvote.core.tile import map_from_points
 from mapvote.core.types import MapvoteError
 from mapvote.formats import DriveWriter, export_map, open_drive, read_map, write_map
-from mapvote.formats.las import write_las
+from mapvote.formats.maps.las import write_las
 
 TR = "0 -1 0 0 0 0 -1 0 1 0 0 0"
 

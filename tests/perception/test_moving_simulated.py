@@ -11,10 +11,10 @@ from mapvote.config import MovingSettings
 from mapvote.core.columns import GROUND_MARGIN_M
 from mapvote.core.geometry import transform
 from mapvote.core.grid import Lattice, window_around
-from mapvote.core.points import ground_surface
+from mapvote.core.ground import ground_surface
 from mapvote.core.types import Bool
 from mapvote.formats import open_drive
-from mapvote.perception.moving import MovingFilter
+from mapvote.perception.moving_objects import MovingFilter
 from mapvote.simulation import simulate
 
 

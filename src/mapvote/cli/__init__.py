@@ -10,6 +10,7 @@ import sys
 import typer
 from rich.console import Console
 
+from mapvote.cli import evaluation, files, inspect, server, update, vehicle
 from mapvote.core.types import MapvoteError
 
 app = typer.Typer(
@@ -24,11 +25,19 @@ app = typer.Typer(
 
 def main() -> None:
     """Entry point of the ``mapvote`` command."""
-    from mapvote.cli import verbs
-
-    verbs.register(app)
+    register(app)
     try:
         app(standalone_mode=True)
     except MapvoteError as error:
         Console(stderr=True, soft_wrap=True).print(f"[bold red]mapvote:[/] {error}", highlight=False)
         sys.exit(1)
+
+
+def register(app: typer.Typer) -> None:
+    """Add every verb to ``app``. Modules import nothing heavy at their top."""
+    evaluation.register(app)
+    vehicle.register(app)
+    files.register(app)
+    update.register(app)
+    server.register(app)
+    inspect.register(app)

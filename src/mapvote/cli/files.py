@@ -59,7 +59,7 @@ def doctor(
 
     from mapvote.formats import read_map
     from mapvote.formats.doctor import examine
-    from mapvote.formats.drive import DriveOptions
+    from mapvote.formats.drives.options import DriveOptions
 
     options = DriveOptions(scans, prior, rate, sensor, None, mount, topic)
     findings = examine(drive, options, None if map_path is None else read_map(map_path))
@@ -88,7 +88,7 @@ def import_map(
 ) -> None:
     """Make a mapvote map of somebody's point cloud: cut into tiles, ground measured. Says what it drops."""
     from mapvote.formats import read_cloud, write_map
-    from mapvote.formats.cloud import to_map
+    from mapvote.formats.maps.cloud import to_map
 
     cloud = read_cloud(source)
     point_map = to_map(str(source), cloud)

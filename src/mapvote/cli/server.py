@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from mapvote.cli.options import Config
-from mapvote.cli.store import StoreName, opened_store, when
+from mapvote.server.store.store import Store
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor
 
-    from mapvote.fleet.publish import Outcome
+    from mapvote.server.store.publish import Outcome
 
 GateDrive = Annotated[Path | None, typer.Option(help="reference drive that must localise no worse in a new version")]
 
@@ -36,8 +36,8 @@ def serve(
 ) -> None:
     """Serve a store to vehicles and operators until stopped."""
     from mapvote.config import load_settings
-    from mapvote.fleet.serve import log_as_json, open_or_create, reference_gate
-    from mapvote.fleet.serve import serve as run
+    from mapvote.server.http.serve import log_as_json, open_or_create, reference_gate
+    from mapvote.server.http.serve import serve as run
 
     settings = load_settings(config)
     log_as_json()
@@ -63,8 +63,8 @@ def publish(
     from concurrent.futures import ThreadPoolExecutor
 
     from mapvote.config import load_settings
-    from mapvote.fleet.publish import publish as publish_version
-    from mapvote.fleet.serve import reference_gate
+    from mapvote.server.http.serve import reference_gate
+    from mapvote.server.store.publish import publish as publish_version
 
     settings = load_settings(config)
     policy = settings.fuse if min_votes is None else settings.fuse.model_copy(update={"min_votes": min_votes})
@@ -82,7 +82,7 @@ def rollback(
     reason: Annotated[str, typer.Option(help="kept with the version")] = "",
 ) -> None:
     """Publish an older version again, and bar the votes that led away from it."""
-    from mapvote.fleet.publish import rollback as roll_back
+    from mapvote.server.store.publish import rollback as roll_back
 
     with opened_store(store) as opened:
         version = roll_back(opened, to, reason=reason)
@@ -99,8 +99,8 @@ def unvote(
 ) -> None:
     """Withdraw a vehicle's votes, from what is to come or (--replay) from every version."""
     from mapvote.core.types import MapvoteError
-    from mapvote.fleet.ballotbox import withdraw
-    from mapvote.fleet.replay import replay as replay_without
+    from mapvote.server.store.ballots import withdraw
+    from mapvote.server.store.replay import replay as replay_without
 
     if (vehicle is None) != everybody:
         raise MapvoteError("unvote: say whose votes go: a VEHICLE, or --all")
@@ -117,8 +117,8 @@ def unvote(
 
 def upgrade(store: StoreName) -> None:
     """Bring a store that an older mapvote wrote to the schema of this one. Stop the server and make a backup first."""
-    from mapvote.fleet.migrate import upgrade as upgrade_schema
-    from mapvote.fleet.store import existing, url_of
+    from mapvote.server.store.migrate import upgrade as upgrade_schema
+    from mapvote.server.store.store import existing, url_of
 
     database = existing(url_of(store))
     try:
@@ -136,7 +136,7 @@ def keys(
 ) -> None:
     """List, issue or revoke keys. A new key is printed once and kept nowhere."""
     from mapvote.core.types import MapvoteError
-    from mapvote.fleet import keys as store_keys
+    from mapvote.server.store import keys as store_keys
 
     with opened_store(store) as opened:
         if action == "list":
@@ -168,9 +168,31 @@ def dask_cluster(address: str) -> Iterator[Executor]:
 
 
 def _print_outcome(done: Outcome, what: str) -> None:
-    from mapvote.fleet.store import names
+    from mapvote.server.store.queries import names
 
     tiles = f" in tiles {names(done.tiles)}" if done.tiles else ""
     print(f"version {done.version} ({what}): {done.added} points added, {done.deleted} deleted{tiles}")
     for reason in done.held:
         print(f"hold: {reason}")
+
+
+StoreName = Annotated[str, typer.Argument(metavar="STORE", help="SQLite file, or URL (postgresql+psycopg://...)")]
+
+
+@contextmanager
+def opened_store(name: str) -> Iterator[Store]:
+    """An existing store, closed at the end."""
+    from mapvote.server.store.store import Store, url_of
+
+    store = Store.open(url_of(name))
+    try:
+        yield store
+    finally:
+        store.close()
+
+
+def when(stamp_ns: int) -> str:
+    """A stamp as a reader of a terminal wants it, UTC."""
+    from datetime import UTC, datetime
+
+    return datetime.fromtimestamp(stamp_ns // 10**9, UTC).strftime("%Y-%m-%d %H:%M:%SZ")

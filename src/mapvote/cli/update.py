@@ -10,7 +10,7 @@ import typer
 if TYPE_CHECKING:
     from mapvote.core.grid import TileIndex
     from mapvote.core.types import U8
-    from mapvote.fleet.fuse import Decision
+    from mapvote.fusion.fuse import Decision
 
 
 def register(app: typer.Typer) -> None:
@@ -32,12 +32,12 @@ def update(
     ] = None,
 ) -> None:
     """Fuse ballots offline and edit the map: add, delete, keep."""
+    from mapvote.codec.ballot import decode
     from mapvote.config import FuseSettings
-    from mapvote.core.ballot import decode
     from mapvote.core.types import MapvoteError
-    from mapvote.fleet.fuse import states_over
-    from mapvote.fleet.update import update_map
     from mapvote.formats import read_map, write_map
+    from mapvote.fusion.fuse import states_over
+    from mapvote.fusion.offline import update_map
 
     if out is None and not dry_run:
         raise MapvoteError("update: say where the updated map goes (--out MAP), or --dry-run to only look")
@@ -67,7 +67,7 @@ def _write_cells(path: Path, states: U8, x0: float, y0: float) -> None:
     import numpy as np
 
     from mapvote.core.grid import CELL_SIZE
-    from mapvote.formats.whole import whole_file
+    from mapvote.formats.atomic import whole_file
 
     with whole_file(path) as part, part.open("wb") as file:
         np.savez_compressed(file, states=states, x0=x0, y0=y0, cell_size=CELL_SIZE)

@@ -11,10 +11,10 @@ import typer
 from mapvote.cli.options import Config, Mount, Prior, Rate, Scans, SensorName, Topic, Vehicle
 
 if TYPE_CHECKING:
-    from mapvote.core.ballot import Ballot
+    from mapvote.client import MapClient
+    from mapvote.codec.ballot import Ballot
     from mapvote.core.types import PointMap
-    from mapvote.fleet.client import MapClient
-    from mapvote.mapping import BuildReport
+    from mapvote.slam.build import BuildReport
     from mapvote.vehicle import DriveReport
 
 
@@ -42,7 +42,7 @@ def build(
 
     from mapvote.config import load_with_sources
     from mapvote.formats import open_drive, write_map
-    from mapvote.mapping import build_map
+    from mapvote.slam.build import build_map
 
     if out.exists():
         raise typer.BadParameter(f"{out} exists; name a new folder", param_hint="--out")
@@ -95,12 +95,13 @@ def vote(
     """Drive once: localise, remove moving objects, compare with the map, and write one ballot."""
     from rich.progress import Progress
 
+    from mapvote.codec.ballot import encode
     from mapvote.config import choose_case, load_with_sources
-    from mapvote.core.ballot import encode
     from mapvote.core.types import MapvoteError
     from mapvote.formats import open_drive, read_map
-    from mapvote.formats.whole import whole_file
-    from mapvote.vehicle import GivenPoses, vote_drive
+    from mapvote.formats.atomic import whole_file
+    from mapvote.localisation.tracker import GivenPoses
+    from mapvote.vehicle import vote_drive
 
     if out is None and send is None:
         raise MapvoteError("vote: say where the ballot goes: --out FILE, --send URL, or both")
@@ -131,7 +132,7 @@ def vote(
 
 
 def _client(url: str, key: str | None) -> MapClient:
-    from mapvote.fleet.client import MapClient
+    from mapvote.client import MapClient
 
     cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
     return MapClient(url, key=key, home=cache / "mapvote")

@@ -126,3 +126,6 @@ def tile_grid(lattice: Lattice, tile: TileIndex) -> Grid:
 def tile_of_cells(rows: NDArray[np.int64], cols: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Tile row and column of lattice cells."""
     return rows // TILE_CELLS, cols // TILE_CELLS
+
+
+CELLS = TILE_CELLS * TILE_CELLS

@@ -8,19 +8,19 @@ from pathlib import Path
 import numpy as np
 
 from mapvote.config import Settings
-from mapvote.core.tiling import all_points
+from mapvote.core.tile import all_points
 from mapvote.core.types import MapvoteError
-from mapvote.evaluation.cases import choose_cases
 from mapvote.evaluation.evaluate import Evaluation, evaluate
-from mapvote.evaluation.gallery import Area, areas_of, gallery
+from mapvote.evaluation.experiments.cases import choose_cases
+from mapvote.evaluation.experiments.scene import Progress, Scene
 from mapvote.evaluation.loopback import Round, vote_by_http
-from mapvote.evaluation.metrics import same_rows
-from mapvote.evaluation.page import Section, page
-from mapvote.evaluation.report import as_csv, as_json, as_text, case_name, tables, write_text
-from mapvote.evaluation.scene import Progress, Scene
+from mapvote.evaluation.reporting.gallery import Area, areas_of, gallery
+from mapvote.evaluation.reporting.html import Section, page
+from mapvote.evaluation.reporting.tables import as_csv, as_json, as_text, case_name, tables, write_text
+from mapvote.evaluation.scoring.map_points import same_rows
 from mapvote.formats import write_map
-from mapvote.formats.pcd import write_pcd
-from mapvote.formats.whole import whole_file
+from mapvote.formats.atomic import whole_file
+from mapvote.formats.maps.pcd import write_pcd
 
 SCENARIO, QUICK_SCENARIO = "street", "corner"
 SEED = 2

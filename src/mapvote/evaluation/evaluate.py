@@ -8,19 +8,16 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-
-from mapvote.core.ballot import Ballot
-from mapvote.core.columns import GROUND_MARGIN_M, reference_window
-from mapvote.core.grid import CELL_SIZE, Grid
-from mapvote.core.types import F64, U8, PointMap
-from mapvote.evaluation.cases import Case, Outcome, Pass, fuse_case, passes
-from mapvote.evaluation.changed_areas import in_changed_areas, survey_anew
-from mapvote.evaluation.metrics import MapJudge, coverage, score_cells, score_objects
-from mapvote.evaluation.nearest import map_obstacles
-from mapvote.evaluation.scene import Progress, Scene
-from mapvote.evaluation.truth import Truth, error_summary, rigid_between
-from mapvote.evaluation.yardsticks import yardsticks
+from mapvote.codec.ballot import Ballot
+from mapvote.core.grid import Grid
+from mapvote.core.types import PointMap
+from mapvote.evaluation.baselines.run import yardsticks
+from mapvote.evaluation.experiments.cases import Case, Pass, fuse_case, passes
+from mapvote.evaluation.experiments.changed_areas import in_changed_areas, survey_anew
+from mapvote.evaluation.experiments.pose_errors import localisation, map_frame, map_shift
+from mapvote.evaluation.experiments.scene import Progress, Scene
+from mapvote.evaluation.scoring.jury import Jury, Outcome
+from mapvote.evaluation.scoring.truth import Truth
 
 
 @dataclass(frozen=True)
@@ -105,70 +102,6 @@ def evaluate(
     return Evaluation(result, scene, truth, jury.window, first_map, outcomes, drives)
 
 
-class Jury:
-    """Scores whatever was decided about one first map against one truth."""
-
-    def __init__(self, first_map: PointMap, truth: Truth) -> None:
-        self.truth = truth
-        self.window = truth.grid_on(first_map.lattice)
-        self._points = MapJudge(map_obstacles(first_map), *_above_ground(first_map, truth))
-        self._objects = [{"kind": o["kind"], "cells": truth.cells_of(o["footprint"])} for o in truth.objects]
-
-    def of_states(self, states: U8, vehicle_states: Sequence[U8]) -> dict[str, Any]:
-        """R for both truths, coverage, objects; all states over the truth's window."""
-        strict, provenance = self.truth.strict, self.truth.provenance
-        return {
-            "strict": score_cells(states, strict).to_dict(),
-            "provenance": score_cells(states, provenance).to_dict(),
-            "coverage": coverage(vehicle_states, strict),
-            "objects": score_objects(states, strict, self._objects, CELL_SIZE).to_dict(),
-        }
-
-    def of_update(self, outcome: Outcome) -> dict[str, Any]:
-        """The same, and what became of the map's points."""
-        points = self._points.score(map_obstacles(outcome.updated)).to_dict()
-        return {**self.of_states(outcome.states, outcome.vehicle_states), "map": points}
-
-
-def _above_ground(first_map: PointMap, truth: Truth) -> tuple[F64, F64, F64]:
-    """Surface samples that could be obstacle points: at least 0.3 m above the map's ground, where that is known."""
-    reference = reference_window(first_map, truth.grid_on(first_map.lattice))
-    chosen = []
-    for samples in truth.surfaces():
-        rows, cols, inside = reference.grid.indices_of(samples)
-        ground = reference.ground_z[rows.clip(0, reference.grid.rows - 1), cols.clip(0, reference.grid.cols - 1)]
-        low = inside & (samples[:, 2] - ground < GROUND_MARGIN_M)
-        chosen.append(samples[~low])
-    return chosen[0], chosen[1], chosen[2]
-
-
 def _state_bytes(ballot: Ballot) -> int:
     """Bytes of the votes alone, without new points and other planes."""
     return sum(len(tile.states or tile.tally or b"") for tile in ballot.tiles)
-
-
-def map_shift(scene: Scene) -> dict[str, float]:
-    """How far the first map lies from the truth: mean offset of the survey's poses, and the 95 % of their distances."""
-    names = scene.drive_names("survey_")
-    offset = np.concatenate([scene.survey_poses(n)[:, :3, 3] - scene.true_poses(n)[:, :3, 3] for n in names])
-    mean = offset.mean(axis=0)
-    return {
-        "mean_m": float(np.linalg.norm(mean)),
-        "x_m": float(mean[0]),
-        "y_m": float(mean[1]),
-        "z_m": float(mean[2]),
-        "p95_m": float(np.percentile(np.linalg.norm(offset, axis=1), 95)),
-    }
-
-
-def map_frame(scene: Scene) -> F64:
-    """T_map_world: the truth's frame in the map's, by the survey's trajectory."""
-    names = scene.drive_names("survey_")
-    believed = np.concatenate([scene.survey_poses(n) for n in names])
-    return rigid_between(believed, np.concatenate([scene.true_poses(n) for n in names]))
-
-
-def localisation(scene: Scene, drives: Sequence[Pass]) -> dict[str, dict[str, float]]:
-    """Each vehicle's pose errors in the map's frame."""
-    T_map_world = map_frame(scene)
-    return {d.vehicle: error_summary(d.T_map_lidar, T_map_world @ scene.true_poses(d.vehicle)) for d in drives}

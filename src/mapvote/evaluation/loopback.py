@@ -11,9 +11,9 @@ from pathlib import Path
 
 import httpx2
 
-from mapvote.core.ballot import Ballot
+from mapvote.client import MapClient
+from mapvote.codec.ballot import Ballot
 from mapvote.core.types import MapvoteError, PointMap
-from mapvote.fleet.client import MapClient
 
 _STOP_S = 20.0
 _SERVE = "from mapvote.cli import main; main()"

@@ -11,19 +11,19 @@ from pathlib import Path
 
 import numpy as np
 
-from mapvote.core.tiling import all_points
+from mapvote.core.tile import all_points
 from mapvote.core.types import Drive, MapvoteError, PointMap
-from mapvote.formats.autoware import PROJECTOR, is_autoware, read_autoware, write_autoware
-from mapvote.formats.cloud import Cloud, to_map
-from mapvote.formats.drive import DriveOptions
-from mapvote.formats.kitti import DriveWriter, is_kitti_folder, open_kitti, read_T_map_lidar
-from mapvote.formats.kitti_raw import is_kitti_raw, open_kitti_raw
-from mapvote.formats.las import is_las, read_las, write_las
-from mapvote.formats.mapfolder import is_map_folder, read_map_folder, write_map_folder
-from mapvote.formats.pcd import is_pcd, read_pcd, write_pcd
-from mapvote.formats.pcd_drive import is_pcd_drive, open_pcd_drive
-from mapvote.formats.ply import is_ply, read_ply, write_ply
-from mapvote.formats.rosbag import is_rosbag, open_rosbag
+from mapvote.formats.drives.kitti import DriveWriter, is_kitti_folder, open_kitti, read_T_map_lidar
+from mapvote.formats.drives.kitti_raw import is_kitti_raw, open_kitti_raw
+from mapvote.formats.drives.options import DriveOptions
+from mapvote.formats.drives.pcd_scans import is_pcd_drive, open_pcd_drive
+from mapvote.formats.drives.rosbag import is_rosbag, open_rosbag
+from mapvote.formats.maps.autoware import PROJECTOR, is_autoware, read_autoware, write_autoware
+from mapvote.formats.maps.cloud import Cloud, to_map
+from mapvote.formats.maps.las import is_las, read_las, write_las
+from mapvote.formats.maps.mapvote_folder import is_map_folder, read_map_folder, write_map_folder
+from mapvote.formats.maps.pcd import is_pcd, read_pcd, write_pcd
+from mapvote.formats.maps.ply import is_ply, read_ply, write_ply
 
 __all__ = [
     "CLOUDS",

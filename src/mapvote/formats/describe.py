@@ -7,13 +7,13 @@ from pathlib import Path
 
 import numpy as np
 
-from mapvote.core.ballot import Ballot, decode, unpack_points, unpack_states
+from mapvote.codec.ballot import Ballot, decode, unpack_points, unpack_states
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS
-from mapvote.core.tiling import all_points
+from mapvote.core.tile import all_points
 from mapvote.core.types import CellState, Drive, MapvoteError, PointMap
 from mapvote.formats import CLOUDS, DRIVES, open_drive, read_cloud, read_map
-from mapvote.formats.cloud import to_map
-from mapvote.formats.mapfolder import is_map_folder
+from mapvote.formats.maps.cloud import to_map
+from mapvote.formats.maps.mapvote_folder import is_map_folder
 
 Rows = list[tuple[str, str]]
 

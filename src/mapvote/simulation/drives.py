@@ -19,7 +19,7 @@ from mapvote.core.columns import GROUND_MARGIN_M
 from mapvote.core.grid import CELL_SIZE
 from mapvote.core.sensors import SENSORS, Sensor
 from mapvote.core.types import F32, F64, I32, U8, MapvoteError
-from mapvote.formats.kitti import DriveWriter, write_poses
+from mapvote.formats.drives.kitti import DriveWriter, write_poses
 from mapvote.simulation.actors import Traffic, make_traffic
 from mapvote.simulation.lidar import Caster, measure, sweep
 from mapvote.simulation.routes import Route, make_routes

@@ -24,9 +24,9 @@ from scipy.spatial import ConvexHull
 
 from mapvote.core.columns import GROUND_MARGIN_M
 from mapvote.core.grid import CELL_SIZE, Grid, Lattice
-from mapvote.core.points import voxel_downsample
 from mapvote.core.sensors import Sensor
 from mapvote.core.types import F32, F64, I32, U8
+from mapvote.core.voxels import voxel_downsample
 from mapvote.simulation.lidar import NOTHING, Caster
 from mapvote.simulation.routes import Route
 from mapvote.simulation.scenario import Scenario

@@ -9,11 +9,11 @@ import numpy as np
 
 from mapvote.core.types import MapvoteError, PointMap, Scan
 from mapvote.formats import open_drive
+from mapvote.formats.doctor.basics import check_prior, check_scans, check_times
 from mapvote.formats.doctor.finding import Finding
 from mapvote.formats.doctor.frames import UPS, check_frames, check_up, up_axis
 from mapvote.formats.doctor.overlap import check_overlap
-from mapvote.formats.doctor.plain import check_prior, check_scans, check_times
-from mapvote.formats.drive import DriveOptions
+from mapvote.formats.drives.options import DriveOptions
 
 __all__ = ["Finding", "examine"]
 

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapvote.core import geometry
-from mapvote.core.points import voxel_downsample, voxel_keys
 from mapvote.core.types import F32, F64, I64, Drive, MapvoteError
+from mapvote.core.voxels import voxel_downsample, voxel_keys
 from mapvote.formats.doctor.finding import Finding
 
 UPS = {

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from mapvote.core import geometry
-from mapvote.core.columns import map_points
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, tile_grid
-from mapvote.core.points import voxel_downsample, voxel_keys
+from mapvote.core.tile import map_points
 from mapvote.core.types import F32, F64, PointMap, Scan
+from mapvote.core.voxels import voxel_downsample, voxel_keys
 from mapvote.formats.doctor.finding import Finding
 
 

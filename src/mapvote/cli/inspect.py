@@ -1,0 +1,85 @@
+"""Verbs that look into a STORE: what happened, who voted strangely, what changed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from mapvote.cli.options import Config
+from mapvote.cli.server import StoreName, opened_store, when
+
+
+def register(app: typer.Typer) -> None:
+    """Add these verbs to ``app``."""
+    for verb in (log, vehicles, changes):
+        app.command()(verb)
+
+
+def log(
+    store: StoreName,
+    events: Annotated[int, typer.Option(min=0, help="also the last so many events")] = 0,
+) -> None:
+    """Versions of a store, and what happened in it."""
+    from rich.console import Console
+    from rich.table import Table
+
+    from mapvote.server.insight.history import events as last_events
+
+    with opened_store(store) as opened:
+        versions, happened = opened.versions(), last_events(opened, events) if events else []
+    table = Table("version", "kind", "from", "when", "by", "reason")
+    for v in versions:
+        origin = v.target if v.target is not None else v.parent
+        table.add_row(str(v.number), v.kind, str(origin or ""), when(v.created_ns), v.published_by, v.reason)
+    Console().print(table)
+    for event in happened:
+        print(f"{event['seq']} {when(event['at_ns'])} {event['kind']} {event['actor']} {event['detail']}")
+
+
+def vehicles(store: StoreName, config: Config = None) -> None:
+    """Which vehicles contradict the others far more than chance, and where."""
+    from rich.console import Console
+    from rich.table import Table
+
+    from mapvote.config import load_settings
+    from mapvote.server.insight.history import vehicle_standings
+
+    settings = load_settings(config)
+    with opened_store(store) as opened:
+        found = vehicle_standings(opened, settings.fuse)
+    table = Table("vehicle", "verdict", "cells compared", "contradictions", "of the others", "p", "the largest")
+    for s in found:
+        places = "; ".join(f"{e.says} at {e.x:.1f}, {e.y:.1f} ({e.cells} cells)" for e in s.evidence[:3])
+        table.add_row(
+            s.vehicle, s.verdict, str(s.cells), str(s.objects), str(s.others_objects), f"{s.p_value:.2g}", places
+        )
+    Console().print(table)
+    print(
+        "Compared where others agree both before and after a vehicle passed; the first and the last cannot be judged."
+    )
+
+
+def changes(
+    store: StoreName,
+    old: Annotated[int, typer.Option("--from", help="version")] = 1,
+    new: Annotated[int | None, typer.Option("--to", help="version; the newest by default")] = None,
+    min_cells: Annotated[int, typer.Option(min=1, help="leave out smaller objects")] = 1,
+    out: Annotated[Path | None, typer.Option(help="GeoJSON file; else printed")] = None,
+) -> None:
+    """What was built and demolished between two versions, as GeoJSON in map metres."""
+    import json
+
+    from mapvote.formats.atomic import whole_file
+    from mapvote.server.insight.history import changes_between
+
+    with opened_store(store) as opened:
+        found = changes_between(opened, old, opened.current() if new is None else new, min_cells)
+    text = json.dumps(found, indent=1)
+    if out is None:
+        print(text)
+        return
+    with whole_file(out) as part:
+        part.write_text(text + "\n")
+    print(f"{len(found['features'])} objects in {out}")

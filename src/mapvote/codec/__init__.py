@@ -1,0 +1,1 @@
+"""Arrays, tiles and ballots as bytes."""

@@ -1,0 +1,182 @@
+"""Ballot <-> bytes: all that passes between vehicle and server (DESIGN 2).
+
+A msgpack envelope of zstd-compressed planes. Reading checks every size before it allocates; planes that
+a newer format adds are ignored, required fields that are missing are refused.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Annotated
+
+import msgspec
+import numba
+import numpy as np
+
+from mapvote.codec.arrays import pack_plane as pack_plane
+from mapvote.codec.arrays import unpack_bytes, unpack_frames, unpack_plane
+from mapvote.codec.tile_file import content_hash as content_hash
+from mapvote.core.grid import CELL_SIZE, TILE_CELLS, TileIndex
+from mapvote.core.types import F32, N_STATES, NO_VOTE, U8, U16, U64, MapvoteError
+
+FORMAT_VERSION = 1
+MAX_TILES = 4096
+MAX_POINTS_PER_CELL = 64
+"""One new point per voxel of a column: no honest ballot has more."""
+MAX_TILE_INDEX = 1 << 20
+_CELLS = TILE_CELLS * TILE_CELLS
+
+Id = Annotated[str, msgspec.Meta(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}\Z")]
+"""Vehicle and drive names: 1-64 of letters, digits, dot, underscore, dash; they appear in URLs and file names."""
+_Text = Annotated[str, msgspec.Meta(pattern=r"^[^\x00-\x1f]*\Z", max_length=200)]
+"""No control characters: some databases refuse them, and no log should print them."""
+_Hash = Annotated[str, msgspec.Meta(pattern=r"^[0-9a-f]{0,64}\Z")]
+_Count = Annotated[int, msgspec.Meta(ge=0, le=1 << 31)]
+
+
+class BallotTile(msgspec.Struct, frozen=True, kw_only=True):
+    """One tile's votes. Planes are compressed; see :func:`states_of` and its neighbours."""
+
+    tile: tuple[int, int]
+    states: bytes | None = None
+    """(256, 256) uint8 CellState or NO_VOTE: two-stage."""
+    tally: bytes | None = None
+    """(5, 256, 256) uint16 votes in VOTE_UNITs, class-major: one-stage."""
+    gone: bytes | None = None
+    """(256, 256) uint64: which voxels of a changed-empty cell are gone (delete mask)."""
+    new_points: bytes | None = None
+    """(m, 3) float32 from the tile's corner, sorted by voxel key: one per 0.3 m voxel of changed-occupied cells."""
+    free: bytes | None = None
+    """(256, 256) uint64: voxels that this drive's rays passed through."""
+
+
+class Ballot(msgspec.Struct, frozen=True, kw_only=True):
+    """What one vehicle says after one drive. Self-contained."""
+
+    format_version: int = FORMAT_VERSION
+    map_id: _Text
+    base: dict[str, _Hash]
+    """Content hash of every tile the votes were cast against, by "row,col"; "" for a tile the map lacked."""
+    vehicle: Id
+    drive: Id
+    start_ns: int
+    end_ns: int
+    method: _Text
+    settings_hash: _Text
+    scans: _Count
+    """Scans in the drive."""
+    scans_localised: _Count
+    """Scans that voted; the others abstained because the vehicle was not sure where it was."""
+    median_sigma_m: float
+    """Median position sigma of the scans that voted."""
+    tiles: list[BallotTile]
+
+
+def tile_key(tile: TileIndex) -> str:
+    """The name of a tile in manifests and ballots: "row,col"."""
+    return f"{tile[0]},{tile[1]}"
+
+
+def unpack_states(data: bytes) -> U8:
+    """(256, 256) uint8; MapvoteError if damaged or not a CellState."""
+    return _checked(unpack_plane(data, "<u1", (TILE_CELLS, TILE_CELLS), "ballot: states"))
+
+
+def unpack_many_states(planes: Sequence[bytes]) -> U8:
+    """(n, 256, 256) uint8: the states of n ballots that the server took in; MapvoteError as :func:`unpack_states`."""
+    return _checked(unpack_frames(planes, _CELLS, "ballot: states").reshape(-1, TILE_CELLS, TILE_CELLS))
+
+
+def _checked(states: U8) -> U8:
+    if not _all_states(states.reshape(-1)):
+        raise MapvoteError("ballot: states holds a value that is no cell state")
+    return states
+
+
+def unpack_tally(data: bytes) -> U16:
+    """(256, 256, 5) uint16; MapvoteError if damaged."""
+    return np.moveaxis(unpack_plane(data, "<u2", (N_STATES, TILE_CELLS, TILE_CELLS), "ballot: tally"), 0, -1)
+
+
+def unpack_words(data: bytes, what: str) -> U64:
+    """(256, 256) uint64; MapvoteError if damaged."""
+    return unpack_plane(data, "<u8", (TILE_CELLS, TILE_CELLS), f"ballot: {what}")
+
+
+def unpack_points(data: bytes) -> F32:
+    """(m, 3) float32 from the tile's corner; MapvoteError if damaged, not finite or outside the tile."""
+    raw = unpack_bytes(data, _CELLS * MAX_POINTS_PER_CELL * 12, "ballot: new_points")
+    if len(raw) % 12:
+        raise MapvoteError(f"ballot: new_points has {len(raw)} bytes, not a multiple of 12")
+    points = np.frombuffer(raw, dtype="<f4").reshape(-1, 3)
+    if not _all_inside(points, np.float32(TILE_CELLS * CELL_SIZE)):
+        raise MapvoteError("ballot: new_points holds a point outside its tile or not finite")
+    return points
+
+
+@numba.njit(cache=True, nogil=True)
+def _all_states(values: U8) -> bool:
+    sound = True
+    for value in values:  # without a way out: that the compiler turns into vectors
+        sound &= (value < N_STATES) | (value == NO_VOTE)
+    return sound
+
+
+@numba.njit(cache=True, nogil=True)
+def _all_inside(points: F32, side: np.float32) -> bool:
+    """Whether all points (m, 3) are finite and within a tile; NaN fails every comparison."""
+    sound = True
+    for x, y, z in points:
+        sound &= 0 <= x < side and 0 <= y < side and abs(z) <= 1e5
+    return sound
+
+
+def encode(ballot: Ballot) -> bytes:
+    """The ballot as one self-contained file."""
+    return msgspec.msgpack.encode(ballot)
+
+
+def decode(data: bytes) -> Ballot:
+    """Check the envelope; planes are checked when unpacked (:func:`validate` does all). MapvoteError if unusable."""
+    try:
+        ballot = msgspec.msgpack.decode(data, type=Ballot)
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:  # ValidationError is a DecodeError
+        raise MapvoteError(f"ballot: not readable ({error}); was it written by this version of mapvote?") from error
+    if ballot.format_version < 1 or ballot.format_version > FORMAT_VERSION:
+        raise MapvoteError(f"ballot: format {ballot.format_version}; this version reads up to {FORMAT_VERSION}")
+    indices = [t.tile for t in ballot.tiles]
+    if len(indices) > MAX_TILES or len(set(indices)) != len(indices):
+        raise MapvoteError(f"ballot: {len(indices)} tiles; at most {MAX_TILES}, each once")
+    for tile in ballot.tiles:
+        if max(abs(tile.tile[0]), abs(tile.tile[1])) > MAX_TILE_INDEX:
+            raise MapvoteError(f"ballot: tile {tile.tile} lies outside any map")
+        if (tile.states is None) == (tile.tally is None):
+            raise MapvoteError(f"ballot: tile {tile.tile} needs either states or a tally")
+        if tile_key(tile.tile) not in ballot.base:
+            raise MapvoteError(f"ballot: tile {tile.tile} has no base hash")
+    if ballot.start_ns > ballot.end_ns:
+        raise MapvoteError("ballot: ends before it starts; check the drive's clock")
+    if not math.isfinite(ballot.median_sigma_m):
+        raise MapvoteError("ballot: median_sigma_m is not finite")
+    return ballot
+
+
+def validate(ballot: Ballot, max_bytes: int | None = None) -> None:
+    """Unpack every plane once; MapvoteError on the first that is damaged or impossible.
+
+    ``max_bytes``: also refuse a ballot whose planes are larger than that, together and decompressed.
+    """
+    size = 0
+    for tile in ballot.tiles:
+        if tile.states is not None:
+            size += unpack_states(tile.states).nbytes
+        if tile.tally is not None:
+            size += unpack_tally(tile.tally).nbytes
+        for what, words in (("gone", tile.gone), ("free", tile.free)):
+            if words is not None:
+                size += unpack_words(words, what).nbytes
+        if tile.new_points is not None:
+            size += unpack_points(tile.new_points).nbytes
+        if max_bytes is not None and size > max_bytes:
+            raise MapvoteError(f"ballot: larger than {max_bytes} bytes when decompressed; send a shorter drive")

@@ -1,0 +1,95 @@
+"""The partial reference map R_i around a vehicle (paper III-A): the map as planes over one window."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy import ndimage
+
+from mapvote.core.columns import GROUND_MARGIN_M, fill_columns
+from mapvote.core.grid import TILE_CELLS, Grid, tile_grid, window_around
+from mapvote.core.ground import base_layers
+from mapvote.core.tile import map_points
+from mapvote.core.types import F64, U64, PointMap, Reference
+
+
+def reference_window(point_map: PointMap, grid: Grid) -> Reference:
+    """The map's planes over ``grid`` (any window; what lies outside every tile is unknown and empty)."""
+    ground_z = np.full(grid.shape, np.nan, dtype=np.float32)
+    free = np.zeros(grid.shape, dtype=np.uint64)
+    learned = False
+    clouds = []
+    for tile in grid.tiles():
+        if tile not in point_map.tiles:
+            continue
+        content = point_map.tiles[tile]
+        window = tile_grid(point_map.lattice, tile)
+        common = window.intersection(grid)
+        ground_z[common.slices_in(grid)] = content.ground_z[common.slices_in(window)]
+        if content.free is not None:
+            learned = True
+            free[common.slices_in(grid)] = content.free[common.slices_in(window)]
+        clouds.append(map_points(window, content.points))
+    base = base_layers(ground_z)
+    occupied = np.zeros(grid.shape, dtype=np.uint64)
+    counts = np.zeros(grid.shape, dtype=np.int32)
+    bottom_z = np.full(grid.shape, np.inf, dtype=np.float32)
+    top_z = np.full(grid.shape, -np.inf, dtype=np.float32)
+    for cloud in clouds:
+        rows, cols, _ = grid.indices_of(cloud)
+        fill_columns(rows, cols, cloud[:, 2], ground_z, base, GROUND_MARGIN_M, occupied, counts, bottom_z, top_z)
+    return Reference(grid, ground_z, base, occupied, counts, bottom_z, top_z, free if learned else None)
+
+
+def above_ground_points(point_map: PointMap, grid: Grid) -> U64:
+    """(rows, cols) all bits where the map holds a ground point in the cell or next to it, else none.
+
+    A stand-in for the known-free columns of a map that came without: whoever measured the ground there looked through
+    the air above it, so an obstacle would most likely be in the map. Where there is no ground point, nobody can say.
+    """
+    wide = grid.padded(1)
+    seen = np.zeros(wide.shape, dtype=np.bool_)
+    for tile in wide.tiles():
+        if tile in point_map.tiles:
+            window = tile_grid(point_map.lattice, tile)
+            content = point_map.tiles[tile]
+            rows, cols, inside = window.indices_of(map_points(window, content.points))
+            low = content.points[:, 2] - content.ground_z[rows * inside, cols * inside] < GROUND_MARGIN_M
+            r, c = rows[low & inside] + window.row0 - wide.row0, cols[low & inside] + window.col0 - wide.col0
+            here = (r >= 0) & (c >= 0) & (r < wide.rows) & (c < wide.cols)
+            seen[r[here], c[here]] = True
+    near = ndimage.binary_dilation(seen, structure=np.ones((3, 3)))[1:-1, 1:-1]
+    return np.where(near, ~np.uint64(0), np.uint64(0))
+
+
+def cut_reference(outer: Reference, window: Grid) -> Reference:
+    """The planes of ``outer`` over ``window``, which lies inside it; views, nothing is copied."""
+    cut = window.slices_in(outer.grid)
+    return Reference(
+        window,
+        outer.ground_z[cut],
+        outer.base[cut],
+        outer.occupied[cut],
+        outer.counts[cut],
+        outer.bottom_z[cut],
+        outer.top_z[cut],
+        None if outer.free is None else outer.free[cut],
+    )
+
+
+class LocalMap:
+    """The reference around a vehicle on the move: laid out over the tiles about it, anew only when it has left them."""
+
+    def __init__(self, point_map: PointMap, window_m: float) -> None:
+        self.point_map, self.window_m = point_map, window_m
+        self.outer: Reference | None = None
+        """The planes last laid out; windows are views into them."""
+
+    def at(self, origin_map: F64) -> tuple[Reference, Reference]:
+        """(the partial reference map R_i, ``window_m`` wide around ``origin_map`` (3,); the planes it is cut from)."""
+        lattice = self.point_map.lattice
+        window = window_around(lattice, origin_map[0], origin_map[1], self.window_m)
+        if self.outer is None or window.intersection(self.outer.grid) != window:
+            row, col = window.row0 + window.rows // 2, window.col0 + window.cols // 2
+            centre = tile_grid(lattice, (row // TILE_CELLS, col // TILE_CELLS))
+            self.outer = reference_window(self.point_map, centre.padded(max(TILE_CELLS, window.rows)))
+        return cut_reference(self.outer, window), self.outer

@@ -1,0 +1,1 @@
+"""One scan against the map: what changed (paper III)."""

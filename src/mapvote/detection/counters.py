@@ -1,0 +1,147 @@
+"""Evidence per voxel over a drive: in how many scans was it struck, in how many seen through (METHOD 4, rules A-C).
+
+Two counters a voxel, kept as bit planes: plane k of a cell is a 64-bit word that holds bit k of the
+counts of its 64 voxels, so that one scan adds to a whole column with a few word operations. A voxel that the map
+holds counts as struck if anything near it was hit (8 neighbouring cells, one layer up or down), and
+then not as seen through, whatever grazed past it in the same scan; any other voxel must be hit itself.
+Two more words a cell say of its mapped voxels, whatever lies next to them, whether a hit ever fell into them and
+whether a ray ever went through (rule I).
+Cells whose ground the map does not know gather nothing: heights would mean nothing there, and the map knows nothing.
+"""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+
+from mapvote.core.columns import TOP_BIT, neighbourhood
+from mapvote.core.grid import TILE_CELLS, Lattice, TileIndex, tile_grid
+from mapvote.core.types import F32, I32, U8, U64, Reference
+from mapvote.perception.raycast import ScanView, Sight
+
+PLANES = 7
+"""Counts up to 127 scans; a cell that would pass it is halved as a whole, which keeps its ratios."""
+OPEN_SHARE = 0.1
+"""A voxel is open if the voxels above and below it were seen through in more than this share of its own times."""
+_THROUGH, _STRUCK = 0, PLANES
+STRUCK_ITSELF, THROUGH_ITSELF = 2 * PLANES, 2 * PLANES + 1
+WORDS = 2 * PLANES + 2
+"""Words a cell: the two counters, and what is said of mapped voxels themselves."""
+_BEHIND = int(Sight.BEHIND)
+
+
+@numba.njit(cache=True, nogil=True)
+def _is_full(planes: U64, first: int, word: np.uint64) -> bool:
+    """Whether one of ``word``'s voxels has reached the highest count."""
+    for k in range(first + PLANES - 1, first - 1, -1):
+        word &= planes[k]
+    return word != 0
+
+
+@numba.njit(cache=True, nogil=True)
+def _add(planes: U64, first: int, word: np.uint64) -> None:
+    """Add 1 to the counts of ``word``'s voxels: a ripple-carry adder over 64 voxels at once."""
+    for k in range(first, first + PLANES):
+        carry = planes[k] & word
+        planes[k] ^= word
+        word = carry
+        if not word:
+            break
+
+
+@numba.njit(cache=True, nogil=True)
+def _halve(planes: U64) -> None:
+    for first in (_THROUGH, _STRUCK):
+        for k in range(first, first + PLANES - 1):
+            planes[k] = planes[k + 1]
+        planes[first + PLANES - 1] = 0
+
+
+@numba.njit(cache=True, nogil=True)
+def count_of(planes: U64, first: int, bit: int) -> int:
+    """The count of one voxel: ``first`` is 0 for seen through, PLANES for struck."""
+    value = 0
+    for k in range(PLANES):
+        value |= int((planes[first + k] >> np.uint64(bit)) & np.uint64(1)) << k
+    return value
+
+
+@numba.njit(cache=True, nogil=True)
+def is_open(planes: U64, bit: int) -> bool:
+    """Whether rays went through a voxel from side to side, and did not only graze it along a slab.
+
+    A roof, an awning or a ceiling is thinner than a voxel: rays that graze it pass through its voxel, but of the voxels
+    above and below they reach only one. The ground bounds the lowest voxel, the end of the word the highest.
+    """
+    through = count_of(planes, _THROUGH, bit)
+    above = count_of(planes, _THROUGH, bit + 1) if bit + 1 < TOP_BIT else through
+    below = count_of(planes, _THROUGH, bit - 1) if bit > 1 else through
+    return min(above, below) > OPEN_SHARE * through
+
+
+@numba.njit(cache=True, nogil=True)
+def _gather(
+    planes: U64, shape: tuple[int, int], row0: int, col0: int,
+    hit: U64, passed: U64, sight: U8, occupied: U64, ground_z: F32, base: I32, reach: int, by_ray: bool, veto: bool,
+) -> None:  # fmt: skip
+    """Add one scan to a tile: the first ``shape`` cells of ``planes``, from (row0, col0) of the window."""
+    for i in range(shape[0]):
+        for j in range(shape[1]):
+            r, c = row0 + i, col0 + j
+            if np.isnan(ground_z[r, c]):
+                continue
+            through, struck, mapped = passed[r, c] & ~hit[r, c], hit[r, c], occupied[r, c]
+            if mapped:
+                near = neighbourhood(hit, base, r, c, reach) & mapped if veto else hit[r, c] & mapped
+                if not by_ray and sight[r, c] >= _BEHIND and not hit[r, c]:
+                    through |= mapped
+                struck = (struck & ~mapped) | near
+                through &= ~near
+            if through or struck:
+                cell = planes[i, j]
+                if mapped:
+                    cell[STRUCK_ITSELF] |= hit[r, c] & mapped
+                    if reach == 1:  # where a scan is not sure of its pose, single voxels mean nothing
+                        cell[THROUGH_ITSELF] |= passed[r, c] & mapped & ~hit[r, c]
+                if _is_full(cell, _THROUGH, through) or _is_full(cell, _STRUCK, struck):
+                    _halve(cell)
+                _add(cell, _THROUGH, through)
+                _add(cell, _STRUCK, struck)
+
+
+class Evidence:
+    """Counters of a drive by tile: (256, 256, WORDS) uint64, seen through first, struck after, then the last two."""
+
+    def __init__(self, lattice: Lattice, by_ray: bool = True, veto: bool = True) -> None:
+        """``by_ray`` (rule A): a mapped voxel is seen through only by a ray through it, else wherever the cell was
+        visible. ``veto`` (rule B): hits near a mapped voxel strike it, else only hits in it."""
+        self.lattice, self.by_ray, self.veto = lattice, by_ray, veto
+        self.tiles: dict[TileIndex, U64] = {}
+
+    def add(self, view: ScanView, reference: Reference, reach: int = 1) -> None:
+        """Add one scan seen against ``reference``; ``reach`` cells around a hit it may stand for (pose uncertainty)."""
+        for tile in view.grid.tiles():
+            window = tile_grid(self.lattice, tile)
+            common = window.intersection(view.grid)
+            if tile not in self.tiles:
+                self.tiles[tile] = np.zeros((TILE_CELLS, TILE_CELLS, WORDS), dtype=np.uint64)
+            row0, col0 = common.row0 - view.grid.row0, common.col0 - view.grid.col0
+            _gather(
+                self.tiles[tile][common.slices_in(window)], common.shape, row0, col0, view.hit, view.passed, view.sight,
+                reference.occupied, reference.ground_z, reference.base, reach, self.by_ray, self.veto,
+            )  # fmt: skip
+
+
+@numba.njit(cache=True, nogil=True)
+def free_words(planes: U64, occupied: U64) -> U64:
+    """(rows, cols) voxels that were seen through in two scans or more, never struck, and that the map does not hold."""
+    out = np.zeros(occupied.shape, dtype=np.uint64)
+    for r in range(occupied.shape[0]):
+        for c in range(occupied.shape[1]):
+            struck, often = occupied[r, c], np.uint64(0)
+            for k in range(PLANES):
+                struck |= planes[r, c, _STRUCK + k]
+                if k > 0:
+                    often |= planes[r, c, _THROUGH + k]
+            out[r, c] = often & ~struck
+    return out

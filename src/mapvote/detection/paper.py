@@ -1,0 +1,120 @@
+"""One scan against the reference: a state per cell (paper III-A, III-B; METHOD 2)."""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+
+from mapvote.config import VotingSettings
+from mapvote.core.columns import below_top, span_of
+from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Grid, Lattice, TileIndex, tile_grid
+from mapvote.core.sensors import Sensor
+from mapvote.core.types import F32, F64, I32, N_STATES, NO_VOTE, U8, U64, CellState, PointMap, Reference
+from mapvote.core.voting import VOTE_UNIT, cast, decide, weight_table
+from mapvote.detection.votes import ALL_BITS, Observation, TileVotes
+from mapvote.perception.raycast import ScanView, Sight
+
+_UNCHANGED_OCCUPIED = int(CellState.UNCHANGED_OCCUPIED)
+_UNCHANGED_EMPTY = int(CellState.UNCHANGED_EMPTY)
+_CHANGED_OCCUPIED = int(CellState.CHANGED_OCCUPIED)
+_CHANGED_EMPTY = int(CellState.CHANGED_EMPTY)
+_UNDETERMINED = int(CellState.UNDETERMINED)
+_CLEAR, _BEHIND, _NEVER = int(Sight.CLEAR), int(Sight.BEHIND), int(Sight.NEVER)
+_OCCLUSION = {"first_hit": 0, "farthest_return": 1, "column": 2}
+_TALL = {"none": 0, "bottom": 1, "height": 2}
+
+
+@numba.njit(cache=True, nogil=True)
+def _paper(
+    counts: I32, hit: U64, passed: U64, sight: U8, occupied: U64, map_counts: I32, bottom_z: F32,
+    origin: F64, x0: float, y0: float, occlusion: int, tall: int, tan_top: float, table: I32, n_min: int, one: int,
+    states: U8, weights: I32,
+) -> None:  # fmt: skip
+    rows, cols = counts.shape
+    for r in range(rows):
+        for c in range(cols):
+            weights[r, c] = one
+            n, mapped, visible = counts[r, c], map_counts[r, c] > 0, sight[r, c] == _CLEAR
+            if occlusion == 1:
+                visible = sight[r, c] >= _BEHIND
+            elif occlusion == 2:
+                crossed = span_of(occupied[r, c]) & passed[r, c]
+                visible = crossed != 0 if mapped else sight[r, c] >= _BEHIND
+            invalid = False
+            if tall == 1 and mapped:
+                dx, dy = x0 + (c + 0.5) * CELL_SIZE - origin[0], y0 + (r + 0.5) * CELL_SIZE - origin[1]
+                invalid = bottom_z[r, c] > origin[2] + tan_top * np.sqrt(dx * dx + dy * dy)
+            elif tall == 2:
+                invalid = occupied[r, c] > below_top(hit[r, c])
+            if invalid or (sight[r, c] == _NEVER and n == 0):
+                states[r, c] = NO_VOTE
+            elif n >= n_min:
+                states[r, c] = _UNCHANGED_OCCUPIED if mapped else _CHANGED_OCCUPIED
+                weights[r, c] = table[min(n, len(table) - 1)]
+            elif n > 0 or not visible:
+                states[r, c] = _UNDETERMINED
+            else:
+                states[r, c] = _CHANGED_EMPTY if mapped else _UNCHANGED_EMPTY
+
+
+def classify_paper(
+    view: ScanView, reference: Reference, origin_map: F64, sensor: Sensor, settings: VotingSettings
+) -> tuple[U8, I32]:
+    """The paper's five states and the votes each is worth: (states uint8, weights int32 in VOTE_UNITs), (rows, cols).
+
+    A cell with n_min points or more is occupied and worth w(n), Eq. (1); with 1 to n_min - 1 undetermined; with none
+    empty if it was visible, else undetermined. NO_VOTE where no ray was fired, and, in case 5 (``skip_tall_cells``),
+    where the map begins above the sensor's view at that range (METHOD 2). ``origin_map`` (3,): the sensor, map metres.
+    """
+    states = np.empty(view.counts.shape, dtype=np.uint8)
+    weights = np.empty(view.counts.shape, dtype=np.int32)
+    table = weight_table(settings.weighted, settings.a, settings.b, settings.k, settings.n_min)
+    tall = _TALL[settings.tall_rule if settings.skip_tall_cells else "none"]
+    _paper(
+        view.counts, view.hit, view.passed, view.sight, reference.occupied, reference.counts, reference.bottom_z,
+        origin_map, view.grid.x0, view.grid.y0, _OCCLUSION[settings.occlusion], tall,
+        np.tan(np.radians(sensor.fov_top_deg)), table, settings.n_min, VOTE_UNIT, states, weights,
+    )  # fmt: skip
+    return states, weights
+
+
+class Tally:
+    """Votes per cell and class over a drive: :func:`mapvote.core.voting.cast` on the tiles that a window touches."""
+
+    def __init__(self, lattice: Lattice) -> None:
+        self.lattice = lattice
+        self.tiles: dict[TileIndex, I32] = {}
+        """(256, 256, 5) int32 in VOTE_UNITs."""
+
+    def add(self, grid: Grid, states: U8, weights: I32) -> None:
+        """Cast one scan's ``states`` (rows, cols of ``grid``) with ``weights``."""
+        for tile in grid.tiles():
+            window = tile_grid(self.lattice, tile)
+            common = window.intersection(grid)
+            if tile not in self.tiles:
+                self.tiles[tile] = np.zeros((TILE_CELLS, TILE_CELLS, N_STATES), dtype=np.int32)
+            inner, outer = common.slices_in(window), common.slices_in(grid)
+            cast(self.tiles[tile][inner], states[outer], weights[outer])
+
+
+class PaperVoter:
+    """Paper III: every scan classifies every cell and casts its votes."""
+
+    def __init__(self, voting: VotingSettings, sensor: Sensor, point_map: PointMap) -> None:
+        self.voting, self.sensor = voting, sensor
+        self._tally = Tally(point_map.lattice)
+
+    def add(self, seen: Observation) -> U64:
+        """Cast one scan's votes; returns (rows, cols) words of voxels whose points may be new."""
+        states, weights = classify_paper(seen.view, seen.reference, seen.origin_map, self.sensor, self.voting)
+        self._tally.add(seen.view.grid, states, weights)
+        return np.where(states == CellState.CHANGED_OCCUPIED, ALL_BITS, np.uint64(0))
+
+    def votes(self) -> dict[TileIndex, TileVotes]:
+        """Every tile with a vote, in ascending order."""
+        out = {}
+        for tile, tally in sorted(self._tally.tiles.items()):
+            if tally.any():
+                new = np.where(tally[..., CellState.CHANGED_OCCUPIED] > 0, ALL_BITS, np.uint64(0))
+                out[tile] = TileVotes(tally, decide(tally), None, None, new, None)
+        return out

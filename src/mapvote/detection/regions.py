@@ -1,0 +1,164 @@
+"""What the cells of a drive say together: the rules that look beyond a cell, over all its tiles (docs/method.md).
+
+Rule C gives up hits that an error of pose explains, H lets roofs fall with their walls, G drops specks, and I takes
+down what is left of demolished things beside what stands. Each looks at a tile with some cells of its neighbours
+around it, so that what lies across an edge is judged alike from both sides.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import Any
+
+import numpy as np
+from scipy import ndimage
+
+from mapvote.config import VotingSettings
+from mapvote.core.columns import TOP_BIT, dilated, remnants
+from mapvote.core.grid import Grid, Lattice, TileIndex, tile_grid
+from mapvote.core.types import I32, NO_VOTE, U8, U64, Bool, CellState
+from mapvote.detection.counters import PLANES, STRUCK_ITSELF, THROUGH_ITSELF
+from mapvote.detection.votes import Judged
+
+_LOWEST, _HIGHEST = np.uint64(0b11), np.uint64(3) << np.uint64(TOP_BIT - 1)
+_HALO = 64
+"""Cells around a tile that rules H and I look at: 19 m, a house."""
+Plane = Any
+"""An array of one tile or window, of any type."""
+
+
+Tiles = Mapping[TileIndex, Judged]
+
+
+def settle(tiles: Tiles, lattice: Lattice, voting: VotingSettings) -> None:
+    """Apply those of the rules C, H, G and I that ``voting.rules`` names, in this order."""
+    if "C" in voting.rules:
+        _give_up_explained(tiles, lattice, voting.join_cells)
+    if "H" in voting.rules:
+        _let_fall(tiles, lattice, voting.fall_cells)
+    if "G" in voting.rules:
+        _drop_specks(tiles, lattice, voting.min_cells)
+    if "I" in voting.rules:
+        _take_remnants(tiles, lattice)
+
+
+def _give_up_explained(tiles: Tiles, lattice: Lattice, join_cells: int) -> None:
+    beside = {tile: judged.verdict.beside for tile, judged in tiles.items()}
+    rule = partial(unexplained, reach=join_cells)
+    for tile, cells in _beyond(lattice, join_cells, rule, (_states(tiles), NO_VOTE), (beside, False)).items():
+        tiles[tile].decide(cells, CellState.UNDETERMINED)
+
+
+def _let_fall(tiles: Tiles, lattice: Lattice, fall_cells: int) -> None:
+    adrift = {tile: judged.verdict.adrift for tile, judged in tiles.items()}
+    rule = partial(fallen, reach=fall_cells)
+    for tile, cells in _beyond(lattice, _HALO, rule, (_states(tiles), NO_VOTE), (adrift, False)).items():
+        tiles[tile].decide(cells, CellState.CHANGED_EMPTY)
+        tiles[tile].verdict.gone[cells] = tiles[tile].here.occupied[cells]
+
+
+def _drop_specks(tiles: Tiles, lattice: Lattice, min_cells: int) -> None:
+    rule = partial(drop_specks, min_cells=min_cells)
+    for tile, cells in _beyond(lattice, min_cells, rule, (_states(tiles), NO_VOTE)).items():
+        tiles[tile].states[cells] = CellState.UNDETERMINED
+
+
+def _take_remnants(tiles: Tiles, lattice: Lattice) -> None:
+    """A cell of which nothing is left is changed-empty, unless new hits lie next to what went: they may be what stands
+    there, put beside it by an error of pose."""
+    empty = int(CellState.CHANGED_EMPTY)
+    loose = {tile: judged.verdict.loose for tile, judged in tiles.items()}
+    base = {tile: judged.here.base for tile, judged in tiles.items()}
+    gone = {t: np.where(judged.states == empty, judged.verdict.gone, np.uint64(0)) for t, judged in tiles.items()}
+    for tile, left in _beyond(lattice, _HALO, remnants, (gone, 0), (loose, 0), (base, 0)).items():
+        judged = tiles[tile]
+        nothing_left = ((left | gone[tile]) == judged.here.occupied) & (left & judged.crowded == 0)
+        judged.decide((left != 0) & nothing_left & (judged.states != empty), CellState.CHANGED_EMPTY)
+        down = judged.states == empty
+        judged.verdict.gone[down] |= left[down]
+        judged.remnants = np.where(down, np.uint64(0), left)
+
+
+def _states(tiles: Tiles) -> dict[TileIndex, U8]:
+    return {tile: judged.states for tile, judged in tiles.items()}
+
+
+def _beyond(
+    lattice: Lattice, halo: int, rule: Callable[..., Plane], *planes: tuple[Mapping[TileIndex, Plane], int]
+) -> dict[TileIndex, Plane]:
+    """``rule`` of ``planes``, tile by tile with ``halo`` cells around it, cut back to the tile. Each plane comes with
+    what it is where there is no tile. Nothing changes until all tiles are through."""
+    out = {}
+    for tile in planes[0][0]:
+        wide = tile_grid(lattice, tile).padded(halo)
+        near = [around(lattice, plane, wide, elsewhere) for plane, elsewhere in planes]
+        out[tile] = rule(*near)[halo:-halo, halo:-halo]
+    return out
+
+
+def around(lattice: Lattice, planes: Mapping[TileIndex, Plane], wide: Grid, elsewhere: int) -> Plane:
+    """The planes of several tiles as one window ``wide``; ``elsewhere`` where there is no tile."""
+    first = next(iter(planes.values()))
+    out = np.full((*wide.shape, *first.shape[2:]), elsewhere, dtype=first.dtype)
+    for tile in wide.tiles():
+        if tile in planes:
+            grid = tile_grid(lattice, tile)
+            common = grid.intersection(wide)
+            out[common.slices_in(wide)] = planes[tile][common.slices_in(grid)]
+    return out
+
+
+def unexplained(states: U8, beside: Bool, reach: int) -> Bool:
+    """(rows, cols) cells of ``beside`` that rule C gives up: an error of pose puts hits next to what is mapped, and
+    there alone. A new thing that touches an old one also stands where nothing explains it: the cells next to it that
+    are ``reach`` cells or less from such a place belong to it."""
+    changed = states == CellState.CHANGED_OCCUPIED
+    core = changed & ~beside
+    joined = ndimage.binary_dilation(core, np.ones((3, 3)), iterations=reach, mask=changed)
+    return np.asarray(changed & ~(core | joined))
+
+
+def fallen(states: U8, adrift: Bool, reach: int) -> Bool:
+    """(rows, cols) cells of rule H: what stood on things that are gone, and no ray could reach, is gone with them.
+
+    The roof of a demolished house, too high for the sensor once nothing is behind it. An ``adrift`` cell goes with the
+    changed-empty or the unchanged-occupied cell that is nearer, so that of two roofs that meet only one falls; a
+    connected group of those that go falls if a changed-empty cell lies within ``reach`` cells of it.
+    """
+    gone, kept = states == CellState.CHANGED_EMPTY, states == CellState.UNCHANGED_OCCUPIED
+    if not gone.any():
+        return np.zeros_like(adrift)
+    to_gone = ndimage.distance_transform_cdt(~gone, "chessboard")
+    goes = adrift & (to_gone < ndimage.distance_transform_cdt(~kept, "chessboard")) if kept.any() else adrift
+    group, count = ndimage.label(goes, structure=np.ones((3, 3)))
+    falls = np.bincount(group[to_gone <= reach], minlength=count + 1) > 0
+    falls[0] = False
+    return np.asarray(falls[group])
+
+
+def drop_specks(states: U8, min_cells: int) -> Bool:
+    """(rows, cols) changed cells whose 8-connected component of equal state has fewer than ``min_cells`` (rule G)."""
+    specks = np.zeros(states.shape, dtype=np.bool_)
+    for change in (CellState.CHANGED_OCCUPIED, CellState.CHANGED_EMPTY):
+        label, _ = ndimage.label(states == change, structure=np.ones((3, 3)))
+        size = np.bincount(label.ravel())
+        size[0] = min_cells
+        specks |= size[label] < min_cells
+    return specks
+
+
+def beside_new(planes: U64, occupied: U64, base: I32) -> U64:
+    """(rows, cols) voxels in which, or next to which, something was struck where the map holds nothing."""
+    struck = np.bitwise_or.reduce(planes[..., PLANES : 2 * PLANES], axis=-1)
+    return dilated(struck & ~occupied, base, 1)
+
+
+def loose_voxels(planes: U64) -> U64:
+    """(rows, cols) mapped voxels into which no hit ever fell, and through which rays went, as through the voxels above
+    and below them: grazing a roof says nothing (rule A). The ground bounds the lowest, the end of the word the highest.
+    """
+    itself = planes[..., THROUGH_ITSELF]
+    through = np.bitwise_or.reduce(planes[..., :PLANES], axis=-1) | itself
+    below, above = through << np.uint64(1) | _LOWEST, through >> np.uint64(1) | _HIGHEST
+    return np.asarray(itself & ~planes[..., STRUCK_ITSELF] & below & above)

@@ -1,0 +1,104 @@
+"""What drives are put through that they did not meet when they were recorded: to see what the method can bear, and
+which of its stages holds it back (issue 3, the experiments and the oracles)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from mapvote.core.geometry import from_xyz_rpy
+from mapvote.core.grid import tile_grid
+from mapvote.core.types import F64, I64, Bool, Drive, MapTile, PointMap, Scan
+from mapvote.evaluation.scoring.truth import Truth
+from mapvote.localisation.ndt import PosePrior
+from mapvote.localisation.tracker import Fix
+from mapvote.simulation.scenario import load_scenario
+from mapvote.simulation.world import make_world
+from mapvote.vehicle import Localise, Movers
+
+NOISE_MEMORY_S = 10.0
+"""Correlation time of the pose noise: as that of the simulator's priors, long against the passing of a house."""
+
+
+@dataclass(frozen=True, slots=True)
+class Conditions:
+    """The default is nothing: everything as recorded, and as the method finds it."""
+
+    scans: str | None = None
+    """Which scans of every drive, surveys and vehicles, are there at all: "::5" makes 2 Hz of 10 Hz."""
+    true_poses: bool = False
+    """Oracle: surveys and vehicles know where they are."""
+    true_moving: bool = False
+    """Oracle: vehicles know which points hit moving bodies (the first map is still made by our own removal)."""
+    true_ground: bool = False
+    """Oracle: the first map knows the height of the ground everywhere."""
+    noise_m: float = 0.0
+    noise_deg: float = 0.0
+    """Standard deviations of AR(1) errors added to the vehicles' poses, on each axis."""
+    noise_told: bool = False
+    """The noise is added to the covariance too: the vehicle knows of it."""
+
+
+def shaken(localise: Localise, stamps_ns: I64, conditions: Conditions, seed: tuple[int, ...]) -> Localise:
+    """``localise`` with noise added to the poses it finds; its own search goes on undisturbed.
+
+    ``stamps_ns`` (n,) of every scan that will come; ``seed`` decides the noise.
+    """
+    sigma = np.repeat([conditions.noise_m, float(np.radians(conditions.noise_deg))], 3)
+    errors = ar1(stamps_ns, sigma, np.random.default_rng(seed))
+    error_at = {int(stamp): error for stamp, error in zip(stamps_ns, errors, strict=True)}
+
+    def found(scan: Scan, prior: PosePrior | None) -> Fix:
+        fix = localise(scan, prior)
+        error = error_at[scan.stamp_ns]
+        T_map_lidar = fix.registration.T_map_lidar.copy()
+        T_map_lidar[:3, :3] = T_map_lidar[:3, :3] @ from_xyz_rpy(0, 0, 0, *error[3:])[:3, :3]
+        T_map_lidar[:3, 3] += error[:3]
+        covariance = fix.registration.covariance + (np.diag(sigma**2) if conditions.noise_told else 0.0)
+        return replace(fix, registration=replace(fix.registration, T_map_lidar=T_map_lidar, covariance=covariance))
+
+    return found
+
+
+def ar1(stamps_ns: I64, sigma: F64, rng: np.random.Generator) -> F64:
+    """(n, k) errors at ``stamps_ns`` (n,), first-order autoregressive, stationary with deviations ``sigma`` (k,)."""
+    kicks = rng.normal(size=(len(stamps_ns), len(sigma))) * sigma
+    out = kicks.copy()
+    for i in range(1, len(stamps_ns)):
+        memory = np.exp(-1e-9 * float(stamps_ns[i] - stamps_ns[i - 1]) / NOISE_MEMORY_S)
+        out[i] = memory * out[i - 1] + np.sqrt(1.0 - memory**2) * kicks[i]
+    return out
+
+
+class TrueMovers(Movers):
+    """The simulator's own word on which points move, instead of the filter."""
+
+    def __init__(self, truth: Truth, whole: Drive) -> None:
+        """``whole``: the drive with all of its scans, whose numbers the truth goes by."""
+        self._truth, self._name = truth, whole.path.name
+        self._number = {int(stamp): i for i, stamp in enumerate(whole.stamps_ns)}
+        self._pushed = 0
+
+    def push(self, points_map: F64, origin_map: F64, obstacle: Bool, stamp_ns: int) -> list[tuple[int, Bool]]:
+        moving = self._truth.moving(self._name, self._number[stamp_ns])
+        if len(moving) != len(points_map):
+            raise ValueError(f"{self._name}: {len(points_map)} points, but the truth labels {len(moving)}")
+        self._pushed += 1
+        return [(self._pushed - 1, moving)]
+
+    def flush(self) -> list[tuple[int, Bool]]:
+        return []
+
+
+def with_true_ground(point_map: PointMap, scenario: str, seed: int, overrides: Mapping[str, Any]) -> PointMap:
+    """``point_map`` with the simulated terrain's height in every cell of every tile. Points stay as they are."""
+    terrain = make_world(load_scenario(scenario, overrides), seed).terrain
+    tiles: dict[tuple[int, int], MapTile] = {}
+    for index, tile in point_map.tiles.items():
+        x, y = tile_grid(point_map.lattice, index).centres()
+        height = terrain.height(x[None, :], y[:, None]).astype(np.float32)
+        tiles[index] = replace(tile, ground_z=height)
+    return replace(point_map, tiles=tiles)

@@ -1,0 +1,68 @@
+"""The jury: what a run is held against, and how it did."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from mapvote.core.columns import GROUND_MARGIN_M
+from mapvote.core.grid import CELL_SIZE, TileIndex
+from mapvote.core.reference import reference_window
+from mapvote.core.types import F64, U8, PointMap
+from mapvote.evaluation.scoring.cells import coverage, score_cells
+from mapvote.evaluation.scoring.map_points import MapJudge, map_obstacles
+from mapvote.evaluation.scoring.objects import score_objects
+from mapvote.evaluation.scoring.truth import Truth
+from mapvote.fusion.fuse import Decision
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What the server made of one case's ballots."""
+
+    updated: PointMap
+    states: U8
+    """Decided, over the truth's window."""
+    vehicle_states: list[U8]
+    """Each vehicle's own decision, over the truth's window."""
+    decisions: Mapping[TileIndex, Decision]
+    seconds: float
+    """Spent on fusing."""
+
+
+class Jury:
+    """Scores whatever was decided about one first map against one truth."""
+
+    def __init__(self, first_map: PointMap, truth: Truth) -> None:
+        self.truth = truth
+        self.window = truth.grid_on(first_map.lattice)
+        self._points = MapJudge(map_obstacles(first_map), *_above_ground(first_map, truth))
+        self._objects = [{"kind": o["kind"], "cells": truth.cells_of(o["footprint"])} for o in truth.objects]
+
+    def of_states(self, states: U8, vehicle_states: Sequence[U8]) -> dict[str, Any]:
+        """R for both truths, coverage, objects; all states over the truth's window."""
+        strict, provenance = self.truth.strict, self.truth.provenance
+        return {
+            "strict": score_cells(states, strict).to_dict(),
+            "provenance": score_cells(states, provenance).to_dict(),
+            "coverage": coverage(vehicle_states, strict),
+            "objects": score_objects(states, strict, self._objects, CELL_SIZE).to_dict(),
+        }
+
+    def of_update(self, outcome: Outcome) -> dict[str, Any]:
+        """The same, and what became of the map's points."""
+        points = self._points.score(map_obstacles(outcome.updated)).to_dict()
+        return {**self.of_states(outcome.states, outcome.vehicle_states), "map": points}
+
+
+def _above_ground(first_map: PointMap, truth: Truth) -> tuple[F64, F64, F64]:
+    """Surface samples that could be obstacle points: at least 0.3 m above the map's ground, where that is known."""
+    reference = reference_window(first_map, truth.grid_on(first_map.lattice))
+    chosen = []
+    for samples in truth.surfaces():
+        rows, cols, inside = reference.grid.indices_of(samples)
+        ground = reference.ground_z[rows.clip(0, reference.grid.rows - 1), cols.clip(0, reference.grid.cols - 1)]
+        low = inside & (samples[:, 2] - ground < GROUND_MARGIN_M)
+        chosen.append(samples[~low])
+    return chosen[0], chosen[1], chosen[2]

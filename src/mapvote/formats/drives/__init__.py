@@ -1,0 +1,1 @@
+"""Recorded drives, a format a file."""

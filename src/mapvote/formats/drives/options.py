@@ -1,0 +1,213 @@
+"""What every drive format shares: drive.toml, ``--scans``, names, priors; and the making of a Drive from them."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from mapvote.config import did_you_mean
+from mapvote.core import geometry
+from mapvote.core.sensors import SENSORS, Sensor
+from mapvote.core.types import F64, I64, Drive, MapvoteError, Scan
+from mapvote.formats.extras import read_text
+
+ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
+
+
+@dataclass(frozen=True, slots=True)
+class DriveOptions:
+    """What the command line may say about a drive; it wins over drive.toml."""
+
+    scans: str | None = None
+    prior: str | None = None
+    rate_hz: float | None = None
+    sensor: str | None = None
+    vehicle: str | None = None
+    mount: str | None = None
+    topic: str | None = None
+
+
+class DriveFile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """drive.toml: what the files of a drive cannot say themselves. Every key is optional."""
+
+    vehicle: str | None = None
+    drive: str | None = None
+    sensor: str | dict[str, Any] | None = None
+    """A name (hdl32e, hdl64e, vlp16) or a table of Sensor's fields."""
+    rate_hz: float | None = None
+    start_ns: int = 0
+    prior: str | None = None
+    prior_sigma_m: float = 1.0
+    prior_sigma_deg: float = 1.0
+    T_base_lidar: list[float] | None = None
+    """12 numbers, the rows of the 3 x 4 matrix; or 6: x, y, z in metres, roll, pitch, yaw in degrees."""
+    motion_compensated: bool = True
+    topic: str | None = None
+    """The PointCloud2 topic of a bag."""
+    origin: list[float] | None = None
+    """Latitude, longitude (degrees), altitude (metres) of the map's origin, for priors from KITTI's oxts."""
+
+
+def read_drive_file(folder: Path) -> DriveFile:
+    """``folder``/drive.toml, or all defaults if there is none. MapvoteError names an unknown key or a wrong value."""
+    file = folder / "drive.toml"
+    if not file.is_file():
+        return DriveFile()
+    try:
+        table = tomllib.loads(read_text(file))
+    except tomllib.TOMLDecodeError as error:
+        raise MapvoteError(f"{file}: not valid TOML ({error})") from error
+    for key in table:
+        if key not in DriveFile.__struct_fields__:
+            raise MapvoteError(f"{file}: unknown key {key!r}{did_you_mean(key, DriveFile.__struct_fields__)}")
+    try:
+        about = msgspec.convert(table, DriveFile)
+    except msgspec.ValidationError as error:
+        raise MapvoteError(f"{file}: {error}") from error
+    if about.prior_sigma_m <= 0 or about.prior_sigma_deg <= 0:
+        raise MapvoteError(f"{file}: prior_sigma_m and prior_sigma_deg must be positive")
+    return about
+
+
+def read_mount(numbers: list[float] | str | None, where: str) -> F64:
+    """T_base_lidar (4, 4) from 12 numbers (rows of 3 x 4) or 6 (metres; roll, pitch, yaw in degrees)."""
+    if numbers is None:
+        return np.eye(4)
+    try:
+        values = [float(v) for v in numbers.replace(",", " ").split()] if isinstance(numbers, str) else numbers
+    except ValueError as error:
+        raise MapvoteError(f"{where}: T_base_lidar is not a list of numbers: {numbers!r}") from error
+    T_base_lidar = np.eye(4)
+    if len(values) == 12:
+        T_base_lidar[:3] = np.reshape(values, (3, 4))
+    elif len(values) == 6:
+        T_base_lidar = geometry.from_xyz_rpy(*values[:3], *np.deg2rad(values[3:]))
+    if len(values) not in (6, 12) or not geometry.is_rigid(T_base_lidar):
+        raise MapvoteError(
+            f"{where}: T_base_lidar must be 12 numbers (a rigid 3 x 4 matrix, row by row) or 6 "
+            f"(x, y, z in metres, roll, pitch, yaw in degrees); got {len(values)}: {values}"
+        )
+    return T_base_lidar
+
+
+def read_sensor(sensor: str | dict[str, Any], where: str) -> Sensor:
+    """A sensor by name, or by a table of its fields. MapvoteError lists what is known."""
+    if isinstance(sensor, str):
+        if sensor not in SENSORS:
+            raise MapvoteError(
+                f"{where}: no sensor named {sensor!r}{did_you_mean(sensor, SENSORS)}; known: {', '.join(SENSORS)}; "
+                f"others as a table [sensor] in drive.toml (name, elevations_deg, azimuth_step_deg)"
+            )
+        return SENSORS[sensor]
+    known = [f.name for f in fields(Sensor)]
+    for key in sensor:
+        if key not in known:
+            raise MapvoteError(f"{where}: [sensor]: unknown key {key!r}{did_you_mean(key, known)}")
+    try:
+        return msgspec.convert(sensor, Sensor)
+    except msgspec.ValidationError as error:
+        raise MapvoteError(f"{where}: [sensor]: {error}") from error
+
+
+def guess_sensor(scan: Scan) -> Sensor:
+    """The known sensor whose vertical field of view lies nearest to what this scan spans."""
+    p = scan.points.astype(np.float64)
+    elevation_deg = np.rad2deg(np.arctan2(p[:, 2], np.hypot(p[:, 0], p[:, 1])))
+    bottom_deg, top_deg = np.quantile(elevation_deg, [0.002, 0.998])
+    return min(SENSORS.values(), key=lambda s: abs(s.fov_bottom_deg - bottom_deg) + abs(s.fov_top_deg - top_deg))
+
+
+def parse_scans(scans: str | None, n: int, where: str) -> I64:
+    """Indices (m,) of the scans that comma-separated ``START:STOP:STEP`` slices choose from n; each once, ascending."""
+    if scans is None:
+        return np.arange(n, dtype=np.int64)
+    chosen = np.zeros(n, dtype=bool)
+    for piece in scans.split(","):
+        try:
+            parts = [int(p) if p.strip() else None for p in piece.split(":")]
+            if len(parts) > 3 or parts == [None]:
+                raise ValueError("not a slice")
+            if len(parts) == 1:
+                chosen[int(parts[0] or 0)] = True
+            else:
+                chosen[slice(*parts)] = True
+        except (ValueError, IndexError) as error:
+            raise MapvoteError(
+                f"{where}: --scans {piece!r} chooses nothing from {n} scans ({error}); write START:STOP:STEP, "
+                f"for example 0:12,24:36"
+            ) from error
+    if not chosen.any():
+        raise MapvoteError(f"{where}: --scans {scans!r} chooses none of its {n} scans")
+    return np.flatnonzero(chosen)
+
+
+def name_from(path: Path) -> str:
+    """A legal vehicle or drive name made from a file's name."""
+    name = re.sub(r"[^A-Za-z0-9._-]+", "-", path.resolve().name).lstrip("._-")[:64]
+    return name or "drive"
+
+
+def _checked_id(name: str, what: str, where: str) -> str:
+    if not ID.fullmatch(name):
+        raise MapvoteError(
+            f"{where}: {what} {name!r} is not a legal name: 1 to 64 letters, digits, dots, underscores and dashes"
+        )
+    return name
+
+
+def make_drive(
+    path: Path,
+    about: DriveFile,
+    options: DriveOptions,
+    *,
+    stamps_ns: I64,
+    T_map_lidar_prior: F64 | None,
+    read_scan: Callable[[int, Sensor], Scan],
+) -> Drive:
+    """A Drive of the chosen scans. ``stamps_ns`` (n,) and the prior (n, 4, 4) are of all scans of the files.
+
+    MapvoteError if stamps do not increase or a prior is not a rigid motion.
+    """
+    where = str(path)
+    late = np.flatnonzero(np.diff(stamps_ns) <= 0)
+    if len(late):
+        i = int(late[0]) + 1
+        raise MapvoteError(
+            f"{where}: times are not sorted: scan {i} ({stamps_ns[i] / 1e9:.6f} s) does not come after scan {i - 1} "
+            f"({stamps_ns[i - 1] / 1e9:.6f} s); {len(late)} such places; sort the scans by time or mend times.txt"
+        )
+    chosen = parse_scans(options.scans, len(stamps_ns), where)
+    sensor_name = options.sensor or about.sensor
+    if sensor_name is None:
+        sensor = guess_sensor(read_scan(int(chosen[0]), SENSORS["hdl64e"]))
+    else:
+        sensor = read_sensor(sensor_name, where)
+    rate_hz = options.rate_hz or about.rate_hz
+    if rate_hz is not None:
+        if not 0.1 <= rate_hz <= 100:
+            raise MapvoteError(f"{where}: a rate of {rate_hz} Hz is not a LiDAR's; give revolutions per second")
+        sensor = replace(sensor, rate_hz=rate_hz)
+    drive_id = about.drive or name_from(path)
+
+    def read_chosen(i: int) -> Scan:
+        return read_scan(int(chosen[i]), sensor)
+
+    return Drive(
+        path=path,
+        vehicle=_checked_id(options.vehicle or about.vehicle or name_from(path), "vehicle", where),
+        drive_id=_checked_id(drive_id, "drive", where),
+        sensor=sensor,
+        stamps_ns=stamps_ns[chosen],
+        read_scan=read_chosen,
+        T_map_lidar_prior=None if T_map_lidar_prior is None else T_map_lidar_prior[chosen],
+        prior_sigma_m=about.prior_sigma_m,
+        prior_sigma_deg=about.prior_sigma_deg,
+        T_base_lidar=read_mount(options.mount or about.T_base_lidar, where),
+    )

@@ -1,0 +1,105 @@
+"""Drives as folders of PCD files, one a scan, with the text files of a KITTI drive folder beside them.
+
+A VIEWPOINT that changes from scan to scan is the pose of the sensor, and serves as the prior. Some tools store the
+points in the map frame then: recognised, and taken back into the sensor's frame.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from mapvote.core import geometry
+from mapvote.core.sensors import Sensor
+from mapvote.core.types import F64, Drive, Scan
+from mapvote.formats.clean import BadPoints, log
+from mapvote.formats.drives.kitti import read_T_map_lidar
+from mapvote.formats.drives.numbered import of_scans, prior_file, read_stamps, scan_files
+from mapvote.formats.drives.options import DriveOptions, make_drive, read_drive_file
+from mapvote.formats.drives.point_fields import scan_from_fields
+from mapvote.formats.drives.poses import check_rigid
+from mapvote.formats.maps.autoware import is_autoware
+from mapvote.formats.maps.cloud import xyz
+from mapvote.formats.maps.pcd import read_pcd_table
+
+
+def pcd_folder(path: Path) -> Path | None:
+    """Where the scans of a PCD drive lie: ``path``/pcd or ``path`` itself; None if it is no such drive."""
+    if not path.is_dir() or is_autoware(path):
+        return None
+    return next((folder for folder in (path / "pcd", path) if any(folder.glob("*.pcd"))), None)
+
+
+def is_pcd_drive(path: Path) -> bool:
+    return pcd_folder(path) is not None
+
+
+def open_pcd_drive(path: Path, options: DriveOptions) -> Drive:
+    """The drive in ``path``; scans are read one by one. MapvoteError says what is missing or does not fit."""
+    about = read_drive_file(path)
+    files = scan_files(pcd_folder(path) or path, ".pcd")
+    stamps_ns = read_stamps(path, files, about, options)
+    prior = prior_file(path, about, options)
+    T_prior = None if prior is None else of_scans(read_T_map_lidar(prior, path), files, prior)
+    viewpoints = _viewpoints(files)
+    in_map_frame = viewpoints is not None and _points_lie_around(viewpoints, files)
+    if viewpoints is not None and T_prior is None and (options.prior or about.prior) is None:
+        log.warning("%s: the PCD files' VIEWPOINT is taken as prior; --prior none refuses it", path)
+        T_prior = viewpoints
+    if in_map_frame:
+        log.warning("%s: points lie in the map frame; taken back to the sensor by each file's VIEWPOINT", path)
+    bad_points = BadPoints(str(path))
+
+    def read_scan(i: int, sensor: Sensor) -> Scan:
+        table, _ = read_pcd_table(files[i])
+        if in_map_frame and viewpoints is not None:
+            table = _to_lidar(str(files[i]), table, viewpoints[i])
+        return scan_from_fields(str(files[i]), i, int(stamps_ns[i]), table, sensor=sensor, bad_points=bad_points)
+
+    return make_drive(path, about, options, stamps_ns=stamps_ns, T_map_lidar_prior=T_prior, read_scan=read_scan)
+
+
+def _viewpoints(files: list[Path]) -> F64 | None:
+    """(n, 4, 4) of the files' VIEWPOINTs; None if they are all the same, and so say nothing."""
+    rows = np.array([_viewpoint_of(f) for f in files])
+    if (rows == rows[0]).all():
+        return None
+    T = np.tile(np.eye(4), (len(rows), 1, 1))
+    T[:, :3, 3] = rows[:, :3]
+    T[:, :3, :3] = Rotation.from_quat(rows[:, 3:], scalar_first=True).as_matrix()
+    check_rigid(T, f"{files[0].parent} (VIEWPOINT)")
+    return T
+
+
+def _viewpoint_of(file: Path) -> F64:
+    """tx ty tz qw qx qy qz from the header alone; no point is read."""
+    with file.open("rb") as stream:
+        for line in stream:
+            if line.startswith(b"VIEWPOINT"):
+                values = np.array([float(word) for word in line.split()[1:]])
+                if len(values) == 7 and np.linalg.norm(values[3:]) > 0.5:
+                    return values
+            if line.startswith(b"DATA"):
+                break
+    return np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
+
+
+def _points_lie_around(viewpoints: F64, files: list[Path]) -> bool:
+    """Whether points lie around the viewpoint, not around the origin, in the scan taken farthest from the origin."""
+    far = int(np.argmax(np.linalg.norm(viewpoints[:, :3, 3], axis=1)))
+    table, _ = read_pcd_table(files[far])
+    points = xyz(str(files[far]), table).astype(np.float64)
+    centre = viewpoints[far, :3, 3]
+    to_origin = np.nanmedian(np.linalg.norm(points, axis=1))
+    return bool(np.linalg.norm(centre) > 10.0 and np.nanmedian(np.linalg.norm(points - centre, axis=1)) < to_origin)
+
+
+def _to_lidar(where: str, table: np.ndarray, T_map_lidar: F64) -> np.ndarray:
+    """The table with x, y, z in the sensor's frame instead of the map's."""
+    points = geometry.transform(geometry.inverse(T_map_lidar), xyz(where, table))
+    out = table.copy()
+    for column, axis in enumerate("xyz"):
+        out[axis] = points[:, column]
+    return out

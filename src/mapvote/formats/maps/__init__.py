@@ -1,0 +1,1 @@
+"""Maps, a format a file."""

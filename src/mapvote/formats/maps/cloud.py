@@ -1,0 +1,98 @@
+"""A file of points as it stands, and the way from there to a map: what PCD, LAS, PLY and Autoware share."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Lattice
+from mapvote.core.tile import map_from_points
+from mapvote.core.types import MapvoteError, PointMap
+from mapvote.formats.clean import MAX_BAD_SHARE
+
+log = logging.getLogger("mapvote.formats")
+
+NEAR_ORIGIN_M = 50_000.0
+"""Maps within this of (0, 0) share the lattice that starts there; farther ones (UTM) get one of their own."""
+
+
+@dataclass(frozen=True, slots=True)
+class Cloud:
+    """``points`` (n, 3), float32 or float64 as the file holds them, map metres."""
+
+    points: NDArray[np.floating]
+    dropped: tuple[str, ...] = ()
+    """Fields of the file that a mapvote map does not keep, e.g. intensity."""
+    georeference: Mapping[str, str] = field(default_factory=dict)
+
+
+def xyz(where: str, table: NDArray[np.void]) -> NDArray[np.floating]:
+    """(n, 3) of a structured array's x, y, z in their own precision; MapvoteError if one is missing."""
+    names = table.dtype.names or ()
+    missing = [axis for axis in "xyz" if axis not in names]
+    if missing:
+        raise MapvoteError(f"{where}: no field {', '.join(missing)} among {', '.join(names)}; points need x, y and z")
+    exact = any(table.dtype[axis] not in (np.float32, np.float16, np.int16, np.uint16) for axis in "xyz")
+    out: NDArray[Any] = np.empty((len(table), 3), dtype=np.float64 if exact else np.float32)
+    for column, axis in enumerate("xyz"):
+        out[:, column] = table[axis]
+    return out
+
+
+def other_fields(names: tuple[str, ...]) -> tuple[str, ...]:
+    """The fields beside x, y, z; padding (names that start with an underscore or a hash) is none."""
+    return tuple(n for n in names if n not in ("x", "y", "z") and not n.startswith(("_", "#")))
+
+
+def lattice_of(points: NDArray[np.floating]) -> Lattice:
+    """The lattice at (0, 0), or for points far from it one that starts at a multiple of a tile's side below them."""
+    low = points[:, :2].min(axis=0).astype(np.float64)
+    high = points[:, :2].max(axis=0).astype(np.float64)
+    if max(np.abs(low).max(), np.abs(high).max()) < NEAR_ORIGIN_M:
+        return Lattice()
+    side = TILE_CELLS * CELL_SIZE
+    x0, y0 = np.floor(low / side) * side
+    return Lattice(round(float(x0), 1), round(float(y0), 1))
+
+
+def to_map(where: str, cloud: Cloud) -> PointMap:
+    """The map of a cloud: tiles cut, ground laid, map_id from the content. Broken points are dropped and counted.
+
+    MapvoteError if the cloud is empty or more than 5 % of it is not finite.
+    """
+    points = cloud.points
+    if len(points) == 0:
+        raise MapvoteError(f"{where}: holds no points; a map needs some")
+    bad = ~(np.isfinite(points[:, 0]) & np.isfinite(points[:, 1]) & np.isfinite(points[:, 2]))
+    n_bad = int(bad.sum())
+    if n_bad > MAX_BAD_SHARE * len(points):
+        raise MapvoteError(
+            f"{where}: {n_bad} of {len(points)} points are not finite, more than {MAX_BAD_SHARE:.0%}; mend the file"
+        )
+    if n_bad:
+        log.warning("%s: dropped %d of %d points that are not finite", where, n_bad, len(points))
+        points = points[~bad]
+    return map_from_points(points, lattice=lattice_of(points), georeference=cloud.georeference)
+
+
+def float32_loss_m(points: NDArray[np.floating]) -> float:
+    """The largest rounding of a coordinate if these points (n, 3) are stored as float32, metres."""
+    peak = float(np.abs(points).max()) if len(points) else 0.0
+    return 0.5 * float(np.spacing(np.float32(peak)))
+
+
+def warn_of_float32(where: str, points: NDArray[np.floating]) -> None:
+    """Say aloud when float32 would move points by more than half a millimetre (coordinates beyond 8 km)."""
+    loss_m = float32_loss_m(points)
+    if loss_m > 0.0005:
+        log.warning(
+            "%s: coordinates of %.0f m as float32 are rounded by up to %.1f mm; subtract an offset, or use LAS",
+            where,
+            float(np.abs(points).max()),
+            1000 * loss_m,
+        )

@@ -1,0 +1,1 @@
+"""The second vote and the edit of a tile (paper IV); pure."""

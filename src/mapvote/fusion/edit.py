@@ -1,0 +1,119 @@
+"""Delete and add points of one tile (paper IV, last paragraphs of DESIGN 4). Everything else stays bit-identical."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numba
+import numpy as np
+
+from mapvote.core.columns import EVERY_BIT
+from mapvote.core.grid import CELL_SIZE, CELLS, Grid
+from mapvote.core.tile import cells_of, columns_of
+from mapvote.core.types import F32, I32, I64, U64, Bool, MapTile
+
+
+def delete_points(tile: MapTile, grid: Grid, gone: U64) -> tuple[MapTile, int]:
+    """The tile without the obstacle points whose voxel is marked in ``gone`` (256, 256), and how many went.
+
+    Ground points are never deleted. Where the ground is unknown, vehicle and server share no base layer for their
+    words, so any mark takes the whole column.
+    """
+    cells = cells_of(grid, tile.points)
+    marked = np.flatnonzero(gone.reshape(-1)[cells])
+    cells = cells[marked]
+    bit, obstacle = columns_of(tile.points[marked], cells, tile.ground_z)
+    known = np.isfinite(tile.ground_z.reshape(-1)[cells])
+    words = np.where(known, gone.reshape(-1)[cells], EVERY_BIT)
+    dropped = marked[obstacle & ((words >> bit.astype(np.uint64)) & np.uint64(1)).astype(np.bool_)]
+    if not len(dropped):
+        return tile, 0
+    return replace(tile, points=np.delete(tile.points, dropped, axis=0)), len(dropped)
+
+
+def add_points(tile: MapTile, grid: Grid, points: F32, cells: I64, voters: I32, min_votes: int) -> tuple[MapTile, int]:
+    """The tile with one representative per voxel that at least ``min_votes`` voters support, and how many came.
+
+    ``points`` (m, 3) from the tile's corner, ``cells`` (m,) flat, ``voters`` (m,) small integers. A voter supports
+    a voxel with a point in it or in the voxel above or below. Voxels that already hold a point of the map stay as
+    they are. New points follow the old ones, ordered by cell and height.
+    """
+    if not len(points):
+        return tile, 0
+    layers = np.floor(points[:, 2].astype(np.float64) / CELL_SIZE).astype(np.int64)
+    touched = np.zeros(CELLS, dtype=np.bool_)
+    touched[cells] = True
+    own_cells = cells_of(grid, tile.points)
+    near = touched[own_cells]
+    own_layers = np.floor(tile.points[near, 2].astype(np.float64) / CELL_SIZE).astype(np.int64)
+    taken = np.isin(_voxel(cells, layers), _voxel(own_cells[near], own_layers))
+    voxels = _voxel(cells, layers)
+    order = np.argsort(voxels)
+    chosen = _representatives(points, voxels, voters, taken, order, min_votes)
+    if not len(chosen):
+        return tile, 0
+    return replace(tile, points=np.concatenate([tile.points, points[chosen]])), len(chosen)
+
+
+def _voxel(cells: I64, layers: I64) -> I64:
+    """One number for each voxel, ascending by cell, then layer; neighbours above each other differ by one."""
+    return cells * (1 << 24) + layers + (1 << 23)
+
+
+@numba.njit(cache=True, nogil=True)
+def _representatives(points: F32, voxels: I64, voters: I32, taken: Bool, order: I64, min_votes: int) -> I64:
+    """Indices of one point per supported voxel, ascending by voxel: the one nearest to the mean of all offered there,
+    of several the first by x, y, z.
+
+    ``order`` sorts ``voxels``; within a voxel any order gives the same: the mean is a sum of whole micrometres.
+    """
+    n = len(voxels)
+    out = np.empty(n, dtype=np.int64)
+    found = 0
+    seen = np.full(0 if n == 0 else voters.max() + 1, -1, dtype=np.int64)
+    low, start = 0, 0
+    while start < n:
+        voxel = voxels[order[start]]
+        stop = start + 1
+        while stop < n and voxels[order[stop]] == voxel:
+            stop += 1
+        while voxels[order[low]] < voxel - 1:
+            low += 1
+        support = 0
+        i = low
+        while i < n and voxels[order[i]] <= voxel + 1:
+            if seen[voters[order[i]]] != start:
+                seen[voters[order[i]]] = start
+                support += 1
+            i += 1
+        if support >= min_votes and not taken[order[start]]:
+            out[found] = _nearest_to_mean(points, order[start:stop])
+            found += 1
+        start = stop
+    return out[:found]
+
+
+@numba.njit(cache=True, nogil=True)
+def _nearest_to_mean(points: F32, some: I64) -> int:
+    mean = np.zeros(3)
+    for k in range(3):
+        total = 0
+        for i in some:
+            total += int(np.round(np.float64(points[i, k]) * 1e6))
+        mean[k] = total / (1e6 * len(some))
+    best, nearest = some[0], np.inf
+    for i in some:
+        distance = 0.0
+        for k in range(3):
+            distance += (np.float64(points[i, k]) - mean[k]) ** 2
+        if distance < nearest or (distance == nearest and _before(points[i], points[best])):
+            best, nearest = i, distance
+    return best
+
+
+@numba.njit(cache=True, nogil=True)
+def _before(a: F32, b: F32) -> bool:
+    for k in range(3):
+        if a[k] != b[k]:
+            return a[k] < b[k]
+    return False

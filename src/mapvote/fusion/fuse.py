@@ -1,0 +1,217 @@
+"""Ballots of a tile -> decisions -> edited tile (paper IV, DESIGN 4). Pure: no files, no database, no clock.
+
+The order in which votes are given never matters: tallies are integer sums, and of several points for one voxel the
+same one is always taken.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapvote.config import FuseSettings
+from mapvote.core.grid import CELLS, TILE_CELLS, Grid, Lattice, TileIndex, tile_grid
+from mapvote.core.tile import cells_of, empty_tile, obstacle_bits
+from mapvote.core.types import F32, I32, I64, N_STATES, NO_VOTE, U8, U64, Bool, CellState, MapTile, MapvoteError
+from mapvote.core.voting import VOTE_UNIT, add_states, add_tally, decide_cells
+from mapvote.fusion.edit import add_points, delete_points
+from mapvote.fusion.outliers import ASKED, contradicting, denying
+from mapvote.fusion.sparse_columns import Words, at_least, counted, packed
+from mapvote.fusion.tile_vote import TileVote, one_each
+
+Rule = Literal["paper", "columns"]
+_BATCH = 32
+"""Votes counted in one call: their states are copied side by side, into no more than stays in the cache."""
+
+
+@dataclass(frozen=True, slots=True)
+class Decision:
+    """What the vehicles decided about one tile, and what came of it."""
+
+    states: U8
+    """(256, 256) CellState or NO_VOTE."""
+    tally: NDArray[Any]
+    """(256, 256, 5) in VOTE_UNITs, see :func:`count`."""
+    vehicles: int
+    added: int
+    """Points added to the tile."""
+    deleted: int
+    """Points deleted from the tile."""
+
+
+def rule_of(method: str) -> Rule:
+    """The server's half of a ballot's method; MapvoteError for one that this version does not know."""
+    if method == "paper":
+        return "paper"
+    if method == "columns":
+        return "columns"
+    raise MapvoteError(f"ballot: method {method!r} is unknown; this version fuses 'paper' and 'columns'")
+
+
+def count(votes: Sequence[TileVote], rule: Rule, min_votes: int) -> tuple[U8, NDArray[Any]]:
+    """(states, tally) of one vote per vehicle: the rule of core.voting, then the quorum (DESIGN 4, "enough votes").
+
+    ``paper``: undetermined competes and a plain majority decides. ``columns``: undetermined abstains and a change
+    needs a majority of the vehicles that determined the cell. A change that fewer than ``min_votes`` vehicles back is
+    undetermined; in one stage a vehicle backs what its own tally alone would decide. The tally is (256, 256, 5) in
+    VOTE_UNITs, class by class in memory, uint16 where no sum can exceed that.
+    """
+    abstain = rule == "columns"
+    quorum = min_votes if min_votes > 1 else 0
+    one_stage = any(vote.tally is not None for vote in votes)
+    small = not one_stage and len(votes) * VOTE_UNIT <= np.iinfo(np.uint16).max
+    tally = np.zeros((N_STATES, CELLS), dtype=np.uint16 if small else np.int32)
+    if one_stage:
+        backers = np.zeros((N_STATES, CELLS), dtype=np.int32)
+        for vote in votes:
+            assert vote.tally is not None
+            add_tally(
+                np.ascontiguousarray(np.moveaxis(vote.tally, -1, 0)).reshape(N_STATES, -1), abstain, tally, backers
+            )
+        states = decide_cells(tally, backers, abstain, quorum)
+    else:
+        for start in range(0, len(votes), _BATCH):
+            add_states(_states_of(votes[start : start + _BATCH]), tally)
+        states = decide_cells(tally, tally, abstain, quorum * VOTE_UNIT)
+    shape = (TILE_CELLS, TILE_CELLS)
+    return states.reshape(shape), np.moveaxis(tally.reshape(N_STATES, *shape), 0, -1)
+
+
+def _states_of(votes: Sequence[TileVote], cells: slice | NDArray[np.intp] = slice(None)) -> U8:
+    """(votes, cells) what each vehicle decided, in some or all of the flat cells; nothing in one stage."""
+    planes = [vote.states.reshape(-1)[cells] for vote in votes if vote.states is not None]
+    return np.stack(planes) if planes else np.empty((0, CELLS), dtype=np.uint8)[:, cells]
+
+
+def fuse_tile(
+    lattice: Lattice,
+    index: TileIndex,
+    tile: MapTile | None,
+    drives: Iterable[TileVote],
+    rule: Rule,
+    settings: FuseSettings,
+) -> tuple[Decision, MapTile | None]:
+    """Decide one tile and edit it. A tile that does not change is returned as the same object (None if there was none).
+
+    ``drives`` are the votes that count on this tile (``select``, ``restrict`` in fusion/tile_vote.py), any order.
+    """
+    grid = tile_grid(lattice, index)
+    votes, states, tally, quorum = hear(one_each(drives, grid), rule, settings)
+    before = tile if tile is not None else empty_tile()
+    edited, deleted = before, 0
+    gone = supported_words(votes, states, quorum)
+    if gone is not None:
+        edited, deleted = delete_points(edited, grid, gone)
+    added = 0
+    if (states == CellState.CHANGED_OCCUPIED).any():
+        edited, added = add_points(edited, grid, *_offered(votes, states, grid), quorum)
+    edited = _learn_free(edited, grid, votes, quorum, points_added=added > 0)
+    unchanged = edited is before
+    return Decision(states, tally, len(votes), added, deleted), tile if unchanged else edited
+
+
+def hear(
+    votes: Sequence[TileVote], rule: Rule, settings: FuseSettings
+) -> tuple[Sequence[TileVote], U8, NDArray[Any], int]:
+    """(the votes that are heard, states, tally, quorum), of one vote a vehicle on a tile; see :func:`count`.
+
+    The quorum falls by one for each that is not heard, for it is one of those that the quorum guards against, but
+    nobody is ever believed alone. Of those that send tallies nobody is judged: theirs do not weigh alike.
+    """
+    heard, quorum = list(votes), settings.min_votes
+    states, tally = count(heard, rule, quorum)
+    if quorum < 2 or any(vote.states is None for vote in heard):
+        return heard, states, tally, quorum
+    for judged in (_contradicting, _denying):
+        found = judged(heard, states, tally, quorum, settings)
+        if found.any():
+            heard = [vote for vote, out in zip(heard, found, strict=True) if not out]
+            quorum = max(2, quorum - int(found.sum()))
+            states, tally = count(heard, rule, quorum)
+    return heard, states, tally, quorum
+
+
+def _contradicting(
+    votes: Sequence[TileVote], states: U8, tally: NDArray[Any], quorum: int, settings: FuseSettings
+) -> Bool:
+    if settings.max_contradiction >= 1.0:
+        return np.zeros(len(votes), dtype=np.bool_)
+    planes = np.moveaxis(tally, -1, 0).reshape(N_STATES, -1)
+    asked = _states_of(votes, ASKED)
+    return np.asarray(contradicting(asked, planes[:, ASKED], settings.max_contradiction, quorum))
+
+
+def _denying(votes: Sequence[TileVote], states: U8, tally: NDArray[Any], quorum: int, settings: FuseSettings) -> Bool:
+    changed = np.flatnonzero((states == CellState.CHANGED_OCCUPIED) | (states == CellState.CHANGED_EMPTY))
+    if settings.max_denial >= 1.0 or not len(changed):
+        return np.zeros(len(votes), dtype=np.bool_)
+    return denying(_states_of(votes, changed), states.reshape(-1)[changed], settings.max_denial)
+
+
+def supported_words(votes: Sequence[TileVote], states: U8, min_votes: int) -> U64 | None:
+    """(256, 256) delete mask, None if there is nothing to delete.
+
+    In cells decided changed-empty, the voxels that ``min_votes`` voters for it mark. In cells decided
+    unchanged-occupied, remnants that ``min_votes`` vehicles mark and more than half of those that determined the cell.
+    """
+    decided, standing = Words.whole(states == CellState.CHANGED_EMPTY), states == CellState.UNCHANGED_OCCUPIED
+    gone = at_least([vote.deletes(decided) for vote in votes], min_votes) if len(decided.cells) else None
+    left = [found for found in (vote.remnants(standing) for vote in votes) if len(found.cells)]
+    if len(left) < min_votes:
+        return gone
+    cells, marks = counted(left)
+    determined = np.sum([vote.determined(cells) for vote in votes], axis=0)
+    remnants = packed((marks >= min_votes) & (2 * marks > determined[:, None]))
+    gone = np.zeros(states.shape, dtype=np.uint64) if gone is None else gone
+    gone.reshape(-1)[cells] |= remnants
+    return gone
+
+
+def _offered(votes: Sequence[TileVote], states: U8, grid: Grid) -> tuple[F32, I64, I32]:
+    """(points, cells, voters) offered for cells decided changed-occupied, by vehicles that voted so there."""
+    offers = [np.empty((0, 3), np.float32) if vote.new_points is None else vote.new_points for vote in votes]
+    if not any(map(len, offers)):
+        return np.empty((0, 3), np.float32), np.empty(0, np.int64), np.empty(0, np.int32)
+    points = np.concatenate(offers)
+    cells = cells_of(grid, points)
+    voters = np.repeat(np.arange(len(votes), dtype=np.int32), [len(offer) for offer in offers])
+    wanted = np.flatnonzero((states == CellState.CHANGED_OCCUPIED).reshape(-1)[cells])
+    first = np.searchsorted(voters[wanted], np.arange(len(votes) + 1))
+    meant = [
+        mine[vote.supports(CellState.CHANGED_OCCUPIED, cells[mine])]
+        for vote, mine in zip(votes, np.split(wanted, first[1:-1]), strict=True)
+    ]
+    keep = np.concatenate(meant)
+    return points[keep], cells[keep], voters[keep]
+
+
+def _learn_free(tile: MapTile, grid: Grid, votes: Sequence[TileVote], min_votes: int, points_added: bool) -> MapTile:
+    """Known-free columns with the voxels that at least ``min_votes`` vehicles passed through, minus the occupied ones.
+
+    Free space is remembered once learned; a voxel that holds a point of the map is never free. Until enough vehicles
+    have passed, a tile that never learned stays so: no free voxel at all would say that nothing new can be known there.
+    """
+    passed = [v.free for v in votes if v.free is not None]
+    if tile.free is None and len(passed) < max(min_votes, 1):
+        return tile
+    if not passed and not points_added:
+        return tile
+    free = tile.free if tile.free is not None else np.zeros((TILE_CELLS, TILE_CELLS), dtype=np.uint64)
+    if len(passed) >= min_votes:
+        free = free | at_least(passed, min_votes)
+    free = free & ~obstacle_bits(tile, grid)
+    return tile if tile.free is not None and np.array_equal(free, tile.free) else replace(tile, free=free)
+
+
+def states_over(lattice: Lattice, decisions: Mapping[TileIndex, Decision]) -> tuple[U8, Grid]:
+    """Decided states (rows, cols) over the smallest window of whole tiles that holds them all; elsewhere NO_VOTE."""
+    rows, cols = [t[0] for t in decisions] or [0], [t[1] for t in decisions] or [0]
+    grid = tile_grid(lattice, (min(rows), min(cols))).union(tile_grid(lattice, (max(rows), max(cols))))
+    states = np.full(grid.shape, NO_VOTE, dtype=np.uint8)
+    for index, decision in decisions.items():
+        states[tile_grid(lattice, index).slices_in(grid)] = decision.states
+    return states, grid

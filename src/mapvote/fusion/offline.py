@@ -1,0 +1,111 @@
+"""The offline server: a map and a handful of ballots in, the updated map out (paper IV)."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
+
+from mapvote.codec.ballot import (
+    Ballot,
+    BallotTile,
+    content_hash,
+    encode,
+    tile_key,
+    unpack_points,
+    unpack_states,
+    unpack_tally,
+)
+from mapvote.config import FuseSettings
+from mapvote.core.grid import TileIndex
+from mapvote.core.types import MapTile, MapvoteError, PointMap
+from mapvote.fusion.fuse import Decision, Rule, fuse_tile, rule_of
+from mapvote.fusion.sparse_columns import Words
+from mapvote.fusion.tile_vote import TileVote, select
+
+
+def tile_vote(ballot: Ballot, tile: BallotTile, digest: str) -> TileVote:
+    """One tile of a ballot with its planes unpacked; MapvoteError if a plane is damaged."""
+    return TileVote(
+        vehicle=ballot.vehicle,
+        end_ns=ballot.end_ns,
+        digest=digest,
+        states=None if tile.states is None else unpack_states(tile.states),
+        tally=None if tile.tally is None else unpack_tally(tile.tally),
+        gone=None if tile.gone is None else Words.unpack(tile.gone, "gone"),
+        new_points=None if tile.new_points is None else unpack_points(tile.new_points),
+        free=None if tile.free is None else Words.unpack(tile.free, "free"),
+    )
+
+
+def base_hash(tile: MapTile | None) -> str:
+    """The content hash a ballot gives for this tile: "" where the map has none."""
+    return "" if tile is None else content_hash(tile.points)
+
+
+def check_round(ballots: Sequence[Ballot], point_map: PointMap) -> Rule:
+    """The one rule of a round. MapvoteError if ballots mix methods or settings, vote on another map or another
+    version of it, or are two different ballots of the same drive."""
+    if not ballots:
+        raise MapvoteError("no ballots: give at least one ballot file")
+    first = ballots[0]
+    drives: dict[tuple[str, str], str] = {}
+    for ballot in ballots:
+        name = f"ballot {ballot.vehicle}/{ballot.drive}"
+        if (ballot.method, ballot.settings_hash) != (first.method, first.settings_hash) or staged(ballot) != staged(
+            first
+        ):
+            raise MapvoteError(
+                f"{name} was cast by {_method(ballot)}, {first.vehicle}/{first.drive} by {_method(first)}: "
+                "one round never mixes methods; vote again with the same settings"
+            )
+        if ballot.map_id != point_map.map_id:
+            raise MapvoteError(f"{name} is a vote on map {ballot.map_id!r}, not on {point_map.map_id!r}")
+        digest = hashlib.sha256(encode(ballot)).hexdigest()
+        if drives.setdefault((ballot.vehicle, ballot.drive), digest) != digest:
+            raise MapvoteError(f"{name} is given twice with different votes: keep one of the two files")
+        for tile in ballot.tiles:
+            if ballot.base[tile_key(tile.tile)] != base_hash(point_map.tiles.get(tile.tile)):
+                raise MapvoteError(
+                    f"{name} voted on another version of tile {tile_key(tile.tile)} than this map holds: "
+                    "use the map it was cast against, or vote again with this one"
+                )
+    return rule_of(first.method)
+
+
+def staged(ballot: Ballot) -> str:
+    """ "two-stage" if the vehicle decided its cells, "one-stage" if it sends its tally."""
+    return "one-stage" if any(tile.tally is not None for tile in ballot.tiles) else "two-stage"
+
+
+def _method(ballot: Ballot) -> str:
+    return f"{ballot.method}, {staged(ballot)}, settings {ballot.settings_hash[:8]}"
+
+
+def update_map(
+    point_map: PointMap, ballots: Iterable[Ballot], settings: FuseSettings
+) -> tuple[PointMap, dict[TileIndex, Decision]]:
+    """Fuse a round of ballots and edit the map: (updated map, decisions by tile). Untouched tiles are the same objects.
+
+    All ballots of one round; ``settings.min_votes`` applies as given (the paper's cases use 1). MapvoteError as in
+    :func:`check_round`, or if a plane is damaged.
+    """
+    ballots = list(ballots)
+    rule = check_round(ballots, point_map)
+    unique = {hashlib.sha256(encode(ballot)).hexdigest(): ballot for ballot in ballots}
+    tiles = dict(point_map.tiles)
+    decisions: dict[TileIndex, Decision] = {}
+    for index in sorted({tile.tile for ballot in ballots for tile in ballot.tiles}):
+        votes = select(_votes_on(index, unique), settings)
+        decision, edited = fuse_tile(point_map.lattice, index, tiles.get(index), votes, rule, settings)
+        decisions[index] = decision
+        if edited is not None:
+            tiles[index] = edited
+    return replace(point_map, tiles=dict(sorted(tiles.items()))), decisions
+
+
+def _votes_on(index: TileIndex, ballots: dict[str, Ballot]) -> Iterator[TileVote]:
+    for digest, ballot in ballots.items():
+        for tile in ballot.tiles:
+            if tile.tile == index:
+                yield tile_vote(ballot, tile, digest)

@@ -1,0 +1,123 @@
+"""Column words of one tile, only those that are not zero: masks and free space mark few of a tile's 65,536 cells."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from mapvote.codec.arrays import unpack_plane
+from mapvote.core.columns import EVERY_BIT
+from mapvote.core.grid import CELLS, TILE_CELLS
+from mapvote.core.types import I32, U64, Bool
+
+_BLOCK = 64
+_BITS = np.arange(64, dtype=np.uint64)
+
+
+@dataclass(frozen=True, slots=True)
+class Words:
+    """The words of some cells; all others are zero."""
+
+    cells: NDArray[np.intp]
+    """(n,) flat cells of the tile, ascending."""
+    words: U64
+    """(n,)"""
+
+    @classmethod
+    def none(cls) -> Words:
+        """No word at all."""
+        return cls(np.empty(0, dtype=np.intp), np.empty(0, dtype=np.uint64))
+
+    @classmethod
+    def of(cls, plane: U64) -> Words:
+        """From a (256, 256) plane."""
+        flat = plane.reshape(-1)
+        return cls(*_not_zero(np.ascontiguousarray(flat)))
+
+    @classmethod
+    def whole(cls, cells: Bool) -> Words:
+        """Every bit of the (256, 256) cells given."""
+        flat = np.flatnonzero(cells)
+        return cls(flat, np.full(len(flat), EVERY_BIT))
+
+    @classmethod
+    def unpack(cls, data: bytes, what: str) -> Words:
+        """From a packed (256, 256) plane of a ballot; MapvoteError if damaged."""
+        plane = unpack_plane(data, "<u8", (CELLS,), f"ballot: {what}")
+        return cls(*_not_zero(plane))
+
+    def within(self, cells: Bool) -> Words:
+        """Only those of the (256, 256) cells given."""
+        return self.at(cells.reshape(-1)[self.cells])
+
+    def where(self, others: Words) -> Words:
+        """Only those of cells that ``others`` names too."""
+        near = np.searchsorted(others.cells, self.cells)
+        near[near == len(others.cells)] = 0
+        return self.at(others.cells[near] == self.cells if len(others.cells) else near > 0)
+
+    def at(self, keep: Bool) -> Words:
+        """Only those where ``keep`` (n,) is set."""
+        return Words(self.cells[keep], self.words[keep])
+
+
+def union(marked: Sequence[Words]) -> Words:
+    """The bits that any of ``marked`` sets."""
+    return Words.of(at_least(marked, 1))
+
+
+def at_least(marked: Sequence[Words], k: int) -> U64:
+    """(256, 256) the bits that at least ``k`` of ``marked`` set: a bitwise running count, no loop over bits."""
+    reached = np.zeros((k, CELLS), dtype=np.uint64)
+    for mine in marked:
+        _mark(reached, mine.cells, mine.words)
+    return reached[k - 1].reshape(TILE_CELLS, TILE_CELLS)
+
+
+def counted(marked: Sequence[Words]) -> tuple[NDArray[np.intp], I32]:
+    """(cells (n,), how many of ``marked`` set each of their bits (n, 64)), for a few cells."""
+    cells = np.unique(np.concatenate([mine.cells for mine in marked]))
+    counts = np.zeros((len(cells), 64), dtype=np.int32)
+    for mine in marked:
+        counts[np.searchsorted(cells, mine.cells)] += ((mine.words[:, None] >> _BITS) & np.uint64(1)).astype(np.int32)
+    return cells, counts
+
+
+def packed(bits: Bool) -> U64:
+    """(n,) words of bits (n, 64)."""
+    return np.asarray((bits.astype(np.uint64) << _BITS).sum(axis=1, dtype=np.uint64))
+
+
+@numba.njit(cache=True, nogil=True)
+def _not_zero(words: U64) -> tuple[NDArray[np.intp], U64]:
+    """Indices of the words (a multiple of 64) that are not zero, and those words."""
+    blocks = len(words) // _BLOCK
+    filled = np.zeros(blocks, dtype=np.uint64)
+    n = 0
+    for b in range(blocks):  # most blocks are empty, and that is seen with vector instructions
+        for i in range(b * _BLOCK, (b + 1) * _BLOCK):
+            filled[b] |= words[i]
+        n += _BLOCK if filled[b] else 0
+    cells, out = np.empty(n, dtype=np.intp), np.empty(n, dtype=np.uint64)
+    n = 0
+    for b in range(blocks):
+        if filled[b]:
+            for i in range(b * _BLOCK, (b + 1) * _BLOCK):
+                cells[n] = i
+                out[n] = words[i]
+                n += words[i] != 0
+    return cells[:n].copy(), out[:n].copy()
+
+
+@numba.njit(cache=True, nogil=True)
+def _mark(reached: U64, cells: NDArray[np.intp], words: U64) -> None:
+    """One more voter: bits that ``reached[i]`` had are now in ``reached[i + 1]`` where it sets them too."""
+    for i in range(len(cells)):
+        cell, word = cells[i], words[i]
+        for level in range(reached.shape[0] - 1, 0, -1):
+            reached[level, cell] |= reached[level - 1, cell] & word
+        reached[0, cell] |= word

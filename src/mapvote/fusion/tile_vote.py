@@ -1,0 +1,171 @@
+"""What one vehicle says of one tile (paper IV): which of its drives speak, and as one vote (DESIGN 4).
+
+Pure, and in no order that matters: drives fold by a commutative rule.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from typing import Protocol, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapvote.config import FuseSettings
+from mapvote.core.grid import TILE_CELLS, Grid
+from mapvote.core.tile import cells_of
+from mapvote.core.types import F32, N_STATES, NO_VOTE, U8, U16, Bool, CellState
+from mapvote.fusion.sparse_columns import Words, union
+
+DAY_NS = 86_400_000_000_000
+CHANGES = (CellState.CHANGED_OCCUPIED, CellState.CHANGED_EMPTY)
+
+
+@dataclass(frozen=True, slots=True)
+class TileVote:
+    """What one drive, or one vehicle after :func:`fold`, says about one tile."""
+
+    vehicle: str
+    end_ns: int
+    digest: str
+    """Hash of the ballot: breaks ties between drives that end at the same moment."""
+    states: U8 | None = None
+    """(256, 256): two-stage."""
+    tally: U16 | None = None
+    """(256, 256, 5): one-stage."""
+    gone: Words | None = None
+    """Column words to delete where the vote is changed-empty, and remnants where it says that the cell stands; None: no
+    remnants, and the whole column above ground."""
+    new_points: F32 | None = None
+    """(m, 3) from the tile's corner; used only where the vote is changed-occupied."""
+    free: Words | None = None
+    """Column words that rays passed through."""
+
+    def spoken(self) -> Bool:
+        """(256, 256) where this vote says anything at all."""
+        if self.states is not None:
+            return self.states != NO_VOTE
+        assert self.tally is not None
+        return np.asarray(self.tally.any(axis=-1))
+
+    def supports(self, state: CellState, cells: NDArray[np.intp]) -> Bool:
+        """(n,) at which of the flat ``cells`` this vote is, or in one stage also counts, for ``state``."""
+        if self.states is not None:
+            return np.asarray(self.states.reshape(-1)[cells] == int(state))
+        assert self.tally is not None
+        return np.asarray(self.tally[cells // TILE_CELLS, cells % TILE_CELLS, int(state)] > 0)
+
+    def determined(self, cells: NDArray[np.intp]) -> Bool:
+        """(n,) at which of the flat ``cells`` this vote says anything but undetermined."""
+        if self.states is not None:
+            return np.asarray(self.states.reshape(-1)[cells] < int(CellState.UNDETERMINED))
+        assert self.tally is not None
+        counts = self.tally[cells // TILE_CELLS, cells % TILE_CELLS, : int(CellState.UNDETERMINED)]
+        return np.asarray(counts.any(axis=-1))
+
+    def alters(self, cells: NDArray[np.intp]) -> Bool:
+        """(n,) at which of the flat ``cells`` this vote would change the map in any way."""
+        altered = self.supports(CHANGES[0], cells) | self.supports(CHANGES[1], cells)
+        return altered if self.gone is None else altered | np.isin(cells, self.gone.cells)
+
+    def deletes(self, among: Words) -> Words:
+        """The voxels that this vote says are gone, of the cells that ``among`` names."""
+        marked = among if self.gone is None else self.gone.where(among)
+        return marked.at(self.supports(CellState.CHANGED_EMPTY, marked.cells))
+
+    def remnants(self, standing: Bool) -> Words:
+        """The voxels that this vote says are gone though the cell stands, of the (256, 256) cells ``standing``."""
+        if self.gone is None:
+            return Words.none()
+        marked = self.gone.within(standing)
+        stands = self.supports(CellState.UNCHANGED_OCCUPIED, marked.cells)
+        return marked.at(stands & ~self.supports(CellState.CHANGED_EMPTY, marked.cells))
+
+
+class Dated(Protocol):
+    """Anything that a vehicle said at a moment."""
+
+    @property
+    def vehicle(self) -> str: ...
+    @property
+    def end_ns(self) -> int: ...
+
+
+D = TypeVar("D", bound=Dated)
+
+
+def select(votes: Iterable[D], settings: FuseSettings) -> list[D]:
+    """The votes inside the window (DESIGN 4): drives within ``max_age_days`` of the newest on this tile, then those
+    of the ``latest_vehicles`` vehicles that passed last. Ties between vehicles go to the later name."""
+    votes = list(votes)
+    if not votes:
+        return []
+    newest = max(v.end_ns for v in votes)
+    recent = [v for v in votes if newest - v.end_ns <= settings.max_age_days * DAY_NS]
+    last: dict[str, int] = {}
+    for vote in recent:
+        last[vote.vehicle] = max(last.get(vote.vehicle, vote.end_ns), vote.end_ns)
+    ranked = sorted(last, key=lambda vehicle: (last[vehicle], vehicle), reverse=True)
+    if len(ranked) <= settings.latest_vehicles:
+        return recent
+    chosen = set(ranked[: settings.latest_vehicles])
+    return [v for v in recent if v.vehicle in chosen]
+
+
+def restrict(vote: TileVote, counts: Bool | None) -> TileVote:
+    """The vote with every cell outside ``counts`` (256, 256) silenced; None means that all of it counts."""
+    if counts is None or counts.all():
+        return vote
+    return replace(
+        vote,
+        states=None if vote.states is None else np.where(counts, vote.states, np.uint8(NO_VOTE)),
+        tally=None if vote.tally is None else np.where(counts[..., None], vote.tally, np.uint16(0)),
+        free=None if vote.free is None else vote.free.within(counts),
+    )
+
+
+def fold(drives: Sequence[TileVote], grid: Grid) -> TileVote:
+    """One vehicle's drives as one vote: in every cell the drive that ended last speaks, ties by hash; a drive that
+    is silent there never overrides. Passed-through voxels add up. Commutative, and idempotent for one drive.
+
+    ``grid`` is the tile's window (:func:`mapvote.core.grid.tile_grid`).
+    """
+    if len(drives) == 1:
+        return drives[0]
+    ordered = sorted(drives, key=lambda drive: (drive.end_ns, drive.digest))
+    source = np.full((TILE_CELLS, TILE_CELLS), -1, dtype=np.int32)
+    for i, drive in enumerate(ordered):
+        source[drive.spoken()] = i
+    states = None if ordered[0].states is None else np.full(source.shape, NO_VOTE, dtype=np.uint8)
+    tally = None if ordered[0].tally is None else np.zeros((*source.shape, N_STATES), dtype=np.uint16)
+    gone: list[Words] = []
+    points: list[F32] = []
+    for i, drive in enumerate(ordered):
+        mine = source == i
+        if states is not None and drive.states is not None:
+            states[mine] = drive.states[mine]
+        if tally is not None and drive.tally is not None:
+            tally[mine] = drive.tally[mine]
+        gone += [drive.deletes(Words.whole(mine)), drive.remnants(mine)]
+        if drive.new_points is not None:
+            points.append(drive.new_points[mine.ravel()[cells_of(grid, drive.new_points)]])
+    free = [drive.free for drive in ordered if drive.free is not None]
+    return TileVote(
+        vehicle=ordered[-1].vehicle,
+        end_ns=ordered[-1].end_ns,
+        digest=ordered[-1].digest,
+        states=states,
+        tally=tally,
+        gone=union(gone),
+        new_points=np.concatenate(points) if points else None,
+        free=union(free) if free else None,
+    )
+
+
+def one_each(drives: Iterable[TileVote], grid: Grid) -> list[TileVote]:
+    """One vote a vehicle, by name: :func:`fold` of all its drives on the tile whose window is ``grid``."""
+    by_vehicle: dict[str, list[TileVote]] = {}
+    for drive in drives:
+        by_vehicle.setdefault(drive.vehicle, []).append(drive)
+    return [fold(by_vehicle[vehicle], grid) for vehicle in sorted(by_vehicle)]

@@ -1,0 +1,1 @@
+"""Where the vehicle is (paper II)."""

@@ -1,0 +1,219 @@
+"""Where the vehicle is, scan after scan: predict, register, judge, recover (paper II; METHOD 5).
+
+A vehicle that does not trust its pose abstains: a lost vehicle must never demolish a street.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from mapvote.config import NdtSettings
+from mapvote.core.geometry import exp, from_xyz_rpy
+from mapvote.core.grid import tile_grid, window_around
+from mapvote.core.tile import map_points
+from mapvote.core.types import F32, F64, I64, PointMap, Registration, Scan
+from mapvote.core.voxels import thin
+from mapvote.localisation.deskew import deskew, twist_between
+from mapvote.localisation.ndt import NdtMap, PosePrior, build_ndt, fitness, refine, thin_for_levels
+
+_REFINED = 3
+"""How many of the best guesses are refined when the vehicle is lost."""
+_RECONSIDERED = 8
+"""The same, when a scan fits worse than the ones before it."""
+_POOR = 0.9
+"""Share of the usual score below which other places are tried."""
+_YAWS_RAD = np.radians([0.0, -3.0, 3.0])
+_ROUNDS = 2
+"""How often a scan is de-skewed anew with the motion just found, while that still changes."""
+_SPEEDS_MPS = np.arange(-2.5, 32.6, 2.5)
+"""Forward speeds tried on a first scan."""
+_TWIST_AGE_S = 1.0
+"""Two poses farther apart in time than this say little about the present velocity."""
+
+
+@dataclass(frozen=True, slots=True)
+class Fix:
+    """One scan, localised."""
+
+    registration: Registration
+    points: F32
+    """(n, 3) the scan's points in the lidar frame at its stamp, de-skewed with the motion found."""
+    trusted: bool
+    """False: the vehicle must not vote with this scan."""
+
+
+def window_points(point_map: PointMap, position: F64, half_window_m: float) -> F64:
+    """Points (n, 3) in map metres of the tiles that a square window around ``position`` touches."""
+    window = window_around(point_map.lattice, float(position[0]), float(position[1]), 2 * half_window_m)
+    tiles = [tile for tile in window.tiles() if tile in point_map.tiles]
+    clouds = [map_points(tile_grid(point_map.lattice, tile), point_map.tiles[tile].points) for tile in tiles]
+    return np.concatenate([np.zeros((0, 3)), *clouds])
+
+
+class MapWindow:
+    """The NDT map around a vehicle in a finished map, built anew when the vehicle leaves its middle."""
+
+    def __init__(self, point_map: PointMap, settings: NdtSettings) -> None:
+        self.point_map = point_map
+        self.settings = settings
+        self.ndt_map: NdtMap | None = None
+
+    def __call__(self, position: F64) -> NdtMap:
+        if self.ndt_map is None or not self.ndt_map.is_central(position):
+            points = window_points(self.point_map, position, self.settings.half_window_m)
+            self.ndt_map = build_ndt(points, self.settings, position)
+        return self.ndt_map
+
+
+class Tracker:
+    """Follows one vehicle. Scans must come in order of time.
+
+    ``map_around``: the NDT map to use near a position (3,), a :class:`MapWindow` for a finished map.
+    """
+
+    def __init__(self, map_around: Callable[[F64], NdtMap], settings: NdtSettings) -> None:
+        self.map_around = map_around
+        self.settings = settings
+        self.twist = np.zeros(6)
+        """Motion per second in the lidar frame (velocity, angular velocity), from the last two trusted poses."""
+        self.last_pose: F64 | None = None
+        self.last_stamp_ns = 0
+        self._measured = False
+        """Whether ``twist`` was measured from two poses, so that it predicts the next."""
+        self._usual_score = 0.0
+        """What trusted scans scored lately: far less than that means the wrong place, however sure it looks."""
+
+    def localise(self, scan: Scan, prior: PosePrior | None = None) -> Fix:
+        """The pose of the next scan. Without any prior, ever, the first pose is taken to be near the map's origin."""
+        seed, reach = self._seed(scan.stamp_ns, prior)
+        ndt_map = self.map_around(seed[:3, 3])
+        twist = self.twist if self._knows_motion(scan) else self._guess_motion(ndt_map, scan, seed, prior)
+        first_level = 0 if self.last_pose is None or reach > 0.5 * self.settings.hypothesis_step_m else 1
+        result = refine(ndt_map, self._clouds(scan, twist), seed, prior, first_level)
+        if result.score < _POOR * self._usual_score:
+            result = self._reconsider(ndt_map, self._clouds(scan, twist), scan.stamp_ns, result, prior)
+        if not self._is_trusted(result, prior):
+            centre = prior.T_map_lidar if prior is not None else seed
+            result = self._search(ndt_map, self._clouds(scan, twist), centre, reach, prior)
+        for _ in range(_ROUNDS):
+            found = self._motion_to(result.T_map_lidar, scan.stamp_ns)
+            if scan.time_s is None or found is None or not _differ(twist, found):
+                break
+            twist = found
+            result = refine(ndt_map, self._clouds(scan, twist), result.T_map_lidar, prior, len(ndt_map.levels) - 1)
+        trusted = self._is_trusted(result, prior)
+        if trusted:
+            self._accept(result.T_map_lidar, scan.stamp_ns, twist)
+            rate = 0.2 if self._usual_score else 1.0
+            self._usual_score += rate * (result.score - self._usual_score)
+        return Fix(result, deskew(scan, twist), trusted)
+
+    def _clouds(self, scan: Scan, twist: F64) -> list[F64]:
+        return thin_for_levels(deskew(scan, twist), self.settings)
+
+    def _knows_motion(self, scan: Scan) -> bool:
+        return scan.time_s is None or bool(self.twist.any()) or self.last_pose is not None
+
+    def _guess_motion(self, ndt_map: NdtMap, scan: Scan, seed: F64, prior: PosePrior | None) -> F64:
+        """The forward speed at which the first scan fits the map best: unknown motion bends it by half a metre."""
+        few = thin(scan.points, self.settings.levels[0].points_m)
+        sample = replace(scan, points=scan.points[few], time_s=None if scan.time_s is None else scan.time_s[few])
+        twists = [np.array([speed, 0.0, 0.0, 0.0, 0.0, 0.0]) for speed in _SPEEDS_MPS]
+        return max(twists, key=lambda twist: refine(ndt_map, self._clouds(sample, twist), seed, prior).score)
+
+    def begin(self, scan: Scan, T_map_lidar: F64) -> Fix:
+        """Take the first pose as given: where there is no map yet, the first scan makes it."""
+        self._accept(T_map_lidar, scan.stamp_ns, self.twist)
+        registration = Registration(T_map_lidar, np.zeros((6, 6)), 1.0, 1.0, 0, True)
+        return Fix(registration, deskew(scan, self.twist), True)
+
+    def _seed(self, stamp_ns: int, prior: PosePrior | None) -> tuple[F64, float]:
+        """The first guess and how far it may be off: by constant velocity while that is fresher than the prior."""
+        if self.last_pose is not None:
+            age = 1e-9 * (stamp_ns - self.last_stamp_ns)
+            known = self._measured or bool(self.twist.any())
+            drift = 0.5 * self.settings.acceleration_mps2 * age**2 if known else age * float(_SPEEDS_MPS[-1])
+            if prior is None or drift < prior.sigma_m:
+                return self.last_pose @ exp(age * self.twist), drift
+        if prior is None:
+            return np.eye(4), self.settings.hypothesis_reach_m
+        return prior.T_map_lidar, 2.0 * prior.sigma_m
+
+    def _is_trusted(self, result: Registration, prior: PosePrior | None) -> bool:
+        s = self.settings
+        sigma_m = float(np.sqrt(np.linalg.eigvalsh(result.covariance[:3, :3])[-1]))
+        good = result.converged and result.inlier_share >= s.min_inlier_share and sigma_m <= s.max_sigma_m
+        if good and prior is not None:
+            off = float(np.linalg.norm(result.T_map_lidar[:3, 3] - prior.T_map_lidar[:3, 3]))
+            good = off <= s.prior_gate * prior.sigma_m + s.gate_m
+        return good
+
+    def _reconsider(
+        self, ndt_map: NdtMap, clouds: list[F64], stamp_ns: int, result: Registration, prior: PosePrior | None
+    ) -> Registration:
+        """The best of ``result``, the prior's place, and every speed that a vehicle may have had since the last scan.
+
+        A street looks alike along itself: a scan that fits worse than usual may have settled one house too early.
+        """
+        guesses = [] if prior is None else [prior.T_map_lidar]
+        if self.last_pose is not None:
+            age = 1e-9 * (stamp_ns - self.last_stamp_ns)
+            guesses += [self.last_pose @ from_xyz_rpy(age * speed, 0.0, 0.0) for speed in _SPEEDS_MPS]
+        ranked = sorted(guesses, key=lambda guess: -fitness(ndt_map, clouds[:1], guess))[:_RECONSIDERED]
+        found = [result, *(refine(ndt_map, clouds, guess, prior) for guess in ranked)]
+        return max(found, key=lambda registration: registration.score)
+
+    def _search(
+        self, ndt_map: NdtMap, clouds: list[F64], centre: F64, reach: float, prior: PosePrior | None
+    ) -> Registration:
+        """Guesses on a grid around ``centre``, ranked by the coarsest level; the best few are refined."""
+        step = self.settings.hypothesis_step_m
+        rings = int(np.ceil(min(max(reach, step), self.settings.hypothesis_reach_m) / step))
+        offsets = step * np.arange(-rings, rings + 1)
+        guesses = [
+            centre @ from_xyz_rpy(x, y, 0.0, 0.0, 0.0, yaw) for x in offsets for y in offsets for yaw in _YAWS_RAD
+        ]
+        sample = [cloud[:: max(1, len(cloud) // 1000)] for cloud in clouds[:1]]
+        ranked = sorted(guesses, key=lambda guess: -fitness(ndt_map, sample, guess))
+        return max((refine(ndt_map, clouds, guess, prior) for guess in ranked[:_REFINED]), key=lambda r: r.score)
+
+    def _motion_to(self, T_map_lidar: F64, stamp_ns: int) -> F64 | None:
+        """Motion per second from the last trusted pose to this one, None if that was too long ago to say."""
+        seconds = 1e-9 * (stamp_ns - self.last_stamp_ns)
+        if self.last_pose is None or not 0 < seconds <= _TWIST_AGE_S:
+            return None
+        return twist_between(self.last_pose, T_map_lidar, seconds)
+
+    def _accept(self, T_map_lidar: F64, stamp_ns: int, twist: F64) -> None:
+        found = self._motion_to(T_map_lidar, stamp_ns)
+        self.twist = twist if found is None else found
+        self._measured = self._measured or found is not None
+        self.last_pose, self.last_stamp_ns = T_map_lidar, stamp_ns
+
+
+def _differ(twist: F64, other: F64) -> bool:
+    """Whether two motions bend a scan differently: by more than 2 cm, at its ends and 20 m away."""
+    change = np.abs(twist - other)
+    return bool(change[:3].max() * 0.05 > 0.02 or change[3:].max() * 0.05 * 20.0 > 0.02)
+
+
+class GivenPoses:
+    """Poses that need no improvement: the prior as it is, or the truth, to measure what localisation is worth."""
+
+    def __init__(self, stamps_ns: I64, T_map_lidar: F64) -> None:
+        """``stamps_ns`` (n,) ascending and ``T_map_lidar`` (n, 4, 4): a pose for every scan that will come."""
+        self._poses = {int(stamp): i for i, stamp in enumerate(stamps_ns)}
+        self._stamps_ns, self._T_map_lidar = stamps_ns, T_map_lidar
+
+    def __call__(self, scan: Scan, prior: PosePrior | None) -> Fix:
+        i = self._poses[scan.stamp_ns]
+        j, k = max(i - 1, 0), min(i + 1, len(self._stamps_ns) - 1)
+        twist = np.zeros(6)
+        if k > j:
+            seconds = 1e-9 * float(self._stamps_ns[k] - self._stamps_ns[j])
+            twist = twist_between(self._T_map_lidar[j], self._T_map_lidar[k], seconds)
+        registration = Registration(self._T_map_lidar[i], np.zeros((6, 6)), 1.0, 1.0, 0, True)
+        return Fix(registration, deskew(scan, twist), True)

@@ -1,0 +1,85 @@
+"""Whose request it is, and what its key may touch."""
+
+from __future__ import annotations
+
+import base64
+import binascii
+from functools import partial
+
+from fastapi import Request
+
+from mapvote.server.errors import Forbidden, Unauthorised
+from mapvote.server.http.batching import Batcher
+from mapvote.server.store import keys
+from mapvote.server.store.store import Store
+
+_AT_ONCE = 256
+"""Keys looked up in one query at most."""
+_REMEMBERED = 10_000
+
+
+class Guard:
+    """Keys come as ``Authorization: Bearer KEY``, or Basic with the key as password (browsers).
+
+    Every request's key is looked up in the store, many in one query: a revoked key works no longer, not even once. A
+    ballot's key is looked up with the ballot itself (:meth:`mapvote.server.store.admission.Intake.look_at`):
+    until then it is enough to know whose it was, which never changes.
+    """
+
+    def __init__(self, store: Store, required: bool) -> None:
+        self._required = required
+        self._looked_up: Batcher[str, keys.Key] = Batcher(partial(keys.check, store), _AT_ONCE)
+        self._known: dict[str, keys.Key] = {}
+
+    async def who(self, authorization: str | None, *, ballot: bool = False) -> tuple[keys.Key, str] | None:
+        """The key of a request and its hash; None if none is needed.
+
+        Unauthorised if it is missing, unknown or revoked; of a ``ballot``, that is for the store to say in the end.
+        """
+        if not self._required:
+            return None
+        secret = _secret_of(authorization)
+        if secret is None:
+            raise Unauthorised("this server needs a key: send it as `Authorization: Bearer KEY`")
+        digest = keys.hash_of(secret)
+        key = self._known.get(digest) if ballot else None
+        if key is None:
+            key = await self._looked_up.put(digest)
+            if len(self._known) > _REMEMBERED:
+                self._known.clear()
+            self._known[digest] = key
+        return key, digest
+
+
+def own(request: Request, vehicle: str) -> str:
+    """Who touches this vehicle's ballots: itself, within its rate, or an operator; Forbidden for anybody else."""
+    key: keys.Key | None = request.state.key
+    if key is None:
+        return vehicle
+    if key.role != "operator":
+        if key.name != vehicle:
+            raise Forbidden(f"the key of {key.name!r} cannot touch ballots of {vehicle[:64]!r}")
+        request.app.state.limit.take(key.name)
+    return key.name
+
+
+def operator(request: Request) -> str:
+    """The operator's name; Forbidden for anybody else."""
+    key: keys.Key | None = request.state.key
+    if key is None:
+        return "operator"
+    if key.role != "operator":
+        raise Forbidden("only an operator can do this")
+    return key.name
+
+
+def _secret_of(authorization: str | None) -> str | None:
+    scheme, _, value = (authorization or "").partition(" ")
+    if scheme.lower() == "bearer" and value.strip():
+        return value.strip()
+    if scheme.lower() == "basic":
+        try:
+            return base64.b64decode(value, validate=True).decode().partition(":")[2] or None
+        except (binascii.Error, UnicodeDecodeError):
+            return None
+    return None

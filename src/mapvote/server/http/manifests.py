@@ -1,0 +1,56 @@
+"""Manifests ready to send. A version never changes, so each is made once, however many ask for it."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Sequence
+from typing import Any
+
+import msgspec
+
+from mapvote.codec.ballot import tile_key
+from mapvote.server.store.store import Manifest, Store
+
+_KEPT = 16
+
+
+class Manifests:
+    """The JSON of manifests asked for of late; for any number of threads."""
+
+    def __init__(self, store: Store) -> None:
+        self._store = store
+        self._lock = threading.Lock()
+        self._made: dict[tuple[int, int | None], bytes] = {}
+
+    def newest(self, asked: Sequence[None]) -> list[int]:
+        """The newest version's number, for each who asks: one query for all of them."""
+        return [self._store.current()] * len(asked)
+
+    def ready(self, number: int, since: int | None) -> bytes | None:
+        """A manifest that was made before."""
+        return self._made.get((number, since))
+
+    def make(self, number: int, since: int | None) -> bytes:
+        """JSON of a version; ``since`` as in :meth:`Store.manifest`. NotFound if there is no such version."""
+        with self._lock:  # of many who ask for a new version, one makes it
+            made = self._made.get((number, since))
+            if made is None:
+                made = msgspec.json.encode(_as_json(self._store.manifest(number, since=since)))
+                while len(self._made) >= _KEPT:
+                    del self._made[next(iter(self._made))]
+                self._made[number, since] = made
+        return made
+
+
+def _as_json(manifest: Manifest) -> dict[str, Any]:
+    tiles = {
+        tile_key(index): {"points": h.points, "ground": h.ground, "free": h.free} for index, h in manifest.tiles.items()
+    }
+    return {
+        "map_id": manifest.map_id,
+        "version": manifest.version,
+        "lattice": {"x0": manifest.lattice.x0, "y0": manifest.lattice.y0},
+        "georeference": dict(manifest.georeference),
+        "tiles": tiles,
+        "removed": [tile_key(index) for index in manifest.removed],
+    }

@@ -1,0 +1,72 @@
+"""Health, metrics, the API's documentation and the operator's page."""
+
+from __future__ import annotations
+
+import html
+from importlib import resources
+from typing import Any
+
+from fastapi import APIRouter, Request, Response
+
+from mapvote.server.errors import NotFound
+from mapvote.server.http.schemas import problems
+
+_DOCS = """<!doctype html><meta charset=utf-8><title>mapvote API</title>
+<style>body{font:15px sans-serif;margin:2em}td,th{padding:.4em .8em;text-align:left;border-top:1px solid #ccc}</style>
+<h1>mapvote API</h1><p>For machines: <a href=openapi.json>openapi.json</a></p>
+<table><tr><th>Method<th>Path<th>What<th>How<th>Answers</tr>ROWS</table>"""
+router = APIRouter()
+
+
+@router.get("/healthz", responses=problems(), summary="Can the store be read?")
+def health(request: Request) -> dict[str, Any]:
+    """200 with the newest version, 503 if the database does not answer."""
+    return {"status": "ok", "version": request.app.state.store.current()}
+
+
+@router.get("/metrics", responses=problems(), response_class=Response, summary="Prometheus metrics")
+def metrics(request: Request) -> Response:
+    """Counters, latencies, the newest version."""
+    gathered = request.app.state.metrics
+    gathered.version.set(request.app.state.store.current())
+    return Response(gathered.text(), media_type="text/plain; version=0.0.4; charset=utf-8")
+
+
+@router.get("/docs", include_in_schema=False)
+def docs(request: Request) -> Response:
+    """The API on one page, from its OpenAPI document, without any script or request to elsewhere."""
+    rows = []
+    for path, methods in request.app.openapi()["paths"].items():
+        for method, about in methods.items():
+            cells = (
+                method.upper(),
+                path,
+                about["summary"],
+                about.get("description", ""),
+                ", ".join(about["responses"]),
+            )
+            rows.append("<tr>" + "".join(f"<td>{html.escape(text)}</td>" for text in cells) + "</tr>")
+    return Response(_DOCS.replace("ROWS", "".join(rows)), media_type="text/html")
+
+
+@router.get("/", include_in_schema=False)
+def index() -> Response:
+    """The operator's page."""
+    return _asset("index.html")
+
+
+@router.get("/viewer/{name}", include_in_schema=False)
+def asset(name: str) -> Response:
+    """A script or style of the operator's page."""
+    return _asset(name)
+
+
+def _asset(name: str) -> Response:
+    kinds = {".html": "text/html", ".js": "text/javascript", ".css": "text/css", ".svg": "image/svg+xml"}
+    file = resources.files("mapvote.server.http") / "viewer" / name
+    kind = kinds.get("." + name.rpartition(".")[2])
+    if kind is None or "/" in name or "\\" in name or not file.is_file():
+        raise NotFound(f"there is no page {name[:80]!r}")
+    policy = "default-src 'self'; img-src 'self' data: blob:; style-src 'self' 'unsafe-inline'; frame-ancestors 'none'"
+    headers = {"Content-Security-Policy": policy, "Cache-Control": "no-cache"}
+    return Response(file.read_bytes(), media_type=kind, headers=headers)

@@ -1,0 +1,113 @@
+"""What is asked and answered by HTTP, and the one table from errors to status codes (DESIGN 5)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from datetime import UTC, datetime
+from typing import Annotated, Any
+
+from fastapi import Path, Query, Request, Response
+from fastapi.responses import JSONResponse
+from pydantic import BaseModel, ConfigDict, Field
+
+from mapvote.core.types import MapvoteError
+from mapvote.server.errors import Conflict, Forbidden, Held, NotFound, TooLarge, TooMany, Unauthorised, Unavailable
+
+STATUS: Mapping[type[MapvoteError], int] = {
+    Unauthorised: 401,
+    Forbidden: 403,
+    NotFound: 404,
+    Conflict: 409,
+    TooLarge: 413,
+    MapvoteError: 422,
+    TooMany: 429,
+    Unavailable: 503,
+}
+"""The one error table: a class stands for its subclasses too."""
+LEAST, MOST = -(1 << 31), (1 << 31) - 1
+"""What a database can compare a version's number with."""
+_PLAIN = r"^[^\x00-\x1f]*$"
+"""No control characters: PostgreSQL stores no NUL."""
+
+Name = Annotated[str, Path(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$")]
+Number = Annotated[int, Path(ge=LEAST, le=MOST)]
+VersionQuery = Annotated[int, Query(ge=LEAST, le=MOST)]
+
+
+class Problem(BaseModel):
+    """What went wrong, and how to mend it."""
+
+    detail: Any
+    reasons: list[str] | None = None
+
+
+class Stored(BaseModel):
+    """A ballot is on disk."""
+
+    vehicle: str
+    drive: str
+    result: str = Field(description="created, replaced, or repeated: the very same ballot stood already")
+
+
+class PublishAsk(BaseModel):
+    """How to publish; an empty object publishes what stands."""
+
+    model_config = ConfigDict(extra="forbid")
+    dry_run: bool = False
+    override: bool = Field(default=False, description="publish in spite of the reasons to hold it")
+    parent: int | None = Field(default=None, ge=LEAST, le=MOST, description="only if this is still the newest version")
+    reason: str = Field(default="", max_length=200, pattern=_PLAIN)
+    min_votes: int | None = Field(default=None, ge=1, le=1000, description="instead of the server's setting")
+
+
+class Published(BaseModel):
+    """What a publish did, or would do."""
+
+    version: int
+    published: bool
+    tiles: list[str]
+    points_added: int
+    points_deleted: int
+    held: list[str]
+
+
+class RollbackAsk(BaseModel):
+    """Which version shall be the map again."""
+
+    model_config = ConfigDict(extra="forbid")
+    to: int = Field(ge=LEAST, le=MOST)
+    reason: str = Field(default="", max_length=200, pattern=_PLAIN)
+
+
+def problems(*codes: int) -> dict[int | str, dict[str, Any]]:
+    """For the OpenAPI document: the refusals that every route knows, and these."""
+    return {code: {"model": Problem} for code in (401, 422, 503, *codes)}
+
+
+def refuse(request: Request | None, error: Exception) -> Response:
+    """The answer to a MapvoteError: {"detail": what to do about it}, and the reasons of a held version."""
+    status = next(STATUS[kind] for kind in type(error).__mro__ if kind in STATUS)
+    content: dict[str, object] = {"detail": str(error)}
+    headers = {}
+    if isinstance(error, Held):
+        content["reasons"] = error.reasons
+    if status in (429, 503):
+        headers["Retry-After"] = "1"
+    response = JSONResponse(content, status, headers)
+    if status == 401:  # two lines: browsers read one challenge a line, and ask for a password only for Basic
+        response.headers.append("WWW-Authenticate", 'Basic realm="mapvote: the key is the password", charset="UTF-8"')
+        response.headers.append("WWW-Authenticate", "Bearer")
+    return response
+
+
+def unreadable(request: Request, error: Exception) -> Response:
+    """A body that is no JSON at all, not even text: FastAPI answers 400, but everything unusable is 422 here."""
+    return refuse(request, MapvoteError("the body is no JSON in UTF-8"))
+
+
+def iso(stamp_ns: int | None) -> str | None:
+    """ISO 8601 in UTC, milliseconds."""
+    if stamp_ns is None:
+        return None
+    whole = datetime.fromtimestamp(min(stamp_ns // 10**9, 253_402_300_799), UTC)
+    return whole.strftime("%Y-%m-%dT%H:%M:%S") + f".{stamp_ns // 10**6 % 1000:03d}Z"

@@ -1,0 +1,124 @@
+"""Run the app on an address: logs, keys where they must be, a graceful stop."""
+
+from __future__ import annotations
+
+import ipaddress
+import logging
+import socket
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import msgspec
+import structlog
+import uvicorn
+
+from mapvote.config import Settings
+from mapvote.core.types import MapvoteError, PointMap
+from mapvote.formats import open_drive, read_map
+from mapvote.server.http.app import create_app
+from mapvote.server.insight.localisation_gate import gate as localise_in_both
+from mapvote.server.store import keys
+from mapvote.server.store.publish import Gate
+from mapvote.server.store.store import Store, url_of
+
+_PATIENCE_S = 5
+"""How long a stopping server waits for answers under way. Ballots take milliseconds."""
+
+
+def open_or_create(where: str, map_path: Path | None) -> Store:
+    """The store at a path or URL; a new one from ``map_path`` if there is none yet. MapvoteError otherwise."""
+    try:
+        return Store.open(url_of(where))
+    except MapvoteError:
+        if map_path is None:
+            raise
+    return Store.create(url_of(where), read_map(map_path))
+
+
+def reference_gate(drive_path: Path, settings: Settings) -> Gate:
+    """A gate that holds a version in which a reference drive localises worse; what cannot be told is let through."""
+    drive = open_drive(drive_path)
+
+    def reasons(old: PointMap, new: PointMap) -> Sequence[str]:
+        result = localise_in_both(old, new, drive, settings.gate, settings.ndt)
+        structlog.get_logger("mapvote").info("gate", verdict=result.verdict, reasons=list(result.reasons))
+        return list(result.reasons) if result.verdict == "hold" else []
+
+    return reasons
+
+
+def is_loopback(host: str) -> bool:
+    """Whether only this machine can reach ``host``."""
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
+
+
+def serve(
+    store: Store,
+    settings: Settings,
+    *,
+    host: str = "127.0.0.1",
+    port: int = 8080,
+    gate: Gate | None = None,
+    ready: Callable[[str], object] = lambda url: None,
+) -> None:
+    """Serve until SIGINT or SIGTERM; requests under way are answered and ballots taken in are written first.
+
+    A publish that is still fusing is answered 503; one that is being written is finished.
+
+    ``ready`` is told the address once it listens. MapvoteError if the address is taken, or beyond loopback while no
+    operator has a key. Without any key at all, on loopback, nobody needs one.
+    """
+    valid = [key for key in keys.listed(store) if key.revoked_ns is None]
+    if not is_loopback(host) and not any(key.role == "operator" for key in valid):
+        raise MapvoteError(f"{host} can be reached from elsewhere: issue keys first (mapvote keys STORE issue NAME)")
+    app = create_app(store, settings, need_keys=bool(valid) or not is_loopback(host), gate=gate)
+    listener = socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET)
+    try:
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        listener.bind((host, port))
+        listener.listen(1024)  # from here on nobody is turned away, even before the app has started
+    except OSError as error:
+        listener.close()
+        raise MapvoteError(f"cannot listen on {host}:{port} ({error.strerror}): choose another --port") from error
+    shown = f"[{host}]" if ":" in host else host
+    ready(f"http://{shown}:{listener.getsockname()[1]}")
+    config = uvicorn.Config(
+        app,
+        access_log=False,
+        proxy_headers=False,
+        log_level="warning",
+        timeout_graceful_shutdown=_PATIENCE_S,
+        server_header=False,
+    )
+    with listener:
+        _Server(config).run(sockets=[listener])
+
+
+class _Server(uvicorn.Server):
+    """Lets go of a publish under way when it is told to stop: what waits to be fused is dropped."""
+
+    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+        state = self.config.app.state  # type: ignore[union-attr]
+        state.stopping = True
+        state.threads.shutdown(wait=False, cancel_futures=True)
+        await super().shutdown(sockets)
+
+
+def log_as_json() -> None:
+    """One JSON object a line on stderr, from us and from the libraries."""
+    structlog.configure(
+        processors=[
+            structlog.processors.add_log_level,
+            structlog.processors.TimeStamper(fmt="iso", utc=True),
+            structlog.processors.format_exc_info,
+            structlog.processors.JSONRenderer(lambda event, default: msgspec.json.encode(event, enc_hook=default)),
+        ],
+        wrapper_class=structlog.make_filtering_bound_logger(logging.INFO),
+        logger_factory=structlog.BytesLoggerFactory(sys.stderr.buffer),
+        cache_logger_on_first_use=True,
+    )
+    logging.basicConfig(level=logging.WARNING, stream=sys.stderr, format='{"event": "%(name)s: %(message)s"}')

@@ -1,0 +1,1 @@
+"""What changed, who says so, and why."""

@@ -1,0 +1,127 @@
+"""Why the map is as it is: the votes behind a cell, what changed between two versions, how fresh each tile is."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import sqlalchemy as sa
+from backports import zstd
+
+from mapvote.config import FuseSettings
+from mapvote.core.grid import TILE_CELLS, TileIndex, tile_grid
+from mapvote.core.types import NO_VOTE, U8, CellState, MapvoteError
+from mapvote.fusion.fuse import Rule, hear
+from mapvote.fusion.tile_vote import TileVote, one_each, select
+from mapvote.server.store import schema
+from mapvote.server.store.blobs import unpack_points_plane
+from mapvote.server.store.eligible_votes import (
+    Round,
+    counting_votes,
+    read_votes,
+    rule_in_use,
+    stored_votes,
+)
+from mapvote.server.store.queries import current_version, load_blob, tiles_of
+from mapvote.server.store.store import Store
+
+_FOREVER = (1 << 63) - 1
+
+
+@dataclass(frozen=True, slots=True)
+class CellVote:
+    """What one standing drive says about a cell."""
+
+    vehicle: str
+    drive: str
+    state: str
+    """Lower case; no_vote where it says nothing."""
+    marks: int | None
+    """Voxels of the map that it says are gone here, of a changed cell or beside what stands; None: it sent no mask."""
+    end_ns: int
+    counts: bool
+    why: str
+    """Why it does not count; empty if it does."""
+
+
+@dataclass(frozen=True, slots=True)
+class CellStory:
+    """One cell: who says what now, and what was decided when."""
+
+    row: int
+    col: int
+    votes: list[CellVote]
+    decisions: list[tuple[int, str]]
+    """(version, state) of every version that decided this cell."""
+
+
+def state_name(state: int) -> str:
+    """A cell state as users read it."""
+    return "no_vote" if state == NO_VOTE else CellState(state).name.lower()
+
+
+def explain_cell(store: Store, x: float, y: float, settings: FuseSettings) -> CellStory:
+    """The votes behind the cell that holds (x, y), map metres. MapvoteError if that is no place on earth."""
+    if not (abs(x) < 1e7 and abs(y) < 1e7):
+        raise MapvoteError(f"({x}, {y}): give map metres, within 10,000 km of the map's origin")
+    rows, cols = store.lattice.cells_of(np.array([[x, y]]))
+    row, col = int(rows[0]), int(cols[0])
+    index, cell = (row // TILE_CELLS, col // TILE_CELLS), (row % TILE_CELLS, col % TILE_CELLS)
+    asked = Round(_FOREVER, settings, store.clock() - round(settings.min_age_s * 1e9))
+    with store.database.reading() as connection:
+        hashes = tiles_of(connection, current_version(connection).number, index).get(index)
+        points = None if hashes is None else unpack_points_plane(load_blob(connection, hashes.points), hashes.points)
+        everyone = stored_votes(connection, index, Round(_FOREVER, settings, _FOREVER))
+        old_enough = [vote for vote in everyone if vote.received_ns <= asked.received_by_ns]
+        inside = {vote.seq for vote in select(old_enough, settings)}
+        counting = {v.digest: v for v in counting_votes(connection, store.lattice, index, points, asked)}
+        rule = rule_in_use(connection) or "columns"
+        silenced = _silenced(store, index, list(counting.values()), rule, settings)
+        plain = read_votes(connection, index, everyone)
+        query = sa.select(schema.decisions.c.version, schema.decisions.c.states)
+        query = query.where(schema.decisions.c.row == index[0], schema.decisions.c.col == index[1])
+        found = connection.execute(query.order_by(schema.decisions.c.version))
+        decided = [(r.version, _states(r.states)) for r in found]
+    votes = []
+    for stored, vote in zip(everyone, plain, strict=True):
+        spoken = bool(vote.spoken()[cell])
+        counts = spoken and stored.seq in inside and bool(counting[stored.digest].spoken()[cell])
+        why = ""
+        if not spoken:
+            why = "says nothing here"
+        elif stored.received_ns > asked.received_by_ns:
+            why = "waits for the minimum age"
+        elif stored.seq not in inside:
+            why = f"older than {settings.max_age_days:g} days or not among the last {settings.latest_vehicles} vehicles"
+        elif not counts:
+            why = "the cell has changed since its base, or a rollback has barred it"
+        elif vote.vehicle in silenced:
+            counts, why = False, "opposes the others over most of this tile, or denies nearly all that changed on it"
+        said, marks = _said(vote, cell), _marks(vote, cell)
+        votes.append(CellVote(stored.vehicle, stored.drive, said, marks, stored.end_ns, counts, why))
+    story = [(version, state_name(int(states[cell]))) for version, states in decided if states[cell] != NO_VOTE]
+    return CellStory(row, col, votes, story)
+
+
+def _silenced(store: Store, index: TileIndex, drives: list[TileVote], rule: Rule, settings: FuseSettings) -> set[str]:
+    """Vehicles that are not heard on a tile, of the votes that count there."""
+    votes = one_each(drives, tile_grid(store.lattice, index))
+    return {vote.vehicle for vote in votes} - {vote.vehicle for vote in hear(votes, rule, settings)[0]}
+
+
+def _states(data: bytes) -> U8:
+    return np.frombuffer(zstd.decompress(data), dtype=np.uint8).reshape(TILE_CELLS, TILE_CELLS)
+
+
+def _said(vote: TileVote, cell: tuple[int, int]) -> str:
+    if vote.states is not None:
+        return state_name(int(vote.states[cell]))
+    assert vote.tally is not None
+    return state_name(int(vote.tally[cell].argmax())) if vote.tally[cell].any() else "no_vote"
+
+
+def _marks(vote: TileVote, cell: tuple[int, int]) -> int | None:
+    if vote.gone is None:
+        return None
+    mine = vote.gone.words[vote.gone.cells == cell[0] * TILE_CELLS + cell[1]]
+    return int(mine[0]).bit_count() if len(mine) else 0

@@ -1,0 +1,109 @@
+"""What happened: changes between versions, coverage, vehicles, events."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+import sqlalchemy as sa
+
+from mapvote.config import FuseSettings
+from mapvote.core.grid import TileIndex, tile_grid
+from mapvote.core.types import U8
+from mapvote.core.voting import decide
+from mapvote.fusion.tile_vote import TileVote, one_each, select
+from mapvote.server.insight.changes import Decided, change_objects, changed_cells
+from mapvote.server.insight.consensus import Compared, Spoken, Standing, compare, judge
+from mapvote.server.insight.explain import _FOREVER, _states
+from mapvote.server.insight.geojson import to_geojson
+from mapvote.server.store import schema
+from mapvote.server.store.blobs import unpack_points_plane
+from mapvote.server.store.eligible_votes import Round, counting_votes, read_votes, standing_tiles, stored_votes
+from mapvote.server.store.queries import current_version, load_blob, load_tile, tiles_of, version_of
+from mapvote.server.store.store import Store
+from mapvote.server.store.tile_jobs import unpack_tally_plane
+
+
+def changes_between(store: Store, old: int, new: int, min_cells: int = 1) -> dict[str, Any]:
+    """Change objects from version ``old`` to ``new`` as GeoJSON in map metres. NotFound if one does not exist."""
+    with store.database.reading() as connection:
+        for number in (old, new):
+            version_of(connection, number)
+        before, after = tiles_of(connection, old), tiles_of(connection, new)
+        found = []
+        for index in sorted(before.keys() | after.keys()):
+            pair = before.get(index), after.get(index)
+            if pair[0] is not None and pair[1] is not None and pair[0].points == pair[1].points:
+                continue
+            tiles = [None if hashes is None else load_tile(connection, hashes) for hashes in pair]
+            decided = list(_decided(store, connection, index, min(old, new), max(old, new)))
+            found.append(changed_cells(store.lattice, index, tiles[0], tiles[1], decided))
+    objects = change_objects(found, min_cells)
+    return to_geojson(
+        objects,
+        store.lattice,
+        map_id=store.map_id,
+        from_version=old,
+        to_version=new,
+        georeference=store.georeference,
+    )
+
+
+def _decided(store: Store, connection: sa.Connection, index: TileIndex, old: int, new: int) -> Iterable[Decided]:
+    d = schema.decisions
+    query = sa.select(d.c.version, d.c.states, d.c.tally).where(d.c.row == index[0], d.c.col == index[1])
+    for row in connection.execute(query.where(d.c.version > old, d.c.version <= new).order_by(d.c.version)).all():
+        version = version_of(connection, row.version)
+        before = tiles_of(connection, row.version - 1, index).get(index)
+        points = None if before is None else unpack_points_plane(load_blob(connection, before.points), before.points)
+        policy = FuseSettings.model_validate(version.policy)
+        asked = Round(version.mark, policy, version.created_ns - round(policy.min_age_s * 1e9))
+        votes = counting_votes(connection, store.lattice, index, points, asked)
+        drives = [(vote.end_ns, vote.states) for vote in votes if vote.states is not None]
+        yield Decided(row.version, _states(row.states), unpack_tally_plane(row.tally), drives)
+
+
+def coverage(store: Store) -> list[dict[str, Any]]:
+    """Per tile of the map or of a standing ballot: when it was last driven past (ns), by how many vehicles."""
+    b, t = schema.ballots, schema.ballot_tiles
+    seen = sa.select(t.c.row, t.c.col, sa.func.max(b.c.end_ns), sa.func.count(sa.distinct(b.c.vehicle)))
+    seen = seen.join(b, b.c.seq == t.c.ballot).where(b.c.gone_seq.is_(None)).group_by(t.c.row, t.c.col)
+    with store.database.reading() as connection:
+        tiles: dict[TileIndex, tuple[int | None, int]] = dict.fromkeys(
+            tiles_of(connection, current_version(connection).number), (None, 0)
+        )
+        tiles |= {(row[0], row[1]): (row[2], row[3]) for row in connection.execute(seen)}
+    return [
+        {"row": index[0], "col": index[1], "last_seen_ns": last, "vehicles": vehicles}
+        for index, (last, vehicles) in sorted(tiles.items())
+    ]
+
+
+def vehicle_standings(store: Store, settings: FuseSettings) -> list[Standing]:
+    """How each vehicle stands to what the others say, over every vote inside the window, in order of name.
+
+    What is compared is the world (occupied or empty now), so votes on an older base count here too.
+    """
+    asked = Round(_FOREVER, settings, _FOREVER)
+    with store.database.reading() as connection:
+        compared: list[Compared] = []
+        for index in standing_tiles(connection, _FOREVER):
+            chosen = select(stored_votes(connection, index, asked), settings)
+            folded = one_each(read_votes(connection, index, chosen), tile_grid(store.lattice, index))
+            compared += compare(index, [Spoken(vote.vehicle, vote.end_ns, _decided_states(vote)) for vote in folded])
+    return judge(compared, store.lattice)
+
+
+def events(store: Store, limit: int = 100) -> list[dict[str, Any]]:
+    """The last events, newest first."""
+    query = sa.select(schema.events).order_by(schema.events.c.seq.desc()).limit(limit)
+    with store.database.reading() as connection:
+        return [dict(row._mapping) for row in connection.execute(query)]
+
+
+def _decided_states(vote: TileVote) -> U8:
+    if vote.states is not None:
+        return vote.states
+    assert vote.tally is not None
+    return decide(vote.tally.astype(np.int32))

@@ -1,0 +1,1 @@
+"""SQL, the only system of record."""

@@ -1,0 +1,120 @@
+"""Ballots in and out of the store: idempotent, one standing ballot per drive, nothing overwritten (DESIGN 4)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import sqlalchemy as sa
+
+from mapvote.codec.ballot import Ballot, BallotTile, tile_key
+from mapvote.server.errors import Conflict, NotFound
+from mapvote.server.store import schema
+from mapvote.server.store.database import insert_rows
+from mapvote.server.store.queries import log_event, next_seq
+from mapvote.server.store.store import Store
+
+
+@dataclass(frozen=True, slots=True)
+class Incoming:
+    """A ballot that is sound in itself."""
+
+    ballot: Ballot
+    digest: str
+    cast_by: str
+    """Method, stage and settings: all ballots of a round agree on them."""
+
+
+@dataclass(frozen=True, slots=True)
+class Receipt:
+    """The answer to a stored ballot. ``created``: this drive had no standing ballot before."""
+
+    vehicle: str
+    drive: str
+    created: bool
+    repeated: bool
+    """The very same ballot stood already: nothing was written."""
+    seq: int
+
+
+def put_in(connection: sa.Connection, ballots: Sequence[Incoming], now: int) -> list[Receipt | Exception]:
+    """Write ballots within a transaction: a receipt each, or Conflict where one votes otherwise than the round."""
+    b = schema.ballots
+    method = agreed = connection.execute(sa.select(schema.maps.c.method)).scalar_one()
+    drives = sa.tuple_(b.c.vehicle, b.c.drive).in_({(i.ballot.vehicle, i.ballot.drive) for i in ballots})
+    query = sa.select(b.c.vehicle, b.c.drive, b.c.seq, b.c.first_seq, b.c.gone_seq, b.c.digest).where(drives)
+    first: dict[tuple[str, str], int] = {}
+    standing: dict[tuple[str, str], tuple[int, str]] = {}
+    for row in connection.execute(query.order_by(b.c.seq)):
+        first.setdefault((row.vehicle, row.drive), row.first_seq)
+        if row.gone_seq is None:
+            standing[row.vehicle, row.drive] = row.seq, row.digest
+    seq = next_seq(connection)
+    results: list[Receipt | Exception] = []
+    log: list[tuple[Any, ...]] = []
+    rows: list[tuple[Any, ...]] = []
+    tiles: list[tuple[Any, ...]] = []
+    replaced: list[dict[str, int]] = []
+    for incoming in ballots:
+        ballot, key = incoming.ballot, (incoming.ballot.vehicle, incoming.ballot.drive)
+        method = method or incoming.cast_by
+        if method != incoming.cast_by:
+            theirs = f"this round votes by {method}, the ballot by {incoming.cast_by}"
+            mend = "vote again as the round does, or ask the operator for a new one (mapvote unvote STORE --all)"
+            results.append(Conflict(f"{theirs}: one round never mixes methods or settings; {mend}"))
+            continue
+        old = standing.get(key)
+        if old is not None and old[1] == incoming.digest:
+            results.append(Receipt(*key, created=False, repeated=True, seq=old[0]))
+            continue
+        if old is not None:
+            replaced.append({"old": old[0], "by": seq})
+        first.setdefault(key, seq)
+        standing[key] = seq, incoming.digest
+        log.append((seq, now, "ballot", *key))
+        times = ballot.start_ns, ballot.end_ns, now
+        rows.append((seq, first[key], None, *key, incoming.digest, *times, ballot.settings_hash[:128]))
+        tiles += [_tile_row(seq, ballot, tile) for tile in ballot.tiles]
+        results.append(Receipt(*key, created=old is None, repeated=False, seq=seq))
+        seq += 1
+    if rows:
+        insert_rows(connection, schema.events, log)
+        insert_rows(connection, b, rows)
+        insert_rows(connection, schema.ballot_tiles, tiles)
+    if replaced:
+        mark = b.update().where(b.c.seq == sa.bindparam("old")).values(gone_seq=sa.bindparam("by"))
+        connection.execute(mark, replaced)
+    if method != agreed:
+        connection.execute(schema.maps.update().values(method=method))
+    return results
+
+
+def _tile_row(seq: int, ballot: Ballot, tile: BallotTile) -> tuple[Any, ...]:
+    """In the order of the table's columns."""
+    base = ballot.base[tile_key(tile.tile)]
+    return *tile.tile, seq, base, tile.states, tile.tally, tile.gone, tile.new_points, tile.free
+
+
+def withdraw(store: Store, vehicle: str | None, drive: str | None = None, *, by: str) -> int:
+    """Un-vote before publication: one drive of a vehicle, or all, or (None) every vehicle's; how many ballots.
+
+    Once no ballot stands a new round begins, which may vote by another method or other settings.
+    NotFound if there is none. What earlier versions made of them stays: see
+    :func:`mapvote.server.store.replay.replay`.
+    """
+    b = schema.ballots
+    whose = f"{vehicle or '*'}/{drive or '*'}"
+    mine: sa.ColumnElement[bool] = b.c.gone_seq.is_(None)
+    if vehicle is not None:
+        mine &= b.c.vehicle == vehicle
+    if drive is not None:
+        mine &= b.c.drive == drive
+    with store.database.writing() as connection:
+        if connection.execute(sa.select(b.c.seq).where(mine)).first() is None:
+            raise NotFound(f"there is no standing ballot {whose}")
+        seq = log_event(connection, store.clock(), "withdraw", by, whose)
+        withdrawn = connection.execute(b.update().where(mine).values(gone_seq=seq)).rowcount
+        if connection.execute(sa.select(b.c.seq).where(b.c.gone_seq.is_(None)).limit(1)).first() is None:
+            connection.execute(schema.maps.update().values(method=None))
+    return int(withdrawn)

@@ -1,0 +1,97 @@
+"""Transactions on SQLite (WAL, durable) or PostgreSQL, by URL: many readers, one writer at a time."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+import sqlalchemy as sa
+from sqlalchemy import exc
+
+from mapvote.server.errors import Unavailable
+
+_WRITERS_LOCK = 0x6D617076  # any number of our own: PostgreSQL's advisory lock that writers take in turn
+_PAGE_BYTES = 16384
+"""A ballot's planes are a few kB each: in SQLite's own 4 kB pages they waste half of the file and of the writing."""
+
+
+class Database:
+    """One database. A transaction is committed when its block ends without an error, else nothing has happened."""
+
+    def __init__(self, url: str, *, timeout_s: float = 30.0) -> None:
+        self.url = sa.make_url(url)
+        self.is_sqlite = self.url.get_backend_name() == "sqlite"
+        if self.is_sqlite:
+            self.engine = sa.create_engine(
+                self.url, pool_size=16, max_overflow=64, connect_args={"timeout": timeout_s, "check_same_thread": False}
+            )
+            sa.event.listen(self.engine, "connect", _prepare_sqlite)
+            sa.event.listen(self.engine, "begin", _begin_sqlite)
+        else:
+            self.engine = sa.create_engine(
+                self.url, pool_size=16, max_overflow=64, pool_pre_ping=True, connect_args={"connect_timeout": 5}
+            )
+
+    @contextmanager
+    def reading(self) -> Iterator[sa.Connection]:
+        """A consistent snapshot: what is committed later stays out of sight. Unavailable if the database is gone."""
+        with _clear_errors(), self.engine.connect() as connection:
+            if not self.is_sqlite:
+                connection = connection.execution_options(isolation_level="REPEATABLE READ")
+            with connection.begin():
+                yield connection
+
+    @contextmanager
+    def writing(self) -> Iterator[sa.Connection]:
+        """The one writer. Unavailable if nothing can be written now (disk full, read-only, database gone)."""
+        with _clear_errors(), self.engine.connect() as connection:
+            connection = connection.execution_options(mapvote_writes=True)
+            with connection.begin():
+                if not self.is_sqlite:
+                    connection.execute(sa.select(sa.func.pg_advisory_xact_lock(_WRITERS_LOCK)))
+                yield connection
+
+    def close(self) -> None:
+        """Give every connection back."""
+        self.engine.dispose()
+
+
+def insert_rows(connection: sa.Connection, table: sa.Table, rows: Sequence[tuple[Any, ...]]) -> None:
+    """Many rows, each with a value for every column of ``table`` in its order, as the driver takes them.
+
+    SQLAlchemy's own work on each row would cost more than the database's.
+    """
+    quote = connection.dialect.identifier_preparer.quote
+    columns = ", ".join(quote(column.name) for column in table.columns)
+    mark = "?" if connection.dialect.name == "sqlite" else "%s"
+    values = ", ".join([mark] * len(table.columns))
+    connection.exec_driver_sql(f"INSERT INTO {quote(table.name)} ({columns}) VALUES ({values})", list(rows))
+
+
+@contextmanager
+def _clear_errors() -> Iterator[None]:
+    try:
+        yield
+    except exc.IntegrityError:
+        raise
+    except exc.DBAPIError as error:
+        reason = str(error.orig).strip().splitlines()
+        raise Unavailable(f"the database refuses ({reason[0] if reason else 'no reason given'}); try again") from error
+    except exc.TimeoutError as error:
+        raise Unavailable("all connections to the database are busy; try again") from error
+
+
+def _prepare_sqlite(connection: Any, _record: Any) -> None:
+    connection.isolation_level = None  # transactions are begun by _begin_sqlite, not guessed by the driver
+    cursor = connection.cursor()
+    cursor.execute(f"PRAGMA page_size={_PAGE_BYTES}")  # heeded only while the file is empty
+    cursor.execute("PRAGMA journal_mode=WAL")
+    cursor.execute("PRAGMA synchronous=FULL")
+    cursor.execute("PRAGMA foreign_keys=ON")
+    cursor.close()
+
+
+def _begin_sqlite(connection: sa.Connection) -> None:
+    writes = connection.get_execution_options().get("mapvote_writes", False)
+    connection.exec_driver_sql("BEGIN IMMEDIATE" if writes else "BEGIN")

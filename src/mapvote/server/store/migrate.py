@@ -1,0 +1,82 @@
+"""The schema's own history: a fresh store gets the newest, an older one is upgraded when told to, a newer one refused.
+
+The revisions lie in ``migrations/versions``, one file each, run by alembic within one transaction: a store is at one
+revision or at the next, never in between. There is no way down: restore the backup instead.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import sqlalchemy as sa
+
+from mapvote.core.types import MapvoteError
+from mapvote.server.store.database import Database
+
+FIRST = "0001"
+HEAD = "0002"
+"""The revision that :mod:`mapvote.server.store.schema` describes."""
+
+
+def revision_of(connection: sa.Connection) -> str | None:
+    """The schema revision of a database; None if it holds no store."""
+    inspector = sa.inspect(connection)
+    if inspector.has_table("alembic_version"):
+        return connection.execute(sa.text("SELECT version_num FROM alembic_version")).scalar_one_or_none()
+    return FIRST if inspector.has_table("maps") else None  # the first stores did not say which schema they have
+
+
+def check(connection: sa.Connection) -> None:
+    """MapvoteError, with the way out, unless the database holds a store of exactly this program's schema."""
+    revision, where = revision_of(connection), connection.engine.url.render_as_string()
+    if revision is None:
+        raise MapvoteError(f"{where}: holds no map yet; create the store with `mapvote serve STORE --map MAP`")
+    if revision == HEAD:
+        return
+    if revision in _known():
+        raise MapvoteError(
+            f"{where}: schema {revision} of an older mapvote, this one works with {HEAD}: stop the server, make a "
+            "backup, then run `mapvote upgrade STORE`"
+        )
+    raise MapvoteError(f"{where}: schema {revision} of a newer mapvote, this one knows up to {HEAD}: install that one")
+
+
+def run_migrations(connection: sa.Connection) -> None:
+    """Bring an empty or older database to HEAD, within the transaction of ``connection``."""
+    from alembic import command
+
+    config = _config()
+    config.attributes["connection"] = connection
+    if not sa.inspect(connection).has_table("alembic_version") and revision_of(connection) == FIRST:
+        command.stamp(config, FIRST)
+    command.upgrade(config, "head")
+
+
+def upgrade(database: Database) -> tuple[str, str]:
+    """Upgrade a store in one transaction: (revision before, revision after). MapvoteError if there is none, or it is
+    newer than this program."""
+    with database.writing() as connection:
+        before = revision_of(connection)
+        if before is None or before not in _known():
+            check(connection)
+        assert before is not None
+        run_migrations(connection)
+    return before, HEAD
+
+
+def _known() -> set[str]:
+    from alembic.script import ScriptDirectory
+
+    return {script.revision for script in ScriptDirectory.from_config(_config()).walk_revisions()}
+
+
+def _config() -> Any:
+    # Imported only when a store is created or does not fit: alembic comes with the server's extra.
+    try:
+        from alembic.config import Config
+    except ImportError as error:
+        raise MapvoteError("creating or upgrading a store needs alembic: pip install 'mapvote[server]'") from error
+    config = Config()
+    config.set_main_option("script_location", str(Path(__file__).parent / "migrations"))
+    return config

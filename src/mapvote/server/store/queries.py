@@ -1,0 +1,134 @@
+"""Queries on versions, tiles, blobs and events that several rooms of the store share."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import sqlalchemy as sa
+
+from mapvote.codec.ballot import tile_key
+from mapvote.core.grid import TileIndex
+from mapvote.core.types import MapTile
+from mapvote.server.errors import NotFound
+from mapvote.server.store import schema
+from mapvote.server.store.blobs import TileHashes, pack_tile, unpack_tile
+
+
+def current_number(connection: sa.Connection) -> int:
+    """Number of the newest version."""
+    return int(connection.execute(sa.select(sa.func.max(schema.versions.c.number))).scalar_one())
+
+
+def current_version(connection: sa.Connection) -> Version:
+    """The newest version."""
+    newest = sa.select(schema.versions).order_by(schema.versions.c.number.desc()).limit(1)
+    return Version(**connection.execute(newest).one()._mapping)
+
+
+def version_of(connection: sa.Connection, number: int) -> Version:
+    """One version; NotFound, naming the newest, if there is none of that number."""
+    row = connection.execute(sa.select(schema.versions).where(schema.versions.c.number == number)).one_or_none()
+    if row is None:
+        newest = current_number(connection)
+        raise NotFound(f"there is no version {number}; the newest is {newest}: fetch it whole")
+    return Version(**row._mapping)
+
+
+def tiles_of(connection: sa.Connection, number: int, only: TileIndex | None = None) -> dict[TileIndex, TileHashes]:
+    """Hashes of a version's tiles, in ascending order: of each tile, the last row up to that version."""
+    t = schema.version_tiles
+    newest = sa.select(t.c.row, t.c.col, sa.func.max(t.c.version).label("version")).where(t.c.version <= number)
+    if only is not None:
+        newest = newest.where(t.c.row == only[0], t.c.col == only[1])
+    last = newest.group_by(t.c.row, t.c.col).subquery()
+    same = (t.c.row == last.c.row) & (t.c.col == last.c.col) & (t.c.version == last.c.version)
+    rows = connection.execute(sa.select(t).join(last, same).where(t.c.points.is_not(None)).order_by(t.c.row, t.c.col))
+    return {(row.row, row.col): TileHashes(row.points, row.ground, row.free) for row in rows}
+
+
+def load_tile(connection: sa.Connection, hashes: TileHashes) -> MapTile:
+    """A tile by its hashes."""
+    free = None if hashes.free is None else load_blob(connection, hashes.free)
+    return unpack_tile(hashes, load_blob(connection, hashes.points), load_blob(connection, hashes.ground), free)
+
+
+def load_blob(connection: sa.Connection, digest: str) -> bytes:
+    """One plane, still compressed; NotFound if no version ever held it."""
+    data = connection.execute(_BLOB, {"digest": digest}).scalar_one_or_none()
+    if data is None:
+        raise NotFound(f"no tile plane has the hash {digest[:64]!r}; take the hashes from a manifest")
+    return bytes(data)
+
+
+def log_event(connection: sa.Connection, at_ns: int, kind: str, actor: str, detail: str) -> int:
+    """Append to the log; its number. Only within a writing transaction."""
+    seq = next_seq(connection)
+    event = {"seq": seq, "at_ns": at_ns, "kind": kind, "actor": actor[:80], "detail": detail[:400]}
+    connection.execute(schema.events.insert(), [event])
+    return seq
+
+
+def next_seq(connection: sa.Connection) -> int:
+    """The number of the next event: safe, because writers take turns."""
+    return int(connection.execute(sa.select(sa.func.max(schema.events.c.seq))).scalar_one() or 0) + 1
+
+
+def add_blobs(connection: sa.Connection, planes: Mapping[str, bytes]) -> None:
+    """Store planes that are not there yet."""
+    for digest, data in planes.items():
+        known = sa.select(schema.blobs.c.hash).where(schema.blobs.c.hash == digest)
+        if connection.execute(known).first() is None:
+            connection.execute(schema.blobs.insert().values(hash=digest, data=data))
+
+
+def add_version(connection: sa.Connection, version: Version, tiles: Mapping[TileIndex, MapTile]) -> None:
+    """Insert a version that sets ``tiles``; sqlalchemy's IntegrityError if its number is taken."""
+    connection.execute(schema.versions.insert().values(**version_row(version)))
+    rows = []
+    for index, tile in tiles.items():
+        hashes, planes = pack_tile(tile)
+        add_blobs(connection, planes)
+        rows.append(tile_row(version.number, index, hashes))
+    if rows:
+        connection.execute(schema.version_tiles.insert(), rows)
+
+
+def version_row(version: Version) -> dict[str, Any]:
+    """A version as the columns of its table."""
+    return {name: getattr(version, name) for name in schema.versions.c.keys()}  # noqa: SIM118
+
+
+def tile_row(number: int, index: TileIndex, hashes: TileHashes | None) -> dict[str, Any]:
+    """One row of version_tiles; None where the version has no such tile."""
+    planes = ("points", "ground", "free")
+    return {"version": number, "row": index[0], "col": index[1]} | {
+        plane: None if hashes is None else getattr(hashes, plane) for plane in planes
+    }
+
+
+def names(tiles: Iterable[TileIndex]) -> str:
+    """Tile keys for a message, at most five of them."""
+    keys = [tile_key(tile) for tile in tiles]
+    return ", ".join(keys[:5]) + (f" and {len(keys) - 5} more" if len(keys) > 5 else "")
+
+
+@dataclass(frozen=True, slots=True)
+class Version:
+    """One published state of the map."""
+
+    number: int
+    parent: int | None
+    kind: str
+    """import, publish, rollback or replay."""
+    target: int | None
+    created_ns: int
+    published_by: str
+    reason: str
+    mark: int
+    """The last event that the version knew of."""
+    policy: Mapping[str, Any]
+
+
+_BLOB = sa.select(schema.blobs.c.data).where(schema.blobs.c.hash == sa.bindparam("digest"))

@@ -1,0 +1,177 @@
+"""The store: versions of one map in SQL, the only system of record (DESIGN 4).
+
+    store = Store.open("sqlite:///street.db")          # or Store.create(url, point_map)
+    store.current(); store.manifest(n); store.tile(n, (0, 0)); store.point_map(n)
+
+What changes it lives beside it, one concern each: ``intake`` (ballots in and out), ``publish`` (publish, roll back,
+un-vote), ``keys``. What explains it: ``standing`` (which votes count), ``explain`` (cells, coverage, log).
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import sqlalchemy as sa
+
+from mapvote.codec.ballot import Id
+from mapvote.core.grid import Lattice, TileIndex
+from mapvote.core.types import MapTile, MapvoteError, PointMap
+from mapvote.server.errors import Unavailable
+from mapvote.server.store import migrate, schema
+from mapvote.server.store.blobs import TileHashes
+from mapvote.server.store.database import Database
+from mapvote.server.store.queries import (
+    Version,
+    add_blobs,
+    add_version,
+    current_number,
+    load_blob,
+    load_tile,
+    log_event,
+    tiles_of,
+    version_of,
+)
+
+__all__ = ["Id", "Manifest", "Store", "Version", "add_blobs", "log_event", "url_of"]
+
+
+@dataclass(frozen=True, slots=True)
+class Manifest:
+    """What a version consists of: the hashes of its tiles."""
+
+    version: int
+    map_id: str
+    lattice: Lattice
+    georeference: Mapping[str, str]
+    tiles: Mapping[TileIndex, TileHashes]
+    removed: Sequence[TileIndex] = ()
+    """With ``since``: tiles that the older version had and this one has not."""
+
+
+def url_of(store: str) -> str:
+    """The database URL of what the command line calls STORE: a URL, or the path of an SQLite file.
+
+    The path is made absolute: workers may run in another folder.
+    """
+    return store if "://" in store else f"sqlite:///{Path(store).absolute()}"
+
+
+def existing(url: str) -> Database:
+    """The database at ``url``; MapvoteError if that is an SQLite file which is not there."""
+    database = Database(url)
+    file = database.url.database
+    if database.is_sqlite and file and file != ":memory:" and not Path(file).exists():
+        raise MapvoteError(f"{file}: no such store; create one with `mapvote serve {file} --map MAP`")
+    return database
+
+
+def now_ns() -> int:
+    """The server's clock."""
+    return time.time_ns()
+
+
+class Store:
+    """An open store. Any number may be open on one database, in any number of processes."""
+
+    def __init__(self, database: Database, clock: Callable[[], int] = now_ns) -> None:
+        self.database = database
+        self.clock = clock
+        with database.reading() as connection:
+            migrate.check(connection)
+            row = connection.execute(sa.select(schema.maps)).one()
+        self.map_id: str = row.map_id
+        self.lattice = Lattice(row.x0, row.y0)
+        self.georeference: Mapping[str, str] = row.georeference
+
+    @classmethod
+    def create(cls, url: str, point_map: PointMap, *, by: str = "operator", clock: Callable[[], int] = now_ns) -> Store:
+        """A new store whose version 1 is ``point_map``; MapvoteError if the database already holds one."""
+        database = Database(url)
+        try:
+            with database.writing() as connection:
+                if migrate.revision_of(connection) is None:
+                    migrate.run_migrations(connection)
+                migrate.check(connection)
+                if connection.execute(sa.select(schema.maps.c.map_id)).first() is not None:
+                    raise MapvoteError(f"{database.url.render_as_string()}: holds a map already; open it instead")
+                origin = {"x0": point_map.lattice.x0, "y0": point_map.lattice.y0}
+                georeference = dict(point_map.georeference)
+                connection.execute(
+                    schema.maps.insert().values(map_id=point_map.map_id, georeference=georeference, **origin)
+                )
+                mark = log_event(connection, clock(), "import", by, point_map.map_id)
+                version = Version(1, None, "import", None, clock(), by, "first map", mark, {})
+                add_version(connection, version, point_map.tiles)
+        except BaseException:
+            database.close()
+            raise
+        return cls(database, clock)
+
+    @classmethod
+    def open(cls, url: str, *, clock: Callable[[], int] = now_ns) -> Store:
+        """An existing store; MapvoteError if there is none, or it has the schema of another mapvote."""
+        database = existing(url)
+        try:
+            return cls(database, clock)
+        except Unavailable as error:
+            database.close()
+            raise MapvoteError(f"{database.url.render_as_string()}: cannot be opened as a store ({error})") from error
+        except BaseException:
+            database.close()
+            raise
+
+    def close(self) -> None:
+        """Close every connection."""
+        self.database.close()
+
+    def current(self) -> int:
+        """Number of the newest version."""
+        with self.database.reading() as connection:
+            return current_number(connection)
+
+    def versions(self) -> list[Version]:
+        """All versions, oldest first."""
+        with self.database.reading() as connection:
+            rows = connection.execute(sa.select(schema.versions).order_by(schema.versions.c.number))
+            return [Version(**row._mapping) for row in rows]
+
+    def manifest(self, number: int | None = None, *, since: int | None = None) -> Manifest:
+        """Tiles of a version (the newest by default); with ``since``, only those set after that version.
+
+        NotFound if there is no such version.
+        """
+        with self.database.reading() as connection:
+            number = current_number(connection) if number is None else number
+            for wanted in (number, since):
+                if wanted is not None:
+                    version_of(connection, wanted)
+            tiles = tiles_of(connection, number)
+            removed: list[TileIndex] = []
+            if since is not None:
+                old = tiles_of(connection, since)
+                removed = sorted(old.keys() - tiles.keys())
+                tiles = {index: hashes for index, hashes in tiles.items() if old.get(index) != hashes}
+        return Manifest(number, self.map_id, self.lattice, self.georeference, tiles, removed)
+
+    def blob(self, digest: str) -> bytes:
+        """One plane of a tile, a zstd frame; NotFound if no version ever held it."""
+        with self.database.reading() as connection:
+            return load_blob(connection, digest)
+
+    def tile(self, number: int, index: TileIndex) -> MapTile | None:
+        """One tile of a version, None where the map has none; NotFound if there is no such version."""
+        with self.database.reading() as connection:
+            version_of(connection, number)
+            hashes = tiles_of(connection, number, index).get(index)
+            return None if hashes is None else load_tile(connection, hashes)
+
+    def point_map(self, number: int | None = None) -> PointMap:
+        """A whole version."""
+        with self.database.reading() as connection:
+            number = current_number(connection) if number is None else number
+            version_of(connection, number)
+            tiles = {index: load_tile(connection, hashes) for index, hashes in tiles_of(connection, number).items()}
+        return PointMap(self.map_id, self.lattice, tiles, self.georeference)

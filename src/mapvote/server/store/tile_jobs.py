@@ -1,0 +1,122 @@
+"""Fuse a round from the store, tile by tile, on any concurrent.futures.Executor: threads here, Dask on a cluster.
+
+A worker reads ballots from the database itself; a decision and the planes that changed travel back.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from concurrent.futures import Executor, ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import lru_cache, partial
+from typing import Any
+
+import numpy as np
+from backports import zstd
+from numpy.typing import NDArray
+
+from mapvote.core.grid import CELLS, TILE_CELLS, Lattice, TileIndex
+from mapvote.core.types import I32, N_STATES, U8, MapTile
+from mapvote.fusion.fuse import Rule, fuse_tile
+from mapvote.server.store.blobs import TileHashes, pack_tile
+from mapvote.server.store.database import Database
+from mapvote.server.store.eligible_votes import Bar, Round, counting_votes
+from mapvote.server.store.queries import load_tile
+
+
+@dataclass(frozen=True, slots=True)
+class Task:
+    """One tile to fuse: everything a worker needs but the ballots."""
+
+    url: str
+    lattice: Lattice
+    index: TileIndex
+    tile: TileHashes | MapTile | None
+    """As it is now: in the store, at hand, or not there."""
+    asked: Round
+    rule: Rule
+    bars: tuple[Bar, ...] | None = None
+    """Instead of those recorded."""
+
+
+@dataclass(frozen=True, slots=True)
+class Fused:
+    """What came of one tile."""
+
+    index: TileIndex
+    states: bytes
+    """(256, 256) uint8, a zstd frame, as in a ballot."""
+    tally: bytes
+    """(5, 65536) uint16 or int32, a zstd frame, see :func:`pack_tally`."""
+    vehicles: int
+    points: int
+    """Before."""
+    added: int
+    deleted: int
+    hashes: TileHashes | None
+    """Of the edited tile; None if it stays as it is."""
+    planes: Mapping[str, bytes]
+    tile: MapTile | None
+    """The edited tile where the task held one at hand (replay), else None."""
+
+
+def fuse_stored(task: Task, database: Database | None = None) -> Fused:
+    """Read the votes that count on one tile, decide, edit. Pure but for reading the database.
+
+    In another process, where there is no ``database`` at hand, one is opened by ``task.url`` and kept.
+    """
+    with (database or _database(task.url)).reading() as connection:
+        stored = task.tile if isinstance(task.tile, TileHashes) else None
+        tile = (
+            task.tile if isinstance(task.tile, MapTile) else None if stored is None else load_tile(connection, stored)
+        )
+        points, digest = None if tile is None else tile.points, None if stored is None else stored.points
+        votes = counting_votes(connection, task.lattice, task.index, points, task.asked, task.bars, digest)
+    decision, edited = fuse_tile(task.lattice, task.index, tile, votes, task.rule, task.asked.settings)
+    changed = edited is not tile and edited is not None
+    hashes, planes = pack_tile(edited) if changed and edited is not None else (None, {})
+    return Fused(
+        index=task.index,
+        states=pack_states(decision.states),
+        tally=pack_tally(decision.tally),
+        vehicles=decision.vehicles,
+        points=0 if points is None else len(points),
+        added=decision.added,
+        deleted=decision.deleted,
+        hashes=hashes,
+        planes=planes,
+        tile=edited if isinstance(task.tile, MapTile) or task.bars is not None else None,
+    )
+
+
+def fuse_round(tasks: Iterable[Task], database: Database, executor: Executor | None = None) -> list[Fused]:
+    """Fuse every tile; results in the order of the tasks. Without an executor, one after another."""
+    if executor is None or isinstance(executor, ThreadPoolExecutor):
+        here = partial(fuse_stored, database=database)
+        return list((executor.map if executor is not None else map)(here, tasks))
+    return list(executor.map(fuse_stored, tasks))
+
+
+def pack_states(states: U8) -> bytes:
+    """Quick rather than small: decisions are written once for each published tile."""
+    return zstd.compress(np.ascontiguousarray(states).tobytes(), 1)
+
+
+def pack_tally(tally: NDArray[Any]) -> bytes:
+    """(256, 256, 5) as a zstd frame of little-endian planes, class by class, which packs four times better than cell
+    by cell: uint16 if it comes so, else int32. The length tells which."""
+    dtype = "<u2" if tally.dtype == np.uint16 else "<i4"
+    return zstd.compress(np.ascontiguousarray(np.moveaxis(tally, -1, 0), dtype=dtype).tobytes(), 1)
+
+
+def unpack_tally_plane(data: bytes) -> I32:
+    """The inverse of :func:`pack_tally`, (256, 256, 5) int32."""
+    raw = zstd.decompress(data)
+    dtype = "<u2" if len(raw) == 2 * N_STATES * CELLS else "<i4"
+    planes = np.frombuffer(raw, dtype=dtype).reshape(N_STATES, TILE_CELLS, TILE_CELLS)
+    return np.ascontiguousarray(np.moveaxis(planes, 0, -1), dtype=np.int32)
+
+
+@lru_cache(maxsize=4)
+def _database(url: str) -> Database:
+    return Database(url)

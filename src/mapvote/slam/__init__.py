@@ -1,0 +1,1 @@
+"""The first map (paper II, [7], [9])."""

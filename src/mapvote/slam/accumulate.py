@@ -1,0 +1,167 @@
+"""Scans at known poses become a map: points without moving objects, ground, known-free columns (METHOD 4 D, remedy 2).
+
+A draft of the map gives the ground and says which voxels anything ever struck. Every voxel's scans are then counted:
+in how many was it struck, in how many seen through. What was struck only rarely by scans that could have struck it is
+the trail of something that moved and escaped the filter: it leaves the map, and its voxels are unknown, not free.
+
+What enters the map has been before the filter, at whatever range: a car that drives ahead of the surveyor, too far off
+for the counting, would else leave its trail unchallenged. Returns from beyond the filter's reach are left out.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numba
+import numpy as np
+from scipy import ndimage
+
+from mapvote.config import Settings
+from mapvote.core.columns import TOP_BIT, shifted
+from mapvote.core.geometry import transform
+from mapvote.core.grid import CELL_SIZE, TILE_CELLS, TileIndex, tile_grid
+from mapvote.core.reference import LocalMap, reference_window
+from mapvote.core.tile import map_from_points
+from mapvote.core.types import F64, I32, I64, U64, Bool, Drive, PointMap, Reference
+from mapvote.core.voxels import VoxelCloud
+from mapvote.detection.counters import PLANES, Evidence, count_of, free_words, is_open
+from mapvote.localisation.deskew import deskew, twist_between
+from mapvote.perception.moving_objects import MovingFilter
+from mapvote.perception.raycast import cast_rays, find_obstacles
+
+ROAD_M = 0.1
+"""Points this low above the ground are the road itself, also under a car."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Waiting:
+    """A scan that waits for the moving-object filter to decide."""
+
+    points_map: F64
+    origin_map: F64
+    obstacle: Bool
+    cell: I32
+    reference: Reference
+
+
+class Layer:
+    """Collects the scans of all drives, then gives the map."""
+
+    def __init__(self, draft: PointMap, settings: Settings) -> None:
+        self.draft, self.settings = draft, settings
+        self.cloud = VoxelCloud(draft.lattice)
+        self.evidence = Evidence(draft.lattice)
+        self._around = LocalMap(draft, 2.0 * settings.mapping.reach_m)
+        self._near = LocalMap(draft, settings.voting.window_m)
+
+    def lay(self, drive: Drive, T_map_lidar: F64, registered: Bool, count: Callable[[], None]) -> None:
+        """Enter every registered scan of one drive at its pose (n, 4, 4). ``count`` is called after each scan read."""
+        reach = {"reach_m": self.settings.mapping.reach_m}
+        movers = MovingFilter(drive.sensor, self.settings.moving.model_copy(update=reach))
+        waiting: deque[_Waiting] = deque()
+        for i, scan in enumerate(drive):
+            if registered[i]:
+                points = deskew(scan, motion_at(drive.stamps_ns, T_map_lidar, i))
+                points_map, origin_map = transform(T_map_lidar[i], points), T_map_lidar[i, :3, 3].copy()
+                reference, _ = self._around.at(origin_map)
+                obstacle, cell = find_obstacles(points_map, reference)
+                waiting.append(_Waiting(points_map, origin_map, obstacle, cell, reference))
+                for _, moving in movers.push(points_map, origin_map, obstacle, scan.stamp_ns):
+                    self._enter(waiting.popleft(), moving)
+            count()
+        for _, moving in movers.flush():
+            self._enter(waiting.popleft(), moving)
+
+    def _enter(self, scan: _Waiting, moving: Bool) -> None:
+        offset = scan.points_map[:, :2] - scan.origin_map[:2]
+        far = np.einsum("ij,ij->i", offset, offset) > self.settings.mapping.reach_m**2
+        self.cloud.add(scan.points_map, moving | _beneath(scan, moving) | far)
+        near, _ = self._near.at(scan.origin_map)
+        self.evidence.add(cast_rays(scan.points_map, scan.origin_map, scan.obstacle, moving, near), near)
+
+    def finish(self) -> PointMap:
+        """The map of everything laid."""
+        points, _ = self.cloud.points()
+        points = points[~self._trails(points, self.draft)]
+        # Trails lift the draft's ground; above the true one stand the undersides of cars that had passed for ground.
+        points = points[~self._trails(points, map_from_points(points, lattice=self.draft.lattice))]
+        point_map = map_from_points(points, lattice=self.draft.lattice)
+        tiles = {tile: replace(content, free=self._free(tile, point_map)) for tile, content in point_map.tiles.items()}
+        return replace(point_map, tiles=tiles)
+
+    def _trails(self, points: F64, ground: PointMap) -> Bool:
+        """Which points (n, 3) lie in voxels that were struck in too few of the scans that could have struck them.
+
+        Only points that stand above the ground of ``ground`` are judged, and only voxels that rays crossed from side to
+        side: what merely grazes a thin slab says nothing against it.
+        """
+        trail = np.zeros(len(points), dtype=np.bool_)
+        rows, cols = self.draft.lattice.cells_of(points)
+        for tile, planes in self.evidence.tiles.items():
+            reference = reference_window(self.draft, tile_grid(self.draft.lattice, tile))
+            standing = reference_window(ground, reference.grid)
+            r, c = rows - reference.grid.row0, cols - reference.grid.col0
+            here = np.flatnonzero((r >= 0) & (r < TILE_CELLS) & (c >= 0) & (c < TILE_CELLS))
+            here = here[find_obstacles(points[here], standing)[0]]
+            r, c = r[here], c[here]
+            bits = np.floor(points[here, 2] / CELL_SIZE).astype(np.int64) - reference.base[r, c]
+            s = self.settings.mapping
+            trail[here] = _are_trails(planes, r, c, bits, s.trail_min_through, s.trail_share)
+        return trail
+
+    def _free(self, tile: TileIndex, point_map: PointMap) -> U64:
+        """Known-free columns of one tile of the finished map, on its own ground."""
+        grid = tile_grid(self.draft.lattice, tile)
+        if tile not in self.evidence.tiles:
+            return np.zeros(grid.shape, dtype=np.uint64)
+        before, after = reference_window(self.draft, grid), reference_window(point_map, grid)
+        free = free_words(self.evidence.tiles[tile], np.zeros(grid.shape, dtype=np.uint64))
+        out = _rebased(free, before.base, after.base) & ~after.occupied
+        out[np.isnan(after.ground_z)] = 0
+        return out
+
+
+def _beneath(scan: _Waiting, moving: Bool) -> Bool:
+    """Points (n,) too low to be obstacles, in or next to cells where something moves: wheels and bumpers, not road."""
+    inside = scan.cell >= 0
+    cells = np.zeros(scan.reference.grid.shape, dtype=np.bool_)
+    cells.ravel()[scan.cell[moving & inside]] = True
+    cells = ndimage.binary_dilation(cells, np.ones((3, 3)))
+    low = np.zeros(len(moving), dtype=np.bool_)
+    near = np.flatnonzero(inside)
+    near = near[cells.ravel()[scan.cell[near]]]
+    low[near] = scan.points_map[near, 2] - scan.reference.ground_z.ravel()[scan.cell[near]] > ROAD_M
+    return low & ~scan.obstacle
+
+
+def motion_at(stamps_ns: I64, T_map_lidar: F64, i: int) -> F64:
+    """(6,) motion per second of scan i in its lidar frame, from the poses (n, 4, 4) before and after it."""
+    before, after = max(i - 1, 0), min(i + 1, len(stamps_ns) - 1)
+    if before == after:
+        return np.zeros(6)
+    seconds = 1e-9 * float(stamps_ns[after] - stamps_ns[before])
+    return twist_between(T_map_lidar[before], T_map_lidar[after], seconds)
+
+
+@numba.njit(cache=True, nogil=True)
+def _are_trails(planes: U64, rows: I64, cols: I64, bits: I64, min_through: int, share: float) -> Bool:
+    """(n,) of voxels (row, col, bit) of a tile; those outside the columns are none."""
+    out = np.zeros(len(bits), dtype=np.bool_)
+    for i in range(len(bits)):
+        if 0 <= bits[i] < TOP_BIT:
+            cell = planes[rows[i], cols[i]]
+            through, struck = count_of(cell, 0, bits[i]), count_of(cell, PLANES, bits[i])
+            rarely = through >= min_through and struck < share * (struck + through)
+            out[i] = rarely and is_open(cell, bits[i])
+    return out
+
+
+@numba.njit(cache=True, nogil=True)
+def _rebased(words: U64, before: I32, after: I32) -> U64:
+    out = np.empty_like(words)
+    for r in range(words.shape[0]):
+        for c in range(words.shape[1]):
+            out[r, c] = shifted(words[r, c], before[r, c] - after[r, c])
+    return out

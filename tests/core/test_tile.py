@@ -1,0 +1,60 @@
+"""One cloud becomes tiles: nothing is lost, nothing moves, and the ground shows no seam."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Grid, Lattice, tile_grid
+from mapvote.core.ground import ground_surface
+from mapvote.core.tile import all_points, map_from_points
+from mapvote.core.types import F64, MapvoteError
+
+
+def sloping_road(seed: int) -> F64:
+    rng = np.random.default_rng(seed)
+    xy = rng.uniform((-90.0, -20.0), (90.0, 20.0), (60_000, 2))
+    return np.column_stack([xy, 0.05 * xy[:, 0] + rng.normal(0, 0.01, len(xy))])
+
+
+def test_every_point_survives_in_its_own_tile_and_within_a_hundredth_of_a_millimetre() -> None:
+    points = sloping_road(1) + np.array([1234.5, -987.0, 3.0])
+    point_map = map_from_points(points, lattice=Lattice(0.3, -0.6))
+    back = all_points(point_map)
+    assert len(back) == len(points)
+    for axis in range(3):
+        np.testing.assert_allclose(np.sort(back[:, axis]), np.sort(points[:, axis]), rtol=0, atol=1e-5)
+    assert len(point_map.tiles) > 2
+    for content in point_map.tiles.values():
+        assert content.points.dtype == np.float32
+        assert content.points[:, :2].min() >= 0
+        assert content.points[:, :2].max() < TILE_CELLS * CELL_SIZE
+
+
+def test_ground_has_no_seam_where_tiles_meet() -> None:
+    points = sloping_road(2)
+    point_map = map_from_points(points)
+    whole = Grid(point_map.lattice, -TILE_CELLS * 2, -TILE_CELLS * 2, TILE_CELLS * 4, TILE_CELLS * 4)
+    expected = ground_surface(points, whole)
+    for tile, content in point_map.tiles.items():
+        piece = expected[tile_grid(point_map.lattice, tile).slices_in(whole)]
+        np.testing.assert_allclose(content.ground_z, piece, atol=1e-5)
+
+
+def test_the_name_of_a_map_follows_its_points() -> None:
+    points = sloping_road(3)
+    assert map_from_points(points).map_id == map_from_points(points.copy()).map_id
+    assert map_from_points(points).map_id != map_from_points(points[::2]).map_id
+    assert map_from_points(points, map_id="street").map_id == "street"
+
+
+@settings(max_examples=10, deadline=None)
+@given(st.lists(st.tuples(*[st.floats(-300, 300)] * 3), min_size=1, max_size=30))
+def test_any_finite_cloud_is_kept_whole(points: list[tuple[float, float, float]]) -> None:
+    assert len(all_points(map_from_points(np.array(points)))) == len(points)
+
+
+@pytest.mark.parametrize("points", [np.zeros((0, 3)), np.zeros((4, 2)), np.array([[0.0, np.nan, 1.0]])])
+def test_a_cloud_that_is_no_map_is_refused(points: F64) -> None:
+    with pytest.raises(MapvoteError):
+        map_from_points(points)

@@ -1,0 +1,169 @@
+"""Counters in bit planes against plain counting, and what strikes or clears a mapped voxel (METHOD 4, A and B)."""
+
+from __future__ import annotations
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from mapvote.core.columns import dilated, neighbourhood, shifted
+from mapvote.core.grid import CELL_SIZE, Grid, Lattice
+from mapvote.core.types import Reference
+from mapvote.detection.counters import PLANES, STRUCK_ITSELF, THROUGH_ITSELF, Evidence, count_of, free_words
+from mapvote.perception.raycast import ScanView, Sight
+
+SIDE = 5
+GRID = Grid(Lattice(), 10, 10, SIDE, SIDE)
+AT = (10 + 2, 10 + 2)
+"""The middle cell of the window, in the tile."""
+words = arrays(np.uint64, (SIDE, SIDE), elements=st.integers(0, 2**62))
+
+
+def view_of(hit: np.ndarray, passed: np.ndarray, sight: int = Sight.CLEAR) -> ScanView:
+    sights = np.full(GRID.shape, int(sight), np.uint8)
+    return ScanView(GRID, (hit != 0).astype(np.int32), hit.astype(np.uint64), passed.astype(np.uint64), sights)
+
+
+def reference_of(occupied: np.ndarray, ground_z: np.ndarray | None = None) -> Reference:
+    ground = np.zeros(GRID.shape, np.float32) if ground_z is None else ground_z.astype(np.float32)
+    filled = np.where(np.isnan(ground), 0.0, ground)
+    base = np.floor(filled / CELL_SIZE).astype(np.int32)
+    none = np.full(GRID.shape, np.inf, np.float32)
+    counts = (occupied != 0).astype(np.int32)
+    return Reference(GRID, ground, base, occupied.astype(np.uint64), counts, none, -none, None)
+
+
+def middle(word: int) -> np.ndarray:
+    out = np.zeros(GRID.shape, np.uint64)
+    out[2, 2] = word
+    return out
+
+
+NOTHING = middle(0)
+
+
+@given(st.lists(st.tuples(words, words), min_size=1, max_size=12))
+@settings(max_examples=30, deadline=None)
+def test_bit_planes_count_like_plain_counters(scans: list[tuple[np.ndarray, np.ndarray]]) -> None:
+    evidence = Evidence(Lattice())
+    through = np.zeros((SIDE, SIDE, 64), int)
+    struck = np.zeros((SIDE, SIDE, 64), int)
+    bits = np.arange(64, dtype=np.uint64)
+    for hit, passed in scans:
+        evidence.add(view_of(hit, passed), reference_of(NOTHING))
+        is_hit = (hit[..., None] >> bits) & np.uint64(1) == 1
+        struck += is_hit
+        through += ((passed[..., None] >> bits) & np.uint64(1) == 1) & ~is_hit
+    planes = evidence.tiles[(0, 0)]
+    for r, c, bit in np.argwhere(through + struck >= 0)[:: 7 * SIDE]:
+        cell = planes[10 + r, 10 + c]
+        assert count_of(cell, 0, bit) == through[r, c, bit]
+        assert count_of(cell, PLANES, bit) == struck[r, c, bit]
+
+
+def test_a_full_counter_is_halved_with_its_cell_and_keeps_the_ratio() -> None:
+    evidence = Evidence(Lattice())
+    for i in range(400):
+        evidence.add(view_of(middle(0b10 if i % 4 == 0 else 0), middle(0b10)), reference_of(NOTHING))
+    cell = evidence.tiles[(0, 0)][AT]
+    through, struck = count_of(cell, 0, 1), count_of(cell, PLANES, 1)
+    assert 60 < through < 128
+    assert abs(through / struck - 3.0) < 0.2
+
+
+def test_a_hit_next_to_a_mapped_voxel_strikes_it_and_vetoes_the_rays_that_grazed_past() -> None:
+    hit = NOTHING.copy()
+    hit[3, 3] = 0b1000  # one cell and one layer off
+    for veto, counts in ((True, (0, 1)), (False, (1, 0))):
+        evidence = Evidence(Lattice(), veto=veto)
+        evidence.add(view_of(hit, middle(0b100)), reference_of(middle(0b100)))
+        cell = evidence.tiles[(0, 0)][AT]
+        assert (count_of(cell, 0, 2), count_of(cell, PLANES, 2)) == counts
+
+
+def test_a_hit_two_cells_away_counts_only_for_an_uncertain_pose() -> None:
+    hit = NOTHING.copy()
+    hit[2, 4] = 0b100
+    for reach, counts in ((1, (1, 0)), (2, (0, 1))):
+        evidence = Evidence(Lattice())
+        evidence.add(view_of(hit, middle(0b100)), reference_of(middle(0b100)), reach)
+        cell = evidence.tiles[(0, 0)][AT]
+        assert (count_of(cell, 0, 2), count_of(cell, PLANES, 2)) == counts
+
+
+def test_a_mapped_voxel_also_keeps_what_befell_it_alone() -> None:
+    hit = NOTHING.copy()
+    hit[3, 3] = 0b100
+    evidence = Evidence(Lattice())
+    evidence.add(view_of(hit, middle(0b110)), reference_of(middle(0b1100)))
+    cell = evidence.tiles[(0, 0)][AT]
+    assert (cell[STRUCK_ITSELF], cell[THROUGH_ITSELF]) == (0, 0b100), "the hit lies next to it, the ray went through it"
+    evidence.add(view_of(middle(0b1100), middle(0b100)), reference_of(middle(0b1100)))
+    assert (cell[STRUCK_ITSELF], cell[THROUGH_ITSELF]) == (0b1100, 0b100)
+
+
+def test_a_scan_that_is_unsure_of_its_pose_says_of_no_single_voxel_that_a_ray_went_through() -> None:
+    evidence = Evidence(Lattice())
+    evidence.add(view_of(NOTHING, middle(0b100)), reference_of(middle(0b100)), 2)
+    assert evidence.tiles[(0, 0)][AT][THROUGH_ITSELF] == 0
+
+
+def test_without_rule_a_a_visible_cell_is_seen_through_whole() -> None:
+    for by_ray, count in ((True, 0), (False, 1)):
+        evidence = Evidence(Lattice(), by_ray=by_ray)
+        evidence.add(view_of(NOTHING, middle(0b1), Sight.BEHIND), reference_of(middle(0b100)))
+        assert count_of(evidence.tiles[(0, 0)][AT], 0, 2) == count
+
+
+def test_on_a_slope_neighbouring_columns_are_compared_at_the_same_height() -> None:
+    ground = np.zeros(GRID.shape)
+    ground[:, 3:] = 0.9  # three layers up
+    hit = NOTHING.copy()
+    hit[2, 3] = 0b1  # 0.9 m to 1.2 m: bit 3 of the middle column
+    evidence = Evidence(Lattice())
+    evidence.add(view_of(hit, middle(0)), reference_of(middle(0b1000), ground))
+    assert count_of(evidence.tiles[(0, 0)][AT], PLANES, 3) == 1
+
+
+def test_cells_of_unknown_ground_gather_nothing() -> None:
+    ground = np.full(GRID.shape, np.nan)
+    evidence = Evidence(Lattice())
+    evidence.add(view_of(middle(1), middle(2)), reference_of(NOTHING, ground))
+    assert not evidence.tiles[(0, 0)].any()
+
+
+def test_free_is_what_was_seen_through_twice_never_struck_and_not_mapped() -> None:
+    evidence = Evidence(Lattice())
+    for hit, passed in ((0, 0b1110), (0, 0b0110), (0b0100, 0b0010)):
+        evidence.add(view_of(middle(hit), middle(passed)), reference_of(NOTHING))
+    assert free_words(evidence.tiles[(0, 0)], np.zeros((256, 256), np.uint64))[AT] == 0b0010
+    occupied = np.full((256, 256), 0b0010, np.uint64)
+    assert free_words(evidence.tiles[(0, 0)], occupied)[AT] == 0
+
+
+@given(words, arrays(np.int32, (SIDE, SIDE), elements=st.integers(-5, 5)), st.integers(1, 2))
+@settings(max_examples=20, deadline=None)
+def test_dilation_is_the_union_over_neighbours_at_world_height(word: np.ndarray, base: np.ndarray, reach: int) -> None:
+    out = dilated(word, base, reach)
+    occupied = {
+        (r, c, int(base[r, c]) + bit)
+        for r, c in np.ndindex(SIDE, SIDE)
+        for bit in range(64)
+        if int(word[r, c]) >> bit & 1
+    }
+    for bit in range(64):
+        near = any(
+            (2 + i, 2 + j, int(base[2, 2]) + bit + k) in occupied and 0 <= bit + k < 64
+            for i in range(-reach, reach + 1)
+            for j in range(-reach, reach + 1)
+            for k in (-1, 0, 1)
+        )
+        assert bool(int(out[2, 2]) >> bit & 1) == near
+    assert neighbourhood(word, base, 2, 2, reach) == out[2, 2]
+
+
+def test_shifting_a_column_drops_what_leaves_it() -> None:
+    assert shifted(np.uint64(0b11), 2) == 0b1100
+    assert shifted(np.uint64(0b11), -1) == 0b1
+    assert shifted(np.uint64(1), 64) == shifted(np.uint64(1 << 63), -64) == 0

@@ -1,0 +1,87 @@
+"""A drive's evidence voter by voter, over whole tiles: what falls with a demolished wall, and what stays beside it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from hand_made import make_map, make_tile, wall
+from mapvote.config import VotingSettings
+from mapvote.core.grid import tile_grid
+from mapvote.core.reference import reference_window
+from mapvote.core.types import CellState, PointMap
+from mapvote.detection.columns import ColumnVoter
+from mapvote.detection.counters import Evidence
+from mapvote.detection.regions import beside_new
+from mapvote.detection.votes import TileVotes
+from mapvote.perception.raycast import ScanView, Sight
+
+ROW = 100
+WALL, POST = range(100, 112), 112
+WALL_Z, POST_Z, CORNICE_Z = [0.75, 1.05, 1.35, 1.65], [0.75, 1.05], 1.65
+ALL_BITS = ~np.uint64(0) >> np.uint64(1)
+
+
+def street() -> PointMap:
+    """A wall that ends at a post; the wall's cornice hangs over the post, in the same cell."""
+    cells = [(ROW, column) for column in WALL]
+    points = [wall(cells, WALL_Z), wall([(ROW, POST)], [*POST_Z, CORNICE_Z])]
+    ground = wall([(r, c) for r in range(90, 120) for c in range(90, 130)], [0.0])
+    return make_map({(0, 0): make_tile(np.concatenate([*points, ground]))})
+
+
+def bits(heights: list[float]) -> np.uint64:
+    return np.uint64(sum(1 << int(z / 0.3) for z in heights))
+
+
+def after(rules: str, more_hits: dict[tuple[int, int], list[float]] | None = None) -> TileVotes:
+    """What a drive says after the wall is gone: rays go through everything, and only the post is struck."""
+    point_map = street()
+    grid = tile_grid(point_map.lattice, (0, 0))
+    reference = reference_window(point_map, grid)
+    hit = np.zeros(grid.shape, np.uint64)
+    hit[ROW, POST] = bits(POST_Z)
+    for cell, heights in (more_hits or {}).items():
+        hit[cell] = bits(heights)
+    passed = np.where(hit != 0, ~hit & ALL_BITS, ALL_BITS)
+    view = ScanView(grid, (hit != 0).astype(np.int32), hit, passed, np.full(grid.shape, int(Sight.CLEAR), np.uint8))
+    evidence = Evidence(point_map.lattice)
+    for _ in range(20):
+        evidence.add(view, reference)
+    return ColumnVoter(VotingSettings(rules=rules), point_map, evidence).votes()[0, 0]
+
+
+def test_the_last_cell_of_a_demolished_wall_falls_though_a_post_stands_next_to_it() -> None:
+    end = (ROW, POST - 1)
+    assert after("ABCDEFGH").states[ROW, WALL[0]] == CellState.CHANGED_EMPTY
+    assert after("ABCDEFGH").states[end] == CellState.UNCHANGED_OCCUPIED, "hits on the post veto it (rule B)"
+    votes = after("ABCDEFGHI")
+    assert votes.states[end] == CellState.CHANGED_EMPTY
+    assert votes.gone is not None
+    assert votes.gone[end] == bits(WALL_Z)
+
+
+def test_the_cornice_goes_from_the_cell_of_the_post_and_the_post_stays() -> None:
+    votes = after("ABCDEFGHI")
+    assert votes.states[ROW, POST] == CellState.UNCHANGED_OCCUPIED
+    assert votes.remnants is not None
+    assert votes.remnants[ROW, POST] == bits([CORNICE_Z])
+    without = after("ABCDEFGH").remnants
+    assert without is not None
+    assert not without.any()
+
+
+def test_no_cell_falls_as_a_remnant_next_to_hits_on_something_new() -> None:
+    """An error of pose puts what stands beside its place in the map: voxels may go, the cell does not change."""
+    votes = after("ABCDEFGHI", {(ROW + 1, POST - 1): [0.75, 1.05]})
+    assert votes.states[ROW, POST - 1] == CellState.UNCHANGED_OCCUPIED
+
+
+@pytest.mark.parametrize("bit", [3, 40])
+def test_beside_new_is_everything_within_a_voxel_of_a_hit_that_the_map_does_not_explain(bit: int) -> None:
+    planes, occupied = np.zeros((5, 5, 16), np.uint64), np.zeros((5, 5), np.uint64)
+    planes[2, 2, 7] = planes[0, 0, 7] = np.uint64(1) << np.uint64(bit)
+    occupied[0, 0] = np.uint64(1) << np.uint64(bit)
+    near = beside_new(planes, occupied, np.zeros((5, 5), np.int32))
+    assert (near[1:4, 1:4] == np.uint64(0b111) << np.uint64(bit - 1)).all()
+    assert np.count_nonzero(near) == 9

@@ -1,0 +1,125 @@
+"""Liars say what their names promise, in ballots that any server would take."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from hand_made import SHAPE, Say, make_ballot, states_plane, two_walls, wall, words_plane
+from mapvote.codec.ballot import Ballot, decode, encode, unpack_points, unpack_states, unpack_words
+from mapvote.config import FuseSettings
+from mapvote.core.types import NO_VOTE, CellState, PointMap
+from mapvote.evaluation.experiments.attacks import (
+    ATTACKS,
+    SHIFT_CELLS,
+    all_changed,
+    false_points,
+    invert,
+    replay,
+    shift,
+    stale,
+)
+from mapvote.fusion.offline import update_map
+
+TILE = (0, 0)
+STANDS, FREE, BUILT, GONE = (10, 10), (40, 40), (50, 50), (10, 12)
+HONEST = {STANDS: 0, FREE: 1, BUILT: 2, GONE: 3, (60, 60): 4}
+
+
+def honest(point_map: PointMap, vehicle: str) -> Ballot:
+    """The wall's last cell is gone, and a new one stands at (50, 50)."""
+    say = Say(
+        states_plane(HONEST),
+        gone=words_plane({GONE: 0b1110}),
+        new_points=wall([BUILT], [0.45, 0.75, 1.05]),
+        free=words_plane({FREE: 0b1110}),
+    )
+    return make_ballot(point_map, {TILE: say}, vehicle=vehicle)
+
+
+def states_of(ballot: Ballot) -> np.ndarray:
+    assert ballot.tiles[0].states is not None
+    return unpack_states(ballot.tiles[0].states)
+
+
+@pytest.mark.parametrize("name", ATTACKS)
+def test_a_lie_is_a_ballot_like_any_other(name: str) -> None:
+    point_map = two_walls()
+    lie = ATTACKS[name](honest(point_map, "v3"), point_map, honest(point_map, "v1"))
+    assert lie.vehicle == "v3"
+    assert decode(encode(lie)) == lie
+    update_map(point_map, [honest(point_map, "v1"), lie], FuseSettings(min_votes=1))
+
+
+def test_inverting_says_the_opposite_of_what_was_determined_and_nothing_elsewhere() -> None:
+    point_map = two_walls()
+    states = states_of(invert(honest(point_map, "v"), point_map, honest(point_map, "w")))
+    assert [states[cell] for cell in HONEST] == [3, 2, 1, 0, 4]
+    assert states[0, 0] == NO_VOTE
+
+
+def test_everything_changed_is_every_cell_of_the_tile() -> None:
+    point_map = two_walls()
+    states = states_of(all_changed(honest(point_map, "v"), point_map, honest(point_map, "w")))
+    assert np.count_nonzero(states == CellState.CHANGED_EMPTY) == 3  # the wall's cells
+    assert np.count_nonzero(states == CellState.CHANGED_OCCUPIED) == SHAPE[0] * SHAPE[1] - 3
+
+
+def test_an_old_street_knows_no_change() -> None:
+    point_map = two_walls()
+    states = states_of(stale(honest(point_map, "v"), point_map, honest(point_map, "w")))
+    assert [states[cell] for cell in HONEST] == [0, 1, 1, 0, 4]
+
+
+def test_a_replayed_ballot_is_the_other_vehicles_under_ones_own_name() -> None:
+    point_map = two_walls()
+    mine = make_ballot(point_map, {TILE: Say(states_plane())}, vehicle="liar", drive="d9")
+    copy = replay(mine, point_map, honest(point_map, "v1"))
+    assert (copy.vehicle, copy.drive) == ("liar", "d9")
+    assert copy.tiles == honest(point_map, "v1").tiles
+
+
+def test_shifting_moves_states_masks_and_points_together() -> None:
+    point_map = two_walls()
+    tile = shift(honest(point_map, "v"), point_map, honest(point_map, "w")).tiles[0]
+    assert tile.states is not None
+    assert tile.gone is not None
+    assert tile.new_points is not None
+    k = SHIFT_CELLS
+    assert unpack_states(tile.states)[BUILT[0] + k, BUILT[1] + k] == CellState.CHANGED_OCCUPIED
+    assert unpack_words(tile.gone, "gone")[GONE[0] + k, GONE[1] + k] == 0b1110
+    moved = unpack_points(tile.new_points) - wall([BUILT], [0.45, 0.75, 1.05])
+    np.testing.assert_allclose(moved, np.tile([0.3 * k, 0.3 * k, 0.0], (3, 1)), atol=1e-5)
+
+
+def test_false_points_leave_the_states_right_and_delete_whole_columns() -> None:
+    point_map = two_walls()
+    tile = false_points(honest(point_map, "v"), point_map, honest(point_map, "w")).tiles[0]
+    assert tile.gone is not None
+    assert tile.new_points is not None
+    np.testing.assert_array_equal(states_of(honest(point_map, "v")), unpack_states(tile.states or b""))
+    assert unpack_words(tile.gone, "gone")[GONE] == ~np.uint64(0)
+    assert len(unpack_points(tile.new_points)) == 5
+
+
+@pytest.mark.parametrize("name", ATTACKS)
+@pytest.mark.parametrize("k", [1, 2, 3])
+def test_k_liars_decide_nothing_among_k_plus_1_honest_vehicles_that_agree(name: str, k: int) -> None:
+    """Where all honest vehicles say the same, min_votes = k + 1 decides and deletes as without the liars (DESIGN 4).
+
+    What liars can still do is to add a point in the voxel above or below one that the honest saw: a voxel counts as
+    supported by whoever saw its neighbour.
+    """
+    point_map, settings = two_walls(), FuseSettings(min_votes=k + 1)
+    true = [honest(point_map, f"v{i}") for i in range(k + 1)]
+    lies = [ATTACKS[name](honest(point_map, f"liar{i}"), point_map, true[0]) for i in range(k)]
+    alone, before = update_map(point_map, true, settings)
+    updated, after = update_map(point_map, [*true, *lies], settings)
+    changes = [np.isin(d[TILE].states, (CellState.CHANGED_OCCUPIED, CellState.CHANGED_EMPTY)) for d in (before, after)]
+    np.testing.assert_array_equal(changes[0], changes[1])
+    was, now = (set(map(tuple, m.tiles[TILE].points.tolist())) for m in (alone, updated))
+    assert was <= now
+    honest_z = [0.45, 0.75, 1.05]
+    for x, y, z in now - was:
+        assert (int(y / 0.3), int(x / 0.3)) == BUILT
+        assert min(abs(z - other) for other in honest_z) < 0.31

@@ -1,0 +1,106 @@
+"""The matrix end to end on the smallest street, and its arithmetic by hand."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from mapvote.config import Settings
+from mapvote.evaluation.experiments.matrix import EXPERIMENTS, Matrix
+from mapvote.evaluation.reporting import requirements
+from mapvote.evaluation.reporting.matrix_tables import FIGURES, Spread, class_table, spread, table
+from mapvote.evaluation.reporting.requirements import DEMANDS, Demand
+
+
+def entry(macro: float, valid: float = 0.0) -> dict[str, Any]:
+    classes = {"unchanged": macro, "changed_occupied": macro, "changed_empty": macro}
+    return {
+        "strict": {"macro_f1": macro, "f1": classes, "precision": classes, "recall": classes},
+        "provenance": {"macro_f1": macro},
+        "strict_old_unchanged": {"macro_f1": macro},
+        "map": {
+            "stale_deleted": 1.0,
+            "stale_apart_deleted": 1.0,
+            "valid_deleted": valid,
+            "new_added": 1.0,
+            "added_false": 0.0,
+        },
+        "coverage": 0.9,
+        "objects": {"found": [True, False], "met": [True, True], "false_m2": [2.5, 1.5]},
+    }
+
+
+def of_rounds(**rounds: dict[str, Any]) -> dict[str, Any]:
+    return {"rounds": rounds}
+
+
+def test_the_worst_is_the_lowest_of_a_merit_and_the_highest_of_a_harm() -> None:
+    assert spread([0.5, 0.75, 1.0]) == Spread(0.75, 0.25, 0.5, 3)
+    assert spread([0.8, 0.9, 1.0], more_is_better=False).worst == 1.0
+    assert spread([0.5]).deviation == 0.0
+
+
+def test_objects_are_counted_in_halves_found_and_above_two_square_metres() -> None:
+    assert FIGURES["found"].of(entry(1.0)) == 0.5
+    assert FIGURES["false_objects"].of(entry(1.0)) == 1.0
+
+
+def test_a_demand_asks_for_the_worst_of_its_rounds_against_the_best_of_the_others() -> None:
+    results = {
+        "main": {2: of_rounds(a=entry(0.9), b=entry(0.8)), 3: of_rounds(a=entry(0.7), b=entry(0.9))},
+        "other": {2: of_rounds(x=entry(0.5), y=entry(0.6))},
+    }
+    plain = Demand("", "main", ("a", "b"), "strict", mean=0.75, aim=0.9, worst=0.7)
+    assert plain.values(results) == pytest.approx([0.8, 0.7])
+    assert "| yes |" in (plain.row(results) or "")
+    stricter = Demand("", "main", ("a", "b"), "strict", mean=0.75, aim=0.9, worst=0.71)
+    assert "| NO |" in (stricter.row(results) or "")
+    against = Demand("", "main", ("a",), "strict", mean=0.3, aim=0.3, against=("other", ("x", "y")))
+    assert against.values(results) == pytest.approx([0.3])  # seed 3 has nothing to compare with
+    harm = Demand("", "main", ("a",), "valid", mean=0.001, aim=0.0)
+    assert "| aim |" in (harm.row(results) or "")
+    assert Demand("", "never run", ("a",), "strict", 0.0, 0.0).row(results) is None
+
+
+def test_every_demand_is_on_an_experiment_and_a_figure_that_exist() -> None:
+    for demand in DEMANDS:
+        assert demand.figure in FIGURES
+        assert {demand.experiment} | ({demand.against[0]} if demand.against else set()) <= set(EXPERIMENTS)
+
+
+def test_the_table_has_a_line_a_round_and_a_cell_a_figure() -> None:
+    lines = table({"main": {2: of_rounds(a=entry(0.5)), 3: of_rounds(a=entry(0.7))}}, "main").splitlines()
+    assert len(lines) == 3
+    assert lines[2].startswith("| a | 0.600 ± 0.141 (0.500) |")
+    assert {line.count("|") for line in lines} == {len(FIGURES) + 2}
+
+
+def test_precision_and_recall_are_means_over_the_seeds_class_by_class() -> None:
+    text = class_table({"main": {2: of_rounds(a=entry(0.5)), 3: of_rounds(a=entry(1.0))}}, "main")
+    assert "| a | 0.7500 / 0.7500 | 0.750 / 0.750 | 0.750 / 0.750 |" in text
+
+
+@pytest.mark.slow
+def test_the_whole_machinery_on_a_corner_twice_and_without_the_drives(tmp_path: Path) -> None:
+    """Every kind of experiment runs, a second run repeats the numbers from the cache, and scans can be dropped."""
+    names = ["main", "liars", "imported", "noise", "2 Hz", "parked", "all true"]
+    matrix = Matrix("corner", (1,), tmp_path, Settings(), workers=1, parked=2)
+    results = {name: {seed: result} for name, seed, result in matrix.run_all(names)}
+    text = requirements.table(results)
+    asked = {demand.what for demand in DEMANDS if demand.experiment in names and demand.values(results)}
+    assert asked == {demand.what for demand in DEMANDS if demand.experiment in names}
+    assert all(what in text for what in asked)
+    main = results["main"][1]["rounds"]
+    assert main["columns"]["provenance"]["macro_f1"] > main["1 column"]["provenance"]["macro_f1"]
+    own, *_, taught = results["imported"][1]["rounds"].values()  # known-free columns learned as good as our own
+    assert taught["provenance"]["macro_f1"] >= own["provenance"]["macro_f1"] - 0.01
+    scene = matrix.scene(EXPERIMENTS["main"], 1)
+    matrix.drop_drives(names, 1)
+    assert not list(scene.folder.glob("*/velodyne"))
+    before = json.dumps(results["main"][1])
+    matrix.result_file("main", 1).unlink()
+    assert json.dumps(matrix.run("main", 1)) == before
+    assert not list(scene.folder.glob("*/velodyne"))  # the ballots were enough

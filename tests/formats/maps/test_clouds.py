@@ -1,0 +1,201 @@
+"""PCD, LAS, PLY and Autoware: what goes out comes back, what is broken is named."""
+
+from __future__ import annotations
+
+import logging
+import os
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from pypcd4 import PointCloud
+
+from mapvote.core.tile import all_points, map_from_points
+from mapvote.core.types import F64, MapvoteError
+from mapvote.formats import export_map, read_cloud, read_map, write_map, write_pcd
+from mapvote.formats.maps.autoware import read_autoware, write_autoware
+from mapvote.formats.maps.cloud import lattice_of
+from mapvote.formats.maps.las import read_las, write_las
+from mapvote.formats.maps.pcd import ENCODINGS
+from mapvote.formats.maps.ply import read_ply, write_ply
+
+UTM = np.array([367_123.0, 3_951_876.0, 40.0])
+
+
+def points(n: int = 500, seed: int = 0) -> F64:
+    return np.random.default_rng(seed).uniform([-60, -60, -2], [60, 60, 12], (n, 3))
+
+
+def by_row(p: NDArray[np.floating]) -> NDArray[np.floating]:
+    return p[np.lexsort(p.T)]
+
+
+@pytest.mark.parametrize("encoding", ENCODINGS)
+@pytest.mark.parametrize("double", [False, True])
+def test_pcd_round_trip_in_every_encoding(tmp_path: Path, encoding: str, double: bool) -> None:
+    before = points() if double else points().astype(np.float32)
+    write_pcd(tmp_path / "a.pcd", before, encoding=encoding, double=double)
+    after = read_cloud(tmp_path / "a.pcd").points
+    assert after.dtype == before.dtype
+    assert np.allclose(after, before, rtol=1e-6) if encoding == "ascii" else np.array_equal(after, before)
+
+
+everyone = st.tuples(st.integers(1, 50), st.integers(0, 2**31), st.floats(-4e6, 4e6))
+
+
+@settings(max_examples=20, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(everyone)
+def test_ply_and_las_keep_world_coordinates(tmp_path: Path, case: tuple[int, int, float]) -> None:
+    n, seed, far = case
+    before = points(n, seed) + np.array([far, -far, 0.0])
+    write_ply(tmp_path / "a.ply", before)
+    assert np.array_equal(read_ply(tmp_path / "a.ply").points, before)
+    for name in ("a.las", "a.laz"):
+        write_las(tmp_path / name, before)
+        assert np.abs(read_las(tmp_path / name).points - before).max() < 0.6e-4
+
+
+@settings(max_examples=20, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(everyone)
+def test_autoware_round_trip_is_exact_in_float32(tmp_path: Path, case: tuple[int, int, float]) -> None:
+    n, seed, far = case
+    before = points(n, seed) + np.array([far / 100, -far / 100, 0.0])
+    write_autoware(tmp_path / "a", before)
+    assert np.array_equal(by_row(read_autoware(tmp_path / "a").points), by_row(before.astype(np.float32)))
+
+
+def test_autoware_metadata_is_what_its_loader_reads(tmp_path: Path) -> None:
+    write_autoware(tmp_path / "a", np.array([[1205.0, 2501.0, 0.0], [-0.5, 3.0, 1.0]]))
+    metadata = yaml.safe_load((tmp_path / "a" / "pointcloud_map_metadata.yaml").read_text())
+    assert metadata == {
+        "x_resolution": 20.0,
+        "y_resolution": 20.0,
+        "-20_0.pcd": [-20, 0],
+        "1200_2500.pcd": [1200, 2500],
+    }
+    tile = PointCloud.from_path(tmp_path / "a" / "pointcloud_map.pcd" / "1200_2500.pcd")
+    assert tile.numpy(("x", "y", "z")).tolist() == [[1205.0, 2501.0, 0.0]]
+
+
+def test_autoware_tiles_that_lie_are_named(tmp_path: Path) -> None:
+    write_autoware(tmp_path / "a", points())
+    file = tmp_path / "a" / "pointcloud_map_metadata.yaml"
+    good = file.read_text()
+    file.write_text(good.replace("[-20, 0]", "[980, 0]"))
+    with pytest.raises(MapvoteError, match=r"-20_0\.pcd: .* outside its square"):
+        read_map(tmp_path / "a")
+    file.write_text(good + "7_7.pcd: [7, 7]\n")
+    with pytest.raises(MapvoteError, match=r"7_7\.pcd: missing"):
+        read_map(tmp_path / "a")
+    for text in ("tiles: 3\n", "[1, 2]\n", "x_resolution: 20\ny_resolution: 20\n", "a: [\n"):
+        file.write_text(text)
+        with pytest.raises(MapvoteError, match="metadata"):
+            read_map(tmp_path / "a")
+
+
+def test_float32_at_utm_coordinates_is_said_aloud(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level(logging.WARNING):
+        write_pcd(tmp_path / "near.pcd", points())
+    assert caplog.text == ""
+    with caplog.at_level(logging.WARNING):
+        write_pcd(tmp_path / "far.pcd", points() + UTM)
+    assert "rounded by up to 125.0 mm" in caplog.text
+
+
+@pytest.mark.parametrize("name", ["m.las", "m.laz", "m.ply"])
+def test_a_utm_map_survives_a_round_trip(tmp_path: Path, name: str) -> None:
+    cloud = points(3000) + UTM
+    before = map_from_points(cloud, lattice=lattice_of(cloud), georeference={"wkt": 'PROJCS["UTM 54N"]'})
+    export_map(before, tmp_path / name)
+    after = read_map(tmp_path / name)
+    assert after.lattice == before.lattice
+    assert np.abs(all_points(after) - all_points(before)).max() < 1e-4
+    write_map(after, tmp_path / "m")
+    assert np.array_equal(all_points(read_map(tmp_path / "m")), all_points(after))
+    if name != "m.ply":
+        assert after.georeference["wkt"] == 'PROJCS["UTM 54N"]'
+
+
+def test_the_same_file_is_the_same_map(tmp_path: Path) -> None:
+    write_pcd(tmp_path / "a.pcd", points())
+    assert read_map(tmp_path / "a.pcd").map_id == read_map(tmp_path / "a.pcd").map_id
+
+
+def test_import_knows_what_it_drops(tmp_path: Path) -> None:
+    rows = np.column_stack([points(), np.linspace(0, 255, 500)]).astype(np.float32)
+    PointCloud.from_xyzi_points(rows).save(tmp_path / "a.pcd")
+    assert read_cloud(tmp_path / "a.pcd").dropped == ("intensity",)
+
+
+def test_truncated_files_are_named(tmp_path: Path) -> None:
+    for name, write in (("a.ply", write_ply), ("a.las", write_las), ("a.laz", write_las), ("a.pcd", write_pcd)):
+        file = tmp_path / name
+        write(file, points())
+        for keep in (0.5, 0.01):
+            data = file.read_bytes()
+            file.write_bytes(data[: int(keep * len(data))])
+            with pytest.raises(MapvoteError, match=name):
+                read_map(file)
+
+
+def test_a_pcd_cut_between_points_is_noticed(tmp_path: Path) -> None:
+    write_pcd(tmp_path / "a.pcd", points())
+    data = (tmp_path / "a.pcd").read_bytes()
+    (tmp_path / "a.pcd").write_bytes(data[:-24])
+    with pytest.raises(MapvoteError, match="498 points, but its header says 500"):
+        read_map(tmp_path / "a.pcd")
+
+
+def test_nan_points_of_a_map_are_dropped_and_counted_or_refused(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    cloud = points()
+    cloud[:3] = np.nan
+    write_ply(tmp_path / "a.ply", cloud)
+    with caplog.at_level(logging.WARNING):
+        assert len(all_points(read_map(tmp_path / "a.ply"))) == 497
+    assert "dropped 3 of 500" in caplog.text
+    cloud[:100] = np.nan
+    write_ply(tmp_path / "a.ply", cloud)
+    with pytest.raises(MapvoteError, match="100 of 500 points are not finite"):
+        read_map(tmp_path / "a.ply")
+
+
+def test_an_empty_map_is_an_error(tmp_path: Path) -> None:
+    write_ply(tmp_path / "a.ply", np.zeros((0, 3)))
+    with pytest.raises(MapvoteError, match="holds no points"):
+        read_map(tmp_path / "a.ply")
+
+
+def test_a_file_without_z_is_named(tmp_path: Path) -> None:
+    PointCloud.from_points(points()[:, :2].astype(np.float32), ("x", "y"), (np.float32, np.float32)).save(
+        tmp_path / "a.pcd"
+    )
+    with pytest.raises(MapvoteError, match="no field z among x, y"):
+        read_map(tmp_path / "a.pcd")
+
+
+@pytest.mark.parametrize(("name", "package", "extra"), [("a.las", "laspy", "las"), ("a.ply", "trimesh", "ply")])
+def test_a_missing_package_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, package: str, extra: str
+) -> None:
+    (tmp_path / name).write_bytes(b"anything")
+    for module in [m for m in sys.modules if m.partition(".")[0] == package]:
+        monkeypatch.delitem(sys.modules, module)
+    monkeypatch.setitem(sys.modules, package, None)
+    with pytest.raises(MapvoteError, match=rf"needs the package {package}; .*mapvote\[{extra}\]"):
+        read_map(tmp_path / name)
+
+
+def test_nothing_is_left_behind_where_it_cannot_be_written(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(MapvoteError, match="cannot be written"):
+        write_pcd(tmp_path / "file" / "a.pcd", points())
+    with pytest.raises(MapvoteError, match=r"no format for \.xyz"):
+        export_map(map_from_points(points()), tmp_path / "a.xyz")
+    assert os.listdir(tmp_path) == ["file"]

@@ -1,0 +1,117 @@
+"""A mapvote map folder keeps a map bit for bit, appears whole, and notices damage."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from mapvote.codec.tile_file import decode_tile, encode_tile
+from mapvote.core.grid import TILE_CELLS, Lattice
+from mapvote.core.tile import all_points, map_from_points
+from mapvote.core.types import MapTile, MapvoteError, PointMap
+from mapvote.formats import read_map, write_map
+
+
+def small_map(seed: int = 0, offset: tuple[float, float] = (0.0, 0.0)) -> PointMap:
+    rng = np.random.default_rng(seed)
+    points = rng.uniform([-100, -50, -1], [100, 50, 8], (3000, 3)) + np.array([*offset, 0.0])
+    lattice = Lattice(round(offset[0] / 0.3) * 0.3, round(offset[1] / 0.3) * 0.3)
+    return map_from_points(points, lattice=lattice, georeference={"crs": "EPSG:32654", "note": "é"})
+
+
+def same(a: MapTile, b: MapTile) -> bool:
+    free = (a.free is None and b.free is None) or np.array_equal(a.free, b.free)  # type: ignore[arg-type]
+    return free and np.array_equal(a.points, b.points) and np.array_equal(a.ground_z, b.ground_z, equal_nan=True)
+
+
+def test_round_trip_is_exact_even_at_utm_coordinates(tmp_path: Path) -> None:
+    before = small_map(offset=(367_123.456, 3_951_876.543))
+    write_map(before, tmp_path / "m")
+    after = read_map(tmp_path / "m")
+    assert (after.map_id, after.lattice, after.georeference) == (before.map_id, before.lattice, before.georeference)
+    assert list(after.tiles) == sorted(before.tiles)
+    assert all(same(before.tiles[k], after.tiles[k]) for k in before.tiles)
+    assert np.array_equal(all_points(before), all_points(after))
+
+
+def test_the_same_map_gives_the_same_bytes(tmp_path: Path) -> None:
+    for name in "ab":
+        write_map(small_map(), tmp_path / name)
+    files = sorted(p.relative_to(tmp_path / "a") for p in (tmp_path / "a").rglob("*") if p.is_file())
+    assert len(files) > 3
+    assert all((tmp_path / "a" / f).read_bytes() == (tmp_path / "b" / f).read_bytes() for f in files)
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(0, 40), st.integers(0, 2**32 - 1), st.booleans())
+def test_tile_bytes_round_trip(n: int, seed: int, learned: bool) -> None:
+    rng = np.random.default_rng(seed)
+    points = (rng.random((n, 3)) * 76.7).astype(np.float32)
+    ground_z = np.where(rng.random((TILE_CELLS, TILE_CELLS)) < 0.1, np.nan, 1.5).astype(np.float32)
+    free = rng.integers(0, 2**63, (TILE_CELLS, TILE_CELLS), dtype=np.uint64) if learned else None
+    tile = MapTile(points, ground_z, free)
+    assert same(decode_tile(encode_tile(tile)), tile)
+    assert encode_tile(decode_tile(encode_tile(tile))) == encode_tile(tile)
+
+
+def test_an_older_map_is_replaced_but_nothing_else(tmp_path: Path) -> None:
+    write_map(small_map(1), tmp_path / "m")
+    write_map(small_map(2), tmp_path / "m")
+    assert read_map(tmp_path / "m").map_id == small_map(2).map_id
+    (tmp_path / "photos").mkdir()
+    (tmp_path / "photos" / "cat.jpg").write_text("cat")
+    with pytest.raises(MapvoteError, match="not replaced"):
+        write_map(small_map(), tmp_path / "photos")
+    assert sorted(os.listdir(tmp_path)) == ["m", "photos"]
+
+
+def test_a_failed_write_leaves_the_old_map_and_no_litter(tmp_path: Path) -> None:
+    write_map(small_map(1), tmp_path / "m")
+    broken = PointMap("x", Lattice(), {(0, 0): MapTile(None, None)})  # type: ignore[arg-type]
+    with pytest.raises((AttributeError, TypeError)):
+        write_map(broken, tmp_path / "m")
+    assert os.listdir(tmp_path) == ["m"]
+    assert read_map(tmp_path / "m").map_id == small_map(1).map_id
+
+
+def test_one_flipped_bit_is_noticed(tmp_path: Path) -> None:
+    write_map(small_map(), tmp_path / "m")
+    tile = sorted((tmp_path / "m" / "tiles").iterdir())[0]
+    data = bytearray(tile.read_bytes())
+    data[len(data) // 2] ^= 1
+    tile.write_bytes(data)
+    with pytest.raises(MapvoteError, match=f"{tile.name}: its bytes are not those of the manifest"):
+        read_map(tmp_path / "m")
+
+
+def test_a_missing_tile_is_noticed(tmp_path: Path) -> None:
+    write_map(small_map(), tmp_path / "m")
+    tile = sorted((tmp_path / "m" / "tiles").iterdir())[0]
+    tile.unlink()
+    with pytest.raises(MapvoteError, match=f"{tile.name}: No such file"):
+        read_map(tmp_path / "m")
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "message"),
+    [("format_version", 99, "update mapvote"), ("cell_size", 0.2, r"cells of 0\.2 m"), ("x0", "a", "not a readable")],
+)
+def test_a_manifest_of_another_kind_is_refused(tmp_path: Path, key: str, value: object, message: str) -> None:
+    write_map(small_map(), tmp_path / "m")
+    file = tmp_path / "m" / "manifest.json"
+    manifest = json.loads(file.read_text())
+    manifest[key] = value
+    file.write_text(json.dumps(manifest))
+    with pytest.raises(MapvoteError, match=message):
+        read_map(tmp_path / "m")
+
+
+def test_nothing_there() -> None:
+    with pytest.raises(MapvoteError, match="nothing is there"):
+        read_map("/nowhere/at/all")

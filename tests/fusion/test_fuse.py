@@ -1,0 +1,389 @@
+"""The server's half of the paper (IV), and DESIGN 4's rules on votes, points and order."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from hand_made import SHAPE, make_tile, states_plane, wall, words_plane
+from mapvote.config import FuseSettings
+from mapvote.core.grid import Lattice, tile_grid
+from mapvote.core.types import NO_VOTE, U8, CellState, MapTile
+from mapvote.core.voting import VOTE_UNIT
+from mapvote.fusion.fuse import Rule, count, fuse_tile, states_over
+from mapvote.fusion.sparse_columns import Words
+from mapvote.fusion.tile_vote import DAY_NS, TileVote, fold, restrict, select
+
+LATTICE = Lattice()
+GRID = tile_grid(LATTICE, (0, 0))
+CELL = (10, 10)
+KEEP, SURE = FuseSettings(min_votes=1), FuseSettings(min_votes=2)
+EMPTY, OCCUPIED = CellState.CHANGED_EMPTY, CellState.CHANGED_OCCUPIED
+
+
+def vote(vehicle: str, states: U8, **more: object) -> TileVote:
+    return TileVote(vehicle, 0, vehicle, states=states, **more)  # type: ignore[arg-type]
+
+
+def marks(word: int) -> Words:
+    return Words.of(words_plane({CELL: word}))
+
+
+def fuse(
+    tile: MapTile | None, votes: list[TileVote], policy: FuseSettings = KEEP, rule: Rule = "columns"
+) -> tuple[U8, MapTile | None]:
+    decision, edited = fuse_tile(LATTICE, (0, 0), tile, votes, rule, policy)
+    return decision.states, edited
+
+
+def test_server_row_of_table_1() -> None:
+    """Vehicles 1 and 2 say changed-occupied, 3 says undetermined: changed-occupied (paper IV, Table I)."""
+    says = [OCCUPIED, OCCUPIED, CellState.UNDETERMINED]
+    votes = [vote(f"v{i}", states_plane({CELL: s})) for i, s in enumerate(says)]
+    assert count(votes, "paper", 1)[0][CELL] == OCCUPIED
+
+
+@pytest.mark.parametrize(
+    ("says", "paper", "columns"),
+    [
+        ([OCCUPIED, EMPTY], CellState.UNDETERMINED, CellState.UNDETERMINED),
+        ([EMPTY, CellState.UNDETERMINED], CellState.UNDETERMINED, EMPTY),
+        ([EMPTY, EMPTY, CellState.UNDETERMINED, CellState.UNDETERMINED, CellState.UNDETERMINED], 4, EMPTY),
+        ([EMPTY, EMPTY, CellState.UNCHANGED_OCCUPIED, CellState.UNCHANGED_EMPTY], EMPTY, CellState.UNDETERMINED),
+    ],
+)
+def test_undetermined_competes_in_the_paper_and_abstains_in_columns(says: list[int], paper: int, columns: int) -> None:
+    votes = [vote(f"v{i}", states_plane({CELL: s})) for i, s in enumerate(says)]
+    assert count(votes, "paper", 1)[0][CELL] == paper
+    assert count(votes, "columns", 1)[0][CELL] == columns
+
+
+def test_tie_keeps_the_points_of_the_map() -> None:
+    tile = make_tile(wall([CELL], [0.45, 0.75]))
+    votes = [vote("a", states_plane({CELL: EMPTY})), vote("b", states_plane({CELL: CellState.UNCHANGED_OCCUPIED}))]
+    assert fuse(tile, votes, rule="paper")[1] is tile
+
+
+def test_ground_is_never_deleted_and_everything_else_is_bit_identical() -> None:
+    ground, gone, other = wall([CELL], [0.05]), wall([CELL], [0.45, 5.0, 30.0]), wall([(20, 20)], [1.0])
+    tile = make_tile(np.concatenate([gone, ground, other]))
+    states, edited = fuse(tile, [vote("a", states_plane({CELL: EMPTY}))])
+    assert states[CELL] == EMPTY
+    assert edited is not None
+    assert edited.points.tobytes() == np.concatenate([ground, other]).tobytes()
+    assert edited.ground_z is tile.ground_z
+
+
+def test_delete_mask_takes_the_awning_and_leaves_the_wall() -> None:
+    tile = make_tile(wall([CELL], [0.45, 1.05, 3.15]))
+    awning = marks(1 << 10)
+    _, edited = fuse(tile, [vote("a", states_plane({CELL: EMPTY}), gone=awning)])
+    assert edited is not None
+    assert edited.points[:, 2].tolist() == pytest.approx([0.45, 1.05])
+
+
+def test_only_voxels_marked_by_enough_vehicles_are_deleted() -> None:
+    tile = make_tile(wall([CELL], [0.45, 0.75, 1.05]))
+    masks = [1 << 1 | 1 << 2, 1 << 2 | 1 << 3, 1 << 2]
+    votes = [
+        vote(f"v{i}", states_plane({CELL: EMPTY}), gone=Words.of(words_plane({CELL: m}))) for i, m in enumerate(masks)
+    ]
+    _, edited = fuse(tile, votes, SURE)
+    assert edited is not None
+    assert edited.points[:, 2].tolist() == pytest.approx([0.45, 1.05])
+
+
+KEPT = CellState.UNCHANGED_OCCUPIED
+
+
+def standing(masks: list[int], state: int = KEPT) -> list[TileVote]:
+    return [vote(f"v{i}", states_plane({CELL: state}), gone=marks(mask)) for i, mask in enumerate(masks)]
+
+
+@pytest.mark.parametrize(
+    ("masks", "left"),
+    [
+        ([0b0110, 0b0110, 0b0000], [1.05]),
+        ([0b0110, 0b0000, 0b0000], [0.45, 0.75, 1.05]),
+        ([0b0110, 0b0100, 0b0000], [0.45, 1.05]),
+        ([0b0110, 0b0110, 0, 0], [0.45, 0.75, 1.05]),
+    ],
+)
+def test_remnants_go_from_a_cell_that_stands_if_most_vehicles_mark_them(masks: list[int], left: list[float]) -> None:
+    tile = make_tile(wall([CELL], [0.45, 0.75, 1.05]))
+    states, edited = fuse(tile, standing(masks), SURE)
+    assert states[CELL] == KEPT
+    assert edited is not None
+    assert edited.points[:, 2].tolist() == pytest.approx(left)
+    assert (edited is tile) == (len(left) == 3)
+
+
+def test_marks_count_only_of_those_who_say_that_the_cell_stands_and_only_if_it_does() -> None:
+    tile = make_tile(wall([CELL], [0.45]))
+    for other in (CellState.UNDETERMINED, CellState.UNCHANGED_EMPTY, NO_VOTE):
+        votes = [*standing([0b10, 0, 0]), vote("z", states_plane({CELL: other}), gone=marks(0b10))]
+        assert fuse(tile, votes, SURE)[1] is tile
+    assert fuse(tile, standing([0b10] * 3, CellState.UNDETERMINED), SURE)[1] is tile
+    whole = [vote(v, states_plane({CELL: KEPT})) for v in "abc"]
+    assert fuse(tile, whole, SURE)[1] is tile, "no mask marks nothing in a cell that stands"
+
+
+def test_a_drive_s_remnants_are_its_vehicle_s() -> None:
+    early, late = standing([0b10, 0b100])
+    late = TileVote("v0", 5, "late", states=late.states, gone=late.gone)
+    folded = fold([late, early], GRID).gone
+    assert folded is not None
+    assert folded.words.tolist() == [0b100], "of the drive that speaks for the cell"
+
+
+def test_heights_are_relative_to_the_ground_of_the_cell() -> None:
+    tile = make_tile(wall([CELL], [100.1, 100.65]), ground=100.0)
+    _, edited = fuse(tile, [vote("a", states_plane({CELL: EMPTY}), gone=marks(1 << 2))])
+    assert edited is not None
+    assert edited.points[:, 2].tolist() == pytest.approx([100.1])
+
+
+def test_min_votes_holds_back_a_change_that_too_few_saw() -> None:
+    tile = make_tile(wall([CELL], [0.45]))
+    states, edited = fuse(tile, [vote("a", states_plane({CELL: EMPTY}))], SURE)
+    assert states[CELL] == CellState.UNDETERMINED
+    assert edited is tile
+
+
+def test_right_state_with_false_points_injects_nothing() -> None:
+    """Two honest vehicles see a wall up to 1 m; a liar votes the same state and adds a tower and another place."""
+    honest = wall([CELL], [0.45, 0.75])
+    lies = np.concatenate([wall([CELL], [5.0, 9.0]), wall([(99, 99)], [1.0])])
+    votes = [vote(f"v{i}", states_plane({CELL: OCCUPIED}), new_points=p) for i, p in enumerate([honest, honest, lies])]
+    _, edited = fuse(None, votes, SURE)
+    assert edited is not None
+    assert edited.points[:, 2].tolist() == pytest.approx([0.45, 0.75])
+
+
+def test_new_points_need_support_within_one_voxel_of_the_column() -> None:
+    says = [wall([CELL], [0.45, 3.15]), wall([CELL], [0.75, 4.05])]
+    votes = [vote(f"v{i}", states_plane({CELL: OCCUPIED}), new_points=p) for i, p in enumerate(says)]
+    _, edited = fuse(None, votes, SURE)
+    assert edited is not None
+    assert edited.points[:, 2].tolist() == pytest.approx([0.45, 0.75])
+
+
+def test_a_vehicle_that_voted_otherwise_adds_no_points() -> None:
+    votes = [
+        vote("a", states_plane({CELL: OCCUPIED}), new_points=wall([CELL], [0.45])),
+        vote("b", states_plane({CELL: CellState.UNDETERMINED}), new_points=wall([CELL], [0.45, 6.0])),
+    ]
+    _, edited = fuse(None, votes)
+    assert edited is not None
+    assert len(edited.points) == 1
+
+
+def test_a_voxel_of_the_map_stays_as_it_is() -> None:
+    tile = make_tile(wall([CELL], [0.05]))
+    offered = wall([CELL], [0.1, 0.45]) + np.float32(0.01)
+    _, edited = fuse(tile, [vote("a", states_plane({CELL: OCCUPIED}), new_points=offered)])
+    assert edited is not None
+    assert len(edited.points) == 2
+    assert edited.points[:1].tobytes() == tile.points.tobytes()
+
+
+def test_one_stage_is_the_sum_of_the_tallies() -> None:
+    """Paper IV: the server aggregates the vote counts; one loud vehicle outvotes two quiet ones."""
+    loud, quiet = np.zeros((*SHAPE, 5), np.uint16), np.zeros((*SHAPE, 5), np.uint16)
+    loud[CELL] = [0, 0, 100 * VOTE_UNIT, 0, 0]
+    quiet[CELL] = [30 * VOTE_UNIT, 0, 0, 0, 5 * VOTE_UNIT]
+    votes = [TileVote(f"v{i}", 0, str(i), tally=t) for i, t in enumerate([loud, quiet, quiet])]
+    states, tally = count(votes, "paper", 1)
+    assert states[CELL] == OCCUPIED
+    assert tally[CELL].tolist() == [60 * VOTE_UNIT, 0, 100 * VOTE_UNIT, 0, 10 * VOTE_UNIT]
+    assert count(votes, "paper", 2)[0][CELL] == CellState.UNDETERMINED
+
+
+def test_free_space_is_learned_by_enough_vehicles_and_not_where_the_map_has_points() -> None:
+    tile = make_tile(wall([CELL], [0.75]))
+    free = words_plane({CELL: 0b1111, (50, 50): 0b1111})
+    votes = [vote(v, states_plane(fill=1), free=Words.of(free)) for v in ("a", "b")]
+    _, edited = fuse(tile, votes, SURE)
+    _, alone = fuse(tile, votes[:1], SURE)
+    assert edited is not None
+    assert edited.free is not None
+    assert edited.points is tile.points
+    assert int(edited.free[CELL]) == 0b1011
+    assert int(edited.free[50, 50]) == 0b1111
+    assert alone is tile, "one vehicle teaches nothing, and a map that never learned must not look like one that did"
+
+
+def test_a_drive_that_is_silent_never_overrides_and_the_later_one_wins() -> None:
+    early = TileVote("a", 1, "x", states=states_plane({(0, 0): EMPTY, (0, 1): EMPTY}))
+    late = TileVote("a", 2, "y", states=states_plane({(0, 1): CellState.UNCHANGED_OCCUPIED}))
+    folded = fold([late, early], GRID).states
+    assert folded is not None
+    assert folded[0, 0] == EMPTY
+    assert folded[0, 1] == CellState.UNCHANGED_OCCUPIED
+
+
+def test_ten_drives_of_one_vehicle_are_one_vote() -> None:
+    drives = [TileVote("a", i, str(i), states=states_plane({CELL: EMPTY})) for i in range(10)]
+    other = vote("b", states_plane({CELL: CellState.UNCHANGED_OCCUPIED}))
+    assert fuse(make_tile(wall([CELL], [0.45])), [*drives, other])[0][CELL] == CellState.UNDETERMINED
+
+
+def test_planes_follow_the_drive_that_speaks_for_the_cell() -> None:
+    """An old drive's new points give way when a later drive of the same vehicle speaks for the cell."""
+    early = TileVote("a", 1, "x", states=states_plane({CELL: OCCUPIED}), new_points=wall([CELL], [0.45]))
+    late = TileVote("a", 2, "y", states=states_plane({CELL: OCCUPIED}), new_points=wall([CELL], [2.0]))
+    folded = fold([early, late], GRID)
+    assert folded.new_points is not None
+    assert folded.new_points[:, 2].tolist() == pytest.approx([2.0])
+
+
+def test_window_in_vehicles_and_days() -> None:
+    votes = [TileVote(f"v{i}", i * DAY_NS, "x", states=states_plane()) for i in range(10)]
+    votes.append(TileVote("old", -40 * DAY_NS, "x", states=states_plane()))
+    chosen = select(votes, FuseSettings(latest_vehicles=3, max_age_days=30))
+    assert [v.vehicle for v in chosen] == ["v7", "v8", "v9"]
+    assert "old" not in {v.vehicle for v in select(votes, FuseSettings(latest_vehicles=99, max_age_days=30))}
+
+
+def test_silenced_cells_count_for_nothing() -> None:
+    states, free = states_plane({CELL: EMPTY, (1, 1): EMPTY}), words_plane({CELL: 7, (1, 1): 7})
+    counts = np.ones(SHAPE, dtype=np.bool_)
+    counts[CELL] = False
+    silenced = restrict(vote("a", states, free=Words.of(free)), counts)
+    assert silenced.states is not None
+    assert silenced.free is not None
+    assert silenced.states[CELL] == NO_VOTE
+    assert silenced.free.cells.tolist() == [1 * 256 + 1]
+    assert silenced.states[1, 1] == EMPTY
+
+
+def plain_rule(votes: list[int], rule: Rule, min_votes: int) -> int:
+    """The state of one cell, in the plainest words (paper IV, DESIGN 4): what the kernels must agree with."""
+    tally = [votes.count(state) for state in range(5)]
+    contenders = tally[:4] if rule == "columns" else tally
+    best = max(contenders)
+    if best == 0:
+        return CellState.UNDETERMINED if tally[4] else NO_VOTE
+    if contenders.count(best) > 1:
+        return CellState.UNDETERMINED
+    state = contenders.index(best)
+    if state in (OCCUPIED, EMPTY):
+        no_majority = rule == "columns" and 2 * best <= sum(contenders)
+        if no_majority or best < min_votes:
+            return CellState.UNDETERMINED
+    return state
+
+
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    voters=st.sampled_from([1, 2, 3, 5, 9, 40]),
+    rule=st.sampled_from(["paper", "columns"]),
+    min_votes=st.integers(1, 4),
+)
+@settings(max_examples=40, deadline=None)
+def test_the_kernels_decide_as_the_plain_rule_does(seed: int, voters: int, rule: Rule, min_votes: int) -> None:
+    rng = np.random.default_rng(seed)
+    says = rng.choice(np.array([0, 1, 2, 3, 4, 255], np.uint8), size=(voters, 256), p=rng.dirichlet(np.ones(6)))
+    planes = [np.concatenate([row, np.full(256 * 255, NO_VOTE, np.uint8)]).reshape(SHAPE) for row in says]
+    states, tally = count([vote(f"v{i}", plane) for i, plane in enumerate(planes)], rule, min_votes)
+    assert tally.dtype == np.uint16
+    for column in range(256):
+        cell = says[:, column].tolist()
+        assert states[0, column] == plain_rule(cell, rule, min_votes)
+        assert tally[0, column].tolist() == [VOTE_UNIT * cell.count(state) for state in range(5)]
+    assert (states[1:] == NO_VOTE).all()
+
+
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    voters=st.integers(1, 6),
+    rule=st.sampled_from(["paper", "columns"]),
+    min_votes=st.integers(1, 3),
+)
+@settings(max_examples=25, deadline=None)
+def test_one_stage_decides_the_sum_and_asks_for_vehicles_that_back_it(
+    seed: int, voters: int, rule: Rule, min_votes: int
+) -> None:
+    """A vehicle backs what its own tally alone would decide. min_votes = 1 is the paper's plain sum."""
+    rng = np.random.default_rng(seed)
+    tallies = np.zeros((voters, *SHAPE, 5), np.uint16)
+    tallies[:, 0] = rng.integers(0, 4, (voters, 256, 5)) * rng.integers(0, 2, (voters, 256, 5))
+    states, total = count([TileVote(str(i), 0, "", tally=t) for i, t in enumerate(tallies)], rule, min_votes)
+    for column in range(256):
+        each = [[state for state in range(5) for _ in range(t[0, column, state])] for t in tallies]
+        expected = plain_rule([state for mine in each for state in mine], rule, 1)
+        backing = [plain_rule(mine, rule, 1) for mine in each].count(expected)
+        if min_votes > 1 and expected in (OCCUPIED, EMPTY) and backing < min_votes:
+            expected = CellState.UNDETERMINED
+        assert states[0, column] == expected
+        assert total[0, column].tolist() == tallies[:, 0, column].sum(axis=0).tolist()
+
+
+def test_one_loud_liar_takes_no_wall_down_because_others_once_looked_through_it() -> None:
+    """Honest tallies hold a stray changed-empty scan; that is no vehicle standing behind the change."""
+    liar, honest = np.zeros((*SHAPE, 5), np.uint16), np.zeros((*SHAPE, 5), np.uint16)
+    liar[CELL] = [0, 0, 0, 4000 * VOTE_UNIT, 0]
+    honest[CELL] = [30 * VOTE_UNIT, 0, 0, VOTE_UNIT, 0]
+    votes = [TileVote(f"v{i}", 0, str(i), tally=t) for i, t in enumerate([liar, honest, honest, honest])]
+    tile = make_tile(wall([CELL], [0.45]))
+    assert fuse(tile, votes, SURE, "paper")[1] is tile
+    second = TileVote("w", 0, "w", tally=liar)
+    assert fuse(tile, [*votes, second], SURE, "paper")[0][CELL] == EMPTY
+
+
+def test_more_votes_than_sixteen_bits_hold_are_counted() -> None:
+    """4,096 vehicles times VOTE_UNIT is 65,536: one more than uint16 can say."""
+    plane = states_plane({CELL: EMPTY})
+    states, tally = count([vote(str(i), plane) for i in range(4096)], "columns", 4096)
+    assert states[CELL] == EMPTY
+    assert tally[CELL].tolist() == [0, 0, 0, 4096 * VOTE_UNIT, 0]
+
+
+def random_drive(rng: np.random.Generator, vehicle: str, end_ns: int) -> TileVote:
+    states = states_plane()
+    states[:6, :6] = rng.choice(np.array([0, 1, 2, 3, 4, 255], np.uint8), size=(6, 6))
+    cells = [(r, c) for r, c in itertools.product(range(6), range(6)) if states[r, c] == OCCUPIED]
+    points = wall(cells, [0.45, 0.75]) + rng.uniform(0, 0.1, size=(2 * len(cells), 3)).astype(np.float32)
+    free, gone = words_plane({}), words_plane({})
+    free[:6, :6], gone[:6, :6] = rng.integers(0, 64, size=(6, 6)), rng.integers(0, 16, size=(6, 6))
+    return TileVote(
+        vehicle,
+        end_ns,
+        str(rng.integers(1 << 40)),
+        states=states,
+        gone=Words.of(gone),
+        new_points=points,
+        free=Words.of(free),
+    )
+
+
+@given(seed=st.integers(0, 2**32 - 1), rule=st.sampled_from(["paper", "columns"]), min_votes=st.integers(1, 3))
+@settings(max_examples=25, deadline=None)
+def test_order_never_matters(seed: int, rule: Rule, min_votes: int) -> None:
+    """Any order of the same drives, from vehicles with one or several drives, gives bit-identical tiles."""
+    rng = np.random.default_rng(seed)
+    drives = [random_drive(rng, f"v{rng.integers(5)}", int(rng.integers(3))) for _ in range(8)]
+    tile = make_tile(wall(list(itertools.product(range(6), range(6))), [0.05, 0.45, 1.05]))
+    results = set()
+    for _ in range(3):
+        order = [drives[i] for i in rng.permutation(len(drives))]
+        states, edited = fuse(tile, order, FuseSettings(min_votes=min_votes), rule)
+        assert edited is not None
+        free = b"never learned" if edited.free is None else edited.free.tobytes()
+        results.add((states.tobytes(), edited.points.tobytes(), free))
+    assert len(results) == 1
+
+
+def test_states_over_a_window_of_tiles() -> None:
+    decision, _ = fuse_tile(LATTICE, (2, 3), None, [vote("a", states_plane({CELL: EMPTY}))], "columns", KEEP)
+    far, _ = fuse_tile(LATTICE, (3, 5), None, [vote("a", states_plane({CELL: OCCUPIED}))], "columns", KEEP)
+    states, grid = states_over(LATTICE, {(2, 3): decision, (3, 5): far})
+    assert states.shape == (512, 768)
+    assert (grid.x0, grid.y0) == pytest.approx((3 * 76.8, 2 * 76.8))
+    assert states[10, 10] == EMPTY
+    assert states[266, 522] == OCCUPIED
+    assert (states == NO_VOTE).sum() == states.size - 2

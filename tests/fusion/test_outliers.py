@@ -1,0 +1,122 @@
+"""Who is not heard: a vehicle that says the opposite of the others nearly everywhere."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from hand_made import SHAPE
+from mapvote.config import FuseSettings
+from mapvote.core.grid import Lattice
+from mapvote.core.types import NO_VOTE, U8, CellState
+from mapvote.fusion.fuse import count, fuse_tile, hear
+from mapvote.fusion.tile_vote import TileVote
+
+UO, UE, CO, CE, UN = CellState
+OPPOSITE = np.array([CE, CO, UE, UO, UN], dtype=np.uint8)
+
+
+def honest(seed: int, errors: float = 0.03) -> U8:
+    """A street of walls and road as one vehicle sees it: a tenth not determined, some per cent wrong."""
+    street = np.where(np.arange(SHAPE[1]) % 16 == 0, UO, UE).astype(np.uint8)
+    states = np.broadcast_to(street, SHAPE).copy()
+    chance = np.random.default_rng(seed).uniform(size=SHAPE)
+    states[chance < 0.1] = UN
+    wrong = chance > 1.0 - errors
+    states[wrong] = OPPOSITE[states[wrong]]
+    return states
+
+
+def named(planes: list[U8]) -> list[TileVote]:
+    return [TileVote(f"v{i}", 0, f"v{i}", states=states) for i, states in enumerate(planes)]
+
+
+def silenced(votes: list[TileVote], **policy: float) -> set[str]:
+    heard = hear(votes, "columns", FuseSettings(**policy))[0]  # type: ignore[arg-type]
+    return {vote.vehicle for vote in votes} - {vote.vehicle for vote in heard}
+
+
+@pytest.mark.parametrize("k", [1, 2, 3])
+def test_k_that_invert_everything_are_not_heard_among_k_plus_1_that_do_not(k: int) -> None:
+    planes = [honest(i) for i in range(k + 1)] + [OPPOSITE[honest(99)]] * k
+    assert silenced(named(planes)) == {f"v{i}" for i in range(k + 1, 2 * k + 1)}
+    assert silenced(named(planes), max_contradiction=1.0) == set()
+
+
+def test_a_liar_cannot_second_the_error_of_one_honest_vehicle() -> None:
+    planes = [honest(i) for i in range(2)] + [OPPOSITE[honest(2)]]
+    lattice, policy = Lattice(), FuseSettings(min_votes=2)
+    decided = fuse_tile(lattice, (0, 0), None, named(planes), "columns", policy)[0].states
+    without = fuse_tile(lattice, (0, 0), None, named(planes[:2]), "columns", policy)[0].states
+    assert np.array_equal(decided, without)
+
+
+def test_a_vehicle_that_saw_a_block_come_down_is_heard() -> None:
+    news = honest(3)
+    news[:80, ::16] = CE  # a third of all walls are gone
+    assert silenced(named([honest(1), honest(2), news])) == set()
+
+
+def test_vehicles_that_disagree_with_each_other_silence_nobody() -> None:
+    rng = np.random.default_rng(5)
+    assert silenced(named([rng.integers(0, 5, SHAPE, dtype=np.uint8) for _ in range(5)])) == set()
+
+
+def test_two_vehicles_alone_are_both_heard() -> None:
+    assert silenced(named([honest(1), OPPOSITE[honest(2)]])) == set()
+
+
+def test_a_few_cells_say_nothing_about_a_vehicle() -> None:
+    def only(states: U8) -> U8:
+        few = np.full(SHAPE, NO_VOTE, dtype=np.uint8)
+        few[:20, :20] = states[:20, :20]
+        return few
+
+    planes = [honest(1), honest(2), only(OPPOSITE[honest(3)])]
+    assert silenced(named(planes)) == set()
+
+
+@settings(max_examples=10, deadline=None)
+@given(st.permutations(range(5)))
+def test_the_order_of_ballots_does_not_decide_who_is_heard(order: list[int]) -> None:
+    votes = named([honest(1), honest(2), OPPOSITE[honest(3)], honest(4, errors=0.3), OPPOSITE[honest(5)]])
+    assert silenced([votes[i] for i in order]) == silenced(votes)
+
+
+def news_of(states: U8) -> U8:
+    """The same street after a block of walls came down."""
+    states = states.copy()
+    walls = states[:80, ::16]
+    walls[walls == UO] = CE
+    return states
+
+
+@pytest.mark.parametrize("k", [1, 2, 3])
+def test_who_denies_every_change_is_not_heard_and_the_quorum_is_what_it_would_be_without(k: int) -> None:
+    planes = [news_of(honest(i, 0.01)) for i in range(k + 1)] + [honest(50 + i, 0.01) for i in range(k)]
+    votes, policy = named(planes), FuseSettings(min_votes=k + 1)
+    heard, states, _, quorum = hear(votes, "columns", policy)
+    assert [vote.vehicle for vote in heard] == [f"v{i}" for i in range(k + 1)]
+    assert quorum == 2, "one less for each, but nobody is believed alone"
+    assert np.array_equal(states, count(votes[: k + 1], "columns", 2)[0])
+    assert len(hear(votes, "columns", policy.model_copy(update={"max_denial": 1.0}))[0]) == 2 * k + 1
+
+
+def test_who_missed_half_of_the_changes_is_heard() -> None:
+    half = honest(3)
+    half[:40] = news_of(half)[:40]
+    votes = named([news_of(honest(1)), news_of(honest(2)), half])
+    assert len(hear(votes, "columns", FuseSettings(min_votes=2))[0]) == 3
+
+
+def test_three_liars_silence_no_honest_vehicle_where_few_others_look() -> None:
+    """In half of the tile three who lie are the majority of those who determined anything."""
+    planes = [honest(i) for i in range(4)]
+    for plane in planes[1:]:
+        plane[:, 64:] = NO_VOTE
+    lies = [np.where(honest(9) == UO, CE, CO).astype(np.uint8)] * 3
+    heard, _, _, quorum = hear(named([*planes, *lies]), "columns", FuseSettings(min_votes=4))
+    assert {f"v{i}" for i in range(4)} <= {vote.vehicle for vote in heard}
+    assert quorum == max(2, 4 - (7 - len(heard)))

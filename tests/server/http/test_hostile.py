@@ -1,0 +1,222 @@
+"""A hostile network at a real server: no 500, no state change, the right status."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+import subprocess
+import sys
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import httpx2
+import msgspec
+import pytest
+import sqlalchemy as sa
+
+from hand_made import SETTINGS, Say, make_ballot, states_plane, two_walls, wall, words_plane
+from live_server import serving
+from mapvote.codec.ballot import MAX_TILE_INDEX, encode
+from mapvote.core.types import CellState
+from mapvote.server.store import keys, schema
+from mapvote.server.store.store import Store
+from mutants import bomb, mutants
+
+CONFIG = f"""
+[server]
+ballots_per_minute = 1e9
+burst = 1000000
+max_body_bytes = 300000
+settings_hash = "{SETTINGS}"
+"""
+
+
+class Site:
+    """A running server, a vehicle's key, and a view of the store behind it."""
+
+    def __init__(self, url: str, vehicle: str, operator: str, store: Store) -> None:
+        self.url, self.operator, self.store = url, operator, store
+        self.http = httpx2.Client(base_url=url, headers={"Authorization": f"Bearer {vehicle}"}, timeout=60.0)
+
+    def put(self, data: bytes, path: str = "/v1/ballots/v1/d1", **headers: str) -> httpx2.Response:
+        return self.http.request("PUT", path, content=data, headers=headers)
+
+    def state(self) -> str:
+        """A digest of every row that a ballot could touch."""
+        digest = hashlib.sha256()
+        with self.store.database.reading() as connection:
+            for table in (schema.maps, schema.ballots, schema.ballot_tiles, schema.versions, schema.events):
+                for row in connection.execute(sa.select(table)):
+                    digest.update(repr(tuple(row)).encode())
+        return digest.hexdigest()
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Site]:
+    home = tmp_path_factory.mktemp("hostile")
+    (home / "server.toml").write_text(CONFIG)
+    store = Store.create(f"sqlite:///{home / 'store.db'}", two_walls())
+    vehicle, operator = keys.issue(store, "v1", "vehicle"), keys.issue(store, "boss", "operator")
+    with serving(home / "store.db", "--config", home / "server.toml", log=home / "log") as (url, _):
+        found = Site(url, vehicle, operator, store)
+        yield found
+        found.http.close()
+    store.close()
+    assert "Traceback" not in (home / "log").read_text()
+
+
+def honest() -> bytes:
+    states = states_plane({(10, 10): CellState.CHANGED_EMPTY, (3, 3): CellState.CHANGED_OCCUPIED})
+    say = Say(states=states, gone=words_plane({(10, 10): 7}), new_points=wall([(3, 3)], [0.5]), free=words_plane({}))
+    return encode(make_ballot(two_walls(), {(0, 0): say, (0, 1): Say(states=states_plane())}))
+
+
+def changed(**fields: Any) -> bytes:
+    """The honest ballot with some fields replaced; ``tile_...`` in its first tile."""
+    ballot = msgspec.msgpack.decode(honest())
+    for name, value in fields.items():
+        if name.startswith("tile_"):
+            ballot["tiles"][0][name.removeprefix("tile_")] = value
+        else:
+            ballot[name] = value
+    return msgspec.msgpack.encode(ballot)
+
+
+def storm(site: Site, n: int, seed: int) -> Counter[int]:
+    """Send ``n`` mutants; what they were answered. A refusal must leave no trace, and say something."""
+    answers: Counter[int] = Counter()
+    before = site.state()
+    for data in mutants(honest(), n, seed):
+        answer = site.put(data)
+        answers[answer.status_code] += 1
+        assert answer.status_code in (200, 201, 403, 409, 413, 422), (answer.status_code, answer.text, data[:200])
+        if answer.status_code >= 400:
+            assert answer.json()["detail"]
+            assert len(answer.content) < 2000
+            after = site.state()
+            assert after == before, f"a refused ballot changed the store: {answer.text}"
+        else:
+            before = site.state()
+    return answers
+
+
+def test_500_mutated_ballots(site: Site) -> None:
+    answers = storm(site, 500, seed=1)
+    assert answers[422] > 250, answers
+    assert site.put(honest()).status_code in (200, 201)
+
+
+@pytest.mark.slow
+def test_10_000_mutated_ballots(site: Site) -> None:
+    answers = storm(site, 10_000, seed=2)
+    assert answers[422] > 5000, answers
+
+
+@pytest.mark.parametrize(
+    ("data", "status", "says"),
+    [
+        (b"", 422, "not readable"),
+        (b"\x00" * 1000, 422, "not readable"),
+        (bytes(400_000), 413, "300000"),
+        (changed(tile_new_points=bomb(1 << 30)), 422, "larger than"),
+        (changed(tile_tile=[MAX_TILE_INDEX + 1, 0]), 422, "outside any map"),
+        (changed(map_id="another map"), 409, "another map"),
+        (changed(vehicle="v2"), 422, "v2/d1"),
+        (changed(end_ns=(1 << 64) - 1), 422, "future"),
+        (changed(start_ns=-(1 << 63)), None, ""),
+        (changed(settings_hash="a\x00b"), 422, "not readable"),
+        (changed(settings_hash="0" * 64), 409, "fleet's configuration"),
+        (changed(method="evidence"), 422, "evidence"),
+        (changed(base={"0,0": "f" * 64, "0,1": "f" * 64}), 409, "fetch"),
+        (changed(base={}), 422, "base hash"),
+        (changed(tiles=[]), 422, "no tile"),
+        (changed(format_version=99), 422, "format 99"),
+    ],
+)
+def test_each_absurdity_gets_its_status(site: Site, data: bytes, status: int | None, says: str) -> None:
+    answer = site.put(data)
+    if status is None:
+        assert answer.status_code in (200, 201)
+        return
+    assert answer.status_code == status, answer.text
+    assert says in answer.json()["detail"]
+
+
+def test_a_body_without_an_announced_length_is_cut_off_too(site: Site) -> None:
+    def endless() -> Iterator[bytes]:
+        for _ in range(100):
+            yield bytes(100_000)
+
+    try:
+        answer = site.http.request("PUT", "/v1/ballots/v1/d1", content=endless())
+    except httpx2.TransportError:
+        return  # cut off while still sending
+    assert answer.status_code == 413
+
+
+def test_another_vehicles_ballots_cannot_be_touched(site: Site) -> None:
+    assert site.put(changed(vehicle="v2"), "/v1/ballots/v2/d1").status_code == 403
+    assert site.http.request("DELETE", "/v1/ballots/v2/d1").status_code == 403
+    assert site.http.request("POST", "/v1/publish", json={}).status_code == 403
+    assert site.http.request("POST", "/v1/rollback", json={"to": 1}).status_code == 403
+
+
+PATHS = ("ballots/../../etc/passwd", "ballots/v1/%2e%2e", "ballots/v1/a%00b", "tiles/..%2f..", "map/versions/%2e%2e")
+
+
+@pytest.mark.parametrize("path", [*(f"/v1/{path}" for path in PATHS), "/viewer/..%2fapp.py", "/viewer/%2e%2e/app.py"])
+def test_no_path_leads_out(site: Site, path: str) -> None:
+    for method in ("GET", "PUT", "DELETE"):
+        answer = site.http.request(method, path, content=b"x" if method == "PUT" else None)
+        assert answer.status_code in (404, 405, 422), (method, path, answer.status_code)
+
+
+@pytest.mark.parametrize("key", ["x", "Bearer", "ü" * 10, "a" * 20_000])
+def test_odd_keys_are_refused(site: Site, key: str) -> None:
+    header = f"Bearer {key}".encode()
+    answer = httpx2.get(site.url + "/v1/map", headers=[(b"authorization", header)])
+    assert answer.status_code in (400, 401, 431)
+
+
+@pytest.mark.parametrize(
+    ("path", "body"),
+    [
+        ("rollback", {"to": 1 << 80}),
+        ("rollback", {"to": 1, "reason": "a\x00b"}),
+        ("publish", {"parent": -(1 << 64)}),
+        ("publish", {"reason": "a\nb"}),
+        ("publish", {"reason": "a" * 201}),
+        ("publish", {"no such thing": 1}),
+    ],
+)
+def test_an_operators_slip_is_422(site: Site, path: str, body: dict[str, Any]) -> None:
+    headers = {"Authorization": f"Bearer {site.operator}"}
+    before = site.state()
+    assert httpx2.post(f"{site.url}/v1/{path}", json=body, headers=headers).status_code == 422
+    assert site.state() == before
+
+
+def schemathesis(site: Site, examples: int) -> None:
+    """Generated requests against the OpenAPI document: what is answered must be what is declared, and never a 500."""
+    program = Path(sys.executable).parent / "schemathesis"
+    if not program.exists():
+        pytest.skip("schemathesis is not installed: pip install schemathesis")
+    checks = "not_a_server_error,status_code_conformance,content_type_conformance,response_schema_conformance"
+    command = [str(program), "run", f"{site.url}/openapi.json", "--checks", checks, "--seed", "1", "--no-color"]
+    command += ["--max-examples", str(examples), "-H", f"Authorization: Bearer {site.operator}"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=600)
+    assert done.returncode == 0, done.stdout[-6000:] + done.stderr[-1000:]
+    tested = re.search(r"Selected: (\d+)/(\d+)", done.stdout)
+    assert tested, done.stdout[-3000:]
+    assert int(tested[1]) == int(tested[2]) >= 12
+
+
+def test_schemathesis_on_every_route(site: Site) -> None:
+    schemathesis(site, 10)
+
+
+@pytest.mark.slow
+def test_schemathesis_at_length(site: Site) -> None:
+    schemathesis(site, 150)

@@ -1,0 +1,210 @@
+"""Vehicles and operators at a real server: a process of its own on loopback."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import httpx2
+import pytest
+
+from hand_made import Say, make_ballot, states_plane, two_walls
+from live_server import mapvote, serving
+from mapvote.client import MapClient
+from mapvote.codec.ballot import Ballot, encode
+from mapvote.config import FuseSettings
+from mapvote.core.types import CellState, MapvoteError, PointMap
+from mapvote.server.store import keys
+from mapvote.server.store.admission import accept, examine
+from mapvote.server.store.publish import publish
+from mapvote.server.store.store import Store
+
+CELL = (10, 10)
+
+
+class Site(NamedTuple):
+    """A running server with keys for an operator and two vehicles."""
+
+    url: str
+    operator: str
+    a: str
+    b: str
+    store: Path
+    log: Path
+
+    def ask(self, method: str, path: str, key: str | None, **more: object) -> httpx2.Response:
+        headers = {"Authorization": f"Bearer {key}"} if key else {}
+        return httpx2.request(method, self.url + path, headers=headers, **more)  # type: ignore[arg-type]
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Site]:
+    home = tmp_path_factory.mktemp("site")
+    store = Store.create(f"sqlite:///{home / 'store.db'}", two_walls())
+    operator, a, b = (
+        keys.issue(store, "boss", "operator"),
+        keys.issue(store, "a", "vehicle"),
+        keys.issue(store, "b", "vehicle"),
+    )
+    store.close()
+    with serving(home / "store.db", log=home / "log") as (url, _):
+        yield Site(url, operator, a, b, home / "store.db", home / "log")
+
+
+def says(point_map: PointMap, vehicle: str, drive: str = "d1", state: int = CellState.CHANGED_EMPTY) -> Ballot:
+    return make_ballot(point_map, {(0, 0): Say(states_plane({CELL: state}))}, vehicle, drive)
+
+
+def test_the_whole_story(site: Site, tmp_path: Path) -> None:
+    """Two vehicles fetch the map and vote, the operator publishes, a third fetches only the tile that changed."""
+    for key, name in ((site.a, "a"), (site.b, "b")):
+        with MapClient(site.url, key=key, home=tmp_path / name) as client:
+            point_map = client.fetch()
+            assert client.version == 1
+            assert client.send(says(point_map, name)) == "created"
+            assert client.send(says(point_map, name)) == "repeated"
+    assert site.ask("POST", "/v1/publish", site.operator, json={"dry_run": True}).json()["points_deleted"] == 3
+    done = site.ask("POST", "/v1/publish", site.operator, json={"parent": 1}).json()
+    assert done == {
+        "version": 2, "published": True, "tiles": ["0,0"], "points_added": 0, "points_deleted": 3, "held": []
+    }  # fmt: skip
+    assert site.ask("POST", "/v1/publish", site.operator, json={"parent": 1}).status_code == 409
+    before = len(list((tmp_path / "a" / "planes").iterdir()))
+    with MapClient(site.url, key=site.a, home=tmp_path / "a") as client:
+        assert len(client.fetch().tiles[0, 0].points) == len(two_walls().tiles[0, 0].points) - 3
+        assert len(client.fetch(1).tiles[0, 0].points) == len(two_walls().tiles[0, 0].points)
+    assert len(list((tmp_path / "a" / "planes").iterdir())) == before + 1
+    found = site.ask("GET", "/v1/changes?from=1&to=2", site.operator).json()
+    assert [f["properties"]["kind"] for f in found["features"]] == ["demolished"]
+    assert found["features"][0]["properties"]["votes_min"] == 2
+    cell = site.ask("GET", "/v1/cells?x=3.1&y=3.1", site.operator).json()
+    assert [(v["vehicle"], v["state"], v["counts"]) for v in cell["votes"]] == [
+        ("a", "changed_empty", False),
+        ("b", "changed_empty", False),
+    ]
+    assert cell["decisions"] == [{"version": 2, "state": "changed_empty"}]
+    tiles = site.ask("GET", "/v1/coverage", site.operator).json()["tiles"]
+    assert [(t["vehicles"], t["last_seen"] is not None) for t in tiles] == [(2, True), (0, False)]
+    assert site.ask("POST", "/v1/rollback", site.operator, json={"to": 1}).json() == {"version": 3}
+    versions = site.ask("GET", "/v1/map/versions", site.operator).json()["versions"]
+    assert [v["kind"] for v in versions] == ["import", "publish", "rollback"]
+    assert versions[1]["policy"]["min_votes"] == 2
+
+
+def test_no_route_answers_without_a_key(site: Site) -> None:
+    paths = site.ask("GET", "/openapi.json", site.operator).json()["paths"]
+    assert len(paths) >= 12
+    for path in [*paths, "/", "/docs", "/openapi.json", "/viewer/app.js", "/nothing"]:
+        for key in (None, "wrong"):
+            assert site.ask("GET", path, key).status_code == 401, path
+
+
+def test_a_vehicle_touches_its_own_ballots_only_and_never_operates(site: Site) -> None:
+    ballot = encode(says(two_walls(), "b", "theft"))
+    assert site.ask("PUT", "/v1/ballots/b/theft", site.a, content=ballot).status_code == 403
+    assert site.ask("PUT", "/v1/ballots/a/theft", site.a, content=ballot).status_code == 422
+    assert site.ask("DELETE", "/v1/ballots/b/d1", site.a).status_code == 403
+    assert site.ask("POST", "/v1/publish", site.a, json={}).status_code == 403
+    assert site.ask("POST", "/v1/rollback", site.a, json={"to": 1}).status_code == 403
+
+
+def test_browsers_send_the_key_as_a_password(site: Site) -> None:
+    page = httpx2.get(site.url + "/", auth=("operator", site.operator))
+    assert page.status_code == 200
+    assert "text/html" in page.headers["content-type"]
+    assert "default-src 'self'" in page.headers["content-security-policy"]
+
+
+def test_errors_say_what_to_do(site: Site) -> None:
+    unknown = site.ask("GET", "/v1/map?since=99", site.a)
+    assert (unknown.status_code, "newest is" in unknown.json()["detail"]) == (404, True)
+    assert site.ask("GET", "/v1/map/versions/99", site.a).status_code == 404
+    assert site.ask("GET", f"/v1/tiles/{'0' * 64}", site.a).status_code == 404
+    assert site.ask("PUT", "/v1/ballots/a/d9", site.a, content=b"junk").status_code == 422
+    assert site.ask("PUT", "/v1/ballots/a/d9", site.a, content=b"x" * 17_000_000).status_code == 413
+    assert site.ask("DELETE", "/v1/ballots/a/never", site.a).status_code == 404
+    assert site.ask("GET", "/v1/cells?x=1e300&y=0", site.a).status_code == 422
+    assert site.ask("GET", "/v1/cells?x=nan&y=0", site.a).status_code == 422
+    stale = encode(make_ballot(two_walls(), {(0, 0): Say(states_plane())}, "a", "d9", base={(0, 0): "f" * 64}))
+    assert site.ask("PUT", "/v1/ballots/a/d9", site.a, content=stale).status_code == 409
+
+
+def test_tiles_are_immutable_and_cacheable(site: Site) -> None:
+    digest = site.ask("GET", "/v1/map/versions/1", site.a).json()["tiles"]["0,1"]["points"]
+    answer = site.ask("GET", f"/v1/tiles/{digest}", site.a)
+    assert "immutable" in answer.headers["cache-control"]
+    headers = {"Authorization": f"Bearer {site.a}", "If-None-Match": answer.headers["etag"]}
+    assert httpx2.get(f"{site.url}/v1/tiles/{digest}", headers=headers).status_code == 304
+
+
+def test_a_manifest_is_sent_again_only_when_the_map_is_a_new_one(tmp_path: Path) -> None:
+    """Also when another process published it."""
+    store = Store.create(f"sqlite:///{tmp_path / 's.db'}", two_walls())
+    with serving(tmp_path / "s.db", log=tmp_path / "log") as (url, _), httpx2.Client(base_url=url) as http:
+        first = http.get("/v1/map")
+        known = {"If-None-Match": first.headers["etag"]}
+        again = http.get("/v1/map", headers=known)
+        assert (again.status_code, again.content) == (304, b"")
+        assert http.get("/v1/map?since=1", headers=known).json()["tiles"] == {}
+        ballots = [says(store.point_map(), vehicle) for vehicle in ("a", "b")]
+        accept(store, [examine(encode(ballot)) for ballot in ballots])
+        assert publish(store, FuseSettings(max_deleted_share=1.0)).version == 2
+        new = http.get("/v1/map", headers=known)
+        assert (new.status_code, new.json()["version"]) == (200, 2)
+        assert list(http.get("/v1/map?since=1").json()["tiles"]) == ["0,0"]
+        assert http.get("/v1/map/versions/1", headers=known).status_code == 304
+    store.close()
+
+
+def test_metrics_and_logs_hold_no_secret(site: Site) -> None:
+    text = site.ask("GET", "/metrics", site.operator).text
+    assert "mapvote_requests_total" in text
+    assert "mapvote_version" in text
+    log = site.log.read_text()
+    assert all(json.loads(line)["event"] for line in log.splitlines())
+    for secret in (site.operator, site.a, site.b):
+        assert secret not in log + text
+
+
+def test_a_revoked_key_stops_working_at_once(site: Site) -> None:
+    issued = subprocess.run(mapvote("keys", site.store, "issue", "c"), capture_output=True, text=True, check=True)
+    key = issued.stdout.strip()
+    assert site.ask("GET", "/v1/map", key).status_code == 200
+    ballots = [encode(says(two_walls(), "c", drive, CellState.UNCHANGED_OCCUPIED)) for drive in ("d1", "d2")]
+    assert site.ask("PUT", "/v1/ballots/c/d1", key, content=ballots[0]).status_code == 201
+    subprocess.run(mapvote("keys", site.store, "revoke", "c"), capture_output=True, check=True)
+    assert site.ask("PUT", "/v1/ballots/c/d2", key, content=ballots[1]).status_code == 401
+    assert site.ask("GET", "/v1/map", key).status_code == 401
+
+
+def test_an_unsent_ballot_waits_in_the_spool(site: Site, tmp_path: Path) -> None:
+    ballot = says(two_walls(), "a", "spooled", CellState.UNCHANGED_OCCUPIED)
+    with MapClient("http://127.0.0.1:9", key=site.a, home=tmp_path, sleep=lambda s: None) as away:
+        assert away.send(ballot) == "spooled"
+        assert away.flush() == {"a~spooled": "spooled"}
+    with MapClient(site.url, key=site.a, home=tmp_path) as client:
+        assert client.flush() == {"a~spooled": "created"}
+        assert client.flush() == {}
+        with pytest.raises(MapvoteError, match=r"refused \(409\)"):
+            client.send(make_ballot(two_walls(), {(0, 0): Say(states_plane())}, "a", "x", map_id="elsewhere"))
+        assert client.flush() == {}
+
+
+def test_beyond_loopback_only_with_keys(tmp_path: Path) -> None:
+    Store.create(f"sqlite:///{tmp_path / 's.db'}", two_walls()).close()
+    command = mapvote("serve", tmp_path / "s.db", "--host", "0.0.0.0", "--port", 0)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 1
+    assert "issue keys first" in done.stderr
+
+
+def test_a_graceful_stop(tmp_path: Path) -> None:
+    Store.create(f"sqlite:///{tmp_path / 's.db'}", two_walls()).close()
+    with serving(tmp_path / "s.db", log=tmp_path / "log") as (url, process):
+        assert httpx2.get(url + "/healthz").json() == {"status": "ok", "version": 1}
+        process.terminate()
+        assert process.wait(10) in (0, -15)
+    assert "Traceback" not in (tmp_path / "log").read_text()

@@ -1,0 +1,153 @@
+"""A real server process whose disk is full or read-only: 503, nothing acknowledged lost, and well again afterwards."""
+
+from __future__ import annotations
+
+import os
+import resource
+import shutil
+import subprocess
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import httpx2
+import numpy as np
+import pytest
+import sqlalchemy as sa
+
+from hand_made import Say, make_ballot, states_plane, two_walls
+from live_server import mapvote, serving
+from mapvote.codec.ballot import encode
+from mapvote.core.types import CellState
+from mapvote.server.store import schema
+from mapvote.server.store.store import Store
+
+CELL = (10, 10)
+
+
+def put(http: httpx2.Client, vehicle: str, drive: str) -> httpx2.Response:
+    """A ballot of some 60 kB against the first map."""
+    noise = np.random.default_rng(len(drive)).random((5000, 3), dtype=np.float32)
+    say = Say(states_plane({CELL: CellState.CHANGED_EMPTY}), new_points=noise)
+    ballot = make_ballot(two_walls(), {(0, 0): say}, vehicle, drive, end_ns=time.time_ns() - 10**9)
+    return http.request("PUT", f"/v1/ballots/{vehicle}/{drive}", content=encode(ballot))
+
+
+def send_until_refused(http: httpx2.Client) -> set[str]:
+    """The drives that were acknowledged before the first refusal, which must be a clear one."""
+    acknowledged: set[str] = set()
+    for i in range(400):
+        answer = put(http, f"v{i % 2}", f"d{i}")
+        if answer.status_code != 201:
+            assert_refused(answer)
+            return acknowledged
+        acknowledged.add(f"d{i}")
+    raise AssertionError("400 ballots of 60 kB found room")
+
+
+def assert_refused(answer: httpx2.Response) -> None:
+    assert answer.status_code == 503, answer.text
+    assert "Retry-After" in answer.headers
+    assert "try again" in answer.json()["detail"]
+
+
+def standing(url: str) -> set[str]:
+    store = Store.open(url)
+    with store.database.reading() as connection:
+        drives = connection.execute(sa.select(schema.ballots.c.drive).where(schema.ballots.c.gone_seq.is_(None)))
+        found = set(drives.scalars())
+    store.close()
+    return found
+
+
+def assert_well_again(http: httpx2.Client, url: str, acknowledged: set[str]) -> None:
+    assert put(http, "v2", "later").status_code == 201
+    assert http.get("/healthz").status_code == 200
+    assert http.request("POST", "/v1/publish", json={"override": True}).json()["published"]
+    assert standing(url) == {*acknowledged, "later"}
+
+
+def test_a_full_disk(small_disk: Path, tmp_path: Path) -> None:
+    url = f"sqlite:///{small_disk / 'store.db'}"
+    Store.create(url, two_walls()).close()
+    filler = small_disk / "filler"
+    filler.write_bytes(bytes(12 << 20))
+    with (
+        serving(small_disk / "store.db", log=tmp_path / "log") as (address, _),
+        httpx2.Client(base_url=address, timeout=60.0) as http,
+    ):
+        acknowledged = send_until_refused(http)
+        assert acknowledged, "the disk was full before anything was acknowledged"
+        for _ in range(3):
+            assert_refused(put(http, "v0", "again"))
+        assert http.get("/v1/map").status_code == 200, "who only reads is served"
+        filler.unlink()
+        assert_well_again(http, url, acknowledged)
+    assert "Traceback" not in (tmp_path / "log").read_text()
+
+
+def test_no_room_for_the_file_to_grow(tmp_path: Path) -> None:
+    """As a full disk, but without being root: the process may not make its files longer than 3 MB for a while."""
+    url = f"sqlite:///{tmp_path / 'store.db'}"
+    Store.create(url, two_walls()).close()
+    with (
+        serving(tmp_path / "store.db", log=tmp_path / "log") as (address, process),
+        httpx2.Client(base_url=address, timeout=60.0) as http,
+    ):
+        before = resource.prlimit(process.pid, resource.RLIMIT_FSIZE, (3 << 20, resource.RLIM_INFINITY))
+        acknowledged = send_until_refused(http)
+        assert acknowledged
+        assert_refused(put(http, "v0", "again"))
+        resource.prlimit(process.pid, resource.RLIMIT_FSIZE, before)
+        assert_well_again(http, url, acknowledged)
+
+
+def test_a_store_on_a_read_only_disk_is_not_served(small_disk: Path) -> None:
+    Store.create(f"sqlite:///{small_disk / 'store.db'}", two_walls()).close()
+    subprocess.run(["mount", "-o", "remount,ro", str(small_disk)], check=True)
+    command = mapvote("serve", small_disk / "store.db", "--port", 0)
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=60)
+    assert done.returncode == 1
+    assert "store.db" in done.stderr
+    assert "Traceback" not in done.stderr
+    subprocess.run(["mount", "-o", "remount,rw", str(small_disk)], check=True)
+
+
+@pytest.fixture
+def ext4(tmp_path: Path) -> Iterator[Path]:
+    """A small ext4 file system in a file; only root may mount one."""
+    image, disk = tmp_path / "image", tmp_path / "ext4"
+    disk.mkdir()
+    image.write_bytes(b"")
+    os.truncate(image, 48 << 20)
+    made = os.getuid() == 0 and shutil.which("mkfs.ext4") is not None
+    made = made and not subprocess.run(["mkfs.ext4", "-q", str(image)], capture_output=True, check=False).returncode
+    mount = ["mount", "-o", "loop", str(image), str(disk)]
+    if not made or subprocess.run(mount, capture_output=True, check=False).returncode:
+        pytest.skip("only root can mount a disk to break, and needs mkfs.ext4 and a loop device")
+    yield disk
+    subprocess.run(["umount", "-l", str(disk)], check=True)
+
+
+def test_a_disk_that_turns_read_only_under_the_server(ext4: Path, tmp_path: Path) -> None:
+    """As Linux does after a write error: the file system is read-only from one moment to the next, with files open."""
+    url = f"sqlite:///{ext4 / 'store.db'}"
+    Store.create(url, two_walls()).close()
+    with (
+        serving(ext4 / "store.db", log=tmp_path / "log") as (address, _),
+        httpx2.Client(base_url=address, timeout=60.0) as http,
+    ):
+        for vehicle, drive in (("v0", "d0"), ("v1", "d1")):
+            assert put(http, vehicle, drive).status_code == 201
+        subprocess.run(["mount", "-o", "remount,abort", str(ext4)], check=True, capture_output=True)
+        for _ in range(3):
+            assert_refused(put(http, "v1", "refused"))
+        assert_refused(http.request("POST", "/v1/publish", json={"override": True}))
+    subprocess.run(["umount", str(ext4)], check=True)
+    subprocess.run(["mount", "-o", "loop", str(tmp_path / "image"), str(ext4)], check=True)
+    with (
+        serving(ext4 / "store.db", log=tmp_path / "log") as (address, _),
+        httpx2.Client(base_url=address, timeout=60.0) as http,
+    ):
+        assert_well_again(http, url, {"d0", "d1"})
+    assert "Traceback" not in (tmp_path / "log").read_text()

@@ -1,0 +1,300 @@
+"""The store's promises (DESIGN 4), on SQLite and on PostgreSQL."""
+
+from __future__ import annotations
+
+import itertools
+import threading
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import numpy as np
+import pytest
+
+from hand_made import Say, make_ballot, states_plane, two_walls, words_plane
+from mapvote.codec.ballot import Ballot, encode
+from mapvote.config import FuseSettings
+from mapvote.core.types import U64, CellState, MapvoteError, PointMap
+from mapvote.fusion.offline import update_map
+from mapvote.fusion.tile_vote import DAY_NS
+from mapvote.server.errors import Conflict, Held, NotFound, Unavailable
+from mapvote.server.insight.explain import explain_cell
+from mapvote.server.store.admission import Intake, accept, examine
+from mapvote.server.store.ballots import Receipt, withdraw
+from mapvote.server.store.publish import publish, rollback
+from mapvote.server.store.store import Store
+
+EMPTY, KEEPS = CellState.CHANGED_EMPTY, CellState.UNCHANGED_OCCUPIED
+POLICY = FuseSettings(min_votes=2)
+CELL, NEXT = (10, 10), (10, 11)
+_count = itertools.count()
+
+
+@pytest.fixture
+def store(database_url: str) -> Iterator[Store]:
+    store = Store.create(database_url, two_walls())
+    yield store
+    store.close()
+
+
+def send(store: Store, *ballots: Ballot) -> list[Receipt]:
+    receipts = accept(store, [examine(encode(ballot)) for ballot in ballots])
+    for receipt in receipts:
+        if isinstance(receipt, MapvoteError):
+            raise receipt
+    return [receipt for receipt in receipts if isinstance(receipt, Receipt)]
+
+
+def says(
+    point_map: PointMap,
+    vehicle: str,
+    state: int,
+    cell: tuple[int, int] = CELL,
+    day: float = 0,
+    gone: U64 | None = None,
+    **more: object,
+) -> Ballot:
+    drive = str(more.pop("drive", f"d{next(_count)}"))
+    say = {(0, 0): Say(states_plane({cell: state}), gone=gone)}
+    return make_ballot(point_map, say, vehicle, drive, end_ns=DAY_NS + round(day * DAY_NS), **more)  # type: ignore[arg-type]
+
+
+def heights(store: Store, cell: tuple[int, int] = CELL) -> int:
+    """Obstacle points of a cell of tile (0, 0) in the newest version."""
+    points = store.point_map().tiles[0, 0].points
+    inside = (np.floor(points[:, 1] / 0.3) == cell[0]) & (np.floor(points[:, 0] / 0.3) == cell[1])
+    return int((inside & (points[:, 2] > 0.3)).sum())
+
+
+def test_a_map_survives_the_store(store: Store) -> None:
+    before, after = two_walls(), store.point_map()
+    assert after.map_id == before.map_id
+    assert after.lattice == before.lattice
+    for index, tile in before.tiles.items():
+        assert after.tiles[index].points.tobytes() == tile.points.tobytes()
+        assert after.tiles[index].ground_z.tobytes() == tile.ground_z.tobytes()
+
+
+def test_two_vehicles_take_a_wall_down_and_the_manifest_says_what_changed(store: Store) -> None:
+    base = store.point_map()
+    send(store, says(base, "a", EMPTY), says(base, "b", EMPTY))
+    outcome = publish(store, POLICY)
+    assert (outcome.version, outcome.published, outcome.deleted) == (2, True, 3)
+    assert heights(store) == 0
+    assert heights(store, NEXT) == 3
+    assert list(store.manifest(since=1).tiles) == [(0, 0)]
+    assert store.manifest(since=2).tiles == {}
+    assert not publish(store, POLICY).published
+    assert len(store.point_map(1).tiles[0, 0].points) == len(base.tiles[0, 0].points)
+
+
+def test_an_unknown_version_is_an_error_not_an_empty_list(store: Store) -> None:
+    for ask in (lambda: store.manifest(7), lambda: store.manifest(since=7), lambda: store.tile(0, (0, 0))):
+        with pytest.raises(NotFound, match="newest is 1"):
+            ask()
+
+
+def test_sending_twice_is_harmless_and_sending_again_replaces(store: Store) -> None:
+    base = store.point_map()
+    first = says(base, "a", EMPTY, drive="d")
+    assert send(store, first)[0].created
+    assert send(store, first)[0].repeated
+    send(store, says(base, "b", EMPTY))
+    again = send(store, says(base, "a", KEEPS, drive="d"))[0]
+    assert (again.created, again.repeated) == (False, False)
+    assert not publish(store, POLICY).published
+
+
+def test_ten_drives_are_one_vote(store: Store) -> None:
+    base = store.point_map()
+    send(store, *[says(base, "a", EMPTY, day=i) for i in range(10)])
+    assert not publish(store, POLICY).published
+
+
+def test_a_wall_that_stood_for_a_year_falls_in_a_week(store: Store) -> None:
+    base = store.point_map()
+    send(store, *[says(base, f"old{i}", KEEPS, day=-7 * i) for i in range(50)])
+    send(store, *[says(base, f"new{i}", EMPTY, day=1 + i) for i in range(5)])
+    publish(store, POLICY)
+    assert heights(store) == 0
+
+
+def test_publishing_one_cell_costs_its_neighbours_nothing(store: Store) -> None:
+    base = store.point_map()
+    send(store, says(base, "a", EMPTY), says(base, "b", EMPTY), says(base, "c", EMPTY, NEXT))
+    publish(store, POLICY)
+    send(store, says(base, "d", EMPTY, NEXT))  # still votes on version 1
+    assert publish(store, POLICY).version == 3
+    assert heights(store, NEXT) == 0
+
+
+def test_a_vote_on_what_has_changed_since_counts_no_more(store: Store) -> None:
+    base = store.point_map()
+    send(store, says(base, "a", EMPTY), says(base, "b", EMPTY))
+    publish(store, POLICY)
+    with pytest.raises(Conflict, match="has changed since"):
+        send(store, says(base, "c", EMPTY))
+    with pytest.raises(Conflict, match="no version had the base"):
+        send(store, says(base, "c", EMPTY, base={(0, 0): "f" * 64}))
+
+
+def test_a_rollback_does_not_come_back_by_itself_but_by_new_votes(store: Store) -> None:
+    base = store.point_map()
+    old = [says(base, v, EMPTY) for v in "ab"]
+    send(store, *old)
+    publish(store, POLICY)
+    version = rollback(store, 1, reason="it still stands")
+    assert (version.number, version.kind, version.target) == (3, "rollback", 1)
+    assert heights(store) == 3
+    assert store.manifest(3).tiles == store.manifest(1).tiles
+    send(store, *old)
+    assert not publish(store, POLICY).published
+    send(store, says(base, "c", EMPTY, day=1))
+    assert not publish(store, POLICY).published
+    send(store, says(base, "d", EMPTY, day=1))
+    assert publish(store, POLICY).published
+    assert heights(store) == 0
+
+
+def test_rolled_back_remnants_stay_until_new_votes_come(store: Store) -> None:
+    base = store.point_map()
+
+    def mark(vehicle: str, day: float) -> Ballot:
+        return says(base, vehicle, KEEPS, day=day, gone=words_plane({CELL: 0b10}))
+
+    old = [mark(v, 0) for v in "ab"]
+    send(store, *old)
+    story = explain_cell(store, (CELL[1] + 0.5) * 0.3, (CELL[0] + 0.5) * 0.3, POLICY)
+    assert [(v.state, v.marks, v.counts) for v in story.votes] == [("unchanged_occupied", 1, True)] * 2
+    assert publish(store, POLICY).deleted == 1
+    rollback(store, 1, reason="it still stands")
+    send(store, *old)
+    assert not publish(store, POLICY).published
+    send(store, *[mark(v, 1) for v in "cd"])
+    assert publish(store, POLICY).deleted == 1
+
+
+def test_withdrawn_before_publication_it_is_as_if_never_cast(store: Store) -> None:
+    base = store.point_map()
+    votes = [says(base, v, EMPTY, cell) for v, cell in (("a", CELL), ("b", CELL), ("c", NEXT), ("d", NEXT))]
+    send(store, *votes)
+    assert withdraw(store, "d", by="operator") == 1
+    publish(store, POLICY)
+    never, _ = update_map(base, votes[:3], POLICY)
+    assert store.point_map().tiles[0, 0].points.tobytes() == never.tiles[0, 0].points.tobytes()
+    with pytest.raises(NotFound):
+        withdraw(store, "d", by="operator")
+
+
+@pytest.mark.parametrize("other", [{"method": "paper"}, {"settings_hash": "0" * 64}])
+def test_a_round_never_mixes_methods_or_settings(store: Store, other: Any) -> None:
+    """The first ballot decides how a round votes; once none stands, another may begin."""
+    base = store.point_map()
+    send(store, says(base, "a", EMPTY), says(base, "b", EMPTY))
+    with pytest.raises(Conflict, match=r"never mixes methods or settings; vote again as the round does"):
+        send(store, says(base, "c", EMPTY, **other))
+    with pytest.raises(Conflict):
+        send(store, says(base, "a", EMPTY, **other))
+    assert withdraw(store, "a", by="a") == 1
+    with pytest.raises(Conflict):
+        send(store, says(base, "c", EMPTY, **other))
+    assert withdraw(store, None, by="operator") == 1
+    send(store, says(base, "c", EMPTY, **other), says(base, "d", EMPTY, **other))
+    assert publish(store, POLICY).deleted == 3
+
+
+def test_an_operator_may_say_which_settings_the_fleet_votes_by(store: Store) -> None:
+    """Then no first ballot, right or wrong, decides for the others."""
+    intake, base = Intake(store, "ab" * 16), store.point_map()
+    ballots = [says(base, "a", EMPTY), says(base, "b", EMPTY, settings_hash="ab" * 32)]
+    refused, taken = intake.accept([examine(encode(ballot)) for ballot in ballots])
+    assert isinstance(refused, Conflict)
+    assert "fleet's configuration" in str(refused)
+    assert isinstance(taken, Receipt)
+
+
+def test_another_map_is_refused_and_so_is_the_future(store: Store) -> None:
+    base = store.point_map()
+    with pytest.raises(Conflict, match="keeps map"):
+        send(store, says(base, "a", EMPTY, map_id="elsewhere"))
+    with pytest.raises(MapvoteError, match="future"):
+        send(store, says(base, "a", EMPTY, day=365 * 200))
+
+
+def test_dry_run_changes_nothing_and_a_held_version_says_why(store: Store) -> None:
+    base = store.point_map()
+    send(store, says(base, "a", EMPTY), says(base, "b", EMPTY))
+    strict = FuseSettings(max_deleted_share=0.01)
+    dry = publish(store, strict, dry_run=True)
+    assert (dry.published, dry.deleted, len(dry.held)) == (False, 3, 1)
+    with pytest.raises(Held, match="deletes 25% of the points"):
+        publish(store, strict)
+    with pytest.raises(Held, match="worse here"):
+        publish(store, POLICY, gate=lambda old, new: ["worse here"])
+    assert store.current() == 1
+    assert publish(store, strict, override=True).published
+    assert "in spite of" in store.versions()[-1].reason
+
+
+def test_the_gate_sees_both_maps(store: Store) -> None:
+    base = store.point_map()
+    send(store, says(base, "a", EMPTY), says(base, "b", EMPTY))
+    seen = []
+    publish(store, POLICY, gate=lambda old, new: seen.append((old, new)) or [])  # type: ignore[func-returns-value]
+    old, new = seen[0]
+    assert len(old.tiles[0, 0].points) - len(new.tiles[0, 0].points) == 3
+    assert new.tiles[0, 1] is old.tiles[0, 1]
+
+
+def test_of_64_publishers_one_wins(store: Store) -> None:
+    base = store.point_map()
+    send(store, says(base, "a", EMPTY), says(base, "b", EMPTY))
+    barrier = threading.Barrier(64)
+
+    def attempt(_: int) -> str:
+        barrier.wait()
+        try:
+            return "published" if publish(store, POLICY, parent=1).published else "nothing"
+        except Conflict:
+            return "conflict"
+
+    with ThreadPoolExecutor(64) as pool:
+        results = list(pool.map(attempt, range(64)))
+    assert sorted(results) == ["conflict"] * 63 + ["published"]
+    assert store.current() == 2
+
+
+def test_readers_never_see_a_mixture(store: Store) -> None:
+    """While versions appear, a manifest is always that of one version: both tiles change together or not at all."""
+    stop = threading.Event()
+    mixtures: list[int] = []
+
+    def read() -> None:
+        while not stop.is_set():
+            manifest = store.manifest()
+            if len({hashes.points for hashes in manifest.tiles.values()}) != 1:
+                mixtures.append(manifest.version)
+
+    reader = threading.Thread(target=read)
+    reader.start()
+    for _ in range(3):
+        base = store.point_map()
+        tiles = {index: Say(states_plane({CELL: EMPTY})) for index in base.tiles}
+        send(store, *[make_ballot(base, tiles, v, f"d{next(_count)}") for v in "ab"])
+        publish(store, POLICY, override=True)
+        rollback(store, 1)
+    stop.set()
+    reader.join()
+    assert mixtures == []
+
+
+def test_what_is_no_store_says_so(database_url: str, store: Store) -> None:
+    with pytest.raises(MapvoteError, match="holds a map already"):
+        Store.create(database_url, two_walls())
+    with pytest.raises(MapvoteError, match="no such store"):
+        Store.open("sqlite:////nowhere/at/all.db")
+
+
+def test_a_database_that_is_gone_is_unavailable(database_url: str) -> None:
+    with pytest.raises((MapvoteError, Unavailable)):
+        Store.open(database_url)
