@@ -3,26 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import AsyncIterator
-from concurrent.futures import Executor, ThreadPoolExecutor
+from concurrent.futures import Executor
 from contextlib import asynccontextmanager
 
 from fastapi import FastAPI
 
 from mapvote.config import Settings
 from mapvote.core.types import MapvoteError
-from mapvote.server.http import operator_routes, pages, vehicle_routes
+from mapvote.server.http import ballot_route, operator_routes, pages, vehicle_routes
 from mapvote.server.http.auth import Guard
-from mapvote.server.http.batching import Batcher
-from mapvote.server.http.limits import RateLimit
-from mapvote.server.http.manifests import Manifests
-from mapvote.server.http.metrics import Metrics, Watch
+from mapvote.server.http.middleware import Watch
 from mapvote.server.http.schemas import refuse, unreadable
-from mapvote.server.store.admission import Intake
+from mapvote.server.http.services import make_services
 from mapvote.server.store.publish import Gate
 from mapvote.server.store.store import Store
-
-_READERS = 1024
-"""Readers answered by one look at the newest version."""
 
 
 def create_app(
@@ -33,26 +27,17 @@ def create_app(
     gate: Gate | None = None,
     executor: Executor | None = None,
 ) -> FastAPI:
-    """The app on an open store, which stays the caller's to close.
+    """The app on an open store, which stays the caller's to close. It runs once.
 
     ``need_keys``: no route answers without a key. ``gate``: see :mod:`mapvote.server.store.publish`; ``executor``:
     where tiles are fused, two threads by default.
     """
-    settings = settings or Settings()
+    parts = make_services(store, settings or Settings(), gate, executor)
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
-        own = ThreadPoolExecutor(2, "fuse")
-        app.state.executor = executor or own
-        app.state.threads, app.state.stopping = own, False
-        app.state.intake = intake = Intake(store, settings.server.settings_hash)
-        app.state.examiner = Batcher(intake.look_at, settings.server.batch)
-        app.state.writer = Batcher(intake.write, settings.server.batch)
-        app.state.newest = Batcher(manifests.newest, _READERS)
         yield
-        await app.state.examiner.close()
-        await app.state.writer.close()
-        own.shutdown(cancel_futures=True)
+        await parts.close()
 
     app = FastAPI(
         title="mapvote",
@@ -62,15 +47,10 @@ def create_app(
         docs_url=None,
         redoc_url=None,
     )
-    app.state.store, app.state.settings, app.state.gate = store, settings, gate
-    app.state.manifests = manifests = Manifests(store)
-    app.state.metrics = metrics = Metrics()
-    app.state.limit = RateLimit(settings.server.ballots_per_minute, settings.server.burst)
-    guard = Guard(store, need_keys)
-    for part in (vehicle_routes, operator_routes, pages):
+    app.state.services = parts
+    for part in (ballot_route, vehicle_routes, operator_routes, pages):
         app.include_router(part.router)
     app.add_exception_handler(MapvoteError, refuse)
     app.add_exception_handler(400, unreadable)
-    app.add_middleware(vehicle_routes.StraightToVote)
-    app.add_middleware(Watch, guard=guard, metrics=metrics)
+    app.add_middleware(Watch, guard=Guard(store, need_keys), metrics=parts.metrics)
     return app

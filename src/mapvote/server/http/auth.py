@@ -10,6 +10,7 @@ from fastapi import Request
 
 from mapvote.server.errors import Forbidden, Unauthorised
 from mapvote.server.http.batching import Batcher
+from mapvote.server.http.services import services
 from mapvote.server.store import keys
 from mapvote.server.store.store import Store
 
@@ -59,7 +60,7 @@ def own(request: Request, vehicle: str) -> str:
     if key.role != "operator":
         if key.name != vehicle:
             raise Forbidden(f"the key of {key.name!r} cannot touch ballots of {vehicle[:64]!r}")
-        request.app.state.limit.take(key.name)
+        services(request).limit.take(key.name)
     return key.name
 
 

@@ -9,13 +9,12 @@ from dataclasses import asdict
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Query, Request
-from starlette.datastructures import State
 
 from mapvote.codec.ballot import tile_key
-from mapvote.config import FuseSettings
 from mapvote.server.errors import Unavailable
 from mapvote.server.http.auth import operator
 from mapvote.server.http.schemas import LEAST, MOST, PublishAsk, Published, RollbackAsk, iso, problems
+from mapvote.server.http.services import Services, services
 from mapvote.server.insight.explain import explain_cell
 from mapvote.server.insight.history import changes_between, coverage, vehicle_standings
 from mapvote.server.store.publish import publish, rollback
@@ -27,22 +26,21 @@ router = APIRouter()
 @router.post("/v1/publish", responses=problems(403, 409), summary="Publish the next version")
 def publish_now(request: Request, ask: PublishAsk) -> Published:
     """Fuse what stands. 409 with the reasons if the policy holds it, or if somebody else published first."""
-    by = operator(request)
-    state = request.app.state
-    policy: FuseSettings = state.settings.fuse
+    by, parts = operator(request), services(request)
+    policy = parts.settings.fuse
     if ask.min_votes is not None:
         policy = policy.model_copy(update={"min_votes": ask.min_votes})
-    with state.metrics.publish_seconds.time(), _unless_stopping(state):
+    with parts.metrics.publish_seconds.time(), _unless_stopping(parts):
         done = publish(
-            state.store,
+            parts.store,
             policy,
             by=by,
             reason=ask.reason,
             parent=ask.parent,
             dry_run=ask.dry_run,
             override=ask.override,
-            gate=state.gate,
-            executor=state.executor,
+            gate=parts.gate,
+            executor=parts.fusing,
         )
     tiles = [tile_key(tile) for tile in done.tiles]
     return Published(
@@ -59,7 +57,7 @@ def publish_now(request: Request, ask: PublishAsk) -> Published:
 def roll_back(request: Request, ask: RollbackAsk) -> dict[str, int]:
     """A new version that is the old one again; the votes that led away from it are barred."""
     by = operator(request)
-    return {"version": rollback(request.app.state.store, ask.to, by=by, reason=ask.reason).number}
+    return {"version": rollback(services(request).store, ask.to, by=by, reason=ask.reason).number}
 
 
 @router.get("/v1/changes", responses=problems(404), summary="What changed, as GeoJSON in map metres")
@@ -70,14 +68,15 @@ def changes(
     min_cells: Annotated[int, Query(ge=1, le=100_000)] = 1,
 ) -> dict[str, Any]:
     """Objects built and demolished between two versions; ``to`` is the newest by default."""
-    store = request.app.state.store
+    store = services(request).store
     return changes_between(store, old, store.current() if new is None else new, min_cells)
 
 
 @router.get("/v1/cells", responses=problems(), summary="The votes behind one cell")
 def cell(request: Request, x: float, y: float) -> dict[str, Any]:
     """Who says what about the cell at (x, y), map metres, whether it counts, and what was decided when."""
-    story = explain_cell(request.app.state.store, x, y, request.app.state.settings.fuse)
+    parts = services(request)
+    story = explain_cell(parts.store, x, y, parts.settings.fuse)
     votes = [
         {
             "vehicle": v.vehicle,
@@ -97,7 +96,7 @@ def cell(request: Request, x: float, y: float) -> dict[str, Any]:
 @router.get("/v1/coverage", responses=problems(), summary="Freshness of every tile")
 def fresh(request: Request) -> dict[str, Any]:
     """When each tile was last driven past, and by how many vehicles whose ballots stand."""
-    tiles = coverage(request.app.state.store)
+    tiles = coverage(services(request).store)
     return {
         "tiles": [
             {name: t[name] for name in ("row", "col", "vehicles")} | {"last_seen": iso(t["last_seen_ns"])}
@@ -110,16 +109,17 @@ def fresh(request: Request) -> dict[str, Any]:
 def vehicles(request: Request) -> dict[str, Any]:
     """How every vehicle stands to what the others say before and after it, with the places where it differs."""
     operator(request)
-    found = vehicle_standings(request.app.state.store, request.app.state.settings.fuse)
+    parts = services(request)
+    found = vehicle_standings(parts.store, parts.settings.fuse)
     return {"vehicles": [asdict(s) | {"evidence": [asdict(e) for e in s.evidence[:_MOST_EVIDENCE]]} for s in found]}
 
 
 @contextmanager
-def _unless_stopping(state: State) -> Iterator[None]:
+def _unless_stopping(parts: Services) -> Iterator[None]:
     """A stopping server takes away the threads that fuse: what they had not begun is cancelled, more is refused."""
     try:
         yield
     except (CancelledError, RuntimeError) as error:
-        if not state.stopping:
+        if not parts.stopping.is_set():
             raise
         raise Unavailable("the server is stopping, nothing was published: ask again once it is back") from error

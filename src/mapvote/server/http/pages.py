@@ -10,6 +10,7 @@ from fastapi import APIRouter, Request, Response
 
 from mapvote.server.errors import NotFound
 from mapvote.server.http.schemas import problems
+from mapvote.server.http.services import services
 
 _DOCS = """<!doctype html><meta charset=utf-8><title>mapvote API</title>
 <style>body{font:15px sans-serif;margin:2em}td,th{padding:.4em .8em;text-align:left;border-top:1px solid #ccc}</style>
@@ -21,15 +22,15 @@ router = APIRouter()
 @router.get("/healthz", responses=problems(), summary="Can the store be read?")
 def health(request: Request) -> dict[str, Any]:
     """200 with the newest version, 503 if the database does not answer."""
-    return {"status": "ok", "version": request.app.state.store.current()}
+    return {"status": "ok", "version": services(request).store.current()}
 
 
 @router.get("/metrics", responses=problems(), response_class=Response, summary="Prometheus metrics")
 def metrics(request: Request) -> Response:
     """Counters, latencies, the newest version."""
-    gathered = request.app.state.metrics
-    gathered.version.set(request.app.state.store.current())
-    return Response(gathered.text(), media_type="text/plain; version=0.0.4; charset=utf-8")
+    parts = services(request)
+    parts.metrics.version.set(parts.store.current())
+    return Response(parts.metrics.text(), media_type="text/plain; version=0.0.4; charset=utf-8")
 
 
 @router.get("/docs", include_in_schema=False)

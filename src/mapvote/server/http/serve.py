@@ -17,6 +17,7 @@ from mapvote.config import Settings
 from mapvote.core.types import MapvoteError, PointMap
 from mapvote.formats import open_drive, read_map
 from mapvote.server.http.app import create_app
+from mapvote.server.http.services import Services
 from mapvote.server.insight.localisation_gate import gate as localise_in_both
 from mapvote.server.store import keys
 from mapvote.server.store.publish import Gate
@@ -102,9 +103,8 @@ class _Server(uvicorn.Server):
     """Lets go of a publish under way when it is told to stop: what waits to be fused is dropped."""
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
-        state = self.config.app.state  # type: ignore[union-attr]
-        state.stopping = True
-        state.threads.shutdown(wait=False, cancel_futures=True)
+        parts: Services = self.config.app.state.services  # type: ignore[union-attr]
+        parts.stop_fusing()
         await super().shutdown(sockets)
 
 

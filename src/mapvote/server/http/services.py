@@ -1,0 +1,85 @@
+"""What the routes work with: the parts of one running app, each with its type, made once."""
+
+from __future__ import annotations
+
+from concurrent.futures import Executor, ThreadPoolExecutor
+from dataclasses import dataclass, field
+from threading import Event
+
+from fastapi import Request
+
+from mapvote.config import Settings
+from mapvote.server.http.batching import Batcher
+from mapvote.server.http.limits import RateLimit
+from mapvote.server.http.manifests import Manifests
+from mapvote.server.http.metrics import Metrics
+from mapvote.server.store.admission import Intake, Sent
+from mapvote.server.store.ballots import Incoming, Receipt
+from mapvote.server.store.publish import Gate
+from mapvote.server.store.store import Store
+
+_READERS = 1024
+"""Readers answered by one look at the newest version."""
+
+
+@dataclass(frozen=True, slots=True)
+class Services:
+    """The parts that live as long as the app; a route asks for them by :func:`services`."""
+
+    store: Store
+    settings: Settings
+    gate: Gate | None
+    """Looks at a version before it is published."""
+    fusing: Executor
+    """Where tiles are fused."""
+    threads: ThreadPoolExecutor
+    """The app's own threads for that, idle if ``fusing`` is another's."""
+    intake: Intake
+    examiner: Batcher[Sent, Incoming]
+    """Looks at ballots, many at once."""
+    writer: Batcher[Incoming, Receipt]
+    """Writes those that passed, many in one transaction."""
+    newest: Batcher[None, int]
+    """The number of the newest version."""
+    manifests: Manifests
+    metrics: Metrics
+    limit: RateLimit
+    stopping: Event = field(default_factory=Event)
+    """Set once the server has been told to stop."""
+
+    def stop_fusing(self) -> None:
+        """Drop what waits to be fused; a publish under way then ends as :class:`Unavailable`."""
+        self.stopping.set()
+        self.threads.shutdown(wait=False, cancel_futures=True)
+
+    async def close(self) -> None:
+        """Wait until every ballot that was taken in is written."""
+        await self.examiner.close()
+        await self.writer.close()
+        self.threads.shutdown(cancel_futures=True)
+
+
+def make_services(store: Store, settings: Settings, gate: Gate | None, executor: Executor | None) -> Services:
+    """The parts of an app on an open store; ``executor`` as in :func:`mapvote.server.http.app.create_app`."""
+    intake, manifests = Intake(store, settings.server.settings_hash), Manifests(store)
+    threads = ThreadPoolExecutor(2, "fuse")
+    return Services(
+        store=store,
+        settings=settings,
+        gate=gate,
+        fusing=executor or threads,
+        threads=threads,
+        intake=intake,
+        examiner=Batcher(intake.look_at, settings.server.batch),
+        writer=Batcher(intake.write, settings.server.batch),
+        newest=Batcher(manifests.newest, _READERS),
+        manifests=manifests,
+        metrics=Metrics(),
+        limit=RateLimit(settings.server.ballots_per_minute, settings.server.burst),
+    )
+
+
+def services(request: Request) -> Services:
+    """The parts of the app that a request came to."""
+    found: Services = request.app.state.services
+    return found
