@@ -17,7 +17,8 @@ from pathlib import Path
 import numpy as np
 
 from mapvote.config import Settings, choose_case
-from mapvote.core.types import Drive, PointMap
+from mapvote.core.point_map import PointMap
+from mapvote.core.types import Drive
 from mapvote.formats import open_drive
 from mapvote.simulation import simulate
 from mapvote.slam.build import build_map

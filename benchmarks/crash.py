@@ -34,7 +34,8 @@ from hand_made import Say, make_ballot, make_map, make_tile, states_plane, wall
 from mapvote.codec.ballot import Ballot, encode
 from mapvote.config import FuseSettings
 from mapvote.core.grid import TileIndex
-from mapvote.core.types import CellState, MapTile, MapvoteError
+from mapvote.core.tile import Tile
+from mapvote.core.types import CellState, MapvoteError
 from mapvote.server.errors import Conflict, Unavailable
 from mapvote.server.store import schema
 from mapvote.server.store.admission import accept, examine
@@ -58,7 +59,7 @@ def first_map(url: str) -> None:
     Store.create(url, make_map(dict.fromkeys(TILES, tile))).close()
 
 
-def votes_on(content: MapTile, tile: TileIndex, cell: tuple[int, int], vehicle: str, drive: str) -> list[Ballot]:
+def votes_on(content: Tile, tile: TileIndex, cell: tuple[int, int], vehicle: str, drive: str) -> list[Ballot]:
     """Two vehicles that agree: what stands in the cell is gone, or, where nothing stands, it is back."""
     point_map, points = make_map({tile: content}), content.points
     inside = (np.floor(points[:, 1] / 0.3) == cell[0]) & (np.floor(points[:, 0] / 0.3) == cell[1])
@@ -69,7 +70,7 @@ def votes_on(content: MapTile, tile: TileIndex, cell: tuple[int, int], vehicle: 
     return [make_ballot(point_map, {tile: say}, f"{vehicle}{i}", drive, now - S + i) for i in range(2)]
 
 
-def tile_now(store: Store, tile: TileIndex) -> MapTile:
+def tile_now(store: Store, tile: TileIndex) -> Tile:
     """A tile of the newest version."""
     content = store.tile(store.current(), tile)
     assert content is not None

@@ -34,7 +34,8 @@ from hand_made import Cell, Say, make_ballot, make_map, make_tile, wall
 from mapvote.codec.ballot import encode
 from mapvote.config import FuseSettings
 from mapvote.core.grid import TileIndex
-from mapvote.core.types import NO_VOTE, U8, CellState, PointMap
+from mapvote.core.point_map import PointMap
+from mapvote.core.types import NO_VOTE, U8, CellState
 from mapvote.fusion.tile_vote import DAY_NS
 from mapvote.server.store.admission import accept, examine
 from mapvote.server.store.ballots import Receipt

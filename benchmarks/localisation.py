@@ -19,7 +19,8 @@ import numpy as np
 
 from mapvote.config import Settings
 from mapvote.core.geometry import exp, inverse, log, rotation_angle
-from mapvote.core.types import F64, PointMap
+from mapvote.core.point_map import PointMap
+from mapvote.core.types import F64
 from mapvote.formats import open_drive, read_T_map_lidar
 from mapvote.localisation.deskew import deskew
 from mapvote.localisation.ndt import PosePrior, register

@@ -28,7 +28,8 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from hand_made import Say, make_ballot, make_map, make_tile, states_plane, wall
 from live_server import serving
 from mapvote.codec.ballot import encode
-from mapvote.core.types import CellState, PointMap
+from mapvote.core.point_map import PointMap
+from mapvote.core.types import CellState
 from mapvote.server.store.admission import accept, examine
 from mapvote.server.store.ballots import Receipt
 from mapvote.server.store.store import Store

@@ -9,7 +9,9 @@ import numpy as np
 
 from mapvote.codec.ballot import Ballot, BallotTile, pack_plane, tile_key
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Lattice, TileIndex
-from mapvote.core.types import F32, NO_VOTE, U8, U16, U64, MapTile, PointMap
+from mapvote.core.point_map import PointMap
+from mapvote.core.tile import Tile
+from mapvote.core.types import F32, NO_VOTE, U8, U16, U64
 from mapvote.fusion.offline import base_hash
 
 Cell = tuple[int, int]
@@ -24,11 +26,11 @@ def wall(cells: list[Cell], heights: list[float]) -> F32:
     return np.array(points, dtype=np.float32).reshape(-1, 3)
 
 
-def make_tile(points: F32, ground: float = 0.0) -> MapTile:
-    return MapTile(points, np.full(SHAPE, ground, dtype=np.float32))
+def make_tile(points: F32, ground: float = 0.0, index: TileIndex = (0, 0)) -> Tile:
+    return Tile(Lattice().tile(index), points, np.full(SHAPE, ground, dtype=np.float32))
 
 
-def make_map(tiles: Mapping[TileIndex, MapTile]) -> PointMap:
+def make_map(tiles: Mapping[TileIndex, Tile]) -> PointMap:
     return PointMap("test-map", Lattice(), dict(tiles))
 
 

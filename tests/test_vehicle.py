@@ -10,11 +10,11 @@ import pytest
 
 from mapvote.codec.ballot import decode, encode, unpack_points, unpack_states, unpack_tally, unpack_words, validate
 from mapvote.config import Settings, VotingSettings
-from mapvote.core.grid import TILE_CELLS, tile_grid
+from mapvote.core.grid import TILE_CELLS
+from mapvote.core.point_map import PointMap, map_from_points
 from mapvote.core.reference import reference_window
 from mapvote.core.sensors import SENSORS
-from mapvote.core.tile import map_from_points
-from mapvote.core.types import F64, Bool, CellState, MapvoteError, PointMap, Registration, Scan
+from mapvote.core.types import F64, Bool, CellState, MapvoteError, Registration, Scan
 from mapvote.localisation.ndt import PosePrior
 from mapvote.localisation.tracker import Fix
 from mapvote.vehicle import Vehicle
@@ -87,7 +87,7 @@ def drive(vehicle: Vehicle) -> Vehicle:
 def state_at(vehicle: Vehicle, x: float, y: float, voting: VotingSettings | None = None) -> int:
     ballot = vehicle.ballot(voting)
     for tile in ballot.tiles:
-        grid = tile_grid(vehicle.point_map.lattice, tile.tile)
+        grid = vehicle.point_map.lattice.tile(tile.tile)
         rows, cols, inside = grid.indices_of(np.array([[x, y]]))
         if inside[0]:
             assert tile.states is not None
@@ -188,7 +188,7 @@ def test_columns_tell_what_was_taken_down_and_which_voxels_are_gone() -> None:
         assert tile.gone is not None
         assert tile.states is not None
         gone, states = unpack_words(tile.gone, "gone"), unpack_states(tile.states)
-        window = tile_grid(vehicle.point_map.lattice, tile.tile)
+        window = vehicle.point_map.lattice.tile(tile.tile)
         mapped = reference_window(vehicle.point_map, window).occupied
         assert not (gone & ~mapped).any()
         assert (gone[states != CellState.CHANGED_EMPTY] == 0).all()

@@ -12,10 +12,10 @@ if TYPE_CHECKING:
     from mapvote.codec.ballot import Ballot as Ballot
     from mapvote.config import Settings as Settings
     from mapvote.config import load_settings as load_settings
+    from mapvote.core.point_map import PointMap as PointMap
     from mapvote.core.types import CellState as CellState
     from mapvote.core.types import Drive as Drive
     from mapvote.core.types import MapvoteError as MapvoteError
-    from mapvote.core.types import PointMap as PointMap
     from mapvote.core.types import Scan as Scan
     from mapvote.formats import open_drive as open_drive
     from mapvote.formats import read_map as read_map

@@ -21,8 +21,10 @@ import msgspec
 import numpy as np
 
 from mapvote.codec.ballot import Ballot, decode, encode
-from mapvote.core.grid import TILE_CELLS, Lattice, TileIndex
-from mapvote.core.types import MapTile, MapvoteError, PointMap
+from mapvote.core.grid import Grid, Lattice, TileIndex
+from mapvote.core.point_map import PointMap
+from mapvote.core.tile import Tile
+from mapvote.core.types import MapvoteError
 from mapvote.formats.atomic import whole_file
 
 Sent = Literal["created", "replaced", "repeated", "spooled"]
@@ -97,9 +99,9 @@ class MapClient:
             manifest = msgspec.json.decode(self._ask("GET", path).content, type=_Manifest)
         except msgspec.DecodeError as error:
             raise MapvoteError(f"{self._url}: is no mapvote server ({error})") from error
-        tiles = {_index(key): self._tile(planes) for key, planes in manifest.tiles.items()}
-        self.version = manifest.version
         lattice = Lattice(manifest.lattice.x0, manifest.lattice.y0)
+        tiles = {_index(key): self._tile(lattice.tile(_index(key)), planes) for key, planes in manifest.tiles.items()}
+        self.version = manifest.version
         return PointMap(manifest.map_id, lattice, tiles, manifest.georeference)
 
     def send(self, ballot: Ballot | bytes) -> Sent:
@@ -136,12 +138,13 @@ class MapClient:
         result: Sent = answer.json()["result"]
         return result
 
-    def _tile(self, planes: _Plane) -> MapTile:
-        shape = (TILE_CELLS, TILE_CELLS)
+    def _tile(self, window: Grid, planes: _Plane) -> Tile:
         points = np.frombuffer(self._plane(planes.points), dtype="<f4").reshape(-1, 3)
-        ground_z = np.frombuffer(self._plane(planes.ground), dtype="<f4").reshape(shape)
-        free = None if planes.free is None else np.frombuffer(self._plane(planes.free), dtype="<u8").reshape(shape)
-        return MapTile(points, ground_z, free)
+        ground_z = np.frombuffer(self._plane(planes.ground), dtype="<f4").reshape(window.shape)
+        free = (
+            None if planes.free is None else np.frombuffer(self._plane(planes.free), dtype="<u8").reshape(window.shape)
+        )
+        return Tile(window, points, ground_z, free)
 
     def _plane(self, digest: str) -> bytes:
         kept = self._planes / digest

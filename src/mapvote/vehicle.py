@@ -18,21 +18,11 @@ import numpy as np
 from mapvote.codec.ballot import Ballot, BallotTile, content_hash, pack_plane, tile_key
 from mapvote.config import Settings, VotingSettings
 from mapvote.core.geometry import transform
-from mapvote.core.grid import TileIndex, tile_grid
+from mapvote.core.grid import TileIndex
+from mapvote.core.point_map import PointMap
 from mapvote.core.reference import LocalMap, reference_window
 from mapvote.core.sensors import Sensor
-from mapvote.core.types import (
-    F64,
-    I32,
-    U64,
-    Bool,
-    CellState,
-    Drive,
-    MapvoteError,
-    PointMap,
-    Reference,
-    Scan,
-)
+from mapvote.core.types import F64, I32, U64, Bool, CellState, Drive, MapvoteError, Reference, Scan
 from mapvote.core.voting import to_wire
 from mapvote.detection.new_points import NewPoints, points_in, select
 from mapvote.detection.voters import Detectors
@@ -222,7 +212,7 @@ class Vehicle:
         }
         new_points = None
         if points is not None:
-            window = tile_grid(self.point_map.lattice, tile)
+            window = self.point_map.lattice.tile(tile)
             base = reference_window(self.point_map, window).base
             new = np.where(changed[CellState.CHANGED_OCCUPIED], votes.new, np.uint64(0))
             kept = points_in(window, points, new, base)

@@ -12,8 +12,8 @@ from typer.testing import CliRunner
 
 from mapvote.cli import files
 from mapvote.codec.ballot import Ballot, BallotTile, encode, pack_plane
+from mapvote.core.point_map import all_points, map_from_points
 from mapvote.core.sensors import SENSORS
-from mapvote.core.tile import all_points, map_from_points
 from mapvote.core.types import F64, MapvoteError
 from mapvote.formats import DriveWriter, read_map, write_map, write_pcd
 

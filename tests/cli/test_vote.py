@@ -8,8 +8,8 @@ from typer.testing import CliRunner
 
 from mapvote.cli import app, register
 from mapvote.core.geometry import from_xyz_rpy
+from mapvote.core.point_map import map_from_points
 from mapvote.core.sensors import SENSORS
-from mapvote.core.tile import map_from_points
 from mapvote.core.types import MapvoteError
 from mapvote.evaluation.loopback import running_server
 from mapvote.formats import DriveWriter, write_map

@@ -7,8 +7,8 @@ import pytest
 
 from mapvote.config import Settings, choose_case
 from mapvote.core.grid import Grid
+from mapvote.core.point_map import map_from_points
 from mapvote.core.reference import above_ground_points
-from mapvote.core.tile import map_from_points
 from mapvote.core.types import MapvoteError
 
 

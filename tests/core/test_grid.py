@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Grid, Lattice, tile_grid, tile_of_cells, window_around
+from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Grid, Lattice, tile_of_cells, window_around
 
 small = st.integers(-2000, 2000)
 sizes = st.integers(1, 600)
@@ -39,7 +39,7 @@ def test_intersection_and_union_bound_both(a: Grid, b: Grid) -> None:
 def test_tiles_cover_a_window_once(grid: Grid) -> None:
     seen = np.zeros(grid.shape, dtype=np.int64)
     for tile in grid.tiles():
-        common = tile_grid(grid.lattice, tile).intersection(grid)
+        common = grid.lattice.tile(tile).intersection(grid)
         seen[common.slices_in(grid)] += 1
     assert (seen == 1).all()
 
@@ -47,7 +47,7 @@ def test_tiles_cover_a_window_once(grid: Grid) -> None:
 @given(small, small)
 def test_a_cell_lies_in_the_tile_that_is_computed_for_it(row: int, col: int) -> None:
     tile_row, tile_col = tile_of_cells(np.array([row]), np.array([col]))
-    tile = tile_grid(Lattice(), (int(tile_row[0]), int(tile_col[0])))
+    tile = Lattice().tile((int(tile_row[0]), int(tile_col[0])))
     assert tile.row0 <= row < tile.row0 + TILE_CELLS
     assert tile.col0 <= col < tile.col0 + TILE_CELLS
 

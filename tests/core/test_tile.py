@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Grid, Lattice, tile_grid
+from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Grid, Lattice
 from mapvote.core.ground import ground_surface
-from mapvote.core.tile import all_points, map_from_points
+from mapvote.core.point_map import all_points, map_from_points
 from mapvote.core.types import F64, MapvoteError
 
 
@@ -37,7 +37,7 @@ def test_ground_has_no_seam_where_tiles_meet() -> None:
     whole = Grid(point_map.lattice, -TILE_CELLS * 2, -TILE_CELLS * 2, TILE_CELLS * 4, TILE_CELLS * 4)
     expected = ground_surface(points, whole)
     for tile, content in point_map.tiles.items():
-        piece = expected[tile_grid(point_map.lattice, tile).slices_in(whole)]
+        piece = expected[point_map.lattice.tile(tile).slices_in(whole)]
         np.testing.assert_allclose(content.ground_z, piece, atol=1e-5)
 
 

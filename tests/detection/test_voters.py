@@ -7,9 +7,9 @@ import pytest
 
 from hand_made import make_map, make_tile, wall
 from mapvote.config import VotingSettings
-from mapvote.core.grid import tile_grid
+from mapvote.core.point_map import PointMap
 from mapvote.core.reference import reference_window
-from mapvote.core.types import CellState, PointMap
+from mapvote.core.types import CellState
 from mapvote.detection.columns import ColumnVoter
 from mapvote.detection.counters import Evidence
 from mapvote.detection.regions import beside_new
@@ -37,7 +37,7 @@ def bits(heights: list[float]) -> np.uint64:
 def after(rules: str, more_hits: dict[tuple[int, int], list[float]] | None = None) -> TileVotes:
     """What a drive says after the wall is gone: rays go through everything, and only the post is struck."""
     point_map = street()
-    grid = tile_grid(point_map.lattice, (0, 0))
+    grid = point_map.lattice.tile((0, 0))
     reference = reference_window(point_map, grid)
     hit = np.zeros(grid.shape, np.uint64)
     hit[ROW, POST] = bits(POST_Z)

@@ -9,8 +9,8 @@ import pytest
 
 from mapvote.config import Settings
 from mapvote.core.geometry import from_xyz_rpy
+from mapvote.core.point_map import all_points, map_from_points
 from mapvote.core.sensors import SENSORS
-from mapvote.core.tile import all_points, map_from_points
 from mapvote.core.types import MapvoteError, Scan
 from mapvote.evaluation.loopback import running_server, vote_by_http
 from mapvote.formats import write_map

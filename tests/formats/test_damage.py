@@ -16,8 +16,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from live_server import mapvote
+from mapvote.core.point_map import map_from_points
 from mapvote.core.sensors import SENSORS
-from mapvote.core.tile import map_from_points
 from mapvote.core.types import MapvoteError
 from mapvote.formats import DriveWriter, export_map, open_drive, read_map, write_map
 from mapvote.formats.maps.las import write_las

@@ -7,13 +7,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hand_made import SHAPE, make_map, make_tile, wall
-from mapvote.core.grid import CELL_SIZE, Lattice, tile_grid
+from mapvote.core.grid import CELL_SIZE, Lattice
 from mapvote.core.reference import reference_window
-from mapvote.core.tile import cells_of, obstacle_bits
-from mapvote.core.types import F32, MapTile
+from mapvote.core.tile import Tile
+from mapvote.core.types import F32
 from mapvote.fusion.edit import add_points, delete_points
 
-GRID = tile_grid(Lattice(), (0, 0))
+GRID = Lattice().tile((0, 0))
 SEEDS = st.integers(0, 2**32 - 1)
 
 
@@ -27,9 +27,9 @@ def test_server_and_vehicle_see_the_same_columns(seed: int, unknown: float) -> N
     rng = np.random.default_rng(seed)
     ground = rng.uniform(-0.5, 2.0, SHAPE).astype(np.float32)
     ground[rng.random(SHAPE) < unknown] = np.nan
-    tile = MapTile(random_points(rng, 3000), ground)
+    tile = Tile(GRID, random_points(rng, 3000), ground)
     seen = reference_window(make_map({(0, 0): tile}), GRID)
-    assert np.array_equal(obstacle_bits(tile, GRID), seen.occupied)
+    assert np.array_equal(tile.obstacle_words, seen.occupied)
 
 
 @given(seed=SEEDS)
@@ -39,14 +39,14 @@ def test_deleting_takes_the_marked_obstacles_and_nothing_else(seed: int) -> None
     tile = make_tile(random_points(rng, 2000, cells=8))
     gone = rng.integers(0, 2**62, SHAPE, dtype=np.int64).astype(np.uint64)
     gone[:4] = 0
-    edited, deleted = delete_points(tile, GRID, gone)
+    edited, deleted = delete_points(tile, gone)
     keep = []
     for x, y, z in tile.points.tolist():
         word = int(gone[int(y / CELL_SIZE), int(x / CELL_SIZE)])
         keep.append(z < 0.3 or not word >> min(int(z / CELL_SIZE), 63) & 1)
     assert edited.points.tobytes() == tile.points[keep].tobytes()
     assert deleted == len(keep) - sum(keep)
-    assert delete_points(tile, GRID, np.zeros(SHAPE, np.uint64))[0] is tile
+    assert delete_points(tile, np.zeros(SHAPE, np.uint64))[0] is tile
 
 
 @given(seed=SEEDS, min_votes=st.integers(1, 3))
@@ -57,12 +57,12 @@ def test_one_point_a_voxel_the_nearest_to_the_mean_whoever_came_first(seed: int,
     points = np.concatenate([points, points[:40]])  # the same point offered twice
     voters = rng.integers(0, 4, len(points)).astype(np.int32)
     tile = make_tile(wall([(1, 1)], [0.45]))
-    edited, added = add_points(tile, GRID, points, cells_of(GRID, points), voters, min_votes)
+    edited, added = add_points(tile, points, GRID.flat_cells(points), voters, min_votes)
     order = rng.permutation(len(points))
-    again, _ = add_points(tile, GRID, points[order], cells_of(GRID, points[order]), voters[order], min_votes)
+    again, _ = add_points(tile, points[order], GRID.flat_cells(points[order]), voters[order], min_votes)
     assert again.points.tobytes() == edited.points.tobytes()
 
-    cell, layer = cells_of(GRID, points), np.floor(points[:, 2].astype(np.float64) / CELL_SIZE)
+    cell, layer = GRID.flat_cells(points), np.floor(points[:, 2].astype(np.float64) / CELL_SIZE)
     expected = 0
     for c, k in sorted(set(zip(cell.tolist(), layer.tolist(), strict=True))):
         mine = points[(cell == c) & (layer == k)].astype(np.float64)

@@ -11,17 +11,19 @@ from hypothesis import strategies as st
 
 from hand_made import SHAPE, make_tile, states_plane, wall, words_plane
 from mapvote.config import FuseSettings
-from mapvote.core.grid import Lattice, tile_grid
-from mapvote.core.types import NO_VOTE, U8, CellState, MapTile
+from mapvote.core.grid import Lattice
+from mapvote.core.tile import Tile
+from mapvote.core.types import NO_VOTE, U8, CellState
 from mapvote.core.voting import VOTE_UNIT
 from mapvote.fusion.fuse import Rule, count, fuse_tile, states_over
 from mapvote.fusion.sparse_columns import Words
 from mapvote.fusion.tile_vote import DAY_NS, TileVote, fold, restrict, select
 
 LATTICE = Lattice()
-GRID = tile_grid(LATTICE, (0, 0))
+GRID = LATTICE.tile((0, 0))
 CELL = (10, 10)
 KEEP, SURE = FuseSettings(min_votes=1), FuseSettings(min_votes=2)
+NOTHING = Tile.empty(LATTICE.tile((0, 0)))
 EMPTY, OCCUPIED = CellState.CHANGED_EMPTY, CellState.CHANGED_OCCUPIED
 
 
@@ -33,10 +35,8 @@ def marks(word: int) -> Words:
     return Words.of(words_plane({CELL: word}))
 
 
-def fuse(
-    tile: MapTile | None, votes: list[TileVote], policy: FuseSettings = KEEP, rule: Rule = "columns"
-) -> tuple[U8, MapTile | None]:
-    decision, edited = fuse_tile(LATTICE, (0, 0), tile, votes, rule, policy)
+def fuse(tile: Tile, votes: list[TileVote], policy: FuseSettings = KEEP, rule: Rule = "columns") -> tuple[U8, Tile]:
+    decision, edited = fuse_tile(tile, votes, rule, policy)
     return decision.states, edited
 
 
@@ -73,7 +73,6 @@ def test_ground_is_never_deleted_and_everything_else_is_bit_identical() -> None:
     tile = make_tile(np.concatenate([gone, ground, other]))
     states, edited = fuse(tile, [vote("a", states_plane({CELL: EMPTY}))])
     assert states[CELL] == EMPTY
-    assert edited is not None
     assert edited.points.tobytes() == np.concatenate([ground, other]).tobytes()
     assert edited.ground_z is tile.ground_z
 
@@ -82,7 +81,6 @@ def test_delete_mask_takes_the_awning_and_leaves_the_wall() -> None:
     tile = make_tile(wall([CELL], [0.45, 1.05, 3.15]))
     awning = marks(1 << 10)
     _, edited = fuse(tile, [vote("a", states_plane({CELL: EMPTY}), gone=awning)])
-    assert edited is not None
     assert edited.points[:, 2].tolist() == pytest.approx([0.45, 1.05])
 
 
@@ -93,7 +91,6 @@ def test_only_voxels_marked_by_enough_vehicles_are_deleted() -> None:
         vote(f"v{i}", states_plane({CELL: EMPTY}), gone=Words.of(words_plane({CELL: m}))) for i, m in enumerate(masks)
     ]
     _, edited = fuse(tile, votes, SURE)
-    assert edited is not None
     assert edited.points[:, 2].tolist() == pytest.approx([0.45, 1.05])
 
 
@@ -117,7 +114,6 @@ def test_remnants_go_from_a_cell_that_stands_if_most_vehicles_mark_them(masks: l
     tile = make_tile(wall([CELL], [0.45, 0.75, 1.05]))
     states, edited = fuse(tile, standing(masks), SURE)
     assert states[CELL] == KEPT
-    assert edited is not None
     assert edited.points[:, 2].tolist() == pytest.approx(left)
     assert (edited is tile) == (len(left) == 3)
 
@@ -143,7 +139,6 @@ def test_a_drive_s_remnants_are_its_vehicle_s() -> None:
 def test_heights_are_relative_to_the_ground_of_the_cell() -> None:
     tile = make_tile(wall([CELL], [100.1, 100.65]), ground=100.0)
     _, edited = fuse(tile, [vote("a", states_plane({CELL: EMPTY}), gone=marks(1 << 2))])
-    assert edited is not None
     assert edited.points[:, 2].tolist() == pytest.approx([100.1])
 
 
@@ -159,16 +154,14 @@ def test_right_state_with_false_points_injects_nothing() -> None:
     honest = wall([CELL], [0.45, 0.75])
     lies = np.concatenate([wall([CELL], [5.0, 9.0]), wall([(99, 99)], [1.0])])
     votes = [vote(f"v{i}", states_plane({CELL: OCCUPIED}), new_points=p) for i, p in enumerate([honest, honest, lies])]
-    _, edited = fuse(None, votes, SURE)
-    assert edited is not None
+    _, edited = fuse(NOTHING, votes, SURE)
     assert edited.points[:, 2].tolist() == pytest.approx([0.45, 0.75])
 
 
 def test_new_points_need_support_within_one_voxel_of_the_column() -> None:
     says = [wall([CELL], [0.45, 3.15]), wall([CELL], [0.75, 4.05])]
     votes = [vote(f"v{i}", states_plane({CELL: OCCUPIED}), new_points=p) for i, p in enumerate(says)]
-    _, edited = fuse(None, votes, SURE)
-    assert edited is not None
+    _, edited = fuse(NOTHING, votes, SURE)
     assert edited.points[:, 2].tolist() == pytest.approx([0.45, 0.75])
 
 
@@ -177,8 +170,7 @@ def test_a_vehicle_that_voted_otherwise_adds_no_points() -> None:
         vote("a", states_plane({CELL: OCCUPIED}), new_points=wall([CELL], [0.45])),
         vote("b", states_plane({CELL: CellState.UNDETERMINED}), new_points=wall([CELL], [0.45, 6.0])),
     ]
-    _, edited = fuse(None, votes)
-    assert edited is not None
+    _, edited = fuse(NOTHING, votes)
     assert len(edited.points) == 1
 
 
@@ -186,7 +178,6 @@ def test_a_voxel_of_the_map_stays_as_it_is() -> None:
     tile = make_tile(wall([CELL], [0.05]))
     offered = wall([CELL], [0.1, 0.45]) + np.float32(0.01)
     _, edited = fuse(tile, [vote("a", states_plane({CELL: OCCUPIED}), new_points=offered)])
-    assert edited is not None
     assert len(edited.points) == 2
     assert edited.points[:1].tobytes() == tile.points.tobytes()
 
@@ -209,7 +200,6 @@ def test_free_space_is_learned_by_enough_vehicles_and_not_where_the_map_has_poin
     votes = [vote(v, states_plane(fill=1), free=Words.of(free)) for v in ("a", "b")]
     _, edited = fuse(tile, votes, SURE)
     _, alone = fuse(tile, votes[:1], SURE)
-    assert edited is not None
     assert edited.free is not None
     assert edited.points is tile.points
     assert int(edited.free[CELL]) == 0b1011
@@ -372,15 +362,14 @@ def test_order_never_matters(seed: int, rule: Rule, min_votes: int) -> None:
     for _ in range(3):
         order = [drives[i] for i in rng.permutation(len(drives))]
         states, edited = fuse(tile, order, FuseSettings(min_votes=min_votes), rule)
-        assert edited is not None
         free = b"never learned" if edited.free is None else edited.free.tobytes()
         results.add((states.tobytes(), edited.points.tobytes(), free))
     assert len(results) == 1
 
 
 def test_states_over_a_window_of_tiles() -> None:
-    decision, _ = fuse_tile(LATTICE, (2, 3), None, [vote("a", states_plane({CELL: EMPTY}))], "columns", KEEP)
-    far, _ = fuse_tile(LATTICE, (3, 5), None, [vote("a", states_plane({CELL: OCCUPIED}))], "columns", KEEP)
+    decision, _ = fuse_tile(Tile.empty(LATTICE.tile((2, 3))), [vote("a", states_plane({CELL: EMPTY}))], "columns", KEEP)
+    far, _ = fuse_tile(Tile.empty(LATTICE.tile((3, 5))), [vote("a", states_plane({CELL: OCCUPIED}))], "columns", KEEP)
     states, grid = states_over(LATTICE, {(2, 3): decision, (3, 5): far})
     assert states.shape == (512, 768)
     assert (grid.x0, grid.y0) == pytest.approx((3 * 76.8, 2 * 76.8))

@@ -13,7 +13,8 @@ from hand_made import Say, make_ballot, states_plane, two_walls, wall
 from mapvote.cli import app, register
 from mapvote.codec.ballot import Ballot, encode
 from mapvote.config import FuseSettings
-from mapvote.core.types import CellState, MapvoteError, PointMap
+from mapvote.core.point_map import PointMap
+from mapvote.core.types import CellState, MapvoteError
 from mapvote.formats import read_map, write_map
 from mapvote.fusion.offline import update_map
 

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from hand_made import SHAPE
 from mapvote.config import FuseSettings
 from mapvote.core.grid import Lattice
+from mapvote.core.tile import Tile
 from mapvote.core.types import NO_VOTE, U8, CellState
 from mapvote.fusion.fuse import count, fuse_tile, hear
 from mapvote.fusion.tile_vote import TileVote
@@ -47,9 +48,9 @@ def test_k_that_invert_everything_are_not_heard_among_k_plus_1_that_do_not(k: in
 
 def test_a_liar_cannot_second_the_error_of_one_honest_vehicle() -> None:
     planes = [honest(i) for i in range(2)] + [OPPOSITE[honest(2)]]
-    lattice, policy = Lattice(), FuseSettings(min_votes=2)
-    decided = fuse_tile(lattice, (0, 0), None, named(planes), "columns", policy)[0].states
-    without = fuse_tile(lattice, (0, 0), None, named(planes[:2]), "columns", policy)[0].states
+    tile, policy = Tile.empty(Lattice().tile((0, 0))), FuseSettings(min_votes=2)
+    decided = fuse_tile(tile, named(planes), "columns", policy)[0].states
+    without = fuse_tile(tile, named(planes[:2]), "columns", policy)[0].states
     assert np.array_equal(decided, without)
 
 

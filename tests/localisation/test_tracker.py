@@ -5,8 +5,8 @@ import pytest
 
 from mapvote.config import NdtSettings
 from mapvote.core.geometry import exp, from_xyz_rpy, inverse, rotation_angle, transform
-from mapvote.core.tile import map_from_points
-from mapvote.core.types import F64, PointMap, Scan
+from mapvote.core.point_map import PointMap, map_from_points
+from mapvote.core.types import F64, Scan
 from mapvote.localisation.ndt import PosePrior
 from mapvote.localisation.tracker import MapWindow, Tracker, window_points
 from streets import path, street, sweep, twist_of

@@ -9,8 +9,8 @@ import pytest
 
 from mapvote.config import Settings
 from mapvote.core.geometry import from_xyz_rpy, inverse, transform
+from mapvote.core.point_map import all_points, map_from_points
 from mapvote.core.sensors import SENSORS
-from mapvote.core.tile import all_points, map_from_points
 from mapvote.core.types import F64, Drive, Scan
 from mapvote.slam.accumulate import Layer
 

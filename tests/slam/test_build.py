@@ -9,9 +9,8 @@ from scipy.spatial import cKDTree
 
 from mapvote.config import Settings
 from mapvote.core.geometry import exp, inverse, rotation_angle
-from mapvote.core.grid import tile_grid
+from mapvote.core.point_map import all_points
 from mapvote.core.reference import reference_window
-from mapvote.core.tile import all_points
 from mapvote.core.types import F64, MapvoteError, Scan
 from mapvote.formats import open_drive, read_T_map_lidar
 from mapvote.localisation.ndt import PosePrior
@@ -123,7 +122,7 @@ def test_what_is_known_to_be_free_holds_no_points(surveyed: tuple[F64, BuildRepo
     known = 0
     for tile, content in point_map.tiles.items():
         assert content.free is not None
-        reference = reference_window(point_map, tile_grid(point_map.lattice, tile))
+        reference = reference_window(point_map, point_map.lattice.tile(tile))
         assert not (content.free & reference.occupied).any()
         known += int(np.bitwise_count(content.free).sum())
     assert known > 1000

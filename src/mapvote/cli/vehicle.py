@@ -13,7 +13,7 @@ from mapvote.cli.options import Config, Mount, Prior, Rate, Scans, SensorName, T
 if TYPE_CHECKING:
     from mapvote.client import MapClient
     from mapvote.codec.ballot import Ballot
-    from mapvote.core.types import PointMap
+    from mapvote.core.point_map import PointMap
     from mapvote.slam.build import BuildReport
     from mapvote.vehicle import DriveReport
 

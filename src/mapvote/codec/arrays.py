@@ -9,22 +9,27 @@ from typing import Any
 
 import numpy as np
 import zstandard
-from backports import zstd
 from numpy.typing import NDArray
 
 from mapvote.core.types import U8, MapvoteError
 
 _own = threading.local()
+_STEP = 1024
 _BATCH = 32
 """Frames unpacked in one call: a larger buffer goes back to the system each time and costs page faults."""
 ZSTD_LEVEL = 19
 """For ballots, which travel by radio. Tiles of noisy float32 gain nothing above level 3."""
 
 
+def compress(raw: bytes, level: int = ZSTD_LEVEL) -> bytes:
+    """One zstd frame that says how large its content is."""
+    return zstandard.ZstdCompressor(level=level).compress(raw)
+
+
 def pack_plane(plane: NDArray[Any], level: int = ZSTD_LEVEL) -> bytes:
     """An array's little-endian C-order bytes, zstd-compressed."""
     little = np.ascontiguousarray(plane.astype(plane.dtype.newbyteorder("<"), copy=False))
-    return zstd.compress(little.tobytes(), level)
+    return compress(little.tobytes(), level)
 
 
 def unpack_bytes(data: bytes, limit: int, what: str) -> bytes:
@@ -45,19 +50,22 @@ def unpack_bytes(data: bytes, limit: int, what: str) -> bytes:
 
 def _unpack_unsaid(data: bytes, limit: int, what: str) -> bytes:
     """A frame that does not say how large it is."""
-    decompressor = zstd.ZstdDecompressor()
+    frame = zstandard.ZstdDecompressor().decompressobj()
+    raw = bytearray()
     try:
-        raw = decompressor.decompress(data, max_length=limit + 1)
-    except zstd.ZstdError as error:
+        for start in range(0, len(data), _STEP):  # a few kilobytes of frame hold 100 MB at the very most
+            raw += frame.decompress(data[start : start + _STEP])
+            if len(raw) > limit or frame.eof:
+                break
+    except zstandard.ZstdError as error:
         raise MapvoteError(f"{what} is damaged ({error}); fetch or send it again") from error
-    if len(raw) > limit or not decompressor.eof or decompressor.unused_data:
+    if len(raw) > limit or not frame.eof or frame.unused_data or start + _STEP < len(data):
         raise MapvoteError(f"{what} is truncated or larger than {limit} bytes when decompressed")
-    return raw
+    return bytes(raw)
 
 
 def _decompressor() -> zstandard.ZstdDecompressor:
-    """One for each thread, used again and again: making one takes as long as unpacking a small plane, and
-    backports.zstd makes one for each frame."""
+    """One for each thread, used again and again: making one takes as long as unpacking a small plane."""
     if not hasattr(_own, "decompressor"):
         _own.decompressor = zstandard.ZstdDecompressor()
     decompressor: zstandard.ZstdDecompressor = _own.decompressor

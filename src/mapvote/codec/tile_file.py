@@ -8,8 +8,9 @@ import msgspec
 import numpy as np
 
 from mapvote.codec.arrays import pack_plane, unpack_plane
-from mapvote.core.grid import CELL_SIZE, TILE_CELLS
-from mapvote.core.types import F32, U64, MapTile, MapvoteError
+from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Grid
+from mapvote.core.tile import Tile
+from mapvote.core.types import F32, U64, MapvoteError
 
 TILE_VERSION = 1
 MAX_TILE_POINTS = 50_000_000
@@ -38,7 +39,7 @@ def free_hash(free: U64 | None) -> str:
     return "" if free is None else hashlib.sha256(np.ascontiguousarray(free, dtype="<u8").tobytes()).hexdigest()
 
 
-def encode_tile(tile: MapTile) -> bytes:
+def encode_tile(tile: Tile) -> bytes:
     """The tile as one self-contained byte string: equal tiles, equal bytes."""
     return msgspec.msgpack.encode(
         _TileFile(
@@ -51,8 +52,8 @@ def encode_tile(tile: MapTile) -> bytes:
     )
 
 
-def decode_tile(data: bytes, what: str = "tile") -> MapTile:
-    """The tile that :func:`encode_tile` took; ``what`` names it in the MapvoteError if it is not usable."""
+def decode_tile(data: bytes, window: Grid, what: str = "tile") -> Tile:
+    """The tile over ``window`` that :func:`encode_tile` took; ``what`` names it in a MapvoteError if it is unusable."""
     try:
         file = msgspec.msgpack.decode(data, type=_TileFile)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
@@ -67,4 +68,4 @@ def decode_tile(data: bytes, what: str = "tile") -> MapTile:
         raise MapvoteError(f"{what}: holds a point outside the tile or not finite; fetch it again")
     ground_z = unpack_plane(file.ground_z, "<f4", _SHAPE, f"{what}: ground_z")
     free = None if file.free is None else unpack_plane(file.free, "<u8", _SHAPE, f"{what}: free")
-    return MapTile(points, ground_z, free)
+    return Tile(window, points, ground_z, free)

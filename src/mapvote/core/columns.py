@@ -9,45 +9,52 @@ from __future__ import annotations
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
 from mapvote.core.grid import CELL_SIZE
-from mapvote.core.types import F32, F64, I32, I64, U64
+from mapvote.core.types import F32, F64, I32, I64, U64, Bool
 
 GROUND_MARGIN_M = 0.3
 """Points lower than this above the ground are ground: they never make a cell occupied (METHOD 2)."""
 TOP_BIT = 63
 
 
+@numba.njit(cache=True, nogil=True, inline="always")
+def height_above(z: float, ground_z: float, base: int) -> float:
+    """Height of a point above the ground of its cell; where that is unknown, above the bottom of its column."""
+    return z - (base * CELL_SIZE if np.isnan(ground_z) else ground_z)
+
+
+@numba.njit(cache=True, nogil=True, inline="always")
+def column_bit(z: float, base: int) -> int:
+    """Which bit of its column's word a height belongs to; what is higher or lower than the word goes to its ends."""
+    return min(max(int(np.floor(z / CELL_SIZE)) - base, 0), TOP_BIT)
+
+
+@numba.njit(cache=True, nogil=True)
+def column_bits(z: F64, ground_z: F32, base: I32) -> tuple[I64, Bool]:
+    """(bit (n,), obstacle (n,)) of points: ``z`` their heights, ``ground_z`` and ``base`` those of their cells.
+
+    The one rule of what is an obstacle and what is ground: see :func:`height_above` and GROUND_MARGIN_M.
+    """
+    bit, obstacle = np.empty(len(z), np.int64), np.empty(len(z), np.bool_)
+    for i in range(len(z)):
+        bit[i] = column_bit(z[i], base[i])
+        obstacle[i] = height_above(z[i], ground_z[i], base[i]) >= GROUND_MARGIN_M
+    return bit, obstacle
+
+
 @numba.njit(cache=True, nogil=True)
 def fill_columns(
-    rows: I64,
-    cols: I64,
-    z: F64,
-    ground_z: F32,
-    base: I32,
-    margin: float,
-    words: NDArray[np.uint64],
-    counts: I32,
-    bottom_z: F32,
-    top_z: F32,
+    rows: I64, cols: I64, z: F64, ground_z: F32, base: I32, words: U64, counts: I32, bottom_z: F32, top_z: F32
 ) -> None:
-    """Enter points (cell indices inside the window, z in map metres) above ``ground + margin`` into the planes.
-
-    Points of cells whose ground is unknown are measured from the filled base. Planes are changed in place.
-    """
+    """Enter points (cell indices inside the window, z in map metres) that are obstacles into the planes, in place."""
     for i in range(len(z)):
         r, c = rows[i], cols[i]
         if r < 0 or c < 0 or r >= words.shape[0] or c >= words.shape[1]:
             continue
-        g = ground_z[r, c]
-        if np.isnan(g):
-            g = base[r, c] * CELL_SIZE
-        if z[i] - g < margin:
+        if height_above(z[i], ground_z[r, c], base[r, c]) < GROUND_MARGIN_M:
             continue
-        bit = int(np.floor(z[i] / CELL_SIZE)) - base[r, c]
-        bit = min(max(bit, 0), TOP_BIT)
-        words[r, c] |= np.uint64(1) << np.uint64(bit)
+        words[r, c] |= np.uint64(1) << np.uint64(column_bit(z[i], base[r, c]))
         counts[r, c] += 1
         bottom_z[r, c] = min(bottom_z[r, c], z[i])
         top_z[r, c] = max(top_z[r, c], z[i])

@@ -35,6 +35,10 @@ class Lattice:
         row = np.floor((xy[:, 1].astype(np.float64) - self.y0) / CELL_SIZE).astype(np.int64)
         return row, col
 
+    def tile(self, index: TileIndex) -> Grid:
+        """The window of one tile."""
+        return Grid(self, index[0] * TILE_CELLS, index[1] * TILE_CELLS, TILE_CELLS, TILE_CELLS)
+
 
 @dataclass(frozen=True, slots=True)
 class Grid:
@@ -66,6 +70,38 @@ class Grid:
         row -= self.row0
         col -= self.col0
         return row, col, (row >= 0) & (row < self.rows) & (col >= 0) & (col < self.cols)
+
+    def to_map(self, points: NDArray[np.float32]) -> NDArray[np.float64]:
+        """Points (n, 3) whose x, y are metres from this window's corner, in map metres, float64."""
+        out = points.astype(np.float64)
+        out[:, 0] += self.x0
+        out[:, 1] += self.y0
+        return out
+
+    def from_map(self, points_map: NDArray[np.floating]) -> NDArray[np.float32]:
+        """Points (n, 3) in map metres as float32 from this window's corner, kept inside the half-open window.
+
+        Rounding to float32 must not carry a point over the far edge, into the next tile.
+        """
+        local = points_map.astype(np.float64)
+        local[:, 0] -= self.x0
+        local[:, 1] -= self.y0
+        out = local.astype(np.float32)
+        for axis, cells in ((0, self.cols), (1, self.rows)):
+            edge = np.nextafter(np.float32(cells * CELL_SIZE), np.float32(0.0))
+            out[:, axis] = np.clip(out[:, axis], np.float32(0.0), edge)
+        return out
+
+    def flat_cells(self, points: NDArray[np.float32]) -> NDArray[np.int64]:
+        """(n,) row * cols + col of points from this window's corner; the outermost cells take what rounding moved."""
+        rows, cols, _ = self.indices_of(self.to_map(points))
+        flat: NDArray[np.int64] = np.clip(rows, 0, self.rows - 1) * self.cols + np.clip(cols, 0, self.cols - 1)
+        return flat
+
+    @property
+    def tile_index(self) -> TileIndex:
+        """The tile whose lower-left corner is this window's; for windows made by :meth:`Lattice.tile`."""
+        return self.row0 // TILE_CELLS, self.col0 // TILE_CELLS
 
     def centres(self) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
         """(x of each column, y of each row), map metres."""
@@ -116,11 +152,6 @@ def window_around(lattice: Lattice, x: float, y: float, side_m: float) -> Grid:
     half = round(0.5 * side_m / CELL_SIZE)
     rows, cols = lattice.cells_of(np.array([[x, y]]))
     return Grid(lattice, int(rows[0]) - half, int(cols[0]) - half, 2 * half + 1, 2 * half + 1)
-
-
-def tile_grid(lattice: Lattice, tile: TileIndex) -> Grid:
-    """The window of one tile."""
-    return Grid(lattice, tile[0] * TILE_CELLS, tile[1] * TILE_CELLS, TILE_CELLS, TILE_CELLS)
 
 
 def tile_of_cells(rows: NDArray[np.int64], cols: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

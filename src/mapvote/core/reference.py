@@ -6,10 +6,10 @@ import numpy as np
 from scipy import ndimage
 
 from mapvote.core.columns import GROUND_MARGIN_M, fill_columns
-from mapvote.core.grid import TILE_CELLS, Grid, tile_grid, window_around
+from mapvote.core.grid import TILE_CELLS, Grid, window_around
 from mapvote.core.ground import base_layers
-from mapvote.core.tile import map_points
-from mapvote.core.types import F64, U64, PointMap, Reference
+from mapvote.core.point_map import PointMap
+from mapvote.core.types import F64, U64, Reference
 
 
 def reference_window(point_map: PointMap, grid: Grid) -> Reference:
@@ -22,13 +22,13 @@ def reference_window(point_map: PointMap, grid: Grid) -> Reference:
         if tile not in point_map.tiles:
             continue
         content = point_map.tiles[tile]
-        window = tile_grid(point_map.lattice, tile)
+        window = content.window
         common = window.intersection(grid)
         ground_z[common.slices_in(grid)] = content.ground_z[common.slices_in(window)]
         if content.free is not None:
             learned = True
             free[common.slices_in(grid)] = content.free[common.slices_in(window)]
-        clouds.append(map_points(window, content.points))
+        clouds.append(content.points_map)
     base = base_layers(ground_z)
     occupied = np.zeros(grid.shape, dtype=np.uint64)
     counts = np.zeros(grid.shape, dtype=np.int32)
@@ -36,7 +36,7 @@ def reference_window(point_map: PointMap, grid: Grid) -> Reference:
     top_z = np.full(grid.shape, -np.inf, dtype=np.float32)
     for cloud in clouds:
         rows, cols, _ = grid.indices_of(cloud)
-        fill_columns(rows, cols, cloud[:, 2], ground_z, base, GROUND_MARGIN_M, occupied, counts, bottom_z, top_z)
+        fill_columns(rows, cols, cloud[:, 2], ground_z, base, occupied, counts, bottom_z, top_z)
     return Reference(grid, ground_z, base, occupied, counts, bottom_z, top_z, free if learned else None)
 
 
@@ -50,9 +50,9 @@ def above_ground_points(point_map: PointMap, grid: Grid) -> U64:
     seen = np.zeros(wide.shape, dtype=np.bool_)
     for tile in wide.tiles():
         if tile in point_map.tiles:
-            window = tile_grid(point_map.lattice, tile)
             content = point_map.tiles[tile]
-            rows, cols, inside = window.indices_of(map_points(window, content.points))
+            window = content.window
+            rows, cols, inside = window.indices_of(content.points_map)
             low = content.points[:, 2] - content.ground_z[rows * inside, cols * inside] < GROUND_MARGIN_M
             r, c = rows[low & inside] + window.row0 - wide.row0, cols[low & inside] + window.col0 - wide.col0
             here = (r >= 0) & (c >= 0) & (r < wide.rows) & (c < wide.cols)
@@ -90,6 +90,6 @@ class LocalMap:
         window = window_around(lattice, origin_map[0], origin_map[1], self.window_m)
         if self.outer is None or window.intersection(self.outer.grid) != window:
             row, col = window.row0 + window.rows // 2, window.col0 + window.cols // 2
-            centre = tile_grid(lattice, (row // TILE_CELLS, col // TILE_CELLS))
+            centre = lattice.tile((row // TILE_CELLS, col // TILE_CELLS))
             self.outer = reference_window(self.point_map, centre.padded(max(TILE_CELLS, window.rows)))
         return cut_reference(self.outer, window), self.outer

@@ -5,7 +5,7 @@ Frames: ``map`` (the world), ``base`` (the vehicle), ``lidar``. SI units, else t
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from enum import IntEnum
 from pathlib import Path
@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from mapvote.core.grid import Grid, Lattice, TileIndex
+from mapvote.core.grid import Grid
 from mapvote.core.sensors import Sensor
 
 F32 = NDArray[np.float32]
@@ -96,29 +96,6 @@ class Registration:
     """Share of the points used that fell into a populated voxel and agreed with it."""
     iterations: int
     converged: bool
-
-
-@dataclass(frozen=True, slots=True)
-class MapTile:
-    """76.8 m x 76.8 m of map. ``points`` are the product; the planes are what the map knows besides."""
-
-    points: F32
-    """(n, 3): x, y from the tile's lower-left corner, z in map metres."""
-    ground_z: F32
-    """(256, 256) height of the ground, map metres; NaN where unknown. Fixed when the map is first built."""
-    free: U64 | None = None
-    """(256, 256) column words of voxels known to be free (see core.columns), or None if never learned."""
-
-
-@dataclass(frozen=True, slots=True)
-class PointMap:
-    """A whole map. Edited tiles make a new PointMap; tiles themselves never change."""
-
-    map_id: str
-    lattice: Lattice
-    tiles: Mapping[TileIndex, MapTile]
-    georeference: Mapping[str, str] = field(default_factory=dict)
-    """Free text carried along (CRS, projector, origin)."""
 
 
 @dataclass(frozen=True, slots=True)

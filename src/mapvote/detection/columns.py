@@ -12,9 +12,10 @@ import numpy as np
 
 from mapvote.config import VotingSettings
 from mapvote.core.columns import TOP_BIT, below_top, dilated
-from mapvote.core.grid import TileIndex, tile_grid
+from mapvote.core.grid import TileIndex
+from mapvote.core.point_map import PointMap
 from mapvote.core.reference import above_ground_points, cut_reference, reference_window
-from mapvote.core.types import I32, U64, Bool, PointMap
+from mapvote.core.types import I32, U64, Bool
 from mapvote.core.voting import VOTE_UNIT
 from mapvote.detection.counters import PLANES, Evidence, count_of, free_words, is_open
 from mapvote.detection.regions import around, beside_new, loose_voxels, settle
@@ -159,7 +160,7 @@ class ColumnVoter:
 
     def _judge(self, tile: TileIndex) -> Judged:
         """What the tile's own evidence says, cell by cell."""
-        window = tile_grid(self.point_map.lattice, tile)
+        window = self.point_map.lattice.tile(tile)
         outer = reference_window(self.point_map, window.padded(1))
         counts = around(self.point_map.lattice, self.evidence.tiles, outer.grid, 0)
         near = dilated(outer.occupied, outer.base, 1)[1:-1, 1:-1]

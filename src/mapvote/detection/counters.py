@@ -15,7 +15,7 @@ import numba
 import numpy as np
 
 from mapvote.core.columns import TOP_BIT, neighbourhood
-from mapvote.core.grid import TILE_CELLS, Lattice, TileIndex, tile_grid
+from mapvote.core.grid import TILE_CELLS, Lattice, TileIndex
 from mapvote.core.types import F32, I32, U8, U64, Reference
 from mapvote.perception.raycast import ScanView, Sight
 
@@ -121,7 +121,7 @@ class Evidence:
     def add(self, view: ScanView, reference: Reference, reach: int = 1) -> None:
         """Add one scan seen against ``reference``; ``reach`` cells around a hit it may stand for (pose uncertainty)."""
         for tile in view.grid.tiles():
-            window = tile_grid(self.lattice, tile)
+            window = self.lattice.tile(tile)
             common = window.intersection(view.grid)
             if tile not in self.tiles:
                 self.tiles[tile] = np.zeros((TILE_CELLS, TILE_CELLS, WORDS), dtype=np.uint64)

@@ -6,7 +6,6 @@ import numba
 import numpy as np
 
 from mapvote.core.grid import CELL_SIZE, Grid, Lattice, TileIndex, tile_of_cells
-from mapvote.core.tile import tile_points
 from mapvote.core.types import F32, F64, I32, U64, Bool
 from mapvote.core.voxels import voxel_keys
 
@@ -60,4 +59,4 @@ def points_in(window: Grid, points_map: F64, words: U64, base: I32) -> F32:
     rows, cols, _ = window.indices_of(points_map)
     cell = (rows * window.cols + cols).astype(np.int32)
     wanted = select(points_map, cell, np.ones(len(points_map), np.bool_), words.ravel(), base.ravel())
-    return tile_points(window, points_map[wanted])
+    return window.from_map(points_map[wanted])

@@ -7,9 +7,10 @@ import numpy as np
 
 from mapvote.config import VotingSettings
 from mapvote.core.columns import below_top, span_of
-from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Grid, Lattice, TileIndex, tile_grid
+from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Grid, Lattice, TileIndex
+from mapvote.core.point_map import PointMap
 from mapvote.core.sensors import Sensor
-from mapvote.core.types import F32, F64, I32, N_STATES, NO_VOTE, U8, U64, CellState, PointMap, Reference
+from mapvote.core.types import F32, F64, I32, N_STATES, NO_VOTE, U8, U64, CellState, Reference
 from mapvote.core.voting import VOTE_UNIT, cast, decide, weight_table
 from mapvote.detection.votes import ALL_BITS, Observation, TileVotes
 from mapvote.perception.raycast import ScanView, Sight
@@ -89,7 +90,7 @@ class Tally:
     def add(self, grid: Grid, states: U8, weights: I32) -> None:
         """Cast one scan's ``states`` (rows, cols of ``grid``) with ``weights``."""
         for tile in grid.tiles():
-            window = tile_grid(self.lattice, tile)
+            window = self.lattice.tile(tile)
             common = window.intersection(grid)
             if tile not in self.tiles:
                 self.tiles[tile] = np.zeros((TILE_CELLS, TILE_CELLS, N_STATES), dtype=np.int32)

@@ -16,7 +16,7 @@ from scipy import ndimage
 
 from mapvote.config import VotingSettings
 from mapvote.core.columns import TOP_BIT, dilated, remnants
-from mapvote.core.grid import Grid, Lattice, TileIndex, tile_grid
+from mapvote.core.grid import Grid, Lattice, TileIndex
 from mapvote.core.types import I32, NO_VOTE, U8, U64, Bool, CellState
 from mapvote.detection.counters import PLANES, STRUCK_ITSELF, THROUGH_ITSELF
 from mapvote.detection.votes import Judged
@@ -91,7 +91,7 @@ def _beyond(
     what it is where there is no tile. Nothing changes until all tiles are through."""
     out = {}
     for tile in planes[0][0]:
-        wide = tile_grid(lattice, tile).padded(halo)
+        wide = lattice.tile(tile).padded(halo)
         near = [around(lattice, plane, wide, elsewhere) for plane, elsewhere in planes]
         out[tile] = rule(*near)[halo:-halo, halo:-halo]
     return out
@@ -103,7 +103,7 @@ def around(lattice: Lattice, planes: Mapping[TileIndex, Plane], wide: Grid, else
     out = np.full((*wide.shape, *first.shape[2:]), elsewhere, dtype=first.dtype)
     for tile in wide.tiles():
         if tile in planes:
-            grid = tile_grid(lattice, tile)
+            grid = lattice.tile(tile)
             common = grid.intersection(wide)
             out[common.slices_in(wide)] = planes[tile][common.slices_in(grid)]
     return out

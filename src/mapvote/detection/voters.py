@@ -10,8 +10,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from mapvote.config import VotingSettings
+from mapvote.core.point_map import PointMap
 from mapvote.core.sensors import Sensor
-from mapvote.core.types import U64, PointMap
+from mapvote.core.types import U64
 from mapvote.detection.columns import ColumnVoter
 from mapvote.detection.counters import Evidence
 from mapvote.detection.paper import PaperVoter

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from mapvote.config import Settings
-from mapvote.core.tile import all_points
+from mapvote.core.point_map import all_points
 from mapvote.core.types import MapvoteError
 from mapvote.evaluation.evaluate import Evaluation, evaluate
 from mapvote.evaluation.experiments.cases import choose_cases

@@ -10,7 +10,7 @@ from typing import Any
 
 from mapvote.codec.ballot import Ballot
 from mapvote.core.grid import Grid
-from mapvote.core.types import PointMap
+from mapvote.core.point_map import PointMap
 from mapvote.evaluation.baselines.run import yardsticks
 from mapvote.evaluation.experiments.cases import Case, Pass, fuse_case, passes
 from mapvote.evaluation.experiments.changed_areas import in_changed_areas, survey_anew

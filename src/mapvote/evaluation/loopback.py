@@ -13,7 +13,8 @@ import httpx2
 
 from mapvote.client import MapClient
 from mapvote.codec.ballot import Ballot
-from mapvote.core.types import MapvoteError, PointMap
+from mapvote.core.point_map import PointMap
+from mapvote.core.types import MapvoteError
 
 _STOP_S = 20.0
 _SERVE = "from mapvote.cli import main; main()"

@@ -11,8 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
-from mapvote.core.tile import all_points
-from mapvote.core.types import Drive, MapvoteError, PointMap
+from mapvote.core.point_map import PointMap, all_points
+from mapvote.core.types import Drive, MapvoteError
 from mapvote.formats.drives.kitti import DriveWriter, is_kitti_folder, open_kitti, read_T_map_lidar
 from mapvote.formats.drives.kitti_raw import is_kitti_raw, open_kitti_raw
 from mapvote.formats.drives.options import DriveOptions

@@ -9,8 +9,8 @@ import numpy as np
 
 from mapvote.codec.ballot import Ballot, decode, unpack_points, unpack_states
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS
-from mapvote.core.tile import all_points
-from mapvote.core.types import CellState, Drive, MapvoteError, PointMap
+from mapvote.core.point_map import PointMap, all_points
+from mapvote.core.types import CellState, Drive, MapvoteError
 from mapvote.formats import CLOUDS, DRIVES, open_drive, read_cloud, read_map
 from mapvote.formats.maps.cloud import to_map
 from mapvote.formats.maps.mapvote_folder import is_map_folder

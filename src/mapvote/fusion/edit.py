@@ -8,30 +8,30 @@ import numba
 import numpy as np
 
 from mapvote.core.columns import EVERY_BIT
-from mapvote.core.grid import CELL_SIZE, CELLS, Grid
-from mapvote.core.tile import cells_of, columns_of
-from mapvote.core.types import F32, I32, I64, U64, Bool, MapTile
+from mapvote.core.grid import CELL_SIZE, CELLS
+from mapvote.core.tile import Tile
+from mapvote.core.types import F32, I32, I64, U64, Bool
 
 
-def delete_points(tile: MapTile, grid: Grid, gone: U64) -> tuple[MapTile, int]:
+def delete_points(tile: Tile, gone: U64) -> tuple[Tile, int]:
     """The tile without the obstacle points whose voxel is marked in ``gone`` (256, 256), and how many went.
 
     Ground points are never deleted. Where the ground is unknown, vehicle and server share no base layer for their
     words, so any mark takes the whole column.
     """
-    cells = cells_of(grid, tile.points)
-    marked = np.flatnonzero(gone.reshape(-1)[cells])
-    cells = cells[marked]
-    bit, obstacle = columns_of(tile.points[marked], cells, tile.ground_z)
-    known = np.isfinite(tile.ground_z.reshape(-1)[cells])
-    words = np.where(known, gone.reshape(-1)[cells], EVERY_BIT)
-    dropped = marked[obstacle & ((words >> bit.astype(np.uint64)) & np.uint64(1)).astype(np.bool_)]
-    if not len(dropped):
+    words = gone.reshape(-1)[tile.cells]
+    if not words.any():
         return tile, 0
-    return replace(tile, points=np.delete(tile.points, dropped, axis=0)), len(dropped)
+    bit, obstacle = tile.columns
+    known = np.isfinite(tile.ground_z.reshape(-1)[tile.cells])
+    words = np.where(known | (words == 0), words, EVERY_BIT)
+    dropped = obstacle & ((words >> bit.astype(np.uint64)) & np.uint64(1)).astype(np.bool_)
+    if not dropped.any():
+        return tile, 0
+    return replace(tile, points=tile.points[~dropped]), int(dropped.sum())
 
 
-def add_points(tile: MapTile, grid: Grid, points: F32, cells: I64, voters: I32, min_votes: int) -> tuple[MapTile, int]:
+def add_points(tile: Tile, points: F32, cells: I64, voters: I32, min_votes: int) -> tuple[Tile, int]:
     """The tile with one representative per voxel that at least ``min_votes`` voters support, and how many came.
 
     ``points`` (m, 3) from the tile's corner, ``cells`` (m,) flat, ``voters`` (m,) small integers. A voter supports
@@ -43,10 +43,9 @@ def add_points(tile: MapTile, grid: Grid, points: F32, cells: I64, voters: I32, 
     layers = np.floor(points[:, 2].astype(np.float64) / CELL_SIZE).astype(np.int64)
     touched = np.zeros(CELLS, dtype=np.bool_)
     touched[cells] = True
-    own_cells = cells_of(grid, tile.points)
-    near = touched[own_cells]
+    near = touched[tile.cells]
     own_layers = np.floor(tile.points[near, 2].astype(np.float64) / CELL_SIZE).astype(np.int64)
-    taken = np.isin(_voxel(cells, layers), _voxel(own_cells[near], own_layers))
+    taken = np.isin(_voxel(cells, layers), _voxel(tile.cells[near], own_layers))
     voxels = _voxel(cells, layers)
     order = np.argsort(voxels)
     chosen = _representatives(points, voxels, voters, taken, order, min_votes)

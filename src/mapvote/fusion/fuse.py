@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapvote.config import FuseSettings
-from mapvote.core.grid import CELLS, TILE_CELLS, Grid, Lattice, TileIndex, tile_grid
-from mapvote.core.tile import cells_of, empty_tile, obstacle_bits
-from mapvote.core.types import F32, I32, I64, N_STATES, NO_VOTE, U8, U64, Bool, CellState, MapTile, MapvoteError
+from mapvote.core.grid import CELLS, TILE_CELLS, Grid, Lattice, TileIndex
+from mapvote.core.tile import Tile
+from mapvote.core.types import F32, I32, I64, N_STATES, NO_VOTE, U8, U64, Bool, CellState, MapvoteError
 from mapvote.core.voting import VOTE_UNIT, add_states, add_tally, decide_cells
 from mapvote.fusion.edit import add_points, delete_points
 from mapvote.fusion.outliers import ASKED, contradicting, denying
@@ -87,31 +87,22 @@ def _states_of(votes: Sequence[TileVote], cells: slice | NDArray[np.intp] = slic
     return np.stack(planes) if planes else np.empty((0, CELLS), dtype=np.uint8)[:, cells]
 
 
-def fuse_tile(
-    lattice: Lattice,
-    index: TileIndex,
-    tile: MapTile | None,
-    drives: Iterable[TileVote],
-    rule: Rule,
-    settings: FuseSettings,
-) -> tuple[Decision, MapTile | None]:
-    """Decide one tile and edit it. A tile that does not change is returned as the same object (None if there was none).
+def fuse_tile(tile: Tile, drives: Iterable[TileVote], rule: Rule, settings: FuseSettings) -> tuple[Decision, Tile]:
+    """Decide one tile and edit it. A tile that does not change is returned as the same object. Where the map has no
+    tile, give :meth:`mapvote.core.tile.Tile.empty`.
 
     ``drives`` are the votes that count on this tile (``select``, ``restrict`` in fusion/tile_vote.py), any order.
     """
-    grid = tile_grid(lattice, index)
-    votes, states, tally, quorum = hear(one_each(drives, grid), rule, settings)
-    before = tile if tile is not None else empty_tile()
-    edited, deleted = before, 0
+    votes, states, tally, quorum = hear(one_each(drives, tile.window), rule, settings)
+    edited, deleted = tile, 0
     gone = supported_words(votes, states, quorum)
     if gone is not None:
-        edited, deleted = delete_points(edited, grid, gone)
+        edited, deleted = delete_points(edited, gone)
     added = 0
     if (states == CellState.CHANGED_OCCUPIED).any():
-        edited, added = add_points(edited, grid, *_offered(votes, states, grid), quorum)
-    edited = _learn_free(edited, grid, votes, quorum, points_added=added > 0)
-    unchanged = edited is before
-    return Decision(states, tally, len(votes), added, deleted), tile if unchanged else edited
+        edited, added = add_points(edited, *_offered(votes, states, tile.window), quorum)
+    edited = _learn_free(edited, votes, quorum, points_added=added > 0)
+    return Decision(states, tally, len(votes), added, deleted), edited
 
 
 def hear(
@@ -177,7 +168,7 @@ def _offered(votes: Sequence[TileVote], states: U8, grid: Grid) -> tuple[F32, I6
     if not any(map(len, offers)):
         return np.empty((0, 3), np.float32), np.empty(0, np.int64), np.empty(0, np.int32)
     points = np.concatenate(offers)
-    cells = cells_of(grid, points)
+    cells = grid.flat_cells(points)
     voters = np.repeat(np.arange(len(votes), dtype=np.int32), [len(offer) for offer in offers])
     wanted = np.flatnonzero((states == CellState.CHANGED_OCCUPIED).reshape(-1)[cells])
     first = np.searchsorted(voters[wanted], np.arange(len(votes) + 1))
@@ -189,7 +180,7 @@ def _offered(votes: Sequence[TileVote], states: U8, grid: Grid) -> tuple[F32, I6
     return points[keep], cells[keep], voters[keep]
 
 
-def _learn_free(tile: MapTile, grid: Grid, votes: Sequence[TileVote], min_votes: int, points_added: bool) -> MapTile:
+def _learn_free(tile: Tile, votes: Sequence[TileVote], min_votes: int, points_added: bool) -> Tile:
     """Known-free columns with the voxels that at least ``min_votes`` vehicles passed through, minus the occupied ones.
 
     Free space is remembered once learned; a voxel that holds a point of the map is never free. Until enough vehicles
@@ -203,15 +194,15 @@ def _learn_free(tile: MapTile, grid: Grid, votes: Sequence[TileVote], min_votes:
     free = tile.free if tile.free is not None else np.zeros((TILE_CELLS, TILE_CELLS), dtype=np.uint64)
     if len(passed) >= min_votes:
         free = free | at_least(passed, min_votes)
-    free = free & ~obstacle_bits(tile, grid)
+    free = free & ~tile.obstacle_words
     return tile if tile.free is not None and np.array_equal(free, tile.free) else replace(tile, free=free)
 
 
 def states_over(lattice: Lattice, decisions: Mapping[TileIndex, Decision]) -> tuple[U8, Grid]:
     """Decided states (rows, cols) over the smallest window of whole tiles that holds them all; elsewhere NO_VOTE."""
     rows, cols = [t[0] for t in decisions] or [0], [t[1] for t in decisions] or [0]
-    grid = tile_grid(lattice, (min(rows), min(cols))).union(tile_grid(lattice, (max(rows), max(cols))))
+    grid = lattice.tile((min(rows), min(cols))).union(lattice.tile((max(rows), max(cols))))
     states = np.full(grid.shape, NO_VOTE, dtype=np.uint8)
     for index, decision in decisions.items():
-        states[tile_grid(lattice, index).slices_in(grid)] = decision.states
+        states[lattice.tile(index).slices_in(grid)] = decision.states
     return states, grid

@@ -18,7 +18,9 @@ from mapvote.codec.ballot import (
 )
 from mapvote.config import FuseSettings
 from mapvote.core.grid import TileIndex
-from mapvote.core.types import MapTile, MapvoteError, PointMap
+from mapvote.core.point_map import PointMap
+from mapvote.core.tile import Tile
+from mapvote.core.types import MapvoteError
 from mapvote.fusion.fuse import Decision, Rule, fuse_tile, rule_of
 from mapvote.fusion.sparse_columns import Words
 from mapvote.fusion.tile_vote import TileVote, select
@@ -38,7 +40,7 @@ def tile_vote(ballot: Ballot, tile: BallotTile, digest: str) -> TileVote:
     )
 
 
-def base_hash(tile: MapTile | None) -> str:
+def base_hash(tile: Tile | None) -> str:
     """The content hash a ballot gives for this tile: "" where the map has none."""
     return "" if tile is None else content_hash(tile.points)
 
@@ -96,10 +98,11 @@ def update_map(
     tiles = dict(point_map.tiles)
     decisions: dict[TileIndex, Decision] = {}
     for index in sorted({tile.tile for ballot in ballots for tile in ballot.tiles}):
+        tile = point_map.tile(index)
         votes = select(_votes_on(index, unique), settings)
-        decision, edited = fuse_tile(point_map.lattice, index, tiles.get(index), votes, rule, settings)
+        decision, edited = fuse_tile(tile, votes, rule, settings)
         decisions[index] = decision
-        if edited is not None:
+        if index in tiles or edited is not tile:
             tiles[index] = edited
     return replace(point_map, tiles=dict(sorted(tiles.items()))), decisions
 

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from mapvote.config import FuseSettings
 from mapvote.core.grid import TILE_CELLS, Grid
-from mapvote.core.tile import cells_of
 from mapvote.core.types import F32, N_STATES, NO_VOTE, U8, U16, Bool, CellState
 from mapvote.fusion.sparse_columns import Words, union
 
@@ -129,7 +128,7 @@ def fold(drives: Sequence[TileVote], grid: Grid) -> TileVote:
     """One vehicle's drives as one vote: in every cell the drive that ended last speaks, ties by hash; a drive that
     is silent there never overrides. Passed-through voxels add up. Commutative, and idempotent for one drive.
 
-    ``grid`` is the tile's window (:func:`mapvote.core.grid.tile_grid`).
+    ``grid`` is the tile's window.
     """
     if len(drives) == 1:
         return drives[0]
@@ -149,7 +148,7 @@ def fold(drives: Sequence[TileVote], grid: Grid) -> TileVote:
             tally[mine] = drive.tally[mine]
         gone += [drive.deletes(Words.whole(mine)), drive.remnants(mine)]
         if drive.new_points is not None:
-            points.append(drive.new_points[mine.ravel()[cells_of(grid, drive.new_points)]])
+            points.append(drive.new_points[mine.ravel()[grid.flat_cells(drive.new_points)]])
     free = [drive.free for drive in ordered if drive.free is not None]
     return TileVote(
         vehicle=ordered[-1].vehicle,

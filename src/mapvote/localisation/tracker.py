@@ -12,9 +12,9 @@ import numpy as np
 
 from mapvote.config import NdtSettings
 from mapvote.core.geometry import exp, from_xyz_rpy
-from mapvote.core.grid import tile_grid, window_around
-from mapvote.core.tile import map_points
-from mapvote.core.types import F32, F64, I64, PointMap, Registration, Scan
+from mapvote.core.grid import window_around
+from mapvote.core.point_map import PointMap
+from mapvote.core.types import F32, F64, I64, Registration, Scan
 from mapvote.core.voxels import thin
 from mapvote.localisation.deskew import deskew, twist_between
 from mapvote.localisation.ndt import NdtMap, PosePrior, build_ndt, fitness, refine, thin_for_levels
@@ -49,7 +49,7 @@ def window_points(point_map: PointMap, position: F64, half_window_m: float) -> F
     """Points (n, 3) in map metres of the tiles that a square window around ``position`` touches."""
     window = window_around(point_map.lattice, float(position[0]), float(position[1]), 2 * half_window_m)
     tiles = [tile for tile in window.tiles() if tile in point_map.tiles]
-    clouds = [map_points(tile_grid(point_map.lattice, tile), point_map.tiles[tile].points) for tile in tiles]
+    clouds = [point_map.tiles[tile].points_map for tile in tiles]
     return np.concatenate([np.zeros((0, 3)), *clouds])
 
 

@@ -14,7 +14,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from mapvote.core.columns import GROUND_MARGIN_M, TOP_BIT
+from mapvote.core.columns import GROUND_MARGIN_M, TOP_BIT, column_bit, height_above
 from mapvote.core.grid import CELL_SIZE, Grid
 from mapvote.core.types import F32, F64, I32, U8, U64, Bool, Reference
 
@@ -68,19 +68,15 @@ def _obstacles(
         obstacle[i] = False
         if r < 0 or c < 0 or r >= rows or c >= cols:
             continue
-        ground = ground_z[r, c]
-        if np.isnan(ground):
-            ground = np.float32(base[r, c] * CELL_SIZE)
         cell[i] = r * cols + c
-        obstacle[i] = points[i, 2] - ground >= GROUND_MARGIN_M
+        obstacle[i] = height_above(points[i, 2], ground_z[r, c], base[r, c]) >= GROUND_MARGIN_M
 
 
 def find_obstacles(points_map: F64, reference: Reference) -> tuple[Bool, I32]:
     """(obstacle (n,) bool, cell (n,) int32) of points (n, 3), map metres.
 
-    A point is an obstacle if it lies at least GROUND_MARGIN_M above the map's ground, by the rule that built the
-    reference (:func:`mapvote.core.columns.fill_columns`). ``cell`` is row * cols + col in the reference's grid, -1
-    outside it.
+    By the rule that built the reference, see :func:`mapvote.core.columns.height_above`. ``cell`` is row * cols + col in
+    the reference's grid, -1 outside it.
     """
     cell = np.empty(len(points_map), dtype=np.int32)
     obstacle = np.empty(len(points_map), dtype=np.bool_)
@@ -96,8 +92,7 @@ def _enter_hits(points: F64, cell: I32, keep: NDArray[np.bool_], base: I32, coun
     for i in range(len(points)):
         if keep[i] and cell[i] >= 0:
             k = cell[i]
-            bit = int(np.floor(points[i, 2] / CELL_SIZE)) - base[k]
-            hit[k] |= np.uint64(1) << np.uint64(min(max(bit, 0), TOP_BIT))
+            hit[k] |= np.uint64(1) << np.uint64(column_bit(points[i, 2], base[k]))
             counts[k] += 1
 
 

@@ -21,10 +21,10 @@ from scipy import ndimage
 from mapvote.config import Settings
 from mapvote.core.columns import TOP_BIT, shifted
 from mapvote.core.geometry import transform
-from mapvote.core.grid import CELL_SIZE, TILE_CELLS, TileIndex, tile_grid
+from mapvote.core.grid import CELL_SIZE, TILE_CELLS, TileIndex
+from mapvote.core.point_map import PointMap, map_from_points
 from mapvote.core.reference import LocalMap, reference_window
-from mapvote.core.tile import map_from_points
-from mapvote.core.types import F64, I32, I64, U64, Bool, Drive, PointMap, Reference
+from mapvote.core.types import F64, I32, I64, U64, Bool, Drive, Reference
 from mapvote.core.voxels import VoxelCloud
 from mapvote.detection.counters import PLANES, Evidence, count_of, free_words, is_open
 from mapvote.localisation.deskew import deskew, twist_between
@@ -100,7 +100,7 @@ class Layer:
         trail = np.zeros(len(points), dtype=np.bool_)
         rows, cols = self.draft.lattice.cells_of(points)
         for tile, planes in self.evidence.tiles.items():
-            reference = reference_window(self.draft, tile_grid(self.draft.lattice, tile))
+            reference = reference_window(self.draft, self.draft.lattice.tile(tile))
             standing = reference_window(ground, reference.grid)
             r, c = rows - reference.grid.row0, cols - reference.grid.col0
             here = np.flatnonzero((r >= 0) & (r < TILE_CELLS) & (c >= 0) & (c < TILE_CELLS))
@@ -113,7 +113,7 @@ class Layer:
 
     def _free(self, tile: TileIndex, point_map: PointMap) -> U64:
         """Known-free columns of one tile of the finished map, on its own ground."""
-        grid = tile_grid(self.draft.lattice, tile)
+        grid = self.draft.lattice.tile(tile)
         if tile not in self.evidence.tiles:
             return np.zeros(grid.shape, dtype=np.uint64)
         before, after = reference_window(self.draft, grid), reference_window(point_map, grid)

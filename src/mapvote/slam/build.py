@@ -17,8 +17,8 @@ from scipy.spatial import cKDTree
 from mapvote.config import MappingSettings, Settings
 from mapvote.core.geometry import inverse, rotation_angle, transform
 from mapvote.core.grid import Lattice
-from mapvote.core.tile import map_from_points
-from mapvote.core.types import F64, I64, Bool, Drive, MapvoteError, PointMap
+from mapvote.core.point_map import PointMap, map_from_points
+from mapvote.core.types import F64, I64, Bool, Drive, MapvoteError
 from mapvote.core.voxels import VoxelCloud, thin
 from mapvote.localisation.deskew import twist_between
 from mapvote.localisation.ndt import NdtMap, PosePrior

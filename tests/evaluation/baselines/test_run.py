@@ -8,9 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mapvote.core.grid import Grid, Lattice
+from mapvote.core.point_map import PointMap, map_from_points
 from mapvote.core.reference import reference_window
-from mapvote.core.tile import map_from_points
-from mapvote.core.types import CellState, PointMap
+from mapvote.core.types import CellState
 from mapvote.evaluation.baselines.dempster_shafer import EvidenceMap, combine, dempster
 from mapvote.evaluation.baselines.nearest_neighbour import NearestNeighbour
 from mapvote.evaluation.scoring.map_points import map_obstacles

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from mapvote.core.grid import CELL_SIZE, Grid
+from mapvote.core.point_map import PointMap, all_points, map_from_points
 from mapvote.core.reference import reference_window
-from mapvote.core.tile import all_points, map_from_points
-from mapvote.core.types import U8, CellState, MapvoteError, PointMap
+from mapvote.core.types import U8, CellState, MapvoteError
 from mapvote.evaluation.experiments.inject import Injection, score_injection
 
 

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from mapvote.core import geometry
+from mapvote.core.point_map import map_from_points
 from mapvote.core.sensors import SENSORS
-from mapvote.core.tile import map_from_points
 from mapvote.core.types import F64
 from mapvote.formats import DriveWriter
 from mapvote.formats.doctor import Finding, examine

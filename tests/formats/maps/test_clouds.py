@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from pypcd4 import PointCloud
 
-from mapvote.core.tile import all_points, map_from_points
+from mapvote.core.point_map import all_points, map_from_points
 from mapvote.core.types import F64, MapvoteError
 from mapvote.formats import export_map, read_cloud, read_map, write_map, write_pcd
 from mapvote.formats.maps.autoware import read_autoware, write_autoware

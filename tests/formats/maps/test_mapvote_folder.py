@@ -13,8 +13,9 @@ from hypothesis import strategies as st
 
 from mapvote.codec.tile_file import decode_tile, encode_tile
 from mapvote.core.grid import TILE_CELLS, Lattice
-from mapvote.core.tile import all_points, map_from_points
-from mapvote.core.types import MapTile, MapvoteError, PointMap
+from mapvote.core.point_map import PointMap, all_points, map_from_points
+from mapvote.core.tile import Tile
+from mapvote.core.types import MapvoteError
 from mapvote.formats import read_map, write_map
 
 
@@ -25,7 +26,7 @@ def small_map(seed: int = 0, offset: tuple[float, float] = (0.0, 0.0)) -> PointM
     return map_from_points(points, lattice=lattice, georeference={"crs": "EPSG:32654", "note": "é"})
 
 
-def same(a: MapTile, b: MapTile) -> bool:
+def same(a: Tile, b: Tile) -> bool:
     free = (a.free is None and b.free is None) or np.array_equal(a.free, b.free)  # type: ignore[arg-type]
     return free and np.array_equal(a.points, b.points) and np.array_equal(a.ground_z, b.ground_z, equal_nan=True)
 
@@ -55,9 +56,10 @@ def test_tile_bytes_round_trip(n: int, seed: int, learned: bool) -> None:
     points = (rng.random((n, 3)) * 76.7).astype(np.float32)
     ground_z = np.where(rng.random((TILE_CELLS, TILE_CELLS)) < 0.1, np.nan, 1.5).astype(np.float32)
     free = rng.integers(0, 2**63, (TILE_CELLS, TILE_CELLS), dtype=np.uint64) if learned else None
-    tile = MapTile(points, ground_z, free)
-    assert same(decode_tile(encode_tile(tile)), tile)
-    assert encode_tile(decode_tile(encode_tile(tile))) == encode_tile(tile)
+    window = Lattice().tile((2, -3))
+    tile = Tile(window, points, ground_z, free)
+    assert same(decode_tile(encode_tile(tile), window), tile)
+    assert encode_tile(decode_tile(encode_tile(tile), window)) == encode_tile(tile)
 
 
 def test_an_older_map_is_replaced_but_nothing_else(tmp_path: Path) -> None:
@@ -73,7 +75,7 @@ def test_an_older_map_is_replaced_but_nothing_else(tmp_path: Path) -> None:
 
 def test_a_failed_write_leaves_the_old_map_and_no_litter(tmp_path: Path) -> None:
     write_map(small_map(1), tmp_path / "m")
-    broken = PointMap("x", Lattice(), {(0, 0): MapTile(None, None)})  # type: ignore[arg-type]
+    broken = PointMap("x", Lattice(), {(0, 0): Tile(None, None, None)})  # type: ignore[arg-type]
     with pytest.raises((AttributeError, TypeError)):
         write_map(broken, tmp_path / "m")
     assert os.listdir(tmp_path) == ["m"]

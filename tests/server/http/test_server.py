@@ -16,7 +16,8 @@ from live_server import mapvote, serving
 from mapvote.client import MapClient
 from mapvote.codec.ballot import Ballot, encode
 from mapvote.config import FuseSettings
-from mapvote.core.types import CellState, MapvoteError, PointMap
+from mapvote.core.point_map import PointMap
+from mapvote.core.types import CellState, MapvoteError
 from mapvote.server.store import keys
 from mapvote.server.store.admission import accept, examine
 from mapvote.server.store.publish import publish

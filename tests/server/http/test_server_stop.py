@@ -14,7 +14,8 @@ import sqlalchemy as sa
 from hand_made import Say, make_ballot, make_map, make_tile, states_plane, wall
 from live_server import serving
 from mapvote.codec.ballot import Ballot, encode
-from mapvote.core.types import CellState, PointMap
+from mapvote.core.point_map import PointMap
+from mapvote.core.types import CellState
 from mapvote.server.store import schema
 from mapvote.server.store.admission import accept, examine
 from mapvote.server.store.store import Store

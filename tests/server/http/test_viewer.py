@@ -19,8 +19,7 @@ from backports import zstd
 
 from chromium import Chromium, program
 from mapvote.core.grid import CELL_SIZE, Lattice
-from mapvote.core.tile import map_from_points
-from mapvote.core.types import PointMap
+from mapvote.core.point_map import PointMap, map_from_points
 from mapvote.server.insight.changes import Decided, change_objects, changed_cells
 from mapvote.server.insight.geojson import to_geojson
 
@@ -112,14 +111,14 @@ def world_answers() -> dict[str, Any]:
     ]
     cells = []
     for index in sorted(after.tiles):
-        a, b = before.tiles.get(index), after.tiles.get(index)
-        changed = changed_cells(before.lattice, index, a, b)
+        a, b = before.tile(index), after.tile(index)
+        changed = changed_cells(a, b)
         states = np.full((256, 256), 255, dtype=np.uint8)
         states[changed.rows - 256 * index[0], changed.cols - 256 * index[1]] = changed.states
         tally = np.zeros((256, 256, 5), dtype=np.int32)
         tally[..., 2:4] = 3 * 16
         stamps = [(1795000000 * 10**9 + i * 3600 * 10**9, states) for i in range(3)]
-        cells.append(changed_cells(before.lattice, index, a, b, [Decided(2, states, tally, stamps)]))
+        cells.append(changed_cells(a, b, [Decided(2, states, tally, stamps)]))
     collection = to_geojson(change_objects(cells), Lattice(), map_id="street", from_version=1, to_version=2)
     empty = to_geojson([], Lattice(), map_id="street", from_version=2, to_version=1)
     answers: dict[str, Any] = {

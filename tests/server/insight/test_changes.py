@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Lattice, TileIndex
-from mapvote.core.tile import map_from_points
-from mapvote.core.types import NO_VOTE, CellState, MapTile, PointMap
+from mapvote.core.point_map import PointMap, map_from_points
+from mapvote.core.tile import Tile
+from mapvote.core.types import NO_VOTE, CellState
 from mapvote.core.voting import VOTE_UNIT
 from mapvote.server.insight.changes import ChangeObject, Decided, change_objects, changed_cells
 from mapvote.server.insight.geojson import to_geojson
@@ -35,10 +36,7 @@ def compare(
     before: PointMap, after: PointMap, decided: dict[TileIndex, list[Decided]] | None = None
 ) -> list[ChangeObject]:
     tiles = sorted(set(before.tiles) | set(after.tiles), reverse=True)
-    return change_objects(
-        changed_cells(before.lattice, t, before.tiles.get(t), after.tiles.get(t), (decided or {}).get(t, ()))
-        for t in tiles
-    )
+    return change_objects(changed_cells(before.tile(t), after.tile(t), (decided or {}).get(t, ())) for t in tiles)
 
 
 def test_a_house_over_four_tiles_is_one_object_with_the_outline_of_the_house() -> None:
@@ -85,8 +83,8 @@ def test_the_way_back_has_the_other_sign() -> None:
 
 def test_a_new_tile_and_unknown_ground() -> None:
     points = np.array([[1.0, 1.0, 5.0], [1.0, 1.0, 7.0]], dtype=np.float32)
-    unknown = MapTile(points, np.full((TILE_CELLS, TILE_CELLS), np.nan, dtype=np.float32))
-    cells = changed_cells(Lattice(), (3, -2), None, unknown)
+    unknown = Tile(Lattice().tile((3, -2)), points, np.full((TILE_CELLS, TILE_CELLS), np.nan, dtype=np.float32))
+    cells = changed_cells(Tile.empty(unknown.window), unknown)
     assert cells.rows.tolist() == [3 * TILE_CELLS + 3]
     assert cells.cols.tolist() == [-2 * TILE_CELLS + 3]
     assert cells.top_m.tolist() == [2.0], "without ground, height is measured from its own lowest point"
@@ -95,8 +93,8 @@ def test_a_new_tile_and_unknown_ground() -> None:
 def test_a_bus_stop_rebuilt_goes_by_the_larger_number() -> None:
     tile = street(cell_points(0, 0, 1, 1, (1.0, 1.4, 2.0))).tiles[(0, 0)]
     moved = street(cell_points(0, 0, 1, 1, (1.1,))).tiles[(0, 0)]
-    assert changed_cells(Lattice(), (0, 0), tile, moved).states.tolist() == [CellState.CHANGED_EMPTY]
-    assert changed_cells(Lattice(), (0, 0), moved, tile).states.tolist() == [CellState.CHANGED_OCCUPIED]
+    assert changed_cells(tile, moved).states.tolist() == [CellState.CHANGED_EMPTY]
+    assert changed_cells(moved, tile).states.tolist() == [CellState.CHANGED_OCCUPIED]
 
 
 def test_votes_and_stamps_come_from_the_drives_that_said_so() -> None:
@@ -153,7 +151,7 @@ def test_geojson_says_that_it_is_in_map_metres_and_is_the_same_every_time() -> N
 
 def test_specks_can_be_left_out() -> None:
     before, after = street(), street(cell_points(0, 0, 2, 2, (2.0,)), cell_points(9, 9, 1, 1, (2.0,)))
-    tile = changed_cells(Lattice(), (0, 0), before.tiles[(0, 0)], after.tiles[(0, 0)])
+    tile = changed_cells(before.tiles[(0, 0)], after.tiles[(0, 0)])
     assert [o.cells for o in change_objects([tile])] == [4, 1]
     assert [o.cells for o in change_objects([tile], min_cells=4)] == [4]
     assert change_objects([]) == []

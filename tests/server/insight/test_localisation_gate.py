@@ -10,9 +10,9 @@ import pytest
 
 from mapvote.config import GateSettings, NdtLevel, NdtSettings
 from mapvote.core.geometry import from_xyz_rpy, inverse, transform
+from mapvote.core.point_map import PointMap, map_from_points
 from mapvote.core.sensors import SENSORS
-from mapvote.core.tile import map_from_points
-from mapvote.core.types import F64, Drive, MapvoteError, PointMap, Scan
+from mapvote.core.types import F64, Drive, MapvoteError, Scan
 from mapvote.server.insight.localisation_gate import GateResult, Localised, compare, decide, gate
 
 NDT = NdtSettings(

@@ -18,7 +18,8 @@ from hand_made import Cell, Say, make_ballot, states_plane, two_walls, wall, wor
 from mapvote.cli import app, register
 from mapvote.codec.ballot import encode
 from mapvote.config import FuseSettings
-from mapvote.core.types import CellState, MapvoteError, PointMap
+from mapvote.core.point_map import PointMap
+from mapvote.core.types import CellState, MapvoteError
 from mapvote.server.errors import Conflict, NotFound
 from mapvote.server.store import publish as publishing
 from mapvote.server.store.admission import accept, examine

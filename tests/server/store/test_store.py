@@ -14,7 +14,8 @@ import pytest
 from hand_made import Say, make_ballot, states_plane, two_walls, words_plane
 from mapvote.codec.ballot import Ballot, encode
 from mapvote.config import FuseSettings
-from mapvote.core.types import U64, CellState, MapvoteError, PointMap
+from mapvote.core.point_map import PointMap
+from mapvote.core.types import U64, CellState, MapvoteError
 from mapvote.fusion.offline import update_map
 from mapvote.fusion.tile_vote import DAY_NS
 from mapvote.server.errors import Conflict, Held, NotFound, Unavailable

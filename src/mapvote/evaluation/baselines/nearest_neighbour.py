@@ -10,8 +10,9 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from mapvote.core.grid import CELL_SIZE, Grid
+from mapvote.core.point_map import PointMap
 from mapvote.core.reference import reference_window
-from mapvote.core.types import F64, NO_VOTE, U8, Bool, CellState, PointMap
+from mapvote.core.types import F64, NO_VOTE, U8, Bool, CellState
 from mapvote.core.voxels import voxel_downsample
 
 DISTANCE_M = 0.5

@@ -11,9 +11,9 @@ import msgspec
 import numpy as np
 
 from mapvote.codec.ballot import Ballot, BallotTile, pack_plane, unpack_points, unpack_states, unpack_words
-from mapvote.core.grid import CELL_SIZE, TILE_CELLS, tile_grid
-from mapvote.core.tile import empty_tile, obstacle_bits
-from mapvote.core.types import F32, NO_VOTE, U8, U64, Bool, CellState, PointMap
+from mapvote.core.grid import CELL_SIZE, TILE_CELLS
+from mapvote.core.point_map import PointMap
+from mapvote.core.types import F32, NO_VOTE, U8, U64, Bool, CellState
 
 Attack = Callable[[Ballot, PointMap, Ballot], Ballot]
 """(the liar's honest ballot, the map, an honest vehicle's ballot) -> what the liar sends."""
@@ -99,9 +99,8 @@ def _claim(ballot: Ballot, point_map: PointMap, lie: Callable[[U8, Bool], U8]) -
     def told(tile: BallotTile) -> BallotTile:
         if tile.states is None:
             raise ValueError("liars need two-stage ballots")
-        grid = tile_grid(point_map.lattice, tile.tile)
-        mapped = point_map.tiles.get(tile.tile) or empty_tile()
-        occupied = obstacle_bits(mapped, grid) != 0
+        mapped = point_map.tile(tile.tile)
+        occupied = mapped.obstacle_words != 0
         states = lie(unpack_states(tile.states), occupied)
         gone = np.where(occupied | (states == CellState.CHANGED_EMPTY), _ALL, np.uint64(0))
         ground_z = np.nan_to_num(mapped.ground_z, nan=0.0)

@@ -19,8 +19,9 @@ import numpy as np
 
 from mapvote.codec.ballot import Ballot, decode, encode, unpack_states, unpack_tally
 from mapvote.config import CASES, FuseSettings, Settings, VotingSettings
-from mapvote.core.grid import Grid, tile_grid
-from mapvote.core.types import F64, NO_VOTE, U8, Drive, MapvoteError, PointMap
+from mapvote.core.grid import Grid
+from mapvote.core.point_map import PointMap
+from mapvote.core.types import F64, NO_VOTE, U8, Drive, MapvoteError
 from mapvote.core.voting import decide
 from mapvote.evaluation.experiments.conditions import TrueMovers, shaken
 from mapvote.evaluation.experiments.scene import BALLOTS_FROM, Progress, Scene, key_of, sources_digest
@@ -210,7 +211,7 @@ def fuse_case(
 def ballot_states(ballot: Ballot, point_map: PointMap) -> tuple[U8, Grid]:
     """What the vehicle itself decided, (rows, cols) over the window of its tiles, two-stage or one-stage."""
     tiles = {tile.tile: tile for tile in ballot.tiles}
-    grids = [tile_grid(point_map.lattice, index) for index in tiles]
+    grids = [point_map.lattice.tile(index) for index in tiles]
     window = grids[0]
     for grid in grids[1:]:
         window = window.union(grid)

@@ -8,7 +8,8 @@ from dataclasses import replace
 import numpy as np
 
 from mapvote.core.geometry import exp
-from mapvote.core.types import F64, I64, Drive, PointMap
+from mapvote.core.point_map import PointMap
+from mapvote.core.types import F64, I64, Drive
 from mapvote.evaluation.experiments.conditions import ar1
 from mapvote.evaluation.experiments.scene import Progress, Scene
 from mapvote.evaluation.scoring.truth import Truth, error_summary, rigid_between

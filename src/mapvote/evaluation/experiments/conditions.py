@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 
 from mapvote.core.geometry import from_xyz_rpy
-from mapvote.core.grid import tile_grid
-from mapvote.core.types import F64, I64, Bool, Drive, MapTile, PointMap, Scan
+from mapvote.core.point_map import PointMap
+from mapvote.core.tile import Tile
+from mapvote.core.types import F64, I64, Bool, Drive, Scan
 from mapvote.evaluation.scoring.truth import Truth
 from mapvote.localisation.ndt import PosePrior
 from mapvote.localisation.tracker import Fix
@@ -96,9 +97,9 @@ class TrueMovers(Movers):
 def with_true_ground(point_map: PointMap, scenario: str, seed: int, overrides: Mapping[str, Any]) -> PointMap:
     """``point_map`` with the simulated terrain's height in every cell of every tile. Points stay as they are."""
     terrain = make_world(load_scenario(scenario, overrides), seed).terrain
-    tiles: dict[tuple[int, int], MapTile] = {}
+    tiles: dict[tuple[int, int], Tile] = {}
     for index, tile in point_map.tiles.items():
-        x, y = tile_grid(point_map.lattice, index).centres()
+        x, y = point_map.lattice.tile(index).centres()
         height = terrain.height(x[None, :], y[:, None]).astype(np.float32)
         tiles[index] = replace(tile, ground_z=height)
     return replace(point_map, tiles=tiles)

@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from mapvote.core.grid import Grid
-from mapvote.core.tile import all_points, map_from_points
+from mapvote.core.point_map import all_points, map_from_points
 from mapvote.core.types import U8, CellState
 from mapvote.evaluation.experiments.cases import Case, fuse_case, have_voted, passes
 from mapvote.evaluation.experiments.scene import BALLOTS_FROM, Progress, Scene, key_of, sources_digest

@@ -14,10 +14,10 @@ import numpy as np
 from scipy import ndimage
 
 from mapvote.core.columns import GROUND_MARGIN_M, TOP_BIT
-from mapvote.core.grid import CELL_SIZE, Grid, tile_grid
+from mapvote.core.grid import CELL_SIZE, Grid
+from mapvote.core.point_map import PointMap
 from mapvote.core.reference import reference_window
-from mapvote.core.tile import map_points, tile_points
-from mapvote.core.types import F64, U8, U64, Bool, CellState, MapvoteError, PointMap, Reference
+from mapvote.core.types import F64, U8, U64, Bool, CellState, MapvoteError, Reference
 from mapvote.evaluation.scoring.cells import ratio
 
 APART_M = 5.0
@@ -123,15 +123,15 @@ def _edited(point_map: PointMap, grid: Grid, reference: Reference, cut: U64, add
     """The map without the points in ``cut`` voxels, with ``added`` points; known-free columns follow."""
     tiles = dict(point_map.tiles)
     for index, tile in tiles.items():
-        window = tile_grid(point_map.lattice, index)
-        points = map_points(window, tile.points)
+        window = tile.window
+        points = tile.points_map
         rows, cols, inside = grid.indices_of(points)
         rows, cols = rows.clip(0, grid.rows - 1), cols.clip(0, grid.cols - 1)
         bit = np.clip(np.floor(points[:, 2] / CELL_SIZE).astype(np.int64) - reference.base[rows, cols], 0, TOP_BIT)
         high = points[:, 2] - reference.ground_z[rows, cols] >= GROUND_MARGIN_M
         gone = inside & high & ((cut[rows, cols] >> bit.astype(np.uint64)) & np.uint64(1)).astype(np.bool_)
         a, b, mine = window.indices_of(added)
-        kept = np.concatenate([tile.points[~gone], tile_points(window, added[mine])])
+        kept = np.concatenate([tile.points[~gone], window.from_map(added[mine])])
         free = tile.free
         if free is not None:
             common = window.intersection(grid)

@@ -19,7 +19,8 @@ import numpy as np
 
 from mapvote.codec.ballot import Ballot
 from mapvote.config import Settings
-from mapvote.core.types import U8, PointMap
+from mapvote.core.point_map import PointMap
+from mapvote.core.types import U8
 from mapvote.evaluation.experiments.attacks import ATTACKS
 from mapvote.evaluation.experiments.cases import Case, Pass, choose_cases, fuse_case, have_voted, passes
 from mapvote.evaluation.experiments.conditions import Conditions

@@ -18,8 +18,9 @@ from mapvote.codec.ballot import Ballot
 from mapvote.config import Settings
 from mapvote.core.geometry import exp, transform
 from mapvote.core.grid import CELL_SIZE, Grid, window_around
+from mapvote.core.point_map import PointMap
 from mapvote.core.reference import LocalMap, reference_window
-from mapvote.core.types import F64, I64, U8, Bool, CellState, Drive, MapvoteError, PointMap, Scan
+from mapvote.core.types import F64, I64, U8, Bool, CellState, Drive, MapvoteError, Scan
 from mapvote.evaluation.experiments.cases import Case, fuse_case
 from mapvote.evaluation.scoring.cells import determined, ratio
 from mapvote.evaluation.scoring.truth import pose_errors, rigid_between

@@ -22,7 +22,8 @@ import numpy as np
 import mapvote
 from mapvote.config import Settings
 from mapvote.core.columns import GROUND_MARGIN_M
-from mapvote.core.types import F64, Drive, PointMap
+from mapvote.core.point_map import PointMap
+from mapvote.core.types import F64, Drive
 from mapvote.core.voxels import voxel_downsample
 from mapvote.evaluation.experiments.conditions import Conditions, with_true_ground
 from mapvote.evaluation.scoring.truth import Truth, read_truth

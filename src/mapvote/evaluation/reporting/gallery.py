@@ -11,8 +11,8 @@ from matplotlib.figure import Figure
 
 from mapvote.core.geometry import transform
 from mapvote.core.grid import window_around
-from mapvote.core.tile import all_points
-from mapvote.core.types import F32, F64, U8, Bool, CellState, PointMap
+from mapvote.core.point_map import PointMap, all_points
+from mapvote.core.types import F32, F64, U8, Bool, CellState
 from mapvote.evaluation.baselines.nearest_neighbour import heights
 from mapvote.evaluation.evaluate import Evaluation
 from mapvote.evaluation.experiments.cases import YARDSTICKS, ballot_states, paper_cases

@@ -8,8 +8,9 @@ from typing import Any
 
 from mapvote.core.columns import GROUND_MARGIN_M
 from mapvote.core.grid import CELL_SIZE, TileIndex
+from mapvote.core.point_map import PointMap
 from mapvote.core.reference import reference_window
-from mapvote.core.types import F64, U8, PointMap
+from mapvote.core.types import F64, U8
 from mapvote.evaluation.scoring.cells import coverage, score_cells
 from mapvote.evaluation.scoring.map_points import MapJudge, map_obstacles
 from mapvote.evaluation.scoring.objects import score_objects

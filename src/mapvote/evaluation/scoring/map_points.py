@@ -8,9 +8,8 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from mapvote.core.columns import GROUND_MARGIN_M
-from mapvote.core.grid import tile_grid
-from mapvote.core.tile import map_points
-from mapvote.core.types import F64, Bool, PointMap
+from mapvote.core.point_map import PointMap
+from mapvote.core.types import F64, Bool
 from mapvote.evaluation.scoring.cells import ratio
 
 
@@ -96,8 +95,8 @@ def map_obstacles(point_map: PointMap) -> F64:
     """The map's points (n, 3) at least GROUND_MARGIN_M above its ground, map metres, tile by tile."""
     clouds = []
     for tile in sorted(point_map.tiles):
-        content, window = point_map.tiles[tile], tile_grid(point_map.lattice, tile)
-        points = map_points(window, content.points)
+        content = point_map.tiles[tile]
+        window, points = content.window, content.points_map
         rows, cols, inside = window.indices_of(points)
         ground = content.ground_z[rows.clip(0, window.rows - 1), cols.clip(0, window.cols - 1)]
         clouds.append(points[inside & (points[:, 2] - ground >= GROUND_MARGIN_M)])

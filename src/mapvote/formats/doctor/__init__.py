@@ -7,7 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from mapvote.core.types import MapvoteError, PointMap, Scan
+from mapvote.core.point_map import PointMap
+from mapvote.core.types import MapvoteError, Scan
 from mapvote.formats import open_drive
 from mapvote.formats.doctor.basics import check_prior, check_scans, check_times
 from mapvote.formats.doctor.finding import Finding

@@ -5,16 +5,16 @@ from __future__ import annotations
 import numpy as np
 
 from mapvote.core import geometry
-from mapvote.core.grid import CELL_SIZE, TILE_CELLS, tile_grid
-from mapvote.core.tile import map_points
-from mapvote.core.types import F32, F64, PointMap, Scan
+from mapvote.core.grid import CELL_SIZE, TILE_CELLS
+from mapvote.core.point_map import PointMap
+from mapvote.core.types import F32, F64, Scan
 from mapvote.core.voxels import voxel_downsample, voxel_keys
 from mapvote.formats.doctor.finding import Finding
 
 
 def check_overlap(T: F64, scans: dict[int, Scan], point_map: PointMap) -> list[Finding]:
     """Does the prior lie on the map, at the right height, and do the scans' points fall on the map's?"""
-    windows = [tile_grid(point_map.lattice, t) for t in point_map.tiles]
+    windows = [point_map.lattice.tile(t) for t in point_map.tiles]
     side = TILE_CELLS * CELL_SIZE
     low = np.array([[w.x0, w.y0] for w in windows])
     outside_m = np.array(
@@ -59,7 +59,7 @@ def _on_map(T_map_lidar: F64, points: F32, point_map: PointMap) -> tuple[float, 
     row, col = lattice.cells_of(T_map_lidar[None, :2, 3])
     home = (int(row[0]) // TILE_CELLS, int(col[0]) // TILE_CELLS)
     near = [k for k in point_map.tiles if max(abs(k[0] - home[0]), abs(k[1] - home[1])) <= 1]
-    cloud = np.concatenate([map_points(tile_grid(lattice, k), point_map.tiles[k].points) for k in near])
+    cloud = np.concatenate([point_map.tiles[k].points_map for k in near])
     occupied = np.unique(voxel_keys(cloud, lattice.x0, lattice.y0, 1.0))
     hit = float(np.isin(voxel_keys(placed, lattice.x0, lattice.y0, 1.0), occupied).mean())
     tile = point_map.tiles.get(home)

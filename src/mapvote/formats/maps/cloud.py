@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Lattice
-from mapvote.core.tile import map_from_points
-from mapvote.core.types import MapvoteError, PointMap
+from mapvote.core.point_map import PointMap, map_from_points
+from mapvote.core.types import MapvoteError
 from mapvote.formats.clean import MAX_BAD_SHARE
 
 log = logging.getLogger("mapvote.formats")

@@ -14,7 +14,8 @@ import msgspec
 from mapvote.codec.ballot import tile_key
 from mapvote.codec.tile_file import content_hash, decode_tile, encode_tile, free_hash
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Lattice
-from mapvote.core.types import MapvoteError, PointMap
+from mapvote.core.point_map import PointMap
+from mapvote.core.types import MapvoteError
 from mapvote.formats.atomic import whole_folder
 
 MANIFEST = "manifest.json"
@@ -106,6 +107,7 @@ def read_manifest(path: Path) -> Manifest:
 def read_map_folder(path: Path) -> PointMap:
     """The map, every tile verified against the manifest. MapvoteError names the first tile that is not whole."""
     manifest = read_manifest(path)
+    lattice = Lattice(manifest.x0, manifest.y0)
     tiles = {}
     for entry in manifest.tiles:
         file = path / f"tiles/{entry.tile[0]}_{entry.tile[1]}.tile"
@@ -115,10 +117,10 @@ def read_map_folder(path: Path) -> PointMap:
             raise MapvoteError(f"{file}: {error.strerror}, but the manifest lists it; copy the map again") from error
         if hashlib.sha256(data).hexdigest() != entry.sha256:
             raise MapvoteError(f"{file}: its bytes are not those of the manifest; copy the map again")
-        tile = decode_tile(data, str(file))
+        tile = decode_tile(data, lattice.tile(entry.tile), str(file))
         if content_hash(tile.points) != entry.content_hash or entry.tile in tiles:
             raise MapvoteError(
                 f"{path / MANIFEST}: tile {tile_key(entry.tile)} contradicts its file; copy the map again"
             )
         tiles[entry.tile] = tile
-    return PointMap(manifest.map_id, Lattice(manifest.x0, manifest.y0), tiles, manifest.georeference)
+    return PointMap(manifest.map_id, lattice, tiles, manifest.georeference)

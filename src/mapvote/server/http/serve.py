@@ -14,7 +14,8 @@ import structlog
 import uvicorn
 
 from mapvote.config import Settings
-from mapvote.core.types import MapvoteError, PointMap
+from mapvote.core.point_map import PointMap
+from mapvote.core.types import MapvoteError
 from mapvote.formats import open_drive, read_map
 from mapvote.server.http.app import create_app
 from mapvote.server.http.services import Services

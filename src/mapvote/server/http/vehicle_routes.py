@@ -7,14 +7,15 @@ from __future__ import annotations
 
 from typing import Annotated, Any
 
-from backports import zstd
 from fastapi import APIRouter, Path, Request, Response
 from fastapi.concurrency import run_in_threadpool
 
+from mapvote.codec.arrays import unpack_bytes
 from mapvote.server.http.auth import own
 from mapvote.server.http.schemas import Name, Number, VersionQuery, iso, problems
 from mapvote.server.http.services import services
 from mapvote.server.store.ballots import withdraw
+from mapvote.server.store.blobs import MAX_PLANE_BYTES
 
 _AS_YOU_HAVE: dict[int | str, dict[str, Any]] = {304: {"description": "as you have"}}
 router = APIRouter()
@@ -71,7 +72,7 @@ def plane(request: Request, digest: Annotated[str, Path(pattern=r"^[0-9a-f]{64}$
     if "zstd" in request.headers.get("accept-encoding", ""):
         headers["Content-Encoding"] = "zstd"
     else:
-        data = zstd.decompress(data)
+        data = unpack_bytes(data, MAX_PLANE_BYTES, "tile plane")
     return Response(data, media_type="application/octet-stream", headers=headers)
 
 

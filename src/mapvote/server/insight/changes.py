@@ -12,9 +12,9 @@ from typing import Literal
 
 import numpy as np
 
-from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Grid, Lattice, TileIndex, tile_grid
-from mapvote.core.tile import map_points
-from mapvote.core.types import F32, F64, I32, I64, U8, Bool, CellState, MapTile
+from mapvote.core.grid import CELL_SIZE, TILE_CELLS
+from mapvote.core.tile import Tile
+from mapvote.core.types import F32, F64, I32, I64, U8, Bool, CellState
 from mapvote.core.voting import VOTE_UNIT
 from mapvote.server.insight.polygons import Ring, pieces, rings
 
@@ -82,16 +82,13 @@ class ChangeObject:
         return self.cells * CELL_SIZE * CELL_SIZE
 
 
-def changed_cells(
-    lattice: Lattice, index: TileIndex, before: MapTile | None, after: MapTile | None, decided: Iterable[Decided] = ()
-) -> ChangedCells:
+def changed_cells(before: Tile, after: Tile, decided: Iterable[Decided] = ()) -> ChangedCells:
     """Which cells of a tile gained points (built) or lost some (demolished); both at once goes by the larger number.
 
     ``decided`` are the decisions on this tile between the two, in ascending order of version.
     """
-    old, new = _points(before), _points(after)
-    window = tile_grid(lattice, index)
-    old_cell, new_cell = _flat_cells(old, window), _flat_cells(new, window)
+    old, new, index = before.points, after.points, before.index
+    old_cell, new_cell = before.cells, after.cells
     cell = np.concatenate([new_cell, old_cell])
     z = np.concatenate([new[:, 2], old[:, 2]]).astype(np.float64)
     came = _missing_from(new, old)
@@ -107,8 +104,7 @@ def changed_cells(
     bottom = np.full(TILE_CELLS**2, np.inf)
     np.maximum.at(top, cell[tells], z[tells])
     np.minimum.at(bottom, cell[tells], z[tells])
-    tile = after if after is not None else before
-    ground = bottom if tile is None else tile.ground_z.reshape(-1).astype(np.float64)
+    ground = np.where(np.isnan(after.ground_z), before.ground_z, after.ground_z).reshape(-1).astype(np.float64)
     ground = np.where(np.isnan(ground), bottom, ground)
     votes, first, last, version = _evidence(flat, states, decided)
     return ChangedCells(
@@ -169,17 +165,6 @@ def change_objects(changed: Iterable[ChangedCells], min_cells: int = 1) -> list[
             )
         )
     return out
-
-
-def _points(tile: MapTile | None) -> F32:
-    return np.empty((0, 3), dtype=np.float32) if tile is None else tile.points
-
-
-def _flat_cells(points: F32, window: Grid) -> I64:
-    """(n,) cell within the tile, of points from its corner; the same reckoning as for editing."""
-    rows, cols, _ = window.indices_of(map_points(window, points))
-    flat: I64 = np.clip(rows, 0, TILE_CELLS - 1) * TILE_CELLS + np.clip(cols, 0, TILE_CELLS - 1)
-    return flat
 
 
 def _missing_from(points: F32, others: F32) -> Bool:

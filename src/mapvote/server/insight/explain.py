@@ -6,15 +6,14 @@ from dataclasses import dataclass
 
 import numpy as np
 import sqlalchemy as sa
-from backports import zstd
 
+from mapvote.codec.arrays import unpack_plane
 from mapvote.config import FuseSettings
-from mapvote.core.grid import TILE_CELLS, TileIndex, tile_grid
+from mapvote.core.grid import TILE_CELLS, TileIndex
 from mapvote.core.types import NO_VOTE, U8, CellState, MapvoteError
 from mapvote.fusion.fuse import Rule, hear
 from mapvote.fusion.tile_vote import TileVote, one_each, select
 from mapvote.server.store import schema
-from mapvote.server.store.blobs import unpack_points_plane
 from mapvote.server.store.eligible_votes import (
     Round,
     counting_votes,
@@ -22,7 +21,7 @@ from mapvote.server.store.eligible_votes import (
     rule_in_use,
     stored_votes,
 )
-from mapvote.server.store.queries import current_version, load_blob, tiles_of
+from mapvote.server.store.queries import current_version, load_tile, tiles_of
 from mapvote.server.store.store import Store
 
 _FOREVER = (1 << 63) - 1
@@ -70,11 +69,11 @@ def explain_cell(store: Store, x: float, y: float, settings: FuseSettings) -> Ce
     asked = Round(_FOREVER, settings, store.clock() - round(settings.min_age_s * 1e9))
     with store.database.reading() as connection:
         hashes = tiles_of(connection, current_version(connection).number, index).get(index)
-        points = None if hashes is None else unpack_points_plane(load_blob(connection, hashes.points), hashes.points)
+        tile = load_tile(connection, store.lattice.tile(index), hashes)
         everyone = stored_votes(connection, index, Round(_FOREVER, settings, _FOREVER))
         old_enough = [vote for vote in everyone if vote.received_ns <= asked.received_by_ns]
         inside = {vote.seq for vote in select(old_enough, settings)}
-        counting = {v.digest: v for v in counting_votes(connection, store.lattice, index, points, asked)}
+        counting = {v.digest: v for v in counting_votes(connection, tile, asked)}
         rule = rule_in_use(connection) or "columns"
         silenced = _silenced(store, index, list(counting.values()), rule, settings)
         plain = read_votes(connection, index, everyone)
@@ -105,12 +104,12 @@ def explain_cell(store: Store, x: float, y: float, settings: FuseSettings) -> Ce
 
 def _silenced(store: Store, index: TileIndex, drives: list[TileVote], rule: Rule, settings: FuseSettings) -> set[str]:
     """Vehicles that are not heard on a tile, of the votes that count there."""
-    votes = one_each(drives, tile_grid(store.lattice, index))
+    votes = one_each(drives, store.lattice.tile(index))
     return {vote.vehicle for vote in votes} - {vote.vehicle for vote in hear(votes, rule, settings)[0]}
 
 
 def _states(data: bytes) -> U8:
-    return np.frombuffer(zstd.decompress(data), dtype=np.uint8).reshape(TILE_CELLS, TILE_CELLS)
+    return unpack_plane(data, "<u1", (TILE_CELLS, TILE_CELLS), "decision: states")
 
 
 def _said(vote: TileVote, cell: tuple[int, int]) -> str:

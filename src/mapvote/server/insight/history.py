@@ -9,7 +9,7 @@ import numpy as np
 import sqlalchemy as sa
 
 from mapvote.config import FuseSettings
-from mapvote.core.grid import TileIndex, tile_grid
+from mapvote.core.grid import TileIndex
 from mapvote.core.types import U8
 from mapvote.core.voting import decide
 from mapvote.fusion.tile_vote import TileVote, one_each, select
@@ -18,9 +18,8 @@ from mapvote.server.insight.consensus import Compared, Spoken, Standing, compare
 from mapvote.server.insight.explain import _FOREVER, _states
 from mapvote.server.insight.geojson import to_geojson
 from mapvote.server.store import schema
-from mapvote.server.store.blobs import unpack_points_plane
 from mapvote.server.store.eligible_votes import Round, counting_votes, read_votes, standing_tiles, stored_votes
-from mapvote.server.store.queries import current_version, load_blob, load_tile, tiles_of, version_of
+from mapvote.server.store.queries import current_version, load_tile, tiles_of, version_of
 from mapvote.server.store.store import Store
 from mapvote.server.store.tile_jobs import unpack_tally_plane
 
@@ -36,9 +35,9 @@ def changes_between(store: Store, old: int, new: int, min_cells: int = 1) -> dic
             pair = before.get(index), after.get(index)
             if pair[0] is not None and pair[1] is not None and pair[0].points == pair[1].points:
                 continue
-            tiles = [None if hashes is None else load_tile(connection, hashes) for hashes in pair]
+            tiles = [load_tile(connection, store.lattice.tile(index), hashes) for hashes in pair]
             decided = list(_decided(store, connection, index, min(old, new), max(old, new)))
-            found.append(changed_cells(store.lattice, index, tiles[0], tiles[1], decided))
+            found.append(changed_cells(tiles[0], tiles[1], decided))
     objects = change_objects(found, min_cells)
     return to_geojson(
         objects,
@@ -56,10 +55,10 @@ def _decided(store: Store, connection: sa.Connection, index: TileIndex, old: int
     for row in connection.execute(query.where(d.c.version > old, d.c.version <= new).order_by(d.c.version)).all():
         version = version_of(connection, row.version)
         before = tiles_of(connection, row.version - 1, index).get(index)
-        points = None if before is None else unpack_points_plane(load_blob(connection, before.points), before.points)
+        tile = load_tile(connection, store.lattice.tile(index), before)
         policy = FuseSettings.model_validate(version.policy)
         asked = Round(version.mark, policy, version.created_ns - round(policy.min_age_s * 1e9))
-        votes = counting_votes(connection, store.lattice, index, points, asked)
+        votes = counting_votes(connection, tile, asked)
         drives = [(vote.end_ns, vote.states) for vote in votes if vote.states is not None]
         yield Decided(row.version, _states(row.states), unpack_tally_plane(row.tally), drives)
 
@@ -90,7 +89,7 @@ def vehicle_standings(store: Store, settings: FuseSettings) -> list[Standing]:
         compared: list[Compared] = []
         for index in standing_tiles(connection, _FOREVER):
             chosen = select(stored_votes(connection, index, asked), settings)
-            folded = one_each(read_votes(connection, index, chosen), tile_grid(store.lattice, index))
+            folded = one_each(read_votes(connection, index, chosen), store.lattice.tile(index))
             compared += compare(index, [Spoken(vote.vehicle, vote.end_ns, _decided_states(vote)) for vote in folded])
     return judge(compared, store.lattice)
 

@@ -17,7 +17,8 @@ from scipy.special import stdtrit
 from mapvote.config import GateSettings, NdtSettings
 from mapvote.core.geometry import from_xyz_rpy
 from mapvote.core.grid import CELL_SIZE
-from mapvote.core.types import F64, Drive, MapvoteError, PointMap
+from mapvote.core.point_map import PointMap
+from mapvote.core.types import F64, Drive, MapvoteError
 from mapvote.localisation.deskew import deskew, twist_between
 from mapvote.localisation.ndt import refine, thin_for_levels
 from mapvote.localisation.tracker import MapWindow
@@ -113,7 +114,7 @@ def gate(old: PointMap, new: PointMap, drive: Drive, settings: GateSettings, ndt
 def scans_near(old: PointMap, new: PointMap, T_map_lidar_prior: F64, reach_m: float) -> np.ndarray:
     """Indices (k,) of the poses (n, 4, 4) within ``reach_m`` of a cell whose points differ between the maps."""
     differing = [
-        changed_cells(old.lattice, index, old.tiles.get(index), new.tiles.get(index))
+        changed_cells(old.tile(index), new.tile(index))
         for index in sorted(old.tiles.keys() | new.tiles.keys())
         if old.tiles.get(index) is not new.tiles.get(index)
     ]

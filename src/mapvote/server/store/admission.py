@@ -9,7 +9,7 @@ from typing import NamedTuple
 import sqlalchemy as sa
 
 from mapvote.codec.ballot import Ballot, BallotTile, decode, tile_key, validate
-from mapvote.core.grid import TileIndex, tile_grid
+from mapvote.core.grid import TileIndex
 from mapvote.core.types import MapvoteError
 from mapvote.fusion.fuse import rule_of
 from mapvote.fusion.offline import staged, tile_vote
@@ -161,5 +161,5 @@ def _counts_somewhere(
     store: Store, connection: sa.Connection, ballot: Ballot, tile: BallotTile, base: str, now: str
 ) -> bool:
     points = [None if not h else unpack_points_plane(load_blob(connection, h), h) for h in (base, now)]
-    same = same_cells(points[0], points[1], tile_grid(store.lattice, tile.tile))
+    same = same_cells(points[0], points[1], store.lattice.tile(tile.tile))
     return bool((tile_vote(ballot, tile, "").spoken() & same).any())

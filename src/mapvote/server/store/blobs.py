@@ -8,15 +8,15 @@ from typing import Any
 
 import numba
 import numpy as np
-from backports import zstd
 from numpy.typing import NDArray
 
+from mapvote.codec.arrays import compress, pack_plane, unpack_bytes, unpack_plane
 from mapvote.core.grid import CELLS, TILE_CELLS, Grid
-from mapvote.core.tile import cells_of
-from mapvote.core.types import F32, I64, U64, Bool, MapTile, MapvoteError
+from mapvote.core.tile import Tile
+from mapvote.core.types import F32, I64, U64, Bool, MapvoteError
 
 _ZSTD_LEVEL = 3
-_MAX_POINTS_BYTES = CELLS * 64 * 12 * 4
+MAX_PLANE_BYTES = CELLS * 64 * 12 * 4
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,14 +28,14 @@ class TileHashes:
     free: str | None
 
 
-def pack_tile(tile: MapTile) -> tuple[TileHashes, dict[str, bytes]]:
+def pack_tile(tile: Tile) -> tuple[TileHashes, dict[str, bytes]]:
     """A tile's hashes and its planes by hash, each one zstd frame of little-endian C-order values."""
     blobs: dict[str, bytes] = {}
 
     def pack(plane: NDArray[Any], dtype: str) -> str:
         raw = np.ascontiguousarray(plane, dtype=dtype).tobytes()
         digest = hashlib.sha256(raw).hexdigest()
-        blobs[digest] = zstd.compress(raw, _ZSTD_LEVEL)
+        blobs[digest] = compress(raw, _ZSTD_LEVEL)
         return digest
 
     points = pack(tile.points, "<f4")
@@ -43,15 +43,15 @@ def pack_tile(tile: MapTile) -> tuple[TileHashes, dict[str, bytes]]:
     return TileHashes(points, ground, None if tile.free is None else pack(tile.free, "<u8")), blobs
 
 
-def unpack_tile(hashes: TileHashes, points: bytes, ground: bytes, free: bytes | None) -> MapTile:
+def unpack_tile(window: Grid, hashes: TileHashes, points: bytes, ground: bytes, free: bytes | None) -> Tile:
     """A tile of its planes; MapvoteError if one is not what its hash says."""
-    shape = (TILE_CELLS, TILE_CELLS)
-    return MapTile(
+    return Tile(
+        window,
         points=unpack_points_plane(points, hashes.points),
-        ground_z=np.frombuffer(_unpack(ground, hashes.ground), dtype="<f4").reshape(shape),
+        ground_z=np.frombuffer(_unpack(ground, hashes.ground), dtype="<f4").reshape(window.shape),
         free=None
         if free is None or hashes.free is None
-        else np.frombuffer(_unpack(free, hashes.free), dtype="<u8").reshape(shape),
+        else np.frombuffer(_unpack(free, hashes.free), dtype="<u8").reshape(window.shape),
     )
 
 
@@ -61,10 +61,7 @@ def unpack_points_plane(data: bytes, digest: str) -> F32:
 
 
 def _unpack(data: bytes, digest: str) -> bytes:
-    try:
-        raw = zstd.ZstdDecompressor().decompress(data, max_length=_MAX_POINTS_BYTES)
-    except zstd.ZstdError as error:
-        raise MapvoteError(f"tile plane {digest[:12]} is damaged ({error}); fetch it again") from error
+    raw = unpack_bytes(data, MAX_PLANE_BYTES, f"tile plane {digest[:12]}")
     if hashlib.sha256(raw).hexdigest() != digest:
         raise MapvoteError(f"tile plane {digest[:12]} is not what its hash says; fetch it again")
     return raw
@@ -78,7 +75,7 @@ def same_cells(a: F32 | None, b: F32 | None, grid: Grid) -> Bool:
 def _digests(points: F32 | None, grid: Grid) -> U64:
     if points is None or not len(points):
         return np.zeros(CELLS, dtype=np.uint64)
-    return _cell_digests(cells_of(grid, points), np.ascontiguousarray(points).view(np.uint32))
+    return _cell_digests(grid.flat_cells(points), np.ascontiguousarray(points).view(np.uint32))
 
 
 @numba.njit(cache=True, nogil=True)
@@ -97,10 +94,10 @@ def _cell_digests(cells: I64, words: NDArray[np.uint32]) -> U64:
 
 def pack_cells(cells: Bool) -> bytes:
     """(256, 256) bool as a small blob."""
-    return zstd.compress(np.packbits(cells.reshape(-1)).tobytes(), _ZSTD_LEVEL)
+    return pack_plane(np.packbits(cells.reshape(-1)), _ZSTD_LEVEL)
 
 
 def unpack_cells(data: bytes) -> Bool:
     """The inverse of :func:`pack_cells`."""
-    bits = np.unpackbits(np.frombuffer(zstd.decompress(data), dtype=np.uint8))
+    bits = np.unpackbits(unpack_plane(data, "<u1", (CELLS // 8,), "cells of a version"))
     return bits.astype(np.bool_).reshape(TILE_CELLS, TILE_CELLS)

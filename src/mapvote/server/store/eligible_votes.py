@@ -15,8 +15,9 @@ import sqlalchemy as sa
 
 from mapvote.codec.ballot import unpack_many_states, unpack_points, unpack_tally
 from mapvote.config import FuseSettings
-from mapvote.core.grid import Lattice, TileIndex, tile_grid
-from mapvote.core.types import F32, U8, Bool
+from mapvote.core.grid import TileIndex
+from mapvote.core.tile import Tile
+from mapvote.core.types import U8, Bool
 from mapvote.fusion.fuse import Rule, rule_of
 from mapvote.fusion.sparse_columns import Words
 from mapvote.fusion.tile_vote import TileVote, restrict, select
@@ -117,18 +118,17 @@ def bars_on(connection: sa.Connection, index: TileIndex, mark: int) -> list[Bar]
 
 def counting_votes(
     connection: sa.Connection,
-    lattice: Lattice,
-    index: TileIndex,
-    points: F32 | None,
+    tile: Tile,
     asked: Round,
     bars: Sequence[Bar] | None = None,
     digest: str | None = None,
 ) -> list[TileVote]:
-    """The votes that count on a tile whose points are now ``points``, each restricted to the cells where it counts.
+    """The votes that count on ``tile`` as it is now, each restricted to the cells where it counts.
 
-    ``bars``: instead of those recorded. ``digest``: the hash of ``points``, where it is known: votes with that base
-    need no comparison.
+    ``bars``: instead of those recorded. ``digest``: the hash of the tile's points, where it is known: votes with that
+    base need no comparison.
     """
+    index = tile.index
     chosen = select(stored_votes(connection, index, asked), asked.settings)
     barred = bars_on(connection, index, asked.mark) if bars is None else bars
 
@@ -137,7 +137,7 @@ def counting_votes(
         if base == digest:
             return None
         old = None if not base else unpack_points_plane(load_blob(connection, base), base)
-        same = same_cells(old, points, tile_grid(lattice, index))
+        same = same_cells(old, tile.points, tile.window)
         return None if same.all() else same
 
     votes = []

@@ -13,8 +13,9 @@ import sqlalchemy as sa
 from sqlalchemy.exc import IntegrityError
 
 from mapvote.config import FuseSettings
-from mapvote.core.grid import TileIndex, tile_grid
-from mapvote.core.types import MapTile, PointMap
+from mapvote.core.grid import Grid, TileIndex
+from mapvote.core.point_map import PointMap
+from mapvote.core.tile import Tile
 from mapvote.server.errors import Conflict, Held
 from mapvote.server.store import schema
 from mapvote.server.store.blobs import TileHashes, pack_cells, same_cells, unpack_tile
@@ -82,13 +83,14 @@ def publish(
         dirty = standing_tiles(connection, mark, newest.mark if nothing_but_votes else None) if in_use else []
     asked = Round(mark, settings, store.clock() - round(settings.min_age_s * 1e9))
     rule = in_use or "columns"
-    tasks = [Task(url_text(store), store.lattice, index, hashes.get(index), asked, rule) for index in dirty]
+    tasks = [Task(url_text(store), store.lattice.tile(index), hashes.get(index), asked, rule) for index in dirty]
     fused = fuse_round(tasks, store.database, executor)
     changed = [f for f in fused if f.hashes is not None]
     held = hold_reasons(changed, settings)
     if gate is not None and changed:
         old = store.point_map(newest.number)
-        held += gate(old, replace(old, tiles=dict(old.tiles) | {f.index: _edited(f) for f in changed}))
+        edited = {f.index: _edited(f, store.lattice.tile(f.index)) for f in changed}
+        held += gate(old, replace(old, tiles=dict(old.tiles) | edited))
     added, deleted = sum(f.added for f in changed), sum(f.deleted for f in changed)
     outcome = Outcome(newest.number, False, [f.index for f in changed], added, deleted, held, fused)
     if dry_run or not changed:
@@ -128,8 +130,9 @@ def rollback(store: Store, to: int, *, by: str = "operator", reason: str = "") -
         differ = sorted(index for index in now.keys() | then.keys() if now.get(index) != then.get(index))
         barred = {}
         for index in differ:
-            pair = [None if h is None else load_tile(connection, h).points for h in (now.get(index), then.get(index))]
-            barred[index] = pack_cells(~same_cells(pair[0], pair[1], tile_grid(store.lattice, index)))
+            window = store.lattice.tile(index)
+            pair = [load_tile(connection, window, state.get(index)).points for state in (now, then)]
+            barred[index] = pack_cells(~same_cells(pair[0], pair[1], window))
     number = newest.number + 1
     version = Version(
         number, newest.number, "rollback", to, store.clock(), by, reason[:400], newest.mark, dict(target.policy)
@@ -192,11 +195,11 @@ def _decision_row(number: int, fused: Fused) -> dict[str, object]:
     }
 
 
-def _edited(fused: Fused) -> MapTile:
+def _edited(fused: Fused, window: Grid) -> Tile:
     hashes = fused.hashes
     assert hashes is not None
     free = None if hashes.free is None else fused.planes[hashes.free]
-    return unpack_tile(hashes, fused.planes[hashes.points], fused.planes[hashes.ground], free)
+    return unpack_tile(window, hashes, fused.planes[hashes.points], fused.planes[hashes.ground], free)
 
 
 def url_text(store: Store) -> str:

@@ -9,8 +9,8 @@ from typing import Any
 import sqlalchemy as sa
 
 from mapvote.codec.ballot import tile_key
-from mapvote.core.grid import TileIndex
-from mapvote.core.types import MapTile
+from mapvote.core.grid import Grid, TileIndex
+from mapvote.core.tile import Tile
 from mapvote.server.errors import NotFound
 from mapvote.server.store import schema
 from mapvote.server.store.blobs import TileHashes, pack_tile, unpack_tile
@@ -48,10 +48,13 @@ def tiles_of(connection: sa.Connection, number: int, only: TileIndex | None = No
     return {(row.row, row.col): TileHashes(row.points, row.ground, row.free) for row in rows}
 
 
-def load_tile(connection: sa.Connection, hashes: TileHashes) -> MapTile:
-    """A tile by its hashes."""
+def load_tile(connection: sa.Connection, window: Grid, hashes: TileHashes | None) -> Tile:
+    """The tile over ``window`` by its hashes; the empty one where there are none."""
+    if hashes is None:
+        return Tile.empty(window)
     free = None if hashes.free is None else load_blob(connection, hashes.free)
-    return unpack_tile(hashes, load_blob(connection, hashes.points), load_blob(connection, hashes.ground), free)
+    points, ground = load_blob(connection, hashes.points), load_blob(connection, hashes.ground)
+    return unpack_tile(window, hashes, points, ground, free)
 
 
 def load_blob(connection: sa.Connection, digest: str) -> bytes:
@@ -83,7 +86,7 @@ def add_blobs(connection: sa.Connection, planes: Mapping[str, bytes]) -> None:
             connection.execute(schema.blobs.insert().values(hash=digest, data=data))
 
 
-def add_version(connection: sa.Connection, version: Version, tiles: Mapping[TileIndex, MapTile]) -> None:
+def add_version(connection: sa.Connection, version: Version, tiles: Mapping[TileIndex, Tile]) -> None:
     """Insert a version that sets ``tiles``; sqlalchemy's IntegrityError if its number is taken."""
     connection.execute(schema.versions.insert().values(**version_row(version)))
     rows = []

@@ -14,8 +14,9 @@ from dataclasses import dataclass, field
 import sqlalchemy as sa
 
 from mapvote.config import FuseSettings
-from mapvote.core.grid import TileIndex, tile_grid
-from mapvote.core.types import F32, MapTile
+from mapvote.core.grid import TileIndex
+from mapvote.core.tile import Tile
+from mapvote.core.types import F32
 from mapvote.fusion.fuse import Rule
 from mapvote.server.errors import NotFound
 from mapvote.server.store import schema
@@ -32,7 +33,7 @@ class _State:
     """A map under way: a published version, with some tiles changed."""
 
     root: int
-    edited: Mapping[TileIndex, MapTile] = field(default_factory=dict)
+    edited: Mapping[TileIndex, Tile] = field(default_factory=dict)
 
 
 def replay(
@@ -96,7 +97,7 @@ def _again(
         assert version.target is not None
         target = states[version.target]
         for index, now, then in _pairs(store, before, target):
-            differ = ~same_cells(_points(now), _points(then), tile_grid(store.lattice, index))
+            differ = ~same_cells(_points(now), _points(then), store.lattice.tile(index))
             bars.setdefault(index, []).append(Bar(version.mark, differ))
         return target
     if version.kind != "publish" or rule is None:
@@ -109,31 +110,31 @@ def _again(
         for index in standing_tiles(connection, version.mark):
             tile = before.edited.get(index)
             if tile is None and index in hashes:
-                tile = load_tile(connection, hashes[index])
+                tile = load_tile(connection, store.lattice.tile(index), hashes[index])
             barred = (*bars_on(connection, index, kept), *bars.get(index, ()))
-            tasks.append(Task(url_text(store), store.lattice, index, tile, asked, rule, barred))
+            tasks.append(Task(url_text(store), store.lattice.tile(index), tile, asked, rule, barred))
     edited = {f.index: f.tile for f in fuse_round(tasks, store.database, executor) if f.hashes and f.tile is not None}
     return _State(before.root, dict(before.edited) | edited)
 
 
-def _pairs(store: Store, a: _State, b: _State) -> Iterator[tuple[TileIndex, MapTile | None, MapTile | None]]:
+def _pairs(store: Store, a: _State, b: _State) -> Iterator[tuple[TileIndex, Tile | None, Tile | None]]:
     """Tiles in which two states may differ, with both of their contents."""
     with store.database.reading() as connection:
         old, new = tiles_of(connection, a.root), tiles_of(connection, b.root)
         candidates = {i for i in old.keys() | new.keys() if old.get(i) != new.get(i)} | set(a.edited) | set(b.edited)
 
-        def content(index: TileIndex, state: _State, hashes: Mapping[TileIndex, TileHashes]) -> MapTile | None:
+        def content(index: TileIndex, state: _State, hashes: Mapping[TileIndex, TileHashes]) -> Tile | None:
             if index in state.edited:
                 return state.edited[index]
-            return load_tile(connection, hashes[index]) if index in hashes else None
+            return load_tile(connection, store.lattice.tile(index), hashes[index]) if index in hashes else None
 
         for index in sorted(candidates):
             yield index, content(index, a, old), content(index, b, new)
 
 
-def _points(tile: MapTile | None) -> F32 | None:
+def _points(tile: Tile | None) -> F32 | None:
     return None if tile is None else tile.points
 
 
-def _count(tile: MapTile | None) -> int:
+def _count(tile: Tile | None) -> int:
     return 0 if tile is None else len(tile.points)

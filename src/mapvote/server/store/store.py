@@ -18,7 +18,9 @@ import sqlalchemy as sa
 
 from mapvote.codec.ballot import Id
 from mapvote.core.grid import Lattice, TileIndex
-from mapvote.core.types import MapTile, MapvoteError, PointMap
+from mapvote.core.point_map import PointMap
+from mapvote.core.tile import Tile
+from mapvote.core.types import MapvoteError
 from mapvote.server.errors import Unavailable
 from mapvote.server.store import migrate, schema
 from mapvote.server.store.blobs import TileHashes
@@ -161,17 +163,20 @@ class Store:
         with self.database.reading() as connection:
             return load_blob(connection, digest)
 
-    def tile(self, number: int, index: TileIndex) -> MapTile | None:
+    def tile(self, number: int, index: TileIndex) -> Tile | None:
         """One tile of a version, None where the map has none; NotFound if there is no such version."""
         with self.database.reading() as connection:
             version_of(connection, number)
             hashes = tiles_of(connection, number, index).get(index)
-            return None if hashes is None else load_tile(connection, hashes)
+            return None if hashes is None else load_tile(connection, self.lattice.tile(index), hashes)
 
     def point_map(self, number: int | None = None) -> PointMap:
         """A whole version."""
         with self.database.reading() as connection:
             number = current_number(connection) if number is None else number
             version_of(connection, number)
-            tiles = {index: load_tile(connection, hashes) for index, hashes in tiles_of(connection, number).items()}
+            tiles = {
+                index: load_tile(connection, self.lattice.tile(index), hashes)
+                for index, hashes in tiles_of(connection, number).items()
+            }
         return PointMap(self.map_id, self.lattice, tiles, self.georeference)

@@ -12,11 +12,12 @@ from functools import lru_cache, partial
 from typing import Any
 
 import numpy as np
-from backports import zstd
 from numpy.typing import NDArray
 
-from mapvote.core.grid import CELLS, TILE_CELLS, Lattice, TileIndex
-from mapvote.core.types import I32, N_STATES, U8, MapTile
+from mapvote.codec.arrays import pack_plane, unpack_bytes
+from mapvote.core.grid import CELLS, TILE_CELLS, Grid, TileIndex
+from mapvote.core.tile import Tile
+from mapvote.core.types import I32, N_STATES, U8
 from mapvote.fusion.fuse import Rule, fuse_tile
 from mapvote.server.store.blobs import TileHashes, pack_tile
 from mapvote.server.store.database import Database
@@ -29,9 +30,8 @@ class Task:
     """One tile to fuse: everything a worker needs but the ballots."""
 
     url: str
-    lattice: Lattice
-    index: TileIndex
-    tile: TileHashes | MapTile | None
+    window: Grid
+    tile: TileHashes | Tile | None
     """As it is now: in the store, at hand, or not there."""
     asked: Round
     rule: Rule
@@ -56,7 +56,7 @@ class Fused:
     hashes: TileHashes | None
     """Of the edited tile; None if it stays as it is."""
     planes: Mapping[str, bytes]
-    tile: MapTile | None
+    tile: Tile | None
     """The edited tile where the task held one at hand (replay), else None."""
 
 
@@ -67,25 +67,24 @@ def fuse_stored(task: Task, database: Database | None = None) -> Fused:
     """
     with (database or _database(task.url)).reading() as connection:
         stored = task.tile if isinstance(task.tile, TileHashes) else None
-        tile = (
-            task.tile if isinstance(task.tile, MapTile) else None if stored is None else load_tile(connection, stored)
-        )
-        points, digest = None if tile is None else tile.points, None if stored is None else stored.points
-        votes = counting_votes(connection, task.lattice, task.index, points, task.asked, task.bars, digest)
-    decision, edited = fuse_tile(task.lattice, task.index, tile, votes, task.rule, task.asked.settings)
-    changed = edited is not tile and edited is not None
-    hashes, planes = pack_tile(edited) if changed and edited is not None else (None, {})
+        if isinstance(task.tile, Tile):
+            tile = task.tile
+        else:
+            tile = Tile.empty(task.window) if stored is None else load_tile(connection, task.window, stored)
+        votes = counting_votes(connection, tile, task.asked, task.bars, None if stored is None else stored.points)
+    decision, edited = fuse_tile(tile, votes, task.rule, task.asked.settings)
+    hashes, planes = (None, {}) if edited is tile else pack_tile(edited)
     return Fused(
-        index=task.index,
+        index=tile.index,
         states=pack_states(decision.states),
         tally=pack_tally(decision.tally),
         vehicles=decision.vehicles,
-        points=0 if points is None else len(points),
+        points=len(tile.points),
         added=decision.added,
         deleted=decision.deleted,
         hashes=hashes,
         planes=planes,
-        tile=edited if isinstance(task.tile, MapTile) or task.bars is not None else None,
+        tile=edited if isinstance(task.tile, Tile) or task.bars is not None else None,
     )
 
 
@@ -99,19 +98,19 @@ def fuse_round(tasks: Iterable[Task], database: Database, executor: Executor | N
 
 def pack_states(states: U8) -> bytes:
     """Quick rather than small: decisions are written once for each published tile."""
-    return zstd.compress(np.ascontiguousarray(states).tobytes(), 1)
+    return pack_plane(states, 1)
 
 
 def pack_tally(tally: NDArray[Any]) -> bytes:
     """(256, 256, 5) as a zstd frame of little-endian planes, class by class, which packs four times better than cell
     by cell: uint16 if it comes so, else int32. The length tells which."""
     dtype = "<u2" if tally.dtype == np.uint16 else "<i4"
-    return zstd.compress(np.ascontiguousarray(np.moveaxis(tally, -1, 0), dtype=dtype).tobytes(), 1)
+    return pack_plane(np.moveaxis(tally, -1, 0).astype(dtype), 1)
 
 
 def unpack_tally_plane(data: bytes) -> I32:
     """The inverse of :func:`pack_tally`, (256, 256, 5) int32."""
-    raw = zstd.decompress(data)
+    raw = unpack_bytes(data, 4 * N_STATES * CELLS, "decision: tally")
     dtype = "<u2" if len(raw) == 2 * N_STATES * CELLS else "<i4"
     planes = np.frombuffer(raw, dtype=dtype).reshape(N_STATES, TILE_CELLS, TILE_CELLS)
     return np.ascontiguousarray(np.moveaxis(planes, 0, -1), dtype=np.int32)

@@ -1,0 +1,97 @@
+"""A whole map, and the one place where a cloud is cut into tiles and their ground is laid."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapvote.core.grid import TILE_CELLS, Lattice, TileIndex, tile_of_cells
+from mapvote.core.ground import ground_surface
+from mapvote.core.tile import Tile
+from mapvote.core.types import F32, F64, MapvoteError
+
+_EXTENT_M = 1e7
+_CHUNK = 1_000_000
+"""Points looked at together: a large cloud is never copied as a whole."""
+
+
+@dataclass(frozen=True, slots=True)
+class PointMap:
+    """A whole map. Edited tiles make a new PointMap; tiles themselves never change."""
+
+    map_id: str
+    lattice: Lattice
+    tiles: Mapping[TileIndex, Tile]
+    georeference: Mapping[str, str] = field(default_factory=dict)
+    """Free text carried along (CRS, projector, origin)."""
+
+    def tile(self, index: TileIndex) -> Tile:
+        """One tile; the empty one where the map has none."""
+        return self.tiles.get(index) or Tile.empty(self.lattice.tile(index))
+
+
+def cut_tiles(points_map: NDArray[np.floating], lattice: Lattice) -> Iterator[tuple[TileIndex, NDArray[np.floating]]]:
+    """Points (n, 3) tile by tile, map metres, input order kept inside each tile; tiles in ascending order."""
+    tiles = np.empty((len(points_map), 2), dtype=np.int32)
+    for start in range(0, len(points_map), _CHUNK):
+        piece = slice(start, start + _CHUNK)
+        tiles[piece, 0], tiles[piece, 1] = tile_of_cells(*lattice.cells_of(points_map[piece]))
+    order = np.lexsort((tiles[:, 1], tiles[:, 0]))
+    seams = np.flatnonzero((tiles[order[1:]] != tiles[order[:-1]]).any(axis=1)) + 1
+    for piece_of_order in np.split(order, seams):
+        row, col = tiles[piece_of_order[0]].tolist()
+        yield (row, col), points_map[piece_of_order]
+
+
+def tile_ground(stored: Mapping[TileIndex, F32], tile: TileIndex, lattice: Lattice) -> F32:
+    """Ground of one tile, (256, 256) float32, from its points and its eight neighbours', so that tiles agree.
+
+    ``stored``: each tile's points (n, 3) from its corner, as the map keeps them, so that a map read back lays the
+    same ground.
+    """
+    around = [(tile[0] + dr, tile[1] + dc) for dr in (-1, 0, 1) for dc in (-1, 0, 1)]
+    near = [lattice.tile(key).to_map(stored[key]) for key in around if key in stored]
+    window = lattice.tile(tile)
+    halo = window.padded(TILE_CELLS)
+    return ground_surface(np.concatenate(near), halo)[window.slices_in(halo)].copy()
+
+
+def map_from_points(
+    points_map: NDArray[np.floating],
+    *,
+    lattice: Lattice | None = None,
+    map_id: str | None = None,
+    georeference: Mapping[str, str] | None = None,
+) -> PointMap:
+    """A PointMap of points (n, 3) in map metres: cut into tiles, every point kept in its order, ground laid.
+
+    ``map_id`` defaults to a hash of the points and the lattice. Raises MapvoteError if there are no points, or if
+    some are not finite or lie beyond 10,000 km.
+    """
+    lattice = lattice or Lattice()
+    points = np.asarray(points_map)
+    if points.ndim != 2 or points.shape[1] != 3 or len(points) == 0:
+        raise MapvoteError(f"a map needs points: got an array of shape {points.shape}, expected (n, 3) with n > 0")
+    digest = hashlib.sha256(np.array([lattice.x0, lattice.y0]).tobytes())
+    for start in range(0, len(points), _CHUNK):
+        piece = np.ascontiguousarray(points[start : start + _CHUNK], dtype=np.float64)
+        bad = ~(np.abs(piece) < _EXTENT_M).all(axis=1)
+        if bad.any():
+            raise MapvoteError(
+                f"{int(bad.sum())} of {len(piece)} map points are not finite or beyond 10,000 km "
+                f"(first: point {start + int(np.argmax(bad))}); remove them first"
+            )
+        digest.update(piece.tobytes())
+    stored = {tile: lattice.tile(tile).from_map(p) for tile, p in cut_tiles(points, lattice)}
+    tiles = {tile: Tile(lattice.tile(tile), stored[tile], tile_ground(stored, tile, lattice)) for tile in stored}
+    return PointMap(map_id or digest.hexdigest()[:16], lattice, tiles, dict(georeference or {}))
+
+
+def all_points(point_map: PointMap) -> F64:
+    """Every point (n, 3) of a map in map metres, tile by tile in ascending order."""
+    clouds = [point_map.tiles[tile].points_map for tile in sorted(point_map.tiles)]
+    return np.concatenate(clouds) if clouds else np.zeros((0, 3))
