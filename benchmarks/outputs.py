@@ -16,7 +16,6 @@ import subprocess
 import sys
 from pathlib import Path
 
-RUN = "from mapvote.cli import main; main()"
 BLOCKS = "0:12,24:36", "12:24,36:50"
 
 
@@ -32,7 +31,7 @@ def main() -> None:
 
     def mapvote(*words: str | Path) -> None:
         environment = {**os.environ, "PYTHONPATH": str(source), "OMP_NUM_THREADS": "1"}
-        command = [sys.executable, "-c", RUN, *map(str, words)]
+        command = [sys.executable, "-m", "mapvote", *map(str, words)]
         subprocess.run(command, env=environment, check=True, stdout=subprocess.DEVNULL)
 
     lines: list[str] = []

@@ -12,7 +12,7 @@ from pathlib import Path
 
 def mapvote(*arguments: object) -> list[str]:
     """The command line of the installed program, run by this Python."""
-    return [sys.executable, "-c", "from mapvote.cli import main; main()", *map(str, arguments)]
+    return [sys.executable, "-m", "mapvote", *map(str, arguments)]
 
 
 @contextmanager

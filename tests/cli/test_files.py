@@ -6,11 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import typer
 from scipy.spatial import cKDTree
 from typer.testing import CliRunner
 
-from mapvote.cli import files
+from mapvote.cli import app
 from mapvote.codec.ballot import Ballot, BallotTile, encode, pack_plane
 from mapvote.core.point_map import all_points, map_from_points
 from mapvote.core.sensors import SENSORS
@@ -24,18 +23,12 @@ def run(monkeypatch: pytest.MonkeyPatch) -> CliRunner:
     return CliRunner()
 
 
-def app() -> typer.Typer:
-    app = typer.Typer()
-    files.register(app)
-    return app
-
-
 def cloud() -> F64:
     return np.random.default_rng(1).uniform([-50, -50, 0], [50, 50, 5], (4000, 3))
 
 
 def invoke(run: CliRunner, *args: str | Path, code: int = 0) -> str:
-    result = run.invoke(app(), [str(a) for a in args])
+    result = run.invoke(app, [str(a) for a in args])
     if isinstance(result.exception, MapvoteError):
         raise result.exception
     assert result.exit_code == code, result.output
@@ -44,7 +37,7 @@ def invoke(run: CliRunner, *args: str | Path, code: int = 0) -> str:
 
 def test_import_then_info_then_export_keeps_every_point(tmp_path: Path, run: CliRunner) -> None:
     write_pcd(tmp_path / "a.pcd", cloud())
-    assert "4000 points in 4 tiles" in invoke(run, "import", tmp_path / "a.pcd", "--out", tmp_path / "m")
+    assert "4000 points in 4 tiles" in invoke(run, "import", tmp_path / "a.pcd", tmp_path / "m")
     told = invoke(run, "info", tmp_path / "m")
     assert "mapvote map" in told
     assert "4,000" in told

@@ -6,16 +6,13 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from mapvote.cli import app, register
+from mapvote.cli import app
 from mapvote.core.geometry import from_xyz_rpy
 from mapvote.core.point_map import map_from_points
 from mapvote.core.sensors import SENSORS
 from mapvote.core.types import MapvoteError
 from mapvote.evaluation.loopback import running_server
 from mapvote.formats import DriveWriter, write_map
-
-if not app.registered_commands:
-    register(app)
 
 
 def street(wall_y: float) -> np.ndarray:
@@ -52,5 +49,5 @@ def test_a_ballot_goes_to_the_server_whose_map_it_was_cast_on(tmp_path: Path, mo
 
 
 def test_a_ballot_needs_somewhere_to_go(tmp_path: Path) -> None:
-    with pytest.raises(MapvoteError, match=r"--out FILE, --send URL"):
+    with pytest.raises(MapvoteError, match=r"--out BALLOT, --send URL"):
         vote(tmp_path, "--map", tmp_path)

@@ -10,7 +10,7 @@ import pytest
 from typer.testing import CliRunner
 
 from hand_made import Say, make_ballot, states_plane, two_walls, wall
-from mapvote.cli import app, register
+from mapvote.cli import app
 from mapvote.codec.ballot import Ballot, encode
 from mapvote.config import FuseSettings
 from mapvote.core.point_map import PointMap
@@ -71,8 +71,6 @@ def test_a_round_that_cannot_be_fused_says_why(
 
 
 def run(arguments: Sequence[object]) -> str:
-    if not app.registered_commands:
-        register(app)
     result = CliRunner().invoke(app, ["update", *map(str, arguments)])
     if result.exception is not None and not isinstance(result.exception, SystemExit):
         raise result.exception

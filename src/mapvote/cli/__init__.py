@@ -1,43 +1,67 @@
 """The command line: one short function per verb, heavy imports inside the verbs.
 
-Errors a user can mend are MapvoteError: one line on stderr, exit code 1. A traceback is a bug.
+A mistake that a user can mend is one line on stderr and exit code 1; Ctrl-C is one line and exit code 130, and leaves
+nothing half-written. A traceback is a bug.
 """
 
 from __future__ import annotations
 
 import sys
+from typing import Annotated
 
 import typer
-from rich.console import Console
 
-from mapvote.cli import evaluation, files, inspect, server, update, vehicle
+from mapvote.cli import evaluation, files, inspect, server, setup, update, vehicle
+from mapvote.cli.terminal import complain
 from mapvote.core.types import MapvoteError
 
 app = typer.Typer(
     name="mapvote",
     help="Keep 3D point-cloud maps true: vehicles vote on what has changed.",
+    epilog="`mapvote COMMAND --help` is the manual of a command. `mapvote demo --quick` shows the whole in a minute.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
-    add_completion=False,
     rich_markup_mode="markdown",
+    context_settings={"help_option_names": ["-h", "--help"]},
 )
+for verbs in (vehicle, files, update, server, inspect, evaluation, setup):
+    verbs.register(app)
 
 
-def main() -> None:
-    """Entry point of the ``mapvote`` command."""
-    register(app)
+def _print_version(asked: bool) -> None:
+    if asked:
+        from importlib.metadata import version
+
+        print(f"mapvote {version('mapvote')}")
+        raise typer.Exit
+
+
+@app.callback()
+def options(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="print the version and end")
+    ] = False,
+) -> None:
+    """Keep 3D point-cloud maps true: vehicles vote on what has changed."""
+
+
+def run() -> None:
+    """Run the verb that the command line names, and end the process with its exit code."""
     try:
-        app(standalone_mode=True)
+        app(prog_name="mapvote")
     except MapvoteError as error:
-        Console(stderr=True, soft_wrap=True).print(f"[bold red]mapvote:[/] {error}", highlight=False)
-        sys.exit(1)
+        complain(str(error))
+    except ModuleNotFoundError as error:
+        from mapvote.formats.extras import missing_extra
 
-
-def register(app: typer.Typer) -> None:
-    """Add every verb to ``app``. Modules import nothing heavy at their top."""
-    evaluation.register(app)
-    vehicle.register(app)
-    files.register(app)
-    update.register(app)
-    server.register(app)
-    inspect.register(app)
+        mend = missing_extra(error)
+        if mend is None:
+            raise
+        complain(mend)
+    except OSError as error:
+        complain(f"{error.filename or 'input or output'}: {error.strerror or error}")
+    except SystemExit as end:
+        if end.code == 130:
+            complain("interrupted; what was not finished was not written")
+        raise
+    sys.exit(1)

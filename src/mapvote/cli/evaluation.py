@@ -2,57 +2,61 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
-from mapvote.cli.options import Config
-
-if TYPE_CHECKING:
-    from rich.progress import TaskID
+from mapvote.cli.options import EVALUATE, Config, Scenario, Seed
+from mapvote.cli.terminal import progress, stages
 
 
 def register(app: typer.Typer) -> None:
     """Add demo, simulate and evaluate."""
-    app.command()(demo)
-    app.command()(simulate)
-    app.command()(evaluate)
+    app.command(rich_help_panel=EVALUATE)(demo)
+    app.command(rich_help_panel=EVALUATE)(simulate)
+    app.command(rich_help_panel=EVALUATE)(evaluate)
 
 
 def simulate(
-    scenario: Annotated[str, typer.Argument(help="paper, clear, street, junction, corner, or a .toml file")],
-    out: Annotated[Path, typer.Argument(help="folder to write; it must not exist")],
-    seed: Annotated[int, typer.Option(help="layout, clutter, traffic and noise")] = 1,
+    scenario: Scenario,
+    out: Annotated[Path, typer.Argument(metavar="FOLDER", help="what to write; it must not exist yet")],
+    seed: Seed = 1,
 ) -> None:
-    """Simulate a street before and after: survey drives, voting vehicles' drives, and the truth apart from them."""
-    from rich.progress import Progress
+    """Simulate a street before and after: survey drives, voting vehicles' drives, and the truth apart from them.
 
+    mapvote simulate corner my_street --seed 2
+    """
     from mapvote.simulation import simulate as run
 
-    with Progress(transient=True) as bar:
-        task = bar.add_task(f"simulating {scenario}", total=None)
-        run(scenario, out, seed, progress=lambda done, total: bar.update(task, completed=done, total=total))
-    typer.echo(
-        f"{out}: drives {', '.join(sorted(p.name for p in out.iterdir() if p.name != 'truth'))}; truth in truth/"
-    )
+    with progress(f"simulating {scenario}") as tell:
+        run(scenario, out, seed, progress=tell)
+    print(f"{out}: drives {', '.join(sorted(p.name for p in out.iterdir() if p.name != 'truth'))}; truth in truth/")
 
 
 def evaluate(
-    scenario: Annotated[str, typer.Argument(help="paper, clear, street, junction, corner, or a .toml file")],
-    seed: Annotated[int, typer.Option(help="layout, clutter, traffic and noise")] = 1,
+    scenario: Scenario,
+    seed: Seed = 1,
     case: Annotated[
-        str, typer.Option(help='1..5, "1 column", columns, yardsticks, several by commas, or all')
+        str,
+        typer.Option(metavar="CASES", help='1..5, "1 column", columns, yardsticks, several by commas, or all'),
     ] = "1,2,3,4,5,columns",
-    poses: Annotated[str, typer.Option(help="ndt: the vehicles localise; truth: they are told where they are")] = "ndt",
-    json: Annotated[Path | None, typer.Option(help="write all numbers to this file")] = None,
-    cache: Annotated[Path | None, typer.Option(help="where drives, maps and ballots are kept")] = None,
-    sensor: Annotated[str | None, typer.Option(help="vlp16, hdl32e or hdl64e instead of the scenario's")] = None,
+    poses: Annotated[
+        str, typer.Option(metavar="ndt|truth", help="whether vehicles localise, or are told where they are")
+    ] = "ndt",
+    json: Annotated[Path | None, typer.Option(metavar="FILE", help="also write all numbers to this file")] = None,
+    cache: Annotated[
+        Path | None, typer.Option(metavar="FOLDER", help="where drives, maps and ballots are kept")
+    ] = None,
+    sensor: Annotated[
+        str | None, typer.Option(metavar="NAME", help="vlp16, hdl32e or hdl64e; else the scenario's")
+    ] = None,
     config: Config = None,
 ) -> None:
-    """Simulate, map, vote, and score: Tables II to IV of the paper with its figures beside ours."""
+    """Simulate, map, vote, and score: Tables II to IV of the paper with its figures beside ours.
+
+    mapvote evaluate corner --seed 2 --case 1,5,columns
+    """
     from rich.console import Console
 
     from mapvote.config import load_settings
@@ -70,47 +74,36 @@ def evaluate(
     scene = Scene(
         scenario, seed, settings, cache or default_cache(), overrides, Conditions(true_poses=poses == "truth")
     )
-    with _stages() as told:
+    with stages() as told:
         result = run(scene, cases, with_yardsticks, told).result
     for table in tables(result):
         Console(width=140).print(table)
     if json is not None:
         write_text(as_json(result), json)
-        typer.echo(f"{json}: all numbers")
-
-
-@contextmanager
-def _stages() -> Iterator[Callable[[str, int, int], None]]:
-    """A progress bar for each stage as it begins; the first run also compiles, which the first bar says."""
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
-
-    columns = TextColumn("{task.description:<24}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
-    with Progress(*columns) as bar:
-        tasks: dict[str, TaskID] = {}
-
-        def told(stage: str, done: int, total: int) -> None:
-            if stage not in tasks:
-                tasks[stage] = bar.add_task(stage, total=total)
-            bar.update(tasks[stage], completed=done, total=total)
-
-        yield told
+        print(f"{json}: all numbers")
 
 
 def demo(
-    out: Annotated[Path, typer.Option(help="folder for maps, tables, pictures and report.html")] = Path("out"),
+    out: Annotated[Path, typer.Option(metavar="FOLDER", help="where maps, tables, pictures and report.html go")] = Path(
+        "out"
+    ),
     quick: Annotated[
         bool, typer.Option("--quick", help="a street corner instead of a street: a minute at most")
     ] = False,
 ) -> None:
-    """The whole story on a simulated street: build a map, let three vehicles vote, update it, tell how good it is."""
+    """The whole story on a simulated street: build a map, let three vehicles vote, update it, tell how good it is.
+
+    mapvote demo --quick
+    """
     from rich.console import Console
+    from rich.markup import escape
 
     from mapvote.evaluation.demo import CASE, commands
     from mapvote.evaluation.demo import demo as run
 
     console = Console(soft_wrap=True)
     console.print("The first run compiles its kernels, which takes some seconds in each stage.", style="dim")
-    with _stages() as told:
+    with stages() as told:
         evaluation, story = run(out, quick, told)
     console.print("\n[bold]What changed[/]", highlight=False)
     for area, deleted, added in story.areas:
@@ -124,8 +117,9 @@ def demo(
         highlight=False,
     )
     console.print("\n[bold]Where to look[/]")
-    console.print(f"  {out / 'report.html'}: the story with pictures and tables", highlight=False)
-    console.print(f"  {out / 'map_before.pcd'} and {out / 'map_after.pcd'}: the maps", highlight=False)
-    console.print(f"  {out / 'tables.txt'}, results.json, results.csv, pictures/", highlight=False)
+    place = escape(str(out))
+    console.print(f"  {place}/report.html: the story with pictures and tables", highlight=False)
+    console.print(f"  {place}/map_before.pcd and {place}/map_after.pcd: the maps", highlight=False)
+    console.print(f"  {place}/tables.txt, results.json, results.csv, pictures/", highlight=False)
     console.print("\n[bold]What to try next[/]")
-    console.print("".join(f"  {line}\n" for line in commands(evaluation, out).splitlines()), highlight=False)
+    console.print(escape("".join(f"  {line}\n" for line in commands(evaluation, out).splitlines())), highlight=False)

@@ -7,55 +7,55 @@ from typing import Annotated
 
 import typer
 
-from mapvote.cli.options import Config
-from mapvote.cli.server import StoreName, opened_store, when
+from mapvote.cli.options import SERVER, Config, StoreName
+from mapvote.cli.server import opened_store, when
+from mapvote.cli.terminal import print_table, waiting
 
 
 def register(app: typer.Typer) -> None:
     """Add these verbs to ``app``."""
     for verb in (log, vehicles, changes):
-        app.command()(verb)
+        app.command(rich_help_panel=SERVER)(verb)
 
 
 def log(
     store: StoreName,
-    events: Annotated[int, typer.Option(min=0, help="also the last so many events")] = 0,
+    events: Annotated[int, typer.Option(min=0, metavar="N", help="also the last so many events")] = 0,
 ) -> None:
-    """Versions of a store, and what happened in it."""
-    from rich.console import Console
-    from rich.table import Table
+    """Versions of a store, and what happened in it.
 
+    mapvote log fleet.db --events 20
+    """
     from mapvote.server.insight.history import events as last_events
 
     with opened_store(store) as opened:
         versions, happened = opened.versions(), last_events(opened, events) if events else []
-    table = Table("version", "kind", "from", "when", "by", "reason")
+    rows = []
     for v in versions:
         origin = v.target if v.target is not None else v.parent
-        table.add_row(str(v.number), v.kind, str(origin or ""), when(v.created_ns), v.published_by, v.reason)
-    Console().print(table)
+        rows.append((str(v.number), v.kind, str(origin or ""), when(v.created_ns), v.published_by, v.reason))
+    print_table(("version", "kind", "from", "when", "by", "reason"), rows)
     for event in happened:
         print(f"{event['seq']} {when(event['at_ns'])} {event['kind']} {event['actor']} {event['detail']}")
 
 
 def vehicles(store: StoreName, config: Config = None) -> None:
-    """Which vehicles contradict the others far more than chance, and where."""
-    from rich.console import Console
-    from rich.table import Table
+    """Which vehicles contradict the others far more than chance, and where.
 
+    mapvote vehicles fleet.db
+    """
     from mapvote.config import load_settings
     from mapvote.server.insight.history import vehicle_standings
 
     settings = load_settings(config)
-    with opened_store(store) as opened:
+    with opened_store(store) as opened, waiting("comparing votes"):
         found = vehicle_standings(opened, settings.fuse)
-    table = Table("vehicle", "verdict", "cells compared", "contradictions", "of the others", "p", "the largest")
+    rows = []
     for s in found:
         places = "; ".join(f"{e.says} at {e.x:.1f}, {e.y:.1f} ({e.cells} cells)" for e in s.evidence[:3])
-        table.add_row(
-            s.vehicle, s.verdict, str(s.cells), str(s.objects), str(s.others_objects), f"{s.p_value:.2g}", places
-        )
-    Console().print(table)
+        counts = str(s.cells), str(s.objects), str(s.others_objects), f"{s.p_value:.2g}"
+        rows.append((s.vehicle, s.verdict, *counts, places))
+    print_table(("vehicle", "verdict", "cells compared", "contradictions", "of the others", "p", "the largest"), rows)
     print(
         "Compared where others agree both before and after a vehicle passed; the first and the last cannot be judged."
     )
@@ -63,18 +63,21 @@ def vehicles(store: StoreName, config: Config = None) -> None:
 
 def changes(
     store: StoreName,
-    old: Annotated[int, typer.Option("--from", help="version")] = 1,
-    new: Annotated[int | None, typer.Option("--to", help="version; the newest by default")] = None,
-    min_cells: Annotated[int, typer.Option(min=1, help="leave out smaller objects")] = 1,
-    out: Annotated[Path | None, typer.Option(help="GeoJSON file; else printed")] = None,
+    old: Annotated[int, typer.Option("--from", metavar="VERSION", help="the older version")] = 1,
+    new: Annotated[int | None, typer.Option("--to", metavar="VERSION", help="the newer; else the newest")] = None,
+    min_cells: Annotated[int, typer.Option(min=1, metavar="N", help="leave out smaller objects")] = 1,
+    out: Annotated[Path | None, typer.Option(metavar="GEOJSON", help="the file to write; else it is printed")] = None,
 ) -> None:
-    """What was built and demolished between two versions, as GeoJSON in map metres."""
+    """What was built and demolished between two versions, as GeoJSON in map metres.
+
+    mapvote changes fleet.db --out changes.geojson
+    """
     import json
 
     from mapvote.formats.atomic import whole_file
     from mapvote.server.insight.history import changes_between
 
-    with opened_store(store) as opened:
+    with opened_store(store) as opened, waiting("comparing versions"):
         found = changes_between(opened, old, opened.current() if new is None else new, min_cells)
     text = json.dumps(found, indent=1)
     if out is None:

@@ -1,19 +1,73 @@
-"""Options that several verbs share, so that they read the same everywhere."""
+"""Arguments and options that several verbs share, so that they read the same everywhere, and the groups of verbs."""
 
 from __future__ import annotations
 
+import inspect
+from collections.abc import Callable
+from functools import wraps
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any, get_type_hints
 
 import typer
 
-Scans = Annotated[str | None, typer.Option(help="Which scans: START:STOP:STEP slices, comma-separated: 0:12,24:36")]
-Prior = Annotated[str | None, typer.Option(help="File of 3 x 4 rows T_map_lidar (a pose topic of a bag), or none")]
-Rate = Annotated[float | None, typer.Option(help="Revolutions per second, where the drive has no times")]
-SensorName = Annotated[
-    str | None, typer.Option("--sensor", help="hdl32e, hdl64e, vlp16; else drive.toml, else a guess")
+DRIVE, MAP, SERVER, EVALUATE, SETUP = "Drive", "Map", "Server", "Simulate and evaluate", "Set up"
+"""Headings of ``mapvote --help``."""
+
+Config = Annotated[Path | None, typer.Option(metavar="TOML", help="settings; `mapvote config` prints them all")]
+DrivePath = Annotated[Path, typer.Argument(metavar="DRIVE", help="a recorded drive, in any format")]
+MapPath = Annotated[Path, typer.Argument(metavar="MAP", help="a map, in any format")]
+Scenario = Annotated[
+    str, typer.Argument(metavar="SCENARIO", help="paper, clear, street, junction, corner, or a TOML file of your own")
 ]
-Vehicle = Annotated[str | None, typer.Option(help="Name of the vehicle; else drive.toml, else the drive's name")]
-Mount = Annotated[str | None, typer.Option(help="T_base_lidar: x,y,z,roll,pitch,yaw (m, deg) or 12 numbers")]
-Topic = Annotated[str | None, typer.Option(help="The PointCloud2 topic of a bag that has several")]
-Config = Annotated[Path | None, typer.Option(help="TOML file of settings; mapvote config prints them all")]
+Seed = Annotated[int, typer.Option(metavar="N", help="decides layout, clutter, traffic and noise")]
+StoreName = Annotated[
+    str, typer.Argument(metavar="STORE", help="an SQLite file, or the URL of a database (postgresql+psycopg://...)")
+]
+Reason = Annotated[str, typer.Option(metavar="TEXT", help="kept with the version")]
+MinVotes = Annotated[
+    int | None, typer.Option(min=1, metavar="N", help="vehicles that a change needs; else as the settings say")
+]
+
+Rate = Annotated[
+    float | None, typer.Option("--rate", metavar="HZ", help="revolutions per second, where the drive has no times")
+]
+Topic = Annotated[str | None, typer.Option(metavar="TOPIC", help="the PointCloud2 topic of a bag that has several")]
+DRIVE_OPTIONS = {
+    "scans": Annotated[
+        str | None, typer.Option(metavar="SLICES", help="which scans: START:STOP:STEP, comma-separated: 0:12,24:36")
+    ],
+    "prior": Annotated[
+        str | None,
+        typer.Option(metavar="FILE|TOPIC|none", help="poses T_map_lidar: rows of 3 x 4, or a pose topic of a bag"),
+    ],
+    "rate_hz": Rate,
+    "sensor": Annotated[
+        str | None, typer.Option(metavar="NAME", help="hdl32e, hdl64e, vlp16; else drive.toml, else a guess")
+    ],
+    "mount": Annotated[
+        str | None,
+        typer.Option(metavar="NUMBERS", help="T_base_lidar: x,y,z,roll,pitch,yaw in metres and degrees, or 12 numbers"),
+    ],
+    "topic": Topic,
+}
+"""What the command line may say about a drive, by the names of ``formats.open_drive``."""
+
+
+def with_drive_options(verb: Callable[..., None]) -> Callable[..., None]:
+    """``verb`` with every one of DRIVE_OPTIONS on its command line, handed over together as its ``drive_options``."""
+
+    @wraps(verb)
+    def command(**arguments: Any) -> None:
+        drive_options = {name: arguments.pop(name) for name in DRIVE_OPTIONS}
+        verb(**arguments, drive_options=drive_options)
+
+    hints = get_type_hints(verb, include_extras=True)
+    own = inspect.signature(verb).parameters.values()
+    said = [p.replace(annotation=hints[p.name]) for p in own if p.name != "drive_options"]
+    keyword = inspect.Parameter.KEYWORD_ONLY
+    shared = [inspect.Parameter(name, keyword, default=None, annotation=kind) for name, kind in DRIVE_OPTIONS.items()]
+    parameters = [p.replace(kind=keyword) for p in said] + shared
+    command.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+    command.__annotations__ = {p.name: p.annotation for p in parameters}
+    del command.__wrapped__
+    return command

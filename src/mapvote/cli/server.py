@@ -9,39 +9,48 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from mapvote.cli.options import Config
-from mapvote.server.store.store import Store
+from mapvote.cli.options import SERVER, Config, MinVotes, Reason, StoreName
+from mapvote.cli.terminal import waiting
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor
 
     from mapvote.server.store.publish import Outcome
+    from mapvote.server.store.store import Store
 
-GateDrive = Annotated[Path | None, typer.Option(help="reference drive that must localise no worse in a new version")]
+GateDrive = Annotated[
+    Path | None, typer.Option(metavar="DRIVE", help="a reference drive that must localise no worse in a new version")
+]
 
 
 def register(app: typer.Typer) -> None:
     """Add these verbs to ``app``."""
     for verb in (serve, publish, rollback, unvote, upgrade, keys):
-        app.command()(verb)
+        app.command(rich_help_panel=SERVER)(verb)
 
 
 def serve(
     store: StoreName,
-    map_path: Annotated[Path | None, typer.Option("--map", help="first map, if STORE is to be created")] = None,
-    host: Annotated[str, typer.Option(help="address to listen on; beyond this machine only with keys")] = "127.0.0.1",
-    port: Annotated[int, typer.Option(min=0, max=65535, help="0: any free one")] = 8080,
+    map_path: Annotated[Path | None, typer.Option("--map", metavar="MAP", help="first map of a new STORE")] = None,
+    host: Annotated[
+        str, typer.Option(metavar="ADDRESS", help="where to listen; beyond this machine only with keys")
+    ] = "127.0.0.1",
+    port: Annotated[int, typer.Option(min=0, max=65535, metavar="N", help="0: any free one")] = 8080,
     gate: GateDrive = None,
     config: Config = None,
 ) -> None:
-    """Serve a store to vehicles and operators until stopped."""
+    """Serve a store to vehicles and operators until stopped.
+
+    mapvote serve fleet.db --map my_map
+    """
     from mapvote.config import load_settings
     from mapvote.server.http.serve import log_as_json, open_or_create, reference_gate
     from mapvote.server.http.serve import serve as run
 
     settings = load_settings(config)
     log_as_json()
-    opened = open_or_create(store, map_path)
+    with waiting(f"opening {store}"):
+        opened = open_or_create(store, map_path)
     try:
         judge = None if gate is None else reference_gate(gate, settings)
         run(opened, settings, host=host, port=port, gate=judge, ready=lambda url: print(f"serving {url}", flush=True))
@@ -51,15 +60,20 @@ def serve(
 
 def publish(
     store: StoreName,
-    dry_run: Annotated[bool, typer.Option(help="only say what would change")] = False,
-    override: Annotated[bool, typer.Option(help="publish in spite of the reasons to hold it")] = False,
-    min_votes: Annotated[int | None, typer.Option(min=1, help="vehicles that a change needs")] = None,
-    reason: Annotated[str, typer.Option(help="kept with the version")] = "",
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="only say what would change")] = False,
+    override: Annotated[bool, typer.Option("--override", help="publish in spite of the reasons to hold it")] = False,
+    min_votes: MinVotes = None,
+    reason: Reason = "",
     gate: GateDrive = None,
-    cluster: Annotated[str | None, typer.Option(help="Dask scheduler to fuse on, e.g. tcp://host:8786")] = None,
+    cluster: Annotated[
+        str | None, typer.Option(metavar="ADDRESS", help="Dask scheduler to fuse on, e.g. tcp://host:8786")
+    ] = None,
     config: Config = None,
 ) -> None:
-    """Fuse the ballots that stand and publish the next version."""
+    """Fuse the ballots that stand and publish the next version.
+
+    mapvote publish fleet.db --dry-run
+    """
     from concurrent.futures import ThreadPoolExecutor
 
     from mapvote.config import load_settings
@@ -69,7 +83,8 @@ def publish(
     settings = load_settings(config)
     policy = settings.fuse if min_votes is None else settings.fuse.model_copy(update={"min_votes": min_votes})
     judge = None if gate is None else reference_gate(gate, settings)
-    with opened_store(store) as opened, dask_cluster(cluster) if cluster else ThreadPoolExecutor(2) as executor:
+    workers = dask_cluster(cluster) if cluster else ThreadPoolExecutor(2)
+    with opened_store(store) as opened, workers as executor, waiting("deciding"):
         done = publish_version(
             opened, policy, reason=reason, dry_run=dry_run, override=override, gate=judge, executor=executor
         )
@@ -78,10 +93,13 @@ def publish(
 
 def rollback(
     store: StoreName,
-    to: Annotated[int, typer.Argument(help="the version that shall be the map again")],
-    reason: Annotated[str, typer.Option(help="kept with the version")] = "",
+    to: Annotated[int, typer.Argument(metavar="VERSION", help="the version that shall be the map again")],
+    reason: Reason = "",
 ) -> None:
-    """Publish an older version again, and bar the votes that led away from it."""
+    """Publish an older version again, and bar the votes that led away from it.
+
+    mapvote rollback fleet.db 1 --reason "the second was wrong"
+    """
     from mapvote.server.store.publish import rollback as roll_back
 
     with opened_store(store) as opened:
@@ -91,13 +109,16 @@ def rollback(
 
 def unvote(
     store: StoreName,
-    vehicle: Annotated[str | None, typer.Argument(help="whose votes go")] = None,
+    vehicle: Annotated[str | None, typer.Argument(metavar="[VEHICLE]", help="whose votes go")] = None,
     everybody: Annotated[bool, typer.Option("--all", help="every vehicle's: begins a new round")] = False,
-    drive: Annotated[str | None, typer.Option(help="only this drive; else all of them")] = None,
-    replay: Annotated[bool, typer.Option(help="also take it out of what is published, in a new version")] = False,
-    yes: Annotated[bool, typer.Option(help="with --replay: publish; else only show the difference")] = False,
+    drive: Annotated[str | None, typer.Option(metavar="NAME", help="only this drive; else all of them")] = None,
+    replay: Annotated[bool, typer.Option("--replay", help="also out of what is published, in a new version")] = False,
+    yes: Annotated[bool, typer.Option("--yes", help="with --replay: publish; else only show the difference")] = False,
 ) -> None:
-    """Withdraw a vehicle's votes, from what is to come or (--replay) from every version."""
+    """Withdraw a vehicle's votes, from what is to come or (--replay) from every version.
+
+    mapvote unvote fleet.db car_1
+    """
     from mapvote.core.types import MapvoteError
     from mapvote.server.store.ballots import withdraw
     from mapvote.server.store.replay import replay as replay_without
@@ -111,12 +132,16 @@ def unvote(
             whose = vehicle or "all vehicles"
             print(f"{withdraw(opened, vehicle, drive, by='operator')} ballots of {whose} withdrawn")
             return
-        done = replay_without(opened, vehicle, dry_run=not yes)
+        with waiting("deciding anew"):
+            done = replay_without(opened, vehicle, dry_run=not yes)
     _print_outcome(done, "published" if done.published else "only shown: --yes publishes it")
 
 
 def upgrade(store: StoreName) -> None:
-    """Bring a store that an older mapvote wrote to the schema of this one. Stop the server and make a backup first."""
+    """Bring a store that an older mapvote wrote to the schema of this one. Stop the server and make a backup first.
+
+    mapvote upgrade fleet.db
+    """
     from mapvote.server.store.migrate import upgrade as upgrade_schema
     from mapvote.server.store.store import existing, url_of
 
@@ -130,11 +155,14 @@ def upgrade(store: StoreName) -> None:
 
 def keys(
     store: StoreName,
-    action: Annotated[str, typer.Argument(help="list, issue or revoke")] = "list",
-    name: Annotated[str | None, typer.Argument(help="vehicle or operator")] = None,
-    operator: Annotated[bool, typer.Option(help="issue an operator's key, not a vehicle's")] = False,
+    action: Annotated[str, typer.Argument(metavar="[ACTION]", help="list, issue or revoke")] = "list",
+    name: Annotated[str | None, typer.Argument(metavar="[NAME]", help="vehicle or operator")] = None,
+    operator: Annotated[bool, typer.Option("--operator", help="issue an operator's key, not a vehicle's")] = False,
 ) -> None:
-    """List, issue or revoke keys. A new key is printed once and kept nowhere."""
+    """List, issue or revoke keys. A new key is printed once and kept nowhere.
+
+    mapvote keys fleet.db issue car_1
+    """
     from mapvote.core.types import MapvoteError
     from mapvote.server.store import keys as store_keys
 
@@ -174,9 +202,6 @@ def _print_outcome(done: Outcome, what: str) -> None:
     print(f"version {done.version} ({what}): {done.added} points added, {done.deleted} deleted{tiles}")
     for reason in done.held:
         print(f"hold: {reason}")
-
-
-StoreName = Annotated[str, typer.Argument(metavar="STORE", help="SQLite file, or URL (postgresql+psycopg://...)")]
 
 
 @contextmanager

@@ -7,6 +7,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from mapvote.cli.options import MAP, MapPath, MinVotes
+from mapvote.cli.terminal import print_table, waiting
+
 if TYPE_CHECKING:
     from mapvote.core.grid import TileIndex
     from mapvote.core.types import U8
@@ -15,23 +18,24 @@ if TYPE_CHECKING:
 
 def register(app: typer.Typer) -> None:
     """Add the verb to ``app``."""
-    app.command()(update)
+    app.command(rich_help_panel=MAP)(update)
 
 
 def update(
-    map_path: Annotated[Path, typer.Argument(metavar="MAP", help="map folder, PCD file or Autoware folder")],
+    map_path: MapPath,
     ballot_files: Annotated[list[Path], typer.Argument(metavar="BALLOT...", help="ballots of one round")],
-    out: Annotated[Path | None, typer.Option(help="where the updated map goes")] = None,
-    dry_run: Annotated[bool, typer.Option(help="decide and report, write no map")] = False,
-    cells: Annotated[Path | None, typer.Option(help="also write the decided states to this .npz")] = None,
-    min_votes: Annotated[
-        int | None,
-        typer.Option(
-            min=1, help="vehicles that a change needs; default 1 for the paper's rule, else as in the settings"
-        ),
-    ] = None,
+    out: Annotated[Path | None, typer.Option(metavar="MAP", help="the updated map to write, a folder")] = None,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="decide and report, write no map")] = False,
+    cells: Annotated[Path | None, typer.Option(metavar="NPZ", help="also write the decided states of cells")] = None,
+    min_votes: MinVotes = None,
 ) -> None:
-    """Fuse ballots offline and edit the map: add, delete, keep."""
+    """Fuse ballots offline and edit the map: add, delete, keep.
+
+    A change needs a majority of the vehicles that determined the cell, and --min-votes of them: by default as many as
+    the settings say, but one where the ballots were cast by the paper's rule.
+
+        mapvote update my_map car_1.ballot car_2.ballot --out my_map_updated
+    """
     from mapvote.codec.ballot import decode
     from mapvote.config import FuseSettings
     from mapvote.core.types import MapvoteError
@@ -52,18 +56,21 @@ def update(
     settings = FuseSettings()
     paper = bool(ballots) and ballots[0].method == "paper"
     settings = settings.model_copy(update={"min_votes": min_votes or (1 if paper else settings.min_votes)})
-    before = read_map(map_path)
-    after, decisions = update_map(before, ballots, settings)
+    with waiting(f"reading {map_path}"):
+        before = read_map(map_path)
+    with waiting("deciding"):
+        after, decisions = update_map(before, ballots, settings)
     if cells is not None:
         states, grid = states_over(before.lattice, decisions)
         _write_cells(cells, states, grid.x0, grid.y0)
     if out is not None and not dry_run:
-        write_map(after, out)
+        with waiting(f"writing {out}"):
+            write_map(after, out)
     _report(decisions, len({ballot.vehicle for ballot in ballots}), settings.min_votes, None if dry_run else out)
 
 
 def _write_cells(path: Path, states: U8, x0: float, y0: float) -> None:
-    """Decided states over the window of all ballots (DESIGN 6), written whole or not at all."""
+    """Decided states over the window of all ballots, written whole or not at all."""
     import numpy as np
 
     from mapvote.core.grid import CELL_SIZE
@@ -74,24 +81,19 @@ def _write_cells(path: Path, states: U8, x0: float, y0: float) -> None:
 
 
 def _report(decisions: dict[TileIndex, Decision], vehicles: int, min_votes: int, out: Path | None) -> None:
-    from rich.console import Console
-    from rich.table import Table
-
     from mapvote.core.types import CellState
 
-    console = Console()
-    table = Table("tile", "vehicles", "changed-occupied cells", "changed-empty cells", "points added", "points deleted")
+    rows = []
     for index, d in decisions.items():
         occupied = int((d.states == CellState.CHANGED_OCCUPIED).sum())
         empty = int((d.states == CellState.CHANGED_EMPTY).sum())
         if occupied or empty:
-            table.add_row(
-                *(str(v) for v in (f"{index[0]},{index[1]}", d.vehicles, occupied, empty, d.added, d.deleted))
-            )
-    if table.row_count:
-        console.print(table)
+            rows.append((f"{index[0]},{index[1]}", *map(str, (d.vehicles, occupied, empty, d.added, d.deleted))))
+    if rows:
+        headings = "vehicles", "changed-occupied cells", "changed-empty cells", "points added", "points deleted"
+        print_table(("tile", *headings), rows)
     added, deleted = sum(d.added for d in decisions.values()), sum(d.deleted for d in decisions.values())
-    console.print(f"{vehicles} vehicles, {len(decisions)} tiles: {added} points added, {deleted} deleted")
+    print(f"{vehicles} vehicles, {len(decisions)} tiles: {added} points added, {deleted} deleted")
     if vehicles < min_votes:
-        console.print(f"A change needs {min_votes} vehicles and {vehicles} voted, so nothing can change: --min-votes 1")
-    console.print(f"updated map: {out}" if out is not None else "dry run: no map written")
+        print(f"A change needs {min_votes} vehicles and {vehicles} voted, so nothing can change: --min-votes 1")
+    print(f"updated map: {out}" if out is not None else "dry run: no map written")

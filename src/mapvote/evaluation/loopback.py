@@ -17,7 +17,6 @@ from mapvote.core.point_map import PointMap
 from mapvote.core.types import MapvoteError
 
 _STOP_S = 20.0
-_SERVE = "from mapvote.cli import main; main()"
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,7 +36,7 @@ def running_server(store: Path, first_map: Path, log: Path) -> Iterator[str]:
 
     MapvoteError with the server's last line if it does not come up.
     """
-    command = [sys.executable, "-c", _SERVE, "serve", str(store), "--map", str(first_map), "--port", "0"]
+    command = [sys.executable, "-m", "mapvote", "serve", str(store), "--map", str(first_map), "--port", "0"]
     with log.open("w") as errors, subprocess.Popen(command, stdout=subprocess.PIPE, stderr=errors, text=True) as server:
         try:
             assert server.stdout is not None

@@ -62,9 +62,9 @@ def whole_folder(path: Path | str, *, sign: str) -> Iterator[Path]:
             os.replace(path, old)
         os.replace(partial, path)
     except OSError as error:
-        if old.exists() and not path.exists():
-            os.replace(old, path)
         raise MapvoteError(f"{path}: cannot be written ({error.strerror or error}); nothing was changed") from error
     finally:
+        if old.exists() and not path.exists():  # an error or Ctrl-C between the two renames
+            os.replace(old, path)
         shutil.rmtree(partial, ignore_errors=True)
         shutil.rmtree(old, ignore_errors=True)

@@ -1,8 +1,10 @@
-"""Packages that only some formats need: asked for when they are needed, missed in one clear line."""
+"""Packages that only some formats and verbs need: asked for when they are needed, missed in one clear line."""
 
 from __future__ import annotations
 
 import importlib
+import re
+from importlib import metadata
 from pathlib import Path
 from types import ModuleType
 
@@ -17,6 +19,20 @@ def require(module: str, extra: str, where: str) -> ModuleType:
         raise MapvoteError(
             f"{where}: needs the package {module.partition('.')[0]}; install it with: pip install 'mapvote[{extra}]'"
         ) from error
+
+
+def missing_extra(error: ModuleNotFoundError) -> str | None:
+    """What to install for a module that was not found, as mapvote's own metadata says; None if no extra has it."""
+    module = (error.name or "").partition(".")[0]
+    try:
+        requirements = metadata.requires("mapvote") or []
+    except metadata.PackageNotFoundError:
+        return None
+    for requirement in requirements:
+        package, extra = re.match(r"[\w.-]+", requirement), re.search(r"extra == ['\"](\w+)['\"]", requirement)
+        if package and extra and re.sub(r"[-.]+", "_", package[0]).lower() == module.lower():
+            return f"this needs the package {module}; install it with: pip install 'mapvote[{extra[1]}]'"
+    return None
 
 
 def read_text(file: Path) -> str:

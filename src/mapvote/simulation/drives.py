@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import multiprocessing
 import os
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -22,6 +20,7 @@ from mapvote.core.types import F32, F64, I32, U8, MapvoteError
 from mapvote.formats.drives.kitti import DriveWriter, write_poses
 from mapvote.simulation.actors import Traffic, make_traffic
 from mapvote.simulation.lidar import Caster, measure, sweep
+from mapvote.simulation.processes import processes
 from mapvote.simulation.routes import Route, make_routes
 from mapvote.simulation.scenario import Scenario, load_scenario
 from mapvote.simulation.truth import count_hits, dense_survey, ground_cells, truth_grid, write_truth
@@ -130,7 +129,7 @@ def _pool(workers: int) -> Iterator[_Run]:
     if workers == 1:
         yield map
         return
-    with ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn")) as pool:
+    with processes(workers) as pool:
         yield pool.map
 
 

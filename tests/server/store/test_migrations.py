@@ -21,7 +21,7 @@ from alembic.script import ScriptDirectory
 from typer.testing import CliRunner
 
 from hand_made import Say, make_ballot, states_plane, two_walls
-from mapvote.cli import app, register
+from mapvote.cli import app
 from mapvote.codec.ballot import encode
 from mapvote.config import FuseSettings
 from mapvote.core.types import CellState, MapvoteError
@@ -137,8 +137,6 @@ def test_an_older_store_is_refused_until_it_is_upgraded(first_store: str) -> Non
         Store.open(first_store)
     with pytest.raises(MapvoteError, match=refusal):
         Store.create(first_store, two_walls())
-    if not app.registered_commands:
-        register(app)
     for says in (f"schema 0001 is now {migrate.HEAD}", "nothing to do"):
         done = CliRunner().invoke(app, ["upgrade", first_store], catch_exceptions=False)
         assert done.exit_code == 0

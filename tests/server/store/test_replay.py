@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from typer.testing import CliRunner
 
 from hand_made import Cell, Say, make_ballot, states_plane, two_walls, wall, words_plane
-from mapvote.cli import app, register
+from mapvote.cli import app
 from mapvote.codec.ballot import encode
 from mapvote.config import FuseSettings
 from mapvote.core.point_map import PointMap
@@ -194,8 +194,6 @@ def test_from_the_command_line(store: Store, honest: Store, database_url: str) -
     name = database_url.removeprefix("sqlite:///")
 
     def run(*arguments: str) -> str:
-        if not app.registered_commands:
-            register(app)
         done = CliRunner().invoke(app, ["unvote", name, *arguments], catch_exceptions=False)
         assert done.exit_code == 0
         return done.output

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import json
-import multiprocessing
 import time
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,6 +22,7 @@ from mapvote.evaluation.experiments.scene import BALLOTS_FROM, Progress, Scene, 
 from mapvote.evaluation.scoring.map_points import map_obstacles
 from mapvote.formats.atomic import whole_folder
 from mapvote.localisation.tracker import GivenPoses
+from mapvote.simulation.processes import processes
 from mapvote.vehicle import Vehicle
 
 
@@ -48,7 +47,7 @@ def yardsticks(
     if progress:
         progress("yardsticks", 0, len(tasks))
     if workers > 1 and len(tasks) > 1:
-        with ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn")) as pool:
+        with processes(workers) as pool:
             list(pool.map(_measure, tasks))
     else:
         for task in tasks:

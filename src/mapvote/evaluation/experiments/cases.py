@@ -7,10 +7,9 @@ and the decided cells are scored. Ballots are cached, so that a run that was cut
 from __future__ import annotations
 
 import json
-import multiprocessing
 import time
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import as_completed
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -32,6 +31,7 @@ from mapvote.formats.atomic import whole_folder
 from mapvote.fusion.fuse import states_over
 from mapvote.fusion.offline import update_map
 from mapvote.localisation.tracker import GivenPoses, MapWindow, Tracker
+from mapvote.simulation.processes import processes
 from mapvote.vehicle import Localise, Vehicle
 
 OCCLUSIONS = ("first_hit", "farthest_return", "column")
@@ -122,7 +122,7 @@ def passes(
     if progress:
         progress("voting", done, len(names))
     if workers > 1 and len(missing) > 1:
-        with ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn")) as pool:
+        with processes(workers) as pool:
             for finished in as_completed([pool.submit(drive_once, scene, cases, name) for name in missing]):
                 finished.result()
                 done += 1

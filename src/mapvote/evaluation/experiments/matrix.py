@@ -7,9 +7,8 @@ short goes on where it stopped, and experiments that share drives, maps or ballo
 from __future__ import annotations
 
 import json
-import multiprocessing
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, Future, wait
 from dataclasses import dataclass, field, replace
 from itertools import product
 from pathlib import Path
@@ -30,6 +29,7 @@ from mapvote.evaluation.experiments.scene import BALLOTS_FROM, Progress, Scene, 
 from mapvote.evaluation.scoring.cells import UNSCORED, determined, ratio, score_cells
 from mapvote.evaluation.scoring.jury import Jury, Outcome
 from mapvote.formats.atomic import whole_file
+from mapvote.simulation.processes import processes
 
 _SCORES_FROM = (
     *BALLOTS_FROM, "fusion", "simulation", "evaluation/scoring", "evaluation/evaluate.py",
@@ -154,7 +154,7 @@ class Matrix:
         alone = replace(self, workers=1)
         waiting = [(name, seed) for name in names for seed in self.seeds]
         running: dict[Future[dict[str, Any]], tuple[str, int]] = {}
-        with ProcessPoolExecutor(self.workers, mp_context=multiprocessing.get_context("spawn")) as pool:
+        with processes(self.workers) as pool:
             while waiting or running:
                 for name, seed in list(waiting):
                     if len(running) < self.workers and all(seed != other for _, other in running.values()):

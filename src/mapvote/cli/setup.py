@@ -1,0 +1,51 @@
+"""Verbs that concern this installation: config."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from mapvote.cli.options import SETUP, Config
+
+
+def register(app: typer.Typer) -> None:
+    """Add these verbs to ``app``."""
+    app.command(rich_help_panel=SETUP)(config)
+
+
+def config(
+    config: Config = None,
+    toml: Annotated[bool, typer.Option("--toml", help="print as TOML, to start a settings file from")] = False,
+) -> None:
+    """Show every setting with its value, where the value comes from, and what it means.
+
+    Settings come from their defaults, then from the TOML file, then from the environment (MAPVOTE_VOTING__N_MIN=4).
+
+        mapvote config --toml > settings.toml
+    """
+    import tomli_w
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    from mapvote.config import Settings, load_with_sources
+
+    settings, sources = load_with_sources(config)
+    if toml:
+        print(tomli_w.dumps(settings.model_dump(exclude_none=True)), end="")
+        return
+    table = Table(title="Settings", title_justify="left", header_style="bold")
+    for heading in ("setting", "value", "source", "meaning"):
+        table.add_column(heading, overflow="fold")
+    for section in Settings.model_fields:
+        values = getattr(settings, section)
+        for key, field in type(values).model_fields.items():
+            source = sources.get(f"{section}.{key}", "default")
+            style = "" if source == "default" else "bold green"
+            row = (f"{section}.{key}", str(getattr(values, key)), source, field.description or "")
+            table.add_row(*(Text(cell) for cell in row), style=style)
+        table.add_section()
+    console = Console()
+    console.print(table)
+    console.print(f"Digest {settings.digest()[:16]}: ballots of one round must agree on it.", highlight=False)

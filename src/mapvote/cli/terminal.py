@@ -1,0 +1,86 @@
+"""What every verb shows in the same way: a mistake in one line, tables, and how far it is while one waits.
+
+Whatever comes from users and files is shown as it is: rich takes square brackets in plain strings for its markup.
+Progress goes to stderr, so that stdout can be piped.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from rich.progress import TaskID
+
+
+def complain(message: str) -> None:
+    """One line on stderr; the words of the message unchanged."""
+    from rich.console import Console
+    from rich.text import Text
+
+    line = Text.assemble(("mapvote:", "bold red"), " ", message)
+    Console(stderr=True, soft_wrap=True).print(line, highlight=False)
+
+
+def print_table(headings: Iterable[str], rows: Iterable[Iterable[str]], title: str | None = None) -> None:
+    """A table on stdout. Text that does not fit is folded, never cut."""
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(title=title, title_justify="left")
+    for heading in headings:
+        table.add_column(heading, overflow="fold")
+    for row in rows:
+        table.add_row(*(Text(cell) for cell in row))
+    Console().print(table)
+
+
+@contextmanager
+def waiting(what: str) -> Iterator[None]:
+    """A turning wheel beside ``what`` for work that cannot say how far it is; nothing where there is no terminal."""
+    from rich.console import Console
+    from rich.markup import escape
+
+    console = Console(stderr=True)
+    if not console.is_terminal:
+        yield
+        return
+    with console.status(escape(what)):
+        yield
+
+
+@contextmanager
+def progress(what: str) -> Iterator[Callable[[int, int], None]]:
+    """A bar for one piece of work, told (done, in all); gone at the end. Nothing where there is no terminal."""
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.progress import Progress
+
+    console = Console(stderr=True)
+    with Progress(transient=True, console=console, disable=not console.is_terminal) as bar:
+        task = bar.add_task(f"{escape(what)}, getting ready", total=None)
+
+        def tell(done: int, total: int) -> None:
+            bar.update(task, description=escape(what), completed=done, total=total)
+
+        yield tell
+
+
+@contextmanager
+def stages() -> Iterator[Callable[[str, int, int], None]]:
+    """A bar for each stage as it begins, told (stage, done, in all); they stay, with the time that each took."""
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+    columns = TextColumn("{task.description:<24}", markup=False), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
+    with Progress(*columns, console=Console(stderr=True)) as bar:
+        tasks: dict[str, TaskID] = {}
+
+        def tell(stage: str, done: int, total: int) -> None:
+            if stage not in tasks:
+                tasks[stage] = bar.add_task(stage, total=total)
+            bar.update(tasks[stage], completed=done, total=total)
+
+        yield tell

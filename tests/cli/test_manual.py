@@ -1,0 +1,117 @@
+"""First contact: the version, the help of every verb, completion, and errors whose words survive the terminal."""
+
+from __future__ import annotations
+
+import inspect
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import typer
+from typer.main import get_command
+from typer.testing import CliRunner
+
+from live_server import mapvote
+from mapvote.cli import app
+from mapvote.cli.options import DRIVE_OPTIONS
+from mapvote.formats import open_drive
+
+VERBS = sorted(get_command(app).commands)  # type: ignore[attr-defined]
+
+
+def run(*arguments: object) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(mapvote(*arguments), capture_output=True, text=True, timeout=60)
+
+
+def ask(*words: str) -> str:
+    result = CliRunner().invoke(app, list(words), env={"COLUMNS": "160", "NO_COLOR": "1"}, prog_name="mapvote")
+    assert result.exit_code == 0, result.output
+    return result.output
+
+
+def test_the_version_is_the_packages() -> None:
+    from importlib.metadata import version
+
+    assert ask("--version") == f"mapvote {version('mapvote')}\n"
+
+
+def test_help_groups_every_verb() -> None:
+    told = ask("--help")
+    for group in ("Drive", "Map", "Server", "Simulate and evaluate", "Set up"):
+        assert f"─ {group} ─" in told
+    assert "─ Commands ─" not in told  # where typer puts what has no group
+    assert "--install-completion" in told
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_the_help_of_every_verb_ends_with_an_example(verb: str) -> None:
+    text = ask(verb, "--help")
+    assert f" mapvote {verb} " in text.split("╭─")[0].partition("Usage:")[2].partition("\n")[2]
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_everything_that_a_verb_takes_is_explained(verb: str) -> None:
+    for parameter in get_command(app).commands[verb].params:  # type: ignore[attr-defined]
+        assert getattr(parameter, "help", "") or parameter.name == "help", f"{verb}: {parameter.name}"
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+def test_a_shell_can_complete(shell: str) -> None:
+    said = subprocess.run(
+        mapvote(), env=os.environ | {"_MAPVOTE_COMPLETE": f"source_{shell}"}, capture_output=True, text=True
+    )
+    assert "_MAPVOTE_COMPLETE" in said.stdout
+
+
+def test_drive_options_are_those_of_open_drive() -> None:
+    assert set(DRIVE_OPTIONS) | {"path", "vehicle"} == set(inspect.signature(open_drive).parameters)
+
+
+@pytest.mark.parametrize("verb", ["build", "vote", "doctor"])
+def test_every_verb_that_takes_a_drive_takes_the_same_options(verb: str) -> None:
+    taken = {p.name for p in get_command(app).commands[verb].params}  # type: ignore[attr-defined]
+    assert set(DRIVE_OPTIONS) <= taken
+
+
+def test_import_and_export_take_what_is_there_and_what_to_write() -> None:
+    for verb in ("import", "export"):
+        arguments = [p for p in get_command(app).commands[verb].params if isinstance(p, typer.core.TyperArgument)]  # type: ignore[attr-defined]
+        assert [p.name for p in arguments][1] == "out"
+        assert len(arguments) == 2
+
+
+def test_square_brackets_in_a_message_reach_the_terminal(tmp_path: Path) -> None:
+    done = run("info", tmp_path / "street[las].pcd")
+    assert done.returncode == 1
+    assert "street[las].pcd: nothing is there" in done.stderr
+    assert done.stdout == ""
+
+
+def test_a_missing_file_is_one_line(tmp_path: Path) -> None:
+    done = run("update", tmp_path / "map", tmp_path / "a.ballot", "--dry-run")
+    assert done.returncode == 1
+    assert len(done.stderr.splitlines()) == 1
+
+
+def test_a_folder_that_cannot_be_written_is_one_line(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    done = run("simulate", "corner", tmp_path / "file" / "street")
+    assert done.returncode == 1
+    assert done.stderr.startswith("mapvote: ")
+    assert len(done.stderr.splitlines()) == 1
+
+
+def test_a_wrong_option_is_a_usage_error() -> None:
+    done = run("simulate", "corner", "--sed", "3")
+    assert done.returncode == 2
+    assert "Traceback" not in done.stderr
+
+
+def test_listing_the_verbs_imports_nothing_heavy() -> None:
+    code = (
+        "import sys; from mapvote.cli import app; heavy = ('numba', 'scipy', 'sqlalchemy', 'fastapi', 'matplotlib', "
+        "'embreex', 'httpx2'); print([name for name in heavy if name in sys.modules])"
+    )
+    assert subprocess.check_output([sys.executable, "-c", code], text=True).strip() == "[]"
