@@ -31,7 +31,7 @@ _HOME = {
     "CellState": "core.types",
     "Drive": "core.types",
     "MapvoteError": "core.types",
-    "PointMap": "core.types",
+    "PointMap": "core.point_map",
     "Scan": "core.types",
     "Settings": "config",
     "Vehicle": "vehicle",
