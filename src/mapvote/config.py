@@ -191,12 +191,6 @@ class ServerSettings(Section):
     max_body_bytes: int = Field(default=16_000_000, description="largest request body")
     ballots_per_minute: float = Field(default=600.0, gt=0, description="of one vehicle, on average")
     burst: int = Field(default=60, ge=1, description="ballots of one vehicle at once")
-    settings_hash: str = Field(
-        default="",
-        pattern="^([0-9a-f]{8,64})?$",
-        description="take only ballots cast by these settings (`mapvote config` shows the digest of yours); "
-        "empty: the first ballot of a round decides",
-    )
     batch: int = Field(default=64, ge=1, description="ballots written in one transaction at most")
 
 

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from mapvote.cli.options import SERVER, Config, StoreName
+from mapvote.cli.options import SERVER, StoreName
 from mapvote.cli.server import opened_store, when
 from mapvote.cli.terminal import print_table, waiting
 
@@ -39,17 +39,15 @@ def log(
         print(f"{event['seq']} {when(event['at_ns'])} {event['kind']} {event['actor']} {event['detail']}")
 
 
-def vehicles(store: StoreName, config: Config = None) -> None:
+def vehicles(store: StoreName) -> None:
     """Which vehicles contradict the others far more than chance, and where.
 
     mapvote vehicles fleet.db
     """
-    from mapvote.config import load_settings
     from mapvote.server.insight.history import vehicle_standings
 
-    settings = load_settings(config)
     with opened_store(store) as opened, waiting("comparing votes"):
-        found = vehicle_standings(opened, settings.fuse)
+        found = vehicle_standings(opened)
     rows = []
     for s in found:
         places = "; ".join(f"{e.says} at {e.x:.1f}, {e.y:.1f} ({e.cells} cells)" for e in s.evidence[:3])

@@ -5,16 +5,17 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
 
-from mapvote.cli.options import SERVER, Config, MinVotes, Reason, StoreName
+from mapvote.cli.options import SERVER, Config, Reason, StoreName
 from mapvote.cli.terminal import waiting
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor
 
+    from mapvote.server.store.keys import Key, Role
     from mapvote.server.store.publish import Outcome
     from mapvote.server.store.store import Store
 
@@ -25,7 +26,7 @@ GateDrive = Annotated[
 
 def register(app: typer.Typer) -> None:
     """Add these verbs to ``app``."""
-    for verb in (serve, publish, rollback, unvote, upgrade, keys):
+    for verb in (serve, publish, policy, rollback, unvote, upgrade, keys):
         app.command(rich_help_panel=SERVER)(verb)
 
 
@@ -46,11 +47,12 @@ def serve(
     from mapvote.config import load_settings
     from mapvote.server.http.serve import log_as_json, open_or_create, reference_gate
     from mapvote.server.http.serve import serve as run
+    from mapvote.server.store.policy import Policy
 
     settings = load_settings(config)
     log_as_json()
     with waiting(f"opening {store}"):
-        opened = open_or_create(store, map_path)
+        opened = open_or_create(store, map_path, None if config is None else Policy.of(settings))
     try:
         judge = None if gate is None else reference_gate(gate, settings)
         run(opened, settings, host=host, port=port, gate=judge, ready=lambda url: print(f"serving {url}", flush=True))
@@ -62,7 +64,6 @@ def publish(
     store: StoreName,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="only say what would change")] = False,
     override: Annotated[bool, typer.Option("--override", help="publish in spite of the reasons to hold it")] = False,
-    min_votes: MinVotes = None,
     reason: Reason = "",
     gate: GateDrive = None,
     cluster: Annotated[
@@ -81,14 +82,36 @@ def publish(
     from mapvote.server.store.publish import publish as publish_version
 
     settings = load_settings(config)
-    policy = settings.fuse if min_votes is None else settings.fuse.model_copy(update={"min_votes": min_votes})
     judge = None if gate is None else reference_gate(gate, settings)
     workers = dask_cluster(cluster) if cluster else ThreadPoolExecutor(2)
     with opened_store(store) as opened, workers as executor, waiting("deciding"):
-        done = publish_version(
-            opened, policy, reason=reason, dry_run=dry_run, override=override, gate=judge, executor=executor
-        )
+        done = publish_version(opened, reason=reason, dry_run=dry_run, override=override, gate=judge, executor=executor)
     _print_outcome(done, "published" if done.published else "dry run" if dry_run else "nothing changed")
+
+
+def policy(
+    store: StoreName,
+    values: Annotated[list[str] | None, typer.Argument(metavar="KEY=VALUE...", help="e.g. fuse.min_votes=3")] = None,
+    reason: Reason = "",
+) -> None:
+    """Show what decides in a store (round, votes, gate), or change it. Holds at once, in a running server too.
+
+    mapvote policy fleet.db fuse.min_votes=3 --reason "more vehicles now"
+    """
+    from mapvote.core.types import MapvoteError
+    from mapvote.server.store.policy import changed, current_policy, policy_changes, set_policy
+
+    pairs = [value.partition("=") for value in values or ()]
+    if any(not equals for _, equals, _ in pairs):
+        raise MapvoteError("policy: give KEY=VALUE, e.g. fuse.min_votes=3; nothing at all shows the policy")
+    with opened_store(store) as opened:
+        if pairs:
+            set_policy(opened, changed(current_policy(opened), {k: v for k, _, v in pairs}), reason=reason)
+        last, found = policy_changes(opened)[-1], current_policy(opened)
+    print(f"policy of {when(last.at_ns)} by {last.by}" + (f": {last.reason}" if last.reason else ""))
+    for section, entries in found.model_dump().items():
+        for key, value in entries.items():
+            print(f"{section}.{key}={value}")
 
 
 def rollback(
@@ -155,11 +178,14 @@ def upgrade(store: StoreName) -> None:
 
 def keys(
     store: StoreName,
-    action: Annotated[str, typer.Argument(metavar="[ACTION]", help="list, issue or revoke")] = "list",
-    name: Annotated[str | None, typer.Argument(metavar="[NAME]", help="vehicle or operator")] = None,
-    operator: Annotated[bool, typer.Option("--operator", help="issue an operator's key, not a vehicle's")] = False,
+    action: Annotated[str, typer.Argument(metavar="[ACTION]", help="list, issue, rotate or revoke")] = "list",
+    name: Annotated[str | None, typer.Argument(metavar="[NAME]", help="of a vehicle or a person")] = None,
+    role: Annotated[str, typer.Option(help="vehicle, reader, reviewer or operator")] = "vehicle",
+    operator: Annotated[bool, typer.Option("--operator", help="the same as --role operator")] = False,
+    days: Annotated[float | None, typer.Option(help="the key ends by itself after so many days")] = None,
+    overlap_days: Annotated[float, typer.Option(min=0, help="rotate: how long the old keys still work")] = 1.0,
 ) -> None:
-    """List, issue or revoke keys. A new key is printed once and kept nowhere.
+    """List, issue, rotate or revoke keys. A new key is printed once and kept nowhere.
 
     mapvote keys fleet.db issue car_1
     """
@@ -169,14 +195,22 @@ def keys(
     with opened_store(store) as opened:
         if action == "list":
             for key in store_keys.listed(opened):
-                state = "valid" if key.revoked_ns is None else f"revoked {when(key.revoked_ns)}"
-                print(f"{key.role} {key.name}: issued {when(key.created_ns)}, {state}")
+                print(f"{key.role} {key.name}: issued {when(key.created_ns)}, {_state(key, opened.clock())}")
         elif action == "issue" and name is not None:
-            print(store_keys.issue(opened, name, "operator" if operator else "vehicle"))
+            print(store_keys.issue(opened, name, cast("Role", "operator" if operator else role), days=days))
+        elif action == "rotate" and name is not None:
+            print(store_keys.rotate(opened, name, overlap_days=overlap_days))
         elif action == "revoke" and name is not None:
             print(f"{store_keys.revoke(opened, name)} keys of {name} revoked")
         else:
-            raise MapvoteError("keys: say list, issue NAME or revoke NAME")
+            raise MapvoteError("keys: say list, issue NAME, rotate NAME or revoke NAME")
+
+
+def _state(key: Key, now_ns: int) -> str:
+    if key.revoked_ns is not None:
+        return f"revoked {when(key.revoked_ns)}"
+    end = "" if key.expires_ns is None else f"until {when(key.expires_ns)}"
+    return f"valid {end}".strip() if key.valid_at(now_ns) else f"ended {end.removeprefix('until ')}"
 
 
 @contextmanager

@@ -21,15 +21,15 @@ from live_server import serving
 from mapvote.codec.ballot import MAX_TILE_INDEX, encode
 from mapvote.core.types import CellState
 from mapvote.server.store import keys, schema
+from mapvote.server.store.policy import Policy, RoundPolicy
 from mapvote.server.store.store import Store
 from mutants import bomb, mutants
 
-CONFIG = f"""
+CONFIG = """
 [server]
 ballots_per_minute = 1e9
 burst = 1000000
 max_body_bytes = 300000
-settings_hash = "{SETTINGS}"
 """
 
 
@@ -57,7 +57,9 @@ class Site:
 def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Site]:
     home = tmp_path_factory.mktemp("hostile")
     (home / "server.toml").write_text(CONFIG)
-    store = Store.create(f"sqlite:///{home / 'store.db'}", two_walls())
+    store = Store.create(
+        f"sqlite:///{home / 'store.db'}", two_walls(), Policy(round=RoundPolicy(settings_hash=SETTINGS))
+    )
     vehicle, operator = keys.issue(store, "v1", "vehicle"), keys.issue(store, "boss", "operator")
     with serving(home / "store.db", "--config", home / "server.toml", log=home / "log") as (url, _):
         found = Site(url, vehicle, operator, store)

@@ -92,7 +92,7 @@ def test_the_whole_story(site: Site, tmp_path: Path) -> None:
     assert site.ask("POST", "/v1/rollback", site.operator, json={"to": 1}).json() == {"version": 3}
     versions = site.ask("GET", "/v1/map/versions", site.operator).json()["versions"]
     assert [v["kind"] for v in versions] == ["import", "publish", "rollback"]
-    assert versions[1]["policy"]["min_votes"] == 2
+    assert versions[1]["policy"]["fuse"]["min_votes"] == 2
 
 
 def test_no_route_answers_without_a_key(site: Site) -> None:

@@ -52,7 +52,7 @@ def town(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
 
 def test_the_liar_is_named_from_the_ballots_in_the_store(town: tuple[Path, str]) -> None:
     store = Store.open(f"sqlite:///{town[0]}")
-    found = {s.vehicle: s for s in vehicle_standings(store, FuseSettings())}
+    found = {s.vehicle: s for s in vehicle_standings(store)}
     store.close()
     assert {name for name, s in found.items() if s.verdict == "contradicts"} == {"liar"}
     assert found["liar"].objects == 25

@@ -1,4 +1,4 @@
-"""The store's promises (DESIGN 4), on SQLite and on PostgreSQL."""
+"""The store's promises, on SQLite and on PostgreSQL."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hand_made import Say, make_ballot, states_plane, two_walls, words_plane
+from hand_made import SETTINGS, Say, make_ballot, states_plane, two_walls, words_plane
 from mapvote.codec.ballot import Ballot, encode
 from mapvote.config import FuseSettings
 from mapvote.core.point_map import PointMap
@@ -20,8 +20,16 @@ from mapvote.fusion.offline import update_map
 from mapvote.fusion.tile_vote import DAY_NS
 from mapvote.server.errors import Conflict, Held, NotFound, Unavailable
 from mapvote.server.insight.explain import explain_cell
-from mapvote.server.store.admission import Intake, accept, examine
+from mapvote.server.store.admission import accept, examine
 from mapvote.server.store.ballots import Receipt, withdraw
+from mapvote.server.store.policy import (
+    Policy,
+    RoundPolicy,
+    changed,
+    current_policy,
+    policy_changes,
+    set_policy,
+)
 from mapvote.server.store.publish import publish, rollback
 from mapvote.server.store.store import Store
 
@@ -165,7 +173,7 @@ def test_rolled_back_remnants_stay_until_new_votes_come(store: Store) -> None:
 
     old = [mark(v, 0) for v in "ab"]
     send(store, *old)
-    story = explain_cell(store, (CELL[1] + 0.5) * 0.3, (CELL[0] + 0.5) * 0.3, POLICY)
+    story = explain_cell(store, (CELL[1] + 0.5) * 0.3, (CELL[0] + 0.5) * 0.3)
     assert [(v.state, v.marks, v.counts) for v in story.votes] == [("unchanged_occupied", 1, True)] * 2
     assert publish(store, POLICY).deleted == 1
     rollback(store, 1, reason="it still stands")
@@ -188,30 +196,33 @@ def test_withdrawn_before_publication_it_is_as_if_never_cast(store: Store) -> No
 
 
 @pytest.mark.parametrize("other", [{"method": "paper"}, {"settings_hash": "0" * 64}])
-def test_a_round_never_mixes_methods_or_settings(store: Store, other: Any) -> None:
-    """The first ballot decides how a round votes; once none stands, another may begin."""
+def test_the_policy_says_how_a_round_votes_and_never_mixes(store: Store, other: Any) -> None:
+    """Whoever comes first, right or wrong, decides nothing for the others. With another policy old votes rest."""
+    first = RoundPolicy(settings_hash=SETTINGS)
+    set_policy(store, Policy(round=first))
     base = store.point_map()
-    send(store, says(base, "a", EMPTY), says(base, "b", EMPTY))
-    with pytest.raises(Conflict, match=r"never mixes methods or settings; vote again as the round does"):
-        send(store, says(base, "c", EMPTY, **other))
-    with pytest.raises(Conflict):
-        send(store, says(base, "a", EMPTY, **other))
-    assert withdraw(store, "a", by="a") == 1
-    with pytest.raises(Conflict):
-        send(store, says(base, "c", EMPTY, **other))
-    assert withdraw(store, None, by="operator") == 1
-    send(store, says(base, "c", EMPTY, **other), says(base, "d", EMPTY, **other))
+    for vehicle in "ca":
+        with pytest.raises(Conflict, match=r"one round never mixes them; vote again with the fleet's configuration"):
+            send(store, says(base, vehicle, EMPTY, **other))
+    send(store, says(base, "a", EMPTY))
+    wanted = {"method": "paper"} if "method" in other else {"settings_hash": "0" * 16}
+    set_policy(store, Policy(round=first.model_copy(update=wanted)), by="ann", reason="a new release")
+    with pytest.raises(Conflict, match="never mixes"):
+        send(store, says(base, "b", EMPTY))
+    send(store, says(base, "c", EMPTY, **other))
+    assert not publish(store, POLICY).published, "a's vote was cast otherwise"
+    send(store, says(base, "d", EMPTY, **other))
     assert publish(store, POLICY).deleted == 3
+    assert [(change.by, change.reason) for change in policy_changes(store)][-1] == ("ann", "a new release")
 
 
-def test_an_operator_may_say_which_settings_the_fleet_votes_by(store: Store) -> None:
-    """Then no first ballot, right or wrong, decides for the others."""
-    intake, base = Intake(store, "ab" * 16), store.point_map()
-    ballots = [says(base, "a", EMPTY), says(base, "b", EMPTY, settings_hash="ab" * 32)]
-    refused, taken = intake.accept([examine(encode(ballot)) for ballot in ballots])
-    assert isinstance(refused, Conflict)
-    assert "fleet's configuration" in str(refused)
-    assert isinstance(taken, Receipt)
+def test_a_policy_is_changed_by_name_and_a_wrong_name_is_told(store: Store) -> None:
+    policy = changed(current_policy(store), {"fuse.min_votes": "3", "round.stage": "one-stage"})
+    assert (policy.fuse.min_votes, policy.round.stage) == (3, "one-stage")
+    with pytest.raises(MapvoteError, match=r"did you mean 'fuse\.min_votes'"):
+        changed(policy, {"fuse.min_vote": 3})
+    with pytest.raises(MapvoteError, match=r"policy: fuse.min_votes = '0'"):
+        changed(policy, {"fuse.min_votes": "0"})
 
 
 def test_another_map_is_refused_and_so_is_the_future(store: Store) -> None:

@@ -58,7 +58,7 @@ def own(request: Request, vehicle: str) -> str:
     if key is None:
         return vehicle
     if key.role != "operator":
-        if key.name != vehicle:
+        if key.role != "vehicle" or key.name != vehicle:
             raise Forbidden(f"the key of {key.name!r} cannot touch ballots of {vehicle[:64]!r}")
         services(request).limit.take(key.name)
     return key.name
@@ -66,11 +66,26 @@ def own(request: Request, vehicle: str) -> str:
 
 def operator(request: Request) -> str:
     """The operator's name; Forbidden for anybody else."""
+    return _one_of(request, "operator")
+
+
+def reviewer(request: Request) -> str:
+    """The name of a reviewer or an operator; Forbidden for anybody else."""
+    return _one_of(request, "reviewer", "operator")
+
+
+def sees_names(request: Request) -> bool:
+    """Whether who asks may know which vehicle voted what, and when; others see pseudonyms and days."""
+    key: keys.Key | None = request.state.key
+    return key is None or key.role in ("reviewer", "operator")
+
+
+def _one_of(request: Request, *roles: keys.Role) -> str:
     key: keys.Key | None = request.state.key
     if key is None:
         return "operator"
-    if key.role != "operator":
-        raise Forbidden("only an operator can do this")
+    if key.role not in roles:
+        raise Forbidden(f"only an {roles[-1]} can do this" if len(roles) == 1 else f"only a {' or '.join(roles)} can")
     return key.name
 
 

@@ -11,12 +11,14 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Query, Request
 
 from mapvote.codec.ballot import tile_key
+from mapvote.fusion.tile_vote import DAY_NS
 from mapvote.server.errors import Unavailable
-from mapvote.server.http.auth import operator
+from mapvote.server.http.auth import operator, reviewer, sees_names
 from mapvote.server.http.schemas import LEAST, MOST, PublishAsk, Published, RollbackAsk, iso, problems
 from mapvote.server.http.services import Services, services
 from mapvote.server.insight.explain import explain_cell
 from mapvote.server.insight.history import changes_between, coverage, vehicle_standings
+from mapvote.server.store.keys import pseudonyms
 from mapvote.server.store.publish import publish, rollback
 
 _MOST_EVIDENCE = 50
@@ -27,13 +29,9 @@ router = APIRouter()
 def publish_now(request: Request, ask: PublishAsk) -> Published:
     """Fuse what stands. 409 with the reasons if the policy holds it, or if somebody else published first."""
     by, parts = operator(request), services(request)
-    policy = parts.settings.fuse
-    if ask.min_votes is not None:
-        policy = policy.model_copy(update={"min_votes": ask.min_votes})
     with parts.metrics.publish_seconds.time(), _unless_stopping(parts):
         done = publish(
             parts.store,
-            policy,
             by=by,
             reason=ask.reason,
             parent=ask.parent,
@@ -76,14 +74,17 @@ def changes(
 def cell(request: Request, x: float, y: float) -> dict[str, Any]:
     """Who says what about the cell at (x, y), map metres, whether it counts, and what was decided when."""
     parts = services(request)
-    story = explain_cell(parts.store, x, y, parts.settings.fuse)
+    story = explain_cell(parts.store, x, y)
+    names = {v.vehicle: v.vehicle for v in story.votes}
+    known = sees_names(request)
+    shown = names if known else pseudonyms(parts.store, names)
     votes = [
         {
-            "vehicle": v.vehicle,
-            "drive": v.drive,
+            "vehicle": shown[v.vehicle],
+            "drive": v.drive if known else "",
             "state": v.state,
             "marks": v.marks,
-            "end": iso(v.end_ns),
+            "end": iso(_seen(v.end_ns, known)),
             "counts": v.counts,
             "why": v.why,
         }
@@ -96,10 +97,10 @@ def cell(request: Request, x: float, y: float) -> dict[str, Any]:
 @router.get("/v1/coverage", responses=problems(), summary="Freshness of every tile")
 def fresh(request: Request) -> dict[str, Any]:
     """When each tile was last driven past, and by how many vehicles whose ballots stand."""
-    tiles = coverage(services(request).store)
+    tiles, known = coverage(services(request).store), sees_names(request)
     return {
         "tiles": [
-            {name: t[name] for name in ("row", "col", "vehicles")} | {"last_seen": iso(t["last_seen_ns"])}
+            {name: t[name] for name in ("row", "col", "vehicles")} | {"last_seen": iso(_seen(t["last_seen_ns"], known))}
             for t in tiles
         ]
     }
@@ -108,10 +109,14 @@ def fresh(request: Request) -> dict[str, Any]:
 @router.get("/v1/vehicles", responses=problems(403), summary="Who contradicts the others")
 def vehicles(request: Request) -> dict[str, Any]:
     """How every vehicle stands to what the others say before and after it, with the places where it differs."""
-    operator(request)
-    parts = services(request)
-    found = vehicle_standings(parts.store, parts.settings.fuse)
+    reviewer(request)
+    found = vehicle_standings(services(request).store)
     return {"vehicles": [asdict(s) | {"evidence": [asdict(e) for e in s.evidence[:_MOST_EVIDENCE]]} for s in found]}
+
+
+def _seen(stamp_ns: int | None, known: bool) -> int | None:
+    """When a vehicle passed, or only on which day: of a road with few vehicles the minute would tell who it was."""
+    return stamp_ns if known or stamp_ns is None else stamp_ns // DAY_NS * DAY_NS
 
 
 @contextmanager

@@ -57,7 +57,6 @@ class PublishAsk(BaseModel):
     override: bool = Field(default=False, description="publish in spite of the reasons to hold it")
     parent: int | None = Field(default=None, ge=LEAST, le=MOST, description="only if this is still the newest version")
     reason: str = Field(default="", max_length=200, pattern=_PLAIN)
-    min_votes: int | None = Field(default=None, ge=1, le=1000, description="instead of the server's setting")
 
 
 class Published(BaseModel):

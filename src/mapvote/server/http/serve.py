@@ -21,6 +21,7 @@ from mapvote.server.http.app import create_app
 from mapvote.server.http.services import Services
 from mapvote.server.insight.localisation_gate import gate as localise_in_both
 from mapvote.server.store import keys
+from mapvote.server.store.policy import Policy
 from mapvote.server.store.publish import Gate
 from mapvote.server.store.store import Store, url_of
 
@@ -28,14 +29,15 @@ _PATIENCE_S = 5
 """How long a stopping server waits for answers under way. Ballots take milliseconds."""
 
 
-def open_or_create(where: str, map_path: Path | None) -> Store:
-    """The store at a path or URL; a new one from ``map_path`` if there is none yet. MapvoteError otherwise."""
+def open_or_create(where: str, map_path: Path | None, policy: Policy | None = None) -> Store:
+    """The store at a path or URL; a new one from ``map_path`` and with this ``policy`` if there is none yet.
+    MapvoteError otherwise."""
     try:
         return Store.open(url_of(where))
     except MapvoteError:
         if map_path is None:
             raise
-    return Store.create(url_of(where), read_map(map_path))
+    return Store.create(url_of(where), read_map(map_path), policy)
 
 
 def reference_gate(drive_path: Path, settings: Settings) -> Gate:
@@ -74,7 +76,7 @@ def serve(
     ``ready`` is told the address once it listens. MapvoteError if the address is taken, or beyond loopback while no
     operator has a key. Without any key at all, on loopback, nobody needs one.
     """
-    valid = [key for key in keys.listed(store) if key.revoked_ns is None]
+    valid = [key for key in keys.listed(store) if key.valid_at(store.clock())]
     if not is_loopback(host) and not any(key.role == "operator" for key in valid):
         raise MapvoteError(f"{host} can be reached from elsewhere: issue keys first (mapvote keys STORE issue NAME)")
     app = create_app(store, settings, need_keys=bool(valid) or not is_loopback(host), gate=gate)

@@ -61,7 +61,7 @@ class Services:
 
 def make_services(store: Store, settings: Settings, gate: Gate | None, executor: Executor | None) -> Services:
     """The parts of an app on an open store; ``executor`` as in :func:`mapvote.server.http.app.create_app`."""
-    intake, manifests = Intake(store, settings.server.settings_hash), Manifests(store)
+    intake, manifests = Intake(store), Manifests(store)
     threads = ThreadPoolExecutor(2, "fuse")
     return Services(
         store=store,

@@ -8,19 +8,18 @@ import numpy as np
 import sqlalchemy as sa
 
 from mapvote.codec.arrays import unpack_plane
-from mapvote.config import FuseSettings
 from mapvote.core.grid import TILE_CELLS, TileIndex
 from mapvote.core.types import NO_VOTE, U8, CellState, MapvoteError
-from mapvote.fusion.fuse import Rule, hear
+from mapvote.fusion.fuse import hear
 from mapvote.fusion.tile_vote import TileVote, one_each, select
 from mapvote.server.store import schema
 from mapvote.server.store.eligible_votes import (
     Round,
     counting_votes,
     read_votes,
-    rule_in_use,
     stored_votes,
 )
+from mapvote.server.store.policy import Policy, policy_in
 from mapvote.server.store.queries import current_version, load_tile, tiles_of
 from mapvote.server.store.store import Store
 
@@ -59,23 +58,24 @@ def state_name(state: int) -> str:
     return "no_vote" if state == NO_VOTE else CellState(state).name.lower()
 
 
-def explain_cell(store: Store, x: float, y: float, settings: FuseSettings) -> CellStory:
+def explain_cell(store: Store, x: float, y: float) -> CellStory:
     """The votes behind the cell that holds (x, y), map metres. MapvoteError if that is no place on earth."""
     if not (abs(x) < 1e7 and abs(y) < 1e7):
         raise MapvoteError(f"({x}, {y}): give map metres, within 10,000 km of the map's origin")
     rows, cols = store.lattice.cells_of(np.array([[x, y]]))
     row, col = int(rows[0]), int(cols[0])
     index, cell = (row // TILE_CELLS, col // TILE_CELLS), (row % TILE_CELLS, col % TILE_CELLS)
-    asked = Round(_FOREVER, settings, store.clock() - round(settings.min_age_s * 1e9))
     with store.database.reading() as connection:
+        policy = policy_in(connection)
+        settings = policy.fuse
+        asked = Round(_FOREVER, policy, store.clock() - round(settings.min_age_s * 1e9))
         hashes = tiles_of(connection, current_version(connection).number, index).get(index)
         tile = load_tile(connection, store.lattice.tile(index), hashes)
-        everyone = stored_votes(connection, index, Round(_FOREVER, settings, _FOREVER))
+        everyone = stored_votes(connection, index, Round(_FOREVER, policy, _FOREVER))
         old_enough = [vote for vote in everyone if vote.received_ns <= asked.received_by_ns]
         inside = {vote.seq for vote in select(old_enough, settings)}
         counting = {v.digest: v for v in counting_votes(connection, tile, asked)}
-        rule = rule_in_use(connection) or "columns"
-        silenced = _silenced(store, index, list(counting.values()), rule, settings)
+        silenced = _silenced(store, index, list(counting.values()), policy)
         plain = read_votes(connection, index, everyone)
         query = sa.select(schema.decisions.c.version, schema.decisions.c.states)
         query = query.where(schema.decisions.c.row == index[0], schema.decisions.c.col == index[1])
@@ -102,10 +102,11 @@ def explain_cell(store: Store, x: float, y: float, settings: FuseSettings) -> Ce
     return CellStory(row, col, votes, story)
 
 
-def _silenced(store: Store, index: TileIndex, drives: list[TileVote], rule: Rule, settings: FuseSettings) -> set[str]:
+def _silenced(store: Store, index: TileIndex, drives: list[TileVote], policy: Policy) -> set[str]:
     """Vehicles that are not heard on a tile, of the votes that count there."""
     votes = one_each(drives, store.lattice.tile(index))
-    return {vote.vehicle for vote in votes} - {vote.vehicle for vote in hear(votes, rule, settings)[0]}
+    heard = hear(votes, policy.round.method, policy.fuse)[0]
+    return {vote.vehicle for vote in votes} - {vote.vehicle for vote in heard}
 
 
 def _states(data: bytes) -> U8:

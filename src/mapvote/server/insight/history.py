@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import sqlalchemy as sa
 
-from mapvote.config import FuseSettings
 from mapvote.core.grid import TileIndex
 from mapvote.core.types import U8
 from mapvote.core.voting import decide
@@ -19,6 +18,7 @@ from mapvote.server.insight.explain import _FOREVER, _states
 from mapvote.server.insight.geojson import to_geojson
 from mapvote.server.store import schema
 from mapvote.server.store.eligible_votes import Round, counting_votes, read_votes, standing_tiles, stored_votes
+from mapvote.server.store.policy import policy_in, recorded
 from mapvote.server.store.queries import current_version, load_tile, tiles_of, version_of
 from mapvote.server.store.store import Store
 from mapvote.server.store.tile_jobs import unpack_tally_plane
@@ -56,8 +56,8 @@ def _decided(store: Store, connection: sa.Connection, index: TileIndex, old: int
         version = version_of(connection, row.version)
         before = tiles_of(connection, row.version - 1, index).get(index)
         tile = load_tile(connection, store.lattice.tile(index), before)
-        policy = FuseSettings.model_validate(version.policy)
-        asked = Round(version.mark, policy, version.created_ns - round(policy.min_age_s * 1e9))
+        policy = recorded(version.policy)
+        asked = Round(version.mark, policy, version.created_ns - round(policy.fuse.min_age_s * 1e9))
         votes = counting_votes(connection, tile, asked)
         drives = [(vote.end_ns, vote.states) for vote in votes if vote.states is not None]
         yield Decided(row.version, _states(row.states), unpack_tally_plane(row.tally), drives)
@@ -79,16 +79,16 @@ def coverage(store: Store) -> list[dict[str, Any]]:
     ]
 
 
-def vehicle_standings(store: Store, settings: FuseSettings) -> list[Standing]:
+def vehicle_standings(store: Store) -> list[Standing]:
     """How each vehicle stands to what the others say, over every vote inside the window, in order of name.
 
     What is compared is the world (occupied or empty now), so votes on an older base count here too.
     """
-    asked = Round(_FOREVER, settings, _FOREVER)
     with store.database.reading() as connection:
+        asked = Round(_FOREVER, policy_in(connection), _FOREVER)
         compared: list[Compared] = []
         for index in standing_tiles(connection, _FOREVER):
-            chosen = select(stored_votes(connection, index, asked), settings)
+            chosen = select(stored_votes(connection, index, asked), asked.settings)
             folded = one_each(read_votes(connection, index, chosen), store.lattice.tile(index))
             compared += compare(index, [Spoken(vote.vehicle, vote.end_ns, _decided_states(vote)) for vote in folded])
     return judge(compared, store.lattice)

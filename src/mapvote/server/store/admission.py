@@ -1,4 +1,4 @@
-"""What a ballot must be to be taken in (DESIGN 4): sound, its vehicle's own, on this map, and still about something."""
+"""What a ballot must be to be taken in: sound, its vehicle's own, on this map, and still about something."""
 
 from __future__ import annotations
 
@@ -16,8 +16,9 @@ from mapvote.fusion.offline import staged, tile_vote
 from mapvote.fusion.tile_vote import DAY_NS
 from mapvote.server.errors import Conflict, Unauthorised
 from mapvote.server.store import keys, schema
-from mapvote.server.store.ballots import Incoming, Receipt, put_in
+from mapvote.server.store.ballots import Incoming, Receipt, put_in, unlike
 from mapvote.server.store.blobs import TileHashes, same_cells, unpack_points_plane
+from mapvote.server.store.policy import policy_in
 from mapvote.server.store.queries import current_number, load_blob, names, tiles_of
 from mapvote.server.store.store import Store
 
@@ -46,19 +47,14 @@ def examine(data: bytes) -> Incoming:
     rule_of(ballot.method)
     if any((tile.states is None) != (ballot.tiles[0].states is None) for tile in ballot.tiles):
         raise MapvoteError("ballot: some tiles hold states and some a tally; a ballot is either two-stage or one-stage")
-    cast_by = f"{ballot.method}, {staged(ballot)}, settings {ballot.settings_hash[:32]}"
-    return Incoming(ballot, hashlib.sha256(data).hexdigest(), cast_by)
+    return Incoming(ballot, hashlib.sha256(data).hexdigest(), f"{ballot.method}, {staged(ballot)}", len(data))
 
 
 class Intake:
-    """Takes ballots into a store, in two steps that may run side by side; remembers the newest version's tiles.
+    """Takes ballots into a store, in two steps that may run side by side; remembers the newest version's tiles."""
 
-    ``settings_hash``: refuse ballots cast by other settings; without it the first ballot of a round decides.
-    """
-
-    def __init__(self, store: Store, settings_hash: str = "") -> None:
+    def __init__(self, store: Store) -> None:
         self._store = store
-        self._settings_hash = settings_hash
         self._current: tuple[int, Mapping[TileIndex, TileHashes]] = (0, {})
 
     def look_at(self, received: Sequence[Sent]) -> list[Incoming | Exception]:
@@ -69,7 +65,8 @@ class Intake:
         """
         found = [_sound(sent) for sent in received]
         with self._store.database.reading() as connection:
-            valid = keys.of(connection, {sent.key_hash for sent in received if sent.key_hash is not None})
+            asked = {sent.key_hash for sent in received if sent.key_hash is not None}
+            valid = keys.of(connection, asked, self._store.clock())
             for i, sent in enumerate(received):
                 if sent.key_hash is not None and sent.key_hash not in valid:
                     found[i] = Unauthorised(keys.UNKNOWN)
@@ -99,13 +96,10 @@ class Intake:
         newest = current_number(connection)
         if newest != self._current[0]:
             self._current = newest, tiles_of(connection, newest)
-        return [self._misfit(connection, ballot.ballot) for ballot in ballots]
+        asked = policy_in(connection).round
+        return [unlike(asked, ballot) or self._misfit(connection, ballot.ballot) for ballot in ballots]
 
     def _misfit(self, connection: sa.Connection, ballot: Ballot) -> MapvoteError | None:
-        if not ballot.settings_hash.startswith(self._settings_hash):
-            ours, theirs = self._settings_hash[:16], ballot.settings_hash[:16]
-            why = f"this server's fleet votes by settings {ours}, the ballot was cast by {theirs}"
-            return Conflict(f"{why}: vote again with the fleet's configuration (mapvote config)")
         current = self._current[1]
         if ballot.map_id != self._store.map_id:
             return Conflict(f"this server keeps map {self._store.map_id!r}, the ballot votes on {ballot.map_id!r}")

@@ -1,4 +1,4 @@
-"""Ballots in and out of the store: idempotent, one standing ballot per drive, nothing overwritten (DESIGN 4)."""
+"""Ballots in and out of the store: idempotent, one standing ballot per drive, nothing overwritten."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from mapvote.codec.ballot import Ballot, BallotTile, tile_key
 from mapvote.server.errors import Conflict, NotFound
 from mapvote.server.store import schema
 from mapvote.server.store.database import insert_rows
+from mapvote.server.store.policy import RoundPolicy, policy_in
 from mapvote.server.store.queries import log_event, next_seq
 from mapvote.server.store.store import Store
 
@@ -23,7 +24,9 @@ class Incoming:
     ballot: Ballot
     digest: str
     cast_by: str
-    """Method, stage and settings: all ballots of a round agree on them."""
+    """Method and stage: all ballots of a round agree on them."""
+    size: int
+    """Bytes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,7 +44,7 @@ class Receipt:
 def put_in(connection: sa.Connection, ballots: Sequence[Incoming], now: int) -> list[Receipt | Exception]:
     """Write ballots within a transaction: a receipt each, or Conflict where one votes otherwise than the round."""
     b = schema.ballots
-    method = agreed = connection.execute(sa.select(schema.maps.c.method)).scalar_one()
+    asked = policy_in(connection).round
     drives = sa.tuple_(b.c.vehicle, b.c.drive).in_({(i.ballot.vehicle, i.ballot.drive) for i in ballots})
     query = sa.select(b.c.vehicle, b.c.drive, b.c.seq, b.c.first_seq, b.c.gone_seq, b.c.digest).where(drives)
     first: dict[tuple[str, str], int] = {}
@@ -58,11 +61,8 @@ def put_in(connection: sa.Connection, ballots: Sequence[Incoming], now: int) -> 
     replaced: list[dict[str, int]] = []
     for incoming in ballots:
         ballot, key = incoming.ballot, (incoming.ballot.vehicle, incoming.ballot.drive)
-        method = method or incoming.cast_by
-        if method != incoming.cast_by:
-            theirs = f"this round votes by {method}, the ballot by {incoming.cast_by}"
-            mend = "vote again as the round does, or ask the operator for a new one (mapvote unvote STORE --all)"
-            results.append(Conflict(f"{theirs}: one round never mixes methods or settings; {mend}"))
+        if (why := unlike(asked, incoming)) is not None:
+            results.append(why)
             continue
         old = standing.get(key)
         if old is not None and old[1] == incoming.digest:
@@ -74,7 +74,8 @@ def put_in(connection: sa.Connection, ballots: Sequence[Incoming], now: int) -> 
         standing[key] = seq, incoming.digest
         log.append((seq, now, "ballot", *key))
         times = ballot.start_ns, ballot.end_ns, now
-        rows.append((seq, first[key], None, *key, incoming.digest, *times, ballot.settings_hash[:128]))
+        how = ballot.settings_hash[:128], incoming.cast_by, incoming.size
+        rows.append((seq, first[key], None, *key, incoming.digest, *times, *how))
         tiles += [_tile_row(seq, ballot, tile) for tile in ballot.tiles]
         results.append(Receipt(*key, created=old is None, repeated=False, seq=seq))
         seq += 1
@@ -85,9 +86,18 @@ def put_in(connection: sa.Connection, ballots: Sequence[Incoming], now: int) -> 
     if replaced:
         mark = b.update().where(b.c.seq == sa.bindparam("old")).values(gone_seq=sa.bindparam("by"))
         connection.execute(mark, replaced)
-    if method != agreed:
-        connection.execute(schema.maps.update().values(method=method))
     return results
+
+
+def unlike(asked: RoundPolicy, incoming: Incoming) -> Conflict | None:
+    """Why a ballot does not fit the round that the policy asks for; None if it does."""
+    settings = incoming.ballot.settings_hash
+    if asked.cast_by == incoming.cast_by and settings.startswith(asked.settings_hash):
+        return None
+    theirs = f"{incoming.cast_by}, settings {settings[:16]}"
+    ours = f"{asked.cast_by}, settings {asked.settings_hash[:16] or 'of any kind'}"
+    mend = "vote again with the fleet's configuration (mapvote config)"
+    return Conflict(f"this round votes by {ours}, the ballot by {theirs}: one round never mixes them; {mend}")
 
 
 def _tile_row(seq: int, ballot: Ballot, tile: BallotTile) -> tuple[Any, ...]:
@@ -99,7 +109,6 @@ def _tile_row(seq: int, ballot: Ballot, tile: BallotTile) -> tuple[Any, ...]:
 def withdraw(store: Store, vehicle: str | None, drive: str | None = None, *, by: str) -> int:
     """Un-vote before publication: one drive of a vehicle, or all, or (None) every vehicle's; how many ballots.
 
-    Once no ballot stands a new round begins, which may vote by another method or other settings.
     NotFound if there is none. What earlier versions made of them stays: see
     :func:`mapvote.server.store.replay.replay`.
     """
@@ -115,6 +124,4 @@ def withdraw(store: Store, vehicle: str | None, drive: str | None = None, *, by:
             raise NotFound(f"there is no standing ballot {whose}")
         seq = log_event(connection, store.clock(), "withdraw", by, whose)
         withdrawn = connection.execute(b.update().where(mine).values(gone_seq=seq)).rowcount
-        if connection.execute(sa.select(b.c.seq).where(b.c.gone_seq.is_(None)).limit(1)).first() is None:
-            connection.execute(schema.maps.update().values(method=None))
     return int(withdrawn)

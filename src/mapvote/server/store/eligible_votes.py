@@ -1,4 +1,4 @@
-"""Which votes count on a tile (DESIGN 4): standing at a moment, in the window, on cells that are still what they were.
+"""Which votes count on a tile: standing at a moment, in the window, on cells that are still what they were.
 
 Everything is asked as of an event number (``mark``), so that a past round can be fused again exactly.
 """
@@ -18,11 +18,11 @@ from mapvote.config import FuseSettings
 from mapvote.core.grid import TileIndex
 from mapvote.core.tile import Tile
 from mapvote.core.types import U8, Bool
-from mapvote.fusion.fuse import Rule, rule_of
 from mapvote.fusion.sparse_columns import Words
 from mapvote.fusion.tile_vote import TileVote, restrict, select
 from mapvote.server.store import schema
 from mapvote.server.store.blobs import same_cells, unpack_cells, unpack_points_plane
+from mapvote.server.store.policy import Policy
 from mapvote.server.store.queries import load_blob
 
 
@@ -39,9 +39,14 @@ class Round:
     """Whose votes are asked for: standing at ``mark``, received by ``received_by_ns``, not of ``without``."""
 
     mark: int
-    settings: FuseSettings
+    policy: Policy
     received_by_ns: int
     without: Collection[str] = ()
+
+    @property
+    def settings(self) -> FuseSettings:
+        """How many votes are enough, and which are in the window."""
+        return self.policy.fuse
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,6 +61,8 @@ class StoredVote:
     received_ns: int
     digest: str
     base: str
+    settings_hash: str
+    cast_by: str
 
 
 class _Planes(NamedTuple):
@@ -78,6 +85,7 @@ _B, _T, _R = schema.ballots, schema.ballot_tiles, schema.bars
 _ROW, _COL, _MARK = (sa.bindparam(name, type_=sa.BigInteger) for name in ("row", "col", "mark"))
 _VOTES_ON = (
     sa.select(_B.c.seq, _B.c.first_seq, _B.c.vehicle, _B.c.drive, _B.c.end_ns, _B.c.received_ns, _B.c.digest, _T.c.base)
+    .add_columns(_B.c.settings_hash, _B.c.cast_by)
     .join(_T, _T.c.ballot == _B.c.seq)
     .where(_T.c.row == _ROW, _T.c.col == _COL, _stands_at(_MARK))
     .where(_B.c.received_ns <= sa.bindparam("received_by", type_=sa.BigInteger))
@@ -89,12 +97,6 @@ _PLANES_OF = sa.select(_T.c.ballot, _T.c.states, _T.c.tally, _T.c.gone, _T.c.new
 )
 
 
-def rule_in_use(connection: sa.Connection) -> Rule | None:
-    """The rule by which standing ballots are decided; None until one has come."""
-    method = connection.execute(sa.select(schema.maps.c.method)).scalar_one()
-    return rule_of(method.split(",")[0]) if method else None
-
-
 def standing_tiles(connection: sa.Connection, mark: int, since: int | None = None) -> list[TileIndex]:
     """Tiles that standing ballots vote on, ascending; with ``since``, those where a ballot came or went after it."""
     b, t = schema.ballots, schema.ballot_tiles
@@ -104,10 +106,17 @@ def standing_tiles(connection: sa.Connection, mark: int, since: int | None = Non
 
 
 def stored_votes(connection: sa.Connection, index: TileIndex, asked: Round) -> list[StoredVote]:
-    """Every standing vote on a tile, in no order that matters."""
+    """Every standing vote of the round on a tile, in no order that matters."""
+    cast = asked.policy.round
     asked_of = {"row": index[0], "col": index[1], "mark": asked.mark, "received_by": asked.received_by_ns}
     found = [StoredVote(*row) for row in connection.execute(_VOTES_ON, asked_of).all()]
-    return [vote for vote in found if vote.vehicle not in asked.without]
+    return [
+        vote
+        for vote in found
+        if vote.vehicle not in asked.without
+        and vote.cast_by == cast.cast_by
+        and vote.settings_hash.startswith(cast.settings_hash)
+    ]
 
 
 def bars_on(connection: sa.Connection, index: TileIndex, mark: int) -> list[Bar]:

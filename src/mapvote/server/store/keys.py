@@ -1,25 +1,31 @@
-"""Keys of vehicles and operators: random, shown once, stored hashed, revocable."""
+"""Keys and whose they are: random, shown once, stored hashed, with a role and perhaps an end."""
 
 from __future__ import annotations
 
 import hashlib
+import hmac
 import re
 import secrets
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
 
 import sqlalchemy as sa
 
 from mapvote.core.types import MapvoteError
+from mapvote.fusion.tile_vote import DAY_NS
 from mapvote.server.errors import NotFound, Unauthorised
 from mapvote.server.store import schema
 from mapvote.server.store.queries import log_event
 from mapvote.server.store.store import Store
 
-Role = Literal["vehicle", "operator"]
-UNKNOWN = "this key is unknown or revoked: ask the operator for a new one (mapvote keys)"
+Role = Literal["vehicle", "reader", "reviewer", "operator"]
+"""A vehicle votes; a reader looks; a reviewer also sees who voted what and judges pending changes; an operator does
+all."""
+ROLES: tuple[Role, ...] = get_args(Role)
+UNKNOWN = "this key is unknown, revoked or past its end: ask the operator for a new one (mapvote keys)"
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
+_MOST_DAYS = 36_500
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,60 +36,112 @@ class Key:
     role: str
     created_ns: int
     revoked_ns: int | None
+    expires_ns: int | None = None
+
+    def valid_at(self, now_ns: int) -> bool:
+        """Whether it opens anything."""
+        return self.revoked_ns is None and (self.expires_ns is None or self.expires_ns > now_ns)
 
 
-def issue(store: Store, name: str, role: Role, *, by: str = "operator") -> str:
-    """A new key for a vehicle or an operator; the only time that it is seen. A name may hold several."""
+def issue(store: Store, name: str, role: Role, *, by: str = "operator", days: float | None = None) -> str:
+    """A new key, good for so many days (None: until it is revoked); the only time that it is seen. A name may hold
+    several, all of one role. MapvoteError for a name that cannot be one, or that has valid keys of another role."""
+    with store.database.writing() as connection:
+        return put_in(connection, store.clock(), name, role, by, days)
+
+
+def put_in(connection: sa.Connection, now: int, name: str, role: Role, by: str, days: float | None = None) -> str:
+    """As :func:`issue`, within a transaction."""
     if not _NAME.fullmatch(name):
         raise MapvoteError(f"{name!r} is no name: 1-64 of letters, digits, dot, underscore, dash")
+    if role not in ROLES:
+        raise MapvoteError(f"{role!r} is no role; choose one of {', '.join(ROLES)}")
+    if days is not None and not 0 < days <= _MOST_DAYS:
+        raise MapvoteError(f"a key for {days:g} days: give more than 0 and at most {_MOST_DAYS}, or leave it out")
+    others = {key.role for key in _keys_of(connection, name) if key.valid_at(now)} - {role}
+    if others:
+        raise MapvoteError(f"{name!r} has a valid key of a {others.pop()}: a name has one role; revoke that one first")
     secret = secrets.token_urlsafe(32)
+    end = None if days is None else now + round(days * DAY_NS)
+    row = {"name": name, "role": role, "hash": hash_of(secret), "created_ns": now, "expires_ns": end}
+    connection.execute(schema.keys.insert().values(**row))
+    log_event(connection, now, "key issued", by, f"{role} {name}" + ("" if days is None else f" for {days:g} days"))
+    return secret
+
+
+def rotate(store: Store, name: str, *, by: str = "operator", overlap_days: float = 1.0) -> str:
+    """A new key for who has one, of the same role and length; those that were valid end after ``overlap_days``.
+
+    NotFound if the name has no valid key.
+    """
+    k = schema.keys
     with store.database.writing() as connection:
         now = store.clock()
-        row = {"name": name, "role": role, "hash": hash_of(secret), "created_ns": now}
-        connection.execute(schema.keys.insert().values(**row))
-        log_event(connection, now, "key issued", by, f"{role} {name}")
-    return secret
+        valid = [key for key in _keys_of(connection, name) if key.valid_at(now)]
+        if not valid:
+            raise NotFound(f"{name!r} has no valid key to take the place of; issue one")
+        last, end = valid[-1], now + round(overlap_days * DAY_NS)
+        later = (k.c.name == name) & k.c.revoked_ns.is_(None) & (k.c.expires_ns.is_(None) | (k.c.expires_ns > end))
+        connection.execute(k.update().where(later).values(expires_ns=end))
+        days = None if last.expires_ns is None else (last.expires_ns - last.created_ns) / DAY_NS
+        return put_in(connection, now, name, last.role, by, days)  # type: ignore[arg-type]
 
 
 def revoke(store: Store, name: str, *, by: str = "operator") -> int:
     """Revoke every key of a name; how many. NotFound if it has none that is valid."""
-    k = schema.keys
     with store.database.writing() as connection:
-        now = store.clock()
-        done = connection.execute(k.update().where(k.c.name == name, k.c.revoked_ns.is_(None)).values(revoked_ns=now))
-        if not done.rowcount:
-            raise NotFound(f"{name!r} has no valid key")
-        log_event(connection, now, "key revoked", by, name)
+        return revoke_in(connection, store.clock(), name, by)
+
+
+def revoke_in(connection: sa.Connection, now: int, name: str, by: str) -> int:
+    """As :func:`revoke`, within a transaction."""
+    k = schema.keys
+    valid = (k.c.name == name) & k.c.revoked_ns.is_(None) & (k.c.expires_ns.is_(None) | (k.c.expires_ns > now))
+    done = connection.execute(k.update().where(valid).values(revoked_ns=now))
+    if not done.rowcount:
+        raise NotFound(f"{name!r} has no valid key")
+    log_event(connection, now, "key revoked", by, name)
     return int(done.rowcount)
 
 
 def listed(store: Store) -> list[Key]:
     """All keys ever issued, oldest first; never the keys themselves."""
-    k = schema.keys
     with store.database.reading() as connection:
-        rows = connection.execute(
-            sa.select(k.c.name, k.c.role, k.c.created_ns, k.c.revoked_ns).order_by(k.c.created_ns)
-        )
-        return [Key(*row) for row in rows]
+        return _keys_of(connection)
 
 
 def check(store: Store, hashes: Sequence[str]) -> list[Key | Exception]:
-    """Whose keys these are, by :func:`hash_of`; Unauthorised in the place of one that is unknown or revoked."""
+    """Whose keys these are, by :func:`hash_of`; Unauthorised in the place of one that opens nothing."""
     with store.database.reading() as connection:
-        valid = of(connection, set(hashes))
+        valid = of(connection, set(hashes), store.clock())
     return [valid[digest] if digest in valid else Unauthorised(UNKNOWN) for digest in hashes]
 
 
-def of(connection: sa.Connection, hashes: Collection[str]) -> dict[str, Key]:
-    """The valid keys among these, by :func:`hash_of`."""
+def of(connection: sa.Connection, hashes: Collection[str], now: int) -> dict[str, Key]:
+    """The keys among these that are valid ``now``, by :func:`hash_of`."""
     if not hashes:
         return {}
     k = schema.keys
-    query = sa.select(k.c.hash, k.c.name, k.c.role, k.c.created_ns, k.c.revoked_ns)
-    rows = connection.execute(query.where(k.c.hash.in_(hashes), k.c.revoked_ns.is_(None)))
-    return {row.hash: Key(row.name, row.role, row.created_ns, row.revoked_ns) for row in rows}
+    found = connection.execute(sa.select(k.c.hash, *_COLUMNS).where(k.c.hash.in_(hashes)))
+    return {digest: key for digest, *columns in found if (key := Key(*columns)).valid_at(now)}
 
 
 def hash_of(secret: str) -> str:
     """SHA-256: a key is 256 random bits, so no slow hash is needed."""
     return hashlib.sha256(secret.encode()).hexdigest()
+
+
+def pseudonyms(store: Store, names: Collection[str]) -> dict[str, str]:
+    """What vehicles and readers see in the place of each vehicle's name: the same one always, of this store alone."""
+    with store.database.reading() as connection:
+        secret = connection.execute(sa.select(schema.maps.c.secret)).scalar_one().encode()
+    return {name: "vehicle-" + hmac.digest(secret, name.encode(), "sha256").hex()[:10] for name in names}
+
+
+_COLUMNS = tuple(schema.keys.c[name] for name in ("name", "role", "created_ns", "revoked_ns", "expires_ns"))
+
+
+def _keys_of(connection: sa.Connection, name: str | None = None) -> list[Key]:
+    k = schema.keys
+    query = sa.select(*_COLUMNS).order_by(k.c.created_ns)
+    return [Key(*row) for row in connection.execute(query if name is None else query.where(k.c.name == name))]

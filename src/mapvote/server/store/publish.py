@@ -1,4 +1,4 @@
-"""New versions: publish what the vehicles decided, roll back, un-vote by replay. One transaction each (DESIGN 4).
+"""New versions: publish what the vehicles decided, roll back, un-vote by replay. One transaction each.
 
 Fusion runs before the transaction and on a snapshot; of several publishers exactly one wins, the others get Conflict.
 """
@@ -19,7 +19,8 @@ from mapvote.core.tile import Tile
 from mapvote.server.errors import Conflict, Held
 from mapvote.server.store import schema
 from mapvote.server.store.blobs import TileHashes, pack_cells, same_cells, unpack_tile
-from mapvote.server.store.eligible_votes import Round, rule_in_use, standing_tiles
+from mapvote.server.store.eligible_votes import Round, standing_tiles
+from mapvote.server.store.policy import policy_in
 from mapvote.server.store.queries import (
     Version,
     add_blobs,
@@ -56,7 +57,7 @@ class Outcome:
 
 def publish(
     store: Store,
-    settings: FuseSettings,
+    settings: FuseSettings | None = None,
     *,
     by: str = "operator",
     reason: str = "",
@@ -68,6 +69,7 @@ def publish(
 ) -> Outcome:
     """Fuse what stands, and publish it as the next version if anything changed.
 
+    By the store's policy; ``settings`` take the place of its ``fuse``, in simulations of one round.
     ``parent``: publish only if that is still the newest version. ``override``: in spite of the reasons to hold it.
     Raises Held with the reasons, or Conflict if somebody else published first.
     """
@@ -77,16 +79,18 @@ def publish(
             raise Conflict(f"the newest version is {newest.number}, not {parent}: look at it, then publish")
         mark = connection.execute(sa.select(sa.func.max(schema.events.c.seq))).scalar_one()
         hashes = tiles_of(connection, newest.number)
-        in_use = rule_in_use(connection)
-        policy = settings.model_dump(mode="json")
-        nothing_but_votes = newest.kind == "publish" and newest.policy == policy and settings.min_age_s == 0
-        dirty = standing_tiles(connection, mark, newest.mark if nothing_but_votes else None) if in_use else []
-    asked = Round(mark, settings, store.clock() - round(settings.min_age_s * 1e9))
-    rule = in_use or "columns"
-    tasks = [Task(url_text(store), store.lattice.tile(index), hashes.get(index), asked, rule) for index in dirty]
+        policy = policy_in(connection)
+        if settings is not None:
+            policy = policy.model_copy(update={"fuse": settings})
+        made_by = policy.model_dump(mode="json")
+        nothing_but_votes = newest.kind == "publish" and newest.policy == made_by and policy.fuse.min_age_s == 0
+        dirty = standing_tiles(connection, mark, newest.mark if nothing_but_votes else None)
+    now = store.clock()
+    asked = Round(mark, policy, now - round(policy.fuse.min_age_s * 1e9))
+    tasks = [Task(url_text(store), store.lattice.tile(index), hashes.get(index), asked) for index in dirty]
     fused = fuse_round(tasks, store.database, executor)
     changed = [f for f in fused if f.hashes is not None]
-    held = hold_reasons(changed, settings)
+    held = hold_reasons(changed, policy.fuse)
     if gate is not None and changed:
         old = store.point_map(newest.number)
         edited = {f.index: _edited(f, store.lattice.tile(f.index)) for f in changed}
@@ -99,7 +103,7 @@ def publish(
         raise Held(held)
     number = newest.number + 1
     why = reason + (f" (in spite of: {'; '.join(held)})" if held else "")
-    version = Version(number, newest.number, "publish", None, store.clock(), by, why[:400], mark, policy)
+    version = Version(number, newest.number, "publish", None, now, by, why[:400], mark, made_by)
     write_version(store, version, {f.index: f.hashes for f in changed}, [f.planes for f in changed], fused)
     return replace(outcome, version=number, published=True)
 
@@ -116,7 +120,7 @@ def hold_reasons(changed: Sequence[Fused], settings: FuseSettings) -> list[str]:
 
 
 def rollback(store: Store, to: int, *, by: str = "operator", reason: str = "") -> Version:
-    """A new version that is ``to`` again, and a bar on the change votes that led away from it (DESIGN 4).
+    """A new version that is ``to`` again, and a bar on the change votes that led away from it.
 
     Votes that were known before count no more for a change of the cells that now turn back; new drives do.
     NotFound if there is no such version, Conflict if it is the newest or somebody publishes meanwhile.

@@ -1,4 +1,4 @@
-"""Un-vote after publication: the map as it would be, had a vehicle never taken part (DESIGN 4).
+"""Un-vote after publication: the map as it would be, had a vehicle never taken part.
 
 Starts from the version before its first vote and goes through every later version again, by the policy recorded in
 each and with the ballots that stood at its moment, without the vehicle. The result is published as one new version.
@@ -13,15 +13,14 @@ from dataclasses import dataclass, field
 
 import sqlalchemy as sa
 
-from mapvote.config import FuseSettings
 from mapvote.core.grid import TileIndex
 from mapvote.core.tile import Tile
 from mapvote.core.types import F32
-from mapvote.fusion.fuse import Rule
 from mapvote.server.errors import NotFound
 from mapvote.server.store import schema
 from mapvote.server.store.blobs import TileHashes, pack_tile, same_cells
-from mapvote.server.store.eligible_votes import Bar, Round, bars_on, rule_in_use, standing_tiles
+from mapvote.server.store.eligible_votes import Bar, Round, bars_on, standing_tiles
+from mapvote.server.store.policy import recorded
 from mapvote.server.store.publish import Outcome, url_text, write_version
 from mapvote.server.store.queries import Version, load_tile, tiles_of
 from mapvote.server.store.store import Store
@@ -47,7 +46,6 @@ def replay(
         b = schema.ballots
         first = connection.execute(sa.select(sa.func.min(b.c.first_seq)).where(b.c.vehicle == vehicle)).scalar_one()
         mark = connection.execute(sa.select(sa.func.max(schema.events.c.seq))).scalar_one()
-        rule = rule_in_use(connection)
     if first is None:
         raise NotFound(f"{vehicle!r} never voted here")
     history = store.versions()
@@ -59,7 +57,7 @@ def replay(
     kept = history[start - 1].mark  # rollbacks up to here hold as recorded, later ones are drawn anew
     bars: dict[TileIndex, list[Bar]] = {}
     for version in history[start:]:
-        states[version.number] = _again(store, version, states, bars, kept, without, rule, executor)
+        states[version.number] = _again(store, version, states, bars, kept, without, executor)
     tiles: dict[TileIndex, TileHashes | None] = {}
     planes: list[Mapping[str, bytes]] = []
     added = deleted = 0
@@ -87,7 +85,6 @@ def _again(
     bars: dict[TileIndex, list[Bar]],
     kept: int,
     without: set[str],
-    rule: Rule | None,
     executor: Executor | None,
 ) -> _State:
     """What a version would have been."""
@@ -100,10 +97,10 @@ def _again(
             differ = ~same_cells(_points(now), _points(then), store.lattice.tile(index))
             bars.setdefault(index, []).append(Bar(version.mark, differ))
         return target
-    if version.kind != "publish" or rule is None:
+    if version.kind != "publish":
         return before
-    policy = FuseSettings.model_validate(version.policy)
-    asked = Round(version.mark, policy, version.created_ns - round(policy.min_age_s * 1e9), frozenset(without))
+    policy = recorded(version.policy)
+    asked = Round(version.mark, policy, version.created_ns - round(policy.fuse.min_age_s * 1e9), frozenset(without))
     tasks = []
     with store.database.reading() as connection:
         hashes = tiles_of(connection, before.root)
@@ -112,7 +109,7 @@ def _again(
             if tile is None and index in hashes:
                 tile = load_tile(connection, store.lattice.tile(index), hashes[index])
             barred = (*bars_on(connection, index, kept), *bars.get(index, ()))
-            tasks.append(Task(url_text(store), store.lattice.tile(index), tile, asked, rule, barred))
+            tasks.append(Task(url_text(store), store.lattice.tile(index), tile, asked, barred))
     edited = {f.index: f.tile for f in fuse_round(tasks, store.database, executor) if f.hashes and f.tile is not None}
     return _State(before.root, dict(before.edited) | edited)
 

@@ -1,4 +1,4 @@
-"""The tables (DESIGN 4). One store holds one map. Times are nanoseconds since 1970, hashes SHA-256 in hex.
+"""The tables. One store holds one map. Times are nanoseconds since 1970, hashes SHA-256 in hex.
 
 Nothing that was voted or published is ever overwritten: a ballot that is replaced or withdrawn is marked with the
 event that did so, so that any past round can be fused again (un-vote by replay).
@@ -25,10 +25,17 @@ maps = sa.Table(
     sa.Column("x0", sa.Double, nullable=False),
     sa.Column("y0", sa.Double, nullable=False),
     sa.Column("georeference", sa.JSON, nullable=False),
-    sa.Column("method", sa.String(64)),
+    sa.Column("secret", sa.String(64), nullable=False),
 )
-"""``method``: how the standing ballots were cast (method, stage, settings); null while there are none: one round never
-mixes them."""
+"""``secret``: what vehicles' pseudonyms are made with; it never leaves the store."""
+
+policies = sa.Table(
+    "policies",
+    metadata,
+    sa.Column("seq", sa.BigInteger, sa.ForeignKey("events.seq"), primary_key=True, autoincrement=False),
+    sa.Column("policy", sa.JSON, nullable=False),
+)
+"""One row a change; the event says who made it, when and why. The newest one holds."""
 
 keys = sa.Table(
     "keys",
@@ -38,9 +45,10 @@ keys = sa.Table(
     sa.Column("hash", _Hash, primary_key=True),
     sa.Column("created_ns", sa.BigInteger, nullable=False),
     sa.Column("revoked_ns", sa.BigInteger),
+    sa.Column("expires_ns", sa.BigInteger),
     sa.UniqueConstraint("hash"),
 )
-"""``role``: vehicle or operator; only the hash of a key is kept."""
+"""``role``: vehicle, reader, reviewer or operator; only the hash of a key is kept. ``expires_ns``: null for never."""
 
 events = sa.Table(
     "events",
@@ -102,9 +110,12 @@ ballots = sa.Table(
     sa.Column("end_ns", sa.BigInteger, nullable=False),
     sa.Column("received_ns", sa.BigInteger, nullable=False),
     sa.Column("settings_hash", sa.String(128), nullable=False),
+    sa.Column("cast_by", sa.String(32), nullable=False),
+    sa.Column("bytes", sa.BigInteger, nullable=False),
     sa.Index("ix_ballots_drive", "vehicle", "drive"),
 )
-"""``first_seq``: when this drive was first heard of; ``gone_seq``: the event that replaced or withdrew this ballot."""
+"""``cast_by``: method and stage; ``bytes``: how large the ballot was when it came.
+``first_seq``: when this drive was first heard of; ``gone_seq``: the event that replaced or withdrew this ballot."""
 
 ballot_tiles = sa.Table(
     "ballot_tiles",

@@ -1,4 +1,4 @@
-"""The store: versions of one map in SQL, the only system of record (DESIGN 4).
+"""The store: versions of one map in SQL, the only system of record.
 
     store = Store.open("sqlite:///street.db")          # or Store.create(url, point_map)
     store.current(); store.manifest(n); store.tile(n, (0, 0)); store.point_map(n)
@@ -9,6 +9,7 @@ un-vote), ``keys``. What explains it: ``standing`` (which votes count), ``explai
 
 from __future__ import annotations
 
+import secrets
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -25,6 +26,7 @@ from mapvote.server.errors import Unavailable
 from mapvote.server.store import migrate, schema
 from mapvote.server.store.blobs import TileHashes
 from mapvote.server.store.database import Database
+from mapvote.server.store.policy import Policy, write_policy
 from mapvote.server.store.queries import (
     Version,
     add_blobs,
@@ -89,7 +91,15 @@ class Store:
         self.georeference: Mapping[str, str] = row.georeference
 
     @classmethod
-    def create(cls, url: str, point_map: PointMap, *, by: str = "operator", clock: Callable[[], int] = now_ns) -> Store:
+    def create(
+        cls,
+        url: str,
+        point_map: PointMap,
+        policy: Policy | None = None,
+        *,
+        by: str = "operator",
+        clock: Callable[[], int] = now_ns,
+    ) -> Store:
         """A new store whose version 1 is ``point_map``; MapvoteError if the database already holds one."""
         database = Database(url)
         try:
@@ -100,13 +110,13 @@ class Store:
                 if connection.execute(sa.select(schema.maps.c.map_id)).first() is not None:
                     raise MapvoteError(f"{database.url.render_as_string()}: holds a map already; open it instead")
                 origin = {"x0": point_map.lattice.x0, "y0": point_map.lattice.y0}
-                georeference = dict(point_map.georeference)
-                connection.execute(
-                    schema.maps.insert().values(map_id=point_map.map_id, georeference=georeference, **origin)
-                )
-                mark = log_event(connection, clock(), "import", by, point_map.map_id)
-                version = Version(1, None, "import", None, clock(), by, "first map", mark, {})
+                about = {"georeference": dict(point_map.georeference), "secret": secrets.token_hex(32)}
+                connection.execute(schema.maps.insert().values(map_id=point_map.map_id, **about, **origin))
+                now = clock()
+                mark = log_event(connection, now, "import", by, point_map.map_id)
+                version = Version(1, None, "import", None, now, by, "first map", mark, {})
                 add_version(connection, version, point_map.tiles)
+                write_policy(connection, policy or Policy(), now, by, "a new store")
         except BaseException:
             database.close()
             raise

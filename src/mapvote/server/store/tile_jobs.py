@@ -18,7 +18,7 @@ from mapvote.codec.arrays import pack_plane, unpack_bytes
 from mapvote.core.grid import CELLS, TILE_CELLS, Grid, TileIndex
 from mapvote.core.tile import Tile
 from mapvote.core.types import I32, N_STATES, U8
-from mapvote.fusion.fuse import Rule, fuse_tile
+from mapvote.fusion.fuse import fuse_tile
 from mapvote.server.store.blobs import TileHashes, pack_tile
 from mapvote.server.store.database import Database
 from mapvote.server.store.eligible_votes import Bar, Round, counting_votes
@@ -34,7 +34,6 @@ class Task:
     tile: TileHashes | Tile | None
     """As it is now: in the store, at hand, or not there."""
     asked: Round
-    rule: Rule
     bars: tuple[Bar, ...] | None = None
     """Instead of those recorded."""
 
@@ -72,7 +71,7 @@ def fuse_stored(task: Task, database: Database | None = None) -> Fused:
         else:
             tile = Tile.empty(task.window) if stored is None else load_tile(connection, task.window, stored)
         votes = counting_votes(connection, tile, task.asked, task.bars, None if stored is None else stored.points)
-    decision, edited = fuse_tile(tile, votes, task.rule, task.asked.settings)
+    decision, edited = fuse_tile(tile, votes, task.asked.policy.round.method, task.asked.settings)
     hashes, planes = (None, {}) if edited is tile else pack_tile(edited)
     return Fused(
         index=tile.index,

@@ -1,0 +1,139 @@
+"""The policy of a store: what a round is cast by, which votes are enough, when a version is held. One row a change.
+
+Everybody who publishes obeys the newest row, and every version records the policy that made it, so that any past round
+can be fused again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal
+
+import sqlalchemy as sa
+from pydantic import Field, ValidationError
+
+from mapvote.config import FuseSettings, GateSettings, Section, Settings, did_you_mean
+from mapvote.core.types import MapvoteError
+from mapvote.server.store import schema
+from mapvote.server.store.queries import log_event
+
+if TYPE_CHECKING:
+    from mapvote.server.store.store import Store
+
+
+class RoundPolicy(Section):
+    """How the ballots of a round are cast. Others are refused, and those that stand already do not count."""
+
+    method: Literal["paper", "columns"] = "columns"
+    stage: Literal["one-stage", "two-stage"] = "two-stage"
+    settings_hash: str = Field(
+        default="",
+        pattern="^([0-9a-f]{8,64})?$",
+        description="only ballots cast by these settings (`mapvote config` shows the digest of yours); empty: by any",
+    )
+
+    @property
+    def cast_by(self) -> str:
+        """Method and stage, as ballots are recorded with them."""
+        return f"{self.method}, {self.stage}"
+
+
+class GatePolicy(GateSettings):
+    """The reference drive by which a new version is judged."""
+
+    drive: str = Field(default="", description="drive on the machine that publishes; empty: no gate")
+
+
+class Policy(Section):
+    """All that decides what becomes of the ballots."""
+
+    round: RoundPolicy = RoundPolicy()
+    fuse: FuseSettings = FuseSettings()
+    gate: GatePolicy = GatePolicy()
+
+    @classmethod
+    def of(cls, settings: Settings) -> Policy:
+        """The first policy of a store made by these settings: its fleet votes as they say."""
+        voting = settings.voting
+        stage: Literal["one-stage", "two-stage"] = "two-stage" if voting.two_stage else "one-stage"
+        asked = RoundPolicy(method=voting.method, stage=stage, settings_hash=settings.digest())
+        return cls(round=asked, fuse=settings.fuse, gate=GatePolicy.model_validate(settings.gate.model_dump()))
+
+
+@dataclass(frozen=True, slots=True)
+class PolicyChange:
+    """One row: what held from an event on, and who said so."""
+
+    seq: int
+    at_ns: int
+    by: str
+    reason: str
+    policy: Policy
+
+
+def recorded(row: Mapping[str, Any]) -> Policy:
+    """The policy of a row or a version. What this program does not know any more is left out; versions of the second
+    schema and before recorded the settings of fusion alone."""
+    sections = row if "fuse" in row or "round" in row else {"fuse": row}
+    known = {
+        name: {key: value for key, value in sections.get(name, {}).items() if key in field.annotation.model_fields}
+        for name, field in Policy.model_fields.items()
+        if field.annotation is not None
+    }
+    return Policy.model_validate(known)
+
+
+def policy_in(connection: sa.Connection) -> Policy:
+    """The newest policy."""
+    p = schema.policies
+    newest = sa.select(p.c.policy).order_by(p.c.seq.desc()).limit(1)
+    return recorded(connection.execute(newest).scalar_one())
+
+
+def current_policy(store: Store) -> Policy:
+    """What holds now."""
+    with store.database.reading() as connection:
+        return policy_in(connection)
+
+
+def policy_changes(store: Store) -> list[PolicyChange]:
+    """Every change, oldest first."""
+    p, e = schema.policies, schema.events
+    rows = sa.select(p.c.seq, e.c.at_ns, e.c.actor, e.c.detail, p.c.policy).join(e, e.c.seq == p.c.seq)
+    with store.database.reading() as connection:
+        found = connection.execute(rows.order_by(p.c.seq)).all()
+    return [PolicyChange(*row[:4], recorded(row[4])) for row in found]
+
+
+def set_policy(store: Store, policy: Policy, *, by: str = "operator", reason: str = "") -> int:
+    """Let another policy hold from now on; the number of the event."""
+    with store.database.writing() as connection:
+        return write_policy(connection, policy, store.clock(), by, reason)
+
+
+def write_policy(connection: sa.Connection, policy: Policy, now: int, by: str, reason: str) -> int:
+    """As :func:`set_policy`, within a transaction."""
+    seq = log_event(connection, now, "policy", by, reason)
+    connection.execute(schema.policies.insert().values(seq=seq, policy=policy.model_dump(mode="json")))
+    return seq
+
+
+def changed(policy: Policy, values: Mapping[str, Any]) -> Policy:
+    """The policy with some values changed, by "section.key"; texts are read as numbers where these are meant.
+
+    MapvoteError naming the key, and the nearest one that exists.
+    """
+    sections = policy.model_dump()
+    known = [f"{section}.{key}" for section, keys in sections.items() for key in keys]
+    for name, value in values.items():
+        if name not in known:
+            raise MapvoteError(f"policy: there is no {name!r}{did_you_mean(name, known)}")
+        section, _, key = name.partition(".")
+        sections[section][key] = value
+    try:
+        return Policy.model_validate(sections)
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(str(part) for part in first["loc"][:2])
+        raise MapvoteError(f"policy: {where} = {first['input']!r}: {first['msg']}") from error
