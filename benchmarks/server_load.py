@@ -86,7 +86,10 @@ class Vehicle(asyncio.Protocol):
         marker = "D" * (len(prefix) + 8)
         body = encode(msgspec.structs.replace(ballot, drive=marker))
         before, after = body.split(marker.encode())
-        line, rest = f"PUT /v1/ballots/{ballot.vehicle}/", f" HTTP/1.1\r\nHost: x\r\nAuthorization: Bearer {key}\r\n"
+        line, rest = (
+            f"PUT /v1/ballots/{ballot.vehicle}/",
+            f" HTTP/1.1\r\nHost: localhost\r\nAuthorization: Bearer {key}\r\n",
+        )
         self._head, self._tail = line.encode(), after
         self._middle = f"{rest}Content-Length: {len(body)}\r\n\r\n".encode() + before
 

@@ -42,7 +42,9 @@ async def ask(address: tuple[str, int], method: str, path: str, body: bytes = b"
     """One request on a connection of its own."""
     reader, writer = await asyncio.open_connection(*address)
     kind = "Content-Type: application/json\r\n"
-    head = f"{method} {path} HTTP/1.1\r\nHost: x\r\n{kind}Content-Length: {len(body)}\r\nConnection: close\r\n\r\n"
+    head = (
+        f"{method} {path} HTTP/1.1\r\nHost: localhost\r\n{kind}Content-Length: {len(body)}\r\nConnection: close\r\n\r\n"
+    )
     writer.write(head.encode() + body)
     answer = await reader.read()
     writer.close()

@@ -17,10 +17,11 @@ def mapvote(*arguments: object) -> list[str]:
 
 @contextmanager
 def serving(*arguments: object, log: Path) -> Iterator[tuple[str, subprocess.Popen[str]]]:
-    """(address, process) of `mapvote serve ARGUMENTS --port 0`; stopped at the end."""
+    """(address, process) of `mapvote serve ARGUMENTS --port 0 --open`, which needs keys if any is issued; stopped at
+    the end."""
     with log.open("a") as errors:
         environment = os.environ | {"NUMBA_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
-        command = mapvote("serve", *arguments, "--port", 0)
+        command = mapvote("serve", *arguments, "--port", 0, "--open")
         process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=errors, text=True, env=environment)
         assert process.stdout is not None
         try:

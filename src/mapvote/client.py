@@ -109,7 +109,7 @@ class MapClient:
         data = ballot if isinstance(ballot, bytes) else encode(ballot)
         about = ballot if isinstance(ballot, Ballot) else decode(ballot)
         waiting = self._spool / f"{about.vehicle}~{about.drive}.ballot"
-        with whole_file(waiting) as part:
+        with whole_file(waiting, private=True) as part:
             part.write_bytes(data)
         return self._send_spooled(waiting)
 
@@ -155,7 +155,7 @@ class MapClient:
         raw = self._ask("GET", f"/v1/tiles/{digest}").content
         if hashlib.sha256(raw).hexdigest() != digest:
             raise MapvoteError(f"{self._url}: tile plane {digest[:12]} came damaged; fetch again")
-        with whole_file(kept) as part:
+        with whole_file(kept, private=True) as part:
             part.write_bytes(raw)
         return raw
 

@@ -13,7 +13,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
 from mapvote.core.types import MapvoteError
 
@@ -192,6 +192,15 @@ class ServerSettings(Section):
     ballots_per_minute: float = Field(default=600.0, gt=0, description="of one vehicle, on average")
     burst: int = Field(default=60, ge=1, description="ballots of one vehicle at once")
     batch: int = Field(default=64, ge=1, description="ballots written in one transaction at most")
+    hosts: tuple[str, ...] = Field(
+        default=(), description="names that this server goes by, besides localhost and addresses in digits"
+    )
+
+    @field_validator("hosts", mode="before")
+    @classmethod
+    def _from_one_line(cls, value: object) -> object:
+        """An environment variable names them with commas."""
+        return [name.strip() for name in value.split(",") if name.strip()] if isinstance(value, str) else value
 
 
 class Settings(Section):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import os
 from collections.abc import Callable
 from functools import wraps
 from pathlib import Path
@@ -21,7 +22,11 @@ Scenario = Annotated[
 ]
 Seed = Annotated[int, typer.Option(metavar="N", help="decides layout, clutter, traffic and noise")]
 StoreName = Annotated[
-    str, typer.Argument(metavar="STORE", help="an SQLite file, or the URL of a database (postgresql+psycopg://...)")
+    str,
+    typer.Argument(metavar="STORE", help="an SQLite file, a postgresql+psycopg:// URL, or - for $MAPVOTE_STORE"),
+]
+KeyFile = Annotated[
+    Path | None, typer.Option(metavar="FILE", help="holds the key for that server; else $MAPVOTE_KEY is the key")
 ]
 Reason = Annotated[str, typer.Option(metavar="TEXT", help="kept with the version")]
 MinVotes = Annotated[
@@ -71,3 +76,15 @@ def with_drive_options(verb: Callable[..., None]) -> Callable[..., None]:
     command.__annotations__ = {p.name: p.annotation for p in parameters}
     del command.__wrapped__
     return command
+
+
+def key_in(key_file: Path | None) -> str | None:
+    """The key in a file, or in the environment: whatever is on the command line, everybody on the machine can read."""
+    from mapvote.core.types import MapvoteError
+
+    if key_file is None:
+        return os.environ.get("MAPVOTE_KEY") or None
+    try:
+        return key_file.read_text().strip() or None
+    except (OSError, UnicodeDecodeError) as error:
+        raise MapvoteError(f"{key_file}: holds no key that can be read ({error})") from error

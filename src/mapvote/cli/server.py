@@ -33,31 +33,37 @@ def register(app: typer.Typer) -> None:
 def serve(
     store: StoreName,
     map_path: Annotated[Path | None, typer.Option("--map", metavar="MAP", help="first map of a new STORE")] = None,
-    host: Annotated[
-        str, typer.Option(metavar="ADDRESS", help="where to listen; beyond this machine only with keys")
-    ] = "127.0.0.1",
+    host: Annotated[str, typer.Option(metavar="ADDRESS", help="where to listen")] = "127.0.0.1",
     port: Annotated[int, typer.Option(min=0, max=65535, metavar="N", help="0: any free one")] = 8080,
+    open_: Annotated[bool, typer.Option("--open", help="need no keys, on this machine, until one is issued")] = False,
     gate: GateDrive = None,
     config: Config = None,
 ) -> None:
-    """Serve a store to vehicles and operators until stopped.
+    """Serve a store to vehicles and operators until stopped. A new store's first operator key is shown once.
 
     mapvote serve fleet.db --map my_map
     """
     from mapvote.config import load_settings
     from mapvote.server.http.serve import log_as_json, open_or_create, reference_gate
     from mapvote.server.http.serve import serve as run
+    from mapvote.server.store.keys import issue
     from mapvote.server.store.policy import Policy
 
     settings = load_settings(config)
     log_as_json()
     with waiting(f"opening {store}"):
-        opened = open_or_create(store, map_path, None if config is None else Policy.of(settings))
+        opened, new = open_or_create(store_url(store), map_path, None if config is None else Policy.of(settings))
     try:
+        if new and not open_:
+            print(f"key of the operator, shown this once: {issue(opened, 'operator', 'operator')}", flush=True)
         judge = None if gate is None else reference_gate(gate, settings)
-        run(opened, settings, host=host, port=port, gate=judge, ready=lambda url: print(f"serving {url}", flush=True))
+        run(opened, settings, host=host, port=port, opened=open_, gate=judge, ready=_say_where)
     finally:
         opened.close()
+
+
+def _say_where(url: str) -> None:
+    print(f"serving {url}", flush=True)
 
 
 def publish(
@@ -166,9 +172,9 @@ def upgrade(store: StoreName) -> None:
     mapvote upgrade fleet.db
     """
     from mapvote.server.store.migrate import upgrade as upgrade_schema
-    from mapvote.server.store.store import existing, url_of
+    from mapvote.server.store.store import existing
 
-    database = existing(url_of(store))
+    database = existing(store_url(store))
     try:
         before, after = upgrade_schema(database)
     finally:
@@ -238,12 +244,35 @@ def _print_outcome(done: Outcome, what: str) -> None:
         print(f"hold: {reason}")
 
 
+def store_url(name: str) -> str:
+    """The database URL of what the command line calls STORE. MapvoteError for one that gives a password away."""
+    import os
+
+    from sqlalchemy.engine import make_url
+    from sqlalchemy.exc import ArgumentError
+
+    from mapvote.core.types import MapvoteError
+    from mapvote.server.store.store import url_of
+
+    given = os.environ.get("MAPVOTE_STORE", "") if name == "-" else name
+    if not given:
+        raise MapvoteError("STORE is -, but MAPVOTE_STORE is not set")
+    try:
+        password = make_url(url_of(given)).password
+    except ArgumentError:
+        raise MapvoteError("STORE is no database URL: postgresql+psycopg://USER@HOST/NAME") from None
+    if password is not None and name != "-":
+        mend = "set MAPVOTE_STORE to the URL and say - for STORE, or keep the password in ~/.pgpass"
+        raise MapvoteError(f"everybody on this machine can read a password on the command line: {mend}")
+    return url_of(given)
+
+
 @contextmanager
 def opened_store(name: str) -> Iterator[Store]:
     """An existing store, closed at the end."""
-    from mapvote.server.store.store import Store, url_of
+    from mapvote.server.store.store import Store
 
-    store = Store.open(url_of(name))
+    store = Store.open(store_url(name))
     try:
         yield store
     finally:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from mapvote.cli.options import DRIVE, Config, DrivePath, with_drive_options
+from mapvote.cli.options import DRIVE, Config, DrivePath, KeyFile, key_in, with_drive_options
 from mapvote.cli.terminal import progress, waiting
 
 if TYPE_CHECKING:
@@ -73,9 +73,7 @@ def vote(
     send: Annotated[
         str | None, typer.Option(metavar="URL", help="the server to send it to; kept for later if that is away")
     ] = None,
-    key: Annotated[
-        str | None, typer.Option(metavar="KEY", envvar="MAPVOTE_KEY", help="the vehicle's key at that server")
-    ] = None,
+    key_file: KeyFile = None,
     vehicle: Annotated[
         str | None, typer.Option(metavar="NAME", help="whose vote; else drive.toml, else the drive's name")
     ] = None,
@@ -103,6 +101,7 @@ def vote(
 
     if out is None and send is None:
         raise MapvoteError("vote: say where the ballot goes: --out BALLOT, --send URL, or both")
+    key = key_in(key_file)
     settings = load_settings(config)
     if case is not None:
         settings = choose_case(settings, case)

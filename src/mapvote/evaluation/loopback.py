@@ -36,7 +36,8 @@ def running_server(store: Path, first_map: Path, log: Path) -> Iterator[str]:
 
     MapvoteError with the server's last line if it does not come up.
     """
-    command = [sys.executable, "-m", "mapvote", "serve", str(store), "--map", str(first_map), "--port", "0"]
+    command = [sys.executable, "-m", "mapvote", "serve", str(store), "--map", str(first_map)]
+    command += ["--port", "0", "--open"]
     with log.open("w") as errors, subprocess.Popen(command, stdout=subprocess.PIPE, stderr=errors, text=True) as server:
         try:
             assert server.stdout is not None

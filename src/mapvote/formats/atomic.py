@@ -25,12 +25,18 @@ def _sync(path: Path) -> None:
 
 
 @contextmanager
-def whole_file(path: Path | str) -> Iterator[Path]:
-    """Gives a hidden path to write to; on leaving without an error it becomes ``path``, replacing what was there."""
+def whole_file(path: Path | str, *, private: bool = False) -> Iterator[Path]:
+    """Gives a hidden path to write to; on leaving without an error it becomes ``path``, replacing what was there.
+
+    ``private``: only its owner can read and write it, from the first byte.
+    """
     path = Path(path)
     partial = _hidden(path, "partial")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
+        if private:
+            partial.unlink(missing_ok=True)
+            os.close(os.open(partial, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600))
         yield partial
         _sync(partial)
         os.replace(partial, path)

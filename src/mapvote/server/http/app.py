@@ -12,6 +12,7 @@ from mapvote.config import Settings
 from mapvote.core.types import MapvoteError
 from mapvote.server.http import ballot_route, operator_routes, pages, vehicle_routes
 from mapvote.server.http.auth import Guard
+from mapvote.server.http.browsers import Hosts
 from mapvote.server.http.middleware import Watch
 from mapvote.server.http.schemas import refuse, unreadable
 from mapvote.server.http.services import make_services
@@ -23,13 +24,14 @@ def create_app(
     store: Store,
     settings: Settings | None = None,
     *,
-    need_keys: bool = True,
+    opened: bool = False,
     gate: Gate | None = None,
     executor: Executor | None = None,
 ) -> FastAPI:
     """The app on an open store, which stays the caller's to close. It runs once.
 
-    ``need_keys``: no route answers without a key. ``gate``: see :mod:`mapvote.server.store.publish`; ``executor``:
+    ``opened``: as long as the store holds no key, whoever asks is answered; else no route answers without one.
+    ``gate``: see :mod:`mapvote.server.store.publish`; ``executor``:
     where tiles are fused, two threads by default.
     """
     parts = make_services(store, settings or Settings(), gate, executor)
@@ -52,5 +54,7 @@ def create_app(
         app.include_router(part.router)
     app.add_exception_handler(MapvoteError, refuse)
     app.add_exception_handler(400, unreadable)
-    app.add_middleware(Watch, guard=Guard(store, need_keys), metrics=parts.metrics)
+    app.add_middleware(
+        Watch, hosts=Hosts(parts.settings.server.hosts), guard=Guard(store, opened=opened), metrics=parts.metrics
+    )
     return app

@@ -25,19 +25,25 @@ class Guard:
     Every request's key is looked up in the store, many in one query: a revoked key works no longer, not even once. A
     ballot's key is looked up with the ballot itself (:meth:`mapvote.server.store.admission.Intake.look_at`):
     until then it is enough to know whose it was, which never changes.
+
+    ``opened``: nobody needs a key as long as the store holds none. The first that is issued ends that, in the same
+    moment and for good.
     """
 
-    def __init__(self, store: Store, required: bool) -> None:
-        self._required = required
+    def __init__(self, store: Store, *, opened: bool) -> None:
+        self._opened = opened
+        self._any_key: Batcher[None, bool] = Batcher(lambda asked: [keys.any_issued(store)] * len(asked), _AT_ONCE)
         self._looked_up: Batcher[str, keys.Key] = Batcher(partial(keys.check, store), _AT_ONCE)
         self._known: dict[str, keys.Key] = {}
 
     async def who(self, authorization: str | None, *, ballot: bool = False) -> tuple[keys.Key, str] | None:
-        """The key of a request and its hash; None if none is needed.
+        """The key of a request and its hash; None if the server is open.
 
         Unauthorised if it is missing, unknown or revoked; of a ``ballot``, that is for the store to say in the end.
         """
-        if not self._required:
+        if self._opened:
+            self._opened = not await self._any_key.put(None)
+        if self._opened:
             return None
         secret = _secret_of(authorization)
         if secret is None:

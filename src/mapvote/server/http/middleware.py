@@ -9,6 +9,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from mapvote.core.types import MapvoteError
 from mapvote.server.http.auth import Guard
+from mapvote.server.http.browsers import Hosts
 from mapvote.server.http.metrics import Metrics
 from mapvote.server.http.schemas import refuse
 
@@ -23,8 +24,9 @@ def is_ballot(scope: Scope) -> bool:
 class Watch:
     """The outermost layer. No key, header or query is ever logged."""
 
-    def __init__(self, app: ASGIApp, guard: Guard, metrics: Metrics) -> None:
+    def __init__(self, app: ASGIApp, hosts: Hosts, guard: Guard, metrics: Metrics) -> None:
         self._app = app
+        self._hosts = hosts
         self._guard = guard
         self._metrics = metrics
 
@@ -41,6 +43,7 @@ class Watch:
             await send(message)
 
         try:
+            self._hosts.check(scope["headers"])
             sent = next((value for name, value in scope["headers"] if name == b"authorization"), None)
             whose = await self._guard.who(None if sent is None else sent.decode("latin-1"), ballot=is_ballot(scope))
             key, key_hash = whose or (None, None)

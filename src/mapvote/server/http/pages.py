@@ -12,10 +12,14 @@ from mapvote.server.errors import NotFound
 from mapvote.server.http.schemas import problems
 from mapvote.server.http.services import services
 
-_DOCS = """<!doctype html><meta charset=utf-8><title>mapvote API</title>
-<style>body{font:15px sans-serif;margin:2em}td,th{padding:.4em .8em;text-align:left;border-top:1px solid #ccc}</style>
-<h1>mapvote API</h1><p>For machines: <a href=openapi.json>openapi.json</a></p>
-<table><tr><th>Method<th>Path<th>What<th>How<th>Answers</tr>ROWS</table>"""
+_OPEN = b"""<p class="open-server" role="alert">This server is open: whoever uses this machine can vote, publish and
+roll back. Issue a key to close it: <code>mapvote keys STORE issue NAME --operator</code></p>"""
+_DOCS = """<!doctype html><html lang="en"><head><meta charset="utf-8"><title>mapvote API</title>
+<link rel="stylesheet" href="viewer/pages.css"></head>
+<body class="plain"><h1>mapvote API</h1><p>For machines: <a href=openapi.json>openapi.json</a></p>
+<table><tr><th>Method<th>Path<th>What<th>How<th>Answers</tr>ROWS</table></body></html>"""
+_STYLE = b'<link rel="stylesheet" href="viewer/pages.css">'
+_VIEWER = resources.files("mapvote.server.http") / "viewer"
 router = APIRouter()
 
 
@@ -47,27 +51,28 @@ def docs(request: Request) -> Response:
                 ", ".join(about["responses"]),
             )
             rows.append("<tr>" + "".join(f"<td>{html.escape(text)}</td>" for text in cells) + "</tr>")
-    return Response(_DOCS.replace("ROWS", "".join(rows)), media_type="text/html")
+    return _page(request, _DOCS.replace("ROWS", "".join(rows)).encode())
 
 
 @router.get("/", include_in_schema=False)
-def index() -> Response:
+def index(request: Request) -> Response:
     """The operator's page."""
-    return _asset("index.html")
+    return _page(request, (_VIEWER / "index.html").read_bytes())
 
 
 @router.get("/viewer/{name}", include_in_schema=False)
 def asset(name: str) -> Response:
     """A script or style of the operator's page."""
-    return _asset(name)
-
-
-def _asset(name: str) -> Response:
-    kinds = {".html": "text/html", ".js": "text/javascript", ".css": "text/css", ".svg": "image/svg+xml"}
-    file = resources.files("mapvote.server.http") / "viewer" / name
+    kinds = {".js": "text/javascript", ".css": "text/css", ".svg": "image/svg+xml"}
+    file = _VIEWER / name
     kind = kinds.get("." + name.rpartition(".")[2])
     if kind is None or "/" in name or "\\" in name or not file.is_file():
         raise NotFound(f"there is no page {name[:80]!r}")
-    policy = "default-src 'self'; img-src 'self' data: blob:; style-src 'self' 'unsafe-inline'; frame-ancestors 'none'"
-    headers = {"Content-Security-Policy": policy, "Cache-Control": "no-cache"}
-    return Response(file.read_bytes(), media_type=kind, headers=headers)
+    return Response(file.read_bytes(), media_type=kind, headers={"Cache-Control": "no-cache"})
+
+
+def _page(request: Request, text: bytes) -> Response:
+    """A page, which says so first if nobody needs a key here."""
+    if request.state.key is None:
+        text = text.replace(b"</head>", _STYLE + b"</head>", 1).replace(b"</body>", _OPEN + b"</body>", 1)
+    return Response(text, media_type="text/html", headers={"Cache-Control": "no-cache"})

@@ -18,26 +18,30 @@ from mapvote.core.point_map import PointMap
 from mapvote.core.types import MapvoteError
 from mapvote.formats import open_drive, read_map
 from mapvote.server.http.app import create_app
+from mapvote.server.http.browsers import HEADERS
 from mapvote.server.http.services import Services
 from mapvote.server.insight.localisation_gate import gate as localise_in_both
 from mapvote.server.store import keys
 from mapvote.server.store.policy import Policy
 from mapvote.server.store.publish import Gate
-from mapvote.server.store.store import Store, url_of
+from mapvote.server.store.store import Store
 
 _PATIENCE_S = 5
 """How long a stopping server waits for answers under way. Ballots take milliseconds."""
 
 
-def open_or_create(where: str, map_path: Path | None, policy: Policy | None = None) -> Store:
-    """The store at a path or URL; a new one from ``map_path`` and with this ``policy`` if there is none yet.
-    MapvoteError otherwise."""
+def open_or_create(url: str, map_path: Path | None, policy: Policy | None = None) -> tuple[Store, bool]:
+    """The store at a database URL, or a new one from ``map_path`` and with this ``policy`` if there is none yet;
+    whether it is new.
+
+    MapvoteError if there is neither.
+    """
     try:
-        return Store.open(url_of(where))
+        return Store.open(url), False
     except MapvoteError:
         if map_path is None:
             raise
-    return Store.create(url_of(where), read_map(map_path), policy)
+    return Store.create(url, read_map(map_path), policy), True
 
 
 def reference_gate(drive_path: Path, settings: Settings) -> Gate:
@@ -66,6 +70,7 @@ def serve(
     *,
     host: str = "127.0.0.1",
     port: int = 8080,
+    opened: bool = False,
     gate: Gate | None = None,
     ready: Callable[[str], object] = lambda url: None,
 ) -> None:
@@ -73,13 +78,16 @@ def serve(
 
     A publish that is still fusing is answered 503; one that is being written is finished.
 
-    ``ready`` is told the address once it listens. MapvoteError if the address is taken, or beyond loopback while no
-    operator has a key. Without any key at all, on loopback, nobody needs one.
+    ``ready`` is told the address once it listens. ``opened``: as long as the store holds no key, whoever is on this
+    machine may do anything. MapvoteError without that if there is no key, with it beyond loopback, or if the address
+    is taken.
     """
-    valid = [key for key in keys.listed(store) if key.valid_at(store.clock())]
-    if not is_loopback(host) and not any(key.role == "operator" for key in valid):
-        raise MapvoteError(f"{host} can be reached from elsewhere: issue keys first (mapvote keys STORE issue NAME)")
-    app = create_app(store, settings, need_keys=bool(valid) or not is_loopback(host), gate=gate)
+    if opened and not is_loopback(host):
+        raise MapvoteError(f"--open is for this machine alone, {host} can be reached from elsewhere: use keys instead")
+    if not opened and not keys.any_issued(store):
+        mend = "issue the first (mapvote keys STORE issue NAME --operator), or say --open to need none on this machine"
+        raise MapvoteError(f"this store has no keys yet: {mend}")
+    app = create_app(store, settings, opened=opened, gate=gate)
     listener = socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET)
     try:
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -97,6 +105,7 @@ def serve(
         log_level="warning",
         timeout_graceful_shutdown=_PATIENCE_S,
         server_header=False,
+        headers=list(HEADERS),
     )
     with listener:
         _Server(config).run(sockets=[listener])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
@@ -9,6 +10,7 @@ from typing import Any
 import sqlalchemy as sa
 from sqlalchemy import exc
 
+from mapvote.core.types import MapvoteError
 from mapvote.server.errors import Unavailable
 
 _WRITERS_LOCK = 0x6D617076  # any number of our own: PostgreSQL's advisory lock that writers take in turn
@@ -52,9 +54,27 @@ class Database:
                     connection.execute(sa.select(sa.func.pg_advisory_xact_lock(_WRITERS_LOCK)))
                 yield connection
 
+    def make_private_file(self) -> None:
+        """An empty SQLite file that only its owner can read and write, if there is none yet; its WAL takes after it.
+
+        MapvoteError if it cannot be made.
+        """
+        file = self.url.database
+        if not self.is_sqlite or not file or file == ":memory:":
+            return
+        try:
+            os.close(os.open(file, os.O_CREAT | os.O_RDWR, 0o600))
+        except OSError as error:
+            raise MapvoteError(f"{file}: cannot be made ({error.strerror})") from error
+
     def close(self) -> None:
         """Give every connection back."""
         self.engine.dispose()
+
+
+def address_of(url: sa.URL) -> str:
+    """A database URL without its password: what may be shown, logged, and sent to a cluster."""
+    return url._replace(password=None).render_as_string()
 
 
 def insert_rows(connection: sa.Connection, table: sa.Table, rows: Sequence[tuple[Any, ...]]) -> None:

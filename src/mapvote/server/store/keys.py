@@ -110,6 +110,12 @@ def listed(store: Store) -> list[Key]:
         return _keys_of(connection)
 
 
+def any_issued(store: Store) -> bool:
+    """Whether the store has ever seen a key: one that is revoked closes an open server as well."""
+    with store.database.reading() as connection:
+        return connection.execute(sa.select(schema.keys.c.name).limit(1)).first() is not None
+
+
 def check(store: Store, hashes: Sequence[str]) -> list[Key | Exception]:
     """Whose keys these are, by :func:`hash_of`; Unauthorised in the place of one that opens nothing."""
     with store.database.reading() as connection:

@@ -19,6 +19,7 @@ from mapvote.core.tile import Tile
 from mapvote.server.errors import Conflict, Held
 from mapvote.server.store import schema
 from mapvote.server.store.blobs import TileHashes, pack_cells, same_cells, unpack_tile
+from mapvote.server.store.database import address_of
 from mapvote.server.store.eligible_votes import Round, standing_tiles
 from mapvote.server.store.policy import policy_in
 from mapvote.server.store.queries import (
@@ -87,7 +88,8 @@ def publish(
         dirty = standing_tiles(connection, mark, newest.mark if nothing_but_votes else None)
     now = store.clock()
     asked = Round(mark, policy, now - round(policy.fuse.min_age_s * 1e9))
-    tasks = [Task(url_text(store), store.lattice.tile(index), hashes.get(index), asked) for index in dirty]
+    url = address_of(store.database.url)
+    tasks = [Task(url, store.lattice.tile(index), hashes.get(index), asked) for index in dirty]
     fused = fuse_round(tasks, store.database, executor)
     changed = [f for f in fused if f.hashes is not None]
     held = hold_reasons(changed, policy.fuse)
@@ -204,8 +206,3 @@ def _edited(fused: Fused, window: Grid) -> Tile:
     assert hashes is not None
     free = None if hashes.free is None else fused.planes[hashes.free]
     return unpack_tile(window, hashes, fused.planes[hashes.points], fused.planes[hashes.ground], free)
-
-
-def url_text(store: Store) -> str:
-    """The database URL with its password, for workers; never to be printed."""
-    return store.database.url.render_as_string(hide_password=False)

@@ -19,9 +19,10 @@ from mapvote.core.types import F32
 from mapvote.server.errors import NotFound
 from mapvote.server.store import schema
 from mapvote.server.store.blobs import TileHashes, pack_tile, same_cells
+from mapvote.server.store.database import address_of
 from mapvote.server.store.eligible_votes import Bar, Round, bars_on, standing_tiles
 from mapvote.server.store.policy import recorded
-from mapvote.server.store.publish import Outcome, url_text, write_version
+from mapvote.server.store.publish import Outcome, write_version
 from mapvote.server.store.queries import Version, load_tile, tiles_of
 from mapvote.server.store.store import Store
 from mapvote.server.store.tile_jobs import Task, fuse_round
@@ -109,7 +110,7 @@ def _again(
             if tile is None and index in hashes:
                 tile = load_tile(connection, store.lattice.tile(index), hashes[index])
             barred = (*bars_on(connection, index, kept), *bars.get(index, ()))
-            tasks.append(Task(url_text(store), store.lattice.tile(index), tile, asked, barred))
+            tasks.append(Task(address_of(store.database.url), store.lattice.tile(index), tile, asked, barred))
     edited = {f.index: f.tile for f in fuse_round(tasks, store.database, executor) if f.hashes and f.tile is not None}
     return _State(before.root, dict(before.edited) | edited)
 

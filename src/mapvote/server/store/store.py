@@ -103,6 +103,7 @@ class Store:
         """A new store whose version 1 is ``point_map``; MapvoteError if the database already holds one."""
         database = Database(url)
         try:
+            database.make_private_file()
             with database.writing() as connection:
                 if migrate.revision_of(connection) is None:
                     migrate.run_migrations(connection)

@@ -1,0 +1,141 @@
+"""From the first second: who may use a server, and what it gives away on the machine that it runs on."""
+
+from __future__ import annotations
+
+import os
+import stat
+import subprocess
+from pathlib import Path
+
+import httpx2
+import pytest
+
+from hand_made import Say, make_ballot, states_plane, two_walls
+from live_server import mapvote, serving
+from mapvote.client import MapClient
+from mapvote.codec.ballot import encode
+from mapvote.formats import write_map
+from mapvote.server.store import keys
+from mapvote.server.store.store import Store
+
+URL_WITH_PASSWORD = "postgresql+psycopg://mapvote:a-secret@127.0.0.1:9/mapvote"
+
+
+def run(*arguments: object, **environment: str) -> subprocess.CompletedProcess[str]:
+    """`mapvote ARGUMENTS`, to its end."""
+    command = mapvote(*arguments)
+    return subprocess.run(
+        command, capture_output=True, text=True, timeout=60, check=False, env=os.environ | environment
+    )
+
+
+def with_key(secret: str) -> dict[str, str]:
+    return {"Authorization": f"Bearer {secret}"}
+
+
+def test_a_new_store_prints_its_first_operator_key_once_and_is_closed_from_the_start(tmp_path: Path) -> None:
+    write_map(two_walls(), tmp_path / "map")
+    command = mapvote("serve", tmp_path / "s.db", "--map", tmp_path / "map", "--port", 0)
+    said: list[str] = []
+    for _ in range(2):
+        with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as server:
+            assert server.stdout is not None
+            lines = [server.stdout.readline()]
+            if not said:
+                lines.append(server.stdout.readline())
+            url = lines[-1].split()[1]
+            said.append(lines[0])
+            assert httpx2.get(f"{url}/v1/map").status_code == 401
+            secret = said[0].split()[-1]
+            assert httpx2.post(f"{url}/v1/publish", json={}, headers=with_key(secret)).status_code == 200
+            server.terminate()
+    assert "key of the operator, shown this once" in said[0]
+    assert said[1].startswith("serving ")
+
+
+def test_without_keys_a_server_starts_only_if_told_to_be_open(tmp_path: Path) -> None:
+    Store.create(f"sqlite:///{tmp_path / 's.db'}", two_walls()).close()
+    done = run("serve", tmp_path / "s.db", "--port", 0)
+    assert done.returncode == 1
+    assert "no keys yet" in done.stderr
+    assert "--open" in done.stderr
+
+
+@pytest.mark.parametrize("host", ["0.0.0.0", "::", "192.0.2.1"])
+def test_an_open_server_is_for_this_machine_alone(tmp_path: Path, host: str) -> None:
+    Store.create(f"sqlite:///{tmp_path / 's.db'}", two_walls()).close()
+    done = run("serve", tmp_path / "s.db", "--open", "--host", host, "--port", 0)
+    assert done.returncode == 1
+    assert "this machine alone" in done.stderr
+
+
+def test_a_key_that_is_issued_later_closes_a_running_server_at_once(tmp_path: Path) -> None:
+    """A revoked one leaves it closed: only keys can have been the reason to open it."""
+    Store.create(f"sqlite:///{tmp_path / 's.db'}", two_walls()).close()
+    ballot = encode(make_ballot(two_walls(), {(0, 0): Say(states_plane())}, "a", "d1"))
+    with serving(tmp_path / "s.db", log=tmp_path / "log") as (url, _):
+        assert httpx2.get(f"{url}/v1/map").status_code == 200
+        for page in ("/", "/docs"):
+            assert "This server is open" in httpx2.get(url + page).text
+        secret = run("keys", tmp_path / "s.db", "issue", "boss", "--operator").stdout.strip()
+        assert httpx2.put(f"{url}/v1/ballots/a/d1", content=ballot).status_code == 401
+        assert httpx2.get(f"{url}/v1/map").status_code == 401
+        assert httpx2.get(f"{url}/v1/map", headers=with_key(secret)).status_code == 200
+        for page in ("/", "/docs"):
+            assert "This server is open" not in httpx2.get(url + page, headers=with_key(secret)).text
+        run("keys", tmp_path / "s.db", "revoke", "boss")
+        assert httpx2.get(f"{url}/v1/map").status_code == 401
+
+
+def test_a_password_on_the_command_line_is_refused_and_not_repeated() -> None:
+    done = run("serve", URL_WITH_PASSWORD)
+    assert done.returncode == 1
+    assert "MAPVOTE_STORE" in done.stderr
+    assert "a-secret" not in done.stdout + done.stderr
+
+
+@pytest.mark.parametrize("verb", [["serve", "-"], ["publish", "-"], ["log", "-"], ["keys", "-"], ["upgrade", "-"]])
+def test_no_error_repeats_the_password_of_the_database(verb: list[str]) -> None:
+    done = run(*verb, MAPVOTE_STORE=URL_WITH_PASSWORD)
+    assert done.returncode == 1
+    assert "a-secret" not in done.stdout + done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_nothing_secret_is_in_the_process_list_in_logs_or_in_files_that_others_can_read(tmp_path: Path) -> None:
+    store = Store.create(f"sqlite:///{tmp_path / 's.db'}", two_walls())
+    secret = keys.issue(store, "a", "vehicle")
+    store.close()
+    command = mapvote("serve", "-", "--port", 0)
+    environment = os.environ | {"MAPVOTE_STORE": f"sqlite:///{tmp_path / 's.db'}"}
+    ballot = make_ballot(two_walls(), {(0, 0): Say(states_plane())}, "a", "d1")
+    with (
+        (tmp_path / "log").open("w") as log,
+        subprocess.Popen(command, stdout=subprocess.PIPE, stderr=log, text=True, env=environment) as server,
+    ):
+        assert server.stdout is not None
+        url = server.stdout.readline().split()[1]
+        assert str(tmp_path) not in Path(f"/proc/{server.pid}/cmdline").read_text()
+        with MapClient(url, key=secret, home=tmp_path / "home") as client:
+            client.fetch()
+            assert client.send(ballot) == "created"
+        with MapClient("http://127.0.0.1:9", key=secret, home=tmp_path / "home", attempts=1) as away:
+            assert away.send(ballot) == "spooled"
+        files = [*tmp_path.glob("s.db*"), *(tmp_path / "home").rglob("*")]
+        assert {path.suffix for path in files} >= {".db", ".db-wal", ".ballot"}
+        for path in files:
+            if path.is_file():
+                assert stat.S_IMODE(path.stat().st_mode) == 0o600, path
+        server.terminate()
+    assert secret not in (tmp_path / "log").read_text()
+
+
+def test_a_vehicle_takes_its_key_from_a_file_or_the_environment_never_from_the_command_line(tmp_path: Path) -> None:
+    shown = run("vote", "--help").stdout
+    assert "--key-file" in shown
+    assert "MAPVOTE_KEY" in shown
+    done = run("vote", tmp_path, "--map", "x", "--send", "http://127.0.0.1:9", "--key", "a-secret")
+    assert done.returncode == 2
+    missing = run("vote", tmp_path, "--map", "x", "--out", tmp_path / "o", "--key-file", tmp_path / "none")
+    assert missing.returncode == 1
+    assert "holds no key" in missing.stderr
