@@ -15,6 +15,7 @@ from mapvote.core.point_map import all_points, map_from_points
 from mapvote.core.sensors import SENSORS
 from mapvote.core.types import F64, MapvoteError
 from mapvote.formats import DriveWriter, read_map, write_map, write_pcd
+from mapvote.formats.maps.cloud import Cloud
 
 
 @pytest.fixture
@@ -36,7 +37,7 @@ def invoke(run: CliRunner, *args: str | Path, code: int = 0) -> str:
 
 
 def test_import_then_info_then_export_keeps_every_point(tmp_path: Path, run: CliRunner) -> None:
-    write_pcd(tmp_path / "a.pcd", cloud())
+    write_pcd(tmp_path / "a.pcd", Cloud(cloud()))
     assert "4000 points in 4 tiles" in invoke(run, "import", tmp_path / "a.pcd", tmp_path / "m")
     told = invoke(run, "info", tmp_path / "m")
     assert "mapvote map" in told

@@ -20,6 +20,7 @@ from mapvote.core.point_map import map_from_points
 from mapvote.core.sensors import SENSORS
 from mapvote.core.types import MapvoteError
 from mapvote.formats import DriveWriter, export_map, open_drive, read_map, write_map
+from mapvote.formats.maps.cloud import Cloud
 from mapvote.formats.maps.las import write_las
 
 TR = "0 -1 0 0 0 0 -1 0 1 0 0 0"
@@ -134,7 +135,7 @@ DAMAGES: dict[str, Callable[[bytearray], None]] = {
 def laz(tmp_path_factory: pytest.TempPathFactory) -> bytes:
     """A LAZ file of 3,000 points."""
     path = tmp_path_factory.mktemp("laz") / "good.laz"
-    write_las(path, np.random.default_rng(0).uniform(-30, 30, (3000, 3)))
+    write_las(path, Cloud(np.random.default_rng(0).uniform(-30, 30, (3000, 3))))
     content = path.read_bytes()
     assert struct.unpack_from("<I", content, 96)[0] == POINTS
     return content

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from mapvote.cli.options import DRIVE, MAP, DrivePath, MapPath, Rate, Topic, with_drive_options
+from mapvote.cli.options import DRIVE, MAP, DrivePath, MapPath, Projector, Rate, Topic, with_drive_options
 from mapvote.cli.terminal import waiting
 
 if TYPE_CHECKING:
@@ -89,28 +89,33 @@ def _lines(finding: Finding) -> list[str]:
 
 
 def import_map(
-    source: Annotated[
-        Path, typer.Argument(metavar="FILE", help="a PCD, LAS, LAZ or PLY file, or a folder of Autoware tiles")
-    ],
+    source: Annotated[Path, typer.Argument(metavar="FILE", help="a point cloud, in any format but our own")],
     out: Annotated[Path, typer.Argument(metavar="MAP", help="the mapvote map to write, a folder")],
+    crs: Annotated[
+        str | None, typer.Option(metavar="CRS", help="project to this: EPSG:32654, WKT; or say that it is in this")
+    ] = None,
+    projector: Projector = None,
+    from_crs: Annotated[
+        str | None,
+        typer.Option(metavar="CRS", help="what the file is in, where it does not say so rightly: EPSG:n, WKT, local"),
+    ] = None,
 ) -> None:
-    """Make a mapvote map of somebody's point cloud: cut into tiles, ground measured. Says what it drops.
+    """Make a mapvote map of somebody's point cloud: in metres, cut into tiles, ground measured. Says what it drops.
 
     mapvote import city.pcd my_map
     """
-    from mapvote.formats import read_cloud, write_map
-    from mapvote.formats.maps.cloud import to_map
+    from mapvote.formats import write_map
+    from mapvote.formats.geo.projector import frame_wanted
+    from mapvote.formats.maps.importing import import_cloud
 
     with waiting(f"reading {source}"):
-        cloud = read_cloud(source)
-    with waiting("cutting tiles, measuring the ground"):
-        point_map = to_map(str(source), cloud)
+        point_map, told = import_cloud(source, frame_wanted(crs, projector), from_crs)
     with waiting(f"writing {out}"):
         write_map(point_map, out)
     kept = sum(len(t.points) for t in point_map.tiles.values())
     print(f"{out}: {kept} points in {len(point_map.tiles)} tiles, map {point_map.map_id}")
-    if cloud.dropped:
-        print(f"dropped: {', '.join(cloud.dropped)} (a mapvote map keeps positions only)")
+    for line in told:
+        print(line)
     print("known-free columns: none yet; the fleet's drives will teach them")
 
 
@@ -123,8 +128,10 @@ def export(
     offset: Annotated[
         str, typer.Option(metavar="X,Y,Z", help="metres to subtract from every point, for formats of float32")
     ] = "0,0,0",
+    crs: Annotated[str | None, typer.Option(metavar="CRS", help="the coordinates to write: EPSG:n or WKT")] = None,
+    projector: Projector = None,
 ) -> None:
-    """Write a map's points in another format. Says what it drops.
+    """Write a map's points in another format, in its own coordinate system or another. Says what it drops.
 
     mapvote export my_map city.pcd
     """
@@ -138,10 +145,13 @@ def export(
     with waiting(f"reading {map_path}"):
         point_map = read_map(map_path)
     with waiting(f"writing {out}"):
-        kind = export_map(point_map, out, (x, y, z))
+        kind, frame = export_map(point_map, out, (x, y, z), crs=crs, projector=projector)
     points = sum(len(t.points) for t in point_map.tiles.values())
     print(f"{out}: {points} points as {kind}")
+    print(f"coordinates: {frame.told()}")
     dropped = ["ground heights (measured again on import)"]
     if any(t.free is not None for t in point_map.tiles.values()):
         dropped.append("known-free columns")
+    if not frame.is_local and out.suffix.lower() in (".pcd", ".ply"):
+        dropped.append(f"the name of the coordinate system ({out.suffix} has no place for it)")
     print(f"dropped: {', '.join(dropped)}")

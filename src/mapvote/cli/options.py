@@ -36,6 +36,10 @@ MinVotes = Annotated[
 Rate = Annotated[
     float | None, typer.Option("--rate", metavar="HZ", help="revolutions per second, where the drive has no times")
 ]
+Projector = Annotated[
+    str | None,
+    typer.Option(metavar="FILE|TYPE", help="Autoware's map_projector_info.yaml, or MGRS:54SUE, LocalCartesian:LAT,LON"),
+]
 Topic = Annotated[str | None, typer.Option(metavar="TOPIC", help="the PointCloud2 topic of a bag that has several")]
 DRIVE_OPTIONS = {
     "scans": Annotated[

@@ -20,6 +20,7 @@ from mapvote.evaluation.reporting.tables import as_csv, as_json, as_text, case_n
 from mapvote.evaluation.scoring.map_points import same_rows
 from mapvote.formats import write_map
 from mapvote.formats.atomic import whole_file
+from mapvote.formats.maps.cloud import Cloud
 from mapvote.formats.maps.pcd import write_pcd
 
 SCENARIO, QUICK_SCENARIO = "street", "corner"
@@ -69,7 +70,7 @@ def demo(out: Path, quick: bool = False, progress: Progress | None = None) -> tu
         progress("drawing", 0, 1)
     for name, point_map in (("map_before", evaluation.first_map), ("map_after", updated)):
         with whole_file(out / f"{name}.pcd") as partial:
-            write_pcd(partial, all_points(point_map))
+            write_pcd(partial, Cloud(all_points(point_map)))
     pictures = gallery(evaluation, CASE, out / "pictures")
     write_text(as_text(evaluation.result), out / "tables.txt")
     write_text(as_json(evaluation.result), out / "results.json")

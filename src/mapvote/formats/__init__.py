@@ -1,33 +1,26 @@
 """Maps and drives in everybody's file formats: open a drive, read a map, write a map.
 
-``DRIVES`` and ``CLOUDS`` list the formats in the order in which they are tried; each is recognised by what lies at
-the path, never by asking.
+Formats are listed in :mod:`mapvote.formats.registry`; each is recognised by what lies at the path, never by asking.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 
 from mapvote.core.point_map import PointMap, all_points
 from mapvote.core.types import Drive, MapvoteError
-from mapvote.formats.drives.kitti import DriveWriter, is_kitti_folder, open_kitti, read_T_map_lidar
-from mapvote.formats.drives.kitti_raw import is_kitti_raw, open_kitti_raw
+from mapvote.formats.drives.kitti import DriveWriter, read_T_map_lidar
 from mapvote.formats.drives.options import DriveOptions
-from mapvote.formats.drives.pcd_scans import is_pcd_drive, open_pcd_drive
-from mapvote.formats.drives.rosbag import is_rosbag, open_rosbag
-from mapvote.formats.maps.autoware import PROJECTOR, is_autoware, read_autoware, write_autoware
+from mapvote.formats.geo.frame import MapFrame, frame_of
+from mapvote.formats.geo.projector import autoware_frame, frame_wanted
 from mapvote.formats.maps.cloud import Cloud, to_map
-from mapvote.formats.maps.las import is_las, read_las, write_las
 from mapvote.formats.maps.mapvote_folder import is_map_folder, read_map_folder, write_map_folder
-from mapvote.formats.maps.pcd import is_pcd, read_pcd, write_pcd
-from mapvote.formats.maps.ply import is_ply, read_ply, write_ply
+from mapvote.formats.maps.pcd import write_pcd
+from mapvote.formats.registry import DRIVES, MAPS, WRITERS
 
 __all__ = [
-    "CLOUDS",
-    "DRIVES",
     "DriveWriter",
     "export_map",
     "open_drive",
@@ -37,20 +30,6 @@ __all__ = [
     "write_map",
     "write_pcd",
 ]
-
-DRIVES: dict[str, tuple[Callable[[Path], bool], Callable[[Path, DriveOptions], Drive]]] = {
-    "KITTI drive folder": (is_kitti_folder, open_kitti),
-    "KITTI raw recording": (is_kitti_raw, open_kitti_raw),
-    "ROS bag": (is_rosbag, open_rosbag),
-    "folder of PCD scans": (is_pcd_drive, open_pcd_drive),
-}
-CLOUDS: dict[str, tuple[Callable[[Path], bool], Callable[[Path], Cloud]]] = {
-    "Autoware tile folder": (is_autoware, read_autoware),
-    "PCD file": (is_pcd, read_pcd),
-    "LAS or LAZ file": (is_las, read_las),
-    "PLY file": (is_ply, read_ply),
-}
-"""Maps that are only points."""
 
 
 def open_drive(
@@ -74,9 +53,9 @@ def open_drive(
     """
     path = Path(path)
     options = DriveOptions(scans, prior, rate_hz, sensor, vehicle, mount, topic)
-    for recognised, open_format in DRIVES.values():
-        if recognised(path):
-            return open_format(path, options)
+    for layout in DRIVES.values():
+        if layout.recognised(path):
+            return layout.open(path, options)
     raise MapvoteError(f"{path}: {_what_is_there(path)}; a drive is one of: {', '.join(DRIVES)}")
 
 
@@ -88,19 +67,19 @@ def read_map(path: Path | str) -> PointMap:
     path = Path(path)
     if is_map_folder(path):
         return read_map_folder(path)
-    return to_map(str(path), read_cloud(path))
+    return to_map(str(path), read_cloud(path).in_metres(str(path)))
 
 
 def read_cloud(path: Path | str) -> Cloud:
-    """The points of a PCD, LAS, LAZ or PLY file or an Autoware folder as they stand, and what a map drops of them.
+    """The points of a file or folder of any format of ``MAPS`` as they stand, and what a map drops of them.
 
     Raises MapvoteError if there is none at ``path`` or it is damaged.
     """
     path = Path(path)
-    for recognised, read_format in CLOUDS.values():
-        if recognised(path):
-            return read_format(path)
-    raise MapvoteError(f"{path}: {_what_is_there(path)}; a map is one of: mapvote map, {', '.join(CLOUDS)}")
+    for layout in MAPS.values():
+        if layout.recognised(path):
+            return layout.read(path)
+    raise MapvoteError(f"{path}: {_what_is_there(path)}; a map is one of: mapvote map, {', '.join(MAPS)}")
 
 
 def write_map(point_map: PointMap, path: Path | str) -> None:
@@ -108,27 +87,41 @@ def write_map(point_map: PointMap, path: Path | str) -> None:
     write_map_folder(point_map, Path(path))
 
 
-def export_map(point_map: PointMap, path: Path | str, offset: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> str:
-    """Write a map's points for others: .pcd, .las, .laz, .ply, else an Autoware folder. Returns the format's name.
+def export_map(
+    point_map: PointMap,
+    path: Path | str,
+    offset: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    *,
+    crs: str | None = None,
+    projector: str | None = None,
+) -> tuple[str, MapFrame]:
+    """Write a map's points for others, by the suffix of ``path`` (``WRITERS``); without one as an Autoware folder.
 
-    ``offset`` (metres) is subtracted from every point, for formats of float32. Whole or not at all.
+    ``crs`` ("EPSG:32654", WKT) or ``projector`` (a map_projector_info.yaml, "MGRS", ...) name another frame than the
+    map's. ``offset`` (metres) is subtracted from every point, for formats of float32. Whole or not at all.
+    Returns the format's name and the frame of what was written.
     """
     path = Path(path)
-    points = all_points(point_map) - np.array(offset)
-    suffix = path.suffix.lower()
-    if suffix == ".pcd":
-        write_pcd(path, points)
-        return "PCD file"
-    if suffix in (".las", ".laz"):
-        write_las(path, points, wkt=point_map.georeference.get("wkt"))
-        return "LAS or LAZ file"
-    if suffix == ".ply":
-        write_ply(path, points)
-        return "PLY file"
-    if suffix:
-        raise MapvoteError(f"{path}: no format for {suffix}; use .pcd, .las, .laz, .ply, or a folder for Autoware")
-    write_autoware(path, points, projector=point_map.georeference.get(PROJECTOR))
-    return "Autoware tile folder"
+    writer = WRITERS.get(path.suffix.lower())
+    if writer is None:
+        suffixes = ", ".join(suffix for suffix in WRITERS if suffix)
+        raise MapvoteError(f"{path}: no format for {path.suffix}; use {suffixes}, or a folder for Autoware")
+    cloud = Cloud(all_points(point_map), frame=frame_of(point_map.georeference))
+    if not len(cloud.points):
+        raise MapvoteError(f"{path}: the map holds no points, so there is nothing to export")
+    if not path.suffix or projector in ("MGRS", "LocalCartesianUTM"):
+        wanted: MapFrame | None = autoware_frame(cloud.frame, cloud.points, projector)
+        if crs is not None:
+            raise MapvoteError(f"{path}: Autoware takes no --crs, but --projector")
+    else:
+        wanted = frame_wanted(crs, projector)
+    cloud = cloud.in_metres(str(path), wanted, sure=True)
+    if any(offset):
+        shifted = tuple(float(a + b) for a, b in zip(cloud.frame.offset_m, offset, strict=True))
+        frame = MapFrame(cloud.frame.crs, (shifted[0], shifted[1], shifted[2]), cloud.frame.heights)
+        cloud = Cloud(cloud.points - np.array(offset), frame=frame, fields=cloud.fields)
+    writer.write(path, cloud)
+    return writer.name, cloud.frame
 
 
 def _what_is_there(path: Path) -> str:

@@ -11,9 +11,10 @@ from mapvote.codec.ballot import Ballot, decode, unpack_points, unpack_states
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS
 from mapvote.core.point_map import PointMap, all_points
 from mapvote.core.types import CellState, Drive, MapvoteError
-from mapvote.formats import CLOUDS, DRIVES, open_drive, read_cloud, read_map
+from mapvote.formats import open_drive, read_map
 from mapvote.formats.maps.cloud import to_map
 from mapvote.formats.maps.mapvote_folder import is_map_folder
+from mapvote.formats.registry import DRIVES, MAPS
 
 Rows = list[tuple[str, str]]
 
@@ -22,13 +23,14 @@ def describe(path: Path, *, rate_hz: float | None = None, topic: str | None = No
     """(title, rows of name and value) of whatever lies at ``path``; MapvoteError if it is nothing of ours."""
     if is_map_folder(path):
         return "mapvote map", _map(read_map(path))
-    for kind, (recognised, _) in CLOUDS.items():
-        if recognised(path):
-            cloud = read_cloud(path)
-            fields = [("other fields", ", ".join(cloud.dropped) or "none"), ("stored as", str(cloud.points.dtype))]
-            return kind, _map(to_map(str(path), cloud)) + fields
-    for kind, (recognised, _) in DRIVES.items():
-        if recognised(path):
+    for kind, layout in MAPS.items():
+        if layout.recognised(path):
+            cloud = layout.read(path)
+            kept, left = ", ".join(cloud.fields) or "none", ", ".join(cloud.dropped) or "none"
+            fields = [("fields", kept), ("other fields", left), ("stored as", str(cloud.points.dtype))]
+            return kind, _map(to_map(str(path), cloud.in_metres(str(path)))) + fields
+    for kind, drive_layout in DRIVES.items():
+        if drive_layout.recognised(path):
             return f"drive, {kind}", _drive(open_drive(path, rate_hz=rate_hz, topic=topic))
     if path.is_file():
         data = path.read_bytes()

@@ -19,7 +19,7 @@ from mapvote.core.point_map import all_points, map_from_points
 from mapvote.core.types import F64, MapvoteError
 from mapvote.formats import export_map, read_cloud, read_map, write_map, write_pcd
 from mapvote.formats.maps.autoware import read_autoware, write_autoware
-from mapvote.formats.maps.cloud import lattice_of
+from mapvote.formats.maps.cloud import Cloud, lattice_of
 from mapvote.formats.maps.las import read_las, write_las
 from mapvote.formats.maps.pcd import ENCODINGS
 from mapvote.formats.maps.ply import read_ply, write_ply
@@ -39,7 +39,7 @@ def by_row(p: NDArray[np.floating]) -> NDArray[np.floating]:
 @pytest.mark.parametrize("double", [False, True])
 def test_pcd_round_trip_in_every_encoding(tmp_path: Path, encoding: str, double: bool) -> None:
     before = points() if double else points().astype(np.float32)
-    write_pcd(tmp_path / "a.pcd", before, encoding=encoding, double=double)
+    write_pcd(tmp_path / "a.pcd", Cloud(before), encoding=encoding, double=double)
     after = read_cloud(tmp_path / "a.pcd").points
     assert after.dtype == before.dtype
     assert np.allclose(after, before, rtol=1e-6) if encoding == "ascii" else np.array_equal(after, before)
@@ -53,10 +53,10 @@ everyone = st.tuples(st.integers(1, 50), st.integers(0, 2**31), st.floats(-4e6, 
 def test_ply_and_las_keep_world_coordinates(tmp_path: Path, case: tuple[int, int, float]) -> None:
     n, seed, far = case
     before = points(n, seed) + np.array([far, -far, 0.0])
-    write_ply(tmp_path / "a.ply", before)
+    write_ply(tmp_path / "a.ply", Cloud(before))
     assert np.array_equal(read_ply(tmp_path / "a.ply").points, before)
     for name in ("a.las", "a.laz"):
-        write_las(tmp_path / name, before)
+        write_las(tmp_path / name, Cloud(before))
         assert np.abs(read_las(tmp_path / name).points - before).max() < 0.6e-4
 
 
@@ -65,12 +65,12 @@ def test_ply_and_las_keep_world_coordinates(tmp_path: Path, case: tuple[int, int
 def test_autoware_round_trip_is_exact_in_float32(tmp_path: Path, case: tuple[int, int, float]) -> None:
     n, seed, far = case
     before = points(n, seed) + np.array([far / 100, -far / 100, 0.0])
-    write_autoware(tmp_path / "a", before)
+    write_autoware(tmp_path / "a", Cloud(before))
     assert np.array_equal(by_row(read_autoware(tmp_path / "a").points), by_row(before.astype(np.float32)))
 
 
 def test_autoware_metadata_is_what_its_loader_reads(tmp_path: Path) -> None:
-    write_autoware(tmp_path / "a", np.array([[1205.0, 2501.0, 0.0], [-0.5, 3.0, 1.0]]))
+    write_autoware(tmp_path / "a", Cloud(np.array([[1205.0, 2501.0, 0.0], [-0.5, 3.0, 1.0]])))
     metadata = yaml.safe_load((tmp_path / "a" / "pointcloud_map_metadata.yaml").read_text())
     assert metadata == {
         "x_resolution": 20.0,
@@ -83,7 +83,7 @@ def test_autoware_metadata_is_what_its_loader_reads(tmp_path: Path) -> None:
 
 
 def test_autoware_tiles_that_lie_are_named(tmp_path: Path) -> None:
-    write_autoware(tmp_path / "a", points())
+    write_autoware(tmp_path / "a", Cloud(points()))
     file = tmp_path / "a" / "pointcloud_map_metadata.yaml"
     good = file.read_text()
     file.write_text(good.replace("[-20, 0]", "[980, 0]"))
@@ -100,17 +100,17 @@ def test_autoware_tiles_that_lie_are_named(tmp_path: Path) -> None:
 
 def test_float32_at_utm_coordinates_is_said_aloud(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     with caplog.at_level(logging.WARNING):
-        write_pcd(tmp_path / "near.pcd", points())
+        write_pcd(tmp_path / "near.pcd", Cloud(points()))
     assert caplog.text == ""
     with caplog.at_level(logging.WARNING):
-        write_pcd(tmp_path / "far.pcd", points() + UTM)
+        write_pcd(tmp_path / "far.pcd", Cloud(points() + UTM))
     assert "rounded by up to 125.0 mm" in caplog.text
 
 
 @pytest.mark.parametrize("name", ["m.las", "m.laz", "m.ply"])
 def test_a_utm_map_survives_a_round_trip(tmp_path: Path, name: str) -> None:
     cloud = points(3000) + UTM
-    before = map_from_points(cloud, lattice=lattice_of(cloud), georeference={"wkt": 'PROJCS["UTM 54N"]'})
+    before = map_from_points(cloud, lattice=lattice_of(cloud), georeference={"crs": "EPSG:32654"})
     export_map(before, tmp_path / name)
     after = read_map(tmp_path / name)
     assert after.lattice == before.lattice
@@ -118,24 +118,26 @@ def test_a_utm_map_survives_a_round_trip(tmp_path: Path, name: str) -> None:
     write_map(after, tmp_path / "m")
     assert np.array_equal(all_points(read_map(tmp_path / "m")), all_points(after))
     if name != "m.ply":
-        assert after.georeference["wkt"] == 'PROJCS["UTM 54N"]'
+        assert after.georeference["crs"] == "EPSG:32654"
 
 
 def test_the_same_file_is_the_same_map(tmp_path: Path) -> None:
-    write_pcd(tmp_path / "a.pcd", points())
+    write_pcd(tmp_path / "a.pcd", Cloud(points()))
     assert read_map(tmp_path / "a.pcd").map_id == read_map(tmp_path / "a.pcd").map_id
 
 
 def test_import_knows_what_it_drops(tmp_path: Path) -> None:
     rows = np.column_stack([points(), np.linspace(0, 255, 500)]).astype(np.float32)
     PointCloud.from_xyzi_points(rows).save(tmp_path / "a.pcd")
-    assert read_cloud(tmp_path / "a.pcd").dropped == ("intensity",)
+    cloud = read_cloud(tmp_path / "a.pcd")
+    assert cloud.dropped == ()
+    assert np.array_equal(cloud.fields["intensity"], rows[:, 3])
 
 
 def test_truncated_files_are_named(tmp_path: Path) -> None:
     for name, write in (("a.ply", write_ply), ("a.las", write_las), ("a.laz", write_las), ("a.pcd", write_pcd)):
         file = tmp_path / name
-        write(file, points())
+        write(file, Cloud(points()))
         for keep in (0.5, 0.01):
             data = file.read_bytes()
             file.write_bytes(data[: int(keep * len(data))])
@@ -144,7 +146,7 @@ def test_truncated_files_are_named(tmp_path: Path) -> None:
 
 
 def test_a_pcd_cut_between_points_is_noticed(tmp_path: Path) -> None:
-    write_pcd(tmp_path / "a.pcd", points())
+    write_pcd(tmp_path / "a.pcd", Cloud(points()))
     data = (tmp_path / "a.pcd").read_bytes()
     (tmp_path / "a.pcd").write_bytes(data[:-24])
     with pytest.raises(MapvoteError, match="498 points, but its header says 500"):
@@ -156,18 +158,18 @@ def test_nan_points_of_a_map_are_dropped_and_counted_or_refused(
 ) -> None:
     cloud = points()
     cloud[:3] = np.nan
-    write_ply(tmp_path / "a.ply", cloud)
+    write_ply(tmp_path / "a.ply", Cloud(cloud))
     with caplog.at_level(logging.WARNING):
         assert len(all_points(read_map(tmp_path / "a.ply"))) == 497
     assert "dropped 3 of 500" in caplog.text
     cloud[:100] = np.nan
-    write_ply(tmp_path / "a.ply", cloud)
+    write_ply(tmp_path / "a.ply", Cloud(cloud))
     with pytest.raises(MapvoteError, match="100 of 500 points are not finite"):
         read_map(tmp_path / "a.ply")
 
 
 def test_an_empty_map_is_an_error(tmp_path: Path) -> None:
-    write_ply(tmp_path / "a.ply", np.zeros((0, 3)))
+    write_ply(tmp_path / "a.ply", Cloud(np.zeros((0, 3))))
     with pytest.raises(MapvoteError, match="holds no points"):
         read_map(tmp_path / "a.ply")
 
@@ -195,7 +197,7 @@ def test_a_missing_package_is_named(
 def test_nothing_is_left_behind_where_it_cannot_be_written(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(MapvoteError, match="cannot be written"):
-        write_pcd(tmp_path / "file" / "a.pcd", points())
+        write_pcd(tmp_path / "file" / "a.pcd", Cloud(points()))
     with pytest.raises(MapvoteError, match=r"no format for \.xyz"):
         export_map(map_from_points(points()), tmp_path / "a.xyz")
     assert os.listdir(tmp_path) == ["file"]

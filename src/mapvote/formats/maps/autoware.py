@@ -5,21 +5,25 @@ Points are in the map frame, not relative to their tile, as autoware_map_loader 
 
 from __future__ import annotations
 
+import logging
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import yaml
-from numpy.typing import NDArray
 
-from mapvote.core.types import F64, MapvoteError
+from mapvote.core.types import MapvoteError
 from mapvote.formats.atomic import whole_folder
 from mapvote.formats.extras import read_text
-from mapvote.formats.maps.cloud import Cloud, warn_of_float32
+from mapvote.formats.geo.frame import MapFrame
+from mapvote.formats.geo.projector import PROJECTOR, frame_of_projector, projector_of
+from mapvote.formats.maps.cloud import Cloud, joined, warn_of_float32
 from mapvote.formats.maps.pcd import read_pcd, save_pcd
 
+log = logging.getLogger("mapvote.formats")
+
 METADATA = "pointcloud_map_metadata.yaml"
-PROJECTOR = "map_projector_info.yaml"
 TILES = "pointcloud_map.pcd"
 """The folder of tiles really is called so, by Autoware's convention."""
 SIDE_M = 20
@@ -44,8 +48,7 @@ def read_autoware(path: Path) -> Cloud:
             raise ValueError("no tiles, or a corner that is not [x, y]")
     except (KeyError, TypeError, ValueError) as error:
         raise MapvoteError(f"{file}: not Autoware's metadata ({error}); {CONTENT}") from error
-    clouds: list[NDArray[np.floating]] = []
-    dropped: set[str] = set()
+    clouds: list[Cloud] = []
     for name, corner in corners.items():
         tile = next((f for f in (path / name, path / TILES / name) if f.is_file()), None)
         if tile is None:
@@ -57,22 +60,41 @@ def read_autoware(path: Path) -> Cloud:
                 f"{tile}: {int(outside.sum())} of {len(outside)} points lie outside its square at {corner.tolist()}; "
                 f"are its points relative to the tile, or is the corner wrong?"
             )
-        clouds.append(cloud.points)
-        dropped.update(cloud.dropped)
+        clouds.append(cloud)
+    return replace(joined(clouds), frame=_frame(path))
+
+
+def is_autoware_default(path: Path) -> bool:
+    """Autoware's default folder: the whole map in one file pointcloud_map.pcd, beside its lanelet2_map.osm."""
+    return path.is_dir() and not is_autoware(path) and (path / TILES).is_file()
+
+
+def read_autoware_default(path: Path) -> Cloud:
+    """The one PCD of Autoware's default folder, in the frame of the map_projector_info.yaml beside it."""
+    cloud = read_pcd(path / TILES)
+    if not (path / PROJECTOR).is_file() and (path / "lanelet2_map.osm").is_file():
+        log.warning("%s: no %s, so its coordinates stay local; --projector MGRS:54SUE names them", path, PROJECTOR)
+    return replace(cloud, frame=_frame(path))
+
+
+def _frame(path: Path) -> MapFrame:
     projector = path / PROJECTOR
-    georeference = {PROJECTOR: read_text(projector)} if projector.is_file() else {}
-    return Cloud(np.concatenate(clouds), tuple(sorted(dropped)), georeference)
+    return frame_of_projector(read_text(projector), str(projector)) if projector.is_file() else MapFrame()
 
 
-def write_autoware(path: Path, points: F64, *, side_m: int = SIDE_M, projector: str | None = None) -> None:
-    """Points (n, 3) in map metres as Autoware's folder, whole or not at all; an older one there is replaced.
+def write_autoware(path: Path, cloud: Cloud, *, side_m: int = SIDE_M) -> None:
+    """A cloud as Autoware's folder, whole or not at all; an older one there is replaced.
 
-    ``side_m``: whole metres. ``projector``: the text of map_projector_info.yaml, where the map carries one.
+    ``side_m``: whole metres. Of the fields intensity goes along. MapvoteError if Autoware has no projector for the
+    cloud's frame (:func:`mapvote.formats.geo.projector.autoware_frame` chooses one that it has).
     """
+    points = cloud.points
     if len(points) == 0:
         raise MapvoteError(f"{path}: no points to write")
+    projector = projector_of(cloud.frame)
     warn_of_float32(str(path), points)
     stored = points.astype(np.float32)
+    fields = {"intensity": cloud.fields["intensity"]} if "intensity" in cloud.fields else {}
     corner = np.floor(stored[:, :2].astype(np.float64) / side_m).astype(np.int64) * side_m
     order = np.lexsort((corner[:, 1], corner[:, 0]))
     seams = np.flatnonzero(np.diff(corner[order], axis=0).any(axis=1)) + 1
@@ -81,11 +103,10 @@ def write_autoware(path: Path, points: F64, *, side_m: int = SIDE_M, projector: 
         lines = [f"x_resolution: {side_m:.1f}", f"y_resolution: {side_m:.1f}"]
         for piece in np.split(order, seams):
             x, y = corner[piece[0]].tolist()
-            save_pcd(folder / TILES / f"{x}_{y}.pcd", stored[piece])
+            save_pcd(folder / TILES / f"{x}_{y}.pcd", stored[piece], {n: v[piece] for n, v in fields.items()})
             lines.append(f"{x}_{y}.pcd: [{x}, {y}]")
         (folder / METADATA).write_text("\n".join(lines) + "\n")
-        if projector is not None:
-            (folder / PROJECTOR).write_text(projector)
+        (folder / PROJECTOR).write_text(projector)
 
 
 def _read_yaml(file: Path) -> dict[Any, Any]:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -14,21 +14,79 @@ from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Lattice
 from mapvote.core.point_map import PointMap, map_from_points
 from mapvote.core.types import MapvoteError
 from mapvote.formats.clean import MAX_BAD_SHARE
+from mapvote.formats.geo.frame import MapFrame
+from mapvote.formats.geo.units import settle
 
 log = logging.getLogger("mapvote.formats")
 
 NEAR_ORIGIN_M = 50_000.0
 """Maps within this of (0, 0) share the lattice that starts there; farther ones (UTM) get one of their own."""
+_SOME = 1_000_000
+"""Points looked at to tell degrees from metres."""
+
+
+KEPT = (
+    "intensity",
+    "red",
+    "green",
+    "blue",
+    "classification",
+    "gps_time",
+    "return_number",
+    "number_of_returns",
+)
+"""Fields of points that a map keeps, by LAS's names."""
+SCALED = ("intensity", "red", "green", "blue")
+"""Those that count from nothing to a full scale, which depends on the type."""
 
 
 @dataclass(frozen=True, slots=True)
 class Cloud:
-    """``points`` (n, 3), float32 or float64 as the file holds them, map metres."""
+    """``points`` (n, 3), float32 or float64 as the file holds them, in the units of ``frame``."""
 
     points: NDArray[np.floating]
     dropped: tuple[str, ...] = ()
     """Fields of the file that a mapvote map does not keep, e.g. intensity."""
-    georeference: Mapping[str, str] = field(default_factory=dict)
+    frame: MapFrame = field(default_factory=MapFrame)
+    """What the file says about its coordinates: they may be in feet or degrees still."""
+    fields: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+    """Columns (n,) of ``KEPT``, with the values and in the type that the file has."""
+
+    def in_metres(self, where: str, wanted: MapFrame | None = None, *, sure: bool = False) -> Cloud:
+        """The cloud in map metres, in the frame ``wanted`` where one is; see ``geo.units.settle``."""
+        frame, convert = settle(where, self.frame, wanted, self.points[:_SOME], sure=sure)
+        return replace(self, points=convert(self.points), frame=frame)
+
+
+def full_scale(values: NDArray[Any]) -> float:
+    """The value that means 1.0: the largest of an integer type; of floats 1, or 255 if any is above 1."""
+    if values.dtype.kind in "iu":
+        return float(np.iinfo(values.dtype).max)
+    return 255.0 if len(values) and float(np.nanmax(values)) > 1.0 else 1.0
+
+
+def joined(pieces: Sequence[Cloud]) -> Cloud:
+    """Pieces of one file as one cloud."""
+    if len(pieces) == 1:
+        return pieces[0]
+    names = [name for name in KEPT if all(name in piece.fields for piece in pieces)]
+    return replace(
+        pieces[0],
+        points=np.concatenate([piece.points for piece in pieces]),
+        fields={name: np.concatenate([piece.fields[name] for piece in pieces]) for name in names},
+        dropped=tuple(sorted({name for piece in pieces for name in piece.dropped})),
+    )
+
+
+def kept_fields(table: NDArray[np.void]) -> dict[str, NDArray[Any]]:
+    """The columns of a structured array that a map keeps: numbers under LAS's names, PCL's packed rgb taken apart."""
+    names = table.dtype.names or ()
+    out = {name: np.ascontiguousarray(table[name]) for name in KEPT if name in names}
+    for packed in ("rgb", "rgba"):
+        if packed in names and "red" not in out and table.dtype[packed].itemsize == 4:
+            word = np.ascontiguousarray(table[packed]).view(np.uint32)
+            out |= {c: ((word >> s) & 255).astype(np.uint8) for c, s in (("red", 16), ("green", 8), ("blue", 0))}
+    return {name: column for name, column in out.items() if column.ndim == 1 and column.dtype.kind in "iuf"}
 
 
 def xyz(where: str, table: NDArray[np.void]) -> NDArray[np.floating]:
@@ -45,8 +103,8 @@ def xyz(where: str, table: NDArray[np.void]) -> NDArray[np.floating]:
 
 
 def other_fields(names: tuple[str, ...]) -> tuple[str, ...]:
-    """The fields beside x, y, z; padding (names that start with an underscore or a hash) is none."""
-    return tuple(n for n in names if n not in ("x", "y", "z") and not n.startswith(("_", "#")))
+    """The fields that a map does not keep; padding (names that start with an underscore or a hash) is none."""
+    return tuple(n for n in names if n not in ("x", "y", "z", "rgb", *KEPT) and not n.startswith(("_", "#")))
 
 
 def lattice_of(points: NDArray[np.floating]) -> Lattice:
@@ -77,7 +135,7 @@ def to_map(where: str, cloud: Cloud) -> PointMap:
     if n_bad:
         log.warning("%s: dropped %d of %d points that are not finite", where, n_bad, len(points))
         points = points[~bad]
-    return map_from_points(points, lattice=lattice_of(points), georeference=cloud.georeference)
+    return map_from_points(points, lattice=lattice_of(points), georeference=cloud.frame.georeference())
 
 
 def float32_loss_m(points: NDArray[np.floating]) -> float:

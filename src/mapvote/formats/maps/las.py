@@ -1,4 +1,4 @@
-"""LAS and LAZ files through laspy (extra ``las``)."""
+"""LAS, LAZ and COPC files through laspy (extra ``las``): read piece by piece, with their coordinate system."""
 
 from __future__ import annotations
 
@@ -7,7 +7,9 @@ import os
 import struct
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -16,9 +18,11 @@ from numpy.typing import NDArray
 from mapvote.core.types import MapvoteError
 from mapvote.formats.atomic import whole_file
 from mapvote.formats.extras import require
+from mapvote.formats.geo.frame import ENU, MapFrame, read_crs
+from mapvote.formats.geo.las_keys import frame_of_keys
 from mapvote.formats.maps import laz_subprocess
-from mapvote.formats.maps.cloud import Cloud, other_fields
-from mapvote.formats.maps.laz_subprocess import Head, read_points
+from mapvote.formats.maps.cloud import SCALED, Cloud, full_scale, joined, other_fields
+from mapvote.formats.maps.laz_subprocess import FIELDS, Head, Piece, read_head, read_pieces
 
 STEP_M = 0.0001
 """Coordinates are whole multiples of this from the file's offset: exact to 0.05 mm over 400 km."""
@@ -31,37 +35,90 @@ def is_las(path: Path) -> bool:
 
 
 def read_las(path: Path) -> Cloud:
-    """The points of a LAS or LAZ file as float64, and its coordinate system as WKT where it has one."""
-    require("laspy", "las", str(path))
+    """The whole file; see :func:`stream_las`."""
+    return joined(list(stream_las(path)))
+
+
+def stream_las(path: Path) -> Iterator[Cloud]:
+    """The points of a LAS, LAZ or COPC file as float64, piece by piece, in the coordinate system that it names.
+
+    One piece without points if the file has none. MapvoteError if it is damaged or cut off.
+    """
+    laspy = require("laspy", "las", str(path))
     compressed = _check_counts(path)
     try:
-        head, points = _read_apart(path) if compressed else read_points(str(path))
+        if compressed:
+            yield from _apart(path)
+        else:
+            with laspy.open(path) as file:
+                head = read_head(file)
+                yield from _clouds(path, head, read_pieces(file, head))
+    except MapvoteError:
+        raise
     except OSError as error:
         raise MapvoteError(f"{path}: cannot be read ({error.strerror or error})") from error
     except Exception as error:  # laspy and lazrs raise their own, numpy's and struct's
         raise MapvoteError(f"{path}: not a whole LAS or LAZ file ({error}); copy or export it again") from error
-    if head.points != head.promised:
-        raise MapvoteError(f"{path}: cut off: {head.points} points, but its header says {head.promised}; copy it again")
-    others = other_fields(tuple(n.lower() for n in head.dimensions))
-    return Cloud(points, others, {"wkt": head.wkt} if head.wkt else {})
 
 
-def _read_apart(path: Path) -> tuple[Head, NDArray[np.float64]]:
-    """:func:`read_points` in a process of its own, which a damaged LAZ file may end; ValueError if it does."""
+def _clouds(path: Path, head: Head, pieces: Iterator[Piece]) -> Iterator[Cloud]:
+    frame = MapFrame(_known(path, head.wkt)) if head.wkt else frame_of_keys(str(path), head.geo_keys)
+    others = tuple(n for n in other_fields(tuple(n.lower() for n in head.dimensions)) if n not in FIELDS)
+    done = 0
+    for points, fields in pieces:
+        done += len(points)
+        yield Cloud(points, others, frame, fields)
+    if done != head.promised:
+        raise MapvoteError(f"{path}: cut off: {done} points, but its header says {head.promised}; copy it again")
+    if not done:
+        yield Cloud(np.empty((0, 3)), others, frame)
+
+
+def _known(path: Path, wkt: str) -> str:
+    try:
+        read_crs(wkt)
+    except MapvoteError as error:
+        raise MapvoteError(f"{path}: {error}; say what it is with --from-crs") from error
+    return wkt
+
+
+def _apart(path: Path) -> Iterator[Cloud]:
+    """What the file holds, read by a process of its own, which a damaged LAZ file may end; ValueError if it does."""
     command = [sys.executable, laz_subprocess.__file__, str(path)]
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, env=environment) as child:
-        assert isinstance(child.stdout, io.BufferedReader)
-        line = child.stdout.readline()
+        try:
+            assert isinstance(child.stdout, io.BufferedReader)
+            head = _decoded(child.stdout.readline())
+            yield from _clouds(path, head, _pieces_of(child.stdout, head))
+        finally:
+            child.kill()  # where the caller wants no more
+
+
+def _decoded(line: bytes) -> Head:
+    if not line:
+        raise ValueError("the LAZ reader crashed on it")
+    head = msgspec.json.decode(line, type=Head)
+    if head.refusal:
+        raise ValueError(head.refusal)
+    return head
+
+
+def _pieces_of(stream: io.BufferedReader, head: Head) -> Iterator[Piece]:
+    while True:
+        line = stream.readline()
+        if line[:1] == b"{":
+            _decoded(line)
         if not line:
-            raise ValueError("the LAZ reader crashed on it")
-        head = msgspec.json.decode(line, type=Head)
-        if head.refusal:
-            raise ValueError(head.refusal)
-        points = np.empty((head.points, 3))
-        if child.stdout.readinto(points.reshape(-1).data) != points.nbytes:
             raise ValueError("the LAZ reader stopped half way; is there enough memory?")
-    return head, points
+        n = int(line)
+        if n == 0:
+            return
+        points, fields = np.empty((n, 3)), {name: np.empty(n, dtype=FIELDS[name]) for name in head.fields}
+        for column in (points.reshape(-1), *fields.values()):
+            if stream.readinto(column.data.cast("B")) != column.nbytes:
+                raise ValueError("the LAZ reader stopped half way; is there enough memory?")
+        yield points, fields
 
 
 def _check_counts(path: Path) -> bool:
@@ -89,17 +146,39 @@ def _check_counts(path: Path) -> bool:
     return bool(header[104] & 0xC0)
 
 
-def write_las(path: Path, points: NDArray[np.floating], *, wkt: str | None = None) -> None:
-    """Points (n, 3) as LAS 1.4, or LAZ if the name ends so; float64 kept to 0.05 mm. Whole or not at all."""
+def las_fields(cloud: Cloud) -> dict[str, NDArray[Any]]:
+    """The columns of a cloud as LAS holds them: 16 bits of intensity and colour, from whatever scale they have."""
+    out = {}
+    for name, kind in FIELDS.items():
+        if name not in cloud.fields:
+            continue
+        values = cloud.fields[name]
+        if name in SCALED and values.dtype != np.uint16:
+            values = np.rint(np.clip(values.astype(np.float64) / full_scale(values), 0.0, 1.0) * 65535.0)
+        out[name] = values.astype(kind)
+    return out
+
+
+def write_las(path: Path, cloud: Cloud) -> None:
+    """A cloud as LAS 1.4, or LAZ if the name ends so; float64 kept to 0.05 mm, with its coordinate system and fields.
+
+    Every point is return 1 of 1 where nothing else is known. Whole or not at all.
+    """
     laspy = require("laspy", "las", str(path))
-    exact = points.astype(np.float64, copy=False)
-    header = laspy.LasHeader(point_format=6, version="1.4")
+    exact = cloud.points.astype(np.float64, copy=False)
+    header = laspy.LasHeader(point_format=7 if "red" in cloud.fields else 6, version="1.4")
     header.offsets = np.floor(exact.mean(axis=0)) if len(exact) else np.zeros(3)
     header.scales = np.full(3, STEP_M)
-    if wkt is not None:
-        header.vlrs.append(laspy.vlrs.known.WktCoordinateSystemVlr(wkt))
+    if not cloud.frame.is_local and not cloud.frame.crs.startswith(ENU):
+        if any(cloud.frame.offset_m):
+            exact = exact + np.array(cloud.frame.offset_m)  # back to the coordinates that the CRS means
+            header.offsets = np.floor(exact.mean(axis=0)) if len(exact) else np.zeros(3)
+        header.vlrs.append(laspy.vlrs.known.WktCoordinateSystemVlr(read_crs(cloud.frame.crs).to_wkt("WKT1_GDAL")))
         header.global_encoding.wkt = True
     las = laspy.LasData(header)
     las.x, las.y, las.z = exact[:, 0], exact[:, 1], exact[:, 2]
+    las.return_number = las.number_of_returns = np.ones(len(exact), dtype=np.uint8)
+    for name, values in las_fields(cloud).items():
+        las[name] = values
     with whole_file(path) as partial, partial.open("wb") as stream:
         las.write(stream, do_compress=path.suffix.lower() == ".laz")

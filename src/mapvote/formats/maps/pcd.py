@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -11,8 +13,9 @@ from pypcd4 import Encoding, PointCloud
 
 from mapvote.core.types import F64, MapvoteError
 from mapvote.formats.atomic import whole_file
-from mapvote.formats.maps.cloud import Cloud, other_fields, warn_of_float32, xyz
+from mapvote.formats.maps.cloud import Cloud, kept_fields, other_fields, warn_of_float32, xyz
 
+NO_FIELDS: Mapping[str, NDArray[Any]] = MappingProxyType({})
 ENCODINGS = tuple(e.value for e in (Encoding.ASCII, Encoding.BINARY, Encoding.BINARY_COMPRESSED))
 
 
@@ -42,22 +45,37 @@ def read_pcd_table(path: Path) -> tuple[NDArray[np.void], F64]:
 def read_pcd(path: Path) -> Cloud:
     """The points of a PCD file; its VIEWPOINT is not applied (map points are in map metres already)."""
     table, _ = read_pcd_table(path)
-    return Cloud(xyz(str(path), table), other_fields(table.dtype.names or ()))
+    return Cloud(xyz(str(path), table), other_fields(table.dtype.names or ()), fields=kept_fields(table))
 
 
-def write_pcd(path: Path, points: NDArray[np.floating], *, encoding: str = "binary", double: bool = False) -> None:
-    """Points (n, 3) as x, y, z; float32, which is all that PCL reads, or float64 if ``double``. Whole or not at all."""
+def write_pcd(path: Path, cloud: Cloud, *, encoding: str = "binary", double: bool = False) -> None:
+    """A cloud as x, y, z, float32, which is all that PCL reads, or float64 if ``double``; and its fields.
+
+    The frame is not written: PCD has no place for it. Whole or not at all.
+    """
     if not double:
-        warn_of_float32(str(path), points)
+        warn_of_float32(str(path), cloud.points)
+    points: NDArray[np.floating] = cloud.points.astype(np.float64) if double else cloud.points.astype(np.float32)
     with whole_file(path) as partial:
-        save_pcd(partial, points.astype(np.float64 if double else np.float32), encoding=encoding)
+        save_pcd(partial, points, cloud.fields, encoding=encoding)
 
 
-def save_pcd(path: Path, points: NDArray[np.floating], *, encoding: str = "binary") -> None:
-    """Points (n, 3) as they are, in their own precision, straight to ``path``."""
-    kind: Any = points.dtype.type
-    columns = [np.ascontiguousarray(points[:, axis]) for axis in range(3)]
-    PointCloud.from_points(columns, ("x", "y", "z"), (kind, kind, kind)).save(path, Encoding(encoding))
+def save_pcd(
+    path: Path,
+    points: NDArray[np.floating],
+    fields: Mapping[str, NDArray[Any]] = NO_FIELDS,
+    *,
+    encoding: str = "binary",
+) -> None:
+    """Points (n, 3) and fields (n,) as they are, in their own precision, straight to ``path``.
+
+    PCL's intensity is a float, and so is written as one.
+    """
+    columns = {axis: np.ascontiguousarray(points[:, i]) for i, axis in enumerate("xyz")} | dict(fields)
+    if "intensity" in columns:
+        columns["intensity"] = columns["intensity"].astype(np.float32)
+    kinds: Any = tuple(column.dtype.type for column in columns.values())
+    PointCloud.from_points(list(columns.values()), tuple(columns), kinds).save(path, Encoding(encoding))
 
 
 def _first_line(error: Exception) -> str:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,7 +12,11 @@ from numpy.typing import NDArray
 from mapvote.core.types import MapvoteError
 from mapvote.formats.atomic import whole_file
 from mapvote.formats.extras import require
-from mapvote.formats.maps.cloud import Cloud, other_fields, xyz
+from mapvote.formats.maps.cloud import Cloud, kept_fields, other_fields, xyz
+
+_TYPES = {
+    "f8": "double", "f4": "float", "u1": "uchar", "i1": "char", "u2": "ushort", "i2": "short", "u4": "uint", "i4": "int"
+}  # fmt: skip
 
 
 def is_ply(path: Path) -> bool:
@@ -31,15 +37,25 @@ def read_ply(path: Path) -> Cloud:
     table = np.empty(int(raw["length"]), dtype=[(n, c.dtype.newbyteorder("=")) for n, c in columns.items()])
     for name, column in columns.items():
         table[name] = column
-    return Cloud(xyz(str(path), table), other_fields(tuple(columns)))
+    return Cloud(xyz(str(path), table), other_fields(tuple(columns)), fields=kept_fields(table))
 
 
-def write_ply(path: Path, points: NDArray[np.floating]) -> None:
-    """Points (n, 3) as double x, y, z, binary little-endian: nothing is rounded. Whole or not at all."""
-    header = (
-        "ply\nformat binary_little_endian 1.0\ncomment mapvote\n"
-        f"element vertex {len(points)}\nproperty double x\nproperty double y\nproperty double z\nend_header\n"
-    )
+def write_ply(path: Path, cloud: Cloud) -> None:
+    """A cloud as double x, y, z and its fields, binary little-endian: nothing is rounded. Whole or not at all.
+
+    The frame is not written: PLY has no place for it.
+    """
+    columns = {axis: cloud.points[:, i] for i, axis in enumerate("xyz")} | dict(cloud.fields)
+    kinds = [(name, "<f8" if name in "xyz" else column.dtype.newbyteorder("<")) for name, column in columns.items()]
+    table = np.empty(len(cloud.points), dtype=kinds)
+    for name, column in columns.items():
+        table[name] = column
+    properties = "".join(f"property {_TYPES[kind.str[1:]]} {name}\n" for name, (kind, _) in _fields_of(table))
+    start = f"ply\nformat binary_little_endian 1.0\ncomment mapvote\nelement vertex {len(table)}\n"
     with whole_file(path) as partial, partial.open("wb") as stream:
-        stream.write(header.encode("ascii"))
-        stream.write(np.ascontiguousarray(points, dtype="<f8").tobytes())
+        stream.write(f"{start}{properties}end_header\n".encode("ascii"))
+        stream.write(table.tobytes())
+
+
+def _fields_of(table: NDArray[np.void]) -> Iterable[tuple[str, tuple[np.dtype[Any], int]]]:
+    return ((name, (about[0], about[1])) for name, about in (table.dtype.fields or {}).items())

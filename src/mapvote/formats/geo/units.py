@@ -1,0 +1,211 @@
+"""From the coordinates of a file to map metres: units converted, degrees refused, another frame where one is wanted."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapvote.core.types import F64, MapvoteError
+from mapvote.formats.geo.frame import ENU, MapFrame, pyproj, read_crs, utm_of
+
+log = logging.getLogger("mapvote.formats")
+
+METRES = {9001: "metre", 9002: "foot", 9003: "US survey foot"}
+"""EPSG's codes of units of length."""
+_UNITS: dict[str, Any] = {
+    "metre": "metre",
+    "foot": {"type": "LinearUnit", "name": "foot", "conversion_factor": 0.3048},
+    "US survey foot": {"type": "LinearUnit", "name": "US survey foot", "conversion_factor": 1200.0 / 3937.0},
+}
+
+Convert = Callable[[NDArray[np.floating]], NDArray[np.floating]]
+"""Points (n, 3) of a file to map metres; the same array if there is nothing to do."""
+
+
+def settle(
+    where: str, stated: MapFrame, wanted: MapFrame | None, first: NDArray[np.floating], *, sure: bool = False
+) -> tuple[MapFrame, Convert]:
+    """(frame of the map, how the file's points get there).
+
+    ``stated``: what the file says of itself, in any unit. ``wanted``: the frame asked for (``--crs``,
+    ``--projector``), None to stay where the file is. ``first``: some points (n, 3) of the file, to name the UTM zone.
+    ``sure``: the user himself said that the file is in local metres.
+    MapvoteError if the file is in degrees, or geocentric, and no frame is asked for.
+    """
+    if stated.is_local:
+        if wanted is None or wanted.is_local:
+            if not sure:
+                _check_no_degrees(where, first)
+            return stated, _as_it_is
+        log.warning("%s: does not name its coordinate system; taken to be what was asked for", where)
+        stated = replace(wanted, heights=stated.heights or wanted.heights)
+        if not any(wanted.offset_m):
+            wanted = None
+    if stated.crs.startswith(ENU):
+        return _moved(stated, wanted)
+    crs = read_crs(stated.crs)
+    heights = stated.heights or height_name(crs)
+    horizontal = crs.sub_crs_list[0] if crs.is_compound else crs
+    if horizontal.is_geographic or horizontal.is_geocentric:
+        if wanted is None or wanted.is_local:
+            raise MapvoteError(_degrees(where, horizontal, first))
+        return _from_degrees(where, horizontal, replace(wanted, heights=wanted.heights or heights))
+    to_m, z_to_m = _units(where, crs)
+    metric = replace(stated, crs=short(stated.crs), heights=heights)
+    if (to_m, z_to_m) != (1.0, 1.0):
+        metric = replace(metric, crs=short(in_metres(horizontal).to_wkt()))
+        log.warning("%s: x, y in units of %.10g m, z of %.10g m: converted to metres", where, to_m, z_to_m)
+    scale = np.array([to_m, to_m, z_to_m])
+    frame, move = _moved(metric, wanted)
+    if (scale == 1.0).all():
+        return frame, move
+    return frame, lambda points: move(points.astype(np.float64) * scale)
+
+
+def _as_it_is(points: NDArray[np.floating]) -> NDArray[np.floating]:
+    return points
+
+
+def _moved(stated: MapFrame, wanted: MapFrame | None) -> tuple[MapFrame, Convert]:
+    """From one metric frame to another; the same projection takes only a subtraction, which is exact."""
+    if wanted is None or wanted.is_local or (wanted.crs == stated.crs and wanted.offset_m == stated.offset_m):
+        return wanted if wanted is not None and wanted.projector else stated, _as_it_is
+    wanted = replace(wanted, heights=wanted.heights or stated.heights)
+    if wanted.crs == stated.crs:
+        shift = np.array(stated.offset_m) - np.array(wanted.offset_m)
+        return wanted, lambda points: points.astype(np.float64) + shift
+    return wanted, lambda points: wanted.from_lonlat(stated.to_lonlat(points))
+
+
+def _from_degrees(where: str, crs: Any, wanted: MapFrame) -> tuple[MapFrame, Convert]:
+    """From the degrees (or geocentric metres) of a file; x is the longitude."""
+    module = pyproj(where)
+    to_wgs84 = module.Transformer.from_crs(crs, "EPSG:4979" if crs.is_geocentric else "EPSG:4326", always_xy=True)
+
+    def convert(points: NDArray[np.floating]) -> F64:
+        columns = points.astype(np.float64).T
+        if not crs.is_geocentric and not (np.abs(columns[1]) <= 90.0).all():
+            raise MapvoteError(f"{where}: latitudes beyond 90 degrees; are x and y exchanged?")
+        moved = to_wgs84.transform(*columns) if crs.is_geocentric else (*to_wgs84.transform(*columns[:2]), columns[2])
+        return wanted.from_lonlat(np.column_stack(moved))
+
+    return wanted, convert
+
+
+def _degrees(where: str, crs: Any, first: NDArray[np.floating]) -> str:
+    longitude, latitude = (float(v) for v in first[0, :2]) if len(first) else (0.0, 0.0)
+    zone = "EPSG:n"
+    if crs.is_geographic and abs(longitude) <= 180.0 and abs(latitude) <= 90.0:
+        zone = utm_of(longitude, latitude)
+    unit = "degrees" if crs.is_geographic else "metres from the Earth's centre"
+    return (
+        f"{where}: coordinates are {unit} ({crs.name}), and a map needs metres; project them: "
+        f"mapvote import '{where}' MAP --crs {zone}"
+    )
+
+
+def _check_no_degrees(where: str, points: NDArray[np.floating]) -> None:
+    """Refuse what can only be longitudes and latitudes: many points in a plate of degrees, far higher than wide."""
+    if len(points) < 100:
+        return
+    low, high = np.nanmin(points, axis=0), np.nanmax(points, axis=0)
+    wide = float((high - low)[:2].max())
+    on_earth = np.abs([low[0], high[0]]).max() <= 180.0 and np.abs([low[1], high[1]]).max() <= 90.0
+    if on_earth and 0.0 < wide < 0.5 and float(high[2] - low[2]) > 4.0 * wide:
+        raise MapvoteError(
+            f"{where}: {wide:.4f} wide and {high[2] - low[2]:.1f} high: x and y look like degrees; if so: "
+            f"mapvote import '{where}' MAP --from-crs EPSG:4326 --crs {utm_of(float(low[0]), float(low[1]))}; "
+            f"if these are metres: --from-crs local"
+        )
+
+
+def _units(where: str, crs: Any) -> tuple[float, float]:
+    """Metres in one unit of x and y, and of z. A file that names no unit for heights has them in that of x and y."""
+    plane = [a for a in crs.axis_info if a.direction.lower() not in ("up", "down")]
+    up = [a for a in crs.axis_info if a.direction.lower() in ("up", "down")]
+    to_m = float(plane[0].unit_conversion_factor) if plane else 1.0
+    if up and up[0].direction.lower() == "down":
+        raise MapvoteError(f"{where}: z counts downwards ({crs.name}); turn it round first")
+    z_to_m = float(up[0].unit_conversion_factor) if up else to_m
+    if not up and to_m != 1.0:
+        log.warning("%s: names no unit for heights: taken to be that of x and y", where)
+    return to_m, z_to_m
+
+
+def height_name(crs: Any) -> str:
+    """What a CRS says that heights count from: the name of its vertical part, the ellipsoid, or "" for nothing."""
+    if crs.is_compound:
+        return str(crs.sub_crs_list[1].name)
+    return "above the ellipsoid" if len(crs.axis_info) == 3 else ""
+
+
+def in_metres(crs: Any) -> Any:
+    """The same projection with axes in metres."""
+    return pyproj().CRS.from_json_dict(_with_unit(crs.to_json_dict(), "metre"))
+
+
+def with_units(text: str, plane: str | None, up: str | None) -> str:
+    """A CRS with other units than its own for x and y, and for z (names of ``METRES``, None for no other)."""
+    crs = read_crs(text)
+    if crs.is_geographic:
+        return text
+    parts = list(crs.sub_crs_list) if crs.is_compound else [crs]
+    told = [plane, up]
+    plain = True
+    for i, part in enumerate(parts):
+        own = float(part.axis_info[0].unit_conversion_factor)
+        unit = told[i]
+        factor = own if unit is None else 1.0 if unit == "metre" else _UNITS[unit]["conversion_factor"]
+        if abs(factor - own) > 1e-9:
+            parts[i] = pyproj().CRS.from_json_dict(_with_unit(part.to_json_dict(), _UNITS[unit or "metre"]))
+            plain = False
+    if len(parts) == 1 and up is not None:
+        vertical = pyproj().CRS.from_json_dict(
+            {
+                "type": "VerticalCRS",
+                "name": "height",
+                "datum": {"type": "VerticalReferenceFrame", "name": "unknown"},
+                "coordinate_system": {
+                    "subtype": "vertical",
+                    "axis": [
+                        {"name": "Height", "abbreviation": "H", "direction": "up", "unit": _UNITS[up]},
+                    ],
+                },
+            }
+        )
+        parts.append(vertical)
+        plain = False
+    if plain:
+        return text
+    if len(parts) == 1:
+        return str(parts[0].to_wkt())
+    compound = pyproj().crs.CompoundCRS(" + ".join(part.name for part in parts), parts)
+    return str(compound.to_wkt())
+
+
+def _with_unit(node: Any, unit: Any) -> Any:
+    if isinstance(node, list):
+        return [_with_unit(child, unit) for child in node]
+    if not isinstance(node, dict):
+        return node
+    out = {key: _with_unit(child, unit) for key, child in node.items() if key not in ("id", "ids")}
+    if "axis" in out and "direction" not in out:
+        for axis in out["axis"]:
+            own = axis.get("unit")
+            angular = own == "degree" or (isinstance(own, dict) and own.get("type") == "AngularUnit")
+            axis["unit"] = own if angular else unit
+    return out
+
+
+def short(crs: str) -> str:
+    """ "EPSG:n" for a CRS that is exactly that one, else its WKT."""
+    known = read_crs(crs)
+    code = known.to_epsg(min_confidence=100)
+    if code is not None and known.equals(read_crs(f"EPSG:{code}"), ignore_axis_order=True):
+        return f"EPSG:{code}"
+    return str(known.to_wkt())

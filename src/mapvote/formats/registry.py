@@ -1,0 +1,80 @@
+"""Every format, listed once: how it is recognised, read and written. A new one is a file of its own and a line here."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from mapvote.core.types import Drive
+from mapvote.formats.drives.kitti import is_kitti_folder, open_kitti
+from mapvote.formats.drives.kitti_raw import is_kitti_raw, open_kitti_raw
+from mapvote.formats.drives.options import DriveOptions
+from mapvote.formats.drives.pcd_scans import is_pcd_drive, open_pcd_drive
+from mapvote.formats.drives.rosbag import is_rosbag, open_rosbag
+from mapvote.formats.maps.autoware import (
+    is_autoware,
+    is_autoware_default,
+    read_autoware,
+    read_autoware_default,
+    write_autoware,
+)
+from mapvote.formats.maps.cloud import Cloud
+from mapvote.formats.maps.las import is_las, read_las, stream_las, write_las
+from mapvote.formats.maps.pcd import is_pcd, read_pcd, write_pcd
+from mapvote.formats.maps.ply import is_ply, read_ply, write_ply
+
+
+@dataclass(frozen=True, slots=True)
+class DriveFormat:
+    """A layout of recorded drives."""
+
+    recognised: Callable[[Path], bool]
+    """By what lies at the path; opens no scan."""
+    open: Callable[[Path, DriveOptions], Drive]
+
+
+@dataclass(frozen=True, slots=True)
+class MapFormat:
+    """A format that holds a map's points."""
+
+    recognised: Callable[[Path], bool]
+    read: Callable[[Path], Cloud]
+    stream: Callable[[Path], Iterator[Cloud]] | None = None
+    """Piece by piece, where the format allows it: for maps larger than memory."""
+
+
+@dataclass(frozen=True, slots=True)
+class MapWriter:
+    """What ``mapvote export`` writes under a suffix."""
+
+    name: str
+    write: Callable[[Path, Cloud], None]
+    """Whole or not at all."""
+
+
+DRIVES: dict[str, DriveFormat] = {
+    "KITTI drive folder": DriveFormat(is_kitti_folder, open_kitti),
+    "KITTI raw recording": DriveFormat(is_kitti_raw, open_kitti_raw),
+    "ROS bag": DriveFormat(is_rosbag, open_rosbag),
+    "folder of PCD scans": DriveFormat(is_pcd_drive, open_pcd_drive),
+}
+"""In the order in which they are tried."""
+
+MAPS: dict[str, MapFormat] = {
+    "Autoware tile folder": MapFormat(is_autoware, read_autoware),
+    "Autoware default folder": MapFormat(is_autoware_default, read_autoware_default),
+    "PCD file": MapFormat(is_pcd, read_pcd),
+    "LAS or LAZ file": MapFormat(is_las, read_las, stream_las),
+    "PLY file": MapFormat(is_ply, read_ply),
+}
+"""Maps that are only points, in the order in which they are tried."""
+
+WRITERS: dict[str, MapWriter] = {
+    ".pcd": MapWriter("PCD file", write_pcd),
+    ".las": MapWriter("LAS file", write_las),
+    ".laz": MapWriter("LAZ file", write_las),
+    ".ply": MapWriter("PLY file", write_ply),
+    "": MapWriter("Autoware tile folder", write_autoware),
+}
+"""By the suffix of the path; a folder has none."""
