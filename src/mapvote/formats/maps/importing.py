@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mapvote.core.types import PointMap
+from mapvote.core.point_map import PointMap
 from mapvote.formats import read_cloud
 from mapvote.formats.geo.frame import LOCAL, MapFrame
 from mapvote.formats.maps.cloud import Cloud, to_map
