@@ -13,23 +13,33 @@ from numpy.typing import NDArray
 from mapvote.core.grid import CELL_SIZE, Lattice
 from mapvote.core.types import F64, I32, I64, Bool
 
+_MIDDLE = 1 << 20
+"""Indices are counted from here, so that keys are positive and never 0: within +-2^20 voxels (314 km at 0.3 m)."""
 
-@numba.njit(cache=True, nogil=True)
-def _slot_of(key: np.int64, table_keys: I64) -> np.int64:
-    mask = len(table_keys) - 1
-    slot = scattered(key) & mask
-    while table_keys[slot] != 0 and table_keys[slot] != key:
+
+@numba.njit(cache=True, nogil=True, inline="always")
+def packed(ix: np.int64, iy: np.int64, iz: np.int64) -> np.int64:
+    """The key of a voxel: equal keys, same voxel; ascending by x, then y, then z. Indices (counted from -2^20) >= 0."""
+    return (ix << 42) | (iy << 21) | iz
+
+
+@numba.njit(cache=True, nogil=True, inline="always")
+def voxel_key(x: float, y: float, z: float, size: float) -> np.int64:
+    """The key of the voxel of side ``size`` that holds (x, y, z)."""
+    ix, iy, iz = np.floor(x / size), np.floor(y / size), np.floor(z / size)
+    return packed(np.int64(ix) + _MIDDLE, np.int64(iy) + _MIDDLE, np.int64(iz) + _MIDDLE)
+
+
+@numba.njit(cache=True, nogil=True, inline="always")
+def slot_of(key: np.int64, table: I64) -> np.int64:
+    """Where a hash table (2^k,) of keys holds ``key``, or the free slot (0) where it belongs: open addressing, linear
+    probing; Fibonacci hashing with the high half folded in, so that the low bits depend on all three indices."""
+    mask = len(table) - 1
+    h = key * np.int64(-7046029254386353131)
+    slot = (h ^ (h >> 32)) & mask
+    while table[slot] != 0 and table[slot] != key:
         slot = (slot + 1) & mask
     return slot
-
-
-@numba.njit(cache=True, nogil=True)
-def _key_of(x: float, y: float, z: float, x0: float, y0: float) -> np.int64:
-    """As :func:`mapvote.core.voxels.voxel_keys`; never 0 within its range."""
-    ix = np.int64(np.floor((x - x0) / CELL_SIZE)) + (1 << 20)
-    iy = np.int64(np.floor((y - y0) / CELL_SIZE)) + (1 << 20)
-    iz = np.int64(np.floor(z / CELL_SIZE)) + (1 << 20)
-    return (ix << 42) | (iy << 21) | iz
 
 
 @numba.njit(cache=True, nogil=True)
@@ -48,8 +58,8 @@ def _enter(
     for i in range(len(points)):
         if skip[i]:
             continue
-        key = _key_of(points[i, 0], points[i, 1], points[i, 2], x0, y0)
-        slot = _slot_of(key, table_keys)
+        key = voxel_key(points[i, 0] - x0, points[i, 1] - y0, points[i, 2], CELL_SIZE)
+        slot = slot_of(key, table_keys)
         if table_keys[slot] == 0:
             table_keys[slot] = key
             table_rows[slot] = n
@@ -73,7 +83,7 @@ def _enter(
 def _rehash(old_keys: I64, old_rows: I32, table_keys: I64, table_rows: I32) -> None:
     for i in range(len(old_keys)):
         if old_keys[i] != 0:
-            slot = _slot_of(old_keys[i], table_keys)
+            slot = slot_of(old_keys[i], table_keys)
             table_keys[slot] = old_keys[i]
             table_rows[slot] = old_rows[i]
 
@@ -119,17 +129,17 @@ class VoxelCloud:
         return sums[:, 4:7] + sums[:, 1:4] / sums[:, :1], self._scans[rows, 0]
 
 
-def voxel_keys(points: NDArray[np.floating], x0: float, y0: float, size: float = CELL_SIZE) -> I64:
-    """(n,) int64 key of each point's voxel on the lattice: equal keys, same voxel; order is by x, then y, then z.
+@numba.njit(cache=True, nogil=True)
+def _keys(points: F64, x0: float, y0: float, size: float) -> I64:
+    out = np.empty(len(points), dtype=np.int64)
+    for i in range(len(points)):
+        out[i] = voxel_key(points[i, 0] - x0, points[i, 1] - y0, points[i, 2], size)
+    return out
 
-    Voxel layers start at z = 0. Coordinates must lie within +-2^20 voxels (314 km at 0.3 m).
-    """
-    p = points.astype(np.float64)
-    ix = np.floor((p[:, 0] - x0) / size).astype(np.int64)
-    iy = np.floor((p[:, 1] - y0) / size).astype(np.int64)
-    iz = np.floor(p[:, 2] / size).astype(np.int64)
-    key: I64 = ((ix + (1 << 20)) << 42) | ((iy + (1 << 20)) << 21) | (iz + (1 << 20))
-    return key
+
+def voxel_keys(points: NDArray[np.floating], x0: float, y0: float, size: float = CELL_SIZE) -> I64:
+    """(n,) int64 key of each point's voxel on the lattice, see :func:`packed`. Voxel layers start at z = 0."""
+    return _keys(np.ascontiguousarray(points, dtype=np.float64), x0, y0, size)
 
 
 def voxel_downsample(points: NDArray[np.floating], size: float, x0: float = 0.0, y0: float = 0.0) -> I64:
@@ -139,34 +149,23 @@ def voxel_downsample(points: NDArray[np.floating], size: float, x0: float = 0.0,
 
 
 @numba.njit(cache=True, nogil=True)
-def scattered(key: np.int64) -> np.int64:
-    """A hash of a voxel key whose low bits depend on all three indices (Fibonacci hashing, high half folded in)."""
-    h = key * np.int64(-7046029254386353131)
-    return h ^ (h >> 32)
-
-
-@numba.njit(cache=True, nogil=True)
 def _thin(points: NDArray[np.float32], size: float, table: I64) -> I64:
     """Indices of the first point in each voxel of side ``size`` (open addressing, linear probing).
 
     ``table`` (2^k,) holds zeros; the answer is empty when it became half full and a larger one is needed.
     """
-    mask = len(table) - 1
     keep = np.empty(len(table) // 2, dtype=np.int64)
     n = 0
     scale = 1.0 / size
     last = np.int64(0)
     for i in range(len(points)):
-        ix = np.int64(points[i, 0] * scale + 1048576.0)
-        iy = np.int64(points[i, 1] * scale + 1048576.0)
-        iz = np.int64(points[i, 2] * scale + 1048576.0)
-        key = (ix << 42) | (iy << 21) | iz
+        # The middle is added first: cutting off is then rounding down, and quicker than floor.
+        ix, iy = np.int64(points[i, 0] * scale + float(_MIDDLE)), np.int64(points[i, 1] * scale + float(_MIDDLE))
+        key = packed(ix, iy, np.int64(points[i, 2] * scale + float(_MIDDLE)))
         if key == last:  # neighbours in a scan mostly share a voxel
             continue
         last = key
-        slot = scattered(key) & mask
-        while table[slot] != 0 and table[slot] != key:
-            slot = (slot + 1) & mask
+        slot = slot_of(key, table)
         if table[slot] == 0:
             if n == len(keep):
                 return keep[:0]

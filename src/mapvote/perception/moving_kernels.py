@@ -6,6 +6,7 @@ import numba
 import numpy as np
 
 from mapvote.core.types import F32, F64, I32, I64, U8, Bool
+from mapvote.core.voxels import slot_of, voxel_key
 
 NOTHING = np.float32(np.inf)
 """Of a range image: no return in that direction."""
@@ -60,11 +61,9 @@ def voxels(points: F64, obstacle: Bool, origin: F64, reach: float, cell: float) 
     size = 1024
     while size < 2 * obstacle.sum():
         size *= 2
-    table = np.full(size, -1, dtype=np.int32)
-    keys = np.empty(n, dtype=np.int64)
+    keys, rows = np.zeros(size, dtype=np.int64), np.empty(size, dtype=np.int32)
     first = np.empty(n, dtype=np.int64)
     voxel_of = np.full(n, -1, dtype=np.int32)
-    per_cell = 1.0 / cell
     m = 0
     for i in range(n):
         if not obstacle[i]:
@@ -72,19 +71,12 @@ def voxels(points: F64, obstacle: Bool, origin: F64, reach: float, cell: float) 
         x, y = points[i, 0] - origin[0], points[i, 1] - origin[1]
         if x * x + y * y > reach * reach:
             continue
-        ix = int(np.floor(points[i, 0] * per_cell)) + (1 << 20)
-        iy = int(np.floor(points[i, 1] * per_cell)) + (1 << 20)
-        iz = int(np.floor(points[i, 2] * per_cell)) + (1 << 20)
-        key = (ix << 42) | (iy << 21) | iz
-        slot = (ix + 389 * iy + 7919 * iz) & (size - 1)
-        while table[slot] >= 0 and keys[table[slot]] != key:
-            slot = (slot + 1) & (size - 1)
-        if table[slot] < 0:
-            table[slot] = m
-            keys[m] = key
-            first[m] = i
+        key = voxel_key(points[i, 0], points[i, 1], points[i, 2], cell)
+        slot = slot_of(key, keys)
+        if keys[slot] == 0:
+            keys[slot], rows[slot], first[m] = key, m, i
             m += 1
-        voxel_of[i] = table[slot]
+        voxel_of[i] = rows[slot]
     return voxel_of, first[:m].copy()
 
 
