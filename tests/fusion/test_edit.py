@@ -28,8 +28,10 @@ def test_server_and_vehicle_see_the_same_columns(seed: int, unknown: float) -> N
     ground = rng.uniform(-0.5, 2.0, SHAPE).astype(np.float32)
     ground[rng.random(SHAPE) < unknown] = np.nan
     tile = Tile(GRID, random_points(rng, 3000), ground)
-    seen = reference_window(make_map({(0, 0): tile}), GRID)
-    assert np.array_equal(tile.obstacle_words, seen.occupied)
+    hill = make_tile(random_points(rng, 3000), 5.0, (0, 1))  # what lies beyond the edge must not move the columns
+    wide = GRID.padded(40)
+    seen = reference_window(make_map({(0, 0): tile, (0, 1): hill}), wide)
+    assert np.array_equal(tile.obstacle_words, seen.occupied[GRID.slices_in(wide)]) or not tile.has_ground
 
 
 @given(seed=SEEDS)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy import ndimage
 
-from mapvote.core.columns import GROUND_MARGIN_M, fill_columns
+from mapvote.core.columns import fill_columns
 from mapvote.core.grid import TILE_CELLS, Grid, window_around
 from mapvote.core.ground import base_layers
 from mapvote.core.point_map import PointMap
@@ -16,28 +16,36 @@ def reference_window(point_map: PointMap, grid: Grid) -> Reference:
     """The map's planes over ``grid`` (any window; what lies outside every tile is unknown and empty)."""
     ground_z = np.full(grid.shape, np.nan, dtype=np.float32)
     free = np.zeros(grid.shape, dtype=np.uint64)
-    learned = False
-    clouds = []
-    for tile in grid.tiles():
-        if tile not in point_map.tiles:
-            continue
-        content = point_map.tiles[tile]
-        window = content.window
-        common = window.intersection(grid)
-        ground_z[common.slices_in(grid)] = content.ground_z[common.slices_in(window)]
-        if content.free is not None:
-            learned = True
-            free[common.slices_in(grid)] = content.free[common.slices_in(window)]
-        clouds.append(content.points_map)
+    tiles = [point_map.tiles[index] for index in grid.tiles() if index in point_map.tiles]
+    for tile in tiles:
+        common = tile.window.intersection(grid)
+        ground_z[common.slices_in(grid)] = tile.ground_z[common.slices_in(tile.window)]
+        if tile.free is not None:
+            free[common.slices_in(grid)] = tile.free[common.slices_in(tile.window)]
     base = base_layers(ground_z)
+    for tile in tiles:
+        if tile.has_ground:  # by the tile alone, so that whoever edits it reads the words as they were written
+            common = tile.window.intersection(grid)
+            base[common.slices_in(grid)] = tile.base[common.slices_in(tile.window)]
     occupied = np.zeros(grid.shape, dtype=np.uint64)
     counts = np.zeros(grid.shape, dtype=np.int32)
     bottom_z = np.full(grid.shape, np.inf, dtype=np.float32)
     top_z = np.full(grid.shape, -np.inf, dtype=np.float32)
-    for cloud in clouds:
-        rows, cols, _ = grid.indices_of(cloud)
-        fill_columns(rows, cols, cloud[:, 2], ground_z, base, occupied, counts, bottom_z, top_z)
-    return Reference(grid, ground_z, base, occupied, counts, bottom_z, top_z, free if learned else None)
+    for tile in tiles:
+        rows, cols, _ = grid.indices_of(tile.points_map)
+        fill_columns(
+            rows, cols, tile.points[:, 2].astype(np.float64), ground_z, base, occupied, counts, bottom_z, top_z
+        )
+    return Reference(
+        grid,
+        ground_z,
+        base,
+        occupied,
+        counts,
+        bottom_z,
+        top_z,
+        free if any(t.free is not None for t in tiles) else None,
+    )
 
 
 def above_ground_points(point_map: PointMap, grid: Grid) -> U64:
@@ -48,15 +56,11 @@ def above_ground_points(point_map: PointMap, grid: Grid) -> U64:
     """
     wide = grid.padded(1)
     seen = np.zeros(wide.shape, dtype=np.bool_)
-    for tile in wide.tiles():
-        if tile in point_map.tiles:
-            content = point_map.tiles[tile]
-            window = content.window
-            rows, cols, inside = window.indices_of(content.points_map)
-            low = content.points[:, 2] - content.ground_z[rows * inside, cols * inside] < GROUND_MARGIN_M
-            r, c = rows[low & inside] + window.row0 - wide.row0, cols[low & inside] + window.col0 - wide.col0
-            here = (r >= 0) & (c >= 0) & (r < wide.rows) & (c < wide.cols)
-            seen[r[here], c[here]] = True
+    for index in wide.tiles():
+        if index in point_map.tiles:
+            tile = point_map.tiles[index]
+            rows, cols, here = wide.indices_of(tile.points_map[~tile.columns[1]])
+            seen[rows[here], cols[here]] = True
     near = ndimage.binary_dilation(seen, structure=np.ones((3, 3)))[1:-1, 1:-1]
     return np.where(near, ~np.uint64(0), np.uint64(0))
 

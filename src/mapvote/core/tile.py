@@ -59,6 +59,11 @@ class Tile:
         """(256, 256) lattice layer of bit 0 of each column, see :func:`mapvote.core.ground.base_layers`."""
         return base_layers(self.ground_z)
 
+    @property
+    def has_ground(self) -> bool:
+        """Whether the ground is known anywhere in it; if not, nobody can say where its columns begin."""
+        return bool(np.isfinite(self.ground_z).any())
+
     @cached_property
     def columns(self) -> tuple[I64, Bool]:
         """(bit of its column word (n,), is it an obstacle (n,)) of each point."""

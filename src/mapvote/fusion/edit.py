@@ -16,15 +16,15 @@ from mapvote.core.types import F32, I32, I64, U64, Bool
 def delete_points(tile: Tile, gone: U64) -> tuple[Tile, int]:
     """The tile without the obstacle points whose voxel is marked in ``gone`` (256, 256), and how many went.
 
-    Ground points are never deleted. Where the ground is unknown, vehicle and server share no base layer for their
-    words, so any mark takes the whole column.
+    Ground points are never deleted. In a tile whose ground nobody knows, words have no agreed beginning, so any mark
+    takes the whole column.
     """
     words = gone.reshape(-1)[tile.cells]
     if not words.any():
         return tile, 0
     bit, obstacle = tile.columns
-    known = np.isfinite(tile.ground_z.reshape(-1)[tile.cells])
-    words = np.where(known | (words == 0), words, EVERY_BIT)
+    if not tile.has_ground:
+        words = np.where(words == 0, words, EVERY_BIT)
     dropped = obstacle & ((words >> bit.astype(np.uint64)) & np.uint64(1)).astype(np.bool_)
     if not dropped.any():
         return tile, 0

@@ -26,7 +26,7 @@ def heights(point_map: PointMap, points: F64) -> F64:
     row, col = int(rows.min()), int(cols.min())
     window = Grid(lattice, row, col, int(rows.max()) - row + 1, int(cols.max()) - col + 1)
     reference = reference_window(point_map, window)
-    filled = np.where(np.isnan(reference.ground_z), (reference.base + 0.5) * CELL_SIZE, reference.ground_z)
+    filled = np.where(np.isnan(reference.ground_z), reference.base * CELL_SIZE, reference.ground_z)
     return points[:, 2] - filled[rows - row, cols - col] if len(points) else np.zeros(0)
 
 

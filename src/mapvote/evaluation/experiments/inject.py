@@ -13,8 +13,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from scipy import ndimage
 
-from mapvote.core.columns import GROUND_MARGIN_M, TOP_BIT
-from mapvote.core.grid import CELL_SIZE, Grid
+from mapvote.core.columns import GROUND_MARGIN_M, column_bits
+from mapvote.core.grid import Grid
 from mapvote.core.point_map import PointMap
 from mapvote.core.reference import reference_window
 from mapvote.core.types import F64, U8, U64, Bool, CellState, MapvoteError, Reference
@@ -127,8 +127,7 @@ def _edited(point_map: PointMap, grid: Grid, reference: Reference, cut: U64, add
         points = tile.points_map
         rows, cols, inside = grid.indices_of(points)
         rows, cols = rows.clip(0, grid.rows - 1), cols.clip(0, grid.cols - 1)
-        bit = np.clip(np.floor(points[:, 2] / CELL_SIZE).astype(np.int64) - reference.base[rows, cols], 0, TOP_BIT)
-        high = points[:, 2] - reference.ground_z[rows, cols] >= GROUND_MARGIN_M
+        bit, high = column_bits(points[:, 2], reference.ground_z[rows, cols], reference.base[rows, cols])
         gone = inside & high & ((cut[rows, cols] >> bit.astype(np.uint64)) & np.uint64(1)).astype(np.bool_)
         a, b, mine = window.indices_of(added)
         kept = np.concatenate([tile.points[~gone], window.from_map(added[mine])])

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from mapvote.core.columns import GROUND_MARGIN_M
+from mapvote.core.columns import column_bits
 from mapvote.core.grid import CELL_SIZE, TileIndex
 from mapvote.core.point_map import PointMap
 from mapvote.core.reference import reference_window
@@ -58,12 +58,12 @@ class Jury:
 
 
 def _above_ground(first_map: PointMap, truth: Truth) -> tuple[F64, F64, F64]:
-    """Surface samples that could be obstacle points: at least 0.3 m above the map's ground, where that is known."""
+    """Surface samples that could be obstacle points: above the map's ground, or outside the window."""
     reference = reference_window(first_map, truth.grid_on(first_map.lattice))
     chosen = []
     for samples in truth.surfaces():
         rows, cols, inside = reference.grid.indices_of(samples)
-        ground = reference.ground_z[rows.clip(0, reference.grid.rows - 1), cols.clip(0, reference.grid.cols - 1)]
-        low = inside & (samples[:, 2] - ground < GROUND_MARGIN_M)
-        chosen.append(samples[~low])
+        cells = rows.clip(0, reference.grid.rows - 1), cols.clip(0, reference.grid.cols - 1)
+        _, obstacle = column_bits(samples[:, 2], reference.ground_z[cells], reference.base[cells])
+        chosen.append(samples[~inside | obstacle])
     return chosen[0], chosen[1], chosen[2]

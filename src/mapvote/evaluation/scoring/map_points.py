@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from mapvote.core.columns import GROUND_MARGIN_M
 from mapvote.core.point_map import PointMap
 from mapvote.core.types import F64, Bool
 from mapvote.evaluation.scoring.cells import ratio
@@ -96,8 +95,5 @@ def map_obstacles(point_map: PointMap) -> F64:
     clouds = []
     for tile in sorted(point_map.tiles):
         content = point_map.tiles[tile]
-        window, points = content.window, content.points_map
-        rows, cols, inside = window.indices_of(points)
-        ground = content.ground_z[rows.clip(0, window.rows - 1), cols.clip(0, window.cols - 1)]
-        clouds.append(points[inside & (points[:, 2] - ground >= GROUND_MARGIN_M)])
+        clouds.append(content.points_map[content.columns[1]])
     return np.concatenate(clouds) if clouds else np.zeros((0, 3))
