@@ -5,6 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mapvote.core import geometry
+from mapvote.core.geometry import turn
 
 metres = st.floats(-100.0, 100.0)
 angles = st.floats(-1.7, 1.7)  # |phi| < sqrt(3) * 1.7 < pi: where log is the inverse of exp
@@ -50,3 +51,11 @@ def test_yaw_turns_x_towards_y() -> None:
 def test_a_mirror_or_a_nan_is_not_rigid() -> None:
     assert not geometry.is_rigid(np.diag([1.0, -1.0, 1.0, 1.0]))
     assert not geometry.is_rigid(np.full((4, 4), np.nan))
+
+
+def test_turn_is_the_azimuth_in_turns_to_1e_5_rad() -> None:
+    angle = np.linspace(-np.pi, np.pi, 2001)
+    found = [turn(np.float32(3.0 * np.cos(a)), np.float32(3.0 * np.sin(a))) for a in angle]
+    off = 2.0 * np.pi * np.array(found) - angle
+    assert np.abs((off + np.pi) % (2.0 * np.pi) - np.pi).max() < 2e-5
+    assert turn(np.float32(0.0), np.float32(0.0)) == 0.0

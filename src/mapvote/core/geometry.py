@@ -6,6 +6,7 @@ radians, applied on the left (``exp(xi) @ T``). Source: Barfoot, State Estimatio
 
 from __future__ import annotations
 
+import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -102,3 +103,18 @@ def is_rigid(T: F64, tolerance: float = 1e-3) -> bool:
     """Whether T is finite, its rotation orthonormal within ``tolerance`` and right-handed."""
     R = T[:3, :3]
     return bool(np.all(np.isfinite(T)) and np.allclose(R @ R.T, np.eye(3), atol=tolerance) and np.linalg.det(R) > 0)
+
+
+@numba.njit(cache=True, nogil=True, inline="always", error_model="numpy")
+def turn(x: np.float32, y: np.float32) -> np.float32:
+    """Azimuth of (x, y) in [0, 1] turns, within 1e-5 rad (Abramowitz and Stegun 4.4.49), in float32 and without a
+    branch, so that a loop over points vectorises: it sorts rays, it measures nothing. 0 for (0, 0)."""
+    ax, ay = abs(x), abs(y)
+    q = min(ax, ay) / max(max(ax, ay), np.float32(1e-30))
+    s = q * q
+    a = np.float32(-0.0851330) + s * np.float32(0.0208351)
+    a = q * (np.float32(0.9998660) + s * (np.float32(-0.3302995) + s * (np.float32(0.1801410) + s * a)))
+    a *= np.float32(0.5 / np.pi)
+    a = np.float32(0.25) - a if ay > ax else a
+    a = np.float32(0.5) - a if x < np.float32(0.0) else a
+    return np.float32(1.0) - a if y < np.float32(0.0) else a
