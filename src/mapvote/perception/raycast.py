@@ -99,7 +99,7 @@ def _enter_hits(points: F64, cell: I32, keep: NDArray[np.bool_], base: I32, coun
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _rays(points: F64, origin: F64, clearance: float) -> tuple[F32, F32, F32, I32]:
-    """(reach, slope, stop, fan) of every ray, each (n,): see :func:`_gather`. Free of branches, so that it vectorises."""
+    """(reach, slope, stop, fan) of every ray, each (n,): see :func:`_gather`. No branches, so that it vectorises."""
     n = len(points)
     reach, slope, stop = np.empty(n, np.float32), np.empty(n, np.float32), np.empty(n, np.float32)
     fan = np.empty(n, np.int32)
