@@ -2,12 +2,29 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
-from mapvote.core.grid import CELL_SIZE, Grid
-from mapvote.core.types import F32, F64, I32, I64
+from mapvote.core.grid import CELL_SIZE, CELLS, TILE_CELLS, TileIndex
+from mapvote.core.ground_growing import STEP_M, UNREACHED, grow, tiles_around
+from mapvote.core.types import F32, F64, I32, I64, U8, Bool
+
+KNOWN_M = 3.0
+"""Farther than this from any measured ground it is unknown."""
+_BRIDGED_M = 1.2
+"""Where the ground only leapt, this far from what was measured, it may yet be found lower: a yard, an underpass."""
+_GRADE = 0.15
+"""Steepest ground that counts as agreeing, and that a thing standing on the ground is told from, metres per metre."""
+_AROUND_CELLS = 7
+_AGREEING = 0.5
+"""Share of the measured cells within 2.1 m that must agree before the ground may start from a cell."""
+_BROAD = 30
+"""Cells of them that must, where a driven path has shown the ground: so far from it reflections are all there may be."""
+
+Heights = tuple[I64, F32]
+"""(flat cell within its tile (n,), height (n,) in map metres) of points."""
 
 
 def base_layers(ground_z: F32) -> I32:
@@ -19,13 +36,6 @@ def base_layers(ground_z: F32) -> I32:
     _lower_envelope(low, 0.02 * CELL_SIZE, 0.02 * CELL_SIZE * np.sqrt(2.0))
     filled = np.where(known, ground_z.astype(np.float64), low)
     return np.floor(filled / CELL_SIZE).astype(np.int32)
-
-
-@numba.njit(cache=True, nogil=True)
-def _lowest(rows: I64, cols: I64, z: F64, inside: NDArray[np.bool_], out: F64) -> None:
-    for i in range(len(z)):
-        if inside[i] and z[i] < out[rows[i], cols[i]]:
-            out[rows[i], cols[i]] = z[i]
 
 
 @numba.njit(cache=True, nogil=True)
@@ -59,10 +69,10 @@ def _lower_envelope(z: F64, straight: float, diagonal: float) -> None:
 
 
 @numba.njit(cache=True, nogil=True)
-def _supported(low: F64, reach: int, grade: float, share: float) -> F64:
-    """``low`` without the cells that hardly any of the known cells within ``reach`` cells agree with (inf instead).
+def _supported(low: F64, reach: int, grade: float, share: float, least: int) -> F64:
+    """``low`` without the cells that too few of the known cells within ``reach`` cells agree with (inf instead).
 
-    Agreement: within 0.3 m, and ``grade`` (metres per cell) times the distance more; by at least 2 cells and a
+    Agreement: within 0.3 m, and ``grade`` (metres per cell) times the distance more; by at least ``least`` cells and a
     ``share`` of them. Reflections below the road come singly or in small clusters far below all
     others, and the envelope would follow each down a cone.
     """
@@ -80,25 +90,79 @@ def _supported(low: F64, reach: int, grade: float, share: float) -> F64:
                         known += 1
                         apart = max(abs(i - r), abs(j - c))
                         agree += abs(low[i, j] - low[r, c]) <= CELL_SIZE + grade * apart
-                if agree >= plenty:
+                if agree >= plenty and agree > least:
                     break
-            if agree > 2 and agree >= share * known:  # the cell itself is one of them
+            if agree > least and agree >= share * known:  # the cell itself is one of them
                 out[r, c] = low[r, c]
     return out
 
 
-def ground_surface(points: NDArray[np.floating], grid: Grid, max_grade: float = 0.15, reach_m: float = 3.0) -> F32:
-    """Height of the ground in every cell of ``grid``, (rows, cols) float32 in the points' frame, NaN where unknown.
+def lay_ground(points: Mapping[TileIndex, Heights], road: Mapping[TileIndex, Heights] | None = None) -> dict[TileIndex, F32]:
+    """Height of the ground in every cell of every tile, (256, 256) float32 map metres, NaN where unknown.
 
-    ``points`` (n, 3) in map metres. A cell farther than ``reach_m`` from any point is unknown. Only points inside
-    ``grid`` are used: give a grid with a margin and cut it, so that windows agree where they meet. A cell
-    with whose lowest point less than a fifth of the known cells within 2.1 m agree is measured wrongly and not used.
+    ``road``: where vehicles drove, the height of the road under them. The ground grows from there
+    (:mod:`mapvote.core.ground_growing`). Where it does not come to, and in maps of which nobody knows the path, it
+    starts from places that the measured cells around agree on and above which nothing rises as gently as ground.
     """
-    rows, cols, inside = grid.indices_of(points)
-    low = np.full(grid.shape, np.inf)
-    _lowest(rows, cols, points[:, 2].astype(np.float64), inside, low)
-    low = _supported(low, 7, max_grade * CELL_SIZE, 0.2)
-    distance = np.where(np.isfinite(low), 0.0, np.inf)
-    _lower_envelope(distance, CELL_SIZE, CELL_SIZE * np.sqrt(2.0))
-    _lower_envelope(low, max_grade * CELL_SIZE, max_grade * CELL_SIZE * np.sqrt(2.0))
-    return np.where(distance <= reach_m, low, np.nan).astype(np.float32)
+    tiles = sorted(points)
+    start, heights = _by_cell([points[tile] for tile in tiles])
+    ground = np.full(len(tiles) * CELLS, np.nan, dtype=np.float32)
+    gap = np.full(len(tiles) * CELLS, UNREACHED, dtype=np.uint8)
+    neighbours = tiles_around(tiles)
+    least = 2
+    if road:
+        cells, z = _lowest_of_each([(k * CELLS + road[t][0], road[t][1]) for k, t in enumerate(tiles) if t in road])
+        grow(cells, z, start, heights, neighbours, ground, gap)
+        least = _BROAD
+    seeds = _agreed(_lows(start, heights, gap), np.where(gap > _BRIDGED_M / STEP_M, np.inf, ground), neighbours, least)
+    grow(seeds, heights[start[seeds]], start, heights, neighbours, ground, gap)
+    ground[gap > KNOWN_M / STEP_M] = np.nan
+    return dict(zip(tiles, ground.reshape(-1, TILE_CELLS, TILE_CELLS), strict=True))
+
+
+def _by_cell(points: Sequence[Heights]) -> tuple[I64, F32]:
+    """(start (cells + 1,), heights (n,)): the points of flat cell c are heights[start[c]:start[c + 1]], lowest first."""
+    cells = np.concatenate([k * CELLS + cell for k, (cell, _) in enumerate(points)])
+    heights = np.concatenate([z for _, z in points])
+    start = np.zeros(len(points) * CELLS + 1, dtype=np.int64)
+    np.cumsum(np.bincount(cells, minlength=len(points) * CELLS), out=start[1:])
+    return start, heights[np.lexsort((heights, cells))]
+
+
+def _lowest_of_each(points: Sequence[Heights]) -> Heights:
+    """The lowest point of each cell; where vehicles drove above each other, the road below is kept."""
+    if not points:
+        return np.empty(0, dtype=np.int64), np.empty(0, dtype=np.float32)
+    cells, z = (np.concatenate(part) for part in zip(*points, strict=True))
+    order = np.lexsort((z, cells))
+    first = np.flatnonzero(np.diff(cells[order], prepend=-1))
+    return cells[order][first], z[order][first]
+
+
+def _lows(start: I64, heights: F32, gap: U8) -> F64:
+    """(tiles, 256, 256) the lowest point of each cell that no measured ground is near, inf where there is none."""
+    low = np.full(len(gap), np.inf)
+    asked = (start[:-1] < start[1:]) & (gap > _BRIDGED_M / STEP_M)
+    low[asked] = heights[start[:-1][asked]]
+    return low.reshape(-1, TILE_CELLS, TILE_CELLS)
+
+
+def _agreed(low: F64, known: F64, neighbours: I32, least: int) -> I64:
+    """(m,) flat cells whose lowest point most cells around agree with, and which no lower ground explains as a thing.
+
+    ``low`` (tiles, 256, 256) as :func:`_lows` has it, ``known`` (cells,) the ground that is known, inf elsewhere.
+    """
+    nothing = np.full((TILE_CELLS, TILE_CELLS), np.inf)
+    known = known.reshape(low.shape)
+    own = slice(TILE_CELLS, 2 * TILE_CELLS)
+    found = []
+    for k, around in enumerate(neighbours):
+        if not np.isfinite(low[k]).any():
+            continue
+        window = np.block([[low[j] if j >= 0 else nothing for j in row] for row in around])
+        window = _supported(window, _AROUND_CELLS, _GRADE * CELL_SIZE, _AGREEING, least)
+        envelope = np.minimum(window, np.block([[known[j] if j >= 0 else nothing for j in row] for row in around]))
+        _lower_envelope(envelope, _GRADE * CELL_SIZE, _GRADE * CELL_SIZE * np.sqrt(2.0))
+        lies: Bool = np.isfinite(window[own, own]) & (window[own, own] <= envelope[own, own] + 0.1)
+        found.append(k * CELLS + np.flatnonzero(lies))
+    return np.concatenate(found) if found else np.empty(0, dtype=np.int64)

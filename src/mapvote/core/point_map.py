@@ -9,8 +9,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from mapvote.core.grid import TILE_CELLS, Lattice, TileIndex, tile_of_cells
-from mapvote.core.ground import ground_surface
+from mapvote.core.grid import Lattice, TileIndex, tile_of_cells
+from mapvote.core.ground import Heights, lay_ground
 from mapvote.core.tile import Tile
 from mapvote.core.types import F32, F64, MapvoteError
 
@@ -47,17 +47,13 @@ def cut_tiles(points_map: NDArray[np.floating], lattice: Lattice) -> Iterator[tu
         yield (row, col), points_map[piece_of_order]
 
 
-def tile_ground(stored: Mapping[TileIndex, F32], tile: TileIndex, lattice: Lattice) -> F32:
-    """Ground of one tile, (256, 256) float32, from its points and its eight neighbours', so that tiles agree.
+def _heights(points: Mapping[TileIndex, F32], lattice: Lattice) -> dict[TileIndex, Heights]:
+    return {tile: (lattice.tile(tile).flat_cells(p), p[:, 2]) for tile, p in points.items()}
 
-    ``stored``: each tile's points (n, 3) from its corner, as the map keeps them, so that a map read back lays the
-    same ground.
-    """
-    around = [(tile[0] + dr, tile[1] + dc) for dr in (-1, 0, 1) for dc in (-1, 0, 1)]
-    near = [lattice.tile(key).to_map(stored[key]) for key in around if key in stored]
-    window = lattice.tile(tile)
-    halo = window.padded(TILE_CELLS)
-    return ground_surface(np.concatenate(near), halo)[window.slices_in(halo)].copy()
+
+def _stored(points_map: NDArray[np.floating], lattice: Lattice) -> dict[TileIndex, F32]:
+    """The points as tiles keep them, so that the ground is laid from what a map read back holds."""
+    return {tile: lattice.tile(tile).from_map(p) for tile, p in cut_tiles(points_map, lattice)}
 
 
 def map_from_points(
@@ -66,9 +62,11 @@ def map_from_points(
     lattice: Lattice | None = None,
     map_id: str | None = None,
     georeference: Mapping[str, str] | None = None,
+    road: F64 | None = None,
 ) -> PointMap:
     """A PointMap of points (n, 3) in map metres: cut into tiles, every point kept in its order, ground laid.
 
+    ``road`` (m, 3), map metres: places known to be ground, from which it grows; without, it must be found.
     ``map_id`` defaults to a hash of the points and the lattice. Raises MapvoteError if there are no points, or if
     some are not finite or lie beyond 10,000 km.
     """
@@ -86,8 +84,10 @@ def map_from_points(
                 f"(first: point {start + int(np.argmax(bad))}); remove them first"
             )
         digest.update(piece.tobytes())
-    stored = {tile: lattice.tile(tile).from_map(p) for tile, p in cut_tiles(points, lattice)}
-    tiles = {tile: Tile(lattice.tile(tile), stored[tile], tile_ground(stored, tile, lattice)) for tile in stored}
+    stored = _stored(points, lattice)
+    known = {} if road is None or len(road) == 0 else _stored(road, lattice)
+    ground = lay_ground(_heights(stored, lattice), _heights(known, lattice))
+    tiles = {tile: Tile(lattice.tile(tile), stored[tile], ground[tile]) for tile in stored}
     return PointMap(map_id or digest.hexdigest()[:16], lattice, tiles, dict(georeference or {}))
 
 

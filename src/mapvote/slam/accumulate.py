@@ -49,8 +49,9 @@ class _Waiting:
 class Layer:
     """Collects the scans of all drives, then gives the map."""
 
-    def __init__(self, draft: PointMap, settings: Settings) -> None:
-        self.draft, self.settings = draft, settings
+    def __init__(self, draft: PointMap, road: F64, settings: Settings) -> None:
+        """``road`` (n, 3), map metres: where vehicles drove, from which the ground grows."""
+        self.draft, self.road, self.settings = draft, road, settings
         self.cloud = VoxelCloud(draft.lattice)
         self.evidence = Evidence(draft.lattice)
         self._around = LocalMap(draft, 2.0 * settings.mapping.reach_m)
@@ -86,8 +87,8 @@ class Layer:
         points, _ = self.cloud.points()
         points = points[~self._trails(points, self.draft)]
         # Trails lift the draft's ground; above the true one stand the undersides of cars that had passed for ground.
-        points = points[~self._trails(points, map_from_points(points, lattice=self.draft.lattice))]
-        point_map = map_from_points(points, lattice=self.draft.lattice)
+        points = points[~self._trails(points, map_from_points(points, lattice=self.draft.lattice, road=self.road))]
+        point_map = map_from_points(points, lattice=self.draft.lattice, road=self.road)
         tiles = {tile: replace(content, free=self._free(tile, point_map)) for tile, content in point_map.tiles.items()}
         return replace(point_map, tiles=tiles)
 

@@ -25,6 +25,7 @@ from mapvote.localisation.ndt import NdtMap, PosePrior
 from mapvote.localisation.tracker import Tracker
 from mapvote.slam.accumulate import Layer
 from mapvote.slam.pose_graph import Anchors, Links, optimise
+from mapvote.slam.road import all_roads, road_under
 
 Progress = Callable[[int, int], None]
 
@@ -80,7 +81,10 @@ def build_map(
     found = [surveyor.follow(drive, count) for drive in drives]
     registered = [mask for _, mask in found]
     poses = settle(drives, [T for T, _ in found], registered, settings.mapping)
-    layer = Layer(map_from_points(surveyor.draft.points()[0], lattice=surveyor.draft.lattice), settings)
+    cloud = surveyor.draft.points()[0]
+    roads = [road_under(T, mask, cloud) for T, mask in zip(poses, registered, strict=True)]
+    road = all_roads(roads)
+    layer = Layer(map_from_points(cloud, lattice=surveyor.draft.lattice, road=road), road, settings)
     for drive, T_map_lidar, mask in zip(drives, poses, registered, strict=True):
         layer.lay(drive, T_map_lidar, mask, count)
     point_map = layer.finish()

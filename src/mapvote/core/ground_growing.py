@@ -1,0 +1,174 @@
+"""Ground grows from where it is known: cell by cell over what was measured, across gaps by what lies around them.
+
+Known first is the road under the driven path, or the places of a map that all measurements around agree on. From there
+the surface goes on to the nearest point of each neighbouring cell, as long as it climbs and falls as ground does. What
+lies below a surface so found is a reflection, what lies above it stands on it: neither is ever asked. Measured cells are
+entered before gaps and narrow gaps before wide ones, so a way round is taken before a leap. Where driven paths lie above
+each other, every cell belongs to the level whose path is nearer, and a cell under both paths to the lower one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numba
+import numpy as np
+
+from mapvote.core.grid import CELL_SIZE, CELLS, TILE_CELLS, TileIndex
+from mapvote.core.types import F32, I32, I64, U8
+
+STEP_M = 0.5 * CELL_SIZE
+"""Unit of a gap's width: a cell is 2 units straight on, 3 across a corner (chamfer 2-3; Borgefors 1986)."""
+WIDEST = 100
+"""Units: 15 m. Ground does not go on across a wider gap."""
+UNREACHED = 255
+"""Gap of a cell that the ground never came to."""
+_NEAR_CELLS = 5
+"""Ground this near (1.5 m) bounds how high and how low a point may be."""
+_NOISE_M = 0.06
+"""Of a voxel's mean height: range and pose noise, a cobble."""
+_CLIMB, _FALL = 0.15, 0.5
+"""Steepest ground, metres per metre. A steeper rise is a thing that stands there; a steep fall must be a broad one."""
+_BROAD = 8
+"""Cells of the 24 around that hold points at a like height, before ground falls steeply or goes on beyond a gap."""
+_BEYOND_GAP = 2
+
+
+@numba.njit(cache=True, nogil=True, inline="always")
+def _cell_at(tile: int, row: int, col: int, neighbours: I32) -> int:
+    """Flat cell of (row, col) counted from a tile's corner; -1 if it lies in a tile that the map does not have."""
+    down, right = row // TILE_CELLS, col // TILE_CELLS
+    other = neighbours[tile, down + 1, right + 1]
+    return -1 if other < 0 else other * CELLS + (row - down * TILE_CELLS) * TILE_CELLS + col - right * TILE_CELLS
+
+
+@numba.njit(cache=True, nogil=True)
+def _bounds(tile: int, row: int, col: int, ground: F32, gap: U8, neighbours: I32) -> tuple[float, float, float]:
+    """(lowest, steeply lowest, highest) height of a point of this cell that continues the measured ground near by."""
+    low, steep, high = -np.inf, -np.inf, np.inf
+    for i in range(-_NEAR_CELLS, _NEAR_CELLS + 1):
+        for j in range(-_NEAR_CELLS, _NEAR_CELLS + 1):
+            other = _cell_at(tile, row + i, col + j, neighbours)
+            if other >= 0 and gap[other] == 0:
+                away = CELL_SIZE * np.sqrt(i * i + j * j)
+                low = max(low, ground[other] - _CLIMB * away)
+                steep = max(steep, ground[other] - _FALL * away)
+                high = min(high, ground[other] + _CLIMB * away)
+    return low - _NOISE_M, steep - _NOISE_M, high + _NOISE_M
+
+
+@numba.njit(cache=True, nogil=True)
+def _like(tile: int, row: int, col: int, z: float, grade: float, start: I64, heights: F32, neighbours: I32) -> int:
+    """How many of the 24 cells around hold a point at the height ``z``, give or take noise and ``grade``."""
+    found = 0
+    for i in range(-2, 3):
+        for j in range(-2, 3):
+            other = _cell_at(tile, row + i, col + j, neighbours)
+            if other < 0 or (i == 0 and j == 0):
+                continue
+            most = _NOISE_M + grade * CELL_SIZE * max(abs(i), abs(j))
+            for k in range(start[other], start[other + 1]):
+                if abs(heights[k] - z) <= most:
+                    found += 1
+                    break
+    return found
+
+
+@numba.njit(cache=True, nogil=True)
+def _continued(cell: int, expected: float, width: int, start: I64, heights: F32, ground: F32, gap: U8, neighbours: I32) -> float:  # fmt: skip
+    """Height of the cell's point that continues the ground, the nearest to ``expected``; NaN if none does."""
+    tile, row, col = cell // CELLS, cell % CELLS // TILE_CELLS, cell % TILE_CELLS
+    if start[cell] == start[cell + 1]:
+        return np.nan
+    low, steep, high = _bounds(tile, row, col, ground, gap, neighbours)
+    near = np.isfinite(low)
+    if not near or low > high:
+        low, high = expected - _NOISE_M - _CLIMB * STEP_M * width, expected + _NOISE_M + _CLIMB * STEP_M * width
+        steep = low
+    best, falls = np.nan, np.nan
+    for k in range(start[cell], start[cell + 1]):
+        z = heights[k]
+        if low <= z <= high and not abs(best - expected) <= abs(z - expected):
+            best = z
+        if steep <= z < low and not falls >= z:
+            falls = z
+    if np.isfinite(best):
+        broad = near or _like(tile, row, col, best, _CLIMB, start, heights, neighbours) >= _BEYOND_GAP
+        return best if broad else np.nan
+    if np.isfinite(falls) and _like(tile, row, col, falls, _FALL, start, heights, neighbours) >= _BROAD:
+        return falls
+    return np.nan
+
+
+@numba.njit(cache=True, nogil=True)
+def _append(queue: I32, first: I32, last: I32, following: I32, width: int, entry: int) -> None:
+    """First in, first out among gaps of one width."""
+    following[entry] = -1
+    if first[width] < 0:
+        first[width] = entry
+    else:
+        following[last[width]] = entry
+    last[width] = entry
+
+
+@numba.njit(cache=True, nogil=True)
+def grow(seeds: I64, seed_z: F32, start: I64, heights: F32, neighbours: I32, ground: F32, gap: U8) -> None:
+    """Let the ground grow from ``seeds`` (m,), flat cells with the height (m,) at which it is known to lie.
+
+    ``heights[start[c]:start[c + 1]]`` are the points of flat cell c = tile * CELLS + row * TILE_CELLS + col, metres;
+    ``neighbours`` (tiles, 3, 3) the tiles around each, -1 where the map has none. In place: ``ground`` (cells,) metres,
+    ``gap`` (cells,) the distance to measured ground in units of STEP_M, UNREACHED where ground did not come.
+    """
+    capacity = max(1024, len(seeds))
+    cells, expected = np.empty(capacity, np.int64), np.empty(capacity, np.float32)
+    following = np.empty(capacity, np.int32)
+    first, last = np.full(WIDEST + 4, -1, np.int32), np.full(WIDEST + 4, -1, np.int32)
+    n = 0
+    for k in range(len(seeds)):
+        cells[n], expected[n] = seeds[k], seed_z[k]
+        _append(first, first, last, following, 1, n)
+        n += 1
+    spare = -1
+    width = 0
+    while width <= WIDEST:
+        entry = first[width]
+        if entry < 0:
+            width += 1
+            continue
+        first[width] = following[entry]
+        cell, z = cells[entry], expected[entry]
+        following[entry], spare = spare, entry
+        if gap[cell] <= width:
+            continue
+        measured = _continued(cell, z, width, start, heights, ground, gap, neighbours)
+        if np.isfinite(measured):
+            ground[cell], gap[cell] = measured, 0
+        else:
+            ground[cell], gap[cell] = z, width
+        here = int(gap[cell])
+        tile, row, col = cell // CELLS, cell % CELLS // TILE_CELLS, cell % TILE_CELLS
+        for i in range(-1, 2):
+            for j in range(-1, 2):
+                other = _cell_at(tile, row + i, col + j, neighbours)
+                farther = here + (2 if i == 0 or j == 0 else 3)
+                if other < 0 or gap[other] <= farther or farther > WIDEST:
+                    continue
+                if spare >= 0:
+                    free, spare = spare, following[spare]
+                else:
+                    if n == len(cells):
+                        cells = np.concatenate((cells, np.empty(n, np.int64)))
+                        expected = np.concatenate((expected, np.empty(n, np.float32)))
+                        following = np.concatenate((following, np.empty(n, np.int32)))
+                    free = n
+                    n += 1
+                cells[free], expected[free] = other, ground[cell]
+                _append(first, first, last, following, farther, free)
+                width = min(width, farther)
+
+
+def tiles_around(tiles: Sequence[TileIndex]) -> I32:
+    """(tiles, 3, 3) where in ``tiles`` each tile's neighbours stand, itself in the middle; -1 for none."""
+    place: Mapping[TileIndex, int] = {tile: k for k, tile in enumerate(tiles)}
+    around = [[[place.get((r + i, c + j), -1) for j in (-1, 0, 1)] for i in (-1, 0, 1)] for r, c in tiles]
+    return np.array(around, dtype=np.int32).reshape(-1, 3, 3)

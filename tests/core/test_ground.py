@@ -1,0 +1,121 @@
+"""The ground follows the road, stays under what stands on it, and above what only mirrors it."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from mapvote.core.grid import Grid, Lattice
+from mapvote.core.reference import reference_window
+from mapvote.core.point_map import map_from_points
+from mapvote.core.types import F32, F64
+
+LATTICE = Lattice(-30.0, -30.0)
+"""All that is tested lies well inside one tile."""
+
+
+def ground_of(*clouds: F64, road: F64 | None = None, cells: int = 100) -> F32:
+    """(cells, cells) the ground from (0, 0) upwards of a map of all clouds."""
+    point_map = map_from_points(np.vstack(clouds), lattice=LATTICE, road=road)
+    return reference_window(point_map, Grid(LATTICE, 100, 100, cells, cells)).ground_z
+
+
+def spread(rng: np.random.Generator, count: int, x: tuple[float, float], y: tuple[float, float]) -> F64:
+    return np.column_stack([rng.uniform(*x, count), rng.uniform(*y, count)])
+
+
+def at(xy: F64, z: F64 | float) -> F64:
+    return np.column_stack([xy, np.broadcast_to(z, len(xy))])
+
+
+def driven(x: tuple[float, float], y: float, z: float = 0.0) -> F64:
+    along = np.arange(*x, 0.15)
+    return np.column_stack([along, np.full(len(along), y), np.full(len(along), z)])
+
+
+def test_the_ground_follows_a_ramp_and_ignores_a_wall_and_an_awning() -> None:
+    rng = np.random.default_rng(0)
+    xy = spread(rng, 40_000, (0, 30), (0, 30))
+    wall = np.column_stack([np.full(4000, 15.05), rng.uniform(0, 30, 4000), 1.5 + rng.uniform(0.2, 6.0, 4000)])
+    awning = at(spread(rng, 2000, (20, 22), (5, 9)), 4.0)
+    ground = ground_of(at(xy, 0.10 * xy[:, 0]), wall, awning)
+    x = 0.3 * (np.arange(100) + 0.5)
+    assert np.isfinite(ground).all()
+    assert np.abs(ground - 0.10 * x[None, :]).max() < 0.1
+
+
+def test_ground_far_from_any_point_is_unknown() -> None:
+    ground = ground_of(np.array([[0.5, 0.5, 7.0], [0.8, 0.5, 7.0], [0.5, 0.8, 7.0]]))
+    assert ground[1, 1] == 7.0
+    assert np.isnan(ground[50, 50])
+
+
+def test_reflections_below_the_road_do_not_sink_the_ground_alone_or_in_a_cluster() -> None:
+    """As behind a van in KITTI drive 0005: twenty points within a metre, four metres below the road."""
+    rng = np.random.default_rng(1)
+    road = at(spread(rng, 40_000, (0, 30), (0, 30)), 0.0)
+    alone = np.array([[9.0, 9.0, -5.4], [10.1, 9.6, -4.6], [21.0, 3.0, -23.0]])
+    cluster = np.column_stack([spread(rng, 20, (12, 13), (12, 13)), rng.normal(-4.0, 0.1, 20)])
+    assert np.abs(ground_of(road, alone, cluster)).max() < 0.05
+
+
+def test_with_the_driven_path_known_even_a_mirrored_street_does_not_sink_the_ground() -> None:
+    rng = np.random.default_rng(4)
+    road = at(spread(rng, 40_000, (0, 30), (0, 30)), 0.0)
+    mirrored = np.column_stack([spread(rng, 40_000, (0, 30), (6, 30)), rng.uniform(-5.0, -1.0, 40_000)])
+    ground = ground_of(road, mirrored, road=driven((0, 30), 3.0))
+    assert np.abs(ground).max() < 0.05
+
+
+def test_a_kerb_and_a_sunken_yard_stay_ground() -> None:
+    xy = spread(np.random.default_rng(3), 60_000, (0, 30), (0, 30))
+    z = np.where(xy[:, 0] > 15.0, 0.15, 0.0) - 1.5 * ((xy[:, 1] > 20.0) & (xy[:, 1] < 26.0))
+    for road in (None, driven((0, 14), 5.0)):
+        ground = ground_of(at(xy, z), road=road)
+        assert np.abs(ground[:30, :49]).max() < 0.05
+        assert np.abs(ground[:30, 53:] - 0.15).max() < 0.06
+        assert np.abs(ground[70:85, :49] + 1.5).max() < 0.05
+
+
+def test_a_ramp_down_beside_a_retaining_wall_does_not_pull_the_street_down() -> None:
+    """An underpass begins: the ramp falls to 3 m below the street, 0.3 m beside the lane."""
+    xy = spread(np.random.default_rng(5), 60_000, (0, 30), (0, 30))
+    ramp = xy[:, 1] > 10.0
+    ground = ground_of(at(xy, np.where(ramp, -0.1 * xy[:, 0], 0.0)), road=driven((0, 30), 5.0))
+    assert np.abs(ground[:32]).max() < 0.05
+    x = 0.3 * (np.arange(100) + 0.5)
+    assert np.abs(ground[36:] + 0.1 * x[None, :]).max() < 0.2
+
+
+def _bridge(rng: np.random.Generator) -> F64:
+    """A street along x at 0 m and, from x = 12 to 18, a bridge across it at 6 m; the street goes on below."""
+    street = at(spread(rng, 60_000, (0, 30), (0, 30)), 0.0)
+    return np.vstack([street, at(spread(rng, 12_000, (12, 18), (0, 30)), 6.0)])
+
+
+def test_of_a_bridge_and_the_street_below_the_map_keeps_the_one_that_was_driven() -> None:
+    rng = np.random.default_rng(6)
+    below = ground_of(_bridge(rng), road=driven((0, 30), 15.0))
+    assert np.abs(below).max() < 0.05
+    across = driven((0, 30), 15.0, 6.0)[:, [1, 0, 2]]
+    above = ground_of(_bridge(rng), road=across)
+    assert np.abs(above[:, 41:59] - 6.0).max() < 0.05
+    assert np.abs(above[:, :30]).max() < 0.05, "off the bridge the street is ground again"
+
+
+def test_where_both_levels_were_driven_the_cells_below_both_paths_go_to_the_lower() -> None:
+    rng = np.random.default_rng(7)
+    both = np.vstack([driven((0, 30), 15.0), driven((0, 30), 15.0, 6.0)[:, [1, 0, 2]]])
+    ground = ground_of(_bridge(rng), road=both)
+    assert np.abs(ground[50]).max() < 0.05
+    assert np.abs(ground[:40, 49:51] - 6.0).max() < 0.05
+    assert np.abs(ground[48:53, 42]).max() < 0.05, "beside a path its level holds"
+
+
+def test_a_parked_car_and_a_hedge_do_not_lift_the_ground() -> None:
+    rng = np.random.default_rng(8)
+    road = at(spread(rng, 40_000, (0, 30), (0, 30)), 0.0)
+    free = ~((np.abs(road[:, 0] - 12) < 2.2) & (np.abs(road[:, 1] - 8) < 0.9))
+    car = np.column_stack([spread(rng, 4000, (9.8, 14.2), (7.1, 8.9)), rng.uniform(0.2, 1.5, 4000)])
+    hedge = np.column_stack([spread(rng, 4000, (0, 30), (20, 21)), rng.uniform(0.05, 1.2, 4000)])
+    ground = ground_of(road[free], car, hedge, road=driven((0, 30), 3.0))
+    assert np.abs(ground).max() < 0.2
