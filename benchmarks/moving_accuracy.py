@@ -23,7 +23,8 @@ from mapvote.config import MovingSettings
 from mapvote.core.columns import GROUND_MARGIN_M
 from mapvote.core.geometry import exp, transform
 from mapvote.core.grid import Grid, Lattice
-from mapvote.core.ground import ground_surface
+from mapvote.core.point_map import map_from_points
+from mapvote.core.reference import reference_window
 from mapvote.core.types import F32, F64, Bool, Drive
 from mapvote.core.voxels import voxel_downsample
 from mapvote.formats import open_drive
@@ -85,7 +86,7 @@ def measure_ground(drive: Drive, T_map_lidar: F64) -> tuple[Grid, F32]:
     lattice = Lattice()
     rows, cols = lattice.cells_of(np.array([points_map.min(axis=0), points_map.max(axis=0)]))
     grid = Grid(lattice, int(rows[0]), int(cols[0]), int(rows[1] - rows[0]) + 1, int(cols[1] - cols[0]) + 1)
-    return grid, ground_surface(points_map, grid)
+    return grid, reference_window(map_from_points(points_map), grid).ground_z
 
 
 def obstacles(points_map: F64, grid: Grid, ground_z: F32) -> Bool:

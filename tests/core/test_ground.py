@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from mapvote.core.grid import Grid, Lattice
-from mapvote.core.reference import reference_window
 from mapvote.core.point_map import map_from_points
+from mapvote.core.reference import reference_window
 from mapvote.core.types import F32, F64
 
 LATTICE = Lattice(-30.0, -30.0)

@@ -11,7 +11,8 @@ from mapvote.config import MovingSettings
 from mapvote.core.columns import GROUND_MARGIN_M
 from mapvote.core.geometry import transform
 from mapvote.core.grid import Lattice, window_around
-from mapvote.core.ground import ground_surface
+from mapvote.core.point_map import map_from_points
+from mapvote.core.reference import reference_window
 from mapvote.core.types import Bool
 from mapvote.formats import open_drive
 from mapvote.perception.moving_objects import MovingFilter
@@ -26,7 +27,7 @@ def labels(street: Path, vehicle: str, stride: int) -> tuple[Bool, Bool]:
     clouds = [transform(T, scan.points) for T, scan in zip(T_map_lidar, drive, strict=True)]
     middle = T_map_lidar[len(drive) // 2, :3, 3]
     grid = window_around(Lattice(), middle[0], middle[1], 260.0)
-    ground_z = ground_surface(np.concatenate(clouds), grid)
+    ground_z = reference_window(map_from_points(np.concatenate(clouds)), grid).ground_z
     moving = MovingFilter(drive.sensor, MovingSettings())
     masks: dict[int, Bool] = {}
     obstacle = []

@@ -21,7 +21,7 @@ _AROUND_CELLS = 7
 _AGREEING = 0.5
 """Share of the measured cells within 2.1 m that must agree before the ground may start from a cell."""
 _BROAD = 30
-"""Cells of them that must, where a driven path has shown the ground: so far from it reflections are all there may be."""
+"""Cells of them that must, where a driven path has shown the ground: apart from it many points are reflections."""
 
 Heights = tuple[I64, F32]
 """(flat cell within its tile (n,), height (n,) in map metres) of points."""
@@ -97,7 +97,7 @@ def _supported(low: F64, reach: int, grade: float, share: float, least: int) -> 
     return out
 
 
-def lay_ground(points: Mapping[TileIndex, Heights], road: Mapping[TileIndex, Heights] | None = None) -> dict[TileIndex, F32]:
+def lay_ground(points: Mapping[TileIndex, Heights], road: Mapping[TileIndex, Heights]) -> dict[TileIndex, F32]:
     """Height of the ground in every cell of every tile, (256, 256) float32 map metres, NaN where unknown.
 
     ``road``: where vehicles drove, the height of the road under them. The ground grows from there
@@ -121,7 +121,7 @@ def lay_ground(points: Mapping[TileIndex, Heights], road: Mapping[TileIndex, Hei
 
 
 def _by_cell(points: Sequence[Heights]) -> tuple[I64, F32]:
-    """(start (cells + 1,), heights (n,)): the points of flat cell c are heights[start[c]:start[c + 1]], lowest first."""
+    """(start (cells + 1,), heights (n,)): flat cell c has the points heights[start[c]:start[c + 1]], lowest first."""
     cells = np.concatenate([k * CELLS + cell for k, (cell, _) in enumerate(points)])
     heights = np.concatenate([z for _, z in points])
     start = np.zeros(len(points) * CELLS + 1, dtype=np.int64)

@@ -1,10 +1,10 @@
 """Ground grows from where it is known: cell by cell over what was measured, across gaps by what lies around them.
 
-Known first is the road under the driven path, or the places of a map that all measurements around agree on. From there
-the surface goes on to the nearest point of each neighbouring cell, as long as it climbs and falls as ground does. What
-lies below a surface so found is a reflection, what lies above it stands on it: neither is ever asked. Measured cells are
-entered before gaps and narrow gaps before wide ones, so a way round is taken before a leap. Where driven paths lie above
-each other, every cell belongs to the level whose path is nearer, and a cell under both paths to the lower one.
+Known first is the road under the driven path, or the places of a map that all measurements around agree on. From
+there the surface goes on to the nearest point of each neighbouring cell, as long as it climbs and falls as ground does.
+What lies below a surface so found is a reflection, what lies above it stands on it: neither is ever asked. Measured
+cells are entered before gaps and narrow gaps before wide ones, so a way round is taken before a leap. Where driven
+paths lie above each other, every cell belongs to the level whose path is nearer, and a cell under both to the lower.
 """
 
 from __future__ import annotations
@@ -75,7 +75,9 @@ def _like(tile: int, row: int, col: int, z: float, grade: float, start: I64, hei
 
 
 @numba.njit(cache=True, nogil=True)
-def _continued(cell: int, expected: float, width: int, start: I64, heights: F32, ground: F32, gap: U8, neighbours: I32) -> float:  # fmt: skip
+def _continued(
+    cell: int, expected: float, width: int, start: I64, heights: F32, ground: F32, gap: U8, neighbours: I32
+) -> float:
     """Height of the cell's point that continues the ground, the nearest to ``expected``; NaN if none does."""
     tile, row, col = cell // CELLS, cell % CELLS // TILE_CELLS, cell % TILE_CELLS
     if start[cell] == start[cell + 1]:

@@ -49,7 +49,7 @@ class _Waiting:
 class Layer:
     """Collects the scans of all drives, then gives the map."""
 
-    def __init__(self, draft: PointMap, road: F64, settings: Settings) -> None:
+    def __init__(self, draft: PointMap, settings: Settings, road: F64 | None = None) -> None:
         """``road`` (n, 3), map metres: where vehicles drove, from which the ground grows."""
         self.draft, self.road, self.settings = draft, road, settings
         self.cloud = VoxelCloud(draft.lattice)

@@ -84,7 +84,7 @@ def build_map(
     cloud = surveyor.draft.points()[0]
     roads = [road_under(T, mask, cloud) for T, mask in zip(poses, registered, strict=True)]
     road = all_roads(roads)
-    layer = Layer(map_from_points(cloud, lattice=surveyor.draft.lattice, road=road), road, settings)
+    layer = Layer(map_from_points(cloud, lattice=surveyor.draft.lattice, road=road), settings, road)
     for drive, T_map_lidar, mask in zip(drives, poses, registered, strict=True):
         layer.lay(drive, T_map_lidar, mask, count)
     point_map = layer.finish()

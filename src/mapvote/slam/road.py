@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -71,7 +72,7 @@ def _dense(positions: F64, registered: Bool) -> F64:
     if len(known) < 2:
         return known
     pieces = [known[:1]]
-    for a, b in zip(known[:-1], known[1:], strict=True):
+    for a, b in pairwise(known):
         length = float(np.linalg.norm(b - a))
         if length <= _JUMP_M:
             share = np.arange(1, max(1, round(length / _STEP_M)) + 1)[:, None] / max(1, round(length / _STEP_M))
