@@ -21,11 +21,10 @@ from mapvote.config import NdtSettings
 from mapvote.core.geometry import from_xyz_rpy, inverse, rotation_angle
 from mapvote.core.types import F64
 from mapvote.formats import open_drive, read_T_map_lidar
-from mapvote.localisation.deskew import deskew
+from mapvote.localisation.deskew import deskew, motion_at
 from mapvote.localisation.ndt import build_ndt, register
 from mapvote.localisation.tracker import window_points
 from mapvote.simulation import simulate
-from mapvote.slam.accumulate import motion_at
 from mapvote.slam.build import build_map
 
 SETTINGS = NdtSettings()

@@ -20,9 +20,10 @@ from mapvote.config import Settings, choose_case
 from mapvote.core.point_map import PointMap
 from mapvote.core.types import Drive
 from mapvote.formats import open_drive
+from mapvote.perception.frontend import DriveReport
 from mapvote.simulation import simulate
 from mapvote.slam.build import build_map
-from mapvote.vehicle import DriveReport, vote_drive
+from mapvote.vehicle import vote_drive
 
 STAGES = ("localise", "ground", "moving", "see", "vote")
 

@@ -14,8 +14,9 @@ import json
 from pathlib import Path
 
 from mapvote.config import load_settings
-from mapvote.evaluation.experiments.cases import choose_cases, fuse_case, passes
+from mapvote.evaluation.experiments.cases import choose_cases, fuse_case
 from mapvote.evaluation.experiments.changed_areas import in_changed_areas, survey_anew
+from mapvote.evaluation.experiments.passes import passes
 from mapvote.evaluation.experiments.pose_errors import map_frame
 from mapvote.evaluation.experiments.scene import Scene, default_cache
 from mapvote.formats.atomic import whole_file

@@ -22,11 +22,10 @@ from mapvote.core.geometry import exp, inverse, log, rotation_angle
 from mapvote.core.point_map import PointMap
 from mapvote.core.types import F64
 from mapvote.formats import open_drive, read_T_map_lidar
-from mapvote.localisation.deskew import deskew
+from mapvote.localisation.deskew import deskew, motion_at
 from mapvote.localisation.ndt import PosePrior, register
 from mapvote.localisation.tracker import MapWindow, Tracker
 from mapvote.simulation import simulate
-from mapvote.slam.accumulate import motion_at
 from mapvote.slam.build import build_map
 
 SETTINGS = Settings()

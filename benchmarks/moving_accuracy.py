@@ -13,6 +13,7 @@ from __future__ import annotations
 import argparse
 import json
 import time
+from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -104,21 +105,22 @@ def run(
     grid, ground_z = measure_ground(drive, T_map_lidar)
     rng = np.random.default_rng(0)
     movers = MovingFilter(drive.sensor, settings)
-    kept: dict[int, tuple[F32, Bool]] = {}
+    kept: deque[tuple[int, F32, Bool]] = deque()
     for i in range(len(drive)):
         scan = drive.read_scan(i)
         T = T_map_lidar[i].copy()
         T[:3, :3] = exp(np.r_[0.0, 0.0, 0.0, rng.normal(size=3) * pose_noise_m / 30.0])[:3, :3] @ T[:3, :3]
         T[:3, 3] += rng.normal(size=3) * pose_noise_m
-        kept[i] = scan.points, obstacles(transform(T_map_lidar[i], scan.points), grid, ground_z)
+        obstacle = obstacles(transform(T_map_lidar[i], scan.points), grid, ground_z)
+        kept.append((i, scan.points, obstacle))
         points_map = transform(T, scan.points)
         start = time.process_time()
-        decided = movers.push(points_map, T[:3, 3], kept[i][1], scan.stamp_ns)
+        decided = movers.push(points_map, T[:3, 3], obstacle, scan.stamp_ns)
         seconds.append(time.process_time() - start)
-        for index, moving in decided:
-            yield index, *kept.pop(index), moving
-    for index, moving in movers.flush():
-        yield index, *kept.pop(index), moving
+        for moving in decided:
+            yield *kept.popleft(), moving
+    for moving in movers.flush():
+        yield *kept.popleft(), moving
 
 
 def score_simulated(folder: Path, stride: int, settings: MovingSettings, pose_noise_m: float) -> Score:

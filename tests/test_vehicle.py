@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ from mapvote.core.grid import TILE_CELLS
 from mapvote.core.point_map import PointMap, map_from_points
 from mapvote.core.reference import reference_window
 from mapvote.core.sensors import SENSORS
-from mapvote.core.types import F64, Bool, CellState, MapvoteError, Registration, Scan
+from mapvote.core.types import F64, CellState, MapvoteError, Registration, Scan
 from mapvote.localisation.ndt import PosePrior
 from mapvote.localisation.tracker import Fix
 from mapvote.vehicle import Vehicle
@@ -56,36 +56,22 @@ def exactly(scan: Scan, prior: PosePrior | None) -> Fix:
     return Fix(Registration(prior.T_map_lidar, np.zeros((6, 6)), 1.0, 1.0, 0, True), scan.points, True)
 
 
-class NothingMoves:
-    """A street without traffic, decided at once."""
-
-    def __init__(self) -> None:
-        self.count = 0
-
-    def push(self, points_map: F64, origin_map: F64, obstacle: Bool, stamp_ns: int) -> list[tuple[int, Bool]]:
-        self.count += 1
-        return [(self.count - 1, np.zeros(len(points_map), dtype=np.bool_))]
-
-    def flush(self) -> list[tuple[int, Bool]]:
-        return []
-
-
 PAPER = Settings(voting=VotingSettings(method="paper"))
 
 
 def make(point_map: PointMap, settings: Settings = PAPER, **more: Any) -> Vehicle:
-    given = {"localise": exactly, "movers": NothingMoves(), **more}
-    return Vehicle("v1", SENSORS["hdl32e"], point_map, settings, **given)
+    return Vehicle("v1", SENSORS["hdl32e"], point_map, settings, **{"localise": exactly, **more})
 
 
 def drive(vehicle: Vehicle) -> Vehicle:
     for i in range(6):
         vehicle.observe(*scan_of(-1.0 + 0.1 * i, i))
+    vehicle.finish()
     return vehicle
 
 
-def state_at(vehicle: Vehicle, x: float, y: float, voting: VotingSettings | None = None) -> int:
-    ballot = vehicle.ballot(voting)
+def state_at(vehicle: Vehicle, x: float, y: float) -> int:
+    ballot = vehicle.ballot()
     for tile in ballot.tiles:
         grid = vehicle.point_map.lattice.tile(tile.tile)
         rows, cols, inside = grid.indices_of(np.array([[x, y]]))
@@ -128,28 +114,17 @@ def test_two_vehicles_with_the_same_scans_say_the_same_bytes() -> None:
         vehicle = make(point_map)
         for scan, pose in scans:
             vehicle.observe(scan, pose)
+        vehicle.finish()
         said.append(encode(vehicle.ballot()))
     assert said[0] == said[1]
     validate(decode(said[0]))
 
 
-def test_several_voters_share_one_pass_and_one_stage_ballots_carry_the_tally() -> None:
-    plain = VotingSettings(method="paper", skip_tall_cells=False)
-    column = plain.model_copy(update={"occlusion": "column"})
-    scans = [scan_of(-1.0 + 0.1 * i, i) for i in range(4)]
-    point_map = street_map()
-    together = make(point_map, voters=[plain, column])
-    alone = make(point_map, Settings(voting=column))
-    for scan, pose in scans:
-        together.observe(scan, pose)
-        alone.observe(scan, pose)
-    assert [t.states for t in together.ballot(column).tiles] == [t.states for t in alone.ballot().tiles]
-    one_stage = together.ballot(plain.model_copy(update={"two_stage": False}))
-    assert all(t.states is None and t.tally is not None for t in one_stage.tiles)
-    assert one_stage.tiles[0].tally is not None
-    assert unpack_tally(one_stage.tiles[0].tally).shape == (TILE_CELLS, TILE_CELLS, 5)
-    with pytest.raises(MapvoteError, match="no voter"):
-        together.ballot(VotingSettings(n_min=9))
+def test_a_one_stage_ballot_carries_the_tally_and_leaves_the_decision_to_the_server() -> None:
+    ballot = drive(make(street_map(), Settings(voting=VotingSettings(method="paper", two_stage=False)))).ballot()
+    assert all(t.states is None and t.tally is not None for t in ballot.tiles)
+    assert ballot.tiles[0].tally is not None
+    assert unpack_tally(ballot.tiles[0].tally).shape == (TILE_CELLS, TILE_CELLS, 5)
 
 
 def test_a_lost_scan_casts_no_vote() -> None:
@@ -162,19 +137,48 @@ def test_a_lost_scan_casts_no_vote() -> None:
     with pytest.raises(MapvoteError, match="none of 2 scans could be localised"):
         vehicle.ballot()
     vehicle.observe(*scan_of(-1.0, 2))
+    with pytest.raises(MapvoteError, match="no scan has voted yet"):
+        vehicle.ballot()
+    vehicle.finish()
     assert vehicle.report.lost == [0, 1]
     assert vehicle.ballot().scans_localised == 1
     assert vehicle.ballot().scans == 3
 
 
 def test_the_moving_object_filter_delays_votes_but_loses_none() -> None:
-    point_map = street_map()
-    vehicle = make(point_map, movers=None)
+    vehicle = make(street_map())
     for i in range(6):
         vehicle.observe(*scan_of(-1.0 + 0.1 * i, i))
     assert len(vehicle.report.stage_s.get("vote", [])) < 6
-    vehicle.ballot()
+    vehicle.finish()
     assert len(vehicle.report.stage_s["vote"]) == 6
+
+
+@pytest.mark.parametrize("method", ["paper", "columns"])
+def test_asking_for_a_ballot_in_mid_drive_says_what_has_voted_so_far_and_changes_nothing(
+    method: Literal["paper", "columns"],
+) -> None:
+    scans, point_map = [scan_of(-1.0 + 0.1 * i, i) for i in range(15)], street_map()
+    asked, left_alone = (make(point_map, Settings(voting=VotingSettings(method=method))) for _ in range(2))
+    for i, (scan, pose) in enumerate(scans):
+        asked.observe(scan, pose)
+        left_alone.observe(scan, pose)
+        if i >= 10:  # the filter decides a scan when it has seen a second more
+            assert encode(asked.ballot()) == encode(asked.ballot())
+            assert (asked.ballot().scans, asked.ballot().scans_localised) == (i + 1, i - 9)
+    asked.finish()
+    left_alone.finish()
+    assert encode(asked.ballot()) == encode(left_alone.ballot())
+    assert asked.ballot().scans_localised == 15
+
+
+def test_a_drive_that_has_ended_takes_no_more_scans() -> None:
+    vehicle = drive(make(street_map()))
+    before = encode(vehicle.ballot())
+    vehicle.finish()
+    assert encode(vehicle.ballot()) == before
+    with pytest.raises(MapvoteError, match="this drive has ended"):
+        vehicle.observe(*scan_of(0.0, 9))
 
 
 COLUMNS = VotingSettings(method="columns")

@@ -117,9 +117,6 @@ class VotingSettings(Section):
     k: float = 0.5
     n_min: int = 5
     window_m: float = Field(default=80.0, description="side of the local grid (paper III-A)")
-    rules: str = Field(
-        default="ABCDEFGHI", pattern=r"^A?B?C?D?E?F?G?H?I?$", description="columns: which of its rules hold (ablation)"
-    )
     empty_votes: float = Field(
         default=0.1, description="columns, F: votes of a ray through a voxel, against one for a hit in it"
     )

@@ -15,6 +15,7 @@ from mapvote.core.types import NO_VOTE, U64, CellState
 from mapvote.detection.columns import weigh
 from mapvote.detection.counters import PLANES, STRUCK_ITSELF, THROUGH_ITSELF, WORDS
 from mapvote.detection.regions import drop_specks, fallen, unexplained
+from mapvote.detection.rules import ALL_RULES, Rules
 from mapvote.detection.votes import Verdict
 
 UO, UE, CO, CE, UN = CellState
@@ -33,11 +34,12 @@ def cell(through: dict[int, int], struck: dict[int, int]) -> U64:
 
 def judge(through: dict[int, int], struck: dict[int, int], occupied: int = 0, **more: Any) -> Verdict:
     near, free, low_there = more.pop("near", 0), more.pop("free", int(FREE)), more.pop("low", False)
+    rules = more.pop("rules", ALL_RULES)
     settings = VotingSettings(method="columns", **more)
     occupied_word, near_word, free_word = (np.full((1, 1), w, np.uint64) for w in (occupied, near, free))
     low, base = np.full((1, 1), low_there), np.zeros((3, 3), np.int32)
     planes = np.pad(cell(through, struck), ((1, 1), (1, 1), (0, 0)))
-    return weigh(planes, base, occupied_word, near_word, free_word, low, settings)
+    return weigh(planes, base, occupied_word, near_word, free_word, low, settings, rules)
 
 
 def around(through: dict[int, int]) -> dict[int, int]:
@@ -59,26 +61,26 @@ def test_rule_a_rays_that_graze_a_slab_without_crossing_it_say_nothing() -> None
     assert state({11: 40, 12: 20}, {}, occupied=1 << 12) == UN, "never a ray above it: an awning seen from below"
     assert state({12: 20, 13: 40}, {}, occupied=1 << 12) == UN, "never a ray below it: a hedge seen from above"
     assert state({11: 40, 12: 20, 13: 40}, {}, occupied=1 << 12) == CE
-    assert state({12: 20, 13: 40}, {}, occupied=1 << 12, rules="BCDEFGH") == CE
+    assert state({12: 20, 13: 40}, {}, occupied=1 << 12, rules=Rules(empty_by_ray=False)) == CE
     assert state({1: 20, 2: 40}, {}, occupied=0b10) == CE, "below the lowest voxel is the ground"
 
 
 def test_rule_e_a_few_hits_outweigh_many_rays_that_grazed_past() -> None:
     assert state(around({3: 20}), {3: 4}, occupied=0b1000) == UO
-    assert state(around({3: 20}), {3: 4}, occupied=0b1000, rules="ABCDFG") == CE
+    assert state(around({3: 20}), {3: 4}, occupied=0b1000, rules=Rules(rays_count_less=False)) == CE
 
 
 def test_rule_e_what_is_hardly_ever_seen_through_is_not_called_gone() -> None:
     through = {1: 40, **around({12: 3})}
     assert state(through, {}, occupied=1 << 12) == UN
-    assert state(through, {}, occupied=1 << 12, rules="ABCDFG") == CE
+    assert state(through, {}, occupied=1 << 12, rules=Rules(rays_count_less=False)) == CE
 
 
 def test_rule_c_sets_apart_what_lies_only_next_to_mapped_voxels() -> None:
     assert not judge({}, {4: 9}).beside[0, 0]
     assert judge({}, {4: 9}, near=1 << 4).beside[0, 0]
     assert not judge({}, {4: 9, 7: 9}, near=1 << 4).beside[0, 0], "part of it stands free"
-    assert not judge({}, {4: 9}, near=1 << 4, rules="ABDEFG").beside[0, 0]
+    assert not judge({}, {4: 9}, near=1 << 4, rules=Rules(pose_explains=False)).beside[0, 0]
 
 
 def test_rule_c_a_new_wall_keeps_the_cells_that_touch_an_old_one_and_a_ghost_along_it_is_dropped() -> None:
@@ -98,7 +100,7 @@ def test_a_cell_that_the_map_has_points_in_is_never_changed_occupied() -> None:
 
 def test_rule_d_new_only_where_the_map_knew_free_space() -> None:
     assert state({}, {4: 9}, free=0) != CO
-    assert state({}, {4: 9}, free=0, rules="ABCEFG") == CO
+    assert state({}, {4: 9}, free=0, rules=Rules(new_where_free=False)) == CO
 
 
 def test_rule_d_the_top_of_a_new_house_comes_with_it_though_the_map_knew_nothing_up_there() -> None:
@@ -112,25 +114,25 @@ def test_rule_d_the_top_of_a_new_house_comes_with_it_though_the_map_knew_nothing
 def test_rule_f_only_rays_at_the_height_of_the_new_thing_speak_against_it() -> None:
     assert state({9: 100}, {4: 4}) == CO
     assert state({4: 100}, {4: 4}) != CO
-    assert state({9: 100}, {4: 4}, rules="ABCDEG") == UE
+    assert state({9: 100}, {4: 4}, rules=Rules(rays_at_height=False)) == UE
 
 
 def test_rule_g_what_was_struck_in_few_of_the_scans_that_saw_through_it_has_only_passed_by() -> None:
     assert state(around({4: 12}), {4: 4}) != CO
-    assert state(around({4: 12}), {4: 4}, rules="ABCDEF") == CO
+    assert state(around({4: 12}), {4: 4}, rules=Rules(brief_is_passing=False)) == CO
     assert state(around({4: 12}), {4: 4, 5: 9}) == CO, "what is next to it was struck often: an edge"
     assert state({4: 12, 5: 30}, {4: 4}) == CO, "rays only grazed it: a slab"
 
 
 def test_rule_g_may_ask_for_more_than_a_single_hit() -> None:
     assert state({}, {4: 1}, min_support=2) != CO
-    assert state({}, {4: 1}, min_support=2, rules="ABCDEF") == CO
+    assert state({}, {4: 1}, min_support=2, rules=Rules(brief_is_passing=False)) == CO
 
 
 def test_rule_g_what_hardly_rises_above_the_ground_is_never_called_gone() -> None:
     assert state({1: 40, 2: 40}, {}, occupied=0b10) == CE
     assert state({1: 40, 2: 40}, {}, occupied=0b10, low=True) == UN
-    assert state({1: 40, 2: 40}, {}, occupied=0b10, low=True, rules="ABCDEF") == CE
+    assert state({1: 40, 2: 40}, {}, occupied=0b10, low=True, rules=Rules(brief_is_passing=False)) == CE
     assert state({}, {1: 40}, occupied=0b10, low=True) == UO
 
 

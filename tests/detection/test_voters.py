@@ -13,12 +13,14 @@ from mapvote.core.types import CellState
 from mapvote.detection.columns import ColumnVoter
 from mapvote.detection.counters import Evidence
 from mapvote.detection.regions import beside_new
+from mapvote.detection.rules import ALL_RULES, Rules
 from mapvote.detection.votes import TileVotes
 from mapvote.perception.raycast import ScanView, Sight
 
 ROW = 100
 WALL, POST = range(100, 112), 112
 WALL_Z, POST_Z, CORNICE_Z = [0.75, 1.05, 1.35, 1.65], [0.75, 1.05], 1.65
+WITHOUT_I = Rules(remnants_go=False)
 ALL_BITS = ~np.uint64(0) >> np.uint64(1)
 
 
@@ -34,7 +36,7 @@ def bits(heights: list[float]) -> np.uint64:
     return np.uint64(sum(1 << int(z / 0.3) for z in heights))
 
 
-def after(rules: str, more_hits: dict[tuple[int, int], list[float]] | None = None) -> TileVotes:
+def after(more_hits: dict[tuple[int, int], list[float]] | None = None, rules: Rules = ALL_RULES) -> TileVotes:
     """What a drive says after the wall is gone: rays go through everything, and only the post is struck."""
     point_map = street()
     grid = point_map.lattice.tile((0, 0))
@@ -47,33 +49,33 @@ def after(rules: str, more_hits: dict[tuple[int, int], list[float]] | None = Non
     view = ScanView(grid, (hit != 0).astype(np.int32), hit, passed, np.full(grid.shape, int(Sight.CLEAR), np.uint8))
     evidence = Evidence(point_map.lattice)
     for _ in range(20):
-        evidence.add(view, reference)
-    return ColumnVoter(VotingSettings(rules=rules), point_map, evidence).votes()[0, 0]
+        evidence.count(view, reference)
+    return ColumnVoter(VotingSettings(), point_map, rules, evidence).votes()[0, 0]
 
 
 def test_the_last_cell_of_a_demolished_wall_falls_though_a_post_stands_next_to_it() -> None:
     end = (ROW, POST - 1)
-    assert after("ABCDEFGH").states[ROW, WALL[0]] == CellState.CHANGED_EMPTY
-    assert after("ABCDEFGH").states[end] == CellState.UNCHANGED_OCCUPIED, "hits on the post veto it (rule B)"
-    votes = after("ABCDEFGHI")
+    assert after(rules=WITHOUT_I).states[ROW, WALL[0]] == CellState.CHANGED_EMPTY
+    assert after(rules=WITHOUT_I).states[end] == CellState.UNCHANGED_OCCUPIED, "hits on the post veto it (rule B)"
+    votes = after()
     assert votes.states[end] == CellState.CHANGED_EMPTY
     assert votes.gone is not None
     assert votes.gone[end] == bits(WALL_Z)
 
 
 def test_the_cornice_goes_from_the_cell_of_the_post_and_the_post_stays() -> None:
-    votes = after("ABCDEFGHI")
+    votes = after()
     assert votes.states[ROW, POST] == CellState.UNCHANGED_OCCUPIED
     assert votes.remnants is not None
     assert votes.remnants[ROW, POST] == bits([CORNICE_Z])
-    without = after("ABCDEFGH").remnants
+    without = after(rules=WITHOUT_I).remnants
     assert without is not None
     assert not without.any()
 
 
 def test_no_cell_falls_as_a_remnant_next_to_hits_on_something_new() -> None:
     """An error of pose puts what stands beside its place in the map: voxels may go, the cell does not change."""
-    votes = after("ABCDEFGHI", {(ROW + 1, POST - 1): [0.75, 1.05]})
+    votes = after({(ROW + 1, POST - 1): [0.75, 1.05]})
     assert votes.states[ROW, POST - 1] == CellState.UNCHANGED_OCCUPIED
 
 

@@ -43,6 +43,7 @@ def test_by_http_and_by_files_the_map_is_the_same(tmp_path: Path) -> None:
         )
         for stamp in stamps:
             vehicle.observe(Scan(int(stamp), points))
+        vehicle.finish()
         ballots.append(vehicle.ballot())
     done = vote_by_http(ballots, tmp_path / "map", tmp_path / "server")
     offline, _ = update_map(first_map, ballots, Settings().fuse)

@@ -61,17 +61,16 @@ class Street:
             self.scans.append((points, origin, points[:, 2] > 0.3, round(t * 1e9)))
             self.truth.append(which >= len(fixed))
 
-    def run(self, sensor: Sensor, settings: MovingSettings) -> dict[int, Bool]:
+    def run(self, sensor: Sensor, settings: MovingSettings) -> list[Bool]:
         moving = MovingFilter(sensor, settings)
-        masks: dict[int, Bool] = {}
+        masks = []
         for points, origin, obstacle, stamp_ns in self.scans:
-            masks.update(moving.push(points, origin, obstacle, stamp_ns))
-        masks.update(moving.flush())
-        return masks
+            masks += moving.push(points, origin, obstacle, stamp_ns)
+        return masks + moving.flush()
 
-    def score(self, masks: dict[int, Bool]) -> tuple[float, float]:
+    def score(self, masks: list[Bool]) -> tuple[float, float]:
         """(precision, recall) over all obstacle points."""
-        found = np.concatenate([masks[i] for i in range(len(self.scans))])
+        found = np.concatenate(masks)
         truth = np.concatenate([t & s[2] for t, s in zip(self.truth, self.scans, strict=True)])
         return float((found & truth).sum() / max(found.sum(), 1)), float((found & truth).sum() / max(truth.sum(), 1))
 
@@ -95,14 +94,14 @@ def test_what_comes_into_view_is_not_moving() -> None:
     """A street without movers: walls appear from behind corners and parked cars, and all of it stays."""
     sensor = coarse("hdl32e")
     street = Street(sensor, 10.0, 3.0, [])
-    found = np.concatenate(list(street.run(sensor, MovingSettings()).values()))
+    found = np.concatenate(street.run(sensor, MovingSettings()))
     assert found.mean() < 1e-3
 
 
 def test_a_car_that_waits_is_static_once_its_arrival_is_older_than_the_window() -> None:
     sensor = coarse("hdl32e")
     street = Street(sensor, 10.0, 3.0, [((6.0, -4.0, 10.4, -2.2, 1.5), 0.0)])
-    assert not any(mask.mean() > 1e-3 for mask in street.run(sensor, MovingSettings()).values())
+    assert not any(mask.mean() > 1e-3 for mask in street.run(sensor, MovingSettings()))
 
 
 def test_a_scan_is_decided_within_the_look_ahead_and_no_later_scan_changes_it() -> None:
@@ -111,14 +110,13 @@ def test_a_scan_is_decided_within_the_look_ahead_and_no_later_scan_changes_it() 
     street = Street(sensor, 10.0, 2.5, [ONCOMING])
     whole = street.run(sensor, settings)
     moving = MovingFilter(sensor, settings)
-    order = []
+    decided = 0
     for newest, (points, origin, obstacle, stamp_ns) in enumerate(street.scans):
-        for index, mask in moving.push(points, origin, obstacle, stamp_ns):
-            assert newest - index <= 5
-            np.testing.assert_array_equal(mask, whole[index])
-            order.append(index)
-    order += [index for index, _ in moving.flush()]
-    assert order == list(range(len(street.scans)))
+        for mask in moving.push(points, origin, obstacle, stamp_ns):
+            assert newest - decided <= 5
+            np.testing.assert_array_equal(mask, whole[decided])
+            decided += 1
+    assert decided + len(moving.flush()) == len(street.scans)
 
 
 def test_nothing_older_than_the_window_is_used() -> None:

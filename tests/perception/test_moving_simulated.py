@@ -29,14 +29,14 @@ def labels(street: Path, vehicle: str, stride: int) -> tuple[Bool, Bool]:
     grid = window_around(Lattice(), middle[0], middle[1], 260.0)
     ground_z = reference_window(map_from_points(np.concatenate(clouds)), grid).ground_z
     moving = MovingFilter(drive.sensor, MovingSettings())
-    masks: dict[int, Bool] = {}
+    masks: list[Bool] = []
     obstacle = []
     for i, points_map in enumerate(clouds):
         rows, cols, inside = grid.indices_of(points_map)
         assert inside.all()
         obstacle.append(points_map[:, 2] - ground_z[rows, cols] > GROUND_MARGIN_M)
-        masks.update(moving.push(points_map, T_map_lidar[i, :3, 3], obstacle[i], int(drive.stamps_ns[i])))
-    masks.update(moving.flush())
+        masks += moving.push(points_map, T_map_lidar[i, :3, 3], obstacle[i], int(drive.stamps_ns[i]))
+    masks += moving.flush()
     folder = street / "truth" / vehicle / "moving"
     true = [np.load(folder / f"{i * stride:06d}.npy")[mask] for i, mask in enumerate(obstacle)]
     return np.concatenate(true), np.concatenate([masks[i][mask] for i, mask in enumerate(obstacle)])

@@ -15,8 +15,8 @@ if TYPE_CHECKING:
     from mapvote.client import MapClient
     from mapvote.codec.ballot import Ballot
     from mapvote.core.point_map import PointMap
+    from mapvote.perception.frontend import DriveReport
     from mapvote.slam.build import BuildReport
-    from mapvote.vehicle import DriveReport
 
 
 def register(app: typer.Typer) -> None:

@@ -19,7 +19,9 @@ from mapvote.core.types import I32, U64, Bool
 from mapvote.core.voting import VOTE_UNIT
 from mapvote.detection.counters import PLANES, Evidence, count_of, free_words, is_open
 from mapvote.detection.regions import around, beside_new, loose_voxels, settle
-from mapvote.detection.votes import Judged, Observation, TileVotes, Verdict
+from mapvote.detection.rules import ALL_RULES, Rules
+from mapvote.detection.votes import Judged, TileVotes, Verdict
+from mapvote.perception.frontend import Observation
 
 
 @numba.njit(cache=True, nogil=True)
@@ -105,7 +107,10 @@ def _weigh(
             votes[4] = 1 if not (votes[0] or votes[1] or votes[2] or votes[3]) else 0
 
 
-def weigh(planes: U64, base: I32, occupied: U64, near: U64, free: U64, low: Bool, settings: VotingSettings) -> Verdict:
+def weigh(
+    planes: U64, base: I32, occupied: U64, near: U64, free: U64, low: Bool, settings: VotingSettings,
+    rules: Rules = ALL_RULES,
+) -> Verdict:  # fmt: skip
     """Votes of a window (rows, cols) from its counters and the map's words.
 
     ``planes`` (rows + 2, cols + 2, WORDS) and ``base`` (rows + 2, cols + 2), the layers of their bits 0, have the
@@ -114,31 +119,41 @@ def weigh(planes: U64, base: I32, occupied: U64, near: U64, free: U64, low: Bool
     kerbs, grass, trails of cars' bumpers are never called gone). A cell that the map has points in is never
     changed-occupied (paper III-A).
     """
-    shape, rules = occupied.shape, settings.rules
+    shape = occupied.shape
     everything = np.full(shape, ~np.uint64(0))
     tally, beside, adrift = np.zeros((*shape, 5), np.int32), np.zeros(shape, np.bool_), np.zeros(shape, np.bool_)
     gone, new = np.zeros(shape, np.uint64), np.zeros(shape, np.uint64)
+    brief = rules.brief_is_passing
     _weigh(
-        planes, base, occupied, near if "C" in rules else np.zeros(shape, np.uint64),
-        free if "D" in rules else everything, low if "G" in rules else np.zeros(shape, np.bool_), "A" in rules,
-        "F" in rules, settings.empty_votes if "F" in rules else 1.0, settings.gone_votes if "E" in rules else 1.0,
-        settings.clear_share if "E" in rules else 0.0, settings.brief_share if "G" in rules else 0.0,
-        settings.min_scans if "G" in rules else 1,
-        settings.min_support if "G" in rules else 1, tally, gone, new, beside, adrift,
+        planes, base, occupied, near if rules.pose_explains else np.zeros(shape, np.uint64),
+        free if rules.new_where_free else everything, low if brief else np.zeros(shape, np.bool_), rules.empty_by_ray,
+        rules.rays_at_height, settings.empty_votes if rules.rays_at_height else 1.0,
+        settings.gone_votes if rules.rays_count_less else 1.0, settings.clear_share if rules.rays_count_less else 0.0,
+        settings.brief_share if brief else 0.0, settings.min_scans if brief else 1,
+        settings.min_support if brief else 1, tally, gone, new, beside, adrift,
     )  # fmt: skip
     loose = np.where(low, np.uint64(0), loose_voxels(planes[1:-1, 1:-1]))
     return Verdict(tally, gone, new, beside, adrift, loose)
 
 
 class ColumnVoter:
-    """METHOD 4: evidence per voxel over the drive, weighed at its end."""
+    """Columns: evidence per voxel over the drive, weighed at its end."""
 
-    def __init__(self, voting: VotingSettings, point_map: PointMap, evidence: Evidence) -> None:
-        """``evidence`` is shared with other voters of this map, and filled by whoever made it."""
-        self.voting, self.point_map, self.evidence = voting, point_map, evidence
+    def __init__(
+        self,
+        voting: VotingSettings,
+        point_map: PointMap,
+        rules: Rules = ALL_RULES,
+        evidence: Evidence | None = None,
+    ) -> None:
+        """``evidence``: counters that another voter fills (who may be the only one to observe), else its own."""
+        self.voting, self.point_map, self.rules = voting, point_map, rules
+        self.evidence = evidence or Evidence(point_map.lattice, rules.empty_by_ray, rules.hits_veto)
 
-    def add(self, seen: Observation) -> U64:
-        """Take note of one scan; returns (rows, cols) words of voxels whose points may be new."""
+    def observe(self, seen: Observation) -> U64:
+        """Count one scan; returns (rows, cols) words of voxels whose points may be new."""
+        reach = 2 if seen.scan.sigma_m > self.voting.wide_sigma_m else 1
+        self.evidence.count(seen.view, seen.reference, reach)
         return seen.view.hit & ~seen.reference.occupied
 
     def votes(self) -> dict[TileIndex, TileVotes]:
@@ -148,7 +163,7 @@ class ColumnVoter:
             found = self._judge(tile)
             if found.verdict.tally.any():
                 judged[tile] = found
-        settle(judged, self.point_map.lattice, self.voting)
+        settle(judged, self.point_map.lattice, self.voting, self.rules)
         out = {}
         for tile, found in judged.items():
             here, verdict = found.here, found.verdict
@@ -167,6 +182,6 @@ class ColumnVoter:
         here = cut_reference(outer, window)
         known = here.free if here.free is not None else above_ground_points(self.point_map, window)
         low = here.top_z - here.ground_z < self.voting.min_height_m
-        verdict = weigh(counts, outer.base, here.occupied, near, known, low, self.voting)
+        verdict = weigh(counts, outer.base, here.occupied, near, known, low, self.voting, self.rules)
         crowded = beside_new(counts, outer.occupied, outer.base)[1:-1, 1:-1]
         return Judged(here, verdict, verdict.states(), crowded, np.zeros_like(verdict.gone))

@@ -118,8 +118,8 @@ class Evidence:
         self.lattice, self.by_ray, self.veto = lattice, by_ray, veto
         self.tiles: dict[TileIndex, U64] = {}
 
-    def add(self, view: ScanView, reference: Reference, reach: int = 1) -> None:
-        """Add one scan seen against ``reference``; ``reach`` cells around a hit it may stand for (pose uncertainty)."""
+    def count(self, view: ScanView, reference: Reference, reach: int = 1) -> None:
+        """Count a scan seen against ``reference``; ``reach`` cells around a hit it may stand for (pose uncertainty)."""
         for tile in view.grid.tiles():
             window = self.lattice.tile(tile)
             common = window.intersection(view.grid)

@@ -6,10 +6,14 @@ import numba
 import numpy as np
 
 from mapvote.core.grid import CELL_SIZE, Grid, Lattice, TileIndex, tile_of_cells
-from mapvote.core.types import F32, F64, I32, U64, Bool
+from mapvote.core.types import F32, F64, I32, U64, Bool, Reference
 from mapvote.core.voxels import voxel_keys
+from mapvote.perception.frontend import Observation, PlacedScan
+from mapvote.perception.raycast import find_obstacles
 
 _COMPACT_AT = 200_000
+REACH_M = 70.0
+"""New points are taken up to here, farther than votes are cast: a tile's width around the vehicle is laid out."""
 
 
 @numba.njit(cache=True, nogil=True)
@@ -28,9 +32,33 @@ class NewPoints:
 
     def __init__(self, lattice: Lattice) -> None:
         self.lattice = lattice
+        self._outer: Reference | None = None
+        self._unmapped: U64 = np.zeros((0, 0), dtype=np.uint64)
         self._points = np.zeros((0, 3))
         self._waiting: list[F64] = []
         self._count = 0
+
+    def gather(self, seen: Observation, may_be_new: U64) -> None:
+        """The points of one scan: of its view, those in voxels of ``may_be_new`` (rows, cols); and what lies beyond."""
+        scan = seen.scan
+        chosen = select(
+            scan.points_map, scan.cell, scan.obstacle & ~seen.moving, may_be_new.ravel(), _flat_base(scan.reference)
+        )
+        self.offer(scan.points_map[chosen])
+        self.offer(self._strange_beyond(scan))
+
+    def _strange_beyond(self, scan: PlacedScan) -> F64:
+        """(m, 3) obstacle points outside the local grid, within reach, in voxels that the map does not hold.
+
+        They cast no vote. But the upper storeys of what is new can be seen only from afar, below the sensor's top beam.
+        """
+        if self._outer is not scan.outer:
+            self._outer, self._unmapped = scan.outer, ~scan.outer.occupied
+        outside = scan.points_map[scan.cell < 0]
+        off = outside[:, :2] - scan.origin_map[:2]
+        far = outside[np.einsum("ij,ij->i", off, off) < REACH_M**2]
+        obstacle, cell = find_obstacles(far, scan.outer)
+        return far[select(far, cell, obstacle, self._unmapped.ravel(), _flat_base(scan.outer))]
 
     def offer(self, points_map: F64) -> None:
         """Points (n, 3), map metres."""
@@ -60,3 +88,7 @@ def points_in(window: Grid, points_map: F64, words: U64, base: I32) -> F32:
     cell = (rows * window.cols + cols).astype(np.int32)
     wanted = select(points_map, cell, np.ones(len(points_map), np.bool_), words.ravel(), base.ravel())
     return window.from_map(points_map[wanted])
+
+
+def _flat_base(reference: Reference) -> I32:
+    return np.ascontiguousarray(reference.base).ravel()

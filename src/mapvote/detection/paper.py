@@ -12,7 +12,8 @@ from mapvote.core.point_map import PointMap
 from mapvote.core.sensors import Sensor
 from mapvote.core.types import F32, F64, I32, N_STATES, NO_VOTE, U8, U64, CellState, Reference
 from mapvote.core.voting import VOTE_UNIT, cast, decide, weight_table
-from mapvote.detection.votes import ALL_BITS, Observation, TileVotes
+from mapvote.detection.votes import ALL_BITS, TileVotes
+from mapvote.perception.frontend import Observation
 from mapvote.perception.raycast import ScanView, Sight
 
 _UNCHANGED_OCCUPIED = int(CellState.UNCHANGED_OCCUPIED)
@@ -87,7 +88,7 @@ class Tally:
         self.tiles: dict[TileIndex, I32] = {}
         """(256, 256, 5) int32 in VOTE_UNITs."""
 
-    def add(self, grid: Grid, states: U8, weights: I32) -> None:
+    def cast(self, grid: Grid, states: U8, weights: I32) -> None:
         """Cast one scan's ``states`` (rows, cols of ``grid``) with ``weights``."""
         for tile in grid.tiles():
             window = self.lattice.tile(tile)
@@ -105,10 +106,10 @@ class PaperVoter:
         self.voting, self.sensor = voting, sensor
         self._tally = Tally(point_map.lattice)
 
-    def add(self, seen: Observation) -> U64:
+    def observe(self, seen: Observation) -> U64:
         """Cast one scan's votes; returns (rows, cols) words of voxels whose points may be new."""
-        states, weights = classify_paper(seen.view, seen.reference, seen.origin_map, self.sensor, self.voting)
-        self._tally.add(seen.view.grid, states, weights)
+        states, weights = classify_paper(seen.view, seen.reference, seen.scan.origin_map, self.sensor, self.voting)
+        self._tally.cast(seen.view.grid, states, weights)
         return np.where(states == CellState.CHANGED_OCCUPIED, ALL_BITS, np.uint64(0))
 
     def votes(self) -> dict[TileIndex, TileVotes]:

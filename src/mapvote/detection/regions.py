@@ -19,6 +19,7 @@ from mapvote.core.columns import TOP_BIT, dilated, remnants
 from mapvote.core.grid import Grid, Lattice, TileIndex
 from mapvote.core.types import I32, NO_VOTE, U8, U64, Bool, CellState
 from mapvote.detection.counters import PLANES, STRUCK_ITSELF, THROUGH_ITSELF
+from mapvote.detection.rules import Rules
 from mapvote.detection.votes import Judged
 
 _LOWEST, _HIGHEST = np.uint64(0b11), np.uint64(3) << np.uint64(TOP_BIT - 1)
@@ -31,15 +32,15 @@ Plane = Any
 Tiles = Mapping[TileIndex, Judged]
 
 
-def settle(tiles: Tiles, lattice: Lattice, voting: VotingSettings) -> None:
-    """Apply those of the rules C, H, G and I that ``voting.rules`` names, in this order."""
-    if "C" in voting.rules:
+def settle(tiles: Tiles, lattice: Lattice, voting: VotingSettings, rules: Rules) -> None:
+    """Apply the rules C, H, G and I, in this order, as far as ``rules`` has them hold."""
+    if rules.pose_explains:
         _give_up_explained(tiles, lattice, voting.join_cells)
-    if "H" in voting.rules:
+    if rules.roofs_fall:
         _let_fall(tiles, lattice, voting.fall_cells)
-    if "G" in voting.rules:
+    if rules.brief_is_passing:
         _drop_specks(tiles, lattice, voting.min_cells)
-    if "I" in voting.rules:
+    if rules.remnants_go:
         _take_remnants(tiles, lattice)
 
 

@@ -1,46 +1,33 @@
-"""Two ways to count a drive, one interface: the paper's votes per scan, and columns of evidence (METHOD 4).
-
-A voter takes in scan after scan and gives, tile by tile, the same thing: a tally, and what would go and come.
-"""
+"""Two ways to count a drive, one interface: the paper's votes per scan, and columns of evidence."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
-import numpy as np
+from typing import Protocol
 
 from mapvote.config import VotingSettings
+from mapvote.core.grid import TileIndex
 from mapvote.core.point_map import PointMap
 from mapvote.core.sensors import Sensor
 from mapvote.core.types import U64
 from mapvote.detection.columns import ColumnVoter
-from mapvote.detection.counters import Evidence
 from mapvote.detection.paper import PaperVoter
-from mapvote.detection.votes import Observation
+from mapvote.detection.votes import TileVotes
+from mapvote.perception.frontend import Observation
 
-Voter = PaperVoter | ColumnVoter
+
+class Voter(Protocol):
+    """:class:`PaperVoter` or :class:`ColumnVoter`: scan after scan goes in, votes come out tile by tile."""
+
+    def observe(self, seen: Observation) -> U64:
+        """Take in one scan; returns (rows, cols) words of the voxels of its view whose points may be new."""
+
+    def votes(self) -> dict[TileIndex, TileVotes]:
+        """What the scans so far amount to, of every tile that they say anything of, in ascending order. Asking changes
+        nothing."""
 
 
-class Detectors:
-    """The voters of one vehicle, by their settings. Voters that count alike share their counters."""
-
-    def __init__(self, votings: Sequence[VotingSettings], sensor: Sensor, point_map: PointMap) -> None:
-        self._evidence: dict[tuple[bool, bool, float], Evidence] = {}
-        self.voters: dict[VotingSettings, Voter] = {}
-        for voting in votings:
-            if voting.method == "columns":
-                by_ray, veto = "A" in voting.rules, "B" in voting.rules
-                fresh = Evidence(point_map.lattice, by_ray, veto)
-                evidence = self._evidence.setdefault((by_ray, veto, voting.wide_sigma_m), fresh)
-                self.voters[voting] = ColumnVoter(voting, point_map, evidence)
-            else:
-                self.voters[voting] = PaperVoter(voting, sensor, point_map)
-
-    def add(self, seen: Observation) -> U64:
-        """One scan for every voter; returns (rows, cols) words of voxels whose points may be new for any of them."""
-        for (_, _, wide_sigma_m), evidence in self._evidence.items():
-            evidence.add(seen.view, seen.reference, reach=2 if seen.sigma_m > wide_sigma_m else 1)
-        new = np.zeros(seen.view.grid.shape, dtype=np.uint64)
-        for voter in self.voters.values():
-            new |= voter.add(seen)
-        return new
+def make_voter(voting: VotingSettings, sensor: Sensor, point_map: PointMap) -> Voter:
+    """The voter that ``voting.method`` names."""
+    if voting.method == "columns":
+        return ColumnVoter(voting, point_map)
+    return PaperVoter(voting, sensor, point_map)

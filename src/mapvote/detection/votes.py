@@ -1,4 +1,4 @@
-"""What a voter says of one tile, and what it is told of one scan."""
+"""What a voter says of one tile, and what it is on the way to that."""
 
 from __future__ import annotations
 
@@ -6,9 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mapvote.core.types import F64, I32, U8, U64, Bool, CellState, Reference
+from mapvote.core.types import I32, U8, U64, Bool, CellState, Reference
 from mapvote.core.voting import decide, one_hot
-from mapvote.perception.raycast import ScanView
 
 
 @dataclass(slots=True)
@@ -49,17 +48,6 @@ class Verdict:
 
     def states(self) -> U8:
         return decide(self.tally)
-
-
-@dataclass(frozen=True, slots=True)
-class Observation:
-    """What one localised scan saw."""
-
-    view: ScanView
-    reference: Reference
-    origin_map: F64
-    sigma_m: float
-    """Standard deviation of the position, metres."""
 
 
 @dataclass(frozen=True, slots=True)

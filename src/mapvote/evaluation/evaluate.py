@@ -12,8 +12,9 @@ from mapvote.codec.ballot import Ballot
 from mapvote.core.grid import Grid
 from mapvote.core.point_map import PointMap
 from mapvote.evaluation.baselines.run import yardsticks
-from mapvote.evaluation.experiments.cases import Case, Pass, fuse_case, passes
+from mapvote.evaluation.experiments.cases import Case, fuse_case
 from mapvote.evaluation.experiments.changed_areas import in_changed_areas, survey_anew
+from mapvote.evaluation.experiments.passes import Pass, passes
 from mapvote.evaluation.experiments.pose_errors import localisation, map_frame, map_shift
 from mapvote.evaluation.experiments.scene import Progress, Scene
 from mapvote.evaluation.scoring.jury import Jury, Outcome

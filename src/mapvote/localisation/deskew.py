@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapvote.core.geometry import inverse, log
-from mapvote.core.types import F64, Scan
+from mapvote.core.types import F64, I64, Scan
 
 
 @numba.njit(cache=True, nogil=True)
@@ -38,3 +38,12 @@ def deskew(scan: Scan, twist: F64) -> NDArray[np.float32]:
 def twist_between(T_map_lidar_0: F64, T_map_lidar_1: F64, seconds: float) -> F64:
     """(6,) constant motion per second, in the moving lidar's frame, that leads from one pose to the other."""
     return log(inverse(T_map_lidar_0) @ T_map_lidar_1) / seconds
+
+
+def motion_at(stamps_ns: I64, T_map_lidar: F64, i: int) -> F64:
+    """(6,) motion per second of scan i in its lidar frame, from the poses (n, 4, 4) before and after it."""
+    before, after = max(i - 1, 0), min(i + 1, len(stamps_ns) - 1)
+    if before == after:
+        return np.zeros(6)
+    seconds = 1e-9 * float(stamps_ns[after] - stamps_ns[before])
+    return twist_between(T_map_lidar[before], T_map_lidar[after], seconds)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from mapvote.config import NdtLevel, NdtSettings
 from mapvote.core.geometry import exp, log
-from mapvote.core.types import F64, Registration
+from mapvote.core.types import F64, Drive, Registration
 from mapvote.core.voxels import thin
 from mapvote.localisation.ndt_kernels import add, normal_equations, reindex
 
@@ -102,6 +102,13 @@ class PosePrior:
     T_map_lidar: F64
     sigma_m: float
     sigma_rad: float
+
+    @classmethod
+    def of(cls, drive: Drive, i: int) -> PosePrior | None:
+        """What ``drive`` brings for its scan ``i``, if anything."""
+        if drive.T_map_lidar_prior is None:
+            return None
+        return cls(drive.T_map_lidar_prior[i], drive.prior_sigma_m, float(np.radians(drive.prior_sigma_deg)))
 
     @property
     def information(self) -> F64:

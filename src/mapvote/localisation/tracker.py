@@ -16,7 +16,7 @@ from mapvote.core.grid import window_around
 from mapvote.core.point_map import PointMap
 from mapvote.core.types import F32, F64, I64, Registration, Scan
 from mapvote.core.voxels import thin
-from mapvote.localisation.deskew import deskew, twist_between
+from mapvote.localisation.deskew import deskew, motion_at, twist_between
 from mapvote.localisation.ndt import NdtMap, PosePrior, build_ndt, fitness, refine, thin_for_levels
 
 _REFINED = 3
@@ -201,7 +201,7 @@ def _differ(twist: F64, other: F64) -> bool:
 
 
 class GivenPoses:
-    """Poses that need no improvement: the prior as it is, or the truth, to measure what localisation is worth."""
+    """Poses that need no improvement: a prior to be trusted, the outcome of SLAM, or the truth."""
 
     def __init__(self, stamps_ns: I64, T_map_lidar: F64) -> None:
         """``stamps_ns`` (n,) ascending and ``T_map_lidar`` (n, 4, 4): a pose for every scan that will come."""
@@ -210,10 +210,6 @@ class GivenPoses:
 
     def __call__(self, scan: Scan, prior: PosePrior | None) -> Fix:
         i = self._poses[scan.stamp_ns]
-        j, k = max(i - 1, 0), min(i + 1, len(self._stamps_ns) - 1)
-        twist = np.zeros(6)
-        if k > j:
-            seconds = 1e-9 * float(self._stamps_ns[k] - self._stamps_ns[j])
-            twist = twist_between(self._T_map_lidar[j], self._T_map_lidar[k], seconds)
+        twist = motion_at(self._stamps_ns, self._T_map_lidar, i)
         registration = Registration(self._T_map_lidar[i], np.zeros((6, 6)), 1.0, 1.0, 0, True)
         return Fix(registration, deskew(scan, twist), True)

@@ -62,11 +62,12 @@ class MovingFilter:
         self._slope_step = float(np.tan(np.radians(0.5 * settings.pixel_deg)))
         self._slopes = int(np.ceil((slope_max - self._slope_min) / self._slope_step))
         self._window: deque[_Scan] = deque()
-        self._pushed = 0
-        self._decided = 0
+        self._waiting = 0
+        """How many of the window's youngest scans are undecided."""
 
-    def push(self, points_map: F64, origin_map: F64, obstacle: Bool, stamp_ns: int) -> list[tuple[int, Bool]]:
-        """Take one scan; return what can now be decided: (running index of the scan, moving mask over its points).
+    def push(self, points_map: F64, origin_map: F64, obstacle: Bool, stamp_ns: int) -> list[Bool]:
+        """Take one scan; return what can now be decided: the masks of moving points (n,) of the oldest scans that
+        were still undecided, in their order.
 
         ``points_map`` (n, 3) and the sensor's ``origin_map`` (3,) in map metres; ``obstacle`` (n,) says which points
         stand more than 0.3 m above the ground: only they can be called moving, but all of them prove what is free.
@@ -79,22 +80,22 @@ class MovingFilter:
         nearest = range_image(points, origin, self._turns, self._slopes, self._slope_min, self._slope_step)
         voxel_of, first = voxels(points, obstacle, origin, self.settings.reach_m, CELL_SIZE)
         self._window.append(_Scan(stamp_ns, origin, nearest, voxel_of, points[first]))
-        self._pushed += 1
+        self._waiting += 1
         return self._decide(stamp_ns - round(self.settings.lookahead_s * 1e9))
 
-    def flush(self) -> list[tuple[int, Bool]]:
+    def flush(self) -> list[Bool]:
         """Decide what is left, with less than the full look ahead: the drive has ended."""
         return self._decide(self._window[-1].stamp_ns) if self._window else []
 
-    def _decide(self, up_to_ns: int) -> list[tuple[int, Bool]]:
+    def _decide(self, up_to_ns: int) -> list[Bool]:
         """Masks of all waiting scans not younger than ``up_to_ns``; forgets what no later scan will ask for."""
         out = []
-        while self._decided < self._pushed:
-            at = len(self._window) - (self._pushed - self._decided)
+        while self._waiting:
+            at = len(self._window) - self._waiting
             if self._window[at].stamp_ns > up_to_ns:
                 break
-            out.append((self._decided, self._moving(at)))
-            self._decided += 1
+            out.append(self._moving(at))
+            self._waiting -= 1
             oldest_ns = self._window[at].stamp_ns - round(self.settings.past_s * 1e9)
             while self._window[0].stamp_ns < oldest_ns:
                 self._window.popleft()

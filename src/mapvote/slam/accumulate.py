@@ -10,9 +10,8 @@ for the counting, would else leave its trail unchallenged. Returns from beyond t
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numba
 import numpy as np
@@ -20,30 +19,19 @@ from scipy import ndimage
 
 from mapvote.config import Settings
 from mapvote.core.columns import TOP_BIT, shifted
-from mapvote.core.geometry import transform
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, TileIndex
 from mapvote.core.point_map import PointMap, map_from_points
 from mapvote.core.reference import LocalMap, reference_window
-from mapvote.core.types import F64, I32, I64, U64, Bool, Drive, Reference
+from mapvote.core.types import F64, I32, I64, U64, Bool, Drive
 from mapvote.core.voxels import VoxelCloud
 from mapvote.detection.counters import PLANES, Evidence, count_of, free_words, is_open
-from mapvote.localisation.deskew import deskew, twist_between
+from mapvote.localisation.tracker import GivenPoses
+from mapvote.perception.frontend import Frontend, Observation, PlacedScan
 from mapvote.perception.moving_objects import MovingFilter
-from mapvote.perception.raycast import cast_rays, find_obstacles
+from mapvote.perception.raycast import find_obstacles
 
 ROAD_M = 0.1
 """Points this low above the ground are the road itself, also under a car."""
-
-
-@dataclass(frozen=True, slots=True)
-class _Waiting:
-    """A scan that waits for the moving-object filter to decide."""
-
-    points_map: F64
-    origin_map: F64
-    obstacle: Bool
-    cell: I32
-    reference: Reference
 
 
 class Layer:
@@ -59,28 +47,22 @@ class Layer:
 
     def lay(self, drive: Drive, T_map_lidar: F64, registered: Bool, count: Callable[[], None]) -> None:
         """Enter every registered scan of one drive at its pose (n, 4, 4). ``count`` is called after each scan read."""
-        reach = {"reach_m": self.settings.mapping.reach_m}
-        movers = MovingFilter(drive.sensor, self.settings.moving.model_copy(update=reach))
-        waiting: deque[_Waiting] = deque()
+        mapping = self.settings.mapping
+        movers = MovingFilter(drive.sensor, self.settings.moving.model_copy(update={"reach_m": mapping.reach_m}))
+        frontend = Frontend(GivenPoses(drive.stamps_ns, T_map_lidar), movers, self._around, self._near)
         for i, scan in enumerate(drive):
             if registered[i]:
-                points = deskew(scan, motion_at(drive.stamps_ns, T_map_lidar, i))
-                points_map, origin_map = transform(T_map_lidar[i], points), T_map_lidar[i, :3, 3].copy()
-                reference, _ = self._around.at(origin_map)
-                obstacle, cell = find_obstacles(points_map, reference)
-                waiting.append(_Waiting(points_map, origin_map, obstacle, cell, reference))
-                for _, moving in movers.push(points_map, origin_map, obstacle, scan.stamp_ns):
-                    self._enter(waiting.popleft(), moving)
+                self._enter(frontend.observe(scan))
             count()
-        for _, moving in movers.flush():
-            self._enter(waiting.popleft(), moving)
+        self._enter(frontend.finish())
 
-    def _enter(self, scan: _Waiting, moving: Bool) -> None:
-        offset = scan.points_map[:, :2] - scan.origin_map[:2]
-        far = np.einsum("ij,ij->i", offset, offset) > self.settings.mapping.reach_m**2
-        self.cloud.add(scan.points_map, moving | _beneath(scan, moving) | far)
-        near, _ = self._near.at(scan.origin_map)
-        self.evidence.add(cast_rays(scan.points_map, scan.origin_map, scan.obstacle, moving, near), near)
+    def _enter(self, seen: list[Observation]) -> None:
+        for observation in seen:
+            scan, moving = observation.scan, observation.moving
+            offset = scan.points_map[:, :2] - scan.origin_map[:2]
+            far = np.einsum("ij,ij->i", offset, offset) > self.settings.mapping.reach_m**2
+            self.cloud.add(scan.points_map, moving | _beneath(scan, moving) | far)
+            self.evidence.count(observation.view, observation.reference)
 
     def finish(self) -> PointMap:
         """The map of everything laid."""
@@ -124,7 +106,7 @@ class Layer:
         return out
 
 
-def _beneath(scan: _Waiting, moving: Bool) -> Bool:
+def _beneath(scan: PlacedScan, moving: Bool) -> Bool:
     """Points (n,) too low to be obstacles, in or next to cells where something moves: wheels and bumpers, not road."""
     inside = scan.cell >= 0
     cells = np.zeros(scan.reference.grid.shape, dtype=np.bool_)
@@ -135,15 +117,6 @@ def _beneath(scan: _Waiting, moving: Bool) -> Bool:
     near = near[cells.ravel()[scan.cell[near]]]
     low[near] = scan.points_map[near, 2] - scan.reference.ground_z.ravel()[scan.cell[near]] > ROAD_M
     return low & ~scan.obstacle
-
-
-def motion_at(stamps_ns: I64, T_map_lidar: F64, i: int) -> F64:
-    """(6,) motion per second of scan i in its lidar frame, from the poses (n, 4, 4) before and after it."""
-    before, after = max(i - 1, 0), min(i + 1, len(stamps_ns) - 1)
-    if before == after:
-        return np.zeros(6)
-    seconds = 1e-9 * float(stamps_ns[after] - stamps_ns[before])
-    return twist_between(T_map_lidar[before], T_map_lidar[after], seconds)
 
 
 @numba.njit(cache=True, nogil=True)

@@ -3,7 +3,7 @@
 Two passes. The first finds where the vehicles were: each scan is registered to the NDT map grown so far, drives
 one after the other into the same map; then all poses are settled together, so that precise priors (a survey
 vehicle's RTK) hold the map in their frame and coarse ones only start the search. The second reads the scans again and
-lays them at their settled poses: de-skewed, without moving objects, one point per 0.3 m voxel (perception.laying).
+lays them at their settled poses: de-skewed, without moving objects, one point per 0.3 m voxel (slam.accumulate).
 """
 
 from __future__ import annotations
@@ -109,7 +109,7 @@ class _Surveyor:
         tracker.twist = _first_motion(drive, self.mapping)
         poses, registered = [], []
         for i, scan in enumerate(drive):
-            prior = _prior(drive, i)
+            prior = PosePrior.of(drive, i)
             fix = None if self.ndt_map is None else tracker.localise(scan, prior)
             if fix is None:
                 fix = tracker.begin(scan, np.eye(4) if prior is None else prior.T_map_lidar)
@@ -197,12 +197,6 @@ def _first_motion(drive: Drive, settings: MappingSettings) -> F64:
     k = 1 if _is_precise(drive, settings) else max(1, int(np.searchsorted(seconds, 1.0)))
     k = min(k, len(drive) - 1)
     return twist_between(drive.T_map_lidar_prior[0], drive.T_map_lidar_prior[k], float(seconds[k]))
-
-
-def _prior(drive: Drive, i: int) -> PosePrior | None:
-    if drive.T_map_lidar_prior is None:
-        return None
-    return PosePrior(drive.T_map_lidar_prior[i], drive.prior_sigma_m, float(np.radians(drive.prior_sigma_deg)))
 
 
 def _is_precise(drive: Drive, settings: MappingSettings) -> bool:

@@ -13,17 +13,19 @@ import numpy as np
 
 from mapvote.core.grid import TILE_CELLS
 from mapvote.core.reference import reference_window
-from mapvote.core.types import F64, I32, N_STATES, U8, Bool
+from mapvote.core.types import F64, I32, N_STATES, U8
 from mapvote.core.voting import decide, one_hot
 from mapvote.evaluation.baselines.dempster_shafer import EvidenceMap, combine
 from mapvote.evaluation.baselines.nearest_neighbour import NearestNeighbour
-from mapvote.evaluation.experiments.cases import Pass, paper_cases
+from mapvote.evaluation.experiments.cases import paper_cases
+from mapvote.evaluation.experiments.passes import Pass
 from mapvote.evaluation.experiments.scene import BALLOTS_FROM, Progress, Scene, key_of, sources_digest
+from mapvote.evaluation.experiments.shared_pass import SharedPass
 from mapvote.evaluation.scoring.map_points import map_obstacles
 from mapvote.formats.atomic import whole_folder
 from mapvote.localisation.tracker import GivenPoses
+from mapvote.perception.frontend import Observation
 from mapvote.simulation.processes import processes
-from mapvote.vehicle import Vehicle
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,21 +90,21 @@ def _measure(task: tuple[Scene, str, F64]) -> None:
     nearest, evidence = NearestNeighbour(map_obstacles(point_map), reference.grid), EvidenceMap(reference)
     seconds: dict[str, list[float]] = {"nearest": [], "evidence": []}
 
-    def watch(points_map: F64, origin_map: F64, obstacle: Bool, moving: Bool) -> None:
-        for yardstick, times in ((nearest, seconds["nearest"]), (evidence, seconds["evidence"])):
-            start = time.perf_counter()
-            yardstick.push(points_map, origin_map, obstacle, moving)
-            times.append(time.perf_counter() - start)
+    def watch(observations: list[Observation]) -> None:
+        for seen in observations:
+            for yardstick, times in ((nearest, seconds["nearest"]), (evidence, seconds["evidence"])):
+                start = time.perf_counter()
+                yardstick.push(seen.scan.points_map, seen.scan.origin_map, seen.scan.obstacle, seen.moving)
+                times.append(time.perf_counter() - start)
 
-    voting = paper_cases(scene.settings)["5"].voting
+    case = paper_cases(scene.settings)["5"]
     there = np.flatnonzero(np.isfinite(T_map_lidar).all(axis=(1, 2)))
     localise = GivenPoses(drive.stamps_ns[there], T_map_lidar[there])
-    vehicle = Vehicle(
-        drive.vehicle, drive.sensor, point_map, scene.settings, voters=[voting], localise=localise, watch=watch
-    )
+    vehicle = SharedPass(drive, point_map, scene.settings, [case], localise=localise)
     for i in there:
-        vehicle.observe(drive.read_scan(int(i)))
-    ballot, stages = vehicle.ballot(), vehicle.report.stage_s
+        watch(vehicle.observe(drive.read_scan(int(i))))
+    watch(vehicle.finish())
+    ballot, stages = vehicle.ballot(case), vehicle.report.stage_s
     start = time.perf_counter()
     states = nearest.states()
     at_end = (time.perf_counter() - start) / max(len(there), 1)

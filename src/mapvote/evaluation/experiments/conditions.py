@@ -16,9 +16,9 @@ from mapvote.core.types import F64, I64, Bool, Drive, Scan
 from mapvote.evaluation.scoring.truth import Truth
 from mapvote.localisation.ndt import PosePrior
 from mapvote.localisation.tracker import Fix
+from mapvote.perception.frontend import Localise, Movers
 from mapvote.simulation.scenario import load_scenario
 from mapvote.simulation.world import make_world
-from mapvote.vehicle import Localise, Movers
 
 NOISE_MEMORY_S = 10.0
 """Correlation time of the pose noise: as that of the simulator's priors, long against the passing of a house."""
@@ -81,16 +81,14 @@ class TrueMovers(Movers):
         """``whole``: the drive with all of its scans, whose numbers the truth goes by."""
         self._truth, self._name = truth, whole.path.name
         self._number = {int(stamp): i for i, stamp in enumerate(whole.stamps_ns)}
-        self._pushed = 0
 
-    def push(self, points_map: F64, origin_map: F64, obstacle: Bool, stamp_ns: int) -> list[tuple[int, Bool]]:
+    def push(self, points_map: F64, origin_map: F64, obstacle: Bool, stamp_ns: int) -> list[Bool]:
         moving = self._truth.moving(self._name, self._number[stamp_ns])
         if len(moving) != len(points_map):
             raise ValueError(f"{self._name}: {len(points_map)} points, but the truth labels {len(moving)}")
-        self._pushed += 1
-        return [(self._pushed - 1, moving)]
+        return [moving]
 
-    def flush(self) -> list[tuple[int, Bool]]:
+    def flush(self) -> list[Bool]:
         return []
 
 

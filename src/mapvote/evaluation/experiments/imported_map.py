@@ -12,7 +12,8 @@ from dataclasses import replace
 from mapvote.core.grid import Grid
 from mapvote.core.point_map import all_points, map_from_points
 from mapvote.core.types import U8, CellState
-from mapvote.evaluation.experiments.cases import Case, fuse_case, have_voted, passes
+from mapvote.evaluation.experiments.cases import Case, fuse_case
+from mapvote.evaluation.experiments.passes import have_voted, passes
 from mapvote.evaluation.experiments.scene import BALLOTS_FROM, Progress, Scene, key_of, sources_digest
 from mapvote.evaluation.scoring.jury import Outcome
 from mapvote.formats import write_map
@@ -34,7 +35,7 @@ def in_turn(
 
     The first round votes on nothing but the points of the scene's map, as a PCD file would have brought them.
     """
-    made_by = sources_digest((*BALLOTS_FROM, "fleet")), case, scene.settings.fuse.model_dump_json()
+    made_by = sources_digest((*BALLOTS_FROM, "fusion")), case, scene.settings.fuse.model_dump_json()
     here = replace(scene, map_name=f"imported-{key_of(*made_by)}")
     outcome = None
     for who in voters:

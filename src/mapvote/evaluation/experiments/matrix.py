@@ -21,9 +21,10 @@ from mapvote.config import Settings
 from mapvote.core.point_map import PointMap
 from mapvote.core.types import U8
 from mapvote.evaluation.experiments.attacks import ATTACKS
-from mapvote.evaluation.experiments.cases import Case, Pass, choose_cases, fuse_case, have_voted, passes
+from mapvote.evaluation.experiments.cases import Case, choose_cases, fuse_case
 from mapvote.evaluation.experiments.conditions import Conditions
 from mapvote.evaluation.experiments.imported_map import CHAINS, in_turn
+from mapvote.evaluation.experiments.passes import Pass, have_voted, passes
 from mapvote.evaluation.experiments.pose_errors import localisation, map_shift
 from mapvote.evaluation.experiments.scene import BALLOTS_FROM, Progress, Scene, key_of, sources_digest
 from mapvote.evaluation.scoring.cells import UNSCORED, determined, ratio, score_cells
@@ -34,7 +35,7 @@ from mapvote.simulation.processes import processes
 _SCORES_FROM = (
     *BALLOTS_FROM, "fusion", "simulation", "evaluation/scoring", "evaluation/evaluate.py",
     "evaluation/experiments/attacks.py", "evaluation/experiments/cases.py", "evaluation/experiments/conditions.py",
-    "evaluation/experiments/imported_map.py", "evaluation/experiments/matrix.py",
+    "evaluation/experiments/imported_map.py", "evaluation/experiments/matrix.py", "evaluation/experiments/passes.py",
 )  # fmt: skip
 
 

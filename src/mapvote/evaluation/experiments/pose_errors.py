@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from mapvote.core.types import F64
-from mapvote.evaluation.experiments.cases import Pass
+from mapvote.evaluation.experiments.passes import Pass
 from mapvote.evaluation.experiments.scene import Scene
 from mapvote.evaluation.scoring.truth import error_summary, rigid_between
 

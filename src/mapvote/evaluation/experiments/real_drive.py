@@ -19,16 +19,19 @@ from mapvote.config import Settings
 from mapvote.core.geometry import exp, transform
 from mapvote.core.grid import CELL_SIZE, Grid, window_around
 from mapvote.core.point_map import PointMap
-from mapvote.core.reference import LocalMap, reference_window
+from mapvote.core.reference import LocalMap
 from mapvote.core.types import F64, I64, U8, Bool, CellState, Drive, MapvoteError, Scan
 from mapvote.evaluation.experiments.cases import Case, fuse_case
+from mapvote.evaluation.experiments.shared_pass import SharedPass
 from mapvote.evaluation.scoring.cells import determined, ratio
 from mapvote.evaluation.scoring.truth import pose_errors, rigid_between
 from mapvote.formats import open_drive, read_T_map_lidar
+from mapvote.localisation.ndt import PosePrior
+from mapvote.localisation.tracker import GivenPoses
+from mapvote.perception.frontend import DriveReport, Frontend, Observation
 from mapvote.perception.moving_objects import MovingFilter
 from mapvote.perception.raycast import find_obstacles
 from mapvote.slam.build import build_map
-from mapvote.vehicle import DriveReport, Vehicle
 
 VEHICLES = 3
 Disturb = Callable[[Drive], Drive]
@@ -83,28 +86,6 @@ def every_other_beam(drive: Drive) -> Drive:
         )
 
     return replace(drive, sensor=sensor, read_scan=read_scan)
-
-
-class MoverCells:
-    """The moving-object filter, noting the cells in which it found moving points."""
-
-    def __init__(self, inner: MovingFilter, lattice_grid: Grid) -> None:
-        self._inner, self._grid = inner, lattice_grid
-        self._clouds: list[F64] = []
-        self.cells = np.zeros(lattice_grid.shape, dtype=np.bool_)
-
-    def push(self, points_map: F64, origin_map: F64, obstacle: Bool, stamp_ns: int) -> list[tuple[int, Bool]]:
-        self._clouds.append(points_map)
-        return self._note(self._inner.push(points_map, origin_map, obstacle, stamp_ns))
-
-    def flush(self) -> list[tuple[int, Bool]]:
-        return self._note(self._inner.flush())
-
-    def _note(self, decided: list[tuple[int, Bool]]) -> list[tuple[int, Bool]]:
-        for _, moving in decided:
-            rows, cols, inside = self._grid.indices_of(self._clouds.pop(0)[moving])
-            self.cells[rows[inside], cols[inside]] = True
-        return decided
 
 
 @dataclass(frozen=True)
@@ -169,11 +150,14 @@ def run_real(
         drive = open_drive(folder, scans=scans, vehicle=f"v{k + 1}")
         T_true = T_map_world @ reference[_indices(scans, n)]
         drive = change_prior(every_other_beam(drive) if thin else drive)
-        vehicle, noted = _drive(drive, point_map, settings, cases, grid, first_pose_only)
-        movers |= noted
+        vehicle = SharedPass(drive, point_map, settings, cases)
+        for i, scan in enumerate(drive):
+            known = i == 0 or not first_pose_only
+            _note_movers(vehicle.observe(scan, PosePrior.of(drive, i) if known else None), grid, movers)
+        _note_movers(vehicle.finish(), grid, movers)
         reached |= _reached_cells(drive, T_true, point_map, grid, settings.voting.window_m)
         for case in cases:
-            ballots[case.name].append(vehicle.ballot(case.voting))
+            ballots[case.name].append(vehicle.ballot(case))
         there = np.setdiff1d(np.arange(len(drive)), vehicle.report.lost)
         off_m, off_rad = pose_errors(np.array(vehicle.report.T_map_lidar)[there], T_true[there])
         reports.append(vehicle.report)
@@ -191,31 +175,25 @@ def run_real(
     )  # fmt: skip
 
 
-def _drive(
-    drive: Drive, point_map: PointMap, settings: Settings, cases: Sequence[Case], grid: Grid, first_pose_only: bool
-) -> tuple[Vehicle, Bool]:
-    movers = MoverCells(MovingFilter(drive.sensor, settings.moving), grid)
-    vehicle = Vehicle(
-        drive.vehicle, drive.sensor, point_map, settings, drive_id=drive.drive_id, movers=movers,
-        voters=[case.voting for case in cases],
-        prior_sigma_m=drive.prior_sigma_m, prior_sigma_deg=drive.prior_sigma_deg,
-    )  # fmt: skip
-    for i, scan in enumerate(drive):
-        known = drive.T_map_lidar_prior is not None and (i == 0 or not first_pose_only)
-        vehicle.observe(scan, drive.T_map_lidar_prior[i] if known and drive.T_map_lidar_prior is not None else None)
-    vehicle.ballot(cases[0].voting)  # decides the scans that still wait for the filter
-    return vehicle, movers.cells
-
-
 def _moving_cells(survey: Drive, T_map_lidar: F64, point_map: PointMap, grid: Grid, settings: Settings) -> Bool:
     """Cells in which something moved while the map was made."""
-    movers = MoverCells(MovingFilter(survey.sensor, settings.moving), grid)
-    reference = reference_window(point_map, grid)
-    for scan, T in zip(survey, T_map_lidar, strict=True):
-        points = transform(T, scan.points)
-        movers.push(points, T[:3, 3], find_obstacles(points, reference)[0], scan.stamp_ns)
-    movers.flush()
-    return movers.cells
+    cells = np.zeros(grid.shape, dtype=np.bool_)
+    frontend = Frontend(
+        GivenPoses(survey.stamps_ns, T_map_lidar),
+        MovingFilter(survey.sensor, settings.moving),
+        LocalMap(point_map, 2.0 * settings.mapping.reach_m),
+    )
+    for scan in survey:
+        _note_movers(frontend.observe(scan), grid, cells)
+    _note_movers(frontend.finish(), grid, cells)
+    return cells
+
+
+def _note_movers(observations: list[Observation], grid: Grid, cells: Bool) -> None:
+    """Mark the ``cells`` (rows, cols of ``grid``) in which the filter found moving points."""
+    for seen in observations:
+        rows, cols, inside = grid.indices_of(seen.scan.points_map[seen.moving])
+        cells[rows[inside], cols[inside]] = True
 
 
 def _reached_cells(drive: Drive, T_map_lidar: F64, point_map: PointMap, grid: Grid, window_m: float) -> Bool:

@@ -191,6 +191,7 @@ def _local_grid(evaluation: Evaluation, index: int) -> Figure:
     settings = scene.settings.model_copy(update={"voting": voting})
     vehicle = Vehicle(name, drive.sensor, evaluation.first_map, settings, localise=localise)
     vehicle.observe(drive.read_scan(index))
+    vehicle.finish()
     once, grid = ballot_states(vehicle.ballot(), evaluation.first_map)
     x, y = first.T_map_lidar[index, :2, 3]
     window = window_around(evaluation.first_map.lattice, float(x), float(y), voting.window_m)

@@ -1,0 +1,161 @@
+"""The way of a scan, for whoever drives: where was it taken, what stands above the ground, what moves, what was seen.
+
+    localise and de-skew -> to the map's frame -> tell the ground -> tell what moves -> wait -> follow the rays
+
+Vehicles, the making of maps and experiments all go this way. Scans go in one by one; observations come out in the same
+order, each once the moving-object filter has decided it, about a second later.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+
+from mapvote.core.geometry import transform
+from mapvote.core.reference import LocalMap
+from mapvote.core.types import F64, I32, Bool, MapvoteError, Reference, Scan
+from mapvote.localisation.ndt import PosePrior
+from mapvote.localisation.tracker import Fix
+from mapvote.perception.raycast import ScanView, cast_rays, find_obstacles
+
+Localise = Callable[[Scan, PosePrior | None], Fix]
+"""Where was this scan taken? ``Tracker.localise`` by NDT, or ``GivenPoses``. An untrusted fix gives no observation."""
+
+
+class Movers(Protocol):
+    """Which points move: :class:`mapvote.perception.moving_objects.MovingFilter`, or anything with its two methods."""
+
+    def push(self, points_map: F64, origin_map: F64, obstacle: Bool, stamp_ns: int) -> list[Bool]: ...
+
+    def flush(self) -> list[Bool]: ...
+
+
+@dataclass(slots=True)
+class DriveReport:
+    """How a drive went."""
+
+    stamps_ns: list[int] = field(default_factory=list)
+    """Of every scan."""
+    lost: list[int] = field(default_factory=list)
+    """Indices of scans that abstained because the vehicle was not sure where it was."""
+    sigmas_m: list[float] = field(default_factory=list)
+    """Position sigma of each scan that was observed: one that still waits for the filter is not in it yet."""
+    T_map_lidar: list[F64] = field(default_factory=list)
+    """Pose of every scan; of a lost one the best guess."""
+    stage_s: dict[str, list[float]] = field(default_factory=dict)
+    """CPU seconds of every scan by stage: localise, ground, moving, see, and what is made of it (vote). All of it runs
+    on one thread."""
+
+    @property
+    def scans(self) -> int:
+        """How many scans went in."""
+        return len(self.stamps_ns)
+
+    @contextmanager
+    def timed(self, stage: str) -> Iterator[None]:
+        start = time.thread_time()
+        yield
+        self.stage_s.setdefault(stage, []).append(time.thread_time() - start)
+
+
+@dataclass(frozen=True, slots=True)
+class PlacedScan:
+    """A scan in the map's frame."""
+
+    index: int
+    """Its number in the drive; lost scans count."""
+    points_map: F64
+    """(n, 3) map metres, de-skewed."""
+    origin_map: F64
+    """(3,) the sensor, map metres."""
+    sigma_m: float
+    """Standard deviation of the position, metres: the largest over all directions."""
+    reference: Reference
+    """Where its points were told from the ground."""
+    outer: Reference
+    """The planes around the vehicle that ``reference`` was cut from."""
+    obstacle: Bool
+    """(n,) points that stand above the ground of ``reference``; none outside it."""
+    cell: I32
+    """(n,) each point's cell in ``reference``, row * cols + col; -1 outside it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Observation:
+    """What one localised scan saw."""
+
+    scan: PlacedScan
+    moving: Bool
+    """(n,) points of moving objects."""
+    view: ScanView
+    """What was struck and what was seen through, over ``reference.grid``."""
+    reference: Reference
+    """The partial reference map R_i (paper III-A) that the scan is compared with."""
+
+
+class Frontend:
+    """One vehicle's sensor on one drive. Memory is bounded: the scans of a second wait, and the map around the vehicle.
+
+    ``ground`` tells points from the ground, and is where the filter looks; rays are followed in ``compared``, by
+    default the same window. ``localise`` and ``movers`` as above, with a state of their own: fresh ones for each drive.
+    """
+
+    def __init__(self, localise: Localise, movers: Movers, ground: LocalMap, compared: LocalMap | None = None) -> None:
+        self.report = DriveReport()
+        self._localise, self._movers, self._ground, self._compared = localise, movers, ground, compared
+        self._waiting: deque[PlacedScan] = deque()
+        self._ended = False
+
+    def observe(self, scan: Scan, prior: PosePrior | None = None) -> list[Observation]:
+        """Take in one scan; returns the observations that are now decided, of scans that came earlier.
+
+        Raises MapvoteError after :meth:`finish`.
+        """
+        if self._ended:
+            raise MapvoteError("this drive has ended: begin the next one with a new Vehicle")
+        report = self.report
+        report.stamps_ns.append(scan.stamp_ns)
+        with report.timed("localise"):
+            fix = self._localise(scan, prior)
+        report.T_map_lidar.append(fix.registration.T_map_lidar)
+        if not fix.trusted:
+            report.lost.append(report.scans - 1)
+            return []
+        with report.timed("ground"):
+            placed = self._place(fix, report.scans - 1)
+        self._waiting.append(placed)
+        with report.timed("moving"):
+            decided = self._movers.push(placed.points_map, placed.origin_map, placed.obstacle, scan.stamp_ns)
+        return self._see(decided)
+
+    def finish(self) -> list[Observation]:
+        """The drive has ended: the observations that still wait, decided with less than the full look ahead."""
+        self._ended = True
+        return self._see(self._movers.flush())
+
+    def _place(self, fix: Fix, index: int) -> PlacedScan:
+        T_map_lidar = fix.registration.T_map_lidar
+        points_map, origin_map = transform(T_map_lidar, fix.points), T_map_lidar[:3, 3].copy()
+        sigma_m = float(np.sqrt(np.linalg.eigvalsh(fix.registration.covariance[:3, :3])[-1]))
+        reference, outer = self._ground.at(origin_map)
+        obstacle, cell = find_obstacles(points_map, reference)
+        return PlacedScan(index, points_map, origin_map, sigma_m, reference, outer, obstacle, cell)
+
+    def _see(self, decided: list[Bool]) -> list[Observation]:
+        """The oldest scans that wait, one for each mask of moving points (n,)."""
+        out = []
+        for moving in decided:
+            scan = self._waiting.popleft()
+            self.report.sigmas_m.append(scan.sigma_m)
+            with self.report.timed("see"):
+                reference = scan.reference if self._compared is None else self._compared.at(scan.origin_map)[0]
+                cell = scan.cell if self._compared is None else None
+                view = cast_rays(scan.points_map, scan.origin_map, scan.obstacle, moving, reference, cell)
+            out.append(Observation(scan, moving, view, reference))
+        return out

@@ -1,0 +1,102 @@
+"""Every scan that could be localised becomes one observation, in order, with its number in the drive."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from hand_made import make_map, make_tile, wall
+from mapvote.config import MovingSettings
+from mapvote.core.geometry import from_xyz_rpy
+from mapvote.core.point_map import PointMap
+from mapvote.core.reference import LocalMap
+from mapvote.core.sensors import SENSORS
+from mapvote.core.types import F64, Bool, MapvoteError, Registration, Scan
+from mapvote.localisation.ndt import PosePrior
+from mapvote.localisation.tracker import Fix, GivenPoses
+from mapvote.perception.frontend import Frontend, Localise, Observation
+from mapvote.perception.moving_objects import MovingFilter
+
+SECOND = 10**9
+SENSOR = from_xyz_rpy(30.0, 30.0, 1.8)
+POINTS = np.array([[5.0, 0.1, -0.3], [5.0, 0.4, -0.3], [3.0, 0.0, -1.8], [60.0, 0.0, 0.0]], np.float32)
+"""Two points of a wall, one of the road, one beyond the window."""
+
+
+def street() -> PointMap:
+    road = wall([(r, c) for r in range(60, 140) for c in range(60, 140)], [0.0])
+    return make_map({(0, 0): make_tile(np.concatenate([road, wall([(100, 116)], [0.75, 1.05])]))})
+
+
+def drive(frontend: Frontend, scans: int) -> list[Observation]:
+    seen = []
+    for i in range(scans):
+        seen += frontend.observe(Scan(i * SECOND // 4, POINTS))
+    return seen
+
+
+def localise(lost: tuple[int, ...] = ()) -> Localise:
+    def known(scan: Scan, prior: PosePrior | None) -> Fix:
+        registration = Registration(SENSOR, np.diag([0.04, 0.01, 0.01, 0, 0, 0]), 1.0, 1.0, 0, True)
+        return Fix(registration, scan.points, scan.stamp_ns * 4 // SECOND not in lost)
+
+    return known
+
+
+def frontend(lost: tuple[int, ...] = (), compared: LocalMap | None = None) -> Frontend:
+    movers = MovingFilter(SENSORS["hdl32e"], MovingSettings())
+    return Frontend(localise(lost), movers, LocalMap(street(), 40.0), compared)
+
+
+def test_observations_come_in_order_a_second_late_and_the_end_of_the_drive_brings_the_rest() -> None:
+    whole = frontend(lost=(2, 5))
+    early = drive(whole, 9)
+    assert [seen.scan.index for seen in early] == [0, 1, 3, 4], "scan 8 is a second after scan 4"
+    assert [seen.scan.index for seen in whole.finish()] == [6, 7, 8]
+    assert whole.finish() == []
+    assert whole.report.lost == [2, 5]
+    assert whole.report.scans == 9
+    assert len(whole.report.T_map_lidar) == 9
+    with pytest.raises(MapvoteError, match="has ended"):
+        whole.observe(Scan(9 * SECOND, POINTS))
+
+
+def test_an_observation_tells_obstacles_from_the_road_and_how_sure_the_pose_was() -> None:
+    one = frontend()
+    drive(one, 1)
+    [seen] = one.finish()
+    assert seen.scan.obstacle.tolist() == [True, True, False, False]
+    assert (seen.scan.cell >= 0).tolist() == [True, True, True, False]
+    assert not seen.moving.any()
+    assert seen.scan.sigma_m == pytest.approx(0.2), "the worst direction"
+    np.testing.assert_allclose(seen.scan.points_map[0], [35.0, 30.1, 1.5], atol=1e-5)
+    assert seen.view.counts.sum() == 2
+    assert seen.reference is seen.scan.reference
+
+
+def test_the_window_of_comparison_may_be_another_than_that_of_the_ground() -> None:
+    narrow = frontend(compared=LocalMap(street(), 6.0))
+    drive(narrow, 1)
+    [seen] = narrow.finish()
+    assert seen.scan.obstacle.tolist() == [True, True, False, False]
+    assert seen.view.grid == seen.reference.grid
+    assert seen.view.counts.sum() == 0, "the wall stands 5 m off, the window reaches 3 m"
+
+
+class AllMove:
+    """Whatever stands above the ground moves."""
+
+    def push(self, points_map: F64, origin_map: F64, obstacle: Bool, stamp_ns: int) -> list[Bool]:
+        return [obstacle]
+
+    def flush(self) -> list[Bool]:
+        return []
+
+
+def test_what_moves_does_not_count_as_struck_and_given_poses_need_no_prior() -> None:
+    poses = GivenPoses(np.array([0, SECOND]), np.array([SENSOR, SENSOR]))
+    everything = Frontend(poses, AllMove(), LocalMap(street(), 40.0))
+    [seen] = everything.observe(Scan(0, POINTS))
+    assert seen.moving.sum() == 2
+    assert seen.view.counts.sum() == 0
+    assert seen.view.passed.any(), "its rays prove what they passed all the same"
