@@ -29,6 +29,7 @@ from mapvote.core.reference import reference_window
 from mapvote.core.types import F32, F64, Bool, Drive
 from mapvote.core.voxels import voxel_downsample
 from mapvote.formats import open_drive
+from mapvote.perception import moving_objects
 from mapvote.perception.moving_objects import MovingFilter
 from mapvote.simulation import simulate
 
@@ -207,6 +208,28 @@ def draw(points: F32, obstacle: Bool, moving: Bool, things: list[dict[str, objec
     figure.savefig(path, dpi=80)
 
 
+def with_value(settings: MovingSettings, key: str, value: float) -> MovingSettings:
+    """The settings with another value; a constant is changed where it stands."""
+    if not key.isupper():
+        return MovingSettings.model_validate({**settings.model_dump(), key: value})
+    setattr(moving_objects, key, type(getattr(moving_objects, key))(value))
+    return settings
+
+
+def sweep(folder: Path, stride: int, out: Path) -> None:
+    """Precision and recall with every constant halved and doubled, one at a time."""
+    rows = ["constant,value,precision,recall"]
+    for name in [n for n in vars(moving_objects) if n.isupper() and n != "CELL_SIZE"]:
+        usual = getattr(moving_objects, name)
+        for value in (usual, usual / 2, 2 * usual):
+            with_value(MovingSettings(), name, min(value, 1.0) if "SHARE" in name else value)
+            score = score_simulated(folder, stride, MovingSettings(), 0.0)
+            rows.append(f"{name},{getattr(moving_objects, name):g},{score.precision:.4f},{score.recall:.4f}")
+        setattr(moving_objects, name, usual)
+    out.parent.mkdir(parents=True, exist_ok=True)
+    out.write_text("\n".join(rows) + "\n")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scenes", nargs="*", help="SCENARIO:SEED, or a folder that mapvote simulate wrote")
@@ -218,9 +241,14 @@ def main() -> None:
     )
     parser.add_argument("--kitti", type=Path, nargs="*", default=[], help="real drives with poses.txt")
     parser.add_argument("--pictures", type=Path, help="write pictures of the real drives here")
-    parser.add_argument("--set", nargs="*", default=[], metavar="KEY=VALUE", help="settings of the filter")
+    parser.add_argument(
+        "--set", nargs="*", default=[], metavar="KEY=VALUE", help="settings and constants of the filter"
+    )
+    parser.add_argument("--sweep", type=Path, metavar="CSV", help="half and twice of every constant, on the scenes")
     args = parser.parse_args()
-    settings = MovingSettings.model_validate(dict(pair.split("=") for pair in args.set))
+    settings = MovingSettings()
+    for key, value in (pair.split("=") for pair in args.set):
+        settings = with_value(settings, key, float(value))
     if args.scenes:
         print(HEADER)
     for scene in args.scenes:
@@ -232,7 +260,10 @@ def main() -> None:
             if not folder.exists():
                 args.cache.mkdir(parents=True, exist_ok=True)
                 simulate(scenario, folder, int(seed), overrides=sensor)
-        score_simulated(folder, args.stride, settings, args.pose_noise)
+        if args.sweep:
+            sweep(folder, args.stride, args.sweep)
+        else:
+            score_simulated(folder, args.stride, settings, args.pose_noise)
     for path in args.kitti:
         score_kitti(path, settings, args.pictures)
 

@@ -17,6 +17,9 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 
 from mapvote.core.types import MapvoteError
 
+METHOD_VERSION = 2
+"""Goes up whenever a constant or a rule changes by which vehicles vote; the numbers below are only what a user sets."""
+
 
 class Section(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -59,23 +62,9 @@ class NdtSettings(Section):
 class MovingSettings(Section):
     """perception/moving_objects.py ([9])."""
 
-    past_s: float = Field(
-        default=2.0, gt=0, description="how far back a scan may be asked whether it saw through a voxel"
-    )
     lookahead_s: float = Field(default=1.0, ge=0, le=1.0, description="how late a scan is decided")
-    looks_past: int = Field(default=6, ge=1, description="scans asked before")
-    looks_ahead: int = Field(default=5, ge=0, description="scans asked after")
+    past_s: float = Field(default=2.0, gt=0, description="how far back other scans are asked")
     reach_m: float = Field(default=50.0, gt=0, description="points farther away are never called moving")
-    pixel_deg: float = Field(default=0.6, gt=0, description="direction pixel of the free-space look-up")
-    tilt_deg: float = Field(default=4.0, ge=0, description="pitch and roll of the vehicle to allow for")
-    margin_m: float = Field(default=0.5, gt=0, description="a ray that ends this far behind a voxel saw through it")
-    height_m: float = Field(default=0.12, gt=0, description="rays this far above and below a voxel bear witness to it")
-    min_free: int = Field(default=2, ge=1, description="scans that saw through a voxel before it can be called brief")
-    enough: int = Field(default=3, ge=2, description="scans that agree without dissent settle a voxel")
-    free_share: float = Field(default=0.5, description="share of the scans able to see a voxel that saw through it")
-    min_voxels: int = Field(default=4, ge=1, description="brief voxels a moving object has at least")
-    share_whole: float = Field(default=0.5, description="brief share at which connected cells move together")
-    share_part: float = Field(default=0.7, description="the same for what remains beside static cells")
 
 
 class MappingSettings(Section):
@@ -173,9 +162,6 @@ class GateSettings(Section):
 
     reach_m: float = Field(default=50.0, gt=0, description="scans farther from every change see no difference")
     max_scans: int = Field(default=60, gt=0, description="scans compared at most, spread evenly")
-    min_scans: int = Field(default=20, ge=10, description="with fewer the gate abstains")
-    block_scans: int = Field(default=5, ge=1, le=5, description="neighbouring scans that count as one observation")
-    start_m: float = Field(default=0.3, gt=0, description="guesses start this far around the prior pose")
     tolerance_found: float = Field(default=0.02, ge=0, description="allowed loss of the share of scans localised")
     tolerance_inlier_share: float = Field(default=0.01, ge=0, description="allowed loss of inlier share")
     tolerance_score: float = Field(default=0.01, ge=0, description="allowed loss of the NDT score")
@@ -212,8 +198,12 @@ class Settings(Section):
     gate: GateSettings = GateSettings()
 
     def digest(self) -> str:
-        """SHA-256 of what a vehicle votes by: ballots of one round must agree on it, whatever a server's limits are."""
-        return hashlib.sha256(self.model_dump_json(include={"ndt", "moving", "voting"}).encode()).hexdigest()
+        """SHA-256 of what a vehicle votes by: ballots of one round must agree on it, whatever a server's limits are.
+
+        Settings and METHOD_VERSION: two programs that would vote otherwise on the same drive never share a round.
+        """
+        settings = self.model_dump_json(include={"ndt", "moving", "voting"})
+        return hashlib.sha256(f"{METHOD_VERSION} {settings}".encode()).hexdigest()
 
 
 CASES: dict[str, dict[str, bool]] = {

@@ -32,6 +32,33 @@ from mapvote.core.sensors import Sensor
 from mapvote.core.types import F32, F64, I32, Bool
 from mapvote.perception.moving_kernels import look, range_image, together, voxels
 
+# Set on the development streets of the simulator. results/moving_constants.csv says what half and twice of each cost;
+# benchmarks/moving_accuracy.py --sweep measures it.
+LOOKS_PAST = 6
+"""Scans asked before."""
+LOOKS_AHEAD = 5
+"""Scans asked after."""
+PIXEL_DEG = 0.6
+"""Direction pixel of the free-space look-up."""
+TILT_DEG = 4.0
+"""Pitch and roll of the vehicle to allow for."""
+MARGIN_M = 0.5
+"""A ray that ends this far behind a voxel saw through it."""
+HEIGHT_M = 0.12
+"""Rays this far above and below a voxel bear witness to it."""
+MIN_FREE = 2
+"""Scans that saw through a voxel before it can be called brief."""
+ENOUGH = 3
+"""Scans that agree without dissent settle a voxel."""
+FREE_SHARE = 0.5
+"""Share of the scans able to see a voxel that saw through it."""
+MIN_VOXELS = 4
+"""Brief voxels that a moving object has at least."""
+SHARE_WHOLE = 0.5
+"""Brief share at which connected cells move together."""
+SHARE_PART = 0.7
+"""The same for what remains beside static cells."""
+
 
 @dataclass(frozen=True, slots=True)
 class _Scan:
@@ -55,11 +82,10 @@ class MovingFilter:
 
     def __init__(self, sensor: Sensor, settings: MovingSettings) -> None:
         self.settings = settings
-        tilt = settings.tilt_deg
-        self._slope_min = float(np.tan(np.radians(max(sensor.fov_bottom_deg - tilt, -60.0))))
-        slope_max = float(np.tan(np.radians(min(sensor.fov_top_deg + tilt, 60.0))))
-        self._turns = round(360.0 / max(2.0 * sensor.azimuth_step_deg, settings.pixel_deg))
-        self._slope_step = float(np.tan(np.radians(0.5 * settings.pixel_deg)))
+        self._slope_min = float(np.tan(np.radians(max(sensor.fov_bottom_deg - TILT_DEG, -60.0))))
+        slope_max = float(np.tan(np.radians(min(sensor.fov_top_deg + TILT_DEG, 60.0))))
+        self._turns = round(360.0 / max(2.0 * sensor.azimuth_step_deg, PIXEL_DEG))
+        self._slope_step = float(np.tan(np.radians(0.5 * PIXEL_DEG)))
         self._slopes = int(np.ceil((slope_max - self._slope_min) / self._slope_step))
         self._window: deque[_Scan] = deque()
         self._waiting = 0
@@ -115,21 +141,21 @@ class MovingFilter:
                 other.origin_map,
                 self._slope_min,
                 self._slope_step,
-                s.margin_m,
-                s.height_m,
-                s.enough,
+                MARGIN_M,
+                HEIGHT_M,
+                ENOUGH,
                 free,
                 hit,
                 sides,
                 waiting,
             )
             waiting = waiting[:left]
-        seen = free + hit >= s.min_free
-        brief = (sides == 3) & (free >= s.min_free) & (free >= s.free_share * (free + hit))
+        seen = free + hit >= MIN_FREE
+        brief = (sides == 3) & (free >= MIN_FREE) & (free >= FREE_SHARE * (free + hit))
         half = int(np.ceil(s.reach_m / CELL_SIZE)) + 2
         cells = np.floor(scan.samples[:, :2] / CELL_SIZE).astype(np.int64)
         cells -= np.floor(scan.origin_map[:2] / CELL_SIZE).astype(np.int64) - half
-        moves = together(cells[:, 1], cells[:, 0], 2 * half + 1, seen, brief, s.min_voxels, s.share_whole, s.share_part)
+        moves = together(cells[:, 1], cells[:, 0], 2 * half + 1, seen, brief, MIN_VOXELS, SHARE_WHOLE, SHARE_PART)
         mask = scan.voxel_of >= 0
         mask[mask] = moves[scan.voxel_of[mask]]
         return mask
@@ -140,8 +166,8 @@ class MovingFilter:
         Those before and after take turns, the farthest first: they are the likeliest to settle a voxel soon.
         """
         scans = list(self._window)
-        before = _spread(scans[:at], self.settings.looks_past)
-        after = _spread(scans[:at:-1], self.settings.looks_ahead)
+        before = _spread(scans[:at], LOOKS_PAST)
+        after = _spread(scans[:at:-1], LOOKS_AHEAD)
         return [s for pair in zip_longest(before, after) for s in pair if s is not None]
 
 

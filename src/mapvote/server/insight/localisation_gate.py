@@ -1,4 +1,4 @@
-"""The localisation gate: a version in which vehicles find themselves worse is not published (issue 4; PEERS 7).
+"""The localisation gate: a version in which vehicles find themselves worse is not published.
 
 The judge is a reference drive: scans with rough poses, recorded lately and not among those that voted. Every scan is
 localised in the old map and in the new one, from the same guesses, and the two are compared in pairs.
@@ -25,6 +25,12 @@ from mapvote.localisation.tracker import MapWindow
 from mapvote.server.insight.changes import changed_cells
 
 Verdict = Literal["pass", "hold", "abstain"]
+MIN_SCANS = 20
+"""With fewer scans near a change the gate abstains: the t distribution's bound is then wider than any tolerance."""
+BLOCK_SCANS = 5
+"""Neighbouring scans that count as one observation: at 10 Hz they meet the same surfaces."""
+START_M = 0.3
+"""Guesses start this far around the prior pose."""
 _START_ANGLES = np.radians([90.0, 210.0, 330.0])
 
 
@@ -99,13 +105,13 @@ def gate(old: PointMap, new: PointMap, drive: Drive, settings: GateSettings, ndt
         raise MapvoteError(f"{drive.path}: the gate needs a drive with prior poses (prior.txt, or --prior FILE)")
     near = scans_near(old, new, drive.T_map_lidar_prior, settings.reach_m)
     chosen = near[np.unique(np.linspace(0, len(near) - 1, min(len(near), settings.max_scans)).astype(np.int64))]
-    if len(chosen) < settings.min_scans:
+    if len(chosen) < MIN_SCANS:
         reason = (
             f"only {len(near)} of {len(drive)} scans of {drive.vehicle}/{drive.drive_id} were taken within "
-            f"{settings.reach_m:g} m of what changed; the gate needs {settings.min_scans}"
+            f"{settings.reach_m:g} m of what changed; the gate needs {MIN_SCANS}"
         )
         return GateResult("abstain", (reason,), len(drive), len(near), 0, ())
-    pairs = localise_in_both(old, new, drive, [int(i) for i in chosen], settings, ndt)
+    pairs = localise_in_both(old, new, drive, [int(i) for i in chosen], ndt)
     measures = compare(pairs, settings)
     verdict, reasons = decide(measures)
     return GateResult(verdict, reasons, len(drive), len(near), len(chosen), measures)
@@ -128,7 +134,7 @@ def scans_near(old: PointMap, new: PointMap, T_map_lidar_prior: F64, reach_m: fl
 
 
 def localise_in_both(
-    old: PointMap, new: PointMap, drive: Drive, scans: Sequence[int], settings: GateSettings, ndt: NdtSettings
+    old: PointMap, new: PointMap, drive: Drive, scans: Sequence[int], ndt: NdtSettings
 ) -> list[tuple[Localised, Localised]]:
     """(in the old map, in the new map) of each scan, de-skewed by the motion of the prior poses."""
     assert drive.T_map_lidar_prior is not None
@@ -138,8 +144,7 @@ def localise_in_both(
         clouds = thin_for_levels(deskew(drive.read_scan(i), _prior_twist(drive, i)), ndt)
         prior = drive.T_map_lidar_prior[i]
         guesses = [
-            prior @ from_xyz_rpy(settings.start_m * np.cos(a), settings.start_m * np.sin(a), 0.0, 0.0, 0.0, 0.0)
-            for a in _START_ANGLES
+            prior @ from_xyz_rpy(START_M * np.cos(a), START_M * np.sin(a), 0.0, 0.0, 0.0, 0.0) for a in _START_ANGLES
         ]
         in_old, in_new = (_localise(window, clouds, prior, guesses, ndt) for window in windows)
         pairs.append((in_old, in_new))
@@ -157,7 +162,7 @@ def compare(pairs: Sequence[tuple[Localised, Localised]], settings: GateSettings
     out = []
     for name, field, sign, tolerance in kinds:
         olds, news = (np.array([getattr(pair[side], field) for pair in pairs]) for side in (0, 1))
-        blocks = np.array([b.mean() for b in np.array_split(sign * (news - olds), len(pairs) // settings.block_scans)])
+        blocks = np.array([b.mean() for b in np.array_split(sign * (news - olds), len(pairs) // BLOCK_SCANS)])
         spread = float(blocks.std(ddof=1)) / np.sqrt(len(blocks))
         uncertainty = float(stdtrit(len(blocks) - 1, 0.95)) * spread
         gain = float(sign * (news.mean() - olds.mean()))
