@@ -48,6 +48,13 @@ class Traffic:
         out: F64 = (1.0 - share) * self._paths[bodies, whole] + share * self._paths[bodies, whole + 1]
         return out
 
+    def tails(self, stamp_s: float) -> F64:
+        """(bodies, 3) map points half a metre above the ground where each body ends, 2.5 m behind its middle."""
+        everyone = np.arange(len(self._paths))
+        x, y, yaw = self.poses(everyone, np.full(len(everyone), stamp_s)).T
+        x, y = x - 2.5 * np.cos(yaw), y - 2.5 * np.sin(yaw)
+        return np.column_stack([x, y, self._terrain.height(x, y) + 0.5])
+
     def mesh(self, stamp_s: float, T_map_lidar: F64, rate_hz: float | None, reach_m: float) -> tuple[F32, I32]:
         """Triangles (m, 3, 3) in the map of the bodies within ``reach_m``, and the body each belongs to, (m,).
 

@@ -19,6 +19,7 @@ from mapvote.core.sensors import SENSORS, Sensor
 from mapvote.core.types import F32, F64, I32, U8, MapvoteError
 from mapvote.formats.drives.kitti import DriveWriter, write_poses
 from mapvote.simulation.actors import Traffic, make_traffic
+from mapvote.simulation.flaws import Hits, Kinds, spoil
 from mapvote.simulation.lidar import Caster, measure, sweep
 from mapvote.simulation.processes import processes
 from mapvote.simulation.routes import Route, make_routes
@@ -83,6 +84,7 @@ class Stage:
     routes: tuple[Route, ...]
     ground: F64
     """(rows, cols) of the scored window."""
+    kinds: Kinds
 
 
 @lru_cache(maxsize=1)
@@ -91,7 +93,11 @@ def _stage(scenario: Scenario, seed: int) -> Stage:
     model = SENSORS[scenario.sensor]
     sensor = replace(model, rate_hz=max(model.rate_hz, scenario.rate_hz))
     routes = tuple(make_routes(scenario, world.terrain, seed))
-    return Stage(scenario, seed, sensor, world, routes, ground_cells(world, truth_grid(scenario)))
+    glazed, painted = (
+        np.array([body.kind == kind for body in world.bodies], dtype=np.bool_) for kind in ("building", "parked car")
+    )
+    kinds = Kinds(glazed, painted, seed)
+    return Stage(scenario, seed, sensor, world, routes, ground_cells(world, truth_grid(scenario)), kinds)
 
 
 @lru_cache(maxsize=1)
@@ -182,13 +188,20 @@ def _drive(task: _Task) -> tuple[I32, I32]:
         T_map_lidar = route.poses(np.array([stamp_s]))[0]
         turning = sensor.rate_hz if scenario.motion_distortion else None
         bodies = Caster(*traffic.mesh(stamp_s, T_map_lidar, turning, sensor.max_range_m))
-        near, _, body_cosine = bodies.cast(rays.origins, rays.directions)
+        near, passing, body_cosine = bodies.cast(rays.origins, rays.directions)
         moving = near < ranges
         ranges, cosine = np.where(moving, near, ranges), np.where(moving, body_cosine, cosine)
-        noisy, kept = measure(sensor, ranges, cosine, rng)
+        hits = Hits(ranges, np.where(moving, passing, objects), cosine, moving)
+        reported, false, lost = spoil(
+            rays, hits, stage.kinds, (still, bodies), traffic.tails(stamp_s), sensor, scenario.flaws,
+            np.random.default_rng(np.random.SeedSequence([seed, 7, drive, index])),
+        )  # fmt: skip
+        noisy, kept = measure(sensor, reported, cosine, rng)
+        kept &= ~lost
         writer.write_scan(index, noisy[kept, None] * rays.directions_lidar[kept], cosine[kept])
+        moving = moving & ~false
         np.save(folder / "truth" / route.name / "moving" / f"{index:06d}.npy", moving[kept])
-        solid = kept & ~moving
+        solid = kept & ~moving & ~false
         points = rays.origins[solid] + ranges[solid, None] * rays.directions[solid]
         count_hits(points, objects[solid], roles, stage.ground, CELL_SIZE, GROUND_MARGIN_M, counts)
     where = np.flatnonzero(counts).astype(np.int32)

@@ -45,6 +45,11 @@ class Caster:
         ranges = np.where(missed, np.float32(np.inf), hit["tfar"])
         return ranges, self._owners[hit["primID"]], cosine.astype(np.float32)
 
+    def normals(self, origins: F32, directions: F32) -> F32:
+        """(n, 3) unit normals of the surfaces that these rays hit, each of which must hit one."""
+        normals = self._scene.run(origins, directions, output=1)["Ng"]
+        return (normals / (np.linalg.norm(normals, axis=1, keepdims=True) + 1e-12)).astype(np.float32)
+
 
 @dataclass(frozen=True)
 class Sweep:

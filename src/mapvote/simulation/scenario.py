@@ -49,6 +49,25 @@ class Clutter(_Table):
     gantry_m: tuple[float, ...] = ()
 
 
+class Flaws(_Table):
+    """What the LiDAR gives besides the truth (simulation/flaws.py). Nothing of it: all shares 0."""
+
+    reflection_share: float = Field(
+        default=0.001,
+        ge=0,
+        le=0.1,
+        description="share of a scan's points that came over a mirror: wet road, glass, cars",
+    )
+    mixed_share: float = Field(
+        default=0.5, ge=0, le=1, description="share of the rays at an edge that report a mixture"
+    )
+    wet_share: float = Field(default=0.05, ge=0, le=1, description="share of the road that is wet, in patches of 2 m")
+    glass_share: float = Field(default=0.15, ge=0, le=1, description="share of the facades that is glass, in panes")
+    dark_share: float = Field(default=0.15, ge=0, le=1, description="share of the vehicles with dark paint")
+    rain: float = Field(default=0.0, ge=0, le=1, description="share of the rays that meet a drop near the sensor")
+    exhaust: float = Field(default=0.0, ge=0, le=1, description="share of the moving bodies with a plume behind them")
+
+
 class Scenario(_Table):
     """A street, what changes on it, who drives there and what they carry."""
 
@@ -71,6 +90,7 @@ class Scenario(_Table):
     temporary_cars: int = Field(default=0, ge=0, description="extra cars parked during one vehicle's pass only")
     traffic: Traffic = Traffic()
     clutter: Clutter = Clutter()
+    flaws: Flaws = Flaws()
     changes: tuple[Change, ...] = ()
 
 
