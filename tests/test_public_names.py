@@ -15,6 +15,11 @@ def test_every_public_name_is_there() -> None:
         mapvote.no_such_name  # noqa: B018
 
 
+def test_dir_lists_the_public_names_and_nothing_else() -> None:
+    assert dir(mapvote) == sorted(mapvote.__all__)
+    assert {"build_map", "vote_drive", "update_map", "map_from_points"} <= set(dir(mapvote))
+
+
 def test_importing_the_package_loads_nothing_heavy() -> None:
     code = "import sys, mapvote; print('numba' in sys.modules, 'numpy' in sys.modules)"
     assert subprocess.check_output([sys.executable, "-c", code], text=True).split() == ["False", "False"]

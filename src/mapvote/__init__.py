@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from mapvote.config import Settings as Settings
     from mapvote.config import load_settings as load_settings
     from mapvote.core.point_map import PointMap as PointMap
+    from mapvote.core.point_map import map_from_points as map_from_points
     from mapvote.core.types import CellState as CellState
     from mapvote.core.types import Drive as Drive
     from mapvote.core.types import MapvoteError as MapvoteError
@@ -37,6 +38,7 @@ _HOME = {
     "Vehicle": "vehicle",
     "build_map": "slam.build",
     "load_settings": "config",
+    "map_from_points": "core.point_map",
     "open_drive": "formats",
     "read_map": "formats",
     "simulate": "simulation",
@@ -50,4 +52,17 @@ __all__ = sorted(_HOME)
 def __getattr__(name: str) -> Any:
     if name not in _HOME:
         raise AttributeError(f"module 'mapvote' has no attribute {name!r}")
-    return getattr(import_module(f"mapvote.{_HOME[name]}"), name)
+    try:
+        return getattr(import_module(f"mapvote.{_HOME[name]}"), name)
+    except ModuleNotFoundError as error:
+        from mapvote.core.types import MapvoteError
+        from mapvote.formats.extras import missing_extra
+
+        mend = missing_extra(error)
+        if mend is None:
+            raise
+        raise MapvoteError(f"mapvote.{name}: {mend}") from error
+
+
+def __dir__() -> list[str]:
+    return __all__

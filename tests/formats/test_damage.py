@@ -158,7 +158,7 @@ def test_the_command_line_says_one_line_about_a_damaged_laz_file(tmp_path: Path,
     damage_count(content)
     path = tmp_path / "bad.laz"
     path.write_bytes(content)
-    out = ["--out", tmp_path / "out"] if verb == "import" else []
+    out = [tmp_path / "out"] if verb == "import" else []
     done = subprocess.run(mapvote(verb, path, *out), capture_output=True, text=True, check=False, timeout=60)
     assert done.returncode == 1
     assert len(done.stderr.strip().splitlines()) == 1

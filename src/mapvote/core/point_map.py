@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from mapvote.core.grid import Lattice, TileIndex, tile_of_cells
 from mapvote.core.ground import Heights, lay_ground
+from mapvote.core.picture import html_picture
 from mapvote.core.tile import Tile
 from mapvote.core.types import F32, F64, MapvoteError
 
@@ -19,7 +20,7 @@ _CHUNK = 1_000_000
 """Points looked at together: a large cloud is never copied as a whole."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, repr=False)
 class PointMap:
     """A whole map. Edited tiles make a new PointMap; tiles themselves never change."""
 
@@ -28,6 +29,14 @@ class PointMap:
     tiles: Mapping[TileIndex, Tile]
     georeference: Mapping[str, str] = field(default_factory=dict)
     """Free text carried along (CRS, projector, origin)."""
+
+    def __repr__(self) -> str:
+        points = sum(len(tile.points) for tile in self.tiles.values())
+        return f"PointMap({self.map_id!r}: {points:,} points in {len(self.tiles)} tiles)"
+
+    def _repr_html_(self) -> str:
+        """The line of ``repr`` over a small picture from above, for notebooks."""
+        return html_picture(repr(self), self.tiles.values())
 
     def tile(self, index: TileIndex) -> Tile:
         """One tile; the empty one where the map has none."""

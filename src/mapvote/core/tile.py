@@ -11,10 +11,10 @@ import numpy as np
 from mapvote.core.columns import column_bits
 from mapvote.core.grid import CELLS, Grid, TileIndex
 from mapvote.core.ground import base_layers
-from mapvote.core.types import F32, F64, I32, I64, U64, Bool
+from mapvote.core.types import F32, F64, I32, I64, U64, Bool, check_array
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Tile:
     """76.8 m x 76.8 m of map. ``points`` are the product; the planes are what the map knows besides.
 
@@ -29,6 +29,16 @@ class Tile:
     """(256, 256) height of the ground, map metres; NaN where unknown. Fixed when the map is first built."""
     free: U64 | None = None
     """(256, 256) column words of voxels known to be free (see core.columns), or None if never learned."""
+
+    def __post_init__(self) -> None:
+        check_array(self.points, "Tile.points", (None, 3), np.float32)
+        check_array(self.ground_z, "Tile.ground_z", self.window.shape, np.float32, finite=False)
+        if self.free is not None:
+            check_array(self.free, "Tile.free", self.window.shape, np.uint64)
+
+    def __repr__(self) -> str:
+        row, col = self.index
+        return f"Tile({row}, {col}: {len(self.points):,} points)"
 
     @classmethod
     def empty(cls, window: Grid) -> Tile:

@@ -9,9 +9,10 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from enum import IntEnum
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
 from mapvote.core.grid import Grid
 from mapvote.core.sensors import Sensor
@@ -28,6 +29,19 @@ Bool = NDArray[np.bool_]
 
 class MapvoteError(Exception):
     """What a user can mend: the message says what, where and how. Printed without a traceback, exit code 1."""
+
+
+def check_array(array: Any, name: str, shape: tuple[int | None, ...], dtype: DTypeLike, finite: bool = True) -> None:
+    """MapvoteError unless ``array`` has this dtype and shape (None: any length) and, if ``finite``, no NaN or inf."""
+    wanted = f"{name}: expected {np.dtype(dtype)} ({', '.join('n' if side is None else str(side) for side in shape)})"
+    if not isinstance(array, np.ndarray):
+        raise MapvoteError(f"{wanted}, got a {type(array).__name__}")
+    like = tuple(is_ if side is None else side for is_, side in zip(array.shape, shape, strict=False))
+    if array.dtype != dtype or array.ndim != len(shape) or array.shape != like:
+        raise MapvoteError(f"{wanted}, got {array.dtype} {array.shape}")
+    if finite and not np.isfinite(array).all():
+        bad = np.argwhere(~np.isfinite(array))
+        raise MapvoteError(f"{name}: {len(bad)} numbers are not finite, the first at {bad[0].tolist()}; leave them out")
 
 
 class CellState(IntEnum):
@@ -57,6 +71,12 @@ class Scan:
     intensity: F32 | None = None
     """(n,) in [0, 1], where known."""
 
+    def __post_init__(self) -> None:
+        check_array(self.points, "Scan.points", (None, 3), np.float32)
+        for name, values in (("Scan.time_s", self.time_s), ("Scan.intensity", self.intensity)):
+            if values is not None:
+                check_array(values, name, (len(self.points),), np.float32)
+
 
 @dataclass(frozen=True, slots=True)
 class Drive:
@@ -75,6 +95,12 @@ class Drive:
     prior_sigma_m: float = 1.0
     prior_sigma_deg: float = 1.0
     T_base_lidar: F64 = field(default_factory=lambda: np.eye(4))
+
+    def __post_init__(self) -> None:
+        check_array(self.stamps_ns, "Drive.stamps_ns", (None,), np.int64)
+        check_array(self.T_base_lidar, "Drive.T_base_lidar", (4, 4), np.float64)
+        if self.T_map_lidar_prior is not None:
+            check_array(self.T_map_lidar_prior, "Drive.T_map_lidar_prior", (len(self.stamps_ns), 4, 4), np.float64)
 
     def __len__(self) -> int:
         return len(self.stamps_ns)

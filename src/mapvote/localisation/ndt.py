@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from mapvote.config import NdtLevel, NdtSettings
 from mapvote.core.geometry import exp, log
-from mapvote.core.types import F64, Drive, Registration
+from mapvote.core.types import F64, Drive, Registration, check_array
 from mapvote.core.voxels import thin
 from mapvote.localisation.ndt_kernels import add, normal_equations, reindex
 
@@ -102,6 +102,9 @@ class PosePrior:
     T_map_lidar: F64
     sigma_m: float
     sigma_rad: float
+
+    def __post_init__(self) -> None:
+        check_array(self.T_map_lidar, "T_map_lidar of the prior", (4, 4), np.float64)
 
     @classmethod
     def of(cls, drive: Drive, i: int) -> PosePrior | None:
