@@ -58,10 +58,18 @@ class Score:
         self.seconds += other.seconds
         return self
 
+    @property
+    def precision(self) -> float:
+        return self.right / max(self.found, 1)
+
+    @property
+    def recall(self) -> float:
+        return self.right / max(self.moving, 1)
+
     def row(self, name: str) -> str:
         return (
             f"{name:24} {self.points:11,} {self.moving / max(self.points, 1):7.1%} "
-            f"{self.right / max(self.found, 1):9.4f} {self.right / max(self.moving, 1):7.4f} "
+            f"{self.precision:9.4f} {self.recall:7.4f} "
             f"{1e3 * float(np.median(self.seconds)):6.2f}"
         )
 
