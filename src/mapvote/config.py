@@ -35,7 +35,7 @@ class NdtLevel(Section):
 
 
 class NdtSettings(Section):
-    """localisation/ndt.py and localisation/tracker.py (METHOD 5)."""
+    """localisation/ndt.py and localisation/tracker.py (docs/decisions/localisation.md)."""
 
     levels: tuple[NdtLevel, ...] = (
         NdtLevel(voxel_m=3.0, floor_m=0.5, points_m=1.0, iterations=15),
@@ -89,7 +89,7 @@ Occlusion = Literal["first_hit", "farthest_return", "column"]
 
 
 class VotingSettings(Section):
-    """The paper's rule, and which of its cases (paper III, V). ``method = "columns"`` is METHOD 4."""
+    """The paper's rule, and which of its cases (paper III, V). ``method = "columns"``: docs/method.md."""
 
     method: Literal["paper", "columns"] = "columns"
     weighted: bool = Field(default=True, description="multiple votes per scan by Eq. (1); false: one vote per scan")
@@ -100,7 +100,7 @@ class VotingSettings(Section):
         description='what case 5 skips: "bottom", cells where the map begins above the view at that range; '
         '"height", the literal reading: cells where the map reaches higher than the scan\'s points',
     )
-    occlusion: Occlusion = Field(default="first_hit", description="what counts as seen to be empty (METHOD 2)")
+    occlusion: Occlusion = Field(default="first_hit", description="what counts as seen to be empty")
     a: float = 2.0
     b: float = 3.0
     k: float = 0.5
@@ -134,7 +134,7 @@ class VotingSettings(Section):
 
 
 class FuseSettings(Section):
-    """fusion/fuse.py: which votes count, how many are enough (DESIGN 4). A version records the ones it was made by."""
+    """fusion/fuse.py: which votes count, how many are enough. A version records the ones it was made by."""
 
     min_votes: int = Field(default=2, ge=1, description="vehicles that a change needs: k + 1 against k liars")
     max_contradiction: float = Field(

@@ -1,4 +1,4 @@
-"""A map without known-free columns: where its ground was measured, an obstacle would have been seen (issue 3)."""
+"""A map without known-free columns: where its ground was measured, an obstacle would have been seen."""
 
 from __future__ import annotations
 

@@ -42,7 +42,7 @@ def test_table_i_server_row() -> None:
 
 
 def test_table_i_contradicts_equation_1() -> None:
-    """METHOD 1: by Eq. (1) 25 changed-occupied scans are worth at least 50 votes, not the 33 that the text says, and
+    """By Eq. (1) 25 changed-occupied scans are worth at least 50 votes, not the 33 that the text says, and
     vehicle 3's 18 are worth at least 36, which beats its 22 undetermined ones. We keep Eq. (1)."""
     assert 25 * float(vote_weight(5)) >= 50 > 33
     least = TABLE_I * np.array([2, 1, 2, 1, 1])

@@ -1,4 +1,4 @@
-"""What a drive's evidence amounts to, rule by rule (METHOD 4, C to I)."""
+"""What a drive's evidence amounts to, rule by rule (C to I)."""
 
 from __future__ import annotations
 

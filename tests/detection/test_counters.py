@@ -1,4 +1,4 @@
-"""Counters in bit planes against plain counting, and what strikes or clears a mapped voxel (METHOD 4, A and B)."""
+"""Counters in bit planes against plain counting, and what strikes or clears a mapped voxel (rules A and B)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The server's half of the paper (IV), and DESIGN 4's rules on votes, points and order."""
+"""The server's half of the paper (IV), and the rules on votes, points and order (docs/decisions/voting.md)."""
 
 from __future__ import annotations
 
@@ -252,7 +252,7 @@ def test_silenced_cells_count_for_nothing() -> None:
 
 
 def plain_rule(votes: list[int], rule: Rule, min_votes: int) -> int:
-    """The state of one cell, in the plainest words (paper IV, DESIGN 4): what the kernels must agree with."""
+    """The state of one cell, in the plainest words (paper IV): what the kernels must agree with."""
     tally = [votes.count(state) for state in range(5)]
     contenders = tally[:4] if rule == "columns" else tally
     best = max(contenders)

@@ -1,4 +1,4 @@
-"""Ballot <-> bytes: all that passes between vehicle and server (DESIGN 2).
+"""Ballot <-> bytes: all that passes between vehicle and server (docs/decisions/data.md).
 
 A msgpack envelope of zstd-compressed planes. Reading checks every size before it allocates; planes that
 a newer format adds are ignored, required fields that are missing are refused.

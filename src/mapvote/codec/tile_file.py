@@ -1,4 +1,4 @@
-"""Map tile <-> bytes: what lies in a map folder and what the server sends (DESIGN 2, 5)."""
+"""Map tile <-> bytes: what lies in a map folder and what the server sends (docs/decisions/data.md)."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class _TileFile(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def content_hash(tile_points: F32) -> str:
-    """SHA-256 of a tile's points: free space learned later changes no published point (DESIGN 2)."""
+    """SHA-256 of a tile's points: free space learned later changes no published point (docs/decisions/data.md)."""
     return hashlib.sha256(np.ascontiguousarray(tile_points, dtype="<f4").tobytes()).hexdigest()
 
 

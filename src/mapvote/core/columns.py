@@ -1,4 +1,4 @@
-"""Columns of evidence: every 0.3 m cell is one 64-bit word, bit i = voxel i of that column (METHOD 4).
+"""Columns of evidence: every 0.3 m cell is one 64-bit word, bit i = voxel i of that column (docs/decisions/columns.md).
 
 Voxels lie on the world lattice: layer = floor(z / 0.3). Bit 0 is the layer that holds the ground of the
 cell (``base``), so words follow the terrain and 64 bits reach 19.2 m above the road; the top bit
@@ -14,7 +14,7 @@ from mapvote.core.grid import CELL_SIZE
 from mapvote.core.types import F32, F64, I32, I64, U64, Bool
 
 GROUND_MARGIN_M = 0.3
-"""Points lower than this above the ground are ground: they never make a cell occupied (METHOD 2)."""
+"""Points lower than this above the ground are ground: they never make a cell occupied (docs/decisions/paper.md)."""
 TOP_BIT = 63
 
 

@@ -111,7 +111,7 @@ class Drive:
 
 @dataclass(frozen=True, slots=True)
 class Registration:
-    """A pose and how far to trust it (METHOD 5: a lost vehicle must never demolish a street)."""
+    """A pose and how far to trust it (a lost vehicle must never demolish a street)."""
 
     T_map_lidar: F64
     covariance: F64

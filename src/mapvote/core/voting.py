@@ -54,7 +54,7 @@ def verdict(uo: int, ue: int, co: int, ce: int, un: int, abstain: bool) -> int:
     """The rule: the class with most votes wins, a tie is UNDETERMINED, no votes are NO_VOTE (paper III-B, IV).
 
     Votes by :class:`CellState`. With ``abstain``, UNDETERMINED does not compete, and a change also needs more than
-    half of all other votes (DESIGN 4, "enough votes").
+    half of all other votes (docs/decisions/voting.md).
     """
     best = max(max(uo, ue), max(co, ce))
     if not abstain:

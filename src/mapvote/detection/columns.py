@@ -1,4 +1,4 @@
-"""From the evidence of a drive to votes (METHOD 4, rules C to I): sums over the voxels that matter in each cell.
+"""From the evidence of a drive to votes (docs/method.md, rules C to I): sums over the voxels that matter in each cell.
 
 A cell's votes are numbers of (scan, voxel) pairs: mapped voxels struck speak for unchanged-occupied, mapped voxels
 seen through for changed-empty, free voxels struck for changed-occupied, and seen through for unchanged-empty. What is

@@ -1,4 +1,4 @@
-"""One scan against the reference: a state per cell (paper III-A, III-B; METHOD 2)."""
+"""One scan against the reference: a state per cell (paper III-A, III-B)."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def classify_paper(
 
     A cell with n_min points or more is occupied and worth w(n), Eq. (1); with 1 to n_min - 1 undetermined; with none
     empty if it was visible, else undetermined. NO_VOTE where no ray was fired, and, in case 5 (``skip_tall_cells``),
-    where the map begins above the sensor's view at that range (METHOD 2). ``origin_map`` (3,): the sensor, map metres.
+    where the map begins above the sensor's view at that range. ``origin_map`` (3,): the sensor, map metres.
     """
     states = np.empty(view.counts.shape, dtype=np.uint8)
     weights = np.empty(view.counts.shape, dtype=np.int32)

@@ -26,7 +26,7 @@ class Evaluation:
     """The numbers, and what pictures need."""
 
     result: dict[str, Any]
-    """What ``--json`` writes (DESIGN 6)."""
+    """What ``--json`` writes."""
     scene: Scene
     truth: Truth
     window: Grid

@@ -1,4 +1,4 @@
-"""Delete and add points of one tile (paper IV, last paragraphs of DESIGN 4). Everything else stays bit-identical."""
+"""Delete and add points of one tile (paper IV). Everything else stays bit-identical."""
 
 from __future__ import annotations
 

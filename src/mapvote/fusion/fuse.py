@@ -1,4 +1,4 @@
-"""Ballots of a tile -> decisions -> edited tile (paper IV, DESIGN 4). Pure: no files, no database, no clock.
+"""Ballots of a tile -> decisions -> edited tile (paper IV). Pure: no files, no database, no clock.
 
 The order in which votes are given never matters: tallies are integer sums, and of several points for one voxel the
 same one is always taken.
@@ -53,7 +53,7 @@ def rule_of(method: str) -> Rule:
 
 
 def count(votes: Sequence[TileVote], rule: Rule, min_votes: int) -> tuple[U8, NDArray[Any]]:
-    """(states, tally) of one vote per vehicle: the rule of core.voting, then the quorum (DESIGN 4, "enough votes").
+    """(states, tally) of one vote per vehicle: the rule of core.voting, then the quorum (docs/decisions/voting.md).
 
     ``paper``: undetermined competes and a plain majority decides. ``columns``: undetermined abstains and a change
     needs a majority of the vehicles that determined the cell. A change that fewer than ``min_votes`` vehicles back is

@@ -1,5 +1,5 @@
 """Who is not heard on a tile: a vehicle that says the opposite of the others nearly everywhere, or nearly wherever
-something changed (DESIGN 4, liars).
+something changed (docs/decisions/voting.md).
 
 A majority of 2k + 1 vehicles outvotes k that lie, but a change also needs k + 1 to back it: k who lie lend their votes
 to whatever error a single honest vehicle makes, or cost every change that one honest vehicle missed. So a vehicle is

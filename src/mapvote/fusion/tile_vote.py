@@ -1,4 +1,4 @@
-"""What one vehicle says of one tile (paper IV): which of its drives speak, and as one vote (DESIGN 4).
+"""What one vehicle says of one tile (paper IV): which of its drives speak, and as one vote (docs/decisions/voting.md).
 
 Pure, and in no order that matters: drives fold by a commutative rule.
 """
@@ -95,7 +95,7 @@ D = TypeVar("D", bound=Dated)
 
 
 def select(votes: Iterable[D], settings: FuseSettings) -> list[D]:
-    """The votes inside the window (DESIGN 4): drives within ``max_age_days`` of the newest on this tile, then those
+    """The votes inside the window: drives within ``max_age_days`` of the newest on this tile, then those
     of the ``latest_vehicles`` vehicles that passed last. Ties between vehicles go to the later name."""
     votes = list(votes)
     if not votes:

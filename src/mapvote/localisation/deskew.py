@@ -1,4 +1,4 @@
-"""Motion within a scan: what was measured at other moments, moved to the scan's stamp (METHOD 5)."""
+"""Motion within a scan: what was measured at other moments, moved to the scan's stamp."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""NDT: a map of Gaussians, and the pose at which a scan fits it best (paper II; METHOD 5).
+"""NDT: a map of Gaussians, and the pose at which a scan fits it best (paper II).
 
 Magnusson, The Three-Dimensional Normal-Distributions Transform, 2009, with three changes: every voxel's
 distribution is widened by an isotropic floor instead of an eigenvalue clamp; Gauss-Newton steps on the

@@ -1,4 +1,4 @@
-"""Where the vehicle is, scan after scan: predict, register, judge, recover (paper II; METHOD 5).
+"""Where the vehicle is, scan after scan: predict, register, judge, recover (paper II).
 
 A vehicle that does not trust its pose abstains: a lost vehicle must never demolish a street.
 """

@@ -1,4 +1,4 @@
-"""What one scan saw, passed through and could not see, as planes over the local grid (paper III-A; METHOD 2, 4).
+"""What one scan saw, passed through and could not see, as planes over the local grid (paper III-A).
 
 Rays are gathered into fans of about a beam's width in azimuth. A fan is walked once over the cells
 it crosses; in each cell, every ray that is still on its way marks the voxels between its height on
@@ -232,7 +232,7 @@ def cast_rays(
 
     ``points_map`` (n, 3) and ``origin_map`` (3,) map metres; ``obstacle`` (n,) as :func:`find_obstacles` gives it
     (which also gives ``cell``, if it is not to be computed again). Points of ``moving`` objects occlude but do not
-    occupy (METHOD 2); the rays of ground points prove emptiness above the ground.
+    occupy (docs/decisions/paper.md); the rays of ground points prove emptiness above the ground.
     """
     if cell is None:
         _, cell = find_obstacles(points_map, reference)

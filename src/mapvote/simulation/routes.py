@@ -1,4 +1,4 @@
-"""How vehicles move through the street, and what they believe about it (METHOD 3, priors)."""
+"""How vehicles move through the street, and what they believe about it (docs/decisions/truth.md)."""
 
 from __future__ import annotations
 

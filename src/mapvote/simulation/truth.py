@@ -1,4 +1,4 @@
-"""What really changed, from the simulator alone (METHOD 3): two definitions, cell by cell.
+"""What really changed, from the simulator alone (docs/decisions/truth.md): two definitions, cell by cell.
 
 **strict** comes from a noise-free survey: dense rays from the true poses of all drives, into the street
 before and the street after. A cell gained if a built body's surface lies in it where nothing was before, and

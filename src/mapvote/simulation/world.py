@@ -17,7 +17,7 @@ from mapvote.simulation.terrain import KERB_M, MARGIN_M, SIDEWALK_M, Terrain, ma
 
 
 class Role(IntEnum):
-    """What a body means for the truth (METHOD 3)."""
+    """What a body means for the truth (docs/decisions/truth.md)."""
 
     KEPT = 0
     ADDED = 1

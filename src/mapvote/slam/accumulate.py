@@ -1,4 +1,4 @@
-"""Scans at known poses become a map: points without moving objects, ground, known-free columns (METHOD 4 D, remedy 2).
+"""Scans at known poses become a map: points without moving objects, ground, known-free columns.
 
 A draft of the map gives the ground and says which voxels anything ever struck. Every voxel's scans are then counted:
 in how many was it struck, in how many seen through. What was struck only rarely by scans that could have struck it is

@@ -1,4 +1,4 @@
-"""NDT SLAM: drives become the first reference map (paper I, II; [7], [9]; METHOD 5).
+"""NDT SLAM: drives become the first reference map (paper I, II; [7], [9]).
 
 Two passes. The first finds where the vehicles were: each scan is registered to the NDT map grown so far, drives
 one after the other into the same map; then all poses are settled together, so that precise priors (a survey

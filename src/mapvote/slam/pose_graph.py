@@ -1,4 +1,4 @@
-"""Poses that agree best with the motion measured between them and with what was known of each (METHOD 3).
+"""Poses that agree best with the motion measured between them and with what was known of each.
 
 Registration to a growing map is smooth but drifts; a survey prior does not drift but is rough. Gauss-Newton on
 SE(3) over the whole trajectory keeps the shape of the one in the frame of the other. Source: Barfoot, State Estimation

@@ -106,7 +106,7 @@ def test_false_points_leave_the_states_right_and_delete_whole_columns() -> None:
 @pytest.mark.parametrize("name", ATTACKS)
 @pytest.mark.parametrize("k", [1, 2, 3])
 def test_k_liars_decide_nothing_among_k_plus_1_honest_vehicles_that_agree(name: str, k: int) -> None:
-    """Where all honest vehicles say the same, min_votes = k + 1 decides and deletes as without the liars (DESIGN 4).
+    """Where all honest vehicles say the same, min_votes = k + 1 decides and deletes as without the liars.
 
     What liars can still do is to add a point in the voxel above or below one that the honest saw: a voxel counts as
     supported by whoever saw its neighbour.

@@ -1,4 +1,4 @@
-"""The drive folder as DESIGN 2 lays it out, read back with nothing but numpy and tomllib."""
+"""The drive folder as docs/decisions/data.md lays it out, read back with nothing but numpy and tomllib."""
 
 from __future__ import annotations
 

@@ -65,7 +65,7 @@ def make_world() -> tuple[PointMap, PointMap]:
 
 @dataclass
 class FakeServer:
-    """Answers the routes that the page asks for with the shapes of DESIGN 5, and notes every request."""
+    """Answers the routes that the page asks for with the shapes that the server gives, and notes every request."""
 
     answers: dict[str, Any]
     key: str | None = None

@@ -1,4 +1,4 @@
-"""Un-vote after publication (DESIGN 4): the map becomes, byte for byte, that of a history without the vehicle."""
+"""Un-vote after publication: the map becomes, byte for byte, that of a history without the vehicle."""
 
 from __future__ import annotations
 

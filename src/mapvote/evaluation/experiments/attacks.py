@@ -1,4 +1,4 @@
-"""Vehicles that lie (issue 3): an honest ballot in, a false one out. All liars tell the same lie, the worst for a vote.
+"""Vehicles that lie: an honest ballot in, a false one out. All liars tell the same lie, the worst for a vote.
 
 Pure functions of the ballot, the map it voted on, and of another vehicle's ballot for those who replay it.
 """

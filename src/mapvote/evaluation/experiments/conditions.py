@@ -1,5 +1,5 @@
 """What drives are put through that they did not meet when they were recorded: to see what the method can bear, and
-which of its stages holds it back (issue 3, the experiments and the oracles)."""
+which of its stages holds it back."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A map that came without known-free columns, and what the fleet teaches it (issue 3; METHOD 4, D).
+"""A map that came without known-free columns, and what the fleet teaches it (docs/method.md, rule D).
 
 Rounds are held in turn: what one round of ballots makes of the map, its points and its known-free columns, is what
 the next one votes on.

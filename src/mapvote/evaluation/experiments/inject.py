@@ -1,4 +1,4 @@
-"""Changes injected into a real map (METHOD 4, "on real streets"): the street stays, the map is made to lie.
+"""Changes injected into a real map: the street stays, the map is made to lie.
 
 Points cut out of the map are an object that the vehicles will find *built*; a phantom box of points where the map
 knows free space is one that they will find *demolished*. The cut voxels are marked free: had the object not stood
@@ -146,7 +146,7 @@ class InjectionScores:
     """How well one case found the injected objects of one kind."""
 
     cell_recall: float
-    """Share of the true cells found: the reached ones, as the strict truth of simulation has it (METHOD 3)."""
+    """Share of the true cells found: the reached ones, as the strict truth of simulation has it."""
     found: int
     """Objects of which at least half of those cells were found."""
     objects: int

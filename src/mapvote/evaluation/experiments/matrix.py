@@ -1,4 +1,4 @@
-"""The experiments of issue 3: what is put to the vote, on which drives, under which conditions.
+"""The experiments: what is put to the vote, on which drives, under which conditions.
 
 An experiment on one street is one result, kept as JSON under a name that says what it depends on: a run that was cut
 short goes on where it stopped, and experiments that share drives, maps or ballots share them in the cache.

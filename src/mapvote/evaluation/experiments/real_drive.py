@@ -1,4 +1,4 @@
-"""A real street, driven once, that did not change (METHOD 4, "on real streets"; paper VI asks for it).
+"""A real street, driven once, that did not change (paper VI asks for it).
 
 The map comes from alternating blocks of a drive's scans, three vehicles from the blocks between, every third scan
 each. All is still one pass: same viewpoints, same parked cars, minutes at most between map and vote. What is

@@ -1,4 +1,4 @@
-"""Mean, spread and worst over seeds, and what must hold (issue 3), as Markdown and JSON."""
+"""Mean, spread and worst over seeds, and what must hold, as Markdown and JSON."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What must hold on unseen seeds (issue 3), asked of the matrix's results."""
+"""What must hold on unseen seeds, asked of the matrix's results."""
 
 from __future__ import annotations
 

@@ -18,7 +18,7 @@ from mapvote.evaluation.scoring.cells import CLASSES, ratio
 from mapvote.formats.atomic import whole_file
 
 Result = Mapping[str, Any]
-"""What ``evaluate --json`` writes (DESIGN 6)."""
+"""What ``evaluate --json`` writes."""
 HEADINGS = {"unchanged": "unchanged", "changed_occupied": "changed (occ.)", "changed_empty": "changed (empty)"}
 
 

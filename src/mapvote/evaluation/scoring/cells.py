@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from mapvote.core.types import NO_VOTE, U8, Bool, CellState
 
 CLASSES = ("unchanged", "changed_occupied", "changed_empty")
-"""The paper's three scored classes; the position is the value in a truth grid (DESIGN 6)."""
+"""The paper's three scored classes; the position is the value in a truth grid."""
 UNSCORED = 255
 """In a truth grid: this cell is not counted."""
 
@@ -43,7 +43,7 @@ class Scores:
 
     @property
     def macro_f1(self) -> float:
-        """Unweighted mean of the three F1: what Table IV holds (METHOD 1)."""
+        """Unweighted mean of the three F1: what Table IV holds (docs/decisions/paper.md)."""
         return sum(self.f1) / 3.0
 
     @property
@@ -52,7 +52,7 @@ class Scores:
         return harmonic_mean(sum(self.precision) / 3.0, sum(self.recall) / 3.0)
 
     def to_dict(self) -> dict[str, object]:
-        """R of ``evaluate --json`` (DESIGN 6)."""
+        """R of ``evaluate --json``."""
         return {
             "precision": dict(zip(CLASSES, self.precision, strict=True)),
             "recall": dict(zip(CLASSES, self.recall, strict=True)),
@@ -63,7 +63,7 @@ class Scores:
 
 
 def classes_of(states: U8) -> U8:
-    """Five states to the three scored classes (METHOD 2): undetermined and never seen count as unchanged."""
+    """Five states to the three scored classes: undetermined and never seen count as unchanged."""
     out = np.zeros(states.shape, dtype=np.uint8)
     out[states == CellState.CHANGED_OCCUPIED] = 1
     out[states == CellState.CHANGED_EMPTY] = 2

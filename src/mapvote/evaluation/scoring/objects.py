@@ -14,7 +14,7 @@ from mapvote.evaluation.scoring.cells import UNSCORED, classes_of, ratio
 
 @dataclass(frozen=True, slots=True)
 class ObjectScores:
-    """Connected changes against the truth (issue 3, "objects")."""
+    """Connected changes against the truth."""
 
     found: tuple[bool, ...]
     """Per true object: at least half of its changed truth cells were decided so."""

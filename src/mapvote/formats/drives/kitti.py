@@ -1,4 +1,4 @@
-"""Drive folders in KITTI's layout (DESIGN 2): velodyne/NNNNNN.bin, times.txt, prior.txt, drive.toml.
+"""Drive folders in KITTI's layout (docs/decisions/data.md): velodyne/NNNNNN.bin, times.txt, prior.txt, drive.toml.
 
 KITTI odometry's sequences are read as they come; their poses are camera poses and are converted with calib.txt.
 """

@@ -1,4 +1,4 @@
-"""A mapvote map on disk: a folder of tiles and one manifest, written whole, verified when read (DESIGN 2).
+"""A mapvote map on disk: a folder of tiles and one manifest, written whole, verified when read.
 
 ``manifest.json`` holds the lattice, the georeference and of every tile its file, its content hash (points), the
 hash of its known-free columns and the SHA-256 of its bytes. ``tiles/ROW_COL.tile`` is core.tilecode's envelope.

@@ -1,4 +1,4 @@
-"""What operators ask: publish, roll back, and look at what changed and why (DESIGN 5)."""
+"""What operators ask: publish, roll back, and look at what changed and why."""
 
 from __future__ import annotations
 

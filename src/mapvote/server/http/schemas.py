@@ -1,4 +1,4 @@
-"""What is asked and answered by HTTP, and the one table from errors to status codes (DESIGN 5)."""
+"""What is asked and answered by HTTP, and the one table from errors to status codes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Changed cells -> change objects: what was built, what was demolished, as GeoJSON in map metres (DESIGN 4, 5).
+"""Changed cells -> change objects: what was built, what was demolished, as GeoJSON in map metres.
 
 What changed is read off the two maps themselves, so it holds between any two versions, rollbacks included. The
 decisions in between say who voted for it. Objects are found on the lattice, not in tiles.

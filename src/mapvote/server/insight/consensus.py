@@ -1,4 +1,4 @@
-"""Does a vehicle contradict the others far more often than they contradict each other? (issue 4; PEERS 11)
+"""Does a vehicle contradict the others far more often than they contradict each other?
 
 Three things make this honest. A cell that looks different before and after a vehicle passed may simply have changed:
 a vote is compared only where others say the same both before it and after it. Neighbouring cells fail together: what

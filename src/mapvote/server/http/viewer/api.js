@@ -1,4 +1,4 @@
-// The server's answers (DESIGN 5). Every request goes to this server only; the key lives in this tab only.
+// The server's answers. Every request goes to this server only; the key lives in this tab only.
 
 const STORAGE = "mapvote-key";
 const BASE = location.origin + location.pathname;  // without a user and password that the address may hold
