@@ -1,4 +1,4 @@
-"""Evidence per voxel over a drive: in how many scans was it struck, in how many seen through (docs/method.md, rules A-C).
+"""Evidence per voxel over a drive: in how many scans was it struck, in how many seen through (rules A-C).
 
 Two counters a voxel, kept as bit planes: plane k of a cell is a 64-bit word that holds bit k of the
 counts of its 64 voxels, so that one scan adds to a whole column with a few word operations. A voxel that the map
