@@ -6,7 +6,7 @@ A vehicle that does not trust its pose abstains: a lost vehicle must never demol
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -120,7 +120,7 @@ class Tracker:
     def _guess_motion(self, ndt_map: NdtMap, scan: Scan, seed: F64, prior: PosePrior | None) -> F64:
         """The forward speed at which the first scan fits the map best: unknown motion bends it by half a metre."""
         few = thin(scan.points, self.settings.levels[0].points_m)
-        sample = replace(scan, points=scan.points[few], time_s=None if scan.time_s is None else scan.time_s[few])
+        sample = Scan(scan.stamp_ns, scan.points[few], None if scan.time_s is None else scan.time_s[few])
         twists = [np.array([speed, 0.0, 0.0, 0.0, 0.0, 0.0]) for speed in _SPEEDS_MPS]
         return max(twists, key=lambda twist: refine(ndt_map, self._clouds(sample, twist), seed, prior).score)
 
