@@ -62,6 +62,16 @@ def _tell(report: BuildReport, out: Path) -> None:
             d = track.drift
             line += f"; off its prior by {d.median_m:.3f} m (median), {d.max_m:.3f} m (most), {d.median_deg:.2f} deg"
         print(line)
+        print(f"{track.vehicle}: {track.heights}")
+        if track.heights.complaint:
+            print(f"warning: {track.vehicle}: {track.heights.complaint}")
+    if report.two_levels is not None:
+        x, y, apart = report.two_levels
+        print(
+            f"warning: two levels were driven above each other, {apart:.1f} m apart at ({x:.1f}, {y:.1f}). A cell has "
+            "one ground: it keeps the road whose path is nearer, below both the lower one; who drives the other cannot "
+            "vote there. (Less than a metre apart it is one road, mapped twice: the drives' heights do not agree.)"
+        )
     frame = "held in its frame by a precise prior" if report.held_by_prior else "not held by any precise prior"
     print(f"{out}: {report.points} points, {frame}")
 

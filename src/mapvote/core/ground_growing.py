@@ -29,9 +29,10 @@ _NOISE_M = 0.06
 """Of a voxel's mean height: range and pose noise, a cobble."""
 _CLIMB, _FALL = 0.15, 0.5
 """Steepest ground, metres per metre. A steeper rise is a thing that stands there; a steep fall must be a broad one."""
-_BROAD = 8
-"""Cells of the 24 around that hold points at a like height, before ground falls steeply or goes on beyond a gap."""
+_BROAD = 12
+"""Cells of the 24 around that fall as steeply, before a steep fall is ground."""
 _BEYOND_GAP = 2
+"""Cells of them that hold points at a like height, before the ground goes on beyond a gap."""
 
 
 @numba.njit(cache=True, nogil=True, inline="always")
@@ -58,8 +59,10 @@ def _bounds(tile: int, row: int, col: int, ground: F32, gap: U8, neighbours: I32
 
 
 @numba.njit(cache=True, nogil=True)
-def _like(tile: int, row: int, col: int, z: float, grade: float, start: I64, heights: F32, neighbours: I32) -> int:
-    """How many of the 24 cells around hold a point at the height ``z``, give or take noise and ``grade``."""
+def _like(
+    tile: int, row: int, col: int, z: float, grade: float, below: float, start: I64, heights: F32, neighbours: I32
+) -> int:
+    """How many of the 24 cells around hold a point ``below`` and at the height ``z``, give or take noise and grade."""
     found = 0
     for i in range(-2, 3):
         for j in range(-2, 3):
@@ -68,7 +71,7 @@ def _like(tile: int, row: int, col: int, z: float, grade: float, start: I64, hei
                 continue
             most = _NOISE_M + grade * CELL_SIZE * max(abs(i), abs(j))
             for k in range(start[other], start[other + 1]):
-                if abs(heights[k] - z) <= most:
+                if abs(heights[k] - z) <= most and heights[k] < below:
                     found += 1
                     break
     return found
@@ -95,9 +98,9 @@ def _continued(
         if steep <= z < low and not falls >= z:
             falls = z
     if np.isfinite(best):
-        broad = near or _like(tile, row, col, best, _CLIMB, start, heights, neighbours) >= _BEYOND_GAP
+        broad = near or _like(tile, row, col, best, _CLIMB, np.inf, start, heights, neighbours) >= _BEYOND_GAP
         return best if broad else np.nan
-    if np.isfinite(falls) and _like(tile, row, col, falls, _FALL, start, heights, neighbours) >= _BROAD:
+    if np.isfinite(falls) and _like(tile, row, col, falls, _FALL, low, start, heights, neighbours) >= _BROAD:
         return falls
     return np.nan
 

@@ -29,6 +29,8 @@ class PointMap:
     tiles: Mapping[TileIndex, Tile]
     georeference: Mapping[str, str] = field(default_factory=dict)
     """Free text carried along (CRS, projector, origin)."""
+    driven: tuple[F64, ...] = ()
+    """(n, 3) the sensor's positions along each drive that the map was made of, map metres; none where nobody knows."""
 
     def __repr__(self) -> str:
         points = sum(len(tile.points) for tile in self.tiles.values())

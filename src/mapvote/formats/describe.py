@@ -9,6 +9,7 @@ import numpy as np
 
 from mapvote.codec.ballot import Ballot, decode, unpack_points, unpack_states
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS
+from mapvote.core.heights import check_heights
 from mapvote.core.point_map import PointMap, all_points
 from mapvote.core.types import CellState, Drive, MapvoteError
 from mapvote.formats import open_drive, read_map
@@ -58,6 +59,7 @@ def _map(point_map: PointMap) -> Rows:
         ("ground", f"known in {known:.0%} of the tiles' cells"),
         ("known free", f"learned in {len(learned)} tiles" if learned else "never learned"),
     ]
+    rows += [(f"drive {k}", str(check_heights(point_map, path))) for k, path in enumerate(point_map.driven, 1)]
     return rows + [(f"georeference: {name}", text.strip()) for name, text in point_map.georeference.items()]
 
 

@@ -9,7 +9,7 @@ lays them at their settled poses: de-skewed, without moving objects, one point p
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -17,6 +17,7 @@ from scipy.spatial import cKDTree
 from mapvote.config import MappingSettings, Settings
 from mapvote.core.geometry import inverse, rotation_angle, transform
 from mapvote.core.grid import Lattice
+from mapvote.core.heights import Heights, check_heights, two_levels
 from mapvote.core.point_map import PointMap, map_from_points
 from mapvote.core.types import F64, I64, Bool, Drive, MapvoteError
 from mapvote.core.voxels import VoxelCloud, thin
@@ -28,6 +29,9 @@ from mapvote.slam.pose_graph import Anchors, Links, optimise
 from mapvote.slam.road import all_roads, road_under
 
 Progress = Callable[[int, int], None]
+MOST_OFF = 0.3
+"""Share of a path that may disagree with the ground by more than 0.3 m before the map is refused: below, it is a place
+(a bridge over another drive, a stretch without points); above, something is wrong with the drive."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,6 +57,8 @@ class DriveTrack:
     length_m: float
     drift: Drift | None
     """Against the prior, where there is one."""
+    heights: Heights
+    """Of the sensor over the map's ground."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,6 +69,9 @@ class BuildReport:
     points: int
     held_by_prior: bool
     """Whether a precise prior fixed the map's frame; otherwise the first scan's prior, or the origin, did."""
+    two_levels: tuple[float, float, float] | None
+    """(x, y, metres apart) where drives ran above each other, the farthest apart: of the two, each cell keeps the road
+    whose path is nearer, below both the lower one. None if nowhere."""
 
 
 def build_map(
@@ -87,10 +96,13 @@ def build_map(
     layer = Layer(map_from_points(cloud, lattice=surveyor.draft.lattice, road=road), settings, road)
     for drive, T_map_lidar, mask in zip(drives, poses, registered, strict=True):
         layer.lay(drive, T_map_lidar, mask, count)
-    point_map = layer.finish()
-    tracks = tuple(_track(drive, T, mask) for drive, T, mask in zip(drives, poses, registered, strict=True))
+    driven = tuple(T[mask][:, :3, 3] for T, mask in zip(poses, registered, strict=True))
+    point_map = replace(layer.finish(), driven=driven)
+    heights = [_agreed_heights(drive, point_map, path) for drive, path in zip(drives, driven, strict=True)]
+    tracks = tuple(_track(*each) for each in zip(drives, poses, registered, heights, strict=True))
     held = any(_is_precise(drive, settings.mapping) for drive in drives)
-    return point_map, BuildReport(tracks, sum(len(tile.points) for tile in point_map.tiles.values()), held)
+    points = sum(len(tile.points) for tile in point_map.tiles.values())
+    return point_map, BuildReport(tracks, points, held, two_levels(road) if len(road) else None)
 
 
 class _Surveyor:
@@ -203,7 +215,18 @@ def _is_precise(drive: Drive, settings: MappingSettings) -> bool:
     return drive.T_map_lidar_prior is not None and drive.prior_sigma_m <= settings.precise_prior_m
 
 
-def _track(drive: Drive, T_map_lidar: F64, registered: Bool) -> DriveTrack:
+def _agreed_heights(drive: Drive, point_map: PointMap, positions: F64) -> Heights:
+    """Heights of a drive's positions (n, 3) over the ground; MapvoteError if that cannot be the road under them."""
+    heights = check_heights(point_map, positions)
+    if heights.off_share > MOST_OFF:
+        raise MapvoteError(
+            f"{drive.path}: {heights.complaint}. Such a map would be wrong without a word: do the drives' heights "
+            "agree (one datum, no drift in z), and is z up? `mapvote doctor` tells; else build the drives apart"
+        )
+    return heights
+
+
+def _track(drive: Drive, T_map_lidar: F64, registered: Bool, heights: Heights) -> DriveTrack:
     length = float(np.linalg.norm(np.diff(T_map_lidar[:, :3, 3], axis=0), axis=1).sum())
     drift = None
     if drive.T_map_lidar_prior is not None:
@@ -211,7 +234,7 @@ def _track(drive: Drive, T_map_lidar: F64, registered: Bool) -> DriveTrack:
         off = np.linalg.norm(T_map_lidar[:, :3, 3] - prior[:, :3, 3], axis=1)
         turn = [rotation_angle(inverse(a) @ b) for a, b in zip(prior, T_map_lidar, strict=True)]
         drift = Drift(float(np.median(off)), float(off.max()), float(off[-1]), float(np.degrees(np.median(turn))))
-    return DriveTrack(drive.vehicle, drive.drive_id, T_map_lidar, registered, length, drift)
+    return DriveTrack(drive.vehicle, drive.drive_id, T_map_lidar, registered, length, drift, heights)
 
 
 def _counter(progress: Progress | None, total: int) -> Callable[[], None]:

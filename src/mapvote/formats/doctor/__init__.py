@@ -13,7 +13,7 @@ from mapvote.formats import open_drive
 from mapvote.formats.doctor.basics import check_prior, check_scans, check_times
 from mapvote.formats.doctor.finding import Finding
 from mapvote.formats.doctor.frames import UPS, check_frames, check_up, up_axis
-from mapvote.formats.doctor.overlap import check_overlap
+from mapvote.formats.doctor.overlap import check_ground, check_overlap
 from mapvote.formats.drives.options import DriveOptions
 
 __all__ = ["Finding", "examine"]
@@ -33,6 +33,7 @@ def examine(
             drive = open_drive(path, **asdict(replace(options, prior="none")))
         except MapvoteError:
             return found
+    found += [] if point_map is None else check_ground(point_map)
     found += check_times(drive)
     if drive.T_map_lidar_prior is not None:
         found += check_prior(drive)
@@ -53,10 +54,12 @@ def examine(
         found += check_scans(drive, list(scans.values()))
         up, depth_m = up_axis([s.points for s in scans.values()])
         found += check_up(up, depth_m)
+        if up == "+z":
+            found.append(Finding("note", f"by the scans themselves the sensor stands {depth_m:.1f} m over the road"))
         # With another axis up, whatever else seems wrong may be its consequence.
         if up == "+z" and drive.T_map_lidar_prior is not None and len(drive) > 1:
             found += check_frames(drive, drive.T_map_lidar_prior, UPS[up], depth_m)
             if point_map is not None:
-                found += check_overlap(drive.T_map_lidar_prior, scans, point_map)
+                found += check_overlap(drive.T_map_lidar_prior, scans, point_map, drive.prior_sigma_m)
     order = {"error": 0, "warning": 1, "note": 2}
     return sorted(found, key=lambda f: order[f.severity])

@@ -10,17 +10,21 @@ import hashlib
 from pathlib import Path
 
 import msgspec
+import numpy as np
 
+from mapvote.codec.arrays import pack_plane, unpack_bytes
 from mapvote.codec.ballot import tile_key
 from mapvote.codec.tile_file import content_hash, decode_tile, encode_tile, free_hash
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Lattice
 from mapvote.core.point_map import PointMap
-from mapvote.core.types import MapvoteError
+from mapvote.core.types import F64, MapvoteError
 from mapvote.formats.atomic import whole_folder
 
 MANIFEST = "manifest.json"
 FORMAT = "mapvote-map"
 FORMAT_VERSION = 1
+MAX_PATH_BYTES = 240_000_000
+"""Ten million scans: eleven days at 10 Hz."""
 
 
 class TileEntry(msgspec.Struct, frozen=True, kw_only=True):
@@ -44,6 +48,8 @@ class Manifest(msgspec.Struct, frozen=True, kw_only=True):
     y0: float
     georeference: dict[str, str]
     tiles: list[TileEntry]
+    driven: list[bytes] = []
+    """Positions of the sensor along each drive, (n, 3) float64, zstd."""
 
 
 def is_map_folder(path: Path) -> bool:
@@ -80,6 +86,7 @@ def write_map_folder(point_map: PointMap, path: Path) -> None:
             y0=point_map.lattice.y0,
             georeference=dict(sorted(point_map.georeference.items())),
             tiles=entries,
+            driven=[pack_plane(path) for path in point_map.driven],
         )
         (folder / MANIFEST).write_bytes(msgspec.json.format(msgspec.json.encode(manifest), indent=1) + b"\n")
 
@@ -123,4 +130,13 @@ def read_map_folder(path: Path) -> PointMap:
                 f"{path / MANIFEST}: tile {tile_key(entry.tile)} contradicts its file; copy the map again"
             )
         tiles[entry.tile] = tile
-    return PointMap(manifest.map_id, lattice, tiles, manifest.georeference)
+    driven = tuple(_positions(data, path) for data in manifest.driven)
+    return PointMap(manifest.map_id, lattice, tiles, manifest.georeference, driven)
+
+
+def _positions(data: bytes, path: Path) -> F64:
+    """(n, 3) one driven path of the manifest of the map folder at ``path``."""
+    flat = np.frombuffer(unpack_bytes(data, MAX_PATH_BYTES, f"{path / MANIFEST}: driven"), dtype="<f8")
+    if len(flat) % 3 or not np.isfinite(flat).all():
+        raise MapvoteError(f"{path / MANIFEST}: a driven path is not whole; copy the map again")
+    return flat.reshape(-1, 3)
