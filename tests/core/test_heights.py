@@ -43,7 +43,7 @@ def test_a_stretch_where_the_ground_sank_is_named_with_its_place() -> None:
 
 
 def test_beyond_the_map_nothing_is_known_and_it_says_so() -> None:
-    off = path(1.73) + [1000.0, 0.0, 0.0]
+    off = path(1.73) + np.array([1000.0, 0.0, 0.0])
     assert np.isnan(heights_over_ground(street(), off)).all()
     assert check_heights(street(), off).complaint == "the map knows no ground under the path"
     assert "unknown under" in str(check_heights(street(), path(1.73, 120.0)))
@@ -57,4 +57,4 @@ def test_a_drive_over_a_bridge_that_it_passed_below_is_two_levels() -> None:
     assert abs(x - 40.0) < 1.0
     assert abs(y) < 1.0
     assert two_levels(below) is None
-    assert two_levels(np.vstack([below, below + [0.0, 0.2, 0.05]])) is None
+    assert two_levels(np.vstack([below, below + np.array([0.0, 0.2, 0.05])])) is None
