@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
@@ -79,11 +80,13 @@ def make_ballot(
     settings_hash: str = SETTINGS,
     map_id: str | None = None,
     base: Mapping[TileIndex, str] | None = None,
+    version: int | Literal["of the map"] | None = "of the map",
 ) -> Ballot:
     hashes = {tile: base_hash(point_map.tiles.get(tile)) for tile in says} | dict(base or {})
     return Ballot(
         map_id=map_id or point_map.map_id,
         base={tile_key(tile): digest for tile, digest in hashes.items()},
+        version=point_map.version if version == "of the map" else version,
         vehicle=vehicle,
         drive=drive,
         start_ns=end_ns - 1_000_000_000,

@@ -102,7 +102,7 @@ class MapClient:
         lattice = Lattice(manifest.lattice.x0, manifest.lattice.y0)
         tiles = {_index(key): self._tile(lattice.tile(_index(key)), planes) for key, planes in manifest.tiles.items()}
         self.version = manifest.version
-        return PointMap(manifest.map_id, lattice, tiles, manifest.georeference)
+        return PointMap(manifest.map_id, lattice, tiles, manifest.georeference, version=manifest.version)
 
     def send(self, ballot: Ballot | bytes) -> Sent:
         """Send a ballot; "spooled" if the server cannot be reached now. MapvoteError if it refuses the ballot."""

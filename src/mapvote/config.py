@@ -152,8 +152,23 @@ class FuseSettings(Section):
     latest_vehicles: int = Field(default=9, ge=1, description="only the last so many vehicles on a tile count")
     max_age_days: float = Field(default=30.0, gt=0, description="and drives so much older than its newest do not")
     min_age_s: float = Field(default=0.0, ge=0, description="a ballot waits so long before it counts (time to un-vote)")
+    stay_days: float = Field(
+        default=30.0, gt=0, description="a new thing enters the map once it can be expected to stay so long"
+    )
+    prior_stay_days: float = Field(
+        default=30.0,
+        ge=0,
+        description="how long what is new is expected to stay where nothing is known to come and go; less than "
+        "stay_days: it must be seen for the difference first",
+    )
     max_deleted_share: float = Field(
-        default=0.5, ge=0, le=1, description="hold a version that deletes more of the points of the tiles it touches"
+        default=0.5, ge=0, le=1, description="hold a version that deletes more of the points of any tile"
+    )
+    max_change_m2: float = Field(
+        default=500.0, ge=0, description="hold a version in which one connected thing is larger that comes or goes"
+    )
+    max_freed_share: float = Field(
+        default=0.5, ge=0, le=1, description="hold one that learns free space in more of a tile that knew of some"
     )
 
 

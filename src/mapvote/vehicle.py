@@ -106,6 +106,7 @@ def write_ballot(
     points, votes, two_stage = new_points.by_tile(), voter.votes(), settings.voting.two_stage
     return Ballot(
         map_id=point_map.map_id,
+        version=point_map.version,
         base={tile_key(tile): _base_hash(point_map, tile) for tile in votes},
         vehicle=vehicle,
         drive=drive,

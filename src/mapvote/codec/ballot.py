@@ -58,6 +58,9 @@ class Ballot(msgspec.Struct, frozen=True, kw_only=True):
     map_id: _Text
     base: dict[str, _Hash]
     """Content hash of every tile the votes were cast against, by "row,col"; "" for a tile the map lacked."""
+    version: Annotated[int, msgspec.Meta(ge=1, le=(1 << 31) - 1)] | None = None
+    """Of the map that the vehicle drove with. None: of an older mapvote, or cast against a map that does not say; it is
+    the last version whose tiles have these hashes."""
     vehicle: Id
     drive: Id
     start_ns: int

@@ -9,6 +9,7 @@ import numpy as np
 
 from mapvote.codec.arrays import pack_plane, unpack_plane
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Grid
+from mapvote.core.memory import PLANES, Memory
 from mapvote.core.tile import Tile
 from mapvote.core.types import F32, U64, MapvoteError
 
@@ -27,6 +28,7 @@ class _TileFile(msgspec.Struct, frozen=True, kw_only=True):
     points: bytes
     ground_z: bytes
     free: bytes | None = None
+    memory: bytes | None = None
 
 
 def content_hash(tile_points: F32) -> str:
@@ -48,6 +50,7 @@ def encode_tile(tile: Tile) -> bytes:
             points=pack_plane(tile.points, _LEVEL),
             ground_z=pack_plane(tile.ground_z, _LEVEL),
             free=None if tile.free is None else pack_plane(tile.free, _LEVEL),
+            memory=None if tile.memory is None else pack_plane(tile.memory.planes, _LEVEL),
         )
     )
 
@@ -68,4 +71,10 @@ def decode_tile(data: bytes, window: Grid, what: str = "tile") -> Tile:
         raise MapvoteError(f"{what}: holds a point outside the tile or not finite; fetch it again")
     ground_z = unpack_plane(file.ground_z, "<f4", _SHAPE, f"{what}: ground_z")
     free = None if file.free is None else unpack_plane(file.free, "<u8", _SHAPE, f"{what}: free")
-    return Tile(window, points, ground_z, free)
+    memory = None if file.memory is None else unpack_memory(file.memory, f"{what}: memory")
+    return Tile(window, points, ground_z, free, memory)
+
+
+def unpack_memory(data: bytes, what: str) -> Memory:
+    """What a tile remembers, of its packed planes; MapvoteError if damaged."""
+    return Memory(unpack_plane(data, "<u4", (PLANES, *_SHAPE), what))

@@ -31,6 +31,8 @@ class PointMap:
     """Free text carried along (CRS, projector, origin)."""
     driven: tuple[F64, ...] = ()
     """(n, 3) the sensor's positions along each drive that the map was made of, map metres; none where nobody knows."""
+    version: int | None = None
+    """How often the map was published; ballots name it. None: of a format that does not say."""
 
     def __repr__(self) -> str:
         points = sum(len(tile.points) for tile in self.tiles.values())

@@ -11,6 +11,7 @@ import numpy as np
 from mapvote.core.columns import column_bits
 from mapvote.core.grid import CELLS, Grid, TileIndex
 from mapvote.core.ground import base_layers
+from mapvote.core.memory import Memory
 from mapvote.core.types import F32, F64, I32, I64, U64, Bool, check_array
 
 
@@ -29,6 +30,8 @@ class Tile:
     """(256, 256) height of the ground, map metres; NaN where unknown. Fixed when the map is first built."""
     free: U64 | None = None
     """(256, 256) column words of voxels known to be free (see core.columns), or None if never learned."""
+    memory: Memory | None = None
+    """When each cell last changed; None: not since the map's first version."""
 
     def __post_init__(self) -> None:
         check_array(self.points, "Tile.points", (None, 3), np.float32)
@@ -47,7 +50,7 @@ class Tile:
 
     def __reduce__(self) -> tuple[Any, ...]:
         """What was worked out does not travel to other processes."""
-        return Tile, (self.window, self.points, self.ground_z, self.free)
+        return Tile, (self.window, self.points, self.ground_z, self.free, self.memory)
 
     @property
     def index(self) -> TileIndex:

@@ -50,6 +50,7 @@ def _map(point_map: PointMap) -> Rows:
     known = float(np.mean([np.isfinite(t.ground_z).mean() for t in tiles]))
     rows = [
         ("map id", point_map.map_id),
+        ("version", str(point_map.version or "unknown")),
         ("points", f"{len(points):,}"),
         ("tiles", f"{len(point_map.tiles)} of {TILE_CELLS * CELL_SIZE:.1f} m"),
         ("x", f"{low[0]:.2f} to {high[0]:.2f} m"),
@@ -97,6 +98,7 @@ def _ballot(ballot: Ballot, size: int) -> Rows:
         ("vehicle", ballot.vehicle),
         ("drive", f"{ballot.drive}, {seconds:.1f} s"),
         ("map id", ballot.map_id),
+        ("version", str(ballot.version or "unknown")),
         ("method", f"{ballot.method}, settings {ballot.settings_hash[:16]}"),
         ("scans", f"{ballot.scans_localised} of {ballot.scans} voted, median sigma {ballot.median_sigma_m:.3f} m"),
         ("tiles", str(len(ballot.tiles))),

@@ -6,7 +6,7 @@ same one is always taken.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -20,7 +20,9 @@ from mapvote.core.types import F32, I32, I64, N_STATES, NO_VOTE, U8, U64, Bool, 
 from mapvote.core.voting import VOTE_UNIT, add_states, add_tally, decide_cells
 from mapvote.fusion.edit import add_points, delete_points
 from mapvote.fusion.outliers import ASKED, contradicting, denying
+from mapvote.fusion.persistence import doubtful, remembered, temporary
 from mapvote.fusion.sparse_columns import Words, at_least, counted, packed
+from mapvote.fusion.spent import changed_in
 from mapvote.fusion.tile_vote import TileVote, one_each
 
 Rule = Literal["paper", "columns"]
@@ -87,13 +89,34 @@ def _states_of(votes: Sequence[TileVote], cells: slice | NDArray[np.intp] = slic
     return np.stack(planes) if planes else np.empty((0, CELLS), dtype=np.uint8)[:, cells]
 
 
-def fuse_tile(tile: Tile, drives: Iterable[TileVote], rule: Rule, settings: FuseSettings) -> tuple[Decision, Tile]:
+def fuse_tile(
+    tile: Tile,
+    drives: Iterable[TileVote],
+    rule: Rule,
+    settings: FuseSettings,
+    version: int = 0,
+    history: Callable[[], Sequence[TileVote]] | None = None,
+) -> tuple[Decision, Tile]:
     """Decide one tile and edit it. A tile that does not change is returned as the same object. Where the map has no
     tile, give :meth:`mapvote.core.tile.Tile.empty`.
 
-    ``drives`` are the votes that count on this tile (``select``, ``restrict`` in fusion/tile_vote.py), any order.
+    ``drives`` are the votes that count on this tile (``select`` in fusion/tile_vote.py, ``unspent`` in
+    fusion/spent.py), any order. ``version``: of the map that this makes; the edited tile remembers it. ``history``:
+    asked, where something comes and goes, for all votes that count of the last ``stay_days``; without it everything new
+    is there to stay.
     """
     votes, states, tally, quorum = hear(one_each(drives, tile.window), rule, settings)
+    if history is not None and doubtful(states, tile.memory, settings).any():
+        states = np.where(temporary(states, tile, history(), settings), np.uint8(CellState.UNDETERMINED), states)
+    edited, added, deleted = _edit(tile, votes, states, quorum)
+    if edited is not tile:
+        memory = changed_in(version, tile, edited)
+        edited = replace(edited, memory=remembered(memory, tile, edited, votes, states))
+    return Decision(states, tally, len(votes), added, deleted), edited
+
+
+def _edit(tile: Tile, votes: Sequence[TileVote], states: U8, quorum: int) -> tuple[Tile, int, int]:
+    """(the tile as decided, points added, points deleted)."""
     edited, deleted = tile, 0
     gone = supported_words(votes, states, quorum)
     if gone is not None:
@@ -101,8 +124,7 @@ def fuse_tile(tile: Tile, drives: Iterable[TileVote], rule: Rule, settings: Fuse
     added = 0
     if (states == CellState.CHANGED_OCCUPIED).any():
         edited, added = add_points(edited, *_offered(votes, states, tile.window), quorum)
-    edited = _learn_free(edited, votes, quorum, points_added=added > 0)
-    return Decision(states, tally, len(votes), added, deleted), edited
+    return _learn_free(edited, votes, quorum, points_added=added > 0), added, deleted
 
 
 def hear(
@@ -183,10 +205,11 @@ def _offered(votes: Sequence[TileVote], states: U8, grid: Grid) -> tuple[F32, I6
 def _learn_free(tile: Tile, votes: Sequence[TileVote], min_votes: int, points_added: bool) -> Tile:
     """Known-free columns with the voxels that at least ``min_votes`` vehicles passed through, minus the occupied ones.
 
-    Free space is remembered once learned; a voxel that holds a point of the map is never free. Until enough vehicles
-    have passed, a tile that never learned stays so: no free voxel at all would say that nothing new can be known there.
+    Only in cells that the vehicle spoke of. Free space is remembered once learned; a voxel that holds a point of the
+    map is never free. Until enough vehicles have passed, a tile that never learned stays so: no free voxel at all would
+    say that nothing new can be known there.
     """
-    passed = [v.free for v in votes if v.free is not None]
+    passed = [v.free.within(v.spoken()) for v in votes if v.free is not None]
     if tile.free is None and len(passed) < max(min_votes, 1):
         return tile
     if not passed and not points_added:

@@ -23,6 +23,7 @@ from mapvote.core.tile import Tile
 from mapvote.core.types import MapvoteError
 from mapvote.fusion.fuse import Decision, Rule, fuse_tile, rule_of
 from mapvote.fusion.sparse_columns import Words
+from mapvote.fusion.spent import unspent
 from mapvote.fusion.tile_vote import TileVote, select
 
 
@@ -32,6 +33,7 @@ def tile_vote(ballot: Ballot, tile: BallotTile, digest: str) -> TileVote:
         vehicle=ballot.vehicle,
         end_ns=ballot.end_ns,
         digest=digest,
+        version=ballot.version or 0,
         states=None if tile.states is None else unpack_states(tile.states),
         tally=None if tile.tally is None else unpack_tally(tile.tally),
         gone=None if tile.gone is None else Words.unpack(tile.gone, "gone"),
@@ -67,12 +69,21 @@ def check_round(ballots: Sequence[Ballot], point_map: PointMap) -> Rule:
         if drives.setdefault((ballot.vehicle, ballot.drive), digest) != digest:
             raise MapvoteError(f"{name} is given twice with different votes: keep one of the two files")
         for tile in ballot.tiles:
-            if ballot.base[tile_key(tile.tile)] != base_hash(point_map.tiles.get(tile.tile)):
+            if not _on_this_tile(ballot, tile.tile, point_map):
                 raise MapvoteError(
                     f"{name} voted on another version of tile {tile_key(tile.tile)} than this map holds: "
                     "use the map it was cast against, or vote again with this one"
                 )
     return rule_of(first.method)
+
+
+def _on_this_tile(ballot: Ballot, index: TileIndex, point_map: PointMap) -> bool:
+    """Whether a ballot was cast against the tile as it is, or says against which earlier version of the map."""
+    if ballot.base[tile_key(index)] == base_hash(point_map.tiles.get(index)):
+        return True
+    memory = point_map.tile(index).memory
+    older = ballot.version is not None and point_map.version is not None and ballot.version < point_map.version
+    return older and memory is not None and bool((memory.changed > (ballot.version or 0)).any())
 
 
 def staged(ballot: Ballot) -> str:
@@ -95,16 +106,23 @@ def update_map(
     ballots = list(ballots)
     rule = check_round(ballots, point_map)
     unique = {hashlib.sha256(encode(ballot)).hexdigest(): ballot for ballot in ballots}
-    tiles = dict(point_map.tiles)
+    tiles, version = dict(point_map.tiles), (point_map.version or 0) + 1
     decisions: dict[TileIndex, Decision] = {}
     for index in sorted({tile.tile for ballot in ballots for tile in ballot.tiles}):
         tile = point_map.tile(index)
-        votes = select(_votes_on(index, unique), settings)
-        decision, edited = fuse_tile(tile, votes, rule, settings)
+        votes = [_unspent(vote, tile) for vote in select(_votes_on(index, unique), settings)]
+        decision, edited = fuse_tile(tile, votes, rule, settings, version)
         decisions[index] = decision
         if index in tiles or edited is not tile:
             tiles[index] = edited
+    if point_map.version is not None and any(tiles[index] is not point_map.tiles.get(index) for index in tiles):
+        point_map = replace(point_map, version=version)
     return replace(point_map, tiles=dict(sorted(tiles.items()))), decisions
+
+
+def _unspent(vote: TileVote, tile: Tile) -> TileVote:
+    """A vote that names no version was checked to be cast against the tile as it is."""
+    return unspent(vote, tile) if vote.version else vote
 
 
 def _votes_on(index: TileIndex, ballots: dict[str, Ballot]) -> Iterator[TileVote]:

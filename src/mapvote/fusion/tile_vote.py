@@ -18,7 +18,6 @@ from mapvote.core.types import F32, N_STATES, NO_VOTE, U8, U16, Bool, CellState
 from mapvote.fusion.sparse_columns import Words, union
 
 DAY_NS = 86_400_000_000_000
-CHANGES = (CellState.CHANGED_OCCUPIED, CellState.CHANGED_EMPTY)
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,6 +39,8 @@ class TileVote:
     """(m, 3) from the tile's corner; used only where the vote is changed-occupied."""
     free: Words | None = None
     """Column words that rays passed through."""
+    version: int = 0
+    """Of the map that the vehicle drove with."""
 
     def spoken(self) -> Bool:
         """(256, 256) where this vote says anything at all."""
@@ -62,11 +63,6 @@ class TileVote:
         assert self.tally is not None
         counts = self.tally[cells // TILE_CELLS, cells % TILE_CELLS, : int(CellState.UNDETERMINED)]
         return np.asarray(counts.any(axis=-1))
-
-    def alters(self, cells: NDArray[np.intp]) -> Bool:
-        """(n,) at which of the flat ``cells`` this vote would change the map in any way."""
-        altered = self.supports(CHANGES[0], cells) | self.supports(CHANGES[1], cells)
-        return altered if self.gone is None else altered | np.isin(cells, self.gone.cells)
 
     def deletes(self, among: Words) -> Words:
         """The voxels that this vote says are gone, of the cells that ``among`` names."""
@@ -140,6 +136,7 @@ def fold(drives: Sequence[TileVote], grid: Grid) -> TileVote:
     tally = None if ordered[0].tally is None else np.zeros((*source.shape, N_STATES), dtype=np.uint16)
     gone: list[Words] = []
     points: list[F32] = []
+    free: list[Words] = []
     for i, drive in enumerate(ordered):
         mine = source == i
         if states is not None and drive.states is not None:
@@ -147,9 +144,10 @@ def fold(drives: Sequence[TileVote], grid: Grid) -> TileVote:
         if tally is not None and drive.tally is not None:
             tally[mine] = drive.tally[mine]
         gone += [drive.deletes(Words.whole(mine)), drive.remnants(mine)]
+        if drive.free is not None:
+            free.append(drive.free.within(drive.spoken()))
         if drive.new_points is not None:
             points.append(drive.new_points[mine.ravel()[grid.flat_cells(drive.new_points)]])
-    free = [drive.free for drive in ordered if drive.free is not None]
     return TileVote(
         vehicle=ordered[-1].vehicle,
         end_ns=ordered[-1].end_ns,

@@ -39,6 +39,10 @@ POINTS = [24, 23, 24, 26]
 """Of every version in the dump."""
 
 
+VERSIONS_DRIVEN = [(2, 1), (3, 1), (4, 1), (7, 3), (8, 3), (9, 3), (12, 4), (13, 4)]
+"""Of the dump's ballots: three before version 2, three after the rollback to the same tiles, two on the newest."""
+
+
 @pytest.fixture
 def first_store(database_url: str) -> str:
     """The URL of a database into which the dump of the first schema was loaded."""
@@ -94,6 +98,11 @@ def test_the_first_schema_becomes_todays_without_loss(first_store: str) -> None:
     (logged,) = [event for event in after["events"] if event not in before["events"]]
     after["events"].remove(logged)
     (policy,) = after.pop("policies")
+    assert {row["version"] for row in after["version_tiles"] if row["memory"] is None} == {1}
+    assert sorted((b["seq"], b["version"]) for b in after["ballots"]) == VERSIONS_DRIVEN
+    before.pop("bars")
+    before_blobs = {row["hash"]: row["data"] for row in before.pop("blobs")}
+    assert before_blobs.items() <= {row["hash"]: row["data"] for row in after.pop("blobs")}.items()
     assert policy["seq"] == logged["seq"]
     for name, rows in before.items():
         kept = [{column: row[column] for column in rows[0]} for row in after[name]] if rows else after[name]

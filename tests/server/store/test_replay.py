@@ -21,9 +21,9 @@ from mapvote.config import FuseSettings
 from mapvote.core.point_map import PointMap
 from mapvote.core.types import CellState, MapvoteError
 from mapvote.server.errors import Conflict, NotFound
-from mapvote.server.store import publish as publishing
 from mapvote.server.store.admission import accept, examine
 from mapvote.server.store.ballots import Receipt
+from mapvote.server.store.commit import write_version
 from mapvote.server.store.publish import publish, rollback
 from mapvote.server.store.replay import replay
 from mapvote.server.store.store import Store
@@ -134,7 +134,7 @@ def test_afterwards_its_old_votes_are_gone_and_new_ones_count(store: Store, hone
     assert not publish(store, POLICY).published, "nothing of the liar is left to publish"
     for one in (store, honest):
         for vehicle in ("liar", "g"):
-            send(one, one.point_map(1), vehicle, say({WALL[2]: EMPTY}), "later")
+            send(one, one.point_map(), vehicle, say({WALL[2]: EMPTY}), "later")
         assert publish(one, POLICY).published
     assert content(store) == content(honest)
 
@@ -176,7 +176,7 @@ def test_who_never_voted_cannot_be_taken_out(store: Store) -> None:
 
 def test_publishing_meanwhile_is_a_conflict(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
     a_year(store, liar=True)
-    write = publishing.write_version
+    write = write_version
 
     def late(*arguments: object, **more: object) -> object:
         rollback(store, 1)

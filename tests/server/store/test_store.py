@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hand_made import SETTINGS, Say, make_ballot, states_plane, two_walls, words_plane
+from hand_made import SETTINGS, Say, make_ballot, states_plane, two_walls, wall, words_plane
 from mapvote.codec.ballot import Ballot, encode
 from mapvote.config import FuseSettings
 from mapvote.core.point_map import PointMap
@@ -35,7 +35,8 @@ from mapvote.server.store.store import Store
 
 EMPTY, KEEPS = CellState.CHANGED_EMPTY, CellState.UNCHANGED_OCCUPIED
 POLICY = FuseSettings(min_votes=2)
-CELL, NEXT = (10, 10), (10, 11)
+BUILT = CellState.CHANGED_OCCUPIED
+CELL, NEXT, YARD = (10, 10), (10, 11), (40, 40)
 _count = itertools.count()
 
 
@@ -141,10 +142,47 @@ def test_a_vote_on_what_has_changed_since_counts_no_more(store: Store) -> None:
     base = store.point_map()
     send(store, says(base, "a", EMPTY), says(base, "b", EMPTY))
     publish(store, POLICY)
-    with pytest.raises(Conflict, match="has changed since"):
+    with pytest.raises(Conflict, match="has changed since version 1"):
         send(store, says(base, "c", EMPTY))
-    with pytest.raises(Conflict, match="no version had the base"):
-        send(store, says(base, "c", EMPTY, base={(0, 0): "f" * 64}))
+    with pytest.raises(Conflict, match="no version had the tiles"):
+        send(store, says(base, "c", EMPTY, base={(0, 0): "f" * 64}, version=None))
+    with pytest.raises(Conflict, match="is not that of version 1"):
+        send(store, says(base, "c", EMPTY, NEXT, base={(0, 0): "f" * 64}))
+    with pytest.raises(Conflict, match="no version 7 yet"):
+        send(store, says(base, "c", EMPTY, NEXT, version=7))
+
+
+def test_votes_are_spent_by_the_version_that_they_made(store: Store) -> None:
+    """A container comes and goes; the cell is as at first, and who truthfully says so does not bring it back."""
+
+    def say(vehicle: str, state: int) -> None:
+        at = {(0, 0): Say(states_plane({YARD: state}), new_points=wall([YARD], [0.45]) if state == BUILT else None)}
+        send(store, make_ballot(store.point_map(), at, vehicle, f"d{next(_count)}", end_ns=DAY_NS))
+
+    for vehicle in "ab":
+        say(vehicle, BUILT)
+    assert publish(store, POLICY).added == 1
+    for vehicle in "ab":
+        say(vehicle, EMPTY)
+    assert publish(store, POLICY).deleted == 1
+    assert store.manifest().tiles == store.manifest(1).tiles, "bit for bit as at first"
+    for vehicle in "abc":
+        say(vehicle, CellState.UNCHANGED_EMPTY)
+        assert not publish(store, POLICY).published
+
+
+def test_a_ballot_of_an_older_mapvote_is_read_by_the_last_version_with_its_tiles(store: Store) -> None:
+    base = store.point_map()
+    old = [says(base, v, EMPTY, version=None) for v in "ab"]
+    send(store, *old)
+    publish(store, POLICY)
+    rollback(store, 1)
+    assert [receipt.repeated for receipt in send(store, *old)] == [True, True]
+    again = says(base, "a", EMPTY, NEXT, version=None, drive=old[0].drive)
+    send(store, again, says(base, "c", EMPTY, version=None))
+    story = explain_cell(store, (CELL[1] + 0.5) * 0.3, (CELL[0] + 0.5) * 0.3)
+    heard = {vote.vehicle: (vote.version, vote.counts) for vote in story.votes}
+    assert heard == {"a": (1, False), "b": (1, False), "c": (3, True)}, "a drive cannot have seen a later version"
 
 
 def test_a_rollback_does_not_come_back_by_itself_but_by_new_votes(store: Store) -> None:
@@ -158,6 +196,7 @@ def test_a_rollback_does_not_come_back_by_itself_but_by_new_votes(store: Store) 
     assert store.manifest(3).tiles == store.manifest(1).tiles
     send(store, *old)
     assert not publish(store, POLICY).published
+    base = store.point_map()
     send(store, says(base, "c", EMPTY, day=1))
     assert not publish(store, POLICY).published
     send(store, says(base, "d", EMPTY, day=1))
@@ -166,10 +205,8 @@ def test_a_rollback_does_not_come_back_by_itself_but_by_new_votes(store: Store) 
 
 
 def test_rolled_back_remnants_stay_until_new_votes_come(store: Store) -> None:
-    base = store.point_map()
-
     def mark(vehicle: str, day: float) -> Ballot:
-        return says(base, vehicle, KEEPS, day=day, gone=words_plane({CELL: 0b10}))
+        return says(store.point_map(), vehicle, KEEPS, day=day, gone=words_plane({CELL: 0b10}))
 
     old = [mark(v, 0) for v in "ab"]
     send(store, *old)

@@ -50,6 +50,8 @@ class Manifest(msgspec.Struct, frozen=True, kw_only=True):
     tiles: list[TileEntry]
     driven: list[bytes] = []
     """Positions of the sensor along each drive, (n, 3) float64, zstd."""
+    version: int = 1
+    """How often the map was published: ballots name it."""
 
 
 def is_map_folder(path: Path) -> bool:
@@ -87,6 +89,7 @@ def write_map_folder(point_map: PointMap, path: Path) -> None:
             georeference=dict(sorted(point_map.georeference.items())),
             tiles=entries,
             driven=[pack_plane(path) for path in point_map.driven],
+            version=point_map.version or 1,
         )
         (folder / MANIFEST).write_bytes(msgspec.json.format(msgspec.json.encode(manifest), indent=1) + b"\n")
 
@@ -131,7 +134,7 @@ def read_map_folder(path: Path) -> PointMap:
             )
         tiles[entry.tile] = tile
     driven = tuple(_positions(data, path) for data in manifest.driven)
-    return PointMap(manifest.map_id, lattice, tiles, manifest.georeference, driven)
+    return PointMap(manifest.map_id, lattice, tiles, manifest.georeference, driven, manifest.version)
 
 
 def _positions(data: bytes, path: Path) -> F64:

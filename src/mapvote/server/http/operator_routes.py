@@ -82,6 +82,7 @@ def cell(request: Request, x: float, y: float) -> dict[str, Any]:
         {
             "vehicle": shown[v.vehicle],
             "drive": v.drive if known else "",
+            "version": v.version,
             "state": v.state,
             "marks": v.marks,
             "end": iso(_seen(v.end_ns, known)),

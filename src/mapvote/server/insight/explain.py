@@ -11,16 +11,12 @@ from mapvote.codec.arrays import unpack_plane
 from mapvote.core.grid import TILE_CELLS, TileIndex
 from mapvote.core.types import NO_VOTE, U8, CellState, MapvoteError
 from mapvote.fusion.fuse import hear
-from mapvote.fusion.tile_vote import TileVote, one_each, select
+from mapvote.fusion.spent import unspent
+from mapvote.fusion.tile_vote import TileVote, one_each
 from mapvote.server.store import schema
-from mapvote.server.store.eligible_votes import (
-    Round,
-    counting_votes,
-    read_votes,
-    stored_votes,
-)
+from mapvote.server.store.eligible_votes import Round, judged_votes, read_votes
 from mapvote.server.store.policy import Policy, policy_in
-from mapvote.server.store.queries import current_version, load_tile, tiles_of
+from mapvote.server.store.queries import current_version, tile_as_of
 from mapvote.server.store.store import Store
 
 _FOREVER = (1 << 63) - 1
@@ -32,6 +28,8 @@ class CellVote:
 
     vehicle: str
     drive: str
+    version: int
+    """Of the map that the vehicle drove with."""
     state: str
     """Lower case; no_vote where it says nothing."""
     marks: int | None
@@ -69,35 +67,27 @@ def explain_cell(store: Store, x: float, y: float) -> CellStory:
         policy = policy_in(connection)
         settings = policy.fuse
         asked = Round(_FOREVER, policy, store.clock() - round(settings.min_age_s * 1e9))
-        hashes = tiles_of(connection, current_version(connection).number, index).get(index)
-        tile = load_tile(connection, store.lattice.tile(index), hashes)
-        everyone = stored_votes(connection, index, Round(_FOREVER, policy, _FOREVER))
-        old_enough = [vote for vote in everyone if vote.received_ns <= asked.received_by_ns]
-        inside = {vote.seq for vote in select(old_enough, settings)}
-        counting = {v.digest: v for v in counting_votes(connection, tile, asked)}
-        silenced = _silenced(store, index, list(counting.values()), policy)
-        plain = read_votes(connection, index, everyone)
+        number = current_version(connection).number
+        tile = tile_as_of(connection, store.lattice.tile(index), number)
+        everyone = judged_votes(connection, index, asked)
+        said = read_votes(connection, index, [stored for stored, _ in everyone])
         query = sa.select(schema.decisions.c.version, schema.decisions.c.states)
         query = query.where(schema.decisions.c.row == index[0], schema.decisions.c.col == index[1])
         found = connection.execute(query.order_by(schema.decisions.c.version))
         decided = [(r.version, _states(r.states)) for r in found]
+    counting = [unspent(vote, tile) for vote, (_, why) in zip(said, everyone, strict=True) if not why]
+    silenced = _silenced(store, index, counting, policy)
     votes = []
-    for stored, vote in zip(everyone, plain, strict=True):
-        spoken = bool(vote.spoken()[cell])
-        counts = spoken and stored.seq in inside and bool(counting[stored.digest].spoken()[cell])
-        why = ""
-        if not spoken:
+    for (stored, why), vote in zip(everyone, said, strict=True):
+        if not vote.spoken()[cell]:
             why = "says nothing here"
-        elif stored.received_ns > asked.received_by_ns:
-            why = "waits for the minimum age"
-        elif stored.seq not in inside:
-            why = f"older than {settings.max_age_days:g} days or not among the last {settings.latest_vehicles} vehicles"
-        elif not counts:
-            why = "the cell has changed since its base, or a rollback has barred it"
-        elif vote.vehicle in silenced:
-            counts, why = False, "opposes the others over most of this tile, or denies nearly all that changed on it"
-        said, marks = _said(vote, cell), _marks(vote, cell)
-        votes.append(CellVote(stored.vehicle, stored.drive, said, marks, stored.end_ns, counts, why))
+        elif not why and not unspent(vote, tile).spoken()[cell]:
+            assert tile.memory is not None
+            why = f"spent: version {tile.memory.changed[cell]} has changed the cell since"
+        elif not why and vote.vehicle in silenced:
+            why = "opposes the others over most of this tile, or denies nearly all that changed on it"
+        whose = stored.vehicle, stored.drive, stored.version
+        votes.append(CellVote(*whose, _said(vote, cell), _marks(vote, cell), stored.end_ns, not why, why))
     story = [(version, state_name(int(states[cell]))) for version, states in decided if states[cell] != NO_VOTE]
     return CellStory(row, col, votes, story)
 

@@ -11,15 +11,15 @@ import sqlalchemy as sa
 from mapvote.core.grid import TileIndex
 from mapvote.core.types import U8
 from mapvote.core.voting import decide
-from mapvote.fusion.tile_vote import TileVote, one_each, select
+from mapvote.fusion.tile_vote import TileVote, one_each
 from mapvote.server.insight.changes import Decided, change_objects, changed_cells
 from mapvote.server.insight.consensus import Compared, Spoken, Standing, compare, judge
 from mapvote.server.insight.explain import _FOREVER, _states
 from mapvote.server.insight.geojson import to_geojson
 from mapvote.server.store import schema
-from mapvote.server.store.eligible_votes import Round, counting_votes, read_votes, standing_tiles, stored_votes
+from mapvote.server.store.eligible_votes import Round, counting_votes, judged_votes, read_votes, standing_tiles
 from mapvote.server.store.policy import policy_in, recorded
-from mapvote.server.store.queries import current_version, load_tile, tiles_of, version_of
+from mapvote.server.store.queries import current_version, load_tile, tile_as_of, tiles_of, version_of
 from mapvote.server.store.store import Store
 from mapvote.server.store.tile_jobs import unpack_tally_plane
 
@@ -54,8 +54,7 @@ def _decided(store: Store, connection: sa.Connection, index: TileIndex, old: int
     query = sa.select(d.c.version, d.c.states, d.c.tally).where(d.c.row == index[0], d.c.col == index[1])
     for row in connection.execute(query.where(d.c.version > old, d.c.version <= new).order_by(d.c.version)).all():
         version = version_of(connection, row.version)
-        before = tiles_of(connection, row.version - 1, index).get(index)
-        tile = load_tile(connection, store.lattice.tile(index), before)
+        tile = tile_as_of(connection, store.lattice.tile(index), row.version - 1)
         policy = recorded(version.policy)
         asked = Round(version.mark, policy, version.created_ns - round(policy.fuse.min_age_s * 1e9))
         votes = counting_votes(connection, tile, asked)
@@ -88,7 +87,7 @@ def vehicle_standings(store: Store) -> list[Standing]:
         asked = Round(_FOREVER, policy_in(connection), _FOREVER)
         compared: list[Compared] = []
         for index in standing_tiles(connection, _FOREVER):
-            chosen = select(stored_votes(connection, index, asked), asked.settings)
+            chosen = [vote for vote, why in judged_votes(connection, index, asked) if not why]
             folded = one_each(read_votes(connection, index, chosen), store.lattice.tile(index))
             compared += compare(index, [Spoken(vote.vehicle, vote.end_ns, _decided_states(vote)) for vote in folded])
     return judge(compared, store.lattice)

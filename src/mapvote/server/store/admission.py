@@ -17,10 +17,11 @@ from mapvote.fusion.tile_vote import DAY_NS
 from mapvote.server.errors import Conflict, Unauthorised
 from mapvote.server.store import keys, schema
 from mapvote.server.store.ballots import Incoming, Receipt, put_in, unlike
-from mapvote.server.store.blobs import TileHashes, same_cells, unpack_points_plane
+from mapvote.server.store.blobs import TileHashes
 from mapvote.server.store.policy import policy_in
-from mapvote.server.store.queries import current_number, load_blob, names, tiles_of
+from mapvote.server.store.queries import current_number, load_memory, memory_of, names, tile_of, tiles_of
 from mapvote.server.store.store import Store
+from mapvote.server.store.version_driven import NO_SUCH_BASE, version_driven
 
 MAX_CLOCK_AHEAD_NS = DAY_NS
 """A drive may end this much after the server's own time: clocks differ, but a vehicle from the future would make all
@@ -96,8 +97,11 @@ class Intake:
         newest = current_number(connection)
         if newest != self._current[0]:
             self._current = newest, tiles_of(connection, newest)
-        asked = policy_in(connection).round
-        return [unlike(asked, ballot) or self._misfit(connection, ballot.ballot) for ballot in ballots]
+        asked, repeated = policy_in(connection).round, _standing(connection, ballots)
+        return [
+            None if one.digest in repeated else unlike(asked, one) or self._misfit(connection, one.ballot)
+            for one in ballots
+        ]
 
     def _misfit(self, connection: sa.Connection, ballot: Ballot) -> MapvoteError | None:
         current = self._current[1]
@@ -105,25 +109,32 @@ class Intake:
             return Conflict(f"this server keeps map {self._store.map_id!r}, the ballot votes on {ballot.map_id!r}")
         if ballot.end_ns > self._store.clock() + MAX_CLOCK_AHEAD_NS:
             return MapvoteError("ballot: the drive ends in the future; set the vehicle's clock")
-        unknown: list[TileIndex] = []
+        version = version_driven(connection, ballot, self._heard_at(connection, ballot))
+        if version is None:
+            return Conflict(NO_SUCH_BASE)
+        if version > self._current[0]:
+            return Conflict(f"there is no version {version} yet; the newest is {self._current[0]}: fetch it")
         counts = False
         for tile in ballot.tiles:
-            base = ballot.base[tile_key(tile.tile)]
-            now = current[tile.tile].points if tile.tile in current else ""
-            if base == now:
-                counts = True
-            elif not _was_base(connection, tile.tile, base):
-                unknown.append(tile.tile)
-            elif not counts:
-                counts = _counts_somewhere(self._store, connection, ballot, tile, base, now)
-        if unknown:
-            return Conflict(f"no version had the base of tile {names(unknown)}: fetch these tiles and vote again")
+            base, now = ballot.base[tile_key(tile.tile)], current.get(tile.tile)
+            then = now if version == self._current[0] else tile_of(connection, version, tile.tile)
+            if base != ("" if then is None else then.points):
+                known = f"the base of tile {tile_key(tile.tile)} is not that of version {version}"
+                return Conflict(f"{known}: fetch the map and vote again")
+            counts = counts or _counts_somewhere(connection, ballot, tile, version, now)
         if not counts:
             stale = names(tile.tile for tile in ballot.tiles)
             return Conflict(
-                f"every cell voted on has changed since the ballot's base: fetch tiles {stale} and vote again"
+                f"every cell voted on has changed since version {version}: fetch tiles {stale} and vote again"
             )
         return None
+
+    def _heard_at(self, connection: sa.Connection, ballot: Ballot) -> int | None:
+        if ballot.version is not None:
+            return None
+        b = schema.ballots
+        mine = (b.c.vehicle == ballot.vehicle) & (b.c.drive == ballot.drive)
+        return connection.execute(sa.select(sa.func.min(b.c.first_seq)).where(mine)).scalar_one()
 
 
 def accept(store: Store, ballots: Sequence[Incoming]) -> list[Receipt | Exception]:
@@ -143,17 +154,22 @@ def _sound(sent: Sent) -> Incoming | Exception:
     return incoming
 
 
-def _was_base(connection: sa.Connection, tile: TileIndex, base: str) -> bool:
-    if base == "":
-        return True
-    t = schema.version_tiles
-    known = sa.select(t.c.version).where(t.c.row == tile[0], t.c.col == tile[1], t.c.points == base).limit(1)
-    return connection.execute(known).first() is not None
+def _standing(connection: sa.Connection, ballots: Sequence[Incoming]) -> set[str]:
+    """Which of these stand already: sending again is harmless, whatever became of the votes."""
+    b = schema.ballots
+    drives = sa.tuple_(b.c.vehicle, b.c.drive).in_({(one.ballot.vehicle, one.ballot.drive) for one in ballots})
+    return set(connection.execute(sa.select(b.c.digest).where(drives, b.c.gone_seq.is_(None))).scalars())
 
 
 def _counts_somewhere(
-    store: Store, connection: sa.Connection, ballot: Ballot, tile: BallotTile, base: str, now: str
+    connection: sa.Connection, ballot: Ballot, tile: BallotTile, version: int, now: TileHashes | None
 ) -> bool:
-    points = [None if not h else unpack_points_plane(load_blob(connection, h), h) for h in (base, now)]
-    same = same_cells(points[0], points[1], store.lattice.tile(tile.tile))
-    return bool((tile_vote(ballot, tile, "").spoken() & same).any())
+    """Whether there is a cell that the ballot speaks of and that has not changed since."""
+    memory = None
+    if now is None:
+        memory = memory_of(connection, (1 << 31) - 1, tile.tile)
+    elif now.memory is not None:
+        memory = load_memory(connection, now.memory)
+    if memory is None or not (memory.changed > version).any():
+        return True
+    return bool((tile_vote(ballot, tile, "").spoken() & (memory.changed <= version)).any())

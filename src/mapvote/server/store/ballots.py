@@ -15,6 +15,7 @@ from mapvote.server.store.database import insert_rows
 from mapvote.server.store.policy import RoundPolicy, policy_in
 from mapvote.server.store.queries import log_event, next_seq
 from mapvote.server.store.store import Store
+from mapvote.server.store.version_driven import NO_SUCH_BASE, version_driven
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,12 +62,16 @@ def put_in(connection: sa.Connection, ballots: Sequence[Incoming], now: int) -> 
     replaced: list[dict[str, int]] = []
     for incoming in ballots:
         ballot, key = incoming.ballot, (incoming.ballot.vehicle, incoming.ballot.drive)
-        if (why := unlike(asked, incoming)) is not None:
-            results.append(why)
-            continue
         old = standing.get(key)
         if old is not None and old[1] == incoming.digest:
             results.append(Receipt(*key, created=False, repeated=True, seq=old[0]))
+            continue
+        if (why := unlike(asked, incoming)) is not None:
+            results.append(why)
+            continue
+        drove_with = version_driven(connection, ballot, first.get(key))
+        if drove_with is None:
+            results.append(Conflict(NO_SUCH_BASE))
             continue
         if old is not None:
             replaced.append({"old": old[0], "by": seq})
@@ -74,7 +79,7 @@ def put_in(connection: sa.Connection, ballots: Sequence[Incoming], now: int) -> 
         standing[key] = seq, incoming.digest
         log.append((seq, now, "ballot", *key))
         times = ballot.start_ns, ballot.end_ns, now
-        how = ballot.settings_hash[:128], incoming.cast_by, incoming.size
+        how = ballot.settings_hash[:128], incoming.cast_by, incoming.size, drove_with
         rows.append((seq, first[key], None, *key, incoming.digest, *times, *how))
         tiles += [_tile_row(seq, ballot, tile) for tile in ballot.tiles]
         results.append(Receipt(*key, created=old is None, repeated=False, seq=seq))

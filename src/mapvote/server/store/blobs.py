@@ -1,19 +1,19 @@
-"""A tile as content-addressed planes, and which cells of two tiles hold the same points."""
+"""A tile as content-addressed planes."""
 
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from mapvote.codec.arrays import compress, pack_plane, unpack_bytes, unpack_plane
+from mapvote.codec.arrays import compress, unpack_bytes
 from mapvote.core.grid import CELLS, TILE_CELLS, Grid
+from mapvote.core.memory import PLANES, Memory
 from mapvote.core.tile import Tile
-from mapvote.core.types import F32, I64, U64, Bool, MapvoteError
+from mapvote.core.types import F32, MapvoteError
 
 _ZSTD_LEVEL = 3
 MAX_PLANE_BYTES = CELLS * 64 * 12 * 4
@@ -26,6 +26,13 @@ class TileHashes:
     points: str
     ground: str
     free: str | None
+    memory: str | None = field(default=None, compare=False)
+    """What the server remembers of the tile; no part of the map, so tiles that differ in nothing else are equal."""
+
+    @classmethod
+    def none(cls) -> TileHashes:
+        """Of a tile that a version does not have any more."""
+        return cls("", "", None)
 
 
 def pack_tile(tile: Tile) -> tuple[TileHashes, dict[str, bytes]]:
@@ -40,10 +47,16 @@ def pack_tile(tile: Tile) -> tuple[TileHashes, dict[str, bytes]]:
 
     points = pack(tile.points, "<f4")
     ground = pack(tile.ground_z, "<f4")
-    return TileHashes(points, ground, None if tile.free is None else pack(tile.free, "<u8")), blobs
+    free = None if tile.free is None else pack(tile.free, "<u8")
+    if tile.memory is None:
+        return TileHashes(points, ground, free), blobs
+    memory, plane = pack_memory(tile.memory)
+    return TileHashes(points, ground, free, memory), blobs | plane
 
 
-def unpack_tile(window: Grid, hashes: TileHashes, points: bytes, ground: bytes, free: bytes | None) -> Tile:
+def unpack_tile(
+    window: Grid, hashes: TileHashes, points: bytes, ground: bytes, free: bytes | None, memory: bytes | None = None
+) -> Tile:
     """A tile of its planes; MapvoteError if one is not what its hash says."""
     return Tile(
         window,
@@ -52,6 +65,7 @@ def unpack_tile(window: Grid, hashes: TileHashes, points: bytes, ground: bytes, 
         free=None
         if free is None or hashes.free is None
         else np.frombuffer(_unpack(free, hashes.free), dtype="<u8").reshape(window.shape),
+        memory=None if memory is None or hashes.memory is None else unpack_memory_plane(memory, hashes.memory),
     )
 
 
@@ -67,37 +81,13 @@ def _unpack(data: bytes, digest: str) -> bytes:
     return raw
 
 
-def same_cells(a: F32 | None, b: F32 | None, grid: Grid) -> Bool:
-    """(256, 256) where two versions of a tile's points hold the same, bit for bit and in the same order."""
-    return np.asarray(_digests(a, grid) == _digests(b, grid)).reshape(TILE_CELLS, TILE_CELLS)
+def pack_memory(memory: Memory) -> tuple[str, dict[str, bytes]]:
+    """What a tile remembers as (hash, plane by hash)."""
+    raw = np.ascontiguousarray(memory.planes, dtype="<u4").tobytes()
+    digest = hashlib.sha256(raw).hexdigest()
+    return digest, {digest: compress(raw, _ZSTD_LEVEL)}
 
 
-def _digests(points: F32 | None, grid: Grid) -> U64:
-    if points is None or not len(points):
-        return np.zeros(CELLS, dtype=np.uint64)
-    return _cell_digests(grid.flat_cells(points), np.ascontiguousarray(points).view(np.uint32))
-
-
-@numba.njit(cache=True, nogil=True)
-def _cell_digests(cells: I64, words: NDArray[np.uint32]) -> U64:
-    """(65536,) a 64-bit FNV-1a hash over the words of each cell's points (n, 3), 0 for a cell without points."""
-    out = np.zeros(65536, dtype=np.uint64)
-    for i in range(len(cells)):
-        h = out[cells[i]]
-        if h == 0:
-            h = np.uint64(0xCBF29CE484222325)
-        for k in range(3):
-            h = (h ^ np.uint64(words[i, k])) * np.uint64(0x100000001B3)
-        out[cells[i]] = h
-    return out
-
-
-def pack_cells(cells: Bool) -> bytes:
-    """(256, 256) bool as a small blob."""
-    return pack_plane(np.packbits(cells.reshape(-1)), _ZSTD_LEVEL)
-
-
-def unpack_cells(data: bytes) -> Bool:
-    """The inverse of :func:`pack_cells`."""
-    bits = np.unpackbits(unpack_plane(data, "<u1", (CELLS // 8,), "cells of a version"))
-    return bits.astype(np.bool_).reshape(TILE_CELLS, TILE_CELLS)
+def unpack_memory_plane(data: bytes, digest: str) -> Memory:
+    """The inverse; MapvoteError if it is not what its hash says."""
+    return Memory(np.frombuffer(_unpack(data, digest), dtype="<u4").reshape(PLANES, TILE_CELLS, TILE_CELLS))

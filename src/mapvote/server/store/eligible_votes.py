@@ -1,16 +1,14 @@
-"""Which votes count on a tile: standing at a moment, in the window, on cells that are still what they were.
+"""Which votes count on a tile: standing at a moment, in the window, on cells where it is not spent.
 
 Everything is asked as of an event number (``mark``), so that a past round can be fused again exactly.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
 from typing import NamedTuple
 
-import numpy as np
 import sqlalchemy as sa
 
 from mapvote.codec.ballot import unpack_many_states, unpack_points, unpack_tally
@@ -19,19 +17,10 @@ from mapvote.core.grid import TileIndex
 from mapvote.core.tile import Tile
 from mapvote.core.types import U8, Bool
 from mapvote.fusion.sparse_columns import Words
-from mapvote.fusion.tile_vote import TileVote, restrict, select
+from mapvote.fusion.spent import unspent
+from mapvote.fusion.tile_vote import DAY_NS, TileVote, select
 from mapvote.server.store import schema
-from mapvote.server.store.blobs import same_cells, unpack_cells, unpack_points_plane
 from mapvote.server.store.policy import Policy
-from mapvote.server.store.queries import load_blob
-
-
-@dataclass(frozen=True, slots=True)
-class Bar:
-    """What a rollback silenced on one tile: change votes on ``cells`` of drives first heard of before ``seq``."""
-
-    seq: int
-    cells: Bool
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,8 +50,14 @@ class StoredVote:
     received_ns: int
     digest: str
     base: str
+    version: int
+    """Of the map that its vehicle drove with."""
     settings_hash: str
     cast_by: str
+
+
+YOUNG = "waits for the minimum age"
+OTHERWISE = "cast by another method or other settings than the policy asks for"
 
 
 class _Planes(NamedTuple):
@@ -81,17 +76,15 @@ def _stands_at(mark: int | sa.BindParameter[int]) -> sa.ColumnElement[bool]:
 
 
 # Asked for every tile of a round: building such a statement takes SQLAlchemy as long as the database takes to answer.
-_B, _T, _R = schema.ballots, schema.ballot_tiles, schema.bars
+_B, _T = schema.ballots, schema.ballot_tiles
 _ROW, _COL, _MARK = (sa.bindparam(name, type_=sa.BigInteger) for name in ("row", "col", "mark"))
 _VOTES_ON = (
     sa.select(_B.c.seq, _B.c.first_seq, _B.c.vehicle, _B.c.drive, _B.c.end_ns, _B.c.received_ns, _B.c.digest, _T.c.base)
-    .add_columns(_B.c.settings_hash, _B.c.cast_by)
+    .add_columns(_B.c.version, _B.c.settings_hash, _B.c.cast_by)
     .join(_T, _T.c.ballot == _B.c.seq)
     .where(_T.c.row == _ROW, _T.c.col == _COL, _stands_at(_MARK))
-    .where(_B.c.received_ns <= sa.bindparam("received_by", type_=sa.BigInteger))
     .order_by(_B.c.seq)
 )
-_BARS_ON = sa.select(_R.c.seq, _R.c.cells).where(_R.c.row == _ROW, _R.c.col == _COL, _R.c.seq <= _MARK)
 _PLANES_OF = sa.select(_T.c.ballot, _T.c.states, _T.c.tally, _T.c.gone, _T.c.new_points, _T.c.free).where(
     _T.c.row == _ROW, _T.c.col == _COL, _T.c.ballot.in_(sa.bindparam("ballots", expanding=True))
 )
@@ -105,65 +98,46 @@ def standing_tiles(connection: sa.Connection, mark: int, since: int | None = Non
     return [(row.row, row.col) for row in connection.execute(tiles.order_by(t.c.row, t.c.col))]
 
 
-def stored_votes(connection: sa.Connection, index: TileIndex, asked: Round) -> list[StoredVote]:
-    """Every standing vote of the round on a tile, in no order that matters."""
-    cast = asked.policy.round
-    asked_of = {"row": index[0], "col": index[1], "mark": asked.mark, "received_by": asked.received_by_ns}
+def judged_votes(connection: sa.Connection, index: TileIndex, asked: Round) -> list[tuple[StoredVote, str]]:
+    """Every standing vote on a tile, and why it does not count there at all; "" if it does, in cells where it is not
+    spent (:func:`mapvote.fusion.spent.unspent`)."""
+    asked_of = {"row": index[0], "col": index[1], "mark": asked.mark}
     found = [StoredVote(*row) for row in connection.execute(_VOTES_ON, asked_of).all()]
-    return [
-        vote
-        for vote in found
-        if vote.vehicle not in asked.without
-        and vote.cast_by == cast.cast_by
-        and vote.settings_hash.startswith(cast.settings_hash)
-    ]
+    found = [vote for vote in found if vote.vehicle not in asked.without]
+    why = {vote.seq: _unready(vote, asked) for vote in found}
+    settings = asked.settings
+    inside = {vote.seq for vote in select([vote for vote in found if not why[vote.seq]], settings)}
+    outside = f"older than {settings.max_age_days:g} days or not among the last {settings.latest_vehicles} vehicles"
+    return [(vote, why[vote.seq] or ("" if vote.seq in inside else outside)) for vote in found]
 
 
-def bars_on(connection: sa.Connection, index: TileIndex, mark: int) -> list[Bar]:
-    """What rollbacks up to ``mark`` silenced on a tile."""
-    found = connection.execute(_BARS_ON, {"row": index[0], "col": index[1], "mark": mark})
-    return [Bar(seq, unpack_cells(cells)) for seq, cells in found]
+def _unready(vote: StoredVote, asked: Round) -> str:
+    cast = asked.policy.round
+    if vote.cast_by != cast.cast_by or not vote.settings_hash.startswith(cast.settings_hash):
+        return OTHERWISE
+    return YOUNG if vote.received_ns > asked.received_by_ns else ""
 
 
 def counting_votes(
-    connection: sa.Connection,
-    tile: Tile,
-    asked: Round,
-    bars: Sequence[Bar] | None = None,
-    digest: str | None = None,
+    connection: sa.Connection, tile: Tile, asked: Round, misread: Mapping[int, Bool] | None = None
 ) -> list[TileVote]:
-    """The votes that count on ``tile`` as it is now, each restricted to the cells where it counts.
+    """The votes that count on ``tile`` as it is now, each restricted to the cells where it is not spent.
 
-    ``bars``: instead of those recorded. ``digest``: the hash of the tile's points, where it is known: votes with that
-    base need no comparison.
+    ``misread``: see :func:`mapvote.fusion.spent.unspent`.
     """
-    index = tile.index
-    chosen = select(stored_votes(connection, index, asked), asked.settings)
-    barred = bars_on(connection, index, asked.mark) if bars is None else bars
-
-    @cache
-    def unchanged(base: str) -> Bool | None:
-        if base == digest:
-            return None
-        old = None if not base else unpack_points_plane(load_blob(connection, base), base)
-        same = same_cells(old, tile.points, tile.window)
-        return None if same.all() else same
-
-    votes = []
-    for stored, vote in zip(chosen, read_votes(connection, index, chosen), strict=True):
-        votes.append(silence(restrict(vote, unchanged(stored.base)), stored.first_seq, barred))
-    return votes
+    chosen = [vote for vote, why in judged_votes(connection, tile.index, asked) if not why]
+    return [unspent(vote, tile, misread) for vote in read_votes(connection, tile.index, chosen)]
 
 
-def silence(vote: TileVote, first_seq: int, bars: Sequence[Bar]) -> TileVote:
-    """The vote without what rollbacks have barred."""
-    for bar in bars:
-        if first_seq < bar.seq:
-            cells = np.flatnonzero(bar.cells)
-            counts = np.ones(bar.cells.shape, dtype=np.bool_)
-            counts.reshape(-1)[cells[vote.alters(cells)]] = False
-            vote = restrict(vote, counts)
-    return vote
+def recent_votes(
+    connection: sa.Connection, tile: Tile, asked: Round, misread: Mapping[int, Bool] | None = None
+) -> list[TileVote]:
+    """As :func:`counting_votes`, of every vehicle and of the last ``stay_days``: what has come and gone here?"""
+    judged = judged_votes(connection, tile.index, asked)
+    ready = [vote for vote, why in judged if why not in (YOUNG, OTHERWISE)]
+    oldest = max((vote.end_ns for vote in ready), default=0) - asked.settings.stay_days * DAY_NS
+    chosen = [vote for vote in ready if vote.end_ns >= oldest]
+    return [unspent(vote, tile, misread) for vote in read_votes(connection, tile.index, chosen)]
 
 
 def read_votes(connection: sa.Connection, index: TileIndex, stored: Sequence[StoredVote]) -> list[TileVote]:
@@ -190,6 +164,7 @@ def _vote(stored: StoredVote, planes: _Planes, states: U8 | None) -> TileVote:
         vehicle=stored.vehicle,
         end_ns=stored.end_ns,
         digest=stored.digest,
+        version=stored.version,
         states=states,
         tally=None if planes.tally is None else unpack_tally(planes.tally),
         gone=None if planes.gone is None else Words.unpack(planes.gone, "gone"),

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import dataclass, replace
 from typing import Any
 
 import sqlalchemy as sa
 
 from mapvote.codec.ballot import tile_key
 from mapvote.core.grid import Grid, TileIndex
+from mapvote.core.memory import Memory
 from mapvote.core.tile import Tile
 from mapvote.server.errors import NotFound
 from mapvote.server.store import schema
-from mapvote.server.store.blobs import TileHashes, pack_tile, unpack_tile
+from mapvote.server.store.blobs import TileHashes, pack_tile, unpack_memory_plane, unpack_tile
 
 
 def current_number(connection: sa.Connection) -> int:
@@ -36,16 +37,38 @@ def version_of(connection: sa.Connection, number: int) -> Version:
     return Version(**row._mapping)
 
 
-def tiles_of(connection: sa.Connection, number: int, only: TileIndex | None = None) -> dict[TileIndex, TileHashes]:
-    """Hashes of a version's tiles, in ascending order: of each tile, the last row up to that version."""
+def tiles_of(
+    connection: sa.Connection, number: int, only: Collection[TileIndex] | None = None
+) -> dict[TileIndex, TileHashes]:
+    """Hashes of a version's tiles (``only`` these), in ascending order: of each, the last row up to that version."""
+    if only is not None and len(only) <= _ONE_BY_ONE:
+        found = {index: tile_of(connection, number, index) for index in sorted(only)}
+        return {index: hashes for index, hashes in found.items() if hashes is not None}
     t = schema.version_tiles
     newest = sa.select(t.c.row, t.c.col, sa.func.max(t.c.version).label("version")).where(t.c.version <= number)
-    if only is not None:
-        newest = newest.where(t.c.row == only[0], t.c.col == only[1])
     last = newest.group_by(t.c.row, t.c.col).subquery()
     same = (t.c.row == last.c.row) & (t.c.col == last.c.col) & (t.c.version == last.c.version)
     rows = connection.execute(sa.select(t).join(last, same).where(t.c.points.is_not(None)).order_by(t.c.row, t.c.col))
-    return {(row.row, row.col): TileHashes(row.points, row.ground, row.free) for row in rows}
+    tiles = {(row.row, row.col): TileHashes(row.points, row.ground, row.free, row.memory) for row in rows}
+    return tiles if only is None else {index: tiles[index] for index in only if index in tiles}
+
+
+def tile_of(connection: sa.Connection, number: int, index: TileIndex) -> TileHashes | None:
+    """Hashes of one tile of a version; None where the map has none."""
+    row = connection.execute(_TILE, {"row": index[0], "col": index[1], "number": number}).one_or_none()
+    return None if row is None or row.points is None else TileHashes(row.points, row.ground, row.free, row.memory)
+
+
+def memory_of(connection: sa.Connection, number: int, index: TileIndex) -> Memory | None:
+    """What is remembered of a place as of a version, also where the map has no tile any more."""
+    row = connection.execute(_TILE, {"row": index[0], "col": index[1], "number": number}).one_or_none()
+    return None if row is None or row.memory is None else load_memory(connection, row.memory)
+
+
+def tiles_set_by(connection: sa.Connection, number: int) -> list[TileIndex]:
+    """The tiles that a version changed."""
+    t = schema.version_tiles
+    return [(row.row, row.col) for row in connection.execute(sa.select(t.c.row, t.c.col).where(t.c.version == number))]
 
 
 def load_tile(connection: sa.Connection, window: Grid, hashes: TileHashes | None) -> Tile:
@@ -53,8 +76,22 @@ def load_tile(connection: sa.Connection, window: Grid, hashes: TileHashes | None
     if hashes is None:
         return Tile.empty(window)
     free = None if hashes.free is None else load_blob(connection, hashes.free)
+    memory = None if hashes.memory is None else load_blob(connection, hashes.memory)
     points, ground = load_blob(connection, hashes.points), load_blob(connection, hashes.ground)
-    return unpack_tile(window, hashes, points, ground, free)
+    return unpack_tile(window, hashes, points, ground, free, memory)
+
+
+def tile_as_of(connection: sa.Connection, window: Grid, number: int) -> Tile:
+    """A tile of a version; where the map has none, an empty one that remembers what was there."""
+    hashes = tile_of(connection, number, window.tile_index)
+    if hashes is not None:
+        return load_tile(connection, window, hashes)
+    return replace(Tile.empty(window), memory=memory_of(connection, number, window.tile_index))
+
+
+def load_memory(connection: sa.Connection, digest: str) -> Memory:
+    """What a tile remembers, by its hash."""
+    return unpack_memory_plane(load_blob(connection, digest), digest)
 
 
 def load_blob(connection: sa.Connection, digest: str) -> bytes:
@@ -103,11 +140,11 @@ def version_row(version: Version) -> dict[str, Any]:
     return {name: getattr(version, name) for name in schema.versions.c.keys()}  # noqa: SIM118
 
 
-def tile_row(number: int, index: TileIndex, hashes: TileHashes | None) -> dict[str, Any]:
-    """One row of version_tiles; None where the version has no such tile."""
-    planes = ("points", "ground", "free")
+def tile_row(number: int, index: TileIndex, hashes: TileHashes) -> dict[str, Any]:
+    """One row of version_tiles."""
+    planes = ("points", "ground", "free", "memory")
     return {"version": number, "row": index[0], "col": index[1]} | {
-        plane: None if hashes is None else getattr(hashes, plane) for plane in planes
+        plane: getattr(hashes, plane) or None for plane in planes
     }
 
 
@@ -134,4 +171,13 @@ class Version:
     policy: Mapping[str, Any]
 
 
+_ONE_BY_ONE = 200
+"""So many tiles are sooner asked for one by one than found among all of the map's."""
+_T = schema.version_tiles
+_TILE = (
+    sa.select(_T.c.points, _T.c.ground, _T.c.free, _T.c.memory)
+    .where(_T.c.row == sa.bindparam("row"), _T.c.col == sa.bindparam("col"), _T.c.version <= sa.bindparam("number"))
+    .order_by(_T.c.version.desc())
+    .limit(1)
+)
 _BLOB = sa.select(schema.blobs.c.data).where(schema.blobs.c.hash == sa.bindparam("digest"))

@@ -2,28 +2,32 @@
 
 Starts from the version before its first vote and goes through every later version again, by the policy recorded in
 each and with the ballots that stood at its moment, without the vehicle. The result is published as one new version.
-A round that made no version because of the vehicle left no trace: the next publish makes up for it.
+A round that made no version because of the vehicle left no trace: the next publish makes up for it. A vote that was
+cast against a version speaks of the map that its vehicle had: it is not heard in cells that are otherwise now.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from concurrent.futures import Executor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import sqlalchemy as sa
 
 from mapvote.core.grid import TileIndex
 from mapvote.core.tile import Tile
-from mapvote.core.types import F32
+from mapvote.core.types import Bool
+from mapvote.fusion.spent import differing
 from mapvote.server.errors import NotFound
 from mapvote.server.store import schema
-from mapvote.server.store.blobs import TileHashes, pack_tile, same_cells
+from mapvote.server.store.blobs import TileHashes, pack_tile
+from mapvote.server.store.commit import NewTiles, write_version
 from mapvote.server.store.database import address_of
-from mapvote.server.store.eligible_votes import Bar, Round, bars_on, standing_tiles
+from mapvote.server.store.eligible_votes import Round, standing_tiles
 from mapvote.server.store.policy import recorded
-from mapvote.server.store.publish import Outcome, write_version
-from mapvote.server.store.queries import Version, load_tile, tiles_of
+from mapvote.server.store.publish import Outcome, turned_back
+from mapvote.server.store.queries import Version, load_tile, memory_of, tile_of, tiles_of
 from mapvote.server.store.store import Store
 from mapvote.server.store.tile_jobs import Task, fuse_round
 
@@ -34,6 +38,19 @@ class _State:
 
     root: int
     edited: Mapping[TileIndex, Tile] = field(default_factory=dict)
+    absent: frozenset[TileIndex] = frozenset()
+    """Of the edited tiles those that the map does not have: they only remember."""
+
+
+@dataclass(slots=True)
+class _History:
+    """The versions gone through again so far."""
+
+    out: Mapping[str, int]
+    """Who is left out, up to which version: who was taken out before speaks again after that."""
+    states: dict[int, _State]
+    misread: dict[TileIndex, dict[int, Bool]] = field(default_factory=dict)
+    """By tile and version, the cells that were otherwise when vehicles drove with it."""
 
 
 def replay(
@@ -43,96 +60,107 @@ def replay(
 
     NotFound if it never voted, Conflict if somebody publishes meanwhile.
     """
+    history = store.versions()
+    newest, number = history[-1], history[-1].number + 1
+    out = {v.policy["unvoted"]: v.number for v in history if v.kind == "replay"} | {vehicle: number}
     with store.database.reading() as connection:
         b = schema.ballots
-        first = connection.execute(sa.select(sa.func.min(b.c.first_seq)).where(b.c.vehicle == vehicle)).scalar_one()
+        heard = sa.select(b.c.vehicle, sa.func.min(b.c.first_seq)).where(b.c.vehicle.in_(out)).group_by(b.c.vehicle)
+        first = {row[0]: row[1] for row in connection.execute(heard)}
         mark = connection.execute(sa.select(sa.func.max(schema.events.c.seq))).scalar_one()
-    if first is None:
+    if vehicle not in first:
         raise NotFound(f"{vehicle!r} never voted here")
-    history = store.versions()
-    newest = history[-1]
-    without = {vehicle} | {v.policy["unvoted"] for v in history if v.kind == "replay"}
-    touched = next((v for v in history if v.kind == "publish" and v.mark >= first), None)
+    touched = next((v for v in history if v.kind == "publish" and v.mark >= min(first.values())), None)
     start = newest.number if touched is None or touched.parent is None else touched.parent
-    states = {number: _State(number) for number in range(1, start + 1)}
-    kept = history[start - 1].mark  # rollbacks up to here hold as recorded, later ones are drawn anew
-    bars: dict[TileIndex, list[Bar]] = {}
-    for version in history[start:]:
-        states[version.number] = _again(store, version, states, bars, kept, without, executor)
-    tiles: dict[TileIndex, TileHashes | None] = {}
+    gone_through = _History(out, {v.number: _State(v.number) for v in history if v.number <= start})
+    for version in history:
+        if version.number > start:
+            _again(store, version, gone_through, executor)
+    tiles: dict[TileIndex, TileHashes] = {}
     planes: list[Mapping[str, bytes]] = []
     added = deleted = 0
-    for index, ours, theirs in _pairs(store, states[newest.number], _State(newest.number)):
-        mine, packed = (None, {}) if ours is None else pack_tile(ours)
-        if mine != (None if theirs is None else pack_tile(theirs)[0]):
-            tiles[index] = mine
+    last = gone_through.states[newest.number]
+    for index, ours, theirs in _pairs(store, last, _State(newest.number)):
+        mine, packed = pack_tile(replace(ours.tile, memory=turned_back(number, theirs.tile, ours.tile)))
+        if (mine if ours.there else None) != (pack_tile(theirs.tile)[0] if theirs.there else None):
+            tiles[index] = mine if ours.there else replace(TileHashes.none(), memory=mine.memory)
             planes.append(packed)
-            grown = _count(ours) - _count(theirs)
+            grown = len(ours.tile.points) - len(theirs.tile.points)
             added, deleted = added + max(grown, 0), deleted + max(-grown, 0)
     if dry_run:
         return Outcome(newest.number, False, sorted(tiles), added, deleted, [])
     why = f"as if {vehicle} had never voted, from version {start} on"
     policy = {"unvoted": vehicle}
-    number = newest.number + 1
     version = Version(number, newest.number, "replay", start, store.clock(), by, why, mark, policy)
-    write_version(store, version, tiles, planes, unvoted=vehicle)
+    write_version(store, version, NewTiles(tiles, planes), unvoted=vehicle)
     return Outcome(number, True, sorted(tiles), added, deleted, [])
 
 
-def _again(
-    store: Store,
-    version: Version,
-    states: Mapping[int, _State],
-    bars: dict[TileIndex, list[Bar]],
-    kept: int,
-    without: set[str],
-    executor: Executor | None,
-) -> _State:
-    """What a version would have been."""
+def _again(store: Store, version: Version, history: _History, executor: Executor | None) -> None:
+    """Add what a version would have been to the history."""
     assert version.parent is not None
-    before = states[version.parent]
+    before = history.states[version.parent]
+    state = before
     if version.kind == "rollback":
         assert version.target is not None
-        target = states[version.target]
-        for index, now, then in _pairs(store, before, target):
-            differ = ~same_cells(_points(now), _points(then), store.lattice.tile(index))
-            bars.setdefault(index, []).append(Bar(version.mark, differ))
-        return target
-    if version.kind != "publish":
-        return before
+        state = _turned_back(store, version.number, before, history.states[version.target])
+    elif version.kind == "publish":
+        state = _fused(store, version, before, history, executor)
+    history.states[version.number] = state
+    for index, ours, theirs in _pairs(store, state, _State(version.number)):
+        differ = differing(ours.tile, theirs.tile)
+        if differ.any():
+            history.misread.setdefault(index, {})[version.number] = differ
+
+
+def _turned_back(store: Store, number: int, before: _State, target: _State) -> _State:
+    edited, absent = dict(before.edited), set(before.absent)
+    for index, now, then in _pairs(store, before, target):
+        if now.there != then.there or pack_tile(now.tile)[0] != pack_tile(then.tile)[0]:
+            edited[index] = replace(then.tile, memory=turned_back(number, now.tile, then.tile))
+            absent = absent - {index} if then.there else absent | {index}
+    return _State(before.root, edited, frozenset(absent))
+
+
+def _fused(store: Store, version: Version, before: _State, history: _History, executor: Executor | None) -> _State:
     policy = recorded(version.policy)
-    asked = Round(version.mark, policy, version.created_ns - round(policy.fuse.min_age_s * 1e9), frozenset(without))
-    tasks = []
+    without = frozenset(name for name, until in history.out.items() if version.number < until)
+    asked = Round(version.mark, policy, version.created_ns - round(policy.fuse.min_age_s * 1e9), without)
+    tasks, url = [], address_of(store.database.url)
     with store.database.reading() as connection:
-        hashes = tiles_of(connection, before.root)
         for index in standing_tiles(connection, version.mark):
-            tile = before.edited.get(index)
-            if tile is None and index in hashes:
-                tile = load_tile(connection, store.lattice.tile(index), hashes[index])
-            barred = (*bars_on(connection, index, kept), *bars.get(index, ()))
-            tasks.append(Task(address_of(store.database.url), store.lattice.tile(index), tile, asked, barred))
-    edited = {f.index: f.tile for f in fuse_round(tasks, store.database, executor) if f.hashes and f.tile is not None}
-    return _State(before.root, dict(before.edited) | edited)
+            tile = _content(store, connection, before, index, tile_of(connection, before.root, index)).tile
+            misread = history.misread.get(index, {})
+            tasks.append(Task(url, tile.window, version.number, tile, asked, misread))
+    fused = fuse_round(tasks, store.database, executor)
+    edited = {f.index: f.tile for f in fused if f.hashes and f.tile is not None}
+    return _State(before.root, dict(before.edited) | edited, before.absent - edited.keys())
 
 
-def _pairs(store: Store, a: _State, b: _State) -> Iterator[tuple[TileIndex, Tile | None, Tile | None]]:
+class _Content(NamedTuple):
+    """A tile of a state: what it holds, and whether the map has it."""
+
+    tile: Tile
+    there: bool
+
+
+def _pairs(store: Store, a: _State, b: _State) -> Iterator[tuple[TileIndex, _Content, _Content]]:
     """Tiles in which two states may differ, with both of their contents."""
     with store.database.reading() as connection:
         old, new = tiles_of(connection, a.root), tiles_of(connection, b.root)
         candidates = {i for i in old.keys() | new.keys() if old.get(i) != new.get(i)} | set(a.edited) | set(b.edited)
-
-        def content(index: TileIndex, state: _State, hashes: Mapping[TileIndex, TileHashes]) -> Tile | None:
-            if index in state.edited:
-                return state.edited[index]
-            return load_tile(connection, store.lattice.tile(index), hashes[index]) if index in hashes else None
-
         for index in sorted(candidates):
-            yield index, content(index, a, old), content(index, b, new)
+            ours = _content(store, connection, a, index, old.get(index))
+            yield index, ours, _content(store, connection, b, index, new.get(index))
 
 
-def _points(tile: Tile | None) -> F32 | None:
-    return None if tile is None else tile.points
-
-
-def _count(tile: Tile | None) -> int:
-    return 0 if tile is None else len(tile.points)
+def _content(
+    store: Store, connection: sa.Connection, state: _State, index: TileIndex, hashes: TileHashes | None
+) -> _Content:
+    """A tile of a state, whose root has it as ``hashes``."""
+    if index in state.edited:
+        return _Content(state.edited[index], index not in state.absent)
+    window = store.lattice.tile(index)
+    if hashes is not None:
+        return _Content(load_tile(connection, window, hashes), True)
+    return _Content(replace(Tile.empty(window), memory=memory_of(connection, state.root, index)), False)

@@ -93,9 +93,11 @@ version_tiles = sa.Table(
     sa.Column("points", _Hash),
     sa.Column("ground", _Hash),
     sa.Column("free", _Hash),
+    sa.Column("memory", _Hash),
     sa.Index("ix_version_tiles_tile", "row", "col", "version"),
 )
-"""Only tiles that the version set; a tile that it does not name is as in its parent. Null points: no such tile."""
+"""Only tiles that the version set; a tile that it does not name is as in its parent. Null points: no such tile.
+``memory``: for every cell the version of its last change, and what came and went; null: nothing ever did."""
 
 ballots = sa.Table(
     "ballots",
@@ -112,9 +114,11 @@ ballots = sa.Table(
     sa.Column("settings_hash", sa.String(128), nullable=False),
     sa.Column("cast_by", sa.String(32), nullable=False),
     sa.Column("bytes", sa.BigInteger, nullable=False),
+    sa.Column("version", sa.Integer, nullable=False),
     sa.Index("ix_ballots_drive", "vehicle", "drive"),
 )
-"""``cast_by``: method and stage; ``bytes``: how large the ballot was when it came.
+"""``cast_by``: method and stage; ``bytes``: how large the ballot was when it came; ``version``: of
+the map that the vehicle drove with.
 ``first_seq``: when this drive was first heard of; ``gone_seq``: the event that replaced or withdrew this ballot."""
 
 ballot_tiles = sa.Table(
@@ -145,14 +149,3 @@ decisions = sa.Table(
     sa.Column("deleted", sa.Integer, nullable=False),
 )
 """``tally``: (5, 65536) uint16 or int32 in VOTE_UNITs, compressed."""
-
-bars = sa.Table(
-    "bars",
-    metadata,
-    sa.Column("version", sa.Integer, sa.ForeignKey("versions.number"), primary_key=True),
-    sa.Column("row", sa.Integer, primary_key=True),
-    sa.Column("col", sa.Integer, primary_key=True),
-    sa.Column("seq", sa.BigInteger, nullable=False),
-    sa.Column("cells", sa.LargeBinary, nullable=False),
-)
-"""A rollback: change votes on ``cells`` (65536 packed bits) from drives first heard of before ``seq`` count no more."""

@@ -35,6 +35,7 @@ from mapvote.server.store.queries import (
     load_blob,
     load_tile,
     log_event,
+    tile_of,
     tiles_of,
     version_of,
 )
@@ -100,7 +101,10 @@ class Store:
         by: str = "operator",
         clock: Callable[[], int] = now_ns,
     ) -> Store:
-        """A new store whose version 1 is ``point_map``; MapvoteError if the database already holds one."""
+        """A new store whose first version is ``point_map``: 1, or what the map itself says.
+
+        MapvoteError if the database already holds a map.
+        """
         database = Database(url)
         try:
             database.make_private_file()
@@ -115,7 +119,7 @@ class Store:
                 connection.execute(schema.maps.insert().values(map_id=point_map.map_id, **about, **origin))
                 now = clock()
                 mark = log_event(connection, now, "import", by, point_map.map_id)
-                version = Version(1, None, "import", None, now, by, "first map", mark, {})
+                version = Version(point_map.version or 1, None, "import", None, now, by, "first map", mark, {})
                 add_version(connection, version, point_map.tiles)
                 write_policy(connection, policy or Policy(), now, by, "a new store")
         except BaseException:
@@ -178,7 +182,7 @@ class Store:
         """One tile of a version, None where the map has none; NotFound if there is no such version."""
         with self.database.reading() as connection:
             version_of(connection, number)
-            hashes = tiles_of(connection, number, index).get(index)
+            hashes = tile_of(connection, number, index)
             return None if hashes is None else load_tile(connection, self.lattice.tile(index), hashes)
 
     def point_map(self, number: int | None = None) -> PointMap:
@@ -190,4 +194,4 @@ class Store:
                 index: load_tile(connection, self.lattice.tile(index), hashes)
                 for index, hashes in tiles_of(connection, number).items()
             }
-        return PointMap(self.map_id, self.lattice, tiles, self.georeference)
+        return PointMap(self.map_id, self.lattice, tiles, self.georeference, version=number)

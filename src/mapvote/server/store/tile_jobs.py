@@ -19,12 +19,15 @@ from numpy.typing import NDArray
 from mapvote.codec.arrays import pack_plane, unpack_bytes
 from mapvote.core.grid import CELLS, TILE_CELLS, Grid, TileIndex
 from mapvote.core.tile import Tile
-from mapvote.core.types import I32, N_STATES, U8
+from mapvote.core.types import I32, I64, N_STATES, U8, Bool
 from mapvote.fusion.fuse import fuse_tile
+from mapvote.fusion.tile_vote import TileVote
 from mapvote.server.store.blobs import TileHashes, pack_tile
 from mapvote.server.store.database import Database, address_of
-from mapvote.server.store.eligible_votes import Bar, Round, counting_votes
-from mapvote.server.store.queries import load_tile
+from mapvote.server.store.eligible_votes import Round, counting_votes, recent_votes
+from mapvote.server.store.queries import load_tile, tile_as_of
+
+_NOWHERE = np.zeros(CELLS, dtype=np.bool_)
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,11 +37,13 @@ class Task:
     url: str
     """Of the database, without its password."""
     window: Grid
+    version: int
+    """That is to be made."""
     tile: TileHashes | Tile | None
     """As it is now: in the store, at hand, or not there."""
     asked: Round
-    bars: tuple[Bar, ...] | None = None
-    """Instead of those recorded."""
+    misread: Mapping[int, Bool] | None = None
+    """See :func:`mapvote.fusion.spent.unspent`; in a replay only."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,6 +63,12 @@ class Fused:
     hashes: TileHashes | None
     """Of the edited tile; None if it stays as it is."""
     planes: Mapping[str, bytes]
+    cells_gone: I64
+    """Flat cells that hold no obstacle any more."""
+    cells_new: I64
+    """Flat cells that hold one for the first time."""
+    freed: int
+    """Cells in which free space was learned, of a tile that knew of any."""
     tile: Tile | None
     """The edited tile where the task held one at hand (replay), else None."""
 
@@ -68,14 +79,17 @@ def fuse_stored(task: Task, database: Database | None = None) -> Fused:
     In another process, where there is no ``database`` at hand, one is opened by ``task.url`` and kept.
     """
     with (database or _database(task.url)).reading() as connection:
-        stored = task.tile if isinstance(task.tile, TileHashes) else None
-        if isinstance(task.tile, Tile):
-            tile = task.tile
-        else:
-            tile = Tile.empty(task.window) if stored is None else load_tile(connection, task.window, stored)
-        votes = counting_votes(connection, tile, task.asked, task.bars, None if stored is None else stored.points)
-    decision, edited = fuse_tile(tile, votes, task.asked.policy.round.method, task.asked.settings)
+        tile = _tile(connection, task)
+        votes = counting_votes(connection, tile, task.asked, task.misread)
+        cast = task.asked.policy.round
+
+        def history() -> list[TileVote]:
+            return recent_votes(connection, tile, task.asked, task.misread)
+
+        recent = history if cast.stage == "two-stage" else None
+        decision, edited = fuse_tile(tile, votes, cast.method, task.asked.settings, task.version, recent)
     hashes, planes = (None, {}) if edited is tile else pack_tile(edited)
+    held, holds = ((tile.obstacle_words != 0), (edited.obstacle_words != 0)) if hashes else (_NOWHERE, _NOWHERE)
     return Fused(
         index=tile.index,
         states=pack_states(decision.states),
@@ -86,8 +100,19 @@ def fuse_stored(task: Task, database: Database | None = None) -> Fused:
         deleted=decision.deleted,
         hashes=hashes,
         planes=planes,
-        tile=edited if isinstance(task.tile, Tile) or task.bars is not None else None,
+        cells_gone=np.flatnonzero(held & ~holds),
+        cells_new=np.flatnonzero(holds & ~held),
+        freed=0 if tile.free is edited.free or tile.free is None else int((tile.free != edited.free).sum()),
+        tile=None if task.misread is None else edited,
     )
+
+
+def _tile(connection: sa.Connection, task: Task) -> Tile:
+    if isinstance(task.tile, Tile):
+        return task.tile
+    if task.tile is not None:
+        return load_tile(connection, task.window, task.tile)
+    return tile_as_of(connection, task.window, task.version - 1)
 
 
 def fuse_round(tasks: Iterable[Task], database: Database, executor: Executor | None = None) -> list[Fused]:

@@ -1,0 +1,97 @@
+"""Things that come and go: what is new in a cell enters the map once it can be expected to stay.
+
+Every cell remembers how many things vehicles saw come and go there, and how long these stayed. A thing that stays for
+a while with no memory of how long (an exponential survival time, as in Rosen, Mason and Leonard, "Towards lifelong
+feature-based mapping in semi-static environments", 2016), of which one expects ``prior_stay_days`` beforehand, can be
+expected to stay (prior + all past stays + its own age) / (1 + number of past stays). Below ``stay_days`` it is
+*temporary* and stays out of the map. What the map holds falls by its own rule: that it stood for a year says nothing
+against a quorum that sees through it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from mapvote.config import FuseSettings
+from mapvote.core.memory import Memory
+from mapvote.core.tile import Tile
+from mapvote.core.types import F64, U8, Bool, CellState
+from mapvote.fusion.tile_vote import TileVote
+
+DAY_S = 86_400
+_CO, _UE, _CE = int(CellState.CHANGED_OCCUPIED), int(CellState.UNCHANGED_EMPTY), int(CellState.CHANGED_EMPTY)
+
+
+def expected_days(memory: Memory | None, cells: Bool, age_days: F64 | float, settings: FuseSettings) -> F64:
+    """(n,) how long what stands in ``cells`` (256, 256) since ``age_days`` (n,) can be expected to stay."""
+    n = int(cells.sum())
+    past = np.zeros((2, n)) if memory is None else np.stack([memory.stays[cells], memory.stayed_s[cells]]).astype(float)
+    return np.asarray((settings.prior_stay_days + past[1] / DAY_S + age_days) / (1.0 + past[0]))
+
+
+def doubtful(states: U8, memory: Memory | None, settings: FuseSettings) -> Bool:
+    """(256, 256) cells decided changed-occupied in which only time can tell whether the thing will stay."""
+    out = states == CellState.CHANGED_OCCUPIED
+    out[out] = expected_days(memory, out, 0.0, settings) < settings.stay_days
+    return np.asarray(out)
+
+
+def ages_days(drives: Sequence[TileVote], cells: Bool, breaks: int) -> F64:
+    """(n,) for how long something has been seen in ``cells`` (256, 256): from its first sighting to its last.
+
+    Of all ``drives`` that count there, each by itself. So many as ``breaks`` in a row that see nothing begin it anew.
+    """
+    n = int(cells.sum())
+    since, last, absent = np.full(n, -1, np.int64), np.full(n, -1, np.int64), np.zeros(n, np.int64)
+    for drive in sorted(drives, key=lambda drive: (drive.end_ns, drive.digest)):
+        assert drive.states is not None
+        seen = drive.states[cells]
+        there, nothing = seen == _CO, seen == _UE
+        absent[there] = 0
+        absent[nothing] += 1
+        since[absent >= breaks] = -1
+        end_s = max(drive.end_ns // 10**9, 0)
+        since[there & (since < 0)] = end_s
+        last[there] = end_s
+    return np.where(since < 0, 0.0, (last - since) / DAY_S)
+
+
+def temporary(states: U8, tile: Tile, drives: Sequence[TileVote], settings: FuseSettings) -> Bool:
+    """(256, 256) cells decided changed-occupied by what comes and goes.
+
+    ``drives``: every vote that counts on the tile and is no more than ``stay_days`` older than the newest.
+    """
+    cells = doubtful(states, tile.memory, settings)
+    if cells.any():
+        age = ages_days(drives, cells, settings.min_votes)
+        stays = (age >= settings.stay_days) | (expected_days(tile.memory, cells, age, settings) >= settings.stay_days)
+        cells[cells] = ~stays
+    return cells
+
+
+def remembered(memory: Memory, before: Tile, after: Tile, votes: Sequence[TileVote], states: U8) -> Memory:
+    """``memory`` with what came and what went between two versions of a tile, by the votes that decided it."""
+    held, holds = (tile.obstacle_words != 0 for tile in (before, after))
+    came, went = holds & ~held, held & ~holds & (memory.came_s > 0)
+    if not came.any() and not went.any():
+        return memory
+    planes = memory.planes.copy()
+    planes[1][came] = _first_s(votes, came & (states == CellState.CHANGED_OCCUPIED), _CO)[came]
+    ended = np.maximum(_first_s(votes, went, _CE), memory.came_s)
+    planes[2][went] += 1
+    planes[3][went] += (ended - memory.came_s)[went]
+    planes[1][went] = 0
+    return replace(memory, planes=planes)
+
+
+def _first_s(votes: Sequence[TileVote], cells: Bool, state: int) -> np.ndarray:
+    """(256, 256) uint32 when the first of ``votes`` said ``state`` in ``cells``, seconds; 0 where none did."""
+    first = np.full(cells.shape, np.iinfo(np.uint32).max, dtype=np.uint32)
+    for vote in votes:
+        if vote.states is not None:
+            mine = cells & (vote.states == state)
+            first[mine] = np.minimum(first[mine], np.uint32(min(max(vote.end_ns // 10**9, 1), 2**32 - 2)))
+    return np.where(first == np.iinfo(np.uint32).max, np.uint32(0), first)

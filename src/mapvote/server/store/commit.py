@@ -1,0 +1,64 @@
+"""The one transaction by which a version appears."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import sqlalchemy as sa
+from sqlalchemy.exc import IntegrityError
+
+from mapvote.core.grid import TileIndex
+from mapvote.server.errors import Conflict
+from mapvote.server.store import schema
+from mapvote.server.store.blobs import TileHashes
+from mapvote.server.store.queries import Version, add_blobs, current_version, log_event, tile_row, version_row
+from mapvote.server.store.store import Store
+from mapvote.server.store.tile_jobs import Fused
+
+
+@dataclass(frozen=True, slots=True)
+class NewTiles:
+    """The tiles that a version sets, and all planes that the store may not hold yet."""
+
+    tiles: Mapping[TileIndex, TileHashes]
+    """A tile without points is one that the version does not have."""
+    planes: Sequence[Mapping[str, bytes]]
+    fused: Sequence[Fused] = field(default=(), repr=False)
+    """What was decided, also where nothing came of it."""
+
+
+def write_version(store: Store, version: Version, new: NewTiles, unvoted: str | None = None) -> Version:
+    """Publish a version; Conflict if its parent is the newest no more. ``unvoted``: this vehicle's votes are gone."""
+    try:
+        with store.database.writing() as connection:
+            if current_version(connection).number != version.parent:
+                raise Conflict(f"version {version.number} was published by somebody else meanwhile; look at it first")
+            seq = log_event(connection, version.created_ns, version.kind, version.published_by, f"v{version.number}")
+            if version.kind != "publish":
+                version = replace(version, mark=seq)
+            connection.execute(schema.versions.insert().values(**version_row(version)))
+            for some in new.planes:
+                add_blobs(connection, some)
+            if new.tiles:
+                rows = [tile_row(version.number, index, hashes) for index, hashes in new.tiles.items()]
+                connection.execute(schema.version_tiles.insert(), rows)
+            if new.fused:
+                connection.execute(schema.decisions.insert(), [_decision_row(version.number, f) for f in new.fused])
+            if unvoted is not None:
+                _take_out(connection, unvoted, seq)
+    except IntegrityError as error:
+        raise Conflict(
+            f"version {version.number} was published by somebody else meanwhile; look at it first"
+        ) from error
+    return version
+
+
+def _take_out(connection: sa.Connection, vehicle: str, seq: int) -> None:
+    b = schema.ballots
+    connection.execute(b.update().where(b.c.vehicle == vehicle, b.c.gone_seq.is_(None)).values(gone_seq=seq))
+
+
+def _decision_row(number: int, fused: Fused) -> dict[str, object]:
+    counts = {name: getattr(fused, name) for name in ("states", "tally", "vehicles", "added", "deleted")}
+    return {"version": number, "row": fused.index[0], "col": fused.index[1]} | counts
