@@ -40,24 +40,33 @@ Projector = Annotated[
     str | None,
     typer.Option(metavar="FILE|TYPE", help="Autoware's map_projector_info.yaml, or MGRS:54SUE, LocalCartesian:LAT,LON"),
 ]
-Topic = Annotated[str | None, typer.Option(metavar="TOPIC", help="the PointCloud2 topic of a bag that has several")]
+Topic = Annotated[
+    str | None,
+    typer.Option(
+        metavar="TOPIC", help="which PointCloud2 topic of a bag (of one vehicle's several, with commas), or scene"
+    ),
+]
 DRIVE_OPTIONS = {
     "scans": Annotated[
         str | None, typer.Option(metavar="SLICES", help="which scans: START:STOP:STEP, comma-separated: 0:12,24:36")
     ],
     "prior": Annotated[
         str | None,
-        typer.Option(metavar="FILE|TOPIC|none", help="poses T_map_lidar: rows of 3 x 4, or a pose topic of a bag"),
+        typer.Option(metavar="FILE|TOPIC|none", help="poses: rows of 3 x 4, TUM, CSV, GNSS; or a topic of a bag"),
     ],
     "rate_hz": Rate,
     "sensor": Annotated[
-        str | None, typer.Option(metavar="NAME", help="hdl32e, hdl64e, vlp16; else drive.toml, else a guess")
+        str | None, typer.Option(metavar="NAME", help="a LiDAR model; else drive.toml, else measured in the scans")
     ],
     "mount": Annotated[
         str | None,
         typer.Option(metavar="NUMBERS", help="T_base_lidar: x,y,z,roll,pitch,yaw in metres and degrees, or 12 numbers"),
     ],
     "topic": Topic,
+    "columns": Annotated[
+        str | None, typer.Option(metavar="NAMES", help="of .bin and .npy scans: x,y,z,intensity,ring; else recognised")
+    ],
+    "dtype": Annotated[str | None, typer.Option(metavar="TYPE", help="of the columns of .bin scans: float32, float64")],
 }
 """What the command line may say about a drive, by the names of ``formats.open_drive``."""
 

@@ -106,6 +106,7 @@ def vote(
     from mapvote.core.types import MapvoteError
     from mapvote.formats import open_drive, read_map
     from mapvote.formats.atomic import whole_file
+    from mapvote.formats.geo.frame import frame_of
     from mapvote.localisation.tracker import GivenPoses
     from mapvote.vehicle import vote_drive
 
@@ -115,14 +116,15 @@ def vote(
     settings = load_settings(config)
     if case is not None:
         settings = choose_case(settings, case)
-    drive = open_drive(drive_path, vehicle=vehicle, **drive_options)
+    with waiting(f"reading {where}"):
+        point_map = _fetch(where, key) if "://" in where else read_map(where)
+    frame = frame_of(point_map.georeference)
+    drive = open_drive(drive_path, vehicle=vehicle, frame=frame, **drive_options)
     localise = None
     if trust_prior:
         if drive.T_map_lidar_prior is None:
             raise MapvoteError(f"{drive_path}: has no prior to trust; give one with --prior, or let it be localised")
         localise = GivenPoses(drive.stamps_ns, drive.T_map_lidar_prior)
-    with waiting(f"reading {where}"):
-        point_map = _fetch(where, key) if "://" in where else read_map(where)
     with progress("voting") as tell:
         ballot, report = vote_drive(drive, point_map, settings, localise=localise, progress=tell)
     data = encode(ballot)

@@ -18,6 +18,12 @@ class Sensor:
     min_range_m: float = 1.0
     max_range_m: float = 100.0
     range_sigma_m: float = 0.02
+    clockwise: bool = True
+    """Seen from above."""
+    rings: bool = True
+    """False: the beams do not lie on rings (solid-state, non-repeating); ``elevations_deg`` is then an even grid."""
+    blind_sectors_deg: tuple[tuple[float, float], ...] = ()
+    """Azimuths (from, to) where the vehicle itself, or the sensor's window, hides everything."""
 
     @property
     def beams(self) -> int:

@@ -5,8 +5,8 @@ Frames: ``map`` (the world), ``base`` (the vehicle), ``lidar``. SI units, else t
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from enum import IntEnum
 from pathlib import Path
 from typing import Any
@@ -70,6 +70,20 @@ class Scan:
     """(n,) when each point was measured, relative to ``stamp_ns``; None if already motion-compensated."""
     intensity: F32 | None = None
     """(n,) in [0, 1], where known."""
+    ring: U16 | None = None
+    """(n,) which beam measured each point, where known."""
+    origin: F64 | None = None
+    """(3,) where its rays begin, in the frame of the points; None at (0, 0, 0), as with the vehicle's first LiDAR."""
+
+    def origin_map(self, T_map_lidar: F64) -> F64:
+        """(3,) where its rays begin, in map metres."""
+        start = T_map_lidar[:3, 3] if self.origin is None else T_map_lidar[:3, :3] @ self.origin + T_map_lidar[:3, 3]
+        return np.array(start, dtype=np.float64)
+
+    def seen_from(self, T_first_other: F64) -> Scan:
+        """The scan of another LiDAR of the vehicle in the frame of its first one."""
+        points = (self.points @ T_first_other[:3, :3].T + T_first_other[:3, 3]).astype(np.float32)
+        return replace(self, points=points, origin=T_first_other[:3, 3].copy())
 
     def __post_init__(self) -> None:
         check_array(self.points, "Scan.points", (None, 3), np.float32)
@@ -95,6 +109,10 @@ class Drive:
     prior_sigma_m: float = 1.0
     prior_sigma_deg: float = 1.0
     T_base_lidar: F64 = field(default_factory=lambda: np.eye(4))
+    georeference: Mapping[str, str] = field(default_factory=dict)
+    """Where on Earth the prior's frame lies, as a map carries it; empty where nobody said."""
+    sensor_told: str = ""
+    """Where the sensor's model comes from, and how sure it is."""
 
     def __post_init__(self) -> None:
         check_array(self.stamps_ns, "Drive.stamps_ns", (None,), np.int64)

@@ -11,8 +11,9 @@ import numpy as np
 
 from mapvote.core.point_map import PointMap, all_points
 from mapvote.core.types import Drive, MapvoteError
-from mapvote.formats.drives.kitti import DriveWriter, read_T_map_lidar
+from mapvote.formats.drives.kitti import DriveWriter
 from mapvote.formats.drives.options import DriveOptions
+from mapvote.formats.drives.poses import read_T_map_lidar
 from mapvote.formats.geo.frame import MapFrame, frame_of
 from mapvote.formats.geo.projector import autoware_frame, frame_wanted
 from mapvote.formats.maps.cloud import Cloud, to_map
@@ -42,17 +43,22 @@ def open_drive(
     vehicle: str | None = None,
     mount: str | None = None,
     topic: str | None = None,
+    columns: str | None = None,
+    dtype: str | None = None,
+    frame: MapFrame | None = None,
 ) -> Drive:
     """A recorded drive of any known format; its scans are read one by one when asked for.
 
     ``scans``: comma-separated START:STOP:STEP slices. ``prior``: a file of 3 x 4 rows T_map_lidar (a topic, for bags),
     or "none". ``rate_hz``, ``sensor``, ``vehicle`` and ``mount`` (T_base_lidar: 12 numbers, or x, y, z, roll, pitch,
-    yaw in metres and degrees) win over drive.toml. ``topic``: the PointCloud2 topic of a bag.
+    yaw in metres and degrees) win over drive.toml. ``topic``: the PointCloud2 topic of a bag (several
+    with commas), the scene of a nuScenes folder. ``columns``, ``dtype``: of .bin and .npy scans, "x,y,z,intensity,ring"
+    and "float32". ``frame``: the map's, into which latitudes and longitudes of a prior go.
 
     Raises MapvoteError if there is no drive at ``path`` or it cannot be used as it is, saying why.
     """
     path = Path(path)
-    options = DriveOptions(scans, prior, rate_hz, sensor, vehicle, mount, topic)
+    options = DriveOptions(scans, prior, rate_hz, sensor, vehicle, mount, topic, columns, dtype, frame)
     for layout in DRIVES.values():
         if layout.recognised(path):
             return layout.open(path, options)

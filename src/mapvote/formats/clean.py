@@ -54,6 +54,7 @@ def clean_scan(
     bad_points: BadPoints,
     intensity: F32 | None = None,
     time_s: F32 | None = None,
+    ring: NDArray[np.number] | None = None,
     no_return: NDArray[np.bool_] | None = None,
 ) -> Scan:
     """A Scan of the usable points (n, 3), in their order.
@@ -81,6 +82,7 @@ def clean_scan(
         points=np.ascontiguousarray(points[keep], dtype=np.float32),
         time_s=None if time_s is None else np.ascontiguousarray(time_s[keep], dtype=np.float32),
         intensity=None if intensity is None else unit_intensity(intensity[keep]),
+        ring=None if ring is None else np.clip(np.nan_to_num(ring[keep]), 0, 65535).astype(np.uint16),
     )
 
 
@@ -101,13 +103,13 @@ def unit_intensity(intensity: NDArray[np.number]) -> F32:
     return np.clip(out, 0.0, 1.0)
 
 
-def spinning_time_s(points: F32, rate_hz: float) -> F32:
+def spinning_time_s(points: F32, rate_hz: float, *, clockwise: bool = True) -> F32:
     """When each point (n, 3) was measured, relative to the middle of the revolution, by its azimuth.
 
-    The sensor turns clockwise seen from above and faces forward at the stamp: -azimuth / (2 pi rate).
+    The sensor faces forward at the stamp: -azimuth / (2 pi rate) if it turns clockwise seen from above.
     """
     azimuth = np.arctan2(points[:, 1], points[:, 0])
-    return (-azimuth / (2.0 * np.pi * rate_hz)).astype(np.float32)
+    return ((-azimuth if clockwise else azimuth) / (2.0 * np.pi * rate_hz)).astype(np.float32)
 
 
 def stamps_from_rate(n: int, rate_hz: float, start_ns: int) -> I64:

@@ -73,6 +73,7 @@ def _drive(drive: Drive) -> Rows:
         ("vehicle", drive.vehicle),
         ("drive", drive.drive_id),
         ("sensor", f"{drive.sensor.name}, {drive.sensor.beams} beams, {drive.sensor.rate_hz:g} Hz"),
+        ("sensor is", drive.sensor_told),
         ("scans", f"{len(drive)} in {seconds:.1f} s, the first with {len(first.points):,} points"),
         ("starts", f"{start:%Y-%m-%d %H:%M:%S} UTC" if start.year > 1990 else "time of day unknown"),
         ("point times", "none: taken as motion-compensated" if first.time_s is None else "yes: scans are de-skewed"),

@@ -7,9 +7,15 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from mapvote.core.types import Drive
+from mapvote.formats.drives.boreas import is_boreas, open_boreas
+from mapvote.formats.drives.cloud_scans import is_cloud_scans, open_cloud_scans
 from mapvote.formats.drives.kitti import is_kitti_folder, open_kitti
 from mapvote.formats.drives.kitti_raw import is_kitti_raw, open_kitti_raw
+from mapvote.formats.drives.mulran import is_mulran, open_mulran
+from mapvote.formats.drives.newer_college import is_newer_college, open_newer_college
+from mapvote.formats.drives.nuscenes import is_nuscenes, open_nuscenes
 from mapvote.formats.drives.options import DriveOptions
+from mapvote.formats.drives.oxford import is_oxford, open_oxford
 from mapvote.formats.drives.pcd_scans import is_pcd_drive, open_pcd_drive
 from mapvote.formats.drives.rosbag import is_rosbag, open_rosbag
 from mapvote.formats.maps.autoware import (
@@ -55,9 +61,15 @@ class MapWriter:
 
 DRIVES: dict[str, DriveFormat] = {
     "KITTI drive folder": DriveFormat(is_kitti_folder, open_kitti),
-    "KITTI raw recording": DriveFormat(is_kitti_raw, open_kitti_raw),
+    "KITTI raw or KITTI-360 recording": DriveFormat(is_kitti_raw, open_kitti_raw),
+    "nuScenes": DriveFormat(is_nuscenes, open_nuscenes),
+    "Boreas sequence": DriveFormat(is_boreas, open_boreas),
+    "MulRan sequence": DriveFormat(is_mulran, open_mulran),
+    "Newer College experiment": DriveFormat(is_newer_college, open_newer_college),
+    "Oxford RobotCar traversal": DriveFormat(is_oxford, open_oxford),
     "ROS bag": DriveFormat(is_rosbag, open_rosbag),
     "folder of PCD scans": DriveFormat(is_pcd_drive, open_pcd_drive),
+    "folder of PLY, LAS, npy or bin scans": DriveFormat(is_cloud_scans, open_cloud_scans),
 }
 """In the order in which they are tried."""
 

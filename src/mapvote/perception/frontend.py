@@ -128,7 +128,7 @@ class Frontend:
             report.lost.append(report.scans - 1)
             return []
         with report.timed("ground"):
-            placed = self._place(fix, report.scans - 1)
+            placed = self._place(scan, fix, report.scans - 1)
         self._waiting.append(placed)
         with report.timed("moving"):
             decided = self._movers.push(placed.points_map, placed.origin_map, placed.obstacle, scan.stamp_ns)
@@ -139,9 +139,9 @@ class Frontend:
         self._ended = True
         return self._see(self._movers.flush())
 
-    def _place(self, fix: Fix, index: int) -> PlacedScan:
+    def _place(self, scan: Scan, fix: Fix, index: int) -> PlacedScan:
         T_map_lidar = fix.registration.T_map_lidar
-        points_map, origin_map = transform(T_map_lidar, fix.points), T_map_lidar[:3, 3].copy()
+        points_map, origin_map = transform(T_map_lidar, fix.points), scan.origin_map(T_map_lidar)
         sigma_m = float(np.sqrt(np.linalg.eigvalsh(fix.registration.covariance[:3, :3])[-1]))
         reference, outer = self._ground.at(origin_map)
         obstacle, cell = find_obstacles(points_map, reference)

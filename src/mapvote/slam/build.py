@@ -8,7 +8,7 @@ lays them at their settled poses: de-skewed, without moving objects, one point p
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -97,12 +97,23 @@ def build_map(
     for drive, T_map_lidar, mask in zip(drives, poses, registered, strict=True):
         layer.lay(drive, T_map_lidar, mask, count)
     driven = tuple(T[mask][:, :3, 3] for T, mask in zip(poses, registered, strict=True))
-    point_map = replace(layer.finish(), driven=driven)
+    point_map = replace(layer.finish(), driven=driven, georeference=dict(_place_on_earth(drives)))
     heights = [_agreed_heights(drive, point_map, path) for drive, path in zip(drives, driven, strict=True)]
     tracks = tuple(_track(*each) for each in zip(drives, poses, registered, heights, strict=True))
     held = any(_is_precise(drive, settings.mapping) for drive in drives)
     points = sum(len(tile.points) for tile in point_map.tiles.values())
     return point_map, BuildReport(tracks, points, held, two_levels(road) if len(road) else None)
+
+
+def _place_on_earth(drives: Sequence[Drive]) -> Mapping[str, str]:
+    """Where the drives' priors lie. MapvoteError if they lie in different frames: the map could only be in one."""
+    known = [drive.georeference for drive in drives if drive.georeference]
+    if any(other != known[0] for other in known):
+        raise MapvoteError(
+            "the drives' priors lie in different frames (each at its own first fix?): give all of them the same origin "
+            "in drive.toml"
+        )
+    return known[0] if known else {}
 
 
 class _Surveyor:

@@ -19,7 +19,8 @@ from mapvote.core.sensors import SENSORS
 from mapvote.core.types import F32, F64, MapvoteError
 from mapvote.formats import open_drive
 from mapvote.formats.drives.point_fields import point_times_s
-from mapvote.formats.drives.poses import from_oxts
+from mapvote.formats.geo.frame import enu_frame
+from mapvote.formats.geo.gnss import poses_from_gnss
 
 N, START = 5, 1_700_000_000_123_456_789
 STORE = get_typestore(Stores.ROS2_HUMBLE)
@@ -218,11 +219,11 @@ def test_kitti_raw_with_oxts(tmp_path: Path) -> None:
     drive = day / "2011_09_26_drive_0001_sync"
     (drive / "velodyne_points" / "data").mkdir(parents=True)
     (drive / "oxts" / "data").mkdir(parents=True)
-    lines, metres_per_degree = [], 6378137.0 * np.pi / 180
+    lines, plane = [], enu_frame(49.0, 8.4, 100.0)
     for i in range(N):
         lines.append(f"2011-09-26 13:02:25.{594360375 + 1000 * i}\n")
-        east = 49.0, 8.4 + 2.0 * i / (metres_per_degree * np.cos(np.deg2rad(49.0)))
-        row = [east[0], east[1], 100.0 + i, 0.0, 0.0, 0.5] + [0.0] * 24
+        lon, lat, _ = plane.to_lonlat(np.array([[2.0 * i, 0.0, 0.0]]))[0]
+        row = [lat, lon, 100.0 + i, 0.0, 0.0, 0.5] + [0.0] * 24
         (drive / "oxts" / "data" / f"{i:010d}.txt").write_text(" ".join(f"{v:.12f}" for v in row))
         if i != 2:  # KITTI's 0009 lacks scans, too
             rows = np.column_stack([cloud(i), np.zeros(300)]).astype("<f4")
@@ -242,8 +243,7 @@ def test_kitti_raw_with_oxts(tmp_path: Path) -> None:
 
 
 def test_oxts_agree_with_the_reference_of_a_real_drive() -> None:
-    """Two points 1/1000 degree apart: by the ellipsoid-free formula that KITTI's own development kit uses."""
-    rows = np.zeros((2, 6))
-    rows[:, 0] = [49.0, 49.001]
-    T_map = from_oxts(rows, np.eye(4))
-    assert T_map[1, 1, 3] == pytest.approx(6378137.0 * np.deg2rad(0.001), rel=1e-4)
+    """Two points 1/1000 degree apart at 49 degrees: 111.21 m by the meridian's radius of curvature on the ellipsoid."""
+    T_map, frame = poses_from_gnss(np.array([[8.4, 49.0, 110.0], [8.4, 49.001, 110.0]]), np.zeros((2, 3)), None)
+    assert T_map[1, 1, 3] == pytest.approx(111.21, abs=0.01)
+    assert frame.crs.startswith("ENU 49.0 8.4")

@@ -14,11 +14,11 @@ import numpy as np
 import tomli_w
 
 from mapvote.core.sensors import Sensor
-from mapvote.core.types import F32, F64, I64, Drive, MapvoteError, Scan
-from mapvote.formats.clean import BadPoints, clean_scan, spinning_time_s
-from mapvote.formats.drives.numbered import of_scans, prior_file, read_stamps, scan_files
-from mapvote.formats.drives.options import DriveOptions, make_drive, read_drive_file
-from mapvote.formats.drives.poses import camera_to_lidar, read_poses, read_T_camera_lidar, travels_along
+from mapvote.core.types import F32, F64, I64, Drive, MapvoteError
+from mapvote.formats.drives.bin_layout import layout_of
+from mapvote.formats.drives.numbered import read_stamps, scan_files
+from mapvote.formats.drives.options import DriveOptions, read_drive_file
+from mapvote.formats.drives.scan_folder import ScanFolder, open_scan_folder
 
 
 def is_kitti_folder(path: Path) -> bool:
@@ -29,58 +29,15 @@ def open_kitti(path: Path, options: DriveOptions) -> Drive:
     """The drive in ``path``; its scans are read one by one. MapvoteError says what is missing or does not fit."""
     about = read_drive_file(path)
     files = scan_files(path / "velodyne", ".bin")
-    stamps_ns = read_stamps(path, files, about, options)
-    prior = prior_file(path, about, options)
-    T_prior = None if prior is None else of_scans(read_T_map_lidar(prior, path), files, prior)
-    bad_points = BadPoints(str(path))
-
-    def read_scan(i: int, sensor: Sensor) -> Scan:
-        rows = read_bin(files[i])
-        return clean_scan(
-            str(files[i]),
-            i,
-            int(stamps_ns[i]),
-            rows[:, :3],
-            sensor=sensor,
-            bad_points=bad_points,
-            intensity=rows[:, 3],
-            time_s=None if about.motion_compensated else spinning_time_s(rows, sensor.rate_hz),
-        )
-
-    return make_drive(path, about, options, stamps_ns=stamps_ns, T_map_lidar_prior=T_prior, read_scan=read_scan)
-
-
-def read_bin(file: Path) -> F32:
-    """(n, 4) float32 x, y, z, intensity of a .bin file as it stands; MapvoteError if it is cut off or missing."""
-    try:
-        data = file.read_bytes()
-    except OSError as error:
-        raise MapvoteError(f"{file}: {error.strerror}; the drive changed while it was read") from error
-    if len(data) % 16:
-        raise MapvoteError(
-            f"{file}: {len(data)} bytes are not a multiple of 16 (float32 x, y, z, intensity): the scan is cut off; "
-            f"copy it again, or leave it out with --scans"
-        )
-    return np.frombuffer(data, dtype="<f4").reshape(-1, 4)
-
-
-def read_T_map_lidar(file: Path, folder: Path) -> F64:
-    """Poses (n, 4, 4) of a file of rows as T_map_lidar. Camera poses are recognised by their motion along z.
-
-    With ``folder``/calib.txt (KITTI odometry) they are converted, the map being the first LiDAR frame; without it
-    they are a MapvoteError.
-    """
-    poses = read_poses(file)
-    calib = folder / "calib.txt"
-    axis = travels_along(poses)
-    if axis == "+z" or (calib.is_file() and axis == "" and file.name != "prior.txt"):
-        if not calib.is_file():
-            raise MapvoteError(
-                f"{file}: these are camera poses (the vehicle moves along z, not x); put KITTI's calib.txt into "
-                f"{folder} to have them converted, or write T_map_lidar rows"
-            )
-        return camera_to_lidar(poses, read_T_camera_lidar(calib))
-    return poses
+    layout = layout_of(files, options.columns or about.columns, options.dtype or about.dtype)
+    folder = ScanFolder(
+        files,
+        read_stamps(path, files, about, options),
+        layout.read,
+        zero_is_no_return=False,
+        spinning=True,
+    )
+    return open_scan_folder(path, about, options, folder)
 
 
 @dataclass(frozen=True)

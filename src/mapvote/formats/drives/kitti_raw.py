@@ -7,13 +7,16 @@ from pathlib import Path
 import numpy as np
 
 from mapvote.core import geometry
-from mapvote.core.sensors import Sensor
-from mapvote.core.types import F64, Drive, MapvoteError, Scan
-from mapvote.formats.clean import BadPoints, clean_scan, log
-from mapvote.formats.drives.kitti import read_bin, read_T_map_lidar
-from mapvote.formats.drives.numbered import lines_of_scans, of_scans, prior_file, read_times_ns, scan_files
-from mapvote.formats.drives.options import DriveFile, DriveOptions, make_drive, read_drive_file
-from mapvote.formats.drives.poses import check_rigid, from_oxts, read_calib, read_numbers
+from mapvote.core.types import F64, I64, Drive, MapvoteError
+from mapvote.formats.clean import log
+from mapvote.formats.drives.bin_layout import layout_of
+from mapvote.formats.drives.kitti_360 import has_kitti_360_poses, kitti_360_poses
+from mapvote.formats.drives.numbered import lines_of_scans, of_scans, read_times_ns, scan_files
+from mapvote.formats.drives.options import DriveFile, DriveOptions, map_frame, read_drive_file
+from mapvote.formats.drives.poses import check_rigid, read_calib, read_numbers
+from mapvote.formats.drives.scan_folder import ScanFolder, open_scan_folder
+from mapvote.formats.drives.trajectory import Trajectory
+from mapvote.formats.geo.gnss import poses_from_gnss
 
 
 def is_kitti_raw(path: Path) -> bool:
@@ -21,30 +24,34 @@ def is_kitti_raw(path: Path) -> bool:
 
 
 def open_kitti_raw(path: Path, options: DriveOptions) -> Drive:
-    """The recording in ``path``. Its oxts are the prior, where calib_imu_to_velo.txt is there or one folder up."""
+    """The recording in ``path``. Its oxts are the prior, where calib_imu_to_velo.txt is there or one folder up; of
+    KITTI-360 its poses.
+    """
     about = read_drive_file(path)
     files = scan_files(path / "velodyne_points" / "data", ".bin")
     table = path / "velodyne_points" / "timestamps.txt"
     if not table.is_file():
         raise MapvoteError(f"{table}: missing; unpack the whole recording")
     times_ns = read_times_ns(table)
-    stamps_ns = times_ns[lines_of_scans(len(times_ns), files, table)]
-    if (options.prior or about.prior) in (None, "oxts"):
-        T_prior = _oxts_prior(path, files, about, wanted=(options.prior or about.prior) == "oxts")
-    else:
-        prior = prior_file(path, about, options)
-        T_prior = None if prior is None else of_scans(read_T_map_lidar(prior, path), files, prior)
-    bad_points = BadPoints(str(path))
+    stamps_ns: I64 = times_ns[lines_of_scans(len(times_ns), files, table)]
+    wanted = options.prior or about.prior
+    if wanted == "oxts":  # a name of ours, no file
+        options = DriveOptions(**{n: getattr(options, n) for n in DriveOptions.__slots__} | {"prior": None})
+        about = DriveFile(**{n: getattr(about, n) for n in DriveFile.__struct_fields__} | {"prior": None})
 
-    def read_scan(i: int, sensor: Sensor) -> Scan:
-        rows = read_bin(files[i])
-        where, stamp_ns = str(files[i]), int(stamps_ns[i])
-        return clean_scan(where, i, stamp_ns, rows[:, :3], sensor=sensor, bad_points=bad_points, intensity=rows[:, 3])
+    def prior() -> Trajectory | F64 | None:
+        if wanted is None and has_kitti_360_poses(path):
+            return kitti_360_poses(path, files, stamps_ns)
+        return _oxts_prior(path, files, stamps_ns, about, options, wanted=wanted == "oxts")
 
-    return make_drive(path, about, options, stamps_ns=stamps_ns, T_map_lidar_prior=T_prior, read_scan=read_scan)
+    layout = layout_of(files, options.columns or about.columns, options.dtype or about.dtype)
+    folder = ScanFolder(files, stamps_ns, layout.read, prior, zero_is_no_return=False)
+    return open_scan_folder(path, about, options, folder)
 
 
-def _oxts_prior(path: Path, files: list[Path], about: DriveFile, *, wanted: bool) -> F64 | None:
+def _oxts_prior(
+    path: Path, files: list[Path], stamps_ns: I64, about: DriveFile, options: DriveOptions, *, wanted: bool
+) -> Trajectory | None:
     folder = path / "oxts" / "data"
     calib = next((f for d in (path, path.parent) if (f := d / "calib_imu_to_velo.txt").is_file()), None)
     if calib is None or not folder.is_dir():
@@ -59,9 +66,7 @@ def _oxts_prior(path: Path, files: list[Path], about: DriveFile, *, wanted: bool
     T_lidar_imu = np.eye(4)
     T_lidar_imu[:3, :3], T_lidar_imu[:3, 3] = numbers["R"].reshape(3, 3), numbers["T"]
     check_rigid(T_lidar_imu[None], str(calib))
-    packets = scan_files(folder, ".txt")
-    rows = np.concatenate([read_numbers(f, 30) for f in packets])
-    origin = None if about.origin is None else np.array(about.origin)
-    if origin is not None and origin.shape != (3,):
-        raise MapvoteError(f"{path / 'drive.toml'}: origin must be latitude, longitude, altitude")
-    return of_scans(from_oxts(rows, geometry.inverse(T_lidar_imu), origin), files, folder)
+    rows = np.concatenate([read_numbers(f, 30) for f in scan_files(folder, ".txt")])
+    T_map_imu, frame = poses_from_gnss(rows[:, [1, 0, 2]], rows[:, 3:6], map_frame(about, options))
+    T_map_lidar = of_scans(T_map_imu @ geometry.inverse(T_lidar_imu), files, folder)
+    return Trajectory(stamps_ns, T_map_lidar, of_vehicle=False, frame=frame)

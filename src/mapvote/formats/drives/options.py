@@ -16,7 +16,9 @@ from mapvote.config import did_you_mean
 from mapvote.core import geometry
 from mapvote.core.sensors import SENSORS, Sensor
 from mapvote.core.types import F64, I64, Drive, MapvoteError, Scan
+from mapvote.formats.drives.sensor_estimate import UNKNOWN, estimate_sensor
 from mapvote.formats.extras import read_text
+from mapvote.formats.geo.frame import MapFrame, enu_frame
 
 ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 
@@ -32,6 +34,11 @@ class DriveOptions:
     vehicle: str | None = None
     mount: str | None = None
     topic: str | None = None
+    columns: str | None = None
+    """Names of a .bin or .npy scan's columns, comma-separated."""
+    dtype: str | None = None
+    frame: MapFrame | None = None
+    """The map's frame, into which latitudes and longitudes go."""
 
 
 class DriveFile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -40,7 +47,7 @@ class DriveFile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
     vehicle: str | None = None
     drive: str | None = None
     sensor: str | dict[str, Any] | None = None
-    """A name (hdl32e, hdl64e, vlp16) or a table of Sensor's fields."""
+    """A name of ``core.sensors.SENSORS``, or a table of Sensor's fields; a table wins over what the scans say."""
     rate_hz: float | None = None
     start_ns: int = 0
     prior: str | None = None
@@ -52,7 +59,9 @@ class DriveFile(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
     topic: str | None = None
     """The PointCloud2 topic of a bag."""
     origin: list[float] | None = None
-    """Latitude, longitude (degrees), altitude (metres) of the map's origin, for priors from KITTI's oxts."""
+    """Latitude, longitude (degrees), altitude (metres) of the map's origin, for priors from GNSS."""
+    columns: str | None = None
+    dtype: str | None = None
 
 
 def read_drive_file(folder: Path) -> DriveFile:
@@ -116,12 +125,15 @@ def read_sensor(sensor: str | dict[str, Any], where: str) -> Sensor:
         raise MapvoteError(f"{where}: [sensor]: {error}") from error
 
 
-def guess_sensor(scan: Scan) -> Sensor:
-    """The known sensor whose vertical field of view lies nearest to what this scan spans."""
-    p = scan.points.astype(np.float64)
-    elevation_deg = np.rad2deg(np.arctan2(p[:, 2], np.hypot(p[:, 0], p[:, 1])))
-    bottom_deg, top_deg = np.quantile(elevation_deg, [0.002, 0.998])
-    return min(SENSORS.values(), key=lambda s: abs(s.fov_bottom_deg - bottom_deg) + abs(s.fov_top_deg - top_deg))
+def map_frame(about: DriveFile, options: DriveOptions) -> MapFrame | None:
+    """The frame that latitudes and longitudes go into: the map's, else a plane at drive.toml's origin, else None."""
+    if options.frame is not None and not options.frame.is_local:
+        return options.frame
+    if about.origin is None:
+        return None
+    if len(about.origin) != 3:
+        raise MapvoteError("drive.toml: origin must be latitude, longitude, altitude")
+    return enu_frame(*about.origin)
 
 
 def parse_scans(scans: str | None, n: int, where: str) -> I64:
@@ -170,8 +182,13 @@ def make_drive(
     stamps_ns: I64,
     T_map_lidar_prior: F64 | None,
     read_scan: Callable[[int, Sensor], Scan],
+    frame: MapFrame = MapFrame(),  # noqa: B008 - frozen
+    T_base_lidar: F64 | None = None,
 ) -> Drive:
     """A Drive of the chosen scans. ``stamps_ns`` (n,) and the prior (n, 4, 4) are of all scans of the files.
+
+    ``frame``: where the prior's frame lies. ``T_base_lidar``: the format's own mount, where nobody says another.
+    The sensor is what the caller or drive.toml say, else it is measured in some of the scans.
 
     MapvoteError if stamps do not increase or a prior is not a rigid motion.
     """
@@ -184,12 +201,8 @@ def make_drive(
             f"({stamps_ns[i - 1] / 1e9:.6f} s); {len(late)} such places; sort the scans by time or mend times.txt"
         )
     chosen = parse_scans(options.scans, len(stamps_ns), where)
-    sensor_name = options.sensor or about.sensor
-    if sensor_name is None:
-        sensor = guess_sensor(read_scan(int(chosen[0]), SENSORS["hdl64e"]))
-    else:
-        sensor = read_sensor(sensor_name, where)
     rate_hz = options.rate_hz or about.rate_hz
+    sensor, told = _sensor_of(where, options.sensor or about.sensor, stamps_ns, chosen, rate_hz, read_scan)
     if rate_hz is not None:
         if not 0.1 <= rate_hz <= 100:
             raise MapvoteError(f"{where}: a rate of {rate_hz} Hz is not a LiDAR's; give revolutions per second")
@@ -209,5 +222,37 @@ def make_drive(
         T_map_lidar_prior=None if T_map_lidar_prior is None else T_map_lidar_prior[chosen],
         prior_sigma_m=about.prior_sigma_m,
         prior_sigma_deg=about.prior_sigma_deg,
-        T_base_lidar=read_mount(options.mount or about.T_base_lidar, where),
+        T_base_lidar=mount_of(about, options, T_base_lidar, where),
+        georeference={} if frame.is_local else frame.georeference(),
+        sensor_told=told,
     )
+
+
+def _sensor_of(
+    where: str,
+    said: str | dict[str, Any] | None,
+    stamps_ns: I64,
+    chosen: I64,
+    rate_hz: float | None,
+    read_scan: Callable[[int, Sensor], Scan],
+) -> tuple[Sensor, str]:
+    """(the sensor, where it comes from). A table that gives only some fields wins over what is measured."""
+    if isinstance(said, str):
+        return read_sensor(said, where), "named"
+    if isinstance(said, dict) and {"name", "elevations_deg", "azimuth_step_deg"} <= set(said):
+        return read_sensor(said, where), "drive.toml"
+    if rate_hz is None and len(stamps_ns) > 1:
+        rate_hz = float(np.clip(1e9 / np.median(np.diff(stamps_ns)), 0.1, 100.0))
+    some = chosen[np.linspace(0, len(chosen) - 1, min(len(chosen), 3)).astype(np.int64)]
+    scans = [read_scan(int(i), replace(UNKNOWN, rate_hz=rate_hz or 10.0)) for i in np.unique(some)]
+    found = estimate_sensor(scans, rate_hz or 10.0)
+    if isinstance(said, dict):
+        known = msgspec.to_builtins(found.sensor)
+        return read_sensor(known | said, where), f"drive.toml, the rest {found.told}"
+    return found.sensor, found.told
+
+
+def mount_of(about: DriveFile, options: DriveOptions, own: F64 | None, where: str) -> F64:
+    """T_base_lidar (4, 4): the caller's, else drive.toml's, else the format's own."""
+    said = options.mount or about.T_base_lidar
+    return own if said is None and own is not None else read_mount(said, where)

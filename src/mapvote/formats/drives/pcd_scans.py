@@ -9,17 +9,17 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from mapvote.core import geometry
-from mapvote.core.sensors import Sensor
-from mapvote.core.types import F64, Drive, Scan
-from mapvote.formats.clean import BadPoints, log
-from mapvote.formats.drives.kitti import read_T_map_lidar
-from mapvote.formats.drives.numbered import of_scans, prior_file, read_stamps, scan_files
-from mapvote.formats.drives.options import DriveOptions, make_drive, read_drive_file
-from mapvote.formats.drives.point_fields import scan_from_fields
+from mapvote.core.types import F64, Drive
+from mapvote.formats.clean import log
+from mapvote.formats.drives.numbered import read_stamps, scan_files
+from mapvote.formats.drives.options import DriveOptions, read_drive_file
 from mapvote.formats.drives.poses import check_rigid
+from mapvote.formats.drives.scan_folder import ScanFolder, open_scan_folder
+from mapvote.formats.drives.trajectory import Trajectory
 from mapvote.formats.maps.autoware import is_autoware
 from mapvote.formats.maps.cloud import xyz
 from mapvote.formats.maps.pcd import read_pcd_table
@@ -41,24 +41,24 @@ def open_pcd_drive(path: Path, options: DriveOptions) -> Drive:
     about = read_drive_file(path)
     files = scan_files(pcd_folder(path) or path, ".pcd")
     stamps_ns = read_stamps(path, files, about, options)
-    prior = prior_file(path, about, options)
-    T_prior = None if prior is None else of_scans(read_T_map_lidar(prior, path), files, prior)
     viewpoints = _viewpoints(files)
     in_map_frame = viewpoints is not None and _points_lie_around(viewpoints, files)
-    if viewpoints is not None and T_prior is None and (options.prior or about.prior) is None:
-        log.warning("%s: the PCD files' VIEWPOINT is taken as prior; --prior none refuses it", path)
-        T_prior = viewpoints
     if in_map_frame:
         log.warning("%s: points lie in the map frame; taken back to the sensor by each file's VIEWPOINT", path)
-    bad_points = BadPoints(str(path))
+    index = {file: i for i, file in enumerate(files)}
 
-    def read_scan(i: int, sensor: Sensor) -> Scan:
-        table, _ = read_pcd_table(files[i])
-        if in_map_frame and viewpoints is not None:
-            table = _to_lidar(str(files[i]), table, viewpoints[i])
-        return scan_from_fields(str(files[i]), i, int(stamps_ns[i]), table, sensor=sensor, bad_points=bad_points)
+    def read(file: Path) -> NDArray[np.void]:
+        table, _ = read_pcd_table(file)
+        return (
+            _to_lidar(str(file), table, viewpoints[index[file]]) if viewpoints is not None and in_map_frame else table
+        )
 
-    return make_drive(path, about, options, stamps_ns=stamps_ns, T_map_lidar_prior=T_prior, read_scan=read_scan)
+    def prior() -> Trajectory | F64 | None:
+        if viewpoints is not None:
+            log.warning("%s: the PCD files' VIEWPOINT is taken as prior; --prior none refuses it", path)
+        return viewpoints
+
+    return open_scan_folder(path, about, options, ScanFolder(files, stamps_ns, read, prior))
 
 
 def _viewpoints(files: list[Path]) -> F64 | None:

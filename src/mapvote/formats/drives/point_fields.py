@@ -2,32 +2,50 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
 from mapvote.core.sensors import Sensor
 from mapvote.core.types import F32, F64, MapvoteError, Scan
-from mapvote.formats.clean import BadPoints, clean_scan
+from mapvote.formats.clean import BadPoints, clean_scan, spinning_time_s
 from mapvote.formats.maps.cloud import xyz
 
 TIME_FIELDS = ("t", "time", "timestamp", "time_stamp", "stamp", "offset_time", "point_time_offset")
 """Ouster, Velodyne, Hesai and Livox, Autoware, Livox: what drivers call the time of a point."""
-INTENSITY_FIELDS = ("intensity", "reflectivity")
+INTENSITY_FIELDS = ("intensity", "reflectivity", "i")
+RING_FIELDS = ("ring", "channel", "laser_id", "laser_number", "line", "laserid")
+_POINT_FIELD = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
+"""sensor_msgs/PointField's types of numbers."""
 _UNITS_NS = {"s": 1e9, "ms": 1e6, "us": 1e3, "ns": 1.0}
 _DAY_NS = 86_400e9
 
 
 def scan_from_fields(
-    where: str, index: int, stamp_ns: int, table: NDArray[np.void], *, sensor: Sensor, bad_points: BadPoints
+    where: str,
+    index: int,
+    stamp_ns: int,
+    table: NDArray[np.void],
+    *,
+    sensor: Sensor,
+    bad_points: BadPoints,
+    zero_is_no_return: bool = True,
+    spinning: bool = False,
 ) -> Scan:
-    """A Scan of a structured array (n,). Points not finite or exactly at the sensor are rays without return."""
+    """A Scan of a structured array (n,). Points not finite or exactly at the sensor are rays without return.
+
+    ``zero_is_no_return`` False: they are defects. ``spinning``: points without times get them from their azimuth.
+    """
     points = xyz(where, table)
     names = table.dtype.names or ()
-    intensity = next((table[name] for name in INTENSITY_FIELDS if name in names), None)
-    time_field = next((name for name in TIME_FIELDS if name in names), None)
-    time_s = (
-        None if time_field is None else point_times_s(f"{where}: {time_field}", table[time_field], stamp_ns, sensor)
+    intensity, ring, time = (
+        next((name for name in known if name in names), None) for known in (INTENSITY_FIELDS, RING_FIELDS, TIME_FIELDS)
     )
+    time_s = None if time is None else point_times_s(f"{where}: {time}", table[time], stamp_ns, sensor)
+    if time_s is None and spinning:
+        time_s = spinning_time_s(points.astype(np.float32), sensor.rate_hz, clockwise=sensor.clockwise)
+    no_return = ~np.isfinite(points).all(axis=1) | (points == 0).all(axis=1)
     return clean_scan(
         where,
         index,
@@ -35,10 +53,41 @@ def scan_from_fields(
         points.astype(np.float32, copy=False),
         sensor=sensor,
         bad_points=bad_points,
-        intensity=None if intensity is None else intensity.astype(np.float32),
+        intensity=None if intensity is None else table[intensity].astype(np.float32),
         time_s=time_s,
-        no_return=~np.isfinite(points).all(axis=1) | (points == 0).all(axis=1),
+        ring=None if ring is None else table[ring],
+        no_return=no_return if zero_is_no_return else None,
     )
+
+
+def point_cloud_table(where: str, message: Any) -> NDArray[np.void]:
+    """The points of a sensor_msgs PointCloud2 as a structured array (n,), little-endian.
+
+    ``message``: rosbags', rclpy's or any object with its fields. MapvoteError if its sizes contradict each other.
+    """
+    data = np.frombuffer(bytes(message.data), dtype=np.uint8)
+    row = message.width * message.point_step
+    if message.height > 1 and message.row_step != row and len(data) == message.height * message.row_step:
+        data = np.ascontiguousarray(data.reshape(message.height, message.row_step)[:, :row]).ravel()
+    if len(data) != message.height * row or message.point_step <= 0:
+        raise MapvoteError(
+            f"{where}: {len(data)} bytes, but its header says {message.height * row}: the message is cut off"
+        )
+    order = ">" if message.is_bigendian else "<"
+    try:
+        known = [f for f in message.fields if f.datatype in _POINT_FIELD]
+        record = np.dtype(
+            {
+                "names": [f.name for f in known],
+                "formats": [(order + _POINT_FIELD[f.datatype], (f.count,) if f.count > 1 else ()) for f in known],
+                "offsets": [f.offset for f in known],
+                "itemsize": message.point_step,
+            }
+        )
+    except (ValueError, TypeError) as error:
+        raise MapvoteError(f"{where}: its fields do not fit its point_step ({error}); is the driver sound?") from error
+    table = data.view(record)
+    return table.astype(record.newbyteorder("<")) if message.is_bigendian else table
 
 
 def point_times_s(where: str, raw: NDArray[np.generic], stamp_ns: int, sensor: Sensor) -> F32 | None:

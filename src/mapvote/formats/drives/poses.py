@@ -1,4 +1,4 @@
-"""Trajectories in text: KITTI's rows of 12 numbers, its camera poses with calib.txt, its oxts (Geiger et al. 2013)."""
+"""Trajectories in text: KITTI's rows of 12 numbers, its camera poses with calib.txt (Geiger et al. 2013)."""
 
 from __future__ import annotations
 
@@ -10,13 +10,11 @@ from mapvote.core import geometry
 from mapvote.core.types import F64, MapvoteError
 from mapvote.formats.extras import read_text
 
-EARTH_RADIUS_M = 6378137.0
-
 
 def read_numbers(file: Path, columns: int) -> F64:
     """(n, columns) float64 of a text file of numbers; MapvoteError names the line that is not one."""
     lines = read_text(file).splitlines()
-    rows = [(number, line.replace(",", " ").split()) for number, line in enumerate(lines, 1) if line.strip()]
+    rows = [(number, line.replace(",", " ").split()) for number, line in enumerate(lines, 1) if _holds(line)]
     out = np.empty((len(rows), columns))
     for i, (number, words) in enumerate(rows):
         try:
@@ -24,6 +22,11 @@ def read_numbers(file: Path, columns: int) -> F64:
         except ValueError as error:
             raise MapvoteError(f"{file}:{number}: expected {columns} numbers, found {len(words)}: {error}") from error
     return out
+
+
+def _holds(line: str) -> bool:
+    """Whether a line is neither empty nor a comment."""
+    return bool(line.strip()) and not line.lstrip().startswith("#")
 
 
 def read_poses(file: Path) -> F64:
@@ -94,26 +97,20 @@ def travels_along(T: F64) -> str:
     return f"{'+' if total[axis] > 0 else '-'}{'xyz'[axis]}"
 
 
-def from_oxts(rows: F64, T_imu_lidar: F64, origin: F64 | None = None) -> F64:
-    """T_map_lidar (n, 4, 4) from KITTI's oxts rows: latitude, longitude, altitude, roll, pitch, yaw first.
+def read_T_map_lidar(file: Path, folder: Path) -> F64:
+    """Poses (n, 4, 4) of a file of rows as T_map_lidar. Camera poses are recognised by their motion along z.
 
-    The map is local east-north-up metres by the Mercator projection of KITTI's development kit, from ``origin``
-    (latitude, longitude, altitude; the first row if None). Angles in radians, yaw 0 = east, counter-clockwise.
+    With ``folder``/calib.txt (KITTI odometry) they are converted, the map being the first LiDAR frame; without it
+    they are a MapvoteError.
     """
-    lat0, lon0, alt0 = rows[0, :3] if origin is None else origin
-    scale = np.cos(np.deg2rad(lat0))
-
-    def mercator(lat: F64, lon: F64) -> tuple[F64, F64]:
-        east = scale * EARTH_RADIUS_M * np.deg2rad(lon)
-        north = scale * EARTH_RADIUS_M * np.log(np.tan(np.deg2rad(90.0 + lat) / 2.0))
-        return east, north
-
-    east0, north0 = mercator(lat0, lon0)
-    out = np.empty((len(rows), 4, 4))
-    for i, (lat, lon, alt, roll, pitch, yaw) in enumerate(rows[:, :6]):
-        east, north = mercator(lat, lon)
-        out[i] = (
-            geometry.from_xyz_rpy(float(east - east0), float(north - north0), alt - alt0, roll, pitch, yaw)
-            @ T_imu_lidar
-        )
-    return out
+    poses = read_poses(file)
+    calib = folder / "calib.txt"
+    axis = travels_along(poses)
+    if axis == "+z" or (calib.is_file() and axis == "" and file.name != "prior.txt"):
+        if not calib.is_file():
+            raise MapvoteError(
+                f"{file}: these are camera poses (the vehicle moves along z, not x); put KITTI's calib.txt into "
+                f"{folder} to have them converted, or write T_map_lidar rows"
+            )
+        return camera_to_lidar(poses, read_T_camera_lidar(calib))
+    return poses

@@ -1,0 +1,204 @@
+"""What LiDAR took these scans? Measured in them: elevations of its rings, azimuth step, spin, blind sectors."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from mapvote.core.sensors import SENSORS, Sensor
+from mapvote.core.types import F64, I64, Scan
+
+UNKNOWN = Sensor("unknown", (0.0,), 0.2, min_range_m=0.5)
+"""Reads the scans that are looked at."""
+_FAR_M = 8.0
+"""Nearer points are left out: the beams of large sensors do not start in one point."""
+_SURE = 0.7
+"""Share of points that must lie on a ring for the rings to be believed."""
+_SECTOR_DEG = 2.0
+_BLIND_DEG = 10.0
+
+
+@dataclass(frozen=True, slots=True)
+class Estimate:
+    """A sensor and how sure it is."""
+
+    sensor: Sensor
+    on_rings: float
+    """Share of far points within a third of the spacing of their ring's elevation."""
+    told: str
+
+
+def estimate_sensor(scans: Sequence[Scan], rate_hz: float) -> Estimate:
+    """The sensor of some scans (one or more). A known model where the rings fit one, else a model of what is seen.
+
+    Rings come from the ring field, else from the order of the points (ring by ring), else from clusters of
+    elevations. Where there are none (solid-state, non-repeating) the model is an even grid over the field of view.
+    """
+    angles = [_angles(scan) for scan in scans]
+    elevation, azimuth = (np.concatenate([a[k] for a in angles]) for k in (0, 1))
+    rings = [_rings(scan, *pair) for scan, pair in zip(scans, angles, strict=True)]
+    blind = blind_sectors(azimuth)
+    found = None if any(r is None for r in rings) else _ring_model(angles, [r for r in rings if r is not None])
+    if found is None or found[2] < _SURE:
+        return _ringless(elevation, azimuth, rate_hz, blind, 0.0 if found is None else found[2])
+    elevations, step, share = found
+    spin = _clockwise(scans, angles)
+    name, model = _known(elevations)
+    seen = f"{len(elevations)} rings, {elevations[0]:.1f} to {elevations[-1]:.1f} deg, {share:.0%} of points on them"
+    if model is not None:
+        return Estimate(replace(model, rate_hz=rate_hz, blind_sectors_deg=blind), share, f"measured: {name} ({seen})")
+    sensor = Sensor(
+        f"measured-{len(elevations)}",
+        tuple(round(float(e), 3) for e in elevations),
+        round(float(step), 4),
+        rate_hz=rate_hz,
+        max_range_m=_reach(scans),
+        clockwise=spin,
+        blind_sectors_deg=blind,
+    )
+    return Estimate(sensor, share, f"measured: {seen}, azimuth step {step:.3f} deg")
+
+
+def _angles(scan: Scan) -> tuple[F64, F64, F64]:
+    """(elevation, azimuth) in degrees and range in metres of every point."""
+    p = scan.points.astype(np.float64)
+    flat = np.hypot(p[:, 0], p[:, 1])
+    return np.degrees(np.arctan2(p[:, 2], flat)), np.degrees(np.arctan2(p[:, 1], p[:, 0])), np.hypot(flat, p[:, 2])
+
+
+def _rings(scan: Scan, elevation: F64, azimuth: F64, _: F64) -> I64 | None:
+    """Which ring each point belongs to, or None."""
+    if scan.ring is not None and 3 < len(np.unique(scan.ring)) <= 256:
+        return scan.ring.astype(np.int64)
+    turns = np.cumsum(np.abs(np.diff(azimuth, prepend=azimuth[:1])) > 180.0)
+    # Ring by ring, the azimuth comes round once a ring; a ring hidden at the seam joins its neighbour, hence the share.
+    if 8 <= turns[-1] < 256 and len(azimuth) / (turns[-1] + 1) > 100:
+        return np.asarray(turns, dtype=np.int64)
+    return _clusters(elevation)
+
+
+def _clusters(elevation: F64) -> I64 | None:
+    """Rings as clusters of elevations, with gaps between them; None if they do not cluster."""
+    for width_deg in (0.01, 0.03):  # dense sensors first; noise makes too many clusters of the finer bins
+        bins = np.arange(-90.0, 90.0 + width_deg, width_deg)
+        smooth = np.convolve(np.histogram(elevation, bins)[0].astype(np.float64), np.ones(3), mode="same")
+        filled = smooth > 0.1 * np.quantile(smooth[smooth > 0], 0.9)
+        starts = np.flatnonzero(filled[1:] & ~filled[:-1]) + 1
+        if 4 <= len(starts) <= 256:
+            return np.asarray(np.searchsorted(starts, np.digitize(elevation, bins) - 1, side="right"), dtype=np.int64)
+    return None
+
+
+def _ring_model(angles: Sequence[tuple[F64, F64, F64]], rings: Sequence[I64]) -> tuple[F64, float, float] | None:
+    """(elevations from the top down, azimuth step in degrees, share of far points on their ring), or None."""
+    elevations: list[float] = []
+    steps: list[float] = []
+    ring_of = []
+    for (elevation, azimuth, reach), ring in zip(angles, rings, strict=True):
+        for number in np.unique(ring):
+            mine = ring == number
+            far = mine & (reach > _FAR_M)
+            if mine.sum() < 20:
+                continue
+            elevations.append(float(np.median(elevation[far] if far.sum() >= 10 else elevation[mine])))
+            gaps = np.diff(np.sort(azimuth[mine]))
+            gaps = gaps[gaps > 1e-3]
+            if len(gaps):
+                steps.append(float(np.median(gaps)))
+            ring_of.append(int(number))
+    if len(set(ring_of)) < 4 or not steps:
+        return None
+    levels = _merged(np.array(elevations))
+    elevation, reach = (np.concatenate([a[k] for a in angles]) for k in (0, 2))
+    spacing = np.median(np.abs(np.diff(levels))) if len(levels) > 1 else 1.0
+    off = np.abs(elevation - _nearest(levels, elevation))[reach > _FAR_M]
+    share = float((off < max(spacing / 3.0, 0.05)).mean()) if len(off) else 0.0
+    return levels, float(np.median(steps)), share
+
+
+def _nearest(levels: F64, values: F64) -> F64:
+    """The level (descending) nearest to each value."""
+    up = levels[::-1]
+    after = np.clip(np.searchsorted(up, values), 1, max(len(up) - 1, 1))
+    below, above = up[after - 1], up[np.minimum(after, len(up) - 1)]
+    return np.where(np.abs(values - below) <= np.abs(values - above), below, above)
+
+
+def _merged(elevations: F64) -> F64:
+    """Elevations of the same ring in several scans as one, from the top down."""
+    levels = np.sort(elevations)[::-1]
+    groups = np.cumsum(np.abs(np.diff(levels, prepend=levels[:1])) > 0.08)
+    return np.array([np.median(levels[groups == g]) for g in range(int(groups[-1]) + 1)])
+
+
+def _known(elevations: F64) -> tuple[str, Sensor | None]:
+    """The listed model whose beams are these: about as many, and each where one of them is."""
+    for name, model in SENSORS.items():
+        beams = np.array(model.elevations_deg)
+        if abs(len(beams) - len(elevations)) > 0.3 * len(beams):
+            continue
+        spacing = float(np.median(np.abs(np.diff(np.sort(beams)))))
+        off = np.abs(elevations - _nearest(np.sort(beams)[::-1], elevations))
+        if (
+            np.median(off) < 0.3 * spacing
+            and np.abs([elevations[0] - beams.max(), elevations[-1] - beams.min()]).max() < 1.5
+        ):
+            return name, model
+    return "", None
+
+
+def _ringless(
+    elevation: F64, azimuth: F64, rate_hz: float, blind: tuple[tuple[float, float], ...], share: float
+) -> Estimate:
+    """A model without rings: as many rows and columns as the density of points makes, over what is seen."""
+    low, high = np.quantile(elevation, [0.002, 0.998])
+    wide = 360.0 - sum(b - a for a, b in blind)
+    per_deg = max(len(elevation), 1) / max((high - low) * wide, 1e-6)
+    step = float(np.clip(1.0 / np.sqrt(max(per_deg, 1e-6)), 0.05, 2.0))
+    rows = int(np.clip(round((high - low) / step), 4, 256))
+    grid = tuple(round(float(e), 3) for e in np.linspace(high, low, rows))
+    sensor = Sensor("no-rings", grid, round(step, 3), rate_hz=rate_hz, rings=False, blind_sectors_deg=blind)
+    told = (
+        f"measured: no rings (only {share:.0%} of the points fit any); {low:.1f} to {high:.1f} deg, {wide:.0f} deg wide"
+    )
+    return Estimate(sensor, share, told)
+
+
+def blind_sectors(azimuth: F64) -> tuple[tuple[float, float], ...]:
+    """Azimuths (from, to) in degrees, at least 10 wide, without a point; past 180 where a sector spans +-180."""
+    turns = round(360.0 / _SECTOR_DEG)
+    empty = np.histogram(azimuth, turns, (-180.0, 180.0))[0] == 0
+    if empty.all() or not empty.any():
+        return ()
+    first = int(np.argmin(empty))  # begin where something is seen, so that no sector is cut in two
+    rolled = np.roll(empty, -first)
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], rolled, [False]]).astype(np.int8)))
+    sectors = []
+    for start, stop in edges.reshape(-1, 2):
+        if (stop - start) * _SECTOR_DEG >= _BLIND_DEG:
+            begin = (start + first) * _SECTOR_DEG - 180.0
+            sectors.append((float(begin), float(begin + (stop - start) * _SECTOR_DEG)))
+    return tuple(sectors)
+
+
+def _clockwise(scans: Sequence[Scan], angles: Sequence[tuple[F64, F64, F64]]) -> bool:
+    """Whether azimuth falls as time goes on; True, as most sensors turn, where no times are known."""
+    turned = [
+        float(np.sign(_wrapped(np.diff(azimuth[np.argsort(scan.time_s, kind="stable")]))).sum())
+        for scan, (_, azimuth, _) in zip(scans, angles, strict=True)
+        if scan.time_s is not None
+    ]
+    return sum(turned) <= 0
+
+
+def _wrapped(angle: F64) -> F64:
+    out: F64 = (angle + 180.0) % 360.0 - 180.0
+    return out
+
+
+def _reach(scans: Sequence[Scan]) -> float:
+    """The range that nearly all points keep within, rounded up to 10 m, at least 50."""
+    farthest = max(float(np.quantile(np.linalg.norm(scan.points, axis=1), 0.999)) for scan in scans)
+    return float(max(50.0, np.ceil(farthest / 10.0) * 10.0))

@@ -1,0 +1,203 @@
+"""Trajectories with times of their own: TUM, CSV with a header, latitudes and longitudes; brought to the scans' stamps.
+
+Rows of 12 or 16 numbers without times (KITTI) are in :mod:`mapvote.formats.drives.poses`.
+"""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from mapvote.core import geometry
+from mapvote.core.types import F64, I64, MapvoteError
+from mapvote.formats.drives.poses import read_numbers
+from mapvote.formats.extras import read_text
+from mapvote.formats.geo.frame import MapFrame
+from mapvote.formats.geo.gnss import poses_from_gnss
+
+MAX_GAP_NS = 500_000_000
+"""A pose is not interpolated over a longer hole, nor taken from farther beyond the ends."""
+_TIMES = {"timestamp": None, "time": None, "stamp": None, "t": None, "gpstime": None, "sec": 1e9, "secs": 1e9}
+_NANOSECONDS = ("nsec", "nanosec", "nsecs", "nanosecs")
+_COLUMNS = {
+    "x": ("x", "tx", "pos_x", "position_x", "easting", "east"),
+    "y": ("y", "ty", "pos_y", "position_y", "northing", "north"),
+    "z": ("z", "tz", "pos_z", "position_z", "altitude", "height", "up", "alt"),
+    "qx": ("qx", "quat_x", "orientation_x"),
+    "qy": ("qy", "quat_y", "orientation_y"),
+    "qz": ("qz", "quat_z", "orientation_z"),
+    "qw": ("qw", "quat_w", "orientation_w"),
+    "roll": ("roll",),
+    "pitch": ("pitch",),
+    "yaw": ("yaw",),
+    "heading": ("heading", "azimuth", "course"),
+    "latitude": ("latitude", "lat"),
+    "longitude": ("longitude", "lon", "lng"),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Trajectory:
+    """Poses with their times."""
+
+    times_ns: I64
+    """(n,) ascending."""
+    T_map: F64
+    """(n, 4, 4) T_map_lidar, or T_map_base where the file speaks of the vehicle (``of_vehicle``)."""
+    of_vehicle: bool
+    frame: MapFrame
+    """Where its map lies; local unless it came from latitudes and longitudes."""
+
+    def at(self, stamps_ns: I64, where: str) -> F64:
+        """(m, 4, 4) at constant twist between two poses. MapvoteError if it does not cover the stamps without holes."""
+        t = self.times_ns
+        after = np.clip(np.searchsorted(t, stamps_ns), 1, max(len(t) - 1, 1))
+        beyond = len(t) < 2 or stamps_ns[0] < t[0] - MAX_GAP_NS or stamps_ns[-1] > t[-1] + MAX_GAP_NS
+        gap = np.array([MAX_GAP_NS + 1]) if beyond else np.maximum(t[after] - t[after - 1], 1)
+        if beyond or gap.max() > 4 * MAX_GAP_NS:
+            span = f"{t[0] / 1e9:.3f} to {t[-1] / 1e9:.3f} s" if len(t) else "none"
+            raise MapvoteError(
+                f"{where}: {len(t)} poses ({span}) do not cover the scans ({stamps_ns[0] / 1e9:.3f} to "
+                f"{stamps_ns[-1] / 1e9:.3f} s) without holes of {4 * MAX_GAP_NS / 1e9:g} s; choose scans that they "
+                f"cover, or --prior none"
+            )
+        share = np.clip((stamps_ns - t[after - 1]) / gap, -0.5, 1.5)
+        pairs = zip(after, share, strict=True)
+        return np.stack([geometry.interpolate(self.T_map[a - 1], self.T_map[a], float(s)) for a, s in pairs])
+
+
+def sorted_trajectory(times_ns: I64, T_map: F64, *, of_vehicle: bool, frame: MapFrame) -> Trajectory:
+    """A trajectory in the order of its times, of equal times the first."""
+    _, first = np.unique(times_ns, return_index=True)
+    return Trajectory(times_ns[first], T_map[first], of_vehicle, frame)
+
+
+def has_times(file: Path) -> bool:
+    """Whether a text file of poses carries times: TUM's eight numbers a row, or a header of names."""
+    line = next((s for s in read_text(file).splitlines() if s.strip() and not s.lstrip().startswith("#")), "")
+    words = line.replace(",", " ").split()
+    return len(words) == 8 or (bool(words) and not _is_number(words[0])) or _header(file) is not None
+
+
+def read_trajectory(file: Path, frame: MapFrame | None = None) -> Trajectory:
+    """TUM (seconds, x, y, z, qx, qy, qz, qw) or CSV with names in its first line.
+
+    ``frame``: the frame of the map, into which latitudes and longitudes go; without one a plane at the first of them.
+    MapvoteError names the line or the column that is wrong.
+    """
+    header = _header(file)
+    if header is None:
+        rows = read_numbers(file, 8)
+        return sorted_trajectory(
+            _ns(file, rows[:, 0]), _of_quaternions(rows[:, 1:]), of_vehicle=False, frame=MapFrame()
+        )
+    names, rows = header, _csv_rows(file, len(header))
+    columns = {key: rows[:, i] for key, aliases in _COLUMNS.items() for i, n in enumerate(names) if n in aliases}
+    times_ns = _times(file, names, rows)
+    if {"latitude", "longitude"} <= set(columns):
+        zero = np.zeros(len(rows))
+        angles = [_radians(columns.get(n, zero)) for n in ("roll", "pitch")]
+        yaw = _radians(columns["yaw"]) if "yaw" in columns else np.pi / 2 - _radians(columns.get("heading", zero))
+        place = np.column_stack([columns["longitude"], columns["latitude"], columns.get("z", zero)])
+        T, frame = poses_from_gnss(place, np.column_stack([*angles, yaw]), frame)
+        return sorted_trajectory(times_ns, T, of_vehicle=True, frame=frame)
+    return sorted_trajectory(times_ns, _poses(file, names, columns), of_vehicle=False, frame=MapFrame())
+
+
+def _poses(file: Path, names: Sequence[str], columns: dict[str, F64]) -> F64:
+    missing = [axis for axis in "xyz" if axis not in columns]
+    if missing:
+        raise MapvoteError(f"{file}: no column {', '.join(missing)} among {', '.join(names)}")
+    position = [columns[axis] for axis in "xyz"]
+    if {"qx", "qy", "qz", "qw"} <= set(columns):
+        return _of_quaternions(np.column_stack([*position, *(columns[q] for q in ("qx", "qy", "qz", "qw"))]))
+    if not {"yaw", "heading"} & set(columns):
+        raise MapvoteError(f"{file}: no orientation: name columns qx, qy, qz, qw, or roll, pitch, yaw")
+    zero = np.zeros(len(position[0]))
+    yaw = _radians(columns["yaw"]) if "yaw" in columns else np.pi / 2 - _radians(columns["heading"])
+    roll, pitch = (_radians(columns.get(n, zero)) for n in ("roll", "pitch"))
+    rows = zip(*position, roll, pitch, yaw, strict=True)
+    return np.stack([geometry.from_xyz_rpy(*(float(v) for v in row)) for row in rows])
+
+
+def _radians(angle: F64) -> F64:
+    """Angles beyond two turns of radians can only be degrees."""
+    return np.radians(angle) if len(angle) and float(np.abs(angle).max()) > 2.0 * np.pi + 0.01 else angle
+
+
+def _of_quaternions(rows: F64) -> F64:
+    """(n, 4, 4) of rows x, y, z, qx, qy, qz, qw."""
+    T = np.tile(np.eye(4), (len(rows), 1, 1))
+    norms = np.linalg.norm(rows[:, 3:], axis=1)
+    if len(rows) and not (np.abs(norms - 1.0) < 0.05).all():
+        raise MapvoteError(f"row {int(np.argmax(np.abs(norms - 1.0)))} of the trajectory has no unit quaternion")
+    T[:, :3, :3] = Rotation.from_quat(rows[:, 3:]).as_matrix() if len(rows) else T[:, :3, :3]
+    T[:, :3, 3] = rows[:, :3]
+    return T
+
+
+def _header(file: Path) -> list[str] | None:
+    """The names in the first line, lower case without units, comments of TUM files left out; None if it has none."""
+    lines = [line for line in read_text(file).splitlines() if line.strip()]
+    if not lines:
+        return None
+    words = [w.strip().strip('"').lower() for w in lines[0].lstrip("#% ").replace(";", ",").split(",")]
+    names = [w.split("[")[0].split("(")[0].strip().removeprefix("field.") for w in words]
+    known = {alias for aliases in _COLUMNS.values() for alias in aliases} | set(_TIMES)
+    return names if len(names) > 3 and len(known & set(names)) >= 3 else None
+
+
+def _csv_rows(file: Path, columns: int) -> F64:
+    out = []
+    lines = [line for line in read_text(file).splitlines() if line.strip()][1:]
+    for number, row in enumerate(csv.reader(line.replace(";", ",") for line in lines), 2):
+        if len(row) < columns:
+            raise MapvoteError(f"{file}:{number}: {len(row)} values, but the header names {columns}")
+        out.append([float(v) if _is_number(v) else np.nan for v in row[:columns]])
+    if not out:
+        raise MapvoteError(f"{file}: a header, but no poses")
+    return np.array(out)
+
+
+def _times(file: Path, names: Sequence[str], rows: F64) -> I64:
+    """Nanoseconds, exact: columns of times are read again as text, for float64 holds no nanoseconds since 1970."""
+    column = next((i for i, name in enumerate(names) if name in _TIMES), None)
+    if column is None:
+        raise MapvoteError(f"{file}: no column of times among {', '.join(names)}; name one timestamp, time or t")
+    lines = [line for line in read_text(file).splitlines() if line.strip()][1:]
+    texts = [line.replace(";", ",").split(",")[column].strip() for line in lines]
+    whole = [int(t) if t.lstrip("-").isdigit() else None for t in texts]
+    fraction = next((i for i, name in enumerate(names) if name in _NANOSECONDS), None)
+    if fraction is not None and None not in whole:
+        return np.array(whole, dtype=np.int64) * 10**9 + rows[:, fraction].astype(np.int64)
+    if None not in whole:
+        unit = _unit(float(np.abs(np.array(whole, dtype=np.float64)).max()))
+        return np.array(whole, dtype=np.int64) * unit
+    return _ns(file, rows[:, column])
+
+
+def _unit(largest: float) -> int:
+    """Nanoseconds in one: seconds, milli-, micro- or nanoseconds since 1970, by size."""
+    return next((10**power for limit, power in ((1e11, 9), (1e14, 6), (1e17, 3)) if largest < limit), 1)
+
+
+def _ns(file: Path, seconds: F64) -> I64:
+    if not np.isfinite(seconds).all():
+        raise MapvoteError(f"{file}: row {int(np.argmax(~np.isfinite(seconds)))} has no time")
+    unit = _unit(float(np.abs(seconds).max(initial=0.0)))
+    whole = np.floor(seconds)
+    ns: I64 = whole.astype(np.int64) * unit + np.round((seconds - whole) * unit).astype(np.int64)
+    return ns
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
