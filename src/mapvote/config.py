@@ -187,6 +187,11 @@ class ServerSettings(Section):
     """server/http/app.py: what the server lets in."""
 
     max_body_bytes: int = Field(default=16_000_000, description="largest request body")
+    upload_bytes: int = Field(default=128_000_000, description="all ballots on their way at once, in memory")
+    connections: int = Field(default=800, ge=8, description="at once; the longest silent makes room for a new one")
+    header_timeout_s: float = Field(default=10.0, gt=0, description="for the headers of a request")
+    body_timeout_s: float = Field(default=120.0, gt=0, description="for its body")
+    answer_timeout_s: float = Field(default=60.0, gt=0, description="for a client that does not take its answer")
     ballots_per_minute: float = Field(default=600.0, gt=0, description="of one vehicle, on average")
     burst: int = Field(default=60, ge=1, description="ballots of one vehicle at once")
     batch: int = Field(default=64, ge=1, description="ballots written in one transaction at most")

@@ -139,3 +139,17 @@ def test_a_vehicle_takes_its_key_from_a_file_or_the_environment_never_from_the_c
     missing = run("vote", tmp_path, "--map", "x", "--out", tmp_path / "o", "--key-file", tmp_path / "none")
     assert missing.returncode == 1
     assert "holds no key" in missing.stderr
+
+
+def test_who_sends_wrong_keys_by_the_hundred_is_looked_up_no_more_and_the_right_ones_go_on(tmp_path: Path) -> None:
+    store = Store.create(f"sqlite:///{tmp_path / 's.db'}", two_walls())
+    secret = keys.issue(store, "boss", "operator")
+    store.close()
+    with serving(tmp_path / "s.db", log=tmp_path / "log") as (url, _), httpx2.Client(base_url=url) as http:
+        assert http.get("/v1/map", headers=with_key(secret)).status_code == 200
+        answers = [http.get("/v1/map", headers=with_key(f"wrong-{i}")).status_code for i in range(200)]
+        assert answers[:100] == [401] * 100
+        assert answers[-1] == 429
+        assert http.get("/v1/map", headers=with_key(secret)).status_code == 200
+        elsewhere = with_key("wrong too") | {"X-Forwarded-For": "192.0.2.7"}
+        assert http.get("/v1/map", headers=elsewhere).status_code == 401

@@ -6,16 +6,16 @@ from collections.abc import AsyncIterator
 from concurrent.futures import Executor
 from contextlib import asynccontextmanager
 
+from anyio import to_thread
 from fastapi import FastAPI
 
 from mapvote.config import Settings
-from mapvote.core.types import MapvoteError
 from mapvote.server.http import ballot_route, operator_routes, pages, vehicle_routes
 from mapvote.server.http.auth import Guard
 from mapvote.server.http.browsers import Hosts
 from mapvote.server.http.middleware import Watch
-from mapvote.server.http.schemas import refuse, unreadable
-from mapvote.server.http.services import make_services
+from mapvote.server.http.schemas import unreadable
+from mapvote.server.http.services import READING, make_services
 from mapvote.server.store.publish import Gate
 from mapvote.server.store.store import Store
 
@@ -31,13 +31,13 @@ def create_app(
     """The app on an open store, which stays the caller's to close. It runs once.
 
     ``opened``: as long as the store holds no key, whoever asks is answered; else no route answers without one.
-    ``gate``: see :mod:`mapvote.server.store.publish`; ``executor``:
-    where tiles are fused, two threads by default.
+    ``gate``: see :mod:`mapvote.server.store.publish`; ``executor``: where tiles are fused, two threads by default.
     """
     parts = make_services(store, settings or Settings(), gate, executor)
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
+        to_thread.current_default_thread_limiter().total_tokens = READING
         yield
         await parts.close()
 
@@ -52,9 +52,7 @@ def create_app(
     app.state.services = parts
     for part in (ballot_route, vehicle_routes, operator_routes, pages):
         app.include_router(part.router)
-    app.add_exception_handler(MapvoteError, refuse)
     app.add_exception_handler(400, unreadable)
-    app.add_middleware(
-        Watch, hosts=Hosts(parts.settings.server.hosts), guard=Guard(store, opened=opened), metrics=parts.metrics
-    )
+    hosts, guard = Hosts(parts.settings.server.hosts), Guard(store, parts.threads.lookups, opened=opened)
+    app.add_middleware(Watch, hosts=hosts, guard=guard, metrics=parts.metrics)
     return app

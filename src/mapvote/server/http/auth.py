@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import base64
 import binascii
+from concurrent.futures import Executor
 from functools import partial
 
 from fastapi import Request
 
 from mapvote.server.errors import Forbidden, Unauthorised
 from mapvote.server.http.batching import Batcher
+from mapvote.server.http.limits import RateLimit
 from mapvote.server.http.services import services
 from mapvote.server.store import keys
 from mapvote.server.store.store import Store
@@ -17,6 +19,8 @@ from mapvote.server.store.store import Store
 _AT_ONCE = 256
 """Keys looked up in one query at most."""
 _REMEMBERED = 10_000
+_WRONG_PER_MINUTE, _WRONG_AT_ONCE = 60.0, 120
+"""Wrong keys from one address that are looked up."""
 
 
 class Guard:
@@ -30,16 +34,20 @@ class Guard:
     moment and for good.
     """
 
-    def __init__(self, store: Store, *, opened: bool) -> None:
+    def __init__(self, store: Store, threads: Executor, *, opened: bool) -> None:
         self._opened = opened
-        self._any_key: Batcher[None, bool] = Batcher(lambda asked: [keys.any_issued(store)] * len(asked), _AT_ONCE)
-        self._looked_up: Batcher[str, keys.Key] = Batcher(partial(keys.check, store), _AT_ONCE)
+        self._any_key: Batcher[None, bool] = Batcher(
+            lambda asked: [keys.any_issued(store)] * len(asked), _AT_ONCE, threads
+        )
+        self._looked_up: Batcher[str, keys.Key] = Batcher(partial(keys.check, store), _AT_ONCE, threads)
         self._known: dict[str, keys.Key] = {}
+        self._wrong = RateLimit(_WRONG_PER_MINUTE, _WRONG_AT_ONCE, "wrong keys")
 
-    async def who(self, authorization: str | None, *, ballot: bool = False) -> tuple[keys.Key, str] | None:
+    async def who(self, authorization: str | None, peer: str, *, ballot: bool = False) -> tuple[keys.Key, str] | None:
         """The key of a request and its hash; None if the server is open.
 
         Unauthorised if it is missing, unknown or revoked; of a ``ballot``, that is for the store to say in the end.
+        TooMany if ``peer`` has sent so many wrong ones that new ones from there are looked up no more for a while.
         """
         if self._opened:
             self._opened = not await self._any_key.put(None)
@@ -51,11 +59,20 @@ class Guard:
         digest = keys.hash_of(secret)
         key = self._known.get(digest) if ballot else None
         if key is None:
-            key = await self._looked_up.put(digest)
+            key = await self._look_up(digest, peer)
             if len(self._known) > _REMEMBERED:
                 self._known.clear()
             self._known[digest] = key
         return key, digest
+
+    async def _look_up(self, digest: str, peer: str) -> keys.Key:
+        if digest not in self._known:
+            self._wrong.check(peer)
+        try:
+            return await self._looked_up.put(digest)
+        except Unauthorised:
+            self._wrong.take(peer)
+            raise
 
 
 def own(request: Request, vehicle: str) -> str:

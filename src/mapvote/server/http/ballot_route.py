@@ -7,19 +7,18 @@ for OpenAPI, and hands the request to :func:`vote` as it came. There is no secon
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Callable, Coroutine
 from typing import Any
 
 import msgspec
 from fastapi import APIRouter, Request, Response
-from fastapi.concurrency import run_in_threadpool
 from fastapi.routing import APIRoute
 
 from mapvote.server.http.auth import own
-from mapvote.server.http.limits import read_body
 from mapvote.server.http.schemas import Name, Stored, problems
-from mapvote.server.http.services import services
-from mapvote.server.store.admission import Intake, Sent
+from mapvote.server.http.services import Services, services
+from mapvote.server.store.admission import Sent
 from mapvote.server.store.ballots import Incoming
 
 _BYTES: dict[str, Any] = {"application/octet-stream": {"schema": {"type": "string", "format": "binary"}}}
@@ -56,10 +55,9 @@ async def vote(request: Request, vehicle: Name, drive: Name) -> Response:
     """
     own(request, vehicle)
     parts = services(request)
-    limit = parts.settings.server.max_body_bytes
-    body = await read_body(request.stream(), request.headers.get("content-length"), limit)
+    body = await parts.uploads.read(vehicle, request.stream(), request.headers.get("content-length"))
     sent = Sent(body, vehicle, drive, request.state.key_hash)
-    incoming = await (parts.examiner.put(sent) if len(body) <= _SMALL_BYTES else _apart(parts.intake, sent))
+    incoming = await (parts.examiner.put(sent) if len(body) <= _SMALL_BYTES else _apart(parts, sent))
     receipt = await parts.writer.put(incoming)
     result = "repeated" if receipt.repeated else "created" if receipt.created else "replaced"
     parts.metrics.ballots.labels(result).inc()
@@ -67,8 +65,9 @@ async def vote(request: Request, vehicle: Name, drive: Name) -> Response:
     return Response(answer, 201 if receipt.created else 200, media_type="application/json")
 
 
-async def _apart(intake: Intake, sent: Sent) -> Incoming:
-    (found,) = await run_in_threadpool(intake.look_at, [sent])
+async def _apart(parts: Services, sent: Sent) -> Incoming:
+    loop = asyncio.get_running_loop()
+    (found,) = await loop.run_in_executor(parts.threads.ballots, parts.intake.look_at, [sent])
     if isinstance(found, Exception):
         raise found
     return found

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable, Sequence
+from concurrent.futures import Executor
 from typing import Generic, TypeVar
 
 Asked = TypeVar("Asked")
@@ -14,15 +15,21 @@ Answer = TypeVar("Answer")
 
 
 class Batcher(Generic[Asked, Answer]):
-    """Calls ``work`` in a thread, one batch after another. Lives on one event loop.
+    """Calls ``work`` in one of ``threads``, one batch of at most ``limit`` after another. Lives on one event loop.
 
     ``work`` gives one answer for each item, in order; an exception among the answers is raised to whoever asked. If
     ``work`` itself raises, everybody in the batch hears it.
     """
 
-    def __init__(self, work: Callable[[Sequence[Asked]], Sequence[Answer | Exception]], limit: int) -> None:
+    def __init__(
+        self,
+        work: Callable[[Sequence[Asked]], Sequence[Answer | Exception]],
+        limit: int,
+        threads: Executor | None = None,
+    ) -> None:
         self._work = work
         self._limit = limit
+        self._threads = threads
         self._waiting: list[tuple[Asked, asyncio.Future[Answer]]] = []
         self._worker: asyncio.Task[None] | None = None
 
@@ -46,7 +53,7 @@ class Batcher(Generic[Asked, Answer]):
             some, self._waiting = self._waiting[: self._limit], self._waiting[self._limit :]
             answers: Sequence[Answer | Exception]
             try:
-                answers = await loop.run_in_executor(None, self._work, [item for item, _ in some])
+                answers = await loop.run_in_executor(self._threads, self._work, [item for item, _ in some])
             except Exception as error:
                 answers = [error] * len(some)
             for (_, future), answer in zip(some, answers, strict=True):

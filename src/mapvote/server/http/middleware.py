@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import asyncio
 import time
 
 import structlog
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from mapvote.core.types import MapvoteError
+from mapvote.server.errors import Unavailable
 from mapvote.server.http.auth import Guard
 from mapvote.server.http.browsers import Hosts
 from mapvote.server.http.metrics import Metrics
@@ -45,12 +47,16 @@ class Watch:
         try:
             self._hosts.check(scope["headers"])
             sent = next((value for name, value in scope["headers"] if name == b"authorization"), None)
-            whose = await self._guard.who(None if sent is None else sent.decode("latin-1"), ballot=is_ballot(scope))
+            authorization = None if sent is None else sent.decode("latin-1")
+            peer = (scope["client"] or ("",))[0]
+            whose = await self._guard.who(authorization, peer, ballot=is_ballot(scope))
             key, key_hash = whose or (None, None)
             scope.setdefault("state", {}).update(key=key, key_hash=key_hash)
             await self._app(scope, receive, watched)
         except MapvoteError as error:
-            await refuse(None, error)(scope, receive, watched)
+            await refuse(error)(scope, receive, watched)
+        except asyncio.CancelledError:  # the server stops and waits no longer
+            await refuse(Unavailable("the server is stopping: ask again once it is back"))(scope, receive, watched)
         finally:
             seconds = time.perf_counter() - start
             method = scope["method"]

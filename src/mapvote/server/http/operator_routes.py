@@ -6,8 +6,10 @@ from collections.abc import Iterator
 from concurrent.futures import CancelledError
 from contextlib import contextmanager
 from dataclasses import asdict
+from functools import partial
 from typing import Annotated, Any
 
+from anyio import to_thread
 from fastapi import APIRouter, Query, Request
 
 from mapvote.codec.ballot import tile_key
@@ -26,9 +28,13 @@ router = APIRouter()
 
 
 @router.post("/v1/publish", responses=problems(403, 409), summary="Publish the next version")
-def publish_now(request: Request, ask: PublishAsk) -> Published:
+async def publish_now(request: Request, ask: PublishAsk) -> Published:
     """Fuse what stands. 409 with the reasons if the policy holds it, or if somebody else published first."""
     by, parts = operator(request), services(request)
+    return await to_thread.run_sync(_publish, parts, ask, by, limiter=parts.threads.publishing)
+
+
+def _publish(parts: Services, ask: PublishAsk, by: str) -> Published:
     with parts.metrics.publish_seconds.time(), _unless_stopping(parts):
         done = publish(
             parts.store,
@@ -52,10 +58,11 @@ def publish_now(request: Request, ask: PublishAsk) -> Published:
 
 
 @router.post("/v1/rollback", responses=problems(403, 404, 409), summary="Go back to an older version")
-def roll_back(request: Request, ask: RollbackAsk) -> dict[str, int]:
+async def roll_back(request: Request, ask: RollbackAsk) -> dict[str, int]:
     """A new version that is the old one again; the votes that led away from it are barred."""
-    by = operator(request)
-    return {"version": rollback(services(request).store, ask.to, by=by, reason=ask.reason).number}
+    by, parts = operator(request), services(request)
+    back = partial(rollback, parts.store, ask.to, by=by, reason=ask.reason)
+    return {"version": (await to_thread.run_sync(back, limiter=parts.threads.publishing)).number}
 
 
 @router.get("/v1/changes", responses=problems(404), summary="What changed, as GeoJSON in map metres")

@@ -24,9 +24,9 @@ router = APIRouter()
 
 
 @router.get("/healthz", responses=problems(), summary="Can the store be read?")
-def health(request: Request) -> dict[str, Any]:
+async def health(request: Request) -> dict[str, Any]:
     """200 with the newest version, 503 if the database does not answer."""
-    return {"status": "ok", "version": services(request).store.current()}
+    return {"status": "ok", "version": await services(request).newest.put(None)}
 
 
 @router.get("/metrics", responses=problems(), response_class=Response, summary="Prometheus metrics")

@@ -83,7 +83,7 @@ def problems(*codes: int) -> dict[int | str, dict[str, Any]]:
     return {code: {"model": Problem} for code in (401, 422, 503, *codes)}
 
 
-def refuse(request: Request | None, error: Exception) -> Response:
+def refuse(error: Exception) -> Response:
     """The answer to a MapvoteError: {"detail": what to do about it}, and the reasons of a held version."""
     status = next(STATUS[kind] for kind in type(error).__mro__ if kind in STATUS)
     content: dict[str, object] = {"detail": str(error)}
@@ -99,9 +99,12 @@ def refuse(request: Request | None, error: Exception) -> Response:
     return response
 
 
-def unreadable(request: Request, error: Exception) -> Response:
-    """A body that is no JSON at all, not even text: FastAPI answers 400, but everything unusable is 422 here."""
-    return refuse(request, MapvoteError("the body is no JSON in UTF-8"))
+async def unreadable(request: Request, error: Exception) -> Response:
+    """A body that is no JSON at all, not even text: FastAPI answers 400, but everything unusable is 422 here.
+
+    Not a plain function: FastAPI would let that wait for one of the threads that operators read with.
+    """
+    return refuse(MapvoteError("the body is no JSON in UTF-8"))
 
 
 def iso(stamp_ns: int | None) -> str | None:

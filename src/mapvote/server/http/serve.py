@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import ipaddress
 import logging
+import resource
 import socket
 import sys
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 
 import msgspec
@@ -19,6 +21,7 @@ from mapvote.core.types import MapvoteError
 from mapvote.formats import open_drive, read_map
 from mapvote.server.http.app import create_app
 from mapvote.server.http.browsers import HEADERS
+from mapvote.server.http.connections import Connection, Crowd, Patience
 from mapvote.server.http.services import Services
 from mapvote.server.insight.localisation_gate import gate as localise_in_both
 from mapvote.server.store import keys
@@ -26,6 +29,11 @@ from mapvote.server.store.policy import Policy
 from mapvote.server.store.publish import Gate
 from mapvote.server.store.store import Store
 
+_FILES = 300
+"""Descriptors beside those of connections: a database's connections, libraries, logs."""
+_SWITCH_S = 5e-4
+"""Python lets a thread that computes keep the others waiting this long at a time, 5 ms unless told; an answer takes
+some twenty such turns."""
 _PATIENCE_S = 5
 """How long a stopping server waits for answers under way. Ballots take milliseconds."""
 
@@ -98,17 +106,32 @@ def serve(
         raise MapvoteError(f"cannot listen on {host}:{port} ({error.strerror}): choose another --port") from error
     shown = f"[{host}]" if ":" in host else host
     ready(f"http://{shown}:{listener.getsockname()[1]}")
+    most = settings.server
+    patience = Patience(most.header_timeout_s, most.body_timeout_s, most.answer_timeout_s, _room_for(most.connections))
     config = uvicorn.Config(
         app,
+        http=partial(Connection, patience=patience, crowd=Crowd(patience.connections)),  # type: ignore[arg-type]
+        ws="none",
         access_log=False,
-        proxy_headers=False,
+        forwarded_allow_ips=["127.0.0.1", "::1"],  # a proxy on this machine says whom it speaks for
         log_level="warning",
         timeout_graceful_shutdown=_PATIENCE_S,
         server_header=False,
         headers=list(HEADERS),
     )
+    sys.setswitchinterval(_SWITCH_S)
     with listener:
         _Server(config).run(sockets=[listener])
+
+
+def _room_for(connections: int) -> int:
+    """As many connections as wished, or as the system lets this process open beside its files."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    needed = connections + _FILES
+    if soft < needed:
+        soft = needed if hard == resource.RLIM_INFINITY else min(needed, hard)
+        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+    return min(connections, soft - _FILES)
 
 
 class _Server(uvicorn.Server):

@@ -6,11 +6,12 @@ from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from threading import Event
 
+from anyio import CapacityLimiter
 from fastapi import Request
 
 from mapvote.config import Settings
 from mapvote.server.http.batching import Batcher
-from mapvote.server.http.limits import RateLimit
+from mapvote.server.http.limits import RateLimit, Uploads
 from mapvote.server.http.manifests import Manifests
 from mapvote.server.http.metrics import Metrics
 from mapvote.server.store.admission import Intake, Sent
@@ -18,8 +19,25 @@ from mapvote.server.store.ballots import Incoming, Receipt
 from mapvote.server.store.publish import Gate
 from mapvote.server.store.store import Store
 
+READING = 2
 _READERS = 1024
 """Readers answered by one look at the newest version."""
+
+
+@dataclass(frozen=True, slots=True)
+class Threads:
+    """Who waits for whom: each kind of work has threads of its own, so that none can take those of another.
+
+    What is in none of these runs in FastAPI's own pool, :data:`READING` threads: whatever an operator looks at.
+    """
+
+    ballots: ThreadPoolExecutor = field(default_factory=lambda: ThreadPoolExecutor(3, "ballots"))
+    lookups: ThreadPoolExecutor = field(default_factory=lambda: ThreadPoolExecutor(2, "lookups"))
+    """Keys and the newest version: health, and what comes before every answer."""
+    fuse: ThreadPoolExecutor = field(default_factory=lambda: ThreadPoolExecutor(2, "fuse"))
+    fetching: CapacityLimiter = field(default_factory=lambda: CapacityLimiter(4))
+    """Manifests and tiles."""
+    publishing: CapacityLimiter = field(default_factory=lambda: CapacityLimiter(2))
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,8 +50,7 @@ class Services:
     """Looks at a version before it is published."""
     fusing: Executor
     """Where tiles are fused."""
-    threads: ThreadPoolExecutor
-    """The app's own threads for that, idle if ``fusing`` is another's."""
+    threads: Threads
     intake: Intake
     examiner: Batcher[Sent, Incoming]
     """Looks at ballots, many at once."""
@@ -44,38 +61,40 @@ class Services:
     manifests: Manifests
     metrics: Metrics
     limit: RateLimit
+    uploads: Uploads
     stopping: Event = field(default_factory=Event)
     """Set once the server has been told to stop."""
 
     def stop_fusing(self) -> None:
         """Drop what waits to be fused; a publish under way then ends as :class:`Unavailable`."""
         self.stopping.set()
-        self.threads.shutdown(wait=False, cancel_futures=True)
+        self.threads.fuse.shutdown(wait=False, cancel_futures=True)
 
     async def close(self) -> None:
         """Wait until every ballot that was taken in is written."""
         await self.examiner.close()
         await self.writer.close()
-        self.threads.shutdown(cancel_futures=True)
+        for pool in (self.threads.fuse, self.threads.ballots, self.threads.lookups):
+            pool.shutdown(cancel_futures=True)
 
 
 def make_services(store: Store, settings: Settings, gate: Gate | None, executor: Executor | None) -> Services:
     """The parts of an app on an open store; ``executor`` as in :func:`mapvote.server.http.app.create_app`."""
-    intake, manifests = Intake(store), Manifests(store)
-    threads = ThreadPoolExecutor(2, "fuse")
+    intake, manifests, threads, most = Intake(store), Manifests(store), Threads(), settings.server
     return Services(
         store=store,
         settings=settings,
         gate=gate,
-        fusing=executor or threads,
+        fusing=executor or threads.fuse,
         threads=threads,
         intake=intake,
-        examiner=Batcher(intake.look_at, settings.server.batch),
-        writer=Batcher(intake.write, settings.server.batch),
-        newest=Batcher(manifests.newest, _READERS),
+        examiner=Batcher(intake.look_at, most.batch, threads.ballots),
+        writer=Batcher(intake.write, most.batch, threads.ballots),
+        newest=Batcher(manifests.newest, _READERS, threads.lookups),
         manifests=manifests,
         metrics=Metrics(),
-        limit=RateLimit(settings.server.ballots_per_minute, settings.server.burst),
+        limit=RateLimit(most.ballots_per_minute, most.burst),
+        uploads=Uploads(most.max_body_bytes, most.upload_bytes),
     )
 
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from typing import Annotated, Any
 
+from anyio import to_thread
 from fastapi import APIRouter, Path, Request, Response
 from fastapi.concurrency import run_in_threadpool
 
@@ -59,14 +60,15 @@ async def one_version(request: Request, number: Number, since: VersionQuery | No
     response_class=Response,
     summary="One plane of a tile",
 )
-def plane(request: Request, digest: Annotated[str, Path(pattern=r"^[0-9a-f]{64}$")]) -> Response:
+async def plane(request: Request, digest: Annotated[str, Path(pattern=r"^[0-9a-f]{64}$")]) -> Response:
     """Raw little-endian values, zstd on the wire where the client takes it. Immutable: the hash is of the values."""
     headers = {
         "ETag": f'"{digest}"',
         "Cache-Control": "private, max-age=31536000, immutable",
         "Vary": "Accept-Encoding",
     }
-    data = services(request).store.blob(digest)
+    parts = services(request)
+    data = await to_thread.run_sync(parts.store.blob, digest, limiter=parts.threads.fetching)
     if request.headers.get("if-none-match") == f'"{digest}"':
         return Response(status_code=304, headers=headers)
     if "zstd" in request.headers.get("accept-encoding", ""):
@@ -88,7 +90,9 @@ async def _manifest(request: Request, number: int | None, since: int | None) -> 
     number = await parts.newest.put(None) if number is None else number
     etag = f'"{number}"' if since is None else f'"{number}-{since}"'
     headers = {"ETag": etag, "Cache-Control": "private, no-cache"}
-    content = parts.manifests.ready(number, since) or await run_in_threadpool(parts.manifests.make, number, since)
+    content = parts.manifests.ready(number, since) or await to_thread.run_sync(
+        parts.manifests.make, number, since, limiter=parts.threads.fetching
+    )
     if request.headers.get("if-none-match") == etag:
         return Response(status_code=304, headers=headers)
     return Response(content, media_type="application/json", headers=headers)

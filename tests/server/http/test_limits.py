@@ -1,0 +1,106 @@
+"""What is held in memory of ballots that are still on their way."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator
+
+import pytest
+
+from mapvote.core.types import MapvoteError
+from mapvote.server.errors import TooLarge, TooMany, Unavailable
+from mapvote.server.http.limits import RateLimit, Uploads
+
+
+class Slow:
+    """A body whose pieces come when told."""
+
+    def __init__(self) -> None:
+        self.pieces: asyncio.Queue[bytes] = asyncio.Queue()
+
+    async def stream(self) -> AsyncIterator[bytes]:
+        while piece := await self.pieces.get():
+            yield piece
+
+    async def send(self, piece: bytes) -> None:
+        self.pieces.put_nowait(piece)
+        for _ in range(3):
+            await asyncio.sleep(0)
+
+
+def test_when_memory_is_short_the_largest_upload_goes_and_a_small_one_is_taken() -> None:
+    async def story() -> None:
+        uploads = Uploads(each=100, together=150)
+        bodies = [Slow() for _ in range(3)]
+        reads = [asyncio.create_task(uploads.read(f"v{i}", body.stream(), None)) for i, body in enumerate(bodies)]
+        await bodies[0].send(bytes(90))
+        await bodies[1].send(bytes(50))
+        await bodies[2].send(bytes(20))
+        assert not any(read.done() for read in reads)
+        for body in bodies[1:]:
+            await body.send(b"x")
+            await body.send(b"")
+        assert [len(await read) for read in reads[1:]] == [51, 21]
+        await bodies[0].send(b"more")
+        with pytest.raises(Unavailable, match="send this one again"):
+            await reads[0]
+        again = Slow()
+        read = asyncio.create_task(uploads.read("v0", again.stream(), None))
+        await again.send(bytes(100))
+        await again.send(b"")
+        assert len(await read) == 100
+
+    asyncio.run(story())
+
+
+def test_one_vehicle_holds_so_many_uploads_and_no_more_and_others_are_not_counted() -> None:
+    async def story() -> None:
+        uploads, bodies = Uploads(each=100, together=1000), [Slow() for _ in range(Uploads.AT_ONCE)]
+        reads = [asyncio.create_task(uploads.read("v", body.stream(), None)) for body in bodies]
+        await asyncio.sleep(0)
+        with pytest.raises(TooMany, match="'v'"):
+            await uploads.read("v", Slow().stream(), None)
+        other, last = Slow(), Slow()
+        read = asyncio.create_task(uploads.read("w", other.stream(), None))
+        await other.send(b"ballot")
+        await other.send(b"")
+        assert await read == b"ballot"
+        for body, one in zip(bodies, reads, strict=True):
+            await body.send(b"")
+            await one
+        read = asyncio.create_task(uploads.read("v", last.stream(), None))
+        await last.send(b"")
+        assert await read == b""
+
+    asyncio.run(story())
+
+
+@pytest.mark.parametrize("declared", ["101", None])
+def test_a_body_beyond_the_limit_is_refused_announced_or_not(declared: str | None) -> None:
+    async def pieces() -> AsyncIterator[bytes]:
+        for _ in range(11):
+            yield bytes(10)
+
+    with pytest.raises(TooLarge, match="100"):
+        asyncio.run(Uploads(each=100, together=1000).read("v", pieces(), declared))
+
+
+def test_a_bucket_refills_with_time() -> None:
+    now = 0.0
+    limit = RateLimit(per_minute=60.0, burst=2, clock=lambda: now)
+    limit.take("v")
+    limit.take("v")
+    with pytest.raises(MapvoteError, match="60"):
+        limit.take("v")
+    limit.take("w")
+    now = 1.0
+    limit.take("v")
+
+
+def test_looking_into_a_bucket_takes_nothing_out() -> None:
+    limit = RateLimit(per_minute=60.0, burst=1, clock=lambda: 0.0)
+    for _ in range(5):
+        limit.check("v")
+    limit.take("v")
+    with pytest.raises(TooMany):
+        limit.check("v")
