@@ -5,7 +5,8 @@
 
 A real server process on loopback, with keys. Against it, in a process of their own, everything at once or each alone:
 48 clients that ask for the most expensive reads again and again, 30 uploads that announce 10 MB and send a byte a
-second, 1,100 connections that never finish their headers (and come back when they are cut), 8 clients with wrong keys.
+second, 1,100 connections that never finish their headers and come back a second after they are cut, 8 clients with
+wrong keys.
 Meanwhile one vehicle sends a ballot of about 20 kB every 100 ms, and somebody asks for /healthz as often, each on a
 connection of its own. Ends with 1 if, with everything at once, one ballot in a hundred waits longer than 1 s or one
 look at the health longer than 100 ms, or if any is refused.
@@ -133,7 +134,9 @@ async def stalled_upload(address: Address, vehicle: str, key: str, turn: int) ->
         writer.close()
 
 
-async def half_open(address: Address) -> None:
+async def half_open(address: Address, turn: int) -> None:
+    await asyncio.sleep(1.0 if turn in HERE else 4.0 * turn / HALF_OPEN)
+    HERE.add(turn)
     reader, writer = await asyncio.open_connection(*address)
     writer.write(b"GET /v1/map HTTP/1.1\r\nHost: localhost\r\nX-Never: ")
     try:
@@ -149,6 +152,8 @@ async def wrong_key(address: Address, turn: int) -> None:
 
 
 ANSWERS: Counter[str] = Counter()
+HERE: set[int] = set()
+"""Half-open connections that have been made once."""
 
 
 async def attack(address: Address, keys: dict[str, str], kinds: set[str]) -> None:
@@ -163,7 +168,7 @@ async def attack(address: Address, keys: dict[str, str], kinds: set[str]) -> Non
     if "uploads" in kinds:
         start(UPLOADS, lambda i: stalled_upload(address, f"bad{i % 8}", keys[f"bad{i % 8}"], i))
     if "half-open" in kinds:
-        start(HALF_OPEN, lambda i: half_open(address))
+        start(HALF_OPEN, lambda i: half_open(address, i))
     if "wrong keys" in kinds:
         start(WRONG, lambda i: wrong_key(address, i))
     await asyncio.gather(*tasks)

@@ -188,7 +188,7 @@ class ServerSettings(Section):
 
     max_body_bytes: int = Field(default=16_000_000, description="largest request body")
     upload_bytes: int = Field(default=128_000_000, description="all ballots on their way at once, in memory")
-    connections: int = Field(default=800, ge=8, description="at once; the longest silent makes room for a new one")
+    connections: int = Field(default=2000, ge=8, description="at once; the longest silent makes room for a new one")
     header_timeout_s: float = Field(default=10.0, gt=0, description="for the headers of a request")
     body_timeout_s: float = Field(default=120.0, gt=0, description="for its body")
     answer_timeout_s: float = Field(default=60.0, gt=0, description="for a client that does not take its answer")

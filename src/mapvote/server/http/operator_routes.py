@@ -10,13 +10,13 @@ from functools import partial
 from typing import Annotated, Any
 
 from anyio import to_thread
-from fastapi import APIRouter, Query, Request
+from fastapi import APIRouter, Query, Request, Response
 
 from mapvote.codec.ballot import tile_key
 from mapvote.fusion.tile_vote import DAY_NS
 from mapvote.server.errors import Unavailable
 from mapvote.server.http.auth import operator, reviewer, sees_names
-from mapvote.server.http.schemas import LEAST, MOST, PublishAsk, Published, RollbackAsk, iso, problems
+from mapvote.server.http.schemas import LEAST, MOST, PublishAsk, Published, RollbackAsk, as_json, iso, problems
 from mapvote.server.http.services import Services, services
 from mapvote.server.insight.explain import explain_cell
 from mapvote.server.insight.history import changes_between, coverage, vehicle_standings
@@ -65,20 +65,25 @@ async def roll_back(request: Request, ask: RollbackAsk) -> dict[str, int]:
     return {"version": (await to_thread.run_sync(back, limiter=parts.threads.publishing)).number}
 
 
-@router.get("/v1/changes", responses=problems(404), summary="What changed, as GeoJSON in map metres")
+@router.get(
+    "/v1/changes",
+    response_model=dict[str, Any],
+    responses=problems(404),
+    summary="What changed, as GeoJSON in map metres",
+)
 def changes(
     request: Request,
     old: Annotated[int, Query(alias="from", ge=LEAST, le=MOST)],
     new: Annotated[int | None, Query(alias="to", ge=LEAST, le=MOST)] = None,
     min_cells: Annotated[int, Query(ge=1, le=100_000)] = 1,
-) -> dict[str, Any]:
+) -> Response:
     """Objects built and demolished between two versions; ``to`` is the newest by default."""
     store = services(request).store
-    return changes_between(store, old, store.current() if new is None else new, min_cells)
+    return as_json(changes_between(store, old, store.current() if new is None else new, min_cells))
 
 
-@router.get("/v1/cells", responses=problems(), summary="The votes behind one cell")
-def cell(request: Request, x: float, y: float) -> dict[str, Any]:
+@router.get("/v1/cells", response_model=dict[str, Any], responses=problems(), summary="The votes behind one cell")
+def cell(request: Request, x: float, y: float) -> Response:
     """Who says what about the cell at (x, y), map metres, whether it counts, and what was decided when."""
     parts = services(request)
     story = explain_cell(parts.store, x, y)
@@ -99,27 +104,29 @@ def cell(request: Request, x: float, y: float) -> dict[str, Any]:
         for v in story.votes
     ]
     decisions = [{"version": version, "state": state} for version, state in story.decisions]
-    return {"row": story.row, "col": story.col, "votes": votes, "decisions": decisions}
+    return as_json({"row": story.row, "col": story.col, "votes": votes, "decisions": decisions})
 
 
-@router.get("/v1/coverage", responses=problems(), summary="Freshness of every tile")
-def fresh(request: Request) -> dict[str, Any]:
+@router.get("/v1/coverage", response_model=dict[str, Any], responses=problems(), summary="Freshness of every tile")
+def fresh(request: Request) -> Response:
     """When each tile was last driven past, and by how many vehicles whose ballots stand."""
     tiles, known = coverage(services(request).store), sees_names(request)
-    return {
-        "tiles": [
-            {name: t[name] for name in ("row", "col", "vehicles")} | {"last_seen": iso(_seen(t["last_seen_ns"], known))}
-            for t in tiles
-        ]
-    }
+    told = [
+        {name: t[name] for name in ("row", "col", "vehicles")} | {"last_seen": iso(_seen(t["last_seen_ns"], known))}
+        for t in tiles
+    ]
+    return as_json({"tiles": told})
 
 
-@router.get("/v1/vehicles", responses=problems(403), summary="Who contradicts the others")
-def vehicles(request: Request) -> dict[str, Any]:
+@router.get(
+    "/v1/vehicles", response_model=dict[str, Any], responses=problems(403), summary="Who contradicts the others"
+)
+def vehicles(request: Request) -> Response:
     """How every vehicle stands to what the others say before and after it, with the places where it differs."""
     reviewer(request)
     found = vehicle_standings(services(request).store)
-    return {"vehicles": [asdict(s) | {"evidence": [asdict(e) for e in s.evidence[:_MOST_EVIDENCE]]} for s in found]}
+    told = [asdict(s) | {"evidence": [asdict(e) for e in s.evidence[:_MOST_EVIDENCE]]} for s in found]
+    return as_json({"vehicles": told})
 
 
 def _seen(stamp_ns: int | None, known: bool) -> int | None:

@@ -19,7 +19,9 @@ from mapvote.server.store.ballots import Incoming, Receipt
 from mapvote.server.store.publish import Gate
 from mapvote.server.store.store import Store
 
-READING = 2
+READING = 1
+"""Threads for whatever an operator looks at. Python computes in one thread at a time: more would only take turns with
+those who answer vehicles."""
 _READERS = 1024
 """Readers answered by one look at the newest version."""
 
