@@ -1,0 +1,134 @@
+"""The rule of voting against a second one in plain words, and the quick ways of the server against the slow one."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from mapvote.core.types import N_STATES, NO_VOTE, CellState
+from mapvote.core.voting import (
+    VOTE_UNIT,
+    add_states,
+    add_tally,
+    decide,
+    decide_cells,
+    decide_change,
+    one_hot,
+    to_wire,
+    vote_weight,
+    weight_table,
+)
+
+UO, UE, CO, CE, UN = (int(state) for state in CellState)
+few_votes = st.lists(st.integers(0, 3), min_size=N_STATES, max_size=N_STATES)
+
+
+def winner(votes: list[int], abstain: bool) -> int:
+    """Most votes win, two firsts are undetermined, no votes are no vote; who abstains does not compete."""
+    standing = {state: n for state, n in enumerate(votes) if n and not (abstain and state == UN)}
+    if not standing:
+        return UN if votes[UN] else NO_VOTE
+    most = max(standing.values())
+    first = [state for state, n in standing.items() if n == most]
+    if len(first) > 1:
+        return UN
+    if abstain and first[0] in (CO, CE) and 2 * most <= sum(votes[:UN]):
+        return UN
+    return first[0]
+
+
+@given(few_votes)
+def test_where_undetermined_competes_a_plain_majority_decides(votes: list[int]) -> None:
+    assert int(decide(np.array(votes, dtype=np.int32))) == winner(votes, abstain=False)
+
+
+@given(few_votes, st.integers(1, 4))
+def test_where_it_abstains_a_change_needs_more_than_half_of_the_others_and_a_quorum(
+    votes: list[int], quorum: int
+) -> None:
+    expected = winner(votes, abstain=True)
+    if expected in (CO, CE) and votes[expected] < quorum:
+        expected = UN
+    assert int(decide_change(np.array(votes, dtype=np.int32) * VOTE_UNIT, quorum)) == expected
+
+
+def test_one_vote_is_enough_for_a_change_unless_more_are_asked_for() -> None:
+    alone = np.array([0, 0, VOTE_UNIT, 0, 0], dtype=np.int32)
+    assert int(decide_change(alone)) == CO
+    assert int(decide_change(alone, 2)) == UN
+
+
+def test_a_quorum_that_is_just_reached_is_reached() -> None:
+    tally = np.array([[0], [0], [0], [32], [0]], dtype=np.int32)
+    assert decide_cells(tally, tally, True, 32).tolist() == [CE]
+    assert decide_cells(tally, tally, True, 33).tolist() == [UN]
+
+
+def test_no_quorum_is_asked_of_what_stays_as_it_is() -> None:
+    for state in (UO, UE):
+        tally = np.zeros((N_STATES, 1), dtype=np.int32)
+        tally[state] = 1
+        assert decide_cells(tally, np.zeros_like(tally), True, 99).tolist() == [state]
+
+
+@pytest.mark.parametrize("voters", [1, 255, 256, 600])
+def test_votes_counted_in_bytes_are_the_votes_counted_one_by_one(voters: int) -> None:
+    """More voters than a byte counts, and more cells than are counted at once."""
+    rng = np.random.default_rng(voters)
+    states = rng.choice([UO, UE, CO, CE, UN, NO_VOTE], (voters, 5000)).astype(np.uint8)
+    tally = np.ones((N_STATES, 5000), dtype=np.int32)
+    add_states(states, tally)
+    expected = 1 + VOTE_UNIT * np.stack([(states == state).sum(axis=0) for state in range(N_STATES)])
+    np.testing.assert_array_equal(tally, expected)
+
+
+@given(st.lists(few_votes, min_size=1, max_size=5))
+def test_in_one_stage_the_sums_decide_and_a_vehicle_backs_what_it_alone_would_decide(
+    says: list[list[int]],
+) -> None:
+    tally, backers = np.zeros((N_STATES, 1), dtype=np.int32), np.zeros((N_STATES, 1), dtype=np.int32)
+    for votes in says:
+        add_tally(np.array(votes, dtype=np.uint16).reshape(N_STATES, 1), True, tally, backers)
+    heard = [votes for votes in says if any(votes)]
+    assert tally.ravel().tolist() == np.sum([[0] * N_STATES, *heard], axis=0).tolist()
+    alone = Counter(winner(votes, abstain=True) for votes in heard)
+    assert backers.ravel().tolist() == [alone[state] for state in range(N_STATES)]
+
+
+@given(st.sampled_from([UO, UE, CO, CE, UN, NO_VOTE]))
+def test_a_vote_is_one_unit_of_its_class_and_silence_none(state: int) -> None:
+    tally = one_hot(np.array([state], dtype=np.uint8))[0]
+    assert tally.tolist() == [VOTE_UNIT if state == own else 0 for own in range(N_STATES)]
+
+
+def test_the_table_of_weights_goes_up_to_its_last_entry() -> None:
+    table = weight_table(True, 2.0, 3.0, 0.5, 5)
+    assert table.shape == (257,)
+    assert weight_table(True, 2.0, 3.0, 0.5, 5, 7).shape == (8,)
+    assert table[256] == 3 * VOTE_UNIT
+    assert table.tolist() == sorted(table.tolist())
+
+
+@settings(max_examples=40)
+@given(st.integers(0, 60), st.floats(0.5, 3.0), st.floats(0.1, 2.0), st.floats(0.1, 1.0), st.integers(1, 9))
+def test_the_weight_begins_at_a_and_never_reaches_b(n: int, a: float, more: float, k: float, n_min: int) -> None:
+    weight = float(vote_weight(n, a, a + more, k, n_min))
+    if n < n_min:
+        assert weight == 0.0
+    else:
+        assert a - 1e-12 <= weight <= a + more
+        assert n > n_min or weight == pytest.approx(a)
+
+
+def test_what_fits_16_bits_is_sent_as_it_is_and_one_more_halves_the_cell() -> None:
+    tally = np.array([[65535, 3, 0, 0, 1], [65536, 4, 0, 0, 1], [131070, 4, 0, 0, 2], [131072, 8, 0, 0, 3]])
+    assert to_wire(tally.astype(np.int32)).tolist() == [
+        [65535, 3, 0, 0, 1],
+        [32768, 2, 0, 0, 0],
+        [65535, 2, 0, 0, 1],
+        [32768, 2, 0, 0, 0],
+    ]

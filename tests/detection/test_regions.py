@@ -1,0 +1,103 @@
+"""Rules that look beyond a cell: what joins, what falls, what is too small, across the edges of tiles too."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from mapvote.core.grid import Lattice
+from mapvote.core.types import U8, CellState
+from mapvote.detection.regions import around, drop_specks, fallen, unexplained
+
+UO, UE, CO, CE, UN = (int(state) for state in CellState)
+
+
+def plane(*marks: tuple[slice | int, slice | int, int], fill: int = UE, side: int = 40) -> U8:
+    out = np.full((side, side), fill, dtype=np.uint8)
+    for rows, cols, state in marks:
+        out[rows, cols] = state
+    return out
+
+
+@pytest.mark.parametrize(("reach", "kept"), [(1, 1), (3, 3), (6, 6)])
+def test_new_hits_beside_mapped_ones_count_as_far_from_free_standing_ones_as_the_reach(reach: int, kept: int) -> None:
+    states = plane((10, slice(10, 22), CO))
+    beside = np.zeros(states.shape, dtype=np.bool_)
+    beside[10, 11:22] = True  # only the first cell stands free
+    given_up = unexplained(states, beside, reach)
+    assert given_up.sum() == 11 - kept
+    assert not given_up[10, : 11 + kept].any()
+
+
+def test_hits_that_all_lie_beside_mapped_ones_are_given_up() -> None:
+    states = plane((10, slice(10, 14), CO))
+    assert unexplained(states, states == CO, 6).sum() == 4
+    assert not unexplained(states, np.zeros(states.shape, dtype=np.bool_), 6).any()
+
+
+def test_the_reach_goes_along_changed_cells_only() -> None:
+    states = plane((10, 10, CO), (10, 12, CO))
+    beside = np.zeros(states.shape, dtype=np.bool_)
+    beside[10, 12] = True
+    assert unexplained(states, beside, 6)[10, 12]
+
+
+@pytest.mark.parametrize(("gap", "falls"), [(1, True), (15, True), (16, False)])
+def test_a_roof_falls_with_walls_no_farther_off_than_the_reach(gap: int, falls: bool) -> None:
+    states = plane((20, 2, CE), (20, slice(2 + gap, 6 + gap), UN), (20, 39, UO))
+    adrift = np.zeros(states.shape, dtype=np.bool_)
+    adrift[20, 2 + gap : 6 + gap] = True
+    down = fallen(states, adrift, 15)
+    assert down.any() == falls
+
+
+def test_of_two_roofs_that_meet_only_the_one_nearer_to_what_is_gone_falls() -> None:
+    states = plane((20, 4, CE), (20, 20, UO))
+    adrift = np.zeros(states.shape, dtype=np.bool_)
+    adrift[20, 5:20] = True
+    down = fallen(states, adrift, 15)
+    assert np.flatnonzero(down[20]).tolist() == list(range(5, 12))  # 12 is as near to the one as to the other
+
+
+def test_without_anything_gone_nothing_falls_and_without_anything_standing_all_of_it() -> None:
+    adrift = np.zeros((40, 40), dtype=np.bool_)
+    adrift[20, 5:9] = True
+    assert not fallen(plane(), adrift, 15).any()
+    assert fallen(plane((20, 4, CE)), adrift, 15).sum() == 4
+
+
+def test_what_is_not_adrift_never_falls() -> None:
+    states = plane((20, 4, CE))
+    assert not fallen(states, np.zeros(states.shape, dtype=np.bool_), 15).any()
+
+
+@pytest.mark.parametrize("state", [CO, CE])
+def test_groups_smaller_than_asked_are_specks_and_corners_join(state: int) -> None:
+    states = plane((5, slice(5, 8), state), (20, 20, state), (21, 21, state), (22, 22, state), (23, 23, state))
+    specks = drop_specks(states, 4)
+    assert np.flatnonzero(specks.any(axis=1)).tolist() == [5]
+    assert specks.sum() == 3
+    assert not drop_specks(states, 3).any()
+
+
+def test_two_kinds_of_change_do_not_make_one_group() -> None:
+    assert drop_specks(plane((5, slice(5, 8), CO), (6, slice(5, 8), CE)), 4).sum() == 6
+
+
+def test_cells_that_did_not_change_are_no_specks() -> None:
+    assert not drop_specks(plane((5, 5, UO), (9, 9, UN)), 4).any()
+
+
+@settings(max_examples=20)
+@given(st.integers(0, 2**32 - 1), st.integers(1, 70))
+def test_a_window_over_several_tiles_is_cut_from_each(seed: int, halo: int) -> None:
+    rng = np.random.default_rng(seed)
+    lattice = Lattice()
+    tiles = {(r, c): rng.integers(0, 5, (256, 256)).astype(np.uint8) for r in (0, 1) for c in (0, 1)}
+    whole = np.block([[tiles[0, 0], tiles[0, 1]], [tiles[1, 0], tiles[1, 1]]])
+    seen = around(lattice, tiles, lattice.tile((0, 0)).padded(halo), 9)
+    assert (seen[:halo] == 9).all()
+    assert (seen[:, :halo] == 9).all()
+    np.testing.assert_array_equal(seen[halo:, halo:], whole[: 256 + halo, : 256 + halo])

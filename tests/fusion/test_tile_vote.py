@@ -1,0 +1,161 @@
+"""What one vehicle says of a tile: which drives speak, what they back, and how they become one vote."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from hand_made import states_plane, wall, words_plane
+from mapvote.config import FuseSettings
+from mapvote.core.grid import TILE_CELLS, Lattice
+from mapvote.core.types import N_STATES, NO_VOTE, CellState
+from mapvote.fusion.sparse_columns import Words
+from mapvote.fusion.tile_vote import DAY_NS, TileVote, fold, one_each, restrict, select
+
+UO, UE, CO, CE, UN = CellState
+WINDOW = Lattice().tile((0, 0))
+HERE, THERE = (3, 4), (200, 17)
+FLAT = np.array([3 * TILE_CELLS + 4, 200 * TILE_CELLS + 17])
+
+
+def drive(vehicle: str, end_ns: int, cells: dict[tuple[int, int], int], **more: object) -> TileVote:
+    return TileVote(vehicle, end_ns, f"{vehicle}{end_ns}", states=states_plane(cells), **more)  # type: ignore[arg-type]
+
+
+def counted(cells: dict[tuple[int, int], list[int]]) -> TileVote:
+    tally = np.zeros((TILE_CELLS, TILE_CELLS, N_STATES), dtype=np.uint16)
+    for cell, votes in cells.items():
+        tally[cell] = votes
+    return TileVote("v", 0, "d", tally=tally)
+
+
+def test_a_drive_as_old_as_the_window_still_speaks_and_one_a_moment_older_does_not() -> None:
+    policy = FuseSettings(max_age_days=2)
+    votes = [drive("new", 3 * DAY_NS, {}), drive("edge", DAY_NS, {}), drive("old", DAY_NS - 1, {})]
+    assert [v.vehicle for v in select(votes, policy)] == ["new", "edge"]
+    assert select([], policy) == []
+
+
+def test_the_window_is_counted_from_the_newest_drive_on_the_tile_not_from_today() -> None:
+    policy = FuseSettings(max_age_days=1)
+    assert len(select([drive("a", 10, {}), drive("b", 20, {})], policy)) == 2
+
+
+def test_of_too_many_vehicles_those_that_passed_last_speak_with_all_their_drives() -> None:
+    policy = FuseSettings(latest_vehicles=2)
+    votes = [drive("a", 1, {}), drive("b", 2, {}), drive("c", 3, {}), drive("a", 4, {})]
+    assert sorted((v.vehicle, v.end_ns) for v in select(votes, policy)) == [("a", 1), ("a", 4), ("c", 3)]
+
+
+def test_of_vehicles_that_passed_at_the_same_moment_the_later_name_goes_first() -> None:
+    votes = [drive(name, 5, {}) for name in "bac"]
+    assert sorted(v.vehicle for v in select(votes, FuseSettings(latest_vehicles=2))) == ["b", "c"]
+
+
+def test_in_a_cell_the_drive_that_ended_last_speaks_and_silence_overrides_nothing() -> None:
+    early, late = drive("v", 1, {HERE: CE, THERE: UO}), drive("v", 2, {HERE: UE})
+    one = fold([late, early], WINDOW)
+    assert one.states is not None
+    assert one.states[HERE] == UE
+    assert one.states[THERE] == UO
+    assert (one.vehicle, one.end_ns) == ("v", 2)
+
+
+@settings(max_examples=25)
+@given(st.integers(0, 2**32 - 1))
+def test_drives_fold_alike_in_any_order(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    drives = []
+    for i in range(3):
+        states = rng.choice([UO, UE, CO, CE, UN, NO_VOTE], (TILE_CELLS, TILE_CELLS)).astype(np.uint8)
+        gone = Words.of(words_plane({HERE: int(rng.integers(1, 99)), THERE: int(rng.integers(1, 99))}))
+        points = wall([HERE, THERE], [0.45 + i])
+        end_ns = int(rng.integers(2))  # ties go by hash
+        drives.append(TileVote("v", end_ns, f"d{i}", states=states, gone=gone, new_points=points, free=gone))
+    folded = [fold(list(order), WINDOW) for order in itertools.permutations(drives)]
+    for other in folded[1:]:
+        assert other.states is not None
+        assert folded[0].states is not None
+        assert other.states.tobytes() == folded[0].states.tobytes()
+        assert other.gone is not None
+        assert folded[0].gone is not None
+        assert other.gone.words.tobytes() == folded[0].gone.words.tobytes()
+        assert other.new_points is not None
+        assert folded[0].new_points is not None
+        assert sorted(other.new_points.tolist()) == sorted(folded[0].new_points.tolist())
+
+
+def test_points_of_a_cell_come_from_the_drive_that_speaks_there() -> None:
+    early = drive("v", 1, {HERE: CO, THERE: CO}, new_points=wall([HERE, THERE], [0.45]))
+    late = drive("v", 2, {HERE: CO}, new_points=wall([HERE], [1.05]))
+    points = fold([early, late], WINDOW).new_points
+    assert points is not None
+    assert sorted(points[:, 2].tolist()) == pytest.approx([0.45, 1.05])
+    assert len(points) == 2
+
+
+def test_what_a_drive_saw_free_stays_seen_when_a_later_drive_speaks() -> None:
+    early = drive("v", 1, {HERE: UE}, free=Words.of(words_plane({HERE: 0b01})))
+    late = drive("v", 2, {HERE: UE}, free=Words.of(words_plane({HERE: 0b10})))
+    free = fold([early, late], WINDOW).free
+    assert free is not None
+    assert free.words.tolist() == [0b11]
+
+
+def test_every_vehicle_has_one_vote_and_they_come_by_name() -> None:
+    votes = one_each([drive("b", 1, {}), drive("a", 2, {}), drive("b", 3, {})], WINDOW)
+    assert [(v.vehicle, v.end_ns) for v in votes] == [("a", 2), ("b", 3)]
+
+
+def test_a_silenced_cell_says_nothing_and_the_others_all_they_said() -> None:
+    counts = np.ones((TILE_CELLS, TILE_CELLS), dtype=np.bool_)
+    vote = drive("v", 1, {HERE: CE, THERE: CO}, free=Words.of(words_plane({HERE: 5, THERE: 6})))
+    assert restrict(vote, None) is vote
+    assert restrict(vote, counts) is vote
+    counts[HERE] = False
+    left = restrict(vote, counts)
+    assert left.states is not None
+    assert left.states[HERE] == NO_VOTE
+    assert left.states[THERE] == CO
+    assert left.free is not None
+    assert left.free.words.tolist() == [6]
+    tally = restrict(counted({HERE: [0, 0, 3, 0, 0], THERE: [0, 0, 2, 0, 0]}), counts).tally
+    assert tally is not None
+    assert tally[HERE].sum() == 0
+    assert tally[THERE].tolist() == [0, 0, 2, 0, 0]
+
+
+def test_what_a_vote_backs_by_its_states_and_by_its_tally() -> None:
+    decided = drive("v", 1, {HERE: CE})
+    assert decided.supports(CE, FLAT).tolist() == [True, False]
+    assert decided.determined(FLAT).tolist() == [True, False]
+    assert drive("v", 1, {HERE: UN}).determined(FLAT).tolist() == [False, False]
+    assert drive("v", 1, {HERE: UN}).spoken().sum() == 1
+    one_stage = counted({HERE: [0, 0, 1, 4, 0], THERE: [0, 0, 0, 0, 2]})
+    assert one_stage.supports(CO, FLAT).tolist() == [True, False]
+    assert one_stage.determined(FLAT).tolist() == [True, False]
+    assert one_stage.spoken().sum() == 2
+
+
+def test_a_vote_without_a_mask_deletes_whole_columns_and_leaves_no_remnants() -> None:
+    vote = drive("v", 1, {HERE: CE, THERE: UO})
+    everywhere = Words.whole(np.isin(np.arange(TILE_CELLS**2), FLAT).reshape(TILE_CELLS, TILE_CELLS))
+    assert vote.deletes(everywhere).cells.tolist() == [FLAT[0]]
+    assert vote.deletes(everywhere).words.tolist() == [2**64 - 1]
+    assert len(vote.remnants(np.ones((TILE_CELLS, TILE_CELLS), dtype=np.bool_)).cells) == 0
+
+
+def test_a_mask_deletes_where_the_cell_is_empty_and_marks_remnants_where_it_stands() -> None:
+    vote = drive("v", 1, {HERE: CE, THERE: UO}, gone=Words.of(words_plane({HERE: 0b1100, THERE: 0b10})))
+    everywhere = Words.whole(np.ones((TILE_CELLS, TILE_CELLS), dtype=np.bool_))
+    assert vote.deletes(everywhere).cells.tolist() == [FLAT[0]]
+    assert vote.deletes(everywhere).words.tolist() == [0b1100]
+    standing = np.ones((TILE_CELLS, TILE_CELLS), dtype=np.bool_)
+    assert vote.remnants(standing).cells.tolist() == [FLAT[1]]
+    assert vote.remnants(standing).words.tolist() == [0b10]
+    standing[THERE] = False
+    assert len(vote.remnants(standing).cells) == 0
