@@ -26,7 +26,7 @@ from rich.table import Table
 
 ROOT = Path(__file__).parent.parent
 TESTS = {
-    "core/voting.py": ["core/test_voting.py", "fusion/test_fuse.py"],
+    "core/voting.py": ["core/test_voting.py", "core/test_voting_model.py", "fusion/test_fuse.py"],
     "fusion/fuse.py": ["fusion/test_fuse.py", "fusion/test_outliers.py"],
     "fusion/tile_vote.py": ["fusion/test_tile_vote.py", "fusion/test_fuse.py"],
     "fusion/edit.py": ["fusion/test_edit.py", "fusion/test_fuse.py"],
