@@ -104,6 +104,13 @@ class MapClient:
         self.version = manifest.version
         return PointMap(manifest.map_id, lattice, tiles, manifest.georeference, version=manifest.version)
 
+    def newest(self) -> int:
+        """The number of the newest version; nothing of it is downloaded. Raises as :meth:`fetch`."""
+        try:
+            return msgspec.json.decode(self._ask("GET", "/v1/map").content, type=_Manifest).version
+        except msgspec.DecodeError as error:
+            raise MapvoteError(f"{self._url}: is no mapvote server ({error})") from error
+
     def send(self, ballot: Ballot | bytes) -> Sent:
         """Send a ballot; "spooled" if the server cannot be reached now. MapvoteError if it refuses the ballot."""
         data = ballot if isinstance(ballot, bytes) else encode(ballot)

@@ -66,7 +66,7 @@ def test_a_shell_can_complete(shell: str) -> None:
 
 
 def test_drive_options_are_those_of_open_drive() -> None:
-    assert set(DRIVE_OPTIONS) | {"path", "vehicle"} == set(inspect.signature(open_drive).parameters)
+    assert set(DRIVE_OPTIONS) | {"path", "vehicle", "frame"} == set(inspect.signature(open_drive).parameters)
 
 
 @pytest.mark.parametrize("verb", ["build", "vote", "doctor"])

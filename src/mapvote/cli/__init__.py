@@ -11,7 +11,7 @@ from typing import Annotated
 
 import typer
 
-from mapvote.cli import evaluation, files, inspect, server, setup, update, vehicle
+from mapvote.cli import evaluation, files, follow, inspect, server, setup, update, vehicle
 from mapvote.cli.terminal import complain
 from mapvote.core.types import MapvoteError
 
@@ -24,7 +24,7 @@ app = typer.Typer(
     rich_markup_mode="markdown",
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-for verbs in (vehicle, files, update, server, inspect, evaluation, setup):
+for verbs in (vehicle, files, update, server, follow, inspect, evaluation, setup):
     verbs.register(app)
 
 

@@ -6,6 +6,7 @@ Points are in the map frame, not relative to their tile, as autoware_map_loader 
 from __future__ import annotations
 
 import logging
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -88,25 +89,39 @@ def write_autoware(path: Path, cloud: Cloud, *, side_m: int = SIDE_M) -> None:
     ``side_m``: whole metres. Of the fields intensity goes along. MapvoteError if Autoware has no projector for the
     cloud's frame (:func:`mapvote.formats.geo.projector.autoware_frame` chooses one that it has).
     """
-    points = cloud.points
-    if len(points) == 0:
-        raise MapvoteError(f"{path}: no points to write")
     projector = projector_of(cloud.frame)
-    warn_of_float32(str(path), points)
-    stored = points.astype(np.float32)
+    with whole_folder(path, sign=METADATA) as folder:
+        (folder / TILES).mkdir()
+        corners = {}
+        for (x, y), tile in squares(str(path), cloud, side_m):
+            corners[f"{x}_{y}.pcd"] = x, y
+            save_pcd(folder / TILES / f"{x}_{y}.pcd", tile.points, tile.fields)
+        (folder / METADATA).write_text(metadata(corners, side_m))
+        (folder / PROJECTOR).write_text(projector)
+
+
+def squares(where: str, cloud: Cloud, side_m: int = SIDE_M) -> Iterator[tuple[tuple[int, int], Cloud]]:
+    """A cloud cut along whole multiples of ``side_m``: (corner, float32 points and their intensity), by x, y.
+
+    MapvoteError if there are no points.
+    """
+    if len(cloud.points) == 0:
+        raise MapvoteError(f"{where}: no points to write")
+    warn_of_float32(where, cloud.points)
+    stored = cloud.points.astype(np.float32)
     fields = {"intensity": cloud.fields["intensity"]} if "intensity" in cloud.fields else {}
     corner = np.floor(stored[:, :2].astype(np.float64) / side_m).astype(np.int64) * side_m
     order = np.lexsort((corner[:, 1], corner[:, 0]))
     seams = np.flatnonzero(np.diff(corner[order], axis=0).any(axis=1)) + 1
-    with whole_folder(path, sign=METADATA) as folder:
-        (folder / TILES).mkdir()
-        lines = [f"x_resolution: {side_m:.1f}", f"y_resolution: {side_m:.1f}"]
-        for piece in np.split(order, seams):
-            x, y = corner[piece[0]].tolist()
-            save_pcd(folder / TILES / f"{x}_{y}.pcd", stored[piece], {n: v[piece] for n, v in fields.items()})
-            lines.append(f"{x}_{y}.pcd: [{x}, {y}]")
-        (folder / METADATA).write_text("\n".join(lines) + "\n")
-        (folder / PROJECTOR).write_text(projector)
+    for piece in np.split(order, seams):
+        x, y = corner[piece[0]].tolist()
+        yield (x, y), Cloud(stored[piece], fields={name: values[piece] for name, values in fields.items()})
+
+
+def metadata(corners: Mapping[str, tuple[int, int]], side_m: int = SIDE_M) -> str:
+    """The text of pointcloud_map_metadata.yaml: the size of tiles, and the corner of each file."""
+    lines = [f"x_resolution: {side_m:.1f}", f"y_resolution: {side_m:.1f}"]
+    return "\n".join([*lines, *(f"{name}: [{x}, {y}]" for name, (x, y) in corners.items())]) + "\n"
 
 
 def _read_yaml(file: Path) -> dict[Any, Any]:
