@@ -64,23 +64,35 @@ def changes(
     old: Annotated[int, typer.Option("--from", metavar="VERSION", help="the older version")] = 1,
     new: Annotated[int | None, typer.Option("--to", metavar="VERSION", help="the newer; else the newest")] = None,
     min_cells: Annotated[int, typer.Option(min=1, metavar="N", help="leave out smaller objects")] = 1,
-    out: Annotated[Path | None, typer.Option(metavar="GEOJSON", help="the file to write; else it is printed")] = None,
+    metres: Annotated[bool, typer.Option("--metres", help="map metres, even if the map knows where it lies")] = False,
+    out: Annotated[
+        Path | None, typer.Option(metavar="FILE", help=".geojson, or .gpkg (GeoPackage); else it is printed")
+    ] = None,
 ) -> None:
-    """What was built and demolished between two versions, as GeoJSON in map metres.
+    """What was built and demolished between two versions: GeoJSON in longitude and latitude, or a GeoPackage.
+
+    A GeoPackage is in the map's own coordinate system. A map in local metres gives metres, and says so.
 
     mapvote changes fleet.db --out changes.geojson
     """
     import json
 
     from mapvote.formats.atomic import whole_file
+    from mapvote.formats.geo.frame import frame_of
+    from mapvote.formats.geo.geopackage import write_geopackage
     from mapvote.server.insight.history import changes_between
 
+    package = out is not None and out.suffix.lower() == ".gpkg"
     with opened_store(store) as opened, waiting("comparing versions"):
-        found = changes_between(opened, old, opened.current() if new is None else new, min_cells)
+        newest = opened.current() if new is None else new
+        found = changes_between(opened, old, newest, min_cells, lonlat=not (metres or package))
     text = json.dumps(found, indent=1)
     if out is None:
         print(text)
         return
-    with whole_file(out) as part:
-        part.write_text(text + "\n")
+    if package:
+        write_geopackage(out, found["features"], frame_of(found["georeference"]))
+    else:
+        with whole_file(out) as part:
+            part.write_text(text + "\n")
     print(f"{len(found['features'])} objects in {out}")

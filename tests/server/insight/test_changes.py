@@ -126,7 +126,8 @@ def test_geojson_says_that_it_is_in_map_metres_and_is_the_same_every_time() -> N
     )
     assert first == again
     collection = json.loads(first)
-    assert "map metres" in collection["coordinates"]
+    assert "map metres" in collection["frame"]
+    assert not {"coordinates", "geometry", "geometries", "properties", "crs"} & set(collection)  # RFC 7946, 7.1 and 4
     (feature,) = collection["features"]
     assert feature["geometry"] == {
         "type": "MultiPolygon",
@@ -155,3 +156,15 @@ def test_specks_can_be_left_out() -> None:
     assert [o.cells for o in change_objects([tile])] == [4, 1]
     assert [o.cells for o in change_objects([tile], min_cells=4)] == [4]
     assert change_objects([]) == []
+
+
+def test_geojson_of_a_map_on_earth_is_longitude_and_latitude() -> None:
+    """The corner of MGRS square 54SUE lies at 138.9 degrees east, 35.2 north."""
+    before, after = street(), street(cell_points(0, 0, 3, 3, (2.0,)))
+    place = {"crs": "EPSG:32654", "offset": "300000.0,3900000.0,0.0"}
+    found = to_geojson(compare(before, after), Lattice(), map_id="m", georeference=place, lonlat=True)
+    corners = np.array(found["features"][0]["geometry"]["coordinates"][0])
+    assert np.abs(corners - [138.80, 35.22]).max() < 0.05
+    assert (np.ptp(corners, axis=0) < 2e-5).all()
+    local = to_geojson(compare(before, after), Lattice(), map_id="m", lonlat=True)
+    assert "local metres" in local["frame"]

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from mapvote.core.grid import CELL_SIZE, Lattice
+from mapvote.formats.geo.frame import MapFrame, frame_of
 from mapvote.server.insight.changes import ChangeObject
 from mapvote.server.insight.polygons import Ring
 
@@ -21,17 +22,36 @@ def to_geojson(
     from_version: int | None = None,
     to_version: int | None = None,
     georeference: Mapping[str, str] | None = None,
+    lonlat: bool = False,
 ) -> dict[str, Any]:
-    """The objects as a GeoJSON FeatureCollection, ready for ``json.dumps``. Coordinates are map metres; it says so."""
+    """The objects as a GeoJSON FeatureCollection (RFC 7946), ready for ``json.dumps``; its member "frame" says where
+    coordinates lie.
+
+    ``lonlat``: longitude and latitude, as the RFC wants them, where the map knows its place on Earth; else map metres.
+    """
+    frame = frame_of(georeference or {})
+    features = [_feature(o, lattice) for o in objects]
+    if lonlat and not frame.is_local:
+        for feature in features:
+            _to_lonlat(feature["geometry"], frame)
     return {
         "type": "FeatureCollection",
-        "coordinates": COORDINATES,
+        "frame": "WGS 84 longitude, latitude" if lonlat and not frame.is_local else f"{MAP_METRES}: {frame.told()}",
         "map_id": map_id,
         "georeference": dict(georeference or {}),
         "from_version": from_version,
         "to_version": to_version,
-        "features": [_feature(o, lattice) for o in objects],
+        "features": features,
     }
+
+
+def _to_lonlat(geometry: dict[str, Any], frame: MapFrame) -> None:
+    """Rings in map metres to degrees, in place; 1e-8 degrees are a millimetre. The sense of the rings stays."""
+    polygons = [geometry["coordinates"]] if geometry["type"] == "Polygon" else geometry["coordinates"]
+    for polygon in polygons:
+        for i, ring in enumerate(polygon):
+            corners = np.column_stack([np.array(ring), np.zeros(len(ring))])
+            polygon[i] = np.round(frame.to_lonlat(corners)[:, :2], 8).tolist()
 
 
 def _feature(change: ChangeObject, lattice: Lattice) -> dict[str, Any]:
@@ -72,7 +92,4 @@ def _utc(stamp_ns: int | None) -> str | None:
     return datetime.fromtimestamp(stamp_ns // 1_000_000_000, UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
 
 
-COORDINATES = (
-    "map metres: x, y in the frame of the map named here, not longitude and latitude; "
-    "the WGS 84 of RFC 7946 does not apply"
-)
+MAP_METRES = "map metres, not the longitude and latitude of RFC 7946"

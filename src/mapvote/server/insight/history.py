@@ -24,8 +24,11 @@ from mapvote.server.store.store import Store
 from mapvote.server.store.tile_jobs import unpack_tally_plane
 
 
-def changes_between(store: Store, old: int, new: int, min_cells: int = 1) -> dict[str, Any]:
-    """Change objects from version ``old`` to ``new`` as GeoJSON in map metres. NotFound if one does not exist."""
+def changes_between(store: Store, old: int, new: int, min_cells: int = 1, *, lonlat: bool = False) -> dict[str, Any]:
+    """Change objects from version ``old`` to ``new`` as GeoJSON in map metres, or longitude and latitude (``lonlat``).
+
+    NotFound if one of the versions does not exist.
+    """
     with store.database.reading() as connection:
         for number in (old, new):
             version_of(connection, number)
@@ -46,6 +49,7 @@ def changes_between(store: Store, old: int, new: int, min_cells: int = 1) -> dic
         from_version=old,
         to_version=new,
         georeference=store.georeference,
+        lonlat=lonlat,
     )
 
 
