@@ -10,7 +10,6 @@ from the cache that benchmarks/matrix.py fills, or are made.
 from __future__ import annotations
 
 import argparse
-import json
 from pathlib import Path
 
 from mapvote.config import load_settings
@@ -19,12 +18,14 @@ from mapvote.evaluation.experiments.changed_areas import in_changed_areas, surve
 from mapvote.evaluation.experiments.passes import passes
 from mapvote.evaluation.experiments.pose_errors import map_frame
 from mapvote.evaluation.experiments.scene import Scene, default_cache
+from mapvote.evaluation.results import to_json
+from mapvote.evaluation.scoring.truth import PoseErrors
 from mapvote.formats.atomic import whole_file
 
 OLD, UPDATED, ANEW = "old map", "updated map", "map surveyed anew"
 
 
-def measure(scene: Scene, workers: int) -> dict[str, dict[str, float]]:
+def measure(scene: Scene, workers: int) -> dict[str, PoseErrors]:
     """Errors by map, as :func:`mapvote.evaluation.scoring.truth.error_summary` gives them."""
     scene.prepare()
     cases, _ = choose_cases(scene.settings, "all")
@@ -53,20 +54,20 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("out/changed_areas.json"))
     arguments = parser.parse_args()
     settings = load_settings(arguments.config)
-    results: dict[int, dict[str, dict[str, float]]] = {}
+    results: dict[str, dict[str, PoseErrors]] = {}
     print("| seed | scans | " + " | ".join(f"{name}: median, 99 %, lost" for name in (OLD, UPDATED, ANEW)) + " |")
     print("|---|---|---|---|---|")
     for seed in map(int, arguments.seeds.split(",")):
         found = measure(Scene(arguments.scenario, seed, settings, arguments.cache), arguments.workers)
-        results[seed] = found
+        results[str(seed)] = found
         cells = [
-            f"{100 * e['median_m']:.1f} cm, {100 * e['p99_m']:.1f} cm, {int(e['scans'] - e['localised'])}"
+            f"{100 * e.median_m:.1f} cm, {100 * e.p99_m:.1f} cm, {e.scans - e.localised}"
             for e in (found[name] for name in (OLD, UPDATED, ANEW))
         ]
-        print(f"| {seed} | {int(found[OLD]['scans'])} | " + " | ".join(cells) + " |", flush=True)
+        print(f"| {seed} | {found[OLD].scans} | " + " | ".join(cells) + " |", flush=True)
         with whole_file(arguments.out) as partial:
-            partial.write_text(json.dumps(results, indent=1) + "\n")
-    worse = max(found[UPDATED]["median_m"] - found[ANEW]["median_m"] for found in results.values())
+            partial.write_text(to_json(results))
+    worse = max(found[UPDATED].median_m - found[ANEW].median_m for found in results.values())
     print(f"updated map against one surveyed anew, median, worst seed: {100 * worse:+.1f} cm (must be +1.0 at most)")
 
 

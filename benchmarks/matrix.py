@@ -10,11 +10,9 @@ for development: report on others.
 from __future__ import annotations
 
 import argparse
-import json
 import time
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
 
 from rich.console import Console
 
@@ -22,6 +20,7 @@ from mapvote.config import load_settings
 from mapvote.evaluation.experiments.matrix import EXPERIMENTS, Matrix
 from mapvote.evaluation.experiments.scene import default_cache
 from mapvote.evaluation.reporting import matrix_tables, requirements
+from mapvote.evaluation.results import MatrixResult, to_json
 from mapvote.formats.atomic import whole_file
 
 
@@ -54,11 +53,11 @@ def main() -> None:
         cases=arguments.cases,
         parked=arguments.parked,
     )
-    results: dict[str, dict[int, dict[str, Any]]] = {}
+    results: dict[str, dict[int, MatrixResult]] = {}
     started = time.monotonic()
     if arguments.tables_only:
         done = [(name, seed) for name in names for seed in seeds if matrix.result_file(name, seed).is_file()]
-        ended: Iterable[tuple[str, int, dict[str, Any]]] = ((n, seed, matrix.run(n, seed)) for n, seed in done)
+        ended: Iterable[tuple[str, int, MatrixResult]] = ((n, seed, matrix.run(n, seed)) for n, seed in done)
     else:
         ended = matrix.run_all(names)
     for name, seed, result in ended:
@@ -71,7 +70,7 @@ def main() -> None:
     print(f"{arguments.out / 'matrix.md'}: every table; matrix.json beside it: all numbers")
 
 
-def write(results: dict[str, dict[int, dict[str, Any]]], out: Path) -> None:
+def write(results: dict[str, dict[int, MatrixResult]], out: Path) -> None:
     """matrix.json and matrix.md into ``out``."""
     titles = {name: f"{name} (seeds {', '.join(str(seed) for seed in by_seed)})" for name, by_seed in results.items()}
     text = "\n".join(f"### {titles[name]}\n\n{matrix_tables.table(results, name)}" for name in results)
@@ -80,7 +79,7 @@ def write(results: dict[str, dict[int, dict[str, Any]]], out: Path) -> None:
     with whole_file(out / "matrix.md") as partial:
         partial.write_text(f"## What must hold\n\n{requirements.table(results)}\n## Experiments\n\n{text}")
     with whole_file(out / "matrix.json") as partial:
-        partial.write_text(json.dumps(results, indent=1, allow_nan=False) + "\n")
+        partial.write_text(to_json({name: {str(k): r for k, r in found.items()} for name, found in results.items()}))
 
 
 if __name__ == "__main__":

@@ -5,10 +5,10 @@ from __future__ import annotations
 import json
 import math
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
+from msgspec.structs import asdict
 
 from mapvote.config import Settings
 from mapvote.core.geometry import exp, from_xyz_rpy
@@ -19,6 +19,7 @@ from mapvote.evaluation.experiments.cases import choose_cases
 from mapvote.evaluation.experiments.scene import Scene
 from mapvote.evaluation.reporting import tables
 from mapvote.evaluation.reporting.html import Section, page
+from mapvote.evaluation.results import EvaluationResult, to_json
 from mapvote.evaluation.scoring.truth import error_summary, pose_errors, rigid_between
 
 SLOWER = {"rate_hz": 4.0}
@@ -36,8 +37,8 @@ def corner(cache: Path) -> Evaluation:
     return evaluate(Scene("corner", 3, settings, cache, SLOWER), choose_cases(settings, "1,3,5,columns")[0])
 
 
-def without_timings(result: Any) -> str:
-    return tables.as_json({key: value for key, value in result.items() if key != "timings"})
+def without_timings(result: EvaluationResult) -> str:
+    return to_json({name: value for name, value in asdict(result).items() if name != "timings"}, sort_keys=True)
 
 
 def test_the_json_is_as_designed_and_never_nan(corner: Evaluation) -> None:
@@ -65,15 +66,16 @@ def test_a_second_run_comes_from_the_cache_and_says_the_same(corner: Evaluation,
 
 
 def test_one_stage_costs_more_bytes_than_two(corner: Evaluation) -> None:
-    cases = corner.result["cases"]
-    assert min(cases["3"]["state_bytes_per_vehicle"]) > 5 * max(cases["1"]["state_bytes_per_vehicle"])
+    cases = corner.result.cases
+    assert min(cases["3"].state_bytes_per_vehicle or [0]) > 5 * max(cases["1"].state_bytes_per_vehicle or [0]) > 0
 
 
 def test_columns_find_what_changed(corner: Evaluation) -> None:
-    columns = corner.result["cases"]["columns"]
-    assert all(columns["objects"]["found"])
-    assert columns["map"]["stale_deleted"] > 0.5
-    assert columns["map"]["valid_deleted"] < 0.01
+    columns = corner.result.cases["columns"]
+    assert all(columns.objects.found)
+    assert columns.map is not None
+    assert columns.map.stale_deleted > 0.5
+    assert columns.map.valid_deleted < 0.01
 
 
 def test_tables_show_every_case_and_the_papers_figures(corner: Evaluation) -> None:
@@ -119,9 +121,9 @@ def test_abstentions_are_counted_not_averaged() -> None:
     found = truth.copy()
     found[1, 0, 3], found[3] = 0.1, np.nan
     summary = error_summary(found, truth)
-    assert (summary["scans"], summary["localised"]) == (4, 3)
-    assert summary["max_m"] == pytest.approx(0.1)
-    assert error_summary(np.full((2, 4, 4), np.nan), truth[:2])["median_m"] == 0.0
+    assert (summary.scans, summary.localised) == (4, 3)
+    assert summary.max_m == pytest.approx(0.1)
+    assert error_summary(np.full((2, 4, 4), np.nan), truth[:2]).median_m == 0.0
 
 
 def test_the_page_needs_nothing_else_and_escapes_what_it_is_given() -> None:
@@ -143,4 +145,4 @@ def test_the_demo_tells_its_story(tmp_path: Path) -> None:
     html = (tmp_path / "out" / "report.html").read_text()
     assert html.count("data:image/png;base64,") == len(list((tmp_path / "out" / "pictures").glob("*.png")))
     assert "https://" not in html
-    assert evaluation.result["poses"] == "ndt"
+    assert evaluation.result.poses == "ndt"

@@ -110,7 +110,7 @@ def demo(
         console.print(
             f"  {area.name}: {area.objects} {area.kind}; {deleted} points deleted, {added} added", highlight=False
         )
-    f1 = evaluation.result["cases"][CASE]["strict"]["macro_f1"]
+    f1 = evaluation.result.cases[CASE].strict.macro_f1
     console.print(
         f"  in all {story.deleted} points deleted, {story.added} added; "
         f"{story.found} of {story.objects} changed objects found, {story.false_objects} false; F1 {f1:.3f}",

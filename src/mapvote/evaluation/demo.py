@@ -93,14 +93,14 @@ def tell(evaluation: Evaluation, done: Round) -> Story:
         return int(((points[:, :2] > area.box[0]) & (points[:, :2] < area.box[1])).all(axis=1).sum())
 
     areas = [(area, inside(deleted, area), inside(added, area)) for area in areas_of(evaluation)]
-    objects = evaluation.result["cases"][CASE]["objects"]
+    objects = evaluation.result.cases[CASE].objects
     return Story(
         len(deleted),
         len(added),
         areas,
-        sum(objects["found"]),
-        len(objects["found"]),
-        len(objects["false_m2"]),
+        sum(objects.found),
+        len(objects.found),
+        len(objects.false_m2),
         done.version,
         done.held,
     )
@@ -129,10 +129,10 @@ def report_page(evaluation: Evaluation, story: Story, pictures: list[tuple[Path,
     """report.html's text: what happened, in the order in which it happened."""
     result = evaluation.result
     drawn = {path.stem: (path, caption) for path, caption in pictures}
-    entry, paper_like = result["cases"][CASE], result["cases"]["1"]
-    sent = entry["bytes_per_vehicle"]
-    scans = sum(place["scans"] for place in result["localisation"].values())
-    error = np.median([place["median_m"] for place in result["localisation"].values()])
+    entry, paper_like = result.cases[CASE], result.cases["1"]
+    sent = entry.bytes_per_vehicle
+    scans = sum(place.scans for place in result.localisation.values())
+    error = np.median([place.median_m for place in result.localisation.values()])
     length_m = evaluation.window.cols * 0.3
     facts = [
         (f"{story.found} of {story.objects}", "changed objects found"),
@@ -180,10 +180,10 @@ def report_page(evaluation: Evaluation, story: Story, pictures: list[tuple[Path,
             "How good that is",
             [
                 f"F1 is the mean over unchanged, changed (occupied) and changed (empty), as in the paper's Table IV: "
-                f"{paper_like['strict']['macro_f1']:.3f} for case 1 and {entry['strict']['macro_f1']:.3f} for "
+                f"{paper_like.strict.macro_f1:.3f} for case 1 and {entry.strict.macro_f1:.3f} for "
                 f"{case_name(CASE)} here (strict truth). The paper's street is not public: its figures stand "
                 "beside ours for orientation, not as a race.",
-                f"The first map lies {100 * result['map_shift']['mean_m']:.1f} cm from the truth on average; "
+                f"The first map lies {100 * result.map_shift.mean_m:.1f} cm from the truth on average; "
                 "the scores include what that costs at the borders of cells.",
             ],
             [drawn["table_iv"]],

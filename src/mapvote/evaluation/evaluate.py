@@ -6,7 +6,8 @@ import os
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+
+from msgspec.structs import asdict
 
 from mapvote.codec.ballot import Ballot
 from mapvote.core.grid import Grid
@@ -17,6 +18,7 @@ from mapvote.evaluation.experiments.changed_areas import in_changed_areas, surve
 from mapvote.evaluation.experiments.passes import Pass, passes
 from mapvote.evaluation.experiments.pose_errors import localisation, map_frame, map_shift
 from mapvote.evaluation.experiments.scene import Progress, Scene
+from mapvote.evaluation.results import CaseResult, Cost, EvaluationResult, Timings
 from mapvote.evaluation.scoring.jury import Jury, Outcome
 from mapvote.evaluation.scoring.truth import Truth
 
@@ -25,8 +27,7 @@ from mapvote.evaluation.scoring.truth import Truth
 class Evaluation:
     """The numbers, and what pictures need."""
 
-    result: dict[str, Any]
-    """What ``--json`` writes."""
+    result: EvaluationResult
     scene: Scene
     truth: Truth
     window: Grid
@@ -49,18 +50,19 @@ def evaluate(
     beams = scene.drive(drives[0].vehicle).sensor.beams
     jury = Jury(first_map, truth)
     best = "columns" if any(case.name == "columns" for case in cases) else cases[0].name
-    outcomes, entries = {}, {}
+    outcomes: dict[str, Outcome] = {}
+    entries: dict[str, CaseResult] = {}
     for i, case in enumerate(cases):
         if progress:
             progress("scoring", i, len(cases))
         ballots = [drive.ballots[case.name] for drive in drives]
         outcome = fuse_case(first_map, ballots, case.min_votes, scene.settings.fuse, jury.window)
         outcomes[case.name] = outcome
-        entries[case.name] = {
-            **jury.of_update(outcome),
-            "bytes_per_vehicle": [drive.sizes[case.name] for drive in drives],
-            "state_bytes_per_vehicle": [_state_bytes(ballot) for ballot in ballots],
-        }
+        entries[case.name] = CaseResult(
+            **asdict(jury.of_update(outcome)),
+            bytes_per_vehicle=[drive.sizes[case.name] for drive in drives],
+            state_bytes_per_vehicle=[_state_bytes(ballot) for ballot in ballots],
+        )
     if progress:
         progress("scoring", len(cases), len(cases))
     T_map_world = map_frame(scene)
@@ -75,31 +77,29 @@ def evaluate(
         measured, costs["case 5"] = yardsticks(scene, drives, workers, progress)
         for name, yardstick in measured.items():
             costs[name] = yardstick.cost
-            entries[name] = {
-                **jury.of_states(yardstick.states, yardstick.vehicle_states),
-                "bytes_per_vehicle": [],
-            }
-    result = {
-        "scenario": scene.scenario,
-        "seed": scene.seed,
-        "poses": "truth" if scene.conditions.true_poses else "ndt",
-        "cells": int(truth.strict.size),
-        "coverage": entries[best]["coverage"],
-        "settings": scene.settings.model_dump(mode="json"),
-        "map_shift": map_shift(scene),
-        "localisation": localisation(scene, drives),
-        "changed_areas": in_changed_areas(scene, truth, drives[0].vehicle, maps),
-        "cases": entries,
-        "timings": {
-            "prepare_s": prepared - started,
-            "vote_s": voted - prepared,
-            "score_s": scored - voted,
-            "yardsticks_s": time.perf_counter() - scored,
-            "methods": {name: {"beams": beams, **cost} for name, cost in costs.items()},
-            "stages_ms": {drive.vehicle: drive.stage_ms for drive in drives},
-            "fuse_s": {name: outcome.seconds for name, outcome in outcomes.items()},
-        },
-    }
+            judgement = jury.of_states(yardstick.states, yardstick.vehicle_states)
+            entries[name] = CaseResult(**asdict(judgement), bytes_per_vehicle=[])
+    result = EvaluationResult(
+        scenario=scene.scenario,
+        seed=scene.seed,
+        poses="truth" if scene.conditions.true_poses else "ndt",
+        cells=int(truth.strict.size),
+        coverage=entries[best].coverage,
+        settings=scene.settings.model_dump(mode="json"),
+        map_shift=map_shift(scene),
+        localisation=localisation(scene, drives),
+        changed_areas=in_changed_areas(scene, truth, drives[0].vehicle, maps),
+        cases=entries,
+        timings=Timings(
+            prepare_s=prepared - started,
+            vote_s=voted - prepared,
+            score_s=scored - voted,
+            yardsticks_s=time.perf_counter() - scored,
+            methods={name: Cost(beams, cost["ms_per_scan"], cost["memory_bytes"]) for name, cost in costs.items()},
+            stages_ms={drive.vehicle: drive.stage_ms for drive in drives},
+            fuse_s={name: outcome.seconds for name, outcome in outcomes.items()},
+        ),
+    )
     return Evaluation(result, scene, truth, jury.window, first_map, outcomes, drives)
 
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
 
+import msgspec
 import pytest
 
 from mapvote.config import Settings
@@ -13,28 +13,45 @@ from mapvote.evaluation.experiments.matrix import EXPERIMENTS, Matrix
 from mapvote.evaluation.reporting import requirements
 from mapvote.evaluation.reporting.matrix_tables import FIGURES, Spread, class_table, spread, table
 from mapvote.evaluation.reporting.requirements import DEMANDS, Demand
+from mapvote.evaluation.results import CaseResult, MapShift, MatrixResult, RoundResult, to_json
+from mapvote.evaluation.scoring.cells import ByClass, Scores
+from mapvote.evaluation.scoring.map_points import MapScores
+from mapvote.evaluation.scoring.objects import ObjectScores
 
 
-def entry(macro: float, valid: float = 0.0) -> dict[str, Any]:
-    classes = {"unchanged": macro, "changed_occupied": macro, "changed_empty": macro}
-    return {
-        "strict": {"macro_f1": macro, "f1": classes, "precision": classes, "recall": classes},
-        "provenance": {"macro_f1": macro},
-        "strict_old_unchanged": {"macro_f1": macro},
-        "map": {
-            "stale_deleted": 1.0,
-            "stale_apart_deleted": 1.0,
-            "valid_deleted": valid,
-            "new_added": 1.0,
-            "added_false": 0.0,
-        },
-        "coverage": 0.9,
-        "objects": {"found": [True, False], "met": [True, True], "false_m2": [2.5, 1.5]},
-    }
+def scores(macro: float) -> Scores:
+    of_each = ByClass(macro, macro, macro)
+    return Scores(of_each, of_each, of_each, macro, macro)
 
 
-def of_rounds(**rounds: dict[str, Any]) -> dict[str, Any]:
-    return {"rounds": rounds}
+def entry(macro: float, valid: float = 0.0) -> RoundResult:
+    return RoundResult(
+        strict=scores(macro), provenance=scores(macro), coverage=0.9,
+        objects=ObjectScores((True, False), (True, True), (0.6, 0.1), (2.5, 1.5)),
+        map=MapScores(
+            stale_deleted=1.0, stale_apart_deleted=1.0, valid_deleted=valid, new_added=1.0, added_false=0.0,
+            stale_points=1, valid_points=1, new_samples=1, added_points=1,
+        ),
+        strict_old_unchanged=scores(macro), provenance_old_unchanged=scores(macro), determined=0.9,
+    )  # fmt: skip
+
+
+def of_rounds(**rounds: RoundResult) -> MatrixResult:
+    shift = MapShift(0.0, 0.0, 0.0, 0.0, 0.0)
+    return MatrixResult(scenario="corner", seed=1, cells=1, map_shift=shift, localisation={}, rounds=rounds)
+
+
+def test_a_result_is_the_same_after_it_was_written_and_read() -> None:
+    result = of_rounds(a=entry(0.9, 0.25))
+    text = to_json(result)
+    assert msgspec.json.decode(text, type=MatrixResult) == result
+    assert json.loads(text)["rounds"]["a"]["map"]["valid_deleted"] == 0.25
+    yardstick = CaseResult(
+        strict=scores(0.5), provenance=scores(0.5), coverage=1.0, objects=entry(0.5).objects, bytes_per_vehicle=[]
+    )
+    assert not {"map", "state_bytes_per_vehicle"} & set(json.loads(to_json(yardstick)))
+    with pytest.raises(ValueError, match="not JSON compliant"):
+        to_json(of_rounds(a=entry(float("nan"))))
 
 
 def test_the_worst_is_the_lowest_of_a_merit_and_the_highest_of_a_harm() -> None:
@@ -93,14 +110,14 @@ def test_the_whole_machinery_on_a_corner_twice_and_without_the_drives(tmp_path: 
     asked = {demand.what for demand in DEMANDS if demand.experiment in names and demand.values(results)}
     assert asked == {demand.what for demand in DEMANDS if demand.experiment in names}
     assert all(what in text for what in asked)
-    main = results["main"][1]["rounds"]
-    assert main["columns"]["provenance"]["macro_f1"] > main["1 column"]["provenance"]["macro_f1"]
-    own, *_, taught = results["imported"][1]["rounds"].values()  # known-free columns learned as good as our own
-    assert taught["provenance"]["macro_f1"] >= own["provenance"]["macro_f1"] - 0.01
+    main = results["main"][1].rounds
+    assert main["columns"].provenance.macro_f1 > main["1 column"].provenance.macro_f1
+    own, *_, taught = results["imported"][1].rounds.values()  # known-free columns learned as good as our own
+    assert taught.provenance.macro_f1 >= own.provenance.macro_f1 - 0.01
     scene = matrix.scene(EXPERIMENTS["main"], 1)
     matrix.drop_drives(names, 1)
     assert not list(scene.folder.glob("*/velodyne"))
-    before = json.dumps(results["main"][1])
+    before = results["main"][1]
     matrix.result_file("main", 1).unlink()
-    assert json.dumps(matrix.run("main", 1)) == before
+    assert matrix.run("main", 1) == before
     assert not list(scene.folder.glob("*/velodyne"))  # the ballots were enough

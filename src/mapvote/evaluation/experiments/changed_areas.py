@@ -12,7 +12,7 @@ from mapvote.core.point_map import PointMap
 from mapvote.core.types import F64, I64, Drive
 from mapvote.evaluation.experiments.conditions import ar1
 from mapvote.evaluation.experiments.scene import Progress, Scene
-from mapvote.evaluation.scoring.truth import Truth, error_summary, rigid_between
+from mapvote.evaluation.scoring.truth import PoseErrors, Truth, error_summary, rigid_between
 from mapvote.formats import read_map, write_map
 from mapvote.formats.atomic import whole_folder
 from mapvote.localisation.ndt import PosePrior
@@ -73,7 +73,7 @@ def _with_rtk(scene: Scene, name: str) -> Drive:
 
 def in_changed_areas(
     scene: Scene, truth: Truth, vehicle: str, maps: Mapping[str, tuple[PointMap, F64]]
-) -> dict[str, dict[str, float]]:
+) -> dict[str, PoseErrors]:
     """Errors of one vehicle's scans near changes, by map (each with its T_map_world); empty if it came near none."""
     drive, scans = scene.drive(vehicle), scans_near_changes(scene, truth, vehicle)
     if not len(scans):

@@ -6,7 +6,6 @@ short goes on where it stopped, and experiments that share drives, maps or ballo
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from dataclasses import dataclass, field, replace
@@ -14,12 +13,13 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
+from msgspec.structs import asdict
 
 from mapvote.codec.ballot import Ballot
 from mapvote.config import Settings
 from mapvote.core.point_map import PointMap
-from mapvote.core.types import U8
 from mapvote.evaluation.experiments.attacks import ATTACKS
 from mapvote.evaluation.experiments.cases import Case, choose_cases, fuse_case
 from mapvote.evaluation.experiments.conditions import Conditions
@@ -27,13 +27,14 @@ from mapvote.evaluation.experiments.imported_map import CHAINS, in_turn
 from mapvote.evaluation.experiments.passes import Pass, have_voted, passes
 from mapvote.evaluation.experiments.pose_errors import localisation, map_shift
 from mapvote.evaluation.experiments.scene import BALLOTS_FROM, Progress, Scene, key_of, sources_digest
+from mapvote.evaluation.results import MatrixResult, RoundResult, to_json
 from mapvote.evaluation.scoring.cells import UNSCORED, determined, ratio, score_cells
 from mapvote.evaluation.scoring.jury import Jury, Outcome
 from mapvote.formats.atomic import whole_file
 from mapvote.simulation.processes import processes
 
 _SCORES_FROM = (
-    *BALLOTS_FROM, "fusion", "simulation", "evaluation/scoring", "evaluation/evaluate.py",
+    *BALLOTS_FROM, "fusion", "simulation", "evaluation/scoring", "evaluation/evaluate.py", "evaluation/results.py",
     "evaluation/experiments/attacks.py", "evaluation/experiments/cases.py", "evaluation/experiments/conditions.py",
     "evaluation/experiments/imported_map.py", "evaluation/experiments/matrix.py", "evaluation/experiments/passes.py",
 )  # fmt: skip
@@ -148,13 +149,13 @@ class Matrix:
         key = key_of(sources_digest(_SCORES_FROM), self.settings.model_dump_json(), self._cases(experiment))
         return self.scene(experiment, seed).work / "results" / f"{name.replace(' ', '-')}-{key}.json"
 
-    def run_all(self, names: Sequence[str]) -> Iterator[tuple[str, int, dict[str, Any]]]:
+    def run_all(self, names: Sequence[str]) -> Iterator[tuple[str, int, MatrixResult]]:
         """(experiment, seed, result) of every experiment on every seed, as each ends: ``workers`` at a time, each on
         one core, the first of ``names`` first. Two of one seed never run together: they share drives, map and ballots.
         """
         alone = replace(self, workers=1)
         waiting = [(name, seed) for name in names for seed in self.seeds]
-        running: dict[Future[dict[str, Any]], tuple[str, int]] = {}
+        running: dict[Future[MatrixResult], tuple[str, int]] = {}
         with processes(self.workers) as pool:
             while waiting or running:
                 for name, seed in list(waiting):
@@ -164,17 +165,16 @@ class Matrix:
                 for ended in wait(running, return_when=FIRST_COMPLETED).done:
                     yield *running.pop(ended), ended.result()
 
-    def run(self, name: str, seed: int, progress: Progress | None = None) -> dict[str, Any]:
+    def run(self, name: str, seed: int, progress: Progress | None = None) -> MatrixResult:
         """The result of one experiment on one seed: entries by round, as in ``evaluate --json``, and the poses'."""
         file = self.result_file(name, seed)
         if not file.is_file():
             result = self._measure(EXPERIMENTS[name], seed, progress)
             with whole_file(file) as partial:
-                partial.write_text(json.dumps(result, indent=1, allow_nan=False) + "\n")
-        found: dict[str, Any] = json.loads(file.read_text())
-        return found
+                partial.write_text(to_json(result))
+        return msgspec.json.decode(file.read_bytes(), type=MatrixResult)
 
-    def _measure(self, experiment: Experiment, seed: int, progress: Progress | None) -> dict[str, Any]:
+    def _measure(self, experiment: Experiment, seed: int, progress: Progress | None) -> MatrixResult:
         scene = self.scene(experiment, seed)
         cases, _ = choose_cases(self.settings, self._cases(experiment))
         if not have_voted(scene, cases):
@@ -191,14 +191,14 @@ class Matrix:
         for name, voters in experiment.chains.items():
             [columns] = [case for case in cases if case.name == "columns"]
             entries[name] = _judged(in_turn(scene, columns, voters, jury.window, self.workers, progress), jury)
-        return {
-            "scenario": self.scenario,
-            "seed": seed,
-            "cells": int(scene.truth.strict.size),
-            "map_shift": map_shift(scene),
-            "localisation": localisation(scene, drives),
-            "rounds": entries,
-        }
+        return MatrixResult(
+            scenario=self.scenario,
+            seed=seed,
+            cells=int(scene.truth.strict.size),
+            map_shift=map_shift(scene),
+            localisation=localisation(scene, drives),
+            rounds=entries,
+        )
 
     def _cases(self, experiment: Experiment) -> str:
         return self.cases if self.cases and experiment.cases == "all" else experiment.cases
@@ -214,16 +214,14 @@ class Matrix:
                 scene.drop_drives()
 
 
-def _judged(outcome: Outcome, jury: Jury) -> dict[str, Any]:
-    return {**jury.of_update(outcome), **_as_others_may_judge(outcome.states, jury)}
-
-
-def _as_others_may_judge(states: U8, jury: Jury) -> dict[str, Any]:
-    """R with old surfaces that no survey saw counted as unchanged, and the share of cells that the fleet determined."""
+def _judged(outcome: Outcome, jury: Jury) -> RoundResult:
+    """With two more views that others may prefer: old surfaces that no survey saw counted as unchanged, and the share
+    of cells that the fleet determined."""
     strict, provenance = jury.truth.with_old_surfaces()
     scored = jury.truth.strict != UNSCORED
-    return {
-        "strict_old_unchanged": score_cells(states, strict).to_dict(),
-        "provenance_old_unchanged": score_cells(states, provenance).to_dict(),
-        "determined": ratio(np.count_nonzero(determined(states) & scored), np.count_nonzero(scored)),
-    }
+    return RoundResult(
+        **asdict(jury.of_update(outcome)),
+        strict_old_unchanged=score_cells(outcome.states, strict),
+        provenance_old_unchanged=score_cells(outcome.states, provenance),
+        determined=ratio(np.count_nonzero(determined(outcome.states) & scored), np.count_nonzero(scored)),
+    )

@@ -16,6 +16,7 @@ from mapvote.core.grid import CELL_SIZE, Grid
 from mapvote.core.types import F64, U8, Bool, CellState
 from mapvote.core.voting import vote_weight
 from mapvote.evaluation.reporting import style
+from mapvote.evaluation.results import CaseResult
 from mapvote.evaluation.scoring import paper_tables
 
 Outline = tuple[str, F64]
@@ -153,15 +154,15 @@ def vote_curve(a: float, b: float, k: float, n_min: int) -> Figure:
     return figure
 
 
-def score_bars(cases: Mapping[str, Any], names: Mapping[str, str]) -> Figure:
-    """Table IV as bars: macro F1 of ``cases`` (the "cases" of the JSON) in both truths, the paper's beside it."""
+def score_bars(cases: Mapping[str, CaseResult], names: Mapping[str, str]) -> Figure:
+    """Table IV as bars: macro F1 of ``cases`` in both truths, the paper's beside it."""
     shown = list(cases)
     figure, axes = style.new_figure(max(7.5, 0.95 * len(shown) + 1.5), 4.0)
     axis = axes[0, 0]
-    series = [
-        ("paper_tables, Table IV", style.EMPTY, [paper_tables.F1.get(case) for case in shown]),
-        ("ours, strict truth", style.STANDING, [cases[case]["strict"]["macro_f1"] for case in shown]),
-        ("ours, provenance truth", "#a3b6c6", [cases[case]["provenance"]["macro_f1"] for case in shown]),
+    series: list[tuple[str, str, list[float | None]]] = [
+        ("paper, Table IV", style.EMPTY, [paper_tables.F1.get(case) for case in shown]),
+        ("ours, strict truth", style.STANDING, [cases[case].strict.macro_f1 for case in shown]),
+        ("ours, provenance truth", "#a3b6c6", [cases[case].provenance.macro_f1 for case in shown]),
     ]
     for k, (label, colour, values) in enumerate(series):
         x = np.array([i + 0.27 * (k - 1) for i, v in enumerate(values) if v is not None])

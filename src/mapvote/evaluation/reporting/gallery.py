@@ -80,7 +80,7 @@ def gallery(evaluation: Evaluation, case: str, folder: Path) -> list[tuple[Path,
     panels = [("Truth (strict)", _as_states(evaluation.truth.strict))]
     panels += [(case_name(n).capitalize(), states) for n, states in decided.items()]
     states = figures.cell_states(panels, evaluation.window, outlines=outlines)
-    shown = {n: e for n, e in evaluation.result["cases"].items() if n in (*"12345", "columns", *YARDSTICKS)}
+    shown = {n: e for n, e in evaluation.result.cases.items() if n in (*"12345", "columns", *YARDSTICKS)}
     bars = figures.score_bars(shown, {n: case_name(n) for n in shown})
     pictures += [
         ("scan", _scan(evaluation, nearest), "One scan of a vehicle, bodies that move in orange: Figure 5."),

@@ -5,12 +5,12 @@ from __future__ import annotations
 import statistics
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
+from mapvote.evaluation.results import MatrixResult, RoundResult
 from mapvote.evaluation.scoring.cells import CLASSES
+from mapvote.evaluation.scoring.map_points import MapScores
 
-Entry = Mapping[str, Any]
-Results = Mapping[str, Mapping[int, Mapping[str, Any]]]
+Results = Mapping[str, Mapping[int, MatrixResult]]
 """By experiment and seed: what :meth:`mapvote.evaluation.experiments.matrix.Matrix.run` gave."""
 FALSE_OBJECT_M2 = 2.0
 
@@ -31,7 +31,7 @@ class Figure:
     """One number of an entry."""
 
     title: str
-    of: Callable[[Entry], float]
+    of: Callable[[RoundResult], float]
     more_is_better: bool = True
     percent: bool = False
 
@@ -41,28 +41,34 @@ class Figure:
         return " ± ".join(f"{scale * x:.{digits}f}" for x in (s.mean, s.deviation)) + f" ({scale * s.worst:.{digits}f})"
 
 
-def _share(of: list[bool]) -> float:
+def _share(of: Sequence[bool]) -> float:
     return sum(of) / len(of) if of else 1.0
 
 
-def _false_objects(entry: Entry) -> float:
-    return float(sum(area > FALSE_OBJECT_M2 for area in entry["objects"]["false_m2"]))
+def _false_objects(entry: RoundResult) -> float:
+    return float(sum(area > FALSE_OBJECT_M2 for area in entry.objects.false_m2))
+
+
+def _points(entry: RoundResult) -> MapScores:
+    if entry.map is None:
+        raise ValueError("every round of the matrix edits a map")
+    return entry.map
 
 
 FIGURES: Mapping[str, Figure] = {
-    "strict": Figure("macro strict", lambda e: e["strict"]["macro_f1"]),
-    "provenance": Figure("macro prov.", lambda e: e["provenance"]["macro_f1"]),
-    "occupied": Figure("F1 ch.-occ. strict", lambda e: e["strict"]["f1"]["changed_occupied"]),
-    "empty": Figure("F1 ch.-empty strict", lambda e: e["strict"]["f1"]["changed_empty"]),
-    "strict_old": Figure("macro strict, old surfaces unchanged", lambda e: e["strict_old_unchanged"]["macro_f1"]),
-    "stale": Figure("stale deleted", lambda e: e["map"]["stale_deleted"], percent=True),
-    "stale_apart": Figure("stale, .6 m off what stands", lambda e: e["map"]["stale_apart_deleted"], percent=True),
-    "valid": Figure("valid deleted", lambda e: e["map"]["valid_deleted"], more_is_better=False, percent=True),
-    "new": Figure("new added", lambda e: e["map"]["new_added"], percent=True),
-    "false": Figure("added on no surface", lambda e: e["map"]["added_false"], more_is_better=False, percent=True),
-    "coverage": Figure("determined by a vehicle", lambda e: e["coverage"], percent=True),
-    "met": Figure("objects found", lambda e: _share(e["objects"]["met"]), percent=True),
-    "found": Figure("half of them found", lambda e: _share(e["objects"]["found"]), percent=True),
+    "strict": Figure("macro strict", lambda e: e.strict.macro_f1),
+    "provenance": Figure("macro prov.", lambda e: e.provenance.macro_f1),
+    "occupied": Figure("F1 ch.-occ. strict", lambda e: e.strict.f1.changed_occupied),
+    "empty": Figure("F1 ch.-empty strict", lambda e: e.strict.f1.changed_empty),
+    "strict_old": Figure("macro strict, old surfaces unchanged", lambda e: e.strict_old_unchanged.macro_f1),
+    "stale": Figure("stale deleted", lambda e: _points(e).stale_deleted, percent=True),
+    "stale_apart": Figure("stale, .6 m off what stands", lambda e: _points(e).stale_apart_deleted, percent=True),
+    "valid": Figure("valid deleted", lambda e: _points(e).valid_deleted, more_is_better=False, percent=True),
+    "new": Figure("new added", lambda e: _points(e).new_added, percent=True),
+    "false": Figure("added on no surface", lambda e: _points(e).added_false, more_is_better=False, percent=True),
+    "coverage": Figure("determined by a vehicle", lambda e: e.coverage, percent=True),
+    "met": Figure("objects found", lambda e: _share(e.objects.met), percent=True),
+    "found": Figure("half of them found", lambda e: _share(e.objects.found), percent=True),
     "false_objects": Figure("false objects > 2 m2", _false_objects, more_is_better=False),
 }
 
@@ -73,11 +79,11 @@ def spread(values: Sequence[float], more_is_better: bool = True) -> Spread:
     return Spread(statistics.fmean(values), deviation, min(values) if more_is_better else max(values), len(values))
 
 
-def rounds_of(results: Results, experiment: str) -> dict[str, dict[int, Entry]]:
+def rounds_of(results: Results, experiment: str) -> dict[str, dict[int, RoundResult]]:
     """By round and seed: the entries of one experiment."""
-    out: dict[str, dict[int, Entry]] = {}
+    out: dict[str, dict[int, RoundResult]] = {}
     for seed, result in results.get(experiment, {}).items():
-        for name, entry in result["rounds"].items():
+        for name, entry in result.rounds.items():
             out.setdefault(name, {})[seed] = entry
     return out
 
@@ -102,11 +108,11 @@ def class_table(results: Results, experiment: str) -> str:
     head = "| | " + " | ".join(f"{name.replace('_', '-')} P / R" for name in CLASSES) + " |"
     lines = [head, "|---" * (len(CLASSES) + 1) + "|"]
     for name, entries in rounds_of(results, experiment).items():
+        precision = zip(*(entry.strict.precision for entry in entries.values()), strict=True)
+        recall = zip(*(entry.strict.recall for entry in entries.values()), strict=True)
         cells = []
-        for k in CLASSES:
-            p, r = (
-                statistics.fmean(e["strict"][which][k] for e in entries.values()) for which in ("precision", "recall")
-            )
+        for k, seeds in zip(CLASSES, zip(precision, recall, strict=True), strict=True):
+            p, r = map(statistics.fmean, seeds)
             cells.append(f"{p:.4f} / {r:.4f}" if k == CLASSES[0] else f"{p:.3f} / {r:.3f}")
         lines.append(f"| {name} | " + " | ".join(cells) + " |")
     return "\n".join(lines) + "\n"

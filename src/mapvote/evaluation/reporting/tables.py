@@ -1,24 +1,22 @@
-"""The results of one evaluation as tables, text, JSON and CSV. Everything is taken from the one result dictionary."""
+"""The results of one evaluation as tables, text, JSON and CSV. Everything is taken from the one result."""
 
 from __future__ import annotations
 
 import csv
 import io
-import json
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
 
+from msgspec.structs import asdict
 from rich import box
 from rich.console import Console
 from rich.table import Table
 
+from mapvote.evaluation.results import CaseResult, EvaluationResult, to_json
 from mapvote.evaluation.scoring import paper_tables
-from mapvote.evaluation.scoring.cells import CLASSES, ratio
+from mapvote.evaluation.scoring.cells import CLASSES, ByClass, Scores, ratio
 from mapvote.formats.atomic import whole_file
 
-Result = Mapping[str, Any]
-"""What ``evaluate --json`` writes."""
 HEADINGS = {"unchanged": "unchanged", "changed_occupied": "changed (occ.)", "changed_empty": "changed (empty)"}
 
 
@@ -35,42 +33,47 @@ def _percent(value: float, digits: int = 1) -> str:
     return f"{100 * value:.{digits}f} %"
 
 
-def _class_table(
-    result: Result, title: str, metric: str, truth: str, printed: Mapping[str, tuple[float, ...]]
-) -> Table:
-    table = Table(title=f"{title} ({truth} truth)", box=box.SIMPLE_HEAD, title_justify="left", title_style="bold")
+def _by_truth(entry: CaseResult) -> dict[str, Scores]:
+    return {"strict": entry.strict, "provenance": entry.provenance}
+
+
+def _class_table(title: str, ours: Mapping[str, ByClass], printed: Mapping[str, tuple[float, ...]]) -> Table:
+    """A line a case, our figure and the paper's for each class."""
+    table = Table(title=title, box=box.SIMPLE_HEAD, title_justify="left", title_style="bold")
     table.add_column("")
     for name in CLASSES:
         table.add_column(HEADINGS[name], justify="right")
         table.add_column("paper", justify="right", style="dim")
-    for case, entry in result["cases"].items():
+    for case, values in ours.items():
         cells = [case_name(case)]
-        for k, name in enumerate(CLASSES):
-            cells += [_share(entry[truth][metric][name]), _share(printed[case][k] if case in printed else None)]
+        for k, value in enumerate(values):
+            cells += [_share(value), _share(printed[case][k] if case in printed else None)]
         table.add_row(*cells)
     return table
 
 
-def tables(result: Result) -> Iterator[Table]:
+def tables(result: EvaluationResult) -> Iterator[Table]:
     """Tables II, III and IV with the paper's figures beside ours, then the map, the poses and the yardsticks' cost."""
     for truth in ("strict", "provenance"):
-        yield _class_table(result, "Table II: precision", "precision", truth, paper_tables.PRECISION)
-        yield _class_table(result, "Table III: recall", "recall", truth, paper_tables.RECALL)
+        scores = {case: _by_truth(entry)[truth] for case, entry in result.cases.items()}
+        precision, recall = ({c: s.precision for c, s in scores.items()}, {c: s.recall for c, s in scores.items()})
+        yield _class_table(f"Table II: precision ({truth} truth)", precision, paper_tables.PRECISION)
+        yield _class_table(f"Table III: recall ({truth} truth)", recall, paper_tables.RECALL)
     f1 = Table(
         title="Table IV: F1, mean of the three classes; coverage; upload", box=box.SIMPLE_HEAD,
         title_justify="left", title_style="bold",
     )  # fmt: skip
     for heading in ("", "strict", "provenance", "paper", "Kim's F1, strict", "coverage", "kB a ballot"):
         f1.add_column(heading, justify="right" if heading else "left", style="dim" if heading == "paper" else "")
-    for case, entry in result["cases"].items():
-        sent = entry["bytes_per_vehicle"]
+    for case, entry in result.cases.items():
+        sent = entry.bytes_per_vehicle
         f1.add_row(
             case_name(case),
-            _share(entry["strict"]["macro_f1"]),
-            _share(entry["provenance"]["macro_f1"]),
+            _share(entry.strict.macro_f1),
+            _share(entry.provenance.macro_f1),
             _share(paper_tables.F1.get(case)),
-            _share(entry["strict"]["kim_f1"]),
-            _share(entry["coverage"]),
+            _share(entry.strict.kim_f1),
+            _share(entry.coverage),
             f"{sum(sent) / len(sent) / 1000:.1f}" if sent else "",
         )
     yield f1
@@ -79,66 +82,65 @@ def tables(result: Result) -> Iterator[Table]:
     yield from _cost_table(result)
 
 
-def _map_table(result: Result) -> Iterator[Table]:
-    rows = {case: entry for case, entry in result["cases"].items() if "map" in entry}
+def _map_table(result: EvaluationResult) -> Iterator[Table]:
+    rows = {case: (entry.map, entry.objects) for case, entry in result.cases.items() if entry.map is not None}
     if not rows:
         return
     table = Table(title="The updated map", box=box.SIMPLE_HEAD, title_justify="left", title_style="bold")
     for heading in ("", "stale deleted", "valid deleted", "new surface added", "added on no surface", "objects found",
                     "false objects"):  # fmt: skip
         table.add_column(heading, justify="right" if heading else "left")
-    for case, entry in rows.items():
-        scores, objects = entry["map"], entry["objects"]
-        false = objects["false_m2"]
+    for case, (scores, objects) in rows.items():
+        false = objects.false_m2
         table.add_row(
             case_name(case),
-            _percent(scores["stale_deleted"], 2),
-            _percent(scores["valid_deleted"], 3),
-            _percent(scores["new_added"], 2),
-            _percent(scores["added_false"], 2),
-            f"{sum(objects['found'])} of {len(objects['found'])}",
+            _percent(scores.stale_deleted, 2),
+            _percent(scores.valid_deleted, 3),
+            _percent(scores.new_added, 2),
+            _percent(scores.added_false, 2),
+            f"{sum(objects.found)} of {len(objects.found)}",
             f"{len(false)}, largest {false[0]:.1f} m²" if false else "none",
         )
     yield table
 
 
-def _localisation_tables(result: Result) -> Iterator[Table]:
-    titles = {
-        "localisation": "Localisation against the true poses, in the map's frame",
-        "changed_areas": "What the map is for: one vehicle's scans within 30 m of a change",
+def _localisation_tables(result: EvaluationResult) -> Iterator[Table]:
+    of_title = {
+        "Localisation against the true poses, in the map's frame": result.localisation,
+        "What the map is for: one vehicle's scans within 30 m of a change": result.changed_areas,
     }
-    for key, title in titles.items():
-        if not result.get(key):
+    for title, errors in of_title.items():
+        if not errors:
             continue
         table = Table(title=title, box=box.SIMPLE_HEAD, title_justify="left", title_style="bold")
         for heading in ("", "scans", "localised", "median", "99 %", "largest", "median angle"):
             table.add_column(heading, justify="right" if heading else "left")
-        for name, entry in result[key].items():
+        for name, entry in errors.items():
             table.add_row(
                 name,
-                str(entry["scans"]),
-                _percent(ratio(entry["localised"], entry["scans"])),
-                f"{100 * entry['median_m']:.1f} cm",
-                f"{100 * entry['p99_m']:.1f} cm",
-                f"{100 * entry['max_m']:.1f} cm",
-                f"{entry['median_deg']:.3f}°",
+                str(entry.scans),
+                _percent(ratio(entry.localised, entry.scans)),
+                f"{100 * entry.median_m:.1f} cm",
+                f"{100 * entry.p99_m:.1f} cm",
+                f"{100 * entry.max_m:.1f} cm",
+                f"{entry.median_deg:.3f}°",
             )
         yield table
 
 
-def _cost_table(result: Result) -> Iterator[Table]:
-    costs = result.get("timings", {}).get("methods")
+def _cost_table(result: EvaluationResult) -> Iterator[Table]:
+    costs = result.timings.methods
     if not costs:
         return
     table = Table(title="Cost on the vehicle", box=box.SIMPLE_HEAD, title_justify="left", title_style="bold")
     for heading in ("", "beams", "ms a scan, median", "memory of its grid"):
         table.add_column(heading, justify="right" if heading else "left")
     for name, entry in costs.items():
-        table.add_row(name, str(entry["beams"]), f"{entry['ms_per_scan']:.1f}", f"{entry['memory_bytes'] / 1e6:.1f} MB")
+        table.add_row(name, str(entry.beams), f"{entry.ms_per_scan:.1f}", f"{entry.memory_bytes / 1e6:.1f} MB")
     yield table
 
 
-def as_text(result: Result) -> str:
+def as_text(result: EvaluationResult) -> str:
     """All tables, plain, 140 columns."""
     out = io.StringIO()
     console = Console(file=out, width=140, color_system=None, highlight=False)
@@ -147,27 +149,27 @@ def as_text(result: Result) -> str:
     return "\n".join(line.rstrip() for line in out.getvalue().splitlines()) + "\n"
 
 
-def as_json(result: Result) -> str:
+def as_json(result: EvaluationResult) -> str:
     """The result with sorted keys; ValueError if a number is NaN or infinite."""
-    return json.dumps(result, indent=1, sort_keys=True, allow_nan=False) + "\n"
+    return to_json(result, sort_keys=True)
 
 
-def as_csv(result: Result) -> str:
+def as_csv(result: EvaluationResult) -> str:
     """One line a number: case, truth, metric, class, value."""
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
     writer.writerow(["case", "truth", "metric", "class", "value"])
-    for case, entry in result["cases"].items():
-        for truth in ("strict", "provenance"):
-            for metric in ("precision", "recall", "f1"):
-                for name in CLASSES:
-                    writer.writerow([case, truth, metric, name, f"{entry[truth][metric][name]:.6f}"])
-            for metric in ("macro_f1", "kim_f1"):
-                writer.writerow([case, truth, metric, "", f"{entry[truth][metric]:.6f}"])
-        writer.writerow([case, "", "coverage", "", f"{entry['coverage']:.6f}"])
-        for size in entry["bytes_per_vehicle"]:
+    for case, entry in result.cases.items():
+        for truth, scores in _by_truth(entry).items():
+            for metric, values in (("precision", scores.precision), ("recall", scores.recall), ("f1", scores.f1)):
+                for name, value in zip(CLASSES, values, strict=True):
+                    writer.writerow([case, truth, metric, name, f"{value:.6f}"])
+            for metric, value in (("macro_f1", scores.macro_f1), ("kim_f1", scores.kim_f1)):
+                writer.writerow([case, truth, metric, "", f"{value:.6f}"])
+        writer.writerow([case, "", "coverage", "", f"{entry.coverage:.6f}"])
+        for size in entry.bytes_per_vehicle:
             writer.writerow([case, "", "bytes", "", size])
-        for metric, value in entry.get("map", {}).items():
+        for metric, value in asdict(entry.map).items() if entry.map else ():
             writer.writerow([case, "", metric, "", value])
     return out.getvalue()
 

@@ -5,9 +5,9 @@ Every ratio is 0.0 where nothing is counted (0/0 = 0), so that no score is ever 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -29,37 +29,38 @@ def harmonic_mean(p: float, r: float) -> float:
     return ratio(2.0 * p * r, p + r)
 
 
-@dataclass(frozen=True, slots=True)
-class Scores:
-    """Precision and recall of the three classes, in the order of :data:`CLASSES`."""
+class ByClass(msgspec.Struct, frozen=True):
+    """A number for each of :data:`CLASSES`; iterates in their order."""
 
-    precision: tuple[float, float, float]
-    recall: tuple[float, float, float]
+    unchanged: float
+    changed_occupied: float
+    changed_empty: float
 
-    @property
-    def f1(self) -> tuple[float, float, float]:
-        p, r = self.precision, self.recall
-        return harmonic_mean(p[0], r[0]), harmonic_mean(p[1], r[1]), harmonic_mean(p[2], r[2])
+    def __iter__(self) -> Iterator[float]:
+        return iter((self.unchanged, self.changed_occupied, self.changed_empty))
 
     @property
-    def macro_f1(self) -> float:
-        """Unweighted mean of the three F1: what Table IV holds (docs/decisions/paper.md)."""
-        return sum(self.f1) / 3.0
+    def mean(self) -> float:
+        """Unweighted."""
+        return sum(self) / 3.0
 
-    @property
-    def kim_f1(self) -> float:
-        """Harmonic mean of mean precision and mean recall, as Kim et al. [15] report it."""
-        return harmonic_mean(sum(self.precision) / 3.0, sum(self.recall) / 3.0)
 
-    def to_dict(self) -> dict[str, object]:
-        """R of ``evaluate --json``."""
-        return {
-            "precision": dict(zip(CLASSES, self.precision, strict=True)),
-            "recall": dict(zip(CLASSES, self.recall, strict=True)),
-            "f1": dict(zip(CLASSES, self.f1, strict=True)),
-            "macro_f1": self.macro_f1,
-            "kim_f1": self.kim_f1,
-        }
+class Scores(msgspec.Struct, frozen=True):
+    """Precision and recall of the three classes, and what follows from them; made by :meth:`of`."""
+
+    precision: ByClass
+    recall: ByClass
+    f1: ByClass
+    macro_f1: float
+    """Unweighted mean of the three F1: what Table IV holds (docs/decisions/paper.md)."""
+    kim_f1: float
+    """Harmonic mean of mean precision and mean recall, as Kim et al. [15] report it."""
+
+    @classmethod
+    def of(cls, precision: ByClass, recall: ByClass) -> Scores:
+        """All scores from the two."""
+        f1 = ByClass(*(harmonic_mean(p, r) for p, r in zip(precision, recall, strict=True)))
+        return cls(precision, recall, f1, f1.mean, harmonic_mean(precision.mean, recall.mean))
 
 
 def classes_of(states: U8) -> U8:
@@ -83,9 +84,8 @@ def score_cells(states: U8, truth: U8) -> Scores:
     """Precision and recall of decided ``states`` (CellState or NO_VOTE) against ``truth`` (0, 1, 2 or 255)."""
     table = confusion(states, truth)
     right, decided, true = np.diag(table), table.sum(axis=0), table.sum(axis=1)
-    p = [ratio(right[k], decided[k]) for k in range(3)]
-    r = [ratio(right[k], true[k]) for k in range(3)]
-    return Scores((p[0], p[1], p[2]), (r[0], r[1], r[2]))
+    precision = ByClass(*(ratio(right[k], decided[k]) for k in range(3)))
+    return Scores.of(precision, ByClass(*(ratio(right[k], true[k]) for k in range(3))))
 
 
 def determined(states: U8) -> Bool:

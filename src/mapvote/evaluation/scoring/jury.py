@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 from mapvote.core.columns import column_bits
 from mapvote.core.grid import CELL_SIZE, TileIndex
 from mapvote.core.point_map import PointMap
 from mapvote.core.reference import reference_window
 from mapvote.core.types import F64, U8
+from mapvote.evaluation.results import Judgement
 from mapvote.evaluation.scoring.cells import coverage, score_cells
-from mapvote.evaluation.scoring.map_points import MapJudge, map_obstacles
+from mapvote.evaluation.scoring.map_points import MapJudge, MapScores, map_obstacles
 from mapvote.evaluation.scoring.objects import score_objects
 from mapvote.evaluation.scoring.truth import Truth
 from mapvote.fusion.fuse import Decision
@@ -41,20 +41,24 @@ class Jury:
         self._points = MapJudge(map_obstacles(first_map), *_above_ground(first_map, truth))
         self._objects = [{"kind": o["kind"], "cells": truth.cells_of(o["footprint"])} for o in truth.objects]
 
-    def of_states(self, states: U8, vehicle_states: Sequence[U8]) -> dict[str, Any]:
+    def of_states(self, states: U8, vehicle_states: Sequence[U8]) -> Judgement:
         """R for both truths, coverage, objects; all states over the truth's window."""
-        strict, provenance = self.truth.strict, self.truth.provenance
-        return {
-            "strict": score_cells(states, strict).to_dict(),
-            "provenance": score_cells(states, provenance).to_dict(),
-            "coverage": coverage(vehicle_states, strict),
-            "objects": score_objects(states, strict, self._objects, CELL_SIZE).to_dict(),
-        }
+        return self._judge(states, vehicle_states, None)
 
-    def of_update(self, outcome: Outcome) -> dict[str, Any]:
+    def of_update(self, outcome: Outcome) -> Judgement:
         """The same, and what became of the map's points."""
-        points = self._points.score(map_obstacles(outcome.updated)).to_dict()
-        return {**self.of_states(outcome.states, outcome.vehicle_states), "map": points}
+        points = self._points.score(map_obstacles(outcome.updated))
+        return self._judge(outcome.states, outcome.vehicle_states, points)
+
+    def _judge(self, states: U8, vehicle_states: Sequence[U8], points: MapScores | None) -> Judgement:
+        strict, provenance = self.truth.strict, self.truth.provenance
+        return Judgement(
+            strict=score_cells(states, strict),
+            provenance=score_cells(states, provenance),
+            coverage=coverage(vehicle_states, strict),
+            objects=score_objects(states, strict, self._objects, CELL_SIZE),
+            map=points,
+        )
 
 
 def _above_ground(first_map: PointMap, truth: Truth) -> tuple[F64, F64, F64]:

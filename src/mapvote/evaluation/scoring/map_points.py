@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
+import msgspec
 import numpy as np
 from scipy.spatial import cKDTree
 
@@ -12,8 +11,7 @@ from mapvote.core.types import F64, Bool
 from mapvote.evaluation.scoring.cells import ratio
 
 
-@dataclass(frozen=True, slots=True)
-class MapScores:
+class MapScores(msgspec.Struct, frozen=True, kw_only=True):
     """What the update did to the points (shares of points, or of surface samples for ``new_added``)."""
 
     stale_deleted: float
@@ -30,10 +28,6 @@ class MapScores:
     valid_points: int
     new_samples: int
     added_points: int
-
-    def to_dict(self) -> dict[str, float | int]:
-        """Plain numbers for JSON."""
-        return {name: getattr(self, name) for name in self.__slots__}
 
 
 class MapJudge:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
+import msgspec
 import numpy as np
 from scipy import ndimage
 
@@ -12,8 +12,7 @@ from mapvote.core.types import U8
 from mapvote.evaluation.scoring.cells import UNSCORED, classes_of, ratio
 
 
-@dataclass(frozen=True, slots=True)
-class ObjectScores:
+class ObjectScores(msgspec.Struct, frozen=True):
     """Connected changes against the truth."""
 
     found: tuple[bool, ...]
@@ -24,15 +23,6 @@ class ObjectScores:
     """Per true object: share of its changed truth cells decided so."""
     false_m2: tuple[float, ...]
     """Area of each decided object that touches no truth of its class, largest first."""
-
-    def to_dict(self) -> dict[str, object]:
-        """Plain lists for JSON."""
-        return {
-            "found": list(self.found),
-            "met": list(self.met),
-            "recall": list(self.recall),
-            "false_m2": list(self.false_m2),
-        }
 
 
 def score_objects(

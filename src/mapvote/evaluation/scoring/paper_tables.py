@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from mapvote.evaluation.scoring.cells import Scores
+from mapvote.evaluation.scoring.cells import ByClass, Scores
 
 PRECISION: dict[str, tuple[float, float, float]] = {
     "1": (0.996, 0.748, 0.550),
@@ -22,4 +22,4 @@ RECALL: dict[str, tuple[float, float, float]] = {
 """Table III."""
 F1 = {"1": 0.830, "2": 0.829, "3": 0.811, "4": 0.807, "5": 0.850}
 """Table IV: the unweighted mean of the three classes' F1 (docs/decisions/paper.md)."""
-SCORES = {case: Scores(PRECISION[case], RECALL[case]) for case in PRECISION}
+SCORES = {case: Scores.of(ByClass(*PRECISION[case]), ByClass(*RECALL[case])) for case in PRECISION}

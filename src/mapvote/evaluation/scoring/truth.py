@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 
 from mapvote.core.geometry import inverse
@@ -124,17 +125,28 @@ def pose_errors(T_found: F64, T_true: F64) -> tuple[F64, F64]:
     return metres, np.arccos(np.clip(cosines, -1.0, 1.0))
 
 
-def error_summary(T_found: F64, T_true: F64) -> dict[str, float]:
-    """Errors over the scans that were localised (rows that are not NaN), and how many there were."""
+class PoseErrors(msgspec.Struct, frozen=True, kw_only=True):
+    """Of a drive's scans: over those that were localised."""
+
+    scans: int
+    localised: int
+    median_m: float
+    p99_m: float
+    max_m: float
+    median_deg: float
+
+
+def error_summary(T_found: F64, T_true: F64) -> PoseErrors:
+    """Of poses (n, 4, 4), both in one frame; a scan that was not localised is a row of NaN."""
     there = np.isfinite(T_found).all(axis=(1, 2))
     metres, radians = pose_errors(T_found[there], T_true[there])
     if not there.any():
         metres, radians = np.zeros(1), np.zeros(1)
-    return {
-        "scans": len(T_found),
-        "localised": int(there.sum()),
-        "median_m": float(np.median(metres)),
-        "p99_m": float(np.percentile(metres, 99)),
-        "max_m": float(metres.max()),
-        "median_deg": float(np.degrees(np.median(radians))),
-    }
+    return PoseErrors(
+        scans=len(T_found),
+        localised=int(there.sum()),
+        median_m=float(np.median(metres)),
+        p99_m=float(np.percentile(metres, 99)),
+        max_m=float(metres.max()),
+        median_deg=float(np.degrees(np.median(radians))),
+    )
