@@ -16,7 +16,7 @@ def test_every_voxel_holds_the_mean_of_its_points_and_counts_its_scans(seed: int
     scans = [rng.normal((offset, offset, 0.0), spread, (500, 3)) for _ in range(4)]
     cloud = VoxelCloud(lattice)
     for scan in scans:
-        cloud.add(scan)
+        cloud.enter(scan)
     points, met = cloud.points()
     keys = voxel_keys(np.concatenate(scans), lattice.x0, lattice.y0)
     unique, inverse = np.unique(keys, return_inverse=True)
@@ -32,8 +32,8 @@ def test_skipped_points_leave_no_trace() -> None:
     points = rng.uniform(-5, 5, (1000, 3))
     skip = points[:, 0] > 0
     some, half = VoxelCloud(Lattice()), VoxelCloud(Lattice())
-    some.add(points, skip)
-    half.add(points[~skip])
+    some.enter(points, skip)
+    half.enter(points[~skip])
     np.testing.assert_array_equal(some.points()[0], half.points()[0])
 
 
@@ -41,5 +41,5 @@ def test_it_grows_past_its_first_table() -> None:
     rng = np.random.default_rng(2)
     points = rng.uniform(-60, 60, (100_000, 3))
     cloud = VoxelCloud(Lattice())
-    cloud.add(points)
+    cloud.enter(points)
     assert len(cloud) == len(voxel_downsample(points, CELL_SIZE))

@@ -16,7 +16,7 @@ from mapvote.detection.columns import weigh
 from mapvote.detection.counters import PLANES, STRUCK_ITSELF, THROUGH_ITSELF, WORDS
 from mapvote.detection.regions import drop_specks, fallen, unexplained
 from mapvote.detection.rules import ALL_RULES, Rules
-from mapvote.detection.votes import Verdict
+from mapvote.detection.votes import Weighed
 
 UO, UE, CO, CE, UN = CellState
 FREE = ~np.uint64(0)
@@ -32,7 +32,7 @@ def cell(through: dict[int, int], struck: dict[int, int]) -> U64:
     return planes
 
 
-def judge(through: dict[int, int], struck: dict[int, int], occupied: int = 0, **more: Any) -> Verdict:
+def judge(through: dict[int, int], struck: dict[int, int], occupied: int = 0, **more: Any) -> Weighed:
     near, free, low_there = more.pop("near", 0), more.pop("free", int(FREE)), more.pop("low", False)
     rules = more.pop("rules", ALL_RULES)
     settings = VotingSettings(method="columns", **more)
@@ -147,18 +147,18 @@ def test_rule_h_a_roof_that_hardly_any_ray_reached_is_adrift_and_one_that_was_st
 
 
 def test_a_wall_keeps_its_voxels_when_the_awning_above_it_is_taken_down() -> None:
-    verdict = judge({8: 30, 9: 30, 10: 30, 11: 30}, {2: 40, 3: 40}, occupied=0b110_0000_1100)
-    assert verdict.states()[0, 0] == UO
-    assert verdict.gone[0, 0] == 0b110_0000_0000
+    weighed = judge({8: 30, 9: 30, 10: 30, 11: 30}, {2: 40, 3: 40}, occupied=0b110_0000_1100)
+    assert weighed.states()[0, 0] == UO
+    assert weighed.gone[0, 0] == 0b110_0000_0000
 
 
 def test_what_no_ray_reached_goes_with_the_column_it_stood_on() -> None:
-    verdict = judge({1: 30, 2: 30, 3: 30, 4: 30}, {}, occupied=0b1_0000_0000_1100)
-    assert verdict.states()[0, 0] == CE
-    assert verdict.gone[0, 0] == 0b1_0000_0000_1100
+    weighed = judge({1: 30, 2: 30, 3: 30, 4: 30}, {}, occupied=0b1_0000_0000_1100)
+    assert weighed.states()[0, 0] == CE
+    assert weighed.gone[0, 0] == 0b1_0000_0000_1100
 
 
-def test_the_verdict_is_a_tally_that_two_vehicles_may_add() -> None:
+def test_what_is_weighed_is_a_tally_that_two_vehicles_may_add() -> None:
     one, other = judge({3: 20}, {}, occupied=0b1000), judge({}, {3: 9}, occupied=0b1000)
     assert (one.tally + other.tally).argmax() == UO
 

@@ -114,7 +114,7 @@ def test_a_precise_prior_decides_what_the_geometry_leaves_open() -> None:
 
 def test_the_window_moves_and_finds_again_what_was_entered(scan: F64) -> None:
     grown = NdtMap(SETTINGS, np.zeros(3))
-    grown.add(street(1, 2.0))
+    grown.enter(street(1, 2.0))
     grown.recentre(np.array([500.0, 0.0, 0.0]))
     assert register(grown, scan, T_TRUE, SETTINGS).inlier_share == 0.0
     grown.recentre(np.array([20.0, 5.0, 0.0]))
@@ -124,8 +124,8 @@ def test_the_window_moves_and_finds_again_what_was_entered(scan: F64) -> None:
 def test_adding_in_two_halves_gives_the_map_of_adding_at_once(ndt_map: NdtMap) -> None:
     points = street(1, 2.0)
     halves = NdtMap(SETTINGS, ndt_map.centre)
-    halves.add(points[: len(points) // 2])
-    halves.add(points[len(points) // 2 :])
+    halves.enter(points[: len(points) // 2])
+    halves.enter(points[len(points) // 2 :])
     for one, two in zip(ndt_map.levels, halves.levels, strict=True):
         assert one.n == two.n
         np.testing.assert_allclose(one.cells[: one.n], two.cells[: two.n], rtol=1e-6, atol=1e-9)

@@ -100,7 +100,7 @@ class VoxelCloud:
         self._n = 0
         self._entered = 0
 
-    def add(self, points_map: F64, skip: Bool | None = None) -> None:
+    def enter(self, points_map: F64, skip: Bool | None = None) -> None:
         """Enter one scan: points (n, 3) in map metres, those of ``skip`` (n,) left out."""
         points = np.ascontiguousarray(points_map, dtype=np.float64)
         mask = np.zeros(len(points), dtype=np.bool_) if skip is None else skip

@@ -18,9 +18,9 @@ from mapvote.core.reference import above_ground_points, cut_reference, reference
 from mapvote.core.types import I32, U64, Bool
 from mapvote.core.voting import VOTE_UNIT
 from mapvote.detection.counters import PLANES, Evidence, count_of, free_words, is_open
-from mapvote.detection.regions import around, beside_new, loose_voxels, settle
+from mapvote.detection.regions import apply_region_rules, around, beside_new, loose_voxels
 from mapvote.detection.rules import ALL_RULES, Rules
-from mapvote.detection.votes import Judged, TileVotes, Verdict
+from mapvote.detection.votes import Judged, TileVotes, Weighed
 from mapvote.perception.frontend import Observation
 
 
@@ -110,7 +110,7 @@ def _weigh(
 def weigh(
     planes: U64, base: I32, occupied: U64, near: U64, free: U64, low: Bool, settings: VotingSettings,
     rules: Rules = ALL_RULES,
-) -> Verdict:  # fmt: skip
+) -> Weighed:  # fmt: skip
     """Votes of a window (rows, cols) from its counters and the map's words.
 
     ``planes`` (rows + 2, cols + 2, WORDS) and ``base`` (rows + 2, cols + 2), the layers of their bits 0, have the
@@ -133,7 +133,7 @@ def weigh(
         settings.min_support if brief else 1, tally, gone, new, beside, adrift,
     )  # fmt: skip
     loose = np.where(low, np.uint64(0), loose_voxels(planes[1:-1, 1:-1]))
-    return Verdict(tally, gone, new, beside, adrift, loose)
+    return Weighed(tally, gone, new, beside, adrift, loose)
 
 
 class ColumnVoter:
@@ -161,16 +161,16 @@ class ColumnVoter:
         judged: dict[TileIndex, Judged] = {}
         for tile in sorted(self.evidence.tiles):
             found = self._judge(tile)
-            if found.verdict.tally.any():
+            if found.weighed.tally.any():
                 judged[tile] = found
-        settle(judged, self.point_map.lattice, self.voting, self.rules)
+        apply_region_rules(judged, self.point_map.lattice, self.voting, self.rules)
         out = {}
         for tile, found in judged.items():
-            here, verdict = found.here, found.verdict
+            here, weighed = found.here, found.weighed
             free = free_words(self.evidence.tiles[tile], here.occupied)
             if here.free is not None:
                 free[here.free != 0] = 0  # what the map knows need not be sent
-            out[tile] = TileVotes(verdict.tally, found.states, verdict.gone, found.remnants, verdict.new, free)
+            out[tile] = TileVotes(weighed.tally, found.states, weighed.gone, found.remnants, weighed.new, free)
         return out
 
     def _judge(self, tile: TileIndex) -> Judged:
@@ -182,6 +182,6 @@ class ColumnVoter:
         here = cut_reference(outer, window)
         known = here.free if here.free is not None else above_ground_points(self.point_map, window)
         low = here.top_z - here.ground_z < self.voting.min_height_m
-        verdict = weigh(counts, outer.base, here.occupied, near, known, low, self.voting, self.rules)
+        weighed = weigh(counts, outer.base, here.occupied, near, known, low, self.voting, self.rules)
         crowded = beside_new(counts, outer.occupied, outer.base)[1:-1, 1:-1]
-        return Judged(here, verdict, verdict.states(), crowded, np.zeros_like(verdict.gone))
+        return Judged(here, weighed, weighed.states(), crowded, np.zeros_like(weighed.gone))

@@ -32,7 +32,7 @@ Plane = Any
 Tiles = Mapping[TileIndex, Judged]
 
 
-def settle(tiles: Tiles, lattice: Lattice, voting: VotingSettings, rules: Rules) -> None:
+def apply_region_rules(tiles: Tiles, lattice: Lattice, voting: VotingSettings, rules: Rules) -> None:
     """Apply the rules C, H, G and I, in this order, as far as ``rules`` has them hold."""
     if rules.pose_explains:
         _give_up_explained(tiles, lattice, voting.join_cells)
@@ -45,18 +45,18 @@ def settle(tiles: Tiles, lattice: Lattice, voting: VotingSettings, rules: Rules)
 
 
 def _give_up_explained(tiles: Tiles, lattice: Lattice, join_cells: int) -> None:
-    beside = {tile: judged.verdict.beside for tile, judged in tiles.items()}
+    beside = {tile: judged.weighed.beside for tile, judged in tiles.items()}
     rule = partial(unexplained, reach=join_cells)
     for tile, cells in _beyond(lattice, join_cells, rule, (_states(tiles), NO_VOTE), (beside, False)).items():
-        tiles[tile].decide(cells, CellState.UNDETERMINED)
+        tiles[tile].overrule(cells, CellState.UNDETERMINED)
 
 
 def _let_fall(tiles: Tiles, lattice: Lattice, fall_cells: int) -> None:
-    adrift = {tile: judged.verdict.adrift for tile, judged in tiles.items()}
+    adrift = {tile: judged.weighed.adrift for tile, judged in tiles.items()}
     rule = partial(fallen, reach=fall_cells)
     for tile, cells in _beyond(lattice, _HALO, rule, (_states(tiles), NO_VOTE), (adrift, False)).items():
-        tiles[tile].decide(cells, CellState.CHANGED_EMPTY)
-        tiles[tile].verdict.gone[cells] = tiles[tile].here.occupied[cells]
+        tiles[tile].overrule(cells, CellState.CHANGED_EMPTY)
+        tiles[tile].weighed.gone[cells] = tiles[tile].here.occupied[cells]
 
 
 def _drop_specks(tiles: Tiles, lattice: Lattice, min_cells: int) -> None:
@@ -69,15 +69,15 @@ def _take_remnants(tiles: Tiles, lattice: Lattice) -> None:
     """A cell of which nothing is left is changed-empty, unless new hits lie next to what went: they may be what stands
     there, put beside it by an error of pose."""
     empty = int(CellState.CHANGED_EMPTY)
-    loose = {tile: judged.verdict.loose for tile, judged in tiles.items()}
+    loose = {tile: judged.weighed.loose for tile, judged in tiles.items()}
     base = {tile: judged.here.base for tile, judged in tiles.items()}
-    gone = {t: np.where(judged.states == empty, judged.verdict.gone, np.uint64(0)) for t, judged in tiles.items()}
+    gone = {t: np.where(judged.states == empty, judged.weighed.gone, np.uint64(0)) for t, judged in tiles.items()}
     for tile, left in _beyond(lattice, _HALO, remnants, (gone, 0), (loose, 0), (base, 0)).items():
         judged = tiles[tile]
         nothing_left = ((left | gone[tile]) == judged.here.occupied) & (left & judged.crowded == 0)
-        judged.decide((left != 0) & nothing_left & (judged.states != empty), CellState.CHANGED_EMPTY)
+        judged.overrule((left != 0) & nothing_left & (judged.states != empty), CellState.CHANGED_EMPTY)
         down = judged.states == empty
-        judged.verdict.gone[down] |= left[down]
+        judged.weighed.gone[down] |= left[down]
         judged.remnants = np.where(down, np.uint64(0), left)
 
 

@@ -15,7 +15,7 @@ class Judged:
     """One tile on its way from evidence to votes. The rules change states, tally and masks in place."""
 
     here: Reference
-    verdict: Verdict
+    weighed: Weighed
     states: U8
     """(256, 256) decided so far."""
     crowded: U64
@@ -23,14 +23,14 @@ class Judged:
     remnants: U64
     """(256, 256) map voxels that are there no more though the rest of the cell stands."""
 
-    def decide(self, cells: Bool, state: CellState) -> None:
+    def overrule(self, cells: Bool, state: CellState) -> None:
         """Let all votes of ``cells`` (256, 256) be for ``state``."""
         self.states[cells] = state
-        self.verdict.tally[cells] = one_hot(np.array(state, dtype=np.uint8))
+        self.weighed.tally[cells] = one_hot(np.array(state, dtype=np.uint8))
 
 
 @dataclass(frozen=True, slots=True)
-class Verdict:
+class Weighed:
     """What a drive says of a window."""
 
     tally: I32

@@ -13,7 +13,7 @@ from mapvote.core.types import MapvoteError
 from mapvote.evaluation.evaluate import Evaluation, evaluate
 from mapvote.evaluation.experiments.cases import choose_cases
 from mapvote.evaluation.experiments.scene import Progress, Scene
-from mapvote.evaluation.loopback import Round, vote_by_http
+from mapvote.evaluation.loopback import Published, vote_by_http
 from mapvote.evaluation.reporting.gallery import Area, areas_of, gallery
 from mapvote.evaluation.reporting.html import Section, page
 from mapvote.evaluation.reporting.tables import as_csv, as_json, as_text, case_name, tables, write_text
@@ -83,7 +83,7 @@ def demo(out: Path, quick: bool = False, progress: Progress | None = None) -> tu
     return evaluation, story
 
 
-def tell(evaluation: Evaluation, done: Round) -> Story:
+def tell(evaluation: Evaluation, done: Published) -> Story:
     """Count what the vote changed, area by area."""
     old, new = all_points(evaluation.first_map), all_points(evaluation.outcomes[CASE].updated)
     survived, added = same_rows(old, new)

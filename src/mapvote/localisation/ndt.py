@@ -19,7 +19,7 @@ from mapvote.config import NdtLevel, NdtSettings
 from mapvote.core.geometry import exp, log
 from mapvote.core.types import F64, Drive, Registration, check_array
 from mapvote.core.voxels import thin
-from mapvote.localisation.ndt_kernels import add, normal_equations, reindex
+from mapvote.localisation.ndt_kernels import enter_points, normal_equations, reindex
 
 _LEVER_M = 20.0
 """Distance at which a rotation is weighed against a shift, where one tolerance must serve both."""
@@ -47,7 +47,7 @@ class NdtGrid:
         self.lowest = np.round((centre - self.reach) / self.level.voxel_m).astype(np.int64)
         reindex(self.voxels, self.n, self.lowest, self.index)
 
-    def add(self, points_map: F64) -> None:
+    def enter(self, points_map: F64) -> None:
         """Enter points (n, 3) in map metres; those outside the window are left out."""
         room = self.n + len(points_map)
         if room > len(self.voxels):
@@ -56,7 +56,7 @@ class NdtGrid:
             self.sums = np.concatenate([self.sums, np.zeros((more, 11))])
             self.cells = np.concatenate([self.cells, np.zeros((more, 9))])
         size, floor = self.level.voxel_m, self.level.floor_m
-        self.n = add(
+        self.n = enter_points(
             points_map,
             self.lowest,
             size,
@@ -71,7 +71,7 @@ class NdtGrid:
 
 
 class NdtMap:
-    """All levels over one bounded window around ``centre`` (map metres), coarse to fine. Grows by :meth:`add`."""
+    """All levels over one bounded window around ``centre`` (map metres), coarse to fine. Grows by :meth:`enter`."""
 
     def __init__(self, settings: NdtSettings, centre: F64) -> None:
         self.settings = settings
@@ -88,11 +88,11 @@ class NdtMap:
         """Whether ``position`` (3,) is near enough to the middle for the window to hold what a scan reaches."""
         return bool(np.abs(np.asarray(position) - self.centre).max() <= self.settings.recentre_m)
 
-    def add(self, points_map: NDArray[np.floating]) -> None:
+    def enter(self, points_map: NDArray[np.floating]) -> None:
         """Enter points (n, 3) in map metres into every level."""
         points = np.ascontiguousarray(points_map, dtype=np.float64)
         for grid in self.levels:
-            grid.add(points)
+            grid.enter(points)
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,7 +124,7 @@ def build_ndt(points_map: NDArray[np.floating], settings: NdtSettings, centre: F
     if centre is None:
         centre = 0.5 * (points_map.min(axis=0) + points_map.max(axis=0)).astype(np.float64)
     ndt_map = NdtMap(settings, centre)
-    ndt_map.add(points_map)
+    ndt_map.enter(points_map)
     return ndt_map
 
 

@@ -69,7 +69,7 @@ def _upright(V: F64) -> None:
 
 
 @numba.njit(cache=True, nogil=True)
-def add(
+def enter_points(
     points: F64,
     lowest: I64,
     size: float,

@@ -157,7 +157,7 @@ def flood(cells: I64, wanted: Bool, side: int) -> I32:
 
 
 @numba.njit(cache=True, nogil=True)
-def together(
+def moving_components(
     rows: I64,
     cols: I64,
     side: int,

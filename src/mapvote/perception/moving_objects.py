@@ -30,7 +30,7 @@ from mapvote.config import MovingSettings
 from mapvote.core.grid import CELL_SIZE
 from mapvote.core.sensors import Sensor
 from mapvote.core.types import F32, F64, I32, Bool
-from mapvote.perception.moving_kernels import look, range_image, together, voxels
+from mapvote.perception.moving_kernels import look, moving_components, range_image, voxels
 
 # Set on the development streets of the simulator. results/moving_constants.csv says what half and twice of each cost;
 # benchmarks/moving_accuracy.py --sweep measures it.
@@ -155,7 +155,9 @@ class MovingFilter:
         half = int(np.ceil(s.reach_m / CELL_SIZE)) + 2
         cells = np.floor(scan.samples[:, :2] / CELL_SIZE).astype(np.int64)
         cells -= np.floor(scan.origin_map[:2] / CELL_SIZE).astype(np.int64) - half
-        moves = together(cells[:, 1], cells[:, 0], 2 * half + 1, seen, brief, MIN_VOXELS, SHARE_WHOLE, SHARE_PART)
+        moves = moving_components(
+            cells[:, 1], cells[:, 0], 2 * half + 1, seen, brief, MIN_VOXELS, SHARE_WHOLE, SHARE_PART
+        )
         mask = scan.voxel_of >= 0
         mask[mask] = moves[scan.voxel_of[mask]]
         return mask

@@ -61,7 +61,7 @@ class Layer:
             scan, moving = observation.scan, observation.moving
             offset = scan.points_map[:, :2] - scan.origin_map[:2]
             far = np.einsum("ij,ij->i", offset, offset) > self.settings.mapping.reach_m**2
-            self.cloud.add(scan.points_map, moving | _beneath(scan, moving) | far)
+            self.cloud.enter(scan.points_map, moving | _beneath(scan, moving) | far)
             self.evidence.count(observation.view, observation.reference)
 
     def finish(self) -> PointMap:

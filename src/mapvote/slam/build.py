@@ -89,7 +89,7 @@ def build_map(
     surveyor = _Surveyor(settings)
     found = [surveyor.follow(drive, count) for drive in drives]
     registered = [mask for _, mask in found]
-    poses = settle(drives, [T for T, _ in found], registered, settings.mapping)
+    poses = settle_poses(drives, [T for T, _ in found], registered, settings.mapping)
     cloud = surveyor.draft.points()[0]
     roads = [road_under(T, mask, cloud) for T, mask in zip(poses, registered, strict=True)]
     road = all_roads(roads)
@@ -160,11 +160,13 @@ class _Surveyor:
 
     def _enter(self, points_map: F64, position: F64) -> None:
         spread = thin(points_map - position, self.mapping.ndt_points_m)
-        self._map_around(position).add(points_map[spread])
-        self.draft.add(points_map)
+        self._map_around(position).enter(points_map[spread])
+        self.draft.enter(points_map)
 
 
-def settle(drives: Sequence[Drive], poses: list[F64], registered: list[Bool], settings: MappingSettings) -> list[F64]:
+def settle_poses(
+    drives: Sequence[Drive], poses: list[F64], registered: list[Bool], settings: MappingSettings
+) -> list[F64]:
     """Poses of all drives that agree with each other's motion and with the precise priors; as given if there are none.
 
     Links are the motion from scan to scan, and from each scan to the nearest much older one near by: it was

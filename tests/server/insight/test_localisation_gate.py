@@ -13,7 +13,7 @@ from mapvote.core.geometry import from_xyz_rpy, inverse, transform
 from mapvote.core.point_map import PointMap, map_from_points
 from mapvote.core.sensors import SENSORS
 from mapvote.core.types import F64, Drive, MapvoteError, Scan
-from mapvote.server.insight.localisation_gate import GateResult, Localised, compare, decide, gate
+from mapvote.server.insight.localisation_gate import GateResult, Localised, compare, gate, pass_or_hold
 
 NDT = NdtSettings(
     levels=(
@@ -150,7 +150,7 @@ def pairs(gains: list[float]) -> list[tuple[Localised, Localised]]:
     ],
 )
 def test_within_tolerance_passes_worse_holds_and_between_it_abstains(gains: list[float], verdict: str) -> None:
-    assert decide(compare(pairs(gains), SETTINGS))[0] == verdict
+    assert pass_or_hold(compare(pairs(gains), SETTINGS))[0] == verdict
 
 
 def test_equal_maps_are_equal() -> None:

@@ -31,7 +31,7 @@ only the survey's drives know the old one, so they stand for a fleet that votes 
 def in_turn(
     scene: Scene, case: Case, voters: Sequence[str], window: Grid, workers: int, progress: Progress | None = None
 ) -> Outcome:
-    """The last round's outcome, its states over ``window`` those of all rounds together (:func:`together`).
+    """The last round's outcome, its states over ``window`` those of all rounds together (:func:`over_both_rounds`).
 
     The first round votes on nothing but the points of the scene's map, as a PCD file would have brought them.
     """
@@ -49,14 +49,14 @@ def in_turn(
         before = outcome
         outcome = fuse_case(here.point_map, ballots, case.min_votes, scene.settings.fuse, window)
         if before is not None:
-            outcome = replace(outcome, states=together(before.states, outcome.states))
+            outcome = replace(outcome, states=over_both_rounds(before.states, outcome.states))
         here = replace(here, map_name=f"{here.map_name}-{who}")
     if outcome is None:
         raise ValueError("a chain of rounds needs someone who votes")
     return outcome
 
 
-def together(first: U8, second: U8) -> U8:
+def over_both_rounds(first: U8, second: U8) -> U8:
     """What two rounds say of each cell of the map before the first: a change of either, unless one undid the other."""
     occupied, empty = CellState.CHANGED_OCCUPIED, CellState.CHANGED_EMPTY
     states = second.copy()

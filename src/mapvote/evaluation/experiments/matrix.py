@@ -41,7 +41,7 @@ _SCORES_FROM = (
 
 
 @dataclass(frozen=True, slots=True)
-class Round:
+class BallotSet:
     """One set of ballots that the server is given."""
 
     name: str
@@ -49,39 +49,39 @@ class Round:
     ballots: Sequence[Ballot]
 
 
-Rounds = Callable[[Sequence[Pass], Sequence[Case], PointMap], Iterator[Round]]
+BallotSets = Callable[[Sequence[Pass], Sequence[Case], PointMap], Iterator[BallotSet]]
 """What is made of the vehicles' passes."""
 
 
-def as_sent(drives: Sequence[Pass], cases: Sequence[Case], first_map: PointMap) -> Iterator[Round]:
+def as_sent(drives: Sequence[Pass], cases: Sequence[Case], first_map: PointMap) -> Iterator[BallotSet]:
     """Every case, all vehicles."""
     for case in cases:
-        yield Round(case.name, case.min_votes, [drive.ballots[case.name] for drive in drives])
+        yield BallotSet(case.name, case.min_votes, [drive.ballots[case.name] for drive in drives])
 
 
-def columns_alone(drives: Sequence[Pass], cases: Sequence[Case], first_map: PointMap) -> Iterator[Round]:
+def columns_alone(drives: Sequence[Pass], cases: Sequence[Case], first_map: PointMap) -> Iterator[BallotSet]:
     """Our own method, all vehicles."""
     return as_sent(drives, [case for case in cases if case.name == "columns"], first_map)
 
 
-def growing(drives: Sequence[Pass], cases: Sequence[Case], first_map: PointMap) -> Iterator[Round]:
+def growing(drives: Sequence[Pass], cases: Sequence[Case], first_map: PointMap) -> Iterator[BallotSet]:
     """Every case, with the first 3, 5, 7 and 10 vehicles."""
     for case, n in product(cases, (3, 5, 7, 10)):
         if n <= len(drives):
-            yield Round(f"{case.name}, {n} vehicles", case.min_votes, [d.ballots[case.name] for d in drives[:n]])
+            yield BallotSet(f"{case.name}, {n} vehicles", case.min_votes, [d.ballots[case.name] for d in drives[:n]])
 
 
-def with_liars(drives: Sequence[Pass], cases: Sequence[Case], first_map: PointMap) -> Iterator[Round]:
+def with_liars(drives: Sequence[Pass], cases: Sequence[Case], first_map: PointMap) -> Iterator[BallotSet]:
     """Columns, for k = 1, 2, 3: 2k + 1 vehicles with min_votes = k + 1, all honest, and the last k of them lying."""
     for k in (1, 2, 3):
         n = 2 * k + 1
         if n > len(drives):
             continue
         honest = [drive.ballots["columns"] for drive in drives[:n]]
-        yield Round(f"columns, {n} honest", k + 1, honest)
+        yield BallotSet(f"columns, {n} honest", k + 1, honest)
         for name, attack in ATTACKS.items():
             lies = [attack(ballot, first_map, honest[0]) for ballot in honest[-k:]]
-            yield Round(f"columns, {k} of {n} {name}", k + 1, [*honest[:-k], *lies])
+            yield BallotSet(f"columns, {k} of {n} {name}", k + 1, [*honest[:-k], *lies])
 
 
 @dataclass(frozen=True)
@@ -92,7 +92,7 @@ class Experiment:
     overrides: Mapping[str, Any] = field(default_factory=dict)
     """Of the scenario."""
     conditions: Conditions = field(default_factory=Conditions)
-    rounds: Rounds = as_sent
+    rounds: BallotSets = as_sent
     chains: Mapping[str, Sequence[str]] = field(default_factory=dict)
     """Besides, columns on the first map without its known-free columns: who votes in turn; see ``imported.in_turn``."""
 

@@ -19,7 +19,7 @@ from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Lattice, TileIndex
 from mapvote.core.types import I64, U8, CellState
 from mapvote.server.insight.polygons import pieces
 
-Verdict = Literal["contradicts", "consistent", "undecidable"]
+Stance = Literal["contradicts", "consistent", "undecidable"]
 Claim = Literal["occupied", "empty"]
 _SAYS_OCCUPIED = (CellState.UNCHANGED_OCCUPIED, CellState.CHANGED_OCCUPIED)
 _SAYS_EMPTY = (CellState.UNCHANGED_EMPTY, CellState.CHANGED_EMPTY)
@@ -65,7 +65,7 @@ class Standing:
     """How a vehicle stands to the consensus, with all that the verdict rests on."""
 
     vehicle: str
-    verdict: Verdict
+    verdict: Stance
     cells: int
     """Cells compared."""
     objects: int
@@ -143,7 +143,7 @@ def judge(
         mine, found = cells[name], len(evidence[name])
         others, others_found = all_cells - mine, all_objects - found
         p_value = _tail(found, others_found, tolerated * mine, others)
-        verdict: Verdict = "undecidable"
+        verdict: Stance = "undecidable"
         if mine and p_value < threshold:
             verdict = "contradicts"
         elif mine and found * others <= tolerated * mine * others_found:

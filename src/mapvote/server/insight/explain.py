@@ -14,7 +14,7 @@ from mapvote.fusion.fuse import hear
 from mapvote.fusion.spent import unspent
 from mapvote.fusion.tile_vote import TileVote, one_each
 from mapvote.server.store import schema
-from mapvote.server.store.eligible_votes import Round, judged_votes, read_votes
+from mapvote.server.store.eligible_votes import Electorate, judged_votes, read_votes
 from mapvote.server.store.policy import Policy, policy_in
 from mapvote.server.store.queries import current_version, tile_as_of
 from mapvote.server.store.store import Store
@@ -66,7 +66,7 @@ def explain_cell(store: Store, x: float, y: float) -> CellStory:
     with store.database.reading() as connection:
         policy = policy_in(connection)
         settings = policy.fuse
-        asked = Round(_FOREVER, policy, store.clock() - round(settings.min_age_s * 1e9))
+        asked = Electorate(_FOREVER, policy, store.clock() - round(settings.min_age_s * 1e9))
         number = current_version(connection).number
         tile = tile_as_of(connection, store.lattice.tile(index), number)
         everyone = judged_votes(connection, index, asked)

@@ -17,7 +17,7 @@ from mapvote.server.insight.consensus import Compared, Spoken, Standing, compare
 from mapvote.server.insight.explain import _FOREVER, _states
 from mapvote.server.insight.geojson import to_geojson
 from mapvote.server.store import schema
-from mapvote.server.store.eligible_votes import Round, counting_votes, judged_votes, read_votes, standing_tiles
+from mapvote.server.store.eligible_votes import Electorate, counting_votes, judged_votes, read_votes, standing_tiles
 from mapvote.server.store.policy import policy_in, recorded
 from mapvote.server.store.queries import current_version, load_tile, tile_as_of, tiles_of, version_of
 from mapvote.server.store.store import Store
@@ -60,7 +60,7 @@ def _decided(store: Store, connection: sa.Connection, index: TileIndex, old: int
         version = version_of(connection, row.version)
         tile = tile_as_of(connection, store.lattice.tile(index), row.version - 1)
         policy = recorded(version.policy)
-        asked = Round(version.mark, policy, version.created_ns - round(policy.fuse.min_age_s * 1e9))
+        asked = Electorate(version.mark, policy, version.created_ns - round(policy.fuse.min_age_s * 1e9))
         votes = counting_votes(connection, tile, asked)
         drives = [(vote.end_ns, vote.states) for vote in votes if vote.states is not None]
         yield Decided(row.version, _states(row.states), unpack_tally_plane(row.tally), drives)
@@ -88,7 +88,7 @@ def vehicle_standings(store: Store) -> list[Standing]:
     What is compared is the world (occupied or empty now), so votes on an older base count here too.
     """
     with store.database.reading() as connection:
-        asked = Round(_FOREVER, policy_in(connection), _FOREVER)
+        asked = Electorate(_FOREVER, policy_in(connection), _FOREVER)
         compared: list[Compared] = []
         for index in standing_tiles(connection, _FOREVER):
             chosen = [vote for vote, why in judged_votes(connection, index, asked) if not why]

@@ -113,7 +113,7 @@ def gate(old: PointMap, new: PointMap, drive: Drive, settings: GateSettings, ndt
         return GateResult("abstain", (reason,), len(drive), len(near), 0, ())
     pairs = localise_in_both(old, new, drive, [int(i) for i in chosen], ndt)
     measures = compare(pairs, settings)
-    verdict, reasons = decide(measures)
+    verdict, reasons = pass_or_hold(measures)
     return GateResult(verdict, reasons, len(drive), len(near), len(chosen), measures)
 
 
@@ -170,7 +170,7 @@ def compare(pairs: Sequence[tuple[Localised, Localised]], settings: GateSettings
     return tuple(out)
 
 
-def decide(measures: Sequence[Measure]) -> tuple[Verdict, tuple[str, ...]]:
+def pass_or_hold(measures: Sequence[Measure]) -> tuple[Verdict, tuple[str, ...]]:
     """hold if any figure is worse than tolerated; pass if none can be; abstain where the scans leave it open."""
     worse = [str(m) for m in measures if m.worse]
     if worse:

@@ -24,7 +24,7 @@ from mapvote.server.store.policy import Policy
 
 
 @dataclass(frozen=True, slots=True)
-class Round:
+class Electorate:
     """Whose votes are asked for: standing at ``mark``, received by ``received_by_ns``, not of ``without``."""
 
     mark: int
@@ -98,7 +98,7 @@ def standing_tiles(connection: sa.Connection, mark: int, since: int | None = Non
     return [(row.row, row.col) for row in connection.execute(tiles.order_by(t.c.row, t.c.col))]
 
 
-def judged_votes(connection: sa.Connection, index: TileIndex, asked: Round) -> list[tuple[StoredVote, str]]:
+def judged_votes(connection: sa.Connection, index: TileIndex, asked: Electorate) -> list[tuple[StoredVote, str]]:
     """Every standing vote on a tile, and why it does not count there at all; "" if it does, in cells where it is not
     spent (:func:`mapvote.fusion.spent.unspent`)."""
     asked_of = {"row": index[0], "col": index[1], "mark": asked.mark}
@@ -111,7 +111,7 @@ def judged_votes(connection: sa.Connection, index: TileIndex, asked: Round) -> l
     return [(vote, why[vote.seq] or ("" if vote.seq in inside else outside)) for vote in found]
 
 
-def _unready(vote: StoredVote, asked: Round) -> str:
+def _unready(vote: StoredVote, asked: Electorate) -> str:
     cast = asked.policy.round
     if vote.cast_by != cast.cast_by or not vote.settings_hash.startswith(cast.settings_hash):
         return OTHERWISE
@@ -119,7 +119,7 @@ def _unready(vote: StoredVote, asked: Round) -> str:
 
 
 def counting_votes(
-    connection: sa.Connection, tile: Tile, asked: Round, misread: Mapping[int, Bool] | None = None
+    connection: sa.Connection, tile: Tile, asked: Electorate, misread: Mapping[int, Bool] | None = None
 ) -> list[TileVote]:
     """The votes that count on ``tile`` as it is now, each restricted to the cells where it is not spent.
 
@@ -130,7 +130,7 @@ def counting_votes(
 
 
 def recent_votes(
-    connection: sa.Connection, tile: Tile, asked: Round, misread: Mapping[int, Bool] | None = None
+    connection: sa.Connection, tile: Tile, asked: Electorate, misread: Mapping[int, Bool] | None = None
 ) -> list[TileVote]:
     """As :func:`counting_votes`, of every vehicle and of the last ``stay_days``: what has come and gone here?"""
     judged = judged_votes(connection, tile.index, asked)

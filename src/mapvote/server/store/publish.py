@@ -24,7 +24,7 @@ from mapvote.server.store import schema
 from mapvote.server.store.blobs import TileHashes, pack_memory, unpack_tile
 from mapvote.server.store.commit import NewTiles, write_version
 from mapvote.server.store.database import address_of
-from mapvote.server.store.eligible_votes import Round, standing_tiles
+from mapvote.server.store.eligible_votes import Electorate, standing_tiles
 from mapvote.server.store.hold import hold_reasons
 from mapvote.server.store.policy import policy_in
 from mapvote.server.store.queries import (
@@ -64,7 +64,7 @@ class Plan:
     """What there is to fuse, as of one moment."""
 
     newest: Version
-    asked: Round
+    asked: Electorate
     tasks: Sequence[Task]
     now: int
 
@@ -114,7 +114,7 @@ def make_plan(store: Store, settings: FuseSettings | None = None) -> Plan:
         policy = policy_in(connection)
         if settings is not None:
             policy = policy.model_copy(update={"fuse": settings})
-        asked = Round(mark, policy, now - round(policy.fuse.min_age_s * 1e9))
+        asked = Electorate(mark, policy, now - round(policy.fuse.min_age_s * 1e9))
         dirty = _dirty(connection, newest, asked)
         hashes = tiles_of(connection, newest.number, dirty)
     made, url = newest.number + 1, address_of(store.database.url)
@@ -122,7 +122,7 @@ def make_plan(store: Store, settings: FuseSettings | None = None) -> Plan:
     return Plan(newest, asked, tasks, now)
 
 
-def _dirty(connection: sa.Connection, newest: Version, asked: Round) -> list[TileIndex]:
+def _dirty(connection: sa.Connection, newest: Version, asked: Electorate) -> list[TileIndex]:
     """Tiles that may give something else than when they were last fused.
 
     Where the newest version changed something, votes are spent that decided together with others. With another policy,

@@ -24,7 +24,7 @@ from mapvote.fusion.fuse import fuse_tile
 from mapvote.fusion.tile_vote import TileVote
 from mapvote.server.store.blobs import TileHashes, pack_tile
 from mapvote.server.store.database import Database, address_of
-from mapvote.server.store.eligible_votes import Round, counting_votes, recent_votes
+from mapvote.server.store.eligible_votes import Electorate, counting_votes, recent_votes
 from mapvote.server.store.queries import load_tile, tile_as_of
 
 _NOWHERE = np.zeros(CELLS, dtype=np.bool_)
@@ -41,7 +41,7 @@ class Task:
     """That is to be made."""
     tile: TileHashes | Tile | None
     """As it is now: in the store, at hand, or not there."""
-    asked: Round
+    asked: Electorate
     misread: Mapping[int, Bool] | None = None
     """See :func:`mapvote.fusion.spent.unspent`; in a replay only."""
 
