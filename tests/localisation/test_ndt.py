@@ -128,7 +128,7 @@ def test_adding_in_two_halves_gives_the_map_of_adding_at_once(ndt_map: NdtMap) -
     halves.enter(points[len(points) // 2 :])
     for one, two in zip(ndt_map.levels, halves.levels, strict=True):
         assert one.n == two.n
-        np.testing.assert_allclose(one.cells[: one.n], two.cells[: two.n], rtol=1e-6, atol=1e-9)
+        np.testing.assert_allclose(one.voxels.cells[: one.n], two.voxels.cells[: two.n], rtol=1e-6, atol=1e-9)
 
 
 @settings(max_examples=25, deadline=None)

@@ -19,7 +19,8 @@ from mapvote.config import NdtLevel, NdtSettings
 from mapvote.core.geometry import exp, log
 from mapvote.core.types import F64, Drive, Registration, check_array
 from mapvote.core.voxels import thin
-from mapvote.localisation.ndt_kernels import enter_points, normal_equations, reindex
+from mapvote.localisation.ndt_kernels import normal_equations
+from mapvote.localisation.ndt_voxels import Voxels, Window, enter_points, reindex
 
 _LEVER_M = 20.0
 """Distance at which a rotation is weighed against a shift, where one tolerance must serve both."""
@@ -35,39 +36,23 @@ class NdtGrid:
         self.level = level
         self.min_points = settings.min_points
         self.reach = np.array([half, half, below])
-        self.index = np.full(shape, -1, dtype=np.int32)
-        self.lowest = np.zeros(3, dtype=np.int64)
-        self.voxels = np.zeros((1024, 3), dtype=np.int64)
-        self.sums = np.zeros((1024, 11))
-        self.cells = np.zeros((1024, 9))
+        self.window = Window(np.full(shape, -1, dtype=np.int32), np.zeros(3, dtype=np.int64), size)
+        self.voxels = Voxels(np.zeros((1024, 3), dtype=np.int64), np.zeros((1024, 11)), np.zeros((1024, 9)))
         self.n = 0
 
     def recentre(self, centre: F64) -> None:
         """Move the window; what was entered before and lies inside is found again."""
-        self.lowest = np.round((centre - self.reach) / self.level.voxel_m).astype(np.int64)
-        reindex(self.voxels, self.n, self.lowest, self.index)
+        self.window.lowest[:] = np.round((centre - self.reach) / self.level.voxel_m).astype(np.int64)
+        reindex(self.window, self.voxels.place, self.n)
 
     def enter(self, points_map: F64) -> None:
         """Enter points (n, 3) in map metres; those outside the window are left out."""
         room = self.n + len(points_map)
-        if room > len(self.voxels):
-            more = max(room, 2 * len(self.voxels)) - len(self.voxels)
-            self.voxels = np.concatenate([self.voxels, np.zeros((more, 3), dtype=np.int64)])
-            self.sums = np.concatenate([self.sums, np.zeros((more, 11))])
-            self.cells = np.concatenate([self.cells, np.zeros((more, 9))])
-        size, floor = self.level.voxel_m, self.level.floor_m
-        self.n = enter_points(
-            points_map,
-            self.lowest,
-            size,
-            floor,
-            self.min_points,
-            self.index,
-            self.voxels,
-            self.sums,
-            self.cells,
-            self.n,
-        )
+        if room > len(self.voxels.place):
+            more = max(room, 2 * len(self.voxels.place)) - len(self.voxels.place)
+            grown = (np.concatenate([a, np.zeros((more, a.shape[1]), dtype=a.dtype)]) for a in self.voxels)
+            self.voxels = Voxels(*grown)
+        self.n = enter_points(points_map, self.window, self.voxels, self.n, self.level.floor_m, self.min_points)
 
 
 class NdtMap:
@@ -185,7 +170,7 @@ def fitness(ndt_map: NdtMap, clouds: list[F64], T_map_lidar: F64, level: int = 0
 
 def _equations(grid: NdtGrid, points: F64, T: F64) -> tuple[F64, F64, F64, float, float]:
     R, t = np.ascontiguousarray(T[:3, :3]), T[:3, 3].copy()
-    return normal_equations(points, R, t, grid.lowest, grid.level.voxel_m, grid.index, grid.cells)
+    return normal_equations(points, R, t, grid.window, grid.voxels.cells)
 
 
 def _solve(H: F64, g: F64, M: F64, settings: NdtSettings) -> tuple[F64, F64]:

@@ -1,0 +1,215 @@
+"""The map side of NDT: points become a normal distribution per voxel.
+
+Equation numbers are those of Magnusson, The Three-Dimensional Normal-Distributions Transform, 2009, chapter 6; where
+we deviate, mapvote.localisation.ndt says how. Steps are inlined by numba: a name costs nothing (docs/results.md).
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numba
+import numpy as np
+
+from mapvote.core.types import F64, I32, I64
+
+FLATNESS = 0.08
+"""A voxel whose points spread less than this share of its side in height is a flat patch."""
+
+Vector = tuple[float, float, float]
+Symmetric = tuple[float, float, float, float, float, float]
+"""(3, 3) by its upper triangle: xx, xy, xz, yy, yz, zz."""
+
+
+class Window(NamedTuple):
+    """The part of space in which voxels are found."""
+
+    rows: I32
+    """(nx, ny, nz) row of each voxel in :class:`Voxels`, or -1."""
+    lowest: I64
+    """(3,) world voxel of rows[0, 0, 0]."""
+    size: float
+    """Side of a voxel, metres."""
+
+
+class Voxels(NamedTuple):
+    """All voxels that points ever fell into, inside the window or not."""
+
+    place: I64
+    """(m, 3) world voxel of each row."""
+    sums: F64
+    """(m, 11) count, first and second moments about the voxel's centre (x y z xx xy xz yy yz zz), scratch."""
+    cells: F64
+    """(m, 9) mean from the voxel's centre, and the precision as a :data:`Symmetric`; zero without a distribution."""
+
+
+@numba.njit(cache=True, nogil=True)
+def _diagonalise(A: F64, V: F64) -> None:
+    """Jacobi's method on the upper triangle of a symmetric (3, 3) A, in place; the columns of V are eigenvectors."""
+    V[:] = 0.0
+    V[0, 0] = V[1, 1] = V[2, 2] = 1.0
+    for _ in range(8):
+        off = abs(A[0, 1]) + abs(A[0, 2]) + abs(A[1, 2])
+        if off < 1e-10 * (abs(A[0, 0]) + abs(A[1, 1]) + abs(A[2, 2])):
+            return
+        for p, q, r in ((0, 1, 2), (0, 2, 1), (1, 2, 0)):
+            if A[p, q] == 0.0:
+                continue
+            theta = 0.5 * (A[q, q] - A[p, p]) / A[p, q]
+            t = (1.0 if theta >= 0.0 else -1.0) / (abs(theta) + np.sqrt(theta * theta + 1.0))
+            c = 1.0 / np.sqrt(t * t + 1.0)
+            s = t * c
+            A[p, p] -= t * A[p, q]
+            A[q, q] += t * A[p, q]
+            A[p, q] = 0.0
+            rp = A[min(r, p), max(r, p)]
+            rq = A[min(r, q), max(r, q)]
+            A[min(r, p), max(r, p)] = c * rp - s * rq
+            A[min(r, q), max(r, q)] = s * rp + c * rq
+            for k in range(3):
+                vp, vq = V[k, p], V[k, q]
+                V[k, p] = c * vp - s * vq
+                V[k, q] = s * vp + c * vq
+
+
+@numba.njit(cache=True, nogil=True)
+def _order(A: F64, V: F64) -> None:
+    """Eigenvalues (diagonal of A) and eigenvectors (columns of V) in ascending order."""
+    for p, q in ((0, 1), (1, 2), (0, 1)):
+        if A[p, p] > A[q, q]:
+            A[p, p], A[q, q] = A[q, q], A[p, p]
+            for k in range(3):
+                V[k, p], V[k, q] = V[k, q], V[k, p]
+
+
+@numba.njit(cache=True, nogil=True)
+def _upright(V: F64) -> None:
+    """The first column becomes the upward direction across the last one."""
+    x, y, z = V[0, 2], V[1, 2], V[2, 2]
+    length = np.sqrt(max(1.0 - z * z, 1e-12))
+    V[0, 0], V[1, 0], V[2, 0] = -x * z / length, -y * z / length, (1.0 - z * z) / length
+
+
+@numba.njit(inline="always")
+def voxel_of(window: Window, x: float, y: float, z: float) -> tuple[np.int64, np.int64, np.int64]:
+    """World voxel of a point, map metres."""
+    size = window.size
+    return np.int64(np.floor(x / size)), np.int64(np.floor(y / size)), np.int64(np.floor(z / size))
+
+
+@numba.njit(inline="always")
+def holds(window: Window, ix: np.int64, iy: np.int64, iz: np.int64, margin: int) -> bool:
+    """Whether the window has this voxel (counted from its lowest), and ``margin`` more to all sides."""
+    nx, ny, nz = window.rows.shape
+    return margin <= ix < nx - margin and margin <= iy < ny - margin and margin <= iz < nz - margin
+
+
+@numba.njit(inline="always")
+def _add_moments(sums: F64, k: int, x: float, y: float, z: float) -> None:
+    """One more point in voxel ``k``, from its centre: the sums behind Eqs. (6.2) and (6.3)."""
+    sums[k, 0] += 1.0
+    sums[k, 1] += x
+    sums[k, 2] += y
+    sums[k, 3] += z
+    sums[k, 4] += x * x
+    sums[k, 5] += x * y
+    sums[k, 6] += x * z
+    sums[k, 7] += y * y
+    sums[k, 8] += y * z
+    sums[k, 9] += z * z
+
+
+@numba.njit(inline="always")
+def _mean_and_covariance(sums: F64, k: int, A: F64) -> Vector:
+    """Eqs. (6.2) and (6.3), divided by the count: the mean is returned, the upper triangle of A is the covariance."""
+    m = sums[k, 0]
+    mx, my, mz = sums[k, 1] / m, sums[k, 2] / m, sums[k, 3] / m
+    A[0, 0], A[0, 1], A[0, 2] = sums[k, 4] / m - mx * mx, sums[k, 5] / m - mx * my, sums[k, 6] / m - mx * mz
+    A[1, 1], A[1, 2], A[2, 2] = sums[k, 7] / m - my * my, sums[k, 8] / m - my * mz, sums[k, 9] / m - mz * mz
+    return mx, my, mz
+
+
+@numba.njit(inline="always")
+def _flatten(A: F64, V: F64, thin: float) -> None:
+    """A flat patch knows its height only. One ring on the road is a line, thin to all sides: taken at face value it
+    would hold the next scan's rings where the last ones were. ``thin``: variances below it are none; A is diagonal."""
+    if A[1, 1] < thin:
+        _upright(V)
+    A[1, 1] = A[2, 2] = np.inf
+
+
+@numba.njit(inline="always")
+def _set_precision(cells: F64, k: int, A: F64, V: F64, floor_variance: float, even: float) -> None:
+    """The inverse covariance of voxel ``k`` from eigenvalues (diagonal of A) and eigenvectors (columns of V).
+
+    Along a direction in which a voxel is filled evenly it says nothing about position. The precision of an even
+    filling, less two standard deviations of its sample variance, is taken off (``even``); otherwise the rhythm of the
+    voxels would hold a vehicle in place on a bare road.
+    """
+    cells[k, 3:] = 0.0
+    for d in range(3):
+        b = max(0.0, 1.0 / (max(A[d, d], 0.0) + floor_variance) - even)
+        cells[k, 3] += b * V[0, d] * V[0, d]
+        cells[k, 4] += b * V[0, d] * V[1, d]
+        cells[k, 5] += b * V[0, d] * V[2, d]
+        cells[k, 6] += b * V[1, d] * V[1, d]
+        cells[k, 7] += b * V[1, d] * V[2, d]
+        cells[k, 8] += b * V[2, d] * V[2, d]
+
+
+@numba.njit(cache=True, nogil=True)
+def enter_points(points: F64, window: Window, voxels: Voxels, n: int, floor_m: float, min_points: int) -> int:
+    """Enter points (n, 3) in map metres, and refresh the distributions they touch. Returns the new number of rows.
+
+    ``voxels`` has room for every point; those outside ``window`` are left out. A distribution needs ``min_points``, and
+    is widened by ``floor_m`` to all sides.
+    """
+    size, sums = window.size, voxels.sums
+    touched = np.empty(len(points), dtype=np.int64)
+    n_touched = 0
+    for i in range(len(points)):
+        ax, ay, az = voxel_of(window, points[i, 0], points[i, 1], points[i, 2])
+        ix, iy, iz = ax - window.lowest[0], ay - window.lowest[1], az - window.lowest[2]
+        if not holds(window, ix, iy, iz, 0):
+            continue
+        k = window.rows[ix, iy, iz]
+        if k < 0:
+            k = n
+            n += 1
+            window.rows[ix, iy, iz] = k
+            voxels.place[k, 0], voxels.place[k, 1], voxels.place[k, 2] = ax, ay, az
+            sums[k, :] = 0.0
+        if sums[k, 10] == 0.0:
+            sums[k, 10] = 1.0
+            touched[n_touched] = k
+            n_touched += 1
+        x, y, z = points[i, 0] - (ax + 0.5) * size, points[i, 1] - (ay + 0.5) * size, points[i, 2] - (az + 0.5) * size
+        _add_moments(sums, k, x, y, z)
+    A, V = np.empty((3, 3)), np.empty((3, 3))
+    thin, floor_variance = (FLATNESS * size) * (FLATNESS * size), floor_m * floor_m
+    for j in range(n_touched):
+        k = touched[j]
+        sums[k, 10] = 0.0
+        m = sums[k, 0]
+        if m < min_points:
+            voxels.cells[k, :] = 0.0
+            continue
+        voxels.cells[k, 0], voxels.cells[k, 1], voxels.cells[k, 2] = _mean_and_covariance(sums, k, A)
+        flat = A[2, 2] < thin
+        _diagonalise(A, V)
+        _order(A, V)
+        if flat:
+            _flatten(A, V, thin)
+        even_variance = size * size / 12.0 * max(0.0, 1.0 - 2.0 * np.sqrt(0.8 / m))
+        _set_precision(voxels.cells, k, A, V, floor_variance, 1.0 / (even_variance + floor_variance))
+    return n
+
+
+@numba.njit(cache=True, nogil=True)
+def reindex(window: Window, place: I64, n: int) -> None:
+    """Find the first ``n`` voxels, whose world voxels are ``place`` (m, 3), in a window that has moved."""
+    window.rows[:] = -1
+    for k in range(n):
+        ix, iy, iz = place[k, 0] - window.lowest[0], place[k, 1] - window.lowest[1], place[k, 2] - window.lowest[2]
+        if holds(window, ix, iy, iz, 0):
+            window.rows[ix, iy, iz] = k
