@@ -6,14 +6,20 @@ nothing half-written. A traceback is a bug.
 
 from __future__ import annotations
 
+import os
 import sys
 from typing import Annotated
 
 import typer
 
-from mapvote.cli import evaluation, files, follow, inspect, server, setup, update, vehicle
-from mapvote.cli.terminal import complain
-from mapvote.core.types import MapvoteError
+for _threads in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+    # Before numpy is imported: its products here are small, and threads that wait for each other cost twice the CPU
+    # time. Work is spread over vehicles and tiles instead. Whoever sets a number keeps it.
+    os.environ.setdefault(_threads, "1")
+
+from mapvote.cli import evaluation, files, follow, inspect, server, setup, update, vehicle  # noqa: E402
+from mapvote.cli.terminal import complain  # noqa: E402
+from mapvote.core.types import MapvoteError  # noqa: E402
 
 app = typer.Typer(
     name="mapvote",
