@@ -1,0 +1,89 @@
+"""A desk with a tiny street on it: the folders and files that the documents name, made once by the program itself."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from command_line import type_in
+from hand_made import Say, make_ballot, states_plane, two_walls
+from mapvote.codec.ballot import encode
+from mapvote.core.types import CellState
+from mapvote.server.store.admission import accept, examine
+from mapvote.server.store.publish import publish
+from mapvote.server.store.store import Store
+
+TINY = """
+name = "tiny"
+length_m = 30.0
+width_m = 60.0
+rate_hz = 2.5
+sensor = "vlp16"
+vehicles = 3
+surveys = ["east inner"]
+
+[[changes]]
+kind = "demolished"
+side = "south"
+from_m = 8.0
+to_m = 22.0
+"""
+
+
+@pytest.fixture(scope="session")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Everything that the documents name. Tests link what they need from here and change nothing."""
+    folder = tmp_path_factory.mktemp("made")
+    home = Path.cwd()
+    os.chdir(folder)
+    try:
+        Path("tiny.toml").write_text(TINY)
+        type_in("mapvote simulate tiny.toml street --seed 2")
+        for name, drive in {
+            "MY_DRIVE": "survey_1", "survey": "survey_1", "drive": "v1", "ANOTHER_DRIVE": "v1",
+            "monday": "v1", "tuesday": "v2", "friday": "v3",
+        }.items():  # fmt: skip
+            os.symlink(f"street/{drive}", name)
+        type_in("mapvote build MY_DRIVE --out my_map")
+        type_in("mapvote vote monday --map my_map --vehicle car_1 --out car_1.ballot")
+        type_in("mapvote vote tuesday --map my_map --vehicle car_2 --out car_2.ballot")
+        type_in("mapvote export my_map tiles")
+        type_in("mapvote export my_map city.pcd")
+        make_store(Path("STORE"))
+        shutil.copy("STORE", "fleet.db")
+    finally:
+        os.chdir(home)
+    return folder
+
+
+@pytest.fixture
+def desk(made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Path]:
+    """Lay these names of ``made`` into a new folder of one's own and go there."""
+
+    def lay(*names: str) -> Path:
+        for name in names:
+            if (made / name).is_file():
+                shutil.copy(made / name, tmp_path / name)
+            else:
+                os.symlink(made / name, tmp_path / name)
+        monkeypatch.chdir(tmp_path)
+        monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+        return tmp_path
+
+    return lay
+
+
+def make_store(path: Path) -> None:
+    """A store of two versions: VEHICLE and car_1 voted a wall away, and car_1 has voted again since."""
+    before = two_walls()
+    gone = {(0, 0): Say(states_plane({(10, c): CellState.CHANGED_EMPTY for c in (10, 11, 12)}))}
+    stays = {(0, 1): Say(states_plane({(10, c): CellState.UNCHANGED_OCCUPIED for c in (10, 11, 12)}))}
+    store = Store.create(f"sqlite:///{path}", before)
+    accept(store, [examine(encode(make_ballot(before, gone, name))) for name in ("VEHICLE", "car_1")])
+    publish(store, override=True)
+    accept(store, [examine(encode(make_ballot(before, stays, name, "d2"))) for name in ("VEHICLE", "car_1")])
+    store.close()

@@ -1,0 +1,164 @@
+"""Ctrl-C in real processes: exit code 130, one line, no traceback, nothing half-written and nothing lost."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from live_server import mapvote
+
+Desk = Callable[..., Path]
+
+
+def interrupt(command: list[str], folder: Path, when: Callable[[], bool]) -> subprocess.CompletedProcess[str]:
+    """Run ``command`` in a process group of its own, as a terminal does; Ctrl-C to all of it once ``when`` says so."""
+    process = subprocess.Popen(
+        command, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
+    )
+    deadline = time.monotonic() + 120
+    while not when() and process.poll() is None and time.monotonic() < deadline:
+        time.sleep(0.01)
+    assert process.poll() is None, f"it had ended before: {process.communicate()}"
+    os.killpg(process.pid, signal.SIGINT)
+    out, err = process.communicate(timeout=60)
+    return subprocess.CompletedProcess(command, process.returncode, out, err)
+
+
+def stopped_by_a_line(done: subprocess.CompletedProcess[str]) -> bool:
+    assert "Traceback" not in done.stderr, done.stderr
+    assert done.stderr.strip().splitlines()[-1].startswith("mapvote: interrupted"), done.stderr
+    return done.returncode == 130
+
+
+def after(seconds: float) -> Callable[[], bool]:
+    start = time.monotonic()
+    return lambda: time.monotonic() - start > seconds
+
+
+def slowed(verb_words: list[str], patch: str) -> list[str]:
+    """``mapvote`` with one function that says ready (by a file of this name) and then takes its time."""
+    code = (
+        "import sys, time, pathlib\n"
+        "def wait(*a, **k):\n    pathlib.Path('ready').touch()\n    time.sleep(60)\n"
+        f"{patch}\nsys.argv = ['mapvote', *{verb_words!r}]\nfrom mapvote.__main__ import main\nmain()\n"
+    )
+    return [sys.executable, "-c", code]
+
+
+VERBS = {
+    "info my_map": "import mapvote.formats.describe as m; m.describe = wait",
+    "doctor MY_DRIVE": "import mapvote.formats.doctor as m; m.examine = wait",
+    "build MY_DRIVE --out new": "import mapvote.slam.build as m; m.build_map = wait",
+    "vote MY_DRIVE --map my_map --out new": "import mapvote.vehicle as m; m.vote_drive = wait",
+    "update my_map car_1.ballot --out new": "import mapvote.fusion.offline as m; m.update_map = wait",
+    "import city.pcd new": "import mapvote.formats.maps.cloud as m; m.to_map = wait",
+    "export my_map new.pcd": "import mapvote.formats as m; m.export_map = wait",
+    "publish STORE": "import mapvote.server.store.publish as m; m.publish = wait",
+    "log STORE": "import mapvote.server.store.store as m; m.Store.versions = wait",
+    "changes STORE --out new": "import mapvote.server.insight.history as m; m.changes_between = wait",
+    "vehicles STORE": "import mapvote.server.insight.history as m; m.vehicle_standings = wait",
+    "config": "import mapvote.config as m; m.load_with_sources = wait",
+}
+
+
+@pytest.mark.parametrize("line", VERBS)
+def test_ctrl_c_in_the_middle_of_a_verb_ends_it_with_one_line(line: str, desk: Desk) -> None:
+    words = line.split()
+    here = desk(*(w for w in words if w in ("my_map", "MY_DRIVE", "car_1.ballot", "city.pcd", "STORE")))
+    done = interrupt(slowed(words, VERBS[line]), here, (here / "ready").exists)
+    assert stopped_by_a_line(done)
+    left = {p.name for p in here.iterdir()} - {"ready", "STORE-wal", "STORE-shm", *words}
+    assert left == set()
+    assert not any((here / name).exists() for name in ("new", "new.pcd"))
+
+
+WRITERS = {
+    "map": ("import city.pcd out", "import mapvote.formats.maps.mapvote_folder as m; m.encode_tile = wait"),
+    "points": ("export my_map out.pcd", "import pypcd4 as m; m.PointCloud.save = wait"),
+    "tiles": ("export my_map out", "import pypcd4 as m; m.PointCloud.save = wait"),
+    "the disk's own time": ("export my_map out.pcd", "import os as m; m.fsync = wait"),
+    "a map in the place of another": ("update my_map car_1.ballot --out out", "import os as m; m.fsync = wait"),
+}
+
+
+@pytest.mark.parametrize("what", WRITERS)
+def test_ctrl_c_while_writing_leaves_what_was_there_and_no_litter(what: str, made: Path, desk: Desk) -> None:
+    line, patch = WRITERS[what]
+    words = line.split()
+    here = desk(*(w for w in words if w in ("my_map", "car_1.ballot", "city.pcd")))
+    before = set(here.iterdir())
+    if words[0] == "update":
+        shutil.copytree(made / "my_map", here / "out")
+        before.add(here / "out")
+    done = interrupt(slowed(words, patch), here, (here / "ready").exists)
+    assert stopped_by_a_line(done)
+    assert set(here.iterdir()) - before == {here / "ready"}
+    if words[0] == "update":
+        old, new = (sorted(f.name for f in (p / "my_map" / "tiles").iterdir()) for p in (made, made))
+        assert old == new
+        assert (here / "out" / "manifest.json").read_bytes() == (made / "my_map" / "manifest.json").read_bytes()
+
+
+def test_ctrl_c_between_the_two_renames_of_a_map_brings_the_old_one_back(made: Path, desk: Desk) -> None:
+    here = desk("my_map", "car_1.ballot")
+    shutil.copytree(made / "my_map", here / "out")
+    patch = (
+        "import os\nreal, turns = os.replace, []\n"
+        "def replace(a, b):\n    turns.append(a)\n    wait() if len(turns) == 2 else None\n    real(a, b)\n"
+        "os.replace = replace"
+    )
+    done = interrupt(slowed(["update", "my_map", "car_1.ballot", "--out", "out"], patch), here, (here / "ready").exists)
+    assert stopped_by_a_line(done)
+    assert (here / "out" / "manifest.json").read_bytes() == (made / "my_map" / "manifest.json").read_bytes()
+    assert {p.name for p in here.iterdir()} == {"my_map", "car_1.ballot", "out", "ready"}
+
+
+def test_ctrl_c_while_processes_simulate_leaves_no_process_and_no_folder(made: Path, desk: Desk) -> None:
+    here = desk("tiny.toml")
+    patch = "import mapvote.simulation.drives as m; m._processes = lambda stage: 2"
+    done = interrupt(
+        slowed(["simulate", "tiny.toml", "street"], patch), here,
+        lambda: any(here.glob(".street.partial/.*/velodyne/*.bin")),
+    )  # fmt: skip
+    assert stopped_by_a_line(done)
+    assert {p.name for p in here.iterdir()} == {"tiny.toml"}
+
+
+def test_ctrl_c_while_the_program_still_imports_is_one_line(tmp_path: Path) -> None:
+    code = (
+        "import sys, time, pathlib, builtins\nreal = builtins.__import__\n"
+        "def slow(name, *rest):\n"
+        "    if name == 'typer':\n        pathlib.Path('ready').touch(); time.sleep(60)\n"
+        "    return real(name, *rest)\n"
+        "builtins.__import__ = slow\nfrom mapvote.__main__ import main\nmain()"
+    )
+    done = interrupt([sys.executable, "-c", code], tmp_path, (tmp_path / "ready").exists)
+    assert stopped_by_a_line(done)
+
+
+def test_a_server_started_as_the_help_says_ends_on_ctrl_c(desk: Desk) -> None:
+    here = desk("my_map")
+    words = ["serve", "fleet.db", "--map", "my_map", "--port", "0"]
+    with (here / "log").open("w") as log:
+        process = subprocess.Popen(
+            mapvote(*words), cwd=here, stdout=subprocess.PIPE, stderr=log, text=True, start_new_session=True
+        )
+        assert process.stdout is not None
+        try:
+            while not process.stdout.readline().startswith("serving "):
+                assert process.poll() is None, (here / "log").read_text()
+            os.killpg(process.pid, signal.SIGINT)
+            assert process.wait(30) == 130
+        finally:
+            process.kill()
+            process.stdout.close()
+    assert "Traceback" not in (here / "log").read_text()
+    assert (here / "fleet.db").exists()
