@@ -69,7 +69,13 @@ VERBS = {
 }
 
 
-@pytest.mark.parametrize("line", VERBS)
+FAST = ("vote", "publish")
+"""The others go the same way; each takes a process of its own."""
+
+
+@pytest.mark.parametrize(
+    "line", [pytest.param(v, marks=() if v.startswith(FAST) else (pytest.mark.slow,)) for v in VERBS]
+)
 def test_ctrl_c_in_the_middle_of_a_verb_ends_it_with_one_line(line: str, desk: Desk) -> None:
     words = line.split()
     here = desk(*(w for w in words if w in ("my_map", "MY_DRIVE", "car_1.ballot", "city.pcd", "STORE")))
@@ -102,8 +108,6 @@ def test_ctrl_c_while_writing_leaves_what_was_there_and_no_litter(what: str, mad
     assert stopped_by_a_line(done)
     assert set(here.iterdir()) - before == {here / "ready"}
     if words[0] == "update":
-        old, new = (sorted(f.name for f in (p / "my_map" / "tiles").iterdir()) for p in (made, made))
-        assert old == new
         assert (here / "out" / "manifest.json").read_bytes() == (made / "my_map" / "manifest.json").read_bytes()
 
 
@@ -121,6 +125,7 @@ def test_ctrl_c_between_the_two_renames_of_a_map_brings_the_old_one_back(made: P
     assert {p.name for p in here.iterdir()} == {"my_map", "car_1.ballot", "out", "ready"}
 
 
+@pytest.mark.slow
 def test_ctrl_c_while_processes_simulate_leaves_no_process_and_no_folder(made: Path, desk: Desk) -> None:
     here = desk("tiny.toml")
     patch = "import mapvote.simulation.drives as m; m._processes = lambda stage: 2"
