@@ -36,6 +36,9 @@ def simulate(
 
 def evaluate(
     scenario: Scenario,
+    drive: Annotated[
+        Path | None, typer.Argument(metavar="[DRIVE]", help="a recorded drive, after the word real", show_default=False)
+    ] = None,
     seed: Seed = 1,
     case: Annotated[
         str,
@@ -51,11 +54,14 @@ def evaluate(
     sensor: Annotated[
         str | None, typer.Option(metavar="NAME", help="vlp16, hdl32e or hdl64e; else the scenario's")
     ] = None,
+    out: Annotated[Path | None, typer.Option(metavar="FOLDER", help="real: where the pictures of the worst go")] = None,
     config: Config = None,
 ) -> None:
     """Simulate, map, vote, and score: Tables II to IV of the paper with its figures beside ours.
 
     mapvote evaluate corner --seed 2 --case 1,5,columns
+
+    mapvote evaluate real my_drive --out report
     """
     from rich.console import Console
 
@@ -66,6 +72,13 @@ def evaluate(
     from mapvote.evaluation.experiments.scene import Scene, default_cache
     from mapvote.evaluation.reporting.tables import as_json, tables, write_text
 
+    if scenario == "real":
+        if drive is None:
+            raise typer.BadParameter("name the drive: mapvote evaluate real DRIVE", param_hint="DRIVE")
+        _evaluate_real(drive, seed, json, out, config)
+        return
+    if drive is not None:
+        raise typer.BadParameter(f"{drive}: a drive follows the word real only", param_hint="DRIVE")
     if poses not in ("ndt", "truth"):
         raise typer.BadParameter(f"{poses!r}: choose ndt or truth", param_hint="--poses")
     settings = load_settings(config)
@@ -81,6 +94,32 @@ def evaluate(
     if json is not None:
         write_text(as_json(result), json)
         print(f"{json}: all numbers")
+
+
+def _evaluate_real(drive: Path, seed: int, json: Path | None, out: Path | None, config: Path | None) -> None:
+    """The bench of a recorded drive; its own blocks are map and vehicles, nothing is simulated but the changes."""
+    from rich.console import Console
+
+    from mapvote.config import load_settings
+    from mapvote.evaluation.experiments.cases import choose_cases
+    from mapvote.evaluation.experiments.real.bench import bench
+    from mapvote.evaluation.reporting.real_figures import draw_worst
+    from mapvote.evaluation.reporting.real_tables import real_tables
+    from mapvote.evaluation.reporting.tables import write_text
+    from mapvote.evaluation.results import to_json
+
+    settings = load_settings(config)
+    cases, _ = choose_cases(settings, "columns")
+    with stages() as told:
+        result = bench(drive, settings, cases, told, seed=seed)
+    for table in real_tables(result, "columns"):
+        Console(width=140).print(table)
+    if json is not None:
+        write_text(to_json(result.figures("columns")), json)
+        print(f"{json}: all numbers")
+    if out is not None:
+        for picture in draw_worst(result, "columns", out):
+            print(f"{picture}")
 
 
 def demo(

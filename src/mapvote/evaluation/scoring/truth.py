@@ -98,6 +98,8 @@ def lay_on(states: U8, grid: Grid, window: Grid) -> U8:
     """``states`` over ``grid`` as an array over ``window`` of the same lattice; NO_VOTE where they do not reach."""
     out = np.full(window.shape, NO_VOTE, dtype=np.uint8)
     common = grid.intersection(window)
+    if 0 in common.shape:
+        return out
     out[common.slices_in(window)] = states[common.slices_in(grid)]
     return out
 

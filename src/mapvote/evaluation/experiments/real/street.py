@@ -8,7 +8,7 @@ measured here is a lower bound of what a fleet meets.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -16,11 +16,11 @@ from scipy import ndimage
 
 from mapvote.codec.ballot import Ballot
 from mapvote.config import Settings
-from mapvote.core.geometry import exp, transform
+from mapvote.core.geometry import transform
 from mapvote.core.grid import CELL_SIZE, Grid, window_around
 from mapvote.core.point_map import PointMap
-from mapvote.core.reference import LocalMap
-from mapvote.core.types import F64, I64, U8, Bool, CellState, Drive, MapvoteError, Scan
+from mapvote.core.reference import LocalMap, reference_window
+from mapvote.core.types import F64, I64, NO_VOTE, U8, Bool, CellState, Drive, MapvoteError
 from mapvote.evaluation.experiments.cases import Case, fuse_case
 from mapvote.evaluation.experiments.shared_pass import SharedPass
 from mapvote.evaluation.scoring.cells import determined, ratio
@@ -31,10 +31,19 @@ from mapvote.localisation.tracker import GivenPoses
 from mapvote.perception.frontend import DriveReport, Frontend, Observation
 from mapvote.perception.moving_objects import MovingFilter
 from mapvote.perception.raycast import find_obstacles
-from mapvote.slam.build import build_map
+from mapvote.slam.build import BuildReport, build_map
 
 VEHICLES = 3
-Disturb = Callable[[Drive], Drive]
+WRONG_M = 0.5
+"""A pose farther off than this is wrong."""
+Edit = Callable[[Drive, I64], Drive]
+"""Changes a drive before it is used: what its sensor sees, or what it believes. The second argument: which scans of the
+recording (n,) it has."""
+
+
+def unedited(drive: Drive, scans: I64) -> Drive:
+    """As recorded."""
+    return drive
 
 
 def split(n: int, block: int) -> tuple[str, list[str]]:
@@ -49,53 +58,36 @@ def split(n: int, block: int) -> tuple[str, list[str]]:
     ]
 
 
-def as_given(drive: Drive) -> Drive:
-    """The prior as recorded."""
-    return drive
+@dataclass(frozen=True)
+class Street:
+    """The map of every other block, and what is needed to judge those who vote on it."""
 
+    folder: Path
+    point_map: PointMap
+    built: BuildReport
+    block: int
+    voting: Sequence[I64]
+    """The scans of each vehicle."""
+    T_map_lidar: F64
+    """(n, 4, 4) the reference trajectory of the whole recording in the map's frame."""
+    grid: Grid
+    movers: Bool
+    """Cells in which something moved while the map was made."""
+    settings: Settings
 
-def disturbed(drive: Drive, sigma_m: float = 0.5, sigma_deg: float = 2.0, seed: int = 0) -> Drive:
-    """The prior with an independent error per scan: ``sigma_m`` in x and y, ``sigma_deg`` in yaw (normal)."""
-    if drive.T_map_lidar_prior is None:
-        raise MapvoteError(f"{drive.path}: has no prior to disturb")
-    rng = np.random.default_rng([seed, *drive.vehicle.encode()])
-    off = np.zeros((len(drive), 6))
-    off[:, :2] = rng.normal(0.0, sigma_m, (len(drive), 2))
-    off[:, 5] = rng.normal(0.0, np.radians(sigma_deg), len(drive))
-    worse = np.array([T @ exp(xi) for T, xi in zip(drive.T_map_lidar_prior, off, strict=True)])
-    return replace(drive, T_map_lidar_prior=worse, prior_sigma_m=2 * sigma_m, prior_sigma_deg=2 * sigma_deg)
-
-
-def every_other_beam(drive: Drive) -> Drive:
-    """The drive as a sensor with half the beams would have seen it; points are matched to the nearest beam."""
-    elevations = np.sort(np.asarray(drive.sensor.elevations_deg))
-    sensor = replace(drive.sensor, elevations_deg=tuple(elevations[::-1][::2].tolist()))
-
-    def read_scan(i: int) -> Scan:
-        scan = drive.read_scan(i)
-        flat = np.hypot(scan.points[:, 0], scan.points[:, 1])
-        elevation = np.degrees(np.arctan2(scan.points[:, 2], flat))
-        above = np.searchsorted(elevations, elevation).clip(1, len(elevations) - 1)
-        nearest = above - (elevation - elevations[above - 1] < elevations[above] - elevation)
-        keep = (len(elevations) - 1 - nearest) % 2 == 0
-        return replace(
-            scan,
-            points=scan.points[keep],
-            time_s=None if scan.time_s is None else scan.time_s[keep],
-            intensity=None if scan.intensity is None else scan.intensity[keep],
-        )
-
-    return replace(drive, sensor=sensor, read_scan=read_scan)
+    @property
+    def mapped(self) -> Bool:
+        """(rows, cols) cells in which the map holds an obstacle."""
+        return np.asarray(reference_window(self.point_map, self.grid).occupied != 0)
 
 
 @dataclass(frozen=True)
 class RealRun:
-    """One drive against the map of its other blocks."""
+    """Three vehicles on a street."""
 
-    point_map: PointMap
-    grid: Grid
+    street: Street
     states: Mapping[str, U8]
-    """Decided by each case, over ``grid``."""
+    """Decided by each case, over the street's grid."""
     movers: Bool
     """Cells in or next to which something moved, by the filter on the map's and the vehicles' scans."""
     reached: Bool
@@ -107,9 +99,23 @@ class RealRun:
     prior_error_m: F64
     scans: int
 
-    def changed_share(self, case: str, *, with_movers: bool) -> float:
-        """Share of determined cells decided as changed, on a street where nothing changed."""
+    @property
+    def lost_share(self) -> float:
+        """Of the scans: abstained."""
+        return 1.0 - len(self.error_m) / self.scans
+
+    @property
+    def wrong_share(self) -> float:
+        """Of the scans: voted from a place WRONG_M or more beside the true one."""
+        return float(np.count_nonzero(self.error_m >= WRONG_M)) / self.scans
+
+    def changed_share(self, case: str, *, with_movers: bool, of_mapped: bool = False) -> float:
+        """Share of determined cells (of those in which the map holds something) decided as changed, where nothing did.
+
+        With ``of_mapped`` only cells that hold an obstacle in the map are counted, above and below the line.
+        """
         scored = determined(self.states[case]) & (np.ones_like(self.movers) if with_movers else ~self.movers)
+        scored &= self.street.mapped if of_mapped else np.ones_like(scored)
         return ratio(np.count_nonzero(changed(self.states[case]) & scored), np.count_nonzero(scored))
 
 
@@ -118,61 +124,69 @@ def changed(states: U8) -> Bool:
     return (states == CellState.CHANGED_OCCUPIED) | (states == CellState.CHANGED_EMPTY)
 
 
-def run_real(
-    folder: Path,
-    cases: Sequence[Case],
-    settings: Settings,
-    *,
-    block: int = 12,
-    change_prior: Disturb = as_given,
-    first_pose_only: bool = False,
-    thin: bool = False,
-    edit: Callable[[PointMap, Grid, Bool], PointMap] | None = None,
-) -> RealRun:
-    """Map from every other block of the drive at ``folder``, three vehicles from the rest, every case decided.
+def reference_trajectory(folder: Path, settings: Settings) -> F64:
+    """(n, 4, 4) where every scan was taken: ``poses.txt`` where there is one, else SLAM over the whole recording."""
+    file = folder / "poses.txt"
+    if file.is_file():
+        return read_T_map_lidar(file, folder)
+    _, built = build_map([open_drive(folder)], settings)
+    return built.tracks[0].T_map_lidar
 
-    ``edit(map, window, movers)`` changes the finished map (injected changes); ``poses.txt`` is read for scoring only.
-    """
-    n = len(open_drive(folder))
+
+def lay_street(
+    folder: Path, settings: Settings, reference: F64, *, block: int = 12, survey_edit: Edit = unedited
+) -> Street:
+    """The map of every other block of the drive at ``folder``; ``reference`` (n, 4, 4) is for scoring only."""
+    n = len(reference)
     mapped, voting = split(n, block)
-    survey = open_drive(folder, scans=mapped)
+    chosen = _indices(mapped, n)
+    survey = survey_edit(open_drive(folder, scans=mapped), chosen)
     point_map, built = build_map([survey], settings)
-    reference = read_T_map_lidar(folder / "poses.txt", folder)
-    T_map_world = rigid_between(built.tracks[0].T_map_lidar, reference[_indices(mapped, n)])
+    T_map_survey = built.tracks[0].T_map_lidar
+    T_map_lidar = rigid_between(T_map_survey, reference[chosen]) @ reference
+    grid = _window(point_map, T_map_lidar)
+    movers = _moving_cells(survey, T_map_survey, point_map, grid, settings)
+    scans = [_indices(text, n) for text in voting]
+    return Street(folder, point_map, built, block, scans, T_map_lidar, grid, movers, settings)
 
-    grid = _window(point_map, reference)
-    movers = _moving_cells(survey, built.tracks[0].T_map_lidar, point_map, grid, settings)
-    point_map = edit(point_map, grid, movers) if edit else point_map
-    reached = np.zeros(grid.shape, dtype=np.bool_)
+
+def vote_on(street: Street, cases: Sequence[Case], *, edit: Edit = unedited, first_pose_only: bool = False) -> RealRun:
+    """Three vehicles drive the street's other blocks; every case is decided."""
+    grid, settings = street.grid, street.settings
+    movers, reached = street.movers.copy(), np.zeros(grid.shape, dtype=np.bool_)
     ballots: dict[str, list[Ballot]] = {case.name: [] for case in cases}
     reports, metres, degrees, prior_metres = [], [], [], []
-    for k, scans in enumerate(voting):
-        drive = open_drive(folder, scans=scans, vehicle=f"v{k + 1}")
-        T_true = T_map_world @ reference[_indices(scans, n)]
-        drive = change_prior(every_other_beam(drive) if thin else drive)
-        vehicle = SharedPass(drive, point_map, settings, cases)
+    for k, scans in enumerate(street.voting):
+        text = ",".join(f"{i}:{i + 1}" for i in scans.tolist())
+        drive = edit(open_drive(street.folder, scans=text, vehicle=f"v{k + 1}"), scans)
+        T_true = street.T_map_lidar[scans]
+        vehicle = SharedPass(drive, street.point_map, settings, cases)
         for i, scan in enumerate(drive):
             known = i == 0 or not first_pose_only
             _note_movers(vehicle.observe(scan, PosePrior.of(drive, i) if known else None), grid, movers)
         _note_movers(vehicle.finish(), grid, movers)
-        reached |= _reached_cells(drive, T_true, point_map, grid, settings.voting.window_m)
-        for case in cases:
-            ballots[case.name].append(vehicle.ballot(case))
+        reached |= _reached_cells(drive, T_true, street.point_map, grid, settings.voting.window_m)
         there = np.setdiff1d(np.arange(len(drive)), vehicle.report.lost)
-        off_m, off_rad = pose_errors(np.array(vehicle.report.T_map_lidar)[there], T_true[there])
         reports.append(vehicle.report)
-        metres.append(off_m)
-        degrees.append(np.degrees(off_rad))
+        if len(there):  # who never found himself sends no ballot
+            for case in cases:
+                ballots[case.name].append(vehicle.ballot(case))
+            off_m, off_rad = pose_errors(np.array(vehicle.report.T_map_lidar)[there], T_true[there])
+            metres.append(off_m)
+            degrees.append(np.degrees(off_rad))
         if drive.T_map_lidar_prior is not None:
             prior_metres.append(pose_errors(drive.T_map_lidar_prior, T_true)[0])
-    states = {
-        case.name: fuse_case(point_map, ballots[case.name], case.min_votes, settings.fuse, grid).states
-        for case in cases
-    }
-    return RealRun(
-        point_map, grid, states, ndimage.binary_dilation(movers, np.ones((3, 3))), reached, reports,
-        np.concatenate(metres), np.concatenate(degrees), np.concatenate(prior_metres), sum(r.scans for r in reports),
-    )  # fmt: skip
+    states = {case.name: _decided(street, ballots[case.name], case) for case in cases}
+    near_movers = ndimage.binary_dilation(movers, np.ones((3, 3)))
+    off_m, off_deg, prior_m = (np.concatenate([np.zeros(0), *parts]) for parts in (metres, degrees, prior_metres))
+    total = sum(report.scans for report in reports)
+    return RealRun(street, states, near_movers, reached, reports, off_m, off_deg, prior_m, total)
+
+
+def _decided(street: Street, ballots: list[Ballot], case: Case) -> U8:
+    if not ballots:
+        return np.full(street.grid.shape, NO_VOTE, dtype=np.uint8)
+    return fuse_case(street.point_map, ballots, case.min_votes, street.settings.fuse, street.grid).states
 
 
 def _moving_cells(survey: Drive, T_map_lidar: F64, point_map: PointMap, grid: Grid, settings: Settings) -> Bool:
@@ -235,7 +249,7 @@ class FalseChange:
 def largest_false_changes(run: RealRun, case: str, most: int = 10) -> list[FalseChange]:
     """The largest groups, 8-connected, one class each, largest first."""
     out = []
-    x, y = run.grid.centres()
+    x, y = run.street.grid.centres()
     for state in (CellState.CHANGED_OCCUPIED, CellState.CHANGED_EMPTY):
         label, count = ndimage.label(run.states[case] == state, structure=np.ones((3, 3)))
         for k in range(1, count + 1):

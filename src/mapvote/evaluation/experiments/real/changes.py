@@ -1,0 +1,158 @@
+"""Changes cast into the scans of a real drive: what was asked, and how much of it was found."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import ndimage
+
+from mapvote.core.columns import GROUND_MARGIN_M
+from mapvote.core.geometry import inverse, transform
+from mapvote.core.grid import Grid
+from mapvote.core.reference import LocalMap, reference_window
+from mapvote.core.types import F64, U8, Bool, CellState, Drive
+from mapvote.core.voxels import VoxelCloud
+from mapvote.evaluation.experiments.cases import Case
+from mapvote.evaluation.experiments.real.raycast import Thing, with_things
+from mapvote.evaluation.experiments.real.street import Edit, RealRun, Street, changed, lay_street, vote_on
+from mapvote.evaluation.experiments.real.things import Site
+from mapvote.evaluation.scoring.cells import ratio
+from mapvote.formats import open_drive
+from mapvote.localisation.tracker import GivenPoses
+from mapvote.perception.raycast import find_obstacles
+
+NEAR_CELLS = 5
+"""1.5 m: precision is counted this close to the things, because over a street it depends on their number."""
+
+
+@dataclass(frozen=True)
+class Asked:
+    """One thing in the cells of a run."""
+
+    kind: str
+    state: CellState
+    cells: Bool
+    """(rows, cols) that must be decided so: rays met it there, or had met it in the map's scans."""
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """How much of one kind was found."""
+
+    kind: str
+    things: int
+    """That a ray met in at least one cell."""
+    half: int
+    """Of them: at least half of their cells were decided rightly."""
+    touched: int
+    """Of them: a cell at the thing, or next to one, was."""
+    cell_recall: float
+    """Share of all their cells."""
+
+
+def survey_site(street: Street) -> Site:
+    """What all scans of the recording show, in the frame of the street's map."""
+    drive = open_drive(street.folder)
+    localise = GivenPoses(drive.stamps_ns, street.T_map_lidar)
+    around = LocalMap(street.point_map, street.settings.voting.window_m)
+    cloud = VoxelCloud(street.point_map.lattice)
+    for scan in drive:
+        fix = localise(scan, None)
+        T = fix.registration.T_map_lidar
+        points = transform(T, fix.points)
+        cloud.enter(points, ~find_obstacles(points, around.at(T[:3, 3])[0])[0])
+    reference = reference_window(street.point_map, street.grid)
+
+    def ground(xy: F64) -> F64:
+        rows, cols, inside = street.grid.indices_of(xy)
+        out = np.full(len(xy), np.nan)
+        out[inside] = reference.ground_z[rows[inside], cols[inside]]
+        return out
+
+    return Site(cloud.points()[0], ground, street.T_map_lidar[:, :3, 3])
+
+
+def among(things: Sequence[Thing], street: Street) -> Edit:
+    """Scans recorded among ``things``, which lie in the frame of the street's map."""
+
+    def edit(drive: Drive, scans: np.ndarray) -> Drive:
+        return with_things(drive, scans, things, street.T_map_lidar)
+
+    return edit
+
+
+def built(street: Street, site: Site, cases: Sequence[Case], seed: int, each: int) -> tuple[RealRun, list[Asked]]:
+    """The vehicles find new things, walls moved by half a metre, and parked cars gone; hedges stood before, too."""
+    things, hedges = site.placed(seed, each)
+    standing = [Thing("hedge", triangles) for triangles in hedges]
+    moved = site.moved_walls(seed, 2 * each)
+    gone = site.gone_cars(each)
+    if hedges:
+        street = lay_street(
+            street.folder, street.settings, street.T_map_lidar, block=street.block, survey_edit=among(standing, street)
+        )
+    run = vote_on(street, cases, edit=among([*standing, *things, *moved, *gone], street))
+    asked = [_new(street, thing) for thing in [*things, *moved]]
+    asked += [_gone(street, thing, thing.left) for thing in [*moved, *gone] if thing.kind != "wall set forward"]
+    return run, asked
+
+
+def demolished(street: Street, site: Site, cases: Sequence[Case], seed: int, each: int) -> tuple[RealRun, list[Asked]]:
+    """The map was made among things that the vehicles do not find any more."""
+    things = [thing for thing in site.placed(seed + 100, each)[0] if thing.kind != "wall behind a hedge"]
+    before = lay_street(
+        street.folder, street.settings, street.T_map_lidar, block=street.block, survey_edit=among(things, street)
+    )
+    T_map_old = before.T_map_lidar[0] @ inverse(street.T_map_lidar[0])
+    return vote_on(before, cases), [
+        _gone(before, thing, [transform(T_map_old, p) for p in thing.met]) for thing in things
+    ]
+
+
+def _new(street: Street, thing: Thing) -> Asked:
+    kind = f"{thing.kind}, new side" if thing.goes is not None else f"{thing.kind} built"
+    return Asked(kind, CellState.CHANGED_OCCUPIED, _cells(street, thing.met) & ~street.mapped)
+
+
+def _gone(street: Street, thing: Thing, points: Sequence[F64]) -> Asked:
+    kind = f"{thing.kind}, old side" if len(thing.comes) and thing.goes is not None else thing.kind
+    kind = kind if thing.goes is not None else f"{kind} gone"
+    cells = _cells(street, points) & street.mapped
+    return Asked(kind, CellState.CHANGED_EMPTY, cells & ~_cells(street, thing.met) if thing.goes is not None else cells)
+
+
+def _cells(street: Street, clouds: Sequence[F64]) -> Bool:
+    """Cells with points (m, 3) above the street's ground."""
+    out = np.zeros(street.grid.shape, dtype=np.bool_)
+    reference = reference_window(street.point_map, street.grid)
+    for points in clouds:
+        rows, cols, inside = street.grid.indices_of(points)
+        rows, cols, z = rows[inside], cols[inside], points[inside, 2]
+        high = z - reference.ground_z[rows, cols] >= GROUND_MARGIN_M
+        out[rows[high], cols[high]] = True
+    return out
+
+
+def score(asked: Sequence[Asked], states: U8) -> list[Found]:
+    """What ``states`` (rows, cols) say of the things, by kind in the order in which they were asked."""
+    out = []
+    for kind in dict.fromkeys(a.kind for a in asked):
+        these = [a for a in asked if a.kind == kind and a.cells.any()]
+        right = [np.count_nonzero((states == a.state) & a.cells) for a in these]
+        size = [np.count_nonzero(a.cells) for a in these]
+        near = [ndimage.binary_dilation(a.cells, np.ones((3, 3))) & (states == a.state) for a in these]
+        half = sum(bool(2 * r >= n) for r, n in zip(right, size, strict=True))
+        touched = sum(bool(n.any()) for n in near)
+        out.append(Found(kind, len(these), half, touched, ratio(sum(right), sum(size))))
+    return out
+
+
+def precision_near(asked: Sequence[Asked], states: U8, grid: Grid) -> float:
+    """Share of the cells decided changed within 1.5 m of the things that are, or lie next to, cells so changed."""
+    near, right = np.zeros(grid.shape, dtype=np.bool_), np.zeros(grid.shape, dtype=np.bool_)
+    for a in asked:
+        near |= ndimage.binary_dilation(a.cells, np.ones((3, 3)), iterations=NEAR_CELLS)
+        right |= ndimage.binary_dilation(a.cells, np.ones((3, 3))) & (states == a.state)
+    return ratio(np.count_nonzero(right), np.count_nonzero(changed(states) & near))
