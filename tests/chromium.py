@@ -27,6 +27,7 @@ FLAGS = (
     "--hide-scrollbars",
     "--remote-debugging-pipe",
 )
+SOFTWARE_WEBGL = ("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 
 
 def program() -> str | None:
@@ -38,14 +39,15 @@ def program() -> str | None:
 class Chromium:
     """One browser with one page. ``errors``: what the page throws or logs as an error; ``requests``: every URL."""
 
-    def __init__(self, width: int = 1280, height: int = 800, dark: bool = False) -> None:
+    def __init__(self, width: int = 1280, height: int = 800, dark: bool = False, webgl: bool = False) -> None:
         command = program()
         if command is None:
             raise FileNotFoundError("Chromium is not installed (apt-get install chromium)")
         self._profile = Path(tempfile.mkdtemp(prefix="mapvote-chromium-"))
         to_read, self._write = os.pipe()
         self._read, to_write = os.pipe()
-        arguments = [command, *FLAGS, f"--user-data-dir={self._profile}", f"--window-size={width},{height}"]
+        graphics = SOFTWARE_WEBGL if webgl else ("--disable-3d-apis",)
+        arguments = [command, *FLAGS, *graphics, f"--user-data-dir={self._profile}", f"--window-size={width},{height}"]
         # Chromium reads commands on descriptor 3 and answers on 4.
         shell = f'exec "$@" 3<&{to_read} 4>&{to_write}'
         self._process = subprocess.Popen(
@@ -158,5 +160,7 @@ class Chromium:
             self.errors.append(str(parameters["exceptionDetails"].get("exception", {}).get("description")))
         elif method == "Log.entryAdded" and parameters["entry"]["level"] == "error":
             self.errors.append(f"{parameters['entry']['text']} {parameters['entry'].get('url', '')}")
+        elif method == "Runtime.consoleAPICalled" and parameters["type"] == "error":
+            self.errors.append(" ".join(str(said.get("value", said.get("description"))) for said in parameters["args"]))
         elif method == "Network.requestWillBeSent":
             self.requests.append(str(parameters["request"]["url"]))

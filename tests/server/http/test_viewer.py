@@ -76,7 +76,7 @@ class FakeServer:
         self.asked.append((path, key))
         if not path.startswith("/v1/"):
             name = "index.html" if path == "/" else path.removeprefix("/viewer/")
-            page = files("mapvote.server") / "viewer" / name
+            page = files("mapvote.server.http") / "viewer" / name
             return 200, TYPES[name.rsplit(".", 1)[1]], page.read_bytes()
         if self.key is not None and key != f"Bearer {self.key}":
             return 401, "application/json", json.dumps({"detail": "this key is unknown or revoked"}).encode()
@@ -211,7 +211,8 @@ def test_the_page_lists_what_was_built_and_demolished_and_asks_nobody_else(
 ) -> None:
     open_page(browser, server)
     assert text(browser, "#which-map") == "street, version 2"
-    assert "2 built" in text(browser, "#tally")
+    assert "1 built" in text(browser, "#tally")
+    assert text(browser, "#small summary") == "1 smaller than 1 m²", "the pole is folded away"
     assert "2 demolished" in text(browser, "#tally")
     first = text(browser, "#changes li").split("\n")
     assert first == ["Built", "12.4 m²", "7.8 m high"], "the largest comes first"
@@ -271,7 +272,7 @@ def test_a_click_elsewhere_tells_who_voted_what_and_names_stay_text(browser: Chr
 
 def test_a_link_opens_the_same_change_again(browser: Chromium, server: FakeServer) -> None:
     open_page(browser, server)
-    last = browser.run("document.querySelector('#changes li:last-child').id.slice(5)")
+    last = browser.run("document.querySelector('#small li').id.slice(5)")
     open_page(browser, server, f"#change={last}")
     browser.wait("!document.querySelector('#details').hidden")
     assert "0.36 m² (4 cells)" in text(browser, "#details")

@@ -77,7 +77,7 @@ def test_the_verb_says_the_same(town: tuple[Path, str]) -> None:
 
     done = subprocess.run(mapvote("vehicles", town[0]), capture_output=True, text=True, check=True)
     line = next(line for line in done.stdout.splitlines() if "liar" in line)
-    assert "contradicts" in line.replace("contradi…", "contradicts")
+    assert "contradi" in line, "a narrow terminal cuts or wraps the word"
 
 
 def test_the_page_on_a_real_server(town: tuple[Path, str], tmp_path: Path) -> None:

@@ -138,15 +138,21 @@ def test_geojson_says_that_it_is_in_map_metres_and_is_the_same_every_time() -> N
     }
     assert feature["properties"] == {
         "kind": "built",
+        "size": "small",
         "area_m2": 0.9,
         "height_m": 2.0,
+        "volume_m3": 0.27,
         "cells": 10,
         "points": 10,
         "votes_min": 0,
         "votes_median": 0.0,
+        "against_median": 0.0,
+        "share_for": None,
         "first_seen": None,
         "last_seen": None,
         "versions": [],
+        "box": [[0.3, -0.6], [1.5, 0.6]],
+        "near": [],
     }
 
 

@@ -10,7 +10,7 @@ from anyio import to_thread
 from fastapi import FastAPI
 
 from mapvote.config import Settings
-from mapvote.server.http import ballot_route, operator_routes, pages, vehicle_routes
+from mapvote.server.http import ballot_route, cloud_routes, desk_routes, operator_routes, pages, vehicle_routes
 from mapvote.server.http.auth import Guard
 from mapvote.server.http.browsers import Hosts
 from mapvote.server.http.middleware import Watch
@@ -50,7 +50,7 @@ def create_app(
         redoc_url=None,
     )
     app.state.services = parts
-    for part in (ballot_route, vehicle_routes, operator_routes, pages):
+    for part in (ballot_route, vehicle_routes, operator_routes, desk_routes, cloud_routes, pages):
         app.include_router(part.router)
     app.add_exception_handler(400, unreadable)
     hosts, guard = Hosts(parts.settings.server.hosts), Guard(store, parts.threads.lookups, opened=opened)

@@ -7,7 +7,7 @@ from concurrent.futures import CancelledError
 from contextlib import contextmanager
 from dataclasses import asdict
 from functools import partial
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from anyio import to_thread
 from fastapi import APIRouter, Query, Request, Response
@@ -19,6 +19,7 @@ from mapvote.server.http.auth import operator, reviewer, sees_names
 from mapvote.server.http.schemas import LEAST, MOST, PublishAsk, Published, RollbackAsk, as_json, iso, problems
 from mapvote.server.http.services import Services, services
 from mapvote.server.insight.explain import explain_cell
+from mapvote.server.insight.geojson import as_csv, feature_rows
 from mapvote.server.insight.history import changes_between, coverage, vehicle_standings
 from mapvote.server.store.keys import pseudonyms
 from mapvote.server.store.publish import publish, rollback
@@ -68,18 +69,22 @@ async def roll_back(request: Request, ask: RollbackAsk) -> dict[str, int]:
 @router.get(
     "/v1/changes",
     response_model=dict[str, Any],
-    responses=problems(404),
-    summary="What changed, as GeoJSON in map metres",
+    responses=problems(404) | {200: {"content": {"text/csv": {}}}},
+    summary="What changed, as GeoJSON in map metres or as CSV",
 )
 def changes(
     request: Request,
     old: Annotated[int, Query(alias="from", ge=LEAST, le=MOST)],
     new: Annotated[int | None, Query(alias="to", ge=LEAST, le=MOST)] = None,
     min_cells: Annotated[int, Query(ge=1, le=100_000)] = 1,
+    format: Literal["geojson", "csv"] = "geojson",
 ) -> Response:
-    """Objects built and demolished between two versions; ``to`` is the newest by default."""
+    """Things built and demolished between two versions; ``to`` is the newest by default."""
     store = services(request).store
-    return as_json(changes_between(store, old, store.current() if new is None else new, min_cells))
+    found = changes_between(store, old, store.current() if new is None else new, min_cells)
+    if format == "csv":
+        return Response(as_csv(feature_rows(found)), media_type="text/csv")
+    return as_json(found)
 
 
 @router.get("/v1/cells", response_model=dict[str, Any], responses=problems(), summary="The votes behind one cell")

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import hashlib
 import html
+from dataclasses import dataclass
+from functools import cache
 from importlib import resources
 from typing import Any
 
 from fastapi import APIRouter, Request, Response
 
+from mapvote.codec.arrays import compress
 from mapvote.server.errors import NotFound
 from mapvote.server.http.schemas import problems
 from mapvote.server.http.services import services
@@ -19,7 +23,7 @@ _DOCS = """<!doctype html><html lang="en"><head><meta charset="utf-8"><title>map
 <body class="plain"><h1>mapvote API</h1><p>For machines: <a href=openapi.json>openapi.json</a></p>
 <table><tr><th>Method<th>Path<th>What<th>How<th>Answers</tr>ROWS</table></body></html>"""
 _STYLE = b'<link rel="stylesheet" href="viewer/pages.css">'
-_VIEWER = resources.files("mapvote.server.http") / "viewer"
+_KINDS = {".html": "text/html", ".js": "text/javascript", ".css": "text/css", ".svg": "image/svg+xml"}
 router = APIRouter()
 
 
@@ -57,18 +61,44 @@ def docs(request: Request) -> Response:
 @router.get("/", include_in_schema=False)
 def index(request: Request) -> Response:
     """The operator's page."""
-    return _page(request, (_VIEWER / "index.html").read_bytes())
+    return _page(request, _assets()["index.html"].plain)
 
 
-@router.get("/viewer/{name}", include_in_schema=False)
-def asset(name: str) -> Response:
+@router.get("/viewer/{name:path}", include_in_schema=False)
+def asset(request: Request, name: str) -> Response:
     """A script or style of the operator's page."""
-    kinds = {".js": "text/javascript", ".css": "text/css", ".svg": "image/svg+xml"}
-    file = _VIEWER / name
-    kind = kinds.get("." + name.rpartition(".")[2])
-    if kind is None or "/" in name or "\\" in name or not file.is_file():
+    found = _assets().get(name)
+    if found is None or found.kind == "text/html":
         raise NotFound(f"there is no page {name[:80]!r}")
-    return Response(file.read_bytes(), media_type=kind, headers={"Cache-Control": "no-cache"})
+    headers = {"Cache-Control": "no-cache", "ETag": found.tag, "Vary": "Accept-Encoding"}
+    if request.headers.get("if-none-match") == found.tag:
+        return Response(status_code=304, headers=headers)
+    if "zstd" in request.headers.get("accept-encoding", ""):
+        return Response(found.packed, media_type=found.kind, headers=headers | {"Content-Encoding": "zstd"})
+    return Response(found.plain, media_type=found.kind, headers=headers)
+
+
+@dataclass(frozen=True, slots=True)
+class _Asset:
+    kind: str
+    plain: bytes
+    packed: bytes
+    tag: str
+
+
+@cache
+def _assets() -> dict[str, _Asset]:
+    """Every file of the page by its name; nothing else can be asked for."""
+    home = resources.files("mapvote.server.http") / "viewer"
+    found = {}
+    for folder in ("", "vendor/"):
+        for file in (home / folder if folder else home).iterdir():
+            kind = _KINDS.get("." + file.name.rpartition(".")[2])
+            if kind is not None:
+                data = file.read_bytes()
+                tag = f'"{hashlib.sha256(data).hexdigest()[:20]}"'
+                found[folder + file.name] = _Asset(kind, data, compress(data, 12), tag)
+    return found
 
 
 def _page(request: Request, text: bytes) -> Response:

@@ -27,7 +27,7 @@ STATUS: Mapping[type[MapvoteError], int] = {
 """The one error table: a class stands for its subclasses too."""
 LEAST, MOST = -(1 << 31), (1 << 31) - 1
 """What a database can compare a version's number with."""
-_PLAIN = r"^[^\x00-\x1f]*$"
+PLAIN = r"^[^\x00-\x1f]*$"
 """No control characters: PostgreSQL stores no NUL."""
 
 Name = Annotated[str, Path(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$")]
@@ -57,7 +57,7 @@ class PublishAsk(BaseModel):
     dry_run: bool = False
     override: bool = Field(default=False, description="publish in spite of the reasons to hold it")
     parent: int | None = Field(default=None, ge=LEAST, le=MOST, description="only if this is still the newest version")
-    reason: str = Field(default="", max_length=200, pattern=_PLAIN)
+    reason: str = Field(default="", max_length=200, pattern=PLAIN)
 
 
 class Published(BaseModel):
@@ -76,7 +76,7 @@ class RollbackAsk(BaseModel):
 
     model_config = ConfigDict(extra="forbid")
     to: int = Field(ge=LEAST, le=MOST)
-    reason: str = Field(default="", max_length=200, pattern=_PLAIN)
+    reason: str = Field(default="", max_length=200, pattern=PLAIN)
 
 
 def problems(*codes: int) -> dict[int | str, dict[str, Any]]:

@@ -14,6 +14,7 @@ from mapvote.server.http.batching import Batcher
 from mapvote.server.http.limits import RateLimit, Uploads
 from mapvote.server.http.manifests import Manifests
 from mapvote.server.http.metrics import Metrics
+from mapvote.server.insight.clouds import Clouds
 from mapvote.server.store.admission import Intake, Sent
 from mapvote.server.store.ballots import Incoming, Receipt
 from mapvote.server.store.publish import Gate
@@ -61,6 +62,8 @@ class Services:
     newest: Batcher[None, int]
     """The number of the newest version."""
     manifests: Manifests
+    clouds: Clouds
+    """Levels of detail for the page."""
     metrics: Metrics
     limit: RateLimit
     uploads: Uploads
@@ -94,6 +97,7 @@ def make_services(store: Store, settings: Settings, gate: Gate | None, executor:
         writer=Batcher(intake.write, most.batch, threads.ballots),
         newest=Batcher(manifests.newest, _READERS, threads.lookups),
         manifests=manifests,
+        clouds=Clouds(store),
         metrics=Metrics(),
         limit=RateLimit(most.ballots_per_minute, most.burst),
         uploads=Uploads(most.max_body_bytes, most.upload_bytes),

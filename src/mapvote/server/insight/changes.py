@@ -1,4 +1,4 @@
-"""Changed cells -> change objects: what was built, what was demolished, as GeoJSON in map metres.
+"""Changed cells -> change objects: what was built, what was demolished, each one thing.
 
 What changed is read off the two maps themselves, so it holds between any two versions, rollbacks included. The
 decisions in between say who voted for it. Objects are found on the lattice, not in tiles.
@@ -7,7 +7,7 @@ decisions in between say who voted for it. Objects are found on the lattice, not
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Literal
 
 import numpy as np
@@ -17,8 +17,13 @@ from mapvote.core.tile import Tile
 from mapvote.core.types import F32, F64, I32, I64, U8, Bool, CellState
 from mapvote.core.voting import VOTE_UNIT
 from mapvote.server.insight.polygons import Ring, pieces, rings
+from mapvote.server.insight.things import REACH_M, group
 
 Kind = Literal["built", "demolished"]
+Size = Literal["large", "car", "small"]
+SMALL_AREA_M2 = 1.0
+CAR_LENGTH_M, CAR_HEIGHT_M = 6.0, 2.5
+"""What fits into these may be parked there: it is listed apart."""
 KINDS: dict[int, Kind] = {CellState.CHANGED_OCCUPIED: "built", CellState.CHANGED_EMPTY: "demolished"}
 _NEVER = np.iinfo(np.int64).max
 _UNTIL = np.iinfo(np.int64).min
@@ -50,8 +55,12 @@ class ChangedCells:
     """Highest point that came or went, above ground."""
     points: I64
     """Points that came or went."""
+    bottom_m: F64
+    """Lowest point that came or went, above ground."""
     votes: I32
     """Votes for the change in the version that made it; 0 where no decision is known."""
+    against: I32
+    """Votes in that version that say something else; undetermined ones say nothing."""
     first_ns: I64
     """End of the first drive that voted for it; a very large number where none is known."""
     last_ns: I64
@@ -68,10 +77,17 @@ class ChangeObject:
     outline: list[list[Ring]]
     """Polygons, each an outer ring and its holes, in lattice corners (col, row)."""
     cells: int
+    where: tuple[I64, I64]
+    """(rows, cols) of its cells on the lattice."""
+    box: tuple[float, float, float, float]
+    """Lowest column and row, highest column and row, in lattice corners."""
     height_m: float
+    volume_m3: float
+    """Of its columns, each from the lowest to the highest voxel that came or went."""
     points: int
     votes_min: int
     votes_median: float
+    against_median: float
     first_seen_ns: int | None
     last_seen_ns: int | None
     versions: list[int]
@@ -80,6 +96,21 @@ class ChangeObject:
     @property
     def area_m2(self) -> float:
         return self.cells * CELL_SIZE * CELL_SIZE
+
+    @property
+    def size(self) -> Size:
+        """How much of a thing it is, for lists that begin with what matters."""
+        if self.area_m2 < SMALL_AREA_M2:
+            return "small"
+        sides = sorted((self.box[2] - self.box[0], self.box[3] - self.box[1]))
+        low = self.height_m < CAR_HEIGHT_M and sides[1] * CELL_SIZE <= CAR_LENGTH_M
+        return "car" if low else "large"
+
+    @property
+    def share_for(self) -> float | None:
+        """Share of the votes that say so, of those that say anything; None where no decision is known."""
+        total = self.votes_median + self.against_median
+        return self.votes_median / total if total else None
 
 
 def changed_cells(before: Tile, after: Tile, decided: Iterable[Decided] = ()) -> ChangedCells:
@@ -91,8 +122,8 @@ def changed_cells(before: Tile, after: Tile, decided: Iterable[Decided] = ()) ->
     old_cell, new_cell = before.cells, after.cells
     cell = np.concatenate([new_cell, old_cell])
     z = np.concatenate([new[:, 2], old[:, 2]]).astype(np.float64)
-    came = _missing_from(new, old)
-    went = _missing_from(old, new)
+    came = missing_from(new, old)
+    went = missing_from(old, new)
     n_came = np.bincount(new_cell[came], minlength=TILE_CELLS**2)
     n_went = np.bincount(old_cell[went], minlength=TILE_CELLS**2)
     flat = np.flatnonzero(n_came + n_went)
@@ -106,68 +137,78 @@ def changed_cells(before: Tile, after: Tile, decided: Iterable[Decided] = ()) ->
     np.minimum.at(bottom, cell[tells], z[tells])
     ground = np.where(np.isnan(after.ground_z), before.ground_z, after.ground_z).reshape(-1).astype(np.float64)
     ground = np.where(np.isnan(ground), bottom, ground)
-    votes, first, last, version = _evidence(flat, states, decided)
+    votes, against, first, last, version = _evidence(flat, states, decided)
     return ChangedCells(
         rows=index[0] * TILE_CELLS + flat // TILE_CELLS,
         cols=index[1] * TILE_CELLS + flat % TILE_CELLS,
         states=states,
         top_m=top[flat] - ground[flat],
+        bottom_m=bottom[flat] - ground[flat],
         points=np.maximum(n_came, n_went)[flat],
         votes=votes,
+        against=against,
         first_ns=first,
         last_ns=last,
         versions=version,
     )
 
 
-def change_objects(changed: Iterable[ChangedCells], min_cells: int = 1) -> list[ChangeObject]:
-    """8-connected cells of one kind, over all tiles: objects in ascending order of their lowest, leftmost cell.
+def change_objects(changed: Iterable[ChangedCells], min_cells: int = 1, reach_m: float = REACH_M) -> list[ChangeObject]:
+    """Things over all tiles, see :func:`mapvote.server.insight.things.group`; in order of their lowest, leftmost cell.
 
     The tiles may come in any order. Objects of fewer than ``min_cells`` cells are left out.
     """
-    parts = [c for c in changed if len(c.rows)]
-    if not parts:
+    cells = _sorted([c for c in changed if len(c.rows)])
+    if cells is None:
         return []
-    rows, cols = np.concatenate([c.rows for c in parts]), np.concatenate([c.cols for c in parts])
-    order = np.lexsort((cols, rows))
-    rows, cols = rows[order], cols[order]
-    states = np.concatenate([c.states for c in parts])[order]
-    top = np.concatenate([c.top_m for c in parts])[order]
-    points = np.concatenate([c.points for c in parts])[order]
-    votes = np.concatenate([c.votes for c in parts])[order]
-    first = np.concatenate([c.first_ns for c in parts])[order]
-    last = np.concatenate([c.last_ns for c in parts])[order]
-    versions = np.concatenate([c.versions for c in parts])[order]
-    found = pieces(rows, cols, states.astype(np.int64))
-    outlines = rings(rows, cols, found.polygons)
-    by_object = np.argsort(found.objects, kind="stable")
-    out = []
-    for mine in np.split(by_object, np.cumsum(np.bincount(found.objects))[:-1]):
-        if len(mine) < min_cells:
-            continue
-        kind = KINDS[int(states[mine[0]])]
-        made_in = sorted({int(v) for v in versions[mine]} - {0})
-        told = votes[mine][versions[mine] > 0] if made_in else votes[mine]  # remnants in cells that stand have no votes
-        seen_first, seen_last = int(first[mine].min()), int(last[mine].max())
-        out.append(
-            ChangeObject(
-                id=f"{kind}.v{made_in[0] if made_in else 0}.{rows[mine[0]]}.{cols[mine[0]]}",
-                kind=kind,
-                outline=[outlines[p] for p in np.unique(found.polygons[mine])],
-                cells=len(mine),
-                height_m=float(top[mine].max()),
-                points=int(points[mine].sum()),
-                votes_min=int(told.min()),
-                votes_median=float(np.median(told)),
-                first_seen_ns=None if seen_first == _NEVER else seen_first,
-                last_seen_ns=None if seen_last == _UNTIL else seen_last,
-                versions=made_in,
-            )
-        )
-    return out
+    kinds = cells.states.astype(np.int64)
+    found = pieces(cells.rows, cells.cols, kinds)
+    outlines = rings(cells.rows, cells.cols, found.polygons)
+    things = group(cells.rows, cells.cols, kinds, found.objects, reach_m)
+    by_thing = np.split(np.argsort(things, kind="stable"), np.cumsum(np.bincount(things))[:-1])
+    return [
+        _object(cells, mine, [outlines[p] for p in np.unique(found.polygons[mine])])
+        for mine in by_thing
+        if len(mine) >= min_cells
+    ]
 
 
-def _missing_from(points: F32, others: F32) -> Bool:
+def _sorted(parts: Sequence[ChangedCells]) -> ChangedCells | None:
+    """All cells of all tiles, by row, then column."""
+    if not parts:
+        return None
+    whole = {f.name: np.concatenate([getattr(c, f.name) for c in parts]) for f in fields(ChangedCells)}
+    order = np.lexsort((whole["cols"], whole["rows"]))
+    return ChangedCells(**{name: values[order] for name, values in whole.items()})
+
+
+def _object(cells: ChangedCells, mine: I64, outline: list[list[Ring]]) -> ChangeObject:
+    rows, cols, versions = cells.rows[mine], cells.cols[mine], cells.versions[mine]
+    kind = KINDS[int(cells.states[mine[0]])]
+    made_in = sorted({int(v) for v in versions} - {0})
+    told = mine[versions > 0] if made_in else mine  # remnants in cells that stand have no votes
+    seen_first, seen_last = int(cells.first_ns[mine].min()), int(cells.last_ns[mine].max())
+    columns = np.maximum(cells.top_m[mine] - cells.bottom_m[mine], 0.0) + CELL_SIZE
+    return ChangeObject(
+        id=f"{kind}.v{made_in[0] if made_in else 0}.{rows[0]}.{cols[0]}",
+        kind=kind,
+        outline=outline,
+        cells=len(mine),
+        where=(rows, cols),
+        box=(float(cols.min()), float(rows.min()), float(cols.max() + 1), float(rows.max() + 1)),
+        height_m=float(cells.top_m[mine].max()),
+        volume_m3=float(columns.sum() * CELL_SIZE**2),
+        points=int(cells.points[mine].sum()),
+        votes_min=int(cells.votes[told].min()),
+        votes_median=float(np.median(cells.votes[told])),
+        against_median=float(np.median(cells.against[told])),
+        first_seen_ns=None if seen_first == _NEVER else seen_first,
+        last_seen_ns=None if seen_last == _UNTIL else seen_last,
+        versions=made_in,
+    )
+
+
+def missing_from(points: F32, others: F32) -> Bool:
     """(n,) which points are not, bit for bit, among ``others``: edits leave every other point as it was."""
     ours = np.ascontiguousarray(points).view("V12").reshape(-1)
     theirs = np.ascontiguousarray(others).view("V12").reshape(-1)
@@ -177,19 +218,23 @@ def _missing_from(points: F32, others: F32) -> Bool:
     return ~known[label[: len(ours)]]
 
 
-def _evidence(flat: I64, states: U8, decided: Iterable[Decided]) -> tuple[I32, I64, I64, I64]:
-    """(votes, first_ns, last_ns, version) of the changed cells; votes are those of the last decision for it."""
+def _evidence(flat: I64, states: U8, decided: Iterable[Decided]) -> tuple[I32, I32, I64, I64, I64]:
+    """(votes, against, first_ns, last_ns, version) of the changed cells, as the last decision for it counted them."""
     votes = np.zeros(len(flat), dtype=np.int32)
+    against = np.zeros(len(flat), dtype=np.int32)
     version = np.zeros(len(flat), dtype=np.int64)
     first = np.full(len(flat), _NEVER)
     last = np.full(len(flat), _UNTIL)
     for decision in decided:
         agrees = decision.states.reshape(-1)[flat] == states
-        counted = decision.tally.reshape(TILE_CELLS**2, -1)[flat, states] // VOTE_UNIT
-        votes = np.where(agrees, counted, votes)
+        told = decision.tally.reshape(TILE_CELLS**2, -1)[flat]
+        counted = told[np.arange(len(flat)), states]
+        others = told[:, : CellState.UNDETERMINED].sum(axis=1) - counted
+        votes = np.where(agrees, counted // VOTE_UNIT, votes)
+        against = np.where(agrees, others // VOTE_UNIT, against)
         version = np.where(agrees, decision.version, version)
         for end_ns, drive in decision.drives:
             said_so = agrees & (drive.reshape(-1)[flat] == states)
             first = np.where(said_so, np.minimum(first, end_ns), first)
             last = np.where(said_so, np.maximum(last, end_ns), last)
-    return votes.astype(np.int32), first, last, version
+    return votes.astype(np.int32), against.astype(np.int32), first, last, version

@@ -19,7 +19,7 @@ from mapvote.server.store.policy import Policy, policy_in
 from mapvote.server.store.queries import current_version, tile_as_of
 from mapvote.server.store.store import Store
 
-_FOREVER = (1 << 63) - 1
+FOREVER = (1 << 63) - 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,7 +66,7 @@ def explain_cell(store: Store, x: float, y: float) -> CellStory:
     with store.database.reading() as connection:
         policy = policy_in(connection)
         settings = policy.fuse
-        asked = Electorate(_FOREVER, policy, store.clock() - round(settings.min_age_s * 1e9))
+        asked = Electorate(FOREVER, policy, store.clock() - round(settings.min_age_s * 1e9))
         number = current_version(connection).number
         tile = tile_as_of(connection, store.lattice.tile(index), number)
         everyone = judged_votes(connection, index, asked)
@@ -74,7 +74,7 @@ def explain_cell(store: Store, x: float, y: float) -> CellStory:
         query = sa.select(schema.decisions.c.version, schema.decisions.c.states)
         query = query.where(schema.decisions.c.row == index[0], schema.decisions.c.col == index[1])
         found = connection.execute(query.order_by(schema.decisions.c.version))
-        decided = [(r.version, _states(r.states)) for r in found]
+        decided = [(r.version, states_of(r.states)) for r in found]
     counting = [unspent(vote, tile) for vote, (_, why) in zip(said, everyone, strict=True) if not why]
     silenced = _silenced(store, index, counting, policy)
     votes = []
@@ -99,7 +99,7 @@ def _silenced(store: Store, index: TileIndex, drives: list[TileVote], policy: Po
     return {vote.vehicle for vote in votes} - {vote.vehicle for vote in heard}
 
 
-def _states(data: bytes) -> U8:
+def states_of(data: bytes) -> U8:
     return unpack_plane(data, "<u1", (TILE_CELLS, TILE_CELLS), "decision: states")
 
 

@@ -1,7 +1,10 @@
-"""Change objects as GeoJSON."""
+"""Change objects as GeoJSON, and any list of the server as CSV."""
 
 from __future__ import annotations
 
+import csv
+import io
+import math
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from typing import Any
@@ -9,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from mapvote.core.grid import CELL_SIZE, Lattice
+from mapvote.core.types import F64
 from mapvote.formats.geo.frame import MapFrame, frame_of
 from mapvote.server.insight.changes import ChangeObject
 from mapvote.server.insight.polygons import Ring
@@ -30,7 +34,7 @@ def to_geojson(
     ``lonlat``: longitude and latitude, as the RFC wants them, where the map knows its place on Earth; else map metres.
     """
     frame = frame_of(georeference or {})
-    features = [_feature(o, lattice) for o in objects]
+    features = [_feature(o, lattice, _neighbours(o, objects)) for o in objects]
     if lonlat and not frame.is_local:
         for feature in features:
             _to_lonlat(feature["geometry"], frame)
@@ -54,7 +58,39 @@ def _to_lonlat(geometry: dict[str, Any], frame: MapFrame) -> None:
             polygon[i] = np.round(frame.to_lonlat(corners)[:, :2], 8).tolist()
 
 
-def _feature(change: ChangeObject, lattice: Lattice) -> dict[str, Any]:
+def as_csv(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Rows as CSV with a header; lists by spaces. What a spreadsheet would take for a formula gets a quote."""
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    names = list(dict.fromkeys(name for row in rows for name in row))
+    writer.writerow(names)
+    writer.writerows([[_cell(row.get(name)) for name in names] for row in rows])
+    return out.getvalue()
+
+
+def feature_rows(collection: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """The features of :func:`to_geojson` without their outlines, for a table."""
+    return [{"id": f["id"]} | f["properties"] for f in collection["features"]]
+
+
+def _cell(value: Any) -> Any:
+    if isinstance(value, list | tuple):
+        value = " ".join(map(str, value))
+    return f"'{value}" if isinstance(value, str) and value[:1] in tuple("=+-@\t\r") else value
+
+
+def _neighbours(change: ChangeObject, objects: Sequence[ChangeObject]) -> list[str]:
+    """What lies near it: ids of other large things whose box is within 15 m, nearest first."""
+    near = [(_distance_m(change, o), o.id) for o in objects if o is not change and o.size == "large"]
+    return [name for distance, name in sorted(near) if distance <= NEAR_M][:MOST_NEIGHBOURS]
+
+
+def _distance_m(a: ChangeObject, b: ChangeObject) -> float:
+    gaps = [max(a.box[i] - b.box[i + 2], b.box[i] - a.box[i + 2], 0.0) for i in (0, 1)]
+    return CELL_SIZE * math.hypot(*gaps)
+
+
+def _feature(change: ChangeObject, lattice: Lattice, near: list[str]) -> dict[str, Any]:
     polygons = [[_corners(ring, lattice) for ring in polygon] for polygon in change.outline]
     single = len(polygons) == 1
     return {
@@ -66,20 +102,26 @@ def _feature(change: ChangeObject, lattice: Lattice) -> dict[str, Any]:
         },
         "properties": {
             "kind": change.kind,
+            "size": change.size,
             "area_m2": round(change.area_m2, 2),
             "height_m": round(change.height_m, 2),
+            "volume_m3": round(change.volume_m3, 2),
             "cells": change.cells,
             "points": change.points,
             "votes_min": change.votes_min,
             "votes_median": change.votes_median,
+            "against_median": change.against_median,
+            "share_for": None if change.share_for is None else round(change.share_for, 3),
             "first_seen": _utc(change.first_seen_ns),
             "last_seen": _utc(change.last_seen_ns),
             "versions": change.versions,
+            "box": _corners(np.reshape(change.box, (2, 2)), lattice),
+            "near": near,
         },
     }
 
 
-def _corners(ring: Ring, lattice: Lattice) -> list[list[float]]:
+def _corners(ring: Ring | F64, lattice: Lattice) -> list[list[float]]:
     metres = np.round(ring * CELL_SIZE + np.array([lattice.x0, lattice.y0]), 3) + 0.0  # + 0.0: no "-0.0" in the file
     corners: list[list[float]] = metres.tolist()
     return corners
@@ -92,4 +134,6 @@ def _utc(stamp_ns: int | None) -> str | None:
     return datetime.fromtimestamp(stamp_ns // 1_000_000_000, UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
 
 
+NEAR_M = 15.0
+MOST_NEIGHBOURS = 5
 MAP_METRES = "map metres, not the longitude and latitude of RFC 7946"

@@ -14,7 +14,7 @@ from mapvote.core.voting import decide
 from mapvote.fusion.tile_vote import TileVote, one_each
 from mapvote.server.insight.changes import Decided, change_objects, changed_cells
 from mapvote.server.insight.consensus import Compared, Spoken, Standing, compare, judge
-from mapvote.server.insight.explain import _FOREVER, _states
+from mapvote.server.insight.explain import FOREVER, states_of
 from mapvote.server.insight.geojson import to_geojson
 from mapvote.server.store import schema
 from mapvote.server.store.eligible_votes import Electorate, counting_votes, judged_votes, read_votes, standing_tiles
@@ -63,7 +63,7 @@ def _decided(store: Store, connection: sa.Connection, index: TileIndex, old: int
         asked = Electorate(version.mark, policy, version.created_ns - round(policy.fuse.min_age_s * 1e9))
         votes = counting_votes(connection, tile, asked)
         drives = [(vote.end_ns, vote.states) for vote in votes if vote.states is not None]
-        yield Decided(row.version, _states(row.states), unpack_tally_plane(row.tally), drives)
+        yield Decided(row.version, states_of(row.states), unpack_tally_plane(row.tally), drives)
 
 
 def coverage(store: Store) -> list[dict[str, Any]]:
@@ -88,9 +88,9 @@ def vehicle_standings(store: Store) -> list[Standing]:
     What is compared is the world (occupied or empty now), so votes on an older base count here too.
     """
     with store.database.reading() as connection:
-        asked = Electorate(_FOREVER, policy_in(connection), _FOREVER)
+        asked = Electorate(FOREVER, policy_in(connection), FOREVER)
         compared: list[Compared] = []
-        for index in standing_tiles(connection, _FOREVER):
+        for index in standing_tiles(connection, FOREVER):
             chosen = [vote for vote, why in judged_votes(connection, index, asked) if not why]
             folded = one_each(read_votes(connection, index, chosen), store.lattice.tile(index))
             compared += compare(index, [Spoken(vote.vehicle, vote.end_ns, _decided_states(vote)) for vote in folded])

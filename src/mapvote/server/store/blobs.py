@@ -13,7 +13,7 @@ from mapvote.codec.arrays import compress, unpack_bytes
 from mapvote.core.grid import CELLS, TILE_CELLS, Grid
 from mapvote.core.memory import PLANES, Memory
 from mapvote.core.tile import Tile
-from mapvote.core.types import F32, MapvoteError
+from mapvote.core.types import F32, Bool, MapvoteError
 
 _ZSTD_LEVEL = 3
 MAX_PLANE_BYTES = CELLS * 64 * 12 * 4
@@ -91,3 +91,14 @@ def pack_memory(memory: Memory) -> tuple[str, dict[str, bytes]]:
 def unpack_memory_plane(data: bytes, digest: str) -> Memory:
     """The inverse; MapvoteError if it is not what its hash says."""
     return Memory(np.frombuffer(_unpack(data, digest), dtype="<u4").reshape(PLANES, TILE_CELLS, TILE_CELLS))
+
+
+def pack_cells(cells: Bool) -> bytes:
+    """(256, 256) bool as a small blob."""
+    return compress(np.packbits(cells.reshape(-1)).tobytes(), _ZSTD_LEVEL)
+
+
+def unpack_cells(data: bytes) -> Bool:
+    """The inverse of :func:`pack_cells`."""
+    bits = np.unpackbits(np.frombuffer(unpack_bytes(data, CELLS // 8, "cells"), dtype=np.uint8))
+    return bits.astype(np.bool_).reshape(TILE_CELLS, TILE_CELLS)

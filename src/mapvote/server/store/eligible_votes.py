@@ -18,8 +18,9 @@ from mapvote.core.tile import Tile
 from mapvote.core.types import U8, Bool
 from mapvote.fusion.sparse_columns import Words
 from mapvote.fusion.spent import unspent
-from mapvote.fusion.tile_vote import DAY_NS, TileVote, select
+from mapvote.fusion.tile_vote import DAY_NS, TileVote, restrict, select
 from mapvote.server.store import schema
+from mapvote.server.store.blobs import unpack_cells
 from mapvote.server.store.policy import Policy
 
 
@@ -85,17 +86,31 @@ _VOTES_ON = (
     .where(_T.c.row == _ROW, _T.c.col == _COL, _stands_at(_MARK))
     .order_by(_B.c.seq)
 )
+_W, _C = schema.reviews, schema.review_cells
+_REVIEWS_ON = (
+    sa.select(_W.c.seq, _W.c.verdict, _C.c.cells)
+    .join(_C, _C.c.review == _W.c.seq)
+    .where(_C.c.row == _ROW, _C.c.col == _COL, _W.c.verdict.in_(("held", "rejected")))
+    .where(_W.c.seq <= _MARK, _W.c.gone_seq.is_(None) | (_W.c.gone_seq > _MARK))
+)
 _PLANES_OF = sa.select(_T.c.ballot, _T.c.states, _T.c.tally, _T.c.gone, _T.c.new_points, _T.c.free).where(
     _T.c.row == _ROW, _T.c.col == _COL, _T.c.ballot.in_(sa.bindparam("ballots", expanding=True))
 )
 
 
 def standing_tiles(connection: sa.Connection, mark: int, since: int | None = None) -> list[TileIndex]:
-    """Tiles that standing ballots vote on, ascending; with ``since``, those where a ballot came or went after it."""
+    """Tiles that standing ballots vote on, ascending; with ``since``, those where a ballot or a review came or went
+    after it."""
     b, t = schema.ballots, schema.ballot_tiles
     wanted = _stands_at(mark) if since is None else (b.c.seq <= mark) & ((b.c.seq > since) | (b.c.gone_seq > since))
     tiles = sa.select(t.c.row, t.c.col).distinct().join(b, b.c.seq == t.c.ballot).where(wanted)
-    return [(row.row, row.col) for row in connection.execute(tiles.order_by(t.c.row, t.c.col))]
+    found = {(row.row, row.col) for row in connection.execute(tiles)}
+    if since is not None:
+        w, c = schema.reviews, schema.review_cells
+        lately = (w.c.seq <= mark) & ((w.c.seq > since) | (w.c.gone_seq > since))
+        reviewed = sa.select(c.c.row, c.c.col).distinct().join(w, w.c.seq == c.c.review).where(lately)
+        found |= {(row.row, row.col) for row in connection.execute(reviewed)}
+    return sorted(found)
 
 
 def judged_votes(connection: sa.Connection, index: TileIndex, asked: Electorate) -> list[tuple[StoredVote, str]]:
@@ -126,7 +141,18 @@ def counting_votes(
     ``misread``: see :func:`mapvote.fusion.spent.unspent`.
     """
     chosen = [vote for vote, why in judged_votes(connection, tile.index, asked) if not why]
-    return [unspent(vote, tile, misread) for vote in read_votes(connection, tile.index, chosen)]
+    reviewed = connection.execute(_REVIEWS_ON, {"row": tile.index[0], "col": tile.index[1], "mark": asked.mark}).all()
+    bars = [(None if verdict == "held" else seq, unpack_cells(cells)) for seq, verdict, cells in reviewed]
+    votes = zip(chosen, read_votes(connection, tile.index, chosen), strict=True)
+    return [_obedient(unspent(vote, tile, misread), stored.first_seq, bars) for stored, vote in votes]
+
+
+def _obedient(vote: TileVote, first_seq: int, bars: Sequence[tuple[int | None, Bool]]) -> TileVote:
+    """The vote without the cells of changes that reviewers held, or rejected after its drive was first heard of."""
+    for seq, cells in bars:
+        if seq is None or first_seq < seq:
+            vote = restrict(vote, ~cells)
+    return vote
 
 
 def recent_votes(

@@ -141,7 +141,7 @@ def judge(store: Store, plan: Plan, changed: Sequence[Fused], gate: Gate | None)
     held = hold_reasons(changed, plan.asked.settings)
     if gate is not None and changed:
         old = store.point_map(plan.newest.number)
-        edited = {f.index: _edited(f, store.lattice.tile(f.index)) for f in changed}
+        edited = {f.index: edited_tile(f, store.lattice.tile(f.index)) for f in changed}
         held += gate(old, replace(old, tiles=dict(old.tiles) | edited))
     return held
 
@@ -197,7 +197,8 @@ def _of_two(
     return old, load_tile(connection, window, then)
 
 
-def _edited(fused: Fused, window: Grid) -> Tile:
+def edited_tile(fused: Fused, window: Grid) -> Tile:
+    """What a tile would be, of the planes that fusion made."""
     hashes, planes = fused.hashes, fused.planes
     assert hashes is not None
     free = None if hashes.free is None else planes[hashes.free]

@@ -149,3 +149,25 @@ decisions = sa.Table(
     sa.Column("deleted", sa.Integer, nullable=False),
 )
 """``tally``: (5, 65536) uint16 or int32 in VOTE_UNITs, compressed."""
+
+reviews = sa.Table(
+    "reviews",
+    metadata,
+    sa.Column("seq", sa.BigInteger, sa.ForeignKey("events.seq"), primary_key=True, autoincrement=False),
+    sa.Column("gone_seq", sa.BigInteger),
+    sa.Column("verdict", sa.String(16), nullable=False),
+    sa.Column("comment", sa.String(400), nullable=False),
+    sa.Column("feature", sa.JSON, nullable=False),
+)
+"""What reviewers decided about a change, ``feature`` as they saw it; ``gone_seq``: the event that took it back."""
+
+review_cells = sa.Table(
+    "review_cells",
+    metadata,
+    sa.Column("row", sa.Integer, primary_key=True),
+    sa.Column("col", sa.Integer, primary_key=True),
+    sa.Column("review", sa.BigInteger, sa.ForeignKey("reviews.seq"), primary_key=True),
+    sa.Column("cells", sa.LargeBinary, nullable=False),
+)
+"""The cells (65536 packed bits) that a review is about. Change votes on them count no more: of a rejected change those
+of drives first heard of before it was rejected, of a held one all, until it is let go."""

@@ -43,6 +43,22 @@ export const versions = async () => (await ask("map/versions")).json();
 export const changes = async (from, to) => (await ask("changes", { from, to })).json();
 export const coverage = async () => (await ask("coverage")).json();
 export const vehicles = async () => (await ask("vehicles")).json();
+export const overview = async (version) => (await ask("clouds/overview", version ? { version } : {})).arrayBuffer();
+export const cloudPart = async ({ points, ground }, level) => (await ask(`clouds/${points}/${ground}/${level}`)).arrayBuffer();
+export const evidence = async (tile, vehicle) => (await ask(`evidence/${tile.replace(",", "/")}`, vehicle ? { vehicle } : {})).arrayBuffer();
+export const versionMap = async (number) => (await ask(`map/versions/${number}`)).json();
+
+const pair = (tile) => `${tile.points}-${tile.ground}`;
+export const cloudChanged = async (old, now) =>
+  (await ask("clouds/changed", { ...(old && { old: pair(old) }), ...(now && { new: pair(now) }) })).arrayBuffer();
+
+// A list as a file: fetched with the key, which a link cannot carry, and handed to the browser.
+export async function download(path, parameters, name) {
+  const made = URL.createObjectURL(await (await ask(path, parameters)).blob());
+  Object.assign(document.createElement("a"), { href: made, download: name }).click();
+  setTimeout(() => URL.revokeObjectURL(made), 10_000);
+}
+
 export const cell = async (x, y) => (await ask("cells", { x: x.toFixed(3), y: y.toFixed(3) })).json();
 
 // (n, 3) points of a tile from its corner. The plane travels as zstd, which the browser undoes as a content encoding.

@@ -2,26 +2,34 @@
 
 import * as api from "./api.js";
 import { showTiles } from "./coverage.js";
-import { closeDetails, drawable, follow, showCell, showChange } from "./details.js";
-import { $, dot, element, link, notice, when } from "./dom.js";
+import { closeDetails, follow, showCell, showChange } from "./details.js";
+import { $, element, link, notice, when } from "./dom.js";
+import { showList } from "./list.js";
+import * as address from "./link.js";
 import { state } from "./page.js";
+import { Stage } from "./stage.js";
 import { showVehicles } from "./vehicles.js";
-import { TILE, View } from "./view.js";
+import { TILE } from "./view.js";
 
 let queue = Promise.resolve();
 const asked = new Set();  // hashes on their way
 
 let range = null;  // the last one asked for
-const view = (state.view = new View($("map"), {
+const view = (state.view = new Stage(api, {
   onPick: (where, change) => (change ? showChange(change.id) : showCell(where)),
   onMove: showScale,
-  wantTile: (hash) => fetchTile(hash),
 }));
+view.onWanted = (hash) => fetchTile(hash);
 
 async function start() {
+  const deep = view.possible() ? begin() : null;
+  const rest = Promise.all([api.versions(), api.coverage()]);
+  rest.catch(() => null);
   try {
-    const [manifest, versions, coverage] = await Promise.all([api.manifest(), api.versions(), api.coverage()]);
-    Object.assign(state, { manifest, versions: versions.versions, coverage: coverage.tiles });
+    state.manifest = await api.manifest();
+    await firstPoints(deep);
+    const [versions, coverage] = await rest;
+    Object.assign(state, { versions: versions.versions, coverage: coverage.tiles });
   } catch (error) {
     return refuse(error);
   }
@@ -33,10 +41,48 @@ async function start() {
   showVersions();
   fillRange();
   showTiles();
-  view.fit(extent(view.tiles));
+  view.flat.fit(extent(view.tiles));
   await showRange();
   follow();
   showVehicles();
+}
+
+async function begin() {
+  const coarse = api.overview().catch(() => null);
+  return view.cloud ? coarse : view.begin(coarse).catch((error) => view.without(`3D does not start: ${error.message}`));
+}
+
+// The coarse picture, before anything else is asked for.
+async function firstPoints(deep) {
+  const buffer = await deep;
+  if (!buffer || !view.cloud) return;
+  const { lattice, tiles } = state.manifest, { stream, cloud } = view;
+  const box = extent(Object.keys(tiles).map((name) => {
+    const [row, col] = name.split(",").map(Number);
+    return { x: lattice.x0 + col * TILE, y: lattice.y0 + row * TILE };
+  }));
+  stream.place([(box[0] + box[2]) / 2, (box[1] + box[3]) / 2, 0]);
+  stream.setTiles(lattice, tiles, null);
+  stream.overview(buffer);
+  const eye = address.read().eye?.split(",").map(Number) ?? [];
+  if (eye.length === 6 && eye.every(Number.isFinite)) cloud.orbit.state = eye;
+  else view.fit(tight(stream.tiles) ?? box, 0, { at_once: true, elevation: 0.62 });
+  view.placed = true;
+  const { Tools } = await import("./tools.js");
+  view.tools ??= new Tools(view, { setCompare: (on) => (state.paired = on) && showClouds() });
+  stream.plan();
+}
+
+// The box of what there is, not of its tiles.
+function tight(tiles) {
+  let [x0, y0, x1, y1] = [Infinity, Infinity, -Infinity, -Infinity];
+  for (const tile of tiles)
+    for (const { packed } of tile.levels)
+      for (let i = 0; i < packed.length; i += 44) {
+        const [x, y] = [tile.x + (packed[i] * TILE) / 65535, tile.y + (packed[i + 1] * TILE) / 65535];
+        [x0, y0, x1, y1] = [Math.min(x0, x), Math.min(y0, y), Math.max(x1, x), Math.max(y1, y)];
+      }
+  return x0 < x1 ? [x0, y0, x1, y1] : null;
 }
 
 function refuse(error) {
@@ -86,8 +132,9 @@ function fillRange() {
   const options = () => numbers.map((n) => element("option", { value: n }, [String(n)]));
   $("from").replaceChildren(...options());
   $("to").replaceChildren(...options());
-  $("to").value = state.manifest.version;
-  $("from").value = Math.max(numbers[0], state.manifest.version - 1);
+  const asked = address.read(), known = (n) => (numbers.includes(Number(n)) ? n : null);
+  $("to").value = known(asked.to) ?? state.manifest.version;
+  $("from").value = known(asked.from) ?? Math.max(numbers[0], state.manifest.version - 1);
 }
 
 function setRange(from, to) {
@@ -107,26 +154,23 @@ async function showRange() {
     refuse(error);
   }
   if (range !== mine) return;
-  state.features = features;
-  state.features.sort((a, b) => b.properties.area_m2 - a.properties.area_m2);
-  view.setChanges(state.features.map(drawable));
-  const count = (kind) => state.features.filter((f) => f.properties.kind === kind).length;
-  $("tally").replaceChildren(
-    ...(state.features.length
-      ? [dot("built"), `${count("built")} built `, " \u2002 ", dot("demolished"), `${count("demolished")} demolished`]
-      : [element("span", { className: "hint" }, [nothing(from, to)])]),
-  );
-  const row = (f) =>
-    element("li", {}, [
-      element("button", { onclick: () => (showChange(f.id), view.fit(drawable(f).box, 0.38)) }, [
-        dot(f.properties.kind),
-        f.properties.kind === "built" ? "Built" : "Demolished",
-        element("span", { className: "number" }, [`${f.properties.area_m2.toFixed(1)} m\u00b2`]),
-        element("span", { className: "number" }, [`${f.properties.height_m.toFixed(1)} m high`]),
-      ]),
-    ]);
-  const items = state.features.map((f) => Object.assign(row(f), { id: `item-${f.id}` }));
-  $("changes").replaceChildren(...items);
+  const usual = Number(to) === state.manifest.version && Number(from) === Math.max(state.versions[0].number, to - 1);
+  address.write({ from: usual ? null : from, to: usual ? null : to });
+  showList(features, nothing(from, to), { from, to });
+  await showClouds().catch((error) => notice(error.message));
+}
+
+// The two versions in 3D: the newer one, what came and went, and the older one if it is to be compared.
+async function showClouds() {
+  if (!view.cloud) return;
+  const [from, to] = [Number($("from").value), Number($("to").value)], { version, tiles, lattice } = state.manifest;
+  const of = async (number) => (number === version ? tiles : (await api.versionMap(number)).tiles);
+  const [older, newer] = await Promise.all([of(from), of(to)]);
+  const differ = [...new Set([...Object.keys(older), ...Object.keys(newer)])].filter((name) => older[name]?.points !== newer[name]?.points);
+  view.stream.setTiles(lattice, newer, state.paired ? older : null);
+  await view.stream.changes(differ, lattice, newer, older, state.paired);
+  view.stream.plan();
+  view.cloud.draw();
 }
 
 const nothing = (from, to) =>
@@ -165,7 +209,23 @@ function showScale(v) {
 
 $("zoom-in").onclick = () => view.zoom(1.6);
 $("zoom-out").onclick = () => view.zoom(1 / 1.6);
-$("fit").onclick = () => view.fit(extent(view.tiles));
+$("fit").onclick = () => (view.flat.fit(extent(view.tiles)), view.fit(tight(view.stream?.tiles ?? []) ?? extent(view.tiles), 0, { elevation: 0.62 }));
+$("to-3d").onclick = () => view.show(view.mode === "deep" ? "flat" : "deep");
+document.addEventListener("keydown", (event) => {
+  if (event.ctrlKey || event.altKey || event.metaKey || event.target.matches("input, select, textarea")) return;
+  const keys = { 2: () => view.show("flat"), 3: () => view.show("deep"), 0: () => $("fit").click(), n: () => step(1), p: () => step(-1) };
+  keys[event.key]?.();
+});
+
+// To the next change of the list, and there.
+function step(by) {
+  const rows = [...document.querySelectorAll("#changes button")];
+  if (!rows.length) return;
+  const at = rows.findIndex((row) => row.getAttribute("aria-current") === "true");
+  const next = rows[(at + by + rows.length) % rows.length];
+  next.focus();
+  next.click();
+}
 $("from").onchange = $("to").onchange = showRange;
 $("forget").onclick = () => (api.key.forget(), location.reload());
 for (const radio of document.getElementsByName("shade"))

@@ -2,6 +2,7 @@
 
 import * as api from "./api.js";
 import { $, dot, element, facts, link, number, when } from "./dom.js";
+import * as address from "./link.js";
 import { state } from "./page.js";
 
 const STATES = {
@@ -21,14 +22,16 @@ export function drawable(feature) {
   const corners = polygons.flatMap((p) => p[0]);
   const xs = corners.map((c) => c[0]), ys = corners.map((c) => c[1]);
   const box = [Math.min(...xs), Math.min(...ys), Math.max(...xs), Math.max(...ys)];
-  return { id: feature.id, kind: feature.properties.kind, polygons, box };
+  const { kind, size, height_m: height } = feature.properties;
+  return { id: feature.id, kind, size, height, polygons, box };
 }
 
 export function showChange(id) {
   const feature = state.features.find((f) => f.id === id);
   if (!feature) return;
   const p = feature.properties, [x, y] = drawable(feature).polygons[0][0][0];
-  location.replace(`#change=${encodeURIComponent(id)}`);
+  address.write({ change: id, cell: null });
+  address.flush();
   asking = null;
   mark(id);
   state.view.select(id);
@@ -36,18 +39,28 @@ export function showChange(id) {
     facts([
       ["area", `${p.area_m2.toFixed(2)} m\u00b2 (${p.cells} cells)`],
       ["height", `${p.height_m.toFixed(1)} m above ground`],
+      p.volume_m3 !== undefined && ["volume", `${p.volume_m3.toFixed(1)} m\u00b3 of its columns`],
       ["points", `${p.points} ${p.kind === "built" ? "added" : "deleted"}`],
       ["votes for it", p.votes_median ? `${number(p.votes_median)} (fewest ${p.votes_min})` : "unknown"],
+      p.against_median !== undefined && ["votes against", number(p.against_median)],
       ["first seen", when(p.first_seen)],
       ["last seen", when(p.last_seen)],
       [p.versions.length > 1 ? "versions" : "version", p.versions.join(", ") || "unknown"],
     ]),
+    p.near?.length > 0 && element("p", { className: "hint" }, ["near it: ", ...p.near.map((other) => near(other))]),
     link("Who voted here?", () => showCell([x + 0.15, y + 0.15])),
   ]);
 }
 
+function near(id) {
+  const feature = state.features.find((f) => f.id === id);
+  const text = feature ? `${feature.properties.kind}, ${feature.properties.area_m2.toFixed(0)} m\u00b2 ` : id;
+  return link(text, () => feature && (showChange(id), visit(feature)));
+}
+
 export async function showCell([x, y]) {
-  location.replace(`#cell=${x.toFixed(2)},${y.toFixed(2)}`);
+  address.write({ cell: `${x.toFixed(2)},${y.toFixed(2)}`, change: null });
+  address.flush();
   mark(null);
   const { x0, y0 } = state.manifest.lattice;
   const corner = [x0 + Math.floor((x - x0) / 0.3) * 0.3, y0 + Math.floor((y - y0) / 0.3) * 0.3];
@@ -80,7 +93,7 @@ export async function showCell([x, y]) {
 
 function details(title, kind, content) {
   $("details").replaceChildren(
-    element("button", { className: "close", title: "Close", onclick: closeDetails }, ["\u00d7"]),
+    element("button", { className: "close", title: "Close", ariaLabel: "Close", onclick: closeDetails }, ["\u00d7"]),
     element("h3", {}, [kind && dot(kind), title]),
     ...content,
   );
@@ -94,21 +107,27 @@ export function closeDetails() {
 }
 
 function mark(id) {
-  for (const button of $("changes").querySelectorAll("button"))
+  for (const button of document.querySelectorAll("#changes button, #cars button, #small button"))
     button.setAttribute("aria-current", String(button.parentElement.id === `item-${id}`));
 }
 
 // A link to one change or one cell.
 export function follow() {
-  const [, what, value] = location.hash.match(/^#(change|cell)=(.+)$/) ?? [];
-  if (what === "change") {
-    const feature = state.features.find((f) => f.id === decodeURIComponent(value));
-    if (feature) state.view.fit(drawable(feature).box, 0.38);
-    showChange(decodeURIComponent(value));
-  } else if (what === "cell") {
-    const where = value.split(",").map(Number);
+  const asked = address.read();
+  if (asked.change) {
+    const feature = state.features.find((f) => f.id === asked.change);
+    if (feature && !asked.eye) visit(feature);
+    showChange(asked.change);
+  } else if (asked.cell) {
+    const where = asked.cell.split(",").map(Number);
     if (where.length !== 2 || !where.every(Number.isFinite)) return;
-    state.view.fit([where[0] - 10, where[1] - 10, where[0] + 10, where[1] + 10]);
+    if (!asked.eye) state.view.fit([where[0] - 10, where[1] - 10, where[0] + 10, where[1] + 10], 0.1, { at_once: true });
     showCell(where);
   }
+}
+
+// Brings a change into view.
+export function visit(feature) {
+  const change = drawable(feature);
+  state.view.fit(change.box, 0.38, { elevation: 0.5, height: change.height });
 }

@@ -10,7 +10,7 @@ export function element(tag, properties, children) {
 
 export const dot = (kind) => element("span", { className: `dot ${kind}` }, []);
 export const link = (text, onclick) => element("button", { className: "link", type: "button", onclick }, [text]);
-export const facts = (pairs) => element("dl", {}, pairs.flatMap(([k, v]) => [element("dt", {}, [k]), element("dd", {}, [v])]));
+export const facts = (pairs) => element("dl", {}, pairs.filter(Boolean).flatMap(([k, v]) => [element("dt", {}, [k]), element("dd", {}, [v])]));
 export const number = (n) => (Number.isInteger(n) ? String(n) : n.toFixed(1));
 export const when = (stamp) => (stamp ? stamp.slice(0, 16).replace("T", " ") + " UTC" : "unknown");
 

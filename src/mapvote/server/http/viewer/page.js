@@ -1,3 +1,3 @@
 // What the panels share: what the server said, and the map's view.
 
-export const state = { manifest: null, versions: [], coverage: [], features: [], shade: "seen", view: null };
+export const state = { manifest: null, older: null, versions: [], coverage: [], features: [], shade: "seen", view: null };

@@ -1,0 +1,87 @@
+"""What the page in 3D asks for: levels of detail, what came and went, and evidence cell by cell."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Path, Query, Request, Response
+
+from mapvote.codec.arrays import compress
+from mapvote.server.http.auth import reviewer
+from mapvote.server.http.schemas import VersionQuery, problems
+from mapvote.server.http.services import services
+from mapvote.server.insight.clouds import evidence
+from mapvote.server.insight.levels import N_LEVELS
+from mapvote.server.store.blobs import TileHashes
+
+_BYTES: dict[int | str, dict[str, Any]] = {200: {"content": {"application/octet-stream": {}}}}
+_FOR_EVER = "private, max-age=31536000, immutable"
+Digest = Annotated[str, Path(pattern=r"^[0-9a-f]{64}$")]
+_Pair = Annotated[str | None, Query(pattern=r"^[0-9a-f]{64}-[0-9a-f]{64}$")]
+_Index = Annotated[int, Path(ge=-(1 << 22), le=1 << 22)]
+router = APIRouter()
+
+
+@router.get(
+    "/v1/clouds/overview",
+    responses=problems(404) | _BYTES,
+    response_class=Response,
+    summary="A whole version, coarse",
+)
+def overview(request: Request, version: VersionQuery | None = None) -> Response:
+    """All tiles in as many levels of detail as 150,000 points allow; the layout is in docs/viewer.md."""
+    parts = services(request)
+    number = parts.store.current() if version is None else version
+    return _packed(request, parts.clouds.overview(number), "private, no-cache")
+
+
+@router.get(
+    "/v1/clouds/changed",
+    responses=problems(404) | _BYTES,
+    response_class=Response,
+    summary="What came and went between two states of a tile",
+)
+def changed(request: Request, old: _Pair = None, new: _Pair = None) -> Response:
+    """``old`` and ``new``: the hashes of the tile's points and ground, joined by a dash; without one, no tile."""
+    return _packed(request, services(request).clouds.changed(_hashes(old), _hashes(new)), _FOR_EVER)
+
+
+@router.get(
+    "/v1/clouds/{points}/{ground}/{level}",
+    responses=problems(404) | _BYTES,
+    response_class=Response,
+    summary="One level of detail of a tile",
+)
+def level_of(
+    request: Request, points: Digest, ground: Digest, level: Annotated[int, Path(ge=0, lt=N_LEVELS)]
+) -> Response:
+    """Immutable. Levels add to one another: every point is in exactly one of the six."""
+    return _packed(request, services(request).clouds.levels(TileHashes(points, ground, None)).part(level), _FOR_EVER)
+
+
+@router.get(
+    "/v1/evidence/{row}/{col}",
+    responses=problems(403) | _BYTES,
+    response_class=Response,
+    summary="Votes cell by cell",
+)
+def evidence_of(request: Request, row: _Index, col: _Index, vehicle: str | None = None) -> Response:
+    """256 x 256 cells of four bytes: vehicles, days since the last one, share that says changed, what most say.
+
+    Of one ``vehicle`` only for reviewers and operators.
+    """
+    if vehicle is not None:
+        reviewer(request)
+    plane = evidence(services(request).store, (row, col), vehicle)
+    return _packed(request, plane.tobytes(), "private, no-cache")
+
+
+def _hashes(pair: str | None) -> TileHashes | None:
+    return None if pair is None else TileHashes(pair[:64], pair[65:], None)
+
+
+def _packed(request: Request, data: bytes, cache: str) -> Response:
+    headers = {"Cache-Control": cache, "Vary": "Accept-Encoding"}
+    if "zstd" in request.headers.get("accept-encoding", ""):
+        data, headers["Content-Encoding"] = compress(data, 1), "zstd"
+    return Response(data, media_type="application/octet-stream", headers=headers)

@@ -1,0 +1,56 @@
+"""The desk by HTTP: what waits to be published, and what reviewers decide about it."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+from fastapi import APIRouter, Path, Request
+from pydantic import BaseModel, ConfigDict, Field
+
+from mapvote.server.http.auth import reviewer
+from mapvote.server.http.schemas import PLAIN, problems
+from mapvote.server.http.services import services
+from mapvote.server.insight.desk import desk, review, verdict_of
+from mapvote.server.store.reviews import undo
+
+router = APIRouter()
+
+
+class ReviewAsk(BaseModel):
+    """A verdict on one change."""
+
+    model_config = ConfigDict(extra="forbid")
+    change: str = Field(max_length=100, pattern=PLAIN, description="id of a change on the desk")
+    verdict: Literal["accepted", "held", "rejected"]
+    comment: str = Field(default="", max_length=300, pattern=PLAIN)
+    after: int | None = Field(default=None, ge=0, lt=1 << 62, description="the verdict that it had when you looked")
+
+
+@router.get("/v1/desk", responses=problems(403), summary="What a publish would change now")
+def whole_desk(request: Request) -> dict[str, Any]:
+    """Pending changes as GeoJSON, with the verdicts so far; what was held and rejected; why the policy would hold."""
+    reviewer(request)
+    parts = services(request)
+    found = desk(parts.store, parts.fusing, parts.gate)
+    left_out = [verdict_of(one) for one in found.reviewed]
+    return {"version": found.version, "held": found.held, "pending": found.pending, "reviewed": left_out}
+
+
+@router.post("/v1/desk/reviews", responses=problems(403, 404, 409), summary="Accept, hold or reject a change")
+def decide(request: Request, ask: ReviewAsk) -> dict[str, int]:
+    """Publishing obeys it: a rejected change does not come back by the votes there are, a held one waits.
+
+    409 if somebody else decided meanwhile.
+    """
+    by, parts = reviewer(request), services(request)
+    seq = review(
+        parts.store, ask.change, ask.verdict, by=by, comment=ask.comment, after=ask.after, executor=parts.fusing
+    )
+    return {"seq": seq}
+
+
+@router.delete("/v1/desk/reviews/{seq}", responses=problems(403, 404, 409), summary="Take a verdict back")
+def take_back(request: Request, seq: Annotated[int, Path(ge=0, lt=1 << 62)]) -> dict[str, int]:
+    """The change is pending again."""
+    undo(services(request).store, seq, by=reviewer(request))
+    return {"seq": seq}

@@ -1,0 +1,42 @@
+// The changes between two versions: what is large first, what is small folded away.
+
+import * as api from "./api.js";
+import { drawable, showChange, visit } from "./details.js";
+import { $, dot, element } from "./dom.js";
+import { state } from "./page.js";
+
+const FOLDS = { car: ["cars", (n) => `${n} that could be ${n > 1 ? "parked cars" : "a parked car"}`], small: ["small", (n) => `${n} smaller than 1 m\u00b2`] };
+
+export function showList(features, nothing, range) {
+  state.features = [...features].sort((a, b) => b.properties.area_m2 - a.properties.area_m2);
+  state.view.setChanges(state.features.map(drawable));
+  const large = state.features.filter((f) => !(f.properties.size in FOLDS));
+  const count = (kind) => large.filter((f) => f.properties.kind === kind).length;
+  $("tally").replaceChildren(
+    ...(features.length
+      ? [dot("built"), `${count("built")} built `, " \u2002 ", dot("demolished"), `${count("demolished")} demolished`]
+      : [element("span", { className: "hint" }, [nothing])]),
+  );
+  $("changes").replaceChildren(...large.map(row));
+  for (const [size, [id, told]] of Object.entries(FOLDS)) {
+    const some = state.features.filter((f) => f.properties.size === size);
+    $(id).hidden = !some.length;
+    $(id).querySelector("summary").textContent = told(some.length);
+    $(id).querySelector("ol").replaceChildren(...some.map(row));
+  }
+  for (const format of ["geojson", "csv"]) {
+    const asked = format === "csv" ? { ...range, format } : range;
+    $(`as-${format}`).href = `v1/changes?${new URLSearchParams(asked)}`;
+    $(`as-${format}`).onclick = (event) => (event.preventDefault(), api.download("changes", asked, `changes.${format}`));
+  }
+}
+
+const row = (f) =>
+  element("li", { id: `item-${f.id}` }, [
+    element("button", { onclick: () => (showChange(f.id), visit(f)) }, [
+      dot(f.properties.kind),
+      f.properties.kind === "built" ? "Built" : "Demolished",
+      element("span", { className: "number" }, [`${f.properties.area_m2.toFixed(1)} m\u00b2`]),
+      element("span", { className: "number" }, [`${f.properties.height_m.toFixed(1)} m high`]),
+    ]),
+  ]);

@@ -1,0 +1,217 @@
+// Which parts of which tiles: what is in view, coarse first, as many points as the frame rate allows.
+
+import { Box3, Vector3 } from "./vendor/three.module.min.js";
+import { TILE } from "./cloud.js";
+import { MARK } from "./shaders.js";
+
+export const SPACING = [4.8, 2.4, 1.2, 0.6, 0.3, 0.15];  // metres between the points of each level
+const HEAD = 24, AT_ONCE = 6, ENOUGH_PIXELS = 1.1, MOST_LOADED = 14e6, FRAME_MS = [45, 75];
+
+// {z0, zStep, packed} of one cloud of an answer, and where the next one begins.
+export function unpack(buffer, offset = 0) {
+  const view = new DataView(buffer, offset), n = view.getUint32(4, true);
+  if (view.getUint32(0, true) !== 0x3143564d) throw new Error("this is no cloud");
+  return { z0: view.getFloat32(8, true), zStep: view.getFloat32(12, true), packed: new Uint16Array(buffer, offset + 16, 4 * n), end: offset + 16 + 8 * n };
+}
+
+export class Stream {
+  constructor(cloud, api, { onLoaded = () => {}, onError = () => {} } = {}) {
+    Object.assign(this, { cloud, api, onLoaded, onError });
+    this.tiles = [];
+    this.budget = 600_000;
+    this.loading = 0;
+    this.last = 0;
+    cloud.onDrawn = () => this.drawn();
+  }
+
+  // The tiles of the newer version (and of the older one where it differs), placed round the map's middle.
+  setTiles(lattice, newer, older) {
+    const known = new Map(this.tiles.map((t) => [t.id, t]));
+    const made = [];
+    const want = (name, hashes, side) => {
+      const id = `${name} ${hashes.points} ${side}`, [row, col] = name.split(",").map(Number);
+      const fresh = { id, name, hashes, side, x: lattice.x0 + col * TILE, y: lattice.y0 + row * TILE, levels: [], low: 0, high: 12, evidence: null };
+      made.push(known.get(id) ?? fresh);
+      known.delete(id);
+    };
+    for (const [name, hashes] of Object.entries(newer)) want(name, hashes, !older || older[name]?.points === hashes.points ? "both" : "new");
+    for (const [name, hashes] of Object.entries(older ?? {})) if (newer[name]?.points !== hashes.points) want(name, hashes, "old");
+    for (const gone of known.values()) this.drop(gone);
+    this.tiles = made;
+  }
+
+  place(origin) {
+    this.cloud.origin = origin;
+  }
+
+  // The first picture: every tile, coarse.
+  overview(buffer, side = "new") {
+    const view = new DataView(buffer), n = view.getUint32(4, true);
+    let at = 8 + HEAD * n;
+    for (let i = 0; i < n; i++) {
+      const read = 8 + HEAD * i, name = `${view.getInt32(read, true)},${view.getInt32(read + 4, true)}`;
+      const whole = view.getInt32(read + 8, true), count = view.getUint32(read + 12, true);
+      const tile = this.tiles.find((t) => t.name === name && (t.side === "both" || t.side === side));
+      const z0 = view.getFloat32(read + 16, true), zStep = view.getFloat32(read + 20, true);
+      const packed = new Uint16Array(buffer.slice(at, at + 8 * count));
+      at += 8 * count;
+      if (tile) this.take(tile, Math.max(whole, 0), { z0, zStep, packed }, whole < 0 ? 0 : whole + 1, SPACING[Math.max(whole, 0)]);
+    }
+  }
+
+  take(tile, level, { z0, zStep, packed }, next, spacing) {
+    const part = this.cloud.add({ ...tile, z0, zStep, packed, spacing, tile, level, evidence: tile.evidence });
+    if (!tile.levels.length) {
+      tile.low = z0;
+      let top = 0;
+      for (let i = 2; i < packed.length; i += 4) top = Math.max(top, packed[i]);
+      tile.high = z0 + top * zStep;
+    }
+    tile.levels.push(part);
+    tile.next = next;
+    if (next === 0) tile.partial = part;
+    return part;
+  }
+
+  drop(tile) {
+    for (const part of tile.levels) this.cloud.remove(part);
+    Object.assign(tile, { levels: [], next: 0, partial: null });
+  }
+
+  // What to draw with this budget, and what to ask for next.
+  plan(budget = this.budget) {
+    const { cloud } = this, frustum = cloud.frustum(), eye = cloud.camera.position, pixels = cloud.shared.pixels.value / cloud.shared.ratio.value;
+    const wanted = [];
+    const box = new Box3(), corner = new Vector3();
+    for (const tile of this.tiles) {
+      const [x, y, z] = [tile.x - cloud.origin[0], tile.y - cloud.origin[1], -cloud.origin[2]];
+      box.min.set(x, y, z + tile.low);
+      box.max.set(x + TILE, y + TILE, z + tile.high);
+      tile.seen = frustum.intersectsBox(box);
+      for (const part of tile.levels) part.wanted = false;
+      if (!tile.seen || (tile.side === "old" && cloud.sides === "new") || (tile.side === "new" && cloud.sides === "old")) continue;
+      const distance = Math.max(box.distanceToPoint(corner.copy(eye)), 2);
+      for (const part of tile.levels) wanted.push({ px: (SPACING[part.level] * pixels) / distance, part, tile });
+      if ((tile.next ?? 0) < SPACING.length) wanted.push({ px: (SPACING[tile.next ?? 0] * pixels) / distance, part: null, tile });
+    }
+    wanted.sort((a, b) => b.px - a.px);
+    let left = budget, finest = 1;
+    this.queue = [];
+    for (const { px, part, tile } of wanted) {
+      if (part) {
+        if (left <= 0) continue;
+        part.wanted = true;
+        part.points.geometry.setDrawRange(0, Math.min(part.count, left));
+        left -= part.count;
+        finest = Math.min(finest, 1);
+      } else if (px > ENOUGH_PIXELS && left > 0) this.queue.push(tile);
+    }
+    this.shown = budget - Math.max(left, 0);
+    for (const tile of this.tiles) this.space(tile);
+    this.fetch();
+  }
+
+  // Points grow where finer levels are missing, so that walls stay closed.
+  space(tile) {
+    const drawn = tile.levels.filter((p) => p.wanted);
+    const spacing = Math.max(SPACING[Math.max(...drawn.map((p) => p.level), 0)] ?? 1, 0.16);
+    for (const part of drawn) part.points.material.uniforms.spacing.value = spacing;
+  }
+
+  fetch() {
+    while (this.loading < AT_ONCE && this.queue.length) {
+      const tile = this.queue.shift();
+      if (tile.loading) continue;
+      tile.loading = true;
+      this.loading++;
+      this.load(tile).catch((error) => ((tile.next = SPACING.length), this.onError(error))).finally(() => {
+        tile.loading = false;
+        this.loading--;
+        this.onLoaded(this);
+        this.cloud.draw();
+        this.soon();
+      });
+    }
+    if (!this.loading && !this.queue.length) this.onLoaded(this);
+  }
+
+  async load(tile) {
+    const level = tile.next ?? 0;
+    const buffer = await this.api.cloudPart(tile.hashes, level);
+    if (!this.tiles.includes(tile)) return;
+    if (tile.partial) {
+      this.cloud.remove(tile.partial);
+      tile.levels = tile.levels.filter((p) => p !== tile.partial);
+      tile.partial = null;
+    }
+    this.take(tile, level, unpack(buffer), level + 1, SPACING[level]);
+    this.tidy();
+  }
+
+  tidy() {  // what is out of view goes first
+    let total = 0;
+    for (const tile of this.tiles) for (const part of tile.levels) total += part.count;
+    for (const tile of this.tiles) {
+      if (total < MOST_LOADED) return;
+      if (tile.seen) continue;
+      for (const part of tile.levels) total -= part.count;
+      this.drop(tile);
+    }
+  }
+
+  soon() {
+    this.waiting ??= setTimeout(() => ((this.waiting = null), this.plan(this.still ? 8 * this.budget : this.budget)), 30);
+  }
+
+  // The eye moved: draw what the budget allows, and once it rests, more.
+  moved() {
+    const now = performance.now(), gap = now - this.last;
+    this.last = now;
+    if (this.frames && gap < 400) {
+      if (gap > FRAME_MS[1]) this.budget = Math.max(40_000, this.budget * 0.85);
+      else if (gap < FRAME_MS[0] && this.shown >= 0.9 * this.budget) this.budget = Math.min(4e6, this.budget * 1.1);
+    }
+    this.frames = (this.frames ?? 0) + 1;
+    this.still = false;
+    this.plan();
+    clearTimeout(this.resting);
+    this.resting = setTimeout(() => {
+      this.still = true;
+      this.frames = 0;
+      this.plan(8 * this.budget);
+      this.cloud.draw();
+    }, 250);
+  }
+
+  drawn() {
+    if (!this.marked && this.tiles.some((t) => t.levels.length)) {
+      this.marked = true;
+      performance.mark("first-points");
+    }
+  }
+
+  async evidence(colours, vehicle) {  // textures of what ballots say, for the tiles in view
+    await Promise.all(this.tiles.map(async (tile) => {
+      const bytes = colours ? await this.api.evidence(tile.name, vehicle) : null;
+      tile.evidence = bytes && this.cloud.texture(new Uint8Array(bytes));
+      for (const part of tile.levels) part.points.material.uniforms.evidence.value = tile.evidence ?? this.cloud.blank;
+    }));
+    this.cloud.draw();
+  }
+
+  // Points that came and went, with shapes of their own.
+  async changes(names, lattice, newer, older, paired) {
+    for (const part of this.marks ?? []) this.cloud.remove(part);
+    this.marks = [];
+    const mine = (this.asked = Symbol());
+    await Promise.all(names.map(async (name) => {
+      const buffer = await this.api.cloudChanged(older[name], newer[name]);
+      if (mine !== this.asked) return;
+      const gone = unpack(buffer), come = unpack(buffer, gone.end), [row, col] = name.split(",").map(Number);
+      const at = { x: lattice.x0 + col * TILE, y: lattice.y0 + row * TILE, spacing: 0.2 };
+      const side = (own) => (paired ? own : "both");
+      if (gone.packed.length) this.marks.push(this.cloud.add({ ...at, ...gone, mark: MARK.removed, side: side("old") }));
+      if (come.packed.length) this.marks.push(this.cloud.add({ ...at, ...come, mark: MARK.added, side: side("new") }));
+    }));
+  }
+}

@@ -1,0 +1,129 @@
+// What one does to the picture: colours, before and after, a slice by height, a measured distance.
+
+import { $, element, notice } from "./dom.js";
+import * as link from "./link.js";
+import { distance } from "./pick.js";
+import { COLOUR } from "./shaders.js";
+
+const BLINK_MS = 800, HIGHEST = 40;
+const LEGENDS = {
+  height: ["ground", "15 m and more above it"], plain: [], age: ["2 months ago or more", "seen today"], votes: ["no vote", "9 vehicles and more"],
+  share: ["all say unchanged", "all say changed"], state: ["unchanged", "changed"],
+};
+
+export class Tools {
+  constructor(stage, { setCompare, vehicles }) {
+    Object.assign(this, { stage, cloud: stage.cloud, stream: stage.stream, setCompare, vehicles });
+    this.points = [];
+    $("colour").onchange = () => this.colour($("colour").value);
+    $("vehicle").onchange = () => this.colour("state");
+    $("compare").onchange = () => this.compare($("compare").value);
+    $("swipe").oninput = () => this.swipe();
+    for (const id of ["slice-low", "slice-high"]) $(id).oninput = () => this.slice();
+    $("measure").onclick = () => this.measure(!this.measuring);
+    const asked = link.read();
+    if (asked.slice) [$("slice-low").value, $("slice-high").value] = asked.slice.split(",");
+    $("colour").value = asked.colour in COLOUR ? asked.colour : "height";
+    $("compare").value = ["before", "swipe", "blink"].includes(asked.compare) ? asked.compare : "after";
+    this.slice();
+    if ($("colour").value !== "height") this.colour($("colour").value);
+    if ($("compare").value !== "after") this.compare($("compare").value);
+    this.legend("height");
+  }
+
+  async colour(name) {
+    link.write({ colour: name === "height" ? null : name });
+    $("vehicle-row").hidden = name !== "state";
+    this.legend(name);
+    try {
+      await this.stream.evidence(COLOUR[name] >= 2, name === "state" ? $("vehicle").value : undefined);
+    } catch (error) {
+      return notice(error.message);
+    }
+    this.cloud.shared.colour.value = COLOUR[name];
+    this.cloud.draw();
+  }
+
+  legend(name) {
+    const ends = LEGENDS[name];
+    $("ramp").hidden = !ends.length;
+    $("ramp-low").textContent = ends[0] ?? "";
+    $("ramp-high").textContent = ends[1] ?? "";
+  }
+
+  compare(name) {
+    link.write({ compare: name === "after" ? null : name });
+    $("swipe-row").hidden = name !== "swipe";
+    $("swipe-bar").hidden = name !== "swipe";
+    clearInterval(this.blinking);
+    this.setCompare(name !== "after");
+    if (name === "swipe") return this.swipe();
+    this.cloud.sides = name === "before" ? "old" : "new";
+    if (name === "blink")
+      this.blinking = setInterval(() => {
+        this.cloud.sides = this.cloud.sides === "new" ? "old" : "new";
+        $("which").textContent = this.cloud.sides === "new" ? "after" : "before";
+        this.stream.plan();
+        this.cloud.draw();
+      }, BLINK_MS);
+    $("which").textContent = name === "before" ? "before" : name === "blink" ? "after" : "";
+    this.stream.plan();
+    this.cloud.draw();
+  }
+
+  swipe() {
+    const share = Number($("swipe").value) / 100;
+    this.cloud.sides = share;
+    $("swipe-bar").style.left = `${100 * share}%`;
+    $("which").textContent = "";
+    this.stream.plan();
+    this.cloud.draw();
+  }
+
+  slice() {
+    const low = Number($("slice-low").value), high = Number($("slice-high").value);
+    const whole = low <= -2 && high >= HIGHEST;
+    this.cloud.shared.slice.value.set(low <= -2 ? -1e4 : low, high >= HIGHEST ? 1e4 : high);
+    $("slice-text").textContent = whole ? "all heights" : `${low <= -2 ? "" : low.toFixed(1)} \u2026 ${high >= HIGHEST ? "" : high.toFixed(1)} m`;
+    link.write({ slice: whole ? null : `${low},${high}` });
+    this.cloud.draw();
+  }
+
+  measure(on) {
+    this.measuring = on;
+    this.points = [];
+    $("measure").setAttribute("aria-pressed", String(on));
+    $("measured").replaceChildren();
+    $("measured-text").textContent = on ? "Click two points." : "";
+  }
+
+  // A point that was clicked: true if measuring took it.
+  take(at) {
+    if (!this.measuring) return false;
+    this.points = this.points.length === 2 ? [at] : [...this.points, at];
+    const [a, b] = this.points;
+    $("measured-text").textContent = b
+      ? `${distance(a, b).toFixed(2)} m (level ${Math.hypot(b[0] - a[0], b[1] - a[1]).toFixed(2)} m, height ${Math.abs(b[2] - a[2]).toFixed(2)} m)`
+      : "Click the second point.";
+    this.place(this.cloud);
+    return true;
+  }
+
+  place(cloud) {
+    const at = this.points.map((p) => cloud.project(p));
+    if (at.some((p) => !p)) return $("measured").replaceChildren();
+    const marks = at.map(([x, y]) => mark("circle", { cx: x, cy: y, r: 5 }));
+    if (at.length === 2) marks.push(mark("line", { x1: at[0][0], y1: at[0][1], x2: at[1][0], y2: at[1][1] }));
+    $("measured").replaceChildren(...marks);
+  }
+
+  showVehicles(names) {
+    $("vehicle").replaceChildren(...names.map((name) => element("option", { value: name }, [name])));
+  }
+}
+
+function mark(kind, attributes) {
+  const made = document.createElementNS("http://www.w3.org/2000/svg", kind);
+  for (const [name, value] of Object.entries(attributes)) made.setAttribute(name, value);
+  return made;
+}

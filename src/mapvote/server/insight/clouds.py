@@ -1,0 +1,165 @@
+"""What the page draws: overviews, levels of detail, what came and went between two tiles, and evidence cell by cell."""
+
+from __future__ import annotations
+
+import threading
+from collections import OrderedDict
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from mapvote.core.grid import TILE_CELLS, Lattice, TileIndex
+from mapvote.core.types import I64, NO_VOTE, U8, CellState
+from mapvote.server.insight.changes import missing_from
+from mapvote.server.insight.explain import FOREVER
+from mapvote.server.insight.levels import Levels, cloud_bytes, make_levels, pack
+from mapvote.server.store.blobs import TileHashes
+from mapvote.server.store.eligible_votes import Electorate, judged_votes, read_votes
+from mapvote.server.store.policy import policy_in
+from mapvote.server.store.queries import load_tile, tiles_of, version_of
+from mapvote.server.store.store import Store
+
+OVERVIEW_POINTS = 150_000
+"""Of an overview at most, 1.2 MB: what a slow connection brings in a second or two."""
+_ANYWHERE = Lattice().tile((0, 0))
+"""Levels count from a tile's corner, wherever that is."""
+_KEPT_BYTES = 256_000_000
+_HEAD = "<i4,<i4,<i4,<u4,<f4,<f4"
+_MAGIC = 0x3143564F
+_DAY_NS = 86_400 * 10**9
+_NEVER_SEEN = 255
+
+
+@dataclass(frozen=True, slots=True)
+class _Part:
+    """What an overview shows of one tile."""
+
+    index: TileIndex
+    levels: Levels
+    level: int
+    points: int
+
+
+class Clouds:
+    """Levels of detail of a store's tiles, made when first asked for and kept, the last used longest; thread-safe.
+
+    A tile's levels follow from its hashes alone, so what is kept never grows stale.
+    """
+
+    def __init__(self, store: Store, kept_bytes: int = _KEPT_BYTES) -> None:
+        self._store = store
+        self._room = kept_bytes
+        self._lock = threading.Lock()
+        self._made: OrderedDict[TileHashes, Levels] = OrderedDict()
+        self._overview: tuple[int, bytes] = 0, b""
+
+    def levels(self, hashes: TileHashes) -> Levels:
+        """The levels of one tile; NotFound if no version ever held it."""
+        with self._lock:
+            known = self._made.get(hashes)
+            if known is not None:
+                self._made.move_to_end(hashes)
+                return known
+        with self._store.database.reading() as connection:
+            tile = load_tile(connection, _ANYWHERE, TileHashes(hashes.points, hashes.ground, None))
+        made = make_levels(tile.points, tile.ground_z)
+        with self._lock:
+            if hashes not in self._made:
+                self._made[hashes] = made
+                self._room -= made.packed.nbytes
+            while self._room < 0 and len(self._made) > 1:
+                _, dropped = self._made.popitem(last=False)
+                self._room += dropped.packed.nbytes
+        return made
+
+    def overview(self, version: int, stop: Callable[[], bool] = lambda: False) -> bytes:
+        """All tiles of a version, coarse: as many whole levels as 150,000 points allow, or an even share of the first.
+
+        uint32 0x3143564F, uint32 number of tiles; for each tile int32 row, int32 col, int32 last whole level (-1: a
+        part of the first), uint32 points, float32 z0_m, float32 z_step_m; then all points as in :class:`Levels`.
+        ``stop`` ends the work early, with nothing to show. NotFound if there is no such version.
+        """
+        if self._overview[0] == version:
+            return self._overview[1]
+        with self._store.database.reading() as connection:
+            version_of(connection, version)
+            tiles = tiles_of(connection, version)
+        made = []
+        for index, hashes in tiles.items():
+            if stop():
+                return b""
+            made.append((index, self.levels(TileHashes(hashes.points, hashes.ground, None))))
+        data = _overview_bytes(_chosen(made))
+        self._overview = version, data
+        return data
+
+    def changed(self, old: TileHashes | None, new: TileHashes | None) -> bytes:
+        """Points that only ``old`` has, then those that only ``new`` has, each as :func:`cloud_bytes`."""
+        with self._store.database.reading() as connection:
+            before, after = (load_tile(connection, _ANYWHERE, hashes) for hashes in (old, new))
+        ground = (after if new is not None else before).ground_z
+        gone, come = missing_from(before.points, after.points), missing_from(after.points, before.points)
+        return b"".join(cloud_bytes(*pack(some, ground)) for some in (before.points[gone], after.points[come]))
+
+
+def _chosen(made: list[tuple[TileIndex, Levels]]) -> list[_Part]:
+    ends = np.array([levels.ends for _, levels in made]).reshape(len(made), -1)
+    fits = np.flatnonzero(ends.sum(axis=0) <= OVERVIEW_POINTS)
+    level = int(fits[-1]) if len(fits) else -1
+    share = OVERVIEW_POINTS // max(len(made), 1)
+    return [
+        _Part(index, levels, level, int(levels.ends[level]) if level >= 0 else min(share, int(levels.ends[0])))
+        for index, levels in made
+    ]
+
+
+def _overview_bytes(parts: list[_Part]) -> bytes:
+    rows = [(*p.index, p.level, p.points, p.levels.z0_m, p.levels.z_step_m) for p in parts]
+    head = np.array([_MAGIC, len(parts)], dtype="<u4").tobytes() + np.array(rows, dtype=_HEAD).tobytes()
+    return head + b"".join(np.ascontiguousarray(p.levels.packed[: p.points], dtype="<u2").tobytes() for p in parts)
+
+
+def evidence(store: Store, index: TileIndex, vehicle: str | None = None) -> U8:
+    """(256, 256, 4) what standing ballots say of a tile's cells now, of all vehicles or of one.
+
+    Vehicles that determined the cell (255: or more); days since the last drive that did, 254 at most (255: never); the
+    share of them that says it changed, in 1/255; and the state that most of them say (NO_VOTE: nobody).
+    """
+    with store.database.reading() as connection:
+        judged = judged_votes(connection, index, Electorate(FOREVER, policy_in(connection), FOREVER))
+        stored = [vote for vote, _ in judged if vehicle is None or vote.vehicle == vehicle]
+        votes = read_votes(connection, index, stored)
+    newest: dict[str, tuple[int, U8]] = {}
+    last = np.full((TILE_CELLS, TILE_CELLS), -1, dtype=np.int64)
+    for vote in sorted(votes, key=lambda vote: (vote.end_ns, vote.digest)):
+        states = decided_states(vote.states, vote.tally)
+        spoken = (states != NO_VOTE) & (states != CellState.UNDETERMINED)
+        last[spoken] = vote.end_ns
+        before = newest.get(vote.vehicle, (0, np.full(states.shape, NO_VOTE, np.uint8)))[1]
+        newest[vote.vehicle] = vote.end_ns, np.where(spoken, states, before)
+    return _summary([states for _, states in newest.values()], last, store.clock())
+
+
+def decided_states(states: U8 | None, tally: np.ndarray | None) -> U8:
+    """What a vote says of each cell, of its decisions or of its tally."""
+    if states is not None:
+        return states
+    assert tally is not None
+    return np.where(tally.any(axis=-1), tally.argmax(axis=-1), NO_VOTE).astype(np.uint8)
+
+
+def _summary(planes: list[U8], last: I64, now_ns: int) -> U8:
+    said = np.zeros((4, TILE_CELLS, TILE_CELLS), dtype=np.int64)
+    for plane in planes:
+        for state in range(4):
+            said[state] += plane == state
+    total = said.sum(axis=0)
+    changed = said[CellState.CHANGED_OCCUPIED] + said[CellState.CHANGED_EMPTY]
+    days = np.clip((now_ns - last) // _DAY_NS, 0, _NEVER_SEEN - 1)
+    out = np.empty((TILE_CELLS, TILE_CELLS, 4), dtype=np.uint8)
+    out[..., 0] = np.minimum(total, 255)
+    out[..., 1] = np.where(last < 0, _NEVER_SEEN, days)
+    out[..., 2] = np.rint(255 * changed / np.maximum(total, 1))
+    out[..., 3] = np.where(total > 0, said.argmax(axis=0), NO_VOTE)
+    return out

@@ -1,0 +1,120 @@
+"""The desk: what a publish would change now, thing by thing, and what reviewers have said about it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from concurrent.futures import Executor
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from mapvote.core.grid import TILE_CELLS, TileIndex
+from mapvote.core.tile import Tile
+from mapvote.core.types import Bool
+from mapvote.server.errors import NotFound
+from mapvote.server.insight.changes import ChangeObject, Decided, change_objects, changed_cells
+from mapvote.server.insight.explain import states_of
+from mapvote.server.insight.geojson import to_geojson
+from mapvote.server.store.publish import Gate, edited_tile, publish
+from mapvote.server.store.queries import load_tile, tile_of
+from mapvote.server.store.reviews import Review, Verdict, decide, standing
+from mapvote.server.store.store import Store
+from mapvote.server.store.tile_jobs import Fused, unpack_tally_plane
+
+_OF_REVIEW = "verdict."
+
+
+@dataclass(frozen=True, slots=True)
+class Desk:
+    """What lies on the desk at one moment."""
+
+    version: int
+    """The newest, on which a publish would build."""
+    held: list[str]
+    """Why the policy would hold the version back."""
+    pending: dict[str, Any]
+    """Changes that a publish would make, GeoJSON; those that somebody accepted carry the verdict."""
+    reviewed: list[Review]
+    """Held and rejected changes, which a publish leaves out."""
+    cells: Mapping[str, Mapping[TileIndex, Bool]]
+    """Of every change by its id."""
+
+
+def desk(store: Store, executor: Executor | None = None, gate: Gate | None = None) -> Desk:
+    """What a publish would do now, in the words of the list of changes. Nothing is written."""
+    outcome = publish(store, dry_run=True, executor=executor, gate=gate)
+    tiles = [_before_and_after(store, outcome.version, fused) for fused in outcome.fused if fused.hashes is not None]
+    told = {f.index: Decided(0, states_of(f.states), unpack_tally_plane(f.tally)) for f in outcome.fused}
+    objects = change_objects(changed_cells(old, new, [told[old.index]]) for old, new in tiles)
+    pending = to_geojson(objects, store.lattice, map_id=store.map_id, from_version=outcome.version)
+    reviews = standing(store)
+    cells = {o.id: _cells_of(o) for o in objects}
+    for feature in pending["features"]:
+        mine = cells[feature["id"]]
+        feature["properties"]["verdict"] = next((_told(r) for r, theirs in reviews if _meet(mine, theirs)), None)
+    cells |= {f"{_OF_REVIEW}{review.seq}": theirs for review, theirs in reviews}
+    left_out = [review for review, _ in reviews if review.verdict != "accepted"]
+    return Desk(outcome.version, list(outcome.held), pending, left_out, cells)
+
+
+def review(
+    store: Store,
+    change: str,
+    verdict: Verdict,
+    *,
+    by: str,
+    comment: str = "",
+    after: int | None = None,
+    executor: Executor | None = None,
+) -> int:
+    """Decide about a pending change, or about one that was held or rejected (``verdict.N``); the verdict's number.
+
+    ``after`` as in :func:`mapvote.server.store.reviews.decide`. NotFound if no such change is pending any more.
+    """
+    now = desk(store, executor)
+    features = {f["id"]: f for f in now.pending["features"]}
+    features |= {f"{_OF_REVIEW}{r.seq}": dict(r.feature) for r in now.reviewed}
+    if change not in features:
+        raise NotFound(f"no change {change[:80]!r} is pending any more: look again")
+    feature = features[change] | {"properties": features[change]["properties"] | {"verdict": None}}
+    return decide(store, verdict, feature, now.cells[change], by=by, comment=comment, after=after)
+
+
+def verdict_of(review: Review) -> dict[str, Any]:
+    """A held or rejected change as GeoJSON, as it was when it was decided, with the verdict."""
+    properties = dict(review.feature["properties"]) | {"verdict": _told(review)}
+    return dict(review.feature) | {"id": f"{_OF_REVIEW}{review.seq}", "properties": properties}
+
+
+def _told(review: Review) -> dict[str, Any]:
+    return {
+        "seq": review.seq,
+        "verdict": review.verdict,
+        "by": review.by,
+        "comment": review.comment,
+        "at_ns": review.at_ns,
+    }
+
+
+def _before_and_after(store: Store, version: int, fused: Fused) -> tuple[Tile, Tile]:
+    window = store.lattice.tile(fused.index)
+    with store.database.reading() as connection:
+        before = load_tile(connection, window, tile_of(connection, version, fused.index))
+    return before, edited_tile(fused, window)
+
+
+def _cells_of(change: ChangeObject) -> dict[TileIndex, Bool]:
+    found: dict[TileIndex, Bool] = {}
+    rows, cols = change.where
+    tiles = np.stack([rows // TILE_CELLS, cols // TILE_CELLS], axis=1)
+    for index in np.unique(tiles, axis=0):
+        mine = (tiles == index).all(axis=1)
+        plane = np.zeros((TILE_CELLS, TILE_CELLS), dtype=np.bool_)
+        plane[rows[mine] % TILE_CELLS, cols[mine] % TILE_CELLS] = True
+        found[int(index[0]), int(index[1])] = plane
+    return found
+
+
+def _meet(mine: Mapping[TileIndex, Bool], theirs: Mapping[TileIndex, Bool]) -> bool:
+    return any((mine[i] & theirs[i]).any() for i in mine.keys() & theirs.keys())

@@ -1,0 +1,117 @@
+"""Clouds by HTTP: what the page is sent is the map, and nothing that it vendors was altered."""
+
+from __future__ import annotations
+
+import hashlib
+import struct
+from collections.abc import Iterator
+from importlib.resources import files
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fastapi.testclient import TestClient
+
+from hand_made import Say, make_ballot, states_plane, two_walls
+from mapvote.codec.ballot import encode
+from mapvote.config import FuseSettings
+from mapvote.core.types import CellState
+from mapvote.server.http.app import create_app
+from mapvote.server.store.admission import accept, examine
+from mapvote.server.store.publish import publish
+from mapvote.server.store.store import Store
+
+WALL = [(10, 10), (10, 11), (10, 12)]
+VENDORED = {
+    "three.core.min.js": "e5a824c8ec97ee44aeb8ce0ab64664e1dd1777df9d0ab2345b35f9941a9fcf33",
+    "three.module.min.js": "0f860495069067a103d1df99e2bb01260f250e118ed7a50537167412ba195a0a",
+    "LICENSE": "bfe119ea4fd413f5f7ca3fcd63adb0c4a073ed39daa2fe7d3e6b769e21272601",
+}
+
+
+@pytest.fixture
+def client(tmp_path: Path) -> Iterator[TestClient]:
+    """Two walls, one of which two vehicles saw gone."""
+    store = Store.create(f"sqlite:///{tmp_path / 'store.db'}", two_walls())
+    for name in ("v1", "v2"):
+        states = states_plane(dict.fromkeys(WALL, CellState.CHANGED_EMPTY), fill=CellState.UNCHANGED_EMPTY)
+        ballot = make_ballot(two_walls(), {(0, 0): Say(states)}, name, end_ns=store.clock())
+        accept(store, [examine(encode(ballot))])
+    publish(store, FuseSettings(max_deleted_share=1.0))
+    with TestClient(create_app(store, opened=True), base_url="http://localhost") as found:
+        yield found
+    store.close()
+
+
+def cloud(data: bytes, at: int = 0) -> tuple[np.ndarray, int]:
+    """((n, 4) packed, where the next cloud begins)."""
+    magic, n = struct.unpack_from("<II", data, at)
+    assert magic == 0x3143564D
+    end = at + 16 + 8 * n
+    return np.frombuffer(data[at + 16 : end], "<u2").reshape(n, 4), end
+
+
+def test_the_levels_of_a_tile_hold_its_points_and_no_more(client: TestClient) -> None:
+    tiles = client.get("/v1/map/versions/1").json()["tiles"]
+    hashes = tiles["0,0"]
+    answers = [client.get(f"/v1/clouds/{hashes['points']}/{hashes['ground']}/{level}") for level in range(6)]
+    assert sum(len(cloud(answer.content)[0]) for answer in answers) == 12
+    assert "immutable" in answers[0].headers["cache-control"]
+    assert client.get(f"/v1/clouds/{'0' * 64}/{hashes['ground']}/0").status_code == 404
+    assert client.get(f"/v1/clouds/{hashes['points']}/{hashes['ground']}/6").status_code == 422
+
+
+def test_the_overview_shows_every_tile_of_a_small_map_whole(client: TestClient) -> None:
+    data = client.get("/v1/clouds/overview?version=1").content
+    magic, n = struct.unpack_from("<II", data)
+    assert (magic, n) == (0x3143564F, 2)
+    heads = [struct.unpack_from("<iiiIff", data, 8 + 24 * i) for i in range(n)]
+    assert [(row, col, level, count) for row, col, level, count, _, _ in heads] == [(0, 0, 5, 12), (0, 1, 5, 12)]
+    assert len(data) == 8 + 2 * 24 + 8 * 24
+    assert client.get("/v1/clouds/overview?version=9").status_code == 404
+
+
+def test_what_came_and_went_between_two_versions(client: TestClient) -> None:
+    old, new = (client.get(f"/v1/map/versions/{n}").json()["tiles"]["0,0"] for n in (1, 2))
+    pairs = {name: f"{h['points']}-{h['ground']}" for name, h in (("old", old), ("new", new))}
+    data = client.get("/v1/clouds/changed", params=pairs).content
+    gone, at = cloud(data)
+    come, end = cloud(data, at)
+    assert (len(gone), len(come), end) == (9, 0, len(data))
+    assert sorted(set((gone[:, 3] / 100 - 10).round(2))) == [0.45, 0.75, 1.05]
+    assert len(cloud(client.get("/v1/clouds/changed", params={"new": pairs["new"]}).content, 16)[0]) == 3
+
+
+def test_evidence_tells_votes_age_share_and_state_of_each_cell(client: TestClient) -> None:
+    plane = np.frombuffer(client.get("/v1/evidence/0/0").content, np.uint8).reshape(256, 256, 4)
+    assert plane[10, 11].tolist() == [2, 0, 255, CellState.CHANGED_EMPTY]
+    assert plane[50, 50].tolist() == [2, 0, 0, CellState.UNCHANGED_EMPTY]
+    unseen = np.frombuffer(client.get("/v1/evidence/0/1").content, np.uint8).reshape(256, 256, 4)
+    assert (unseen == [0, 255, 0, 255]).all()
+    one = np.frombuffer(client.get("/v1/evidence/0/0?vehicle=v1").content, np.uint8).reshape(256, 256, 4)
+    assert one[10, 11, 0] == 1
+
+
+def test_a_list_of_changes_is_geojson_or_csv(client: TestClient) -> None:
+    assert client.get("/v1/changes?from=1").json()["features"][0]["properties"]["kind"] == "demolished"
+    head, row = client.get("/v1/changes?from=1&format=csv").text.splitlines()
+    assert head.startswith("id,kind,size,area_m2,height_m")
+    assert row.startswith("demolished.v2.10.10,demolished,small,0.27,1.05")
+
+
+def test_what_is_vendored_is_three_js_as_npm_has_it() -> None:
+    folder = files("mapvote.server.http") / "viewer" / "vendor"
+    assert {f.name: hashlib.sha256(f.read_bytes()).hexdigest() for f in folder.iterdir()} == VENDORED
+
+
+def test_the_page_has_its_files_and_nobody_reaches_others(client: TestClient) -> None:
+    page = client.get("/viewer/vendor/three.core.min.js")
+    assert page.status_code == 200
+    assert (
+        client.get(
+            "/viewer/app.js", headers={"If-None-Match": client.get("/viewer/app.js").headers["etag"]}
+        ).status_code
+        == 304
+    )
+    for name in ("../app.py", "..%2fapp.py", "vendor/../../app.py", "/etc/passwd", "vendor/LICENSE", "vendor"):
+        assert client.get(f"/viewer/{name}").status_code == 404, name

@@ -1,0 +1,126 @@
+"""The desk on SQLite and PostgreSQL: what people decide about a change, and that publishing obeys."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import pytest
+from fastapi.testclient import TestClient
+
+from hand_made import Say, make_ballot, states_plane, two_walls
+from mapvote.codec.ballot import encode
+from mapvote.config import FuseSettings
+from mapvote.core.types import CellState
+from mapvote.server.http.app import create_app
+from mapvote.server.store import keys, policy
+from mapvote.server.store.admission import accept, examine
+from mapvote.server.store.store import Store
+
+WALL = [(10, 10), (10, 11), (10, 12)]
+Server = tuple[TestClient, Store, dict[str, dict[str, str]]]
+
+
+def vote(store: Store, drive: str, vehicles: tuple[str, ...] = ("v1", "v2")) -> None:
+    """These vehicles say that both walls are gone."""
+    for name in vehicles:
+        states = states_plane(dict.fromkeys(WALL, CellState.CHANGED_EMPTY), fill=CellState.UNCHANGED_EMPTY)
+        says = {(0, 0): Say(states), (0, 1): Say(states)}
+        accept(store, [examine(encode(make_ballot(two_walls(), says, name, drive, end_ns=store.clock())))])
+
+
+@pytest.fixture
+def server(database_url: str) -> Iterator[Server]:
+    """A server where a publish would take two walls away; keys of two reviewers, an operator and a vehicle."""
+    store = Store.create(database_url, two_walls())
+    now = policy.current_policy(store)
+    policy.set_policy(store, now.model_copy(update={"fuse": FuseSettings(max_deleted_share=1.0)}), by="test")
+    vote(store, "d1")
+    people: dict[str, keys.Role] = {"anna": "reviewer", "bert": "reviewer", "boss": "operator", "v1": "vehicle"}
+    who = {name: {"Authorization": f"Bearer {keys.issue(store, name, role)}"} for name, role in people.items()}
+    with TestClient(create_app(store), base_url="http://localhost") as client:
+        yield client, store, who
+    store.close()
+
+
+def pending(server: Server) -> list[dict[str, Any]]:
+    client, _, who = server
+    found: list[dict[str, Any]] = client.get("/v1/desk", headers=who["anna"]).json()["pending"]["features"]
+    return found
+
+
+def decide(server: Server, who: str, change: str, verdict: str, **more: Any) -> Any:
+    client, _, whose = server
+    return client.post("/v1/desk/reviews", headers=whose[who], json={"change": change, "verdict": verdict} | more)
+
+
+def published(server: Server) -> dict[str, Any]:
+    client, _, who = server
+    answer: dict[str, Any] = client.post("/v1/publish", headers=who["boss"], json={}).json()
+    return answer
+
+
+def test_what_was_rejected_is_left_out_and_the_same_votes_never_bring_it_back(server: Server) -> None:
+    first, second = pending(server)
+    assert first["properties"]["votes_median"] == 2
+    assert decide(server, "anna", first["id"], "rejected", comment="a wall of glass").status_code == 200
+    assert [f["id"] for f in pending(server)] == [second["id"]]
+    assert published(server)["points_deleted"] == 9, "the other wall alone"
+    assert published(server)["published"] is False
+    assert pending(server) == []
+    vote(server[1], "d2", ("v1", "v2"))
+    assert [f["properties"]["kind"] for f in pending(server)] == ["demolished"], "new drives do"
+
+
+def test_what_is_held_waits_for_all_votes_until_it_is_let_go(server: Server) -> None:
+    client, store, who = server
+    first, _ = pending(server)
+    seq = decide(server, "anna", first["id"], "held").json()["seq"]
+    assert published(server)["points_deleted"] == 9
+    vote(store, "d2")
+    assert pending(server) == []
+    (waiting,) = client.get("/v1/desk", headers=who["bert"]).json()["reviewed"]
+    assert (waiting["id"], waiting["properties"]["verdict"]["by"]) == (f"verdict.{seq}", "anna")
+    assert client.delete(f"/v1/desk/reviews/{seq}", headers=who["bert"]).status_code == 200
+    assert published(server)["points_deleted"] == 9, "no new vote was needed"
+
+
+def test_of_two_reviewers_at_once_one_wins_and_the_other_is_told_by_whom(server: Server) -> None:
+    change = pending(server)[0]["id"]
+    with ThreadPoolExecutor(2) as both:
+        answers = list(both.map(lambda who: decide(server, who, change, "accepted"), ("anna", "bert")))
+    assert sorted(answer.status_code for answer in answers) == [200, 409]
+    told = next(answer.json()["detail"] for answer in answers if answer.status_code == 409)
+    assert "has accepted this change meanwhile" in told
+    seen = next(f["properties"]["verdict"] for f in pending(server) if f["id"] == change)
+    loser = "bert" if seen["by"] == "anna" else "anna"
+    assert decide(server, loser, change, "held", after=seen["seq"]).status_code == 200, "having looked again"
+    assert decide(server, seen["by"], f"verdict.{seen['seq']}", "rejected", after=seen["seq"]).status_code == 404
+
+
+def test_a_verdict_can_be_taken_back_once(server: Server) -> None:
+    client, _, who = server
+    before = pending(server)
+    seq = decide(server, "anna", before[0]["id"], "rejected").json()["seq"]
+    assert client.delete(f"/v1/desk/reviews/{seq}", headers=who["anna"]).status_code == 200
+    assert client.delete(f"/v1/desk/reviews/{seq}", headers=who["bert"]).status_code == 409
+    assert client.delete("/v1/desk/reviews/0", headers=who["bert"]).status_code == 404
+    assert pending(server) == before
+
+
+def test_only_reviewers_and_operators_sit_at_the_desk(server: Server) -> None:
+    client, _, who = server
+    assert client.get("/v1/desk", headers=who["v1"]).status_code == 403
+    assert decide(server, "v1", "x", "accepted").status_code == 403
+    assert decide(server, "boss", "x", "accepted").status_code == 404
+    assert client.get("/v1/desk").status_code == 401
+
+
+def test_a_hostile_comment_is_kept_as_text(server: Server) -> None:
+    told = "<script>alert(1)</script>\u202e'; DROP TABLE reviews; --"
+    change = pending(server)[0]["id"]
+    assert decide(server, "anna", change, "held", comment=told).status_code == 200
+    client, _, who = server
+    (held,) = client.get("/v1/desk", headers=who["boss"]).json()["reviewed"]
+    assert held["properties"]["verdict"]["comment"] == told
