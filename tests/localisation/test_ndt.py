@@ -143,3 +143,16 @@ def test_deskew_undoes_the_motion_of_a_scan(speed: float, sideways: float, yaw_r
     points = deskew(Scan(0, seen.astype(np.float32), time_s), twist)
     np.testing.assert_allclose(points, still, atol=2e-3)
     np.testing.assert_allclose(twist_between(np.eye(4), exp(0.1 * twist), 0.1), twist, atol=1e-9)
+
+
+def test_a_map_that_grows_point_by_point_is_the_map_of_all_points_and_makes_rows_for_voxels_only() -> None:
+    rng = np.random.default_rng(5)
+    points = np.concatenate([rng.uniform(-30, 30, (4000, 3)) * [1, 1, 0.1], rng.normal(0, 0.4, (50000, 3))])
+    at_once, in_pieces = NdtMap(NdtSettings(), np.zeros(3)), NdtMap(NdtSettings(), np.zeros(3))
+    at_once.enter(points)
+    for piece in np.array_split(points, 97):
+        in_pieces.enter(piece)
+    for one, other in zip(at_once.levels, in_pieces.levels, strict=True):
+        assert one.n == other.n
+        assert len(one.voxels.place) <= max(2 * one.n, 1024)
+        np.testing.assert_array_equal(one.voxels.cells[: one.n], other.voxels.cells[: other.n])

@@ -47,12 +47,14 @@ class NdtGrid:
 
     def enter(self, points_map: F64) -> None:
         """Enter points (n, 3) in map metres; those outside the window are left out."""
-        room = self.n + len(points_map)
-        if room > len(self.voxels.place):
-            more = max(room, 2 * len(self.voxels.place)) - len(self.voxels.place)
-            grown = (np.concatenate([a, np.zeros((more, a.shape[1]), dtype=a.dtype)]) for a in self.voxels)
-            self.voxels = Voxels(*grown)
-        self.n = enter_points(points_map, self.window, self.voxels, self.n, self.level.floor_m, self.min_points)
+        left = points_map
+        while len(left):
+            if self.n == len(self.voxels.place):
+                self.voxels = Voxels(*(np.concatenate([a, np.zeros_like(a)]) for a in self.voxels))
+            self.n, looked_at = enter_points(
+                left, self.window, self.voxels, self.n, self.level.floor_m, self.min_points
+            )
+            left = left[looked_at:]
 
 
 class NdtMap:

@@ -158,15 +158,18 @@ def _set_precision(cells: F64, k: int, A: F64, V: F64, floor_variance: float, ev
 
 
 @numba.njit(cache=True, nogil=True)
-def enter_points(points: F64, window: Window, voxels: Voxels, n: int, floor_m: float, min_points: int) -> int:
-    """Enter points (n, 3) in map metres, and refresh the distributions they touch. Returns the new number of rows.
+def enter_points(
+    points: F64, window: Window, voxels: Voxels, n: int, floor_m: float, min_points: int
+) -> tuple[int, int]:
+    """Enter points (n, 3) in map metres, and refresh the distributions they touch.
 
-    ``voxels`` has room for every point; those outside ``window`` are left out. A distribution needs ``min_points``, and
-    is widened by ``floor_m`` to all sides.
+    Returns (the new number of rows, how many points were looked at): fewer than all where ``voxels`` has no row left,
+    so that rows are made for voxels and not for points. Points outside ``window`` are left out. A distribution needs
+    ``min_points``, and is widened by ``floor_m`` to all sides.
     """
     size, sums = window.size, voxels.sums
     touched = np.empty(len(points), dtype=np.int64)
-    n_touched = 0
+    n_touched, looked_at = 0, len(points)
     for i in range(len(points)):
         ax, ay, az = voxel_of(window, points[i, 0], points[i, 1], points[i, 2])
         ix, iy, iz = ax - window.lowest[0], ay - window.lowest[1], az - window.lowest[2]
@@ -174,6 +177,9 @@ def enter_points(points: F64, window: Window, voxels: Voxels, n: int, floor_m: f
             continue
         k = window.rows[ix, iy, iz]
         if k < 0:
+            if n == len(sums):
+                looked_at = i
+                break
             k = n
             n += 1
             window.rows[ix, iy, iz] = k
@@ -202,7 +208,7 @@ def enter_points(points: F64, window: Window, voxels: Voxels, n: int, floor_m: f
             _flatten(A, V, thin)
         even_variance = size * size / 12.0 * max(0.0, 1.0 - 2.0 * np.sqrt(0.8 / m))
         _set_precision(voxels.cells, k, A, V, floor_variance, 1.0 / (even_variance + floor_variance))
-    return n
+    return n, looked_at
 
 
 @numba.njit(cache=True, nogil=True)
