@@ -43,3 +43,8 @@ def read_text(file: Path) -> str:
         raise MapvoteError(f"{file}: cannot be read ({error.strerror or error})") from error
     except UnicodeDecodeError as error:
         raise MapvoteError(f"{file}: not a text file ({error.reason} at byte {error.start}); copy it again") from error
+
+
+def first_line(error: BaseException) -> str:
+    """What another library's error says, in one line."""
+    return (str(error).strip().splitlines() or [type(error).__name__])[0]

@@ -26,6 +26,7 @@ from mapvote.formats.maps.autoware import (
     write_autoware,
 )
 from mapvote.formats.maps.cloud import Cloud
+from mapvote.formats.maps.e57 import is_e57, read_e57
 from mapvote.formats.maps.las import is_las, read_las, stream_las, write_las
 from mapvote.formats.maps.pcd import is_pcd, read_pcd, write_pcd
 from mapvote.formats.maps.ply import is_ply, read_ply, write_ply
@@ -79,6 +80,7 @@ MAPS: dict[str, MapFormat] = {
     "PCD file": MapFormat(is_pcd, read_pcd),
     "LAS or LAZ file": MapFormat(is_las, read_las, stream_las),
     "PLY file": MapFormat(is_ply, read_ply),
+    "E57 file": MapFormat(is_e57, read_e57),
 }
 """Maps that are only points, in the order in which they are tried."""
 

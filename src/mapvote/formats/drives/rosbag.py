@@ -19,7 +19,7 @@ from mapvote.formats.drives.options import DriveFile, DriveOptions, make_drive, 
 from mapvote.formats.drives.point_fields import point_cloud_table, scan_from_fields
 from mapvote.formats.drives.poses import read_T_map_lidar
 from mapvote.formats.drives.trajectory import has_times, read_trajectory
-from mapvote.formats.extras import require
+from mapvote.formats.extras import first_line, require
 from mapvote.formats.geo.frame import MapFrame
 
 CLOUD = "sensor_msgs/msg/PointCloud2"
@@ -43,10 +43,20 @@ class Bag:
             self.reader.open()
         except Exception as error:  # rosbags lets through what its storages raise
             raise MapvoteError(
-                f"{path}: not a readable bag ({error}); was the recording stopped properly? Try: ros2 bag reindex"
+                f"{path}: not a readable bag ({first_line(error)}); was the recording stopped properly? Try: "
+                "ros2 bag reindex"
             ) from error
         weakref.finalize(self, self.reader.close)
         self.path = path
+
+    def decode(self, connection: Any, data: bytes) -> Any:
+        """A serialised message; MapvoteError if it is damaged."""
+        try:
+            return self.reader.deserialize(data, connection.msgtype)
+        except Exception as error:  # rosbags raises what struct, numpy and its own parsers do
+            raise MapvoteError(
+                f"{self.path}: {connection.topic}: a message is damaged ({first_line(error)}); copy the bag again"
+            ) from error
 
     def topics(self, *types: str) -> dict[str, int]:
         """Topics of these message types, with their number of messages."""
@@ -61,23 +71,19 @@ class Bag:
             raise
         except Exception as error:  # whatever zstd, lz4, sqlite and struct raise
             raise MapvoteError(
-                f"{self.path}: {topic}: damaged ({type(error).__name__}: {error}); copy it again"
+                f"{self.path}: {topic}: damaged ({type(error).__name__}: {first_line(error)}); copy it again"
             ) from error
 
     def messages(self, topic: str, **window: int) -> Iterator[tuple[int, Any]]:
         """(receive time ns, message) one by one."""
         for connection, time_ns, data in self.raw(topic, **window):
-            try:
-                message = self.reader.deserialize(data, connection.msgtype)
-            except Exception as error:  # rosbags raises what struct, numpy and its own parsers do
-                raise MapvoteError(
-                    f"{self.path}: {topic}: a message is damaged ({error}); copy the bag again"
-                ) from error
-            yield time_ns, message
+            yield time_ns, self.decode(connection, data)
 
     def stamp_ns(self, data: bytes) -> int:
         """The stamp in the header of a serialised message, without reading the rest."""
         order = "<" if not self.reader.is2 or data[1] & 1 else ">"
+        if len(data) < 12:
+            raise MapvoteError(f"{self.path}: a message of {len(data)} bytes has no header; copy the bag again")
         seconds, nanoseconds = struct.unpack_from(f"{order}II", data, 4)
         return int(seconds) * 10**9 + int(nanoseconds)
 
@@ -101,7 +107,7 @@ def open_rosbag(path: Path, options: DriveOptions) -> Drive:
         where = f"{path} {topic}, scan {i}"
         for connection, _, data in bag.raw(topic, start=start, stop=start + 1):
             if bag.stamp_ns(data) in (stamps_ns[i], 0):
-                table = point_cloud_table(where, bag.reader.deserialize(data, connection.msgtype))
+                table = point_cloud_table(where, bag.decode(connection, data))
                 scan = scan_from_fields(where, i, int(stamps_ns[i]), table, sensor=sensor, bad_points=bad_points)
                 return scan if which[i] == 0 else scan.seen_from(mounts[which[i]])
         raise MapvoteError(f"{where}: gone; the bag changed while it was read")
@@ -162,6 +168,8 @@ def _choose_topics(bag: Bag, wanted: str | None) -> list[str]:
 def _stamps(bag: Bag, topics: list[str]) -> tuple[I64, I64, I64]:
     """(topic, receive time, header stamp) of every scan by stamp; the receive times twice where drivers wrote none."""
     found = [(k, time_ns, bag.stamp_ns(data)) for k, topic in enumerate(topics) for _, time_ns, data in bag.raw(topic)]
+    if not found:
+        raise MapvoteError(f"{bag.path}: {', '.join(topics)}: no message can be read; copy the bag again")
     rows = np.array(found, dtype=np.int64)
     if (rows[:, 2] == 0).all():
         log.warning("%s: %s has no stamps in its headers; the times of receipt are used", bag.path, ", ".join(topics))

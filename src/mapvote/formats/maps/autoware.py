@@ -16,7 +16,7 @@ import yaml
 
 from mapvote.core.types import MapvoteError
 from mapvote.formats.atomic import whole_folder
-from mapvote.formats.extras import read_text
+from mapvote.formats.extras import first_line, read_text
 from mapvote.formats.geo.frame import MapFrame
 from mapvote.formats.geo.projector import PROJECTOR, frame_of_projector, projector_of
 from mapvote.formats.maps.cloud import Cloud, joined, warn_of_float32
@@ -128,7 +128,7 @@ def _read_yaml(file: Path) -> dict[Any, Any]:
     try:
         table = yaml.safe_load(read_text(file))
     except (yaml.YAMLError, ValueError) as error:
-        raise MapvoteError(f"{file}: cannot be read ({error})") from error
+        raise MapvoteError(f"{file}: cannot be read ({first_line(error)})") from error
     if not isinstance(table, dict):
         raise MapvoteError(f"{file}: not Autoware's metadata; {CONTENT}")
     return table

@@ -13,6 +13,7 @@ from pypcd4 import Encoding, PointCloud
 
 from mapvote.core.types import F64, MapvoteError
 from mapvote.formats.atomic import whole_file
+from mapvote.formats.extras import first_line
 from mapvote.formats.maps.cloud import Cloud, kept_fields, other_fields, warn_of_float32, xyz
 
 NO_FIELDS: Mapping[str, NDArray[Any]] = MappingProxyType({})
@@ -33,7 +34,7 @@ def read_pcd_table(path: Path) -> tuple[NDArray[np.void], F64]:
     except OSError as error:
         raise MapvoteError(f"{path}: cannot be read ({error.strerror or error})") from error
     except Exception as error:  # pypcd4 lets through whatever numpy, struct, lzf and pydantic raise
-        raise MapvoteError(f"{path}: not a whole PCD file ({_first_line(error)}); copy or export it again") from error
+        raise MapvoteError(f"{path}: not a whole PCD file ({first_line(error)}); copy or export it again") from error
     table = np.atleast_1d(cloud.pc_data)
     if len(table) != cloud.metadata.points:
         raise MapvoteError(
@@ -76,7 +77,3 @@ def save_pcd(
         columns["intensity"] = columns["intensity"].astype(np.float32)
     kinds: Any = tuple(column.dtype.type for column in columns.values())
     PointCloud.from_points(list(columns.values()), tuple(columns), kinds).save(path, Encoding(encoding))
-
-
-def _first_line(error: Exception) -> str:
-    return (str(error).strip().splitlines() or [type(error).__name__])[0]
