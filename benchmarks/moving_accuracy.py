@@ -227,8 +227,10 @@ def with_value(settings: MovingSettings, key: str, value: float) -> MovingSettin
 def sweep(folder: Path, stride: int, out: Path) -> None:
     """Precision and recall with every constant halved and doubled, one at a time."""
     rows = ["constant,value,precision,recall"]
-    for name in [n for n in vars(moving_objects) if n.isupper() and n != "CELL_SIZE"]:
-        usual = getattr(moving_objects, name)
+    numbers = {name: value for name, value in vars(moving_objects).items() if isinstance(value, int | float)}
+    for name, usual in numbers.items():
+        if not name.isupper() or name == "CELL_SIZE":
+            continue
         for value in (usual, usual / 2, 2 * usual):
             with_value(MovingSettings(), name, min(value, 1.0) if "SHARE" in name else value)
             score = score_simulated(folder, stride, MovingSettings(), 0.0)

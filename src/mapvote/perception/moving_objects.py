@@ -32,8 +32,8 @@ from mapvote.core.sensors import Sensor
 from mapvote.core.types import F32, F64, I32, Bool
 from mapvote.perception.moving_kernels import look, moving_components, range_image, voxels
 
-# Set on the development streets of the simulator. results/moving_constants.csv says what half and twice of each cost;
-# benchmarks/moving_accuracy.py --sweep measures it.
+# Set on the development streets of the simulator; what half and twice of each cost,
+# benchmarks/moving_accuracy.py --sweep measures.
 LOOKS_PAST = 6
 """Scans asked before."""
 LOOKS_AHEAD = 5
