@@ -1,0 +1,90 @@
+"""Compile every kernel that a vehicle and the map's update need, by doing once what they do, on a street of no size.
+
+Compiled kernels stay in numba's cache: beside the program, or where that is read-only in the user's own cache (or in
+``NUMBA_CACHE_DIR``), so that later runs start at once.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+
+from mapvote.codec.ballot import Ballot, decode, encode
+from mapvote.config import Settings, choose_case
+from mapvote.core.geometry import from_xyz_rpy, inverse, transform
+from mapvote.core.point_map import PointMap, map_from_points
+from mapvote.core.sensors import SENSORS
+from mapvote.core.types import F64, Drive, Scan
+from mapvote.fusion.offline import update_map
+from mapvote.slam.build import build_map
+from mapvote.vehicle import vote_drive
+
+_SCANS = 14
+_STEP_M = 0.8
+_SPACING_M = 0.35
+
+
+def warm_up() -> Iterator[tuple[str, float]]:
+    """(what was compiled, CPU seconds that it took), step by step. With everything in the cache it takes seconds."""
+    old, new = _street(demolished=False), _street(demolished=True)
+    settings = Settings()
+    built: list[PointMap] = []
+    ballots: list[Ballot] = []
+
+    def vote(case: str) -> Callable[[], object]:
+        drive = _drive(new, turning=case == "columns")
+        return lambda: ballots.append(vote_drive(drive, built[0], choose_case(settings, case))[0])
+
+    steps: list[tuple[str, Callable[[], object]]] = [
+        ("a map cut into tiles, its ground", lambda: map_from_points(old)),
+        ("a map built by SLAM", lambda: built.append(build_map([_drive(old, turning=True)], settings)[0])),
+        ("a drive that votes by columns", vote("columns")),
+        ("a drive that votes by the paper's rule", vote("5")),
+        ("ballots sent and fused", lambda: _fuse(built[0], ballots, settings)),
+    ]
+    for what, work in steps:
+        start = time.process_time()
+        work()
+        yield what, time.process_time() - start
+
+
+def _fuse(point_map: PointMap, ballots: list[Ballot], settings: Settings) -> None:
+    """Each method's ballots on their own: one round never mixes them."""
+    for ballot in ballots:
+        alone = settings.fuse.model_copy(update={"min_votes": 1})
+        update_map(point_map, [decode(encode(ballot))], alone)
+
+
+def _street(demolished: bool) -> F64:
+    """(n, 3) points of 40 m of road between two rows of houses, one of which may be gone."""
+    rng = np.random.default_rng(0)
+
+    def surface(low: tuple[float, ...], high: tuple[float, ...]) -> F64:
+        sides = np.subtract(high, low)
+        n = int(np.prod(sides[sides > 0]) / _SPACING_M**2)
+        return np.asarray(rng.uniform(low, high, (n, 3)) + rng.normal(0.0, 0.01, (n, 3)))
+
+    pieces = [surface((-25, -11, 0), (25, 11, 0))]
+    for x in (-24.0, -10.0, 4.0):
+        for y in (-10.0, 10.0):
+            if not (demolished and (x, y) == (-10.0, 10.0)):
+                pieces += [surface((x, y, 0), (x + 11, y, 6)), surface((x, min(y, 1.4 * y), 0), (x, max(y, 1.4 * y), 6))]
+    return np.concatenate(pieces)
+
+
+def _drive(street_map: F64, turning: bool) -> Drive:
+    """A drive along the street's middle; ``turning``: its points bring the times at which they were measured."""
+    poses = np.array([from_xyz_rpy(_STEP_M * (i - _SCANS / 2), 0.3, 1.8, 0.0, 0.0, 0.01 * i) for i in range(_SCANS)])
+    stamps_ns = 10**9 + np.arange(_SCANS, dtype=np.int64) * 10**8
+
+    def read_scan(i: int) -> Scan:
+        points = transform(inverse(poses[i]), street_map).astype(np.float32)
+        points = points[np.hypot(points[:, 0], points[:, 1]) > 1.5]
+        time_s = np.zeros(len(points), dtype=np.float32) if turning else None
+        return Scan(int(stamps_ns[i]), points, time_s)
+
+    sensor = SENSORS["vlp16"]
+    return Drive(Path("warmup"), "warmup", "warmup", sensor, stamps_ns, read_scan, poses, 0.02, 0.1)

@@ -1,0 +1,92 @@
+"""The wheel in clean environments: it drives and edits maps; an extra brings its verbs; a missing one says so."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+import venv
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mapvote.formats import write_pcd
+
+ROOT = Path(__file__).parents[1]
+pytestmark = pytest.mark.slow
+
+BASE_LACKS = ["sqlalchemy", "alembic", "fastapi", "uvicorn", "structlog", "embreex", "matplotlib", "small_gicp"]
+TRIES = {
+    "server": ["log", "no-store.db"],
+    "sim": ["simulate", "no-scenario", "out"],
+}
+"""A verb of each extra, and words that make it fail without it, and otherwise at something else."""
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("wheel")
+    source = shutil.copytree(ROOT, folder / "source", ignore=shutil.ignore_patterns(".venv", ".git", "out", ".*_cache"))
+    subprocess.run(
+        [sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "-w", folder, source], check=True, timeout=300
+    )
+    return next(folder.glob("*.whl"))
+
+
+def install(folder: Path, what: str) -> Path:
+    """The ``bin`` of a new environment in which ``what`` is installed."""
+    venv.create(folder, with_pip=True)
+    subprocess.run([folder / "bin" / "pip", "install", "-q", what], check=True, timeout=900)
+    return folder / "bin"
+
+
+def run(bin_: Path, folder: Path, *words: object, code: int = 0) -> str:
+    clean = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+    command = [str(bin_ / "mapvote"), *map(str, words)]
+    done = subprocess.run(command, cwd=folder, env=clean, capture_output=True, text=True, timeout=300)
+    assert done.returncode == code, done.stdout + done.stderr
+    return done.stdout + done.stderr
+
+
+def importable(bin_: Path, modules: list[str]) -> list[str]:
+    code = f"from importlib.util import find_spec as f; print(*[m for m in {modules!r} if f(m)])"
+    clean = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+    return subprocess.run([bin_ / "python", "-c", code], env=clean, capture_output=True, text=True).stdout.split()
+
+
+def test_the_wheel_alone_edits_maps_and_names_the_extra_that_a_verb_lacks(wheel: Path, tmp_path: Path) -> None:
+    bin_ = install(tmp_path / "env", str(wheel))
+    assert importable(bin_, BASE_LACKS) == []
+    assert run(bin_, tmp_path, "--version").startswith("mapvote ")
+    write_pcd(tmp_path / "city.pcd", np.random.default_rng(0).uniform([0, 0, 0], [50, 50, 4], (5000, 3)))
+    run(bin_, tmp_path, "import", "city.pcd", "my_map")
+    assert "5,000" in run(bin_, tmp_path, "info", "my_map")
+    run(bin_, tmp_path, "export", "my_map", "tiles")
+    run(bin_, tmp_path, "config", "--toml")
+    for extra, words in TRIES.items():
+        said = run(bin_, tmp_path, *words, code=1)
+        assert f"pip install 'mapvote[{extra}]'" in said
+        assert "Traceback" not in said
+
+
+@pytest.mark.parametrize("extra", TRIES)
+def test_an_extra_brings_its_verbs(wheel: Path, extra: str, tmp_path: Path) -> None:
+    bin_ = install(tmp_path / "env", f"{wheel}[{extra}]")
+    said = run(bin_, tmp_path, *TRIES[extra], code=1)
+    assert "pip install" not in said
+    assert "Traceback" not in said
+
+
+@pytest.mark.parametrize("python", ["python3.12", "python3.13"])
+def test_another_python_installs_and_runs_the_wheel(wheel: Path, python: str, tmp_path: Path) -> None:
+    program = shutil.which(python)
+    if program is None or subprocess.run([program, "-c", "import venv"], capture_output=True).returncode:
+        pytest.skip(f"no working {python} on this machine")
+    subprocess.run([program, "-m", "venv", tmp_path / "env"], check=True, timeout=120)
+    bin_ = tmp_path / "env" / "bin"
+    subprocess.run([bin_ / "pip", "install", "-q", str(wheel)], check=True, timeout=900)
+    write_pcd(tmp_path / "city.pcd", np.random.default_rng(0).uniform([0, 0, 0], [50, 50, 4], (5000, 3)))
+    run(bin_, tmp_path, "import", "city.pcd", "my_map")
+    assert "5,000" in run(bin_, tmp_path, "info", "my_map")
