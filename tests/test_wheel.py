@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from mapvote.formats import write_pcd
+from mapvote.formats.maps.cloud import Cloud
 
 ROOT = Path(__file__).parents[1]
 pytestmark = pytest.mark.slow
@@ -60,7 +61,7 @@ def test_the_wheel_alone_edits_maps_and_names_the_extra_that_a_verb_lacks(wheel:
     bin_ = install(tmp_path / "env", str(wheel))
     assert importable(bin_, BASE_LACKS) == []
     assert run(bin_, tmp_path, "--version").startswith("mapvote ")
-    write_pcd(tmp_path / "city.pcd", np.random.default_rng(0).uniform([0, 0, 0], [50, 50, 4], (5000, 3)))
+    write_pcd(tmp_path / "city.pcd", Cloud(np.random.default_rng(0).uniform([0, 0, 0], [50, 50, 4], (5000, 3))))
     run(bin_, tmp_path, "import", "city.pcd", "my_map")
     assert "5,000" in run(bin_, tmp_path, "info", "my_map")
     run(bin_, tmp_path, "export", "my_map", "tiles")
@@ -87,6 +88,6 @@ def test_another_python_installs_and_runs_the_wheel(wheel: Path, python: str, tm
     subprocess.run([program, "-m", "venv", tmp_path / "env"], check=True, timeout=120)
     bin_ = tmp_path / "env" / "bin"
     subprocess.run([bin_ / "pip", "install", "-q", str(wheel)], check=True, timeout=900)
-    write_pcd(tmp_path / "city.pcd", np.random.default_rng(0).uniform([0, 0, 0], [50, 50, 4], (5000, 3)))
+    write_pcd(tmp_path / "city.pcd", Cloud(np.random.default_rng(0).uniform([0, 0, 0], [50, 50, 4], (5000, 3))))
     run(bin_, tmp_path, "import", "city.pcd", "my_map")
     assert "5,000" in run(bin_, tmp_path, "info", "my_map")

@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
+from msgspec import structs
 
 from mapvote.codec.ballot import Ballot, decode, encode
 from mapvote.config import Settings, choose_case
@@ -52,14 +53,14 @@ def warm_up() -> Iterator[tuple[str, float]]:
 
 
 def _fuse(point_map: PointMap, ballots: list[Ballot], settings: Settings) -> None:
-    """Each method's ballots on their own: one round never mixes them."""
+    """Each method's ballots on their own: one round never mixes them. Three voters, so that they are compared."""
     for ballot in ballots:
-        alone = settings.fuse.model_copy(update={"min_votes": 1})
-        update_map(point_map, [decode(encode(ballot))], alone)
+        same = [decode(encode(structs.replace(ballot, vehicle=name))) for name in ("a", "b", "c")]
+        update_map(point_map, same, settings.fuse)
 
 
 def _street(demolished: bool) -> F64:
-    """(n, 3) points of 40 m of road between two rows of houses, one of which may be gone."""
+    """(n, 3) points of 50 m of road between two rows of houses; one may be gone, and something built on the road."""
     rng = np.random.default_rng(0)
 
     def surface(low: tuple[float, ...], high: tuple[float, ...]) -> F64:
@@ -71,7 +72,12 @@ def _street(demolished: bool) -> F64:
     for x in (-24.0, -10.0, 4.0):
         for y in (-10.0, 10.0):
             if not (demolished and (x, y) == (-10.0, 10.0)):
-                pieces += [surface((x, y, 0), (x + 11, y, 6)), surface((x, min(y, 1.4 * y), 0), (x, max(y, 1.4 * y), 6))]
+                pieces += [
+                    surface((x, y, 0), (x + 11, y, 6)),
+                    surface((x, min(y, 1.4 * y), 0), (x, max(y, 1.4 * y), 6)),
+                ]
+    if demolished:
+        pieces += [surface((8, 4, 0), (12, 4, 3)), surface((8, 4, 0), (8, 7, 3))]
     return np.concatenate(pieces)
 
 

@@ -30,7 +30,9 @@ def missing_extra(error: ModuleNotFoundError) -> str | None:
         return None
     for requirement in requirements:
         package, extra = re.match(r"[\w.-]+", requirement), re.search(r"extra == ['\"](\w+)['\"]", requirement)
-        if package and extra and re.sub(r"[-.]+", "_", package[0]).lower() == module.lower():
+        if package is None or extra is None or extra[1] in ("all", "dev"):  # which hold what the others hold
+            continue
+        if re.sub(r"[-.]+", "_", package[0]).lower() == module.lower():
             return f"this needs the package {module}; install it with: pip install 'mapvote[{extra[1]}]'"
     return None
 
