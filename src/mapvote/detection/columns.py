@@ -7,6 +7,8 @@ observed is weighed against what was observable, so neither scan rate nor beams 
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numba
 import numpy as np
 
@@ -15,13 +17,16 @@ from mapvote.core.columns import TOP_BIT, below_top, dilated
 from mapvote.core.grid import TileIndex
 from mapvote.core.point_map import PointMap
 from mapvote.core.reference import above_ground_points, cut_reference, reference_window
-from mapvote.core.types import I32, U64, Bool
+from mapvote.core.types import I32, U64, Bool, CellState
 from mapvote.core.voting import VOTE_UNIT
 from mapvote.detection.counters import PLANES, Evidence, count_of, free_words, is_open
 from mapvote.detection.regions import apply_region_rules, around, beside_new, loose_voxels
 from mapvote.detection.rules import ALL_RULES, Rules
 from mapvote.detection.votes import Judged, TileVotes, Weighed
 from mapvote.perception.frontend import Observation
+
+UO, UE, CO, CE, UN = (int(state) for state in CellState)
+"""Columns of a tally."""
 
 
 @numba.njit(cache=True, nogil=True)
@@ -32,6 +37,17 @@ def _ones(word: np.uint64) -> int:
         word &= word - np.uint64(1)
         count += 1
     return count
+
+
+@numba.njit(cache=True, nogil=True)
+def _most_through(cell: U64) -> int:
+    """The highest count of scans that saw through one of a cell's voxels, found bit by bit in all of them at once."""
+    best, highest = ~np.uint64(0), 0
+    for k in range(PLANES - 1, -1, -1):
+        if best & cell[k]:
+            best &= cell[k]
+            highest |= 1 << k
+    return highest
 
 
 @numba.njit(cache=True, nogil=True)
@@ -48,63 +64,112 @@ def _is_brief(planes: U64, base: I32, r: int, c: int, bit: int, share: float) ->
     return struck < share * (struck + through) and is_open(planes[r, c], bit)
 
 
+class Maps(NamedTuple):
+    """What a window's cells are weighed from: the counters, and the map's words. Planes of (rows, cols)."""
+
+    planes: U64
+    """(rows + 2, cols + 2, WORDS) counters, with the cells around the window."""
+    base: I32
+    """(rows + 2, cols + 2) layers of bits 0, likewise."""
+    occupied: U64
+    near: U64
+    """Voxels in which a hit may belong to a mapped voxel next to them (rule C)."""
+    free: U64
+    """What the map knows to be free (rule D)."""
+    low: Bool
+    """Cells whose map hardly rises above the ground (rule G: kerbs, grass, trails of bumpers are never called gone)."""
+
+
+class Weights(NamedTuple):
+    """The settings of the same names, with those of the rules that do not hold put out of force."""
+
+    crossed: bool
+    """Whether a mapped voxel is seen through only if it is open (rule A)."""
+    by_height: bool
+    empty_votes: float
+    gone_votes: float
+    clear_share: float
+    brief_share: float
+    min_scans: int
+    min_support: int
+
+
 @numba.njit(cache=True, nogil=True)
-def _weigh(
-    planes: U64, base: I32, occupied: U64, near: U64, free: U64, low: Bool, crossed: bool, by_height: bool,
-    empty_votes: float, gone_votes: float, clear_share: float, brief_share: float, min_scans: int, min_support: int,
-    tally: I32, gone: U64, new: U64, beside: Bool, adrift: Bool,
-) -> None:  # fmt: skip
-    for r in range(occupied.shape[0]):
-        for c in range(occupied.shape[1]):
-            cell, mapped = planes[r + 1, c + 1], occupied[r, c]
+def _weigh_mapped(cell: U64, mapped: np.uint64, w: Weights) -> tuple[int, int, int, np.uint64]:
+    """A cell that the map has points in: (kept: hits on its voxels, lost: rays through them, clear: the most rays
+    through one of them, and the word of the voxels that are gone)."""
+    kept, lost, clear, gone = 0, 0, 0, np.uint64(0)
+    for bit in range(64):
+        one = np.uint64(1) << np.uint64(bit)
+        if not mapped & one:
+            continue
+        through, struck = count_of(cell, 0, bit), count_of(cell, PLANES, bit)
+        kept += struck
+        if through and (not w.crossed or is_open(cell, bit)):
+            lost += through
+            clear = max(clear, through)
+            if w.gone_votes * through > struck:
+                gone |= one
+    return kept, lost, clear, gone
+
+
+@numba.njit(cache=True, nogil=True)
+def _weigh_empty(maps: Maps, r: int, c: int, struck: np.uint64, w: Weights) -> tuple[int, int, np.uint64, np.uint64]:
+    """A cell that the map has no points in, and hits in the voxels of ``struck``: (found: hits where the map knew free
+    space, refuted: rays through the same voxels, their word, and the word of hits where the map knew nothing)."""
+    cell = maps.planes[r + 1, c + 1]
+    found, refuted, new, beyond = 0, 0, np.uint64(0), np.uint64(0)
+    for bit in range(64):
+        one = np.uint64(1) << np.uint64(bit)
+        if not struck & one:
+            continue
+        through, hits = count_of(cell, 0, bit), count_of(cell, PLANES, bit)
+        if hits < w.min_scans or hits <= w.empty_votes * through:
+            continue
+        if _is_brief(maps.planes, maps.base, r + 1, c + 1, bit, w.brief_share):
+            continue
+        if maps.free[r, c] & one:
+            new |= one
+            found += hits
+            refuted += through
+        elif not maps.near[r, c] & one:
+            beyond |= one
+    return found, refuted, new, beyond
+
+
+@numba.njit(cache=True, nogil=True)
+def _weigh(maps: Maps, w: Weights, tally: I32, gone: U64, new: U64, beside: Bool, adrift: Bool) -> None:
+    """Fill the five planes, which come empty, cell by cell. See :class:`mapvote.detection.votes.Weighed`."""
+    for r in range(maps.occupied.shape[0]):
+        for c in range(maps.occupied.shape[1]):
+            cell, mapped, low = maps.planes[r + 1, c + 1], maps.occupied[r, c], maps.low[r, c]
             through, struck = np.uint64(0), np.uint64(0)
             for k in range(PLANES):
                 through |= cell[k]
                 struck |= cell[PLANES + k]
             if not through | struck:
                 continue
-            strange, beyond = np.uint64(0) if mapped else struck, np.uint64(0)
-            kept, lost, found, refuted, rays, clear = 0, 0, 0, 0, 0, 0
-            for bit in range(64):
-                one = np.uint64(1) << np.uint64(bit)
-                if not (through | struck) & one:
-                    continue
-                t, s = count_of(cell, 0, bit), count_of(cell, PLANES, bit)
-                rays = max(rays, t)
-                if mapped & one:
-                    kept += s
-                    if not crossed or is_open(cell, bit):
-                        lost += t
-                        clear = max(clear, t)
-                        if gone_votes * t > s:
-                            gone[r, c] |= one
-                elif strange & one and s >= min_scans and s > empty_votes * t:
-                    if _is_brief(planes, base, r + 1, c + 1, bit, brief_share):
-                        continue
-                    if free[r, c] & one:
-                        new[r, c] |= one
-                        found += s
-                        refuted += t
-                    elif not near[r, c] & one:
-                        beyond |= one
-            if kept or found < min_support:
-                found, refuted, new[r, c] = 0, 0, 0
-            else:  # a new thing's upper parts, where the map knew nothing, come with it
-                beside[r, c] = not new[r, c] & ~near[r, c]
-                new[r, c] |= beyond | ~(below_top(new[r, c]) | free[r, c])
-            if low[r, c] or clear < clear_share * rays:
-                lost = 0  # hardly ever seen through: foliage, or the end of the view
-            if mapped and not (kept or lost or low[r, c]):
-                under = (mapped & (~mapped + np.uint64(1))) - np.uint64(1)  # below the lowest voxel
-                adrift[r, c] = 2 * _ones(under & through) >= _ones(under) > 0
-            if lost and not kept:
-                gone[r, c] |= mapped & ~struck  # what no ray reached goes with what it stood on
-            votes = tally[r, c]
-            votes[0] = kept * VOTE_UNIT
-            votes[1] = round(empty_votes * VOTE_UNIT * (refuted if by_height and found else 0 if mapped else rays))
-            votes[2] = found * VOTE_UNIT
-            votes[3] = round(lost * gone_votes * VOTE_UNIT)
-            votes[4] = 1 if not (votes[0] or votes[1] or votes[2] or votes[3]) else 0
+            rays, votes = _most_through(cell), tally[r, c]
+            if mapped:
+                kept, lost, clear, gone[r, c] = _weigh_mapped(cell, mapped, w)
+                if low or clear < w.clear_share * rays:
+                    lost = 0  # hardly ever seen through: foliage, or the end of the view
+                if lost and not kept:
+                    gone[r, c] |= mapped & ~struck  # what no ray reached goes with what it stood on
+                if not (kept or lost or low):
+                    under = (mapped & (~mapped + np.uint64(1))) - np.uint64(1)  # below the lowest voxel
+                    adrift[r, c] = 2 * _ones(under & through) >= _ones(under) > 0
+                votes[UO], votes[CE] = kept * VOTE_UNIT, round(lost * w.gone_votes * VOTE_UNIT)
+            else:
+                found, refuted, word, beyond = _weigh_empty(maps, r, c, struck, w)
+                if found >= w.min_support:  # a new thing's upper parts, where the map knew nothing, come with it
+                    beside[r, c] = not word & ~maps.near[r, c]
+                    new[r, c] = word | beyond | ~(below_top(word) | maps.free[r, c])
+                else:
+                    found, refuted = 0, 0
+                against = refuted if w.by_height and found else rays
+                votes[UE], votes[CO] = round(w.empty_votes * VOTE_UNIT * against), found * VOTE_UNIT
+            votes[UN] = 1 if not (votes[UO] or votes[UE] or votes[CO] or votes[CE]) else 0
 
 
 def weigh(
@@ -120,20 +185,33 @@ def weigh(
     changed-occupied (paper III-A).
     """
     shape = occupied.shape
-    everything = np.full(shape, ~np.uint64(0))
     tally, beside, adrift = np.zeros((*shape, 5), np.int32), np.zeros(shape, np.bool_), np.zeros(shape, np.bool_)
     gone, new = np.zeros(shape, np.uint64), np.zeros(shape, np.uint64)
-    brief = rules.brief_is_passing
-    _weigh(
-        planes, base, occupied, near if rules.pose_explains else np.zeros(shape, np.uint64),
-        free if rules.new_where_free else everything, low if brief else np.zeros(shape, np.bool_), rules.empty_by_ray,
-        rules.rays_at_height, settings.empty_votes if rules.rays_at_height else 1.0,
-        settings.gone_votes if rules.rays_count_less else 1.0, settings.clear_share if rules.rays_count_less else 0.0,
-        settings.brief_share if brief else 0.0, settings.min_scans if brief else 1,
-        settings.min_support if brief else 1, tally, gone, new, beside, adrift,
-    )  # fmt: skip
+    maps = Maps(
+        planes,
+        base,
+        occupied,
+        near if rules.pose_explains else np.zeros(shape, np.uint64),
+        free if rules.new_where_free else np.full(shape, ~np.uint64(0)),
+        low if rules.brief_is_passing else np.zeros(shape, np.bool_),
+    )
+    _weigh(maps, _weights(settings, rules), tally, gone, new, beside, adrift)
     loose = np.where(low, np.uint64(0), loose_voxels(planes[1:-1, 1:-1]))
     return Weighed(tally, gone, new, beside, adrift, loose)
+
+
+def _weights(settings: VotingSettings, rules: Rules) -> Weights:
+    e, f, g = rules.rays_count_less, rules.rays_at_height, rules.brief_is_passing
+    return Weights(
+        crossed=rules.empty_by_ray,
+        by_height=f,
+        empty_votes=settings.empty_votes if f else 1.0,
+        gone_votes=settings.gone_votes if e else 1.0,
+        clear_share=settings.clear_share if e else 0.0,
+        brief_share=settings.brief_share if g else 0.0,
+        min_scans=settings.min_scans if g else 1,
+        min_support=settings.min_support if g else 1,
+    )
 
 
 class ColumnVoter:
