@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numba
 import numpy as np
 
@@ -22,41 +24,80 @@ _CHANGED_OCCUPIED = int(CellState.CHANGED_OCCUPIED)
 _CHANGED_EMPTY = int(CellState.CHANGED_EMPTY)
 _UNDETERMINED = int(CellState.UNDETERMINED)
 _CLEAR, _BEHIND, _NEVER = int(Sight.CLEAR), int(Sight.BEHIND), int(Sight.NEVER)
-_OCCLUSION = {"first_hit": 0, "farthest_return": 1, "column": 2}
-_TALL = {"none": 0, "bottom": 1, "height": 2}
+_OCCLUSION_FIRST, _OCCLUSION_FARTHEST, _OCCLUSION_COLUMN = 0, 1, 2
+_OCCLUSION = {
+    "first_hit": _OCCLUSION_FIRST,
+    "farthest_return": _OCCLUSION_FARTHEST,
+    "column": _OCCLUSION_COLUMN,
+}
+_TALL_NONE, _TALL_BOTTOM, _TALL_HEIGHT = 0, 1, 2
+_TALL = {"none": _TALL_NONE, "bottom": _TALL_BOTTOM, "height": _TALL_HEIGHT}
+
+
+class Seen(NamedTuple):
+    """The planes of :class:`mapvote.perception.raycast.ScanView`, and where the scan was taken."""
+
+    counts: I32
+    hit: U64
+    passed: U64
+    sight: U8
+    origin: F64
+    """(3,) the sensor, map metres."""
+    x0: float
+    y0: float
+    """Lower-left corner of the planes, map metres."""
+
+
+class Mapped(NamedTuple):
+    """What the map has in the same cells, as in :class:`mapvote.core.types.Reference`."""
+
+    occupied: U64
+    counts: I32
+    bottom_z: F32
+
+
+class Rule(NamedTuple):
+    """The settings, as numbers."""
+
+    occlusion: int
+    tall: int
+    tan_top: float
+    """Slope of the sensor's highest ray."""
+    table: I32
+    """Votes of n points in VOTE_UNITs, Eq. (1); the last for any more."""
+    n_min: int
 
 
 @numba.njit(cache=True, nogil=True)
-def _paper(
-    counts: I32, hit: U64, passed: U64, sight: U8, occupied: U64, map_counts: I32, bottom_z: F32,
-    origin: F64, x0: float, y0: float, occlusion: int, tall: int, tan_top: float, table: I32, n_min: int, one: int,
-    states: U8, weights: I32,
-) -> None:  # fmt: skip
+def _paper(seen: Seen, mapped: Mapped, rule: Rule, states: U8, weights: I32) -> None:
+    counts, hit, passed, sight, origin, x0, y0 = seen  # unpacked once: a group handed on for each cell would cost much
+    occupied, map_counts, bottom_z = mapped
     rows, cols = counts.shape
     for r in range(rows):
         for c in range(cols):
-            weights[r, c] = one
-            n, mapped, visible = counts[r, c], map_counts[r, c] > 0, sight[r, c] == _CLEAR
-            if occlusion == 1:
-                visible = sight[r, c] >= _BEHIND
-            elif occlusion == 2:
-                crossed = span_of(occupied[r, c]) & passed[r, c]
-                visible = crossed != 0 if mapped else sight[r, c] >= _BEHIND
+            weights[r, c] = VOTE_UNIT
+            n, is_mapped = counts[r, c], map_counts[r, c] > 0
+            # Was the cell seen, by one of the three occlusion rules (docs/decisions/paper.md)?
+            visible = sight[r, c] >= (_CLEAR if rule.occlusion == _OCCLUSION_FIRST else _BEHIND)
+            if rule.occlusion == _OCCLUSION_COLUMN and is_mapped:
+                visible = span_of(occupied[r, c]) & passed[r, c] != 0
+            # Case 5: the map begins above the view at that range, or reaches above the scan's points.
             invalid = False
-            if tall == 1 and mapped:
+            if rule.tall == _TALL_BOTTOM and is_mapped:
                 dx, dy = x0 + (c + 0.5) * CELL_SIZE - origin[0], y0 + (r + 0.5) * CELL_SIZE - origin[1]
-                invalid = bottom_z[r, c] > origin[2] + tan_top * np.sqrt(dx * dx + dy * dy)
-            elif tall == 2:
+                invalid = bottom_z[r, c] > origin[2] + rule.tan_top * np.sqrt(dx * dx + dy * dy)
+            elif rule.tall == _TALL_HEIGHT:
                 invalid = occupied[r, c] > below_top(hit[r, c])
+            # The five states (paper III-A).
             if invalid or (sight[r, c] == _NEVER and n == 0):
                 states[r, c] = NO_VOTE
-            elif n >= n_min:
-                states[r, c] = _UNCHANGED_OCCUPIED if mapped else _CHANGED_OCCUPIED
-                weights[r, c] = table[min(n, len(table) - 1)]
+            elif n >= rule.n_min:
+                states[r, c] = _UNCHANGED_OCCUPIED if is_mapped else _CHANGED_OCCUPIED
+                weights[r, c] = rule.table[min(n, len(rule.table) - 1)]
             elif n > 0 or not visible:
                 states[r, c] = _UNDETERMINED
             else:
-                states[r, c] = _CHANGED_EMPTY if mapped else _UNCHANGED_EMPTY
+                states[r, c] = _CHANGED_EMPTY if is_mapped else _UNCHANGED_EMPTY
 
 
 def classify_paper(
@@ -72,11 +113,11 @@ def classify_paper(
     weights = np.empty(view.counts.shape, dtype=np.int32)
     table = weight_table(settings.weighted, settings.a, settings.b, settings.k, settings.n_min)
     tall = _TALL[settings.tall_rule if settings.skip_tall_cells else "none"]
-    _paper(
-        view.counts, view.hit, view.passed, view.sight, reference.occupied, reference.counts, reference.bottom_z,
-        origin_map, view.grid.x0, view.grid.y0, _OCCLUSION[settings.occlusion], tall,
-        np.tan(np.radians(sensor.fov_top_deg)), table, settings.n_min, VOTE_UNIT, states, weights,
-    )  # fmt: skip
+    grid = view.grid
+    seen = Seen(view.counts, view.hit, view.passed, view.sight, origin_map, grid.x0, grid.y0)
+    tan_top = float(np.tan(np.radians(sensor.fov_top_deg)))
+    rule = Rule(_OCCLUSION[settings.occlusion], tall, tan_top, table, settings.n_min)
+    _paper(seen, Mapped(reference.occupied, reference.counts, reference.bottom_z), rule, states, weights)
     return states, weights
 
 

@@ -1,7 +1,7 @@
 """The scan's side of NDT: the normal equations of one Gauss-Newton step.
 
 Equation numbers are those of Magnusson, The Three-Dimensional Normal-Distributions Transform, 2009, chapter 6; where
-we deviate, mapvote.localisation.ndt says how. Steps are inlined by numba: a name costs nothing (docs/results.md).
+we deviate, mapvote.localisation.ndt says how. Steps are inlined by numba: a name costs next to nothing (docs/results.md).
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from mapvote.core.types import F64
+from mapvote.core.types import F64, I32
 from mapvote.localisation.ndt_voxels import Symmetric, Vector, Window, holds, voxel_of
 
 INLIER_E = 7.81
@@ -38,19 +38,19 @@ def transform_point(R: F64, points: F64, i: int) -> Vector:
 
 @numba.njit(inline="always")
 def linearise(
-    window: Window, cells: F64, ix: np.int64, iy: np.int64, iz: np.int64, ox: float, oy: float, oz: float
+    rows: I32, size: float, cells: F64, ix: np.int64, iy: np.int64, iz: np.int64, ox: float, oy: float, oz: float
 ) -> tuple[Symmetric, Vector, float]:
-    """Pull of the voxel (ix, iy, iz) of the window and the six beside it on a point at (ox, oy, oz) from its centre.
+    """Pull of the voxel (ix, iy, iz) of ``rows`` and the six beside it on a point at (ox, oy, oz) from its centre.
 
     With u the point from a voxel's mean, C its precision, e = u C u and w = exp(-e / 2), the weight of Eq. (6.9) with
     d1 = d2 = 1: (A = sum of w C, b = sum of w C u, the smallest e). Gauss-Newton drops the other terms of Eq. (6.13).
     """
     a00, a01, a02, a11, a12, a22 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     b0, b1, b2 = 0.0, 0.0, 0.0
-    nearest, size = np.inf, window.size
+    nearest = np.inf
     for j in range(7):
         dx, dy, dz = _neighbour(j)
-        k = window.rows[ix + dx, iy + dy, iz + dz]
+        k = rows[ix + dx, iy + dy, iz + dz]
         if k < 0 or cells[k, 3] + cells[k, 6] + cells[k, 8] == 0.0:
             continue
         ux = ox - dx * size - cells[k, 0]
@@ -119,16 +119,17 @@ def accumulate(H: F64, M: F64, g: F64, gi: F64, p: Vector, A: Symmetric, b: Vect
 def normal_equations(points: F64, R: F64, t: F64, window: Window, cells: F64) -> tuple[F64, F64, F64, float, float]:
     """H, g of the reweighted least squares at pose (R, t); M, the sum of g_i g_i^T; mean likelihood; inlier share."""
     H, M, g, gi = np.zeros((6, 6)), np.zeros((6, 6)), np.zeros(6), np.empty(6)
-    likelihood, inliers, size = 0.0, 0, window.size
+    likelihood, inliers = 0.0, 0
+    rows, lowest, size = window  # unpacked once: a group handed on for each point would cost a little
     for i in range(len(points)):
         p = transform_point(R, points, i)
         x, y, z = p[0] + t[0], p[1] + t[1], p[2] + t[2]
-        ax, ay, az = voxel_of(window, x, y, z)
-        ix, iy, iz = ax - window.lowest[0], ay - window.lowest[1], az - window.lowest[2]
-        if not holds(window, ix, iy, iz, 1):
+        ax, ay, az = voxel_of(size, x, y, z)
+        ix, iy, iz = ax - lowest[0], ay - lowest[1], az - lowest[2]
+        if not holds(rows, ix, iy, iz, 1):
             continue
         ox, oy, oz = x - (ax + 0.5) * size, y - (ay + 0.5) * size, z - (az + 0.5) * size
-        A, b, nearest = linearise(window, cells, ix, iy, iz, ox, oy, oz)
+        A, b, nearest = linearise(rows, size, cells, ix, iy, iz, ox, oy, oz)
         if nearest == np.inf:
             continue
         likelihood += np.exp(-0.5 * nearest)

@@ -1,7 +1,7 @@
 """The map side of NDT: points become a normal distribution per voxel.
 
 Equation numbers are those of Magnusson, The Three-Dimensional Normal-Distributions Transform, 2009, chapter 6; where
-we deviate, mapvote.localisation.ndt says how. Steps are inlined by numba: a name costs nothing (docs/results.md).
+we deviate, mapvote.localisation.ndt says how. Steps are inlined by numba: a name costs next to nothing (docs/results.md).
 """
 
 from __future__ import annotations
@@ -91,16 +91,15 @@ def _upright(V: F64) -> None:
 
 
 @numba.njit(inline="always")
-def voxel_of(window: Window, x: float, y: float, z: float) -> tuple[np.int64, np.int64, np.int64]:
+def voxel_of(size: float, x: float, y: float, z: float) -> tuple[np.int64, np.int64, np.int64]:
     """World voxel of a point, map metres."""
-    size = window.size
     return np.int64(np.floor(x / size)), np.int64(np.floor(y / size)), np.int64(np.floor(z / size))
 
 
 @numba.njit(inline="always")
-def holds(window: Window, ix: np.int64, iy: np.int64, iz: np.int64, margin: int) -> bool:
+def holds(rows: I32, ix: np.int64, iy: np.int64, iz: np.int64, margin: int) -> bool:
     """Whether the window has this voxel (counted from its lowest), and ``margin`` more to all sides."""
-    nx, ny, nz = window.rows.shape
+    nx, ny, nz = rows.shape
     return margin <= ix < nx - margin and margin <= iy < ny - margin and margin <= iz < nz - margin
 
 
@@ -167,22 +166,23 @@ def enter_points(
     so that rows are made for voxels and not for points. Points outside ``window`` are left out. A distribution needs
     ``min_points``, and is widened by ``floor_m`` to all sides.
     """
-    size, sums = window.size, voxels.sums
+    rows, lowest, size = window
+    sums = voxels.sums
     touched = np.empty(len(points), dtype=np.int64)
     n_touched, looked_at = 0, len(points)
     for i in range(len(points)):
-        ax, ay, az = voxel_of(window, points[i, 0], points[i, 1], points[i, 2])
-        ix, iy, iz = ax - window.lowest[0], ay - window.lowest[1], az - window.lowest[2]
-        if not holds(window, ix, iy, iz, 0):
+        ax, ay, az = voxel_of(size, points[i, 0], points[i, 1], points[i, 2])
+        ix, iy, iz = ax - lowest[0], ay - lowest[1], az - lowest[2]
+        if not holds(rows, ix, iy, iz, 0):
             continue
-        k = window.rows[ix, iy, iz]
+        k = rows[ix, iy, iz]
         if k < 0:
             if n == len(sums):
                 looked_at = i
                 break
             k = n
             n += 1
-            window.rows[ix, iy, iz] = k
+            rows[ix, iy, iz] = k
             voxels.place[k, 0], voxels.place[k, 1], voxels.place[k, 2] = ax, ay, az
             sums[k, :] = 0.0
         if sums[k, 10] == 0.0:
@@ -214,8 +214,9 @@ def enter_points(
 @numba.njit(cache=True, nogil=True)
 def reindex(window: Window, place: I64, n: int) -> None:
     """Find the first ``n`` voxels, whose world voxels are ``place`` (m, 3), in a window that has moved."""
-    window.rows[:] = -1
+    rows, lowest, _ = window
+    rows[:] = -1
     for k in range(n):
-        ix, iy, iz = place[k, 0] - window.lowest[0], place[k, 1] - window.lowest[1], place[k, 2] - window.lowest[2]
-        if holds(window, ix, iy, iz, 0):
-            window.rows[ix, iy, iz] = k
+        ix, iy, iz = place[k, 0] - lowest[0], place[k, 1] - lowest[1], place[k, 2] - lowest[2]
+        if holds(rows, ix, iy, iz, 0):
+            rows[ix, iy, iz] = k
