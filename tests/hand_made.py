@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Literal
 
@@ -12,8 +12,10 @@ from mapvote.codec.ballot import Ballot, BallotTile, pack_plane, tile_key
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Lattice, TileIndex
 from mapvote.core.point_map import PointMap
 from mapvote.core.tile import Tile
-from mapvote.core.types import F32, NO_VOTE, U8, U16, U64
+from mapvote.core.types import F32, NO_VOTE, U8, U16, U64, Scan
 from mapvote.fusion.offline import base_hash
+from mapvote.localisation.ndt import PosePrior
+from mapvote.localisation.tracker import Fix
 
 Cell = tuple[int, int]
 SETTINGS = "5e771465" * 8
@@ -105,3 +107,16 @@ def two_walls() -> PointMap:
     cells = [(10, 10), (10, 11), (10, 12)]
     points = np.concatenate([wall(cells, [0.05]), wall(cells, [0.45, 0.75, 1.05])])
     return make_map({(0, 0): make_tile(points), (0, 1): make_tile(points.copy())})
+
+
+class AtOnce:
+    """A localiser that decides every scan when it comes, by a plain function."""
+
+    def __init__(self, find: Callable[[Scan, PosePrior | None], Fix]) -> None:
+        self._find = find
+
+    def push(self, scan: Scan, prior: PosePrior | None) -> list[Fix]:
+        return [self._find(scan, prior)]
+
+    def flush(self) -> list[Fix]:
+        return []

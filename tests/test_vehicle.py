@@ -8,6 +8,7 @@ from typing import Any, Literal
 import numpy as np
 import pytest
 
+from hand_made import AtOnce
 from mapvote.codec.ballot import decode, encode, unpack_points, unpack_states, unpack_tally, unpack_words, validate
 from mapvote.config import Settings, VotingSettings
 from mapvote.core.grid import TILE_CELLS
@@ -53,14 +54,14 @@ def scan_of(x: float, i: int) -> tuple[Scan, F64]:
 def exactly(scan: Scan, prior: PosePrior | None) -> Fix:
     """The prior is the truth."""
     assert prior is not None
-    return Fix(Registration(prior.T_map_lidar, np.zeros((6, 6)), 1.0, 1.0, 0, True), scan.points, True)
+    return Fix(scan, Registration(prior.T_map_lidar, np.zeros((6, 6)), 1.0, 1.0, 0, True), scan.points, True)
 
 
 PAPER = Settings(voting=VotingSettings(method="paper"))
 
 
 def make(point_map: PointMap, settings: Settings = PAPER, **more: Any) -> Vehicle:
-    return Vehicle("v1", SENSORS["hdl32e"], point_map, settings, **{"localise": exactly, **more})
+    return Vehicle("v1", SENSORS["hdl32e"], point_map, settings, **{"localise": AtOnce(exactly), **more})
 
 
 def drive(vehicle: Vehicle) -> Vehicle:
@@ -131,7 +132,7 @@ def test_a_lost_scan_casts_no_vote() -> None:
     def lost_at_first(scan: Scan, prior: PosePrior | None) -> Fix:
         return replace(exactly(scan, prior), trusted=scan.stamp_ns >= 2 * 10**8)
 
-    vehicle = make(street_map(), localise=lost_at_first)
+    vehicle = make(street_map(), localise=AtOnce(lost_at_first))
     for i in range(2):
         vehicle.observe(*scan_of(-1.0, i))
     with pytest.raises(MapvoteError, match="none of 2 scans could be localised"):

@@ -52,11 +52,24 @@ class NdtSettings(Section):
     map_sigma_deg: float = Field(default=0.03, description="the same, rotation")
     min_inlier_share: float = Field(default=0.5, description="below it the vehicle abstains; lost scans have about .4")
     max_sigma_m: float = Field(default=0.15, description="abstain when the pose is less certain than this")
-    prior_gate: float = Field(default=5.0, description="abstain this many sigma from the prior (plus gate_m)")
-    gate_m: float = Field(default=1.0, description="slack of that gate, for errors the sigma does not cover")
     acceleration_mps2: float = Field(default=3.0, description="how fast a prediction by constant velocity goes stale")
     hypothesis_step_m: float = Field(default=1.0, description="spacing of the guesses when the vehicle is lost")
     hypothesis_reach_m: float = Field(default=10.0, description="farthest guess from the seed")
+
+
+class TrustSettings(Section):
+    """localisation/trust.py and localisation/localiser.py: when a pose may be voted with."""
+
+    points: int = Field(default=1000, ge=200, description="points of a scan looked at")
+    near_m: float = Field(default=2.0, gt=0, description="other places are tried from here")
+    far_m: float = Field(default=15.0, gt=0, description="to here, along the street and across it")
+    min_fit: float = Field(default=0.6, description="fit, as a share of what the map leads to expect")
+    min_known: float = Field(default=0.3, description="share of the standing points where the map has been")
+    min_lead: float = Field(default=0.05, description="by how much the best other place must fit worse, same scale")
+    scans: int = Field(default=3, ge=1, description="scans in turn that must hold before the first vote")
+    every_m: float = Field(default=10.0, gt=0, description="a track that holds is looked at again after this distance")
+    every_s: float = Field(default=2.0, gt=0, description="or this time")
+    wait_scans: int = Field(default=40, ge=5, description="scans that wait at most until their track is confirmed")
 
 
 class MovingSettings(Section):
@@ -210,6 +223,7 @@ class Settings(Section):
     """All of them. ``mapvote config`` prints this page."""
 
     ndt: NdtSettings = NdtSettings()
+    trust: TrustSettings = TrustSettings()
     moving: MovingSettings = MovingSettings()
     mapping: MappingSettings = MappingSettings()
     voting: VotingSettings = VotingSettings()
@@ -222,7 +236,7 @@ class Settings(Section):
 
         Settings and METHOD_VERSION: two programs that would vote otherwise on the same drive never share a round.
         """
-        settings = self.model_dump_json(include={"ndt", "moving", "voting"})
+        settings = self.model_dump_json(include={"ndt", "trust", "moving", "voting"})
         return hashlib.sha256(f"{METHOD_VERSION} {settings}".encode()).hexdigest()
 
 

@@ -17,9 +17,9 @@ from mapvote.core.voting import to_wire
 from mapvote.detection.new_points import NewPoints, points_in
 from mapvote.detection.voters import Voter, make_voter
 from mapvote.detection.votes import TileVotes
+from mapvote.localisation.localiser import Localise, Localiser
 from mapvote.localisation.ndt import PosePrior
-from mapvote.localisation.tracker import MapWindow, Tracker
-from mapvote.perception.frontend import DriveReport, Frontend, Localise, Observation
+from mapvote.perception.frontend import DriveReport, Frontend, Observation
 from mapvote.perception.moving_objects import MovingFilter
 
 
@@ -46,7 +46,7 @@ class Vehicle:
         self.settings = settings or Settings()
         self._prior_sigmas = prior_sigma_m, float(np.radians(prior_sigma_deg))
         self._frontend = Frontend(
-            localise or Tracker(MapWindow(point_map, self.settings.ndt), self.settings.ndt).localise,
+            localise or Localiser(point_map, self.settings, sensor),
             MovingFilter(sensor, self.settings.moving),
             LocalMap(point_map, self.settings.voting.window_m),
         )
@@ -117,6 +117,9 @@ def write_ballot(
         scans=report.scans,
         scans_localised=voted,
         median_sigma_m=float(np.median(report.sigmas_m)),
+        length_m=report.length_m(),
+        prior_misfit_m=report.prior_misfit_m(),
+        prior_sigma_m=report.prior_sigma_m(),
         tiles=[_ballot_tile(point_map, tile, v, points.get(tile), two_stage) for tile, v in votes.items()],
     )
 

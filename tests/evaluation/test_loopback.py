@@ -15,7 +15,7 @@ from mapvote.core.types import MapvoteError, Scan
 from mapvote.evaluation.loopback import running_server, vote_by_http
 from mapvote.formats import write_map
 from mapvote.fusion.offline import update_map
-from mapvote.localisation.tracker import GivenPoses
+from mapvote.localisation.localiser import GivenPoses
 from mapvote.vehicle import Vehicle
 
 

@@ -84,12 +84,6 @@ def test_a_lost_vehicle_recovers_by_its_prior(tracker: Tracker) -> None:
     assert off(fix.registration.T_map_lidar, 8) < 0.05
 
 
-def test_a_pose_that_contradicts_its_prior_is_not_trusted(tracker: Tracker) -> None:
-    tracker.localise(scan(0), prior(0))
-    far = prior(1, 9.5, 0.0, 0.0, sigma_m=0.5)
-    assert not tracker.localise(scan(1), far).trusted
-
-
 def test_only_the_map_around_the_vehicle_is_held(point_map: PointMap) -> None:
     here = window_points(point_map, np.array([0.0, 0.0, 0.0]), SETTINGS.half_window_m)
     assert len(here) == sum(len(tile.points) for tile in point_map.tiles.values())

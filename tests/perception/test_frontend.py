@@ -5,16 +5,17 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hand_made import make_map, make_tile, wall
+from hand_made import AtOnce, make_map, make_tile, wall
 from mapvote.config import MovingSettings
 from mapvote.core.geometry import from_xyz_rpy
 from mapvote.core.point_map import PointMap
 from mapvote.core.reference import LocalMap
 from mapvote.core.sensors import SENSORS
 from mapvote.core.types import F64, Bool, MapvoteError, Registration, Scan
+from mapvote.localisation.localiser import GivenPoses, Localise
 from mapvote.localisation.ndt import PosePrior
-from mapvote.localisation.tracker import Fix, GivenPoses
-from mapvote.perception.frontend import Frontend, Localise, Observation
+from mapvote.localisation.tracker import Fix
+from mapvote.perception.frontend import Frontend, Observation
 from mapvote.perception.moving_objects import MovingFilter
 
 SECOND = 10**9
@@ -38,9 +39,9 @@ def drive(frontend: Frontend, scans: int) -> list[Observation]:
 def localise(lost: tuple[int, ...] = ()) -> Localise:
     def known(scan: Scan, prior: PosePrior | None) -> Fix:
         registration = Registration(SENSOR, np.diag([0.04, 0.01, 0.01, 0, 0, 0]), 1.0, 1.0, 0, True)
-        return Fix(registration, scan.points, scan.stamp_ns * 4 // SECOND not in lost)
+        return Fix(scan, registration, scan.points, scan.stamp_ns * 4 // SECOND not in lost)
 
-    return known
+    return AtOnce(known)
 
 
 def frontend(lost: tuple[int, ...] = (), compared: LocalMap | None = None) -> Frontend:

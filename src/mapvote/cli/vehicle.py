@@ -107,7 +107,7 @@ def vote(
     from mapvote.formats import open_drive, read_map
     from mapvote.formats.atomic import whole_file
     from mapvote.formats.geo.frame import frame_of
-    from mapvote.localisation.tracker import GivenPoses
+    from mapvote.localisation.localiser import GivenPoses
     from mapvote.vehicle import vote_drive
 
     if out is None and send is None:
@@ -160,7 +160,7 @@ def _send(url: str, key: str | None, data: bytes) -> None:
 def _tell_votes(ballot: Ballot, report: DriveReport, out: Path | None, size: int) -> None:
     print(
         f"{ballot.vehicle}: {ballot.scans_localised} of {ballot.scans} scans localised "
-        f"(median sigma {ballot.median_sigma_m:.3f} m), the others abstain"
+        f"(median sigma {ballot.median_sigma_m:.3f} m) over {ballot.length_m or 0.0:.0f} m, the others abstain"
     )
     stages = ", ".join(f"{stage} {1000.0 * sorted(s)[len(s) // 2]:.1f}" for stage, s in report.stage_s.items())
     print(f"milliseconds a scan (median): {stages}")

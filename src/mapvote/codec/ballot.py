@@ -73,6 +73,12 @@ class Ballot(msgspec.Struct, frozen=True, kw_only=True):
     """Scans that voted; the others abstained because the vehicle was not sure where it was."""
     median_sigma_m: float
     """Median position sigma of the scans that voted."""
+    length_m: float | None = None
+    """Road driven while localised; None if the ballot does not say."""
+    prior_misfit_m: float | None = None
+    """Median distance, in the plane, between fix and prior of the scans that voted; None without a prior."""
+    prior_sigma_m: float | None = None
+    """What the prior said of itself."""
     tiles: list[BallotTile]
 
 
@@ -162,6 +168,10 @@ def decode(data: bytes) -> Ballot:
         raise MapvoteError("ballot: ends before it starts; check the drive's clock")
     if not math.isfinite(ballot.median_sigma_m):
         raise MapvoteError("ballot: median_sigma_m is not finite")
+    for name in ("length_m", "prior_misfit_m", "prior_sigma_m"):
+        value = getattr(ballot, name)
+        if value is not None and not 0.0 <= value < math.inf:
+            raise MapvoteError(f"ballot: {name} = {value} is not a distance")
     return ballot
 
 

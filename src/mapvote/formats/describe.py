@@ -87,6 +87,15 @@ def _drive(drive: Drive) -> Rows:
     return [*rows, ("prior", about), ("from", ends)]
 
 
+def _foundation(ballot: Ballot) -> str:
+    if ballot.length_m is None:
+        return "not said"
+    misfit = "no prior"
+    if ballot.prior_misfit_m is not None and ballot.prior_sigma_m is not None:
+        misfit = f"{ballot.prior_misfit_m:.2f} m off its prior (median), which claims {ballot.prior_sigma_m:.2f} m"
+    return f"{ballot.length_m:.0f} m driven, {ballot.scans_localised / max(ballot.scans, 1):.0%} of scans, {misfit}"
+
+
 def _ballot(ballot: Ballot, size: int) -> Rows:
     counts = np.zeros(len(CellState), dtype=np.int64)
     for tile in ballot.tiles:
@@ -102,6 +111,7 @@ def _ballot(ballot: Ballot, size: int) -> Rows:
         ("version", str(ballot.version or "unknown")),
         ("method", f"{ballot.method}, settings {ballot.settings_hash[:16]}"),
         ("scans", f"{ballot.scans_localised} of {ballot.scans} voted, median sigma {ballot.median_sigma_m:.3f} m"),
+        ("founded on", _foundation(ballot)),
         ("tiles", str(len(ballot.tiles))),
         ("planes", ", ".join(planes)),
         ("new points", f"{new:,}"),

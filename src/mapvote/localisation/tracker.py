@@ -14,9 +14,9 @@ from mapvote.config import NdtSettings
 from mapvote.core.geometry import exp, from_xyz_rpy
 from mapvote.core.grid import window_around
 from mapvote.core.point_map import PointMap
-from mapvote.core.types import F32, F64, I64, Registration, Scan
+from mapvote.core.types import F32, F64, Registration, Scan
 from mapvote.core.voxels import thin
-from mapvote.localisation.deskew import deskew, motion_at, twist_between
+from mapvote.localisation.deskew import deskew, twist_between
 from mapvote.localisation.ndt import NdtMap, PosePrior, build_ndt, fitness, refine, thin_for_levels
 
 _REFINED = 3
@@ -30,7 +30,7 @@ _ROUNDS = 2
 """How often a scan is de-skewed anew with the motion just found, while that still changes."""
 _SPEEDS_MPS = np.arange(-2.5, 32.6, 2.5)
 """Forward speeds tried on a first scan."""
-_TWIST_AGE_S = 1.0
+TWIST_AGE_S = 1.0
 """Two poses farther apart in time than this say little about the present velocity."""
 
 
@@ -38,11 +38,12 @@ _TWIST_AGE_S = 1.0
 class Fix:
     """One scan, localised."""
 
+    scan: Scan
     registration: Registration
     points: F32
     """(n, 3) the scan's points in the lidar frame at its stamp, de-skewed with the motion found."""
     trusted: bool
-    """False: the vehicle must not vote with this scan."""
+    """Whether the registration by itself is sound; whether it is the right place, the Localiser finds out."""
 
 
 def window_points(point_map: PointMap, position: F64, half_window_m: float) -> F64:
@@ -87,15 +88,18 @@ class Tracker:
         """What trusted scans scored lately: far less than that means the wrong place, however sure it looks."""
 
     def localise(self, scan: Scan, prior: PosePrior | None = None) -> Fix:
-        """The pose of the next scan. Without any prior, ever, the first pose is taken to be near the map's origin."""
+        """The pose of the next scan. Without any prior, ever, the first pose is taken to be near the map's origin.
+
+        A prior is a guess and a factor, no gate: whether a pose can be voted with is the Localiser's to say.
+        """
         seed, reach = self._seed(scan.stamp_ns, prior)
         ndt_map = self.map_around(seed[:3, 3])
-        twist = self.twist if self._knows_motion(scan) else self._guess_motion(ndt_map, scan, seed, prior)
+        twist = self.twist if self._knows_motion(scan) else self.guess_motion(ndt_map, scan, seed, prior)
         first_level = 0 if self.last_pose is None or reach > 0.5 * self.settings.hypothesis_step_m else 1
         result = refine(ndt_map, self._clouds(scan, twist), seed, prior, first_level)
         if result.score < _POOR * self._usual_score:
             result = self._reconsider(ndt_map, self._clouds(scan, twist), scan.stamp_ns, result, prior)
-        if not self._is_trusted(result, prior):
+        if not self.is_sound(result):
             centre = prior.T_map_lidar if prior is not None else seed
             result = self._search(ndt_map, self._clouds(scan, twist), centre, reach, prior)
         for _ in range(_ROUNDS):
@@ -104,31 +108,36 @@ class Tracker:
                 break
             twist = found
             result = refine(ndt_map, self._clouds(scan, twist), result.T_map_lidar, prior, len(ndt_map.levels) - 1)
-        trusted = self._is_trusted(result, prior)
+        trusted = self.is_sound(result)
         if trusted:
             self._accept(result.T_map_lidar, scan.stamp_ns, twist)
             rate = 0.2 if self._usual_score else 1.0
             self._usual_score += rate * (result.score - self._usual_score)
-        return Fix(result, deskew(scan, twist), trusted)
+        return Fix(scan, result, deskew(scan, twist), trusted)
 
     def _clouds(self, scan: Scan, twist: F64) -> list[F64]:
         return thin_for_levels(deskew(scan, twist), self.settings)
 
     def _knows_motion(self, scan: Scan) -> bool:
-        return scan.time_s is None or bool(self.twist.any()) or self.last_pose is not None
+        return scan.time_s is None or bool(self.twist.any()) or self._measured
 
-    def _guess_motion(self, ndt_map: NdtMap, scan: Scan, seed: F64, prior: PosePrior | None) -> F64:
-        """The forward speed at which the first scan fits the map best: unknown motion bends it by half a metre."""
+    def guess_motion(self, ndt_map: NdtMap, scan: Scan, seed: F64, prior: PosePrior | None) -> F64:
+        """The forward speed at which a scan fits the map best: unknown motion bends it, and moves it since the last."""
         few = thin(scan.points, self.settings.levels[0].points_m)
         sample = Scan(scan.stamp_ns, scan.points[few], None if scan.time_s is None else scan.time_s[few])
-        twists = [np.array([speed, 0.0, 0.0, 0.0, 0.0, 0.0]) for speed in _SPEEDS_MPS]
-        return max(twists, key=lambda twist: refine(ndt_map, self._clouds(sample, twist), seed, prior).score)
+        age = 1e-9 * (scan.stamp_ns - self.last_stamp_ns)
+        moved: list[tuple[float, F64]] = []
+        for speed in _SPEEDS_MPS:
+            twist = np.array([speed, 0.0, 0.0, 0.0, 0.0, 0.0])
+            start = seed if self.last_pose is None else self.last_pose @ exp(age * twist)
+            moved.append((refine(ndt_map, self._clouds(sample, twist), start, prior).score, twist))
+        return max(moved, key=lambda found: found[0])[1]
 
     def begin(self, scan: Scan, T_map_lidar: F64) -> Fix:
         """Take the first pose as given: where there is no map yet, the first scan makes it."""
         self._accept(T_map_lidar, scan.stamp_ns, self.twist)
         registration = Registration(T_map_lidar, np.zeros((6, 6)), 1.0, 1.0, 0, True)
-        return Fix(registration, deskew(scan, self.twist), True)
+        return Fix(scan, registration, deskew(scan, self.twist), True)
 
     def _seed(self, stamp_ns: int, prior: PosePrior | None) -> tuple[F64, float]:
         """The first guess and how far it may be off: by constant velocity while that is fresher than the prior."""
@@ -142,14 +151,17 @@ class Tracker:
             return np.eye(4), self.settings.hypothesis_reach_m
         return prior.T_map_lidar, 2.0 * prior.sigma_m
 
-    def _is_trusted(self, result: Registration, prior: PosePrior | None) -> bool:
+    def move_to(self, T_map_lidar: F64, stamp_ns: int, twist: F64 | None = None, score: float = 0.0) -> None:
+        """The vehicle was here then: the track goes on from this pose, with this motion or none known."""
+        self.last_pose, self.last_stamp_ns = T_map_lidar, stamp_ns
+        self.twist, self._measured = (np.zeros(6), False) if twist is None else (twist, True)
+        self._usual_score = score
+
+    def is_sound(self, result: Registration) -> bool:
+        """Whether a registration converged, met the map and is certain enough; that it is the right place says more."""
         s = self.settings
         sigma_m = float(np.sqrt(np.linalg.eigvalsh(result.covariance[:3, :3])[-1]))
-        good = result.converged and result.inlier_share >= s.min_inlier_share and sigma_m <= s.max_sigma_m
-        if good and prior is not None:
-            off = float(np.linalg.norm(result.T_map_lidar[:3, 3] - prior.T_map_lidar[:3, 3]))
-            good = off <= s.prior_gate * prior.sigma_m + s.gate_m
-        return good
+        return result.converged and result.inlier_share >= s.min_inlier_share and sigma_m <= s.max_sigma_m
 
     def _reconsider(
         self, ndt_map: NdtMap, clouds: list[F64], stamp_ns: int, result: Registration, prior: PosePrior | None
@@ -183,7 +195,7 @@ class Tracker:
     def _motion_to(self, T_map_lidar: F64, stamp_ns: int) -> F64 | None:
         """Motion per second from the last trusted pose to this one, None if that was too long ago to say."""
         seconds = 1e-9 * (stamp_ns - self.last_stamp_ns)
-        if self.last_pose is None or not 0 < seconds <= _TWIST_AGE_S:
+        if self.last_pose is None or not 0 < seconds <= TWIST_AGE_S:
             return None
         return twist_between(self.last_pose, T_map_lidar, seconds)
 
@@ -198,18 +210,3 @@ def _differ(twist: F64, other: F64) -> bool:
     """Whether two motions bend a scan differently: by more than 2 cm, at its ends and 20 m away."""
     change = np.abs(twist - other)
     return bool(change[:3].max() * 0.05 > 0.02 or change[3:].max() * 0.05 * 20.0 > 0.02)
-
-
-class GivenPoses:
-    """Poses that need no improvement: a prior to be trusted, the outcome of SLAM, or the truth."""
-
-    def __init__(self, stamps_ns: I64, T_map_lidar: F64) -> None:
-        """``stamps_ns`` (n,) ascending and ``T_map_lidar`` (n, 4, 4): a pose for every scan that will come."""
-        self._poses = {int(stamp): i for i, stamp in enumerate(stamps_ns)}
-        self._stamps_ns, self._T_map_lidar = stamps_ns, T_map_lidar
-
-    def __call__(self, scan: Scan, prior: PosePrior | None) -> Fix:
-        i = self._poses[scan.stamp_ns]
-        twist = motion_at(self._stamps_ns, self._T_map_lidar, i)
-        registration = Registration(self._T_map_lidar[i], np.zeros((6, 6)), 1.0, 1.0, 0, True)
-        return Fix(registration, deskew(scan, twist), True)

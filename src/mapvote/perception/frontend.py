@@ -3,14 +3,14 @@
     localise and de-skew -> to the map's frame -> tell the ground -> tell what moves -> wait -> follow the rays
 
 Vehicles, the making of maps and experiments all go this way. Scans go in one by one; observations come out in the same
-order, each once the moving-object filter has decided it, about a second later.
+order, each once its place is confirmed and the moving-object filter has decided it, a second or two later.
 """
 
 from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Protocol
@@ -20,12 +20,10 @@ import numpy as np
 from mapvote.core.geometry import transform
 from mapvote.core.reference import LocalMap
 from mapvote.core.types import F64, I32, Bool, MapvoteError, Reference, Scan
+from mapvote.localisation.localiser import Localise
 from mapvote.localisation.ndt import PosePrior
 from mapvote.localisation.tracker import Fix
 from mapvote.perception.raycast import ScanView, cast_rays, find_obstacles
-
-Localise = Callable[[Scan, PosePrior | None], Fix]
-"""Where was this scan taken? ``Tracker.localise`` by NDT, or ``GivenPoses``. An untrusted fix gives no observation."""
 
 
 class Movers(Protocol):
@@ -47,7 +45,9 @@ class DriveReport:
     sigmas_m: list[float] = field(default_factory=list)
     """Position sigma of each scan that was observed: one that still waits for the filter is not in it yet."""
     T_map_lidar: list[F64] = field(default_factory=list)
-    """Pose of every scan; of a lost one the best guess."""
+    """Pose of every scan that is decided; of a lost one the best guess."""
+    priors: list[PosePrior | None] = field(default_factory=list)
+    """Of every scan."""
     stage_s: dict[str, list[float]] = field(default_factory=dict)
     """CPU seconds of every scan by stage: localise, ground, moving, see, and what is made of it (vote). All of it runs
     on one thread."""
@@ -56,6 +56,28 @@ class DriveReport:
     def scans(self) -> int:
         """How many scans went in."""
         return len(self.stamps_ns)
+
+    def length_m(self) -> float:
+        """Road driven between scans in turn that were both localised."""
+        steps = np.linalg.norm(np.diff([T[:3, 3] for T in self.T_map_lidar], axis=0), axis=1)
+        found = np.ones(len(self.T_map_lidar), dtype=np.bool_)
+        found[self.lost] = False
+        return float(steps[found[1:] & found[:-1]].sum())
+
+    def prior_misfit_m(self) -> float | None:
+        """Median distance in the plane between fix and prior of the scans that were localised; None without priors."""
+        lost = set(self.lost)
+        off = [
+            float(np.linalg.norm(T[:2, 3] - prior.T_map_lidar[:2, 3]))
+            for i, (T, prior) in enumerate(zip(self.T_map_lidar, self.priors, strict=False))
+            if prior is not None and i not in lost
+        ]
+        return float(np.median(off)) if off else None
+
+    def prior_sigma_m(self) -> float | None:
+        """What the priors said of themselves; None without priors."""
+        said = [prior.sigma_m for prior in self.priors if prior is not None]
+        return float(np.median(said)) if said else None
 
     @contextmanager
     def timed(self, stage: str) -> Iterator[None]:
@@ -121,27 +143,36 @@ class Frontend:
             raise MapvoteError("this drive has ended: begin the next one with a new Vehicle")
         report = self.report
         report.stamps_ns.append(scan.stamp_ns)
+        report.priors.append(prior)
         with report.timed("localise"):
-            fix = self._localise(scan, prior)
-        report.T_map_lidar.append(fix.registration.T_map_lidar)
-        if not fix.trusted:
-            report.lost.append(report.scans - 1)
-            return []
-        with report.timed("ground"):
-            placed = self._place(scan, fix, report.scans - 1)
-        self._waiting.append(placed)
-        with report.timed("moving"):
-            decided = self._movers.push(placed.points_map, placed.origin_map, placed.obstacle, scan.stamp_ns)
-        return self._see(decided)
+            fixes = self._localise.push(scan, prior)
+        return [seen for fix in fixes for seen in self._take(fix)]
 
     def finish(self) -> list[Observation]:
         """The drive has ended: the observations that still wait, decided with less than the full look ahead."""
         self._ended = True
-        return self._see(self._movers.flush())
+        with self.report.timed("localise"):
+            fixes = self._localise.flush()
+        return [seen for fix in fixes for seen in self._take(fix)] + self._see(self._movers.flush())
 
-    def _place(self, scan: Scan, fix: Fix, index: int) -> PlacedScan:
+    def _take(self, fix: Fix) -> list[Observation]:
+        """One more scan is decided: if it is lost it says nothing."""
+        report = self.report
+        index = len(report.T_map_lidar)
+        report.T_map_lidar.append(fix.registration.T_map_lidar)
+        if not fix.trusted:
+            report.lost.append(index)
+            return []
+        with report.timed("ground"):
+            placed = self._place(fix, index)
+        self._waiting.append(placed)
+        with report.timed("moving"):
+            decided = self._movers.push(placed.points_map, placed.origin_map, placed.obstacle, fix.scan.stamp_ns)
+        return self._see(decided)
+
+    def _place(self, fix: Fix, index: int) -> PlacedScan:
         T_map_lidar = fix.registration.T_map_lidar
-        points_map, origin_map = transform(T_map_lidar, fix.points), scan.origin_map(T_map_lidar)
+        points_map, origin_map = transform(T_map_lidar, fix.points), fix.scan.origin_map(T_map_lidar)
         sigma_m = float(np.sqrt(np.linalg.eigvalsh(fix.registration.covariance[:3, :3])[-1]))
         reference, outer = self._ground.at(origin_map)
         obstacle, cell = find_obstacles(points_map, reference)

@@ -87,6 +87,9 @@ class Scenario(_Table):
     max_grade: float = Field(default=0.03, ge=0, le=0.12)
     crown: float = Field(default=0.02, ge=0)
     crossing_m: float | None = Field(default=None, description="where a second street crosses, metres from the west")
+    house_m: float | None = Field(
+        default=None, gt=7, description="every house of the front row is the same one, this wide, wall to wall"
+    )
     temporary_cars: int = Field(default=0, ge=0, description="extra cars parked during one vehicle's pass only")
     traffic: Traffic = Traffic()
     clutter: Clutter = Clutter()

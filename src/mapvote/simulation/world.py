@@ -135,15 +135,20 @@ def _plots(scenario: Scenario, side: Side, rng: np.random.Generator) -> Iterator
             if change.from_m < start or change.to_m - change.from_m < 6.0 * change.count or change.to_m > high:
                 where = f"{change.count} building(s) from {change.from_m} to {change.to_m} m"
                 raise MapvoteError(f"scenario {scenario.name}: {where} do not fit: 6 m each, in a free stretch")
-            yield from _fill(start, change.from_m, rng)
+            yield from _fill(start, change.from_m, rng, scenario.house_m)
             each = (change.to_m - change.from_m) / change.count
             for k in range(change.count):
                 yield change.from_m + k * each + 0.5, change.from_m + (k + 1) * each - 0.5, change.kind
             start = change.to_m
-        yield from _fill(start, high, rng)
+        yield from _fill(start, high, rng, scenario.house_m)
 
 
-def _fill(start: float, stop: float, rng: np.random.Generator) -> Iterator[tuple[float, float, str]]:
+def _fill(
+    start: float, stop: float, rng: np.random.Generator, house_m: float | None = None
+) -> Iterator[tuple[float, float, str]]:
+    while house_m and stop - start >= house_m:
+        yield start, start + house_m, "kept"
+        start += house_m
     while stop - start > 7.0:
         end = min(start + rng.uniform(9.0, 22.0), stop)
         yield start, end, "kept"
@@ -153,18 +158,21 @@ def _fill(start: float, stop: float, rng: np.random.Generator) -> Iterator[tuple
 def _frontage(scenario: Scenario, side: Side, terrain: Terrain, rng: np.random.Generator) -> list[Body]:
     """Buildings along the facade line, gardens and yards between, a second row behind."""
     bodies = []
+    equal = int(rng.integers(1 << 32)) if scenario.house_m else None
     for low, high, change in _plots(scenario, side, rng):
-        width, height, turn = high - low, rng.uniform(4.0, 15.0), rng.normal(0.0, 0.015)
-        setback = SIDEWALK_M + rng.choice([rng.uniform(0.2, 0.9), rng.uniform(0.9, 3.0)], p=[0.65, 0.35])
-        if change == "kept" and rng.uniform() < 0.09:  # a yard: fence or hedge in front, a shed at the back
-            front = hedge(rng, width, 0.6, 1.1) if rng.uniform() < 0.5 else box(0, width, -0.08, 0.08, -0.5, 1.6)
+        draw = rng if equal is None else np.random.default_rng(equal)  # the same draws make the same house
+        width, height, turn = high - low, draw.uniform(4.0, 15.0), draw.normal(0.0, 0.015)
+        setback = SIDEWALK_M + draw.choice([draw.uniform(0.2, 0.9), draw.uniform(0.9, 3.0)], p=[0.65, 0.35])
+        yards = change == "kept" and equal is None
+        if yards and draw.uniform() < 0.09:  # a fence or hedge in front, a shed at the back
+            front = hedge(draw, width, 0.6, 1.1) if draw.uniform() < 0.5 else box(0, width, -0.08, 0.08, -0.5, 1.6)
             bodies.append(Body("fence", side.put(front, low, SIDEWALK_M + 0.4, terrain)))
             bodies.append(Body("shed", side.put(box(0, 0.5 * width, 0, 3, -1, 2.6), low, SIDEWALK_M + 9.0, terrain)))
             continue
-        house = side.put(building(rng, width, rng.uniform(8.0, 13.0), height), low, setback, terrain, turn)
+        house = side.put(building(draw, width, draw.uniform(8.0, 13.0), height), low, setback, terrain, turn)
         bodies.append(Body("building", house, change != "built", (change != "demolished",) * scenario.vehicles))
-        if change == "kept" and setback > SIDEWALK_M + 1.4 and rng.uniform() < 0.5:
-            bodies.append(Body("hedge", side.put(hedge(rng, width, 0.5, 0.9), low, SIDEWALK_M + 0.5, terrain)))
+        if change == "kept" and setback > SIDEWALK_M + 1.4 and draw.uniform() < 0.5:
+            bodies.append(Body("hedge", side.put(hedge(draw, width, 0.5, 0.9), low, SIDEWALK_M + 0.5, terrain)))
     for low, high in ((a, b) for span in side.spans for a, b, _ in _fill(span[0] - 3.0, span[1], rng)):
         back = building(rng, (high - low) * rng.uniform(0.75, 0.95), 10.0, rng.uniform(5.0, 15.0))
         bodies.append(Body("building", side.put(back, low, rng.uniform(29.0, 36.0), terrain)))

@@ -25,7 +25,7 @@ from mapvote.core.reference import LocalMap, reference_window
 from mapvote.core.types import F64, I32, I64, U64, Bool, Drive
 from mapvote.core.voxels import VoxelCloud
 from mapvote.detection.counters import PLANES, Evidence, count_of, free_words, is_open
-from mapvote.localisation.tracker import GivenPoses
+from mapvote.localisation.localiser import GivenPoses
 from mapvote.perception.frontend import Frontend, Observation, PlacedScan
 from mapvote.perception.moving_objects import MovingFilter
 from mapvote.perception.raycast import find_obstacles

@@ -7,14 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hand_made import two_walls
+from hand_made import AtOnce, two_walls
 from mapvote.core.types import Drive, Registration, Scan
 from mapvote.evaluation.experiments.conditions import (
     NOISE_MEMORY_S,
     Conditions,
+    Shaken,
     TrueMovers,
     ar1,
-    shaken,
     with_true_ground,
 )
 from mapvote.evaluation.scoring.truth import read_truth
@@ -36,21 +36,21 @@ def test_ar1_noise_has_its_deviation_and_its_memory() -> None:
 
 
 def still(scan: Scan, prior: PosePrior | None) -> Fix:
-    return Fix(Registration(np.eye(4), np.zeros((6, 6)), 1.0, 1.0, 1, True), scan.points, True)
+    return Fix(scan, Registration(np.eye(4), np.zeros((6, 6)), 1.0, 1.0, 1, True), scan.points, True)
 
 
 @pytest.mark.parametrize("told", [False, True])
 def test_shaken_poses_stay_rigid_and_only_a_vehicle_that_is_told_doubts_them(told: bool) -> None:
     stamps_ns = np.arange(50, dtype=np.int64) * 100_000_000
     conditions = Conditions(noise_m=0.1, noise_deg=0.2, noise_told=told)
-    one, again = (shaken(still, stamps_ns, conditions, (1, 2)) for _ in range(2))
+    one, again = (Shaken(AtOnce(still), stamps_ns, conditions, (1, 2)) for _ in range(2))
     scans = [Scan(int(stamp), np.zeros((1, 3), np.float32)) for stamp in stamps_ns]
     for scan in scans:
-        found = one(scan, None).registration
+        found = one.push(scan, None)[0].registration
         T = found.T_map_lidar
         assert 0 < np.linalg.norm(T[:3, 3]) < 1.0
         np.testing.assert_allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-12)
-        np.testing.assert_array_equal(again(scan, None).registration.T_map_lidar, T)
+        np.testing.assert_array_equal(again.push(scan, None)[0].registration.T_map_lidar, T)
         assert found.covariance[0, 0] == pytest.approx(0.01 if told else 0.0)
 
 

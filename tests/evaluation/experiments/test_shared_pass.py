@@ -16,7 +16,7 @@ from mapvote.core.types import F64, Drive, Scan
 from mapvote.detection.rules import ALL_RULES, Rules
 from mapvote.evaluation.experiments.cases import by_letters, choose_cases
 from mapvote.evaluation.experiments.shared_pass import SharedPass
-from mapvote.localisation.tracker import GivenPoses
+from mapvote.localisation.localiser import GivenPoses
 from mapvote.vehicle import vote_drive
 
 N = 8

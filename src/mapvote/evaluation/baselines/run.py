@@ -23,7 +23,7 @@ from mapvote.evaluation.experiments.scene import BALLOTS_FROM, Progress, Scene, 
 from mapvote.evaluation.experiments.shared_pass import SharedPass
 from mapvote.evaluation.scoring.map_points import map_obstacles
 from mapvote.formats.atomic import whole_folder
-from mapvote.localisation.tracker import GivenPoses
+from mapvote.localisation.localiser import GivenPoses
 from mapvote.perception.frontend import Observation
 from mapvote.simulation.processes import processes
 

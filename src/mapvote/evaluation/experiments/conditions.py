@@ -14,9 +14,10 @@ from mapvote.core.point_map import PointMap
 from mapvote.core.tile import Tile
 from mapvote.core.types import F64, I64, Bool, Drive, Scan
 from mapvote.evaluation.scoring.truth import Truth
+from mapvote.localisation.localiser import Localise
 from mapvote.localisation.ndt import PosePrior
 from mapvote.localisation.tracker import Fix
-from mapvote.perception.frontend import Localise, Movers
+from mapvote.perception.frontend import Movers
 from mapvote.simulation.scenario import load_scenario
 from mapvote.simulation.world import make_world
 
@@ -43,25 +44,31 @@ class Conditions:
     """The noise is added to the covariance too: the vehicle knows of it."""
 
 
-def shaken(localise: Localise, stamps_ns: I64, conditions: Conditions, seed: tuple[int, ...]) -> Localise:
+class Shaken:
     """``localise`` with noise added to the poses it finds; its own search goes on undisturbed.
 
     ``stamps_ns`` (n,) of every scan that will come; ``seed`` decides the noise.
     """
-    sigma = np.repeat([conditions.noise_m, float(np.radians(conditions.noise_deg))], 3)
-    errors = ar1(stamps_ns, sigma, np.random.default_rng(seed))
-    error_at = {int(stamp): error for stamp, error in zip(stamps_ns, errors, strict=True)}
 
-    def found(scan: Scan, prior: PosePrior | None) -> Fix:
-        fix = localise(scan, prior)
-        error = error_at[scan.stamp_ns]
+    def __init__(self, localise: Localise, stamps_ns: I64, conditions: Conditions, seed: tuple[int, ...]) -> None:
+        self._localise, self._told = localise, conditions.noise_told
+        self._sigma = np.repeat([conditions.noise_m, float(np.radians(conditions.noise_deg))], 3)
+        errors = ar1(stamps_ns, self._sigma, np.random.default_rng(seed))
+        self._error_at = {int(stamp): error for stamp, error in zip(stamps_ns, errors, strict=True)}
+
+    def push(self, scan: Scan, prior: PosePrior | None) -> list[Fix]:
+        return [self._shake(fix) for fix in self._localise.push(scan, prior)]
+
+    def flush(self) -> list[Fix]:
+        return [self._shake(fix) for fix in self._localise.flush()]
+
+    def _shake(self, fix: Fix) -> Fix:
+        error = self._error_at[fix.scan.stamp_ns]
         T_map_lidar = fix.registration.T_map_lidar.copy()
         T_map_lidar[:3, :3] = T_map_lidar[:3, :3] @ from_xyz_rpy(0, 0, 0, *error[3:])[:3, :3]
         T_map_lidar[:3, 3] += error[:3]
-        covariance = fix.registration.covariance + (np.diag(sigma**2) if conditions.noise_told else 0.0)
+        covariance = fix.registration.covariance + (np.diag(self._sigma**2) if self._told else 0.0)
         return replace(fix, registration=replace(fix.registration, T_map_lidar=T_map_lidar, covariance=covariance))
-
-    return found
 
 
 def ar1(stamps_ns: I64, sigma: F64, rng: np.random.Generator) -> F64:

@@ -14,14 +14,13 @@ from mapvote.codec.ballot import Ballot, decode, encode
 from mapvote.core.point_map import PointMap
 from mapvote.core.types import F64, Drive
 from mapvote.evaluation.experiments.cases import Case
-from mapvote.evaluation.experiments.conditions import TrueMovers, shaken
+from mapvote.evaluation.experiments.conditions import Shaken, TrueMovers
 from mapvote.evaluation.experiments.scene import BALLOTS_FROM, Progress, Scene, key_of, sources_digest
 from mapvote.evaluation.experiments.shared_pass import SharedPass
 from mapvote.formats import open_drive
 from mapvote.formats.atomic import whole_folder
+from mapvote.localisation.localiser import GivenPoses, Localise, Localiser
 from mapvote.localisation.ndt import PosePrior
-from mapvote.localisation.tracker import GivenPoses, MapWindow, Tracker
-from mapvote.perception.frontend import Localise
 from mapvote.simulation.processes import processes
 
 
@@ -106,15 +105,15 @@ def drive_once(scene: Scene, cases: Sequence[Case], name: str) -> None:
 
 def _localise(scene: Scene, drive: Drive, point_map: PointMap) -> Localise:
     """By NDT, or by the truth; with noise if the scene's conditions say so."""
-    conditions, ndt = scene.conditions, scene.settings.ndt
+    conditions = scene.conditions
     if conditions.true_poses:
         assert drive.T_map_lidar_prior is not None
         localise: Localise = GivenPoses(drive.stamps_ns, drive.T_map_lidar_prior)
     else:
-        localise = Tracker(MapWindow(point_map, ndt), ndt).localise
+        localise = Localiser(point_map, scene.settings, drive.sensor)
     if conditions.noise_m or conditions.noise_deg:
         number = scene.drive_names("v").index(drive.path.name)
-        localise = shaken(localise, drive.stamps_ns, conditions, (scene.seed, number))
+        localise = Shaken(localise, drive.stamps_ns, conditions, (scene.seed, number))
     return localise
 
 

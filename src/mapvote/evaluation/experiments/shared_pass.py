@@ -22,9 +22,9 @@ from mapvote.detection.paper import PaperVoter
 from mapvote.detection.rules import Rules
 from mapvote.detection.voters import Voter
 from mapvote.evaluation.experiments.cases import Case
+from mapvote.localisation.localiser import Localise, Localiser
 from mapvote.localisation.ndt import PosePrior
-from mapvote.localisation.tracker import MapWindow, Tracker
-from mapvote.perception.frontend import DriveReport, Frontend, Localise, Movers, Observation
+from mapvote.perception.frontend import DriveReport, Frontend, Movers, Observation
 from mapvote.perception.moving_objects import MovingFilter
 from mapvote.vehicle import write_ballot
 
@@ -44,7 +44,7 @@ class SharedPass:
     ) -> None:
         self.drive, self.point_map, self.settings = drive, point_map, settings
         self._frontend = Frontend(
-            localise or Tracker(MapWindow(point_map, settings.ndt), settings.ndt).localise,
+            localise or Localiser(point_map, settings, drive.sensor),
             movers or MovingFilter(drive.sensor, settings.moving),
             LocalMap(point_map, settings.voting.window_m),
         )

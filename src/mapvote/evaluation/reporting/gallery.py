@@ -21,7 +21,7 @@ from mapvote.evaluation.reporting.tables import case_name
 from mapvote.evaluation.scoring.cells import UNSCORED
 from mapvote.evaluation.scoring.map_points import same_rows
 from mapvote.evaluation.scoring.truth import lay_on
-from mapvote.localisation.tracker import GivenPoses
+from mapvote.localisation.localiser import GivenPoses
 from mapvote.simulation.scenario import load_scenario
 from mapvote.vehicle import Vehicle
 

@@ -30,6 +30,7 @@ MIN_SCANS = 20
 BLOCK_SCANS = 5
 """Neighbouring scans that count as one observation: at 10 Hz they meet the same surfaces."""
 START_M = 0.3
+_SCATTER_M = 1.0
 """Guesses start this far around the prior pose."""
 _START_ANGLES = np.radians([90.0, 210.0, 330.0])
 
@@ -189,7 +190,7 @@ def _localise(window: MapWindow, clouds: list[F64], prior: F64, guesses: list[F6
     scatter = float(np.sqrt(((positions - positions.mean(axis=0)) ** 2).sum(axis=1).mean()))
     sigma_m = float(np.sqrt(np.linalg.eigvalsh(best.covariance[:3, :3])[-1]))
     trusted = best.inlier_share >= ndt.min_inlier_share and sigma_m <= ndt.max_sigma_m
-    return Localised(best.score, best.inlier_share, min(scatter, ndt.gate_m), float(trusted))
+    return Localised(best.score, best.inlier_share, min(scatter, _SCATTER_M), float(trusted))
 
 
 def _prior_twist(drive: Drive, i: int) -> F64:

@@ -29,6 +29,12 @@ other votes look old."""
 MAX_UNPACKED_BYTES = 512 << 20
 """All planes of one ballot together, decompressed: some ten kilometres of street."""
 
+MIN_SCANS = 3
+"""Fewer localised scans found no ballot: their place was never confirmed by others."""
+MAX_MISFIT_SIGMAS = 3.0
+MISFIT_SLACK_M = 1.0
+"""A drive whose fixes lie steadily farther off its priors is held back: its clock, its GNSS or its place is wrong."""
+
 
 class Sent(NamedTuple):
     """What came by HTTP: a ballot's bytes, what its address says, and the hash of the key that it came with."""
@@ -45,10 +51,28 @@ def examine(data: bytes) -> Incoming:
     validate(ballot, MAX_UNPACKED_BYTES)
     if not ballot.tiles:
         raise MapvoteError("ballot: votes on no tile")
+    _check_founded(ballot)
     rule_of(ballot.method)
     if any((tile.states is None) != (ballot.tiles[0].states is None) for tile in ballot.tiles):
         raise MapvoteError("ballot: some tiles hold states and some a tally; a ballot is either two-stage or one-stage")
     return Incoming(ballot, hashlib.sha256(data).hexdigest(), f"{ballot.method}, {staged(ballot)}", len(data))
+
+
+def _check_founded(ballot: Ballot) -> None:
+    if ballot.scans_localised < MIN_SCANS:
+        raise MapvoteError(
+            f"ballot: only {ballot.scans_localised} of {ballot.scans} scans were localised, {MIN_SCANS} are needed; "
+            "drive farther on the map"
+        )
+    if ballot.prior_misfit_m is None or ballot.prior_sigma_m is None:
+        return
+    allowed = MAX_MISFIT_SIGMAS * ballot.prior_sigma_m + MISFIT_SLACK_M
+    if ballot.prior_misfit_m > allowed:
+        raise MapvoteError(
+            f"ballot held back: fixes and priors of {ballot.vehicle}/{ballot.drive} lie {ballot.prior_misfit_m:.1f} m "
+            f"apart (median), the priors claim {ballot.prior_sigma_m:.2f} m; check the vehicle's clock and GNSS, state "
+            "its true sigma, or vote without a prior (--prior none)"
+        )
 
 
 class Intake:

@@ -26,8 +26,8 @@ from mapvote.evaluation.experiments.shared_pass import SharedPass
 from mapvote.evaluation.scoring.cells import determined, ratio
 from mapvote.evaluation.scoring.truth import pose_errors, rigid_between
 from mapvote.formats import open_drive, read_T_map_lidar
+from mapvote.localisation.localiser import GivenPoses
 from mapvote.localisation.ndt import PosePrior
-from mapvote.localisation.tracker import GivenPoses
 from mapvote.perception.frontend import DriveReport, Frontend, Observation
 from mapvote.perception.moving_objects import MovingFilter
 from mapvote.perception.raycast import find_obstacles

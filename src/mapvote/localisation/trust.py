@@ -1,0 +1,194 @@
+"""Whether a pose can be trusted: what fits there, against what should fit there and what fits elsewhere.
+
+No fixed share of inliers serves all sensors and streets. Two comparisons do. How well the scan fits is divided by how
+well a scan from this very place would fit, predicted from the map's own distributions and the sensor's noise. And the
+best other place, 2 to 15 m along or across the street or turned about, must fit clearly worse. Both look only at
+points that stand above the ground: the road fits itself everywhere.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+
+from mapvote.config import TrustSettings
+from mapvote.core.geometry import from_xyz_rpy
+from mapvote.core.types import F64, I32, I64, Bool
+from mapvote.localisation.ndt import NdtMap, fitness, refine
+
+_CELL_M = 3.0
+_ABOVE_M = 0.6
+"""Points this high above the lowest one around them stand above the ground, on any road that can be driven."""
+_SAME_PLACE_M = 1.5
+"""Two fixes nearer than this are one place; if the other fits better, the first had not settled."""
+_SETTLED_M = 0.2
+_REFINED = 3
+"""How many of the best other places are refined."""
+_STEP_M = 1.0
+_COARSE = 300
+"""Standing points that rank the places before any is refined."""
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """What speaks for a pose."""
+
+    fit: float
+    """Likelihood of the standing points over what the map leads to expect of them; about 1 at the right place."""
+    known: float
+    """Share of the standing points that lie where the map has been."""
+    lead: float
+    """By how much the fit exceeds that of the best other place; below 0 that one is better."""
+    T_map_lidar_other: F64 | None
+    """The best other place, if there is any."""
+
+
+class Judge:
+    """Looks at one scan at one pose of a map."""
+
+    def __init__(self, settings: TrustSettings, range_sigma_m: float) -> None:
+        self.settings = settings
+        self.range_sigma_m = range_sigma_m
+
+    def judge(self, ndt_map: NdtMap, points_lidar: F64, T_map_lidar: F64) -> Verdict:
+        """``points_lidar`` (n, 3) de-skewed and thinned; a few thousand are plenty."""
+        few = np.ascontiguousarray(points_lidar[:: max(1, len(points_lidar) // self.settings.points)])
+        standing = few[stands_above_ground(few, T_map_lidar)]
+        expected, known = self._expected(ndt_map, standing, T_map_lidar)
+        here = self._likelihood(ndt_map, standing, T_map_lidar) / expected
+        best, lead = None, here
+        for other in self._others(ndt_map, few, standing, T_map_lidar):
+            ahead = here - self._likelihood(ndt_map, standing, other) / expected
+            away = float(np.linalg.norm(other[:2, 3] - T_map_lidar[:2, 3]))
+            away = away if float(other[:2, 0] @ T_map_lidar[:2, 0]) > 0.0 else np.inf
+            if ahead < lead and (away > _SAME_PLACE_M or (ahead < 0.0 and away > _SETTLED_M)):
+                best, lead = other, ahead
+        return Verdict(here, known, lead, best)
+
+    def fit(self, ndt_map: NdtMap, points_lidar: F64, T_map_lidar: F64) -> float:
+        """The verdict's fit alone."""
+        few = np.ascontiguousarray(points_lidar[:: max(1, len(points_lidar) // self.settings.points)])
+        standing = few[stands_above_ground(few, T_map_lidar)]
+        expected, known = self._expected(ndt_map, standing, T_map_lidar)
+        return self._likelihood(ndt_map, standing, T_map_lidar) / expected if known >= self.settings.min_known else 0.0
+
+    def holds(self, verdict: Verdict) -> bool:
+        """Whether the verdict speaks for the pose."""
+        s = self.settings
+        return verdict.fit >= s.min_fit and verdict.known >= s.min_known and verdict.lead >= s.min_lead
+
+    def _expected(self, ndt_map: NdtMap, standing: F64, T: F64) -> tuple[float, float]:
+        """(mean likelihood that the standing points should have, share of them where the map has been)."""
+        coarse, fine = ndt_map.levels[0], ndt_map.levels[-1]
+        points = standing @ T[:3, :3].T + T[:3, 3]
+        known = _is_near_map(points, coarse.lowest, coarse.level.voxel_m, coarse.index)
+        if not known.any():
+            return 1.0, 0.0
+        each = _self_likelihood(
+            points, fine.lowest, fine.level.voxel_m, fine.index, fine.cells, fine.sums, self.range_sigma_m
+        )
+        mapped = each[each >= 0.0]
+        usual = float(mapped.mean()) if len(mapped) else 1.0
+        return max(usual * float(known.mean()), 1e-6), float(known.mean())
+
+    def _likelihood(self, ndt_map: NdtMap, standing: F64, T: F64) -> float:
+        return fitness(ndt_map, [standing] * len(ndt_map.levels), T, len(ndt_map.levels) - 1)
+
+    def _others(self, ndt_map: NdtMap, few: F64, standing: F64, T: F64) -> list[F64]:
+        """Refined poses of the best other places: the coarse peaks along four arms and turned about, and just
+        ahead and behind."""
+        away = np.arange(self.settings.near_m - _STEP_M, self.settings.far_m + 0.5 * _STEP_M, _STEP_M)
+        coarse = [standing[:: max(1, len(standing) // _COARSE)]]
+        peaks = []
+        for x, y, yaw in ((1.0, 0.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, -1.0, 0.0), (1.0, 0.0, np.pi)):
+            steps = away if yaw == 0.0 else np.concatenate([-away[::-1], away])
+            guesses = [T @ from_xyz_rpy(x * s, y * s, 0.0, 0.0, 0.0, yaw) for s in steps]
+            fits = np.array([fitness(ndt_map, coarse, guess) for guess in guesses])
+            rising = fits[1:] > fits[:-1]
+            falling = np.append(fits[1:-1] >= fits[2:], True)
+            peaks += [(float(fits[k]), guesses[k]) for k in np.flatnonzero(rising & falling) + 1]
+        peaks.sort(key=lambda peak: -peak[0])
+        unsettled = [T @ from_xyz_rpy(s, 0.0, 0.0) for s in (away[0], -away[0])]
+        clouds = [few] * len(ndt_map.levels)
+        guesses = [*unsettled, *(guess for _, guess in peaks[:_REFINED])]
+        return [refine(ndt_map, clouds, guess).T_map_lidar for guess in guesses]
+
+
+def stands_above_ground(points_lidar: F64, T_map_lidar: F64) -> Bool:
+    """(n,) whether each point (n, 3) lies well above the lowest one within a few metres of it, plumb."""
+    return height_above_lowest(points_lidar @ T_map_lidar[:3, :3].T) > _ABOVE_M
+
+
+@numba.njit(cache=True, nogil=True)
+def height_above_lowest(points: F64) -> F64:
+    """(n,) height of each point (n, 3) above the lowest one within 3 to 6 m of it; -inf beyond 120 m."""
+    half = 40
+    low = np.full((2 * half + 2, 2 * half + 2), np.inf)
+    out = np.full(len(points), -np.inf)
+    for i in range(len(points)):
+        r = np.int64(np.floor(points[i, 1] / _CELL_M)) + half + 1
+        c = np.int64(np.floor(points[i, 0] / _CELL_M)) + half + 1
+        if 0 < r <= 2 * half and 0 < c <= 2 * half:
+            low[r, c] = min(low[r, c], points[i, 2])
+    for i in range(len(points)):
+        r = np.int64(np.floor(points[i, 1] / _CELL_M)) + half + 1
+        c = np.int64(np.floor(points[i, 0] / _CELL_M)) + half + 1
+        if 0 < r <= 2 * half and 0 < c <= 2 * half:
+            out[i] = points[i, 2] - low[r - 1 : r + 2, c - 1 : c + 2].min()
+    return out
+
+
+@numba.njit(cache=True, nogil=True)
+def _is_near_map(points: F64, lowest: I64, size: float, index: I32) -> Bool:
+    """(n,) whether the point's voxel, or one beside it, holds anything."""
+    out = np.zeros(len(points), dtype=np.bool_)
+    nx, ny, nz = index.shape
+    for i in range(len(points)):
+        ix = np.int64(np.floor(points[i, 0] / size)) - lowest[0]
+        iy = np.int64(np.floor(points[i, 1] / size)) - lowest[1]
+        iz = np.int64(np.floor(points[i, 2] / size)) - lowest[2]
+        if 1 <= ix < nx - 1 and 1 <= iy < ny - 1 and 1 <= iz < nz - 1:
+            out[i] = (
+                index[ix, iy, iz] >= 0
+                or index[ix - 1, iy, iz] >= 0
+                or index[ix + 1, iy, iz] >= 0
+                or index[ix, iy - 1, iz] >= 0
+                or index[ix, iy + 1, iz] >= 0
+                or index[ix, iy, iz - 1] >= 0
+                or index[ix, iy, iz + 1] >= 0
+            )
+    return out
+
+
+@numba.njit(cache=True, nogil=True)
+def _self_likelihood(points: F64, lowest: I64, size: float, index: I32, cells: F64, sums: F64, noise_m: float) -> F64:
+    """(n,) expected likelihood of a point drawn, with the sensor's noise, from its voxel's own distribution.
+
+    For u ~ N(0, S) and precision C: E exp(-u'Cu / 2) = det(I + S C)^-1/2. -1 where the voxel has no distribution.
+    """
+    out = np.full(len(points), -1.0)
+    nx, ny, nz = index.shape
+    S, C = np.empty((3, 3)), np.empty((3, 3))
+    for i in range(len(points)):
+        ix = np.int64(np.floor(points[i, 0] / size)) - lowest[0]
+        iy = np.int64(np.floor(points[i, 1] / size)) - lowest[1]
+        iz = np.int64(np.floor(points[i, 2] / size)) - lowest[2]
+        if not (0 <= ix < nx and 0 <= iy < ny and 0 <= iz < nz):
+            continue
+        k = index[ix, iy, iz]
+        if k < 0 or cells[k, 3] + cells[k, 6] + cells[k, 8] == 0.0:
+            continue
+        m = sums[k, 0]
+        a, b, c = cells[k, 0], cells[k, 1], cells[k, 2]
+        S[0, 0], S[0, 1], S[0, 2] = sums[k, 4] / m - a * a, sums[k, 5] / m - a * b, sums[k, 6] / m - a * c
+        S[1, 1], S[1, 2], S[2, 2] = sums[k, 7] / m - b * b, sums[k, 8] / m - b * c, sums[k, 9] / m - c * c
+        S[1, 0], S[2, 0], S[2, 1] = S[0, 1], S[0, 2], S[1, 2]
+        for d in range(3):
+            S[d, d] += noise_m * noise_m
+        C[0, 0], C[0, 1], C[0, 2] = cells[k, 3], cells[k, 4], cells[k, 5]
+        C[1, 0], C[1, 1], C[1, 2] = cells[k, 4], cells[k, 6], cells[k, 7]
+        C[2, 0], C[2, 1], C[2, 2] = cells[k, 5], cells[k, 7], cells[k, 8]
+        out[i] = 1.0 / np.sqrt(max(np.linalg.det(np.eye(3) + S @ C), 1.0))
+    return out

@@ -1,0 +1,131 @@
+"""A vehicle votes only from places that it has made sure of, and finds its place when what it was told is wrong."""
+
+import numpy as np
+import pytest
+
+from mapvote.config import Settings
+from mapvote.core.geometry import from_xyz_rpy, transform
+from mapvote.core.point_map import PointMap, map_from_points
+from mapvote.core.sensors import SENSORS
+from mapvote.core.types import F64, Scan
+from mapvote.localisation.localiser import Localiser
+from mapvote.localisation.ndt import PosePrior
+from mapvote.localisation.tracker import Fix
+from streets import path, street, sweep, twist_of
+
+SETTINGS = Settings()
+POSES = path(12)
+
+
+@pytest.fixture(scope="module")
+def point_map() -> PointMap:
+    """The street, with a kiosk and a hoarding that make its places differ."""
+    return map_from_points(world(1, 2.0))
+
+
+def world(seed: int, density: float) -> F64:
+    rng = np.random.default_rng(seed)
+    kiosk = rng.uniform((-6, 8, 0), (-3, 10, 3), (int(1500 * density), 3))
+    hoarding = rng.uniform((14, -11, 0), (17, -8.5, 4), (int(1500 * density), 3))
+    return np.concatenate([street(seed, density), kiosk, hoarding])
+
+
+def scan(i: int) -> Scan:
+    return sweep(world(100 + i, 0.6), POSES[i], twist_of(POSES, i), (i + 1) * 100_000_000)
+
+
+def localiser(point_map: PointMap) -> Localiser:
+    return Localiser(point_map, SETTINGS, SENSORS["hdl32e"])
+
+
+def drive(localiser: Localiser, T_map_lidar_prior: F64 | None, scans: int = 12) -> list[Fix]:
+    fixes = []
+    for i in range(scans):
+        prior = None if T_map_lidar_prior is None else PosePrior(T_map_lidar_prior[i], 1.0, np.radians(1.0))
+        fixes += localiser.push(scan(i), prior)
+    return fixes + localiser.flush()
+
+
+def off(fixes: list[Fix]) -> F64:
+    """(n,) metres off the truth."""
+    return np.array(
+        [np.linalg.norm(fix.registration.T_map_lidar[:3, 3] - T[:3, 3]) for fix, T in zip(fixes, POSES, strict=False)]
+    )
+
+
+def test_scans_wait_until_several_agree_and_then_all_are_trusted(point_map: PointMap) -> None:
+    one = localiser(point_map)
+    prior = [PosePrior(T, 1.0, np.radians(1.0)) for T in POSES]
+    assert [len(one.push(scan(i), prior[i])) for i in range(3)] == [0, 0, 3]
+
+
+@pytest.mark.parametrize("told", [(0.0, 0.0), (-8.0, 0.0), (10.0, 0.0), (3.0, 4.0)])
+def test_a_prior_metres_off_moves_no_vehicle_and_silences_none(point_map: PointMap, told: tuple[float, float]) -> None:
+    fixes = drive(localiser(point_map), np.array([T @ from_xyz_rpy(*told, 0.0) for T in POSES]))
+    assert len(fixes) == len(POSES)
+    assert all(fix.trusted for fix in fixes)
+    assert off(fixes).max() < 0.15
+
+
+def test_a_steady_error_of_the_prior_is_learned(point_map: PointMap) -> None:
+    one = localiser(point_map)
+    drive(one, np.array([T @ from_xyz_rpy(-8.0, 0.0, 0.0) for T in POSES]))
+    assert one.misfit[0] > 4.0
+
+
+def test_without_any_prior_the_vehicle_is_found(point_map: PointMap) -> None:
+    fixes = drive(localiser(point_map), None, scans=5)
+    assert all(fix.trusted for fix in fixes)
+    assert off(fixes).max() < 0.15
+
+
+def test_a_prior_that_faces_backwards_is_overruled_by_the_map(point_map: PointMap) -> None:
+    back = np.array([T @ from_xyz_rpy(0, 0, 0, 0, 0, np.pi) for T in POSES])
+    fixes = drive(localiser(point_map), back)
+    trusted = np.array([fix.trusted for fix in fixes])
+    assert trusted[-4:].all()
+    assert off(fixes)[trusted].max() < 0.15
+
+
+def test_a_vehicle_in_a_street_that_the_map_does_not_show_never_votes(point_map: PointMap) -> None:
+    one = localiser(point_map)
+    elsewhere = transform(from_xyz_rpy(0, 0, 0, 0, 0, 1.2), street(5, 0.6)[::2] * [1.0, 2.5, 1.0])
+    fixes = []
+    for i in range(8):
+        lost = sweep(elsewhere, POSES[i], np.zeros(6), (i + 1) * 100_000_000)
+        fixes += one.push(lost, PosePrior(POSES[i], 1.0, np.radians(1.0)))
+    fixes += one.flush()
+    assert len(fixes) == 8
+    assert not any(fix.trusted for fix in fixes)
+
+
+def test_between_two_endless_walls_nobody_knows_how_far_along_he_is() -> None:
+    def tunnel(seed: int, n: int) -> F64:
+        rng = np.random.default_rng(seed)
+        sides = [rng.uniform((-80, y, 0), (80, y + 0.02, 5), (n, 3)) for y in (-5, 5)]
+        return np.concatenate([*sides, rng.uniform((-80, -5, -0.02), (80, 5, 0), (n, 3))])
+
+    one = localiser(map_from_points(tunnel(1, 60_000)))
+    fixes = []
+    for i in range(5):
+        seen = sweep(tunnel(10 + i, 20_000), POSES[i], twist_of(POSES, i), (i + 1) * 100_000_000)
+        fixes += one.push(seen, PosePrior(POSES[i], 1.0, np.radians(1.0)))
+    assert not any(fix.trusted for fix in fixes + one.flush())
+
+
+def test_a_blind_scan_in_the_middle_does_not_vote_and_does_no_harm(point_map: PointMap) -> None:
+    one = localiser(point_map)
+    fixes = []
+    for i in range(12):
+        blind = Scan((i + 1) * 100_000_000, np.zeros((0, 3), dtype=np.float32), np.zeros(0, dtype=np.float32))
+        fixes += one.push(blind if i == 5 else scan(i), PosePrior(POSES[i], 1.0, np.radians(1.0)))
+    fixes += one.flush()
+    assert [i for i, fix in enumerate(fixes) if not fix.trusted] == [5]
+    assert np.delete(off(fixes), 5).max() < 0.15
+
+
+def test_what_waits_is_bounded(point_map: PointMap) -> None:
+    one = localiser(point_map)
+    empty = np.zeros((0, 3), dtype=np.float32)
+    out = [len(one.push(Scan(i * 100_000_000, empty), PosePrior(POSES[0], 1.0, 0.02))) for i in range(60)]
+    assert sum(out) == 60 - SETTINGS.trust.wait_scans
