@@ -83,11 +83,17 @@ class Judge:
         """(mean likelihood that the standing points should have, share of them where the map has been)."""
         coarse, fine = ndt_map.levels[0], ndt_map.levels[-1]
         points = standing @ T[:3, :3].T + T[:3, 3]
-        known = _is_near_map(points, coarse.lowest, coarse.level.voxel_m, coarse.index)
+        known = _is_near_map(points, coarse.window.lowest, coarse.level.voxel_m, coarse.window.rows)
         if not known.any():
             return 1.0, 0.0
         each = _self_likelihood(
-            points, fine.lowest, fine.level.voxel_m, fine.index, fine.cells, fine.sums, self.range_sigma_m
+            points,
+            fine.window.lowest,
+            fine.level.voxel_m,
+            fine.window.rows,
+            fine.voxels.cells,
+            fine.voxels.sums,
+            self.range_sigma_m,
         )
         mapped = each[each >= 0.0]
         usual = float(mapped.mean()) if len(mapped) else 1.0
