@@ -87,6 +87,7 @@ class MappingSettings(Section):
     min_inlier_share: float = Field(default=0.4, description="as ndt.min_inlier_share, while the map is still growing")
     precise_prior_m: float = Field(default=0.1, description="a prior at least this good holds the map's frame")
     prior_slack: float = Field(default=5.0, description="widens that prior's sigma: its errors are alike for a while")
+    prior_memory_s: float = Field(default=20.0, gt=0, description="how long the errors of a coarser prior stay alike")
     link_sigma_m: float = Field(default=0.003, description="random error of the motion from scan to scan")
     link_sigma_deg: float = Field(default=0.01, description="the same, rotation")
     revisit_m: float = Field(default=10.0, description="a scan this near to a much older one is linked to it")

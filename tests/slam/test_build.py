@@ -12,6 +12,7 @@ from mapvote.core.geometry import exp, inverse, rotation_angle
 from mapvote.core.point_map import all_points
 from mapvote.core.reference import reference_window
 from mapvote.core.types import F64, MapvoteError, Scan
+from mapvote.evaluation.scoring.truth import rigid_between
 from mapvote.formats import open_drive, read_T_map_lidar
 from mapvote.localisation.ndt import PosePrior
 from mapvote.localisation.tracker import MapWindow, Tracker
@@ -86,13 +87,35 @@ def test_without_a_prior_the_first_scan_is_the_frame() -> None:
     assert np.linalg.norm(report.tracks[0].T_map_lidar[-1, :3, 3] - relative[-1, :3, 3]) < 0.2
 
 
-def test_a_coarse_prior_starts_the_search_but_does_not_bend_the_map() -> None:
+def test_coarse_priors_place_the_map_together_and_do_not_bend_it() -> None:
     coarse = noisy(SURVEY, 5, 0.5, 1.0)
+    coarse[0, :3, 3] += [6.0, -4.0, 0.0]  # the first of them founds nothing
     _, report = build_map([drive_along(SURVEY, 4, coarse, sigma_m=0.5)])
-    found = report.tracks[0].T_map_lidar
+    [track] = report.tracks
     assert not report.held_by_prior
-    offset = coarse[0] @ inverse(SURVEY[0])  # the map is where the first scan's prior put it
-    assert errors(found, np.array([offset @ T for T in SURVEY]))[0] < 0.05
+    assert errors(track.T_map_lidar, SURVEY)[0] < 0.6
+    rigid = rigid_between(track.T_map_lidar, SURVEY)
+    assert errors(track.T_map_lidar, np.array([rigid @ T for T in SURVEY]))[0] < 0.05
+    assert track.broken == ()
+    assert 0.2 < np.median(track.sigma_m) < 1.2, "25 priors that err alike are hardly better than one of them"
+
+
+def test_a_gap_in_the_survey_is_bridged() -> None:
+    poses = np.concatenate([path(8, -30.0), path(8, -30.0 + 8.0 + 16.0)])
+    first, second = drive_along(poses[:8], 21), drive_along(poses[8:], 22)
+    stamps = np.concatenate([first.stamps_ns, second.stamps_ns + 2_400_000_000])
+
+    def read_scan(i: int) -> Scan:
+        scan = first.read_scan(i) if i < 8 else second.read_scan(i - 8)
+        return replace(scan, stamp_ns=int(stamps[i]))
+
+    coarse = noisy(poses, 23, 0.5, 1.0)
+    gap = replace(first, stamps_ns=stamps, read_scan=read_scan, T_map_lidar_prior=coarse, prior_sigma_m=0.5)
+    _, report = build_map([gap])
+    [track] = report.tracks
+    assert track.registered.all()
+    rigid = rigid_between(track.T_map_lidar, poses)
+    assert errors(track.T_map_lidar, np.array([rigid @ T for T in poses]))[0] < 0.1
 
 
 def test_a_second_survey_may_begin_where_the_first_has_not_been() -> None:

@@ -54,6 +54,8 @@ def build(
 
 
 def _tell(report: BuildReport, out: Path) -> None:
+    import numpy as np
+
     for track in report.tracks:
         line = (
             f"{track.vehicle}: {int(track.registered.sum())} of {len(track.registered)} scans, {track.length_m:.0f} m"
@@ -62,6 +64,10 @@ def _tell(report: BuildReport, out: Path) -> None:
             d = track.drift
             line += f"; off its prior by {d.median_m:.3f} m (median), {d.max_m:.3f} m (most), {d.median_deg:.2f} deg"
         print(line)
+        for i in track.broken:
+            print(
+                f"warning: {track.vehicle}: the map is broken before scan {i}: nothing fitted, only priors tie it there"
+            )
         print(f"{track.vehicle}: {track.heights}")
         if track.heights.complaint:
             print(f"warning: {track.vehicle}: {track.heights.complaint}")
@@ -72,7 +78,9 @@ def _tell(report: BuildReport, out: Path) -> None:
             "one ground: it keeps the road whose path is nearer, below both the lower one; who drives the other cannot "
             "vote there. (Less than a metre apart it is one road, mapped twice: the drives' heights do not agree.)"
         )
-    frame = "held in its frame by a precise prior" if report.held_by_prior else "not held by any precise prior"
+    sigma_m = max(float(np.median(track.sigma_m)) for track in report.tracks)
+    frame = "held in its frame by a precise prior" if report.held_by_prior else "laid on all priors together"
+    frame = f"{frame}, to {sigma_m:.2f} m" if sigma_m == sigma_m else "in the frame of its first scan"
     print(f"{out}: {report.points} points, {frame}")
 
 

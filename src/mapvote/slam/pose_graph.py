@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy import sparse
-from scipy.sparse.linalg import spsolve
+from scipy.sparse.linalg import splu, spsolve
 
 from mapvote.core.geometry import exp, hat, inverse, log
 from mapvote.core.types import F64, I64
@@ -38,6 +38,10 @@ class Anchors:
     """(k, 4, 4)."""
     sigma_m: float
     sigma_rad: float
+    said_m: float = 1.0
+    """What each claims of itself alone; ``sigma_m`` is wider where many err alike."""
+    weights: F64 | None = None
+    """(k,) in (0, 1], how far each is believed; None: all."""
 
 
 def adjoint(T: F64) -> F64:
@@ -53,15 +57,28 @@ def optimise(T_map: F64, links: list[Links], anchors: list[Anchors], iterations:
     """Poses (n, 4, 4) moved to the least-squares solution; those that nothing fixes stay where they are."""
     poses = T_map.copy()
     for _ in range(iterations):
-        step = _step(poses, links, anchors)
+        H, gradient = _normal_equations(poses, links, anchors)
+        step = -np.asarray(spsolve(H, gradient.ravel())).reshape(len(poses), 6)
         poses = np.array([T @ exp(xi) for T, xi in zip(poses, step, strict=True)])
         if np.abs(step).max(initial=0.0) < 1e-6:
             break
     return poses
 
 
-def _step(poses: F64, links: list[Links], anchors: list[Anchors]) -> F64:
-    """(n, 6) Gauss-Newton step: T exp(step). A tiny weight on the step itself keeps what is free in place."""
+def position_sigmas(T_map: F64, links: list[Links], anchors: list[Anchors], asked: I64) -> F64:
+    """(k,) standard deviation of the positions of the poses ``asked`` (k,), the largest over all directions."""
+    H, _ = _normal_equations(T_map, links, anchors)
+    solve = splu(H).solve
+    out = []
+    for i in asked.tolist():
+        unit = np.zeros((6 * len(T_map), 3))
+        unit[6 * i : 6 * i + 3] = np.eye(3)
+        out.append(np.sqrt(np.linalg.eigvalsh(solve(unit)[6 * i : 6 * i + 3])[-1]))
+    return np.array(out)
+
+
+def _normal_equations(poses: F64, links: list[Links], anchors: list[Anchors]) -> tuple[sparse.csc_matrix, F64]:
+    """(6n, 6n) and (n, 6) of a Gauss-Newton step T exp(step). A tiny weight on the step itself keeps what is free."""
     n = len(poses)
     gradient = np.zeros((n, 6))
     blocks: dict[tuple[int, int], F64] = {(i, i): 1e-6 * np.eye(6) for i in range(n)}
@@ -83,15 +100,16 @@ def _step(poses: F64, links: list[Links], anchors: list[Anchors]) -> F64:
             enter(j, i, W @ A)
     for anchor in anchors:
         W = _weight(anchor.sigma_m, anchor.sigma_rad)
-        for i, P in zip(anchor.pose.tolist(), anchor.T_map, strict=True):
-            gradient[i] += W @ log(inverse(P) @ poses[i])
-            enter(i, i, W)
+        believed = np.ones(len(anchor.pose)) if anchor.weights is None else anchor.weights
+        for i, P, w in zip(anchor.pose.tolist(), anchor.T_map, believed, strict=True):
+            gradient[i] += w * W @ log(inverse(P) @ poses[i])
+            enter(i, i, w * W)
     keys = np.array(list(blocks))
     row = 6 * keys[:, 0, None, None] + np.arange(6)[None, :, None] + np.zeros((1, 1, 6), dtype=np.int64)
     col = 6 * keys[:, 1, None, None] + np.arange(6)[None, None, :] + np.zeros((1, 6, 1), dtype=np.int64)
     values = np.array(list(blocks.values()))
     H = sparse.csc_matrix((values.ravel(), (row.ravel(), col.ravel())), shape=(6 * n, 6 * n))
-    return -np.asarray(spsolve(H, gradient.ravel())).reshape(n, 6)
+    return H, gradient
 
 
 def _weight(sigma_m: float, sigma_rad: float) -> F64:

@@ -20,7 +20,7 @@ from mapvote.evaluation.experiments.real.street import Edit, RealRun, Street, ch
 from mapvote.evaluation.experiments.real.things import Site
 from mapvote.evaluation.scoring.cells import ratio
 from mapvote.formats import open_drive
-from mapvote.localisation.tracker import GivenPoses
+from mapvote.localisation.localiser import GivenPoses
 from mapvote.perception.raycast import find_obstacles
 
 NEAR_CELLS = 5

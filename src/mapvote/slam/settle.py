@@ -1,0 +1,141 @@
+"""Where all scans of all drives were, settled together: the shape from registration, the place from every prior.
+
+A precise prior (RTK) holds each pose. Ordinary ones (GNSS) err alike for seconds to minutes, jump and go wild: the
+whole is first laid on the robust fit of them all (slam.frame), then the graph lets them bend it only as far as their
+number of *independent* errors says, none of them more than its distance from the others allows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from mapvote.config import MappingSettings
+from mapvote.core.geometry import inverse
+from mapvote.core.types import F64, I64, Drive
+from mapvote.slam.frame import fit_to_priors, trust_in
+from mapvote.slam.pose_graph import Anchors, Links, optimise, position_sigmas
+from mapvote.slam.surveyor import Surveyed, is_precise
+
+_REWEIGHTED = 3
+"""How often the priors' weights are taken anew."""
+_ASKED = 12
+"""Poses of a drive whose covariance is worked out; the others lie between."""
+
+
+@dataclass(frozen=True, slots=True)
+class Settled:
+    """All drives' poses."""
+
+    T_map_lidar: list[F64]
+    """(n, 4, 4) of each drive."""
+    T_map_draft: F64
+    """(4, 4) how the draft was moved as a whole, before it was bent a little."""
+    sigma_m: list[F64]
+    """(n,) standard deviation of each position in the frame of the priors; nan without any prior."""
+
+
+def settle(drives: Sequence[Drive], found: Sequence[Surveyed], settings: MappingSettings) -> Settled:
+    """Poses of all drives that agree with each other's motion and with all priors; as given if there are none."""
+    poses = [one.T_map_lidar for one in found]
+    starts = np.cumsum([0] + [len(T) for T in poses])
+    T, known = np.concatenate(poses), np.flatnonzero(np.concatenate([one.registered for one in found]))
+    T_map_draft = np.eye(4)
+    if not any(drive.T_map_lidar_prior is not None for drive in drives):
+        return Settled(poses, T_map_draft, [np.full(len(p), np.nan) for p in poses])
+    if not any(is_precise(drive, settings) for drive in drives):
+        T_map_draft = _laid_on_priors(drives, T, known, starts)
+        T = T_map_draft @ T
+    links = _links(drives, T, known, _pieces(found, starts), settings)
+    anchors = _anchors(drives, T, starts, settings)
+    for _ in range(_REWEIGHTED):
+        T = optimise(T, links, anchors)
+        anchors = [replace(a, weights=trust_in(_off(T, a), a.said_m)) for a in anchors]
+    return Settled(np.split(T, starts[1:-1]), T_map_draft, _sigmas(T, links, anchors, starts))
+
+
+def _sigmas(T: F64, links: list[Links], anchors: list[Anchors], starts: I64) -> list[F64]:
+    ends = list(pairwise(starts.tolist()))
+    asked = [np.unique(np.linspace(a, b - 1, _ASKED).round().astype(np.int64)) for a, b in ends]
+    sigmas = position_sigmas(T, links, anchors, np.concatenate(asked))
+    pieces = np.split(sigmas, np.cumsum([len(a) for a in asked])[:-1])
+    return [np.interp(np.arange(a, b), at, s) for (a, b), at, s in zip(ends, asked, pieces, strict=True)]
+
+
+def _pieces(found: Sequence[Surveyed], starts: I64) -> I64:
+    """(n,) number of the unbroken stretch that each scan belongs to."""
+    begins = np.zeros(int(starts[-1]), dtype=np.int64)
+    begins[starts[:-1]] = 1
+    for start, one in zip(starts, found, strict=False):
+        begins[start + np.array(one.broken, dtype=np.int64)] = 1
+    return np.cumsum(begins)
+
+
+def _laid_on_priors(drives: Sequence[Drive], T: F64, known: I64, starts: I64) -> F64:
+    """(4, 4) one motion of the whole, from all drives' priors."""
+    positions, priors, said = [], [], []
+    for start, drive in zip(starts, drives, strict=False):
+        if drive.T_map_lidar_prior is not None:
+            mine = known[(known >= start) & (known < start + len(drive))]
+            positions.append(T[mine, :3, 3])
+            priors.append(drive.T_map_lidar_prior[mine - start, :3, 3])
+            said.append(drive.prior_sigma_m)
+    return fit_to_priors(np.concatenate(positions), np.concatenate(priors), max(said))
+
+
+def _anchors(drives: Sequence[Drive], T: F64, starts: I64, settings: MappingSettings) -> list[Anchors]:
+    """All priors of all drives; of errors that last, as many scans as share one share one weight."""
+    out = []
+    for start, drive in zip(starts, drives, strict=False):
+        if drive.T_map_lidar_prior is None:
+            continue
+        slack = settings.prior_slack
+        if not is_precise(drive, settings):
+            seconds = 1e-9 * float(drive.stamps_ns[-1] - drive.stamps_ns[0])
+            alike = min(1.0, settings.prior_memory_s / max(seconds, 1e-3)) * len(drive)
+            slack = float(np.sqrt(max(alike, 1.0)))
+        sigma_rad = settings.prior_slack * slack * float(np.radians(drive.prior_sigma_deg))
+        anchor = Anchors(
+            np.arange(start, start + len(drive)),
+            drive.T_map_lidar_prior,
+            slack * drive.prior_sigma_m,
+            sigma_rad if not is_precise(drive, settings) else slack * float(np.radians(drive.prior_sigma_deg)),
+            said_m=max(drive.prior_sigma_m, settings.precise_prior_m),
+        )
+        out.append(replace(anchor, weights=trust_in(_off(T, anchor), anchor.said_m)))
+    return out
+
+
+def _off(T: F64, anchors: Anchors) -> F64:
+    return np.asarray(np.linalg.norm(T[anchors.pose, :3, 3] - anchors.T_map[:, :3, 3], axis=1))
+
+
+def _links(drives: Sequence[Drive], T: F64, known: I64, piece_of: I64, settings: MappingSettings) -> list[Links]:
+    """The motion from scan to scan, and from each scan to the nearest much older one near by: it was registered to the
+    map that the older one made."""
+    order = np.concatenate([np.asarray(drive.stamps_ns) for drive in drives])
+    consecutive = piece_of[known[:-1]] == piece_of[known[1:]]
+    pairs = [(known[:-1][consecutive], known[1:][consecutive])]
+    tree = cKDTree(T[known, :3, 3])
+    first, second = [], []
+    for j, near in zip(known, tree.query_ball_point(T[known, :3, 3], settings.revisit_m), strict=True):
+        older = [
+            i for i in known[near] if i < j and (piece_of[i] != piece_of[j] or _apart(order, int(i), int(j), settings))
+        ]
+        if older:
+            first.append(min(older, key=lambda i: (float(np.linalg.norm(T[i, :3, 3] - T[j, :3, 3])), i)))
+            second.append(j)
+    pairs.append((np.array(first, dtype=np.int64), np.array(second, dtype=np.int64)))
+    sigma_m, sigma_rad = settings.link_sigma_m, float(np.radians(settings.link_sigma_deg))
+    return [
+        Links(a, b, np.array([inverse(T[i]) @ T[j] for i, j in zip(a, b, strict=True)]), sigma_m, sigma_rad)
+        for a, b in pairs
+    ]
+
+
+def _apart(stamps_ns: I64, i: int, j: int, settings: MappingSettings) -> bool:
+    return bool(abs(int(stamps_ns[j]) - int(stamps_ns[i])) > 1e9 * settings.revisit_s)

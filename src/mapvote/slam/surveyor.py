@@ -1,0 +1,147 @@
+"""The first pass: where each scan was taken, in the NDT map that grows with it.
+
+Ordinary priors (GNSS) neither guide nor gate a registration that succeeds: they err by more than it does, and alike
+for a while, which would bend the map. They help where registration fails, moved into the frame of what was driven so
+far. A scan that would jump against the vehicle's motion is not registered; where nothing fits any more the map is
+broken, the track begins anew at the prior, and the report says where.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from mapvote.config import MappingSettings, Settings
+from mapvote.core.geometry import exp, inverse, transform
+from mapvote.core.grid import Lattice
+from mapvote.core.types import F64, Bool, Drive, MapvoteError, Scan
+from mapvote.core.voxels import VoxelCloud, thin
+from mapvote.localisation.deskew import twist_between
+from mapvote.localisation.ndt import NdtMap, PosePrior
+from mapvote.localisation.tracker import Fix, Tracker
+from mapvote.slam.frame import fit_to_priors
+
+_JUMP_M = 0.5
+"""A scan this far from where the last ones were heading, beyond what a vehicle can brake or swerve, is not there."""
+_PATIENCE = 5
+"""Scans in turn without a registration before the map counts as broken."""
+
+
+@dataclass(frozen=True, slots=True)
+class Surveyed:
+    """Where one drive went, in the frame of the draft."""
+
+    T_map_lidar: F64
+    """(n, 4, 4); of a scan that was not registered the best guess."""
+    registered: Bool
+    """(n,)."""
+    broken: tuple[int, ...]
+    """Scans at which the track began anew, tied to what was before by priors alone."""
+
+
+def is_precise(drive: Drive, settings: MappingSettings) -> bool:
+    """Whether a drive's prior is a surveyor's."""
+    return drive.T_map_lidar_prior is not None and drive.prior_sigma_m <= settings.precise_prior_m
+
+
+class Surveyor:
+    """The NDT map as it grows, drive after drive."""
+
+    def __init__(self, settings: Settings) -> None:
+        self.mapping = settings.mapping
+        self.ndt = settings.ndt.model_copy(update={"min_inlier_share": settings.mapping.min_inlier_share})
+        self.ndt_map: NdtMap | None = None
+        self.draft = VoxelCloud(Lattice())
+        """A cloud of everything, for the ground and the occupied voxels that the second pass needs."""
+        self._found: list[F64] = []
+        self._told: list[F64] = []
+        """Positions (3,) of registered scans and of their priors, to tell the frame of the priors by."""
+
+    def follow(self, drive: Drive, count: Callable[[], None]) -> Surveyed:
+        """Where one drive went, each scan entered once it is registered. MapvoteError if fewer than half could be."""
+        tracker = Tracker(self._map_around, self.ndt)
+        tracker.twist = _first_motion(drive, self.mapping)
+        precise = is_precise(drive, self.mapping)
+        poses, registered, broken, lost = [], [], [], 0
+        for i, scan in enumerate(drive):
+            prior = PosePrior.of(drive, i)
+            fix = self._locate(tracker, scan, prior if precise or self.ndt_map is None else None)
+            if not fix.trusted and not precise and prior is not None:
+                prior = self._in_draft(prior)
+                fix = self._locate(tracker, scan, prior)
+            # A surveyor enters where no drive has been yet: a precise prior is as good as a registration.
+            if not fix.trusted and prior is not None and (precise or lost >= _PATIENCE):
+                fix = tracker.begin(scan, prior.T_map_lidar)
+                broken += [] if precise else [i]
+            lost = 0 if fix.trusted else lost + 1
+            poses.append(fix.registration.T_map_lidar)
+            registered.append(fix.trusted)
+            if fix.trusted:
+                self._enter(fix, drive, i)
+            count()
+        if np.mean(registered) < 0.5:
+            raise MapvoteError(
+                f"{drive.path}: only {int(np.sum(registered))} of {len(drive)} scans could be registered to the map "
+                "so far; is the drive in order of time, and its prior in the same frame as the other drives'?"
+            )
+        return Surveyed(np.array(poses), np.array(registered), tuple(broken))
+
+    def _locate(self, tracker: Tracker, scan: Scan, prior: PosePrior | None) -> Fix:
+        """The scan in the map so far; untrusted if it would jump."""
+        if self.ndt_map is None:
+            return tracker.begin(scan, np.eye(4) if prior is None else prior.T_map_lidar)
+        before = tracker.last_pose, tracker.last_stamp_ns, tracker.twist
+        moving = tracker.last_pose is not None and bool(tracker.twist.any())
+        fix = tracker.localise(scan, prior)
+        if not fix.trusted or not moving or before[0] is None:
+            return fix
+        age = 1e-9 * (scan.stamp_ns - before[1])
+        ahead = before[0] @ exp(age * before[2])
+        off = float(np.linalg.norm(fix.registration.T_map_lidar[:3, 3] - ahead[:3, 3]))
+        if off <= _JUMP_M + 0.5 * self.ndt.acceleration_mps2 * age**2:
+            return fix
+        tracker.move_to(before[0], before[1], before[2], fix.registration.score)
+        return replace(fix, trusted=False)
+
+    def _in_draft(self, prior: PosePrior) -> PosePrior:
+        """A prior moved to the frame of what was driven so far, as uncertain as the priors proved there."""
+        if not self._told:
+            return prior
+        found, told = np.array(self._found), np.array(self._told)
+        T_prior_draft = fit_to_priors(found, told, prior.sigma_m)
+        off = np.linalg.norm(found @ T_prior_draft[:3, :3].T + T_prior_draft[:3, 3] - told, axis=1)
+        T_map_lidar = inverse(T_prior_draft) @ prior.T_map_lidar
+        return replace(prior, T_map_lidar=T_map_lidar, sigma_m=max(prior.sigma_m, float(np.median(off))))
+
+    def _map_around(self, position: F64) -> NdtMap:
+        if self.ndt_map is None:
+            self.ndt_map = NdtMap(self.ndt, position)
+        if not self.ndt_map.is_central(position):
+            self.ndt_map.recentre(position)
+        return self.ndt_map
+
+    def _enter(self, fix: Fix, drive: Drive, i: int) -> None:
+        T_map_lidar = fix.registration.T_map_lidar
+        points_map, position = transform(T_map_lidar, fix.points), T_map_lidar[:3, 3]
+        spread = thin(points_map - position, self.mapping.ndt_points_m)
+        self._map_around(position).enter(points_map[spread])
+        self.draft.enter(points_map)
+        if drive.T_map_lidar_prior is not None:
+            self._found.append(position.copy())
+            self._told.append(drive.T_map_lidar_prior[i, :3, 3])
+
+
+def _first_motion(drive: Drive, settings: MappingSettings) -> F64:
+    """(6,) motion per second at the start by the priors: to the next scan, or the middle one of several over a second
+    if they are coarse, of which one may be wild."""
+    told = drive.T_map_lidar_prior
+    if told is None or len(drive) < 2:
+        return np.zeros(6)
+    seconds = 1e-9 * (drive.stamps_ns - drive.stamps_ns[0]).astype(np.float64)
+    k = 1 if is_precise(drive, settings) else max(1, int(np.searchsorted(seconds, 1.0)))
+    k = min(k, len(drive) - 1)
+    tries = 1 if is_precise(drive, settings) else min(k, len(drive) - k)
+    motions = [twist_between(told[i], told[i + k], float(seconds[i + k] - seconds[i])) for i in range(tries)]
+    return np.asarray(np.median(motions, axis=0))
