@@ -1,4 +1,4 @@
-"""A first map from ordinary GNSS: a simulated street with a bend, priors that err alike for a while, jump and start askew.
+"""A first map from ordinary GNSS: a simulated street with a bend, priors that err alike for a while, and jump.
 
     python benchmarks/survey_gnss.py [--length 1200] [--seeds 1 2] [--kitti ../shared/data/kitti/2011_09_26_0001]
 
@@ -148,8 +148,8 @@ def kitti(folder: Path) -> None:
     T = rigid_between(poses[0], drive.T_map_lidar_prior)
     laid = rms((T @ drive.T_map_lidar_prior)[:, :3, 3], poses[0][:, :3, 3])
     print(
-        f"KITTI {folder.name}: {registered:.0%} registered, {rms(poses[0][:, :3, 3], told):.3f} m rms off its priors as "
-        f"they are, {laid:.3f} m after the best rigid fit"
+        f"KITTI {folder.name}: {registered:.0%} registered, {rms(poses[0][:, :3, 3], told):.3f} m rms off its priors "
+        f"as they are, {laid:.3f} m after the best rigid fit"
     )
 
 

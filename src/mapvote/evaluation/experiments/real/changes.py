@@ -59,7 +59,7 @@ def survey_site(street: Street) -> Site:
     around = LocalMap(street.point_map, street.settings.voting.window_m)
     cloud = VoxelCloud(street.point_map.lattice)
     for scan in drive:
-        fix = localise(scan, None)
+        [fix] = localise.push(scan, None)
         T = fix.registration.T_map_lidar
         points = transform(T, fix.points)
         cloud.enter(points, ~find_obstacles(points, around.at(T[:3, 3])[0])[0])
