@@ -64,11 +64,11 @@ class Say:
     def packed(self, tile: TileIndex) -> BallotTile:
         return BallotTile(
             tile=tile,
-            states=None if self.states is None else pack_plane(self.states),
-            tally=None if self.tally is None else pack_plane(np.moveaxis(self.tally, -1, 0)),
-            gone=None if self.gone is None else pack_plane(self.gone),
-            new_points=None if self.new_points is None else pack_plane(self.new_points),
-            free=None if self.free is None else pack_plane(self.free),
+            states=None if self.states is None else pack_plane(self.states, 1),
+            tally=None if self.tally is None else pack_plane(np.moveaxis(self.tally, -1, 0), 1),
+            gone=None if self.gone is None else pack_plane(self.gone, 1),
+            new_points=None if self.new_points is None else pack_plane(self.new_points, 1),
+            free=None if self.free is None else pack_plane(self.free, 1),
         )
 
 

@@ -49,9 +49,9 @@ class PostgresCluster:
         """Stop the server: cutting connections off, or (``crash``) without a checkpoint, as if the power had failed."""
         self._run("pg_ctl", "-D", str(self._data), "-m", "immediate" if crash else "fast", "-w", "stop")
 
-    def create(self, name: str) -> str:
-        """A new empty database; its SQLAlchemy URL."""
-        self._run("createdb", "-h", str(self.home), "-U", USER, name)
+    def create(self, name: str, like: str = "template1") -> str:
+        """A new database, empty or a copy of another; its SQLAlchemy URL."""
+        self._run("createdb", "-h", str(self.home), "-U", USER, "-T", like, name)
         return f"postgresql+psycopg://{USER}@/{name}?host={self.home}"
 
     def drop(self, name: str) -> None:

@@ -180,11 +180,11 @@ def rollback(store: Store, to: int, *, by: str = "operator", reason: str = "") -
 
 
 def turned_back(version: int, now: Tile, then: Tile) -> Memory:
-    """What a tile remembers that is again as it was ``then``: its own changes since, and that it turned back."""
-    came_and_went = then.memory or Memory.none()
-    planes = came_and_went.planes.copy()
-    planes[0] = (now.memory or Memory.none()).with_changed(differing(now, then), version).changed
-    return Memory(planes)
+    """What a tile remembers that is again as it was ``then``: cells that turn back forget what came and went since."""
+    differ = differing(now, then)
+    planes = (now.memory or Memory.none()).planes.copy()
+    planes[:, differ] = (then.memory or Memory.none()).planes[:, differ]
+    return Memory(planes).with_changed(differ, version)
 
 
 def _of_two(

@@ -1,0 +1,245 @@
+"""Random histories of a small street, lived through by the store and by the rules in plain words (``rules.py``)."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Callable
+from contextlib import suppress
+from threading import Barrier, Thread
+
+import numpy as np
+from rules import CE, CO, DAY_S, UE, UN, UO, Cast, Cell, CellMap, Server, Spoken
+
+from hand_made import Say, make_ballot, states_plane, two_walls, wall, words_plane
+from mapvote.codec.ballot import encode
+from mapvote.config import FuseSettings
+from mapvote.core.memory import Memory
+from mapvote.core.types import MapvoteError
+from mapvote.server.errors import Conflict, NotFound
+from mapvote.server.store.admission import accept, examine
+from mapvote.server.store.ballots import Receipt, withdraw
+from mapvote.server.store.policy import Policy, set_policy
+from mapvote.server.store.publish import publish, rollback
+from mapvote.server.store.replay import replay
+from mapvote.server.store.store import Store
+
+WALL: list[Cell] = [(10, 10), (10, 11), (10, 12)]
+LAWN: list[Cell] = [(20, 20), (20, 21), (30, 30)]
+VEHICLES = ("a", "b", "c", "d", "e")
+OPEN = {"max_deleted_share": 1.0, "max_freed_share": 1.0}
+START_S = 1_700_000_000
+
+
+class Clock:
+    """Stands until somebody moves it on."""
+
+    def __init__(self) -> None:
+        self.now_s = START_S
+
+    def __call__(self) -> int:
+        return self.now_s * 10**9
+
+
+class History:
+    """One street, twice: in a store and in plain words. Each step is done to both, then they are compared."""
+
+    def __init__(self, seed: int, make_store: Callable[[Clock], Store]) -> None:
+        self.rng = random.Random(seed)
+        self.clock = Clock()
+        self.store = make_store(self.clock)
+        first = FuseSettings.model_validate(OPEN)
+        self.policy(first)
+        walls = {cell: CellMap((0.05, 0.45, 0.75, 1.05)) for cell in WALL}
+        self.rules = Server(walls | {cell: CellMap() for cell in LAWN}, first)
+        self.hashes = {1: self.store.manifest(1).tiles[0, 0].points}
+        self.drives = 0
+        self.published: dict[int, int] = {}
+        self.there = dict.fromkeys(WALL, True) | dict.fromkeys(LAWN, False)
+
+    def policy(self, settings: FuseSettings) -> None:
+        set_policy(self.store, Policy(fuse=settings))
+
+    def live(self, steps: int) -> None:
+        """So many steps; AssertionError, naming the step, at the first difference."""
+        acts = [self.vote] * 8 + [self.round] * 8 + [self.publish] * 2 + [self.world] * 5
+        acts += [self.again, self.back, self.take_out, self.other_policy, self.without, self.race]
+        for step in range(steps):
+            act = self.rng.choice(acts)
+            self.clock.now_s += self.rng.choice([60, 3_600, DAY_S, 3 * DAY_S])
+            act()
+            self.compare(f"step {step}, {act.__name__}")
+
+    def world(self) -> None:
+        """Something comes or goes."""
+        cell = self.rng.choice(WALL + LAWN)
+        self.there[cell] = not self.there[cell]
+
+    def vote(self) -> None:
+        self.drives += 1
+        self._cast(self.rng.choice(VEHICLES), f"d{self.drives}")
+
+    def round(self) -> None:
+        """Some vehicles pass, and an operator publishes."""
+        for vehicle in self.rng.sample(VEHICLES, 3):
+            self.drives += 1
+            self._cast(vehicle, f"d{self.drives}")
+        self.publish()
+
+    def again(self) -> None:
+        """A drive is sent once more, with other votes."""
+        standing = [cast for cast in self.rules.casts if cast.gone_at is None]
+        if standing:
+            cast = self.rng.choice(standing)
+            self._cast(cast.vehicle, cast.drive)
+
+    def _cast(self, vehicle: str, drive: str) -> None:
+        rng, newest = self.rng, self.rules.newest
+        version = newest if rng.random() < 0.6 else rng.randint(max(1, newest - 3), newest)
+        has_free = rng.random() < 0.7
+        masks = rng.random() < 0.5
+        says = {c: self._say(c, version, masks, has_free) for c in WALL + LAWN if rng.random() < 0.7}
+        if not says:
+            return
+        end_s = self.clock.now_s - rng.choice([1, 30, 5_000, 2 * DAY_S]) - self.drives
+        named: int | None = version
+        if rng.random() < 0.15:  # of an older mapvote: read by the last version with its tiles
+            first = [c.seq for c in self.rules.casts if (c.vehicle, c.drive) == (vehicle, drive)]
+            named, version = None, self._last_like(version, min(first, default=None))
+            if version == 0:
+                return
+        counts = self.rules.counts_anywhere(version, says)
+        if self._send(vehicle, drive, end_s, named, version, says, masks, has_free) is not counts:
+            raise AssertionError(f"{vehicle}/{drive} counts: {counts}, and the store thinks otherwise")
+        if counts:
+            self.rules.vote(Cast(vehicle, drive, end_s, version, says, has_free, self.clock.now_s, 0))
+
+    def _last_like(self, version: int, heard_at: int | None) -> int:
+        """The last version whose points are those of ``version``, of those that were there when the drive was heard
+        of; 0 if there was none."""
+        wanted = [cell.heights for cell in self.rules.versions[version].cells.values()]
+        alike = [
+            n
+            for n, v in self.rules.versions.items()
+            if [cell.heights for cell in v.cells.values()] == wanted and (heard_at is None or self._made(n) < heard_at)
+        ]
+        return max(alike, default=0)
+
+    def _made(self, number: int) -> int:
+        """The event by which a version was made."""
+        version = self.rules.versions[number]
+        return version.mark if version.kind != "publish" else self.published[number]
+
+    def _say(self, cell: Cell, version: int, masks: bool, has_free: bool) -> Spoken:
+        """Mostly the truth, as seen against that version."""
+        rng = self.rng
+        mapped = self.rules.versions[version].cells[cell].stands()
+        truth = {(True, True): UO, (True, False): CE, (False, True): CO, (False, False): UE}[mapped, self.there[cell]]
+        state = truth if rng.random() < 0.75 else rng.choice([UO, UE, CO, CE, UN])
+        gone = rng.choice([0b1110, 0b0110, 0b0010, 0]) if masks and state in (CE, UO) and rng.random() < 0.7 else 0
+        heights = rng.choice([(0.45, 0.75), (0.45,), (0.75,)]) if state == CO else ()
+        return Spoken(state, gone if masks else None, heights, rng.choice([0, 0b111000, 0b110]) if has_free else 0)
+
+    def _send(
+        self, vehicle: str, drive: str, end_s: int, named: int | None, version: int, says: dict[Cell, Spoken],
+        masks: bool, has_free: bool,
+    ) -> bool:  # fmt: skip
+        points = [wall([cell], list(s.heights)) for cell, s in says.items() if s.heights]
+        say = Say(
+            states_plane({cell: s.state for cell, s in says.items()}),
+            gone=words_plane({cell: s.gone or 0 for cell, s in says.items()}) if masks else None,
+            new_points=np.concatenate(points) if points else None,
+            free=words_plane({cell: s.free for cell, s in says.items()}) if has_free else None,
+        )
+        base = {(0, 0): self.hashes[version]}
+        ballot = make_ballot(two_walls(), {(0, 0): say}, vehicle, drive, end_s * 10**9, base=base, version=named)
+        (receipt,) = accept(self.store, [examine(encode(ballot))])
+        assert isinstance(receipt, Receipt | Conflict), receipt
+        return isinstance(receipt, Receipt)
+
+    def publish(self) -> None:
+        done = publish(self.store, override=True).published
+        assert done == self._publish_by_the_rules(), f"published: {done}"
+
+    def _publish_by_the_rules(self) -> bool:
+        done = self.rules.publish(self.clock.now_s)
+        if done:
+            self.published[self.rules.newest] = self.rules.seq
+        return done
+
+    def race(self) -> None:
+        """Two operators publish at once: one version at most, whoever wins."""
+        barrier, parent = Barrier(2), self.store.current()
+
+        def attempt() -> None:
+            barrier.wait()
+            with suppress(Conflict):
+                publish(self.store, override=True, parent=parent)
+
+        both = [Thread(target=attempt) for _ in range(2)]
+        for one in both:
+            one.start()
+        for one in both:
+            one.join()
+        self._publish_by_the_rules()
+
+    def back(self) -> None:
+        if self.rules.newest > 1:
+            to = self.rng.randint(1, self.rules.newest - 1)
+            rollback(self.store, to)
+            self.rules.rollback(to, self.clock.now_s)
+
+    def take_out(self) -> None:
+        vehicle = self.rng.choice(VEHICLES)
+        with suppress(NotFound):
+            withdraw(self.store, vehicle, by="operator")
+            self.rules.withdraw(vehicle)
+
+    def other_policy(self) -> None:
+        rng = self.rng
+        settings = FuseSettings(
+            min_votes=rng.choice([1, 2, 2, 3]),
+            latest_vehicles=rng.choice([2, 3, 9]),
+            max_age_days=rng.choice([2.0, 30.0]),
+            min_age_s=rng.choice([0.0, 0.0, 7_200.0]),
+            prior_stay_days=rng.choice([30.0, 30.0, 27.0]),
+        ).model_copy(update=OPEN)
+        self.policy(settings)
+        self.rules.settings = settings
+
+    def without(self) -> None:
+        vehicle = self.rng.choice(VEHICLES)
+        with suppress(NotFound):
+            replay(self.store, vehicle, dry_run=False)
+            self.rules.replay(vehicle, self.clock.now_s)
+
+    def compare(self, where: str) -> None:
+        """The newest version, cell by cell, and nothing anywhere else."""
+        newest = self.store.current()
+        assert newest == self.rules.newest, f"{where}: version {newest}, by the rules {self.rules.newest}"
+        if newest in self.hashes:
+            return
+        tile = self.store.tile(newest, (0, 0))
+        assert tile is not None
+        self.hashes[newest] = self.store.manifest(newest).tiles[0, 0].points
+        memory = tile.memory or Memory.none()
+        expected = self.rules.versions[newest]
+        assert (tile.free is not None) == expected.knows_free, f"{where}: knows of free space"
+        for cell, wanted in expected.cells.items():
+            mine = tile.cells == cell[0] * 256 + cell[1]
+            heights = tuple(round(float(z), 2) for z in tile.points[mine, 2])
+            free = 0 if tile.free is None else int(tile.free[cell])
+            found = CellMap(heights, free, *(int(plane[cell]) for plane in memory.planes))
+            assert found == wanted, f"{where}: cell {cell} is {found}, by the rules {wanted}"
+        assert len(tile.points) == sum(len(cell.heights) for cell in expected.cells.values()), where
+
+
+def live(seed: int, make_store: Callable[[Clock], Store], steps: int = 40) -> str | None:
+    """One history; what the store and the rules disagree on, None if on nothing."""
+    history = History(seed, make_store)
+    try:
+        history.live(steps)
+    except (AssertionError, MapvoteError) as error:
+        return f"seed {seed}: {type(error).__name__} {error}"
+    finally:
+        history.store.close()
+    return None

@@ -1,0 +1,312 @@
+"""The rules of the server in plain words, one cell at a time and nothing skipped: what the store must agree with.
+
+Written from the documentation, not from the code: no array holds more than one cell, every publish decides every cell
+afresh, and a replay goes through everything again. One tile, few cells, two-stage ballots of the columns rule, flat
+ground at 0: the points of a cell are their heights.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field, replace
+
+from mapvote.config import FuseSettings
+
+UO, UE, CO, CE, UN = range(5)
+Cell = tuple[int, int]
+DAY_S = 86_400
+LAYER_M = 0.3
+EVERY = (1 << 64) - 1
+
+
+@dataclass(frozen=True)
+class CellMap:
+    """What a version holds of one cell, and what is remembered of it."""
+
+    heights: tuple[float, ...] = ()
+    free: int = 0
+    changed: int = 0
+    came_s: int = 0
+    stays: int = 0
+    stayed_s: int = 0
+
+    def stands(self) -> bool:
+        return any(z >= LAYER_M for z in self.heights)
+
+    def same_as(self, other: CellMap) -> bool:
+        return self.heights == other.heights and self.free == other.free
+
+
+@dataclass(frozen=True)
+class Spoken:
+    """What one drive says of one cell."""
+
+    state: int
+    gone: int | None = None
+    heights: tuple[float, ...] = ()
+    free: int = 0
+
+
+@dataclass(frozen=True)
+class Cast:
+    """A ballot as the server took it in."""
+
+    vehicle: str
+    drive: str
+    end_s: int
+    version: int
+    says: dict[Cell, Spoken]
+    has_free: bool
+    received_s: int
+    seq: int
+    gone_at: int | None = None
+
+
+@dataclass(frozen=True)
+class Version:
+    kind: str
+    cells: dict[Cell, CellMap]
+    knows_free: bool
+    mark: int
+    made_s: float
+    settings: FuseSettings
+    target: int = 0
+    unvoted: str = ""
+
+
+@dataclass
+class Server:
+    """Everything that happened, and the versions that came of it."""
+
+    cells: dict[Cell, CellMap]
+    settings: FuseSettings
+    seq: int = 0
+    casts: list[Cast] = field(default_factory=list)
+    versions: dict[int, Version] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self.versions[1] = Version("import", dict(self.cells), False, 0, 0.0, self.settings)
+
+    @property
+    def newest(self) -> int:
+        return max(self.versions)
+
+    def event(self) -> int:
+        self.seq += 1
+        return self.seq
+
+    def counts_anywhere(self, version: int, says: dict[Cell, Spoken]) -> bool:
+        now = self.versions[self.newest].cells
+        return any(now[cell].changed <= version for cell in says)
+
+    def vote(self, cast: Cast) -> None:
+        """The same drive again takes the place of the first."""
+        seq = self.event()
+        self.casts = [
+            replace(c, gone_at=seq) if (c.vehicle, c.drive) == (cast.vehicle, cast.drive) and c.gone_at is None else c
+            for c in self.casts
+        ]
+        self.casts.append(replace(cast, seq=seq))
+
+    def withdraw(self, vehicle: str) -> None:
+        seq = self.event()
+        self.casts = [replace(c, gone_at=seq) if c.vehicle == vehicle and c.gone_at is None else c for c in self.casts]
+
+    def publish(self, now_s: float) -> bool:
+        """Whether there is a new version."""
+        before, mark = self.versions[self.newest], self.seq
+        standing = stand_at(self.casts, mark)
+        cells, knows = fuse(before, standing, self.settings, now_s, self.newest + 1, lambda cast, cell: True)
+        if knows == before.knows_free and all(cells[c].same_as(before.cells[c]) for c in cells):
+            return False
+        self.event()
+        self.versions[self.newest + 1] = Version("publish", cells, knows, mark, now_s, self.settings)
+        return True
+
+    def rollback(self, to: int, now_s: float) -> None:
+        number, mark = self.newest + 1, self.event()
+        before, target = self.versions[self.newest], self.versions[to]
+        cells = turned_back(before, target, number)
+        self.versions[number] = Version("rollback", cells, target.knows_free, mark, now_s, target.settings, to)
+
+    def replay(self, vehicle: str, now_s: float) -> None:
+        """The map as if the vehicle had never voted."""
+        number = self.newest + 1
+        out = {v.unvoted: n for n, v in self.versions.items() if v.kind == "replay"} | {vehicle: number}
+        again = {1: self.versions[1]}
+        for n in range(2, number):
+            again[n] = self._again(n, again, out)
+        mark = self.event()
+        ours, theirs = again[number - 1], self.versions[number - 1]
+        cells = turned_back(theirs, ours, number)
+        self.casts = [replace(c, gone_at=mark) if c.vehicle == vehicle and c.gone_at is None else c for c in self.casts]
+        self.versions[number] = replace(
+            theirs, kind="replay", cells=cells, knows_free=ours.knows_free, mark=mark, made_s=now_s, unvoted=vehicle
+        )
+
+    def _again(self, n: int, again: dict[int, Version], out: dict[str, int]) -> Version:
+        was, before = self.versions[n], again[n - 1]
+        if was.kind == "rollback":
+            target = again[was.target]
+            return replace(was, cells=turned_back(before, target, n), knows_free=target.knows_free)
+        if was.kind == "replay":
+            return replace(was, cells=before.cells, knows_free=before.knows_free)
+        standing = [c for c in stand_at(self.casts, was.mark) if n >= out.get(c.vehicle, 0)]
+
+        def as_its_vehicle_saw_it(cast: Cast, cell: Cell) -> bool:
+            return again[cast.version].cells[cell].same_as(self.versions[cast.version].cells[cell])
+
+        cells, knows = fuse(before, standing, was.settings, was.made_s, n, as_its_vehicle_saw_it)
+        return replace(was, cells=cells, knows_free=knows)
+
+
+def stand_at(casts: Iterable[Cast], mark: int) -> list[Cast]:
+    return [c for c in casts if c.seq <= mark and (c.gone_at is None or c.gone_at > mark)]
+
+
+def turned_back(before: Version, target: Version, number: int) -> dict[Cell, CellMap]:
+    """The target's cells; those that are otherwise than before have changed in this version."""
+    return {
+        cell: before.cells[cell] if then.same_as(before.cells[cell]) else replace(then, changed=number)
+        for cell, then in target.cells.items()
+    }
+
+
+def in_window(casts: list[Cast], settings: FuseSettings) -> list[Cast]:
+    """Not too much older than the newest, of the vehicles that passed last."""
+    newest = max(c.end_s for c in casts)
+    recent = [c for c in casts if newest - c.end_s <= settings.max_age_days * DAY_S]
+    last = {c.vehicle: max(o.end_s for o in recent if o.vehicle == c.vehicle) for c in recent}
+    ranked = sorted(last, key=lambda v: (last[v], v), reverse=True)[: settings.latest_vehicles]
+    return [c for c in recent if c.vehicle in ranked]
+
+
+def fuse(
+    before: Version,
+    standing: list[Cast],
+    settings: FuseSettings,
+    now_s: float,
+    number: int,
+    readable: Callable[[Cast, Cell], bool],
+) -> tuple[dict[Cell, CellMap], bool]:
+    """Every cell, decided afresh."""
+    ripe = [c for c in standing if c.received_s <= now_s - settings.min_age_s]
+    if not ripe:
+        return dict(before.cells), before.knows_free
+    chosen = in_window(ripe, settings)
+    learns = len({c.vehicle for c in chosen if c.has_free})
+    knows = before.knows_free or learns >= max(settings.min_votes, 1)
+    cells, added = {}, False
+    for cell, held in before.cells.items():
+
+        def counts(cast: Cast, cell: Cell = cell, held: CellMap = held) -> bool:
+            return cell in cast.says and held.changed <= cast.version and readable(cast, cell)
+
+        heard: dict[str, list[Cast]] = {}
+        last: dict[str, int] = {}
+        for cast in sorted(chosen, key=lambda c: c.end_s):
+            last[cast.vehicle] = cast.end_s
+            if counts(cast):
+                heard.setdefault(cast.vehicle, []).append(cast)
+        recent = [c for c in ripe if max(r.end_s for r in ripe) - c.end_s <= settings.stay_days * DAY_S]
+        recent = sorted((c for c in recent if counts(c)), key=lambda c: c.end_s)
+        new = decide_cell(held, heard, last, recent, cell, settings)
+        added = added or len(new.heights) > len(held.heights)
+        cells[cell] = new
+    for cell, held in before.cells.items():
+        free = held.free
+        if knows and learns >= settings.min_votes:
+            passed = [
+                {bit for c in chosen if c.vehicle == v and c.has_free and cell in c.says
+                 and held.changed <= c.version and readable(c, cell) for bit in bits(c.says[cell].free)}
+                for v in {c.vehicle for c in chosen}
+            ]  # fmt: skip
+            free |= sum(1 << b for b in range(64) if sum(b in mine for mine in passed) >= settings.min_votes)
+        if knows and (learns or added):
+            free &= ~occupied(cells[cell].heights)
+        cells[cell] = replace(cells[cell], free=free)
+        if not cells[cell].same_as(held):
+            cells[cell] = replace(cells[cell], changed=number)
+    return cells, knows
+
+
+def decide_cell(
+    held: CellMap,
+    heard: dict[str, list[Cast]],
+    last: dict[str, int],
+    recent: list[Cast],
+    cell: Cell,
+    settings: FuseSettings,
+) -> CellMap:
+    """One cell: one vote a vehicle, its latest drive that says anything; then delete, add, remember."""
+    says = {vehicle: drives[-1].says[cell] for vehicle, drives in heard.items()}
+    state = decide([s.state for s in says.values()], settings.min_votes)
+    if state == CO and is_temporary(held, recent, cell, settings):
+        state = UN
+    heights = held.heights
+    if state in (CE, UO):
+        heights = tuple(z for z in heights if z < LAYER_M or not goes(int(z // LAYER_M), state, says, settings))
+    if state == CO:
+        layers = {int(z // LAYER_M) for z in heights}
+        offered = {v: {int(z // LAYER_M): z for z in s.heights} for v, s in says.items() if s.state == CO}
+        for layer in sorted({layer for mine in offered.values() for layer in mine}):
+            backing = sum(any(near in mine for near in (layer - 1, layer, layer + 1)) for mine in offered.values())
+            if backing >= settings.min_votes and layer not in layers:
+                heights += (next(mine[layer] for mine in offered.values() if layer in mine),)
+    new = replace(held, heights=heights)
+    if new.stands() and not held.stands():
+        return replace(new, came_s=min(last[v] for v, s in says.items() if s.state == CO))
+    if held.stands() and not new.stands() and held.came_s:
+        ended = max(min((last[v] for v, s in says.items() if s.state == CE), default=0), held.came_s)
+        return replace(new, came_s=0, stays=held.stays + 1, stayed_s=held.stayed_s + ended - held.came_s)
+    return new
+
+
+def decide(votes: list[int], min_votes: int) -> int:
+    """Undetermined abstains; a change needs a majority of those that determined the cell, and a quorum."""
+    counts = [votes.count(state) for state in (UO, UE, CO, CE)]
+    best = max(counts)
+    if best == 0 or counts.count(best) > 1:
+        return UN
+    state = counts.index(best)
+    if state in (CO, CE) and (2 * best <= sum(counts) or best < min_votes):
+        return UN
+    return state
+
+
+def goes(layer: int, state: int, says: dict[str, Spoken], settings: FuseSettings) -> bool:
+    """Whether enough vehicles say that this voxel is gone, of a cell that is empty now or that stands."""
+    if state == CE:
+        marks = [EVERY if s.gone is None else s.gone for s in says.values() if s.state == CE]
+        return sum(m >> layer & 1 for m in marks) >= settings.min_votes
+    marks = [s.gone or 0 for s in says.values() if s.state == UO]
+    marking, determined = sum(m >> layer & 1 for m in marks), sum(s.state != UN for s in says.values())
+    return marking >= settings.min_votes and 2 * marking > determined
+
+
+def is_temporary(held: CellMap, recent: list[Cast], cell: Cell, settings: FuseSettings) -> bool:
+    """What is new stays out until it can be expected to stay, by what came and went here before and its own age."""
+    since, seen, absent = None, 0, 0
+    for cast in recent:
+        state = cast.says[cell].state
+        if state == UE:
+            absent += 1
+            since = None if absent >= settings.min_votes else since
+        if state == CO:
+            absent, seen = 0, cast.end_s
+            since = cast.end_s if since is None else since
+    age = 0.0 if since is None else (seen - since) / DAY_S
+    expected = (settings.prior_stay_days + held.stayed_s / DAY_S + age) / (1.0 + held.stays)
+    sure = (settings.prior_stay_days + held.stayed_s / DAY_S) / (1.0 + held.stays) >= settings.stay_days
+    return not (sure or age >= settings.stay_days or expected >= settings.stay_days)
+
+
+def bits(word: int) -> set[int]:
+    return {b for b in range(64) if word >> b & 1}
+
+
+def occupied(heights: Iterable[float]) -> int:
+    word = 0
+    for z in heights:
+        word |= (1 << int(z // LAYER_M)) if z >= LAYER_M else 0
+    return word

@@ -1,0 +1,57 @@
+"""The store does what its rules say in plain words (``rules.py``), whatever happens: random histories of a street.
+
+``python benchmarks/histories.py`` runs thousands.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parent))
+
+from hand_made import two_walls
+from histories import Clock, live
+from mapvote.fusion.tile_vote import TileVote
+from mapvote.server.store import eligible_votes
+from mapvote.server.store.store import Store
+
+MakeStore = Callable[[Clock], Store]
+
+
+@pytest.fixture
+def sqlite_stores(tmp_path: Path) -> MakeStore:
+    names = iter(range(1_000))
+    return lambda clock: Store.create(f"sqlite:///{tmp_path / f'{next(names)}.db'}", two_walls(), clock=clock)
+
+
+def disagreements(make: MakeStore, seeds: range, steps: int = 25) -> list[str]:
+    return [found for seed in seeds if (found := live(seed, make, steps)) is not None]
+
+
+def test_store_and_rules_agree(sqlite_stores: MakeStore) -> None:
+    assert disagreements(sqlite_stores, range(10)) == []
+
+
+@pytest.mark.slow
+def test_store_and_rules_agree_in_many_histories(sqlite_stores: MakeStore) -> None:
+    assert disagreements(sqlite_stores, range(10, 170)) == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(500, 530))
+def test_store_and_rules_agree_on_postgresql(postgres_url: str, seed: int) -> None:
+    assert live(seed, lambda clock: Store.create(postgres_url, two_walls(), clock=clock), 25) is None
+
+
+def test_the_rules_object_to_a_store_that_lets_votes_count_twice(
+    sqlite_stores: MakeStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def whatever_came_since(vote: TileVote, *_: object) -> TileVote:
+        return vote
+
+    monkeypatch.setattr(eligible_votes, "unspent", whatever_came_since)
+    assert disagreements(sqlite_stores, range(6)) != []
