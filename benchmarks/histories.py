@@ -3,7 +3,7 @@
 python benchmarks/histories.py --sqlite 2000 --postgres 300
 
 Drives that repeat, objects that come, go and come back, policies that change, minimum age, withdrawal, rollback, replay
-and racing publishers (tests/server/store/histories.py). Prints every disagreement with its seed, and at the end a line
+and racing publishers (tests/histories.py). Prints every disagreement with its seed, and at the end a line
 for docs/results.md.
 """
 
@@ -20,7 +20,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 TESTS = Path(__file__).parents[1] / "tests"
-sys.path[:0] = [str(TESTS), str(TESTS / "server" / "store")]
+sys.path.insert(0, str(TESTS))
 
 from hand_made import two_walls  # noqa: E402
 from histories import START_S, Clock, live  # noqa: E402

@@ -1,17 +1,14 @@
-"""The store does what its rules say in plain words (``rules.py``), whatever happens: random histories of a street.
+"""The store does what its rules say in plain words (``plain_rules.py``), whatever happens: random histories.
 
 ``python benchmarks/histories.py`` runs thousands.
 """
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parent))
 
 from hand_made import two_walls
 from histories import Clock, live

@@ -1,4 +1,4 @@
-"""Random histories of a small street, lived through by the store and by the rules in plain words (``rules.py``)."""
+"""Random histories of a street, lived through by the store and by its rules in plain words (``plain_rules.py``)."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from contextlib import suppress
 from threading import Barrier, Thread
 
 import numpy as np
-from rules import CE, CO, DAY_S, UE, UN, UO, Cast, Cell, CellMap, Server, Spoken
 
 from hand_made import Say, make_ballot, states_plane, two_walls, wall, words_plane
 from mapvote.codec.ballot import encode
@@ -22,6 +21,7 @@ from mapvote.server.store.policy import Policy, set_policy
 from mapvote.server.store.publish import publish, rollback
 from mapvote.server.store.replay import replay
 from mapvote.server.store.store import Store
+from plain_rules import CE, CO, DAY_S, UE, UN, UO, Cast, Cell, CellMap, Server, Spoken
 
 WALL: list[Cell] = [(10, 10), (10, 11), (10, 12)]
 LAWN: list[Cell] = [(20, 20), (20, 21), (30, 30)]
@@ -108,7 +108,7 @@ class History:
             if version == 0:
                 return
         counts = self.rules.counts_anywhere(version, says)
-        if self._send(vehicle, drive, end_s, named, version, says, masks, has_free) is not counts:
+        if self._send(vehicle, drive, end_s, named, version, says, masks, has_free) != counts:
             raise AssertionError(f"{vehicle}/{drive} counts: {counts}, and the store thinks otherwise")
         if counts:
             self.rules.vote(Cast(vehicle, drive, end_s, version, says, has_free, self.clock.now_s, 0))
