@@ -69,7 +69,8 @@ def killed_server(url: str, seed: int, moment_s: float, cluster: PostgresCluster
     store = url.removeprefix("sqlite:///")
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        with serving(store, log=folder / "log") as (address, process):
+        (folder / "server.toml").write_text("[server]\ndrives_a_day = 1000000\n")
+        with serving(store, "--config", folder / "server.toml", log=folder / "log") as (address, process):
             traffic = Traffic(address, seed, folder)
             try:
                 if not traffic.begun.wait(60.0):

@@ -208,6 +208,9 @@ class ServerSettings(Section):
     answer_timeout_s: float = Field(default=60.0, gt=0, description="for a client that does not take its answer")
     ballots_per_minute: float = Field(default=600.0, gt=0, description="of one vehicle, on average")
     burst: int = Field(default=60, ge=1, description="ballots of one vehicle at once")
+    drives_a_day: int = Field(default=300, ge=1, description="that one vehicle may send")
+    tiles_a_drive: int = Field(default=1000, ge=1, description="that one ballot may vote on, of 76.8 m by 76.8 m")
+    stored_bytes: int = Field(default=2_000_000_000, ge=1, description="that one vehicle's ballots may take")
     batch: int = Field(default=64, ge=1, description="ballots written in one transaction at most")
     hosts: tuple[str, ...] = Field(
         default=(), description="names that this server goes by, besides localhost and addresses in digits"

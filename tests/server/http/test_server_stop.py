@@ -64,7 +64,8 @@ def test_a_stop_under_load_is_soon_and_loses_nothing(tmp_path: Path, after_s: fl
             connected.set()
             published.append(http.request("POST", "/v1/publish", json={"override": True}).status_code)
 
-    with serving(tmp_path / "s.db", log=tmp_path / "log") as (url, process):
+    (tmp_path / "server.toml").write_text("[server]\ndrives_a_day = 1000000\n")
+    with serving(tmp_path / "s.db", "--config", tmp_path / "server.toml", log=tmp_path / "log") as (url, process):
         senders = [
             threading.Thread(target=send_until_stopped, args=(url, f"v{i}", point_map, acknowledged)) for i in range(4)
         ]

@@ -18,6 +18,7 @@ from mapvote.server.insight.clouds import Clouds
 from mapvote.server.store.admission import Intake, Sent
 from mapvote.server.store.ballots import Incoming, Receipt
 from mapvote.server.store.publish import Gate
+from mapvote.server.store.quotas import Quota
 from mapvote.server.store.store import Store
 
 READING = 1
@@ -85,7 +86,8 @@ class Services:
 
 def make_services(store: Store, settings: Settings, gate: Gate | None, executor: Executor | None) -> Services:
     """The parts of an app on an open store; ``executor`` as in :func:`mapvote.server.http.app.create_app`."""
-    intake, manifests, threads, most = Intake(store), Manifests(store), Threads(), settings.server
+    manifests, threads, most = Manifests(store), Threads(), settings.server
+    intake = Intake(store, Quota(most.drives_a_day, most.tiles_a_drive, most.stored_bytes))
     return Services(
         store=store,
         settings=settings,

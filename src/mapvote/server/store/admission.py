@@ -20,6 +20,8 @@ from mapvote.server.store.ballots import Incoming, Receipt, put_in, unlike
 from mapvote.server.store.blobs import TileHashes
 from mapvote.server.store.policy import policy_in
 from mapvote.server.store.queries import current_number, load_memory, memory_of, names, tile_of, tiles_of
+from mapvote.server.store.quotas import Quota, Quotas
+from mapvote.server.store.reach import refuse_out_of_reach
 from mapvote.server.store.store import Store
 from mapvote.server.store.version_driven import NO_SUCH_BASE, version_driven
 
@@ -76,10 +78,14 @@ def _check_founded(ballot: Ballot) -> None:
 
 
 class Intake:
-    """Takes ballots into a store, in two steps that may run side by side; remembers the newest version's tiles."""
+    """Takes ballots into a store, in two steps that may run side by side; remembers the newest version's tiles.
 
-    def __init__(self, store: Store) -> None:
+    ``quota``: what one vehicle may leave in the store; None: as much as it likes.
+    """
+
+    def __init__(self, store: Store, quota: Quota | None = None) -> None:
         self._store = store
+        self._quotas = None if quota is None else Quotas(quota)
         self._current: tuple[int, Mapping[TileIndex, TileHashes]] = (0, {})
 
     def look_at(self, received: Sequence[Sent]) -> list[Incoming | Exception]:
@@ -117,15 +123,21 @@ class Intake:
 
     def _misfits(self, connection: sa.Connection, ballots: Sequence[Incoming]) -> list[MapvoteError | None]:
         """Conflict for each ballot on another map, cast by other settings, with an unknown base or without a cell that
-        still counts; MapvoteError for one from the future."""
+        still counts; MapvoteError for one from the future or from where its vehicle cannot have been, TooMany for more
+        than its vehicle's quota."""
         newest = current_number(connection)
         if newest != self._current[0]:
             self._current = newest, tiles_of(connection, newest)
         asked, repeated = policy_in(connection).round, _standing(connection, ballots)
         return [
-            None if one.digest in repeated else unlike(asked, one) or self._misfit(connection, one.ballot)
+            None
+            if one.digest in repeated
+            else unlike(asked, one) or self._misfit(connection, one.ballot) or self._too_much(connection, one)
             for one in ballots
         ]
+
+    def _too_much(self, connection: sa.Connection, one: Incoming) -> MapvoteError | None:
+        return None if self._quotas is None else self._quotas.refusal(connection, one, self._store.clock())
 
     def _misfit(self, connection: sa.Connection, ballot: Ballot) -> MapvoteError | None:
         current = self._current[1]
@@ -133,6 +145,9 @@ class Intake:
             return Conflict(f"this server keeps map {self._store.map_id!r}, the ballot votes on {ballot.map_id!r}")
         if ballot.end_ns > self._store.clock() + MAX_CLOCK_AHEAD_NS:
             return MapvoteError("ballot: the drive ends in the future; set the vehicle's clock")
+        out_of_reach = refuse_out_of_reach(ballot, current.keys())
+        if out_of_reach is not None:
+            return out_of_reach
         version = version_driven(connection, ballot, self._heard_at(connection, ballot))
         if version is None:
             return Conflict(NO_SUCH_BASE)
