@@ -18,8 +18,8 @@ _TILES_AWAY = int(MAX_REACH_M // _TILE_M) + 1
 
 
 def refuse_out_of_reach(ballot: Ballot, map_tiles: Collection[TileIndex]) -> MapvoteError | None:
-    """Why a ballot votes where its vehicle cannot have been: a cell more than MAX_REACH_M from every tile of the map, or
-    tiles in groups that lie farther apart than that. None if it may have been there."""
+    """Why a ballot votes where its vehicle cannot have been: on a cell more than MAX_REACH_M from every tile of the map,
+    or on tiles in groups that lie farther apart than that. None if it may have been there."""
     for tile in ballot.tiles:
         near = [index for index in _around(tile.tile) if index in map_tiles]
         if _within(tile.tile, near):
@@ -54,9 +54,8 @@ def _farthest_m(ballot: Ballot, tile: BallotTile, near: Collection[TileIndex]) -
     rows, cols = np.nonzero(spoken)
     if not len(rows):
         return 0.0
-    y, x = (
-        (origin * TILE_CELLS + cells + 0.5) * CELL_SIZE for origin, cells in zip(tile.tile, (rows, cols), strict=True)
-    )
+    y = (tile.tile[0] * TILE_CELLS + rows + 0.5) * CELL_SIZE
+    x = (tile.tile[1] * TILE_CELLS + cols + 0.5) * CELL_SIZE
     least: F64 = np.full(len(rows), np.inf)
     for row, col in near:
         dy = np.maximum(np.maximum(row * _TILE_M - y, y - (row + 1) * _TILE_M), 0.0)
