@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+import contextlib
+import json
+import os
 import random
+import signal
+import subprocess
+import sys
 import tempfile
 import threading
 import time
+from functools import cache
 from pathlib import Path
 
 import httpx2
 
 from crash import CELLS, TILES, votes_on
-from live_server import serving
 from mapvote.client import MapClient
 from mapvote.core.types import MapvoteError
 from postgres_cluster import PostgresCluster
@@ -64,28 +70,77 @@ class Traffic:
                     return
 
 
+class Launcher:
+    """Starts servers quickly: each is forked from a process that has the program loaded already, so that two hundred
+    take minutes. From there on it is `mapvote serve`, as a user starts it."""
+
+    def __init__(self) -> None:
+        command = [sys.executable, __file__]
+        self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+
+    def start(self, store: str, config: Path, log: Path) -> tuple[str, int]:
+        """(address, process) of a new server."""
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        self._process.stdin.write(json.dumps([store, str(config), str(log)]) + "\n")
+        self._process.stdin.flush()
+        said = dict(self._process.stdout.readline().split() for _ in range(2))
+        if said.keys() != {"pid", "serving"}:
+            raise SystemExit(f"the server did not start: {log.read_text()[-2000:]}")
+        return said["serving"], int(said["pid"])
+
+
+def launch() -> None:
+    """The launcher's own process: a line of JSON for each server, the process and the address of it for an answer."""
+    from mapvote.cli.server import serve
+    from mapvote.server.http import serve as _loaded  # noqa: F401
+
+    signal.signal(signal.SIGCHLD, signal.SIG_IGN)
+    for line in sys.stdin:
+        store, config, log = json.loads(line)
+        child = os.fork()
+        if child == 0:
+            signal.signal(signal.SIGCHLD, signal.SIG_DFL)
+            os.dup2(os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND), 2)
+            try:
+                serve(store, None, "127.0.0.1", 0, True, None, Path(config))
+            finally:
+                os._exit(7)
+        print(f"pid {child}", flush=True)
+
+
+@cache
+def launcher() -> Launcher:
+    """One for the whole run."""
+    return Launcher()
+
+
 def killed_server(url: str, seed: int, moment_s: float, cluster: PostgresCluster | None) -> list[tuple[str, str]]:
     """Start a server, kill it (and the database under it) ``moment_s`` after its first acknowledgement."""
     store = url.removeprefix("sqlite:///")
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        (folder / "server.toml").write_text("[server]\ndrives_a_day = 1000000\n")
-        with serving(store, "--config", folder / "server.toml", log=folder / "log") as (address, process):
-            traffic = Traffic(address, seed, folder)
-            try:
-                if not traffic.begun.wait(60.0):
-                    raise SystemExit(f"kill {seed}: nothing was acknowledged: {(folder / 'log').read_text()[-2000:]}")
-                time.sleep(moment_s)
-                if cluster is not None:
-                    cluster.stop(crash=True)
-                if process.poll() is not None:
-                    raise SystemExit(f"kill {seed}: the server ended by itself: {(folder / 'log').read_text()[-2000:]}")
-            finally:
-                process.kill()
-                process.wait()
-                traffic.end()
+        config, log = folder / "server.toml", folder / "log"
+        config.write_text("[server]\ndrives_a_day = 1000000\n")
+        address, process = launcher().start(store, config, log)
+        traffic = Traffic(address, seed, folder)
+        try:
+            if not traffic.begun.wait(60.0):
+                raise SystemExit(f"kill {seed}: nothing was acknowledged: {log.read_text()[-2000:]}")
+            time.sleep(moment_s)
+            if cluster is not None:
+                cluster.stop(crash=True)
+            os.kill(process, 0)  # ProcessLookupError: it ended by itself
+        finally:
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(process, signal.SIGKILL)
+            traffic.end()
         if "Traceback" in (folder / "log").read_text():
             raise SystemExit(f"kill {seed}: the server stumbled: {(folder / 'log').read_text()[-4000:]}")
     if cluster is not None:
         cluster.start()
     return traffic.acknowledged
+
+
+if __name__ == "__main__":
+    launch()

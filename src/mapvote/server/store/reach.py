@@ -18,8 +18,8 @@ _TILES_AWAY = int(MAX_REACH_M // _TILE_M) + 1
 
 
 def refuse_out_of_reach(ballot: Ballot, map_tiles: Collection[TileIndex]) -> MapvoteError | None:
-    """Why a ballot votes where its vehicle cannot have been: on a cell more than MAX_REACH_M from every tile of the map,
-    or on tiles in groups that lie farther apart than that. None if it may have been there."""
+    """Why a ballot votes where its vehicle cannot have been: on a cell more than MAX_REACH_M from every tile of the
+    map, or on tiles in groups that lie farther apart than that. None if it may have been there."""
     for tile in ballot.tiles:
         near = [index for index in _around(tile.tile) if index in map_tiles]
         if _within(tile.tile, near):
