@@ -232,6 +232,17 @@ def row(kinds: set[str], waits: Waits) -> dict[str, Any]:
     return found | {"refused": len(waits.refused)}
 
 
+def by_the_server(log: Path, start: int) -> dict[str, float]:
+    """What the server's own log says of the honest ones since it was ``start`` bytes long: from the headers to the last
+    byte of the answer. Without the waits of this process, which shares two cores with the attackers."""
+    took: dict[str, list[float]] = {"ballot": [], "healthz": []}
+    for line in log.read_bytes()[start:].splitlines():
+        told = json.loads(line) if line.startswith(b"{") else {}
+        if told.get("key") == "honest":
+            took["healthz" if told["path"] == "/healthz" else "ballot"].append(told["ms"])
+    return {f"server_{name}_p99_ms": round(float(np.percentile(ms, 99))) for name, ms in took.items()}
+
+
 def under_attack(
     address: Address, keys: dict[str, str], ballot: Ballot, kinds: set[str], seconds: float
 ) -> dict[str, Any]:
@@ -266,7 +277,9 @@ def run(store_name: str, url: str, seconds: float, folder: Path, kinds: list[set
         asyncio.run(measure((host, int(port)), keys, ballot, 3.0, "warm"))
         rows = []
         for some in kinds:
+            start = (folder / "log").stat().st_size
             rows.append(under_attack((host, int(port)), keys, ballot, some, seconds))
+            rows[-1] |= by_the_server(folder / "log", start) | {"load": round(os.getloadavg()[0], 1)}
             memory = Path(f"/proc/{server.pid}/status").read_text().split("VmHWM:")[1].split()[0]
             rows[-1]["server_peak_MB"] = int(memory) // 1000
             print(json.dumps(rows[-1]), flush=True)

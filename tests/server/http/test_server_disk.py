@@ -63,6 +63,7 @@ def standing(url: str) -> set[str]:
 def assert_well_again(http: httpx2.Client, url: str, acknowledged: set[str]) -> None:
     assert put(http, "v2", "later").status_code == 201
     assert http.get("/healthz").status_code == 200
+    assert http.get("/readyz").status_code == 200
     assert http.request("POST", "/v1/publish", json={"override": True}).json()["published"]
     assert standing(url) == {*acknowledged, "later"}
 

@@ -46,14 +46,15 @@ def test_a_database_gone_for_ten_seconds_is_503_and_then_all_is_well(
                 assert refused.status_code == 503
                 assert "Retry-After" in refused.headers
                 assert "again" in refused.json()["detail"]
-                for path in ("/v1/map", "/healthz", "/v1/coverage"):
+                for path in ("/v1/map", "/healthz", "/readyz", "/v1/coverage"):
                     assert http.get(path).status_code == 503
                 assert http.request("POST", "/v1/publish", json={}).status_code == 503
                 time.sleep(0.5)
         finally:
             postgres_cluster.start()
         assert put(http, "v1", "after").status_code == 201
-        assert http.get("/healthz").status_code == 200
+        for path in ("/healthz", "/readyz"):
+            assert http.get(path).status_code == 200
     store = Store.open(postgres_url)
     with store.database.reading() as connection:
         assert set(connection.execute(sa.select(schema.ballots.c.drive)).scalars()) == {"before", "after"}

@@ -9,6 +9,7 @@ from typing import Any
 import msgspec
 
 from mapvote.codec.ballot import tile_key
+from mapvote.server.store.queries import current_number
 from mapvote.server.store.store import Manifest, Store
 
 _KEPT = 16
@@ -25,6 +26,11 @@ class Manifests:
     def newest(self, asked: Sequence[None]) -> list[int]:
         """The newest version's number, for each who asks: one query for all of them."""
         return [self._store.current()] * len(asked)
+
+    def newest_if_writable(self, asked: Sequence[None]) -> list[int]:
+        """As :meth:`newest`, of a database that takes a writer now; Unavailable if it does not."""
+        with self._store.database.writing() as connection:
+            return [current_number(connection)] * len(asked)
 
     def ready(self, number: int, since: int | None) -> bytes | None:
         """A manifest that was made before."""

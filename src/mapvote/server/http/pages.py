@@ -12,7 +12,7 @@ from typing import Any
 from fastapi import APIRouter, Request, Response
 
 from mapvote.codec.arrays import compress
-from mapvote.server.errors import NotFound
+from mapvote.server.errors import NotFound, Unavailable
 from mapvote.server.http.schemas import problems
 from mapvote.server.http.services import services
 
@@ -33,11 +33,20 @@ async def health(request: Request) -> dict[str, Any]:
     return {"status": "ok", "version": await services(request).newest.put(None)}
 
 
+@router.get("/readyz", responses=problems(), summary="Can ballots be taken in?")
+async def ready(request: Request) -> dict[str, Any]:
+    """200 if the database can be written now, 503 with what it says if not, or if the server is stopping."""
+    parts = services(request)
+    if parts.stopping.is_set():
+        raise Unavailable("the server is stopping")
+    return {"status": "ready", "version": await parts.writable.put(None)}
+
+
 @router.get("/metrics", responses=problems(), response_class=Response, summary="Prometheus metrics")
-def metrics(request: Request) -> Response:
+async def metrics(request: Request) -> Response:
     """Counters, latencies, the newest version."""
     parts = services(request)
-    parts.metrics.version.set(parts.store.current())
+    parts.metrics.version.set(await parts.newest.put(None))
     return Response(parts.metrics.text(), media_type="text/plain; version=0.0.4; charset=utf-8")
 
 
@@ -59,13 +68,13 @@ def docs(request: Request) -> Response:
 
 
 @router.get("/", include_in_schema=False)
-def index(request: Request) -> Response:
+async def index(request: Request) -> Response:
     """The operator's page."""
     return _page(request, _assets()["index.html"].plain)
 
 
 @router.get("/viewer/{name:path}", include_in_schema=False)
-def asset(request: Request, name: str) -> Response:
+async def asset(request: Request, name: str) -> Response:
     """A script or style of the operator's page."""
     found = _assets().get(name)
     if found is None or found.kind == "text/html":

@@ -62,6 +62,8 @@ class Services:
     """Writes those that passed, many in one transaction."""
     newest: Batcher[None, int]
     """The number of the newest version."""
+    writable: Batcher[None, int]
+    """The same, once a transaction could be begun that might write."""
     manifests: Manifests
     clouds: Clouds
     """Levels of detail for the page."""
@@ -98,6 +100,7 @@ def make_services(store: Store, settings: Settings, gate: Gate | None, executor:
         examiner=Batcher(intake.look_at, most.batch, threads.ballots),
         writer=Batcher(intake.write, most.batch, threads.ballots),
         newest=Batcher(manifests.newest, _READERS, threads.lookups),
+        writable=Batcher(manifests.newest_if_writable, _READERS, threads.lookups),
         manifests=manifests,
         clouds=Clouds(store),
         metrics=Metrics(),
