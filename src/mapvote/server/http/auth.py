@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import base64
 import binascii
 from concurrent.futures import Executor
@@ -9,7 +10,7 @@ from functools import partial
 
 from fastapi import Request
 
-from mapvote.server.errors import Forbidden, Unauthorised
+from mapvote.server.errors import Forbidden, TooMany, Unauthorised
 from mapvote.server.http.batching import Batcher
 from mapvote.server.http.limits import RateLimit
 from mapvote.server.http.services import services
@@ -19,6 +20,7 @@ from mapvote.server.store.store import Store
 _AT_ONCE = 256
 """Keys looked up in one query at most."""
 _REMEMBERED = 10_000
+_PAUSE_S = 1.0
 _WRONG_PER_MINUTE, _WRONG_AT_ONCE = 60.0, 120
 """Wrong keys from one address that are looked up."""
 
@@ -67,7 +69,11 @@ class Guard:
 
     async def _look_up(self, digest: str, peer: str) -> keys.Key:
         if digest not in self._known:
-            self._wrong.check(peer)
+            try:
+                self._wrong.check(peer)
+            except TooMany:
+                await asyncio.sleep(_PAUSE_S)  # a flood waits for its answers instead of asking for more
+                raise
         try:
             return await self._looked_up.put(digest)
         except Unauthorised:
