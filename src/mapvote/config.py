@@ -216,6 +216,11 @@ class ServerSettings(Section):
         default=(), description="names that this server goes by, besides localhost and addresses in digits"
     )
 
+    webhook_url: str = Field(
+        default="", pattern="^(https?://.*)?$", description="where events are posted to; empty: nowhere"
+    )
+    webhook_secret: str = Field(default="", description="what they are signed with (HMAC-SHA256)")
+
     @field_validator("hosts", mode="before")
     @classmethod
     def _from_one_line(cls, value: object) -> object:

@@ -68,6 +68,10 @@ def changes(
     out: Annotated[
         Path | None, typer.Option(metavar="FILE", help=".geojson, or .gpkg (GeoPackage); else it is printed")
     ] = None,
+    page: Annotated[
+        Path | None,
+        typer.Option("--html", metavar="FILE", help="one page with the clouds of the largest, before and after"),
+    ] = None,
 ) -> None:
     """What was built and demolished between two versions: GeoJSON in longitude and latitude, or a GeoPackage.
 
@@ -80,12 +84,20 @@ def changes(
     from mapvote.formats.atomic import whole_file
     from mapvote.formats.geo.frame import frame_of
     from mapvote.formats.geo.geopackage import write_geopackage
-    from mapvote.server.insight.history import changes_between
+    from mapvote.server.insight.cutout import whole_page
+    from mapvote.server.insight.history import changes_between, cutouts_between
 
     package = out is not None and out.suffix.lower() == ".gpkg"
     with opened_store(store) as opened, waiting("comparing versions"):
         newest = opened.current() if new is None else new
         found = changes_between(opened, old, newest, min_cells, lonlat=not (metres or package))
+        cutouts = cutouts_between(opened, old, newest, found) if page is not None else []
+    if page is not None:
+        with whole_file(page) as part:
+            part.write_text(whole_page(f"{found['map_id']}: version {old} to {newest}", cutouts))
+        print(f"{len(cutouts)} of {len(found['features'])} changes in {page}")
+        if out is None:
+            return
     text = json.dumps(found, indent=1)
     if out is None:
         print(text)

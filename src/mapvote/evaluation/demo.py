@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -22,6 +23,9 @@ from mapvote.formats import write_map
 from mapvote.formats.atomic import whole_file
 from mapvote.formats.maps.cloud import Cloud
 from mapvote.formats.maps.pcd import write_pcd
+from mapvote.server.insight.cutout import Cutout, fragment
+from mapvote.server.insight.history import changes_between, cutouts_between
+from mapvote.server.store.store import Store, url_of
 
 SCENARIO, QUICK_SCENARIO = "street", "corner"
 SEED = 2
@@ -77,7 +81,12 @@ def demo(out: Path, quick: bool = False, progress: Progress | None = None) -> tu
     write_text(as_csv(evaluation.result), out / "results.csv")
     write_map(updated, out / "map_after")
     story = tell(evaluation, done)
-    write_text(report_page(evaluation, story, pictures, out), out / "report.html")
+    write_text(
+        report_page(
+            evaluation, story, pictures, out, changed_areas(out / "work" / "server" / "store.db", done.version)
+        ),
+        out / "report.html",
+    )
     if progress:
         progress("drawing", 1, 1)
     return evaluation, story
@@ -125,7 +134,18 @@ def commands(evaluation: Evaluation, out: Path) -> str:
     )
 
 
-def report_page(evaluation: Evaluation, story: Story, pictures: list[tuple[Path, str]], out: Path) -> str:
+def changed_areas(store: Path, version: int) -> list[Cutout]:
+    """What the server's round changed, cut out of the map."""
+    opened = Store.open(url_of(str(store)))
+    try:
+        return cutouts_between(opened, 1, version, changes_between(opened, 1, version)) if version > 1 else []
+    finally:
+        opened.close()
+
+
+def report_page(
+    evaluation: Evaluation, story: Story, pictures: list[tuple[Path, str]], out: Path, cutouts: Sequence[Cutout] = ()
+) -> str:
     """report.html's text: what happened, in the order in which it happened."""
     result = evaluation.result
     drawn = {path.stem: (path, caption) for path, caption in pictures}
@@ -156,7 +176,12 @@ def report_page(evaluation: Evaluation, story: Story, pictures: list[tuple[Path,
             ],
             [drawn["street"]],
         ),
-        Section("The changed areas", pictures=[drawn[area.name.replace(" ", "_")] for area, _, _ in story.areas]),
+        Section(
+            "The changed areas",
+            ["Drag to turn the cloud; what went are blue crosses, what came red diamonds."] if cutouts else [],
+            markup=fragment(cutouts) if cutouts else "",
+            pictures=[drawn[area.name.replace(" ", "_")] for area, _, _ in story.areas],
+        ),
         Section(
             "What a vehicle sees and how it votes",
             [

@@ -49,6 +49,8 @@ class Section:
     pictures: Sequence[tuple[Path, str]] = ()
     tables: Sequence[Table] = ()
     commands: str = ""
+    markup: str = ""
+    """HTML as it is, from those who made it safe."""
 
 
 def page(title: str, lead: str, facts: Sequence[tuple[str, str]], sections: Sequence[Section]) -> str:
@@ -66,6 +68,7 @@ def page(title: str, lead: str, facts: Sequence[tuple[str, str]], sections: Sequ
 def _section(section: Section) -> str:
     parts = [f"<h2>{escape(section.heading)}</h2>"]
     parts += [f"<p>{escape(text)}</p>" for text in section.text]
+    parts += [section.markup] if section.markup else []
     for path, caption in section.pictures:
         raw = path.read_bytes()
         width = round(int.from_bytes(raw[16:20], "big") / _PIXELS)  # PNG: the width stands in its first chunk

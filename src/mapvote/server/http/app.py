@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import AsyncIterator
 from concurrent.futures import Executor
 from contextlib import asynccontextmanager
@@ -10,12 +11,21 @@ from anyio import to_thread
 from fastapi import FastAPI
 
 from mapvote.config import Settings
-from mapvote.server.http import ballot_route, cloud_routes, desk_routes, operator_routes, pages, vehicle_routes
+from mapvote.server.http import (
+    ballot_route,
+    cloud_routes,
+    desk_routes,
+    event_routes,
+    operator_routes,
+    pages,
+    vehicle_routes,
+)
 from mapvote.server.http.auth import Guard
 from mapvote.server.http.browsers import Hosts
 from mapvote.server.http.middleware import Watch
 from mapvote.server.http.schemas import unreadable
 from mapvote.server.http.services import READING, make_services
+from mapvote.server.http.webhook import deliver
 from mapvote.server.store.publish import Gate
 from mapvote.server.store.store import Store
 
@@ -38,7 +48,10 @@ def create_app(
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
         to_thread.current_default_thread_limiter().total_tokens = READING
+        posting = asyncio.create_task(deliver(parts)) if parts.settings.server.webhook_url else None
         yield
+        if posting is not None:
+            posting.cancel()
         await parts.close()
 
     app = FastAPI(
@@ -50,7 +63,8 @@ def create_app(
         redoc_url=None,
     )
     app.state.services = parts
-    for part in (ballot_route, vehicle_routes, operator_routes, desk_routes, cloud_routes, pages):
+    routes = (ballot_route, vehicle_routes, operator_routes, desk_routes, cloud_routes, event_routes, pages)
+    for part in routes:
         app.include_router(part.router)
     app.add_exception_handler(400, unreadable)
     hosts, guard = Hosts(parts.settings.server.hosts), Guard(store, parts.threads.lookups, opened=opened)

@@ -14,7 +14,7 @@ from fastapi import APIRouter, Query, Request, Response
 
 from mapvote.codec.ballot import tile_key
 from mapvote.fusion.tile_vote import DAY_NS
-from mapvote.server.errors import Unavailable
+from mapvote.server.errors import Held, Unavailable
 from mapvote.server.http.auth import operator, reviewer, sees_names
 from mapvote.server.http.schemas import LEAST, MOST, PublishAsk, Published, RollbackAsk, as_json, iso, problems
 from mapvote.server.http.services import Services, services
@@ -23,6 +23,7 @@ from mapvote.server.insight.geojson import as_csv, feature_rows
 from mapvote.server.insight.history import changes_between, coverage, vehicle_standings
 from mapvote.server.store.keys import pseudonyms
 from mapvote.server.store.publish import publish, rollback
+from mapvote.server.store.queries import log_event
 
 _MOST_EVIDENCE = 50
 router = APIRouter()
@@ -36,7 +37,7 @@ async def publish_now(request: Request, ask: PublishAsk) -> Published:
 
 
 def _publish(parts: Services, ask: PublishAsk, by: str) -> Published:
-    with parts.metrics.publish_seconds.time(), _unless_stopping(parts):
+    with parts.metrics.publish_seconds.time(), _unless_stopping(parts), _told_if_held(parts, by):
         done = publish(
             parts.store,
             by=by,
@@ -137,6 +138,17 @@ def vehicles(request: Request) -> Response:
 def _seen(stamp_ns: int | None, known: bool) -> int | None:
     """When a vehicle passed, or only on which day: of a road with few vehicles the minute would tell who it was."""
     return stamp_ns if known or stamp_ns is None else stamp_ns // DAY_NS * DAY_NS
+
+
+@contextmanager
+def _told_if_held(parts: Services, by: str) -> Iterator[None]:
+    """A publish that the policy holds is an event: whoever listens can look."""
+    try:
+        yield
+    except Held as error:
+        with parts.store.database.writing() as connection:
+            log_event(connection, parts.store.clock(), "held back", by, "; ".join(error.reasons))
+        raise
 
 
 @contextmanager

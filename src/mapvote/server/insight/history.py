@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from functools import cache
 from typing import Any
 
 import numpy as np
 import sqlalchemy as sa
 
 from mapvote.core.grid import TileIndex
+from mapvote.core.tile import Tile
 from mapvote.core.types import U8
 from mapvote.core.voting import decide
 from mapvote.fusion.tile_vote import TileVote, one_each
 from mapvote.server.insight.changes import Decided, change_objects, changed_cells
 from mapvote.server.insight.consensus import Compared, Spoken, Standing, compare, judge
+from mapvote.server.insight.cutout import Cutout, Tiles, of_feature
 from mapvote.server.insight.explain import FOREVER, states_of
 from mapvote.server.insight.geojson import to_geojson
 from mapvote.server.store import schema
@@ -51,6 +54,25 @@ def changes_between(store: Store, old: int, new: int, min_cells: int = 1, *, lon
         georeference=store.georeference,
         lonlat=lonlat,
     )
+
+
+def cutouts_between(store: Store, old: int, new: int, found: Mapping[str, Any], most: int = 12) -> list[Cutout]:
+    """The largest things of :func:`changes_between` with what stands around them, before and after."""
+    with store.database.reading() as connection:
+        hashes = tiles_of(connection, old), tiles_of(connection, new)
+
+    def look(side: int) -> Tiles:
+        @cache
+        def load(index: TileIndex) -> Tile:
+            with store.database.reading() as connection:
+                return load_tile(connection, store.lattice.tile(index), hashes[side].get(index))
+
+        return load
+
+    tiles = look(0), look(1)
+    large = [f for f in found["features"] if f["properties"]["size"] == "large"] or list(found["features"])
+    largest = sorted(large, key=lambda f: -f["properties"]["area_m2"])[:most]
+    return [of_feature(feature, tiles, store.lattice) for feature in largest]
 
 
 def _decided(store: Store, connection: sa.Connection, index: TileIndex, old: int, new: int) -> Iterable[Decided]:

@@ -16,12 +16,12 @@ export const key = {
   forget: () => sessionStorage.removeItem(STORAGE),
 };
 
-async function ask(path, parameters = {}) {
+async function ask(path, parameters = {}, more = {}) {
   const query = new URLSearchParams(parameters).toString();
-  const headers = key.get() ? { Authorization: `Bearer ${key.get()}` } : {};
+  const headers = { ...(key.get() && { Authorization: `Bearer ${key.get()}` }), ...more.headers };
   let answer;
   try {
-    answer = await fetch(`${BASE}v1/${path}${query ? "?" + query : ""}`, { headers });
+    answer = await fetch(`${BASE}v1/${path}${query ? "?" + query : ""}`, { ...more, headers });
   } catch {
     throw new Refused(0, "The server does not answer. Is it running?");
   }
@@ -58,6 +58,15 @@ export async function download(path, parameters, name) {
   Object.assign(document.createElement("a"), { href: made, download: name }).click();
   setTimeout(() => URL.revokeObjectURL(made), 10_000);
 }
+
+const send = async (path, method, body) =>
+  (await ask(path, {}, { method, headers: { "Content-Type": "application/json" }, body: JSON.stringify(body) })).json();
+export const desk = async () => (await ask("desk")).json();
+export const review = (asked) => send("desk/reviews", "POST", asked);
+export const takeBack = (seq) => send(`desk/reviews/${seq}`, "DELETE", undefined);
+export const publish = (asked) => send("publish", "POST", asked);
+export const rollback = (asked) => send("rollback", "POST", asked);
+export const stream = async (signal) => (await ask("events", {}, { signal })).body;
 
 export const cell = async (x, y) => (await ask("cells", { x: x.toFixed(3), y: y.toFixed(3) })).json();
 

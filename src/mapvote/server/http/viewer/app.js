@@ -4,10 +4,12 @@ import * as api from "./api.js";
 import { showTiles } from "./coverage.js";
 import { closeDetails, follow, showCell, showChange } from "./details.js";
 import { $, element, link, notice, when } from "./dom.js";
+import { confirm, goBack, showDesk } from "./desk.js";
 import { showList } from "./list.js";
 import * as address from "./link.js";
 import { state } from "./page.js";
 import { Stage } from "./stage.js";
+import { listen } from "./live.js";
 import { showVehicles } from "./vehicles.js";
 import { TILE } from "./view.js";
 
@@ -45,7 +47,10 @@ async function start() {
   await showRange();
   follow();
   showVehicles();
+  showDesk();
+  listen();
 }
+state.restart = () => start();
 
 async function begin() {
   const coarse = api.overview().catch(() => null);
@@ -109,7 +114,7 @@ function showVersions() {
       element("p", {}, [v.reason || "no reason given"]),
       element("p", { className: "by" }, [`${KIND[v.kind]?.(v) ?? v.kind} by ${v.published_by}`]),
       v.number > 1 && link("Show its changes", () => setRange(v.number - 1, v.number)),
-      v.number !== newest && link("How to go back to it", (e) => e.target.replaceWith(howToRollBack(v.number))),
+      v.number !== newest && goingBack(v.number, newest),
     ]);
   $("versions").replaceChildren(...[...state.versions].reverse().map(item));
 }
@@ -121,11 +126,14 @@ const KIND = {
   replay: (v) => `replayed from version ${v.target}`,
 };
 
-const howToRollBack = (number) =>
-  element("span", { className: "hint" }, [
-    element("code", {}, [`mapvote rollback STORE ${number}`]),
-    " publishes it again as a new version; votes that led away from it are barred.",
-  ]);
+// The difference is shown before anything happens; who may not do it is told so by the server.
+function goingBack(number, newest) {
+  const button = link("Go back to it", async () => {
+    await setRange(newest, number);
+    confirm(button, `Publish version ${number} again? The list shows what would change.`, () => goBack(number));
+  });
+  return button;
+}
 
 function fillRange() {
   const numbers = state.versions.map((v) => v.number);

@@ -1,0 +1,129 @@
+// The desk: what a publish would change now, judged one by one; publishing and going back, the difference shown first.
+
+import * as api from "./api.js";
+import { drawable } from "./details.js";
+import { $, dot, element, notice } from "./dom.js";
+import { state } from "./page.js";
+
+const SAID = { accepted: "accepted", held: "held", rejected: "rejected" };
+const KEYS = { a: "accepted", h: "held", r: "rejected" };
+let desk = null, chosen = null;
+
+// For reviewers and operators; to anyone else the server does not tell.
+export async function showDesk() {
+  try {
+    desk = await api.desk();
+  } catch (error) {
+    if (error.status !== 403) notice(error.message);
+    return;
+  }
+  const { pending, reviewed, held, version } = desk;
+  const size = (f) => -f.properties.area_m2;
+  const waiting = [...pending.features].sort((a, b) => size(a) - size(b));
+  $("desk").hidden = false;
+  $("desk-tally").textContent = waiting.length
+    ? `A publish would make ${waiting.length} change${waiting.length > 1 ? "s" : ""} to version ${version}.`
+    : `Nothing waits: a publish would change nothing in version ${version}.`;
+  $("desk-held").replaceChildren(...held.map((reason) => element("li", {}, [`would be held: ${reason}`])));
+  $("pending").replaceChildren(...[...waiting, ...reviewed].map(row));
+  $("publish").disabled = !waiting.length;
+  $("publish").textContent = held.length ? "Publish in spite of that" : "Publish";
+  const again = [...waiting, ...reviewed].find((f) => f.id === chosen?.id);
+  choose(again ?? null);
+}
+
+const row = (f) => {
+  const p = f.properties, v = p.verdict;
+  const button = element("button", { onclick: () => choose(f, true) }, [
+    dot(p.kind),
+    p.kind === "built" ? "Built" : "Demolished",
+    element("span", { className: "number" }, [`${p.area_m2.toFixed(1)} m\u00b2`]),
+    element("span", { className: "number" }, [v ? `${SAID[v.verdict]} by ${v.by}` : `${p.votes_median} of ${p.votes_median + p.against_median}`]),
+  ]);
+  button.dataset.change = f.id;
+  return element("li", {}, [button]);
+};
+
+function choose(feature, visit = false) {
+  chosen = feature;
+  for (const button of $("pending").querySelectorAll("button")) button.setAttribute("aria-current", String(button.dataset.change === feature?.id));
+  $("verdict-form").hidden = !feature;
+  if (!feature) return;
+  const v = feature.properties.verdict, shown = drawable(feature);
+  $("verdict-told").textContent = v ? `${v.by} has ${SAID[v.verdict]} it${v.comment ? `: \u201c${v.comment}\u201d` : "."}` : "Nobody has decided about it yet.";
+  $("undo").disabled = !v;
+  state.view.setPending?.(shown);
+  if (visit) state.view.fit(shown.box, 0.38, { elevation: 0.5, height: shown.height });
+}
+
+async function decide(verdict) {
+  if (!chosen) return;
+  const next = nextAfter(chosen.id);
+  await told(async () => {
+    await api.review({ change: chosen.id, verdict, comment: $("comment").value, after: chosen.properties.verdict?.seq ?? null });
+    $("comment").value = "";
+    chosen = next ? { id: next } : null;
+  });
+}
+
+const nextAfter = (id) => {
+  const ids = [...$("pending").querySelectorAll("button")].map((b) => b.dataset.change);
+  return ids[ids.indexOf(id) + 1] ?? null;
+};
+
+// Does it, says what came of it, and looks at the desk again: somebody else may have decided meanwhile.
+async function told(action, done = "") {
+  try {
+    await action();
+    $("desk-said").textContent = done;
+  } catch (error) {
+    $("desk-said").textContent = error.message;
+  }
+  await showDesk();
+}
+
+$("verdict-form").onsubmit = (event) => event.preventDefault();
+for (const [key, verdict] of Object.entries(KEYS)) $(verdict).onclick = () => decide(verdict);
+$("undo").onclick = () => told(() => api.takeBack(chosen.properties.verdict.seq));
+document.addEventListener("keydown", (event) => {
+  if (event.ctrlKey || event.altKey || event.metaKey || event.target.matches("input, select, textarea")) return;
+  if ($("desk").hidden || !chosen) return;
+  if (event.key in KEYS) decide(KEYS[event.key]);
+  else if (event.key === "u" && !$("undo").disabled) $("undo").click();
+});
+
+$("dry-run").onclick = () => told(async () => {
+  const would = await api.publish({ dry_run: true });
+  $("difference").textContent = `It would change ${would.tiles.length} tiles: ${would.points_added} points added, ${would.points_deleted} deleted.`;
+});
+$("publish").onclick = () => confirm($("publish"), `${$("publish").textContent}: ${desk.pending.features.length} changes?`, async () => {
+  $("desk-said").textContent = "Publishing\u2026";
+  await told(async () => {
+    const done = await api.publish({ parent: desk.version, override: desk.held.length > 0, reason: $("reason").value });
+    $("difference").textContent = `Version ${done.version} is published: ${done.points_added} points added, ${done.points_deleted} deleted.`;
+  });
+  state.restart?.();
+});
+
+// A button that asks once more, in its own place, before it acts.
+export function confirm(button, question, action) {
+  const usual = button.textContent;
+  if (button.dataset.asked) return;
+  button.dataset.asked = "yes";
+  const yes = element("button", { type: "button", className: "yes" }, [question]);
+  const no = element("button", { type: "button" }, ["Cancel"]);
+  const end = () => (yes.remove(), no.remove(), (button.hidden = false), delete button.dataset.asked, (button.textContent = usual));
+  yes.onclick = () => (end(), action());
+  no.onclick = () => (end(), button.focus());
+  button.hidden = true;
+  button.after(yes, no);
+  yes.focus();
+}
+
+export async function goBack(number) {
+  await told(async () => {
+    const done = await api.rollback({ to: number, reason: $("reason").value });
+    $("difference").textContent = `Version ${done.version} is version ${number} again.`;
+  });
+  state.restart?.();
+}

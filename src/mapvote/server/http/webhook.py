@@ -1,0 +1,55 @@
+"""The same events by POST to an integrator's address, signed, in order, again until they are taken."""
+
+from __future__ import annotations
+
+import asyncio
+import hashlib
+import hmac
+from dataclasses import asdict
+
+import httpx2
+import msgspec
+import structlog
+from anyio import to_thread
+
+from mapvote.server.errors import Unavailable
+from mapvote.server.http.services import Services
+from mapvote.server.insight.feed import events_after, newest_event
+
+_EVERY_S = 1.0
+_TIMEOUT_S = 10.0
+_LONGEST_S = 60.0
+
+
+def signature(secret: str, timestamp: str, body: bytes) -> str:
+    """``sha256=`` and the HMAC-SHA256 of ``timestamp.body`` in hex: tells who sent it, and when."""
+    return "sha256=" + hmac.new(secret.encode(), timestamp.encode() + b"." + body, hashlib.sha256).hexdigest()
+
+
+async def deliver(parts: Services) -> None:
+    """Send what happens from now on to ``[server] webhook_url``, until it is cancelled.
+
+    What is not answered by 2xx is sent again, after one second, then two, four, at most sixty; nothing overtakes it.
+    """
+    asked = parts.settings.server
+    seq = await to_thread.run_sync(newest_event, parts.store, limiter=parts.threads.fetching)
+    wait = _EVERY_S
+    async with httpx2.AsyncClient(timeout=_TIMEOUT_S, follow_redirects=False) as client:
+        while True:
+            try:
+                events = await to_thread.run_sync(events_after, parts.store, seq, limiter=parts.threads.fetching)
+                if events:
+                    body = msgspec.json.encode({"map_id": parts.store.map_id, "events": [asdict(e) for e in events]})
+                    stamp = str(parts.store.clock() // 10**9)
+                    headers = {
+                        "Content-Type": "application/json",
+                        "X-Mapvote-Timestamp": stamp,
+                        "X-Mapvote-Signature": signature(asked.webhook_secret, stamp, body),
+                    }
+                    (await client.post(asked.webhook_url, content=body, headers=headers)).raise_for_status()
+                    seq = events[-1].seq
+                wait = _EVERY_S
+            except (httpx2.HTTPError, Unavailable) as error:
+                structlog.get_logger("mapvote").warning("webhook", error=type(error).__name__, again_in_s=wait)
+                wait = min(2 * wait, _LONGEST_S)
+            await asyncio.sleep(wait)

@@ -1,0 +1,102 @@
+"""Events as they happen, on a real server: by stream and by webhook."""
+
+from __future__ import annotations
+
+import json
+import queue
+import threading
+from collections.abc import Iterator
+from http.server import BaseHTTPRequestHandler, HTTPServer
+from pathlib import Path
+
+import httpx2
+import pytest
+
+from hand_made import Say, make_ballot, states_plane, two_walls
+from live_server import serving
+from mapvote.client import MapClient
+from mapvote.core.types import CellState
+from mapvote.server.http.event_routes import as_sse
+from mapvote.server.http.webhook import signature
+from mapvote.server.insight.feed import Event, without_names
+from mapvote.server.store.store import Store
+
+SECRET = "a secret of both"
+Posts = queue.Queue[tuple[str, str, bytes]]
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Path:
+    Store.create(f"sqlite:///{tmp_path / 'store.db'}", two_walls()).close()
+    return tmp_path / "store.db"
+
+
+def vote(url: str, home: Path) -> None:
+    says = {(0, 0): Say(states_plane(fill=CellState.UNCHANGED_EMPTY))}
+    with MapClient(url, home=home) as client:
+        client.fetch()
+        client.send(make_ballot(two_walls(), says, "v1"))
+
+
+def test_a_ballot_is_told_to_who_listens_and_again_to_who_comes_back(store: Path, tmp_path: Path) -> None:
+    with serving(store, "--open", log=tmp_path / "log") as (url, _), httpx2.Client(timeout=20.0) as http:
+        with http.stream("GET", f"{url}/v1/events") as answer:
+            lines = answer.iter_lines()
+            assert next(lines) == ": listening"
+            vote(url, tmp_path / "home")
+            told = next(json.loads(line[5:]) for line in lines if line.startswith("data:"))
+        assert (told["version"], "v1" in told["actor"] + told["detail"]) == (1, True)
+        with http.stream("GET", f"{url}/v1/events", headers={"Last-Event-ID": str(told["seq"] - 1)}) as answer:
+            again = next(json.loads(line[5:]) for line in answer.iter_lines() if line.startswith("data:"))
+        assert again == told
+
+
+@pytest.fixture
+def receiver() -> Iterator[tuple[str, Posts]]:
+    """An address that refuses the first post and takes the others."""
+    posts: Posts = queue.Queue()
+    refused = threading.Event()
+
+    class Handler(BaseHTTPRequestHandler):
+        def do_POST(self) -> None:
+            body = self.rfile.read(int(self.headers["Content-Length"]))
+            self.send_response(200 if refused.is_set() else 503)
+            self.end_headers()
+            if refused.is_set():
+                posts.put((self.headers["X-Mapvote-Timestamp"], self.headers["X-Mapvote-Signature"], body))
+            refused.set()
+
+        def log_message(self, *arguments: object) -> None:
+            pass
+
+    listener = HTTPServer(("127.0.0.1", 0), Handler)
+    thread = threading.Thread(target=listener.serve_forever, kwargs={"poll_interval": 0.05})
+    thread.start()
+    yield f"http://127.0.0.1:{listener.server_port}/hook", posts
+    listener.shutdown()
+    thread.join()
+    listener.server_close()
+
+
+def test_a_webhook_is_signed_and_sent_again_until_it_is_taken(
+    store: Path, tmp_path: Path, receiver: tuple[str, Posts]
+) -> None:
+    config = tmp_path / "mapvote.toml"
+    config.write_text(f'[server]\nwebhook_url = "{receiver[0]}"\nwebhook_secret = "{SECRET}"\n')
+    with serving(store, "--open", "--config", config, log=tmp_path / "log") as (url, _):
+        vote(url, tmp_path / "home")
+        stamp, signed, body = receiver[1].get(timeout=30)
+    assert signed == signature(SECRET, stamp, body)
+    assert signed != signature("another", stamp, body)
+    assert [event["version"] for event in json.loads(body)["events"]] == [1]
+
+
+def test_no_name_can_begin_another_event() -> None:
+    sent = as_sse(Event(7, 0, "ballot", "v1\n\ndata: {}", "x\r\n", 1))
+    assert sent.count(b"\n\n") == 1
+    assert sent.count(b"\ndata:") == 1
+
+
+def test_readers_hear_that_something_happened_but_not_who_drove_by() -> None:
+    events = [Event(1, 5, "ballot", "v1", "d1", 1), Event(2, 6, "publish", "boss", "v2", 2)]
+    assert without_names(events) == [Event(1, 5, "ballot", "", "", 1), events[1]]
