@@ -119,7 +119,8 @@ def fragment(cutouts: Sequence[Cutout]) -> str:
 def whole_page(title: str, cutouts: Sequence[Cutout]) -> str:
     """A file of its own."""
     return (
-        f'<!doctype html><html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width">'
+        f'<!doctype html><html lang="en"><head><meta charset="utf-8">'
+        '<meta name="viewport" content="width=device-width">'
         f"<title>{html.escape(title)}</title></head><body><main><h1>{html.escape(title)}</h1>{fragment(cutouts)}"
         "</main></body></html>\n"
     )
