@@ -17,7 +17,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 
 from mapvote.core.types import MapvoteError
 
-METHOD_VERSION = 2
+METHOD_VERSION = 3
 """Goes up whenever a constant or a rule changes by which vehicles vote; the numbers below are only what a user sets."""
 
 
@@ -120,31 +120,10 @@ class VotingSettings(Section):
     k: float = 0.5
     n_min: int = 5
     window_m: float = Field(default=80.0, description="side of the local grid (paper III-A)")
-    empty_votes: float = Field(
-        default=0.1, description="columns, F: votes of a ray through a voxel, against one for a hit in it"
-    )
-    gone_votes: float = Field(
-        default=0.125, description="columns, E: votes of a ray through a mapped voxel, against one for a hit near it"
-    )
-    clear_share: float = Field(
-        default=0.3, description="columns, E: share of the scans with rays through a cell that saw through what it held"
-    )
-    join_cells: int = Field(default=6, ge=1, description="columns, C: how far a new thing reaches along mapped cells")
-    fall_cells: int = Field(default=15, description="columns, H: how far what is gone takes unseen cells with it")
-    brief_share: float = Field(
-        default=0.35, description="columns, G: a new voxel struck in fewer of the scans able to was only passed by"
-    )
-    min_scans: int = Field(default=1, description="columns, G: scans that must have hit a new voxel")
-    min_support: int = Field(
-        default=1, description="columns, G: hits (scans by voxels) that make a cell changed-occupied"
-    )
     min_height_m: float = Field(
-        default=0.6, description="columns, G: a cell whose map rises no higher than this is never changed-empty"
+        default=0.6, description="columns: a cell whose map rises no higher than this is never changed-empty"
     )
-    min_cells: int = Field(default=4, description="columns, G: smaller groups of changed cells are dropped")
-    wide_sigma_m: float = Field(
-        default=0.1, description="columns: a pose less certain than this makes a hit speak for two cells around it"
-    )
+    min_cells: int = Field(default=4, description="columns: smaller groups of changed cells are dropped")
 
 
 class FuseSettings(Section):

@@ -9,7 +9,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from mapvote.config import VotingSettings
 from mapvote.core.columns import remnants
 from mapvote.core.types import NO_VOTE, U64, CellState
 from mapvote.detection.columns import weigh
@@ -35,11 +34,10 @@ def cell(through: dict[int, int], struck: dict[int, int]) -> U64:
 def judge(through: dict[int, int], struck: dict[int, int], occupied: int = 0, **more: Any) -> Weighed:
     near, free, low_there = more.pop("near", 0), more.pop("free", int(FREE)), more.pop("low", False)
     rules = more.pop("rules", ALL_RULES)
-    settings = VotingSettings(method="columns", **more)
     occupied_word, near_word, free_word = (np.full((1, 1), w, np.uint64) for w in (occupied, near, free))
     low, base = np.full((1, 1), low_there), np.zeros((3, 3), np.int32)
     planes = np.pad(cell(through, struck), ((1, 1), (1, 1), (0, 0)))
-    return weigh(planes, base, occupied_word, near_word, free_word, low, settings, rules)
+    return weigh(planes, base, occupied_word, near_word, free_word, low, rules)
 
 
 def around(through: dict[int, int]) -> dict[int, int]:
@@ -124,11 +122,6 @@ def test_rule_g_what_was_struck_in_few_of_the_scans_that_saw_through_it_has_only
     assert state({4: 12, 5: 30}, {4: 4}) == CO, "rays only grazed it: a slab"
 
 
-def test_rule_g_may_ask_for_more_than_a_single_hit() -> None:
-    assert state({}, {4: 1}, min_support=2) != CO
-    assert state({}, {4: 1}, min_support=2, rules=Rules(brief_is_passing=False)) == CO
-
-
 def test_rule_g_what_hardly_rises_above_the_ground_is_never_called_gone() -> None:
     assert state({1: 40, 2: 40}, {}, occupied=0b10) == CE
     assert state({1: 40, 2: 40}, {}, occupied=0b10, low=True) == UN
@@ -197,7 +190,7 @@ def test_only_voxels_never_struck_and_once_seen_through_are_loose() -> None:
     planes, one = np.zeros((3, 3, WORDS), np.uint64), np.ones((1, 1), np.uint64)
     planes[1, 1, THROUGH_ITSELF], planes[1, 1, STRUCK_ITSELF] = 0b110, 0b100
     for low, loose in ((False, 0b010), (True, 0)):
-        seen = weigh(planes, np.zeros((3, 3), np.int32), one, one, one, np.full((1, 1), low), VotingSettings())
+        seen = weigh(planes, np.zeros((3, 3), np.int32), one, one, one, np.full((1, 1), low))
         assert seen.loose[0, 0] == loose
 
 

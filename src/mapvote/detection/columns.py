@@ -25,6 +25,18 @@ from mapvote.detection.rules import ALL_RULES, Rules
 from mapvote.detection.votes import Judged, TileVotes, Weighed
 from mapvote.perception.frontend import Observation
 
+# Set on the development streets (seeds 1, 11 and 12 of `paper`); docs/results.md has what each rule is worth on others.
+EMPTY_VOTES = 0.1
+"""Rule F: votes of a ray through a free voxel, against one for a hit in it."""
+GONE_VOTES = 0.125
+"""Rule E: votes of a ray through a mapped voxel, against one for a hit near it: foliage lets seven of eight through."""
+CLEAR_SHARE = 0.3
+"""Rule E: of the scans with rays through a cell, the share that must have seen through what it held."""
+BRIEF_SHARE = 0.35
+"""Rule G: a new voxel struck in fewer of the scans able to was only passed by."""
+WIDE_SIGMA_M = 0.1
+"""A pose less certain than this makes a hit speak for two cells around it, not one."""
+
 UO, UE, CO, CE, UN = (int(state) for state in CellState)
 """Columns of a tally."""
 
@@ -81,7 +93,7 @@ class Maps(NamedTuple):
 
 
 class Weights(NamedTuple):
-    """The settings of the same names, with those of the rules that do not hold put out of force."""
+    """The constants of the same names, with those of the rules that do not hold put out of force."""
 
     crossed: bool
     """Whether a mapped voxel is seen through only if it is open (rule A)."""
@@ -90,8 +102,6 @@ class Weights(NamedTuple):
     gone_votes: float
     clear_share: float
     brief_share: float
-    min_scans: int
-    min_support: int
 
 
 @numba.njit(cache=True, nogil=True)
@@ -124,7 +134,7 @@ def _weigh_empty(maps: Maps, r: int, c: int, struck: np.uint64, w: Weights) -> t
         if not struck & one:
             continue
         through, hits = count_of(cell, 0, bit), count_of(cell, PLANES, bit)
-        if hits < w.min_scans or hits <= w.empty_votes * through:
+        if hits <= w.empty_votes * through:
             continue
         if _is_brief(maps.planes, maps.base, r + 1, c + 1, bit, w.brief_share):
             continue
@@ -162,7 +172,7 @@ def _weigh(maps: Maps, w: Weights, tally: I32, gone: U64, new: U64, beside: Bool
                 votes[UO], votes[CE] = kept * VOTE_UNIT, round(lost * w.gone_votes * VOTE_UNIT)
             else:
                 found, refuted, word, beyond = _weigh_empty(maps, r, c, struck, w)
-                if found >= w.min_support:  # a new thing's upper parts, where the map knew nothing, come with it
+                if found:  # a new thing's upper parts, where the map knew nothing, come with it
                     beside[r, c] = not word & ~maps.near[r, c]
                     new[r, c] = word | beyond | ~(below_top(word) | maps.free[r, c])
                 else:
@@ -173,8 +183,7 @@ def _weigh(maps: Maps, w: Weights, tally: I32, gone: U64, new: U64, beside: Bool
 
 
 def weigh(
-    planes: U64, base: I32, occupied: U64, near: U64, free: U64, low: Bool, settings: VotingSettings,
-    rules: Rules = ALL_RULES,
+    planes: U64, base: I32, occupied: U64, near: U64, free: U64, low: Bool, rules: Rules = ALL_RULES
 ) -> Weighed:  # fmt: skip
     """Votes of a window (rows, cols) from its counters and the map's words.
 
@@ -195,22 +204,20 @@ def weigh(
         free if rules.new_where_free else np.full(shape, ~np.uint64(0)),
         low if rules.brief_is_passing else np.zeros(shape, np.bool_),
     )
-    _weigh(maps, _weights(settings, rules), tally, gone, new, beside, adrift)
+    _weigh(maps, _weights(rules), tally, gone, new, beside, adrift)
     loose = np.where(low, np.uint64(0), loose_voxels(planes[1:-1, 1:-1]))
     return Weighed(tally, gone, new, beside, adrift, loose)
 
 
-def _weights(settings: VotingSettings, rules: Rules) -> Weights:
+def _weights(rules: Rules) -> Weights:
     e, f, g = rules.rays_count_less, rules.rays_at_height, rules.brief_is_passing
     return Weights(
         crossed=rules.empty_by_ray,
         by_height=f,
-        empty_votes=settings.empty_votes if f else 1.0,
-        gone_votes=settings.gone_votes if e else 1.0,
-        clear_share=settings.clear_share if e else 0.0,
-        brief_share=settings.brief_share if g else 0.0,
-        min_scans=settings.min_scans if g else 1,
-        min_support=settings.min_support if g else 1,
+        empty_votes=EMPTY_VOTES if f else 1.0,
+        gone_votes=GONE_VOTES if e else 1.0,
+        clear_share=CLEAR_SHARE if e else 0.0,
+        brief_share=BRIEF_SHARE if g else 0.0,
     )
 
 
@@ -230,7 +237,7 @@ class ColumnVoter:
 
     def observe(self, seen: Observation) -> U64:
         """Count one scan; returns (rows, cols) words of voxels whose points may be new."""
-        reach = 2 if seen.scan.sigma_m > self.voting.wide_sigma_m else 1
+        reach = 2 if seen.scan.sigma_m > WIDE_SIGMA_M else 1
         self.evidence.count(seen.view, seen.reference, reach)
         return seen.view.hit & ~seen.reference.occupied
 
@@ -260,6 +267,6 @@ class ColumnVoter:
         here = cut_reference(outer, window)
         known = here.free if here.free is not None else above_ground_points(self.point_map, window)
         low = here.top_z - here.ground_z < self.voting.min_height_m
-        weighed = weigh(counts, outer.base, here.occupied, near, known, low, self.voting, self.rules)
+        weighed = weigh(counts, outer.base, here.occupied, near, known, low, self.rules)
         crowded = beside_new(counts, outer.occupied, outer.base)[1:-1, 1:-1]
         return Judged(here, weighed, weighed.states(), crowded, np.zeros_like(weighed.gone))

@@ -23,6 +23,10 @@ from mapvote.detection.rules import Rules
 from mapvote.detection.votes import Judged
 
 _LOWEST, _HIGHEST = np.uint64(0b11), np.uint64(3) << np.uint64(TOP_BIT - 1)
+JOIN_CELLS = 6
+"""Rule C: how far a new thing reaches along mapped cells."""
+FALL_CELLS = 15
+"""Rule H: how far what is gone takes unseen cells with it."""
 _HALO = 64
 """Cells around a tile that rules H and I look at: 19 m, a house."""
 Plane = Any
@@ -35,9 +39,9 @@ Tiles = Mapping[TileIndex, Judged]
 def apply_region_rules(tiles: Tiles, lattice: Lattice, voting: VotingSettings, rules: Rules) -> None:
     """Apply the rules C, H, G and I, in this order, as far as ``rules`` has them hold."""
     if rules.pose_explains:
-        _give_up_explained(tiles, lattice, voting.join_cells)
+        _give_up_explained(tiles, lattice, JOIN_CELLS)
     if rules.roofs_fall:
-        _let_fall(tiles, lattice, voting.fall_cells)
+        _let_fall(tiles, lattice, FALL_CELLS)
     if rules.brief_is_passing:
         _drop_specks(tiles, lattice, voting.min_cells)
     if rules.remnants_go:

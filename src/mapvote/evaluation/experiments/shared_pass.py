@@ -51,7 +51,7 @@ class SharedPass:
         self._voters: dict[tuple[VotingSettings, Rules], Voter] = {}
         self._observing: list[Voter] = []
         """Those of them that fill the counters."""
-        self._evidence: dict[tuple[bool, bool, float], Evidence] = {}
+        self._evidence: dict[tuple[bool, bool], Evidence] = {}
         for case in cases:
             self._enrol(case)
         self._new_points = NewPoints(point_map.lattice)
@@ -65,7 +65,7 @@ class SharedPass:
             self._voters[key] = PaperVoter(voting, self.drive.sensor, self.point_map)
             self._observing.append(self._voters[key])
             return
-        counted_by = rules.empty_by_ray, rules.hits_veto, voting.wide_sigma_m
+        counted_by = rules.empty_by_ray, rules.hits_veto
         voter = ColumnVoter(voting, self.point_map, rules, self._evidence.get(counted_by))
         if counted_by not in self._evidence:
             self._evidence[counted_by] = voter.evidence
