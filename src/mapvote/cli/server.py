@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, cast
 
@@ -26,7 +26,7 @@ GateDrive = Annotated[
 
 def register(app: typer.Typer) -> None:
     """Add these verbs to ``app``."""
-    for verb in (serve, publish, policy, rollback, unvote, upgrade, keys):
+    for verb in (serve, publish, policy, rollback, unvote, check, upgrade, keys):
         app.command(rich_help_panel=SERVER)(verb)
 
 
@@ -164,6 +164,38 @@ def unvote(
         with waiting("deciding anew"):
             done = replay_without(opened, vehicle, dry_run=not yes)
     _print_outcome(done, "published" if done.published else "only shown: --yes publishes it")
+
+
+def check(
+    store: StoreName,
+    mend: Annotated[bool, typer.Option("--mend", help="set aside what is damaged, mend what --from has")] = False,
+    other: Annotated[str | None, typer.Option("--from", metavar="STORE", help="e.g. a backup of this store")] = None,
+) -> None:
+    """Is every plane, ballot and version what it was when it was written? Exit code 1 if something is damaged.
+
+    mapvote check fleet.db --mend --from backup.db
+    """
+    from mapvote.codec.arrays import unpack_bytes
+    from mapvote.core.types import MapvoteError
+    from mapvote.server.store.blobs import MAX_PLANE_BYTES
+    from mapvote.server.store.check import check as look
+
+    def elsewhere(digest: str) -> bytes | None:
+        if backup is None:
+            return None
+        try:
+            return unpack_bytes(backup.blob(digest), MAX_PLANE_BYTES, f"tile plane {digest[:12]}")
+        except MapvoteError:
+            return None
+
+    second = opened_store(other) if other else nullcontext()
+    with opened_store(store) as opened, second as backup, waiting("reading every byte"):
+        found = look(opened, mend=mend, source=elsewhere)
+    for damage in found:
+        print(damage)
+    if found:
+        raise MapvoteError(f"{store}: {len(found)} things are damaged" + ("" if mend else "; --mend sets them aside"))
+    print("every plane, ballot and version is what it was when it was written")
 
 
 def upgrade(store: StoreName) -> None:

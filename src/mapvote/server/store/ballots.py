@@ -13,6 +13,7 @@ from mapvote.server.errors import Conflict, NotFound
 from mapvote.server.store import schema
 from mapvote.server.store.database import insert_rows
 from mapvote.server.store.policy import RoundPolicy, policy_in
+from mapvote.server.store.quarantine import sum_of
 from mapvote.server.store.queries import log_event, next_seq
 from mapvote.server.store.store import Store
 from mapvote.server.store.version_driven import NO_SUCH_BASE, version_driven
@@ -108,7 +109,8 @@ def unlike(asked: RoundPolicy, incoming: Incoming) -> Conflict | None:
 def _tile_row(seq: int, ballot: Ballot, tile: BallotTile) -> tuple[Any, ...]:
     """In the order of the table's columns."""
     base = ballot.base[tile_key(tile.tile)]
-    return *tile.tile, seq, base, tile.states, tile.tally, tile.gone, tile.new_points, tile.free
+    planes = tile.states, tile.tally, tile.gone, tile.new_points, tile.free
+    return *tile.tile, seq, base, *planes, sum_of(base, *planes)
 
 
 def withdraw(store: Store, vehicle: str | None, drive: str | None = None, *, by: str) -> int:

@@ -12,6 +12,7 @@ from mapvote.core.grid import TileIndex
 from mapvote.server.errors import Conflict
 from mapvote.server.store import schema
 from mapvote.server.store.blobs import TileHashes
+from mapvote.server.store.quarantine import sum_of
 from mapvote.server.store.queries import Version, add_blobs, current_version, log_event, tile_row, version_row
 from mapvote.server.store.store import Store
 from mapvote.server.store.tile_jobs import Fused
@@ -44,7 +45,9 @@ def write_version(store: Store, version: Version, new: NewTiles, unvoted: str | 
                 rows = [tile_row(version.number, index, hashes) for index, hashes in new.tiles.items()]
                 connection.execute(schema.version_tiles.insert(), rows)
             if new.fused:
-                connection.execute(schema.decisions.insert(), [_decision_row(version.number, f) for f in new.fused])
+                connection.execute(
+                    schema.decisions.insert(), [_decision_row(version.number, f) for f in new.fused if not f.lost]
+                )
             if unvoted is not None:
                 _take_out(connection, unvoted, seq)
     except IntegrityError as error:
@@ -61,4 +64,5 @@ def _take_out(connection: sa.Connection, vehicle: str, seq: int) -> None:
 
 def _decision_row(number: int, fused: Fused) -> dict[str, object]:
     counts = {name: getattr(fused, name) for name in ("states", "tally", "vehicles", "added", "deleted")}
-    return {"version": number, "row": fused.index[0], "col": fused.index[1]} | counts
+    total = sum_of(fused.states, fused.tally)
+    return {"version": number, "row": fused.index[0], "col": fused.index[1], "sum": total} | counts

@@ -22,6 +22,7 @@ from mapvote.fusion.tile_vote import DAY_NS, TileVote, restrict, select
 from mapvote.server.store import schema
 from mapvote.server.store.blobs import unpack_cells
 from mapvote.server.store.policy import Policy
+from mapvote.server.store.quarantine import Damage, DamagedBallots, ballot_name, ballot_sum
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,6 +33,8 @@ class Electorate:
     policy: Policy
     received_by_ns: int
     without: Collection[str] = ()
+    set_aside: Collection[str] = ()
+    """Ballots that are damaged, see :func:`mapvote.server.store.quarantine.ballot_name`."""
 
     @property
     def settings(self) -> FuseSettings:
@@ -58,6 +61,7 @@ class StoredVote:
 
 
 YOUNG = "waits for the minimum age"
+DAMAGED = "damaged, and set aside"
 OTHERWISE = "cast by another method or other settings than the policy asks for"
 
 
@@ -93,9 +97,9 @@ _REVIEWS_ON = (
     .where(_C.c.row == _ROW, _C.c.col == _COL, _W.c.verdict.in_(("held", "rejected")))
     .where(_W.c.seq <= _MARK, _W.c.gone_seq.is_(None) | (_W.c.gone_seq > _MARK))
 )
-_PLANES_OF = sa.select(_T.c.ballot, _T.c.states, _T.c.tally, _T.c.gone, _T.c.new_points, _T.c.free).where(
-    _T.c.row == _ROW, _T.c.col == _COL, _T.c.ballot.in_(sa.bindparam("ballots", expanding=True))
-)
+_PLANES_OF = sa.select(
+    _T.c.ballot, _T.c.states, _T.c.tally, _T.c.gone, _T.c.new_points, _T.c.free, _T.c.base, _T.c.sum
+).where(_T.c.row == _ROW, _T.c.col == _COL, _T.c.ballot.in_(sa.bindparam("ballots", expanding=True)))
 
 
 def standing_tiles(connection: sa.Connection, mark: int, since: int | None = None) -> list[TileIndex]:
@@ -119,15 +123,17 @@ def judged_votes(connection: sa.Connection, index: TileIndex, asked: Electorate)
     asked_of = {"row": index[0], "col": index[1], "mark": asked.mark}
     found = [StoredVote(*row) for row in connection.execute(_VOTES_ON, asked_of).all()]
     found = [vote for vote in found if vote.vehicle not in asked.without]
-    why = {vote.seq: _unready(vote, asked) for vote in found}
+    why = {vote.seq: _unready(vote, index, asked) for vote in found}
     settings = asked.settings
     inside = {vote.seq for vote in select([vote for vote in found if not why[vote.seq]], settings)}
     outside = f"older than {settings.max_age_days:g} days or not among the last {settings.latest_vehicles} vehicles"
     return [(vote, why[vote.seq] or ("" if vote.seq in inside else outside)) for vote in found]
 
 
-def _unready(vote: StoredVote, asked: Electorate) -> str:
+def _unready(vote: StoredVote, index: TileIndex, asked: Electorate) -> str:
     cast = asked.policy.round
+    if ballot_name(vote.seq, *index) in asked.set_aside:
+        return DAMAGED
     if vote.cast_by != cast.cast_by or not vote.settings_hash.startswith(cast.settings_hash):
         return OTHERWISE
     return YOUNG if vote.received_ns > asked.received_by_ns else ""
@@ -160,14 +166,14 @@ def recent_votes(
 ) -> list[TileVote]:
     """As :func:`counting_votes`, of every vehicle and of the last ``stay_days``: what has come and gone here?"""
     judged = judged_votes(connection, tile.index, asked)
-    ready = [vote for vote, why in judged if why not in (YOUNG, OTHERWISE)]
+    ready = [vote for vote, why in judged if why not in (YOUNG, OTHERWISE, DAMAGED)]
     oldest = max((vote.end_ns for vote in ready), default=0) - asked.settings.stay_days * DAY_NS
     chosen = [vote for vote in ready if vote.end_ns >= oldest]
     return [unspent(vote, tile, misread) for vote in read_votes(connection, tile.index, chosen)]
 
 
 def read_votes(connection: sa.Connection, index: TileIndex, stored: Sequence[StoredVote]) -> list[TileVote]:
-    """The planes of stored votes, in their order, nothing silenced."""
+    """The planes of stored votes, in their order, nothing silenced. DamagedBallots, naming them, if some are."""
     found = _planes(connection, index, [vote.seq for vote in stored])
     planes = [found[vote.seq] for vote in stored]
     decided = iter(unpack_many_states([mine.states for mine in planes if mine.states is not None]))
@@ -179,9 +185,15 @@ def read_votes(connection: sa.Connection, index: TileIndex, stored: Sequence[Sto
 
 def _planes(connection: sa.Connection, index: TileIndex, ballots: Sequence[int]) -> dict[int, _Planes]:
     out: dict[int, _Planes] = {}
+    damaged: list[Damage] = []
     for start in range(0, len(ballots), 500):  # SQLite's limit on variables in one statement
         asked_of = {"row": index[0], "col": index[1], "ballots": ballots[start : start + 500]}
-        out |= {ballot: _Planes(*planes) for ballot, *planes in connection.execute(_PLANES_OF, asked_of).all()}
+        for row in connection.execute(_PLANES_OF, asked_of).all():
+            if row.sum != ballot_sum(row):
+                damaged.append(Damage("ballot", ballot_name(row.ballot, *index), "is not what its sum says"))
+            out[row.ballot] = _Planes(row.states, row.tally, row.gone, row.new_points, row.free)
+    if damaged:
+        raise DamagedBallots(damaged)
     return out
 
 

@@ -27,6 +27,7 @@ from mapvote.server.store.database import address_of
 from mapvote.server.store.eligible_votes import Electorate, standing_tiles
 from mapvote.server.store.hold import hold_reasons
 from mapvote.server.store.policy import policy_in
+from mapvote.server.store.quarantine import quarantine, set_aside
 from mapvote.server.store.queries import (
     Version,
     current_version,
@@ -91,6 +92,10 @@ def publish(
     if parent is not None and parent != plan.newest.number:
         raise Conflict(f"the newest version is {plan.newest.number}, not {parent}: look at it, then publish")
     fused = fuse_round(plan.tasks, store.database, executor)
+    damaged = [damage for one in fused for damage in one.damaged]
+    if damaged and not dry_run:
+        with store.database.writing() as connection:
+            quarantine(connection, damaged, plan.now, by)
     changed = [f for f in fused if f.hashes is not None]
     held = judge(store, plan, changed, gate)
     added, deleted = sum(f.added for f in changed), sum(f.deleted for f in changed)
@@ -114,7 +119,8 @@ def make_plan(store: Store, settings: FuseSettings | None = None) -> Plan:
         policy = policy_in(connection)
         if settings is not None:
             policy = policy.model_copy(update={"fuse": settings})
-        asked = Electorate(mark, policy, now - round(policy.fuse.min_age_s * 1e9))
+        aside = frozenset(name for kind, name in set_aside(connection) if kind == "ballot")
+        asked = Electorate(mark, policy, now - round(policy.fuse.min_age_s * 1e9), set_aside=aside)
         dirty = _dirty(connection, newest, asked)
         hashes = tiles_of(connection, newest.number, dirty)
     made, url = newest.number + 1, address_of(store.database.url)

@@ -133,8 +133,10 @@ ballot_tiles = sa.Table(
     sa.Column("gone", sa.LargeBinary),
     sa.Column("new_points", sa.LargeBinary),
     sa.Column("free", sa.LargeBinary),
+    sa.Column("sum", sa.String(64), nullable=False),
     sa.Index("ix_ballot_tiles_ballot", "ballot"),
 )
+"""``sum``: SHA-256 over base and planes."""
 
 decisions = sa.Table(
     "decisions",
@@ -147,6 +149,7 @@ decisions = sa.Table(
     sa.Column("vehicles", sa.Integer, nullable=False),
     sa.Column("added", sa.Integer, nullable=False),
     sa.Column("deleted", sa.Integer, nullable=False),
+    sa.Column("sum", sa.String(64), nullable=False),
 )
 """``tally``: (5, 65536) uint16 or int32 in VOTE_UNITs, compressed."""
 
@@ -171,3 +174,13 @@ review_cells = sa.Table(
 )
 """The cells (65536 packed bits) that a review is about. Change votes on them count no more: of a rejected change those
 of drives first heard of before it was rejected, of a held one all, until it is let go."""
+
+quarantine = sa.Table(
+    "quarantine",
+    metadata,
+    sa.Column("kind", sa.String(16), primary_key=True),
+    sa.Column("name", sa.String(160), primary_key=True),
+    sa.Column("seq", sa.BigInteger, sa.ForeignKey("events.seq"), nullable=False),
+    sa.Column("why", sa.String(200), nullable=False),
+)
+"""What is damaged and takes no part: planes by hash, ballots and decisions by number and tile."""

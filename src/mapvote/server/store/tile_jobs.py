@@ -6,9 +6,9 @@ A worker reads ballots from the database itself; a decision and the planes that 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from typing import Any
 
@@ -17,14 +17,17 @@ import sqlalchemy as sa
 from numpy.typing import NDArray
 
 from mapvote.codec.arrays import pack_plane, unpack_bytes
+from mapvote.codec.ballot import tile_key
 from mapvote.core.grid import CELLS, TILE_CELLS, Grid, TileIndex
 from mapvote.core.tile import Tile
-from mapvote.core.types import I32, I64, N_STATES, U8, Bool
+from mapvote.core.types import I32, I64, N_STATES, U8, Bool, MapvoteError
 from mapvote.fusion.fuse import fuse_tile
 from mapvote.fusion.tile_vote import TileVote
+from mapvote.server.errors import Unavailable
 from mapvote.server.store.blobs import TileHashes, pack_tile
 from mapvote.server.store.database import Database, address_of
 from mapvote.server.store.eligible_votes import Electorate, counting_votes, recent_votes
+from mapvote.server.store.quarantine import Damage, DamagedBallots
 from mapvote.server.store.queries import load_tile, tile_as_of
 
 _NOWHERE = np.zeros(CELLS, dtype=np.bool_)
@@ -71,23 +74,57 @@ class Fused:
     """Cells in which free space was learned, of a tile that knew of any."""
     tile: Tile | None
     """The edited tile where the task held one at hand (replay), else None."""
+    damaged: Sequence[Damage] = ()
+    """What could not be read, and was left out."""
+
+    @property
+    def lost(self) -> bool:
+        """Whether the tile itself could not be read."""
+        return not self.states
+
+    @classmethod
+    def nothing(cls, index: TileIndex, damaged: Sequence[Damage]) -> Fused:
+        """Of a tile that cannot be read."""
+        nowhere = np.empty(0, dtype=np.int64)
+        return cls(index, b"", b"", 0, 0, 0, 0, None, {}, nowhere, nowhere, 0, None, damaged)
 
 
 def fuse_stored(task: Task, database: Database | None = None) -> Fused:
     """Read the votes that count on one tile, decide, edit. Pure but for reading the database.
 
-    In another process, where there is no ``database`` at hand, one is opened by ``task.url`` and kept.
+    Damaged ballots are left out and named; a damaged tile stays as it is and is named. In another process, where there
+    is no ``database`` at hand, one is opened by ``task.url`` and kept.
     """
-    with (database or _database(task.url)).reading() as connection:
-        tile = _tile(connection, task)
-        votes = counting_votes(connection, tile, task.asked, task.misread)
-        cast = task.asked.policy.round
+    damaged: list[Damage] = []
+    while True:
+        try:
+            with (database or _database(task.url)).reading() as connection:
+                return replace(_fuse(connection, task), damaged=damaged)
+        except DamagedBallots as error:
+            damaged += error.found
+            aside = {*task.asked.set_aside, *(damage.name for damage in error.found)}
+            task = replace(task, asked=replace(task.asked, set_aside=frozenset(aside)))
+        except Unavailable:
+            raise
+        except MapvoteError as error:
+            lost = Damage("plane", _plane_of(task), str(error)[:180])
+            return Fused.nothing(task.window.tile_index, [*damaged, lost])
 
-        def history() -> list[TileVote]:
-            return recent_votes(connection, tile, task.asked, task.misread)
 
-        recent = history if cast.stage == "two-stage" else None
-        decision, edited = fuse_tile(tile, votes, cast.method, task.asked.settings, task.version, recent)
+def _plane_of(task: Task) -> str:
+    return task.tile.points if isinstance(task.tile, TileHashes) else f"of tile {tile_key(task.window.tile_index)}"
+
+
+def _fuse(connection: sa.Connection, task: Task) -> Fused:
+    tile = _tile(connection, task)
+    votes = counting_votes(connection, tile, task.asked, task.misread)
+    cast = task.asked.policy.round
+
+    def history() -> list[TileVote]:
+        return recent_votes(connection, tile, task.asked, task.misread)
+
+    recent = history if cast.stage == "two-stage" else None
+    decision, edited = fuse_tile(tile, votes, cast.method, task.asked.settings, task.version, recent)
     hashes, planes = (None, {}) if edited is tile else pack_tile(edited)
     held, holds = ((tile.obstacle_words != 0), (edited.obstacle_words != 0)) if hashes else (_NOWHERE, _NOWHERE)
     return Fused(

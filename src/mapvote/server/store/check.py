@@ -1,0 +1,117 @@
+"""Is every byte of a store what it was when it was written? Say what is damaged, set it aside, mend what can be mended.
+
+What cannot be mended is set aside: a ballot's votes on that tile count no more, a tile is not fused, and all others go
+on as if nothing had happened.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from typing import Any
+
+import sqlalchemy as sa
+
+from mapvote.codec.arrays import compress, unpack_bytes
+from mapvote.codec.ballot import tile_key
+from mapvote.core.types import MapvoteError
+from mapvote.server.store import schema
+from mapvote.server.store.blobs import MAX_PLANE_BYTES
+from mapvote.server.store.database import insert_rows
+from mapvote.server.store.quarantine import Damage, ballot_name, ballot_sum, quarantine, sum_of
+from mapvote.server.store.queries import log_event
+from mapvote.server.store.store import Store
+
+Source = Callable[[str], bytes | None]
+"""A plane's values by hash, from another store or a map folder; None if it is not there."""
+_BATCH = 500
+
+
+def check(
+    store: Store, *, mend: bool = False, source: Source = lambda digest: None, by: str = "operator"
+) -> list[Damage]:
+    """Everything that is damaged, and with ``mend`` what was done about it. What cannot be mended is set aside."""
+    with store.database.reading() as connection:
+        found = [*_database(connection, store), *_planes(connection), *_chain(connection)]
+        found += [*_ballots(connection), *_decisions(connection)]
+    if mend and found:
+        with store.database.writing() as connection:
+            found = [_mend(connection, damage, source, store.clock(), by) for damage in found]
+    return found
+
+
+def _database(connection: sa.Connection, store: Store) -> Iterator[Damage]:
+    """What the database itself says of its pages."""
+    if store.database.is_sqlite:
+        for (said,) in connection.execute(sa.text("PRAGMA integrity_check(20)")).all():
+            if said != "ok":
+                yield Damage("database", "pages", str(said)[:180])
+
+
+def _planes(connection: sa.Connection) -> Iterator[Damage]:
+    for row in _in_batches(connection, sa.select(schema.blobs).order_by(schema.blobs.c.hash)):
+        why = _wrong(row.hash, row.data)
+        if why:
+            yield Damage("plane", row.hash, why)
+
+
+def _wrong(digest: str, data: bytes) -> str:
+    try:
+        raw = unpack_bytes(data, MAX_PLANE_BYTES, "plane")
+    except MapvoteError as error:
+        return str(error)[:120]
+    return "" if hashlib.sha256(raw).hexdigest() == digest else "is not what its hash says"
+
+
+def _chain(connection: sa.Connection) -> Iterator[Damage]:
+    """Versions follow each other, and every plane that they name is there."""
+    v, t = schema.versions, schema.version_tiles
+    last = None
+    for number, parent in connection.execute(sa.select(v.c.number, v.c.parent).order_by(v.c.number)).tuples():
+        if parent != last or (last is not None and number != last + 1):
+            yield Damage("version", str(number), f"follows version {parent}, not {last}")
+        last = number
+    for name in ("points", "ground", "free", "memory"):
+        column = t.c[name]
+        lost = sa.select(t.c.version, t.c.row, t.c.col, column).join(
+            schema.blobs, schema.blobs.c.hash == column, isouter=True
+        )
+        for row in connection.execute(lost.where(column.is_not(None), schema.blobs.c.hash.is_(None))):
+            yield Damage(
+                "plane", row[3], f"{name} of tile {tile_key((row.row, row.col))} in version {row.version} is lost"
+            )
+
+
+def _ballots(connection: sa.Connection) -> Iterator[Damage]:
+    t = schema.ballot_tiles
+    for row in _in_batches(connection, sa.select(t).order_by(t.c.row, t.c.col, t.c.ballot)):
+        if row.sum and row.sum != ballot_sum(row):
+            yield Damage("ballot", ballot_name(row.ballot, row.row, row.col), "is not what its sum says")
+
+
+def _decisions(connection: sa.Connection) -> Iterator[Damage]:
+    d = schema.decisions
+    for row in _in_batches(connection, sa.select(d).order_by(d.c.version, d.c.row, d.c.col)):
+        if row.sum and row.sum != sum_of(row.states, row.tally):
+            yield Damage(
+                "decision", f"{row.version} on tile {tile_key((row.row, row.col))}", "is not what its sum says"
+            )
+
+
+def _in_batches(connection: sa.Connection, query: sa.Select[Any]) -> Iterator[Any]:
+    """Rows, so many at a time: a store is larger than memory."""
+    yield from connection.execution_options(yield_per=_BATCH).execute(query)
+
+
+def _mend(connection: sa.Connection, damage: Damage, source: Source, now: int, by: str) -> Damage:
+    raw = source(damage.name) if damage.kind == "plane" else None
+    if raw is None or hashlib.sha256(raw).hexdigest() != damage.name:
+        quarantine(connection, [damage], now, by)
+        return replace(damage, mended="set aside")
+    b, q = schema.blobs, schema.quarantine
+    connection.execute(b.delete().where(b.c.hash == damage.name))
+    insert_rows(connection, b, [(damage.name, compress(raw, 3))])
+    connection.execute(q.delete().where(q.c.kind == "plane", q.c.name == damage.name))
+    log_event(connection, now, "mended", by, f"plane {damage.name}")
+    return replace(damage, mended="mended from the other store")

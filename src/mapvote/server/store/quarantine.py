@@ -1,0 +1,78 @@
+"""What is damaged is set aside by name, so that everything else goes on: in the log, the metrics and /readyz.
+
+Planes of tiles are named by their hash; planes of ballots and decisions carry a sum beside them.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import sqlalchemy as sa
+
+from mapvote.codec.ballot import tile_key
+from mapvote.core.types import MapvoteError
+from mapvote.server.store import schema
+from mapvote.server.store.queries import log_event
+
+
+@dataclass(frozen=True, slots=True)
+class Damage:
+    """One thing that is not as it was written."""
+
+    kind: str
+    """plane, ballot, decision, version or database."""
+    name: str
+    """The plane's hash; or ballot, version and tile."""
+    why: str
+    mended: str = ""
+    """What was done about it; empty: nothing yet."""
+
+    def __str__(self) -> str:
+        return f"{self.kind} {self.name}: {self.why}" + (f"; {self.mended}" if self.mended else "")
+
+
+class DamagedBallots(MapvoteError):
+    """Votes that are not what was sent."""
+
+    def __init__(self, found: list[Damage]) -> None:
+        super().__init__("; ".join(map(str, found)))
+        self.found = found
+
+
+def sum_of(*parts: bytes | str | None) -> str:
+    """SHA-256 over the parts of a row, each with its length, so that none can pass for another."""
+    digest = hashlib.sha256()
+    for part in parts:
+        raw = b"" if part is None else part.encode() if isinstance(part, str) else bytes(part)
+        digest.update(f"{-1 if part is None else len(raw)}:".encode() + raw)
+    return digest.hexdigest()
+
+
+def ballot_name(seq: int, row: int, col: int) -> str:
+    """One ballot's votes on one tile."""
+    return f"{seq} on tile {tile_key((row, col))}"
+
+
+def ballot_sum(row: Any) -> str:
+    """The sum of a row of ballot_tiles."""
+    return sum_of(row.base, row.states, row.tally, row.gone, row.new_points, row.free)
+
+
+def set_aside(connection: sa.Connection) -> dict[tuple[str, str], str]:
+    """Why each thing is in quarantine, by (kind, name)."""
+    q = schema.quarantine
+    return {(row.kind, row.name): row.why for row in connection.execute(sa.select(q.c.kind, q.c.name, q.c.why))}
+
+
+def quarantine(connection: sa.Connection, damaged: Iterable[Damage], now: int, by: str) -> None:
+    """Set aside what is not yet; each is named in the log."""
+    known = set(set_aside(connection))
+    for damage in damaged:
+        if (damage.kind, damage.name) not in known:
+            seq = log_event(connection, now, "quarantine", by, str(damage))
+            row = {"kind": damage.kind, "name": damage.name[:160], "seq": seq, "why": damage.why[:200]}
+            connection.execute(schema.quarantine.insert().values(**row))
+            known.add((damage.kind, damage.name))

@@ -1,0 +1,102 @@
+"""One flipped bit: named by check, set aside, and everything undamaged goes on being published."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+import sqlalchemy as sa
+
+from hand_made import Say, make_ballot, states_plane, two_walls
+from mapvote.codec.ballot import encode
+from mapvote.config import FuseSettings
+from mapvote.core.types import CellState
+from mapvote.server.store import schema
+from mapvote.server.store.admission import accept, examine
+from mapvote.server.store.ballots import Receipt
+from mapvote.server.store.blobs import pack_tile
+from mapvote.server.store.check import check
+from mapvote.server.store.policy import Policy
+from mapvote.server.store.publish import publish
+from mapvote.server.store.quarantine import ballot_name, set_aside
+from mapvote.server.store.store import Store
+
+CELL = (10, 10)
+POLICY = Policy(fuse=FuseSettings(max_deleted_share=1.0))
+
+
+@pytest.fixture
+def store(database_url: str) -> Iterator[Store]:
+    store = Store.create(database_url, two_walls(), POLICY)
+    base = store.point_map()
+    for vehicle in ("a", "b", "c"):
+        say = Say(states_plane({CELL: CellState.CHANGED_EMPTY}))
+        ballot = make_ballot(base, dict.fromkeys(base.tiles, say), vehicle)
+        (receipt,) = accept(store, [examine(encode(ballot))])
+        assert isinstance(receipt, Receipt)
+    yield store
+    store.close()
+
+
+def flip(store: Store, table: sa.Table, column: str, where: sa.ColumnElement[bool], bit: int = 77) -> None:
+    """Turn one bit of a plane, as a failing disk would."""
+    with store.database.writing() as connection:
+        data = bytearray(connection.execute(sa.select(table.c[column]).where(where)).scalars().first() or b"")
+        data[bit // 8 % len(data)] ^= 1 << bit % 8
+        connection.execute(table.update().where(where).values({column: bytes(data)}))
+
+
+def test_a_sound_store_has_nothing_to_tell(store: Store) -> None:
+    assert check(store) == []
+    publish(store)
+    assert check(store, mend=True) == []
+
+
+def test_a_damaged_tile_is_named_and_all_others_are_published(store: Store) -> None:
+    """Both tiles hold the same points, so it is the ground of one that is damaged."""
+    with store.database.writing() as connection:
+        t = schema.version_tiles
+        ground = np.full((256, 256), 0.01, np.float32)
+        hashes, planes = pack_tile(two_walls().tiles[0, 1].__class__(two_walls().tiles[0, 1].window,
+                                   two_walls().tiles[0, 1].points, ground))  # fmt: skip
+        connection.execute(schema.blobs.insert().values(hash=hashes.ground, data=planes[hashes.ground]))
+        connection.execute(t.update().where(t.c.col == 1).values(ground=hashes.ground))
+    flip(store, schema.blobs, "data", schema.blobs.c.hash == hashes.ground)
+    assert [(damage.kind, damage.name) for damage in check(store)] == [("plane", hashes.ground)]
+    done = publish(store)
+    assert (done.published, list(done.tiles)) == (True, [(0, 0)])
+    with store.database.reading() as connection:
+        assert set_aside(connection), "and named"
+
+
+def test_a_damaged_ballot_is_left_out_and_the_others_decide(store: Store) -> None:
+    t = schema.ballot_tiles
+    with store.database.reading() as connection:
+        seq = connection.execute(sa.select(sa.func.min(t.c.ballot))).scalar_one()
+    flip(store, t, "states", (t.c.ballot == seq) & (t.c.col == 0))
+    name = ballot_name(seq, 0, 0)
+    assert [damage.name for damage in check(store)] == [name]
+    done = publish(store)
+    assert list(done.tiles) == [(0, 0), (0, 1)]
+    assert [fused.vehicles for fused in done.fused] == [2, 3]
+    with store.database.reading() as connection:
+        assert ("ballot", name) in set_aside(connection)
+
+
+def test_a_plane_is_mended_from_another_store(store: Store, tmp_path_factory: pytest.TempPathFactory) -> None:
+    other = Store.create(f"sqlite:///{tmp_path_factory.mktemp('other') / 's.db'}", two_walls())
+    points = store.manifest().tiles[0, 0].points
+    flip(store, schema.blobs, "data", schema.blobs.c.hash == points)
+    assert not publish(store).published
+
+    def source(digest: str) -> bytes | None:
+        from mapvote.codec.arrays import unpack_bytes
+
+        return unpack_bytes(other.blob(digest), 1 << 30, digest)
+
+    (damage,) = check(store, mend=True, source=source)
+    assert "mended" in damage.mended
+    assert check(store) == []
+    assert publish(store).published
+    other.close()
