@@ -68,7 +68,7 @@ def _chain(connection: sa.Connection) -> Iterator[Damage]:
     """Versions follow each other, and every plane that they name is there."""
     v, t = schema.versions, schema.version_tiles
     last = None
-    for number, parent in connection.execute(sa.select(v.c.number, v.c.parent).order_by(v.c.number)).tuples():
+    for number, parent in connection.execute(sa.select(v.c.number, v.c.parent).order_by(v.c.number)):
         if parent != last or (last is not None and number != last + 1):
             yield Damage("version", str(number), f"follows version {parent}, not {last}")
         last = number
