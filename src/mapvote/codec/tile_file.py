@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import hashlib
+from typing import Any
 
 import msgspec
 import numpy as np
+from numpy.typing import NDArray
 
 from mapvote.codec.arrays import pack_plane, unpack_plane
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Grid
@@ -17,6 +19,7 @@ TILE_VERSION = 1
 MAX_TILE_POINTS = 50_000_000
 """8,000 points per square metre; 600 MB. Nothing honest is denser."""
 _LEVEL = 3
+_FIELD_TYPES = ("|u1", "|i1", "<u2", "<i2", "<u4", "<i4", "<u8", "<i8", "<f4", "<f8")
 _SHAPE = (TILE_CELLS, TILE_CELLS)
 
 
@@ -29,6 +32,8 @@ class _TileFile(msgspec.Struct, frozen=True, kw_only=True):
     ground_z: bytes
     free: bytes | None = None
     memory: bytes | None = None
+    fields: dict[str, tuple[str, bytes]] = {}
+    """Type and values of each field of the points."""
 
 
 def content_hash(tile_points: F32) -> str:
@@ -51,6 +56,7 @@ def encode_tile(tile: Tile) -> bytes:
             ground_z=pack_plane(tile.ground_z, _LEVEL),
             free=None if tile.free is None else pack_plane(tile.free, _LEVEL),
             memory=None if tile.memory is None else pack_plane(tile.memory.planes, _LEVEL),
+            fields={name: (c.dtype.newbyteorder("<").str, pack_plane(c, _LEVEL)) for name, c in tile.fields.items()},
         )
     )
 
@@ -72,7 +78,15 @@ def decode_tile(data: bytes, window: Grid, what: str = "tile") -> Tile:
     ground_z = unpack_plane(file.ground_z, "<f4", _SHAPE, f"{what}: ground_z")
     free = None if file.free is None else unpack_plane(file.free, "<u8", _SHAPE, f"{what}: free")
     memory = None if file.memory is None else unpack_memory(file.memory, f"{what}: memory")
-    return Tile(window, points, ground_z, free, memory)
+    fields = {name: _unpack_field(*about, file.n_points, f"{what}: {name}") for name, about in file.fields.items()}
+    return Tile(window, points, ground_z, free, memory, fields)
+
+
+def _unpack_field(kind: str, data: bytes, n: int, what: str) -> NDArray[Any]:
+    """(n,) one field; MapvoteError if it is damaged or no column of numbers."""
+    if kind not in _FIELD_TYPES:
+        raise MapvoteError(f"{what}: of type {kind[:20]!r}, which no field has; fetch it again")
+    return unpack_plane(data, kind, (n,), what)
 
 
 def unpack_memory(data: bytes, what: str) -> Memory:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +14,7 @@ from mapvote.core.grid import Lattice, TileIndex, tile_of_cells
 from mapvote.core.ground import Heights, lay_ground
 from mapvote.core.picture import html_picture
 from mapvote.core.tile import Tile
-from mapvote.core.types import F32, F64, MapvoteError
+from mapvote.core.types import F32, F64, I64, MapvoteError
 
 _EXTENT_M = 1e7
 _CHUNK = 1_000_000
@@ -47,8 +48,8 @@ class PointMap:
         return self.tiles.get(index) or Tile.empty(self.lattice.tile(index))
 
 
-def cut_tiles(points_map: NDArray[np.floating], lattice: Lattice) -> Iterator[tuple[TileIndex, NDArray[np.floating]]]:
-    """Points (n, 3) tile by tile, map metres, input order kept inside each tile; tiles in ascending order."""
+def cut_tiles(points_map: NDArray[np.floating], lattice: Lattice) -> Iterator[tuple[TileIndex, I64]]:
+    """Which of the points (n, 3) lie in each tile, input order kept inside each tile; tiles in ascending order."""
     tiles = np.empty((len(points_map), 2), dtype=np.int32)
     for start in range(0, len(points_map), _CHUNK):
         piece = slice(start, start + _CHUNK)
@@ -57,7 +58,7 @@ def cut_tiles(points_map: NDArray[np.floating], lattice: Lattice) -> Iterator[tu
     seams = np.flatnonzero((tiles[order[1:]] != tiles[order[:-1]]).any(axis=1)) + 1
     for piece_of_order in np.split(order, seams):
         row, col = tiles[piece_of_order[0]].tolist()
-        yield (row, col), points_map[piece_of_order]
+        yield (row, col), piece_of_order
 
 
 def _heights(points: Mapping[TileIndex, F32], lattice: Lattice) -> dict[TileIndex, Heights]:
@@ -66,7 +67,7 @@ def _heights(points: Mapping[TileIndex, F32], lattice: Lattice) -> dict[TileInde
 
 def _stored(points_map: NDArray[np.floating], lattice: Lattice) -> dict[TileIndex, F32]:
     """The points as tiles keep them, so that the ground is laid from what a map read back holds."""
-    return {tile: lattice.tile(tile).from_map(p) for tile, p in cut_tiles(points_map, lattice)}
+    return {tile: lattice.tile(tile).from_map(points_map[mine]) for tile, mine in cut_tiles(points_map, lattice)}
 
 
 def map_from_points(
@@ -76,12 +77,13 @@ def map_from_points(
     map_id: str | None = None,
     georeference: Mapping[str, str] | None = None,
     road: F64 | None = None,
+    fields: Mapping[str, NDArray[Any]] | None = None,
 ) -> PointMap:
     """A PointMap of points (n, 3) in map metres: cut into tiles, every point kept in its order, ground laid.
 
     ``road`` (m, 3), map metres: places known to be ground, from which it grows; without, it must be found.
-    ``map_id`` defaults to a hash of the points and the lattice. Raises MapvoteError if there are no points, or if
-    some are not finite or lie beyond 10,000 km.
+    ``fields``: columns (n,) that stay with the points. ``map_id`` defaults to a hash of the points and the lattice.
+    Raises MapvoteError if there are no points, or if some are not finite or lie beyond 10,000 km.
     """
     lattice = lattice or Lattice()
     points = np.asarray(points_map)
@@ -101,6 +103,9 @@ def map_from_points(
     known = {} if road is None or len(road) == 0 else _stored(road, lattice)
     ground = lay_ground(_heights(stored, lattice), _heights(known, lattice))
     tiles = {tile: Tile(lattice.tile(tile), stored[tile], ground[tile]) for tile in stored}
+    if fields:
+        for tile, mine in cut_tiles(points, lattice):
+            tiles[tile] = replace(tiles[tile], fields={name: column[mine] for name, column in fields.items()})
     return PointMap(map_id or digest.hexdigest()[:16], lattice, tiles, dict(georeference or {}))
 
 
@@ -108,3 +113,13 @@ def all_points(point_map: PointMap) -> F64:
     """Every point (n, 3) of a map in map metres, tile by tile in ascending order."""
     clouds = [point_map.tiles[tile].points_map for tile in sorted(point_map.tiles)]
     return np.concatenate(clouds) if clouds else np.zeros((0, 3))
+
+
+def all_fields(point_map: PointMap) -> dict[str, NDArray[Any]]:
+    """The fields (n,) of :func:`all_points`, in the same order; 0 where a tile lacks one, all its points being new."""
+    tiles = [point_map.tiles[index] for index in sorted(point_map.tiles)]
+    kinds = {name: column.dtype for tile in tiles for name, column in tile.fields.items()}
+    return {
+        name: np.concatenate([t.fields.get(name, np.zeros(len(t.points), kind)).astype(kind) for t in tiles])
+        for name, kind in kinds.items()
+    }

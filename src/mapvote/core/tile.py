@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mapvote.core.columns import column_bits
 from mapvote.core.grid import CELLS, Grid, TileIndex
@@ -32,12 +34,17 @@ class Tile:
     """(256, 256) column words of voxels known to be free (see core.columns), or None if never learned."""
     memory: Memory | None = None
     """When each cell last changed; None: not since the map's first version."""
+    fields: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+    """Columns (n,) that came with the points of an imported map: intensity, red, classification, gps_time ..."""
 
     def __post_init__(self) -> None:
         check_array(self.points, "Tile.points", (None, 3), np.float32)
         check_array(self.ground_z, "Tile.ground_z", self.window.shape, np.float32, finite=False)
         if self.free is not None:
             check_array(self.free, "Tile.free", self.window.shape, np.uint64)
+        for name, column in self.fields.items():
+            if column.shape != (len(self.points),):
+                raise ValueError(f"Tile.fields[{name!r}] is {column.shape}, but there are {len(self.points)} points")
 
     def __repr__(self) -> str:
         row, col = self.index
@@ -50,7 +57,20 @@ class Tile:
 
     def __reduce__(self) -> tuple[Any, ...]:
         """What was worked out does not travel to other processes."""
-        return Tile, (self.window, self.points, self.ground_z, self.free, self.memory)
+        return Tile, (self.window, self.points, self.ground_z, self.free, self.memory, self.fields)
+
+    def without(self, dropped: Bool) -> Tile:
+        """The tile without some of its points (n,); the others keep their fields."""
+        fields = {name: column[~dropped] for name, column in self.fields.items()}
+        return replace(self, points=self.points[~dropped], fields=fields)
+
+    def with_new(self, points: F32) -> Tile:
+        """The tile with more points (m, 3) after its own; their fields are 0, for ballots carry positions only."""
+        fields = {
+            name: np.concatenate([column, np.zeros(len(points), dtype=column.dtype)])
+            for name, column in self.fields.items()
+        }
+        return replace(self, points=np.concatenate([self.points, points]), fields=fields)
 
     @property
     def index(self) -> TileIndex:

@@ -5,18 +5,19 @@ Formats are listed in :mod:`mapvote.formats.registry`; each is recognised by wha
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from mapvote.core.point_map import PointMap, all_points
-from mapvote.core.types import Drive, MapvoteError
+from mapvote.core.point_map import PointMap, all_fields, all_points
+from mapvote.core.types import U8, Drive, MapvoteError
 from mapvote.formats.drives.kitti import DriveWriter
 from mapvote.formats.drives.options import DriveOptions
 from mapvote.formats.drives.poses import read_T_map_lidar
 from mapvote.formats.geo.frame import MapFrame, frame_of
 from mapvote.formats.geo.projector import autoware_frame, frame_wanted
-from mapvote.formats.maps.cloud import Cloud, to_map
+from mapvote.formats.maps.cloud import GROUND, UNCLASSIFIED, Cloud, to_map
 from mapvote.formats.maps.mapvote_folder import is_map_folder, read_map_folder, write_map_folder
 from mapvote.formats.maps.pcd import write_pcd
 from mapvote.formats.registry import DRIVES, MAPS, WRITERS
@@ -112,9 +113,11 @@ def export_map(
     if writer is None:
         suffixes = ", ".join(suffix for suffix in WRITERS if suffix)
         raise MapvoteError(f"{path}: no format for {path.suffix}; use {suffixes}, or a folder for Autoware")
-    cloud = Cloud(all_points(point_map), frame=frame_of(point_map.georeference))
+    cloud = Cloud(all_points(point_map), frame=frame_of(point_map.georeference), fields=all_fields(point_map))
     if not len(cloud.points):
         raise MapvoteError(f"{path}: the map holds no points, so there is nothing to export")
+    if writer.classes and "classification" not in cloud.fields:
+        cloud = replace(cloud, fields={**cloud.fields, "classification": ground_classes(point_map)})
     if not path.suffix or projector in ("MGRS", "LocalCartesianUTM"):
         wanted: MapFrame | None = autoware_frame(cloud.frame, cloud.points, projector)
         if crs is not None:
@@ -128,6 +131,14 @@ def export_map(
         cloud = Cloud(cloud.points - np.array(offset), frame=frame, fields=cloud.fields)
     writer.write(path, cloud)
     return writer.name, cloud.frame
+
+
+def ground_classes(point_map: PointMap) -> U8:
+    """(n,) ASPRS class of every point of a map, as ``all_points`` orders them: ground, or unclassified."""
+    tiles = [point_map.tiles[index] for index in sorted(point_map.tiles)]
+    return np.concatenate(
+        [np.where(t.has_ground & ~t.columns[1], GROUND, UNCLASSIFIED).astype(np.uint8) for t in tiles]
+    )
 
 
 def _what_is_there(path: Path) -> str:

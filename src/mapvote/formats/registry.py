@@ -58,6 +58,8 @@ class MapWriter:
     name: str
     write: Callable[[Path, Cloud], None]
     """Whole or not at all."""
+    classes: bool = False
+    """Whether the format has a place for ASPRS classes."""
 
 
 DRIVES: dict[str, DriveFormat] = {
@@ -86,8 +88,8 @@ MAPS: dict[str, MapFormat] = {
 
 WRITERS: dict[str, MapWriter] = {
     ".pcd": MapWriter("PCD file", write_pcd),
-    ".las": MapWriter("LAS file", write_las),
-    ".laz": MapWriter("LAZ file", write_las),
+    ".las": MapWriter("LAS file", write_las, classes=True),
+    ".laz": MapWriter("LAZ file", write_las, classes=True),
     ".ply": MapWriter("PLY file", write_ply),
     "": MapWriter("Autoware tile folder", write_autoware),
 }

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numba
 import numpy as np
 
@@ -28,7 +26,7 @@ def delete_points(tile: Tile, gone: U64) -> tuple[Tile, int]:
     dropped = obstacle & ((words >> bit.astype(np.uint64)) & np.uint64(1)).astype(np.bool_)
     if not dropped.any():
         return tile, 0
-    return replace(tile, points=tile.points[~dropped]), int(dropped.sum())
+    return tile.without(dropped), int(dropped.sum())
 
 
 def add_points(tile: Tile, points: F32, cells: I64, voters: I32, min_votes: int) -> tuple[Tile, int]:
@@ -51,7 +49,7 @@ def add_points(tile: Tile, points: F32, cells: I64, voters: I32, min_votes: int)
     chosen = _representatives(points, voxels, voters, taken, order, min_votes)
     if not len(chosen):
         return tile, 0
-    return replace(tile, points=np.concatenate([tile.points, points[chosen]])), len(chosen)
+    return tile.with_new(points[chosen]), len(chosen)
 
 
 def _voxel(cells: I64, layers: I64) -> I64:

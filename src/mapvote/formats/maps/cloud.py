@@ -36,6 +36,8 @@ KEPT = (
     "number_of_returns",
 )
 """Fields of points that a map keeps, by LAS's names."""
+GROUND, UNCLASSIFIED = 2, 1
+"""ASPRS classes."""
 SCALED = ("intensity", "red", "green", "blue")
 """Those that count from nothing to a full scale, which depends on the type."""
 
@@ -121,9 +123,10 @@ def lattice_of(points: NDArray[np.floating]) -> Lattice:
 def to_map(where: str, cloud: Cloud) -> PointMap:
     """The map of a cloud: tiles cut, ground laid, map_id from the content. Broken points are dropped and counted.
 
+    Points that the file classifies as ground are ground.
     MapvoteError if the cloud is empty or more than 5 % of it is not finite.
     """
-    points = cloud.points
+    points, fields = cloud.points, dict(cloud.fields)
     if len(points) == 0:
         raise MapvoteError(f"{where}: holds no points; a map needs some")
     bad = ~(np.isfinite(points[:, 0]) & np.isfinite(points[:, 1]) & np.isfinite(points[:, 2]))
@@ -134,8 +137,11 @@ def to_map(where: str, cloud: Cloud) -> PointMap:
         )
     if n_bad:
         log.warning("%s: dropped %d of %d points that are not finite", where, n_bad, len(points))
-        points = points[~bad]
-    return map_from_points(points, lattice=lattice_of(points), georeference=cloud.frame.georeference())
+        points, fields = points[~bad], {name: column[~bad] for name, column in fields.items()}
+    ground = points[fields["classification"] == GROUND].astype(np.float64) if "classification" in fields else None
+    return map_from_points(
+        points, lattice=lattice_of(points), georeference=cloud.frame.georeference(), road=ground, fields=fields
+    )
 
 
 def float32_loss_m(points: NDArray[np.floating]) -> float:
