@@ -9,11 +9,13 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from mapvote.client import MapClient as MapClient
     from mapvote.codec.ballot import Ballot as Ballot
     from mapvote.config import Settings as Settings
     from mapvote.config import load_settings as load_settings
     from mapvote.core.point_map import PointMap as PointMap
     from mapvote.core.point_map import map_from_points as map_from_points
+    from mapvote.core.sensors import Sensor as Sensor
     from mapvote.core.types import CellState as CellState
     from mapvote.core.types import Drive as Drive
     from mapvote.core.types import MapvoteError as MapvoteError
@@ -21,6 +23,7 @@ if TYPE_CHECKING:
     from mapvote.formats import open_drive as open_drive
     from mapvote.formats import read_map as read_map
     from mapvote.formats import write_map as write_map
+    from mapvote.formats.drives.point_fields import scan_from_point_cloud2 as scan_from_point_cloud2
     from mapvote.fusion.offline import update_map as update_map
     from mapvote.simulation import simulate as simulate
     from mapvote.slam.build import build_map as build_map
@@ -31,9 +34,11 @@ _HOME = {
     "Ballot": "codec.ballot",
     "CellState": "core.types",
     "Drive": "core.types",
+    "MapClient": "client",
     "MapvoteError": "core.types",
     "PointMap": "core.point_map",
     "Scan": "core.types",
+    "Sensor": "core.sensors",
     "Settings": "config",
     "Vehicle": "vehicle",
     "build_map": "slam.build",
@@ -41,6 +46,7 @@ _HOME = {
     "map_from_points": "core.point_map",
     "open_drive": "formats",
     "read_map": "formats",
+    "scan_from_point_cloud2": "formats.drives.point_fields",
     "simulate": "simulation",
     "update_map": "fusion.offline",
     "vote_drive": "vehicle",

@@ -90,6 +90,19 @@ def point_cloud_table(where: str, message: Any) -> NDArray[np.void]:
     return table.astype(record.newbyteorder("<")) if message.is_bigendian else table
 
 
+def scan_from_point_cloud2(message: Any, sensor: Sensor) -> Scan:
+    """A live sensor_msgs/PointCloud2 as a Scan: of rclpy, rosbags, or any object with its fields.
+
+    Its stamp is the message's; a field of times (``TIME_FIELDS``) makes it be de-skewed, ``intensity`` and ``ring`` are
+    kept. MapvoteError if the message is cut off, has no x, y, z, or holds no usable point.
+    """
+    stamp = message.header.stamp
+    stamp_ns = int(getattr(stamp, "sec", 0)) * 10**9 + int(getattr(stamp, "nanosec", 0))
+    where = f"PointCloud2 in {message.header.frame_id or 'no frame'} at {stamp_ns}"
+    table = point_cloud_table(where, message)
+    return scan_from_fields(where, 0, stamp_ns, table, sensor=sensor, bad_points=BadPoints(where))
+
+
 def point_times_s(where: str, raw: NDArray[np.generic], stamp_ns: int, sensor: Sensor) -> F32 | None:
     """Times (n,) relative to ``stamp_ns`` from a field of any unit; None if all are equal: no times were recorded.
 
