@@ -133,4 +133,4 @@ def test_deployment_files_use_verbs_options_and_extras_that_exist() -> None:
         assert {word for word in after if word.startswith("--")} <= known
     extras = tomllib.loads((EXAMPLES.parent / "pyproject.toml").read_text())["project"]["optional-dependencies"]
     assert {"server", "postgres", "geo"} <= set(extras)
-    assert "init" in verbs
+    assert "MAPVOTE_STORE" in compose["mapvote"]["environment"]
