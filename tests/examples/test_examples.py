@@ -34,11 +34,15 @@ def node() -> ModuleType:
 
 
 def street() -> np.ndarray[Any, np.dtype[np.float64]]:
-    x, y = np.meshgrid(np.arange(-15, 15, 0.2), np.arange(-6, 6, 0.2))
+    gx, gy = np.meshgrid(np.arange(-15, 15, 0.2), np.arange(-6, 6, 0.2))
     a, b = np.meshgrid(np.arange(-15, 15, 0.2), np.arange(0, 4, 0.2))
     walls = [np.column_stack([a.ravel(), np.full(a.size, side), b.ravel()]) for side in (-6.0, 6.0)]
     ends = [np.column_stack([np.full(b.size, e), a.ravel() * 0.4, b.ravel()]) for e in (-15.0, 15.0)]
-    return np.concatenate([np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)]), *walls, *ends])
+    t, h = np.meshgrid(np.arange(0, 2 * np.pi, 0.2), np.arange(0, 3, 0.1))
+    places = np.random.default_rng(1).uniform([-14, -5], [14, 5], (14, 2))
+    trees = [np.column_stack([x + 0.4 * np.cos(t.ravel()), y + 0.4 * np.sin(t.ravel()), h.ravel()]) for x, y in places]
+    ground = np.column_stack([gx.ravel(), gy.ravel(), np.zeros(gx.size)])
+    return np.concatenate([ground, *walls, *ends, *trees])
 
 
 def header(ns: int, frame: str) -> Any:
