@@ -94,6 +94,7 @@ export async function showCell([x, y]) {
 function details(title, kind, content) {
   $("details").replaceChildren(
     element("button", { className: "close", title: "Close", ariaLabel: "Close", onclick: closeDetails }, ["\u00d7"]),
+    element("h2", { className: "unseen" }, ["Chosen"]),
     element("h3", {}, [kind && dot(kind), title]),
     ...content,
   );

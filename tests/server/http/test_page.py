@@ -1,0 +1,160 @@
+"""The page in 3D on a real server, in a browser with WebGL in software: the cloud, the desk, and who can use it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from urllib.parse import urlsplit
+
+import numpy as np
+import pytest
+
+from chromium import Chromium, program
+from hand_made import Say, make_ballot, make_map, make_tile, states_plane, wall
+from live_server import serving
+from mapvote.codec.ballot import encode
+from mapvote.config import FuseSettings
+from mapvote.core.types import CellState
+from mapvote.server.insight.cutout import whole_page
+from mapvote.server.insight.history import changes_between, cutouts_between
+from mapvote.server.store import policy
+from mapvote.server.store.admission import accept, examine
+from mapvote.server.store.publish import publish
+from mapvote.server.store.store import Store
+
+HOUSE = [(r, c) for r in range(40, 60) for c in range(40, 70) if r in (40, 59) or c in (40, 69)]
+SHED = [(r, c) for r in range(150, 160) for c in range(150, 160) if r in (150, 159) or c in (150, 159)]
+HEIGHTS = [0.45, 1.05, 1.65, 2.55, 3.15, 4.05]
+AXE = Path(__file__).parents[2] / "vendor" / "axe.min.js"
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Path:
+    """A village where a house was taken down in version 2, and a shed would go with the next."""
+    ground = wall([(r, c) for r in range(0, 256, 2) for c in range(0, 256, 2)], [0.05])
+    village = np.concatenate([ground, wall(HOUSE, HEIGHTS), wall(SHED, HEIGHTS)])
+    point_map = make_map({(0, 0): make_tile(village)})
+    opened = Store.create(f"sqlite:///{tmp_path / 'store.db'}", point_map)
+    lax = policy.current_policy(opened).model_copy(update={"fuse": FuseSettings(max_deleted_share=1.0)})
+    policy.set_policy(opened, lax, by="test")
+    for number, gone in enumerate((HOUSE, SHED)):
+        for name in ("v1", "v2"):
+            states = states_plane(dict.fromkeys(gone, CellState.CHANGED_EMPTY), fill=CellState.UNCHANGED_EMPTY)
+            base = opened.point_map()
+            ballot = make_ballot(base, {(0, 0): Say(states)}, name, f"d{number}", end_ns=opened.clock())
+            accept(opened, [examine(encode(ballot))])
+        if number == 0:
+            publish(opened, by="<b>boss</b>", reason="<script>alert(1)</script>")
+    opened.close()
+    return tmp_path / "store.db"
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Chromium]:
+    if program() is None:
+        pytest.skip("Chromium is not installed: apt-get install chromium")
+    found = Chromium(webgl=True)
+    yield found
+    found.close()
+
+
+def press(browser: Chromium, key: str) -> None:
+    for kind in ("keyDown", "keyUp"):
+        browser.call("Input.dispatchKeyEvent", type=kind, key=key, text=key if len(key) == 1 else "")
+
+
+def text(browser: Chromium, selector: str) -> str:
+    found: str = browser.run(f"document.querySelector({selector!r}).innerText")
+    return found
+
+
+def ready(browser: Chromium, url: str) -> None:
+    browser.open(url)
+    browser.wait("performance.getEntriesByName('all-in-view').length", 60)
+    browser.wait("document.querySelectorAll('#pending button').length", 60)
+
+
+def test_the_cloud_is_drawn_and_nobody_else_is_asked(browser: Chromium, store: Path, tmp_path: Path) -> None:
+    with serving(store, "--open", log=tmp_path / "log") as (url, _):
+        ready(browser, url)
+        assert "0 built" in text(browser, "#tally")
+        assert text(browser, "#labels").startswith("× demolished 4 m")
+        colours = """(() => { const c = document.querySelector('#cloud'), p = document.createElement('canvas');
+            p.width = c.width; p.height = c.height; const g = p.getContext('2d'); g.drawImage(c, 0, 0);
+            const d = g.getImageData(0, 0, p.width, p.height).data, seen = new Set();
+            for (let i = 0; i < d.length; i += 4) seen.add(d[i] << 16 | d[i + 1] << 8 | d[i + 2]);
+            return seen.size; })()"""
+        browser.wait(f"{colours} > 20")
+        press(browser, "2")
+        assert browser.run("!document.querySelector('#map').hidden && document.querySelector('#cloud').hidden")
+        press(browser, "3")
+        for way in ("before", "swipe", "blink", "after"):
+            browser.run(f"(s => (s.value = '{way}', s.onchange()))(document.querySelector('#compare'))")
+        for colour in ("plain", "age", "votes", "share", "height"):
+            browser.run(f"(s => (s.value = '{colour}', s.onchange()))(document.querySelector('#colour'))")
+        browser.run("document.querySelector('#changes button').click()")
+        browser.wait("location.hash.includes('change=demolished.v2')")
+        browser.wait("location.hash.includes('eye=')")
+        assert "<script>alert(1)</script>" in text(browser, "#versions"), "text stays text"
+        assert {urlsplit(u).netloc for u in browser.requests if u.startswith("http")} == {urlsplit(url).netloc}
+        assert browser.errors == []
+
+
+def test_the_desk_is_worked_by_keyboard_and_publishing_obeys(browser: Chromium, store: Path, tmp_path: Path) -> None:
+    with serving(store, "--open", log=tmp_path / "log") as (url, _):
+        ready(browser, url)
+        browser.run("document.querySelector('#pending button').focus()")
+        browser.run("document.activeElement.click()")
+        press(browser, "r")
+        browser.wait("document.querySelector('#pending').innerText.includes('rejected by operator')")
+        assert browser.run("document.querySelector('#publish').disabled")
+        browser.run("document.querySelector('#pending button').click()")
+        press(browser, "u")
+        browser.wait("!document.querySelector('#pending').innerText.includes('rejected')")
+        browser.run("document.querySelector('#dry-run').click()")
+        browser.wait("document.querySelector('#difference').innerText.includes('1 tiles')")
+        browser.run("document.querySelector('#publish').click()")
+        browser.wait("document.activeElement.className === 'yes'")
+        browser.run("document.activeElement.click()")
+        browser.wait("document.querySelector('#which-map').innerText.endsWith('version 3')")
+        browser.wait("document.querySelector('#tally').innerText.includes('1 demolished')")
+        back = "[...document.querySelectorAll('#versions .link')].find(b => b.innerText === 'Go back to it')"
+        browser.run(f"{back}.click()")
+        browser.wait("document.querySelectorAll('#versions .yes').length")
+        browser.run("document.querySelector('#versions .yes').click()")
+        browser.wait("document.querySelector('#which-map').innerText.endsWith('version 4')")
+        assert browser.errors == []
+
+
+@pytest.mark.parametrize(("width", "height", "zoom"), [(1280, 800, 1), (360, 740, 1), (1280, 800, 2)])
+def test_axe_finds_nothing_and_nothing_is_cut_off(
+    browser: Chromium, store: Path, tmp_path: Path, width: int, height: int, zoom: int
+) -> None:
+    size = {"width": width // zoom, "height": height // zoom, "deviceScaleFactor": zoom, "mobile": False}
+    browser.call("Emulation.setDeviceMetricsOverride", **size)
+    try:
+        with serving(store, "--open", log=tmp_path / "log") as (url, _):
+            ready(browser, url)
+            browser.run("document.querySelector('#changes button').click()")
+            browser.call("Runtime.evaluate", expression=AXE.read_text())
+            told = "axe.run().then(r => r.violations.map(v => `${v.id}: ${v.nodes.map(n => n.html)}`))"
+            assert browser.run(told) == []
+            assert browser.run("document.documentElement.scrollWidth <= innerWidth")
+    finally:
+        browser.call("Emulation.setDeviceMetricsOverride", width=1280, height=800, deviceScaleFactor=1, mobile=False)
+
+
+def test_a_change_in_a_file_of_its_own_can_be_looked_at_offline(browser: Chromium, store: Path, tmp_path: Path) -> None:
+    opened = Store.open(f"sqlite:///{store}")
+    cutouts = cutouts_between(opened, 1, 2, changes_between(opened, 1, 2))
+    opened.close()
+    page = tmp_path / "changes.html"
+    page.write_text(whole_page("</title><script>alert(1)</script>", cutouts))
+    browser.open(page.as_uri())
+    browser.wait("document.querySelectorAll('.row button').length === 4")
+    assert text(browser, "h1") == "</title><script>alert(1)</script>"
+    browser.run("document.querySelectorAll('.row button')[2].click()")
+    assert browser.run("document.querySelectorAll('.row button')[2].getAttribute('aria-pressed')") == "true"
+    assert not [u for u in browser.requests if u.startswith("http")]
+    assert browser.errors == []
+    assert page.stat().st_size < 2_000_000
