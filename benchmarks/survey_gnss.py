@@ -158,6 +158,7 @@ def main() -> None:
     parser.add_argument("--length", type=float, default=1200.0)
     parser.add_argument("--seeds", type=int, nargs="*", default=[1, 2])
     parser.add_argument("--kitti", type=Path)
+    parser.add_argument("--both", action="store_true", help="also there and back")
     arguments = parser.parse_args()
     if arguments.kitti:
         kitti(arguments.kitti)
@@ -166,7 +167,8 @@ def main() -> None:
     for seed in arguments.seeds:
         drives, truths = bent_drives(arguments.length, seed)
         report(f"one drive, seed {seed}", drives[:1], truths[:1])
-        report(f"there and back, seed {seed}", drives, truths)
+        if arguments.both:
+            report(f"there and back, seed {seed}", drives, truths)
 
 
 if __name__ == "__main__":

@@ -28,13 +28,16 @@ def register(app: typer.Typer) -> None:
 def build(
     drives: Annotated[list[Path], typer.Argument(metavar="DRIVE...", help="one or more drives of the same place")],
     out: Annotated[Path, typer.Option(metavar="MAP", help="the map to write; a folder that does not exist yet")],
+    report_png: Annotated[
+        Path | None, typer.Option("--report", metavar="PNG", help="a picture of how the drives fit their priors")
+    ] = None,
     config: Config = None,
     *,
     drive_options: dict[str, Any],
 ) -> None:
     """Build the first map from one or more drives by NDT SLAM: de-skewed, without moving objects, 0.3 m voxels.
 
-    A precise prior (RTK) holds the map in its frame, a coarse one only starts the search, none is needed.
+    A precise prior (RTK) holds the map in its frame, coarse ones (GNSS) place it all together, none is needed.
 
         mapvote build MY_DRIVE --out my_map
     """
@@ -51,6 +54,11 @@ def build(
     with waiting(f"writing {out}"):
         write_map(point_map, out)
     _tell(report, out)
+    if report_png is not None:
+        from mapvote.evaluation.reporting.survey_figure import draw_survey
+
+        draw_survey(opened, report, report_png)
+        print(f"{report_png}: where the drives went, and how far off their priors")
 
 
 def _tell(report: BuildReport, out: Path) -> None:
