@@ -9,15 +9,16 @@ from scipy.spatial import cKDTree
 
 from mapvote.config import Settings
 from mapvote.core.geometry import exp, inverse, rotation_angle
-from mapvote.core.point_map import all_points
+from mapvote.core.point_map import all_points, map_from_points
 from mapvote.core.reference import reference_window
-from mapvote.core.types import F64, MapvoteError, Scan
+from mapvote.core.sensors import SENSORS
+from mapvote.core.types import F64, Drive, MapvoteError, Scan
 from mapvote.evaluation.scoring.truth import rigid_between
 from mapvote.formats import open_drive, read_T_map_lidar
 from mapvote.localisation.ndt import PosePrior
 from mapvote.localisation.tracker import MapWindow, Tracker
 from mapvote.simulation import simulate
-from mapvote.slam.build import BuildReport, build_map
+from mapvote.slam.build import BuildReport, _agreed_heights, build_map
 from streets import drive_along, path, street
 
 SURVEY = path(25, -15.0)
@@ -202,3 +203,15 @@ def test_localisation_in_our_own_map_of_a_simulated_street(corner: Path) -> None
     assert np.quantile(shifts, 0.99) < 0.2
     assert np.mean(trusted) >= 0.99
     assert np.median(turns) < 0.15  # 0.1 in the map's frame; here the map's own tilt of a three-second survey is in it
+
+
+def test_ground_that_the_path_contradicts_is_refused_with_the_place() -> None:
+    """Half of a drive stands 2 m higher over the ground than the other: one of the two is wrong."""
+    x, y = np.meshgrid(np.arange(0.15, 60.0, 0.3), np.arange(0.15, 12.0, 0.3))
+    flat = map_from_points(np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)]))
+    along = np.arange(2.0, 58.0)
+    path = np.column_stack([along, np.full(56, 6.0), np.where(along < 34.0, 1.8, 3.8)])
+    drive = Drive(Path("survey"), "v", "d", SENSORS["vlp16"], np.arange(56), lambda i: Scan(i, np.zeros((0, 3), "f4")))
+    with pytest.raises(MapvoteError, match=r"disagree by more than 0.3 m along 42.9% of the path, most by 2.00 m at"):
+        _agreed_heights(drive, flat, path)
+    assert _agreed_heights(drive, flat, path[:32]).complaint == ""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,7 @@ from mapvote.core.point_map import PointMap, all_points, map_from_points
 from mapvote.core.tile import Tile
 from mapvote.core.types import MapvoteError
 from mapvote.formats import read_map, write_map
+from mapvote.formats.describe import describe
 
 
 def small_map(seed: int = 0, offset: tuple[float, float] = (0.0, 0.0)) -> PointMap:
@@ -117,3 +119,16 @@ def test_a_manifest_of_another_kind_is_refused(tmp_path: Path, key: str, value: 
 def test_nothing_there() -> None:
     with pytest.raises(MapvoteError, match="nothing is there"):
         read_map("/nowhere/at/all")
+
+
+def test_the_driven_paths_come_back_and_info_says_how_high_the_sensor_stood(tmp_path: Path) -> None:
+    x, y = np.meshgrid(np.arange(0.15, 40.0, 0.3), np.arange(0.15, 12.0, 0.3))
+    road = np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)])
+    path = np.column_stack([np.arange(2.0, 38.0), np.full(36, 6.0), np.full(36, 1.73)])
+    write_map(replace(map_from_points(road), driven=(path,)), tmp_path / "map")
+    back = read_map(tmp_path / "map")
+    np.testing.assert_array_equal(back.driven[0], path)
+    rows = dict(describe(tmp_path / "map")[1])
+    assert rows["drive 1"] == "sensor 1.73 m over the ground (median), off by 0.00 m at most"
+    write_map(map_from_points(road), tmp_path / "imported")
+    assert read_map(tmp_path / "imported").driven == ()
