@@ -1,0 +1,40 @@
+"""What a reader of the documents relies on: links lead somewhere, lines fit a window, names are those of the house."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
+SOURCES = sorted([*(ROOT / "src").rglob("*.py"), *(ROOT / "src").rglob("*.js")])
+names = [str(page.relative_to(ROOT)) for page in PAGES]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=names)
+def test_every_link_of_a_page_leads_to_a_file(page: Path) -> None:
+    links = re.findall(r"\]\(([^)#]+)(?:#[^)]*)?\)", page.read_text())
+    local = [link for link in links if "://" not in link and not link.startswith("mailto:")]
+    assert [link for link in local if not (page.parent / link).exists()] == []
+
+
+@pytest.mark.parametrize("page", PAGES, ids=names)
+def test_lines_of_prose_wrap_at_120(page: Path) -> None:
+    text = re.sub(r"^```.*?^```", "", page.read_text(), flags=re.MULTILINE | re.DOTALL)
+    prose = [line for line in text.splitlines() if not line.startswith(("|", "!["))]
+    assert [line for line in prose if len(line) > 120] == []
+
+
+@pytest.mark.parametrize("page", PAGES, ids=names)
+def test_files_that_a_page_names_are_there(page: Path) -> None:
+    named = set(re.findall(r"`((?:[a-z_]+/)+[a-z_0-9]+\.(?:py|toml|js))`", page.read_text()))
+    rooms = (ROOT, ROOT / "src/mapvote", ROOT / "src/mapvote/evaluation", ROOT / "docs")
+    assert sorted(name for name in named if not any((room / name).exists() for room in rooms)) == []
+
+
+def test_no_source_refers_to_a_document_that_is_not_here() -> None:
+    for file in SOURCES:
+        for link in re.findall(r"docs/[\w/]+\.md", file.read_text()):
+            assert (ROOT / link).exists(), f"{file.relative_to(ROOT)} points at {link}"
