@@ -54,7 +54,9 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
         type_in("mapvote export my_map tiles")
         type_in("mapvote export my_map city.pcd")
         make_store(Path("STORE"))
-        shutil.copy("STORE", "fleet.db")
+        for copy in ("fleet.db", "BACKUP", "backup.db"):
+            shutil.copy("STORE", copy)
+        Path("key").write_text("mv_" + "0" * 40)
     finally:
         os.chdir(home)
     return folder

@@ -30,6 +30,9 @@ NOT_RUN = {
     r"^pip install": "changes the machine: tests/test_wheel.py installs every extra",
     r"^(systemctl|sqlite3|pg_dump) ": "another program's command",
     r"postgresql\+psycopg://mapvote@db": "names a machine that is not here; tests/server runs PostgreSQL",
+    r"\.\./shared/data/kitti": "needs the KITTI scans: tests/evaluation/experiments/real runs it where they are",
+    r"^mapvote evaluate real ": "takes minutes on a real drive: tests/evaluation/experiments/real runs it",
+    r"maps\.example\.org": "names a server that is not here: tests/cli/test_follow.py follows a real one",
     r"^mapvote serve ": "runs until it is stopped: tests/cli/test_interrupt.py does both",
     r"^mapvote (evaluate|simulate) paper ": "takes half an hour and gigabytes: `corner` is run from the help instead",
     r"^python benchmarks/": "takes minutes to hours: only its options are looked up here",
@@ -60,7 +63,12 @@ def not_run(line: str) -> str | None:
     return next((reason for pattern, reason in NOT_RUN.items() if re.search(pattern, line)), None)
 
 
-SHELL = [(where, commands(text)) for where, language, text in blocks() if language in ("", "sh", "bash", "console")]
+SHELL = [
+    (where, commands(text))
+    for where, language, text in blocks()
+    if language in ("", "sh", "bash", "console") and not where.startswith("docs/tutorial.md")
+]
+"""The tutorial is one story, from block to block: tests/cli/test_tutorial.py tells it whole."""
 ALTERNATIVES = [
     (where, [other]) for where, lines in SHELL for line in lines for other in re.findall(r"# or: (mapvote .*)", line)
 ]
@@ -134,7 +142,7 @@ def test_a_benchmark_of_a_page_is_there_and_takes_its_options(line: str) -> None
 
 
 def test_no_exemption_is_stale() -> None:
-    lines = [line for _, lines in SHELL for line in lines]
+    lines = [*(line for _, lines in SHELL for line in lines), *examples()]
     assert [pattern for pattern in NOT_RUN if not any(re.search(pattern, line) for line in lines)] == []
 
 

@@ -30,7 +30,7 @@ def build(folder: Path) -> Path:
     """One of everything."""
     rng = np.random.default_rng(0)
     points = rng.uniform([-30, -30, -1], [30, 30, 5], (60, 3))
-    point_map = map_from_points(points, georeference={"wkt": "X"})
+    point_map = map_from_points(points, georeference={"crs": "EPSG:32654"})
     for name in ("m.pcd", "m.ply", "m.las", "m.laz", "autoware"):
         export_map(point_map, folder / name)
     write_map(point_map, folder / "map")

@@ -63,6 +63,9 @@ def make_world() -> tuple[PointMap, PointMap]:
     return street(*stays, *old), street(*stays, *new)
 
 
+EMPTY_DESK = {"version": 2, "held": [], "pending": {"type": "FeatureCollection", "features": []}, "reviewed": []}
+
+
 @dataclass
 class FakeServer:
     """Answers the routes that the page asks for with the shapes that the server gives, and notes every request."""
@@ -80,7 +83,9 @@ class FakeServer:
             return 200, TYPES[name.rsplit(".", 1)[1]], page.read_bytes()
         if self.key is not None and key != f"Bearer {self.key}":
             return 401, "application/json", json.dumps({"detail": "this key is unknown or revoked"}).encode()
-        found = self.answers.get(path.removeprefix("/v1/"))
+        if path == "/v1/events":
+            return 200, "text/event-stream", b": listening\n\n"
+        found = self.answers.get(path.removeprefix("/v1/"), EMPTY_DESK if path == "/v1/desk" else None)
         if callable(found):
             found = found(query)
         if isinstance(found, bytes):

@@ -1,0 +1,26 @@
+"""The tutorial, word for word and from its first block to its last, on the scans that it speaks of."""
+
+from __future__ import annotations
+
+import os
+import re
+from pathlib import Path
+
+import pytest
+
+from command_line import type_in
+
+ROOT = Path(__file__).parents[2]
+DRIVE = ROOT / "../shared/data/kitti/2011_09_26_0001"
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not DRIVE.exists(), reason="the KITTI scans are not beside the repository")
+def test_the_tutorial_works_word_for_word(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    os.symlink(DRIVE.resolve(), "2011_09_26_drive_0001_sync")
+    text = (ROOT / "docs/tutorial.md").read_text()
+    for block in re.findall(r"^```\n(.*?)^```", text, re.MULTILINE | re.DOTALL):
+        for line in block.splitlines():
+            type_in(line)
+    assert (tmp_path / "street.pcd").exists()
