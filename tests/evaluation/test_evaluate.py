@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from pathlib import Path
 
 import numpy as np
@@ -131,7 +132,8 @@ def test_the_page_needs_nothing_else_and_escapes_what_it_is_given() -> None:
     assert "<script" not in html
     assert "A &lt;b&gt; title" in html
     assert "http://" not in html
-    assert "https://" not in html
+    loads = re.findall(r"""(?:\b(?:src|href)\s*=|\bfrom|\bimport\(|\bfetch\(|url\()\s*["']?https?://[^"')\s]*""", html)
+    assert loads == [], "it needs nothing from elsewhere; the scripts inside it may name addresses"
 
 
 @pytest.mark.slow
@@ -144,5 +146,6 @@ def test_the_demo_tells_its_story(tmp_path: Path) -> None:
         assert (tmp_path / "out" / name).stat().st_size > 100
     html = (tmp_path / "out" / "report.html").read_text()
     assert html.count("data:image/png;base64,") == len(list((tmp_path / "out" / "pictures").glob("*.png")))
-    assert "https://" not in html
+    loads = re.findall(r"""(?:\b(?:src|href)\s*=|\bfrom|\bimport\(|\bfetch\(|url\()\s*["']?https?://[^"')\s]*""", html)
+    assert loads == [], "it needs nothing from elsewhere; the scripts inside it may name addresses"
     assert evaluation.result.poses == "ndt"
