@@ -8,13 +8,13 @@ import numba
 import numpy as np
 
 from mapvote.config import VotingSettings
-from mapvote.core.columns import below_top, span_of
+from mapvote.core.columns import EVERY_BIT, below_top, span_of
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Grid, Lattice, TileIndex
 from mapvote.core.point_map import PointMap
 from mapvote.core.sensors import Sensor
 from mapvote.core.types import F32, F64, I32, N_STATES, NO_VOTE, U8, U64, CellState, Reference
 from mapvote.core.voting import VOTE_UNIT, cast, decide, weight_table
-from mapvote.detection.votes import ALL_BITS, TileVotes
+from mapvote.detection.votes import TileVotes
 from mapvote.perception.frontend import Observation
 from mapvote.perception.raycast import ScanView, Sight
 
@@ -151,13 +151,13 @@ class PaperVoter:
         """Cast one scan's votes; returns (rows, cols) words of voxels whose points may be new."""
         states, weights = classify_paper(seen.view, seen.reference, seen.scan.origin_map, self.sensor, self.voting)
         self._tally.cast(seen.view.grid, states, weights)
-        return np.where(states == CellState.CHANGED_OCCUPIED, ALL_BITS, np.uint64(0))
+        return np.where(states == CellState.CHANGED_OCCUPIED, EVERY_BIT, np.uint64(0))
 
     def votes(self) -> dict[TileIndex, TileVotes]:
         """Every tile with a vote, in ascending order."""
         out = {}
         for tile, tally in sorted(self._tally.tiles.items()):
             if tally.any():
-                new = np.where(tally[..., CellState.CHANGED_OCCUPIED] > 0, ALL_BITS, np.uint64(0))
+                new = np.where(tally[..., CellState.CHANGED_OCCUPIED] > 0, EVERY_BIT, np.uint64(0))
                 out[tile] = TileVotes(tally, decide(tally), None, None, new, None)
         return out

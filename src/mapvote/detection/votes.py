@@ -66,6 +66,3 @@ class TileVotes:
     """(256, 256) voxels whose points are new where the cell is changed-occupied."""
     free: U64 | None
     """(256, 256) voxels seen to be free in cells where the map knew of none; None: not asked."""
-
-
-ALL_BITS = ~np.uint64(0)
