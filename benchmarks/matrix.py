@@ -76,6 +76,7 @@ def write(results: dict[str, dict[int, MatrixResult]], out: Path) -> None:
     text = "\n".join(f"### {titles[name]}\n\n{matrix_tables.table(results, name)}" for name in results)
     if "main" in results:
         text += f"\n### main, class by class\n\n{matrix_tables.class_table(results, 'main')}"
+        text += f"\n### main, what perfect labels would score\n\n{matrix_tables.ceiling_table(results, 'main')}"
     with whole_file(out / "matrix.md") as partial:
         partial.write_text(f"## What must hold\n\n{requirements.table(results)}\n## Experiments\n\n{text}")
     with whole_file(out / "matrix.json") as partial:

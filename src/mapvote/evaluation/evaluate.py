@@ -89,6 +89,7 @@ def evaluate(
         map_shift=map_shift(scene),
         localisation=localisation(scene, drives),
         changed_areas=in_changed_areas(scene, truth, drives[0].vehicle, maps),
+        ceilings=jury.ceilings(),
         cases=entries,
         timings=Timings(
             prepare_s=prepared - started,

@@ -27,6 +27,8 @@ class Judgement(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     coverage: float
     """Share of the scored cells that some vehicle determined."""
     objects: ObjectScores
+    also: dict[str, Scores] = {}
+    """By the further truths of ``scoring/truths.py``."""
     map: MapScores | None = None
     """None (not in the JSON) where no map was edited: the yardsticks only decide cells."""
 
@@ -100,6 +102,8 @@ class EvaluationResult(msgspec.Struct, frozen=True, kw_only=True):
     """By vehicle."""
     changed_areas: dict[str, PoseErrors]
     """One vehicle's scans near changes, by map."""
+    ceilings: dict[str, Scores]
+    """By truth: what perfect labels on every measured point would score in cells."""
     cases: dict[str, CaseResult]
     timings: Timings
 
@@ -112,6 +116,8 @@ class MatrixResult(msgspec.Struct, frozen=True, kw_only=True):
     cells: int
     map_shift: MapShift
     localisation: dict[str, PoseErrors]
+    ceilings: dict[str, Scores]
+    """As of ``evaluate``."""
     rounds: dict[str, RoundResult]
 
 

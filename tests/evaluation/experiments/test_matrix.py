@@ -27,6 +27,7 @@ def scores(macro: float) -> Scores:
 def entry(macro: float, valid: float = 0.0) -> RoundResult:
     return RoundResult(
         strict=scores(macro), provenance=scores(macro), coverage=0.9,
+        also={"border": scores(macro), "border, provenance": scores(macro)},
         objects=ObjectScores((True, False), (True, True), (0.6, 0.1), (2.5, 1.5)),
         map=MapScores(
             stale_deleted=1.0, stale_apart_deleted=1.0, valid_deleted=valid, new_added=1.0, added_false=0.0,
@@ -38,7 +39,10 @@ def entry(macro: float, valid: float = 0.0) -> RoundResult:
 
 def of_rounds(**rounds: RoundResult) -> MatrixResult:
     shift = MapShift(0.0, 0.0, 0.0, 0.0, 0.0)
-    return MatrixResult(scenario="corner", seed=1, cells=1, map_shift=shift, localisation={}, rounds=rounds)
+    return MatrixResult(
+        scenario="corner", seed=1, cells=1, map_shift=shift, localisation={}, ceilings={"strict": scores(0.97)},
+        rounds=rounds,
+    )  # fmt: skip
 
 
 def test_a_result_is_the_same_after_it_was_written_and_read() -> None:

@@ -197,6 +197,7 @@ class Matrix:
             cells=int(scene.truth.strict.size),
             map_shift=map_shift(scene),
             localisation=localisation(scene, drives),
+            ceilings=jury.ceilings(),
             rounds=entries,
         )
 

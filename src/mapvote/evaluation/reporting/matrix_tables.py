@@ -58,8 +58,12 @@ def _points(entry: RoundResult) -> MapScores:
 FIGURES: Mapping[str, Figure] = {
     "strict": Figure("macro strict", lambda e: e.strict.macro_f1),
     "provenance": Figure("macro prov.", lambda e: e.provenance.macro_f1),
+    "border": Figure("macro border", lambda e: e.also["border"].macro_f1),
+    "border_provenance": Figure("macro border, prov.", lambda e: e.also["border, provenance"].macro_f1),
     "occupied": Figure("F1 ch.-occ. strict", lambda e: e.strict.f1.changed_occupied),
     "empty": Figure("F1 ch.-empty strict", lambda e: e.strict.f1.changed_empty),
+    "border_occupied": Figure("F1 ch.-occ. border", lambda e: e.also["border"].f1.changed_occupied),
+    "border_empty": Figure("F1 ch.-empty border", lambda e: e.also["border"].f1.changed_empty),
     "strict_old": Figure("macro strict, old surfaces unchanged", lambda e: e.strict_old_unchanged.macro_f1),
     "stale": Figure("stale deleted", lambda e: _points(e).stale_deleted, percent=True),
     "stale_apart": Figure("stale, .6 m off what stands", lambda e: _points(e).stale_apart_deleted, percent=True),
@@ -100,6 +104,18 @@ def table(results: Results, experiment: str) -> str:
             s = spread([figure.of(e) for e in entries.values()], figure.more_is_better)
             cells.append(figure.text(s))
         lines.append(f"| {name} | " + " | ".join(cells) + " |")
+    return "\n".join(lines) + "\n"
+
+
+def ceiling_table(results: Results, experiment: str) -> str:
+    """Markdown: what perfect labels would score, seed by seed: macro-F1, then changed-occupied / changed-empty."""
+    found = results.get(experiment, {})
+    names = list(next(iter(found.values())).ceilings) if found else []
+    lines = ["| seed | " + " | ".join(names) + " |", "|---" * (len(names) + 1) + "|"]
+    for seed, result in found.items():
+        scores = [result.ceilings[name] for name in names]
+        cells = [f"{s.macro_f1:.3f} ({s.f1.changed_occupied:.3f} / {s.f1.changed_empty:.3f})" for s in scores]
+        lines.append(f"| {seed} | " + " | ".join(cells) + " |")
     return "\n".join(lines) + "\n"
 
 

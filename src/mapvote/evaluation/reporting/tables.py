@@ -34,7 +34,7 @@ def _percent(value: float, digits: int = 1) -> str:
 
 
 def _by_truth(entry: CaseResult) -> dict[str, Scores]:
-    return {"strict": entry.strict, "provenance": entry.provenance}
+    return {"strict": entry.strict, "provenance": entry.provenance, **entry.also}
 
 
 def _class_table(title: str, ours: Mapping[str, ByClass], printed: Mapping[str, tuple[float, ...]]) -> Table:
@@ -63,7 +63,8 @@ def tables(result: EvaluationResult) -> Iterator[Table]:
         title="Table IV: F1, mean of the three classes; coverage; upload", box=box.SIMPLE_HEAD,
         title_justify="left", title_style="bold",
     )  # fmt: skip
-    for heading in ("", "strict", "provenance", "paper", "Kim's F1, strict", "coverage", "kB a ballot"):
+    also = list(result.ceilings)[2:]
+    for heading in ("", "strict", "provenance", *also, "paper", "Kim's F1, strict", "coverage", "kB a ballot"):
         f1.add_column(heading, justify="right" if heading else "left", style="dim" if heading == "paper" else "")
     for case, entry in result.cases.items():
         sent = entry.bytes_per_vehicle
@@ -71,11 +72,13 @@ def tables(result: EvaluationResult) -> Iterator[Table]:
             case_name(case),
             _share(entry.strict.macro_f1),
             _share(entry.provenance.macro_f1),
+            *(_share(entry.also[truth].macro_f1) for truth in also),
             _share(paper_tables.F1.get(case)),
             _share(entry.strict.kim_f1),
             _share(entry.coverage),
             f"{sum(sent) / len(sent) / 1000:.1f}" if sent else "",
         )
+    f1.add_row("perfect labels", *(_share(scores.macro_f1) for scores in result.ceilings.values()), style="dim")
     yield f1
     yield from _map_table(result)
     yield from _localisation_tables(result)

@@ -11,10 +11,12 @@ from mapvote.core.point_map import PointMap
 from mapvote.core.reference import reference_window
 from mapvote.core.types import F64, U8
 from mapvote.evaluation.results import Judgement
-from mapvote.evaluation.scoring.cells import coverage, score_cells
+from mapvote.evaluation.scoring.border import ceiling
+from mapvote.evaluation.scoring.cells import Scores, coverage, score_cells
 from mapvote.evaluation.scoring.map_points import MapJudge, MapScores, map_obstacles
 from mapvote.evaluation.scoring.objects import score_objects
 from mapvote.evaluation.scoring.truth import Truth
+from mapvote.evaluation.scoring.truths import TRUTHS
 from mapvote.fusion.fuse import Decision
 
 
@@ -37,12 +39,13 @@ class Jury:
 
     def __init__(self, first_map: PointMap, truth: Truth) -> None:
         self.truth = truth
+        self._also = {name: of(truth) for name, of in TRUTHS.items()}
         self.window = truth.grid_on(first_map.lattice)
         self._points = MapJudge(map_obstacles(first_map), *_above_ground(first_map, truth))
         self._objects = [{"kind": o["kind"], "cells": truth.cells_of(o["footprint"])} for o in truth.objects]
 
     def of_states(self, states: U8, vehicle_states: Sequence[U8]) -> Judgement:
-        """R for both truths, coverage, objects; all states over the truth's window."""
+        """Scores by every truth, coverage, objects; all states over the truth's window."""
         return self._judge(states, vehicle_states, None)
 
     def of_update(self, outcome: Outcome) -> Judgement:
@@ -50,11 +53,17 @@ class Jury:
         points = self._points.score(map_obstacles(outcome.updated))
         return self._judge(outcome.states, outcome.vehicle_states, points)
 
+    def ceilings(self) -> dict[str, Scores]:
+        """By truth: what perfect labels on every measured point would score (scoring/border.py)."""
+        truths = {"strict": self.truth.strict, "provenance": self.truth.provenance, **self._also}
+        return {name: ceiling(self.truth, cells) for name, cells in truths.items()}
+
     def _judge(self, states: U8, vehicle_states: Sequence[U8], points: MapScores | None) -> Judgement:
         strict, provenance = self.truth.strict, self.truth.provenance
         return Judgement(
             strict=score_cells(states, strict),
             provenance=score_cells(states, provenance),
+            also={name: score_cells(states, cells) for name, cells in self._also.items()},
             coverage=coverage(vehicle_states, strict),
             objects=score_objects(states, strict, self._objects, CELL_SIZE),
             map=points,
