@@ -7,10 +7,12 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Path, Query, Request, Response
 
 from mapvote.codec.arrays import compress
+from mapvote.core.types import MapvoteError
 from mapvote.server.http.auth import reviewer
-from mapvote.server.http.schemas import VersionQuery, problems
+from mapvote.server.http.schemas import LEAST, MOST, VersionQuery, problems
 from mapvote.server.http.services import services
 from mapvote.server.insight.clouds import evidence
+from mapvote.server.insight.history import picture_between
 from mapvote.server.insight.levels import N_LEVELS
 from mapvote.server.store.blobs import TileHashes
 
@@ -19,6 +21,7 @@ _FOR_EVER = "private, max-age=31536000, immutable"
 Digest = Annotated[str, Path(pattern=r"^[0-9a-f]{64}$")]
 _Pair = Annotated[str | None, Query(pattern=r"^[0-9a-f]{64}-[0-9a-f]{64}$")]
 _Index = Annotated[int, Path(ge=-(1 << 22), le=1 << 22)]
+_Metres = Annotated[float, Query(ge=-1e8, le=1e8, allow_inf_nan=False)]
 router = APIRouter()
 
 
@@ -57,6 +60,29 @@ def level_of(
 ) -> Response:
     """Immutable. Levels add to one another: every point is in exactly one of the six."""
     return _packed(request, services(request).clouds.levels(TileHashes(points, ground, None)).part(level), _FOR_EVER)
+
+
+@router.get(
+    "/v1/pictures",
+    responses=problems(404) | {200: {"content": {"image/png": {}}}},
+    response_class=Response,
+    summary="A place before and after",
+)
+def picture(
+    request: Request,
+    old: Annotated[int, Query(alias="from", ge=LEAST, le=MOST)],
+    new: Annotated[int, Query(alias="to", ge=LEAST, le=MOST)],
+    x0: _Metres,
+    y0: _Metres,
+    x1: _Metres,
+    y1: _Metres,
+) -> Response:
+    """PNG of two versions side by side, in and around a box in map metres: what went are blue crosses, what came red
+    diamonds. At most 76.8 m from 10 m below its lower-left corner are shown."""
+    if not (x0 <= x1 and y0 <= y1):
+        raise MapvoteError("a box has x0 <= x1 and y0 <= y1, map metres")
+    data = picture_between(services(request).store, old, new, (x0, y0, x1, y1))
+    return Response(data, media_type="image/png", headers={"Cache-Control": _FOR_EVER})
 
 
 @router.get(

@@ -30,6 +30,8 @@ _MODULES = (
     "standalone.js",
 )
 Tiles = Callable[[TileIndex], Tile]
+Box = tuple[float, float, float, float]
+"""x0, y0, x1, y1, map metres."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,16 +43,14 @@ class Cutout:
     x: float
     """Lower-left corner, map metres."""
     y: float
-    box: tuple[float, float, float, float]
-    """Of the change itself: x0, y0, x1, y1, map metres."""
+    box: Box
+    """Of the change itself."""
     height_m: float
     clouds: Mapping[str, bytes]
     """kept, removed and added, each as :func:`mapvote.server.insight.levels.cloud_bytes`."""
 
 
-def cut_out(
-    name: str, facts: str, box: Sequence[float], height_m: float, tiles: tuple[Tiles, Tiles], lattice: Lattice
-) -> Cutout:
+def cut_out(name: str, facts: str, box: Box, height_m: float, tiles: tuple[Tiles, Tiles], lattice: Lattice) -> Cutout:
     """The cloud within 10 m of a box (x0, y0, x1, y1), map metres, from the tiles before and after.
 
     At most 76.8 m of it, and 60,000 points evenly.
@@ -73,7 +73,7 @@ def cut_out(
         ):
             found[kind].append(_inside(points, window, far))
     clouds = {kind: cloud_bytes(*pack(_thinned(np.concatenate(some)), ground)) for kind, some in found.items()}
-    return Cutout(name, facts, window.x0, window.y0, (box[0], box[1], box[2], box[3]), height_m, clouds)
+    return Cutout(name, facts, window.x0, window.y0, box, height_m, clouds)
 
 
 def of_feature(feature: Mapping[str, Any], tiles: tuple[Tiles, Tiles], lattice: Lattice) -> Cutout:

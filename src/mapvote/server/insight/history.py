@@ -16,9 +16,10 @@ from mapvote.core.voting import decide
 from mapvote.fusion.tile_vote import TileVote, one_each
 from mapvote.server.insight.changes import Decided, change_objects, changed_cells
 from mapvote.server.insight.consensus import Compared, Spoken, Standing, compare, judge
-from mapvote.server.insight.cutout import Cutout, Tiles, of_feature
+from mapvote.server.insight.cutout import Box, Cutout, Tiles, cut_out, of_feature
 from mapvote.server.insight.explain import FOREVER, states_of
 from mapvote.server.insight.geojson import to_geojson
+from mapvote.server.insight.picture import before_and_after
 from mapvote.server.store import schema
 from mapvote.server.store.eligible_votes import Electorate, counting_votes, judged_votes, read_votes, standing_tiles
 from mapvote.server.store.policy import policy_in, recorded
@@ -58,21 +59,33 @@ def changes_between(store: Store, old: int, new: int, min_cells: int = 1, *, lon
 
 def cutouts_between(store: Store, old: int, new: int, found: Mapping[str, Any], most: int = 12) -> list[Cutout]:
     """The largest things of :func:`changes_between` with what stands around them, before and after."""
-    with store.database.reading() as connection:
-        hashes = tiles_of(connection, old), tiles_of(connection, new)
-
-    def look(side: int) -> Tiles:
-        @cache
-        def load(index: TileIndex) -> Tile:
-            with store.database.reading() as connection:
-                return load_tile(connection, store.lattice.tile(index), hashes[side].get(index))
-
-        return load
-
-    tiles = look(0), look(1)
+    tiles = _tiles_of(store, old), _tiles_of(store, new)
     large = [f for f in found["features"] if f["properties"]["size"] == "large"] or list(found["features"])
     largest = sorted(large, key=lambda f: -f["properties"]["area_m2"])[:most]
     return [of_feature(feature, tiles, store.lattice) for feature in largest]
+
+
+def picture_between(store: Store, old: int, new: int, box: Box) -> bytes:
+    """PNG of what stands in and 10 m around a box (x0, y0, x1, y1), map metres, in two versions, side by side.
+
+    NotFound if one of the versions does not exist.
+    """
+    tiles = _tiles_of(store, old), _tiles_of(store, new)
+    return before_and_after(cut_out("", "", box, 0.0, tiles, store.lattice))
+
+
+def _tiles_of(store: Store, version: int) -> Tiles:
+    """Tiles of one version by their index, each loaded once."""
+    with store.database.reading() as connection:
+        version_of(connection, version)
+        hashes = tiles_of(connection, version)
+
+    @cache
+    def load(index: TileIndex) -> Tile:
+        with store.database.reading() as connection:
+            return load_tile(connection, store.lattice.tile(index), hashes.get(index))
+
+    return load
 
 
 def _decided(store: Store, connection: sa.Connection, index: TileIndex, old: int, new: int) -> Iterable[Decided]:

@@ -13,7 +13,7 @@ import numba
 import numpy as np
 
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS
-from mapvote.core.types import F32, I64, U8, U16
+from mapvote.core.types import F32, F64, I64, U8, U16
 
 SPACINGS_M = (4.8, 2.4, 1.2, 0.6, 0.3)
 """Voxel side of each level; one more level takes what is left."""
@@ -76,6 +76,13 @@ def cloud_bytes(packed: U16, z0_m: float, z_step_m: float) -> bytes:
     (n, 4) uint16, all little-endian."""
     head = np.array([(_MAGIC, len(packed), z0_m, z_step_m)], dtype=_BYTES)
     return head.tobytes() + np.ascontiguousarray(packed, dtype="<u2").tobytes()
+
+
+def unpack_cloud(data: bytes) -> F64:
+    """(n, 3) metres from the tile's corner, of what :func:`cloud_bytes` gave."""
+    _, n, z0, step = np.frombuffer(data, dtype=_BYTES, count=1)[0]
+    packed = np.frombuffer(data, dtype="<u2", offset=16).reshape(int(n), 4).astype(np.float64)
+    return packed[:, :3] * [SIDE_M / _STEPS, SIDE_M / _STEPS, float(step)] + [0.0, 0.0, float(z0)]
 
 
 @numba.njit(cache=True, nogil=True)

@@ -52,6 +52,9 @@ const pair = (tile) => `${tile.points}-${tile.ground}`;
 export const cloudChanged = async (old, now) =>
   (await ask("clouds/changed", { ...(old && { old: pair(old) }), ...(now && { new: pair(now) }) })).arrayBuffer();
 
+// A place before and after, as an address that an <img> can show: the key travels with a request, not with a link.
+export const picture = async (asked) => URL.createObjectURL(await (await ask("pictures", asked)).blob());
+
 // A list as a file: fetched with the key, which a link cannot carry, and handed to the browser.
 export async function download(path, parameters, name) {
   const made = URL.createObjectURL(await (await ask(path, parameters)).blob());

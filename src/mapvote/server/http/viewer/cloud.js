@@ -9,6 +9,13 @@ import { Orbit } from "./orbit.js";
 import { COLOUR, MARK, POINT_FRAGMENT, POINT_VERTEX, QUAD_FRAGMENT, QUAD_VERTEX, RAMPS } from "./shaders.js";
 
 export const TILE = 76.8;
+
+// Where the ground of a cloud lies, metres: by what most of its points say, for some may be reflections far below it.
+export function groundOf({ z0, zStep, packed }) {
+  const said = [];
+  for (let i = 0; i < packed.length; i += 4) said.push(z0 + packed[i + 2] * zStep - (packed[i + 3] - 1000) / 100);
+  return said.sort((a, b) => a - b)[said.length >> 1] ?? z0;
+}
 const NEAR_SHARE = 0.01;
 ColorManagement.enabled = false;  // the page's colours, as they are
 

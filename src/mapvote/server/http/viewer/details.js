@@ -48,8 +48,26 @@ export function showChange(id) {
       [p.versions.length > 1 ? "versions" : "version", p.versions.join(", ") || "unknown"],
     ]),
     p.near?.length > 0 && element("p", { className: "hint" }, ["near it: ", ...p.near.map((other) => near(other))]),
+    beforeAndAfter(p),
     link("Who voted here?", () => showCell([x + 0.15, y + 0.15])),
   ]);
+}
+
+// The server's picture; it comes when it comes, and a change without one is told all the same.
+function beforeAndAfter(p) {
+  const [[x0, y0], [x1, y1]] = p.box ?? [[NaN, NaN], [NaN, NaN]];
+  const figure = element("figure", { hidden: true }, []);
+  const asked = { from: $("from").value, to: $("to").value, x0, y0, x1, y1 };
+  if (Number.isFinite(x0)) api.picture(asked).then((src) => {
+    const alt = `Before and after: ${p.kind === "built" ? "what came are red diamonds" : "what went are blue crosses"}`;
+    const image = element("img", { src, alt, width: 608, height: 260 }, []);
+    const large = element("button", { type: "button", title: "Larger, or small again", ariaExpanded: "false" }, [image]);
+    large.onclick = () => (large.ariaExpanded = String(large.ariaExpanded !== "true"));
+    const sides = ["before", "after"].map((side) => element("span", {}, [side]));
+    figure.replaceChildren(large, element("figcaption", {}, sides));
+    figure.hidden = false;
+  }, () => null);
+  return figure;
 }
 
 function near(id) {
@@ -96,7 +114,7 @@ function details(title, kind, content) {
     element("button", { className: "close", title: "Close", ariaLabel: "Close", onclick: closeDetails }, ["\u00d7"]),
     element("h2", { className: "unseen" }, ["Chosen"]),
     element("h3", {}, [kind && dot(kind), title]),
-    ...content,
+    ...content.filter(Boolean),
   );
   $("details").hidden = false;
 }

@@ -92,12 +92,12 @@ export class Stage {
     this.cloud.orbit.flyTo(box, this.groundAt(box) + height / 3, { margin: wide, height, ...flight });
   }
 
-  // About where the ground lies there: the lowest point of the tile's coarse picture.
+  // About where the ground lies there, by the tile's coarse picture.
   groundAt(box) {
     const [x, y] = [(box[0] + box[2]) / 2, (box[1] + box[3]) / 2];
     const inside = (t) => x >= t.x && x < t.x + 76.8 && y >= t.y && y < t.y + 76.8 && t.levels.length;
     const near = this.stream?.tiles.find(inside) ?? this.stream?.tiles.find((t) => t.levels.length);
-    return near?.low ?? 0;
+    return near?.ground ?? 0;
   }
 
   zoom(factor) {

@@ -1,6 +1,6 @@
 // Changes cut out of their map, in a page of their own: turn them, look before and after.
 
-import { Cloud } from "./cloud.js";
+import { Cloud, groundOf } from "./cloud.js";
 import { MARK } from "./shaders.js";
 
 const home = document.querySelector(".cutouts"), [which, when] = home.querySelectorAll(".row");
@@ -29,8 +29,8 @@ function show() {
 function turn(at) {
   chosen = at;
   show();
-  const c = all[at], low = unpack(bytes(c.kept)).z0;
-  cloud.orbit.flyTo(c.box, low + c.height / 3, { at_once: true, elevation: 0.5, margin: 1.7, height: c.height });
+  const c = all[at], ground = groundOf(unpack(bytes(c.kept)));
+  cloud.orbit.flyTo(c.box, ground + c.height / 3, { at_once: true, elevation: 0.5, margin: 1.7, height: c.height });
 }
 
 function press() {

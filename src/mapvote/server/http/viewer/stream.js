@@ -1,7 +1,7 @@
 // Which parts of which tiles: what is in view, coarse first, as many points as the frame rate allows.
 
 import { Box3, Vector3 } from "./vendor/three.module.min.js";
-import { TILE } from "./cloud.js";
+import { groundOf, TILE } from "./cloud.js";
 import { MARK } from "./shaders.js";
 
 export const SPACING = [4.8, 2.4, 1.2, 0.6, 0.3, 0.15];  // metres between the points of each level
@@ -30,7 +30,7 @@ export class Stream {
     const made = [];
     const want = (name, hashes, side) => {
       const id = `${name} ${hashes.points} ${side}`, [row, col] = name.split(",").map(Number);
-      const fresh = { id, name, hashes, side, x: lattice.x0 + col * TILE, y: lattice.y0 + row * TILE, levels: [], low: 0, high: 12, evidence: null };
+      const fresh = { id, name, hashes, side, x: lattice.x0 + col * TILE, y: lattice.y0 + row * TILE, levels: [], low: 0, ground: 0, high: 12, evidence: null };
       made.push(known.get(id) ?? fresh);
       known.delete(id);
     };
@@ -59,10 +59,11 @@ export class Stream {
     }
   }
 
-  take(tile, level, { z0, zStep, packed }, next, spacing) {
+  take(tile, level, cloud, next, spacing) {
+    const { z0, zStep, packed } = cloud;
     const part = this.cloud.add({ ...tile, z0, zStep, packed, spacing, tile, level, evidence: tile.evidence });
     if (!tile.levels.length) {
-      tile.low = z0;
+      Object.assign(tile, { low: z0, ground: groundOf(cloud) });
       let top = 0;
       for (let i = 2; i < packed.length; i += 4) top = Math.max(top, packed[i]);
       tile.high = z0 + top * zStep;
