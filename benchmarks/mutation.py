@@ -1,171 +1,189 @@
 """Do the tests notice a changed operator? Random one-operator mutants of the modules that decide.
 
-    python benchmarks/mutation.py [--mutants 200] [--seed 1] [--only fusion/fuse.py] [--out results/mutants.csv]
+    python benchmarks/mutation.py [--mutants 200] [--seed 1] [--only fusion/fuse.py] [--minutes 14]
 
-Each mutant is one comparison, arithmetic, logical or bit operator, constant or negation of one module changed; it is
-killed if a test of those that name the module fails.
+Every module gives the same number of mutants, drawn by the seed. A mutant is killed if a test of those that name its
+module fails, crashes or takes too long. Results are added to ``results/mutation.csv`` as they come: a run that was cut
+goes on where it stopped, and survivors are tried again once a test has changed. Mutants of a module that has changed
+since are thrown away. ``--report`` runs nothing and writes docs/mutation.md.
 """
 
 from __future__ import annotations
 
 import argparse
-import ast
-import csv
+import hashlib
 import os
 import random
+import resource
 import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
-from dataclasses import dataclass
+import time
 from pathlib import Path
 
-from rich.console import Console
-from rich.table import Table
+from mutants_of_code import Mutant, mutants_of
+from mutation_results import COLUMNS, ROOT, Result, read_results, report, write_results
+from numba_caches import link_others
 
-ROOT = Path(__file__).parent.parent
 TESTS = {
     "core/voting.py": ["core/test_voting.py", "core/test_voting_model.py", "fusion/test_fuse.py"],
-    "fusion/fuse.py": ["fusion/test_fuse.py", "fusion/test_outliers.py"],
+    "fusion/fuse.py": ["fusion/test_fuse.py", "fusion/test_outliers.py", "fusion/test_persistence.py"],
     "fusion/tile_vote.py": ["fusion/test_tile_vote.py", "fusion/test_fuse.py"],
     "fusion/edit.py": ["fusion/test_edit.py", "fusion/test_fuse.py"],
     "fusion/outliers.py": ["fusion/test_outliers.py"],
-    "server/store/eligible_votes.py": ["server/store"],
-    "detection/paper.py": ["detection/test_paper.py", "detection/test_voters.py"],
+    "fusion/spent.py": ["fusion/test_spent.py"],
+    "fusion/persistence.py": ["fusion/test_persistence.py"],
+    "server/store/eligible_votes.py": ["server/store/test_eligible_votes.py", "server/store/test_rules.py"],
+    "server/store/hold.py": ["server/store/test_hold.py"],
+    "detection/paper.py": ["detection/test_paper.py"],
+    "detection/counters.py": ["detection/test_counters.py"],
     "detection/columns.py": ["detection/test_columns.py", "detection/test_voters.py"],
-    "detection/regions.py": ["detection"],
+    "detection/regions.py": ["detection/test_regions.py", "detection/test_columns.py", "detection/test_voters.py"],
     "perception/raycast.py": ["perception/test_raycast.py"],
-    "localisation/tracker.py": ["localisation"],
+    "localisation/tracker.py": ["localisation/test_tracker.py", "localisation/test_localiser.py"],
+    "localisation/trust.py": ["localisation/test_trust.py", "localisation/test_localiser.py"],
     "evaluation/scoring/cells.py": ["evaluation/scoring"],
     "evaluation/scoring/objects.py": ["evaluation/scoring"],
+    "evaluation/scoring/map_points.py": ["evaluation/scoring"],
+    "evaluation/scoring/truth.py": ["evaluation/scoring"],
 }
-SWAPS: dict[type[ast.AST], type[ast.AST]] = {
-    ast.Lt: ast.LtE, ast.LtE: ast.Lt, ast.Gt: ast.GtE, ast.GtE: ast.Gt, ast.Eq: ast.NotEq, ast.NotEq: ast.Eq,
-    ast.Add: ast.Sub, ast.Sub: ast.Add, ast.Mult: ast.Add, ast.And: ast.Or, ast.Or: ast.And,
-    ast.BitAnd: ast.BitOr, ast.BitOr: ast.BitAnd, ast.LShift: ast.RShift, ast.RShift: ast.LShift,
-}  # fmt: skip
-
-
-@dataclass(frozen=True)
-class Mutant:
-    """One change of one module."""
-
-    module: str
-    line: int
-    what: str
-    text: str
-
-
-def mutants_of(module: str) -> list[Mutant]:
-    """Every one-operator mutant of a module."""
-    source = (ROOT / "src/mapvote" / module).read_text()
-    return [Mutant(module, line, what, ast.unparse(tree)) for line, what, tree in _changed(source)]
-
-
-def _changed(source: str) -> Iterator[tuple[int, str, ast.Module]]:
-    for i in range(len(_sites(ast.parse(source)))):
-        tree = ast.parse(source)
-        node, field, at = _sites(tree)[i]
-        line = next(getattr(n, "lineno", 0) for n in (node, field) if hasattr(n, "lineno"))
-        yield line, _mutate(node, at), tree
-
-
-def _sites(tree: ast.Module) -> list[tuple[ast.AST, ast.AST, int]]:
-    """(node, where it stands, which of its operators) of all that can change; annotations and docstrings cannot."""
-    left_out: set[int] = set()
-    for node in ast.walk(tree):
-        for name in ("annotation", "returns"):
-            if getattr(node, name, None) is not None:
-                left_out |= {id(n) for n in ast.walk(getattr(node, name))}
-        for decorator in getattr(node, "decorator_list", []):
-            left_out |= {id(n) for n in ast.walk(decorator)}
-    found: list[tuple[ast.AST, ast.AST, int]] = []
-    for node in ast.walk(tree):
-        if id(node) in left_out:
-            continue
-        if isinstance(node, ast.Compare):
-            found += [(node, node, k) for k, op in enumerate(node.ops) if type(op) in SWAPS]
-        elif (
-            (isinstance(node, ast.BinOp | ast.BoolOp | ast.AugAssign) and type(node.op) in SWAPS)
-            or (isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.Not | ast.Invert))
-            or (isinstance(node, ast.Constant) and type(node.value) in (int, bool) and hasattr(node, "lineno"))
-        ):
-            found.append((node, node, 0))
-    return found
-
-
-def _mutate(node: ast.AST, at: int) -> str:
-    """Change a node in place; says how."""
-    before = ast.unparse(node)
-    if isinstance(node, ast.Compare):
-        node.ops[at] = SWAPS[type(node.ops[at])]()  # type: ignore[assignment]
-    elif isinstance(node, ast.BinOp | ast.BoolOp | ast.AugAssign):
-        node.op = SWAPS[type(node.op)]()  # type: ignore[assignment]
-    elif isinstance(node, ast.UnaryOp):
-        node.op = ast.UAdd()
-    elif isinstance(node, ast.Constant):
-        node.value = (not node.value) if isinstance(node.value, bool) else node.value + 1  # type: ignore[operator]
-    return f"{before} -> {ast.unparse(node)}"
-
-
-def killed(mutant: Mutant, house: Path) -> bool:
-    """Whether the module's tests fail on it, in a copy of the house."""
-    file = house / "src/mapvote" / mutant.module
-    original = file.read_text()
-    # numba does not see that a kernel called from another module has changed.
-    for cache in (house / "src").rglob("*.nb[ic]"):
-        if cache.parent.parent == file.parent or _imports(cache.parent.parent, mutant.module):
-            cache.unlink()
-    file.write_text(mutant.text)
-    tests = [f"tests/{t}" for t in TESTS[mutant.module] if (house / "tests" / t).exists()]
-    environment = {**os.environ, "PYTHONPATH": str(house / "src"), "OMP_NUM_THREADS": "1"}
-    command = [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", *tests]
-    try:
-        done = subprocess.run(command, cwd=house, env=environment, capture_output=True, timeout=300)
-        return done.returncode != 0
-    except subprocess.TimeoutExpired:
-        return True
-    finally:
-        file.write_text(original)
-
-
-def _imports(folder: Path, module: str) -> bool:
-    name = "mapvote." + module.removesuffix(".py").replace("/", ".")
-    return any(name in file.read_text() for file in folder.glob("*.py"))
+"""The deciding modules, and the tests that name them, quick ones first."""
+HOUSE = Path(tempfile.gettempdir()) / "mapvote-mutation"
+"""A copy of the sources, in which the mutants live, and numba's caches."""
+MEMORY_BYTES = 8 << 30
+"""Of address space: a mutant that asks for all memory gets none."""
+QUICK = """
+from hypothesis import Phase, settings
+phases = [Phase.explicit, Phase.generate]
+settings.register_profile("quick", derandomize=True, deadline=None, database=None, phases=phases)
+"""
+"""Hypothesis' profile: what falsifies a mutant need not be made small."""
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--mutants", type=int, default=200)
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--only", help="one module, e.g. fusion/fuse.py")
-    parser.add_argument("--out", type=Path, default=Path("results/mutants.csv"))
+    parser.add_argument("--only", nargs="+", choices=list(TESTS), default=list(TESTS), metavar="MODULE")
+    parser.add_argument("--minutes", type=float, default=1e9, help="stop after this long; the next run goes on")
+    parser.add_argument("--out", type=Path, default=ROOT / "results/mutation.csv")
+    parser.add_argument("--report", action="store_true", help="only write docs/mutation.md from the results")
     arguments = parser.parse_args()
-    chance = random.Random(arguments.seed)
-    modules = [arguments.only] if arguments.only else list(TESTS)
-    share = -(-arguments.mutants // len(modules))
-    every = {module: mutants_of(module) for module in modules}
-    chosen = [mutant for some in every.values() for mutant in chance.sample(some, min(share, len(some)))]
-    rows, score = [], {module: [0, 0] for module in modules}
-    with tempfile.TemporaryDirectory() as folder:
-        house = Path(folder)
-        for part in ("src", "tests", "pyproject.toml"):
-            (shutil.copytree if (ROOT / part).is_dir() else shutil.copy)(ROOT / part, house / part)
-        for mutant in chosen:
-            dead = killed(mutant, house)
-            score[mutant.module][0] += dead
-            score[mutant.module][1] += 1
-            rows.append([mutant.module, mutant.line, mutant.what, "killed" if dead else "survived"])
-            print(*rows[-1], sep="  ", flush=True)
-            arguments.out.parent.mkdir(parents=True, exist_ok=True)
-            with arguments.out.open("w", newline="") as file:
-                csv.writer(file).writerows([["module", "line", "change", "outcome"], *rows])
-    table = Table("module", "killed", "of")
-    for module, (dead, of) in score.items():
-        table.add_row(module, str(dead), str(of))
-    table.add_row("all", str(sum(d for d, _ in score.values())), str(len(chosen)))
-    Console().print(table)
+    if not arguments.report:
+        until = time.monotonic() + 60.0 * arguments.minutes
+        copy_house()
+        for module in arguments.only:
+            share = -(-arguments.mutants // len(TESTS))
+            try_module(module, share, arguments.seed, arguments.out, until)
+    if arguments.out == ROOT / "results/mutation.csv":
+        report(read_results(arguments.out))
+
+
+def copy_house() -> None:
+    """The sources and tests of today, byte for byte and with their times, which numba's caches go by."""
+    for part in ("src", "tests"):
+        shutil.rmtree(HOUSE / part, ignore_errors=True)
+        shutil.copytree(ROOT / part, HOUSE / part, ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copy2(ROOT / "pyproject.toml", HOUSE / "pyproject.toml")
+    (HOUSE / "tests" / "quick_hypothesis.py").write_text(QUICK)
+
+
+def try_module(module: str, share: int, seed: int, out: Path, until: float) -> None:
+    """Run what is still to be run of a module's mutants."""
+    source = (ROOT / "src/mapvote" / module).read_text()
+    every = list(mutants_of(module, source))
+    drawn = random.Random(f"{seed} {module}").sample(every, min(share, len(every)))
+    of_source, of_tests = digest(ROOT / "src/mapvote" / module), digest(*(ROOT / "tests" / t for t in TESTS[module]))
+    known = {
+        (r.place, r.seed): r
+        for r in read_results(out)
+        if r.module == module and r.source == of_source and (r.outcome != "survived" or r.tests == of_tests)
+    }
+    waiting = [mutant for mutant in drawn if (mutant.place, seed) not in known]
+    # What is known of mutants that this seed never drew, or of other seeds, stays; what is out of date goes.
+    others = [r for r in read_results(out) if r.module != module or (r.source == of_source and r.seed != seed)]
+    write_results(out, [*others, *(known[m.place, seed] for m in drawn if (m.place, seed) in known)])
+    if not waiting or time.monotonic() > until:
+        return
+    limit_s = 60.0 + 4.0 * unchanged(module)
+    for mutant in waiting:
+        if time.monotonic() > until:
+            return
+        outcome, seconds = try_mutant(mutant, limit_s)
+        result = Result(seed, module, mutant.place, mutant.line, mutant.change, outcome, seconds, of_source, of_tests)
+        print(*(getattr(result, column) for column in COLUMNS[1:7]), sep="  ", flush=True)
+        write_results(out, [*read_results(out), result])
+
+
+def digest(*paths: Path) -> str:
+    """Of files and folders of Python."""
+    if missing := [str(path) for path in paths if not path.exists()]:
+        raise SystemExit(f"{', '.join(missing)}: not there")
+    files = sorted(file for path in paths for file in ([path] if path.is_file() else path.rglob("*.py")))
+    return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()[:12]
+
+
+def common_cache() -> Path:
+    """Where numba keeps the kernels of these very sources."""
+    return HOUSE / f"cache-{digest(ROOT / 'src')}"
+
+
+def unchanged(module: str) -> float:
+    """Seconds that the module's tests take as it is, and pass; everything is compiled afterwards."""
+    done, _ = run_tests(module, common_cache(), 900.0)
+    if done != "survived":
+        raise SystemExit(f"{module}: its tests do not pass ({done}); see {HOUSE / 'last-run.txt'}")
+    return run_tests(module, common_cache(), 900.0)[1]
+
+
+def try_mutant(mutant: Mutant, limit_s: float) -> tuple[str, float]:
+    """(outcome, seconds) of the module's tests on a mutant."""
+    file = HOUSE / "src/mapvote" / mutant.module
+    cache = HOUSE / "cache-of-mutant"
+    shutil.rmtree(cache, ignore_errors=True)
+    link_others(common_cache(), cache, ROOT / "src/mapvote", mutant.module)
+    file.write_text(mutant.text)
+    try:
+        return run_tests(mutant.module, cache, limit_s)
+    finally:
+        shutil.copy2(ROOT / "src/mapvote" / mutant.module, file)
+
+
+def run_tests(module: str, cache: Path, limit_s: float) -> tuple[str, float]:
+    """(killed, crashed, hangs or survived, seconds). SystemExit if pytest itself failed."""
+    environment = {**os.environ, "PYTHONPATH": f"{HOUSE / 'src'}:{HOUSE / 'tests'}", "NUMBA_CACHE_DIR": str(cache)}
+    environment |= {"OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1", "PYTHONDONTWRITEBYTECODE": "1"}
+    tests = [f"tests/{test}" for test in TESTS[module]]
+    options = ["-q", "-x", "-p", "no:cacheprovider", "-p", "quick_hypothesis", "--hypothesis-profile=quick"]
+    command = [sys.executable, "-m", "pytest", *options, *tests]
+    began = time.monotonic()
+    with (HOUSE / "last-run.txt").open("w") as log:
+        running = subprocess.Popen(
+            command,
+            cwd=HOUSE,
+            env=environment,
+            stdout=log,
+            stderr=log,
+            start_new_session=True,
+            preexec_fn=_limit_memory,
+        )
+        try:
+            code = running.wait(limit_s)
+        except subprocess.TimeoutExpired:
+            os.killpg(running.pid, 9)
+            running.wait()
+            return "hangs", time.monotonic() - began
+    seconds = time.monotonic() - began
+    if code < 0:
+        return "crashed", seconds
+    if code not in (0, 1, 2):  # 2: a module that cannot be imported
+        raise SystemExit(f"{module}: pytest ended with {code}; see {HOUSE / 'last-run.txt'}")
+    return "killed" if code else "survived", seconds
+
+
+def _limit_memory() -> None:
+    resource.setrlimit(resource.RLIMIT_AS, (MEMORY_BYTES, MEMORY_BYTES))
 
 
 if __name__ == "__main__":

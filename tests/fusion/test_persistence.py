@@ -1,0 +1,217 @@
+"""Things that come and go: how long what is new can be expected to stay, and what a cell remembers of the past."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from hand_made import SHAPE, make_tile, states_plane, wall
+from mapvote.config import FuseSettings
+from mapvote.core.memory import Memory
+from mapvote.core.tile import Tile
+from mapvote.core.types import Bool, CellState
+from mapvote.fusion.fuse import fuse_tile
+from mapvote.fusion.persistence import DAY_S, ages_days, doubtful, expected_days, remembered, temporary
+from mapvote.fusion.tile_vote import TileVote
+
+UO, UE, CO, CE, UN = (int(state) for state in CellState)
+CELL, OTHER = (10, 10), (200, 3)
+SETTINGS = FuseSettings(stay_days=30.0, prior_stay_days=30.0, min_votes=2)
+START_S = 1_700_000_000
+
+
+def at(*cells: tuple[int, int]) -> Bool:
+    out = np.zeros(SHAPE, dtype=np.bool_)
+    for cell in cells:
+        out[cell] = True
+    return out
+
+
+def memory(stays: int = 0, stayed_days: float = 0.0, came_s: int = 0, cell: tuple[int, int] = CELL) -> Memory:
+    planes = Memory.none().planes
+    planes[1][cell], planes[2][cell], planes[3][cell] = came_s, stays, stayed_days * DAY_S
+    return Memory(planes)
+
+
+def drive(day: float, states: dict[tuple[int, int], int], vehicle: str = "v") -> TileVote:
+    end_ns = (START_S + round(day * DAY_S)) * 10**9
+    return TileVote(vehicle, end_ns, f"{vehicle}{day}", states=states_plane(states))
+
+
+def drives(*said: tuple[float, int]) -> list[TileVote]:
+    return [drive(day, {CELL: state}) for day, state in said]
+
+
+def age(seen: Sequence[TileVote], breaks: int = 2) -> float:
+    return float(ages_days(seen, at(CELL), breaks)[0])
+
+
+@given(st.integers(0, 50), st.floats(0, 300), st.floats(0, 100))
+def test_the_expected_stay_is_prior_past_and_present_over_one_more_than_the_past_stays(
+    stays: int, stayed_days: float, days: float
+) -> None:
+    found = expected_days(memory(stays, stayed_days), at(CELL), days, SETTINGS)
+    assert found.tolist() == pytest.approx([(30.0 + stayed_days + days) / (1 + stays)], abs=1e-4)
+
+
+def test_where_nothing_is_remembered_what_is_new_is_expected_to_stay_as_long_as_the_prior_says() -> None:
+    assert expected_days(None, at(CELL, OTHER), 0.0, SETTINGS).tolist() == [30.0, 30.0]
+    assert expected_days(None, at(CELL, OTHER), np.array([1.0, 2.5]), SETTINGS).tolist() == [31.0, 32.5]
+
+
+def test_each_cell_has_its_own_past() -> None:
+    past = memory(1, 10.0, cell=CELL)
+    assert expected_days(past, at(CELL, OTHER), 0.0, SETTINGS).tolist() == [20.0, 30.0]  # CELL comes first
+
+
+def test_new_things_are_in_doubt_where_others_came_and_went_and_nothing_else_ever_is() -> None:
+    states = states_plane({CELL: CO, OTHER: CO, (1, 1): CE, (1, 2): UO, (1, 3): UN})
+    assert np.argwhere(doubtful(states, memory(1, 0.0), SETTINGS)).tolist() == [list(CELL)]
+    assert not doubtful(states, None, SETTINGS).any()
+    assert not doubtful(states, memory(1, 30.0), SETTINGS).any(), "thirty days are just long enough"
+    assert doubtful(states, memory(1, 29.9), SETTINGS)[CELL]
+    everywhere = doubtful(states, None, SETTINGS.model_copy(update={"prior_stay_days": 29.0}))
+    assert np.argwhere(everywhere).tolist() == [list(CELL), list(OTHER)]
+
+
+def test_a_thing_is_as_old_as_the_time_from_its_first_sighting_to_its_last() -> None:
+    assert age(drives((0, CO), (1, CO), (5, CO))) == 5.0
+    assert age(drives((5, CO), (0, CO), (1, CO))) == 5.0, "in whatever order the drives are given"
+    assert age(drives((0, UE), (2, CO), (5, UN), (7, UO))) == 0.0, "only who sees it says that it is there"
+    assert age(drives((0, UE), (1, UN))) == 0.0, "nothing was ever there"
+    assert age([]) == 0.0
+
+
+def test_so_many_in_a_row_that_see_nothing_begin_it_anew_and_fewer_do_not() -> None:
+    assert age(drives((0, CO), (1, UE), (4, CO))) == 4.0
+    assert age(drives((0, CO), (1, UE), (2, UE), (4, CO), (6, CO))) == 2.0
+    assert age(drives((0, CO), (1, UE), (2, CO), (3, UE), (4, CO))) == 4.0, "not in a row"
+    assert age(drives((0, CO), (1, UE), (2, UE))) == 0.0, "gone"
+    assert age(drives((0, CO), (1, UE), (4, CO)), breaks=1) == 0.0
+    assert age(drives((0, CO), (1, UE), (2, UE), (4, CO)), breaks=3) == 4.0
+
+
+def test_cells_age_each_by_itself_and_others_are_not_asked() -> None:
+    seen = [drive(0, {CELL: CO, (0, 0): CO}), drive(2, {OTHER: CO}), drive(3, {CELL: CO, OTHER: UE}), drive(9, {})]
+    assert ages_days(seen, at(CELL, OTHER), 1).tolist() == [3.0, 0.0]
+
+
+def test_a_clock_that_stood_before_1970_is_taken_for_1970() -> None:
+    early = TileVote("v", -5 * DAY_S * 10**9, "x", states=states_plane({CELL: CO}))
+    late = TileVote("v", 2 * DAY_S * 10**9, "y", states=states_plane({CELL: CO}))
+    assert age([early, late]) == 2.0
+
+
+NEW = states_plane({CELL: CO})
+
+
+@pytest.mark.parametrize(
+    ("stays", "stayed_days", "seen_days", "stays_out"),
+    [
+        (0, 0.0, 0.0, False),  # nothing ever went here
+        (1, 0.0, 0.0, True),  # 30 / 2
+        (1, 0.0, 29.0, True),  # (30 + 29) / 2
+        (1, 0.0, 30.0, False),  # it has stood for as long as is asked
+        (1, 20.0, 10.0, False),  # (30 + 20 + 10) / 2 is just enough
+        (1, 20.0, 9.0, True),
+        (9, 0.0, 30.0, False),  # whatever came and went: it has stood long enough
+    ],
+)
+def test_what_is_new_where_things_come_and_go_stays_out_until_it_can_be_expected_to_stay(
+    stays: int, stayed_days: float, seen_days: float, stays_out: bool
+) -> None:
+    tile = replace(make_tile(wall([], [])), memory=memory(stays, stayed_days))
+    seen = drives((0.0, CO), (seen_days, CO))
+    assert np.argwhere(temporary(NEW, tile, seen, SETTINGS)).tolist() == ([list(CELL)] if stays_out else [])
+
+
+def test_absence_is_counted_by_the_quorum() -> None:
+    tile = replace(make_tile(wall([], [])), memory=memory(1, 0.0))
+    seen = drives((0.0, CO), (1.0, UE), (31.0, CO))
+    assert not temporary(NEW, tile, seen, SETTINGS).any(), "one vehicle that saw nothing is not believed"
+    assert temporary(NEW, tile, seen, SETTINGS.model_copy(update={"min_votes": 1})).any()
+
+
+STANDS, BARE = make_tile(wall([CELL], [0.75])), make_tile(wall([], []))
+
+
+def second(vehicle: str, when_s: int, state: int) -> TileVote:
+    return TileVote(vehicle, when_s * 10**9 + 999_999_999, vehicle, states=states_plane({CELL: state}))
+
+
+def test_what_came_is_remembered_with_the_first_sighting_among_the_votes_that_decided_it() -> None:
+    votes = [second("a", START_S + 7, CO), second("b", START_S + 2, CO), second("c", START_S, UE)]
+    after = remembered(Memory.none(), BARE, STANDS, votes, NEW)
+    assert after.came_s[CELL] == START_S + 2
+    assert after.came_s.sum() == START_S + 2, "and nowhere else"
+    assert not after.stays.any()
+    assert not after.stayed_s.any()
+
+
+def test_what_went_adds_a_stay_and_how_long_it_was_and_can_come_again() -> None:
+    before = memory(stays=2, stayed_days=1.0, came_s=START_S)
+    votes = [second("a", START_S + 500, CE), second("b", START_S + 400, CE), second("c", START_S + 300, UO)]
+    after = remembered(before, STANDS, BARE, votes, states_plane({CELL: CE}))
+    assert (after.stays[CELL], after.stayed_s[CELL], after.came_s[CELL]) == (3, DAY_S + 400, 0)
+    assert (before.stays[CELL], before.came_s[CELL]) == (2, START_S), "what was remembered before is left alone"
+
+
+def test_what_was_surveyed_leaves_no_stay_when_it_goes() -> None:
+    nothing = Memory.none()
+    after = remembered(nothing, STANDS, BARE, [second("a", START_S, CE)], states_plane({CELL: CE}))
+    assert after is nothing
+
+
+def test_a_thing_never_left_before_it_came() -> None:
+    """Clocks differ between vehicles: what was seen gone before it was seen there stayed for no time at all."""
+    before = memory(came_s=START_S)
+    after = remembered(before, STANDS, BARE, [second("a", START_S - 90, CE)], states_plane({CELL: CE}))
+    assert (after.stays[CELL], after.stayed_s[CELL]) == (1, 0)
+
+
+def test_what_stands_on_unasked_is_not_remembered_as_new() -> None:
+    before = Memory.none()
+    assert remembered(before, STANDS, STANDS, [second("a", START_S, UO)], states_plane({CELL: UO})) is before
+
+
+@pytest.mark.parametrize(("end_ns", "came_s"), [(0, 1), (-(10**18), 1), (2**32 * 10**9, 2**32 - 2)])
+def test_a_time_that_32_bits_cannot_hold_is_the_nearest_that_they_can(end_ns: int, came_s: int) -> None:
+    """0 would say that nothing was ever put there."""
+    vote = TileVote("a", end_ns, "a", states=states_plane({CELL: CO}))
+    assert remembered(Memory.none(), BARE, STANDS, [vote], NEW).came_s[CELL] == came_s
+
+
+def fused(tile: Tile, day: float, state: int, version: int, history: list[TileVote]) -> Tile:
+    points = wall([CELL], [0.75]) if state == CO else None
+    votes = [replace(drive(day, {CELL: state}, vehicle), new_points=points) for vehicle in "ab"]
+    history += votes
+    return fuse_tile(tile, votes, "columns", SETTINGS, version, lambda: history)[1]
+
+
+def test_a_skip_that_comes_and_goes_enters_the_map_once_and_then_only_after_a_month() -> None:
+    """The first time it comes it may stay for good; after it went, the next one has to show that it does."""
+    history: list[TileVote] = []
+    tile = fused(make_tile(wall([], []), index=(0, 0)), 0, CO, 2, history)
+    assert len(tile.points) == 1
+    tile = fused(tile, 3, CE, 3, history)
+    assert len(tile.points) == 0
+    assert tile.memory is not None
+    assert (tile.memory.stays[CELL], tile.memory.stayed_s[CELL]) == (1, 3 * DAY_S)
+    assert tile.memory.changed[CELL] == 3
+    history.clear()  # spent by the version that took it down
+    for day in (10, 20, 36):
+        assert len(fused(tile, day, CO, 4, history).points) == 0, "(30 + 3 + 26) / 2 days"
+    assert len(fused(tile, 37, CO, 4, history).points) == 1, "(30 + 3 + 27) / 2 days"
+
+
+def test_without_a_history_everything_new_is_there_to_stay() -> None:
+    tile = replace(make_tile(wall([], [])), memory=memory(9, 0.0))
+    votes = [replace(drive(0, {CELL: CO}, vehicle), new_points=wall([CELL], [0.75])) for vehicle in "ab"]
+    assert len(fuse_tile(tile, votes, "columns", SETTINGS)[1].points) == 1
+    states = fuse_tile(tile, votes, "columns", SETTINGS, 2, lambda: votes)[0].states
+    assert states[CELL] == UN

@@ -1,0 +1,137 @@
+"""A vote is spent once its cell has changed since the version that its vehicle drove with."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from hand_made import SHAPE, make_tile, states_plane, wall, words_plane
+from mapvote.core.grid import CELL_SIZE
+from mapvote.core.memory import Memory
+from mapvote.core.tile import Tile
+from mapvote.core.types import NO_VOTE, CellState
+from mapvote.fusion.sparse_columns import Words
+from mapvote.fusion.spent import changed_in, differing, unspent
+from mapvote.fusion.tile_vote import TileVote
+
+CE = int(CellState.CHANGED_EMPTY)
+CELL, OTHER, THIRD = (10, 10), (200, 3), (255, 255)
+TILE = make_tile(wall([CELL, OTHER], [0.45, 0.75]))
+
+
+def changed(**versions: int) -> Tile:
+    memory = Memory.none()
+    for cell, version in zip((CELL, OTHER, THIRD), versions.values(), strict=False):
+        memory.planes[0][cell] = version
+    return replace(TILE, memory=memory)
+
+
+def vote(version: int) -> TileVote:
+    free = Words.of(words_plane({CELL: 0b100, OTHER: 0b1}))
+    return TileVote("v", 0, "v", states=states_plane({CELL: CE, OTHER: CE}), free=free, version=version)
+
+
+def spoken(cast: TileVote) -> list[list[int]]:
+    assert cast.states is not None
+    return np.argwhere(cast.states != NO_VOTE).tolist()
+
+
+def test_a_vote_counts_where_its_cell_is_as_old_as_its_map_and_nowhere_else() -> None:
+    tile = changed(cell=3, other=5)
+    assert spoken(unspent(vote(5), tile)) == [list(CELL), list(OTHER)]
+    assert spoken(unspent(vote(4), tile)) == [list(CELL)]
+    assert spoken(unspent(vote(3), tile)) == [list(CELL)]
+    assert spoken(unspent(vote(2), tile)) == []
+
+
+def test_where_a_vote_is_spent_so_is_the_free_space_that_it_saw() -> None:
+    free = unspent(vote(3), changed(cell=3, other=5)).free
+    assert free is not None
+    assert free.cells.tolist() == [10 * 256 + 10]
+
+
+def test_on_a_tile_that_never_changed_every_vote_counts() -> None:
+    cast = vote(0)
+    assert unspent(cast, TILE) is cast
+
+
+def test_what_a_version_showed_wrongly_is_no_ground_for_a_vote() -> None:
+    """After a replay: the vehicle saw a map that has been taken back."""
+    wrong = np.zeros(SHAPE, dtype=np.bool_)
+    wrong[CELL] = True
+    assert spoken(unspent(vote(3), TILE, {3: wrong})) == [list(OTHER)]
+    assert spoken(unspent(vote(3), TILE, {2: wrong})) == [list(CELL), list(OTHER)]
+    assert spoken(unspent(vote(3), changed(cell=0, other=4), {3: wrong})) == []
+    assert spoken(unspent(vote(3), changed(cell=4, other=3), {3: wrong})) == [list(OTHER)]
+
+
+def cells_of(found: np.ndarray) -> list[list[int]]:
+    assert found.shape == SHAPE
+    return np.argwhere(found).tolist()
+
+
+def test_a_tile_does_not_differ_from_itself_nor_from_a_copy() -> None:
+    assert cells_of(differing(TILE, TILE)) == []
+    assert cells_of(differing(TILE, make_tile(TILE.points.copy()))) == []
+
+
+def test_a_point_more_less_or_elsewhere_is_a_difference_in_its_cell() -> None:
+    more = make_tile(np.concatenate([TILE.points, wall([THIRD], [9.0])]))
+    assert cells_of(differing(TILE, more)) == cells_of(differing(more, TILE)) == [list(THIRD)]
+    less = make_tile(TILE.points[:-1])
+    assert cells_of(differing(TILE, less)) == [list(OTHER)]
+    emptied = make_tile(wall([], []))
+    assert cells_of(differing(TILE, emptied)) == cells_of(differing(emptied, TILE)) == [list(CELL), list(OTHER)]
+    assert cells_of(differing(emptied, make_tile(wall([], [])))) == []
+
+
+@given(st.integers(0, 2), st.sampled_from([CELL, OTHER]))
+@settings(max_examples=10)
+def test_the_last_bit_of_any_coordinate_is_a_difference(axis: int, cell: tuple[int, int]) -> None:
+    points = TILE.points.copy()
+    mine = [i for i, p in enumerate(points) if (int(p[1] / CELL_SIZE), int(p[0] / CELL_SIZE)) == cell]
+    points[mine[0], axis] = np.nextafter(points[mine[0], axis], np.float32(np.inf))
+    assert cells_of(differing(TILE, make_tile(points))) == [list(cell)]
+
+
+def test_points_that_swap_their_heights_are_other_points() -> None:
+    """A sum would not notice."""
+    a = make_tile(wall([CELL], [0.45, 0.75]) + np.array([[0.01, 0, 0], [0, 0, 0]], np.float32))
+    b = make_tile(wall([CELL], [0.45, 0.75]) + np.array([[0, 0, 0], [0.01, 0, 0]], np.float32))
+    assert cells_of(differing(a, b)) == [list(CELL)]
+
+
+@pytest.mark.parametrize(
+    ("one", "other", "differ"),
+    [
+        (None, None, []),
+        (None, {}, []),  # learning that nothing is free is no difference
+        (None, {CELL: 1}, [CELL]),
+        ({CELL: 1}, None, [CELL]),
+        ({CELL: 1}, {CELL: 1}, []),
+        ({CELL: 1}, {CELL: 3, OTHER: 1}, [CELL, OTHER]),
+    ],
+)
+def test_what_is_known_to_be_free_makes_a_difference(
+    one: dict[tuple[int, int], int] | None, other: dict[tuple[int, int], int] | None, differ: list[tuple[int, int]]
+) -> None:
+    a, b = (replace(TILE, free=None if cells is None else words_plane(cells)) for cells in (one, other))
+    assert cells_of(differing(a, b)) == [list(cell) for cell in differ]
+
+
+def test_differences_of_points_and_of_free_space_add_up() -> None:
+    more = make_tile(np.concatenate([TILE.points, wall([THIRD], [9.0])]))
+    assert cells_of(differing(TILE, replace(more, free=words_plane({OTHER: 4})))) == [list(OTHER), list(THIRD)]
+
+
+def test_an_edited_tile_remembers_the_version_of_each_change_and_keeps_the_older_ones() -> None:
+    more = make_tile(np.concatenate([TILE.points, wall([THIRD], [9.0])]))
+    first = changed_in(7, TILE, more)
+    assert first.changed[THIRD] == 7
+    assert first.changed.sum() == 7
+    second = changed_in(9, replace(more, memory=first), replace(make_tile(more.points[1:]), memory=first))
+    assert (second.changed[CELL], second.changed[OTHER], second.changed[THIRD]) == (9, 0, 7)

@@ -1,0 +1,343 @@
+"""Which votes count on a tile, asked of a store as of any moment, and why the others do not."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from hand_made import SETTINGS, Say, make_ballot, states_plane, two_walls, wall, words_plane
+from mapvote.codec.ballot import encode
+from mapvote.config import FuseSettings
+from mapvote.core.grid import TileIndex
+from mapvote.core.memory import Memory
+from mapvote.core.types import NO_VOTE, CellState
+from mapvote.fusion.tile_vote import DAY_NS, TileVote
+from mapvote.server.store import reviews
+from mapvote.server.store.admission import accept, examine
+from mapvote.server.store.ballots import Receipt, withdraw
+from mapvote.server.store.eligible_votes import (
+    DAMAGED,
+    OTHERWISE,
+    YOUNG,
+    Electorate,
+    counting_votes,
+    judged_votes,
+    read_votes,
+    recent_votes,
+    standing_tiles,
+)
+from mapvote.server.store.policy import Policy, RoundPolicy, set_policy
+from mapvote.server.store.quarantine import ballot_name
+from mapvote.server.store.store import Store
+
+CELL, OTHER = (10, 10), (10, 11)
+HERE, BESIDE = (0, 0), (0, 1)
+CE, CO, UO = CellState.CHANGED_EMPTY, CellState.CHANGED_OCCUPIED, CellState.UNCHANGED_OCCUPIED
+NOW_S = 1_700_000_000
+
+
+class Clock:
+    """Stands, until a test moves it on."""
+
+    def __init__(self) -> None:
+        self.ns = NOW_S * 10**9
+
+    def __call__(self) -> int:
+        return self.ns
+
+
+@pytest.fixture
+def clock() -> Clock:
+    return Clock()
+
+
+@pytest.fixture(scope="module")
+def first_store(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Made once: every test has a copy."""
+    file = tmp_path_factory.mktemp("first") / "store.db"
+    Store.create(f"sqlite:///{file}", two_walls(), clock=Clock()).close()
+    return file
+
+
+@pytest.fixture
+def store(first_store: Path, tmp_path: Path, clock: Clock) -> Iterator[Store]:
+    store = Store.open(f"sqlite:///{shutil.copy(first_store, tmp_path)}", clock=clock)
+    yield store
+    store.close()
+
+
+def cast(
+    store: Store,
+    vehicle: str,
+    day: float = 0,
+    drive: str = "d",
+    tiles: tuple[TileIndex, ...] = (HERE,),
+    say: Say | None = None,
+    **more: Any,
+) -> int:
+    """A vehicle says that two cells of a wall are gone, or ``say``; the ballot's number."""
+    say = say or Say(states_plane({CELL: CE, OTHER: CE}))
+    end_ns = (NOW_S - 100 * 86_400) * 10**9 + round(day * DAY_NS)
+    ballot = make_ballot(two_walls(), dict.fromkeys(tiles, say), vehicle, drive, end_ns, **more)
+    stage = "one-stage" if say.tally is not None else "two-stage"
+    set_policy(store, Policy(round=RoundPolicy.model_validate({"method": ballot.method, "stage": stage})))
+    (receipt,) = accept(store, [examine(encode(ballot))])
+    assert isinstance(receipt, Receipt), receipt
+    return receipt.seq
+
+
+def asked(store: Store, **more: object) -> Electorate:
+    """Everything up to now, by a policy that asks for nothing in particular."""
+    rule = more.pop("round", RoundPolicy())
+    policy = Policy(fuse=more.pop("fuse", FuseSettings()), round=rule)  # type: ignore[arg-type]
+    return replace(Electorate(10**9, policy, received_by_ns=store.clock()), **more)  # type: ignore[arg-type]
+
+
+def judged(store: Store, question: Electorate) -> dict[str, str]:
+    with store.database.reading() as connection:
+        return {vote.vehicle: why for vote, why in judged_votes(connection, HERE, question)}
+
+
+def counting(store: Store, question: Electorate, **more: object) -> list[TileVote]:
+    tile = replace(store.point_map().tiles[HERE], **more)  # type: ignore[arg-type]
+    with store.database.reading() as connection:
+        return counting_votes(connection, tile, question)
+
+
+def spoken(vote: TileVote) -> list[tuple[int, int]]:
+    assert vote.states is not None
+    return [(int(r), int(c)) for r, c in np.argwhere(vote.states != NO_VOTE)]
+
+
+def test_a_standing_vote_counts_and_says_what_was_sent(store: Store) -> None:
+    free = words_plane({CELL: 0b11})
+    gone = words_plane({CELL: 0b10})
+    points = wall([OTHER], [0.75])
+    cast(store, "a", day=3, say=Say(states_plane({CELL: CE, OTHER: CO}), gone=gone, new_points=points, free=free))
+    assert judged(store, asked(store)) == {"a": ""}
+    (vote,) = counting(store, asked(store))
+    assert (vote.vehicle, vote.version, vote.tally) == ("a", 1, None)
+    assert vote.end_ns == (NOW_S - 97 * 86_400) * 10**9
+    assert vote.states is not None
+    assert (vote.states[CELL], vote.states[OTHER]) == (CE, CO)
+    assert vote.gone is not None
+    assert vote.free is not None
+    assert vote.new_points is not None
+    assert (vote.gone.words.tolist(), vote.free.words.tolist()) == ([0b10], [0b11])
+    assert vote.new_points.tobytes() == points.tobytes()
+
+
+def test_a_tally_is_read_as_a_tally(store: Store) -> None:
+    tally = np.zeros((256, 256, 5), dtype=np.uint16)
+    tally[CELL] = [1, 0, 0, 7, 2]
+    cast(store, "a", say=Say(tally=tally), method="paper")
+    question = asked(store, round=RoundPolicy(method="paper", stage="one-stage"))
+    (vote,) = counting(store, question)
+    assert vote.states is None
+    assert vote.tally is not None
+    assert vote.tally[CELL].tolist() == [1, 0, 0, 7, 2]
+    assert (vote.gone, vote.new_points, vote.free) == (None, None, None)
+
+
+def test_a_round_is_asked_as_of_any_moment(store: Store) -> None:
+    first, second = cast(store, "a"), cast(store, "b")
+    assert list(judged(store, asked(store, mark=first - 1))) == []
+    assert list(judged(store, asked(store, mark=first))) == ["a"]
+    assert list(judged(store, asked(store, mark=second))) == ["a", "b"]
+    again = cast(store, "a", day=1)
+    assert [list(judged(store, asked(store, mark=mark))) for mark in (again - 1, again)] == [["a", "b"], ["b", "a"]]
+    withdraw(store, "b", by="test")
+    assert list(judged(store, asked(store))) == ["a"]
+    assert list(judged(store, asked(store, mark=second))) == ["a", "b"], "what was then stays what was then"
+
+
+def test_only_votes_on_this_tile_are_asked_for(store: Store) -> None:
+    cast(store, "a", tiles=(BESIDE,))
+    assert judged(store, asked(store)) == {}
+    assert counting(store, asked(store)) == []
+
+
+def test_a_vehicle_that_is_left_out_is_not_even_named(store: Store) -> None:
+    cast(store, "a")
+    cast(store, "b")
+    assert judged(store, asked(store, without=("a",))) == {"b": ""}
+
+
+def test_a_ballot_waits_for_its_minimum_age(store: Store, clock: Clock) -> None:
+    cast(store, "a")
+    received = clock.ns
+    assert judged(store, asked(store, received_by_ns=received - 1)) == {"a": YOUNG}
+    assert judged(store, asked(store, received_by_ns=received)) == {"a": ""}
+
+
+def test_ballots_cast_by_other_methods_or_settings_than_the_policy_asks_for_do_not_count(store: Store) -> None:
+    cast(store, "a")
+    cast(store, "b", method="paper")
+    cast(store, "c", settings_hash="00" * 32)
+    assert judged(store, asked(store)) == {"a": "", "b": OTHERWISE, "c": ""}
+    by_settings = asked(store, round=RoundPolicy(settings_hash=SETTINGS[:8]))
+    assert judged(store, by_settings) == {"a": "", "b": OTHERWISE, "c": OTHERWISE}
+    assert judged(store, asked(store, round=RoundPolicy(stage="one-stage"))) == dict.fromkeys("abc", OTHERWISE)
+
+
+def test_what_is_damaged_is_set_aside_on_its_tile(store: Store) -> None:
+    seq = cast(store, "a", tiles=(HERE, BESIDE))
+    assert judged(store, asked(store, set_aside=(ballot_name(seq, *HERE),))) == {"a": DAMAGED}
+    assert judged(store, asked(store, set_aside=(ballot_name(seq, *BESIDE),))) == {"a": ""}
+
+
+def test_votes_outside_the_window_are_told_which_window(store: Store) -> None:
+    for day, vehicle in enumerate("abc"):
+        cast(store, vehicle, day=10.0 * day)
+    outside = "older than 15 days or not among the last 9 vehicles"
+    assert judged(store, asked(store, fuse=FuseSettings(max_age_days=15))) == {"a": outside, "b": "", "c": ""}
+    few = judged(store, asked(store, fuse=FuseSettings(latest_vehicles=1)))
+    assert few == {"a": "older than 30 days or not among the last 1 vehicles", "b": few["a"], "c": ""}
+    assert [vote.vehicle for vote in counting(store, asked(store, fuse=FuseSettings(latest_vehicles=1)))] == ["c"]
+
+
+def test_the_window_is_of_the_votes_that_are_ready(store: Store, clock: Clock) -> None:
+    """One that waits for its age pushes no other out."""
+    cast(store, "a")
+    received = clock.ns
+    clock.ns += 10**9
+    cast(store, "b", day=60)
+    found = judged(store, asked(store, received_by_ns=received))
+    assert found == {"a": "", "b": YOUNG}
+
+
+def test_a_vote_counts_in_the_cells_that_have_not_changed_since(store: Store) -> None:
+    cast(store, "a")
+    memory = Memory.none()
+    memory.planes[0][CELL] = 2
+    (vote,) = counting(store, asked(store), memory=memory)
+    assert spoken(vote) == [OTHER]
+
+
+def review(store: Store, verdict: reviews.Verdict, cell: tuple[int, int] = CELL) -> int:
+    cells = np.zeros((256, 256), dtype=np.bool_)
+    cells[cell] = True
+    feature = {"id": "x", "properties": {"kind": "demolished"}}
+    return reviews.decide(store, verdict, feature, {HERE: cells}, by="anna")
+
+
+def test_what_reviewers_hold_is_silent_for_all_until_they_let_go(store: Store) -> None:
+    cast(store, "a")
+    seq = review(store, "held")
+    last = cast(store, "b")
+    assert [spoken(vote) for vote in counting(store, asked(store))] == [[OTHER], [OTHER]]
+    reviews.undo(store, seq, by="anna")
+    assert [spoken(vote) for vote in counting(store, asked(store))] == [[CELL, OTHER]] * 2
+    held_then = counting(store, asked(store, mark=last))
+    assert [spoken(vote) for vote in held_then] == [[OTHER], [OTHER]], "as of then it was held"
+
+
+def test_what_reviewers_reject_only_later_drives_can_say_again(store: Store) -> None:
+    cast(store, "a")
+    review(store, "rejected")
+    cast(store, "b")
+    assert [spoken(vote) for vote in counting(store, asked(store))] == [[OTHER], [CELL, OTHER]]
+    cast(store, "a")  # the same drive once more is no new drive
+    assert {vote.vehicle: spoken(vote) for vote in counting(store, asked(store))}["a"] == [OTHER]
+    cast(store, "a", drive="another", day=1)
+    drives = [spoken(vote) for vote in counting(store, asked(store)) if vote.vehicle == "a"]
+    assert sorted(drives) == [[CELL, OTHER], [OTHER]]
+
+
+def test_what_was_accepted_or_is_about_another_tile_silences_nothing(store: Store) -> None:
+    cast(store, "a")
+    review(store, "accepted")
+    cells = {BESIDE: np.ones((256, 256), dtype=np.bool_)}
+    reviews.decide(store, "held", {"id": "y", "properties": {"kind": "built"}}, cells, by="bert")
+    assert [spoken(vote) for vote in counting(store, asked(store))] == [[CELL, OTHER]]
+
+
+def test_a_verdict_counts_from_its_own_moment_on(store: Store) -> None:
+    seq = cast(store, "a")
+    review(store, "held")
+    assert [spoken(vote) for vote in counting(store, asked(store, mark=seq))] == [[CELL, OTHER]]
+
+
+def recent(store: Store, question: Electorate) -> list[str]:
+    tile = store.point_map().tiles[HERE]
+    with store.database.reading() as connection:
+        return [vote.vehicle for vote in recent_votes(connection, tile, question)]
+
+
+def test_the_recent_past_is_of_every_vehicle_within_the_days_that_a_thing_must_stay(store: Store) -> None:
+    for day, vehicle in ((0, "a"), (10, "b"), (20, "c"), (30, "d")):
+        cast(store, vehicle, day=day)
+    few = FuseSettings(latest_vehicles=1, stay_days=20, max_age_days=5)
+    assert recent(store, asked(store, fuse=few)) == ["b", "c", "d"], "as old as the days, and just so"
+    assert [vote.vehicle for vote in counting(store, asked(store, fuse=few))] == ["d"]
+
+
+def test_the_recent_past_knows_no_ballot_that_is_not_ready(store: Store, clock: Clock) -> None:
+    cast(store, "a")
+    cast(store, "b", method="paper")
+    damaged = cast(store, "c")
+    received = clock.ns
+    clock.ns += 10**9
+    cast(store, "d", day=60)
+    question = asked(store, received_by_ns=received, set_aside=(ballot_name(damaged, *HERE),))
+    assert recent(store, question) == ["a"]
+    assert recent(store, asked(store, without=("a", "b", "c", "d"))) == []
+
+
+def test_in_the_recent_past_spent_cells_are_silent_too(store: Store) -> None:
+    cast(store, "a")
+    memory = Memory.none()
+    memory.planes[0][CELL] = 2
+    tile = replace(store.point_map().tiles[HERE], memory=memory)
+    with store.database.reading() as connection:
+        (vote,) = recent_votes(connection, tile, asked(store))
+    assert spoken(vote) == [OTHER]
+
+
+def test_votes_are_read_in_the_order_asked_for_and_no_tile_has_too_many(store: Store) -> None:
+    cast(store, "a", say=Say(states_plane({CELL: CE})))
+    cast(store, "b", say=Say(states_plane({OTHER: UO})))
+    with store.database.reading() as connection:
+        stored = [vote for vote, _ in judged_votes(connection, HERE, asked(store))]
+        backwards = read_votes(connection, HERE, stored[::-1])
+        many = read_votes(connection, HERE, stored * 600)  # more than one statement may ask for
+        assert read_votes(connection, HERE, []) == []
+    assert [(vote.vehicle, spoken(vote)) for vote in backwards] == [("b", [OTHER]), ("a", [CELL])]
+    assert [vote.vehicle for vote in many] == ["a", "b"] * 600
+    assert spoken(many[-2]) == [CELL]
+
+
+def tiles(store: Store, mark: int = 10**9, since: int | None = None) -> list[tuple[int, int]]:
+    with store.database.reading() as connection:
+        return standing_tiles(connection, mark, since)
+
+
+def test_tiles_are_asked_about_where_ballots_stand(store: Store) -> None:
+    assert tiles(store) == []
+    first = cast(store, "a", tiles=(BESIDE, HERE))
+    second = cast(store, "b")
+    assert tiles(store) == [HERE, BESIDE]
+    assert tiles(store, mark=first - 1) == []
+    withdraw(store, "a", by="test")
+    assert tiles(store) == [HERE]
+    assert tiles(store, mark=second) == [HERE, BESIDE]
+
+
+def test_tiles_are_asked_about_again_where_a_ballot_came_or_went_or_a_reviewer_spoke(store: Store) -> None:
+    seq = cast(store, "a", tiles=(BESIDE,))
+    assert tiles(store, since=seq - 1) == [BESIDE]
+    assert tiles(store, since=seq) == []
+    withdraw(store, "a", by="test")
+    assert tiles(store, since=seq) == [BESIDE], "it went"
+    verdict = review(store, "held")
+    assert tiles(store, since=seq) == [HERE, BESIDE]
+    assert tiles(store, since=verdict) == []
+    assert tiles(store, mark=verdict - 1, since=seq) == [BESIDE]
+    reviews.undo(store, verdict, by="anna")
+    assert tiles(store, since=verdict) == [HERE]
