@@ -46,7 +46,7 @@ def measure(scene: Scene, workers: int) -> dict[str, PoseErrors]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--scenario", default="paper")
+    parser.add_argument("--scenario", default="street570")
     parser.add_argument("--seeds", default="3,5,6,7,8")
     parser.add_argument("--cache", type=Path, default=default_cache())
     parser.add_argument("--config", type=Path)

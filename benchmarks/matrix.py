@@ -3,8 +3,8 @@
     python benchmarks/matrix.py --seeds 3,5,6,7,8 --out out/matrix            # everything (docs/results.md)
     python benchmarks/matrix.py --scenario corner --seeds 1 --experiments main # minutes
 
-A run that was cut short goes on where it stopped; what is done is written after every experiment. Seed 1 of `paper` is
-for development: report on others.
+A run that was cut short goes on where it stopped; what is done is written after every experiment. Seed 1 of
+`street570` is for development: report on others.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from mapvote.formats.atomic import whole_file
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--scenario", default="paper", help="a scenario's name or file (default paper)")
+    parser.add_argument("--scenario", default="street570", help="a scenario's name or file (default street570)")
     parser.add_argument("--seeds", default="3,5,6,7,8", help="comma-separated (default 3,5,6,7,8)")
     parser.add_argument("--experiments", help=f"comma-separated, of: {', '.join(EXPERIMENTS)} (default all)")
     parser.add_argument("--cases", help='instead of all, in main and liars: "1,1 column,columns" takes half the time')

@@ -13,8 +13,9 @@ from mapvote.simulation.truth import CHANGED_EMPTY, CHANGED_OCCUPIED, UNCHANGED,
 from mapvote.simulation.world import Body, Role, make_world
 
 
-def test_the_papers_street_has_its_514900_cells_and_four_changed_areas() -> None:
-    scenario = load_scenario("paper")
+@pytest.mark.parametrize("name", ["as_published", "street570"])
+def test_the_papers_street_has_its_514900_cells_and_four_changed_areas(name: str) -> None:
+    scenario = load_scenario(name)
     assert truth_grid(scenario).shape == (271, 1900)
     assert [(c.kind, c.count) for c in scenario.changes] == [
         ("built", 1),
@@ -36,11 +37,32 @@ def test_every_scenario_lays_out_by_seed_and_differently_by_another(name: str) -
     np.testing.assert_array_equal(first, second)
     assert first.shape != third.shape or not np.allclose(first, third)
     kinds = {body.kind for body in one.bodies}
-    assert {"ground", "building", "tree", "pole", "parked car"} <= kinds
+    assert {"ground", "building", "pole", "parked car"} <= kinds
+
+
+def test_as_published_has_what_the_paper_tells_and_nothing_more() -> None:
+    scenario = load_scenario("as_published")
+    assert set(scenario.flaws.model_dump().values()) == {0.0}
+    world = make_world(scenario, 1)
+    assert {body.kind for body in world.bodies} == {"ground", "building", "pole", "sign", "parked car"}
+    axis = world.terrain.axis_y
+    for body in world.bodies:
+        y = np.abs(body.triangles[..., 1] - axis)
+        if body.kind == "building":
+            assert len(body.triangles) == 12, "a block: six faces of two triangles"
+            assert 12.4 < y.min() < 13.9, ".2 to .9 m behind the sidewalk, at its nearest corner"
+            assert y.max() < 34.0, "no second row"
+    cars = [body.in_pass for body in world.bodies if body.kind == "parked car"]
+    assert np.sum(cars, axis=0).tolist() == [8, 8, 8]
+    assert all(body.role == Role.PASSING for body in world.bodies if body.kind == "parked car")
+
+
+def test_the_older_name_of_the_harder_street_still_holds() -> None:
+    assert load_scenario("paper") == load_scenario("street570")
 
 
 def test_the_road_is_crowned_kerbed_and_no_steeper_than_it_says() -> None:
-    scenario = load_scenario("paper")
+    scenario = load_scenario("street570")
     terrain = make_world(scenario, 1).terrain
     x = np.linspace(0, 570, 2000)
     along = np.gradient(terrain.height(x, terrain.axis_y), x)
@@ -80,7 +102,7 @@ def test_temporary_cars_stand_during_one_pass_only() -> None:
         make_world(load_scenario("corner", {"temporary_cars": 500}), 1)
 
 
-@pytest.mark.parametrize("name", ["paper", "junction"])
+@pytest.mark.parametrize("name", ["street570", "junction"])
 def test_traffic_moves_and_leaves_room_for_the_vehicle(name: str) -> None:
     scenario = load_scenario(name)
     world = make_world(scenario, 1)
@@ -98,7 +120,7 @@ def test_traffic_moves_and_leaves_room_for_the_vehicle(name: str) -> None:
 
 
 def test_priors_are_as_good_as_they_say() -> None:
-    scenario = load_scenario("paper", {"vehicles": 10})
+    scenario = load_scenario("street570", {"vehicles": 10})
     world = make_world(scenario, 1)
     for route in make_routes(scenario, world.terrain, 1):
         error = route.priors(np.random.default_rng(0))[:, :3, 3] - route.poses(route.time_s)[:, :3, 3]

@@ -18,7 +18,11 @@ Config = Annotated[Path | None, typer.Option(metavar="TOML", help="settings; `ma
 DrivePath = Annotated[Path, typer.Argument(metavar="DRIVE", help="a recorded drive, in any format")]
 MapPath = Annotated[Path, typer.Argument(metavar="MAP", help="a map, in any format")]
 Scenario = Annotated[
-    str, typer.Argument(metavar="SCENARIO", help="paper, clear, street, junction, corner, or a TOML file of your own")
+    str,
+    typer.Argument(
+        metavar="SCENARIO",
+        help="street570, as_published, clear, street, junction, terrace, corner, or a TOML file of your own",
+    ),
 ]
 Seed = Annotated[int, typer.Option(metavar="N", help="decides layout, clutter, traffic and noise")]
 StoreName = Annotated[

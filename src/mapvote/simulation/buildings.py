@@ -11,7 +11,7 @@ import numpy as np
 from mapvote.core.types import F64
 from mapvote.simulation.shapes import box, join, taper
 
-_BELOW = -1.2
+FOOT_M = -1.2
 """Walls reach below the ground so that no gap opens on slopes."""
 
 
@@ -28,7 +28,7 @@ def building(rng: np.random.Generator, width: float, depth: float, height: float
         parts.append(box(u, u + 0.15, -0.9, 0.0, z, min(z + 1.6, height)))
     if rng.uniform() < 0.5:  # steps, a vending machine, flower boxes
         u = rng.uniform(0.3, width - 1.8)
-        parts.append(box(u, u + rng.uniform(0.8, 1.5), -rng.uniform(0.4, 0.9), 0.0, _BELOW, rng.uniform(0.45, 1.8)))
+        parts.append(box(u, u + rng.uniform(0.8, 1.5), -rng.uniform(0.4, 0.9), 0.0, FOOT_M, rng.uniform(0.45, 1.8)))
     return join(parts)
 
 
@@ -36,25 +36,25 @@ def _walls(rng: np.random.Generator, width: float, depth: float, height: float) 
     """The body, with an entrance recess or a stepped facade in most buildings."""
     kind = rng.choice(["plain", "recess", "step", "arcade"], p=[0.3, 0.35, 0.2, 0.15])
     if kind == "plain" or width < 7.0:
-        return [box(0, width, 0, depth, _BELOW, height)]
+        return [box(0, width, 0, depth, FOOT_M, height)]
     if kind == "recess":
         left, right = rng.uniform(0.25, 0.4) * width, rng.uniform(0.6, 0.75) * width
         back = rng.uniform(0.6, 1.8)
         return [
-            box(0, left, 0, depth, _BELOW, height),
-            box(right, width, 0, depth, _BELOW, height),
-            box(left, right, back, depth, _BELOW, height),
+            box(0, left, 0, depth, FOOT_M, height),
+            box(right, width, 0, depth, FOOT_M, height),
+            box(left, right, back, depth, FOOT_M, height),
         ]
     if kind == "step":
         split, back = rng.uniform(0.35, 0.65) * width, rng.uniform(0.8, 2.5)
         return [
-            box(0, split, 0, depth, _BELOW, height),
-            box(split, width, back, depth, _BELOW, height * rng.uniform(0.6, 1)),
+            box(0, split, 0, depth, FOOT_M, height),
+            box(split, width, back, depth, FOOT_M, height * rng.uniform(0.6, 1)),
         ]
     pillars = [
-        box(u - 0.2, u + 0.2, 0, 0.4, _BELOW, 3.0) for u in np.linspace(0.2, width - 0.2, max(2, int(width // 3.5)))
+        box(u - 0.2, u + 0.2, 0, 0.4, FOOT_M, 3.0) for u in np.linspace(0.2, width - 0.2, max(2, int(width // 3.5)))
     ]
-    return [box(0, width, 1.8, depth, _BELOW, 3.0), box(0, width, 0, depth, 3.0, height), *pillars]
+    return [box(0, width, 1.8, depth, FOOT_M, 3.0), box(0, width, 0, depth, 3.0, height), *pillars]
 
 
 def _roof(rng: np.random.Generator, width: float, depth: float, height: float) -> list[F64]:

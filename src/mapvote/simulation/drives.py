@@ -63,11 +63,11 @@ def simulate(
             (partial / "truth" / route.name / "moving").mkdir(parents=True)
         with _pool(workers or _processes(stage)) as run:
             dense = run(_survey, [(spec, seed, drive) for drive in range(len(stage.routes))])
-            survey, vehicles = _drive_all(stage, partial, run, progress)
+            survey, vehicles, densest = _drive_all(stage, partial, run, progress)
             for index, (route, writer) in enumerate(zip(stage.routes, writers, strict=True)):
                 writer.close(route.stamps_ns, route.priors(np.random.default_rng([seed, 4, index])))
                 write_poses(partial / "truth" / route.name / "poses.txt", route.poses(route.time_s))
-            write_truth(partial / "truth", stage.world, spec, list(dense), survey, vehicles)
+            write_truth(partial / "truth", stage.world, spec, list(dense), survey, vehicles, densest)
         os.replace(partial, out)
     finally:
         shutil.rmtree(partial, ignore_errors=True)
@@ -144,8 +144,9 @@ def _processes(stage: Stage) -> int:
     return (os.cpu_count() or 1) if sum(route.scans for route in stage.routes) > 400 else 1
 
 
-def _drive_all(stage: Stage, folder: Path, run: _Run, progress: Progress | None) -> tuple[I32, I32]:
-    """Drive every route; (survey, vehicles) counts (roles, rows, cols) of the recorded points that stand still."""
+def _drive_all(stage: Stage, folder: Path, run: _Run, progress: Progress | None) -> tuple[I32, I32, I32]:
+    """Drive every route; (survey, vehicles) counts (roles, rows, cols) of the recorded points that stand still, and
+    (rows, cols) the most of them that one scan of a vehicle had on built bodies."""
     tasks = [
         (stage.scenario, stage.seed, folder, drive, first, min(first + _CHUNK, route.scans))
         for drive, route in enumerate(stage.routes)
@@ -153,13 +154,17 @@ def _drive_all(stage: Stage, folder: Path, run: _Run, progress: Progress | None)
     ]
     scans = sum(route.scans for route in stage.routes)
     totals = np.zeros((2, len(Role), *stage.ground.shape), dtype=np.int32)
+    densest = np.zeros(stage.ground.shape, dtype=np.int32)
     done = 0
-    for task, (where, hits) in zip(tasks, run(_drive, tasks), strict=True):
-        totals[0 if stage.routes[task[3]].vehicle is None else 1].ravel()[where] += hits
+    for task, (where, hits, most) in zip(tasks, run(_drive, tasks), strict=True):
+        survey = stage.routes[task[3]].vehicle is None
+        totals[0 if survey else 1].ravel()[where] += hits
+        if not survey:
+            np.maximum(densest, most, out=densest)
         done += task[5] - task[4]
         if progress:
             progress(done, scans)
-    return totals[0], totals[1]
+    return totals[0], totals[1], densest
 
 
 def _survey(task: tuple[Scenario, int, int]) -> tuple[I32, F32, U8]:
@@ -172,14 +177,16 @@ def _survey(task: tuple[Scenario, int, int]) -> tuple[I32, F32, U8]:
 _Task = tuple[Scenario, int, Path, int, int, int]
 
 
-def _drive(task: _Task) -> tuple[I32, I32]:
-    """Simulate and write some scans of one drive; (flat index, count) of the hits by role and cell."""
+def _drive(task: _Task) -> tuple[I32, I32, U8]:
+    """Simulate and write some scans of one drive; (flat index, count) of the hits by role and cell, and the most that
+    one scan had on built bodies (rows, cols), 255 at most."""
     scenario, seed, folder, drive, first, last = task
     stage = _stage(scenario, seed)
     still, traffic = _street(scenario, seed, drive)
     route, sensor, roles = stage.routes[drive], stage.sensor, stage.world.roles()
     writer = _writer(folder, route, stage)
     counts = np.zeros((len(Role), *stage.ground.shape), dtype=np.int32)
+    most = np.zeros(stage.ground.shape, dtype=np.int32)
     for index in range(first, last):
         rng = np.random.default_rng(np.random.SeedSequence([seed, 6, drive, index]))
         stamp_s = index / route.rate_hz
@@ -203,6 +210,8 @@ def _drive(task: _Task) -> tuple[I32, I32]:
         np.save(folder / "truth" / route.name / "moving" / f"{index:06d}.npy", moving[kept])
         solid = kept & ~moving & ~false
         points = rays.origins[solid] + ranges[solid, None] * rays.directions[solid]
+        before = counts[Role.ADDED].copy()
         count_hits(points, objects[solid], roles, stage.ground, CELL_SIZE, GROUND_MARGIN_M, counts)
+        np.maximum(most, counts[Role.ADDED] - before, out=most)
     where = np.flatnonzero(counts).astype(np.int32)
-    return where, counts.ravel()[where]
+    return where, counts.ravel()[where], most.clip(max=255).astype(np.uint8)

@@ -90,11 +90,19 @@ class Scenario(_Table):
     house_m: float | None = Field(
         default=None, gt=7, description="every house of the front row is the same one, this wide, wall to wall"
     )
+    blocks: bool = Field(
+        default=False,
+        description="the front row are plain blocks with flat roofs, near the sidewalk; no second row",
+    )
     temporary_cars: int = Field(default=0, ge=0, description="extra cars parked during one vehicle's pass only")
     traffic: Traffic = Traffic()
     clutter: Clutter = Clutter()
     flaws: Flaws = Flaws()
     changes: tuple[Change, ...] = ()
+
+
+ALIASES = {"paper": "street570"}
+"""Older names of scenarios."""
 
 
 def names() -> list[str]:
@@ -105,6 +113,7 @@ def names() -> list[str]:
 def load_scenario(scenario: str | Path, overrides: Mapping[str, Any] | None = None) -> Scenario:
     """A scenario by name or TOML file; ``overrides`` replace fields, key by key in its
     tables. MapvoteError names a key that does not exist."""
+    scenario = ALIASES.get(str(scenario), scenario)
     path = Path(scenario)
     if path.suffix == ".toml":
         if not path.is_file():

@@ -176,8 +176,10 @@ def write_truth(
     dense: Sequence[tuple[I32, F32, U8]],
     survey: I32,
     vehicles: I32,
+    densest: I32,
 ) -> None:
-    """truth.npz, surface.npz and objects.json into ``folder``; ``dense`` holds :func:`dense_survey` of each route."""
+    """truth.npz, surface.npz and objects.json into ``folder``; ``dense`` holds :func:`dense_survey` of each route,
+    ``densest`` (rows, cols) the most points that one scan of a vehicle had on built bodies."""
     grid = truth_grid(scenario)
     hits: I32 = np.stack([counts for counts, _, _ in dense]).sum(axis=0, dtype=np.int32)
     strict, provenance, reason = judge(hits, survey, vehicles, scenario.rate_hz)
@@ -186,6 +188,7 @@ def write_truth(
         strict=strict,
         provenance=provenance,
         reason=reason,
+        densest=densest.astype(np.uint8),
         x0=grid.x0,
         y0=grid.y0,
         cell_size=CELL_SIZE,

@@ -10,7 +10,7 @@ import numpy as np
 
 from mapvote.core.types import F32, F64, I32, MapvoteError
 from mapvote.simulation import furniture
-from mapvote.simulation.buildings import building
+from mapvote.simulation.buildings import FOOT_M, building
 from mapvote.simulation.scenario import Scenario
 from mapvote.simulation.shapes import box, car, hedge, join, place, van
 from mapvote.simulation.terrain import KERB_M, MARGIN_M, SIDEWALK_M, Terrain, make_terrain
@@ -103,7 +103,7 @@ def make_world(scenario: Scenario, seed: int) -> World:
     terrain = make_terrain(scenario, rng)
     bodies = [Body("ground", terrain.triangles())]
     for side in _sides(scenario):
-        bodies += _frontage(scenario, side, terrain, rng)
+        bodies += (_blocks if scenario.blocks else _frontage)(scenario, side, terrain, rng)
         bodies += _kerbside(scenario, side, terrain, rng)
     middle = Side(0.0, terrain.axis_y, 0.0, 1, ())
     for s in scenario.clutter.gantry_m:
@@ -176,6 +176,16 @@ def _frontage(scenario: Scenario, side: Side, terrain: Terrain, rng: np.random.G
     for low, high in ((a, b) for span in side.spans for a, b, _ in _fill(span[0] - 3.0, span[1], rng)):
         back = building(rng, (high - low) * rng.uniform(0.75, 0.95), 10.0, rng.uniform(5.0, 15.0))
         bodies.append(Body("building", side.put(back, low, rng.uniform(29.0, 36.0), terrain)))
+    return bodies
+
+
+def _blocks(scenario: Scenario, side: Side, terrain: Terrain, rng: np.random.Generator) -> list[Body]:
+    """Plain blocks with flat roofs along the sidewalk, and nothing behind them."""
+    bodies = []
+    for low, high, change in _plots(scenario, side, rng):
+        block = box(0, high - low, 0, rng.uniform(8.0, 13.0), FOOT_M, rng.uniform(4.0, 15.0))
+        placed = side.put(block, low, SIDEWALK_M + rng.uniform(0.2, 0.9), terrain, rng.normal(0.0, 0.015))
+        bodies.append(Body("building", placed, change != "built", (change != "demolished",) * scenario.vehicles))
     return bodies
 
 
