@@ -50,7 +50,7 @@ def test_as_published_has_what_the_paper_tells_and_nothing_more() -> None:
         y = np.abs(body.triangles[..., 1] - axis)
         if body.kind == "building":
             assert len(body.triangles) == 12, "a block: six faces of two triangles"
-            assert 12.4 < y.min() < 13.9, ".2 to .9 m behind the sidewalk, at its nearest corner"
+            assert 12.3 < y.min() < 13.5, ".2 to .9 m behind the sidewalk, hardly askew"
             assert y.max() < 34.0, "no second row"
     cars = [body.in_pass for body in world.bodies if body.kind == "parked car"]
     assert np.sum(cars, axis=0).tolist() == [8, 8, 8]

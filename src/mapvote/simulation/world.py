@@ -184,7 +184,7 @@ def _blocks(scenario: Scenario, side: Side, terrain: Terrain, rng: np.random.Gen
     bodies = []
     for low, high, change in _plots(scenario, side, rng):
         block = box(0, high - low, 0, rng.uniform(8.0, 13.0), FOOT_M, rng.uniform(4.0, 15.0))
-        placed = side.put(block, low, SIDEWALK_M + rng.uniform(0.2, 0.9), terrain, rng.normal(0.0, 0.015))
+        placed = side.put(block, low, SIDEWALK_M + rng.uniform(0.2, 0.9), terrain, rng.normal(0.0, 0.005))
         bodies.append(Body("building", placed, change != "built", (change != "demolished",) * scenario.vehicles))
     return bodies
 
