@@ -70,9 +70,7 @@ def tables(result: EvaluationResult) -> Iterator[Table]:
         sent = entry.bytes_per_vehicle
         f1.add_row(
             case_name(case),
-            _share(entry.strict.macro_f1),
-            _share(entry.provenance.macro_f1),
-            *(_share(entry.also[truth].macro_f1) for truth in also),
+            *(_share(scores.macro_f1) for scores in _by_truth(entry).values()),
             _share(paper_tables.F1.get(case)),
             _share(entry.strict.kim_f1),
             _share(entry.coverage),

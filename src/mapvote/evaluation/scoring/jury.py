@@ -9,7 +9,7 @@ from mapvote.core.columns import column_bits
 from mapvote.core.grid import CELL_SIZE, TileIndex
 from mapvote.core.point_map import PointMap
 from mapvote.core.reference import reference_window
-from mapvote.core.types import F64, U8
+from mapvote.core.types import F64, U8, Reference
 from mapvote.evaluation.results import Judgement
 from mapvote.evaluation.scoring.border import ceiling
 from mapvote.evaluation.scoring.cells import Scores, coverage, score_cells
@@ -39,9 +39,12 @@ class Jury:
 
     def __init__(self, first_map: PointMap, truth: Truth) -> None:
         self.truth = truth
-        self._also = {name: of(truth) for name, of in TRUTHS.items()}
         self.window = truth.grid_on(first_map.lattice)
-        self._points = MapJudge(map_obstacles(first_map), *_above_ground(first_map, truth))
+        self.first_map = reference_window(first_map, self.window)
+        """Over the truth's window."""
+        self.truths = {name: judge(truth, self.first_map) for name, judge in TRUTHS.items()}
+        """(rows, cols) of each, by name."""
+        self._points = MapJudge(map_obstacles(first_map), *_above_ground(self.first_map, truth))
         self._objects = [{"kind": o["kind"], "cells": truth.cells_of(o["footprint"])} for o in truth.objects]
 
     def of_states(self, states: U8, vehicle_states: Sequence[U8]) -> Judgement:
@@ -55,24 +58,22 @@ class Jury:
 
     def ceilings(self) -> dict[str, Scores]:
         """By truth: what perfect labels on every measured point would score (scoring/border.py)."""
-        truths = {"strict": self.truth.strict, "provenance": self.truth.provenance, **self._also}
-        return {name: ceiling(self.truth, cells) for name, cells in truths.items()}
+        return {name: ceiling(self.truth, cells) for name, cells in self.truths.items()}
 
     def _judge(self, states: U8, vehicle_states: Sequence[U8], points: MapScores | None) -> Judgement:
-        strict, provenance = self.truth.strict, self.truth.provenance
+        scores = {name: score_cells(states, cells) for name, cells in self.truths.items()}
         return Judgement(
-            strict=score_cells(states, strict),
-            provenance=score_cells(states, provenance),
-            also={name: score_cells(states, cells) for name, cells in self._also.items()},
-            coverage=coverage(vehicle_states, strict),
-            objects=score_objects(states, strict, self._objects, CELL_SIZE),
+            strict=scores.pop("strict"),
+            provenance=scores.pop("provenance"),
+            also=scores,
+            coverage=coverage(vehicle_states, self.truths["strict"]),
+            objects=score_objects(states, self.truths["strict"], self._objects, CELL_SIZE),
             map=points,
         )
 
 
-def _above_ground(first_map: PointMap, truth: Truth) -> tuple[F64, F64, F64]:
+def _above_ground(reference: Reference, truth: Truth) -> tuple[F64, F64, F64]:
     """Surface samples that could be obstacle points: above the map's ground, or outside the window."""
-    reference = reference_window(first_map, truth.grid_on(first_map.lattice))
     chosen = []
     for samples in truth.surfaces():
         rows, cols, inside = reference.grid.indices_of(samples)
