@@ -31,7 +31,7 @@ def truth_of(folder: Path, cells: np.ndarray, **walls: float) -> Truth:
         points=np.concatenate(list(samples.values())).astype(np.float32),
         label=np.concatenate([np.full(len(points), labels[name], np.uint8) for name, points in samples.items()]),
     )
-    return Truth(folder / "truth", 0.0, 0.0, cells, cells, *np.zeros((2, *cells.shape), np.uint8), ())
+    return Truth(folder / "truth", 0.0, 0.0, cells, cells, np.zeros_like(cells), np.zeros_like(cells), ())
 
 
 def column_of(kind: int, column: int) -> np.ndarray:
