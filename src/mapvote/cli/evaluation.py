@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from mapvote.cli.options import EVALUATE, Config, Scenario, Seed
-from mapvote.cli.terminal import progress, stages
+from mapvote.cli.terminal import print_table, progress, stages
 
 
 def register(app: typer.Typer) -> None:
@@ -54,7 +54,12 @@ def evaluate(
     sensor: Annotated[
         str | None, typer.Option(metavar="NAME", help="vlp16, hdl32e or hdl64e; else the scenario's")
     ] = None,
-    out: Annotated[Path | None, typer.Option(metavar="FOLDER", help="real: where the pictures of the worst go")] = None,
+    out: Annotated[
+        Path | None, typer.Option(metavar="FOLDER", help="real: where tables and pictures of the worst go")
+    ] = None,
+    scans: Annotated[
+        str | None, typer.Option(metavar="SLICES", help="real: which scans of the drive: 0:300, say")
+    ] = None,
     config: Config = None,
 ) -> None:
     """Simulate, map, vote, and score: Tables II to IV of the paper with its figures beside ours.
@@ -75,7 +80,7 @@ def evaluate(
     if scenario == "real":
         if drive is None:
             raise typer.BadParameter("name the drive: mapvote evaluate real DRIVE", param_hint="DRIVE")
-        _evaluate_real(drive, seed, json, out, config)
+        _evaluate_real(drive, scans, seed, json, out, config)
         return
     if drive is not None:
         raise typer.BadParameter(f"{drive}: a drive follows the word real only", param_hint="DRIVE")
@@ -96,30 +101,34 @@ def evaluate(
         print(f"{json}: all numbers")
 
 
-def _evaluate_real(drive: Path, seed: int, json: Path | None, out: Path | None, config: Path | None) -> None:
+def _evaluate_real(
+    drive: Path, scans: str | None, seed: int, json: Path | None, out: Path | None, config: Path | None
+) -> None:
     """The bench of a recorded drive; its own blocks are map and vehicles, nothing is simulated but the changes."""
-    from rich.console import Console
-
     from mapvote.config import load_settings
     from mapvote.evaluation.experiments.cases import choose_cases
     from mapvote.evaluation.experiments.real.bench import bench
     from mapvote.evaluation.reporting.real_figures import draw_worst
-    from mapvote.evaluation.reporting.real_tables import real_tables
+    from mapvote.evaluation.reporting.real_tables import as_markdown, real_tables
     from mapvote.evaluation.reporting.tables import write_text
     from mapvote.evaluation.results import to_json
 
     settings = load_settings(config)
     cases, _ = choose_cases(settings, "columns")
     with stages() as told:
-        result = bench(drive, settings, cases, told, seed=seed)
-    for table in real_tables(result, "columns"):
-        Console(width=140).print(table)
+        result = bench(drive, settings, cases, told, scans=scans, seed=seed)
+    sheets = real_tables(result, "columns")
+    for sheet in sheets:
+        print_table(sheet.headings, sheet.rows, sheet.title)
     if json is not None:
         write_text(to_json(result.figures("columns")), json)
         print(f"{json}: all numbers")
     if out is not None:
-        for picture in draw_worst(result, "columns", out):
-            print(f"{picture}")
+        pictures = draw_worst(result, "columns", out)
+        command = f"mapvote evaluate real {drive}{f' --scans {scans}' if scans else ''} --seed {seed} --out {out}"
+        write_text(as_markdown(sheets, command), out / "tables.md")
+        for file in [out / "tables.md", *pictures]:
+            print(f"{file}")
 
 
 def demo(

@@ -87,7 +87,7 @@ def _draw(run: RealRun, picture: F64, title: str, spots: Sequence[Spot], path: P
     axes["all"].imshow(picture, origin="lower", extent=extent)
     axes["all"].set_xlabel("east, m")
     axes["all"].set_ylabel("north, m")
-    axes["all"].set_title(f"{run.street.folder.name}, {title}")
+    axes["all"].set_title(f"{run.street.recording.path.resolve().name}, {title}")
     for k in range(5 * len(rows)):
         ax = axes[str(k)]
         if k >= len(spots):

@@ -11,7 +11,7 @@ from mapvote.core.geometry import from_xyz_rpy
 from mapvote.core.sensors import SENSORS
 from mapvote.core.types import F64, Drive
 from mapvote.evaluation.experiments.real import sensing
-from mapvote.evaluation.experiments.real.street import Edit
+from mapvote.evaluation.experiments.real.street import Edit, part_of
 from mapvote.formats import DriveWriter, open_drive
 
 SPEED = 10.0
@@ -34,8 +34,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def believed(folder: Path, edit: Edit) -> F64:
     """(n, 3) positions of the prior of every third scan, after the change, less the true ones."""
     drive = open_drive(folder, scans="::3")
-    scans = np.arange(0, 40, 3)
-    T = edit(drive, scans).T_map_lidar_prior
+    T = part_of(edit(open_drive(folder)), np.arange(0, 40, 3)).T_map_lidar_prior
     assert T is not None
     assert drive.T_map_lidar_prior is not None
     return np.asarray(T[:, :3, 3] - drive.T_map_lidar_prior[:, :3, 3])
@@ -58,7 +57,7 @@ def test_a_bias_is_constant_and_a_drift_grows_from_nothing(folder: Path) -> None
 
 def test_another_street_crosses_this_one(folder: Path) -> None:
     drive = open_drive(folder)
-    T = sensing.of_another_street()(drive, np.arange(40)).T_map_lidar_prior
+    T = sensing.of_another_street()(drive).T_map_lidar_prior
     assert T is not None
     assert np.ptp(T[:, 0, 3]) < 1e-6
     assert abs(np.ptp(T[:, 1, 3]) - 39.0) < 1e-6
@@ -66,7 +65,14 @@ def test_another_street_crosses_this_one(folder: Path) -> None:
 
 def test_rain_shortens_its_share_of_the_rays_and_turns_none(folder: Path) -> None:
     drive: Drive = open_drive(folder)
-    dry, wet = drive.read_scan(3).points, sensing.in_rain(0.2)(drive, np.arange(40)).read_scan(3).points
+    dry, wet = drive.read_scan(3).points, sensing.in_rain(0.2)(drive).read_scan(3).points
     reach = np.linalg.norm(wet, axis=1) / np.linalg.norm(dry, axis=1)
     assert 0.12 < (reach < 0.99).mean() < 0.28
     np.testing.assert_allclose(wet / np.linalg.norm(wet, axis=1)[:, None], dry / 30.0, atol=1e-4)
+
+
+def test_a_thinned_scan_is_a_part_of_the_scan(folder: Path) -> None:
+    drive = open_drive(folder)
+    whole, few = drive.read_scan(5).points, sensing.thinned(0.7)(drive).read_scan(5).points
+    assert 0.2 < len(few) / len(whole) < 0.4
+    assert {tuple(p) for p in few.tolist()} <= {tuple(p) for p in whole.tolist()}

@@ -10,20 +10,31 @@ from mapvote.core.types import MapvoteError
 from mapvote.evaluation.experiments.cases import choose_cases
 from mapvote.evaluation.experiments.real.bench import ground_of
 from mapvote.evaluation.experiments.real.sensing import disturbed, every_other_beam
-from mapvote.evaluation.experiments.real.street import Edit, lay_street, reference_trajectory, split, unedited, vote_on
+from mapvote.evaluation.experiments.real.street import (
+    Edit,
+    Street,
+    lay_street,
+    open_recording,
+    split,
+    unedited,
+    vote_on,
+)
 
 KITTI = Path(__file__).parents[4] / "../shared/data/kitti/2011_09_26_0001"
 needs_kitti = pytest.mark.skipif(not KITTI.is_dir(), reason="the KITTI scans are not at ../shared/data (licence)")
 
 
+def laid(folder: Path) -> Street:
+    recording, reference = open_recording(folder, Settings())
+    return lay_street(recording, Settings(), reference)
+
+
 def test_every_scan_is_mapped_or_voted_with_once() -> None:
     mapped, voting = split(50, 12)
-    used = np.concatenate(
-        [np.arange(50)[slice(*map(int, part.split(":")))] for text in (mapped, *voting) for part in text.split(",")]
-    )
-    assert sorted(used.tolist()) == list(range(50))
-    with pytest.raises(MapvoteError, match="too few"):
-        split(10, 12)
+    assert sorted(np.concatenate([mapped, *voting]).tolist()) == list(range(50))
+    assert mapped.tolist() == [*range(12), *range(24, 36), *range(48, 50)]
+    with pytest.raises(MapvoteError, match=r"of 30 scans in blocks of 25, 5 are left to vote: 12 are needed"):
+        split(30, 25)
 
 
 @needs_kitti
@@ -34,7 +45,7 @@ def test_every_scan_is_mapped_or_voted_with_once() -> None:
 def test_vehicles_find_themselves_within_10_cm_and_none_is_lost(edit: Edit, first_pose_only: bool) -> None:
     """Every third scan at 12 m/s is 4 m from the last: a motion not yet known must not settle one house too early."""
     cases, _ = choose_cases(Settings(), "1")
-    street = lay_street(KITTI, Settings(), reference_trajectory(KITTI, Settings()))
+    street = laid(KITTI)
     run = vote_on(street, cases, edit=edit, first_pose_only=first_pose_only)
     assert len(run.error_m) == run.scans == 24
     assert np.median(run.error_m) <= 0.10
@@ -49,7 +60,7 @@ def test_hardly_anything_is_called_changed_where_nothing_changed(drive: str) -> 
     """Movers apart .2 % of determined cells and a quarter of case 1's share at most, movers included 1 %."""
     cases, _ = choose_cases(Settings(), "1,columns")
     folder = KITTI.with_name(f"2011_09_26_{drive}")
-    street = lay_street(folder, Settings(), reference_trajectory(folder, Settings()))
+    street = laid(folder)
     for edit in (unedited, every_other_beam):
         run = vote_on(street, cases, edit=edit)
         share = run.changed_share("columns", with_movers=False)
@@ -64,7 +75,7 @@ def test_hardly_anything_is_called_changed_where_nothing_changed(drive: str) -> 
 def test_no_reflection_sinks_the_ground_under_the_driven_path(drive: str) -> None:
     """KITTI's sensor stands 1.73 m above the road. Before the path was asked, drive 0005's stood at 4.1 m."""
     folder = KITTI.with_name(f"2011_09_26_{drive}")
-    ground = ground_of(lay_street(folder, Settings(), reference_trajectory(folder, Settings())))
+    ground = ground_of(laid(folder))
     assert abs(ground.sensor_height_m - 1.73) <= 0.05
     assert abs(ground.worst_off_m) <= 0.2
     assert ground.occupied_share <= 0.01

@@ -40,7 +40,7 @@ def drive() -> tuple[Drive, F64]:
 def seen(things: list[Thing]) -> tuple[F64, F64]:
     """(points before, points after) of the first scan, map metres, ray by ray where none was dropped."""
     plain, T = drive()
-    changed = with_things(plain, np.arange(2), things, T)
+    changed = with_things(plain, things, T)
     return transform(T[0], plain.read_scan(0).points), transform(T[0], changed.read_scan(0).points)
 
 

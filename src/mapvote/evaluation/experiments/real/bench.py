@@ -20,12 +20,11 @@ from mapvote.evaluation.experiments.real.street import (
     RealRun,
     Street,
     lay_street,
-    reference_trajectory,
+    open_recording,
     unedited,
     vote_on,
 )
-from mapvote.evaluation.scoring.cells import ratio
-from mapvote.formats import open_drive
+from mapvote.evaluation.scoring.cells import determined, ratio
 
 BLOCKS = (12, 25)
 PRIORS: Mapping[str, Edit] = {
@@ -55,6 +54,7 @@ class Bench:
     """Everything that was measured on one drive."""
 
     name: str
+    scans: int
     ground: Ground
     runs: dict[str, RealRun] = field(default_factory=dict)
     """Nothing changed in any of them."""
@@ -66,6 +66,7 @@ class Bench:
         """All of it as numbers, by ``case``."""
         return {
             "drive": self.name,
+            "scans": self.scans,
             "ground": {k: v if np.isfinite(v) else None for k, v in asdict(self.ground).items()},
             "unchanged": {name: unchanged_figures(run, case) for name, run in self.runs.items()},
             "changed": {
@@ -80,8 +81,10 @@ class Bench:
 
 
 def unchanged_figures(run: RealRun, case: str) -> dict[str, float]:
-    """Shares of cells and scans, and errors in metres (0 where no scan was localised)."""
+    """Counts, shares of cells and scans, and errors in metres (0 where no scan was localised)."""
     return {
+        "ballots": float(run.ballots),
+        "determined_cells": float(np.count_nonzero(determined(run.states[case]))),
         "false_share": run.changed_share(case, with_movers=False),
         "false_share_with_movers": run.changed_share(case, with_movers=True),
         "false_share_of_mapped": run.changed_share(case, with_movers=False, of_mapped=True),
@@ -93,15 +96,22 @@ def unchanged_figures(run: RealRun, case: str) -> dict[str, float]:
 
 
 def bench(
-    folder: Path, settings: Settings, cases: Sequence[Case], tell: Tell, *, seed: int = 1, each: int = 4
+    folder: Path,
+    settings: Settings,
+    cases: Sequence[Case],
+    tell: Tell,
+    *,
+    scans: str | None = None,
+    seed: int = 1,
+    each: int = 4,
 ) -> Bench:
-    """Run all of it on the drive at ``folder``, ``each`` things of a kind. What a drive is too short or too bare for is
-    skipped and named. MapvoteError if it has fewer scans than two of the smallest blocks.
+    """Run all of it on the drive at ``folder`` (of its ``scans``), ``each`` things of a kind. What a drive is too short
+    or too bare for is skipped and named. MapvoteError if it is too short for the smallest blocks.
     """
-    reference = reference_trajectory(folder, settings)
-    street = lay_street(folder, settings, reference, block=BLOCKS[0])
-    result = Bench(folder.resolve().name, ground_of(street))
-    jobs = _unchanged(folder, settings, reference, street, cases)
+    recording, reference = open_recording(folder, settings, scans)
+    street = lay_street(recording, settings, reference, block=BLOCKS[0])
+    result = Bench(folder.resolve().name, len(recording), ground_of(street))
+    jobs = _unchanged(recording, settings, reference, street, cases)
     total = len(jobs) + 2
     for k, (name, job) in enumerate(jobs.items()):
         tell("real street", k, total)
@@ -121,7 +131,7 @@ def bench(
 
 
 def _unchanged(
-    folder: Path, settings: Settings, reference: F64, street: Street, cases: Sequence[Case]
+    recording: Drive, settings: Settings, reference: F64, street: Street, cases: Sequence[Case]
 ) -> dict[str, Callable[[], RealRun]]:
     """Runs by name, each made when called."""
 
@@ -129,17 +139,18 @@ def _unchanged(
         return lambda: vote_on(other(), cases, edit=edit)
 
     def laid(block: int) -> Callable[[], Street]:
-        return lambda: lay_street(folder, settings, reference, block=block)
+        return lambda: lay_street(recording, settings, reference, block=block)
 
     jobs = {f"blocks of {BLOCKS[0]} scans": on(lambda: street)}
     jobs |= {f"blocks of {block} scans": on(laid(block)) for block in BLOCKS[1:]}
     jobs["map ends half way"] = on(laid(-(-len(reference) // 2)))
     jobs["every other beam"] = on(lambda: street, sensing.every_other_beam)
+    jobs["70 % of the points lost"] = on(lambda: street, sensing.thinned(0.7))
     jobs["rain, 10 % of the rays"] = on(lambda: street, sensing.in_rain(0.1))
-    first: Drive = open_drive(folder)
-    if first.T_map_lidar_prior is not None:
+    if recording.T_map_lidar_prior is not None:
         jobs["first pose only"] = lambda: vote_on(street, cases, first_pose_only=True)
         jobs |= {f"prior {name}": on(lambda: street, edit) for name, edit in PRIORS.items()}
+    jobs["no prior"] = on(lambda: street, sensing.without_prior)
     return jobs
 
 

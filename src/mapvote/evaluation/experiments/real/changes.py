@@ -12,14 +12,13 @@ from mapvote.core.columns import GROUND_MARGIN_M
 from mapvote.core.geometry import inverse, transform
 from mapvote.core.grid import Grid
 from mapvote.core.reference import LocalMap, reference_window
-from mapvote.core.types import F64, U8, Bool, CellState, Drive
+from mapvote.core.types import F64, U8, Bool, CellState
 from mapvote.core.voxels import VoxelCloud
 from mapvote.evaluation.experiments.cases import Case
 from mapvote.evaluation.experiments.real.raycast import Thing, with_things
-from mapvote.evaluation.experiments.real.street import Edit, RealRun, Street, changed, lay_street, vote_on
+from mapvote.evaluation.experiments.real.street import Edit, RealRun, Street, changed, lay_street, met_cells, vote_on
 from mapvote.evaluation.experiments.real.things import Site
 from mapvote.evaluation.scoring.cells import ratio
-from mapvote.formats import open_drive
 from mapvote.localisation.localiser import GivenPoses
 from mapvote.perception.raycast import find_obstacles
 
@@ -35,6 +34,8 @@ class Asked:
     state: CellState
     cells: Bool
     """(rows, cols) that must be decided so: rays met it there, or had met it in the map's scans."""
+    rays: float = 0.0
+    """That met it, in the mean of the scans in which any did."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,11 +51,13 @@ class Found:
     """Of them: a cell at the thing, or next to one, was."""
     cell_recall: float
     """Share of all their cells."""
+    rays: float
+    """That met one of them in a scan, in the median."""
 
 
 def survey_site(street: Street) -> Site:
     """What all scans of the recording show, in the frame of the street's map."""
-    drive = open_drive(street.folder)
+    drive = street.recording
     localise = GivenPoses(drive.stamps_ns, street.T_map_lidar)
     around = LocalMap(street.point_map, street.settings.voting.window_m)
     cloud = VoxelCloud(street.point_map.lattice)
@@ -76,11 +79,7 @@ def survey_site(street: Street) -> Site:
 
 def among(things: Sequence[Thing], street: Street) -> Edit:
     """Scans recorded among ``things``, which lie in the frame of the street's map."""
-
-    def edit(drive: Drive, scans: np.ndarray) -> Drive:
-        return with_things(drive, scans, things, street.T_map_lidar)
-
-    return edit
+    return lambda recording: with_things(recording, things, street.T_map_lidar)
 
 
 def built(street: Street, site: Site, cases: Sequence[Case], seed: int, each: int) -> tuple[RealRun, list[Asked]]:
@@ -91,11 +90,15 @@ def built(street: Street, site: Site, cases: Sequence[Case], seed: int, each: in
     gone = site.gone_cars(each)
     if hedges:
         street = lay_street(
-            street.folder, street.settings, street.T_map_lidar, block=street.block, survey_edit=among(standing, street)
-        )
-    run = vote_on(street, cases, edit=among([*standing, *things, *moved, *gone], street))
+            street.recording, street.settings, street.T_map_lidar, block=street.block,
+            survey_edit=among(standing, street),
+        )  # fmt: skip
+    after = among([*standing, *things, *moved, *gone], street)
+    run = vote_on(street, cases, edit=after)
     asked = [_new(street, thing) for thing in [*things, *moved]]
-    asked += [_gone(street, thing, thing.left) for thing in [*moved, *gone] if thing.kind != "wall set forward"]
+    still = met_cells(street, after)
+    left = [thing for thing in [*moved, *gone] if thing.kind != "wall set forward"]
+    asked += [_gone(street, thing, thing.left, still) for thing in left]
     return run, asked
 
 
@@ -103,24 +106,28 @@ def demolished(street: Street, site: Site, cases: Sequence[Case], seed: int, eac
     """The map was made among things that the vehicles do not find any more."""
     things = [thing for thing in site.placed(seed + 100, each)[0] if thing.kind != "wall behind a hedge"]
     before = lay_street(
-        street.folder, street.settings, street.T_map_lidar, block=street.block, survey_edit=among(things, street)
+        street.recording, street.settings, street.T_map_lidar, block=street.block, survey_edit=among(things, street)
     )
     T_map_old = before.T_map_lidar[0] @ inverse(street.T_map_lidar[0])
-    return vote_on(before, cases), [
-        _gone(before, thing, [transform(T_map_old, p) for p in thing.met]) for thing in things
-    ]
+    still = met_cells(before)
+    asked = [_gone(before, thing, [transform(T_map_old, p) for p in thing.met], still) for thing in things]
+    return vote_on(before, cases), asked
 
 
 def _new(street: Street, thing: Thing) -> Asked:
     kind = f"{thing.kind}, new side" if thing.goes is not None else f"{thing.kind} built"
-    return Asked(kind, CellState.CHANGED_OCCUPIED, _cells(street, thing.met) & ~street.mapped)
+    return Asked(kind, CellState.CHANGED_OCCUPIED, _cells(street, thing.met) & ~street.mapped, _rays(thing.met))
 
 
-def _gone(street: Street, thing: Thing, points: Sequence[F64]) -> Asked:
-    kind = f"{thing.kind}, old side" if len(thing.comes) and thing.goes is not None else thing.kind
-    kind = kind if thing.goes is not None else f"{kind} gone"
-    cells = _cells(street, points) & street.mapped
-    return Asked(kind, CellState.CHANGED_EMPTY, cells & ~_cells(street, thing.met) if thing.goes is not None else cells)
+def _gone(street: Street, thing: Thing, points: Sequence[F64], still: Bool) -> Asked:
+    """What had stood at ``points``, but for the cells in which something stands ``still`` (rows, cols)."""
+    kind = thing.kind if thing.goes is not None else f"{thing.kind} gone"
+    kind = f"{kind}, old side" if thing.goes is not None and len(thing.comes) else kind
+    return Asked(kind, CellState.CHANGED_EMPTY, _cells(street, points) & street.mapped & ~still, _rays(points))
+
+
+def _rays(clouds: Sequence[F64]) -> float:
+    return float(np.mean([len(points) for points in clouds if len(points)] or [0]))
 
 
 def _cells(street: Street, clouds: Sequence[F64]) -> Bool:
@@ -145,7 +152,8 @@ def score(asked: Sequence[Asked], states: U8) -> list[Found]:
         near = [ndimage.binary_dilation(a.cells, np.ones((3, 3))) & (states == a.state) for a in these]
         half = sum(bool(2 * r >= n) for r, n in zip(right, size, strict=True))
         touched = sum(bool(n.any()) for n in near)
-        out.append(Found(kind, len(these), half, touched, ratio(sum(right), sum(size))))
+        rays = float(np.median([a.rays for a in these] or [0]))
+        out.append(Found(kind, len(these), half, touched, ratio(sum(right), sum(size)), rays))
     return out
 
 

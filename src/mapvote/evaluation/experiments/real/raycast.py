@@ -13,7 +13,7 @@ import numpy as np
 
 from mapvote.core.geometry import inverse, transform
 from mapvote.core.grid import CELL_SIZE
-from mapvote.core.types import F32, F64, I64, Bool, Drive, Scan
+from mapvote.core.types import F32, F64, Bool, Drive, Scan
 from mapvote.localisation.deskew import deskew, motion_at
 from mapvote.simulation.lidar import Caster
 from mapvote.simulation.shapes import box
@@ -47,17 +47,16 @@ class Thing:
         return np.asarray(self.comes.reshape(-1, 3)[:, :2].mean(axis=0))
 
 
-def with_things(drive: Drive, scans: I64, things: Sequence[Thing], reference: F64) -> Drive:
-    """The drive as it would have been recorded among ``things``; ``reference`` (n, 4, 4) of the whole recording.
+def with_things(drive: Drive, things: Sequence[Thing], reference: F64) -> Drive:
+    """The drive as it would have been recorded among ``things``; ``reference`` (n, 4, 4): where it was.
 
     Every scan read notes in the things where its rays ended. Scans come out de-skewed.
     """
-    stamps_ns, T_ref_lidar = drive.stamps_ns, reference[scans]
 
     def read_scan(i: int) -> Scan:
-        scan, T = drive.read_scan(i), T_ref_lidar[i]
-        points = deskew(scan, motion_at(stamps_ns, T_ref_lidar, i)).astype(np.float32)
-        rng = np.random.default_rng([int(scans[i]), 2])
+        scan, T = drive.read_scan(i), reference[i]
+        points = deskew(scan, motion_at(drive.stamps_ns, reference, i)).astype(np.float32)
+        rng = np.random.default_rng([i, 2])
         keep = np.ones(len(points), dtype=np.bool_)
         for thing in things:
             if np.linalg.norm(thing.centre - T[:2, 3]) < REACH_M:

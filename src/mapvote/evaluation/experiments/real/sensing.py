@@ -8,9 +8,8 @@ from dataclasses import replace
 import numpy as np
 
 from mapvote.core.geometry import exp, from_xyz_rpy
-from mapvote.core.types import F64, I64, Bool, Drive, MapvoteError, Scan
+from mapvote.core.types import F64, Bool, Drive, MapvoteError, Scan
 from mapvote.evaluation.experiments.real.street import Edit
-from mapvote.formats import open_drive
 
 _DROPS_M = 5.0
 
@@ -25,7 +24,7 @@ def of_points(scan: Scan, keep: Bool) -> Scan:
     )
 
 
-def every_other_beam(drive: Drive, scans: I64) -> Drive:
+def every_other_beam(drive: Drive) -> Drive:
     """The drive as a sensor with half the beams would have seen it; points are matched to the nearest beam."""
     elevations = np.sort(np.asarray(drive.sensor.elevations_deg))
     sensor = replace(drive.sensor, elevations_deg=tuple(elevations[::-1][::2].tolist()))
@@ -41,13 +40,26 @@ def every_other_beam(drive: Drive, scans: I64) -> Drive:
     return replace(drive, sensor=sensor, read_scan=read_scan)
 
 
+def thinned(share: float) -> Edit:
+    """That share of the points is not there, any of them."""
+
+    def edit(drive: Drive) -> Drive:
+        def read_scan(i: int) -> Scan:
+            scan = drive.read_scan(i)
+            return of_points(scan, np.random.default_rng([i, 3]).random(len(scan.points)) >= share)
+
+        return replace(drive, read_scan=read_scan)
+
+    return edit
+
+
 def in_rain(share: float) -> Edit:
     """Rain: that share of the rays ends on a drop near the sensor (exponential, 5 m in the mean)."""
 
-    def edit(drive: Drive, scans: I64) -> Drive:
+    def edit(drive: Drive) -> Drive:
         def read_scan(i: int) -> Scan:
             scan = drive.read_scan(i)
-            rng = np.random.default_rng([int(scans[i]), 1])
+            rng = np.random.default_rng([i, 1])
             reach = np.linalg.norm(scan.points, axis=1)
             drop = drive.sensor.min_range_m + rng.exponential(_DROPS_M, len(reach)).astype(np.float32)
             short = np.where((rng.random(len(reach)) < share) & (drop < reach), drop / np.maximum(reach, 1e-3), 1.0)
@@ -58,33 +70,33 @@ def in_rain(share: float) -> Edit:
     return edit
 
 
-def believing(change: Callable[[F64, F64, F64], F64]) -> Edit:
-    """A prior made of ``change(all priors (m, 4, 4), all stamps (m,), stamps of the drive (n,)) -> (n, 4, 4)``.
+def believing(change: Callable[[F64, F64], F64]) -> Edit:
+    """A prior made of ``change(priors (n, 4, 4), seconds since the first scan (n,)) -> (n, 4, 4)``.
 
-    All: of the whole recording; stamps in seconds. The stated sigmas stay as they are: the vehicle does not know.
+    The stated sigmas stay as they are: the vehicle does not know.
     """
 
-    def edit(drive: Drive, scans: I64) -> Drive:
-        whole = open_drive(drive.path)
-        if whole.T_map_lidar_prior is None:
-            raise MapvoteError(f"{drive.path}: has no prior to change")
-        start = whole.stamps_ns[0]
-        all_s, own_s = 1e-9 * (whole.stamps_ns - start), 1e-9 * (drive.stamps_ns - start)
-        return replace(drive, T_map_lidar_prior=change(whole.T_map_lidar_prior, all_s, own_s))
+    def edit(drive: Drive) -> Drive:
+        at_s = 1e-9 * (drive.stamps_ns - drive.stamps_ns[0])
+        return replace(drive, T_map_lidar_prior=change(_prior_of(drive), at_s))
 
     return edit
+
+
+def without_prior(drive: Drive) -> Drive:
+    """Nobody says where the vehicle is."""
+    return replace(drive, T_map_lidar_prior=None)
 
 
 def late(seconds: float) -> Edit:
     """Where the vehicle was ``seconds`` ago; before the recording it drove on as at its start."""
 
-    def change(T: F64, all_s: F64, own_s: F64) -> F64:
-        nearest = np.abs(all_s[None, :] - (own_s - seconds)[:, None]).argmin(axis=1)
-        out = T[nearest].copy()
-        speed = (T[-1, :3, 3] - T[0, :3, 3]) / max(all_s[-1], 1e-3) if len(T) < 10 else (T[9] - T[0])[:3, 3] / all_s[9]
-        for axis in range(3):
-            before = np.minimum(own_s - seconds - all_s[0], 0.0) * speed[axis]
-            out[:, axis, 3] = np.interp(own_s - seconds, all_s, T[:, axis, 3]) + before
+    def change(T: F64, at_s: F64) -> F64:
+        then = at_s - seconds
+        out = T[np.abs(at_s[None, :] - then[:, None]).argmin(axis=1)].copy()
+        few = min(9, len(T) - 1)
+        before = np.minimum(then, 0.0)[:, None] * (T[few] - T[0])[:3, 3] / max(float(at_s[few]), 1e-3)
+        out[:, :3, 3] = before + np.column_stack([np.interp(then, at_s, T[:, axis, 3]) for axis in range(3)])
         return out
 
     return believing(change)
@@ -92,36 +104,21 @@ def late(seconds: float) -> Edit:
 
 def biased(metres: float) -> Edit:
     """Off by as much all the time, half way between ahead and aside as the drive begins."""
-
-    def change(T: F64, all_s: F64, own_s: F64) -> F64:
-        out = _at(T, all_s, own_s)
-        ahead = np.arctan2(T[0, 1, 0], T[0, 0, 0]) + 0.25 * np.pi
-        out[:, :2, 3] += metres * np.array([np.cos(ahead), np.sin(ahead)])
-        return out
-
-    return believing(change)
+    return believing(lambda T, at_s: _aside(T, np.full(len(T), metres)))
 
 
 def drifting(metres: float) -> Edit:
     """Right at first, and as far off as that at the end: a heading error that grows."""
-
-    def change(T: F64, all_s: F64, own_s: F64) -> F64:
-        out = _at(T, all_s, own_s)
-        ahead = np.arctan2(T[0, 1, 0], T[0, 0, 0]) + 0.25 * np.pi
-        grown = metres * (own_s - all_s[0]) / max(all_s[-1] - all_s[0], 1e-3)
-        out[:, :2, 3] += grown[:, None] * np.array([np.cos(ahead), np.sin(ahead)])
-        return out
-
-    return believing(change)
+    return believing(lambda T, at_s: _aside(T, metres * at_s / max(float(at_s[-1]), 1e-3)))
 
 
 def of_another_street() -> Edit:
     """The whole track turned by 90 deg about its middle: a street that crosses this one."""
 
-    def change(T: F64, all_s: F64, own_s: F64) -> F64:
+    def change(T: F64, at_s: F64) -> F64:
         x, y, z = T[len(T) // 2, :3, 3].tolist()
         turn = from_xyz_rpy(x, y, z, yaw=0.5 * np.pi) @ from_xyz_rpy(-x, -y, -z)
-        return np.asarray(turn @ _at(T, all_s, own_s))
+        return np.asarray(turn @ T)
 
     return believing(change)
 
@@ -129,18 +126,25 @@ def of_another_street() -> Edit:
 def disturbed(sigma_m: float = 0.5, sigma_deg: float = 2.0) -> Edit:
     """An independent error in every scan, normal in x, y and yaw; the vehicle knows twice as much."""
 
-    def edit(drive: Drive, scans: I64) -> Drive:
-        if drive.T_map_lidar_prior is None:
-            raise MapvoteError(f"{drive.path}: has no prior to disturb")
-        rng = np.random.default_rng([0, *drive.vehicle.encode()])
-        off = np.zeros((len(drive), 6))
-        off[:, :2] = rng.normal(0.0, sigma_m, (len(drive), 2))
-        off[:, 5] = rng.normal(0.0, np.radians(sigma_deg), len(drive))
-        worse = np.array([T @ exp(xi) for T, xi in zip(drive.T_map_lidar_prior, off, strict=True)])
+    def edit(drive: Drive) -> Drive:
+        T, rng = _prior_of(drive), np.random.default_rng(0)
+        off = np.zeros((len(T), 6))
+        off[:, :2] = rng.normal(0.0, sigma_m, (len(T), 2))
+        off[:, 5] = rng.normal(0.0, np.radians(sigma_deg), len(T))
+        worse = np.array([T_map_lidar @ exp(xi) for T_map_lidar, xi in zip(T, off, strict=True)])
         return replace(drive, T_map_lidar_prior=worse, prior_sigma_m=2 * sigma_m, prior_sigma_deg=2 * sigma_deg)
 
     return edit
 
 
-def _at(T: F64, all_s: F64, own_s: F64) -> F64:
-    return T[np.searchsorted(all_s, own_s - 1e-6).clip(0, len(T) - 1)].copy()
+def _prior_of(drive: Drive) -> F64:
+    if drive.T_map_lidar_prior is None:
+        raise MapvoteError(f"{drive.path}: has no prior to change")
+    return drive.T_map_lidar_prior
+
+
+def _aside(T: F64, metres: F64) -> F64:
+    """Poses (n, 4, 4) moved by ``metres`` (n,) half way between ahead and aside as the drive begins."""
+    ahead, out = np.arctan2(T[0, 1, 0], T[0, 0, 0]) + 0.25 * np.pi, T.copy()
+    out[:, :2, 3] += metres[:, None] * np.array([np.cos(ahead), np.sin(ahead)])
+    return out

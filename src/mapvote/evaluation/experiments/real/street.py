@@ -8,7 +8,7 @@ measured here is a lower bound of what a fleet meets.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -26,6 +26,7 @@ from mapvote.evaluation.experiments.shared_pass import SharedPass
 from mapvote.evaluation.scoring.cells import determined, ratio
 from mapvote.evaluation.scoring.truth import pose_errors, rigid_between
 from mapvote.formats import open_drive, read_T_map_lidar
+from mapvote.formats.drives.options import parse_scans
 from mapvote.localisation.localiser import GivenPoses
 from mapvote.localisation.ndt import PosePrior
 from mapvote.perception.frontend import DriveReport, Frontend, Observation
@@ -36,33 +37,48 @@ from mapvote.slam.build import BuildReport, build_map
 VEHICLES = 3
 WRONG_M = 0.5
 """A pose farther off than this is wrong."""
-Edit = Callable[[Drive, I64], Drive]
-"""Changes a drive before it is used: what its sensor sees, or what it believes. The second argument: which scans of the
-recording (n,) it has."""
+LEAST_SCANS = 4
+"""Of each vehicle: a place counts as found once three scans agree on it."""
+Edit = Callable[[Drive], Drive]
+"""Changes a whole recording before any of it is used: what its sensor sees, or what it believes."""
 
 
-def unedited(drive: Drive, scans: I64) -> Drive:
+def unedited(recording: Drive) -> Drive:
     """As recorded."""
-    return drive
+    return recording
 
 
-def split(n: int, block: int) -> tuple[str, list[str]]:
-    """(``--scans`` of the map, of each vehicle) for a drive of ``n`` scans: blocks in turn, every third scan each."""
-    starts = range(0, n, block)
-    if len(starts) < 2:
-        raise MapvoteError(f"{n} scans are too few for blocks of {block}: choose smaller blocks")
-    mapped = ",".join(f"{s}:{min(s + block, n)}" for s in starts[::2])
-    return mapped, [
-        ",".join(f"{s + k}:{min(s + block, n)}:{VEHICLES}" for s in starts[1::2] if s + k < min(s + block, n))
-        for k in range(VEHICLES)
-    ]
+def part_of(recording: Drive, scans: I64, vehicle: str | None = None) -> Drive:
+    """These scans (m,) of a recording, in ascending order, driven by ``vehicle``."""
+    prior = recording.T_map_lidar_prior
+    return replace(
+        recording,
+        vehicle=vehicle or recording.vehicle,
+        stamps_ns=recording.stamps_ns[scans],
+        read_scan=lambda i: recording.read_scan(int(scans[i])),
+        T_map_lidar_prior=None if prior is None else prior[scans],
+    )
+
+
+def split(n: int, block: int) -> tuple[I64, list[I64]]:
+    """(scans of the map, of each vehicle) of a recording of ``n``: blocks in turn, every third scan each.
+
+    MapvoteError if that leaves too few to vote.
+    """
+    blocks = np.arange(n) // block
+    mapped, rest = np.flatnonzero(blocks % 2 == 0), np.flatnonzero(blocks % 2 == 1)
+    if len(rest) < LEAST_SCANS * VEHICLES:
+        raise MapvoteError(
+            f"of {n} scans in blocks of {block}, {len(rest)} are left to vote: {LEAST_SCANS * VEHICLES} are needed"
+        )
+    return mapped, [rest[(rest % block) % VEHICLES == k] for k in range(VEHICLES)]
 
 
 @dataclass(frozen=True)
 class Street:
     """The map of every other block, and what is needed to judge those who vote on it."""
 
-    folder: Path
+    recording: Drive
     point_map: PointMap
     built: BuildReport
     block: int
@@ -90,14 +106,17 @@ class RealRun:
     """Decided by each case, over the street's grid."""
     movers: Bool
     """Cells in or next to which something moved, by the filter on the map's and the vehicles' scans."""
-    reached: Bool
-    """Cells in which a scan of some vehicle met something above the ground, at the reference poses."""
     reports: Sequence[DriveReport]
     error_m: F64
     """Of every scan that was localised, against the reference in the map's frame."""
     error_deg: F64
     prior_error_m: F64
     scans: int
+
+    @property
+    def ballots(self) -> int:
+        """Vehicles that found themselves at all, and so sent one."""
+        return sum(len(report.lost) < report.scans for report in self.reports)
 
     @property
     def lost_share(self) -> float:
@@ -124,48 +143,48 @@ def changed(states: U8) -> Bool:
     return (states == CellState.CHANGED_OCCUPIED) | (states == CellState.CHANGED_EMPTY)
 
 
-def reference_trajectory(folder: Path, settings: Settings) -> F64:
-    """(n, 4, 4) where every scan was taken: ``poses.txt`` where there is one, else SLAM over the whole recording."""
-    file = folder / "poses.txt"
-    if file.is_file():
-        return read_T_map_lidar(file, folder)
-    _, built = build_map([open_drive(folder)], settings)
-    return built.tracks[0].T_map_lidar
+def open_recording(folder: Path, settings: Settings, scans: str | None = None) -> tuple[Drive, F64]:
+    """The drive at ``folder`` and where (n, 4, 4) its scans were taken: by ``poses.txt`` where there is one, else by
+    SLAM over all that is opened. ``scans``: as ``--scans`` of any verb. MapvoteError if the two do not match.
+    """
+    whole = open_drive(folder)
+    chosen = parse_scans(scans, len(whole), str(folder))
+    recording, file = part_of(whole, chosen), folder / "poses.txt"
+    if not file.is_file():
+        return recording, build_map([recording], settings)[1].tracks[0].T_map_lidar
+    T = read_T_map_lidar(file, folder)
+    if len(T) != len(whole):
+        raise MapvoteError(f"{file}: {len(T)} poses for {len(whole)} scans: give a row for every scan")
+    return recording, T[chosen]
 
 
 def lay_street(
-    folder: Path, settings: Settings, reference: F64, *, block: int = 12, survey_edit: Edit = unedited
+    recording: Drive, settings: Settings, reference: F64, *, block: int = 12, survey_edit: Edit = unedited
 ) -> Street:
-    """The map of every other block of the drive at ``folder``; ``reference`` (n, 4, 4) is for scoring only."""
-    n = len(reference)
-    mapped, voting = split(n, block)
-    chosen = _indices(mapped, n)
-    survey = survey_edit(open_drive(folder, scans=mapped), chosen)
+    """The map of every other block of a recording; ``reference`` (n, 4, 4) is for scoring only."""
+    mapped, voting = split(len(reference), block)
+    survey = part_of(survey_edit(recording), mapped)
     point_map, built = build_map([survey], settings)
     T_map_survey = built.tracks[0].T_map_lidar
-    T_map_lidar = rigid_between(T_map_survey, reference[chosen]) @ reference
+    T_map_lidar = rigid_between(T_map_survey, reference[mapped]) @ reference
     grid = _window(point_map, T_map_lidar)
     movers = _moving_cells(survey, T_map_survey, point_map, grid, settings)
-    scans = [_indices(text, n) for text in voting]
-    return Street(folder, point_map, built, block, scans, T_map_lidar, grid, movers, settings)
+    return Street(recording, point_map, built, block, voting, T_map_lidar, grid, movers, settings)
 
 
 def vote_on(street: Street, cases: Sequence[Case], *, edit: Edit = unedited, first_pose_only: bool = False) -> RealRun:
     """Three vehicles drive the street's other blocks; every case is decided."""
-    grid, settings = street.grid, street.settings
-    movers, reached = street.movers.copy(), np.zeros(grid.shape, dtype=np.bool_)
+    recording, movers = edit(street.recording), street.movers.copy()
     ballots: dict[str, list[Ballot]] = {case.name: [] for case in cases}
     reports, metres, degrees, prior_metres = [], [], [], []
     for k, scans in enumerate(street.voting):
-        text = ",".join(f"{i}:{i + 1}" for i in scans.tolist())
-        drive = edit(open_drive(street.folder, scans=text, vehicle=f"v{k + 1}"), scans)
+        drive = part_of(recording, scans, f"v{k + 1}")
         T_true = street.T_map_lidar[scans]
-        vehicle = SharedPass(drive, street.point_map, settings, cases)
+        vehicle = SharedPass(drive, street.point_map, street.settings, cases)
         for i, scan in enumerate(drive):
             known = i == 0 or not first_pose_only
-            _note_movers(vehicle.observe(scan, PosePrior.of(drive, i) if known else None), grid, movers)
-        _note_movers(vehicle.finish(), grid, movers)
-        reached |= _reached_cells(drive, T_true, street.point_map, grid, settings.voting.window_m)
+            _note_movers(vehicle.observe(scan, PosePrior.of(drive, i) if known else None), street.grid, movers)
+        _note_movers(vehicle.finish(), street.grid, movers)
         there = np.setdiff1d(np.arange(len(drive)), vehicle.report.lost)
         reports.append(vehicle.report)
         if len(there):  # who never found himself sends no ballot
@@ -180,7 +199,7 @@ def vote_on(street: Street, cases: Sequence[Case], *, edit: Edit = unedited, fir
     near_movers = ndimage.binary_dilation(movers, np.ones((3, 3)))
     off_m, off_deg, prior_m = (np.concatenate([np.zeros(0), *parts]) for parts in (metres, degrees, prior_metres))
     total = sum(report.scans for report in reports)
-    return RealRun(street, states, near_movers, reached, reports, off_m, off_deg, prior_m, total)
+    return RealRun(street, states, near_movers, reports, off_m, off_deg, prior_m, total)
 
 
 def _decided(street: Street, ballots: list[Ballot], case: Case) -> U8:
@@ -210,20 +229,17 @@ def _note_movers(observations: list[Observation], grid: Grid, cells: Bool) -> No
         cells[rows[inside], cols[inside]] = True
 
 
-def _reached_cells(drive: Drive, T_map_lidar: F64, point_map: PointMap, grid: Grid, window_m: float) -> Bool:
-    """Cells in which a scan of ``drive`` met something above the ground, no farther off than a vehicle looks."""
-    reached = np.zeros(grid.shape, dtype=np.bool_)
-    surroundings = LocalMap(point_map, window_m)
-    for scan, T in zip(drive, T_map_lidar, strict=True):
-        points = transform(T, scan.points)
-        rows, cols, inside = grid.indices_of(points[find_obstacles(points, surroundings.at(T[:3, 3])[0])[0]])
-        reached[rows[inside], cols[inside]] = True
-    return reached
-
-
-def _indices(scans: str, n: int) -> I64:
-    """The indices that a ``--scans`` text selects of ``n``."""
-    return np.concatenate([np.arange(n)[slice(*map(int, part.split(":")))] for part in scans.split(",")])
+def met_cells(street: Street, edit: Edit = unedited) -> Bool:
+    """(rows, cols) cells in which a vehicle's scan met something above the ground, at the reference poses."""
+    met = np.zeros(street.grid.shape, dtype=np.bool_)
+    around = LocalMap(street.point_map, street.settings.voting.window_m)
+    recording = edit(street.recording)
+    for i in np.concatenate(street.voting).tolist():
+        T = street.T_map_lidar[i]
+        points = transform(T, recording.read_scan(i).points)
+        rows, cols, inside = street.grid.indices_of(points[find_obstacles(points, around.at(T[:3, 3])[0])[0]])
+        met[rows[inside], cols[inside]] = True
+    return met
 
 
 def _window(point_map: PointMap, reference: F64) -> Grid:
