@@ -124,3 +124,24 @@ def test_a_hostile_comment_is_kept_as_text(server: Server) -> None:
     client, _, who = server
     (held,) = client.get("/v1/desk", headers=who["boss"]).json()["reviewed"]
     assert held["properties"]["verdict"]["comment"] == told
+
+
+def test_every_list_is_geojson_where_it_has_a_place_and_csv_always(server: Server) -> None:
+    client, _, who = server
+    first, second = pending(server)
+    decide(server, "anna", first["id"], "rejected", comment="=glass")
+    for path in ("desk", "coverage", "vehicles"):
+        found = client.get(f"/v1/{path}?format=geojson", headers=who["boss"]).json()
+        assert found["type"] == "FeatureCollection"
+    tiles = client.get("/v1/coverage?format=geojson", headers=who["boss"]).json()["features"]
+    corners = tiles[1]["geometry"]["coordinates"][0]
+    assert (tiles[1]["properties"]["col"], corners[0], corners[2]) == (1, [76.8, 0.0], [153.6, 76.8])
+    desk = client.get("/v1/desk?format=csv", headers=who["boss"]).text.splitlines()
+    assert len(desk) == 3, "what waits and what was rejected"
+    assert ",rejected,anna,'=glass" in desk[2], "no spreadsheet takes a comment for a formula"
+    versions = client.get("/v1/map/versions?format=csv", headers=who["boss"]).text.splitlines()
+    assert versions[0].startswith("number,parent,kind,target,published_by,reason,created")
+    assert len(versions) == 2
+    vehicles = client.get("/v1/vehicles?format=csv", headers=who["boss"]).text.splitlines()
+    assert [row.split(",")[0] for row in vehicles] == ["vehicle", "v1", "v2"]
+    assert second["id"] in desk[1]

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
-from fastapi import APIRouter, Path, Request
+from fastapi import APIRouter, Path, Request, Response
 from pydantic import BaseModel, ConfigDict, Field
 
 from mapvote.server.http.auth import reviewer
-from mapvote.server.http.schemas import PLAIN, problems
+from mapvote.server.http.schemas import AS_CSV, PLAIN, Places, as_json, as_table, problems
 from mapvote.server.http.services import services
 from mapvote.server.insight.desk import desk, review, verdict_of
+from mapvote.server.insight.geojson import feature_rows
 from mapvote.server.store.reviews import undo
 
 router = APIRouter()
@@ -26,14 +28,31 @@ class ReviewAsk(BaseModel):
     after: int | None = Field(default=None, ge=0, lt=1 << 62, description="the verdict that it had when you looked")
 
 
-@router.get("/v1/desk", responses=problems(403), summary="What a publish would change now")
-def whole_desk(request: Request) -> dict[str, Any]:
-    """Pending changes as GeoJSON, with the verdicts so far; what was held and rejected; why the policy would hold."""
+@router.get(
+    "/v1/desk",
+    response_model=dict[str, Any],
+    responses=problems(403) | AS_CSV,
+    summary="What a publish would change now",
+)
+def whole_desk(request: Request, format: Places = "json") -> Response:
+    """Pending changes as GeoJSON, with the verdicts so far; what was held and rejected; why the policy would hold.
+
+    As ``geojson`` or ``csv``: pending and reviewed changes in one list.
+    """
     reviewer(request)
     parts = services(request)
     found = desk(parts.store, parts.fusing, parts.gate)
     left_out = [verdict_of(one) for one in found.reviewed]
-    return {"version": found.version, "held": found.held, "pending": found.pending, "reviewed": left_out}
+    if format == "json":
+        return as_json({"version": found.version, "held": found.held, "pending": found.pending, "reviewed": left_out})
+    listed = found.pending | {"features": [*found.pending["features"], *left_out]}
+    return as_json(listed) if format == "geojson" else as_table([_flat(row) for row in feature_rows(listed)])
+
+
+def _flat(row: Mapping[str, Any]) -> dict[str, Any]:
+    """A verdict takes columns of its own."""
+    said = row["verdict"] or {"verdict": "", "by": "", "comment": ""}
+    return dict(row) | {"verdict": said["verdict"], "by": said["by"], "comment": said["comment"]}
 
 
 @router.post("/v1/desk/reviews", responses=problems(403, 404, 409), summary="Accept, hold or reject a change")

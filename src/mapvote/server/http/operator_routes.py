@@ -16,11 +16,24 @@ from mapvote.codec.ballot import tile_key
 from mapvote.fusion.tile_vote import DAY_NS
 from mapvote.server.errors import Held, Unavailable
 from mapvote.server.http.auth import operator, reviewer, sees_names
-from mapvote.server.http.schemas import LEAST, MOST, PublishAsk, Published, RollbackAsk, as_json, iso, problems
+from mapvote.server.http.schemas import (
+    AS_CSV,
+    LEAST,
+    MOST,
+    Places,
+    PublishAsk,
+    Published,
+    RollbackAsk,
+    as_json,
+    as_table,
+    iso,
+    problems,
+)
 from mapvote.server.http.services import Services, services
 from mapvote.server.insight.explain import explain_cell
-from mapvote.server.insight.geojson import as_csv, feature_rows
+from mapvote.server.insight.geojson import feature_rows
 from mapvote.server.insight.history import changes_between, coverage, vehicle_standings
+from mapvote.server.insight.lists import contradictions, standing_rows, tile_squares
 from mapvote.server.store.keys import pseudonyms
 from mapvote.server.store.publish import publish, rollback
 from mapvote.server.store.queries import log_event
@@ -70,7 +83,7 @@ async def roll_back(request: Request, ask: RollbackAsk) -> dict[str, int]:
 @router.get(
     "/v1/changes",
     response_model=dict[str, Any],
-    responses=problems(404) | {200: {"content": {"text/csv": {}}}},
+    responses=problems(404) | AS_CSV,
     summary="What changed, as GeoJSON in map metres or as CSV",
 )
 def changes(
@@ -84,7 +97,7 @@ def changes(
     store = services(request).store
     found = changes_between(store, old, store.current() if new is None else new, min_cells)
     if format == "csv":
-        return Response(as_csv(feature_rows(found)), media_type="text/csv")
+        return as_table(feature_rows(found))
     return as_json(found)
 
 
@@ -113,24 +126,36 @@ def cell(request: Request, x: float, y: float) -> Response:
     return as_json({"row": story.row, "col": story.col, "votes": votes, "decisions": decisions})
 
 
-@router.get("/v1/coverage", response_model=dict[str, Any], responses=problems(), summary="Freshness of every tile")
-def fresh(request: Request) -> Response:
+@router.get(
+    "/v1/coverage", response_model=dict[str, Any], responses=problems() | AS_CSV, summary="Freshness of every tile"
+)
+def fresh(request: Request, format: Places = "json") -> Response:
     """When each tile was last driven past, and by how many vehicles whose ballots stand."""
-    tiles, known = coverage(services(request).store), sees_names(request)
+    store = services(request).store
+    tiles, known = coverage(store), sees_names(request)
     told = [
         {name: t[name] for name in ("row", "col", "vehicles")} | {"last_seen": iso(_seen(t["last_seen_ns"], known))}
         for t in tiles
     ]
-    return as_json({"tiles": told})
+    if format == "csv":
+        return as_table(told)
+    return as_json(tile_squares(told, store.lattice) if format == "geojson" else {"tiles": told})
 
 
 @router.get(
-    "/v1/vehicles", response_model=dict[str, Any], responses=problems(403), summary="Who contradicts the others"
+    "/v1/vehicles",
+    response_model=dict[str, Any],
+    responses=problems(403) | AS_CSV,
+    summary="Who contradicts the others",
 )
-def vehicles(request: Request) -> Response:
+def vehicles(request: Request, format: Places = "json") -> Response:
     """How every vehicle stands to what the others say before and after it, with the places where it differs."""
     reviewer(request)
     found = vehicle_standings(services(request).store)
+    if format == "csv":
+        return as_table(standing_rows(found))
+    if format == "geojson":
+        return as_json(contradictions(found))
     told = [asdict(s) | {"evidence": [asdict(e) for e in s.evidence[:_MOST_EVIDENCE]]} for s in found]
     return as_json({"vehicles": told})
 

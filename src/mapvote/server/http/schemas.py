@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import msgspec
 from fastapi import Path, Query, Request, Response
@@ -13,6 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from mapvote.core.types import MapvoteError
 from mapvote.server.errors import Conflict, Forbidden, Held, NotFound, TooLarge, TooMany, Unauthorised, Unavailable
+from mapvote.server.insight.geojson import as_csv
 
 STATUS: Mapping[type[MapvoteError], int] = {
     Unauthorised: 401,
@@ -32,6 +33,9 @@ PLAIN = r"^[^\x00-\x1f]*$"
 
 Name = Annotated[str, Path(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$")]
 Number = Annotated[int, Path(ge=LEAST, le=MOST)]
+Table = Literal["json", "csv"]
+Places = Literal["json", "geojson", "csv"]
+"""How a list is asked for; what has a place can be GeoJSON too."""
 VersionQuery = Annotated[int, Query(ge=LEAST, le=MOST)]
 
 
@@ -79,6 +83,9 @@ class RollbackAsk(BaseModel):
     reason: str = Field(default="", max_length=200, pattern=PLAIN)
 
 
+AS_CSV: dict[int | str, dict[str, Any]] = {200: {"content": {"text/csv": {}}}}
+
+
 def problems(*codes: int) -> dict[int | str, dict[str, Any]]:
     """For the OpenAPI document: the refusals that every route knows, and these."""
     return {code: {"model": Problem} for code in (401, 422, 503, *codes)}
@@ -88,6 +95,11 @@ def as_json(content: object) -> Response:
     """An answer, encoded where it is made: FastAPI would do so on the event loop, and with a large one keep all others
     waiting."""
     return Response(msgspec.json.encode(content), media_type="application/json")
+
+
+def as_table(rows: Sequence[Mapping[str, Any]]) -> Response:
+    """Rows as CSV."""
+    return Response(as_csv(rows), media_type="text/csv")
 
 
 def refuse(error: Exception) -> Response:

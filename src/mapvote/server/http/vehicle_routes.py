@@ -13,7 +13,7 @@ from fastapi.concurrency import run_in_threadpool
 
 from mapvote.codec.arrays import unpack_bytes
 from mapvote.server.http.auth import own
-from mapvote.server.http.schemas import Name, Number, VersionQuery, as_json, iso, problems
+from mapvote.server.http.schemas import AS_CSV, Name, Number, Table, VersionQuery, as_json, as_table, iso, problems
 from mapvote.server.http.services import services
 from mapvote.server.store.ballots import withdraw
 from mapvote.server.store.blobs import MAX_PLANE_BYTES
@@ -33,13 +33,15 @@ async def newest(request: Request, since: VersionQuery | None = None) -> Respons
     return await _manifest(request, None, since)
 
 
-@router.get("/v1/map/versions", response_model=dict[str, Any], responses=problems(), summary="All versions")
-def versions(request: Request) -> Response:
+@router.get("/v1/map/versions", response_model=dict[str, Any], responses=problems() | AS_CSV, summary="All versions")
+def versions(request: Request, format: Table = "json") -> Response:
     """Every version, oldest first, with the policy it was made by."""
     listed = []
     for v in services(request).store.versions():
         entry = {name: getattr(v, name) for name in ("number", "parent", "kind", "target", "published_by", "reason")}
         listed.append(entry | {"created": iso(v.created_ns), "policy": v.policy})
+    if format == "csv":
+        return as_table([{name: told for name, told in entry.items() if name != "policy"} for entry in listed])
     return as_json({"versions": listed})
 
 

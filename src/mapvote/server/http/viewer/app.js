@@ -234,6 +234,11 @@ function step(by) {
   next.focus();
   next.click();
 }
+for (const list of document.querySelectorAll("[data-list]")) {
+  const { list: path, as: format } = list.dataset, name = path.split("/").at(-1);
+  list.href = `v1/${path}?format=${format}`;
+  list.onclick = (event) => (event.preventDefault(), api.download(path, { format }, `${name}.${format}`).catch((error) => notice(error.message)));
+}
 $("from").onchange = $("to").onchange = showRange;
 $("forget").onclick = () => (api.key.forget(), location.reload());
 for (const radio of document.getElementsByName("shade"))
