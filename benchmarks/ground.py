@@ -1,4 +1,4 @@
-"""The ground of a map made from simulated surveys, against the terrain that the simulator knows (docs/results.md).
+"""The ground of a map made from simulated surveys, against the terrain that the simulator knows.
 
     python benchmarks/ground.py corner:1 junction:1 street:2
 

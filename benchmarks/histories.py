@@ -4,7 +4,7 @@ python benchmarks/histories.py --sqlite 2000 --postgres 300
 
 Drives that repeat, objects that come, go and come back, policies that change, minimum age, withdrawal, rollback, replay
 and racing publishers (tests/histories.py). Prints every disagreement with its seed, and at the end a line
-for docs/results.md.
+for docs/measurements/votes.md.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The figures that the filter must reach, against the simulator's labels (docs/results.md quotes larger scenes)."""
+"""The figures that the filter must reach, against the simulator's labels (docs/measurements quotes larger scenes)."""
 
 from __future__ import annotations
 

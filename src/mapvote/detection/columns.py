@@ -25,8 +25,8 @@ from mapvote.detection.rules import ALL_RULES, Rules
 from mapvote.detection.votes import Judged, TileVotes, Weighed
 from mapvote.perception.frontend import Observation
 
-# Set on the development streets (seeds 1, 11 and 12 of `street570`); docs/results.md has what each rule is worth on
-# others.
+# Set on the development streets (seeds 1, 11 and 12 of `street570`); docs/measurements/columns.md has what
+# each rule is worth on others.
 EMPTY_VOTES = 0.1
 """Rule F: votes of a ray through a free voxel, against one for a hit in it."""
 GONE_VOTES = 0.125

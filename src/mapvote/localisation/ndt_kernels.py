@@ -1,7 +1,7 @@
 """The scan's side of NDT: the normal equations of one Gauss-Newton step.
 
 Equation numbers are those of Magnusson, The Three-Dimensional Normal-Distributions Transform, 2009, chapter 6; where
-we deviate, mapvote.localisation.ndt says how. Steps are inlined by numba; docs/results.md tells the cost.
+we deviate, mapvote.localisation.ndt says how. Steps are inlined by numba; docs/measurements/speed.md tells the cost.
 """
 
 from __future__ import annotations
