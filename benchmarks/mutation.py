@@ -49,7 +49,7 @@ TESTS = {
     "evaluation/scoring/truth.py": ["evaluation/scoring"],
 }
 """The deciding modules, and the tests that name them, quick ones first."""
-HOUSE = Path(tempfile.gettempdir()) / "mapvote-mutation"
+HOUSE = Path(os.environ.get("MUTATION_HOUSE", Path(tempfile.gettempdir()) / "mapvote-mutation"))
 """A copy of the sources, in which the mutants live, and numba's caches."""
 MEMORY_BYTES = 8 << 30
 """Of address space: a mutant that asks for all memory gets none."""

@@ -22,7 +22,7 @@ def point_map() -> PointMap:
 
 @pytest.fixture
 def tracker(point_map: PointMap) -> Tracker:
-    return Tracker(MapWindow(point_map), SETTINGS)
+    return Tracker(MapWindow(point_map, SETTINGS), SETTINGS)
 
 
 def scan(i: int) -> Scan:
@@ -85,9 +85,9 @@ def test_a_lost_vehicle_recovers_by_its_prior(tracker: Tracker) -> None:
 
 
 def test_only_the_map_around_the_vehicle_is_held(point_map: PointMap) -> None:
-    here = window_points(point_map, np.array([0.0, 0.0, 0.0]))
+    here = window_points(point_map, np.array([0.0, 0.0, 0.0]), SETTINGS.half_window_m)
     assert len(here) == sum(len(tile.points) for tile in point_map.tiles.values())
-    assert len(window_points(point_map, np.array([900.0, 0.0, 0.0]))) == 0
+    assert len(window_points(point_map, np.array([900.0, 0.0, 0.0]), SETTINGS.half_window_m)) == 0
 
 
 def test_starts_one_metre_and_three_degrees_off_find_the_pose(point_map: PointMap) -> None:
@@ -96,7 +96,7 @@ def test_starts_one_metre_and_three_degrees_off_find_the_pose(point_map: PointMa
     for k in range(20):
         i = 1 + k % (len(POSES) - 2)
         way, yaw = rng.uniform(0, 2 * np.pi), rng.choice([-3.0, 3.0])
-        tracker = Tracker(MapWindow(point_map), SETTINGS)
+        tracker = Tracker(MapWindow(point_map, SETTINGS), SETTINGS)
         tracker.twist = twist_of(POSES, i)
         fix = tracker.localise(scan(i), prior(i, np.cos(way), np.sin(way), 0.0, yaw_deg=float(yaw)))
         found += off(fix.registration.T_map_lidar, i) < 0.2
@@ -106,7 +106,7 @@ def test_starts_one_metre_and_three_degrees_off_find_the_pose(point_map: PointMa
 def test_the_same_scans_give_the_same_poses_to_the_last_bit(point_map: PointMap) -> None:
     runs = []
     for _ in range(2):
-        tracker = Tracker(MapWindow(point_map), SETTINGS)
+        tracker = Tracker(MapWindow(point_map, SETTINGS), SETTINGS)
         runs.append([tracker.localise(scan(i), prior(i, 0.3, 0.2, 0.0)).registration.T_map_lidar for i in range(3)])
     np.testing.assert_array_equal(runs[0], runs[1])
 

@@ -30,8 +30,6 @@ from mapvote.perception.frontend import Frontend, Observation, PlacedScan
 from mapvote.perception.moving_objects import MovingFilter
 from mapvote.perception.raycast import find_obstacles
 
-_MIN_THROUGH, _TRAIL_SHARE = 3, 0.45
-"""A voxel is a trail if so many scans saw through it, and of those able to a smaller share struck it."""
 ROAD_M = 0.1
 """Points this low above the ground are the road itself, also under a car."""
 
@@ -92,7 +90,8 @@ class Layer:
             here = here[find_obstacles(points[here], standing)[0]]
             r, c = r[here], c[here]
             bits = np.floor(points[here, 2] / CELL_SIZE).astype(np.int64) - reference.base[r, c]
-            trail[here] = _are_trails(planes, r, c, bits, _MIN_THROUGH, _TRAIL_SHARE)
+            s = self.settings.mapping
+            trail[here] = _are_trails(planes, r, c, bits, s.trail_min_through, s.trail_share)
         return trail
 
     def _free(self, tile: TileIndex, point_map: PointMap) -> U64:

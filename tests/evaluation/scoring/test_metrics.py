@@ -13,12 +13,24 @@ from hypothesis.extra.numpy import arrays
 from msgspec import to_builtins
 from msgspec.structs import asdict
 
+from hand_made import make_map, make_tile
+from hand_made import wall as tile_wall
 from mapvote.core.types import NO_VOTE, CellState
 from mapvote.evaluation.results import to_json
 from mapvote.evaluation.scoring import paper_tables
-from mapvote.evaluation.scoring.cells import UNSCORED, ByClass, Scores, classes_of, confusion, coverage, score_cells
-from mapvote.evaluation.scoring.map_points import MapJudge
-from mapvote.evaluation.scoring.objects import score_objects
+from mapvote.evaluation.scoring.cells import (
+    UNSCORED,
+    ByClass,
+    Scores,
+    classes_of,
+    confusion,
+    coverage,
+    harmonic_mean,
+    ratio,
+    score_cells,
+)
+from mapvote.evaluation.scoring.map_points import MapJudge, map_obstacles, same_rows
+from mapvote.evaluation.scoring.objects import ObjectScores, score_objects
 
 
 @pytest.mark.parametrize("case", ["1", "2", "3", "4", "5"])
@@ -150,3 +162,117 @@ def test_an_object_is_met_by_one_connected_change_and_not_by_scattered_cells() -
 
 def test_scores_are_values() -> None:
     assert Scores.of(ByClass(1, 1, 1), ByClass(1, 1, 1)).macro_f1 == 1.0
+
+
+def test_what_stands_nearer_than_what_went_is_no_stale_point() -> None:
+    """A removed sample within reach makes a point stale, unless something that stands is as near."""
+    samples = {"kept": [[0.0, 0, 0]], "added": [[10.0, 0, 0]], "removed": [[0.2, 0, 0], [10.2, 0, 0], [20.0, 0, 0]]}
+    kept, added, removed = (np.array(samples[name]) for name in ("kept", "added", "removed"))
+    x = [0.05, 0.1, 0.15, 10.05, 10.15, 20.0, 20.5, 20.51, 30.0]
+    old = np.array([[value, 0.0, 0.0] for value in x])
+    judge = MapJudge(old, kept, added, removed, reach_m=0.5)
+    assert np.flatnonzero(judge.stale).tolist() == [2, 4, 5, 6], "just within reach is within reach"
+    assert np.flatnonzero(judge.valid).tolist() == [0, 1]
+    usual = MapJudge(old, kept, added, removed)
+    assert np.flatnonzero(usual.stale).tolist() == [2, 4, 5]
+
+
+def test_stale_points_apart_from_all_that_stands_are_told_by_themselves() -> None:
+    kept, removed = np.array([[0.0, 0, 0]]), np.array([[0.5, 0, 0], [0.61, 0, 0], [5.0, 0, 0]])
+    old = removed.copy()
+    scores = MapJudge(old, kept, np.zeros((0, 3)), removed).score(old[:2])
+    assert scores.stale_deleted == pytest.approx(1 / 3)
+    assert scores.stale_apart_deleted == pytest.approx(1 / 2), "two are .6 m or more from what stands"
+    nobody = MapJudge(old, np.zeros((0, 3)), np.zeros((0, 3)), removed).score(old)
+    assert (nobody.stale_apart_deleted, nobody.stale_points, nobody.valid_points) == (0.0, 3, 0)
+
+
+def test_added_points_are_counted_and_judged_by_what_stands_now() -> None:
+    kept, added = np.array([[0.0, 0, 0]]), np.array([[5.0, 0, 0], [6.0, 0, 0]])
+    new = np.array([[0.0, 0, 0], [5.29, 0, 0], [0.2, 0, 0], [5.6, 0, 0], [9.0, 0, 0]])
+    scores = MapJudge(kept, kept, added, np.zeros((0, 3))).score(new)
+    assert (scores.added_points, scores.new_samples) == (4, 2)
+    assert scores.new_added == 0.5, "one sample has a point within reach, the other not"
+    assert scores.added_false == 0.5, "two of four lie on nothing"
+
+
+def test_an_old_point_survives_only_bit_for_bit() -> None:
+    old = np.array([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]])
+    new = np.array([[np.nextafter(1.0, 2.0), 2.0, 3.0], [4.0, 5.0, 6.0], [7.0, 8.0, 9.0]])
+    survived, fresh = same_rows(old, new)
+    assert survived.tolist() == [False, True]
+    assert fresh.tolist() == [new[0].tolist(), [7.0, 8.0, 9.0]]
+
+
+def test_the_obstacles_of_a_map_are_its_points_above_the_ground_tile_by_tile() -> None:
+    a = make_tile(tile_wall([(3, 3)], [0.1, 0.75]), index=(0, 1))
+    b = make_tile(tile_wall([(3, 3)], [0.1, 1.05]), index=(0, 0))
+    points = map_obstacles(make_map({(0, 1): a, (0, 0): b}))
+    np.testing.assert_allclose(points, [[1.05, 1.05, 1.05], [77.85, 1.05, 0.75]], atol=1e-5)
+    assert map_obstacles(make_map({})).shape == (0, 3)
+
+
+def test_a_ratio_of_nothing_is_zero() -> None:
+    assert (ratio(3, 4), ratio(1, 0), ratio(0, 5)) == (0.75, 0.0, 0.0)
+    assert harmonic_mean(0.5, 1.0) == pytest.approx(2 / 3)
+    assert harmonic_mean(0.0, 0.0) == harmonic_mean(0.0, 1.0) == 0.0
+
+
+def test_the_macro_f1_is_the_mean_of_the_three() -> None:
+    scores = Scores.of(ByClass(1.0, 0.5, 0.2), ByClass(1.0, 1.0, 0.3))
+    assert tuple(scores.f1) == pytest.approx((1.0, 2 / 3, 0.24))
+    assert scores.macro_f1 == pytest.approx((1.0 + 2 / 3 + 0.24) / 3)
+    assert scores.kim_f1 == pytest.approx(2 * (1.7 / 3) * (2.3 / 3) / (4.0 / 3))
+
+
+def objects_of(states: np.ndarray, truth: np.ndarray, cell_m: float = 0.3, **more: float) -> ObjectScores:
+    kinds = {1: "built", 2: "demolished"}
+    objects = [{"kind": name, "cells": truth == k} for k, name in kinds.items() if (truth == k).any()]
+    return score_objects(states, truth, objects, cell_m, **more)
+
+
+def test_an_invention_two_cells_from_the_truth_is_none_and_three_cells_off_is_one() -> None:
+    truth = np.zeros((30, 30), np.uint8)
+    truth[5:10, 5:10] = 1
+    for gap, false in ((1, ()), (2, ()), (3, (1.8,))):
+        states = np.ones((30, 30), np.uint8)
+        states[5:10, 9 + gap : 13 + gap] = CellState.CHANGED_OCCUPIED
+        assert objects_of(states, truth).false_m2 == false
+    states[:] = 1
+    states[5:10, 11:15] = CellState.CHANGED_EMPTY
+    assert objects_of(states, truth).false_m2 == (1.8,), "near a change of the other kind it is an invention"
+    truth[5:10, 11] = UNSCORED
+    assert objects_of(states, truth).false_m2 == (), "near what is not scored nobody can tell"
+
+
+def test_inventions_are_told_largest_first_and_corners_join_them() -> None:
+    truth = np.zeros((40, 40), np.uint8)
+    states = np.ones((40, 40), np.uint8)
+    states[0:4, 0:4] = CellState.CHANGED_EMPTY  # 16 cells
+    states[4:8, 4:8] = CellState.CHANGED_EMPTY  # joined at a corner
+    states[20:24, 20:25] = CellState.CHANGED_OCCUPIED  # 20 cells
+    states[30:33, 30:34] = CellState.CHANGED_OCCUPIED  # 12 cells
+    states[36:38, 36:38] = CellState.CHANGED_EMPTY  # .36 m2: a speck
+    assert objects_of(states, truth).false_m2 == (2.88, 1.8, 1.08)
+    assert objects_of(states, truth, cell_m=0.5, min_m2=5.0).false_m2 == (8.0, 5.0)
+
+
+def test_of_a_small_object_all_of_it_must_be_decided_to_meet_it() -> None:
+    truth = np.zeros((20, 20), np.uint8)
+    truth[3, 3:7] = 2  # .36 m2
+    states = np.ones((20, 20), np.uint8)
+    states[3, 3:6] = CellState.CHANGED_EMPTY
+    assert objects_of(states, truth).met == (False,)
+    assert objects_of(states, truth).found == (True,)
+    states[3, 6] = CellState.CHANGED_EMPTY
+    assert objects_of(states, truth).met == (True,)
+    assert objects_of(np.ones_like(states), truth).met == (False,), "and nothing at all meets none"
+
+
+def test_an_object_is_met_by_exactly_the_least_area() -> None:
+    truth = np.zeros((20, 20), np.uint8)
+    truth[2:12, 2:12] = 1
+    states = np.ones((20, 20), np.uint8)
+    states[2:5, 2:6] = CellState.CHANGED_OCCUPIED  # 12 cells
+    assert objects_of(states, truth, cell_m=0.5, min_m2=3.0).met == (True,)
+    assert objects_of(states, truth, cell_m=0.5, min_m2=3.01).met == (False,)

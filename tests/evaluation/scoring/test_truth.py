@@ -1,0 +1,180 @@
+"""What a truth folder says, and how poses compare: by hand, and against exact geometry."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from mapvote.core.geometry import exp, from_xyz_rpy, inverse
+from mapvote.core.grid import CELL_SIZE, Grid, Lattice
+from mapvote.core.types import F64, NO_VOTE, MapvoteError
+from mapvote.evaluation.scoring.truth import (
+    Truth,
+    error_summary,
+    lay_on,
+    pose_errors,
+    read_truth,
+    rigid_between,
+)
+
+ROWS, COLS = 40, 50
+X0, Y0 = -3.0, 6.0
+
+
+def write_scene(scene: Path, **planes: np.ndarray) -> Path:
+    """A truth folder as the simulator writes it: nothing changed, but for ``planes``."""
+    folder = scene / "truth"
+    (folder / "drive_1" / "moving").mkdir(parents=True)
+    zero = np.zeros((ROWS, COLS), dtype=np.uint8)
+    every = {"strict": zero, "provenance": zero, "reason": zero, "densest": zero} | planes
+    np.savez(folder / "truth.npz", x0=X0, y0=Y0, **every)
+    (folder / "objects.json").write_text(json.dumps({"objects": [{"kind": "built", "height_m": 3.0}]}))
+    points = np.array([[1, 0, 0], [2, 0, 0], [3, 0, 0], [4, 0, 0]], dtype=np.float32)
+    np.savez(folder / "surface.npz", points=points, label=np.array([2, 0, 1, 0], dtype=np.uint8))
+    rows = np.array([from_xyz_rpy(i, 2.0, 3.0, yaw=0.1)[:3].ravel() for i in range(3)])
+    np.savetxt(folder / "drive_1" / "poses.txt", rows)
+    np.save(folder / "drive_1" / "moving" / "000012.npy", np.array([0, 1, 1], dtype=np.uint8))
+    return scene
+
+
+@pytest.fixture
+def truth(tmp_path: Path) -> Truth:
+    return read_truth(write_scene(tmp_path))
+
+
+def test_a_truth_is_read_as_it_was_written(truth: Truth) -> None:
+    assert (truth.x0, truth.y0, truth.strict.shape) == (X0, Y0, (ROWS, COLS))
+    assert truth.objects == ({"kind": "built", "height_m": 3.0},)
+    kept, added, removed = truth.surfaces()
+    assert (kept[:, 0].tolist(), added[:, 0].tolist(), removed[:, 0].tolist()) == ([2, 4], [3], [1])
+    assert kept.dtype == np.float64
+    np.testing.assert_allclose(truth.poses("drive_1")[2], from_xyz_rpy(2.0, 2.0, 3.0, yaw=0.1), atol=1e-12)
+    assert truth.moving("drive_1", 12).tolist() == [False, True, True]
+
+
+@pytest.mark.parametrize("missing", ["truth.npz", "objects.json"])
+def test_half_a_truth_is_none_and_says_what_to_do(tmp_path: Path, missing: str) -> None:
+    (write_scene(tmp_path) / "truth" / missing).unlink()
+    with pytest.raises(MapvoteError, match=r"truth: no usable truth .* simulate the scene again"):
+        read_truth(tmp_path)
+
+
+def test_a_truth_of_other_planes_is_none(tmp_path: Path) -> None:
+    folder = write_scene(tmp_path) / "truth"
+    np.savez(folder / "truth.npz", strict=np.zeros((2, 2)))
+    with pytest.raises(MapvoteError, match="no usable truth"):
+        read_truth(tmp_path)
+
+
+def test_a_truth_lies_on_the_lattice_of_a_map_that_starts_on_whole_cells(truth: Truth) -> None:
+    assert truth.grid_on(Lattice()) == Grid(Lattice(), 20, -10, ROWS, COLS)
+    shifted = Lattice(0.3, -0.6)
+    assert truth.grid_on(shifted) == Grid(shifted, 22, -11, ROWS, COLS)
+    for off in (Lattice(0.1, 0.0), Lattice(0.0, 0.1)):
+        with pytest.raises(MapvoteError, match=r"off the map's lattice .* multiples of 0.3 m"):
+            truth.grid_on(off)
+
+
+def test_old_surfaces_that_no_survey_saw_count_as_unchanged_for_another_judge(tmp_path: Path) -> None:
+    strict, provenance, reason = (np.full((ROWS, COLS), value, dtype=np.uint8) for value in (2, 255, 0))
+    reason[3, 4], reason[5, 6] = 3, 2
+    scene = write_scene(tmp_path, strict=strict, provenance=provenance, reason=reason)
+    other_strict, other_provenance = read_truth(scene).with_old_surfaces()
+    assert np.argwhere(other_strict != 2).tolist() == np.argwhere(other_provenance != 255).tolist() == [[3, 4]]
+    assert (other_strict[3, 4], other_provenance[3, 4]) == (0, 0)
+
+
+def distance_outside(corners: F64, x: F64, y: F64) -> F64:
+    """How far points lie outside the edges of a convex polygon that runs counter-clockwise; negative inside."""
+    out = np.full(x.shape, -np.inf)
+    for (ax, ay), (bx, by) in zip(corners, np.roll(corners, -1, axis=0), strict=True):
+        out = np.maximum(out, ((by - ay) * (x - ax) - (bx - ax) * (y - ay)) / np.hypot(bx - ax, by - ay))
+    return out
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.integers(3, 6), st.floats(0, 6), st.floats(1.0, 4.0), st.booleans())
+def test_the_cells_of_a_footprint_have_their_centres_in_it_or_within_60_cm(
+    n: int, turned: float, radius: float, clockwise: bool
+) -> None:
+    angle = turned + 2 * np.pi * np.arange(n) / n
+    corners = np.column_stack([4.0 + radius * np.cos(angle), 12.0 + 0.7 * radius * np.sin(angle)])
+    zero = np.zeros((ROWS, COLS), dtype=np.uint8)
+    truth = Truth(Path(), X0, Y0, zero, zero, zero, zero, ())
+    found = truth.cells_of((corners[::-1] if clockwise else corners).tolist())
+    assert found.any()
+    x, y = np.meshgrid(X0 + (np.arange(COLS) + 0.5) * CELL_SIZE, Y0 + (np.arange(ROWS) + 0.5) * CELL_SIZE)
+    away = distance_outside(corners, x, y)
+    assert ((found == (away <= 0.6)) | (abs(away - 0.6) < 1e-9)).all()
+
+
+def test_states_are_laid_on_another_window_and_elsewhere_nobody_voted() -> None:
+    states = np.arange(12, dtype=np.uint8).reshape(3, 4)
+    laid = lay_on(states, Grid(Lattice(), 10, 20, 3, 4), Grid(Lattice(), 11, 18, 4, 4))
+    assert laid.tolist() == [[255, 255, 4, 5], [255, 255, 8, 9], [255] * 4, [255] * 4]
+    for row0, col0 in ((13, 20), (10, 24), (0, 0)):  # touching it, or far away
+        assert (lay_on(states, Grid(Lattice(), 10, 20, 3, 4), Grid(Lattice(), row0, col0, 3, 3)) == NO_VOTE).all()
+
+
+def trajectory(rng: np.random.Generator, n: int, straight: bool) -> F64:
+    poses = [from_xyz_rpy(2.0 * i, 0.0, 0.0) for i in range(n)]
+    return np.array(poses if straight else [T @ exp(rng.normal(0, 0.5, 6)) for T in poses])
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.integers(2, 9), st.booleans())
+def test_the_motion_between_two_frames_is_found_exactly_on_a_straight_road_too(
+    seed: int, n: int, straight: bool
+) -> None:
+    rng = np.random.default_rng(seed)
+    T_map_world = exp(rng.normal(0, 1.0, 6))
+    T_world = trajectory(rng, n, straight)
+    np.testing.assert_allclose(rigid_between(T_map_world @ T_world, T_world), T_map_world, atol=1e-9)
+
+
+def test_between_frames_that_do_not_quite_agree_positions_and_axes_are_weighed_as_points_2_m_apart() -> None:
+    """The found motion is the best: any small step away from it makes the sum of squares larger."""
+    rng = np.random.default_rng(3)
+    T_world = trajectory(rng, 8, straight=True)
+    T_map = np.array([T @ exp(rng.normal(0, 0.2, 6)) for T in T_world])
+
+    def squares(T: F64) -> float:
+        off = T_map - T @ T_world
+        return float((off[:, :3, 3] ** 2).sum() + 2.0**2 * (off[:, :3, :3] ** 2).sum())
+
+    best = rigid_between(T_map, T_world)
+    centre = from_xyz_rpy(*T_world[:, :3, 3].mean(axis=0))
+    for axis in range(6):
+        for step in (-0.02, 0.02):
+            assert squares(best @ centre @ exp(step * np.eye(6)[axis]) @ inverse(centre)) > squares(best)
+
+
+def test_pose_errors_are_metres_and_radians_whatever_the_axis() -> None:
+    found = np.array([np.eye(4), from_xyz_rpy(1, 2, 3), from_xyz_rpy(5, 0, 0, yaw=0.5)])
+    true = np.array([from_xyz_rpy(3, 4, 0), from_xyz_rpy(1, 2, 3, roll=-0.2), from_xyz_rpy(5, 0, 0, yaw=0.5)])
+    metres, radians = pose_errors(found, true)
+    np.testing.assert_allclose(metres, [5.0, 0.0, 0.0])
+    np.testing.assert_allclose(radians, [0.0, 0.2, 0.0], atol=1e-7)
+    assert pose_errors(np.eye(4)[None], from_xyz_rpy(0, 0, 0, yaw=np.pi)[None])[1][0] == pytest.approx(np.pi)
+
+
+def test_a_summary_is_of_the_scans_that_were_localised() -> None:
+    true = np.tile(np.eye(4), (5, 1, 1))
+    found = np.array([from_xyz_rpy(x, 0, 0, yaw=np.radians(x)) for x in (1.0, 2.0, 6.0, 9.0, 0.0)])
+    found[3] = np.nan
+    found[4, 0, 3] = np.nan
+    errors = error_summary(found, true)
+    assert (errors.scans, errors.localised) == (5, 3)
+    assert (errors.median_m, errors.max_m) == (2.0, 6.0)
+    assert errors.p99_m == pytest.approx(5.92)
+    assert errors.median_deg == pytest.approx(2.0)
+
+
+def test_of_a_drive_that_was_never_localised_no_error_is_known() -> None:
+    errors = error_summary(np.full((2, 4, 4), np.nan), np.tile(np.eye(4), (2, 1, 1)))
+    assert (errors.scans, errors.localised, errors.max_m, errors.median_deg) == (2, 0, 0.0, 0.0)
