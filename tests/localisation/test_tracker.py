@@ -3,11 +3,12 @@
 import numpy as np
 import pytest
 
+from hand_made import make_map, make_tile, wall
 from mapvote.config import NdtSettings
 from mapvote.core.geometry import exp, from_xyz_rpy, inverse, rotation_angle, transform
 from mapvote.core.point_map import PointMap, map_from_points
-from mapvote.core.types import F64, Scan
-from mapvote.localisation.ndt import PosePrior
+from mapvote.core.types import F64, Registration, Scan
+from mapvote.localisation.ndt import NdtMap, PosePrior
 from mapvote.localisation.tracker import MapWindow, Tracker, window_points
 from streets import path, street, sweep, twist_of
 
@@ -115,3 +116,198 @@ def test_motion_found_by_one_scan_serves_the_next(tracker: Tracker) -> None:
     tracker.localise(scan(0), prior(0))
     predicted = POSES[0] @ exp(0.1 * tracker.twist)
     assert np.linalg.norm(predicted[:3, 3] - POSES[1][:3, 3]) < 0.3
+
+
+class Asked(Exception):
+    """Where the tracker looked first."""
+
+    def __init__(self, position: F64) -> None:
+        self.position = position
+
+
+def first_look(tracker: Tracker, stamp_ns: int, told: PosePrior | None = None) -> list[float]:
+    """The position around which the tracker asks for the map: where it takes the vehicle to be."""
+
+    def refuse(position: F64) -> NdtMap:
+        raise Asked(position)
+
+    tracker.map_around = refuse
+    with pytest.raises(Asked) as asked:
+        tracker.localise(blind(stamp_ns), told)
+    return [round(float(x), 6) for x in asked.value.position]
+
+
+def blind(stamp_ns: int) -> Scan:
+    return Scan(stamp_ns, np.zeros((0, 3), dtype=np.float32), np.zeros(0, dtype=np.float32))
+
+
+BLIND = blind(100_000_000)
+TENTH, SECOND = 100_000_000, 1_000_000_000
+TWIST = np.array([20.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+
+
+def at(x: float, sigma_m: float = 1.0) -> PosePrior:
+    return PosePrior(from_xyz_rpy(x, 0.0, 1.8), sigma_m, 0.01)
+
+
+def elsewhere() -> Tracker:
+    """A tracker that need not know any map."""
+    return Tracker(lambda position: NdtMap(SETTINGS, position), SETTINGS)
+
+
+def test_a_vehicle_of_which_nothing_is_known_is_looked_for_at_the_origin_or_where_it_is_told_to_be() -> None:
+    assert first_look(elsewhere(), TENTH) == [0.0, 0.0, 0.0]
+    assert first_look(elsewhere(), TENTH, at(7.0)) == [7.0, 0.0, 1.8]
+
+
+@pytest.mark.parametrize(
+    ("after_ns", "sigma_m", "x"),
+    [
+        (TENTH, 1.0, 102.0),  # constant velocity drifts 1.5 cm in that time
+        (TENTH, 0.0151, 102.0),
+        (TENTH, 0.015, 7.0),  # as good as the prediction: the prior
+        (SECOND, 1.51, 120.0),
+        (SECOND, 1.5, 7.0),  # 3 m/s2 for a second
+    ],
+)
+def test_the_motion_so_far_is_believed_while_it_drifts_less_than_the_prior(
+    after_ns: int, sigma_m: float, x: float
+) -> None:
+    tracker = elsewhere()
+    tracker.move_to(from_xyz_rpy(100.0, 0.0, 1.8), 50 * TENTH, TWIST)
+    assert first_look(tracker, 50 * TENTH + after_ns, at(7.0, sigma_m)) == [x, 0.0, 1.8]
+    assert first_look(tracker, 50 * TENTH + after_ns) == [100.0 + 20e-9 * after_ns, 0.0, 1.8], "without one, always"
+
+
+def test_of_a_vehicle_whose_motion_is_unknown_the_last_place_is_good_for_a_moment_only() -> None:
+    """It may drive 32.5 m/s: 3.25 m in a tenth of a second."""
+    for sigma_m, x in ((3.3, 100.0), (3.2, 7.0)):
+        tracker = elsewhere()
+        tracker.move_to(from_xyz_rpy(100.0, 0.0, 1.8), 50 * TENTH)
+        assert first_look(tracker, 51 * TENTH, at(7.0, sigma_m)) == [x, 0.0, 1.8]
+
+
+def test_a_vehicle_that_was_measured_to_stand_still_is_one_whose_motion_is_known() -> None:
+    tracker = elsewhere()
+    tracker.move_to(from_xyz_rpy(100.0, 0.0, 1.8), 50 * TENTH, np.zeros(6))
+    assert first_look(tracker, 51 * TENTH, at(7.0, 0.02)) == [100.0, 0.0, 1.8]
+
+
+def test_the_first_pose_of_a_survey_is_taken_as_given() -> None:
+    tracker = elsewhere()
+    fix = tracker.begin(BLIND, POSES[3])
+    assert fix.trusted
+    found = fix.registration
+    assert (found.score, found.inlier_share, found.iterations, found.converged) == (1.0, 1.0, 0, True)
+    np.testing.assert_array_equal(found.T_map_lidar, POSES[3])
+    assert not found.covariance.any()
+    assert first_look(tracker, 2 * TENTH) == [round(float(x), 6) for x in POSES[3][:3, 3]]
+
+
+@pytest.mark.parametrize(("after_ns", "measured"), [(1, True), (SECOND, True), (SECOND + 1, False), (0, False)])
+def test_two_poses_tell_the_motion_if_they_are_no_more_than_a_second_apart(after_ns: int, measured: bool) -> None:
+    tracker = elsewhere()
+    tracker.begin(blind(TENTH), from_xyz_rpy(0.0, 0.0, 0.0))
+    step = from_xyz_rpy(6e-9 * after_ns, 0.0, 0.0, 0.0, 0.0, 1e-10 * after_ns)
+    tracker.begin(blind(TENTH + after_ns), step)
+    if measured:
+        np.testing.assert_allclose(tracker.twist[[0, 5]], [6.0, 0.1], rtol=1e-3)
+    else:
+        assert not tracker.twist.any()
+
+
+def test_after_a_gap_the_old_motion_is_kept_and_a_lost_track_forgets_it() -> None:
+    tracker = elsewhere()
+    tracker.move_to(np.eye(4), TENTH, TWIST)
+    tracker.begin(blind(TENTH + 2 * SECOND), from_xyz_rpy(1.0, 0.0, 0.0))
+    np.testing.assert_array_equal(tracker.twist, TWIST)
+    tracker.move_to(np.eye(4), TENTH)
+    assert not tracker.twist.any()
+
+
+def registered(position_sigma: F64, converged: bool = True, inlier_share: float = 1.0) -> Registration:
+    turned = rotation(0.7)
+    covariance = np.diag([0.0, 0.0, 0.0, 9.0, 9.0, 9.0])
+    covariance[:3, :3] = turned @ np.diag(position_sigma**2) @ turned.T
+    return Registration(np.eye(4), covariance, 1.0, inlier_share, 5, converged)
+
+
+def rotation(yaw: float) -> F64:
+    return from_xyz_rpy(0, 0, 0, yaw=yaw)[:3, :3]
+
+
+def test_a_registration_is_sound_if_it_converged_met_the_map_and_is_certain_in_every_direction() -> None:
+    tracker = elsewhere()
+    assert tracker.is_sound(registered(np.array([0.14, 0.1, 0.1])))
+    assert tracker.is_sound(registered(np.array([0.1, 0.1, 0.1]), inlier_share=0.5)), "just enough"
+    assert not tracker.is_sound(registered(np.array([0.1, 0.1, 0.1]), converged=False))
+    assert not tracker.is_sound(registered(np.array([0.1, 0.1, 0.1]), inlier_share=0.49))
+    for axis in range(3):
+        sigma = np.full(3, 0.01)
+        sigma[axis] = 0.16
+        assert not tracker.is_sound(registered(sigma)), "along any one direction"
+
+
+def test_the_map_around_a_vehicle_is_built_anew_only_when_it_leaves_the_middle(point_map: PointMap) -> None:
+    around = MapWindow(point_map, SETTINGS)
+    first = around(np.array([0.0, 0.0, 1.8]))
+    assert around(np.array([24.0, -24.0, 1.8])) is first
+    second = around(np.array([24.1, 0.0, 1.8]))
+    assert second is not first
+    np.testing.assert_array_equal(second.centre, [24.1, 0.0, 1.8])
+    assert around(np.array([20.0, 0.0, 1.8])) is second
+
+
+def test_a_window_holds_the_tiles_that_it_touches_and_no_others() -> None:
+    tiles = {(r, c): make_tile(wall([(1, 1)], [float(3 * r + c)]), index=(r, c)) for r in range(3) for c in range(3)}
+    point_map = make_map(tiles)
+
+    def heights(x: float, y: float, half_m: float) -> list[float]:
+        return sorted(window_points(point_map, np.array([x, y, 0.0]), half_m)[:, 2].tolist())
+
+    assert heights(115.2, 115.2, 10.0) == [4.0]
+    assert heights(115.2, 115.2, 39.0) == list(range(9))
+    assert heights(115.2, 76.8, 10.0) == [1.0, 4.0]
+    assert heights(76.8, 115.2, 10.0) == [3.0, 4.0]
+
+
+def test_on_a_first_scan_the_speed_is_found_by_how_the_scan_is_bent(tracker: Tracker) -> None:
+    fix = tracker.localise(scan(0), prior(0))
+    assert fix.trusted
+    assert tracker.twist.tolist() == [10.0, 0.0, 0.0, 0.0, 0.0, 0.0], "of the speeds tried, every 2.5 m/s"
+    assert off(fix.registration.T_map_lidar, 0) < 0.04
+
+
+def test_a_scan_without_times_is_taken_as_it_is(tracker: Tracker) -> None:
+    T = POSES[2]
+    points = transform(inverse(T), street(102, 0.6))
+    flash = Scan(TENTH, points[np.linalg.norm(points, axis=1) < 40.0].astype(np.float32), None)
+    fix = tracker.localise(flash, prior(2, 0.3, 0.2, 0.0))
+    assert fix.trusted
+    assert fix.points is flash.points
+    assert not tracker.twist.any()
+    assert off(fix.registration.T_map_lidar, 2) < 0.04
+
+
+def test_a_scan_that_fits_worse_than_usual_is_tried_at_its_prior_and_at_every_speed(point_map: PointMap) -> None:
+    """A street looks alike along itself: a scan may settle one house too early."""
+    i = 6
+    for told in (prior(i), None):
+        tracker = Tracker(MapWindow(point_map, SETTINGS), SETTINGS)
+        back = POSES[i] @ from_xyz_rpy(-10.0, 0.0, 0.0)
+        start_ns = (i + 1) * TENTH - SECOND // 2
+        tracker.move_to(back, start_ns, np.zeros(6), score=0.9)  # it was at rest, and 20 m/s half a second later
+        fix = tracker.localise(scan(i), told)
+        assert off(fix.registration.T_map_lidar, i) < 0.2
+        careless = Tracker(MapWindow(point_map, SETTINGS), SETTINGS)
+        careless.move_to(back, start_ns, np.zeros(6), score=0.0)
+        assert off(careless.localise(scan(i), None).registration.T_map_lidar, i) > 1.0, "or nothing is shown here"
+
+
+def test_a_vehicle_told_metres_wrong_is_found_by_looking_around(point_map: PointMap) -> None:
+    for shift in ((3.0, -2.0, 0.0), (-4.0, 1.0, 0.0)):
+        tracker = Tracker(MapWindow(point_map, SETTINGS), SETTINGS)
+        tracker.twist = twist_of(POSES, 5)
+        fix = tracker.localise(scan(5), prior(5, *shift, yaw_deg=3.0, sigma_m=3.0))
+        assert fix.trusted
+        assert off(fix.registration.T_map_lidar, 5) < 0.1
