@@ -99,9 +99,6 @@ class MappingSettings(Section):
     revisit_s: float = Field(default=10.0, description="and much older means this, within a drive")
 
 
-Occlusion = Literal["first_hit", "farthest_return", "column"]
-
-
 class VotingSettings(Section):
     """The paper's rule, and which of its cases (paper III, V). ``method = "columns"``: docs/method.md."""
 
@@ -109,21 +106,43 @@ class VotingSettings(Section):
     weighted: bool = Field(default=True, description="multiple votes per scan by Eq. (1); false: one vote per scan")
     two_stage: bool = Field(default=True, description="the vehicle decides its cells; false: it sends its tally")
     skip_tall_cells: bool = Field(default=True, description="case 5: no vote where the map begins above the view")
-    tall_rule: Literal["bottom", "height"] = Field(
-        default="bottom",
-        description='what case 5 skips: "bottom", cells where the map begins above the view at that range; '
-        '"height", the literal reading: cells where the map reaches higher than the scan\'s points',
-    )
-    occlusion: Occlusion = Field(default="first_hit", description="what counts as seen to be empty")
     a: float = 2.0
     b: float = 3.0
     k: float = 0.5
-    n_min: int = 5
     window_m: float = Field(default=80.0, description="side of the local grid (paper III-A)")
     min_height_m: float = Field(
         default=0.6, description="columns: a cell whose map rises no higher than this is never changed-empty"
     )
     min_cells: int = Field(default=4, description="columns: smaller groups of changed cells are dropped")
+
+
+class PaperSettings(Section):
+    """How the paper's open sentences are read (detection/readings.py has each with its quotation). Columns have no part
+    in it."""
+
+    occluded: Literal["votes", "abstains"] = Field(
+        default="votes", description="a scan that cannot see a cell votes undetermined there, or gives no vote"
+    )
+    few_points: Literal["undetermined", "empty"] = Field(
+        default="undetermined", description="what a cell with 1 to n_min - 1 points is for that scan"
+    )
+    movers: Literal["occlude", "removed"] = Field(
+        default="occlude", description="whether points of moving objects still hide what is behind them"
+    )
+    line_of_sight: Literal["points", "cells", "farthest", "column"] = Field(
+        default="points",
+        description="what hides: the nearest point above the ground, the nearest in an occupied cell, the farthest "
+        "return alone, or whatever lets no ray through the heights in which the map has points",
+    )
+    tall_rule: Literal["bottom", "height"] = Field(
+        default="bottom",
+        description="what case 5 skips: cells where the map begins above the view at that range; or, literally, where "
+        "it reaches higher than the scan's points",
+    )
+    n_min: int = Field(default=5, ge=1, le=8, description="points that make a cell occupied, n_min of Eq. (1)")
+    window_m: float = Field(
+        default=80.0, gt=1, description="side of the square in which scans vote; no more than voting.window_m"
+    )
 
 
 class FuseSettings(Section):
@@ -215,6 +234,7 @@ class Settings(Section):
     moving: MovingSettings = MovingSettings()
     mapping: MappingSettings = MappingSettings()
     voting: VotingSettings = VotingSettings()
+    paper: PaperSettings = PaperSettings()
     fuse: FuseSettings = FuseSettings()
     server: ServerSettings = ServerSettings()
     gate: GateSettings = GateSettings()
@@ -224,7 +244,7 @@ class Settings(Section):
 
         Settings and METHOD_VERSION: two programs that would vote otherwise on the same drive never share a round.
         """
-        settings = self.model_dump_json(include={"ndt", "trust", "moving", "voting"})
+        settings = self.model_dump_json(include={"ndt", "trust", "moving", "voting", "paper"})
         return hashlib.sha256(f"{METHOD_VERSION} {settings}".encode()).hexdigest()
 
 
@@ -239,6 +259,12 @@ CASES: dict[str, dict[str, bool]] = {
 
 
 ENV_PREFIX = "MAPVOTE_"
+MOVED = {
+    "voting.n_min": "paper.n_min",
+    "voting.tall_rule": "paper.tall_rule",
+    "voting.occlusion": "paper.line_of_sight (first_hit: points, farthest_return: farthest, column: column)",
+}
+"""Settings that had another name."""
 
 
 def did_you_mean(key: str, known: Iterable[str]) -> str:
@@ -248,7 +274,7 @@ def did_you_mean(key: str, known: Iterable[str]) -> str:
 
 
 def load_settings(path: Path | str | None = None, env: Mapping[str, str] | None = None) -> Settings:
-    """The defaults, changed by the TOML file at ``path``, changed by the environment (``MAPVOTE_VOTING__N_MIN=4``).
+    """The defaults, changed by the TOML file at ``path``, changed by the environment (``MAPVOTE_PAPER__N_MIN=4``).
 
     Raises MapvoteError naming the file or variable, the key, and the nearest key that exists.
     """
@@ -265,6 +291,8 @@ def load_with_sources(
         if section not in Settings.model_fields:
             raise MapvoteError(f"{source}: unknown section {section!r}{did_you_mean(section, Settings.model_fields)}")
         known = type(getattr(Settings(), section)).model_fields
+        if f"{section}.{key}" in MOVED:
+            raise MapvoteError(f"{source}: {section}.{key} is called {MOVED[f'{section}.{key}']} now")
         if key not in known:
             raise MapvoteError(f"{source}: unknown setting {section}.{key}{did_you_mean(key, known)}")
         values.setdefault(section, {})[key] = value

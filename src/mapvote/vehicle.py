@@ -50,7 +50,7 @@ class Vehicle:
             MovingFilter(sensor, self.settings.moving),
             LocalMap(point_map, self.settings.voting.window_m),
         )
-        self._voter = make_voter(self.settings.voting, sensor, point_map)
+        self._voter = make_voter(self.settings, sensor, point_map)
         self._new_points = NewPoints(point_map.lattice)
 
     @property

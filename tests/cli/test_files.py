@@ -101,9 +101,9 @@ def test_info_of_nonsense_is_one_clear_error(tmp_path: Path, run: CliRunner) -> 
 
 
 def test_config_tells_value_and_source(tmp_path: Path, run: CliRunner) -> None:
-    (tmp_path / "s.toml").write_text("[voting]\nn_min = 7\n")
+    (tmp_path / "s.toml").write_text("[paper]\nn_min = 7\n")
     told = invoke(run, "config", "--config", tmp_path / "s.toml")
-    line = next(line for line in told.splitlines() if "voting.n_min" in line)
+    line = next(line for line in told.splitlines() if "paper.n_min" in line)
     assert " 7 " in line
     assert "default" not in line
     toml = invoke(run, "config", "--toml")

@@ -16,18 +16,20 @@ def test_nothing_said_means_defaults() -> None:
 
 def test_the_environment_wins_over_the_file_and_each_source_is_known(tmp_path: Path) -> None:
     file = tmp_path / "s.toml"
-    file.write_text("[voting]\nn_min = 7\na = 1.5\n")
-    settings, sources = load_with_sources(file, {"MAPVOTE_VOTING__N_MIN": "4", "MAPVOTE_KEY": "secret", "HOME": "/"})
-    assert (settings.voting.n_min, settings.voting.a, settings.voting.b) == (4, 1.5, 3.0)
-    assert sources == {"voting.n_min": "MAPVOTE_VOTING__N_MIN", "voting.a": str(file)}
+    file.write_text("[paper]\nn_min = 7\n[voting]\na = 1.5\n")
+    settings, sources = load_with_sources(file, {"MAPVOTE_PAPER__N_MIN": "4", "MAPVOTE_KEY": "secret", "HOME": "/"})
+    assert (settings.paper.n_min, settings.voting.a, settings.voting.b) == (4, 1.5, 3.0)
+    assert sources == {"paper.n_min": "MAPVOTE_PAPER__N_MIN", "voting.a": str(file)}
 
 
 @pytest.mark.parametrize(
     ("text", "message"),
     [
         ("[votting]\nn_min = 7\n", "unknown section 'votting'; did you mean 'voting'"),
-        ("[voting]\nn_minn = 7\n", r"unknown setting voting\.n_minn; did you mean 'n_min'"),
-        ("[voting]\nn_min = 'many'\n", r"voting\.n_min = 'many'"),
+        ("[paper]\nn_minn = 7\n", r"unknown setting paper\.n_minn; did you mean 'n_min'"),
+        ("[paper]\nn_min = 'many'\n", r"paper\.n_min = 'many'"),
+        ("[paper]\noccluded = 'perhaps'\n", r"paper\.occluded = 'perhaps'.*'votes' or 'abstains'"),
+        ("[voting]\nocclusion = 'column'\n", r"voting\.occlusion is called paper\.line_of_sight"),
         ("n_min = 7\n", "outside a section"),
         ("[voting\n", "cannot be read"),
     ],

@@ -6,14 +6,17 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from mapvote.config import VotingSettings
+from mapvote.config import PaperSettings, VotingSettings
 from mapvote.core.columns import below_top, span_of
 from mapvote.core.grid import Grid, Lattice
 from mapvote.core.sensors import SENSORS
 from mapvote.core.types import NO_VOTE, CellState, Reference
 from mapvote.core.voting import VOTE_UNIT, vote_weight
-from mapvote.detection.paper import classify_paper
+from mapvote.detection.paper import classify_paper, reading_table
+from mapvote.detection.sightings import WORDS, encode
 from mapvote.perception.raycast import ScanView, Sight
 
 ORIGIN = np.array([0.15, 0.15, 1.8])
@@ -49,10 +52,13 @@ def one_cell(
     return view, reference
 
 
-def vote(view: ScanView, reference: Reference, **settings: Any) -> tuple[int, int]:
-    states, weights = classify_paper(
-        view, reference, ORIGIN, SENSOR, VotingSettings.model_validate({"skip_tall_cells": False, **settings})
-    )
+def vote(
+    view: ScanView, reference: Reference, weighted: bool = True, tall: bool = False, **read: Any
+) -> tuple[int, int]:
+    """State and votes of the last cell, the paper's sentences ``read`` like that."""
+    words = encode(view, reference, ORIGIN, SENSOR)
+    voting = VotingSettings(weighted=weighted, skip_tall_cells=tall)
+    states, weights = classify_paper(words, reference.counts > 0, voting, PaperSettings.model_validate(read))
     return int(states[0, -1]), int(weights[0, -1])
 
 
@@ -83,23 +89,23 @@ def test_occupied_cells_have_the_votes_of_equation_1_and_others_one() -> None:
 
 def test_the_three_occlusion_rules() -> None:
     behind_a_fence = one_cell(0, Sight.BEHIND, map_bits=0b1010_0000, passed=0b100_0000)
-    assert vote(*behind_a_fence, occlusion="first_hit")[0] == CellState.UNDETERMINED
-    assert vote(*behind_a_fence, occlusion="farthest_return")[0] == CellState.CHANGED_EMPTY
-    assert vote(*behind_a_fence, occlusion="column")[0] == CellState.CHANGED_EMPTY  # through the span, not a voxel
+    assert vote(*behind_a_fence, line_of_sight="points")[0] == CellState.UNDETERMINED
+    assert vote(*behind_a_fence, line_of_sight="farthest")[0] == CellState.CHANGED_EMPTY
+    assert vote(*behind_a_fence, line_of_sight="column")[0] == CellState.CHANGED_EMPTY  # through the span, not a voxel
     over_it = one_cell(0, Sight.CLEAR, map_bits=0b1010_0000, passed=0b1_0000)
-    assert vote(*over_it, occlusion="column")[0] == CellState.UNDETERMINED
+    assert vote(*over_it, line_of_sight="column")[0] == CellState.UNDETERMINED
 
 
 def test_case_5_skips_cells_whose_map_begins_above_the_view_at_that_range() -> None:
     # 9 m away, the view of an HDL-32E at 1.8 m ends at 1.8 + 9 tan(10.67 deg) = 3.50 m.
     for bottom_z, state in ((3.4, CellState.CHANGED_EMPTY), (3.6, NO_VOTE)):
         cell = one_cell(0, Sight.CLEAR, map_bits=1 << 12, bottom_z=bottom_z)
-        assert vote(*cell, skip_tall_cells=True)[0] == state
+        assert vote(*cell, tall=True)[0] == state
         assert vote(*cell)[0] == CellState.CHANGED_EMPTY
 
 
 def test_case_5_read_literally_skips_cells_where_the_map_is_higher_than_the_scan() -> None:
-    literal: dict[str, Any] = {"skip_tall_cells": True, "tall_rule": "height"}
+    literal: dict[str, Any] = {"tall": True, "tall_rule": "height"}
     assert vote(*one_cell(0, Sight.CLEAR, map_bits=0b10), **literal)[0] == NO_VOTE
     assert vote(*one_cell(9, Sight.CLEAR, map_bits=0b110, hit=0b10), **literal)[0] == NO_VOTE
     assert vote(*one_cell(9, Sight.CLEAR, map_bits=0b110, hit=0b101), **literal)[0] == CellState.UNCHANGED_OCCUPIED
@@ -110,3 +116,46 @@ def test_bits_of_a_column() -> None:
     assert span_of(np.uint64(0)) == 0
     assert span_of(np.uint64(1 << 63)) == 1 << 63
     assert below_top(np.uint64(0b0100_1000)) == 0b0111_1111
+
+
+def test_an_occluded_scan_votes_undetermined_or_gives_no_vote() -> None:
+    for map_bits in (0, 0b1110):
+        hidden = one_cell(0, Sight.BEHIND, map_bits)
+        assert vote(*hidden)[0] == CellState.UNDETERMINED
+        assert vote(*hidden, occluded="abstains")[0] == NO_VOTE
+    assert vote(*one_cell(9, Sight.BEHIND), occluded="abstains")[0] == CellState.CHANGED_OCCUPIED
+    assert vote(*one_cell(2, Sight.BEHIND), occluded="abstains")[0] == CellState.UNDETERMINED, "it was seen, a little"
+
+
+def test_below_n_min_a_cell_is_undetermined_or_empty_but_never_occupied() -> None:
+    few = one_cell(4, Sight.CLEAR, 0b1110)
+    assert vote(*few)[0] == CellState.UNDETERMINED
+    assert vote(*few, few_points="empty")[0] == CellState.CHANGED_EMPTY
+    assert vote(*few, few_points="empty", n_min=4)[0] == CellState.UNCHANGED_OCCUPIED
+
+
+@given(
+    st.sampled_from(["votes", "abstains"]),
+    st.sampled_from(["undetermined", "empty"]),
+    st.sampled_from(["occlude", "removed"]),
+    st.sampled_from(["points", "cells", "farthest", "column"]),
+    st.sampled_from(["bottom", "height"]),
+    st.integers(1, 8),
+    st.booleans(),
+)
+def test_whatever_is_read_n_min_points_make_a_cell_occupied_and_the_map_says_changed_or_not(
+    occluded: Any, few_points: Any, movers: Any, sight: Any, tall_rule: Any, n_min: int, tall: bool
+) -> None:
+    paper = PaperSettings(
+        occluded=occluded, few_points=few_points, movers=movers, line_of_sight=sight, tall_rule=tall_rule, n_min=n_min
+    )
+    states, weights = reading_table(VotingSettings(skip_tall_cells=tall), paper)
+    n = np.arange(WORDS) & 15
+    spoken = states != NO_VOTE
+    assert np.array_equal(spoken[0], spoken[1]), "a scan speaks or does not, whatever the map holds"
+    occupied = (states == CellState.UNCHANGED_OCCUPIED) | (states == CellState.CHANGED_OCCUPIED)
+    assert np.array_equal(occupied[0], (n >= n_min) & spoken[0])
+    assert not np.isin(states[0], (CellState.UNCHANGED_OCCUPIED, CellState.CHANGED_EMPTY)).any()
+    assert not np.isin(states[1], (CellState.CHANGED_OCCUPIED, CellState.UNCHANGED_EMPTY)).any()
+    assert weights[n < n_min].max() == VOTE_UNIT
+    assert weights[n >= n_min].min() == 2 * VOTE_UNIT

@@ -42,7 +42,7 @@ def config(
 ) -> None:
     """Show every setting with its value, where the value comes from, and what it means.
 
-    Settings come from their defaults, then from the TOML file, then from the environment (MAPVOTE_VOTING__N_MIN=4).
+    Settings come from their defaults, then from the TOML file, then from the environment (MAPVOTE_PAPER__N_MIN=4).
 
         mapvote config --toml > settings.toml
     """

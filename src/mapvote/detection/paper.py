@@ -1,124 +1,71 @@
-"""One scan against the reference: a state per cell (paper III-A, III-B)."""
+"""One scan against the reference: a state per cell (paper III-A, III-B), as the paper's sentences are read."""
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from functools import lru_cache
 
-import numba
 import numpy as np
 
-from mapvote.config import VotingSettings
-from mapvote.core.columns import EVERY_BIT, below_top, span_of
-from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Grid, Lattice, TileIndex
+from mapvote.config import PaperSettings, VotingSettings
+from mapvote.core.columns import EVERY_BIT
+from mapvote.core.grid import TILE_CELLS, Grid, Lattice, TileIndex
 from mapvote.core.point_map import PointMap
 from mapvote.core.sensors import Sensor
-from mapvote.core.types import F32, F64, I32, N_STATES, NO_VOTE, U8, U64, CellState, Reference
+from mapvote.core.types import I32, N_STATES, NO_VOTE, U8, U16, U64, Bool, CellState
 from mapvote.core.voting import VOTE_UNIT, cast, decide, weight_table
+from mapvote.detection import sightings as bits
 from mapvote.detection.votes import TileVotes
 from mapvote.perception.frontend import Observation
-from mapvote.perception.raycast import ScanView, Sight
 
-_UNCHANGED_OCCUPIED = int(CellState.UNCHANGED_OCCUPIED)
-_UNCHANGED_EMPTY = int(CellState.UNCHANGED_EMPTY)
-_CHANGED_OCCUPIED = int(CellState.CHANGED_OCCUPIED)
-_CHANGED_EMPTY = int(CellState.CHANGED_EMPTY)
-_UNDETERMINED = int(CellState.UNDETERMINED)
-_CLEAR, _BEHIND, _NEVER = int(Sight.CLEAR), int(Sight.BEHIND), int(Sight.NEVER)
-_OCCLUSION_FIRST, _OCCLUSION_FARTHEST, _OCCLUSION_COLUMN = 0, 1, 2
-_OCCLUSION = {
-    "first_hit": _OCCLUSION_FIRST,
-    "farthest_return": _OCCLUSION_FARTHEST,
-    "column": _OCCLUSION_COLUMN,
+_SIGHT = {
+    "points": bits.CLEAR,
+    "cells": bits.CLEAR_OF_CELLS,
+    "farthest": bits.BEFORE_FARTHEST,
+    "column": bits.THROUGH_COLUMN,
 }
-_TALL_NONE, _TALL_BOTTOM, _TALL_HEIGHT = 0, 1, 2
-_TALL = {"none": _TALL_NONE, "bottom": _TALL_BOTTOM, "height": _TALL_HEIGHT}
+_TALL = {"bottom": bits.BEGINS_ABOVE, "height": bits.REACHES_HIGHER}
 
 
-class Seen(NamedTuple):
-    """The planes of :class:`mapvote.perception.raycast.ScanView`, and where the scan was taken."""
+@lru_cache(maxsize=64)
+def reading_table(voting: VotingSettings, paper: PaperSettings) -> tuple[U8, I32]:
+    """The reading as a table: (states (2, 65536) by whether the map holds points and by word, weights (65536,)).
 
-    counts: I32
-    hit: U64
-    passed: U64
-    sight: U8
-    origin: F64
-    """(3,) the sensor, map metres."""
-    x0: float
-    y0: float
-    """Lower-left corner of the planes, map metres."""
-
-
-class Mapped(NamedTuple):
-    """What the map has in the same cells, as in :class:`mapvote.core.types.Reference`."""
-
-    occupied: U64
-    counts: I32
-    bottom_z: F32
-
-
-class Rule(NamedTuple):
-    """The settings, as numbers."""
-
-    occlusion: int
-    tall: int
-    tan_top: float
-    """Slope of the sensor's highest ray."""
-    table: I32
-    """Votes of n points in VOTE_UNITs, Eq. (1); the last for any more."""
-    n_min: int
+    A cell with n_min points or more is occupied and worth w(n), Eq. (1), in VOTE_UNITs; with fewer undetermined or
+    empty; with none empty if it was visible, else undetermined or without a vote. NO_VOTE where no ray was fired, and,
+    in case 5 (``skip_tall_cells``), where the map is too tall.
+    """
+    words = np.arange(bits.WORDS)
+    n = words & bits.MOST_POINTS
+    shift = bits.WITHOUT_MOVERS if paper.movers == "removed" else 0
+    visible = words & (_SIGHT[paper.line_of_sight] << shift) != 0
+    fired = words & (bits.FIRED << shift) != 0
+    occupied = n >= paper.n_min
+    empty = (n == 0) & visible
+    if paper.few_points == "empty":
+        empty |= (n > 0) & ~occupied
+    unseen = int(CellState.UNDETERMINED) if paper.occluded == "votes" else NO_VOTE
+    states = np.empty((2, bits.WORDS), dtype=np.uint8)
+    for mapped, if_occupied, if_empty in (
+        (0, CellState.CHANGED_OCCUPIED, CellState.UNCHANGED_EMPTY),
+        (1, CellState.UNCHANGED_OCCUPIED, CellState.CHANGED_EMPTY),
+    ):
+        states[mapped] = np.where(n > 0, CellState.UNDETERMINED, np.where(fired, unseen, NO_VOTE))
+        states[mapped, empty] = if_empty
+        states[mapped, occupied] = if_occupied
+        if voting.skip_tall_cells:
+            states[mapped, words & _TALL[paper.tall_rule] != 0] = NO_VOTE
+    points = weight_table(voting.weighted, voting.a, voting.b, voting.k, paper.n_min, bits.MOST_POINTS)
+    return states, np.where(occupied, points[n], VOTE_UNIT).astype(np.int32)
 
 
-@numba.njit(cache=True, nogil=True)
-def _paper(seen: Seen, mapped: Mapped, rule: Rule, states: U8, weights: I32) -> None:
-    counts, hit, passed, sight, origin, x0, y0 = seen  # unpacked once: a group handed on for each cell would cost much
-    occupied, map_counts, bottom_z = mapped
-    rows, cols = counts.shape
-    for r in range(rows):
-        for c in range(cols):
-            weights[r, c] = VOTE_UNIT
-            n, is_mapped = counts[r, c], map_counts[r, c] > 0
-            # Was the cell seen, by one of the three occlusion rules (docs/decisions/paper.md)?
-            visible = sight[r, c] >= (_CLEAR if rule.occlusion == _OCCLUSION_FIRST else _BEHIND)
-            if rule.occlusion == _OCCLUSION_COLUMN and is_mapped:
-                visible = span_of(occupied[r, c]) & passed[r, c] != 0
-            # Case 5: the map begins above the view at that range, or reaches above the scan's points.
-            invalid = False
-            if rule.tall == _TALL_BOTTOM and is_mapped:
-                dx, dy = x0 + (c + 0.5) * CELL_SIZE - origin[0], y0 + (r + 0.5) * CELL_SIZE - origin[1]
-                invalid = bottom_z[r, c] > origin[2] + rule.tan_top * np.sqrt(dx * dx + dy * dy)
-            elif rule.tall == _TALL_HEIGHT:
-                invalid = occupied[r, c] > below_top(hit[r, c])
-            # The five states (paper III-A).
-            if invalid or (sight[r, c] == _NEVER and n == 0):
-                states[r, c] = NO_VOTE
-            elif n >= rule.n_min:
-                states[r, c] = _UNCHANGED_OCCUPIED if is_mapped else _CHANGED_OCCUPIED
-                weights[r, c] = rule.table[min(n, len(rule.table) - 1)]
-            elif n > 0 or not visible:
-                states[r, c] = _UNDETERMINED
-            else:
-                states[r, c] = _CHANGED_EMPTY if is_mapped else _UNCHANGED_EMPTY
-
-
-def classify_paper(
-    view: ScanView, reference: Reference, origin_map: F64, sensor: Sensor, settings: VotingSettings
-) -> tuple[U8, I32]:
+def classify_paper(words: U16, mapped: Bool, voting: VotingSettings, paper: PaperSettings) -> tuple[U8, I32]:
     """The paper's five states and the votes each is worth: (states uint8, weights int32 in VOTE_UNITs), (rows, cols).
 
-    A cell with n_min points or more is occupied and worth w(n), Eq. (1); with 1 to n_min - 1 undetermined; with none
-    empty if it was visible, else undetermined. NO_VOTE where no ray was fired, and, in case 5 (``skip_tall_cells``),
-    where the map begins above the sensor's view at that range. ``origin_map`` (3,): the sensor, map metres.
+    ``words`` (rows, cols) what the scan says (:mod:`mapvote.detection.sightings`), ``mapped`` where the map holds
+    obstacle points; see :func:`reading_table`.
     """
-    states = np.empty(view.counts.shape, dtype=np.uint8)
-    weights = np.empty(view.counts.shape, dtype=np.int32)
-    table = weight_table(settings.weighted, settings.a, settings.b, settings.k, settings.n_min)
-    tall = _TALL[settings.tall_rule if settings.skip_tall_cells else "none"]
-    grid = view.grid
-    seen = Seen(view.counts, view.hit, view.passed, view.sight, origin_map, grid.x0, grid.y0)
-    tan_top = float(np.tan(np.radians(sensor.fov_top_deg)))
-    rule = Rule(_OCCLUSION[settings.occlusion], tall, tan_top, table, settings.n_min)
-    _paper(seen, Mapped(reference.occupied, reference.counts, reference.bottom_z), rule, states, weights)
-    return states, weights
+    states, weights = reading_table(voting, paper)
+    return states[mapped.astype(np.intp), words], weights[words]
 
 
 class Tally:
@@ -143,13 +90,14 @@ class Tally:
 class PaperVoter:
     """Paper III: every scan classifies every cell and casts its votes."""
 
-    def __init__(self, voting: VotingSettings, sensor: Sensor, point_map: PointMap) -> None:
-        self.voting, self.sensor = voting, sensor
+    def __init__(self, voting: VotingSettings, paper: PaperSettings, sensor: Sensor, point_map: PointMap) -> None:
+        self.voting, self.paper, self.sensor = voting, paper, sensor
         self._tally = Tally(point_map.lattice)
 
     def observe(self, seen: Observation) -> U64:
         """Cast one scan's votes; returns (rows, cols) words of voxels whose points may be new."""
-        states, weights = classify_paper(seen.view, seen.reference, seen.scan.origin_map, self.sensor, self.voting)
+        words = bits.sightings(seen, self.sensor, self.paper.n_min, self.paper)
+        states, weights = classify_paper(words, seen.reference.counts > 0, self.voting, self.paper)
         self._tally.cast(seen.view.grid, states, weights)
         return np.where(states == CellState.CHANGED_OCCUPIED, EVERY_BIT, np.uint64(0))
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Protocol
 
-from mapvote.config import VotingSettings
+from mapvote.config import Settings
 from mapvote.core.grid import TileIndex
 from mapvote.core.point_map import PointMap
 from mapvote.core.sensors import Sensor
@@ -26,8 +26,8 @@ class Voter(Protocol):
         nothing."""
 
 
-def make_voter(voting: VotingSettings, sensor: Sensor, point_map: PointMap) -> Voter:
+def make_voter(settings: Settings, sensor: Sensor, point_map: PointMap) -> Voter:
     """The voter that ``voting.method`` names."""
-    if voting.method == "columns":
-        return ColumnVoter(voting, point_map)
-    return PaperVoter(voting, sensor, point_map)
+    if settings.voting.method == "columns":
+        return ColumnVoter(settings.voting, point_map)
+    return PaperVoter(settings.voting, settings.paper, sensor, point_map)

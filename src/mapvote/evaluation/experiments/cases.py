@@ -7,14 +7,14 @@ decided cells are scored.
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
 
 from mapvote.codec.ballot import Ballot, unpack_states, unpack_tally
-from mapvote.config import CASES, FuseSettings, Settings, VotingSettings
+from mapvote.config import CASES, FuseSettings, PaperSettings, Settings, VotingSettings
 from mapvote.core.grid import Grid
 from mapvote.core.point_map import PointMap
 from mapvote.core.types import NO_VOTE, U8, MapvoteError
@@ -25,7 +25,16 @@ from mapvote.evaluation.scoring.truth import lay_on
 from mapvote.fusion.fuse import states_over
 from mapvote.fusion.offline import update_map
 
-OCCLUSIONS = ("first_hit", "farthest_return", "column")
+OCCLUSIONS: Mapping[str, Mapping[str, str]] = {
+    "": {},
+    " farthest_return": {"line_of_sight": "farthest"},
+    " column": {"line_of_sight": "column"},
+}
+"""Readings of sight that stand beside the one that is set, by what they add to a case's name."""
+
+
+AS_BEFORE = PaperSettings()
+"""The paper as it has been read from the start."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,18 +44,20 @@ class Case:
     name: str
     voting: VotingSettings
     min_votes: int
+    paper: PaperSettings = AS_BEFORE
+    """How the paper is read; columns are not asked."""
     rules: Rules = ALL_RULES
     """Of columns: all hold, but in an ablation."""
 
 
 def paper_cases(settings: Settings) -> dict[str, Case]:
-    """Cases 1 to 5 under ``first_hit``, named "1".., and under the other occlusion rules, named "1 column".. ."""
+    """Cases 1 to 5 as ``[paper]`` reads them, named "1".., and under the other rules of sight, named "1 column".. ."""
     cases = {}
-    for occlusion in OCCLUSIONS:
+    for added, differently in OCCLUSIONS.items():
+        paper = settings.paper.model_copy(update=differently)
         for number, booleans in CASES.items():
-            name = number if occlusion == OCCLUSIONS[0] else f"{number} {occlusion}"
-            voting = settings.voting.model_copy(update={"method": "paper", "occlusion": occlusion, **booleans})
-            cases[name] = Case(name, voting, min_votes=1)
+            voting = settings.voting.model_copy(update={"method": "paper", **booleans})
+            cases[number + added] = Case(number + added, voting, 1, paper)
     return cases
 
 

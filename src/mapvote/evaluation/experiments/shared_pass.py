@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from mapvote.codec.ballot import Ballot
-from mapvote.config import Settings, VotingSettings
+from mapvote.config import PaperSettings, Settings, VotingSettings
 from mapvote.core.point_map import PointMap
 from mapvote.core.reference import LocalMap
 from mapvote.core.types import Drive, Scan
@@ -48,7 +48,7 @@ class SharedPass:
             movers or MovingFilter(drive.sensor, settings.moving),
             LocalMap(point_map, settings.voting.window_m),
         )
-        self._voters: dict[tuple[VotingSettings, Rules], Voter] = {}
+        self._voters: dict[tuple[VotingSettings, PaperSettings, Rules], Voter] = {}
         self._observing: list[Voter] = []
         """Those of them that fill the counters."""
         self._evidence: dict[tuple[bool, bool], Evidence] = {}
@@ -60,9 +60,9 @@ class SharedPass:
         key = _counts_as(case)
         if key in self._voters:
             return
-        voting, rules = key
+        voting, paper, rules = key
         if voting.method == "paper":
-            self._voters[key] = PaperVoter(voting, self.drive.sensor, self.point_map)
+            self._voters[key] = PaperVoter(voting, paper, self.drive.sensor, self.point_map)
             self._observing.append(self._voters[key])
             return
         counted_by = rules.empty_by_ray, rules.hits_veto
@@ -96,13 +96,13 @@ class SharedPass:
 
     def ballot(self, case: Case) -> Ballot:
         """What the vehicle says by one of its cases. MapvoteError if no scan has voted."""
-        settings = self.settings.model_copy(update={"voting": case.voting})
+        settings = self.settings.model_copy(update={"voting": case.voting, "paper": case.paper})
         return write_ballot(
             self.drive.vehicle, self.drive.drive_id, self.point_map, settings, self.report,
             self._voters[_counts_as(case)], self._new_points,
         )  # fmt: skip
 
 
-def _counts_as(case: Case) -> tuple[VotingSettings, Rules]:
+def _counts_as(case: Case) -> tuple[VotingSettings, PaperSettings, Rules]:
     """Voters that differ only in who decides (one stage or two) count alike."""
-    return case.voting.model_copy(update={"two_stage": True}), case.rules
+    return case.voting.model_copy(update={"two_stage": True}), case.paper, case.rules

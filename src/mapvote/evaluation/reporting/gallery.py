@@ -75,7 +75,7 @@ def gallery(evaluation: Evaluation, case: str, folder: Path) -> list[tuple[Path,
             (area.name.replace(" ", "_"), _area(evaluation.first_map, area, old, survived, added, paths), caption)
         )
     nearest = _scan_near(evaluation, areas)
-    v = evaluation.scene.settings.voting
+    v, n_min = evaluation.scene.settings.voting, evaluation.scene.settings.paper.n_min
     decided = {n: evaluation.outcomes[n].states for n in ("1", "5", "columns") if n in evaluation.outcomes}
     panels = [("Truth (strict)", _as_states(evaluation.truth.strict))]
     panels += [(case_name(n).capitalize(), states) for n, states in decided.items()]
@@ -85,7 +85,11 @@ def gallery(evaluation: Evaluation, case: str, folder: Path) -> list[tuple[Path,
     pictures += [
         ("scan", _scan(evaluation, nearest), "One scan of a vehicle, bodies that move in orange: Figure 5."),
         ("local_grid", _local_grid(evaluation, nearest), "The 80 m local grid of one vehicle: Figures 2 and 3."),
-        ("vote_curve", figures.vote_curve(v.a, v.b, v.k, v.n_min), "Votes of an occupied cell, Eq. (1): Figure 4."),
+        (
+            "vote_curve",
+            figures.vote_curve(v.a, v.b, v.k, n_min),
+            "Votes of an occupied cell, Eq. (1): Figure 4.",
+        ),
         (
             "states",
             states,
@@ -195,7 +199,7 @@ def _local_grid(evaluation: Evaluation, index: int) -> Figure:
     once, grid = ballot_states(vehicle.ballot(), evaluation.first_map)
     x, y = first.T_map_lidar[index, :2, 3]
     window = window_around(evaluation.first_map.lattice, float(x), float(y), voting.window_m)
-    panels = [("One scan, case 1 (first_hit)", lay_on(once, grid, window))]
+    panels = [("One scan, case 1", lay_on(once, grid, window))]
     panels += [
         (f"The whole drive, {case_name(n)}", lay_on(*ballot_states(first.ballots[n], evaluation.first_map), window))
         for n in ("1", "columns")

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 
-from mapvote.config import Settings
+from mapvote.config import PaperSettings
 from mapvote.core.grid import Grid
 from mapvote.core.types import F32, F64, U8, Reference
 from mapvote.evaluation.scoring.border import border
@@ -23,7 +23,7 @@ def could_be_known(truth: Truth, first_map: Reference) -> U8:
     simulator), and a demolished one of which the map holds no point. Both are unscored.
     """
     out = truth.provenance.copy()
-    out[(out == _OCCUPIED) & (truth.densest < Settings().voting.n_min)] = UNSCORED
+    out[(out == _OCCUPIED) & (truth.densest < PaperSettings().n_min)] = UNSCORED
     out[(out == _EMPTY) & (first_map.counts == 0)] = UNSCORED
     return out
 
