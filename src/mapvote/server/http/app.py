@@ -25,6 +25,7 @@ from mapvote.server.http.browsers import Hosts
 from mapvote.server.http.middleware import Watch
 from mapvote.server.http.schemas import unreadable
 from mapvote.server.http.services import READING, make_services
+from mapvote.server.http.warming import keep_overview
 from mapvote.server.http.webhook import deliver
 from mapvote.server.store.publish import Gate
 from mapvote.server.store.store import Store
@@ -48,10 +49,13 @@ def create_app(
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
         to_thread.current_default_thread_limiter().total_tokens = READING
-        posting = asyncio.create_task(deliver(parts)) if parts.settings.server.webhook_url else None
+        beside = [keep_overview(parts), *([deliver(parts)] if parts.settings.server.webhook_url else [])]
+        tasks = [asyncio.create_task(work) for work in beside]
         yield
-        if posting is not None:
-            posting.cancel()
+        parts.stopping.set()
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
         await parts.close()
 
     app = FastAPI(

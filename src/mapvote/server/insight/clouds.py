@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections import OrderedDict
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -22,6 +21,8 @@ from mapvote.server.store.store import Store
 
 OVERVIEW_POINTS = 150_000
 """Of an overview at most, 1.2 MB: what a slow connection brings in a second or two."""
+_SPARE = 4
+"""Times the even share of it that is kept of a tile while an overview is made: a map of any size fits in memory."""
 _ANYWHERE = Lattice().tile((0, 0))
 """Levels count from a tile's corner, wherever that is."""
 _KEPT_BYTES = 256_000_000
@@ -29,16 +30,6 @@ _HEAD = "<i4,<i4,<i4,<u4,<f4,<f4"
 _MAGIC = 0x3143564F
 _DAY_NS = 86_400 * 10**9
 _NEVER_SEEN = 255
-
-
-@dataclass(frozen=True, slots=True)
-class _Part:
-    """What an overview shows of one tile."""
-
-    index: TileIndex
-    levels: Levels
-    level: int
-    points: int
 
 
 class Clouds:
@@ -89,8 +80,9 @@ class Clouds:
         for index, hashes in tiles.items():
             if stop():
                 return b""
-            made.append((index, self.levels(TileHashes(hashes.points, hashes.ground, None))))
-        data = _overview_bytes(_chosen(made))
+            levels = self.levels(TileHashes(hashes.points, hashes.ground, None))
+            made.append((index, levels.thinned(_SPARE * OVERVIEW_POINTS // len(tiles))))
+        data = _overview_bytes(made)
         self._overview = version, data
         return data
 
@@ -103,21 +95,20 @@ class Clouds:
         return b"".join(cloud_bytes(*pack(some, ground)) for some in (before.points[gone], after.points[come]))
 
 
-def _chosen(made: list[tuple[TileIndex, Levels]]) -> list[_Part]:
+def _overview_bytes(made: Sequence[tuple[TileIndex, Levels]]) -> bytes:
     ends = np.array([levels.ends for _, levels in made]).reshape(len(made), -1)
     fits = np.flatnonzero(ends.sum(axis=0) <= OVERVIEW_POINTS)
-    level = int(fits[-1]) if len(fits) else -1
+    finest = int(fits[-1]) if len(fits) else -1
     share = OVERVIEW_POINTS // max(len(made), 1)
-    return [
-        _Part(index, levels, level, int(levels.ends[level]) if level >= 0 else min(share, int(levels.ends[0])))
-        for index, levels in made
-    ]
-
-
-def _overview_bytes(parts: list[_Part]) -> bytes:
-    rows = [(*p.index, p.level, p.points, p.levels.z0_m, p.levels.z_step_m) for p in parts]
-    head = np.array([_MAGIC, len(parts)], dtype="<u4").tobytes() + np.array(rows, dtype=_HEAD).tobytes()
-    return head + b"".join(np.ascontiguousarray(p.levels.packed[: p.points], dtype="<u2").tobytes() for p in parts)
+    rows, clouds = [], []
+    for index, levels in made:
+        whole = min(finest, int(np.searchsorted(levels.ends, len(levels.packed), side="right")) - 1)
+        points = int(levels.ends[whole]) if whole >= 0 else min(share, len(levels.packed))
+        rows.append((*index, whole, points, levels.z0_m, levels.z_step_m))
+        clouds.append(np.ascontiguousarray(levels.packed[:points], dtype="<u2").tobytes())
+    return b"".join(
+        [np.array([_MAGIC, len(made)], dtype="<u4").tobytes(), np.array(rows, dtype=_HEAD).tobytes(), *clouds]
+    )
 
 
 def evidence(store: Store, index: TileIndex, vehicle: str | None = None) -> U8:

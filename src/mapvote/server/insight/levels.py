@@ -1,13 +1,13 @@
 """A tile's points in levels of detail: any prefix of them is an even, thinner picture of the tile.
 
-Each point belongs to the coarsest level in whose voxels it is the first; within a level the order is random, and the
-same on every run. Levels are added to one another, so nothing is sent twice (Potree's additive levels, Schuetz 2016,
-on our tiles instead of an octree: a tile is one node, whose parts are its levels).
+Each point belongs to the coarsest level in whose voxels it is the tile's first; within a level the order is random,
+and the same on every run. Levels are added to one another, so nothing is sent twice (Potree's additive levels, Schuetz
+2016, on our tiles instead of an octree: a tile is one node, whose parts are its levels).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numba
 import numpy as np
@@ -22,6 +22,8 @@ SIDE_M = TILE_CELLS * CELL_SIZE
 ABOVE_OFFSET_M = 10.0
 _STEPS = 65535
 _LEAST_Z_STEP_M = 0.002
+_MOST_LAYERS = 512
+"""Of voxels, upwards: beyond, heights count as one."""
 _BYTES = "<u4,<u4,<f4,<f4"
 _MAGIC = 0x3143564D
 
@@ -38,6 +40,10 @@ class Levels:
     z0_m: float
     z_step_m: float
 
+    def thinned(self, points: int) -> Levels:
+        """The first points alone, of their own: at least the coarsest level, ``ends`` as before."""
+        return replace(self, packed=self.packed[: max(points, int(self.ends[0]))].copy())
+
     def part(self, level: int) -> bytes:
         """One level for the wire, see :func:`cloud_bytes`."""
         start = 0 if level == 0 else int(self.ends[level - 1])
@@ -46,29 +52,30 @@ class Levels:
 
 def make_levels(points: F32, ground_z: F32) -> Levels:
     """Sort points (n, 3), from the tile's corner, into levels; ``ground_z`` (256, 256) as in the tile."""
-    shuffled = points[np.random.default_rng(0).permutation(len(points))]
-    level = _levels(shuffled, np.array(SPACINGS_M))
-    order = np.argsort(level, kind="stable")
-    packed, z0, step = pack(shuffled[order], ground_z)
-    return Levels(packed, np.cumsum(np.bincount(level, minlength=N_LEVELS)), z0, step)
+    sizes = np.array(SPACINGS_M)
+    low, high = _heights(points)
+    sides = np.ceil(SIDE_M / sizes).astype(np.int64) + 1
+    layers = np.minimum(((high - low) / sizes).astype(np.int64) + 1, _MOST_LAYERS)
+    level = _levels(points, low, sizes, sides, layers)  # in the tile's own order: what is near comes soon, and is cheap
+    shuffled = np.random.default_rng(0).permutation(len(points))
+    packed, z0, step = pack(points, ground_z)
+    in_levels = packed[shuffled[np.argsort(level[shuffled], kind="stable")]]
+    return Levels(in_levels, np.cumsum(np.bincount(level, minlength=N_LEVELS)), z0, step)
 
 
 def pack(points: F32, ground_z: F32) -> tuple[U16, float, float]:
     """(packed (n, 4), z0_m, z_step_m) of points from a tile's corner, in their order, see :class:`Levels`."""
     if not len(points):
         return np.zeros((0, 4), dtype=np.uint16), 0.0, _LEAST_Z_STEP_M
-    z = points[:, 2].astype(np.float64)
-    z0 = float(z.min())
-    step = max(_LEAST_Z_STEP_M, float(z.max() - z0) / _STEPS)
-    out = np.empty((len(points), 4), dtype=np.uint16)
-    out[:, :2] = np.clip(np.rint(points[:, :2] * (_STEPS / SIDE_M)), 0, _STEPS)
-    out[:, 2] = np.rint((z - z0) / step)
-    cells = np.clip((points[:, :2] / CELL_SIZE).astype(np.int64), 0, TILE_CELLS - 1)
-    ground = ground_z[cells[:, 1], cells[:, 0]].astype(np.float64)
+    low, high = _heights(points)
+    step = max(_LEAST_Z_STEP_M, (high - low) / _STEPS)
     known = ground_z[np.isfinite(ground_z)]
-    ground = np.where(np.isfinite(ground), ground, np.median(known) if len(known) else z0)
-    out[:, 3] = np.clip(np.rint((z - ground + ABOVE_OFFSET_M) * 100), 0, _STEPS)
-    return out, z0, step
+    elsewhere = float(np.median(known)) if len(known) else low
+    return _pack(points, ground_z, elsewhere, low, step), low, step
+
+
+def _heights(points: F32) -> tuple[float, float]:
+    return (float(points[:, 2].min()), float(points[:, 2].max())) if len(points) else (0.0, 0.0)
 
 
 def cloud_bytes(packed: U16, z0_m: float, z_step_m: float) -> bytes:
@@ -86,29 +93,42 @@ def unpack_cloud(data: bytes) -> F64:
 
 
 @numba.njit(cache=True, nogil=True)
-def _levels(points: F32, spacings: np.ndarray) -> U8:
-    """(n,) level of each point, in the order given. Beyond 512 layers of the finest voxel, heights count as one."""
-    n = len(points)
-    out = np.full(n, len(spacings), dtype=np.uint8)
-    if n == 0:
-        return out
-    low, high = points[0, 2], points[0, 2]
-    for i in range(n):
-        low, high = min(low, points[i, 2]), max(high, points[i, 2])
-    for level in range(len(spacings)):
-        size = spacings[level]
-        side = int(np.ceil(76.8 / size)) + 1
-        layers = min(int((high - low) / size) + 1, 512)
-        taken = np.zeros(side * side * layers, dtype=np.bool_)
-        for coarser in (True, False):  # what coarser levels hold takes its voxels first
-            for i in range(n):
-                if (out[i] < level) != coarser:
-                    continue
-                x = min(max(int(points[i, 0] / size), 0), side - 1)
-                y = min(max(int(points[i, 1] / size), 0), side - 1)
-                z = min(int((points[i, 2] - low) / size), layers - 1)
-                voxel = (z * side + y) * side + x
-                if not coarser and not taken[voxel]:
-                    out[i] = level
-                taken[voxel] = True
+def _levels(points: F32, low: float, sizes: F64, sides: I64, layers: I64) -> U8:
+    """(n,) level of each point: the coarsest in whose voxel no point came before.
+
+    Voxels of a level lie whole in those of the coarser one, so that whoever takes a voxel takes all that hold it.
+    """
+    first = np.zeros(len(sizes) + 1, dtype=np.int64)
+    for k in range(len(sizes)):
+        first[k + 1] = first[k] + sides[k] * sides[k] * layers[k]
+    taken = np.zeros(first[-1], dtype=np.bool_)
+    out = np.full(len(points), len(sizes), dtype=np.uint8)
+    for i in range(len(points)):
+        x, y, z = points[i, 0], points[i, 1], points[i, 2] - low
+        for k in range(len(sizes) - 1, -1, -1):
+            col = min(max(int(x / sizes[k]), 0), sides[k] - 1)
+            row = min(max(int(y / sizes[k]), 0), sides[k] - 1)
+            voxel = first[k] + (min(int(z / sizes[k]), layers[k] - 1) * sides[k] + row) * sides[k] + col
+            if taken[voxel]:
+                break
+            taken[voxel] = True
+            out[i] = k
+    return out
+
+
+@numba.njit(cache=True, nogil=True)
+def _pack(points: F32, ground_z: F32, elsewhere: float, z0: float, step: float) -> U16:
+    """(n, 4), see :class:`Levels`. ``elsewhere``: the ground where a cell knows none."""
+    out = np.empty((len(points), 4), dtype=np.uint16)
+    for i in range(len(points)):
+        x, y, z = points[i, 0], points[i, 1], points[i, 2]
+        row = min(max(int(y / CELL_SIZE), 0), TILE_CELLS - 1)
+        col = min(max(int(x / CELL_SIZE), 0), TILE_CELLS - 1)
+        ground = float(ground_z[row, col])
+        if not np.isfinite(ground):
+            ground = elsewhere
+        out[i, 0] = min(max(round(x * (_STEPS / SIDE_M)), 0), _STEPS)
+        out[i, 1] = min(max(round(y * (_STEPS / SIDE_M)), 0), _STEPS)
+        out[i, 2] = round((z - z0) / step)
+        out[i, 3] = min(max(round((z - ground + ABOVE_OFFSET_M) * 100), 0), _STEPS)
     return out
