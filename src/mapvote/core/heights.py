@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from mapvote.core.point_map import PointMap
-from mapvote.core.types import F64
+from mapvote.core.types import F64, I64
 
 LEVEL_M = 0.3
 """Path and ground that disagree by more are two levels, or one of them is wrong."""
@@ -83,13 +83,17 @@ def two_levels(path: F64) -> tuple[float, float, float] | None:
 
     Positions in order of driving, drives one after another, heights of the road and not of sensors.
     """
-    pairs = cKDTree(path[:, :2]).query_pairs(_BESIDE_M, output_type="ndarray")
-    pairs = pairs[np.abs(pairs[:, 0] - pairs[:, 1]) > _STEPS]
+    pairs = crossings(path)
     if len(pairs) == 0:
         return None
     apart = np.abs(path[pairs[:, 0], 2] - path[pairs[:, 1], 2])
     worst = int(np.argmax(apart))
-    if apart[worst] <= LEVEL_M:
-        return None
     x, y = path[pairs[worst, 0], :2]
     return float(x), float(y), float(apart[worst])
+
+
+def crossings(path: F64) -> I64:
+    """(k, 2) indices of road positions (n, 3) of which one runs above the other."""
+    pairs = cKDTree(path[:, :2]).query_pairs(_BESIDE_M, output_type="ndarray")
+    pairs = pairs[np.abs(pairs[:, 0] - pairs[:, 1]) > _STEPS]
+    return np.asarray(pairs[np.abs(path[pairs[:, 0], 2] - path[pairs[:, 1], 2]) > LEVEL_M], dtype=np.int64)

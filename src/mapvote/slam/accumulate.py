@@ -29,6 +29,7 @@ from mapvote.localisation.localiser import GivenPoses
 from mapvote.perception.frontend import Frontend, Observation, PlacedScan
 from mapvote.perception.moving_objects import MovingFilter
 from mapvote.perception.raycast import find_obstacles
+from mapvote.slam.mirrored import mirrored
 
 ROAD_M = 0.1
 """Points this low above the ground are the road itself, also under a car."""
@@ -69,7 +70,8 @@ class Layer:
         points, _ = self.cloud.points()
         points = points[~self._trails(points, self.draft)]
         # Trails lift the draft's ground; above the true one stand the undersides of cars that had passed for ground.
-        points = points[~self._trails(points, map_from_points(points, lattice=self.draft.lattice, road=self.road))]
+        laid = map_from_points(points, lattice=self.draft.lattice, road=self.road)
+        points = points[~(self._trails(points, laid) | mirrored(points, laid, self.road))]
         point_map = map_from_points(points, lattice=self.draft.lattice, road=self.road)
         tiles = {tile: replace(content, free=self._free(tile, point_map)) for tile, content in point_map.tiles.items()}
         return replace(point_map, tiles=tiles)
