@@ -49,6 +49,14 @@ def test_a_drive_with_coarse_priors_is_followed_within_centimetres(tracker: Trac
         assert np.degrees(rotation_angle(inverse(POSES[i]) @ fix.registration.T_map_lidar)) < 0.15
 
 
+@pytest.mark.parametrize("metres", [-9.0, -5.0, 4.0, 9.0])
+def test_a_prior_metres_too_high_or_low_still_finds_the_road(tracker: Tracker, metres: float) -> None:
+    for i in range(3):
+        fix = tracker.localise(scan(i), prior(i, 1.0, -1.0, metres, sigma_m=2.5))
+        assert fix.trusted
+        assert off(fix.registration.T_map_lidar, i) < 0.04
+
+
 def test_the_first_pose_is_prior_enough(tracker: Tracker) -> None:
     for i in range(len(POSES)):
         fix = tracker.localise(scan(i), prior(0, 0.5, -0.5, 0.0) if i == 0 else None)

@@ -26,7 +26,8 @@ def road(y: float, z: float = 0.0) -> F64:
 def left_out(cloud: F64, driven: F64, asked: F64) -> list[bool]:
     """Which of the points ``asked`` are taken for reflections in a map of ``cloud`` and them."""
     points = np.vstack([cloud, asked])
-    return mirrored(points, map_from_points(points, lattice=LATTICE, road=driven), driven)[len(cloud) :].tolist()
+    out = mirrored(points, map_from_points(points, lattice=LATTICE, road=driven), driven)
+    return [bool(left) for left in out[len(cloud) :]]
 
 
 def test_points_metres_below_the_road_are_reflections_and_the_road_is_none() -> None:

@@ -30,6 +30,8 @@ _ROUNDS = 2
 """How often a scan is de-skewed anew with the motion just found, while that still changes."""
 _SPEEDS_MPS = np.arange(-2.5, 32.6, 2.5)
 """Forward speeds tried on a first scan."""
+_FAR_BETTER = 1.2
+"""What another height must fit better by before the prior's is given up."""
 TWIST_AGE_S = 1.0
 """Two poses farther apart in time than this say little about the present velocity."""
 
@@ -94,6 +96,8 @@ class Tracker:
         """
         seed, reach = self._seed(scan.stamp_ns, prior)
         ndt_map = self.map_around(seed[:3, 3])
+        if reach >= self.settings.hypothesis_step_m:
+            seed = self._levelled(ndt_map, scan, seed)
         twist = self.twist if self._knows_motion(scan) else self.guess_motion(ndt_map, scan, seed, prior)
         first_level = 0 if self.last_pose is None or reach > 0.5 * self.settings.hypothesis_step_m else 1
         result = refine(ndt_map, self._clouds(scan, twist), seed, prior, first_level)
@@ -150,6 +154,16 @@ class Tracker:
         if prior is None:
             return np.eye(4), self.settings.hypothesis_reach_m
         return prior.T_map_lidar, 2.0 * prior.sigma_m
+
+    def _levelled(self, ndt_map: NdtMap, scan: Scan, seed: F64) -> F64:
+        """The seed at the height at which the scan fits far better: satellites know heights worst, and NDT finds no
+        road that lies metres from the scan's own."""
+        sample = thin_for_levels(scan.points[thin(scan.points, self.settings.levels[0].points_m)], self.settings)[:1]
+        steps = np.arange(self.settings.hypothesis_step_m, self.settings.hypothesis_reach_m + 1e-6)
+        guesses = [seed, *(from_xyz_rpy(0.0, 0.0, z) @ seed for step in steps for z in (step, -step))]
+        fits = [fitness(ndt_map, sample, guess) for guess in guesses]
+        best = int(np.argmax(fits))
+        return guesses[best] if fits[best] > _FAR_BETTER * fits[0] else seed
 
     def move_to(self, T_map_lidar: F64, stamp_ns: int, twist: F64 | None = None, score: float = 0.0) -> None:
         """The vehicle was here then: the track goes on from this pose, with this motion or none known."""
