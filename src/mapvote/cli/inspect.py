@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from mapvote.cli.options import SERVER, StoreName
-from mapvote.cli.server import opened_store, when
+from mapvote.cli.store import opened_store, when
 from mapvote.cli.terminal import print_table, waiting
 
 

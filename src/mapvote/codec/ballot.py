@@ -121,6 +121,8 @@ def unpack_points(data: bytes) -> F32:
     points = np.frombuffer(raw, dtype="<f4").reshape(-1, 3)
     if not _all_inside(points, np.float32(TILE_CELLS * CELL_SIZE)):
         raise MapvoteError("ballot: new_points holds a point outside its tile or not finite")
+    if most_in_a_cell(points) > MAX_POINTS_PER_CELL:
+        raise MapvoteError(f"ballot: new_points holds more than {MAX_POINTS_PER_CELL} points in one cell")
     return points
 
 
@@ -139,6 +141,18 @@ def _all_inside(points: F32, side: np.float32) -> bool:
     for x, y, z in points:
         sound &= 0 <= x < side and 0 <= y < side and abs(z) <= 1e5
     return sound
+
+
+@numba.njit(cache=True, nogil=True)
+def most_in_a_cell(points: F32) -> int:
+    """The most of these points (m, 3), from the tile's corner and inside it, that lie in one cell."""
+    counts = np.zeros(TILE_CELLS * TILE_CELLS, dtype=np.int64)
+    most = 0
+    for x, y, _ in points:
+        cell = min(int(y / CELL_SIZE), TILE_CELLS - 1) * TILE_CELLS + min(int(x / CELL_SIZE), TILE_CELLS - 1)
+        counts[cell] += 1
+        most = max(most, counts[cell])
+    return most
 
 
 def encode(ballot: Ballot) -> bytes:
@@ -166,12 +180,14 @@ def decode(data: bytes) -> Ballot:
             raise MapvoteError(f"ballot: tile {tile.tile} has no base hash")
     if ballot.start_ns > ballot.end_ns:
         raise MapvoteError("ballot: ends before it starts; check the drive's clock")
-    if not math.isfinite(ballot.median_sigma_m):
-        raise MapvoteError("ballot: median_sigma_m is not finite")
-    for name in ("length_m", "prior_misfit_m", "prior_sigma_m"):
+    if ballot.scans_localised > ballot.scans:
+        raise MapvoteError(
+            f"ballot: {ballot.scans_localised} of {ballot.scans} scans were localised: more than there are"
+        )
+    for name in ("median_sigma_m", "length_m", "prior_misfit_m", "prior_sigma_m"):
         value = getattr(ballot, name)
         if value is not None and not 0.0 <= value < math.inf:
-            raise MapvoteError(f"ballot: {name} = {value} is not a distance")
+            raise MapvoteError(f"ballot: {name} = {value} is no distance")
     return ballot
 
 

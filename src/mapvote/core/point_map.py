@@ -34,6 +34,8 @@ class PointMap:
     """(n, 3) the sensor's positions along each drive that the map was made of, map metres; none where nobody knows."""
     version: int | None = None
     """How often the map was published; ballots name it. None: of a format that does not say."""
+    surveyed_ns: int | None = None
+    """When the last drive that the map was made of ended, since 1970; None where nobody knows."""
 
     def __repr__(self) -> str:
         points = sum(len(tile.points) for tile in self.tiles.values())

@@ -29,6 +29,9 @@ MOST_OFF = 0.3
 """Share of a path that may disagree with the ground by more than 0.3 m before the map is refused: below, it is a place
 (a bridge over another drive, a stretch without points); above, something is wrong with the drive."""
 
+_FIRST_DATE_NS = 946_684_800 * 10**9
+"""2000. Clocks that count from zero tell less."""
+
 
 @dataclass(frozen=True, slots=True)
 class Drift:
@@ -98,6 +101,7 @@ def build_map(
         layer.lay(drive, T_map_lidar, mask, count)
     driven = tuple(T[mask][:, :3, 3] for T, mask in zip(poses, registered, strict=True))
     point_map = replace(layer.finish(), driven=driven, georeference=dict(_place_on_earth(drives)))
+    point_map = replace(point_map, surveyed_ns=_last_stamp(drives))
     heights = [_agreed_heights(drive, point_map, path) for drive, path in zip(drives, driven, strict=True)]
     tracks = tuple(_track(*each) for each in zip(drives, poses, found, heights, settled.sigma_m, strict=True))
     held = any(is_precise(drive, settings.mapping) for drive in drives)
@@ -114,6 +118,12 @@ def _place_on_earth(drives: Sequence[Drive]) -> Mapping[str, str]:
             "in drive.toml"
         )
     return known[0] if known else {}
+
+
+def _last_stamp(drives: Sequence[Drive]) -> int | None:
+    """When the last drive ended; None if one has a clock that tells no date."""
+    ends = [int(drive.stamps_ns[-1]) for drive in drives]
+    return max(ends) if min(ends) > _FIRST_DATE_NS else None
 
 
 def _agreed_heights(drive: Drive, point_map: PointMap, positions: F64) -> Heights:

@@ -94,6 +94,7 @@ def test_the_first_schema_becomes_todays_without_loss(first_store: str) -> None:
     ((one, other),) = zip(before.pop("maps"), after.pop("maps"), strict=True)
     assert one.pop("method") == "columns, two-stage"
     assert len(other.pop("secret")) == 64
+    assert other.pop("surveyed_ns") is None
     assert one == other
     (logged,) = [event for event in after["events"] if event not in before["events"]]
     after["events"].remove(logged)

@@ -52,6 +52,8 @@ class Manifest(msgspec.Struct, frozen=True, kw_only=True):
     """Positions of the sensor along each drive, (n, 3) float64, zstd."""
     version: int = 1
     """How often the map was published: ballots name it."""
+    surveyed_ns: int | None = None
+    """When the last drive that it was made of ended."""
 
 
 def is_map_folder(path: Path) -> bool:
@@ -90,6 +92,7 @@ def write_map_folder(point_map: PointMap, path: Path) -> None:
             tiles=entries,
             driven=[pack_plane(path) for path in point_map.driven],
             version=point_map.version or 1,
+            surveyed_ns=point_map.surveyed_ns,
         )
         (folder / MANIFEST).write_bytes(msgspec.json.format(msgspec.json.encode(manifest), indent=1) + b"\n")
 
@@ -134,7 +137,8 @@ def read_map_folder(path: Path) -> PointMap:
             )
         tiles[entry.tile] = tile
     driven = tuple(_positions(data, path) for data in manifest.driven)
-    return PointMap(manifest.map_id, lattice, tiles, manifest.georeference, driven, manifest.version)
+    versioned = manifest.version, manifest.surveyed_ns
+    return PointMap(manifest.map_id, lattice, tiles, manifest.georeference, driven, *versioned)
 
 
 def _positions(data: bytes, path: Path) -> F64:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import partial
 from typing import NamedTuple
 
 import sqlalchemy as sa
@@ -13,7 +15,6 @@ from mapvote.core.grid import TileIndex
 from mapvote.core.types import MapvoteError
 from mapvote.fusion.fuse import rule_of
 from mapvote.fusion.offline import staged, tile_vote
-from mapvote.fusion.tile_vote import DAY_NS
 from mapvote.server.errors import Conflict, Unauthorised
 from mapvote.server.store import keys, schema
 from mapvote.server.store.ballots import Incoming, Receipt, put_in, unlike
@@ -21,11 +22,11 @@ from mapvote.server.store.blobs import TileHashes
 from mapvote.server.store.policy import policy_in
 from mapvote.server.store.queries import current_number, load_memory, memory_of, names, tile_of, tiles_of
 from mapvote.server.store.quotas import Quota, Quotas
-from mapvote.server.store.reach import refuse_out_of_reach
+from mapvote.server.store.reach import LowestGround, refuse_out_of_height, refuse_out_of_reach
 from mapvote.server.store.store import Store
 from mapvote.server.store.version_driven import NO_SUCH_BASE, version_driven
 
-MAX_CLOCK_AHEAD_NS = DAY_NS
+MAX_CLOCK_AHEAD_NS = 300 * 10**9
 """A drive may end this much after the server's own time: clocks differ, but a vehicle from the future would make all
 other votes look old."""
 MAX_UNPACKED_BYTES = 512 << 20
@@ -87,6 +88,7 @@ class Intake:
         self._store = store
         self._quotas = None if quota is None else Quotas(quota)
         self._current: tuple[int, Mapping[TileIndex, TileHashes]] = (0, {})
+        self._lowest = LowestGround()
 
     def look_at(self, received: Sequence[Sent]) -> list[Incoming | Exception]:
         """Everything but writing: each ballot, or why it is refused. Unavailable is raised for all.
@@ -143,11 +145,10 @@ class Intake:
         current = self._current[1]
         if ballot.map_id != self._store.map_id:
             return Conflict(f"this server keeps map {self._store.map_id!r}, the ballot votes on {ballot.map_id!r}")
-        if ballot.end_ns > self._store.clock() + MAX_CLOCK_AHEAD_NS:
-            return MapvoteError("ballot: the drive ends in the future; set the vehicle's clock")
-        out_of_reach = refuse_out_of_reach(ballot, current.keys())
-        if out_of_reach is not None:
-            return out_of_reach
+        impossible = self._wrong_time(ballot) or refuse_out_of_reach(ballot, current.keys())
+        impossible = impossible or refuse_out_of_height(ballot, current, partial(self._lowest.look_up, connection))
+        if impossible is not None:
+            return impossible
         version = version_driven(connection, ballot, self._heard_at(connection, ballot))
         if version is None:
             return Conflict(NO_SUCH_BASE)
@@ -166,6 +167,13 @@ class Intake:
             return Conflict(
                 f"every cell voted on has changed since version {version}: fetch tiles {stale} and vote again"
             )
+        return None
+
+    def _wrong_time(self, ballot: Ballot) -> MapvoteError | None:
+        if ballot.end_ns > self._store.clock() + MAX_CLOCK_AHEAD_NS:
+            return MapvoteError("ballot: the drive ends in the future; set the vehicle's clock")
+        if self._store.surveyed_ns is not None and ballot.end_ns < self._store.surveyed_ns:
+            return MapvoteError("ballot: the drive ended before the map was surveyed; set the vehicle's clock")
         return None
 
     def _heard_at(self, connection: sa.Connection, ballot: Ballot) -> int | None:
@@ -190,7 +198,7 @@ def _sound(sent: Sent) -> Incoming | Exception:
     if (theirs.vehicle, theirs.drive) != (sent.vehicle, sent.drive):
         address = f"{sent.vehicle[:64]}/{sent.drive[:64]}"
         return MapvoteError(f"the ballot is of {theirs.vehicle}/{theirs.drive}, not {address}")
-    return incoming
+    return replace(incoming, key_hash=sent.key_hash)
 
 
 def _standing(connection: sa.Connection, ballots: Sequence[Incoming]) -> set[str]:

@@ -9,8 +9,9 @@ from typing import Any
 import sqlalchemy as sa
 
 from mapvote.codec.ballot import Ballot, BallotTile, tile_key
-from mapvote.server.errors import Conflict, NotFound
-from mapvote.server.store import schema
+from mapvote.core.types import MapvoteError
+from mapvote.server.errors import Conflict, NotFound, Unauthorised
+from mapvote.server.store import keys, schema
 from mapvote.server.store.database import insert_rows
 from mapvote.server.store.policy import RoundPolicy, policy_in
 from mapvote.server.store.quarantine import sum_of
@@ -29,6 +30,8 @@ class Incoming:
     """Method and stage: all ballots of a round agree on them."""
     size: int
     """Bytes."""
+    key_hash: str | None = None
+    """Of the key that it came with."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,8 +47,11 @@ class Receipt:
 
 
 def put_in(connection: sa.Connection, ballots: Sequence[Incoming], now: int) -> list[Receipt | Exception]:
-    """Write ballots within a transaction: a receipt each, or Conflict where one votes otherwise than the round."""
+    """Write ballots within a transaction: a receipt each, or Conflict where one votes otherwise than the round,
+    Unauthorised where its key was revoked since it was looked at."""
     b = schema.ballots
+    asked_keys = {incoming.key_hash for incoming in ballots if incoming.key_hash is not None}
+    valid = keys.of(connection, asked_keys, now)
     asked = policy_in(connection).round
     drives = sa.tuple_(b.c.vehicle, b.c.drive).in_({(i.ballot.vehicle, i.ballot.drive) for i in ballots})
     query = sa.select(b.c.vehicle, b.c.drive, b.c.seq, b.c.first_seq, b.c.gone_seq, b.c.digest).where(drives)
@@ -67,7 +73,10 @@ def put_in(connection: sa.Connection, ballots: Sequence[Incoming], now: int) -> 
         if old is not None and old[1] == incoming.digest:
             results.append(Receipt(*key, created=False, repeated=True, seq=old[0]))
             continue
-        if (why := unlike(asked, incoming)) is not None:
+        why = unlike(asked, incoming)
+        if incoming.key_hash is not None and incoming.key_hash not in valid:
+            why = Unauthorised(keys.UNKNOWN)
+        if why is not None:
             results.append(why)
             continue
         drove_with = version_driven(connection, ballot, first.get(key))
@@ -95,7 +104,7 @@ def put_in(connection: sa.Connection, ballots: Sequence[Incoming], now: int) -> 
     return results
 
 
-def unlike(asked: RoundPolicy, incoming: Incoming) -> Conflict | None:
+def unlike(asked: RoundPolicy, incoming: Incoming) -> MapvoteError | None:
     """Why a ballot does not fit the round that the policy asks for; None if it does."""
     settings = incoming.ballot.settings_hash
     if asked.cast_by == incoming.cast_by and settings.startswith(asked.settings_hash):

@@ -61,7 +61,7 @@ def unpack_tile(
     return Tile(
         window,
         points=unpack_points_plane(points, hashes.points),
-        ground_z=np.frombuffer(_unpack(ground, hashes.ground), dtype="<f4").reshape(window.shape),
+        ground_z=unpack_ground_plane(ground, hashes.ground),
         free=None
         if free is None or hashes.free is None
         else np.frombuffer(_unpack(free, hashes.free), dtype="<u8").reshape(window.shape),
@@ -72,6 +72,11 @@ def unpack_tile(
 def unpack_points_plane(data: bytes, digest: str) -> F32:
     """The points plane of a tile alone."""
     return np.frombuffer(_unpack(data, digest), dtype="<f4").reshape(-1, 3)
+
+
+def unpack_ground_plane(data: bytes, digest: str) -> F32:
+    """(256, 256) the ground plane of a tile alone."""
+    return np.frombuffer(_unpack(data, digest), dtype="<f4").reshape(TILE_CELLS, TILE_CELLS)
 
 
 def _unpack(data: bytes, digest: str) -> bytes:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
-import sqlalchemy as sa
 from sqlalchemy.exc import IntegrityError
 
 from mapvote.core.grid import TileIndex
@@ -13,7 +12,7 @@ from mapvote.server.errors import Conflict
 from mapvote.server.store import schema
 from mapvote.server.store.blobs import TileHashes
 from mapvote.server.store.quarantine import sum_of
-from mapvote.server.store.queries import Version, add_blobs, current_version, log_event, tile_row, version_row
+from mapvote.server.store.queries import Version, add_blobs, current_version, end_votes, log_event, tile_row, version_row
 from mapvote.server.store.store import Store
 from mapvote.server.store.tile_jobs import Fused
 
@@ -49,17 +48,12 @@ def write_version(store: Store, version: Version, new: NewTiles, unvoted: str | 
                     schema.decisions.insert(), [_decision_row(version.number, f) for f in new.fused if not f.lost]
                 )
             if unvoted is not None:
-                _take_out(connection, unvoted, seq)
+                end_votes(connection, unvoted, seq)
     except IntegrityError as error:
         raise Conflict(
             f"version {version.number} was published by somebody else meanwhile; look at it first"
         ) from error
     return version
-
-
-def _take_out(connection: sa.Connection, vehicle: str, seq: int) -> None:
-    b = schema.ballots
-    connection.execute(b.update().where(b.c.vehicle == vehicle, b.c.gone_seq.is_(None)).values(gone_seq=seq))
 
 
 def _decision_row(number: int, fused: Fused) -> dict[str, object]:

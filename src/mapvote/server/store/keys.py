@@ -16,7 +16,7 @@ from mapvote.core.types import MapvoteError
 from mapvote.fusion.tile_vote import DAY_NS
 from mapvote.server.errors import NotFound, Unauthorised
 from mapvote.server.store import schema
-from mapvote.server.store.queries import log_event
+from mapvote.server.store.queries import end_votes, log_event
 from mapvote.server.store.store import Store
 
 Role = Literal["vehicle", "reader", "reviewer", "operator"]
@@ -87,21 +87,27 @@ def rotate(store: Store, name: str, *, by: str = "operator", overlap_days: float
         return put_in(connection, now, name, last.role, by, days)  # type: ignore[arg-type]
 
 
-def revoke(store: Store, name: str, *, by: str = "operator") -> int:
-    """Revoke every key of a name; how many. NotFound if it has none that is valid."""
+def revoke(store: Store, name: str, *, by: str = "operator", keep_votes: bool = False) -> tuple[int, int]:
+    """Revoke every key of a name: (keys, ballots that count no more). NotFound if it has no valid key.
+
+    Who is trusted no longer was not to be trusted before: its standing ballots count no more, unless ``keep_votes``.
+    What was published of them stays (:func:`mapvote.server.store.replay.replay` takes that out too).
+    """
     with store.database.writing() as connection:
-        return revoke_in(connection, store.clock(), name, by)
+        return revoke_in(connection, store.clock(), name, by, keep_votes=keep_votes)
 
 
-def revoke_in(connection: sa.Connection, now: int, name: str, by: str) -> int:
+def revoke_in(
+    connection: sa.Connection, now: int, name: str, by: str, *, keep_votes: bool = False
+) -> tuple[int, int]:
     """As :func:`revoke`, within a transaction."""
     k = schema.keys
     valid = (k.c.name == name) & k.c.revoked_ns.is_(None) & (k.c.expires_ns.is_(None) | (k.c.expires_ns > now))
     done = connection.execute(k.update().where(valid).values(revoked_ns=now))
     if not done.rowcount:
         raise NotFound(f"{name!r} has no valid key")
-    log_event(connection, now, "key revoked", by, name)
-    return int(done.rowcount)
+    seq = log_event(connection, now, "key revoked", by, f"{name}, its votes {'stay' if keep_votes else 'go'}")
+    return int(done.rowcount), 0 if keep_votes else end_votes(connection, name, seq)
 
 
 def listed(store: Store) -> list[Key]:

@@ -110,6 +110,13 @@ def log_event(connection: sa.Connection, at_ns: int, kind: str, actor: str, deta
     return seq
 
 
+def end_votes(connection: sa.Connection, vehicle: str, seq: int) -> int:
+    """A vehicle's standing ballots count no more, by the event ``seq``; how many. What versions made of them stays."""
+    b = schema.ballots
+    standing = b.update().where(b.c.vehicle == vehicle, b.c.gone_seq.is_(None))
+    return int(connection.execute(standing.values(gone_seq=seq)).rowcount)
+
+
 def next_seq(connection: sa.Connection) -> int:
     """The number of the next event: safe, because writers take turns."""
     return int(connection.execute(sa.select(sa.func.max(schema.events.c.seq))).scalar_one() or 0) + 1
@@ -169,6 +176,8 @@ class Version:
     mark: int
     """The last event that the version knew of."""
     policy: Mapping[str, Any]
+    cleared_seq: int | None = None
+    """The event by which its planes were cleared away; None: it is there."""
 
 
 _ONE_BY_ONE = 200

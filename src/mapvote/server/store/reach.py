@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Mapping
 
 import numpy as np
+import sqlalchemy as sa
 
-from mapvote.codec.ballot import Ballot, BallotTile, tile_key
+from mapvote.codec.ballot import Ballot, BallotTile, tile_key, unpack_points
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, TileIndex
 from mapvote.core.types import F64, Bool, MapvoteError
 from mapvote.fusion.offline import tile_vote
+from mapvote.server.store.blobs import TileHashes, unpack_ground_plane
+from mapvote.server.store.queries import load_blob
 
+MAX_BELOW_M, MAX_ABOVE_M = 10.0, 120.0
+"""New points lie between so much below and so much above the lowest ground of the map around them."""
 MAX_REACH_M = 200.0
 """Twice what a LiDAR sees: a vote farther from the map than this cannot come from a vehicle that localised in it."""
 _TILE_M = TILE_CELLS * CELL_SIZE
@@ -32,6 +37,47 @@ def refuse_out_of_reach(ballot: Ballot, map_tiles: Collection[TileIndex]) -> Map
         first, other = (tile_key(index) for index in apart)
         why = f"tiles {first} and {other} lie on ways more than {MAX_REACH_M:.0f} m apart"
         return MapvoteError(f"{why}: a drive is one way; send each part as a drive of its own")
+    return None
+
+
+class LowestGround:
+    """How deep the ground of each tile lies, by its plane's hash: looked up in the store once. For any threads."""
+
+    def __init__(self) -> None:
+        self._known: dict[str, float] = {}
+
+    def look_up(self, connection: sa.Connection, ground: str) -> float:
+        """Map metres; inf where the ground is unknown, or its plane damaged."""
+        if ground not in self._known:
+            try:
+                plane = unpack_ground_plane(load_blob(connection, ground), ground)
+            except MapvoteError:
+                return np.inf
+            known = plane[np.isfinite(plane)]
+            self._known[ground] = float(known.min()) if len(known) else np.inf
+        return self._known[ground]
+
+
+def refuse_out_of_height(
+    ballot: Ballot, map_tiles: Mapping[TileIndex, TileHashes], lowest_m: Callable[[str], float]
+) -> MapvoteError | None:
+    """Why a ballot brings points deeper or higher than anything on this map can be; None if it may.
+
+    ``lowest_m``: of a ground plane by its hash. The nearest tiles tell: itself and its neighbours, else those in reach.
+    """
+    for tile in ballot.tiles:
+        heights = () if tile.new_points is None else unpack_points(tile.new_points)[:, 2]
+        if not len(heights):
+            continue
+        near = [index for index in _around(tile.tile) if index in map_tiles]
+        touching = [index for index in near if max(abs(index[0] - tile.tile[0]), abs(index[1] - tile.tile[1])) <= 1]
+        lowest = min((lowest_m(map_tiles[index].ground) for index in touching or near), default=np.inf)
+        if np.isfinite(lowest) and not lowest - MAX_BELOW_M <= min(heights) <= max(heights) <= lowest + MAX_ABOVE_M:
+            span = f"{min(heights):.1f} to {max(heights):.1f} m on tile {tile_key(tile.tile)}"
+            allowed = (
+                f"{MAX_BELOW_M:g} m below to {MAX_ABOVE_M:g} m above the map's lowest ground there, {lowest:.1f} m"
+            )
+            return MapvoteError(f"new points at {span} are not within {allowed}: is the vehicle on this level?")
     return None
 
 

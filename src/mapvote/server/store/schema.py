@@ -26,8 +26,10 @@ maps = sa.Table(
     sa.Column("y0", sa.Double, nullable=False),
     sa.Column("georeference", sa.JSON, nullable=False),
     sa.Column("secret", sa.String(64), nullable=False),
+    sa.Column("surveyed_ns", sa.BigInteger),
 )
-"""``secret``: what vehicles' pseudonyms are made with; it never leaves the store."""
+"""``secret``: what vehicles' pseudonyms are made with; it never leaves the store. ``surveyed_ns``: when the last drive
+that the first version was made of ended; null where nobody knows."""
 
 policies = sa.Table(
     "policies",
@@ -81,8 +83,10 @@ versions = sa.Table(
     sa.Column("reason", sa.String(400), nullable=False),
     sa.Column("mark", sa.BigInteger, nullable=False),
     sa.Column("policy", sa.JSON, nullable=False),
+    sa.Column("cleared_seq", sa.BigInteger),
 )
-"""``mark``: the last event that the version knew of. ``target``: the version that a rollback or replay starts from."""
+"""``mark``: the last event that the version knew of. ``target``: the version that a rollback or replay starts from.
+``cleared_seq``: the event by which its planes and decisions were cleared away; what is left is that it was."""
 
 version_tiles = sa.Table(
     "version_tiles",

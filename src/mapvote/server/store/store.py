@@ -12,8 +12,9 @@ from __future__ import annotations
 import secrets
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import sqlalchemy as sa
 
@@ -90,6 +91,7 @@ class Store:
         self.map_id: str = row.map_id
         self.lattice = Lattice(row.x0, row.y0)
         self.georeference: Mapping[str, str] = row.georeference
+        self.surveyed_ns: int | None = row.surveyed_ns
 
     @classmethod
     def create(
@@ -114,8 +116,9 @@ class Store:
                 migrate.check(connection)
                 if connection.execute(sa.select(schema.maps.c.map_id)).first() is not None:
                     raise MapvoteError(f"{database.url.render_as_string()}: holds a map already; open it instead")
-                origin = {"x0": point_map.lattice.x0, "y0": point_map.lattice.y0}
+                origin: dict[str, Any] = {"x0": point_map.lattice.x0, "y0": point_map.lattice.y0}
                 about = {"georeference": dict(point_map.georeference), "secret": secrets.token_hex(32)}
+                origin |= {"surveyed_ns": point_map.surveyed_ns}
                 connection.execute(schema.maps.insert().values(map_id=point_map.map_id, **about, **origin))
                 now = clock()
                 mark = log_event(connection, now, "import", by, point_map.map_id)
@@ -194,4 +197,5 @@ class Store:
                 index: load_tile(connection, self.lattice.tile(index), hashes)
                 for index, hashes in tiles_of(connection, number).items()
             }
-        return PointMap(self.map_id, self.lattice, tiles, self.georeference, version=number)
+        dated = {"version": number, "surveyed_ns": self.surveyed_ns}
+        return replace(PointMap(self.map_id, self.lattice, tiles, self.georeference), **dated)
