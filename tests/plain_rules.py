@@ -241,7 +241,11 @@ def decide_cell(
     """One cell: one vote a vehicle, its latest drive that says anything; then delete, add, remember."""
     says = {vehicle: drives[-1].says[cell] for vehicle, drives in heard.items()}
     state = decide([s.state for s in says.values()], settings.min_votes)
+    said = [(drives[-1].end_s, drives[-1].says[cell].state) for drives in heard.values()]
+    state = state if state in (CO, CE) else turn(said, settings.min_votes) or state
     if state == CO and is_temporary(held, recent, cell, settings):
+        state = UN
+    if (state == CO or (state == CE and held.came_s)) and last_word(heard, cell) != state:
         state = UN
     heights = held.heights
     if state in (CE, UO):
@@ -272,6 +276,25 @@ def decide(votes: list[int], min_votes: int) -> int:
     if state in (CO, CE) and (2 * best <= sum(counts) or best < min_votes):
         return UN
     return state
+
+
+def turn(said: list[tuple[int, int]], min_votes: int) -> int | None:
+    """Until some moment all say that nothing changed, and since then more than the quorum, and all, that it did."""
+    for before, after in ((UO, CE), (UE, CO)):
+        then = [end_s for end_s, state in said if state == before]
+        since = [end_s for end_s, state in said if state == after]
+        everyone = len(then) + len(since) == sum(state != UN for _, state in said)
+        if everyone and len(since) > min_votes and max(then, default=0) < min(since):
+            return after
+    return None
+
+
+def last_word(heard: dict[str, list[Cast]], cell: Cell) -> int:
+    """What the last drive says that determined the cell."""
+    determined = [
+        (c.end_s, c.says[cell].state) for drives in heard.values() for c in drives if c.says[cell].state != UN
+    ]
+    return max(determined)[1]
 
 
 def goes(layer: int, state: int, says: dict[str, Spoken], settings: FuseSettings) -> bool:

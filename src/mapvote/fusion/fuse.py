@@ -20,12 +20,15 @@ from mapvote.core.types import F32, I32, I64, N_STATES, NO_VOTE, U8, U64, Bool, 
 from mapvote.core.voting import VOTE_UNIT, add_states, add_tally, decide_cells
 from mapvote.fusion.edit import add_points, delete_points
 from mapvote.fusion.outliers import ASKED, contradicting, denying
-from mapvote.fusion.persistence import doubtful, remembered, temporary
+from mapvote.fusion.persistence import denied_last, doubtful, remembered, temporary
 from mapvote.fusion.sparse_columns import Words, at_least, counted, packed
 from mapvote.fusion.spent import changed_in
 from mapvote.fusion.tile_vote import TileVote, one_each
+from mapvote.fusion.turning import turned
 
 Rule = Literal["paper", "columns"]
+History = Callable[[], Sequence[TileVote]]
+"""Gives the votes of a tile over a longer time."""
 _BATCH = 32
 """Votes counted in one call: their states are copied side by side, into no more than stays in the cache."""
 
@@ -95,7 +98,7 @@ def fuse_tile(
     rule: Rule,
     settings: FuseSettings,
     version: int = 0,
-    history: Callable[[], Sequence[TileVote]] | None = None,
+    history: History | None = None,
 ) -> tuple[Decision, Tile]:
     """Decide one tile and edit it. A tile that does not change is returned as the same object. Where the map has no
     tile, give :meth:`mapvote.core.tile.Tile.empty`.
@@ -105,14 +108,26 @@ def fuse_tile(
     asked, where something comes and goes, for all votes that count of the last ``stay_days``; without it everything new
     is there to stay.
     """
+    drives = list(drives)
     votes, states, tally, quorum = hear(one_each(drives, tile.window), rule, settings)
-    if history is not None and doubtful(states, tile.memory, settings).any():
-        states = np.where(temporary(states, tile, history(), settings), np.uint8(CellState.UNDETERMINED), states)
+    if all(vote.states is not None for vote in votes):
+        names = {vote.vehicle for vote in votes}
+        heard = [drive for drive in drives if drive.vehicle in names]
+        states = turned(states, heard, tally, quorum) if rule == "columns" else states
+        states = states if history is None else _what_stays(states, tile, heard, settings, history)
     edited, added, deleted = _edit(tile, votes, states, quorum)
     if edited is not tile:
         memory = changed_in(version, tile, edited)
         edited = replace(edited, memory=remembered(memory, tile, edited, votes, states))
     return Decision(states, tally, len(votes), added, deleted), edited
+
+
+def _what_stays(states: U8, tile: Tile, heard: Sequence[TileVote], settings: FuseSettings, history: History) -> U8:
+    """(256, 256) states without the changes that must wait: what may be gone again, or comes and goes."""
+    waits = denied_last(states, tile.memory, heard)
+    if doubtful(states, tile.memory, settings).any():
+        waits |= temporary(states, tile, history(), settings)
+    return np.where(waits, np.uint8(CellState.UNDETERMINED), states)
 
 
 def _edit(tile: Tile, votes: Sequence[TileVote], states: U8, quorum: int) -> tuple[Tile, int, int]:

@@ -6,6 +6,10 @@ feature-based mapping in semi-static environments", 2016), of which one expects 
 expected to stay (prior + all past stays + its own age) / (1 + number of past stays). Below ``stay_days`` it is
 *temporary* and stays out of the map. What the map holds falls by its own rule: that it stood for a year says nothing
 against a quorum that sees through it.
+
+Where things come and go, the last who looked has the last word: two vehicles saw a car that had left before the third
+passed, so it waits, for the fourth. That is said of what is new, and of what vehicles brought; what was surveyed falls
+by a quorum alone, so that nobody who denies it can hold it up.
 """
 
 from __future__ import annotations
@@ -20,9 +24,11 @@ from mapvote.core.memory import Memory
 from mapvote.core.tile import Tile
 from mapvote.core.types import F64, U8, Bool, CellState
 from mapvote.fusion.tile_vote import TileVote
+from mapvote.fusion.turning import in_order
 
 DAY_S = 86_400
 _CO, _UE, _CE = int(CellState.CHANGED_OCCUPIED), int(CellState.UNCHANGED_EMPTY), int(CellState.CHANGED_EMPTY)
+_UN = int(CellState.UNDETERMINED)
 
 
 def expected_days(memory: Memory | None, cells: Bool, age_days: F64 | float, settings: FuseSettings) -> F64:
@@ -70,6 +76,21 @@ def temporary(states: U8, tile: Tile, drives: Sequence[TileVote], settings: Fuse
         stays = (age >= settings.stay_days) | (expected_days(tile.memory, cells, age, settings) >= settings.stay_days)
         cells[cells] = ~stays
     return cells
+
+
+def denied_last(states: U8, memory: Memory | None, drives: Sequence[TileVote]) -> Bool:
+    """(256, 256) cells of which something new, or the end of what vehicles brought, is decided, though the last of
+    ``drives`` that determined them says otherwise."""
+    brought = np.zeros(states.shape, dtype=np.bool_) if memory is None else memory.came_s > 0
+    out = np.asarray((states == _CO) | ((states == _CE) & brought))
+    cells = np.flatnonzero(out)
+    if len(cells):
+        said = in_order(drives, cells)[0]
+        determined = said < _UN
+        newest = len(said) - 1 - np.argmax(determined[::-1], axis=0)
+        last = said[newest, np.arange(len(cells))]
+        out.reshape(-1)[cells] = determined.any(axis=0) & (last != states.reshape(-1)[cells])
+    return out
 
 
 def remembered(memory: Memory, before: Tile, after: Tile, votes: Sequence[TileVote], states: U8) -> Memory:

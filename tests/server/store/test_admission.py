@@ -51,7 +51,7 @@ def test_more_localised_scans_than_there_were_are_a_lie() -> None:
 
 @pytest.mark.parametrize("sigma_m", [-0.01, float("nan"), float("inf")])
 def test_a_sigma_is_a_distance(sigma_m: float) -> None:
-    with pytest.raises(MapvoteError, match="median_sigma_m = .* is no distance"):
+    with pytest.raises(MapvoteError, match=r"median_sigma_m = .* is no distance"):
         examine(encode(ballot(median_sigma_m=sigma_m)))
 
 

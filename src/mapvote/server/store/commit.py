@@ -12,7 +12,15 @@ from mapvote.server.errors import Conflict
 from mapvote.server.store import schema
 from mapvote.server.store.blobs import TileHashes
 from mapvote.server.store.quarantine import sum_of
-from mapvote.server.store.queries import Version, add_blobs, current_version, end_votes, log_event, tile_row, version_row
+from mapvote.server.store.queries import (
+    Version,
+    add_blobs,
+    current_version,
+    end_votes,
+    log_event,
+    tile_row,
+    version_row,
+)
 from mapvote.server.store.store import Store
 from mapvote.server.store.tile_jobs import Fused
 

@@ -97,9 +97,7 @@ def revoke(store: Store, name: str, *, by: str = "operator", keep_votes: bool = 
         return revoke_in(connection, store.clock(), name, by, keep_votes=keep_votes)
 
 
-def revoke_in(
-    connection: sa.Connection, now: int, name: str, by: str, *, keep_votes: bool = False
-) -> tuple[int, int]:
+def revoke_in(connection: sa.Connection, now: int, name: str, by: str, *, keep_votes: bool = False) -> tuple[int, int]:
     """As :func:`revoke`, within a transaction."""
     k = schema.keys
     valid = (k.c.name == name) & k.c.revoked_ns.is_(None) & (k.c.expires_ns.is_(None) | (k.c.expires_ns > now))
