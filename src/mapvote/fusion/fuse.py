@@ -92,6 +92,22 @@ def _states_of(votes: Sequence[TileVote], cells: slice | NDArray[np.intp] = slic
     return np.stack(planes) if planes else np.empty((0, CELLS), dtype=np.uint8)[:, cells]
 
 
+@dataclass(frozen=True, slots=True)
+class Heard:
+    """What comes of the votes on a tile, before it is edited."""
+
+    votes: Sequence[TileVote]
+    """Those that are heard, one a vehicle."""
+    states: U8
+    """(256, 256) CellState or NO_VOTE."""
+    tally: NDArray[Any]
+    quorum: int
+    denied: Bool | None = None
+    """Changes that wait because the last vehicle that looked says otherwise."""
+    passing: Bool | None = None
+    """New things that stay out because they come and go."""
+
+
 def fuse_tile(
     tile: Tile,
     drives: Iterable[TileVote],
@@ -101,33 +117,40 @@ def fuse_tile(
     history: History | None = None,
 ) -> tuple[Decision, Tile]:
     """Decide one tile and edit it. A tile that does not change is returned as the same object. Where the map has no
-    tile, give :meth:`mapvote.core.tile.Tile.empty`.
+    tile, give :meth:`mapvote.core.tile.Tile.empty`. ``version``: of the map that this makes; the edited tile remembers
+    it. The rest as in :func:`decide_tile`.
+    """
+    heard = decide_tile(tile, drives, rule, settings, history)
+    edited, added, deleted = _edit(tile, heard.votes, heard.states, heard.quorum)
+    if edited is not tile:
+        memory = changed_in(version, tile, edited)
+        edited = replace(edited, memory=remembered(memory, tile, edited, heard.votes, heard.states))
+    return Decision(heard.states, heard.tally, len(heard.votes), added, deleted), edited
+
+
+def decide_tile(
+    tile: Tile, drives: Iterable[TileVote], rule: Rule, settings: FuseSettings, history: History | None = None
+) -> Heard:
+    """What the votes decide: counted, then in the order of time.
 
     ``drives`` are the votes that count on this tile (``select`` in fusion/tile_vote.py, ``unspent`` in
-    fusion/spent.py), any order. ``version``: of the map that this makes; the edited tile remembers it. ``history``:
-    asked, where something comes and goes, for all votes that count of the last ``stay_days``; without it everything new
-    is there to stay.
+    fusion/spent.py), any order. ``history``: asked, where something comes and goes, for all votes that count of the
+    last ``stay_days``; without it all is of one moment, and everything new is there to stay.
     """
     drives = list(drives)
     votes, states, tally, quorum = hear(one_each(drives, tile.window), rule, settings)
-    if all(vote.states is not None for vote in votes):
-        names = {vote.vehicle for vote in votes}
-        heard = [drive for drive in drives if drive.vehicle in names]
-        states = turned(states, heard, tally, quorum) if rule == "columns" else states
-        states = states if history is None else _what_stays(states, tile, heard, settings, history)
-    edited, added, deleted = _edit(tile, votes, states, quorum)
-    if edited is not tile:
-        memory = changed_in(version, tile, edited)
-        edited = replace(edited, memory=remembered(memory, tile, edited, votes, states))
-    return Decision(states, tally, len(votes), added, deleted), edited
-
-
-def _what_stays(states: U8, tile: Tile, heard: Sequence[TileVote], settings: FuseSettings, history: History) -> U8:
-    """(256, 256) states without the changes that must wait: what may be gone again, or comes and goes."""
-    waits = denied_last(states, tile.memory, heard)
-    if doubtful(states, tile.memory, settings).any():
-        waits |= temporary(states, tile, history(), settings)
-    return np.where(waits, np.uint8(CellState.UNDETERMINED), states)
+    if any(vote.states is None for vote in votes):
+        return Heard(votes, states, tally, quorum)
+    names = {vote.vehicle for vote in votes}
+    spoken = [drive for drive in drives if drive.vehicle in names]
+    states = turned(states, spoken, tally, quorum) if rule == "columns" else states
+    if history is None:
+        return Heard(votes, states, tally, quorum)
+    denied = denied_last(states, tile.memory, spoken)
+    doubt = doubtful(states, tile.memory, settings).any()
+    passing = temporary(states, tile, history(), settings) if doubt else np.zeros_like(denied)
+    states = np.where(denied | passing, np.uint8(CellState.UNDETERMINED), states)
+    return Heard(votes, states, tally, quorum, denied, passing)
 
 
 def _edit(tile: Tile, votes: Sequence[TileVote], states: U8, quorum: int) -> tuple[Tile, int, int]:

@@ -16,6 +16,7 @@ from mapvote.core.types import CellState
 from mapvote.server.http.app import create_app
 from mapvote.server.store import keys, policy
 from mapvote.server.store.admission import accept, examine
+from mapvote.server.store.publish import make_plan
 from mapvote.server.store.store import Store
 
 WALL = [(10, 10), (10, 11), (10, 12)]
@@ -84,6 +85,21 @@ def test_what_is_held_waits_for_all_votes_until_it_is_let_go(server: Server) -> 
     assert (waiting["id"], waiting["properties"]["verdict"]["by"]) == (f"verdict.{seq}", "anna")
     assert client.delete(f"/v1/desk/reviews/{seq}", headers=who["bert"]).status_code == 200
     assert published(server)["points_deleted"] == 9, "no new vote was needed"
+
+
+def test_a_verdict_alone_makes_its_tile_one_to_decide_again(server: Server) -> None:
+    """Nothing else happened there since it was last decided: no ballot, no version."""
+    client, store, who = server
+    first, _ = pending(server)
+    seq = decide(server, "anna", first["id"], "held").json()["seq"]
+    assert published(server)["tiles"] == ["0,1"]
+    assert [task.window.tile_index for task in make_plan(store).tasks] == [(0, 1)], "what the newest version changed"
+    assert client.delete(f"/v1/desk/reviews/{seq}", headers=who["anna"]).status_code == 200
+    assert [task.window.tile_index for task in make_plan(store).tasks] == [(0, 0), (0, 1)]
+    (again,) = pending(server)
+    assert decide(server, "bert", again["id"], "rejected").status_code == 200
+    assert published(server)["published"] is False
+    assert published(server)["published"] is False, "and it stays so"
 
 
 def test_of_two_reviewers_at_once_one_wins_and_the_other_is_told_by_whom(server: Server) -> None:

@@ -119,11 +119,13 @@ def cell(request: Request, x: float, y: float) -> Response:
             "end": iso(_seen(v.end_ns, known)),
             "counts": v.counts,
             "why": v.why,
+            "heard": list(v.heard),
         }
         for v in story.votes
     ]
     decisions = [{"version": version, "state": state} for version, state in story.decisions]
-    return as_json({"row": story.row, "col": story.col, "votes": votes, "decisions": decisions})
+    told = {"votes": votes, "decisions": decisions, "thing": story.thing}
+    return as_json({"row": story.row, "col": story.col} | told)
 
 
 @router.get(

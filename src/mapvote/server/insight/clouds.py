@@ -11,10 +11,9 @@ import numpy as np
 from mapvote.core.grid import TILE_CELLS, Lattice, TileIndex
 from mapvote.core.types import I64, NO_VOTE, U8, CellState
 from mapvote.server.insight.changes import missing_from
-from mapvote.server.insight.explain import FOREVER
 from mapvote.server.insight.levels import Levels, cloud_bytes, make_levels, pack
 from mapvote.server.store.blobs import TileHashes
-from mapvote.server.store.eligible_votes import Electorate, judged_votes, read_votes
+from mapvote.server.store.eligible_votes import FOREVER, Electorate, judged_votes, read_votes
 from mapvote.server.store.policy import policy_in
 from mapvote.server.store.queries import load_tile, tiles_of, version_of
 from mapvote.server.store.store import Store

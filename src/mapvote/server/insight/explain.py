@@ -1,25 +1,41 @@
-"""Why the map is as it is: the votes behind a cell, what changed between two versions, how fresh each tile is."""
+"""Why the map is as it is: the votes behind a cell, in which versions they were heard, and what stands there."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 import sqlalchemy as sa
 
 from mapvote.codec.arrays import unpack_plane
 from mapvote.core.grid import TILE_CELLS, TileIndex
+from mapvote.core.tile import Tile
 from mapvote.core.types import NO_VOTE, U8, CellState, MapvoteError
-from mapvote.fusion.fuse import hear
+from mapvote.fusion.fuse import decide_tile
+from mapvote.fusion.persistence import expected_days
 from mapvote.fusion.spent import unspent
-from mapvote.fusion.tile_vote import TileVote, one_each
+from mapvote.fusion.tile_vote import TileVote
 from mapvote.server.store import schema
-from mapvote.server.store.eligible_votes import Electorate, judged_votes, read_votes
-from mapvote.server.store.policy import Policy, policy_in
-from mapvote.server.store.queries import current_version, tile_as_of
+from mapvote.server.store.eligible_votes import (
+    DAMAGED,
+    Electorate,
+    StoredVote,
+    counted_votes,
+    electorate_now,
+    judged_votes,
+    read_votes,
+    recent_votes,
+)
+from mapvote.server.store.policy import recorded
+from mapvote.server.store.quarantine import DamagedBallots
+from mapvote.server.store.queries import current_version, tile_as_of, version_of
 from mapvote.server.store.store import Store
 
-FOREVER = (1 << 63) - 1
+_LOOKED_INTO = 30
+"""So many of the last versions that decided a cell are asked which votes they heard."""
+REVIEWED = "of a change that a reviewer held or rejected"
+OPPOSES = "opposes the others over most of this tile, or denies nearly all that changed on it"
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,8 +52,11 @@ class CellVote:
     """Voxels of the map that it says are gone here, of a changed cell or beside what stands; None: it sent no mask."""
     end_ns: int
     counts: bool
+    """Whether the next version hears it."""
     why: str
     """Why it does not count; empty if it does."""
+    heard: tuple[int, ...]
+    """Versions in which it was heard on this cell, of the last 30 that decided it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,6 +68,17 @@ class CellStory:
     votes: list[CellVote]
     decisions: list[tuple[int, str]]
     """(version, state) of every version that decided this cell."""
+    thing: str
+    """What stands there, and whether something new is temporary; what came and went before."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Place:
+    """A cell, as of one version."""
+
+    tile: Tile
+    cell: tuple[int, int]
+    asked: Electorate
 
 
 def state_name(state: int) -> str:
@@ -64,39 +94,114 @@ def explain_cell(store: Store, x: float, y: float) -> CellStory:
     row, col = int(rows[0]), int(cols[0])
     index, cell = (row // TILE_CELLS, col // TILE_CELLS), (row % TILE_CELLS, col % TILE_CELLS)
     with store.database.reading() as connection:
-        policy = policy_in(connection)
-        settings = policy.fuse
-        asked = Electorate(FOREVER, policy, store.clock() - round(settings.min_age_s * 1e9))
-        number = current_version(connection).number
-        tile = tile_as_of(connection, store.lattice.tile(index), number)
-        everyone = judged_votes(connection, index, asked)
-        said = read_votes(connection, index, [stored for stored, _ in everyone])
-        query = sa.select(schema.decisions.c.version, schema.decisions.c.states)
-        query = query.where(schema.decisions.c.row == index[0], schema.decisions.c.col == index[1])
-        found = connection.execute(query.order_by(schema.decisions.c.version))
-        decided = [(r.version, states_of(r.states)) for r in found]
-    counting = [unspent(vote, tile) for vote, (_, why) in zip(said, everyone, strict=True) if not why]
-    silenced = _silenced(store, index, counting, policy)
-    votes = []
-    for (stored, why), vote in zip(everyone, said, strict=True):
-        if not vote.spoken()[cell]:
-            why = "says nothing here"
-        elif not why and not unspent(vote, tile).spoken()[cell]:
-            assert tile.memory is not None
-            why = f"spent: version {tile.memory.changed[cell]} has changed the cell since"
-        elif not why and vote.vehicle in silenced:
-            why = "opposes the others over most of this tile, or denies nearly all that changed on it"
-        whose = stored.vehicle, stored.drive, stored.version
-        votes.append(CellVote(*whose, _said(vote, cell), _marks(vote, cell), stored.end_ns, not why, why))
-    story = [(version, state_name(int(states[cell]))) for version, states in decided if states[cell] != NO_VOTE]
-    return CellStory(row, col, votes, story)
+        tile = tile_as_of(connection, store.lattice.tile(index), current_version(connection).number)
+        now = _undamaged(connection, _Place(tile, cell, electorate_now(connection, store.clock())))
+        decided = _decisions(connection, index, cell)
+        heard: dict[int, list[int]] = {}
+        for version, _ in decided[-_LOOKED_INTO:]:
+            for seq in _heard_by(connection, store, version, now):
+                heard.setdefault(seq, []).append(version)
+        votes = [_vote(*each, now, tuple(heard.get(each[0].seq, ()))) for each in _everyone(connection, now)]
+        thing = _thing(connection, now)
+    return CellStory(row, col, votes, decided, thing)
 
 
-def _silenced(store: Store, index: TileIndex, drives: list[TileVote], policy: Policy) -> set[str]:
+def _decisions(connection: sa.Connection, index: TileIndex, cell: tuple[int, int]) -> list[tuple[int, str]]:
+    d = schema.decisions
+    query = sa.select(d.c.version, d.c.states).where(d.c.row == index[0], d.c.col == index[1]).order_by(d.c.version)
+    found = [(row.version, int(states_of(row.states)[cell])) for row in connection.execute(query)]
+    return [(version, state_name(state)) for version, state in found if state != NO_VOTE]
+
+
+def _undamaged(connection: sa.Connection, place: _Place) -> _Place:
+    """The same, without ballots that cannot be read."""
+    try:
+        read_votes(connection, place.tile.index, [vote for vote, why in _judged(connection, place) if why != DAMAGED])
+    except DamagedBallots as error:
+        aside = {*place.asked.set_aside, *(damage.name for damage in error.found)}
+        return replace(place, asked=replace(place.asked, set_aside=frozenset(aside)))
+    return place
+
+
+def _judged(connection: sa.Connection, place: _Place) -> list[tuple[StoredVote, str]]:
+    return judged_votes(connection, place.tile.index, place.asked)
+
+
+def _everyone(connection: sa.Connection, now: _Place) -> list[tuple[StoredVote, TileVote | None, str]]:
+    """Every standing vote on the tile, what it says, and why it does not count on the cell ("" if it does)."""
+    judged = _judged(connection, now)
+    readable = [vote for vote, why in judged if why != DAMAGED]
+    said = dict(zip((vote.seq for vote in readable), read_votes(connection, now.tile.index, readable), strict=True))
+    counted = counted_votes(connection, now.tile, now.asked)
+    obeyed = {stored.seq: vote for stored, vote in counted}
+    silenced = _silenced(now, [vote for _, vote in counted])
+    return [
+        (stored, said.get(stored.seq), why or _why_not(said[stored.seq], obeyed.get(stored.seq), now, silenced))
+        for stored, why in judged
+    ]
+
+
+def _why_not(vote: TileVote, obeyed: TileVote | None, now: _Place, silenced: set[str]) -> str:
+    """Of a vote that counts on the tile: why not on this cell."""
+    if not vote.spoken()[now.cell]:
+        return "says nothing here"
+    if not unspent(vote, now.tile).spoken()[now.cell]:
+        assert now.tile.memory is not None
+        return f"spent: version {now.tile.memory.changed[now.cell]} has changed the cell since"
+    if obeyed is not None and not obeyed.spoken()[now.cell]:
+        return REVIEWED
+    return OPPOSES if vote.vehicle in silenced else ""
+
+
+def _silenced(place: _Place, drives: Sequence[TileVote]) -> set[str]:
     """Vehicles that are not heard on a tile, of the votes that count there."""
-    votes = one_each(drives, store.lattice.tile(index))
-    heard = hear(votes, policy.round.method, policy.fuse)[0]
-    return {vote.vehicle for vote in votes} - {vote.vehicle for vote in heard}
+    policy = place.asked.policy
+    heard = decide_tile(place.tile, drives, policy.round.method, policy.fuse).votes
+    return {vote.vehicle for vote in drives} - {vote.vehicle for vote in heard}
+
+
+def _heard_by(connection: sa.Connection, store: Store, number: int, now: _Place) -> list[int]:
+    """The ballots that a version heard on the cell."""
+    version = version_of(connection, number)
+    policy = recorded(version.policy)
+    received_by_ns = version.created_ns - round(policy.fuse.min_age_s * 1e9)
+    asked = Electorate(version.mark, policy, received_by_ns, set_aside=now.asked.set_aside)
+    then = replace(now, asked=asked, tile=tile_as_of(connection, now.tile.window, number - 1))
+    counted = counted_votes(connection, then.tile, asked)
+    silenced = _silenced(then, [vote for _, vote in counted])
+    return [s.seq for s, vote in counted if vote.spoken()[now.cell] and vote.vehicle not in silenced]
+
+
+def _vote(stored: StoredVote, vote: TileVote | None, why: str, now: _Place, heard: tuple[int, ...]) -> CellVote:
+    state, marks = ("unreadable", None) if vote is None else (_said(vote, now.cell), _marks(vote, now.cell))
+    whose = stored.vehicle, stored.drive, stored.version
+    return CellVote(*whose, state, marks, stored.end_ns, not why, why, heard)
+
+
+def _thing(connection: sa.Connection, now: _Place) -> str:
+    """In words: what stands in the cell or is about to, and what came and went."""
+    tile, cell, policy = now.tile, now.cell, now.asked.policy
+    here = np.zeros((TILE_CELLS, TILE_CELLS), dtype=np.bool_)
+    here[cell] = True
+    told = []
+    drives = [vote for _, vote in counted_votes(connection, tile, now.asked)]
+    if policy.round.stage == "two-stage":
+        recent = recent_votes(connection, tile, now.asked)
+        found = decide_tile(tile, drives, policy.round.method, policy.fuse, lambda: recent)
+        if found.passing is not None and found.passing[cell]:
+            told.append("temporary: what is new here is not expected to stay, and stays out of the map")
+        elif found.denied is not None and found.denied[cell]:
+            told.append("waits: the last vehicle that looked says otherwise")
+    if tile.obstacle_words[cell]:
+        brought = tile.memory is not None and tile.memory.came_s[cell] > 0
+        told.append("stands: brought by vehicles" if brought else "stands: surveyed")
+    stays = 0 if tile.memory is None else int(tile.memory.stays[cell])
+    if stays and tile.memory is not None:
+        days = int(tile.memory.stayed_s[cell]) / 86_400 / stays
+        expected = float(expected_days(tile.memory, here, 0.0, policy.fuse)[0])
+        past = f"{stays} things came and went here, after {days:.1f} days on average"
+        told.append(f"{past}; the next can be expected to stay {expected:.1f}")
+    return "; ".join(told)
 
 
 def states_of(data: bytes) -> U8:

@@ -17,11 +17,18 @@ from mapvote.fusion.tile_vote import TileVote, one_each
 from mapvote.server.insight.changes import Decided, change_objects, changed_cells
 from mapvote.server.insight.consensus import Compared, Spoken, Standing, compare, judge
 from mapvote.server.insight.cutout import Box, Cutout, Tiles, cut_out, of_feature
-from mapvote.server.insight.explain import FOREVER, states_of
+from mapvote.server.insight.explain import states_of
 from mapvote.server.insight.geojson import to_geojson
 from mapvote.server.insight.picture import before_and_after
 from mapvote.server.store import schema
-from mapvote.server.store.eligible_votes import Electorate, counting_votes, judged_votes, read_votes, standing_tiles
+from mapvote.server.store.eligible_votes import (
+    FOREVER,
+    Electorate,
+    counting_votes,
+    judged_votes,
+    read_votes,
+    standing_tiles,
+)
 from mapvote.server.store.policy import policy_in, recorded
 from mapvote.server.store.queries import current_version, load_tile, tile_as_of, tiles_of, version_of
 from mapvote.server.store.store import Store

@@ -21,8 +21,8 @@ from mapvote.fusion.spent import unspent
 from mapvote.fusion.tile_vote import DAY_NS, TileVote, restrict, select
 from mapvote.server.store import schema
 from mapvote.server.store.blobs import unpack_cells
-from mapvote.server.store.policy import Policy
-from mapvote.server.store.quarantine import Damage, DamagedBallots, ballot_name, ballot_sum
+from mapvote.server.store.policy import Policy, policy_in
+from mapvote.server.store.quarantine import Damage, DamagedBallots, ballot_name, ballot_sum, set_aside
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,6 +60,7 @@ class StoredVote:
     cast_by: str
 
 
+FOREVER = (1 << 63) - 1
 YOUNG = "waits for the minimum age"
 DAMAGED = "damaged, and set aside"
 OTHERWISE = "cast by another method or other settings than the policy asks for"
@@ -130,6 +131,18 @@ def judged_votes(connection: sa.Connection, index: TileIndex, asked: Electorate)
     return [(vote, why[vote.seq] or ("" if vote.seq in inside else outside)) for vote in found]
 
 
+def electorate_now(
+    connection: sa.Connection, now: int, mark: int = FOREVER, settings: FuseSettings | None = None
+) -> Electorate:
+    """Whose votes count if somebody publishes at ``now``, by the newest policy, with ``settings`` in the place of its
+    ``fuse`` if given."""
+    policy = policy_in(connection)
+    if settings is not None:
+        policy = policy.model_copy(update={"fuse": settings})
+    aside = frozenset(name for kind, name in set_aside(connection) if kind == "ballot")
+    return Electorate(mark, policy, now - round(policy.fuse.min_age_s * 1e9), set_aside=aside)
+
+
 def _unready(vote: StoredVote, index: TileIndex, asked: Electorate) -> str:
     cast = asked.policy.round
     if ballot_name(vote.seq, *index) in asked.set_aside:
@@ -146,11 +159,18 @@ def counting_votes(
 
     ``misread``: see :func:`mapvote.fusion.spent.unspent`.
     """
+    return [vote for _, vote in counted_votes(connection, tile, asked, misread)]
+
+
+def counted_votes(
+    connection: sa.Connection, tile: Tile, asked: Electorate, misread: Mapping[int, Bool] | None = None
+) -> list[tuple[StoredVote, TileVote]]:
+    """As :func:`counting_votes`, each beside its ballot."""
     chosen = [vote for vote, why in judged_votes(connection, tile.index, asked) if not why]
     reviewed = connection.execute(_REVIEWS_ON, {"row": tile.index[0], "col": tile.index[1], "mark": asked.mark}).all()
     bars = [(None if verdict == "held" else seq, unpack_cells(cells)) for seq, verdict, cells in reviewed]
     votes = zip(chosen, read_votes(connection, tile.index, chosen), strict=True)
-    return [_obedient(unspent(vote, tile, misread), stored.first_seq, bars) for stored, vote in votes]
+    return [(stored, _obedient(unspent(vote, tile, misread), stored.first_seq, bars)) for stored, vote in votes]
 
 
 def _obedient(vote: TileVote, first_seq: int, bars: Sequence[tuple[int | None, Bool]]) -> TileVote:

@@ -24,10 +24,9 @@ from mapvote.server.store import schema
 from mapvote.server.store.blobs import TileHashes, pack_memory, unpack_tile
 from mapvote.server.store.commit import NewTiles, write_version
 from mapvote.server.store.database import address_of
-from mapvote.server.store.eligible_votes import Electorate, standing_tiles
+from mapvote.server.store.eligible_votes import Electorate, electorate_now, standing_tiles
 from mapvote.server.store.hold import hold_reasons
-from mapvote.server.store.policy import policy_in
-from mapvote.server.store.quarantine import quarantine, set_aside
+from mapvote.server.store.quarantine import quarantine
 from mapvote.server.store.queries import (
     Version,
     current_version,
@@ -116,11 +115,7 @@ def make_plan(store: Store, settings: FuseSettings | None = None) -> Plan:
     with store.database.reading() as connection:
         newest = current_version(connection)
         mark = connection.execute(sa.select(sa.func.max(schema.events.c.seq))).scalar_one()
-        policy = policy_in(connection)
-        if settings is not None:
-            policy = policy.model_copy(update={"fuse": settings})
-        aside = frozenset(name for kind, name in set_aside(connection) if kind == "ballot")
-        asked = Electorate(mark, policy, now - round(policy.fuse.min_age_s * 1e9), set_aside=aside)
+        asked = electorate_now(connection, now, mark, settings)
         dirty = _dirty(connection, newest, asked)
         hashes = tiles_of(connection, newest.number, dirty)
     made, url = newest.number + 1, address_of(store.database.url)

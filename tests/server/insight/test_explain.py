@@ -1,0 +1,110 @@
+"""The story of a cell: what stands there, who said what, and in which versions it was heard."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+import sqlalchemy as sa
+
+from hand_made import Say, make_ballot, states_plane, two_walls, wall
+from mapvote.codec.ballot import encode
+from mapvote.config import FuseSettings
+from mapvote.core.types import CellState
+from mapvote.fusion.tile_vote import DAY_NS
+from mapvote.server.insight.explain import CellStory, explain_cell
+from mapvote.server.store import schema
+from mapvote.server.store.admission import accept, examine
+from mapvote.server.store.ballots import Receipt
+from mapvote.server.store.policy import Policy, set_policy
+from mapvote.server.store.publish import publish
+from mapvote.server.store.store import Store
+
+WALL, LAWN = (10, 10), (20, 20)
+START_NS = 1_700_000_000 * 10**9
+
+
+class Clock:
+    now = START_NS
+
+    def __call__(self) -> int:
+        return self.now
+
+
+@pytest.fixture
+def clock() -> Clock:
+    return Clock()
+
+
+@pytest.fixture
+def store(database_url: str, clock: Clock) -> Iterator[Store]:
+    policy = Policy(fuse=FuseSettings(max_deleted_share=1.0, prior_stay_days=10.0))
+    store = Store.create(database_url, two_walls(), policy, clock=clock)
+    yield store
+    store.close()
+
+
+def say(store: Store, vehicle: str, state: CellState, cell: tuple[int, int] = WALL) -> None:
+    points = wall([cell], [0.45, 0.75]) if state == CellState.CHANGED_OCCUPIED else None
+    now, base = store.clock(), store.point_map()
+    ballot = make_ballot(base, {(0, 0): Say(states_plane({cell: state}), new_points=points)}, vehicle, f"d{now}", now)
+    (receipt,) = accept(store, [examine(encode(ballot))])
+    assert isinstance(receipt, Receipt), receipt
+
+
+def story(store: Store, cell: tuple[int, int] = WALL) -> CellStory:
+    return explain_cell(store, (cell[1] + 0.5) * 0.3, (cell[0] + 0.5) * 0.3)
+
+
+def test_a_vote_is_named_with_the_version_that_heard_it_or_why_it_does_not_count(store: Store, clock: Clock) -> None:
+    for vehicle in ("a", "b"):
+        say(store, vehicle, CellState.CHANGED_EMPTY)
+    assert [(v.counts, v.heard) for v in story(store).votes] == [(True, ()), (True, ())]
+    assert publish(store).version == 2
+    clock.now += DAY_NS
+    say(store, "c", CellState.UNCHANGED_EMPTY)
+    told = story(store)
+    assert [(v.vehicle, v.version, v.heard, v.counts) for v in told.votes] == [
+        ("a", 1, (2,), False), ("b", 1, (2,), False), ("c", 2, (), True)
+    ]  # fmt: skip
+    assert told.votes[0].why == "spent: version 2 has changed the cell since"
+    assert told.decisions == [(2, "changed_empty")]
+
+
+def test_what_comes_and_goes_is_called_temporary_until_it_can_be_expected_to_stay(store: Store, clock: Clock) -> None:
+    for vehicle in ("a", "b"):
+        say(store, vehicle, CellState.CHANGED_OCCUPIED, LAWN)
+    assert story(store, LAWN).thing.startswith("temporary:")
+    assert not publish(store).published
+    clock.now += 21 * DAY_NS
+    say(store, "c", CellState.CHANGED_OCCUPIED, LAWN)
+    assert story(store, LAWN).thing == ""
+    assert publish(store).published
+    assert story(store, LAWN).thing == "stands: brought by vehicles"
+    assert [v.heard for v in story(store, LAWN).votes] == [(2,)] * 3
+    for vehicle in ("a", "b"):
+        say(store, vehicle, CellState.CHANGED_EMPTY, LAWN)
+    assert publish(store).published
+    assert story(store, LAWN).thing.startswith("1 things came and went here, after 21.0 days on average; the next can")
+    assert story(store, WALL).thing == "stands: surveyed"
+
+
+def test_who_looked_last_holds_up_what_is_new(store: Store, clock: Clock) -> None:
+    set_policy(store, Policy(fuse=FuseSettings()))
+    for vehicle, state in (("a", "CHANGED_OCCUPIED"), ("b", "CHANGED_OCCUPIED"), ("c", "UNCHANGED_EMPTY")):
+        clock.now += 3_600 * 10**9
+        say(store, vehicle, CellState[state], LAWN)
+    assert story(store, LAWN).thing == "waits: the last vehicle that looked says otherwise"
+    assert not publish(store).published
+
+
+def test_a_damaged_ballot_is_told_and_hides_no_other(store: Store) -> None:
+    for vehicle in ("a", "b", "c"):
+        say(store, vehicle, CellState.CHANGED_EMPTY)
+    with store.database.writing() as connection:
+        t = schema.ballot_tiles
+        first = connection.execute(sa.select(sa.func.min(t.c.ballot))).scalar_one()
+        connection.execute(t.update().where(t.c.ballot == first).values(states=b"rot"))
+    assert [(v.state, v.counts) for v in story(store).votes] == [
+        ("unreadable", False), ("changed_empty", True), ("changed_empty", True)
+    ]  # fmt: skip
