@@ -18,10 +18,6 @@ if TYPE_CHECKING:
 
     from mapvote.server.store.publish import Outcome
 
-GateDrive = Annotated[
-    Path | None, typer.Option(metavar="DRIVE", help="a reference drive that must localise no worse in a new version")
-]
-
 
 def register(app: typer.Typer) -> None:
     """Add these verbs to ``app``."""
@@ -35,7 +31,6 @@ def serve(
     host: Annotated[str, typer.Option(metavar="ADDRESS", help="where to listen")] = "127.0.0.1",
     port: Annotated[int, typer.Option(min=0, max=65535, metavar="N", help="0: any free one")] = 8080,
     open_: Annotated[bool, typer.Option("--open", help="need no keys, on this machine, until one is issued")] = False,
-    gate: GateDrive = None,
     config: Config = None,
 ) -> None:
     """Serve a store to vehicles and operators until stopped. A new store's first operator key is shown once.
@@ -43,7 +38,7 @@ def serve(
     mapvote serve fleet.db --map my_map
     """
     from mapvote.config import load_settings
-    from mapvote.server.http.serve import log_as_json, open_or_create, reference_gate
+    from mapvote.server.http.serve import log_as_json, open_or_create
     from mapvote.server.http.serve import serve as run
     from mapvote.server.store.keys import issue
     from mapvote.server.store.policy import Policy
@@ -55,8 +50,7 @@ def serve(
     try:
         if new and not open_:
             print(f"key of the operator, shown this once: {issue(opened, 'operator', 'operator')}", flush=True)
-        judge = None if gate is None else reference_gate(gate, settings)
-        run(opened, settings, host=host, port=port, opened=open_, gate=judge, ready=_say_where)
+        run(opened, settings, host=host, port=port, opened=open_, ready=_say_where)
     finally:
         opened.close()
 
@@ -70,7 +64,6 @@ def publish(
     dry_run: Annotated[bool, typer.Option("--dry-run", help="only say what would change")] = False,
     override: Annotated[bool, typer.Option("--override", help="publish in spite of the reasons to hold it")] = False,
     reason: Reason = "",
-    gate: GateDrive = None,
     cluster: Annotated[
         str | None, typer.Option(metavar="ADDRESS", help="Dask scheduler to fuse on, e.g. tcp://host:8786")
     ] = None,
@@ -83,11 +76,10 @@ def publish(
     from concurrent.futures import ThreadPoolExecutor
 
     from mapvote.config import load_settings
-    from mapvote.server.http.serve import reference_gate
+    from mapvote.server.insight.localisation_gate import gate_by
     from mapvote.server.store.publish import publish as publish_version
 
-    settings = load_settings(config)
-    judge = None if gate is None else reference_gate(gate, settings)
+    judge = gate_by(load_settings(config).ndt)
     workers = dask_cluster(cluster) if cluster else ThreadPoolExecutor(2)
     with opened_store(store) as opened, workers as executor, waiting("deciding"):
         done = publish_version(opened, reason=reason, dry_run=dry_run, override=override, gate=judge, executor=executor)

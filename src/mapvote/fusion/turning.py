@@ -70,12 +70,12 @@ def _turn(said: U8, ends_ns: I64, whose: I64, before: int, after: int) -> NDArra
             if said[i, cell] != NO_VOTE:
                 last[whose[i]] = i
         oldest_after, newest_before, other = np.iinfo(np.int64).max, np.iinfo(np.int64).min, False
-        for i in last:
-            if i >= 0 and said[i, cell] == after:
-                oldest_after = min(oldest_after, ends_ns[i])
-            elif i >= 0 and said[i, cell] == before:
-                newest_before = max(newest_before, ends_ns[i])
-            elif i >= 0 and said[i, cell] < _UN:
+        for word in last:
+            if word >= 0 and said[word, cell] == after:
+                oldest_after = min(oldest_after, ends_ns[word])
+            elif word >= 0 and said[word, cell] == before:
+                newest_before = max(newest_before, ends_ns[word])
+            elif word >= 0 and said[word, cell] < _UN:
                 other = True
         found[cell] = not other and newest_before < oldest_after
     return found

@@ -13,7 +13,8 @@ from mapvote.core.geometry import from_xyz_rpy, inverse, transform
 from mapvote.core.point_map import PointMap, map_from_points
 from mapvote.core.sensors import SENSORS
 from mapvote.core.types import F64, Drive, MapvoteError, Scan
-from mapvote.server.insight.localisation_gate import GateResult, Localised, compare, gate, pass_or_hold
+from mapvote.server.insight.localisation_gate import GateResult, Localised, compare, gate, gate_by, pass_or_hold
+from mapvote.server.store.policy import GatePolicy
 
 NDT = NdtSettings(
     levels=(
@@ -156,3 +157,12 @@ def test_within_tolerance_passes_worse_holds_and_between_it_abstains(gains: list
 def test_equal_maps_are_equal() -> None:
     for measure in compare(pairs([0.0] * 20), SETTINGS):
         assert (measure.gain, measure.uncertainty) == (0.0, 0.0)
+
+
+def test_the_gate_judges_by_the_drive_that_the_policy_names(monkeypatch: pytest.MonkeyPatch) -> None:
+    drives = {"/drives/ring": drive_through(STREET)}
+    monkeypatch.setattr("mapvote.server.insight.localisation_gate.open_drive", lambda path: drives[str(path)])
+    asked = GatePolicy(drive="/drives/ring", **SETTINGS.model_dump())
+    wrong = np.concatenate([ROAD, *HOUSES[:4], *HOUSES[10:]])
+    assert gate_by(NDT)(asked, street_map(STREET), street_map(wrong)) != []
+    assert gate_by(NDT)(asked, street_map(STREET), street_map(STREET)) == []

@@ -23,6 +23,7 @@ from mapvote.server.insight.explain import explain_cell
 from mapvote.server.store.admission import accept, examine
 from mapvote.server.store.ballots import Receipt, withdraw
 from mapvote.server.store.policy import (
+    GatePolicy,
     Policy,
     RoundPolicy,
     changed,
@@ -273,15 +274,18 @@ def test_another_map_is_refused_and_so_is_the_future(store: Store) -> None:
 def test_dry_run_changes_nothing_and_a_held_version_says_why(store: Store) -> None:
     base = store.point_map()
     send(store, says(base, "a", EMPTY), says(base, "b", EMPTY))
+    set_policy(store, Policy(gate=GatePolicy(drive="/drives/ring")))
     strict = FuseSettings(max_deleted_share=0.01)
     dry = publish(store, strict, dry_run=True)
     assert (dry.published, dry.deleted, len(dry.held)) == (False, 3, 1)
     with pytest.raises(Held, match="deletes 25% of the points"):
         publish(store, strict)
-    with pytest.raises(Held, match="worse here"):
-        publish(store, POLICY, gate=lambda old, new: ["worse here"])
+    with pytest.raises(Held, match="worse by /drives/ring"):
+        publish(store, POLICY, gate=lambda asked, old, new: [f"worse by {asked.drive}"])
+    with pytest.raises(MapvoteError, match="judges versions by /drives/ring: publish by the server or mapvote publish"):
+        publish(store, POLICY)
     assert store.current() == 1
-    assert publish(store, strict, override=True).published
+    assert publish(store, strict, override=True, gate=lambda asked, old, new: []).published
     assert "in spite of" in store.versions()[-1].reason
 
 
@@ -289,7 +293,15 @@ def test_the_gate_sees_both_maps(store: Store) -> None:
     base = store.point_map()
     send(store, says(base, "a", EMPTY), says(base, "b", EMPTY))
     seen = []
-    publish(store, POLICY, gate=lambda old, new: seen.append((old, new)) or [])  # type: ignore[func-returns-value]
+
+    def gate(asked: GatePolicy, old: PointMap, new: PointMap) -> list[str]:
+        seen.append((old, new))
+        return []
+
+    publish(store, POLICY, gate=gate)
+    assert seen == [], "the policy names no drive"
+    set_policy(store, Policy(gate=GatePolicy(drive="/drives/ring")))
+    publish(store, POLICY, gate=gate, dry_run=True)
     old, new = seen[0]
     assert len(old.tiles[0, 0].points) - len(new.tiles[0, 0].points) == 3
     assert new.tiles[0, 1] is old.tiles[0, 1]

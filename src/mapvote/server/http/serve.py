@@ -7,7 +7,7 @@ import logging
 import resource
 import socket
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
@@ -16,17 +16,14 @@ import structlog
 import uvicorn
 
 from mapvote.config import Settings
-from mapvote.core.point_map import PointMap
 from mapvote.core.types import MapvoteError
-from mapvote.formats import open_drive, read_map
+from mapvote.formats import read_map
 from mapvote.server.http.app import create_app
 from mapvote.server.http.browsers import HEADERS
 from mapvote.server.http.connections import Connection, Crowd, Patience
 from mapvote.server.http.services import Services
-from mapvote.server.insight.localisation_gate import gate as localise_in_both
 from mapvote.server.store import keys
 from mapvote.server.store.policy import Policy
-from mapvote.server.store.publish import Gate
 from mapvote.server.store.store import Store
 
 _FILES = 300
@@ -52,18 +49,6 @@ def open_or_create(url: str, map_path: Path | None, policy: Policy | None = None
     return Store.create(url, read_map(map_path), policy), True
 
 
-def reference_gate(drive_path: Path, settings: Settings) -> Gate:
-    """A gate that holds a version in which a reference drive localises worse; what cannot be told is let through."""
-    drive = open_drive(drive_path)
-
-    def reasons(old: PointMap, new: PointMap) -> Sequence[str]:
-        result = localise_in_both(old, new, drive, settings.gate, settings.ndt)
-        structlog.get_logger("mapvote").info("gate", verdict=result.verdict, reasons=list(result.reasons))
-        return list(result.reasons) if result.verdict == "hold" else []
-
-    return reasons
-
-
 def is_loopback(host: str) -> bool:
     """Whether only this machine can reach ``host``."""
     try:
@@ -79,7 +64,6 @@ def serve(
     host: str = "127.0.0.1",
     port: int = 8080,
     opened: bool = False,
-    gate: Gate | None = None,
     ready: Callable[[str], object] = lambda url: None,
 ) -> None:
     """Serve until SIGINT or SIGTERM; requests under way are answered and ballots taken in are written first.
@@ -95,7 +79,7 @@ def serve(
     if not opened and not keys.any_issued(store):
         mend = "issue the first (mapvote keys STORE issue NAME --operator), or say --open to need none on this machine"
         raise MapvoteError(f"this store has no keys yet: {mend}")
-    app = create_app(store, settings, opened=opened, gate=gate)
+    app = create_app(store, settings, opened=opened)
     listener = socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET)
     try:
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)

@@ -15,6 +15,7 @@ from mapvote.server.http.limits import RateLimit, Uploads
 from mapvote.server.http.manifests import Manifests
 from mapvote.server.http.metrics import Metrics
 from mapvote.server.insight.clouds import Clouds
+from mapvote.server.insight.localisation_gate import gate_by
 from mapvote.server.store.admission import Intake, Sent
 from mapvote.server.store.ballots import Incoming, Receipt
 from mapvote.server.store.publish import Gate
@@ -50,7 +51,7 @@ class Services:
 
     store: Store
     settings: Settings
-    gate: Gate | None
+    gate: Gate
     """Looks at a version before it is published."""
     fusing: Executor
     """Where tiles are fused."""
@@ -93,7 +94,7 @@ def make_services(store: Store, settings: Settings, gate: Gate | None, executor:
     return Services(
         store=store,
         settings=settings,
-        gate=gate,
+        gate=gate or gate_by(settings.ndt),
         fusing=executor or threads.fuse,
         threads=threads,
         intake=intake,

@@ -8,9 +8,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
+import structlog
 from scipy.spatial import cKDTree
 from scipy.special import stdtrit
 
@@ -19,10 +21,13 @@ from mapvote.core.geometry import from_xyz_rpy
 from mapvote.core.grid import CELL_SIZE
 from mapvote.core.point_map import PointMap
 from mapvote.core.types import F64, Drive, MapvoteError
+from mapvote.formats import open_drive
 from mapvote.localisation.deskew import deskew, twist_between
 from mapvote.localisation.ndt import refine, thin_for_levels
 from mapvote.localisation.tracker import MapWindow
 from mapvote.server.insight.changes import changed_cells
+from mapvote.server.store.policy import GatePolicy
+from mapvote.server.store.publish import Gate
 
 Verdict = Literal["pass", "hold", "abstain"]
 MIN_SCANS = 20
@@ -92,6 +97,19 @@ class GateResult:
     """Scans taken near what changed: only these see a difference."""
     scans_compared: int
     measures: tuple[Measure, ...]
+
+
+def gate_by(ndt: NdtSettings) -> Gate:
+    """Judges by the policy's reference drive; what that cannot tell is let through. MapvoteError if there is no drive
+    where the policy says."""
+
+    def reasons(asked: GatePolicy, old: PointMap, new: PointMap) -> Sequence[str]:
+        settings = GateSettings.model_validate(asked.model_dump(exclude={"drive"}))
+        result = gate(old, new, open_drive(Path(asked.drive)), settings, ndt)
+        structlog.get_logger("mapvote").info("gate", verdict=result.verdict, reasons=list(result.reasons))
+        return list(result.reasons) if result.verdict == "hold" else []
+
+    return reasons
 
 
 def gate(old: PointMap, new: PointMap, drive: Drive, settings: GateSettings, ndt: NdtSettings) -> GateResult:

@@ -18,6 +18,7 @@ from mapvote.core.grid import Grid, TileIndex
 from mapvote.core.memory import Memory
 from mapvote.core.point_map import PointMap
 from mapvote.core.tile import Tile
+from mapvote.core.types import MapvoteError
 from mapvote.fusion.spent import differing
 from mapvote.server.errors import Conflict, Held
 from mapvote.server.store import schema
@@ -26,6 +27,7 @@ from mapvote.server.store.commit import NewTiles, write_version
 from mapvote.server.store.database import address_of
 from mapvote.server.store.eligible_votes import Electorate, electorate_now, standing_tiles
 from mapvote.server.store.hold import hold_reasons
+from mapvote.server.store.policy import GatePolicy
 from mapvote.server.store.quarantine import quarantine
 from mapvote.server.store.queries import (
     Version,
@@ -39,8 +41,8 @@ from mapvote.server.store.queries import (
 from mapvote.server.store.store import Store
 from mapvote.server.store.tile_jobs import Fused, Task, fuse_round
 
-Gate = Callable[[PointMap, PointMap], Sequence[str]]
-"""Looks at (old map, new map) and gives the reasons to hold the new one; none lets it through."""
+Gate = Callable[[GatePolicy, PointMap, PointMap], Sequence[str]]
+"""Looks at (old map, new map) as the policy asks and gives the reasons to hold the new one; none lets it through."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,7 +87,8 @@ def publish(
 
     By the store's policy; ``settings`` take the place of its ``fuse``, in simulations of one round. ``parent``: publish
     only if that is still the newest version. ``override``: in spite of the reasons to hold it. Raises Held with the
-    reasons, or Conflict if somebody else published first.
+    reasons, Conflict if somebody else published first, MapvoteError if the policy asks for a reference drive and there
+    is no ``gate`` to judge by it.
     """
     plan = make_plan(store, settings)
     if parent is not None and parent != plan.newest.number:
@@ -96,6 +99,9 @@ def publish(
         with store.database.writing() as connection:
             quarantine(connection, damaged, plan.now, by)
     changed = [f for f in fused if f.hashes is not None]
+    if gate is None and plan.asked.policy.gate.drive and not dry_run:
+        asked = plan.asked.policy.gate.drive
+        raise MapvoteError(f"the policy judges versions by {asked}: publish by the server or mapvote publish")
     held = judge(store, plan, changed, gate)
     added, deleted = sum(f.added for f in changed), sum(f.deleted for f in changed)
     outcome = Outcome(plan.newest.number, False, [f.index for f in changed], added, deleted, held, fused)
@@ -139,12 +145,12 @@ def _dirty(connection: sa.Connection, newest: Version, asked: Electorate) -> lis
 
 def judge(store: Store, plan: Plan, changed: Sequence[Fused], gate: Gate | None) -> list[str]:
     """The reasons to hold the version."""
-    held = hold_reasons(changed, plan.asked.settings)
-    if gate is not None and changed:
-        old = store.point_map(plan.newest.number)
-        edited = {f.index: edited_tile(f, store.lattice.tile(f.index)) for f in changed}
-        held += gate(old, replace(old, tiles=dict(old.tiles) | edited))
-    return held
+    held, asked = hold_reasons(changed, plan.asked.settings), plan.asked.policy.gate
+    if gate is None or not asked.drive or not changed:
+        return held
+    old = store.point_map(plan.newest.number)
+    edited = {f.index: edited_tile(f, store.lattice.tile(f.index)) for f in changed}
+    return [*held, *gate(asked, old, replace(old, tiles=dict(old.tiles) | edited))]
 
 
 def commit(store: Store, plan: Plan, fused: Sequence[Fused], by: str, why: str) -> int:

@@ -12,7 +12,7 @@ from __future__ import annotations
 import secrets
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -197,5 +197,4 @@ class Store:
                 index: load_tile(connection, self.lattice.tile(index), hashes)
                 for index, hashes in tiles_of(connection, number).items()
             }
-        dated = {"version": number, "surveyed_ns": self.surveyed_ns}
-        return replace(PointMap(self.map_id, self.lattice, tiles, self.georeference), **dated)
+        return PointMap(self.map_id, self.lattice, tiles, self.georeference, (), number, self.surveyed_ns)
