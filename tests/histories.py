@@ -20,6 +20,7 @@ from mapvote.server.store.ballots import Receipt, withdraw
 from mapvote.server.store.policy import Policy, set_policy
 from mapvote.server.store.publish import publish, rollback
 from mapvote.server.store.replay import replay
+from mapvote.server.store.reviews import decide, undo
 from mapvote.server.store.store import Store
 from plain_rules import CE, CO, DAY_S, UE, UN, UO, Cast, Cell, CellMap, Server, Spoken
 
@@ -54,6 +55,7 @@ class History:
         self.hashes = {1: self.store.manifest(1).tiles[0, 0].points}
         self.drives = 0
         self.published: dict[int, int] = {}
+        self.verdicts: list[int] = []
         self.there = dict.fromkeys(WALL, True) | dict.fromkeys(LAWN, False)
 
     def policy(self, settings: FuseSettings) -> None:
@@ -63,6 +65,7 @@ class History:
         """So many steps; AssertionError, naming the step, at the first difference."""
         acts = [self.vote] * 8 + [self.round] * 8 + [self.publish] * 2 + [self.world] * 5
         acts += [self.again, self.back, self.take_out, self.other_policy, self.without, self.race]
+        acts += [self.review, self.let_go]
         for step in range(steps):
             act = self.rng.choice(acts)
             self.clock.now_s += self.rng.choice([60, 3_600, DAY_S, 3 * DAY_S])
@@ -193,6 +196,26 @@ class History:
         with suppress(NotFound):
             withdraw(self.store, vehicle, by="operator")
             self.rules.withdraw(vehicle)
+
+    def review(self) -> None:
+        """Somebody holds a change of some cells, or rejects it."""
+        cells = self.rng.sample(WALL + LAWN, 2)
+        verdict = self.rng.choice(["held", "rejected"])
+        plane = np.zeros((256, 256), dtype=np.bool_)
+        plane[tuple(zip(*cells, strict=True))] = True
+        kind = str(len(self.rules.reviews))  # each of its own kind: none is in the place of another
+        feature = {"id": kind, "properties": {"kind": kind}}
+        seq = decide(self.store, "held" if verdict == "held" else "rejected", feature, {(0, 0): plane}, by="anna")
+        self.rules.review(verdict, cells)
+        self.verdicts.append(seq)
+
+    def let_go(self) -> None:
+        """A verdict is taken back."""
+        standing = [i for i, review in enumerate(self.rules.reviews) if review.gone_at is None]
+        if standing:
+            which = self.rng.choice(standing)
+            undo(self.store, self.verdicts[which], by="anna")
+            self.rules.let_go(which)
 
     def other_policy(self) -> None:
         rng = self.rng

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 from mapvote.config import FuseSettings
 
@@ -63,6 +64,17 @@ class Cast:
 
 
 @dataclass(frozen=True)
+class Review:
+    """Votes on these cells that count no more: of a rejected change those of drives first heard of before it was
+    rejected, of a held one all."""
+
+    verdict: str
+    cells: list[Cell]
+    seq: int
+    gone_at: int | None = None
+
+
+@dataclass(frozen=True)
 class Version:
     kind: str
     cells: dict[Cell, CellMap]
@@ -82,6 +94,7 @@ class Server:
     settings: FuseSettings
     seq: int = 0
     casts: list[Cast] = field(default_factory=list)
+    reviews: list[Review] = field(default_factory=list)
     versions: dict[int, Version] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -112,11 +125,26 @@ class Server:
         seq = self.event()
         self.casts = [replace(c, gone_at=seq) if c.vehicle == vehicle and c.gone_at is None else c for c in self.casts]
 
+    def review(self, verdict: str, cells: list[Cell]) -> None:
+        self.reviews.append(Review(verdict, cells, self.event()))
+
+    def let_go(self, which: int) -> None:
+        self.reviews[which] = replace(self.reviews[which], gone_at=self.event())
+
+    def obeys(self, cast: Cast, cell: Cell, mark: int) -> bool:
+        """Whether no verdict that stands at ``mark`` bars the vote."""
+        first = min(c.seq for c in self.casts if (c.vehicle, c.drive) == (cast.vehicle, cast.drive))
+        barring = [
+            r for r in self.reviews if r.seq <= mark and (r.gone_at is None or r.gone_at > mark) and cell in r.cells
+        ]
+        return not any(r.verdict == "held" or first < r.seq for r in barring)
+
     def publish(self, now_s: float) -> bool:
         """Whether there is a new version."""
         before, mark = self.versions[self.newest], self.seq
         standing = stand_at(self.casts, mark)
-        cells, knows = fuse(before, standing, self.settings, now_s, self.newest + 1, lambda cast, cell: True)
+        obeys = partial(self.obeys, mark=mark)
+        cells, knows = fuse(before, standing, self.settings, now_s, self.newest + 1, lambda cast, cell: True, obeys)
         if knows == before.knows_free and all(cells[c].same_as(before.cells[c]) for c in cells):
             return False
         self.event()
@@ -156,7 +184,8 @@ class Server:
         def as_its_vehicle_saw_it(cast: Cast, cell: Cell) -> bool:
             return again[cast.version].cells[cell].same_as(self.versions[cast.version].cells[cell])
 
-        cells, knows = fuse(before, standing, was.settings, was.made_s, n, as_its_vehicle_saw_it)
+        obeys = partial(self.obeys, mark=was.mark)
+        cells, knows = fuse(before, standing, was.settings, was.made_s, n, as_its_vehicle_saw_it, obeys)
         return replace(was, cells=cells, knows_free=knows)
 
 
@@ -188,6 +217,7 @@ def fuse(
     now_s: float,
     number: int,
     readable: Callable[[Cast, Cell], bool],
+    obeys: Callable[[Cast, Cell], bool],
 ) -> tuple[dict[Cell, CellMap], bool]:
     """Every cell, decided afresh."""
     ripe = [c for c in standing if c.received_s <= now_s - settings.min_age_s]
@@ -206,7 +236,7 @@ def fuse(
         last: dict[str, int] = {}
         for cast in sorted(chosen, key=lambda c: c.end_s):
             last[cast.vehicle] = cast.end_s
-            if counts(cast):
+            if counts(cast) and obeys(cast, cell):
                 heard.setdefault(cast.vehicle, []).append(cast)
         recent = [c for c in ripe if max(r.end_s for r in ripe) - c.end_s <= settings.stay_days * DAY_S]
         recent = sorted((c for c in recent if counts(c)), key=lambda c: c.end_s)
@@ -216,11 +246,12 @@ def fuse(
     for cell, held in before.cells.items():
         free = held.free
         if knows and learns >= settings.min_votes:
+            telling = [c for c in chosen if c.has_free and cell in c.says and held.changed <= c.version]
+            telling = [c for c in telling if readable(c, cell) and obeys(c, cell)]
             passed = [
-                {bit for c in chosen if c.vehicle == v and c.has_free and cell in c.says
-                 and held.changed <= c.version and readable(c, cell) for bit in bits(c.says[cell].free)}
+                {bit for c in telling if c.vehicle == v for bit in bits(c.says[cell].free)}
                 for v in {c.vehicle for c in chosen}
-            ]  # fmt: skip
+            ]
             free |= sum(1 << b for b in range(64) if sum(b in mine for mine in passed) >= settings.min_votes)
         if knows and (learns or added):
             free &= ~occupied(cells[cell].heights)

@@ -274,12 +274,12 @@ def test_another_map_is_refused_and_so_is_the_future(store: Store) -> None:
 def test_dry_run_changes_nothing_and_a_held_version_says_why(store: Store) -> None:
     base = store.point_map()
     send(store, says(base, "a", EMPTY), says(base, "b", EMPTY))
-    set_policy(store, Policy(gate=GatePolicy(drive="/drives/ring")))
     strict = FuseSettings(max_deleted_share=0.01)
     dry = publish(store, strict, dry_run=True)
     assert (dry.published, dry.deleted, len(dry.held)) == (False, 3, 1)
     with pytest.raises(Held, match="deletes 25% of the points"):
         publish(store, strict)
+    set_policy(store, Policy(gate=GatePolicy(drive="/drives/ring")))
     with pytest.raises(Held, match="worse by /drives/ring"):
         publish(store, POLICY, gate=lambda asked, old, new: [f"worse by {asked.drive}"])
     with pytest.raises(MapvoteError, match="judges versions by /drives/ring: publish by the server or mapvote publish"):
