@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 def register(app: typer.Typer) -> None:
     """Add these verbs to ``app``."""
-    for verb in (check, upgrade, keys):
+    for verb in (check, gc, upgrade, keys):
         app.command(rich_help_panel=SERVER)(verb)
 
 
@@ -52,6 +52,23 @@ def check(
     if found:
         raise MapvoteError(f"{store}: {len(found)} things are damaged" + ("" if mend else "; --mend sets them aside"))
     print("every plane, ballot and version is what it was when it was written")
+
+
+def gc(
+    store: StoreName,
+    yes: Annotated[bool, typer.Option("--yes", help="clear it away; else only say what would go")] = False,
+) -> None:
+    """Clear away what the policy does not keep: old versions (keep.versions) and ballots that can decide nothing more.
+
+    mapvote gc fleet.db
+    """
+    from mapvote.server.store.clearing import clear
+
+    with opened_store(store) as opened, waiting("looking for what can go"):
+        done = clear(opened, dry_run=not yes)
+    counts = f"{done.versions} versions ({done.planes} planes, {done.decisions} decisions)"
+    print(f"{counts} and {done.ballots} ballots on tiles, {done.size:,} bytes" + ("" if yes else ": --yes clears them"))
+    print(f"the oldest version left is {done.oldest}")
 
 
 def upgrade(store: StoreName) -> None:

@@ -298,7 +298,7 @@ def test_the_gate_sees_both_maps(store: Store) -> None:
         seen.append((old, new))
         return []
 
-    publish(store, POLICY, gate=gate)
+    publish(store, POLICY, gate=gate, dry_run=True)
     assert seen == [], "the policy names no drive"
     set_policy(store, Policy(gate=GatePolicy(drive="/drives/ring")))
     publish(store, POLICY, gate=gate, dry_run=True)

@@ -9,6 +9,7 @@ from typing import Any
 import msgspec
 
 from mapvote.codec.ballot import tile_key
+from mapvote.server.store.quarantine import set_aside
 from mapvote.server.store.queries import current_number
 from mapvote.server.store.store import Manifest, Store
 
@@ -31,6 +32,12 @@ class Manifests:
         """As :meth:`newest`, of a database that takes a writer now; Unavailable if it does not."""
         with self._store.database.writing() as connection:
             return [current_number(connection)] * len(asked)
+
+    def damaged(self, asked: Sequence[None]) -> list[list[str]]:
+        """What is in quarantine, "kind name: why", for each who asks."""
+        with self._store.database.reading() as connection:
+            found = [f"{kind} {name}: {why}" for (kind, name), why in sorted(set_aside(connection).items())]
+        return [found] * len(asked)
 
     def ready(self, number: int, since: int | None) -> bytes | None:
         """A manifest that was made before."""

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from collections import Counter as TallyOf
+from collections.abc import Sequence
 from functools import lru_cache, partial
 from typing import NamedTuple
 
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, generate_latest
+
+from mapvote.server.store.quarantine import KINDS
 
 
 class Metrics:
@@ -19,7 +23,14 @@ class Metrics:
         self.seconds = histogram("mapvote_request_seconds", "Time to answer", ["method"])
         self.publish_seconds = histogram("mapvote_publish_seconds", "Time to publish", buckets=(0.1, 1, 10, 60, 600))
         self.version = Gauge("mapvote_version", "Newest version", registry=self.registry)
+        self.quarantined = Gauge("mapvote_quarantined", "Damaged, and set aside", ["kind"], registry=self.registry)
         self.of = lru_cache(maxsize=256)(self._of)
+
+    def tell_damaged(self, found: Sequence[str]) -> None:
+        """``found``: "kind name: why"."""
+        counts = TallyOf(text.partition(" ")[0] for text in found)
+        for kind in KINDS:
+            self.quarantined.labels(kind).set(counts[kind])
 
     def text(self) -> bytes:
         """Prometheus' text format."""

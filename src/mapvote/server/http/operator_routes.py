@@ -9,6 +9,7 @@ from dataclasses import asdict
 from functools import partial
 from typing import Annotated, Any, Literal
 
+import structlog
 from anyio import to_thread
 from fastapi import APIRouter, Query, Request, Response
 
@@ -61,6 +62,8 @@ def _publish(parts: Services, ask: PublishAsk, by: str) -> Published:
             gate=parts.gate,
             executor=parts.fusing,
         )
+    for damage in (damage for fused in done.fused for damage in fused.damaged):
+        structlog.get_logger("mapvote").error("quarantine", kind=damage.kind, name=damage.name, why=damage.why)
     tiles = [tile_key(tile) for tile in done.tiles]
     return Published(
         version=done.version,

@@ -23,6 +23,8 @@ _DOCS = """<!doctype html><html lang="en"><head><meta charset="utf-8"><title>map
 <body class="plain"><h1>mapvote API</h1><p>For machines: <a href=openapi.json>openapi.json</a></p>
 <table><tr><th>Method<th>Path<th>What<th>How<th>Answers</tr>ROWS</table></body></html>"""
 _STYLE = b'<link rel="stylesheet" href="viewer/pages.css">'
+_NAMED = 20
+"""Damaged things that /readyz names; the log has all."""
 _KINDS = {".html": "text/html", ".js": "text/javascript", ".css": "text/css", ".svg": "image/svg+xml"}
 router = APIRouter()
 
@@ -35,11 +37,15 @@ async def health(request: Request) -> dict[str, Any]:
 
 @router.get("/readyz", responses=problems(), summary="Can ballots be taken in?")
 async def ready(request: Request) -> dict[str, Any]:
-    """200 if the database can be written now, 503 with what it says if not, or if the server is stopping."""
+    """200 if the database can be written now, 503 with what it says if not, or if the server is stopping.
+
+    ``quarantine`` names what is damaged and was set aside: all else goes on.
+    """
     parts = services(request)
     if parts.stopping.is_set():
         raise Unavailable("the server is stopping")
-    return {"status": "ready", "version": await parts.writable.put(None)}
+    version, damaged = await parts.writable.put(None), await parts.damaged.put(None)
+    return {"status": "ready", "version": version, "quarantine": damaged[:_NAMED], "quarantined": len(damaged)}
 
 
 @router.get("/metrics", responses=problems(), response_class=Response, summary="Prometheus metrics")
@@ -47,6 +53,7 @@ async def metrics(request: Request) -> Response:
     """Counters, latencies, the newest version."""
     parts = services(request)
     parts.metrics.version.set(await parts.newest.put(None))
+    parts.metrics.tell_damaged(await parts.damaged.put(None))
     return Response(parts.metrics.text(), media_type="text/plain; version=0.0.4; charset=utf-8")
 
 

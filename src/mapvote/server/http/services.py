@@ -65,6 +65,8 @@ class Services:
     """The number of the newest version."""
     writable: Batcher[None, int]
     """The same, once a transaction could be begun that might write."""
+    damaged: Batcher[None, list[str]]
+    """What is in quarantine, in words."""
     manifests: Manifests
     clouds: Clouds
     """Levels of detail for the page."""
@@ -102,6 +104,7 @@ def make_services(store: Store, settings: Settings, gate: Gate | None, executor:
         writer=Batcher(intake.write, most.batch, threads.ballots),
         newest=Batcher(manifests.newest, _READERS, threads.lookups),
         writable=Batcher(manifests.newest_if_writable, _READERS, threads.lookups),
+        damaged=Batcher(manifests.damaged, _READERS, threads.lookups),
         manifests=manifests,
         clouds=Clouds(store),
         metrics=Metrics(),

@@ -29,7 +29,7 @@ from mapvote.server.store.eligible_votes import (
 )
 from mapvote.server.store.policy import recorded
 from mapvote.server.store.quarantine import DamagedBallots
-from mapvote.server.store.queries import current_version, tile_as_of, version_of
+from mapvote.server.store.queries import current_version, oldest_kept, tile_as_of, version_of
 from mapvote.server.store.store import Store
 
 _LOOKED_INTO = 30
@@ -163,6 +163,8 @@ def _silenced(place: _Place, drives: Sequence[TileVote]) -> set[str]:
 def _heard_by(connection: sa.Connection, store: Store, number: int, now: _Place) -> list[int]:
     """The ballots that a version heard on the cell."""
     version = version_of(connection, number)
+    if number <= oldest_kept(connection):
+        return []  # what it was made of was cleared away
     policy = recorded(version.policy)
     received_by_ns = version.created_ns - round(policy.fuse.min_age_s * 1e9)
     asked = Electorate(version.mark, policy, received_by_ns, set_aside=now.asked.set_aside)

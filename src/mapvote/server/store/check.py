@@ -20,7 +20,7 @@ from mapvote.server.store import schema
 from mapvote.server.store.blobs import MAX_PLANE_BYTES
 from mapvote.server.store.database import insert_rows
 from mapvote.server.store.quarantine import Damage, ballot_name, ballot_sum, quarantine, sum_of
-from mapvote.server.store.queries import log_event
+from mapvote.server.store.queries import log_event, oldest_kept, shows_in_kept
 from mapvote.server.store.store import Store
 
 Source = Callable[[str], bytes | None]
@@ -72,12 +72,13 @@ def _chain(connection: sa.Connection) -> Iterator[Damage]:
         if parent != last or (last is not None and number != last + 1):
             yield Damage("version", str(number), f"follows version {parent}, not {last}")
         last = number
+    kept = shows_in_kept(oldest_kept(connection))
     for name in ("points", "ground", "free", "memory"):
         column = t.c[name]
         lost = sa.select(t.c.version, t.c.row, t.c.col, column).join(
             schema.blobs, schema.blobs.c.hash == column, isouter=True
         )
-        for row in connection.execute(lost.where(column.is_not(None), schema.blobs.c.hash.is_(None))):
+        for row in connection.execute(lost.where(column.is_not(None), schema.blobs.c.hash.is_(None), kept)):
             yield Damage(
                 "plane", row[3], f"{name} of tile {tile_key((row.row, row.col))} in version {row.version} is lost"
             )

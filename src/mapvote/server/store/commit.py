@@ -19,6 +19,7 @@ from mapvote.server.store.queries import (
     end_votes,
     log_event,
     tile_row,
+    version_of,
     version_row,
 )
 from mapvote.server.store.store import Store
@@ -42,6 +43,8 @@ def write_version(store: Store, version: Version, new: NewTiles, unvoted: str | 
         with store.database.writing() as connection:
             if current_version(connection).number != version.parent:
                 raise Conflict(f"version {version.number} was published by somebody else meanwhile; look at it first")
+            if version.target is not None:
+                version_of(connection, version.target)
             seq = log_event(connection, version.created_ns, version.kind, version.published_by, f"v{version.number}")
             if version.kind != "publish":
                 version = replace(version, mark=seq)

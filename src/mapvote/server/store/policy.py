@@ -45,12 +45,20 @@ class GatePolicy(GateSettings):
     drive: str = Field(default="", description="drive on the machine that publishes; empty: no gate")
 
 
+class KeepPolicy(Section):
+    """What is cleared away (:mod:`mapvote.server.store.clearing`)."""
+
+    versions: int = Field(default=0, ge=0, description="older ones than the last so many may go; 0: none ever")
+    automatic: bool = Field(default=False, description="after every version, not only by `mapvote gc`")
+
+
 class Policy(Section):
     """All that decides what becomes of the ballots."""
 
     round: RoundPolicy = RoundPolicy()
     fuse: FuseSettings = FuseSettings()
     gate: GatePolicy = GatePolicy()
+    keep: KeepPolicy = KeepPolicy()
 
     @classmethod
     def of(cls, settings: Settings) -> Policy:

@@ -23,6 +23,7 @@ from mapvote.fusion.spent import differing
 from mapvote.server.errors import Conflict, Held
 from mapvote.server.store import schema
 from mapvote.server.store.blobs import TileHashes, pack_memory, unpack_tile
+from mapvote.server.store.clearing import clear
 from mapvote.server.store.commit import NewTiles, write_version
 from mapvote.server.store.database import address_of
 from mapvote.server.store.eligible_votes import Electorate, electorate_now, standing_tiles
@@ -111,6 +112,8 @@ def publish(
         raise Held(held)
     why = reason + (f" (in spite of: {'; '.join(held)})" if held else "")
     number = commit(store, plan, fused, by, why)
+    if plan.asked.policy.keep.automatic:
+        clear(store, by=by, dry_run=False)
     return replace(outcome, version=number, published=True)
 
 

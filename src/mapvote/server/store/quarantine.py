@@ -17,13 +17,15 @@ from mapvote.core.types import MapvoteError
 from mapvote.server.store import schema
 from mapvote.server.store.queries import log_event
 
+KINDS = ("plane", "ballot", "decision", "version", "row", "database")
+
 
 @dataclass(frozen=True, slots=True)
 class Damage:
     """One thing that is not as it was written."""
 
     kind: str
-    """plane, ballot, decision, version or database."""
+    """One of KINDS."""
     name: str
     """The plane's hash; or ballot, version and tile."""
     why: str

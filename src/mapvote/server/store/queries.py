@@ -28,13 +28,31 @@ def current_version(connection: sa.Connection) -> Version:
     return Version(**connection.execute(newest).one()._mapping)
 
 
-def version_of(connection: sa.Connection, number: int) -> Version:
-    """One version; NotFound, naming the newest, if there is none of that number."""
+def version_of(connection: sa.Connection, number: int, *, cleared: bool = False) -> Version:
+    """One version; NotFound, naming the newest, if there is none of that number, or (unless ``cleared`` will do) it was
+    cleared away."""
     row = connection.execute(sa.select(schema.versions).where(schema.versions.c.number == number)).one_or_none()
     if row is None:
         newest = current_number(connection)
         raise NotFound(f"there is no version {number}; the newest is {newest}: fetch it whole")
+    if row.cleared_seq is not None and not cleared:
+        oldest = oldest_kept(connection)
+        raise NotFound(f"version {number} was cleared away; the oldest that is kept is {oldest}")
     return Version(**row._mapping)
+
+
+def oldest_kept(connection: sa.Connection) -> int:
+    """The first version that was not cleared away."""
+    v = schema.versions
+    return int(connection.execute(sa.select(sa.func.min(v.c.number)).where(v.c.cleared_seq.is_(None))).scalar_one())
+
+
+def shows_in_kept(oldest: int) -> sa.ColumnElement[bool]:
+    """Of a row of version_tiles: whether a version from ``oldest`` on has the tile as it says."""
+    t, later = schema.version_tiles, schema.version_tiles.alias()
+    same = (later.c.row == t.c.row) & (later.c.col == t.c.col) & (later.c.version > t.c.version)
+    hidden = sa.exists().where(same, later.c.version <= oldest)
+    return (t.c.version >= oldest) | ~hidden
 
 
 def tiles_of(

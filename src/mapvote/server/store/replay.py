@@ -2,7 +2,8 @@
 
 Starts from the version before its first vote and goes through every later version again, by the policy recorded in
 each and with the ballots that stood at its moment, without the vehicle. The result is published as one new version.
-A round that made no version because of the vehicle left no trace: the next publish makes up for it. A vote that was
+Nothing is gone through again before the oldest version that is kept. A
+round that made no version because of the vehicle left no trace: the next publish makes up for it. A vote that was
 cast against a version speaks of the map that its vehicle had: it is not heard in cells that are otherwise now.
 """
 
@@ -72,6 +73,7 @@ def replay(
         raise NotFound(f"{vehicle!r} never voted here")
     touched = next((v for v in history if v.kind == "publish" and v.mark >= min(first.values())), None)
     start = newest.number if touched is None or touched.parent is None else touched.parent
+    start = max(start, next(v.number for v in history if v.cleared_seq is None))
     gone_through = _History(out, {v.number: _State(v.number) for v in history if v.number <= start})
     for version in history:
         if version.number > start:

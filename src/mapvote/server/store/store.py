@@ -165,9 +165,9 @@ class Store:
         """
         with self.database.reading() as connection:
             number = current_number(connection) if number is None else number
-            for wanted in (number, since):
-                if wanted is not None:
-                    version_of(connection, wanted)
+            version_of(connection, number)
+            if since is not None:
+                version_of(connection, since, cleared=True)
             tiles = tiles_of(connection, number)
             removed: list[TileIndex] = []
             if since is not None:

@@ -1,0 +1,126 @@
+"""What a store need not keep for ever: planes and decisions of old versions, and ballots that can decide nothing more.
+
+That a version was, by whom and why, and that a ballot was cast, stays. What is left can be published from, rolled back
+to and replayed as before, from the oldest version that is kept.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import sqlalchemy as sa
+
+from mapvote.fusion.tile_vote import DAY_NS
+from mapvote.server.store import schema
+from mapvote.server.store.policy import policy_in, recorded
+from mapvote.server.store.queries import current_number, log_event, oldest_kept, shows_in_kept, version_of
+from mapvote.server.store.store import Store
+
+_AT_ONCE = 500
+
+
+@dataclass(frozen=True, slots=True)
+class Cleared:
+    """What went, or would go."""
+
+    oldest: int
+    """The oldest version that is left."""
+    versions: int
+    planes: int
+    decisions: int
+    ballots: int
+    """Votes of one drive on one tile."""
+    size: int
+    """Bytes of all these."""
+
+
+def clear(store: Store, *, by: str = "operator", dry_run: bool = True) -> Cleared:
+    """Clear away what the policy does not keep, in one transaction; with ``dry_run`` only say what."""
+    with store.database.reading() if dry_run else store.database.writing() as connection:
+        oldest = _oldest_to_keep(connection)
+        old_planes, old_ballots = _planes(connection, oldest), _ballots(connection, oldest)
+        old_decisions = _decisions(connection, oldest)
+        v = schema.versions
+        gone = (v.c.number < oldest) & v.c.cleared_seq.is_(None)
+        versions = int(connection.execute(sa.select(sa.func.count()).where(gone)).scalar_one())
+        size = sum(row.size for row in (*old_planes, *old_ballots, *old_decisions))
+        found = Cleared(oldest, versions, len(old_planes), len(old_decisions), len(old_ballots), size)
+        if dry_run or not (versions or old_planes or old_ballots or old_decisions):
+            return found
+        told = f"{versions} versions before {oldest}, {len(old_ballots)} ballots on tiles, {size} bytes"
+        seq = log_event(connection, store.clock(), "cleared", by, told)
+        connection.execute(v.update().where(gone).values(cleared_seq=seq))
+        _delete(connection, schema.decisions, ("version", "row", "col"), old_decisions)
+        _delete(connection, schema.ballot_tiles, ("row", "col", "ballot"), old_ballots)
+        _delete(connection, schema.blobs, ("hash",), old_planes)
+        _give_back_quota(connection)
+    return found
+
+
+def _oldest_to_keep(connection: sa.Connection) -> int:
+    """The first of the last so many versions; one that was not cleared yet if none may go."""
+    keep, before = policy_in(connection).keep.versions, oldest_kept(connection)
+    return before if keep == 0 else max(before, current_number(connection) - keep + 1)
+
+
+def _planes(connection: sa.Connection, oldest: int) -> list[Any]:
+    """Planes that no version from ``oldest`` on shows."""
+    t, b = schema.version_tiles, schema.blobs
+    needed = sa.union(*(sa.select(t.c[name]).where(t.c[name].is_not(None), shows_in_kept(oldest)) for name in _PLANES))
+    unused = sa.select(b.c.hash, sa.func.length(b.c.data).label("size")).where(b.c.hash.not_in(needed))
+    return list(connection.execute(unused).all())
+
+
+def _decisions(connection: sa.Connection, oldest: int) -> list[Any]:
+    d = schema.decisions
+    size = (sa.func.length(d.c.states) + sa.func.length(d.c.tally)).label("size")
+    return list(connection.execute(sa.select(d.c.version, d.c.row, d.c.col, size).where(d.c.version < oldest)).all())
+
+
+def _ballots(connection: sa.Connection, oldest: int) -> list[Any]:
+    """Votes on a tile that no version after ``oldest`` has heard or can hear: withdrawn or replaced before it, or older
+    than every window since, counted from the newest vote on the tile that stood then and still does."""
+    t, b, then = schema.ballot_tiles, schema.ballots, version_of(connection, oldest)
+    newest = (
+        sa.select(t.c.row, t.c.col, sa.func.max(b.c.end_ns).label("end_ns"))
+        .join(b, b.c.seq == t.c.ballot)
+        .where(b.c.seq <= then.mark, b.c.gone_seq.is_(None))
+        .group_by(t.c.row, t.c.col)
+        .subquery()
+    )
+    window_ns = round(_longest_window_days(connection, oldest) * DAY_NS)
+    past = (b.c.gone_seq <= then.mark) | (b.c.end_ns < newest.c.end_ns - window_ns)
+    size = sum((sa.func.coalesce(sa.func.length(t.c[name]), 0) for name in _OF_BALLOTS), start=sa.literal(0))
+    found = (
+        sa.select(t.c.row, t.c.col, t.c.ballot, size.label("size"))
+        .join(b, b.c.seq == t.c.ballot)
+        .join(newest, (newest.c.row == t.c.row) & (newest.c.col == t.c.col), isouter=True)
+    )
+    return list(connection.execute(found.where(past)).all())
+
+
+def _longest_window_days(connection: sa.Connection, oldest: int) -> float:
+    """By the policy that holds, and those by which the versions that are left would be made again."""
+    v = schema.versions
+    made_by = connection.execute(sa.select(v.c.policy).where(v.c.number >= oldest, v.c.kind == "publish")).scalars()
+    policies = [policy_in(connection), *(recorded(one) for one in made_by)]
+    return max(max(policy.fuse.max_age_days, policy.fuse.stay_days) for policy in policies)
+
+
+def _delete(connection: sa.Connection, table: sa.Table, key: Iterable[str], rows: list[Any]) -> None:
+    columns = sa.tuple_(*(table.c[name] for name in key))
+    for start in range(0, len(rows), _AT_ONCE):
+        some = [tuple(getattr(row, name) for name in key) for row in rows[start : start + _AT_ONCE]]
+        connection.execute(table.delete().where(columns.in_(some)))
+
+
+def _give_back_quota(connection: sa.Connection) -> None:
+    """A ballot of which nothing is left takes no room any more."""
+    b, t = schema.ballots, schema.ballot_tiles
+    connection.execute(b.update().where(b.c.bytes > 0, ~sa.exists().where(t.c.ballot == b.c.seq)).values(bytes=0))
+
+
+_PLANES = ("points", "ground", "free", "memory")
+_OF_BALLOTS = ("states", "tally", "gone", "new_points", "free")

@@ -1,0 +1,146 @@
+"""What is cleared away, and that everything from the oldest kept version on goes on as if nothing had been."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import sqlalchemy as sa
+
+from hand_made import Say, make_ballot, states_plane, two_walls, wall
+from mapvote.codec.ballot import encode
+from mapvote.config import FuseSettings
+from mapvote.core.types import CellState
+from mapvote.fusion.tile_vote import DAY_NS
+from mapvote.server.errors import NotFound
+from mapvote.server.insight.explain import explain_cell
+from mapvote.server.store import schema
+from mapvote.server.store.admission import accept, examine
+from mapvote.server.store.ballots import Receipt
+from mapvote.server.store.blobs import pack_tile
+from mapvote.server.store.check import check
+from mapvote.server.store.clearing import clear
+from mapvote.server.store.policy import KeepPolicy, Policy, set_policy
+from mapvote.server.store.publish import publish, rollback
+from mapvote.server.store.replay import replay
+from mapvote.server.store.store import Store
+
+CELL = (20, 20)
+START_NS = 1_700_000_000 * 10**9
+FUSE = FuseSettings(max_deleted_share=1.0, prior_stay_days=1e6)
+
+
+class Clock:
+    now = START_NS
+
+    def __call__(self) -> int:
+        return self.now
+
+
+@pytest.fixture
+def clock() -> Clock:
+    return Clock()
+
+
+@pytest.fixture
+def store(database_url: str, clock: Clock) -> Iterator[Store]:
+    store = Store.create(database_url, two_walls(), Policy(fuse=FUSE, keep=KeepPolicy(versions=3)), clock=clock)
+    yield store
+    store.close()
+
+
+def come_and_go(store: Store, clock: Clock, times: int, days: float = 20.0) -> None:
+    """Something is put on the lawn, or taken away again, by two vehicles every so many days: a version each time."""
+    for _ in range(times):
+        clock.now += round(days * DAY_NS)
+        base, there = store.point_map(), store.current() % 2 == 0
+        state = CellState.CHANGED_EMPTY if there else CellState.CHANGED_OCCUPIED
+        say = Say(states_plane({CELL: state}), new_points=None if there else wall([CELL], [0.45, 0.75]))
+        for vehicle in ("a", "b"):
+            ballot = make_ballot(base, {(0, 0): say}, vehicle, f"d{clock.now}", clock.now)
+            (receipt,) = accept(store, [examine(encode(ballot))])
+            assert isinstance(receipt, Receipt), receipt
+        assert publish(store).published
+
+
+def rows(store: Store, table: sa.Table) -> int:
+    with store.database.reading() as connection:
+        return int(connection.execute(sa.select(sa.func.count()).select_from(table)).scalar_one())
+
+
+def test_a_dry_run_says_what_would_go_and_takes_nothing(store: Store, clock: Clock) -> None:
+    come_and_go(store, clock, 8)
+    tables = schema.blobs, schema.decisions, schema.ballot_tiles
+    before = [rows(store, table) for table in tables]
+    said = clear(store)
+    assert (said.oldest, said.versions) == (7, 6)
+    assert min(said.planes, said.decisions, said.ballots, said.size) > 0
+    assert [rows(store, table) for table in tables] == before
+    assert clear(store, dry_run=False) == said
+    after = [rows(store, table) for table in tables]
+    gone = [b - a for b, a in zip(before, after, strict=True)]
+    assert gone == [said.planes, said.decisions, said.ballots]
+    again = clear(store, dry_run=False)
+    assert (again.versions, again.planes, again.decisions, again.ballots, again.size) == (0, 0, 0, 0, 0)
+
+
+def test_what_is_left_is_whole_and_bit_for_bit_as_it_was(store: Store, clock: Clock) -> None:
+    come_and_go(store, clock, 8)
+    before = {n: [pack_tile(tile) for tile in store.point_map(n).tiles.values()] for n in (7, 8, 9)}
+    changed = store.manifest(since=2).tiles
+    clear(store, dry_run=False)
+    assert check(store) == []
+    assert {n: [pack_tile(tile) for tile in store.point_map(n).tiles.values()] for n in (7, 8, 9)} == before
+    assert store.manifest(since=2).tiles == changed, "who drives with an old version is told what changed since"
+    for lost in (lambda: store.point_map(3), lambda: store.manifest(3), lambda: rollback(store, 3)):
+        with pytest.raises(NotFound, match="version 3 was cleared away; the oldest that is kept is 7"):
+            lost()
+    assert rollback(store, 7).number == 10
+    assert [v.number for v in store.versions()] == list(range(1, 11)), "that they were stays"
+    story = explain_cell(store, 20.5 * 0.3, 20.5 * 0.3)
+    assert [version for version, _ in story.decisions] == [7, 8, 9]
+
+
+def test_it_goes_on_as_if_nothing_had_been_cleared(store: Store, clock: Clock, tmp_path: Path) -> None:
+    """The same history with and without clearing ends in the same map."""
+    come_and_go(store, clock, 6)
+    clear(store, dry_run=False)
+    come_and_go(store, clock, 4)
+    clear(store, dry_run=False)
+    cleared = [pack_tile(tile) for tile in store.point_map().tiles.values()]
+    other_clock = Clock()
+    other = Store.create(f"sqlite:///{tmp_path / 'other.db'}", two_walls(), Policy(fuse=FUSE), clock=other_clock)
+    come_and_go(other, other_clock, 10)
+    assert cleared == [pack_tile(tile) for tile in other.point_map().tiles.values()]
+    other.close()
+
+
+def test_a_replay_begins_at_the_oldest_version_that_is_left(store: Store, clock: Clock) -> None:
+    come_and_go(store, clock, 8)
+    whole = replay(store, "a", dry_run=True)
+    clear(store, dry_run=False)
+    done = replay(store, "a", dry_run=False)
+    assert store.versions()[-1].target == 7
+    assert done.published == bool(whole.tiles) or done.published
+
+
+def test_a_vehicle_gets_its_quota_back(store: Store, clock: Clock) -> None:
+    come_and_go(store, clock, 8)
+    clear(store, dry_run=False)
+    with store.database.reading() as connection:
+        b = schema.ballots
+        taken = connection.execute(sa.select(b.c.bytes > 0).order_by(b.c.seq)).scalars().all()
+    assert (taken[0], taken[-1]) == (False, True)
+    assert len(taken) == 16, "that they voted stays"
+
+
+def test_the_policy_clears_by_itself_and_keeps_everything_unless_told(store: Store, clock: Clock) -> None:
+    set_policy(store, Policy(fuse=FUSE))
+    come_and_go(store, clock, 5)
+    assert clear(store).versions == 0
+    set_policy(store, Policy(fuse=FUSE, keep=KeepPolicy(versions=2, automatic=True)))
+    come_and_go(store, clock, 1)
+    assert clear(store).versions == 0
+    with pytest.raises(NotFound, match="the oldest that is kept is 6"):
+        store.point_map(5)
