@@ -1,0 +1,175 @@
+"""Flip one bit of a store, a hundred times: does `mapvote check` name it, and is everything else still published?
+
+python benchmarks/flipped_bits.py --database sqlite
+python benchmarks/flipped_bits.py --database postgresql
+
+A store of six tiles, three versions, a round of ballots under way. Each time a fresh copy of it, and one bit of one
+value turned: of a random byte of all that it stores (``--every-table``: of a random table's instead, so that small
+tables are met as often as large ones). Named: check tells of the damage. Then a publish: whatever the bit did not touch
+must come out as it would have. Served: every plane of every other tile can be fetched and is what its hash says.
+"""
+
+from __future__ import annotations
+
+import argparse
+import random
+import sys
+import tempfile
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import sqlalchemy as sa
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+
+from hand_made import Say, make_ballot, make_map, make_tile, states_plane, wall
+from mapvote.codec.ballot import encode
+from mapvote.config import FuseSettings
+from mapvote.core.grid import TileIndex
+from mapvote.core.types import CellState, MapvoteError
+from mapvote.server.store import schema
+from mapvote.server.store.admission import accept, examine
+from mapvote.server.store.ballots import Receipt
+from mapvote.server.store.blobs import TileHashes, unpack_points_plane
+from mapvote.server.store.check import check
+from mapvote.server.store.policy import Policy
+from mapvote.server.store.publish import publish
+from mapvote.server.store.store import Store
+from postgres_cluster import PostgresCluster
+
+TILES = [(0, col) for col in range(6)]
+CELLS = [(10, 10 + c) for c in range(4)]
+TABLES = [table for table in schema.metadata.sorted_tables if table.name != "quarantine"]
+Place = tuple[sa.Table, sa.Column[Any], dict[str, Any]]
+
+
+def make(url: str) -> None:
+    """The store that is damaged again and again."""
+    tiles = {
+        index: make_tile(wall(CELLS, [0.05, 0.45, 0.75 + 0.01 * index[1]]), ground=0.001 * index[1], index=index)
+        for index in TILES
+    }
+    store = Store.create(url, make_map(tiles), Policy(fuse=FuseSettings(max_deleted_share=1.0)))
+    for step, cell in enumerate(CELLS[:3]):
+        base = store.point_map()
+        for vehicle in ("a", "b", "c"):
+            say = Say(states_plane({cell: CellState.CHANGED_EMPTY}, fill=CellState.UNDETERMINED))
+            ballot = make_ballot(base, dict.fromkeys(TILES, say), vehicle, f"d{step}", store.clock() - 10**9)
+            (receipt,) = accept(store, [examine(encode(ballot))])
+            assert isinstance(receipt, Receipt), receipt
+        if step < 2:
+            assert publish(store).published
+    store.close()
+
+
+def bytes_of(connection: sa.Connection) -> list[tuple[int, Place]]:
+    """Every value that has bytes, with how many."""
+    found = []
+    for table in TABLES:
+        for row in connection.execute(sa.select(table)).mappings():
+            key = {column.name: row[column.name] for column in table.primary_key}
+            for column in table.columns:
+                value = row[column.name]
+                if isinstance(value, bytes | memoryview | str) and len(value) and not column.primary_key:
+                    found.append((len(value), (table, column, key)))
+    return found
+
+
+def flip(store: Store, rng: random.Random, every_table: bool) -> Place:
+    """Turn one bit; where."""
+    with store.database.writing() as connection:
+        values = bytes_of(connection)
+        if every_table:
+            table = rng.choice(sorted({place[0].name for _, place in values}))
+            values = [(size, place) for size, place in values if place[0].name == table]
+        ((_, place),) = rng.choices(values, weights=[size for size, _ in values])
+        table, column, key = place
+        where = sa.and_(*(table.c[name] == value for name, value in key.items()))
+        value = connection.execute(sa.select(column).where(where)).scalar_one()
+        connection.execute(table.update().where(where).values({column.name: _turned(value, rng)}))
+    return place
+
+
+def _turned(value: Any, rng: random.Random) -> Any:
+    raw = bytearray(value.encode() if isinstance(value, str) else bytes(value))
+    at = rng.randrange(len(raw))
+    if isinstance(value, str):  # the low bits: what stays text
+        raw[at] ^= 1 << rng.randrange(3)
+        return raw.decode()
+    raw[at] ^= 1 << rng.randrange(8)
+    return bytes(raw)
+
+
+def touches(place: Place, index: TileIndex, hashes: TileHashes) -> bool:
+    """Whether the damage is of this tile or of its votes."""
+    table, _, key = place
+    if table is schema.blobs:
+        return key["hash"] in (hashes.points, hashes.ground, hashes.free, hashes.memory)
+    return key.get("row", index[0]) == index[0] and key.get("col", index[1]) == index[1]
+
+
+def try_once(url: str, rng: random.Random, every_table: bool, expected: dict[TileIndex, TileHashes]) -> tuple[str, ...]:
+    """(where, named or not, how the rest fared)."""
+    store = Store.open(url)
+    try:
+        before = store.manifest().tiles
+        place = flip(store, rng, every_table)
+        where, named = f"{place[0].name}.{place[1].name}", "named" if check(store) else "not named"
+        try:
+            publish(store)
+            after = store.manifest().tiles
+            others = [index for index in TILES if not touches(place, index, before[index])]
+            wrong = [index for index in others if after[index] != expected[index]]
+            for index in others:
+                unpack_points_plane(store.blob(after[index].points), after[index].points)
+            return where, named, f"{len(wrong)} other tiles were not published" if wrong else "all else published"
+        except MapvoteError as error:
+            return where, named, f"not published: {error}"[:100]
+    finally:
+        store.close()
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--database", choices=["sqlite", "postgresql"], default="sqlite")
+    parser.add_argument("--flips", type=int, default=100)
+    parser.add_argument("--every-table", action="store_true")
+    asked = parser.parse_args()
+    results: Counter[tuple[str, ...]] = Counter()
+    cluster = PostgresCluster() if asked.database == "postgresql" else None
+    try:
+        with tempfile.TemporaryDirectory() as folder:
+            first = Path(folder) / "first.db"
+            make(cluster.create("first") if cluster else f"sqlite:///{first}")
+            url = _copy(cluster, first, "expected")
+            store = Store.open(url)
+            publish(store)
+            expected = dict(store.manifest().tiles)
+            store.close()
+            for number in range(asked.flips):
+                url = _copy(cluster, first, f"s{number}")
+                results[try_once(url, random.Random(number), asked.every_table, expected)] += 1
+                if cluster:
+                    cluster.drop(f"s{number}")
+    finally:
+        if cluster:
+            cluster.close()
+    print(f"| {asked.database}: where the bit was | flips | check | the rest |\n|---|---|---|---|")
+    for (where, named, rest), count in sorted(results.items()):
+        print(f"| `{where}` | {count} | {named} | {rest} |")
+    named = sum(count for (_, found, _), count in results.items() if found == "named")
+    whole = sum(count for (_, _, rest), count in results.items() if rest == "all else published")
+    print(f"{asked.flips} flips: {named} named, all else published after {whole}")
+
+
+def _copy(cluster: PostgresCluster | None, first: Path, name: str) -> str:
+    if cluster:
+        return cluster.create(name, like="first")
+    file = first.with_name(f"{name}.db")
+    file.write_bytes(first.read_bytes())
+    return f"sqlite:///{file}"
+
+
+if __name__ == "__main__":
+    main()
