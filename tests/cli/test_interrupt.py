@@ -12,8 +12,12 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from typer.main import get_command
 
 from live_server import mapvote
+from mapvote.cli import app
+from mapvote.server.insight.history import events
+from mapvote.server.store.store import Store
 
 Desk = Callable[..., Path]
 
@@ -66,7 +70,23 @@ VERBS = {
     "changes STORE --out new": "import mapvote.server.insight.history as m; m.changes_between = wait",
     "vehicles STORE": "import mapvote.server.insight.history as m; m.vehicle_standings = wait",
     "config": "import mapvote.config as m; m.load_with_sources = wait",
+    "demo --quick --out new": "import mapvote.evaluation.demo as m; m.evaluate = wait",
+    "evaluate tiny.toml --json new": "import mapvote.evaluation.evaluate as m; m.evaluate = wait",
+    "warmup": "import mapvote.warmup as m; m.warm_up = wait",
+    "follow http://localhost:9 new --autoware": "import mapvote.client as m; m.MapClient.newest = wait",
+    "policy STORE": "import mapvote.server.store.policy as m; m.policy_changes = wait; m.current_policy = wait",
+    "rollback STORE 1": "import mapvote.server.store.publish as m; m.rollback = wait",
+    "unvote STORE car_1": "import mapvote.server.store.ballots as m; m.withdraw = wait",
+    "check STORE --mend": "import mapvote.server.store.check as m; m.check = wait",
+    "upgrade STORE": "import mapvote.server.store.migrate as m; m.upgrade = wait",
+    "keys STORE": "import mapvote.server.store.keys as m; m.listed = wait",
 }
+ELSEWHERE = {"serve", "simulate"}
+"""Verbs with a test of their own below."""
+
+
+def test_every_verb_is_interrupted_by_a_test() -> None:
+    assert {line.split()[0] for line in VERBS} | ELSEWHERE == set(get_command(app).commands)  # type: ignore[attr-defined]
 
 
 FAST = ("vote", "publish")
@@ -84,6 +104,28 @@ def test_ctrl_c_in_the_middle_of_a_verb_ends_it_with_one_line(line: str, desk: D
     left = {p.name for p in here.iterdir()} - {"ready", "STORE-wal", "STORE-shm", *words}
     assert left == set()
     assert not any((here / name).exists() for name in ("new", "new.pcd"))
+
+
+@pytest.mark.parametrize(
+    "line", ["rollback STORE 1", pytest.param("unvote STORE car_1 --replay --yes", marks=pytest.mark.slow)]
+)
+def test_ctrl_c_while_a_version_is_being_written_leaves_no_version(line: str, desk: Desk) -> None:
+    """Its row is there by then, in a transaction that never ends."""
+    here = desk("STORE")
+    before = what_is_in(here / "STORE")
+    patch = "import mapvote.server.store.commit as m; m.tile_row = wait"
+    done = interrupt(slowed(line.split(), patch), here, (here / "ready").exists)
+    assert stopped_by_a_line(done)
+    assert what_is_in(here / "STORE") == before
+    assert before[0] == [1, 2]
+
+
+def what_is_in(path: Path) -> tuple[list[int], list[str]]:
+    """Versions and events of a store."""
+    store = Store.open(f"sqlite:///{path}")
+    found = [v.number for v in store.versions()], [str(event) for event in events(store, 99)]
+    store.close()
+    return found
 
 
 WRITERS = {

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -46,7 +47,7 @@ def brute_passed(points: np.ndarray, origin: np.ndarray, reference: Reference) -
     return surely, possibly
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=12, deadline=None)
 @given(st.integers(0, 2**31), st.integers(1, 12), st.booleans())
 def test_passed_words_agree_with_a_brute_force_walk_in_3d(seed: int, n: int, hilly: bool) -> None:
     rng = np.random.default_rng(seed)
@@ -121,3 +122,120 @@ def test_ranges_on_the_edge_of_a_sorting_step_are_sorted_all_the_same() -> None:
         points, np.array([0.0, 0.0, 1.8]), np.ones(len(reach), bool), np.zeros(len(reach), bool), flat_reference()
     )
     assert view.counts.sum() > 0
+
+
+def wide_reference(side: int = 301) -> Reference:
+    """Flat ground at 0 over a window of 45 m to each side."""
+    grid = Grid(Lattice(), -(side // 2), -(side // 2), side, side)
+    zero, empty = np.zeros(grid.shape, np.float32), np.zeros(grid.shape, np.uint64)
+    none = np.full(grid.shape, np.inf, np.float32)
+    return Reference(grid, zero, zero.astype(np.int32), empty, np.zeros(grid.shape, np.int32), none, -none, None)
+
+
+def along(fan: int, distance: np.ndarray) -> np.ndarray:
+    """(n, 2) points so far off in the middle of a fan."""
+    azimuth = (fan + 0.5) * 2 * np.pi / FANS
+    return np.column_stack([np.cos(azimuth) * distance, np.sin(azimuth) * distance])
+
+
+@pytest.mark.parametrize(
+    ("fan", "from_m"), [(1, 25.0), (1023, 25.0), (2, 12.5), (6, 12.5), (4, 6.25), (40, 3.125), (64, 0.4), (128, 0.0)]
+)
+def test_near_the_sensor_only_some_fans_mark_what_they_pass_and_all_of_them_see(fan: int, from_m: float) -> None:
+    """Every second fan nearer than 25 m, every fourth nearer than half of it, and so on: two fans cross every cell."""
+    reference, origin = wide_reference(), np.array([0.15, 0.15, 1.8])
+    flat = along(fan, np.array([40.0])) + origin[:2]
+    view = cast_rays(np.column_stack([flat, [1.8]]), origin, np.array([True]), np.array([False]), reference)
+    distance = np.arange(0.4, 39.0, 0.05)
+    rows, cols, _ = reference.grid.indices_of(np.column_stack([along(fan, distance) + origin[:2], 0 * distance]))
+    marked = view.passed[rows, cols] != 0
+    assert not marked[distance < from_m - 0.45].any()
+    assert marked[distance > from_m + 0.45].all()
+    assert (view.sight[rows, cols] == Sight.CLEAR).all()
+
+
+@given(st.integers(0, 2**31), st.booleans())
+@settings(max_examples=8, deadline=None)
+def test_all_rays_of_one_fan_are_walked_at_once_each_to_its_own_end(seed: int, hilly: bool) -> None:
+    """A dozen beams of one firing, in any order: the words of the fan are those of each ray by itself."""
+    rng = np.random.default_rng(seed)
+    reference = flat_reference(rng.uniform(-1.0, 1.0, (SIDE, SIDE)) if hilly else None)
+    origin = np.array([0.3, -0.2, 1.7])
+    reach = rng.permutation(np.concatenate([rng.uniform(0.8, 8.0, 11), [3.0, 3.0]]))
+    flat = along(128 * int(rng.integers(16)), reach)
+    points = origin + np.column_stack([flat, reach * np.tan(rng.uniform(-0.5, 0.9, len(reach)))])
+    yes, no = np.ones(len(points), bool), np.zeros(len(points), bool)
+    together = cast_rays(points, origin, yes, no, reference)
+    apart = [cast_rays(p[None], origin, yes[:1], no[:1], reference) for p in points]
+    np.testing.assert_array_equal(together.passed, np.bitwise_or.reduce([view.passed for view in apart]))
+    np.testing.assert_array_equal(together.hit, np.bitwise_or.reduce([view.hit for view in apart]))
+    np.testing.assert_array_equal(together.counts, np.sum([view.counts for view in apart], axis=0))
+    surely, possibly = brute_passed(points, origin, reference)
+    assert not (together.passed & ~possibly).any()
+    assert not (surely & ~together.passed).any()
+
+
+@pytest.mark.parametrize("way", [(1, 0), (0, 1), (-1, 0), (0, -1)])
+def test_a_ray_along_an_axis_passes_the_cells_of_one_row_or_column_and_no_other(way: tuple[int, int]) -> None:
+    reference, origin = wide_reference(), np.array([0.15, 0.15, 0.75])
+    end = origin + 6.09 * np.array([*way, 0.0])
+    view = cast_rays(end[None], origin, np.array([True]), np.array([False]), reference)
+    middle = reference.grid.rows // 2
+    cells = np.argwhere(view.passed) - middle
+    # the last 0.45 m before the hit prove nothing: 5.64 m are 18.8 cells, and the sensor is in the middle of one
+    assert sorted(map(tuple, cells.tolist())) == sorted((way[1] * k, way[0] * k) for k in range(20))
+    assert set(view.passed[view.passed != 0].tolist()) == {0b100}
+    seen = np.argwhere(view.sight == Sight.CLEAR) - middle
+    assert sorted(map(tuple, seen.tolist())) == sorted((way[1] * k, way[0] * k) for k in range(21))
+    beyond = np.argwhere(view.sight == Sight.BEYOND) - middle
+    assert len(beyond) == middle - 20
+
+
+def test_points_of_a_cell_are_counted_and_marked_at_their_heights() -> None:
+    reference = flat_reference()
+    points = np.array([[3.0, 3.0, 0.4], [3.02, 3.05, 0.5], [3.0, 3.0, 1.0], [3.0, 3.0, 30.0], [-3.0, 3.0, 0.7]])
+    view = cast_rays(points, np.array([0.0, 0.0, 1.8]), np.ones(5, bool), np.array([0, 0, 0, 0, 1], bool), reference)
+    rows, cols, _ = reference.grid.indices_of(points)
+    assert view.counts[rows[0], cols[0]] == 4
+    assert int(view.hit[rows[0], cols[0]]) == 0b1010 | 1 << 63, "and whatever is higher than a word in its last bit"
+    assert view.counts.sum() == 4
+
+
+def test_what_lies_in_the_sensors_own_cell_proves_nothing() -> None:
+    origin = np.array([0.2, 0.05, 1.8])
+    near = origin + np.array([[0.29, 0.0, 0.0], [0.0, -0.2, 0.0], [0.0, 0.0, -1.8]])
+    view = cast_rays(near, origin, np.ones(3, bool), np.zeros(3, bool), flat_reference())
+    assert not view.passed.any()
+    assert not view.sight.any()
+
+
+def test_a_ray_goes_on_over_what_is_below_the_window_and_above_a_word() -> None:
+    """A bridge: the ground of some cells lies 6 m below, that of others 25 m above the ray."""
+    ground = np.zeros((SIDE, SIDE))
+    ground[:, 35:40], ground[:, 45:50] = -6.0, 25.0
+    reference, origin = flat_reference(ground), np.array([0.0, 0.0, 1.75])
+    view = cast_rays(np.array([[8.0, 0.0, 1.75]]), origin, np.array([True]), np.array([False]), reference)
+    row = 30
+    assert set(view.passed[row, 35:40].tolist()) == {1 << 25}, "5.75 + 0.25 voxels of 0.3 m above 20 layers down"
+    assert not view.passed[row, 45:50].any()
+    assert set(view.passed[row, 40:45].tolist()) == {1 << 5}
+    assert not (view.passed >> np.uint64(63)).any()
+
+
+def test_words_hold_what_is_passed_up_to_19_m_and_nothing_above() -> None:
+    reference, origin = flat_reference(), np.array([0.0, 0.0, 1.8])
+    view = cast_rays(np.array([[6.0, 0.0, 60.0]]), origin, np.array([True]), np.array([False]), reference)
+    together = int(np.bitwise_or.reduce(view.passed.ravel()))
+    assert together == (1 << 63) - (1 << 6)
+
+
+def test_the_middle_of_a_fan_is_the_mean_of_its_rays() -> None:
+    """Two rays at the edges of a fan of 0.18 degrees: at 14 m the fan passes between them."""
+    reference, origin = wide_reference(), np.array([0.0, 0.0, 1.0])
+    azimuth = (128 + np.array([0.02, 0.98])) * 2 * np.pi / FANS
+    points = np.column_stack([40.0 * np.cos(azimuth), 40.0 * np.sin(azimuth), [1.0, 1.0]])
+    view = cast_rays(points, origin, np.ones(2, bool), np.zeros(2, bool), reference)
+    middle = cast_rays(
+        np.array([[*along(128, np.array([40.0]))[0], 1.0]]), origin, np.ones(1, bool), np.zeros(1, bool), reference
+    )
+    np.testing.assert_array_equal(view.passed, middle.passed)
