@@ -3,7 +3,7 @@
     python benchmarks/fusion.py                        # 25 to 200 vehicles, 4 to 16 tiles, one and two threads
     python benchmarks/fusion.py --planes states        # votes alone: no delete masks, no points, no free space
 
-A run is `publish(dry_run=True)`: it reads every ballot from the database, decompresses it, checks which cells count,
+A run is `preview()`: it reads every ballot from the database, decompresses it, checks which cells count,
 decides, edits the tiles and packs them. One vehicle on one tile is 65,536 cell-votes, spoken or not. The ballots are
 shaped like those of simulated drives: a corridor of street seen, noise along its borders, a house that fell and a
 kiosk that rose. The peer is the same decision in plain numpy (`numpy_round`), from the same database with sqlite3 and
@@ -39,7 +39,7 @@ from mapvote.core.types import NO_VOTE, U8, CellState
 from mapvote.fusion.tile_vote import DAY_NS
 from mapvote.server.store.admission import accept, examine
 from mapvote.server.store.ballots import Receipt
-from mapvote.server.store.publish import publish
+from mapvote.server.store.publish import preview
 from mapvote.server.store.store import Store
 
 SHAPE = (256, 256)
@@ -125,7 +125,7 @@ def our_round(store: Store, policy: FuseSettings, threads: int) -> float:
     """Seconds for a dry run."""
     with ThreadPoolExecutor(threads) as pool:
         start = time.perf_counter()
-        publish(store, policy, dry_run=True, executor=pool)
+        preview(store, policy, executor=pool)
         return time.perf_counter() - start
 
 

@@ -9,11 +9,11 @@ from typing import Literal
 import numpy as np
 
 from mapvote.codec.ballot import Ballot, BallotTile, pack_plane, tile_key
+from mapvote.codec.tile_file import base_hash
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Lattice, TileIndex
 from mapvote.core.point_map import PointMap
 from mapvote.core.tile import Tile
 from mapvote.core.types import F32, NO_VOTE, U8, U16, U64, Scan
-from mapvote.fusion.offline import base_hash
 from mapvote.localisation.ndt import PosePrior
 from mapvote.localisation.tracker import Fix
 

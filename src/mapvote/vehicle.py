@@ -6,7 +6,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from mapvote.codec.ballot import Ballot, BallotTile, content_hash, pack_plane, tile_key
+from mapvote.codec.ballot import Ballot, BallotTile, pack_plane, tile_key
+from mapvote.codec.tile_file import base_hash
 from mapvote.config import Settings
 from mapvote.core.grid import TileIndex
 from mapvote.core.point_map import PointMap
@@ -107,7 +108,7 @@ def write_ballot(
     return Ballot(
         map_id=point_map.map_id,
         version=point_map.version,
-        base={tile_key(tile): _base_hash(point_map, tile) for tile in votes},
+        base={tile_key(tile): base_hash(point_map.tiles.get(tile)) for tile in votes},
         vehicle=vehicle,
         drive=drive,
         start_ns=report.stamps_ns[0],
@@ -150,10 +151,6 @@ def _ballot_tile(
         new_points=new_points,
         free=None if votes.free is None else pack_plane(votes.free),
     )
-
-
-def _base_hash(point_map: PointMap, tile: TileIndex) -> str:
-    return content_hash(point_map.tiles[tile].points) if tile in point_map.tiles else ""
 
 
 def vote_drive(

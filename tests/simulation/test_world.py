@@ -9,7 +9,7 @@ from mapvote.core.types import MapvoteError
 from mapvote.simulation.actors import make_traffic
 from mapvote.simulation.routes import make_routes
 from mapvote.simulation.scenario import load_scenario, names
-from mapvote.simulation.truth import CHANGED_EMPTY, CHANGED_OCCUPIED, UNCHANGED, UNSCORED, judge, truth_grid
+from mapvote.simulation.truth import CHANGED_EMPTY, CHANGED_OCCUPIED, UNCHANGED, UNSCORED, label_cells, truth_grid
 from mapvote.simulation.world import Body, Role, make_world
 
 
@@ -153,6 +153,6 @@ def test_truth_of_single_cells() -> None:
             assert isinstance(hits, dict)
             for role, count in hits.items():
                 planes[plane, role, 0, column] = count
-    strict, provenance, _ = judge(planes[:2], planes[2], planes[3], rate_hz=10.0)
+    strict, provenance, _ = label_cells(planes[:2], planes[2], planes[3], rate_hz=10.0)
     assert strict[0].tolist() == [case[4] for case in cases]
     assert provenance[0].tolist() == [case[5] for case in cases]

@@ -77,12 +77,16 @@ def publish(
 
     from mapvote.config import load_settings
     from mapvote.server.insight.localisation_gate import gate_by
+    from mapvote.server.store.publish import preview
     from mapvote.server.store.publish import publish as publish_version
 
-    judge = gate_by(load_settings(config).ndt)
+    reference = gate_by(load_settings(config).ndt)
     workers = dask_cluster(cluster) if cluster else ThreadPoolExecutor(2)
     with opened_store(store) as opened, workers as executor, waiting("deciding"):
-        done = publish_version(opened, reason=reason, dry_run=dry_run, override=override, gate=judge, executor=executor)
+        if dry_run:
+            done = preview(opened, gate=reference, executor=executor)
+        else:
+            done = publish_version(opened, reason=reason, override=override, gate=reference, executor=executor)
     _print_outcome(done, "published" if done.published else "dry run" if dry_run else "nothing changed")
 
 

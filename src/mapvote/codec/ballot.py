@@ -16,7 +16,6 @@ import numpy as np
 
 from mapvote.codec.arrays import pack_plane as pack_plane
 from mapvote.codec.arrays import unpack_bytes, unpack_frames, unpack_plane
-from mapvote.codec.tile_file import content_hash as content_hash
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, TileIndex
 from mapvote.core.types import F32, N_STATES, NO_VOTE, U8, U16, U64, MapvoteError
 

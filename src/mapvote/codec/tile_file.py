@@ -41,6 +41,11 @@ def content_hash(tile_points: F32) -> str:
     return hashlib.sha256(np.ascontiguousarray(tile_points, dtype="<f4").tobytes()).hexdigest()
 
 
+def base_hash(tile: Tile | None) -> str:
+    """The content hash that a ballot gives for this tile: "" where the map has none."""
+    return "" if tile is None else content_hash(tile.points)
+
+
 def free_hash(free: U64 | None) -> str:
     """SHA-256 of a tile's known-free columns; "" where none were ever learned."""
     return "" if free is None else hashlib.sha256(np.ascontiguousarray(free, dtype="<u8").tobytes()).hexdigest()

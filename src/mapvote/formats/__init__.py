@@ -7,13 +7,14 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Unpack
 
 import numpy as np
 
 from mapvote.core.point_map import PointMap, all_fields, all_points
 from mapvote.core.types import U8, Drive, MapvoteError
 from mapvote.formats.drives.kitti import DriveWriter
-from mapvote.formats.drives.options import DriveOptions
+from mapvote.formats.drives.options import DriveOptions, SaidOfDrive
 from mapvote.formats.drives.poses import read_T_map_lidar
 from mapvote.formats.geo.frame import MapFrame, frame_of
 from mapvote.formats.geo.projector import autoware_frame, frame_wanted
@@ -34,20 +35,7 @@ __all__ = [
 ]
 
 
-def open_drive(
-    path: Path | str,
-    *,
-    scans: str | None = None,
-    prior: str | None = None,
-    rate_hz: float | None = None,
-    sensor: str | None = None,
-    vehicle: str | None = None,
-    mount: str | None = None,
-    topic: str | None = None,
-    columns: str | None = None,
-    dtype: str | None = None,
-    frame: MapFrame | None = None,
-) -> Drive:
+def open_drive(path: Path | str, **said: Unpack[SaidOfDrive]) -> Drive:
     """A recorded drive of any known format; its scans are read one by one when asked for.
 
     ``scans``: comma-separated START:STOP:STEP slices. ``prior``: a file of 3 x 4 rows T_map_lidar (a topic, for bags),
@@ -59,7 +47,7 @@ def open_drive(
     Raises MapvoteError if there is no drive at ``path`` or it cannot be used as it is, saying why.
     """
     path = Path(path)
-    options = DriveOptions(scans, prior, rate_hz, sensor, vehicle, mount, topic, columns, dtype, frame)
+    options = DriveOptions(**said)
     for layout in DRIVES.values():
         if layout.recognised(path):
             return layout.open(path, options)

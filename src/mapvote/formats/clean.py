@@ -44,28 +44,32 @@ class BadPoints:
             )
 
 
-def clean_scan(
-    where: str,
-    index: int,
-    stamp_ns: int,
-    points: F32,
-    *,
-    sensor: Sensor,
-    bad_points: BadPoints,
-    intensity: F32 | None = None,
-    time_s: F32 | None = None,
-    ring: NDArray[np.number] | None = None,
-    no_return: NDArray[np.bool_] | None = None,
-) -> Scan:
-    """A Scan of the usable points (n, 3), in their order.
+@dataclass(frozen=True, slots=True)
+class RawScan:
+    """One scan as a file holds it; what a format does not tell is None."""
 
-    Dropped in silence, because the format says so: ``no_return`` (n,), rays that hit nothing; and points nearer than
-    the sensor can measure. Dropped and counted: not finite, or beyond 2 km. MapvoteError if these are more than 5 %,
-    or if nothing is left.
+    index: int
+    stamp_ns: int
+    points: F32
+    """(n, 3), metres in the lidar frame."""
+    intensity: F32 | None = None
+    time_s: F32 | None = None
+    """(n,) relative to the stamp."""
+    ring: NDArray[np.number] | None = None
+    no_return: NDArray[np.bool_] | None = None
+    """(n,) rays that hit nothing."""
+
+
+def clean_scan(where: str, raw: RawScan, sensor: Sensor, bad_points: BadPoints) -> Scan:
+    """A Scan of the usable points, in their order.
+
+    Dropped in silence, because the format says so: rays without return, and points nearer than the sensor can measure.
+    Dropped and counted: not finite, or beyond 2 km. MapvoteError if these are more than 5 %, or if nothing is left.
     """
+    points = raw.points
     x, y, z = (points[:, axis].astype(np.float64) for axis in range(3))
     distance = np.sqrt(x * x + y * y + z * z)
-    measured = np.ones(len(points), dtype=bool) if no_return is None else ~no_return
+    measured = np.ones(len(points), dtype=bool) if raw.no_return is None else ~raw.no_return
     good = distance < FAR_M  # False for NaN too
     bad = int((measured & ~good).sum())
     if bad > MAX_BAD_SHARE * max(int(measured.sum()), 1):
@@ -73,16 +77,16 @@ def clean_scan(
             f"{where}: {bad} of {int(measured.sum())} points are not finite or beyond {FAR_M:.0f} m, more than "
             f"{MAX_BAD_SHARE:.0%}: {_likely_cause(distance[measured])}"
         )
-    bad_points.count(index, bad)
+    bad_points.count(raw.index, bad)
     keep = measured & good & (distance >= sensor.min_range_m - 5.0 * sensor.range_sigma_m)
     if not keep.any():
         raise MapvoteError(f"{where}: no usable point among {len(points)}; leave this scan out with --scans")
     return Scan(
-        stamp_ns=stamp_ns,
+        stamp_ns=raw.stamp_ns,
         points=np.ascontiguousarray(points[keep], dtype=np.float32),
-        time_s=None if time_s is None else np.ascontiguousarray(time_s[keep], dtype=np.float32),
-        intensity=None if intensity is None else unit_intensity(intensity[keep]),
-        ring=None if ring is None else np.clip(np.nan_to_num(ring[keep]), 0, 65535).astype(np.uint16),
+        time_s=None if raw.time_s is None else np.ascontiguousarray(raw.time_s[keep], dtype=np.float32),
+        intensity=None if raw.intensity is None else unit_intensity(raw.intensity[keep]),
+        ring=None if raw.ring is None else np.clip(np.nan_to_num(raw.ring[keep]), 0, 65535).astype(np.uint16),
     )
 
 

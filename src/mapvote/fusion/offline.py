@@ -9,13 +9,13 @@ from dataclasses import replace
 from mapvote.codec.ballot import (
     Ballot,
     BallotTile,
-    content_hash,
     encode,
     tile_key,
     unpack_points,
     unpack_states,
     unpack_tally,
 )
+from mapvote.codec.tile_file import base_hash
 from mapvote.config import FuseSettings
 from mapvote.core.grid import TileIndex
 from mapvote.core.point_map import PointMap
@@ -40,11 +40,6 @@ def tile_vote(ballot: Ballot, tile: BallotTile, digest: str) -> TileVote:
         new_points=None if tile.new_points is None else unpack_points(tile.new_points),
         free=None if tile.free is None else Words.unpack(tile.free, "free"),
     )
-
-
-def base_hash(tile: Tile | None) -> str:
-    """The content hash a ballot gives for this tile: "" where the map has none."""
-    return "" if tile is None else content_hash(tile.points)
 
 
 def check_round(ballots: Sequence[Ballot], point_map: PointMap) -> Rule:

@@ -132,7 +132,7 @@ def _towards(T_map_lidar: F64, circles: F64, sensor: Sensor) -> F32:
     return (local.reshape(-1, 3) @ T_map_lidar[:3, :3].T).astype(np.float32)
 
 
-def judge(dense: I32, survey: I32, vehicles: I32, rate_hz: float) -> tuple[U8, U8, U8]:
+def label_cells(dense: I32, survey: I32, vehicles: I32, rate_hz: float) -> tuple[U8, U8, U8]:
     """(strict, provenance, reason why a cell is unscored), each (rows, cols).
 
     ``dense`` (2, roles, rows, cols): noise-free hits before and after; ``survey`` and ``vehicles`` (roles, rows, cols):
@@ -182,7 +182,7 @@ def write_truth(
     ``densest`` (rows, cols) the most points that one scan of a vehicle had on built bodies."""
     grid = truth_grid(scenario)
     hits: I32 = np.stack([counts for counts, _, _ in dense]).sum(axis=0, dtype=np.int32)
-    strict, provenance, reason = judge(hits, survey, vehicles, scenario.rate_hz)
+    strict, provenance, reason = label_cells(hits, survey, vehicles, scenario.rate_hz)
     np.savez_compressed(
         folder / "truth.npz",
         strict=strict,

@@ -12,7 +12,7 @@ from scipy.stats import binom
 
 from mapvote.core.grid import TILE_CELLS, Lattice
 from mapvote.core.types import NO_VOTE, U8, CellState
-from mapvote.server.insight.consensus import Spoken, Standing, compare, judge
+from mapvote.server.insight.consensus import Spoken, Standing, compare, standings_of
 
 DAY = 86_400_000_000_000
 UO, UE, CO, CE, UN = CellState
@@ -33,7 +33,7 @@ def ghosts(n: int, fill: int = CellState.UNCHANGED_EMPTY) -> U8:
 
 def standings(*votes: tuple[str, int, U8]) -> dict[str, Standing]:
     compared = compare((0, 0), [Spoken(name, day * DAY, states) for name, day, states in votes])
-    return {s.vehicle: s for s in judge(compared, Lattice())}
+    return {s.vehicle: s for s in standings_of(compared, Lattice())}
 
 
 def test_a_vehicle_that_sees_ghosts_among_eight_that_do_not_is_named_with_the_evidence() -> None:
@@ -93,7 +93,7 @@ def test_a_ghost_over_two_tiles_is_one_object() -> None:
     compared = []
     for index, states in (((0, 0), west), ((0, 1), east)):
         compared += compare(index, [Spoken("a", 0, plane()), Spoken("x", 1, states), Spoken("b", 2, plane())])
-    found = {s.vehicle: s for s in judge(compared, Lattice())}
+    found = {s.vehicle: s for s in standings_of(compared, Lattice())}
     assert [(e.cells, e.x) for e in found["x"].evidence] == [(24, 76.8)]
 
 
@@ -106,8 +106,8 @@ def test_flicker_is_not_counted() -> None:
 
 def test_the_order_of_votes_does_not_matter() -> None:
     votes = [Spoken(f"v{i}", i * DAY, ghosts(i)) for i in range(6)]
-    forth = judge(compare((0, 0), votes), Lattice())
-    assert forth == judge(compare((0, 0), votes[::-1]), Lattice())
+    forth = standings_of(compare((0, 0), votes), Lattice())
+    assert forth == standings_of(compare((0, 0), votes[::-1]), Lattice())
 
 
 @settings(max_examples=60, deadline=None)
@@ -140,5 +140,5 @@ def test_honest_vehicles_with_equal_noise_are_named_less_often_than_the_signific
             for row, col in rng.integers(0, TILE_CELLS - 4, (n, 2)):
                 states[row : row + 3, col : col + 3] = CO
             votes.append(Spoken(f"v{i}", i, states))
-        alarms += any(s.verdict == "contradicts" for s in judge(compare((0, 0), votes), Lattice()))
+        alarms += any(s.verdict == "contradicts" for s in standings_of(compare((0, 0), votes), Lattice()))
     assert alarms <= 1

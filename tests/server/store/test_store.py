@@ -31,7 +31,7 @@ from mapvote.server.store.policy import (
     policy_changes,
     set_policy,
 )
-from mapvote.server.store.publish import publish, rollback
+from mapvote.server.store.publish import preview, publish, rollback
 from mapvote.server.store.store import Store
 
 EMPTY, KEEPS = CellState.CHANGED_EMPTY, CellState.UNCHANGED_OCCUPIED
@@ -275,7 +275,7 @@ def test_dry_run_changes_nothing_and_a_held_version_says_why(store: Store) -> No
     base = store.point_map()
     send(store, says(base, "a", EMPTY), says(base, "b", EMPTY))
     strict = FuseSettings(max_deleted_share=0.01)
-    dry = publish(store, strict, dry_run=True)
+    dry = preview(store, strict)
     assert (dry.published, dry.deleted, len(dry.held)) == (False, 3, 1)
     with pytest.raises(Held, match="deletes 25% of the points"):
         publish(store, strict)

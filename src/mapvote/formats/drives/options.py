@@ -7,7 +7,7 @@ import tomllib
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict
 
 import msgspec
 import numpy as np
@@ -21,6 +21,21 @@ from mapvote.formats.extras import read_text
 from mapvote.formats.geo.frame import MapFrame, enu_frame
 
 ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
+
+
+class SaidOfDrive(TypedDict, total=False):
+    """What may be said about a drive when it is opened, by name: :class:`DriveOptions` before any default."""
+
+    scans: str | None
+    prior: str | None
+    rate_hz: float | None
+    sensor: str | None
+    vehicle: str | None
+    mount: str | None
+    topic: str | None
+    columns: str | None
+    dtype: str | None
+    frame: MapFrame | None
 
 
 @dataclass(frozen=True, slots=True)

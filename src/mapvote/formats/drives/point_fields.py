@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from mapvote.core.sensors import Sensor
 from mapvote.core.types import F32, F64, MapvoteError, Scan
-from mapvote.formats.clean import BadPoints, clean_scan, spinning_time_s
+from mapvote.formats.clean import BadPoints, RawScan, clean_scan, spinning_time_s
 from mapvote.formats.maps.cloud import xyz
 
 TIME_FIELDS = ("t", "time", "timestamp", "time_stamp", "stamp", "offset_time", "point_time_offset")
@@ -46,18 +46,16 @@ def scan_from_fields(
     if time_s is None and spinning:
         time_s = spinning_time_s(points.astype(np.float32), sensor.rate_hz, clockwise=sensor.clockwise)
     no_return = ~np.isfinite(points).all(axis=1) | (points == 0).all(axis=1)
-    return clean_scan(
-        where,
+    raw = RawScan(
         index,
         stamp_ns,
         points.astype(np.float32, copy=False),
-        sensor=sensor,
-        bad_points=bad_points,
         intensity=None if intensity is None else table[intensity].astype(np.float32),
         time_s=time_s,
         ring=None if ring is None else table[ring],
         no_return=no_return if zero_is_no_return else None,
     )
+    return clean_scan(where, raw, sensor, bad_points)
 
 
 def point_cloud_table(where: str, message: Any) -> NDArray[np.void]:

@@ -36,7 +36,7 @@ from mapvote.server.insight.geojson import feature_rows
 from mapvote.server.insight.history import changes_between, coverage, vehicle_standings
 from mapvote.server.insight.lists import contradictions, standing_rows, tile_squares
 from mapvote.server.store.keys import pseudonyms
-from mapvote.server.store.publish import publish, rollback
+from mapvote.server.store.publish import preview, publish, rollback
 from mapvote.server.store.queries import log_event
 
 _MOST_EVIDENCE = 50
@@ -52,16 +52,18 @@ async def publish_now(request: Request, ask: PublishAsk) -> Published:
 
 def _publish(parts: Services, ask: PublishAsk, by: str) -> Published:
     with parts.metrics.publish_seconds.time(), _unless_stopping(parts), _told_if_held(parts, by):
-        done = publish(
-            parts.store,
-            by=by,
-            reason=ask.reason,
-            parent=ask.parent,
-            dry_run=ask.dry_run,
-            override=ask.override,
-            gate=parts.gate,
-            executor=parts.fusing,
-        )
+        if ask.dry_run:
+            done = preview(parts.store, parent=ask.parent, gate=parts.gate, executor=parts.fusing)
+        else:
+            done = publish(
+                parts.store,
+                by=by,
+                reason=ask.reason,
+                parent=ask.parent,
+                override=ask.override,
+                gate=parts.gate,
+                executor=parts.fusing,
+            )
     for damage in (damage for fused in done.fused for damage in fused.damaged):
         structlog.get_logger("mapvote").error("quarantine", kind=damage.kind, name=damage.name, why=damage.why)
     tiles = [tile_key(tile) for tile in done.tiles]

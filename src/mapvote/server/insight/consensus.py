@@ -114,7 +114,7 @@ def compare(index: TileIndex, votes: Iterable[Spoken]) -> list[Compared]:
     return sorted(out, key=lambda entry: entry.vehicle)
 
 
-def judge(
+def standings_of(
     compared: Iterable[Compared],
     lattice: Lattice,
     *,

@@ -16,7 +16,7 @@ from mapvote.server.errors import NotFound
 from mapvote.server.insight.changes import ChangeObject, Decided, change_objects, changed_cells
 from mapvote.server.insight.explain import states_of
 from mapvote.server.insight.geojson import to_geojson
-from mapvote.server.store.publish import Gate, edited_tile, publish
+from mapvote.server.store.publish import Gate, edited_tile, preview
 from mapvote.server.store.queries import load_tile, tile_of
 from mapvote.server.store.reviews import Review, Verdict, decide, standing
 from mapvote.server.store.store import Store
@@ -43,7 +43,7 @@ class Desk:
 
 def desk(store: Store, executor: Executor | None = None, gate: Gate | None = None) -> Desk:
     """What a publish would do now, in the words of the list of changes. Nothing is written."""
-    outcome = publish(store, dry_run=True, executor=executor, gate=gate)
+    outcome = preview(store, executor=executor, gate=gate)
     tiles = [_before_and_after(store, outcome.version, fused) for fused in outcome.fused if fused.hashes is not None]
     told = {f.index: Decided(0, states_of(f.states), unpack_tally_plane(f.tally)) for f in outcome.fused}
     objects = change_objects(changed_cells(old, new, [told[old.index]]) for old, new in tiles)

@@ -15,7 +15,7 @@ from mapvote.core.types import U8
 from mapvote.core.voting import decide
 from mapvote.fusion.tile_vote import TileVote, one_each
 from mapvote.server.insight.changes import Decided, change_objects, changed_cells
-from mapvote.server.insight.consensus import Compared, Spoken, Standing, compare, judge
+from mapvote.server.insight.consensus import Compared, Spoken, Standing, compare, standings_of
 from mapvote.server.insight.cutout import Box, Cutout, Tiles, cut_out, of_feature
 from mapvote.server.insight.explain import states_of
 from mapvote.server.insight.geojson import to_geojson
@@ -136,7 +136,7 @@ def vehicle_standings(store: Store) -> list[Standing]:
             chosen = [vote for vote, why in judged_votes(connection, index, asked) if not why]
             folded = one_each(read_votes(connection, index, chosen), store.lattice.tile(index))
             compared += compare(index, [Spoken(vote.vehicle, vote.end_ns, _decided_states(vote)) for vote in folded])
-    return judge(compared, store.lattice)
+    return standings_of(compared, store.lattice)
 
 
 def events(store: Store, limit: int = 100) -> list[dict[str, Any]]:

@@ -1,4 +1,4 @@
-"""New versions: publish what the vehicles decided, or go back. Plan, fuse, judge, commit.
+"""New versions: publish what the vehicles decided, or go back. Plan, fuse, hold or let through, commit.
 
 Planning and fusion run before the transaction and on a snapshot; of several publishers exactly one wins, the others get
 Conflict. What is published follows from the versions, the ballots, the policy and one reading of the clock: tiles on
@@ -48,7 +48,7 @@ Gate = Callable[[GatePolicy, PointMap, PointMap], Sequence[str]]
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What a publish did, or with ``dry_run`` would do."""
+    """What a publish did, or would do."""
 
     version: int
     """The new version, or the current one if nothing was published."""
@@ -58,7 +58,7 @@ class Outcome:
     added: int
     deleted: int
     held: Sequence[str]
-    """Why the policy holds it back (in a dry run), or what the operator overrode."""
+    """Why the policy would hold it back, or what the operator overrode."""
     fused: Sequence[Fused] = field(default=(), repr=False)
 
 
@@ -72,6 +72,18 @@ class Plan:
     now: int
 
 
+def preview(
+    store: Store,
+    settings: FuseSettings | None = None,
+    *,
+    parent: int | None = None,
+    gate: Gate | None = None,
+    executor: Executor | None = None,
+) -> Outcome:
+    """What :func:`publish` would do now. Nothing is written."""
+    return _decide(store, settings, parent, gate, executor)[1]
+
+
 def publish(
     store: Store,
     settings: FuseSettings | None = None,
@@ -79,7 +91,6 @@ def publish(
     by: str = "operator",
     reason: str = "",
     parent: int | None = None,
-    dry_run: bool = False,
     override: bool = False,
     gate: Gate | None = None,
     executor: Executor | None = None,
@@ -91,30 +102,37 @@ def publish(
     reasons, Conflict if somebody else published first, MapvoteError if the policy asks for a reference drive and there
     is no ``gate`` to judge by it.
     """
+    plan, outcome = _decide(store, settings, parent, gate, executor)
+    damaged = [damage for one in outcome.fused for damage in one.damaged]
+    if damaged:
+        with store.database.writing() as connection:
+            quarantine(connection, damaged, plan.now, by)
+    if gate is None and plan.asked.policy.gate.drive:
+        asked = plan.asked.policy.gate.drive
+        raise MapvoteError(f"the policy judges versions by {asked}: publish by the server or mapvote publish")
+    if not outcome.tiles:
+        return outcome
+    if outcome.held and not override:
+        raise Held(list(outcome.held))
+    why = reason + (f" (in spite of: {'; '.join(outcome.held)})" if outcome.held else "")
+    number = commit(store, plan, outcome.fused, by, why)
+    if plan.asked.policy.keep.automatic:
+        clear(store, by=by, dry_run=False)
+    return replace(outcome, version=number, published=True)
+
+
+def _decide(
+    store: Store, settings: FuseSettings | None, parent: int | None, gate: Gate | None, executor: Executor | None
+) -> tuple[Plan, Outcome]:
+    """What there is to publish, and what speaks against it."""
     plan = make_plan(store, settings)
     if parent is not None and parent != plan.newest.number:
         raise Conflict(f"the newest version is {plan.newest.number}, not {parent}: look at it, then publish")
     fused = fuse_round(plan.tasks, store.database, executor)
-    damaged = [damage for one in fused for damage in one.damaged]
-    if damaged and not dry_run:
-        with store.database.writing() as connection:
-            quarantine(connection, damaged, plan.now, by)
     changed = [f for f in fused if f.hashes is not None]
-    if gate is None and plan.asked.policy.gate.drive and not dry_run:
-        asked = plan.asked.policy.gate.drive
-        raise MapvoteError(f"the policy judges versions by {asked}: publish by the server or mapvote publish")
-    held = judge(store, plan, changed, gate)
+    held = reasons_to_hold(store, plan, changed, gate)
     added, deleted = sum(f.added for f in changed), sum(f.deleted for f in changed)
-    outcome = Outcome(plan.newest.number, False, [f.index for f in changed], added, deleted, held, fused)
-    if dry_run or not changed:
-        return outcome
-    if held and not override:
-        raise Held(held)
-    why = reason + (f" (in spite of: {'; '.join(held)})" if held else "")
-    number = commit(store, plan, fused, by, why)
-    if plan.asked.policy.keep.automatic:
-        clear(store, by=by, dry_run=False)
-    return replace(outcome, version=number, published=True)
+    return plan, Outcome(plan.newest.number, False, [f.index for f in changed], added, deleted, held, fused)
 
 
 def make_plan(store: Store, settings: FuseSettings | None = None) -> Plan:
@@ -146,8 +164,8 @@ def _dirty(connection: sa.Connection, newest: Version, asked: Electorate) -> lis
     return sorted({*touched, *tiles_set_by(connection, newest.number)})
 
 
-def judge(store: Store, plan: Plan, changed: Sequence[Fused], gate: Gate | None) -> list[str]:
-    """The reasons to hold the version."""
+def reasons_to_hold(store: Store, plan: Plan, changed: Sequence[Fused], gate: Gate | None) -> list[str]:
+    """What speaks against the version."""
     held, asked = hold_reasons(changed, plan.asked.settings), plan.asked.policy.gate
     if gate is None or not asked.drive or not changed:
         return held
