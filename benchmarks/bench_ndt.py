@@ -17,17 +17,14 @@ from pathlib import Path
 import numpy as np
 import small_gicp
 
-from mapvote.config import NdtSettings
 from mapvote.core.geometry import from_xyz_rpy, inverse, rotation_angle
 from mapvote.core.types import F64
 from mapvote.formats import open_drive, read_T_map_lidar
 from mapvote.localisation.deskew import deskew, motion_at
-from mapvote.localisation.ndt import build_ndt, register
+from mapvote.localisation.ndt import CENTRAL_M, build_ndt, register
 from mapvote.localisation.tracker import window_points
 from mapvote.simulation import simulate
 from mapvote.slam.build import build_map
-
-SETTINGS = NdtSettings()
 
 
 def vgicp(target: small_gicp.GaussianVoxelMap, points: F64, guess: F64) -> F64:
@@ -47,12 +44,12 @@ def main(folder: Path) -> None:
     turns: dict[str, list[float]] = {"ndt": [], "vgicp": []}
     # Coordinates near zero for both: VGICP's voxels hold float32 offsets.
     middle = truth[len(truth) // 2, :3, 3]
-    points = window_points(point_map, middle, SETTINGS.half_window_m)
-    ndt_map = build_ndt(points, SETTINGS, middle)
+    points = window_points(point_map, middle)
+    ndt_map = build_ndt(points, middle)
     cloud, _ = small_gicp.preprocess_points(points, downsampling_resolution=0.3, num_neighbors=10, num_threads=1)
     target = small_gicp.GaussianVoxelMap(1.0)
     target.insert(cloud)
-    near = np.flatnonzero(np.abs(truth[:, :3, 3] - middle).max(axis=1) < SETTINGS.recentre_m)
+    near = np.flatnonzero(np.abs(truth[:, :3, 3] - middle).max(axis=1) < CENTRAL_M)
     for k, i in enumerate([near[0], *near]):  # the first call only warms up
         scan = drive.read_scan(int(i))
         scan_points = deskew(scan, motion_at(drive.stamps_ns, truth, int(i)))
@@ -62,7 +59,7 @@ def main(folder: Path) -> None:
         for name in ("ndt", "vgicp") if k % 2 else ("vgicp", "ndt"):
             start = time.perf_counter()
             if name == "ndt":
-                T = register(ndt_map, scan_points, guess, SETTINGS, first_level=1).T_map_lidar
+                T = register(ndt_map, scan_points, guess, first_level=1).T_map_lidar
             else:
                 T = vgicp(target, scan_points_f64, guess)
             elapsed = 1e3 * (time.perf_counter() - start)

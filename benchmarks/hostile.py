@@ -271,7 +271,7 @@ def run(store_name: str, url: str, seconds: float, folder: Path, kinds: list[set
     ballot = typical_ballot(store)
     store.close()
     config = folder / "server.toml"
-    config.write_text("[server]\nballots_per_minute = 100000\nburst = 10000\ndrives_a_day = 1000000\n")
+    config.write_text("[server]\nballots_per_minute = 100000\ndrives_a_day = 1000000\n")
     with serving(store_name, "--config", config, log=folder / "log") as (address, server):
         host, port = address.removeprefix("http://").split(":")
         asyncio.run(measure((host, int(port)), keys, ballot, 3.0, "warm"))

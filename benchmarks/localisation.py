@@ -64,7 +64,7 @@ def drives(folder: Path, point_map: PointMap, T_truth_map: F64, prior_only_once:
     for path in sorted(folder.glob("v*")):
         drive, true = open_drive(path), truth_of(folder, path.name)
         assert drive.T_map_lidar_prior is not None
-        tracker = Tracker(MapWindow(point_map, SETTINGS.ndt), SETTINGS.ndt)
+        tracker = Tracker(MapWindow(point_map), SETTINGS.ndt)
         for i, scan in enumerate(drive):
             prior = PosePrior(drive.T_map_lidar_prior[i], drive.prior_sigma_m, np.radians(drive.prior_sigma_deg))
             start = time.perf_counter()
@@ -93,7 +93,7 @@ def starts(folder: Path, point_map: PointMap, T_truth_map: F64, count: int = 300
         guess[:3, :3] = exp([0, 0, 0, 0, 0, yaw])[:3, :3] @ guess[:3, :3]
         guess[:3, 3] += [np.cos(way), np.sin(way), 0.0]
         points = deskew(drive.read_scan(i), motion_at(drive.stamps_ns, true, i))
-        result = register(MapWindow(point_map, SETTINGS.ndt)(guess[:3, 3]), points, guess, SETTINGS.ndt)
+        result = register(MapWindow(point_map)(guess[:3, 3]), points, guess)
         found.append(float(np.linalg.norm(result.T_map_lidar[:3, 3] - true[i, :3, 3])) < 0.2)
     print(f" {count} starts 1 m / 3 deg off: {np.mean(found):.3f} end within 0.2 m")
 

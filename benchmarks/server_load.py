@@ -150,7 +150,7 @@ def measure(store_name: str, database_url: str, connections: int, seconds: float
     secrets = [issue(store, f"v{i}", "vehicle") for i in range(connections)]
     store.close()
     config = folder / "server.toml"
-    config.write_text("[server]\nballots_per_minute = 1e9\nburst = 1000000\ndrives_a_day = 1000000000\n")
+    config.write_text("[server]\nballots_per_minute = 1e9\ndrives_a_day = 1000000000\n")
     ballot = typical_ballot()
     with serving(store_name, "--config", config, log=folder / "log") as (url, server):
         uvloop.run(send_all(url, ballot, secrets, 2.0, "warm"))

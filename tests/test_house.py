@@ -109,8 +109,8 @@ def test_a_public_name_means_one_thing() -> None:
 
 def test_what_is_too_long_or_too_crowded_is_found() -> None:
     """The checks above can fail."""
-    body = "def f(a, b, c, d, /, e, f, *, g, h, **i): ...\n@numba.njit(cache=True)\ndef k(a, b, c, d, e, f, g, h, i): ...\n"
-    many, kernel = ast.parse(body).body
+    given = "(a, b, c, d, /, e, f, *, g, h, **i): ..."
+    many, kernel = ast.parse(f"def f{given}\n@numba.njit(cache=True)\ndef k{given}\n").body
     assert isinstance(many, ast.FunctionDef)
     assert isinstance(kernel, ast.FunctionDef)
     assert arguments(many) == 9

@@ -17,7 +17,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 
 from mapvote.core.types import MapvoteError
 
-METHOD_VERSION = 3
+METHOD_VERSION = 4
 """Goes up whenever a constant or a rule changes by which vehicles vote; the numbers below are only what a user sets."""
 
 
@@ -25,78 +25,36 @@ class Section(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
-class NdtLevel(Section):
-    """One step of the coarse-to-fine search."""
-
-    voxel_m: float = Field(gt=0, description="side of the NDT voxels")
-    floor_m: float = Field(gt=0, description="standard deviation added to every voxel's distribution, isotropic")
-    points_m: float = Field(gt=0, description="the scan is thinned to one point per voxel of this side")
-    iterations: int = Field(gt=0, description="most Gauss-Newton steps at this level")
-
-
 class NdtSettings(Section):
-    """localisation/ndt.py and localisation/tracker.py (docs/decisions/localisation.md)."""
+    """When a scan's registration is sound (localisation/tracker.py)."""
 
-    levels: tuple[NdtLevel, ...] = (
-        NdtLevel(voxel_m=3.0, floor_m=0.5, points_m=1.0, iterations=15),
-        NdtLevel(voxel_m=2.0, floor_m=0.25, points_m=1.0, iterations=15),
-        NdtLevel(voxel_m=1.0, floor_m=0.1, points_m=0.7, iterations=15),
-    )
-    half_window_m: float = Field(default=96.0, description="half the side of the NDT map kept around the vehicle")
-    below_m: float = Field(default=24.0, description="how far that window reaches below the vehicle")
-    above_m: float = Field(default=40.0, description="and above it")
-    recentre_m: float = Field(default=24.0, description="the window moves when the vehicle is this far off its middle")
-    min_points: int = Field(default=3, description="a voxel with fewer points has no distribution")
-    covariance_scale: float = Field(default=5.0, description="what neighbouring residuals have in common, calibrated")
-    map_sigma_m: float = Field(default=0.01, description="what the map itself is off by around a scan, position")
-    map_sigma_deg: float = Field(default=0.03, description="the same, rotation")
     min_inlier_share: float = Field(default=0.5, description="below it the vehicle abstains; lost scans have about .4")
     max_sigma_m: float = Field(default=0.15, description="abstain when the pose is less certain than this")
-    acceleration_mps2: float = Field(default=3.0, description="how fast a prediction by constant velocity goes stale")
-    hypothesis_step_m: float = Field(default=1.0, description="spacing of the guesses when the vehicle is lost")
-    hypothesis_reach_m: float = Field(default=10.0, description="farthest guess from the seed")
 
 
 class TrustSettings(Section):
-    """localisation/trust.py and localisation/localiser.py: when a pose may be voted with."""
+    """When a sound pose may be voted with (localisation/trust.py, localisation/localiser.py)."""
 
-    points: int = Field(default=1000, ge=200, description="points of a scan looked at")
-    near_m: float = Field(default=2.0, gt=0, description="other places are tried from here")
-    far_m: float = Field(default=15.0, gt=0, description="to here, along the street and across it")
     min_fit: float = Field(default=0.6, description="fit, as a share of what the map leads to expect")
-    min_known: float = Field(default=0.3, description="share of the standing points where the map has been")
     min_lead: float = Field(default=0.05, description="by how much the best other place must fit worse, same scale")
-    scans: int = Field(default=3, ge=1, description="scans in turn that must hold before the first vote")
-    every_m: float = Field(default=10.0, gt=0, description="a track that holds is looked at again after this distance")
-    every_s: float = Field(default=2.0, gt=0, description="or this time")
-    wait_scans: int = Field(default=40, ge=5, description="scans that wait at most until their track is confirmed")
+    scans: int = Field(default=3, ge=1, description="looks in turn that must hold before the first vote")
 
 
 class MovingSettings(Section):
     """perception/moving_objects.py ([9])."""
 
     lookahead_s: float = Field(default=1.0, ge=0, le=1.0, description="how late a scan is decided")
-    past_s: float = Field(default=2.0, gt=0, description="how far back other scans are asked")
     reach_m: float = Field(default=50.0, gt=0, description="points farther away are never called moving")
 
 
 class MappingSettings(Section):
     """slam/build.py: NDT SLAM."""
 
-    ndt_points_m: float = Field(default=0.3, description="scans enter the NDT map thinned to one point per such voxel")
-    min_inlier_share: float = Field(default=0.4, description="as ndt.min_inlier_share, while the map is still growing")
-    precise_prior_m: float = Field(default=0.1, description="a prior at least this good holds the map's frame")
-    prior_slack: float = Field(default=5.0, description="widens that prior's sigma: its errors are alike for a while")
-    prior_memory_s: float = Field(default=20.0, gt=0, description="how long the errors of a coarser prior stay alike")
-    link_sigma_m: float = Field(default=0.003, description="random error of the motion from scan to scan")
-    link_sigma_deg: float = Field(default=0.01, description="the same, rotation")
-    revisit_m: float = Field(default=10.0, description="a scan this near to a much older one is linked to it")
     reach_m: float = Field(
         default=80.0, description="farther returns do not enter the map; the moving-object filter looks as far"
     )
-    trail_min_through: int = Field(default=3, description="scans that saw through a voxel before it can be a trail")
-    trail_share: float = Field(default=0.45, description="a voxel struck in fewer of the scans able to is a trail")
-    revisit_s: float = Field(default=10.0, description="and much older means this, within a drive")
+    precise_prior_m: float = Field(default=0.1, description="a prior at least this good holds the map's frame")
+    prior_memory_s: float = Field(default=20.0, gt=0, description="how long the errors of a coarser prior stay alike")
 
 
 class VotingSettings(Section):
@@ -187,8 +145,6 @@ class FuseSettings(Section):
 class GateSettings(Section):
     """server/insight/localisation_gate.py: when a new version may be published, judged by a reference drive."""
 
-    reach_m: float = Field(default=50.0, gt=0, description="scans farther from every change see no difference")
-    max_scans: int = Field(default=60, gt=0, description="scans compared at most, spread evenly")
     tolerance_found: float = Field(default=0.02, ge=0, description="allowed loss of the share of scans localised")
     tolerance_inlier_share: float = Field(default=0.01, ge=0, description="allowed loss of inlier share")
     tolerance_score: float = Field(default=0.01, ge=0, description="allowed loss of the NDT score")
@@ -198,18 +154,17 @@ class GateSettings(Section):
 class ServerSettings(Section):
     """server/http/app.py: what the server lets in."""
 
-    max_body_bytes: int = Field(default=16_000_000, description="largest request body")
-    upload_bytes: int = Field(default=128_000_000, description="all ballots on their way at once, in memory")
+    max_body_bytes: int = Field(default=16_000_000, description="largest request body; eight such wait in memory")
     connections: int = Field(default=2000, ge=8, description="at once; the longest silent makes room for a new one")
     header_timeout_s: float = Field(default=10.0, gt=0, description="for the headers of a request")
     body_timeout_s: float = Field(default=120.0, gt=0, description="for its body")
     answer_timeout_s: float = Field(default=60.0, gt=0, description="for a client that does not take its answer")
-    ballots_per_minute: float = Field(default=600.0, gt=0, description="of one vehicle, on average")
-    burst: int = Field(default=60, ge=1, description="ballots of one vehicle at once")
+    ballots_per_minute: float = Field(
+        default=600.0, gt=0, description="of one vehicle, on average; a tenth of them at once"
+    )
     drives_a_day: int = Field(default=300, ge=1, description="that one vehicle may send")
     tiles_a_drive: int = Field(default=1000, ge=1, description="that one ballot may vote on, of 76.8 m by 76.8 m")
     stored_bytes: int = Field(default=2_000_000_000, ge=1, description="that one vehicle's ballots may take")
-    batch: int = Field(default=64, ge=1, description="ballots written in one transaction at most")
     hosts: tuple[str, ...] = Field(
         default=(), description="names that this server goes by, besides localhost and addresses in digits"
     )

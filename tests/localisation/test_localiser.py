@@ -8,7 +8,7 @@ from mapvote.core.geometry import from_xyz_rpy, transform
 from mapvote.core.point_map import PointMap, map_from_points
 from mapvote.core.sensors import SENSORS
 from mapvote.core.types import F64, Scan
-from mapvote.localisation.localiser import Localiser
+from mapvote.localisation.localiser import WAIT_SCANS, Localiser
 from mapvote.localisation.ndt import PosePrior
 from mapvote.localisation.tracker import Fix
 from streets import path, street, sweep, twist_of
@@ -128,4 +128,4 @@ def test_what_waits_is_bounded(point_map: PointMap) -> None:
     one = localiser(point_map)
     empty = np.zeros((0, 3), dtype=np.float32)
     out = [len(one.push(Scan(i * 100_000_000, empty), PosePrior(POSES[0], 1.0, 0.02))) for i in range(60)]
-    assert sum(out) == 60 - SETTINGS.trust.wait_scans
+    assert sum(out) == 60 - WAIT_SCANS

@@ -5,20 +5,19 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mapvote.config import NdtSettings
 from mapvote.core.geometry import exp, from_xyz_rpy, inverse, rotation_angle, transform
 from mapvote.core.types import F64, Scan
+from mapvote.localisation import ndt
 from mapvote.localisation.deskew import deskew, twist_between
 from mapvote.localisation.ndt import NdtMap, PosePrior, build_ndt, register
 from streets import street, surface
 
-SETTINGS = NdtSettings()
 T_TRUE = from_xyz_rpy(3.0, -1.0, 1.8, 0.01, -0.015, 0.3)
 
 
 @pytest.fixture(scope="module")
 def ndt_map() -> NdtMap:
-    return build_ndt(street(1, 2.0), SETTINGS)
+    return build_ndt(street(1, 2.0))
 
 
 @pytest.fixture(scope="module")
@@ -34,7 +33,7 @@ def errors(T: F64) -> tuple[float, float]:
 @given(st.floats(-0.7, 0.7), st.floats(-0.7, 0.7), st.floats(-0.2, 0.2), st.floats(-0.05, 0.05))
 def test_a_known_motion_is_recovered(ndt_map: NdtMap, scan: F64, dx: float, dy: float, dz: float, yaw: float) -> None:
     guess = T_TRUE @ from_xyz_rpy(dx, dy, dz, 0.0, 0.0, yaw)
-    result = register(ndt_map, scan, guess, SETTINGS)
+    result = register(ndt_map, scan, guess)
     shift, turn = errors(result.T_map_lidar)
     assert result.converged
     assert shift < 0.02
@@ -44,41 +43,42 @@ def test_a_known_motion_is_recovered(ndt_map: NdtMap, scan: F64, dx: float, dy: 
 
 def test_the_answer_does_not_depend_on_where_in_the_world_the_street_lies(scan: F64) -> None:
     offset = np.array([600_000.0, -5_600_000.0, 300.0])
-    far = build_ndt(street(1, 2.0) + offset, SETTINGS)
+    far = build_ndt(street(1, 2.0) + offset)
     guess = T_TRUE.copy()
     guess[:3, 3] += offset + np.array([0.3, 0.2, 0.0])
-    result = register(far, scan, guess, SETTINGS)
+    result = register(far, scan, guess)
     result.T_map_lidar[:3, 3] -= offset
     assert errors(result.T_map_lidar)[0] < 0.02
 
 
 def test_a_wrong_pose_shows_in_score_and_inliers(ndt_map: NdtMap, scan: F64) -> None:
-    right = register(ndt_map, scan, T_TRUE, SETTINGS)
-    lost = register(ndt_map, scan, T_TRUE @ from_xyz_rpy(60.0, 40.0, 0.0, 0.0, 0.0, 1.0), SETTINGS)
+    right = register(ndt_map, scan, T_TRUE)
+    lost = register(ndt_map, scan, T_TRUE @ from_xyz_rpy(60.0, 40.0, 0.0, 0.0, 0.0, 1.0))
     assert lost.score < 0.5 * right.score
     assert lost.inlier_share < 0.5 * right.inlier_share
 
 
 def test_no_overlap_at_all_is_an_answer_not_an_error(ndt_map: NdtMap, scan: F64) -> None:
-    result = register(ndt_map, scan, T_TRUE @ from_xyz_rpy(1e6, 0.0, 0.0), SETTINGS)
+    result = register(ndt_map, scan, T_TRUE @ from_xyz_rpy(1e6, 0.0, 0.0))
     assert result.inlier_share == 0.0
     assert result.score == 0.0
     assert np.isfinite(result.covariance).all()
-    empty = register(ndt_map, np.zeros((0, 3)), T_TRUE, SETTINGS)
+    empty = register(ndt_map, np.zeros((0, 3)), T_TRUE)
     assert empty.inlier_share == 0.0
 
 
-def test_covariance_covers_the_error_over_many_scans() -> None:
+def test_covariance_covers_the_error_over_many_scans(monkeypatch: pytest.MonkeyPatch) -> None:
     """Normalised squared errors average 6 when the covariance is right; a factor of 4 either way is accepted.
 
     The map of this test is exact, so the part of the covariance that stands for the map's own error is left out.
     """
-    exact = SETTINGS.model_copy(update={"map_sigma_m": 0.0, "map_sigma_deg": 0.0})
-    ndt_map = build_ndt(street(1, 2.0), exact)
+    monkeypatch.setattr(ndt, "MAP_SIGMA_M", 0.0)
+    monkeypatch.setattr(ndt, "MAP_SIGMA_RAD", 0.0)
+    ndt_map = build_ndt(street(1, 2.0))
     squares = []
     for seed in range(10, 30):
         points = transform(inverse(T_TRUE), street(seed, 0.5))
-        result = register(ndt_map, points, T_TRUE, exact, first_level=1)
+        result = register(ndt_map, points, T_TRUE, first_level=1)
         R = result.T_map_lidar[:3, :3] @ T_TRUE[:3, :3].T
         turn = 0.5 * np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
         error = np.concatenate([result.T_map_lidar[:3, 3] - T_TRUE[:3, 3], turn])
@@ -89,9 +89,9 @@ def test_covariance_covers_the_error_over_many_scans() -> None:
 
 def test_a_road_without_houses_does_not_know_where_along_it_one_is() -> None:
     rng = np.random.default_rng(5)
-    bare = build_ndt(surface(rng, 30_000, (-60, -8, 0), (60, 8, 0)), SETTINGS)
+    bare = build_ndt(surface(rng, 30_000, (-60, -8, 0), (60, 8, 0)))
     points = surface(rng, 8_000, (-40, -7, -1.8), (40, 7, -1.8))
-    result = register(bare, points, from_xyz_rpy(0.0, 0.0, 1.9), SETTINGS)
+    result = register(bare, points, from_xyz_rpy(0.0, 0.0, 1.9))
     assert abs(result.T_map_lidar[2, 3] - 1.8) < 0.02
     sigma = np.sqrt(np.diag(result.covariance))
     assert sigma[0] > 3 * sigma[2]
@@ -101,29 +101,28 @@ def test_a_precise_prior_decides_what_the_geometry_leaves_open() -> None:
     rng = np.random.default_rng(6)
     corridor = build_ndt(
         np.concatenate([surface(rng, 20_000, (-90, -6, 0), (90, 6, 0)), surface(rng, 20_000, (-90, 6, 0), (90, 6, 8))]),
-        SETTINGS,
     )
     points = np.concatenate(
         [surface(rng, 6_000, (-40, -6, -1.8), (40, 6, -1.8)), surface(rng, 6_000, (-40, 6, -1.8), (40, 6, 6.2))]
     )
     prior = PosePrior(from_xyz_rpy(0.5, 0.0, 1.8), 0.02, np.radians(0.05))
     guess = from_xyz_rpy(0.0, 0.1, 1.7)
-    held = register(corridor, points, guess, SETTINGS, prior=prior)
+    held = register(corridor, points, guess, prior=prior)
     np.testing.assert_allclose(held.T_map_lidar[:3, 3], [0.5, 0.0, 1.8], atol=0.06)
 
 
 def test_the_window_moves_and_finds_again_what_was_entered(scan: F64) -> None:
-    grown = NdtMap(SETTINGS, np.zeros(3))
+    grown = NdtMap(np.zeros(3))
     grown.enter(street(1, 2.0))
     grown.recentre(np.array([500.0, 0.0, 0.0]))
-    assert register(grown, scan, T_TRUE, SETTINGS).inlier_share == 0.0
+    assert register(grown, scan, T_TRUE).inlier_share == 0.0
     grown.recentre(np.array([20.0, 5.0, 0.0]))
-    assert errors(register(grown, scan, T_TRUE, SETTINGS).T_map_lidar)[0] < 0.02
+    assert errors(register(grown, scan, T_TRUE).T_map_lidar)[0] < 0.02
 
 
 def test_adding_in_two_halves_gives_the_map_of_adding_at_once(ndt_map: NdtMap) -> None:
     points = street(1, 2.0)
-    halves = NdtMap(SETTINGS, ndt_map.centre)
+    halves = NdtMap(ndt_map.centre)
     halves.enter(points[: len(points) // 2])
     halves.enter(points[len(points) // 2 :])
     for one, two in zip(ndt_map.levels, halves.levels, strict=True):
@@ -148,7 +147,7 @@ def test_deskew_undoes_the_motion_of_a_scan(speed: float, sideways: float, yaw_r
 def test_a_map_that_grows_point_by_point_is_the_map_of_all_points_and_makes_rows_for_voxels_only() -> None:
     rng = np.random.default_rng(5)
     points = np.concatenate([rng.uniform(-30, 30, (4000, 3)) * [1, 1, 0.1], rng.normal(0, 0.4, (50000, 3))])
-    at_once, in_pieces = NdtMap(NdtSettings(), np.zeros(3)), NdtMap(NdtSettings(), np.zeros(3))
+    at_once, in_pieces = NdtMap(np.zeros(3)), NdtMap(np.zeros(3))
     at_once.enter(points)
     for piece in np.array_split(points, 97):
         in_pieces.enter(piece)

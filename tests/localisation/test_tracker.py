@@ -23,7 +23,7 @@ def point_map() -> PointMap:
 
 @pytest.fixture
 def tracker(point_map: PointMap) -> Tracker:
-    return Tracker(MapWindow(point_map, SETTINGS), SETTINGS)
+    return Tracker(MapWindow(point_map), SETTINGS)
 
 
 def scan(i: int) -> Scan:
@@ -94,9 +94,9 @@ def test_a_lost_vehicle_recovers_by_its_prior(tracker: Tracker) -> None:
 
 
 def test_only_the_map_around_the_vehicle_is_held(point_map: PointMap) -> None:
-    here = window_points(point_map, np.array([0.0, 0.0, 0.0]), SETTINGS.half_window_m)
+    here = window_points(point_map, np.array([0.0, 0.0, 0.0]))
     assert len(here) == sum(len(tile.points) for tile in point_map.tiles.values())
-    assert len(window_points(point_map, np.array([900.0, 0.0, 0.0]), SETTINGS.half_window_m)) == 0
+    assert len(window_points(point_map, np.array([900.0, 0.0, 0.0]))) == 0
 
 
 def test_starts_one_metre_and_three_degrees_off_find_the_pose(point_map: PointMap) -> None:
@@ -105,7 +105,7 @@ def test_starts_one_metre_and_three_degrees_off_find_the_pose(point_map: PointMa
     for k in range(20):
         i = 1 + k % (len(POSES) - 2)
         way, yaw = rng.uniform(0, 2 * np.pi), rng.choice([-3.0, 3.0])
-        tracker = Tracker(MapWindow(point_map, SETTINGS), SETTINGS)
+        tracker = Tracker(MapWindow(point_map), SETTINGS)
         tracker.twist = twist_of(POSES, i)
         fix = tracker.localise(scan(i), prior(i, np.cos(way), np.sin(way), 0.0, yaw_deg=float(yaw)))
         found += off(fix.registration.T_map_lidar, i) < 0.2
@@ -115,7 +115,7 @@ def test_starts_one_metre_and_three_degrees_off_find_the_pose(point_map: PointMa
 def test_the_same_scans_give_the_same_poses_to_the_last_bit(point_map: PointMap) -> None:
     runs = []
     for _ in range(2):
-        tracker = Tracker(MapWindow(point_map, SETTINGS), SETTINGS)
+        tracker = Tracker(MapWindow(point_map), SETTINGS)
         runs.append([tracker.localise(scan(i), prior(i, 0.3, 0.2, 0.0)).registration.T_map_lidar for i in range(3)])
     np.testing.assert_array_equal(runs[0], runs[1])
 
@@ -160,7 +160,7 @@ def at(x: float, sigma_m: float = 1.0) -> PosePrior:
 
 def elsewhere() -> Tracker:
     """A tracker that need not know any map."""
-    return Tracker(lambda position: NdtMap(SETTINGS, position), SETTINGS)
+    return Tracker(lambda position: NdtMap(position), SETTINGS)
 
 
 def test_a_vehicle_of_which_nothing_is_known_is_looked_for_at_the_origin_or_where_it_is_told_to_be() -> None:
@@ -257,7 +257,7 @@ def test_a_registration_is_sound_if_it_converged_met_the_map_and_is_certain_in_e
 
 
 def test_the_map_around_a_vehicle_is_built_anew_only_when_it_leaves_the_middle(point_map: PointMap) -> None:
-    around = MapWindow(point_map, SETTINGS)
+    around = MapWindow(point_map)
     first = around(np.array([0.0, 0.0, 1.8]))
     assert around(np.array([24.0, -24.0, 1.8])) is first
     second = around(np.array([24.1, 0.0, 1.8]))
@@ -301,20 +301,20 @@ def test_a_scan_that_fits_worse_than_usual_is_tried_at_its_prior_and_at_every_sp
     """A street looks alike along itself: a scan may settle one house too early."""
     i = 6
     for told in (prior(i), None):
-        tracker = Tracker(MapWindow(point_map, SETTINGS), SETTINGS)
+        tracker = Tracker(MapWindow(point_map), SETTINGS)
         back = POSES[i] @ from_xyz_rpy(-10.0, 0.0, 0.0)
         start_ns = (i + 1) * TENTH - SECOND // 2
         tracker.move_to(back, start_ns, np.zeros(6), score=0.9)  # it was at rest, and 20 m/s half a second later
         fix = tracker.localise(scan(i), told)
         assert off(fix.registration.T_map_lidar, i) < 0.2
-        careless = Tracker(MapWindow(point_map, SETTINGS), SETTINGS)
+        careless = Tracker(MapWindow(point_map), SETTINGS)
         careless.move_to(back, start_ns, np.zeros(6), score=0.0)
         assert off(careless.localise(scan(i), None).registration.T_map_lidar, i) > 1.0, "or nothing is shown here"
 
 
 def test_a_vehicle_told_metres_wrong_is_found_by_looking_around(point_map: PointMap) -> None:
     for shift in ((3.0, -2.0, 0.0), (-4.0, 1.0, 0.0)):
-        tracker = Tracker(MapWindow(point_map, SETTINGS), SETTINGS)
+        tracker = Tracker(MapWindow(point_map), SETTINGS)
         tracker.twist = twist_of(POSES, 5)
         fix = tracker.localise(scan(5), prior(5, *shift, yaw_deg=3.0, sigma_m=3.0))
         assert fix.trusted

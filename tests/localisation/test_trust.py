@@ -7,22 +7,24 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mapvote.config import NdtLevel, NdtSettings, TrustSettings
+from mapvote.config import TrustSettings
 from mapvote.core.geometry import from_xyz_rpy, inverse, transform
 from mapvote.core.types import F64
-from mapvote.localisation.ndt import NdtMap, build_ndt
+from mapvote.localisation import trust
+from mapvote.localisation.ndt import Level, NdtMap, build_ndt
 from mapvote.localisation.trust import Judge, Verdict, height_above_lowest, stands_above_ground
 
 HERE = np.eye(4)
-ALL_POINTS = TrustSettings(points=10**6)
+ALL_POINTS = 10**6
 NOISE_M = 0.05
 TWELVE_UP = np.array([0.0, 0.0, 12.0])
 
 
-def one_level(size: float, half_m: float = 24.0) -> NdtSettings:
-    """A map of voxels of one size, 24 m to all sides of its middle but ``half_m`` along x and y."""
-    level = NdtLevel(voxel_m=size, floor_m=0.1, points_m=0.1, iterations=10)
-    return NdtSettings(levels=(level,), half_window_m=half_m, below_m=24.0, above_m=24.0)
+def one_level(points: F64, size: float, half_m: float = 24.0) -> NdtMap:
+    """A map of voxels of one size, ``half_m`` along x and y to all sides of its middle."""
+    ndt_map = NdtMap(np.zeros(3), (Level(size, floor_m=0.1, points_m=0.1, iterations=10),), half_m)
+    ndt_map.enter(points)
+    return ndt_map
 
 
 def clusters(seed: int, n: int, noise_m: float = 0.0) -> F64:
@@ -54,7 +56,7 @@ def with_ground(points: F64) -> F64:
 
 
 def far_map() -> NdtMap:
-    return build_ndt(clusters(1, 3000), one_level(3.0), np.zeros(3))
+    return one_level(clusters(1, 3000), 3.0)
 
 
 def test_a_scan_drawn_from_the_map_itself_fits_as_the_map_leads_to_expect() -> None:
@@ -62,35 +64,36 @@ def test_a_scan_drawn_from_the_map_itself_fits_as_the_map_leads_to_expect() -> N
     scan = with_ground(clusters(2, 2500, NOISE_M))
     for T in (HERE, from_xyz_rpy(2.0, -1.0, 0.5, 0.0, 0.0, 0.7)):
         points = transform(inverse(T), scan)
-        assert Judge(ALL_POINTS, NOISE_M).fit(far_map(), points, T) == pytest.approx(1.0, abs=0.02)
+        assert Judge(TrustSettings(), NOISE_M, ALL_POINTS).fit(far_map(), points, T) == pytest.approx(1.0, abs=0.02)
 
 
 def test_more_noise_than_the_sensor_has_fits_worse_than_expected() -> None:
     noisy = with_ground(clusters(2, 2500, 0.4))
-    assert Judge(ALL_POINTS, NOISE_M).fit(far_map(), noisy, HERE) < 0.8
-    assert Judge(ALL_POINTS, 0.4).fit(far_map(), noisy, HERE) == pytest.approx(1.0, abs=0.04)
+    assert Judge(TrustSettings(), NOISE_M, ALL_POINTS).fit(far_map(), noisy, HERE) < 0.8
+    assert Judge(TrustSettings(), 0.4, ALL_POINTS).fit(far_map(), noisy, HERE) == pytest.approx(1.0, abs=0.04)
 
 
 def test_points_where_the_map_has_never_been_count_for_nothing_but_are_told() -> None:
     """Half of the scan stands 12 m above everything: the fit of the other half is what it was."""
     cloud = clusters(2, 2500, NOISE_M)
     scan = with_ground(np.concatenate([cloud, cloud + TWELVE_UP]))
-    verdict = Judge(ALL_POINTS, NOISE_M).judge(far_map(), scan, HERE)
+    verdict = Judge(TrustSettings(), NOISE_M, ALL_POINTS).judge(far_map(), scan, HERE)
     assert verdict.known == pytest.approx(0.5)
     assert verdict.fit == pytest.approx(1.0, abs=0.02)
 
 
-def test_where_less_is_known_than_asked_for_nothing_fits() -> None:
+def test_where_less_is_known_than_asked_for_nothing_fits(monkeypatch: pytest.MonkeyPatch) -> None:
     cloud = clusters(2, 500, NOISE_M)
     scan = with_ground(np.concatenate([cloud, cloud + TWELVE_UP]))
     for least, fits in ((0.49, True), (0.5, True), (0.51, False)):
-        judge = Judge(TrustSettings(points=10**6, min_known=least), NOISE_M)
+        monkeypatch.setattr(trust, "MIN_KNOWN", least)
+        judge = Judge(TrustSettings(), NOISE_M, ALL_POINTS)
         assert (judge.fit(far_map(), scan, HERE) > 0.9) == fits
 
 
 def test_a_scan_that_meets_nothing_of_the_map_fits_nowhere() -> None:
     up = with_ground(clusters(2, 100) + TWELVE_UP)
-    verdict = Judge(ALL_POINTS, NOISE_M).judge(far_map(), up, HERE)
+    verdict = Judge(TrustSettings(), NOISE_M, ALL_POINTS).judge(far_map(), up, HERE)
     assert (verdict.fit, verdict.known) == (0.0, 0.0)
 
 
@@ -100,7 +103,7 @@ def test_known_is_the_share_of_points_in_or_beside_a_voxel_of_the_map(seed: int)
     """Looked up in a set of voxels, up to one voxel before the edge of the window."""
     rng = np.random.default_rng(seed)
     mapped = rng.uniform(-8.0, 8.0, (25, 3))
-    ndt_map = build_ndt(mapped, one_level(1.0, half_m=8.0), np.zeros(3))
+    ndt_map = one_level(mapped, 1.0, half_m=8.0)
     filled = {tuple(voxel) for voxel in np.floor(mapped).astype(int).tolist()}
     points = rng.uniform((-10.0, -10.0, 2.0), (10.0, 10.0, 9.0), (300, 3))
     ways = [(0, 0, 0), (1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1)]
@@ -110,7 +113,7 @@ def test_known_is_the_share_of_points_in_or_beside_a_voxel_of_the_map(seed: int)
         known += inside and any((x + i, y + j, z + k) in filled for i, j, k in ways)
     x, y = np.meshgrid(np.arange(-12.0, 13.0), np.arange(-12.0, 13.0))
     scan = np.concatenate([points, np.column_stack([x.ravel(), y.ravel(), np.full(x.size, -20.0)])])
-    verdict = Judge(ALL_POINTS, NOISE_M).judge(ndt_map, scan, HERE)
+    verdict = Judge(TrustSettings(), NOISE_M, ALL_POINTS).judge(ndt_map, scan, HERE)
     assert verdict.known == pytest.approx(known / len(points))
 
 
@@ -142,15 +145,12 @@ def verdict(fit: float = 1.0, known: float = 1.0, lead: float = 1.0) -> Verdict:
 
 
 def test_a_verdict_speaks_for_a_pose_if_fit_knowledge_and_lead_are_all_good_enough() -> None:
-    judge = Judge(TrustSettings(min_fit=0.6, min_known=0.3, min_lead=0.05), NOISE_M)
+    judge = Judge(TrustSettings(min_fit=0.6, min_lead=0.05), NOISE_M)
     assert judge.holds(verdict())
     assert judge.holds(verdict(0.6, 0.3, 0.05)), "just good enough"
     assert not judge.holds(verdict(fit=0.59))
     assert not judge.holds(verdict(known=0.29))
     assert not judge.holds(verdict(lead=0.04))
-
-
-STREET = NdtSettings(half_window_m=48.0)
 
 
 def box(x: float, y: float, side: float = 1.5, height: float = 4.0) -> F64:
@@ -179,7 +179,7 @@ def road(rng: np.random.Generator, half_x_m: float, half_y_m: float) -> F64:
 
 @pytest.fixture(scope="module")
 def square() -> NdtMap:
-    return build_ndt(place(), STREET, np.zeros(3))
+    return build_ndt(place(), np.zeros(3))
 
 
 def seen_from(T: F64, seed: int = 3) -> F64:
@@ -188,7 +188,7 @@ def seen_from(T: F64, seed: int = 3) -> F64:
     return transform(inverse(T), points + rng.normal(0, 0.02, points.shape))
 
 
-JUDGE = Judge(TrustSettings(points=3000), 0.02)
+JUDGE = Judge(TrustSettings(), 0.02, 3000)
 TRUTH = from_xyz_rpy(0.5, -0.4, 1.8, 0.0, 0.0, 0.3)
 
 
@@ -230,7 +230,7 @@ def test_a_pose_that_has_not_settled_yields_to_the_one_beside_it_and_a_settled_o
 def test_where_a_street_repeats_itself_no_place_leads() -> None:
     boxes = np.concatenate([box(x, y) for x in np.arange(-45.0, 45.0, 6.0) for y in (-8.0, 8.0)])
     street = np.concatenate([boxes, road(np.random.default_rng(1), 45.0, 10.0)])
-    ndt_map = build_ndt(street, STREET, np.zeros(3))
+    ndt_map = build_ndt(street, np.zeros(3))
     near = street[np.abs(street[:, 0]) < 20.0]
     found = JUDGE.judge(ndt_map, transform(inverse(from_xyz_rpy(0, 0, 1.8)), near), from_xyz_rpy(0, 0, 1.8))
     assert found.fit > 0.75
@@ -243,6 +243,6 @@ def test_where_a_street_repeats_itself_no_place_leads() -> None:
 
 
 def test_a_handful_of_points_is_enough_and_costs_no_more(square: NdtMap) -> None:
-    few = Judge(TrustSettings(points=400), 0.02).judge(square, seen_from(TRUTH), TRUTH)
+    few = Judge(TrustSettings(), 0.02, 400).judge(square, seen_from(TRUTH), TRUTH)
     assert few.fit == pytest.approx(JUDGE.judge(square, seen_from(TRUTH), TRUTH).fit, abs=0.1)
     assert few.lead > 0.2

@@ -10,6 +10,7 @@ import pytest
 from mapvote.config import MovingSettings
 from mapvote.core.sensors import SENSORS, Sensor
 from mapvote.core.types import F64, Bool
+from mapvote.perception import moving_objects
 from mapvote.perception.moving_objects import MovingFilter
 
 LIDAR_HEIGHT = 1.9
@@ -119,9 +120,10 @@ def test_a_scan_is_decided_within_the_look_ahead_and_no_later_scan_changes_it() 
     assert decided + len(moving.flush()) == len(street.scans)
 
 
-def test_nothing_older_than_the_window_is_used() -> None:
+def test_nothing_older_than_the_window_is_used(monkeypatch: pytest.MonkeyPatch) -> None:
     sensor = coarse("hdl32e")
-    settings = MovingSettings(past_s=1.0, lookahead_s=0.5)
+    monkeypatch.setattr(moving_objects, "PAST_S", 1.0)
+    settings = MovingSettings(lookahead_s=0.5)
     street = Street(sensor, 10.0, 2.5, [ONCOMING])
     whole = street.run(sensor, settings)
     street.scans = street.scans[5:]

@@ -191,7 +191,7 @@ def test_localisation_in_our_own_map_of_a_simulated_street(corner: Path) -> None
         drive = open_drive(corner / name)
         assert drive.T_map_lidar_prior is not None
         true = read_T_map_lidar(corner / "truth" / name / "poses.txt", corner / name)
-        tracker = Tracker(MapWindow(point_map, settings.ndt), settings.ndt)
+        tracker = Tracker(MapWindow(point_map), settings.ndt)
         for i, scan in enumerate(drive):
             prior = PosePrior(drive.T_map_lidar_prior[i], drive.prior_sigma_m, np.radians(drive.prior_sigma_deg))
             fix = tracker.localise(scan, prior)

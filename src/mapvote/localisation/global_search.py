@@ -22,9 +22,9 @@ from mapvote.core.point_map import PointMap
 from mapvote.core.types import F64, I64, U8, U64, MapvoteError, Scan
 from mapvote.core.voxels import thin
 from mapvote.localisation.deskew import deskew
-from mapvote.localisation.ndt import refine, thin_for_levels
+from mapvote.localisation.ndt import LEVELS, refine, thin_for_levels
 from mapvote.localisation.tracker import MapWindow, Tracker
-from mapvote.localisation.trust import Judge, height_above_lowest
+from mapvote.localisation.trust import MIN_KNOWN, Judge, height_above_lowest
 
 _CELL_M = 1.0
 _LAYER_M = 1.0
@@ -76,7 +76,7 @@ class GlobalSearch:
 
     def __init__(self, point_map: PointMap, ndt: NdtSettings, trust: TrustSettings, range_sigma_m: float) -> None:
         self.point_map, self.ndt, self.trust = point_map, ndt, trust
-        self.map_around = MapWindow(point_map, ndt)
+        self.map_around = MapWindow(point_map)
         self.judge = Judge(trust, range_sigma_m)
 
     @cached_property
@@ -110,7 +110,7 @@ class GlobalSearch:
         """(share, x, y, yaw) of the best places, sharpened on single cells."""
         lay = self._layout
         yaws = np.arange(_YAWS) * (2.0 * np.pi / _YAWS)
-        hopeless = int(0.5 * self.trust.min_fit * self.trust.min_known * _FIRST)
+        hopeless = int(0.5 * self.trust.min_fit * MIN_KNOWN * _FIRST)
         scores = _correlate(lay.wide, lay.rows, lay.cols, xy, bits, yaws, hopeless, _FIRST)
         flat = scores.ravel()
         likely = np.argsort(flat, kind="stable")[::-1][: 400 * _PEAKS]
@@ -139,7 +139,7 @@ class GlobalSearch:
     def _choose(self, scan: Scan, guesses: list[F64]) -> Found | None:
         """Refine all, judge the best few with the motion that suits them, and compare."""
         guesses.sort(key=lambda T: (round(T[0, 3] / 40.0), round(T[1, 3] / 40.0)))  # neighbours share a window
-        clouds = thin_for_levels(scan.points, self.ndt)
+        clouds = thin_for_levels(scan.points)
         clouds = [cloud[:: max(1, len(cloud) // 2000)] for cloud in clouds]
         refined = [refine(self.map_around(guess[:3, 3]), clouds, guess) for guess in guesses]
         refined.sort(key=lambda result: -result.score)
@@ -155,8 +155,8 @@ class GlobalSearch:
         points = scan.points
         if scan.time_s is not None:
             points = deskew(scan, Tracker(self.map_around, self.ndt).guess_motion(ndt_map, scan, T, None))
-        T = refine(ndt_map, thin_for_levels(points, self.ndt), T).T_map_lidar
-        few = points[thin(points, self.ndt.levels[-1].points_m)].astype(np.float64)
+        T = refine(ndt_map, thin_for_levels(points), T).T_map_lidar
+        few = points[thin(points, LEVELS[-1].points_m)].astype(np.float64)
         return self.judge.fit(ndt_map, few, T), T
 
 

@@ -21,10 +21,14 @@ from mapvote.core.types import F64, I64, Registration, Scan
 from mapvote.core.voxels import thin
 from mapvote.localisation.deskew import deskew, motion_at, twist_between
 from mapvote.localisation.global_search import GlobalSearch
-from mapvote.localisation.ndt import PosePrior, refine, thin_for_levels
+from mapvote.localisation.ndt import LEVELS, PosePrior, refine, thin_for_levels
 from mapvote.localisation.tracker import TWIST_AGE_S, Fix, MapWindow, Tracker
 from mapvote.localisation.trust import Judge, Verdict
 
+WAIT_SCANS = 40
+"""Scans that wait at most until their track is confirmed: what a vehicle can hold, 4 s at 10 Hz."""
+_EVERY_M, _EVERY_S = 10.0, 2.0
+"""A track that holds is looked at again after this distance or time, well within the 15 m that a look covers."""
 _JUMPS = 4
 """How often a track may move on one scan before it counts as lost there."""
 _MEMORY = 0.1
@@ -66,7 +70,7 @@ class Localiser:
     ) -> None:
         self.trust = settings.trust
         self.search = GlobalSearch(point_map, settings.ndt, settings.trust, sensor.range_sigma_m)
-        self.map_around = MapWindow(point_map, settings.ndt)
+        self.map_around = MapWindow(point_map)
         self.tracker = Tracker(self.map_around, settings.ndt)
         self.judge = Judge(settings.trust, sensor.range_sigma_m)
         self.misfit = np.zeros(3)
@@ -90,7 +94,7 @@ class Localiser:
             self._look()
             if self._confirmed and self._held:
                 return self._decide(len(self._waiting), True)
-        return self._decide(max(0, len(self._waiting) - self.trust.wait_scans), False)
+        return self._decide(max(0, len(self._waiting) - WAIT_SCANS), False)
 
     def flush(self) -> list[Fix]:
         """See :class:`Localise`."""
@@ -123,7 +127,7 @@ class Localiser:
         if last is None or not self._confirmed or not fix.trusted:
             return True
         way = np.linalg.norm(fix.registration.T_map_lidar[:3, 3] - last.registration.T_map_lidar[:3, 3])
-        return bool(way >= self.trust.every_m or 1e-9 * (fix.scan.stamp_ns - last.scan.stamp_ns) >= self.trust.every_s)
+        return bool(way >= _EVERY_M or 1e-9 * (fix.scan.stamp_ns - last.scan.stamp_ns) >= _EVERY_S)
 
     def _look(self) -> None:
         """Judge the newest fix; move the track while another place fits better."""
@@ -144,7 +148,7 @@ class Localiser:
         fix = self._waiting[-1].fix
         T_map_lidar = fix.registration.T_map_lidar
         ndt_map = self.map_around(T_map_lidar[:3, 3])
-        few = fix.points[thin(fix.points, ndt_map.settings.levels[-1].points_m)].astype(np.float64)
+        few = fix.points[thin(fix.points, LEVELS[-1].points_m)].astype(np.float64)
         return self.judge.judge(ndt_map, few, T_map_lidar)
 
     def _move(self, T_map_lidar: F64) -> None:
@@ -163,7 +167,7 @@ class Localiser:
     def _register_anew(self, waiting: _Waiting, guess: F64, twist: F64) -> None:
         before, ndt_map = waiting.fix.registration.T_map_lidar, self.map_around(guess[:3, 3])
         points = deskew(waiting.fix.scan, twist)
-        result = refine(ndt_map, thin_for_levels(points, ndt_map.settings), guess)
+        result = refine(ndt_map, thin_for_levels(points), guess)
         waiting.fix = Fix(waiting.fix.scan, result, points, self.tracker.is_sound(result))
         if waiting.misfit is not None:
             waiting.misfit = waiting.misfit + result.T_map_lidar[:3, 3] - before[:3, 3]

@@ -10,18 +10,45 @@ Pose errors are (6,) vectors (rho, phi) in map axes about the sensor: t' = t + r
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mapvote.config import NdtLevel, NdtSettings
 from mapvote.core.geometry import exp, log
 from mapvote.core.types import F64, Drive, Registration, check_array
 from mapvote.core.voxels import thin
 from mapvote.localisation.ndt_kernels import normal_equations
 from mapvote.localisation.ndt_voxels import Voxels, Window, enter_points, reindex
 
+
+@dataclass(frozen=True, slots=True)
+class Level:
+    """One step of the coarse-to-fine search."""
+
+    voxel_m: float
+    """Side of the NDT voxels."""
+    floor_m: float
+    """Standard deviation added to every voxel's distribution, isotropic."""
+    points_m: float
+    """The scan is thinned to one point per voxel of this side."""
+    iterations: int
+    """Most Gauss-Newton steps at this level."""
+
+
+LEVELS = Level(3.0, 0.5, 1.0, 15), Level(2.0, 0.25, 1.0, 15), Level(1.0, 0.1, 0.7, 15)
+"""Coarse to fine: voxels of the paper's 0.3 m have no basin, and denser scans gave no better median."""
+HALF_WINDOW_M, BELOW_M, ABOVE_M = 96.0, 24.0, 40.0
+"""How far the window reaches to the sides, below and above its centre: as far as a scan has points to speak of."""
+CENTRAL_M = 24.0
+"""A vehicle this far from the window's centre still has 72 m of map to all sides."""
+MIN_POINTS = 3
+"""A voxel with fewer points has no distribution: two make a line."""
+COVARIANCE_SCALE = 5.0
+"""What neighbouring residuals have in common, calibrated so that normalised squared errors average 6."""
+MAP_SIGMA_M, MAP_SIGMA_RAD = 0.01, float(np.radians(0.03))
+"""What the map itself is off by around a scan, which no residual shows."""
 _LEVER_M = 20.0
 """Distance at which a rotation is weighed against a shift, where one tolerance must serve both."""
 
@@ -29,13 +56,11 @@ _LEVER_M = 20.0
 class NdtGrid:
     """One level of the map: voxels of one size. All are kept; those inside the window can be found."""
 
-    def __init__(self, level: NdtLevel, settings: NdtSettings) -> None:
+    def __init__(self, level: Level, half: float) -> None:
         size = level.voxel_m
-        half, below, above = settings.half_window_m, settings.below_m, settings.above_m
-        shape = (round(2 * half / size), round(2 * half / size), round((below + above) / size))
+        shape = (round(2 * half / size), round(2 * half / size), round((BELOW_M + ABOVE_M) / size))
         self.level = level
-        self.min_points = settings.min_points
-        self.reach = np.array([half, half, below])
+        self.reach = np.array([half, half, BELOW_M])
         self.window = Window(np.full(shape, -1, dtype=np.int32), np.zeros(3, dtype=np.int64), size)
         self.voxels = Voxels(np.zeros((1024, 3), dtype=np.int64), np.zeros((1024, 11)), np.zeros((1024, 9)))
         self.n = 0
@@ -51,18 +76,15 @@ class NdtGrid:
         while len(left):
             if self.n == len(self.voxels.place):
                 self.voxels = Voxels(*(np.concatenate([a, np.zeros_like(a)]) for a in self.voxels))
-            self.n, looked_at = enter_points(
-                left, self.window, self.voxels, self.n, self.level.floor_m, self.min_points
-            )
+            self.n, looked_at = enter_points(left, self.window, self.voxels, self.n, self.level.floor_m, MIN_POINTS)
             left = left[looked_at:]
 
 
 class NdtMap:
     """All levels over one bounded window around ``centre`` (map metres), coarse to fine. Grows by :meth:`enter`."""
 
-    def __init__(self, settings: NdtSettings, centre: F64) -> None:
-        self.settings = settings
-        self.levels = [NdtGrid(level, settings) for level in settings.levels]
+    def __init__(self, centre: F64, levels: Sequence[Level] = LEVELS, half_window_m: float = HALF_WINDOW_M) -> None:
+        self.levels = [NdtGrid(level, half_window_m) for level in levels]
         self.recentre(centre)
 
     def recentre(self, centre: F64) -> None:
@@ -73,7 +95,7 @@ class NdtMap:
 
     def is_central(self, position: F64) -> bool:
         """Whether ``position`` (3,) is near enough to the middle for the window to hold what a scan reaches."""
-        return bool(np.abs(np.asarray(position) - self.centre).max() <= self.settings.recentre_m)
+        return bool(np.abs(np.asarray(position) - self.centre).max() <= CENTRAL_M)
 
     def enter(self, points_map: NDArray[np.floating]) -> None:
         """Enter points (n, 3) in map metres into every level."""
@@ -106,30 +128,29 @@ class PosePrior:
         return np.diag([self.sigma_m**-2] * 3 + [self.sigma_rad**-2] * 3)
 
 
-def build_ndt(points_map: NDArray[np.floating], settings: NdtSettings, centre: F64 | None = None) -> NdtMap:
+def build_ndt(points_map: NDArray[np.floating], centre: F64 | None = None) -> NdtMap:
     """The NDT map of points (n, 3) in map metres, its window around ``centre`` (default: the middle of the points)."""
     if centre is None:
         centre = 0.5 * (points_map.min(axis=0) + points_map.max(axis=0)).astype(np.float64)
-    ndt_map = NdtMap(settings, centre)
+    ndt_map = NdtMap(centre)
     ndt_map.enter(points_map)
     return ndt_map
 
 
-def thin_for_levels(points_lidar: NDArray[np.floating], settings: NdtSettings) -> list[F64]:
+def thin_for_levels(points_lidar: NDArray[np.floating]) -> list[F64]:
     """The scan as each level wants it: one point per voxel of the level's ``points_m``. Finest first thinned once."""
     clouds: dict[float, F64] = {}
     source = np.ascontiguousarray(points_lidar, dtype=np.float32)
-    for size in sorted({level.points_m for level in settings.levels}):
+    for size in sorted({level.points_m for level in LEVELS}):
         source = source[thin(source, size)]
         clouds[size] = source.astype(np.float64)
-    return [clouds[level.points_m] for level in settings.levels]
+    return [clouds[level.points_m] for level in LEVELS]
 
 
 def register(
     ndt_map: NdtMap,
     points_lidar: NDArray[np.floating],
     T_map_lidar_guess: F64,
-    settings: NdtSettings,
     *,
     prior: PosePrior | None = None,
     first_level: int = 0,
@@ -138,7 +159,7 @@ def register(
 
     Never raises for bad overlap: the inlier share and the score are low instead, and the caller abstains.
     """
-    return refine(ndt_map, thin_for_levels(points_lidar, settings), T_map_lidar_guess, prior, first_level)
+    return refine(ndt_map, thin_for_levels(points_lidar), T_map_lidar_guess, prior, first_level)
 
 
 def refine(
@@ -155,7 +176,7 @@ def refine(
         for _ in range(grid.level.iterations):
             iterations += 1
             H, g, M, score, inlier_share = _equations(grid, clouds[i], T)
-            covariance, step = _solve(H, g, M, ndt_map.settings)
+            covariance, step = _solve(H, g, M)
             if prior is not None and i == last:
                 covariance, step = _fuse(covariance, step, prior, T)
             T = _moved(T, _clamped(step, 0.5 * grid.level.voxel_m))
@@ -175,18 +196,18 @@ def _equations(grid: NdtGrid, points: F64, T: F64) -> tuple[F64, F64, F64, float
     return normal_equations(points, R, t, grid.window, grid.voxels.cells)
 
 
-def _solve(H: F64, g: F64, M: F64, settings: NdtSettings) -> tuple[F64, F64]:
+def _solve(H: F64, g: F64, M: F64) -> tuple[F64, F64]:
     """Covariance and step of the NDT alone.
 
     The covariance is the robust ("sandwich") estimate H^-1 M H^-1, M being the scatter of the points' own
-    gradients, times ``covariance_scale`` for what neighbouring points have in common, plus what the map itself is
+    gradients, times COVARIANCE_SCALE for what neighbouring points have in common, plus what the map itself is
     off by. A direction that nothing fixes gets a small curvature, hence a large variance and no step, instead of a
     singular matrix.
     """
     floor = 1e-6 * max(float(np.trace(H)), 1.0) * np.eye(6)
     H_inv = _inverse(H + floor)
-    map_variance = np.diag([settings.map_sigma_m**2] * 3 + [np.radians(settings.map_sigma_deg) ** 2] * 3)
-    return settings.covariance_scale * (H_inv @ (M + floor) @ H_inv) + map_variance, -H_inv @ g
+    map_variance = np.diag([MAP_SIGMA_M**2] * 3 + [MAP_SIGMA_RAD**2] * 3)
+    return COVARIANCE_SCALE * (H_inv @ (M + floor) @ H_inv) + map_variance, -H_inv @ g
 
 
 def _fuse(covariance: F64, step: F64, prior: PosePrior, T: F64) -> tuple[F64, F64]:

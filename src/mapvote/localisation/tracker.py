@@ -17,7 +17,16 @@ from mapvote.core.point_map import PointMap
 from mapvote.core.types import F32, F64, Registration, Scan
 from mapvote.core.voxels import thin
 from mapvote.localisation.deskew import deskew, twist_between
-from mapvote.localisation.ndt import NdtMap, PosePrior, build_ndt, fitness, refine, thin_for_levels
+from mapvote.localisation.ndt import (
+    HALF_WINDOW_M,
+    LEVELS,
+    NdtMap,
+    PosePrior,
+    build_ndt,
+    fitness,
+    refine,
+    thin_for_levels,
+)
 
 _REFINED = 3
 """How many of the best guesses are refined when the vehicle is lost."""
@@ -25,6 +34,10 @@ _RECONSIDERED = 8
 """The same, when a scan fits worse than the ones before it."""
 _POOR = 0.9
 """Share of the usual score below which other places are tried."""
+_STEP_M, _REACH_M = 1.0, 10.0
+"""Spacing of the guesses when the vehicle is lost, and the farthest."""
+ACCELERATION_MPS2 = 3.0
+"""How fast a prediction by constant velocity goes stale: a car brakes harder than this only in an emergency."""
 _YAWS_RAD = np.radians([0.0, -3.0, 3.0])
 _ROUNDS = 2
 """How often a scan is de-skewed anew with the motion just found, while that still changes."""
@@ -48,8 +61,8 @@ class Fix:
     """Whether the registration by itself is sound; whether it is the right place, the Localiser finds out."""
 
 
-def window_points(point_map: PointMap, position: F64, half_window_m: float) -> F64:
-    """Points (n, 3) in map metres of the tiles that a square window around ``position`` touches."""
+def window_points(point_map: PointMap, position: F64, half_window_m: float = HALF_WINDOW_M) -> F64:
+    """Points (n, 3) in map metres of the tiles that the NDT's window around ``position`` touches."""
     window = window_around(point_map.lattice, float(position[0]), float(position[1]), 2 * half_window_m)
     tiles = [tile for tile in window.tiles() if tile in point_map.tiles]
     clouds = [point_map.tiles[tile].points_map for tile in tiles]
@@ -59,15 +72,13 @@ def window_points(point_map: PointMap, position: F64, half_window_m: float) -> F
 class MapWindow:
     """The NDT map around a vehicle in a finished map, built anew when the vehicle leaves its middle."""
 
-    def __init__(self, point_map: PointMap, settings: NdtSettings) -> None:
+    def __init__(self, point_map: PointMap) -> None:
         self.point_map = point_map
-        self.settings = settings
         self.ndt_map: NdtMap | None = None
 
     def __call__(self, position: F64) -> NdtMap:
         if self.ndt_map is None or not self.ndt_map.is_central(position):
-            points = window_points(self.point_map, position, self.settings.half_window_m)
-            self.ndt_map = build_ndt(points, self.settings, position)
+            self.ndt_map = build_ndt(window_points(self.point_map, position), position)
         return self.ndt_map
 
 
@@ -99,7 +110,7 @@ class Tracker:
         if reach >= self.settings.hypothesis_step_m:
             seed = self._levelled(ndt_map, scan, seed)
         twist = self.twist if self._knows_motion(scan) else self.guess_motion(ndt_map, scan, seed, prior)
-        first_level = 0 if self.last_pose is None or reach > 0.5 * self.settings.hypothesis_step_m else 1
+        first_level = 0 if self.last_pose is None or reach > 0.5 * _STEP_M else 1
         result = refine(ndt_map, self._clouds(scan, twist), seed, prior, first_level)
         if result.score < _POOR * self._usual_score:
             result = self._reconsider(ndt_map, self._clouds(scan, twist), scan.stamp_ns, result, prior)
@@ -120,14 +131,14 @@ class Tracker:
         return Fix(scan, result, deskew(scan, twist), trusted)
 
     def _clouds(self, scan: Scan, twist: F64) -> list[F64]:
-        return thin_for_levels(deskew(scan, twist), self.settings)
+        return thin_for_levels(deskew(scan, twist))
 
     def _knows_motion(self, scan: Scan) -> bool:
         return scan.time_s is None or bool(self.twist.any()) or self._measured
 
     def guess_motion(self, ndt_map: NdtMap, scan: Scan, seed: F64, prior: PosePrior | None) -> F64:
         """The forward speed at which a scan fits the map best: unknown motion bends it, and moves it since the last."""
-        few = thin(scan.points, self.settings.levels[0].points_m)
+        few = thin(scan.points, LEVELS[0].points_m)
         sample = Scan(scan.stamp_ns, scan.points[few], None if scan.time_s is None else scan.time_s[few])
         age = 1e-9 * (scan.stamp_ns - self.last_stamp_ns)
         moved: list[tuple[float, F64]] = []
@@ -148,11 +159,11 @@ class Tracker:
         if self.last_pose is not None:
             age = 1e-9 * (stamp_ns - self.last_stamp_ns)
             known = self._measured or bool(self.twist.any())
-            drift = 0.5 * self.settings.acceleration_mps2 * age**2 if known else age * float(_SPEEDS_MPS[-1])
+            drift = 0.5 * ACCELERATION_MPS2 * age**2 if known else age * float(_SPEEDS_MPS[-1])
             if prior is None or drift < prior.sigma_m:
                 return self.last_pose @ exp(age * self.twist), drift
         if prior is None:
-            return np.eye(4), self.settings.hypothesis_reach_m
+            return np.eye(4), _REACH_M
         return prior.T_map_lidar, 2.0 * prior.sigma_m
 
     def _levelled(self, ndt_map: NdtMap, scan: Scan, seed: F64) -> F64:
@@ -196,9 +207,8 @@ class Tracker:
         self, ndt_map: NdtMap, clouds: list[F64], centre: F64, reach: float, prior: PosePrior | None
     ) -> Registration:
         """Guesses on a grid around ``centre``, ranked by the coarsest level; the best few are refined."""
-        step = self.settings.hypothesis_step_m
-        rings = int(np.ceil(min(max(reach, step), self.settings.hypothesis_reach_m) / step))
-        offsets = step * np.arange(-rings, rings + 1)
+        rings = int(np.ceil(min(max(reach, _STEP_M), _REACH_M) / _STEP_M))
+        offsets = _STEP_M * np.arange(-rings, rings + 1)
         guesses = [
             centre @ from_xyz_rpy(x, y, 0.0, 0.0, 0.0, yaw) for x in offsets for y in offsets for yaw in _YAWS_RAD
         ]

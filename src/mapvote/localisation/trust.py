@@ -18,6 +18,12 @@ from mapvote.core.geometry import from_xyz_rpy
 from mapvote.core.types import F64, I32, I64, Bool
 from mapvote.localisation.ndt import NdtMap, fitness, refine
 
+MIN_KNOWN = 0.3
+"""Share of the standing points that must lie where the map has been: with fewer, what fits there proves little."""
+_POINTS = 1000
+"""Points of a scan looked at."""
+_NEAR_M, _FAR_M = 2.0, 15.0
+"""Other places are tried from here to there, along the street and across it: houses and parked cars repeat so."""
 _CELL_M = 3.0
 _ABOVE_M = 0.6
 """Points this high above the lowest one around them stand above the ground, on any road that can be driven."""
@@ -48,13 +54,13 @@ class Verdict:
 class Judge:
     """Looks at one scan at one pose of a map."""
 
-    def __init__(self, settings: TrustSettings, range_sigma_m: float) -> None:
-        self.settings = settings
+    def __init__(self, settings: TrustSettings, range_sigma_m: float, most_points: int = _POINTS) -> None:
+        self.settings, self.most_points = settings, most_points
         self.range_sigma_m = range_sigma_m
 
     def judge(self, ndt_map: NdtMap, points_lidar: F64, T_map_lidar: F64) -> Verdict:
         """``points_lidar`` (n, 3) de-skewed and thinned; a few thousand are plenty."""
-        few = np.ascontiguousarray(points_lidar[:: max(1, len(points_lidar) // self.settings.points)])
+        few = np.ascontiguousarray(points_lidar[:: max(1, len(points_lidar) // self.most_points)])
         standing = few[stands_above_ground(few, T_map_lidar)]
         expected, known = self._expected(ndt_map, standing, T_map_lidar)
         here = self._likelihood(ndt_map, standing, T_map_lidar) / expected
@@ -69,15 +75,15 @@ class Judge:
 
     def fit(self, ndt_map: NdtMap, points_lidar: F64, T_map_lidar: F64) -> float:
         """The verdict's fit alone."""
-        few = np.ascontiguousarray(points_lidar[:: max(1, len(points_lidar) // self.settings.points)])
+        few = np.ascontiguousarray(points_lidar[:: max(1, len(points_lidar) // self.most_points)])
         standing = few[stands_above_ground(few, T_map_lidar)]
         expected, known = self._expected(ndt_map, standing, T_map_lidar)
-        return self._likelihood(ndt_map, standing, T_map_lidar) / expected if known >= self.settings.min_known else 0.0
+        return self._likelihood(ndt_map, standing, T_map_lidar) / expected if known >= MIN_KNOWN else 0.0
 
     def holds(self, verdict: Verdict) -> bool:
         """Whether the verdict speaks for the pose."""
         s = self.settings
-        return verdict.fit >= s.min_fit and verdict.known >= s.min_known and verdict.lead >= s.min_lead
+        return verdict.fit >= s.min_fit and verdict.known >= MIN_KNOWN and verdict.lead >= s.min_lead
 
     def _expected(self, ndt_map: NdtMap, standing: F64, T: F64) -> tuple[float, float]:
         """(mean likelihood that the standing points should have, share of them where the map has been)."""
@@ -105,7 +111,7 @@ class Judge:
     def _others(self, ndt_map: NdtMap, few: F64, standing: F64, T: F64) -> list[F64]:
         """Refined poses of the best other places: the coarse peaks along four arms and turned about, and just
         ahead and behind."""
-        away = np.arange(self.settings.near_m - _STEP_M, self.settings.far_m + 0.5 * _STEP_M, _STEP_M)
+        away = np.arange(_NEAR_M - _STEP_M, _FAR_M + 0.5 * _STEP_M, _STEP_M)
         coarse = [standing[:: max(1, len(standing) // _COARSE)]]
         peaks = []
         for x, y, yaw in ((1.0, 0.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, -1.0, 0.0), (1.0, 0.0, np.pi)):

@@ -12,7 +12,7 @@ rays went through both just below and just above the place, because a ray over a
 It needs no map, only poses, so it serves SLAM and voting alike.
 
 Online: a scan is decided after at most ``lookahead_s`` (1 s), because what a vehicle ahead of
-us hides is seen through only once it has driven on. Nothing older than ``past_s`` before it is used.
+us hides is seen through only once it has driven on. Nothing older than ``PAST_S`` (2 s) before it is used.
 
 What it cannot tell: a car that waits through the whole window is static, one farther than ``reach_m`` is never called
 moving, and what only the sky lies behind is judged by the cells it is connected to (rays without return are unknown).
@@ -34,6 +34,8 @@ from mapvote.perception.moving_kernels import look, moving_components, range_ima
 
 # Set on the development streets of the simulator; what half and twice of each cost,
 # benchmarks/moving_accuracy.py --sweep measures.
+PAST_S = 2.0
+"""How far back other scans are asked."""
 LOOKS_PAST = 6
 """Scans asked before."""
 LOOKS_AHEAD = 5
@@ -122,7 +124,7 @@ class MovingFilter:
                 break
             out.append(self._moving(at))
             self._waiting -= 1
-            oldest_ns = self._window[at].stamp_ns - round(self.settings.past_s * 1e9)
+            oldest_ns = self._window[at].stamp_ns - round(PAST_S * 1e9)
             while self._window[0].stamp_ns < oldest_ns:
                 self._window.popleft()
         return out

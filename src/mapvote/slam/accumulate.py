@@ -31,6 +31,8 @@ from mapvote.perception.moving_objects import MovingFilter
 from mapvote.perception.raycast import find_obstacles
 from mapvote.slam.mirrored import mirrored
 
+_MIN_THROUGH, _TRAIL_SHARE = 3, 0.45
+"""A voxel is a trail if so many scans saw through it, and of those able to a smaller share struck it."""
 ROAD_M = 0.1
 """Points this low above the ground are the road itself, also under a car."""
 
@@ -92,8 +94,7 @@ class Layer:
             here = here[find_obstacles(points[here], standing)[0]]
             r, c = r[here], c[here]
             bits = np.floor(points[here, 2] / CELL_SIZE).astype(np.int64) - reference.base[r, c]
-            s = self.settings.mapping
-            trail[here] = _are_trails(planes, r, c, bits, s.trail_min_through, s.trail_share)
+            trail[here] = _are_trails(planes, r, c, bits, _MIN_THROUGH, _TRAIL_SHARE)
         return trail
 
     def _free(self, tile: TileIndex, point_map: PointMap) -> U64:

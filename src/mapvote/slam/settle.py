@@ -21,6 +21,12 @@ from mapvote.slam.frame import fit_to_priors, trust_in
 from mapvote.slam.pose_graph import Anchors, Links, optimise, position_sigmas
 from mapvote.slam.surveyor import Surveyed, is_precise
 
+_SLACK = 5.0
+"""Widens a precise prior's sigma: its errors are alike for a while."""
+_LINK_SIGMA_M, _LINK_SIGMA_RAD = 0.003, float(np.radians(0.01))
+"""Random error of the motion from scan to scan."""
+_REVISIT_M, _REVISIT_S = 10.0, 10.0
+"""A scan this near to one at least so much older is linked to it."""
 _REWEIGHTED = 3
 """How often the priors' weights are taken anew."""
 _ASKED = 12
@@ -50,7 +56,7 @@ def settle(drives: Sequence[Drive], found: Sequence[Surveyed], settings: Mapping
     if not any(is_precise(drive, settings) for drive in drives):
         T_map_draft = _laid_on_priors(drives, T, known, starts)
         T = T_map_draft @ T
-    links = _links(drives, T, known, _pieces(found, starts), settings)
+    links = _links(drives, T, known, _pieces(found, starts))
     anchors = _anchors(drives, T, starts, settings)
     for _ in range(_REWEIGHTED):
         T = optimise(T, links, anchors)
@@ -93,12 +99,12 @@ def _anchors(drives: Sequence[Drive], T: F64, starts: I64, settings: MappingSett
     for start, drive in zip(starts, drives, strict=False):
         if drive.T_map_lidar_prior is None:
             continue
-        slack = settings.prior_slack
+        slack = _SLACK
         if not is_precise(drive, settings):
             seconds = 1e-9 * float(drive.stamps_ns[-1] - drive.stamps_ns[0])
             alike = min(1.0, settings.prior_memory_s / max(seconds, 1e-3)) * len(drive)
             slack = float(np.sqrt(max(alike, 1.0)))
-        sigma_rad = settings.prior_slack * slack * float(np.radians(drive.prior_sigma_deg))
+        sigma_rad = _SLACK * slack * float(np.radians(drive.prior_sigma_deg))
         anchor = Anchors(
             np.arange(start, start + len(drive)),
             drive.T_map_lidar_prior,
@@ -114,7 +120,7 @@ def _off(T: F64, anchors: Anchors) -> F64:
     return np.asarray(np.linalg.norm(T[anchors.pose, :3, 3] - anchors.T_map[:, :3, 3], axis=1))
 
 
-def _links(drives: Sequence[Drive], T: F64, known: I64, piece_of: I64, settings: MappingSettings) -> list[Links]:
+def _links(drives: Sequence[Drive], T: F64, known: I64, piece_of: I64) -> list[Links]:
     """The motion from scan to scan, and from each scan to the nearest much older one near by: it was registered to the
     map that the older one made."""
     order = np.concatenate([np.asarray(drive.stamps_ns) for drive in drives])
@@ -122,20 +128,17 @@ def _links(drives: Sequence[Drive], T: F64, known: I64, piece_of: I64, settings:
     pairs = [(known[:-1][consecutive], known[1:][consecutive])]
     tree = cKDTree(T[known, :3, 3])
     first, second = [], []
-    for j, near in zip(known, tree.query_ball_point(T[known, :3, 3], settings.revisit_m), strict=True):
-        older = [
-            i for i in known[near] if i < j and (piece_of[i] != piece_of[j] or _apart(order, int(i), int(j), settings))
-        ]
+    for j, near in zip(known, tree.query_ball_point(T[known, :3, 3], _REVISIT_M), strict=True):
+        older = [i for i in known[near] if i < j and (piece_of[i] != piece_of[j] or _apart(order, int(i), int(j)))]
         if older:
             first.append(min(older, key=lambda i: (float(np.linalg.norm(T[i, :3, 3] - T[j, :3, 3])), i)))
             second.append(j)
     pairs.append((np.array(first, dtype=np.int64), np.array(second, dtype=np.int64)))
-    sigma_m, sigma_rad = settings.link_sigma_m, float(np.radians(settings.link_sigma_deg))
     return [
-        Links(a, b, np.array([inverse(T[i]) @ T[j] for i, j in zip(a, b, strict=True)]), sigma_m, sigma_rad)
+        Links(a, b, np.array([inverse(T[i]) @ T[j] for i, j in zip(a, b, strict=True)]), _LINK_SIGMA_M, _LINK_SIGMA_RAD)
         for a, b in pairs
     ]
 
 
-def _apart(stamps_ns: I64, i: int, j: int, settings: MappingSettings) -> bool:
-    return bool(abs(int(stamps_ns[j]) - int(stamps_ns[i])) > 1e9 * settings.revisit_s)
+def _apart(stamps_ns: I64, i: int, j: int) -> bool:
+    return bool(abs(int(stamps_ns[j]) - int(stamps_ns[i])) > 1e9 * _REVISIT_S)

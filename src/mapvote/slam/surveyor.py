@@ -20,9 +20,13 @@ from mapvote.core.types import F64, Bool, Drive, MapvoteError, Scan
 from mapvote.core.voxels import VoxelCloud, thin
 from mapvote.localisation.deskew import twist_between
 from mapvote.localisation.ndt import NdtMap, PosePrior
-from mapvote.localisation.tracker import Fix, Tracker
+from mapvote.localisation.tracker import ACCELERATION_MPS2, Fix, Tracker
 from mapvote.slam.frame import fit_to_priors
 
+_MIN_INLIER_SHARE = 0.4
+"""As the setting of ndt, while the map is still growing: half of a scan may look at what nobody has seen yet."""
+_POINTS_M = 0.3
+"""Scans enter the NDT map thinned to one point per such voxel: the paper's storage resolution."""
 _JUMP_M = 0.5
 """A scan this far from where the last ones were heading, beyond what a vehicle can brake or swerve, is not there."""
 _PATIENCE = 5
@@ -51,7 +55,7 @@ class Surveyor:
 
     def __init__(self, settings: Settings) -> None:
         self.mapping = settings.mapping
-        self.ndt = settings.ndt.model_copy(update={"min_inlier_share": settings.mapping.min_inlier_share})
+        self.ndt = settings.ndt.model_copy(update={"min_inlier_share": _MIN_INLIER_SHARE})
         self.ndt_map: NdtMap | None = None
         self.draft = VoxelCloud(Lattice())
         """A cloud of everything, for the ground and the occupied voxels that the second pass needs."""
@@ -100,7 +104,7 @@ class Surveyor:
         age = 1e-9 * (scan.stamp_ns - before[1])
         ahead = before[0] @ exp(age * before[2])
         off = float(np.linalg.norm(fix.registration.T_map_lidar[:3, 3] - ahead[:3, 3]))
-        if off <= _JUMP_M + 0.5 * self.ndt.acceleration_mps2 * age**2:
+        if off <= _JUMP_M + 0.5 * ACCELERATION_MPS2 * age**2:
             return fix
         tracker.move_to(before[0], before[1], before[2], fix.registration.score)
         return replace(fix, trusted=False)
@@ -117,7 +121,7 @@ class Surveyor:
 
     def _map_around(self, position: F64) -> NdtMap:
         if self.ndt_map is None:
-            self.ndt_map = NdtMap(self.ndt, position)
+            self.ndt_map = NdtMap(position)
         if not self.ndt_map.is_central(position):
             self.ndt_map.recentre(position)
         return self.ndt_map
@@ -125,7 +129,7 @@ class Surveyor:
     def _enter(self, fix: Fix, drive: Drive, i: int) -> None:
         T_map_lidar = fix.registration.T_map_lidar
         points_map, position = transform(T_map_lidar, fix.points), T_map_lidar[:3, 3]
-        spread = thin(points_map - position, self.mapping.ndt_points_m)
+        spread = thin(points_map - position, _POINTS_M)
         self._map_around(position).enter(points_map[spread])
         self.draft.enter(points_map)
         if drive.T_map_lidar_prior is not None:

@@ -28,7 +28,6 @@ from mutants import bomb, mutants
 CONFIG = """
 [server]
 ballots_per_minute = 1e9
-burst = 1000000
 drives_a_day = 1000000000
 max_body_bytes = 300000
 """

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mapvote.config import GateSettings, NdtLevel, NdtSettings
+from mapvote.config import GateSettings, NdtSettings
 from mapvote.core.geometry import from_xyz_rpy, inverse, transform
 from mapvote.core.point_map import PointMap, map_from_points
 from mapvote.core.sensors import SENSORS
@@ -16,13 +16,7 @@ from mapvote.core.types import F64, Drive, MapvoteError, Scan
 from mapvote.server.insight.localisation_gate import GateResult, Localised, compare, gate, gate_by, pass_or_hold
 from mapvote.server.store.policy import GatePolicy
 
-NDT = NdtSettings(
-    levels=(
-        NdtLevel(voxel_m=2.0, floor_m=0.25, points_m=1.0, iterations=15),
-        NdtLevel(voxel_m=1.0, floor_m=0.1, points_m=0.7, iterations=15),
-    )
-)
-SETTINGS = GateSettings(max_scans=20)
+NDT, SETTINGS = NdtSettings(), GateSettings()
 
 
 def box(x: float, y: float, width: float, depth: float, height: float, rng: np.random.Generator) -> F64:

@@ -34,7 +34,7 @@ def scans_near_changes(scene: Scene, truth: Truth, drive: str) -> I64:
 
 def localise_in(drive: Drive, scans: I64, point_map: PointMap, scene: Scene) -> F64:
     """(n, 4, 4) the pose of each of these scans by NDT in ``point_map`` from the drive's own prior, NaN where lost."""
-    tracker = Tracker(MapWindow(point_map, scene.settings.ndt), scene.settings.ndt)
+    tracker = Tracker(MapWindow(point_map), scene.settings.ndt)
     out = np.full((len(scans), 4, 4), np.nan)
     for k, i in enumerate(scans):
         prior = None

@@ -17,7 +17,7 @@ class RateLimit:
     """A token bucket for each name: ``burst`` at once, ``per_minute`` on average. For one thread (the event loop)."""
 
     def __init__(
-        self, per_minute: float, burst: int, what: str = "ballots", clock: Callable[[], float] = time.monotonic
+        self, per_minute: float, burst: float, what: str = "ballots", clock: Callable[[], float] = time.monotonic
     ) -> None:
         self._what = what
         self._per_s = per_minute / 60.0

@@ -25,6 +25,12 @@ from mapvote.server.store.store import Store
 READING = 1
 """Threads for whatever an operator looks at. Python computes in one thread at a time: more would only take turns with
 those who answer vehicles."""
+_BATCH = 64
+"""Ballots written in one transaction at most."""
+_BURST = 0.1
+"""Share of a minute's ballots that a vehicle may send at once."""
+_UPLOADS = 8
+"""Largest bodies that fit into the memory for all ballots on their way."""
 _READERS = 1024
 """Readers answered by one look at the newest version."""
 
@@ -100,16 +106,16 @@ def make_services(store: Store, settings: Settings, gate: Gate | None, executor:
         fusing=executor or threads.fuse,
         threads=threads,
         intake=intake,
-        examiner=Batcher(intake.look_at, most.batch, threads.ballots),
-        writer=Batcher(intake.write, most.batch, threads.ballots),
+        examiner=Batcher(intake.look_at, _BATCH, threads.ballots),
+        writer=Batcher(intake.write, _BATCH, threads.ballots),
         newest=Batcher(manifests.newest, _READERS, threads.lookups),
         writable=Batcher(manifests.newest_if_writable, _READERS, threads.lookups),
         damaged=Batcher(manifests.damaged, _READERS, threads.lookups),
         manifests=manifests,
         clouds=Clouds(store),
         metrics=Metrics(),
-        limit=RateLimit(most.ballots_per_minute, most.burst),
-        uploads=Uploads(most.max_body_bytes, most.upload_bytes),
+        limit=RateLimit(most.ballots_per_minute, max(1.0, _BURST * most.ballots_per_minute)),
+        uploads=Uploads(most.max_body_bytes, _UPLOADS * most.max_body_bytes),
     )
 
 

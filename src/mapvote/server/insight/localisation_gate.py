@@ -30,6 +30,10 @@ from mapvote.server.store.policy import GatePolicy
 from mapvote.server.store.publish import Gate
 
 Verdict = Literal["pass", "hold", "abstain"]
+REACH_M = 50.0
+"""Scans farther from every change see no difference."""
+MOST_SCANS = 60
+"""Scans compared at most, spread evenly."""
 MIN_SCANS = 20
 """With fewer scans near a change the gate abstains: the t distribution's bound is then wider than any tolerance."""
 BLOCK_SCANS = 5
@@ -122,12 +126,12 @@ def gate(old: PointMap, new: PointMap, drive: Drive, settings: GateSettings, ndt
         raise MapvoteError(f"gate: {old.map_id!r} and {new.map_id!r} are not versions of one map")
     if drive.T_map_lidar_prior is None:
         raise MapvoteError(f"{drive.path}: the gate needs a drive with prior poses (prior.txt, or --prior FILE)")
-    near = scans_near(old, new, drive.T_map_lidar_prior, settings.reach_m)
-    chosen = near[np.unique(np.linspace(0, len(near) - 1, min(len(near), settings.max_scans)).astype(np.int64))]
+    near = scans_near(old, new, drive.T_map_lidar_prior, REACH_M)
+    chosen = near[np.unique(np.linspace(0, len(near) - 1, min(len(near), MOST_SCANS)).astype(np.int64))]
     if len(chosen) < MIN_SCANS:
         reason = (
             f"only {len(near)} of {len(drive)} scans of {drive.vehicle}/{drive.drive_id} were taken within "
-            f"{settings.reach_m:g} m of what changed; the gate needs {MIN_SCANS}"
+            f"{REACH_M:g} m of what changed; the gate needs {MIN_SCANS}"
         )
         return GateResult("abstain", (reason,), len(drive), len(near), 0, ())
     pairs = localise_in_both(old, new, drive, [int(i) for i in chosen], ndt)
@@ -157,10 +161,10 @@ def localise_in_both(
 ) -> list[tuple[Localised, Localised]]:
     """(in the old map, in the new map) of each scan, de-skewed by the motion of the prior poses."""
     assert drive.T_map_lidar_prior is not None
-    windows = MapWindow(old, ndt), MapWindow(new, ndt)
+    windows = MapWindow(old), MapWindow(new)
     pairs = []
     for i in scans:
-        clouds = thin_for_levels(deskew(drive.read_scan(i), _prior_twist(drive, i)), ndt)
+        clouds = thin_for_levels(deskew(drive.read_scan(i), _prior_twist(drive, i)))
         prior = drive.T_map_lidar_prior[i]
         guesses = [
             prior @ from_xyz_rpy(START_M * np.cos(a), START_M * np.sin(a), 0.0, 0.0, 0.0, 0.0) for a in _START_ANGLES
