@@ -28,6 +28,7 @@ NAMED_TWICE = {
     "compare",
     "coverage",
     "decide",
+    "encode",
     "examine",
     "heights",
     "main",
