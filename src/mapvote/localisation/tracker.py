@@ -107,7 +107,7 @@ class Tracker:
         """
         seed, reach = self._seed(scan.stamp_ns, prior)
         ndt_map = self.map_around(seed[:3, 3])
-        if reach >= self.settings.hypothesis_step_m:
+        if reach >= _STEP_M:
             seed = self._levelled(ndt_map, scan, seed)
         twist = self.twist if self._knows_motion(scan) else self.guess_motion(ndt_map, scan, seed, prior)
         first_level = 0 if self.last_pose is None or reach > 0.5 * _STEP_M else 1
@@ -169,8 +169,8 @@ class Tracker:
     def _levelled(self, ndt_map: NdtMap, scan: Scan, seed: F64) -> F64:
         """The seed at the height at which the scan fits far better: satellites know heights worst, and NDT finds no
         road that lies metres from the scan's own."""
-        sample = thin_for_levels(scan.points[thin(scan.points, self.settings.levels[0].points_m)], self.settings)[:1]
-        steps = np.arange(self.settings.hypothesis_step_m, self.settings.hypothesis_reach_m + 1e-6)
+        sample = thin_for_levels(scan.points[thin(scan.points, LEVELS[0].points_m)])[:1]
+        steps = np.arange(_STEP_M, _REACH_M + 1e-6)
         guesses = [seed, *(from_xyz_rpy(0.0, 0.0, z) @ seed for step in steps for z in (step, -step))]
         fits = [fitness(ndt_map, sample, guess) for guess in guesses]
         best = int(np.argmax(fits))
