@@ -13,7 +13,7 @@ from mapvote.fusion.tile_vote import DAY_NS
 from mapvote.server.errors import NotFound, Unauthorised
 from mapvote.server.store import keys
 from mapvote.server.store.admission import Intake, Sent, accept, examine
-from mapvote.server.store.publish import publish
+from mapvote.server.store.publish import preview
 from mapvote.server.store.replay import replay
 from mapvote.server.store.store import Store
 
@@ -95,7 +95,7 @@ def test_whose_key_is_revoked_is_not_heard_any_more_unless_one_says_so(store: St
         keys.issue(store, vehicle, "vehicle")
         accept(store, [examine(takes_the_wall_down(vehicle))])
     assert keys.revoke(store, "v1", keep_votes=keep_votes) == (1, 0 if keep_votes else 1)
-    assert publish(store, dry_run=True).deleted == (3 if keep_votes else 0)
+    assert preview(store).deleted == (3 if keep_votes else 0)
 
 
 def test_what_a_revoked_vehicle_took_part_in_stays_published_and_can_be_replayed_without_it(store: Store) -> None:

@@ -298,10 +298,10 @@ def test_the_gate_sees_both_maps(store: Store) -> None:
         seen.append((old, new))
         return []
 
-    publish(store, POLICY, gate=gate, dry_run=True)
+    preview(store, POLICY, gate=gate)
     assert seen == [], "the policy names no drive"
     set_policy(store, Policy(gate=GatePolicy(drive="/drives/ring")))
-    publish(store, POLICY, gate=gate, dry_run=True)
+    preview(store, POLICY, gate=gate)
     old, new = seen[0]
     assert len(old.tiles[0, 0].points) - len(new.tiles[0, 0].points) == 3
     assert new.tiles[0, 1] is old.tiles[0, 1]
