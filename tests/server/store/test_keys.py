@@ -13,7 +13,7 @@ from mapvote.fusion.tile_vote import DAY_NS
 from mapvote.server.errors import NotFound, Unauthorised
 from mapvote.server.store import keys
 from mapvote.server.store.admission import Intake, Sent, accept, examine
-from mapvote.server.store.publish import preview
+from mapvote.server.store.publish import preview, publish
 from mapvote.server.store.replay import replay
 from mapvote.server.store.store import Store
 
