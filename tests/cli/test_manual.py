@@ -16,6 +16,7 @@ from typer.testing import CliRunner
 from live_server import mapvote
 from mapvote.cli import app
 from mapvote.cli.options import DRIVE_OPTIONS
+from mapvote.cli.terminal import print_table
 from mapvote.formats import open_drive
 
 VERBS = sorted(get_command(app).commands)  # type: ignore[attr-defined]
@@ -115,3 +116,9 @@ def test_listing_the_verbs_imports_nothing_heavy() -> None:
         "'embreex', 'httpx2'); print([name for name in heavy if name in sys.modules])"
     )
     assert subprocess.check_output([sys.executable, "-c", code], text=True).strip() == "[]"
+
+
+def test_square_brackets_of_files_survive_in_tables_too(capsys: pytest.CaptureFixture[str]) -> None:
+    print_table(("of [las]",), [["a[bold]b"]], title="street[las]")
+    shown = capsys.readouterr().out
+    assert all(word in shown for word in ("of [las]", "a[bold]b", "street[las]"))
