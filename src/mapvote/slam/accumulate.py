@@ -2,7 +2,8 @@
 
 A draft of the map gives the ground and says which voxels anything ever struck. Every voxel's scans are then counted:
 in how many was it struck, in how many seen through. What was struck only rarely by scans that could have struck it is
-the trail of something that moved and escaped the filter: it leaves the map, and its voxels are unknown, not free.
+the trail of something that moved and escaped the filter: it leaves the map, and its voxels are unknown, not free. So
+does what is no surface at all (slam/strays.py).
 
 What enters the map has been before the filter, at whatever range: a car that drives ahead of the surveyor, too far off
 for the counting, would else leave its trail unchallenged. Returns from beyond the filter's reach are left out.
@@ -19,7 +20,7 @@ from scipy import ndimage
 
 from mapvote.config import Settings
 from mapvote.core.columns import TOP_BIT, shifted
-from mapvote.core.grid import CELL_SIZE, TILE_CELLS, TileIndex
+from mapvote.core.grid import CELL_SIZE, TILE_CELLS, TileIndex, tile_of_cells
 from mapvote.core.point_map import PointMap, map_from_points
 from mapvote.core.reference import LocalMap, reference_window
 from mapvote.core.types import F64, I32, I64, U64, Bool, Drive
@@ -30,6 +31,7 @@ from mapvote.perception.frontend import Frontend, Observation, PlacedScan
 from mapvote.perception.moving_objects import MovingFilter
 from mapvote.perception.raycast import find_obstacles
 from mapvote.slam.mirrored import mirrored
+from mapvote.slam.strays import strays
 
 _MIN_THROUGH, _TRAIL_SHARE = 3, 0.45
 """A voxel is a trail if so many scans saw through it, and of those able to a smaller share struck it."""
@@ -45,6 +47,7 @@ class Layer:
         self.draft, self.road, self.settings = draft, road, settings
         self.cloud = VoxelCloud(draft.lattice)
         self.evidence = Evidence(draft.lattice)
+        self._driven: list[F64] = []
         self._around = LocalMap(draft, 2.0 * settings.mapping.reach_m)
         self._near = LocalMap(draft, settings.voting.window_m)
 
@@ -53,6 +56,7 @@ class Layer:
         mapping = self.settings.mapping
         movers = MovingFilter(drive.sensor, self.settings.moving.model_copy(update={"reach_m": mapping.reach_m}))
         frontend = Frontend(GivenPoses(drive.stamps_ns, T_map_lidar), movers, self._around, self._near)
+        self._driven.append(T_map_lidar[registered, :3, 3])
         for i, scan in enumerate(drive):
             if registered[i]:
                 self._enter(frontend.observe(scan))
@@ -69,29 +73,31 @@ class Layer:
 
     def finish(self) -> PointMap:
         """The map of everything laid."""
-        points, _ = self.cloud.points()
-        points = points[~self._trails(points, self.draft)]
+        points, scans = self.cloud.points()
+        kept = ~self._trails(points, _standing(points, self.draft))
+        points, scans = points[kept], scans[kept]
         # Trails lift the draft's ground; above the true one stand the undersides of cars that had passed for ground.
         laid = map_from_points(points, lattice=self.draft.lattice, road=self.road)
-        points = points[~(self._trails(points, laid) | mirrored(points, laid, self.road))]
-        point_map = map_from_points(points, lattice=self.draft.lattice, road=self.road)
+        obstacle = _standing(points, laid)
+        driven = np.concatenate(self._driven) if self._driven else np.zeros((0, 3))
+        dropped = self._trails(points, obstacle) | mirrored(points, laid, self.road)
+        dropped |= obstacle & strays(points, scans, driven, self.draft.lattice)
+        point_map = map_from_points(points[~dropped], lattice=self.draft.lattice, road=self.road)
         tiles = {tile: replace(content, free=self._free(tile, point_map)) for tile, content in point_map.tiles.items()}
         return replace(point_map, tiles=tiles)
 
-    def _trails(self, points: F64, ground: PointMap) -> Bool:
+    def _trails(self, points: F64, obstacle: Bool) -> Bool:
         """Which points (n, 3) lie in voxels that were struck in too few of the scans that could have struck them.
 
-        Only points that stand above the ground of ``ground`` are judged, and only voxels that rays crossed from side to
-        side: what merely grazes a thin slab says nothing against it.
+        Only those of ``obstacle`` (n,) are judged, and only voxels that rays crossed from side to side: what merely
+        grazes a thin slab says nothing against it.
         """
         trail = np.zeros(len(points), dtype=np.bool_)
         rows, cols = self.draft.lattice.cells_of(points)
         for tile, planes in self.evidence.tiles.items():
             reference = reference_window(self.draft, self.draft.lattice.tile(tile))
-            standing = reference_window(ground, reference.grid)
             r, c = rows - reference.grid.row0, cols - reference.grid.col0
-            here = np.flatnonzero((r >= 0) & (r < TILE_CELLS) & (c >= 0) & (c < TILE_CELLS))
-            here = here[find_obstacles(points[here], standing)[0]]
+            here = np.flatnonzero((r >= 0) & (r < TILE_CELLS) & (c >= 0) & (c < TILE_CELLS) & obstacle)
             r, c = r[here], c[here]
             bits = np.floor(points[here, 2] / CELL_SIZE).astype(np.int64) - reference.base[r, c]
             trail[here] = _are_trails(planes, r, c, bits, _MIN_THROUGH, _TRAIL_SHARE)
@@ -107,6 +113,16 @@ class Layer:
         out = _rebased(free, before.base, after.base) & ~after.occupied
         out[np.isnan(after.ground_z)] = 0
         return out
+
+
+def _standing(points: F64, ground: PointMap) -> Bool:
+    """(n,) which points (n, 3) stand above the ground of ``ground``; none outside its tiles."""
+    out = np.zeros(len(points), dtype=np.bool_)
+    rows, cols = tile_of_cells(*ground.lattice.cells_of(points))
+    for row, col in ground.tiles:
+        here = np.flatnonzero((rows == row) & (cols == col))
+        out[here] = find_obstacles(points[here], reference_window(ground, ground.lattice.tile((row, col))))[0]
+    return out
 
 
 def _beneath(scan: PlacedScan, moving: Bool) -> Bool:

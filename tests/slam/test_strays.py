@@ -1,0 +1,67 @@
+"""What hardly anybody met who passed by, and what range noise carried into the next voxel, is no surface of its own."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from mapvote.core.grid import Lattice
+from mapvote.core.types import F64
+from mapvote.core.voxels import VoxelCloud
+from mapvote.slam.strays import NEAR_M, strays
+
+LATTICE = Lattice()
+
+
+def road(places: int) -> F64:
+    """Twice past the origin, ten metres off: ``places`` positions, a metre or more apart."""
+    x = np.linspace(-15.0, 15.0, places // 2)
+    return np.concatenate([np.column_stack([x, np.full(len(x), y), np.zeros(len(x))]) for y in (-10.0, -11.5)])
+
+
+def test_a_point_that_one_scan_of_sixty_met_is_no_surface_and_a_wall_is() -> None:
+    points = np.array([[0.1, 0.1, 2.0], [3.1, 0.1, 2.0], [6.1, 0.1, 2.0]])
+    assert strays(points, np.array([1, 2, 40], np.int32), road(60), LATTICE).tolist() == [True, False, False]
+
+
+def test_where_few_scans_were_taken_or_from_afar_one_is_enough() -> None:
+    points = np.array([[0.1, 0.1, 2.0]])
+    once = np.ones(1, np.int32)
+    assert not strays(points, once, road(14), LATTICE).any(), "2 Hz"
+    assert not strays(points, once, road(60) - np.array([0.0, NEAR_M, 0.0]), LATTICE).any()
+    assert not strays(points, once, np.zeros((0, 3)), LATTICE).any()
+
+
+def test_who_waits_at_a_light_asks_no_more_of_a_wall() -> None:
+    waiting = np.concatenate([road(40), np.repeat([[5.0, -10.0, 0.0]], 600, axis=0)])
+    assert not strays(np.array([[0.1, 0.1, 2.0]]), np.full(1, 3, np.int32), waiting, LATTICE).any()
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+def test_a_wall_two_centimetres_from_a_face_is_one_wall(axis: int, side: float) -> None:
+    rng = np.random.default_rng(1)
+    face = 3.0
+    cloud = VoxelCloud(LATTICE)
+    for _ in range(50):
+        wall = np.column_stack([np.full(200, face + 0.02 * side), rng.uniform(0, 3, 200), rng.uniform(1, 3, 200)])
+        wall[:, 0] += rng.normal(0.0, 0.02, 200)
+        cloud.enter(wall if axis == 0 else wall[:, [1, 0, 2]])
+    points, scans = cloud.points()
+    kept = points[~strays(points, scans, np.zeros((0, 3)), LATTICE)]
+    over = (points[:, axis] - face) * side < 0
+    assert over.any(), "noise carries some over the face"
+    assert ((kept[:, axis] - face) * side > 0).all()
+    assert len(kept) == np.count_nonzero(~over)
+
+
+def test_two_walls_a_hand_apart_stay_two() -> None:
+    cloud = VoxelCloud(LATTICE)
+    for x in (2.93, 3.05):
+        cloud.enter(np.column_stack([np.full(100, x), np.linspace(0, 3, 100), np.full(100, 2.0)]))
+    points, scans = cloud.points()
+    assert not strays(points, scans, np.zeros((0, 3)), LATTICE).any()
+
+
+def test_no_points_are_no_strays() -> None:
+    assert strays(np.zeros((0, 3)), np.zeros(0, np.int32), road(60), LATTICE).shape == (0,)
