@@ -14,7 +14,7 @@ import mapvote
 from mapvote.core.ground_growing import grow
 from mapvote.core.voting import add_states
 from mapvote.fusion.outliers import contradicting
-from mapvote.localisation.ndt_kernels import normal_equations
+from mapvote.localisation.ndt_solver import align
 from mapvote.perception.moving_kernels import look
 from mapvote.warmup import warm_up
 
@@ -26,7 +26,7 @@ def test_warming_up_goes_through_every_step_and_says_what_each_took() -> None:
     told = list(warm_up())
     assert len(told) == 5
     assert all(seconds > 0 for _, seconds in told)
-    for kernel in (normal_equations, add_states, look, grow, contradicting):
+    for kernel in (align, add_states, look, grow, contradicting):
         assert kernel.signatures
 
 

@@ -140,7 +140,7 @@ class GlobalSearch:
         """Refine all, judge the best few with the motion that suits them, and compare."""
         guesses.sort(key=lambda T: (round(T[0, 3] / 40.0), round(T[1, 3] / 40.0)))  # neighbours share a window
         clouds = thin_for_levels(scan.points)
-        clouds = [cloud[:: max(1, len(cloud) // 2000)] for cloud in clouds]
+        clouds = [np.ascontiguousarray(cloud[:, :: max(1, cloud.shape[1] // 2000)]) for cloud in clouds]
         refined = [refine(self.map_around(guess[:3, 3]), clouds, guess) for guess in guesses]
         refined.sort(key=lambda result: -result.score)
         judged = [self._judged(scan, T) for T in _distinct([r.T_map_lidar for r in refined])[:_JUDGED]]

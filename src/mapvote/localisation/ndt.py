@@ -16,10 +16,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mapvote.core.geometry import exp, log
-from mapvote.core.types import F64, Drive, Registration, check_array
+from mapvote.core.types import F32, F64, I64, Drive, Registration, check_array
 from mapvote.core.voxels import thin
-from mapvote.localisation.ndt_kernels import normal_equations
+from mapvote.localisation.ndt_kernels import mean_likelihood, room_for
+from mapvote.localisation.ndt_solver import Certainty, Place, align
 from mapvote.localisation.ndt_voxels import Voxels, Window, enter_points, reindex
 
 
@@ -49,8 +49,13 @@ COVARIANCE_SCALE = 5.0
 """What neighbouring residuals have in common, calibrated so that normalised squared errors average 6."""
 MAP_SIGMA_M, MAP_SIGMA_RAD = 0.01, float(np.radians(0.03))
 """What the map itself is off by around a scan, which no residual shows."""
-_LEVER_M = 20.0
-"""Distance at which a rotation is weighed against a shift, where one tolerance must serve both."""
+_KNOWN = Certainty(
+    COVARIANCE_SCALE, np.array([MAP_SIGMA_M**2] * 3 + [MAP_SIGMA_RAD**2] * 3), np.eye(4), np.zeros((6, 6))
+)
+"""Of a scan without a prior."""
+_ENOUGH = 20_000
+"""Points that are thinned at least: of a dense scan every third, fifth .. is looked at. Odd, so that no beam is left
+out where points are stored firing by firing."""
 
 
 class NdtGrid:
@@ -137,14 +142,27 @@ def build_ndt(points_map: NDArray[np.floating], centre: F64 | None = None) -> Nd
     return ndt_map
 
 
-def thin_for_levels(points_lidar: NDArray[np.floating]) -> list[F64]:
-    """The scan as each level wants it: one point per voxel of the level's ``points_m``. Finest first thinned once."""
-    clouds: dict[float, F64] = {}
+def thin_for_levels(points_lidar: NDArray[np.floating]) -> list[F32]:
+    """The scan as each level wants it, (3, m): one point per voxel of the level's ``points_m``."""
     source = np.ascontiguousarray(points_lidar, dtype=np.float32)
+    chosen = thinned(source)
+    return [in_rows(source[chosen[level.points_m]]) for level in LEVELS]
+
+
+def in_rows(points_lidar: NDArray[np.floating]) -> F32:
+    """(3, n) of points (n, 3): rows of x, y and z, as the kernels want them."""
+    return np.ascontiguousarray(points_lidar.T, dtype=np.float32)
+
+
+def thinned(points_lidar: F32) -> dict[float, I64]:
+    """By size, metres: indices, ascending, of one of (n, 3) points per voxel of each size that the levels want."""
+    n = len(points_lidar)
+    few = np.arange(0, n, max(1, (n // _ENOUGH - 1) | 1))
+    chosen: dict[float, I64] = {}
     for size in sorted({level.points_m for level in LEVELS}):
-        source = source[thin(source, size)]
-        clouds[size] = source.astype(np.float64)
-    return [clouds[level.points_m] for level in LEVELS]
+        few = few[thin(points_lidar[few], size)]
+        chosen[size] = few
+    return chosen
 
 
 def register(
@@ -163,81 +181,29 @@ def register(
 
 
 def refine(
-    ndt_map: NdtMap, clouds: list[F64], T_map_lidar_guess: F64, prior: PosePrior | None = None, first_level: int = 0
+    ndt_map: NdtMap, clouds: list[F32], T_map_lidar_guess: F64, prior: PosePrior | None = None, first_level: int = 0
 ) -> Registration:
     """:func:`register` for a scan already thinned by :func:`thin_for_levels`."""
-    T = T_map_lidar_guess.copy()
+    T = np.array(T_map_lidar_guess, dtype=np.float64)
     iterations = 0
     last = len(ndt_map.levels) - 1
     for i in range(first_level, last + 1):
         grid = ndt_map.levels[i]
         tolerance = (0.01 if i == last else 0.05) * grid.level.floor_m
-        converged = False
-        for _ in range(grid.level.iterations):
-            iterations += 1
-            H, g, M, score, inlier_share = _equations(grid, clouds[i], T)
-            covariance, step = _solve(H, g, M)
-            if prior is not None and i == last:
-                covariance, step = _fuse(covariance, step, prior, T)
-            T = _moved(T, _clamped(step, 0.5 * grid.level.voxel_m))
-            if np.linalg.norm(step[:3]) < tolerance and np.linalg.norm(step[3:]) * _LEVER_M < tolerance:
-                converged = True
-                break
+        where = Place(grid.window, grid.voxels.cells, grid.level.iterations, tolerance)
+        known = _KNOWN if prior is None or i < last else _with(prior)
+        pairs = room_for(clouds[i].shape[1])
+        covariance, score, inlier_share, more, converged = align(clouds[i], T, where, known, pairs)
+        iterations += more
     return Registration(T, covariance, score, inlier_share, iterations, converged)
 
 
-def fitness(ndt_map: NdtMap, clouds: list[F64], T_map_lidar: F64, level: int = 0) -> float:
+def _with(prior: PosePrior) -> Certainty:
+    return _KNOWN._replace(T_prior=np.ascontiguousarray(prior.T_map_lidar), information=prior.information)
+
+
+def fitness(ndt_map: NdtMap, clouds: list[F32], T_map_lidar: F64, level: int = 0) -> float:
     """Mean likelihood of the scan at a pose, in [0, 1], at one level: to rank guesses before any is refined."""
-    return _equations(ndt_map.levels[level], clouds[level], T_map_lidar)[3]
-
-
-def _equations(grid: NdtGrid, points: F64, T: F64) -> tuple[F64, F64, F64, float, float]:
-    R, t = np.ascontiguousarray(T[:3, :3]), T[:3, 3].copy()
-    return normal_equations(points, R, t, grid.window, grid.voxels.cells)
-
-
-def _solve(H: F64, g: F64, M: F64) -> tuple[F64, F64]:
-    """Covariance and step of the NDT alone.
-
-    The covariance is the robust ("sandwich") estimate H^-1 M H^-1, M being the scatter of the points' own
-    gradients, times COVARIANCE_SCALE for what neighbouring points have in common, plus what the map itself is
-    off by. A direction that nothing fixes gets a small curvature, hence a large variance and no step, instead of a
-    singular matrix.
-    """
-    floor = 1e-6 * max(float(np.trace(H)), 1.0) * np.eye(6)
-    H_inv = _inverse(H + floor)
-    map_variance = np.diag([MAP_SIGMA_M**2] * 3 + [MAP_SIGMA_RAD**2] * 3)
-    return COVARIANCE_SCALE * (H_inv @ (M + floor) @ H_inv) + map_variance, -H_inv @ g
-
-
-def _fuse(covariance: F64, step: F64, prior: PosePrior, T: F64) -> tuple[F64, F64]:
-    """The NDT's step and the step to the prior, weighed by their information."""
-    information = _inverse(covariance)
-    to_prior = np.concatenate([prior.T_map_lidar[:3, 3] - T[:3, 3], _rotation_step(prior.T_map_lidar, T)])
-    fused = _inverse(information + prior.information)
-    return fused, fused @ (information @ step + prior.information @ to_prior)
-
-
-def _inverse(matrix: F64) -> F64:
-    return np.asarray(np.linalg.inv(matrix), dtype=np.float64)
-
-
-def _rotation_step(T_to: F64, T_from: F64) -> F64:
-    """phi with R_to = exp(phi) R_from."""
-    difference = np.eye(4)
-    difference[:3, :3] = T_to[:3, :3] @ T_from[:3, :3].T
-    return log(difference)[3:]
-
-
-def _clamped(step: F64, limit_m: float) -> F64:
-    """The step, shortened as a whole if it shifts a point 20 m away by more than ``limit_m``."""
-    length = max(float(np.linalg.norm(step[:3])), float(np.linalg.norm(step[3:])) * _LEVER_M)
-    return step * min(1.0, limit_m / max(length, 1e-12))
-
-
-def _moved(T: F64, step: F64) -> F64:
-    """T with its sensor shifted by rho and turned by phi, both in map axes."""
-    out = T.copy()
-    out[:3, :3] = exp(np.concatenate([np.zeros(3), step[3:]]))[:3, :3] @ T[:3, :3]
-    out[:3, 3] += step[:3]
-    return out
+    grid = ndt_map.levels[level]
+    likelihood: float = mean_likelihood(clouds[level], T_map_lidar, grid.window, grid.voxels.cells)
+    return likelihood

@@ -1,21 +1,44 @@
-"""The scan's side of NDT: the normal equations of one Gauss-Newton step.
+"""The scan's side of NDT: points are paired with the voxels around them, and Gauss-Newton steps summed over the pairs.
 
 Equation numbers are those of Magnusson, The Three-Dimensional Normal-Distributions Transform, 2009, chapter 6; where
-we deviate, mapvote.localisation.ndt says how. Steps are inlined by numba; docs/measurements/speed.md tells the cost.
+we deviate, mapvote.localisation.ndt says how. Pairs lie in columns, so that the sums run over vectors of them, in
+float32 about the sensor; they serve until the pose has moved by a share of a voxel.
 """
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numba
 import numpy as np
 
-from mapvote.core.types import F64, I32
-from mapvote.localisation.ndt_voxels import Symmetric, Vector, Window, holds, voxel_of
+from mapvote.core.types import F32, F64, I32
+from mapvote.localisation.ndt_voxels import Vector, Window, holds, voxel_of
 
 INLIER_E = 7.81
 """Squared Mahalanobis distance below which a point agrees with a voxel: 95 % of chi-square, 3 degrees of freedom."""
 CUTOFF_E = 25.0
 """Beyond this a voxel's pull on a point, exp(-e / 2), is nothing."""
+_BLOCK = 1024
+"""Points whose sums are taken in float32 before they are added up in float64."""
+_MEAN, _PRECISION, _ROWS = 0, 3, 9
+
+
+class Pairs(NamedTuple):
+    """Which point is compared with which voxels: each with its own and the six beside it (DIRECT7)."""
+
+    of: F32
+    """(7, 9, n) of each partner of each point: the voxel's mean from ``origin`` in map axes, and its precision xx, xy,
+    xz, yy, yz, zz; zeros where there is no partner."""
+    home: I32
+    """(3, n) the voxel that the point lay in when it was paired, as an index of the window."""
+    origin: F64
+    """(3,) map metres: near the sensor, so that float32 suffices."""
+
+
+def room_for(n: int) -> Pairs:
+    """Room for the pairs of n points."""
+    return Pairs(np.empty((7, _ROWS, n), dtype=np.float32), np.empty((3, n), dtype=np.int32), np.zeros(3))
 
 
 @numba.njit(inline="always")
@@ -28,117 +51,180 @@ def _neighbour(j: int) -> tuple[int, int, int]:
 
 
 @numba.njit(inline="always")
-def transform_point(R: F64, points: F64, i: int) -> Vector:
-    """Point i turned into map axes, about the sensor: so that rotation and position stay separate unknowns."""
-    x = R[0, 0] * points[i, 0] + R[0, 1] * points[i, 1] + R[0, 2] * points[i, 2]
-    y = R[1, 0] * points[i, 0] + R[1, 1] * points[i, 1] + R[1, 2] * points[i, 2]
-    z = R[2, 0] * points[i, 0] + R[2, 1] * points[i, 1] + R[2, 2] * points[i, 2]
-    return x, y, z
-
-
-@numba.njit(inline="always")
-def linearise(
-    rows: I32, size: float, cells: F64, ix: np.int64, iy: np.int64, iz: np.int64, ox: float, oy: float, oz: float
-) -> tuple[Symmetric, Vector, float]:
-    """Pull of the voxel (ix, iy, iz) of ``rows`` and the six beside it on a point at (ox, oy, oz) from its centre.
-
-    With u the point from a voxel's mean, C its precision, e = u C u and w = exp(-e / 2), the weight of Eq. (6.9) with
-    d1 = d2 = 1: (A = sum of w C, b = sum of w C u, the smallest e). Gauss-Newton drops the other terms of Eq. (6.13).
-    """
-    a00, a01, a02, a11, a12, a22 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-    b0, b1, b2 = 0.0, 0.0, 0.0
-    nearest = np.inf
-    for j in range(7):
-        dx, dy, dz = _neighbour(j)
-        k = rows[ix + dx, iy + dy, iz + dz]
-        if k < 0 or cells[k, 3] + cells[k, 6] + cells[k, 8] == 0.0:
-            continue
-        ux = ox - dx * size - cells[k, 0]
-        uy = oy - dy * size - cells[k, 1]
-        uz = oz - dz * size - cells[k, 2]
-        c00, c01, c02, c11, c12, c22 = cells[k, 3], cells[k, 4], cells[k, 5], cells[k, 6], cells[k, 7], cells[k, 8]
-        v0 = c00 * ux + c01 * uy + c02 * uz
-        v1 = c01 * ux + c11 * uy + c12 * uz
-        v2 = c02 * ux + c12 * uy + c22 * uz
-        e = ux * v0 + uy * v1 + uz * v2
-        nearest = min(nearest, e)
-        if e <= CUTOFF_E:
-            w = np.exp(-0.5 * e)
-            a00, a01, a02 = a00 + w * c00, a01 + w * c01, a02 + w * c02
-            a11, a12, a22 = a11 + w * c11, a12 + w * c12, a22 + w * c22
-            b0, b1, b2 = b0 + w * v0, b1 + w * v1, b2 + w * v2
-    return (a00, a01, a02, a11, a12, a22), (b0, b1, b2), nearest
-
-
-@numba.njit(inline="always")
-def accumulate(H: F64, M: F64, g: F64, gi: F64, p: Vector, A: Symmetric, b: Vector) -> None:
-    """H += J^T A J, g += J^T b (the sums of Eqs. (6.13) and (6.12)) and M += (J^T b)(J^T b)^T, upper triangles.
-
-    J = [I, -[p]x], the derivative of the point by (rho, phi); ``gi`` (6,) is scratch.
-    """
-    px, py, pz = p
-    a00, a01, a02, a11, a12, a22 = A
-    b0, b1, b2 = b
-    gi[0], gi[1], gi[2] = b0, b1, b2
-    gi[3], gi[4], gi[5] = py * b2 - pz * b1, pz * b0 - px * b2, px * b1 - py * b0
-    # Columns of Q = A (-[p]x) = A times ((0, pz, -py), (-pz, 0, px), (py, -px, 0)).
-    q00, q01, q02 = -a01 * pz + a02 * py, a00 * pz - a02 * px, -a00 * py + a01 * px
-    q10, q11, q12 = -a11 * pz + a12 * py, a01 * pz - a12 * px, -a01 * py + a11 * px
-    q20, q21, q22 = -a12 * pz + a22 * py, a02 * pz - a22 * px, -a02 * py + a12 * px
-    # Position: A.
-    H[0, 0] += a00
-    H[0, 1] += a01
-    H[0, 2] += a02
-    H[1, 1] += a11
-    H[1, 2] += a12
-    H[2, 2] += a22
-    # Position by rotation: Q.
-    H[0, 3] += q00
-    H[0, 4] += q01
-    H[0, 5] += q02
-    H[1, 3] += q10
-    H[1, 4] += q11
-    H[1, 5] += q12
-    H[2, 3] += q20
-    H[2, 4] += q21
-    H[2, 5] += q22
-    # Rotation: (-[p]x)^T Q.
-    H[3, 3] += py * q20 - pz * q10
-    H[3, 4] += py * q21 - pz * q11
-    H[3, 5] += py * q22 - pz * q12
-    H[4, 4] += pz * q01 - px * q21
-    H[4, 5] += pz * q02 - px * q22
-    H[5, 5] += px * q12 - py * q02
-    for r in range(6):
-        g[r] += gi[r]
-        for c in range(r, 6):
-            M[r, c] += gi[r] * gi[c]
+def _in_map(points: F32, T: F64, i: int) -> Vector:
+    """Point i in map metres."""
+    x, y, z = np.float64(points[0, i]), np.float64(points[1, i]), np.float64(points[2, i])
+    return (
+        T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3],
+        T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3],
+        T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3],
+    )
 
 
 @numba.njit(cache=True, nogil=True)
-def normal_equations(points: F64, R: F64, t: F64, window: Window, cells: F64) -> tuple[F64, F64, F64, float, float]:
-    """H, g of the reweighted least squares at pose (R, t); M, the sum of g_i g_i^T; mean likelihood; inlier share."""
-    H, M, g, gi = np.zeros((6, 6)), np.zeros((6, 6)), np.zeros(6), np.empty(6)
-    likelihood, inliers = 0.0, 0
+def pair_up(points: F32, T: F64, window: Window, cells: F64, pairs: Pairs) -> None:
+    """Pair those of the points (3, n) that lie in another voxel at pose T (4, 4) than when they were last paired."""
     rows, lowest, size = window  # unpacked once: a group handed on for each point would cost a little
-    for i in range(len(points)):
-        p = transform_point(R, points, i)
-        x, y, z = p[0] + t[0], p[1] + t[1], p[2] + t[2]
+    of, home, origin = pairs
+    low = lowest * size - origin
+    for i in range(points.shape[1]):
+        x, y, z = _in_map(points, T, i)
+        ax, ay, az = voxel_of(size, x, y, z)
+        ix, iy, iz = ax - lowest[0], ay - lowest[1], az - lowest[2]
+        if ix == home[0, i] and iy == home[1, i] and iz == home[2, i]:
+            continue
+        home[0, i], home[1, i], home[2, i] = ix, iy, iz
+        inside = holds(rows, ix, iy, iz, 1)
+        for j in range(7):
+            dx, dy, dz = _neighbour(j)
+            k = rows[ix + dx, iy + dy, iz + dz] if inside else np.int32(-1)
+            if k < 0:
+                of[j, :, i] = 0.0
+                continue
+            of[j, _MEAN, i] = (ix + dx + 0.5) * size + low[0] + cells[k, 0]
+            of[j, _MEAN + 1, i] = (iy + dy + 0.5) * size + low[1] + cells[k, 1]
+            of[j, _MEAN + 2, i] = (iz + dz + 0.5) * size + low[2] + cells[k, 2]
+            for c in range(6):
+                of[j, _PRECISION + c, i] = cells[k, 3 + c]
+
+
+@numba.njit(inline="always")
+def _likelihood(e: np.float32) -> np.float32:
+    """exp(-e / 2) for e from 0 to CUTOFF_E, 0 beyond: Taylor's series at a 32nd of it, squared five times. Within
+    2e-4 of itself where it is least, 1e-6 where it matters; without a call, so that loops over pairs vectorise."""
+    y = np.float32(-1.0 / 64.0) * min(e, np.float32(CUTOFF_E))
+    s = np.float32(1.0 / 24.0) + y * np.float32(1.0 / 120.0)
+    s = np.float32(1.0) + y * (np.float32(1.0) + y * (np.float32(0.5) + y * (np.float32(1.0 / 6.0) + y * s)))
+    s *= s
+    s *= s
+    s *= s
+    s *= s
+    s *= s
+    return s if e <= np.float32(CUTOFF_E) else np.float32(0.0)
+
+
+@numba.njit(error_model="numpy", fastmath=True)
+def _pull(of: F32, j: int, i: int, x: np.float32, y: np.float32, z: np.float32) -> tuple[np.float32, ...]:
+    """Of the j-th partner of point i, which lies at (x, y, z) from the origin: (e, w C, w C u) with u the point from
+    the voxel's mean, C its precision, e = u C u and w = exp(-e / 2), the weight of Eq. (6.9) with d1 = d2 = 1."""
+    x, y, z = x - of[j, 0, i], y - of[j, 1, i], z - of[j, 2, i]
+    c00, c01, c02, c11, c12, c22 = of[j, 3, i], of[j, 4, i], of[j, 5, i], of[j, 6, i], of[j, 7, i], of[j, 8, i]
+    b0, b1, b2 = c00 * x + c01 * y + c02 * z, c01 * x + c11 * y + c12 * z, c02 * x + c12 * y + c22 * z
+    e = x * b0 + y * b1 + z * b2
+    w = _likelihood(e)
+    e = e if c00 + c11 + c22 > np.float32(0.0) else np.float32(1e9)
+    return e, w * c00, w * c01, w * c02, w * c11, w * c12, w * c22, w * b0, w * b1, w * b2
+
+
+@numba.njit(error_model="numpy", fastmath=True)
+def _both(p: tuple[np.float32, ...], q: tuple[np.float32, ...]) -> tuple[np.float32, ...]:
+    """The smaller e, and the sums of the rest."""
+    return (
+        min(p[0], q[0]), p[1] + q[1], p[2] + q[2], p[3] + q[3], p[4] + q[4], p[5] + q[5], p[6] + q[6], p[7] + q[7],
+        p[8] + q[8], p[9] + q[9],
+    )  # fmt: skip
+
+
+@numba.njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+def _sum_block(points: F32, of: F32, first: int, last: int, R: F32, d: F32, sums: F64) -> None:
+    """Add up points from ``first`` to ``last`` at rotation R (3, 3), the sensor at ``d`` (3,) metres from the origin.
+
+    ``sums`` (50,): the upper triangle of H = J^T w C J row by row, g = J^T w C u (the sums of Eqs. (6.13) and (6.12),
+    of which Gauss-Newton drops the other terms), the upper triangle of the sum of g_i g_i^T, likelihoods, inliers.
+    J = [I, -[p]x] is the derivative of the point by (rho, phi). One vector lane a point; no stores, no branches.
+    """
+    zero = np.float32(0.0)
+    h00, h01, h02, h11, h12, h22 = zero, zero, zero, zero, zero, zero
+    q00, q01, q02, q10, q11, q12, q20, q21, q22 = zero, zero, zero, zero, zero, zero, zero, zero, zero
+    r00, r01, r02, r11, r12, r22 = zero, zero, zero, zero, zero, zero
+    s0, s1, s2, s3, s4, s5, likelihood, inliers = zero, zero, zero, zero, zero, zero, zero, zero
+    m00, m01, m02, m03, m04, m05, m11, m12 = zero, zero, zero, zero, zero, zero, zero, zero
+    m13, m14, m15, m22, m23, m24, m25 = zero, zero, zero, zero, zero, zero, zero
+    m33, m34, m35, m44, m45, m55 = zero, zero, zero, zero, zero, zero
+    for i in range(first, last):
+        x, y, z = points[0, i], points[1, i], points[2, i]
+        px = R[0, 0] * x + R[0, 1] * y + R[0, 2] * z
+        py = R[1, 0] * x + R[1, 1] * y + R[1, 2] * z
+        pz = R[2, 0] * x + R[2, 1] * y + R[2, 2] * z
+        x, y, z = px + d[0], py + d[1], pz + d[2]
+        pull = _both(_pull(of, 0, i, x, y, z), _pull(of, 1, i, x, y, z))
+        pull = _both(pull, _both(_pull(of, 2, i, x, y, z), _pull(of, 3, i, x, y, z)))
+        pull = _both(pull, _both(_pull(of, 4, i, x, y, z), _pull(of, 5, i, x, y, z)))
+        e, c00, c01, c02, c11, c12, c22, g0, g1, g2 = _both(pull, _pull(of, 6, i, x, y, z))
+        likelihood += _likelihood(e)
+        inliers += np.float32(1.0) if e < np.float32(INLIER_E) else zero
+        # Columns of Q = C (-[p]x) = C times ((0, pz, -py), (-pz, 0, px), (py, -px, 0)).
+        a00, a01, a02 = c02 * py - c01 * pz, c00 * pz - c02 * px, c01 * px - c00 * py
+        a10, a11, a12 = c12 * py - c11 * pz, c01 * pz - c12 * px, c11 * px - c01 * py
+        a20, a21, a22 = c22 * py - c12 * pz, c02 * pz - c22 * px, c12 * px - c02 * py
+        h00, h01, h02, h11, h12, h22 = h00 + c00, h01 + c01, h02 + c02, h11 + c11, h12 + c12, h22 + c22
+        q00, q01, q02 = q00 + a00, q01 + a01, q02 + a02
+        q10, q11, q12 = q10 + a10, q11 + a11, q12 + a12
+        q20, q21, q22 = q20 + a20, q21 + a21, q22 + a22
+        # Rotation: (-[p]x)^T Q.
+        r00, r01, r02 = r00 + py * a20 - pz * a10, r01 + py * a21 - pz * a11, r02 + py * a22 - pz * a12
+        r11, r12, r22 = r11 + pz * a01 - px * a21, r12 + pz * a02 - px * a22, r22 + px * a12 - py * a02
+        g3, g4, g5 = py * g2 - pz * g1, pz * g0 - px * g2, px * g1 - py * g0
+        s0, s1, s2, s3, s4, s5 = s0 + g0, s1 + g1, s2 + g2, s3 + g3, s4 + g4, s5 + g5
+        m00, m01, m02, m03 = m00 + g0 * g0, m01 + g0 * g1, m02 + g0 * g2, m03 + g0 * g3
+        m04, m05, m11, m12 = m04 + g0 * g4, m05 + g0 * g5, m11 + g1 * g1, m12 + g1 * g2
+        m13, m14, m15, m22 = m13 + g1 * g3, m14 + g1 * g4, m15 + g1 * g5, m22 + g2 * g2
+        m23, m24, m25, m33 = m23 + g2 * g3, m24 + g2 * g4, m25 + g2 * g5, m33 + g3 * g3
+        m34, m35, m44, m45, m55 = m34 + g3 * g4, m35 + g3 * g5, m44 + g4 * g4, m45 + g4 * g5, m55 + g5 * g5
+    for k, value in enumerate((
+        h00, h01, h02, q00, q01, q02, h11, h12, q10, q11, q12, h22, q20, q21, q22, r00, r01, r02, r11, r12, r22,
+        s0, s1, s2, s3, s4, s5, m00, m01, m02, m03, m04, m05, m11, m12, m13, m14, m15, m22, m23, m24, m25, m33, m34,
+        m35, m44, m45, m55, likelihood, inliers,
+    )):  # fmt: skip
+        sums[k] += value
+
+
+@numba.njit(cache=True, nogil=True)
+def linearise(points: F32, pairs: Pairs, T: F64, H: F64, M: F64, g: F64) -> tuple[float, float]:
+    """The reweighted least squares of points (3, n) at pose T, for pairs made there: fills H (6, 6), the scatter M
+    (6, 6) of the points' own gradients, and g (6, 1). Returns (mean likelihood, share of inliers)."""
+    sums = np.zeros(50)
+    R, d = T[:3, :3].astype(np.float32), (T[:3, 3] - pairs.origin).astype(np.float32)
+    n = points.shape[1]
+    for first in range(0, n, _BLOCK):
+        _sum_block(points, pairs.of, first, min(first + _BLOCK, n), R, d, sums)
+    k = 0
+    for r in range(6):
+        for c in range(r, 6):
+            H[r, c] = H[c, r] = sums[k]
+            M[r, c] = M[c, r] = sums[27 + k]
+            k += 1
+        g[r, 0] = sums[21 + r]
+    return sums[48] / max(1, n), sums[49] / max(1, n)
+
+
+@numba.njit(inline="always")
+def _misfit(cells: F64, k: int, ux: float, uy: float, uz: float) -> float:
+    """e = u C u of a point at u from the mean of voxel k, C its precision: the squared Mahalanobis distance."""
+    vx = cells[k, 3] * ux + 2.0 * (cells[k, 4] * uy + cells[k, 5] * uz)
+    vy = cells[k, 6] * uy + 2.0 * cells[k, 7] * uz
+    return vx * ux + vy * uy + cells[k, 8] * uz * uz
+
+
+@numba.njit(cache=True, nogil=True)
+def mean_likelihood(points: F32, T: F64, window: Window, cells: F64) -> float:
+    """Of points (3, n) at pose T (4, 4), in [0, 1]: what :func:`linearise` says, for a single look without pairs."""
+    rows, lowest, size = window
+    total = 0.0
+    for i in range(points.shape[1]):
+        x, y, z = _in_map(points, T, i)
         ax, ay, az = voxel_of(size, x, y, z)
         ix, iy, iz = ax - lowest[0], ay - lowest[1], az - lowest[2]
         if not holds(rows, ix, iy, iz, 1):
             continue
-        ox, oy, oz = x - (ax + 0.5) * size, y - (ay + 0.5) * size, z - (az + 0.5) * size
-        A, b, nearest = linearise(rows, size, cells, ix, iy, iz, ox, oy, oz)
-        if nearest == np.inf:
-            continue
-        likelihood += np.exp(-0.5 * nearest)
-        if nearest < INLIER_E:
-            inliers += 1
-        accumulate(H, M, g, gi, p, A, b)
-    for r in range(6):
-        for c in range(r):
-            H[r, c] = H[c, r]
-            M[r, c] = M[c, r]
-    n = max(1, len(points))
-    return H, g, M, likelihood / n, inliers / n
+        x, y, z = x - (ax + 0.5) * size, y - (ay + 0.5) * size, z - (az + 0.5) * size
+        nearest = CUTOFF_E + 1.0
+        for j in range(7):
+            dx, dy, dz = _neighbour(j)
+            k = rows[ix + dx, iy + dy, iz + dz]
+            if k < 0 or cells[k, 3] + cells[k, 6] + cells[k, 8] == 0.0:
+                continue
+            ux, uy, uz = x - dx * size - cells[k, 0], y - dy * size - cells[k, 1], z - dz * size - cells[k, 2]
+            nearest = min(nearest, _misfit(cells, k, ux, uy, uz))
+        total += np.float64(_likelihood(np.float32(nearest)))
+    return total / max(1, points.shape[1])

@@ -15,7 +15,6 @@ from mapvote.core.geometry import exp, from_xyz_rpy
 from mapvote.core.grid import window_around
 from mapvote.core.point_map import PointMap
 from mapvote.core.types import F32, F64, Registration, Scan
-from mapvote.core.voxels import thin
 from mapvote.localisation.deskew import deskew, twist_between
 from mapvote.localisation.ndt import (
     HALF_WINDOW_M,
@@ -25,8 +24,8 @@ from mapvote.localisation.ndt import (
     build_ndt,
     fitness,
     refine,
-    thin_for_levels,
 )
+from mapvote.localisation.sample import Sample
 
 _REFINED = 3
 """How many of the best guesses are refined when the vehicle is lost."""
@@ -107,22 +106,23 @@ class Tracker:
         """
         seed, reach = self._seed(scan.stamp_ns, prior)
         ndt_map = self.map_around(seed[:3, 3])
+        sample = Sample(scan)
         if reach >= _STEP_M:
-            seed = self._levelled(ndt_map, scan, seed)
-        twist = self.twist if self._knows_motion(scan) else self.guess_motion(ndt_map, scan, seed, prior)
-        first_level = 0 if self.last_pose is None or reach > 0.5 * _STEP_M else 1
-        result = refine(ndt_map, self._clouds(scan, twist), seed, prior, first_level)
+            seed = self._levelled(ndt_map, sample, seed)
+        twist = self.twist if self._knows_motion(scan) else self._guess_motion(ndt_map, scan, sample, seed, prior)
+        clouds = sample.clouds(twist)
+        result = refine(ndt_map, clouds, seed, prior, self._first_level(reach))
         if result.score < _POOR * self._usual_score:
-            result = self._reconsider(ndt_map, self._clouds(scan, twist), scan.stamp_ns, result, prior)
+            result = self._reconsider(ndt_map, clouds, scan.stamp_ns, result, prior)
         if not self.is_sound(result):
             centre = prior.T_map_lidar if prior is not None else seed
-            result = self._search(ndt_map, self._clouds(scan, twist), centre, reach, prior)
+            result = self._search(ndt_map, clouds, centre, reach, prior)
         for _ in range(_ROUNDS):
             found = self._motion_to(result.T_map_lidar, scan.stamp_ns)
             if scan.time_s is None or found is None or not _differ(twist, found):
                 break
             twist = found
-            result = refine(ndt_map, self._clouds(scan, twist), result.T_map_lidar, prior, len(ndt_map.levels) - 1)
+            result = refine(ndt_map, sample.clouds(twist), result.T_map_lidar, prior, len(LEVELS) - 1)
         trusted = self.is_sound(result)
         if trusted:
             self._accept(result.T_map_lidar, scan.stamp_ns, twist)
@@ -130,22 +130,26 @@ class Tracker:
             self._usual_score += rate * (result.score - self._usual_score)
         return Fix(scan, result, deskew(scan, twist), trusted)
 
-    def _clouds(self, scan: Scan, twist: F64) -> list[F64]:
-        return thin_for_levels(deskew(scan, twist))
+    def _first_level(self, reach: float) -> int:
+        """The coarsest level that a guess needs which may be off by ``reach`` metres."""
+        if self.last_pose is None or reach > 0.5 * _STEP_M:
+            return 0
+        return len(LEVELS) - 1 if reach <= LEVELS[-1].floor_m else 1
 
     def _knows_motion(self, scan: Scan) -> bool:
         return scan.time_s is None or bool(self.twist.any()) or self._measured
 
     def guess_motion(self, ndt_map: NdtMap, scan: Scan, seed: F64, prior: PosePrior | None) -> F64:
         """The forward speed at which a scan fits the map best: unknown motion bends it, and moves it since the last."""
-        few = thin(scan.points, LEVELS[0].points_m)
-        sample = Scan(scan.stamp_ns, scan.points[few], None if scan.time_s is None else scan.time_s[few])
+        return self._guess_motion(ndt_map, scan, Sample(scan), seed, prior)
+
+    def _guess_motion(self, ndt_map: NdtMap, scan: Scan, sample: Sample, seed: F64, prior: PosePrior | None) -> F64:
         age = 1e-9 * (scan.stamp_ns - self.last_stamp_ns)
         moved: list[tuple[float, F64]] = []
         for speed in _SPEEDS_MPS:
             twist = np.array([speed, 0.0, 0.0, 0.0, 0.0, 0.0])
             start = seed if self.last_pose is None else self.last_pose @ exp(age * twist)
-            moved.append((refine(ndt_map, self._clouds(sample, twist), start, prior).score, twist))
+            moved.append((refine(ndt_map, sample.coarse(twist), start, prior).score, twist))
         return max(moved, key=lambda found: found[0])[1]
 
     def begin(self, scan: Scan, T_map_lidar: F64) -> Fix:
@@ -166,13 +170,13 @@ class Tracker:
             return np.eye(4), _REACH_M
         return prior.T_map_lidar, 2.0 * prior.sigma_m
 
-    def _levelled(self, ndt_map: NdtMap, scan: Scan, seed: F64) -> F64:
+    def _levelled(self, ndt_map: NdtMap, sample: Sample, seed: F64) -> F64:
         """The seed at the height at which the scan fits far better: satellites know heights worst, and NDT finds no
         road that lies metres from the scan's own."""
-        sample = thin_for_levels(scan.points[thin(scan.points, LEVELS[0].points_m)])[:1]
+        coarse = sample.coarse(np.zeros(6))
         steps = np.arange(_STEP_M, _REACH_M + 1e-6)
         guesses = [seed, *(from_xyz_rpy(0.0, 0.0, z) @ seed for step in steps for z in (step, -step))]
-        fits = [fitness(ndt_map, sample, guess) for guess in guesses]
+        fits = [fitness(ndt_map, coarse, guess) for guess in guesses]
         best = int(np.argmax(fits))
         return guesses[best] if fits[best] > _FAR_BETTER * fits[0] else seed
 
@@ -189,7 +193,7 @@ class Tracker:
         return result.converged and result.inlier_share >= s.min_inlier_share and sigma_m <= s.max_sigma_m
 
     def _reconsider(
-        self, ndt_map: NdtMap, clouds: list[F64], stamp_ns: int, result: Registration, prior: PosePrior | None
+        self, ndt_map: NdtMap, clouds: list[F32], stamp_ns: int, result: Registration, prior: PosePrior | None
     ) -> Registration:
         """The best of ``result``, the prior's place, and every speed that a vehicle may have had since the last scan.
 
@@ -204,7 +208,7 @@ class Tracker:
         return max(found, key=lambda registration: registration.score)
 
     def _search(
-        self, ndt_map: NdtMap, clouds: list[F64], centre: F64, reach: float, prior: PosePrior | None
+        self, ndt_map: NdtMap, clouds: list[F32], centre: F64, reach: float, prior: PosePrior | None
     ) -> Registration:
         """Guesses on a grid around ``centre``, ranked by the coarsest level; the best few are refined."""
         rings = int(np.ceil(min(max(reach, _STEP_M), _REACH_M) / _STEP_M))
@@ -212,7 +216,7 @@ class Tracker:
         guesses = [
             centre @ from_xyz_rpy(x, y, 0.0, 0.0, 0.0, yaw) for x in offsets for y in offsets for yaw in _YAWS_RAD
         ]
-        sample = [cloud[:: max(1, len(cloud) // 1000)] for cloud in clouds[:1]]
+        sample = [np.ascontiguousarray(clouds[0][:, :: max(1, clouds[0].shape[1] // 1000)])]
         ranked = sorted(guesses, key=lambda guess: -fitness(ndt_map, sample, guess))
         return max((refine(ndt_map, clouds, guess, prior) for guess in ranked[:_REFINED]), key=lambda r: r.score)
 

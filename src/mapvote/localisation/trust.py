@@ -16,7 +16,7 @@ import numpy as np
 from mapvote.config import TrustSettings
 from mapvote.core.geometry import from_xyz_rpy
 from mapvote.core.types import F64, I32, I64, Bool
-from mapvote.localisation.ndt import NdtMap, fitness, refine
+from mapvote.localisation.ndt import NdtMap, fitness, in_rows, refine
 
 MIN_KNOWN = 0.3
 """Share of the standing points that must lie where the map has been: with fewer, what fits there proves little."""
@@ -106,13 +106,13 @@ class Judge:
         return max(usual * float(known.mean()), 1e-6), float(known.mean())
 
     def _likelihood(self, ndt_map: NdtMap, standing: F64, T: F64) -> float:
-        return fitness(ndt_map, [standing] * len(ndt_map.levels), T, len(ndt_map.levels) - 1)
+        return fitness(ndt_map, [in_rows(standing)] * len(ndt_map.levels), T, len(ndt_map.levels) - 1)
 
     def _others(self, ndt_map: NdtMap, few: F64, standing: F64, T: F64) -> list[F64]:
         """Refined poses of the best other places: the coarse peaks along four arms and turned about, and just
         ahead and behind."""
         away = np.arange(_NEAR_M - _STEP_M, _FAR_M + 0.5 * _STEP_M, _STEP_M)
-        coarse = [standing[:: max(1, len(standing) // _COARSE)]]
+        coarse = [in_rows(standing[:: max(1, len(standing) // _COARSE)])]
         peaks = []
         for x, y, yaw in ((1.0, 0.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, -1.0, 0.0), (1.0, 0.0, np.pi)):
             steps = away if yaw == 0.0 else np.concatenate([-away[::-1], away])
@@ -123,7 +123,7 @@ class Judge:
             peaks += [(float(fits[k]), guesses[k]) for k in np.flatnonzero(rising & falling) + 1]
         peaks.sort(key=lambda peak: -peak[0])
         unsettled = [T @ from_xyz_rpy(s, 0.0, 0.0) for s in (away[0], -away[0])]
-        clouds = [few] * len(ndt_map.levels)
+        clouds = [in_rows(few)] * len(ndt_map.levels)
         guesses = [*unsettled, *(guess for _, guess in peaks[:_REFINED])]
         return [refine(ndt_map, clouds, guess).T_map_lidar for guess in guesses]
 

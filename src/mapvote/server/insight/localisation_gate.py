@@ -20,7 +20,7 @@ from mapvote.config import GateSettings, NdtSettings
 from mapvote.core.geometry import from_xyz_rpy
 from mapvote.core.grid import CELL_SIZE
 from mapvote.core.point_map import PointMap
-from mapvote.core.types import F64, Drive, MapvoteError
+from mapvote.core.types import F32, F64, Drive, MapvoteError
 from mapvote.formats import open_drive
 from mapvote.localisation.deskew import deskew, twist_between
 from mapvote.localisation.ndt import refine, thin_for_levels
@@ -204,7 +204,7 @@ def pass_or_hold(measures: Sequence[Measure]) -> tuple[Verdict, tuple[str, ...]]
     return "pass", tuple(str(m) for m in measures)
 
 
-def _localise(window: MapWindow, clouds: list[F64], prior: F64, guesses: list[F64], ndt: NdtSettings) -> Localised:
+def _localise(window: MapWindow, clouds: list[F32], prior: F64, guesses: list[F64], ndt: NdtSettings) -> Localised:
     ndt_map = window(prior[:3, 3])
     found = [refine(ndt_map, clouds, guess) for guess in guesses]
     best = max(found, key=lambda registration: registration.score)
