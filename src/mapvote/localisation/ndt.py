@@ -49,10 +49,6 @@ COVARIANCE_SCALE = 5.0
 """What neighbouring residuals have in common, calibrated so that normalised squared errors average 6."""
 MAP_SIGMA_M, MAP_SIGMA_RAD = 0.01, float(np.radians(0.03))
 """What the map itself is off by around a scan, which no residual shows."""
-_KNOWN = Certainty(
-    COVARIANCE_SCALE, np.array([MAP_SIGMA_M**2] * 3 + [MAP_SIGMA_RAD**2] * 3), np.eye(4), np.zeros((6, 6))
-)
-"""Of a scan without a prior."""
 _ENOUGH = 20_000
 """Points that are thinned at least: of a dense scan every third, fifth .. is looked at. Odd, so that no beam is left
 out where points are stored firing by firing."""
@@ -191,15 +187,18 @@ def refine(
         grid = ndt_map.levels[i]
         tolerance = (0.01 if i == last else 0.05) * grid.level.floor_m
         where = Place(grid.window, grid.voxels.cells, grid.level.iterations, tolerance)
-        known = _KNOWN if prior is None or i < last else _with(prior)
+        known = _known(prior if i == last else None)
         pairs = room_for(clouds[i].shape[1])
         covariance, score, inlier_share, more, converged = align(clouds[i], T, where, known, pairs)
         iterations += more
     return Registration(T, covariance, score, inlier_share, iterations, converged)
 
 
-def _with(prior: PosePrior) -> Certainty:
-    return _KNOWN._replace(T_prior=np.ascontiguousarray(prior.T_map_lidar), information=prior.information)
+def _known(prior: PosePrior | None) -> Certainty:
+    variance = np.array([MAP_SIGMA_M**2] * 3 + [MAP_SIGMA_RAD**2] * 3)
+    if prior is None:
+        return Certainty(COVARIANCE_SCALE, variance, np.eye(4), np.zeros((6, 6)))
+    return Certainty(COVARIANCE_SCALE, variance, np.ascontiguousarray(prior.T_map_lidar), prior.information)
 
 
 def fitness(ndt_map: NdtMap, clouds: list[F32], T_map_lidar: F64, level: int = 0) -> float:
