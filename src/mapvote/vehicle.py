@@ -52,7 +52,7 @@ class Vehicle:
             LocalMap(point_map, self.settings.voting.window_m),
         )
         self._voter = make_voter(self.settings, sensor, point_map)
-        self._new_points = NewPoints(point_map.lattice)
+        self._new_points = NewPoints(point_map.lattice, beyond=self.settings.voting.method == "columns")
 
     @property
     def report(self) -> DriveReport:

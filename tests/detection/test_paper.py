@@ -11,12 +11,13 @@ from hypothesis import strategies as st
 
 from mapvote.config import PaperSettings, VotingSettings
 from mapvote.core.columns import below_top, span_of
+from mapvote.core.geometry import from_xyz_rpy
 from mapvote.core.grid import Grid, Lattice
 from mapvote.core.sensors import SENSORS
 from mapvote.core.types import NO_VOTE, CellState, Reference
 from mapvote.core.voting import VOTE_UNIT, vote_weight
 from mapvote.detection.paper import classify_paper, reading_table
-from mapvote.detection.sightings import WORDS, encode
+from mapvote.detection.sightings import BEGINS_ABOVE, WORDS, encode
 from mapvote.perception.raycast import ScanView, Sight
 
 ORIGIN = np.array([0.15, 0.15, 1.8])
@@ -102,6 +103,15 @@ def test_case_5_skips_cells_whose_map_begins_above_the_view_at_that_range() -> N
         cell = one_cell(0, Sight.CLEAR, map_bits=1 << 12, bottom_z=bottom_z)
         assert vote(*cell, tall=True)[0] == state
         assert vote(*cell)[0] == CellState.CHANGED_EMPTY
+
+
+def test_case_5_knows_how_the_sensor_leans() -> None:
+    # 9 m away, 2 deg of pitch lift the view's upper end from 3.50 m to 1.8 + 9 tan(12.67 deg) = 3.82 m, or lower it.
+    view, reference = one_cell(0, Sight.CLEAR, map_bits=1 << 12, bottom_z=3.6)
+    for pitch_deg, invalid in ((0.0, True), (-2.0, False), (2.0, True)):
+        up = from_xyz_rpy(0, 0, 0, 0, np.radians(pitch_deg), 0)[:3, 2]
+        words = encode(view, reference, ORIGIN, SENSOR, up_map=up)
+        assert (words[0, -1] & BEGINS_ABOVE != 0) == invalid
 
 
 def test_case_5_read_literally_skips_cells_where_the_map_is_higher_than_the_scan() -> None:

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from mapvote.cli.options import EVALUATE, Config, Scenario, Seed
 from mapvote.cli.terminal import print_table, progress, stages
+
+if TYPE_CHECKING:
+    from mapvote.config import Settings
 
 
 def register(app: typer.Typer) -> None:
@@ -54,8 +57,20 @@ def evaluate(
     sensor: Annotated[
         str | None, typer.Option(metavar="NAME", help="vlp16, hdl32e or hdl64e; else the scenario's")
     ] = None,
+    cars: Annotated[
+        int | None, typer.Option(metavar="N", min=0, help="cars that park during one vehicle's pass only, for each")
+    ] = None,
+    reading: Annotated[
+        str | None,
+        typer.Option(metavar="KEY=VALUE,..", help="how the paper's open sentences are read: keys of [paper]"),
+    ] = None,
+    readings: Annotated[bool, typer.Option("--readings", help="every reading of the paper by case")] = False,
+    explain: Annotated[
+        str, typer.Option(metavar="CASES", help="of the paper's cases: every true and false cell and its cause")
+    ] = "",
     out: Annotated[
-        Path | None, typer.Option(metavar="FOLDER", help="real: where tables and pictures of the worst go")
+        Path | None,
+        typer.Option(metavar="FOLDER", help="where pictures of what is explained go; real: tables, pictures of worst"),
     ] = None,
     scans: Annotated[
         str | None, typer.Option(metavar="SLICES", help="real: which scans of the drive: 0:300, say")
@@ -66,15 +81,17 @@ def evaluate(
 
     mapvote evaluate corner --seed 2 --case 1,5,columns
 
+    mapvote evaluate as_published --case 1,2,3,4,5 --readings --explain 1 --out pictures
+
     mapvote evaluate real my_drive --out report
     """
     from rich.console import Console
 
-    from mapvote.config import load_settings
     from mapvote.evaluation.evaluate import evaluate as run
     from mapvote.evaluation.experiments.cases import choose_cases
     from mapvote.evaluation.experiments.conditions import Conditions
     from mapvote.evaluation.experiments.scene import Scene, default_cache
+    from mapvote.evaluation.experiments.study import PUBLISHED, Study
     from mapvote.evaluation.reporting.tables import as_json, tables, write_text
 
     if scenario == "real":
@@ -86,19 +103,44 @@ def evaluate(
         raise typer.BadParameter(f"{drive}: a drive follows the word real only", param_hint="DRIVE")
     if poses not in ("ndt", "truth"):
         raise typer.BadParameter(f"{poses!r}: choose ndt or truth", param_hint="--poses")
-    settings = load_settings(config)
+    settings = _settings_read(config, scenario, reading)
     cases, with_yardsticks = choose_cases(settings, case)
-    overrides = {"sensor": sensor} if sensor else {}
+    overrides: dict[str, str | int] = {"sensor": sensor} if sensor else {}
+    if cars is not None:
+        overrides["temporary_cars"] = cars
+    names = tuple(name.strip() for name in explain.split(",") if name.strip())
+    study = Study(readings, scenario in PUBLISHED, names)
     scene = Scene(
         scenario, seed, settings, cache or default_cache(), overrides, Conditions(true_poses=poses == "truth")
     )
     with stages() as told:
-        result = run(scene, cases, with_yardsticks, told).result
+        evaluation = run(scene, cases, with_yardsticks, told, study)
+    result = evaluation.result
     for table in tables(result):
         Console(width=140).print(table)
     if json is not None:
         write_text(as_json(result), json)
         print(f"{json}: all numbers")
+    if out is not None:
+        from mapvote.evaluation.reporting.budget_figure import budget_figure
+        from mapvote.evaluation.reporting.style import save
+
+        for name, causes in evaluation.causes.items():
+            picture = out / f"explained_{name.replace(' ', '_')}.png"
+            save(budget_figure(name, causes, evaluation.window), picture)
+            print(f"{picture}")
+
+
+def _settings_read(config: Path | None, scenario: str, reading: str | None) -> Settings:
+    """The settings, the paper read as the command line says, else as they say, else as suits the scenario."""
+    from mapvote.config import load_with_sources
+    from mapvote.detection.readings import read
+    from mapvote.evaluation.experiments.study import PUBLISHED
+
+    settings, sources = load_with_sources(config)
+    told = any(key.startswith("paper.") for key in sources)
+    said = reading or ("" if told else PUBLISHED.get(scenario, ""))
+    return settings.model_copy(update={"paper": read(settings.paper, said)}) if said else settings
 
 
 def _evaluate_real(

@@ -44,7 +44,11 @@ class MovingSettings(Section):
     """perception/moving_objects.py ([9])."""
 
     lookahead_s: float = Field(default=1.0, ge=0, le=1.0, description="how late a scan is decided")
-    reach_m: float = Field(default=50.0, gt=0, description="points farther away are never called moving")
+    reach_m: float = Field(
+        default=57.0,
+        gt=0,
+        description="points farther away are never called moving; the corners of the local grid are 56.7 m away",
+    )
 
 
 class MappingSettings(Section):

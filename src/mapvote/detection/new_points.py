@@ -30,8 +30,10 @@ def select(points: F64, cell: I32, stationary: Bool, words: U64, base: I32) -> B
 class NewPoints:
     """One point per 0.3 m voxel, the first that was offered: candidates for changed-occupied cells."""
 
-    def __init__(self, lattice: Lattice) -> None:
-        self.lattice = lattice
+    def __init__(self, lattice: Lattice, beyond: bool = True) -> None:
+        """``beyond``: also what lies outside the local grid. The paper has none of it, and the filter of moving objects
+        does not look there: only rules that ask more of a new voxel than that a scan struck it can take it."""
+        self.lattice, self.beyond = lattice, beyond
         self._outer: Reference | None = None
         self._unmapped: U64 = np.zeros((0, 0), dtype=np.uint64)
         self._points = np.zeros((0, 3))
@@ -45,7 +47,8 @@ class NewPoints:
             scan.points_map, scan.cell, scan.obstacle & ~seen.moving, may_be_new.ravel(), _flat_base(scan.reference)
         )
         self.offer(scan.points_map[chosen])
-        self.offer(self._strange_beyond(scan))
+        if self.beyond:
+            self.offer(self._strange_beyond(scan))
 
     def _strange_beyond(self, scan: PlacedScan) -> F64:
         """(m, 3) obstacle points outside the local grid, within reach, in voxels that the map does not hold.

@@ -8,7 +8,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+from pydantic import ValidationError
+
 from mapvote.config import PaperSettings
+from mapvote.core.types import MapvoteError
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,11 +100,29 @@ OPEN_SENTENCES: tuple[OpenSentence, ...] = (
 )
 
 
-def readings_of(base: PaperSettings) -> dict[str, PaperSettings]:
-    """By name ("as set", "occluded abstains", "n_min 3", ..): ``base``, and it with one sentence read otherwise."""
+def readings_of(base: PaperSettings, only: str | None = None) -> dict[str, PaperSettings]:
+    """By name ("as set", "occluded abstains", "n_min 3", ..): ``base``, and it with one sentence read otherwise.
+
+    ``only``: the one setting that is varied; None: each in turn.
+    """
     found = {"as set": base}
     for sentence in OPEN_SENTENCES:
         for value in sentence.readings:
-            if value != getattr(base, sentence.setting):
+            if only in (None, sentence.setting) and value != getattr(base, sentence.setting):
                 found[f"{sentence.setting} {value}"] = base.model_copy(update={sentence.setting: value})
     return found
+
+
+def read(base: PaperSettings, said: str) -> PaperSettings:
+    """``base`` with what ``said`` changes: "occluded=abstains, n_min=3". MapvoteError names what there is."""
+    values = base.model_dump()
+    for piece in said.split(","):
+        setting, _, value = (part.strip() for part in piece.partition("="))
+        if setting not in values:
+            raise MapvoteError(f"reading {piece.strip()!r}: choose {', '.join(values)}, as in occluded=abstains")
+        values[setting] = value
+    try:
+        return PaperSettings.model_validate(values)
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise MapvoteError(f"reading {first['loc'][0]}={first['input']}: {first['msg']}") from error

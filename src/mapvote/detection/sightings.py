@@ -30,6 +30,9 @@ WORDS = 1 << 16
 _BEHIND, _CLEAR, _NEVER = np.uint8(Sight.BEHIND), np.uint8(Sight.CLEAR), np.uint8(Sight.NEVER)
 
 
+LEVEL = np.array([0.0, 0.0, 1.0])
+
+
 @numba.njit(cache=True, nogil=True)
 def _of_sight(sight: U8, clear_of_cells: U8, passed: U64, occupied: U64, shift: int, words: U16) -> None:
     """The five bits of one view into ``words``, in place; all planes (rows, cols)."""
@@ -51,14 +54,19 @@ def _of_sight(sight: U8, clear_of_cells: U8, passed: U64, occupied: U64, shift: 
 
 @numba.njit(cache=True, nogil=True)
 def _of_points(
-    counts: I32, hit: U64, occupied: U64, bottom_z: F32, origin: F64, x0: float, y0: float, tan_top: float, words: U16
-) -> None:
+    counts: I32, hit: U64, occupied: U64, bottom_z: F32, eye: tuple[F64, F64], x0: float, y0: float, tan_top: float,
+    words: U16,
+) -> None:  # fmt: skip
+    """``eye``: the sensor's place and its upward axis, (3,) each."""
+    origin, up = eye
     for r in range(counts.shape[0]):
         for c in range(counts.shape[1]):
             word = min(counts[r, c], MOST_POINTS)
             if occupied[r, c]:
                 dx, dy = x0 + (c + 0.5) * CELL_SIZE - origin[0], y0 + (r + 0.5) * CELL_SIZE - origin[1]
-                if bottom_z[r, c] > origin[2] + tan_top * np.sqrt(dx * dx + dy * dy):
+                dz = bottom_z[r, c] - origin[2]
+                above = dx * up[0] + dy * up[1] + dz * up[2]  # as the sensor leans, not as the world lies
+                if above > tan_top * np.sqrt(max(dx * dx + dy * dy + dz * dz - above * above, 0.0)):
                     word |= BEGINS_ABOVE
             if occupied[r, c] > below_top(hit[r, c]):
                 word |= REACHES_HIGHER
@@ -72,8 +80,10 @@ def encode(
     sensor: Sensor,
     clear_of_cells: U8 | None = None,
     without_movers: tuple[ScanView, U8] | None = None,
+    up_map: F64 = LEVEL,
 ) -> U16:
-    """(rows, cols) words of one scan seen from ``origin_map`` (3,), map metres.
+    """(rows, cols) words of one scan seen from ``origin_map`` (3,), map metres, by a sensor with the upward axis
+    ``up_map`` (3,).
 
     ``clear_of_cells``: the :class:`Sight` of each cell where only occupied cells hide; ``without_movers``: view and
     that sight of the scan without its movers. What is not given is taken to be like the rest.
@@ -81,7 +91,15 @@ def encode(
     words = np.zeros(view.counts.shape, dtype=np.uint16)
     tan_top, grid = float(np.tan(np.radians(sensor.fov_top_deg))), view.grid
     _of_points(
-        view.counts, view.hit, reference.occupied, reference.bottom_z, origin_map, grid.x0, grid.y0, tan_top, words
+        view.counts,
+        view.hit,
+        reference.occupied,
+        reference.bottom_z,
+        (origin_map, up_map),
+        grid.x0,
+        grid.y0,
+        tan_top,
+        words,
     )
     cells = view.sight if clear_of_cells is None else clear_of_cells
     _of_sight(view.sight, cells, view.passed, reference.occupied, 0, words)
@@ -102,7 +120,7 @@ def sightings(seen: Observation, sensor: Sensor, n_min: int, asked: PaperSetting
         still = ~seen.moving
         view = _cast(seen, still, seen.scan.obstacle)
         without = view, _clear_of_cells(seen, still, n_min) if by_cells else view.sight
-    words = encode(seen.view, seen.reference, seen.scan.origin_map, sensor, cells, without)
+    words = encode(seen.view, seen.reference, seen.scan.origin_map, sensor, cells, without, seen.scan.up_map)
     if asked is not None:
         words[~votes_in(seen.view.grid, seen.scan.origin_map, asked.window_m)] = 0
     return words

@@ -18,9 +18,12 @@ from mapvote.evaluation.experiments.changed_areas import in_changed_areas, surve
 from mapvote.evaluation.experiments.passes import Pass, passes
 from mapvote.evaluation.experiments.pose_errors import localisation, map_frame, map_shift
 from mapvote.evaluation.experiments.scene import Progress, Scene
+from mapvote.evaluation.experiments.study import NOTHING_BESIDES, Study
 from mapvote.evaluation.results import CaseResult, Cost, EvaluationResult, Timings
+from mapvote.evaluation.scoring.budget import Causes
 from mapvote.evaluation.scoring.jury import Jury, Outcome
 from mapvote.evaluation.scoring.truth import Truth
+from mapvote.evaluation.scoring.truths import SIDE_BY_SIDE, sizes_by_height
 
 
 @dataclass(frozen=True)
@@ -34,17 +37,23 @@ class Evaluation:
     first_map: PointMap
     outcomes: Mapping[str, Outcome]
     drives: Sequence[Pass]
+    causes: Mapping[str, Causes]
+    """By case that was to be explained: every true and false cell of the provenance truth and its cause."""
 
 
 def evaluate(
-    scene: Scene, cases: Sequence[Case], with_yardsticks: bool = False, progress: Progress | None = None
+    scene: Scene,
+    cases: Sequence[Case],
+    with_yardsticks: bool = False,
+    progress: Progress | None = None,
+    study: Study = NOTHING_BESIDES,
 ) -> Evaluation:
     """Run what the cache lacks, decide and score every case. Two processes where there are two cores."""
     started = time.perf_counter()
     scene.prepare(progress)
     prepared = time.perf_counter()
     workers = min(2, os.cpu_count() or 1)
-    drives = passes(scene, cases, workers, progress)
+    drives = passes(scene, cases, workers, progress, keep=study.wanted)
     voted = time.perf_counter()
     truth, first_map = scene.truth, scene.point_map
     beams = scene.drive(drives[0].vehicle).sensor.beams
@@ -65,6 +74,7 @@ def evaluate(
         )
     if progress:
         progress("scoring", len(cases), len(cases))
+    found = study.of(scene, cases, jury, outcomes, progress)
     T_map_world = map_frame(scene)
     maps = {
         "old map": (first_map, T_map_world),
@@ -90,7 +100,14 @@ def evaluate(
         localisation=localisation(scene, drives),
         changed_areas=in_changed_areas(scene, truth, drives[0].vehicle, maps),
         ceilings=jury.ceilings(),
+        truth_sizes={
+            name: sizes_by_height(cells, truth, jury.first_map)
+            for name, cells in jury.truths.items()
+            if name in SIDE_BY_SIDE
+        },
         cases=entries,
+        readings=found.readings,
+        budgets=found.budgets,
         timings=Timings(
             prepare_s=prepared - started,
             vote_s=voted - prepared,
@@ -101,7 +118,7 @@ def evaluate(
             fuse_s={name: outcome.seconds for name, outcome in outcomes.items()},
         ),
     )
-    return Evaluation(result, scene, truth, jury.window, first_map, outcomes, drives)
+    return Evaluation(result, scene, truth, jury.window, first_map, outcomes, drives, found.causes)
 
 
 def _state_bytes(ballot: Ballot) -> int:

@@ -11,6 +11,7 @@ from typing import Any
 
 import msgspec
 
+from mapvote.evaluation.scoring.budget import Budget
 from mapvote.evaluation.scoring.cells import Scores
 from mapvote.evaluation.scoring.map_points import MapScores
 from mapvote.evaluation.scoring.objects import ObjectScores
@@ -85,7 +86,7 @@ class Timings(msgspec.Struct, frozen=True, kw_only=True):
     """By case."""
 
 
-class EvaluationResult(msgspec.Struct, frozen=True, kw_only=True):
+class EvaluationResult(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     """One scenario and seed: what ``evaluate --json`` writes."""
 
     scenario: str
@@ -104,7 +105,13 @@ class EvaluationResult(msgspec.Struct, frozen=True, kw_only=True):
     """One vehicle's scans near changes, by map."""
     ceilings: dict[str, Scores]
     """By truth: what perfect labels on every measured point would score in cells."""
+    truth_sizes: dict[str, dict[str, dict[str, int]]]
+    """By truth, class and height of the lowest surface: changed cells."""
     cases: dict[str, CaseResult]
+    readings: dict[str, dict[str, dict[str, Scores]]] = {}
+    """By reading of the paper, case and truth, if asked for."""
+    budgets: dict[str, dict[str, Budget]] = {}
+    """By case and truth, if asked for."""
     timings: Timings
 
 

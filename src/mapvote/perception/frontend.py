@@ -96,6 +96,8 @@ class PlacedScan:
     """(n, 3) map metres, de-skewed."""
     origin_map: F64
     """(3,) the sensor, map metres."""
+    up_map: F64
+    """(3,) the sensor's own upward axis, in the map's frame."""
     sigma_m: float
     """Standard deviation of the position, metres: the largest over all directions."""
     reference: Reference
@@ -176,7 +178,8 @@ class Frontend:
         sigma_m = float(np.sqrt(np.linalg.eigvalsh(fix.registration.covariance[:3, :3])[-1]))
         reference, outer = self._ground.at(origin_map)
         obstacle, cell = find_obstacles(points_map, reference)
-        return PlacedScan(index, points_map, origin_map, sigma_m, reference, outer, obstacle, cell)
+        up_map = T_map_lidar[:3, 2]
+        return PlacedScan(index, points_map, origin_map, up_map, sigma_m, reference, outer, obstacle, cell)
 
     def _see(self, decided: list[Bool]) -> list[Observation]:
         """The oldest scans that wait, one for each mask of moving points (n,)."""

@@ -1,7 +1,7 @@
 """One pass over a drive that serves many voters: what a scan saw is worked out once, each voter counts by its rules.
 
-Voters that count alike share their counters, and all share the candidates for new points: a voxel's point is the first
-that any of them asked for.
+Voters that count alike share their counters, and those of a method share the candidates for new points: a voxel's point
+is the first that any of them asked for.
 """
 
 from __future__ import annotations
@@ -49,12 +49,15 @@ class SharedPass:
             LocalMap(point_map, settings.voting.window_m),
         )
         self._voters: dict[tuple[VotingSettings, PaperSettings, Rules], Voter] = {}
-        self._observing: list[Voter] = []
+        self._observing: list[PaperVoter | ColumnVoter] = []
         """Those of them that fill the counters."""
         self._evidence: dict[tuple[bool, bool], Evidence] = {}
         for case in cases:
             self._enrol(case)
-        self._new_points = NewPoints(point_map.lattice)
+        self._new_points = {
+            method: NewPoints(point_map.lattice, beyond=method == "columns")
+            for method in {voter.voting.method for voter in self._observing}
+        }
 
     def _enrol(self, case: Case) -> None:
         key = _counts_as(case)
@@ -62,8 +65,9 @@ class SharedPass:
             return
         voting, paper, rules = key
         if voting.method == "paper":
-            self._voters[key] = PaperVoter(voting, paper, self.drive.sensor, self.point_map)
-            self._observing.append(self._voters[key])
+            by_scan = PaperVoter(voting, paper, self.drive.sensor, self.point_map)
+            self._voters[key] = by_scan
+            self._observing.append(by_scan)
             return
         counted_by = rules.empty_by_ray, rules.hits_veto
         voter = ColumnVoter(voting, self.point_map, rules, self._evidence.get(counted_by))
@@ -88,10 +92,11 @@ class SharedPass:
     def _vote(self, observations: list[Observation]) -> list[Observation]:
         for seen in observations:
             with self.report.timed("vote"):
-                may_be_new = np.zeros(seen.view.grid.shape, dtype=np.uint64)
+                may_be_new = {method: np.zeros(seen.view.grid.shape, dtype=np.uint64) for method in self._new_points}
                 for voter in self._observing:
-                    may_be_new |= voter.observe(seen)
-                self._new_points.gather(seen, may_be_new)
+                    may_be_new[voter.voting.method] |= voter.observe(seen)
+                for method, words in may_be_new.items():
+                    self._new_points[method].gather(seen, words)
         return observations
 
     def ballot(self, case: Case) -> Ballot:
@@ -99,7 +104,7 @@ class SharedPass:
         settings = self.settings.model_copy(update={"voting": case.voting, "paper": case.paper})
         return write_ballot(
             self.drive.vehicle, self.drive.drive_id, self.point_map, settings, self.report,
-            self._voters[_counts_as(case)], self._new_points,
+            self._voters[_counts_as(case)], self._new_points[case.voting.method],
         )  # fmt: skip
 
 

@@ -12,6 +12,7 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
+from mapvote.evaluation.reporting.study_tables import study_tables
 from mapvote.evaluation.results import CaseResult, EvaluationResult, to_json
 from mapvote.evaluation.scoring import paper_tables
 from mapvote.evaluation.scoring.cells import CLASSES, ByClass, Scores, ratio
@@ -78,6 +79,7 @@ def tables(result: EvaluationResult) -> Iterator[Table]:
         )
     f1.add_row("perfect labels", *(_share(scores.macro_f1) for scores in result.ceilings.values()), style="dim")
     yield f1
+    yield from study_tables(result)
     yield from _map_table(result)
     yield from _localisation_tables(result)
     yield from _cost_table(result)

@@ -38,6 +38,9 @@ TRUTHS: Mapping[str, Callable[[Truth, Reference], U8]] = {
 """What each calls a cell, over the window of the truth: 0 unchanged, 1 changed-occupied, 2 changed-empty, 255 unscored;
 ``first_map`` is the map that is voted on, over the same window (docs/decisions/truth.md)."""
 
+SIDE_BY_SIDE = ("strict", "provenance", "could be known")
+"""Those that differ in what they ask for, whose sizes are told."""
+
 BANDS = ("below 1.5 m", "1.5 to 4 m", "above 4 m", "no sample")
 """Where the lowest changed surface of a cell lies above the ground; "no sample": the noise-free survey met none."""
 _EDGES_M = (1.5, 4.0)
