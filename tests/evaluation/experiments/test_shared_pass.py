@@ -61,7 +61,7 @@ def test_each_case_says_what_a_vehicle_of_its_own_would_have_said(street: PointM
     assert [observation.scan.index for observation in seen] == list(range(N))
     said = set()
     for case in cases:
-        settings = Settings(voting=case.voting)
+        settings = Settings(voting=case.voting, paper=case.paper)
         alone, _ = vote_drive(drive, street, settings, localise=GivenPoses(STAMPS, POSES))
         together = shared.ballot(case)
         assert planes(together) == planes(alone)
