@@ -182,13 +182,13 @@ def test_a_revoked_key_stops_working_at_once(site: Site) -> None:
 
 def test_an_unsent_ballot_waits_in_the_spool(site: Site, tmp_path: Path) -> None:
     ballot = says(two_walls(), "a", "spooled", CellState.UNCHANGED_OCCUPIED)
-    with MapClient("http://127.0.0.1:9", key=site.a, home=tmp_path, sleep=lambda s: None) as away:
-        assert away.send(ballot) == "spooled"
-        assert away.flush() == {"a~spooled": "spooled"}
+    with MapClient(site.url, key="of nobody", home=tmp_path) as shut_out:
+        with pytest.raises(MapvoteError, match=r"refused \(401\).*the ballot waits in"):
+            shut_out.send(ballot)
     with MapClient(site.url, key=site.a, home=tmp_path) as client:
         assert client.flush() == {"a~spooled": "created"}
         assert client.flush() == {}
-        with pytest.raises(MapvoteError, match=r"refused \(409\)"):
+        with pytest.raises(MapvoteError, match=r"refused \(409\).*the ballot is kept in"):
             client.send(make_ballot(two_walls(), {(0, 0): Say(states_plane())}, "a", "x", map_id="elsewhere"))
         assert client.flush() == {}
 

@@ -65,5 +65,6 @@ def _as_json(manifest: Manifest) -> dict[str, Any]:
         "lattice": {"x0": manifest.lattice.x0, "y0": manifest.lattice.y0},
         "georeference": dict(manifest.georeference),
         "tiles": tiles,
+        "digest": manifest.digest,
         "removed": [tile_key(index) for index in manifest.removed],
     }

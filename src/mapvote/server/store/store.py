@@ -9,6 +9,7 @@ un-vote), ``keys``. What explains it: ``standing`` (which votes count), ``explai
 
 from __future__ import annotations
 
+import hashlib
 import secrets
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -53,8 +54,17 @@ class Manifest:
     lattice: Lattice
     georeference: Mapping[str, str]
     tiles: Mapping[TileIndex, TileHashes]
+    digest: str
+    """Of all tiles of the version, see :func:`digest_of`."""
     removed: Sequence[TileIndex] = ()
     """With ``since``: tiles that the older version had and this one has not."""
+
+
+def digest_of(tiles: Mapping[TileIndex, TileHashes]) -> str:
+    """SHA-256 over a line for each tile in ascending order: row, column and its planes' hashes, "-" for none. Who keeps
+    a manifest up to date by what changed can tell whether it still is the server's."""
+    lines = (f"{r} {c} {h.points} {h.ground} {h.free or '-'}\n" for (r, c), h in sorted(tiles.items()))
+    return hashlib.sha256("".join(lines).encode()).hexdigest()
 
 
 def url_of(store: str) -> str:
@@ -169,12 +179,13 @@ class Store:
             if since is not None:
                 version_of(connection, since, cleared=True)
             tiles = tiles_of(connection, number)
+            digest = digest_of(tiles)
             removed: list[TileIndex] = []
             if since is not None:
                 old = tiles_of(connection, since)
                 removed = sorted(old.keys() - tiles.keys())
                 tiles = {index: hashes for index, hashes in tiles.items() if old.get(index) != hashes}
-        return Manifest(number, self.map_id, self.lattice, self.georeference, tiles, removed)
+        return Manifest(number, self.map_id, self.lattice, self.georeference, tiles, digest, removed)
 
     def blob(self, digest: str) -> bytes:
         """One plane of a tile, a zstd frame; NotFound if no version ever held it."""

@@ -1,0 +1,113 @@
+"""Requests to one server, repeated while the trouble may pass, as patiently as the server asks for."""
+
+from __future__ import annotations
+
+import random
+import time
+from collections.abc import Callable, Mapping
+from email.utils import parsedate_to_datetime
+from typing import Any
+
+import httpx2
+
+from mapvote.core.types import MapvoteError
+
+_PASSING = {429, 500, 502, 503, 504}
+"""Answers that may be better next time."""
+_LONGEST_WAIT_S = 60.0
+"""A server that asks for more is asked again another time."""
+
+
+class Unreachable(MapvoteError):
+    """The server did not answer, or not now."""
+
+
+class Refused(MapvoteError):
+    """The server answered that it will not."""
+
+    def __init__(self, message: str, status: int) -> None:
+        super().__init__(message)
+        self.status = status
+
+
+class Connection:
+    """One server, as one who holds a key."""
+
+    def __init__(
+        self,
+        url: str,
+        *,
+        key: str | None = None,
+        attempts: int = 4,
+        timeout_s: float = 30.0,
+        sleep: Callable[[float], object] = time.sleep,
+    ) -> None:
+        headers = {"Accept-Encoding": "identity"} | ({"Authorization": f"Bearer {key}"} if key else {})
+        self._http = httpx2.Client(base_url=url.rstrip("/"), headers=headers, timeout=timeout_s)
+        self.url = url
+        self._attempts = attempts
+        self._sleep = sleep
+
+    def close(self) -> None:
+        """Close the sockets."""
+        self._http.close()
+
+    def ask(
+        self,
+        method: str,
+        path: str,
+        *,
+        content: bytes | None = None,
+        json: object = None,
+        headers: Mapping[str, str] | None = None,
+    ) -> httpx2.Response:
+        """One request, repeated with growing, scattered pauses, or those that the server names, while the trouble may
+        pass. Unreachable if it does not, Refused (with the server's reason) for 4xx."""
+        trouble, wait_s = "", 0.0
+        for attempt in range(self._attempts):
+            if attempt:
+                self._sleep(max(0.25 * 2**attempt * random.uniform(0.5, 1.5), wait_s))
+            try:
+                answer = self._http.request(method, path, content=content, json=json, headers=dict(headers or {}))
+            except httpx2.TransportError as error:
+                trouble, wait_s = str(error) or type(error).__name__, 0.0
+                continue
+            except (httpx2.InvalidURL, httpx2.UnsupportedProtocol) as error:
+                raise MapvoteError(f"{self.url}: is no address of a server ({error})") from error
+            if answer.status_code in _PASSING:
+                trouble, wait_s = detail_of(answer), _asked_to_wait_s(answer)
+                if wait_s > _LONGEST_WAIT_S:
+                    raise Unreachable(f"{self.url}: {trouble}; ask again in {wait_s:.0f} s")
+                continue
+            if answer.status_code >= 400:
+                why = f"{self.url}: refused ({answer.status_code}): {detail_of(answer)}"
+                raise Refused(why, answer.status_code)
+            return answer
+        raise Unreachable(f"{self.url}: no answer after {self._attempts} attempts ({trouble}); try again later")
+
+    def ask_json(self, method: str, path: str, *, json: object = None) -> Any:
+        """What a server answers, decoded. MapvoteError also if that is no JSON."""
+        try:
+            return self.ask(method, path, json=json).json()
+        except ValueError as error:
+            raise MapvoteError(f"{self.url}: is no mapvote server ({error})") from error
+
+
+def detail_of(answer: httpx2.Response) -> str:
+    """What a server says of a refusal."""
+    try:
+        found: Any = answer.json()["detail"]
+    except (ValueError, KeyError, TypeError):
+        return f"status {answer.status_code}"
+    return str(found)
+
+
+def _asked_to_wait_s(answer: httpx2.Response) -> float:
+    """Retry-After (RFC 9110, 10.2.3): seconds or a date; 0 if there is none."""
+    said = answer.headers.get("retry-after", "").strip()
+    if said.isdigit():
+        return float(said)
+    try:
+        return max(0.0, parsedate_to_datetime(said).timestamp() - time.time())
+    except (ValueError, TypeError):
+        return 0.0

@@ -1,0 +1,257 @@
+"""What a vehicle needs of the server: the newest map, and a way to send a ballot that loses nothing.
+
+client = MapClient("https://maps.example.org", key=..., home=Path("~/.cache/mapvote").expanduser())
+point_map = client.fetch()
+client.send(ballot)                # kept in the spool and sent later if the server cannot be reached
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import time
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from types import TracebackType
+from typing import Literal
+
+import msgspec
+import numpy as np
+
+from mapvote.client.connection import Connection, Refused, Unreachable
+from mapvote.client.spool import Spool, server_folder
+from mapvote.codec.ballot import Ballot, decode, encode
+from mapvote.core.grid import CELL_SIZE, Grid, Lattice, TileIndex
+from mapvote.core.point_map import PointMap
+from mapvote.core.tile import Tile
+from mapvote.core.types import MapvoteError
+from mapvote.formats.atomic import whole_file
+
+Sent = Literal["created", "replaced", "repeated", "spooled"]
+Region = tuple[float, float, float, float]
+"""x and y of the lower left corner, x and y of the upper right one, map metres."""
+_KEEP_WAITING = {401, 403}
+"""Refusals that a new key mends."""
+
+
+class _Plane(msgspec.Struct, order=True):
+    points: str
+    ground: str
+    free: str | None = None
+
+    def hashes(self) -> list[str]:
+        return [digest for digest in (self.points, self.ground, self.free) if digest is not None]
+
+
+class _Lattice(msgspec.Struct):
+    x0: float
+    y0: float
+
+
+class _Manifest(msgspec.Struct):
+    map_id: str
+    version: int
+    lattice: _Lattice
+    tiles: dict[str, _Plane]
+    georeference: dict[str, str] = {}
+    digest: str = ""
+    """Of all tiles of the version; "" from an older server."""
+    removed: list[str] = []
+
+    def whole(self) -> bool:
+        """Whether these are all tiles of the version, and as the server has them."""
+        ordered = sorted((_index(key), planes) for key, planes in self.tiles.items())
+        lines = (f"{r} {c} {p.points} {p.ground} {p.free or '-'}\n" for (r, c), p in ordered)
+        return self.digest == hashlib.sha256("".join(lines).encode()).hexdigest()
+
+    def followed_by(self, since: _Manifest) -> _Manifest:
+        """The newer manifest that ``since``, which tells only what changed, makes of this one."""
+        tiles = {key: planes for key, planes in self.tiles.items() if key not in since.removed} | since.tiles
+        return msgspec.structs.replace(since, tiles=tiles, removed=[])
+
+
+class MapClient:
+    """One vehicle's line to one server.
+
+    ``home`` holds planes of tiles by hash, of all servers (``cache_bytes`` at most, beside what the map last fetched
+    needs), and for each server the newest manifest and the spool of unsent ballots.
+    """
+
+    def __init__(
+        self,
+        url: str,
+        *,
+        home: Path,
+        key: str | None = None,
+        attempts: int = 4,
+        timeout_s: float = 30.0,
+        cache_bytes: int = 4_000_000_000,
+        sleep: Callable[[float], object] = time.sleep,
+    ) -> None:
+        self._server = Connection(url, key=key, attempts=attempts, timeout_s=timeout_s, sleep=sleep)
+        self._url = url
+        self._planes, self._spool = home / "planes", Spool(home, url)
+        self._kept_manifest = server_folder(home, url) / "manifest.json"
+        self._cache_bytes = cache_bytes
+        self.version: int | None = None
+        """Version of the map last fetched."""
+
+    def __enter__(self) -> MapClient:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the connections."""
+        self._server.close()
+
+    def fetch(self, version: int | None = None, *, region: Region | None = None) -> PointMap:
+        """The newest map, or one version; only planes that ``home`` lacks are downloaded, and of the list of tiles only
+        what changed.
+
+        ``region``: only tiles that meet it. A ballot may name no tile outside: leave 100 m around where you drive.
+        Unreachable if the server does not answer; MapvoteError if it refuses or what comes is damaged.
+        """
+        manifest = self._newest() if version is None else self._manifest(f"/v1/map/versions/{version}")
+        lattice = Lattice(manifest.lattice.x0, manifest.lattice.y0)
+        wanted = {_index(key): planes for key, planes in manifest.tiles.items()}
+        if region is not None:
+            wanted = {index: planes for index, planes in wanted.items() if _meets(lattice.tile(index), region)}
+        tiles = {index: self._tile(lattice.tile(index), planes) for index, planes in wanted.items()}
+        self._bound_cache({digest for planes in wanted.values() for digest in planes.hashes()})
+        self.version = manifest.version
+        return PointMap(manifest.map_id, lattice, tiles, manifest.georeference, version=manifest.version)
+
+    def newest(self) -> int:
+        """The number of the newest version; no tile is downloaded. Raises as :meth:`fetch`."""
+        return self._newest().version
+
+    def send(self, ballot: Ballot | bytes) -> Sent:
+        """Send a ballot; "spooled" if the server cannot be reached now. Refused if it refuses, saying where the ballot
+        is kept and what to do."""
+        data = ballot if isinstance(ballot, bytes) else encode(ballot)
+        about = ballot if isinstance(ballot, Ballot) else decode(ballot)
+        return self._send_spooled(self._spool.put(about.vehicle, about.drive, data))
+
+    def flush(self, vehicle: str | None = None) -> dict[str, Sent | MapvoteError]:
+        """Try again to send what waits for this server (of one vehicle): what came of each, by "vehicle~drive"."""
+        results: dict[str, Sent | MapvoteError] = {}
+        for waiting in self._spool.waiting(vehicle):
+            name = f"{waiting.parent.name}~{waiting.stem}"
+            try:
+                results[name] = self._send_spooled(waiting)
+            except MapvoteError as error:
+                results[name] = error
+            if results[name] == "spooled":
+                break
+        return results
+
+    def _send_spooled(self, waiting: Path) -> Sent:
+        try:
+            path = f"/v1/ballots/{waiting.parent.name}/{waiting.stem}"
+            answer = self._server.ask("PUT", path, content=waiting.read_bytes())
+        except Unreachable:
+            return "spooled"
+        except Refused as error:
+            if error.status in _KEEP_WAITING:
+                told = f"{error}; the ballot waits in {waiting}: it is sent with the next one, by a key that may"
+                raise Refused(told, error.status) from error
+            kept = self._spool.set_aside(waiting)
+            told = f"{error}; the ballot is kept in {kept}" + (_VOTE_AGAIN if error.status == 409 else "")
+            raise Refused(told, error.status) from error
+        self._spool.sent(waiting)
+        result: Sent = answer.json()["result"]
+        return result
+
+    def _newest(self) -> _Manifest:
+        """The newest manifest: what is kept of the last one, and what changed since."""
+        kept = self._kept()
+        if kept is not None:
+            tag = f'"{kept.version}-{kept.version}"'
+            try:
+                answer = self._server.ask("GET", f"/v1/map?since={kept.version}", headers={"If-None-Match": tag})
+            except Refused as error:
+                if error.status != 404:
+                    raise
+                kept = None  # the server is not the one it was: it never had that version
+            else:
+                if answer.status_code == 304:
+                    return kept
+                since = self._decoded(answer.content)
+                followed = kept.followed_by(since)
+                if since.map_id == kept.map_id and followed.whole():
+                    return self._keep(followed)
+        return self._keep(self._manifest("/v1/map"))
+
+    def _manifest(self, path: str) -> _Manifest:
+        return self._decoded(self._server.ask("GET", path).content)
+
+    def _decoded(self, content: bytes) -> _Manifest:
+        try:
+            return msgspec.json.decode(content, type=_Manifest)
+        except msgspec.DecodeError as error:
+            raise MapvoteError(f"{self._url}: is no mapvote server ({error})") from error
+
+    def _kept(self) -> _Manifest | None:
+        try:
+            return msgspec.json.decode(self._kept_manifest.read_bytes(), type=_Manifest)
+        except (OSError, msgspec.DecodeError):
+            return None
+
+    def _keep(self, manifest: _Manifest) -> _Manifest:
+        with whole_file(self._kept_manifest, private=True) as part:
+            part.write_bytes(msgspec.json.encode(manifest))
+        return manifest
+
+    def _tile(self, window: Grid, planes: _Plane) -> Tile:
+        points = np.frombuffer(self._plane(planes.points), dtype="<f4").reshape(-1, 3)
+        ground_z = np.frombuffer(self._plane(planes.ground), dtype="<f4").reshape(window.shape)
+        free = (
+            None if planes.free is None else np.frombuffer(self._plane(planes.free), dtype="<u8").reshape(window.shape)
+        )
+        return Tile(window, points, ground_z, free)
+
+    def _plane(self, digest: str) -> bytes:
+        kept = self._planes / digest
+        if kept.exists():
+            raw = kept.read_bytes()
+            if hashlib.sha256(raw).hexdigest() == digest:
+                os.utime(kept)
+                return raw
+        raw = self._server.ask("GET", f"/v1/tiles/{digest}").content
+        if hashlib.sha256(raw).hexdigest() != digest:
+            raise MapvoteError(f"{self._url}: tile plane {digest[:12]} came damaged; fetch again")
+        with whole_file(kept, private=True) as part:
+            part.write_bytes(raw)
+        return raw
+
+    def _bound_cache(self, needed: Iterable[str]) -> None:
+        """Forget the planes that were used longest ago, beyond ``cache_bytes``; never those of the map just fetched."""
+        if not self._planes.is_dir():
+            return
+        others = {file.name: file.stat() for file in os.scandir(self._planes)}
+        for digest in needed:
+            others.pop(digest, None)
+        size = sum(about.st_size for about in others.values())
+        for name in sorted(others, key=lambda name: others[name].st_mtime_ns):
+            if size <= self._cache_bytes:
+                return
+            (self._planes / name).unlink(missing_ok=True)
+            size -= others[name].st_size
+
+
+_VOTE_AGAIN = ": fetch the map and vote again with that drive"
+
+
+def _index(key: str) -> TileIndex:
+    row, _, col = key.partition(",")
+    return int(row), int(col)
+
+
+def _meets(window: Grid, region: Region) -> bool:
+    x0, y0, x1, y1 = region
+    rows, cols = window.shape
+    return x0 < window.x0 + cols * CELL_SIZE and window.x0 < x1 and y0 < window.y0 + rows * CELL_SIZE and window.y0 < y1
