@@ -7,10 +7,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from mapvote.cli.options import DRIVE, MAP, DrivePath, MapPath, Projector, Rate, Topic, with_drive_options
+from mapvote.cli.options import DRIVE, MAP, DrivePath, KeyFile, Projector, Rate, Topic, with_drive_options
+from mapvote.cli.remote import is_store, is_url, map_of, overview_of
 from mapvote.cli.terminal import waiting
 
 if TYPE_CHECKING:
+    from mapvote.core.point_map import PointMap
     from mapvote.formats.doctor import Finding
 
 
@@ -23,11 +25,14 @@ def register(app: typer.Typer) -> None:
 
 
 def info(
-    path: Annotated[Path, typer.Argument(metavar="PATH", help="a map, a drive or a ballot, in any format")],
+    path: Annotated[
+        str, typer.Argument(metavar="PATH|STORE|URL", help="a map, a drive or a ballot, in any format; or a store")
+    ],
     rate_hz: Rate = None,
     topic: Topic = None,
+    key_file: KeyFile = None,
 ) -> None:
-    """Say what is in this file or folder.
+    """Say what is in this file or folder, or in a store or behind a server.
 
     mapvote info my_map
     """
@@ -38,7 +43,8 @@ def info(
     from mapvote.formats.describe import describe
 
     with waiting(f"reading {path}"):
-        title, rows = describe(path, rate_hz=rate_hz, topic=topic)
+        found = overview_of(path, key_file)
+        title, rows = describe(Path(path), rate_hz=rate_hz, topic=topic) if found is None else ("store", found)
     table = Table(show_header=False)
     table.add_column(style="cyan", no_wrap=True)
     table.add_column(overflow="fold")
@@ -120,7 +126,7 @@ def import_map(
 
 
 def export(
-    map_path: MapPath,
+    source: Annotated[str, typer.Argument(metavar="MAP|STORE|URL", help="a map, a store, or a server's newest map")],
     out: Annotated[
         Path,
         typer.Argument(metavar="FILE", help=".pcd, .las, .laz, .ply, or a folder to fill with Autoware tiles"),
@@ -130,20 +136,33 @@ def export(
     ] = "0,0,0",
     crs: Annotated[str | None, typer.Option(metavar="CRS", help="the coordinates to write: EPSG:n or WKT")] = None,
     projector: Projector = None,
+    version: Annotated[int | None, typer.Option(metavar="N", help="of a store or server; else the newest")] = None,
+    since: Annotated[
+        int | None, typer.Option(metavar="N", help="Autoware: only tiles that differ from this version's")
+    ] = None,
+    key_file: KeyFile = None,
 ) -> None:
     """Write a map's points in another format, in its own coordinate system or another. Says what it drops.
+
+    From a store or a server, Autoware tiles are named by their content: a running Autoware takes a path for what it is.
 
     mapvote export my_map city.pcd
     """
     from mapvote.core.types import MapvoteError
-    from mapvote.formats import export_map, read_map
+    from mapvote.formats import export_map
 
     try:
         x, y, z = (float(v) for v in offset.split(","))
     except ValueError as error:
         raise MapvoteError(f"--offset {offset!r}: give three numbers, for example 367000,3951000,0") from error
-    with waiting(f"reading {map_path}"):
-        point_map = read_map(map_path)
+    with waiting(f"reading {source}"):
+        point_map = map_of(source, key_file, version)
+        older = None if since is None else map_of(source, key_file, since)
+    if not out.suffix and (is_url(source) or is_store(source)):
+        _lay(point_map, out, older, projector)
+        return
+    if since is not None:
+        raise MapvoteError("export: --since writes Autoware tiles: give a folder, not a file")
     with waiting(f"writing {out}"):
         kind, frame = export_map(point_map, out, (x, y, z), crs=crs, projector=projector)
     points = sum(len(t.points) for t in point_map.tiles.values())
@@ -155,3 +174,18 @@ def export(
     if not frame.is_local and out.suffix.lower() in (".pcd", ".ply"):
         dropped.append(f"the name of the coordinate system ({out.suffix} has no place for it)")
     print(f"dropped: {', '.join(dropped)}")
+
+
+def _lay(point_map: PointMap, out: Path, older: PointMap | None, projector: str | None) -> None:
+    from mapvote.cli.follow import autoware_cloud
+    from mapvote.formats.maps.autoware_live import lay_version, names_of
+
+    cloud = autoware_cloud(point_map, out, projector)
+    known = frozenset(names_of(str(out), autoware_cloud(older, out, projector))) if older is not None else frozenset()
+    with waiting(f"writing {out}"):
+        change = lay_version(out, cloud, point_map.version or 0, known=known)
+    print(f"{out}: version {change.version}, {change.tiles} Autoware tiles, {change.written} written")
+    if older is not None:
+        print(
+            f"tiles of version {older.version} that are as they were are named, not written: copy this folder over it"
+        )

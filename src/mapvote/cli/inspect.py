@@ -3,40 +3,77 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
-from mapvote.cli.options import SERVER, StoreName
+from mapvote.cli.options import SERVER, KeyFile, StoreName, StoreOrUrl
+from mapvote.cli.remote import is_url, server_at
 from mapvote.cli.store import opened_store, when
 from mapvote.cli.terminal import print_table, waiting
 
 
 def register(app: typer.Typer) -> None:
     """Add these verbs to ``app``."""
-    for verb in (log, vehicles, changes):
+    for verb in (log, explain, vehicles, changes):
         app.command(rich_help_panel=SERVER)(verb)
 
 
 def log(
-    store: StoreName,
+    store: StoreOrUrl,
     events: Annotated[int, typer.Option(min=0, metavar="N", help="also the last so many events")] = 0,
+    key_file: KeyFile = None,
 ) -> None:
     """Versions of a store, and what happened in it.
 
     mapvote log fleet.db --events 20
     """
-    from mapvote.server.insight.history import events as last_events
+    from mapvote.server.insight.overview import log_of
 
-    with opened_store(store) as opened:
-        versions, happened = opened.versions(), last_events(opened, events) if events else []
+    if is_url(store):
+        with server_at(store, key_file) as server:
+            told = server.ask_json("GET", f"/v1/log?events={events}")
+    else:
+        with opened_store(store) as opened:
+            told = log_of(opened, events)
     rows = []
-    for v in versions:
-        origin = v.target if v.target is not None else v.parent
-        rows.append((str(v.number), v.kind, str(origin or ""), when(v.created_ns), v.published_by, v.reason))
+    for v in told["versions"]:
+        origin = v["target"] if v["target"] is not None else v["parent"]
+        made = v["kind"], str(origin or ""), when(v["created_ns"]), v["published_by"], v["reason"]
+        rows.append((str(v["number"]), *made))
     print_table(("version", "kind", "from", "when", "by", "reason"), rows)
-    for event in happened:
+    for event in told["events"]:
         print(f"{event['seq']} {when(event['at_ns'])} {event['kind']} {event['actor']} {event['detail']}")
+
+
+def explain(
+    store: StoreOrUrl,
+    x: Annotated[float, typer.Argument(metavar="X", help="map metres; after -- if one is negative")],
+    y: Annotated[float, typer.Argument(metavar="Y", help="map metres")],
+    key_file: KeyFile = None,
+) -> None:
+    """Why a cell of the map is as it is: every vote on it, which version heard it, or why it does not count.
+
+    mapvote explain fleet.db 12.5 -- -3.0
+    """
+    from mapvote.server.insight.explain import as_told, explain_cell
+
+    if is_url(store):
+        with server_at(store, key_file) as server:
+            told = server.ask_json("GET", f"/v1/cells?x={x}&y={y}")
+    else:
+        with opened_store(store) as opened:
+            told = as_told(explain_cell(opened, x, y))
+    print(f"cell {told['row']}, {told['col']}: {told['thing'] or 'empty'}")
+    for decision in told["decisions"]:
+        print(f"version {decision['version']} decided {decision['state']}")
+    rows = []
+    for v in told["votes"]:
+        heard = ", ".join(str(number) for number in v["heard"])
+        counts = "counts" if v["counts"] else v["why"]
+        ended = v["end"] if "end" in v else when(v["end_ns"])
+        rows.append((v["vehicle"], v["drive"], ended, str(v["version"]), v["state"], heard, counts))
+    print_table(("vehicle", "drive", "ended", "drove with", "says", "heard in", "now"), rows)
 
 
 def vehicles(store: StoreName) -> None:
@@ -60,7 +97,7 @@ def vehicles(store: StoreName) -> None:
 
 
 def changes(
-    store: StoreName,
+    store: StoreOrUrl,
     old: Annotated[int, typer.Option("--from", metavar="VERSION", help="the older version")] = 1,
     new: Annotated[int | None, typer.Option("--to", metavar="VERSION", help="the newer; else the newest")] = None,
     min_cells: Annotated[int, typer.Option(min=1, metavar="N", help="leave out smaller objects")] = 1,
@@ -72,6 +109,7 @@ def changes(
         Path | None,
         typer.Option("--html", metavar="FILE", help="one page with the clouds of the largest, before and after"),
     ] = None,
+    key_file: KeyFile = None,
 ) -> None:
     """What was built and demolished between two versions: GeoJSON in longitude and latitude, or a GeoPackage.
 
@@ -79,15 +117,20 @@ def changes(
 
     mapvote changes fleet.db --out changes.geojson
     """
-    import json
-
+    from mapvote.core.types import MapvoteError
     from mapvote.formats.atomic import whole_file
-    from mapvote.formats.geo.frame import frame_of
-    from mapvote.formats.geo.geopackage import write_geopackage
     from mapvote.server.insight.cutout import whole_page
     from mapvote.server.insight.history import changes_between, cutouts_between
 
     package = out is not None and out.suffix.lower() == ".gpkg"
+    if is_url(store):
+        if page is not None:
+            raise MapvoteError("changes: --html is made from a STORE; the server's own page shows the clouds")
+        until = "" if new is None else f"&to={new}"
+        asked = f"/v1/changes?from={old}{until}&min_cells={min_cells}&lonlat={not (metres or package)}"
+        with server_at(store, key_file) as server, waiting("comparing versions"):
+            _write_changes(server.ask_json("GET", asked.lower()), out)
+        return
     with opened_store(store) as opened, waiting("comparing versions"):
         newest = opened.current() if new is None else new
         found = changes_between(opened, old, newest, min_cells, lonlat=not (metres or package))
@@ -98,13 +141,22 @@ def changes(
         print(f"{len(cutouts)} of {len(found['features'])} changes in {page}")
         if out is None:
             return
-    text = json.dumps(found, indent=1)
+    _write_changes(found, out)
+
+
+def _write_changes(found: dict[str, Any], out: Path | None) -> None:
+    import json
+
+    from mapvote.formats.atomic import whole_file
+    from mapvote.formats.geo.frame import frame_of
+    from mapvote.formats.geo.geopackage import write_geopackage
+
     if out is None:
-        print(text)
+        print(json.dumps(found, indent=1))
         return
-    if package:
+    if out.suffix.lower() == ".gpkg":
         write_geopackage(out, found["features"], frame_of(found["georeference"]))
     else:
         with whole_file(out) as part:
-            part.write_text(text + "\n")
+            part.write_text(json.dumps(found, indent=1) + "\n")
     print(f"{len(found['features'])} objects in {out}")

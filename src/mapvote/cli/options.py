@@ -29,6 +29,9 @@ StoreName = Annotated[
     str,
     typer.Argument(metavar="STORE", help="an SQLite file, a postgresql+psycopg:// URL, or - for $MAPVOTE_STORE"),
 ]
+StoreOrUrl = Annotated[
+    str, typer.Argument(metavar="STORE|URL", help="a STORE, or the address of the server that keeps it")
+]
 KeyFile = Annotated[
     Path | None, typer.Option(metavar="FILE", help="holds the key for that server; else $MAPVOTE_KEY is the key")
 ]

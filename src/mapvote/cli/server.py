@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from mapvote.cli.options import SERVER, Config, Reason, StoreName
+from mapvote.cli.options import SERVER, Config, KeyFile, Reason, StoreName, StoreOrUrl
+from mapvote.cli.remote import is_url, server_at
 from mapvote.cli.store import opened_store, store_url, when
 from mapvote.cli.terminal import waiting
 
@@ -60,7 +61,7 @@ def _say_where(url: str) -> None:
 
 
 def publish(
-    store: StoreName,
+    store: StoreOrUrl,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="only say what would change")] = False,
     override: Annotated[bool, typer.Option("--override", help="publish in spite of the reasons to hold it")] = False,
     reason: Reason = "",
@@ -68,18 +69,27 @@ def publish(
         str | None, typer.Option(metavar="ADDRESS", help="Dask scheduler to fuse on, e.g. tcp://host:8786")
     ] = None,
     config: Config = None,
+    key_file: KeyFile = None,
 ) -> None:
-    """Fuse the ballots that stand and publish the next version.
+    """Fuse the ballots that stand and publish the next version; a server does it by itself, with its own cluster.
 
     mapvote publish fleet.db --dry-run
     """
     from concurrent.futures import ThreadPoolExecutor
 
     from mapvote.config import load_settings
+    from mapvote.core.types import MapvoteError
     from mapvote.server.insight.localisation_gate import gate_by
     from mapvote.server.store.publish import preview
     from mapvote.server.store.publish import publish as publish_version
 
+    if is_url(store):
+        if cluster or config:
+            raise MapvoteError("publish: the server has its own --cluster and --config; leave these out")
+        ask = {"dry_run": dry_run, "override": override, "reason": reason}
+        with server_at(store, key_file) as server, waiting("deciding"):
+            _print_published(server.ask_json("POST", "/v1/publish", json=ask), dry_run)
+        return
     reference = gate_by(load_settings(config).ndt)
     workers = dask_cluster(cluster) if cluster else ThreadPoolExecutor(2)
     with opened_store(store) as opened, workers as executor, waiting("deciding"):
@@ -87,30 +97,50 @@ def publish(
             done = preview(opened, gate=reference, executor=executor)
         else:
             done = publish_version(opened, reason=reason, override=override, gate=reference, executor=executor)
-    _print_outcome(done, "published" if done.published else "dry run" if dry_run else "nothing changed")
+    _print_outcome(done, _what(done.published, dry_run))
+
+
+def _what(published: bool, dry_run: bool) -> str:
+    return "published" if published else "dry run" if dry_run else "nothing changed"
+
+
+def _print_published(done: dict[str, Any], dry_run: bool) -> None:
+    tiles = f" in tiles {'; '.join(done['tiles'])}" if done["tiles"] else ""
+    what = _what(done["published"], dry_run)
+    points = f"{done['points_added']} points added, {done['points_deleted']} deleted"
+    print(f"version {done['version']} ({what}): {points}{tiles}")
+    for why in done["held"]:
+        print(f"hold: {why}")
 
 
 def policy(
-    store: StoreName,
+    store: StoreOrUrl,
     values: Annotated[list[str] | None, typer.Argument(metavar="KEY=VALUE...", help="e.g. fuse.min_votes=3")] = None,
     reason: Reason = "",
+    key_file: KeyFile = None,
 ) -> None:
     """Show what decides in a store (round, votes, gate), or change it. Holds at once, in a running server too.
 
     mapvote policy fleet.db fuse.min_votes=3 --reason "more vehicles now"
     """
     from mapvote.core.types import MapvoteError
-    from mapvote.server.store.policy import changed, current_policy, policy_changes, set_policy
+    from mapvote.server.store.policy import policy_told, set_values
 
     pairs = [value.partition("=") for value in values or ()]
     if any(not equals for _, equals, _ in pairs):
         raise MapvoteError("policy: give KEY=VALUE, e.g. fuse.min_votes=3; nothing at all shows the policy")
-    with opened_store(store) as opened:
-        if pairs:
-            set_policy(opened, changed(current_policy(opened), {k: v for k, _, v in pairs}), reason=reason)
-        last, found = policy_changes(opened)[-1], current_policy(opened)
-    print(f"policy of {when(last.at_ns)} by {last.by}" + (f": {last.reason}" if last.reason else ""))
-    for section, entries in found.model_dump().items():
+    wanted = {key: value for key, _, value in pairs}
+    if is_url(store):
+        with server_at(store, key_file) as server:
+            ask = {"values": wanted, "reason": reason}
+            told = server.ask_json("PATCH", "/v1/policy", json=ask) if pairs else server.ask_json("GET", "/v1/policy")
+    else:
+        with opened_store(store) as opened:
+            if pairs:
+                set_values(opened, wanted, reason=reason)
+            told = policy_told(opened)
+    print(f"policy of {when(told['at_ns'])} by {told['by']}" + (f": {told['reason']}" if told["reason"] else ""))
+    for section, entries in told["policy"].items():
         for key, value in entries.items():
             print(f"{section}.{key}={value}")
 

@@ -8,11 +8,12 @@ from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
 
-from mapvote.cli.options import SERVER, StoreName
+from mapvote.cli.options import SERVER, KeyFile, StoreName, StoreOrUrl
 from mapvote.cli.terminal import waiting
 
 if TYPE_CHECKING:
     from mapvote.server.store.keys import Key, Role
+    from mapvote.server.store.quarantine import Damage
     from mapvote.server.store.store import Store
 
 
@@ -23,14 +24,34 @@ def register(app: typer.Typer) -> None:
 
 
 def check(
-    store: StoreName,
+    store: StoreOrUrl,
     mend: Annotated[bool, typer.Option("--mend", help="set aside what is damaged, mend what --from has")] = False,
     other: Annotated[str | None, typer.Option("--from", metavar="STORE", help="e.g. a backup of this store")] = None,
+    key_file: KeyFile = None,
 ) -> None:
     """Is every plane, ballot and version what it was when it was written? Exit code 1 if something is damaged.
 
     mapvote check fleet.db --mend --from backup.db
     """
+    from mapvote.cli.remote import is_url, server_at
+    from mapvote.core.types import MapvoteError
+    from mapvote.server.store.quarantine import Damage
+
+    if is_url(store):
+        if mend or other:
+            raise MapvoteError("check: --mend and --from take a STORE, on the machine where it is")
+        with server_at(store, key_file) as server, waiting("the server reads every byte"):
+            found = [Damage(**damage) for damage in server.ask_json("GET", "/v1/check")["damage"]]
+    else:
+        found = _checked(store, mend, other)
+    for damage in found:
+        print(damage)
+    if found:
+        raise MapvoteError(f"{store}: {len(found)} things are damaged" + ("" if mend else "; --mend sets them aside"))
+    print("every plane, ballot and version is what it was when it was written")
+
+
+def _checked(store: str, mend: bool, other: str | None) -> list[Damage]:
     from mapvote.codec.arrays import unpack_bytes
     from mapvote.core.types import MapvoteError
     from mapvote.server.store.blobs import MAX_PLANE_BYTES
@@ -46,12 +67,7 @@ def check(
 
     second = opened_store(other) if other else nullcontext()
     with opened_store(store) as opened, second as backup, waiting("reading every byte"):
-        found = look(opened, mend=mend, source=elsewhere)
-    for damage in found:
-        print(damage)
-    if found:
-        raise MapvoteError(f"{store}: {len(found)} things are damaged" + ("" if mend else "; --mend sets them aside"))
-    print("every plane, ballot and version is what it was when it was written")
+        return look(opened, mend=mend, source=elsewhere)
 
 
 def gc(

@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from mapvote.cli.options import DRIVE, Config, DrivePath, KeyFile, key_in, with_drive_options
+from mapvote.cli.remote import client_of, map_of
 from mapvote.cli.terminal import progress, waiting
 
 if TYPE_CHECKING:
-    from mapvote.client import MapClient
     from mapvote.codec.ballot import Ballot
-    from mapvote.core.point_map import PointMap
     from mapvote.perception.frontend import DriveReport
     from mapvote.slam.build import BuildReport
 
@@ -120,7 +118,7 @@ def vote(
     from mapvote.codec.ballot import encode
     from mapvote.config import choose_case, load_settings
     from mapvote.core.types import MapvoteError
-    from mapvote.formats import open_drive, read_map
+    from mapvote.formats import open_drive
     from mapvote.formats.atomic import whole_file
     from mapvote.formats.geo.frame import frame_of
     from mapvote.localisation.localiser import GivenPoses
@@ -133,7 +131,7 @@ def vote(
     if case is not None:
         settings = choose_case(settings, case)
     with waiting(f"reading {where}"):
-        point_map = _fetch(where, key) if "://" in where else read_map(where)
+        point_map = map_of(where, key_file)
     frame = frame_of(point_map.georeference)
     drive = open_drive(drive_path, vehicle=vehicle, frame=frame, **drive_options)
     localise = None
@@ -152,21 +150,9 @@ def vote(
         _send(send, key, data)
 
 
-def _client(url: str, key: str | None) -> MapClient:
-    from mapvote.client import MapClient
-
-    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    return MapClient(url, key=key, home=cache / "mapvote")
-
-
-def _fetch(url: str, key: str | None) -> PointMap:
-    with _client(url, key) as client:
-        return client.fetch()
-
-
 def _send(url: str, key: str | None, data: bytes) -> None:
     """Send what waits in the spool, then this ballot."""
-    with _client(url, key) as client:
+    with client_of(url, key) as client:
         for name, result in client.flush().items():
             print(f"{name} from the spool: {result}")
         result = client.send(data)

@@ -182,9 +182,9 @@ def test_a_revoked_key_stops_working_at_once(site: Site) -> None:
 
 def test_an_unsent_ballot_waits_in_the_spool(site: Site, tmp_path: Path) -> None:
     ballot = says(two_walls(), "a", "spooled", CellState.UNCHANGED_OCCUPIED)
-    with MapClient(site.url, key="of nobody", home=tmp_path) as shut_out:
-        with pytest.raises(MapvoteError, match=r"refused \(401\).*the ballot waits in"):
-            shut_out.send(ballot)
+    shut_out = MapClient(site.url, key="of nobody", home=tmp_path)
+    with shut_out, pytest.raises(MapvoteError, match=r"refused \(401\).*the ballot waits in"):
+        shut_out.send(ballot)
     with MapClient(site.url, key=site.a, home=tmp_path) as client:
         assert client.flush() == {"a~spooled": "created"}
         assert client.flush() == {}

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import re
+from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -49,8 +50,22 @@ def laid_version(folder: Path) -> int | None:
     return history[-1].version if history and (folder / METADATA).is_file() else None
 
 
-def lay_version(folder: Path, cloud: Cloud, version: int, *, keep: int = 3, side_m: int = SIDE_M) -> Change:
-    """Show ``cloud`` (map metres, in a frame that Autoware knows) in ``folder``; only tiles that it lacks are written.
+def names_of(where: str, cloud: Cloud, side_m: int = SIDE_M) -> list[str]:
+    """The files that a cloud's tiles would be; ``where`` is for messages."""
+    return [f"{x}_{y}_{_hash8(tile)}.pcd" for (x, y), tile in squares(where, cloud, side_m)]
+
+
+def lay_version(
+    folder: Path,
+    cloud: Cloud,
+    version: int,
+    *,
+    keep: int = 3,
+    side_m: int = SIDE_M,
+    known: Collection[str] = (),
+) -> Change:
+    """Show ``cloud`` (map metres, in a frame that Autoware knows) in ``folder``; only tiles that it lacks are written,
+    and of those none that is ``known`` where the folder goes.
 
     Tiles of the ``keep`` versions before stay. At every moment the metadata there names only whole tiles. MapvoteError
     if the folder holds a map of somebody else.
@@ -66,7 +81,7 @@ def lay_version(folder: Path, cloud: Cloud, version: int, *, keep: int = 3, side
     for (x, y), tile in squares(str(folder), cloud, side_m):
         name = f"{x}_{y}_{_hash8(tile)}.pcd"
         corners[name] = x, y
-        if not (tiles / name).is_file():
+        if name not in known and not (tiles / name).is_file():
             with whole_file(tiles / name) as partial:
                 save_pcd(partial, tile.points, tile.fields)
             written += 1

@@ -18,6 +18,7 @@ from mapvote.server.http import (
     event_routes,
     operator_routes,
     pages,
+    store_routes,
     vehicle_routes,
 )
 from mapvote.server.http.auth import Guard
@@ -67,8 +68,8 @@ def create_app(
         redoc_url=None,
     )
     app.state.services = parts
-    routes = (ballot_route, vehicle_routes, operator_routes, desk_routes, cloud_routes, event_routes, pages)
-    for part in routes:
+    asked = ballot_route, vehicle_routes, operator_routes, store_routes, desk_routes, cloud_routes, event_routes
+    for part in (*asked, pages):
         app.include_router(part.router)
     app.add_exception_handler(400, unreadable)
     hosts, guard = Hosts(parts.settings.server.hosts), Guard(store, parts.threads.lookups, opened=opened)

@@ -31,7 +31,7 @@ from mapvote.server.http.schemas import (
     problems,
 )
 from mapvote.server.http.services import Services, services
-from mapvote.server.insight.explain import explain_cell
+from mapvote.server.insight.explain import as_told, explain_cell
 from mapvote.server.insight.geojson import feature_rows
 from mapvote.server.insight.history import changes_between, coverage, vehicle_standings
 from mapvote.server.insight.lists import contradictions, standing_rows, tile_squares
@@ -96,11 +96,12 @@ def changes(
     old: Annotated[int, Query(alias="from", ge=LEAST, le=MOST)],
     new: Annotated[int | None, Query(alias="to", ge=LEAST, le=MOST)] = None,
     min_cells: Annotated[int, Query(ge=1, le=100_000)] = 1,
+    lonlat: Annotated[bool, Query(description="in longitude and latitude, if the map says where it lies")] = False,
     format: Literal["geojson", "csv"] = "geojson",
 ) -> Response:
     """Things built and demolished between two versions; ``to`` is the newest by default."""
     store = services(request).store
-    found = changes_between(store, old, store.current() if new is None else new, min_cells)
+    found = changes_between(store, old, store.current() if new is None else new, min_cells, lonlat=lonlat)
     if format == "csv":
         return as_table(feature_rows(found))
     return as_json(found)
@@ -110,27 +111,13 @@ def changes(
 def cell(request: Request, x: float, y: float) -> Response:
     """Who says what about the cell at (x, y), map metres, whether it counts, and what was decided when."""
     parts = services(request)
-    story = explain_cell(parts.store, x, y)
-    names = {v.vehicle: v.vehicle for v in story.votes}
-    known = sees_names(request)
-    shown = names if known else pseudonyms(parts.store, names)
-    votes = [
-        {
-            "vehicle": shown[v.vehicle],
-            "drive": v.drive if known else "",
-            "version": v.version,
-            "state": v.state,
-            "marks": v.marks,
-            "end": iso(_seen(v.end_ns, known)),
-            "counts": v.counts,
-            "why": v.why,
-            "heard": list(v.heard),
-        }
-        for v in story.votes
-    ]
-    decisions = [{"version": version, "state": state} for version, state in story.decisions]
-    told = {"votes": votes, "decisions": decisions, "thing": story.thing}
-    return as_json({"row": story.row, "col": story.col} | told)
+    told, known = as_told(explain_cell(parts.store, x, y)), sees_names(request)
+    shown = {} if known else pseudonyms(parts.store, {vote["vehicle"] for vote in told["votes"]})
+    for vote in told["votes"]:
+        vote["end"] = iso(_seen(vote.pop("end_ns"), known))
+        if not known:
+            vote |= {"vehicle": shown[vote["vehicle"]], "drive": ""}
+    return as_json(told)
 
 
 @router.get(

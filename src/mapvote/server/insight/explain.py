@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
+from typing import Any
 
 import numpy as np
 import sqlalchemy as sa
@@ -104,6 +105,13 @@ def explain_cell(store: Store, x: float, y: float) -> CellStory:
         votes = [_vote(*each, now, tuple(heard.get(each[0].seq, ()))) for each in _everyone(connection, now)]
         thing = _thing(connection, now)
     return CellStory(row, col, votes, decided, thing)
+
+
+def as_told(story: CellStory) -> dict[str, Any]:
+    """A story as JSON."""
+    votes = [asdict(vote) for vote in story.votes]
+    decisions = [{"version": version, "state": state} for version, state in story.decisions]
+    return {"row": story.row, "col": story.col, "thing": story.thing, "votes": votes, "decisions": decisions}
 
 
 def _decisions(connection: sa.Connection, index: TileIndex, cell: tuple[int, int]) -> list[tuple[int, str]]:

@@ -145,3 +145,19 @@ def changed(policy: Policy, values: Mapping[str, Any]) -> Policy:
         first = error.errors()[0]
         where = ".".join(str(part) for part in first["loc"][:2])
         raise MapvoteError(f"policy: {where} = {first['input']!r}: {first['msg']}") from error
+
+
+def set_values(store: Store, values: Mapping[str, Any], *, by: str = "operator", reason: str = "") -> int:
+    """Change some values of the policy that holds, by "section.key", in one transaction; the number of the event.
+
+    MapvoteError as :func:`changed`.
+    """
+    with store.database.writing() as connection:
+        return write_policy(connection, changed(policy_in(connection), values), store.clock(), by, reason)
+
+
+def policy_told(store: Store) -> dict[str, Any]:
+    """The policy that holds, who set it, when and why, as JSON."""
+    last = policy_changes(store)[-1]
+    told = {"by": last.by, "at_ns": last.at_ns, "reason": last.reason}
+    return told | {"policy": last.policy.model_dump(mode="json")}

@@ -1,0 +1,90 @@
+"""A STORE, or the URL of a server that keeps one: verbs that take either ask here which it is."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from mapvote.cli.options import key_in
+from mapvote.cli.store import opened_store
+
+if TYPE_CHECKING:
+    from mapvote.client import MapClient
+    from mapvote.client.connection import Connection
+    from mapvote.core.point_map import PointMap
+
+_SQLITE = b"SQLite format 3\0"
+
+
+def is_url(name: str) -> bool:
+    """Whether this is a server's address."""
+    return name.startswith(("http://", "https://"))
+
+
+def is_store(name: str) -> bool:
+    """Whether this is a database's address, or an SQLite file."""
+    if name == "-" or ("://" in name and not is_url(name)):
+        return True
+    try:
+        with Path(name).open("rb") as file:
+            return file.read(len(_SQLITE)) == _SQLITE
+    except OSError:
+        return False
+
+
+@contextmanager
+def server_at(url: str, key_file: Path | None) -> Iterator[Connection]:
+    """A line to a server, for those who look at it and run it."""
+    from mapvote.client.connection import Connection
+
+    server = Connection(url, key=key_in(key_file), timeout_s=600.0)
+    try:
+        yield server
+    finally:
+        server.close()
+
+
+def client_of(url: str, key: str | None) -> MapClient:
+    """A vehicle's line to a server; what it keeps lies in the user's cache."""
+    from mapvote.client import MapClient
+
+    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    return MapClient(url, key=key, home=cache / "mapvote")
+
+
+def map_of(name: str, key_file: Path | None, version: int | None = None) -> PointMap:
+    """The newest map of a store or a server, or one version of it; or a map in any file format."""
+    from mapvote.core.types import MapvoteError
+    from mapvote.formats import read_map
+
+    if is_url(name):
+        with client_of(name, key_in(key_file)) as client:
+            return client.fetch(version)
+    if is_store(name):
+        with opened_store(name) as store:
+            return store.point_map(version)
+    if version is not None:
+        raise MapvoteError(f"{name}: only a store or a server has versions")
+    return read_map(name)
+
+
+def overview_of(name: str, key_file: Path | None) -> list[tuple[str, str]] | None:
+    """What is in a store or behind a server, as rows; None if this is neither."""
+    from datetime import UTC, datetime
+
+    if is_url(name):
+        with server_at(name, key_file) as server:
+            found = server.ask_json("GET", "/v1/info")
+    elif is_store(name):
+        from mapvote.server.insight.overview import overview
+
+        with opened_store(name) as store:
+            found = overview(store)
+    else:
+        return None
+    published = datetime.fromtimestamp(found.pop("published_ns") // 10**9, UTC).strftime("%Y-%m-%d %H:%M:%SZ")
+    rows = [(key.replace("_", " "), f"{value:,}" if isinstance(value, int) else value) for key, value in found.items()]
+    return [*rows, ("published", published)]

@@ -1,0 +1,63 @@
+"""What operators ask about the store itself: its policy, its log, whether it is whole."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import Annotated, Any
+
+from anyio import to_thread
+from fastapi import APIRouter, Query, Request, Response
+from pydantic import BaseModel, ConfigDict, Field
+
+from mapvote.server.http.auth import operator, reviewer
+from mapvote.server.http.schemas import PLAIN, as_json, problems
+from mapvote.server.http.services import services
+from mapvote.server.insight.overview import log_of, overview
+from mapvote.server.store.check import check
+from mapvote.server.store.policy import policy_told, set_values
+
+router = APIRouter()
+
+
+class PolicyAsk(BaseModel):
+    """What to change of the policy."""
+
+    model_config = ConfigDict(extra="forbid")
+    values: dict[str, str | int | float | bool] = Field(max_length=100, description="by section.key: fuse.min_votes")
+    reason: str = Field(default="", max_length=200, pattern=PLAIN)
+
+
+@router.get("/v1/policy", response_model=dict[str, Any], responses=problems(), summary="What decides")
+def policy(request: Request) -> Response:
+    """The policy that holds, who set it and why."""
+    return as_json(policy_told(services(request).store))
+
+
+@router.patch("/v1/policy", response_model=dict[str, Any], responses=problems(403), summary="Decide otherwise")
+def change_policy(request: Request, ask: PolicyAsk) -> Response:
+    """Holds at once. 422 naming the value that cannot be, or the key that does not exist."""
+    by, store = operator(request), services(request).store
+    set_values(store, ask.values, by=by, reason=ask.reason)
+    return as_json(policy_told(store))
+
+
+@router.get("/v1/info", response_model=dict[str, Any], responses=problems(), summary="What is in the store")
+def info(request: Request) -> Response:
+    """The map, its newest version, and how much there is of everything."""
+    return as_json(overview(services(request).store))
+
+
+@router.get("/v1/log", response_model=dict[str, Any], responses=problems(403), summary="What happened")
+def log(request: Request, events: Annotated[int, Query(ge=0, le=10_000)] = 0) -> Response:
+    """Every version, and the last so many events."""
+    reviewer(request)
+    return as_json(log_of(services(request).store, events))
+
+
+@router.get("/v1/check", response_model=dict[str, Any], responses=problems(403), summary="Is every byte as written?")
+async def whole(request: Request) -> Response:
+    """Reads the whole store; what is damaged is named, nothing is changed."""
+    operator(request)
+    parts = services(request)
+    found = await to_thread.run_sync(check, parts.store, limiter=parts.threads.publishing)
+    return as_json({"damage": [asdict(damage) for damage in found]})
