@@ -71,7 +71,7 @@ def explain(
     for v in told["votes"]:
         heard = ", ".join(str(number) for number in v["heard"])
         counts = "counts" if v["counts"] else v["why"]
-        ended = v["end"] if "end" in v else when(v["end_ns"])
+        ended = v["end"][:19].replace("T", " ") + "Z" if "end" in v else when(v["end_ns"])
         rows.append((v["vehicle"], v["drive"], ended, str(v["version"]), v["state"], heard, counts))
     print_table(("vehicle", "drive", "ended", "drove with", "says", "heard in", "now"), rows)
 

@@ -1,0 +1,101 @@
+"""Every verb that takes a STORE takes the URL of its server, and says the same."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from hand_made import Say, make_ballot, make_map, make_tile, states_plane, wall
+from live_server import serving
+from mapvote.cli import app
+from mapvote.codec.ballot import encode
+from mapvote.config import FuseSettings
+from mapvote.core.types import CellState
+from mapvote.server.store.admission import accept, examine
+from mapvote.server.store.policy import Policy
+from mapvote.server.store.store import Store
+
+WALL = [(10, 10), (10, 11), (10, 12)]
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, str]]:
+    """A store and the server that keeps it: three tiles, two vehicles that say that a wall of the last is gone."""
+    home = tmp_path_factory.mktemp("site")
+    tiles = {(0, c): make_tile(wall(WALL, [0.05, 0.45 + 0.01 * c]), 0.0, (0, c)) for c in range(3)}
+    policy = Policy(fuse=FuseSettings(max_deleted_share=1.0))
+    store = Store.create(f"sqlite:///{home / 's.db'}", make_map(tiles), policy)
+    for vehicle in ("a", "b"):
+        say = Say(states_plane(dict.fromkeys(WALL, CellState.CHANGED_EMPTY)))
+        accept(store, [examine(encode(make_ballot(store.point_map(), {(0, 2): say}, vehicle)))])
+    store.close()
+    with serving(home / "s.db", log=home / "log") as (url, _):
+        yield str(home / "s.db"), url
+
+
+def say(*words: object) -> str:
+    result = CliRunner().invoke(app, [str(word) for word in words], env={"COLUMNS": "160", "NO_COLOR": "1"})
+    assert result.exit_code == 0, result.output + str(result.exception)
+    return result.output
+
+
+def both(site: tuple[str, str], verb: str, *words: object) -> str:
+    """What a verb says of the store; of the server it says the same."""
+    said = say(verb, site[0], *words)
+    assert say(verb, site[1], *words) == said
+    return said
+
+
+def test_a_server_is_looked_at_run_and_exported_like_its_store(site: tuple[str, str], tmp_path: Path) -> None:
+    assert "fuse.min_votes=2" in both(site, "policy")
+    say("policy", site[1], "fuse.latest_vehicles=7", "--reason", "few")
+    assert "by operator: few" in both(site, "policy").splitlines()[0]
+    assert "(dry run): 0 points added, 3 deleted in tiles 0,2" in both(site, "publish", "--dry-run")
+    assert "version 2 (published)" in say("publish", site[1], "--reason", "gone")
+    assert "gone" in both(site, "log", "--events", 5)
+    told = both(site, "explain", (2 * 256 + 11.5) * 0.3, 10.5 * 0.3)
+    assert "version 2 decided changed_empty" in told
+    assert "spent: version 2 has changed the cell since" in told
+    assert "every plane, ballot and version is what it was" in both(site, "check")
+    assert re.search(r"ballots +│ 2 ", both(site, "info"))
+    found = json.loads(both(site, "changes", "--metres"))
+    assert [f["properties"]["kind"] for f in found["features"]] == ["demolished"]
+    out = [tmp_path / "store", tmp_path / "server"]
+    for source, folder in zip(site, out, strict=True):
+        assert "3 Autoware tiles, 3 written" in say("export", source, folder)
+    names = [sorted(file.name for file in (folder / "pointcloud_map.pcd").iterdir()) for folder in out]
+    assert names[0] == names[1]
+
+
+def test_only_tiles_that_changed_since_a_version_are_written(site: tuple[str, str], tmp_path: Path) -> None:
+    """Laid over the folder of that version they make the new one."""
+    store = Store.open(f"sqlite:///{site[0]}")
+    assert store.current() == 2
+    store.close()
+    assert "3 Autoware tiles, 1 written" in say("export", site[1], tmp_path / "delta", "--since", 1)
+    say("export", site[0], tmp_path / "old", "--version", 1)
+    say("export", site[0], tmp_path / "new")
+    old, new, delta = (
+        {f.name for f in (tmp_path / n / "pointcloud_map.pcd").iterdir()} for n in ("old", "new", "delta")
+    )
+    assert delta == new - old
+    assert len(delta) == 1
+
+
+@pytest.mark.parametrize(
+    ("words", "why"),
+    [
+        (["check", "http://localhost:1", "--mend"], "take a STORE"),
+        (["publish", "http://localhost:1", "--cluster", "tcp://x"], "the server has its own"),
+        (["changes", "http://localhost:1", "--html", "x.html"], "is made from a STORE"),
+    ],
+)
+def test_what_only_the_machine_of_the_store_can_do_is_said(words: list[str], why: str) -> None:
+    result = CliRunner().invoke(app, words)
+    assert result.exit_code == 1
+    assert why in str(result.exception)
