@@ -67,7 +67,7 @@ def test_a_server_is_looked_at_run_and_exported_like_its_store(site: tuple[str, 
     assert [f["properties"]["kind"] for f in found["features"]] == ["demolished"]
     out = [tmp_path / "store", tmp_path / "server"]
     for source, folder in zip(site, out, strict=True):
-        assert "3 Autoware tiles, 3 written" in say("export", source, folder)
+        assert "4 Autoware tiles, 4 written" in say("export", source, folder)
     names = [sorted(file.name for file in (folder / "pointcloud_map.pcd").iterdir()) for folder in out]
     assert names[0] == names[1]
 
@@ -77,7 +77,7 @@ def test_only_tiles_that_changed_since_a_version_are_written(site: tuple[str, st
     store = Store.open(f"sqlite:///{site[0]}")
     assert store.current() == 2
     store.close()
-    assert "3 Autoware tiles, 1 written" in say("export", site[1], tmp_path / "delta", "--since", 1)
+    assert "4 Autoware tiles, 1 written" in say("export", site[1], tmp_path / "delta", "--since", 1)
     say("export", site[0], tmp_path / "old", "--version", 1)
     say("export", site[0], tmp_path / "new")
     old, new, delta = (

@@ -30,7 +30,7 @@ from mapvote.server.store.eligible_votes import (
     standing_tiles,
 )
 from mapvote.server.store.policy import policy_in, recorded
-from mapvote.server.store.queries import current_version, load_tile, tile_as_of, tiles_of, version_of
+from mapvote.server.store.queries import current_version, load_tile, tile_as_of, tiles_of, tiles_set_between, version_of
 from mapvote.server.store.store import Store
 from mapvote.server.store.tile_jobs import unpack_tally_plane
 
@@ -43,7 +43,8 @@ def changes_between(store: Store, old: int, new: int, min_cells: int = 1, *, lon
     with store.database.reading() as connection:
         for number in (old, new):
             version_of(connection, number)
-        before, after = tiles_of(connection, old), tiles_of(connection, new)
+        touched = tiles_set_between(connection, min(old, new), max(old, new))
+        before, after = tiles_of(connection, old, touched), tiles_of(connection, new, touched)
         found = []
         for index in sorted(before.keys() | after.keys()):
             pair = before.get(index), after.get(index)

@@ -20,7 +20,15 @@ from mapvote.server.store import keys, schema
 from mapvote.server.store.ballots import Incoming, Receipt, put_in, unlike
 from mapvote.server.store.blobs import TileHashes
 from mapvote.server.store.policy import policy_in
-from mapvote.server.store.queries import current_number, load_memory, memory_of, names, tile_of, tiles_of
+from mapvote.server.store.queries import (
+    current_number,
+    load_memory,
+    memory_of,
+    names,
+    tile_of,
+    tiles_of,
+    tiles_set_between,
+)
 from mapvote.server.store.quotas import Quota, Quotas
 from mapvote.server.store.reach import LowestGround, refuse_out_of_height, refuse_out_of_reach
 from mapvote.server.store.store import Store
@@ -128,8 +136,7 @@ class Intake:
         still counts; MapvoteError for one from the future or from where its vehicle cannot have been, TooMany for more
         than its vehicle's quota."""
         newest = current_number(connection)
-        if newest != self._current[0]:
-            self._current = newest, tiles_of(connection, newest)
+        self._current = newest, _brought_up(connection, newest, *self._current)
         asked, repeated = policy_in(connection).round, _standing(connection, ballots)
         return [
             None
@@ -182,6 +189,20 @@ class Intake:
         b = schema.ballots
         mine = (b.c.vehicle == ballot.vehicle) & (b.c.drive == ballot.drive)
         return connection.execute(sa.select(sa.func.min(b.c.first_seq)).where(mine)).scalar_one()
+
+
+def _brought_up(
+    connection: sa.Connection, number: int, known: int, tiles: Mapping[TileIndex, TileHashes]
+) -> Mapping[TileIndex, TileHashes]:
+    """The tiles of a version, of those of an older one (0: none) and what was set since."""
+    if number == known:
+        return tiles
+    if known == 0:
+        return tiles_of(connection, number)
+    touched = tiles_set_between(connection, known, number)
+    changed = set(touched)
+    kept = {index: hashes for index, hashes in tiles.items() if index not in changed}
+    return kept | tiles_of(connection, number, touched)
 
 
 def accept(store: Store, ballots: Sequence[Incoming]) -> list[Receipt | Exception]:

@@ -107,9 +107,12 @@ def standing_tiles(connection: sa.Connection, mark: int, since: int | None = Non
     """Tiles that standing ballots vote on, ascending; with ``since``, those where a ballot or a review came or went
     after it."""
     b, t = schema.ballots, schema.ballot_tiles
-    wanted = _stands_at(mark) if since is None else (b.c.seq <= mark) & ((b.c.seq > since) | (b.c.gone_seq > since))
-    tiles = sa.select(t.c.row, t.c.col).distinct().join(b, b.c.seq == t.c.ballot).where(wanted)
-    found = {(row.row, row.col) for row in connection.execute(tiles)}
+    if since is None:
+        queries = [sa.select(t.c.row, t.c.col).distinct().join(b, b.c.seq == t.c.ballot).where(_stands_at(mark))]
+    else:  # asked apart, each is answered by an index of its own
+        lately = (b.c.seq > since) & (b.c.seq <= mark), (b.c.gone_seq > since) & (b.c.seq <= mark)
+        queries = [sa.select(t.c.row, t.c.col).where(t.c.ballot.in_(sa.select(b.c.seq).where(some))) for some in lately]
+    found = {(row.row, row.col) for query in queries for row in connection.execute(query)}
     if since is not None:
         w, c = schema.reviews, schema.review_cells
         lately = (w.c.seq <= mark) & ((w.c.seq > since) | (w.c.gone_seq > since))

@@ -89,6 +89,13 @@ def tiles_set_by(connection: sa.Connection, number: int) -> list[TileIndex]:
     return [(row.row, row.col) for row in connection.execute(sa.select(t.c.row, t.c.col).where(t.c.version == number))]
 
 
+def tiles_set_between(connection: sa.Connection, old: int, new: int) -> list[TileIndex]:
+    """The tiles that versions after ``old`` up to ``new`` set, ascending: all others are the same in both."""
+    t = schema.version_tiles
+    found = sa.select(t.c.row, t.c.col).distinct().where(t.c.version > old, t.c.version <= new)
+    return sorted((row.row, row.col) for row in connection.execute(found))
+
+
 def load_tile(connection: sa.Connection, window: Grid, hashes: TileHashes | None) -> Tile:
     """The tile over ``window`` by its hashes; the empty one where there are none."""
     if hashes is None:

@@ -120,6 +120,7 @@ ballots = sa.Table(
     sa.Column("bytes", sa.BigInteger, nullable=False),
     sa.Column("version", sa.Integer, nullable=False),
     sa.Index("ix_ballots_drive", "vehicle", "drive"),
+    sa.Index("ix_ballots_gone_seq", "gone_seq"),
 )
 """``cast_by``: method and stage; ``bytes``: how large the ballot was when it came; ``version``: of
 the map that the vehicle drove with.

@@ -39,6 +39,7 @@ from mapvote.server.store.queries import (
     log_event,
     tile_of,
     tiles_of,
+    tiles_set_between,
     version_of,
 )
 
@@ -60,11 +61,12 @@ class Manifest:
     """With ``since``: tiles that the older version had and this one has not."""
 
 
-def digest_of(tiles: Mapping[TileIndex, TileHashes]) -> str:
-    """SHA-256 over a line for each tile in ascending order: row, column and its planes' hashes, "-" for none. Who keeps
-    a manifest up to date by what changed can tell whether it still is the server's."""
-    lines = (f"{r} {c} {h.points} {h.ground} {h.free or '-'}\n" for (r, c), h in sorted(tiles.items()))
-    return hashlib.sha256("".join(lines).encode()).hexdigest()
+def digest_of(tiles: Mapping[TileIndex, TileHashes]) -> int:
+    """The sum, modulo 2^256, of a SHA-256 for each tile: of its row, column and planes' hashes, "-" for none. Who keeps
+    a manifest up to date by what changed can tell whether it still is the server's; so can the server, at little cost.
+    """
+    lines = (f"{r} {c} {h.points} {h.ground} {h.free or '-'}" for (r, c), h in tiles.items())
+    return sum(int.from_bytes(hashlib.sha256(line.encode()).digest()) for line in lines) % (1 << 256)
 
 
 def url_of(store: str) -> str:
@@ -102,6 +104,7 @@ class Store:
         self.lattice = Lattice(row.x0, row.y0)
         self.georeference: Mapping[str, str] = row.georeference
         self.surveyed_ns: int | None = row.surveyed_ns
+        self._digests: dict[int, int] = {}
 
     @classmethod
     def create(
@@ -178,14 +181,33 @@ class Store:
             version_of(connection, number)
             if since is not None:
                 version_of(connection, since, cleared=True)
-            tiles = tiles_of(connection, number)
-            digest = digest_of(tiles)
-            removed: list[TileIndex] = []
-            if since is not None:
-                old = tiles_of(connection, since)
-                removed = sorted(old.keys() - tiles.keys())
-                tiles = {index: hashes for index, hashes in tiles.items() if old.get(index) != hashes}
-        return Manifest(number, self.map_id, self.lattice, self.georeference, tiles, digest, removed)
+            if since is None:
+                tiles, removed = tiles_of(connection, number), []
+                self._digests[number] = digest_of(tiles)
+            else:
+                tiles, removed = self._changed(connection, since, number)
+            digest = self._digest(connection, number)
+        return Manifest(number, self.map_id, self.lattice, self.georeference, tiles, f"{digest:064x}", removed)
+
+    def _changed(
+        self, connection: sa.Connection, since: int, number: int
+    ) -> tuple[dict[TileIndex, TileHashes], list[TileIndex]]:
+        """(tiles of ``number`` that are otherwise than in ``since``, tiles that only ``since`` has)."""
+        touched = tiles_set_between(connection, min(since, number), max(since, number))
+        then, now = tiles_of(connection, since, touched), tiles_of(connection, number, touched)
+        changed = {index: hashes for index, hashes in now.items() if then.get(index) != hashes}
+        return changed, sorted(then.keys() - now.keys())
+
+    def _digest(self, connection: sa.Connection, number: int) -> int:
+        """Of a version: what is known of the last one before it, and what changed since."""
+        before = max((known for known in self._digests if known <= number), default=None)
+        if before is None:
+            self._digests[number] = digest_of(tiles_of(connection, number))
+        elif before < number:
+            touched = tiles_set_between(connection, before, number)
+            then, now = (digest_of(tiles_of(connection, version, touched)) for version in (before, number))
+            self._digests[number] = (self._digests[before] - then + now) % (1 << 256)
+        return self._digests[number]
 
     def blob(self, digest: str) -> bytes:
         """One plane of a tile, a zstd frame; NotFound if no version ever held it."""

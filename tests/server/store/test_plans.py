@@ -1,0 +1,104 @@
+"""However large a store grows: what is asked often reads by an index what it needs, and nothing else."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import sqlalchemy as sa
+
+from hand_made import Say, make_ballot, states_plane, two_walls
+from mapvote.codec.ballot import encode
+from mapvote.config import FuseSettings
+from mapvote.core.types import CellState
+from mapvote.server.insight.history import changes_between
+from mapvote.server.store.admission import Intake, examine
+from mapvote.server.store.policy import Policy
+from mapvote.server.store.publish import publish
+from mapvote.server.store.store import Store
+
+LARGE = ("ballots", "ballot_tiles", "version_tiles", "blobs", "decisions", "events")
+"""Tables that grow with the fleet, the map and time."""
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Iterator[Store]:
+    """A publish has been, and one tile has new votes."""
+    store = Store.create(
+        f"sqlite:///{tmp_path / 's.db'}", two_walls(), Policy(fuse=FuseSettings(max_deleted_share=1.0))
+    )
+    intake = Intake(store)
+    vote(store, intake, "d1", (10, 10))
+    assert publish(store).published
+    vote(store, intake, "d2", (10, 11))
+    yield store
+    store.close()
+
+
+def vote(store: Store, intake: Intake, drive: str, cell: tuple[int, int], vehicles: str = "ab") -> None:
+    say = Say(states_plane({cell: CellState.CHANGED_EMPTY}))
+    base = store.point_map()
+    ballots = [examine(encode(make_ballot(base, {(0, 0): say}, vehicle, drive))) for vehicle in vehicles]
+    assert not [answer for answer in intake.accept(ballots) if isinstance(answer, Exception)]
+
+
+def scans(store: Store, act: Callable[[], object]) -> list[str]:
+    """The plan of every statement that reads the whole of a large table, by the database's own account."""
+    found: list[str] = []
+
+    def explain(_: Any, cursor: Any, statement: str, parameters: Any, *__: Any) -> None:
+        if not statement.lstrip().upper().startswith(("SELECT", "UPDATE", "DELETE")):
+            return
+        asked = cursor.connection.cursor()
+        plan = asked.execute(f"EXPLAIN QUERY PLAN {statement}", parameters).fetchall()
+        found.extend(f"{row[3]}: {statement[:200]}" for row in plan if reads_all(row[3]))
+
+    sa.event.listen(store.database.engine, "before_cursor_execute", explain)
+    try:
+        act()
+    finally:
+        sa.event.remove(store.database.engine, "before_cursor_execute", explain)
+    return found
+
+
+def reads_all(step: str) -> bool:
+    """SQLite calls it SCAN; where it reads an index from one end until it has enough (a newest one) it says so too."""
+    words = step.split()
+    return words[0] == "SCAN" and words[1] in LARGE
+
+
+def test_the_test_sees_a_scan(store: Store) -> None:
+    def count() -> None:
+        with store.database.reading() as connection:
+            connection.execute(sa.text("SELECT count(*) FROM ballots WHERE settings_hash = 'x'"))
+
+    assert len(scans(store, count)) == 1
+
+
+def test_a_publish_reads_what_changed(store: Store) -> None:
+    assert scans(store, lambda: publish(store)) == []
+
+
+def test_a_ballot_is_taken_in_without_reading_the_others(store: Store) -> None:
+    intake = Intake(store)
+    vote(store, intake, "d3", (10, 12))
+    publish(store)
+    base = {(0, 0): store.manifest().tiles[0, 0].points}
+    say = Say(states_plane({(10, 12): CellState.UNCHANGED_EMPTY}))
+    ballot = examine(encode(make_ballot(two_walls(), {(0, 0): say}, "c", "d4", base=base, version=store.current())))
+    answers: list[object] = []
+    assert scans(store, lambda: answers.extend(intake.accept([ballot]))) == []
+    assert not isinstance(answers[0], Exception), answers
+
+
+def test_what_changed_since_a_version_is_found_without_the_rest(store: Store) -> None:
+    store.manifest()
+    publish(store)
+    assert scans(store, lambda: store.manifest(since=1)) == []
+
+
+def test_changes_between_two_versions_read_what_they_changed(store: Store) -> None:
+    publish(store)
+    assert scans(store, lambda: changes_between(store, 1, store.current())) == []
