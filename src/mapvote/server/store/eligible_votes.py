@@ -111,12 +111,12 @@ def standing_tiles(connection: sa.Connection, mark: int, since: int | None = Non
         queries = [sa.select(t.c.row, t.c.col).distinct().join(b, b.c.seq == t.c.ballot).where(_stands_at(mark))]
     else:  # asked apart, each is answered by an index of its own
         lately = (b.c.seq > since) & (b.c.seq <= mark), (b.c.gone_seq > since) & (b.c.seq <= mark)
-        queries = [sa.select(t.c.row, t.c.col).where(t.c.ballot.in_(sa.select(b.c.seq).where(some))) for some in lately]
+        queries = [sa.select(t.c.row, t.c.col).where(t.c.ballot.in_(sa.select(b.c.seq).where(one))) for one in lately]
     found = {(row.row, row.col) for query in queries for row in connection.execute(query)}
     if since is not None:
         w, c = schema.reviews, schema.review_cells
-        lately = (w.c.seq <= mark) & ((w.c.seq > since) | (w.c.gone_seq > since))
-        reviewed = sa.select(c.c.row, c.c.col).distinct().join(w, w.c.seq == c.c.review).where(lately)
+        changed = (w.c.seq <= mark) & ((w.c.seq > since) | (w.c.gone_seq > since))
+        reviewed = sa.select(c.c.row, c.c.col).distinct().join(w, w.c.seq == c.c.review).where(changed)
         found |= {(row.row, row.col) for row in connection.execute(reviewed)}
     return sorted(found)
 

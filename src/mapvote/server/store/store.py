@@ -182,7 +182,7 @@ class Store:
             if since is not None:
                 version_of(connection, since, cleared=True)
             if since is None:
-                tiles, removed = tiles_of(connection, number), []
+                tiles, removed = tiles_of(connection, number), list[TileIndex]()
                 self._digests[number] = digest_of(tiles)
             else:
                 tiles, removed = self._changed(connection, since, number)
