@@ -36,7 +36,7 @@ import scipy.spatial  # noqa: E402, F401
 import sqlalchemy  # noqa: E402, F401
 
 from mutants_of_code import Mutant, mutants_of  # noqa: E402
-from mutation_results import COLUMNS, ROOT, Result, read_results, report, write_results  # noqa: E402
+from mutation_results import ROOT, Result, read_results, report, write_results  # noqa: E402
 from numba_caches import link_others  # noqa: E402
 
 TESTS = {
@@ -108,15 +108,10 @@ def try_module(module: str, share: int, seed: int, out: Path, until: float) -> N
     every = list(mutants_of(module, source))
     drawn = random.Random(f"{seed} {module}").sample(every, min(share, len(every)))
     of_source, of_tests = digest(ROOT / "src/mapvote" / module), digest(*(ROOT / "tests" / t for t in TESTS[module]))
-    known = {
-        (r.place, r.seed): r
-        for r in read_results(out)
-        if r.module == module and r.source == of_source and (r.outcome != "survived" or r.tests == of_tests)
-    }
-    waiting = [mutant for mutant in drawn if (mutant.place, seed) not in known]
-    # What is known of mutants that this seed never drew, or of other seeds, stays; what is out of date goes.
-    others = [r for r in read_results(out) if r.module != module or (r.source == of_source and r.seed != seed)]
-    write_results(out, [*others, *(known[m.place, seed] for m in drawn if (m.place, seed) in known)])
+    tried = {(r.seed, r.place): r for r in read_results(out) if r.module == module and r.source == of_source}
+    write_results(out, [*(r for r in read_results(out) if r.module != module), *tried.values()])
+    done = {r.place for r in tried.values() if r.seed == seed and (r.outcome != "survived" or r.tests == of_tests)}
+    waiting = [mutant for mutant in drawn if mutant.place not in done]
     if not waiting or time.monotonic() > until:
         return
     limit_s = 60.0 + 4.0 * unchanged(module)
@@ -124,9 +119,13 @@ def try_module(module: str, share: int, seed: int, out: Path, until: float) -> N
         if time.monotonic() > until:
             return
         outcome, seconds = try_mutant(mutant, limit_s)
-        result = Result(seed, module, mutant.place, mutant.line, mutant.change, outcome, seconds, of_source, of_tests)
-        print(*(getattr(result, column) for column in COLUMNS[1:7]), sep="  ", flush=True)
-        write_results(out, [*read_results(out), result])
+        before = tried.get((seed, mutant.place))
+        first = before.first if before else outcome
+        result = Result(
+            seed, module, mutant.place, mutant.line, mutant.change, outcome, first, seconds, of_source, of_tests
+        )
+        print(module, mutant.line, mutant.change, outcome, f"{seconds:.1f} s", sep="  ", flush=True)
+        write_results(out, [*(r for r in read_results(out) if r != before), result])
 
 
 def digest(*paths: Path) -> str:

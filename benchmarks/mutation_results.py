@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -23,6 +23,8 @@ class Result:
     change: str
     outcome: str
     """killed, crashed, hangs (all three noticed) or survived."""
+    first: str
+    """The same when it was first tried: before anybody had looked at the survivors, and written tests for them."""
     seconds: float
     source: str
     """Digest of the module."""
@@ -38,7 +40,7 @@ def read_results(path: Path) -> list[Result]:
         return []
     with path.open(newline="") as file:
         return [
-            Result(int(r["seed"]), r["module"], int(r["place"]), int(r["line"]), r["change"], r["outcome"],
+            Result(int(r["seed"]), r["module"], int(r["place"]), int(r["line"]), r["change"], r["outcome"], r["first"],
                    float(r["seconds"]), r["source"], r["tests"])
             for r in csv.DictReader(file)
         ]  # fmt: skip
@@ -57,30 +59,54 @@ def write_results(path: Path, results: Sequence[Result]) -> None:
 
 def report(results: Sequence[Result]) -> None:
     """Write docs/mutation.md."""
-    seeds = sorted({r.seed for r in results})
+    why = equal_mutants()
+    survivors = [r for r in results if r.outcome == "survived"]
+    rows = [
+        _row(f"`{name}`", [r for r in results if r.module == name], why) for name in dict.fromkeys(_modules(results))
+    ]
     lines = [
         "# Do the tests notice a changed operator?",
         "",
-        "Random one-operator mutants of the modules that decide, each held against the tests that name its module.",
-        "Written by `python benchmarks/mutation.py` from `results/mutation.csv`; do not edit.",
+        "Random one-operator mutants of the modules that decide, each held against the tests that name its module (an",
+        "operator, a small constant or a negation changed, `min` for `max`, `any` for `all`; as many of every module.",
+        "*At first* is before anybody had looked at the survivors; then tests were written that state what they break.",
+        "*Equal* ones no test can tell from the original; they count as not killed.",
         "",
-        "| module | " + " | ".join(f"seed {seed}: killed of" for seed in seeds) + " |",
-        "|---|" + "---|" * len(seeds),
+        f"Written from results/mutation.csv by `python benchmarks/mutation.py --seed {_seeds(results)}`; do not edit.",
+        "",
+        "| module | mutants | killed at first | killed now | of the others: equal |",
+        "|---|---|---|---|---|",
+        *rows,
+        _row("all", results, why),
+        "",
+        "## Survivors",
+        "",
+        "| module, line | change | equal, because |",
+        "|---|---|---|",
     ]
-    for module in [*sorted({r.module for r in results}), ""]:
-        counts = []
-        for seed in seeds:
-            mine = [r for r in results if r.seed == seed and module in (r.module, "")]
-            dead = sum(r.outcome != "survived" for r in mine)
-            counts.append(f"{dead} of {len(mine)} ({dead / len(mine):.0%})" if mine else "")
-        lines.append(f"| {f'`{module}`' if module else 'all'} | " + " | ".join(counts) + " |")
-    lines += ["", "## Survivors", "", "| seed | module, line | change | equal, because |", "|---|---|---|---|"]
-    why = equal_mutants()
-    for r in results:
-        if r.outcome == "survived":
-            change = f"`{r.change}`".replace("|", "\\|")
-            lines.append(f"| {r.seed} | `{r.module}` {r.line} | {change} | {why.get((r.module, r.change), '')} |")
+    for r in survivors:
+        change = f"`{r.change}`".replace("|", "\\|")
+        lines.append(f"| `{r.module}` {r.line} | {change} | {why.get((r.module, r.change), '')} |")
     (ROOT / "docs/mutation.md").write_text("\n".join(lines) + "\n")
+
+
+def _modules(results: Sequence[Result]) -> list[str]:
+    return sorted(r.module for r in results)
+
+
+def _seeds(results: Sequence[Result]) -> str:
+    return ", ".join(str(seed) for seed in sorted({r.seed for r in results}))
+
+
+def _row(name: str, mine: Sequence[Result], why: Mapping[tuple[str, str], str]) -> str:
+    first, now = (sum(outcome != "survived" for outcome in some) for some in ([r.first for r in mine], _now(mine)))
+    equal = sum((r.module, r.change) in why for r in mine if r.outcome == "survived")
+    n = max(len(mine), 1)
+    return f"| {name} | {len(mine)} | {first} ({first / n:.0%}) | {now} ({now / n:.0%}) | {equal or ''} |"
+
+
+def _now(mine: Sequence[Result]) -> list[str]:
+    return [r.outcome for r in mine]
 
 
 def equal_mutants() -> dict[tuple[str, str], str]:

@@ -105,6 +105,12 @@ def test_points_that_swap_their_heights_are_other_points() -> None:
     assert cells_of(differing(a, b)) == [list(CELL)]
 
 
+def test_a_point_in_the_very_corner_of_a_tile_at_height_zero_is_a_point() -> None:
+    """All its bits are zero, as those of nothing are."""
+    corner = make_tile(np.concatenate([TILE.points, np.zeros((1, 3), np.float32)]))
+    assert cells_of(differing(TILE, corner)) == [[0, 0]]
+
+
 @pytest.mark.parametrize(
     ("one", "other", "differ"),
     [

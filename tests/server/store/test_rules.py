@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -21,8 +22,10 @@ MakeStore = Callable[[Clock], Store]
 
 @pytest.fixture
 def sqlite_stores(tmp_path: Path) -> MakeStore:
-    names = iter(range(1_000))
-    return lambda clock: Store.create(f"sqlite:///{tmp_path / f'{next(names)}.db'}", two_walls(), clock=clock)
+    """New stores, each a copy of one that was made once."""
+    first, names = tmp_path / "first.db", iter(range(1_000))
+    Store.create(f"sqlite:///{first}", two_walls(), clock=Clock()).close()
+    return lambda clock: Store.open(f"sqlite:///{shutil.copy(first, tmp_path / f'{next(names)}.db')}", clock=clock)
 
 
 def disagreements(make: MakeStore, seeds: range, steps: int = 25) -> list[str]:
