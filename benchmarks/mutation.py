@@ -80,6 +80,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--only", nargs="+", choices=list(TESTS), default=list(TESTS), metavar="MODULE")
     parser.add_argument("--minutes", type=float, default=1e9, help="stop after this long; the next run goes on")
+    parser.add_argument("--at-most", type=int, default=1_000_000, metavar="N", help="new ones of each module")
     parser.add_argument("--out", type=Path, default=ROOT / "results/mutation.csv")
     parser.add_argument("--report", action="store_true", help="only write docs/mutation.md from the results")
     arguments = parser.parse_args()
@@ -88,7 +89,7 @@ def main() -> None:
         copy_house()
         for module in arguments.only:
             share = -(-arguments.mutants // len(TESTS))
-            try_module(module, share, arguments.seed, arguments.out, until)
+            try_module(module, share, arguments.seed, arguments.out, until, arguments.at_most)
     if arguments.out == ROOT / "results/mutation.csv":
         report(read_results(arguments.out))
 
@@ -102,7 +103,7 @@ def copy_house() -> None:
     (HOUSE / "tests" / "quick_hypothesis.py").write_text(QUICK)
 
 
-def try_module(module: str, share: int, seed: int, out: Path, until: float) -> None:
+def try_module(module: str, share: int, seed: int, out: Path, until: float, at_most: int) -> None:
     """Run what is still to be run of a module's mutants."""
     source = (ROOT / "src/mapvote" / module).read_text()
     every = list(mutants_of(module, source))
@@ -111,7 +112,7 @@ def try_module(module: str, share: int, seed: int, out: Path, until: float) -> N
     tried = {(r.seed, r.place): r for r in read_results(out) if r.module == module and r.source == of_source}
     write_results(out, [*(r for r in read_results(out) if r.module != module), *tried.values()])
     done = {r.place for r in tried.values() if r.seed == seed and (r.outcome != "survived" or r.tests == of_tests)}
-    waiting = [mutant for mutant in drawn if mutant.place not in done]
+    waiting = [mutant for mutant in drawn if mutant.place not in done][:at_most]
     if not waiting or time.monotonic() > until:
         return
     limit_s = 60.0 + 4.0 * unchanged(module)
@@ -142,11 +143,11 @@ def common_cache() -> Path:
 
 
 def unchanged(module: str) -> float:
-    """Seconds that the module's tests take as it is, and pass; everything is compiled afterwards."""
-    done, _ = run_tests(module, common_cache(), 900.0)
+    """Seconds that the module's tests take as it is, and pass; every kernel is compiled afterwards."""
+    done, seconds = run_tests(module, common_cache(), 900.0)
     if done != "survived":
         raise SystemExit(f"{module}: its tests do not pass ({done}); see {HOUSE / 'last-run.txt'}")
-    return run_tests(module, common_cache(), 900.0)[1]
+    return seconds
 
 
 def try_mutant(mutant: Mutant, limit_s: float) -> tuple[str, float]:

@@ -9,16 +9,19 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from hand_made import make_map, make_tile, wall
 from mapvote.config import PaperSettings, VotingSettings
 from mapvote.core.columns import below_top, span_of
 from mapvote.core.geometry import from_xyz_rpy
-from mapvote.core.grid import Grid, Lattice
+from mapvote.core.grid import CELL_SIZE, Grid, Lattice, window_around
+from mapvote.core.reference import reference_window
 from mapvote.core.sensors import SENSORS
-from mapvote.core.types import NO_VOTE, CellState, Reference
+from mapvote.core.types import NO_VOTE, U64, CellState, Reference
 from mapvote.core.voting import VOTE_UNIT, vote_weight
-from mapvote.detection.paper import classify_paper, reading_table
+from mapvote.detection.paper import PaperVoter, classify_paper, reading_table
 from mapvote.detection.sightings import BEGINS_ABOVE, WORDS, encode
-from mapvote.perception.raycast import ScanView, Sight
+from mapvote.perception.frontend import Observation, PlacedScan
+from mapvote.perception.raycast import ScanView, Sight, cast_rays, find_obstacles
 
 ORIGIN = np.array([0.15, 0.15, 1.8])
 SENSOR = SENSORS["hdl32e"]
@@ -169,3 +172,45 @@ def test_whatever_is_read_n_min_points_make_a_cell_occupied_and_the_map_says_cha
     assert not np.isin(states[1], (CellState.CHANGED_OCCUPIED, CellState.UNCHANGED_EMPTY)).any()
     assert weights[n < n_min].max() == VOTE_UNIT
     assert weights[n >= n_min].min() == 2 * VOTE_UNIT
+
+
+def seen_twice() -> tuple[PaperVoter, U64]:
+    """Two scans of a street over two tiles: a wall of the map is struck eight times, and so is a new thing."""
+    tiles = {(0, 0): make_tile(wall([(10, 250)], [0.75, 1.05])), (0, 1): make_tile(wall([], []), index=(0, 1))}
+    point_map = make_map(tiles)
+    origin = np.array([254.5, 20.5, 6.0]) * CELL_SIZE
+    reference = reference_window(point_map, window_around(point_map.lattice, origin[0], origin[1], 24.0))
+    heights = np.linspace(0.65, 1.15, 8)
+    cells = np.array([[250.5, 10.5], [258.5, 10.5]]) * CELL_SIZE
+    points = np.concatenate([np.column_stack([np.tile(cell, (8, 1)), heights]) for cell in cells])
+    obstacle, cell = find_obstacles(points, reference)
+    moving = np.zeros(len(points), dtype=np.bool_)
+    view = cast_rays(points, origin, obstacle, moving, reference)
+    placed = PlacedScan(0, points, origin, 0.01, reference, reference, obstacle, cell)
+    voter = PaperVoter(VotingSettings(), PaperSettings(), SENSOR, point_map)
+    for _ in range(2):
+        may_be_new = voter.observe(Observation(placed, moving, view, reference))
+    return voter, may_be_new
+
+
+def test_a_drive_s_votes_are_the_sums_of_its_scans_tile_by_tile() -> None:
+    voter, may_be_new = seen_twice()
+    votes = voter.votes()
+    assert list(votes) == [(-1, 0), (-1, 1), (0, 0), (0, 1)], "and where it saw nothing it says so"
+    left, right = votes[0, 0], votes[0, 1]
+    twice = 2 * round(float(vote_weight(8)) * VOTE_UNIT)
+    assert left.tally[10, 250].tolist() == [twice, 0, 0, 0, 0]
+    assert right.tally[10, 2].tolist() == [0, 0, twice, 0, 0]
+    assert left.states[10, 250] == CellState.UNCHANGED_OCCUPIED
+    assert right.states[10, 2] == CellState.CHANGED_OCCUPIED
+    assert np.argwhere(right.new).tolist() == [[10, 2]], "its points are new whatever their height"
+    assert right.new[10, 2] == ~np.uint64(0)
+    assert not left.new.any()
+    assert np.count_nonzero(may_be_new) == 1
+    assert (left.gone, left.remnants, left.free) == (None, None, None), "the paper's vote is of whole cells"
+
+
+def test_asking_for_votes_changes_none_and_before_any_scan_there_are_none() -> None:
+    voter, _ = seen_twice()
+    assert voter.votes()[0, 1].tally.tobytes() == voter.votes()[0, 1].tally.tobytes()
+    assert PaperVoter(VotingSettings(), PaperSettings(), SENSOR, make_map({})).votes() == {}

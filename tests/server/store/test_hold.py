@@ -92,6 +92,10 @@ def test_nothing_has_no_areas() -> None:
     assert len(areas_m2(*lattice_cells([]))) == 0
 
 
+def test_a_single_cell_is_a_thing() -> None:
+    assert areas_m2(*lattice_cells([(fused(), cells((255, 255)))])).tolist() == pytest.approx([0.09])
+
+
 @given(st.integers(0, 2**32 - 1), st.floats(0.05, 0.6), st.integers(-300, 300))
 def test_things_are_the_8_connected_components_wherever_they_lie(seed: int, share: float, shift: int) -> None:
     picture = np.random.default_rng(seed).random((9, 11)) < share

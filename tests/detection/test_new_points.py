@@ -1,0 +1,78 @@
+"""New points of a drive: one to a voxel, of what stands still, near enough, and where the map holds nothing."""
+
+from __future__ import annotations
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from mapvote.core.grid import CELL_SIZE, Lattice
+from mapvote.core.types import F64
+from mapvote.detection.new_points import NewPoints, points_in, select
+
+LATTICE = Lattice()
+
+
+@settings(max_examples=10)
+@given(st.integers(0, 2**32 - 1))
+def test_points_are_taken_from_the_voxels_of_a_word_and_of_what_stands_still(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    points = rng.uniform(-3.0, 25.0, (60, 3))
+    cell = rng.integers(-1, 4, 60).astype(np.int32)
+    stationary = rng.random(60) < 0.7
+    words = rng.integers(0, 2**63, 4).astype(np.uint64)
+    words[0] = 0
+    base = rng.integers(-5, 5, 4).astype(np.int32)
+    found = select(points, cell, stationary, words, base)
+    for i in range(60):
+        if cell[i] < 0 or not stationary[i]:
+            assert not found[i]
+            continue
+        bit = min(max(int(np.floor(points[i, 2] / CELL_SIZE)) - int(base[cell[i]]), 0), 63)
+        assert found[i] == bool(int(words[cell[i]]) >> bit & 1)
+
+
+def voxels(points: F64) -> set[tuple[int, int, int]]:
+    return {tuple(voxel) for voxel in np.floor(points / CELL_SIZE).astype(int).tolist()}
+
+
+@settings(max_examples=5)
+@given(st.integers(0, 2**32 - 1))
+def test_of_each_voxel_the_first_point_that_was_offered_is_kept(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    offered = [rng.uniform((-1.0, -1.0, 1.0), (1.0, 1.0, 3.0), (20, 3)) for _ in range(4)]
+    new = NewPoints(LATTICE)
+    for points in offered:
+        new.offer(points)
+    kept = np.concatenate(list(new.by_tile().values()))
+    everything = np.concatenate(offered)
+    assert len(kept) == len(voxels(kept)) == len(voxels(everything))
+    for point in kept:
+        same = [p for p in everything if voxels(p[None]) == voxels(point[None])]
+        assert point.tobytes() == same[0].tobytes()
+
+
+def test_points_come_back_by_tile_in_ascending_order_and_asking_twice_changes_nothing() -> None:
+    new = NewPoints(LATTICE)
+    new.offer(np.array([[80.0, 1.0, 1.0], [1.0, 1.0, 2.0], [1.0, 1.0, 1.0], [-1.0, 1.0, 1.0]]))
+    new.offer(np.zeros((0, 3)))
+    first = new.by_tile()
+    assert list(first) == [(0, -1), (0, 0), (0, 1)]
+    assert first[0, 0][:, 2].tolist() == [1.0, 2.0]
+    again = new.by_tile()
+    assert all(again[tile].tobytes() == first[tile].tobytes() for tile in first)
+
+
+def test_a_drive_without_new_points_has_no_tiles() -> None:
+    assert NewPoints(LATTICE).by_tile() == {}
+
+
+def test_points_of_a_tile_are_cut_to_a_word_and_told_from_its_corner() -> None:
+    window = LATTICE.tile((1, 2))
+    words, base = np.zeros(window.shape, np.uint64), np.zeros(window.shape, np.int32)
+    words[3, 4] = 0b100
+    inside = [2 * 76.8 + 4.5 * CELL_SIZE, 76.8 + 3.5 * CELL_SIZE]
+    points = np.array([[*inside, 0.75], [*inside, 1.05], [inside[0] + 0.3, inside[1], 0.75]])
+    found = points_in(window, points, words, base)
+    assert found.dtype == np.float32
+    np.testing.assert_allclose(found, [[1.35, 1.05, 0.75]], atol=1e-5)

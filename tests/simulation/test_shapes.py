@@ -1,0 +1,182 @@
+"""What the street is made of: solids by their measures, foliage that lets rays pass, the ground and its mesh."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from mapvote.core.types import F64
+from mapvote.simulation import buildings, furniture, shapes
+from mapvote.simulation.scenario import load_scenario
+from mapvote.simulation.terrain import KERB_HEIGHT_M, KERB_M, make_terrain
+
+sizes = st.floats(0.2, 5.0)
+few = settings(max_examples=20)
+
+
+def area(triangles: F64) -> float:
+    edges = triangles[:, 1:] - triangles[:, :1]
+    return float(0.5 * np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1).sum())
+
+
+def volume(triangles: F64) -> float:
+    """By the divergence theorem: right only of a closed surface whose faces all look outwards, or all inwards."""
+    return abs(float(np.einsum("ij,ij->", triangles[:, 0], np.cross(triangles[:, 1], triangles[:, 2])) / 6.0))
+
+
+def bounds(triangles: F64) -> list[tuple[float, float]]:
+    flat = triangles.reshape(-1, 3)
+    return [(round(float(a), 6), round(float(b), 6)) for a, b in zip(flat.min(axis=0), flat.max(axis=0), strict=True)]
+
+
+@few
+@given(sizes, sizes, sizes, st.floats(-20, 20))
+def test_a_box_is_closed_and_has_the_area_and_volume_of_a_box(x: float, y: float, z: float, at: float) -> None:
+    solid = shapes.box(at, at + x, -at, -at + y, 1.0, 1.0 + z)
+    assert solid.shape == (12, 3, 3)
+    assert area(solid) == pytest.approx(2 * (x * y + y * z + z * x))
+    assert volume(solid) == pytest.approx(x * y * z, rel=1e-6)
+
+
+@few
+@given(st.integers(3, 20), sizes, sizes)
+def test_a_cylinder_is_a_prism_of_so_many_sides_open_below(sides: int, radius: float, height: float) -> None:
+    solid = shapes.cylinder(radius, 0.0, height, sides)
+    polygon = 0.5 * sides * radius**2 * np.sin(2 * np.pi / sides)
+    around = sides * 2 * radius * np.sin(np.pi / sides) * height
+    assert area(solid) == pytest.approx(polygon + around)
+    assert volume(solid) == pytest.approx(polygon * height), "the open foot lies at height zero and adds nothing"
+
+
+def test_a_taper_is_a_frustum() -> None:
+    solid = shapes.taper((0, 4, 0, 4, 0), (1, 3, 1, 3, 3))
+    assert volume(solid) == pytest.approx(3.0 / 3.0 * (16 + 4 + 8))
+    assert bounds(solid) == [(0, 4), (0, 4), (0, 3)]
+
+
+@few
+@given(st.floats(-7, 7), st.floats(-50, 50), st.floats(-50, 50))
+def test_a_placed_solid_is_turned_counter_clockwise_about_its_foot_and_then_moved(
+    yaw: float, x: float, y: float
+) -> None:
+    tip = np.array([[[1.0, 0.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, 2.0]]])
+    placed = shapes.place(tip, x, y, 0.5, yaw)[0]
+    np.testing.assert_allclose(placed[0], [x + np.cos(yaw), y + np.sin(yaw), 0.5])
+    np.testing.assert_allclose(placed[1:], [[x, y, 0.5], [x, y, 2.5]])
+
+
+@pytest.mark.parametrize(
+    ("solid", "length", "width", "height", "lowest"),
+    [
+        (shapes.car(), 4.4, 1.8, 1.5, 0.0),
+        (shapes.van(), 5.6, 2.0, 2.4, 0.3),
+        (shapes.bus(), 10.5, 2.5, 3.1, 0.3),
+        (shapes.pedestrian(1.8), 0.28, 0.46, 1.8, 0.0),
+        (shapes.two_wheeler(1.6), 1.7, 0.44, 1.6, 0.05),
+    ],
+)
+def test_road_users_are_as_large_as_they_say_and_stand_on_the_road(
+    solid: F64, length: float, width: float, height: float, lowest: float
+) -> None:
+    (x0, x1), (y0, y1), (z0, z1) = bounds(solid)
+    assert x1 - x0 == pytest.approx(length, abs=0.06)
+    assert y1 - y0 == pytest.approx(width, abs=0.08)
+    assert [z0, z1] == pytest.approx([lowest, height])
+    assert [x0 + x1, y0 + y1] == pytest.approx([0.0, 0.0], abs=0.16), "around the origin"
+
+
+def test_leaves_fill_the_crown_and_leave_gaps() -> None:
+    rng = np.random.default_rng(1)
+    half = np.array([2.0, 1.5, 1.0])
+    leaves = shapes.foliage(rng, (2.0, 1.5, 1.0), 4.0, 500, 0.1)
+    centres = (leaves.mean(axis=1) - [0.0, 0.0, 4.0]) / half
+    assert len(leaves) == 500
+    assert np.linalg.norm(centres, axis=1).max() < 1.15
+    assert np.linalg.norm(centres, axis=1).min() > 0.3
+    assert area(leaves) < 0.5 * 4 * np.pi * 1.5**2, "rays pass between them"
+
+
+def test_a_hedge_stands_on_the_ground_along_its_length() -> None:
+    (x0, x1), (y0, y1), (z0, z1) = bounds(shapes.hedge(np.random.default_rng(2), 6.0, 0.8, 1.2))
+    assert -0.2 < x0 < 0.2
+    assert 5.8 < x1 < 6.2
+    assert -0.6 < y0 < -0.3 < 0.3 < y1 < 0.6
+    assert -0.1 < z0 < 0.2
+    assert 1.0 < z1 < 1.4
+
+
+def test_samples_lie_on_the_surface_one_to_each_patch() -> None:
+    solid = shapes.box(0, 4, 0, 3, 0, 2)
+    points = shapes.sample(solid, 0.1, np.random.default_rng(3))
+    assert len(points) == pytest.approx(52 / 0.01, rel=0.05)
+    to_faces = np.minimum(points, np.array([4.0, 3.0, 2.0]) - points)
+    assert np.abs(to_faces.min(axis=1)).max() < 1e-9
+    on_top = points[points[:, 2] == 2.0]
+    assert len(on_top) == pytest.approx(1200, rel=0.15)
+    assert on_top[:, :2].mean(axis=0) == pytest.approx([2.0, 1.5], abs=0.15)
+
+
+def test_of_no_parts_nothing_is_joined_or_sampled() -> None:
+    assert shapes.join([]).shape == (0, 3, 3)
+    assert shapes.sample(shapes.join([]), 0.1, np.random.default_rng(0)).shape == (0, 3)
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_a_building_stands_on_its_plot_and_hangs_over_the_sidewalk_by_two_metres_at_most(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    width, depth, height = rng.uniform(5, 20), rng.uniform(6, 12), rng.uniform(4, 14)
+    (x0, x1), (y0, y1), (z0, z1) = bounds(buildings.building(rng, width, depth, height))
+    assert -0.7 < x0 < 0.5
+    assert width - 0.5 < x1 < width + 0.7
+    assert -2.0 < y0 <= 0.0
+    assert depth - 0.01 < y1 < depth + 0.7
+    assert z0 == buildings.FOOT_M, "its walls reach below any slope"
+    assert height <= z1 < height + 3.0
+
+
+def test_a_building_is_the_same_for_the_same_seed_and_another_for_another() -> None:
+    first, again, other = (buildings.building(np.random.default_rng(seed), 9.0, 8.0, 6.0) for seed in (5, 5, 6))
+    np.testing.assert_array_equal(first, again)
+    assert other.shape != first.shape or (other != first).any()
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_furniture_is_as_high_as_such_things_are_and_rooted_in_the_ground(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    for make, low, high in ((furniture.tree, 3.0, 7.5), (furniture.pole, 6.5, 9.0), (furniture.sign, 2.0, 3.2)):
+        z0, z1 = bounds(make(rng))[2]
+        assert z0 == -0.5
+        assert low < z1 <= high
+    assert bounds(furniture.street_box(rng))[2][1] <= 2.5
+    assert bounds(furniture.rail(10.0)) == [(-0.06, 10.06), (-0.06, 0.06), (-0.3, 0.8)]
+
+
+def test_a_gantry_spans_the_road_higher_than_any_lorry() -> None:
+    solid = furniture.gantry(10.0)
+    assert bounds(solid)[1] == (-10.15, 10.15)
+    over_the_road = solid[np.abs(solid[:, :, 1]).max(axis=1) < 9.0]
+    assert bounds(over_the_road)[2][0] > 4.5
+
+
+def test_the_mesh_of_the_ground_is_its_height_and_has_no_holes() -> None:
+    scenario = load_scenario("corner")
+    terrain = make_terrain(scenario, np.random.default_rng(4))
+    mesh = terrain.triangles()
+    corners = mesh.reshape(-1, 3)
+    np.testing.assert_allclose(corners[:, 2], terrain.height(corners[:, 0], corners[:, 1]))
+    (x0, x1), (y0, y1), _ = bounds(mesh)
+    flat = mesh.copy()
+    flat[..., 2] = 0.0
+    assert area(flat) == pytest.approx((x1 - x0) * (y1 - y0)), "seen from above, every place is covered once"
+
+
+def test_the_kerb_is_a_step_of_15_cm_on_both_sides_of_the_road() -> None:
+    scenario = load_scenario("corner")
+    terrain = make_terrain(scenario, np.random.default_rng(4))
+    x = 3.0
+    for side in (-1.0, 1.0):
+        road, walk = (terrain.height(x, terrain.axis_y + side * (KERB_M + off)) for off in (-0.001, 0.001))
+        assert float(walk - road) == pytest.approx(KERB_HEIGHT_M, abs=0.005)
+    assert float(terrain.road_distance(x, terrain.axis_y + 3.0)) <= 3.0
