@@ -7,19 +7,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mapvote.config import NdtLevel, NdtSettings
 from mapvote.core.types import F64
-from mapvote.localisation.ndt import NdtGrid
+from mapvote.localisation.ndt import MIN_POINTS, Level, NdtGrid
 
 SIZE, FLOOR_M = 2.0, 0.1
 MIDDLE = np.array([3.0, -3.0, 1.0])
 """Of the voxel in which a cloud lies."""
 
 
-def grid(min_points: int = 3, centre: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> NdtGrid:
-    level = NdtLevel(voxel_m=SIZE, floor_m=FLOOR_M, points_m=0.1, iterations=1)
-    made = NdtGrid(level, NdtSettings(half_window_m=10.0, below_m=10.0, above_m=10.0, min_points=min_points))
-    made.recentre(np.array(centre))
+def grid(size: float = SIZE, half_m: float = 10.0) -> NdtGrid:
+    made = NdtGrid(Level(size, FLOOR_M, points_m=0.1, iterations=1), half_m)
+    made.recentre(np.zeros(3))
     return made
 
 
@@ -72,11 +70,11 @@ def test_points_that_come_in_pieces_make_the_same_map(seed: int, pieces: int) ->
 
 
 def test_too_few_points_make_no_distribution_and_one_more_does() -> None:
-    made = grid(min_points=4)
-    points = cloud(1, 4)
-    made.enter(points[:3])
+    made = grid()
+    points = cloud(1, MIN_POINTS)
+    made.enter(points[:-1])
     assert not made.voxels.cells[:1].any()
-    made.enter(points[3:])
+    made.enter(points[-1:])
     assert made.voxels.cells[0, 3:].any()
 
 
@@ -132,9 +130,7 @@ def test_points_outside_the_window_are_left_out_and_found_again_when_it_has_move
 
 @pytest.mark.parametrize("voxels", [1023, 1024, 1025, 2500])
 def test_there_is_room_for_any_number_of_voxels(voxels: int) -> None:
-    level = NdtLevel(voxel_m=0.5, floor_m=FLOOR_M, points_m=0.1, iterations=1)
-    made = NdtGrid(level, NdtSettings(half_window_m=20.0, below_m=2.0, above_m=2.0, min_points=1))
-    made.recentre(np.zeros(3))
+    made = grid(size=0.5, half_m=20.0)
     index = np.arange(voxels)
     points = np.column_stack([index % 60, index // 60, 0 * index]) * 0.5 + np.array([-14.75, -14.75, 0.25])
     made.enter(np.repeat(points, 2, axis=0))
