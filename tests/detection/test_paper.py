@@ -186,7 +186,8 @@ def seen_twice() -> tuple[PaperVoter, U64]:
     obstacle, cell = find_obstacles(points, reference)
     moving = np.zeros(len(points), dtype=np.bool_)
     view = cast_rays(points, origin, obstacle, moving, reference)
-    placed = PlacedScan(0, points, origin, 0.01, reference, reference, obstacle, cell)
+    up = np.array([0.0, 0.0, 1.0])
+    placed = PlacedScan(0, points, origin, up, 0.01, reference, reference, obstacle, cell)
     voter = PaperVoter(VotingSettings(), PaperSettings(), SENSOR, point_map)
     for _ in range(2):
         may_be_new = voter.observe(Observation(placed, moving, view, reference))
