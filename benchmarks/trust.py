@@ -83,12 +83,12 @@ def run(cases: list[Case], name: str) -> tuple[int, int, int, int, float]:
     return n, astray, shy, wrong, 1e3 * (time.process_time() - start) / n
 
 
-def kitti(folder: Path, block: int = 10) -> list[Case]:
-    """Every other block of a drive as map, the others driven as they are (10 Hz)."""
+def kitti(folder: Path, block: int = 10, first: int = 0) -> list[Case]:
+    """Every other block of a drive as map, from the ``first`` on, the others driven as they are (10 Hz)."""
     n = len(open_drive(folder))
     starts = range(0, n, block)
-    mapped = [i for s in starts[::2] for i in range(s, min(s + block, n))]
-    survey = open_drive(folder, scans=",".join(f"{s}:{min(s + block, n)}" for s in starts[::2]))
+    mapped = [i for s in starts[first::2] for i in range(s, min(s + block, n))]
+    survey = open_drive(folder, scans=",".join(f"{s}:{min(s + block, n)}" for s in starts[first::2]))
     point_map, built = build_map([survey], SETTINGS)
     reference = read_T_map_lidar(folder / "poses.txt", folder)
     T = rigid_between(built.tracks[0].T_map_lidar, reference[mapped]) @ reference
@@ -98,7 +98,7 @@ def kitti(folder: Path, block: int = 10) -> list[Case]:
             open_drive(folder, scans=f"{s}:{min(s + block, n)}"),
             T[s : s + block],
         )
-        for s in starts[1::2]
+        for s in starts[1 - first :: 2]
     ]
 
 

@@ -186,6 +186,10 @@ class Tracker:
         self.twist, self._measured = (np.zeros(6), False) if twist is None else (twist, True)
         self._usual_score = score
 
+    def correct(self, T_map_lidar: F64, twist: F64) -> None:
+        """The last scan was taken here, a little beside where it was found: the track goes on from this pose."""
+        self.last_pose, self.twist = T_map_lidar, twist
+
     def is_sound(self, result: Registration) -> bool:
         """Whether a registration converged, met the map and is certain enough; that it is the right place says more."""
         s = self.settings
