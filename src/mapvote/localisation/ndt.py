@@ -185,7 +185,7 @@ def refine(
     last = len(ndt_map.levels) - 1
     for i in range(first_level, last + 1):
         grid = ndt_map.levels[i]
-        tolerance = (0.01 if i == last else 0.05) * grid.level.floor_m
+        tolerance = max(0.001, (0.01 if i == last else 0.05) * grid.level.floor_m)
         where = Place(grid.window, grid.voxels.cells, grid.level.iterations, tolerance)
         known = _known(prior if i == last else None)
         pairs = room_for(clouds[i].shape[1])
