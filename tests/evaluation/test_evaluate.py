@@ -145,6 +145,9 @@ def test_the_demo_tells_its_story(tmp_path: Path) -> None:
     for name in ("report.html", "tables.txt", "results.json", "results.csv", "map_before.pcd", "map_after.pcd"):
         assert (tmp_path / "out" / name).stat().st_size > 100
     html = (tmp_path / "out" / "report.html").read_text()
+    assert "Beside the paper&#x27;s own table" in html
+    assert "occluded abstains" in html
+    assert "paper, Table IV" in html
     assert html.count("data:image/png;base64,") == len(list((tmp_path / "out" / "pictures").glob("*.png")))
     loads = re.findall(r"""(?:\b(?:src|href)\s*=|\bfrom|\bimport\(|\bfetch\(|url\()\s*["']?https?://[^"')\s]*""", html)
     assert loads == [], "it needs nothing from elsewhere; the scripts inside it may name addresses"

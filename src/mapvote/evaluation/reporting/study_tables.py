@@ -34,7 +34,7 @@ def study_tables(result: EvaluationResult) -> Iterator[Table]:
     if result.readings:
         truths = list(next(iter(next(iter(result.readings.values())).values())))
         for truth in truths:
-            yield _readings(result.readings, truth)
+            yield readings_table(result.readings, truth)
     for case, by_truth in result.budgets.items():
         for truth, found in by_truth.items():
             yield from _budget(case, truth, found)
@@ -49,7 +49,8 @@ def _sizes(result: EvaluationResult) -> Table:
     return table
 
 
-def _readings(readings: Mapping[str, Mapping[str, Mapping[str, Scores]]], truth: str) -> Table:
+def readings_table(readings: Mapping[str, Mapping[str, Mapping[str, Scores]]], truth: str) -> Table:
+    """A line a reading, macro-F1 by case against one truth; the paper's Table IV last."""
     cases = list(next(iter(readings.values())))
     table = _new(f"Readings of the paper: F1, mean of the three classes ({truth} truth)", "reading", *map(_case, cases))
     for name, by_case in readings.items():
