@@ -29,7 +29,9 @@ from mapvote.core.reference import reference_window
 from mapvote.core.types import F32, F64, Bool, Drive
 from mapvote.core.voxels import voxel_downsample
 from mapvote.formats import open_drive
+from mapvote.evaluation.baselines.occupied_briefly import OccupiedBriefly
 from mapvote.perception import moving_objects
+from mapvote.perception.frontend import Movers
 from mapvote.perception.moving_objects import MovingFilter
 from mapvote.simulation import simulate
 
@@ -108,12 +110,15 @@ def obstacles(points_map: F64, grid: Grid, ground_z: F32) -> Bool:
 
 
 def run(
-    drive: Drive, T_map_lidar: F64, settings: MovingSettings, seconds: list[float], pose_noise_m: float = 0.0
+    drive: Drive, T_map_lidar: F64, settings: MovingSettings | None, seconds: list[float], pose_noise_m: float = 0.0
 ) -> Iterator[tuple[int, F32, Bool, Bool]]:
-    """(scan, its points in the lidar frame, obstacle mask, moving mask) of every scan, in order."""
+    """(scan, its points in the lidar frame, obstacle mask, moving mask) of every scan, in order.
+
+    ``settings`` None: by [9] read literally.
+    """
     grid, ground_z = measure_ground(drive, T_map_lidar)
     rng = np.random.default_rng(0)
-    movers = MovingFilter(drive.sensor, settings)
+    movers: Movers = MovingFilter(drive.sensor, settings) if settings else OccupiedBriefly()
     kept: deque[tuple[int, F32, Bool]] = deque()
     for i in range(len(drive)):
         scan = drive.read_scan(i)
@@ -132,7 +137,7 @@ def run(
         yield *kept.popleft(), moving
 
 
-def score_simulated(folder: Path, stride: int, settings: MovingSettings, pose_noise_m: float) -> Score:
+def score_simulated(folder: Path, stride: int, settings: MovingSettings | None, pose_noise_m: float) -> Score:
     """Prints a row per vehicle and the pooled one, which it returns."""
     pooled = Score()
     for path in sorted(folder.glob("v[0-9]*")):
@@ -255,6 +260,7 @@ def main() -> None:
         "--set", nargs="*", default=[], metavar="KEY=VALUE", help="settings and constants of the filter"
     )
     parser.add_argument("--sweep", type=Path, metavar="CSV", help="half and twice of every constant, on the scenes")
+    parser.add_argument("--literal", action="store_true", help="also [9] read literally, on the scenes")
     args = parser.parse_args()
     settings = MovingSettings()
     for key, value in (pair.split("=") for pair in args.set):
@@ -274,6 +280,9 @@ def main() -> None:
             sweep(folder, args.stride, args.sweep)
         else:
             score_simulated(folder, args.stride, settings, args.pose_noise)
+            if args.literal:
+                print("[9] read literally:")
+                score_simulated(folder, args.stride, None, args.pose_noise)
     for path in args.kitti:
         score_kitti(path, settings, args.pictures)
 
