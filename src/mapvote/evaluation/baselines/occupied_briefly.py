@@ -1,7 +1,7 @@
 """Removal of moving objects as a short sentence has it ([9], read literally): a yardstick for our filter.
 
-A cell of the world's 2D grid that has been occupied for less than a time belongs to a moving object. Nothing is asked of
-who could have seen the cell: what has only just come into view is moving, and what comes by again after a while too.
+A cell of the world's 2D grid that has been occupied for less than a time belongs to a moving object. Nobody asks who
+could have seen the cell: what has only just come into view is moving, and what comes by again after a while too.
 """
 
 from __future__ import annotations
