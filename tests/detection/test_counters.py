@@ -10,15 +10,7 @@ from hypothesis.extra.numpy import arrays
 from mapvote.core.columns import dilated, neighbourhood, shifted
 from mapvote.core.grid import CELL_SIZE, Grid, Lattice
 from mapvote.core.types import Reference
-from mapvote.detection.counters import (
-    PLANES,
-    STRUCK_ITSELF,
-    THROUGH_ITSELF,
-    Evidence,
-    count_of,
-    free_words,
-    struck_near,
-)
+from mapvote.detection.counters import PLANES, STRUCK_ITSELF, THROUGH_ITSELF, Evidence, count_of, free_words
 from mapvote.perception.raycast import ScanView, Sight
 
 SIDE = 5
@@ -51,44 +43,6 @@ def middle(word: int) -> np.ndarray:
 NOTHING = middle(0)
 
 
-def count(evidence: Evidence, hit: np.ndarray, passed: np.ndarray, reference: Reference, sure: bool = True) -> None:
-    """One scan whose hits speak for the voxels next to them."""
-    near = dilated(hit.astype(np.uint64), reference.base, 1)
-    evidence.count(view_of(hit, passed), near, reference, sure)
-
-
-def near_point(x: float, y: float, z: float, reach_m: float, ground: np.ndarray | None = None) -> np.ndarray:
-    """Voxels within ``reach_m`` of one point in the middle cell: x, y, z from its lower corner."""
-    point = np.array([[12 * CELL_SIZE + x, 12 * CELL_SIZE + y, z]])
-    return struck_near(point, np.ones(1, np.bool_), reference_of(NOTHING, ground), reach_m)
-
-
-def test_a_hit_in_the_middle_of_a_voxel_is_near_no_other() -> None:
-    assert np.array_equal(near_point(0.15, 0.15, 0.75, 0.1), middle(0b100))
-
-
-def test_a_hit_five_centimetres_from_a_face_is_near_the_voxel_behind_it_and_at_a_corner_near_eight() -> None:
-    near = near_point(0.25, 0.15, 0.75, 0.1)
-    assert np.count_nonzero(near) == 2
-    assert near[2, 3] == 0b100
-    near = near_point(0.05, 0.05, 0.65, 0.1)
-    assert np.count_nonzero(near) == 4
-    assert (near[1:3, 1:3] == 0b110).all()
-
-
-def test_within_a_voxel_of_a_hit_are_all_its_neighbours() -> None:
-    hit = middle(0b1000)
-    assert np.array_equal(near_point(0.21, 0.13, 1.04, CELL_SIZE), dilated(hit, np.zeros(GRID.shape, np.int32), 1))
-
-
-def test_a_hit_is_near_no_voxel_below_the_ground_of_its_neighbour() -> None:
-    ground = np.zeros(GRID.shape)
-    ground[:, 3:] = 2.1
-    near = near_point(0.25, 0.15, 0.75, 0.1, ground)
-    assert near[2, 2] == 0b100
-    assert not near[:, 3:].any()
-
-
 @given(st.lists(st.tuples(words, words), min_size=1, max_size=12))
 @settings(max_examples=30, deadline=None)
 def test_bit_planes_count_like_plain_counters(scans: list[tuple[np.ndarray, np.ndarray]]) -> None:
@@ -97,7 +51,7 @@ def test_bit_planes_count_like_plain_counters(scans: list[tuple[np.ndarray, np.n
     struck = np.zeros((SIDE, SIDE, 64), int)
     bits = np.arange(64, dtype=np.uint64)
     for hit, passed in scans:
-        count(evidence, hit, passed, reference_of(NOTHING))
+        evidence.count(view_of(hit, passed), reference_of(NOTHING))
         is_hit = (hit[..., None] >> bits) & np.uint64(1) == 1
         struck += is_hit
         through += ((passed[..., None] >> bits) & np.uint64(1) == 1) & ~is_hit
@@ -111,7 +65,7 @@ def test_bit_planes_count_like_plain_counters(scans: list[tuple[np.ndarray, np.n
 def test_a_full_counter_is_halved_with_its_cell_and_keeps_the_ratio() -> None:
     evidence = Evidence(Lattice())
     for i in range(400):
-        count(evidence, middle(0b10 if i % 4 == 0 else 0), middle(0b10), reference_of(NOTHING))
+        evidence.count(view_of(middle(0b10 if i % 4 == 0 else 0), middle(0b10)), reference_of(NOTHING))
     cell = evidence.tiles[(0, 0)][AT]
     through, struck = count_of(cell, 0, 1), count_of(cell, PLANES, 1)
     assert 60 < through < 128
@@ -123,7 +77,17 @@ def test_a_hit_next_to_a_mapped_voxel_strikes_it_and_vetoes_the_rays_that_grazed
     hit[3, 3] = 0b1000  # one cell and one layer off
     for veto, counts in ((True, (0, 1)), (False, (1, 0))):
         evidence = Evidence(Lattice(), veto=veto)
-        count(evidence, hit, middle(0b100), reference_of(middle(0b100)))
+        evidence.count(view_of(hit, middle(0b100)), reference_of(middle(0b100)))
+        cell = evidence.tiles[(0, 0)][AT]
+        assert (count_of(cell, 0, 2), count_of(cell, PLANES, 2)) == counts
+
+
+def test_a_hit_two_cells_away_counts_only_for_an_uncertain_pose() -> None:
+    hit = NOTHING.copy()
+    hit[2, 4] = 0b100
+    for reach, counts in ((1, (1, 0)), (2, (0, 1))):
+        evidence = Evidence(Lattice())
+        evidence.count(view_of(hit, middle(0b100)), reference_of(middle(0b100)), reach)
         cell = evidence.tiles[(0, 0)][AT]
         assert (count_of(cell, 0, 2), count_of(cell, PLANES, 2)) == counts
 
@@ -132,23 +96,23 @@ def test_a_mapped_voxel_also_keeps_what_befell_it_alone() -> None:
     hit = NOTHING.copy()
     hit[3, 3] = 0b100
     evidence = Evidence(Lattice())
-    count(evidence, hit, middle(0b110), reference_of(middle(0b1100)))
+    evidence.count(view_of(hit, middle(0b110)), reference_of(middle(0b1100)))
     cell = evidence.tiles[(0, 0)][AT]
     assert (cell[STRUCK_ITSELF], cell[THROUGH_ITSELF]) == (0, 0b100), "the hit lies next to it, the ray went through it"
-    count(evidence, middle(0b1100), middle(0b100), reference_of(middle(0b1100)))
+    evidence.count(view_of(middle(0b1100), middle(0b100)), reference_of(middle(0b1100)))
     assert (cell[STRUCK_ITSELF], cell[THROUGH_ITSELF]) == (0b1100, 0b100)
 
 
 def test_a_scan_that_is_unsure_of_its_pose_says_of_no_single_voxel_that_a_ray_went_through() -> None:
     evidence = Evidence(Lattice())
-    count(evidence, NOTHING, middle(0b100), reference_of(middle(0b100)), sure=False)
+    evidence.count(view_of(NOTHING, middle(0b100)), reference_of(middle(0b100)), 2)
     assert evidence.tiles[(0, 0)][AT][THROUGH_ITSELF] == 0
 
 
 def test_without_rule_a_a_visible_cell_is_seen_through_whole() -> None:
     for by_ray, count in ((True, 0), (False, 1)):
         evidence = Evidence(Lattice(), by_ray=by_ray)
-        evidence.count(view_of(NOTHING, middle(0b1), Sight.BEHIND), NOTHING, reference_of(middle(0b100)))
+        evidence.count(view_of(NOTHING, middle(0b1), Sight.BEHIND), reference_of(middle(0b100)))
         assert count_of(evidence.tiles[(0, 0)][AT], 0, 2) == count
 
 
@@ -158,21 +122,21 @@ def test_on_a_slope_neighbouring_columns_are_compared_at_the_same_height() -> No
     hit = NOTHING.copy()
     hit[2, 3] = 0b1  # 0.9 m to 1.2 m: bit 3 of the middle column
     evidence = Evidence(Lattice())
-    count(evidence, hit, middle(0), reference_of(middle(0b1000), ground))
+    evidence.count(view_of(hit, middle(0)), reference_of(middle(0b1000), ground))
     assert count_of(evidence.tiles[(0, 0)][AT], PLANES, 3) == 1
 
 
 def test_cells_of_unknown_ground_gather_nothing() -> None:
     ground = np.full(GRID.shape, np.nan)
     evidence = Evidence(Lattice())
-    count(evidence, middle(1), middle(2), reference_of(NOTHING, ground))
+    evidence.count(view_of(middle(1), middle(2)), reference_of(NOTHING, ground))
     assert not evidence.tiles[(0, 0)].any()
 
 
 def test_free_is_what_was_seen_through_twice_never_struck_and_not_mapped() -> None:
     evidence = Evidence(Lattice())
     for hit, passed in ((0, 0b1110), (0, 0b0110), (0b0100, 0b0010)):
-        count(evidence, middle(hit), middle(passed), reference_of(NOTHING))
+        evidence.count(view_of(middle(hit), middle(passed)), reference_of(NOTHING))
     assert free_words(evidence.tiles[(0, 0)], np.zeros((256, 256), np.uint64))[AT] == 0b0010
     occupied = np.full((256, 256), 0b0010, np.uint64)
     assert free_words(evidence.tiles[(0, 0)], occupied)[AT] == 0

@@ -7,7 +7,6 @@ import pytest
 
 from hand_made import make_map, make_tile, wall
 from mapvote.config import VotingSettings
-from mapvote.core.columns import dilated
 from mapvote.core.point_map import PointMap
 from mapvote.core.reference import reference_window
 from mapvote.core.types import CellState
@@ -50,7 +49,7 @@ def after(more_hits: dict[tuple[int, int], list[float]] | None = None, rules: Ru
     view = ScanView(grid, (hit != 0).astype(np.int32), hit, passed, np.full(grid.shape, int(Sight.CLEAR), np.uint8))
     evidence = Evidence(point_map.lattice)
     for _ in range(20):
-        evidence.count(view, dilated(hit, reference.base, 1), reference)
+        evidence.count(view, reference)
     return ColumnVoter(VotingSettings(), point_map, rules, evidence).votes()[0, 0]
 
 

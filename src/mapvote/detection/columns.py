@@ -19,7 +19,7 @@ from mapvote.core.point_map import PointMap
 from mapvote.core.reference import above_ground_points, cut_reference, reference_window
 from mapvote.core.types import I32, U64, Bool, CellState
 from mapvote.core.voting import VOTE_UNIT
-from mapvote.detection.counters import PLANES, Evidence, count_of, free_words, is_open, struck_near
+from mapvote.detection.counters import PLANES, Evidence, count_of, free_words, is_open
 from mapvote.detection.regions import apply_region_rules, around, beside_new, loose_voxels
 from mapvote.detection.rules import ALL_RULES, Rules
 from mapvote.detection.votes import Judged, TileVotes, Weighed
@@ -35,10 +35,8 @@ CLEAR_SHARE = 0.3
 """Rule E: of the scans with rays through a cell, the share that must have seen through what it held."""
 BRIEF_SHARE = 0.35
 """Rule G: a new voxel struck in fewer of the scans able to was only passed by."""
-HIT_REACH_M = 0.15
-"""Rule B: a hit this near to a mapped voxel, and a sigma of the pose more, may be a hit on what stands there."""
 WIDE_SIGMA_M = 0.1
-"""A scan whose pose is less certain than this says nothing of single voxels (rule I)."""
+"""A pose less certain than this makes a hit speak for two cells around it, not one."""
 
 UO, UE, CO, CE, UN = (int(state) for state in CellState)
 """Columns of a tally."""
@@ -240,9 +238,8 @@ class ColumnVoter:
 
     def observe(self, seen: Observation) -> U64:
         """Count one scan; returns (rows, cols) words of voxels whose points may be new."""
-        scan = seen.scan
-        near = struck_near(scan.points_map, scan.obstacle & ~seen.moving, seen.reference, HIT_REACH_M + scan.sigma_m)
-        self.evidence.count(seen.view, near, seen.reference, sure=scan.sigma_m <= WIDE_SIGMA_M)
+        reach = 2 if seen.scan.sigma_m > WIDE_SIGMA_M else 1
+        self.evidence.count(seen.view, seen.reference, reach)
         return seen.view.hit & ~seen.reference.occupied
 
     def votes(self) -> dict[TileIndex, TileVotes]:

@@ -2,9 +2,8 @@
 
 Two counters a voxel, kept as bit planes: plane k of a cell is a 64-bit word that holds bit k of the
 counts of its 64 voxels, so that one scan adds to a whole column with a few word operations. A voxel that the map
-holds counts as struck if a hit lies in it or so little beside it that the scan's error may have put it there
-(:func:`struck_near`), and then not as seen through, whatever grazed past it in the same scan; any other voxel must be
-hit itself.
+holds counts as struck if anything near it was hit (8 neighbouring cells, one layer up or down), and
+then not as seen through, whatever grazed past it in the same scan; any other voxel must be hit itself.
 Two more words a cell say of its mapped voxels, whatever lies next to them, whether a hit ever fell into them and
 whether a ray ever went through (rule I).
 Cells whose ground the map does not know gather nothing: heights would mean nothing there, and the map knows nothing.
@@ -15,9 +14,9 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from mapvote.core.columns import TOP_BIT, column_bit
-from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Lattice, TileIndex
-from mapvote.core.types import F32, F64, I32, U8, U64, Bool, Reference
+from mapvote.core.columns import TOP_BIT, neighbourhood
+from mapvote.core.grid import TILE_CELLS, Lattice, TileIndex
+from mapvote.core.types import F32, I32, U8, U64, Reference
 from mapvote.perception.raycast import ScanView, Sight
 
 PLANES = 7
@@ -83,7 +82,7 @@ def is_open(planes: U64, bit: int) -> bool:
 @numba.njit(cache=True, nogil=True)
 def _gather(
     planes: U64, shape: tuple[int, int], row0: int, col0: int,
-    hit: U64, near_hit: U64, passed: U64, sight: U8, occupied: U64, ground_z: F32, sure: bool, by_ray: bool, veto: bool,
+    hit: U64, passed: U64, sight: U8, occupied: U64, ground_z: F32, base: I32, reach: int, by_ray: bool, veto: bool,
 ) -> None:  # fmt: skip
     """Add one scan to a tile: the first ``shape`` cells of ``planes``, from (row0, col0) of the window."""
     for i in range(shape[0]):
@@ -93,7 +92,7 @@ def _gather(
                 continue
             through, struck, mapped = passed[r, c] & ~hit[r, c], hit[r, c], occupied[r, c]
             if mapped:
-                near = near_hit[r, c] & mapped if veto else hit[r, c] & mapped
+                near = neighbourhood(hit, base, r, c, reach) & mapped if veto else hit[r, c] & mapped
                 if not by_ray and sight[r, c] >= _BEHIND and not hit[r, c]:
                     through |= mapped
                 struck = (struck & ~mapped) | near
@@ -102,43 +101,12 @@ def _gather(
                 cell = planes[i, j]
                 if mapped:
                     cell[STRUCK_ITSELF] |= hit[r, c] & mapped
-                    if sure:  # where a scan is not sure of its pose, single voxels mean nothing
+                    if reach == 1:  # where a scan is not sure of its pose, single voxels mean nothing
                         cell[THROUGH_ITSELF] |= passed[r, c] & mapped & ~hit[r, c]
                 if _is_full(cell, _THROUGH, through) or _is_full(cell, _STRUCK, struck):
                     _halve(cell)
                 _add(cell, _THROUGH, through)
                 _add(cell, _STRUCK, struck)
-
-
-@numba.njit(cache=True, nogil=True)
-def _mark_near(
-    points: F64, chosen: Bool, base: I32, lattice: tuple[float, float], corner: tuple[int, int], reach: float, near: U64
-) -> None:
-    """Set the bits of the voxels of ``near`` that lie within ``reach`` of the ``chosen`` points, axis by axis."""
-    rows, cols = base.shape
-    for i in range(len(points)):
-        if not chosen[i]:
-            continue
-        x, y, z = points[i, 0] - lattice[0], points[i, 1] - lattice[1], points[i, 2]
-        first_row, last_row = int(np.floor((y - reach) / CELL_SIZE)), int(np.floor((y + reach) / CELL_SIZE))
-        first_col, last_col = int(np.floor((x - reach) / CELL_SIZE)), int(np.floor((x + reach) / CELL_SIZE))
-        for r in range(max(first_row - corner[0], 0), min(last_row - corner[0], rows - 1) + 1):
-            for c in range(max(first_col - corner[1], 0), min(last_col - corner[1], cols - 1) + 1):
-                if int(np.floor((z + reach) / CELL_SIZE)) < base[r, c]:
-                    continue  # below the ground of that cell
-                low, high = column_bit(z - reach, base[r, c]), column_bit(z + reach, base[r, c])
-                for bit in range(low, high + 1):
-                    near[r, c] |= np.uint64(1) << np.uint64(bit)
-
-
-def struck_near(points_map: F64, chosen: Bool, reference: Reference, reach_m: float) -> U64:
-    """(rows, cols) words of the voxels that hold one of the ``chosen`` (n,) points (n, 3), map metres, or lie within
-    ``reach_m`` of one along each axis."""
-    near = np.zeros(reference.grid.shape, dtype=np.uint64)
-    grid = reference.grid
-    lattice, corner = (grid.lattice.x0, grid.lattice.y0), (grid.row0, grid.col0)
-    _mark_near(points_map, chosen, np.ascontiguousarray(reference.base), lattice, corner, reach_m, near)
-    return near
 
 
 class Evidence:
@@ -150,9 +118,8 @@ class Evidence:
         self.lattice, self.by_ray, self.veto = lattice, by_ray, veto
         self.tiles: dict[TileIndex, U64] = {}
 
-    def count(self, view: ScanView, near_hit: U64, reference: Reference, sure: bool = True) -> None:
-        """Count a scan seen against ``reference``. ``near_hit`` (rows, cols): words of the voxels that a hit may stand
-        for, see :func:`struck_near`; ``sure``: whether the pose is good enough to speak of single voxels."""
+    def count(self, view: ScanView, reference: Reference, reach: int = 1) -> None:
+        """Count a scan seen against ``reference``; ``reach`` cells around a hit it may stand for (pose uncertainty)."""
         for tile in view.grid.tiles():
             window = self.lattice.tile(tile)
             common = window.intersection(view.grid)
@@ -160,8 +127,8 @@ class Evidence:
                 self.tiles[tile] = np.zeros((TILE_CELLS, TILE_CELLS, WORDS), dtype=np.uint64)
             row0, col0 = common.row0 - view.grid.row0, common.col0 - view.grid.col0
             _gather(
-                self.tiles[tile][common.slices_in(window)], common.shape, row0, col0, view.hit, near_hit, view.passed,
-                view.sight, reference.occupied, reference.ground_z, sure, self.by_ray, self.veto,
+                self.tiles[tile][common.slices_in(window)], common.shape, row0, col0, view.hit, view.passed, view.sight,
+                reference.occupied, reference.ground_z, reference.base, reach, self.by_ray, self.veto,
             )  # fmt: skip
 
 

@@ -25,7 +25,7 @@ from mapvote.core.point_map import PointMap, map_from_points
 from mapvote.core.reference import LocalMap, reference_window
 from mapvote.core.types import F64, I32, I64, U64, Bool, Drive
 from mapvote.core.voxels import VoxelCloud
-from mapvote.detection.counters import PLANES, Evidence, count_of, free_words, is_open, struck_near
+from mapvote.detection.counters import PLANES, Evidence, count_of, free_words, is_open
 from mapvote.localisation.localiser import GivenPoses
 from mapvote.perception.frontend import Frontend, Observation, PlacedScan
 from mapvote.perception.moving_objects import MovingFilter
@@ -69,9 +69,7 @@ class Layer:
             offset = scan.points_map[:, :2] - scan.origin_map[:2]
             far = np.einsum("ij,ij->i", offset, offset) > self.settings.mapping.reach_m**2
             self.cloud.enter(scan.points_map, moving | _beneath(scan, moving) | far)
-            standing = scan.obstacle & ~moving
-            near = struck_near(scan.points_map, standing, observation.reference, CELL_SIZE)  # trails are ragged
-            self.evidence.count(observation.view, near, observation.reference)
+            self.evidence.count(observation.view, observation.reference)
 
     def finish(self) -> PointMap:
         """The map of everything laid."""
