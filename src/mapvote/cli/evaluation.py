@@ -72,6 +72,9 @@ def evaluate(
         Path | None,
         typer.Option(metavar="FOLDER", help="where pictures of what is explained go; real: tables, pictures of worst"),
     ] = None,
+    figures: Annotated[
+        Path | None, typer.Option(metavar="FOLDER", help="also draw the paper's figures here: PNG, SVG and PDF")
+    ] = None,
     scans: Annotated[
         str | None, typer.Option(metavar="SLICES", help="real: which scans of the drive: 0:300, say")
     ] = None,
@@ -129,6 +132,13 @@ def evaluate(
             picture = out / f"explained_{name.replace(' ', '_')}.png"
             save(budget_figure(name, causes, evaluation.window), picture)
             print(f"{picture}")
+    if figures is not None:
+        from mapvote.evaluation.reporting.gallery import gallery
+
+        best = "columns" if "columns" in result.cases else cases[0].name
+        with progress("drawing"):
+            drawn = gallery(evaluation, best, figures, ("png", "svg", "pdf"))
+        print(f"{figures}: {len(drawn)} figures, each as PNG, SVG and PDF")
 
 
 def _settings_read(config: Path | None, scenario: str, reading: str | None) -> Settings:

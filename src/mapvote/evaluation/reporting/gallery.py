@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -53,9 +54,21 @@ def areas_of(evaluation: Evaluation) -> list[Area]:
     return out
 
 
-def gallery(evaluation: Evaluation, case: str, folder: Path) -> list[tuple[Path, str]]:
+def gallery(
+    evaluation: Evaluation, case: str, folder: Path, formats: Sequence[style.Format] = ("png",)
+) -> list[tuple[Path, str]]:
     """Draw everything; ``case`` is the one whose updated map is shown. Returns (picture, caption)."""
     folder.mkdir(parents=True, exist_ok=True)
+    out = []
+    for name, picture, caption in drawn(evaluation, case):
+        for format in formats:
+            style.save(picture, folder / f"{name}.{format}", format)
+        out.append((folder / f"{name}.{formats[0]}", caption))
+    return out
+
+
+def drawn(evaluation: Evaluation, case: str) -> list[tuple[str, Figure, str]]:
+    """(name, figure, caption) of every picture."""
     old, new = all_points(evaluation.first_map), all_points(evaluation.outcomes[case].updated)
     survived, added = same_rows(old, new)
     deleted = old[~survived]
@@ -81,7 +94,8 @@ def gallery(evaluation: Evaluation, case: str, folder: Path) -> list[tuple[Path,
     panels += [(case_name(n).capitalize(), states) for n, states in decided.items()]
     states = figures.cell_states(panels, evaluation.window, outlines=outlines)
     shown = {n: e for n, e in evaluation.result.cases.items() if n in (*"12345", "columns", *YARDSTICKS)}
-    bars = figures.score_bars(shown, {n: case_name(n) for n in shown})
+    names = {n: case_name(n) for n in shown}
+    bars = figures.score_bars(shown, names)
     pictures += [
         ("scan", _scan(evaluation, nearest), "One scan of a vehicle, bodies that move in orange: Figure 5."),
         ("local_grid", _local_grid(evaluation, nearest), "The 80 m local grid of one vehicle: Figures 2 and 3."),
@@ -96,12 +110,10 @@ def gallery(evaluation: Evaluation, case: str, folder: Path) -> list[tuple[Path,
             "What the server decided, cell by cell; yellow in the truth: unscored.",
         ),
         ("table_iv", bars, "Table IV as bars, the paper's figures beside ours."),
+        ("classes", figures.class_bars(shown, names), "Precision and recall of each class: Tables II and III."),
+        ("bytes", figures.byte_bars(shown, names), "What a vehicle sends, by case."),
     ]
-    out = []
-    for name, picture, caption in pictures:
-        style.save(picture, folder / f"{name}.png")
-        out.append((folder / f"{name}.png", caption))
-    return out
+    return pictures
 
 
 def _as_states(truth: U8) -> U8:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 from mapvote.core.types import NO_VOTE, U8, CellState
 from mapvote.formats.atomic import whole_file
 
+Format = Literal["png", "svg", "pdf"]
 INK, PAPER_WHITE, FAINT = "#22303c", "#ffffff", "#8795a1"
 NEW, GONE, STANDING, EMPTY, UNSURE = "#d7263d", "#1673c4", "#51687c", "#e6ecf1", "#f2c230"
 STATE_COLOURS = {
@@ -61,9 +62,11 @@ def new_figure(width: float, height: float, rows: int = 1, cols: int = 1, **grid
         return figure, figure.subplots(rows, cols, squeeze=False, **grid)
 
 
-def save(figure: Figure, path: Path) -> None:
-    """PNG without dates or versions in it, whole or not at all: same picture, same bytes."""
+def save(figure: Figure, path: Path, format: Format = "png") -> None:
+    """Without dates or versions in it, whole or not at all: same picture, same bytes."""
     import matplotlib
 
-    with matplotlib.rc_context(_FONT), whole_file(path) as partial:
-        figure.savefig(partial, format="png", dpi=140, metadata={"Software": None})
+    undated = {"png": {"Software": None}, "svg": {"Date": None, "Creator": None}, "pdf": {"CreationDate": None}}
+    fixed = {"svg.hashsalt": "mapvote", "svg.fonttype": "none", "pdf.fonttype": 42}
+    with matplotlib.rc_context(_FONT | fixed), whole_file(path) as partial:
+        figure.savefig(partial, format=format, dpi=140, metadata=undated[format])

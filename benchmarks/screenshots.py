@@ -1,0 +1,153 @@
+"""The pictures of the page in docs/pictures, taken anew: a real server, headless Chromium, software WebGL.
+
+    mapvote demo --out out
+    python benchmarks/screenshots.py out/work/server/store.db
+    python benchmarks/screenshots.py out/work/server/store.db --only dark,phone --to /tmp/pictures
+
+Needs Chromium (apt-get install chromium).
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+sys.path[:0] = [str(Path(__file__).parents[1] / "tests"), str(Path(__file__).parent)]
+
+from chromium import Chromium
+from hand_made import make_map
+from live_server import serving
+from mapvote.server.store.store import Store
+from page import town
+
+PICTURES = Path(__file__).parents[1] / "docs/pictures"
+SHOWN = "performance.getEntriesByName('first-points').length > 0"
+LISTED = "document.querySelectorAll('#changes button').length > 0"
+
+
+def settled(browser: Chromium, seconds: float = 6.0) -> None:
+    """Wait until all that is in view has come."""
+    browser.wait(SHOWN, 90)
+    count, since = -1, time.monotonic()
+    while time.monotonic() - since < seconds:
+        now = browser.run("performance.getEntriesByType('resource').length")
+        if now != count:
+            count, since = now, time.monotonic()
+        time.sleep(0.2)
+
+
+def of_demo(browser: Chromium, url: str) -> None:
+    """The whole street, its largest change chosen."""
+    browser.open(url)
+    browser.wait(LISTED, 90)
+    settled(browser)
+
+
+def of_change(browser: Chromium, url: str) -> None:
+    """The eye on the largest change, told beside it."""
+    browser.open(url)
+    browser.wait(LISTED, 90)
+    browser.run("document.querySelector('#changes button').click()")
+    browser.wait("document.querySelector('#details figure img')?.naturalWidth > 0", 30)
+    settled(browser)
+
+
+def of_demolition(browser: Chromium, url: str) -> None:
+    """The eye on the largest demolition."""
+    browser.open(url)
+    browser.wait(LISTED, 90)
+    browser.run("[...document.querySelectorAll('#changes button')].find(b => b.innerText.includes('Demo')).click()")
+    settled(browser)
+
+
+def as_seen_without_red(browser: Chromium, url: str) -> None:
+    """As of_change, to someone who cannot tell red from green."""
+    browser.call("Emulation.setEmulatedVisionDeficiency", type="deuteranopia")
+    of_change(browser, url)
+
+
+def while_loading(browser: Chromium, url: str) -> None:
+    """Over a slow line, three seconds after the start."""
+    browser.call("Network.emulateNetworkConditions", offline=False, latency=400, downloadThroughput=120_000,
+                 uploadThroughput=60_000)  # fmt: skip
+    browser.open(url)
+    browser.wait(SHOWN, 120)
+    time.sleep(1.0)
+
+
+def nothing_yet(browser: Chromium, url: str) -> None:
+    """A store with its first map, before anybody has driven."""
+    browser.open(url)
+    browser.wait("!document.querySelector('#content').hidden && document.querySelector('#tally').innerText", 60)
+
+
+def connection_lost(browser: Chromium, url: str) -> None:
+    """The server has gone; what is shown stays."""
+    of_demo(browser, url)
+    browser.call("Network.emulateNetworkConditions", offline=True, latency=0, downloadThroughput=0, uploadThroughput=0)
+    browser.wait("!document.querySelector('#offline').hidden", 60)
+
+
+def large_town(browser: Chromium, url: str) -> None:
+    """Ten million points."""
+    browser.open(url)
+    settled(browser)
+
+
+Picture = tuple[str, Callable[[Chromium, str], None], dict[str, object]]
+DEMO: list[Picture] = [
+    ("page", of_demo, {}),
+    ("page_change", of_change, {}),
+    ("page_dark", of_demolition, {"dark": True}),
+    ("page_phone", of_change, {"width": 360, "height": 740}),
+    ("page_colour_blind", as_seen_without_red, {}),
+    ("page_loading", while_loading, {}),
+    ("page_lost", connection_lost, {}),
+]
+
+
+def take(picture: Picture, url: str, to: Path) -> None:
+    """One picture, by a browser of its own."""
+    name, prepare, how = picture
+    browser = Chromium(**{"width": 1400, "height": 900, "webgl": True} | how)  # type: ignore[arg-type]
+    try:
+        prepare(browser, url)
+        browser.screenshot(to / f"{name}.png")
+        print(to / f"{name}.png")
+    finally:
+        browser.close()
+
+
+def main() -> None:
+    """Parse and run."""
+    asked = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    asked.add_argument("store", type=Path, help="of the demo")
+    asked.add_argument("--to", type=Path, default=PICTURES)
+    asked.add_argument("--only", default="", help="names without page_, by commas")
+    options = asked.parse_args()
+    wanted = {f"page_{name}" if name != "page" else name for name in filter(None, options.only.split(","))}
+    with tempfile.TemporaryDirectory() as folder:
+        log = Path(folder) / "log"
+        with serving(options.store, log=log) as (url, _):
+            for picture in DEMO:
+                if not wanted or picture[0] in wanted:
+                    take(picture, url, options.to)
+        others: list[tuple[Picture, Callable[[], object]]] = [
+            (("page_empty", nothing_yet, {}), lambda: make_map({})),
+            (("page_town", large_town, {}), lambda: town(10)),
+        ]
+        for picture, made in others:
+            if wanted and picture[0] not in wanted:
+                continue
+            store = Path(folder) / f"{picture[0]}.db"
+            Store.create(f"sqlite:///{store}", made()).close()  # type: ignore[arg-type]
+            with serving(store, log=log) as (url, _):
+                take(picture, url, options.to)
+
+
+if __name__ == "__main__":
+    main()
