@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from threading import Event
+from time import sleep
 from typing import Any
 
 import pytest
@@ -161,3 +163,28 @@ def test_every_list_is_geojson_where_it_has_a_place_and_csv_always(server: Serve
     vehicles = client.get("/v1/vehicles?format=csv", headers=who["boss"]).text.splitlines()
     assert [row.split(",")[0] for row in vehicles] == ["vehicle", "v1", "v2"]
     assert second["id"] in desk[1]
+
+
+def test_a_publish_tells_how_far_it_is_and_can_be_cancelled(server: Server) -> None:
+    _, store, who = server
+    go_on = Event()
+    with ThreadPoolExecutor(1) as fusing, ThreadPoolExecutor(1) as beside:
+        fusing.submit(go_on.wait, 30)
+        with TestClient(create_app(store, executor=fusing), base_url="http://localhost") as client:
+            assert client.delete("/v1/publish", headers=who["boss"]).status_code == 404, "nothing is being published"
+            asked = beside.submit(client.post, "/v1/publish", headers=who["boss"], json={})
+            try:
+                while not (running := client.get("/v1/publish", headers=who["anna"]).json()["running"]):
+                    sleep(0.01)
+                assert running == [{"by": "boss", "dry_run": False, "done": 0, "of": 2}]
+                assert client.delete("/v1/publish", headers=who["anna"]).status_code == 403, "reviewers only look"
+                assert client.delete("/v1/publish", headers=who["boss"]).json() == {"cancelled": 1}
+            finally:
+                go_on.set()
+            answer = asked.result(30)
+            assert answer.status_code == 409
+            assert answer.json()["detail"] == "cancelled by boss after 1 of 2 tiles: nothing was published"
+            assert client.get("/v1/map", headers=who["boss"]).json()["version"] == 1
+            assert client.get("/v1/publish", headers=who["boss"]).json() == {"running": []}
+            again = client.post("/v1/publish", headers=who["boss"], json={}).json()
+            assert again["published"], "the votes still stand"

@@ -50,10 +50,29 @@ async def publish_now(request: Request, ask: PublishAsk) -> Published:
     return await to_thread.run_sync(_publish, parts, ask, by, limiter=parts.threads.publishing)
 
 
+@router.get("/v1/publish", response_model=dict[str, Any], responses=problems(403), summary="How far a publish is")
+async def publishing_now(request: Request) -> dict[str, Any]:
+    """Publishes under way, and looks at what one would do: who asked, and how many tiles of how many are fused."""
+    reviewer(request)
+    rounds = services(request).publishing.now()
+    return {"running": [{"by": r.by, "dry_run": r.dry_run, "done": r.done, "of": r.of} for r in rounds]}
+
+
+@router.delete("/v1/publish", responses=problems(403, 404), summary="Cancel what is being published")
+async def cancel_publishing(request: Request) -> dict[str, int]:
+    """Every publish under way ends before its next tile with 409, and nothing of it is published."""
+    return {"cancelled": services(request).publishing.cancel(operator(request))}
+
+
 def _publish(parts: Services, ask: PublishAsk, by: str) -> Published:
-    with parts.metrics.publish_seconds.time(), _unless_stopping(parts), _told_if_held(parts, by):
+    with (
+        parts.metrics.publish_seconds.time(),
+        _unless_stopping(parts),
+        _told_if_held(parts, by),
+        parts.publishing.watched(parts.fusing, by, ask.dry_run) as executor,
+    ):
         if ask.dry_run:
-            done = preview(parts.store, parent=ask.parent, gate=parts.gate, executor=parts.fusing)
+            done = preview(parts.store, parent=ask.parent, gate=parts.gate, executor=executor)
         else:
             done = publish(
                 parts.store,
@@ -62,7 +81,7 @@ def _publish(parts: Services, ask: PublishAsk, by: str) -> Published:
                 parent=ask.parent,
                 override=ask.override,
                 gate=parts.gate,
-                executor=parts.fusing,
+                executor=executor,
             )
     for damage in (damage for fused in done.fused for damage in fused.damaged):
         structlog.get_logger("mapvote").error("quarantine", kind=damage.kind, name=damage.name, why=damage.why)

@@ -14,6 +14,7 @@ from mapvote.server.http.batching import Batcher
 from mapvote.server.http.limits import RateLimit, Uploads
 from mapvote.server.http.manifests import Manifests
 from mapvote.server.http.metrics import Metrics
+from mapvote.server.http.publishing import Publishing
 from mapvote.server.insight.clouds import Clouds
 from mapvote.server.insight.localisation_gate import gate_by
 from mapvote.server.store.admission import Intake, Sent
@@ -74,6 +75,8 @@ class Services:
     damaged: Batcher[None, list[str]]
     """What is in quarantine, in words."""
     manifests: Manifests
+    publishing: Publishing
+    """Rounds under way."""
     clouds: Clouds
     """Levels of detail for the page."""
     metrics: Metrics
@@ -112,6 +115,7 @@ def make_services(store: Store, settings: Settings, gate: Gate | None, executor:
         writable=Batcher(manifests.newest_if_writable, _READERS, threads.lookups),
         damaged=Batcher(manifests.damaged, _READERS, threads.lookups),
         manifests=manifests,
+        publishing=Publishing(),
         clouds=Clouds(store),
         metrics=Metrics(),
         limit=RateLimit(most.ballots_per_minute, max(1.0, _BURST * most.ballots_per_minute)),

@@ -6,8 +6,8 @@ A worker reads ballots from the database itself; a decision and the planes that 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Mapping, Sequence
-from concurrent.futures import Executor, ThreadPoolExecutor
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from typing import Any
@@ -152,12 +152,41 @@ def _tile(connection: sa.Connection, task: Task) -> Tile:
     return tile_as_of(connection, task.window, task.version - 1)
 
 
+class Watched(Executor):
+    """Fuses where another executor does, and tells of every tile that is done.
+
+    ``told`` is called with (tiles done, tiles in all), the first time before any; what it raises ends the round, and
+    what had not begun is never done.
+    """
+
+    def __init__(self, within: Executor, told: Callable[[int, int], None]) -> None:
+        self.within = within
+        self._told = told
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        """As the other does."""
+        return self.within.submit(fn, *args, **kwargs)
+
+    def map(
+        self, fn: Callable[..., Any], *iterables: Iterable[Any], timeout: float | None = None, chunksize: int = 1
+    ) -> Iterator[Any]:
+        """As the other does, in order."""
+        tasks = [list(some) for some in iterables]
+        of = min(map(len, tasks), default=0)
+        self._told(0, of)
+        results = self.within.map(fn, *tasks, timeout=timeout, chunksize=chunksize)
+        for done in range(1, of + 1):
+            yield next(results)
+            self._told(done, of)
+
+
 def fuse_round(tasks: Iterable[Task], database: Database, executor: Executor | None = None) -> list[Fused]:
     """Fuse every tile; results in the order of the tasks. Without an executor, one after another."""
-    if executor is None or isinstance(executor, ThreadPoolExecutor):
-        here = partial(fuse_stored, database=database)
-        return list((executor.map if executor is not None else map)(here, tasks))
-    return list(executor.map(fuse_stored, tasks))
+    where = executor.within if isinstance(executor, Watched) else executor
+    here = partial(fuse_stored, database=database)
+    if executor is None:
+        return [here(task) for task in tasks]
+    return list(executor.map(here if isinstance(where, ThreadPoolExecutor) else fuse_stored, tasks))
 
 
 def pack_states(states: U8) -> bytes:

@@ -68,6 +68,8 @@ export const desk = async () => (await ask("desk")).json();
 export const review = (asked) => send("desk/reviews", "POST", asked);
 export const takeBack = (seq) => send(`desk/reviews/${seq}`, "DELETE", undefined);
 export const publish = (asked) => send("publish", "POST", asked);
+export const publishing = async () => (await (await ask("publish")).json()).running;
+export const cancelPublish = () => send("publish", "DELETE", undefined);
 export const rollback = (asked) => send("rollback", "POST", asked);
 export const stream = async (signal) => (await ask("events", {}, { signal })).body;
 

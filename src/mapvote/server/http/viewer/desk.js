@@ -97,13 +97,23 @@ $("dry-run").onclick = () => told(async () => {
   $("difference").textContent = `It would change ${would.tiles.length} tiles: ${would.points_added} points added, ${would.points_deleted} deleted.`;
 });
 $("publish").onclick = () => confirm($("publish"), `${$("publish").textContent}: ${desk.pending.features.length} changes?`, async () => {
-  $("desk-said").textContent = "Publishing\u2026";
   await told(async () => {
-    const done = await api.publish({ parent: desk.version, override: desk.held.length > 0, reason: $("reason").value });
+    const watch = setInterval(watched, 500);
+    $("cancel").hidden = false;
+    $("desk-said").textContent = "Publishing\u2026";
+    const asked = { parent: desk.version, override: desk.held.length > 0, reason: $("reason").value };
+    const done = await api.publish(asked).finally(() => (clearInterval(watch), ($("cancel").hidden = true)));
     $("difference").textContent = `Version ${done.version} is published: ${done.points_added} points added, ${done.points_deleted} deleted.`;
   });
   state.restart?.();
 });
+
+// How far it is, while it lasts.
+async function watched() {
+  const mine = (await api.publishing().catch(() => [])).find((one) => !one.dry_run);
+  if (mine && !$("cancel").hidden) $("desk-said").textContent = `Publishing: ${mine.done} of ${mine.of} tiles`;
+}
+$("cancel").onclick = () => api.cancelPublish().catch((error) => notice(error.message));
 
 // A button that asks once more, in its own place, before it acts.
 export function confirm(button, question, action) {

@@ -1,0 +1,64 @@
+"""What is being published at this moment: how far it is, and a way to stop it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from concurrent.futures import Executor
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from threading import Lock
+
+from mapvote.server.errors import Conflict, NotFound
+from mapvote.server.store.tile_jobs import Watched
+
+
+@dataclass(slots=True)
+class Round:
+    """One publish, or one look at what it would do."""
+
+    by: str
+    dry_run: bool
+    done: int = 0
+    """Tiles fused so far."""
+    of: int = 0
+    cancelled_by: str | None = None
+
+    def told(self, done: int, of: int) -> None:
+        """Of a tile that is done. Raises Conflict, naming who, once somebody has cancelled it."""
+        self.done, self.of = done, of
+        if self.cancelled_by is not None:
+            raise Conflict(f"cancelled by {self.cancelled_by} after {done} of {of} tiles: nothing was published")
+
+
+@dataclass(frozen=True, slots=True)
+class Publishing:
+    """All rounds under way in this server; thread-safe."""
+
+    _rounds: list[Round] = field(default_factory=list)
+    _lock: Lock = field(default_factory=Lock)
+
+    @contextmanager
+    def watched(self, executor: Executor, by: str, dry_run: bool) -> Iterator[Executor]:
+        """An executor for one round, which can be seen and cancelled as long as it lasts."""
+        mine = Round(by, dry_run)
+        with self._lock:
+            self._rounds.append(mine)
+        try:
+            yield Watched(executor, mine.told)
+        finally:
+            with self._lock:
+                self._rounds.remove(mine)
+
+    def now(self) -> list[Round]:
+        """The rounds under way, oldest first."""
+        with self._lock:
+            return list(self._rounds)
+
+    def cancel(self, by: str) -> int:
+        """Stop every publish under way before its next tile; how many. What only looks goes on. NotFound if none is."""
+        stopped = [one for one in self.now() if not one.dry_run]
+        if not stopped:
+            raise NotFound("nothing is being published")
+        for one in stopped:
+            one.cancelled_by = by
+        return len(stopped)
