@@ -10,13 +10,15 @@ Needs Chromium (apt-get install chromium).
 from __future__ import annotations
 
 import argparse
+import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
-sys.path[:0] = [str(Path(__file__).parents[1] / "tests"), str(Path(__file__).parent)]
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
 from chromium import Chromium
 from hand_made import make_map
@@ -85,10 +87,10 @@ def nothing_yet(browser: Chromium, url: str) -> None:
     browser.wait("!document.querySelector('#content').hidden && document.querySelector('#tally').innerText", 60)
 
 
-def connection_lost(browser: Chromium, url: str) -> None:
+def connection_lost(process: subprocess.Popen[str], browser: Chromium, url: str) -> None:
     """The server has gone; what is shown stays."""
     of_demo(browser, url)
-    browser.call("Network.emulateNetworkConditions", offline=True, latency=0, downloadThroughput=0, uploadThroughput=0)
+    process.terminate()
     browser.wait("!document.querySelector('#offline').hidden", 60)
 
 
@@ -106,7 +108,6 @@ DEMO: list[Picture] = [
     ("page_phone", of_change, {"width": 360, "height": 740}),
     ("page_colour_blind", as_seen_without_red, {}),
     ("page_loading", while_loading, {}),
-    ("page_lost", connection_lost, {}),
 ]
 
 
@@ -132,8 +133,8 @@ def main() -> None:
     wanted = {f"page_{name}" if name != "page" else name for name in filter(None, options.only.split(","))}
     with tempfile.TemporaryDirectory() as folder:
         log = Path(folder) / "log"
-        with serving(options.store, log=log) as (url, _):
-            for picture in DEMO:
+        with serving(options.store, log=log) as (url, process):
+            for picture in [*DEMO, ("page_lost", partial(connection_lost, process), {})]:
                 if not wanted or picture[0] in wanted:
                     take(picture, url, options.to)
         others: list[tuple[Picture, Callable[[], object]]] = [
