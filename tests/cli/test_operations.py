@@ -102,5 +102,5 @@ def test_every_command_of_the_page_works_as_printed(mapvote: str, store: tuple[s
             said.append(done.stdout)
         server.terminate()
         assert server.wait(30) in (0, -15)
-    assert any("2 deleted in tiles 0,0" in text for text in said), "what was voted was published"
+    assert any("6 deleted in tiles 0,0" in text for text in said), said
     assert any("version 3 is version 1 again" in text for text in said)

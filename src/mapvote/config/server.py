@@ -10,7 +10,9 @@ from mapvote.config.section import Section
 class FuseSettings(Section):
     """fusion/fuse.py: which votes count, how many are enough. A version records the ones it was made by."""
 
-    min_votes: int = Field(default=2, ge=1, description="vehicles that a change needs: k + 1 against k liars")
+    min_votes: int = Field(
+        default=2, ge=1, le=10_000, description="vehicles that a change needs: k + 1 against k liars"
+    )
     max_contradiction: float = Field(
         default=0.5,
         gt=0,
@@ -23,15 +25,22 @@ class FuseSettings(Section):
         le=1,
         description="nor is who denies a larger share of the changes decided on the tile; 1: everyone is",
     )
-    latest_vehicles: int = Field(default=9, ge=1, description="only the last so many vehicles on a tile count")
-    max_age_days: float = Field(default=30.0, gt=0, description="and drives so much older than its newest do not")
-    min_age_s: float = Field(default=0.0, ge=0, description="a ballot waits so long before it counts (time to un-vote)")
+    latest_vehicles: int = Field(
+        default=9, ge=1, le=10_000, description="only the last so many vehicles on a tile count"
+    )
+    max_age_days: float = Field(
+        default=30.0, gt=0, le=36_500, description="and drives so much older than its newest do not"
+    )
+    min_age_s: float = Field(
+        default=0.0, ge=0, le=1e9, description="a ballot waits so long before it counts (time to un-vote)"
+    )
     stay_days: float = Field(
-        default=30.0, gt=0, description="a new thing enters the map once it can be expected to stay so long"
+        default=30.0, gt=0, le=36_500, description="a new thing enters the map once it can be expected to stay so long"
     )
     prior_stay_days: float = Field(
         default=30.0,
         ge=0,
+        le=1e6,
         description="how long what is new is expected to stay where nothing is known to come and go; less than "
         "stay_days: it must be seen for the difference first",
     )
@@ -39,7 +48,10 @@ class FuseSettings(Section):
         default=0.5, ge=0, le=1, description="hold a version that deletes more of the points of any tile"
     )
     max_change_m2: float = Field(
-        default=500.0, ge=0, description="hold a version in which one connected thing is larger that comes or goes"
+        default=500.0,
+        ge=0,
+        le=1e9,
+        description="hold a version in which one connected thing is larger that comes or goes",
     )
     max_freed_share: float = Field(
         default=0.5, ge=0, le=1, description="hold one that learns free space in more of a tile that knew of some"

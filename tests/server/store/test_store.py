@@ -30,6 +30,7 @@ from mapvote.server.store.policy import (
     current_policy,
     policy_changes,
     set_policy,
+    set_values,
 )
 from mapvote.server.store.publish import preview, publish, rollback
 from mapvote.server.store.store import Store
@@ -287,6 +288,16 @@ def test_dry_run_changes_nothing_and_a_held_version_says_why(store: Store) -> No
     assert store.current() == 1
     assert publish(store, strict, override=True, gate=lambda asked, old, new: []).published
     assert "in spite of" in store.versions()[-1].reason
+
+
+@pytest.mark.parametrize(
+    "values",
+    [{"fuse.min_votes": "1e30"}, {"fuse.max_age_days": "nan"}, {"fuse.min_age_s": "inf"}, {"gate.drive": "\0"}],
+)
+def test_a_policy_that_nobody_can_mean_is_refused(store: Store, values: dict[str, str]) -> None:
+    with pytest.raises(MapvoteError, match=next(iter(values))):
+        set_values(store, values)
+    assert current_policy(store) == Policy()
 
 
 def test_the_gate_sees_both_maps(store: Store) -> None:

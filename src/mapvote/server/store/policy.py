@@ -42,13 +42,20 @@ class RoundPolicy(Section):
 class GatePolicy(GateSettings):
     """The reference drive by which a new version is judged."""
 
-    drive: str = Field(default="", description="drive on the machine that publishes; empty: no gate")
+    drive: str = Field(
+        default="",
+        max_length=1000,
+        pattern=r"^[^\x00-\x1f]*$",
+        description="drive on the machine that publishes; empty: no gate",
+    )
 
 
 class KeepPolicy(Section):
     """What is cleared away (:mod:`mapvote.server.store.clearing`)."""
 
-    versions: int = Field(default=0, ge=0, description="older ones than the last so many may go; 0: none ever")
+    versions: int = Field(
+        default=0, ge=0, le=1_000_000, description="older ones than the last so many may go; 0: none ever"
+    )
     automatic: bool = Field(default=False, description="after every version, not only by `mapvote gc`")
 
 
