@@ -64,7 +64,9 @@ def test_info_of_a_drive_and_doctor(tmp_path: Path, run: CliRunner) -> None:
     told = invoke(run, "info", tmp_path / "d")
     for word in ("car-7", "vlp16, 16 beams, 10 Hz", "4 in 0.3 s", "prior       │ none"):
         assert word in told
-    assert "no prior" in invoke(run, "doctor", tmp_path / "d")
+    told = invoke(run, "doctor", tmp_path / "d", code=1)
+    assert "no prior" in told
+    assert "scan 1 is the same as the one before it (3 such scans of 4)" in told
     (tmp_path / "d" / "velodyne" / "000000.bin").write_bytes(b"12345")
     assert "not a multiple of 16" in invoke(run, "doctor", tmp_path / "d", code=1)
 

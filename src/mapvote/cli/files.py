@@ -9,11 +9,11 @@ import typer
 
 from mapvote.cli.options import DRIVE, MAP, DrivePath, KeyFile, Projector, Rate, Topic, with_drive_options
 from mapvote.cli.remote import is_store, is_url, map_of, overview_of
-from mapvote.cli.terminal import waiting
+from mapvote.cli.terminal import stages_that_vanish, waiting
 
 if TYPE_CHECKING:
     from mapvote.core.point_map import PointMap
-    from mapvote.formats.doctor import Finding
+    from mapvote.doctor import Finding
 
 
 def register(app: typer.Typer) -> None:
@@ -69,12 +69,16 @@ def doctor(
     """
     from rich.console import Console
 
+    from mapvote.doctor import examine
     from mapvote.formats import read_map
-    from mapvote.formats.doctor import examine
     from mapvote.formats.drives.options import DriveOptions
 
-    with waiting(f"examining {drive}"):
-        findings = examine(drive, DriveOptions(**drive_options), None if map_path is None else read_map(map_path))
+    point_map = None
+    if map_path is not None:
+        with waiting(f"reading {map_path}"):
+            point_map = read_map(map_path)
+    with stages_that_vanish() as tell:
+        findings = examine(drive, DriveOptions(**drive_options), point_map, tell)
     console = Console(soft_wrap=True, highlight=False)
     for finding in findings:
         for line in _lines(finding):

@@ -52,8 +52,9 @@ def waiting(what: str) -> Iterator[None]:
 
 
 @contextmanager
-def progress(what: str) -> Iterator[Callable[[int, int], None]]:
-    """A bar for one piece of work, told (done, in all); gone at the end. Nothing where there is no terminal."""
+def progress(what: str) -> Iterator[Callable[..., None]]:
+    """A bar for one piece of work, told (done, in all), perhaps a new name; gone at the end. Nothing where there is no
+    terminal."""
     from rich.console import Console
     from rich.markup import escape
     from rich.progress import Progress
@@ -62,8 +63,8 @@ def progress(what: str) -> Iterator[Callable[[int, int], None]]:
     with Progress(transient=True, console=console, disable=not console.is_terminal) as bar:
         task = bar.add_task(f"{escape(what)}, getting ready", total=None)
 
-        def tell(done: int, total: int) -> None:
-            bar.update(task, description=escape(what), completed=done, total=total)
+        def tell(done: int, total: int, now: str = what) -> None:
+            bar.update(task, description=escape(now), completed=done, total=total)
 
         yield tell
 
@@ -84,3 +85,10 @@ def stages() -> Iterator[Callable[[str, int, int], None]]:
             bar.update(tasks[stage], completed=done, total=total)
 
         yield tell
+
+
+@contextmanager
+def stages_that_vanish() -> Iterator[Callable[[str, int, int], None]]:
+    """One bar, told (stage, done, in all), that takes the name of each stage in turn and is gone at the end."""
+    with progress("getting ready") as tell:
+        yield lambda stage, done, total: tell(done, total, stage)

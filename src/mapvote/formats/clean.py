@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from dataclasses import dataclass, field
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -56,8 +57,8 @@ class RawScan:
     time_s: F32 | None = None
     """(n,) relative to the stamp."""
     ring: NDArray[np.number] | None = None
-    no_return: NDArray[np.bool_] | None = None
-    """(n,) rays that hit nothing."""
+    zero_is_no_return: bool = False
+    """Points that are not finite or (0, 0, 0) are rays that hit nothing."""
 
 
 def clean_scan(where: str, raw: RawScan, sensor: Sensor, bad_points: BadPoints) -> Scan:
@@ -66,21 +67,20 @@ def clean_scan(where: str, raw: RawScan, sensor: Sensor, bad_points: BadPoints) 
     Dropped in silence, because the format says so: rays without return, and points nearer than the sensor can measure.
     Dropped and counted: not finite, or beyond 2 km. MapvoteError if these are more than 5 %, or if nothing is left.
     """
-    points = raw.points
-    x, y, z = (points[:, axis].astype(np.float64) for axis in range(3))
-    distance = np.sqrt(x * x + y * y + z * z)
-    measured = np.ones(len(points), dtype=bool) if raw.no_return is None else ~raw.no_return
-    good = distance < FAR_M  # False for NaN too
-    bad = int((measured & ~good).sum())
-    if bad > MAX_BAD_SHARE * max(int(measured.sum()), 1):
+    points, near_m = raw.points, sensor.min_range_m - 5.0 * sensor.range_sigma_m
+    kept, measured, bad = _sort_out(np.ascontiguousarray(points), raw.zero_is_no_return, near_m, FAR_M)
+    if bad > MAX_BAD_SHARE * max(measured, 1):
         raise MapvoteError(
-            f"{where}: {bad} of {int(measured.sum())} points are not finite or beyond {FAR_M:.0f} m, more than "
-            f"{MAX_BAD_SHARE:.0%}: {_likely_cause(distance[measured])}"
+            f"{where}: {bad} of {measured} points are not finite or beyond {FAR_M:.0f} m, more than "
+            f"{MAX_BAD_SHARE:.0%}: {_likely_cause(points)}"
         )
     bad_points.count(raw.index, bad)
-    keep = measured & good & (distance >= sensor.min_range_m - 5.0 * sensor.range_sigma_m)
-    if not keep.any():
-        raise MapvoteError(f"{where}: no usable point among {len(points)}; leave this scan out with --scans")
+    if len(kept) == 0:
+        raise MapvoteError(
+            f"{where}: no usable point among {len(points)}, all nearer than {near_m:.1f} m: are they metres? "
+            "Else leave this scan out with --scans"
+        )
+    keep = slice(None) if len(kept) == len(points) else kept
     return Scan(
         stamp_ns=raw.stamp_ns,
         points=np.ascontiguousarray(points[keep], dtype=np.float32),
@@ -90,7 +90,29 @@ def clean_scan(where: str, raw: RawScan, sensor: Sensor, bad_points: BadPoints) 
     )
 
 
-def _likely_cause(distance: NDArray[np.float64]) -> str:
+@numba.njit(cache=True, nogil=True)
+def _sort_out(
+    points: NDArray[np.floating], zero_is_no_return: bool, near_m: float, far_m: float
+) -> tuple[I64, int, int]:
+    """(indices of the usable points (n, 3), how many were measured, how many of these are no measurements)."""
+    kept = np.empty(len(points), dtype=np.int64)
+    n, measured, bad = 0, 0, 0
+    for i in range(len(points)):
+        x, y, z = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
+        squared = x * x + y * y + z * z
+        if zero_is_no_return and (squared == 0.0 or not np.isfinite(squared)):
+            continue
+        measured += 1
+        if not squared < far_m * far_m:  # True for NaN too
+            bad += 1
+        elif squared >= near_m * abs(near_m):
+            kept[n] = i
+            n += 1
+    return kept[:n], measured, bad
+
+
+def _likely_cause(points: F32) -> str:
+    distance = np.linalg.norm(points.astype(np.float64), axis=1)
     finite = distance[np.isfinite(distance)]
     farthest = float(np.quantile(finite, 0.99)) if len(finite) else 0.0
     if len(finite) > 0.9 * len(distance) and FAR_M < farthest < 300_000.0:
@@ -101,10 +123,21 @@ def _likely_cause(distance: NDArray[np.float64]) -> str:
 
 def unit_intensity(intensity: NDArray[np.number]) -> F32:
     """Intensity in [0, 1]: 8-bit values (any above 1) are divided by 255 and cut there; not a number becomes 0."""
-    out = np.nan_to_num(intensity.astype(np.float32), nan=0.0, posinf=0.0, neginf=0.0)
-    if len(out) and float(out.max()) > 1.0:
-        out = out / np.float32(255.0)
-    return np.clip(out, 0.0, 1.0)
+    return _unit(np.ascontiguousarray(intensity, dtype=np.float32))
+
+
+@numba.njit(cache=True, nogil=True)
+def _unit(intensity: F32) -> F32:
+    out = np.empty_like(intensity)
+    scale = np.float32(1.0)
+    for value in intensity:
+        if value > 1.0 and np.isfinite(value):
+            scale = np.float32(255.0)
+            break
+    for i in range(len(intensity)):
+        value = intensity[i] / scale
+        out[i] = min(max(value, np.float32(0.0)), np.float32(1.0)) if np.isfinite(value) else np.float32(0.0)
+    return out
 
 
 def spinning_time_s(points: F32, rate_hz: float, *, clockwise: bool = True) -> F32:

@@ -45,7 +45,6 @@ def scan_from_fields(
     time_s = None if time is None else point_times_s(f"{where}: {time}", table[time], stamp_ns, sensor)
     if time_s is None and spinning:
         time_s = spinning_time_s(points.astype(np.float32), sensor.rate_hz, clockwise=sensor.clockwise)
-    no_return = ~np.isfinite(points).all(axis=1) | (points == 0).all(axis=1)
     raw = RawScan(
         index,
         stamp_ns,
@@ -53,7 +52,7 @@ def scan_from_fields(
         intensity=None if intensity is None else table[intensity].astype(np.float32),
         time_s=time_s,
         ring=None if ring is None else table[ring],
-        no_return=no_return if zero_is_no_return else None,
+        zero_is_no_return=zero_is_no_return,
     )
     return clean_scan(where, raw, sensor, bad_points)
 

@@ -1,0 +1,126 @@
+"""The doctor's round of one drive: cheap looks at every scan, then what registration measures."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import numpy as np
+
+from mapvote.core.types import F32, F64, Drive, MapvoteError
+from mapvote.doctor.finding import Finding, in_order
+from mapvote.doctor.frames import check_agreement, check_scan_motion, in_map_frame
+from mapvote.doctor.looks import Looks, look_at_all
+from mapvote.doctor.motion import Run, follow, starts_of_runs
+from mapvote.doctor.prior import check_prior, check_times
+from mapvote.doctor.road import Road, find_road
+from mapvote.doctor.scans import check_scans
+from mapvote.formats import open_drive
+from mapvote.formats.drives.options import DriveOptions
+
+Progress = Callable[[str, int, int], None]
+"""Told (stage, done, in all)."""
+_ROAD_SCANS = 7
+
+
+def open_for_examination(path: Path, options: DriveOptions) -> tuple[Drive | None, list[Finding]]:
+    """(the drive, what stopped it from opening as it is): a broken prior hides nothing else."""
+    try:
+        return open_drive(path, **asdict(options)), []
+    except MapvoteError as error:
+        found = [Finding("error", str(error))]
+    try:
+        return open_drive(path, **asdict(replace(options, prior="none"))), found
+    except MapvoteError:
+        return None, found
+
+
+def cheap_checks(drive: Drive, progress: Progress | None = None) -> tuple[list[Finding], Looks]:
+    """What shows without registering a scan; every file is looked at."""
+    looks = look_at_all(drive, None if progress is None else lambda done, n: progress("looking at scans", done, n))
+    T = drive.T_map_lidar_prior
+    if T is not None and len(looks.index) and in_map_frame(T, looks):
+        what = "the points are in the map's frame already: they move along with the prior"
+        mend = "give them in the sensor's frame: p_lidar = inverse(T_map_lidar) p_map, one pose a scan"
+        return [Finding("error", what, mend)], looks
+    found = check_times(drive) + check_scans(drive, looks)
+    return found + (check_prior(drive) if len(drive) >= 2 else []), looks
+
+
+def examine_drive(
+    path: Path, options: DriveOptions | None = None, progress: Progress | None = None
+) -> tuple[list[Finding], Drive | None, F64 | None]:
+    """(findings, errors first; the drive; its poses as they would be mended), of the drive at ``path``."""
+    drive, found = open_for_examination(path, options or DriveOptions())
+    if drive is None:
+        return found, None, None
+    more, looks = cheap_checks(drive, progress)
+    if found:  # the prior could not be read: that there is none, goes without saying
+        more = [f for f in more if not f.what.startswith("no prior")]
+    found += more
+    T = drive.T_map_lidar_prior
+    if not any(f.severity == "error" and "map's frame already" in f.what for f in found) and len(looks.index) > 2:
+        more, T = measure(drive, looks, progress)
+        found += more
+    return in_order(found), drive, T
+
+
+def measure(drive: Drive, looks: Looks, progress: Progress | None = None) -> tuple[list[Finding], F64 | None]:
+    """(what registration finds, the prior as it would be mended)."""
+    T = drive.T_map_lidar_prior
+    usable = np.flatnonzero(np.isin(np.arange(len(drive)), looks.index))
+    some = usable[np.linspace(0, len(usable) - 1, min(len(usable), _ROAD_SCANS)).astype(np.int64)]
+    road = find_road([drive.read_scan(int(i)).points for i in some])
+    found = _check_road(road, T, some.tolist())
+    median_m = float(np.median(looks.range_m[:, 1]))
+    if not 1.5 <= median_m <= 150.0 or road.up != "+z":
+        return found, T  # whatever else seems wrong may be its consequence
+
+    def read(i: int) -> F32:
+        return drive.read_scan(int(usable[i])).points
+
+    starts = starts_of_runs(len(usable), None if T is None else T[usable])
+    runs = []
+    for k, start in enumerate(starts):
+        run = follow(read, int(start), len(usable), road)
+        runs.append(Run(usable[run.indices], run.T_first_lidar, run.fit))
+        if progress is not None:
+            progress("registering scans", k + 1, len(starts))
+    found += check_scan_motion(drive, runs)
+    if T is None or (any(f.severity == "error" for f in found[-1:]) and "fit" in found[-1].what):
+        return found, T
+    more, mended = check_agreement(drive, T, runs, road, float(np.median(looks.turns)))
+    return found + more, mended
+
+
+def _check_road(road: Road, T: F64 | None, indices: list[int]) -> list[Finding]:
+    if road.up == "-z":
+        what = f"the sensor is upside down: the road lies {road.depth_m:.1f} m above it (z points down)"
+        mend = "negate y and z of every point (or only z, if right and left are right already)"
+        return [Finding("error", what, mend)]
+    if road.up != "+z":
+        what = f"the points' axis {road.up} points up (the road lies {road.depth_m:.1f} m along its opposite), not z"
+        mend = "turn the points to x forward, y left, z up (camera axes are x right, y down, z forward)"
+        return [Finding("error", what, mend)]
+    found = []
+    if road.share < 0.1:
+        what = f"no road lies below the sensor (the fullest layer holds {road.share:.0%} of the near points)"
+        mend = "are the lower beams missing, the points cut, or z measured from elsewhere?"
+        return [Finding("warning", what, mend)]
+    found.append(Finding("note", f"by the scans themselves the sensor stands {road.depth_m:.1f} m over the road"))
+    if road.depth_m < 0.5:
+        what = f"the road lies only {road.depth_m:.1f} m below the points' origin"
+        found.append(Finding("warning", what, "are the points in the vehicle's frame? Give them in the sensor's"))
+    if road.scatter_m > 0.12:
+        what = f"the road is {road.scatter_m:.2f} m rough: the ranges scatter, or times or calibration are wrong"
+        found.append(Finding("warning", what, "sound sensors show 0.01 to 0.05 m"))
+    normal = road.normal if T is None else np.mean([T[i, :3, :3] @ road.normal for i in indices], axis=0)
+    tilt_deg = float(np.degrees(np.arccos(np.clip(normal[2] / np.linalg.norm(normal), -1.0, 1.0))))
+    if T is not None and tilt_deg > 4.0:
+        pitch, roll = np.degrees(np.arcsin(-road.normal[0])), np.degrees(np.arcsin(road.normal[1]))
+        own = f"in the scans: pitch {pitch:.1f}, roll {roll:.1f}"
+        what = f"by prior and scans the road is tilted by {tilt_deg:.1f} deg ({own})"
+        mend = "level the points by that, or put the sensor's tilt into the prior's rotations; on a hill all is well"
+        found.append(Finding("error" if tilt_deg > 8.0 else "warning", what, mend))
+    return found

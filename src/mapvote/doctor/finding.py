@@ -1,0 +1,24 @@
+"""What the doctor says."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Literal
+
+Severity = Literal["error", "warning", "note"]
+_ORDER = {"error": 0, "warning": 1, "note": 2}
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """``error``: it cannot be used so. ``warning``: results will suffer. ``note``: worth knowing."""
+
+    severity: Severity
+    what: str
+    mend: str = ""
+
+
+def in_order(found: Iterable[Finding]) -> list[Finding]:
+    """Errors first; the same said once."""
+    return sorted(dict.fromkeys(found), key=lambda f: _ORDER[f.severity])

@@ -1,0 +1,148 @@
+"""One look at every scan of a drive: a few numbers each, cheap enough for all of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from mapvote.core.types import F32, F64, I64, Drive, MapvoteError
+
+SECTORS = 36
+_POINTS = 12_000
+"""Points of a scan that are looked at."""
+_BINS, _BIN_M = 400, 0.5
+QUANTA_M = (1.0, 0.5, 0.25, 0.1, 0.05, 0.02)
+"""Steps to which coordinates may have been rounded."""
+
+
+@dataclass(frozen=True, slots=True)
+class Looks:
+    """Of every scan that could be read, one row; the others are in ``refused``."""
+
+    index: I64
+    """(m,) which scan."""
+    count: I64
+    """(m,) points."""
+    low: F64
+    """(m, 3) least coordinate along each axis."""
+    high: F64
+    """(m, 3)."""
+    mean: F64
+    """(m, 3)."""
+    range_m: F64
+    """(m, 3) ranges from the origin: of a tenth, half and 99 % of the points."""
+    sectors: F64
+    """(m, 36) share of the points in each ten degrees of azimuth, from -180 deg."""
+    near: F64
+    """(m,) share within 2 m of the origin."""
+    unit: F64
+    """(m, 3) share of each coordinate that lies in [0, 1]."""
+    rounded: F64
+    """(m, 6) share of the points whose x, y and z are multiples of QUANTA_M."""
+    turns: F64
+    """(m,) how often the points, in their order, go round counter-clockwise."""
+    print_: F64
+    """(m,) a number that two different scans hardly share."""
+    has_times: bool
+    has_intensity: bool
+    refused: dict[int, str]
+    """Why a scan could not be read."""
+
+
+def look_at_all(drive: Drive, progress: Callable[[int, int], None] | None = None) -> Looks:
+    """Every scan of the drive read once. ``progress`` is told (done, in all)."""
+    rows: list[F64] = []
+    counts: list[int] = []
+    index: list[int] = []
+    refused: dict[int, str] = {}
+    times = intensity = False
+    for i in range(len(drive)):
+        try:
+            scan = drive.read_scan(i)
+        except MapvoteError as error:
+            refused[i] = str(error)
+        else:
+            rows.append(_look(scan.points, max(1, len(scan.points) // _POINTS), np.array(QUANTA_M)))
+            counts.append(len(scan.points))
+            index.append(i)
+            times |= scan.time_s is not None
+            intensity |= scan.intensity is not None
+        if progress is not None:
+            progress(i + 1, len(drive))
+    table: NDArray[np.float64] = np.array(rows).reshape(len(rows), -1 if rows else _WIDTH)
+    parts = np.split(table, np.cumsum(_PARTS)[:-1], axis=1)
+    low, high, mean, range_m, sectors, near, unit, rounded, turns, print_ = parts
+    return Looks(
+        np.array(index, dtype=np.int64),
+        np.array(counts, dtype=np.int64),
+        low,
+        high,
+        mean,
+        range_m,
+        sectors,
+        near[:, 0],
+        unit,
+        rounded,
+        turns[:, 0],
+        print_[:, 0],
+        times,
+        intensity,
+        refused,
+    )
+
+
+_PARTS = (3, 3, 3, 3, SECTORS, 1, 3, len(QUANTA_M), 1, 1)
+_WIDTH = sum(_PARTS)
+
+
+@numba.njit(cache=True, nogil=True)
+def _look(points: F32, stride: int, quanta: F64) -> F64:
+    """One row of :class:`Looks`, its parts one after the other; every ``stride``-th of the points (n, 3)."""
+    low, high, total = np.full(3, np.inf), np.full(3, -np.inf), np.zeros(3)
+    sectors, ranges, unit, rounded = np.zeros(36), np.zeros(_BINS), np.zeros(3), np.zeros(len(quanta))
+    near, turns, before, print_, n = 0.0, 0.0, 0.0, 0.0, 0
+    for i in range(0, len(points), stride):
+        squared = 0.0
+        for axis in range(3):
+            v = np.float64(points[i, axis])
+            low[axis], high[axis] = min(low[axis], v), max(high[axis], v)
+            total[axis] += v
+            squared += v * v
+            unit[axis] += 0.0 <= v <= 1.0
+        distance = np.sqrt(squared)
+        ranges[min(int(distance / _BIN_M), _BINS - 1)] += 1.0
+        near += distance < 2.0
+        azimuth = np.arctan2(np.float64(points[i, 1]), np.float64(points[i, 0]))
+        sectors[int((azimuth + np.pi) / (2.0 * np.pi) * 36.0) % 36] += 1.0
+        step = azimuth - before
+        step -= 2.0 * np.pi * np.round(step / (2.0 * np.pi))
+        if n > 0 and abs(step) < 1.0:
+            turns += step / (2.0 * np.pi)
+        before = azimuth
+        for k in range(len(quanta)):
+            whole = True
+            for axis in range(3):
+                v = np.float64(points[i, axis]) / quanta[k]
+                whole = whole and abs(v - np.round(v)) < 1e-3
+            rounded[k] += whole
+        print_ += (n % 97 + 1.0) * distance
+        n += 1
+    out = np.empty(3 + 3 + 3 + 3 + 36 + 1 + 3 + len(quanta) + 1 + 1)
+    share = 1.0 / max(n, 1)
+    out[0:3], out[3:6], out[6:9] = low, high, total * share
+    seen, wanted = 0.0, 0
+    for k in range(_BINS):
+        seen += ranges[k]
+        while wanted < 3 and seen >= (0.1 * n if wanted == 0 else 0.5 * n if wanted == 1 else 0.99 * n):
+            out[9 + wanted] = (k + 0.5) * _BIN_M
+            wanted += 1
+    out[12:48] = sectors * share
+    out[48] = near * share
+    out[49:52] = unit * share
+    out[52 : 52 + len(quanta)] = rounded * share
+    out[-2], out[-1] = turns, print_
+    return out

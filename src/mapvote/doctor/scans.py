@@ -1,0 +1,148 @@
+"""What one look at every scan shows: cut off, empty, doubled, half missing, columns or units mistaken."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy import ndimage
+
+from mapvote.core.types import Drive
+from mapvote.doctor.finding import Finding
+from mapvote.doctor.looks import QUANTA_M, SECTORS, Looks
+
+_CUT_SHARE = 0.6
+"""A scan with fewer points than this share of its neighbours' is cut off."""
+_EMPTY_SECTOR = 0.05
+"""A sector with less than this share of an even one's points is empty."""
+
+
+def check_scans(drive: Drive, looks: Looks) -> list[Finding]:
+    """Everything that shows without registering anything; of every scan."""
+    found = _refused(drive, looks)
+    if len(looks.index) == 0:
+        return found
+    units = _units(looks)
+    columns = _columns(looks)
+    found += columns or units
+    found += _counts(drive, looks) + _doubled(looks) + _body(looks)
+    found += [] if columns or units else _sectors(drive, looks) + _reach(looks)
+    found += _rounded(looks)
+    if not looks.has_times:
+        what = "points carry no times: scans are taken as motion-compensated"
+        found.append(Finding("note", what, "if they are not, set motion_compensated = false in drive.toml"))
+    if not looks.has_intensity:
+        found.append(Finding("note", "no intensity field", "the method does not need it"))
+    return found
+
+
+def _refused(drive: Drive, looks: Looks) -> list[Finding]:
+    if not looks.refused:
+        return []
+    i, why = min(looks.refused.items())
+    others = f" (and {len(looks.refused) - 1} more of {len(drive)} scans)" if len(looks.refused) > 1 else ""
+    mend = ""
+    if "not finite or beyond" in why and drive.T_map_lidar_prior is not None:
+        place = drive.T_map_lidar_prior[i, :3, 3]
+        if np.linalg.norm(place) > 2000.0:
+            mend = "are the points in the map's frame already? Then take them back: p_lidar = inverse(T_map_lidar) p"
+    return [Finding("error", why + others, mend)]
+
+
+def _columns(looks: Looks) -> list[Finding]:
+    """A coordinate that is something else: an intensity, a constant."""
+    found = []
+    unit = np.median(looks.unit, axis=0)
+    spread = np.median(looks.high - looks.low, axis=0)
+    for axis, name in enumerate("xyz"):
+        if spread[axis] == 0.0:
+            what = f"{name} is {looks.low[0, axis]:g} in every point: the scans are flat"
+            found.append(Finding("error", what, "a 3D LiDAR is needed; is the column order x, y, z? (--columns)"))
+        elif unit[axis] > 0.98:
+            what = f"{name} lies within [0, 1] in {unit[axis]:.0%} of the points: it looks like an intensity"
+            found.append(Finding("error", what, "name the columns in their order: --columns x,y,z,intensity"))
+        elif np.median(looks.low[:, axis]) >= 0.0 and np.median(looks.rounded[:, 0]) < 0.9:
+            what = f"{name} is never negative: no LiDAR sees to one side only, or nothing below itself"
+            found.append(Finding("error", what, "is it a range, an intensity, an absolute value? Check --columns"))
+    return found
+
+
+def _units(looks: Looks) -> list[Finding]:
+    median_m = float(np.median(looks.range_m[:, 1]))
+    if median_m > 150.0 or np.isinf(median_m):
+        what = f"points are {median_m:.0f} m away in the median: no LiDAR in a street sees so"
+        mend = "convert the points to metres (they look like centimetres), or are they in the map's frame?"
+        return [Finding("error", what, mend)]
+    if median_m < 1.5:
+        what = f"points are {median_m:.2f} m away in the median"
+        return [Finding("error", what, "convert the points to metres, or mask the vehicle's own body")]
+    return []
+
+
+def _counts(drive: Drive, looks: Looks) -> list[Finding]:
+    found = []
+    usual = float(np.median(looks.count))
+    around = ndimage.median_filter(looks.count, size=9, mode="nearest")
+    cut = np.flatnonzero(looks.count < _CUT_SHARE * around)
+    if len(cut):
+        k = int(cut[np.argmin(looks.count[cut] / around[cut])])
+        what = f"scan {looks.index[k]} holds {looks.count[k]} points, those around it {around[k]:.0f}: cut off?"
+        more = f" ({len(cut)} such scans)" if len(cut) > 1 else ""
+        found.append(Finding("error", what + more, "copy it again, or leave it out with --scans"))
+    if usual < 0.1 * drive.sensor.beams * drive.sensor.azimuths or usual < 1500:
+        what = f"{usual:.0f} points a scan, few for a {drive.sensor.name}"
+        found.append(Finding("warning", what, "is it another sensor (--sensor), or a down-sampled recording?"))
+    return found
+
+
+def _doubled(looks: Looks) -> list[Finding]:
+    same = np.flatnonzero((np.diff(looks.print_) == 0.0) & (np.diff(looks.count) == 0))
+    if not len(same):
+        return []
+    what = f"scan {looks.index[same[0] + 1]} is the same as the one before it"
+    more = f" ({len(same)} such scans of {len(looks.index)})" if len(same) > 1 else ""
+    return [Finding("error", what + more, "the recording stood still or was written twice: leave the copies out")]
+
+
+def _body(looks: Looks) -> list[Finding]:
+    own = float(np.median(looks.near))
+    if own <= 0.05 or np.median(looks.range_m[:, 1]) < 1.5:
+        return []
+    what = f"{own:.0%} of the points are within 2 m of the sensor: the vehicle's own body?"
+    return [Finding("warning", what, "mask it: it would be mapped as a wall that follows the car")]
+
+
+def _sectors(drive: Drive, looks: Looks) -> list[Finding]:
+    """Directions in which hardly any scan sees anything, and scans that lack what the others see."""
+    mean = looks.sectors.mean(axis=0)
+    empty = mean * SECTORS < _EMPTY_SECTOR
+    found = []
+    blind_deg = 360.0 / SECTORS * int(empty.sum())
+    if blind_deg >= 60.0:
+        first = int(np.argmax(empty & ~np.roll(empty, 1)))
+        start = -180.0 + 10.0 * first
+        what = f"nothing is seen over {blind_deg:.0f} deg of azimuth (from {start:.0f} deg counter-clockwise)"
+        mend = "part of every revolution is missing? Sound only for a sensor that sees no more, or is hidden there"
+        found.append(Finding("warning" if drive.sensor.rings else "note", what, mend))
+    seen = mean * SECTORS > 0.3
+    lost = ((looks.sectors < _EMPTY_SECTOR * mean) & seen).sum(axis=1) * 10.0
+    bad = np.flatnonzero(lost >= 60.0)
+    if len(bad) and len(bad) < 0.5 * len(lost):
+        k = int(bad[np.argmax(lost[bad])])
+        what = f"scan {looks.index[k]} lacks {lost[k]:.0f} deg of azimuth that the others see ({len(bad)} such scans)"
+        found.append(Finding("error", what, "packets were lost, or the file is cut off: leave these scans out"))
+    return found
+
+
+def _reach(looks: Looks) -> list[Finding]:
+    far_m = float(np.median(looks.range_m[:, 2]))
+    if far_m >= 15.0:
+        return []
+    what = f"99 % of the points lie within {far_m:.0f} m"
+    return [Finding("warning", what, "cut to a small range? Votes need what stands beside the road, 20 m and more")]
+
+
+def _rounded(looks: Looks) -> list[Finding]:
+    for k, quantum in enumerate(QUANTA_M):
+        if np.median(looks.rounded[:, k]) > 0.95 and quantum >= 0.05:
+            what = f"coordinates are rounded to {quantum:g} m"
+            return [Finding("error" if quantum > 0.2 else "warning", what, "write them in millimetres or as float32")]
+    return []
