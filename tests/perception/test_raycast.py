@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 
 from mapvote.core.grid import CELL_SIZE, Grid, Lattice
 from mapvote.core.types import Reference
-from mapvote.perception.raycast import CLEARANCE_M, FANS, Sight, cast_rays, find_obstacles
+from mapvote.perception.fans import FANS
+from mapvote.perception.raycast import CLEARANCE_M, Sight, cast_rays, find_obstacles
 
 SIDE = 61
 """Cells of the small window: 18.3 m."""
@@ -239,3 +240,14 @@ def test_the_middle_of_a_fan_is_the_mean_of_its_rays() -> None:
         np.array([[*along(128, np.array([40.0]))[0], 1.0]]), origin, np.ones(1, bool), np.zeros(1, bool), reference
     )
     np.testing.assert_array_equal(view.passed, middle.passed)
+
+
+def test_without_sight_the_same_voxels_are_passed() -> None:
+    rng, reference, origin = np.random.default_rng(4), wide_reference(), np.array([0.1, -0.2, 1.8])
+    points = origin + rng.normal(size=(4000, 3)) * [20.0, 20.0, 1.0]
+    mask, none = points[:, 2] > 0.3, np.zeros(len(points), bool)
+    with_sight = cast_rays(points, origin, mask, none, reference)
+    without = cast_rays(points, origin, mask, none, reference, with_sight=False)
+    np.testing.assert_array_equal(with_sight.passed, without.passed)
+    assert with_sight.sight.any()
+    assert without.sight.size == 0

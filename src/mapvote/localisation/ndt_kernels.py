@@ -141,7 +141,7 @@ def _sum_block(points: F32, of: F32, first: int, last: int, R: F32, d: F32, sums
     m00, m01, m02, m03, m04, m05, m11, m12 = zero, zero, zero, zero, zero, zero, zero, zero
     m13, m14, m15, m22, m23, m24, m25 = zero, zero, zero, zero, zero, zero, zero
     m33, m34, m35, m44, m45, m55 = zero, zero, zero, zero, zero, zero
-    for i in range(first, last):
+    for i in range(np.uint64(first), np.uint64(last)):  # unsigned: an index that cannot be negative vectorises
         x, y, z = points[0, i], points[1, i], points[2, i]
         px = R[0, 0] * x + R[0, 1] * y + R[0, 2] * z
         py = R[1, 0] * x + R[1, 1] * y + R[1, 2] * z

@@ -130,9 +130,18 @@ class Frontend:
     default the same window. ``localise`` and ``movers`` as above, with a state of their own: fresh ones for each drive.
     """
 
-    def __init__(self, localise: Localise, movers: Movers, ground: LocalMap, compared: LocalMap | None = None) -> None:
+    def __init__(
+        self,
+        localise: Localise,
+        movers: Movers,
+        ground: LocalMap,
+        compared: LocalMap | None = None,
+        *,
+        with_sight: bool = True,
+    ) -> None:
         self.report = DriveReport()
         self._localise, self._movers, self._ground, self._compared = localise, movers, ground, compared
+        self._with_sight = with_sight
         self._waiting: deque[PlacedScan] = deque()
         self._ended = False
 
@@ -190,6 +199,8 @@ class Frontend:
             with self.report.timed("see"):
                 reference = scan.reference if self._compared is None else self._compared.at(scan.origin_map)[0]
                 cell = scan.cell if self._compared is None else None
-                view = cast_rays(scan.points_map, scan.origin_map, scan.obstacle, moving, reference, cell)
+                view = cast_rays(
+                    scan.points_map, scan.origin_map, scan.obstacle, moving, reference, cell, self._with_sight
+                )
             out.append(Observation(scan, moving, view, reference))
         return out

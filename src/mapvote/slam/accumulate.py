@@ -55,7 +55,9 @@ class Layer:
         """Enter every registered scan of one drive at its pose (n, 4, 4). ``count`` is called after each scan read."""
         mapping = self.settings.mapping
         movers = MovingFilter(drive.sensor, self.settings.moving.model_copy(update={"reach_m": mapping.reach_m}))
-        frontend = Frontend(GivenPoses(drive.stamps_ns, T_map_lidar), movers, self._around, self._near)
+        frontend = Frontend(
+            GivenPoses(drive.stamps_ns, T_map_lidar), movers, self._around, self._near, with_sight=False
+        )
         self._driven.append(T_map_lidar[registered, :3, 3])
         for i, scan in enumerate(drive):
             if registered[i]:
