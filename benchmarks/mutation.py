@@ -53,6 +53,7 @@ TESTS = {
     "detection/counters.py": ["detection/test_counters.py"],
     "detection/columns.py": ["detection/test_columns.py", "detection/test_voters.py"],
     "detection/regions.py": ["detection/test_regions.py", "detection/test_columns.py", "detection/test_voters.py"],
+    "perception/fans.py": ["perception/test_raycast.py"],
     "perception/raycast.py": ["perception/test_raycast.py"],
     "localisation/tracker.py": ["localisation/test_tracker.py"],
     "localisation/trust.py": ["localisation/test_trust.py"],
