@@ -196,6 +196,15 @@ def test_added_points_are_counted_and_judged_by_what_stands_now() -> None:
     assert scores.added_false == 0.5, "two of four lie on nothing"
 
 
+def test_a_point_just_within_reach_of_a_surface_lies_on_it() -> None:
+    added = np.array([[5.0, 0.0, 0.0]])
+    scores = MapJudge(np.zeros((0, 3)), np.zeros((0, 3)), added, np.zeros((0, 3)), reach_m=0.5).score(added + 0.5 * X)
+    assert (scores.new_added, scores.added_false) == (1.0, 0.0)
+
+
+X = np.array([[1.0, 0.0, 0.0]])
+
+
 def test_an_old_point_survives_only_bit_for_bit() -> None:
     old = np.array([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]])
     new = np.array([[np.nextafter(1.0, 2.0), 2.0, 3.0], [4.0, 5.0, 6.0], [7.0, 8.0, 9.0]])
