@@ -74,10 +74,12 @@ VERBS = {
     "evaluate tiny.toml --json new": "import mapvote.evaluation.evaluate as m; m.evaluate = wait",
     "warmup": "import mapvote.warmup as m; m.warm_up = wait",
     "follow http://localhost:9 new --autoware": "import mapvote.client as m; m.MapClient.newest = wait",
-    "policy STORE": "import mapvote.server.store.policy as m; m.policy_changes = wait; m.current_policy = wait",
+    "policy STORE": "import mapvote.server.store.policy as m; m.policy_told = wait",
     "rollback STORE 1": "import mapvote.server.store.publish as m; m.rollback = wait",
     "unvote STORE car_1": "import mapvote.server.store.ballots as m; m.withdraw = wait",
     "check STORE --mend": "import mapvote.server.store.check as m; m.check = wait",
+    "explain STORE 3.2 3.2": "import mapvote.server.insight.explain as m; m.explain_cell = wait",
+    "gc STORE --yes": "import mapvote.server.store.clearing as m; m.clear = wait",
     "upgrade STORE": "import mapvote.server.store.migrate as m; m.upgrade = wait",
     "keys STORE": "import mapvote.server.store.keys as m; m.listed = wait",
 }
