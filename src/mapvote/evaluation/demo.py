@@ -248,7 +248,7 @@ def report_page(
                 f"The first map lies {100 * result.map_shift.mean_m:.1f} cm from the truth on average; "
                 "the scores include what that costs at the borders of cells.",
             ],
-            [drawn["table_iv"]],
+            [drawn["table_iv"], drawn["classes"], drawn["bytes"]],
             every,
         ),
         beside_the_paper(result),

@@ -10,6 +10,7 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Polygon
+from matplotlib.ticker import LogLocator, NullLocator
 from scipy import ndimage
 
 from mapvote.core.grid import CELL_SIZE, Grid
@@ -215,6 +216,9 @@ def byte_bars(cases: Mapping[str, CaseResult], names: Mapping[str, str]) -> Figu
         values = [np.mean(getattr(cases[case], field) or [np.nan]) / 1000 for case in shown]
         axis.bar(np.arange(len(shown)) + 0.4 * (k - 0.5), values, width=0.38, color=colour, label=label)
     axis.set_yscale("log")
+    axis.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axis.yaxis.set_major_formatter("{x:g}")
+    axis.yaxis.set_minor_locator(NullLocator())
     axis.set_ylabel("kB a vehicle")
     axis.set_xticks(range(len(shown)), [names.get(case, case).replace(", ", ",\n") for case in shown])
     axis.spines[["top", "right"]].set_visible(False)
