@@ -9,8 +9,8 @@ from collections.abc import Iterator
 
 import numpy as np
 import sqlalchemy as sa
+import zstandard
 from alembic import op
-from backports import zstd
 
 revision = "0004"
 down_revision = "0003"
@@ -74,14 +74,14 @@ def _free(connection: sa.Connection, digest: str | None) -> np.ndarray:
 
 def _load(connection: sa.Connection, digest: str) -> bytes:
     found = connection.execute(sa.text("SELECT data FROM blobs WHERE hash = :hash"), {"hash": digest}).scalar_one()
-    return zstd.decompress(bytes(found))
+    return zstandard.ZstdDecompressor().decompressobj().decompress(bytes(found))
 
 
 def _store(connection: sa.Connection, raw: bytes) -> str:
     digest = hashlib.sha256(raw).hexdigest()
     known = connection.execute(sa.text("SELECT 1 FROM blobs WHERE hash = :hash"), {"hash": digest}).first()
     if known is None:
-        about = {"hash": digest, "data": zstd.compress(raw, 3)}
+        about = {"hash": digest, "data": zstandard.ZstdCompressor(level=3).compress(raw)}
         connection.execute(sa.text("INSERT INTO blobs (hash, data) VALUES (:hash, :data)"), about)
     return digest
 
