@@ -18,6 +18,7 @@ from mapvote.cli import app
 from mapvote.cli.options import DRIVE_OPTIONS
 from mapvote.cli.terminal import print_table
 from mapvote.formats import open_drive
+from mapvote.formats.drives.options import SaidOfDrive
 
 VERBS = sorted(get_command(app).commands)  # type: ignore[attr-defined]
 
@@ -67,7 +68,8 @@ def test_a_shell_can_complete(shell: str) -> None:
 
 
 def test_drive_options_are_those_of_open_drive() -> None:
-    assert set(DRIVE_OPTIONS) | {"path", "vehicle", "frame"} == set(inspect.signature(open_drive).parameters)
+    assert set(inspect.signature(open_drive).parameters) == {"path", "said"}
+    assert set(DRIVE_OPTIONS) | {"vehicle", "frame"} == set(SaidOfDrive.__annotations__)
 
 
 @pytest.mark.parametrize("verb", ["build", "vote", "doctor"])
