@@ -27,7 +27,7 @@ CELL = (10, 10)
 
 def put(http: httpx2.Client, vehicle: str, drive: str) -> httpx2.Response:
     """A ballot of some 60 kB against the first map."""
-    noise = np.random.default_rng(len(drive)).random((5000, 3), dtype=np.float32) * np.float32([76, 76, 1])
+    noise = np.random.default_rng(len(drive)).random((5000, 3), dtype=np.float32) * np.array([76, 76, 1], np.float32)
     say = Say(states_plane({CELL: CellState.CHANGED_EMPTY}), new_points=noise)
     ballot = make_ballot(two_walls(), {(0, 0): say}, vehicle, drive, end_ns=time.time_ns() - 10**9)
     return http.request("PUT", f"/v1/ballots/{vehicle}/{drive}", content=encode(ballot))

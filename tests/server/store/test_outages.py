@@ -26,7 +26,7 @@ POLICY = FuseSettings(max_deleted_share=1.0)
 
 def vote(store: Store, drive: str, vehicle: str = "v1") -> None:
     """A ballot of some 60 kB that must be acknowledged; Unavailable if the store cannot keep it."""
-    noise = np.random.default_rng(len(drive)).random((5000, 3), dtype=np.float32) * np.float32([76, 76, 1])
+    noise = np.random.default_rng(len(drive)).random((5000, 3), dtype=np.float32) * np.array([76, 76, 1], np.float32)
     say = Say(states_plane({(10, 10): CellState.CHANGED_EMPTY}), new_points=noise)
     ballot = make_ballot(two_walls(), {(0, 0): say}, vehicle, drive, end_ns=store.clock() - S)
     (receipt,) = accept(store, [examine(encode(ballot))])
