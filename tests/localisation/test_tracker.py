@@ -8,8 +8,9 @@ from mapvote.config import NdtSettings
 from mapvote.core.geometry import exp, from_xyz_rpy, inverse, rotation_angle, transform
 from mapvote.core.point_map import PointMap, map_from_points
 from mapvote.core.types import F64, Registration, Scan
+from mapvote.localisation.map_window import MapWindow, window_points
 from mapvote.localisation.ndt import NdtMap, PosePrior
-from mapvote.localisation.tracker import MapWindow, Tracker, window_points
+from mapvote.localisation.tracker import Tracker
 from streets import path, street, sweep, twist_of
 
 SETTINGS = NdtSettings()

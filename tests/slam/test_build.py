@@ -15,8 +15,9 @@ from mapvote.core.sensors import SENSORS
 from mapvote.core.types import F64, Drive, MapvoteError, Scan
 from mapvote.evaluation.scoring.truth import rigid_between
 from mapvote.formats import open_drive, read_T_map_lidar
+from mapvote.localisation.map_window import MapWindow
 from mapvote.localisation.ndt import PosePrior
-from mapvote.localisation.tracker import MapWindow, Tracker
+from mapvote.localisation.tracker import Tracker
 from mapvote.simulation import simulate
 from mapvote.slam.build import BuildReport, _agreed_heights, build_map
 from streets import drive_along, path, street

@@ -18,7 +18,7 @@ from mapvote.doctor.places import Place, fitting, register_all
 from mapvote.doctor.road import find_road
 from mapvote.localisation.deskew import deskew, motion_at
 from mapvote.localisation.global_search import GlobalSearch
-from mapvote.localisation.tracker import MapWindow
+from mapvote.localisation.map_window import MapWindow
 
 _PLACES = 6
 _SEARCHED = 4

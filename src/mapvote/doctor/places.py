@@ -11,8 +11,8 @@ from mapvote.config import TrustSettings
 from mapvote.core.geometry import from_xyz_rpy
 from mapvote.core.types import F32, F64, Scan
 from mapvote.core.voxels import thin
+from mapvote.localisation.map_window import MapWindow
 from mapvote.localisation.ndt import LEVELS, NdtMap, fitness, refine, thin_for_levels
-from mapvote.localisation.tracker import MapWindow
 from mapvote.localisation.trust import Judge
 
 _OFFSETS_M = np.arange(-6.0, 6.1, 1.0)

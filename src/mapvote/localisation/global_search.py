@@ -22,8 +22,9 @@ from mapvote.core.point_map import PointMap
 from mapvote.core.types import F64, I64, U8, U64, MapvoteError, Scan
 from mapvote.core.voxels import thin
 from mapvote.localisation.deskew import deskew
+from mapvote.localisation.map_window import MapWindow
 from mapvote.localisation.ndt import LEVELS, refine, thin_for_levels
-from mapvote.localisation.tracker import MapWindow, Tracker
+from mapvote.localisation.tracker import Tracker
 from mapvote.localisation.trust import MIN_KNOWN, Judge, height_above_lowest
 
 _CELL_M = 1.0

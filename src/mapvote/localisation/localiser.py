@@ -2,7 +2,8 @@
 
 A scan waits until the place of its track has been confirmed by a look taken at it or after it. So nothing has to be
 recalled once a track proves wrong: its scans since the last good look have not voted yet. Where another place fits
-better the track moves there, and what waits moves along. Memory is bounded by the scans that may wait.
+better the track moves there, and what waits moves along. What a look confirms together leaves one by one, so that no
+scan has the work of ten. Memory is bounded by the scans that may wait.
 """
 
 from __future__ import annotations
@@ -21,12 +22,16 @@ from mapvote.core.types import F64, I64, Registration, Scan
 from mapvote.core.voxels import thin
 from mapvote.localisation.deskew import deskew, motion_at, twist_between
 from mapvote.localisation.global_search import GlobalSearch
+from mapvote.localisation.map_window import MapWindow
 from mapvote.localisation.ndt import LEVELS, PosePrior, refine, thin_for_levels
-from mapvote.localisation.tracker import TWIST_AGE_S, Fix, MapWindow, Tracker
+from mapvote.localisation.tracker import TWIST_AGE_S, Fix, Tracker
 from mapvote.localisation.trust import Judge, Verdict
 
 WAIT_SCANS = 40
 """Scans that wait at most until their track is confirmed: what a vehicle can hold, 4 s at 10 Hz."""
+_LEAVING = 20
+"""Confirmed scans that may queue up, the longest between two looks at 10 Hz: one leaves with every scan, two while more
+than this are left."""
 _EVERY_M, _EVERY_S = 10.0, 2.0
 """A track that holds is looked at again after this distance or time, well within the 15 m that a look covers."""
 _JUMPS = 4
@@ -76,6 +81,8 @@ class Localiser:
         self.misfit = np.zeros(3)
         """How far trusted fixes lately lay off their priors, map metres."""
         self._waiting: deque[_Waiting] = deque()
+        self._decided: deque[Fix] = deque()
+        """What nothing can change any more, and has not left yet."""
         self._held = 0
         """Looks in turn that held."""
         self._confirmed = False
@@ -86,21 +93,31 @@ class Localiser:
         """See :class:`Localise`."""
         if not self._has_place(scan, prior):
             self._waiting.append(_Waiting(_nowhere(scan), None))
-            return self._decide(len(self._waiting), False)
+            self._decide(len(self._waiting), False)
+            return self._leave()
         fix = self.tracker.localise(scan, None if prior is None else self._corrected(prior))
+        self.map_around.prepare(fix.registration.T_map_lidar[:3, 3])
         misfit = None if prior is None else fix.registration.T_map_lidar[:3, 3] - prior.T_map_lidar[:3, 3]
         self._waiting.append(_Waiting(fix, misfit))
         if self._is_due(fix):
             self._look()
             if self._confirmed and self._held:
-                return self._decide(len(self._waiting), True)
-        return self._decide(max(0, len(self._waiting) - WAIT_SCANS), False)
+                self._decide(len(self._waiting), True)
+        self._decide(max(0, len(self._waiting) - WAIT_SCANS), False)
+        return self._leave()
 
     def flush(self) -> list[Fix]:
         """See :class:`Localise`."""
         if self._waiting and self._confirmed:
             self._look()
-        return self._decide(len(self._waiting), self._confirmed)
+        self._decide(len(self._waiting), self._confirmed)
+        left = list(self._decided)
+        self._decided.clear()
+        return left
+
+    def _leave(self) -> list[Fix]:
+        count = min(len(self._decided), 1 if len(self._decided) <= _LEAVING else 2)
+        return [self._decided.popleft() for _ in range(count)]
 
     def _has_place(self, scan: Scan, prior: PosePrior | None) -> bool:
         """Search the whole map where there is nothing else to go by, or where the track has not held for long."""
@@ -183,16 +200,14 @@ class Localiser:
         registration = newest.fix.registration
         self.tracker.move_to(registration.T_map_lidar, newest.fix.scan.stamp_ns, twist, registration.score)
 
-    def _decide(self, count: int, confirmed: bool) -> list[Fix]:
-        """The oldest ``count`` scans leave; what they say of the prior is remembered if they are trusted."""
-        decided = []
+    def _decide(self, count: int, confirmed: bool) -> None:
+        """The oldest ``count`` scans are decided; what they say of the prior is remembered if they are trusted."""
         for _ in range(count):
             waiting = self._waiting.popleft()
             fix = replace(waiting.fix, trusted=waiting.fix.trusted and confirmed)
             if fix.trusted and waiting.misfit is not None:
                 self.misfit = self.misfit + _MEMORY * (waiting.misfit - self.misfit)
-            decided.append(fix)
-        return decided
+            self._decided.append(fix)
 
 
 def _nowhere(scan: Scan) -> Fix:

@@ -20,7 +20,7 @@ from mapvote.core.types import F32, F64, I64, Drive, Registration, check_array
 from mapvote.core.voxels import thin
 from mapvote.localisation.ndt_kernels import mean_likelihood, room_for
 from mapvote.localisation.ndt_solver import Certainty, Place, align
-from mapvote.localisation.ndt_voxels import Voxels, Window, enter_points, reindex
+from mapvote.localisation.ndt_voxels import Voxels, Window, enter_points, join_voxels, reindex
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +63,7 @@ class NdtGrid:
         self.level = level
         self.reach = np.array([half, half, BELOW_M])
         self.window = Window(np.full(shape, -1, dtype=np.int32), np.zeros(3, dtype=np.int64), size)
-        self.voxels = Voxels(np.zeros((1024, 3), dtype=np.int64), np.zeros((1024, 11)), np.zeros((1024, 9)))
+        self.voxels = room_for_voxels(1024)
         self.n = 0
 
     def recentre(self, centre: F64) -> None:
@@ -73,12 +73,32 @@ class NdtGrid:
 
     def enter(self, points_map: F64) -> None:
         """Enter points (n, 3) in map metres; those outside the window are left out."""
-        left = points_map
-        while len(left):
-            if self.n == len(self.voxels.place):
-                self.voxels = Voxels(*(np.concatenate([a, np.zeros_like(a)]) for a in self.voxels))
-            self.n, looked_at = enter_points(left, self.window, self.voxels, self.n, self.level.floor_m, MIN_POINTS)
-            left = left[looked_at:]
+        self.voxels, self.n = entered(points_map, self.window, self.voxels, self.n, self.level.floor_m)
+
+    def join(self, others: Sequence[Voxels]) -> None:
+        """Add voxels of this level, of points that were not entered; those outside the window are left out."""
+        room = self.n + sum(len(more.place) for more in others)
+        if room > len(self.voxels.place):
+            more = room_for_voxels(room - self.n)
+            self.voxels = Voxels(*(np.concatenate([a[: self.n], b]) for a, b in zip(self.voxels, more, strict=True)))
+        for part in others:
+            self.n = join_voxels(part, self.window, self.voxels, self.n, self.level.floor_m, MIN_POINTS)
+
+
+def entered(points_map: F64, window: Window, voxels: Voxels, n: int, floor_m: float) -> tuple[Voxels, int]:
+    """(voxels with points (n, 3) in map metres entered, how many there are): with more room where they need it."""
+    left = points_map
+    while len(left):
+        if n == len(voxels.place):
+            voxels = Voxels(*(np.concatenate([a, np.zeros_like(a)]) for a in voxels))
+        n, looked_at = enter_points(left, window, voxels, n, floor_m, MIN_POINTS)
+        left = left[looked_at:]
+    return voxels, n
+
+
+def room_for_voxels(n: int) -> Voxels:
+    """Room for n voxels."""
+    return Voxels(np.zeros((n, 3), dtype=np.int64), np.zeros((n, 11)), np.zeros((n, 9)))
 
 
 class NdtMap:

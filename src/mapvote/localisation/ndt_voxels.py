@@ -157,6 +157,28 @@ def _set_precision(cells: F64, k: int, A: F64, V: F64, floor_variance: float, ev
 
 
 @numba.njit(cache=True, nogil=True)
+def _refresh(voxels: Voxels, touched: I64, size: float, floor_m: float, min_points: int) -> None:
+    """The distributions of the rows ``touched`` (m,), from their sums."""
+    sums = voxels.sums
+    A, V = np.empty((3, 3)), np.empty((3, 3))
+    thin, floor_variance = (FLATNESS * size) * (FLATNESS * size), floor_m * floor_m
+    for k in touched:
+        sums[k, 10] = 0.0
+        m = sums[k, 0]
+        if m < min_points:
+            voxels.cells[k, :] = 0.0
+            continue
+        voxels.cells[k, 0], voxels.cells[k, 1], voxels.cells[k, 2] = _mean_and_covariance(sums, k, A)
+        flat = A[2, 2] < thin
+        _diagonalise(A, V)
+        _order(A, V)
+        if flat:
+            _flatten(A, V, thin)
+        even_variance = size * size / 12.0 * max(0.0, 1.0 - 2.0 * np.sqrt(0.8 / m))
+        _set_precision(voxels.cells, k, A, V, floor_variance, 1.0 / (even_variance + floor_variance))
+
+
+@numba.njit(cache=True, nogil=True)
 def enter_points(
     points: F64, window: Window, voxels: Voxels, n: int, floor_m: float, min_points: int
 ) -> tuple[int, int]:
@@ -191,24 +213,34 @@ def enter_points(
             n_touched += 1
         x, y, z = points[i, 0] - (ax + 0.5) * size, points[i, 1] - (ay + 0.5) * size, points[i, 2] - (az + 0.5) * size
         _add_moments(sums, k, x, y, z)
-    A, V = np.empty((3, 3)), np.empty((3, 3))
-    thin, floor_variance = (FLATNESS * size) * (FLATNESS * size), floor_m * floor_m
-    for j in range(n_touched):
-        k = touched[j]
-        sums[k, 10] = 0.0
-        m = sums[k, 0]
-        if m < min_points:
-            voxels.cells[k, :] = 0.0
-            continue
-        voxels.cells[k, 0], voxels.cells[k, 1], voxels.cells[k, 2] = _mean_and_covariance(sums, k, A)
-        flat = A[2, 2] < thin
-        _diagonalise(A, V)
-        _order(A, V)
-        if flat:
-            _flatten(A, V, thin)
-        even_variance = size * size / 12.0 * max(0.0, 1.0 - 2.0 * np.sqrt(0.8 / m))
-        _set_precision(voxels.cells, k, A, V, floor_variance, 1.0 / (even_variance + floor_variance))
+    _refresh(voxels, touched[:n_touched], size, floor_m, min_points)
     return n, looked_at
+
+
+@numba.njit(cache=True, nogil=True)
+def join_voxels(others: Voxels, window: Window, voxels: Voxels, n: int, floor_m: float, min_points: int) -> int:
+    """Add the voxels of points that are not in ``voxels`` yet, and refresh the distributions of those that both have.
+
+    ``voxels`` must have a row left for each. Returns the new number of rows. What lies outside ``window`` is left out.
+    """
+    rows, lowest, size = window
+    shared = np.empty(len(others.place), dtype=np.int64)
+    n_shared = 0
+    for j in range(len(others.place)):
+        ix, iy, iz = others.place[j, 0] - lowest[0], others.place[j, 1] - lowest[1], others.place[j, 2] - lowest[2]
+        if not holds(rows, ix, iy, iz, 0):
+            continue
+        k = rows[ix, iy, iz]
+        if k >= 0:
+            voxels.sums[k] += others.sums[j]
+            shared[n_shared] = k
+            n_shared += 1
+            continue
+        rows[ix, iy, iz] = n
+        voxels.place[n], voxels.sums[n], voxels.cells[n] = others.place[j], others.sums[j], others.cells[j]
+        n += 1
+    _refresh(voxels, shared[:n_shared], size, floor_m, min_points)
+    return n
 
 
 @numba.njit(cache=True, nogil=True)

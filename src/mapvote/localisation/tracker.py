@@ -12,16 +12,12 @@ import numpy as np
 
 from mapvote.config import NdtSettings
 from mapvote.core.geometry import exp, from_xyz_rpy
-from mapvote.core.grid import window_around
-from mapvote.core.point_map import PointMap
 from mapvote.core.types import F32, F64, Registration, Scan
 from mapvote.localisation.deskew import deskew, twist_between
 from mapvote.localisation.ndt import (
-    HALF_WINDOW_M,
     LEVELS,
     NdtMap,
     PosePrior,
-    build_ndt,
     fitness,
     refine,
 )
@@ -60,31 +56,11 @@ class Fix:
     """Whether the registration by itself is sound; whether it is the right place, the Localiser finds out."""
 
 
-def window_points(point_map: PointMap, position: F64, half_window_m: float = HALF_WINDOW_M) -> F64:
-    """Points (n, 3) in map metres of the tiles that the NDT's window around ``position`` touches."""
-    window = window_around(point_map.lattice, float(position[0]), float(position[1]), 2 * half_window_m)
-    tiles = [tile for tile in window.tiles() if tile in point_map.tiles]
-    clouds = [point_map.tiles[tile].points_map for tile in tiles]
-    return np.concatenate([np.zeros((0, 3)), *clouds])
-
-
-class MapWindow:
-    """The NDT map around a vehicle in a finished map, built anew when the vehicle leaves its middle."""
-
-    def __init__(self, point_map: PointMap) -> None:
-        self.point_map = point_map
-        self.ndt_map: NdtMap | None = None
-
-    def __call__(self, position: F64) -> NdtMap:
-        if self.ndt_map is None or not self.ndt_map.is_central(position):
-            self.ndt_map = build_ndt(window_points(self.point_map, position), position)
-        return self.ndt_map
-
-
 class Tracker:
     """Follows one vehicle. Scans must come in order of time.
 
-    ``map_around``: the NDT map to use near a position (3,), a :class:`MapWindow` for a finished map.
+    ``map_around``: the NDT map to use near a position (3,), for a finished map a
+    :class:`mapvote.localisation.map_window.MapWindow`.
     """
 
     def __init__(self, map_around: Callable[[F64], NdtMap], settings: NdtSettings) -> None:

@@ -15,8 +15,9 @@ from mapvote.evaluation.experiments.scene import Progress, Scene
 from mapvote.evaluation.scoring.truth import PoseErrors, Truth, error_summary, rigid_between
 from mapvote.formats import read_map, write_map
 from mapvote.formats.atomic import whole_folder
+from mapvote.localisation.map_window import MapWindow
 from mapvote.localisation.ndt import PosePrior
-from mapvote.localisation.tracker import MapWindow, Tracker
+from mapvote.localisation.tracker import Tracker
 from mapvote.slam.build import build_map
 
 NEAR_M = 30.0
