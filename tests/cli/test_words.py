@@ -34,7 +34,6 @@ NOT_RUN = {
     r"^mapvote evaluate real ": "takes minutes on a real drive: tests/evaluation/experiments/real runs it",
     r"maps\.example\.org": "names a server that is not here: tests/cli/test_follow.py follows a real one",
     r"^mapvote serve ": "runs until it is stopped: tests/cli/test_interrupt.py does both",
-    r"^mapvote (evaluate|simulate) paper ": "takes half an hour and gigabytes: `corner` is run from the help instead",
     r"^python benchmarks/": "takes minutes to hours: only its options are looked up here",
 }
 SLOW = r"^mapvote (demo|simulate|evaluate|warmup)\b"
