@@ -12,12 +12,12 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from mapvote.config import load_settings
+from mapvote.config import cache_folder, load_settings
 from mapvote.evaluation.experiments.cases import choose_cases, fuse_case
 from mapvote.evaluation.experiments.changed_areas import in_changed_areas, survey_anew
 from mapvote.evaluation.experiments.passes import passes
 from mapvote.evaluation.experiments.pose_errors import map_frame
-from mapvote.evaluation.experiments.scene import Scene, default_cache
+from mapvote.evaluation.experiments.scene import Scene
 from mapvote.evaluation.results import to_json
 from mapvote.evaluation.scoring.truth import PoseErrors
 from mapvote.formats.atomic import whole_file
@@ -48,7 +48,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scenario", default="street570")
     parser.add_argument("--seeds", default="3,5,6,7,8")
-    parser.add_argument("--cache", type=Path, default=default_cache())
+    parser.add_argument("--cache", type=Path, default=cache_folder())
     parser.add_argument("--config", type=Path)
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--out", type=Path, default=Path("out/changed_areas.json"))

@@ -16,9 +16,8 @@ from pathlib import Path
 
 from rich.console import Console
 
-from mapvote.config import load_settings
+from mapvote.config import cache_folder, load_settings
 from mapvote.evaluation.experiments.matrix import EXPERIMENTS, Matrix
-from mapvote.evaluation.experiments.scene import default_cache
 from mapvote.evaluation.reporting import matrix_tables, requirements
 from mapvote.evaluation.results import MatrixResult, to_json
 from mapvote.formats.atomic import whole_file
@@ -32,7 +31,7 @@ def main() -> None:
     parser.add_argument("--cases", help='instead of all, in main and liars: "1,1 column,columns" takes half the time')
     parser.add_argument("--parked", type=int, help="cars parked during each pass in parked (default 12; corner: 2)")
     parser.add_argument("--out", type=Path, default=Path("out/matrix"))
-    parser.add_argument("--cache", type=Path, default=default_cache(), help="where drives, maps and ballots are kept")
+    parser.add_argument("--cache", type=Path, default=cache_folder(), help="where drives, maps and ballots are kept")
     parser.add_argument("--config", type=Path, help="settings (TOML)")
     parser.add_argument("--workers", type=int, default=2, help="experiments at a time, each on one core")
     parser.add_argument("--drop-drives", action="store_true", help="delete scans (3 GB a seed) once they are done with")

@@ -90,10 +90,11 @@ def evaluate(
     """
     from rich.console import Console
 
+    from mapvote.config import cache_folder
     from mapvote.evaluation.evaluate import evaluate as run
     from mapvote.evaluation.experiments.cases import choose_cases
     from mapvote.evaluation.experiments.conditions import Conditions
-    from mapvote.evaluation.experiments.scene import Scene, default_cache
+    from mapvote.evaluation.experiments.scene import Scene
     from mapvote.evaluation.experiments.study import PUBLISHED, Study
     from mapvote.evaluation.reporting.tables import as_json, tables, write_text
 
@@ -113,9 +114,7 @@ def evaluate(
         overrides["temporary_cars"] = cars
     names = tuple(name.strip() for name in explain.split(",") if name.strip())
     study = Study(readings, scenario in PUBLISHED, names)
-    scene = Scene(
-        scenario, seed, settings, cache or default_cache(), overrides, Conditions(true_poses=poses == "truth")
-    )
+    scene = Scene(scenario, seed, settings, cache or cache_folder(), overrides, Conditions(true_poses=poses == "truth"))
     with stages() as told:
         evaluation = run(scene, cases, with_yardsticks, told, study)
     result = evaluation.result
@@ -135,9 +134,8 @@ def evaluate(
     if figures is not None:
         from mapvote.evaluation.reporting.gallery import gallery
 
-        best = "columns" if "columns" in result.cases else cases[0].name
         with progress("drawing"):
-            drawn = gallery(evaluation, best, figures, ("png", "svg", "pdf"))
+            drawn = gallery(evaluation, evaluation.best, figures, ("png", "svg", "pdf"))
         print(f"{figures}: {len(drawn)} figures, each as PNG, SVG and PDF")
 
 

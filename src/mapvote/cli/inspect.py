@@ -127,9 +127,10 @@ def changes(
         if page is not None:
             raise MapvoteError("changes: --html is made from a STORE; the server's own page shows the clouds")
         until = "" if new is None else f"&to={new}"
-        asked = f"/v1/changes?from={old}{until}&min_cells={min_cells}&lonlat={not (metres or package)}"
+        lonlat = "false" if metres or package else "true"
+        asked = f"/v1/changes?from={old}{until}&min_cells={min_cells}&lonlat={lonlat}"
         with server_at(store, key_file) as server, waiting("comparing versions"):
-            _write_changes(server.ask_json("GET", asked.lower()), out)
+            _write_changes(server.ask_json("GET", asked), out)
         return
     with opened_store(store) as opened, waiting("comparing versions"):
         newest = opened.current() if new is None else new

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -50,9 +49,9 @@ def server_at(url: str, key_file: Path | None) -> Iterator[Connection]:
 def client_of(url: str, key: str | None) -> MapClient:
     """A vehicle's line to a server; what it keeps lies in the user's cache."""
     from mapvote.client import MapClient
+    from mapvote.config import cache_folder
 
-    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    return MapClient(url, key=key, home=cache / "mapvote")
+    return MapClient(url, key=key, home=cache_folder())
 
 
 def map_of(name: str, key_file: Path | None, version: int | None = None) -> PointMap:

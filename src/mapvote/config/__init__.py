@@ -25,6 +25,11 @@ METHOD_VERSION = 5
 """Goes up whenever a constant or a rule changes by which vehicles vote; the numbers below are only what a user sets."""
 
 
+def cache_folder() -> Path:
+    """What can be made or fetched again lies here: $XDG_CACHE_HOME/mapvote, else ~/.cache/mapvote."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "mapvote"
+
+
 class NdtSettings(Section):
     """When a scan's registration is sound (localisation/tracker.py)."""
 

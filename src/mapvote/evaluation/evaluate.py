@@ -39,6 +39,8 @@ class Evaluation:
     drives: Sequence[Pass]
     causes: Mapping[str, Causes]
     """By case that was to be explained: every true and false cell of the provenance truth and its cause."""
+    best: str
+    """The case whose updated map is shown: columns, else the first."""
 
 
 def evaluate(
@@ -59,21 +61,7 @@ def evaluate(
     beams = scene.drive(drives[0].vehicle).sensor.beams
     jury = Jury(first_map, truth)
     best = "columns" if any(case.name == "columns" for case in cases) else cases[0].name
-    outcomes: dict[str, Outcome] = {}
-    entries: dict[str, CaseResult] = {}
-    for i, case in enumerate(cases):
-        if progress:
-            progress("scoring", i, len(cases))
-        ballots = [drive.ballots[case.name] for drive in drives]
-        outcome = fuse_case(first_map, ballots, case.min_votes, scene.settings.fuse, jury.window)
-        outcomes[case.name] = outcome
-        entries[case.name] = CaseResult(
-            **asdict(jury.of_update(outcome)),
-            bytes_per_vehicle=[drive.sizes[case.name] for drive in drives],
-            state_bytes_per_vehicle=[_state_bytes(ballot) for ballot in ballots],
-        )
-    if progress:
-        progress("scoring", len(cases), len(cases))
+    outcomes, entries = _scored(scene, cases, drives, jury, progress)
     found = study.of(scene, cases, jury, outcomes, progress)
     T_map_world = map_frame(scene)
     maps = {
@@ -118,7 +106,29 @@ def evaluate(
             fuse_s={name: outcome.seconds for name, outcome in outcomes.items()},
         ),
     )
-    return Evaluation(result, scene, truth, jury.window, first_map, outcomes, drives, found.causes)
+    return Evaluation(result, scene, truth, jury.window, first_map, outcomes, drives, found.causes, best)
+
+
+def _scored(
+    scene: Scene, cases: Sequence[Case], drives: Sequence[Pass], jury: Jury, progress: Progress | None
+) -> tuple[dict[str, Outcome], dict[str, CaseResult]]:
+    """By case: what the server makes of its ballots, and the scores."""
+    outcomes: dict[str, Outcome] = {}
+    entries: dict[str, CaseResult] = {}
+    for i, case in enumerate(cases):
+        if progress:
+            progress("scoring", i, len(cases))
+        ballots = [drive.ballots[case.name] for drive in drives]
+        outcome = fuse_case(scene.point_map, ballots, case.min_votes, scene.settings.fuse, jury.window)
+        outcomes[case.name] = outcome
+        entries[case.name] = CaseResult(
+            **asdict(jury.of_update(outcome)),
+            bytes_per_vehicle=[drive.sizes[case.name] for drive in drives],
+            state_bytes_per_vehicle=[_state_bytes(ballot) for ballot in ballots],
+        )
+    if progress:
+        progress("scoring", len(cases), len(cases))
+    return outcomes, entries
 
 
 def _state_bytes(ballot: Ballot) -> int:

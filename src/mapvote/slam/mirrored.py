@@ -33,8 +33,9 @@ def mirrored(points: F64, point_map: PointMap, road: F64 | None) -> Bool:
     if road is not None and len(road):
         above_each_other = road[np.unique(crossings(road))]
         if len(above_each_other):
-            near = cKDTree(above_each_other[:, :2]).query(points[:, :2], distance_upper_bound=_BRIDGE_M)[0]
-            out &= np.isinf(near)
+            below = np.flatnonzero(out)
+            tree = cKDTree(above_each_other[:, :2])
+            out[below] = np.isinf(tree.query(points[below, :2], distance_upper_bound=_BRIDGE_M)[0])
     return out
 
 

@@ -45,11 +45,6 @@ _MAP_FROM = ("core", "codec", "formats", "localisation", "perception", "detectio
 BALLOTS_FROM = (*_MAP_FROM, "vehicle.py", "evaluation/experiments/shared_pass.py", "evaluation/experiments/kept.py")
 
 
-def default_cache() -> Path:
-    """$XDG_CACHE_HOME/mapvote, else ~/.cache/mapvote."""
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "mapvote"
-
-
 @cache
 def sources_digest(parts: tuple[str, ...]) -> str:
     """SHA-256 over the program text of some modules and packages of mapvote."""

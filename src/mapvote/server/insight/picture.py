@@ -57,15 +57,11 @@ def before_and_after(cutout: Cutout) -> bytes:
     kept, removed, added = (unpack_cloud(cutout.clouds[kind]) for kind in ("kept", "removed", "added"))
     everything = np.concatenate([kept, removed, added])
     eye = _eye(everything, cutout.box)
-    sides = [_draw(eye, kept, some, shape, colour) for some, shape, colour in _changes(removed, added)]
+    sides = [_draw(eye, kept, removed, _CROSS, _BLUE), _draw(eye, kept, added, _DIAMOND, _RED)]
     gap = np.full((HEIGHT, GAP, 3), 255, dtype=np.uint8)
     out = io.BytesIO()
     Image.fromarray(np.concatenate([sides[0], gap, sides[1]], axis=1)).save(out, "PNG", optimize=True)
     return out.getvalue()
-
-
-def _changes(removed: F64, added: F64) -> Sequence[tuple[F64, Sequence[tuple[int, int]], I64]]:
-    return (removed, _CROSS, _BLUE), (added, _DIAMOND, _RED)
 
 
 def _eye(points: F64, box: Box) -> _Eye:
