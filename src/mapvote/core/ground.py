@@ -32,10 +32,12 @@ def base_layers(ground_z: F32) -> I32:
     known = np.isfinite(ground_z)
     if not known.any():
         return np.zeros(ground_z.shape, dtype=np.int32)
-    low = np.where(known, ground_z, np.inf).astype(np.float64)
+    low = ground_z.astype(np.float64)
+    low[~known] = np.inf
     _lower_envelope(low, 0.02 * CELL_SIZE, 0.02 * CELL_SIZE * np.sqrt(2.0))
-    filled = np.where(known, ground_z.astype(np.float64), low)
-    return np.floor(filled / CELL_SIZE).astype(np.int32)
+    np.copyto(low, ground_z, where=known)
+    low /= CELL_SIZE
+    return np.floor(low, out=low).astype(np.int32)
 
 
 @numba.njit(cache=True, nogil=True)

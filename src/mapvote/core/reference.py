@@ -2,18 +2,34 @@
 
 from __future__ import annotations
 
+from collections.abc import Generator
+
 import numpy as np
 from scipy import ndimage
 
 from mapvote.core.columns import fill_columns
-from mapvote.core.grid import TILE_CELLS, Grid, window_around
+from mapvote.core.grid import TILE_CELLS, Grid, TileIndex, window_around
 from mapvote.core.ground import base_layers
 from mapvote.core.point_map import PointMap
 from mapvote.core.types import F64, U64, Reference
 
+Layout = Generator[None, None, Reference]
+"""The planes of a window on their way: each step takes a few milliseconds at most, the last one returns them."""
+
 
 def reference_window(point_map: PointMap, grid: Grid) -> Reference:
     """The map's planes over ``grid`` (any window; what lies outside every tile is unknown and empty)."""
+    return _finished(_laid_out(point_map, grid))
+
+
+def _finished(layout: Layout) -> Reference:
+    reached: Layout | Reference = layout
+    while not isinstance(reached, Reference):
+        reached = _step(reached)
+    return reached
+
+
+def _laid_out(point_map: PointMap, grid: Grid) -> Layout:
     ground_z = np.full(grid.shape, np.nan, dtype=np.float32)
     free = np.zeros(grid.shape, dtype=np.uint64)
     tiles = [point_map.tiles[index] for index in grid.tiles() if index in point_map.tiles]
@@ -22,7 +38,9 @@ def reference_window(point_map: PointMap, grid: Grid) -> Reference:
         ground_z[common.slices_in(grid)] = tile.ground_z[common.slices_in(tile.window)]
         if tile.free is not None:
             free[common.slices_in(grid)] = tile.free[common.slices_in(tile.window)]
+    yield
     base = base_layers(ground_z)
+    yield
     for tile in tiles:
         if tile.has_ground:  # by the tile alone, so that whoever edits it reads the words as they were written
             common = tile.window.intersection(grid)
@@ -32,6 +50,7 @@ def reference_window(point_map: PointMap, grid: Grid) -> Reference:
     bottom_z = np.full(grid.shape, np.inf, dtype=np.float32)
     top_z = np.full(grid.shape, -np.inf, dtype=np.float32)
     for tile in tiles:
+        yield
         rows, cols, _ = grid.indices_of(tile.points_map)
         fill_columns(
             rows, cols, tile.points[:, 2].astype(np.float64), ground_z, base, occupied, counts, bottom_z, top_z
@@ -81,19 +100,47 @@ def cut_reference(outer: Reference, window: Grid) -> Reference:
 
 
 class LocalMap:
-    """The reference around a vehicle on the move: laid out over the tiles about it, anew only when it has left them."""
+    """The reference around a vehicle on the move: laid out over the tiles about it, anew only when it has left them.
+
+    The next one is laid out step by step, one for each time that is asked, while the vehicle drives through the tile
+    that will be its middle.
+    """
 
     def __init__(self, point_map: PointMap, window_m: float) -> None:
         self.point_map, self.window_m = point_map, window_m
         self.outer: Reference | None = None
         """The planes last laid out; windows are views into them."""
+        self._middle: TileIndex | None = None
+        self._next: tuple[TileIndex, Layout | Reference] | None = None
+        """Another middle, and what there is of its planes."""
 
     def at(self, origin_map: F64) -> tuple[Reference, Reference]:
         """(the partial reference map R_i, ``window_m`` wide around ``origin_map`` (3,); the planes it is cut from)."""
         lattice = self.point_map.lattice
         window = window_around(lattice, origin_map[0], origin_map[1], self.window_m)
+        row, col = window.row0 + window.rows // 2, window.col0 + window.cols // 2
+        middle = row // TILE_CELLS, col // TILE_CELLS
         if self.outer is None or window.intersection(self.outer.grid) != window:
-            row, col = window.row0 + window.rows // 2, window.col0 + window.cols // 2
-            centre = lattice.tile((row // TILE_CELLS, col // TILE_CELLS))
-            self.outer = reference_window(self.point_map, centre.padded(max(TILE_CELLS, window.rows)))
+            ahead = self._ahead(middle, window)
+            self.outer = ahead if isinstance(ahead, Reference) else _finished(ahead)
+            self._middle, self._next = middle, None
+        elif middle != self._middle:
+            ahead = self._ahead(middle, window)
+            if not isinstance(ahead, Reference):
+                self._next = middle, _step(ahead)
         return cut_reference(self.outer, window), self.outer
+
+    def _ahead(self, middle: TileIndex, window: Grid) -> Layout | Reference:
+        if self._next is not None and self._next[0] == middle:
+            return self._next[1]
+        centre = self.point_map.lattice.tile(middle)
+        return _laid_out(self.point_map, centre.padded(max(TILE_CELLS, window.rows)))
+
+
+def _step(layout: Layout) -> Layout | Reference:
+    try:
+        next(layout)
+    except StopIteration as done:
+        reference: Reference = done.value
+        return reference
+    return layout

@@ -1,0 +1,53 @@
+"""The reference around a vehicle on the move is the one laid out for its place, however it was prepared."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+from typing import cast
+
+import numpy as np
+import pytest
+
+from hand_made import make_map, make_tile, wall
+from mapvote.core.grid import TILE_CELLS
+from mapvote.core.point_map import PointMap
+from mapvote.core.reference import LocalMap, reference_window
+from mapvote.core.types import F64, Reference
+
+
+@pytest.fixture(scope="module")
+def point_map() -> PointMap:
+    rng = np.random.default_rng(5)
+    cells = [(int(r), int(c)) for r, c in rng.integers(0, 256, (300, 2))]
+    return make_map({(0, c): make_tile(wall(cells, [0.05, 1.0, 2.5]), index=(0, c)) for c in range(4)})
+
+
+def assert_same(one: Reference, other: Reference) -> None:
+    for each in fields(Reference):
+        np.testing.assert_array_equal(getattr(one, each.name), getattr(other, each.name))
+
+
+def along(metres: F64) -> list[F64]:
+    return [np.array([x, 30.0, 1.8]) for x in metres]
+
+
+def test_a_reference_prepared_on_the_way_is_the_one_laid_out_at_once(point_map: PointMap) -> None:
+    local = LocalMap(point_map, 20.0)
+    laid_out = []
+    for position in along(np.arange(20.0, 260.0, 4.0)):
+        _, outer = local.at(position)
+        if not laid_out or outer is not laid_out[-1]:
+            laid_out.append(outer)
+    assert len(laid_out) == 3
+    for outer, tile in zip(laid_out, ((0, 0), (0, 1), (0, 2)), strict=True):
+        assert outer.grid == point_map.lattice.tile(tile).padded(TILE_CELLS)
+        assert_same(outer, reference_window(point_map, outer.grid))
+
+
+def test_what_was_prepared_in_vain_does_no_harm(point_map: PointMap) -> None:
+    local = LocalMap(point_map, 20.0)
+    there, back, elsewhere = along(np.array([70.0, 80.0])), along(np.array([60.0])), along(np.array([250.0]))
+    for position in (*there, *back, *there, *elsewhere):
+        cut, _ = local.at(position)
+        np.testing.assert_array_equal(cut.occupied, reference_window(point_map, cut.grid).occupied)
+    assert cast(Reference, local.outer).grid == point_map.lattice.tile((0, 3)).padded(TILE_CELLS)
