@@ -15,7 +15,7 @@ from mapvote.core.ground_growing import grow
 from mapvote.core.voting import add_states
 from mapvote.fusion.outliers import contradicting
 from mapvote.localisation.ndt_solver import align
-from mapvote.perception.moving_kernels import look
+from mapvote.perception.range_image import look
 from mapvote.warmup import warm_up
 
 SOURCES = Path(mapvote.__file__).parent

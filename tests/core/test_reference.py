@@ -33,7 +33,7 @@ def along(metres: F64) -> list[F64]:
 
 def test_a_reference_prepared_on_the_way_is_the_one_laid_out_at_once(point_map: PointMap) -> None:
     local = LocalMap(point_map, 20.0)
-    laid_out = []
+    laid_out: list[Reference] = []
     for position in along(np.arange(20.0, 260.0, 4.0)):
         _, outer = local.at(position)
         if not laid_out or outer is not laid_out[-1]:

@@ -29,8 +29,9 @@ import numpy as np
 from mapvote.config import MovingSettings
 from mapvote.core.grid import CELL_SIZE
 from mapvote.core.sensors import Sensor
-from mapvote.core.types import F32, F64, I32, Bool
-from mapvote.perception.moving_kernels import look, moving_components, range_image, voxels
+from mapvote.core.types import F64, I32, Bool
+from mapvote.perception.moving_kernels import moving_components, voxels
+from mapvote.perception.range_image import U16, Counts, Pixels, Samples, look, range_image
 
 # Set on the development streets of the simulator; what half and twice of each cost,
 # benchmarks/moving_accuracy.py --sweep measures.
@@ -68,8 +69,8 @@ class _Scan:
 
     stamp_ns: int
     origin_map: F64
-    nearest: F32
-    """(azimuths, slopes) horizontal range of the nearest return around each direction, +inf where there is none."""
+    nearest: U16
+    """(azimuths, slopes) horizontal range of the nearest return around each direction, see ``range_image``."""
     voxel_of: I32
     """(n,) index into ``samples`` of each point, -1 for points that cannot be moving (ground, out of reach)."""
     samples: F64
@@ -84,11 +85,12 @@ class MovingFilter:
 
     def __init__(self, sensor: Sensor, settings: MovingSettings) -> None:
         self.settings = settings
-        self._slope_min = float(np.tan(np.radians(max(sensor.fov_bottom_deg - TILT_DEG, -60.0))))
-        slope_max = float(np.tan(np.radians(min(sensor.fov_top_deg + TILT_DEG, 60.0))))
-        self._turns = round(360.0 / max(2.0 * sensor.azimuth_step_deg, PIXEL_DEG))
-        self._slope_step = float(np.tan(np.radians(0.5 * PIXEL_DEG)))
-        self._slopes = int(np.ceil((slope_max - self._slope_min) / self._slope_step))
+        slope_min = np.tan(np.radians(max(sensor.fov_bottom_deg - TILT_DEG, -60.0)))
+        slope_max = np.tan(np.radians(min(sensor.fov_top_deg + TILT_DEG, 60.0)))
+        per_slope = 1.0 / np.tan(np.radians(0.5 * PIXEL_DEG))
+        turns = round(360.0 / max(2.0 * sensor.azimuth_step_deg, PIXEL_DEG))
+        slopes = int(np.ceil((slope_max - slope_min) * per_slope))
+        self._pixels = Pixels(turns, slopes, np.float32(slope_min), np.float32(per_slope))
         self._window: deque[_Scan] = deque()
         self._waiting = 0
         """How many of the window's youngest scans are undecided."""
@@ -105,7 +107,7 @@ class MovingFilter:
             raise ValueError(f"stamps must increase: {stamp_ns} after {self._window[-1].stamp_ns}")
         points = np.ascontiguousarray(points_map, dtype=np.float64)
         origin = np.asarray(origin_map, dtype=np.float64)
-        nearest = range_image(points, origin, self._turns, self._slopes, self._slope_min, self._slope_step)
+        nearest = range_image(points, origin, self._pixels)
         voxel_of, first = voxels(points, obstacle, origin, self.settings.reach_m, CELL_SIZE)
         self._window.append(_Scan(stamp_ns, origin, nearest, voxel_of, points[first]))
         self._waiting += 1
@@ -132,37 +134,20 @@ class MovingFilter:
     def _moving(self, at: int) -> Bool:
         """The mask of the window's scan ``at``, from the other scans of the window."""
         s, scan = self.settings, self._window[at]
-        free = np.zeros(len(scan.samples), dtype=np.int32)
-        hit = np.zeros(len(scan.samples), dtype=np.int32)
-        sides = np.zeros(len(scan.samples), dtype=np.uint8)
-        waiting = np.arange(len(scan.samples), dtype=np.int32)
+        m = left = len(scan.samples)
+        counts = Counts(np.zeros(m, np.int32), np.zeros(m, np.int32), np.zeros(m, np.uint8))
+        x, y, z = (scan.samples - scan.origin_map).astype(np.float32).T.copy()
+        waiting = Samples(x, y, z, np.arange(m, dtype=np.int32))
         for other in self._witnesses(at):
-            left = look(
-                scan.samples,
-                other.nearest,
-                other.origin_map,
-                self._slope_min,
-                self._slope_step,
-                MARGIN_M,
-                HEIGHT_M,
-                ENOUGH,
-                free,
-                hit,
-                sides,
-                waiting,
-            )
-            waiting = waiting[:left]
-        seen = free + hit >= MIN_FREE
-        brief = (sides == 3) & (free >= MIN_FREE) & (free >= FREE_SHARE * (free + hit))
+            sensor = (other.origin_map - scan.origin_map).astype(np.float32)
+            left = look(waiting, left, other.nearest, sensor, self._pixels, (MARGIN_M, HEIGHT_M, ENOUGH), counts)
+        free, seen = counts.free, counts.free + counts.hit
+        brief = (counts.sides == 3) & (free >= MIN_FREE) & (free >= FREE_SHARE * seen)
         half = int(np.ceil(s.reach_m / CELL_SIZE)) + 2
         cells = np.floor(scan.samples[:, :2] / CELL_SIZE).astype(np.int64)
         cells -= np.floor(scan.origin_map[:2] / CELL_SIZE).astype(np.int64) - half
-        moves = moving_components(
-            cells[:, 1], cells[:, 0], 2 * half + 1, seen, brief, MIN_VOXELS, SHARE_WHOLE, SHARE_PART
-        )
-        mask = scan.voxel_of >= 0
-        mask[mask] = moves[scan.voxel_of[mask]]
-        return mask
+        rows, cols, share = cells[:, 1], cells[:, 0], (SHARE_WHOLE, SHARE_PART)
+        return moving_components(rows, cols, 2 * half + 1, seen >= MIN_FREE, brief, MIN_VOXELS, *share, scan.voxel_of)
 
     def _witnesses(self, at: int) -> list[_Scan]:
         """Up to ``looks`` other scans spread evenly over the time before, and over the time after, scan ``at``.
