@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mapvote.core.grid import CELL_SIZE, Lattice
 from mapvote.core.types import F64
-from mapvote.detection.new_points import NewPoints, points_in, select
+from mapvote.detection import new_points
+from mapvote.detection.new_points import REACH_M, NewPoints, _beyond, points_in, select
 
 LATTICE = Lattice()
 
@@ -76,3 +78,38 @@ def test_points_of_a_tile_are_cut_to_a_word_and_told_from_its_corner() -> None:
     found = points_in(window, points, words, base)
     assert found.dtype == np.float32
     np.testing.assert_allclose(found, [[1.35, 1.05, 0.75]], atol=1e-5)
+
+
+def test_what_lies_beyond_the_local_grid_is_new_where_it_stands_near_and_unmapped() -> None:
+    """The kernel, against the same rule written out for arrays."""
+    rng = np.random.default_rng(2)
+    points = rng.uniform((-5.0, -5.0, 0.0), (95.0, 95.0, 6.0), (4000, 3))
+    cell = rng.integers(-1, 1, 4000).astype(np.int32)
+    ground_z = np.where(rng.random((300, 300)) < 0.2, np.nan, rng.uniform(0.0, 1.0, (300, 300))).astype(np.float32)
+    base = np.floor(np.nan_to_num(ground_z) / CELL_SIZE).astype(np.int32)
+    occupied = rng.integers(0, 2**63, (300, 300), dtype=np.uint64)
+    origin = np.array([20.0, 30.0, 1.8])
+    found = _beyond(points, cell, origin, ground_z, base, occupied, (0.0, 0.0), (0, 0))
+    cols, rows = np.floor(points[:, :2] / CELL_SIZE).astype(int).T
+    inside = (rows >= 0) & (rows < 300) & (cols >= 0) & (cols < 300)
+    rows, cols, z = np.clip(rows, 0, 299), np.clip(cols, 0, 299), points[:, 2]
+    foot = np.where(np.isnan(ground_z), base * CELL_SIZE, ground_z)[rows, cols]
+    bit = np.clip(np.floor(z / CELL_SIZE).astype(int) - base[rows, cols], 0, 63).astype(np.uint64)
+    unmapped = occupied[rows, cols] >> bit & np.uint64(1) == 0
+    near = ((points - origin)[:, :2] ** 2).sum(axis=1) < REACH_M**2
+    np.testing.assert_array_equal(found, np.flatnonzero(inside & (cell < 0) & near & (z - foot >= 0.3) & unmapped))
+    assert len(found) > 100
+
+
+def test_runs_that_are_sorted_on_the_way_keep_the_first_point_of_each_voxel(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(4)
+    offered = [rng.uniform((-3.0, -3.0, 1.0), (3.0, 3.0, 3.0), (90, 3)) for _ in range(12)]
+    at_once, on_the_way = NewPoints(LATTICE), NewPoints(LATTICE)
+    for points in offered:
+        at_once.offer(points)
+    monkeypatch.setattr(new_points, "_COMPACT_AT", 100)
+    for points in offered:
+        on_the_way.offer(points)
+    assert len(on_the_way._runs) > 2
+    for tile, kept in at_once.by_tile().items():
+        np.testing.assert_array_equal(on_the_way.by_tile()[tile], kept)

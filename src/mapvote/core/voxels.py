@@ -149,8 +149,8 @@ def voxel_downsample(points: NDArray[np.floating], size: float, x0: float = 0.0,
 
 
 @numba.njit(cache=True, nogil=True)
-def _thin(points: NDArray[np.float32], size: float, table: I64) -> I64:
-    """Indices of the first point in each voxel of side ``size`` (open addressing, linear probing).
+def _thin(points: NDArray[np.float32], every: int, size: float, table: I64) -> I64:
+    """Indices of the first of every ``every``-th point in each voxel of side ``size`` (open addressing).
 
     ``table`` (2^k,) holds zeros; the answer is empty when it became half full and a larger one is needed.
     """
@@ -158,7 +158,7 @@ def _thin(points: NDArray[np.float32], size: float, table: I64) -> I64:
     n = 0
     scale = 1.0 / size
     last = np.int64(0)
-    for i in range(len(points)):
+    for i in range(0, len(points), every):
         # The middle is added first: cutting off is then rounding down, and quicker than floor.
         ix, iy = np.int64(points[i, 0] * scale + float(_MIDDLE)), np.int64(points[i, 1] * scale + float(_MIDDLE))
         key = packed(ix, iy, np.int64(points[i, 2] * scale + float(_MIDDLE)))
@@ -175,15 +175,16 @@ def _thin(points: NDArray[np.float32], size: float, table: I64) -> I64:
     return keep[:n].copy()
 
 
-def thin(points: NDArray[np.floating], size: float) -> I64:
+def thin(points: NDArray[np.floating], size: float, every: int = 1) -> I64:
     """Indices (m,) of the first of (n, 3) points in each voxel of side ``size``, ascending. Within 2^20 voxels of 0.
+    Of a dense scan, only every ``every``-th point may be looked at.
 
     Does in a millisecond what :func:`voxel_downsample` does on the lattice; for scans, in their own frame.
     """
     cloud = np.ascontiguousarray(points, dtype=np.float32)
     slots = 1 << 15
     while True:
-        keep = _thin(cloud, size, np.zeros(slots, dtype=np.int64))
+        keep = _thin(cloud, every, size, np.zeros(slots, dtype=np.int64))
         if len(keep) or len(cloud) == 0:
             return keep
         slots *= 2

@@ -5,13 +5,14 @@ from __future__ import annotations
 import numba
 import numpy as np
 
+from mapvote.core.columns import GROUND_MARGIN_M, column_bit, height_above
 from mapvote.core.grid import CELL_SIZE, Grid, Lattice, TileIndex, tile_of_cells
-from mapvote.core.types import F32, F64, I32, U64, Bool, Reference
+from mapvote.core.types import F32, F64, I32, I64, U64, Bool, Reference
 from mapvote.core.voxels import voxel_keys
 from mapvote.perception.frontend import Observation, PlacedScan
-from mapvote.perception.raycast import find_obstacles
 
-_COMPACT_AT = 200_000
+_COMPACT_AT = 50_000
+"""Points sorted together: so many take a few milliseconds, and no scan is to wait for more."""
 REACH_M = 70.0
 """New points are taken up to here, farther than votes are cast: a tile's width around the vehicle is laid out."""
 
@@ -27,6 +28,31 @@ def select(points: F64, cell: I32, stationary: Bool, words: U64, base: I32) -> B
     return out
 
 
+@numba.njit(cache=True, nogil=True)
+def _beyond(
+    points: F64, cell: I32, origin: F64, ground_z: F32, base: I32, occupied: U64, lattice: tuple[float, float],
+    corner: tuple[int, int],
+) -> I64:  # fmt: skip
+    """Which of the points (n, 3) outside the local grid (``cell`` -1) are obstacles, within reach, and in voxels that
+    the map does not hold; the planes (rows, cols) from ``corner`` on ``lattice`` say so."""
+    rows, cols = occupied.shape
+    found, n = np.empty(len(points), np.int64), 0
+    for i in range(len(points)):
+        if cell[i] >= 0 or (points[i, 0] - origin[0]) ** 2 + (points[i, 1] - origin[1]) ** 2 >= REACH_M**2:
+            continue
+        c = int(np.floor((points[i, 0] - lattice[0]) / CELL_SIZE)) - corner[1]
+        r = int(np.floor((points[i, 1] - lattice[1]) / CELL_SIZE)) - corner[0]
+        if not (0 <= r < rows and 0 <= c < cols):
+            continue
+        z = points[i, 2]
+        if height_above(z, ground_z[r, c], base[r, c]) < GROUND_MARGIN_M:
+            continue
+        if not (occupied[r, c] >> np.uint64(column_bit(z, base[r, c]))) & np.uint64(1):
+            found[n] = i
+            n += 1
+    return found[:n].copy()
+
+
 class NewPoints:
     """One point per 0.3 m voxel, the first that was offered: candidates for changed-occupied cells."""
 
@@ -34,9 +60,8 @@ class NewPoints:
         """``beyond``: also what lies outside the local grid. The paper has none of it, and the filter of moving objects
         does not look there: only rules that ask more of a new voxel than that a scan struck it can take it."""
         self.lattice, self.beyond = lattice, beyond
-        self._outer: Reference | None = None
-        self._unmapped: U64 = np.zeros((0, 0), dtype=np.uint64)
-        self._points = np.zeros((0, 3))
+        self._runs: list[F64] = []
+        """Points in ascending order of their voxels, each run with one point a voxel."""
         self._waiting: list[F64] = []
         self._count = 0
 
@@ -55,13 +80,13 @@ class NewPoints:
 
         They cast no vote. But the upper storeys of what is new can be seen only from afar, below the sensor's top beam.
         """
-        if self._outer is not scan.outer:
-            self._outer, self._unmapped = scan.outer, ~scan.outer.occupied
-        outside = scan.points_map[scan.cell < 0]
-        off = outside[:, :2] - scan.origin_map[:2]
-        far = outside[np.einsum("ij,ij->i", off, off) < REACH_M**2]
-        obstacle, cell = find_obstacles(far, scan.outer)
-        return far[select(far, cell, obstacle, self._unmapped.ravel(), _flat_base(scan.outer))]
+        grid, outer = scan.outer.grid, scan.outer
+        lattice, corner = (grid.lattice.x0, grid.lattice.y0), (grid.row0, grid.col0)
+        return scan.points_map[
+            _beyond(
+                scan.points_map, scan.cell, scan.origin_map, outer.ground_z, outer.base, outer.occupied, lattice, corner
+            )
+        ]
 
     def offer(self, points_map: F64) -> None:
         """Points (n, 3), map metres."""
@@ -72,17 +97,23 @@ class NewPoints:
                 self._compact()
 
     def _compact(self) -> None:
-        every = np.concatenate([self._points, *self._waiting])
+        """Sort what came since the last run; a run that is still small is sorted in again, an older one never."""
+        last = [self._runs.pop()] if self._runs and len(self._runs[-1]) < _COMPACT_AT else []
+        self._runs.append(self._one_a_voxel([*last, *self._waiting]))
+        self._waiting, self._count = [], 0
+
+    def _one_a_voxel(self, clouds: list[F64]) -> F64:
+        every = np.concatenate([np.zeros((0, 3)), *clouds])
         keys = voxel_keys(every, self.lattice.x0, self.lattice.y0)
         _, first = np.unique(keys, return_index=True)  # sorted by key; the earliest of each
-        self._points, self._waiting, self._count = every[first], [], 0
+        return every[first]
 
     def by_tile(self) -> dict[TileIndex, F64]:
         """Points (m, 3) in map metres of each tile, sorted by voxel key."""
-        self._compact()
-        rows, cols = tile_of_cells(*self.lattice.cells_of(self._points))
+        points = self._one_a_voxel([*self._runs, *self._waiting])
+        rows, cols = tile_of_cells(*self.lattice.cells_of(points))
         tiles = sorted({(int(r), int(c)) for r, c in zip(*np.unique([rows, cols], axis=1), strict=True)})
-        return {(r, c): self._points[(rows == r) & (cols == c)] for r, c in tiles}
+        return {(r, c): points[(rows == r) & (cols == c)] for r, c in tiles}
 
 
 def points_in(window: Grid, points_map: F64, words: U64, base: I32) -> F32:

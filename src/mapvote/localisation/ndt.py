@@ -172,10 +172,10 @@ def in_rows(points_lidar: NDArray[np.floating]) -> F32:
 
 def thinned(points_lidar: F32) -> dict[float, I64]:
     """By size, metres: indices, ascending, of one of (n, 3) points per voxel of each size that the levels want."""
-    n = len(points_lidar)
-    few = np.arange(0, n, max(1, (n // _ENOUGH - 1) | 1))
-    chosen: dict[float, I64] = {}
-    for size in sorted({level.points_m for level in LEVELS}):
+    sizes = sorted({level.points_m for level in LEVELS})
+    few = thin(points_lidar, sizes[0], every=max(1, (len(points_lidar) // _ENOUGH - 1) | 1))
+    chosen = {sizes[0]: few}
+    for size in sizes[1:]:
         few = few[thin(points_lidar[few], size)]
         chosen[size] = few
     return chosen

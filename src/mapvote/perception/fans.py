@@ -44,26 +44,27 @@ class Fans(NamedTuple):
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _rays(points: F64, origin: F64, clearance: float) -> tuple[F32, F32, F32, I32]:
-    """(reach, slope, stop, fan) of every ray, each (n,): see :class:`Fans`. No branches, so that it vectorises."""
+def _rays(points: F64, origin: F64, clearance: float) -> tuple[F32, F32, F32, F32, F32, I32]:
+    """(reach, direction x, y, slope, stop, fan) of every ray, each (n,): see :class:`Fans`. Without a branch, and by an
+    index that cannot be negative, so that it vectorises."""
     n = len(points)
     reach, slope, stop = np.empty(n, np.float32), np.empty(n, np.float32), np.empty(n, np.float32)
-    fan = np.empty(n, np.int32)
-    for i in range(n):
+    x, y, fan = np.empty(n, np.float32), np.empty(n, np.float32), np.empty(n, np.int32)
+    for i in range(np.uint64(0), np.uint64(n)):
         dx, dy = np.float32(points[i, 0] - origin[0]), np.float32(points[i, 1] - origin[1])
         dz = np.float32(points[i, 2] - origin[2])
         h = np.sqrt(dx * dx + dy * dy)
-        reach[i] = h
+        reach[i], x[i], y[i] = h, dx / h, dy / h
         slope[i] = dz / (np.float32(CELL_SIZE) * h)
         stop[i] = h - np.float32(clearance) * h / np.sqrt(h * h + dz * dz)
         fan[i] = min(np.int32(turn(dx, dy) * np.float32(FANS)), np.int32(FANS - 1))
-    return reach, slope, stop, fan
+    return reach, x, y, slope, stop, fan
 
 
 @numba.njit(cache=True, nogil=True)
 def gather_rays(points: F64, obstacle: NDArray[np.bool_], origin: F64, clearance: float) -> Fans:
     """Sort rays into fans."""
-    reach, rise, end, fan = _rays(points, origin, clearance)
+    reach, x, y, rise, end, fan = _rays(points, origin, clearance)
     start = np.zeros(FANS + 1, np.int32)
     direction = np.zeros((FANS, 2))
     nearest = np.full(FANS, INFINITY, np.float32)
@@ -73,8 +74,8 @@ def gather_rays(points: F64, obstacle: NDArray[np.bool_], origin: F64, clearance
         if not h >= CELL_SIZE:  # the sensor's own cell proves nothing
             continue
         start[f + 1] += 1
-        direction[f, 0] += (points[i, 0] - origin[0]) / h
-        direction[f, 1] += (points[i, 1] - origin[1]) / h
+        direction[f, 0] += x[i]
+        direction[f, 1] += y[i]
         farthest[f] = max(farthest[f], h)
         if obstacle[i] and h < nearest[f]:
             nearest[f] = h
@@ -167,13 +168,23 @@ def _cross_cells(way: Way, ahead: tuple[int, int], end: float, base: I32, layer:
     return n
 
 
+@numba.njit(inline="always")
+def _entered_before(entered: F32, n: int, stop: np.float32) -> np.uint64:
+    """How many of the first ``n`` ascending numbers lie below ``stop``."""
+    low, high = np.uint64(0), np.uint64(n)
+    while low < high:
+        middle = (low + high) >> np.uint64(1)
+        low, high = (middle + np.uint64(1), high) if entered[middle] < stop else (low, middle)
+    return low
+
+
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _pass(slope: np.float32, stop: np.float32, height: np.float32, n: int, crossed: Crossed) -> None:
+def _pass(slope: np.float32, stop: np.float32, height: np.float32, n: np.uint64, crossed: Crossed) -> None:
     """Enter what one ray passes of the first ``n`` cells: in each, the voxels between its heights on entering and on
     leaving. ``height`` of the sensor over its layer, in voxels. One vector lane a cell."""
     t, bottom, words = crossed.entered, crossed.bottom, crossed.words
     none, top, one = np.int32(0), np.int32(TOP_BIT), np.int32(1)
-    for j in range(np.uint64(0), np.uint64(n)):  # unsigned: an index that cannot be negative vectorises
+    for j in range(np.uint64(0), n):  # unsigned: an index that cannot be negative vectorises
         enter = np.int32(np.floor(height + slope * t[j])) - bottom[j]
         leave = np.int32(np.floor(height + slope * min(t[j + np.uint64(1)], stop))) - bottom[j]
         low = min(max(np.int32(min(enter, leave)), none), top)
@@ -201,7 +212,7 @@ def mark_passed(fans: Fans, origin: F64, corner: tuple[float, float], base: I32,
         ahead = (1 if dy > 0 else -1), (1 if dx > 0 else -1)
         n = _cross_cells(_set_out(x, y, dx, dy, marks_from), ahead, fans.end[f], base, layer, crossed)
         for k in range(start[f], start[f + 1]):
-            _pass(slope[k], stop[k], height, np.searchsorted(crossed.entered[:n], stop[k]), crossed)
+            _pass(slope[k], stop[k], height, _entered_before(crossed.entered, n, stop[k]), crossed)
         for j in range(n):
             passed[crossed.cell[j]] |= crossed.words[j]
 
