@@ -33,6 +33,9 @@ NOT_RUN = {
     r"\.\./shared/data/kitti": "needs the KITTI scans: tests/evaluation/experiments/real runs it where they are",
     r"^mapvote evaluate real ": "takes minutes on a real drive: tests/evaluation/experiments/real runs it",
     r"maps\.example\.org": "names a server that is not here: tests/cli/test_follow.py follows a real one",
+    r"^mapvote (evaluate|simulate) (street|street570|as_published)\b": (
+        "takes many minutes and gigabytes: `corner` is run from the help instead"
+    ),
     r"^mapvote serve ": "runs until it is stopped: tests/cli/test_interrupt.py does both",
     r"^python benchmarks/": "takes minutes to hours: only its options are looked up here",
 }
@@ -96,7 +99,18 @@ def run_all(lines: list[str], made: Path, desk: Desk) -> None:
         type_in(re.sub(r"\b(VERSION)\b", lambda m: STANDS_FOR[m[0]], line))
 
 
-@pytest.mark.parametrize(("where", "lines"), SHELL + ALTERNATIVES, ids=lambda v: v if isinstance(v, str) else "")
+def is_slow(lines: list[str]) -> bool:
+    return any(re.search(SLOW, line) and not_run(line) is None for line in lines)
+
+
+@pytest.mark.parametrize(
+    ("where", "lines"),
+    [
+        pytest.param(where, lines, id=where, marks=[pytest.mark.slow] if is_slow(lines) else [])
+        for where, lines in SHELL + ALTERNATIVES
+        if any(not_run(line) is None for line in lines)
+    ],
+)
 def test_the_commands_of_a_page_work_word_for_word(where: str, lines: list[str], made: Path, desk: Desk) -> None:
     run_all(lines, made, desk)
 
