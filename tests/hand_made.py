@@ -10,6 +10,7 @@ import numpy as np
 
 from mapvote.codec.ballot import Ballot, BallotTile, pack_plane, tile_key
 from mapvote.codec.tile_file import base_hash
+from mapvote.codec.words import pack_words
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Lattice, TileIndex
 from mapvote.core.point_map import PointMap
 from mapvote.core.tile import Tile
@@ -66,9 +67,9 @@ class Say:
             tile=tile,
             states=None if self.states is None else pack_plane(self.states, 1),
             tally=None if self.tally is None else pack_plane(np.moveaxis(self.tally, -1, 0), 1),
-            gone=None if self.gone is None else pack_plane(self.gone, 1),
+            gone=None if self.gone is None else pack_words(self.gone),
             new_points=None if self.new_points is None else pack_plane(self.new_points, 1),
-            free=None if self.free is None else pack_plane(self.free, 1),
+            free=None if self.free is None else pack_words(self.free),
         )
 
 

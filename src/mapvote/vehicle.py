@@ -8,6 +8,7 @@ import numpy as np
 
 from mapvote.codec.ballot import Ballot, BallotTile, pack_plane, tile_key
 from mapvote.codec.tile_file import base_hash
+from mapvote.codec.words import pack_words
 from mapvote.config import Settings
 from mapvote.core.grid import TileIndex
 from mapvote.core.point_map import PointMap
@@ -148,9 +149,9 @@ def _ballot_tile(
         tile=tile,
         states=pack_plane(votes.states) if two_stage else None,
         tally=None if two_stage else pack_plane(np.moveaxis(to_wire(votes.tally), -1, 0)),
-        gone=None if gone is None else pack_plane(gone),
+        gone=None if gone is None else pack_words(gone),
         new_points=new_points,
-        free=None if votes.free is None else pack_plane(votes.free),
+        free=None if votes.free is None else pack_words(votes.free),
     )
 
 

@@ -16,10 +16,12 @@ import numpy as np
 
 from mapvote.codec.arrays import pack_plane as pack_plane
 from mapvote.codec.arrays import unpack_bytes, unpack_frames, unpack_plane
+from mapvote.codec.words import unpack_cells
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, TileIndex
-from mapvote.core.types import F32, N_STATES, NO_VOTE, U8, U16, U64, MapvoteError
+from mapvote.core.types import F32, N_STATES, NO_VOTE, U8, U16, MapvoteError
 
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
+"""2: masks and free space as the words of some cells; 1, which is still read: as whole planes."""
 MAX_TILES = 4096
 MAX_POINTS_PER_CELL = 64
 """One new point per voxel of a column: no honest ballot has more."""
@@ -43,11 +45,11 @@ class BallotTile(msgspec.Struct, frozen=True, kw_only=True):
     tally: bytes | None = None
     """(5, 256, 256) uint16 votes in VOTE_UNITs, class-major: one-stage."""
     gone: bytes | None = None
-    """(256, 256) uint64: which voxels of a changed-empty cell are gone (delete mask)."""
+    """(256, 256) uint64, see codec/words.py: which voxels of a changed-empty cell are gone (delete mask)."""
     new_points: bytes | None = None
     """(m, 3) float32 from the tile's corner, sorted by voxel key: one per 0.3 m voxel of changed-occupied cells."""
     free: bytes | None = None
-    """(256, 256) uint64: voxels that this drive's rays passed through."""
+    """(256, 256) uint64, likewise: voxels that this drive's rays passed through."""
 
 
 class Ballot(msgspec.Struct, frozen=True, kw_only=True):
@@ -105,11 +107,6 @@ def _checked(states: U8) -> U8:
 def unpack_tally(data: bytes) -> U16:
     """(256, 256, 5) uint16; MapvoteError if damaged."""
     return np.moveaxis(unpack_plane(data, "<u2", (N_STATES, TILE_CELLS, TILE_CELLS), "ballot: tally"), 0, -1)
-
-
-def unpack_words(data: bytes, what: str) -> U64:
-    """(256, 256) uint64; MapvoteError if damaged."""
-    return unpack_plane(data, "<u8", (TILE_CELLS, TILE_CELLS), f"ballot: {what}")
 
 
 def unpack_points(data: bytes) -> F32:
@@ -203,7 +200,7 @@ def validate(ballot: Ballot, max_bytes: int | None = None) -> None:
             size += unpack_tally(tile.tally).nbytes
         for what, words in (("gone", tile.gone), ("free", tile.free)):
             if words is not None:
-                size += unpack_words(words, what).nbytes
+                size += sum(part.nbytes for part in unpack_cells(words, what))
         if tile.new_points is not None:
             size += unpack_points(tile.new_points).nbytes
         if max_bytes is not None and size > max_bytes:

@@ -6,11 +6,13 @@ Pure functions of the ballot, the map it voted on, and of another vehicle's ball
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from typing import TypeVar
 
 import msgspec
 import numpy as np
 
-from mapvote.codec.ballot import Ballot, BallotTile, pack_plane, unpack_points, unpack_states, unpack_words
+from mapvote.codec.ballot import Ballot, BallotTile, pack_plane, unpack_points, unpack_states
+from mapvote.codec.words import pack_words, unpack_words
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS
 from mapvote.core.point_map import PointMap
 from mapvote.core.types import F32, NO_VOTE, U8, U64, Bool, CellState
@@ -22,6 +24,7 @@ SHIFT_CELLS = 3
 FALSE_HEIGHTS_M = (0.75, 1.05, 1.35, 1.65, 1.95)
 """Above the ground, where false points stand."""
 _ALL = ~np.uint64(0)
+Plane = TypeVar("Plane", U8, U64)
 
 
 def invert(ballot: Ballot, point_map: PointMap, other: Ballot) -> Ballot:
@@ -70,8 +73,8 @@ def shift(ballot: Ballot, point_map: PointMap, other: Ballot) -> Ballot:
         return msgspec.structs.replace(
             tile,
             states=None if tile.states is None else pack_plane(_shifted(unpack_states(tile.states), NO_VOTE)),
-            gone=None if tile.gone is None else pack_plane(_shifted(unpack_words(tile.gone, "gone"), 0)),
-            free=None if tile.free is None else pack_plane(_shifted(unpack_words(tile.free, "free"), 0)),
+            gone=None if tile.gone is None else pack_words(_shifted(unpack_words(tile.gone, "gone"), 0)),
+            free=None if tile.free is None else pack_words(_shifted(unpack_words(tile.free, "free"), 0)),
             new_points=None if points is None else pack_plane(points),
         )
 
@@ -108,7 +111,7 @@ def _claim(ballot: Ballot, point_map: PointMap, lie: Callable[[U8, Bool], U8]) -
         return msgspec.structs.replace(
             tile,
             states=pack_plane(states),
-            gone=pack_plane(gone),
+            gone=pack_words(gone),
             new_points=pack_plane(points) if len(points) else None,
         )
 
@@ -123,7 +126,7 @@ def made_up(cells: Bool, ground_z: F32) -> F32:
     return np.concatenate(poles).astype(np.float32)
 
 
-def _shifted(plane: U8 | U64, vacated: int) -> U8 | U64:
+def _shifted(plane: Plane, vacated: int) -> Plane:
     out = np.full_like(plane, vacated)
     out[SHIFT_CELLS:, SHIFT_CELLS:] = plane[:-SHIFT_CELLS, :-SHIFT_CELLS]
     return out
