@@ -51,10 +51,10 @@ class Vehicle:
             localise or Localiser(point_map, self.settings, sensor),
             MovingFilter(sensor, self.settings.moving),
             LocalMap(point_map, self.settings.voting.window_m),
-            with_sight=self.settings.voting.method != "columns",
+            with_sight=self.settings.voting.method == "paper",
         )
         self._voter = make_voter(self.settings, sensor, point_map)
-        self._new_points = NewPoints(point_map.lattice, beyond=self.settings.voting.method == "columns")
+        self._new_points = NewPoints(point_map.lattice, beyond=self.settings.voting.method != "paper")
 
     @property
     def report(self) -> DriveReport:

@@ -45,7 +45,7 @@ def evaluate(
     seed: Seed = 1,
     case: Annotated[
         str,
-        typer.Option(metavar="CASES", help='1..5, "1 column", columns, yardsticks, several by commas, or all'),
+        typer.Option(metavar="CASES", help='1..5, "1 column", columns, surfaces, yardsticks, by commas, or all'),
     ] = "1,2,3,4,5,columns",
     poses: Annotated[
         str, typer.Option(metavar="ndt|truth", help="whether vehicles localise, or are told where they are")

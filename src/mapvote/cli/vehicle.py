@@ -102,7 +102,8 @@ def vote(
         str | None, typer.Option(metavar="NAME", help="whose vote; else drive.toml, else the drive's name")
     ] = None,
     case: Annotated[
-        str | None, typer.Option(metavar="CASE", help="columns, or the paper's case 1 to 5; else as the settings say")
+        str | None,
+        typer.Option(metavar="CASE", help="columns, surfaces, or the paper's 1 to 5; else by the settings"),
     ] = None,
     trust_prior: Annotated[
         bool, typer.Option("--trust-prior", help="take the prior for the pose, do not localise")

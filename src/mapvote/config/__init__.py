@@ -67,9 +67,9 @@ class MappingSettings(Section):
 
 
 class VotingSettings(Section):
-    """The paper's rule, and which of its cases (paper III, V). ``method = "columns"``: docs/method.md."""
+    """The paper's rule, and which of its cases (paper III, V). ``"columns"`` and ``"surfaces"``: docs/method.md."""
 
-    method: Literal["paper", "columns"] = "columns"
+    method: Literal["paper", "columns", "surfaces"] = "columns"
     weighted: bool = Field(default=True, description="multiple votes per scan by Eq. (1); false: one vote per scan")
     two_stage: bool = Field(default=True, description="the vehicle decides its cells; false: it sends its tally")
     skip_tall_cells: bool = Field(default=True, description="case 5: no vote where the map begins above the view")
@@ -78,7 +78,7 @@ class VotingSettings(Section):
     k: float = 0.5
     window_m: float = Field(default=80.0, description="side of the local grid (paper III-A)")
     min_height_m: float = Field(
-        default=0.6, description="columns: a cell whose map rises no higher than this is never changed-empty"
+        default=0.6, description="columns, surfaces: a cell whose map rises no higher than this is never changed-empty"
     )
     min_cells: int = Field(default=4, description="columns: smaller groups of changed cells are dropped")
 
@@ -214,11 +214,14 @@ def _from_env(env: Mapping[str, str]) -> Iterable[tuple[str, str, Any, str]]:
 
 
 def choose_case(settings: Settings, case: str) -> Settings:
-    """``settings`` with the vote of one of the paper's cases, "1" to "5", or of "columns". MapvoteError for another."""
-    if case == "columns":
-        chosen: dict[str, object] = {"method": "columns"}
+    """``settings`` with the vote of one of the paper's cases, "1" to "5", of "columns" or of "surfaces".
+
+    MapvoteError for another.
+    """
+    if case in ("columns", "surfaces"):
+        chosen: dict[str, object] = {"method": case}
     elif case in CASES:
         chosen = {"method": "paper", **CASES[case]}
     else:
-        raise MapvoteError(f"no case {case!r}; choose columns or one of {', '.join(CASES)}")
+        raise MapvoteError(f"no case {case!r}; choose columns, surfaces or one of {', '.join(CASES)}")
     return settings.model_copy(update={"voting": settings.voting.model_copy(update=chosen)})

@@ -31,7 +31,7 @@ _BEHIND = int(Sight.BEHIND)
 
 
 @numba.njit(cache=True, nogil=True)
-def _is_full(planes: U64, first: int, word: np.uint64) -> bool:
+def is_full(planes: U64, first: int, word: np.uint64) -> bool:
     """Whether one of ``word``'s voxels has reached the highest count."""
     for k in range(first + PLANES - 1, first - 1, -1):
         word &= planes[k]
@@ -39,7 +39,7 @@ def _is_full(planes: U64, first: int, word: np.uint64) -> bool:
 
 
 @numba.njit(cache=True, nogil=True)
-def _add(planes: U64, first: int, word: np.uint64) -> None:
+def add_one(planes: U64, first: int, word: np.uint64) -> None:
     """Add 1 to the counts of ``word``'s voxels: a ripple-carry adder over 64 voxels at once."""
     for k in range(first, first + PLANES):
         carry = planes[k] & word
@@ -50,7 +50,7 @@ def _add(planes: U64, first: int, word: np.uint64) -> None:
 
 
 @numba.njit(cache=True, nogil=True)
-def _halve(planes: U64) -> None:
+def halve(planes: U64) -> None:
     for first in (_THROUGH, _STRUCK):
         for k in range(first, first + PLANES - 1):
             planes[k] = planes[k + 1]
@@ -103,10 +103,10 @@ def _gather(
                     cell[STRUCK_ITSELF] |= hit[r, c] & mapped
                     if reach == 1:  # where a scan is not sure of its pose, single voxels mean nothing
                         cell[THROUGH_ITSELF] |= passed[r, c] & mapped & ~hit[r, c]
-                if _is_full(cell, _THROUGH, through) or _is_full(cell, _STRUCK, struck):
-                    _halve(cell)
-                _add(cell, _THROUGH, through)
-                _add(cell, _STRUCK, struck)
+                if is_full(cell, _THROUGH, through) or is_full(cell, _STRUCK, struck):
+                    halve(cell)
+                add_one(cell, _THROUGH, through)
+                add_one(cell, _STRUCK, struck)
 
 
 class Evidence:

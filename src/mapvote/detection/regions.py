@@ -27,7 +27,7 @@ JOIN_CELLS = 6
 """Rule C: how far a new thing reaches along mapped cells."""
 FALL_CELLS = 15
 """Rule H: how far what is gone takes unseen cells with it."""
-_HALO = 64
+HALO = 64
 """Cells around a tile that rules H and I look at: 19 m, a house."""
 Plane = Any
 """An array of one tile or window, of any type."""
@@ -51,21 +51,21 @@ def apply_region_rules(tiles: Tiles, lattice: Lattice, voting: VotingSettings, r
 def _give_up_explained(tiles: Tiles, lattice: Lattice, join_cells: int) -> None:
     beside = {tile: judged.weighed.beside for tile, judged in tiles.items()}
     rule = partial(unexplained, reach=join_cells)
-    for tile, cells in _beyond(lattice, join_cells, rule, (_states(tiles), NO_VOTE), (beside, False)).items():
+    for tile, cells in beyond_tiles(lattice, join_cells, rule, (_states(tiles), NO_VOTE), (beside, False)).items():
         tiles[tile].overrule(cells, CellState.UNDETERMINED)
 
 
 def _let_fall(tiles: Tiles, lattice: Lattice, fall_cells: int) -> None:
     adrift = {tile: judged.weighed.adrift for tile, judged in tiles.items()}
     rule = partial(fallen, reach=fall_cells)
-    for tile, cells in _beyond(lattice, _HALO, rule, (_states(tiles), NO_VOTE), (adrift, False)).items():
+    for tile, cells in beyond_tiles(lattice, HALO, rule, (_states(tiles), NO_VOTE), (adrift, False)).items():
         tiles[tile].overrule(cells, CellState.CHANGED_EMPTY)
         tiles[tile].weighed.gone[cells] = tiles[tile].here.occupied[cells]
 
 
 def _drop_specks(tiles: Tiles, lattice: Lattice, min_cells: int) -> None:
     rule = partial(drop_specks, min_cells=min_cells)
-    for tile, cells in _beyond(lattice, min_cells, rule, (_states(tiles), NO_VOTE)).items():
+    for tile, cells in beyond_tiles(lattice, min_cells, rule, (_states(tiles), NO_VOTE)).items():
         tiles[tile].states[cells] = CellState.UNDETERMINED
 
 
@@ -76,7 +76,7 @@ def _take_remnants(tiles: Tiles, lattice: Lattice) -> None:
     loose = {tile: judged.weighed.loose for tile, judged in tiles.items()}
     base = {tile: judged.here.base for tile, judged in tiles.items()}
     gone = {t: np.where(judged.states == empty, judged.weighed.gone, np.uint64(0)) for t, judged in tiles.items()}
-    for tile, left in _beyond(lattice, _HALO, remnants, (gone, 0), (loose, 0), (base, 0)).items():
+    for tile, left in beyond_tiles(lattice, HALO, remnants, (gone, 0), (loose, 0), (base, 0)).items():
         judged = tiles[tile]
         nothing_left = ((left | gone[tile]) == judged.here.occupied) & (left & judged.crowded == 0)
         judged.overrule((left != 0) & nothing_left & (judged.states != empty), CellState.CHANGED_EMPTY)
@@ -89,7 +89,7 @@ def _states(tiles: Tiles) -> dict[TileIndex, U8]:
     return {tile: judged.states for tile, judged in tiles.items()}
 
 
-def _beyond(
+def beyond_tiles(
     lattice: Lattice, halo: int, rule: Callable[..., Plane], *planes: tuple[Mapping[TileIndex, Plane], int]
 ) -> dict[TileIndex, Plane]:
     """``rule`` of ``planes``, tile by tile with ``halo`` cells around it, cut back to the tile. Each plane comes with

@@ -1,4 +1,4 @@
-"""Two ways to count a drive, one interface: the paper's votes per scan, and columns of evidence."""
+"""Three ways to count a drive, one interface: the paper's votes per scan, columns of evidence, and surfaces."""
 
 from __future__ import annotations
 
@@ -11,12 +11,14 @@ from mapvote.core.sensors import Sensor
 from mapvote.core.types import U64
 from mapvote.detection.columns import ColumnVoter
 from mapvote.detection.paper import PaperVoter
+from mapvote.detection.surfaces import SurfaceVoter
 from mapvote.detection.votes import TileVotes
 from mapvote.perception.frontend import Observation
 
 
 class Voter(Protocol):
-    """:class:`PaperVoter` or :class:`ColumnVoter`: scan after scan goes in, votes come out tile by tile."""
+    """:class:`PaperVoter`, :class:`ColumnVoter` or :class:`SurfaceVoter`: scan after scan goes in, votes come out tile
+    by tile."""
 
     def observe(self, seen: Observation) -> U64:
         """Take in one scan; returns (rows, cols) words of the voxels of its view whose points may be new."""
@@ -30,4 +32,6 @@ def make_voter(settings: Settings, sensor: Sensor, point_map: PointMap) -> Voter
     """The voter that ``voting.method`` names."""
     if settings.voting.method == "columns":
         return ColumnVoter(settings.voting, point_map)
+    if settings.voting.method == "surfaces":
+        return SurfaceVoter(settings.voting, point_map)
     return PaperVoter(settings.voting, settings.paper, sensor, point_map)

@@ -52,9 +52,9 @@ def rule_of(method: str) -> Rule:
     """The server's half of a ballot's method; MapvoteError for one that this version does not know."""
     if method == "paper":
         return "paper"
-    if method == "columns":
+    if method in ("columns", "surfaces"):  # they differ in how a vehicle decides
         return "columns"
-    raise MapvoteError(f"ballot: method {method!r} is unknown; this version fuses 'paper' and 'columns'")
+    raise MapvoteError(f"ballot: method {method!r} is unknown; this version fuses 'paper', 'columns' and 'surfaces'")
 
 
 def count(votes: Sequence[TileVote], rule: Rule, min_votes: int) -> tuple[U8, NDArray[Any]]:

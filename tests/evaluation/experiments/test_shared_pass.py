@@ -52,7 +52,7 @@ def planes(ballot: Ballot) -> list[tuple[object, ...]]:
 
 
 def test_each_case_says_what_a_vehicle_of_its_own_would_have_said(street: PointMap, drive: Drive) -> None:
-    cases, _ = choose_cases(Settings(), "1,1 column,3,5,columns,columns one-stage")
+    cases, _ = choose_cases(Settings(), "1,1 column,3,5,columns,columns one-stage,surfaces")
     shared = SharedPass(drive, street, Settings(), cases, localise=GivenPoses(STAMPS, POSES))
     seen = []
     for scan in drive:

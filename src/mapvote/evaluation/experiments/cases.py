@@ -62,13 +62,15 @@ def paper_cases(settings: Settings) -> dict[str, Case]:
 
 
 def column_cases(settings: Settings) -> dict[str, Case]:
-    """Our own method: as it is, decided by the server alone, and growing rule by rule (the ablation)."""
+    """Our own methods: columns as they are, decided by the server alone, and growing rule by rule (the ablation); and
+    surfaces."""
     voting = settings.voting.model_copy(update={"method": "columns"})
     whole = Case("columns", voting, settings.fuse.min_votes)
     one_stage = voting.model_copy(update={"two_stage": False})
     cases = [whole, replace(whole, name="columns one-stage", voting=one_stage)]
     for n in range(1, len(LETTERS)):
         cases.append(replace(whole, name=f"columns {LETTERS[:n]}", rules=by_letters(LETTERS[:n])))
+    cases.append(replace(whole, name="surfaces", voting=voting.model_copy(update={"method": "surfaces"})))
     return {case.name: case for case in cases}
 
 
@@ -85,8 +87,10 @@ YARDSTICKS = ("nearest", "evidence")
 
 
 def choose_cases(settings: Settings, wanted: str) -> tuple[list[Case], bool]:
-    """Cases by comma-separated names (1 to 5, "1 column" and its like, columns, yardsticks, or "all" that there is),
-    and whether the yardsticks are wanted. MapvoteError names one that there is not, or says that no vote is left.
+    """Cases by comma-separated names (1 to 5, "1 column" and its like, columns, surfaces, yardsticks, or "all" that
+    there is), and whether the yardsticks are wanted.
+
+    MapvoteError names one that there is not, or says that no vote is left.
     """
     every = {**paper_cases(settings), **column_cases(settings)}
     names = [*every, "yardsticks"] if wanted == "all" else [name.strip() for name in wanted.split(",")]

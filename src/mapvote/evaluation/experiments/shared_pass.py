@@ -20,6 +20,7 @@ from mapvote.detection.counters import Evidence
 from mapvote.detection.new_points import NewPoints
 from mapvote.detection.paper import PaperVoter
 from mapvote.detection.rules import Rules
+from mapvote.detection.surfaces import SurfaceVoter
 from mapvote.detection.voters import Voter
 from mapvote.evaluation.experiments.cases import Case
 from mapvote.localisation.localiser import Localise, Localiser
@@ -49,13 +50,13 @@ class SharedPass:
             LocalMap(point_map, settings.voting.window_m),
         )
         self._voters: dict[tuple[VotingSettings, PaperSettings, Rules], Voter] = {}
-        self._observing: list[PaperVoter | ColumnVoter] = []
+        self._observing: list[PaperVoter | ColumnVoter | SurfaceVoter] = []
         """Those of them that fill the counters."""
         self._evidence: dict[tuple[bool, bool], Evidence] = {}
         for case in cases:
             self._enrol(case)
         self._new_points = {
-            method: NewPoints(point_map.lattice, beyond=method == "columns")
+            method: NewPoints(point_map.lattice, beyond=method != "paper")
             for method in {voter.voting.method for voter in self._observing}
         }
 
@@ -68,6 +69,11 @@ class SharedPass:
             by_scan = PaperVoter(voting, paper, self.drive.sensor, self.point_map)
             self._voters[key] = by_scan
             self._observing.append(by_scan)
+            return
+        if voting.method == "surfaces":
+            of_surfaces = SurfaceVoter(voting, self.point_map)
+            self._voters[key] = of_surfaces
+            self._observing.append(of_surfaces)
             return
         counted_by = rules.empty_by_ray, rules.hits_veto
         voter = ColumnVoter(voting, self.point_map, rules, self._evidence.get(counted_by))

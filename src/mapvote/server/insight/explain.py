@@ -13,7 +13,7 @@ from mapvote.codec.arrays import unpack_plane
 from mapvote.core.grid import TILE_CELLS, TileIndex
 from mapvote.core.tile import Tile
 from mapvote.core.types import NO_VOTE, U8, CellState, MapvoteError
-from mapvote.fusion.fuse import decide_tile
+from mapvote.fusion.fuse import decide_tile, rule_of
 from mapvote.fusion.persistence import expected_days
 from mapvote.fusion.spent import unspent
 from mapvote.fusion.tile_vote import TileVote
@@ -164,7 +164,7 @@ def _why_not(vote: TileVote, obeyed: TileVote | None, now: _Place, silenced: set
 def _silenced(place: _Place, drives: Sequence[TileVote]) -> set[str]:
     """Vehicles that are not heard on a tile, of the votes that count there."""
     policy = place.asked.policy
-    heard = decide_tile(place.tile, drives, policy.round.method, policy.fuse).votes
+    heard = decide_tile(place.tile, drives, rule_of(policy.round.method), policy.fuse).votes
     return {vote.vehicle for vote in drives} - {vote.vehicle for vote in heard}
 
 
@@ -197,7 +197,7 @@ def _thing(connection: sa.Connection, now: _Place) -> str:
     drives = [vote for _, vote in counted_votes(connection, tile, now.asked)]
     if policy.round.stage == "two-stage":
         recent = recent_votes(connection, tile, now.asked)
-        found = decide_tile(tile, drives, policy.round.method, policy.fuse, lambda: recent)
+        found = decide_tile(tile, drives, rule_of(policy.round.method), policy.fuse, lambda: recent)
         if found.passing is not None and found.passing[cell]:
             told.append("temporary: what is new here is not expected to stay, and stays out of the map")
         elif found.denied is not None and found.denied[cell]:

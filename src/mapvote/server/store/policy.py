@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 class RoundPolicy(Section):
     """How the ballots of a round are cast. Others are refused, and those that stand already do not count."""
 
-    method: Literal["paper", "columns"] = "columns"
+    method: Literal["paper", "columns", "surfaces"] = "columns"
     stage: Literal["one-stage", "two-stage"] = "two-stage"
     settings_hash: str = Field(
         default="",

@@ -21,7 +21,7 @@ from mapvote.codec.ballot import tile_key
 from mapvote.core.grid import CELLS, TILE_CELLS, Grid, TileIndex
 from mapvote.core.tile import Tile
 from mapvote.core.types import I32, I64, N_STATES, U8, Bool, MapvoteError
-from mapvote.fusion.fuse import fuse_tile
+from mapvote.fusion.fuse import fuse_tile, rule_of
 from mapvote.fusion.tile_vote import TileVote
 from mapvote.server.errors import Unavailable
 from mapvote.server.store.blobs import TileHashes, pack_tile
@@ -124,7 +124,7 @@ def _fuse(connection: sa.Connection, task: Task) -> Fused:
         return recent_votes(connection, tile, task.asked, task.misread)
 
     recent = history if cast.stage == "two-stage" else None
-    decision, edited = fuse_tile(tile, votes, cast.method, task.asked.settings, task.version, recent)
+    decision, edited = fuse_tile(tile, votes, rule_of(cast.method), task.asked.settings, task.version, recent)
     hashes, planes = (None, {}) if edited is tile else pack_tile(edited)
     held, holds = ((tile.obstacle_words != 0), (edited.obstacle_words != 0)) if hashes else (_NOWHERE, _NOWHERE)
     return Fused(

@@ -1,0 +1,94 @@
+"""Evidence per voxel where a hit knows its own place: in how many scans was a voxel's surface met, in how many crossed.
+
+A hit speaks for what lies within its own error, HIT_REACH_M, and for nothing beside that: a wall half a metre from
+where one stood is another wall. A voxel that the map holds is met by a hit so near it, any other one by a hit in it;
+and what was met is not crossed in the same scan, whatever grazed past. Crossed is a voxel if one scan's rays pass it
+and the voxels above and below it: of a slab (roof, awning, ceiling) they reach only one of the two.
+
+Counts are kept as those of columns (detection/counters.py), with a word a cell of what any ray ever passed.
+"""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+
+from mapvote.core.columns import TOP_BIT, column_bit
+from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Lattice, TileIndex
+from mapvote.core.types import F32, F64, I32, U64, Bool
+from mapvote.detection.counters import PLANES, add_one, halve, is_full
+from mapvote.perception.frontend import Observation
+from mapvote.perception.raycast import find_obstacles
+
+HIT_REACH_M = 0.1
+"""How far from it a hit may speak for a surface: range noise and pose sigma together, three times over (docs/decisions/
+evidence.md has what other reaches do)."""
+CROSSED, MET = 0, PLANES
+PASSED = 2 * PLANES
+WORDS = 2 * PLANES + 1
+"""Words a cell: the two counters, and what any ray passed."""
+_LOWEST, _HIGHEST = np.uint64(0b11), np.uint64(1) << np.uint64(TOP_BIT - 1)
+"""The ground bounds the lowest voxel, the end of the word the highest."""
+
+
+@numba.njit(cache=True, nogil=True)
+def _mark_near(
+    points: F64, cell: I32, chosen: Bool, base: I32, corner: tuple[float, float], reach: float, near: U64
+) -> None:
+    """Enter into ``near`` (rows, cols) the voxels that come within ``reach`` metres, along each axis, of the points."""
+    rows, cols = base.shape
+    for i in range(len(points)):
+        if not chosen[i] or cell[i] < 0:
+            continue
+        r, c = cell[i] // cols, cell[i] % cols
+        x, y, z = points[i, 0] - corner[0] - c * CELL_SIZE, points[i, 1] - corner[1] - r * CELL_SIZE, points[i, 2]
+        last_r, last_c = min(r + (y > CELL_SIZE - reach), rows - 1), min(c + (x > CELL_SIZE - reach), cols - 1)
+        for k in range(max(r - (y < reach), 0), last_r + 1):
+            for j in range(max(c - (x < reach), 0), last_c + 1):
+                low, high = column_bit(z - reach, base[k, j]), column_bit(z + reach, base[k, j])
+                near[k, j] |= (np.uint64(2) << np.uint64(high)) - (np.uint64(1) << np.uint64(low))
+
+
+@numba.njit(cache=True, nogil=True)
+def _gather(planes: U64, row0: int, col0: int, hit: U64, near: U64, passed: U64, occupied: U64, ground_z: F32) -> None:
+    """Add one scan to a tile's cells ``planes``, which begin at (row0, col0) of the window."""
+    for i in range(planes.shape[0]):
+        for j in range(planes.shape[1]):
+            r, c = row0 + i, col0 + j
+            if np.isnan(ground_z[r, c]) or not hit[r, c] | near[r, c] | passed[r, c]:
+                continue
+            cell, rays, mapped = planes[i, j], passed[r, c], occupied[r, c]
+            above, below = rays >> np.uint64(1) | _HIGHEST, rays << np.uint64(1) | _LOWEST
+            crossed = rays & above & below & ~near[r, c]
+            met = (near[r, c] & mapped) | (hit[r, c] & ~mapped)
+            cell[PASSED] |= rays
+            if is_full(cell, CROSSED, crossed) or is_full(cell, MET, met):
+                halve(cell)
+            add_one(cell, CROSSED, crossed)
+            add_one(cell, MET, met)
+
+
+class SurfaceEvidence:
+    """Counters of a drive by tile: (256, 256, WORDS) uint64, crossed first, met after, then what rays passed."""
+
+    def __init__(self, lattice: Lattice) -> None:
+        self.lattice = lattice
+        self.tiles: dict[TileIndex, U64] = {}
+
+    def count(self, seen: Observation) -> None:
+        """Count one scan."""
+        view, here, scan = seen.view, seen.reference, seen.scan
+        near, base = np.zeros(view.grid.shape, dtype=np.uint64), np.ascontiguousarray(here.base)
+        cell = scan.cell if here is scan.reference else find_obstacles(scan.points_map, here)[1]
+        still = scan.obstacle & ~seen.moving
+        _mark_near(scan.points_map, cell, still, base, (view.grid.x0, view.grid.y0), HIT_REACH_M, near)
+        for tile in view.grid.tiles():
+            window = self.lattice.tile(tile)
+            common = window.intersection(view.grid)
+            if tile not in self.tiles:
+                self.tiles[tile] = np.zeros((TILE_CELLS, TILE_CELLS, WORDS), dtype=np.uint64)
+            row0, col0 = common.row0 - view.grid.row0, common.col0 - view.grid.col0
+            _gather(
+                self.tiles[tile][common.slices_in(window)], row0, col0, view.hit, near, view.passed, here.occupied,
+                here.ground_z,
+            )  # fmt: skip

@@ -1,0 +1,221 @@
+"""One rule of evidence: what did a drive's rays do to each surface of the map, and what stands where it was free?
+
+A mapped voxel is gone that was crossed more often than HIT_RAYS times its hits, and stands that was met and is not. A
+cell is changed-empty if a voxel of it is gone and none stands: what no ray could decide in it goes along. Cells that no
+ray could decide go with what falls, as columns have it (rule H). A free voxel met more often than rays spoke against it
+is new. Support, not area, makes a change of either: a pole is narrow and tall, a speck is neither. docs/method.md.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+from scipy import ndimage
+
+from mapvote.config import VotingSettings
+from mapvote.core.columns import below_top, dilated
+from mapvote.core.grid import Lattice, TileIndex
+from mapvote.core.point_map import PointMap
+from mapvote.core.reference import above_ground_points, cut_reference, reference_window
+from mapvote.core.types import I32, NO_VOTE, U8, U64, Bool, CellState, Reference
+from mapvote.core.voting import one_hot
+from mapvote.detection.counters import count_of, free_words
+from mapvote.detection.regions import HALO, JOIN_CELLS, beyond_tiles, fallen, unexplained
+from mapvote.detection.surface_counts import CROSSED, MET, PASSED, SurfaceEvidence
+from mapvote.detection.votes import TileVotes
+from mapvote.perception.frontend import Observation
+
+# Set on corner 1 and 2, street 2 and KITTI 0001 in blocks of 12 and 25 scans: docs/decisions/evidence.md has each.
+HIT_RAYS = 8
+"""Scans that crossed a mapped voxel, against one that met it."""
+GONE_RAYS = 3
+"""Scans that must have crossed it beyond those: two may be an error of two poses."""
+NEW_RAYS = 0.5
+"""Of the scans in which a free voxel was met, one goes against two that crossed it."""
+SUPPORT = 6
+"""Voxels that a change must be decided by, over its 8-connected cells: a pole of 1.8 m, or half a square metre."""
+FALL_CELLS = 8
+"""How far what is gone takes cells with it that no ray could decide: 2.4 m, where columns allow 4.5."""
+
+
+@dataclass(slots=True)
+class _Judged:
+    """One tile on the way to its votes: words and states, (256, 256) each."""
+
+    here: Reference
+    gone: U64
+    stands: U64
+    new: U64
+    beyond: U64
+    """Met where the map knew nothing and has nothing beside it."""
+    beside: Bool
+    """Cells whose new voxels all lie next to mapped ones."""
+    adrift: Bool
+    """Mapped cells that no ray decided, with rays through half of what is under them or more."""
+    states: U8
+    remnants: U64
+
+
+@numba.njit(cache=True, nogil=True)
+def weigh_surfaces(
+    planes: U64, occupied: U64, free: U64, near: U64, gone: U64, stands: U64, new: U64, beyond: U64
+) -> None:
+    """Fill the last four planes (rows, cols), which come empty, from counters (rows, cols, WORDS) and the map's words:
+    ``free`` it knows to be, ``near`` its points."""
+    for r in range(occupied.shape[0]):
+        for c in range(occupied.shape[1]):
+            cell = planes[r, c]
+            for bit in range(64):
+                one = np.uint64(1) << np.uint64(bit)
+                crossed, met = count_of(cell, CROSSED, bit), count_of(cell, MET, bit)
+                if occupied[r, c] & one:
+                    if crossed >= GONE_RAYS + HIT_RAYS * met:
+                        gone[r, c] |= one
+                    elif met:
+                        stands[r, c] |= one
+                elif met >= 1 + NEW_RAYS * crossed:
+                    if free[r, c] & one:
+                        new[r, c] |= one
+                    elif not near[r, c] & one:
+                        beyond[r, c] |= one
+
+
+def supported(cells: Bool, voxels: U64) -> Bool:
+    """(rows, cols) those of ``cells`` whose 8-connected group has SUPPORT set bits in ``voxels`` (rows, cols)."""
+    group, count = ndimage.label(cells, structure=np.ones((3, 3)))
+    votes = np.bincount(group.ravel(), weights=np.bitwise_count(voxels).ravel(), minlength=count + 1)
+    return np.asarray(cells & (votes >= SUPPORT)[group])
+
+
+def settled(gone: U64, stands: U64, mapped: U64, base: I32) -> U64:
+    """(rows, cols) ``gone``, and those ``mapped`` voxels that neither plane holds and that it reaches before ``stands``
+    does, from voxel to touching voxel (26); where both come at once, they stand."""
+    gone, stands = gone.copy(), stands.copy()
+    left = mapped & ~gone & ~stands
+    while left.any():
+        more_stand = dilated(stands, base, 1) & left
+        more_gone = dilated(gone, base, 1) & left & ~more_stand
+        if not (more_stand.any() or more_gone.any()):
+            break
+        stands |= more_stand
+        gone |= more_gone
+        left &= ~(more_stand | more_gone)
+    return gone
+
+
+class SurfaceVoter:
+    """Surfaces: evidence per voxel over the drive, weighed at its end. Decides alone: its tally is one vote a cell."""
+
+    def __init__(self, voting: VotingSettings, point_map: PointMap) -> None:
+        self.voting, self.point_map = voting, point_map
+        self.evidence = SurfaceEvidence(point_map.lattice)
+
+    def observe(self, seen: Observation) -> U64:
+        """Count one scan; returns (rows, cols) words of voxels whose points may be new."""
+        self.evidence.count(seen)
+        return seen.view.hit & ~seen.reference.occupied
+
+    def votes(self) -> dict[TileIndex, TileVotes]:
+        """Every tile with evidence, in ascending order."""
+        judged = {tile: self._judge(tile) for tile in sorted(self.evidence.tiles)}
+        _decide_mapped(judged, self.point_map.lattice)
+        _decide_new(judged, self.point_map.lattice)
+        out = {}
+        for tile, found in judged.items():
+            here = found.here
+            if (found.states == NO_VOTE).all():
+                continue
+            free = free_words(self.evidence.tiles[tile], here.occupied)
+            known = ~np.uint64(0) if here.free is None else here.free
+            if here.free is not None:
+                free[here.free != 0] = 0  # what the map knows need not be sent
+            top = _below_tops(found.new)
+            new = np.where(found.new != 0, found.new | found.beyond | ~(top | known), np.uint64(0))
+            out[tile] = TileVotes(one_hot(found.states), found.states, found.gone, found.remnants, new, free)
+        return out
+
+    def _judge(self, tile: TileIndex) -> _Judged:
+        """What the tile's own evidence says, voxel by voxel and cell by cell."""
+        window = self.point_map.lattice.tile(tile)
+        outer = reference_window(self.point_map, window.padded(1))
+        near = dilated(outer.occupied, outer.base, 1)[1:-1, 1:-1]
+        here, planes = cut_reference(outer, window), self.evidence.tiles[tile]
+        known = here.free if here.free is not None else above_ground_points(self.point_map, window)
+        gone, stands, new, beyond = (np.zeros(window.shape, dtype=np.uint64) for _ in range(4))
+        weigh_surfaces(planes, here.occupied, known, near, gone, stands, new, beyond)
+        mapped, passed = here.occupied != 0, planes[..., PASSED]
+        low = mapped & ~(here.top_z - here.ground_z >= self.voting.min_height_m)
+        under = np.where(mapped, (here.occupied & (~here.occupied + np.uint64(1))) - np.uint64(1), np.uint64(0))
+        clear = 2 * np.bitwise_count(under & passed) >= np.bitwise_count(under)
+        states = np.full(window.shape, NO_VOTE, dtype=np.uint8)
+        states[passed != 0] = CellState.UNCHANGED_EMPTY
+        states[mapped & (passed != 0)] = CellState.UNDETERMINED
+        states[~mapped & (beyond != 0)] = CellState.UNDETERMINED
+        states[stands != 0] = CellState.UNCHANGED_OCCUPIED
+        return _Judged(
+            here=here,
+            gone=np.where(low, np.uint64(0), gone),
+            stands=stands,
+            new=np.where(mapped, np.uint64(0), new),
+            beyond=beyond,
+            beside=(new != 0) & (new & ~near == 0),
+            adrift=mapped & ~low & (gone | stands == 0) & (under != 0) & clear,
+            states=states,
+            remnants=np.zeros_like(gone),
+        )
+
+
+@numba.njit(cache=True, nogil=True)
+def _below_tops(words: U64) -> U64:
+    out = np.empty_like(words)
+    for r in range(words.shape[0]):
+        for c in range(words.shape[1]):
+            out[r, c] = below_top(words[r, c])
+    return out
+
+
+def _decide_mapped(tiles: dict[TileIndex, _Judged], lattice: Lattice) -> None:
+    """What is gone, what falls with it, and what is left of it beside what stands."""
+    gone = {tile: found.gone for tile, found in tiles.items()}
+    empty = {tile: (found.gone != 0) & (found.stands == 0) for tile, found in tiles.items()}
+    for tile, cells in beyond_tiles(lattice, HALO, supported, (empty, False), (gone, 0)).items():
+        tiles[tile].states[empty[tile]] = CellState.UNDETERMINED
+        tiles[tile].states[cells] = CellState.CHANGED_EMPTY
+    states, adrift = _states(tiles), {tile: found.adrift for tile, found in tiles.items()}
+
+    def fall(states: U8, adrift: Bool) -> Bool:
+        return fallen(states, adrift, FALL_CELLS)
+
+    for tile, cells in beyond_tiles(lattice, HALO, fall, (states, NO_VOTE), (adrift, False)).items():
+        tiles[tile].states[cells] = CellState.CHANGED_EMPTY
+    for found in tiles.values():
+        down = found.states == CellState.CHANGED_EMPTY
+        found.gone = np.where(down, found.here.occupied, found.gone)
+    gone = {tile: found.gone for tile, found in tiles.items()}
+    stands, base = {t: found.stands for t, found in tiles.items()}, {t: found.here.base for t, found in tiles.items()}
+    mapped = {tile: np.where(found.stands != 0, found.here.occupied, 0) for tile, found in tiles.items()}
+    for tile, words in beyond_tiles(lattice, HALO, settled, (gone, 0), (stands, 0), (mapped, 0), (base, 0)).items():
+        tiles[tile].remnants = np.where(tiles[tile].stands != 0, words, np.uint64(0))
+
+
+def _decide_new(tiles: dict[TileIndex, _Judged], lattice: Lattice) -> None:
+    """Where something new stands, but for what an error of pose explains (rule C) and for specks."""
+    occupied = np.uint8(CellState.CHANGED_OCCUPIED)
+    candidates = {tile: np.where(found.new != 0, occupied, np.uint8(NO_VOTE)) for tile, found in tiles.items()}
+    beside = {tile: found.beside for tile, found in tiles.items()}
+    new = {tile: found.new for tile, found in tiles.items()}
+
+    def stand(states: U8, beside: Bool, new: U64) -> Bool:
+        given_up = unexplained(states, beside, JOIN_CELLS)
+        return supported((states == occupied) & ~given_up, new)
+
+    planes = (candidates, NO_VOTE), (beside, False), (new, 0)
+    for tile, cells in beyond_tiles(lattice, HALO, stand, *planes).items():
+        tiles[tile].states[tiles[tile].new != 0] = CellState.UNDETERMINED
+        tiles[tile].states[cells] = occupied
+
+
+def _states(tiles: dict[TileIndex, _Judged]) -> dict[TileIndex, U8]:
+    return {tile: found.states for tile, found in tiles.items()}

@@ -1,0 +1,150 @@
+"""A drive's evidence surface by surface: what a hit speaks for, what is gone, what is new, and what is too little."""
+
+from __future__ import annotations
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from hand_made import make_map, make_tile, wall
+from mapvote.config import VotingSettings
+from mapvote.core.grid import CELL_SIZE
+from mapvote.core.point_map import PointMap
+from mapvote.core.reference import reference_window
+from mapvote.core.types import F64, U64, CellState
+from mapvote.detection.counters import PLANES, count_of
+from mapvote.detection.surface_counts import CROSSED, HIT_REACH_M, MET, WORDS, SurfaceEvidence
+from mapvote.detection.surfaces import GONE_RAYS, HIT_RAYS, SUPPORT, SurfaceVoter, settled, weigh_surfaces
+from mapvote.detection.votes import TileVotes
+from mapvote.perception.frontend import Observation, PlacedScan
+from mapvote.perception.raycast import ScanView, find_obstacles
+
+ROW, COLUMNS = 100, range(100, 112)
+HEIGHTS = [0.75, 1.05, 1.35, 1.65]
+ALL_BITS = ~np.uint64(0) >> np.uint64(1)
+UO, CO, CE, UN = (
+    CellState.UNCHANGED_OCCUPIED, CellState.CHANGED_OCCUPIED, CellState.CHANGED_EMPTY, CellState.UNDETERMINED,
+)  # fmt: skip
+
+
+def street(standing: list[tuple[int, int]], heights: list[float]) -> PointMap:
+    ground = wall([(r, c) for r in range(85, 125) for c in range(85, 135)], [0.0])
+    return make_map({(0, 0): make_tile(np.concatenate([wall(standing, heights), ground]))})
+
+
+def one_scan(point_map: PointMap, points: F64) -> Observation:
+    """Rays through everything but these points (n, 3)."""
+    grid = point_map.lattice.tile((0, 0))
+    here = reference_window(point_map, grid)
+    obstacle, cell = find_obstacles(points, here)
+    hit = np.zeros(grid.shape, np.uint64)
+    for k, z in zip(cell, points[:, 2], strict=True):
+        hit.ravel()[k] |= np.uint64(1 << int(z / CELL_SIZE))
+    still, origin = np.zeros(len(points), np.bool_), np.zeros(3)
+    scan = PlacedScan(0, points, origin, np.array([0.0, 0.0, 1.0]), 0.01, here, here, obstacle, cell)
+    view = ScanView(grid, (hit != 0).astype(np.int32), hit, ~hit & ALL_BITS, np.zeros((0, 0), np.uint8))
+    return Observation(scan, still, view, here)
+
+
+def after(point_map: PointMap, points: F64, scans: int = 8) -> TileVotes:
+    voter = SurfaceVoter(VotingSettings(), point_map)
+    for _ in range(scans):
+        voter.observe(one_scan(point_map, points))
+    return voter.votes()[0, 0]
+
+
+def standing_at(y: float, heights: list[float] = HEIGHTS) -> F64:
+    """(n, 3) points of a wall along x at ``y``."""
+    return np.array([((c + 0.5) * CELL_SIZE, y, z) for c in COLUMNS for z in heights])
+
+
+WALL = [(ROW, c) for c in COLUMNS]
+OLD_Y = (ROW + 0.5) * CELL_SIZE
+
+
+def test_a_wall_set_back_by_half_a_metre_is_an_old_wall_gone_and_a_new_one_come() -> None:
+    votes = after(street(WALL, HEIGHTS), standing_at(OLD_Y + 0.5))
+    assert all(votes.states[cell] == CE for cell in WALL)
+    assert all(votes.states[ROW + 2, c] == CO for c in COLUMNS)
+    assert votes.gone is not None
+    assert votes.gone[ROW, 105] == np.uint64(0b111100)
+
+
+def test_a_wall_met_some_centimetres_off_its_place_stands() -> None:
+    votes = after(street(WALL, HEIGHTS), standing_at(OLD_Y + 0.5 * CELL_SIZE + 0.5 * HIT_REACH_M))
+    assert all(votes.states[cell] == UO for cell in WALL)
+    assert not (votes.states == CO).any()
+
+
+def test_a_pole_that_went_is_a_change_and_a_twig_is_none() -> None:
+    tall = [0.45 + 0.3 * k for k in range(SUPPORT)]
+    assert after(street([(ROW, 105)], tall), standing_at(OLD_Y + 9)).states[ROW, 105] == CE
+    assert after(street([(ROW, 105)], tall[1:]), standing_at(OLD_Y + 9)).states[ROW, 105] == UN
+
+
+def test_what_two_scans_crossed_is_not_gone_yet() -> None:
+    gone_after = [after(street(WALL, HEIGHTS), standing_at(OLD_Y + 9), n).states[ROW, 105] for n in (2, GONE_RAYS)]
+    assert gone_after == [UN, CE]
+
+
+def test_what_is_no_higher_than_a_kerb_is_never_gone() -> None:
+    assert not (after(street(WALL, [0.45]), standing_at(OLD_Y + 9)).states == CE).any()
+
+
+def test_a_roof_that_no_ray_could_reach_falls_with_the_wall_that_bore_it() -> None:
+    roof = [(ROW + k, c) for k in range(1, 5) for c in COLUMNS]
+    points = np.concatenate([wall(WALL, HEIGHTS), wall(roof, [4.65])])
+    ground = wall([(r, c) for r in range(85, 125) for c in range(85, 135)], [0.0])
+    point_map = make_map({(0, 0): make_tile(np.concatenate([points, ground]))})
+    voter = SurfaceVoter(VotingSettings(), point_map)
+    for _ in range(8):
+        seen = one_scan(point_map, standing_at(OLD_Y + 9))
+        seen.view.passed[:] &= np.uint64((1 << 12) - 1)  # no ray rises to the roof
+        voter.observe(seen)
+    assert all(voter.votes()[0, 0].states[cell] == CE for cell in roof)
+
+
+@given(crossed=st.integers(0, 120), met=st.integers(0, 20))
+def test_one_hit_outweighs_as_many_rays_as_is_said(crossed: int, met: int) -> None:
+    planes = np.zeros((1, 1, WORDS), np.uint64)
+    for first, count in ((CROSSED, crossed), (MET, met)):
+        for k in range(PLANES):
+            planes[0, 0, first + k] = np.uint64((count >> k & 1) << 5)
+    gone, stands, new, beyond = (np.zeros((1, 1), np.uint64) for _ in range(4))
+    mapped, none = np.full((1, 1), 1 << 5, np.uint64), np.zeros((1, 1), np.uint64)
+    weigh_surfaces(planes, mapped, none, none, gone, stands, new, beyond)
+    assert (gone[0, 0] != 0) == (crossed >= GONE_RAYS + HIT_RAYS * met)
+    assert (stands[0, 0] != 0) == (met > 0 and gone[0, 0] == 0)
+    assert not (new | beyond).any()
+
+
+words = arrays(np.uint64, (4, 4), elements=st.integers(0, 2**63 - 1))
+
+
+@given(words, words, words)
+@settings(max_examples=25, deadline=None)
+def test_what_is_undecided_goes_with_what_reaches_it_first_and_nothing_that_stands_goes(
+    gone: U64, stands: U64, mapped: U64
+) -> None:
+    gone = gone & ~stands
+    settled_words = settled(gone, stands, mapped, np.zeros((4, 4), np.int32))
+    assert (settled_words & gone == gone).all()
+    assert not (settled_words & stands).any()
+    assert not (settled_words & ~(gone | mapped)).any()
+
+
+@given(st.lists(st.tuples(*[st.floats(0.6, 3.0)] * 3), min_size=1, max_size=6))
+@settings(max_examples=25, deadline=None)
+def test_a_hit_meets_exactly_the_mapped_voxels_within_its_reach(offsets: list[tuple[float, float, float]]) -> None:
+    cells = [(r, c) for r in range(98, 114) for c in range(98, 114)]
+    point_map = street(cells, [0.45 + 0.3 * k for k in range(12)])
+    points = np.array(offsets) + np.array([30.0, 30.0, 0.0])
+    evidence = SurfaceEvidence(point_map.lattice)
+    evidence.count(one_scan(point_map, points))
+    for r, c in cells[::7]:
+        for bit in range(1, 12):
+            low = np.array([c, r, bit]) * CELL_SIZE
+            apart = np.maximum(low - points, points - low - CELL_SIZE).max(axis=1).min()
+            if abs(apart - HIT_REACH_M) > 1e-6 and abs(apart) > 1e-6:
+                assert count_of(evidence.tiles[0, 0][r, c], MET, bit) == (apart < HIT_REACH_M)
