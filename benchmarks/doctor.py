@@ -1,10 +1,12 @@
-"""What the doctor says of drives broken on purpose, kind by kind: rightly named, vaguely, wrongly, or called sound.
+"""What the doctor says of drives and maps broken on purpose, kind by kind: rightly named, vaguely, wrongly, or sound.
 
-    python benchmarks/doctor.py drives --source NAME=FOLDER[:SCANS] ... --out results/doctor_drives.csv
+    python benchmarks/doctor.py drives --source NAME=DRIVE ... --out results/doctor_drives.csv
+    python benchmarks/doctor.py maps --source NAME=DRIVE+MAP ... --out results/doctor_maps.csv
 
-Every source is a sound drive with a prior of its own; it is judged as it is first. Verdicts: "right", an error or a
-warning names the illness (alone or together with what the drive cannot tell from it); "vague", something is wrong but
-not what; "wrong", an error names something else; "sound".
+A source is a sound drive with a prior of its own, for maps with a map of the same street; it is judged as it is first.
+DRIVE@START:STOP:STEP takes some of the scans. Verdicts: "right", an error or a warning names the illness (alone or
+together with what cannot be told from it); "vague", something is wrong but not what; "wrong", an error names something
+else; "sound". Of maps that were moved, what the doctor measures is held against what was done.
 """
 
 from __future__ import annotations
@@ -16,24 +18,62 @@ import shutil
 import tempfile
 import time
 from collections import Counter
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 
 from broken_drives import Kind, Recording
 from drive_kinds import KINDS
+from map_kinds import MAP_KINDS, NOWHERE, MapKind, around, moved_poses
+from mapvote.core.geometry import inverse, rotation_angle
+from mapvote.core.point_map import all_points
+from mapvote.core.types import Drive
 from mapvote.doctor.drives import examine_drive
 from mapvote.doctor.finding import Finding
-from mapvote.formats import open_drive
+from mapvote.doctor.maps import examine_points
+from mapvote.doctor.on_map import check_on_map
+from mapvote.formats import open_drive, read_map
 from mapvote.formats.atomic import whole_file
+from mapvote.formats.maps.cloud import Cloud
 
-VAGUE = "do not belong together|do not fit|leap|the vehicle drives at|off the scans' motion|fits the scans in"
+VAGUE = "do not belong together|do not fit|leap|the vehicle drives at|off the scans' motion|fits the scans in|nowhere"
 """Errors that say something is wrong without saying what."""
 
 
-def recording(folder: Path, scans: str | None) -> Recording:
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("what", choices=("drives", "maps"))
+    parser.add_argument("--source", action="append", required=True, metavar="NAME=DRIVE[@SCANS][+MAP]")
+    parser.add_argument("--kinds", default="", help="only those whose name matches this regular expression")
+    parser.add_argument("--out", type=Path, help="CSV; rows of these sources replace older ones")
+    arguments = parser.parse_args()
+    rows: list[dict] = []
+    for source in arguments.source:
+        name, _, where = source.partition("=")
+        judged = drives(name, where) if arguments.what == "drives" else maps(name, where)
+        for kind, judge in judged:
+            if re.search(arguments.kinds, kind):
+                rows.append(judge())
+                tell(rows[-1])
+                if arguments.out:
+                    write(arguments.out, rows)
+        print(summary(name, rows))
+
+
+def opened(where: str) -> Drive:
+    folder, _, scans = where.partition("@")
+    return open_drive(folder, scans=scans or None)
+
+
+def drives(source: str, where: str) -> Iterator[tuple[str, object]]:
+    sound = recording(opened(where))
+    for kind in (Kind("as it is", "^$", grave=False), *KINDS):
+        yield kind.name, lambda kind=kind: judge_drive(source, kind, sound)
+
+
+def recording(drive: Drive) -> Recording:
     """A sound drive in memory, its scans as the files have them."""
-    drive = open_drive(folder, scans=scans)
     assert drive.T_map_lidar_prior is not None
     read = [drive.read_scan(i) for i in range(len(drive))]
     rows = [
@@ -43,35 +83,7 @@ def recording(folder: Path, scans: str | None) -> Recording:
     return Recording(rows, drive.T_map_lidar_prior, (drive.stamps_ns - drive.stamps_ns[0]) * 1e-9, toml)
 
 
-def verdict(kind: Kind, found: list[Finding]) -> str:
-    told = [f for f in found if f.severity != "note"]
-    if any(re.search(kind.right, f.what) for f in told):
-        return "right"
-    if not told:
-        return "sound"
-    return "wrong" if any(f.severity == "error" and not re.search(VAGUE, f.what) for f in told) else "vague"
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--source", action="append", required=True, metavar="NAME=FOLDER[:SCANS]")
-    parser.add_argument("--kinds", default="", help="only those whose name matches this regular expression")
-    parser.add_argument("--out", type=Path, help="CSV to add the rows of these sources to")
-    arguments = parser.parse_args()
-    rows: list[dict] = []
-    for source in arguments.source:
-        name, _, where = source.partition("=")
-        folder, _, scans = where.partition("@")
-        sound = recording(Path(folder), scans or None)
-        kinds = [k for k in (Kind("as it is", "^$", grave=False), *KINDS) if re.search(arguments.kinds, k.name)]
-        for kind in kinds:
-            rows.append(judge(name, kind, sound))
-        print(summary(name, rows))
-    if arguments.out:
-        write(arguments.out, rows)
-
-
-def judge(source: str, kind: Kind, sound: Recording) -> dict:
+def judge_drive(source: str, kind: Kind, sound: Recording) -> dict:
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch) / "drive"
         kind.drive(sound).write(folder)
@@ -79,13 +91,86 @@ def judge(source: str, kind: Kind, sound: Recording) -> dict:
         started = time.process_time()
         found, _, _ = examine_drive(folder)
         seconds = time.process_time() - started
-        told = [f"{f.severity}: {f.what}".replace(str(folder), "drive") for f in found if f.severity != "note"]
         shutil.rmtree(folder)
-    row = {"source": source, "kind": kind.name, "grave": int(kind.grave), "verdict": verdict(kind, found)}
-    row |= {"errors": sum(f.severity == "error" for f in found), "cpu_s": f"{seconds:.2f}", "told": " | ".join(told)}
-    if row["verdict"] != "right":
-        print(f"{source:14} {row['verdict']:6} {kind.name:45} {' | '.join(told)[:400]}", flush=True)
-    return row
+    return row(source, kind.name, kind.grave, kind.right, found, seconds, str(folder))
+
+
+def maps(source: str, where: str) -> Iterator[tuple[str, object]]:
+    """Kinds of broken maps; with a second ``+MAP`` also that one, laid where the first lies."""
+    at, *folders = where.split("+")
+    drive, points = opened(at), all_points(read_map(folders[0]))
+    assert drive.T_map_lidar_prior is not None
+    middle = np.round(drive.T_map_lidar_prior[len(drive) // 2, :3, 3]) - [0.0, 0.0, 2.0]
+    kinds = [MapKind("as it is", "^$", lambda p: p, np.eye(4), grave=False), *MAP_KINDS]
+    if len(folders) > 1:
+        other = all_points(read_map(folders[1]))
+        other -= np.append(np.median(other[:, :2], axis=0), np.quantile(other[:, 2], 0.3))
+        kinds.append(MapKind("the map of another street", NOWHERE, lambda p: other))
+    sound: list[np.ndarray] = []
+    for kind in kinds:
+        changed = around(points, middle, kind.change)
+        yield kind.name, lambda kind=kind, p=changed: judge_map(source, kind, drive, p, sound, middle)
+
+
+def judge_map(
+    source: str, kind: MapKind, drive: Drive, points: np.ndarray, sound: list[np.ndarray], middle: np.ndarray
+) -> dict:
+    started = time.process_time()
+    found, point_map = examine_points("map", Cloud(points))
+    T = drive.T_map_lidar_prior
+    assert T is not None
+    if point_map is not None and not any(f.severity == "error" for f in found):
+        more, T = check_on_map(drive, T, point_map)
+        found = [*found, *more]
+    judged = row(source, kind.name, kind.grave, kind.right, found, time.process_time() - started, "map")
+    if not sound:
+        sound.append(T)
+    measured = any(re.search("against the prior|agree to", f.what) for f in found)
+    if kind.moved is not None and measured:
+        judged |= errors_of(T, moved_poses(sound[0], middle, kind.moved))
+    return judged
+
+
+def errors_of(T: np.ndarray, T_true: np.ndarray) -> dict:
+    """By how much poses (n, 4, 4) as the doctor mends them are off: metres, degrees, per cent."""
+    k = len(T) // 2
+    spread = [np.linalg.norm(one[-1, :3, 3] - one[0, :3, 3]) for one in (T, T_true)]
+    return {
+        "off_m": f"{np.linalg.norm(T[k, :3, 3] - T_true[k, :3, 3]):.3f}",
+        "off_deg": f"{np.degrees(rotation_angle(inverse(T_true[k]) @ T[k])):.2f}",
+        "off_percent": f"{100 * abs(spread[0] / spread[1] - 1):.2f}",
+    }
+
+
+def verdict(right: str, found: list[Finding]) -> str:
+    told = [f for f in found if f.severity != "note"]
+    if any(re.search(right, f.what) for f in told):
+        return "right"
+    if not told:
+        return "sound"
+    return "wrong" if any(f.severity == "error" and not re.search(VAGUE, f.what) for f in told) else "vague"
+
+
+def row(source: str, kind: str, grave: bool, right: str, found: list[Finding], cpu_s: float, path: str) -> dict:
+    told = [f"{f.severity}: {f.what}".replace(path, "it") for f in found if f.severity != "note"]
+    return {
+        "source": source,
+        "kind": kind,
+        "grave": int(grave),
+        "verdict": verdict(right, found),
+        "errors": sum(f.severity == "error" for f in found),
+        "cpu_s": f"{cpu_s:.2f}",
+        "off_m": "",
+        "off_deg": "",
+        "off_percent": "",
+        "told": " | ".join(told),
+    }
+
+
+def tell(r: dict) -> None:
+    off = f" off {r['off_m']} m {r['off_deg']} deg {r['off_percent']} %" if r["off_m"] else ""
+    if r["verdict"] != "right" or off:
+        print(f"{r['source']:8} {r['verdict']:6} {r['kind']:40}{off} {r['cpu_s']} s {r['told'][:400]}", flush=True)
 
 
 def summary(source: str, rows: list[dict]) -> str:

@@ -9,6 +9,7 @@ import pytest
 from scipy.spatial import cKDTree
 from typer.testing import CliRunner
 
+from hand_made import two_walls
 from mapvote.cli import app
 from mapvote.codec.ballot import Ballot, BallotTile, encode, pack_plane
 from mapvote.core.point_map import all_points, map_from_points
@@ -16,6 +17,7 @@ from mapvote.core.sensors import SENSORS
 from mapvote.core.types import F64, MapvoteError
 from mapvote.formats import DriveWriter, read_map, write_map, write_pcd
 from mapvote.formats.maps.cloud import Cloud
+from mapvote.server.store.store import Store
 
 
 @pytest.fixture
@@ -67,8 +69,21 @@ def test_info_of_a_drive_and_doctor(tmp_path: Path, run: CliRunner) -> None:
     told = invoke(run, "doctor", tmp_path / "d", code=1)
     assert "no prior" in told
     assert "scan 1 is the same as the one before it (3 such scans of 4)" in told
+    with pytest.raises(MapvoteError, match=r"z is never negative.* Check --columns"):
+        invoke(run, "build", tmp_path / "d", "--out", tmp_path / "m")
     (tmp_path / "d" / "velodyne" / "000000.bin").write_bytes(b"12345")
     assert "not a multiple of 16" in invoke(run, "doctor", tmp_path / "d", code=1)
+
+
+def test_the_doctor_takes_maps_stores_and_no_server(tmp_path: Path, run: CliRunner) -> None:
+    write_pcd(tmp_path / "a.pcd", Cloud(1000.0 * cloud()))
+    assert "millimetres, or centimetres?" in invoke(run, "doctor", tmp_path / "a.pcd", code=1)
+    with pytest.raises(MapvoteError, match="give the points in metres"):
+        invoke(run, "import", tmp_path / "a.pcd", tmp_path / "m")
+    Store.create(f"sqlite:///{tmp_path}/fleet.db", two_walls()).close()
+    assert "no operator has a valid key" in invoke(run, "doctor", tmp_path / "fleet.db")
+    with pytest.raises(MapvoteError, match="mapvote check http"):
+        invoke(run, "doctor", "http://127.0.0.1:1")
 
 
 def test_info_of_a_ballot(tmp_path: Path, run: CliRunner) -> None:

@@ -7,8 +7,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from mapvote.cli.options import DRIVE, MAP, DrivePath, KeyFile, Projector, Rate, Topic, with_drive_options
+from mapvote.cli.looks import look_at_map
+from mapvote.cli.options import DRIVE, MAP, KeyFile, Projector, Rate, Topic, with_drive_options
 from mapvote.cli.remote import is_store, is_url, map_of, overview_of
+from mapvote.cli.store import opened_store
 from mapvote.cli.terminal import stages_that_vanish, waiting
 
 if TYPE_CHECKING:
@@ -56,36 +58,47 @@ def info(
 
 
 def doctor(
-    drive: DrivePath,
+    path: Annotated[
+        str, typer.Argument(metavar="DRIVE|MAP|BALLOT|STORE", help="a drive, a map or a ballot, in any format; a store")
+    ],
     map_path: Annotated[
         Path | None, typer.Option("--map", metavar="MAP", help="also say whether the drive lies on this map")
     ] = None,
     *,
     drive_options: dict[str, Any],
 ) -> None:
-    """Say what is wrong with a drive and how to mend it. Exit code 1 if it cannot be used as it is.
+    """Say what is wrong with a drive, a map, a ballot or a store, and how to mend it. Exit code 1 if it is unusable.
 
     mapvote doctor MY_DRIVE --map my_map
     """
     from rich.console import Console
 
+    from mapvote.core.types import MapvoteError
     from mapvote.doctor import examine
     from mapvote.formats import read_map
     from mapvote.formats.drives.options import DriveOptions
 
+    if is_url(path):
+        raise MapvoteError(f"doctor: {path} is a server: mapvote check {path} looks at its store")
     point_map = None
     if map_path is not None:
         with waiting(f"reading {map_path}"):
             point_map = read_map(map_path)
-    with stages_that_vanish() as tell:
-        findings = examine(drive, DriveOptions(**drive_options), point_map, tell)
+    if is_store(path):
+        from mapvote.doctor.stores import check_store
+
+        with opened_store(path) as store, waiting("reading every byte"):
+            findings = check_store(store)
+    else:
+        with stages_that_vanish() as tell:
+            findings = examine(Path(path), DriveOptions(**drive_options), point_map, tell)
     console = Console(soft_wrap=True, highlight=False)
     for finding in findings:
         for line in _lines(finding):
             console.print(line)
     errors = sum(f.severity == "error" for f in findings)
     warnings = sum(f.severity == "warning" for f in findings)
-    print(f"{drive}: {errors} errors, {warnings} warnings" if errors or warnings else f"{drive}: sound")
+    print(f"{path}: {errors} errors, {warnings} warnings" if errors or warnings else f"{path}: sound")
     if errors:
         raise typer.Exit(1)
 
@@ -120,6 +133,7 @@ def import_map(
 
     with waiting(f"reading {source}"):
         point_map, told = import_cloud(source, frame_wanted(crs, projector), from_crs)
+    look_at_map(str(source), point_map)
     with waiting(f"writing {out}"):
         write_map(point_map, out)
     kept = sum(len(t.points) for t in point_map.tiles.values())

@@ -7,6 +7,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from mapvote.cli.looks import sound_map
 from mapvote.cli.options import key_in
 from mapvote.cli.store import opened_store
 
@@ -57,7 +58,6 @@ def client_of(url: str, key: str | None) -> MapClient:
 def map_of(name: str, key_file: Path | None, version: int | None = None) -> PointMap:
     """The newest map of a store or a server, or one version of it; or a map in any file format."""
     from mapvote.core.types import MapvoteError
-    from mapvote.formats import read_map
 
     if is_url(name):
         with client_of(name, key_in(key_file)) as client:
@@ -67,7 +67,7 @@ def map_of(name: str, key_file: Path | None, version: int | None = None) -> Poin
             return store.point_map(version)
     if version is not None:
         raise MapvoteError(f"{name}: only a store or a server has versions")
-    return read_map(name)
+    return sound_map(name)
 
 
 def overview_of(name: str, key_file: Path | None) -> list[tuple[str, str]] | None:

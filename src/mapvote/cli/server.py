@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from mapvote.cli.looks import sound_map
 from mapvote.cli.options import SERVER, Config, KeyFile, Reason, StoreName, StoreOrUrl
 from mapvote.cli.remote import is_url, server_at
 from mapvote.cli.store import opened_store, store_url, when
@@ -47,7 +48,9 @@ def serve(
     settings = load_settings(config)
     log_as_json()
     with waiting(f"opening {store}"):
-        opened, new = open_or_create(store_url(store), map_path, None if config is None else Policy.of(settings))
+        opened, new = open_or_create(
+            store_url(store), map_path, None if config is None else Policy.of(settings), read=sound_map
+        )
     try:
         if new and not open_:
             print(f"key of the operator, shown this once: {issue(opened, 'operator', 'operator')}", flush=True)

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from mapvote.cli.looks import sound_map
 from mapvote.cli.options import MAP, MapPath, MinVotes
 from mapvote.cli.terminal import print_table, waiting
 
@@ -39,7 +40,7 @@ def update(
     from mapvote.codec.ballot import decode
     from mapvote.config import FuseSettings
     from mapvote.core.types import MapvoteError
-    from mapvote.formats import read_map, write_map
+    from mapvote.formats import write_map
     from mapvote.fusion.fuse import states_over
     from mapvote.fusion.offline import update_map
 
@@ -57,7 +58,7 @@ def update(
     paper = bool(ballots) and ballots[0].method == "paper"
     settings = settings.model_copy(update={"min_votes": min_votes or (1 if paper else settings.min_votes)})
     with waiting(f"reading {map_path}"):
-        before = read_map(map_path)
+        before = sound_map(map_path)
     with waiting("deciding"):
         after, decisions = update_map(before, ballots, settings)
     if cells is not None:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from mapvote.cli.looks import look_at
 from mapvote.cli.options import DRIVE, Config, DrivePath, KeyFile, key_in, with_drive_options
 from mapvote.cli.remote import client_of, map_of
 from mapvote.cli.terminal import progress, waiting
@@ -47,6 +48,8 @@ def build(
         raise typer.BadParameter(f"{out} exists; name a new folder", param_hint="--out")
     settings = load_settings(config)
     opened = [open_drive(path, **drive_options) for path in drives]
+    for drive in opened:
+        look_at(drive)
     with progress("mapping") as tell:
         point_map, report = build_map(opened, settings, progress=tell)
     with waiting(f"writing {out}"):
@@ -135,6 +138,7 @@ def vote(
         point_map = map_of(where, key_file)
     frame = frame_of(point_map.georeference)
     drive = open_drive(drive_path, vehicle=vehicle, frame=frame, **drive_options)
+    look_at(drive)
     localise = None
     if trust_prior:
         if drive.T_map_lidar_prior is None:

@@ -1,4 +1,4 @@
-"""What is wrong with a drive, and how to mend it: measured where it can be, else a list of what cannot be told apart.
+"""What is wrong with a drive, a map, a ballot or a store, and how to mend it: measured where it can be, not guessed.
 
 Cheap looks at every file come first (:mod:`mapvote.doctor.scans`, :mod:`mapvote.doctor.prior`), then scans are
 registered to each other (:mod:`mapvote.doctor.motion`) and the motion found is held against the prior under every
@@ -7,16 +7,25 @@ reading of it (:mod:`mapvote.doctor.frames`). docs/decisions/doctor.md says why.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
-from mapvote.core.point_map import PointMap
+from mapvote.core.point_map import PointMap, all_points
 from mapvote.core.types import Drive, MapvoteError
-from mapvote.doctor.drives import Progress, cheap_checks, examine_drive
-from mapvote.doctor.finding import Finding, in_order
-from mapvote.doctor.on_map import check_ground, check_on_map
+from mapvote.doctor.bags import check_bag
+from mapvote.doctor.ballots import check_ballot
+from mapvote.doctor.clouds import check_cloud
+from mapvote.doctor.drives import cheap_checks, examine_drive
+from mapvote.doctor.finding import Finding, Progress, in_order
+from mapvote.doctor.maps import check_map, examine_map
+from mapvote.doctor.on_map import check_on_map
+from mapvote.doctor.prior import NO_PRIOR
 from mapvote.formats.drives.options import DriveOptions
+from mapvote.formats.drives.rosbag import is_rosbag
+from mapvote.formats.maps.mapvote_folder import is_map_folder
+from mapvote.formats.registry import DRIVES, MAPS
 
-__all__ = ["Finding", "examine", "must_be_usable"]
+__all__ = ["Finding", "check_cloud", "examine", "must_be_usable", "usable"]
 
 
 def examine(
@@ -25,21 +34,39 @@ def examine(
     point_map: PointMap | None = None,
     progress: Progress | None = None,
 ) -> list[Finding]:
-    """Everything the doctor finds in the drive at ``path``, errors first; with a map also whether it lies on it."""
-    found, drive, T = examine_drive(path, options, progress)
+    """Everything the doctor finds at ``path``, errors first: in a map, a ballot, or a drive (with a map also on it)."""
+    if is_map_folder(path) or any(layout.recognised(path) for layout in MAPS.values()):
+        return examine_map(path)[0]
+    if path.is_file() and not any(layout.recognised(path) for layout in DRIVES.values()):
+        return check_ballot(path.read_bytes())
+    options = options or DriveOptions()
+    found = check_bag(path, options) if is_rosbag(path) else []
+    more, drive, T = examine_drive(path, options, progress)
+    found += more
     if point_map is not None:
-        found += check_ground(point_map)
+        found += _of_the_map(point_map)
         if drive is not None and T is not None and not any(f.severity == "error" for f in found):
             more, _ = check_on_map(drive, T, point_map, progress)
             found += more
     return in_order(found)
 
 
+def _of_the_map(point_map: PointMap) -> list[Finding]:
+    """What is wrong with a map, among findings about a drive."""
+    found = check_cloud(all_points(point_map)) + check_map(point_map)
+    return [replace(f, what=f"the map: {f.what}") for f in found if f.severity != "note"]
+
+
 def must_be_usable(drive: Drive, progress: Progress | None = None) -> list[Finding]:
-    """The warnings of the cheap checks; MapvoteError with the first error, if there is one."""
+    """The warnings of the cheap checks of a drive; MapvoteError with the first error, if there is one."""
     found, _ = cheap_checks(drive, progress)
+    return [f for f in usable(str(drive.path), found) if f != NO_PRIOR]
+
+
+def usable(path: str, found: list[Finding]) -> list[Finding]:
+    """The warnings among what was found at ``path``; MapvoteError with the first error, if there is one."""
     errors = [f for f in found if f.severity == "error"]
     if errors:
-        more = f" ({len(errors) - 1} more errors: mapvote doctor {drive.path})" if len(errors) > 1 else ""
-        raise MapvoteError(f"{drive.path}: {errors[0].what}. {errors[0].mend}{more}")
-    return [f for f in found if f.severity == "warning" and not f.what.startswith("no prior")]
+        more = f" ({len(errors) - 1} more errors: mapvote doctor {path})" if len(errors) > 1 else ""
+        raise MapvoteError(f"{path}: {errors[0].what}. {errors[0].mend}{more}")
+    return [f for f in found if f.severity == "warning"]

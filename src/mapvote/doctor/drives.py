@@ -2,26 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
 
 from mapvote.core.types import F32, F64, Drive, MapvoteError
-from mapvote.doctor.finding import Finding, in_order
+from mapvote.doctor.finding import Finding, Progress, in_order
 from mapvote.doctor.frames import check_agreement, check_scan_motion, in_map_frame
 from mapvote.doctor.looks import Looks, look_at_all
 from mapvote.doctor.motion import Run, follow, starts_of_runs
-from mapvote.doctor.prior import check_prior, check_times
+from mapvote.doctor.prior import NO_PRIOR, check_prior, check_times
 from mapvote.doctor.road import Road, find_road
 from mapvote.doctor.scans import check_scans
 from mapvote.formats import open_drive
 from mapvote.formats.drives.options import DriveOptions
 
-Progress = Callable[[str, int, int], None]
-"""Told (stage, done, in all)."""
 _ROAD_SCANS = 7
+IN_MAP_FRAME = Finding(
+    "error",
+    "the points are in the map's frame already: they move along with the prior",
+    "give them in the sensor's frame: p_lidar = inverse(T_map_lidar) p_map, one pose a scan",
+)
 
 
 def open_for_examination(path: Path, options: DriveOptions) -> tuple[Drive | None, list[Finding]]:
@@ -41,9 +43,7 @@ def cheap_checks(drive: Drive, progress: Progress | None = None) -> tuple[list[F
     looks = look_at_all(drive, None if progress is None else lambda done, n: progress("looking at scans", done, n))
     T = drive.T_map_lidar_prior
     if T is not None and len(looks.index) and in_map_frame(T, looks):
-        what = "the points are in the map's frame already: they move along with the prior"
-        mend = "give them in the sensor's frame: p_lidar = inverse(T_map_lidar) p_map, one pose a scan"
-        return [Finding("error", what, mend)], looks
+        return [IN_MAP_FRAME], looks
     found = check_times(drive) + check_scans(drive, looks)
     return found + (check_prior(drive) if len(drive) >= 2 else []), looks
 
@@ -57,10 +57,10 @@ def examine_drive(
         return found, None, None
     more, looks = cheap_checks(drive, progress)
     if found:  # the prior could not be read: that there is none, goes without saying
-        more = [f for f in more if not f.what.startswith("no prior")]
+        more = [f for f in more if f != NO_PRIOR]
     found += more
     T = drive.T_map_lidar_prior
-    if not any(f.severity == "error" and "map's frame already" in f.what for f in found) and len(looks.index) > 2:
+    if IN_MAP_FRAME not in found and len(looks.index) > 2:
         more, T = measure(drive, looks, progress)
         found += more
     return in_order(found), drive, T

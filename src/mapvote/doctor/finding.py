@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Literal
 
 Severity = Literal["error", "warning", "note"]
+Progress = Callable[[str, int, int], None]
+"""Told (stage, done, in all)."""
 _ORDER = {"error": 0, "warning": 1, "note": 2}
 
 

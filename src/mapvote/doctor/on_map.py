@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
 from mapvote.config import NdtSettings, TrustSettings
-from mapvote.core.geometry import from_xyz_rpy
+from mapvote.core.geometry import from_xyz_rpy, inverse
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS
 from mapvote.core.heights import LEVEL_M, check_heights, heights_over_ground
 from mapvote.core.point_map import PointMap
 from mapvote.core.types import F32, F64, Drive, MapvoteError, Scan
 from mapvote.doctor.difference import Difference, difference_of
-from mapvote.doctor.finding import Finding, Severity
+from mapvote.doctor.finding import Finding, Progress, Severity
 from mapvote.doctor.places import Place, fitting, register_all
 from mapvote.doctor.road import find_road
 from mapvote.localisation.deskew import deskew, motion_at
@@ -25,10 +25,8 @@ _SEARCHED = 4
 _MIRROR = np.array([1.0, -1.0, 1.0], dtype=np.float32)
 _TURN_DEG, _TILT_DEG, _SCALE = 0.5, 1.5, 0.01
 
-Tell = Callable[[str, int, int], None]
 
-
-def check_on_map(drive: Drive, T: F64, point_map: PointMap, tell: Tell | None = None) -> tuple[list[Finding], F64]:
+def check_on_map(drive: Drive, T: F64, point_map: PointMap, tell: Progress | None = None) -> tuple[list[Finding], F64]:
     """(findings, the poses (n, 4, 4) as they lie on the map), by a prior (n, 4, 4) that suits the scans."""
     found = _outside(T, point_map)
     index = np.unique(np.linspace(0, len(drive) - 1, _PLACES).astype(np.int64))
@@ -99,7 +97,7 @@ def _searched(
     T: F64,
     scans: dict[int, Scan],
     trust: TrustSettings,
-    tell: Tell | None,
+    tell: Progress | None,
 ) -> tuple[list[Place], int]:
     """(the places under the difference that suits most of them, how many scans fit mirrored where none fits so)."""
     chosen = [i for k, i in enumerate(scans) if k % max(1, len(scans) // _SEARCHED) == 0][:_SEARCHED]
@@ -111,7 +109,7 @@ def _searched(
             tell("searching the map", k + 1, len(chosen))
         found = _find(search, scans[i], trust)
         if found is not None:
-            D = found @ np.linalg.inv(T[i])
+            D = found @ inverse(T[i])
             places = register_all(around, scans, {j: [D @ T[j]] for j in scans}, trust, sigma_m, None)
             best = max(best, places, key=lambda p: len(fitting(p)))
             if len(fitting(best)) > 0.6 * len(scans):
@@ -195,4 +193,4 @@ def check_ground(point_map: PointMap) -> list[Finding]:
     """Does the map's ground lie under the paths that it was made of?"""
     complaints = [check_heights(point_map, path).complaint for path in point_map.driven]
     mend = "build the map anew; where drives run above each other it keeps one level, and the other cannot vote there"
-    return [Finding("warning", f"the map: {what}", mend) for what in complaints if what]
+    return [Finding("warning", what, mend) for what in complaints if what]

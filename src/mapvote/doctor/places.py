@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,6 +11,7 @@ from mapvote.config import TrustSettings
 from mapvote.core.geometry import from_xyz_rpy
 from mapvote.core.types import F32, F64, Scan
 from mapvote.core.voxels import thin
+from mapvote.doctor.finding import Progress
 from mapvote.localisation.map_window import MapWindow
 from mapvote.localisation.ndt import LEVELS, NdtMap, fitness, refine, thin_for_levels
 from mapvote.localisation.trust import Judge
@@ -44,7 +45,7 @@ def register_all(
     guesses: Mapping[int, Sequence[F64]],
     trust: TrustSettings,
     range_sigma_m: float,
-    tell: Callable[[str, int, int], None] | None,
+    tell: Progress | None,
 ) -> list[Place]:
     """Every scan in the map around its guesses."""
     out = []

@@ -9,6 +9,11 @@ from mapvote.doctor.finding import Finding, Severity
 from mapvote.doctor.readings import course, heading
 
 _FASTEST_MPS = 70.0
+NO_PRIOR = Finding(
+    "warning",
+    "no prior: the vehicle must find itself in the map",
+    "write prior.txt (3 x 4 rows T_map_lidar), or expect to be asked for the first pose",
+)
 
 
 def check_times(drive: Drive) -> list[Finding]:
@@ -45,8 +50,7 @@ def check_times(drive: Drive) -> list[Finding]:
 def check_prior(drive: Drive) -> list[Finding]:
     T = drive.T_map_lidar_prior
     if T is None:
-        mend = "write prior.txt (3 x 4 rows T_map_lidar), or expect to be asked for the first pose"
-        return [Finding("warning", "no prior: the vehicle must find itself in the map", mend)]
+        return [NO_PRIOR]
     if len(T) < 2:
         return []
     steps_m = np.linalg.norm(np.diff(T[:, :3, 3], axis=0), axis=1)

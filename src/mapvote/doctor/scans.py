@@ -21,7 +21,7 @@ def check_scans(drive: Drive, looks: Looks) -> list[Finding]:
     if len(looks.index) == 0:
         return found
     units = _units(looks)
-    columns = _columns(looks)
+    columns = _columns(drive, looks)
     found += columns or units
     found += _counts(drive, looks) + _doubled(looks) + _body(looks)
     found += [] if columns or units else _sectors(drive, looks) + _reach(looks)
@@ -47,7 +47,7 @@ def _refused(drive: Drive, looks: Looks) -> list[Finding]:
     return [Finding("error", why + others, mend)]
 
 
-def _columns(looks: Looks) -> list[Finding]:
+def _columns(drive: Drive, looks: Looks) -> list[Finding]:
     """A coordinate that is something else: an intensity, a constant."""
     found = []
     unit = np.median(looks.unit, axis=0)
@@ -60,9 +60,18 @@ def _columns(looks: Looks) -> list[Finding]:
             what = f"{name} lies within [0, 1] in {unit[axis]:.0%} of the points: it looks like an intensity"
             found.append(Finding("error", what, "name the columns in their order: --columns x,y,z,intensity"))
         elif np.median(looks.low[:, axis]) >= 0.0 and np.median(looks.rounded[:, 0]) < 0.9:
-            what = f"{name} is never negative: no LiDAR sees to one side only, or nothing below itself"
-            found.append(Finding("error", what, "is it a range, an intensity, an absolute value? Check --columns"))
+            found += _never_negative(drive, looks, name)
     return found
+
+
+def _never_negative(drive: Drive, looks: Looks, name: str) -> list[Finding]:
+    """Points that go round the sensor, and only part of the way, are half of a revolution; that is told elsewhere."""
+    if name != "z" and (not drive.sensor.rings or abs(np.median(looks.turns)) > 0.3):
+        return []
+    what = f"{name} is never negative: no LiDAR sees nothing below itself"
+    if name != "z":
+        what = f"{name} is never negative: an absolute value, a range, or half of the azimuth is missing (180 deg)"
+    return [Finding("error", what, "is it a range, an intensity, an absolute value? Check --columns")]
 
 
 def _units(looks: Looks) -> list[Finding]:

@@ -3,67 +3,23 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
-from rosbags.rosbag2 import StoragePlugin, Writer
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from rosbags.typesys import get_types_from_msg
 from scipy.spatial import cKDTree
 
+from bag_recorder import START, Recorder
 from mapvote.core import geometry
-from mapvote.core.types import F64, MapvoteError
+from mapvote.core.types import MapvoteError
 from mapvote.formats import open_drive
 from mapvote.formats.geo.frame import MapFrame
 
-START = 1_700_000_000 * 10**9
 HALL = np.random.default_rng(0).uniform([-20, -20, -2], [20, 20, 6], (2000, 3))
 T_BASE = {
     "front": geometry.from_xyz_rpy(2.0, 0.0, 1.0, 0.0, 0.1, 0.0),
     "rear": geometry.from_xyz_rpy(-2.0, 0.3, 1.2, 0, 0, 3.0),
 }
-
-
-class Recorder:
-    """Writes one bag."""
-
-    def __init__(self, path: Path) -> None:
-        self.store = get_typestore(Stores.ROS2_HUMBLE)
-        self.types: dict[str, Any] = dict(self.store.types)
-        self.bag = Writer(path, version=9, storage_plugin=StoragePlugin.MCAP)
-        self.bag.open()
-        self.topics: dict[str, Any] = {}
-
-    def header(self, ns: int, frame: str) -> Any:
-        return self.types["std_msgs/msg/Header"](
-            self.types["builtin_interfaces/msg/Time"](ns // 10**9, ns % 10**9), frame
-        )
-
-    def write(self, topic: str, kind: str, ns: int, message: Any) -> None:
-        if topic not in self.topics:
-            self.topics[topic] = self.bag.add_connection(topic, kind, typestore=self.store)
-        self.bag.write(self.topics[topic], ns, self.store.serialize_cdr(message, kind))
-
-    def cloud(self, topic: str, frame: str, ns: int, points: NDArray[np.floating]) -> None:
-        kind, field = "sensor_msgs/msg/PointCloud2", self.types["sensor_msgs/msg/PointField"]
-        raw = np.ascontiguousarray(points, dtype="<f4").view(np.uint8).ravel()
-        fields = [field(axis, 4 * i, 7, 1) for i, axis in enumerate("xyz")]
-        n = len(points)
-        self.write(
-            topic, kind, ns, self.types[kind](self.header(ns, frame), 1, n, fields, False, 12, 12 * n, raw, True)
-        )
-
-    def static(self, frames: dict[str, F64]) -> None:
-        from scipy.spatial.transform import Rotation
-
-        g = "geometry_msgs/msg/"
-        transforms = []
-        for child, T in frames.items():
-            q = self.types[g + "Quaternion"](*Rotation.from_matrix(T[:3, :3]).as_quat().tolist())
-            transform = self.types[g + "Transform"](self.types[g + "Vector3"](*T[:3, 3].tolist()), q)
-            transforms.append(self.types[g + "TransformStamped"](self.header(START, "base_link"), child, transform))
-        self.write("/tf_static", "tf2_msgs/msg/TFMessage", START, self.types["tf2_msgs/msg/TFMessage"](transforms))
 
 
 def two_lidars(path: Path, *, static: bool = True) -> Path:

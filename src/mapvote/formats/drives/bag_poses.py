@@ -50,8 +50,22 @@ def _fixes(bag: Bag, topic: str, frame: MapFrame | None) -> Trajectory:
 
 def T_first_lidar(bag: Bag, first: str, other: str) -> F64:
     """T_first_other (4, 4) between the frames of two PointCloud2 topics, by /tf_static; MapvoteError without."""
-    source, target = (_frame_id(bag, topic) for topic in (first, other))
-    edges: dict[str, list[tuple[str, F64]]] = {}
+    source, target = (frame_id(bag, topic) for topic in (first, other))
+    reached = T_from(static_frames(bag), source)
+    if target not in reached:
+        raise MapvoteError(
+            f"{bag.path}: /tf_static does not say where {target} ({other}) sits to {source} ({first}); record it, or "
+            f"choose one LiDAR with --topic"
+        )
+    return reached[target]
+
+
+Edges = dict[str, list[tuple[str, F64]]]
+
+
+def static_frames(bag: Bag) -> Edges:
+    """From each frame of /tf_static to its neighbours, with T_frame_neighbour (4, 4), both ways."""
+    edges: Edges = {}
     for topic in bag.topics(_TF):
         if not topic.endswith("tf_static"):
             continue
@@ -61,6 +75,11 @@ def T_first_lidar(bag: Bag, first: str, other: str) -> F64:
                 parent, child = t.header.frame_id.strip("/"), t.child_frame_id.strip("/")
                 edges.setdefault(parent, []).append((child, T))
                 edges.setdefault(child, []).append((parent, geometry.inverse(T)))
+    return edges
+
+
+def T_from(edges: Edges, source: str) -> dict[str, F64]:
+    """T_source_frame (4, 4) of every frame that can be reached."""
     reached, waiting = {source: np.eye(4)}, [source]
     while waiting:
         here = waiting.pop()
@@ -68,17 +87,14 @@ def T_first_lidar(bag: Bag, first: str, other: str) -> F64:
             if there not in reached:
                 reached[there] = reached[here] @ T
                 waiting.append(there)
-    if target not in reached:
-        raise MapvoteError(
-            f"{bag.path}: /tf_static does not say where {target} ({other}) sits to {source} ({first}); record it, or "
-            f"choose one LiDAR with --topic"
-        )
-    return reached[target]
+    return reached
 
 
-def _frame_id(bag: Bag, topic: str) -> str:
+def frame_id(bag: Bag, topic: str, *, child: bool = False) -> str:
+    """The frame of a topic's first message; ``child``: what an Odometry tracks, "" where the message does not say."""
     for _, message in bag.messages(topic):
-        return str(message.header.frame_id).strip("/")
+        name = getattr(message, "child_frame_id", "") if child else message.header.frame_id
+        return str(name).strip("/")
     return ""
 
 

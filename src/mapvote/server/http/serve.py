@@ -16,6 +16,7 @@ import structlog
 import uvicorn
 
 from mapvote.config import Settings
+from mapvote.core.point_map import PointMap
 from mapvote.core.types import MapvoteError
 from mapvote.formats import read_map
 from mapvote.server.http.app import create_app
@@ -35,7 +36,13 @@ _PATIENCE_S = 5
 """How long a stopping server waits for answers under way. Ballots take milliseconds."""
 
 
-def open_or_create(url: str, map_path: Path | None, policy: Policy | None = None) -> tuple[Store, bool]:
+def open_or_create(
+    url: str,
+    map_path: Path | None,
+    policy: Policy | None = None,
+    *,
+    read: Callable[[Path], PointMap] = read_map,
+) -> tuple[Store, bool]:
     """The store at a database URL, or a new one from ``map_path`` and with this ``policy`` if there is none yet;
     whether it is new.
 
@@ -46,7 +53,7 @@ def open_or_create(url: str, map_path: Path | None, policy: Policy | None = None
     except MapvoteError:
         if map_path is None:
             raise
-    return Store.create(url, read_map(map_path), policy), True
+    return Store.create(url, read(map_path), policy), True
 
 
 def is_loopback(host: str) -> bool:

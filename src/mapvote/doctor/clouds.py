@@ -1,0 +1,124 @@
+"""What a map's points show before anything is made of them: units, axes, strays, copies, rounding."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from mapvote.core.types import F64
+from mapvote.doctor.finding import Finding
+from mapvote.doctor.road import UPS
+
+_SOME = 400_000
+_FEW = 1000
+"""Fewer points show nothing."""
+_COLUMN_M = 2.0
+_SHEET_M = 0.2
+_HIGHEST_M = 3000.0
+"""No map of streets is higher."""
+
+
+def check_cloud(points: NDArray[np.floating]) -> list[Finding]:
+    """Of points (n, 3) in map metres, as somebody's file holds them."""
+    if len(points) < _FEW:
+        return [
+            Finding("warning", f"the map holds {len(points)} points only", "is the file cut off, or the wrong one?")
+        ]
+    found = _strays(points)
+    spacing = _spacing(points)
+    return found + (_units(points, spacing) or _axes(points)) + _copies(spacing) + _rounded(points)
+
+
+def _box(points: NDArray[np.floating]) -> tuple[F64, F64]:
+    some = points[:: max(1, len(points) // _SOME)]
+    return np.quantile(some, 0.001, axis=0), np.quantile(some, 0.999, axis=0)
+
+
+def _strays(points: NDArray[np.floating]) -> list[Finding]:
+    low, high = _box(points)
+    wide = high - low
+    outside = ((points < low - wide - 20.0) | (points > high + wide + 20.0)).any(axis=1)
+    if not outside.any():
+        return []
+    far_m = float(np.abs(points[outside] - 0.5 * (low + high)).max())
+    what = f"{int(outside.sum())} of {len(points)} points lie far off all others, up to {far_m:.0f} m"
+    return [Finding("warning", what, "strays, or another place's points: cut them off")]
+
+
+def _spacing(points: NDArray[np.floating]) -> F64:
+    """(m,) distance of some points to their nearest neighbour, of all points around one place."""
+    centre = np.median(points[:: max(1, len(points) // 1000)], axis=0)
+    distance = np.abs(points[:, :2] - centre[:2]).max(axis=1)
+    near = points[distance <= np.partition(distance, min(_SOME, len(points)) - 1)[min(_SOME, len(points)) - 1]]
+    near = near[:_SOME].astype(np.float64)
+    away, _ = cKDTree(near).query(near[:: max(1, len(near) // 2000)], k=2)
+    return np.asarray(away[:, 1])
+
+
+def _units(points: NDArray[np.floating], spacing: F64) -> list[Finding]:
+    low, high = _box(points)
+    wide = high - low
+    apart_m, mend = float(np.median(spacing)), "give the points in metres"
+    if wide.max() < 5.0:
+        what = f"the map is {wide[0]:.3g} by {wide[1]:.3g} by {wide[2]:.3g} m small: kilometres, or degrees?"
+        return [Finding("error", what, mend)]
+    if wide[2] < 0.05:
+        return [Finding("error", "all points lie at one height: the map is flat", "is the column order x, y, z?")]
+    if wide[2] > _HIGHEST_M or (apart_m > 2.0 and wide[2] > 0.2 * _HIGHEST_M):
+        what = f"points are {apart_m:.2g} m apart, the map is {wide[2]:.0f} m high: millimetres, or centimetres?"
+        return [Finding("error", what, mend)]
+    if apart_m > 0.5:
+        what = f"points are {apart_m:.2f} m apart (median): too sparse to tell what stands there, or not metres"
+        return [Finding("warning", what, "a map needs a point every 0.3 m or so")]
+    return []
+
+
+def _axes(points: NDArray[np.floating]) -> list[Finding]:
+    """Which way is up: a street is a sheet of ground with things on it, none below."""
+    some = points[:: max(1, len(points) // _SOME)].astype(np.float64)
+    share = {name: _sheet_share(some, up) for name, up in UPS.items()}
+    best = max(share, key=lambda name: share[name])
+    opposite = ("-" if best[0] == "+" else "+") + best[1]
+    # Between two walls, as much lies at one end of an axis as at the other: that is no ground.
+    if best == "+z" or share[best] < 1.3 * max(share["+z"], share[opposite]):
+        return []
+    if best == "-z":
+        what = "the map is upside down: things hang below the ground"
+        return [Finding("error", what, "negate y and z of every point (only z, if right and left are right already)")]
+    what = f"the map's axis {best} points up, not z"
+    return [Finding("error", what, "turn the points so that z is up (x east, y north)")]
+
+
+def _sheet_share(points: F64, up: F64) -> float:
+    """Share of the points that lie within 0.2 m of the lowest of their column of 2 m, along ``up``."""
+    axis = int(np.argmax(np.abs(up)))
+    height = points[:, axis] * up[axis]
+    others = [a for a in range(3) if a != axis]
+    cells = np.floor((points[:, others] - points[:, others].min(axis=0)) / _COLUMN_M).astype(np.int64)
+    key = cells[:, 0] * (cells[:, 1].max() + 1) + cells[:, 1]
+    order = np.lexsort((height, key))
+    key, height = key[order], height[order]
+    starts = np.flatnonzero(np.diff(key, prepend=-1))
+    counts = np.diff(np.append(starts, len(key)))
+    lowest = np.repeat(height[starts + counts // 20], counts)
+    tall = np.repeat(height[starts + counts - 1] - height[starts] > 1.5, counts)
+    return float(((np.abs(height - lowest) < _SHEET_M) & tall).mean())
+
+
+def _copies(spacing: F64) -> list[Finding]:
+    twice = float((spacing < 1e-6).mean())
+    if twice < 0.05:
+        return []
+    return [Finding("warning", f"{twice:.0%} of the points are there twice", "the map was joined with itself?")]
+
+
+def _rounded(points: NDArray[np.floating]) -> list[Finding]:
+    some = points[:: max(1, len(points) // 20_000)].astype(np.float64)
+    for axis, name in enumerate("xyz"):
+        for quantum in (1.0, 0.5, 0.25, 0.125):
+            steps = some[:, axis] / quantum
+            if (np.abs(steps - np.round(steps)) < 1e-3).mean() > 0.95 and np.ptp(some[:, axis]) > 0.05:
+                what = f"{name} is rounded to {quantum:g} m in the map"
+                return [Finding("error", what, "float32 of large coordinates? Subtract an offset before writing them")]
+    return []

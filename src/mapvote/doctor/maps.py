@@ -1,0 +1,135 @@
+"""A map by itself: what its file shows, its ground, layers that are there twice, holes, density, frame."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from mapvote.core.point_map import PointMap, all_points
+from mapvote.core.types import F64, MapvoteError
+from mapvote.doctor.clouds import check_cloud
+from mapvote.doctor.finding import Finding, in_order
+from mapvote.doctor.ghosts import ghost_layer, ghost_shift
+from mapvote.doctor.on_map import check_ground
+from mapvote.formats import read_cloud, read_map
+from mapvote.formats.geo.frame import frame_of
+from mapvote.formats.maps.cloud import Cloud, to_map
+from mapvote.formats.maps.mapvote_folder import is_map_folder
+
+_FAR_M = 50_000.0
+_SLOPE_DEG = 6.0
+
+
+def examine_map(path: Path) -> tuple[list[Finding], PointMap | None]:
+    """(findings, errors first; the map, if one can be made of it) of a map in any format."""
+    try:
+        if not is_map_folder(path):
+            return examine_points(str(path), read_cloud(path).in_metres(str(path)))
+        point_map = read_map(path)
+    except MapvoteError as error:
+        return [Finding("error", str(error))], None
+    return in_order(check_cloud(all_points(point_map)) + check_map(point_map)), point_map
+
+
+def examine_points(where: str, cloud: Cloud) -> tuple[list[Finding], PointMap | None]:
+    """The same of points in metres that no map has been made of yet."""
+    found = check_cloud(cloud.points)
+    if any(f.severity == "error" for f in found):
+        return in_order(found), None
+    try:
+        point_map = to_map(where, cloud)
+    except MapvoteError as error:
+        return in_order([*found, Finding("error", str(error))]), None
+    return in_order(found + check_map(point_map)), point_map
+
+
+def check_map(point_map: PointMap) -> list[Finding]:
+    """Of a map whose ground has been measured."""
+    points = all_points(point_map)
+    height = np.concatenate([_heights(point_map, index) for index in sorted(point_map.tiles)])
+    found = _ground(point_map, points, height) + check_ground(point_map) + _missing_tiles(point_map)
+    layer = ghost_layer(height)
+    if layer is not None:
+        what = f"the road lies there twice, {abs(layer):.2f} m apart in height: a ghost layer"
+        found.append(Finding("error", what, "two drives of different height were laid over each other: align them"))
+    else:
+        shift = ghost_shift(points[(height > 0.5) & (height < 6.0)])
+        if shift is not None:
+            x, y = shift
+            by = f"{np.hypot(x, y):.1f} m (x {x:+.1f}, y {y:+.1f})"
+            what = f"walls and poles are there twice, shifted by {by}: a ghost layer"
+            found.append(Finding("error", what, "two drives were laid over each other unaligned: align them"))
+    found += _frame(point_map, points)
+    return found
+
+
+def _heights(point_map: PointMap, index: tuple[int, int]) -> F64:
+    tile = point_map.tiles[index]
+    return np.asarray(tile.points_map[:, 2] - tile.ground_z.reshape(-1)[tile.cells])
+
+
+def _ground(point_map: PointMap, points: F64, height: F64) -> list[Finding]:
+    found = []
+    known = float(np.isfinite(height).mean())
+    if known < 0.5:
+        what = f"the ground is known under {known:.0%} of the points only"
+        found.append(Finding("warning", what, "is the road missing, cut off below, or is z not up?"))
+    below = float((height < -1.0).mean())
+    if below > 0.01:
+        what = f"{below:.1%} of the points lie more than 1 m below the ground"
+        found.append(Finding("warning", what, "reflections, cellars, or a second layer below"))
+    near = np.abs(height) < 0.15
+    if near.sum() < 100:
+        return [*found, Finding("warning", "hardly any point lies on the ground", "was the ground cut out of the map?")]
+    share_near = float(near.mean())
+    if share_near < 0.08:
+        what = f"only {share_near:.0%} of the points lie on the ground"
+        found.append(Finding("warning", what, "was the ground cut out of the map? Votes need the road"))
+    return found + _plane(points[near]) + _thickness(height)
+
+
+def _plane(ground: F64) -> list[Finding]:
+    p = ground[:: max(1, len(ground) // 100_000)]
+    centre = p.mean(axis=0)
+    plane = np.column_stack([p[:, :2] - centre[:2], np.ones(len(p))])
+    slope, *_ = np.linalg.lstsq(plane, p[:, 2] - centre[2], rcond=None)
+    slope_deg = float(np.degrees(np.arctan(np.hypot(slope[0], slope[1]))))
+    if slope_deg <= _SLOPE_DEG:
+        return []
+    what = f"the ground as a whole is tilted by {slope_deg:.1f} deg"
+    return [Finding("warning", what, "sound on a steep street only; else z is not up: level the map")]
+
+
+def _thickness(height: F64) -> list[Finding]:
+    wide = height[(np.abs(height) < 0.6)]
+    rough = 1.4826 * float(np.median(np.abs(wide - np.median(wide))))
+    if rough <= 0.12:
+        return []
+    what = f"the ground is {rough:.2f} m thick"
+    return [Finding("warning", what, "scans scatter, or several were laid over each other badly")]
+
+
+def _missing_tiles(point_map: PointMap) -> list[Finding]:
+    tiles = set(point_map.tiles)
+    around = {(r + a, c + b) for r, c in tiles for a, b in ((0, 1), (0, -1), (1, 0), (-1, 0))} - tiles
+    holes = [
+        (r, c)
+        for r, c in sorted(around)
+        if ((r - 1, c) in tiles and (r + 1, c) in tiles) or ((r, c - 1) in tiles and (r, c + 1) in tiles)
+    ]
+    if not holes:
+        return []
+    window = point_map.lattice.tile(holes[0])
+    what = f"{len(holes)} tiles are missing between others, the first at ({window.x0:.0f}, {window.y0:.0f})"
+    return [Finding("warning", what, "a hole in the map: there nobody can vote")]
+
+
+def _frame(point_map: PointMap, points: F64) -> list[Finding]:
+    frame = frame_of(point_map.georeference)
+    low, high = points.min(axis=0), points.max(axis=0)
+    told = f"x {low[0]:.0f} to {high[0]:.0f}, y {low[1]:.0f} to {high[1]:.0f}, z {low[2]:.0f} to {high[2]:.0f} m"
+    if frame.is_local and max(np.abs(low[:2]).max(), np.abs(high[:2]).max()) > _FAR_M:
+        what = f"the map does not say which coordinates it is in ({told})"
+        return [Finding("warning", what, "import it with --from-crs EPSG:n, so that GNSS and maps find it")]
+    return [Finding("note", f"{told}; {frame.told()}")]

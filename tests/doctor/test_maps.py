@@ -1,0 +1,108 @@
+"""The doctor looks at a map by itself: units, axes, layers that are there twice, holes, rounding."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mapvote.core.point_map import PointMap, map_from_points
+from mapvote.core.types import F64
+from mapvote.doctor import Finding, examine
+from mapvote.doctor.clouds import check_cloud
+from mapvote.doctor.maps import check_map
+from mapvote.formats import write_map
+
+
+def street() -> F64:
+    """A road with walls at odd angles and poles beside it, map metres; seeded. Scanned evenly, every 0.2 m or so."""
+    rng = np.random.default_rng(5)
+    n = 60_000
+    x, y = rng.uniform(0, 100, n), rng.uniform(-25, 25, n)
+    parts = [np.column_stack([x, y, 0.01 * x + rng.normal(0, 0.01, n)])]
+    for _ in range(50):
+        x0, y0 = rng.uniform(0, 100), rng.choice([-1, 1]) * rng.uniform(8, 22)
+        along, height, heading = rng.uniform(2, 10), rng.uniform(2, 8), rng.uniform(0, np.pi)
+        s, z = rng.uniform(0, along, 900), rng.uniform(0, height, 900)
+        x = x0 + s * np.cos(heading)
+        parts.append(np.column_stack([x, y0 + s * np.sin(heading), 0.01 * x + z]))
+    return np.concatenate(parts)
+
+
+@pytest.fixture(scope="module")
+def points() -> F64:
+    return street()
+
+
+@pytest.fixture(scope="module")
+def sound(points: F64) -> PointMap:
+    return map_from_points(points)
+
+
+def serious(found: list[Finding]) -> list[str]:
+    return [f.what for f in found if f.severity != "note"]
+
+
+def test_a_sound_map_is_not_blamed(points: F64, sound: PointMap) -> None:
+    assert serious(check_cloud(points) + check_map(sound)) == []
+
+
+@pytest.mark.parametrize(
+    ("change", "name"),
+    [
+        (lambda p: 1000 * p, "millimetres"),
+        (lambda p: 100 * p, "centimetres"),
+        (lambda p: p / 1000, "kilometres"),
+        (lambda p: p * [1, 1, 0], "flat"),
+        (lambda p: p * [1, -1, -1], "upside down"),
+        (lambda p: p[:, [0, 2, 1]] * [1, 1, -1], r"axis +y points up"),
+        (lambda p: p[:, [2, 1, 0]], "axis +x points up"),
+        (lambda p: np.round(p * 2) / 2, "rounded to 0.5 m"),
+        (lambda p: np.concatenate([p, p]), "there twice"),
+        (lambda p: np.concatenate([p, [[9e5, 0, 0]]]), "1 of 105001 points lie far off all others"),
+        (lambda p: p[::60], "too sparse"),
+        (lambda p: p[:10], "10 points only"),
+    ],
+)
+def test_what_is_wrong_with_points_is_named(points: F64, change: Callable[[F64], F64], name: str) -> None:
+    assert any(name in what for what in serious(check_cloud(change(points)))), check_cloud(change(points))
+
+
+def test_a_map_of_walls_alone_has_no_axis_that_points_up(points: F64) -> None:
+    rng = np.random.default_rng(1)
+    x, z = rng.uniform(0, 60, 20_000), rng.uniform(0, 6, 20_000)
+    walls = np.column_stack([x, np.where(rng.random(20_000) < 0.5, -8.0, 8.0), z])
+    assert not [what for what in serious(check_cloud(walls)) if "up" in what]
+
+
+def test_a_second_road_above_the_first_is_a_ghost(points: F64) -> None:
+    twice = map_from_points(np.concatenate([points, points + np.array([0, 0, 0.6])]))
+    assert any("the road lies there twice, 0.6" in what for what in serious(check_map(twice)))
+
+
+def test_walls_that_are_there_twice_are_a_ghost_with_its_shift(points: F64) -> None:
+    twice = map_from_points(np.concatenate([points, points + np.array([3.0, -1.0, 0])]))
+    found = [what for what in serious(check_map(twice)) if "walls and poles are there twice" in what]
+    assert found
+    assert "3.2 m (x +3.0, y -1.0)" in found[0] or "3.2 m (x -3.0, y +1.0)" in found[0]
+
+
+def test_coordinates_without_a_name_are_told(points: F64) -> None:
+    far = map_from_points(points + np.array([367_000.0, 3_951_000.0, 20.0]))
+    assert any("does not say which coordinates" in what for what in serious(check_map(far)))
+
+
+def test_a_tile_that_is_missing_between_others_is_told(sound: PointMap, points: F64) -> None:
+    long = map_from_points(np.concatenate([points, points + np.array([260.0, 0, 2.6])]))
+    assert any("missing between others" in what for what in serious(check_map(long)))
+
+
+def test_examine_takes_map_folders_and_ballots(tmp_path: Path, sound: PointMap) -> None:
+    write_map(sound, tmp_path / "m")
+    found = examine(tmp_path / "m")
+    assert serious(found) == []
+    assert any("local metres" in f.what for f in found)
+    (tmp_path / "b.ballot").write_bytes(b"no ballot")
+    assert [f.severity for f in examine(tmp_path / "b.ballot")] == ["error"]
