@@ -10,11 +10,13 @@ from mapvote.core.types import F64
 from mapvote.doctor.finding import Finding
 from mapvote.doctor.road import UPS
 
-_SOME = 400_000
+_SOME, _NEAR = 400_000, 100_000
 _FEW = 1000
 """Fewer points show nothing."""
 _COLUMN_M = 2.0
 _SHEET_M = 0.2
+_STRAY_M = 300.0
+"""Farther off they make the map larger than it is; nearer ones are reflections."""
 _HIGHEST_M = 3000.0
 """No map of streets is higher."""
 
@@ -26,8 +28,8 @@ def check_cloud(points: NDArray[np.floating]) -> list[Finding]:
             Finding("warning", f"the map holds {len(points)} points only", "is the file cut off, or the wrong one?")
         ]
     found = _strays(points)
-    spacing = _spacing(points)
-    return found + (_units(points, spacing) or _axes(points)) + _copies(spacing) + _rounded(points)
+    apart_m = spacing(points)
+    return found + (_units(points, apart_m) or _axes(points)) + _copies(apart_m) + _rounded(points)
 
 
 def _box(points: NDArray[np.floating]) -> tuple[F64, F64]:
@@ -43,23 +45,24 @@ def _strays(points: NDArray[np.floating]) -> list[Finding]:
         return []
     far_m = float(np.abs(points[outside] - 0.5 * (low + high)).max())
     what = f"{int(outside.sum())} of {len(points)} points lie far off all others, up to {far_m:.0f} m"
-    return [Finding("warning", what, "strays, or another place's points: cut them off")]
+    mend = "strays, or another place's points: cut them off"
+    return [Finding("warning" if far_m > _STRAY_M else "note", what, mend)]
 
 
-def _spacing(points: NDArray[np.floating]) -> F64:
+def spacing(points: NDArray[np.floating]) -> F64:
     """(m,) distance of some points to their nearest neighbour, of all points around one place."""
     centre = np.median(points[:: max(1, len(points) // 1000)], axis=0)
     distance = np.abs(points[:, :2] - centre[:2]).max(axis=1)
-    near = points[distance <= np.partition(distance, min(_SOME, len(points)) - 1)[min(_SOME, len(points)) - 1]]
-    near = near[:_SOME].astype(np.float64)
+    near = points[distance <= np.partition(distance, min(_NEAR, len(points)) - 1)[min(_NEAR, len(points)) - 1]]
+    near = near[:_NEAR].astype(np.float64)
     away, _ = cKDTree(near).query(near[:: max(1, len(near) // 2000)], k=2)
     return np.asarray(away[:, 1])
 
 
-def _units(points: NDArray[np.floating], spacing: F64) -> list[Finding]:
+def _units(points: NDArray[np.floating], apart: F64) -> list[Finding]:
     low, high = _box(points)
     wide = high - low
-    apart_m, mend = float(np.median(spacing)), "give the points in metres"
+    apart_m, mend = float(np.median(apart)), "give the points in metres"
     if wide.max() < 5.0:
         what = f"the map is {wide[0]:.3g} by {wide[1]:.3g} by {wide[2]:.3g} m small: kilometres, or degrees?"
         return [Finding("error", what, mend)]
@@ -106,8 +109,8 @@ def _sheet_share(points: F64, up: F64) -> float:
     return float(((np.abs(height - lowest) < _SHEET_M) & tall).mean())
 
 
-def _copies(spacing: F64) -> list[Finding]:
-    twice = float((spacing < 1e-6).mean())
+def _copies(apart_m: F64) -> list[Finding]:
+    twice = float((apart_m < 1e-6).mean())
     if twice < 0.05:
         return []
     return [Finding("warning", f"{twice:.0%} of the points are there twice", "the map was joined with itself?")]

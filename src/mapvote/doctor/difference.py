@@ -12,6 +12,8 @@ from mapvote.core.types import F64
 
 _POSITION_M, _ROTATION_RAD = 0.03, np.radians(0.15)
 """Errors of one registration; they weigh positions against rotations."""
+_SCALE = 0.01
+"""Of the scale that points show; it stands where a drive is too short to tell it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,8 +49,11 @@ class Difference:
         return out
 
 
-def difference_of(T_prior: F64, T_map: F64) -> Difference:
-    """Of poses (m, 4, 4) of the same scans, by robust least squares. Errors come from how well the places agree."""
+def difference_of(T_prior: F64, T_map: F64, scale: float = 1.0) -> Difference:
+    """Of poses (m, 4, 4) of the same scans, by robust least squares. Errors come from how well the places agree.
+
+    ``scale``: as the points of the scans showed it, to a per cent; places far apart tell it better.
+    """
     middle = T_prior[:, :3, 3].mean(axis=0)
     p, q = T_prior[:, :3, 3] - middle, T_map[:, :3, 3] - middle
     turned = Rotation.from_matrix(T_map[:, :3, :3] @ np.swapaxes(T_prior[:, :3, :3], 1, 2))
@@ -57,10 +62,9 @@ def difference_of(T_prior: F64, T_map: F64) -> Difference:
         R = Rotation.from_rotvec(x[3:6])
         positions = (np.exp(x[6]) * R.apply(p) + x[:3] - q) / _POSITION_M
         rotations = (R.inv() * turned).as_rotvec() / _ROTATION_RAD
-        # A scale that short drives cannot tell stays at 1.
-        return np.concatenate([positions.ravel(), rotations.ravel(), [x[6] / 0.2]])
+        return np.concatenate([positions.ravel(), rotations.ravel(), [(x[6] - np.log(scale)) / _SCALE]])
 
-    start = np.concatenate([q.mean(axis=0), turned.mean().as_rotvec(), [0.0]])
+    start = np.concatenate([q.mean(axis=0), turned.mean().as_rotvec(), [np.log(scale)]])
     found = optimize.least_squares(off, start, loss="soft_l1", f_scale=2.0)
     spread = max(1.0, 1.4826 * float(np.median(np.abs(found.fun))))
     sigma = spread * np.sqrt(np.diag(np.linalg.pinv(found.jac.T @ found.jac)))

@@ -15,10 +15,15 @@ from mapvote.doctor.motion import Run, follow, starts_of_runs
 from mapvote.doctor.prior import NO_PRIOR, check_prior, check_times
 from mapvote.doctor.road import Road, find_road
 from mapvote.doctor.scans import check_scans
+from mapvote.doctor.scatter import range_scatter_m
 from mapvote.formats import open_drive
 from mapvote.formats.drives.options import DriveOptions
 
 _ROAD_SCANS = 7
+_ROUGH_M = 0.12
+_SCATTER_M = 0.1
+_HIGHEST_M = 4.5
+"""Of a sensor over the road."""
 IN_MAP_FRAME = Finding(
     "error",
     "the points are in the map's frame already: they move along with the prior",
@@ -71,8 +76,9 @@ def measure(drive: Drive, looks: Looks, progress: Progress | None = None) -> tup
     T = drive.T_map_lidar_prior
     usable = np.flatnonzero(np.isin(np.arange(len(drive)), looks.index))
     some = usable[np.linspace(0, len(usable) - 1, min(len(usable), _ROAD_SCANS)).astype(np.int64)]
-    road = find_road([drive.read_scan(int(i)).points for i in some])
-    found = _check_road(road, T, some.tolist())
+    clouds = [drive.read_scan(int(i)).points for i in some]
+    road, scatter_m = find_road(clouds), float(np.median([range_scatter_m(points) for points in clouds]))
+    found = _check_ranges(scatter_m) + _check_road(road, scatter_m, T, some.tolist())
     median_m = float(np.median(looks.range_m[:, 1]))
     if not 1.5 <= median_m <= 150.0 or road.up != "+z":
         return found, T  # whatever else seems wrong may be its consequence
@@ -80,21 +86,30 @@ def measure(drive: Drive, looks: Looks, progress: Progress | None = None) -> tup
     def read(i: int) -> F32:
         return drive.read_scan(int(usable[i])).points
 
-    starts = starts_of_runs(len(usable), None if T is None else T[usable])
+    starts = starts_of_runs(len(usable), None if T is None else T[usable], looks.leaps)
     runs = []
     for k, start in enumerate(starts):
         run = follow(read, int(start), len(usable), road)
         runs.append(Run(usable[run.indices], run.T_first_lidar, run.fit))
         if progress is not None:
             progress("registering scans", k + 1, len(starts))
-    found += check_scan_motion(drive, runs)
-    if T is None or (any(f.severity == "error" for f in found[-1:]) and "fit" in found[-1].what):
+    unsound = check_scan_motion(drive, runs)
+    found += unsound
+    if T is None or unsound:  # what the scans do not show, the prior cannot be held against
         return found, T
     more, mended = check_agreement(drive, T, runs, road, float(np.median(looks.turns)))
     return found + more, mended
 
 
-def _check_road(road: Road, T: F64 | None, indices: list[int]) -> list[Finding]:
+def _check_ranges(scatter_m: float) -> list[Finding]:
+    if scatter_m <= _SCATTER_M:
+        return []
+    what = f"ranges scatter by {scatter_m:.2f} m against those of the rays beside them (sound sensors: 0.01 to 0.04 m)"
+    mend = "is the sensor calibrated, and does each point carry its own range? Such scans blur the map"
+    return [Finding("error" if scatter_m > 2.0 * _SCATTER_M else "warning", what, mend)]
+
+
+def _check_road(road: Road, scatter_m: float, T: F64 | None, indices: list[int]) -> list[Finding]:
     if road.up == "-z":
         what = f"the sensor is upside down: the road lies {road.depth_m:.1f} m above it (z points down)"
         mend = "negate y and z of every point (or only z, if right and left are right already)"
@@ -104,17 +119,19 @@ def _check_road(road: Road, T: F64 | None, indices: list[int]) -> list[Finding]:
         mend = "turn the points to x forward, y left, z up (camera axes are x right, y down, z forward)"
         return [Finding("error", what, mend)]
     found = []
-    if road.share < 0.1:
-        what = f"no road lies below the sensor (the fullest layer holds {road.share:.0%} of the near points)"
+    rough = road.scatter_m > _ROUGH_M
+    if not road.is_there or (rough and scatter_m <= _SCATTER_M):
+        what = f"no road lies below the sensor (the fullest layer holds {road.share:.0%} of the near points"
+        what += f", {road.scatter_m:.2f} m thick, its depth +-{road.unsteady_m:.2f} m from scan to scan)"
         mend = "are the lower beams missing, the points cut, or z measured from elsewhere?"
         return [Finding("warning", what, mend)]
     found.append(Finding("note", f"by the scans themselves the sensor stands {road.depth_m:.1f} m over the road"))
     if road.depth_m < 0.5:
         what = f"the road lies only {road.depth_m:.1f} m below the points' origin"
         found.append(Finding("warning", what, "are the points in the vehicle's frame? Give them in the sensor's"))
-    if road.scatter_m > 0.12:
-        what = f"the road is {road.scatter_m:.2f} m rough: the ranges scatter, or times or calibration are wrong"
-        found.append(Finding("warning", what, "sound sensors show 0.01 to 0.05 m"))
+    if road.depth_m > _HIGHEST_M:
+        what = f"the road lies {road.depth_m:.1f} m below the sensor: no vehicle is so high, the scans are too large"
+        found.append(Finding("warning", what, f"are the points in feet (then it is {0.3048 * road.depth_m:.1f} m)?"))
     normal = road.normal if T is None else np.mean([T[i, :3, :3] @ road.normal for i in indices], axis=0)
     tilt_deg = float(np.degrees(np.arccos(np.clip(normal[2] / np.linalg.norm(normal), -1.0, 1.0))))
     if T is not None and tilt_deg > 4.0:

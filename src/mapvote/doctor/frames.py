@@ -20,6 +20,8 @@ from mapvote.doctor.prior import drift_angle_deg
 from mapvote.doctor.readings import AS_IT_IS, READINGS, Reading
 from mapvote.doctor.road import Road
 
+_FAR_M = 50.0
+"""Points in the sensor's frame lie around it: their mean is never so far from the origin."""
 LEAST_FIT = 0.55
 """Sound scans, a step apart, agree in .75 to .95 of their points; scans of different places in .2 to .5."""
 _HEIGHT_M = (0.8, 4.0)
@@ -53,8 +55,8 @@ def check_scan_motion(drive: Drive, runs: Sequence[Run]) -> list[Finding]:
         return [Finding("error", what, mend)]
     leaps = np.concatenate([~agree_with_time(run, drive.stamps_ns) for run in runs])
     if len(leaps) and leaps.mean() > 0.25:
-        what = f"the scans leap: in {leaps.mean():.0%} of the steps the vehicle would brake or start as none can"
-        return [Finding("error", what, mend + " Scans are out of order, or times are wrong")]
+        what = f"the vehicle would brake or start as none can in {leaps.mean():.0%} of the steps"
+        return [Finding("error", f"the scans leap: they are out of order, or their times are wrong ({what})", mend)]
     speed = [run.length_m / (1e-9 * float(np.diff(drive.stamps_ns[run.indices[[0, -1]]])[0])) for run in runs]
     if np.median(speed) > 70.0:
         what = f"by scans and times the vehicle drives at {np.median(speed):.0f} m/s"
@@ -67,7 +69,11 @@ def check_scan_motion(drive: Drive, runs: Sequence[Run]) -> list[Finding]:
 
 
 def in_map_frame(T: F64, looks: Looks) -> bool:
-    """Whether the points move along with the prior: then they are in the map's frame already."""
+    """Whether the points lie around the prior, or move along with it: then they are in the map's frame already."""
+    away_m = float(np.median(np.linalg.norm(T[looks.index, :3, 3], axis=1)))
+    off_m = float(np.median(np.linalg.norm(looks.mean - T[looks.index, :3, 3], axis=1)))
+    if away_m > _FAR_M and off_m < 0.5 * away_m:
+        return True
     p, centre = T[looks.index, :2, 3], looks.mean[:, :2]
     spread = p - p.mean(axis=0)
     if len(p) < 5 or np.linalg.norm(p.max(axis=0) - p.min(axis=0)) < 8.0:
@@ -89,7 +95,8 @@ def check_agreement(drive: Drive, T: F64, runs: Sequence[Run], road: Road, turns
     as_it_is = _held(AS_IT_IS, T, runs)
     held = [_held(reading, T, runs) for reading in READINGS]
     turn, pitch = measure_turn(T, runs)
-    numbers = [measure_scale(T, runs), turn, pitch, measure_time(T, runs, drive.stamps_ns)]
+    time = measure_time(T, runs, drive.stamps_ns)
+    numbers = [measure_scale(T, runs), turn, pitch, *([time] if time is not None else [])]
     wordy = [m for m in numbers if m is not (turn if abs(pitch.value) > abs(turn.value) else pitch)]
     held += [_held(_number_reading(m, T, runs, road), T, runs, special=False) for m in wordy]
     best = min([as_it_is, *held], key=lambda h: h.median)
@@ -169,13 +176,13 @@ def _scale_words(m: Measured, road: Road) -> tuple[str, str]:
     low, high = _HEIGHT_M
     size = f"{m.value:.3f} times (+-{m.sigma:.3f})" if 0.1 < m.value < 10 else f"{m.value:.3g} times"
     usual, other = low <= road.depth_m <= high, low <= road.depth_m * m.value <= high
-    if road.share > 0.1 and other and not usual:
+    if road.is_there and other and not usual:
         what = f"the scans are {1 / m.value:.3f} times too large (+-{m.sigma / m.value**2:.3f})"
         return (
             f"{what}: by them the road lies {road.depth_m:.1f} m below",
             f"multiply their points by {m.value:.4f} (feet are 0.3048 m)",
         )
-    if road.share > 0.1 and usual and not other:
+    if road.is_there and usual and not other:
         return f"the prior's positions are {size} too large", f"divide its positions by {m.value:.4f}"
     what = f"the prior's positions are {size} too large, or the scans that much too small"
     return what, "compare with a length that you know; Mercator's metres need a projection (UTM), feet 0.3048"

@@ -52,6 +52,12 @@ class Looks:
     refused: dict[int, str]
     """Why a scan could not be read."""
 
+    @property
+    def leaps(self) -> F64:
+        """(m - 1,) by how much the directions in which a scan sees something differ from those of the one before."""
+        leaps: F64 = np.abs(np.diff(self.sectors, axis=0)).sum(axis=1)
+        return leaps
+
 
 def look_at_all(drive: Drive, progress: Callable[[int, int], None] | None = None) -> Looks:
     """Every scan of the drive read once. ``progress`` is told (done, in all)."""

@@ -8,7 +8,7 @@ import numpy as np
 
 from mapvote.core.point_map import PointMap, all_points
 from mapvote.core.types import F64, MapvoteError
-from mapvote.doctor.clouds import check_cloud
+from mapvote.doctor.clouds import check_cloud, spacing
 from mapvote.doctor.finding import Finding, in_order
 from mapvote.doctor.ghosts import ghost_layer, ghost_shift
 from mapvote.doctor.on_map import check_ground
@@ -19,6 +19,8 @@ from mapvote.formats.maps.mapvote_folder import is_map_folder
 
 _FAR_M = 50_000.0
 _SLOPE_DEG = 6.0
+_SPARSE_M = 0.4
+"""Points farther apart make patterns of their own."""
 
 
 def examine_map(path: Path) -> tuple[list[Finding], PointMap | None]:
@@ -53,7 +55,7 @@ def check_map(point_map: PointMap) -> list[Finding]:
     if layer is not None:
         what = f"the road lies there twice, {abs(layer):.2f} m apart in height: a ghost layer"
         found.append(Finding("error", what, "two drives of different height were laid over each other: align them"))
-    else:
+    elif float(np.median(spacing(points))) < _SPARSE_M:
         shift = ghost_shift(points[(height > 0.5) & (height < 6.0)])
         if shift is not None:
             x, y = shift

@@ -15,7 +15,7 @@ from mapvote.doctor.agreement import LEVER_M, residuals
 from mapvote.doctor.motion import Run
 
 _TIME_S = 3.0
-"""Shifts in time are looked for so far."""
+"""Shifts in time are looked for so far, and over a quarter of the drive: beyond, little is left to compare."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,12 +98,15 @@ def measure_turn(T: F64, runs: Sequence[Run]) -> tuple[Measured, Measured]:
     )
 
 
-def measure_time(T: F64, runs: Sequence[Run], stamps_ns: I64) -> Measured:
-    """How much later than the scans the prior's times are."""
+def measure_time(T: F64, runs: Sequence[Run], stamps_ns: I64) -> Measured | None:
+    """How much later than the scans the prior's times are; None if no shift that the drive can show fits."""
+    most_s = min(_TIME_S, (stamps_ns[-1] - stamps_ns[0]) * 1e-9 / 4.0)
 
     def rule(p: F64) -> Callable[[F64], F64]:
         return lambda T: at_times(T, stamps_ns, float(p[0]))
 
-    starts = [np.array([s]) for s in np.arange(-_TIME_S, _TIME_S + 0.01, 0.2)]
+    starts = [np.array([s]) for s in np.arange(-most_s, most_s + 0.01, min(0.2, most_s))]
     x, sigma = _fit(rule, starts, T, runs)
+    if abs(x[0]) >= most_s:
+        return None
     return Measured("time", float(x[0]), float(sigma[0]), rule(x))

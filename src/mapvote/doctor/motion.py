@@ -19,6 +19,7 @@ from mapvote.localisation.ndt import NdtMap, fitness, refine, thin_for_levels
 _HALF_WINDOW_M = 60.0
 """Of the NDT map of a run: its scans reach 50 m."""
 RUNS = 8
+_ACROSS = 2
 SCANS = 11
 _STEP_M = 2.5
 """Scans are left out of a run while consecutive ones stay this near."""
@@ -51,8 +52,19 @@ class Run:
         return float(np.linalg.norm(np.diff(self.T_first_lidar[:, :3, 3], axis=0), axis=1).sum())
 
 
-def starts_of_runs(n: int, T_map_lidar: F64 | None) -> I64:
-    """First scans of the runs of a drive of n scans: spread evenly, and half of them where the prior turns most."""
+def starts_of_runs(n: int, T_map_lidar: F64 | None, leaps: F64 | None = None) -> I64:
+    """First scans of the runs of a drive of n scans: spread evenly, half of them where the prior turns most.
+
+    ``leaps`` (n - 1,): how much each scan differs from the one before; where that is most a run is laid across.
+    """
+    starts = _spread(n, T_map_lidar)
+    if leaps is None or len(leaps) < n - 1 or len(starts) < 2:
+        return starts
+    most = np.argsort(leaps, kind="stable")[-_ACROSS:] - SCANS // 2
+    return np.unique(np.concatenate([starts, np.clip(most, 0, starts[-1])]))
+
+
+def _spread(n: int, T_map_lidar: F64 | None) -> I64:
     span = SCANS + 2 * _MOST_STEP
     if n <= span:
         return np.zeros(1, dtype=np.int64)

@@ -14,7 +14,8 @@ from mapvote.core.point_map import PointMap
 from mapvote.core.types import F32, F64, Drive, MapvoteError, Scan
 from mapvote.doctor.difference import Difference, difference_of
 from mapvote.doctor.finding import Finding, Progress, Severity
-from mapvote.doctor.places import Place, fitting, register_all
+from mapvote.doctor.other_scale import in_another_scale
+from mapvote.doctor.places import Place, fitting, register_all, total_fit
 from mapvote.doctor.road import find_road
 from mapvote.localisation.deskew import deskew, motion_at
 from mapvote.localisation.global_search import GlobalSearch
@@ -22,6 +23,8 @@ from mapvote.localisation.map_window import MapWindow
 
 _PLACES = 6
 _SEARCHED = 4
+_FEW = 0.8
+"""If fewer scans fit, the map may be in another scale."""
 _MIRROR = np.array([1.0, -1.0, 1.0], dtype=np.float32)
 _TURN_DEG, _TILT_DEG, _SCALE = 0.5, 1.5, 0.01
 
@@ -34,10 +37,18 @@ def check_on_map(drive: Drive, T: F64, point_map: PointMap, tell: Progress | Non
     settings, trust = NdtSettings(), TrustSettings()
     around = MapWindow(point_map)
     road = find_road([scan.points for scan in scans.values()])
-    depth_m = road.depth_m if road.up == "+z" and road.share > 0.1 else None
+    depth_m = road.depth_m if road.up == "+z" and road.is_there else None
     guesses = {i: _on_ground(T[i], point_map, depth_m) for i in scans}
     places = register_all(around, scans, guesses, trust, drive.sensor.range_sigma_m, tell)
+    scale = 1.0
+    if len(fitting(places)) < _FEW * len(places):
+        scale, better = in_another_scale(around, scans, T, trust, drive.sensor.range_sigma_m, tell)
+        if total_fit(better) > 1.2 * total_fit(places):
+            places = better
+        else:
+            scale = 1.0
     if len(fitting(places)) < 0.5 * len(places):
+        scale = 1.0
         search = GlobalSearch(point_map, settings, trust, drive.sensor.range_sigma_m)
         better, mirrored = _searched(search, around, drive, T, scans, trust, tell)
         if mirrored:
@@ -48,7 +59,7 @@ def check_on_map(drive: Drive, T: F64, point_map: PointMap, tell: Progress | Non
     if len(good) < 2:
         return [*found, _fits_nowhere(places, trust)], T
     found += _where_not(places, good)
-    difference = difference_of(np.array([T[p.index] for p in good]), np.array([p.T_map_lidar for p in good]))
+    difference = difference_of(np.array([T[p.index] for p in good]), np.array([p.T_map_lidar for p in good]), scale)
     found += _differs(difference, drive)
     mended = np.array([difference.applied(one) for one in T])
     return found + _heights(point_map, mended, drive), mended

@@ -39,6 +39,11 @@ def fitting(places: Sequence[Place]) -> list[Place]:
     return [p for p in places if p.fit >= p.least]
 
 
+def total_fit(places: Sequence[Place]) -> float:
+    """Of those that fit: tells a few good ones from many."""
+    return sum(p.fit for p in fitting(places))
+
+
 def register_all(
     around: MapWindow,
     scans: Mapping[int, Scan],

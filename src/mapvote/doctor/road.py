@@ -20,6 +20,7 @@ UPS = {
 _NEAR_M = 15.0
 _ROAD_SHARE = 0.1
 """A plane with fewer of a scan's near points than this is no road."""
+_UNSTEADY_M = 0.3
 _THICK_M = 0.12
 _DEPTH_M = (0.2, 12.0)
 _TRIES = 300
@@ -39,6 +40,13 @@ class Road:
     """(3,) of the road, upwards, in the frame of the points."""
     scatter_m: float
     """By how much points near the plane leave it, robust standard deviation."""
+    unsteady_m: float = 0.0
+    """By how much the depth differs from scan to scan, robust standard deviation."""
+
+    @property
+    def is_there(self) -> bool:
+        """Whether it can be a road: some points lie in it, and as deep in every scan."""
+        return self.share >= _ROAD_SHARE and self.unsteady_m < _UNSTEADY_M
 
     @property
     def tilt_deg(self) -> float:
@@ -57,7 +65,8 @@ def find_road(scans: Sequence[F32]) -> Road:
     fitted = [_fitted(points, *one[best][1:]) for points, one in zip(near, planes, strict=True)]
     normal = np.median([normal for normal, _, _ in fitted], axis=0)
     depth_m, scatter_m = (float(np.median([one[k] for one in fitted])) for k in (1, 2))
-    return Road(best, depth_m, share[best], normal / np.linalg.norm(normal), scatter_m)
+    unsteady_m = 1.4826 * float(np.median([abs(depth - depth_m) for _, depth, _ in fitted]))
+    return Road(best, depth_m, share[best], normal / np.linalg.norm(normal), scatter_m, unsteady_m)
 
 
 def _near(scan: F32) -> F64:
