@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from mapvote.cli.looks import sound_map
 from mapvote.cli.options import key_in
-from mapvote.cli.store import opened_store
+from mapvote.cli.store import opened_store, when
 
 if TYPE_CHECKING:
     from mapvote.client import MapClient
@@ -72,8 +72,6 @@ def map_of(name: str, key_file: Path | None, version: int | None = None) -> Poin
 
 def overview_of(name: str, key_file: Path | None) -> list[tuple[str, str]] | None:
     """What is in a store or behind a server, as rows; None if this is neither."""
-    from datetime import UTC, datetime
-
     if is_url(name):
         with server_at(name, key_file) as server:
             found = server.ask_json("GET", "/v1/info")
@@ -84,6 +82,6 @@ def overview_of(name: str, key_file: Path | None) -> list[tuple[str, str]] | Non
             found = overview(store)
     else:
         return None
-    published = datetime.fromtimestamp(found.pop("published_ns") // 10**9, UTC).strftime("%Y-%m-%d %H:%M:%SZ")
+    published = when(found.pop("published_ns"))
     rows = [(key.replace("_", " "), f"{value:,}" if isinstance(value, int) else value) for key, value in found.items()]
     return [*rows, ("published", published)]

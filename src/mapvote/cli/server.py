@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -91,7 +91,11 @@ def publish(
             raise MapvoteError("publish: the server has its own --cluster and --config; leave these out")
         ask = {"dry_run": dry_run, "override": override, "reason": reason}
         with server_at(store, key_file) as server, waiting("deciding"):
-            _print_published(server.ask_json("POST", "/v1/publish", json=ask), dry_run)
+            told = server.ask_json("POST", "/v1/publish", json=ask)
+        added, deleted = told["points_added"], told["points_deleted"]
+        _tell(
+            told["version"], _what(told["published"], dry_run), added, deleted, "; ".join(told["tiles"]), told["held"]
+        )
         return
     reference = gate_by(load_settings(config).ndt)
     workers = dask_cluster(cluster) if cluster else ThreadPoolExecutor(2)
@@ -105,15 +109,6 @@ def publish(
 
 def _what(published: bool, dry_run: bool) -> str:
     return "published" if published else "dry run" if dry_run else "nothing changed"
-
-
-def _print_published(done: dict[str, Any], dry_run: bool) -> None:
-    tiles = f" in tiles {'; '.join(done['tiles'])}" if done["tiles"] else ""
-    what = _what(done["published"], dry_run)
-    points = f"{done['points_added']} points added, {done['points_deleted']} deleted"
-    print(f"version {done['version']} ({what}): {points}{tiles}")
-    for why in done["held"]:
-        print(f"hold: {why}")
 
 
 def policy(
@@ -213,7 +208,12 @@ def dask_cluster(address: str) -> Iterator[Executor]:
 def _print_outcome(done: Outcome, what: str) -> None:
     from mapvote.server.store.queries import names
 
-    tiles = f" in tiles {names(done.tiles)}" if done.tiles else ""
-    print(f"version {done.version} ({what}): {done.added} points added, {done.deleted} deleted{tiles}")
-    for reason in done.held:
+    _tell(done.version, what, done.added, done.deleted, names(done.tiles), done.held)
+
+
+def _tell(version: int, what: str, added: int, deleted: int, tiles: str, held: Sequence[str]) -> None:
+    print(
+        f"version {version} ({what}): {added} points added, {deleted} deleted" + (f" in tiles {tiles}" if tiles else "")
+    )
+    for reason in held:
         print(f"hold: {reason}")

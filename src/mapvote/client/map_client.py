@@ -21,6 +21,7 @@ import numpy as np
 from mapvote.client.connection import Connection, Refused, Unreachable
 from mapvote.client.spool import Spool, server_folder
 from mapvote.codec.ballot import Ballot, decode, encode
+from mapvote.codec.tile_file import digest_of_tiles
 from mapvote.core.grid import CELL_SIZE, Grid, Lattice, TileIndex
 from mapvote.core.point_map import PointMap
 from mapvote.core.tile import Tile
@@ -60,8 +61,7 @@ class _Manifest(msgspec.Struct):
 
     def whole(self) -> bool:
         """Whether these are all tiles of the version, and as the server has them."""
-        lines = (f"{key.replace(',', ' ')} {p.points} {p.ground} {p.free or '-'}" for key, p in self.tiles.items())
-        total = sum(int.from_bytes(hashlib.sha256(line.encode()).digest()) for line in lines) % (1 << 256)
+        total = digest_of_tiles((key, p.points, p.ground, p.free) for key, p in self.tiles.items())
         return self.digest == f"{total:064x}"
 
     def followed_by(self, since: _Manifest) -> _Manifest:

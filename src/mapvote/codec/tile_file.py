@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Iterable
 from typing import Any
 
 import msgspec
@@ -18,6 +19,8 @@ from mapvote.core.types import F32, U64, MapvoteError
 TILE_VERSION = 1
 MAX_TILE_POINTS = 50_000_000
 """8,000 points per square metre; 600 MB. Nothing honest is denser."""
+DIGESTS = 1 << 256
+"""Sums of hashes are taken modulo this."""
 _LEVEL = 3
 _FIELD_TYPES = ("|u1", "|i1", "<u2", "<i2", "<u4", "<i4", "<u8", "<i8", "<f4", "<f8")
 _SHAPE = (TILE_CELLS, TILE_CELLS)
@@ -39,6 +42,14 @@ class _TileFile(msgspec.Struct, frozen=True, kw_only=True):
 def content_hash(tile_points: F32) -> str:
     """SHA-256 of a tile's points: free space learned later changes no published point (docs/decisions/data.md)."""
     return hashlib.sha256(np.ascontiguousarray(tile_points, dtype="<f4").tobytes()).hexdigest()
+
+
+def digest_of_tiles(tiles: Iterable[tuple[str, str, str, str | None]]) -> int:
+    """The sum, modulo :data:`DIGESTS`, of a SHA-256 for each tile: of its key ("row,col") and its planes' hashes
+    (points, ground, free), "-" for none. Who keeps a manifest up to date by what changed can tell whether it still is
+    the server's; so can the server, at little cost: sums of what changed can be added and taken away."""
+    lines = (f"{key.replace(',', ' ')} {points} {ground} {free or '-'}" for key, points, ground, free in tiles)
+    return sum(int.from_bytes(hashlib.sha256(line.encode()).digest()) for line in lines) % DIGESTS
 
 
 def base_hash(tile: Tile | None) -> str:

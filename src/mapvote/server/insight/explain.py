@@ -28,7 +28,6 @@ from mapvote.server.store.eligible_votes import (
     read_votes,
     recent_votes,
 )
-from mapvote.server.store.policy import recorded
 from mapvote.server.store.quarantine import DamagedBallots
 from mapvote.server.store.queries import current_version, oldest_kept, tile_as_of, version_of
 from mapvote.server.store.store import Store
@@ -102,8 +101,9 @@ def explain_cell(store: Store, x: float, y: float) -> CellStory:
         for version, _ in decided[-_LOOKED_INTO:]:
             for seq in _heard_by(connection, store, version, now):
                 heard.setdefault(seq, []).append(version)
-        votes = [_vote(*each, now, tuple(heard.get(each[0].seq, ()))) for each in _everyone(connection, now)]
-        thing = _thing(connection, now)
+        counted = counted_votes(connection, tile, now.asked)
+        votes = [_vote(*each, now, tuple(heard.get(each[0].seq, ()))) for each in _everyone(connection, now, counted)]
+        thing = _thing(connection, now, [vote for _, vote in counted])
     return CellStory(row, col, votes, decided, thing)
 
 
@@ -126,8 +126,7 @@ def _undamaged(connection: sa.Connection, place: _Place) -> _Place:
     try:
         read_votes(connection, place.tile.index, [vote for vote, why in _judged(connection, place) if why != DAMAGED])
     except DamagedBallots as error:
-        aside = {*place.asked.set_aside, *(damage.name for damage in error.found)}
-        return replace(place, asked=replace(place.asked, set_aside=frozenset(aside)))
+        return replace(place, asked=place.asked.leaving_out(error.found))
     return place
 
 
@@ -135,12 +134,16 @@ def _judged(connection: sa.Connection, place: _Place) -> list[tuple[StoredVote, 
     return judged_votes(connection, place.tile.index, place.asked)
 
 
-def _everyone(connection: sa.Connection, now: _Place) -> list[tuple[StoredVote, TileVote | None, str]]:
-    """Every standing vote on the tile, what it says, and why it does not count on the cell ("" if it does)."""
+def _everyone(
+    connection: sa.Connection, now: _Place, counted: Sequence[tuple[StoredVote, TileVote]]
+) -> list[tuple[StoredVote, TileVote | None, str]]:
+    """Every standing vote on the tile, what it says, and why it does not count on the cell ("" if it does).
+
+    ``counted``: those that count on the tile.
+    """
     judged = _judged(connection, now)
     readable = [vote for vote, why in judged if why != DAMAGED]
     said = dict(zip((vote.seq for vote in readable), read_votes(connection, now.tile.index, readable), strict=True))
-    counted = counted_votes(connection, now.tile, now.asked)
     obeyed = {stored.seq: vote for stored, vote in counted}
     silenced = _silenced(now, [vote for _, vote in counted])
     return [
@@ -173,9 +176,7 @@ def _heard_by(connection: sa.Connection, store: Store, number: int, now: _Place)
     version = version_of(connection, number)
     if number <= oldest_kept(connection):
         return []  # what it was made of was cleared away
-    policy = recorded(version.policy)
-    received_by_ns = version.created_ns - round(policy.fuse.min_age_s * 1e9)
-    asked = Electorate(version.mark, policy, received_by_ns, set_aside=now.asked.set_aside)
+    asked = Electorate.of(version, set_aside=now.asked.set_aside)
     then = replace(now, asked=asked, tile=tile_as_of(connection, now.tile.window, number - 1))
     counted = counted_votes(connection, then.tile, asked)
     silenced = _silenced(then, [vote for _, vote in counted])
@@ -188,13 +189,12 @@ def _vote(stored: StoredVote, vote: TileVote | None, why: str, now: _Place, hear
     return CellVote(*whose, state, marks, stored.end_ns, not why, why, heard)
 
 
-def _thing(connection: sa.Connection, now: _Place) -> str:
-    """In words: what stands in the cell or is about to, and what came and went."""
+def _thing(connection: sa.Connection, now: _Place, drives: Sequence[TileVote]) -> str:
+    """In words: what stands in the cell or is about to, and what came and went, by the votes that count there."""
     tile, cell, policy = now.tile, now.cell, now.asked.policy
     here = np.zeros((TILE_CELLS, TILE_CELLS), dtype=np.bool_)
     here[cell] = True
     told = []
-    drives = [vote for _, vote in counted_votes(connection, tile, now.asked)]
     if policy.round.stage == "two-stage":
         recent = recent_votes(connection, tile, now.asked)
         found = decide_tile(tile, drives, rule_of(policy.round.method), policy.fuse, lambda: recent)

@@ -29,7 +29,7 @@ from mapvote.server.store.eligible_votes import (
     read_votes,
     standing_tiles,
 )
-from mapvote.server.store.policy import policy_in, recorded
+from mapvote.server.store.policy import policy_in
 from mapvote.server.store.queries import current_version, load_tile, tile_as_of, tiles_of, tiles_set_between, version_of
 from mapvote.server.store.store import Store
 from mapvote.server.store.tile_jobs import unpack_tally_plane
@@ -102,9 +102,7 @@ def _decided(store: Store, connection: sa.Connection, index: TileIndex, old: int
     for row in connection.execute(query.where(d.c.version > old, d.c.version <= new).order_by(d.c.version)).all():
         version = version_of(connection, row.version)
         tile = tile_as_of(connection, store.lattice.tile(index), row.version - 1)
-        policy = recorded(version.policy)
-        asked = Electorate(version.mark, policy, version.created_ns - round(policy.fuse.min_age_s * 1e9))
-        votes = counting_votes(connection, tile, asked)
+        votes = counting_votes(connection, tile, Electorate.of(version))
         drives = [(vote.end_ns, vote.states) for vote in votes if vote.states is not None]
         yield Decided(row.version, states_of(row.states), unpack_tally_plane(row.tally), drives)
 

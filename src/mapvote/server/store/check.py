@@ -73,7 +73,7 @@ def _chain(connection: sa.Connection) -> Iterator[Damage]:
             yield Damage("version", str(number), f"follows version {parent}, not {last}")
         last = number
     kept = shows_in_kept(oldest_kept(connection))
-    for name in ("points", "ground", "free", "memory"):
+    for name in schema.TILE_PLANES:
         column = t.c[name]
         lost = sa.select(t.c.version, t.c.row, t.c.col, column).join(
             schema.blobs, schema.blobs.c.hash == column, isouter=True

@@ -67,8 +67,8 @@ def _oldest_to_keep(connection: sa.Connection) -> int:
 
 def _planes(connection: sa.Connection, oldest: int) -> list[Any]:
     """Planes that no version from ``oldest`` on shows."""
-    t, b = schema.version_tiles, schema.blobs
-    needed = sa.union(*(sa.select(t.c[name]).where(t.c[name].is_not(None), shows_in_kept(oldest)) for name in _PLANES))
+    t, b, planes = schema.version_tiles, schema.blobs, schema.TILE_PLANES
+    needed = sa.union(*(sa.select(t.c[name]).where(t.c[name].is_not(None), shows_in_kept(oldest)) for name in planes))
     unused = sa.select(b.c.hash, sa.func.length(b.c.data).label("size")).where(b.c.hash.not_in(needed))
     return list(connection.execute(unused).all())
 
@@ -92,7 +92,7 @@ def _ballots(connection: sa.Connection, oldest: int) -> list[Any]:
     )
     window_ns = round(_longest_window_days(connection, oldest) * DAY_NS)
     past = (b.c.gone_seq <= then.mark) | (b.c.end_ns < newest.c.end_ns - window_ns)
-    size = sum((sa.func.coalesce(sa.func.length(t.c[name]), 0) for name in _OF_BALLOTS), start=sa.literal(0))
+    size = sum((sa.func.coalesce(sa.func.length(t.c[name]), 0) for name in schema.BALLOT_PLANES), start=sa.literal(0))
     found = (
         sa.select(t.c.row, t.c.col, t.c.ballot, size.label("size"))
         .join(b, b.c.seq == t.c.ballot)
@@ -120,7 +120,3 @@ def _give_back_quota(connection: sa.Connection) -> None:
     """A ballot of which nothing is left takes no room any more."""
     b, t = schema.ballots, schema.ballot_tiles
     connection.execute(b.update().where(b.c.bytes > 0, ~sa.exists().where(t.c.ballot == b.c.seq)).values(bytes=0))
-
-
-_PLANES = ("points", "ground", "free", "memory")
-_OF_BALLOTS = ("states", "tally", "gone", "new_points", "free")

@@ -5,8 +5,8 @@ Everything is asked as of an event number (``mark``), so that a past round can b
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import sqlalchemy as sa
@@ -21,8 +21,9 @@ from mapvote.fusion.spent import unspent
 from mapvote.fusion.tile_vote import DAY_NS, TileVote, restrict, select
 from mapvote.server.store import schema
 from mapvote.server.store.blobs import unpack_cells
-from mapvote.server.store.policy import Policy, policy_in
+from mapvote.server.store.policy import Policy, policy_in, recorded
 from mapvote.server.store.quarantine import Damage, DamagedBallots, ballot_name, ballot_sum, set_aside
+from mapvote.server.store.queries import Version
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,6 +41,17 @@ class Electorate:
     def settings(self) -> FuseSettings:
         """How many votes are enough, and which are in the window."""
         return self.policy.fuse
+
+    @classmethod
+    def of(cls, version: Version, without: Collection[str] = (), set_aside: Collection[str] = ()) -> Electorate:
+        """Whose votes a version asked for, by the policy that it was made by."""
+        policy = recorded(version.policy)
+        received_by_ns = version.created_ns - round(policy.fuse.min_age_s * 1e9)
+        return cls(version.mark, policy, received_by_ns, without, set_aside)
+
+    def leaving_out(self, damaged: Iterable[Damage]) -> Electorate:
+        """The same without ballots that turned out to be damaged."""
+        return replace(self, set_aside=frozenset({*self.set_aside, *(damage.name for damage in damaged)}))
 
 
 @dataclass(frozen=True, slots=True)

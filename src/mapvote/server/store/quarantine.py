@@ -60,7 +60,7 @@ def ballot_name(seq: int, row: int, col: int) -> str:
 
 def ballot_sum(row: Any) -> str:
     """The sum of a row of ballot_tiles."""
-    return sum_of(row.base, row.states, row.tally, row.gone, row.new_points, row.free)
+    return sum_of(row.base, *(getattr(row, plane) for plane in schema.BALLOT_PLANES))
 
 
 def set_aside(connection: sa.Connection) -> dict[tuple[str, str], str]:

@@ -174,9 +174,8 @@ def version_row(version: Version) -> dict[str, Any]:
 
 def tile_row(number: int, index: TileIndex, hashes: TileHashes) -> dict[str, Any]:
     """One row of version_tiles."""
-    planes = ("points", "ground", "free", "memory")
     return {"version": number, "row": index[0], "col": index[1]} | {
-        plane: getattr(hashes, plane) or None for plane in planes
+        plane: getattr(hashes, plane) or None for plane in schema.TILE_PLANES
     }
 
 

@@ -26,7 +26,6 @@ from mapvote.server.store.blobs import TileHashes, pack_tile
 from mapvote.server.store.commit import NewTiles, write_version
 from mapvote.server.store.database import address_of
 from mapvote.server.store.eligible_votes import Electorate, standing_tiles
-from mapvote.server.store.policy import recorded
 from mapvote.server.store.publish import Outcome, turned_back
 from mapvote.server.store.queries import Version, load_tile, memory_of, tile_of, tiles_of
 from mapvote.server.store.store import Store
@@ -125,9 +124,8 @@ def _turned_back(store: Store, number: int, before: _State, target: _State) -> _
 
 
 def _fused(store: Store, version: Version, before: _State, history: _History, executor: Executor | None) -> _State:
-    policy = recorded(version.policy)
     without = frozenset(name for name, until in history.out.items() if version.number < until)
-    asked = Electorate(version.mark, policy, version.created_ns - round(policy.fuse.min_age_s * 1e9), without)
+    asked = Electorate.of(version, without)
     tasks, url = [], address_of(store.database.url)
     with store.database.reading() as connection:
         for index in standing_tiles(connection, version.mark):

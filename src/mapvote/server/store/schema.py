@@ -17,6 +17,10 @@ metadata = sa.MetaData(
     }
 )
 _Hash = sa.String(64)
+TILE_PLANES = "points", "ground", "free", "memory"
+"""Columns of version_tiles: hashes of planes."""
+BALLOT_PLANES = "states", "tally", "gone", "new_points", "free"
+"""Columns of ballot_tiles that hold planes."""
 
 maps = sa.Table(
     "maps",

@@ -9,7 +9,6 @@ un-vote), ``keys``. What explains it: ``standing`` (which votes count), ``explai
 
 from __future__ import annotations
 
-import hashlib
 import secrets
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -19,7 +18,8 @@ from typing import Any
 
 import sqlalchemy as sa
 
-from mapvote.codec.ballot import Id
+from mapvote.codec.ballot import Id, tile_key
+from mapvote.codec.tile_file import DIGESTS, digest_of_tiles
 from mapvote.core.grid import Lattice, TileIndex
 from mapvote.core.point_map import PointMap
 from mapvote.core.tile import Tile
@@ -62,11 +62,8 @@ class Manifest:
 
 
 def digest_of(tiles: Mapping[TileIndex, TileHashes]) -> int:
-    """The sum, modulo 2^256, of a SHA-256 for each tile: of its row, column and planes' hashes, "-" for none. Who keeps
-    a manifest up to date by what changed can tell whether it still is the server's; so can the server, at little cost.
-    """
-    lines = (f"{r} {c} {h.points} {h.ground} {h.free or '-'}" for (r, c), h in tiles.items())
-    return sum(int.from_bytes(hashlib.sha256(line.encode()).digest()) for line in lines) % (1 << 256)
+    """See :func:`mapvote.codec.tile_file.digest_of_tiles`."""
+    return digest_of_tiles((tile_key(index), h.points, h.ground, h.free) for index, h in tiles.items())
 
 
 def url_of(store: str) -> str:
@@ -206,7 +203,7 @@ class Store:
         elif before < number:
             touched = tiles_set_between(connection, before, number)
             then, now = (digest_of(tiles_of(connection, version, touched)) for version in (before, number))
-            self._digests[number] = (self._digests[before] - then + now) % (1 << 256)
+            self._digests[number] = (self._digests[before] - then + now) % DIGESTS
         return self._digests[number]
 
     def blob(self, digest: str) -> bytes:

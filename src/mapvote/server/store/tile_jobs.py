@@ -102,8 +102,7 @@ def fuse_stored(task: Task, database: Database | None = None) -> Fused:
                 return replace(_fuse(connection, task), damaged=damaged)
         except DamagedBallots as error:
             damaged += error.found
-            aside = {*task.asked.set_aside, *(damage.name for damage in error.found)}
-            task = replace(task, asked=replace(task.asked, set_aside=frozenset(aside)))
+            task = replace(task, asked=task.asked.leaving_out(error.found))
         except Unavailable:
             raise
         except MapvoteError as error:
