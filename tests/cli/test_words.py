@@ -134,13 +134,17 @@ def examples() -> list[str]:
     return [line.strip() for text in helps for line in text.splitlines() if re.match(r"\s*mapvote ", line)]
 
 
-@pytest.mark.parametrize("line", [line for line in examples() if not re.search(SLOW, line)])
+def run_here(slow: bool) -> list[str]:
+    return [line for line in examples() if not_run(line) is None and bool(re.search(SLOW, line)) == slow]
+
+
+@pytest.mark.parametrize("line", run_here(slow=False))
 def test_the_example_of_a_help_works(line: str, made: Path, desk: Desk) -> None:
     run_all([line], made, desk)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("line", [line for line in examples() if re.search(SLOW, line)])
+@pytest.mark.parametrize("line", run_here(slow=True))
 def test_the_long_example_of_a_help_works(line: str, made: Path, desk: Desk) -> None:
     run_all([line], made, desk)
 
