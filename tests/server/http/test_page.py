@@ -30,11 +30,15 @@ AXE = Path(__file__).parents[2] / "vendor" / "axe.min.js"
 
 @pytest.fixture
 def store(tmp_path: Path) -> Path:
-    """A village where a house was taken down in version 2, and a shed would go with the next."""
+    village(f"sqlite:///{tmp_path / 'store.db'}")
+    return tmp_path / "store.db"
+
+
+def village(database: str) -> None:
+    """A store of a village where a house was taken down in version 2, and a shed would go with the next."""
     ground = wall([(r, c) for r in range(0, 256, 2) for c in range(0, 256, 2)], [0.05])
-    village = np.concatenate([ground, wall(HOUSE, HEIGHTS), wall(SHED, HEIGHTS)])
-    point_map = make_map({(0, 0): make_tile(village)})
-    opened = Store.create(f"sqlite:///{tmp_path / 'store.db'}", point_map)
+    houses = np.concatenate([ground, wall(HOUSE, HEIGHTS), wall(SHED, HEIGHTS)])
+    opened = Store.create(database, make_map({(0, 0): make_tile(houses)}))
     lax = policy.current_policy(opened).model_copy(update={"fuse": FuseSettings(max_deleted_share=1.0)})
     policy.set_policy(opened, lax, by="test")
     for number, gone in enumerate((HOUSE, SHED)):
@@ -46,7 +50,6 @@ def store(tmp_path: Path) -> Path:
         if number == 0:
             publish(opened, by="<b>boss</b>", reason="<script>alert(1)</script>")
     opened.close()
-    return tmp_path / "store.db"
 
 
 @pytest.fixture(scope="module")
@@ -59,8 +62,21 @@ def browser() -> Iterator[Chromium]:
 
 
 def press(browser: Chromium, key: str) -> None:
+    """Type one key: a letter, Tab or Enter."""
+    told: dict[str, object] = {"key": key}
+    if len(key) == 1:
+        told["text"] = key
+    else:
+        told |= {"code": key, "windowsVirtualKeyCode": {"Tab": 9, "Enter": 13}[key]}
+        told |= {"text": "\r"} if key == "Enter" else {}
     for kind in ("keyDown", "keyUp"):
-        browser.call("Input.dispatchKeyEvent", type=kind, key=key, text=key if len(key) == 1 else "")
+        browser.call("Input.dispatchKeyEvent", type=kind, **told)
+
+
+def enter(browser: Chromium, chosen: str) -> None:
+    """Go to a control by its JavaScript expression, as Tab would, and press Enter there."""
+    browser.run(f"{chosen}.focus()")
+    press(browser, "Enter")
 
 
 def text(browser: Chromium, selector: str) -> str:
@@ -100,30 +116,49 @@ def test_the_cloud_is_drawn_and_nobody_else_is_asked(browser: Chromium, store: P
         assert browser.errors == []
 
 
-def test_the_desk_is_worked_by_keyboard_and_publishing_obeys(browser: Chromium, store: Path, tmp_path: Path) -> None:
-    with serving(store, "--open", log=tmp_path / "log") as (url, _):
+def test_the_desk_is_worked_by_keyboard_and_publishing_obeys(
+    browser: Chromium, database_url: str, tmp_path: Path
+) -> None:
+    village(database_url)
+    with serving(database_url, "--open", log=tmp_path / "log") as (url, _):
         ready(browser, url)
-        browser.run("document.querySelector('#pending button').focus()")
-        browser.run("document.activeElement.click()")
+        enter(browser, "document.querySelector('#pending button')")
         press(browser, "r")
         browser.wait("document.querySelector('#pending').innerText.includes('rejected by operator')")
         assert browser.run("document.querySelector('#publish').disabled")
-        browser.run("document.querySelector('#pending button').click()")
+        enter(browser, "document.querySelector('#pending button')")
         press(browser, "u")
         browser.wait("!document.querySelector('#pending').innerText.includes('rejected')")
-        browser.run("document.querySelector('#dry-run').click()")
+        enter(browser, "document.querySelector('#dry-run')")
         browser.wait("document.querySelector('#difference').innerText.includes('1 tiles')")
-        browser.run("document.querySelector('#publish').click()")
+        enter(browser, "document.querySelector('#publish')")
         browser.wait("document.activeElement.className === 'yes'")
-        browser.run("document.activeElement.click()")
+        press(browser, "Enter")
         browser.wait("document.querySelector('#which-map').innerText.endsWith('version 3')")
         browser.wait("document.querySelector('#tally').innerText.includes('1 demolished')")
-        back = "[...document.querySelectorAll('#versions .link')].find(b => b.innerText === 'Go back to it')"
-        browser.run(f"{back}.click()")
-        browser.wait("document.querySelectorAll('#versions .yes').length")
-        browser.run("document.querySelector('#versions .yes').click()")
+        enter(browser, "[...document.querySelectorAll('#versions .link')].find(b => b.innerText === 'Go back to it')")
+        browser.wait("document.activeElement.className === 'yes'")
+        press(browser, "Enter")
         browser.wait("document.querySelector('#which-map').innerText.endsWith('version 4')")
         assert browser.errors == []
+
+
+def test_tab_alone_comes_to_every_control_that_is_shown(browser: Chromium, store: Path, tmp_path: Path) -> None:
+    with serving(store, "--open", log=tmp_path / "log") as (url, _):
+        ready(browser, url)
+        enter(browser, "document.querySelector('#changes button')")
+        browser.wait("location.hash.includes('change=')")
+        asked = "a[href], button, select, input, textarea, summary"
+        shown = f"[...document.querySelectorAll({asked!r})].filter(e => !e.disabled && e.checkVisibility())"
+        # The list beside the cloud holds what its signs say, in order; arrows choose among radio buttons.
+        shown += ".filter(e => !e.matches('.sign') && (e.type !== 'radio' || e.checked))"
+        count = browser.run(f"{shown}.length")
+        assert count > 20
+        browser.run("document.body.focus()")
+        for _ in range(2 * count):
+            press(browser, "Tab")
+            browser.run("document.activeElement.reached = true")
+        assert browser.run(f"{shown}.filter(e => !e.reached).map(e => e.outerHTML.slice(0, 80))") == []
 
 
 @pytest.mark.parametrize(("width", "height", "zoom"), [(1280, 800, 1), (360, 740, 1), (1280, 800, 2)])
