@@ -142,7 +142,7 @@ def _all_inside(points: F32, side: np.float32) -> bool:
 @numba.njit(cache=True, nogil=True)
 def most_in_a_cell(points: F32) -> int:
     """The most of these points (m, 3), from the tile's corner and inside it, that lie in one cell."""
-    counts = np.zeros(TILE_CELLS * TILE_CELLS, dtype=np.int64)
+    counts = np.zeros(TILE_CELLS * TILE_CELLS, dtype=np.uint16)  # one that runs over has been counted as the most
     most = 0
     for x, y, _ in points:
         cell = min(int(y / CELL_SIZE), TILE_CELLS - 1) * TILE_CELLS + min(int(x / CELL_SIZE), TILE_CELLS - 1)

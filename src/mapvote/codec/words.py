@@ -7,6 +7,7 @@ same lie together, which packs a fifth smaller than the words as they are. Ballo
 
 from __future__ import annotations
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -36,11 +37,25 @@ def unpack_cells(data: bytes, what: str) -> tuple[NDArray[np.intp], U64]:
         cells = np.flatnonzero(plane)
         return cells, plane[cells]
     n, left = divmod(len(raw), _WAY + _WORD)
-    ways, words = _from_bytes(raw[: _WAY * n], "<u2"), _from_bytes(raw[_WAY * n : len(raw) - left], "<u8")
-    cells = np.cumsum(ways, dtype=np.intp)
-    if left or (n and cells[-1] >= CELLS) or not ways[1:].all() or not words.all():
+    cells, words = np.empty(n, dtype=np.intp), np.empty(n, dtype=np.uint64)
+    if left or not _ascending(raw, cells, words):
         raise MapvoteError(f"ballot: {what} is damaged ({len(raw)} bytes); fetch or send it again")
     return cells, words
+
+
+@numba.njit(cache=True, nogil=True)
+def _ascending(raw: U8, cells: NDArray[np.intp], words: U64) -> bool:
+    """Fill ``cells`` and ``words`` (n,); whether cells ascend within the tile, and none is without a word."""
+    n, cell, sound = len(cells), np.int64(0), True
+    for i in range(n):
+        way = np.int64(raw[i]) | (np.int64(raw[n + i]) << 8)
+        cell += way
+        word = np.uint64(0)
+        for k in range(_WORD):
+            word |= np.uint64(raw[(_WAY + k) * n + i]) << np.uint64(8 * k)
+        cells[i], words[i] = cell, word
+        sound &= (way > 0 or i == 0) and word != 0
+    return sound and cell < CELLS
 
 
 def unpack_words(data: bytes, what: str) -> U64:
@@ -54,8 +69,3 @@ def unpack_words(data: bytes, what: str) -> U64:
 def _by_byte(values: NDArray[np.integer], size: int) -> bytes:
     """All lowest bytes first, then all that come next .."""
     return np.ascontiguousarray(values.astype(f"<u{size}").view(np.uint8).reshape(-1, size).T).tobytes()
-
-
-def _from_bytes(raw: U8, dtype: str) -> U64:
-    size = np.dtype(dtype).itemsize
-    return np.ascontiguousarray(raw.reshape(size, -1).T).view(dtype).reshape(-1)
