@@ -49,6 +49,9 @@ class Watched:
     def votes(self) -> Any:
         return self.voter.votes()
 
+    def each(self) -> Any:
+        return self.voter.each()
+
 
 def judge(street: Street, last: int | None) -> dict[str, Any]:
     """{"ours": .., "peers": ..}: by stage milliseconds (median, mean, worst), and the quality."""

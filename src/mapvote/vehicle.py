@@ -106,11 +106,13 @@ def write_ballot(
             f"{vehicle}: none of {report.scans} scans could be localised in map {point_map.map_id}; "
             "is the drive on this map, and its prior in the map's frame?"
         )
-    points, votes, two_stage = new_points.by_tile(), voter.votes(), settings.voting.two_stage
+    points, two_stage = new_points.by_tile(), settings.voting.two_stage
+    tiles = [_ballot_tile(point_map, tile, votes, points.get(tile), two_stage) for tile, votes in voter.each()]
+    tiles.sort(key=lambda tile: tile.tile)
     return Ballot(
         map_id=point_map.map_id,
         version=point_map.version,
-        base={tile_key(tile): base_hash(point_map.tiles.get(tile)) for tile in votes},
+        base={tile_key(tile.tile): base_hash(point_map.tiles.get(tile.tile)) for tile in tiles},
         vehicle=vehicle,
         drive=drive,
         start_ns=report.stamps_ns[0],
@@ -123,7 +125,7 @@ def write_ballot(
         length_m=report.length_m(),
         prior_misfit_m=report.prior_misfit_m(),
         prior_sigma_m=report.prior_sigma_m(),
-        tiles=[_ballot_tile(point_map, tile, v, points.get(tile), two_stage) for tile, v in votes.items()],
+        tiles=tiles,
     )
 
 

@@ -10,7 +10,7 @@ from mapvote.config import VotingSettings
 from mapvote.core.point_map import PointMap
 from mapvote.core.reference import reference_window
 from mapvote.core.types import CellState
-from mapvote.detection.columns import ColumnVoter
+from mapvote.detection.column_voter import ColumnVoter
 from mapvote.detection.counters import Evidence
 from mapvote.detection.regions import beside_new
 from mapvote.detection.rules import ALL_RULES, Rules

@@ -55,7 +55,7 @@ def _ascending(raw: U8, cells: NDArray[np.intp], words: U64) -> bool:
             word |= np.uint64(raw[(_WAY + k) * n + i]) << np.uint64(8 * k)
         cells[i], words[i] = cell, word
         sound &= (way > 0 or i == 0) and word != 0
-    return sound and cell < CELLS
+    return bool(sound and cell < CELLS)
 
 
 def unpack_words(data: bytes, what: str) -> U64:

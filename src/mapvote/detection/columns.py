@@ -12,18 +12,13 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
-from mapvote.config import VotingSettings
-from mapvote.core.columns import TOP_BIT, below_top, dilated
-from mapvote.core.grid import TileIndex
-from mapvote.core.point_map import PointMap
-from mapvote.core.reference import above_ground_points, cut_reference, reference_window
+from mapvote.core.columns import TOP_BIT, below_top
 from mapvote.core.types import I32, U64, Bool, CellState
 from mapvote.core.voting import VOTE_UNIT
-from mapvote.detection.counters import PLANES, Evidence, count_of, free_words, is_open
-from mapvote.detection.regions import apply_region_rules, around, beside_new, loose_voxels
+from mapvote.detection.counters import PLANES, count_of, is_open
+from mapvote.detection.regions import loose_voxels
 from mapvote.detection.rules import ALL_RULES, Rules
-from mapvote.detection.votes import Judged, TileVotes, Weighed
-from mapvote.perception.frontend import Observation
+from mapvote.detection.votes import Weighed
 
 # Set on the development streets (seeds 1, 11 and 12 of `street570`); docs/measurements/columns.md has what
 # each rule is worth on others.
@@ -35,8 +30,7 @@ CLEAR_SHARE = 0.3
 """Rule E: of the scans with rays through a cell, the share that must have seen through what it held."""
 BRIEF_SHARE = 0.35
 """Rule G: a new voxel struck in fewer of the scans able to was only passed by."""
-WIDE_SIGMA_M = 0.1
-"""A pose less certain than this makes a hit speak for two cells around it, not one."""
+
 
 UO, UE, CO, CE, UN = (int(state) for state in CellState)
 """Columns of a tally."""
@@ -220,54 +214,3 @@ def _weights(rules: Rules) -> Weights:
         clear_share=CLEAR_SHARE if e else 0.0,
         brief_share=BRIEF_SHARE if g else 0.0,
     )
-
-
-class ColumnVoter:
-    """Columns: evidence per voxel over the drive, weighed at its end."""
-
-    def __init__(
-        self,
-        voting: VotingSettings,
-        point_map: PointMap,
-        rules: Rules = ALL_RULES,
-        evidence: Evidence | None = None,
-    ) -> None:
-        """``evidence``: counters that another voter fills (who may be the only one to observe), else its own."""
-        self.voting, self.point_map, self.rules = voting, point_map, rules
-        self.evidence = evidence or Evidence(point_map.lattice, rules.empty_by_ray, rules.hits_veto)
-
-    def observe(self, seen: Observation) -> U64:
-        """Count one scan; returns (rows, cols) words of voxels whose points may be new."""
-        reach = 2 if seen.scan.sigma_m > WIDE_SIGMA_M else 1
-        self.evidence.count(seen.view, seen.reference, reach)
-        return seen.view.hit & ~seen.reference.occupied
-
-    def votes(self) -> dict[TileIndex, TileVotes]:
-        """Every tile with evidence, in ascending order."""
-        judged: dict[TileIndex, Judged] = {}
-        for tile in sorted(self.evidence.tiles):
-            found = self._judge(tile)
-            if found.weighed.tally.any():
-                judged[tile] = found
-        apply_region_rules(judged, self.point_map.lattice, self.voting, self.rules)
-        out = {}
-        for tile, found in judged.items():
-            here, weighed = found.here, found.weighed
-            free = free_words(self.evidence.tiles[tile], here.occupied)
-            if here.free is not None:
-                free[here.free != 0] = 0  # what the map knows need not be sent
-            out[tile] = TileVotes(weighed.tally, found.states, weighed.gone, found.remnants, weighed.new, free)
-        return out
-
-    def _judge(self, tile: TileIndex) -> Judged:
-        """What the tile's own evidence says, cell by cell."""
-        window = self.point_map.lattice.tile(tile)
-        outer = reference_window(self.point_map, window.padded(1))
-        counts = around(self.point_map.lattice, self.evidence.tiles, outer.grid, 0)
-        near = dilated(outer.occupied, outer.base, 1)[1:-1, 1:-1]
-        here = cut_reference(outer, window)
-        known = here.free if here.free is not None else above_ground_points(self.point_map, window)
-        low = here.top_z - here.ground_z < self.voting.min_height_m
-        weighed = weigh(counts, outer.base, here.occupied, near, known, low, self.rules)
-        crowded = beside_new(counts, outer.occupied, outer.base)[1:-1, 1:-1]
-        return Judged(here, weighed, weighed.states(), crowded, np.zeros_like(weighed.gone))

@@ -15,8 +15,9 @@ import numba
 import numpy as np
 
 from mapvote.core.columns import TOP_BIT, neighbourhood
-from mapvote.core.grid import TILE_CELLS, Lattice, TileIndex
+from mapvote.core.grid import Lattice
 from mapvote.core.types import F32, I32, U8, U64, Reference
+from mapvote.detection.packed_tiles import PackedTiles
 from mapvote.perception.raycast import ScanView, Sight
 
 PLANES = 7
@@ -110,26 +111,29 @@ def _gather(
 
 
 class Evidence:
-    """Counters of a drive by tile: (256, 256, WORDS) uint64, seen through first, struck after, then the last two."""
+    """Counters of a drive by tile: (256, 256, WORDS) uint64, seen through first, struck after, then the last two.
+
+    Memory is bounded by the tiles around the vehicle, and some hundred kilobytes for each that it has left.
+    """
 
     def __init__(self, lattice: Lattice, by_ray: bool = True, veto: bool = True) -> None:
         """``by_ray`` (rule A): a mapped voxel is seen through only by a ray through it, else wherever the cell was
         visible. ``veto`` (rule B): hits near a mapped voxel strike it, else only hits in it."""
         self.lattice, self.by_ray, self.veto = lattice, by_ray, veto
-        self.tiles: dict[TileIndex, U64] = {}
+        self.tiles = PackedTiles(lattice, WORDS)
 
     def count(self, view: ScanView, reference: Reference, reach: int = 1) -> None:
         """Count a scan seen against ``reference``; ``reach`` cells around a hit it may stand for (pose uncertainty)."""
         for tile in view.grid.tiles():
             window = self.lattice.tile(tile)
             common = window.intersection(view.grid)
-            if tile not in self.tiles:
-                self.tiles[tile] = np.zeros((TILE_CELLS, TILE_CELLS, WORDS), dtype=np.uint64)
             row0, col0 = common.row0 - view.grid.row0, common.col0 - view.grid.col0
+            planes = self.tiles.near(tile)[common.slices_in(window)]
             _gather(
-                self.tiles[tile][common.slices_in(window)], common.shape, row0, col0, view.hit, view.passed, view.sight,
+                planes, common.shape, row0, col0, view.hit, view.passed, view.sight,
                 reference.occupied, reference.ground_z, reference.base, reach, self.by_ray, self.veto,
             )  # fmt: skip
+        self.tiles.leave(view.grid)
 
 
 @numba.njit(cache=True, nogil=True)

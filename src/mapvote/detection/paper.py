@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from functools import lru_cache
 
 import numpy as np
@@ -103,9 +104,11 @@ class PaperVoter:
 
     def votes(self) -> dict[TileIndex, TileVotes]:
         """Every tile with a vote, in ascending order."""
-        out = {}
+        return dict(self.each())
+
+    def each(self) -> Iterator[tuple[TileIndex, TileVotes]]:
+        """The same one by one."""
         for tile, tally in sorted(self._tally.tiles.items()):
             if tally.any():
                 new = np.where(tally[..., CellState.CHANGED_OCCUPIED] > 0, EVERY_BIT, np.uint64(0))
-                out[tile] = TileVotes(tally, decide(tally), None, None, new, None)
-        return out
+                yield tile, TileVotes(tally, decide(tally), None, None, new, None)

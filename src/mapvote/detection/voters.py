@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Protocol
 
 from mapvote.config import Settings
@@ -9,7 +10,7 @@ from mapvote.core.grid import TileIndex
 from mapvote.core.point_map import PointMap
 from mapvote.core.sensors import Sensor
 from mapvote.core.types import U64
-from mapvote.detection.columns import ColumnVoter
+from mapvote.detection.column_voter import ColumnVoter
 from mapvote.detection.paper import PaperVoter
 from mapvote.detection.surfaces import SurfaceVoter
 from mapvote.detection.votes import TileVotes
@@ -26,6 +27,9 @@ class Voter(Protocol):
     def votes(self) -> dict[TileIndex, TileVotes]:
         """What the scans so far amount to, of every tile that they say anything of, in ascending order. Asking changes
         nothing."""
+
+    def each(self) -> Iterator[tuple[TileIndex, TileVotes]]:
+        """The same tile by tile, in any order: so that no drive is too long for memory."""
 
 
 def make_voter(settings: Settings, sensor: Sensor, point_map: PointMap) -> Voter:

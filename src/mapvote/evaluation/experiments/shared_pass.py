@@ -15,7 +15,7 @@ from mapvote.config import PaperSettings, Settings, VotingSettings
 from mapvote.core.point_map import PointMap
 from mapvote.core.reference import LocalMap
 from mapvote.core.types import Drive, Scan
-from mapvote.detection.columns import ColumnVoter
+from mapvote.detection.column_voter import ColumnVoter
 from mapvote.detection.counters import Evidence
 from mapvote.detection.new_points import NewPoints
 from mapvote.detection.paper import PaperVoter

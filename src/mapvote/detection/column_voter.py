@@ -1,0 +1,100 @@
+"""Columns as a voter: evidence per voxel over the drive, weighed at its end (docs/method.md)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+
+import numpy as np
+
+from mapvote.config import VotingSettings
+from mapvote.core.columns import dilated
+from mapvote.core.grid import TileIndex
+from mapvote.core.point_map import PointMap
+from mapvote.core.reference import above_ground_points, cut_reference, reference_window
+from mapvote.core.types import U64
+from mapvote.detection.columns import weigh
+from mapvote.detection.counters import Evidence, free_words
+from mapvote.detection.regions import apply_region_rules, around, beside_new
+from mapvote.detection.rules import ALL_RULES, Rules
+from mapvote.detection.votes import Judged, TileVotes
+from mapvote.perception.frontend import Observation
+
+WIDE_SIGMA_M = 0.1
+"""A pose less certain than this makes a hit speak for two cells around it, not one."""
+_AT_ONCE = 24
+"""Tiles that are judged together; of more, blocks of _BLOCK by _BLOCK with the tiles around them, 15 MB each."""
+_BLOCK = 3
+
+
+class ColumnVoter:
+    """Columns: evidence per voxel over the drive, weighed at its end."""
+
+    def __init__(
+        self,
+        voting: VotingSettings,
+        point_map: PointMap,
+        rules: Rules = ALL_RULES,
+        evidence: Evidence | None = None,
+    ) -> None:
+        """``evidence``: counters that another voter fills (who may be the only one to observe), else its own."""
+        self.voting, self.point_map, self.rules = voting, point_map, rules
+        self.evidence = evidence or Evidence(point_map.lattice, rules.empty_by_ray, rules.hits_veto)
+
+    def observe(self, seen: Observation) -> U64:
+        """Count one scan; returns (rows, cols) words of voxels whose points may be new."""
+        reach = 2 if seen.scan.sigma_m > WIDE_SIGMA_M else 1
+        self.evidence.count(seen.view, seen.reference, reach)
+        return seen.view.hit & ~seen.reference.occupied
+
+    def votes(self) -> dict[TileIndex, TileVotes]:
+        """Every tile with evidence, in ascending order."""
+        return dict(sorted(self.each()))
+
+    def each(self) -> Iterator[tuple[TileIndex, TileVotes]]:
+        """The same one by one, in an order of its own: a drive of many tiles is judged block by block.
+
+        No rule looks farther than a tile (JOIN_CELLS, twice the halo and a speck are less), so a block is judged as in
+        the whole if the tiles around it are judged along.
+        """
+        tiles = sorted(self.evidence.tiles)
+        if len(tiles) <= _AT_ONCE:
+            yield from self._of_block(tiles, tiles)
+            return
+        for row, col in sorted({(r // _BLOCK, c // _BLOCK) for r, c in tiles}):
+            inner = [t for t in tiles if (t[0] // _BLOCK, t[1] // _BLOCK) == (row, col)]
+            around = {(r + i, c + j) for r, c in inner for i in (-1, 0, 1) for j in (-1, 0, 1)}
+            yield from self._of_block(inner, [t for t in tiles if t in around])
+
+    def _of_block(self, wanted: list[TileIndex], tiles: list[TileIndex]) -> Iterator[tuple[TileIndex, TileVotes]]:
+        """The votes of the tiles ``wanted``, judged together with all of ``tiles``."""
+        counters = {tile: self.evidence.tiles[tile] for tile in tiles}
+        judged: dict[TileIndex, Judged] = {}
+        for tile in tiles:
+            found = self._judge(tile, counters)
+            if found.weighed.tally.any():
+                judged[tile] = found
+        apply_region_rules(judged, self.point_map.lattice, self.voting, self.rules)
+        for tile in wanted:
+            if tile in judged:
+                yield tile, _votes_of(judged[tile], counters[tile])
+
+    def _judge(self, tile: TileIndex, counters: Mapping[TileIndex, U64]) -> Judged:
+        """What the tile's own evidence says, cell by cell."""
+        window = self.point_map.lattice.tile(tile)
+        outer = reference_window(self.point_map, window.padded(1))
+        counts = around(self.point_map.lattice, counters, outer.grid, 0)
+        near = dilated(outer.occupied, outer.base, 1)[1:-1, 1:-1]
+        here = cut_reference(outer, window)
+        known = here.free if here.free is not None else above_ground_points(self.point_map, window)
+        low = here.top_z - here.ground_z < self.voting.min_height_m
+        weighed = weigh(counts, outer.base, here.occupied, near, known, low, self.rules)
+        crowded = beside_new(counts, outer.occupied, outer.base)[1:-1, 1:-1]
+        return Judged(here, weighed, weighed.states(), crowded, np.zeros_like(weighed.gone))
+
+
+def _votes_of(found: Judged, counters: U64) -> TileVotes:
+    weighed = found.weighed
+    free = free_words(counters, found.here.occupied)
+    if found.here.free is not None:
+        free[found.here.free != 0] = 0  # what the map knows need not be sent
+    return TileVotes(weighed.tally, found.states, weighed.gone, found.remnants, weighed.new, free)

@@ -1,0 +1,70 @@
+"""Counters of the tiles around a vehicle as they are, of those it has left packed: memory for a long road."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+
+import numpy as np
+
+from mapvote.codec.arrays import compress, unpack_bytes
+from mapvote.core.grid import CELLS, TILE_CELLS, Grid, Lattice, TileIndex
+from mapvote.core.types import U64
+
+_FAST = 1
+"""zstd level: packed while driving, and read once or twice."""
+_FAR_CELLS = 64
+"""A tile this far from the view has been left: a vehicle that turns round comes back to it, and it is unpacked."""
+
+
+class PackedTiles(Mapping[TileIndex, U64]):
+    """Planes (256, 256, words) uint64 by tile. Reading one that is packed gives a copy; :meth:`near` opens it."""
+
+    def __init__(self, lattice: Lattice, words: int) -> None:
+        self.lattice, self.words = lattice, words
+        self._open: dict[TileIndex, U64] = {}
+        self._packed: dict[TileIndex, bytes] = {}
+
+    def __getitem__(self, tile: TileIndex) -> U64:
+        return self._open[tile] if tile in self._open else self._unpacked(self._packed[tile])
+
+    def __iter__(self) -> Iterator[TileIndex]:
+        yield from self._open
+        yield from self._packed
+
+    def __len__(self) -> int:
+        return len(self._open) + len(self._packed)
+
+    def __contains__(self, tile: object) -> bool:
+        return tile in self._open or tile in self._packed
+
+    def near(self, tile: TileIndex) -> U64:
+        """The planes of a tile, to be changed in place; zeros if there were none."""
+        if tile not in self._open:
+            packed = self._packed.pop(tile, None)
+            shape = TILE_CELLS, TILE_CELLS, self.words
+            self._open[tile] = np.zeros(shape, dtype=np.uint64) if packed is None else self._unpacked(packed)
+        return self._open[tile]
+
+    def leave(self, view: Grid) -> None:
+        """Pack one tile that lies far from ``view``, if there is any: for every scan, so that none has it all."""
+        around = view.padded(_FAR_CELLS)
+        for tile, planes in self._open.items():
+            common = self.lattice.tile(tile).intersection(around)
+            if common.rows == 0 or common.cols == 0:
+                self._packed[tile] = _packed(planes)
+                del self._open[tile]
+                return
+
+    def _unpacked(self, data: bytes) -> U64:
+        raw = np.frombuffer(unpack_bytes(data, CELLS * 8 * (self.words + 1), "evidence"), dtype=np.uint64)
+        cells, *words = raw.reshape(self.words + 1, -1)
+        planes = np.zeros((CELLS, self.words), dtype=np.uint64)
+        planes[cells.astype(np.intp)] = np.stack(words, axis=1)
+        return planes.reshape(TILE_CELLS, TILE_CELLS, self.words)
+
+
+def _packed(planes: U64) -> bytes:
+    """The cells in which anything was counted, and their words plane by plane: most of the higher ones are empty."""
+    flat = planes.reshape(CELLS, -1)
+    cells = np.flatnonzero(flat.any(axis=1))
+    return compress(np.concatenate([cells.astype(np.uint64)[None], flat[cells].T]).tobytes(), _FAST)
