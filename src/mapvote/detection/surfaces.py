@@ -8,6 +8,7 @@ is new. Support, not area, makes a change of either: a pole is narrow and tall, 
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numba
@@ -135,6 +136,10 @@ class SurfaceVoter:
             new = np.where(found.new != 0, found.new | found.beyond | ~(top | known), np.uint64(0))
             out[tile] = TileVotes(one_hot(found.states), found.states, found.gone, found.remnants, new, free)
         return out
+
+    def each(self) -> Iterator[tuple[TileIndex, TileVotes]]:
+        """The same one by one; all tiles are judged together."""
+        yield from self.votes().items()
 
     def _judge(self, tile: TileIndex) -> _Judged:
         """What the tile's own evidence says, voxel by voxel and cell by cell."""
