@@ -15,7 +15,7 @@ from mapvote.core import geometry
 from mapvote.core.point_map import map_from_points
 from mapvote.core.sensors import SENSORS
 from mapvote.core.types import F64
-from mapvote.doctor import Finding, examine
+from mapvote.doctor import Finding, diagnose
 from mapvote.doctor.readings import CAMERA_TO_LIDAR
 from mapvote.formats import DriveWriter
 from mapvote.formats.drives.kitti import write_poses
@@ -100,8 +100,8 @@ def serious(found: list[Finding]) -> list[str]:
 
 
 def test_a_healthy_drive_is_sound(tmp_path: Path, scans: list[F64]) -> None:
-    assert serious(examine(write(tmp_path / "d", scans))) == []
-    assert serious(examine(tmp_path / "d", None, map_from_points(world()))) == []
+    assert serious(diagnose(write(tmp_path / "d", scans)).findings) == []
+    assert serious(diagnose(tmp_path / "d", None, map_from_points(world())).findings) == []
 
 
 @pytest.mark.parametrize(
@@ -120,7 +120,7 @@ def test_a_healthy_drive_is_sound(tmp_path: Path, scans: list[F64]) -> None:
 def test_a_prior_read_wrongly_is_named(
     tmp_path: Path, scans: list[F64], change: Callable[[F64], F64], name: str
 ) -> None:
-    found = examine(write(tmp_path / "d", scans, pose=change))
+    found = diagnose(write(tmp_path / "d", scans, pose=change)).findings
     assert any(name in what for what in serious(found)), found
 
 
@@ -137,12 +137,12 @@ def test_a_prior_read_wrongly_is_named(
 def test_axes_and_units_of_points_are_named(
     tmp_path: Path, scans: list[F64], factors: tuple[float, float, float], name: str
 ) -> None:
-    found = examine(write(tmp_path / "d", scans, point=lambda p: p * np.array(factors)))
+    found = diagnose(write(tmp_path / "d", scans, point=lambda p: p * np.array(factors))).findings
     assert any(name in what for what in serious(found)), found
 
 
 def test_points_in_camera_axes_are_named(tmp_path: Path, scans: list[F64]) -> None:
-    found = examine(write(tmp_path / "d", scans, point=lambda p: p @ CAMERA_TO_LIDAR[:3, :3]))
+    found = diagnose(write(tmp_path / "d", scans, point=lambda p: p @ CAMERA_TO_LIDAR[:3, :3])).findings
     errors = [f.what for f in found if f.severity == "error"]
     assert errors == ["the points' axis -y points up (the road lies 1.8 m along its opposite), not z"]
 
@@ -152,14 +152,14 @@ def test_points_in_camera_axes_are_named(tmp_path: Path, scans: list[F64]) -> No
     [(100_000_000_000, "milliseconds, not seconds"), (100_000, "divided by 1000"), (450_000_000, "0.450 s apart")],
 )
 def test_units_of_times_are_named(tmp_path: Path, scans: list[F64], step_ns: int, name: str) -> None:
-    found = examine(write(tmp_path / "d", scans, step_ns=step_ns))
+    found = diagnose(write(tmp_path / "d", scans, step_ns=step_ns)).findings
     assert any(name in f.what for f in found), found
 
 
 def test_a_broken_prior_does_not_hide_other_ills(tmp_path: Path, scans: list[F64]) -> None:
     write(tmp_path / "d", scans, point=lambda p: p * np.array([1, -1, -1]))
     write_poses(tmp_path / "d" / "prior.txt", 2 * poses())
-    what = " ".join(serious(examine(tmp_path / "d")))
+    what = " ".join(serious(diagnose(tmp_path / "d").findings))
     assert "not orthonormal" in what
     assert "upside down" in what
 
@@ -169,7 +169,7 @@ def test_jumps_bodies_and_thin_scans_are_named(tmp_path: Path, scans: list[F64])
     jumping[10, 0, 3] += 40.0
     write(tmp_path / "d", [np.concatenate([s[::90], 0.01 * s[::300] + [1.5, 0, 0]]) for s in scans])
     write_poses(tmp_path / "d" / "prior.txt", jumping)
-    found = " ".join(serious(examine(tmp_path / "d")))
+    found = " ".join(serious(diagnose(tmp_path / "d").findings))
     for illness in ("jumps 2 times", "own body", "few for a hdl32e"):
         assert illness in found
 
@@ -178,15 +178,20 @@ def test_jumps_bodies_and_thin_scans_are_named(tmp_path: Path, scans: list[F64])
 def test_drive_and_map_that_do_not_belong_together(tmp_path: Path, scans: list[F64]) -> None:
     write(tmp_path / "d", scans)
     elsewhere = map_from_points(world() + np.array([5000.0, 0, 0]))
-    assert "do not overlap" in serious(examine(tmp_path / "d", None, elsewhere))[0]
+    assert "do not overlap" in serious(diagnose(tmp_path / "d", None, elsewhere).findings)[0]
     lower = map_from_points(world() - np.array([0, 0, 40.0]))
-    assert "shifted by 40.00 m (x -0.00, y +0.00, z -40.00" in serious(examine(tmp_path / "d", None, lower))[0]
+    assert (
+        "shifted by 40.00 m (x -0.00, y +0.00, z -40.00" in serious(diagnose(tmp_path / "d", None, lower).findings)[0]
+    )
+    larger = map_from_points(1.04 * world())
+    found = serious(diagnose(tmp_path / "d", None, larger).findings)
+    assert any("scaled by 1.0" in what for what in found), found
     bare = world()
     bare = bare[bare[:, 0] < -30]
     corner = map_from_points(np.concatenate([bare, [[10.0, 5.0, 0.0]]]))
-    assert "fits the map nowhere" in serious(examine(tmp_path / "d", None, corner))[0]
+    assert "fits the map nowhere" in serious(diagnose(tmp_path / "d", None, corner).findings)[0]
 
 
 def test_nothing_there_is_one_error() -> None:
-    found = examine(Path("/nowhere"))
+    found = diagnose(Path("/nowhere")).findings
     assert [f.severity for f in found] == ["error"]

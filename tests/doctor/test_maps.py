@@ -10,7 +10,7 @@ import pytest
 
 from mapvote.core.point_map import PointMap, map_from_points
 from mapvote.core.types import F64
-from mapvote.doctor import Finding, examine
+from mapvote.doctor import Finding, diagnose
 from mapvote.doctor.clouds import check_cloud
 from mapvote.doctor.maps import check_map
 from mapvote.formats import write_map
@@ -101,8 +101,8 @@ def test_a_tile_that_is_missing_between_others_is_told(sound: PointMap, points: 
 
 def test_examine_takes_map_folders_and_ballots(tmp_path: Path, sound: PointMap) -> None:
     write_map(sound, tmp_path / "m")
-    found = examine(tmp_path / "m")
+    found = diagnose(tmp_path / "m").findings
     assert serious(found) == []
     assert any("local metres" in f.what for f in found)
     (tmp_path / "b.ballot").write_bytes(b"no ballot")
-    assert [f.severity for f in examine(tmp_path / "b.ballot")] == ["error"]
+    assert [f.severity for f in diagnose(tmp_path / "b.ballot").findings] == ["error"]

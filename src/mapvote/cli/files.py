@@ -64,6 +64,9 @@ def doctor(
     map_path: Annotated[
         Path | None, typer.Option("--map", metavar="MAP", help="also say whether the drive lies on this map")
     ] = None,
+    png: Annotated[
+        Path | None, typer.Option("--png", metavar="FILE", help="a picture of a drive's scans, as read and as mended")
+    ] = None,
     *,
     drive_options: dict[str, Any],
 ) -> None:
@@ -74,7 +77,7 @@ def doctor(
     from rich.console import Console
 
     from mapvote.core.types import MapvoteError
-    from mapvote.doctor import examine
+    from mapvote.doctor import Diagnosis, diagnose
     from mapvote.formats import read_map
     from mapvote.formats.drives.options import DriveOptions
 
@@ -88,17 +91,22 @@ def doctor(
         from mapvote.doctor.stores import check_store
 
         with opened_store(path) as store, waiting("reading every byte"):
-            findings = check_store(store)
+            diagnosis = Diagnosis(check_store(store))
     else:
         with stages_that_vanish() as tell:
-            findings = examine(Path(path), DriveOptions(**drive_options), point_map, tell)
+            diagnosis = diagnose(Path(path), DriveOptions(**drive_options), point_map, tell)
     console = Console(soft_wrap=True, highlight=False)
-    for finding in findings:
+    for finding in diagnosis.findings:
         for line in _lines(finding):
             console.print(line)
-    errors = sum(f.severity == "error" for f in findings)
-    warnings = sum(f.severity == "warning" for f in findings)
+    errors = sum(f.severity == "error" for f in diagnosis.findings)
+    warnings = sum(f.severity == "warning" for f in diagnosis.findings)
     print(f"{path}: {errors} errors, {warnings} warnings" if errors or warnings else f"{path}: sound")
+    if png is not None:
+        from mapvote.evaluation.reporting.doctor_figure import draw_diagnosis
+
+        draw_diagnosis(diagnosis, point_map, png)
+        print(f"{png}: the scans as read, and as mended")
     if errors:
         raise typer.Exit(1)
 

@@ -7,11 +7,11 @@ reading of it (:mod:`mapvote.doctor.frames`). docs/decisions/doctor.md says why.
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from mapvote.core.point_map import PointMap, all_points
-from mapvote.core.types import Drive, MapvoteError
+from mapvote.core.types import F64, Drive, MapvoteError
 from mapvote.doctor.bags import check_bag
 from mapvote.doctor.ballots import check_ballot
 from mapvote.doctor.clouds import check_cloud
@@ -25,20 +25,32 @@ from mapvote.formats.drives.rosbag import is_rosbag
 from mapvote.formats.maps.mapvote_folder import is_map_folder
 from mapvote.formats.registry import DRIVES, MAPS
 
-__all__ = ["Finding", "check_cloud", "examine", "must_be_usable", "usable"]
+__all__ = ["Diagnosis", "Finding", "check_cloud", "diagnose", "must_be_usable", "usable"]
 
 
-def examine(
+@dataclass(frozen=True, slots=True)
+class Diagnosis:
+    """What the doctor found, errors first, and of a drive how it lies."""
+
+    findings: list[Finding]
+    drive: Drive | None = None
+    T_read: F64 | None = None
+    """(n, 4, 4) its prior."""
+    T_mended: F64 | None = None
+    """(n, 4, 4) what takes its points, as they are in the files, to where they belong; None where nobody knows."""
+
+
+def diagnose(
     path: Path,
     options: DriveOptions | None = None,
     point_map: PointMap | None = None,
     progress: Progress | None = None,
-) -> list[Finding]:
-    """Everything the doctor finds at ``path``, errors first: in a map, a ballot, or a drive (with a map also on it)."""
+) -> Diagnosis:
+    """Everything the doctor finds at ``path``: in a map, a ballot or a drive (with a map, also if it lies on it)."""
     if is_map_folder(path) or any(layout.recognised(path) for layout in MAPS.values()):
-        return examine_map(path)[0]
+        return Diagnosis(examine_map(path)[0])
     if path.is_file() and not any(layout.recognised(path) for layout in DRIVES.values()):
-        return check_ballot(path.read_bytes())
+        return Diagnosis(check_ballot(path.read_bytes()))
     options = options or DriveOptions()
     found = check_bag(path, options) if is_rosbag(path) else []
     more, drive, T = examine_drive(path, options, progress)
@@ -46,9 +58,11 @@ def examine(
     if point_map is not None:
         found += _of_the_map(point_map)
         if drive is not None and T is not None and not any(f.severity == "error" for f in found):
-            more, _ = check_on_map(drive, T, point_map, progress)
+            more, T = check_on_map(drive, T, point_map, progress)
             found += more
-    return in_order(found)
+    read = None if drive is None else drive.T_map_lidar_prior
+    unknown = T is read and any(f.severity == "error" for f in found)
+    return Diagnosis(in_order(found), drive, read, None if unknown else T)
 
 
 def _of_the_map(point_map: PointMap) -> list[Finding]:

@@ -45,6 +45,7 @@ def misfits(T: F64, runs: Sequence[Run]) -> F64:
     return np.asarray(each.reshape(-1, 2).mean(axis=1))
 
 
-def misfit(T: F64, runs: Sequence[Run]) -> float:
-    """The median of :func:`misfits`: a run that went astray, or a jump of the prior, does not decide."""
-    return float(np.median(misfits(T, runs)))
+def position_misfit(T: F64, runs: Sequence[Run]) -> float:
+    """Metres by which positions alone differ, median over the runs: rotations say nothing of scale or time."""
+    off = np.linalg.norm(residuals(T, runs)[:, :3], axis=1).reshape(-1, 2).mean(axis=1)
+    return float(np.median(off))

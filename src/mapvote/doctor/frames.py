@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mapvote.core.types import F64, Drive
-from mapvote.doctor.agreement import misfits
+from mapvote.doctor.agreement import misfits, position_misfit
 from mapvote.doctor.finding import Finding, Severity
 from mapvote.doctor.looks import Looks
 from mapvote.doctor.measured import Measured, measure_scale, measure_time, measure_turn
@@ -108,7 +108,7 @@ def check_agreement(drive: Drive, T: F64, runs: Sequence[Run], road: Road, turns
         return [_named(group, as_it_is, best, length_m)], best.reading.poses(T)
     if as_it_is.median > floor_m:
         return [_nothing_fits(as_it_is, runs, length_m, told_m)], T
-    found = _by_numbers(numbers, as_it_is, T, runs)
+    found = _by_numbers(numbers, T, runs)
     found += _places(as_it_is, runs) + _scatter(drive, as_it_is, length_m)
     found += _cannot_tell(as_it_is, held, length_m, turns, drive.sensor.clockwise)
     return found, T
@@ -211,16 +211,16 @@ def _nothing_fits(as_it_is: _Held, runs: Sequence[Run], length_m: float, told_m:
     return Finding("error", what, "is it the trajectory of this drive, one row for each scan, in order?")
 
 
-def _by_numbers(numbers: Sequence[Measured], as_it_is: _Held, T: F64, runs: Sequence[Run]) -> list[Finding]:
+def _by_numbers(numbers: Sequence[Measured], T: F64, runs: Sequence[Run]) -> list[Finding]:
     """Scale, turn, pitch and time, where the prior is off by a little and the runs show it."""
-    found = []
+    found, before = [], position_misfit(T, runs)
     least = {"scale": _SCALE, "turn": _TURN_DEG, "pitch": _PITCH_DEG, "time": _TIME_S}
     for m in numbers:
         off = abs(np.log(m.value)) if m.kind == "scale" else abs(m.value)
         sigma = m.sigma / m.value if m.kind == "scale" else m.sigma
-        gained = as_it_is.median - float(np.median(misfits(m.poses(T), runs)))
-        if off > max(least[m.kind], 5.0 * sigma) and gained > 0.25 * as_it_is.median:
-            grave = off > 2.0 * least[m.kind] or (m.kind == "scale" and gained > 0.5 * as_it_is.median)
+        gained = before - position_misfit(m.poses(T), runs)
+        if off > max(least[m.kind], 5.0 * sigma) and gained > 0.25 * before:
+            grave = off > 2.0 * least[m.kind] or (m.kind == "scale" and gained > 0.5 * before)
             found.append((gained, Finding("error" if grave else "warning", *_small_words(m))))
     found.sort(key=lambda one: -one[0])
     return [finding for _, finding in found[:1]]  # one cause moves all of them a little

@@ -1,0 +1,37 @@
+"""What the doctor found is drawn: scans as read and as mended, with a map and without, and where nothing is known."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mapvote.core.point_map import map_from_points
+from mapvote.doctor import Diagnosis, Finding
+from mapvote.evaluation.reporting.doctor_figure import draw_diagnosis
+from streets import drive_along, path
+
+
+@pytest.fixture(scope="module")
+def diagnosis() -> Diagnosis:
+    poses = path(10)
+    drive = drive_along(poses, 1, poses.copy())
+    moved = poses.copy()
+    moved[:, 0, 3] += 3.0
+    return Diagnosis([Finding("error", "the prior is 3 m off", "move it")], drive, moved, poses)
+
+
+def test_the_picture_is_the_same_each_time_and_shows_the_map(tmp_path: Path, diagnosis: Diagnosis) -> None:
+    point_map = map_from_points(np.random.default_rng(1).uniform(0, 20, (2000, 3)))
+    for name in ("one.png", "two.png"):
+        draw_diagnosis(diagnosis, point_map, tmp_path / name)
+    draw_diagnosis(diagnosis, None, tmp_path / "without_map.png")
+    assert (tmp_path / "one.png").read_bytes()[:4] == b"\x89PNG"
+    assert (tmp_path / "one.png").read_bytes() == (tmp_path / "two.png").read_bytes()
+    assert (tmp_path / "one.png").read_bytes() != (tmp_path / "without_map.png").read_bytes()
+
+
+@pytest.mark.parametrize("lost", [{"T_mended": None}, {"T_read": None, "T_mended": None}, {"drive": None}])
+def test_what_is_not_known_is_said(tmp_path: Path, diagnosis: Diagnosis, lost: dict[str, None]) -> None:
+    draw_diagnosis(replace(diagnosis, **lost), None, tmp_path / "x.png")
+    assert (tmp_path / "x.png").stat().st_size > 1000
