@@ -45,7 +45,8 @@ def misfits(T: F64, runs: Sequence[Run]) -> F64:
     return np.asarray(each.reshape(-1, 2).mean(axis=1))
 
 
-def position_misfit(T: F64, runs: Sequence[Run]) -> float:
-    """Metres by which positions alone differ, median over the runs: rotations say nothing of scale or time."""
-    off = np.linalg.norm(residuals(T, runs)[:, :3], axis=1).reshape(-1, 2).mean(axis=1)
-    return float(np.median(off))
+def misfit(T: F64, runs: Sequence[Run], *, scale: bool = False) -> float:
+    """The median of :func:`misfits`; for a ``scale`` of positions alone, of which rotations say nothing."""
+    if not scale:
+        return float(np.median(misfits(T, runs)))
+    return float(np.median(np.linalg.norm(residuals(T, runs)[:, :3], axis=1).reshape(-1, 2).mean(axis=1)))

@@ -9,9 +9,10 @@ import numpy as np
 
 from mapvote.core.types import F32, F64, Drive, MapvoteError
 from mapvote.doctor.finding import Finding, Progress, in_order
-from mapvote.doctor.frames import check_agreement, check_scan_motion, in_map_frame
+from mapvote.doctor.frames import check_agreement
 from mapvote.doctor.looks import Looks, look_at_all
 from mapvote.doctor.motion import Run, follow, starts_of_runs
+from mapvote.doctor.movement import check_scan_motion, in_map_frame
 from mapvote.doctor.prior import NO_PRIOR, check_prior, check_times
 from mapvote.doctor.road import Road, find_road
 from mapvote.doctor.scans import check_scans
