@@ -11,7 +11,7 @@ from mapvote.core.types import F32, F64, Drive, MapvoteError
 from mapvote.doctor.finding import Finding, Progress, in_order
 from mapvote.doctor.frames import check_agreement
 from mapvote.doctor.looks import Looks, look_at_all
-from mapvote.doctor.motion import Run, follow, starts_of_runs
+from mapvote.doctor.motion import Run, follow, starts_across, starts_of_runs
 from mapvote.doctor.movement import check_scan_motion, in_map_frame
 from mapvote.doctor.prior import NO_PRIOR, check_prior, check_times
 from mapvote.doctor.road import Road, find_road
@@ -90,7 +90,8 @@ def measure(drive: Drive, looks: Looks, progress: Progress | None = None) -> tup
     def read(i: int) -> F32:
         return drive.read_scan(int(usable[i])).points
 
-    starts = starts_of_runs(len(usable), None if T is None else T[usable], looks.leaps)
+    spread = starts_of_runs(len(usable), None if T is None else T[usable])
+    starts = dict.fromkeys([*spread, *starts_across(looks.leaps, len(usable))])
     runs = []
     for k, start in enumerate(starts):
         run = follow(read, int(start), len(usable), road)
@@ -99,6 +100,7 @@ def measure(drive: Drive, looks: Looks, progress: Progress | None = None) -> tup
             progress("registering scans", k + 1, len(starts))
     unsound = check_scan_motion(drive, runs)
     found += unsound
+    runs = runs[: len(spread)]
     if T is None or unsound:  # what the scans do not show, the prior cannot be held against
         return found, T
     more, mended = check_agreement(drive, T, runs, road, float(np.median(looks.turns)))

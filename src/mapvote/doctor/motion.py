@@ -52,19 +52,17 @@ class Run:
         return float(np.linalg.norm(np.diff(self.T_first_lidar[:, :3, 3], axis=0), axis=1).sum())
 
 
-def starts_of_runs(n: int, T_map_lidar: F64 | None, leaps: F64 | None = None) -> I64:
-    """First scans of the runs of a drive of n scans: spread evenly, half of them where the prior turns most.
+def starts_across(leaps: F64, n: int) -> I64:
+    """First scans of runs across the places where scans differ most from the one before, by ``leaps`` (n - 1,).
 
-    ``leaps`` (n - 1,): how much each scan differs from the one before; where that is most a run is laid across.
+    They show whether the scans are in order; chosen for being odd, they are no measure of the prior.
     """
-    starts = _spread(n, T_map_lidar)
-    if leaps is None or len(leaps) < n - 1 or len(starts) < 2:
-        return starts
     most = np.argsort(leaps, kind="stable")[-_ACROSS:] - SCANS // 2
-    return np.unique(np.concatenate([starts, np.clip(most, 0, starts[-1])]))
+    return np.unique(np.clip(most, 0, max(0, n - SCANS)))
 
 
-def _spread(n: int, T_map_lidar: F64 | None) -> I64:
+def starts_of_runs(n: int, T_map_lidar: F64 | None) -> I64:
+    """First scans of the runs of a drive of n scans: spread evenly, half of them where the prior turns most."""
     span = SCANS + 2 * _MOST_STEP
     if n <= span:
         return np.zeros(1, dtype=np.int64)
