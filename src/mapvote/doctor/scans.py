@@ -65,8 +65,9 @@ def _columns(drive: Drive, looks: Looks) -> list[Finding]:
 
 
 def _never_negative(drive: Drive, looks: Looks, name: str) -> list[Finding]:
-    """Points that go round the sensor, and only part of the way, are half of a revolution; that is told elsewhere."""
-    if name != "z" and (not drive.sensor.rings or abs(np.median(looks.turns)) > 0.3):
+    """A sensor without rings may look ahead only. Points that go round it, but only part of the way, are half of a
+    revolution: that is told as the sectors that are missing."""
+    if (name == "x" and not drive.sensor.rings) or (name != "z" and abs(np.median(looks.turns)) > 0.3):
         return []
     what = f"{name} is never negative: no LiDAR sees nothing below itself"
     if name != "z":
@@ -130,7 +131,10 @@ def _sectors(drive: Drive, looks: Looks) -> list[Finding]:
         start = -180.0 + 10.0 * first
         what = f"nothing is seen over {blind_deg:.0f} deg of azimuth (from {start:.0f} deg counter-clockwise)"
         mend = "part of every revolution is missing? Sound only for a sensor that sees no more, or is hidden there"
-        found.append(Finding("warning" if drive.sensor.rings else "note", what, mend))
+        middle = np.radians(-175.0 + 10.0 * np.arange(SECTORS))
+        facing = np.arctan2(mean @ np.sin(middle), mean @ np.cos(middle))
+        looks_ahead = not drive.sensor.rings and abs(facing) < np.radians(30.0)
+        found.append(Finding("note" if looks_ahead else "warning", what, mend))
     seen = mean * SECTORS > 0.3
     lost = ((looks.sectors < _EMPTY_SECTOR * mean) & seen).sum(axis=1) * 10.0
     bad = np.flatnonzero(lost >= 60.0)
