@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mapvote.codec.arrays import compress, pack_plane, unpack_bytes
-from mapvote.codec.words import pack_words, unpack_cells, unpack_words
+from mapvote.codec.words import pack_words, unpack_sparse, unpack_words
 from mapvote.core.types import U64, MapvoteError
 
 
@@ -24,7 +24,7 @@ def test_words_come_back_as_they_went_in_whichever_way_they_travelled(marked: di
     plane = plane_of(marked)
     for data in (pack_words(plane), pack_plane(plane, 1)):
         np.testing.assert_array_equal(unpack_words(data, "gone"), plane)
-        cells, words = unpack_cells(data, "gone")
+        cells, words = unpack_sparse(data, "gone")
         np.testing.assert_array_equal(cells, np.flatnonzero(plane))
         np.testing.assert_array_equal(words, plane.reshape(-1)[cells])
 
@@ -48,4 +48,4 @@ def test_a_full_plane_and_an_empty_one_travel_too() -> None:
 )
 def test_what_no_vehicle_wrote_is_refused(raw: bytes) -> None:
     with pytest.raises(MapvoteError, match="ballot: free is damaged"):
-        unpack_cells(compress(raw, 1), "free")
+        unpack_sparse(compress(raw, 1), "free")

@@ -16,7 +16,7 @@ import numpy as np
 
 from mapvote.codec.arrays import pack_plane as pack_plane
 from mapvote.codec.arrays import unpack_bytes, unpack_frames, unpack_plane
-from mapvote.codec.words import unpack_cells
+from mapvote.codec.words import unpack_sparse
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, TileIndex
 from mapvote.core.types import F32, N_STATES, NO_VOTE, U8, U16, MapvoteError
 
@@ -200,7 +200,7 @@ def validate(ballot: Ballot, max_bytes: int | None = None) -> None:
             size += unpack_tally(tile.tally).nbytes
         for what, words in (("gone", tile.gone), ("free", tile.free)):
             if words is not None:
-                size += sum(part.nbytes for part in unpack_cells(words, what))
+                size += sum(part.nbytes for part in unpack_sparse(words, what))
         if tile.new_points is not None:
             size += unpack_points(tile.new_points).nbytes
         if max_bytes is not None and size > max_bytes:

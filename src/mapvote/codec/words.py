@@ -26,7 +26,7 @@ def pack_words(plane: U64) -> bytes:
     return compress(_by_byte(np.diff(cells, prepend=0), _WAY) + _by_byte(flat[cells], _WORD))
 
 
-def unpack_cells(data: bytes, what: str) -> tuple[NDArray[np.intp], U64]:
+def unpack_sparse(data: bytes, what: str) -> tuple[NDArray[np.intp], U64]:
     """(flat cells (n,), ascending; their words (n,), none of them 0), of either format. MapvoteError if damaged.
 
     ``what`` names the plane in messages, e.g. "gone".
@@ -60,7 +60,7 @@ def _ascending(raw: U8, cells: NDArray[np.intp], words: U64) -> bool:
 
 def unpack_words(data: bytes, what: str) -> U64:
     """(256, 256) uint64; MapvoteError if damaged."""
-    cells, words = unpack_cells(data, what)
+    cells, words = unpack_sparse(data, what)
     plane = np.zeros(CELLS, dtype=np.uint64)
     plane[cells] = words
     return plane.reshape(TILE_CELLS, TILE_CELLS)

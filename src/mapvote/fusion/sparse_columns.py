@@ -9,7 +9,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from mapvote.codec.words import unpack_cells
+from mapvote.codec.words import unpack_sparse
 from mapvote.core.columns import EVERY_BIT
 from mapvote.core.grid import CELLS, TILE_CELLS
 from mapvote.core.types import I32, U64, Bool
@@ -47,7 +47,7 @@ class Words:
     @classmethod
     def unpack(cls, data: bytes, what: str) -> Words:
         """From a packed plane of a ballot; MapvoteError if damaged."""
-        return cls(*unpack_cells(data, what))
+        return cls(*unpack_sparse(data, what))
 
     def within(self, cells: Bool) -> Words:
         """Only those of the (256, 256) cells given."""
