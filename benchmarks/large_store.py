@@ -31,8 +31,8 @@ from mapvote.server.store.blobs import pack_tile
 from mapvote.server.store.database import insert_rows
 from mapvote.server.store.policy import Policy, current_policy
 from mapvote.server.store.publish import publish
-from mapvote.server.store.quarantine import sum_of
 from mapvote.server.store.store import Store
+from mapvote.server.store.sums import sum_of
 from postgres_cluster import PostgresCluster
 
 WALL = [(10, 10 + c) for c in range(8)]

@@ -84,6 +84,31 @@ def test_a_damaged_ballot_is_left_out_and_the_others_decide(store: Store) -> Non
         assert ("ballot", name) in set_aside(connection)
 
 
+@pytest.mark.parametrize(
+    ("table", "column", "kind"),
+    [("ballots", "vehicle", "ballot"), ("versions", "reason", "version"), ("events", "actor", "event")],
+)
+def test_a_turned_letter_in_a_head_is_named(store: Store, table: str, column: str, kind: str) -> None:
+    head = schema.metadata.tables[table]
+    key = next(iter(head.primary_key))
+    with store.database.writing() as connection:
+        first = connection.execute(sa.select(sa.func.min(key))).scalar_one()
+        said = connection.execute(sa.select(head.c[column]).where(key == first)).scalar_one()
+        turned = chr(ord(said[0]) ^ 1) + said[1:]
+        connection.execute(head.update().where(key == first).values({column: turned}))
+    assert [(damage.kind, damage.name) for damage in check(store, mend=True)] == [(kind, str(first))]
+    counted = 2 if table == "ballots" else 3
+    assert [fused.vehicles for fused in publish(store).fused] == [counted, counted], "who spoke is not known any more"
+
+
+def test_a_ballot_that_ended_by_no_event_is_named(store: Store) -> None:
+    b = schema.ballots
+    with store.database.writing() as connection:
+        seq = connection.execute(sa.select(sa.func.max(b.c.seq))).scalar_one()
+        connection.execute(b.update().where(b.c.seq == seq).values(gone_seq=1 << 40))
+    assert [(damage.kind, damage.name) for damage in check(store)] == [("ballot", str(seq))]
+
+
 def test_a_plane_is_mended_from_another_store(store: Store, tmp_path_factory: pytest.TempPathFactory) -> None:
     other = Store.create(f"sqlite:///{tmp_path_factory.mktemp('other') / 's.db'}", two_walls())
     points = store.manifest().tiles[0, 0].points

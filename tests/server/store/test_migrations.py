@@ -29,6 +29,7 @@ from mapvote.server.insight.explain import explain_cell
 from mapvote.server.store import keys, migrate, schema
 from mapvote.server.store.admission import accept, examine
 from mapvote.server.store.ballots import Receipt
+from mapvote.server.store.check import check
 from mapvote.server.store.database import Database
 from mapvote.server.store.policy import RoundPolicy, current_policy
 from mapvote.server.store.publish import publish
@@ -91,6 +92,8 @@ def test_the_first_schema_becomes_todays_without_loss(first_store: str) -> None:
         assert migrate.upgrade(database) == (migrate.FIRST, migrate.HEAD)
         assert migrate.upgrade(database) == (migrate.HEAD, migrate.HEAD)
     after = content(first_store)
+    for table in schema.HEADS.values():
+        assert all(len(row.pop("sum")) == 64 for row in after[table.name])
     ((one, other),) = zip(before.pop("maps"), after.pop("maps"), strict=True)
     assert one.pop("method") == "columns, two-stage"
     assert len(other.pop("secret")) == 64
@@ -112,6 +115,7 @@ def test_the_first_schema_becomes_todays_without_loss(first_store: str) -> None:
     assert all(ballot["bytes"] > 0 for ballot in after["ballots"])
 
     store = Store.open(first_store)
+    assert check(store) == []
     assert current_policy(store).round == RoundPolicy(method="columns", stage="two-stage")
     assert [version.kind for version in store.versions()] == ["import", "publish", "rollback", "publish"]
     maps = [store.point_map(version.number) for version in store.versions()]

@@ -140,7 +140,8 @@ def vehicle_standings(store: Store) -> list[Standing]:
 
 def events(store: Store, limit: int = 100) -> list[dict[str, Any]]:
     """The last events, newest first."""
-    query = sa.select(schema.events).order_by(schema.events.c.seq.desc()).limit(limit)
+    e = schema.events.c
+    query = sa.select(e.seq, e.at_ns, e.kind, e.actor, e.detail).order_by(schema.events.c.seq.desc()).limit(limit)
     with store.database.reading() as connection:
         return [dict(row._mapping) for row in connection.execute(query)]
 

@@ -14,9 +14,9 @@ from mapvote.server.errors import Conflict, NotFound, Unauthorised
 from mapvote.server.store import keys, schema
 from mapvote.server.store.database import insert_rows
 from mapvote.server.store.policy import RoundPolicy, policy_in
-from mapvote.server.store.quarantine import sum_of
 from mapvote.server.store.queries import log_event, next_seq
 from mapvote.server.store.store import Store
+from mapvote.server.store.sums import sum_of
 from mapvote.server.store.version_driven import NO_SUCH_BASE, version_driven
 
 

@@ -19,9 +19,10 @@ from mapvote.core.types import MapvoteError
 from mapvote.server.store import schema
 from mapvote.server.store.blobs import MAX_PLANE_BYTES
 from mapvote.server.store.database import insert_rows
-from mapvote.server.store.quarantine import Damage, ballot_name, ballot_sum, quarantine, sum_of
+from mapvote.server.store.quarantine import Damage, ballot_name, ballot_sum, quarantine
 from mapvote.server.store.queries import log_event, oldest_kept, shows_in_kept
 from mapvote.server.store.store import Store
+from mapvote.server.store.sums import sum_of, summed
 
 Source = Callable[[str], bytes | None]
 """A plane's values by hash, from another store or a map folder; None if it is not there."""
@@ -34,6 +35,7 @@ def check(
     """Everything that is damaged, and with ``mend`` what was done about it. What cannot be mended is set aside."""
     with store.database.reading() as connection:
         found = [*_database(connection, store), *_planes(connection), *_chain(connection)]
+        found += [*_heads(connection), *_ends(connection)]
         found += [*_ballots(connection), *_decisions(connection)]
     if mend and found:
         with store.database.writing() as connection:
@@ -82,6 +84,28 @@ def _chain(connection: sa.Connection) -> Iterator[Damage]:
             yield Damage(
                 "plane", row[3], f"{name} of tile {tile_key((row.row, row.col))} in version {row.version} is lost"
             )
+
+
+def _heads(connection: sa.Connection) -> Iterator[Damage]:
+    """What is written once of versions, ballots, the log, keys, policies and reviews."""
+    for kind, table in schema.HEADS.items():
+        over, key = summed(table), list(table.primary_key)
+        for row in _in_batches(connection, sa.select(table).order_by(*key)):
+            if row.sum != sum_of(*(getattr(row, name) for name in over)):
+                name = " ".join(str(getattr(row, column.name))[:64] for column in key)
+                yield Damage(kind, name, "its head is not what its sum says")
+
+
+def _ends(connection: sa.Connection) -> Iterator[Damage]:
+    """What was replaced, withdrawn, taken back or cleared was so by an event that there is, and after it came."""
+    b, r, v, e = schema.ballots.c, schema.reviews.c, schema.versions.c, schema.events.c
+    for kind, name, came, ended in (
+        ("ballot", b.seq, b.seq, b.gone_seq), ("review", r.seq, r.seq, r.gone_seq),
+        ("version", v.number, v.mark, v.cleared_seq),
+    ):  # fmt: skip
+        lost = ended.not_in(sa.select(e.seq)) | (ended <= came)
+        for row in connection.execute(sa.select(name, ended).where(ended.is_not(None), lost)):
+            yield Damage(kind, str(row[0]), f"ended by event {row[1]}, which cannot be")
 
 
 def _ballots(connection: sa.Connection) -> Iterator[Damage]:

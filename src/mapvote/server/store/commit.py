@@ -11,7 +11,6 @@ from mapvote.core.grid import TileIndex
 from mapvote.server.errors import Conflict
 from mapvote.server.store import schema
 from mapvote.server.store.blobs import TileHashes
-from mapvote.server.store.quarantine import sum_of
 from mapvote.server.store.queries import (
     Version,
     add_blobs,
@@ -23,6 +22,7 @@ from mapvote.server.store.queries import (
     version_row,
 )
 from mapvote.server.store.store import Store
+from mapvote.server.store.sums import sum_of
 from mapvote.server.store.tile_jobs import Fused
 
 

@@ -12,6 +12,7 @@ from sqlalchemy import exc
 
 from mapvote.core.types import MapvoteError
 from mapvote.server.errors import Unavailable
+from mapvote.server.store.sums import with_sums
 
 _WRITERS_LOCK = 0x6D617076  # any number of our own: PostgreSQL's advisory lock that writers take in turn
 _PAGE_BYTES = 16384
@@ -78,7 +79,8 @@ def address_of(url: sa.URL) -> str:
 
 
 def insert_rows(connection: sa.Connection, table: sa.Table, rows: Sequence[tuple[Any, ...]]) -> None:
-    """Many rows, each with a value for every column of ``table`` in its order, as the driver takes them.
+    """Many rows, each with a value for every column of ``table`` in its order, as the driver takes them; the sums of
+    heads (:func:`mapvote.server.store.sums.sum_over`) are added here.
 
     SQLAlchemy's own work on each row would cost more than the database's.
     """
@@ -86,7 +88,8 @@ def insert_rows(connection: sa.Connection, table: sa.Table, rows: Sequence[tuple
     columns = ", ".join(quote(column.name) for column in table.columns)
     mark = "?" if connection.dialect.name == "sqlite" else "%s"
     values = ", ".join([mark] * len(table.columns))
-    connection.exec_driver_sql(f"INSERT INTO {quote(table.name)} ({columns}) VALUES ({values})", list(rows))
+    statement = f"INSERT INTO {quote(table.name)} ({columns}) VALUES ({values})"
+    connection.exec_driver_sql(statement, list(with_sums(table, rows)))
 
 
 @contextmanager

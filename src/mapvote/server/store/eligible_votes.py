@@ -35,7 +35,7 @@ class Electorate:
     received_by_ns: int
     without: Collection[str] = ()
     set_aside: Collection[str] = ()
-    """Ballots that are damaged, see :func:`mapvote.server.store.quarantine.ballot_name`."""
+    """Ballots that are damaged, by number or on one tile (:func:`mapvote.server.store.quarantine.ballot_name`)."""
 
     @property
     def settings(self) -> FuseSettings:
@@ -160,7 +160,7 @@ def electorate_now(
 
 def _unready(vote: StoredVote, index: TileIndex, asked: Electorate) -> str:
     cast = asked.policy.round
-    if ballot_name(vote.seq, *index) in asked.set_aside:
+    if asked.set_aside and not {str(vote.seq), ballot_name(vote.seq, *index)}.isdisjoint(asked.set_aside):
         return DAMAGED
     if vote.cast_by != cast.cast_by or not vote.settings_hash.startswith(cast.settings_hash):
         return OTHERWISE

@@ -1,11 +1,11 @@
 """What is damaged is set aside by name, so that everything else goes on: in the log, the metrics and /readyz.
 
-Planes of tiles are named by their hash; planes of ballots and decisions carry a sum beside them.
+Planes of tiles are named by their hash; planes of ballots and decisions carry a sum beside them, and so do the heads
+of ballots, versions, the log and all else that is written once.
 """
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
@@ -16,8 +16,9 @@ from mapvote.codec.ballot import tile_key
 from mapvote.core.types import MapvoteError
 from mapvote.server.store import schema
 from mapvote.server.store.queries import log_event
+from mapvote.server.store.sums import sum_of
 
-KINDS = ("plane", "ballot", "decision", "version", "row", "database")
+KINDS = ("plane", "decision", *schema.HEADS, "row", "database")
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,15 +43,6 @@ class DamagedBallots(MapvoteError):
     def __init__(self, found: list[Damage]) -> None:
         super().__init__("; ".join(map(str, found)))
         self.found = found
-
-
-def sum_of(*parts: bytes | str | None) -> str:
-    """SHA-256 over the parts of a row, each with its length, so that none can pass for another."""
-    digest = hashlib.sha256()
-    for part in parts:
-        raw = b"" if part is None else part.encode() if isinstance(part, str) else bytes(part)
-        digest.update(f"{-1 if part is None else len(raw)}:".encode() + raw)
-    return digest.hexdigest()
 
 
 def ballot_name(seq: int, row: int, col: int) -> str:

@@ -24,14 +24,14 @@ def current_number(connection: sa.Connection) -> int:
 
 def current_version(connection: sa.Connection) -> Version:
     """The newest version."""
-    newest = sa.select(schema.versions).order_by(schema.versions.c.number.desc()).limit(1)
+    newest = sa.select(*VERSION_COLUMNS).order_by(schema.versions.c.number.desc()).limit(1)
     return Version(**connection.execute(newest).one()._mapping)
 
 
 def version_of(connection: sa.Connection, number: int, *, cleared: bool = False) -> Version:
     """One version; NotFound, naming the newest, if there is none of that number, or (unless ``cleared`` will do) it was
     cleared away."""
-    row = connection.execute(sa.select(schema.versions).where(schema.versions.c.number == number)).one_or_none()
+    row = connection.execute(sa.select(*VERSION_COLUMNS).where(schema.versions.c.number == number)).one_or_none()
     if row is None:
         newest = current_number(connection)
         raise NotFound(f"there is no version {number}; the newest is {newest}: fetch it whole")
@@ -169,7 +169,7 @@ def add_version(connection: sa.Connection, version: Version, tiles: Mapping[Tile
 
 def version_row(version: Version) -> dict[str, Any]:
     """A version as the columns of its table."""
-    return {name: getattr(version, name) for name in schema.versions.c.keys()}  # noqa: SIM118
+    return {name: getattr(version, name) for name in (column.name for column in VERSION_COLUMNS)}
 
 
 def tile_row(number: int, index: TileIndex, hashes: TileHashes) -> dict[str, Any]:
@@ -204,6 +204,8 @@ class Version:
     """The event by which its planes were cleared away; None: it is there."""
 
 
+VERSION_COLUMNS = [column for column in schema.versions.c if column.name != "sum"]
+"""What a :class:`Version` is made of."""
 _ONE_BY_ONE = 200
 """So many tiles are sooner asked for one by one than found among all of the map's."""
 _T = schema.version_tiles

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import sqlalchemy as sa
 
+from mapvote.server.store.sums import sum_over
+
 metadata = sa.MetaData(
     naming_convention={
         "ix": "ix_%(column_0_label)s",
@@ -31,6 +33,7 @@ maps = sa.Table(
     sa.Column("georeference", sa.JSON, nullable=False),
     sa.Column("secret", sa.String(64), nullable=False),
     sa.Column("surveyed_ns", sa.BigInteger),
+    sum_over("map_id", "georeference", "secret", "surveyed_ns"),
 )
 """``secret``: what vehicles' pseudonyms are made with; it never leaves the store. ``surveyed_ns``: when the last drive
 that the first version was made of ended; null where nobody knows."""
@@ -40,6 +43,7 @@ policies = sa.Table(
     metadata,
     sa.Column("seq", sa.BigInteger, sa.ForeignKey("events.seq"), primary_key=True, autoincrement=False),
     sa.Column("policy", sa.JSON, nullable=False),
+    sum_over("seq", "policy"),
 )
 """One row a change; the event says who made it, when and why. The newest one holds."""
 
@@ -52,6 +56,7 @@ keys = sa.Table(
     sa.Column("created_ns", sa.BigInteger, nullable=False),
     sa.Column("revoked_ns", sa.BigInteger),
     sa.Column("expires_ns", sa.BigInteger),
+    sum_over("name", "role", "hash", "created_ns"),
     sa.UniqueConstraint("hash"),
 )
 """``role``: vehicle, reader, reviewer or operator; only the hash of a key is kept. ``expires_ns``: null for never."""
@@ -64,6 +69,7 @@ events = sa.Table(
     sa.Column("kind", sa.String(16), nullable=False),
     sa.Column("actor", sa.String(80), nullable=False),
     sa.Column("detail", sa.String(400), nullable=False),
+    sum_over("seq", "at_ns", "kind", "actor", "detail"),
 )
 """The log, and the one order of everything: writers take turns, so ``seq`` grows in the order of commits."""
 
@@ -88,6 +94,7 @@ versions = sa.Table(
     sa.Column("mark", sa.BigInteger, nullable=False),
     sa.Column("policy", sa.JSON, nullable=False),
     sa.Column("cleared_seq", sa.BigInteger),
+    sum_over("number", "parent", "kind", "target", "created_ns", "published_by", "reason", "mark", "policy"),
 )
 """``mark``: the last event that the version knew of. ``target``: the version that a rollback or replay starts from.
 ``cleared_seq``: the event by which its planes and decisions were cleared away; what is left is that it was."""
@@ -123,6 +130,19 @@ ballots = sa.Table(
     sa.Column("cast_by", sa.String(32), nullable=False),
     sa.Column("bytes", sa.BigInteger, nullable=False),
     sa.Column("version", sa.Integer, nullable=False),
+    sum_over(
+        "seq",
+        "first_seq",
+        "vehicle",
+        "drive",
+        "digest",
+        "start_ns",
+        "end_ns",
+        "received_ns",
+        "settings_hash",
+        "cast_by",
+        "version",
+    ),
     sa.Index("ix_ballots_drive", "vehicle", "drive"),
     sa.Index("ix_ballots_gone_seq", "gone_seq"),
 )
@@ -170,6 +190,7 @@ reviews = sa.Table(
     sa.Column("verdict", sa.String(16), nullable=False),
     sa.Column("comment", sa.String(400), nullable=False),
     sa.Column("feature", sa.JSON, nullable=False),
+    sum_over("seq", "verdict", "comment", "feature"),
 )
 """What reviewers decided about a change, ``feature`` as they saw it; ``gone_seq``: the event that took it back."""
 
@@ -180,6 +201,7 @@ review_cells = sa.Table(
     sa.Column("col", sa.Integer, primary_key=True),
     sa.Column("review", sa.BigInteger, sa.ForeignKey("reviews.seq"), primary_key=True),
     sa.Column("cells", sa.LargeBinary, nullable=False),
+    sum_over("row", "col", "review", "cells"),
 )
 """The cells (65536 packed bits) that a review is about. Change votes on them count no more: of a rejected change those
 of drives first heard of before it was rejected, of a held one all, until it is let go."""
@@ -193,3 +215,9 @@ quarantine = sa.Table(
     sa.Column("why", sa.String(200), nullable=False),
 )
 """What is damaged and takes no part: planes by hash, ballots and decisions by number and tile."""
+
+HEADS = {
+    "map": maps, "policy": policies, "key": keys, "event": events, "version": versions, "ballot": ballots,
+    "review": reviews, "reviewed": review_cells,
+}  # fmt: skip
+"""What carries a sum over all of a row that is written once, by the kind of damage."""

@@ -30,6 +30,7 @@ from mapvote.server.store.blobs import TileHashes
 from mapvote.server.store.database import Database
 from mapvote.server.store.policy import Policy, write_policy
 from mapvote.server.store.queries import (
+    VERSION_COLUMNS,
     Version,
     add_blobs,
     add_version,
@@ -165,7 +166,7 @@ class Store:
     def versions(self) -> list[Version]:
         """All versions, oldest first."""
         with self.database.reading() as connection:
-            rows = connection.execute(sa.select(schema.versions).order_by(schema.versions.c.number))
+            rows = connection.execute(sa.select(*VERSION_COLUMNS).order_by(schema.versions.c.number))
             return [Version(**row._mapping) for row in rows]
 
     def manifest(self, number: int | None = None, *, since: int | None = None) -> Manifest:
