@@ -67,6 +67,8 @@ def explain(
     print(f"cell {told['row']}, {told['col']}: {told['thing'] or 'empty'}")
     for decision in told["decisions"]:
         print(f"version {decision['version']} decided {decision['state']}")
+    if told.get("probability") is not None:
+        print(f"the last of them is right with a probability of {told['probability']:.2f}")
     rows = []
     for v in told["votes"]:
         heard = ", ".join(str(number) for number in v["heard"])

@@ -148,6 +148,7 @@ def test_geojson_says_that_it_is_in_map_metres_and_is_the_same_every_time() -> N
         "votes_median": 0.0,
         "against_median": 0.0,
         "share_for": None,
+        "probability": None,
         "first_seen": None,
         "last_seen": None,
         "versions": [],

@@ -12,7 +12,7 @@ from mapvote.codec.ballot import encode
 from mapvote.config import FuseSettings
 from mapvote.core.types import CellState
 from mapvote.fusion.tile_vote import DAY_NS
-from mapvote.server.insight.explain import CellStory, explain_cell
+from mapvote.server.insight.explain import CellStory, as_told, explain_cell
 from mapvote.server.store import schema
 from mapvote.server.store.admission import accept, examine
 from mapvote.server.store.ballots import Receipt
@@ -69,6 +69,9 @@ def test_a_vote_is_named_with_the_version_that_heard_it_or_why_it_does_not_count
     ]  # fmt: skip
     assert told.votes[0].why == "spent: version 2 has changed the cell since"
     assert told.decisions == [(2, "changed_empty")]
+    assert told.probability is not None
+    assert 0.0 < told.probability < 1.0
+    assert as_told(told)["probability"] == round(told.probability, 3)
 
 
 def test_what_comes_and_goes_is_called_temporary_until_it_can_be_expected_to_stay(store: Store, clock: Clock) -> None:

@@ -16,6 +16,7 @@ from mapvote.core.grid import CELL_SIZE, TILE_CELLS
 from mapvote.core.tile import Tile
 from mapvote.core.types import F32, F64, I32, I64, U8, Bool, CellState
 from mapvote.core.voting import VOTE_UNIT
+from mapvote.fusion.probability import alike_beside, change_probability
 from mapvote.server.insight.polygons import Ring, pieces, rings
 from mapvote.server.insight.things import REACH_M, group
 
@@ -92,6 +93,8 @@ class ChangeObject:
     last_seen_ns: int | None
     versions: list[int]
     """The versions that made it, ascending; empty where no decision is known."""
+    probability: float | None
+    """Mean over its cells that each of them did change (fusion/probability.py); None where no decision is known."""
 
     @property
     def area_m2(self) -> float:
@@ -165,9 +168,11 @@ def change_objects(changed: Iterable[ChangedCells], min_cells: int = 1, reach_m:
     found = pieces(cells.rows, cells.cols, kinds)
     outlines = rings(cells.rows, cells.cols, found.polygons)
     things = group(cells.rows, cells.cols, kinds, found.objects, reach_m)
+    beside = alike_beside(cells.rows, cells.cols, kinds)
+    probability = change_probability(cells.states, cells.votes, cells.against, beside)
     by_thing = np.split(np.argsort(things, kind="stable"), np.cumsum(np.bincount(things))[:-1])
     return [
-        _object(cells, mine, [outlines[p] for p in np.unique(found.polygons[mine])])
+        _object(cells, probability, mine, [outlines[p] for p in np.unique(found.polygons[mine])])
         for mine in by_thing
         if len(mine) >= min_cells
     ]
@@ -182,7 +187,7 @@ def _sorted(parts: Sequence[ChangedCells]) -> ChangedCells | None:
     return ChangedCells(**{name: values[order] for name, values in whole.items()})
 
 
-def _object(cells: ChangedCells, mine: I64, outline: list[list[Ring]]) -> ChangeObject:
+def _object(cells: ChangedCells, probability: F64, mine: I64, outline: list[list[Ring]]) -> ChangeObject:
     rows, cols, versions = cells.rows[mine], cells.cols[mine], cells.versions[mine]
     kind = KINDS[int(cells.states[mine[0]])]
     made_in = sorted({int(v) for v in versions} - {0})
@@ -205,6 +210,7 @@ def _object(cells: ChangedCells, mine: I64, outline: list[list[Ring]]) -> Change
         first_seen_ns=None if seen_first == _NEVER else seen_first,
         last_seen_ns=None if seen_last == _UNTIL else seen_last,
         versions=made_in,
+        probability=float(probability[told].mean()) if made_in else None,
     )
 
 

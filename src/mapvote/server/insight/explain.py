@@ -13,8 +13,10 @@ from mapvote.codec.arrays import unpack_plane
 from mapvote.core.grid import TILE_CELLS, TileIndex
 from mapvote.core.tile import Tile
 from mapvote.core.types import NO_VOTE, U8, CellState, MapvoteError
+from mapvote.core.voting import VOTE_UNIT
 from mapvote.fusion.fuse import decide_tile, rule_of
 from mapvote.fusion.persistence import expected_days
+from mapvote.fusion.probability import alike_beside, change_probability
 from mapvote.fusion.spent import unspent
 from mapvote.fusion.tile_vote import TileVote
 from mapvote.server.store import schema
@@ -31,6 +33,7 @@ from mapvote.server.store.eligible_votes import (
 from mapvote.server.store.quarantine import DamagedBallots
 from mapvote.server.store.queries import current_version, oldest_kept, tile_as_of, version_of
 from mapvote.server.store.store import Store
+from mapvote.server.store.tile_jobs import unpack_tally_plane
 
 _LOOKED_INTO = 30
 """So many of the last versions that decided a cell are asked which votes they heard."""
@@ -68,6 +71,8 @@ class CellStory:
     votes: list[CellVote]
     decisions: list[tuple[int, str]]
     """(version, state) of every version that decided this cell."""
+    probability: float | None
+    """That it changed as the last of them says (fusion/probability.py); None if that one says of no change."""
     thing: str
     """What stands there, and whether something new is temporary; what came and went before."""
 
@@ -103,15 +108,17 @@ def explain_cell(store: Store, x: float, y: float) -> CellStory:
                 heard.setdefault(seq, []).append(version)
         counted = counted_votes(connection, tile, now.asked)
         votes = [_vote(*each, now, tuple(heard.get(each[0].seq, ()))) for each in _everyone(connection, now, counted)]
+        probability = _probability(connection, index, cell, decided[-1][0]) if decided else None
         thing = _thing(connection, now, [vote for _, vote in counted])
-    return CellStory(row, col, votes, decided, thing)
+    return CellStory(row, col, votes, decided, probability, thing)
 
 
 def as_told(story: CellStory) -> dict[str, Any]:
     """A story as JSON."""
     votes = [asdict(vote) for vote in story.votes]
     decisions = [{"version": version, "state": state} for version, state in story.decisions]
-    return {"row": story.row, "col": story.col, "thing": story.thing, "votes": votes, "decisions": decisions}
+    told = {"row": story.row, "col": story.col, "thing": story.thing, "votes": votes, "decisions": decisions}
+    return {**told, "probability": None if story.probability is None else round(story.probability, 3)}
 
 
 def _decisions(connection: sa.Connection, index: TileIndex, cell: tuple[int, int]) -> list[tuple[int, str]]:
@@ -119,6 +126,23 @@ def _decisions(connection: sa.Connection, index: TileIndex, cell: tuple[int, int
     query = sa.select(d.c.version, d.c.states).where(d.c.row == index[0], d.c.col == index[1]).order_by(d.c.version)
     found = [(row.version, int(states_of(row.states)[cell])) for row in connection.execute(query)]
     return [(version, state_name(state)) for version, state in found if state != NO_VOTE]
+
+
+def _probability(connection: sa.Connection, index: TileIndex, cell: tuple[int, int], version: int) -> float | None:
+    """That the cell changed as ``version`` decided; cells of other tiles are not asked for what changed beside it."""
+    d = schema.decisions
+    query = sa.select(d.c.states, d.c.tally).where(d.c.row == index[0], d.c.col == index[1], d.c.version == version)
+    row = connection.execute(query).one()
+    states, counted = states_of(row.states), unpack_tally_plane(row.tally)[cell].astype(np.int64) // VOTE_UNIT
+    state = int(states[cell])
+    if state not in (CellState.CHANGED_OCCUPIED, CellState.CHANGED_EMPTY):
+        return None
+    rows, cols = np.nonzero(states == state)
+    beside = alike_beside(rows, cols, np.zeros(len(rows), np.int64))[(rows == cell[0]) & (cols == cell[1])]
+    against = counted[: CellState.UNDETERMINED].sum() - counted[state]
+    return float(
+        change_probability(states[cell].reshape(1), np.array([counted[state]]), np.array([against]), beside)[0]
+    )
 
 
 def _undamaged(connection: sa.Connection, place: _Place) -> _Place:

@@ -112,6 +112,7 @@ def _feature(change: ChangeObject, lattice: Lattice, near: list[str]) -> dict[st
             "votes_median": change.votes_median,
             "against_median": change.against_median,
             "share_for": None if change.share_for is None else round(change.share_for, 3),
+            "probability": None if change.probability is None else round(change.probability, 3),
             "first_seen": _utc(change.first_seen_ns),
             "last_seen": _utc(change.last_seen_ns),
             "versions": change.versions,
