@@ -23,9 +23,11 @@ class PackedTiles(Mapping[TileIndex, U64]):
         self.lattice, self.words = lattice, words
         self._open: dict[TileIndex, U64] = {}
         self._packed: dict[TileIndex, bytes] = {}
+        self._spare: list[U64] = []
+        """Planes of tiles that were left, for the next: given back, they would leave holes that the heap grows by."""
 
     def __getitem__(self, tile: TileIndex) -> U64:
-        return self._open[tile] if tile in self._open else self._unpacked(self._packed[tile])
+        return self._open[tile] if tile in self._open else self._unpacked(self._packed[tile], self._new())
 
     def __iter__(self) -> Iterator[TileIndex]:
         yield from self._open
@@ -40,9 +42,8 @@ class PackedTiles(Mapping[TileIndex, U64]):
     def near(self, tile: TileIndex) -> U64:
         """The planes of a tile, to be changed in place; zeros if there were none."""
         if tile not in self._open:
-            packed = self._packed.pop(tile, None)
-            shape = TILE_CELLS, TILE_CELLS, self.words
-            self._open[tile] = np.zeros(shape, dtype=np.uint64) if packed is None else self._unpacked(packed)
+            packed, planes = self._packed.pop(tile, None), self._zeros()
+            self._open[tile] = planes if packed is None else self._unpacked(packed, planes)
         return self._open[tile]
 
     def leave(self, view: Grid) -> None:
@@ -52,15 +53,25 @@ class PackedTiles(Mapping[TileIndex, U64]):
             common = self.lattice.tile(tile).intersection(around)
             if common.rows == 0 or common.cols == 0:
                 self._packed[tile] = _packed(planes)
-                del self._open[tile]
+                self._spare.append(self._open.pop(tile))
                 return
 
-    def _unpacked(self, data: bytes) -> U64:
+    def _new(self) -> U64:
+        return np.zeros((TILE_CELLS, TILE_CELLS, self.words), dtype=np.uint64)
+
+    def _zeros(self) -> U64:
+        if not self._spare:
+            return self._new()
+        planes = self._spare.pop()
+        planes[:] = 0
+        return planes
+
+    def _unpacked(self, data: bytes, planes: U64) -> U64:
+        """``planes``, which come empty, with what was packed."""
         raw = np.frombuffer(unpack_bytes(data, CELLS * 8 * (self.words + 1), "evidence"), dtype=np.uint64)
         cells, *words = raw.reshape(self.words + 1, -1)
-        planes = np.zeros((CELLS, self.words), dtype=np.uint64)
-        planes[cells.astype(np.intp)] = np.stack(words, axis=1)
-        return planes.reshape(TILE_CELLS, TILE_CELLS, self.words)
+        planes.reshape(CELLS, self.words)[cells.astype(np.intp)] = np.stack(words, axis=1)
+        return planes
 
 
 def _packed(planes: U64) -> bytes:
