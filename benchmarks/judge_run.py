@@ -24,7 +24,8 @@ from mapvote.localisation.deskew import deskew, motion_at
 from mapvote.perception.frontend import Observation
 from mapvote.vehicle import Vehicle
 
-WARM_UP = 10
+WARM_UP = 25
+"""Scans: the first leaves for the voter after some fifteen."""
 LOOK_AHEAD = 10
 """Scans in a second: how late both sides say what moves."""
 STAGES = {
@@ -59,6 +60,7 @@ def judge(street: Street, last: int | None) -> dict[str, Any]:
     vehicle = _vehicle(street)
     for i in range(min(count, WARM_UP)):
         vehicle.observe(*_scan(street, i))
+    vehicle.finish()  # so that what comes last is compiled too
     vehicle, ms = _vehicle(street), defaultdict(lambda: np.zeros(count))
     watched = vehicle._voter = Watched(vehicle._voter)
     points_map = all_points(street.point_map)
