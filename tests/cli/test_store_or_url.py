@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+import sqlalchemy as sa
 from typer.testing import CliRunner
 
 from hand_made import Say, make_ballot, make_map, make_tile, states_plane, wall
@@ -16,8 +17,10 @@ from mapvote.cli import app
 from mapvote.codec.ballot import encode
 from mapvote.config import FuseSettings
 from mapvote.core.types import CellState
+from mapvote.server.store import schema
 from mapvote.server.store.admission import accept, examine
 from mapvote.server.store.policy import Policy
+from mapvote.server.store.quarantine import set_aside
 from mapvote.server.store.store import Store
 
 WALL = [(10, 10), (10, 11), (10, 12)]
@@ -65,6 +68,10 @@ def test_a_server_is_looked_at_run_and_exported_like_its_store(site: tuple[str, 
     assert re.search(r"ballots +│ 2 ", both(site, "info"))
     found = json.loads(both(site, "changes", "--metres"))
     assert [f["properties"]["kind"] for f in found["features"]] == ["demolished"]
+    pages = [tmp_path / "store.html", tmp_path / "server.html"]
+    for source, page in zip(site, pages, strict=True):
+        assert "the largest of 1 changes" in say("changes", source, "--html", page)
+    assert pages[0].read_text() == pages[1].read_text()
     out = [tmp_path / "store", tmp_path / "server"]
     for source, folder in zip(site, out, strict=True):
         assert "4 Autoware tiles, 4 written" in say("export", source, folder)
@@ -87,12 +94,27 @@ def test_only_tiles_that_changed_since_a_version_are_written(site: tuple[str, st
     assert len(delta) == 1
 
 
+def test_a_server_sets_aside_what_is_damaged(site: tuple[str, str]) -> None:
+    store = Store.open(f"sqlite:///{site[0]}")
+    b = schema.ballots
+    with store.database.writing() as connection:
+        seq = connection.execute(sa.select(sa.func.min(b.c.seq))).scalar_one()
+        connection.execute(b.update().where(b.c.seq == seq).values(vehicle="c"))
+    result = CliRunner().invoke(app, ["check", site[1], "--mend"])
+    assert result.exit_code == 1
+    assert f"ballot {seq}: its head is not what its sum says; set aside" in result.output
+    with store.database.reading() as connection:
+        assert ("ballot", str(seq)) in set_aside(connection)
+    store.close()
+
+
 @pytest.mark.parametrize(
     ("words", "why"),
     [
-        (["check", "http://localhost:1", "--mend"], "take a STORE"),
+        (["check", "http://localhost:1", "--from", "b.db"], "takes a STORE"),
         (["publish", "http://localhost:1", "--cluster", "tcp://x"], "the server has its own"),
-        (["changes", "http://localhost:1", "--html", "x.html"], "is made from a STORE"),
+        (["vote", ".", "--map", ".", "--out", "b", "--region", "0,0,9,9"], "only a server sends a part"),
+        (["vote", ".", "--map", "http://localhost:1", "--out", "b", "--region", "9,9,0,0"], "lower left corner first"),
     ],
 )
 def test_what_only_the_machine_of_the_store_can_do_is_said(words: list[str], why: str) -> None:

@@ -119,29 +119,24 @@ def changes(
 
     mapvote changes fleet.db --out changes.geojson
     """
-    from mapvote.core.types import MapvoteError
     from mapvote.formats.atomic import whole_file
-    from mapvote.server.insight.cutout import whole_page
-    from mapvote.server.insight.history import changes_between, cutouts_between
+    from mapvote.server.insight.history import changes_between, page_between
 
     package = out is not None and out.suffix.lower() == ".gpkg"
     if is_url(store):
-        if page is not None:
-            raise MapvoteError("changes: --html is made from a STORE; the server's own page shows the clouds")
-        until = "" if new is None else f"&to={new}"
-        lonlat = "false" if metres or package else "true"
-        asked = f"/v1/changes?from={old}{until}&min_cells={min_cells}&lonlat={lonlat}"
+        asked = f"from={old}&min_cells={min_cells}" + ("" if new is None else f"&to={new}")
         with server_at(store, key_file) as server, waiting("comparing versions"):
-            _write_changes(server.ask_json("GET", asked), out)
-        return
-    with opened_store(store) as opened, waiting("comparing versions"):
-        newest = opened.current() if new is None else new
-        found = changes_between(opened, old, newest, min_cells, lonlat=not (metres or package))
-        cutouts = cutouts_between(opened, old, newest, found) if page is not None else []
+            found = server.ask_json("GET", f"/v1/changes?{asked}&lonlat={str(not (metres or package)).lower()}")
+            text = server.ask("GET", f"/v1/changes/page?{asked}").text if page is not None else ""
+    else:
+        with opened_store(store) as opened, waiting("comparing versions"):
+            newest = opened.current() if new is None else new
+            found = changes_between(opened, old, newest, min_cells, lonlat=not (metres or package))
+            text = page_between(opened, old, newest, found) if page is not None else ""
     if page is not None:
         with whole_file(page) as part:
-            part.write_text(whole_page(f"{found['map_id']}: version {old} to {newest}", cutouts))
-        print(f"{len(cutouts)} of {len(found['features'])} changes in {page}")
+            part.write_text(text)
+        print(f"the largest of {len(found['features'])} changes in {page}")
         if out is None:
             return
     _write_changes(found, out)

@@ -14,6 +14,7 @@ from mapvote.cli.store import opened_store, when
 if TYPE_CHECKING:
     from mapvote.client import MapClient
     from mapvote.client.connection import Connection
+    from mapvote.client.map_client import Region
     from mapvote.core.point_map import PointMap
 
 _SQLITE = b"SQLite format 3\0"
@@ -55,19 +56,35 @@ def client_of(url: str, key: str | None) -> MapClient:
     return MapClient(url, key=key, home=cache_folder())
 
 
-def map_of(name: str, key_file: Path | None, version: int | None = None) -> PointMap:
-    """The newest map of a store or a server, or one version of it; or a map in any file format."""
+def map_of(name: str, key_file: Path | None, version: int | None = None, region: Region | None = None) -> PointMap:
+    """The newest map of a store or a server, or one version of it; or a map in any file format. ``region``: only
+    the tiles of a server's that meet it."""
     from mapvote.core.types import MapvoteError
 
     if is_url(name):
         with client_of(name, key_in(key_file)) as client:
-            return client.fetch(version)
+            return client.fetch(version, region=region)
+    if region is not None:
+        raise MapvoteError(f"{name}: only a server sends a part of its map; leave out --region")
     if is_store(name):
         with opened_store(name) as store:
             return store.point_map(version)
     if version is not None:
         raise MapvoteError(f"{name}: only a store or a server has versions")
     return sound_map(name)
+
+
+def region_in(text: str) -> Region:
+    """X0,Y0,X1,Y1; MapvoteError if it is none."""
+    from mapvote.core.types import MapvoteError
+
+    try:
+        x0, y0, x1, y1 = map(float, text.split(","))
+    except ValueError:
+        raise MapvoteError(f"--region {text}: give X0,Y0,X1,Y1 in map metres, lower left and upper right") from None
+    if not (x0 < x1 and y0 < y1):
+        raise MapvoteError(f"--region {text}: holds nothing; give the lower left corner first, then the upper right")
+    return x0, y0, x1, y1
 
 
 def overview_of(name: str, key_file: Path | None) -> list[tuple[str, str]] | None:

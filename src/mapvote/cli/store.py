@@ -38,10 +38,11 @@ def check(
     from mapvote.server.store.quarantine import Damage
 
     if is_url(store):
-        if mend or other:
-            raise MapvoteError("check: --mend and --from take a STORE, on the machine where it is")
+        if other:
+            raise MapvoteError("check: --from takes a STORE, on the machine where it is")
         with server_at(store, key_file) as server, waiting("the server reads every byte"):
-            found = [Damage(**damage) for damage in server.ask_json("GET", "/v1/check")["damage"]]
+            told = server.ask_json("POST" if mend else "GET", "/v1/check")
+        found = [Damage(**damage) for damage in told["damage"]]
     else:
         found = _checked(store, mend, other)
     for damage in found:

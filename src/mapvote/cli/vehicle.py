@@ -9,7 +9,7 @@ import typer
 
 from mapvote.cli.looks import look_at
 from mapvote.cli.options import DRIVE, Config, DrivePath, KeyFile, key_in, with_drive_options
-from mapvote.cli.remote import client_of, map_of
+from mapvote.cli.remote import client_of, map_of, region_in
 from mapvote.cli.terminal import progress, waiting
 
 if TYPE_CHECKING:
@@ -111,6 +111,10 @@ def vote(
     trust_prior: Annotated[
         bool, typer.Option("--trust-prior", help="take the prior for the pose, do not localise")
     ] = False,
+    region: Annotated[
+        str | None,
+        typer.Option(metavar="X0,Y0,X1,Y1", help="of a server's map only this, 100 m around the drive; map metres"),
+    ] = None,
     config: Config = None,
     *,
     drive_options: dict[str, Any],
@@ -135,7 +139,7 @@ def vote(
     if case is not None:
         settings = choose_case(settings, case)
     with waiting(f"reading {where}"):
-        point_map = map_of(where, key_file)
+        point_map = map_of(where, key_file, region=None if region is None else region_in(region))
     frame = frame_of(point_map.georeference)
     drive = open_drive(drive_path, vehicle=vehicle, frame=frame, **drive_options)
     look_at(drive)

@@ -2,24 +2,34 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import queue
 import threading
 from collections.abc import Iterator
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, cast
 
 import httpx2
 import pytest
+import sqlalchemy as sa
 
 from hand_made import Say, make_ballot, states_plane, two_walls
 from live_server import serving
 from mapvote.client import MapClient
+from mapvote.config.server import ServerSettings
 from mapvote.core.types import CellState
 from mapvote.server.http.event_routes import as_sse
-from mapvote.server.http.webhook import signature
-from mapvote.server.insight.feed import Event, without_names
+from mapvote.server.http.webhook import deliver, signature
+from mapvote.server.insight.feed import Event, newest_event, without_names
+from mapvote.server.store import schema
+from mapvote.server.store.queries import log_event
 from mapvote.server.store.store import Store
+
+if TYPE_CHECKING:
+    from mapvote.server.http.services import Services
 
 SECRET = "a secret of both"
 Posts = queue.Queue[tuple[str, str, bytes]]
@@ -89,6 +99,41 @@ def test_a_webhook_is_signed_and_sent_again_until_it_is_taken(
     assert signed == signature(SECRET, stamp, body)
     assert signed != signature("another", stamp, body)
     assert [event["version"] for event in json.loads(body)["events"]] == [1]
+
+
+def test_a_restart_neither_loses_nor_repeats_what_a_webhook_gets(tmp_path: Path, receiver: tuple[str, Posts]) -> None:
+    store = Store.create(f"sqlite:///{tmp_path / 's.db'}", two_walls())
+    settings = SimpleNamespace(server=ServerSettings(webhook_url=receiver[0], webhook_secret=SECRET))
+    threads = SimpleNamespace(fetching=None)
+    parts = cast("Services", SimpleNamespace(store=store, settings=settings, threads=threads))
+
+    async def listen(posts: int) -> list[str]:
+        task = asyncio.create_task(deliver(parts))
+        heard: list[tuple[str, str, bytes]] = []
+        while len(heard) < posts or (posts == 0 and not known()):
+            await asyncio.sleep(0.02)
+            if not receiver[1].empty():
+                heard.append(receiver[1].get())
+        while posts and known()[0] < newest_event(store):
+            await asyncio.sleep(0.02)
+        task.cancel()
+        return [event["detail"] for _, _, body in heard for event in json.loads(body)["events"]]
+
+    def known() -> list[int]:
+        with store.database.reading() as connection:
+            return list(connection.execute(sa.select(schema.deliveries.c.seq)).scalars())
+
+    def happens(what: str) -> None:
+        with store.database.writing() as connection:
+            log_event(connection, 5, "test", "", what)
+
+    assert asyncio.run(listen(0)) == []
+    happens("one")
+    assert asyncio.run(listen(1)) == ["one"]
+    happens("two")
+    happens("three")
+    assert asyncio.run(listen(1)) == ["two", "three"]
+    store.close()
 
 
 def test_no_name_can_begin_another_event() -> None:

@@ -33,7 +33,7 @@ from mapvote.server.http.schemas import (
 from mapvote.server.http.services import Services, services
 from mapvote.server.insight.explain import as_told, explain_cell
 from mapvote.server.insight.geojson import feature_rows
-from mapvote.server.insight.history import changes_between, coverage, vehicle_standings
+from mapvote.server.insight.history import changes_between, coverage, page_between, vehicle_standings
 from mapvote.server.insight.lists import contradictions, standing_rows, tile_squares
 from mapvote.server.store.keys import pseudonyms
 from mapvote.server.store.publish import preview, publish, rollback
@@ -124,6 +124,21 @@ def changes(
     if format == "csv":
         return as_table(feature_rows(found))
     return as_json(found)
+
+
+@router.get("/v1/changes/page", responses=problems(404), summary="What changed, as a page that needs no server")
+def changes_page(
+    request: Request,
+    old: Annotated[int, Query(alias="from", ge=LEAST, le=MOST)],
+    new: Annotated[int | None, Query(alias="to", ge=LEAST, le=MOST)] = None,
+    min_cells: Annotated[int, Query(ge=1, le=100_000)] = 1,
+) -> Response:
+    """A file to keep or to mail: the clouds of the largest changes, before and after."""
+    store = services(request).store
+    newest = store.current() if new is None else new
+    page = page_between(store, old, newest, changes_between(store, old, newest, min_cells))
+    kept = {"Content-Disposition": 'attachment; filename="changes.html"'}
+    return Response(page, media_type="text/html", headers=kept)
 
 
 @router.get("/v1/cells", response_model=dict[str, Any], responses=problems(), summary="The votes behind one cell")

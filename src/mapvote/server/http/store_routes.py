@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict
+from functools import partial
 from typing import Annotated, Any
 
 from anyio import to_thread
@@ -60,4 +61,13 @@ async def whole(request: Request) -> Response:
     operator(request)
     parts = services(request)
     found = await to_thread.run_sync(check, parts.store, limiter=parts.threads.publishing)
+    return as_json({"damage": [asdict(damage) for damage in found]})
+
+
+@router.post("/v1/check", response_model=dict[str, Any], responses=problems(403), summary="Set aside what is damaged")
+async def mend(request: Request) -> Response:
+    """As looking, and what is damaged takes no part from now on. Planes are mended on the server's own machine, from a
+    backup."""
+    by, parts = operator(request), services(request)
+    found = await to_thread.run_sync(partial(check, parts.store, mend=True, by=by), limiter=parts.threads.publishing)
     return as_json({"damage": [asdict(damage) for damage in found]})

@@ -6,6 +6,7 @@ import asyncio
 import hashlib
 import hmac
 from dataclasses import asdict
+from functools import partial
 
 import httpx2
 import msgspec
@@ -14,7 +15,7 @@ from anyio import to_thread
 
 from mapvote.server.errors import Unavailable
 from mapvote.server.http.services import Services
-from mapvote.server.insight.feed import events_after, newest_event
+from mapvote.server.insight.feed import events_after, take, taken_up_to
 
 _EVERY_S = 1.0
 _TIMEOUT_S = 10.0
@@ -27,17 +28,19 @@ def signature(secret: str, timestamp: str, body: bytes) -> str:
 
 
 async def deliver(parts: Services) -> None:
-    """Send what happens from now on to ``[server] webhook_url``, until it is cancelled.
+    """Send what happens to ``[server] webhook_url``, until it is cancelled: from the first start with that address on,
+    and after a restart from where it was. (Killed between an answer and its note, the last post is sent again.)
 
     What is not answered by 2xx is sent again, after one second, then two, four, at most sixty; nothing overtakes it.
     """
     asked = parts.settings.server
-    seq = await to_thread.run_sync(newest_event, parts.store, limiter=parts.threads.fetching)
+    ask = partial(to_thread.run_sync, limiter=parts.threads.fetching)
+    seq = noted = await ask(taken_up_to, parts.store, asked.webhook_url)
     wait = _EVERY_S
     async with httpx2.AsyncClient(timeout=_TIMEOUT_S, follow_redirects=False) as client:
         while True:
             try:
-                events = await to_thread.run_sync(events_after, parts.store, seq, limiter=parts.threads.fetching)
+                events = await ask(events_after, parts.store, seq)
                 if events:
                     body = msgspec.json.encode({"map_id": parts.store.map_id, "events": [asdict(e) for e in events]})
                     stamp = str(parts.store.clock() // 10**9)
@@ -48,6 +51,9 @@ async def deliver(parts: Services) -> None:
                     }
                     (await client.post(asked.webhook_url, content=body, headers=headers)).raise_for_status()
                     seq = events[-1].seq
+                if seq != noted:
+                    await ask(take, parts.store, asked.webhook_url, seq)
+                    noted = seq
                 wait = _EVERY_S
             except (httpx2.HTTPError, Unavailable) as error:
                 structlog.get_logger("mapvote").warning("webhook", error=type(error).__name__, again_in_s=wait)

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import sqlalchemy as sa
 
 from mapvote.server.store import schema
+from mapvote.server.store.keys import hash_of
 from mapvote.server.store.queries import current_number
 from mapvote.server.store.store import Store
 
@@ -33,6 +34,24 @@ def newest_event(store: Store) -> int:
     """Number of the last event."""
     with store.database.reading() as connection:
         return int(connection.execute(sa.select(sa.func.max(schema.events.c.seq))).scalar_one())
+
+
+def taken_up_to(store: Store, address: str) -> int:
+    """The last event that a listener at this address took; of one that was never heard of, the newest there is."""
+    d = schema.deliveries
+    with store.database.writing() as connection:
+        taken = connection.execute(sa.select(d.c.seq).where(d.c.address == hash_of(address))).scalar_one_or_none()
+        if taken is None:
+            taken = connection.execute(sa.select(sa.func.max(schema.events.c.seq))).scalar_one()
+            connection.execute(d.insert().values(address=hash_of(address), seq=taken))
+    return int(taken)
+
+
+def take(store: Store, address: str, seq: int) -> None:
+    """A listener that was heard of took everything up to this event."""
+    d = schema.deliveries
+    with store.database.writing() as connection:
+        connection.execute(d.update().where(d.c.address == hash_of(address)).values(seq=seq))
 
 
 def events_after(store: Store, seq: int) -> list[Event]:

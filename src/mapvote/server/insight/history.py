@@ -16,7 +16,7 @@ from mapvote.core.voting import decide
 from mapvote.fusion.tile_vote import TileVote, one_each
 from mapvote.server.insight.changes import Decided, change_objects, changed_cells
 from mapvote.server.insight.consensus import Compared, Spoken, Standing, compare, standings_of
-from mapvote.server.insight.cutout import Box, Cutout, Tiles, cut_out, of_feature
+from mapvote.server.insight.cutout import Box, Cutout, Tiles, cut_out, of_feature, whole_page
 from mapvote.server.insight.explain import states_of
 from mapvote.server.insight.geojson import to_geojson
 from mapvote.server.insight.picture import before_and_after
@@ -71,6 +71,11 @@ def cutouts_between(store: Store, old: int, new: int, found: Mapping[str, Any], 
     large = [f for f in found["features"] if f["properties"]["size"] == "large"] or list(found["features"])
     largest = sorted(large, key=lambda f: -f["properties"]["area_m2"])[:most]
     return [of_feature(feature, tiles, store.lattice) for feature in largest]
+
+
+def page_between(store: Store, old: int, new: int, found: Mapping[str, Any]) -> str:
+    """HTML of :func:`cutouts_between`, a file that needs nothing else."""
+    return whole_page(f"{found['map_id']}: version {old} to {new}", cutouts_between(store, old, new, found))
 
 
 def picture_between(store: Store, old: int, new: int, box: Box) -> bytes:

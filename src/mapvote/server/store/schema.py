@@ -216,6 +216,14 @@ quarantine = sa.Table(
 )
 """What is damaged and takes no part: planes by hash, ballots and decisions by number and tile."""
 
+deliveries = sa.Table(
+    "deliveries",
+    metadata,
+    sa.Column("address", _Hash, primary_key=True),
+    sa.Column("seq", sa.BigInteger, nullable=False),
+)
+"""Up to which event a webhook has taken them, by the hash of its address."""
+
 HEADS = {
     "map": maps, "policy": policies, "key": keys, "event": events, "version": versions, "ballot": ballots,
     "review": reviews, "reviewed": review_cells,
