@@ -98,22 +98,23 @@ def judge_drive(source: str, kind: Kind, sound: Recording) -> dict:
 def maps(source: str, where: str) -> Iterator[tuple[str, object]]:
     """Kinds of broken maps; with a second ``+MAP`` also that one, laid where the first lies."""
     at, *folders = where.split("+")
-    drive, points = opened(at), all_points(read_map(folders[0]))
+    drive, point_map = opened(at), read_map(folders[0])
+    points = all_points(point_map)
     assert drive.T_map_lidar_prior is not None
+    _, T_sound = check_on_map(drive, drive.T_map_lidar_prior, point_map)
     middle = np.round(drive.T_map_lidar_prior[len(drive) // 2, :3, 3]) - [0.0, 0.0, 2.0]
     kinds = [MapKind("as it is", "^$", lambda p: p, np.eye(4), grave=False), *MAP_KINDS]
     if len(folders) > 1:
         other = all_points(read_map(folders[1]))
         other -= np.append(np.median(other[:, :2], axis=0), np.quantile(other[:, 2], 0.3))
         kinds.append(MapKind("the map of another street", NOWHERE, lambda p: other))
-    sound: list[np.ndarray] = []
     for kind in kinds:
         changed = around(points, middle, kind.change)
-        yield kind.name, lambda kind=kind, p=changed: judge_map(source, kind, drive, p, sound, middle)
+        yield kind.name, lambda kind=kind, p=changed: judge_map(source, kind, drive, p, T_sound, middle)
 
 
 def judge_map(
-    source: str, kind: MapKind, drive: Drive, points: np.ndarray, sound: list[np.ndarray], middle: np.ndarray
+    source: str, kind: MapKind, drive: Drive, points: np.ndarray, T_sound: np.ndarray, middle: np.ndarray
 ) -> dict:
     started = time.process_time()
     found, point_map = examine_points("map", Cloud(points))
@@ -123,11 +124,9 @@ def judge_map(
         more, T = check_on_map(drive, T, point_map)
         found = [*found, *more]
     judged = row(source, kind.name, kind.grave, kind.right, found, time.process_time() - started, "map")
-    if not sound:
-        sound.append(T)
     measured = any(re.search("against the prior|agree to", f.what) for f in found)
     if kind.moved is not None and measured:
-        judged |= errors_of(T, moved_poses(sound[0], middle, kind.moved))
+        judged |= errors_of(T, moved_poses(T_sound, middle, kind.moved))
     return judged
 
 
