@@ -42,6 +42,6 @@ def test_build_draws_how_the_drives_fit_and_tells_the_height_over_the_ground(sur
     assert len(np.unique(picture.reshape(-1, picture.shape[2]), axis=0)) > 20, "lines, dots and words are drawn"
     assert "sensor 1.79 m over the ground" in type_in("mapvote info map")
     doctor = CliRunner().invoke(app, ["doctor", str(survey), "--map", "map"], env={"COLUMNS": "200"})
-    assert doctor.exit_code == 1, "two of its priors are wild"
+    assert doctor.exit_code == 0, "two of its priors are wild: the map leaves them out"
     assert "the prior jumps 4 times" in doctor.output
     assert "by the scans themselves the sensor stands 1.8 m over the road" in doctor.output

@@ -25,8 +25,10 @@ def street(wall_y: float) -> np.ndarray:
 def drive(folder: Path) -> Path:
     T_map_lidar = from_xyz_rpy(15.0, 4.0, 1.9)
     writer = DriveWriter(folder, vehicle="v1", sensor=SENSORS["hdl32e"], start_ns=1_700_000_000_000_000_000).open()
+    rng = np.random.default_rng(1)
     for i in range(20):
-        writer.write_scan(i, (street(12.05) - T_map_lidar[:3, 3]).astype(np.float32))
+        points = street(12.05) - T_map_lidar[:3, 3]
+        writer.write_scan(i, (points + rng.normal(0.0, 0.005, points.shape)).astype(np.float32))
     writer.close(writer.start_ns + np.arange(20) * 100_000_000, np.tile(T_map_lidar, (20, 1, 1)))
     return folder
 

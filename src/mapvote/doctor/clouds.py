@@ -19,6 +19,8 @@ _STRAY_M = 300.0
 """Farther off they make the map larger than it is; nearer ones are reflections."""
 _HIGHEST_M = 3000.0
 """No map of streets is higher."""
+_LEAST_SHEET = 0.09
+"""Of a street's points .12 to .17 lie on its ground (simulated ones and KITTI); with less nothing says what is up."""
 
 
 def check_cloud(points: NDArray[np.floating]) -> list[Finding]:
@@ -84,7 +86,7 @@ def _axes(points: NDArray[np.floating]) -> list[Finding]:
     best = max(share, key=lambda name: share[name])
     opposite = ("-" if best[0] == "+" else "+") + best[1]
     # Between two walls, as much lies at one end of an axis as at the other: that is no ground.
-    if best == "+z" or share[best] < 1.3 * max(share["+z"], share[opposite]):
+    if best == "+z" or share[best] < max(_LEAST_SHEET, 1.3 * share["+z"], 1.3 * share[opposite]):
         return []
     if best == "-z":
         what = "the map is upside down: things hang below the ground"

@@ -6,13 +6,15 @@ import numpy as np
 from scipy import ndimage
 
 from mapvote.core.types import Drive
-from mapvote.doctor.finding import Finding
+from mapvote.doctor.finding import Finding, Severity
 from mapvote.doctor.looks import QUANTA_M, SECTORS, Looks
 
 _CUT_SHARE = 0.6
 """A scan with fewer points than this share of its neighbours' is cut off."""
 _EMPTY_SECTOR = 0.05
 """A sector with less than this share of an even one's points is empty."""
+_SOME_SCANS = 0.05
+"""A drive of which no larger share is spoilt can be used as it is, and the doctor warns."""
 
 
 def check_scans(drive: Drive, looks: Looks) -> list[Finding]:
@@ -32,6 +34,10 @@ def check_scans(drive: Drive, looks: Looks) -> list[Finding]:
     if not looks.has_intensity:
         found.append(Finding("note", "no intensity field", "the method does not need it"))
     return found
+
+
+def _severity(spoilt: int, scans: int) -> Severity:
+    return "error" if spoilt > _SOME_SCANS * scans else "warning"
 
 
 def _refused(drive: Drive, looks: Looks) -> list[Finding]:
@@ -96,7 +102,8 @@ def _counts(drive: Drive, looks: Looks) -> list[Finding]:
         k = int(cut[np.argmin(looks.count[cut] / around[cut])])
         what = f"scan {looks.index[k]} holds {looks.count[k]} points, those around it {around[k]:.0f}: cut off?"
         more = f" ({len(cut)} such scans)" if len(cut) > 1 else ""
-        found.append(Finding("error", what + more, "copy it again, or leave it out with --scans"))
+        mend = "copy it again, or leave it out with --scans"
+        found.append(Finding(_severity(len(cut), len(looks.count)), what + more, mend))
     if usual < 0.1 * drive.sensor.beams * drive.sensor.azimuths or usual < 1500:
         what = f"{usual:.0f} points a scan, few for a {drive.sensor.name}"
         found.append(Finding("warning", what, "is it another sensor (--sensor), or a down-sampled recording?"))
@@ -109,7 +116,8 @@ def _doubled(looks: Looks) -> list[Finding]:
         return []
     what = f"scan {looks.index[same[0] + 1]} is the same as the one before it"
     more = f" ({len(same)} such scans of {len(looks.index)})" if len(same) > 1 else ""
-    return [Finding("error", what + more, "the recording stood still or was written twice: leave the copies out")]
+    mend = "the recording stood still or was written twice: leave the copies out"
+    return [Finding(_severity(len(same), len(looks.index)), what + more, mend)]
 
 
 def _body(looks: Looks) -> list[Finding]:
@@ -141,7 +149,8 @@ def _sectors(drive: Drive, looks: Looks) -> list[Finding]:
     if len(bad) and len(bad) < 0.5 * len(lost):
         k = int(bad[np.argmax(lost[bad])])
         what = f"scan {looks.index[k]} lacks {lost[k]:.0f} deg of azimuth that the others see ({len(bad)} such scans)"
-        found.append(Finding("error", what, "packets were lost, or the file is cut off: leave these scans out"))
+        mend = "packets were lost, or the file is cut off: leave these scans out"
+        found.append(Finding(_severity(len(bad), len(lost)), what, mend))
     return found
 
 
