@@ -12,6 +12,7 @@ import sys
 import tempfile
 import threading
 import time
+import traceback
 from functools import cache
 from pathlib import Path
 
@@ -103,9 +104,11 @@ def launch() -> None:
             signal.signal(signal.SIGCHLD, signal.SIG_DFL)
             os.dup2(os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND), 2)
             try:
-                serve(store, None, "127.0.0.1", 0, True, None, Path(config))
-            finally:
-                os._exit(7)
+                serve(store, port=0, open_=True, config=Path(config))
+            except BaseException:
+                traceback.print_exc()
+            print("died 7", flush=True)  # or whoever waits for the address would wait for ever
+            os._exit(7)
         print(f"pid {child}", flush=True)
 
 
