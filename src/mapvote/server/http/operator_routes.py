@@ -12,6 +12,7 @@ from typing import Annotated, Any, Literal
 import structlog
 from anyio import to_thread
 from fastapi import APIRouter, Query, Request, Response
+from fastapi.responses import HTMLResponse
 
 from mapvote.codec.ballot import tile_key
 from mapvote.fusion.tile_vote import DAY_NS
@@ -126,7 +127,12 @@ def changes(
     return as_json(found)
 
 
-@router.get("/v1/changes/page", responses=problems(404), summary="What changed, as a page that needs no server")
+@router.get(
+    "/v1/changes/page",
+    response_class=HTMLResponse,
+    responses=problems(404),
+    summary="What changed, as a page that needs no server",
+)
 def changes_page(
     request: Request,
     old: Annotated[int, Query(alias="from", ge=LEAST, le=MOST)],
@@ -138,7 +144,7 @@ def changes_page(
     newest = store.current() if new is None else new
     page = page_between(store, old, newest, changes_between(store, old, newest, min_cells))
     kept = {"Content-Disposition": 'attachment; filename="changes.html"'}
-    return Response(page, media_type="text/html", headers=kept)
+    return HTMLResponse(page, headers=kept)
 
 
 @router.get("/v1/cells", response_model=dict[str, Any], responses=problems(), summary="The votes behind one cell")
