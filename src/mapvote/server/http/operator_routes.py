@@ -12,7 +12,6 @@ from typing import Annotated, Any, Literal
 import structlog
 from anyio import to_thread
 from fastapi import APIRouter, Query, Request, Response
-from fastapi.responses import HTMLResponse
 
 from mapvote.codec.ballot import tile_key
 from mapvote.fusion.tile_vote import DAY_NS
@@ -129,8 +128,8 @@ def changes(
 
 @router.get(
     "/v1/changes/page",
-    response_class=HTMLResponse,
-    responses=problems(404),
+    response_class=Response,
+    responses=problems(404) | {200: {"content": {"text/html": {"schema": {"type": "string"}}}}},
     summary="What changed, as a page that needs no server",
 )
 def changes_page(
@@ -144,7 +143,7 @@ def changes_page(
     newest = store.current() if new is None else new
     page = page_between(store, old, newest, changes_between(store, old, newest, min_cells))
     kept = {"Content-Disposition": 'attachment; filename="changes.html"'}
-    return HTMLResponse(page, headers=kept)
+    return Response(page, media_type="text/html", headers=kept)
 
 
 @router.get("/v1/cells", response_model=dict[str, Any], responses=problems(), summary="The votes behind one cell")
