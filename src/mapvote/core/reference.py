@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Generator
+from typing import NamedTuple
 
 import numpy as np
 from scipy import ndimage
 
-from mapvote.core.columns import fill_columns
+from mapvote.core.columns import dilated, fill_columns
 from mapvote.core.grid import TILE_CELLS, Grid, TileIndex, window_around
 from mapvote.core.ground import base_layers
 from mapvote.core.point_map import PointMap
@@ -22,11 +23,10 @@ def reference_window(point_map: PointMap, grid: Grid) -> Reference:
     return _finished(_laid_out(point_map, grid))
 
 
-def _finished(layout: Layout) -> Reference:
-    reached: Layout | Reference = layout
-    while not isinstance(reached, Reference):
-        reached = _step(reached)
-    return reached
+def _finished(layout: Layout | Reference) -> Reference:
+    while not isinstance(layout, Reference):
+        layout = _step(layout)
+    return layout
 
 
 def _laid_out(point_map: PointMap, grid: Grid) -> Layout:
@@ -99,6 +99,26 @@ def cut_reference(outer: Reference, window: Grid) -> Reference:
     )
 
 
+class Bordered(NamedTuple):
+    """A tile's planes, and what lies beside it."""
+
+    here: Reference
+    outer: Reference
+    """With a cell more on each side."""
+    near: U64
+    """(rows, cols) voxels that the map holds, or that touch such a one."""
+    known: U64
+    """(rows, cols) voxels that the map knows to be free, or has to be taken to know (:func:`above_ground_points`)."""
+
+
+def bordered(point_map: PointMap, window: Grid) -> Bordered:
+    """What the rules of detection ask of the map over ``window``."""
+    outer = reference_window(point_map, window.padded(1))
+    here = cut_reference(outer, window)
+    near = dilated(outer.occupied, outer.base, 1)[1:-1, 1:-1]
+    return Bordered(here, outer, near, here.free if here.free is not None else above_ground_points(point_map, window))
+
+
 class LocalMap:
     """The reference around a vehicle on the move: laid out over the tiles about it, anew only when it has left them.
 
@@ -121,8 +141,7 @@ class LocalMap:
         row, col = window.row0 + window.rows // 2, window.col0 + window.cols // 2
         middle = row // TILE_CELLS, col // TILE_CELLS
         if self.outer is None or window.intersection(self.outer.grid) != window:
-            ahead = self._ahead(middle, window)
-            self.outer = ahead if isinstance(ahead, Reference) else _finished(ahead)
+            self.outer = _finished(self._ahead(middle, window))
             self._middle, self._next = middle, None
         elif middle != self._middle:
             ahead = self._ahead(middle, window)

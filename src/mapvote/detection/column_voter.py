@@ -7,13 +7,12 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 
 from mapvote.config import VotingSettings
-from mapvote.core.columns import dilated
 from mapvote.core.grid import TileIndex
 from mapvote.core.point_map import PointMap
-from mapvote.core.reference import above_ground_points, cut_reference, reference_window
+from mapvote.core.reference import bordered
 from mapvote.core.types import U64
 from mapvote.detection.columns import weigh
-from mapvote.detection.counters import Evidence, free_words
+from mapvote.detection.counters import Evidence, newly_free
 from mapvote.detection.regions import apply_region_rules, around, beside_new
 from mapvote.detection.rules import ALL_RULES, Rules
 from mapvote.detection.votes import Judged, TileVotes
@@ -80,12 +79,9 @@ class ColumnVoter:
 
     def _judge(self, tile: TileIndex, counters: Mapping[TileIndex, U64]) -> Judged:
         """What the tile's own evidence says, cell by cell."""
-        window = self.point_map.lattice.tile(tile)
-        outer = reference_window(self.point_map, window.padded(1))
-        counts = around(self.point_map.lattice, counters, outer.grid, 0)
-        near = dilated(outer.occupied, outer.base, 1)[1:-1, 1:-1]
-        here = cut_reference(outer, window)
-        known = here.free if here.free is not None else above_ground_points(self.point_map, window)
+        lattice = self.point_map.lattice
+        here, outer, near, known = bordered(self.point_map, lattice.tile(tile))
+        counts = around(lattice, counters, outer.grid, 0)
         low = here.top_z - here.ground_z < self.voting.min_height_m
         weighed = weigh(counts, outer.base, here.occupied, near, known, low, self.rules)
         crowded = beside_new(counts, outer.occupied, outer.base)[1:-1, 1:-1]
@@ -93,8 +89,5 @@ class ColumnVoter:
 
 
 def _votes_of(found: Judged, counters: U64) -> TileVotes:
-    weighed = found.weighed
-    free = free_words(counters, found.here.occupied)
-    if found.here.free is not None:
-        free[found.here.free != 0] = 0  # what the map knows need not be sent
+    weighed, free = found.weighed, newly_free(counters, found.here)
     return TileVotes(weighed.tally, found.states, weighed.gone, found.remnants, weighed.new, free)

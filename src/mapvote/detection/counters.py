@@ -149,3 +149,11 @@ def free_words(planes: U64, occupied: U64) -> U64:
                     often |= planes[r, c, _THROUGH + k]
             out[r, c] = often & ~struck
     return out
+
+
+def newly_free(planes: U64, here: Reference) -> U64:
+    """:func:`free_words` of a tile, but for cells that the map knows: those need not be sent."""
+    free = free_words(planes, here.occupied)
+    if here.free is not None:
+        free[here.free != 0] = 0
+    return free

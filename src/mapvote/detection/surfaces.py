@@ -19,10 +19,10 @@ from mapvote.config import VotingSettings
 from mapvote.core.columns import below_top, dilated
 from mapvote.core.grid import Lattice, TileIndex
 from mapvote.core.point_map import PointMap
-from mapvote.core.reference import above_ground_points, cut_reference, reference_window
+from mapvote.core.reference import bordered
 from mapvote.core.types import I32, NO_VOTE, U8, U64, Bool, CellState, Reference
 from mapvote.core.voting import one_hot
-from mapvote.detection.counters import count_of, free_words
+from mapvote.detection.counters import count_of, newly_free
 from mapvote.detection.regions import HALO, JOIN_CELLS, beyond_tiles, fallen, unexplained
 from mapvote.detection.surface_counts import CROSSED, MET, PASSED, SurfaceEvidence
 from mapvote.detection.votes import TileVotes
@@ -128,10 +128,8 @@ class SurfaceVoter:
             here = found.here
             if (found.states == NO_VOTE).all():
                 continue
-            free = free_words(self.evidence.tiles[tile], here.occupied)
+            free = newly_free(self.evidence.tiles[tile], here)
             known = ~np.uint64(0) if here.free is None else here.free
-            if here.free is not None:
-                free[here.free != 0] = 0  # what the map knows need not be sent
             top = _below_tops(found.new)
             new = np.where(found.new != 0, found.new | found.beyond | ~(top | known), np.uint64(0))
             out[tile] = TileVotes(one_hot(found.states), found.states, found.gone, found.remnants, new, free)
@@ -144,10 +142,8 @@ class SurfaceVoter:
     def _judge(self, tile: TileIndex) -> _Judged:
         """What the tile's own evidence says, voxel by voxel and cell by cell."""
         window = self.point_map.lattice.tile(tile)
-        outer = reference_window(self.point_map, window.padded(1))
-        near = dilated(outer.occupied, outer.base, 1)[1:-1, 1:-1]
-        here, planes = cut_reference(outer, window), self.evidence.tiles[tile]
-        known = here.free if here.free is not None else above_ground_points(self.point_map, window)
+        here, _, near, known = bordered(self.point_map, window)
+        planes = self.evidence.tiles[tile]
         gone, stands, new, beyond = (np.zeros(window.shape, dtype=np.uint64) for _ in range(4))
         weigh_surfaces(planes, here.occupied, known, near, gone, stands, new, beyond)
         mapped, passed = here.occupied != 0, planes[..., PASSED]

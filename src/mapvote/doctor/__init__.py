@@ -10,14 +10,14 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from mapvote.core.point_map import PointMap, all_points
+from mapvote.core.point_map import PointMap
 from mapvote.core.types import F64, Drive, MapvoteError
 from mapvote.doctor.bags import check_bag
 from mapvote.doctor.ballots import check_ballot
 from mapvote.doctor.clouds import check_cloud
 from mapvote.doctor.drives import cheap_checks, examine_drive
 from mapvote.doctor.finding import Finding, Progress, in_order
-from mapvote.doctor.maps import check_map, examine_map
+from mapvote.doctor.maps import check_whole, examine_map
 from mapvote.doctor.on_map import check_on_map
 from mapvote.doctor.prior import NO_PRIOR
 from mapvote.formats.drives.options import DriveOptions
@@ -67,8 +67,8 @@ def diagnose(
 
 def _of_the_map(point_map: PointMap) -> list[Finding]:
     """What is wrong with a map, among findings about a drive."""
-    found = check_cloud(all_points(point_map)) + check_map(point_map)
-    return [replace(f, what=f"the map: {f.what}") for f in found if f.severity != "note"]
+    found = [f for f in check_whole(point_map) if f.severity != "note"]
+    return [replace(f, what=f"the map: {f.what}") for f in found]
 
 
 def must_be_usable(drive: Drive, progress: Progress | None = None) -> list[Finding]:

@@ -31,7 +31,7 @@ def examine_map(path: Path) -> tuple[list[Finding], PointMap | None]:
         point_map = read_map(path)
     except MapvoteError as error:
         return [Finding("error", str(error))], None
-    return in_order(check_cloud(all_points(point_map)) + check_map(point_map)), point_map
+    return in_order(check_whole(point_map)), point_map
 
 
 def examine_points(where: str, cloud: Cloud) -> tuple[list[Finding], PointMap | None]:
@@ -44,6 +44,11 @@ def examine_points(where: str, cloud: Cloud) -> tuple[list[Finding], PointMap | 
     except MapvoteError as error:
         return in_order([*found, Finding("error", str(error))]), None
     return in_order(found + check_map(point_map)), point_map
+
+
+def check_whole(point_map: PointMap) -> list[Finding]:
+    """All that a map shows by itself."""
+    return check_cloud(all_points(point_map)) + check_map(point_map)
 
 
 def check_map(point_map: PointMap) -> list[Finding]:

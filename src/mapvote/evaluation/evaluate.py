@@ -88,11 +88,7 @@ def evaluate(
         localisation=localisation(scene, drives),
         changed_areas=in_changed_areas(scene, truth, drives[0].vehicle, maps),
         ceilings=jury.ceilings(),
-        truth_sizes={
-            name: sizes_by_height(cells, truth, jury.first_map)
-            for name, cells in jury.truths.items()
-            if name in SIDE_BY_SIDE
-        },
+        truth_sizes={name: sizes_by_height(jury.truths[name], truth, jury.first_map) for name in SIDE_BY_SIDE},
         cases=entries,
         readings=found.readings,
         budgets=found.budgets,

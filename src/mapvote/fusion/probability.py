@@ -39,7 +39,7 @@ def alike_beside(rows: I64, cols: I64, kinds: I64) -> I32:
         return np.zeros(0, dtype=np.int32)
     high, wide = int(rows.min()), int(cols.min())
     width = int(cols.max()) - wide + 3
-    keys = ((rows - high + 1) * width + cols - wide + 1) * (int(kinds.max()) + 1) + kinds
     step = int(kinds.max()) + 1
+    keys = ((rows - high + 1) * width + cols - wide + 1) * step + kinds
     around = [(i * width + j) * step for i in (-1, 0, 1) for j in (-1, 0, 1) if i or j]
     return np.sum([np.isin(keys + offset, keys) for offset in around], axis=0, dtype=np.int32)

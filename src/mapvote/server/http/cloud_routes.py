@@ -9,7 +9,7 @@ from fastapi import APIRouter, Path, Query, Request, Response
 from mapvote.codec.arrays import compress
 from mapvote.core.types import MapvoteError
 from mapvote.server.http.auth import reviewer
-from mapvote.server.http.schemas import LEAST, MOST, VersionQuery, problems
+from mapvote.server.http.schemas import From, To, VersionQuery, problems
 from mapvote.server.http.services import services
 from mapvote.server.insight.clouds import evidence
 from mapvote.server.insight.history import picture_between
@@ -70,8 +70,8 @@ def level_of(
 )
 def picture(
     request: Request,
-    old: Annotated[int, Query(alias="from", ge=LEAST, le=MOST)],
-    new: Annotated[int, Query(alias="to", ge=LEAST, le=MOST)],
+    old: From,
+    new: To,
     x0: _Metres,
     y0: _Metres,
     x1: _Metres,

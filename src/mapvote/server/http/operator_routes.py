@@ -19,8 +19,9 @@ from mapvote.server.errors import Held, Unavailable
 from mapvote.server.http.auth import operator, reviewer, sees_names
 from mapvote.server.http.schemas import (
     AS_CSV,
-    LEAST,
-    MOST,
+    From,
+    MinCells,
+    Newest,
     Places,
     PublishAsk,
     Published,
@@ -112,9 +113,9 @@ async def roll_back(request: Request, ask: RollbackAsk) -> dict[str, int]:
 )
 def changes(
     request: Request,
-    old: Annotated[int, Query(alias="from", ge=LEAST, le=MOST)],
-    new: Annotated[int | None, Query(alias="to", ge=LEAST, le=MOST)] = None,
-    min_cells: Annotated[int, Query(ge=1, le=100_000)] = 1,
+    old: From,
+    new: Newest = None,
+    min_cells: MinCells = 1,
     lonlat: Annotated[bool, Query(description="in longitude and latitude, if the map says where it lies")] = False,
     format: Literal["geojson", "csv"] = "geojson",
 ) -> Response:
@@ -134,9 +135,9 @@ def changes(
 )
 def changes_page(
     request: Request,
-    old: Annotated[int, Query(alias="from", ge=LEAST, le=MOST)],
-    new: Annotated[int | None, Query(alias="to", ge=LEAST, le=MOST)] = None,
-    min_cells: Annotated[int, Query(ge=1, le=100_000)] = 1,
+    old: From,
+    new: Newest = None,
+    min_cells: MinCells = 1,
 ) -> Response:
     """A file to keep or to mail: the clouds of the largest changes, before and after."""
     store = services(request).store

@@ -37,6 +37,11 @@ Table = Literal["json", "csv"]
 Places = Literal["json", "geojson", "csv"]
 """How a list is asked for; what has a place can be GeoJSON too."""
 VersionQuery = Annotated[int, Query(ge=LEAST, le=MOST)]
+From = Annotated[int, Query(alias="from", ge=LEAST, le=MOST)]
+To = Annotated[int, Query(alias="to", ge=LEAST, le=MOST)]
+Newest = Annotated[int | None, Query(alias="to", ge=LEAST, le=MOST)]
+"""As :data:`To`, the newest version if it is left out."""
+MinCells = Annotated[int, Query(ge=1, le=100_000)]
 
 
 class Problem(BaseModel):

@@ -169,7 +169,7 @@ def add_version(connection: sa.Connection, version: Version, tiles: Mapping[Tile
 
 def version_row(version: Version) -> dict[str, Any]:
     """A version as the columns of its table."""
-    return {name: getattr(version, name) for name in (column.name for column in VERSION_COLUMNS)}
+    return {column.name: getattr(version, column.name) for column in VERSION_COLUMNS}
 
 
 def tile_row(number: int, index: TileIndex, hashes: TileHashes) -> dict[str, Any]:
