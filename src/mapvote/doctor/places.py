@@ -10,8 +10,8 @@ import numpy as np
 from mapvote.config import TrustSettings
 from mapvote.core.geometry import from_xyz_rpy
 from mapvote.core.types import F32, F64, Scan
-from mapvote.core.voxels import thin
 from mapvote.doctor.finding import Progress
+from mapvote.localisation.airborne import solid_sample
 from mapvote.localisation.map_window import MapWindow
 from mapvote.localisation.ndt import LEVELS, NdtMap, fitness, refine, thin_for_levels
 from mapvote.localisation.trust import Judge
@@ -64,7 +64,7 @@ def register_all(
 def place_of(around: MapWindow, i: int, scan: Scan, guesses: Sequence[F64], judge: Judge) -> Place:
     """From the guesses themselves, and from the best of a grid of 6 m and 3 deg around them if none of them fits."""
     clouds = thin_for_levels(scan.points)
-    few = scan.points[thin(scan.points, LEVELS[-1].points_m)].astype(np.float64)
+    few = solid_sample(scan.points, LEVELS[-1].points_m)
     best = Place(i, guesses[0], 0.0, 0.0, judge.settings.min_fit)
     for guess in guesses:
         ndt_map = around(guess[:3, 3])

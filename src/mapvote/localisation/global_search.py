@@ -20,7 +20,7 @@ from mapvote.core.geometry import inverse
 from mapvote.core.grid import CELL_SIZE
 from mapvote.core.point_map import PointMap
 from mapvote.core.types import F64, I64, U8, U64, MapvoteError, Scan
-from mapvote.core.voxels import thin
+from mapvote.localisation.airborne import solid_sample
 from mapvote.localisation.deskew import deskew
 from mapvote.localisation.map_window import MapWindow
 from mapvote.localisation.ndt import LEVELS, refine, thin_for_levels
@@ -93,7 +93,7 @@ class GlobalSearch:
 
     def find(self, scan: Scan) -> Found | None:
         """The best place, however good it is; None if nothing stands in the scan or nothing in the map is like it."""
-        few = scan.points[thin(scan.points, 1.0)].astype(np.float64)
+        few = solid_sample(scan.points, 1.0)
         height = height_above_lowest(few)
         near = few[:, 0] ** 2 + few[:, 1] ** 2 < _REACH_M**2
         sample = few[near & (height > _LOW_M) & (height < _HIGH_M)]
@@ -157,7 +157,7 @@ class GlobalSearch:
         if scan.time_s is not None:
             points = deskew(scan, Tracker(self.map_around, self.ndt).guess_motion(ndt_map, scan, T, None))
         T = refine(ndt_map, thin_for_levels(points), T).T_map_lidar
-        few = points[thin(points, LEVELS[-1].points_m)].astype(np.float64)
+        few = solid_sample(points, LEVELS[-1].points_m)
         return self.judge.fit(ndt_map, few, T), T
 
 

@@ -19,7 +19,7 @@ from mapvote.core.geometry import inverse
 from mapvote.core.point_map import PointMap
 from mapvote.core.sensors import Sensor
 from mapvote.core.types import F64, I64, Registration, Scan
-from mapvote.core.voxels import thin
+from mapvote.localisation.airborne import solid_sample
 from mapvote.localisation.deskew import deskew, motion_at, twist_between
 from mapvote.localisation.global_search import GlobalSearch
 from mapvote.localisation.map_window import MapWindow
@@ -165,7 +165,7 @@ class Localiser:
         fix = self._waiting[-1].fix
         T_map_lidar = fix.registration.T_map_lidar
         ndt_map = self.map_around(T_map_lidar[:3, 3])
-        few = fix.points[thin(fix.points, LEVELS[-1].points_m)].astype(np.float64)
+        few = solid_sample(fix.points, LEVELS[-1].points_m)
         return self.judge.judge(ndt_map, few, T_map_lidar)
 
     def _move(self, T_map_lidar: F64) -> None:
