@@ -20,8 +20,9 @@ class Sheet:
 
 
 def real_tables(bench: Bench, case: str) -> list[Sheet]:
-    """The ground, the unchanged street and the largest of its false changes, and what was cast into the scans."""
-    sheets = [_ground(bench), _unchanged(bench, case), _largest(bench, case), _changed(bench, case), _skipped(bench)]
+    """The ground, the unchanged street, its poses and largest false changes, and what was cast into the scans."""
+    unchanged = _unchanged(bench, case), _poses(bench, case), _largest(bench, case)
+    sheets = [_ground(bench), *unchanged, _changed(bench, case), _skipped(bench)]
     return [sheet for sheet in sheets if sheet.rows]
 
 
@@ -36,29 +37,35 @@ def as_markdown(sheets: list[Sheet], command: str) -> str:
 
 def _ground(bench: Bench) -> Sheet:
     g = bench.ground
-    headings = ("sensor over ground, median", "worst off", "path off by > 0.3 m", "occupied under the driven line")
+    headings = ("sensor over ground", "worst off", "off by > 0.3 m", "occupied under the path")
     row = f"{g.sensor_height_m:.3f} m", f"{g.worst_off_m:+.3f} m", f"{g.off_share:.1%}", f"{g.occupied_share:.1%}"
     return Sheet(f"{bench.name}, {bench.scans} scans: the ground", headings, [row])
 
 
 def _unchanged(bench: Bench, case: str) -> Sheet:
-    headings = (
-        "run", "ballots", "cells determined", "% of them false", "movers included", "% of mapped cells false",
-        "scans lost, %", "wrong by 0.5 m, %", "median error, m", "worst, m",
-    )  # fmt: skip
+    headings = "run", "cells determined", "false, %", "with movers, %", "of mapped, %"
     rows = []
     for name, run in bench.runs.items():
         f = unchanged_figures(run, case)
-        if run.ballots == 0:
-            rows.append((name, "0", *["-"] * 4, "100", *["-"] * 3))
-            continue
-        rows.append((
-            name, str(run.ballots), f"{f['determined_cells']:.0f}", f"{100 * f['false_share']:.3f}",
-            f"{100 * f['false_share_with_movers']:.3f}", f"{100 * f['false_share_of_mapped']:.3f}",
-            f"{100 * f['lost_share']:.0f}", f"{100 * f['wrong_share']:.1f}", f"{f['median_error_m']:.3f}",
-            f"{f['max_error_m']:.3f}",
-        ))  # fmt: skip
+        shares = (100 * f[key] for key in ("false_share", "false_share_with_movers", "false_share_of_mapped"))
+        figures = f"{f['determined_cells']:.0f}", *(f"{share:.3f}" for share in shares)
+        rows.append((name, *(figures if run.ballots else ["no ballot", *["-"] * 3])))
     return Sheet(f"{bench.name}: nothing changed; cells that {case} decides as changed", headings, rows)
+
+
+def _poses(bench: Bench, case: str) -> Sheet:
+    headings = "run", "ballots", "lost, %", "wrong, %", "median, m", "worst, m"
+    rows = []
+    for name, run in bench.runs.items():
+        f = unchanged_figures(run, case)
+        errors = f"{100 * f['wrong_share']:.1f}", f"{f['median_error_m']:.3f}", f"{f['max_error_m']:.3f}"
+        seen = run.ballots > 0
+        rows.append(
+            (name, str(run.ballots), f"{100 * f['lost_share'] if seen else 100:.0f}", *(errors if seen else "---"))
+        )
+    return Sheet(
+        f"{bench.name}: poses; scans that nobody could trust, those wrong by .5 m, and the rest", headings, rows
+    )
 
 
 def _largest(bench: Bench, case: str) -> Sheet:
@@ -66,12 +73,12 @@ def _largest(bench: Bench, case: str) -> Sheet:
     if bench.runs:
         found = largest_false_changes(next(iter(bench.runs.values())), case, 5)
         rows = [(f.kind.replace("_", "-"), f"{f.x}, {f.y}", f"{f.m2}", "yes" if f.on_mover else "no") for f in found]
-    headings = ("the largest of them in the first run", "x, y in the map, m", "m²", "where something moved")
+    headings = ("in the first run", "x, y in the map, m", "m²", "where something moved")
     return Sheet(f"{bench.name}: the largest false changes", headings, rows)
 
 
 def _changed(bench: Bench, case: str) -> Sheet:
-    headings = ("thing", "asked", "found by half of its cells", "touched", "cell recall", "rays that met one in a scan")
+    headings = ("thing", "asked", "half found", "touched", "cell recall", "rays a scan")
     rows, said = [], []
     for name, (run, asked) in bench.changed.items():
         said.append(f"{precision_near(asked, run.states[case], run.street.grid):.2f} ({name})")
