@@ -9,14 +9,15 @@ import numpy as np
 import pytest
 
 from hand_made import AtOnce
-from mapvote.codec.ballot import decode, encode, unpack_points, unpack_states, unpack_tally, validate
+from mapvote.codec.ballot import decode, encode, unpack_offer, unpack_points, unpack_states, unpack_tally, validate
 from mapvote.codec.words import unpack_words
-from mapvote.config import Settings, VotingSettings
+from mapvote.config import FuseSettings, Settings, VotingSettings
 from mapvote.core.grid import TILE_CELLS
-from mapvote.core.point_map import PointMap, map_from_points
+from mapvote.core.point_map import PointMap, all_fields, all_points, map_from_points
 from mapvote.core.reference import reference_window
 from mapvote.core.sensors import SENSORS
 from mapvote.core.types import F64, CellState, MapvoteError, Registration, Scan
+from mapvote.fusion.offline import update_map
 from mapvote.localisation.ndt import PosePrior
 from mapvote.localisation.tracker import Fix
 from mapvote.vehicle import Vehicle
@@ -106,6 +107,32 @@ def test_new_points_lie_in_changed_occupied_cells_one_to_a_voxel() -> None:
         assert len(np.unique(cells, axis=0)) == len(points)
         total += len(points)
     assert total >= 60  # ten columns of the wall, nine voxels above the ground in each, seen from inside the fan
+
+
+@pytest.mark.parametrize("kind", [np.uint8, np.float32, None])
+def test_new_points_have_the_sensors_intensity_if_the_map_holds_one(kind: type | None) -> None:
+    """Old walls and roads are dark, the new wall is bright: 0.8 of the scale on which the map's points are."""
+    point_map, dark = street_map(), 0.2 * (1.0 if kind is np.float32 else 255.0)
+    if kind is not None:
+        street = all_points(point_map)
+        point_map = map_from_points(street, fields={"intensity": np.full(len(street), dark, dtype=kind)})
+    vehicle = make(point_map)
+    for i in range(6):
+        scan, pose = scan_of(-1.0 + 0.1 * i, i)
+        bright = np.where(np.arange(len(scan.points)) < len(NEW), 0.8, 0.2).astype(np.float32)
+        vehicle.observe(replace(scan, intensity=bright), pose)
+    vehicle.finish()
+    ballot = decode(encode(vehicle.ballot()))
+    offers = [unpack_offer(tile) for tile in ballot.tiles if tile.new_points is not None]
+    if kind is None:
+        assert all(intensity is None for _, intensity in offers)
+        return
+    assert {int(v) for _, intensity in offers if intensity is not None for v in intensity} == {204}
+    after, _ = update_map(point_map, [ballot], FuseSettings(min_votes=1))
+    new = np.abs(all_points(after)[:, 0] - 8.25) + np.abs(all_points(after)[:, 1] - 3.5) < 1.2
+    found = all_fields(after)["intensity"][new & (all_points(after)[:, 2] > 0.3)]
+    assert len(found) > 10
+    np.testing.assert_allclose(found, 0.8 * (1.0 if kind is np.float32 else 255.0), atol=1e-6)
 
 
 def test_two_vehicles_with_the_same_scans_say_the_same_bytes() -> None:

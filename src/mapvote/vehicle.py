@@ -54,7 +54,9 @@ class Vehicle:
             with_sight=self.settings.voting.method == "paper",
         )
         self._voter = make_voter(self.settings, sensor, point_map)
-        self._new_points = NewPoints(point_map.lattice, beyond=self.settings.voting.method != "paper")
+        self._new_points = NewPoints(
+            point_map.lattice, beyond=self.settings.voting.method != "paper", intensity=point_map.has_intensity
+        )
 
     @property
     def report(self) -> DriveReport:
@@ -137,13 +139,14 @@ def _ballot_tile(
         change: votes.states == change if two_stage else votes.tally[..., change] > 0
         for change in (CellState.CHANGED_OCCUPIED, CellState.CHANGED_EMPTY)
     }
-    new_points = None
+    new_points = intensity = None
     if points is not None:
         window = point_map.lattice.tile(tile)
         base = reference_window(point_map, window).base
         new = np.where(changed[CellState.CHANGED_OCCUPIED], votes.new, np.uint64(0))
-        kept = points_in(window, points, new, base)
+        kept, bright = points_in(window, points, new, base)
         new_points = pack_plane(kept) if len(kept) else None
+        intensity = pack_plane(bright) if len(kept) and bright is not None and bright.any() else None
     gone, left = votes.gone, np.uint64(0) if votes.remnants is None else votes.remnants
     if gone is not None:
         gone = np.where(changed[CellState.CHANGED_EMPTY], gone, left)
@@ -153,6 +156,7 @@ def _ballot_tile(
         tally=None if two_stage else pack_plane(np.moveaxis(to_wire(votes.tally), -1, 0)),
         gone=None if gone is None else pack_words(gone),
         new_points=new_points,
+        intensity=intensity,
         free=None if votes.free is None else pack_words(votes.free),
     )
 

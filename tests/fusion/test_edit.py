@@ -59,9 +59,10 @@ def test_one_point_a_voxel_the_nearest_to_the_mean_whoever_came_first(seed: int,
     points = np.concatenate([points, points[:40]])  # the same point offered twice
     voters = rng.integers(0, 4, len(points)).astype(np.int32)
     tile = make_tile(wall([(1, 1)], [0.45]))
-    edited, added = add_points(tile, points, GRID.flat_cells(points), voters, min_votes)
+    bright = rng.integers(0, 256, len(points)).astype(np.uint8)
+    edited, added = add_points(tile, points, bright, GRID.flat_cells(points), voters, min_votes)
     order = rng.permutation(len(points))
-    again, _ = add_points(tile, points[order], GRID.flat_cells(points[order]), voters[order], min_votes)
+    again, _ = add_points(tile, points[order], bright[order], GRID.flat_cells(points[order]), voters[order], min_votes)
     assert again.points.tobytes() == edited.points.tobytes()
 
     cell, layer = GRID.flat_cells(points), np.floor(points[:, 2].astype(np.float64) / CELL_SIZE)

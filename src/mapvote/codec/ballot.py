@@ -48,6 +48,8 @@ class BallotTile(msgspec.Struct, frozen=True, kw_only=True):
     """(256, 256) uint64, see codec/words.py: which voxels of a changed-empty cell are gone (delete mask)."""
     new_points: bytes | None = None
     """(m, 3) float32 from the tile's corner, sorted by voxel key: one per 0.3 m voxel of changed-occupied cells."""
+    intensity: bytes | None = None
+    """(m,) uint8 of each of them, 255 for 1.0; None: the map holds no intensity, or the sensor measures none."""
     free: bytes | None = None
     """(256, 256) uint64, likewise: voxels that this drive's rays passed through."""
 
@@ -120,6 +122,17 @@ def unpack_points(data: bytes) -> F32:
     if most_in_a_cell(points) > MAX_POINTS_PER_CELL:
         raise MapvoteError(f"ballot: new_points holds more than {MAX_POINTS_PER_CELL} points in one cell")
     return points
+
+
+def unpack_offer(tile: BallotTile) -> tuple[F32 | None, U8 | None]:
+    """The new points (m, 3) of a tile and their intensity (m,); MapvoteError as :func:`unpack_points`, and if there is
+    not one for each."""
+    points = None if tile.new_points is None else unpack_points(tile.new_points)
+    if tile.intensity is None:
+        return points, None
+    if points is None:
+        raise MapvoteError(f"ballot: tile {tile.tile} has the intensity of new points, but none of those")
+    return points, unpack_plane(tile.intensity, "|u1", (len(points),), "ballot: intensity")
 
 
 @numba.njit(cache=True, nogil=True)
@@ -201,7 +214,6 @@ def validate(ballot: Ballot, max_bytes: int | None = None) -> None:
         for what, words in (("gone", tile.gone), ("free", tile.free)):
             if words is not None:
                 size += sum(part.nbytes for part in unpack_sparse(words, what))
-        if tile.new_points is not None:
-            size += unpack_points(tile.new_points).nbytes
+        size += sum(part.nbytes for part in unpack_offer(tile) if part is not None)
         if max_bytes is not None and size > max_bytes:
             raise MapvoteError(f"ballot: larger than {max_bytes} bytes when decompressed; send a shorter drive")

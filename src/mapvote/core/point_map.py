@@ -45,6 +45,11 @@ class PointMap:
         """The line of ``repr`` over a small picture from above, for notebooks."""
         return html_picture(repr(self), self.tiles.values())
 
+    @property
+    def has_intensity(self) -> bool:
+        """Whether its points say how bright they are, so that new ones should."""
+        return any("intensity" in tile.fields for tile in self.tiles.values())
+
     def tile(self, index: TileIndex) -> Tile:
         """One tile; the empty one where the map has none."""
         return self.tiles.get(index) or Tile.empty(self.lattice.tile(index))

@@ -14,7 +14,10 @@ from mapvote.core.columns import column_bits
 from mapvote.core.grid import CELLS, Grid, TileIndex
 from mapvote.core.ground import base_layers
 from mapvote.core.memory import Memory
-from mapvote.core.types import F32, F64, I32, I64, U64, Bool, check_array
+from mapvote.core.types import F32, F64, I32, I64, U8, U64, Bool, check_array
+
+_SCALES = (1.0, 255.0, 4095.0, 65535.0)
+"""What files give the brightest point: 1, or the largest number of 8, 12 or 16 bits, whatever type they keep it in."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -64,12 +67,17 @@ class Tile:
         fields = {name: column[~dropped] for name, column in self.fields.items()}
         return replace(self, points=self.points[~dropped], fields=fields)
 
-    def with_new(self, points: F32) -> Tile:
-        """The tile with more points (m, 3) after its own; their fields are 0, for ballots carry positions only."""
-        fields = {
-            name: np.concatenate([column, np.zeros(len(points), dtype=column.dtype)])
-            for name, column in self.fields.items()
-        }
+    def with_new(self, points: F32, intensity: U8 | None = None) -> Tile:
+        """The tile with more points (m, 3) after its own.
+
+        ``intensity`` (m,), 255 for 1.0, goes into the field of that name, on its scale; every other field is 0.
+        """
+        fields = {}
+        for name, column in self.fields.items():
+            new = np.zeros(len(points), dtype=column.dtype)
+            if name == "intensity" and intensity is not None:
+                new = (intensity * (brightest(column) / 255.0)).astype(column.dtype)
+            fields[name] = np.concatenate([column, new])
         return replace(self, points=np.concatenate([self.points, points]), fields=fields)
 
     @property
@@ -110,3 +118,10 @@ class Tile:
         words = np.zeros(CELLS, dtype=np.uint64)
         np.bitwise_or.at(words, self.cells[obstacle], np.uint64(1) << bit[obstacle].astype(np.uint64))
         return words.reshape(self.window.shape)
+
+
+def brightest(intensity: NDArray[Any]) -> float:
+    """The value that means 1.0 in a field of a map: the smallest scale in use that holds all of the values (n,)."""
+    highest = float(np.nanmax(intensity, initial=0.0))
+    scales = _SCALES[1:] if intensity.dtype.kind in "iu" else _SCALES
+    return next((scale for scale in scales if highest <= scale), highest)

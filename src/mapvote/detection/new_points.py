@@ -7,7 +7,7 @@ import numpy as np
 
 from mapvote.core.columns import GROUND_MARGIN_M, column_bit, height_above
 from mapvote.core.grid import CELL_SIZE, Grid, Lattice, TileIndex, tile_of_cells
-from mapvote.core.types import F32, F64, I32, I64, U64, Bool, Reference
+from mapvote.core.types import F32, F64, I32, I64, U8, U64, Bool, Reference
 from mapvote.core.voxels import voxel_keys
 from mapvote.perception.frontend import Observation, PlacedScan
 
@@ -56,10 +56,11 @@ def _beyond(
 class NewPoints:
     """One point per 0.3 m voxel, the first that was offered: candidates for changed-occupied cells."""
 
-    def __init__(self, lattice: Lattice, beyond: bool = True) -> None:
+    def __init__(self, lattice: Lattice, beyond: bool = True, *, intensity: bool = False) -> None:
         """``beyond``: also what lies outside the local grid. The paper has none of it, and the filter of moving objects
-        does not look there: only rules that ask more of a new voxel than that a scan struck it can take it."""
-        self.lattice, self.beyond = lattice, beyond
+        does not look there: only rules that ask more of a new voxel than that a scan struck it can take it.
+        ``intensity``: keep it with each point."""
+        self.lattice, self.beyond, self.intensity = lattice, beyond, intensity
         self._runs: list[F64] = []
         """Points in ascending order of their voxels, each run with one point a voxel."""
         self._waiting: list[F64] = []
@@ -71,26 +72,32 @@ class NewPoints:
         chosen = select(
             scan.points_map, scan.cell, scan.obstacle & ~seen.moving, may_be_new.ravel(), _flat_base(scan.reference)
         )
-        self.offer(scan.points_map[chosen])
+        self._offer_of(scan, np.flatnonzero(chosen))
         if self.beyond:
-            self.offer(self._strange_beyond(scan))
+            self._offer_of(scan, self._strange_beyond(scan))
 
-    def _strange_beyond(self, scan: PlacedScan) -> F64:
-        """(m, 3) obstacle points outside the local grid, within reach, in voxels that the map does not hold.
+    def _offer_of(self, scan: PlacedScan, chosen: I64) -> None:
+        intensity = None if scan.intensity is None or not self.intensity else scan.intensity[chosen]
+        self.offer(scan.points_map[chosen], intensity)
+
+    def _strange_beyond(self, scan: PlacedScan) -> I64:
+        """(m,) obstacle points outside the local grid, within reach, in voxels that the map does not hold.
 
         They cast no vote. But the upper storeys of what is new can be seen only from afar, below the sensor's top beam.
         """
         grid, outer = scan.outer.grid, scan.outer
         lattice, corner = (grid.lattice.x0, grid.lattice.y0), (grid.row0, grid.col0)
-        return scan.points_map[
-            _beyond(
-                scan.points_map, scan.cell, scan.origin_map, outer.ground_z, outer.base, outer.occupied, lattice, corner
-            )
-        ]
+        return _beyond(
+            scan.points_map, scan.cell, scan.origin_map, outer.ground_z, outer.base, outer.occupied, lattice, corner
+        )
 
-    def offer(self, points_map: F64) -> None:
-        """Points (n, 3), map metres."""
+    def offer(self, points_map: F64, intensity: F32 | None = None) -> None:
+        """Points (n, 3), map metres, and their intensity (n,); 0 where None."""
         if len(points_map):
+            if self.intensity:
+                points_map = np.column_stack(
+                    [points_map, np.zeros(len(points_map)) if intensity is None else intensity]
+                )
             self._waiting.append(points_map)
             self._count += len(points_map)
             if self._count > _COMPACT_AT:
@@ -103,25 +110,27 @@ class NewPoints:
         self._waiting, self._count = [], 0
 
     def _one_a_voxel(self, clouds: list[F64]) -> F64:
-        every = np.concatenate([np.zeros((0, 3)), *clouds])
+        every = np.concatenate([np.zeros((0, 4 if self.intensity else 3)), *clouds])
         keys = voxel_keys(every, self.lattice.x0, self.lattice.y0)
         _, first = np.unique(keys, return_index=True)  # sorted by key; the earliest of each
         return every[first]
 
     def by_tile(self) -> dict[TileIndex, F64]:
-        """Points (m, 3) in map metres of each tile, sorted by voxel key."""
+        """Points (m, 3) in map metres of each tile, sorted by voxel key; (m, 4) with their intensity."""
         points = self._one_a_voxel([*self._runs, *self._waiting])
         rows, cols = tile_of_cells(*self.lattice.cells_of(points))
         tiles = sorted({(int(r), int(c)) for r, c in zip(*np.unique([rows, cols], axis=1), strict=True)})
         return {(r, c): points[(rows == r) & (cols == c)] for r, c in tiles}
 
 
-def points_in(window: Grid, points_map: F64, words: U64, base: I32) -> F32:
-    """Those of ``points_map`` (n, 3) that lie in voxels of ``words`` (256, 256) of a tile, float32 from its corner."""
+def points_in(window: Grid, points_map: F64, words: U64, base: I32) -> tuple[F32, U8 | None]:
+    """Those of ``points_map`` (n, 3 or 4) that lie in voxels of ``words`` (256, 256) of a tile: (m, 3) float32 from its
+    corner, and the intensity (m,) of those that came with one, 255 for 1.0."""
     rows, cols, _ = window.indices_of(points_map)
     cell = (rows * window.cols + cols).astype(np.int32)
     wanted = select(points_map, cell, np.ones(len(points_map), np.bool_), words.ravel(), base.ravel())
-    return window.from_map(points_map[wanted])
+    kept = points_map[wanted]
+    return window.from_map(kept[:, :3]), np.rint(kept[:, 3] * 255.0).astype(np.uint8) if kept.shape[1] == 4 else None
 
 
 def _flat_base(reference: Reference) -> I32:

@@ -8,7 +8,7 @@ import numpy as np
 from mapvote.core.columns import EVERY_BIT
 from mapvote.core.grid import CELL_SIZE, CELLS
 from mapvote.core.tile import Tile
-from mapvote.core.types import F32, I32, I64, U64, Bool
+from mapvote.core.types import F32, I32, I64, U8, U64, Bool
 
 
 def delete_points(tile: Tile, gone: U64) -> tuple[Tile, int]:
@@ -29,12 +29,12 @@ def delete_points(tile: Tile, gone: U64) -> tuple[Tile, int]:
     return tile.without(dropped), int(dropped.sum())
 
 
-def add_points(tile: Tile, points: F32, cells: I64, voters: I32, min_votes: int) -> tuple[Tile, int]:
+def add_points(tile: Tile, points: F32, intensity: U8, cells: I64, voters: I32, min_votes: int) -> tuple[Tile, int]:
     """The tile with one representative per voxel that at least ``min_votes`` voters support, and how many came.
 
-    ``points`` (m, 3) from the tile's corner, ``cells`` (m,) flat, ``voters`` (m,) small integers. A voter supports
-    a voxel with a point in it or in the voxel above or below. Voxels that already hold a point of the map stay as
-    they are. New points follow the old ones, ordered by cell and height.
+    ``points`` (m, 3) from the tile's corner, ``intensity`` (m,) 255 for 1.0, ``cells`` (m,) flat, ``voters`` (m,) small
+    integers. A voter supports a voxel with a point in it or in the voxel above or below. Voxels that already hold a
+    point of the map stay as they are. New points follow the old ones, ordered by cell and height.
     """
     if not len(points):
         return tile, 0
@@ -46,10 +46,10 @@ def add_points(tile: Tile, points: F32, cells: I64, voters: I32, min_votes: int)
     taken = np.isin(_voxel(cells, layers), _voxel(tile.cells[near], own_layers))
     voxels = _voxel(cells, layers)
     order = np.argsort(voxels)
-    chosen = _representatives(points, voxels, voters, taken, order, min_votes)
+    chosen = _representatives(points, intensity, voxels, voters, taken, order, min_votes)
     if not len(chosen):
         return tile, 0
-    return tile.with_new(points[chosen]), len(chosen)
+    return tile.with_new(points[chosen], intensity[chosen]), len(chosen)
 
 
 def _voxel(cells: I64, layers: I64) -> I64:
@@ -58,9 +58,11 @@ def _voxel(cells: I64, layers: I64) -> I64:
 
 
 @numba.njit(cache=True, nogil=True)
-def _representatives(points: F32, voxels: I64, voters: I32, taken: Bool, order: I64, min_votes: int) -> I64:
+def _representatives(
+    points: F32, intensity: U8, voxels: I64, voters: I32, taken: Bool, order: I64, min_votes: int
+) -> I64:
     """Indices of one point per supported voxel, ascending by voxel: the one nearest to the mean of all offered there,
-    of several the first by x, y, z.
+    of several the first by x, y, z, intensity.
 
     ``order`` sorts ``voxels``; within a voxel any order gives the same: the mean is a sum of whole micrometres.
     """
@@ -84,14 +86,14 @@ def _representatives(points: F32, voxels: I64, voters: I32, taken: Bool, order: 
                 support += 1
             i += 1
         if support >= min_votes and not taken[order[start]]:
-            out[found] = _nearest_to_mean(points, order[start:stop])
+            out[found] = _nearest_to_mean(points, intensity, order[start:stop])
             found += 1
         start = stop
     return out[:found]
 
 
 @numba.njit(cache=True, nogil=True)
-def _nearest_to_mean(points: F32, some: I64) -> int:
+def _nearest_to_mean(points: F32, intensity: U8, some: I64) -> int:
     mean = np.zeros(3)
     for k in range(3):
         total = 0
@@ -103,14 +105,14 @@ def _nearest_to_mean(points: F32, some: I64) -> int:
         distance = 0.0
         for k in range(3):
             distance += (np.float64(points[i, k]) - mean[k]) ** 2
-        if distance < nearest or (distance == nearest and _before(points[i], points[best])):
+        if distance < nearest or (distance == nearest and _before(points, intensity, i, best)):
             best, nearest = i, distance
     return best
 
 
 @numba.njit(cache=True, nogil=True)
-def _before(a: F32, b: F32) -> bool:
+def _before(points: F32, intensity: U8, one: int, other: int) -> bool:
     for k in range(3):
-        if a[k] != b[k]:
-            return a[k] < b[k]
-    return False
+        if points[one, k] != points[other, k]:
+            return points[one, k] < points[other, k]
+    return intensity[one] < intensity[other]

@@ -222,11 +222,11 @@ def supported_words(votes: Sequence[TileVote], states: U8, min_votes: int) -> U6
     return gone
 
 
-def _offered(votes: Sequence[TileVote], states: U8, grid: Grid) -> tuple[F32, I64, I32]:
-    """(points, cells, voters) offered for cells decided changed-occupied, by vehicles that voted so there."""
+def _offered(votes: Sequence[TileVote], states: U8, grid: Grid) -> tuple[F32, U8, I64, I32]:
+    """(points, intensity, cells, voters) offered for cells decided changed-occupied, by vehicles that voted so."""
     offers = [np.empty((0, 3), np.float32) if vote.new_points is None else vote.new_points for vote in votes]
     if not any(map(len, offers)):
-        return np.empty((0, 3), np.float32), np.empty(0, np.int64), np.empty(0, np.int32)
+        return np.empty((0, 3), np.float32), np.empty(0, np.uint8), np.empty(0, np.int64), np.empty(0, np.int32)
     points = np.concatenate(offers)
     cells = grid.flat_cells(points)
     voters = np.repeat(np.arange(len(votes), dtype=np.int32), [len(offer) for offer in offers])
@@ -237,7 +237,8 @@ def _offered(votes: Sequence[TileVote], states: U8, grid: Grid) -> tuple[F32, I6
         for vote, mine in zip(votes, np.split(wanted, first[1:-1]), strict=True)
     ]
     keep = np.concatenate(meant)
-    return points[keep], cells[keep], voters[keep]
+    intensity = np.concatenate([vote.measured() for vote in votes])
+    return points[keep], intensity[keep], cells[keep], voters[keep]
 
 
 def _learn_free(tile: Tile, votes: Sequence[TileVote], min_votes: int, points_added: bool) -> Tile:

@@ -11,7 +11,7 @@ from mapvote.codec.ballot import (
     BallotTile,
     encode,
     tile_key,
-    unpack_points,
+    unpack_offer,
     unpack_states,
     unpack_tally,
 )
@@ -29,6 +29,7 @@ from mapvote.fusion.tile_vote import TileVote, select
 
 def tile_vote(ballot: Ballot, tile: BallotTile, digest: str) -> TileVote:
     """One tile of a ballot with its planes unpacked; MapvoteError if a plane is damaged."""
+    new_points, intensity = unpack_offer(tile)
     return TileVote(
         vehicle=ballot.vehicle,
         end_ns=ballot.end_ns,
@@ -37,7 +38,8 @@ def tile_vote(ballot: Ballot, tile: BallotTile, digest: str) -> TileVote:
         states=None if tile.states is None else unpack_states(tile.states),
         tally=None if tile.tally is None else unpack_tally(tile.tally),
         gone=None if tile.gone is None else Words.unpack(tile.gone, "gone"),
-        new_points=None if tile.new_points is None else unpack_points(tile.new_points),
+        new_points=new_points,
+        intensity=intensity,
         free=None if tile.free is None else Words.unpack(tile.free, "free"),
     )
 

@@ -37,10 +37,18 @@ class TileVote:
     remnants, and the whole column above ground."""
     new_points: F32 | None = None
     """(m, 3) from the tile's corner; used only where the vote is changed-occupied."""
+    intensity: U8 | None = None
+    """(m,) of the new points, 255 for 1.0; None: nobody measured it."""
     free: Words | None = None
     """Column words that rays passed through."""
     version: int = 0
     """Of the map that the vehicle drove with."""
+
+    def measured(self) -> U8:
+        """(m,) the intensity of the new points; 0 where nobody measured it."""
+        if self.intensity is not None:
+            return self.intensity
+        return np.zeros(0 if self.new_points is None else len(self.new_points), dtype=np.uint8)
 
     def spoken(self) -> Bool:
         """(256, 256) where this vote says anything at all."""
@@ -136,6 +144,7 @@ def fold(drives: Sequence[TileVote], grid: Grid) -> TileVote:
     tally = None if ordered[0].tally is None else np.zeros((*source.shape, N_STATES), dtype=np.uint16)
     gone: list[Words] = []
     points: list[F32] = []
+    intensity: list[U8] = []
     free: list[Words] = []
     for i, drive in enumerate(ordered):
         mine = source == i
@@ -147,7 +156,9 @@ def fold(drives: Sequence[TileVote], grid: Grid) -> TileVote:
         if drive.free is not None:
             free.append(drive.free.within(drive.spoken()))
         if drive.new_points is not None:
-            points.append(drive.new_points[mine.ravel()[grid.flat_cells(drive.new_points)]])
+            here = mine.ravel()[grid.flat_cells(drive.new_points)]
+            points.append(drive.new_points[here])
+            intensity.append(drive.measured()[here])
     return TileVote(
         vehicle=ordered[-1].vehicle,
         end_ns=ordered[-1].end_ns,
@@ -156,6 +167,7 @@ def fold(drives: Sequence[TileVote], grid: Grid) -> TileVote:
         tally=tally,
         gone=union(gone),
         new_points=np.concatenate(points) if points else None,
+        intensity=np.concatenate(intensity) if any(drive.intensity is not None for drive in ordered) else None,
         free=union(free) if free else None,
     )
 

@@ -19,7 +19,7 @@ import numpy as np
 
 from mapvote.core.geometry import transform
 from mapvote.core.reference import LocalMap
-from mapvote.core.types import F64, I32, Bool, MapvoteError, Reference, Scan
+from mapvote.core.types import F32, F64, I32, Bool, MapvoteError, Reference, Scan
 from mapvote.localisation.localiser import Localise
 from mapvote.localisation.ndt import PosePrior
 from mapvote.localisation.tracker import Fix
@@ -108,6 +108,8 @@ class PlacedScan:
     """(n,) points that stand above the ground of ``reference``; none outside it."""
     cell: I32
     """(n,) each point's cell in ``reference``, row * cols + col; -1 outside it."""
+    intensity: F32 | None = None
+    """(n,) in [0, 1]; None: the sensor does not measure it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -189,7 +191,9 @@ class Frontend:
         reference, outer = self._ground.at(origin_map)
         obstacle, cell = find_obstacles(points_map, reference)
         up_map = T_map_lidar[:3, 2]
-        return PlacedScan(index, points_map, origin_map, up_map, sigma_m, reference, outer, obstacle, cell)
+        return PlacedScan(
+            index, points_map, origin_map, up_map, sigma_m, reference, outer, obstacle, cell, fix.scan.intensity
+        )
 
     def _see(self, decided: list[Bool]) -> list[Observation]:
         """The oldest scans that wait, one for each mask of moving points (n,)."""

@@ -61,12 +61,14 @@ def test_fields_survive_an_edit_for_every_point_that_stays(tmp_path: Path) -> No
     edited, gone = delete_points(tile, np.full((256, 256), 2**64 - 1, dtype=np.uint64))
     new = np.array([[5.0, 5.0, 40.0]], dtype=np.float32)
     cells = edited.window.flat_cells(new)
-    edited, came = add_points(edited, new, cells, np.zeros(1, dtype=np.int32), 1)
+    bright = np.array([51], dtype=np.uint8)
+    edited, came = add_points(edited, new, bright, cells, np.zeros(1, dtype=np.int32), 1)
     assert gone > 0
     assert came == 1
     for i, p in enumerate(edited.points[:-1].tolist()):
         assert edited.fields["intensity"][i] == before[tuple(p)]
-    assert edited.fields["intensity"][-1] == 0
+    assert edited.fields["intensity"][-1] == 0.2 * 65535
+    assert edited.fields["red"][-1] == 0
 
 
 def test_noise_is_dropped_and_ground_classes_are_ground(tmp_path: Path) -> None:

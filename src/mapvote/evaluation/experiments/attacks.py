@@ -76,6 +76,7 @@ def shift(ballot: Ballot, point_map: PointMap, other: Ballot) -> Ballot:
             gone=None if tile.gone is None else pack_words(_shifted(unpack_words(tile.gone, "gone"), 0)),
             free=None if tile.free is None else pack_words(_shifted(unpack_words(tile.free, "free"), 0)),
             new_points=None if points is None else pack_plane(points),
+            intensity=None,
         )
 
     return msgspec.structs.replace(ballot, tiles=[moved(tile) for tile in ballot.tiles])
@@ -113,6 +114,7 @@ def _claim(ballot: Ballot, point_map: PointMap, lie: Callable[[U8, Bool], U8]) -
             states=pack_plane(states),
             gone=pack_words(gone),
             new_points=pack_plane(points) if len(points) else None,
+            intensity=None,
         )
 
     return msgspec.structs.replace(ballot, tiles=[told(tile) for tile in ballot.tiles])
