@@ -18,7 +18,7 @@ from rich.console import Console
 
 from mapvote.config import cache_folder, load_settings
 from mapvote.evaluation.experiments.matrix import EXPERIMENTS, Matrix
-from mapvote.evaluation.reporting import matrix_tables, requirements
+from mapvote.evaluation.reporting import matrix_tables, requirements, study_figures, style
 from mapvote.evaluation.results import MatrixResult, to_json
 from mapvote.formats.atomic import whole_file
 
@@ -35,6 +35,7 @@ def main() -> None:
     parser.add_argument("--config", type=Path, help="settings (TOML)")
     parser.add_argument("--workers", type=int, default=2, help="experiments at a time, each on one core")
     parser.add_argument("--drop-drives", action="store_true", help="delete scans (3 GB a seed) once they are done with")
+    parser.add_argument("--figures", type=Path, help="draw ablation and robustness here: PNG, SVG and PDF")
     parser.add_argument("--tables-only", action="store_true", help="only write what earlier runs measured")
     arguments = parser.parse_args()
     seeds = tuple(int(seed) for seed in arguments.seeds.split(","))
@@ -65,8 +66,22 @@ def main() -> None:
         if arguments.drop_drives:
             matrix.drop_drives(names, seed)
         write({name: dict(sorted(results[name].items())) for name in names if name in results}, arguments.out)
+    if arguments.figures is not None:
+        draw(results, arguments.figures)
     print(requirements.table(results))
     print(f"{arguments.out / 'matrix.md'}: every table; matrix.json beside it: all numbers")
+
+
+def draw(results: dict[str, dict[int, MatrixResult]], out: Path) -> None:
+    """What was measured of ablation and robustness, each in three formats; says what was not."""
+    drawn = {"ablation": study_figures.matrix_ablation(results), "robustness": study_figures.robustness(results)}
+    for name, figure in drawn.items():
+        if figure is None:
+            print(f"{name}: too little was measured to draw it")
+            continue
+        for kind in style.FORMATS:
+            style.save(figure, out / f"{name}.{kind}", kind)
+            print(out / f"{name}.{kind}")
 
 
 def write(results: dict[str, dict[int, MatrixResult]], out: Path) -> None:

@@ -101,6 +101,8 @@ def evaluate(
     if scenario == "real":
         if drive is None:
             raise typer.BadParameter("name the drive: mapvote evaluate real DRIVE", param_hint="DRIVE")
+        if figures is not None:
+            raise typer.BadParameter("of a recorded drive --out draws the pictures", param_hint="--figures")
         _evaluate_real(drive, scans, seed, json, out, config)
         return
     if drive is not None:
@@ -133,9 +135,10 @@ def evaluate(
             print(f"{picture}")
     if figures is not None:
         from mapvote.evaluation.reporting.gallery import gallery
+        from mapvote.evaluation.reporting.style import FORMATS
 
         with progress("drawing"):
-            drawn = gallery(evaluation, evaluation.best, figures, ("png", "svg", "pdf"))
+            drawn = gallery(evaluation, evaluation.best, figures, FORMATS)
         print(f"{figures}: {len(drawn)} figures, each as PNG, SVG and PDF")
 
 

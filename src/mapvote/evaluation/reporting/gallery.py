@@ -17,10 +17,11 @@ from mapvote.core.types import F32, F64, U8, Bool, CellState
 from mapvote.evaluation.baselines.nearest_neighbour import heights
 from mapvote.evaluation.evaluate import Evaluation
 from mapvote.evaluation.experiments.cases import YARDSTICKS, ballot_states, paper_cases
-from mapvote.evaluation.reporting import birdseye, figures, style
+from mapvote.evaluation.reporting import birdseye, figures, study_figures, style
 from mapvote.evaluation.reporting.tables import case_name
 from mapvote.evaluation.scoring.cells import UNSCORED
 from mapvote.evaluation.scoring.map_points import same_rows
+from mapvote.evaluation.scoring.reliability import reliability
 from mapvote.evaluation.scoring.truth import lay_on
 from mapvote.localisation.localiser import GivenPoses
 from mapvote.simulation.scenario import load_scenario
@@ -113,7 +114,24 @@ def drawn(evaluation: Evaluation, case: str) -> list[tuple[str, Figure, str]]:
         ("classes", figures.class_bars(shown, names), "Precision and recall of each class: Tables II and III."),
         ("bytes", figures.byte_bars(shown, names), "What a vehicle sends, by case."),
     ]
-    return pictures
+    return [*pictures, *_of_columns(evaluation)]
+
+
+def _of_columns(evaluation: Evaluation) -> list[tuple[str, Figure, str]]:
+    """Of columns, where they voted: their probabilities, and what each rule is worth where they voted rule by rule."""
+    out = []
+    if "columns" in evaluation.outcomes:
+        decisions, lattice = evaluation.outcomes["columns"].decisions, evaluation.first_map.lattice
+        found = {
+            state: reliability(decisions, lattice, evaluation.truth.strict, evaluation.window, state)
+            for state in (CellState.CHANGED_OCCUPIED, CellState.CHANGED_EMPTY)
+        }
+        caption = "How often cells changed that were told to, by the probability they were told with (strict truth)."
+        out.append(("reliability", study_figures.reliability_diagram(found), caption))
+    ablation = study_figures.ablation({name: [entry] for name, entry in evaluation.result.cases.items()})
+    if ablation is not None:
+        out.append(("ablation", ablation, "What each rule of columns is worth, added one by one (strict truth)."))
+    return out
 
 
 def _as_states(truth: U8) -> U8:

@@ -14,6 +14,7 @@ from mapvote.core.types import NO_VOTE, U8, CellState
 from mapvote.formats.atomic import whole_file
 
 Format = Literal["png", "svg", "pdf"]
+FORMATS: tuple[Format, ...] = "png", "svg", "pdf"
 INK, PAPER_WHITE, FAINT = "#22303c", "#ffffff", "#8795a1"
 NEW, GONE, STANDING, EMPTY, UNSURE = "#d7263d", "#1673c4", "#51687c", "#e6ecf1", "#f2c230"
 STATE_COLOURS = {

@@ -24,7 +24,8 @@ Kind = Literal["built", "demolished"]
 Size = Literal["large", "car", "small"]
 SMALL_AREA_M2 = 1.0
 CAR_LENGTH_M, CAR_HEIGHT_M = 6.0, 2.5
-"""What fits into these may be parked there: it is listed apart."""
+"""What fits into these may be a car, or what one left behind: it is listed apart. Several of them side by side, which
+lie within reach of each other, are no larger thing: each connected piece is asked."""
 KINDS: dict[int, Kind] = {CellState.CHANGED_OCCUPIED: "built", CellState.CHANGED_EMPTY: "demolished"}
 _NEVER = np.iinfo(np.int64).max
 _UNTIL = np.iinfo(np.int64).min
@@ -82,6 +83,8 @@ class ChangeObject:
     """(rows, cols) of its cells on the lattice."""
     box: tuple[float, float, float, float]
     """Lowest column and row, highest column and row, in lattice corners."""
+    longest_m: float
+    """The longer side of the box around the longest of its connected pieces."""
     height_m: float
     volume_m3: float
     """Of its columns, each from the lowest to the highest voxel that came or went."""
@@ -105,9 +108,7 @@ class ChangeObject:
         """How much of a thing it is, for lists that begin with what matters."""
         if self.area_m2 < SMALL_AREA_M2:
             return "small"
-        sides = sorted((self.box[2] - self.box[0], self.box[3] - self.box[1]))
-        low = self.height_m < CAR_HEIGHT_M and sides[1] * CELL_SIZE <= CAR_LENGTH_M
-        return "car" if low else "large"
+        return "car" if self.height_m < CAR_HEIGHT_M and self.longest_m <= CAR_LENGTH_M else "large"
 
     @property
     def share_for(self) -> float | None:
@@ -170,9 +171,10 @@ def change_objects(changed: Iterable[ChangedCells], min_cells: int = 1, reach_m:
     things = group(cells.rows, cells.cols, kinds, found.objects, reach_m)
     beside = alike_beside(cells.rows, cells.cols, kinds)
     probability = change_probability(cells.states, cells.votes, cells.against, beside)
+    lengths = _lengths(cells.rows, cells.cols, found.objects)[found.objects]
     by_thing = np.split(np.argsort(things, kind="stable"), np.cumsum(np.bincount(things))[:-1])
     return [
-        _object(cells, probability, mine, [outlines[p] for p in np.unique(found.polygons[mine])])
+        _object(cells, probability, lengths, mine, [outlines[p] for p in np.unique(found.polygons[mine])])
         for mine in by_thing
         if len(mine) >= min_cells
     ]
@@ -187,7 +189,19 @@ def _sorted(parts: Sequence[ChangedCells]) -> ChangedCells | None:
     return ChangedCells(**{name: values[order] for name, values in whole.items()})
 
 
-def _object(cells: ChangedCells, probability: F64, mine: I64, outline: list[list[Ring]]) -> ChangeObject:
+def _lengths(rows: I64, cols: I64, pieces: I32) -> I64:
+    """(k,) cells along the longer side of the box around each piece."""
+    k = int(pieces.max()) + 1
+    sides = []
+    for along in (rows, cols):
+        low, high = np.full(k, _NEVER), np.full(k, _UNTIL)
+        np.minimum.at(low, pieces, along)
+        np.maximum.at(high, pieces, along)
+        sides.append(high - low + 1)
+    return np.maximum(*sides)
+
+
+def _object(cells: ChangedCells, probability: F64, lengths: I64, mine: I64, outline: list[list[Ring]]) -> ChangeObject:
     rows, cols, versions = cells.rows[mine], cells.cols[mine], cells.versions[mine]
     kind = KINDS[int(cells.states[mine[0]])]
     made_in = sorted({int(v) for v in versions} - {0})
@@ -201,6 +215,7 @@ def _object(cells: ChangedCells, probability: F64, mine: I64, outline: list[list
         cells=len(mine),
         where=(rows, cols),
         box=(float(cols.min()), float(rows.min()), float(cols.max() + 1), float(rows.max() + 1)),
+        longest_m=float(lengths[mine].max() * CELL_SIZE),
         height_m=float(cells.top_m[mine].max()),
         volume_m3=float(columns.sum() * CELL_SIZE**2),
         points=int(cells.points[mine].sum()),
