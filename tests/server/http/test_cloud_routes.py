@@ -18,6 +18,7 @@ from hand_made import Say, make_ballot, states_plane, two_walls
 from mapvote.codec.ballot import encode
 from mapvote.config import FuseSettings
 from mapvote.core.types import CellState
+from mapvote.fusion.probability import change_probability
 from mapvote.server.http.app import create_app
 from mapvote.server.store.admission import accept, examine
 from mapvote.server.store.publish import publish
@@ -84,9 +85,10 @@ def test_what_came_and_went_between_two_versions(client: TestClient) -> None:
     assert len(cloud(client.get("/v1/clouds/changed", params={"new": pairs["new"]}).content, 16)[0]) == 3
 
 
-def test_evidence_tells_votes_age_share_and_state_of_each_cell(client: TestClient) -> None:
+def test_evidence_tells_votes_age_probability_and_state_of_each_cell(client: TestClient) -> None:
     plane = np.frombuffer(client.get("/v1/evidence/0/0").content, np.uint8).reshape(256, 256, 4)
-    assert plane[10, 11].tolist() == [2, 0, 255, CellState.CHANGED_EMPTY]
+    likely = change_probability(np.array([CellState.CHANGED_EMPTY], np.uint8), *np.array([[2], [0], [2]]))[0]
+    assert plane[10, 11].tolist() == [2, 0, round(255 * likely), CellState.CHANGED_EMPTY]
     assert plane[50, 50].tolist() == [2, 0, 0, CellState.UNCHANGED_EMPTY]
     unseen = np.frombuffer(client.get("/v1/evidence/0/1").content, np.uint8).reshape(256, 256, 4)
     assert (unseen == [0, 255, 0, 255]).all()

@@ -106,11 +106,14 @@ def test_the_cloud_is_drawn_and_nobody_else_is_asked(browser: Chromium, store: P
         press(browser, "3")
         for way in ("before", "swipe", "blink", "after"):
             browser.run(f"(s => (s.value = '{way}', s.onchange()))(document.querySelector('#compare'))")
-        for colour in ("plain", "age", "votes", "share", "height"):
+        for colour in ("plain", "age", "votes", "probability", "state", "height"):
             browser.run(f"(s => (s.value = '{colour}', s.onchange()))(document.querySelector('#colour'))")
+            if colour == "state":
+                browser.wait("location.hash.includes('vehicle=v1')")
         browser.run("document.querySelector('#changes button').click()")
         browser.wait("location.hash.includes('change=demolished.v2')")
         browser.wait("location.hash.includes('eye=')")
+        assert "of a cell of it" in text(browser, "#details")
         assert "<script>alert(1)</script>" in text(browser, "#versions"), "text stays text"
         assert {urlsplit(u).netloc for u in browser.requests if u.startswith("http")} == {urlsplit(url).netloc}
         assert browser.errors == []

@@ -92,7 +92,7 @@ def picture(
     summary="Votes cell by cell",
 )
 def evidence_of(request: Request, row: _Index, col: _Index, vehicle: str | None = None) -> Response:
-    """256 x 256 cells of four bytes: vehicles, days since the last one, share that says changed, what most say.
+    """256 x 256 cells of four bytes: vehicles, days since the last one, probability of a change, what most say.
 
     Of one ``vehicle`` only for reviewers and operators.
     """

@@ -9,7 +9,8 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from mapvote.core.grid import TILE_CELLS, Lattice, TileIndex
-from mapvote.core.types import I64, NO_VOTE, U8, CellState
+from mapvote.core.types import F64, I64, NO_VOTE, U8, CellState
+from mapvote.fusion.probability import alike_beside, change_probability
 from mapvote.server.insight.changes import missing_from
 from mapvote.server.insight.levels import Levels, cloud_bytes, make_levels, pack
 from mapvote.server.store.blobs import TileHashes
@@ -113,8 +114,8 @@ def _overview_bytes(made: Sequence[tuple[TileIndex, Levels]]) -> bytes:
 def evidence(store: Store, index: TileIndex, vehicle: str | None = None) -> U8:
     """(256, 256, 4) what standing ballots say of a tile's cells now, of all vehicles or of one.
 
-    Vehicles that determined the cell (255: or more); days since the last drive that did, 254 at most (255: never); the
-    share of them that says it changed, in 1/255; and the state that most of them say (NO_VOTE: nobody).
+    Vehicles that determined the cell (255: or more); days since the last drive that did, 254 at most (255: never); how
+    probable it is that the cell changed, in 1/255; and the state that most of them say (NO_VOTE: nobody).
     """
     with store.database.reading() as connection:
         judged = judged_votes(connection, index, Electorate(FOREVER, policy_in(connection), FOREVER))
@@ -145,11 +146,24 @@ def _summary(planes: list[U8], last: I64, now_ns: int) -> U8:
         for state in range(4):
             said[state] += plane == state
     total = said.sum(axis=0)
-    changed = said[CellState.CHANGED_OCCUPIED] + said[CellState.CHANGED_EMPTY]
     days = np.clip((now_ns - last) // _DAY_NS, 0, _NEVER_SEEN - 1)
     out = np.empty((TILE_CELLS, TILE_CELLS, 4), dtype=np.uint8)
     out[..., 0] = np.minimum(total, 255)
     out[..., 1] = np.where(last < 0, _NEVER_SEEN, days)
-    out[..., 2] = np.rint(255 * changed / np.maximum(total, 1))
+    out[..., 2] = np.rint(255 * _probability(said))
     out[..., 3] = np.where(total > 0, said.argmax(axis=0), NO_VOTE)
+    return out
+
+
+def _probability(said: I64) -> F64:
+    """(256, 256) that a cell changed as most vehicles say that say so, of vehicles by state (4, 256, 256); 0 where
+    nobody does."""
+    changes = said[CellState.CHANGED_OCCUPIED : CellState.CHANGED_EMPTY + 1]
+    rows, cols = np.nonzero(changes.any(axis=0))
+    kinds = changes[:, rows, cols].argmax(axis=0)
+    votes = changes[kinds, rows, cols]
+    states = (kinds + CellState.CHANGED_OCCUPIED).astype(np.uint8)
+    against = said[:, rows, cols].sum(axis=0) - votes
+    out = np.zeros(said.shape[1:])
+    out[rows, cols] = change_probability(states, votes, against, alike_beside(rows, cols, kinds))
     return out

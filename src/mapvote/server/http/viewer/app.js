@@ -242,7 +242,9 @@ for (const list of document.querySelectorAll("[data-list]")) {
 $("from").onchange = $("to").onchange = showRange;
 $("forget").onclick = () => (api.key.forget(), location.reload());
 for (const radio of document.getElementsByName("shade"))
-  radio.onchange = () => ((state.shade = radio.value), showTiles());
+  radio.onchange = () => ((state.shade = radio.value), address.write({ shade: radio.value === "seen" ? null : radio.value }), showTiles());
+const shade = document.querySelector(`[name=shade][value="${CSS.escape(address.read().shade ?? "")}"]`);
+if (shade) (shade.checked = true), (state.shade = shade.value);
 matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => state.manifest && showTiles());
 $("key-form").onsubmit = (event) => {
   event.preventDefault();

@@ -1,7 +1,7 @@
 // How a point looks: its place from four small integers, its colour from a ramp, its shape from what happened to it.
 
 export const MARK = { none: 0, removed: 1, added: 2 };
-export const COLOUR = { height: 0, plain: 1, age: 2, votes: 3, share: 4, state: 5 };
+export const COLOUR = { height: 0, plain: 1, age: 2, votes: 3, probability: 4, state: 5 };
 
 export const POINT_VERTEX = `
 precision highp float;

@@ -8,22 +8,24 @@ import { COLOUR } from "./shaders.js";
 const BLINK_MS = 800, HIGHEST = 40;
 const LEGENDS = {
   height: ["ground", "15 m and more above it"], plain: [], age: ["2 months ago or more", "seen today"], votes: ["no vote", "9 vehicles and more"],
-  share: ["all say unchanged", "all say changed"], state: ["unchanged", "changed"],
+  probability: ["0: nobody says so", "1"], state: ["unchanged", "changed"],
 };
 
 export class Tools {
-  constructor(stage, { setCompare, vehicles }) {
-    Object.assign(this, { stage, cloud: stage.cloud, stream: stage.stream, setCompare, vehicles });
+  constructor(stage, { setCompare }) {
+    Object.assign(this, { stage, cloud: stage.cloud, stream: stage.stream, setCompare });
     this.points = [];
     $("colour").onchange = () => this.colour($("colour").value);
     $("vehicle").onchange = () => this.colour("state");
+    this.wanted = link.read().vehicle;  // chosen once the server has told who there is
     $("compare").onchange = () => this.compare($("compare").value);
     $("swipe").oninput = () => this.swipe();
     for (const id of ["slice-low", "slice-high"]) $(id).oninput = () => this.slice();
     $("measure").onclick = () => this.measure(!this.measuring);
     const asked = link.read();
+    if (Number.isFinite(Number(asked.swipe ?? NaN))) $("swipe").value = Number(asked.swipe);
     if (asked.slice) [$("slice-low").value, $("slice-high").value] = asked.slice.split(",");
-    $("colour").value = asked.colour in COLOUR ? asked.colour : "height";
+    $("colour").value = asked.colour in COLOUR && asked.colour !== "state" ? asked.colour : "height";
     $("compare").value = ["before", "swipe", "blink"].includes(asked.compare) ? asked.compare : "after";
     this.slice();
     if ($("colour").value !== "height") this.colour($("colour").value);
@@ -32,7 +34,7 @@ export class Tools {
   }
 
   async colour(name) {
-    link.write({ colour: name === "height" ? null : name });
+    link.write({ colour: name === "height" ? null : name, vehicle: name === "state" ? $("vehicle").value : null });
     $("vehicle-row").hidden = name !== "state";
     this.legend(name);
     try {
@@ -52,7 +54,7 @@ export class Tools {
   }
 
   compare(name) {
-    link.write({ compare: name === "after" ? null : name });
+    link.write({ compare: name === "after" ? null : name, swipe: null });
     $("swipe-row").hidden = name !== "swipe";
     $("swipe-bar").hidden = name !== "swipe";
     clearInterval(this.blinking);
@@ -75,6 +77,7 @@ export class Tools {
     const share = Number($("swipe").value) / 100;
     this.cloud.sides = share;
     $("swipe-bar").style.left = `${100 * share}%`;
+    link.write({ swipe: share === 0.5 ? null : $("swipe").value });
     $("which").textContent = "";
     this.stream.plan();
     this.cloud.draw();
@@ -117,8 +120,17 @@ export class Tools {
     $("measured").replaceChildren(...marks);
   }
 
+  // Whose votes can be looked at one by one: the server tells reviewers and operators only.
   showVehicles(names) {
+    const chosen = this.wanted ?? $("vehicle").value;
     $("vehicle").replaceChildren(...names.map((name) => element("option", { value: name }, [name])));
+    if (names.includes(chosen)) $("vehicle").value = chosen;
+    const option = $("colour").querySelector("[value=state]");
+    option.hidden = option.disabled = !names.length;
+    if (!names.includes(this.wanted)) return;
+    this.wanted = null;
+    $("colour").value = "state";
+    this.colour("state");
   }
 }
 

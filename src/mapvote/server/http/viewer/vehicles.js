@@ -14,6 +14,7 @@ export async function showVehicles() {
   } catch {
     return;
   }
+  state.view.tools?.showVehicles(found.map((v) => v.vehicle));
   const against = found.filter((v) => v.verdict === "contradicts");
   const open = found.filter((v) => v.verdict === "undecidable").length;
   $("vehicles").replaceChildren(...against.map(item));
