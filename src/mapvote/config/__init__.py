@@ -62,6 +62,9 @@ class MappingSettings(Section):
     reach_m: float = Field(
         default=80.0, description="farther returns do not enter the map; the moving-object filter looks as far"
     )
+    drop_strays: bool = Field(
+        default=True, description="leave out points that are no surface of their own; false: as paper II, keep them"
+    )
     precise_prior_m: float = Field(default=0.1, description="a prior at least this good holds the map's frame")
     prior_memory_s: float = Field(default=20.0, gt=0, description="how long the errors of a coarser prior stay alike")
 

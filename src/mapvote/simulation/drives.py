@@ -91,7 +91,9 @@ class Stage:
 def _stage(scenario: Scenario, seed: int) -> Stage:
     world = make_world(scenario, seed)
     model = SENSORS[scenario.sensor]
-    sensor = replace(model, rate_hz=max(model.rate_hz, scenario.rate_hz))
+    noise = scenario.flaws.range_sigma_m
+    sigma_m = model.range_sigma_m if noise is None else noise
+    sensor = replace(model, rate_hz=max(model.rate_hz, scenario.rate_hz), range_sigma_m=sigma_m)
     routes = tuple(make_routes(scenario, world.terrain, seed))
     glazed, painted = (
         np.array([body.kind == kind for body in world.bodies], dtype=np.bool_) for kind in ("building", "parked car")

@@ -66,6 +66,7 @@ class Flaws(_Table):
     dark_share: float = Field(default=0.15, ge=0, le=1, description="share of the vehicles with dark paint")
     rain: float = Field(default=0.0, ge=0, le=1, description="share of the rays that meet a drop near the sensor")
     exhaust: float = Field(default=0.0, ge=0, le=1, description="share of the moving bodies with a plume behind them")
+    range_sigma_m: float | None = Field(default=None, ge=0, description="range noise; None: that of the sensor's model")
 
 
 class Scenario(_Table):

@@ -83,7 +83,8 @@ class Layer:
         obstacle = _standing(points, laid)
         driven = np.concatenate(self._driven) if self._driven else np.zeros((0, 3))
         dropped = self._trails(points, obstacle) | mirrored(points, laid, self.road)
-        dropped |= obstacle & strays(points, scans, driven, self.draft.lattice)
+        if self.settings.mapping.drop_strays:
+            dropped |= obstacle & strays(points, scans, driven, self.draft.lattice)
         point_map = map_from_points(points[~dropped], lattice=self.draft.lattice, road=self.road)
         tiles = {tile: replace(content, free=self._free(tile, point_map)) for tile, content in point_map.tiles.items()}
         return replace(point_map, tiles=tiles)
