@@ -135,6 +135,14 @@ def test_new_points_have_the_sensors_intensity_if_the_map_holds_one(kind: type |
     np.testing.assert_allclose(found, 0.8 * (1.0 if kind is np.float32 else 255.0), atol=1e-6)
 
 
+def test_the_paper_takes_no_new_points_from_beyond_its_local_grid_where_no_filter_looks() -> None:
+    """The new wall stands 8.25 m ahead; a grid of 12 m ends before it."""
+    for method, there in (("paper", False), ("columns", True)):
+        narrow = Settings(voting=VotingSettings(method=method, window_m=12.0))
+        points = drive(make(street_map(), narrow))._new_points.by_tile()
+        assert any((found[:, 0] > 8.0).any() for found in points.values()) == there
+
+
 def test_two_vehicles_with_the_same_scans_say_the_same_bytes() -> None:
     scans = [scan_of(-1.0 + 0.1 * i, i) for i in range(4)]
     point_map = street_map()

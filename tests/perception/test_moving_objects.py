@@ -7,10 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mapvote.config import MovingSettings
+from mapvote.config import MovingSettings, VotingSettings
+from mapvote.core.grid import CELL_SIZE, Lattice, window_around
 from mapvote.core.sensors import SENSORS, Sensor
 from mapvote.core.types import F64, Bool
 from mapvote.perception import moving_objects
+from mapvote.perception.moving_kernels import voxels
 from mapvote.perception.moving_objects import MovingFilter
 
 LIDAR_HEIGHT = 1.9
@@ -89,6 +91,17 @@ def test_movers_are_found_and_nothing_else_at_any_rate_and_number_of_beams(senso
     precision, recall = street.score(street.run(sensor, MovingSettings()))
     assert precision >= 0.97
     assert recall >= 0.60
+
+
+@pytest.mark.parametrize("x", [0.01, 0.15, 0.29])
+def test_whatever_can_vote_is_looked_at_up_to_the_corners_of_the_local_grid(x: float) -> None:
+    grid = window_around(Lattice(), x, x, VotingSettings().window_m)
+    rows, cols = np.array([0, 0, grid.rows, grid.rows]), np.array([0, grid.cols, 0, grid.cols])
+    corners = np.column_stack([grid.x0 + CELL_SIZE * cols, grid.y0 + CELL_SIZE * rows, np.ones(4)])
+    origin = np.array([x, x, LIDAR_HEIGHT])
+    assert np.linalg.norm(corners - origin, axis=1).max() > 56.5
+    voxel_of, _ = voxels(corners, np.ones(4, np.bool_), origin, MovingSettings().reach_m, CELL_SIZE)
+    assert (voxel_of >= 0).all()
 
 
 def test_what_comes_into_view_is_not_moving() -> None:

@@ -12,7 +12,7 @@ from mapvote.core.types import F32, F64
 from mapvote.simulation import shapes, simulate
 from mapvote.simulation.drives import _stage
 from mapvote.simulation.flaws import PULSE_M, Hits, Kinds, chance_of, mixed, spoil
-from mapvote.simulation.lidar import Caster, Sweep, sweep
+from mapvote.simulation.lidar import Caster, Sweep, measure, sweep
 from mapvote.simulation.scenario import Flaws, load_scenario
 
 SENSOR = SENSORS["hdl32e"]
@@ -50,6 +50,15 @@ def test_without_flaws_the_sensor_reports_the_truth() -> None:
     ranges, false, lost, hits = spoiled(NONE)
     np.testing.assert_array_equal(ranges, hits.ranges)
     assert len(false) == len(lost) == 0
+
+
+@pytest.mark.parametrize(("sigma_m", "noise"), [(None, SENSOR.range_sigma_m), (0.0, 0.0), (0.05, 0.05)])
+def test_ranges_are_as_noisy_as_the_scenario_says_or_else_the_model(sigma_m: float | None, noise: float) -> None:
+    sensor = _stage(load_scenario("corner", {"flaws": {"range_sigma_m": sigma_m}}), 1).sensor
+    assert sensor.range_sigma_m == noise
+    ranges = np.full(20_000, 20.0, dtype=np.float32)
+    noisy, _ = measure(sensor, ranges, np.ones_like(ranges), np.random.default_rng(1))
+    assert np.std(noisy - ranges) == pytest.approx(noise, rel=0.05)
 
 
 def test_a_wet_road_mirrors_the_wall_below_itself() -> None:

@@ -67,3 +67,20 @@ def test_a_wall_that_is_never_nearer_than_70_m_stays_and_returns_from_farther_th
     )  # fmt: skip
     layer.lay(drive, poses, np.ones(2, np.bool_), lambda: None)
     assert np.hypot(*all_points(layer.finish())[:, :2].T).max() <= 65.0
+
+
+@pytest.mark.parametrize("drop", [True, False])
+def test_what_one_scan_of_many_met_stays_out_of_the_map_unless_strays_are_kept(drop: bool) -> None:
+    mapping = Settings().mapping.model_copy(update={"drop_strays": drop})
+    poses = np.array([from_xyz_rpy(x, 0.0, 1.8, 0.0, 0.0, 0.0) for x in np.arange(60.0)])
+    road = sheet(np.arange(-20.0, 80.0, 0.5), np.arange(-8.0, 8.0, 0.5), np.zeros(1))
+    layer = Layer(map_from_points(road), Settings().model_copy(update={"mapping": mapping}))
+    stray = np.array([[30.1, 5.1, 2.0]])
+
+    def read_scan(i: int) -> Scan:
+        points = np.concatenate([road, stray]) if i == 50 else road
+        return Scan(i, transform(inverse(poses[i]), points).astype(np.float32))
+
+    drive = Drive(Path("once"), "survey", "once", SENSORS["hdl32e"], np.arange(60), read_scan)
+    layer.lay(drive, poses, np.ones(60, np.bool_), lambda: None)
+    assert (all_points(layer.finish())[:, 2] > 1.0).any() != drop
