@@ -1,6 +1,8 @@
 """The paper's tables on `as_published`, over several seeds: what the paper prints, what comes out here, and why.
 
     python benchmarks/published.py --seeds 41,42,43,44,45 --folder out/published --csv results/as_published.csv
+    python benchmarks/published.py --seeds 41 --cars 0,8,12 --csv results/as_published_cars.csv    # two stages over one
+    python benchmarks/published.py --seeds 41 --sensors vlp16,hdl32e,hdl64e                        # bytes and cost
 
 A seed whose JSON lies in the folder already is not driven again.
 """
@@ -17,21 +19,31 @@ from pathlib import Path
 from statistics import fmean
 from typing import Any
 
+from mapvote.core.sensors import SENSORS
+from mapvote.simulation.scenario import load_scenario
+
 CASES = "1", "2", "3", "4", "5"
 PAPER = {"1": 0.830, "2": 0.829, "3": 0.811, "4": 0.807, "5": 0.850}
 TRUTHS = "strict", "provenance", "could be known"
 SET, VOTES = "as set", "occluded votes"
 
 
-def driven(seed: int, folder: Path, cars: int | None) -> dict[str, Any]:
+SCENARIO = "as_published"
+CARS, SENSOR = load_scenario(SCENARIO).temporary_cars, load_scenario(SCENARIO).sensor
+"""The scenario's own: cars parked for one pass only, a vehicle, and the vehicles' LiDAR."""
+
+
+def driven(seed: int, folder: Path, cars: int = CARS, sensor: str = SENSOR) -> dict[str, Any]:
     """The numbers of one seed, as ``mapvote evaluate`` writes them."""
-    name = folder / (f"{seed}.json" if cars is None else f"{seed}_cars_{cars}.json")
-    if not name.exists():
-        words = ["evaluate", "as_published", "--seed", str(seed), "--case", ",".join(CASES), "--readings"]
-        words += ["--explain", "1,5", "--json", str(name), "--out", str(folder / f"pictures_{seed}")]
-        words += [] if cars is None else ["--cars", str(cars)]
+    other = [f"cars_{cars}"] * (cars != CARS) + [sensor] * (sensor != SENSOR)
+    name = "_".join([str(seed), *other])
+    file = folder / f"{name}.json"
+    if not file.exists():
+        words = ["evaluate", SCENARIO, "--seed", str(seed), "--case", ",".join(CASES), "--readings"]
+        words += ["--explain", "1,5", "--json", str(file), "--out", str(folder / f"pictures_{name}")]
+        words += ["--cars", str(cars), "--sensor", sensor]
         subprocess.run([sys.executable, "-m", "mapvote", *words], check=True)
-    return dict(json.loads(name.read_text()))
+    return dict(json.loads(file.read_text()))
 
 
 def macro(run: dict[str, Any], case: str, truth: str, reading: str = SET) -> float:
@@ -108,30 +120,70 @@ def costs(runs: list[dict[str, Any]]) -> None:
     table(["seed", "simulate and map, s", "vote, s", "score, readings, causes, s"], rows)
 
 
+def by_cars(runs: dict[int, list[dict[str, Any]]]) -> None:
+    """What two stages gain over one, and many votes a scan over one, by the cars that park for one pass only."""
+    rows = []
+    for cars, some in runs.items():
+        gains = []
+        for a, b in (("1", "3"), ("2", "4"), ("1", "2"), ("3", "4")):
+            each = [macro(run, a, "provenance") - macro(run, b, "provenance") for run in some]
+            gains.append(f"{fmean(each):+.3f} ({min(each):+.3f} to {max(each):+.3f})")
+        means = [f"{fmean(macro(run, case, 'provenance') for run in some):.3f}" for case in CASES]
+        rows.append([str(cars), str(len(some)), *means, *gains])
+    table(["cars a pass", "seeds", *(f"case {case}" for case in CASES), "1 - 3", "2 - 4", "1 - 2", "3 - 4"], rows)
+
+
+def by_sensor(runs: dict[str, list[dict[str, Any]]]) -> None:
+    """Bytes of a vehicle's votes and ballot, and milliseconds a scan, by the LiDAR."""
+    rows = []
+    for sensor, some in runs.items():
+        row = [str(SENSORS[sensor].beams)]
+        for key in ("state_bytes_per_vehicle", "bytes_per_vehicle"):
+            for case in ("1", "3", "5"):
+                row.append(f"{fmean(n for run in some for n in run['cases'][case][key]) / 1000:.1f}")
+        stages = [stage for run in some for stage in run["timings"]["stages_ms"].values()]
+        row += [f"{fmean(stage[name] for stage in stages):.1f}" for name in ("localise", "moving", "see")]
+        row += [f"{fmean(macro(run, case, 'provenance') for run in some):.3f}" for case in ("1", "3", "5")]
+        rows.append(row)
+    three = [f"case {case}" for case in ("1", "3", "5")]
+    head = ["beams", *(f"votes, kB, {c}" for c in three), *(f"ballot, kB, {c}" for c in three)]
+    table([*head, "localise, ms a scan", "movers, ms", "see, ms", *(f"macro-F1, {c}" for c in three)], rows)
+
+
+def write_csv(file: Path, runs: dict[tuple[int, str], list[dict[str, Any]]]) -> None:
+    """Every macro-F1, a line each."""
+    with file.open("w", newline="") as opened:
+        out = csv.writer(opened, lineterminator="\n")
+        out.writerow(["seed", "cars", "sensor", "reading", "truth", "case", "macro_f1"])
+        for (cars, sensor), some in runs.items():
+            for run in some:
+                for reading, cases in run["readings"].items():
+                    for case, truths in cases.items():
+                        first = [run["seed"], cars, sensor, reading]
+                        out.writerows([*first, t, case, f"{v['macro_f1']:.4f}"] for t, v in truths.items())
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", default="41,42,43,44,45")
-    parser.add_argument(
-        "--cars", type=int, help="cars parked for one pass only, a vehicle; the scenario's own otherwise"
-    )
+    parser.add_argument("--cars", default=str(CARS), help="cars parked for one pass only, a vehicle, by commas")
+    parser.add_argument("--sensors", default=SENSOR, help="the vehicles' LiDARs, by commas")
     parser.add_argument("--folder", type=Path, default=Path("out/published"), help="JSON and pictures of each seed")
     parser.add_argument("--csv", type=Path)
     options = parser.parse_args()
     options.folder.mkdir(parents=True, exist_ok=True)
-    runs = [driven(int(seed), options.folder, options.cars) for seed in options.seeds.split(",")]
-    demands(runs)
-    tables(runs)
-    costs(runs)
+    cars, sensors = [int(n) for n in options.cars.split(",")], options.sensors.split(",")
+    seeds = [int(seed) for seed in options.seeds.split(",")]
+    runs = {(n, s): [driven(seed, options.folder, n, s) for seed in seeds] for n in cars for s in sensors}
+    for (n, sensor), some in runs.items():
+        print(f"\n{n} cars a pass, {sensor}\n")
+        demands(some)
+        tables(some)
+        costs(some)
+    by_cars({n: runs[n, sensors[0]] for n in cars})
+    by_sensor({sensor: runs[cars[0], sensor] for sensor in sensors})
     if options.csv is not None:
-        with options.csv.open("w", newline="") as file:
-            out = csv.writer(file, lineterminator="\n")
-            out.writerow(["seed", "reading", "truth", "case", "macro_f1"])
-            for run in runs:
-                for reading, cases in run["readings"].items():
-                    for case, truths in cases.items():
-                        out.writerows(
-                            [run["seed"], reading, t, case, f"{v['macro_f1']:.4f}"] for t, v in truths.items()
-                        )
+        write_csv(options.csv, runs)
 
 
 if __name__ == "__main__":

@@ -176,7 +176,7 @@ def beside_the_paper(result: EvaluationResult) -> Section:
             f"meets what the others do not, as cars parked during one pass: {ours['1'] - ours['3']:+.3f} here, "
             f"{paper_tables.F1['1'] - paper_tables.F1['3']:+.3f} there.",
         ],
-        tables=[readings_table(result.readings, "provenance")],
+        tables=[readings_table(result.readings, "provenance", result.settings["paper"]["occluded"])],
     )
 
 
