@@ -21,7 +21,7 @@ Scenario = Annotated[
     str,
     typer.Argument(
         metavar="SCENARIO",
-        help="street570, as_published, clear, street, junction, terrace, corner, or a TOML file of your own",
+        help="street570, as_published, clear, street, junction, terrace, half_gone, corner, or a TOML file of your own",
     ),
 ]
 Seed = Annotated[int, typer.Option(metavar="N", help="decides layout, clutter, traffic and noise")]
