@@ -137,9 +137,9 @@ def test_new_points_have_the_sensors_intensity_if_the_map_holds_one(kind: type |
 
 def test_the_paper_takes_no_new_points_from_beyond_its_local_grid_where_no_filter_looks() -> None:
     """The new wall stands 8.25 m ahead; a grid of 12 m ends before it."""
-    for method, there in (("paper", False), ("columns", True)):
-        narrow = Settings(voting=VotingSettings(method=method, window_m=12.0))
-        points = drive(make(street_map(), narrow))._new_points.by_tile()
+    narrow = VotingSettings(method="paper", window_m=12.0), VotingSettings(method="columns", window_m=12.0)
+    for voting, there in zip(narrow, (False, True), strict=True):
+        points = drive(make(street_map(), Settings(voting=voting)))._new_points.by_tile()
         assert any((found[:, 0] > 8.0).any() for found in points.values()) == there
 
 
