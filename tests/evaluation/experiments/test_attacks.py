@@ -105,7 +105,7 @@ def test_false_points_leave_the_states_right_and_delete_whole_columns() -> None:
 
 
 @pytest.mark.parametrize("name", ATTACKS)
-@pytest.mark.parametrize("k", [1, 2, 3])
+@pytest.mark.parametrize("k", [1, 2, pytest.param(3, marks=pytest.mark.slow)])
 def test_k_liars_decide_nothing_among_k_plus_1_honest_vehicles_that_agree(name: str, k: int) -> None:
     """Where all honest vehicles say the same, min_votes = k + 1 decides and deletes as without the liars.
 

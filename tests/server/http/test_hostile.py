@@ -212,6 +212,7 @@ def schemathesis(site: Site, examples: int, *options: str) -> tuple[int, int]:
     return int(tested[1]), int(tested[2])
 
 
+@pytest.mark.slow
 def test_schemathesis_on_every_route(site: Site) -> None:
     tested, declared = schemathesis(site, 5)
     assert tested == declared >= 12

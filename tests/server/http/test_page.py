@@ -119,6 +119,7 @@ def test_the_cloud_is_drawn_and_nobody_else_is_asked(browser: Chromium, store: P
         assert browser.errors == []
 
 
+@pytest.mark.slow
 def test_the_desk_is_worked_by_keyboard_and_publishing_obeys(
     browser: Chromium, database_url: str, tmp_path: Path
 ) -> None:
@@ -164,7 +165,9 @@ def test_tab_alone_comes_to_every_control_that_is_shown(browser: Chromium, store
         assert browser.run(f"{shown}.filter(e => !e.reached).map(e => e.outerHTML.slice(0, 80))") == []
 
 
-@pytest.mark.parametrize(("width", "height", "zoom"), [(1280, 800, 1), (360, 740, 1), (1280, 800, 2)])
+@pytest.mark.parametrize(
+    ("width", "height", "zoom"), [(360, 740, 1), *(pytest.param(1280, 800, z, marks=pytest.mark.slow) for z in (1, 2))]
+)
 def test_axe_finds_nothing_and_nothing_is_cut_off(
     browser: Chromium, store: Path, tmp_path: Path, width: int, height: int, zoom: int
 ) -> None:

@@ -87,6 +87,7 @@ def test_a_full_disk(small_disk: Path, tmp_path: Path) -> None:
     assert "Traceback" not in (tmp_path / "log").read_text()
 
 
+@pytest.mark.slow
 def test_no_room_for_the_file_to_grow(tmp_path: Path) -> None:
     """As a full disk, but without being root: the process may not make its files longer than 3 MB for a while."""
     url = f"sqlite:///{tmp_path / 'store.db'}"
@@ -130,6 +131,7 @@ def ext4(tmp_path: Path) -> Iterator[Path]:
     subprocess.run(["umount", "-l", str(disk)], check=True)
 
 
+@pytest.mark.slow
 def test_a_disk_that_turns_read_only_under_the_server(ext4: Path, tmp_path: Path) -> None:
     """As Linux does after a write error: the file system is read-only from one moment to the next, with files open."""
     url = f"sqlite:///{ext4 / 'store.db'}"

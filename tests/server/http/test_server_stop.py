@@ -49,7 +49,7 @@ def send_until_stopped(url: str, vehicle: str, point_map: PointMap, acknowledged
             acknowledged.add((vehicle, drive))
 
 
-@pytest.mark.parametrize("after_s", [0.3, 1.0])
+@pytest.mark.parametrize("after_s", [0.3, pytest.param(1.0, marks=pytest.mark.slow)])
 def test_a_stop_under_load_is_soon_and_loses_nothing(tmp_path: Path, after_s: float) -> None:
     point_map = street()
     store = Store.create(f"sqlite:///{tmp_path / 's.db'}", point_map)

@@ -208,7 +208,7 @@ def test_from_the_command_line(store: Store, honest: Store, database_url: str) -
 
 
 @given(seed=st.integers(0, 2**32 - 1))
-@settings(max_examples=12, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=5, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_any_history(tmp_path_factory: pytest.TempPathFactory, seed: int) -> None:
     """Random rounds of six vehicles, with publishes and rollbacks in between, all on the first map."""
     folder, number = tmp_path_factory.mktemp("any"), next(_number)

@@ -33,12 +33,12 @@ def disagreements(make: MakeStore, seeds: range, steps: int = 25) -> list[str]:
 
 
 def test_store_and_rules_agree(sqlite_stores: MakeStore) -> None:
-    assert disagreements(sqlite_stores, range(10)) == []
+    assert disagreements(sqlite_stores, range(4)) == []
 
 
 @pytest.mark.slow
 def test_store_and_rules_agree_in_many_histories(sqlite_stores: MakeStore) -> None:
-    assert disagreements(sqlite_stores, range(10, 170)) == []
+    assert disagreements(sqlite_stores, range(4, 170)) == []
 
 
 @pytest.mark.slow
