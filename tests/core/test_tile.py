@@ -1,10 +1,13 @@
 """One cloud becomes tiles: nothing is lost, nothing moves, and the ground shows no seam."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from hand_made import make_tile
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Grid, Lattice
 from mapvote.core.point_map import all_points, map_from_points
 from mapvote.core.types import F64, MapvoteError
@@ -67,3 +70,17 @@ def test_any_finite_cloud_is_kept_whole(points: list[tuple[float, float, float]]
 def test_a_cloud_that_is_no_map_is_refused(points: F64) -> None:
     with pytest.raises(MapvoteError):
         map_from_points(points)
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.booleans())
+def test_what_an_edited_tile_takes_along_is_what_it_would_work_out_afresh(seed: int, known: bool) -> None:
+    rng = np.random.default_rng(seed)
+    tile = make_tile(rng.uniform(0.0, (76.8, 76.8, 9.0), (200, 3)).astype(np.float32))
+    if known:
+        assert tile.obstacle_words.any(), "worked out, with all that it follows from"
+    few = rng.uniform(0.0, (76.8, 76.8, 9.0), (5, 3)).astype(np.float32)
+    edited = tile.without(rng.random(200) < 0.3).with_new(few).but(free=np.ones((TILE_CELLS, TILE_CELLS), np.uint64))
+    afresh = replace(edited)
+    for name in ("cells", "base", "columns", "obstacle_words"):
+        np.testing.assert_equal(getattr(edited, name), getattr(afresh, name))

@@ -20,6 +20,15 @@ _SCALES = (1.0, 255.0, 4095.0, 65535.0)
 """What files give the brightest point: 1, or the largest number of 8, 12 or 16 bits, whatever type they keep it in."""
 
 
+_FOLLOWS_FROM = {
+    "cells": {"points"},
+    "base": {"ground_z"},
+    "columns": {"points", "ground_z"},
+    "obstacle_words": {"points", "ground_z"},
+}
+"""What a tile works out once, and the planes that it follows from."""
+
+
 @dataclass(frozen=True, repr=False)
 class Tile:
     """76.8 m x 76.8 m of map. ``points`` are the product; the planes are what the map knows besides.
@@ -62,10 +71,23 @@ class Tile:
         """What was worked out does not travel to other processes."""
         return Tile, (self.window, self.points, self.ground_z, self.free, self.memory, self.fields)
 
+    def but(self, **planes: Any) -> Tile:
+        """The tile with other ``planes``; what was worked out of those that stay goes along."""
+        other = replace(self, **planes)
+        for name, of in _FOLLOWS_FROM.items():
+            if name in self.__dict__ and not of & planes.keys():
+                other.__dict__[name] = self.__dict__[name]
+        return other
+
     def without(self, dropped: Bool) -> Tile:
         """The tile without some of its points (n,); the others keep their fields."""
-        fields = {name: column[~dropped] for name, column in self.fields.items()}
-        return replace(self, points=self.points[~dropped], fields=fields)
+        left = ~dropped
+        fields = {name: column[left] for name, column in self.fields.items()}
+        other = self.but(points=self.points[left], fields=fields)
+        other.__dict__["cells"] = self.cells[left]
+        bit, obstacle = self.columns
+        other.__dict__["columns"] = bit[left], obstacle[left]
+        return other
 
     def with_new(self, points: F32, intensity: U8 | None = None) -> Tile:
         """The tile with more points (m, 3) after its own.
@@ -78,7 +100,7 @@ class Tile:
             if name == "intensity" and intensity is not None:
                 new = (intensity * (brightest(column) / 255.0)).astype(column.dtype)
             fields[name] = np.concatenate([column, new])
-        return replace(self, points=np.concatenate([self.points, points]), fields=fields)
+        return self.but(points=np.concatenate([self.points, points]), fields=fields)
 
     @property
     def index(self) -> TileIndex:

@@ -7,7 +7,7 @@ same one is always taken.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
@@ -124,7 +124,7 @@ def fuse_tile(
     edited, added, deleted = _edit(tile, heard.votes, heard.states, heard.quorum)
     if edited is not tile:
         memory = changed_in(version, tile, edited)
-        edited = replace(edited, memory=remembered(memory, tile, edited, heard.votes, heard.states))
+        edited = edited.but(memory=remembered(memory, tile, edited, heard.votes, heard.states))
     return Decision(heard.states, heard.tally, len(heard.votes), added, deleted), edited
 
 
@@ -248,7 +248,7 @@ def _learn_free(tile: Tile, votes: Sequence[TileVote], min_votes: int, points_ad
     map is never free. Until enough vehicles have passed, a tile that never learned stays so: no free voxel at all would
     say that nothing new can be known there.
     """
-    passed = [v.free.within(v.spoken()) for v in votes if v.free is not None]
+    passed = [vote.passed() for vote in votes if vote.free is not None]
     if tile.free is None and len(passed) < max(min_votes, 1):
         return tile
     if not passed and not points_added:
@@ -257,7 +257,7 @@ def _learn_free(tile: Tile, votes: Sequence[TileVote], min_votes: int, points_ad
     if len(passed) >= min_votes:
         free = free | at_least(passed, min_votes)
     free = free & ~tile.obstacle_words
-    return tile if tile.free is not None and np.array_equal(free, tile.free) else replace(tile, free=free)
+    return tile if tile.free is not None and np.array_equal(free, tile.free) else tile.but(free=free)
 
 
 def states_over(lattice: Lattice, decisions: Mapping[TileIndex, Decision]) -> tuple[U8, Grid]:

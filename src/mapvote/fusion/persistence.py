@@ -110,9 +110,12 @@ def remembered(memory: Memory, before: Tile, after: Tile, votes: Sequence[TileVo
 
 def _first_s(votes: Sequence[TileVote], cells: Bool, state: int) -> np.ndarray:
     """(256, 256) uint32 when the first of ``votes`` said ``state`` in ``cells``, seconds; 0 where none did."""
-    first = np.full(cells.shape, np.iinfo(np.uint32).max, dtype=np.uint32)
+    flat = np.flatnonzero(cells)
+    first = np.full(len(flat), np.iinfo(np.uint32).max, dtype=np.uint32)
     for vote in votes:
         if vote.states is not None:
-            mine = cells & (vote.states == state)
-            first[mine] = np.minimum(first[mine], np.uint32(min(max(vote.end_ns // 10**9, 1), 2**32 - 2)))
-    return np.where(first == np.iinfo(np.uint32).max, np.uint32(0), first)
+            end_s = np.uint32(min(max(vote.end_ns // 10**9, 1), 2**32 - 2))
+            np.minimum(first, end_s, out=first, where=vote.states.reshape(-1)[flat] == state)
+    out = np.zeros(cells.shape, dtype=np.uint32)
+    out.reshape(-1)[flat] = np.where(first == np.iinfo(np.uint32).max, np.uint32(0), first)
+    return out

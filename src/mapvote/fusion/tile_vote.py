@@ -72,6 +72,14 @@ class TileVote:
         counts = self.tally[cells // TILE_CELLS, cells % TILE_CELLS, : int(CellState.UNDETERMINED)]
         return np.asarray(counts.any(axis=-1))
 
+    def passed(self) -> Words:
+        """The voxels that rays passed through, of cells that this vote speaks of."""
+        if self.free is None:
+            return Words.none()
+        if self.states is None:
+            return self.free.within(self.spoken())
+        return self.free.at(self.states.reshape(-1)[self.free.cells] != NO_VOTE)
+
     def deletes(self, among: Words) -> Words:
         """The voxels that this vote says are gone, of the cells that ``among`` names."""
         marked = among if self.gone is None else self.gone.where(among)
@@ -154,7 +162,7 @@ def fold(drives: Sequence[TileVote], grid: Grid) -> TileVote:
             tally[mine] = drive.tally[mine]
         gone += [drive.deletes(Words.whole(mine)), drive.remnants(mine)]
         if drive.free is not None:
-            free.append(drive.free.within(drive.spoken()))
+            free.append(drive.passed())
         if drive.new_points is not None:
             here = mine.ravel()[grid.flat_cells(drive.new_points)]
             points.append(drive.new_points[here])
