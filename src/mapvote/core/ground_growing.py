@@ -29,8 +29,8 @@ _NOISE_M = 0.06
 """Of a voxel's mean height: range and pose noise, a cobble."""
 _CLIMB, _FALL = 0.15, 0.5
 """Steepest ground, metres per metre. A steeper rise is a thing that stands there; a steep fall must be a broad one."""
-_BROAD = 12
-"""Cells of the 24 around that fall as steeply, before a steep fall is ground."""
+_BROAD = 14
+"""Cells of the 24 around that fall as steeply, before a steep fall is ground: reflections make patches of 12."""
 _BEYOND_GAP = 2
 """Cells of them that hold points at a like height, before the ground goes on beyond a gap."""
 
