@@ -46,19 +46,21 @@ def main() -> None:
     parser.add_argument("what", choices=("drives", "maps"))
     parser.add_argument("--source", action="append", required=True, metavar="NAME=DRIVE[@SCANS][+MAP]")
     parser.add_argument("--kinds", default="", help="only those whose name matches this regular expression")
-    parser.add_argument("--out", type=Path, help="CSV; rows of these sources replace older ones")
+    parser.add_argument("--part", default="1/1", metavar="K/N", help="only the K-th of N equal parts of the list")
+    parser.add_argument("--out", type=Path, help="CSV; rows of the same source and kind replace older ones")
     arguments = parser.parse_args()
     rows: list[dict] = []
+    part, parts = (int(v) for v in arguments.part.split("/"))
     for source in arguments.source:
         name, _, where = source.partition("=")
         judged = drives(name, where) if arguments.what == "drives" else maps(name, where)
-        for kind, judge in judged:
-            if re.search(arguments.kinds, kind):
+        for number, (kind, judge) in enumerate(judged):
+            if number % parts == part - 1 and re.search(arguments.kinds, kind):
                 rows.append(judge())
                 tell(rows[-1])
                 if arguments.out:
                     write(arguments.out, rows)
-        print(summary(name, rows))
+        print(summary(name, read(arguments.out) if arguments.out else rows))
 
 
 def opened(where: str) -> Drive:
@@ -182,12 +184,17 @@ def summary(source: str, rows: list[dict]) -> str:
     return f"{source}: {len(mine)} kinds: {shares}; grave ones called sound: {grave}"
 
 
+def read(file: Path) -> list[dict]:
+    if not file.exists():
+        return []
+    with file.open(newline="") as stream:
+        return [r | {"grave": int(r["grave"])} for r in csv.DictReader(stream)]
+
+
 def write(file: Path, rows: list[dict]) -> None:
-    """Rows of sources judged now replace older ones of theirs."""
-    old = []
-    if file.exists():
-        with file.open(newline="") as stream:
-            old = [r for r in csv.DictReader(stream) if r["source"] not in {row["source"] for row in rows}]
+    """What was judged now replaces what was judged before."""
+    judged = {(r["source"], r["kind"]) for r in rows}
+    old = [r for r in read(file) if (r["source"], r["kind"]) not in judged]
     with whole_file(file) as partial, partial.open("w", newline="") as stream:
         table = csv.DictWriter(stream, fieldnames=list(rows[0]))
         table.writeheader()
