@@ -11,7 +11,7 @@ import pytest
 from mapvote.core.point_map import PointMap, map_from_points
 from mapvote.core.types import F64
 from mapvote.doctor import Finding, diagnose
-from mapvote.doctor.clouds import check_cloud
+from mapvote.doctor.clouds import check_cloud, in_memory
 from mapvote.doctor.maps import check_map
 from mapvote.formats import write_map
 
@@ -46,7 +46,7 @@ def serious(found: list[Finding]) -> list[str]:
 
 
 def test_a_sound_map_is_not_blamed(points: F64, sound: PointMap) -> None:
-    assert serious(check_cloud(points) + check_map(sound)) == []
+    assert serious(check_cloud(in_memory(points)) + check_map(sound)) == []
 
 
 @pytest.mark.parametrize(
@@ -67,14 +67,16 @@ def test_a_sound_map_is_not_blamed(points: F64, sound: PointMap) -> None:
     ],
 )
 def test_what_is_wrong_with_points_is_named(points: F64, change: Callable[[F64], F64], name: str) -> None:
-    assert any(name in what for what in serious(check_cloud(change(points)))), check_cloud(change(points))
+    assert any(name in what for what in serious(check_cloud(in_memory(change(points))))), check_cloud(
+        in_memory(change(points))
+    )
 
 
 def test_a_map_of_walls_alone_has_no_axis_that_points_up(points: F64) -> None:
     rng = np.random.default_rng(1)
     x, z = rng.uniform(0, 60, 20_000), rng.uniform(0, 6, 20_000)
     walls = np.column_stack([x, np.where(rng.random(20_000) < 0.5, -8.0, 8.0), z])
-    assert not [what for what in serious(check_cloud(walls)) if "up" in what]
+    assert not [what for what in serious(check_cloud(in_memory(walls))) if "up" in what]
 
 
 def test_a_second_road_above_the_first_is_a_ghost(points: F64) -> None:

@@ -136,16 +136,16 @@ def import_map(
     mapvote import city.pcd my_map
     """
     from mapvote.formats import write_map
+    from mapvote.formats.atomic import folder_beside
     from mapvote.formats.geo.projector import frame_wanted
     from mapvote.formats.maps.importing import import_cloud
 
     with waiting(f"reading {source}"):
-        point_map, told = import_cloud(source, frame_wanted(crs, projector), from_crs)
+        point_map, told = import_cloud(source, frame_wanted(crs, projector), from_crs, folder_beside(out))
     look_at_map(str(source), point_map)
     with waiting(f"writing {out}"):
         write_map(point_map, out)
-    kept = sum(len(t.points) for t in point_map.tiles.values())
-    print(f"{out}: {kept} points in {len(point_map.tiles)} tiles, map {point_map.map_id}")
+    print(f"{out}: {point_map.n_points} points in {len(point_map.tiles)} tiles, map {point_map.map_id}")
     for line in told:
         print(line)
     print("known-free columns: none yet; the fleet's drives will teach them")
@@ -191,8 +191,7 @@ def export(
         raise MapvoteError("export: --since writes Autoware tiles: give a folder, not a file")
     with waiting(f"writing {out}"):
         kind, frame = export_map(point_map, out, (x, y, z), crs=crs, projector=projector)
-    points = sum(len(t.points) for t in point_map.tiles.values())
-    print(f"{out}: {points} points as {kind}")
+    print(f"{out}: {point_map.n_points} points as {kind}")
     print(f"coordinates: {frame.told()}")
     dropped = ["ground heights (measured again on import)"]
     if any(t.free is not None for t in point_map.tiles.values()):

@@ -34,8 +34,7 @@ def sound_map(path: Path | str) -> PointMap:
 
 def look_at_map(path: str, point_map: PointMap) -> None:
     """MapvoteError for a map whose points cannot be used so."""
-    from mapvote.core.point_map import all_points
-    from mapvote.doctor import check_cloud, usable
+    from mapvote.doctor import check_cloud, tile_by_tile, usable
 
-    for finding in usable(path, check_cloud(all_points(point_map))):
+    for finding in usable(path, check_cloud(tile_by_tile(point_map))):
         print(f"warning: {path}: {finding.what}", file=sys.stderr)

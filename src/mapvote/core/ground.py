@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping
+from functools import lru_cache
 
 import numba
 import numpy as np
@@ -22,6 +23,8 @@ _AGREEING = 0.5
 """Share of the measured cells within 2.1 m that must agree before the ground may start from a cell."""
 _BROAD = 30
 """Cells of them that must, where a driven path has shown the ground: apart from it many points are reflections."""
+_NEAR_TILES = 64
+"""Planes kept while the windows around neighbouring tiles are looked at."""
 
 Heights = tuple[I64, F32]
 """(flat cell within its tile (n,), height (n,) in map metres) of points."""
@@ -105,65 +108,94 @@ def lay_ground(points: Mapping[TileIndex, Heights], road: Mapping[TileIndex, Hei
     ``road``: where vehicles drove, the height of the road under them. The ground grows from there
     (:mod:`mapvote.core.ground_growing`). Where it does not come to, and in maps of which nobody knows the path, it
     starts from places that the measured cells around agree on and above which nothing rises as gently as ground.
+    Tiles are asked for one by one, in ascending order: of a large map only the heights are held, 4 bytes a point and
+    0.6 MB a tile.
     """
     tiles = sorted(points)
-    start, heights = _by_cell([points[tile] for tile in tiles])
+    start, heights = _by_cell(points[tile] for tile in tiles)
     ground = np.full(len(tiles) * CELLS, np.nan, dtype=np.float32)
     gap = np.full(len(tiles) * CELLS, UNREACHED, dtype=np.uint8)
     neighbours = tiles_around(tiles)
     least = 2
     if road:
-        cells, z = _lowest_of_each([(k * CELLS + road[t][0], road[t][1]) for k, t in enumerate(tiles) if t in road])
+        lowest = [(k, *_lowest_of_each(*road[tile])) for k, tile in enumerate(tiles) if tile in road]
+        cells = np.concatenate([np.empty(0, dtype=np.int64), *(k * CELLS + cell for k, cell, _ in lowest)])
+        z = np.concatenate([np.empty(0, dtype=np.float32), *(height for _, _, height in lowest)])
         grow(cells, z, start, heights, neighbours, ground, gap)
         least = _BROAD
-    seeds = _agreed(_lows(start, heights, gap), np.where(gap > _BRIDGED_M / STEP_M, np.inf, ground), neighbours, least)
+    seeds = _agreed(_Lows(start, heights, gap, ground), neighbours, least)
     grow(seeds, heights[start[seeds]], start, heights, neighbours, ground, gap)
     ground[gap > KNOWN_M / STEP_M] = np.nan
     return dict(zip(tiles, ground.reshape(-1, TILE_CELLS, TILE_CELLS), strict=True))
 
 
-def _by_cell(points: Sequence[Heights]) -> tuple[I64, F32]:
+def _by_cell(points: Iterable[Heights]) -> tuple[I32 | I64, F32]:
     """(start (cells + 1,), heights (n,)): flat cell c has the points heights[start[c]:start[c + 1]], lowest first."""
-    cells = np.concatenate([k * CELLS + cell for k, (cell, _) in enumerate(points)])
-    heights = np.concatenate([z for _, z in points])
-    start = np.zeros(len(points) * CELLS + 1, dtype=np.int64)
-    np.cumsum(np.bincount(cells, minlength=len(points) * CELLS), out=start[1:])
-    return start, heights[np.lexsort((heights, cells))]
+    counts, sorted_heights = [], []
+    for cells, z in points:
+        counts.append(np.bincount(cells, minlength=CELLS).astype(np.int32))
+        sorted_heights.append(z[np.lexsort((z, cells))])
+    n = sum(map(len, sorted_heights))
+    cells_and_end = len(counts) * CELLS + 1
+    few = n <= np.iinfo(np.int32).max
+    start: I32 | I64 = np.zeros(cells_and_end, dtype=np.int32) if few else np.zeros(cells_and_end, dtype=np.int64)
+    np.cumsum(np.concatenate(counts), out=start[1:])
+    counts.clear()
+    return start, _emptied(sorted_heights, n)
 
 
-def _lowest_of_each(points: Sequence[Heights]) -> Heights:
+def _emptied(parts: list[F32], n: int) -> F32:
+    """The parts, of n values together, as one array; each is let go once it is copied."""
+    out, done = np.empty(n, dtype=np.float32), 0
+    for i, part in enumerate(parts):
+        out[done : done + len(part)] = part
+        done += len(part)
+        parts[i] = np.empty(0, dtype=np.float32)
+    return out
+
+
+def _lowest_of_each(cells: I64, z: F32) -> Heights:
     """The lowest point of each cell; where vehicles drove above each other, the road below is kept."""
-    if not points:
-        return np.empty(0, dtype=np.int64), np.empty(0, dtype=np.float32)
-    cells, z = (np.concatenate(part) for part in zip(*points, strict=True))
     order = np.lexsort((z, cells))
     first = np.flatnonzero(np.diff(cells[order], prepend=-1))
     return cells[order][first], z[order][first]
 
 
-def _lows(start: I64, heights: F32, gap: U8) -> F64:
-    """(tiles, 256, 256) the lowest point of each cell that no measured ground is near, inf where there is none."""
-    low = np.full(len(gap), np.inf)
-    asked = (start[:-1] < start[1:]) & (gap > _BRIDGED_M / STEP_M)
-    low[asked] = heights[start[:-1][asked]]
-    return low.reshape(-1, TILE_CELLS, TILE_CELLS)
+class _Lows:
+    """What was known before ground starts anew: two planes a tile, worked out when they are asked for."""
+
+    def __init__(self, start: I32 | I64, heights: F32, gap: U8, ground: F32) -> None:
+        self._start, self._heights, self._gap, self._ground = start, heights, gap, ground
+
+    def low(self, tile: int) -> F64:
+        """(256, 256) the lowest point of each cell that no measured ground is near, inf where there is none."""
+        cells = slice(tile * CELLS, (tile + 1) * CELLS)
+        first = self._start[tile * CELLS : (tile + 1) * CELLS + 1]
+        asked = (first[:-1] < first[1:]) & (self._gap[cells] > _BRIDGED_M / STEP_M)
+        low = np.full(CELLS, np.inf)
+        low[asked] = self._heights[first[:-1][asked]]
+        return low.reshape(TILE_CELLS, TILE_CELLS)
+
+    def known(self, tile: int) -> F32:
+        """(256, 256) the ground that is known, inf elsewhere."""
+        cells = slice(tile * CELLS, (tile + 1) * CELLS)
+        known: F32 = np.where(self._gap[cells] > _BRIDGED_M / STEP_M, np.inf, self._ground[cells])
+        return known.reshape(TILE_CELLS, TILE_CELLS)
 
 
-def _agreed(low: F64, known: F64, neighbours: I32, least: int) -> I64:
-    """(m,) flat cells whose lowest point most cells around agree with, and which no lower ground explains as a thing.
-
-    ``low`` (tiles, 256, 256) as :func:`_lows` has it, ``known`` (cells,) the ground that is known, inf elsewhere.
-    """
+def _agreed(lows: _Lows, neighbours: I32, least: int) -> I64:
+    """(m,) flat cells whose lowest point most cells around agree with, and which no lower ground explains as things."""
+    low = lru_cache(maxsize=_NEAR_TILES)(lows.low)
     nothing = np.full((TILE_CELLS, TILE_CELLS), np.inf)
-    known = known.reshape(low.shape)
     own = slice(TILE_CELLS, 2 * TILE_CELLS)
     found = []
     for k, around in enumerate(neighbours):
-        if not np.isfinite(low[k]).any():
+        if not np.isfinite(low(k)).any():
             continue
-        window = np.block([[low[j] if j >= 0 else nothing for j in row] for row in around])
+        window = np.block([[low(j) if j >= 0 else nothing for j in row] for row in around.tolist()])
         window = _supported(window, _AROUND_CELLS, _GRADE * CELL_SIZE, _AGREEING, least)
-        envelope = np.minimum(window, np.block([[known[j] if j >= 0 else nothing for j in row] for row in around]))
+        known = np.block([[lows.known(j) if j >= 0 else nothing for j in row] for row in around.tolist()])
+        envelope = np.minimum(window, known)
         _lower_envelope(envelope, _GRADE * CELL_SIZE, _GRADE * CELL_SIZE * np.sqrt(2.0))
         lies: Bool = np.isfinite(window[own, own]) & (window[own, own] <= envelope[own, own] + 0.1)
         found.append(k * CELLS + np.flatnonzero(lies))

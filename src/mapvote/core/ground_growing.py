@@ -60,7 +60,7 @@ def _bounds(tile: int, row: int, col: int, ground: F32, gap: U8, neighbours: I32
 
 @numba.njit(cache=True, nogil=True)
 def _like(
-    tile: int, row: int, col: int, z: float, grade: float, below: float, start: I64, heights: F32, neighbours: I32
+    tile: int, row: int, col: int, z: float, grade: float, below: float, start: I32 | I64, heights: F32, neighbours: I32
 ) -> int:
     """How many of the 24 cells around hold a point ``below`` and at the height ``z``, give or take noise and grade."""
     found = 0
@@ -79,7 +79,7 @@ def _like(
 
 @numba.njit(cache=True, nogil=True)
 def _continued(
-    cell: int, expected: float, width: int, start: I64, heights: F32, ground: F32, gap: U8, neighbours: I32
+    cell: int, expected: float, width: int, start: I32 | I64, heights: F32, ground: F32, gap: U8, neighbours: I32
 ) -> float:
     """Height of the cell's point that continues the ground, the nearest to ``expected``; NaN if none does."""
     tile, row, col = cell // CELLS, cell % CELLS // TILE_CELLS, cell % TILE_CELLS
@@ -117,7 +117,7 @@ def _append(queue: I32, first: I32, last: I32, following: I32, width: int, entry
 
 
 @numba.njit(cache=True, nogil=True)
-def grow(seeds: I64, seed_z: F32, start: I64, heights: F32, neighbours: I32, ground: F32, gap: U8) -> None:
+def grow(seeds: I64, seed_z: F32, start: I32 | I64, heights: F32, neighbours: I32, ground: F32, gap: U8) -> None:
     """Let the ground grow from ``seeds`` (m,), flat cells with the height (m,) at which it is known to lie.
 
     ``heights[start[c]:start[c + 1]]`` are the points of flat cell c = tile * CELLS + row * TILE_CELLS + col, metres;

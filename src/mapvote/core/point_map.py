@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from mapvote.core.grid import Lattice, TileIndex, tile_of_cells
 from mapvote.core.ground import Heights, lay_ground
+from mapvote.core.lazy_tiles import LazyTiles
 from mapvote.core.picture import html_picture
 from mapvote.core.tile import Tile
 from mapvote.core.types import F32, F64, I64, MapvoteError
@@ -38,12 +39,18 @@ class PointMap:
     """When the last drive that the map was made of ended, since 1970; None where nobody knows."""
 
     def __repr__(self) -> str:
-        points = sum(len(tile.points) for tile in self.tiles.values())
-        return f"PointMap({self.map_id!r}: {points:,} points in {len(self.tiles)} tiles)"
+        return f"PointMap({self.map_id!r}: {self.n_points:,} points in {len(self.tiles)} tiles)"
 
     def _repr_html_(self) -> str:
         """The line of ``repr`` over a small picture from above, for notebooks."""
         return html_picture(repr(self), self.tiles.values())
+
+    @property
+    def n_points(self) -> int:
+        """Of all tiles together."""
+        if isinstance(self.tiles, LazyTiles):
+            return self.tiles.n_points
+        return sum(len(tile.points) for tile in self.tiles.values())
 
     @property
     def has_intensity(self) -> bool:
@@ -99,12 +106,7 @@ def map_from_points(
     digest = hashlib.sha256(np.array([lattice.x0, lattice.y0]).tobytes())
     for start in range(0, len(points), _CHUNK):
         piece = np.ascontiguousarray(points[start : start + _CHUNK], dtype=np.float64)
-        bad = ~(np.abs(piece) < _EXTENT_M).all(axis=1)
-        if bad.any():
-            raise MapvoteError(
-                f"{int(bad.sum())} of {len(piece)} map points are not finite or beyond 10,000 km "
-                f"(first: point {start + int(np.argmax(bad))}); remove them first"
-            )
+        check_extent(piece, start)
         digest.update(piece.tobytes())
     stored = _stored(points, lattice)
     known = {} if road is None or len(road) == 0 else _stored(road, lattice)
@@ -114,6 +116,16 @@ def map_from_points(
         for tile, mine in cut_tiles(points, lattice):
             tiles[tile] = replace(tiles[tile], fields={name: column[mine] for name, column in fields.items()})
     return PointMap(map_id or digest.hexdigest()[:16], lattice, tiles, dict(georeference or {}))
+
+
+def check_extent(points: F64, before: int = 0) -> None:
+    """MapvoteError if some of the points (n, 3), before which came others, are not finite or beyond 10,000 km."""
+    bad = ~(np.abs(points) < _EXTENT_M).all(axis=1)
+    if bad.any():
+        raise MapvoteError(
+            f"{int(bad.sum())} of {len(points)} map points are not finite or beyond 10,000 km "
+            f"(first: point {before + int(np.argmax(bad))}); remove them first"
+        )
 
 
 def all_points(point_map: PointMap) -> F64:

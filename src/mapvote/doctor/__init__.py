@@ -14,7 +14,7 @@ from mapvote.core.point_map import PointMap
 from mapvote.core.types import F64, Drive, MapvoteError
 from mapvote.doctor.bags import check_bag
 from mapvote.doctor.ballots import check_ballot
-from mapvote.doctor.clouds import check_cloud
+from mapvote.doctor.clouds import check_cloud, tile_by_tile
 from mapvote.doctor.drives import cheap_checks, examine_drive
 from mapvote.doctor.finding import Finding, Progress, in_order
 from mapvote.doctor.maps import check_whole, examine_map
@@ -25,7 +25,7 @@ from mapvote.formats.drives.rosbag import is_rosbag
 from mapvote.formats.maps.mapvote_folder import is_map_folder
 from mapvote.formats.registry import DRIVES, MAPS
 
-__all__ = ["Diagnosis", "Finding", "check_cloud", "diagnose", "must_be_usable", "usable"]
+__all__ = ["Diagnosis", "Finding", "check_cloud", "diagnose", "must_be_usable", "tile_by_tile", "usable"]
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from mapvote.core.point_map import PointMap
 from mapvote.core.types import F64
 from mapvote.doctor.finding import Finding
 from mapvote.doctor.road import UPS
 
+Pieces = Callable[[], Iterator[NDArray[np.floating]]]
+"""The points (n, 3) of a map from the start, piece by piece: as often as it is called."""
 _SOME, _NEAR = 400_000, 100_000
 _FEW = 1000
 """Fewer points show nothing."""
@@ -23,47 +28,66 @@ _LEAST_SHEET = 0.09
 """Of a street's points .12 to .17 lie on its ground (simulated ones and KITTI); with less nothing says what is up."""
 
 
-def check_cloud(points: NDArray[np.floating]) -> list[Finding]:
-    """Of points (n, 3) in map metres, as somebody's file holds them."""
-    if len(points) < _FEW:
-        return [
-            Finding("warning", f"the map holds {len(points)} points only", "is the file cut off, or the wrong one?")
-        ]
-    found = _strays(points)
-    apart_m = spacing(points)
-    return found + (_units(points, apart_m) or _axes(points)) + _copies(apart_m) + _rounded(points)
+def in_memory(points: NDArray[np.floating]) -> Pieces:
+    """One piece."""
+    return lambda: iter([points])
 
 
-def _box(points: NDArray[np.floating]) -> tuple[F64, F64]:
-    some = points[:: max(1, len(points) // _SOME)]
-    return np.quantile(some, 0.001, axis=0), np.quantile(some, 0.999, axis=0)
+def tile_by_tile(point_map: PointMap) -> Pieces:
+    """The points of a map."""
+    return lambda: (point_map.tiles[index].points_map for index in sorted(point_map.tiles))
 
 
-def _strays(points: NDArray[np.floating]) -> list[Finding]:
-    low, high = _box(points)
-    wide = high - low
-    outside = ((points < low - wide - 20.0) | (points > high + wide + 20.0)).any(axis=1)
-    if not outside.any():
+def check_cloud(pieces: Pieces) -> list[Finding]:
+    """Of points in map metres, as somebody's file holds them."""
+    n = sum(map(len, pieces()))
+    if n < _FEW:
+        return [Finding("warning", f"the map holds {n} points only", "is the file cut off, or the wrong one?")]
+    some = _every(pieces, max(1, n // _SOME))
+    low, high = np.quantile(some, 0.001, axis=0), np.quantile(some, 0.999, axis=0)
+    found = _strays(pieces, n, low, high)
+    apart_m = spacing(pieces, some)
+    return found + (_units(high - low, apart_m) or _axes(some)) + _copies(apart_m) + _rounded(some)
+
+
+def _every(pieces: Pieces, step: int) -> F64:
+    """(m, 3) every ``step``-th point."""
+    parts, skip = [], 0
+    for points in pieces():
+        parts.append(points[skip::step].astype(np.float64))
+        skip = (skip - len(points)) % step
+    return np.concatenate(parts)
+
+
+def _strays(pieces: Pieces, n: int, low: F64, high: F64) -> list[Finding]:
+    wide, strays, far_m = high - low, 0, 0.0
+    for points in pieces():
+        outside = ((points < low - wide - 20.0) | (points > high + wide + 20.0)).any(axis=1)
+        strays += int(outside.sum())
+        far_m = max(far_m, float(np.abs(points[outside] - 0.5 * (low + high)).max(initial=0.0)))
+    if not strays:
         return []
-    far_m = float(np.abs(points[outside] - 0.5 * (low + high)).max())
-    what = f"{int(outside.sum())} of {len(points)} points lie far off all others, up to {far_m:.0f} m"
+    what = f"{strays} of {n} points lie far off all others, up to {far_m:.0f} m"
     mend = "strays, or another place's points: cut them off"
     return [Finding("warning" if far_m > _STRAY_M else "note", what, mend)]
 
 
-def spacing(points: NDArray[np.floating]) -> F64:
-    """(m,) distance of some points to their nearest neighbour, of all points around one place."""
-    centre = np.median(points[:: max(1, len(points) // 1000)], axis=0)
-    distance = np.abs(points[:, :2] - centre[:2]).max(axis=1)
-    near = points[distance <= np.partition(distance, min(_NEAR, len(points)) - 1)[min(_NEAR, len(points)) - 1]]
-    near = near[:_NEAR].astype(np.float64)
-    away, _ = cKDTree(near).query(near[:: max(1, len(near) // 2000)], k=2)
-    return np.asarray(away[:, 1])
+def spacing(pieces: Pieces, some: F64) -> F64:
+    """(m,) distance of points to their nearest neighbour, of all points around one place, the middle of ``some``."""
+    centre = np.median(some[:: max(1, len(some) // 1000)], axis=0)
+    near, away = np.empty((0, 3)), np.empty(0)
+    for points in pieces():
+        distance = np.abs(points[:, :2] - centre[:2]).max(axis=1)
+        close = distance <= (away.max() if len(away) == _NEAR else np.inf)
+        near, away = np.concatenate([near, points[close]]), np.concatenate([away, distance[close]])
+        if len(near) > _NEAR:
+            chosen = np.sort(np.argpartition(away, _NEAR - 1)[:_NEAR])
+            near, away = near[chosen], away[chosen]
+    beside, _ = cKDTree(near).query(near[:: max(1, len(near) // 2000)], k=2)
+    return np.asarray(beside[:, 1])
 
 
-def _units(points: NDArray[np.floating], apart: F64) -> list[Finding]:
-    low, high = _box(points)
-    wide = high - low
+def _units(wide: F64, apart: F64) -> list[Finding]:
     apart_m, mend = float(np.median(apart)), "give the points in metres"
     if wide.max() < 5.0:
         what = f"the map is {wide[0]:.3g} by {wide[1]:.3g} by {wide[2]:.3g} m small: kilometres, or degrees?"
@@ -79,9 +103,8 @@ def _units(points: NDArray[np.floating], apart: F64) -> list[Finding]:
     return []
 
 
-def _axes(points: NDArray[np.floating]) -> list[Finding]:
+def _axes(some: F64) -> list[Finding]:
     """Which way is up: a street is a sheet of ground with things on it, none below."""
-    some = points[:: max(1, len(points) // _SOME)].astype(np.float64)
     share = {name: _sheet_share(some, up) for name, up in UPS.items()}
     best = max(share, key=lambda name: share[name])
     opposite = ("-" if best[0] == "+" else "+") + best[1]
@@ -118,8 +141,8 @@ def _copies(apart_m: F64) -> list[Finding]:
     return [Finding("warning", f"{twice:.0%} of the points are there twice", "the map was joined with itself?")]
 
 
-def _rounded(points: NDArray[np.floating]) -> list[Finding]:
-    some = points[:: max(1, len(points) // 20_000)].astype(np.float64)
+def _rounded(some: F64) -> list[Finding]:
+    some = some[:: max(1, len(some) // 20_000)]
     for axis, name in enumerate("xyz"):
         for quantum in (1.0, 0.5, 0.25, 0.125):
             steps = some[:, axis] / quantum

@@ -2,20 +2,25 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
+from mapvote.core.grid import TileIndex
+from mapvote.core.lazy_tiles import KEPT_POINTS, LazyTiles
 from mapvote.core.point_map import PointMap, all_points
+from mapvote.core.tile import Tile
 from mapvote.core.types import F64, MapvoteError
-from mapvote.doctor.clouds import check_cloud, spacing
+from mapvote.doctor.clouds import check_cloud, in_memory, spacing, tile_by_tile
 from mapvote.doctor.finding import Finding, in_order
 from mapvote.doctor.ghosts import ghost_layer, ghost_shift
 from mapvote.doctor.on_map import check_ground
 from mapvote.formats import read_cloud, read_map
 from mapvote.formats.geo.frame import frame_of
-from mapvote.formats.maps.cloud import Cloud, to_map
+from mapvote.formats.maps.cloud import Cloud
 from mapvote.formats.maps.mapvote_folder import is_map_folder
+from mapvote.formats.maps.tiling import to_map
 
 _FAR_M = 50_000.0
 _SLOPE_DEG = 6.0
@@ -36,7 +41,7 @@ def examine_map(path: Path) -> tuple[list[Finding], PointMap | None]:
 
 def examine_points(where: str, cloud: Cloud) -> tuple[list[Finding], PointMap | None]:
     """The same of points in metres that no map has been made of yet."""
-    found = check_cloud(cloud.points)
+    found = check_cloud(in_memory(cloud.points))
     if any(f.severity == "error" for f in found):
         return in_order(found), None
     try:
@@ -48,27 +53,45 @@ def examine_points(where: str, cloud: Cloud) -> tuple[list[Finding], PointMap | 
 
 def check_whole(point_map: PointMap) -> list[Finding]:
     """All that a map shows by itself."""
-    return check_cloud(all_points(point_map)) + check_map(point_map)
+    return check_cloud(tile_by_tile(point_map)) + check_map(point_map)
 
 
 def check_map(point_map: PointMap) -> list[Finding]:
-    """Of a map whose ground has been measured."""
-    points = all_points(point_map)
-    height = np.concatenate([_heights(point_map, index) for index in sorted(point_map.tiles)])
-    found = _ground(point_map, points, height) + check_ground(point_map) + _missing_tiles(point_map)
+    """Of a map whose ground has been measured. Of one larger than memory ground and copies are looked at around the
+    middle."""
+    some = _around_the_middle(point_map)
+    points = all_points(some)
+    height = np.concatenate([_heights(some, index) for index in sorted(some.tiles)])
+    found = _ground(some, points, height) + check_ground(point_map) + _missing_tiles(point_map)
+    if some is not point_map:
+        what = f"ground and copies were looked at in {len(some.tiles)} tiles of {len(point_map.tiles)}, in the middle"
+        found.append(Finding("note", what))
     layer = ghost_layer(height)
     if layer is not None:
         what = f"the road lies there twice, {abs(layer):.2f} m apart in height: a ghost layer"
         found.append(Finding("error", what, "two drives of different height were laid over each other: align them"))
-    elif float(np.median(spacing(points))) < _SPARSE_M:
+    elif float(np.median(spacing(in_memory(points), points))) < _SPARSE_M:
         shift = ghost_shift(points[(height > 0.5) & (height < 6.0)])
         if shift is not None:
             x, y = shift
             by = f"{np.hypot(x, y):.1f} m (x {x:+.1f}, y {y:+.1f})"
             what = f"walls and poles are there twice, shifted by {by}: a ghost layer"
             found.append(Finding("error", what, "two drives were laid over each other unaligned: align them"))
-    found += _frame(point_map, points)
-    return found
+    return found + _frame(point_map)
+
+
+def _around_the_middle(point_map: PointMap) -> PointMap:
+    """The map, or of one that is larger than memory the tiles nearest to the middle, as many as there is room for."""
+    if not isinstance(point_map.tiles, LazyTiles):
+        return point_map
+    row, col = np.median(np.array(list(point_map.tiles)), axis=0)
+    nearest = sorted(point_map.tiles, key=lambda index: (np.hypot(index[0] - row, index[1] - col), index))
+    chosen: dict[TileIndex, Tile] = {}
+    for index in nearest:
+        if chosen and sum(len(tile.points) for tile in chosen.values()) > KEPT_POINTS:
+            break
+        chosen[index] = point_map.tiles[index]
+    return replace(point_map, tiles=dict(sorted(chosen.items())))
 
 
 def _heights(point_map: PointMap, index: tuple[int, int]) -> F64:
@@ -132,9 +155,12 @@ def _missing_tiles(point_map: PointMap) -> list[Finding]:
     return [Finding("warning", what, "a hole in the map: there nobody can vote")]
 
 
-def _frame(point_map: PointMap, points: F64) -> list[Finding]:
+def _frame(point_map: PointMap) -> list[Finding]:
     frame = frame_of(point_map.georeference)
-    low, high = points.min(axis=0), points.max(axis=0)
+    low, high = np.full(3, np.inf), np.full(3, -np.inf)
+    for points in tile_by_tile(point_map)():
+        low = np.minimum(low, points.min(axis=0, initial=np.inf))
+        high = np.maximum(high, points.max(axis=0, initial=-np.inf))
     told = f"x {low[0]:.0f} to {high[0]:.0f}, y {low[1]:.0f} to {high[1]:.0f}, z {low[2]:.0f} to {high[2]:.0f} m"
     if frame.is_local and max(np.abs(low[:2]).max(), np.abs(high[:2]).max()) > _FAR_M:
         what = f"the map does not say which coordinates it is in ({told})"

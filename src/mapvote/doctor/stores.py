@@ -4,11 +4,9 @@ from __future__ import annotations
 
 from collections import Counter
 
-from mapvote.core.point_map import all_points
 from mapvote.core.types import MapvoteError
-from mapvote.doctor.clouds import check_cloud
 from mapvote.doctor.finding import Finding, in_order
-from mapvote.doctor.maps import check_map
+from mapvote.doctor.maps import check_whole
 from mapvote.server.insight.overview import overview
 from mapvote.server.store.check import check
 from mapvote.server.store.keys import listed
@@ -35,7 +33,7 @@ def check_store(store: Store) -> list[Finding]:
         point_map = store.point_map()
     except MapvoteError as error:
         return in_order([*found, Finding("error", f"its newest map cannot be read: {error}", _MEND)])
-    return in_order(found + check_cloud(all_points(point_map)) + check_map(point_map))
+    return in_order(found + check_whole(point_map))
 
 
 def _damage(store: Store) -> list[Finding]:

@@ -5,6 +5,7 @@ Formats are listed in :mod:`mapvote.formats.registry`; each is recognised by wha
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Unpack
@@ -18,9 +19,10 @@ from mapvote.formats.drives.options import DriveOptions, SaidOfDrive
 from mapvote.formats.drives.poses import read_T_map_lidar
 from mapvote.formats.geo.frame import MapFrame, frame_of
 from mapvote.formats.geo.projector import autoware_frame, frame_wanted
-from mapvote.formats.maps.cloud import GROUND, UNCLASSIFIED, Cloud, to_map
+from mapvote.formats.maps.cloud import GROUND, UNCLASSIFIED, Cloud, joined
 from mapvote.formats.maps.mapvote_folder import is_map_folder, read_map_folder, write_map_folder
 from mapvote.formats.maps.pcd import write_pcd
+from mapvote.formats.maps.tiling import in_metres, map_of
 from mapvote.formats.registry import DRIVES, MAPS, WRITERS
 
 __all__ = [
@@ -62,7 +64,19 @@ def read_map(path: Path | str) -> PointMap:
     path = Path(path)
     if is_map_folder(path):
         return read_map_folder(path)
-    return to_map(str(path), read_cloud(path).in_metres(str(path)))
+    return map_of(str(path), in_metres(str(path), stream_cloud(path)))
+
+
+def stream_cloud(path: Path | str) -> Iterator[Cloud]:
+    """The points of a file or folder of any format of ``MAPS`` as they stand, piece by piece where the format allows.
+
+    Raises MapvoteError if there is none at ``path``, or when it comes to where it is damaged.
+    """
+    path = Path(path)
+    for layout in MAPS.values():
+        if layout.recognised(path):
+            return layout.stream(path)
+    raise MapvoteError(f"{path}: {_what_is_there(path)}; a map is one of: mapvote map, {', '.join(MAPS)}")
 
 
 def read_cloud(path: Path | str) -> Cloud:
@@ -70,11 +84,7 @@ def read_cloud(path: Path | str) -> Cloud:
 
     Raises MapvoteError if there is none at ``path`` or it is damaged.
     """
-    path = Path(path)
-    for layout in MAPS.values():
-        if layout.recognised(path):
-            return layout.read(path)
-    raise MapvoteError(f"{path}: {_what_is_there(path)}; a map is one of: mapvote map, {', '.join(MAPS)}")
+    return joined(list(stream_cloud(path)))
 
 
 def write_map(point_map: PointMap, path: Path | str) -> None:

@@ -74,3 +74,8 @@ def whole_folder(path: Path | str, *, sign: str) -> Iterator[Path]:
             os.replace(old, path)
         shutil.rmtree(partial, ignore_errors=True)
         shutil.rmtree(old, ignore_errors=True)
+
+
+def folder_beside(path: Path) -> Path | None:
+    """Where temporary files for an output at ``path`` may lie, on the same disk; None if there is nothing yet."""
+    return next((folder for folder in path.absolute().parents if folder.is_dir()), None)

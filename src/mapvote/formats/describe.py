@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -10,11 +11,12 @@ import numpy as np
 from mapvote.codec.ballot import Ballot, decode, unpack_points, unpack_states
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS
 from mapvote.core.heights import check_heights
-from mapvote.core.point_map import PointMap, all_points
+from mapvote.core.point_map import PointMap
 from mapvote.core.types import CellState, Drive, MapvoteError
 from mapvote.formats import open_drive, read_map
-from mapvote.formats.maps.cloud import to_map
+from mapvote.formats.maps.cloud import Cloud
 from mapvote.formats.maps.mapvote_folder import is_map_folder
+from mapvote.formats.maps.tiling import in_metres, map_of
 from mapvote.formats.registry import DRIVES, MAPS
 
 Rows = list[tuple[str, str]]
@@ -26,10 +28,9 @@ def describe(path: Path, *, rate_hz: float | None = None, topic: str | None = No
         return "mapvote map", _map(read_map(path))
     for kind, layout in MAPS.items():
         if layout.recognised(path):
-            cloud = layout.read(path)
-            kept, left = ", ".join(cloud.fields) or "none", ", ".join(cloud.dropped) or "none"
-            fields = [("fields", kept), ("other fields", left), ("stored as", str(cloud.points.dtype))]
-            return kind, _map(to_map(str(path), cloud.in_metres(str(path)))) + fields
+            about: dict[str, dict[str, None]] = {"fields": {}, "other fields": {}, "stored as": {}}
+            point_map = map_of(str(path), in_metres(str(path), _noted(layout.stream(path), about)))
+            return kind, _map(point_map) + [(name, ", ".join(found) or "none") for name, found in about.items()]
     for kind, drive_layout in DRIVES.items():
         if drive_layout.recognised(path):
             return f"drive, {kind}", _drive(open_drive(path, rate_hz=rate_hz, topic=topic))
@@ -42,23 +43,32 @@ def describe(path: Path, *, rate_hz: float | None = None, topic: str | None = No
     return "", _map(read_map(path))  # raises, and says what is there
 
 
+def _noted(pieces: Iterator[Cloud], about: dict[str, dict[str, None]]) -> Iterator[Cloud]:
+    for piece in pieces:
+        about["fields"] |= dict.fromkeys(piece.fields)
+        about["other fields"] |= dict.fromkeys(piece.dropped)
+        about["stored as"] |= {str(piece.points.dtype): None}
+        yield piece
+
+
 def _map(point_map: PointMap) -> Rows:
-    points = all_points(point_map)
-    low, high = points.min(axis=0), points.max(axis=0)
-    tiles = point_map.tiles.values()
-    learned = [t.free for t in tiles if t.free is not None]
-    known = float(np.mean([np.isfinite(t.ground_z).mean() for t in tiles]))
+    low, high, known, learned = np.full(3, np.inf), np.full(3, -np.inf), 0.0, 0
+    for tile in point_map.tiles.values():
+        low = np.minimum(low, tile.points_map.min(axis=0, initial=np.inf))
+        high = np.maximum(high, tile.points_map.max(axis=0, initial=-np.inf))
+        known += float(np.isfinite(tile.ground_z).mean()) / len(point_map.tiles)
+        learned += tile.free is not None
     rows = [
         ("map id", point_map.map_id),
         ("version", str(point_map.version or "unknown")),
-        ("points", f"{len(points):,}"),
+        ("points", f"{point_map.n_points:,}"),
         ("tiles", f"{len(point_map.tiles)} of {TILE_CELLS * CELL_SIZE:.1f} m"),
         ("x", f"{low[0]:.2f} to {high[0]:.2f} m"),
         ("y", f"{low[1]:.2f} to {high[1]:.2f} m"),
         ("z", f"{low[2]:.2f} to {high[2]:.2f} m"),
         ("lattice", f"cells of {CELL_SIZE} m from ({point_map.lattice.x0}, {point_map.lattice.y0})"),
         ("ground", f"known in {known:.0%} of the tiles' cells"),
-        ("known free", f"learned in {len(learned)} tiles" if learned else "never learned"),
+        ("known free", f"learned in {learned} tiles" if learned else "never learned"),
     ]
     rows += [(f"drive {k}", str(check_heights(point_map, path))) for k, path in enumerate(point_map.driven, 1)]
     return rows + [(f"georeference: {name}", text.strip()) for name, text in point_map.georeference.items()]

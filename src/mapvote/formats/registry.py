@@ -21,15 +21,15 @@ from mapvote.formats.drives.rosbag import is_rosbag, open_rosbag
 from mapvote.formats.maps.autoware import (
     is_autoware,
     is_autoware_default,
-    read_autoware,
-    read_autoware_default,
+    stream_autoware,
+    stream_autoware_default,
     write_autoware,
 )
 from mapvote.formats.maps.cloud import Cloud
-from mapvote.formats.maps.e57 import is_e57, read_e57
-from mapvote.formats.maps.las import is_las, read_las, stream_las, write_las
-from mapvote.formats.maps.pcd import is_pcd, read_pcd, write_pcd
-from mapvote.formats.maps.ply import is_ply, read_ply, write_ply
+from mapvote.formats.maps.e57 import is_e57, stream_e57
+from mapvote.formats.maps.las import is_las, stream_las, write_las
+from mapvote.formats.maps.pcd import is_pcd, stream_pcd, write_pcd
+from mapvote.formats.maps.ply import is_ply, stream_ply, write_ply
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,8 +46,7 @@ class MapFormat:
     """A format that holds a map's points."""
 
     recognised: Callable[[Path], bool]
-    read: Callable[[Path], Cloud]
-    stream: Callable[[Path], Iterator[Cloud]] | None = None
+    stream: Callable[[Path], Iterator[Cloud]]
     """Piece by piece, where the format allows it: for maps larger than memory."""
 
 
@@ -77,12 +76,12 @@ DRIVES: dict[str, DriveFormat] = {
 """In the order in which they are tried."""
 
 MAPS: dict[str, MapFormat] = {
-    "Autoware tile folder": MapFormat(is_autoware, read_autoware),
-    "Autoware default folder": MapFormat(is_autoware_default, read_autoware_default),
-    "PCD file": MapFormat(is_pcd, read_pcd),
-    "LAS or LAZ file": MapFormat(is_las, read_las, stream_las),
-    "PLY file": MapFormat(is_ply, read_ply),
-    "E57 file": MapFormat(is_e57, read_e57),
+    "Autoware tile folder": MapFormat(is_autoware, stream_autoware),
+    "Autoware default folder": MapFormat(is_autoware_default, stream_autoware_default),
+    "PCD file": MapFormat(is_pcd, stream_pcd),
+    "LAS or LAZ file": MapFormat(is_las, stream_las),
+    "PLY file": MapFormat(is_ply, stream_ply),
+    "E57 file": MapFormat(is_e57, stream_e57),
 }
 """Maps that are only points, in the order in which they are tried."""
 

@@ -18,6 +18,7 @@ from mapvote.codec.ballot import (
 from mapvote.codec.tile_file import base_hash
 from mapvote.config import FuseSettings
 from mapvote.core.grid import TileIndex
+from mapvote.core.lazy_tiles import with_changed
 from mapvote.core.point_map import PointMap
 from mapvote.core.tile import Tile
 from mapvote.core.types import MapvoteError
@@ -103,18 +104,19 @@ def update_map(
     ballots = list(ballots)
     rule = check_round(ballots, point_map)
     unique = {hashlib.sha256(encode(ballot)).hexdigest(): ballot for ballot in ballots}
-    tiles, version = dict(point_map.tiles), (point_map.version or 0) + 1
+    changed: dict[TileIndex, Tile] = {}
+    version = (point_map.version or 0) + 1
     decisions: dict[TileIndex, Decision] = {}
     for index in sorted({tile.tile for ballot in ballots for tile in ballot.tiles}):
         tile = point_map.tile(index)
         votes = [_unspent(vote, tile) for vote in select(_votes_on(index, unique), settings)]
         decision, edited = fuse_tile(tile, votes, rule, settings, version)
         decisions[index] = decision
-        if index in tiles or edited is not tile:
-            tiles[index] = edited
-    if point_map.version is not None and any(tiles[index] is not point_map.tiles.get(index) for index in tiles):
+        if edited is not tile:
+            changed[index] = edited
+    if point_map.version is not None and changed:
         point_map = replace(point_map, version=version)
-    return replace(point_map, tiles=dict(sorted(tiles.items()))), decisions
+    return replace(point_map, tiles=with_changed(point_map.tiles, changed)), decisions
 
 
 def _unspent(vote: TileVote, tile: Tile) -> TileVote:

@@ -19,8 +19,8 @@ from mapvote.formats.atomic import whole_folder
 from mapvote.formats.extras import first_line, read_text
 from mapvote.formats.geo.frame import MapFrame
 from mapvote.formats.geo.projector import PROJECTOR, frame_of_projector, projector_of
-from mapvote.formats.maps.cloud import Cloud, joined, warn_of_float32
-from mapvote.formats.maps.pcd import read_pcd, save_pcd
+from mapvote.formats.maps.cloud import Cloud, warn_of_float32
+from mapvote.formats.maps.pcd import read_pcd, save_pcd, stream_pcd
 
 log = logging.getLogger("mapvote.formats")
 
@@ -35,8 +35,8 @@ def is_autoware(path: Path) -> bool:
     return (path / METADATA).is_file()
 
 
-def read_autoware(path: Path) -> Cloud:
-    """All tiles that the metadata lists, in its order, as one cloud; every point is checked to lie in its tile.
+def stream_autoware(path: Path) -> Iterator[Cloud]:
+    """The tiles that the metadata lists, in its order; every point is checked to lie in its tile.
 
     MapvoteError names a tile that is missing, broken, or whose points lie outside it by more than a centimetre.
     """
@@ -49,7 +49,7 @@ def read_autoware(path: Path) -> Cloud:
             raise ValueError("no tiles, or a corner that is not [x, y]")
     except (KeyError, TypeError, ValueError) as error:
         raise MapvoteError(f"{file}: not Autoware's metadata ({error}); {CONTENT}") from error
-    clouds: list[Cloud] = []
+    frame = _frame(path)
     for name, corner in corners.items():
         tile = next((f for f in (path / name, path / TILES / name) if f.is_file()), None)
         if tile is None:
@@ -61,8 +61,7 @@ def read_autoware(path: Path) -> Cloud:
                 f"{tile}: {int(outside.sum())} of {len(outside)} points lie outside its square at {corner.tolist()}; "
                 f"are its points relative to the tile, or is the corner wrong?"
             )
-        clouds.append(cloud)
-    return replace(joined(clouds), frame=_frame(path))
+        yield replace(cloud, frame=frame)
 
 
 def is_autoware_default(path: Path) -> bool:
@@ -70,12 +69,13 @@ def is_autoware_default(path: Path) -> bool:
     return path.is_dir() and not is_autoware(path) and (path / TILES).is_file()
 
 
-def read_autoware_default(path: Path) -> Cloud:
+def stream_autoware_default(path: Path) -> Iterator[Cloud]:
     """The one PCD of Autoware's default folder, in the frame of the map_projector_info.yaml beside it."""
-    cloud = read_pcd(path / TILES)
     if not (path / PROJECTOR).is_file() and (path / "lanelet2_map.osm").is_file():
         log.warning("%s: no %s, so its coordinates stay local; --projector MGRS:54SUE names them", path, PROJECTOR)
-    return replace(cloud, frame=_frame(path))
+    frame = _frame(path)
+    for piece in stream_pcd(path / TILES):
+        yield replace(piece, frame=frame)
 
 
 def _frame(path: Path) -> MapFrame:

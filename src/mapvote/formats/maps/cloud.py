@@ -11,9 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Lattice
-from mapvote.core.point_map import PointMap, map_from_points
 from mapvote.core.types import MapvoteError
-from mapvote.formats.clean import MAX_BAD_SHARE
 from mapvote.formats.geo.frame import MapFrame
 from mapvote.formats.geo.units import settle
 
@@ -118,30 +116,6 @@ def lattice_of(points: NDArray[np.floating]) -> Lattice:
     side = TILE_CELLS * CELL_SIZE
     x0, y0 = np.floor(low / side) * side
     return Lattice(round(float(x0), 1), round(float(y0), 1))
-
-
-def to_map(where: str, cloud: Cloud) -> PointMap:
-    """The map of a cloud: tiles cut, ground laid, map_id from the content. Broken points are dropped and counted.
-
-    Points that the file classifies as ground are ground.
-    MapvoteError if the cloud is empty or more than 5 % of it is not finite.
-    """
-    points, fields = cloud.points, dict(cloud.fields)
-    if len(points) == 0:
-        raise MapvoteError(f"{where}: holds no points; a map needs some")
-    bad = ~(np.isfinite(points[:, 0]) & np.isfinite(points[:, 1]) & np.isfinite(points[:, 2]))
-    n_bad = int(bad.sum())
-    if n_bad > MAX_BAD_SHARE * len(points):
-        raise MapvoteError(
-            f"{where}: {n_bad} of {len(points)} points are not finite, more than {MAX_BAD_SHARE:.0%}; mend the file"
-        )
-    if n_bad:
-        log.warning("%s: dropped %d of %d points that are not finite", where, n_bad, len(points))
-        points, fields = points[~bad], {name: column[~bad] for name, column in fields.items()}
-    ground = points[fields["classification"] == GROUND].astype(np.float64) if "classification" in fields else None
-    return map_from_points(
-        points, lattice=lattice_of(points), georeference=cloud.frame.georeference(), road=ground, fields=fields
-    )
 
 
 def float32_loss_m(points: NDArray[np.floating]) -> float:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +13,7 @@ from numpy.typing import NDArray
 from mapvote.core.types import MapvoteError
 from mapvote.formats.extras import first_line, require
 from mapvote.formats.geo.frame import MapFrame
-from mapvote.formats.maps.cloud import Cloud, joined
+from mapvote.formats.maps.cloud import Cloud
 
 MAX_POINTS_PER_BYTE = 16
 _FIELDS = {"intensity": "intensity", "colorRed": "red", "colorGreen": "green", "colorBlue": "blue"}
@@ -21,8 +23,8 @@ def is_e57(path: Path) -> bool:
     return path.is_file() and path.suffix.lower() == ".e57"
 
 
-def read_e57(path: Path) -> Cloud:
-    """The points of all scans of a file, in the coordinate system that it names; rays without return are left out.
+def stream_e57(path: Path) -> Iterator[Cloud]:
+    """The points of a file, scan by scan, in the coordinate system that it names; rays without return are left out.
 
     MapvoteError if it is damaged, or holds no scan of cartesian or spherical points.
     """
@@ -33,16 +35,19 @@ def read_e57(path: Path) -> Cloud:
         counts = [file.get_header(i).point_count for i in range(file.scan_count)]
         if sum(counts) > size:
             raise ValueError(f"its header promises {sum(counts)} points, more than it has room for")
-        clouds = [_scan(file, i) for i in range(file.scan_count) if counts[i]]
+        if not any(counts):
+            raise MapvoteError(f"{path}: holds no scan with points")
         wkt = _coordinate_metadata(file)
+        frame = MapFrame(wkt) if wkt else MapFrame()
+        for i in range(file.scan_count):
+            if counts[i]:
+                yield replace(_scan(file, i), frame=frame)
+    except MapvoteError:
+        raise
     except OSError as error:
         raise MapvoteError(f"{path}: cannot be read ({error.strerror or error})") from error
     except Exception as error:  # libE57 and pye57 raise their own
         raise MapvoteError(f"{path}: not a whole E57 file ({first_line(error)}); copy or export it again") from error
-    if not clouds:
-        raise MapvoteError(f"{path}: holds no scan with points")
-    whole = joined(clouds)
-    return Cloud(whole.points, whole.dropped, MapFrame(wkt) if wkt else MapFrame(), whole.fields)
 
 
 def _scan(file: Any, index: int) -> Cloud:

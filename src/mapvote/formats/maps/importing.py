@@ -2,36 +2,64 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
 from mapvote.core.point_map import PointMap
-from mapvote.formats import read_cloud
+from mapvote.formats import stream_cloud
 from mapvote.formats.geo.frame import LOCAL, MapFrame
-from mapvote.formats.maps.cloud import Cloud, to_map
+from mapvote.formats.maps.cloud import Cloud
+from mapvote.formats.maps.tiling import in_metres, map_of
 
 NOISE = (7, 18)
 """ASPRS classes: low noise, high noise."""
 
 
-def import_cloud(path: Path, wanted: MapFrame | None = None, from_crs: str | None = None) -> tuple[PointMap, list[str]]:
+def import_cloud(
+    path: Path, wanted: MapFrame | None = None, from_crs: str | None = None, folder: Path | None = None
+) -> tuple[PointMap, list[str]]:
     """(the map, lines that say what became of the file's coordinates, classes and fields).
 
     ``wanted``: the frame to project to. ``from_crs``: what the file is in, where it says nothing or the wrong thing.
+    ``folder``: where temporary files may lie.
     """
-    cloud = read_cloud(path)
+    pieces = stream_cloud(path)
     if from_crs is not None:
-        cloud = replace(cloud, frame=MapFrame(LOCAL if from_crs.lower() == LOCAL else from_crs))
-    cloud = cloud.in_metres(str(path), wanted, sure=from_crs is not None)
-    told = [f"coordinates: {cloud.frame.told()}"]
-    cloud, noise = without_noise(cloud)
-    if noise:
-        told.append(f"dropped: {noise} points that the file classifies as noise (classes 7 and 18)")
-    if cloud.dropped:
-        told.append(f"dropped fields: {', '.join(cloud.dropped)}")
-    return to_map(str(path), cloud), told
+        said = MapFrame(LOCAL if from_crs.lower() == LOCAL else from_crs)
+        pieces = (replace(piece, frame=said) for piece in pieces)
+    left = _LeftOut()
+    point_map = map_of(str(path), left.noise(in_metres(str(path), pieces, wanted, sure=from_crs is not None)), folder)
+    return point_map, left.told()
+
+
+@dataclass
+class _LeftOut:
+    """What passes by on the way from the file to the map."""
+
+    frame: MapFrame = field(default_factory=MapFrame)
+    points: int = 0
+    fields: dict[str, None] = field(default_factory=dict)
+
+    def noise(self, pieces: Iterator[Cloud]) -> Iterator[Cloud]:
+        """The pieces without the points that the file classifies as noise."""
+        for piece in pieces:
+            self.frame = piece.frame
+            self.fields |= dict.fromkeys(piece.dropped)
+            kept, n = without_noise(piece)
+            self.points += n
+            yield kept
+
+    def told(self) -> list[str]:
+        """In words."""
+        told = [f"coordinates: {self.frame.told()}"]
+        if self.points:
+            told.append(f"dropped: {self.points} points that the file classifies as noise (classes 7 and 18)")
+        if self.fields:
+            told.append(f"dropped fields: {', '.join(self.fields)}")
+        return told
 
 
 def without_noise(cloud: Cloud) -> tuple[Cloud, int]:

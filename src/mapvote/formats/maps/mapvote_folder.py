@@ -15,8 +15,10 @@ import numpy as np
 from mapvote.codec.arrays import pack_plane, unpack_bytes
 from mapvote.codec.ballot import tile_key
 from mapvote.codec.tile_file import content_hash, decode_tile, encode_tile, free_hash
-from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Lattice
+from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Lattice, TileIndex
+from mapvote.core.lazy_tiles import LazyTiles, in_memory_if_small
 from mapvote.core.point_map import PointMap
+from mapvote.core.tile import Tile
 from mapvote.core.types import F64, MapvoteError
 from mapvote.formats.atomic import whole_folder
 
@@ -118,27 +120,42 @@ def read_manifest(path: Path) -> Manifest:
 
 
 def read_map_folder(path: Path) -> PointMap:
-    """The map, every tile verified against the manifest. MapvoteError names the first tile that is not whole."""
+    """The map, every tile verified against the manifest. MapvoteError names the first tile that is not whole.
+
+    Of a map larger than memory the bytes of all files are verified now, and each tile is read when it is asked for.
+    """
     manifest = read_manifest(path)
     lattice = Lattice(manifest.x0, manifest.y0)
-    tiles = {}
-    for entry in manifest.tiles:
-        file = path / f"tiles/{entry.tile[0]}_{entry.tile[1]}.tile"
-        try:
-            data = file.read_bytes()
-        except OSError as error:
-            raise MapvoteError(f"{file}: {error.strerror}, but the manifest lists it; copy the map again") from error
-        if hashlib.sha256(data).hexdigest() != entry.sha256:
-            raise MapvoteError(f"{file}: its bytes are not those of the manifest; copy the map again")
-        tile = decode_tile(data, lattice.tile(entry.tile), str(file))
-        if content_hash(tile.points) != entry.content_hash or entry.tile in tiles:
-            raise MapvoteError(
-                f"{path / MANIFEST}: tile {tile_key(entry.tile)} contradicts its file; copy the map again"
-            )
-        tiles[entry.tile] = tile
+    entries = {entry.tile: entry for entry in manifest.tiles}
+    if len(entries) < len(manifest.tiles):
+        raise MapvoteError(f"{path / MANIFEST}: lists a tile twice; copy the map again")
+
+    def load(index: TileIndex) -> Tile:
+        file, data = _bytes_of(path, entries[index])
+        tile = decode_tile(data, lattice.tile(index), str(file))
+        if (content_hash(tile.points), len(tile.points)) != (entries[index].content_hash, entries[index].points):
+            raise MapvoteError(f"{path / MANIFEST}: tile {tile_key(index)} contradicts its file; copy the map again")
+        return tile
+
+    tiles = in_memory_if_small(LazyTiles(load, {index: entry.points for index, entry in entries.items()}))
+    if isinstance(tiles, LazyTiles):
+        for entry in manifest.tiles:
+            _bytes_of(path, entry)
     driven = tuple(_positions(data, path) for data in manifest.driven)
     versioned = manifest.version, manifest.surveyed_ns
     return PointMap(manifest.map_id, lattice, tiles, manifest.georeference, driven, *versioned)
+
+
+def _bytes_of(path: Path, entry: TileEntry) -> tuple[Path, bytes]:
+    """The file of a tile and what is in it; MapvoteError if that is not what the manifest says."""
+    file = path / f"tiles/{entry.tile[0]}_{entry.tile[1]}.tile"
+    try:
+        data = file.read_bytes()
+    except OSError as error:
+        raise MapvoteError(f"{file}: {error.strerror}, but the manifest lists it; copy the map again") from error
+    if hashlib.sha256(data).hexdigest() != entry.sha256:
+        raise MapvoteError(f"{file}: its bytes are not those of the manifest; copy the map again")
+    return file, data
 
 
 def _positions(data: bytes, path: Path) -> F64:

@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from itertools import islice
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
-from pypcd4 import Encoding, PointCloud
+from pypcd4 import Encoding, MetaData, PointCloud
 
 from mapvote.core.types import F64, MapvoteError
 from mapvote.formats.atomic import whole_file
 from mapvote.formats.extras import first_line
-from mapvote.formats.maps.cloud import Cloud, kept_fields, other_fields, warn_of_float32, xyz
+from mapvote.formats.maps.cloud import Cloud, joined, kept_fields, other_fields, warn_of_float32, xyz
 
+_BLOCK = 500_000
+"""Points read at a time."""
 NO_FIELDS: Mapping[str, NDArray[Any]] = MappingProxyType({})
 ENCODINGS = tuple(e.value for e in (Encoding.ASCII, Encoding.BINARY, Encoding.BINARY_COMPRESSED))
 
@@ -31,22 +34,77 @@ def read_pcd_table(path: Path) -> tuple[NDArray[np.void], F64]:
     """
     try:
         cloud = PointCloud.from_path(path)
-    except OSError as error:
-        raise MapvoteError(f"{path}: cannot be read ({error.strerror or error})") from error
-    except Exception as error:  # pypcd4 lets through whatever numpy, struct, lzf and pydantic raise
-        raise MapvoteError(f"{path}: not a whole PCD file ({first_line(error)}); copy or export it again") from error
+    except Exception as error:
+        raise _unreadable(path, error) from error
     table = np.atleast_1d(cloud.pc_data)
-    if len(table) != cloud.metadata.points:
-        raise MapvoteError(
-            f"{path}: cut off: {len(table)} points, but its header says {cloud.metadata.points}; copy it again"
-        )
+    _check_count(path, len(table), cloud.metadata)
     return table, np.array(cloud.metadata.viewpoint, dtype=np.float64)
 
 
+def _unreadable(path: Path, error: Exception) -> MapvoteError:
+    if isinstance(error, OSError):
+        return MapvoteError(f"{path}: cannot be read ({error.strerror or error})")
+    # pypcd4 lets through whatever numpy, struct, lzf and pydantic raise
+    return MapvoteError(f"{path}: not a whole PCD file ({first_line(error)}); copy or export it again")
+
+
+def _check_count(path: Path, found: int, about: MetaData) -> None:
+    if found != about.points:
+        raise MapvoteError(f"{path}: cut off: {found} points, but its header says {about.points}; copy it again")
+
+
 def read_pcd(path: Path) -> Cloud:
-    """The points of a PCD file; its VIEWPOINT is not applied (map points are in map metres already)."""
-    table, _ = read_pcd_table(path)
-    return Cloud(xyz(str(path), table), other_fields(table.dtype.names or ()), fields=kept_fields(table))
+    """The whole file; see :func:`stream_pcd`."""
+    return joined(list(stream_pcd(path)))
+
+
+def stream_pcd(path: Path) -> Iterator[Cloud]:
+    """The points of a PCD file, piece by piece (binary_compressed, one block by its nature, in one); its VIEWPOINT is
+    not applied: map points are in map metres already. MapvoteError as :func:`read_pcd_table`."""
+    try:
+        with path.open("rb") as file:
+            about = _header(file)
+            compressed = about.points and about.data == Encoding.BINARY_COMPRESSED
+            tables = iter([read_pcd_table(path)[0]]) if compressed else _blocks(file, about)
+            found = 0
+            for table in tables:
+                found += len(table)
+                yield Cloud(xyz(str(path), table), other_fields(table.dtype.names or ()), fields=kept_fields(table))
+            _check_count(path, found, about)
+    except MapvoteError:
+        raise
+    except Exception as error:
+        raise _unreadable(path, error) from error
+
+
+def _header(file: BinaryIO) -> MetaData:
+    """What the lines up to DATA say; the file is left where points begin."""
+    lines: list[str] = []
+    for raw in file:
+        line = raw.decode().strip()
+        if line and not line.startswith("#"):
+            lines.append(line)
+        if line.startswith("DATA") or len(lines) >= 10:
+            break
+    return MetaData.parse_header(lines)
+
+
+def _blocks(file: BinaryIO, about: MetaData) -> Iterator[NDArray[np.void]]:
+    """The points that follow the header, ascii or binary; fewer than it says if the file is cut off."""
+    dtype, left = about.build_dtype(), about.points
+    if left <= 0:
+        yield np.empty(0, dtype=dtype)
+    while left > 0:
+        if about.data == Encoding.ASCII:
+            lines = list(islice(file, _BLOCK))
+            table = np.atleast_1d(np.loadtxt(lines, dtype, delimiter=" ")) if lines else np.empty(0, dtype=dtype)
+        else:
+            raw = file.read(min(left, _BLOCK) * dtype.itemsize)
+            table = np.frombuffer(raw[: len(raw) // dtype.itemsize * dtype.itemsize], dtype=dtype)
+        if not len(table):
+            return
+        left -= len(table)
+        yield table
 
 
 def write_pcd(path: Path, cloud: Cloud, *, encoding: str = "binary", double: bool = False) -> None:

@@ -1,0 +1,205 @@
+"""From the pieces of a cloud to a map: what is in memory is a piece, a tile, and the heights of all points.
+
+Twice over the disk: points as they come, for only then is known where the map lies and which fields all pieces have;
+then by tile. The ground needs all heights at once, because it grows from tile to tile.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from itertools import chain
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mapvote.core.grid import Lattice, TileIndex
+from mapvote.core.ground import Heights, lay_ground
+from mapvote.core.lazy_tiles import LazyTiles, in_memory_if_small
+from mapvote.core.point_map import PointMap, check_extent, cut_tiles
+from mapvote.core.tile import Tile
+from mapvote.core.types import F32, F64, MapvoteError
+from mapvote.formats.clean import MAX_BAD_SHARE
+from mapvote.formats.geo.frame import MapFrame
+from mapvote.formats.geo.units import settle
+from mapvote.formats.maps.cloud import GROUND, KEPT, Cloud, joined, lattice_of
+from mapvote.formats.maps.spill import Columns, Spill
+
+log = logging.getLogger("mapvote.formats")
+
+_SOME = 1_000_000
+"""Points looked at to tell degrees from metres; and points in a piece."""
+_XYZ = "xyz"
+
+
+def in_metres(
+    where: str, pieces: Iterator[Cloud], wanted: MapFrame | None = None, *, sure: bool = False
+) -> Iterator[Cloud]:
+    """Pieces of one file in map metres, in the frame ``wanted`` where one is; see ``geo.units.settle``."""
+    first: list[Cloud] = []
+    for piece in pieces:
+        first.append(piece)
+        if sum(len(p.points) for p in first) >= _SOME:
+            break
+    if not first:
+        return
+    frame, convert = settle(where, first[0].frame, wanted, joined(first).points[:_SOME], sure=sure)
+    for piece in chain(first, pieces):
+        yield replace(piece, points=convert(piece.points), frame=frame)
+
+
+def to_map(where: str, cloud: Cloud) -> PointMap:
+    """:func:`map_of` a cloud that is in memory as a whole."""
+    return map_of(where, [cloud])
+
+
+def map_of(where: str, pieces: Iterable[Cloud], folder: Path | None = None) -> PointMap:
+    """The map of a cloud in pieces: tiles cut, ground laid, map_id from the content. Broken points are dropped and
+    counted. Points that the file classifies as ground are ground.
+
+    ``folder``: where temporary files may lie. Of a map larger than memory the tiles are read from them.
+    MapvoteError if the cloud is empty or more than 5 % of it is not finite.
+    """
+    taken = _Taken(where, Spill(folder))
+    for piece in pieces:
+        taken.take(piece)
+    lattice = taken.lattice()
+    parts = _Parts(lattice, Spill(folder))
+    digest = hashlib.sha256(np.array([lattice.x0, lattice.y0]).tobytes())
+    done = 0
+    for block in taken.blocks():
+        points: F64 = np.ascontiguousarray(block[_XYZ], dtype=np.float64)
+        check_extent(points, done)
+        done += len(points)
+        digest.update(points.tobytes())
+        parts.cut(block)
+    taken.spill.close()
+    ground = lay_ground(parts.heights, parts.road)
+    tiles = in_memory_if_small(LazyTiles(lambda index: parts.tile(index, ground[index]), parts.points))
+    return PointMap(digest.hexdigest()[:16], lattice, tiles, taken.frame.georeference())
+
+
+@dataclass
+class _Taken:
+    """The points of a file as they came, on disk, and what only the whole file tells."""
+
+    where: str
+    spill: Spill
+    frame: MapFrame = field(default_factory=MapFrame)
+    total: int = 0
+    bad: int = 0
+    _low: F64 | None = None
+    _high: F64 | None = None
+    _kinds: list[dict[str, np.dtype[Any]]] = field(default_factory=list)
+
+    def take(self, cloud: Cloud) -> None:
+        points = cloud.points
+        self.frame = cloud.frame
+        self._kinds.append({name: column.dtype for name, column in {**cloud.fields, _XYZ: points}.items()})
+        good = np.isfinite(points[:, 0]) & np.isfinite(points[:, 1]) & np.isfinite(points[:, 2])
+        self.total += len(points)
+        self.bad += len(points) - int(good.sum())
+        columns = {_XYZ: points, **cloud.fields}
+        if not good.all():
+            columns = {name: column[good] for name, column in columns.items()}
+        if not good.any():
+            return
+        low, high = columns[_XYZ].min(axis=0).astype(np.float64), columns[_XYZ].max(axis=0).astype(np.float64)
+        self._low = low if self._low is None else np.minimum(self._low, low)
+        self._high = high if self._high is None else np.maximum(self._high, high)
+        for start in range(0, len(columns[_XYZ]), _SOME):
+            self.spill.add({name: column[start : start + _SOME] for name, column in columns.items()})
+
+    def lattice(self) -> Lattice:
+        """Where the map's cells lie. MapvoteError if no map can be made of what was taken."""
+        if not self.total:
+            raise MapvoteError(f"{self.where}: holds no points; a map needs some")
+        if self.bad > MAX_BAD_SHARE * self.total:
+            raise MapvoteError(
+                f"{self.where}: {self.bad} of {self.total} points are not finite, more than {MAX_BAD_SHARE:.0%}; "
+                "mend the file"
+            )
+        if self.bad:
+            log.warning("%s: dropped %d of %d points that are not finite", self.where, self.bad, self.total)
+        assert self._low is not None
+        assert self._high is not None
+        return lattice_of(np.array([self._low, self._high]))
+
+    def blocks(self) -> Iterator[Columns]:
+        """What was taken, in order: the fields that all pieces have, each in one type."""
+        names = [name for name in (_XYZ, *KEPT) if all(name in kinds for kinds in self._kinds)]
+        types = {name: np.result_type(*(kinds[name] for kinds in self._kinds)) for name in names}
+        for number in range(len(self.spill)):
+            block = self.spill.read(number)
+            yield {name: block[name].astype(types[name], copy=False) for name in names}
+
+
+class _Parts:
+    """Points by tile, on disk: of every tile the blocks that hold some of it, in the order in which they came."""
+
+    def __init__(self, lattice: Lattice, spill: Spill) -> None:
+        self.points: dict[TileIndex, int] = {}
+        """How many each tile holds."""
+        self._lattice, self._spill = lattice, spill
+        self._blocks: dict[TileIndex, list[int]] = {}
+        self._grounded: set[TileIndex] = set()
+
+    def cut(self, block: Columns) -> None:
+        """Take in a block of points in map metres and their fields."""
+        for index, mine in cut_tiles(block[_XYZ], self._lattice):
+            part = {name: column[mine] for name, column in block.items()}
+            part[_XYZ] = self._lattice.tile(index).from_map(part[_XYZ])
+            if (part.get("classification", np.empty(0)) == GROUND).any():
+                self._grounded.add(index)
+            self._blocks.setdefault(index, []).append(self._spill.add(part))
+            self.points[index] = self.points.get(index, 0) + len(mine)
+
+    def read(self, index: TileIndex) -> Columns:
+        """The points of a tile, from its corner, and their fields."""
+        parts = [self._spill.read(number) for number in self._blocks[index]]
+        return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+
+    def tile(self, index: TileIndex, ground_z: F32) -> Tile:
+        columns = self.read(index)
+        points = columns.pop(_XYZ)
+        return Tile(self._lattice.tile(index), points, ground_z, fields=columns)
+
+    @property
+    def heights(self) -> Mapping[TileIndex, Heights]:
+        """Of all points."""
+        return _Asked(self.points, lambda index: self._heights(index, self.read(index)[_XYZ]))
+
+    @property
+    def road(self) -> Mapping[TileIndex, Heights]:
+        """Of the points that the file says are ground, if it says so."""
+
+        def ground(index: TileIndex) -> Heights:
+            columns = self.read(index)
+            return self._heights(index, columns[_XYZ][columns["classification"] == GROUND])
+
+        return _Asked(dict.fromkeys(self._grounded), ground)
+
+    def _heights(self, index: TileIndex, points: F32) -> Heights:
+        return self._lattice.tile(index).flat_cells(points), points[:, 2]
+
+
+class _Asked(Mapping[TileIndex, Heights]):
+    """A mapping that works out a value whenever it is asked."""
+
+    def __init__(self, keys: Mapping[TileIndex, Any], ask: Callable[[TileIndex], Heights]) -> None:
+        self._keys, self._ask = keys, ask
+
+    def __getitem__(self, index: TileIndex) -> Heights:
+        return self._ask(index)
+
+    def __contains__(self, index: object) -> bool:
+        return index in self._keys
+
+    def __iter__(self) -> Iterator[TileIndex]:
+        return iter(self._keys)
+
+    def __len__(self) -> int:
+        return len(self._keys)

@@ -1,0 +1,146 @@
+"""A map that is made piece by piece, over the disk, is the map that is made of all its points at once."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from hand_made import Say, make_ballot, states_plane, wall
+from mapvote.config import FuseSettings
+from mapvote.core import lazy_tiles
+from mapvote.core.lazy_tiles import LazyTiles
+from mapvote.core.point_map import PointMap, map_from_points
+from mapvote.core.types import F64, CellState, MapvoteError
+from mapvote.formats import read_map, write_map
+from mapvote.formats.maps import pcd, ply, spill
+from mapvote.formats.maps.cloud import Cloud, lattice_of
+from mapvote.formats.maps.importing import import_cloud
+from mapvote.formats.maps.pcd import write_pcd
+from mapvote.formats.maps.ply import write_ply
+from mapvote.formats.maps.tiling import map_of
+from mapvote.fusion.offline import update_map
+
+
+def street(seed: int, n: int = 4000, x: float = 0.0) -> tuple[F64, dict[str, Any]]:
+    """Two tiles of road, and things on it."""
+    rng = np.random.default_rng(seed)
+    points = rng.uniform([x - 40, -30, 0], [x + 40, 30, 0.02], (n, 3))
+    points[: n // 4, 2] += rng.uniform(0, 5, n // 4)
+    classes = np.where(points[:, 2] < 0.05, 2, 1).astype(np.uint8)
+    return points, {"intensity": rng.integers(0, 999, n).astype(np.uint16), "classification": classes}
+
+
+def files(point_map: PointMap, folder: Path) -> dict[str, bytes]:
+    write_map(point_map, folder)
+    return {str(file.relative_to(folder)): file.read_bytes() for file in sorted(folder.rglob("*")) if file.is_file()}
+
+
+@settings(max_examples=8, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.integers(0, 2**31), st.lists(st.integers(0, 4000), max_size=5), st.sampled_from([0.0, 367_000.0]))
+def test_pieces_make_the_same_bytes_as_the_whole(
+    tmp_path_factory: pytest.TempPathFactory, seed: int, cuts: list[int], x: float
+) -> None:
+    points, fields = street(seed, x=x)
+    ends = [0, *sorted(cuts), len(points)]
+    pieces = [
+        Cloud(points[a:b], fields={name: column[a:b] for name, column in fields.items()}) for a, b in pairwise(ends)
+    ]
+    folder = tmp_path_factory.mktemp("maps")
+    road = points[fields["classification"] == 2]
+    whole = map_from_points(points, lattice=lattice_of(points), road=road, fields=fields, georeference={"crs": "local"})
+    assert files(map_of("it", iter(pieces)), folder / "a") == files(whole, folder / "b")
+
+
+@pytest.fixture
+def large(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Everything counts as larger than memory."""
+    monkeypatch.setattr(lazy_tiles, "KEPT_POINTS", 1500)
+    monkeypatch.setattr(spill, "_IN_MEMORY", 1)
+    monkeypatch.setattr(pcd, "_BLOCK", 700)
+    monkeypatch.setattr(ply, "_BLOCK", 700)
+
+
+@pytest.mark.usefixtures("large")
+@pytest.mark.parametrize("suffix", [".pcd", ".ply", " ascii.pcd", ".laz"])
+def test_a_map_larger_than_memory_is_the_same_map(tmp_path: Path, suffix: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    from mapvote.formats.maps.las import write_las
+
+    points, fields = street(3)
+    cloud, file = Cloud(points, fields=fields), tmp_path / f"a{suffix}"
+    if suffix == ".ply":
+        write_ply(file, cloud)
+    elif suffix == ".laz":
+        write_las(file, cloud)
+    else:
+        write_pcd(file, cloud, encoding="ascii" if "ascii" in suffix else "binary", double=True)
+    made, _ = import_cloud(file, folder=tmp_path)
+    assert isinstance(made.tiles, LazyTiles)
+    assert (len(made.tiles), made.n_points) == (4, 4000)
+    lazy = files(made, tmp_path / "lazy")
+    monkeypatch.undo()
+    small, _ = import_cloud(file)
+    assert isinstance(small.tiles, dict)
+    assert lazy == files(small, tmp_path / "small")
+    assert sorted(p.name for p in tmp_path.iterdir()) == sorted([file.name, "lazy", "small"])
+
+
+@pytest.mark.usefixtures("large")
+def test_a_tile_that_somebody_holds_is_not_made_again(tmp_path: Path) -> None:
+    points, fields = street(4)
+    made = map_of("it", [Cloud(points, fields=fields)])
+    held = made.tiles[0, 0]
+    for _ in range(2):
+        assert sum(len(tile.points) for tile in made.tiles.values()) == 4000
+    assert made.tiles[0, 0] is held
+    assert made.tiles.get((7, 7)) is None
+
+
+@pytest.mark.usefixtures("large")
+def test_a_large_map_on_disk_is_opened_tile_by_tile_and_updated(tmp_path: Path) -> None:
+    points, fields = street(7)
+    write_map(map_of("it", [Cloud(points, fields=fields)]), tmp_path / "m")
+    opened = read_map(tmp_path / "m")
+    assert isinstance(opened.tiles, LazyTiles)
+    built = Say(states_plane({(5, 5): CellState.CHANGED_OCCUPIED}), new_points=wall([(5, 5)], [0.45, 0.75]))
+    after, _ = update_map(opened, [make_ballot(opened, {(0, 0): built})], FuseSettings(min_votes=1))
+    assert isinstance(after.tiles, LazyTiles)
+    assert after.n_points == 4002
+    assert after.tiles[0, -1] is opened.tiles[0, -1]
+    before, now = files(opened, tmp_path / "a"), files(after, tmp_path / "b")
+    assert {name for name in now if now[name] != before[name]} == {"manifest.json", "tiles/0_0.tile"}
+
+
+@pytest.mark.usefixtures("large")
+def test_a_large_map_with_a_damaged_tile_is_refused_when_it_is_opened(tmp_path: Path) -> None:
+    points, _ = street(8)
+    write_map(map_of("it", [Cloud(points)]), tmp_path / "m")
+    (tmp_path / "m/tiles/0_0.tile").write_bytes(b"no tile")
+    with pytest.raises(MapvoteError, match=r"0_0\.tile: its bytes are not those of the manifest"):
+        read_map(tmp_path / "m")
+
+
+def test_a_file_that_is_cut_off_late_leaves_no_map(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pcd, "_BLOCK", 700)
+    points, _ = street(5)
+    write_pcd(tmp_path / "a.pcd", Cloud(points))
+    (tmp_path / "a.pcd").write_bytes((tmp_path / "a.pcd").read_bytes()[:-100])
+    with pytest.raises(MapvoteError, match="cut off: 3991 points, but its header says 4000"):
+        read_map(tmp_path / "a.pcd")
+
+
+def test_a_full_disk_is_one_clear_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(spill, "_IN_MEMORY", 1)
+
+    def full(**_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("tempfile.TemporaryFile", full)
+    points, _ = street(6)
+    with pytest.raises(MapvoteError, match="no room for temporary files"):
+        map_of("it", [Cloud(points)])
