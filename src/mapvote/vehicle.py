@@ -7,6 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from mapvote.codec.ballot import Ballot, BallotTile, pack_plane, tile_key
+from mapvote.codec.path import pack_path
 from mapvote.codec.tile_file import base_hash
 from mapvote.codec.words import pack_words
 from mapvote.config import Settings
@@ -127,6 +128,7 @@ def write_ballot(
         length_m=report.length_m(),
         prior_misfit_m=report.prior_misfit_m(),
         prior_sigma_m=report.prior_sigma_m(),
+        path=pack_path(report.driven(), point_map.lattice),
         tiles=tiles,
     )
 

@@ -16,6 +16,7 @@ import numpy as np
 
 from mapvote.codec.arrays import pack_plane as pack_plane
 from mapvote.codec.arrays import unpack_bytes, unpack_frames, unpack_plane
+from mapvote.codec.path import check_path
 from mapvote.codec.words import unpack_sparse
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, TileIndex
 from mapvote.core.types import F32, N_STATES, NO_VOTE, U8, U16, MapvoteError
@@ -82,6 +83,8 @@ class Ballot(msgspec.Struct, frozen=True, kw_only=True):
     """Median distance, in the plane, between fix and prior of the scans that voted; None without a prior."""
     prior_sigma_m: float | None = None
     """What the prior said of itself."""
+    path: bytes | None = None
+    """Where it drove (codec/path.py); None if the ballot does not say."""
     tiles: list[BallotTile]
 
 
@@ -206,6 +209,8 @@ def validate(ballot: Ballot, max_bytes: int | None = None) -> None:
     ``max_bytes``: also refuse a ballot whose planes are larger than that, together and decompressed.
     """
     size = 0
+    if ballot.path is not None:
+        check_path(ballot.path, [tile.tile for tile in ballot.tiles])
     for tile in ballot.tiles:
         if tile.states is not None:
             size += unpack_states(tile.states).nbytes

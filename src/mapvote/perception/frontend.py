@@ -64,6 +64,11 @@ class DriveReport:
         found[self.lost] = False
         return float(steps[found[1:] & found[:-1]].sum())
 
+    def driven(self) -> list[F64]:
+        """(3,) each: where the sensor was, map metres, of the scans that were localised."""
+        lost = set(self.lost)
+        return [T[:3, 3] for i, T in enumerate(self.T_map_lidar) if i not in lost]
+
     def prior_misfit_m(self) -> float | None:
         """Median distance in the plane between fix and prior of the scans that were localised; None without priors."""
         lost = set(self.lost)

@@ -12,10 +12,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from fastapi.testclient import TestClient
+from msgspec.structs import replace
 from PIL import Image
 
 from hand_made import Say, make_ballot, states_plane, two_walls
 from mapvote.codec.ballot import encode
+from mapvote.codec.path import pack_path
 from mapvote.config import FuseSettings
 from mapvote.core.types import CellState
 from mapvote.fusion.probability import change_probability
@@ -39,6 +41,9 @@ def client(tmp_path: Path) -> Iterator[TestClient]:
     for name in ("v1", "v2"):
         states = states_plane(dict.fromkeys(WALL, CellState.CHANGED_EMPTY), fill=CellState.UNCHANGED_EMPTY)
         ballot = make_ballot(two_walls(), {(0, 0): Say(states)}, name, end_ns=store.clock())
+        if name == "v1":
+            way = [np.array([x, 6.0, 2.0]) for x in np.arange(2.0, 42.0, 0.5)]
+            ballot = replace(ballot, path=pack_path(way, store.lattice))
         accept(store, [examine(encode(ballot))])
     publish(store, FuseSettings(max_deleted_share=1.0))
     with TestClient(create_app(store, opened=True), base_url="http://localhost") as found:
@@ -94,6 +99,21 @@ def test_evidence_tells_votes_age_probability_and_state_of_each_cell(client: Tes
     assert (unseen == [0, 255, 0, 255]).all()
     one = np.frombuffer(client.get("/v1/evidence/0/0?vehicle=v1").content, np.uint8).reshape(256, 256, 4)
     assert one[10, 11, 0] == 1
+
+
+def test_where_vehicles_drove_lies_on_the_ground_and_is_a_line_or_a_row(client: TestClient) -> None:
+    (line,) = client.get("/v1/paths").json()["features"]
+    assert (line["properties"]["vehicle"], line["properties"]["length_m"]) == ("v1", pytest.approx(39.5, abs=0.5))
+    x, y, z = np.array(line["geometry"]["coordinates"]).T
+    assert (x[0], x[-1]) == (pytest.approx(2.0, abs=0.2), pytest.approx(41.5, abs=0.2))
+    assert y == pytest.approx(6.0, abs=0.2)
+    assert np.abs(z).max() < 0.2
+    head, row = client.get("/v1/paths?format=csv").text.splitlines()
+    assert head == "vehicle,drive,start,end,version,length_m"
+    assert row.startswith("v1,d1,")
+    assert client.get("/v1/paths?vehicle=v2").json()["features"] == []
+    assert client.delete("/v1/ballots/v1/d1").status_code == 200
+    assert client.get("/v1/paths").json()["features"] == [], "a vote that was taken back takes its path along"
 
 
 def test_a_list_of_changes_is_geojson_or_csv(client: TestClient) -> None:

@@ -130,6 +130,7 @@ def test_a_verdict_can_be_taken_back_once(server: Server) -> None:
 def test_only_reviewers_and_operators_sit_at_the_desk(server: Server) -> None:
     client, _, who = server
     assert client.get("/v1/desk", headers=who["v1"]).status_code == 403
+    assert client.get("/v1/paths", headers=who["v1"]).status_code == 403
     assert decide(server, "v1", "x", "accepted").status_code == 403
     assert decide(server, "boss", "x", "accepted").status_code == 404
     assert client.get("/v1/desk").status_code == 401

@@ -8,11 +8,13 @@ from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
 from chromium import Chromium, program
 from hand_made import Say, make_ballot, make_map, make_tile, states_plane, wall
 from live_server import serving
 from mapvote.codec.ballot import encode
+from mapvote.codec.path import pack_path
 from mapvote.config import FuseSettings
 from mapvote.core.types import CellState
 from mapvote.server.insight.cutout import whole_page
@@ -24,7 +26,7 @@ from mapvote.server.store.store import Store
 
 HOUSE = [(r, c) for r in range(40, 60) for c in range(40, 70) if r in (40, 59) or c in (40, 69)]
 SHED = [(r, c) for r in range(150, 160) for c in range(150, 160) if r in (150, 159) or c in (150, 159)]
-HEIGHTS = [0.45, 1.05, 1.65, 2.55, 3.15, 4.05]
+HEIGHTS = [0.45, 1.05, 1.65, 2.55, 3.15, 4.35]
 AXE = Path(__file__).parents[2] / "vendor" / "axe.min.js"
 
 
@@ -46,6 +48,7 @@ def village(database: str) -> None:
             states = states_plane(dict.fromkeys(gone, CellState.CHANGED_EMPTY), fill=CellState.UNCHANGED_EMPTY)
             base = opened.point_map()
             ballot = make_ballot(base, {(0, 0): Say(states)}, name, f"d{number}", end_ns=opened.clock())
+            ballot = replace(ballot, path=pack_path([np.array([x, 30.0]) for x in range(4, 74, 5)], opened.lattice))
             accept(opened, [examine(encode(ballot))])
         if number == 0:
             publish(opened, by="<b>boss</b>", reason="<script>alert(1)</script>")
@@ -101,6 +104,11 @@ def test_the_cloud_is_drawn_and_nobody_else_is_asked(browser: Chromium, store: P
             for (let i = 0; i < d.length; i += 4) seen.add(d[i] << 16 | d[i + 1] << 8 | d[i + 2]);
             return seen.size; })()"""
         browser.wait(f"{colours} > 20")
+        pixels = """(wanted => { const c = document.querySelector('#cloud'), p = document.createElement('canvas');
+            p.width = c.width; p.height = c.height; const g = p.getContext('2d'); g.drawImage(c, 0, 0);
+            const d = g.getImageData(0, 0, p.width, p.height).data, rgb = parseInt(wanted.slice(1), 16); let n = 0;
+            for (let i = 0; i < d.length; i += 4) n += (d[i] << 16 | d[i + 1] << 8 | d[i + 2]) === rgb;
+            return n; })"""
         press(browser, "2")
         assert browser.run("!document.querySelector('#map').hidden && document.querySelector('#cloud').hidden")
         press(browser, "3")
@@ -110,6 +118,11 @@ def test_the_cloud_is_drawn_and_nobody_else_is_asked(browser: Chromium, store: P
             browser.run(f"(s => (s.value = '{colour}', s.onchange()))(document.querySelector('#colour'))")
             if colour == "state":
                 browser.wait("location.hash.includes('vehicle=v1')")
+        before = browser.run(f"{pixels}('#c26a00')")
+        browser.run("document.querySelector('#paths').click()")
+        browser.wait("document.querySelector('#paths-text').innerText === '4 drives, 0.3 km'")
+        browser.wait(f"{pixels}('#c26a00') > {before} + 50")
+        browser.wait("location.hash.includes('paths=1')")
         browser.run("document.querySelector('#changes button').click()")
         browser.wait("location.hash.includes('change=demolished.v2')")
         browser.wait("location.hash.includes('eye=')")

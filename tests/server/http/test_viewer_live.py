@@ -23,7 +23,7 @@ from mapvote.server.store.store import Store
 
 HOUSE = [(r, c) for r in range(40, 60) for c in range(40, 70) if r in (40, 59) or c in (40, 69)]
 GHOSTS = [(r + i, c + j) for r in range(100, 250, 30) for c in range(100, 250, 30) for i in range(3) for j in range(3)]
-HEIGHTS = [0.45, 1.05, 2.55, 4.05]
+HEIGHTS = [0.45, 1.05, 2.55, 4.35]
 HOUR = 3_600_000_000_000
 
 

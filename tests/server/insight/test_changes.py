@@ -177,12 +177,12 @@ def test_geojson_of_a_map_on_earth_is_longitude_and_latitude() -> None:
     assert "local metres" in local["frame"]
 
 
-def test_what_two_cars_leave_behind_is_no_larger_thing_and_a_long_low_wall_is() -> None:
-    car, rest = cell_points(0, 0, 15, 6, (0.6, 1.5)), cell_points(18, 2, 5, 3, (1.2,))
-    (left,) = compare(street(car, rest), street())
-    assert (left.box[2] - left.box[0]) * CELL_SIZE > 6.0
-    assert left.size == "car"
-    assert left.longest_m == pytest.approx(4.5)
-    (wall,) = compare(street(cell_points(0, 0, 25, 1, (1.5,))), street())
+def test_what_two_vehicles_leave_behind_is_no_larger_thing_but_a_long_low_wall_is() -> None:
+    bus, car = cell_points(0, 0, 38, 9, (0.6, 1.5, 3.2)), cell_points(42, 2, 13, 3, (1.2,))
+    (left,) = compare(street(bus, car), street())
+    assert (left.box[2] - left.box[0]) * CELL_SIZE > 12.0
+    assert left.size == "vehicle"
+    assert left.longest_m == pytest.approx(11.4)
+    (wall,) = compare(street(cell_points(0, 0, 45, 1, (1.5,))), street())
     assert wall.size == "large"
-    assert wall.longest_m == pytest.approx(7.5)
+    assert wall.longest_m == pytest.approx(13.5)

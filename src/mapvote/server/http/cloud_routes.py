@@ -9,11 +9,12 @@ from fastapi import APIRouter, Path, Query, Request, Response
 from mapvote.codec.arrays import compress
 from mapvote.core.types import MapvoteError
 from mapvote.server.http.auth import reviewer
-from mapvote.server.http.schemas import From, To, VersionQuery, problems
+from mapvote.server.http.schemas import AS_CSV, From, Places, To, VersionQuery, as_json, as_table, problems
 from mapvote.server.http.services import services
 from mapvote.server.insight.clouds import evidence
 from mapvote.server.insight.history import picture_between
 from mapvote.server.insight.levels import N_LEVELS
+from mapvote.server.insight.paths import paths
 from mapvote.server.store.blobs import TileHashes
 
 _BYTES: dict[int | str, dict[str, Any]] = {200: {"content": {"application/octet-stream": {}}}}
@@ -100,6 +101,17 @@ def evidence_of(request: Request, row: _Index, col: _Index, vehicle: str | None 
         reviewer(request)
     plane = evidence(services(request).store, (row, col), vehicle)
     return _packed(request, plane.tobytes(), "private, no-cache")
+
+
+@router.get(
+    "/v1/paths", response_model=dict[str, Any], responses=problems(403) | AS_CSV, summary="Where vehicles drove"
+)
+def driven(request: Request, vehicle: str | None = None, format: Places = "json") -> Response:
+    """Of standing ballots that tell of it, the newest drive first, 500 at most: GeoJSON lines in map metres; as ``csv``
+    without the lines."""
+    reviewer(request)
+    found = paths(services(request).store, vehicle)
+    return as_table([feature["properties"] for feature in found["features"]]) if format == "csv" else as_json(found)
 
 
 def _hashes(pair: str | None) -> TileHashes | None:

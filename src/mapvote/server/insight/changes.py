@@ -21,11 +21,12 @@ from mapvote.server.insight.polygons import Ring, pieces, rings
 from mapvote.server.insight.things import REACH_M, group
 
 Kind = Literal["built", "demolished"]
-Size = Literal["large", "car", "small"]
+Size = Literal["large", "vehicle", "small"]
 SMALL_AREA_M2 = 1.0
-CAR_LENGTH_M, CAR_HEIGHT_M = 6.0, 2.5
-"""What fits into these may be a car, or what one left behind: it is listed apart. Several of them side by side, which
-lie within reach of each other, are no larger thing: each connected piece is asked."""
+VEHICLE_LENGTH_M, VEHICLE_HEIGHT_M = 12.0, 4.0
+"""What fits into these, the largest that a bus or lorry may be (Directive 96/53/EC), may be a vehicle, or the trail of
+one that a survey took for a thing: it is listed apart. Several side by side, which lie within reach of each other, are
+no larger thing: each connected piece is asked."""
 KINDS: dict[int, Kind] = {CellState.CHANGED_OCCUPIED: "built", CellState.CHANGED_EMPTY: "demolished"}
 _NEVER = np.iinfo(np.int64).max
 _UNTIL = np.iinfo(np.int64).min
@@ -108,7 +109,8 @@ class ChangeObject:
         """How much of a thing it is, for lists that begin with what matters."""
         if self.area_m2 < SMALL_AREA_M2:
             return "small"
-        return "car" if self.height_m < CAR_HEIGHT_M and self.longest_m <= CAR_LENGTH_M else "large"
+        fits = self.height_m <= VEHICLE_HEIGHT_M and self.longest_m <= VEHICLE_LENGTH_M
+        return "vehicle" if fits else "large"
 
     @property
     def share_for(self) -> float | None:

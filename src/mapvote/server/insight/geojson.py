@@ -113,8 +113,8 @@ def _feature(change: ChangeObject, lattice: Lattice, near: list[str]) -> dict[st
             "against_median": change.against_median,
             "share_for": None if change.share_for is None else round(change.share_for, 3),
             "probability": None if change.probability is None else round(change.probability, 3),
-            "first_seen": _utc(change.first_seen_ns),
-            "last_seen": _utc(change.last_seen_ns),
+            "first_seen": utc(change.first_seen_ns),
+            "last_seen": utc(change.last_seen_ns),
             "versions": change.versions,
             "box": _corners(np.reshape(change.box, (2, 2)), lattice),
             "near": near,
@@ -128,7 +128,7 @@ def _corners(ring: Ring | F64, lattice: Lattice) -> list[list[float]]:
     return corners
 
 
-def _utc(stamp_ns: int | None) -> str | None:
+def utc(stamp_ns: int | None) -> str | None:
     """ISO 8601, whole seconds; ``None`` where unknown."""
     if stamp_ns is None:
         return None

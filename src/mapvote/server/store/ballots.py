@@ -66,6 +66,7 @@ def put_in(connection: sa.Connection, ballots: Sequence[Incoming], now: int) -> 
     log: list[tuple[Any, ...]] = []
     rows: list[tuple[Any, ...]] = []
     tiles: list[tuple[Any, ...]] = []
+    paths: list[tuple[Any, ...]] = []
     replaced: list[dict[str, int]] = []
     for incoming in ballots:
         ballot, key = incoming.ballot, (incoming.ballot.vehicle, incoming.ballot.drive)
@@ -92,12 +93,16 @@ def put_in(connection: sa.Connection, ballots: Sequence[Incoming], now: int) -> 
         how = ballot.settings_hash[:128], incoming.cast_by, incoming.size, drove_with
         rows.append((seq, first[key], None, *key, incoming.digest, *times, *how))
         tiles += [_tile_row(seq, ballot, tile) for tile in ballot.tiles]
+        if ballot.path is not None:
+            paths.append((seq, ballot.path))
         results.append(Receipt(*key, created=old is None, repeated=False, seq=seq))
         seq += 1
     if rows:
         insert_rows(connection, schema.events, log)
         insert_rows(connection, b, rows)
         insert_rows(connection, schema.ballot_tiles, tiles)
+    if paths:
+        insert_rows(connection, schema.paths, paths)
     if replaced:
         mark = b.update().where(b.c.seq == sa.bindparam("old")).values(gone_seq=sa.bindparam("by"))
         connection.execute(mark, replaced)

@@ -167,6 +167,15 @@ ballot_tiles = sa.Table(
 )
 """``sum``: SHA-256 over base and planes."""
 
+paths = sa.Table(
+    "paths",
+    metadata,
+    sa.Column("ballot", sa.BigInteger, sa.ForeignKey("ballots.seq"), primary_key=True, autoincrement=False),
+    sa.Column("path", sa.LargeBinary, nullable=False),
+    sum_over("ballot", "path"),
+)
+"""Where vehicles drove, of ballots that say so (codec/path.py)."""
+
 decisions = sa.Table(
     "decisions",
     metadata,
@@ -226,6 +235,6 @@ deliveries = sa.Table(
 
 HEADS = {
     "map": maps, "policy": policies, "key": keys, "event": events, "version": versions, "ballot": ballots,
-    "review": reviews, "reviewed": review_cells,
+    "review": reviews, "reviewed": review_cells, "path": paths,
 }  # fmt: skip
 """What carries a sum over all of a row that is written once, by the kind of damage."""

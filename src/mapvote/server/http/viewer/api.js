@@ -46,6 +46,7 @@ export const vehicles = async () => (await ask("vehicles")).json();
 export const overview = async (version) => (await ask("clouds/overview", version ? { version } : {})).arrayBuffer();
 export const cloudPart = async ({ points, ground }, level) => (await ask(`clouds/${points}/${ground}/${level}`)).arrayBuffer();
 export const evidence = async (tile, vehicle) => (await ask(`evidence/${tile.replace(",", "/")}`, vehicle ? { vehicle } : {})).arrayBuffer();
+export const paths = async (vehicle) => (await ask("paths", vehicle ? { vehicle } : {})).json();
 export const versionMap = async (number) => (await ask(`map/versions/${number}`)).json();
 
 const pair = (tile) => `${tile.points}-${tile.ground}`;

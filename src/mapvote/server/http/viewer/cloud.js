@@ -1,7 +1,8 @@
 // The cloud in 3D: parts of tiles on the graphics card, drawn when something changed. Knows nothing of the server.
 
 import {
-  BufferAttribute, BufferGeometry, Color, ColorManagement, DataTexture, DepthTexture, Frustum, GLSL3, Matrix4, Mesh, NearestFilter,
+  BufferAttribute, BufferGeometry, Color, ColorManagement, DataTexture, DepthTexture, Frustum, GLSL3, LineBasicMaterial,
+  LineSegments, Matrix4, Mesh, NearestFilter,
   PerspectiveCamera, PlaneGeometry, Points, RawShaderMaterial, Scene, Sphere, UnsignedByteType, Vector2, Vector3,
   WebGLRenderTarget, WebGLRenderer,
 } from "./vendor/three.module.min.js";
@@ -86,6 +87,28 @@ export class Cloud {
     this.scene.remove(part.points);
     part.points.geometry.dispose();
     part.points.material.dispose();
+  }
+
+  // Lines of [x, y, z], map metres, seen through everything; they take the place of those before.
+  setLines(lines) {
+    if (this.lines) {
+      this.scene.remove(this.lines);
+      this.lines.geometry.dispose();
+      this.lines.material.dispose();
+      this.lines = null;
+    }
+    const local = ([x, y, z]) => [x - this.origin[0], y - this.origin[1], z - this.origin[2] + 0.3];
+    const ends = lines.flatMap((line) => line.slice(1).flatMap((at, i) => [...local(line[i]), ...local(at)]));
+    if (ends.length) {
+      const geometry = new BufferGeometry();
+      geometry.setAttribute("position", new BufferAttribute(new Float32Array(ends), 3));
+      this.lines = new LineSegments(geometry, new LineBasicMaterial({ depthTest: false, depthWrite: false }));
+      this.lines.material.color.setStyle(getComputedStyle(document.documentElement).getPropertyValue("--path").trim() || "#e07b00", "");
+      this.lines.frustumCulled = false;
+      this.lines.renderOrder = 1;
+      this.scene.add(this.lines);
+    }
+    this.draw();
   }
 
   texture(bytes) {  // (256, 256, 4) evidence of one tile

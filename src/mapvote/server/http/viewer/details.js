@@ -127,7 +127,7 @@ export function closeDetails() {
 }
 
 function mark(id) {
-  for (const button of document.querySelectorAll("#changes button, #cars button, #small button"))
+  for (const button of document.querySelectorAll("#changes button, #vehicles-maybe button, #small button"))
     button.setAttribute("aria-current", String(button.parentElement.id === `item-${id}`));
 }
 

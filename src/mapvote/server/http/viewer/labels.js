@@ -8,7 +8,7 @@ export class Labels {
   }
 
   set(changes) {
-    const large = changes.filter((c) => c.size !== "small" && c.size !== "car").slice(0, MOST);
+    const large = changes.filter((c) => c.size === "large").slice(0, MOST);
     this.signs = large.map((change) => {
       const sign = document.createElement("button");
       sign.type = "button";

@@ -5,7 +5,7 @@ import { drawable, showChange, visit } from "./details.js";
 import { $, dot, element } from "./dom.js";
 import { state } from "./page.js";
 
-const FOLDS = { car: ["cars", (n) => `${n} that could be ${n > 1 ? "cars" : "a car"}`], small: ["small", (n) => `${n} smaller than 1 m\u00b2`] };
+const FOLDS = { vehicle: ["vehicles-maybe", (n) => `${n} that could be ${n > 1 ? "vehicles" : "a vehicle"}`], small: ["small", (n) => `${n} smaller than 1 m\u00b2`] };
 
 export function showList(features, nothing, range) {
   state.features = [...features].sort((a, b) => b.properties.area_m2 - a.properties.area_m2);

@@ -79,6 +79,12 @@ export class Stage {
     this.flat.setRaster(hash, points);
   }
 
+  // Lines of [x, y, z], map metres.
+  setPaths(lines) {
+    this.flat.setPaths(lines);
+    this.cloud?.setLines(lines);
+  }
+
   select(id, cell = null) {
     this.flat.select(id, cell);
     this.labels.select(id);

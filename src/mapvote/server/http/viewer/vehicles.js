@@ -3,6 +3,7 @@
 import * as api from "./api.js";
 import { showCell } from "./details.js";
 import { $, element, link } from "./dom.js";
+import { offerPaths } from "./paths.js";
 import { state } from "./page.js";
 
 const MOST = 5;
@@ -14,6 +15,7 @@ export async function showVehicles() {
   } catch {
     return;
   }
+  offerPaths();
   state.view.tools?.showVehicles(found.map((v) => v.vehicle));
   const against = found.filter((v) => v.verdict === "contradicts");
   const open = found.filter((v) => v.verdict === "undecidable").length;

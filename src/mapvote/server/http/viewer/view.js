@@ -12,6 +12,7 @@ export class View {
     this.scale = 2;  // pixels per metre
     this.tiles = [];
     this.changes = [];
+    this.paths = [];
     this.rasters = new Map();
     this.pointers = new Map();
     new ResizeObserver(() => this.resize()).observe(canvas);
@@ -23,7 +24,7 @@ export class View {
   readColours() {
     const style = getComputedStyle(document.documentElement);
     const of = (name) => style.getPropertyValue(name).trim();
-    this.colours = { built: of("--built"), demolished: of("--demolished"), line: of("--line"), ink: of("--ink"), point: of("--point") };
+    this.colours = { built: of("--built"), demolished: of("--demolished"), line: of("--line"), ink: of("--ink"), point: of("--point"), path: of("--path") };
     this.rasters.clear();
     this.draw();
   }
@@ -35,6 +36,11 @@ export class View {
 
   setChanges(changes) {  // {id, kind, polygons, box}
     this.changes = changes;
+    this.draw();
+  }
+
+  setPaths(paths) {  // lines of [x, y, ..]
+    this.paths = paths;
     this.draw();
   }
 
@@ -126,6 +132,13 @@ export class View {
     g.clearRect(0, 0, canvas.clientWidth, canvas.clientHeight);
     g.imageSmoothingEnabled = this.scale < 1 / CELL;
     for (const tile of this.tiles) this.paintTile(g, tile);
+    g.strokeStyle = this.colours.path;
+    g.lineWidth = 2;
+    for (const line of this.paths) {
+      g.beginPath();
+      for (const at of line) g.lineTo(...this.toScreen(at));
+      g.stroke();
+    }
     for (const change of this.changes) this.paintChange(g, change);
     if (this.cell) {
       const [x, y] = this.toScreen([this.cell[0], this.cell[1] + CELL]), side = CELL * this.scale;
