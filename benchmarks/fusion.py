@@ -76,12 +76,13 @@ def said(rng: np.random.Generator) -> Say:
 
 
 def fill(store: Store, tiles: Sequence[TileIndex], vehicles: int, planes: str) -> float:
-    """One ballot of every vehicle on all tiles; mean bytes a ballot and tile. Four streets, given out in turn."""
+    """One ballot of every vehicle on all tiles; mean bytes a ballot and tile. No two say the same of a tile: such would
+    be copies."""
     rng = np.random.default_rng(1)
-    kinds = [said(rng) for _ in range(40)]
+    kinds = [said(rng) for _ in range(max(vehicles, 40))]
     base, size = store.point_map(), 0
     for vehicle in range(vehicles):
-        says = {tile: kinds[(vehicle * 7 + i) % len(kinds)] for i, tile in enumerate(tiles)}
+        says = {tile: kinds[(vehicle + i) % len(kinds)] for i, tile in enumerate(tiles)}
         if planes == "states":
             says = {tile: Say(say.states) for tile, say in says.items()}
         data = encode(make_ballot(base, says, f"v{vehicle:03}", "d", end_ns=DAY_NS + vehicle))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -81,6 +82,11 @@ def _write_cells(path: Path, states: U8, x0: float, y0: float) -> None:
         np.savez_compressed(file, states=states, x0=x0, y0=y0, cell_size=CELL_SIZE)
 
 
+def _copies(decisions: dict[TileIndex, Decision]) -> Counter[tuple[str, str]]:
+    """On how many tiles a vehicle's drive is a copy of another's, by the two."""
+    return Counter((copy.vehicle, copy.heard_vehicle) for d in decisions.values() for copy in d.copies)
+
+
 def _report(decisions: dict[TileIndex, Decision], vehicles: int, min_votes: int, out: Path | None) -> None:
     from mapvote.core.types import CellState
 
@@ -95,6 +101,8 @@ def _report(decisions: dict[TileIndex, Decision], vehicles: int, min_votes: int,
         print_table(("tile", *headings), rows)
     added, deleted = sum(d.added for d in decisions.values()), sum(d.deleted for d in decisions.values())
     print(f"{vehicles} vehicles, {len(decisions)} tiles: {added} points added, {deleted} deleted")
+    for (vehicle, heard), tiles in sorted(_copies(decisions).items()):
+        print(f"{vehicle} sent what {heard} sent, on {tiles} tiles: the two count as one vehicle there")
     if vehicles < min_votes:
         print(f"A change needs {min_votes} vehicles and {vehicles} voted, so nothing can change: --min-votes 1")
     print(f"updated map: {out}" if out is not None else "dry run: no map written")

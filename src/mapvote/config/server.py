@@ -25,6 +25,12 @@ class FuseSettings(Section):
         le=1,
         description="nor is who denies a larger share of the changes decided on the tile; 1: everyone is",
     )
+    min_difference: float = Field(
+        default=0.1,
+        ge=0,
+        lt=1,
+        description="two vehicles' drives whose masks differ by a smaller share of what .9 m makes are one; 0: never",
+    )
     latest_vehicles: int = Field(
         default=9, ge=1, le=10_000, description="only the last so many vehicles on a tile count"
     )

@@ -18,6 +18,7 @@ from mapvote.core.grid import CELLS, TILE_CELLS, Grid, Lattice, TileIndex
 from mapvote.core.tile import Tile
 from mapvote.core.types import F32, I32, I64, N_STATES, NO_VOTE, U8, U64, Bool, CellState, MapvoteError
 from mapvote.core.voting import VOTE_UNIT, add_states, add_tally, decide_cells
+from mapvote.fusion.copies import Copy, liars_among, originals
 from mapvote.fusion.edit import add_points, delete_points
 from mapvote.fusion.outliers import ASKED, contradicting, denying
 from mapvote.fusion.persistence import denied_last, doubtful, remembered, temporary
@@ -46,6 +47,8 @@ class Decision:
     """Points added to the tile."""
     deleted: int
     """Points deleted from the tile."""
+    copies: Sequence[Copy] = ()
+    """Drives that are not heard because another vehicle's is, that is alike."""
 
 
 def rule_of(method: str) -> Rule:
@@ -106,6 +109,7 @@ class Heard:
     """Changes that wait because the last vehicle that looked says otherwise."""
     passing: Bool | None = None
     """New things that stay out because they come and go."""
+    copies: Sequence[Copy] = ()
 
 
 def fuse_tile(
@@ -125,7 +129,7 @@ def fuse_tile(
     if edited is not tile:
         memory = changed_in(version, tile, edited)
         edited = edited.but(memory=remembered(memory, tile, edited, heard.votes, heard.states))
-    return Decision(heard.states, heard.tally, len(heard.votes), added, deleted), edited
+    return Decision(heard.states, heard.tally, len(heard.votes), added, deleted, heard.copies), edited
 
 
 def decide_tile(
@@ -137,20 +141,21 @@ def decide_tile(
     fusion/spent.py), any order. ``history``: asked, where something comes and goes, for all votes that count of the
     last ``stay_days``; without it all is of one moment, and everything new is there to stay.
     """
-    drives = list(drives)
-    votes, states, tally, quorum = hear(one_each(drives, tile.window), rule, settings)
+    drives, copies = originals(list(drives), settings)
+    silenced = liars_among(copies, drives)
+    votes, states, tally, quorum = hear(one_each(drives, tile.window), rule, settings, silenced)
     if any(vote.states is None for vote in votes):
         return Heard(votes, states, tally, quorum)
     names = {vote.vehicle for vote in votes}
     spoken = [drive for drive in drives if drive.vehicle in names]
     states = turned(states, spoken, tally, quorum) if rule == "columns" else states
     if history is None:
-        return Heard(votes, states, tally, quorum)
+        return Heard(votes, states, tally, quorum, copies=copies)
     denied = denied_last(states, tile.memory, spoken)
     doubt = doubtful(states, tile.memory, settings).any()
-    passing = temporary(states, tile, history(), settings) if doubt else np.zeros_like(denied)
+    passing = temporary(states, tile, originals(history(), settings)[0], settings) if doubt else np.zeros_like(denied)
     states = np.where(denied | passing, np.uint8(CellState.UNDETERMINED), states)
-    return Heard(votes, states, tally, quorum, denied, passing)
+    return Heard(votes, states, tally, quorum, denied, passing, copies)
 
 
 def _edit(tile: Tile, votes: Sequence[TileVote], states: U8, quorum: int) -> tuple[Tile, int, int]:
@@ -166,14 +171,15 @@ def _edit(tile: Tile, votes: Sequence[TileVote], states: U8, quorum: int) -> tup
 
 
 def hear(
-    votes: Sequence[TileVote], rule: Rule, settings: FuseSettings
+    votes: Sequence[TileVote], rule: Rule, settings: FuseSettings, silenced: int = 0
 ) -> tuple[Sequence[TileVote], U8, NDArray[Any], int]:
     """(the votes that are heard, states, tally, quorum), of one vote a vehicle on a tile; see :func:`count`.
 
-    The quorum falls by one for each that is not heard, for it is one of those that the quorum guards against, but
-    nobody is ever believed alone. Of those that send tallies nobody is judged: theirs do not weigh alike.
+    The quorum falls by one for each that is not heard, for it is one of those that the quorum guards against, and by
+    the ``silenced`` of whom that was known before; but nobody is ever believed alone. Of those that send tallies nobody
+    is judged: theirs do not weigh alike.
     """
-    heard, quorum = list(votes), settings.min_votes
+    heard, quorum = list(votes), max(settings.min_votes - silenced, min(settings.min_votes, 2))
     states, tally = count(heard, rule, quorum)
     if quorum < 2 or any(vote.states is None for vote in heard):
         return heard, states, tally, quorum

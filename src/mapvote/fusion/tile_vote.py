@@ -43,6 +43,13 @@ class TileVote:
     """Column words that rays passed through."""
     version: int = 0
     """Of the map that the vehicle drove with."""
+    unrestricted: U8 | None = None
+    """Its states as they were sent, where :func:`restrict` has silenced some."""
+
+    @property
+    def sent(self) -> U8 | None:
+        """(256, 256) the states that were sent, whether they count or not; None in one stage."""
+        return self.states if self.unrestricted is None else self.unrestricted
 
     def measured(self) -> U8:
         """(m,) the intensity of the new points; 0 where nobody measured it."""
@@ -131,6 +138,7 @@ def restrict(vote: TileVote, counts: Bool | None) -> TileVote:
     return replace(
         vote,
         states=None if vote.states is None else np.where(counts, vote.states, np.uint8(NO_VOTE)),
+        unrestricted=vote.sent,
         tally=None if vote.tally is None else np.where(counts[..., None], vote.tally, np.uint16(0)),
         free=None if vote.free is None else vote.free.within(counts),
     )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+import numpy as np
 import pytest
 import sqlalchemy as sa
 
@@ -12,7 +13,8 @@ from mapvote.codec.ballot import encode
 from mapvote.config import FuseSettings
 from mapvote.core.types import CellState
 from mapvote.fusion.tile_vote import DAY_NS
-from mapvote.server.insight.explain import CellStory, as_told, explain_cell
+from mapvote.server.insight.explain import COPY, CellStory, as_told, explain_cell
+from mapvote.server.insight.history import events
 from mapvote.server.store import schema
 from mapvote.server.store.admission import accept, examine
 from mapvote.server.store.ballots import Receipt
@@ -111,3 +113,21 @@ def test_a_damaged_ballot_is_told_and_hides_no_other(store: Store) -> None:
     assert [(v.state, v.counts) for v in story(store).votes] == [
         ("unreadable", False), ("changed_empty", True), ("changed_empty", True)
     ]  # fmt: skip
+
+
+def test_of_copies_the_story_says_that_one_is_heard_and_the_log_whose_they_are_once(store: Store, clock: Clock) -> None:
+    wandering = np.random.default_rng(1).integers(-5, 6, (2, 256)).cumsum(axis=1).clip(-30, 30)
+    for name, edge in (("a", wandering[0]), ("liar", wandering[0]), ("b", wandering[1])):
+        states = np.where(
+            np.arange(256)[:, None] < 120 + edge, CellState.UNCHANGED_EMPTY, CellState.UNDETERMINED
+        ).astype(np.uint8)
+        states[WALL] = CellState.CHANGED_EMPTY
+        ballot = make_ballot(store.point_map(), {(0, 0): Say(states)}, name, "d", clock.now - ord(name[0]))
+        assert isinstance(accept(store, [examine(encode(ballot))])[0], Receipt)
+    assert {vote.vehicle: vote.why for vote in story(store).votes} == {"a": COPY, "b": "", "liar": ""}
+    assert publish(store).published
+    publish(store)
+    assert {vote.vehicle: vote.heard for vote in story(store).votes} == {"a": (), "b": (2,), "liar": (2,)}
+    (told,) = [event for event in events(store) if event["kind"] == "copy"]
+    assert told["detail"].startswith("a's ballot ")
+    assert "is a copy of liar's " in told["detail"]

@@ -61,25 +61,14 @@ def replay(ballot: Ballot, point_map: PointMap, other: Ballot) -> Ballot:
     return msgspec.structs.replace(other, vehicle=ballot.vehicle, drive=ballot.drive)
 
 
+def jitter(ballot: Ballot, point_map: PointMap, other: Ballot) -> Ballot:
+    """As :func:`replay`, all of it moved by a cell to the north-east so that nothing is the same."""
+    return _moved(replay(ballot, point_map, other), 1)
+
+
 def shift(ballot: Ballot, point_map: PointMap, other: Ballot) -> Ballot:
     """Everything :data:`SHIFT_CELLS` cells to the north-east of where it is, states, masks and points."""
-
-    def moved(tile: BallotTile) -> BallotTile:
-        points = None
-        if tile.new_points is not None:
-            way = np.array([SHIFT_CELLS * CELL_SIZE, SHIFT_CELLS * CELL_SIZE, 0.0], dtype=np.float32)
-            shifted = unpack_points(tile.new_points) + way
-            points = shifted[(shifted[:, :2] < TILE_CELLS * CELL_SIZE - 0.01).all(axis=1)]
-        return msgspec.structs.replace(
-            tile,
-            states=None if tile.states is None else pack_plane(_shifted(unpack_states(tile.states), NO_VOTE)),
-            gone=None if tile.gone is None else pack_words(_shifted(unpack_words(tile.gone, "gone"), 0)),
-            free=None if tile.free is None else pack_words(_shifted(unpack_words(tile.free, "free"), 0)),
-            new_points=None if points is None else pack_plane(points),
-            intensity=None,
-        )
-
-    return msgspec.structs.replace(ballot, tiles=[moved(tile) for tile in ballot.tiles])
+    return _moved(ballot, SHIFT_CELLS)
 
 
 def false_points(ballot: Ballot, point_map: PointMap, other: Ballot) -> Ballot:
@@ -92,6 +81,7 @@ ATTACKS: Mapping[str, Attack] = {
     "everything changed": all_changed,
     "replaying the old street": stale,
     "replaying another vehicle": replay,
+    "replaying another vehicle, moved by a cell": jitter,
     "shifting by 3 cells": shift,
     "right states, false points": false_points,
 }
@@ -128,7 +118,28 @@ def made_up(cells: Bool, ground_z: F32) -> F32:
     return np.concatenate(poles).astype(np.float32)
 
 
-def _shifted(plane: Plane, vacated: int) -> Plane:
+def _moved(ballot: Ballot, by: int) -> Ballot:
+    """The ballot with everything so many cells to the north-east of where it is, tile by tile."""
+
+    def moved(tile: BallotTile) -> BallotTile:
+        points = None
+        if tile.new_points is not None:
+            way = np.array([by * CELL_SIZE, by * CELL_SIZE, 0.0], dtype=np.float32)
+            shifted = unpack_points(tile.new_points) + way
+            points = shifted[(shifted[:, :2] < TILE_CELLS * CELL_SIZE - 0.01).all(axis=1)]
+        return msgspec.structs.replace(
+            tile,
+            states=None if tile.states is None else pack_plane(_shifted(unpack_states(tile.states), NO_VOTE, by)),
+            gone=None if tile.gone is None else pack_words(_shifted(unpack_words(tile.gone, "gone"), 0, by)),
+            free=None if tile.free is None else pack_words(_shifted(unpack_words(tile.free, "free"), 0, by)),
+            new_points=None if points is None else pack_plane(points),
+            intensity=None,
+        )
+
+    return msgspec.structs.replace(ballot, tiles=[moved(tile) for tile in ballot.tiles])
+
+
+def _shifted(plane: Plane, vacated: int, by: int) -> Plane:
     out = np.full_like(plane, vacated)
-    out[SHIFT_CELLS:, SHIFT_CELLS:] = plane[:-SHIFT_CELLS, :-SHIFT_CELLS]
+    out[by:, by:] = plane[:-by, :-by]
     return out

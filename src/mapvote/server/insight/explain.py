@@ -14,7 +14,7 @@ from mapvote.core.grid import TILE_CELLS, TileIndex
 from mapvote.core.tile import Tile
 from mapvote.core.types import NO_VOTE, U8, CellState, MapvoteError
 from mapvote.core.voting import VOTE_UNIT
-from mapvote.fusion.fuse import decide_tile, rule_of
+from mapvote.fusion.fuse import Heard, decide_tile, rule_of
 from mapvote.fusion.persistence import expected_days
 from mapvote.fusion.probability import alike_beside, change_probability
 from mapvote.fusion.spent import unspent
@@ -39,6 +39,7 @@ _LOOKED_INTO = 30
 """So many of the last versions that decided a cell are asked which votes they heard."""
 REVIEWED = "of a change that a reviewer held or rejected"
 OPPOSES = "opposes the others over most of this tile, or denies nearly all that changed on it"
+COPY = "a copy: what it determined on this tile is what another vehicle's drive did, and that one is heard for both"
 
 
 @dataclass(frozen=True, slots=True)
@@ -169,14 +170,14 @@ def _everyone(
     readable = [vote for vote, why in judged if why != DAMAGED]
     said = dict(zip((vote.seq for vote in readable), read_votes(connection, now.tile.index, readable), strict=True))
     obeyed = {stored.seq: vote for stored, vote in counted}
-    silenced = _silenced(now, [vote for _, vote in counted])
+    heard = _decided(now, [vote for _, vote in counted])
     return [
-        (stored, said.get(stored.seq), why or _why_not(said[stored.seq], obeyed.get(stored.seq), now, silenced))
+        (stored, said.get(stored.seq), why or _why_not(said[stored.seq], obeyed.get(stored.seq), now, heard))
         for stored, why in judged
     ]
 
 
-def _why_not(vote: TileVote, obeyed: TileVote | None, now: _Place, silenced: set[str]) -> str:
+def _why_not(vote: TileVote, obeyed: TileVote | None, now: _Place, heard: Heard) -> str:
     """Of a vote that counts on the tile: why not on this cell."""
     if not vote.spoken()[now.cell]:
         return "says nothing here"
@@ -185,14 +186,23 @@ def _why_not(vote: TileVote, obeyed: TileVote | None, now: _Place, silenced: set
         return f"spent: version {now.tile.memory.changed[now.cell]} has changed the cell since"
     if obeyed is not None and not obeyed.spoken()[now.cell]:
         return REVIEWED
-    return OPPOSES if vote.vehicle in silenced else ""
+    if _is_copy(vote, heard):
+        return COPY
+    return OPPOSES if _is_silenced(vote, heard) else ""
 
 
-def _silenced(place: _Place, drives: Sequence[TileVote]) -> set[str]:
-    """Vehicles that are not heard on a tile, of the votes that count there."""
+def _decided(place: _Place, drives: Sequence[TileVote]) -> Heard:
+    """What comes of the votes that count on a tile."""
     policy = place.asked.policy
-    heard = decide_tile(place.tile, drives, rule_of(policy.round.method), policy.fuse).votes
-    return {vote.vehicle for vote in drives} - {vote.vehicle for vote in heard}
+    return decide_tile(place.tile, drives, rule_of(policy.round.method), policy.fuse)
+
+
+def _is_copy(vote: TileVote, heard: Heard) -> bool:
+    return any((vote.vehicle, vote.digest) == (copy.vehicle, copy.digest) for copy in heard.copies)
+
+
+def _is_silenced(vote: TileVote, heard: Heard) -> bool:
+    return all(vote.vehicle != other.vehicle for other in heard.votes)
 
 
 def _heard_by(connection: sa.Connection, store: Store, number: int, now: _Place) -> list[int]:
@@ -203,8 +213,9 @@ def _heard_by(connection: sa.Connection, store: Store, number: int, now: _Place)
     asked = Electorate.of(version, set_aside=now.asked.set_aside)
     then = replace(now, asked=asked, tile=tile_as_of(connection, now.tile.window, number - 1))
     counted = counted_votes(connection, then.tile, asked)
-    silenced = _silenced(then, [vote for _, vote in counted])
-    return [s.seq for s, vote in counted if vote.spoken()[now.cell] and vote.vehicle not in silenced]
+    heard = _decided(then, [vote for _, vote in counted])
+    speaking = [(stored.seq, vote) for stored, vote in counted if vote.spoken()[now.cell]]
+    return [seq for seq, vote in speaking if not _is_copy(vote, heard) and not _is_silenced(vote, heard)]
 
 
 def _vote(stored: StoredVote, vote: TileVote | None, why: str, now: _Place, heard: tuple[int, ...]) -> CellVote:

@@ -7,7 +7,7 @@ which nothing has come or gone since they were last fused would give what they g
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
 
@@ -34,6 +34,7 @@ from mapvote.server.store.queries import (
     Version,
     current_version,
     load_tile,
+    log_event,
     memory_of,
     tiles_of,
     tiles_set_by,
@@ -104,9 +105,11 @@ def publish(
     """
     plan, outcome = _decide(store, settings, parent, gate, executor)
     damaged = [damage for one in outcome.fused for damage in one.damaged]
-    if damaged:
+    copies = {str(copy) for one in outcome.fused for copy in one.copies}
+    if damaged or copies:
         with store.database.writing() as connection:
             quarantine(connection, damaged, plan.now, by)
+            _log_copies(connection, copies, plan.now, by)
     if gate is None and plan.asked.policy.gate.drive:
         asked = plan.asked.policy.gate.drive
         raise MapvoteError(f"the policy judges versions by {asked}: publish by the server or mapvote publish")
@@ -181,6 +184,14 @@ def commit(store: Store, plan: Plan, fused: Sequence[Fused], by: str, why: str) 
     tiles = {f.index: f.hashes for f in fused if f.hashes is not None}
     write_version(store, version, NewTiles(tiles, [f.planes for f in fused], fused))
     return version.number
+
+
+def _log_copies(connection: sa.Connection, copies: Iterable[str], now: int, by: str) -> None:
+    """Each is named once."""
+    e = schema.events.c
+    known = set(connection.execute(sa.select(e.detail).where(e.kind == "copy")).scalars())
+    for copy in sorted(set(copies) - known):
+        log_event(connection, now, "copy", by, copy)
 
 
 def rollback(store: Store, to: int, *, by: str = "operator", reason: str = "") -> Version:

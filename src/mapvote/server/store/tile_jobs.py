@@ -21,6 +21,7 @@ from mapvote.codec.ballot import tile_key
 from mapvote.core.grid import CELLS, TILE_CELLS, Grid, TileIndex
 from mapvote.core.tile import Tile
 from mapvote.core.types import I32, I64, N_STATES, U8, Bool, MapvoteError
+from mapvote.fusion.copies import Copy
 from mapvote.fusion.fuse import fuse_tile, rule_of
 from mapvote.fusion.tile_vote import TileVote
 from mapvote.server.errors import Unavailable
@@ -76,6 +77,8 @@ class Fused:
     """The edited tile where the task held one at hand (replay), else None."""
     damaged: Sequence[Damage] = ()
     """What could not be read, and was left out."""
+    copies: Sequence[Copy] = ()
+    """Drives that were not heard because another vehicle's was, that is alike."""
 
     @property
     def lost(self) -> bool:
@@ -140,6 +143,7 @@ def _fuse(connection: sa.Connection, task: Task) -> Fused:
         cells_new=np.flatnonzero(holds & ~held),
         freed=0 if tile.free is edited.free or tile.free is None else int((tile.free != edited.free).sum()),
         tile=None if task.misread is None else edited,
+        copies=decision.copies,
     )
 
 

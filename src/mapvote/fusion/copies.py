@@ -1,0 +1,194 @@
+"""Ballots that are copies: drives of two vehicles whose masks agree more than independent drives can count as one
+(docs/decisions/voting.md).
+
+What a drive determines of a tile ends where its rays thin out, where traffic stood in the way, where it turned off: two
+drives down one lane draw different borders. So two masks *differ* in the cells that one determined and the other did
+not determine within a cell of there, or the other way round. It is told as a share of what the lesser mask would differ
+from itself by, had it been drawn three cells (.9 m) farther north or east. A copy differs nowhere, and nowhere either
+if every cell of it was moved by one. Honest vehicles stay well above the bound (docs/measurements/votes.md).
+
+Of drives that are copies of each other one is heard, the one that agrees best with all others: what was moved, or
+added, agrees less. At most one of their vehicles is honest. So of those that are not heard all but one lie for sure,
+and the quorum, which guards against so many liars, falls by as many.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+
+from mapvote.config import FuseSettings
+from mapvote.core.grid import TILE_CELLS
+from mapvote.core.types import I64, U8, U64, CellState
+from mapvote.fusion.tile_vote import TileVote
+
+LEAST_MOVED = 64
+"""Cells, in the rows looked at. Masks that three cells change less are not judged: little is soon alike by chance, and
+so are masks with more holes than ground."""
+_UN = int(CellState.UNDETERMINED)
+_LAST = TILE_CELLS - 1
+_APART = 3
+"""Cells; and of so many rows one is looked at, which is enough for a share."""
+_ASKED = slice(None, None, 7)
+
+
+@dataclass(frozen=True, slots=True)
+class Copy:
+    """A drive that is not heard on a tile, because one is heard that is alike."""
+
+    vehicle: str
+    digest: str
+    """Of its ballot."""
+    heard_vehicle: str
+    heard_digest: str
+
+    def __str__(self) -> str:
+        return (
+            f"{self.vehicle}'s ballot {self.digest[:12]} is a copy of {self.heard_vehicle}'s {self.heard_digest[:12]}"
+        )
+
+
+def originals(drives: Sequence[TileVote], settings: FuseSettings) -> tuple[Sequence[TileVote], list[Copy]]:
+    """(the ``drives`` of a tile without copies, the copies); in which order they are given never matters.
+
+    Drives of two vehicles that differ by less than ``min_difference`` are copies. Where one vehicle may change the map,
+    and of those that send tallies, nobody is judged.
+    """
+    judged = [drive for drive in drives if drive.sent is not None]
+    if settings.min_votes < 2 or settings.min_difference <= 0.0 or len({drive.vehicle for drive in judged}) < 2:
+        return drives, []
+    judged.sort(key=lambda drive: (drive.end_ns, drive.digest))
+    number = {name: i for i, name in enumerate(sorted({drive.vehicle for drive in judged}))}
+    whose = np.array([number[drive.vehicle] for drive in judged])
+    group = _groups(_packed([drive.sent for drive in judged if drive.sent is not None]), whose, settings.min_difference)
+    copies = []
+    for first in np.flatnonzero(np.bincount(group) > 1):
+        alike = [drive for drive, own in zip(judged, group, strict=True) if own == first]
+        others = [drive for drive, own in zip(judged, group, strict=True) if own != first]
+        heard = max(alike, key=lambda drive: _agreement(drive, others))
+        copies += [Copy(d.vehicle, d.digest, heard.vehicle, heard.digest) for d in alike if d is not heard]
+    silent = {(copy.vehicle, copy.digest) for copy in copies}
+    return [drive for drive in drives if (drive.vehicle, drive.digest) not in silent], copies
+
+
+def liars_among(copies: Sequence[Copy], heard: Sequence[TileVote]) -> int:
+    """How many vehicles that ``copies`` silence on a tile lie for sure; ``heard``: the drives that are left."""
+    left = {drive.vehicle for drive in heard}
+    silent: dict[str, str] = {}
+    for copy in copies:
+        if copy.vehicle not in left:
+            silent[copy.vehicle] = min(copy.heard_digest, silent.get(copy.vehicle, copy.heard_digest))
+    return sum(n - 1 for n in Counter(silent.values()).values())
+
+
+def difference(a: U8, b: U8) -> tuple[int, int]:
+    """(cells in which the masks of two planes of states (256, 256) differ, in how many the lesser would differ from
+    itself), in the rows that are looked at.
+
+    The tile's rim is not: what lies beside it is not known.
+    """
+    moved, looked = _look(_packed([a, b]))
+    return int(_differing(looked[0], looked[1], 1, TILE_CELLS**2)), int(moved.min())
+
+
+def _packed(planes: Iterable[U8]) -> U64:
+    """(n, 256, 4) words of what n planes of states determined, the first column in the lowest bit."""
+    bits = [np.packbits(plane.reshape(-1) < _UN, bitorder="little") for plane in planes]
+    return np.stack(bits).view("<u8").reshape(-1, TILE_CELLS, TILE_CELLS // 64)
+
+
+def _agreement(drive: TileVote, others: Sequence[TileVote]) -> int:
+    """How many more of the others' votes a drive agrees with than it opposes."""
+    assert drive.sent is not None
+    own, total = drive.sent.reshape(-1)[_ASKED], 0
+    for other in others:
+        assert other.sent is not None
+        said = other.sent.reshape(-1)[_ASKED]
+        both = (own < _UN) & (said < _UN)
+        total += 2 * int((both & (own == said)).sum()) - int(both.sum())
+    return total
+
+
+@numba.njit(cache=True, nogil=True)
+def _groups(masks: U64, whose: I64, least: float) -> I64:
+    """(n,) the first of all drives that are alike to a drive, or to one that is alike to it, and so on."""
+    moved, looked = _look(masks)
+    group = np.arange(len(masks))
+    for i in range(len(masks)):
+        for k in range(i):
+            whole = min(moved[i], moved[k])
+            if whose[i] == whose[k] or group[i] == group[k] or whole < LEAST_MOVED:
+                continue
+            most = int(np.ceil(least * whole)) - 1
+            if _differing(looked[i], looked[k], 1, most) <= most:
+                older, newer = min(group[i], group[k]), max(group[i], group[k])
+                for other in range(i + 1):
+                    if group[other] == newer:
+                        group[other] = older
+    return group
+
+
+@numba.njit(cache=True, nogil=True)
+def _look(masks: U64) -> tuple[I64, U64]:
+    """Of masks (n, 256, 4), in the rows looked at: by how many cells each would differ from itself (n,), and
+    (n, 85, 3, 4) words: what is set, what is or has a neighbour that is, and what is and has none that is not."""
+    moved = np.zeros(len(masks), dtype=np.int64)
+    looked = np.empty((len(masks), len(range(1, _LAST, _APART)), 3, 4), dtype=np.uint64)
+    east = np.empty_like(looked[0])
+    for i in range(len(masks)):
+        for n, row in enumerate(range(1, _LAST, _APART)):
+            for w in range(4):
+                some, every = np.uint64(0), ~np.uint64(0)
+                for near in masks[i, row - 1 : row + 2]:
+                    from_east = (near[w] >> np.uint64(1)) | (near[w + 1] << np.uint64(63) if w < 3 else np.uint64(0))
+                    from_west = _from_west(near, w, 1)
+                    some |= near[w] | from_west | from_east
+                    every &= near[w] & from_west & from_east
+                looked[i, n, 0, w], looked[i, n, 1, w], looked[i, n, 2, w] = masks[i, row, w], some, every
+            for plane in range(3):
+                for w in range(4):
+                    east[n, plane, w] = _from_west(looked[i, n, plane], w, _APART)
+        moved[i] = _differing(looked[i, 1:], looked[i, :-1], 1, TILE_CELLS**2)
+        moved[i] += _differing(looked[i], east, 1 + _APART, TILE_CELLS**2)
+        moved[i] //= 2
+    return moved, looked
+
+
+@numba.njit(cache=True, nogil=True)
+def _from_west(words: U64, w: int, by: int) -> np.uint64:
+    """A word of a row (4,) that is moved by so many columns to the east."""
+    carried = words[w - 1] >> np.uint64(64 - by) if w else np.uint64(0)
+    return (words[w] << np.uint64(by)) | carried
+
+
+@numba.njit(cache=True, nogil=True)
+def _differing(a: U64, b: U64, rim: int, most: int) -> int:
+    """In how many cells two masks (rows, 3, 4) differ, but for ``rim`` columns on either side; once they are more than
+    ``most``, so many and one."""
+    count = 0
+    for n in range(len(a)):
+        for w in range(4):
+            one = (a[n, 0, w] & ~b[n, 1, w]) | (~a[n, 0, w] & b[n, 2, w])
+            other = (b[n, 0, w] & ~a[n, 1, w]) | (~b[n, 0, w] & a[n, 2, w])
+            inside = ~np.uint64(0)
+            if w == 0:
+                inside <<= np.uint64(rim)
+            if w == 3:
+                inside >>= np.uint64(rim)
+            count += _ones((one | other) & inside)
+        if count > most:
+            return most + 1
+    return count
+
+
+@numba.njit(cache=True, nogil=True)
+def _ones(word: np.uint64) -> np.int64:
+    """How many bits are set (Warren, Hacker's Delight, 5-1)."""
+    word = word - ((word >> np.uint64(1)) & np.uint64(0x5555555555555555))
+    word = (word & np.uint64(0x3333333333333333)) + ((word >> np.uint64(2)) & np.uint64(0x3333333333333333))
+    word = (word + (word >> np.uint64(4))) & np.uint64(0x0F0F0F0F0F0F0F0F)
+    return np.int64((word * np.uint64(0x0101010101010101)) >> np.uint64(56))
