@@ -14,7 +14,6 @@ and the quorum, which guards against so many liars, falls by as many.
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
@@ -76,13 +75,11 @@ def originals(drives: Sequence[TileVote], settings: FuseSettings) -> tuple[Seque
 
 
 def liars_among(copies: Sequence[Copy], heard: Sequence[TileVote]) -> int:
-    """How many vehicles that ``copies`` silence on a tile lie for sure; ``heard``: the drives that are left."""
-    left = {drive.vehicle for drive in heard}
-    silent: dict[str, str] = {}
-    for copy in copies:
-        if copy.vehicle not in left:
-            silent[copy.vehicle] = min(copy.heard_digest, silent.get(copy.vehicle, copy.heard_digest))
-    return sum(n - 1 for n in Counter(silent.values()).values())
+    """How many vehicles that ``copies`` silence on a tile lie for sure: all but one of those that are alike. ``heard``:
+    the drives that are left."""
+    silent = {copy.vehicle for copy in copies} - {drive.vehicle for drive in heard}
+    groups = {copy.heard_digest for copy in copies if copy.vehicle in silent}
+    return max(0, len(silent) - len(groups))
 
 
 def difference(a: U8, b: U8) -> tuple[int, int]:
