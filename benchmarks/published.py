@@ -3,6 +3,7 @@
     python benchmarks/published.py --seeds 41,42,43,44,45 --folder out/published --csv results/as_published.csv
     python benchmarks/published.py --seeds 41 --cars 0,8,12 --csv results/as_published_cars.csv    # two stages over one
     python benchmarks/published.py --seeds 41 --sensors vlp16,hdl32e,hdl64e                        # bytes and cost
+    python benchmarks/published.py --without-strays                       # on the product's own map, as all else
 
 A seed whose JSON lies in the folder already is not driven again.
 """
@@ -12,6 +13,7 @@ from __future__ import annotations
 import argparse
 import csv
 import json
+import os
 import subprocess
 import sys
 from collections import defaultdict
@@ -33,16 +35,17 @@ CARS, SENSOR = load_scenario(SCENARIO).temporary_cars, load_scenario(SCENARIO).s
 """The scenario's own: cars parked for one pass only, a vehicle, and the vehicles' LiDAR."""
 
 
-def driven(seed: int, folder: Path, cars: int = CARS, sensor: str = SENSOR) -> dict[str, Any]:
+def driven(seed: int, folder: Path, cars: int, sensor: str, drop_strays: bool) -> dict[str, Any]:
     """The numbers of one seed, as ``mapvote evaluate`` writes them."""
-    other = [f"cars_{cars}"] * (cars != CARS) + [sensor] * (sensor != SENSOR)
+    other = [f"cars_{cars}"] * (cars != CARS) + [sensor] * (sensor != SENSOR) + ["without_strays"] * drop_strays
     name = "_".join([str(seed), *other])
     file = folder / f"{name}.json"
     if not file.exists():
         words = ["evaluate", SCENARIO, "--seed", str(seed), "--case", ",".join(CASES), "--readings"]
         words += ["--explain", "1,5", "--json", str(file), "--out", str(folder / f"pictures_{name}")]
         words += ["--cars", str(cars), "--sensor", sensor]
-        subprocess.run([sys.executable, "-m", "mapvote", *words], check=True)
+        environment = {**os.environ, "MAPVOTE_MAPPING__DROP_STRAYS": str(drop_strays).lower()}
+        subprocess.run([sys.executable, "-m", "mapvote", *words], check=True, env=environment)
     return dict(json.loads(file.read_text()))
 
 
@@ -168,13 +171,15 @@ def main() -> None:
     parser.add_argument("--seeds", default="41,42,43,44,45")
     parser.add_argument("--cars", default=str(CARS), help="cars parked for one pass only, a vehicle, by commas")
     parser.add_argument("--sensors", default=SENSOR, help="the vehicles' LiDARs, by commas")
+    parser.add_argument("--without-strays", action="store_true", help="on a map that leaves out what is no surface")
     parser.add_argument("--folder", type=Path, default=Path("out/published"), help="JSON and pictures of each seed")
     parser.add_argument("--csv", type=Path)
     options = parser.parse_args()
     options.folder.mkdir(parents=True, exist_ok=True)
     cars, sensors = [int(n) for n in options.cars.split(",")], options.sensors.split(",")
     seeds = [int(seed) for seed in options.seeds.split(",")]
-    runs = {(n, s): [driven(seed, options.folder, n, s) for seed in seeds] for n in cars for s in sensors}
+    drop = options.without_strays
+    runs = {(n, s): [driven(seed, options.folder, n, s, drop) for seed in seeds] for n in cars for s in sensors}
     for (n, sensor), some in runs.items():
         print(f"\n{n} cars a pass, {sensor}\n")
         demands(some)

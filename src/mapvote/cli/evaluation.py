@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from mapvote.cli.options import EVALUATE, Config, Scenario, Seed
 from mapvote.cli.terminal import print_table, progress, stages
-
-if TYPE_CHECKING:
-    from mapvote.config import Settings
 
 
 def register(app: typer.Typer) -> None:
@@ -90,12 +87,12 @@ def evaluate(
     """
     from rich.console import Console
 
-    from mapvote.config import cache_folder
+    from mapvote.config import cache_folder, load_with_sources
     from mapvote.evaluation.evaluate import evaluate as run
     from mapvote.evaluation.experiments.cases import choose_cases
     from mapvote.evaluation.experiments.conditions import Conditions
     from mapvote.evaluation.experiments.scene import Scene
-    from mapvote.evaluation.experiments.study import PUBLISHED, Study
+    from mapvote.evaluation.experiments.study import PUBLISHED, Study, as_paper
     from mapvote.evaluation.reporting.tables import as_json, tables, write_text
 
     if scenario == "real":
@@ -109,7 +106,8 @@ def evaluate(
         raise typer.BadParameter(f"{drive}: a drive follows the word real only", param_hint="DRIVE")
     if poses not in ("ndt", "truth"):
         raise typer.BadParameter(f"{poses!r}: choose ndt or truth", param_hint="--poses")
-    settings = _settings_read(config, scenario, reading)
+    settings, sources = load_with_sources(config)
+    settings = as_paper(settings, scenario, sources, reading)
     cases, with_yardsticks = choose_cases(settings, case)
     overrides: dict[str, str | int] = {"sensor": sensor} if sensor else {}
     if cars is not None:
@@ -140,18 +138,6 @@ def evaluate(
         with progress("drawing"):
             drawn = gallery(evaluation, evaluation.best, figures, FORMATS)
         print(f"{figures}: {len(drawn)} figures, each as PNG, SVG and PDF")
-
-
-def _settings_read(config: Path | None, scenario: str, reading: str | None) -> Settings:
-    """The settings, the paper read as the command line says, else as they say, else as suits the scenario."""
-    from mapvote.config import load_with_sources
-    from mapvote.detection.readings import read
-    from mapvote.evaluation.experiments.study import PUBLISHED
-
-    settings, sources = load_with_sources(config)
-    told = any(key.startswith("paper.") for key in sources)
-    said = reading or ("" if told else PUBLISHED.get(scenario, ""))
-    return settings.model_copy(update={"paper": read(settings.paper, said)}) if said else settings
 
 
 def _evaluate_real(

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
+from mapvote.config import Settings
 from mapvote.core.types import MapvoteError
+from mapvote.detection.readings import read
 from mapvote.evaluation.experiments.cases import Case
 from mapvote.evaluation.experiments.explain import witness
 from mapvote.evaluation.experiments.kept import KeptDrive, read_kept
@@ -20,7 +22,22 @@ from mapvote.evaluation.scoring.jury import Jury, Outcome
 from mapvote.evaluation.scoring.truths import SIDE_BY_SIDE
 
 PUBLISHED = {"as_published": "occluded=abstains"}
-"""How the paper is read on a scenario unless told otherwise; both readings of an occluded scan stand side by side."""
+"""How the paper is read on a scenario unless told otherwise; both readings of an occluded scan stand side by side.
+There the first map keeps its strays too: the paper's holds whatever stood still (II), and its cases vote on that."""
+
+
+def as_paper(settings: Settings, scenario: str, told: Collection[str] = (), reading: str | None = None) -> Settings:
+    """``settings`` with the paper read as ``reading`` says, and what suits the scenario of the rest.
+
+    ``told``: names ("mapping.drop_strays") of what the user set: that stays. MapvoteError for a reading there is not.
+    """
+    known, published = settings, scenario in PUBLISHED
+    said = reading or ("" if any(key.startswith("paper.") for key in told) else PUBLISHED.get(scenario, ""))
+    if said:
+        known = known.model_copy(update={"paper": read(known.paper, said)})
+    if published and "mapping.drop_strays" not in told:
+        known = known.model_copy(update={"mapping": known.mapping.model_copy(update={"drop_strays": False})})
+    return known
 
 
 @dataclass(frozen=True, slots=True)
