@@ -101,7 +101,7 @@ def _before_and_after(store: Store, version: int, fused: Fused) -> tuple[Tile, T
     window = store.lattice.tile(fused.index)
     with store.database.reading() as connection:
         before = load_tile(connection, window, tile_of(connection, version, fused.index))
-    return before, edited_tile(fused, window)
+    return before, edited_tile(fused, before)
 
 
 def _cells_of(change: ChangeObject) -> dict[TileIndex, Bool]:

@@ -13,7 +13,7 @@ from mapvote.codec.arrays import compress, unpack_bytes
 from mapvote.core.grid import CELLS, TILE_CELLS, Grid
 from mapvote.core.memory import PLANES, Memory
 from mapvote.core.tile import Tile
-from mapvote.core.types import F32, Bool, MapvoteError
+from mapvote.core.types import F32, U64, Bool, MapvoteError
 
 _ZSTD_LEVEL = 3
 MAX_PLANE_BYTES = CELLS * 64 * 12 * 4
@@ -35,9 +35,13 @@ class TileHashes:
         return cls("", "", None)
 
 
-def pack_tile(tile: Tile) -> tuple[TileHashes, dict[str, bytes]]:
-    """A tile's hashes and its planes by hash, each one zstd frame of little-endian C-order values."""
+def pack_tile(tile: Tile, edited_from: tuple[Tile, TileHashes] | None = None) -> tuple[TileHashes, dict[str, bytes]]:
+    """A tile's hashes and its planes by hash, each one zstd frame of little-endian C-order values.
+
+    Of a tile ``edited_from`` another, only the planes that the other does not have: the ground is never edited.
+    """
     blobs: dict[str, bytes] = {}
+    old, known = edited_from or (None, TileHashes.none())
 
     def pack(plane: NDArray[Any], dtype: str) -> str:
         raw = np.ascontiguousarray(plane, dtype=dtype).tobytes()
@@ -46,8 +50,9 @@ def pack_tile(tile: Tile) -> tuple[TileHashes, dict[str, bytes]]:
         return digest
 
     points = pack(tile.points, "<f4")
-    ground = pack(tile.ground_z, "<f4")
-    free = None if tile.free is None else pack(tile.free, "<u8")
+    ground = known.ground if old is not None and tile.ground_z is old.ground_z else pack(tile.ground_z, "<f4")
+    same = old is not None and tile.free is old.free
+    free = known.free if same or tile.free is None else pack(tile.free, "<u8")
     if tile.memory is None:
         return TileHashes(points, ground, free), blobs
     memory, plane = pack_memory(tile.memory)
@@ -62,9 +67,7 @@ def unpack_tile(
         window,
         points=unpack_points_plane(points, hashes.points),
         ground_z=unpack_ground_plane(ground, hashes.ground),
-        free=None
-        if free is None or hashes.free is None
-        else np.frombuffer(_unpack(free, hashes.free), dtype="<u8").reshape(window.shape),
+        free=None if free is None or hashes.free is None else unpack_free_plane(free, hashes.free),
         memory=None if memory is None or hashes.memory is None else unpack_memory_plane(memory, hashes.memory),
     )
 
@@ -77,6 +80,11 @@ def unpack_points_plane(data: bytes, digest: str) -> F32:
 def unpack_ground_plane(data: bytes, digest: str) -> F32:
     """(256, 256) the ground plane of a tile alone."""
     return np.frombuffer(_unpack(data, digest), dtype="<f4").reshape(TILE_CELLS, TILE_CELLS)
+
+
+def unpack_free_plane(data: bytes, digest: str) -> U64:
+    """(256, 256) the plane of known-free column words of a tile alone."""
+    return np.frombuffer(_unpack(data, digest), dtype="<u8").reshape(TILE_CELLS, TILE_CELLS)
 
 
 def _unpack(data: bytes, digest: str) -> bytes:

@@ -22,7 +22,13 @@ from mapvote.core.types import MapvoteError
 from mapvote.fusion.spent import differing
 from mapvote.server.errors import Conflict, Held
 from mapvote.server.store import schema
-from mapvote.server.store.blobs import TileHashes, pack_memory, unpack_tile
+from mapvote.server.store.blobs import (
+    TileHashes,
+    pack_memory,
+    unpack_free_plane,
+    unpack_ground_plane,
+    unpack_points_plane,
+)
 from mapvote.server.store.clearing import clear
 from mapvote.server.store.commit import NewTiles, write_version
 from mapvote.server.store.database import address_of
@@ -173,7 +179,9 @@ def reasons_to_hold(store: Store, plan: Plan, changed: Sequence[Fused], gate: Ga
     if gate is None or not asked.drive or not changed:
         return held
     old = store.point_map(plan.newest.number)
-    edited = {f.index: edited_tile(f, store.lattice.tile(f.index)) for f in changed}
+    edited = {
+        f.index: edited_tile(f, old.tiles.get(f.index) or Tile.empty(store.lattice.tile(f.index))) for f in changed
+    }
     return [*held, *gate(asked, old, replace(old, tiles=dict(old.tiles) | edited))]
 
 
@@ -236,9 +244,13 @@ def _of_two(
     return old, load_tile(connection, window, then)
 
 
-def edited_tile(fused: Fused, window: Grid) -> Tile:
-    """What a tile would be, of the planes that fusion made."""
+def edited_tile(fused: Fused, before: Tile) -> Tile:
+    """What the tile that was ``before`` would be: fusion made the planes that do not stay."""
     hashes, planes = fused.hashes, fused.planes
     assert hashes is not None
-    free = None if hashes.free is None else planes[hashes.free]
-    return unpack_tile(window, hashes, planes[hashes.points], planes[hashes.ground], free)
+    ground, free = before.ground_z, before.free
+    if hashes.ground in planes:
+        ground = unpack_ground_plane(planes[hashes.ground], hashes.ground)
+    if hashes.free is not None and hashes.free in planes:
+        free = unpack_free_plane(planes[hashes.free], hashes.free)
+    return Tile(before.window, unpack_points_plane(planes[hashes.points], hashes.points), ground, free)

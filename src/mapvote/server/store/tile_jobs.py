@@ -127,7 +127,8 @@ def _fuse(connection: sa.Connection, task: Task) -> Fused:
 
     recent = history if cast.stage == "two-stage" else None
     decision, edited = fuse_tile(tile, votes, rule_of(cast.method), task.asked.settings, task.version, recent)
-    hashes, planes = (None, {}) if edited is tile else pack_tile(edited)
+    stored = (tile, task.tile) if isinstance(task.tile, TileHashes) else None
+    hashes, planes = (None, {}) if edited is tile else pack_tile(edited, stored)
     held, holds = ((tile.obstacle_words != 0), (edited.obstacle_words != 0)) if hashes else (_NOWHERE, _NOWHERE)
     return Fused(
         index=tile.index,
