@@ -23,6 +23,7 @@ from mapvote.server.store.replay import replay
 from mapvote.server.store.reviews import decide, undo
 from mapvote.server.store.store import Store
 from plain_rules import CE, CO, DAY_S, UE, UN, UO, Cast, Cell, CellMap, Server, Spoken
+from standing_clock import Clock
 
 WALL: list[Cell] = [(10, 10), (10, 11), (10, 12)]
 LAWN: list[Cell] = [(20, 20), (20, 21), (30, 30)]
@@ -31,22 +32,12 @@ OPEN = {"max_deleted_share": 1.0, "max_freed_share": 1.0}
 START_S = 1_700_000_000
 
 
-class Clock:
-    """Stands until somebody moves it on."""
-
-    def __init__(self) -> None:
-        self.now_s = START_S
-
-    def __call__(self) -> int:
-        return self.now_s * 10**9
-
-
 class History:
     """One street, twice: in a store and in plain words. Each step is done to both, then they are compared."""
 
     def __init__(self, seed: int, make_store: Callable[[Clock], Store]) -> None:
         self.rng = random.Random(seed)
-        self.clock = Clock()
+        self.clock = Clock(START_S * 10**9)
         self.store = make_store(self.clock)
         first = FuseSettings.model_validate(OPEN)
         self.policy(first)
@@ -58,6 +49,10 @@ class History:
         self.verdicts: list[int] = []
         self.there = dict.fromkeys(WALL, True) | dict.fromkeys(LAWN, False)
 
+    @property
+    def now_s(self) -> int:
+        return self.clock.now // 10**9
+
     def policy(self, settings: FuseSettings) -> None:
         set_policy(self.store, Policy(fuse=settings))
 
@@ -68,7 +63,7 @@ class History:
         acts += [self.review, self.let_go]
         for step in range(steps):
             act = self.rng.choice(acts)
-            self.clock.now_s += self.rng.choice([60, 3_600, DAY_S, 3 * DAY_S])
+            self.clock.now += self.rng.choice([60, 3_600, DAY_S, 3 * DAY_S]) * 10**9
             act()
             self.compare(f"step {step}, {act.__name__}")
 
@@ -103,7 +98,7 @@ class History:
         says = {c: self._say(c, version, masks, has_free) for c in WALL + LAWN if rng.random() < 0.7}
         if not says:
             return
-        end_s = self.clock.now_s - rng.choice([1, 30, 5_000, 2 * DAY_S]) - self.drives
+        end_s = self.now_s - rng.choice([1, 30, 5_000, 2 * DAY_S]) - self.drives
         named: int | None = version
         if rng.random() < 0.15:  # of an older mapvote: read by the last version with its tiles
             first = [c.seq for c in self.rules.casts if (c.vehicle, c.drive) == (vehicle, drive)]
@@ -114,7 +109,7 @@ class History:
         if self._send(vehicle, drive, end_s, named, version, says, masks, has_free) != counts:
             raise AssertionError(f"{vehicle}/{drive} counts: {counts}, and the store thinks otherwise")
         if counts:
-            self.rules.vote(Cast(vehicle, drive, end_s, version, says, has_free, self.clock.now_s, 0))
+            self.rules.vote(Cast(vehicle, drive, end_s, version, says, has_free, self.now_s, 0))
 
     def _last_like(self, version: int, heard_at: int | None) -> int:
         """The last version whose points are those of ``version``, of those that were there when the drive was heard
@@ -164,7 +159,7 @@ class History:
         assert done == self._publish_by_the_rules(), f"published: {done}"
 
     def _publish_by_the_rules(self) -> bool:
-        done = self.rules.publish(self.clock.now_s)
+        done = self.rules.publish(self.now_s)
         if done:
             self.published[self.rules.newest] = self.rules.seq
         return done
@@ -189,7 +184,7 @@ class History:
         if self.rules.newest > 1:
             to = self.rng.randint(1, self.rules.newest - 1)
             rollback(self.store, to)
-            self.rules.rollback(to, self.clock.now_s)
+            self.rules.rollback(to, self.now_s)
 
     def take_out(self) -> None:
         vehicle = self.rng.choice(VEHICLES)
@@ -233,7 +228,7 @@ class History:
         vehicle = self.rng.choice(VEHICLES)
         with suppress(NotFound):
             replay(self.store, vehicle, dry_run=False)
-            self.rules.replay(vehicle, self.clock.now_s)
+            self.rules.replay(vehicle, self.now_s)
 
     def compare(self, where: str) -> None:
         """The newest version, cell by cell, and nothing anywhere else."""

@@ -21,21 +21,15 @@ from mapvote.server.store.ballots import Receipt
 from mapvote.server.store.policy import Policy, set_policy
 from mapvote.server.store.publish import publish
 from mapvote.server.store.store import Store
+from standing_clock import Clock
 
 WALL, LAWN = (10, 10), (20, 20)
 START_NS = 1_700_000_000 * 10**9
 
 
-class Clock:
-    now = START_NS
-
-    def __call__(self) -> int:
-        return self.now
-
-
 @pytest.fixture
 def clock() -> Clock:
-    return Clock()
+    return Clock(START_NS)
 
 
 @pytest.fixture

@@ -25,22 +25,16 @@ from mapvote.server.store.policy import KeepPolicy, Policy, set_policy
 from mapvote.server.store.publish import publish, rollback
 from mapvote.server.store.replay import replay
 from mapvote.server.store.store import Store
+from standing_clock import Clock
 
 CELL = (20, 20)
 START_NS = 1_700_000_000 * 10**9
 FUSE = FuseSettings(max_deleted_share=1.0, prior_stay_days=1e6)
 
 
-class Clock:
-    now = START_NS
-
-    def __call__(self) -> int:
-        return self.now
-
-
 @pytest.fixture
 def clock() -> Clock:
-    return Clock()
+    return Clock(START_NS)
 
 
 @pytest.fixture
@@ -109,7 +103,7 @@ def test_it_goes_on_as_if_nothing_had_been_cleared(store: Store, clock: Clock, t
     come_and_go(store, clock, 4)
     clear(store, dry_run=False)
     cleared = [pack_tile(tile) for tile in store.point_map().tiles.values()]
-    other_clock = Clock()
+    other_clock = Clock(START_NS)
     other = Store.create(f"sqlite:///{tmp_path / 'other.db'}", two_walls(), Policy(fuse=FUSE), clock=other_clock)
     come_and_go(other, other_clock, 10)
     assert cleared == [pack_tile(tile) for tile in other.point_map().tiles.values()]

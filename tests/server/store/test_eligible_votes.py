@@ -35,6 +35,7 @@ from mapvote.server.store.eligible_votes import (
 from mapvote.server.store.policy import Policy, RoundPolicy, set_policy
 from mapvote.server.store.quarantine import ballot_name
 from mapvote.server.store.store import Store
+from standing_clock import Clock
 
 CELL, OTHER = (10, 10), (10, 11)
 HERE, BESIDE = (0, 0), (0, 1)
@@ -42,26 +43,16 @@ CE, CO, UO = CellState.CHANGED_EMPTY, CellState.CHANGED_OCCUPIED, CellState.UNCH
 NOW_S = 1_700_000_000
 
 
-class Clock:
-    """Stands, until a test moves it on."""
-
-    def __init__(self) -> None:
-        self.ns = NOW_S * 10**9
-
-    def __call__(self) -> int:
-        return self.ns
-
-
 @pytest.fixture
 def clock() -> Clock:
-    return Clock()
+    return Clock(NOW_S * 10**9)
 
 
 @pytest.fixture(scope="module")
 def first_store(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Made once: every test has a copy."""
     file = tmp_path_factory.mktemp("first") / "store.db"
-    Store.create(f"sqlite:///{file}", two_walls(), clock=Clock()).close()
+    Store.create(f"sqlite:///{file}", two_walls(), clock=Clock(NOW_S * 10**9)).close()
     return file
 
 
@@ -171,7 +162,7 @@ def test_a_vehicle_that_is_left_out_is_not_even_named(store: Store) -> None:
 
 def test_a_ballot_waits_for_its_minimum_age(store: Store, clock: Clock) -> None:
     cast(store, "a")
-    received = clock.ns
+    received = clock.now
     assert judged(store, asked(store, received_by_ns=received - 1)) == {"a": YOUNG}
     assert judged(store, asked(store, received_by_ns=received)) == {"a": ""}
 
@@ -205,8 +196,8 @@ def test_votes_outside_the_window_are_told_which_window(store: Store) -> None:
 def test_the_window_is_of_the_votes_that_are_ready(store: Store, clock: Clock) -> None:
     """One that waits for its age pushes no other out."""
     cast(store, "a")
-    received = clock.ns
-    clock.ns += 10**9
+    received = clock.now
+    clock.now += 10**9
     cast(store, "b", day=60)
     found = judged(store, asked(store, received_by_ns=received))
     assert found == {"a": "", "b": YOUNG}
@@ -282,8 +273,8 @@ def test_the_recent_past_knows_no_ballot_that_is_not_ready(store: Store, clock: 
     cast(store, "a")
     cast(store, "b", method="paper")
     damaged = cast(store, "c")
-    received = clock.ns
-    clock.ns += 10**9
+    received = clock.now
+    clock.now += 10**9
     cast(store, "d", day=60)
     question = asked(store, received_by_ns=received, set_aside=(ballot_name(damaged, *HERE),))
     assert recent(store, question) == ["a"]

@@ -16,22 +16,14 @@ from mapvote.server.store.admission import Intake, Sent, accept, examine
 from mapvote.server.store.publish import preview, publish
 from mapvote.server.store.replay import replay
 from mapvote.server.store.store import Store
+from standing_clock import Clock
 
 NOON = 1_700_000_000 * 10**9
 
 
-class Clock:
-    """A clock that stands until it is set."""
-
-    now = NOON
-
-    def __call__(self) -> int:
-        return self.now
-
-
 @pytest.fixture
 def clock() -> Clock:
-    return Clock()
+    return Clock(NOON)
 
 
 @pytest.fixture

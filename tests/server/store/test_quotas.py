@@ -11,13 +11,7 @@ from mapvote.server.store.admission import Intake, examine
 from mapvote.server.store.ballots import Incoming, Receipt
 from mapvote.server.store.quotas import Quota
 from mapvote.server.store.store import Store
-
-
-class Clock:
-    now = 1_800_000_000_000_000_000
-
-    def __call__(self) -> int:
-        return self.now
+from standing_clock import Clock
 
 
 def drive(vehicle: str, name: str, tiles: int = 1) -> Incoming:
@@ -26,7 +20,7 @@ def drive(vehicle: str, name: str, tiles: int = 1) -> Incoming:
 
 
 def test_so_many_drives_a_day_each_vehicle_for_itself_and_a_restart_forgets_nothing(database_url: str) -> None:
-    clock = Clock()
+    clock = Clock(1_800_000_000_000_000_000)
     store = Store.create(database_url, two_walls(), clock=clock)
     quota = Quota(drives_a_day=3, tiles_a_drive=2, stored_bytes=1 << 40)
     intake = Intake(store, quota)

@@ -12,10 +12,11 @@ from pathlib import Path
 import pytest
 
 from hand_made import two_walls
-from histories import Clock, live
+from histories import START_S, live
 from mapvote.fusion.tile_vote import TileVote
 from mapvote.server.store import eligible_votes
 from mapvote.server.store.store import Store
+from standing_clock import Clock
 
 MakeStore = Callable[[Clock], Store]
 
@@ -24,7 +25,7 @@ MakeStore = Callable[[Clock], Store]
 def sqlite_stores(tmp_path: Path) -> MakeStore:
     """New stores, each a copy of one that was made once."""
     first, names = tmp_path / "first.db", iter(range(1_000))
-    Store.create(f"sqlite:///{first}", two_walls(), clock=Clock()).close()
+    Store.create(f"sqlite:///{first}", two_walls(), clock=Clock(START_S * 10**9)).close()
     return lambda clock: Store.open(f"sqlite:///{shutil.copy(first, tmp_path / f'{next(names)}.db')}", clock=clock)
 
 
