@@ -10,6 +10,7 @@ Needs Chromium (apt-get install chromium).
 from __future__ import annotations
 
 import argparse
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -20,9 +21,13 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
+from PIL import Image
+
 from chromium import Chromium
 from hand_made import make_map
 from live_server import serving
+from mapvote.server.insight.history import changes_between, page_between
+from mapvote.server.store import keys
 from mapvote.server.store.store import Store
 from page import town
 
@@ -42,9 +47,27 @@ def settled(browser: Chromium, seconds: float = 6.0) -> None:
         time.sleep(0.2)
 
 
+ALONG = "118,40,3,128,-2.25,0.42"
+"""The eye on the middle of the street, from the south-west: x, y, z, distance, bearing, elevation."""
+
+
 def of_demo(browser: Chromium, url: str) -> None:
-    """The whole street, its largest change chosen."""
-    browser.open(url)
+    """Along the street."""
+    browser.open(f"{url}/#eye={ALONG}")
+    browser.wait(LISTED, 90)
+    settled(browser)
+
+
+def of_swipe(browser: Chromium, url: str) -> None:
+    """Before and after beside a bar, with the paths of those who voted."""
+    browser.open(f"{url}/#compare=swipe&swipe=50&paths=1&eye={ALONG}")
+    browser.wait(LISTED, 90)
+    settled(browser)
+
+
+def from_above(browser: Chromium, url: str) -> None:
+    """Without WebGL, or by a key."""
+    browser.open(f"{url}/#view=2d&paths=1")
     browser.wait(LISTED, 90)
     settled(browser)
 
@@ -73,12 +96,11 @@ def as_seen_without_red(browser: Chromium, url: str) -> None:
 
 
 def while_loading(browser: Chromium, url: str) -> None:
-    """Over a slow line, three seconds after the start."""
+    """Over a slow line: the first points are there, more is coming."""
     browser.call("Network.emulateNetworkConditions", offline=False, latency=400, downloadThroughput=120_000,
                  uploadThroughput=60_000)  # fmt: skip
     browser.open(url)
-    browser.wait(SHOWN, 120)
-    time.sleep(1.0)
+    browser.wait(f"{SHOWN} && !document.querySelector('#busy').hidden", 120)
 
 
 def nothing_yet(browser: Chromium, url: str) -> None:
@@ -108,19 +130,52 @@ DEMO: list[Picture] = [
     ("page_phone", of_change, {"width": 360, "height": 740}),
     ("page_colour_blind", as_seen_without_red, {}),
     ("page_loading", while_loading, {}),
+    ("page_swipe", of_swipe, {}),
+    ("page_2d", from_above, {"webgl": False}),
 ]
 
 
-def take(picture: Picture, url: str, to: Path) -> None:
-    """One picture, by a browser of its own."""
+def take(picture: Picture, url: str, key: str, to: Path) -> None:
+    """One picture, by a browser of its own, to an operator; in 256 colours, which is all that it has."""
     name, prepare, how = picture
     browser = Chromium(**{"width": 1400, "height": 900, "webgl": True} | how)  # type: ignore[arg-type]
+    browser.call("Network.setExtraHTTPHeaders", headers={"Authorization": f"Bearer {key}"})
     try:
         prepare(browser, url)
-        browser.screenshot(to / f"{name}.png")
-        print(to / f"{name}.png")
+        file = to / f"{name}.png"
+        browser.screenshot(file)
+        Image.open(file).convert("RGB").quantize(256, dither=Image.Dither.NONE).save(file, optimize=True)
+        print(file)
     finally:
         browser.close()
+
+
+def closed(store: Path) -> str:
+    """An operator's key to a store, which needs keys from then on."""
+    opened = Store.open(f"sqlite:///{store}")
+    try:
+        return keys.issue(opened, "operator", "operator")
+    finally:
+        opened.close()
+
+
+def file_of_changes(store: Path, folder: Path) -> Path:
+    """What `mapvote changes --html` writes of the newest version."""
+    opened = Store.open(f"sqlite:///{store}")
+    try:
+        newest = opened.current()
+        page = page_between(opened, newest - 1, newest, changes_between(opened, newest - 1, newest))
+    finally:
+        opened.close()
+    (folder / "changes.html").write_text(page)
+    return folder / "changes.html"
+
+
+def of_file(browser: Chromium, url: str) -> None:
+    """A change in a file of its own."""
+    browser.open(url)
+    browser.wait("document.querySelectorAll('.row button').length > 0", 60)
+    time.sleep(5.0)
 
 
 def main() -> None:
@@ -132,11 +187,15 @@ def main() -> None:
     options = asked.parse_args()
     wanted = {f"page_{name}" if name != "page" else name for name in filter(None, options.only.split(","))}
     with tempfile.TemporaryDirectory() as folder:
-        log = Path(folder) / "log"
-        with serving(options.store, log=log) as (url, process):
+        log, copy = Path(folder) / "log", Path(folder) / "demo.db"
+        shutil.copy(options.store, copy)
+        key = closed(copy)
+        if not wanted or "page_file" in wanted:
+            take(("page_file", of_file, {}), file_of_changes(copy, Path(folder)).as_uri(), key, options.to)
+        with serving(copy, log=log) as (url, process):
             for picture in [*DEMO, ("page_lost", partial(connection_lost, process), {})]:
                 if not wanted or picture[0] in wanted:
-                    take(picture, url, options.to)
+                    take(picture, url, key, options.to)
         others: list[tuple[Picture, Callable[[], object]]] = [
             (("page_empty", nothing_yet, {}), lambda: make_map({})),
             (("page_town", large_town, {}), lambda: town(10)),
@@ -146,8 +205,9 @@ def main() -> None:
                 continue
             store = Path(folder) / f"{picture[0]}.db"
             Store.create(f"sqlite:///{store}", made()).close()  # type: ignore[arg-type]
+            key = closed(store)
             with serving(store, log=log) as (url, _):
-                take(picture, url, options.to)
+                take(picture, url, key, options.to)
 
 
 if __name__ == "__main__":

@@ -126,7 +126,7 @@ def test_the_cloud_is_drawn_and_nobody_else_is_asked(browser: Chromium, store: P
         browser.run("document.querySelector('#changes button').click()")
         browser.wait("location.hash.includes('change=demolished.v2')")
         browser.wait("location.hash.includes('eye=')")
-        assert "of a cell of it" in text(browser, "#details")
+        assert "mean of its cells" in text(browser, "#details")
         assert "<script>alert(1)</script>" in text(browser, "#versions"), "text stays text"
         assert {urlsplit(u).netloc for u in browser.requests if u.startswith("http")} == {urlsplit(url).netloc}
         assert browser.errors == []

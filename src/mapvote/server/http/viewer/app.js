@@ -25,6 +25,7 @@ view.onWanted = (hash) => fetchTile(hash);
 
 async function start() {
   const deep = view.possible() ? begin() : null;
+  $("busy").hidden = !deep;
   const rest = Promise.all([api.versions(), api.coverage()]);
   rest.catch(() => null);
   try {

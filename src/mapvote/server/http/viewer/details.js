@@ -42,7 +42,7 @@ export function showChange(id) {
       p.volume_m3 !== undefined && ["volume", `${p.volume_m3.toFixed(1)} m\u00b3 of its columns`],
       ["points", `${p.points} ${p.kind === "built" ? "added" : "deleted"}`],
       ["votes for it", p.votes_median ? `${number(p.votes_median)} (fewest ${p.votes_min})` : "unknown"],
-      Number.isFinite(p.probability) && ["probability", `${Math.round(100 * p.probability)} %, of a cell of it`],
+      Number.isFinite(p.probability) && ["probability", `${Math.round(100 * p.probability)} %, mean of its cells`],
       p.against_median !== undefined && ["votes against", number(p.against_median)],
       ["first seen", when(p.first_seen)],
       ["last seen", when(p.last_seen)],

@@ -21,6 +21,7 @@ export class Stage {
     this.cloud = new Cloud($("cloud"), { onPick: (px) => this.picked(px), onMove: () => this.turned() });
     this.stream = new Stream(this.cloud, this.api, { onLoaded: (s) => this.loaded(s), onError: (error) => notice(error.message) });
     $("to-3d").hidden = false;
+    $("how").open = !matchMedia("(max-width: 760px)").matches;  // on a phone the cloud comes first
     this.show(link.read().view === "2d" ? "flat" : "deep");
     const buffer = await overview;
     return buffer;
@@ -36,6 +37,7 @@ export class Stage {
   }
 
   without(text) {
+    $("busy").hidden = true;
     $("deep-controls").hidden = true;
     $("hint-3d").textContent = text;
     $("hint-3d").hidden = false;
@@ -127,6 +129,7 @@ export class Stage {
   }
 
   loaded(stream) {
+    if (!stream.tiles.length) return;
     const busy = stream.loading > 0 || stream.queue?.length > 0;
     $("busy").hidden = !busy;
     if (busy || this.complete || !stream.marked) return;

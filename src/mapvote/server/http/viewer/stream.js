@@ -133,7 +133,7 @@ export class Stream {
         this.soon();
       });
     }
-    if (!this.loading && !this.queue.length) this.onLoaded(this);
+    this.onLoaded(this);
   }
 
   async load(tile) {
