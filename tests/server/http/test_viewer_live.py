@@ -95,7 +95,7 @@ def test_the_page_on_a_real_server(town: tuple[Path, str], tmp_path: Path) -> No
             browser.run("document.querySelector('#changes button').click()")
             shown = browser.run("document.querySelector('#details').innerText")
             assert "(96 cells)" in shown
-            assert "4.0 m above ground" in shown
+            assert "4.3 m above ground" in shown
             assert "7 (fewest 7)" in shown
             browser.run("document.querySelector('#details .link').click()")
             browser.wait("document.querySelector('#details h3').innerText.startsWith('Cell at')")
