@@ -112,7 +112,13 @@ def keys(
     operator: Annotated[bool, typer.Option("--operator", help="the same as --role operator")] = False,
     days: Annotated[float | None, typer.Option(help="the key ends by itself after so many days")] = None,
     overlap_days: Annotated[float, typer.Option(min=0, help="rotate: how long the old keys still work")] = 1.0,
-    keep_votes: Annotated[bool, typer.Option("--keep-votes", help="revoke: standing ballots go on counting")] = False,
+    keep_votes: Annotated[
+        bool | None,
+        typer.Option(
+            "--keep-votes/--end-votes",
+            help="revoke: standing ballots go on counting, or not; a terminal is asked, else they do not",
+        ),
+    ] = None,
 ) -> None:
     """List, issue, rotate or revoke keys. A new key is printed once and kept nowhere.
 
@@ -130,10 +136,20 @@ def keys(
         elif action == "rotate" and name is not None:
             print(store_keys.rotate(opened, name, overlap_days=overlap_days))
         elif action == "revoke" and name is not None:
-            revoked, ended = store_keys.revoke(opened, name, keep_votes=keep_votes)
+            keep = _keep_votes(store_keys.standing(opened, name), name) if keep_votes is None else keep_votes
+            revoked, ended = store_keys.revoke(opened, name, keep_votes=keep)
             print(f"{revoked} keys of {name} revoked" + (f", {ended} ballots count no more" if ended else ""))
         else:
             raise MapvoteError("keys: say list, issue NAME, rotate NAME or revoke NAME")
+
+
+def _keep_votes(standing: int, name: str) -> bool:
+    """What becomes of the ballots of a name that is revoked, by whoever sits there."""
+    import sys
+
+    if not standing or not sys.stdin.isatty():
+        return False
+    return typer.confirm(f"{standing} ballots of {name} stand. Shall they go on counting?", default=False)
 
 
 def _state(key: Key, now_ns: int) -> str:

@@ -1,0 +1,41 @@
+"""What becomes of a vehicle's votes when its key is revoked is for whoever revokes it to say."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+
+import pytest
+
+from hand_made import Say, make_ballot, states_plane, two_walls
+from mapvote.cli.store import keys
+from mapvote.codec.ballot import encode
+from mapvote.core.types import CellState
+from mapvote.server.store.admission import accept, examine
+from mapvote.server.store.keys import issue, standing
+from mapvote.server.store.store import Store
+
+
+class Terminal(io.StringIO):
+    """Somebody sits there."""
+
+    def isatty(self) -> bool:
+        return True
+
+
+@pytest.mark.parametrize(
+    ("typed", "said", "left"),
+    [(Terminal("y\n"), None, 1), (Terminal("\n"), None, 0), (Terminal(), True, 1), (io.StringIO(), None, 0)],
+    ids=["they are to count", "no answer", "said beforehand", "nobody there"],
+)
+def test_who_revokes_a_key_is_asked_what_becomes_of_the_votes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, typed: io.StringIO, said: bool | None, left: int
+) -> None:
+    store = Store.create(f"sqlite:///{tmp_path / 'fleet.db'}", two_walls())
+    issue(store, "car_1", "vehicle")
+    say = Say(states_plane({(10, 10): CellState.CHANGED_EMPTY}))
+    accept(store, [examine(encode(make_ballot(two_walls(), {(0, 0): say}, "car_1", end_ns=1_700_000_000 * 10**9)))])
+    monkeypatch.setattr("sys.stdin", typed)
+    keys(str(tmp_path / "fleet.db"), "revoke", "car_1", keep_votes=said)
+    assert standing(store, "car_1") == left
+    store.close()
