@@ -4,9 +4,9 @@ python benchmarks/histories.py --sqlite 2000 --postgres 300
 python benchmarks/histories.py --sqlite 100 --postgres 0 --csv results/histories.csv      # goes on where that ends
 
 Drives that repeat, objects that come, go and come back, policies that change, minimum age, withdrawal, rollback,
-replay, verdicts of reviewers and racing publishers (tests/histories.py). Prints every disagreement with its seed, and
-at the end a line for docs/measurements/votes.md. With ``--csv`` every history is a row (database, seed, steps, what
-disagreed), appended as it ends.
+replay, verdicts of reviewers and racing publishers, in one of three copies of ballots too (tests/histories.py). Prints
+every disagreement with its seed, and at the end a line for docs/measurements/votes.md. With ``--csv`` every history is
+a row (database, seed, steps, what disagreed), appended as it ends.
 """
 
 from __future__ import annotations

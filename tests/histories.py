@@ -5,15 +5,16 @@ from __future__ import annotations
 import random
 from collections.abc import Callable
 from contextlib import suppress
+from functools import cache
 from threading import Barrier, Thread
 
 import numpy as np
 
-from hand_made import Say, make_ballot, states_plane, two_walls, wall, words_plane
+from hand_made import Say, make_ballot, two_walls, wall, words_plane
 from mapvote.codec.ballot import encode
 from mapvote.config import FuseSettings
 from mapvote.core.memory import Memory
-from mapvote.core.types import MapvoteError
+from mapvote.core.types import NO_VOTE, U8, Bool, MapvoteError
 from mapvote.server.errors import Conflict, NotFound
 from mapvote.server.store.admission import accept, examine
 from mapvote.server.store.ballots import Receipt, withdraw
@@ -30,6 +31,8 @@ LAWN: list[Cell] = [(20, 20), (20, 21), (30, 30)]
 VEHICLES = ("a", "b", "c", "d", "e")
 OPEN = {"max_deleted_share": 1.0, "max_freed_share": 1.0}
 START_S = 1_700_000_000
+WAYS = ("north", "south")
+"""That somebody drove who determined much besides, where nothing ever comes or goes."""
 
 
 class History:
@@ -48,6 +51,8 @@ class History:
         self.published: dict[int, int] = {}
         self.verdicts: list[int] = []
         self.there = dict.fromkeys(WALL, True) | dict.fromkeys(LAWN, False)
+        self.ways = WAYS if seed % 3 == 0 else ()
+        """In one history of three there are copies."""
 
     @property
     def now_s(self) -> int:
@@ -98,6 +103,10 @@ class History:
         says = {c: self._say(c, version, masks, has_free) for c in WALL + LAWN if rng.random() < 0.7}
         if not says:
             return
+        way = rng.choice(["", *self.ways])
+        states = seen_along(way, rng.choice([0, 0, 1]))
+        for cell, spoken in says.items():
+            states[cell] = spoken.state
         end_s = self.now_s - rng.choice([1, 30, 5_000, 2 * DAY_S]) - self.drives
         named: int | None = version
         if rng.random() < 0.15:  # of an older mapvote: read by the last version with its tiles
@@ -105,11 +114,12 @@ class History:
             named, version = None, self._last_like(version, min(first, default=None))
             if version == 0:
                 return
-        counts = self.rules.counts_anywhere(version, says)
-        if self._send(vehicle, drive, end_s, named, version, says, masks, has_free) != counts:
+        counts = bool(way) or self.rules.counts_anywhere(version, says)
+        if self._send(vehicle, drive, end_s, named, version, states, says, masks, has_free) != counts:
             raise AssertionError(f"{vehicle}/{drive} counts: {counts}, and the store thinks otherwise")
         if counts:
-            self.rules.vote(Cast(vehicle, drive, end_s, version, says, has_free, self.now_s, 0))
+            plane = states.tobytes()
+            self.rules.vote(Cast(vehicle, drive, end_s, version, says, has_free, self.now_s, 0, None, way, plane))
 
     def _last_like(self, version: int, heard_at: int | None) -> int:
         """The last version whose points are those of ``version``, of those that were there when the drive was heard
@@ -138,12 +148,12 @@ class History:
         return Spoken(state, gone if masks else None, heights, rng.choice([0, 0b111000, 0b110]) if has_free else 0)
 
     def _send(
-        self, vehicle: str, drive: str, end_s: int, named: int | None, version: int, says: dict[Cell, Spoken],
-        masks: bool, has_free: bool,
+        self, vehicle: str, drive: str, end_s: int, named: int | None, version: int, states: U8,
+        says: dict[Cell, Spoken], masks: bool, has_free: bool,
     ) -> bool:  # fmt: skip
         points = [wall([cell], list(s.heights)) for cell, s in says.items() if s.heights]
         say = Say(
-            states_plane({cell: s.state for cell, s in says.items()}),
+            states,
             gone=words_plane({cell: s.gone or 0 for cell, s in says.items()}) if masks else None,
             new_points=np.concatenate(points) if points else None,
             free=words_plane({cell: s.free for cell, s in says.items()}) if has_free else None,
@@ -249,6 +259,23 @@ class History:
             found = CellMap(heights, free, *(int(plane[cell]) for plane in memory.planes))
             assert found == wanted, f"{where}: cell {cell} is {found}, by the rules {wanted}"
         assert len(tile.points) == sum(len(cell.heights) for cell in expected.cells.values()), where
+
+
+@cache
+def _mask(way: str) -> Bool:
+    """What is seen from a way, but for the wall and the lawn: its border wanders, in parts of the tile of its own."""
+    out = np.zeros((256, 256), dtype=np.bool_)
+    if way:
+        rng = np.random.default_rng(WAYS.index(way))
+        border = rng.integers(-5, 6, 256).cumsum().clip(-40, 40)
+        rows = np.arange(256)[:, None]
+        out = (rows > 50) & ((rows < 150 + border) if way == "north" else (rows > 150 + border))
+    return out
+
+
+def seen_along(way: str, by: int) -> U8:
+    """States of a drive that went a way, moved by so many cells: nothing has changed there."""
+    return np.where(np.roll(_mask(way), by, axis=1), np.uint8(UE), np.uint8(NO_VOTE))
 
 
 def live(seed: int, make_store: Callable[[Clock], Store], steps: int = 40) -> str | None:

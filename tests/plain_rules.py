@@ -11,6 +11,8 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from functools import partial
 
+import numpy as np
+
 from mapvote.config import FuseSettings
 
 UO, UE, CO, CE, UN = range(5)
@@ -61,6 +63,10 @@ class Cast:
     received_s: int
     seq: int
     gone_at: int | None = None
+    way: str = ""
+    """Of a drive that determined much besides: where. Whoever says the same of one way sent one drive twice."""
+    plane: bytes = b""
+    """All that it says, 256 x 256 states."""
 
 
 @dataclass(frozen=True)
@@ -210,6 +216,41 @@ def in_window(casts: list[Cast], settings: FuseSettings) -> list[Cast]:
     return [c for c in recent if c.vehicle in ranked]
 
 
+def without_copies(casts: list[Cast], settings: FuseSettings) -> list[Cast]:
+    """Drives of several vehicles that say the same of one way are one: that is heard which agrees best with all others,
+    of those the one that ended first."""
+    if settings.min_votes < 2:
+        return casts
+    out = set()
+    for alike in alike_among(casts):
+        others = [c for c in casts if c not in alike]
+        best = max(alike, key=lambda c: (agreement(c, others), -c.end_s))
+        out |= {c.seq for c in alike if c is not best}
+    return [c for c in casts if c.seq not in out]
+
+
+def alike_among(casts: list[Cast]) -> list[list[Cast]]:
+    found = [[c for c in casts if c.way == way] for way in sorted({c.way for c in casts} - {""})]
+    return [alike for alike in found if len({c.vehicle for c in alike}) > 1]
+
+
+def agreement(cast: Cast, others: list[Cast]) -> int:
+    """In how many more cells it says what another determined than otherwise, of every seventh cell."""
+    own, score = np.frombuffer(cast.plane, np.uint8)[::7], 0
+    for other in others:
+        theirs = np.frombuffer(other.plane, np.uint8)[::7]
+        both = (own < UN) & (theirs < UN)
+        score += int((both & (own == theirs)).sum()) - int((both & (own != theirs)).sum())
+    return score
+
+
+def liars(everyone: list[Cast], heard: list[Cast]) -> int:
+    """Of the vehicles that say one way and are not heard anywhere, one a way may be honest."""
+    left = {c.vehicle for c in heard}
+    silent = [{c.vehicle for c in alike} - left for alike in alike_among(everyone)]
+    return max(0, len(set().union(*silent)) - sum(1 for vehicles in silent if vehicles))
+
+
 def fuse(
     before: Version,
     standing: list[Cast],
@@ -223,9 +264,14 @@ def fuse(
     ripe = [c for c in standing if c.received_s <= now_s - settings.min_age_s]
     if not ripe:
         return dict(before.cells), before.knows_free
-    chosen = in_window(ripe, settings)
+    everyone = in_window(ripe, settings)
+    chosen = without_copies(everyone, settings)
+    quorum = settings.min_votes - liars(everyone, chosen)
+    quorum = max(quorum, min(settings.min_votes, 2))
     learns = len({c.vehicle for c in chosen if c.has_free})
-    knows = before.knows_free or learns >= max(settings.min_votes, 1)
+    knows = before.knows_free or learns >= max(quorum, 1)
+    lately = [c for c in ripe if max(r.end_s for r in ripe) - c.end_s <= settings.stay_days * DAY_S]
+    lately = without_copies(lately, settings)
     cells, added = {}, False
     for cell, held in before.cells.items():
 
@@ -238,21 +284,20 @@ def fuse(
             last[cast.vehicle] = cast.end_s
             if counts(cast) and obeys(cast, cell):
                 heard.setdefault(cast.vehicle, []).append(cast)
-        recent = [c for c in ripe if max(r.end_s for r in ripe) - c.end_s <= settings.stay_days * DAY_S]
-        recent = sorted((c for c in recent if counts(c)), key=lambda c: c.end_s)
-        new = decide_cell(held, heard, last, recent, cell, settings)
+        recent = sorted((c for c in lately if counts(c)), key=lambda c: c.end_s)
+        new = decide_cell(held, heard, last, recent, cell, settings, quorum)
         added = added or len(new.heights) > len(held.heights)
         cells[cell] = new
     for cell, held in before.cells.items():
         free = held.free
-        if knows and learns >= settings.min_votes:
+        if knows and learns >= quorum:
             telling = [c for c in chosen if c.has_free and cell in c.says and held.changed <= c.version]
             telling = [c for c in telling if readable(c, cell) and obeys(c, cell)]
             passed = [
                 {bit for c in telling if c.vehicle == v for bit in bits(c.says[cell].free)}
                 for v in {c.vehicle for c in chosen}
             ]
-            free |= sum(1 << b for b in range(64) if sum(b in mine for mine in passed) >= settings.min_votes)
+            free |= sum(1 << b for b in range(64) if sum(b in mine for mine in passed) >= quorum)
         if knows and (learns or added):
             free &= ~occupied(cells[cell].heights)
         cells[cell] = replace(cells[cell], free=free)
@@ -268,25 +313,26 @@ def decide_cell(
     recent: list[Cast],
     cell: Cell,
     settings: FuseSettings,
+    quorum: int,
 ) -> CellMap:
     """One cell: one vote a vehicle, its latest drive that says anything; then delete, add, remember."""
     says = {vehicle: drives[-1].says[cell] for vehicle, drives in heard.items()}
-    state = decide([s.state for s in says.values()], settings.min_votes)
+    state = decide([s.state for s in says.values()], quorum)
     said = [(drives[-1].end_s, drives[-1].says[cell].state) for drives in heard.values()]
-    state = state if state in (CO, CE) else turn(said, settings.min_votes) or state
+    state = state if state in (CO, CE) else turn(said, quorum) or state
     if state == CO and is_temporary(held, recent, cell, settings):
         state = UN
     if (state == CO or (state == CE and held.came_s)) and last_word(heard, cell) != state:
         state = UN
     heights = held.heights
     if state in (CE, UO):
-        heights = tuple(z for z in heights if z < LAYER_M or not goes(int(z // LAYER_M), state, says, settings))
+        heights = tuple(z for z in heights if z < LAYER_M or not goes(int(z // LAYER_M), state, says, quorum))
     if state == CO:
         layers = {int(z // LAYER_M) for z in heights}
         offered = {v: {int(z // LAYER_M): z for z in s.heights} for v, s in says.items() if s.state == CO}
         for layer in sorted({layer for mine in offered.values() for layer in mine}):
             backing = sum(any(near in mine for near in (layer - 1, layer, layer + 1)) for mine in offered.values())
-            if backing >= settings.min_votes and layer not in layers:
+            if backing >= quorum and layer not in layers:
                 heights += (next(mine[layer] for mine in offered.values() if layer in mine),)
     new = replace(held, heights=heights)
     if new.stands() and not held.stands():
@@ -328,14 +374,14 @@ def last_word(heard: dict[str, list[Cast]], cell: Cell) -> int:
     return max(determined)[1]
 
 
-def goes(layer: int, state: int, says: dict[str, Spoken], settings: FuseSettings) -> bool:
+def goes(layer: int, state: int, says: dict[str, Spoken], quorum: int) -> bool:
     """Whether enough vehicles say that this voxel is gone, of a cell that is empty now or that stands."""
     if state == CE:
         marks = [EVERY if s.gone is None else s.gone for s in says.values() if s.state == CE]
-        return sum(m >> layer & 1 for m in marks) >= settings.min_votes
+        return sum(m >> layer & 1 for m in marks) >= quorum
     marks = [s.gone or 0 for s in says.values() if s.state == UO]
     marking, determined = sum(m >> layer & 1 for m in marks), sum(s.state != UN for s in says.values())
-    return marking >= settings.min_votes and 2 * marking > determined
+    return marking >= quorum and 2 * marking > determined
 
 
 def is_temporary(held: CellMap, recent: list[Cast], cell: Cell, settings: FuseSettings) -> bool:

@@ -25,7 +25,7 @@ from mapvote.core.grid import TILE_CELLS
 from mapvote.core.types import I64, U8, U64, CellState
 from mapvote.fusion.tile_vote import TileVote
 
-LEAST_MOVED = 64
+LEAST_MOVED = 200
 """Cells, in the rows looked at. Masks that three cells change less are not judged: little is soon alike by chance, and
 so are masks with more holes than ground."""
 _UN = int(CellState.UNDETERMINED)

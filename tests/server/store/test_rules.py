@@ -6,13 +6,16 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import pytest
 
 from hand_made import two_walls
 from histories import START_S, live
+from mapvote.config import FuseSettings
+from mapvote.fusion import fuse
+from mapvote.fusion.copies import Copy
 from mapvote.fusion.tile_vote import TileVote
 from mapvote.server.store import eligible_votes
 from mapvote.server.store.store import Store
@@ -46,6 +49,16 @@ def test_store_and_rules_agree_in_many_histories(sqlite_stores: MakeStore) -> No
 @pytest.mark.parametrize("seed", range(500, 530))
 def test_store_and_rules_agree_on_postgresql(postgres_url: str, seed: int) -> None:
     assert live(seed, lambda clock: Store.create(postgres_url, two_walls(), clock=clock), 25) is None
+
+
+def test_the_rules_object_to_a_store_that_hears_copies(
+    sqlite_stores: MakeStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def whoever_speaks(drives: Sequence[TileVote], _: FuseSettings) -> tuple[Sequence[TileVote], list[Copy]]:
+        return drives, []
+
+    monkeypatch.setattr(fuse, "originals", whoever_speaks)
+    assert disagreements(sqlite_stores, range(3, 4)) != []
 
 
 def test_the_rules_object_to_a_store_that_lets_votes_count_twice(
