@@ -264,13 +264,11 @@ class History:
 @cache
 def _mask(way: str) -> Bool:
     """What is seen from a way, but for the wall and the lawn: its border wanders, in parts of the tile of its own."""
-    out = np.zeros((256, 256), dtype=np.bool_)
-    if way:
-        rng = np.random.default_rng(WAYS.index(way))
-        border = rng.integers(-5, 6, 256).cumsum().clip(-40, 40)
-        rows = np.arange(256)[:, None]
-        out = (rows > 50) & ((rows < 150 + border) if way == "north" else (rows > 150 + border))
-    return out
+    if not way:
+        return np.zeros((256, 256), dtype=np.bool_)
+    borders = np.random.default_rng(WAYS.index(way)).integers(-5, 6, (2, 256)).cumsum(axis=1).clip(-20, 20)
+    rows, (first, last) = np.arange(256)[:, None], {"north": (70, 130), "south": (160, 220)}[way]
+    return np.asarray((rows > first + borders[0]) & (rows < last + borders[1]))
 
 
 def seen_along(way: str, by: int) -> U8:

@@ -110,11 +110,11 @@ def test_a_damaged_ballot_is_told_and_hides_no_other(store: Store) -> None:
 
 
 def test_of_copies_the_story_says_that_one_is_heard_and_the_log_whose_they_are_once(store: Store, clock: Clock) -> None:
-    wandering = np.random.default_rng(1).integers(-5, 6, (2, 256)).cumsum(axis=1).clip(-30, 30)
-    for name, edge in (("a", wandering[0]), ("liar", wandering[0]), ("b", wandering[1])):
-        states = np.where(
-            np.arange(256)[:, None] < 120 + edge, CellState.UNCHANGED_EMPTY, CellState.UNDETERMINED
-        ).astype(np.uint8)
+    wandering = np.random.default_rng(1).integers(-5, 6, (4, 256)).cumsum(axis=1).clip(-30, 30)
+    for name, way in (("a", wandering[:2]), ("liar", wandering[:2]), ("b", wandering[2:])):
+        rows = np.arange(256)[:, None]
+        seen = (rows > 60 + way[0]) & (rows < 180 + way[1])
+        states = np.where(seen, CellState.UNCHANGED_EMPTY, CellState.UNDETERMINED).astype(np.uint8)
         states[WALL] = CellState.CHANGED_EMPTY
         ballot = make_ballot(store.point_map(), {(0, 0): Say(states)}, name, "d", clock.now - ord(name[0]))
         assert isinstance(accept(store, [examine(encode(ballot))])[0], Receipt)
