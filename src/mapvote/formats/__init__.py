@@ -6,20 +6,22 @@ Formats are listed in :mod:`mapvote.formats.registry`; each is recognised by wha
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Unpack
 
 import numpy as np
 
-from mapvote.core.point_map import PointMap, all_fields, all_points
-from mapvote.core.types import U8, Drive, MapvoteError
+from mapvote.core.point_map import PointMap
+from mapvote.core.tile import Tile
+from mapvote.core.types import F64, U8, Drive, MapvoteError
 from mapvote.formats.drives.kitti import DriveWriter
 from mapvote.formats.drives.options import DriveOptions, SaidOfDrive
 from mapvote.formats.drives.poses import read_T_map_lidar
 from mapvote.formats.geo.frame import MapFrame, frame_of
 from mapvote.formats.geo.projector import autoware_frame, frame_wanted
+from mapvote.formats.geo.units import settle
 from mapvote.formats.maps.cloud import GROUND, UNCLASSIFIED, Cloud, joined
+from mapvote.formats.maps.clouds import Clouds
 from mapvote.formats.maps.mapvote_folder import is_map_folder, read_map_folder, write_map_folder
 from mapvote.formats.maps.pcd import write_pcd
 from mapvote.formats.maps.tiling import in_metres, map_of
@@ -111,32 +113,42 @@ def export_map(
     if writer is None:
         suffixes = ", ".join(suffix for suffix in WRITERS if suffix)
         raise MapvoteError(f"{path}: no format for {path.suffix}; use {suffixes}, or a folder for Autoware")
-    cloud = Cloud(all_points(point_map), frame=frame_of(point_map.georeference), fields=all_fields(point_map))
-    if not len(cloud.points):
+    if not point_map.n_points:
         raise MapvoteError(f"{path}: the map holds no points, so there is nothing to export")
-    if writer.classes and "classification" not in cloud.fields:
-        cloud = replace(cloud, fields={**cloud.fields, "classification": ground_classes(point_map)})
+    stated, corners = frame_of(point_map.georeference), _corners(point_map)
     if not path.suffix or projector in ("MGRS", "LocalCartesianUTM"):
-        wanted: MapFrame | None = autoware_frame(cloud.frame, cloud.points, projector)
+        wanted: MapFrame | None = autoware_frame(stated, corners, projector)
         if crs is not None:
             raise MapvoteError(f"{path}: Autoware takes no --crs, but --projector")
     else:
         wanted = frame_wanted(crs, projector)
-    cloud = cloud.in_metres(str(path), wanted, sure=True)
+    frame, convert = settle(str(path), stated, wanted, corners, sure=True)
     if any(offset):
-        shifted = tuple(float(a + b) for a, b in zip(cloud.frame.offset_m, offset, strict=True))
-        frame = MapFrame(cloud.frame.crs, (shifted[0], shifted[1], shifted[2]), cloud.frame.heights)
-        cloud = Cloud(cloud.points - np.array(offset), frame=frame, fields=cloud.fields)
-    writer.write(path, cloud)
-    return writer.name, cloud.frame
+        x, y, z = (float(a + b) for a, b in zip(frame.offset_m, offset, strict=True))
+        frame = MapFrame(frame.crs, (x, y, z), frame.heights)
+
+    def pieces() -> Iterator[Cloud]:
+        for index in sorted(point_map.tiles):
+            tile = point_map.tiles[index]
+            points, fields = convert(tile.points_map), dict(tile.fields)
+            if writer.classes and "classification" not in fields:
+                fields["classification"] = ground_classes(tile)
+            yield Cloud(points - np.array(offset) if any(offset) else points, frame=frame, fields=fields)
+
+    writer.write(path, Clouds.gathered(pieces, frame))
+    return writer.name, frame
 
 
-def ground_classes(point_map: PointMap) -> U8:
-    """(n,) ASPRS class of every point of a map, as ``all_points`` orders them: ground, or unclassified."""
-    tiles = [point_map.tiles[index] for index in sorted(point_map.tiles)]
-    return np.concatenate(
-        [np.where(t.has_ground & ~t.columns[1], GROUND, UNCLASSIFIED).astype(np.uint8) for t in tiles]
-    )
+def _corners(point_map: PointMap) -> F64:
+    """(2, 3) the lowest and the highest coordinates of a map's points."""
+    boxes = [(t.points_map.min(axis=0), t.points_map.max(axis=0)) for t in point_map.tiles.values() if len(t.points)]
+    low, high = np.array(boxes).transpose(1, 0, 2)
+    return np.array([low.min(axis=0), high.max(axis=0)])
+
+
+def ground_classes(tile: Tile) -> U8:
+    """(n,) ASPRS class of every point of a tile: ground, or unclassified."""
+    return np.where(tile.has_ground & ~tile.columns[1], GROUND, UNCLASSIFIED).astype(np.uint8)
 
 
 def _what_is_there(path: Path) -> str:

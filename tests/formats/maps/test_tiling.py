@@ -17,7 +17,7 @@ from mapvote.core import lazy_tiles
 from mapvote.core.lazy_tiles import LazyTiles
 from mapvote.core.point_map import PointMap, map_from_points
 from mapvote.core.types import F64, CellState, MapvoteError
-from mapvote.formats import read_map, write_map
+from mapvote.formats import export_map, read_map, write_map
 from mapvote.formats.maps import pcd, ply, spill
 from mapvote.formats.maps.cloud import Cloud, lattice_of
 from mapvote.formats.maps.importing import import_cloud
@@ -114,6 +114,25 @@ def test_a_large_map_on_disk_is_opened_tile_by_tile_and_updated(tmp_path: Path) 
     assert after.tiles[0, -1] is opened.tiles[0, -1]
     before, now = files(opened, tmp_path / "a"), files(after, tmp_path / "b")
     assert {name for name in now if now[name] != before[name]} == {"manifest.json", "tiles/0_0.tile"}
+
+
+@pytest.mark.parametrize("out", ["a.las", "a.laz", "a.ply", "a.pcd", "a"])
+def test_a_large_map_leaves_as_the_same_file(tmp_path: Path, out: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    points, fields = street(9)
+    fields["intensity"] = (fields["intensity"] / 999.0).astype(np.float32)
+    small = map_of("it", [Cloud(points, fields=fields)])
+    export_map(small, tmp_path / "small" / out)
+    monkeypatch.setattr(lazy_tiles, "KEPT_POINTS", 1500)
+    monkeypatch.setattr(spill, "_IN_MEMORY", 1)
+    large = map_of("it", [Cloud(points, fields=fields)])
+    assert isinstance(large.tiles, LazyTiles)
+    export_map(large, tmp_path / "large" / out)
+    found = [
+        {str(f.relative_to(tmp_path / size)): f.read_bytes() for f in (tmp_path / size).rglob("*") if f.is_file()}
+        for size in ("small", "large")
+    ]
+    assert found[0] == found[1]
+    assert len(found[0]) == (1 if "." in out else 18)
 
 
 @pytest.mark.usefixtures("large")

@@ -15,12 +15,14 @@ import numpy as np
 import yaml
 
 from mapvote.core.types import MapvoteError
-from mapvote.formats.atomic import whole_folder
+from mapvote.formats.atomic import folder_beside, whole_folder
 from mapvote.formats.extras import first_line, read_text
 from mapvote.formats.geo.frame import MapFrame
 from mapvote.formats.geo.projector import PROJECTOR, frame_of_projector, projector_of
 from mapvote.formats.maps.cloud import Cloud, warn_of_float32
+from mapvote.formats.maps.clouds import Clouds
 from mapvote.formats.maps.pcd import read_pcd, save_pcd, stream_pcd
+from mapvote.formats.maps.spill import Spill
 
 log = logging.getLogger("mapvote.formats")
 
@@ -83,39 +85,47 @@ def _frame(path: Path) -> MapFrame:
     return frame_of_projector(read_text(projector), str(projector)) if projector.is_file() else MapFrame()
 
 
-def write_autoware(path: Path, cloud: Cloud, *, side_m: int = SIDE_M) -> None:
+def write_autoware(path: Path, cloud: Cloud | Clouds, *, side_m: int = SIDE_M) -> None:
     """A cloud as Autoware's folder, whole or not at all; an older one there is replaced.
 
     ``side_m``: whole metres. Of the fields intensity goes along. MapvoteError if Autoware has no projector for the
     cloud's frame (:func:`mapvote.formats.geo.projector.autoware_frame` chooses one that it has).
     """
-    projector = projector_of(cloud.frame)
+    clouds = Clouds.of(cloud)
+    projector = projector_of(clouds.frame)
     with whole_folder(path, sign=METADATA) as folder:
         (folder / TILES).mkdir()
         corners = {}
-        for (x, y), tile in squares(str(path), cloud, side_m):
+        for (x, y), tile in squares(str(path), clouds, side_m):
             corners[f"{x}_{y}.pcd"] = x, y
             save_pcd(folder / TILES / f"{x}_{y}.pcd", tile.points, tile.fields)
         (folder / METADATA).write_text(metadata(corners, side_m))
         (folder / PROJECTOR).write_text(projector)
 
 
-def squares(where: str, cloud: Cloud, side_m: int = SIDE_M) -> Iterator[tuple[tuple[int, int], Cloud]]:
+def squares(where: str, cloud: Cloud | Clouds, side_m: int = SIDE_M) -> Iterator[tuple[tuple[int, int], Cloud]]:
     """A cloud cut along whole multiples of ``side_m``: (corner, float32 points and their intensity), by x, y.
 
-    MapvoteError if there are no points.
+    ``where`` is the place that they go to. MapvoteError if there are no points.
     """
-    if len(cloud.points) == 0:
+    clouds = Clouds.of(cloud)
+    if not clouds.n:
         raise MapvoteError(f"{where}: no points to write")
-    warn_of_float32(where, cloud.points)
-    stored = cloud.points.astype(np.float32)
-    fields = {"intensity": cloud.fields["intensity"]} if "intensity" in cloud.fields else {}
-    corner = np.floor(stored[:, :2].astype(np.float64) / side_m).astype(np.int64) * side_m
-    order = np.lexsort((corner[:, 1], corner[:, 0]))
-    seams = np.flatnonzero(np.diff(corner[order], axis=0).any(axis=1)) + 1
-    for piece in np.split(order, seams):
-        x, y = corner[piece[0]].tolist()
-        yield (x, y), Cloud(stored[piece], fields={name: values[piece] for name, values in fields.items()})
+    warn_of_float32(where, clouds.corners)
+    spill = Spill(folder_beside(Path(where)))
+    blocks: dict[tuple[int, int], list[int]] = {}
+    for piece in clouds:
+        stored = piece.points.astype(np.float32)
+        columns = {"points": stored} | {n: c for n, c in piece.fields.items() if n == "intensity"}
+        corner = np.floor(stored[:, :2].astype(np.float64) / side_m).astype(np.int64) * side_m
+        order = np.lexsort((corner[:, 1], corner[:, 0]))
+        seams = np.flatnonzero(np.diff(corner[order], axis=0).any(axis=1)) + 1
+        for rows in np.split(order, seams) if len(order) else ():
+            x, y = corner[rows[0]].tolist()
+            blocks.setdefault((x, y), []).append(spill.add({name: column[rows] for name, column in columns.items()}))
+    for at in sorted(blocks):
+        fields = spill.joined(blocks[at])
+        yield at, Cloud(fields.pop("points"), fields=fields)
 
 
 def metadata(corners: Mapping[str, tuple[int, int]], side_m: int = SIDE_M) -> str:

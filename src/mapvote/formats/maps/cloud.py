@@ -89,6 +89,14 @@ def kept_fields(table: NDArray[np.void]) -> dict[str, NDArray[Any]]:
     return {name: column for name, column in out.items() if column.ndim == 1 and column.dtype.kind in "iuf"}
 
 
+def as_table(cloud: Cloud, kinds: Sequence[tuple[str, np.dtype[Any]]]) -> NDArray[np.void]:
+    """The rows of a file: a structured array of x, y, z and fields, as ``kinds`` orders and types them."""
+    table = np.empty(len(cloud.points), dtype=list(kinds))
+    for name, _ in kinds:
+        table[name] = cloud.points[:, "xyz".index(name)] if name in "xyz" else cloud.fields[name]
+    return table
+
+
 def xyz(where: str, table: NDArray[np.void]) -> NDArray[np.floating]:
     """(n, 3) of a structured array's x, y, z in their own precision; MapvoteError if one is missing."""
     names = table.dtype.names or ()

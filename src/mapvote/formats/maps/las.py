@@ -7,7 +7,7 @@ import os
 import struct
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,8 @@ from mapvote.formats.extras import require
 from mapvote.formats.geo.frame import ENU, MapFrame, read_crs
 from mapvote.formats.geo.las_keys import frame_of_keys
 from mapvote.formats.maps import laz_subprocess
-from mapvote.formats.maps.cloud import SCALED, Cloud, full_scale, joined, other_fields
+from mapvote.formats.maps.cloud import SCALED, Cloud, joined, other_fields
+from mapvote.formats.maps.clouds import Clouds
 from mapvote.formats.maps.laz_subprocess import FIELDS, Head, Piece, read_head, read_pieces
 
 STEP_M = 0.0001
@@ -146,39 +147,44 @@ def _check_counts(path: Path) -> bool:
     return bool(header[104] & 0xC0)
 
 
-def las_fields(cloud: Cloud) -> dict[str, NDArray[Any]]:
-    """The columns of a cloud as LAS holds them: 16 bits of intensity and colour, from whatever scale they have."""
+def las_fields(fields: Mapping[str, NDArray[Any]], full: Mapping[str, float]) -> dict[str, NDArray[Any]]:
+    """Columns as LAS holds them: 16 bits of intensity and colour, from the ``full`` scale that they have."""
     out = {}
     for name, kind in FIELDS.items():
-        if name not in cloud.fields:
+        if name not in fields:
             continue
-        values = cloud.fields[name]
+        values = fields[name]
         if name in SCALED and values.dtype != np.uint16:
-            values = np.rint(np.clip(values.astype(np.float64) / full_scale(values), 0.0, 1.0) * 65535.0)
+            values = np.rint(np.clip(values.astype(np.float64) / full[name], 0.0, 1.0) * 65535.0)
         out[name] = values.astype(kind)
     return out
 
 
-def write_las(path: Path, cloud: Cloud) -> None:
+def write_las(path: Path, cloud: Cloud | Clouds) -> None:
     """A cloud as LAS 1.4, or LAZ if the name ends so; float64 kept to 0.05 mm, with its coordinate system and fields.
 
     Every point is return 1 of 1 where nothing else is known. Whole or not at all.
     """
     laspy = require("laspy", "las", str(path))
-    exact = cloud.points.astype(np.float64, copy=False)
-    header = laspy.LasHeader(point_format=7 if "red" in cloud.fields else 6, version="1.4")
-    header.offsets = np.floor(exact.mean(axis=0)) if len(exact) else np.zeros(3)
+    clouds = Clouds.of(cloud)
+    header = laspy.LasHeader(point_format=7 if "red" in clouds.kinds else 6, version="1.4")
     header.scales = np.full(3, STEP_M)
-    if not cloud.frame.is_local and not cloud.frame.crs.startswith(ENU):
-        if any(cloud.frame.offset_m):
-            exact = exact + np.array(cloud.frame.offset_m)  # back to the coordinates that the CRS means
-            header.offsets = np.floor(exact.mean(axis=0)) if len(exact) else np.zeros(3)
-        header.vlrs.append(laspy.vlrs.known.WktCoordinateSystemVlr(read_crs(cloud.frame.crs).to_wkt("WKT1_GDAL")))
+    shift = np.zeros(3)
+    if not clouds.frame.is_local and not clouds.frame.crs.startswith(ENU):
+        shift = np.array(clouds.frame.offset_m)  # back to the coordinates that the CRS means
+        header.vlrs.append(laspy.vlrs.known.WktCoordinateSystemVlr(read_crs(clouds.frame.crs).to_wkt("WKT1_GDAL")))
         header.global_encoding.wkt = True
-    las = laspy.LasData(header)
-    las.x, las.y, las.z = exact[:, 0], exact[:, 1], exact[:, 2]
-    las.return_number = las.number_of_returns = np.ones(len(exact), dtype=np.uint8)
-    for name, values in las_fields(cloud).items():
-        las[name] = values
-    with whole_file(path) as partial, partial.open("wb") as stream:
-        las.write(stream, do_compress=path.suffix.lower() == ".laz")
+    header.offsets = np.floor(0.5 * (clouds.low + clouds.high) + shift)
+    compressed = path.suffix.lower() == ".laz"
+    with (
+        whole_file(path) as partial,
+        partial.open("wb") as stream,
+        laspy.open(stream, mode="w", header=header, do_compress=compressed, closefd=False) as out,
+    ):
+        for piece in clouds:
+            record = laspy.ScaleAwarePointRecord.zeros(len(piece.points), header=header)
+            record.x, record.y, record.z = (piece.points.astype(np.float64, copy=False) + shift).T
+            record.return_number = record.number_of_returns = np.ones(len(record), dtype=np.uint8)
+            for name, values in las_fields(piece.fields, clouds.full).items():
+                record[name] = values
+            out.write_points(record)

@@ -15,7 +15,8 @@ from pypcd4 import Encoding, MetaData, PointCloud
 from mapvote.core.types import F64, MapvoteError
 from mapvote.formats.atomic import whole_file
 from mapvote.formats.extras import first_line
-from mapvote.formats.maps.cloud import Cloud, joined, kept_fields, other_fields, warn_of_float32, xyz
+from mapvote.formats.maps.cloud import Cloud, as_table, joined, kept_fields, other_fields, warn_of_float32, xyz
+from mapvote.formats.maps.clouds import Clouds
 
 _BLOCK = 500_000
 """Points read at a time."""
@@ -107,16 +108,34 @@ def _blocks(file: BinaryIO, about: MetaData) -> Iterator[NDArray[np.void]]:
         yield table
 
 
-def write_pcd(path: Path, cloud: Cloud, *, encoding: str = "binary", double: bool = False) -> None:
+def write_pcd(path: Path, cloud: Cloud | Clouds, *, encoding: str = "binary", double: bool = False) -> None:
     """A cloud as x, y, z, float32, which is all that PCL reads, or float64 if ``double``; and its fields.
 
-    The frame is not written: PCD has no place for it. Whole or not at all.
+    The frame is not written: PCD has no place for it. ``encoding`` other than binary takes the whole cloud into memory.
+    Whole or not at all.
     """
+    clouds, kind = Clouds.of(cloud), np.float64 if double else np.float32
     if not double:
-        warn_of_float32(str(path), cloud.points)
-    points: NDArray[np.floating] = cloud.points.astype(np.float64) if double else cloud.points.astype(np.float32)
+        warn_of_float32(str(path), clouds.corners)
     with whole_file(path) as partial:
-        save_pcd(partial, points, cloud.fields, encoding=encoding)
+        if encoding != Encoding.BINARY:
+            whole = joined(list(clouds))
+            save_pcd(partial, whole.points.astype(kind), whole.fields, encoding=encoding)
+            return
+        about = _as_header({**dict.fromkeys("xyz", np.dtype(kind)), **clouds.kinds}, clouds.n)
+        kinds = list(zip(about.fields, (about.build_dtype()[name] for name in about.fields), strict=True))
+        with partial.open("wb") as stream:
+            stream.write(about.compose_header(Encoding.BINARY).encode())
+            for piece in clouds:
+                stream.write(as_table(piece, kinds).tobytes())
+
+
+def _as_header(kinds: Mapping[str, np.dtype[Any]], n: int) -> MetaData:
+    """PCL's intensity is a float, and so is written as one."""
+    kinds = {name: np.dtype(np.float32) if name == "intensity" else kind for name, kind in kinds.items()}
+    columns = [np.empty(1, dtype=kind) for kind in kinds.values()]
+    one = PointCloud.from_points(columns, tuple(kinds), tuple(kind.type for kind in kinds.values())).metadata
+    return one.derive(points=n, width=n)
 
 
 def save_pcd(

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mapvote.core.types import MapvoteError
 from mapvote.formats.atomic import whole_file
 from mapvote.formats.extras import require
-from mapvote.formats.maps.cloud import Cloud, joined, kept_fields, other_fields, xyz
+from mapvote.formats.maps.cloud import Cloud, as_table, joined, kept_fields, other_fields, xyz
+from mapvote.formats.maps.clouds import Clouds
 
 _BLOCK = 500_000
 """Vertices read at a time."""
@@ -77,22 +77,17 @@ def _whole(path: Path, loader: Any, stream: BinaryIO) -> Cloud:
     return Cloud(xyz(str(path), table), other_fields(tuple(columns)), fields=kept_fields(table))
 
 
-def write_ply(path: Path, cloud: Cloud) -> None:
+def write_ply(path: Path, cloud: Cloud | Clouds) -> None:
     """A cloud as double x, y, z and its fields, binary little-endian: nothing is rounded. Whole or not at all.
 
     The frame is not written: PLY has no place for it.
     """
-    columns = {axis: cloud.points[:, i] for i, axis in enumerate("xyz")} | dict(cloud.fields)
-    kinds = [(name, "<f8" if name in "xyz" else column.dtype.newbyteorder("<")) for name, column in columns.items()]
-    table = np.empty(len(cloud.points), dtype=kinds)
-    for name, column in columns.items():
-        table[name] = column
-    properties = "".join(f"property {_TYPES[kind.str[1:]]} {name}\n" for name, (kind, _) in _fields_of(table))
-    start = f"ply\nformat binary_little_endian 1.0\ncomment mapvote\nelement vertex {len(table)}\n"
+    clouds = Clouds.of(cloud)
+    kinds = [(axis, np.dtype("<f8")) for axis in "xyz"]
+    kinds += [(name, kind.newbyteorder("<")) for name, kind in clouds.kinds.items()]
+    properties = "".join(f"property {_TYPES[kind.str[1:]]} {name}\n" for name, kind in kinds)
+    start = f"ply\nformat binary_little_endian 1.0\ncomment mapvote\nelement vertex {clouds.n}\n"
     with whole_file(path) as partial, partial.open("wb") as stream:
         stream.write(f"{start}{properties}end_header\n".encode("ascii"))
-        stream.write(table.tobytes())
-
-
-def _fields_of(table: NDArray[np.void]) -> Iterable[tuple[str, tuple[np.dtype[Any], int]]]:
-    return ((name, (about[0], about[1])) for name, about in (table.dtype.fields or {}).items())
+        for piece in clouds:
+            stream.write(as_table(piece, kinds).tobytes())

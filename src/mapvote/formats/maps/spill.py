@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import tempfile
 import weakref
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -57,3 +57,8 @@ class Spill:
             out[name] = np.empty(shape, dtype=dtype)
             self._file.readinto(out[name].reshape(-1).view(np.uint8).data)
         return out
+
+    def joined(self, numbers: Sequence[int]) -> Columns:
+        """The columns of several blocks of the same kinds, one after another."""
+        parts = [self.read(number) for number in numbers]
+        return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}

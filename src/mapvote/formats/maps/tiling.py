@@ -159,8 +159,7 @@ class _Parts:
 
     def read(self, index: TileIndex) -> Columns:
         """The points of a tile, from its corner, and their fields."""
-        parts = [self._spill.read(number) for number in self._blocks[index]]
-        return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+        return self._spill.joined(self._blocks[index])
 
     def tile(self, index: TileIndex, ground_z: F32) -> Tile:
         columns = self.read(index)
