@@ -194,6 +194,8 @@ def _agreed(lows: _Lows, neighbours: I32, least: int) -> I64:
             continue
         window = np.block([[low(j) if j >= 0 else nothing for j in row] for row in around.tolist()])
         window = _supported(window, _AROUND_CELLS, _GRADE * CELL_SIZE, _AGREEING, least)
+        if not np.isfinite(window[own, own]).any():
+            continue
         known = np.block([[lows.known(j) if j >= 0 else nothing for j in row] for row in around.tolist()])
         envelope = np.minimum(window, known)
         _lower_envelope(envelope, _GRADE * CELL_SIZE, _GRADE * CELL_SIZE * np.sqrt(2.0))
