@@ -34,6 +34,10 @@ class LazyTiles(Mapping[TileIndex, Tile]):
         """Of all tiles together; none is made for it."""
         return sum(self._points.values())
 
+    def largest(self, n: int) -> list[TileIndex]:
+        """The tiles with the most points, ``n`` at most."""
+        return sorted(self._points, key=lambda index: -self._points[index])[:n]
+
     def __getitem__(self, index: TileIndex) -> Tile:
         if index not in self._points:
             raise KeyError(index)

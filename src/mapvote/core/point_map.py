@@ -54,8 +54,10 @@ class PointMap:
 
     @property
     def has_intensity(self) -> bool:
-        """Whether its points say how bright they are, so that new ones should."""
-        return any("intensity" in tile.fields for tile in self.tiles.values())
+        """Whether its points say how bright they are, so that new ones should. Of a map larger than memory the largest
+        tiles tell."""
+        asked = self.tiles.largest(3) if isinstance(self.tiles, LazyTiles) else list(self.tiles)
+        return any("intensity" in self.tiles[index].fields for index in asked)
 
     def tile(self, index: TileIndex) -> Tile:
         """One tile; the empty one where the map has none."""

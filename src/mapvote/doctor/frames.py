@@ -21,8 +21,10 @@ from mapvote.doctor.road import Road
 
 _HEIGHT_M = (0.8, 4.0)
 """Of a sensor on a vehicle, over the road."""
-_SCALE, _TURN_DEG, _PITCH_DEG, _TIME_S = 0.02, 2.0, 2.0, 0.15
-"""Less is not complained of: priors err so much by themselves."""
+_LEAST = {"scale": 0.02, "turn": 2.0, "pitch": 2.0, "time": 0.15}
+"""Share, degrees, degrees, seconds. Less is not complained of: priors err so much by themselves."""
+_SIGMAS = 5.0
+"""Nor is what is less than so many of its standard errors."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,6 +68,7 @@ def check_agreement(drive: Drive, T: F64, runs: Sequence[Run], road: Road, turns
     if as_it_is.median > floor_m:
         return [_nothing_fits(as_it_is, runs, length_m, told_m)], T
     found = _by_numbers(numbers, T, runs)
+    found += [] if found else [_not_shown(numbers, runs, length_m)]
     found += _places(as_it_is, runs) + _scatter(drive, as_it_is, length_m)
     found += _cannot_tell(as_it_is, held, length_m, turns, drive.sensor.clockwise)
     return found, T
@@ -171,17 +174,29 @@ def _nothing_fits(as_it_is: _Held, runs: Sequence[Run], length_m: float, told_m:
 def _by_numbers(numbers: Sequence[Measured], T: F64, runs: Sequence[Run]) -> list[Finding]:
     """Scale, turn, pitch and time, where the prior is off by a little and the runs show it."""
     found = []
-    least = {"scale": _SCALE, "turn": _TURN_DEG, "pitch": _PITCH_DEG, "time": _TIME_S}
     for m in numbers:
         off = abs(np.log(m.value)) if m.kind == "scale" else abs(m.value)
-        sigma = m.sigma / m.value if m.kind == "scale" else m.sigma
         before = misfit(T, runs, scale=m.kind == "scale")
         gained = before - misfit(m.poses(T), runs, scale=m.kind == "scale")
-        if off > max(least[m.kind], 5.0 * sigma) and gained > 0.25 * before:
-            grave = off > 2.0 * least[m.kind] or (m.kind == "scale" and gained > 0.5 * before)
+        if off > _least_shown(m) and gained > 0.25 * before:
+            grave = off > 2.0 * _LEAST[m.kind] or (m.kind == "scale" and gained > 0.5 * before)
             found.append((gained, Finding("error" if grave else "warning", *_small_words(m))))
     found.sort(key=lambda one: -one[0])
     return [finding for _, finding in found[:1]]  # one cause moves all of them a little
+
+
+def _least_shown(m: Measured) -> float:
+    """The least of its kind that is complained of: share, degrees or seconds."""
+    return max(_LEAST[m.kind], _SIGMAS * (m.sigma / m.value if m.kind == "scale" else m.sigma))
+
+
+def _not_shown(numbers: Sequence[Measured], runs: Sequence[Run], length_m: float) -> Finding:
+    """How large a mistake may be before this drive shows it: a short one shows little."""
+    least = {m.kind: _least_shown(m) for m in numbers}
+    told = [f"{least['scale']:.0%} of scale", f"{least['turn']:.0f} deg of heading"]
+    told += [f"{least['time']:.1f} s"] if "time" in least else []
+    what = f"in {len(runs)} runs of {length_m:.0f} m mistakes of the prior show from {', '.join(told)} on"
+    return Finding("note", what, "a longer drive with turns tells more")
 
 
 def _small_words(m: Measured) -> tuple[str, str]:
