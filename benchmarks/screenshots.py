@@ -41,6 +41,7 @@ def settled(browser: Chromium, seconds: float = 6.0) -> None:
     browser.wait(SHOWN, 90)
     count, since = -1, time.monotonic()
     while time.monotonic() - since < seconds:
+        browser.wait("document.querySelector('#busy').hidden", 120)
         now = browser.run("performance.getEntriesByType('resource').length")
         if now != count:
             count, since = now, time.monotonic()
@@ -100,7 +101,7 @@ def while_loading(browser: Chromium, url: str) -> None:
     browser.call("Network.emulateNetworkConditions", offline=False, latency=400, downloadThroughput=120_000,
                  uploadThroughput=60_000)  # fmt: skip
     browser.open(url)
-    browser.wait(f"{SHOWN} && !document.querySelector('#busy').hidden", 120)
+    browser.wait(SHOWN, 120)
 
 
 def nothing_yet(browser: Chromium, url: str) -> None:

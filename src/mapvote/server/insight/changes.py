@@ -17,7 +17,8 @@ from mapvote.core.tile import Tile
 from mapvote.core.types import F32, F64, I32, I64, U8, Bool, CellState
 from mapvote.core.voting import VOTE_UNIT
 from mapvote.fusion.probability import alike_beside, change_probability
-from mapvote.server.insight.polygons import Ring, pieces, rings
+from mapvote.server.insight.adjoining import buildings
+from mapvote.server.insight.polygons import Ring, rings
 from mapvote.server.insight.things import REACH_M, group
 
 Kind = Literal["built", "demolished"]
@@ -168,7 +169,7 @@ def change_objects(changed: Iterable[ChangedCells], min_cells: int = 1, reach_m:
     if cells is None:
         return []
     kinds = cells.states.astype(np.int64)
-    found = pieces(cells.rows, cells.cols, kinds)
+    found = buildings(cells.rows, cells.cols, kinds)
     outlines = rings(cells.rows, cells.cols, found.polygons)
     things = group(cells.rows, cells.cols, kinds, found.objects, reach_m)
     beside = alike_beside(cells.rows, cells.cols, kinds)

@@ -14,6 +14,9 @@ PART_SHARE = 1 / 3
 """A piece larger than this share of its neighbour is a thing of its own, unless their hulls overlap: houses stand
 closer to each other than the walls of one house."""
 
+TOUCH_CELLS = 1.0
+"""Hulls that overlap no more than that only touch: houses wall to wall."""
+
 
 def group(rows: I64, cols: I64, kinds: I64, pieces: I32, reach_m: float = REACH_M) -> I32:
     """(n,) labels of things, 0 ... k - 1, of cells (n,) whose ``pieces`` are 8-connected and of one kind each.
@@ -40,7 +43,7 @@ def group(rows: I64, cols: I64, kinds: I64, pieces: I32, reach_m: float = REACH_
         fits = [
             (gap, leader)
             for gap, leader in zip(gaps, near.tolist(), strict=True)
-            if gap < 0 or (gap <= reach and size[piece] <= PART_SHARE * size[leader])
+            if gap < -TOUCH_CELLS or (gap <= reach and size[piece] <= PART_SHARE * size[leader])
         ]
         if fits:
             owner[piece] = min(fits)[1]
