@@ -128,7 +128,13 @@ def test_the_cloud_is_drawn_and_nobody_else_is_asked(browser: Chromium, store: P
         browser.wait("location.hash.includes('eye=')")
         assert "mean of its cells" in text(browser, "#details")
         assert "<script>alert(1)</script>" in text(browser, "#versions"), "text stays text"
-        assert {urlsplit(u).netloc for u in browser.requests if u.startswith("http")} == {urlsplit(url).netloc}
+        shared = browser.run("location.href").replace("compare=", "was=") + "&compare=swipe&swipe=30"
+        asked = list(browser.requests)
+        assert browser.errors == []
+        browser.open(shared)
+        browser.wait("document.querySelector('#swipe-bar').style.left === '30%'")
+        browser.wait("document.querySelector('#details').innerText.includes('Demolished')")
+        assert {urlsplit(u).netloc for u in asked + browser.requests if u.startswith("http")} == {urlsplit(url).netloc}
         assert browser.errors == []
 
 

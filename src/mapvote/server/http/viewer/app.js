@@ -75,7 +75,7 @@ async function firstPoints(deep) {
   else view.fit(tight(stream.tiles) ?? box, 0, { at_once: true, elevation: 0.62 });
   view.placed = true;
   const { Tools } = await import("./tools.js");
-  view.tools ??= new Tools(view, { setCompare: (on) => (state.paired = on) && showClouds() });
+  view.tools ??= new Tools(view, { setCompare: (on) => (state.paired = on) && state.versions.length && showClouds() });
   stream.plan();
 }
 
