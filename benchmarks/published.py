@@ -157,12 +157,13 @@ def write_csv(file: Path, runs: dict[tuple[int, str], list[dict[str, Any]]]) -> 
     """Every macro-F1, a line each."""
     with file.open("w", newline="") as opened:
         out = csv.writer(opened, lineterminator="\n")
-        out.writerow(["seed", "cars", "sensor", "reading", "truth", "case", "macro_f1"])
+        out.writerow(["seed", "cars", "sensor", "strays", "reading", "truth", "case", "macro_f1"])
         for (cars, sensor), some in runs.items():
             for run in some:
+                strays = "dropped" if run["settings"]["mapping"].get("drop_strays", True) else "kept"
                 for reading, cases in run["readings"].items():
                     for case, truths in cases.items():
-                        first = [run["seed"], cars, sensor, reading]
+                        first = [run["seed"], cars, sensor, strays, reading]
                         out.writerows([*first, t, case, f"{v['macro_f1']:.4f}"] for t, v in truths.items())
 
 

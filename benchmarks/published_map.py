@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import argparse
 import csv
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from statistics import fmean
 
@@ -28,8 +28,10 @@ from mapvote.evaluation.experiments.scene import Scene
 from mapvote.evaluation.experiments.study import as_paper
 from mapvote.evaluation.experiments.sweep import decided
 from mapvote.evaluation.scoring.cells import CLASSES, Scores, score_cells
+from mapvote.evaluation.scoring.paper_tables import F1, PRECISION, RECALL
 from mapvote.simulation.scenario import load_scenario
 from mapvote.slam.accumulate import Layer
+from mapvote.slam.road import all_roads, road_under
 
 SCENARIO, CASES = "as_published", "1,2,3,4,5"
 VOTED, DROPPED, KEPT = "as voted on", "laid again, without strays", "laid again, with strays"
@@ -37,12 +39,14 @@ VOTED, DROPPED, KEPT = "as voted on", "laid again, without strays", "laid again,
 
 def laid_again(scene: Scene) -> Iterator[tuple[str, PointMap]]:
     """The map of the surveys at the poses that its own SLAM found, without and with strays."""
-    first = scene.point_map
-    road = np.concatenate(first.driven)
-    layer = Layer(map_from_points(all_points(first), lattice=first.lattice, road=road), scene.settings, road)
-    for name in scene.drive_names("survey_"):
-        poses = scene.survey_poses(name)
-        layer.lay(scene.drive(name), poses, np.ones(len(poses), dtype=np.bool_), lambda: None)
+    first, names = scene.point_map, scene.drive_names("survey_")
+    poses = {name: scene.survey_poses(name) for name in names}
+    registered = {name: np.ones(len(T), dtype=np.bool_) for name, T in poses.items()}
+    cloud = all_points(first)
+    road = all_roads([road_under(poses[name], registered[name], cloud) for name in names])
+    layer = Layer(map_from_points(cloud, lattice=first.lattice, road=road), scene.settings, road)
+    for name in names:
+        layer.lay(scene.drive(name), poses[name], registered[name], lambda: None)
     for name, drop in ((DROPPED, True), (KEPT, False)):
         mapping = scene.settings.mapping.model_copy(update={"drop_strays": drop})
         layer.settings = scene.settings.model_copy(update={"mapping": mapping})
@@ -83,12 +87,34 @@ def main() -> None:
             with options.csv.open("w", newline="") as file:
                 head = ["macro_f1", *(f"{what}_{kind}" for what in ("precision", "recall") for kind in CLASSES)]
                 csv.writer(file, lineterminator="\n").writerows([["seed", "map", "case", *head], *rows])
+    tables(rows)
+
+
+def tables(rows: Sequence[Sequence[str]]) -> None:
+    """Macro-F1 by map and case, precision and recall of the changed classes, and the paper's order of cases."""
+    seeds = sorted({row[0] for row in rows})
+    values = {(row[0], row[1], row[2]): [float(v) for v in row[3:]] for row in rows}
+    cases = CASES.split(",")
+
+    def line(name: str, cells: Sequence[str]) -> None:
+        print(f"| {' | '.join([name, *cells])} |")
+
+    line(f"macro-F1, mean (range) of seeds {', '.join(seeds)}", [f"case {case}" for case in cases])
+    line("---", ["---"] * len(cases))
+    line("the paper, on its street", [f"{F1[case]:.3f}" for case in cases])
     for name in (VOTED, DROPPED, KEPT):
-        for case in CASES.split(","):
-            mine = [[float(v) for v in row[3:]] for row in rows if row[1:3] == [name, case]]
-            means = " ".join(f"{fmean(column):.3f}" for column in zip(*mine, strict=True))
-            macros = [row[0] for row in mine]
-            print(f"{name}; case {case}: {means}; macro-F1 {min(macros):.3f} to {max(macros):.3f}")
+        each = [[values[seed, name, case][0] for seed in seeds] for case in cases]
+        line(name, [f"{fmean(some):.3f} ({min(some):.3f} to {max(some):.3f})" for some in each])
+    for k, kind in ((1, "changed-occupied"), (2, "changed-empty")):
+        line(f"{kind}, P / R: the paper", [f"{PRECISION[case][k]:.3f} / {RECALL[case][k]:.3f}" for case in cases])
+        for name in (VOTED, KEPT):
+            each = [[fmean(values[seed, name, case][i] for seed in seeds) for i in (k + 1, k + 4)] for case in cases]
+            line(f"{kind}, P / R: {name}", [f"{p:.3f} / {r:.3f}" for p, r in each])
+    for a, b in (("1", "2"), ("5", "1"), ("1", "3"), ("2", "4"), ("3", "4")):
+        for name in (VOTED, KEPT):
+            gains = [values[seed, name, a][0] - values[seed, name, b][0] for seed in seeds]
+            ahead = sum(gain > 0 for gain in gains)
+            print(f"case {a} over {b}, {name}: {fmean(gains):+.3f}, ahead on {ahead} of {len(seeds)}")
 
 
 if __name__ == "__main__":
