@@ -13,8 +13,9 @@ from __future__ import annotations
 
 import argparse
 import csv
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -37,6 +38,9 @@ SCENARIO = "half_gone"
 LEVELS = {"NDT, .5 m": Level(0.5, 0.05, 0.5, 30), "NDT, 1 m": Level(1.0, 0.1, 0.5, 30)}
 TRACKER = "own tracker, with prior"
 LOST_M = 0.5
+_BUILT = [{"side": side, "from_m": 38.0, "to_m": 112.0, "count": 5, "kind": "built"} for side in ("north", "south")]
+STREETS: Mapping[str, Mapping[str, Any]] = {"gone": {}, "built": {"changes": _BUILT}}
+"""What became of the facades, as overrides of the scenario."""
 HEAD = ["street", "seed", "vehicle", "localised by", "map", "scans", "lost", "median, cm", "99 %, cm", "worst, cm"]
 
 
@@ -108,13 +112,11 @@ def pooled(rows: list[list[str]]) -> Iterator[list[str]]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", default="1,2,3")
+    parser.add_argument("--facades", default="gone,built", help="what became of them, by commas")
     parser.add_argument("--cache", type=Path, default=cache_folder())
     parser.add_argument("--csv", type=Path)
     options = parser.parse_args()
-    changes = [
-        {"side": side, "from_m": 38.0, "to_m": 112.0, "count": 5, "kind": "built"} for side in ("north", "south")
-    ]
-    streets = {"gone": {}, "built": {"changes": changes}}
+    streets = {name: STREETS[name] for name in options.facades.split(",")}
     rows = [
         row
         for street, overrides in streets.items()
