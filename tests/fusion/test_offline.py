@@ -14,7 +14,7 @@ from mapvote.cli import app
 from mapvote.codec.ballot import Ballot, encode
 from mapvote.config import FuseSettings
 from mapvote.core.point_map import PointMap
-from mapvote.core.types import CellState, MapvoteError
+from mapvote.core.types import NO_VOTE, CellState, MapvoteError
 from mapvote.formats import read_map, write_map
 from mapvote.fusion.offline import update_map
 
@@ -90,6 +90,19 @@ def test_update_on_files(street: PointMap, tmp_path: Path) -> None:
         assert (float(cells["x0"]), float(cells["y0"]), float(cells["cell_size"])) == (0.0, 0.0, 0.3)
     assert "dry run" in run([tmp_path / "map", *files, "--dry-run", "--out", tmp_path / "nothing"])
     assert not (tmp_path / "nothing").exists()
+
+
+def test_update_says_who_sent_what_another_sent(street: PointMap, tmp_path: Path) -> None:
+    write_map(street, tmp_path / "map")
+    borders = np.random.default_rng(1).integers(-5, 6, (2, 256)).cumsum(axis=1).clip(-20, 20)
+    rows = np.arange(256)[:, None]
+    states = np.where((rows > 60 + borders[0]) & (rows < 180 + borders[1]), CellState.UNCHANGED_EMPTY, NO_VOTE).astype(
+        np.uint8
+    )
+    for vehicle, moved in (("v1", states), ("v2", np.roll(states, 1, axis=0))):
+        (tmp_path / vehicle).write_bytes(encode(make_ballot(street, {(0, 0): Say(moved)}, vehicle)))
+    told = run([tmp_path / "map", tmp_path / "v1", tmp_path / "v2", "--dry-run"])
+    assert "on 1 tile: the two count as one vehicle there" in told
 
 
 def test_one_vehicle_alone_needs_min_votes_1(street: PointMap, tmp_path: Path) -> None:

@@ -102,7 +102,8 @@ def _report(decisions: dict[TileIndex, Decision], vehicles: int, min_votes: int,
     added, deleted = sum(d.added for d in decisions.values()), sum(d.deleted for d in decisions.values())
     print(f"{vehicles} vehicles, {len(decisions)} tiles: {added} points added, {deleted} deleted")
     for (vehicle, heard), tiles in sorted(_copies(decisions).items()):
-        print(f"{vehicle} sent what {heard} sent, on {tiles} tiles: the two count as one vehicle there")
+        where = f"{tiles} tile{'s' if tiles > 1 else ''}"
+        print(f"{vehicle} sent what {heard} sent, on {where}: the two count as one vehicle there")
     if vehicles < min_votes:
         print(f"A change needs {min_votes} vehicles and {vehicles} voted, so nothing can change: --min-votes 1")
     print(f"updated map: {out}" if out is not None else "dry run: no map written")
