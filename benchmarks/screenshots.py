@@ -72,7 +72,7 @@ def from_above(browser: Chromium, url: str) -> None:
     """Without WebGL, or by a key."""
     browser.open(f"{url}/#view=2d&paths=1")
     browser.wait(LISTED, 90)
-    settled(browser)
+    time.sleep(10.0)
 
 
 def of_change(browser: Chromium, url: str) -> None:

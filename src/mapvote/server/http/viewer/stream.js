@@ -5,7 +5,7 @@ import { groundOf, TILE } from "./cloud.js";
 import { MARK } from "./shaders.js";
 
 export const SPACING = [4.8, 2.4, 1.2, 0.6, 0.3, 0.15];  // metres between the points of each level
-const HEAD = 24, AT_ONCE = 6, ENOUGH_PIXELS = 1.1, MOST_LOADED = 14e6, FRAME_MS = [45, 75];
+const HEAD = 24, AT_ONCE = 6, ENOUGH_PIXELS = 1.1, MOST_LOADED = 14e6, FRAME_MS = [45, 75], LEAST = 30_000, MOST = 4e6;
 
 // {z0, zStep, packed} of one cloud of an answer, and where the next one begins.
 export function unpack(buffer, offset = 0) {
@@ -166,25 +166,28 @@ export class Stream {
 
   // The eye moved: draw what the budget allows, and once it rests, more.
   moved() {
-    const now = performance.now(), gap = now - this.last;
-    this.last = now;
-    if (this.frames && gap < 400) {
-      if (gap > FRAME_MS[1]) this.budget = Math.max(40_000, this.budget * 0.85);
-      else if (gap < FRAME_MS[0] && this.shown >= 0.9 * this.budget) this.budget = Math.min(4e6, this.budget * 1.1);
-    }
-    this.frames = (this.frames ?? 0) + 1;
+    if (this.still !== false) this.frames = 0;
     this.still = false;
     this.plan();
     clearTimeout(this.resting);
     this.resting = setTimeout(() => {
       this.still = true;
-      this.frames = 0;
       this.plan(8 * this.budget);
       this.cloud.draw();
     }, 250);
   }
 
+  // Between two frames of one movement: too long a time takes points away, at once if it is far too long.
+  adapt() {
+    const now = performance.now(), gap = now - this.last;
+    this.last = now;
+    if (this.still !== false || this.frames++ < 1) return;
+    if (gap > FRAME_MS[1]) this.budget = Math.max(LEAST, this.budget * Math.max(0.5, FRAME_MS[0] / gap));
+    else if (gap < FRAME_MS[0] && this.shown >= 0.9 * this.budget) this.budget = Math.min(MOST, this.budget * 1.1);
+  }
+
   drawn() {
+    this.adapt();
     if (!this.marked && this.tiles.some((t) => t.levels.length)) {
       this.marked = true;
       performance.mark("first-points");
