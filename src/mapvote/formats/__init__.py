@@ -21,10 +21,10 @@ from mapvote.formats.geo.frame import MapFrame, frame_of
 from mapvote.formats.geo.projector import autoware_frame, frame_wanted
 from mapvote.formats.geo.units import settle
 from mapvote.formats.maps.cloud import GROUND, UNCLASSIFIED, Cloud, joined
-from mapvote.formats.maps.clouds import Clouds
+from mapvote.formats.maps.cloud_pieces import CloudPieces
 from mapvote.formats.maps.mapvote_folder import is_map_folder, read_map_folder, write_map_folder
 from mapvote.formats.maps.pcd import write_pcd
-from mapvote.formats.maps.tiling import in_metres, map_of
+from mapvote.formats.maps.tiling import in_map_metres, map_of
 from mapvote.formats.registry import DRIVES, MAPS, WRITERS
 
 __all__ = [
@@ -66,7 +66,7 @@ def read_map(path: Path | str) -> PointMap:
     path = Path(path)
     if is_map_folder(path):
         return read_map_folder(path)
-    return map_of(str(path), in_metres(str(path), stream_cloud(path)))
+    return map_of(str(path), in_map_metres(str(path), stream_cloud(path)))
 
 
 def stream_cloud(path: Path | str) -> Iterator[Cloud]:
@@ -135,7 +135,7 @@ def export_map(
                 fields["classification"] = ground_classes(tile)
             yield Cloud(points - np.array(offset) if any(offset) else points, frame=frame, fields=fields)
 
-    writer.write(path, Clouds.gathered(pieces, frame))
+    writer.write(path, CloudPieces.gathered(pieces, frame))
     return writer.name, frame
 
 

@@ -26,7 +26,7 @@ from mapvote.formats.maps.autoware import (
     write_autoware,
 )
 from mapvote.formats.maps.cloud import Cloud
-from mapvote.formats.maps.clouds import Clouds
+from mapvote.formats.maps.cloud_pieces import CloudPieces
 from mapvote.formats.maps.e57 import is_e57, stream_e57
 from mapvote.formats.maps.las import is_las, stream_las, write_las
 from mapvote.formats.maps.pcd import is_pcd, stream_pcd, write_pcd
@@ -56,7 +56,7 @@ class MapWriter:
     """What ``mapvote export`` writes under a suffix."""
 
     name: str
-    write: Callable[[Path, Clouds], None]
+    write: Callable[[Path, CloudPieces], None]
     """Whole or not at all."""
     classes: bool = False
     """Whether the format has a place for ASPRS classes."""

@@ -20,7 +20,7 @@ from mapvote.formats.extras import first_line, read_text
 from mapvote.formats.geo.frame import MapFrame
 from mapvote.formats.geo.projector import PROJECTOR, frame_of_projector, projector_of
 from mapvote.formats.maps.cloud import Cloud, warn_of_float32
-from mapvote.formats.maps.clouds import Clouds
+from mapvote.formats.maps.cloud_pieces import CloudPieces
 from mapvote.formats.maps.pcd import read_pcd, save_pcd, stream_pcd
 from mapvote.formats.maps.spill import Spill
 
@@ -85,13 +85,13 @@ def _frame(path: Path) -> MapFrame:
     return frame_of_projector(read_text(projector), str(projector)) if projector.is_file() else MapFrame()
 
 
-def write_autoware(path: Path, cloud: Cloud | Clouds, *, side_m: int = SIDE_M) -> None:
+def write_autoware(path: Path, cloud: Cloud | CloudPieces, *, side_m: int = SIDE_M) -> None:
     """A cloud as Autoware's folder, whole or not at all; an older one there is replaced.
 
     ``side_m``: whole metres. Of the fields intensity goes along. MapvoteError if Autoware has no projector for the
     cloud's frame (:func:`mapvote.formats.geo.projector.autoware_frame` chooses one that it has).
     """
-    clouds = Clouds.of(cloud)
+    clouds = CloudPieces.of(cloud)
     projector = projector_of(clouds.frame)
     with whole_folder(path, sign=METADATA) as folder:
         (folder / TILES).mkdir()
@@ -103,12 +103,12 @@ def write_autoware(path: Path, cloud: Cloud | Clouds, *, side_m: int = SIDE_M) -
         (folder / PROJECTOR).write_text(projector)
 
 
-def squares(where: str, cloud: Cloud | Clouds, side_m: int = SIDE_M) -> Iterator[tuple[tuple[int, int], Cloud]]:
+def squares(where: str, cloud: Cloud | CloudPieces, side_m: int = SIDE_M) -> Iterator[tuple[tuple[int, int], Cloud]]:
     """A cloud cut along whole multiples of ``side_m``: (corner, float32 points and their intensity), by x, y.
 
     ``where`` is the place that they go to. MapvoteError if there are no points.
     """
-    clouds = Clouds.of(cloud)
+    clouds = CloudPieces.of(cloud)
     if not clouds.n:
         raise MapvoteError(f"{where}: no points to write")
     warn_of_float32(where, clouds.corners)

@@ -89,7 +89,7 @@ def kept_fields(table: NDArray[np.void]) -> dict[str, NDArray[Any]]:
     return {name: column for name, column in out.items() if column.ndim == 1 and column.dtype.kind in "iuf"}
 
 
-def as_table(cloud: Cloud, kinds: Sequence[tuple[str, np.dtype[Any]]]) -> NDArray[np.void]:
+def table_of(cloud: Cloud, kinds: Sequence[tuple[str, np.dtype[Any]]]) -> NDArray[np.void]:
     """The rows of a file: a structured array of x, y, z and fields, as ``kinds`` orders and types them."""
     table = np.empty(len(cloud.points), dtype=list(kinds))
     for name, _ in kinds:

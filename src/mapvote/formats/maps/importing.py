@@ -12,7 +12,7 @@ from mapvote.core.point_map import PointMap
 from mapvote.formats import stream_cloud
 from mapvote.formats.geo.frame import LOCAL, MapFrame
 from mapvote.formats.maps.cloud import Cloud
-from mapvote.formats.maps.tiling import in_metres, map_of
+from mapvote.formats.maps.tiling import in_map_metres, map_of
 
 NOISE = (7, 18)
 """ASPRS classes: low noise, high noise."""
@@ -31,7 +31,9 @@ def import_cloud(
         said = MapFrame(LOCAL if from_crs.lower() == LOCAL else from_crs)
         pieces = (replace(piece, frame=said) for piece in pieces)
     left = _LeftOut()
-    point_map = map_of(str(path), left.noise(in_metres(str(path), pieces, wanted, sure=from_crs is not None)), folder)
+    point_map = map_of(
+        str(path), left.noise(in_map_metres(str(path), pieces, wanted, sure=from_crs is not None)), folder
+    )
     return point_map, left.told()
 
 

@@ -22,7 +22,7 @@ from mapvote.formats.geo.frame import ENU, MapFrame, read_crs
 from mapvote.formats.geo.las_keys import frame_of_keys
 from mapvote.formats.maps import laz_subprocess
 from mapvote.formats.maps.cloud import SCALED, Cloud, joined, other_fields
-from mapvote.formats.maps.clouds import Clouds
+from mapvote.formats.maps.cloud_pieces import CloudPieces
 from mapvote.formats.maps.laz_subprocess import FIELDS, Head, Piece, read_head, read_pieces
 
 STEP_M = 0.0001
@@ -160,13 +160,13 @@ def las_fields(fields: Mapping[str, NDArray[Any]], full: Mapping[str, float]) ->
     return out
 
 
-def write_las(path: Path, cloud: Cloud | Clouds) -> None:
+def write_las(path: Path, cloud: Cloud | CloudPieces) -> None:
     """A cloud as LAS 1.4, or LAZ if the name ends so; float64 kept to 0.05 mm, with its coordinate system and fields.
 
     Every point is return 1 of 1 where nothing else is known. Whole or not at all.
     """
     laspy = require("laspy", "las", str(path))
-    clouds = Clouds.of(cloud)
+    clouds = CloudPieces.of(cloud)
     header = laspy.LasHeader(point_format=7 if "red" in clouds.kinds else 6, version="1.4")
     header.scales = np.full(3, STEP_M)
     shift = np.zeros(3)

@@ -15,8 +15,8 @@ from pypcd4 import Encoding, MetaData, PointCloud
 from mapvote.core.types import F64, MapvoteError
 from mapvote.formats.atomic import whole_file
 from mapvote.formats.extras import first_line
-from mapvote.formats.maps.cloud import Cloud, as_table, joined, kept_fields, other_fields, warn_of_float32, xyz
-from mapvote.formats.maps.clouds import Clouds
+from mapvote.formats.maps.cloud import Cloud, joined, kept_fields, other_fields, table_of, warn_of_float32, xyz
+from mapvote.formats.maps.cloud_pieces import CloudPieces
 
 _BLOCK = 500_000
 """Points read at a time."""
@@ -108,13 +108,13 @@ def _blocks(file: BinaryIO, about: MetaData) -> Iterator[NDArray[np.void]]:
         yield table
 
 
-def write_pcd(path: Path, cloud: Cloud | Clouds, *, encoding: str = "binary", double: bool = False) -> None:
+def write_pcd(path: Path, cloud: Cloud | CloudPieces, *, encoding: str = "binary", double: bool = False) -> None:
     """A cloud as x, y, z, float32, which is all that PCL reads, or float64 if ``double``; and its fields.
 
     The frame is not written: PCD has no place for it. ``encoding`` other than binary takes the whole cloud into memory.
     Whole or not at all.
     """
-    clouds, kind = Clouds.of(cloud), np.float64 if double else np.float32
+    clouds, kind = CloudPieces.of(cloud), np.float64 if double else np.float32
     if not double:
         warn_of_float32(str(path), clouds.corners)
     with whole_file(path) as partial:
@@ -127,7 +127,7 @@ def write_pcd(path: Path, cloud: Cloud | Clouds, *, encoding: str = "binary", do
         with partial.open("wb") as stream:
             stream.write(about.compose_header(Encoding.BINARY).encode())
             for piece in clouds:
-                stream.write(as_table(piece, kinds).tobytes())
+                stream.write(table_of(piece, kinds).tobytes())
 
 
 def _as_header(kinds: Mapping[str, np.dtype[Any]], n: int) -> MetaData:

@@ -11,8 +11,8 @@ import numpy as np
 from mapvote.core.types import MapvoteError
 from mapvote.formats.atomic import whole_file
 from mapvote.formats.extras import require
-from mapvote.formats.maps.cloud import Cloud, as_table, joined, kept_fields, other_fields, xyz
-from mapvote.formats.maps.clouds import Clouds
+from mapvote.formats.maps.cloud import Cloud, joined, kept_fields, other_fields, table_of, xyz
+from mapvote.formats.maps.cloud_pieces import CloudPieces
 
 _BLOCK = 500_000
 """Vertices read at a time."""
@@ -77,12 +77,12 @@ def _whole(path: Path, loader: Any, stream: BinaryIO) -> Cloud:
     return Cloud(xyz(str(path), table), other_fields(tuple(columns)), fields=kept_fields(table))
 
 
-def write_ply(path: Path, cloud: Cloud | Clouds) -> None:
+def write_ply(path: Path, cloud: Cloud | CloudPieces) -> None:
     """A cloud as double x, y, z and its fields, binary little-endian: nothing is rounded. Whole or not at all.
 
     The frame is not written: PLY has no place for it.
     """
-    clouds = Clouds.of(cloud)
+    clouds = CloudPieces.of(cloud)
     kinds = [(axis, np.dtype("<f8")) for axis in "xyz"]
     kinds += [(name, kind.newbyteorder("<")) for name, kind in clouds.kinds.items()]
     properties = "".join(f"property {_TYPES[kind.str[1:]]} {name}\n" for name, kind in kinds)
@@ -90,4 +90,4 @@ def write_ply(path: Path, cloud: Cloud | Clouds) -> None:
     with whole_file(path) as partial, partial.open("wb") as stream:
         stream.write(f"{start}{properties}end_header\n".encode("ascii"))
         for piece in clouds:
-            stream.write(as_table(piece, kinds).tobytes())
+            stream.write(table_of(piece, kinds).tobytes())

@@ -35,7 +35,7 @@ _SOME = 1_000_000
 _XYZ = "xyz"
 
 
-def in_metres(
+def in_map_metres(
     where: str, pieces: Iterator[Cloud], wanted: MapFrame | None = None, *, sure: bool = False
 ) -> Iterator[Cloud]:
     """Pieces of one file in map metres, in the frame ``wanted`` where one is; see ``geo.units.settle``."""

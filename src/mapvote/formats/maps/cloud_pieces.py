@@ -14,7 +14,7 @@ from mapvote.formats.maps.cloud import SCALED, Cloud, full_scale
 
 
 @dataclass(frozen=True, slots=True)
-class Clouds:
+class CloudPieces:
     """The pieces of one cloud, in one frame; asked again they come again."""
 
     pieces: Callable[[], Iterator[Cloud]]
@@ -31,12 +31,12 @@ class Clouds:
     """The value that means 1.0, of those that count up to a full scale."""
 
     @classmethod
-    def of(cls, cloud: Cloud | Clouds) -> Clouds:
+    def of(cls, cloud: Cloud | CloudPieces) -> CloudPieces:
         """What is in memory already, as one piece."""
-        return cloud if isinstance(cloud, Clouds) else cls.gathered(lambda: iter([cloud]), cloud.frame)
+        return cloud if isinstance(cloud, CloudPieces) else cls.gathered(lambda: iter([cloud]), cloud.frame)
 
     @classmethod
-    def gathered(cls, pieces: Callable[[], Iterator[Cloud]], frame: MapFrame) -> Clouds:
+    def gathered(cls, pieces: Callable[[], Iterator[Cloud]], frame: MapFrame) -> CloudPieces:
         """Goes through all pieces once."""
         n, low, high = 0, np.full(3, np.inf), np.full(3, -np.inf)
         kinds: dict[str, np.dtype[Any]] = {}
