@@ -13,6 +13,7 @@ import pytest
 import mapvote
 from mapvote.core.ground_growing import grow
 from mapvote.core.voting import add_states
+from mapvote.fusion.copies import grouped
 from mapvote.fusion.outliers import contradicting
 from mapvote.localisation.ndt_solver import align
 from mapvote.perception.range_image import look
@@ -26,7 +27,7 @@ def test_warming_up_goes_through_every_step_and_says_what_each_took() -> None:
     told = list(warm_up())
     assert len(told) == 5
     assert all(seconds > 0 for _, seconds in told)
-    for kernel in (align, add_states, look, grow, contradicting):
+    for kernel in (align, add_states, look, grow, contradicting, grouped):
         assert kernel.signatures
 
 

@@ -53,10 +53,12 @@ def warm_up() -> Iterator[tuple[str, float]]:
 
 
 def _fuse(point_map: PointMap, ballots: list[Ballot], settings: Settings) -> None:
-    """Each method's ballots on their own: one round never mixes them. Three voters, so that they are compared."""
+    """Each method's ballots on their own: one round never mixes them. Three voters, so that they are compared: first
+    as copies of each other, then as three that happen to say the same."""
     for ballot in ballots:
         same = [decode(encode(structs.replace(ballot, vehicle=name))) for name in ("a", "b", "c")]
-        update_map(point_map, same, settings.fuse)
+        for least in (settings.fuse.min_difference, 0.0):
+            update_map(point_map, same, settings.fuse.model_copy(update={"min_difference": least}))
 
 
 def _street(demolished: bool) -> F64:

@@ -63,7 +63,7 @@ def originals(drives: Sequence[TileVote], settings: FuseSettings) -> tuple[Seque
     judged.sort(key=lambda drive: (drive.end_ns, drive.digest))
     number = {name: i for i, name in enumerate(sorted({drive.vehicle for drive in judged}))}
     whose = np.array([number[drive.vehicle] for drive in judged])
-    group = _groups(_packed([drive.sent for drive in judged if drive.sent is not None]), whose, settings.min_difference)
+    group = grouped(_packed([drive.sent for drive in judged if drive.sent is not None]), whose, settings.min_difference)
     copies = []
     for first in np.flatnonzero(np.bincount(group) > 1):
         alike = [drive for drive, own in zip(judged, group, strict=True) if own == first]
@@ -111,7 +111,7 @@ def _agreement(drive: TileVote, others: Sequence[TileVote]) -> int:
 
 
 @numba.njit(cache=True, nogil=True)
-def _groups(masks: U64, whose: I64, least: float) -> I64:
+def grouped(masks: U64, whose: I64, least: float) -> I64:
     """(n,) the first of all drives that are alike to a drive, or to one that is alike to it, and so on."""
     moved, looked = _look(masks)
     group = np.arange(len(masks))

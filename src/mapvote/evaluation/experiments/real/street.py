@@ -205,7 +205,8 @@ def vote_on(street: Street, cases: Sequence[Case], *, edit: Edit = unedited, fir
 def _decided(street: Street, ballots: list[Ballot], case: Case) -> U8:
     if not ballots:
         return np.full(street.grid.shape, NO_VOTE, dtype=np.uint8)
-    return fuse_case(street.point_map, ballots, case.min_votes, street.settings.fuse, street.grid).states
+    fuse = street.settings.fuse.model_copy(update={"min_difference": 0.0})  # they share one drive, and are no copies
+    return fuse_case(street.point_map, ballots, case.min_votes, fuse, street.grid).states
 
 
 def _moving_cells(survey: Drive, T_map_lidar: F64, point_map: PointMap, grid: Grid, settings: Settings) -> Bool:
