@@ -12,7 +12,7 @@ from mapvote.cli.store import keys
 from mapvote.codec.ballot import encode
 from mapvote.core.types import CellState
 from mapvote.server.store.admission import accept, examine
-from mapvote.server.store.keys import issue, standing
+from mapvote.server.store.keys import ballots_standing, issue
 from mapvote.server.store.store import Store
 
 
@@ -37,5 +37,5 @@ def test_who_revokes_a_key_is_asked_what_becomes_of_the_votes(
     accept(store, [examine(encode(make_ballot(two_walls(), {(0, 0): say}, "car_1", end_ns=1_700_000_000 * 10**9)))])
     monkeypatch.setattr("sys.stdin", typed)
     keys(str(tmp_path / "fleet.db"), "revoke", "car_1", keep_votes=said)
-    assert standing(store, "car_1") == left
+    assert ballots_standing(store, "car_1") == left
     store.close()

@@ -136,7 +136,7 @@ def keys(
         elif action == "rotate" and name is not None:
             print(store_keys.rotate(opened, name, overlap_days=overlap_days))
         elif action == "revoke" and name is not None:
-            keep = _keep_votes(store_keys.standing(opened, name), name) if keep_votes is None else keep_votes
+            keep = _keep_votes(store_keys.ballots_standing(opened, name), name) if keep_votes is None else keep_votes
             revoked, ended = store_keys.revoke(opened, name, keep_votes=keep)
             print(f"{revoked} keys of {name} revoked" + (f", {ended} ballots count no more" if ended else ""))
         else:

@@ -108,7 +108,7 @@ def revoke_in(connection: sa.Connection, now: int, name: str, by: str, *, keep_v
     return int(done.rowcount), 0 if keep_votes else end_votes(connection, name, seq)
 
 
-def standing(store: Store, name: str) -> int:
+def ballots_standing(store: Store, name: str) -> int:
     """How many ballots of a name stand."""
     b = schema.ballots.c
     query = sa.select(sa.func.count()).select_from(schema.ballots).where(b.vehicle == name, b.gone_seq.is_(None))
