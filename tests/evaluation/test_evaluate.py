@@ -150,6 +150,7 @@ def test_the_demo_tells_its_story(tmp_path: Path) -> None:
     html = (tmp_path / "out" / "report.html").read_text()
     assert "Beside the paper&#x27;s own table" in html
     assert "occluded abstains" in html
+    assert len(html) < 12_000_000
     assert "paper, Table IV" in html
     assert html.count("data:image/png;base64,") == len(list((tmp_path / "out" / "pictures").glob("*.png")))
     loads = re.findall(r"""(?:\b(?:src|href)\s*=|\bfrom|\bimport\(|\bfetch\(|url\()\s*["']?https?://[^"')\s]*""", html)

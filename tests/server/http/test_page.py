@@ -118,6 +118,16 @@ def test_the_cloud_is_drawn_and_nobody_else_is_asked(browser: Chromium, store: P
             browser.run(f"(s => (s.value = '{colour}', s.onchange()))(document.querySelector('#colour'))")
             if colour == "state":
                 browser.wait("location.hash.includes('vehicle=v1')")
+        for low, told in (("3", "above 3.0 m"), ("-2", "all heights")):
+            browser.run(f"(s => (s.value = '{low}', s.oninput()))(document.querySelector('#slice-low'))")
+            assert browser.run("document.querySelector('#slice-text').textContent") == told
+        enter(browser, "document.querySelector('#measure')")
+        for x, y in ((420, 420), (520, 440)):
+            told = text(browser, "#measured-text")
+            browser.click(x, y)
+            browser.wait(f"document.querySelector('#measured-text').innerText !== {told!r}")
+        assert " m (level " in text(browser, "#measured-text")
+        enter(browser, "document.querySelector('#measure')")
         before = browser.run(f"{pixels}('#c26a00')")
         browser.run("document.querySelector('#paths').click()")
         browser.wait("document.querySelector('#paths-text').innerText === '4 drives, 0.3 km'")

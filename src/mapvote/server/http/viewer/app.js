@@ -61,6 +61,7 @@ async function begin() {
 // The coarse picture, before anything else is asked for.
 async function firstPoints(deep) {
   const buffer = await deep;
+  $("busy").hidden = !buffer || !Object.keys(state.manifest.tiles).length;
   if (!buffer || !view.cloud) return;
   const { lattice, tiles } = state.manifest, { stream, cloud } = view;
   const box = extent(Object.keys(tiles).map((name) => {
@@ -92,6 +93,7 @@ function tight(tiles) {
 }
 
 function refuse(error) {
+  $("busy").hidden = true;
   $("which-map").textContent = location.host;
   if (error.status === 401 || error.status === 403) {
     $("key-form").hidden = false;

@@ -171,7 +171,7 @@ export class Stream {
     this.plan();
     clearTimeout(this.resting);
     this.resting = setTimeout(() => {
-      this.still = true;
+      this.still = this.cloud.lit = true;
       this.plan(8 * this.budget);
       this.cloud.draw();
     }, 250);
@@ -184,6 +184,7 @@ export class Stream {
     if (this.still !== false || this.frames++ < 1) return;
     if (gap > FRAME_MS[1]) this.budget = Math.max(LEAST, this.budget * Math.max(0.5, FRAME_MS[0] / gap));
     else if (gap < FRAME_MS[0] && this.shown >= 0.9 * this.budget) this.budget = Math.min(MOST, this.budget * 1.1);
+    this.cloud.lit = this.budget > LEAST;  // where the fewest points are still too many, the light goes too
   }
 
   drawn() {

@@ -87,7 +87,8 @@ export class Tools {
     const low = Number($("slice-low").value), high = Number($("slice-high").value);
     const whole = low <= -2 && high >= HIGHEST;
     this.cloud.shared.slice.value.set(low <= -2 ? -1e4 : low, high >= HIGHEST ? 1e4 : high);
-    $("slice-text").textContent = whole ? "all heights" : `${low <= -2 ? "" : low.toFixed(1)} \u2026 ${high >= HIGHEST ? "" : high.toFixed(1)} m`;
+    const [from, to] = [`${low.toFixed(1)} m`, `${high.toFixed(1)} m`];
+    $("slice-text").textContent = whole ? "all heights" : high >= HIGHEST ? `above ${from}` : low <= -2 ? `below ${to}` : `${from} to ${to}`;
     link.write({ slice: whole ? null : `${low},${high}` });
     this.cloud.draw();
   }
