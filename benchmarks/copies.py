@@ -6,8 +6,9 @@
 First, of every street: how many pairs of drives on a tile were judged, the smallest difference among them
 (fusion/copies.py), and how many honest drives were taken for copies. ``--alike``: all in one lane at 20 km/h, without
 traffic or cars that come and go. Then a row for k = 1, 2, 3 of 2k + 1 vehicles that send the first one's ballot, as it
-is or moved by a cell, beside the same vehicles, all honest: macro F1 (strict and provenance), false objects above 2 m2,
-and drives taken for copies on a tile. ``--judge 0`` does without the rule. Drives, maps and ballots are cached.
+is or moved by a cell, beside the same vehicles, all honest, and the k + 1 without them: macro F1 (strict and
+provenance), false objects above 2 m2, and drives taken for copies on a tile. ``--judge 0`` does without the rule.
+Drives, maps and ballots are cached.
 """
 
 from __future__ import annotations
@@ -68,8 +69,10 @@ def attacked(scene: Scene, ballots: Sequence[Ballot], fuse: FuseSettings) -> Non
         told = {"all honest": honest}
         for name, lie in (("copied", replay), ("copied, moved by a cell", jitter)):
             told[name] = [*honest[:-k], *(lie(ballot, first_map, honest[0]) for ballot in honest[-k:])]
+        told["left out"] = honest[:-k]
         for name, sent in told.items():
-            outcome = fuse_case(first_map, sent, k + 1, fuse, jury.window)
+            min_votes = 2 if name == "left out" else k + 1
+            outcome = fuse_case(first_map, sent, min_votes, fuse, jury.window)
             found = jury.of_update(outcome)
             false = sum(area > 2.0 for area in found.objects.false_m2)
             copies = sum(len(decision.copies) for decision in outcome.decisions.values())
