@@ -108,8 +108,7 @@ def lay_ground(points: Mapping[TileIndex, Heights], road: Mapping[TileIndex, Hei
     ``road``: where vehicles drove, the height of the road under them. The ground grows from there
     (:mod:`mapvote.core.ground_growing`). Where it does not come to, and in maps of which nobody knows the path, it
     starts from places that the measured cells around agree on and above which nothing rises as gently as ground.
-    Tiles are asked for one by one, in ascending order: of a large map only the heights are held, 4 bytes a point and
-    0.6 MB a tile.
+    Tiles are asked for one by one, in ascending order: of a large map only the heights are held.
     """
     tiles = sorted(points)
     start, heights = _by_cell(points[tile] for tile in tiles)
