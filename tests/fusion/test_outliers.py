@@ -7,12 +7,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hand_made import SHAPE
+from hand_made import SHAPE, make_tile, states_plane, wall
 from mapvote.config import FuseSettings
 from mapvote.core.grid import Lattice
 from mapvote.core.tile import Tile
 from mapvote.core.types import NO_VOTE, U8, CellState
 from mapvote.fusion.fuse import count, fuse_tile, hear
+from mapvote.fusion.spent import unspent
 from mapvote.fusion.tile_vote import TileVote
 
 UO, UE, CO, CE, UN = CellState
@@ -121,3 +122,23 @@ def test_three_liars_silence_no_honest_vehicle_where_few_others_look() -> None:
     heard, _, _, quorum = hear(named([*planes, *lies]), "columns", FuseSettings(min_votes=4))
     assert {f"v{i}" for i in range(4)} <= {vote.vehicle for vote in heard}
     assert quorum == max(2, 4 - (7 - len(heard)))
+
+
+def test_what_waits_for_the_last_who_looked_still_waits_when_all_else_is_published() -> None:
+    """A house fell, a car came, and left before the third passed. Once the house is gone from the map, the car is all
+    that is left to deny: that makes no denier of the third."""
+    house, car = [(r, 40) for r in range(100, 200)], [(r, c) for r in range(50, 60) for c in range(60, 68)]
+    before = make_tile(wall(house, [0.45, 0.75, 1.05]))
+    passed = states_plane(dict.fromkeys(house, CE) | dict.fromkeys(car, UE))
+    saw_it = states_plane(dict.fromkeys(house, CE) | dict.fromkeys(car, CO))
+    offered = wall(car, [0.45, 0.75])
+    votes = [TileVote(f"v{i}", i * 10**9, f"v{i}", states=saw_it, new_points=offered, version=1) for i in (1, 2)]
+    votes.append(TileVote("v3", 3 * 10**9, "v3", states=passed, version=1))
+    policy = FuseSettings(min_votes=2, min_difference=0.0)
+    decision, published = fuse_tile(before, votes, "columns", policy, 2, lambda: votes)
+    assert (decision.deleted, decision.added) == (300, 0)
+    left = [unspent(vote, published) for vote in votes]
+    assert fuse_tile(published, left, "columns", policy, 3, lambda: left)[1] is published
+    again = [*votes, TileVote("v3", 4 * 10**9, "v3b", states=passed, version=1)]
+    left = [unspent(vote, published) for vote in again]
+    assert fuse_tile(published, left, "columns", policy, 3, lambda: left)[1] is published, "drives are folded"

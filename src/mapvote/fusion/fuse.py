@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Literal
 
 import numpy as np
@@ -20,11 +21,11 @@ from mapvote.core.types import F32, I32, I64, N_STATES, NO_VOTE, U8, U64, Bool, 
 from mapvote.core.voting import VOTE_UNIT, add_states, add_tally, decide_cells
 from mapvote.fusion.copies import Copy, liars_among, originals
 from mapvote.fusion.edit import add_points, delete_points
-from mapvote.fusion.outliers import ASKED, contradicting, denying
+from mapvote.fusion.outliers import borne_out, contradictors, deniers
 from mapvote.fusion.persistence import denied_last, doubtful, remembered, temporary
 from mapvote.fusion.sparse_columns import Words, at_least, counted, packed
 from mapvote.fusion.spent import changed_in
-from mapvote.fusion.tile_vote import TileVote, one_each
+from mapvote.fusion.tile_vote import TileVote, one_each, states_of
 from mapvote.fusion.turning import turned
 
 Rule = Literal["paper", "columns"]
@@ -83,16 +84,10 @@ def count(votes: Sequence[TileVote], rule: Rule, min_votes: int) -> tuple[U8, ND
         states = decide_cells(tally, backers, abstain, quorum)
     else:
         for start in range(0, len(votes), _BATCH):
-            add_states(_states_of(votes[start : start + _BATCH]), tally)
+            add_states(states_of(votes[start : start + _BATCH]), tally)
         states = decide_cells(tally, tally, abstain, quorum * VOTE_UNIT)
     shape = (TILE_CELLS, TILE_CELLS)
     return states.reshape(shape), np.moveaxis(tally.reshape(N_STATES, *shape), 0, -1)
-
-
-def _states_of(votes: Sequence[TileVote], cells: slice | NDArray[np.intp] = slice(None)) -> U8:
-    """(votes, cells) what each vehicle decided, in some or all of the flat cells; nothing in one stage."""
-    planes = [vote.states.reshape(-1)[cells] for vote in votes if vote.states is not None]
-    return np.stack(planes) if planes else np.empty((0, CELLS), dtype=np.uint8)[:, cells]
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,7 +138,8 @@ def decide_tile(
     """
     drives, copies = originals(list(drives), settings)
     silenced = liars_among(copies, drives)
-    votes, states, tally, quorum = hear(one_each(drives, tile.window), rule, settings, silenced)
+    each = one_each(drives, tile.window)
+    votes, states, tally, quorum = hear(each, rule, settings, silenced, borne_out(each, tile))
     if any(vote.states is None for vote in votes):
         return Heard(votes, states, tally, quorum)
     names = {vote.vehicle for vote in votes}
@@ -171,42 +167,29 @@ def _edit(tile: Tile, votes: Sequence[TileVote], states: U8, quorum: int) -> tup
 
 
 def hear(
-    votes: Sequence[TileVote], rule: Rule, settings: FuseSettings, silenced: int = 0
+    votes: Sequence[TileVote],
+    rule: Rule,
+    settings: FuseSettings,
+    silenced: int = 0,
+    bearing_out: Mapping[str, int] | None = None,
 ) -> tuple[Sequence[TileVote], U8, NDArray[Any], int]:
     """(the votes that are heard, states, tally, quorum), of one vote a vehicle on a tile; see :func:`count`.
 
     The quorum falls by one for each that is not heard, for it is one of those that the quorum guards against, and by
     the ``silenced`` of whom that was known before; but nobody is ever believed alone. Of those that send tallies nobody
-    is judged: theirs do not weigh alike.
+    is judged: theirs do not weigh alike. ``bearing_out``: by vehicle, see :func:`borne_out`.
     """
     heard, quorum = list(votes), max(settings.min_votes - silenced, min(settings.min_votes, 2))
     states, tally = count(heard, rule, quorum)
     if quorum < 2 or any(vote.states is None for vote in heard):
         return heard, states, tally, quorum
-    for judged in (_contradicting, _denying):
+    for judged in (contradictors, partial(deniers, bearing_out=bearing_out or {})):
         found = judged(heard, states, tally, quorum, settings)
         if found.any():
             heard = [vote for vote, out in zip(heard, found, strict=True) if not out]
             quorum = max(2, quorum - int(found.sum()))
             states, tally = count(heard, rule, quorum)
     return heard, states, tally, quorum
-
-
-def _contradicting(
-    votes: Sequence[TileVote], states: U8, tally: NDArray[Any], quorum: int, settings: FuseSettings
-) -> Bool:
-    if settings.max_contradiction >= 1.0:
-        return np.zeros(len(votes), dtype=np.bool_)
-    planes = np.moveaxis(tally, -1, 0).reshape(N_STATES, -1)
-    asked = _states_of(votes, ASKED)
-    return np.asarray(contradicting(asked, planes[:, ASKED], settings.max_contradiction, quorum))
-
-
-def _denying(votes: Sequence[TileVote], states: U8, tally: NDArray[Any], quorum: int, settings: FuseSettings) -> Bool:
-    changed = np.flatnonzero((states == CellState.CHANGED_OCCUPIED) | (states == CellState.CHANGED_EMPTY))
-    if settings.max_denial >= 1.0 or not len(changed):
-        return np.zeros(len(votes), dtype=np.bool_)
-    return denying(_states_of(votes, changed), states.reshape(-1)[changed], settings.max_denial)
 
 
 def supported_words(votes: Sequence[TileVote], states: U8, min_votes: int) -> U64 | None:

@@ -11,21 +11,62 @@ some per cent of a tile. Whoever is found out was one of the k, which is smaller
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from mapvote.core.types import U8, Bool, CellState
+from mapvote.config import FuseSettings
+from mapvote.core.tile import Tile
+from mapvote.core.types import I64, N_STATES, NO_VOTE, U8, Bool, CellState
 from mapvote.core.voting import VOTE_UNIT
+from mapvote.fusion.tile_vote import TileVote, states_of
 
-ASKED = slice(None, None, 13)
+_ASKED_CELLS = slice(None, None, 13)
 """The flat cells asked, enough for a share; the stride divides no tile's side, so that no column is left out."""
 _MIN_ASKED = 64
 """With fewer cells to go by nobody is judged: 75 m2 that the others agree on, or 6 m2 of changes."""
 _UN = int(CellState.UNDETERMINED)
 _ASKED, _AGREED, _OPPOSED = 0b1, 0b10, 0b100
+
+
+def contradictors(
+    votes: Sequence[TileVote], states: U8, tally: NDArray[Any], quorum: int, settings: FuseSettings
+) -> Bool:
+    """(n,) which of the votes :func:`contradicting` names, by all that they say; ``tally`` (256, 256, 5)."""
+    if settings.max_contradiction >= 1.0:
+        return np.zeros(len(votes), dtype=np.bool_)
+    planes = np.moveaxis(tally, -1, 0).reshape(N_STATES, -1)
+    asked = states_of(votes, _ASKED_CELLS)
+    return np.asarray(contradicting(asked, planes[:, _ASKED_CELLS], settings.max_contradiction, quorum))
+
+
+def deniers(
+    votes: Sequence[TileVote],
+    states: U8,
+    tally: NDArray[Any],
+    quorum: int,
+    settings: FuseSettings,
+    bearing_out: Mapping[str, int],
+) -> Bool:
+    """(n,) which of the votes :func:`denying` names, of the changes among the decided ``states`` (256, 256)."""
+    changed = np.flatnonzero((states == CellState.CHANGED_OCCUPIED) | (states == CellState.CHANGED_EMPTY))
+    if settings.max_denial >= 1.0 or not len(changed):
+        return np.zeros(len(votes), dtype=np.bool_)
+    true = np.array([bearing_out.get(vote.vehicle, 0) for vote in votes], dtype=np.int64)
+    return denying(states_of(votes, changed), states.reshape(-1)[changed], settings.max_denial, true)
+
+
+def borne_out(votes: Iterable[TileVote], tile: Tile) -> dict[str, int]:
+    """By vehicle, in how many cells its vote does not count any more because they are now as it said: built on, or
+    empty."""
+    silenced = [vote for vote in votes if vote.unrestricted is not None and vote.states is not None]
+    if not silenced:
+        return {}
+    as_is = np.where(tile.obstacle_words != 0, np.uint8(CellState.CHANGED_OCCUPIED), np.uint8(CellState.CHANGED_EMPTY))
+    return {v.vehicle: int(np.count_nonzero((v.states == NO_VOTE) & (v.unrestricted == as_is))) for v in silenced}
 
 
 @numba.njit(cache=True, nogil=True)
@@ -49,14 +90,16 @@ def contradicting(states: U8, tally: NDArray[Any], most: float, quorum: int) -> 
     return found
 
 
-def denying(states: U8, decided: U8, most: float) -> Bool:
+def denying(states: U8, decided: U8, most: float, came_true: I64) -> Bool:
     """(n,) which vehicles' ``states`` (n, cells) deny more than ``most`` of the changes that were ``decided`` (cells,).
 
-    Nothing is said of a vehicle that determined fewer than 64 of these cells.
+    The cells ``came_true`` (n,), which the map has since changed as it said, count among what each was asked, and did
+    not deny. Without them whoever backed all that was published would be judged by the few changes that are left, those
+    that wait for it. Nothing is said of a vehicle that determined fewer than 64 of these cells.
     """
     determined = states < _UN
     denied = (determined & (states != decided)).sum(axis=1)
-    asked = determined.sum(axis=1)
+    asked = determined.sum(axis=1) + came_true
     return np.asarray((asked >= _MIN_ASKED) & (denied > most * asked))
 
 

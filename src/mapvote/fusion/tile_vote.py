@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapvote.config import FuseSettings
-from mapvote.core.grid import TILE_CELLS, Grid
+from mapvote.core.grid import CELLS, TILE_CELLS, Grid
 from mapvote.core.types import F32, N_STATES, NO_VOTE, U8, U16, Bool, CellState
 from mapvote.fusion.sparse_columns import Words, union
 
@@ -101,6 +101,12 @@ class TileVote:
         return marked.at(stands & ~self.supports(CellState.CHANGED_EMPTY, marked.cells))
 
 
+def states_of(votes: Sequence[TileVote], cells: slice | NDArray[np.intp] = slice(None)) -> U8:
+    """(votes, cells) what each vehicle decided, in some or all of the flat cells; nothing in one stage."""
+    planes = [vote.states.reshape(-1)[cells] for vote in votes if vote.states is not None]
+    return np.stack(planes) if planes else np.empty((0, CELLS), dtype=np.uint8)[:, cells]
+
+
 class Dated(Protocol):
     """Anything that a vehicle said at a moment."""
 
@@ -175,11 +181,18 @@ def fold(drives: Sequence[TileVote], grid: Grid) -> TileVote:
             here = mine.ravel()[grid.flat_cells(drive.new_points)]
             points.append(drive.new_points[here])
             intensity.append(drive.measured()[here])
+    unrestricted = None
+    if states is not None and any(drive.unrestricted is not None for drive in ordered):
+        unrestricted = np.full(source.shape, NO_VOTE, dtype=np.uint8)
+        for drive in ordered:
+            if drive.sent is not None:
+                np.copyto(unrestricted, drive.sent, where=drive.sent != NO_VOTE)
     return TileVote(
         vehicle=ordered[-1].vehicle,
         end_ns=ordered[-1].end_ns,
         digest=ordered[-1].digest,
         states=states,
+        unrestricted=unrestricted,
         tally=tally,
         gone=union(gone),
         new_points=np.concatenate(points) if points else None,
