@@ -249,7 +249,7 @@ def report_page(
                 f"The first map lies {100 * result.map_shift.mean_m:.1f} cm from the truth on average; "
                 "the scores include what that costs at the borders of cells.",
             ],
-            [drawn["table_iv"], drawn["classes"], drawn["bytes"]],
+            [drawn[name] for name in ("table_iv", "classes", "bytes", "reliability", "ablation") if name in drawn],
             every,
         ),
         beside_the_paper(result),
