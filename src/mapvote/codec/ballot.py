@@ -95,15 +95,16 @@ def tile_key(tile: TileIndex) -> str:
 
 def unpack_states(data: bytes) -> U8:
     """(256, 256) uint8; MapvoteError if damaged or not a CellState."""
-    return _checked(unpack_plane(data, "<u1", (TILE_CELLS, TILE_CELLS), "ballot: states"))
+    return check_states(unpack_plane(data, "<u1", (TILE_CELLS, TILE_CELLS), "ballot: states"))
 
 
 def unpack_many_states(planes: Sequence[bytes]) -> U8:
     """(n, 256, 256) uint8: the states of n ballots that the server took in; MapvoteError as :func:`unpack_states`."""
-    return _checked(unpack_frames(planes, _CELLS, "ballot: states").reshape(-1, TILE_CELLS, TILE_CELLS))
+    return check_states(unpack_frames(planes, _CELLS, "ballot: states").reshape(-1, TILE_CELLS, TILE_CELLS))
 
 
-def _checked(states: U8) -> U8:
+def check_states(states: U8) -> U8:
+    """The same, of any shape; MapvoteError if one is no cell state."""
     if not _all_states(states.reshape(-1)):
         raise MapvoteError("ballot: states holds a value that is no cell state")
     return states

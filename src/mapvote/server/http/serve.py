@@ -23,6 +23,7 @@ from mapvote.server.http.app import create_app
 from mapvote.server.http.browsers import HEADERS
 from mapvote.server.http.connections import Connection, Crowd, Patience
 from mapvote.server.http.services import Services
+from mapvote.server.http.warming import settle
 from mapvote.server.store import keys
 from mapvote.server.store.policy import Policy
 from mapvote.server.store.store import Store
@@ -95,6 +96,7 @@ def serve(
     except OSError as error:
         listener.close()
         raise MapvoteError(f"cannot listen on {host}:{port} ({error.strerror}): choose another --port") from error
+    settle()
     shown = f"[{host}]" if ":" in host else host
     ready(f"http://{shown}:{listener.getsockname()[1]}")
     most = settings.server
