@@ -56,3 +56,14 @@ def test_heights_are_told_above_the_ground() -> None:
 def test_the_same_tile_has_the_same_levels_on_every_run() -> None:
     first, again = (make_levels(scattered(5000), GROUND) for _ in range(2))
     assert [first.part(i) for i in range(N_LEVELS)] == [again.part(i) for i in range(N_LEVELS)]
+
+
+@pytest.mark.parametrize("most", [0, 500, 5000, 40_000])
+def test_the_coarse_part_alone_is_made_of_the_same_points_as_the_coarse_part_of_all(most: int) -> None:
+    points = scattered(30_000)
+    whole, coarse = make_levels(points, GROUND), make_levels(points, GROUND, most)
+    assert len(coarse.packed) == min(max(most, whole.ends[0]), 30_000)
+    assert coarse.ends.tolist() == whole.ends.tolist()
+    finest = int(np.searchsorted(whole.ends, len(coarse.packed), side="right")) - 1
+    both = [part.packed[: whole.ends[finest], :2].tolist() for part in (whole, coarse)]
+    assert sorted(both[0]) == sorted(both[1])

@@ -7,6 +7,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from mapvote.core.point_map import PointMap
+from mapvote.core.rows import found_among
 from mapvote.core.types import F64, Bool
 from mapvote.evaluation.scoring.cells import ratio
 
@@ -75,9 +76,8 @@ def _distance(points: F64, surface: cKDTree) -> F64:
 
 def same_rows(old: F64, new: F64) -> tuple[Bool, F64]:
     """(which rows of ``old`` are in ``new``, the rows of ``new`` that are not in ``old``), compared bit for bit."""
-    record = np.dtype((np.void, 24))
-    a, b = (np.ascontiguousarray(p, dtype=np.float64).view(record).ravel() for p in (old, new))
-    return np.isin(a, b), new[~np.isin(b, a)]
+    a, b = (np.asarray(points, dtype=np.float64) for points in (old, new))
+    return found_among(a, b), new[~found_among(b, a)]
 
 
 APART_M = 0.6

@@ -13,8 +13,9 @@ from typing import Literal
 import numpy as np
 
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS
+from mapvote.core.rows import found_among
 from mapvote.core.tile import Tile
-from mapvote.core.types import F32, F64, I32, I64, U8, Bool, CellState
+from mapvote.core.types import F64, I32, I64, U8, CellState
 from mapvote.core.voting import VOTE_UNIT
 from mapvote.fusion.probability import alike_beside, change_probability
 from mapvote.server.insight.adjoining import buildings
@@ -129,8 +130,7 @@ def changed_cells(before: Tile, after: Tile, decided: Iterable[Decided] = ()) ->
     old_cell, new_cell = before.cells, after.cells
     cell = np.concatenate([new_cell, old_cell])
     z = np.concatenate([new[:, 2], old[:, 2]]).astype(np.float64)
-    came = missing_from(new, old)
-    went = missing_from(old, new)
+    came, went = ~found_among(new, old), ~found_among(old, new)
     n_came = np.bincount(new_cell[came], minlength=TILE_CELLS**2)
     n_went = np.bincount(old_cell[went], minlength=TILE_CELLS**2)
     flat = np.flatnonzero(n_came + n_went)
@@ -230,16 +230,6 @@ def _object(cells: ChangedCells, probability: F64, lengths: I64, mine: I64, outl
         versions=made_in,
         probability=float(probability[told].mean()) if made_in else None,
     )
-
-
-def missing_from(points: F32, others: F32) -> Bool:
-    """(n,) which points are not, bit for bit, among ``others``: edits leave every other point as it was."""
-    ours = np.ascontiguousarray(points).view("V12").reshape(-1)
-    theirs = np.ascontiguousarray(others).view("V12").reshape(-1)
-    _, label = np.unique(np.concatenate([ours, theirs]), return_inverse=True)
-    known = np.zeros(len(label) + 1, dtype=np.bool_)
-    known[label[len(ours) :]] = True
-    return ~known[label[: len(ours)]]
 
 
 def _evidence(flat: I64, states: U8, decided: Iterable[Decided]) -> tuple[I32, I32, I64, I64, I64]:

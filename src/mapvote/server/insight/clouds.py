@@ -9,9 +9,9 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from mapvote.core.grid import TILE_CELLS, Lattice, TileIndex
+from mapvote.core.rows import found_among
 from mapvote.core.types import F64, I64, NO_VOTE, U8, CellState
 from mapvote.fusion.probability import alike_beside, change_probability
-from mapvote.server.insight.changes import missing_from
 from mapvote.server.insight.levels import Levels, cloud_bytes, make_levels, pack
 from mapvote.server.store.blobs import TileHashes
 from mapvote.server.store.eligible_votes import FOREVER, Electorate, judged_votes, read_votes
@@ -41,7 +41,7 @@ class Clouds:
     def __init__(self, store: Store, kept_bytes: int = _KEPT_BYTES) -> None:
         self._store = store
         self._room = kept_bytes
-        self._lock = threading.Lock()
+        self._lock, self._making = threading.Lock(), threading.Lock()
         self._made: OrderedDict[TileHashes, Levels] = OrderedDict()
         self._overview: tuple[int, bytes] = 0, b""
 
@@ -71,27 +71,33 @@ class Clouds:
         part of the first), uint32 points, float32 z0_m, float32 z_step_m; then all points as in :class:`Levels`.
         ``stop`` ends the work early, with nothing to show. NotFound if there is no such version.
         """
-        if self._overview[0] == version:
+        with self._making:  # of many who ask, one makes it
+            if self._overview[0] != version:
+                made = self._coarse(version, stop)
+                if made is None:
+                    return b""
+                self._overview = version, _overview_bytes(made)
             return self._overview[1]
+
+    def _coarse(self, version: int, stop: Callable[[], bool]) -> list[tuple[TileIndex, Levels]] | None:
         with self._store.database.reading() as connection:
             version_of(connection, version)
             tiles = tiles_of(connection, version)
         made = []
         for index, hashes in tiles.items():
             if stop():
-                return b""
-            levels = self.levels(TileHashes(hashes.points, hashes.ground, None))
-            made.append((index, levels.thinned(_SPARE * OVERVIEW_POINTS // len(tiles))))
-        data = _overview_bytes(made)
-        self._overview = version, data
-        return data
+                return None
+            with self._store.database.reading() as connection:
+                tile = load_tile(connection, _ANYWHERE, TileHashes(hashes.points, hashes.ground, None))
+            made.append((index, make_levels(tile.points, tile.ground_z, _SPARE * OVERVIEW_POINTS // len(tiles))))
+        return made
 
     def changed(self, old: TileHashes | None, new: TileHashes | None) -> bytes:
         """Points that only ``old`` has, then those that only ``new`` has, each as :func:`cloud_bytes`."""
         with self._store.database.reading() as connection:
             before, after = (load_tile(connection, _ANYWHERE, hashes) for hashes in (old, new))
         ground = (after if new is not None else before).ground_z
-        gone, come = missing_from(before.points, after.points), missing_from(after.points, before.points)
+        gone, come = ~found_among(before.points, after.points), ~found_among(after.points, before.points)
         return b"".join(cloud_bytes(*pack(some, ground)) for some in (before.points[gone], after.points[come]))
 
 

@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 
 from mapvote.core.grid import TILE_CELLS, Grid, Lattice, TileIndex
+from mapvote.core.rows import found_among
 from mapvote.core.tile import Tile
 from mapvote.core.types import F32, F64
-from mapvote.server.insight.changes import missing_from
 from mapvote.server.insight.levels import SIDE_M, cloud_bytes, pack
 
 AROUND_M = 10.0
@@ -65,7 +65,7 @@ def cut_out(name: str, facts: str, box: Box, height_m: float, tiles: tuple[Tiles
         common = before.window.intersection(window)
         known = np.where(np.isnan(after.ground_z), before.ground_z, after.ground_z)
         ground[common.slices_in(window)] = known[common.slices_in(before.window)]
-        gone, come = missing_from(before.points, after.points), missing_from(after.points, before.points)
+        gone, come = ~found_among(before.points, after.points), ~found_among(after.points, before.points)
         for kind, points in (
             ("kept", after.points_map[~come]),
             ("removed", before.points_map[gone]),

@@ -7,7 +7,7 @@ and the same on every run. Levels are added to one another, so nothing is sent t
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numba
 import numpy as np
@@ -40,27 +40,30 @@ class Levels:
     z0_m: float
     z_step_m: float
 
-    def thinned(self, points: int) -> Levels:
-        """The first points alone, of their own: at least the coarsest level, ``ends`` as before."""
-        return replace(self, packed=self.packed[: max(points, int(self.ends[0]))].copy())
-
     def part(self, level: int) -> bytes:
         """One level for the wire, see :func:`cloud_bytes`."""
         start = 0 if level == 0 else int(self.ends[level - 1])
         return cloud_bytes(self.packed[start : int(self.ends[level])], self.z0_m, self.z_step_m)
 
 
-def make_levels(points: F32, ground_z: F32) -> Levels:
-    """Sort points (n, 3), from the tile's corner, into levels; ``ground_z`` (256, 256) as in the tile."""
+def make_levels(points: F32, ground_z: F32, most: int | None = None) -> Levels:
+    """Sort points (n, 3), from the tile's corner, into levels; ``ground_z`` (256, 256) as in the tile.
+
+    ``most``: only the coarsest level and what else of the coarse ones fits into so many points, ``ends`` as if it were
+    all: for a picture of a whole map.
+    """
     sizes = np.array(SPACINGS_M)
     low, high = _heights(points)
     sides = np.ceil(SIDE_M / sizes).astype(np.int64) + 1
     layers = np.minimum(((high - low) / sizes).astype(np.int64) + 1, _MOST_LAYERS)
     level = _levels(points, low, sizes, sides, layers)  # in the tile's own order: what is near comes soon, and is cheap
-    shuffled = np.random.default_rng(0).permutation(len(points))
-    packed, z0, step = pack(points, ground_z)
-    in_levels = packed[shuffled[np.argsort(level[shuffled], kind="stable")]]
-    return Levels(in_levels, np.cumsum(np.bincount(level, minlength=N_LEVELS)), z0, step)
+    ends = np.cumsum(np.bincount(level, minlength=N_LEVELS))
+    room = len(points) if most is None else max(most, int(ends[0]))
+    chosen = np.flatnonzero(level <= np.searchsorted(ends, room))
+    shuffled = np.random.default_rng(0).permutation(chosen)
+    coarse_first = shuffled[np.argsort(level[shuffled], kind="stable")][:room]
+    packed, z0, step = pack(points[coarse_first], ground_z)
+    return Levels(packed, ends, z0, step)
 
 
 def pack(points: F32, ground_z: F32) -> tuple[U16, float, float]:
