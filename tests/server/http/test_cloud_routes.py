@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import io
+import re
 import struct
 from collections.abc import Iterator
 from importlib.resources import files
@@ -79,15 +80,17 @@ def test_the_overview_shows_every_tile_of_a_small_map_whole(client: TestClient) 
     assert client.get("/v1/clouds/overview?version=9").status_code == 404
 
 
-def test_what_came_and_went_between_two_versions(client: TestClient) -> None:
-    old, new = (client.get(f"/v1/map/versions/{n}").json()["tiles"]["0,0"] for n in (1, 2))
-    pairs = {name: f"{h['points']}-{h['ground']}" for name, h in (("old", old), ("new", new))}
-    data = client.get("/v1/clouds/changed", params=pairs).content
-    gone, at = cloud(data)
+def test_what_came_and_went_between_two_versions_is_told_of_the_tiles_that_differ(client: TestClient) -> None:
+    data = client.get("/v1/clouds/changed?from=1&to=2").content
+    assert struct.unpack_from("<ii", data) == (0, 0)
+    gone, at = cloud(data, 8)
     come, end = cloud(data, at)
     assert (len(gone), len(come), end) == (9, 0, len(data))
     assert sorted(set((gone[:, 3] / 100 - 10).round(2))) == [0.45, 0.75, 1.05]
-    assert len(cloud(client.get("/v1/clouds/changed", params={"new": pairs["new"]}).content, 16)[0]) == 3
+    back, _ = cloud(client.get("/v1/clouds/changed?from=2&to=1").content, 8)
+    assert len(back) == 0
+    assert client.get("/v1/clouds/changed?from=1&to=1").content == b""
+    assert client.get("/v1/clouds/changed?from=1&to=9").status_code == 404
 
 
 def test_evidence_tells_votes_age_probability_and_state_of_each_cell(client: TestClient) -> None:
@@ -126,6 +129,20 @@ def test_a_list_of_changes_is_geojson_or_csv(client: TestClient) -> None:
 def test_what_is_vendored_is_three_js_as_npm_has_it() -> None:
     folder = files("mapvote.server.http") / "viewer" / "vendor"
     assert {f.name: hashlib.sha256(f.read_bytes()).hexdigest() for f in folder.iterdir()} == VENDORED
+
+
+def test_the_page_names_every_module_that_it_begins_with_so_that_all_are_asked_for_at_once() -> None:
+    folder = files("mapvote.server.http") / "viewer"
+
+    def needed(name: str) -> set[str]:
+        parts = re.findall(r'from ?"\./([^"]+)"', (folder / name).read_text())
+        home = name.rpartition("/")[0]
+        inside = [f"{home}/{part}" if home else part for part in parts]
+        return {name}.union(*(needed(part) for part in inside))
+
+    begun = set().union(*(needed(name) for name in ("app.js", "cloud.js", "stream.js", "tools.js")))
+    named = re.findall(r'rel="modulepreload" href="viewer/([^"]+)"', (folder / "index.html").read_text())
+    assert sorted(named) == sorted(begun - {"app.js"})
 
 
 def test_the_page_has_its_files_and_nobody_reaches_others(client: TestClient) -> None:

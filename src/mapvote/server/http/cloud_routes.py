@@ -20,7 +20,6 @@ from mapvote.server.store.blobs import TileHashes
 _BYTES: dict[int | str, dict[str, Any]] = {200: {"content": {"application/octet-stream": {}}}}
 _FOR_EVER = "private, max-age=31536000, immutable"
 Digest = Annotated[str, Path(pattern=r"^[0-9a-f]{64}$")]
-_Pair = Annotated[str | None, Query(pattern=r"^[0-9a-f]{64}-[0-9a-f]{64}$")]
 _Index = Annotated[int, Path(ge=-(1 << 22), le=1 << 22)]
 _Metres = Annotated[float, Query(ge=-1e8, le=1e8, allow_inf_nan=False)]
 router = APIRouter()
@@ -43,11 +42,11 @@ def overview(request: Request, version: VersionQuery | None = None) -> Response:
     "/v1/clouds/changed",
     responses=problems(404) | _BYTES,
     response_class=Response,
-    summary="What came and went between two states of a tile",
+    summary="What came and went between two versions",
 )
-def changed(request: Request, old: _Pair = None, new: _Pair = None) -> Response:
-    """``old`` and ``new``: the hashes of the tile's points and ground, joined by a dash; without one, no tile."""
-    return _packed(request, services(request).clouds.changed(_hashes(old), _hashes(new)), _FOR_EVER)
+def changed(request: Request, old: From, new: To) -> Response:
+    """Tile by tile, two clouds each; the layout is in docs/viewer.md."""
+    return _packed(request, services(request).clouds.changed(old, new), _FOR_EVER)
 
 
 @router.get(
@@ -112,10 +111,6 @@ def driven(request: Request, vehicle: str | None = None, format: Places = "json"
     reviewer(request)
     found = paths(services(request).store, vehicle)
     return as_table([feature["properties"] for feature in found["features"]]) if format == "csv" else as_json(found)
-
-
-def _hashes(pair: str | None) -> TileHashes | None:
-    return None if pair is None else TileHashes(pair[:64], pair[65:], None)
 
 
 def _packed(request: Request, data: bytes, cache: str) -> Response:

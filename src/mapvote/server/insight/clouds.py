@@ -16,7 +16,7 @@ from mapvote.server.insight.levels import Levels, cloud_bytes, make_levels, pack
 from mapvote.server.store.blobs import TileHashes
 from mapvote.server.store.eligible_votes import FOREVER, Electorate, judged_votes, read_votes
 from mapvote.server.store.policy import policy_in
-from mapvote.server.store.queries import load_tile, tiles_of, version_of
+from mapvote.server.store.queries import load_tile, tiles_of, tiles_that_differ, version_of
 from mapvote.server.store.store import Store
 
 OVERVIEW_POINTS = 150_000
@@ -92,13 +92,21 @@ class Clouds:
             made.append((index, make_levels(tile.points, tile.ground_z, _SPARE * OVERVIEW_POINTS // len(tiles))))
         return made
 
-    def changed(self, old: TileHashes | None, new: TileHashes | None) -> bytes:
-        """Points that only ``old`` has, then those that only ``new`` has, each as :func:`cloud_bytes`."""
+    def changed(self, old: int, new: int) -> bytes:
+        """What came and went from version ``old`` to ``new``: of each tile that differs int32 row, int32 col, the
+        points that only ``old`` has, then those that only ``new`` has, both as :func:`cloud_bytes`.
+
+        NotFound if one of the versions does not exist.
+        """
+        told = []
         with self._store.database.reading() as connection:
-            before, after = (load_tile(connection, _ANYWHERE, hashes) for hashes in (old, new))
-        ground = (after if new is not None else before).ground_z
-        gone, come = ~found_among(before.points, after.points), ~found_among(after.points, before.points)
-        return b"".join(cloud_bytes(*pack(some, ground)) for some in (before.points[gone], after.points[come]))
+            for index, *pair in tiles_that_differ(connection, old, new):
+                before, after = (load_tile(connection, _ANYWHERE, hashes) for hashes in pair)
+                ground = (after if pair[1] is not None else before).ground_z
+                gone, come = ~found_among(before.points, after.points), ~found_among(after.points, before.points)
+                told.append(np.array(index, dtype="<i4").tobytes())
+                told += [cloud_bytes(*pack(some, ground)) for some in (before.points[gone], after.points[come])]
+        return b"".join(told)
 
 
 def _overview_bytes(made: Sequence[tuple[TileIndex, Levels]]) -> bytes:

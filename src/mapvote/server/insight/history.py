@@ -30,7 +30,7 @@ from mapvote.server.store.eligible_votes import (
     standing_tiles,
 )
 from mapvote.server.store.policy import policy_in
-from mapvote.server.store.queries import current_version, load_tile, tile_as_of, tiles_of, tiles_set_between, version_of
+from mapvote.server.store.queries import current_version, load_tile, tile_as_of, tiles_of, tiles_that_differ, version_of
 from mapvote.server.store.store import Store
 from mapvote.server.store.tile_jobs import unpack_tally_plane
 
@@ -41,15 +41,8 @@ def changes_between(store: Store, old: int, new: int, min_cells: int = 1, *, lon
     NotFound if one of the versions does not exist.
     """
     with store.database.reading() as connection:
-        for number in (old, new):
-            version_of(connection, number)
-        touched = tiles_set_between(connection, min(old, new), max(old, new))
-        before, after = tiles_of(connection, old, touched), tiles_of(connection, new, touched)
         found = []
-        for index in sorted(before.keys() | after.keys()):
-            pair = before.get(index), after.get(index)
-            if pair[0] is not None and pair[1] is not None and pair[0].points == pair[1].points:
-                continue
+        for index, *pair in tiles_that_differ(connection, old, new):
             tiles = [load_tile(connection, store.lattice.tile(index), hashes) for hashes in pair]
             decided = list(_decided(store, connection, index, min(old, new), max(old, new)))
             found.append(changed_cells(tiles[0], tiles[1], decided))

@@ -96,6 +96,21 @@ def tiles_set_between(connection: sa.Connection, old: int, new: int) -> list[Til
     return sorted((row.row, row.col) for row in connection.execute(found))
 
 
+def tiles_that_differ(
+    connection: sa.Connection, old: int, new: int
+) -> list[tuple[TileIndex, TileHashes | None, TileHashes | None]]:
+    """(index, as it was, as it is) of every tile whose points two versions do not share, ascending.
+
+    NotFound if one of the versions does not exist.
+    """
+    for number in (old, new):
+        version_of(connection, number)
+    touched = tiles_set_between(connection, min(old, new), max(old, new))
+    before, after = tiles_of(connection, old, touched), tiles_of(connection, new, touched)
+    pairs = [(index, before.get(index), after.get(index)) for index in sorted(before.keys() | after.keys())]
+    return [(index, was, is_) for index, was, is_ in pairs if was is None or is_ is None or was.points != is_.points]
+
+
 def load_tile(connection: sa.Connection, window: Grid, hashes: TileHashes | None) -> Tile:
     """The tile over ``window`` by its hashes; the empty one where there are none."""
     if hashes is None:

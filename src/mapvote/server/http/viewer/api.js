@@ -49,9 +49,7 @@ export const evidence = async (tile, vehicle) => (await ask(`evidence/${tile.rep
 export const paths = async (vehicle) => (await ask("paths", vehicle ? { vehicle } : {})).json();
 export const versionMap = async (number) => (await ask(`map/versions/${number}`)).json();
 
-const pair = (tile) => `${tile.points}-${tile.ground}`;
-export const cloudChanged = async (old, now) =>
-  (await ask("clouds/changed", { ...(old && { old: pair(old) }), ...(now && { new: pair(now) }) })).arrayBuffer();
+export const cloudsChanged = async (from, to) => (await ask("clouds/changed", { from, to })).arrayBuffer();
 
 // A place before and after, as an address that an <img> can show: the key travels with a request, not with a link.
 export const picture = async (asked) => URL.createObjectURL(await (await ask("pictures", asked)).blob());

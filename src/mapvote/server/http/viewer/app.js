@@ -16,7 +16,7 @@ import { TILE } from "./view.js";
 let queue = Promise.resolve();
 const asked = new Set();  // hashes on their way
 
-let range = null;  // the last one asked for
+let range = null;  // {from, to, list, clouds}: the two versions that are shown, and what was asked about them
 const view = (state.view = new Stage(api, {
   onPick: (where, change) => (change ? showChange(change.id) : showCell(where)),
   onMove: showScale,
@@ -24,15 +24,19 @@ const view = (state.view = new Stage(api, {
 view.onWanted = (hash) => fetchTile(hash);
 
 async function start() {
+  const known = Promise.all([api.versions(), api.manifest()]);  // before the overview: small, and more is asked by them
   const deep = view.possible() ? begin() : null;
+  const coverage = api.coverage();
+  for (const answer of [known, coverage]) answer.catch(() => null);
   $("busy").hidden = !deep;
-  const rest = Promise.all([api.versions(), api.coverage()]);
-  rest.catch(() => null);
+  let first;
   try {
-    state.manifest = await api.manifest();
+    const [{ versions }, manifest] = await known;
+    Object.assign(state, { versions, manifest });
+    fillRange();
+    first = askRange(Boolean(deep));
     await firstPoints(deep);
-    const [versions, coverage] = await rest;
-    Object.assign(state, { versions: versions.versions, coverage: coverage.tiles });
+    state.coverage = (await coverage).tiles;
   } catch (error) {
     return refuse(error);
   }
@@ -42,10 +46,9 @@ async function start() {
   $("which-map").textContent = `${state.manifest.map_id}, version ${state.manifest.version}`;
   document.title = `mapvote: ${state.manifest.map_id}`;
   showVersions();
-  fillRange();
   showTiles();
   view.flat.fit(extent(view.tiles));
-  await showRange();
+  await showRange(first);
   follow();
   showVehicles();
   showDesk();
@@ -76,8 +79,8 @@ async function firstPoints(deep) {
   else view.fit(tight(stream.tiles) ?? box, 0, { at_once: true, elevation: 0.62 });
   view.placed = true;
   const { Tools } = await import("./tools.js");
-  view.tools ??= new Tools(view, { setCompare: (on) => (state.paired = on) && state.versions.length && showClouds() });
-  stream.plan();
+  view.tools ??= new Tools(view, { setCompare: (on) => (state.paired = on) && showClouds() });
+  stream.rest();
 }
 
 // The box of what there is, not of its tiles.
@@ -154,13 +157,23 @@ function setRange(from, to) {
   return showRange();
 }
 
-async function showRange() {
+// What the list and the cloud show of the two versions chosen, on its way.
+function askRange(deep = Boolean(view.cloud)) {
   const [from, to] = [$("from").value, $("to").value];
-  const mine = (range = Symbol());
+  const same = from === to;
+  const clouds = deep && !same ? api.cloudsChanged(from, to) : Promise.resolve(new ArrayBuffer(0));
+  const list = same ? Promise.resolve([]) : api.changes(from, to).then((found) => found.features);
+  for (const answer of [list, clouds]) answer.catch(() => null);  // whoever shows it tells
+  return (range = { from, to, list, clouds });
+}
+
+async function showRange(mine = askRange()) {
+  const { from, to } = mine;
   closeDetails();
+  const shown = showClouds();
   let features = [];
   try {
-    if (from !== to) features = (await api.changes(from, to)).features;
+    features = await mine.list;
   } catch (error) {
     refuse(error);
   }
@@ -168,20 +181,21 @@ async function showRange() {
   const usual = Number(to) === state.manifest.version && Number(from) === Math.max(state.versions[0].number, to - 1);
   address.write({ from: usual ? null : from, to: usual ? null : to });
   showList(features, nothing(from, to), { from, to });
-  await showClouds().catch((error) => notice(error.message));
+  await shown;
 }
 
 // The two versions in 3D: the newer one, what came and went, and the older one if it is to be compared.
-async function showClouds() {
-  if (!view.cloud) return;
-  const [from, to] = [Number($("from").value), Number($("to").value)], { version, tiles, lattice } = state.manifest;
-  const of = async (number) => (number === version ? tiles : (await api.versionMap(number)).tiles);
-  const [older, newer] = await Promise.all([of(from), of(to)]);
-  const differ = [...new Set([...Object.keys(older), ...Object.keys(newer)])].filter((name) => older[name]?.points !== newer[name]?.points);
-  view.stream.setTiles(lattice, newer, state.paired ? older : null);
-  await view.stream.changes(differ, lattice, newer, older, state.paired);
-  view.stream.plan();
-  view.cloud.draw();
+async function showClouds(mine = range) {
+  const { version, tiles, lattice } = state.manifest;
+  const of = async (number) => (Number(number) === version ? tiles : (await api.versionMap(number)).tiles);
+  try {
+    const [older, newer, changed] = await Promise.all([state.paired ? of(mine.from) : null, of(mine.to), mine.clouds]);
+    if (!view.cloud || range !== mine) return;
+    view.stream.setTiles(lattice, newer, older);
+    view.stream.changes(changed, lattice, state.paired);
+  } catch (error) {
+    notice(error.message);
+  }
 }
 
 const nothing = (from, to) =>

@@ -12,12 +12,16 @@ import { COLOUR, MARK, POINT_FRAGMENT, POINT_VERTEX, QUAD_FRAGMENT, QUAD_VERTEX,
 export const TILE = 76.8;
 
 // Where the ground of a cloud lies, metres: by what most of its points say, for some may be reflections far below it.
+// Some thousand of them tell.
 export function groundOf({ z0, zStep, packed }) {
-  const said = [];
-  for (let i = 0; i < packed.length; i += 4) said.push(z0 + packed[i + 2] * zStep - (packed[i + 3] - 1000) / 100);
-  return said.sort((a, b) => a - b)[said.length >> 1] ?? z0;
+  const n = packed.length / 4, apart = Math.ceil(n / 1000);
+  const said = Float64Array.from({ length: n && Math.ceil(n / apart) }, (_, k) => {
+    const i = 4 * k * apart;
+    return z0 + packed[i + 2] * zStep - (packed[i + 3] - 1000) / 100;
+  });
+  return said.sort()[said.length >> 1] ?? z0;
 }
-const NEAR_SHARE = 0.01;
+const NEAR_SHARE = 0.01, REST = 2, REST_MS = [300, 1500];
 ColorManagement.enabled = false;  // the page's colours, as they are
 
 export class Cloud {
@@ -32,6 +36,8 @@ export class Cloud {
     this.parts = new Set();
     this.sides = "new";  // which of two states of the map: "old", "new", or a number: old left of that share
     this.lit = true;
+    this.expecting = false;  // whether more is on its way
+    this.rested = 0;
     const blank = new DataTexture(new Uint8Array(4), 1, 1);
     blank.needsUpdate = true;
     this.blank = blank;
@@ -141,7 +147,7 @@ export class Cloud {
     camera.updateProjectionMatrix();
     camera.updateMatrixWorld();
     this.onMove(this);
-    this.draw();
+    this.now();
   }
 
   frustum() {
@@ -162,10 +168,27 @@ export class Cloud {
     return { from: this.camera.position.toArray().map((v, i) => v + this.origin[i]), way };
   }
 
+  // With the next frame. While more is on its way and the eye rests, frames leave the processor to what comes: where
+  // the processor draws, each takes as long as several answers.
   draw() {
+    if (this.pending) return;
+    const wait = this.expecting ? this.rested - performance.now() : 0;
+    if (wait > 0) return void (this.later ??= setTimeout(() => this.now(), wait));
+    this.now();
+  }
+
+  now() {
+    clearTimeout(this.later);
+    this.later = null;
     this.pending ??= requestAnimationFrame(() => {
       this.pending = null;
-      if (!this.canvas.hidden) this.paint();
+      if (this.canvas.hidden) return;
+      const begun = performance.now();
+      requestAnimationFrame(() => {
+        const now = performance.now();
+        this.rested = now + Math.min(Math.max(REST * (now - begun), REST_MS[0]), REST_MS[1]);
+      });
+      this.paint();
     });
   }
 

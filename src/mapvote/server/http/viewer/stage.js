@@ -74,7 +74,7 @@ export class Stage {
     this.changes = changes;
     this.flat.setChanges(changes);
     this.labels.set(changes);
-    this.turned();
+    this.placeLabels();
   }
 
   setRaster(hash, points) {
@@ -90,7 +90,7 @@ export class Stage {
   select(id, cell = null) {
     this.flat.select(id, cell);
     this.labels.select(id);
-    this.turned();
+    this.placeLabels();
   }
 
   fit(box, margin = 0.1, flight = {}) {
@@ -115,9 +115,13 @@ export class Stage {
   turned() {
     if (this.mode !== "deep" || !this.cloud) return;
     this.stream?.moved();
-    this.labels.place(this.cloud, this.groundAt.bind(this));
+    this.placeLabels();
     this.tools?.place(this.cloud);
     if (this.placed) link.write({ eye: this.cloud.orbit.state.map((v) => Number(v.toFixed(2))).join(",") });
+  }
+
+  placeLabels() {
+    if (this.mode === "deep" && this.cloud) this.labels.place(this.cloud, this.groundAt.bind(this));
   }
 
   async picked(px) {
@@ -130,11 +134,7 @@ export class Stage {
 
   loaded(stream) {
     if (!stream.tiles.length) return;
-    const busy = stream.loading > 0 || stream.queue?.length > 0;
-    $("busy").hidden = !busy;
-    if (busy || this.complete || !stream.marked) return;
-    this.complete = true;
-    performance.mark("all-in-view");
+    $("busy").hidden = !stream.busy;
   }
 }
 

@@ -6,6 +6,7 @@ import { MARK } from "./shaders.js";
 
 export const SPACING = [4.8, 2.4, 1.2, 0.6, 0.3, 0.15];  // metres between the points of each level
 const HEAD = 24, AT_ONCE = 6, ENOUGH_PIXELS = 1.1, MOST_LOADED = 14e6, FRAME_MS = [45, 75], LEAST = 30_000, MOST = 4e6;
+const FIRST = 40_000;  // points of the first picture, so that it comes at once even where the processor draws
 
 // {z0, zStep, packed} of one cloud of an answer, and where the next one begins.
 export function unpack(buffer, offset = 0) {
@@ -21,6 +22,7 @@ export class Stream {
     this.budget = 600_000;
     this.loading = 0;
     this.last = 0;
+    cloud.lit = false;  // until the first picture is there
     cloud.onDrawn = () => this.drawn();
   }
 
@@ -89,27 +91,41 @@ export class Stream {
       box.min.set(x, y, z + tile.low);
       box.max.set(x + TILE, y + TILE, z + tile.high);
       tile.seen = frustum.intersectsBox(box);
-      for (const part of tile.levels) part.wanted = false;
+      for (const part of tile.levels) part.share = 0;
       if (!tile.seen || (tile.side === "old" && cloud.sides === "new") || (tile.side === "new" && cloud.sides === "old")) continue;
       const distance = Math.max(box.distanceToPoint(corner.copy(eye)), 2);
       for (const part of tile.levels) wanted.push({ px: (SPACING[part.level] * pixels) / distance, part, tile });
       if ((tile.next ?? 0) < SPACING.length) wanted.push({ px: (SPACING[tile.next ?? 0] * pixels) / distance, part: null, tile });
     }
     wanted.sort((a, b) => b.px - a.px);
-    let left = budget, finest = 1;
+    const all = wanted.reduce((sum, { part }) => sum + (part?.count ?? 0), 0);
+    const share = this.marked ? 1 : Math.min(1, FIRST / all);
+    cloud.shared.coarse.value = Math.sqrt(1 / share);
+    let left = budget;
     this.queue = [];
     for (const { px, part, tile } of wanted) {
       if (part) {
         if (left <= 0) continue;
-        part.wanted = true;
-        part.points.geometry.setDrawRange(0, Math.min(part.count, left));
+        part.share = Math.ceil(share * Math.min(part.count, left));
         left -= part.count;
-        finest = Math.min(finest, 1);
       } else if (px > ENOUGH_PIXELS && left > 0) this.queue.push(tile);
     }
     this.shown = budget - Math.max(left, 0);
-    for (const tile of this.tiles) this.space(tile);
+    if (this.tiles.map((tile) => this.show(tile)).some(Boolean)) cloud.draw();
     this.fetch();
+  }
+
+  // Draws of a tile what was planned; whether that is another picture than before.
+  show(tile) {
+    const said = tile.levels.map((part) => `${part.level} ${part.share}`).join();
+    if (said === tile.said) return false;
+    tile.said = said;
+    for (const part of tile.levels) {
+      part.wanted = part.share > 0;
+      part.points.geometry.setDrawRange(0, part.share);
+    }
+    this.space(tile);
+    return true;
   }
 
   // Points grow where finer levels are missing, so that walls stay closed.
@@ -128,11 +144,21 @@ export class Stream {
       this.load(tile).catch((error) => ((tile.next = SPACING.length), this.onError(error))).finally(() => {
         tile.loading = false;
         this.loading--;
-        this.onLoaded(this);
-        this.cloud.draw();
+        this.told();
         this.soon();
       });
     }
+    this.told();
+  }
+
+  get busy() {
+    return this.loading > 0 || this.queue?.length > 0 || !this.compared;
+  }
+
+  told() {
+    const { cloud } = this, done = cloud.expecting && !this.busy;
+    cloud.expecting = this.busy;
+    if (done) cloud.draw();
     this.onLoaded(this);
   }
 
@@ -170,11 +196,19 @@ export class Stream {
     this.still = false;
     this.plan();
     clearTimeout(this.resting);
-    this.resting = setTimeout(() => {
-      this.still = this.cloud.lit = true;
-      this.plan(8 * this.budget);
-      this.cloud.draw();
-    }, 250);
+    this.resting = setTimeout(() => this.rest(), 250);
+  }
+
+  rest() {
+    clearTimeout(this.resting);
+    this.still = true;
+    this.light(Boolean(this.marked));
+    this.plan(8 * this.budget);
+  }
+
+  light(lit) {
+    if (lit !== this.cloud.lit) this.cloud.draw();
+    this.cloud.lit = lit;
   }
 
   // Between two frames of one movement: too long a time takes points away, at once if it is far too long.
@@ -189,9 +223,13 @@ export class Stream {
 
   drawn() {
     this.adapt();
+    const drawn = (name, then = () => {}) => requestAnimationFrame(() => (performance.mark(name), then()));  // it is on screen once the next frame begins
     if (!this.marked && this.tiles.some((t) => t.levels.length)) {
       this.marked = true;
-      performance.mark("first-points");
+      drawn("first-points", () => (this.still ? this.rest() : this.soon()));
+    } else if (this.marked && this.still && !this.busy && !this.complete) {
+      this.complete = true;
+      drawn("all-in-view");
     }
   }
 
@@ -204,19 +242,21 @@ export class Stream {
     this.cloud.draw();
   }
 
-  // Points that came and went, with shapes of their own.
-  async changes(names, lattice, newer, older, paired) {
+  // Points that came and went, as the server tells them, with shapes of their own.
+  changes(buffer, lattice, paired) {
     for (const part of this.marks ?? []) this.cloud.remove(part);
     this.marks = [];
-    const mine = (this.asked = Symbol());
-    await Promise.all(names.map(async (name) => {
-      const buffer = await this.api.cloudChanged(older[name], newer[name]);
-      if (mine !== this.asked) return;
-      const gone = unpack(buffer), come = unpack(buffer, gone.end), [row, col] = name.split(",").map(Number);
-      const at = { x: lattice.x0 + col * TILE, y: lattice.y0 + row * TILE, spacing: 0.2 };
+    const view = new DataView(buffer);
+    for (let at = 0, gone, come; at < buffer.byteLength; at = come.end) {
+      const [row, col] = [view.getInt32(at, true), view.getInt32(at + 4, true)];
+      gone = unpack(buffer, at + 8);
+      come = unpack(buffer, gone.end);
+      const corner = { x: lattice.x0 + col * TILE, y: lattice.y0 + row * TILE, spacing: 0.2 };
       const side = (own) => (paired ? own : "both");
-      if (gone.packed.length) this.marks.push(this.cloud.add({ ...at, ...gone, mark: MARK.removed, side: side("old") }));
-      if (come.packed.length) this.marks.push(this.cloud.add({ ...at, ...come, mark: MARK.added, side: side("new") }));
-    }));
+      if (gone.packed.length) this.marks.push(this.cloud.add({ ...corner, ...gone, mark: MARK.removed, side: side("old") }));
+      if (come.packed.length) this.marks.push(this.cloud.add({ ...corner, ...come, mark: MARK.added, side: side("new") }));
+    }
+    this.compared = true;
+    this.plan(this.still ? 8 * this.budget : this.budget);
   }
 }
