@@ -9,8 +9,10 @@ import pytest
 import sqlalchemy as sa
 
 from hand_made import Say, make_ballot, states_plane, two_walls
+from mapvote.codec.arrays import unpack_bytes
 from mapvote.codec.ballot import encode
 from mapvote.config import FuseSettings
+from mapvote.core.tile import Tile
 from mapvote.core.types import CellState
 from mapvote.server.store import schema
 from mapvote.server.store.admission import accept, examine
@@ -53,21 +55,40 @@ def test_a_sound_store_has_nothing_to_tell(store: Store) -> None:
     assert check(store, mend=True) == []
 
 
-def test_a_damaged_tile_is_named_and_all_others_are_published(store: Store) -> None:
-    """Both tiles hold the same points, so it is the ground of one that is damaged."""
+def with_a_ground_of_its_own(store: Store) -> tuple[str, bytes]:
+    """Both tiles hold the same points, so it is the ground of (0, 1) that will be damaged: its hash and plane."""
     with store.database.writing() as connection:
-        t = schema.version_tiles
-        ground = np.full((256, 256), 0.01, np.float32)
-        hashes, planes = pack_tile(two_walls().tiles[0, 1].__class__(two_walls().tiles[0, 1].window,
-                                   two_walls().tiles[0, 1].points, ground))  # fmt: skip
+        t, tile = schema.version_tiles, two_walls().tiles[0, 1]
+        hashes, planes = pack_tile(Tile(tile.window, tile.points, np.full((256, 256), 0.01, np.float32)))
         connection.execute(schema.blobs.insert().values(hash=hashes.ground, data=planes[hashes.ground]))
         connection.execute(t.update().where(t.c.col == 1).values(ground=hashes.ground))
-    flip(store, schema.blobs, "data", schema.blobs.c.hash == hashes.ground)
-    assert [(damage.kind, damage.name) for damage in check(store)] == [("plane", hashes.ground)]
+    return hashes.ground, planes[hashes.ground]
+
+
+def test_a_damaged_tile_is_named_all_others_are_published_and_once_mended_it_is_too(store: Store) -> None:
+    ground, plane = with_a_ground_of_its_own(store)
+    flip(store, schema.blobs, "data", schema.blobs.c.hash == ground)
+    assert [(damage.kind, damage.name) for damage in check(store)] == [("plane", ground)]
     done = publish(store)
     assert (done.published, list(done.tiles)) == (True, [(0, 0)])
     with store.database.reading() as connection:
         assert set_aside(connection), "and named"
+    assert not publish(store).published
+    check(store, mend=True, source=lambda digest: unpack_bytes(plane, 1 << 30, digest))
+    done = publish(store)
+    assert (done.published, list(done.tiles)) == (True, [(0, 1)]), "its votes have waited"
+
+
+def test_a_tile_whose_deciding_ballots_are_set_aside_is_decided_anew(store: Store) -> None:
+    base, t = store.point_map(), schema.ballot_tiles
+    deny = {(0, 0): Say(states_plane({CELL: CellState.UNCHANGED_OCCUPIED}))}
+    receipts = accept(store, [examine(encode(make_ballot(base, deny, vehicle))) for vehicle in "defg"])
+    assert list(publish(store).tiles) == [(0, 1)], "three against four"
+    for receipt in receipts:
+        assert isinstance(receipt, Receipt)
+        flip(store, t, "states", t.c.ballot == receipt.seq)
+    assert len(check(store, mend=True)) == 4
+    assert list(publish(store).tiles) == [(0, 0)]
 
 
 def test_a_damaged_ballot_is_left_out_and_the_others_decide(store: Store) -> None:
@@ -116,8 +137,6 @@ def test_a_plane_is_mended_from_another_store(store: Store, tmp_path_factory: py
     assert not publish(store).published
 
     def source(digest: str) -> bytes | None:
-        from mapvote.codec.arrays import unpack_bytes
-
         return unpack_bytes(other.blob(digest), 1 << 30, digest)
 
     (damage,) = check(store, mend=True, source=source)

@@ -19,7 +19,7 @@ from mapvote.core.types import MapvoteError
 from mapvote.server.store import schema
 from mapvote.server.store.blobs import MAX_PLANE_BYTES
 from mapvote.server.store.database import insert_rows
-from mapvote.server.store.quarantine import Damage, ballot_name, ballot_sum, quarantine
+from mapvote.server.store.quarantine import MENDED, Damage, ballot_name, ballot_sum, quarantine
 from mapvote.server.store.queries import log_event, oldest_kept, shows_in_kept
 from mapvote.server.store.store import Store
 from mapvote.server.store.sums import sum_of, summed
@@ -138,5 +138,5 @@ def _mend(connection: sa.Connection, damage: Damage, source: Source, now: int, b
     connection.execute(b.delete().where(b.c.hash == damage.name))
     insert_rows(connection, b, [(damage.name, compress(raw, 3))])
     connection.execute(q.delete().where(q.c.kind == "plane", q.c.name == damage.name))
-    log_event(connection, now, "mended", by, f"plane {damage.name}")
+    log_event(connection, now, MENDED, by, f"plane {damage.name}")
     return replace(damage, mended="mended from the other store")

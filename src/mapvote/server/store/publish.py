@@ -35,7 +35,7 @@ from mapvote.server.store.database import address_of
 from mapvote.server.store.eligible_votes import Electorate, electorate_now, standing_tiles
 from mapvote.server.store.hold import hold_reasons
 from mapvote.server.store.policy import GatePolicy
-from mapvote.server.store.quarantine import quarantine
+from mapvote.server.store.quarantine import quarantine, tiles_hurt_or_mended
 from mapvote.server.store.queries import (
     Version,
     current_version,
@@ -170,6 +170,7 @@ def _dirty(connection: sa.Connection, newest: Version, asked: Electorate) -> lis
     if not fused or policy.fuse.min_age_s > 0:
         return standing_tiles(connection, asked.mark)
     touched = standing_tiles(connection, asked.mark, newest.mark)
+    touched += tiles_hurt_or_mended(connection, newest.mark)
     return sorted({*touched, *tiles_set_by(connection, newest.number)})
 
 

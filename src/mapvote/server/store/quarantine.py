@@ -13,11 +13,14 @@ from typing import Any
 import sqlalchemy as sa
 
 from mapvote.codec.ballot import tile_key
+from mapvote.core.grid import TileIndex
 from mapvote.core.types import MapvoteError
 from mapvote.server.store import schema
 from mapvote.server.store.queries import log_event
 from mapvote.server.store.sums import sum_of
 
+MENDED = "mended"
+"""The kind of the event by which a plane is again what it was."""
 KINDS = ("plane", "decision", *schema.HEADS, "row", "database")
 
 
@@ -70,3 +73,19 @@ def quarantine(connection: sa.Connection, damaged: Iterable[Damage], now: int, b
             row = {"kind": damage.kind, "name": damage.name[:160], "seq": seq, "why": damage.why[:200]}
             connection.execute(schema.quarantine.insert().values(**row))
             known.add((damage.kind, damage.name))
+
+
+def tiles_hurt_or_mended(connection: sa.Connection, since: int) -> set[TileIndex]:
+    """Tiles that may be fused otherwise since an event: a ballot there was set aside, or one of their planes mended."""
+    q, e, t, v = schema.quarantine.c, schema.events.c, schema.ballot_tiles.c, schema.version_tiles
+    aside = connection.execute(sa.select(q.name).where(q.kind == "ballot", q.seq > since)).scalars()
+    ballots = {int(name.split()[0]) for name in aside}
+    mended = connection.execute(sa.select(e.detail).where(e.kind == MENDED, e.seq > since)).scalars()
+    planes = {detail.removeprefix("plane ") for detail in mended}
+    queries = []
+    if ballots:
+        queries.append(sa.select(t.row, t.col).where(t.ballot.in_(ballots)))
+    if planes:
+        shows = sa.or_(*(v.c[name].in_(planes) for name in schema.TILE_PLANES))
+        queries.append(sa.select(v.c.row, v.c.col).where(shows))
+    return {(row, col) for query in queries for row, col in connection.execute(query)}
