@@ -142,6 +142,7 @@ def test_no_name_can_begin_another_event() -> None:
     assert sent.count(b"\ndata:") == 1
 
 
-def test_readers_hear_that_something_happened_but_not_who_drove_by() -> None:
-    events = [Event(1, 5, "ballot", "v1", "d1", 1), Event(2, 6, "publish", "boss", "v2", 2)]
-    assert without_names(events) == [Event(1, 5, "ballot", "", "", 1), events[1]]
+def test_readers_hear_what_happened_to_the_map_but_not_who_drove_by_or_when() -> None:
+    published, judged = Event(2, 6, "publish", "boss", "v2", 2), Event(3, 7, "rejected", "eve", "built.v2.1.1", 2)
+    events = [Event(1, 5, "ballot", "v1", "d1", 1), published, judged, Event(4, 8, "withdraw", "v1", "v1/d1", 2)]
+    assert without_names(events) == [published, Event(3, 7, "rejected", "", "", 2)]

@@ -81,6 +81,10 @@ def test_the_whole_story(site: Site, tmp_path: Path) -> None:
     found = site.ask("GET", "/v1/changes?from=1&to=2", site.operator).json()
     assert [f["properties"]["kind"] for f in found["features"]] == ["demolished"]
     assert found["features"][0]["properties"]["votes_min"] == 2
+    exact = found["features"][0]["properties"]["last_seen"]
+    by_day = site.ask("GET", "/v1/changes?from=1&to=2", site.a).json()["features"][0]["properties"]["last_seen"]
+    assert (by_day[:10], by_day[10:19]) == (exact[:10], "T00:00:00"), "no minute of anybody's pass"
+    assert exact != by_day
     cell = site.ask("GET", "/v1/cells?x=3.1&y=3.1", site.operator).json()
     assert [(v["vehicle"], v["state"], v["counts"]) for v in cell["votes"]] == [
         ("a", "changed_empty", False),

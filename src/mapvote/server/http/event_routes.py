@@ -36,8 +36,8 @@ async def listen(
 ) -> StreamingResponse:
     """Ballots, verdicts, versions and publishes that were held, each an event whose id is its number in the log.
 
-    ``after`` (or ``Last-Event-ID``, which browsers send by themselves): from there on; else what is to come. Vehicles'
-    names go to reviewers and operators only.
+    ``after`` (or ``Last-Event-ID``, which browsers send by themselves): from there on; else what is to come. Of
+    ballots, and by whom else, only reviewers and operators hear.
     """
     parts, named = services(request), sees_names(request)
     start = last_event_id if last_event_id is not None else after

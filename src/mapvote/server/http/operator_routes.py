@@ -14,7 +14,6 @@ from anyio import to_thread
 from fastapi import APIRouter, Query, Request, Response
 
 from mapvote.codec.ballot import tile_key
-from mapvote.fusion.tile_vote import DAY_NS
 from mapvote.server.errors import Held, Unavailable
 from mapvote.server.http.auth import operator, reviewer, sees_names
 from mapvote.server.http.schemas import (
@@ -34,7 +33,7 @@ from mapvote.server.http.schemas import (
 from mapvote.server.http.services import Services, services
 from mapvote.server.insight.explain import as_told, explain_cell
 from mapvote.server.insight.geojson import feature_rows
-from mapvote.server.insight.history import changes_between, coverage, page_between, vehicle_standings
+from mapvote.server.insight.history import changes_between, coverage, page_between, seen, vehicle_standings
 from mapvote.server.insight.lists import contradictions, standing_rows, tile_squares
 from mapvote.server.store.keys import pseudonyms
 from mapvote.server.store.publish import preview, publish, rollback
@@ -120,8 +119,9 @@ def changes(
     format: Literal["geojson", "csv"] = "geojson",
 ) -> Response:
     """Things built and demolished between two versions; ``to`` is the newest by default."""
-    store = services(request).store
-    found = changes_between(store, old, store.current() if new is None else new, min_cells, lonlat=lonlat)
+    store, known = services(request).store, sees_names(request)
+    newest = store.current() if new is None else new
+    found = changes_between(store, old, newest, min_cells, lonlat=lonlat, known=known)
     if format == "csv":
         return as_table(feature_rows(found))
     return as_json(found)
@@ -140,9 +140,9 @@ def changes_page(
     min_cells: MinCells = 1,
 ) -> Response:
     """A file to keep or to mail: the clouds of the largest changes, before and after."""
-    store = services(request).store
+    store, known = services(request).store, sees_names(request)
     newest = store.current() if new is None else new
-    page = page_between(store, old, newest, changes_between(store, old, newest, min_cells))
+    page = page_between(store, old, newest, changes_between(store, old, newest, min_cells, known=known))
     kept = {"Content-Disposition": 'attachment; filename="changes.html"'}
     return Response(page, media_type="text/html", headers=kept)
 
@@ -154,7 +154,7 @@ def cell(request: Request, x: float, y: float) -> Response:
     told, known = as_told(explain_cell(parts.store, x, y)), sees_names(request)
     shown = {} if known else pseudonyms(parts.store, {vote["vehicle"] for vote in told["votes"]})
     for vote in told["votes"]:
-        vote["end"] = iso(_seen(vote.pop("end_ns"), known))
+        vote["end"] = iso(seen(vote.pop("end_ns"), known))
         if not known:
             vote |= {"vehicle": shown[vote["vehicle"]], "drive": ""}
     return as_json(told)
@@ -168,7 +168,7 @@ def fresh(request: Request, format: Places = "json") -> Response:
     store = services(request).store
     tiles, known = coverage(store), sees_names(request)
     told = [
-        {name: t[name] for name in ("row", "col", "vehicles")} | {"last_seen": iso(_seen(t["last_seen_ns"], known))}
+        {name: t[name] for name in ("row", "col", "vehicles")} | {"last_seen": iso(seen(t["last_seen_ns"], known))}
         for t in tiles
     ]
     if format == "csv":
@@ -192,11 +192,6 @@ def vehicles(request: Request, format: Places = "json") -> Response:
         return as_json(contradictions(found))
     told = [asdict(s) | {"evidence": [asdict(e) for e in s.evidence[:_MOST_EVIDENCE]]} for s in found]
     return as_json({"vehicles": told})
-
-
-def _seen(stamp_ns: int | None, known: bool) -> int | None:
-    """When a vehicle passed, or only on which day: of a road with few vehicles the minute would tell who it was."""
-    return stamp_ns if known or stamp_ns is None else stamp_ns // DAY_NS * DAY_NS
 
 
 @contextmanager

@@ -14,6 +14,8 @@ from mapvote.server.store.store import Store
 
 OF_THE_MAP = ("import", "publish", "rollback", "replay")
 """Kinds that concern the map alone: anybody who may read it may know by whom and why."""
+OF_VEHICLES = ("ballot", "withdraw")
+"""Kinds that tell the minute of a pass."""
 _MOST = 500
 
 
@@ -65,5 +67,6 @@ def events_after(store: Store, seq: int) -> list[Event]:
 
 
 def without_names(events: Sequence[Event]) -> list[Event]:
-    """For those who may not know which vehicle did what: that something happened, and when."""
-    return [e if e.kind in OF_THE_MAP else Event(e.seq, e.at_ns, e.kind, "", "", e.version) for e in events]
+    """For those who may not know which vehicle did what, and when: nothing of ballots, of the rest that it happened."""
+    told = [e for e in events if e.kind not in OF_VEHICLES]
+    return [e if e.kind in OF_THE_MAP else Event(e.seq, e.at_ns, e.kind, "", "", e.version) for e in told]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from functools import cache
 from typing import Any
 
@@ -13,7 +14,7 @@ from mapvote.core.grid import TileIndex
 from mapvote.core.tile import Tile
 from mapvote.core.types import U8
 from mapvote.core.voting import decide
-from mapvote.fusion.tile_vote import TileVote, one_each
+from mapvote.fusion.tile_vote import DAY_NS, TileVote, one_each
 from mapvote.server.insight.changes import Decided, change_objects, changed_cells
 from mapvote.server.insight.consensus import Compared, Spoken, Standing, compare, standings_of
 from mapvote.server.insight.cutout import Box, Cutout, Tiles, cut_out, of_feature, whole_page
@@ -35,8 +36,17 @@ from mapvote.server.store.store import Store
 from mapvote.server.store.tile_jobs import unpack_tally_plane
 
 
-def changes_between(store: Store, old: int, new: int, min_cells: int = 1, *, lonlat: bool = False) -> dict[str, Any]:
+def seen(stamp_ns: int | None, known: bool) -> int | None:
+    """When a vehicle passed, or, to whom it is not ``known`` which, only on which day: of a road with few vehicles the
+    minute would tell who it was."""
+    return stamp_ns if known or stamp_ns is None else stamp_ns // DAY_NS * DAY_NS
+
+
+def changes_between(
+    store: Store, old: int, new: int, min_cells: int = 1, *, lonlat: bool = False, known: bool = True
+) -> dict[str, Any]:
     """Change objects from version ``old`` to ``new`` as GeoJSON in map metres, or longitude and latitude (``lonlat``).
+    ``known``: see :func:`seen`.
 
     NotFound if one of the versions does not exist.
     """
@@ -46,9 +56,11 @@ def changes_between(store: Store, old: int, new: int, min_cells: int = 1, *, lon
             tiles = [load_tile(connection, store.lattice.tile(index), hashes) for hashes in pair]
             decided = list(_decided(store, connection, index, min(old, new), max(old, new)))
             found.append(changed_cells(tiles[0], tiles[1], decided))
-    objects = change_objects(found, min_cells)
     return to_geojson(
-        objects,
+        [
+            replace(thing, first_seen_ns=seen(thing.first_seen_ns, known), last_seen_ns=seen(thing.last_seen_ns, known))
+            for thing in change_objects(found, min_cells)
+        ],
         store.lattice,
         map_id=store.map_id,
         from_version=old,
