@@ -17,7 +17,8 @@ from mapvote.server.insight.explain import COPY, CellStory, as_told, explain_cel
 from mapvote.server.insight.history import events
 from mapvote.server.store import schema
 from mapvote.server.store.admission import accept, examine
-from mapvote.server.store.ballots import Receipt
+from mapvote.server.store.ballots import Receipt, withdraw
+from mapvote.server.store.keys import issue, revoke
 from mapvote.server.store.policy import Policy, set_policy
 from mapvote.server.store.publish import publish
 from mapvote.server.store.store import Store
@@ -50,6 +51,21 @@ def say(store: Store, vehicle: str, state: CellState, cell: tuple[int, int] = WA
 
 def story(store: Store, cell: tuple[int, int] = WALL) -> CellStory:
     return explain_cell(store, (cell[1] + 0.5) * 0.3, (cell[0] + 0.5) * 0.3)
+
+
+def test_a_vote_that_a_version_heard_stays_in_the_story_when_it_is_taken_back(store: Store, clock: Clock) -> None:
+    for vehicle in ("a", "b", "c"):
+        say(store, vehicle, CellState.CHANGED_EMPTY)
+    assert publish(store).version == 2
+    withdraw(store, "a", by="a")
+    issue(store, "b", "vehicle")
+    revoke(store, "b")
+    found = {vote.vehicle: vote for vote in story(store).votes}
+    assert [(found[name].state, found[name].heard, found[name].counts) for name in "abc"] == [
+        ("changed_empty", (2,), False)
+    ] * 3
+    assert (found["a"].why, found["b"].why) == ("withdrawn", "its vehicle's key was revoked")
+    assert found["c"].why.startswith("spent")
 
 
 def test_a_vote_is_named_with_the_version_that_heard_it_or_why_it_does_not_count(store: Store, clock: Clock) -> None:

@@ -11,7 +11,6 @@ import sqlalchemy as sa
 
 from mapvote.codec.arrays import unpack_plane
 from mapvote.core.grid import TILE_CELLS, TileIndex
-from mapvote.core.tile import Tile
 from mapvote.core.types import NO_VOTE, U8, CellState, MapvoteError
 from mapvote.core.voting import VOTE_UNIT
 from mapvote.fusion.fuse import Heard, decide_tile, rule_of
@@ -19,10 +18,10 @@ from mapvote.fusion.persistence import expected_days
 from mapvote.fusion.probability import alike_beside, change_probability
 from mapvote.fusion.spent import unspent
 from mapvote.fusion.tile_vote import TileVote
+from mapvote.server.insight.heard import Place, decided_on, ended, heard_by, is_copy, is_silenced
 from mapvote.server.store import schema
 from mapvote.server.store.eligible_votes import (
     DAMAGED,
-    Electorate,
     StoredVote,
     counted_votes,
     electorate_now,
@@ -31,7 +30,7 @@ from mapvote.server.store.eligible_votes import (
     recent_votes,
 )
 from mapvote.server.store.quarantine import DamagedBallots
-from mapvote.server.store.queries import current_version, oldest_kept, tile_as_of, version_of
+from mapvote.server.store.queries import current_version, tile_as_of
 from mapvote.server.store.store import Store
 from mapvote.server.store.tile_jobs import unpack_tally_plane
 
@@ -44,7 +43,7 @@ COPY = "a copy: what it determined on this tile is what another vehicle's drive 
 
 @dataclass(frozen=True, slots=True)
 class CellVote:
-    """What one standing drive says about a cell."""
+    """What one drive says about a cell, or said when a version heard it."""
 
     vehicle: str
     drive: str
@@ -78,15 +77,6 @@ class CellStory:
     """What stands there, and whether something new is temporary; what came and went before."""
 
 
-@dataclass(frozen=True, slots=True)
-class _Place:
-    """A cell, as of one version."""
-
-    tile: Tile
-    cell: tuple[int, int]
-    asked: Electorate
-
-
 def state_name(state: int) -> str:
     """A cell state as users read it."""
     return "no_vote" if state == NO_VOTE else CellState(state).name.lower()
@@ -101,14 +91,18 @@ def explain_cell(store: Store, x: float, y: float) -> CellStory:
     index, cell = (row // TILE_CELLS, col // TILE_CELLS), (row % TILE_CELLS, col % TILE_CELLS)
     with store.database.reading() as connection:
         tile = tile_as_of(connection, store.lattice.tile(index), current_version(connection).number)
-        now = _undamaged(connection, _Place(tile, cell, electorate_now(connection, store.clock())))
+        now = _undamaged(connection, Place(tile, cell, electorate_now(connection, store.clock())))
         decided = _decisions(connection, index, cell)
         heard: dict[int, list[int]] = {}
+        past: dict[int, tuple[StoredVote, TileVote]] = {}
         for version, _ in decided[-_LOOKED_INTO:]:
-            for seq in _heard_by(connection, store, version, now):
-                heard.setdefault(seq, []).append(version)
+            for stored, vote in heard_by(connection, store, version, now):
+                heard.setdefault(stored.seq, []).append(version)
+                past[stored.seq] = stored, vote
         counted = counted_votes(connection, tile, now.asked)
-        votes = [_vote(*each, now, tuple(heard.get(each[0].seq, ()))) for each in _everyone(connection, now, counted)]
+        everyone = _everyone(connection, now, counted)
+        everyone += ended(connection, [past[seq] for seq in past.keys() - {stored.seq for stored, _, _ in everyone}])
+        votes = [_vote(*each, now, tuple(heard.get(each[0].seq, ()))) for each in everyone]
         probability = _probability(connection, index, cell, decided[-1][0]) if decided else None
         thing = _thing(connection, now, [vote for _, vote in counted])
     return CellStory(row, col, votes, decided, probability, thing)
@@ -146,7 +140,7 @@ def _probability(connection: sa.Connection, index: TileIndex, cell: tuple[int, i
     )
 
 
-def _undamaged(connection: sa.Connection, place: _Place) -> _Place:
+def _undamaged(connection: sa.Connection, place: Place) -> Place:
     """The same, without ballots that cannot be read."""
     try:
         read_votes(connection, place.tile.index, [vote for vote, why in _judged(connection, place) if why != DAMAGED])
@@ -155,12 +149,12 @@ def _undamaged(connection: sa.Connection, place: _Place) -> _Place:
     return place
 
 
-def _judged(connection: sa.Connection, place: _Place) -> list[tuple[StoredVote, str]]:
+def _judged(connection: sa.Connection, place: Place) -> list[tuple[StoredVote, str]]:
     return judged_votes(connection, place.tile.index, place.asked)
 
 
 def _everyone(
-    connection: sa.Connection, now: _Place, counted: Sequence[tuple[StoredVote, TileVote]]
+    connection: sa.Connection, now: Place, counted: Sequence[tuple[StoredVote, TileVote]]
 ) -> list[tuple[StoredVote, TileVote | None, str]]:
     """Every standing vote on the tile, what it says, and why it does not count on the cell ("" if it does).
 
@@ -170,14 +164,14 @@ def _everyone(
     readable = [vote for vote, why in judged if why != DAMAGED]
     said = dict(zip((vote.seq for vote in readable), read_votes(connection, now.tile.index, readable), strict=True))
     obeyed = {stored.seq: vote for stored, vote in counted}
-    heard = _decided(now, [vote for _, vote in counted])
+    heard = decided_on(now, [vote for _, vote in counted])
     return [
         (stored, said.get(stored.seq), why or _why_not(said[stored.seq], obeyed.get(stored.seq), now, heard))
         for stored, why in judged
     ]
 
 
-def _why_not(vote: TileVote, obeyed: TileVote | None, now: _Place, heard: Heard) -> str:
+def _why_not(vote: TileVote, obeyed: TileVote | None, now: Place, heard: Heard) -> str:
     """Of a vote that counts on the tile: why not on this cell."""
     if not vote.spoken()[now.cell]:
         return "says nothing here"
@@ -186,45 +180,18 @@ def _why_not(vote: TileVote, obeyed: TileVote | None, now: _Place, heard: Heard)
         return f"spent: version {now.tile.memory.changed[now.cell]} has changed the cell since"
     if obeyed is not None and not obeyed.spoken()[now.cell]:
         return REVIEWED
-    if _is_copy(vote, heard):
+    if is_copy(vote, heard):
         return COPY
-    return OPPOSES if _is_silenced(vote, heard) else ""
+    return OPPOSES if is_silenced(vote, heard) else ""
 
 
-def _decided(place: _Place, drives: Sequence[TileVote]) -> Heard:
-    """What comes of the votes that count on a tile."""
-    policy = place.asked.policy
-    return decide_tile(place.tile, drives, rule_of(policy.round.method), policy.fuse)
-
-
-def _is_copy(vote: TileVote, heard: Heard) -> bool:
-    return any((vote.vehicle, vote.digest) == (copy.vehicle, copy.digest) for copy in heard.copies)
-
-
-def _is_silenced(vote: TileVote, heard: Heard) -> bool:
-    return all(vote.vehicle != other.vehicle for other in heard.votes)
-
-
-def _heard_by(connection: sa.Connection, store: Store, number: int, now: _Place) -> list[int]:
-    """The ballots that a version heard on the cell."""
-    version = version_of(connection, number)
-    if number <= oldest_kept(connection):
-        return []  # what it was made of was cleared away
-    asked = Electorate.of(version, set_aside=now.asked.set_aside)
-    then = replace(now, asked=asked, tile=tile_as_of(connection, now.tile.window, number - 1))
-    counted = counted_votes(connection, then.tile, asked)
-    heard = _decided(then, [vote for _, vote in counted])
-    speaking = [(stored.seq, vote) for stored, vote in counted if vote.spoken()[now.cell]]
-    return [seq for seq, vote in speaking if not _is_copy(vote, heard) and not _is_silenced(vote, heard)]
-
-
-def _vote(stored: StoredVote, vote: TileVote | None, why: str, now: _Place, heard: tuple[int, ...]) -> CellVote:
+def _vote(stored: StoredVote, vote: TileVote | None, why: str, now: Place, heard: tuple[int, ...]) -> CellVote:
     state, marks = ("unreadable", None) if vote is None else (_said(vote, now.cell), _marks(vote, now.cell))
     whose = stored.vehicle, stored.drive, stored.version
     return CellVote(*whose, state, marks, stored.end_ns, not why, why, heard)
 
 
-def _thing(connection: sa.Connection, now: _Place, drives: Sequence[TileVote]) -> str:
+def _thing(connection: sa.Connection, now: Place, drives: Sequence[TileVote]) -> str:
     """In words: what stands in the cell or is about to, and what came and went, by the votes that count there."""
     tile, cell, policy = now.tile, now.cell, now.asked.policy
     here = np.zeros((TILE_CELLS, TILE_CELLS), dtype=np.bool_)
