@@ -1,4 +1,4 @@
-"""What becomes of a vehicle's votes when its key is revoked is for whoever revokes it to say."""
+"""Whoever revokes a vehicle's key says what becomes of its votes, and the log says who that was."""
 
 from __future__ import annotations
 
@@ -8,9 +8,11 @@ from pathlib import Path
 import pytest
 
 from hand_made import Say, make_ballot, states_plane, two_walls
+from mapvote.cli.server import policy
 from mapvote.cli.store import keys
 from mapvote.codec.ballot import encode
 from mapvote.core.types import CellState
+from mapvote.server.insight.feed import events_after, newest_event
 from mapvote.server.store.admission import accept, examine
 from mapvote.server.store.keys import ballots_standing, issue
 from mapvote.server.store.store import Store
@@ -38,4 +40,13 @@ def test_who_revokes_a_key_is_asked_what_becomes_of_the_votes(
     monkeypatch.setattr("sys.stdin", typed)
     keys(str(tmp_path / "fleet.db"), "revoke", "car_1", keep_votes=said)
     assert ballots_standing(store, "car_1") == left
+    store.close()
+
+
+def test_the_log_names_who_was_logged_in(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    store = Store.create(f"sqlite:///{tmp_path / 'fleet.db'}", two_walls())
+    monkeypatch.setenv("LOGNAME", "ann")
+    keys(str(tmp_path / "fleet.db"), "issue", "car_1")
+    policy(str(tmp_path / "fleet.db"), ["fuse.min_votes=3"], reason="more vehicles now")
+    assert [event.actor for event in events_after(store, newest_event(store) - 2)] == ["ann", "ann"]
     store.close()

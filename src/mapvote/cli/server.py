@@ -12,7 +12,7 @@ import typer
 from mapvote.cli.looks import sound_map
 from mapvote.cli.options import SERVER, Config, KeyFile, Reason, StoreName, StoreOrUrl
 from mapvote.cli.remote import is_url, server_at
-from mapvote.cli.store import opened_store, store_url, when
+from mapvote.cli.store import opened_store, store_url, when, who
 from mapvote.cli.terminal import waiting
 
 if TYPE_CHECKING:
@@ -53,7 +53,9 @@ def serve(
         )
     try:
         if new and not open_:
-            print(f"key of the operator, shown this once: {issue(opened, 'operator', 'operator')}", flush=True)
+            print(
+                f"key of the operator, shown this once: {issue(opened, 'operator', 'operator', by=who())}", flush=True
+            )
         run(opened, settings, host=host, port=port, opened=open_, ready=_say_where)
     finally:
         opened.close()
@@ -103,7 +105,9 @@ def publish(
         if dry_run:
             done = preview(opened, gate=reference, executor=executor)
         else:
-            done = publish_version(opened, reason=reason, override=override, gate=reference, executor=executor)
+            done = publish_version(
+                opened, by=who(), reason=reason, override=override, gate=reference, executor=executor
+            )
     _print_outcome(done, _what(done.published, dry_run))
 
 
@@ -135,7 +139,7 @@ def policy(
     else:
         with opened_store(store) as opened:
             if pairs:
-                set_values(opened, wanted, reason=reason)
+                set_values(opened, wanted, by=who(), reason=reason)
             told = policy_told(opened)
     print(f"policy of {when(told['at_ns'])} by {told['by']}" + (f": {told['reason']}" if told["reason"] else ""))
     for section, entries in told["policy"].items():
@@ -155,7 +159,7 @@ def rollback(
     from mapvote.server.store.publish import rollback as roll_back
 
     with opened_store(store) as opened:
-        version = roll_back(opened, to, reason=reason)
+        version = roll_back(opened, to, by=who(), reason=reason)
     print(f"version {version.number} is version {to} again")
 
 
@@ -182,10 +186,10 @@ def unvote(
     with opened_store(store) as opened:
         if not replay or vehicle is None:
             whose = vehicle or "all vehicles"
-            print(f"{withdraw(opened, vehicle, drive, by='operator')} ballots of {whose} withdrawn")
+            print(f"{withdraw(opened, vehicle, drive, by=who())} ballots of {whose} withdrawn")
             return
         with waiting("deciding anew"):
-            done = replay_without(opened, vehicle, dry_run=not yes)
+            done = replay_without(opened, vehicle, by=who(), dry_run=not yes)
     _print_outcome(done, "published" if done.published else "only shown: --yes publishes it")
 
 

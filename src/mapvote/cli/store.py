@@ -68,7 +68,7 @@ def _checked(store: str, mend: bool, other: str | None) -> list[Damage]:
 
     second = opened_store(other) if other else nullcontext()
     with opened_store(store) as opened, second as backup, waiting("reading every byte"):
-        return look(opened, mend=mend, source=elsewhere)
+        return look(opened, mend=mend, source=elsewhere, by=who())
 
 
 def gc(
@@ -82,7 +82,7 @@ def gc(
     from mapvote.server.store.clearing import clear
 
     with opened_store(store) as opened, waiting("looking for what can go"):
-        done = clear(opened, dry_run=not yes)
+        done = clear(opened, by=who(), dry_run=not yes)
     counts = f"{done.versions} versions ({done.planes} planes, {done.decisions} decisions)"
     print(f"{counts} and {done.ballots} ballots on tiles, {done.size:,} bytes" + ("" if yes else ": --yes clears them"))
     print(f"the oldest version left is {done.oldest}")
@@ -132,12 +132,12 @@ def keys(
             for key in store_keys.listed(opened):
                 print(f"{key.role} {key.name}: issued {when(key.created_ns)}, {_state(key, opened.clock())}")
         elif action == "issue" and name is not None:
-            print(store_keys.issue(opened, name, cast("Role", "operator" if operator else role), days=days))
+            print(store_keys.issue(opened, name, cast("Role", "operator" if operator else role), by=who(), days=days))
         elif action == "rotate" and name is not None:
-            print(store_keys.rotate(opened, name, overlap_days=overlap_days))
+            print(store_keys.rotate(opened, name, by=who(), overlap_days=overlap_days))
         elif action == "revoke" and name is not None:
             keep = _keep_votes(store_keys.ballots_standing(opened, name), name) if keep_votes is None else keep_votes
-            revoked, ended = store_keys.revoke(opened, name, keep_votes=keep)
+            revoked, ended = store_keys.revoke(opened, name, by=who(), keep_votes=keep)
             print(f"{revoked} keys of {name} revoked" + (f", {ended} ballots count no more" if ended else ""))
         else:
             raise MapvoteError("keys: say list, issue NAME, rotate NAME or revoke NAME")
@@ -192,6 +192,16 @@ def opened_store(name: str) -> Iterator[Store]:
         yield store
     finally:
         store.close()
+
+
+def who() -> str:
+    """Who sits at this machine, by the name they are logged in with: what a store's log calls them."""
+    import getpass
+
+    try:
+        return getpass.getuser()
+    except (KeyError, OSError):  # no name for this number
+        return "operator"
 
 
 def when(stamp_ns: int) -> str:

@@ -67,5 +67,6 @@ def ended(
     """Votes that some version heard and that stand no more, oldest first, and what ended them."""
     b, e = schema.ballots.c, schema.events.c
     ends = sa.select(b.seq, e.kind).join(schema.events, e.seq == b.gone_seq).where(b.seq.in_([s.seq for s, _ in past]))
-    by = {seq: ENDED.get(kind, kind) for seq, kind in connection.execute(ends)}
-    return [(stored, vote, by.get(stored.seq, "stands no more")) for stored, vote in sorted(past, key=lambda one: one[0].seq)]
+    why = {seq: ENDED.get(kind, kind) for seq, kind in connection.execute(ends)}
+    ordered = sorted(past, key=lambda one: one[0].seq)
+    return [(stored, vote, why.get(stored.seq, "stands no more")) for stored, vote in ordered]
