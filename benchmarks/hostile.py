@@ -241,7 +241,8 @@ def by_the_server(log: Path, start: int) -> dict[str, float]:
         told = json.loads(line) if line.startswith(b"{") else {}
         if told.get("key") == "honest":
             took["healthz" if told["path"] == "/healthz" else "ballot"].append(told["ms"])
-    return {f"server_{name}_p99_ms": round(float(np.percentile(ms, 99))) for name, ms in took.items()}
+    p99 = {f"server_{name}_p99_ms": round(float(np.percentile(ms, 99))) for name, ms in took.items()}
+    return p99 | {f"server_{name}_max_ms": round(max(ms)) for name, ms in took.items()}
 
 
 def under_attack(
