@@ -34,7 +34,11 @@ class TooLarge(MapvoteError):
 
 
 class TooMany(MapvoteError):
-    """Beyond the rate limit of a key; try again later."""
+    """Beyond what a key or a vehicle may send; try again in ``after_s``."""
+
+    def __init__(self, why: str, after_s: float = 1.0) -> None:
+        super().__init__(why)
+        self.after_s = after_s
 
 
 class Unavailable(MapvoteError):

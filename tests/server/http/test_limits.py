@@ -7,7 +7,6 @@ from collections.abc import AsyncIterator
 
 import pytest
 
-from mapvote.core.types import MapvoteError
 from mapvote.server.errors import TooLarge, TooMany, Unavailable
 from mapvote.server.http.limits import RateLimit, Uploads
 
@@ -90,8 +89,9 @@ def test_a_bucket_refills_with_time() -> None:
     limit = RateLimit(per_minute=60.0, burst=2, clock=lambda: now)
     limit.take("v")
     limit.take("v")
-    with pytest.raises(MapvoteError, match="60"):
+    with pytest.raises(TooMany, match="60") as refused:
         limit.take("v")
+    assert refused.value.after_s == 1.0
     limit.take("w")
     now = 1.0
     limit.take("v")

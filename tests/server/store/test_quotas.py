@@ -7,6 +7,7 @@ from mapvote.codec.ballot import encode
 from mapvote.core.types import CellState
 from mapvote.fusion.tile_vote import DAY_NS
 from mapvote.server.errors import TooMany
+from mapvote.server.http.schemas import refuse
 from mapvote.server.store.admission import Intake, examine
 from mapvote.server.store.ballots import Incoming, Receipt
 from mapvote.server.store.quotas import Quota
@@ -30,6 +31,7 @@ def test_so_many_drives_a_day_each_vehicle_for_itself_and_a_restart_forgets_noth
         (refused,) = again.accept([drive("a", "d3")])
         assert isinstance(refused, TooMany)
         assert "try again tomorrow" in str(refused)
+        assert refuse(refused).headers["retry-after"] == "3600", "it is counted again once an hour"
         (repeated,) = again.accept([drive("a", "d0")])
         assert isinstance(repeated, Receipt)
         assert repeated.repeated

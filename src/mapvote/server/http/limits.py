@@ -27,8 +27,10 @@ class RateLimit:
 
     def check(self, name: str) -> None:
         """TooMany if the bucket of ``name`` is empty; takes nothing."""
-        if self._tokens(name, self._clock()) < 1.0:
-            raise TooMany(f"{name!r} sends more than {self._per_s * 60:g} {self._what} a minute: try again later")
+        lacking = 1.0 - self._tokens(name, self._clock())
+        if lacking > 0.0:
+            too_fast = f"{name!r} sends more than {self._per_s * 60:g} {self._what} a minute: try again later"
+            raise TooMany(too_fast, lacking / self._per_s)
 
     def take(self, name: str) -> None:
         """One request of ``name``; TooMany if its bucket is empty."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from typing import Annotated, Any, Literal
@@ -115,7 +116,7 @@ def refuse(error: Exception) -> Response:
     if isinstance(error, Held):
         content["reasons"] = error.reasons
     if status in (429, 503):
-        headers["Retry-After"] = "1"
+        headers["Retry-After"] = str(math.ceil(error.after_s)) if isinstance(error, TooMany) else "1"
     response = JSONResponse(content, status, headers)
     if status == 401:  # two lines: browsers read one challenge a line, and ask for a password only for Basic
         response.headers.append("WWW-Authenticate", 'Basic realm="mapvote: the key is the password", charset="UTF-8"')

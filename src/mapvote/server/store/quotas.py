@@ -61,10 +61,12 @@ class Quotas:
     def _over(self, used: _Used, incoming: Incoming) -> MapvoteError | None:
         vehicle, quota = incoming.ballot.vehicle, self._quota
         if used.ballots >= quota.drives_a_day:
-            return TooMany(f"{vehicle!r} has sent {used.ballots} drives in 24 hours, its limit: try again tomorrow")
+            said = f"{vehicle!r} has sent {used.ballots} drives in 24 hours, its limit: try again tomorrow"
+            return TooMany(said, _COUNTED_AGAIN_NS / 1e9)
         if used.size + incoming.size > quota.stored_bytes:
             full = f"the ballots of {vehicle!r} would take more than {quota.stored_bytes:,} bytes in the store"
-            return TooMany(f"{full}: ask the operator to clear old ones away, or for a larger quota")
+            mend = "ask the operator to clear old ones away, or for a larger quota"
+            return TooMany(f"{full}: {mend}", _COUNTED_AGAIN_NS / 1e9)
         return None
 
 
