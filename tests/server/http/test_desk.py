@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from threading import Event
 from time import sleep
 from typing import Any
 
+import numpy as np
 import pytest
 from fastapi.testclient import TestClient
+from PIL import Image
 
 from hand_made import Say, make_ballot, states_plane, two_walls
 from mapvote.codec.ballot import encode
@@ -134,6 +137,20 @@ def test_only_reviewers_and_operators_sit_at_the_desk(server: Server) -> None:
     assert decide(server, "v1", "x", "accepted").status_code == 403
     assert decide(server, "boss", "x", "accepted").status_code == 404
     assert client.get("/v1/desk").status_code == 401
+
+
+def test_a_pending_change_is_pictured_as_it_is_and_as_it_would_be(server: Server) -> None:
+    client, _, who = server
+    first, second = pending(server)
+    shown = client.get("/v1/desk/pictures", params={"change": first["id"]}, headers=who["anna"])
+    picture = np.asarray(Image.open(io.BytesIO(shown.content)).convert("RGB")).astype(int)
+    before, after = np.hsplit(picture, 2)
+    blue = [np.count_nonzero(half[..., 2] - half[..., 0] > 100) for half in (before, after)]
+    assert blue[0] > 20 > 5 > blue[1], "what goes is marked where it still stands"
+    assert client.get("/v1/desk/pictures?change=none", headers=who["anna"]).status_code == 404
+    assert client.get("/v1/desk/pictures", params={"change": first["id"]}, headers=who["v1"]).status_code == 403
+    assert decide(server, "anna", second["id"], "rejected").status_code == 200
+    assert client.get("/v1/desk/pictures", params={"change": second["id"]}, headers=who["anna"]).status_code == 404
 
 
 def test_a_hostile_comment_is_kept_as_text(server: Server) -> None:

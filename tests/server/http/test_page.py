@@ -156,6 +156,9 @@ def test_the_desk_is_worked_by_keyboard_and_publishing_obeys(
     with serving(database_url, "--open", log=tmp_path / "log") as (url, _):
         ready(browser, url)
         enter(browser, "document.querySelector('#pending button')")
+        browser.wait("document.querySelector('#pending-picture img')?.naturalWidth === 608")
+        assert text(browser, "#labels").startswith("waits: ×")
+        browser.wait("location.hash.includes('pending=demolished.')")
         press(browser, "r")
         browser.wait("document.querySelector('#pending').innerText.includes('rejected by operator')")
         assert browser.run("document.querySelector('#publish').disabled")

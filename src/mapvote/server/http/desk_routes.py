@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
-from fastapi import APIRouter, Path, Request, Response
+from fastapi import APIRouter, Path, Query, Request, Response
 from pydantic import BaseModel, ConfigDict, Field
 
 from mapvote.server.http.auth import reviewer
 from mapvote.server.http.schemas import AS_CSV, PLAIN, Places, as_json, as_table, problems
 from mapvote.server.http.services import services
-from mapvote.server.insight.desk import desk, review, verdict_of
+from mapvote.server.insight.desk import desk, pending_picture, review, verdict_of
 from mapvote.server.insight.geojson import feature_rows
 from mapvote.server.store.reviews import undo
 
@@ -47,6 +47,20 @@ def whole_desk(request: Request, format: Places = "json") -> Response:
         return as_json({"version": found.version, "held": found.held, "pending": found.pending, "reviewed": left_out})
     listed = found.pending | {"features": [*found.pending["features"], *left_out]}
     return as_json(listed) if format == "geojson" else as_table([_flat(row) for row in feature_rows(listed)])
+
+
+@router.get(
+    "/v1/desk/pictures",
+    responses=problems(403, 404) | {200: {"content": {"image/png": {}}}},
+    response_class=Response,
+    summary="A pending change before and after",
+)
+def pending(request: Request, change: Annotated[str, Query(max_length=100)]) -> Response:
+    """PNG as `/v1/pictures` gives it, of the newest version and of what a publish would make of it now."""
+    reviewer(request)
+    parts = services(request)
+    data = pending_picture(parts.store, change, parts.fusing)
+    return Response(data, media_type="image/png", headers={"Cache-Control": "no-store"})
 
 
 def _flat(row: Mapping[str, Any]) -> dict[str, Any]:

@@ -14,8 +14,11 @@ from mapvote.core.tile import Tile
 from mapvote.core.types import Bool
 from mapvote.server.errors import NotFound
 from mapvote.server.insight.changes import ChangeObject, Decided, change_objects, changed_cells
+from mapvote.server.insight.cutout import cut_out
 from mapvote.server.insight.explain import states_of
 from mapvote.server.insight.geojson import to_geojson
+from mapvote.server.insight.history import tiles_at
+from mapvote.server.insight.picture import before_and_after
 from mapvote.server.store.publish import Gate, edited_tile, preview
 from mapvote.server.store.queries import load_tile, tile_of
 from mapvote.server.store.reviews import Review, Verdict, decide, standing
@@ -39,6 +42,8 @@ class Desk:
     """Held and rejected changes, which a publish leaves out."""
     cells: Mapping[str, Mapping[TileIndex, Bool]]
     """Of every change by its id."""
+    edited: Mapping[TileIndex, Tile]
+    """Tiles as a publish would make them."""
 
 
 def desk(store: Store, executor: Executor | None = None, gate: Gate | None = None) -> Desk:
@@ -55,7 +60,23 @@ def desk(store: Store, executor: Executor | None = None, gate: Gate | None = Non
         feature["properties"]["verdict"] = next((_told(r) for r, theirs in reviews if _meet(mine, theirs)), None)
     cells |= {f"{_OF_REVIEW}{review.seq}": theirs for review, theirs in reviews}
     left_out = [review for review, _ in reviews if review.verdict != "accepted"]
-    return Desk(outcome.version, list(outcome.held), pending, left_out, cells)
+    edited = {new.index: new for _, new in tiles}
+    return Desk(outcome.version, list(outcome.held), pending, left_out, cells, edited)
+
+
+def pending_picture(store: Store, change: str, executor: Executor | None = None) -> bytes:
+    """PNG of the place of a pending change, as it is and as a publish would make it, side by side.
+
+    NotFound if no such change is pending any more.
+    """
+    now = desk(store, executor)
+    feature = next((f for f in now.pending["features"] if f["id"] == change), None)
+    if feature is None:
+        raise NotFound(f"no change {change[:80]!r} is pending any more: look again")
+    low, high = feature["properties"]["box"]
+    before = tiles_at(store, now.version)
+    after = lambda index: now.edited[index] if index in now.edited else before(index)  # noqa: E731
+    return before_and_after(cut_out("", "", (*low, *high), 0.0, (before, after), store.lattice))
 
 
 def review(

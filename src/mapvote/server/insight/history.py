@@ -72,7 +72,7 @@ def changes_between(
 
 def cutouts_between(store: Store, old: int, new: int, found: Mapping[str, Any], most: int = 12) -> list[Cutout]:
     """The largest things of :func:`changes_between` with what stands around them, before and after."""
-    tiles = _tiles_of(store, old), _tiles_of(store, new)
+    tiles = tiles_at(store, old), tiles_at(store, new)
     large = [f for f in found["features"] if f["properties"]["size"] == "large"] or list(found["features"])
     largest = sorted(large, key=lambda f: -f["properties"]["area_m2"])[:most]
     return [of_feature(feature, tiles, store.lattice) for feature in largest]
@@ -88,12 +88,12 @@ def picture_between(store: Store, old: int, new: int, box: Box) -> bytes:
 
     NotFound if one of the versions does not exist.
     """
-    tiles = _tiles_of(store, old), _tiles_of(store, new)
+    tiles = tiles_at(store, old), tiles_at(store, new)
     return before_and_after(cut_out("", "", box, 0.0, tiles, store.lattice))
 
 
-def _tiles_of(store: Store, version: int) -> Tiles:
-    """Tiles of one version by their index, each loaded once."""
+def tiles_at(store: Store, version: int) -> Tiles:
+    """Tiles of one version by their index, each loaded once. NotFound if there is no such version."""
     with store.database.reading() as connection:
         version_of(connection, version)
         hashes = tiles_of(connection, version)

@@ -54,6 +54,8 @@ export const cloudsChanged = async (from, to) => (await ask("clouds/changed", { 
 // A place before and after, as an address that an <img> can show: the key travels with a request, not with a link.
 export const picture = async (asked) => URL.createObjectURL(await (await ask("pictures", asked)).blob());
 
+export const pendingPicture = async (change) => URL.createObjectURL(await (await ask("desk/pictures", { change })).blob());
+
 // A list as a file: fetched with the key, which a link cannot carry, and handed to the browser.
 export async function download(path, parameters, name) {
   const made = URL.createObjectURL(await (await ask(path, parameters)).blob());

@@ -18,7 +18,7 @@ const asked = new Set();  // hashes on their way
 
 let range = null;  // {from, to, list, clouds}: the two versions that are shown, and what was asked about them
 const view = (state.view = new Stage(api, {
-  onPick: (where, change) => (change ? showChange(change.id) : showCell(where)),
+  onPick: (where, change) => (change && !change.pending ? showChange(change.id) : where && showCell(where)),
   onMove: showScale,
 }));
 view.onWanted = (hash) => fetchTile(hash);

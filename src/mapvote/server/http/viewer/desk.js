@@ -1,12 +1,14 @@
 // The desk: what a publish would change now, judged one by one; publishing and going back, the difference shown first.
 
 import * as api from "./api.js";
-import { drawable } from "./details.js";
+import { beforeAndAfter, drawable } from "./details.js";
 import { $, dot, element, notice } from "./dom.js";
+import * as address from "./link.js";
 import { state } from "./page.js";
 
 const SAID = { accepted: "accepted", held: "held", rejected: "rejected" };
 const KEYS = { a: "accepted", h: "held", r: "rejected" };
+const REVIEW = "verdict.";  // a change that was held or rejected, which a publish leaves out
 let desk = null, chosen = null;
 
 // For reviewers and operators; to anyone else the server does not tell.
@@ -28,8 +30,8 @@ export async function showDesk() {
   $("pending").replaceChildren(...[...waiting, ...reviewed].map(row));
   $("publish").disabled = !waiting.length;
   $("publish").textContent = held.length ? "Publish in spite of that" : "Publish";
-  const again = [...waiting, ...reviewed].find((f) => f.id === chosen?.id);
-  choose(again ?? null);
+  const wanted = chosen?.id ?? address.read().pending;
+  choose([...waiting, ...reviewed].find((f) => f.id === wanted) ?? null);
 }
 
 const row = (f) => {
@@ -45,14 +47,17 @@ const row = (f) => {
 };
 
 function choose(feature, visit = false) {
+  const before = chosen?.id;
   chosen = feature;
+  address.write({ pending: feature?.id ?? null });
+  state.view.setPending(feature && drawable(feature));
   for (const button of $("pending").querySelectorAll("button")) button.setAttribute("aria-current", String(button.dataset.change === feature?.id));
   $("verdict-form").hidden = !feature;
   if (!feature) return;
   const v = feature.properties.verdict, shown = drawable(feature);
   $("verdict-told").textContent = v ? `${v.by} has ${SAID[v.verdict]} it${v.comment ? `: \u201c${v.comment}\u201d` : "."}` : "Nobody has decided about it yet.";
   $("undo").disabled = !v;
-  state.view.setPending?.(shown);
+  if (feature.id !== before || visit) $("pending-picture").replaceChildren(feature.id.startsWith(REVIEW) ? "" : beforeAndAfter(feature.properties.kind, api.pendingPicture(feature.id)));
   if (visit) state.view.fit(shown.box, 0.38, { elevation: 0.5, height: shown.height });
 }
 

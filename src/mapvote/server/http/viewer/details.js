@@ -49,18 +49,16 @@ export function showChange(id) {
       [p.versions.length > 1 ? "versions" : "version", p.versions.join(", ") || "unknown"],
     ]),
     p.near?.length > 0 && element("p", { className: "hint" }, ["near it: ", ...p.near.map((other) => near(other))]),
-    beforeAndAfter(p),
+    p.box && beforeAndAfter(p.kind, api.picture(pictured(p.box))),
     link("Who voted here?", () => showCell([x + 0.15, y + 0.15])),
   ]);
 }
 
 // The server's picture; it comes when it comes, and a change without one is told all the same.
-function beforeAndAfter(p) {
-  const [[x0, y0], [x1, y1]] = p.box ?? [[NaN, NaN], [NaN, NaN]];
+export function beforeAndAfter(kind, picture) {
   const figure = element("figure", { hidden: true }, []);
-  const asked = { from: $("from").value, to: $("to").value, x0, y0, x1, y1 };
-  if (Number.isFinite(x0)) api.picture(asked).then((src) => {
-    const alt = `Before and after: ${p.kind === "built" ? "what came are red diamonds" : "what went are blue crosses"}`;
+  picture.then((src) => {
+    const alt = `Before and after: ${kind === "built" ? "what came are red diamonds" : "what went are blue crosses"}`;
     const image = element("img", { src, alt, width: 608, height: 260 }, []);
     const large = element("button", { type: "button", title: "Larger, or small again", ariaExpanded: "false" }, [image]);
     large.onclick = () => (large.ariaExpanded = String(large.ariaExpanded !== "true"));
@@ -70,6 +68,8 @@ function beforeAndAfter(p) {
   }, () => null);
   return figure;
 }
+
+const pictured = ([[x0, y0], [x1, y1]]) => ({ from: $("from").value, to: $("to").value, x0, y0, x1, y1 });
 
 function near(id) {
   const feature = state.features.find((f) => f.id === id);

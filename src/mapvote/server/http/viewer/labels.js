@@ -8,13 +8,13 @@ export class Labels {
   }
 
   set(changes) {
-    const large = changes.filter((c) => c.size === "large").slice(0, MOST);
+    const large = changes.filter((c) => c.size === "large" || c.pending).slice(0, MOST);
     this.signs = large.map((change) => {
       const sign = document.createElement("button");
       sign.type = "button";
       sign.tabIndex = -1;  // the list beside it holds the same, in order, for the keyboard
       sign.className = `sign ${change.kind}`;
-      sign.textContent = `${change.kind === "built" ? "+ built" : "\u00d7 demolished"}${change.height ? ` ${change.height.toFixed(0)} m` : ""}`;
+      sign.textContent = `${change.pending ? "waits: " : ""}${change.kind === "built" ? "+ built" : "\u00d7 demolished"}${change.height ? ` ${change.height.toFixed(0)} m` : ""}`;
       sign.onclick = () => this.onChosen(change.id);
       return { change, sign };
     });

@@ -1,6 +1,6 @@
 // Everything one sees is in the address: sending it on shows the same.
 
-const ORDER = ["change", "cell", "from", "to", "view", "shade", "colour", "vehicle", "compare", "swipe", "slice", "paths", "eye"];
+const ORDER = ["change", "cell", "from", "to", "view", "shade", "colour", "vehicle", "compare", "swipe", "slice", "paths", "open", "pending", "eye"];
 
 export function read() {
   const found = new URLSearchParams(location.hash.slice(1));

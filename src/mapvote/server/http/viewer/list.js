@@ -3,6 +3,7 @@
 import * as api from "./api.js";
 import { drawable, showChange, visit } from "./details.js";
 import { $, dot, element } from "./dom.js";
+import * as address from "./link.js";
 import { state } from "./page.js";
 
 const FOLDS = { vehicle: ["vehicles-maybe", (n) => `${n} that could be ${n > 1 ? "vehicles" : "a vehicle"}`], small: ["small", (n) => `${n} smaller than 1 m\u00b2`] };
@@ -23,12 +24,22 @@ export function showList(features, nothing, range) {
     $(id).hidden = !some.length;
     $(id).querySelector("summary").textContent = told(some.length);
     $(id).querySelector("ol").replaceChildren(...some.map(row));
+    $(id).open = unfolded().includes(size);
+    $(id).ontoggle = () => unfold(size, $(id).open);
   }
   for (const format of ["geojson", "csv"]) {
     const asked = format === "csv" ? { ...range, format } : range;
     $(`as-${format}`).href = `v1/changes?${new URLSearchParams(asked)}`;
     $(`as-${format}`).onclick = (event) => (event.preventDefault(), api.download("changes", asked, `changes.${format}`));
   }
+}
+
+const unfolded = () => address.read().open?.split(",") ?? [];
+
+function unfold(size, open) {
+  const sizes = unfolded().filter((other) => other !== size).concat(open ? size : []);
+  address.write({ open: sizes.join() || null });
+  address.flush();  // the next one unfolded is written beside it
 }
 
 const row = (f) =>

@@ -72,8 +72,19 @@ export class Stage {
 
   setChanges(changes) {
     this.changes = changes;
-    this.flat.setChanges(changes);
-    this.labels.set(changes);
+    this.mark();
+  }
+
+  // A change that waits at the desk and is looked at: marked as those that were made. Null: none.
+  setPending(change) {
+    this.pending = change && { ...change, pending: true };
+    this.mark();
+  }
+
+  mark() {
+    const all = this.pending ? [this.pending, ...this.changes] : this.changes;
+    this.flat.setChanges(all);
+    this.labels.set(all);
     this.placeLabels();
   }
 
