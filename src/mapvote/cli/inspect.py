@@ -149,6 +149,9 @@ def _write_changes(found: dict[str, Any], out: Path | None) -> None:
     from mapvote.formats.geo.frame import frame_of
     from mapvote.formats.geo.geopackage import write_geopackage
 
+    if found.get("damaged"):
+        left_out = "; ".join(found["damaged"])
+        typer.echo(f"left out: tiles {left_out} are damaged (mapvote check tells more)", err=True)
     if out is None:
         print(json.dumps(found, indent=1))
         return

@@ -14,6 +14,8 @@ from mapvote.codec.ballot import encode
 from mapvote.config import FuseSettings
 from mapvote.core.tile import Tile
 from mapvote.core.types import CellState
+from mapvote.server.insight.clouds import Clouds, evidence
+from mapvote.server.insight.history import changes_between, vehicle_standings
 from mapvote.server.store import schema
 from mapvote.server.store.admission import accept, examine
 from mapvote.server.store.ballots import Receipt
@@ -77,6 +79,24 @@ def test_a_damaged_tile_is_named_all_others_are_published_and_once_mended_it_is_
     check(store, mend=True, source=lambda digest: unpack_bytes(plane, 1 << 30, digest))
     done = publish(store)
     assert (done.published, list(done.tiles)) == (True, [(0, 1)]), "its votes have waited"
+
+
+def test_what_is_damaged_hides_nothing_else_from_whoever_looks(store: Store) -> None:
+    """A ballot's vote on one tile, and the ground of the other."""
+    ground, _ = with_a_ground_of_its_own(store)
+    assert len(publish(store).tiles) == 2
+    t = schema.ballot_tiles
+    with store.database.reading() as connection:
+        first = connection.execute(sa.select(sa.func.min(t.c.ballot))).scalar_one()
+    flip(store, t, "states", (t.c.ballot == first) & (t.c.col == 0))
+    flip(store, schema.blobs, "data", schema.blobs.c.hash == ground)
+    for _ in range(2):
+        found = changes_between(store, 1, 2)
+        assert (len(found["features"]), found["damaged"]) == (1, ["0,1"])
+        assert [standing.vehicle for standing in vehicle_standings(store)] == ["a", "b", "c"]
+        assert evidence(store, (0, 0))[CELL][0] == 2, "vehicles"
+        assert np.frombuffer(Clouds(store).overview(2), "<u4")[1] == 1, "tiles"
+        check(store, mend=True)
 
 
 def test_a_tile_whose_deciding_ballots_are_set_aside_is_decided_anew(store: Store) -> None:

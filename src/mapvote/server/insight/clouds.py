@@ -10,11 +10,20 @@ import numpy as np
 
 from mapvote.core.grid import TILE_CELLS, Lattice, TileIndex
 from mapvote.core.rows import found_among
-from mapvote.core.types import F64, I64, NO_VOTE, U8, CellState
+from mapvote.core.types import F64, I64, NO_VOTE, U8, CellState, MapvoteError
 from mapvote.fusion.probability import alike_beside, change_probability
+from mapvote.fusion.tile_vote import TileVote
+from mapvote.server.errors import Unavailable
 from mapvote.server.insight.levels import Levels, cloud_bytes, make_levels, pack
 from mapvote.server.store.blobs import TileHashes
-from mapvote.server.store.eligible_votes import FOREVER, Electorate, judged_votes, read_votes
+from mapvote.server.store.eligible_votes import (
+    DAMAGED,
+    FOREVER,
+    Electorate,
+    from_sound_ballots,
+    judged_votes,
+    read_votes,
+)
 from mapvote.server.store.policy import policy_in
 from mapvote.server.store.queries import load_tile, tiles_of, tiles_that_differ, version_of
 from mapvote.server.store.store import Store
@@ -87,8 +96,13 @@ class Clouds:
         for index, hashes in tiles.items():
             if stop():
                 return None
-            with self._store.database.reading() as connection:
-                tile = load_tile(connection, _ANYWHERE, TileHashes(hashes.points, hashes.ground, None))
+            try:
+                with self._store.database.reading() as connection:
+                    tile = load_tile(connection, _ANYWHERE, TileHashes(hashes.points, hashes.ground, None))
+            except Unavailable:
+                raise
+            except MapvoteError:
+                continue  # damaged: who asks for the tile itself is told
             made.append((index, make_levels(tile.points, tile.ground_z, _SPARE * OVERVIEW_POINTS // len(tiles))))
         return made
 
@@ -132,9 +146,12 @@ def evidence(store: Store, index: TileIndex, vehicle: str | None = None) -> U8:
     probable it is that the cell changed, in 1/255; and the state that most of them say (NO_VOTE: nobody).
     """
     with store.database.reading() as connection:
-        judged = judged_votes(connection, index, Electorate(FOREVER, policy_in(connection), FOREVER))
-        stored = [vote for vote, _ in judged if vehicle is None or vote.vehicle == vehicle]
-        votes = read_votes(connection, index, stored)
+
+        def said(asked: Electorate) -> list[TileVote]:
+            judged = [vote for vote, why in judged_votes(connection, index, asked) if why != DAMAGED]
+            return read_votes(connection, index, [v for v in judged if vehicle is None or v.vehicle == vehicle])
+
+        votes = from_sound_ballots(connection, Electorate(FOREVER, policy_in(connection), FOREVER), said)
     newest: dict[str, tuple[int, U8]] = {}
     last = np.full((TILE_CELLS, TILE_CELLS), -1, dtype=np.int64)
     for vote in sorted(votes, key=lambda vote: (vote.end_ns, vote.digest)):

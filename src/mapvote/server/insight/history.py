@@ -4,17 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 from typing import Any
 
 import numpy as np
 import sqlalchemy as sa
 
+from mapvote.codec.ballot import tile_key
 from mapvote.core.grid import TileIndex
 from mapvote.core.tile import Tile
-from mapvote.core.types import U8
+from mapvote.core.types import U8, MapvoteError
 from mapvote.core.voting import decide
 from mapvote.fusion.tile_vote import DAY_NS, TileVote, one_each
+from mapvote.server.errors import Unavailable
 from mapvote.server.insight.changes import Decided, change_objects, changed_cells
 from mapvote.server.insight.consensus import Compared, Spoken, Standing, compare, standings_of
 from mapvote.server.insight.cutout import Box, Cutout, Tiles, cut_out, of_feature, whole_page
@@ -26,6 +28,7 @@ from mapvote.server.store.eligible_votes import (
     FOREVER,
     Electorate,
     counting_votes,
+    from_sound_ballots,
     judged_votes,
     read_votes,
     standing_tiles,
@@ -46,17 +49,23 @@ def changes_between(
     store: Store, old: int, new: int, min_cells: int = 1, *, lonlat: bool = False, known: bool = True
 ) -> dict[str, Any]:
     """Change objects from version ``old`` to ``new`` as GeoJSON in map metres, or longitude and latitude (``lonlat``).
-    ``known``: see :func:`seen`.
+    ``known``: see :func:`seen`. Tiles that cannot be read are left out, and named as "damaged".
 
     NotFound if one of the versions does not exist.
     """
     with store.database.reading() as connection:
-        found = []
+        found, damaged = [], []
         for index, *pair in tiles_that_differ(connection, old, new):
-            tiles = [load_tile(connection, store.lattice.tile(index), hashes) for hashes in pair]
-            decided = list(_decided(store, connection, index, min(old, new), max(old, new)))
+            try:
+                tiles = [load_tile(connection, store.lattice.tile(index), hashes) for hashes in pair]
+                decided = list(_decided(store, connection, index, min(old, new), max(old, new)))
+            except Unavailable:
+                raise
+            except MapvoteError:
+                damaged.append(tile_key(index))
+                continue
             found.append(changed_cells(tiles[0], tiles[1], decided))
-    return to_geojson(
+    told = to_geojson(
         [
             replace(thing, first_seen_ns=seen(thing.first_seen_ns, known), last_seen_ns=seen(thing.last_seen_ns, known))
             for thing in change_objects(found, min_cells)
@@ -68,6 +77,7 @@ def changes_between(
         georeference=store.georeference,
         lonlat=lonlat,
     )
+    return told | ({"damaged": damaged} if damaged else {})
 
 
 def cutouts_between(store: Store, old: int, new: int, found: Mapping[str, Any], most: int = 12) -> list[Cutout]:
@@ -112,7 +122,7 @@ def _decided(store: Store, connection: sa.Connection, index: TileIndex, old: int
     for row in connection.execute(query.where(d.c.version > old, d.c.version <= new).order_by(d.c.version)).all():
         version = version_of(connection, row.version)
         tile = tile_as_of(connection, store.lattice.tile(index), row.version - 1)
-        votes = counting_votes(connection, tile, Electorate.of(version))
+        votes = from_sound_ballots(connection, Electorate.of(version), partial(counting_votes, connection, tile))
         drives = [(vote.end_ns, vote.states) for vote in votes if vote.states is not None]
         yield Decided(row.version, states_of(row.states), unpack_tally_plane(row.tally), drives)
 
@@ -139,11 +149,16 @@ def vehicle_standings(store: Store) -> list[Standing]:
     What is compared is the world (occupied or empty now), so votes on an older base count here too.
     """
     with store.database.reading() as connection:
-        asked = Electorate(FOREVER, policy_in(connection), FOREVER)
+        everybody = Electorate(FOREVER, policy_in(connection), FOREVER)
         compared: list[Compared] = []
-        for index in standing_tiles(connection, FOREVER):
+
+        def said_on(index: TileIndex, asked: Electorate) -> list[TileVote]:
             chosen = [vote for vote, why in judged_votes(connection, index, asked) if not why]
-            folded = one_each(read_votes(connection, index, chosen), store.lattice.tile(index))
+            return read_votes(connection, index, chosen)
+
+        for index in standing_tiles(connection, FOREVER):
+            said = from_sound_ballots(connection, everybody, partial(said_on, index))
+            folded = one_each(said, store.lattice.tile(index))
             compared += compare(index, [Spoken(vote.vehicle, vote.end_ns, _decided_states(vote)) for vote in folded])
     return standings_of(compared, store.lattice)
 

@@ -5,9 +5,9 @@ Everything is asked as of an event number (``mark``), so that a past round can b
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import sqlalchemy as sa
 
@@ -72,6 +72,7 @@ class StoredVote:
     cast_by: str
 
 
+Read = TypeVar("Read")
 FOREVER = (1 << 63) - 1
 YOUNG = "waits for the minimum age"
 DAMAGED = "damaged, and set aside"
@@ -154,8 +155,8 @@ def electorate_now(
     policy = policy_in(connection)
     if settings is not None:
         policy = policy.model_copy(update={"fuse": settings})
-    aside = frozenset(name for kind, name in set_aside(connection) if kind == "ballot")
-    return Electorate(mark, policy, now - round(policy.fuse.min_age_s * 1e9), set_aside=aside)
+    received_by_ns = now - round(policy.fuse.min_age_s * 1e9)
+    return Electorate(mark, policy, received_by_ns, set_aside=ballots_aside(connection))
 
 
 def _unready(vote: StoredVote, index: TileIndex, asked: Electorate) -> str:
@@ -205,6 +206,21 @@ def recent_votes(
     oldest = max((vote.end_ns for vote in ready), default=0) - asked.settings.stay_days * DAY_NS
     chosen = [vote for vote in ready if vote.end_ns >= oldest]
     return [unspent(vote, tile, misread) for vote in read_votes(connection, tile.index, chosen)]
+
+
+def from_sound_ballots(connection: sa.Connection, asked: Electorate, read: Callable[[Electorate], Read]) -> Read:
+    """What ``read`` gives without the ballots that are set aside, and those that turn out to be damaged on the way."""
+    asked = replace(asked, set_aside=frozenset({*asked.set_aside, *ballots_aside(connection)}))
+    while True:
+        try:
+            return read(asked)
+        except DamagedBallots as error:
+            asked = asked.leaving_out(error.found)
+
+
+def ballots_aside(connection: sa.Connection) -> frozenset[str]:
+    """Ballots in quarantine, as an electorate leaves them out."""
+    return frozenset(name for kind, name in set_aside(connection) if kind == "ballot")
 
 
 def read_votes(connection: sa.Connection, index: TileIndex, stored: Sequence[StoredVote]) -> list[TileVote]:

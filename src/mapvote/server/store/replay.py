@@ -25,7 +25,7 @@ from mapvote.server.store import schema
 from mapvote.server.store.blobs import TileHashes, pack_tile
 from mapvote.server.store.commit import NewTiles, write_version
 from mapvote.server.store.database import address_of
-from mapvote.server.store.eligible_votes import Electorate, standing_tiles
+from mapvote.server.store.eligible_votes import Electorate, ballots_aside, standing_tiles
 from mapvote.server.store.publish import Outcome, turned_back
 from mapvote.server.store.queries import Version, load_tile, memory_of, tile_of, tiles_of
 from mapvote.server.store.store import Store
@@ -125,9 +125,9 @@ def _turned_back(store: Store, number: int, before: _State, target: _State) -> _
 
 def _fused(store: Store, version: Version, before: _State, history: _History, executor: Executor | None) -> _State:
     without = frozenset(name for name, until in history.out.items() if version.number < until)
-    asked = Electorate.of(version, without)
     tasks, url = [], address_of(store.database.url)
     with store.database.reading() as connection:
+        asked = Electorate.of(version, without, ballots_aside(connection))
         for index in standing_tiles(connection, version.mark):
             tile = _content(store, connection, before, index, tile_of(connection, before.root, index)).tile
             misread = history.misread.get(index, {})
