@@ -66,6 +66,9 @@ def test_a_vote_that_a_version_heard_stays_in_the_story_when_it_is_taken_back(st
     ] * 3
     assert (found["a"].why, found["b"].why) == ("withdrawn", "its vehicle's key was revoked")
     assert found["c"].why.startswith("spent")
+    with store.database.writing() as connection:
+        connection.execute(schema.ballot_tiles.update().values(states=b"rot"))
+    assert [vote.state for vote in story(store).votes] == ["unreadable"], "of those that stand"
 
 
 def test_a_vote_is_named_with_the_version_that_heard_it_or_why_it_does_not_count(store: Store, clock: Clock) -> None:
@@ -123,6 +126,18 @@ def test_a_damaged_ballot_is_told_and_hides_no_other(store: Store) -> None:
     assert [(v.state, v.counts) for v in story(store).votes] == [
         ("unreadable", False), ("changed_empty", True), ("changed_empty", True)
     ]  # fmt: skip
+
+
+def test_a_damaged_decision_is_told_and_hides_no_vote(store: Store) -> None:
+    for vehicle in ("a", "b"):
+        say(store, vehicle, CellState.CHANGED_EMPTY)
+    publish(store)
+    with store.database.writing() as connection:
+        connection.execute(schema.decisions.update().values(states=b"rot"))
+    told = story(store)
+    assert told.decisions == [(2, "unreadable")]
+    assert told.probability is None
+    assert [vote.heard for vote in told.votes] == [(2,), (2,)]
 
 
 def test_of_copies_the_story_says_that_one_is_heard_and_the_log_whose_they_are_once(store: Store, clock: Clock) -> None:

@@ -36,6 +36,7 @@ from mapvote.server.store.tile_jobs import unpack_tally_plane
 
 _LOOKED_INTO = 30
 """So many of the last versions that decided a cell are asked which votes they heard."""
+UNREADABLE = "unreadable"
 REVIEWED = "of a change that a reviewer held or rejected"
 OPPOSES = "opposes the others over most of this tile, or denies nearly all that changed on it"
 COPY = "a copy: what it determined on this tile is what another vehicle's drive did, and that one is heard for both"
@@ -119,16 +120,27 @@ def as_told(story: CellStory) -> dict[str, Any]:
 def _decisions(connection: sa.Connection, index: TileIndex, cell: tuple[int, int]) -> list[tuple[int, str]]:
     d = schema.decisions
     query = sa.select(d.c.version, d.c.states).where(d.c.row == index[0], d.c.col == index[1]).order_by(d.c.version)
-    found = [(row.version, int(states_of(row.states)[cell])) for row in connection.execute(query)]
-    return [(version, state_name(state)) for version, state in found if state != NO_VOTE]
+    found = [(row.version, _state_in(row.states, cell)) for row in connection.execute(query)]
+    return [(version, state) for version, state in found if state != state_name(NO_VOTE)]
+
+
+def _state_in(states: bytes, cell: tuple[int, int]) -> str:
+    try:
+        return state_name(int(states_of(states)[cell]))
+    except MapvoteError:
+        return UNREADABLE
 
 
 def _probability(connection: sa.Connection, index: TileIndex, cell: tuple[int, int], version: int) -> float | None:
-    """That the cell changed as ``version`` decided; cells of other tiles are not asked for what changed beside it."""
+    """That the cell changed as ``version`` decided; cells of other tiles are not asked for what changed beside it. None
+    if it decided on no change, or on what cannot be read any more."""
     d = schema.decisions
     query = sa.select(d.c.states, d.c.tally).where(d.c.row == index[0], d.c.col == index[1], d.c.version == version)
     row = connection.execute(query).one()
-    states, counted = states_of(row.states), unpack_tally_plane(row.tally)[cell].astype(np.int64) // VOTE_UNIT
+    try:
+        states, counted = states_of(row.states), unpack_tally_plane(row.tally)[cell].astype(np.int64) // VOTE_UNIT
+    except MapvoteError:
+        return None
     state = int(states[cell])
     if state not in (CellState.CHANGED_OCCUPIED, CellState.CHANGED_EMPTY):
         return None
@@ -186,7 +198,7 @@ def _why_not(vote: TileVote, obeyed: TileVote | None, now: Place, heard: Heard) 
 
 
 def _vote(stored: StoredVote, vote: TileVote | None, why: str, now: Place, heard: tuple[int, ...]) -> CellVote:
-    state, marks = ("unreadable", None) if vote is None else (_said(vote, now.cell), _marks(vote, now.cell))
+    state, marks = (UNREADABLE, None) if vote is None else (_said(vote, now.cell), _marks(vote, now.cell))
     whose = stored.vehicle, stored.drive, stored.version
     return CellVote(*whose, state, marks, stored.end_ns, not why, why, heard)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import sqlalchemy as sa
 
@@ -11,7 +12,7 @@ from mapvote.core.tile import Tile
 from mapvote.fusion.fuse import Heard, decide_tile, rule_of
 from mapvote.fusion.tile_vote import TileVote
 from mapvote.server.store import schema
-from mapvote.server.store.eligible_votes import Electorate, StoredVote, counted_votes
+from mapvote.server.store.eligible_votes import Electorate, StoredVote, counted_votes, from_sound_ballots
 from mapvote.server.store.queries import oldest_kept, tile_as_of, version_of
 from mapvote.server.store.store import Store
 
@@ -55,7 +56,7 @@ def heard_by(connection: sa.Connection, store: Store, number: int, now: Place) -
         return []  # what it was made of was cleared away
     asked = Electorate.of(version, set_aside=now.asked.set_aside)
     then = replace(now, asked=asked, tile=tile_as_of(connection, now.tile.window, number - 1))
-    counted = counted_votes(connection, then.tile, asked)
+    counted = from_sound_ballots(connection, asked, partial(counted_votes, connection, then.tile))
     heard = decided_on(then, [vote for _, vote in counted])
     speaking = [(stored, vote) for stored, vote in counted if vote.spoken()[now.cell]]
     return [one for one in speaking if not is_copy(one[1], heard) and not is_silenced(one[1], heard)]
