@@ -20,15 +20,17 @@ from mapvote.core.voting import VOTE_UNIT
 from mapvote.fusion.probability import alike_beside, change_probability
 from mapvote.server.insight.adjoining import buildings
 from mapvote.server.insight.polygons import Ring, rings
-from mapvote.server.insight.things import REACH_M, group
+from mapvote.server.insight.things import REACH_M, group, widths_m
 
 Kind = Literal["built", "demolished"]
 Size = Literal["large", "vehicle", "small"]
 SMALL_AREA_M2 = 1.0
-VEHICLE_LENGTH_M, VEHICLE_HEIGHT_M = 12.0, 4.0
+VEHICLE_LENGTH_M, VEHICLE_WIDTH_M, VEHICLE_HEIGHT_M = 12.0, 2.55, 4.0
 """What fits into these, the largest that a bus or lorry may be (Directive 96/53/EC), may be a vehicle, or the trail of
 one that a survey took for a thing: it is listed apart. Several side by side, which lie within reach of each other, are
 no larger thing: each connected piece is asked."""
+_BORDER_M = 2 * CELL_SIZE * 2**0.5
+"""How much wider the cells of a thing may be than itself: a cell's diagonal on either side."""
 KINDS: dict[int, Kind] = {CellState.CHANGED_OCCUPIED: "built", CellState.CHANGED_EMPTY: "demolished"}
 _NEVER = np.iinfo(np.int64).max
 _UNTIL = np.iinfo(np.int64).min
@@ -88,6 +90,8 @@ class ChangeObject:
     """Lowest column and row, highest column and row, in lattice corners."""
     longest_m: float
     """The longer side of the box around the longest of its connected pieces."""
+    width_m: float
+    """Of the widest of its connected pieces, as the narrowest gate that it would fit through."""
     height_m: float
     volume_m3: float
     """Of its columns, each from the lowest to the highest voxel that came or went."""
@@ -112,7 +116,7 @@ class ChangeObject:
         if self.area_m2 < SMALL_AREA_M2:
             return "small"
         fits = self.height_m <= VEHICLE_HEIGHT_M and self.longest_m <= VEHICLE_LENGTH_M
-        return "vehicle" if fits else "large"
+        return "vehicle" if fits and self.width_m <= VEHICLE_WIDTH_M + _BORDER_M else "large"
 
     @property
     def share_for(self) -> float | None:
@@ -174,10 +178,11 @@ def change_objects(changed: Iterable[ChangedCells], min_cells: int = 1, reach_m:
     things = group(cells.rows, cells.cols, kinds, found.objects, reach_m)
     beside = alike_beside(cells.rows, cells.cols, kinds)
     probability = change_probability(cells.states, cells.votes, cells.against, beside)
-    lengths = _lengths(cells.rows, cells.cols, found.objects)[found.objects]
+    sides = np.stack([_lengths(cells.rows, cells.cols, found.objects) * CELL_SIZE,
+                      widths_m(cells.rows, cells.cols, found.objects)], axis=1)[found.objects]  # fmt: skip
     by_thing = np.split(np.argsort(things, kind="stable"), np.cumsum(np.bincount(things))[:-1])
     return [
-        _object(cells, probability, lengths, mine, [outlines[p] for p in np.unique(found.polygons[mine])])
+        _object(cells, probability, sides, mine, [outlines[p] for p in np.unique(found.polygons[mine])])
         for mine in by_thing
         if len(mine) >= min_cells
     ]
@@ -204,7 +209,7 @@ def _lengths(rows: I64, cols: I64, pieces: I32) -> I64:
     return np.maximum(*sides)
 
 
-def _object(cells: ChangedCells, probability: F64, lengths: I64, mine: I64, outline: list[list[Ring]]) -> ChangeObject:
+def _object(cells: ChangedCells, probability: F64, sides_m: F64, mine: I64, outline: list[list[Ring]]) -> ChangeObject:
     rows, cols, versions = cells.rows[mine], cells.cols[mine], cells.versions[mine]
     kind = KINDS[int(cells.states[mine[0]])]
     made_in = sorted({int(v) for v in versions} - {0})
@@ -218,7 +223,8 @@ def _object(cells: ChangedCells, probability: F64, lengths: I64, mine: I64, outl
         cells=len(mine),
         where=(rows, cols),
         box=(float(cols.min()), float(rows.min()), float(cols.max() + 1), float(rows.max() + 1)),
-        longest_m=float(lengths[mine].max() * CELL_SIZE),
+        longest_m=float(sides_m[mine, 0].max()),
+        width_m=float(sides_m[mine, 1].max()),
         height_m=float(cells.top_m[mine].max()),
         volume_m3=float(columns.sum() * CELL_SIZE**2),
         points=int(cells.points[mine].sum()),

@@ -53,6 +53,18 @@ def group(rows: I64, cols: I64, kinds: I64, pieces: I32, reach_m: float = REACH_
     return _in_order(owner[pieces])
 
 
+def widths_m(rows: I64, cols: I64, pieces: I32) -> F64:
+    """(k,) metres: the narrowest gate that each piece (n,) labels 0 ... k - 1 would fit through, across a side of its
+    convex hull."""
+    members = np.split(np.argsort(pieces, kind="stable"), np.cumsum(np.bincount(pieces))[:-1])
+    return np.array([_width(_corners(rows[m], cols[m])) for m in members]) * CELL_SIZE
+
+
+def _width(corners: F64) -> float:
+    across = corners @ ConvexHull(corners).equations[:, :2].T
+    return float(np.ptp(across, axis=0).min())
+
+
 def _corners(rows: I64, cols: I64) -> F64:
     """(4 n, 2) corners of cells, in cells."""
     lower = np.stack([cols, rows], axis=1).astype(np.float64)
