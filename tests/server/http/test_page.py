@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import json
+import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from pathlib import Path
+from threading import Event, Thread
 from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
+import uvicorn
 from msgspec.structs import replace
 
 from chromium import Chromium, program
@@ -17,6 +23,7 @@ from mapvote.codec.ballot import encode
 from mapvote.codec.path import pack_path
 from mapvote.config import FuseSettings
 from mapvote.core.types import CellState
+from mapvote.server.http.app import create_app
 from mapvote.server.insight.cutout import whole_page
 from mapvote.server.insight.history import changes_between, cutouts_between
 from mapvote.server.store import policy
@@ -177,6 +184,71 @@ def test_the_desk_is_worked_by_keyboard_and_publishing_obeys(
         press(browser, "Enter")
         browser.wait("document.querySelector('#which-map').innerText.endsWith('version 4')")
         assert browser.errors == []
+
+
+@contextmanager
+def slowly(store: Path) -> Iterator[tuple[str, ThreadPoolExecutor, Event]]:
+    """(address, where it fuses, one tile at a time, what lets go on who waits there) of a server in this process."""
+    opened, go_on = Store.open(f"sqlite:///{store}"), Event()
+    with ThreadPoolExecutor(1) as fusing:
+        app = create_app(opened, opened=True, executor=fusing)
+        server = uvicorn.Server(uvicorn.Config(app, port=0, log_level="error", timeout_graceful_shutdown=1))
+        thread = Thread(target=server.run)
+        thread.start()
+        while not server.started:
+            time.sleep(0.01)
+        try:
+            yield f"http://127.0.0.1:{server.servers[0].sockets[0].getsockname()[1]}", fusing, go_on
+        finally:
+            go_on.set()
+            server.should_exit = True
+            thread.join()
+    opened.close()
+
+
+@pytest.mark.slow
+def test_a_publish_tells_on_the_page_how_far_it_is_and_is_cancelled_there(browser: Chromium, store: Path) -> None:
+    with slowly(store) as (url, fusing, go_on):
+        ready(browser, url)
+        fusing.submit(go_on.wait, 60)
+        enter(browser, "document.querySelector('#publish')")
+        browser.wait("document.activeElement.className === 'yes'")
+        press(browser, "Enter")
+        browser.wait("document.querySelector('#desk-said').innerText === 'Publishing: 0 of 1 tiles'")
+        enter(browser, "document.querySelector('#cancel')")
+        time.sleep(0.5)
+        go_on.set()
+        told = "cancelled by operator after 1 of 1 tiles: nothing was published"
+        browser.wait(f"document.querySelector('#desk-said').innerText.includes({told!r})")
+        assert text(browser, "#which-map").endswith("version 2")
+        assert text(browser, "#pending").startswith("Demolished"), "it waits as before"
+        browser.open("about:blank")
+
+
+@pytest.mark.slow
+def test_who_decides_after_another_is_told_so_on_the_page(browser: Chromium, store: Path, tmp_path: Path) -> None:
+    with serving(store, "--open", log=tmp_path / "log") as (url, _):
+        ready(browser, url)
+        enter(browser, "document.querySelector('#pending button')")
+        change = browser.run("document.querySelector('#pending button').dataset.change")
+        asked = {"change": change, "verdict": "accepted", "comment": "I was there"}
+        told = {"method": "POST", "headers": {"Content-Type": "application/json"}, "body": json.dumps(asked)}
+        browser.run(
+            f"fetch('v1/desk/reviews', {json.dumps(told)}).then(() => document.querySelector('#rejected').click())"
+        )
+        browser.wait("document.querySelector('#desk-said').innerText")
+        assert "operator" in text(browser, "#desk-said")
+        browser.wait("document.querySelector('#pending').innerText.includes('accepted by operator')")
+
+
+def test_what_lies_in_the_middle_is_chosen_by_keyboard(browser: Chromium, store: Path, tmp_path: Path) -> None:
+    with serving(store, "--open", log=tmp_path / "log") as (url, _):
+        ready(browser, url)
+        for key, canvas in (("3", "#cloud"), ("2", "#map")):
+            press(browser, key)
+            enter(browser, f"document.querySelector('{canvas}')")
+            browser.wait("!document.querySelector('#details').hidden")
+            enter(browser, "document.querySelector('#details .close')")
 
 
 def test_tab_alone_comes_to_every_control_that_is_shown(browser: Chromium, store: Path, tmp_path: Path) -> None:

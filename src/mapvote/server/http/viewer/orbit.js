@@ -96,6 +96,7 @@ export class Orbit {
       if (x || y) e.shiftKey ? this.turn(x, y) : this.move(x, y);
       else if (e.key === "+" || e.key === "=") this.zoom(1.3);
       else if (e.key === "-") this.zoom(1 / 1.3);
+      else if (e.key === "Enter") this.pick([c.clientWidth / 2, c.clientHeight / 2]);
       else return;
       e.preventDefault();
     });

@@ -201,6 +201,7 @@ export class View {
       if (step) this.pan(...step);
       else if (e.key === "+" || e.key === "=") this.zoom(1.4);
       else if (e.key === "-") this.zoom(1 / 1.4);
+      else if (e.key === "Enter") this.onPick(this.centre, this.changeAt(this.toScreen(this.centre)));
       else return;
       e.preventDefault();
     });
