@@ -17,6 +17,7 @@ from mapvote.doctor.prior import NO_PRIOR, check_prior, check_times
 from mapvote.doctor.road import Road, find_road
 from mapvote.doctor.scans import check_scans
 from mapvote.doctor.scatter import range_scatter_m
+from mapvote.doctor.whole import CHAIN_SCANS
 from mapvote.formats import open_drive
 from mapvote.formats.drives.options import DriveOptions
 
@@ -103,7 +104,12 @@ def measure(drive: Drive, looks: Looks, progress: Progress | None = None) -> tup
     runs = runs[: len(spread)]
     if T is None or unsound:  # what the scans do not show, the prior cannot be held against
         return found, T
-    more, mended = check_agreement(drive, T, runs, road, float(np.median(looks.turns)))
+
+    def chain() -> Run:
+        run = follow(read, 0, len(usable), road, CHAIN_SCANS)
+        return Run(usable[run.indices], run.T_first_lidar, run.fit)
+
+    more, mended = check_agreement(drive, T, runs, road, float(np.median(looks.turns)), chain)
     return found + more, mended
 
 

@@ -5,26 +5,25 @@ A reading is held against another run by run. Those that no run tells from the b
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from mapvote.core.types import F64, Drive
-from mapvote.doctor.agreement import misfit, misfits
+from mapvote.doctor.agreement import misfits
 from mapvote.doctor.finding import Finding, Severity
 from mapvote.doctor.measured import Measured, measure_scale, measure_time, measure_turn
 from mapvote.doctor.motion import Run
 from mapvote.doctor.prior import drift_angle_deg
 from mapvote.doctor.readings import AS_IT_IS, READINGS, Reading
 from mapvote.doctor.road import Road
+from mapvote.doctor.small import check_small, small_words
 
 _HEIGHT_M = (0.8, 4.0)
 """Of a sensor on a vehicle, over the road."""
-_LEAST = {"scale": 0.02, "turn": 2.0, "pitch": 2.0, "time": 0.15}
-"""Share, degrees, degrees, seconds. Less is not complained of: priors err so much by themselves."""
-_SIGMAS = 5.0
-"""Nor is what is less than so many of its standard errors."""
+CANNOT_TELL = "this drive cannot tell without a turn whether"
+"""A map can."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,8 +41,11 @@ class _Held:
         return float(np.median(self.misfit))
 
 
-def check_agreement(drive: Drive, T: F64, runs: Sequence[Run], road: Road, turns: float) -> tuple[list[Finding], F64]:
-    """(findings, the poses (n, 4, 4) mended as far as is known). ``turns``: how the points go round, for a mirror."""
+def check_agreement(
+    drive: Drive, T: F64, runs: Sequence[Run], road: Road, turns: float, chain: Callable[[], Run]
+) -> tuple[list[Finding], F64]:
+    """(findings, the poses (n, 4, 4) mended as far as is known). ``turns``: how the points go round, for a mirror;
+    ``chain``: a long run, asked for where the prior is right but for a little."""
     length_m = float(np.median([run.length_m for run in runs]))
     told_m = float(np.median([np.linalg.norm(T[r.indices[-1], :3, 3] - T[r.indices[0], :3, 3]) for r in runs]))
     if length_m < 1.0 and told_m < 1.0:
@@ -67,8 +69,7 @@ def check_agreement(drive: Drive, T: F64, runs: Sequence[Run], road: Road, turns
         return [_named(group, as_it_is, best, length_m)], best.reading.poses(T)
     if as_it_is.median > floor_m:
         return [_nothing_fits(as_it_is, runs, length_m, told_m)], T
-    found = _by_numbers(numbers, T, runs)
-    found += [] if found else [_not_shown(numbers, runs, length_m)]
+    found = check_small(T, chain(), runs, time, drive.stamps_ns)
     found += _places(as_it_is, runs) + _scatter(drive, as_it_is, length_m)
     found += _cannot_tell(as_it_is, held, length_m, turns, drive.sensor.clockwise)
     return found, T
@@ -121,7 +122,7 @@ def _number_reading(m: Measured, T: F64, runs: Sequence[Run], road: Road) -> Rea
         what = f"the prior is {abs(m.value):.2f} s {'late' if m.value > 0 else 'early'} (+-{m.sigma:.2f})"
         return Reading(what, f"shift its times by {-m.value:+.2f} s, or its rows against the scans", m.poses)
     if m.kind == "pitch":
-        return Reading(*_small_words(m), m.poses, "scans" if road.tilt_deg > 0.5 * abs(m.value) else "prior")
+        return Reading(*small_words(m), m.poses, "scans" if road.tilt_deg > 0.5 * abs(m.value) else "prior")
     forward, drift = forward_deg(runs), drift_angle_deg(T)
     if abs(forward) > max(0.5 * abs(m.value), 2.0 * abs(drift)):
         back = "face backwards (x to the rear): they " if abs(forward) > 170.0 else ""
@@ -171,48 +172,6 @@ def _nothing_fits(as_it_is: _Held, runs: Sequence[Run], length_m: float, told_m:
     return Finding("error", what, "is it the trajectory of this drive, one row for each scan, in order?")
 
 
-def _by_numbers(numbers: Sequence[Measured], T: F64, runs: Sequence[Run]) -> list[Finding]:
-    """Scale, turn, pitch and time, where the prior is off by a little and the runs show it."""
-    found = []
-    for m in numbers:
-        off = abs(np.log(m.value)) if m.kind == "scale" else abs(m.value)
-        before = misfit(T, runs, scale=m.kind == "scale")
-        gained = before - misfit(m.poses(T), runs, scale=m.kind == "scale")
-        if off > _least_shown(m) and gained > 0.25 * before:
-            grave = off > 2.0 * _LEAST[m.kind] or (m.kind == "scale" and gained > 0.5 * before)
-            found.append((gained, Finding("error" if grave else "warning", *_small_words(m))))
-    found.sort(key=lambda one: -one[0])
-    return [finding for _, finding in found[:1]]  # one cause moves all of them a little
-
-
-def _least_shown(m: Measured) -> float:
-    """The least of its kind that is complained of: share, degrees or seconds."""
-    return max(_LEAST[m.kind], _SIGMAS * (m.sigma / m.value if m.kind == "scale" else m.sigma))
-
-
-def _not_shown(numbers: Sequence[Measured], runs: Sequence[Run], length_m: float) -> Finding:
-    """How large a mistake may be before this drive shows it: a short one shows little."""
-    least = {m.kind: _least_shown(m) for m in numbers}
-    told = [f"{least['scale']:.0%} of scale", f"{least['turn']:.0f} deg of heading"]
-    told += [f"{least['time']:.1f} s"] if "time" in least else []
-    what = f"in {len(runs)} runs of {length_m:.0f} m mistakes of the prior show from {', '.join(told)} on"
-    return Finding("note", what, "a longer drive with turns tells more")
-
-
-def _small_words(m: Measured) -> tuple[str, str]:
-    if m.kind == "scale":
-        what = f"prior and scans differ in scale: the prior is {m.value:.3f} times as large (+-{m.sigma:.3f})"
-        return what, "a projection's scale (Mercator), feet, or the sensor's calibration? Compare with a known length"
-    if m.kind == "time":
-        side = "late" if m.value > 0 else "early"
-        return f"the prior is {abs(m.value):.2f} s {side} (+-{m.sigma:.2f})", "shift its times against the scans"
-    if m.kind == "pitch":
-        what = f"the scans are pitched by {m.value:.1f} deg (+-{m.sigma:.1f}) against the prior's motion"
-        return what, "level the points, or put the sensor's pitch into T_base_lidar and the prior's rotations"
-    what = f"headings and scans are turned against each other by {m.value:.1f} deg (+-{m.sigma:.1f})"
-    return what, "mend the yaw of T_base_lidar, or of the prior"
-
-
 def _places(as_it_is: _Held, runs: Sequence[Run]) -> list[Finding]:
     usual = as_it_is.median
     bad = np.flatnonzero(as_it_is.misfit > 4.0 * usual + 1.0)
@@ -246,8 +205,7 @@ def _cannot_tell(
     if not like:
         return []
     names = "; ".join(reading.name for reading in like)
-    unusual = any(_is_left_handed(reading) for reading in like) and turns > 0.5 and clockwise
-    what = f"this drive cannot tell without a turn whether: {names}"
-    if unusual:
+    what = f"{CANNOT_TELL}: {names}"
+    if any(_is_left_handed(reading) for reading in like) and turns > 0.5 and clockwise:
         what += " (the points go round counter-clockwise, most sensors clockwise)"
-    return [Finding("warning" if unusual else "note", what, "check with a drive that turns, or against a map (--map)")]
+    return [Finding("warning", what, "check with a drive that turns, or against a map (--map)")]

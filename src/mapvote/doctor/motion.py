@@ -75,14 +75,15 @@ def starts_of_runs(n: int, T_map_lidar: F64 | None) -> I64:
     return np.unique(np.concatenate([most, even[::2]]))
 
 
-def follow(read: Callable[[int], F32], start: int, n: int, road: Road) -> Run:
-    """The run that begins at scan ``start`` of n. ``read`` gives a scan's points (m, 3); ``road`` is what they show."""
+def follow(read: Callable[[int], F32], start: int, n: int, road: Road, scans: int = SCANS) -> Run:
+    """The run that begins at scan ``start`` of n. ``read`` gives a scan's points (m, 3); ``road`` is what they show.
+    No more than ``scans`` are registered."""
     first = read(start)
     ndt_map = NdtMap(np.zeros(3), half_window_m=_HALF_WINDOW_M)
     ndt_map.enter(_near(first))
     indices, poses, fits = [start], [np.eye(4)], [1.0]
     i, step = start, 1
-    while len(indices) < SCANS and i + step < n:
+    while len(indices) < scans and i + step < n:
         i += step
         clouds = thin_for_levels(_near(read(i)))
         found = _registered(ndt_map, clouds, _guesses(indices, poses, i, UPS[road.up]), road)

@@ -16,6 +16,8 @@ _EMPTY_SECTOR = 0.05
 _SOME_SCANS = 0.05
 """A drive of which no larger share is spoilt can be used as it is, and the doctor warns."""
 
+_PERIOD_POINTS = 50_000
+
 
 def check_scans(drive: Drive, looks: Looks) -> list[Finding]:
     """Everything that shows without registering anything; of every scan."""
@@ -55,7 +57,9 @@ def _refused(drive: Drive, looks: Looks) -> list[Finding]:
 
 def _columns(drive: Drive, looks: Looks) -> list[Finding]:
     """A coordinate that is something else: an intensity, a constant."""
-    found = []
+    found = _period(drive, looks)
+    if found:
+        return found
     unit = np.median(looks.unit, axis=0)
     spread = np.median(looks.high - looks.low, axis=0)
     for axis, name in enumerate("xyz"):
@@ -68,6 +72,22 @@ def _columns(drive: Drive, looks: Looks) -> list[Finding]:
         elif np.median(looks.low[:, axis]) >= 0.0 and np.median(looks.rounded[:, 0]) < 0.9:
             found += _never_negative(drive, looks, name)
     return found
+
+
+def _period(drive: Drive, looks: Looks) -> list[Finding]:
+    """After how many numbers a scan repeats itself: neighbouring points are alike, column by column."""
+    scan = drive.read_scan(int(looks.index[len(looks.index) // 2]))
+    columns = [scan.points] if scan.intensity is None else [scan.points, scan.intensity]
+    rows = np.column_stack(columns)[:_PERIOD_POINTS].astype(np.float64)
+    width, flat = rows.shape[1], rows.ravel()
+    if len(flat) < 1000:
+        return []
+    unlike = {k: np.minimum(np.abs(flat[k:] - flat[:-k]), 20.0).mean() for k in range(2, 16) if k == width or k % width}
+    period = min(unlike, key=lambda k: unlike[k])
+    if unlike[period] > 0.5 * unlike[width]:
+        return []
+    what = f"the numbers of a scan repeat themselves after {period}, not after the {width} columns that were read"
+    return [Finding("error", what, "name all columns in their order: --columns x,y,z,intensity,ring")]
 
 
 def _never_negative(drive: Drive, looks: Looks, name: str) -> list[Finding]:
