@@ -77,12 +77,15 @@ def _columns(drive: Drive, looks: Looks) -> list[Finding]:
 def _period(drive: Drive, looks: Looks) -> list[Finding]:
     """After how many numbers a scan repeats itself: neighbouring points are alike, column by column."""
     scan = drive.read_scan(int(looks.index[len(looks.index) // 2]))
-    columns = [scan.points] if scan.intensity is None else [scan.points, scan.intensity]
-    rows = np.column_stack(columns)[:_PERIOD_POINTS].astype(np.float64)
-    width, flat = rows.shape[1], rows.ravel()
+    points = scan.points[:_PERIOD_POINTS].astype(np.float64)
+    # Intensities may have been scaled when they were read: their column only keeps its place.
+    flat = (points if scan.intensity is None else np.pad(points, ((0, 0), (0, 1)), constant_values=np.nan)).ravel()
+    width = len(flat) // max(len(points), 1)
     if len(flat) < 1000:
         return []
-    unlike = {k: np.minimum(np.abs(flat[k:] - flat[:-k]), 20.0).mean() for k in range(2, 16) if k == width or k % width}
+    unlike = {
+        k: np.nanmean(np.minimum(np.abs(flat[k:] - flat[:-k]), 20.0)) for k in range(2, 16) if k == width or k % width
+    }
     period = min(unlike, key=lambda k: unlike[k])
     if unlike[period] > 0.5 * unlike[width]:
         return []

@@ -1,0 +1,107 @@
+"""What is wrong by a little is named where the drive surely shows it; a drive that shows too little says so."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mapvote.core import geometry
+from mapvote.core.sensors import SENSORS
+from mapvote.core.types import F64, Drive, Scan
+from mapvote.doctor.finding import Finding
+from mapvote.doctor.frames import CANNOT_TELL, check_agreement
+from mapvote.doctor.motion import Run
+from mapvote.doctor.road import Road
+from mapvote.doctor.small import check_small
+from mapvote.doctor.whole import held_against
+
+ROAD = Road("+z", 1.8, 0.4, np.array([0.0, 0.0, 1.0]), 0.02)
+
+
+def along(metres: float, curved: bool = False) -> F64:
+    """Poses 0.7 m apart, straight on or in a bend."""
+    step = geometry.from_xyz_rpy(0.7, 0, 0, yaw=0.02 if curved else 0.0)
+    T = [geometry.from_xyz_rpy(3.0, -2.0, 1.8)]
+    while len(T) < metres / 0.7:
+        T.append(T[-1] @ step)
+    return np.stack(T)
+
+
+def straying(T: F64, sigma_m: float, seed: int = 1) -> F64:
+    """As a GNSS receiver strays: errors that last for ten seconds."""
+    rng, memory, error = np.random.default_rng(seed), np.exp(-0.01), np.zeros(3)
+    out = T.copy()
+    for one in out:
+        error = memory * error + np.sqrt(1 - memory**2) * rng.normal(0, sigma_m, 3)
+        one[:3, 3] += error
+    return out
+
+
+def smaller(T: F64, factor: float) -> F64:
+    out = T.copy()
+    out[:, :3, 3] *= factor
+    return out
+
+
+def run_of(T: F64, start: int, end: int, every: int = 3) -> Run:
+    indices = np.arange(start, end, every)
+    seen = np.array([geometry.inverse(T[start]) @ T[i] for i in indices])
+    return Run(indices, seen, np.full(len(indices), 0.9))
+
+
+def runs_of(T: F64) -> list[Run]:
+    return [run_of(T, start, start + 31) for start in range(0, len(T) - 31, 31)]
+
+
+def found_in(T: F64, prior: F64) -> list[Finding]:
+    stamps = np.arange(len(T)) * 100_000_000
+    return check_small(prior, run_of(T, 0, len(T)), runs_of(T), None, stamps)
+
+
+@pytest.mark.parametrize("curved", [False, True])
+def test_scale_and_heading_are_told_apart_within_their_errors(curved: bool) -> None:
+    T = along(150.0, curved)
+    turned = smaller(straying(T, 0.02), 0.97) @ geometry.from_xyz_rpy(0, 0, 0, yaw=np.radians(3.0))
+    whole = held_against(turned, run_of(T, 0, len(T)))
+    assert whole is not None
+    assert whole.scale.value == pytest.approx(0.97, abs=2 * whole.scale.sigma)
+    assert whole.turn.value == pytest.approx(3.0, abs=2 * whole.turn.sigma)
+    assert abs(whole.pitch.value) < 2 * whole.pitch.sigma
+    mended = whole.turn.poses(whole.scale.poses(turned))
+    again = held_against(mended, run_of(T, 0, len(T)))
+    assert again is not None
+    assert abs(again.turn.value) < 0.1
+    assert again.scale.value == pytest.approx(1.0, abs=0.001)
+
+
+def test_positions_four_per_cent_too_small_are_named_on_a_street_and_never_called_sound_on_forty_metres() -> None:
+    street, short = along(250.0), along(42.0)
+    for seed in range(5):
+        assert all(f.severity == "note" for f in found_in(street, straying(street, 0.3, seed)))
+        named = found_in(street, smaller(straying(street, 0.3, seed), 0.96))
+        assert any("differ in scale" in f.what for f in named if f.severity != "note"), named
+        unsure = found_in(short, smaller(straying(short, 0.6, seed), 0.96))
+        assert any(f.severity != "note" for f in unsure), unsure
+
+
+def test_a_prior_may_stray_without_being_blamed_for_it() -> None:
+    short = along(60.0)
+    for seed in range(5):
+        assert all(f.severity != "error" for f in found_in(short, straying(short, 0.8, seed)))
+
+
+def test_a_straight_street_along_x_cannot_tell_a_mirrored_track_and_a_bend_can() -> None:
+    for curved in (False, True):
+        T = along(120.0, curved)
+        mirrored = T * np.array([1.0, -1, 1, 1])[None, :, None]
+        mirrored[:, :3, :3] = T[:, :3, :3]
+        stamps = np.arange(len(T)) * 100_000_000
+        drive = Drive(Path("d"), "v", "d", SENSORS["hdl32e"], stamps, lambda i: Scan(0, np.zeros((0, 3), np.float32)))
+        found, _ = check_agreement(drive, mirrored, runs_of(T), ROAD, 0.0, lambda T=T: run_of(T, 0, len(T)))
+        told = [f.what for f in found if f.severity != "note"]
+        if curved:
+            assert any("the prior's track is mirrored" in what and CANNOT_TELL not in what for what in told), told
+        else:
+            assert any(what.startswith(CANNOT_TELL) and "track is mirrored" in what for what in told), told
