@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from functools import lru_cache
 
 import numba
 import numpy as np
 
 from mapvote.core.grid import CELL_SIZE, CELLS, TILE_CELLS, TileIndex
-from mapvote.core.ground_growing import STEP_M, UNREACHED, grow, tiles_around
+from mapvote.core.ground_growing import SEED, STEP_M, UNREACHED, grow, tiles_around
 from mapvote.core.types import F32, F64, I32, I64, U8, Bool
 
 KNOWN_M = 3.0
@@ -23,8 +23,8 @@ _AGREEING = 0.5
 """Share of the measured cells within 2.1 m that must agree before the ground may start from a cell."""
 _BROAD = 30
 """Cells of them that must, where a driven path has shown the ground: apart from it many points are reflections."""
-_NEAR_TILES = 64
-"""Planes kept while the windows around neighbouring tiles are looked at."""
+_NEAR_TILES = 128
+"""Planes kept, of 256 kB, while the windows around neighbouring tiles are looked at: three rows of them and more."""
 
 Heights = tuple[I64, F32]
 """(flat cell within its tile (n,), height (n,) in map metres) of points."""
@@ -74,8 +74,9 @@ def _lower_envelope(z: F64, straight: float, diagonal: float) -> None:
 
 
 @numba.njit(cache=True, nogil=True)
-def _supported(low: F64, reach: int, grade: float, share: float, least: int) -> F64:
-    """``low`` without the cells that too few of the known cells within ``reach`` cells agree with (inf instead).
+def _supported(low: F32, reach: int, grade: float, share: float, least: int) -> F32:
+    """``low`` without a rim of ``reach`` cells, and without the cells (inf instead) that too few of the known cells
+    within ``reach`` agree with.
 
     Agreement: within 0.3 m, and ``grade`` (metres per cell) times the distance more; by at least ``least`` cells and a
     ``share`` of them. Reflections below the road come singly or in small clusters far below all
@@ -83,22 +84,22 @@ def _supported(low: F64, reach: int, grade: float, share: float, least: int) -> 
     """
     rows, cols = low.shape
     plenty = share * (2 * reach + 1) ** 2
-    out = np.full_like(low, np.inf)
-    for r in range(rows):
-        for c in range(cols):
+    out = np.full((rows - 2 * reach, cols - 2 * reach), np.inf, np.float32)
+    for r in range(reach, rows - reach):
+        for c in range(reach, cols - reach):
             if not np.isfinite(low[r, c]):
                 continue
             known, agree = 0, 0
-            for i in range(max(r - reach, 0), min(r + reach + 1, rows)):
-                for j in range(max(c - reach, 0), min(c + reach + 1, cols)):
+            for i in range(r - reach, r + reach + 1):
+                for j in range(c - reach, c + reach + 1):
                     if np.isfinite(low[i, j]):
                         known += 1
                         apart = max(abs(i - r), abs(j - c))
-                        agree += abs(low[i, j] - low[r, c]) <= CELL_SIZE + grade * apart
+                        agree += abs(np.float64(low[i, j]) - np.float64(low[r, c])) <= CELL_SIZE + grade * apart
                 if agree >= plenty and agree > least:
                     break
             if agree > least and agree >= share * known:  # the cell itself is one of them
-                out[r, c] = low[r, c]
+                out[r - reach, c - reach] = low[r, c]
     return out
 
 
@@ -111,46 +112,35 @@ def lay_ground(points: Mapping[TileIndex, Heights], road: Mapping[TileIndex, Hei
     Tiles are asked for one by one, in ascending order: of a large map only the heights are held.
     """
     tiles = sorted(points)
-    start, heights = _by_cell(points[tile] for tile in tiles)
+    start, heights = _by_cell((points[tile] for tile in tiles), len(tiles))
     ground = np.full(len(tiles) * CELLS, np.nan, dtype=np.float32)
     gap = np.full(len(tiles) * CELLS, UNREACHED, dtype=np.uint8)
     neighbours = tiles_around(tiles)
-    least = 2
+    for k, tile in enumerate(tiles):
+        if tile in road:
+            cells, z = _lowest_of_each(*road[tile])
+            ground[k * CELLS + cells], gap[k * CELLS + cells] = z, SEED
     if road:
-        lowest = [(k, *_lowest_of_each(*road[tile])) for k, tile in enumerate(tiles) if tile in road]
-        cells = np.concatenate([np.empty(0, dtype=np.int64), *(k * CELLS + cell for k, cell, _ in lowest)])
-        z = np.concatenate([np.empty(0, dtype=np.float32), *(height for _, _, height in lowest)])
-        grow(cells, z, start, heights, neighbours, ground, gap)
-        least = _BROAD
-    seeds = _agreed(_Lows(start, heights, gap, ground), neighbours, least)
-    grow(seeds, heights[start[seeds]], start, heights, neighbours, ground, gap)
+        grow(start, heights, neighbours, ground, gap)
+    _sow(_Lows(start, heights, gap, ground), neighbours, _BROAD if road else 2)
+    grow(start, heights, neighbours, ground, gap)
     ground[gap > KNOWN_M / STEP_M] = np.nan
     return dict(zip(tiles, ground.reshape(-1, TILE_CELLS, TILE_CELLS), strict=True))
 
 
-def _by_cell(points: Iterable[Heights]) -> tuple[I32 | I64, F32]:
+def _by_cell(points: Iterable[Heights], tiles: int) -> tuple[I32 | I64, F32]:
     """(start (cells + 1,), heights (n,)): flat cell c has the points heights[start[c]:start[c + 1]], lowest first."""
-    counts, sorted_heights = [], []
-    for cells, z in points:
-        counts.append(np.bincount(cells, minlength=CELLS).astype(np.int32))
-        sorted_heights.append(z[np.lexsort((z, cells))])
-    n = sum(map(len, sorted_heights))
-    cells_and_end = len(counts) * CELLS + 1
-    few = n <= np.iinfo(np.int32).max
-    start: I32 | I64 = np.zeros(cells_and_end, dtype=np.int32) if few else np.zeros(cells_and_end, dtype=np.int64)
-    np.cumsum(np.concatenate(counts), out=start[1:])
-    counts.clear()
-    return start, _emptied(sorted_heights, n)
-
-
-def _emptied(parts: list[F32], n: int) -> F32:
-    """The parts, of n values together, as one array; each is let go once it is copied."""
-    out, done = np.empty(n, dtype=np.float32), 0
-    for i, part in enumerate(parts):
-        out[done : done + len(part)] = part
-        done += len(part)
-        parts[i] = np.empty(0, dtype=np.float32)
-    return out
+    start: I32 | I64 = np.zeros(tiles * CELLS + 1, dtype=np.int32)
+    heights, n = np.empty(0, dtype=np.float32), 0
+    for k, (cells, z) in enumerate(points):
+        if n + len(z) > np.iinfo(start.dtype).max:
+            start = start.astype(np.int64)
+        # Resized, not concatenated: nothing is there twice.
+        heights.resize(n + len(z), refcheck=False)
+        heights[n:] = z[np.lexsort((z, cells))]
+        start[k * CELLS + 1 : (k + 1) * CELLS + 1] = n + np.cumsum(np.bincount(cells, minlength=CELLS))
+        n += len(z)
+    return start, heights
 
 
 def _lowest_of_each(cells: I64, z: F32) -> Heights:
@@ -161,17 +151,17 @@ def _lowest_of_each(cells: I64, z: F32) -> Heights:
 
 
 class _Lows:
-    """What was known before ground starts anew: two planes a tile, worked out when they are asked for."""
+    """What was known before ground starts anew: planes of a tile, worked out when they are asked for."""
 
     def __init__(self, start: I32 | I64, heights: F32, gap: U8, ground: F32) -> None:
         self._start, self._heights, self._gap, self._ground = start, heights, gap, ground
 
-    def low(self, tile: int) -> F64:
+    def low(self, tile: int) -> F32:
         """(256, 256) the lowest point of each cell that no measured ground is near, inf where there is none."""
         cells = slice(tile * CELLS, (tile + 1) * CELLS)
         first = self._start[tile * CELLS : (tile + 1) * CELLS + 1]
         asked = (first[:-1] < first[1:]) & (self._gap[cells] > _BRIDGED_M / STEP_M)
-        low = np.full(CELLS, np.inf)
+        low = np.full(CELLS, np.inf, dtype=np.float32)
         low[asked] = self._heights[first[:-1][asked]]
         return low.reshape(TILE_CELLS, TILE_CELLS)
 
@@ -181,23 +171,30 @@ class _Lows:
         known: F32 = np.where(self._gap[cells] > _BRIDGED_M / STEP_M, np.inf, self._ground[cells])
         return known.reshape(TILE_CELLS, TILE_CELLS)
 
+    def sow(self, tile: int, lies: Bool) -> None:
+        """Ground shall grow from the cells ``lies`` (256, 256) of a tile, from their lowest points."""
+        cells = tile * CELLS + np.flatnonzero(lies)
+        self._ground[cells], self._gap[cells] = self._heights[self._start[cells]], SEED
 
-def _agreed(lows: _Lows, neighbours: I32, least: int) -> I64:
-    """(m,) flat cells whose lowest point most cells around agree with, and which no lower ground explains as things."""
+
+def _sow(lows: _Lows, neighbours: I32, least: int) -> None:
+    """Seeds: cells whose lowest point most cells around agree with, and which no lower ground explains as things."""
     low = lru_cache(maxsize=_NEAR_TILES)(lows.low)
-    nothing = np.full((TILE_CELLS, TILE_CELLS), np.inf)
+    nothing = np.full((TILE_CELLS, TILE_CELLS), np.inf, dtype=np.float32)
+    near = slice(TILE_CELLS - _AROUND_CELLS, 2 * TILE_CELLS + _AROUND_CELLS)
     own = slice(TILE_CELLS, 2 * TILE_CELLS)
-    found = []
-    for k, around in enumerate(neighbours):
-        if not np.isfinite(low(k)).any():
-            continue
-        window = np.block([[low(j) if j >= 0 else nothing for j in row] for row in around.tolist()])
-        window = _supported(window, _AROUND_CELLS, _GRADE * CELL_SIZE, _AGREEING, least)
-        if not np.isfinite(window[own, own]).any():
-            continue
-        known = np.block([[lows.known(j) if j >= 0 else nothing for j in row] for row in around.tolist()])
-        envelope = np.minimum(window, known)
-        _lower_envelope(envelope, _GRADE * CELL_SIZE, _GRADE * CELL_SIZE * np.sqrt(2.0))
-        lies: Bool = np.isfinite(window[own, own]) & (window[own, own] <= envelope[own, own] + 0.1)
-        found.append(k * CELLS + np.flatnonzero(lies))
-    return np.concatenate(found) if found else np.empty(0, dtype=np.int64)
+
+    def window(tile: int, plane: Callable[[int], F32]) -> F32:
+        return np.block([[plane(j) if j >= 0 else nothing for j in row] for row in neighbours[tile].tolist()])
+
+    @lru_cache(maxsize=_NEAR_TILES)
+    def supported(tile: int) -> F32:
+        if not np.isfinite(low(tile)).any():
+            return nothing
+        return _supported(window(tile, low)[near, near], _AROUND_CELLS, _GRADE * CELL_SIZE, _AGREEING, least)
+
+    for k in range(len(neighbours)):
+        if np.isfinite(supported(k)).any():
+            envelope = np.minimum(window(k, supported), window(k, lows.known)).astype(np.float64)
+            _lower_envelope(envelope, _GRADE * CELL_SIZE, _GRADE * CELL_SIZE * np.sqrt(2.0))
+            lows.sow(k, np.isfinite(supported(k)) & (supported(k) <= envelope[own, own] + 0.1))

@@ -23,6 +23,8 @@ WIDEST = 100
 """Units: 15 m. Ground does not go on across a wider gap."""
 UNREACHED = 255
 """Gap of a cell that the ground never came to."""
+SEED = 254
+"""Gap of a cell from which it shall grow."""
 _NEAR_CELLS = 5
 """Ground this near (1.5 m) bounds how high and how low a point may be."""
 _NOISE_M = 0.06
@@ -117,39 +119,51 @@ def _append(queue: I32, first: I32, last: I32, following: I32, width: int, entry
 
 
 @numba.njit(cache=True, nogil=True)
-def grow(seeds: I64, seed_z: F32, start: I32 | I64, heights: F32, neighbours: I32, ground: F32, gap: U8) -> None:
-    """Let the ground grow from ``seeds`` (m,), flat cells with the height (m,) at which it is known to lie.
+def _enter(
+    cell: int, z: float, width: int, start: I32 | I64, heights: F32, neighbours: I32, ground: F32, gap: U8
+) -> None:
+    """The ground comes to a cell: as it was measured there, else at the height ``z``, ``width`` from what was."""
+    measured = _continued(cell, z, width, start, heights, ground, gap, neighbours)
+    if np.isfinite(measured):
+        ground[cell], gap[cell] = measured, 0
+    else:
+        ground[cell], gap[cell] = z, width
+
+
+@numba.njit(cache=True, nogil=True)
+def grow(start: I32 | I64, heights: F32, neighbours: I32, ground: F32, gap: U8) -> None:
+    """Let the ground grow from where it is known to lie: cells whose ``gap`` is SEED, at the height ``ground``.
 
     ``heights[start[c]:start[c + 1]]`` are the points of flat cell c = tile * CELLS + row * TILE_CELLS + col, metres;
     ``neighbours`` (tiles, 3, 3) the tiles around each, -1 where the map has none. In place: ``ground`` (cells,) metres,
     ``gap`` (cells,) the distance to measured ground in units of STEP_M, UNREACHED where ground did not come.
+
+    Seeds are all entered before any of them is left: only the rim of what they cover waits in the queue.
     """
-    capacity = max(1024, len(seeds))
-    cells, expected = np.empty(capacity, np.int64), np.empty(capacity, np.float32)
-    following = np.empty(capacity, np.int32)
+    for cell in range(len(gap)):
+        if gap[cell] == SEED:
+            _enter(cell, ground[cell], 1, start, heights, neighbours, ground, gap)
+    cells, expected = np.empty(1024, np.int64), np.empty(1024, np.float32)
+    following = np.empty(1024, np.int32)
     first, last = np.full(WIDEST + 4, -1, np.int32), np.full(WIDEST + 4, -1, np.int32)
-    n = 0
-    for k in range(len(seeds)):
-        cells[n], expected[n] = seeds[k], seed_z[k]
-        _append(first, first, last, following, 1, n)
-        n += 1
-    spare = -1
-    width = 0
+    n, spare, width, looked_at = 0, -1, 0, 0
     while width <= WIDEST:
-        entry = first[width]
-        if entry < 0:
-            width += 1
-            continue
-        first[width] = following[entry]
-        cell, z = cells[entry], expected[entry]
-        following[entry], spare = spare, entry
-        if gap[cell] <= width:
-            continue
-        measured = _continued(cell, z, width, start, heights, ground, gap, neighbours)
-        if np.isfinite(measured):
-            ground[cell], gap[cell] = measured, 0
+        if looked_at < len(gap):
+            cell = looked_at
+            looked_at += 1
+            if gap[cell] > 1:
+                continue
         else:
-            ground[cell], gap[cell] = z, width
+            entry = first[width]
+            if entry < 0:
+                width += 1
+                continue
+            first[width] = following[entry]
+            cell = cells[entry]
+            following[entry], spare = spare, entry
+            if gap[cell] <= width:
+                continue
+            _enter(cell, expected[entry], width, start, heights, neighbours, ground, gap)
         here = int(gap[cell])
         tile, row, col = cell // CELLS, cell % CELLS // TILE_CELLS, cell % TILE_CELLS
         for i in range(-1, 2):
