@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -99,9 +100,26 @@ def test_a_straight_street_along_x_cannot_tell_a_mirrored_track_and_a_bend_can()
         mirrored[:, :3, :3] = T[:, :3, :3]
         stamps = np.arange(len(T)) * 100_000_000
         drive = Drive(Path("d"), "v", "d", SENSORS["hdl32e"], stamps, lambda i: Scan(0, np.zeros((0, 3), np.float32)))
-        found, _ = check_agreement(drive, mirrored, runs_of(T), ROAD, 0.0, lambda T=T: run_of(T, 0, len(T)))
+        found, _ = check_agreement(drive, mirrored, runs_of(T), ROAD, 0.0, partial(run_of, T, 0, len(T)))
         told = [f.what for f in found if f.severity != "note"]
         if curved:
             assert any("the prior's track is mirrored" in what and CANNOT_TELL not in what for what in told), told
         else:
             assert any(what.startswith(CANNOT_TELL) and "track is mirrored" in what for what in told), told
+
+
+def test_on_a_straight_street_turned_scans_swapped_axes_and_turned_headings_are_named_together() -> None:
+    T = along(120.0)
+    stamps = np.arange(len(T)) * 100_000_000
+    drive = Drive(Path("d"), "v", "d", SENSORS["hdl32e"], stamps, lambda i: Scan(0, np.zeros((0, 3), np.float32)))
+    for yaw_deg, name in ((90, "x and y of the scans are swapped"), (180, "in reverse order")):
+        turned = [
+            Run(run.indices, C @ run.T_first_lidar @ geometry.inverse(C), run.fit)
+            for C in (geometry.from_xyz_rpy(0, 0, 0, yaw=np.radians(yaw_deg)),)
+            for run in runs_of(T)
+        ]
+        (error,) = check_agreement(drive, T, turned, ROAD, 0.0, partial(run_of, T, 0, len(T)))[0]
+        assert error.severity == "error"
+        assert f"the scans are turned by {yaw_deg} deg" in error.what
+        assert name in error.what
+        assert "cannot tell which" in error.what

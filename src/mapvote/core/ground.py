@@ -95,7 +95,8 @@ def _supported(low: F32, reach: int, grade: float, share: float, least: int) -> 
                     if np.isfinite(low[i, j]):
                         known += 1
                         apart = max(abs(i - r), abs(j - c))
-                        agree += abs(np.float64(low[i, j]) - np.float64(low[r, c])) <= CELL_SIZE + grade * apart
+                        if abs(np.float64(low[i, j]) - np.float64(low[r, c])) <= CELL_SIZE + grade * apart:
+                            agree += 1
                 if agree >= plenty and agree > least:
                     break
             if agree > least and agree >= share * known:  # the cell itself is one of them

@@ -128,6 +128,18 @@ def _in_map_axes(T: F64) -> F64:
     return out
 
 
+def _quarter_turns(yaw_deg: int) -> tuple[Reading, Reading]:
+    """What custom confuses, of the scans and of the prior: both move the same way."""
+    rule = turned(yaw_deg=-yaw_deg)
+    axes = {90: "x right, y forward", -90: "x left, y to the rear", 180: "facing backwards"}[yaw_deg]
+    scans = f"the scans are turned by {yaw_deg} deg about z ({axes})"
+    prior = f"the prior's headings are off by {yaw_deg} deg, counter-clockwise"
+    return (
+        Reading(scans, "turn the points, or T_base_lidar, so that x is forward", rule, "scans"),
+        Reading(prior, f"turn its rotations by {-yaw_deg} deg about z", rule),
+    )
+
+
 AS_IT_IS = Reading("as it is", "", lambda T: T)
 STILL = Reading("the scans do not move against each other", "", _still, "scans")
 READINGS = (
@@ -168,6 +180,7 @@ READINGS = (
         lambda T: np.asarray(T @ np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])),
         told_by="scans",
     ),
+    *(reading for yaw_deg in (90, -90, 180) for reading in _quarter_turns(yaw_deg)),
     Reading(
         "the scans are turned into the map's axes already, about the sensor",
         "turn the points back by the prior's rotation, or give poses without rotation",
