@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from mapvote.core.grid import TileIndex
-from mapvote.core.lazy_tiles import KEPT_POINTS, LazyTiles
+from mapvote.core.lazy_tiles import LazyTiles
 from mapvote.core.point_map import PointMap, all_points
 from mapvote.core.tile import Tile
 from mapvote.core.types import F64, MapvoteError
@@ -26,6 +26,8 @@ _FAR_M = 50_000.0
 _SLOPE_DEG = 6.0
 _SPARSE_M = 0.4
 """Points farther apart make patterns of their own."""
+_MIDDLE_POINTS = 4_000_000
+"""Of a map larger than memory so many show its ground and copies."""
 
 
 def examine_map(path: Path) -> tuple[list[Finding], PointMap | None]:
@@ -81,14 +83,14 @@ def check_map(point_map: PointMap) -> list[Finding]:
 
 
 def _around_the_middle(point_map: PointMap) -> PointMap:
-    """The map, or of one that is larger than memory the tiles nearest to the middle, as many as there is room for."""
+    """The map, or of one that is larger than memory the tiles nearest to the middle."""
     if not isinstance(point_map.tiles, LazyTiles):
         return point_map
     row, col = np.median(np.array(list(point_map.tiles)), axis=0)
     nearest = sorted(point_map.tiles, key=lambda index: (np.hypot(index[0] - row, index[1] - col), index))
     chosen: dict[TileIndex, Tile] = {}
     for index in nearest:
-        if chosen and sum(len(tile.points) for tile in chosen.values()) > KEPT_POINTS:
+        if chosen and sum(len(tile.points) for tile in chosen.values()) > _MIDDLE_POINTS:
             break
         chosen[index] = point_map.tiles[index]
     return replace(point_map, tiles=dict(sorted(chosen.items())))
