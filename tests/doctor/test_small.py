@@ -120,6 +120,6 @@ def test_on_a_straight_street_turned_scans_swapped_axes_and_turned_headings_are_
         ]
         (error,) = check_agreement(drive, T, turned, ROAD, 0.0, partial(run_of, T, 0, len(T)))[0]
         assert error.severity == "error"
-        assert f"the scans are turned by {yaw_deg} deg" in error.what
+        assert f"turned by {yaw_deg} deg about z" in error.what
         assert name in error.what
         assert "cannot tell which" in error.what

@@ -131,11 +131,14 @@ def _in_map_axes(T: F64) -> F64:
 def _quarter_turns(yaw_deg: int) -> tuple[Reading, Reading]:
     """What custom confuses, of the scans and of the prior: both move the same way."""
     rule = turned(yaw_deg=-yaw_deg)
-    axes = {90: "x right, y forward", -90: "x left, y to the rear", 180: "facing backwards"}[yaw_deg]
-    scans = f"the scans are turned by {yaw_deg} deg about z ({axes})"
+    scans = {
+        90: "the scans are turned by 90 deg about z (x right, y forward)",
+        -90: "the scans are turned by -90 deg about z (x left, y to the rear)",
+        180: "the scans face backwards (x to the rear): they are turned by 180 deg about z",
+    }
     prior = f"the prior's headings are off by {yaw_deg} deg, counter-clockwise"
     return (
-        Reading(scans, "turn the points, or T_base_lidar, so that x is forward", rule, "scans"),
+        Reading(scans[yaw_deg], "turn the points, or T_base_lidar, so that x is forward", rule, "scans"),
         Reading(prior, f"turn its rotations by {-yaw_deg} deg about z", rule),
     )
 
