@@ -123,3 +123,12 @@ def test_on_a_straight_street_turned_scans_swapped_axes_and_turned_headings_are_
         assert f"turned by {yaw_deg} deg about z" in error.what
         assert name in error.what
         assert "cannot tell which" in error.what
+
+
+def test_a_place_where_a_scan_does_not_fit_those_before_it_is_named() -> None:
+    T = along(120.0)
+    chain = run_of(T, 0, len(T))
+    fit = np.where(np.arange(len(chain.fit)) == 20, 0.3, chain.fit)
+    stamps = np.arange(len(T)) * 100_000_000
+    told = check_small(T, Run(chain.indices, chain.T_first_lidar, fit), runs_of(T), None, stamps)
+    assert any("between scans 57 and 60" in f.what for f in told), told

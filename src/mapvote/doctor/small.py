@@ -24,15 +24,27 @@ _SHORT = 0.05
 
 def check_small(T: F64, chain: Run, runs: Sequence[Run], time: Measured | None, stamps_ns: I64) -> list[Finding]:
     """Of the prior's poses T (n, 4, 4): scale, turn and pitch by the chain, the shift in time by the runs as well."""
+    broken = _broken(chain)
     chain = unbroken(chain)
     whole = held_against(T, chain)
     if time is not None and _shows(time, T, runs) and strays_less(T, stamps_ns, time.value, chain) > 0.2:
         grave = abs(time.value) > 2.0 * _LEAST["time"]
-        return [Finding("error" if grave else "warning", *small_words(time))]
+        return [*broken, Finding("error" if grave else "warning", *small_words(time))]
     if whole is None:
-        return [Finding("warning", "too few scans fit each other to measure scale and heading", "drive farther")]
-    found = [f for m in (whole.scale, whole.turn, whole.pitch) for f in _told(m)]
+        what = "too few scans fit each other to measure scale and heading"
+        return [*broken, Finding("warning", what, "drive farther")]
+    found = broken + [f for m in (whole.scale, whole.turn, whole.pitch) for f in _told(m)]
     return found or [_not_shown(whole, time)]
+
+
+def _broken(chain: Run) -> list[Finding]:
+    """Where a scan does not fit those before it, though the runs do by themselves."""
+    after = len(unbroken(chain).indices)
+    if after == len(chain.indices):
+        return []
+    before, scan = chain.indices[after - 1], chain.indices[after]
+    what = f"between scans {before} and {scan} the sensor is elsewhere at once: they do not fit each other"
+    return [Finding("warning", what, "are scans missing there, or out of order?")]
 
 
 def _shows(time: Measured, T: F64, runs: Sequence[Run]) -> bool:
