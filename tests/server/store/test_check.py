@@ -96,6 +96,7 @@ def test_what_is_damaged_hides_nothing_else_from_whoever_looks(store: Store) -> 
         assert [standing.vehicle for standing in vehicle_standings(store)] == ["a", "b", "c"]
         assert evidence(store, (0, 0))[CELL][0] == 2, "vehicles"
         assert np.frombuffer(Clouds(store).overview(2), "<u4")[1] == 1, "tiles"
+        assert np.frombuffer(Clouds(store).changed(1, 2)[:8], "<i4").tolist() == [0, 0]
         check(store, mend=True)
 
 

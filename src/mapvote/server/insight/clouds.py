@@ -5,11 +5,13 @@ from __future__ import annotations
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from mapvote.core.grid import TILE_CELLS, Lattice, TileIndex
 from mapvote.core.rows import found_among
+from mapvote.core.tile import Tile
 from mapvote.core.types import F64, I64, NO_VOTE, U8, CellState, MapvoteError
 from mapvote.fusion.probability import alike_beside, change_probability
 from mapvote.fusion.tile_vote import TileVote
@@ -96,30 +98,39 @@ class Clouds:
         for index, hashes in tiles.items():
             if stop():
                 return None
-            try:
-                with self._store.database.reading() as connection:
-                    tile = load_tile(connection, _ANYWHERE, TileHashes(hashes.points, hashes.ground, None))
-            except Unavailable:
-                raise
-            except MapvoteError:
-                continue  # damaged: who asks for the tile itself is told
-            made.append((index, make_levels(tile.points, tile.ground_z, _SPARE * OVERVIEW_POINTS // len(tiles))))
+            for tile in self._sound(hashes):
+                made.append((index, make_levels(tile.points, tile.ground_z, _SPARE * OVERVIEW_POINTS // len(tiles))))
         return made
+
+    def _sound(self, *states: TileHashes | None) -> list[Tile]:
+        """Points and ground of tiles; none where one is damaged: who asks for the tile itself is told."""
+        try:
+            with self._store.database.reading() as connection:
+                return [load_tile(connection, _ANYWHERE, h and replace(h, free=None, memory=None)) for h in states]
+        except Unavailable:
+            raise
+        except MapvoteError:
+            return []
 
     def changed(self, old: int, new: int) -> bytes:
         """What came and went from version ``old`` to ``new``: of each tile that differs int32 row, int32 col, the
-        points that only ``old`` has, then those that only ``new`` has, both as :func:`cloud_bytes`.
+        points that only ``old`` has, then those that only ``new`` has, both as :func:`cloud_bytes`. Damaged tiles are
+        left out.
 
         NotFound if one of the versions does not exist.
         """
-        told = []
         with self._store.database.reading() as connection:
-            for index, *pair in tiles_that_differ(connection, old, new):
-                before, after = (load_tile(connection, _ANYWHERE, hashes) for hashes in pair)
-                ground = (after if pair[1] is not None else before).ground_z
-                gone, come = ~found_among(before.points, after.points), ~found_among(after.points, before.points)
-                told.append(np.array(index, dtype="<i4").tobytes())
-                told += [cloud_bytes(*pack(some, ground)) for some in (before.points[gone], after.points[come])]
+            differ = tiles_that_differ(connection, old, new)
+        told = []
+        for index, *states in differ:
+            pair = self._sound(*states)
+            if not pair:
+                continue
+            before, after = pair
+            ground = (after if states[1] is not None else before).ground_z
+            gone, come = ~found_among(before.points, after.points), ~found_among(after.points, before.points)
+            told.append(np.array(index, dtype="<i4").tobytes())
+            told += [cloud_bytes(*pack(some, ground)) for some in (before.points[gone], after.points[come])]
         return b"".join(told)
 
 
