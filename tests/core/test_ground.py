@@ -119,3 +119,14 @@ def test_a_parked_car_and_a_hedge_do_not_lift_the_ground() -> None:
     hedge = np.column_stack([spread(rng, 4000, (0, 30), (20, 21)), rng.uniform(0.05, 1.2, 4000)])
     ground = ground_of(road[free], car, hedge, road=driven((0, 30), 3.0))
     assert np.abs(ground).max() < 0.2
+
+
+def test_the_sidewalk_begins_a_cell_behind_its_kerb_at_most_though_mixed_pixels_lie_at_the_foot_of_it() -> None:
+    rng = np.random.default_rng(9)
+    street = spread(rng, 40_000, (0, 30), (0, 30))
+    kerb = street[:, 1] > 10.0
+    road, walk = at(street[~kerb], 0.0), at(street[kerb], 0.15)
+    mixed = np.column_stack([spread(rng, 150, (0, 30), (9.9, 10.6)), rng.uniform(-0.4, -0.1, 150)])
+    ground = ground_of(road, walk, mixed, road=driven((0, 30), 5.0))
+    assert np.abs(ground[:33]).max() < 0.05
+    assert np.abs(ground[35:] - 0.15).max() < 0.05

@@ -32,7 +32,12 @@ _NOISE_M = 0.06
 _CLIMB, _FALL = 0.15, 0.5
 """Steepest ground, metres per metre. A steeper rise is a thing that stands there; a steep fall must be a broad one."""
 _BROAD = 14
-"""Cells of the 24 around that fall as steeply, before a steep fall is ground: reflections make patches of 12."""
+"""Cells of the 24 around at a like height, before what lies off the expected ground is ground: a steep fall, a kerb's
+step up, a surface between measurements that contradict each other. Reflections make patches of 12."""
+_KERB_M = 0.2
+"""How much more than a slope a step up may rise and be ground: a kerb."""
+_OPEN_M = 1.0
+"""Room above what lies on a kerb: a car's underside has none."""
 _BEYOND_GAP = 2
 """Cells of them that hold points at a like height, before the ground goes on beyond a gap."""
 
@@ -62,9 +67,21 @@ def _bounds(tile: int, row: int, col: int, ground: F32, gap: U8, neighbours: I32
 
 @numba.njit(cache=True, nogil=True)
 def _like(
-    tile: int, row: int, col: int, z: float, grade: float, below: float, start: I32 | I64, heights: F32, neighbours: I32
+    tile: int,
+    row: int,
+    col: int,
+    z: float,
+    grade: float,
+    below: float,
+    clear: float,
+    start: I32 | I64,
+    heights: F32,
+    neighbours: I32,
 ) -> int:
-    """How many of the 24 cells around hold a point ``below`` and at the height ``z``, give or take noise and grade."""
+    """How many of the 24 cells around hold a point ``below`` and at the height ``z``, give or take noise and grade.
+
+    Only points count that have no other within ``clear`` metres above them.
+    """
     found = 0
     for i in range(-2, 3):
         for j in range(-2, 3):
@@ -73,7 +90,8 @@ def _like(
                 continue
             most = _NOISE_M + grade * CELL_SIZE * max(abs(i), abs(j))
             for k in range(start[other], start[other + 1]):
-                if abs(heights[k] - z) <= most and heights[k] < below:
+                alone = k + 1 == start[other + 1] or heights[k + 1] - heights[k] >= clear
+                if abs(heights[k] - z) <= most and heights[k] < below and alone:
                     found += 1
                     break
     return found
@@ -89,22 +107,30 @@ def _continued(
         return np.nan
     low, steep, high = _bounds(tile, row, col, ground, gap, neighbours)
     near = np.isfinite(low)
-    if not near or low > high:
+    torn = low > high  # what was measured on both sides of a kerb
+    if not near or torn:
         low, high = expected - _NOISE_M - _CLIMB * STEP_M * width, expected + _NOISE_M + _CLIMB * STEP_M * width
         steep = low
-    best, falls = np.nan, np.nan
+    best, falls, rises = np.nan, np.nan, np.nan
     for k in range(start[cell], start[cell + 1]):
         z = heights[k]
         if low <= z <= high and not abs(best - expected) <= abs(z - expected):
             best = z
         if steep <= z < low and not falls >= z:
             falls = z
-    if np.isfinite(best):
-        broad = near or _like(tile, row, col, best, _CLIMB, np.inf, start, heights, neighbours) >= _BEYOND_GAP
-        return best if broad else np.nan
-    if np.isfinite(falls) and _like(tile, row, col, falls, _FALL, low, start, heights, neighbours) >= _BROAD:
-        return falls
-    return np.nan
+        if near and high < z <= high + _KERB_M and not rises <= z:
+            rises = z
+    if near and not torn and abs(best - expected) <= _NOISE_M:
+        return best
+    grade, below, clear, least = _CLIMB, np.inf, 0.0, _BROAD if near else _BEYOND_GAP
+    if not np.isfinite(best):
+        best, clear, least = rises, _OPEN_M, _BROAD
+        if np.isfinite(falls):
+            best, grade, below, clear = falls, _FALL, low, 0.0
+    if not np.isfinite(best):
+        return np.nan
+    alike = _like(tile, row, col, best, grade, below, clear, start, heights, neighbours)
+    return best if alike >= least else np.nan
 
 
 @numba.njit(cache=True, nogil=True)
