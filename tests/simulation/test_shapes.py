@@ -172,6 +172,15 @@ def test_the_mesh_of_the_ground_is_its_height_and_has_no_holes() -> None:
     assert area(flat) == pytest.approx((x1 - x0) * (y1 - y0)), "seen from above, every place is covered once"
 
 
+@pytest.mark.parametrize("name", ["corner", "street", "junction"])
+def test_the_mesh_of_the_carriageway_keeps_to_its_height_up_to_both_kerbs(name: str) -> None:
+    terrain = make_terrain(load_scenario(name), np.random.default_rng(4))
+    middles = terrain.triangles().mean(axis=1)
+    road = middles[terrain.road_distance(middles[:, 0], middles[:, 1]) < KERB_M - 0.01]
+    assert len(road) > 100
+    np.testing.assert_allclose(road[:, 2], terrain.height(road[:, 0], road[:, 1]), atol=0.03)
+
+
 def test_the_kerb_is_a_step_of_15_cm_on_both_sides_of_the_road() -> None:
     scenario = load_scenario("corner")
     terrain = make_terrain(scenario, np.random.default_rng(4))

@@ -50,7 +50,9 @@ class Terrain:
     def triangles(self) -> F64:
         """The ground as a mesh that follows :meth:`height`, kerbs included."""
         xs = np.arange(-MARGIN_M, self.length + MARGIN_M + 1.0, 2.0)
-        kerb = np.array([-SIDEWALK_M, -KERB_M - 0.01, -KERB_M, -3.5, 0.0, 3.5, KERB_M, KERB_M + 0.01, SIDEWALK_M])
+        # The gutter is just within the kerb: on it, rounding would decide whether the road or the sidewalk is there.
+        side = np.array([3.5, KERB_M - 0.005, KERB_M + 0.005, SIDEWALK_M])
+        kerb = np.concatenate([-side[::-1], [0.0], side])
         plots = np.array([18.0, 25.0, 34.2, 45.0, 60.0, 80.0])
         ys = self.axis_y + np.concatenate([-plots, kerb, plots])
         if self.crossing_x is not None:
