@@ -75,6 +75,7 @@ def test_info_of_a_drive_and_doctor(tmp_path: Path, run: CliRunner) -> None:
     assert "not a multiple of 16" in invoke(run, "doctor", tmp_path / "d", code=1)
 
 
+@pytest.mark.slow
 def test_the_doctor_takes_maps_stores_and_no_server(tmp_path: Path, run: CliRunner) -> None:
     write_pcd(tmp_path / "a.pcd", Cloud(1000.0 * cloud()))
     assert "millimetres, or centimetres?" in invoke(run, "doctor", tmp_path / "a.pcd", code=1)

@@ -157,6 +157,7 @@ def test_ctrl_c_while_writing_leaves_what_was_there_and_no_litter(what: str, mad
         assert (here / "out" / "manifest.json").read_bytes() == (made / "my_map" / "manifest.json").read_bytes()
 
 
+@pytest.mark.slow
 def test_ctrl_c_between_the_two_renames_of_a_map_brings_the_old_one_back(made: Path, desk: Desk) -> None:
     here = desk("my_map", "car_1.ballot")
     shutil.copytree(made / "my_map", here / "out")

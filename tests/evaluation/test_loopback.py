@@ -53,6 +53,7 @@ def test_by_http_and_by_files_the_map_is_the_same(tmp_path: Path) -> None:
     assert np.array_equal(all_points(done.updated), all_points(offline))
 
 
+@pytest.mark.slow
 def test_a_server_that_cannot_start_says_why(tmp_path: Path) -> None:
     with (
         pytest.raises(MapvoteError, match="did not start"),

@@ -88,6 +88,7 @@ def test_truth_names_what_was_built_and_demolished(corner: Path) -> None:
     assert (float(truth["x0"]), float(truth["y0"]), float(truth["cell_size"])) == (0.0, 0.0, 0.3)
 
 
+@pytest.mark.slow
 def test_same_seed_same_bytes_whatever_the_number_of_processes(tmp_path: Path) -> None:
     simulate("corner", tmp_path / "a", seed=5, overrides=FEW, workers=1)
     simulate("corner", tmp_path / "b", seed=5, overrides=FEW, workers=2)

@@ -89,6 +89,7 @@ def test_without_a_prior_the_first_scan_is_the_frame() -> None:
     assert np.linalg.norm(report.tracks[0].T_map_lidar[-1, :3, 3] - relative[-1, :3, 3]) < 0.2
 
 
+@pytest.mark.slow
 def test_coarse_priors_place_the_map_together_and_do_not_bend_it() -> None:
     coarse = noisy(SURVEY, 5, 0.5, 1.0)
     coarse[0, :3, 3] += [6.0, -4.0, 0.0]  # the first of them founds nothing
@@ -120,6 +121,7 @@ def test_a_gap_in_the_survey_is_bridged() -> None:
     assert errors(track.T_map_lidar, np.array([rigid @ T for T in poses]))[0] < 0.1
 
 
+@pytest.mark.slow
 def test_a_second_survey_may_begin_where_the_first_has_not_been() -> None:
     far = path(12, 60.0)
     near = path(12, -70.0)

@@ -68,6 +68,7 @@ def test_movers_are_no_new_objects(old_map: PointMap) -> None:
     assert not (detector.states() == CellState.CHANGED_OCCUPIED).any()
 
 
+@pytest.mark.slow
 def test_evidence_finds_them_too_and_says_nothing_about_what_is_hidden(old_map: PointMap) -> None:
     points, obstacle = today()
     reference = reference_window(old_map, GRID)

@@ -44,6 +44,7 @@ def states_of(ballot: Ballot) -> np.ndarray:
     return unpack_states(ballot.tiles[0].states)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ATTACKS)
 def test_a_lie_is_a_ballot_like_any_other(name: str) -> None:
     point_map = two_walls()

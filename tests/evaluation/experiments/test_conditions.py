@@ -61,6 +61,7 @@ def corner(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
+@pytest.mark.slow
 def test_true_movers_know_the_scans_of_a_thinned_drive_by_their_stamps(corner: Path) -> None:
     truth, whole = read_truth(corner), open_drive(corner / "v1")
     thinned: Drive = open_drive(corner / "v1", scans="::3")

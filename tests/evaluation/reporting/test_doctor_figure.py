@@ -21,6 +21,7 @@ def diagnosis() -> Diagnosis:
     return Diagnosis([Finding("error", "the prior is 3 m off", "move it")], drive, moved, poses)
 
 
+@pytest.mark.slow
 def test_the_picture_is_the_same_each_time_and_shows_the_map(tmp_path: Path, diagnosis: Diagnosis) -> None:
     point_map = map_from_points(np.random.default_rng(1).uniform(0, 20, (2000, 3)))
     for name in ("one.png", "two.png"):

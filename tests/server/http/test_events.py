@@ -88,6 +88,7 @@ def receiver() -> Iterator[tuple[str, Posts]]:
     listener.server_close()
 
 
+@pytest.mark.slow
 def test_a_webhook_is_signed_and_sent_again_until_it_is_taken(
     store: Path, tmp_path: Path, receiver: tuple[str, Posts]
 ) -> None:

@@ -98,6 +98,7 @@ def storm(site: Site, n: int, seed: int) -> Counter[int]:
     return answers
 
 
+@pytest.mark.slow
 def test_500_mutated_ballots(site: Site) -> None:
     answers = storm(site, 500, seed=1)
     assert answers[422] > 250, answers

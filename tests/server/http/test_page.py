@@ -251,6 +251,7 @@ def test_what_lies_in_the_middle_is_chosen_by_keyboard(browser: Chromium, store:
             enter(browser, "document.querySelector('#details .close')")
 
 
+@pytest.mark.slow
 def test_tab_alone_comes_to_every_control_that_is_shown(browser: Chromium, store: Path, tmp_path: Path) -> None:
     with serving(store, "--open", log=tmp_path / "log") as (url, _):
         ready(browser, url)

@@ -61,6 +61,7 @@ def test_without_keys_a_server_starts_only_if_told_to_be_open(tmp_path: Path) ->
     assert "--open" in done.stderr
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("host", ["0.0.0.0", "::", "192.0.2.1"])
 def test_an_open_server_is_for_this_machine_alone(tmp_path: Path, host: str) -> None:
     Store.create(f"sqlite:///{tmp_path / 's.db'}", two_walls()).close()
@@ -94,6 +95,7 @@ def test_a_password_on_the_command_line_is_refused_and_not_repeated() -> None:
     assert "a-secret" not in done.stdout + done.stderr
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("verb", [["serve", "-"], ["publish", "-"], ["log", "-"], ["keys", "-"], ["upgrade", "-"]])
 def test_no_error_repeats_the_password_of_the_database(verb: list[str]) -> None:
     done = run(*verb, MAPVOTE_STORE=URL_WITH_PASSWORD)
@@ -141,6 +143,7 @@ def test_a_vehicle_takes_its_key_from_a_file_or_the_environment_never_from_the_c
     assert "holds no key" in missing.stderr
 
 
+@pytest.mark.slow
 def test_who_sends_wrong_keys_by_the_hundred_is_looked_up_no_more_and_the_right_ones_go_on(tmp_path: Path) -> None:
     store = Store.create(f"sqlite:///{tmp_path / 's.db'}", two_walls())
     secret = keys.issue(store, "boss", "operator")

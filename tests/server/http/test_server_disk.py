@@ -68,6 +68,7 @@ def assert_well_again(http: httpx2.Client, url: str, acknowledged: set[str]) -> 
     assert standing(url) == {*acknowledged, "later"}
 
 
+@pytest.mark.slow
 def test_a_full_disk(small_disk: Path, tmp_path: Path) -> None:
     url = f"sqlite:///{small_disk / 'store.db'}"
     Store.create(url, two_walls()).close()

@@ -60,6 +60,7 @@ def test_the_liar_is_named_from_the_ballots_in_the_store(town: tuple[Path, str])
     assert found["v2"].verdict == "consistent"
 
 
+@pytest.mark.slow
 def test_only_operators_hear_who_contradicts_whom(town: tuple[Path, str], tmp_path: Path) -> None:
     store = Store.open(f"sqlite:///{town[0]}")
     vehicle = keys.issue(store, "v1", "vehicle")
@@ -72,6 +73,7 @@ def test_only_operators_hear_who_contradicts_whom(town: tuple[Path, str], tmp_pa
     assert (liar["verdict"], liar["evidence"][0]["says"]) == ("contradicts", "occupied")
 
 
+@pytest.mark.slow
 def test_the_verb_says_the_same(town: tuple[Path, str]) -> None:
     import subprocess
 

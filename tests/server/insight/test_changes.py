@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -28,8 +29,15 @@ def cell_points(col0: int, row0: int, cols: int, rows: int, heights: tuple[float
 
 def street(*houses: np.ndarray) -> PointMap:
     """Flat ground at z = 0 over 2 x 2 tiles, and houses."""
-    ground = cell_points(-256, -256, 512, 512, (0.0,))
-    return map_from_points(np.concatenate([ground, *houses]), map_id="street")
+    return _bare() if not houses else map_from_points(np.concatenate([_GROUND, *houses]), map_id="street")
+
+
+_GROUND = cell_points(-256, -256, 512, 512, (0.0,))
+
+
+@cache
+def _bare() -> PointMap:
+    return map_from_points(_GROUND, map_id="street")
 
 
 def compare(
