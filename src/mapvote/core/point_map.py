@@ -53,11 +53,15 @@ class PointMap:
         return sum(len(tile.points) for tile in self.tiles.values())
 
     @property
-    def has_intensity(self) -> bool:
-        """Whether its points say how bright they are, so that new ones should. Of a map larger than memory the largest
-        tiles tell."""
+    def field_names(self) -> list[str]:
+        """Of the fields that its points have. Of a map larger than memory the largest tiles tell."""
         asked = self.tiles.largest(3) if isinstance(self.tiles, LazyTiles) else list(self.tiles)
-        return any("intensity" in self.tiles[index].fields for index in asked)
+        return sorted({name for index in asked for name in self.tiles[index].fields})
+
+    @property
+    def has_intensity(self) -> bool:
+        """Whether its points say how bright they are, so that new ones should."""
+        return "intensity" in self.field_names
 
     def tile(self, index: TileIndex) -> Tile:
         """One tile; the empty one where the map has none."""
