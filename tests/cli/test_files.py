@@ -59,7 +59,9 @@ def test_import_then_info_then_export_keeps_every_point(tmp_path: Path, run: Cli
     assert all_points(read_map(tmp_path / "c.ply"))[:, 0].max() < 0
 
 
-def test_a_store_says_which_fields_of_a_map_it_will_not_keep(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+def test_a_store_says_which_fields_of_a_map_it_will_not_keep(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     bright = {"intensity": np.arange(4000, dtype=np.uint16)}
     for name, fields, said in (("a", {}, ""), ("b", bright, "not the points' intensity")):
         write_map(map_from_points(cloud(), fields=fields), tmp_path / name)
