@@ -104,7 +104,15 @@ def _like_the_best(best: _Held, held: Sequence[_Held], length_m: float, runs: Se
     wanted = "prior" if abs(forward_deg(runs)) < 15.0 else "scans"
     by_convention = [h for h in special if h.reading.told_by in (wanted, "order") or _is_left_handed(h.reading)]
     numbers = [h for h in group if not h.special and h.reading.told_by == wanted]
-    return sorted(by_convention or numbers or special or group, key=lambda h: h.median)
+    chosen = by_convention or numbers or special or group
+    if not any(_tells_degrees(h.reading) for h in chosen):
+        chosen += [h for h in numbers if _tells_degrees(h.reading)]
+    return sorted(chosen, key=lambda h: h.median)
+
+
+def _tells_degrees(reading: Reading) -> bool:
+    """Whether it is a turn about z: what a straight drive shows of many mistakes."""
+    return " deg " in reading.name or " deg," in reading.name
 
 
 def _is_left_handed(reading: Reading) -> bool:

@@ -64,7 +64,7 @@ def _columns(drive: Drive, looks: Looks) -> list[Finding]:
     spread = np.median(looks.high - looks.low, axis=0)
     for axis, name in enumerate("xyz"):
         if spread[axis] == 0.0:
-            what = f"{name} is {looks.low[0, axis]:g} in every point: the scans are flat"
+            what = f"{name} is {looks.low[0, axis] + 0.0:g} in every point: the scans are flat"
             found.append(Finding("error", what, "a 3D LiDAR is needed; is the column order x, y, z? (--columns)"))
         elif unit[axis] > 0.98:
             what = f"{name} lies within [0, 1] in {unit[axis]:.0%} of the points: it looks like an intensity"
