@@ -132,3 +132,16 @@ def test_a_place_where_a_scan_does_not_fit_those_before_it_is_named() -> None:
     stamps = np.arange(len(T)) * 100_000_000
     told = check_small(T, Run(chain.indices, chain.T_first_lidar, fit), runs_of(T), None, stamps)
     assert any("between scans 57 and 60" in f.what for f in told), told
+
+
+def test_headings_that_are_off_by_any_angle_are_named_on_a_straight_street() -> None:
+    T = along(120.0) @ geometry.from_xyz_rpy(0, 0, 0)
+    stamps = np.arange(len(T)) * 100_000_000
+    drive = Drive(Path("d"), "v", "d", SENSORS["hdl32e"], stamps, lambda i: Scan(0, np.zeros((0, 3), np.float32)))
+    off = straying(T, 0.1) @ geometry.from_xyz_rpy(0, 0, 0, yaw=np.radians(20.0))
+    (error,) = [
+        f
+        for f in check_agreement(drive, off, runs_of(T), ROAD, 0.0, partial(run_of, T, 0, len(T)))[0]
+        if f.severity == "error"
+    ]
+    assert "headings are off by 20" in error.what or "headings are off by 19" in error.what
