@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -34,6 +35,8 @@ OVERVIEW_POINTS = 150_000
 """Of an overview at most, 1.2 MB: what a slow connection brings in a second or two."""
 _SPARE = 4
 """Times the even share of it that is kept of a tile while an overview is made: a map of any size fits in memory."""
+_AT_ONCE = 2
+"""Tiles of an overview: reading and sorting them leaves the interpreter free, and somebody waits."""
 _ANYWHERE = Lattice().tile((0, 0))
 """Levels count from a tile's corner, wherever that is."""
 _KEPT_BYTES = 256_000_000
@@ -94,13 +97,14 @@ class Clouds:
         with self._store.database.reading() as connection:
             version_of(connection, version)
             tiles = tiles_of(connection, version)
-        made = []
-        for index, hashes in tiles.items():
-            if stop():
-                return None
-            for tile in self._sound(hashes):
-                made.append((index, make_levels(tile.points, tile.ground_z, _SPARE * OVERVIEW_POINTS // len(tiles))))
-        return made
+
+        def made(index: TileIndex) -> list[tuple[TileIndex, Levels]]:
+            sound = [] if stop() else self._sound(tiles[index])
+            return [(index, make_levels(t.points, t.ground_z, _SPARE * OVERVIEW_POINTS // len(tiles))) for t in sound]
+
+        with ThreadPoolExecutor(_AT_ONCE, "coarse") as pool:
+            parts = list(pool.map(made, tiles))
+        return None if stop() else [part for of_tile in parts for part in of_tile]
 
     def _sound(self, *states: TileHashes | None) -> list[Tile]:
         """Points and ground of tiles; none where one is damaged: who asks for the tile itself is told."""
