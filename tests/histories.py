@@ -107,7 +107,7 @@ class History:
         states = seen_along(way, rng.choice([0, 0, 1]))
         for cell, spoken in says.items():
             states[cell] = spoken.state
-        end_s = self.now_s - rng.choice([1, 30, 5_000, 2 * DAY_S]) - self.drives
+        end_s = self._end_s(self.now_s - rng.choice([1, 30, 5_000, 2 * DAY_S]) - self.drives)
         named: int | None = version
         if rng.random() < 0.15:  # of an older mapvote: read by the last version with its tiles
             first = [c.seq for c in self.rules.casts if (c.vehicle, c.drive) == (vehicle, drive)]
@@ -120,6 +120,13 @@ class History:
         if counts:
             plane = states.tobytes()
             self.rules.vote(Cast(vehicle, drive, end_s, version, says, has_free, self.now_s, 0, None, way, plane))
+
+    def _end_s(self, about: int) -> int:
+        """A moment at which no drive has ended yet: of two that end at once the hashes decide."""
+        taken = {cast.end_s for cast in self.rules.casts}
+        while about in taken:
+            about -= 1
+        return about
 
     def _last_like(self, version: int, heard_at: int | None) -> int:
         """The last version whose points are those of ``version``, of those that were there when the drive was heard
