@@ -50,9 +50,16 @@ def _cell_at(tile: int, row: int, col: int, neighbours: I32) -> int:
     return -1 if other < 0 else other * CELLS + (row - down * TILE_CELLS) * TILE_CELLS + col - right * TILE_CELLS
 
 
+@numba.njit(cache=True, nogil=True, inline="always")
+def _placed(cell: int) -> tuple[int, int, int]:
+    """(tile, row, col) of a flat cell."""
+    return cell // CELLS, cell % CELLS // TILE_CELLS, cell % TILE_CELLS
+
+
 @numba.njit(cache=True, nogil=True)
-def _bounds(tile: int, row: int, col: int, ground: F32, gap: U8, neighbours: I32) -> tuple[float, float, float]:
+def _bounds(cell: int, ground: F32, gap: U8, neighbours: I32) -> tuple[float, float, float]:
     """(lowest, steeply lowest, highest) height of a point of this cell that continues the measured ground near by."""
+    tile, row, col = _placed(cell)
     low, steep, high = -np.inf, -np.inf, np.inf
     for i in range(-_NEAR_CELLS, _NEAR_CELLS + 1):
         for j in range(-_NEAR_CELLS, _NEAR_CELLS + 1):
@@ -67,21 +74,13 @@ def _bounds(tile: int, row: int, col: int, ground: F32, gap: U8, neighbours: I32
 
 @numba.njit(cache=True, nogil=True)
 def _like(
-    tile: int,
-    row: int,
-    col: int,
-    z: float,
-    grade: float,
-    below: float,
-    clear: float,
-    start: I32 | I64,
-    heights: F32,
-    neighbours: I32,
+    cell: int, z: float, grade: float, below: float, clear: float, start: I32 | I64, heights: F32, neighbours: I32
 ) -> int:
     """How many of the 24 cells around hold a point ``below`` and at the height ``z``, give or take noise and grade.
 
     Only points count that have no other within ``clear`` metres above them.
     """
+    tile, row, col = _placed(cell)
     found = 0
     for i in range(-2, 3):
         for j in range(-2, 3):
@@ -102,13 +101,12 @@ def _continued(
     cell: int, expected: float, width: int, start: I32 | I64, heights: F32, ground: F32, gap: U8, neighbours: I32
 ) -> float:
     """Height of the cell's point that continues the ground, the nearest to ``expected``; NaN if none does."""
-    tile, row, col = cell // CELLS, cell % CELLS // TILE_CELLS, cell % TILE_CELLS
     if start[cell] == start[cell + 1]:
         return np.nan
-    low, steep, high = _bounds(tile, row, col, ground, gap, neighbours)
+    low, steep, high = _bounds(cell, ground, gap, neighbours)
     near = np.isfinite(low)
-    torn = low > high  # what was measured on both sides of a kerb
-    if not near or torn:
+    agreed = near and low <= high  # else what was measured lies on both sides of a kerb
+    if not agreed:
         low, high = expected - _NOISE_M - _CLIMB * STEP_M * width, expected + _NOISE_M + _CLIMB * STEP_M * width
         steep = low
     best, falls, rises = np.nan, np.nan, np.nan
@@ -120,7 +118,7 @@ def _continued(
             falls = z
         if near and high < z <= high + _KERB_M and not rises <= z:
             rises = z
-    if near and not torn and abs(best - expected) <= _NOISE_M:
+    if agreed and abs(best - expected) <= _NOISE_M:
         return best
     grade, below, clear, least = _CLIMB, np.inf, 0.0, _BROAD if near else _BEYOND_GAP
     if not np.isfinite(best):
@@ -129,7 +127,7 @@ def _continued(
             best, grade, below, clear = falls, _FALL, low, 0.0
     if not np.isfinite(best):
         return np.nan
-    alike = _like(tile, row, col, best, grade, below, clear, start, heights, neighbours)
+    alike = _like(cell, best, grade, below, clear, start, heights, neighbours)
     return best if alike >= least else np.nan
 
 
@@ -191,7 +189,7 @@ def grow(start: I32 | I64, heights: F32, neighbours: I32, ground: F32, gap: U8) 
                 continue
             _enter(cell, expected[entry], width, start, heights, neighbours, ground, gap)
         here = int(gap[cell])
-        tile, row, col = cell // CELLS, cell % CELLS // TILE_CELLS, cell % TILE_CELLS
+        tile, row, col = _placed(cell)
         for i in range(-1, 2):
             for j in range(-1, 2):
                 other = _cell_at(tile, row + i, col + j, neighbours)

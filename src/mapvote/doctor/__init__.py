@@ -17,7 +17,6 @@ from mapvote.doctor.ballots import check_ballot
 from mapvote.doctor.clouds import check_cloud, tile_by_tile
 from mapvote.doctor.drives import cheap_checks, examine_drive
 from mapvote.doctor.finding import Finding, Progress, in_order
-from mapvote.doctor.frames import CANNOT_TELL
 from mapvote.doctor.maps import check_whole, examine_map
 from mapvote.doctor.on_map import check_on_map
 from mapvote.doctor.prior import NO_PRIOR
@@ -60,8 +59,8 @@ def diagnose(
         found += _of_the_map(point_map)
         if drive is not None and T is not None and not any(f.severity == "error" for f in found):
             more, T = check_on_map(drive, T, point_map, progress)
-            if all(f.severity == "note" for f in more):  # the map told what the drive could not
-                found = [f for f in found if not f.what.startswith(CANNOT_TELL)]
+            if all(f.severity == "note" for f in more):
+                found = [f for f in found if not f.map_tells]
             found += more
     read = None if drive is None else drive.T_map_lidar_prior
     unknown = T is read and any(f.severity == "error" for f in found)

@@ -19,6 +19,8 @@ class Finding:
     severity: Severity
     what: str
     mend: str = ""
+    map_tells: bool = False
+    """Whether a map can tell what the drive cannot: on one that it lies well on, nothing of this is left."""
 
 
 def in_order(found: Iterable[Finding]) -> list[Finding]:

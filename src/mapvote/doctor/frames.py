@@ -23,7 +23,6 @@ from mapvote.doctor.small import check_small, small_words
 _HEIGHT_M = (0.8, 4.0)
 """Of a sensor on a vehicle, over the road."""
 CANNOT_TELL = "this drive cannot tell without a turn whether"
-"""A map can."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,14 +104,9 @@ def _like_the_best(best: _Held, held: Sequence[_Held], length_m: float, runs: Se
     by_convention = [h for h in special if h.reading.told_by in (wanted, "order") or _is_left_handed(h.reading)]
     numbers = [h for h in group if not h.special and h.reading.told_by == wanted]
     chosen = by_convention or numbers or special or group
-    if not any(_tells_degrees(h.reading) for h in chosen):
-        chosen += [h for h in numbers if _tells_degrees(h.reading)]
+    if not any(h.reading.angle for h in chosen):
+        chosen += [h for h in numbers if h.reading.angle]
     return sorted(chosen, key=lambda h: h.median)
-
-
-def _tells_degrees(reading: Reading) -> bool:
-    """Whether it is a turn about z: what a straight drive shows of many mistakes."""
-    return " deg " in reading.name or " deg," in reading.name
 
 
 def _is_left_handed(reading: Reading) -> bool:
@@ -135,14 +129,15 @@ def _number_reading(m: Measured, T: F64, runs: Sequence[Run], road: Road) -> Rea
         what = f"the prior is {abs(m.value):.2f} s {'late' if m.value > 0 else 'early'} (+-{m.sigma:.2f})"
         return Reading(what, f"shift its times by {-m.value:+.2f} s, or its rows against the scans", m.poses)
     if m.kind == "pitch":
-        return Reading(*small_words(m), m.poses, "scans" if road.tilt_deg > 0.5 * abs(m.value) else "prior")
+        side = "scans" if road.tilt_deg > 0.5 * abs(m.value) else "prior"
+        return Reading(*small_words(m), m.poses, side, angle=True)
     forward, drift = forward_deg(runs), drift_angle_deg(T)
     if abs(forward) > max(0.5 * abs(m.value), 2.0 * abs(drift)):
         back = "face backwards (x to the rear): they " if abs(forward) > 170.0 else ""
         what = f"the scans {back}are turned by {forward:.1f} deg about z (+-{m.sigma:.1f}) from the direction of travel"
-        return Reading(what, "turn the points, or T_base_lidar, so that x is forward", m.poses, "scans")
+        return Reading(what, "turn the points, or T_base_lidar, so that x is forward", m.poses, "scans", angle=True)
     what = f"the prior's headings are off by {m.value:.1f} deg (+-{m.sigma:.1f}), counter-clockwise"
-    return Reading(what, f"turn its rotations by {-m.value:.1f} deg about z", m.poses)
+    return Reading(what, f"turn its rotations by {-m.value:.1f} deg about z", m.poses, angle=True)
 
 
 def _scale_words(m: Measured, road: Road) -> tuple[str, str]:
@@ -221,4 +216,4 @@ def _cannot_tell(
     what = f"{CANNOT_TELL}: {names}"
     if any(_is_left_handed(reading) for reading in like) and turns > 0.5 and clockwise:
         what += " (the points go round counter-clockwise, most sensors clockwise)"
-    return [Finding("warning", what, "check with a drive that turns, or against a map (--map)")]
+    return [Finding("warning", what, "check with a drive that turns, or against a map (--map)", map_tells=True)]

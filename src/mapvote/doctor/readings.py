@@ -31,6 +31,8 @@ class Reading:
     """Which side is wrong: "prior", "scans", or "order"."""
     catch_all: bool = False
     """Fits much that is wrong otherwise: named only where nothing more special fits."""
+    angle: bool = False
+    """Tells by how many degrees something is turned: a straight drive shows many a mistake as that."""
 
 
 def scaled(factor: float) -> Callable[[F64], F64]:
@@ -138,8 +140,8 @@ def _quarter_turns(yaw_deg: int) -> tuple[Reading, Reading]:
     }
     prior = f"the prior's headings are off by {yaw_deg} deg, counter-clockwise"
     return (
-        Reading(scans[yaw_deg], "turn the points, or T_base_lidar, so that x is forward", rule, "scans"),
-        Reading(prior, f"turn its rotations by {-yaw_deg} deg about z", rule),
+        Reading(scans[yaw_deg], "turn the points, or T_base_lidar, so that x is forward", rule, "scans", angle=True),
+        Reading(prior, f"turn its rotations by {-yaw_deg} deg about z", rule, angle=True),
     )
 
 

@@ -24,8 +24,8 @@ _SHORT = 0.05
 
 def check_small(T: F64, chain: Run, runs: Sequence[Run], time: Measured | None, stamps_ns: I64) -> list[Finding]:
     """Of the prior's poses T (n, 4, 4): scale, turn and pitch by the chain, the shift in time by the runs as well."""
-    broken = _broken(chain)
-    chain = unbroken(chain)
+    followed, chain = chain, unbroken(chain)
+    broken = _broken(followed, len(chain.indices))
     whole = held_against(T, chain)
     if time is not None and _shows(time, T, runs) and strays_less(T, stamps_ns, time.value, chain) > 0.2:
         grave = abs(time.value) > 2.0 * _LEAST["time"]
@@ -37,9 +37,8 @@ def check_small(T: F64, chain: Run, runs: Sequence[Run], time: Measured | None, 
     return found or [_not_shown(whole, time)]
 
 
-def _broken(chain: Run) -> list[Finding]:
-    """Where a scan does not fit those before it, though the runs do by themselves."""
-    after = len(unbroken(chain).indices)
+def _broken(chain: Run, after: int) -> list[Finding]:
+    """Where a scan does not fit the ``after`` ones before it, though the runs do by themselves."""
     if after == len(chain.indices):
         return []
     before, scan = chain.indices[after - 1], chain.indices[after]

@@ -21,7 +21,7 @@ from mapvote.core.types import F32, I32, I64, N_STATES, NO_VOTE, U8, U64, Bool, 
 from mapvote.core.voting import VOTE_UNIT, add_states, add_tally, decide_cells
 from mapvote.fusion.copies import Copy, liars_among, originals
 from mapvote.fusion.edit import add_points, delete_points
-from mapvote.fusion.outliers import borne_out, contradictors, deniers
+from mapvote.fusion.outliers import contradictors, deniers
 from mapvote.fusion.persistence import denied_last, doubtful, remembered, temporary
 from mapvote.fusion.sparse_columns import Words, at_least, counted, packed
 from mapvote.fusion.spent import changed_in
@@ -138,8 +138,7 @@ def decide_tile(
     """
     drives, copies = originals(list(drives), settings)
     silenced = liars_among(copies, drives)
-    each = one_each(drives, tile.window)
-    votes, states, tally, quorum = hear(each, rule, settings, silenced, borne_out(each, tile))
+    votes, states, tally, quorum = hear(one_each(drives, tile.window), rule, settings, silenced, tile)
     if any(vote.states is None for vote in votes):
         return Heard(votes, states, tally, quorum)
     names = {vote.vehicle for vote in votes}
@@ -171,19 +170,19 @@ def hear(
     rule: Rule,
     settings: FuseSettings,
     silenced: int = 0,
-    bearing_out: Mapping[str, int] | None = None,
+    tile: Tile | None = None,
 ) -> tuple[Sequence[TileVote], U8, NDArray[Any], int]:
     """(the votes that are heard, states, tally, quorum), of one vote a vehicle on a tile; see :func:`count`.
 
     The quorum falls by one for each that is not heard, for it is one of those that the quorum guards against, and by
     the ``silenced`` of whom that was known before; but nobody is ever believed alone. Of those that send tallies nobody
-    is judged: theirs do not weigh alike. ``bearing_out``: by vehicle, see :func:`borne_out`.
+    is judged: theirs do not weigh alike. ``tile``: as it is now, see :func:`deniers`.
     """
     heard, quorum = list(votes), max(settings.min_votes - silenced, min(settings.min_votes, 2))
     states, tally = count(heard, rule, quorum)
     if quorum < 2 or any(vote.states is None for vote in heard):
         return heard, states, tally, quorum
-    for judged in (contradictors, partial(deniers, bearing_out=bearing_out or {})):
+    for judged in (contradictors, partial(deniers, tile=tile)):
         found = judged(heard, states, tally, quorum, settings)
         if found.any():
             heard = [vote for vote, out in zip(heard, found, strict=True) if not out]

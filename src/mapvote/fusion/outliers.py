@@ -11,7 +11,7 @@ some per cent of a tile. Whoever is found out was one of the k, which is smaller
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numba
@@ -49,24 +49,27 @@ def deniers(
     tally: NDArray[Any],
     quorum: int,
     settings: FuseSettings,
-    bearing_out: Mapping[str, int],
+    tile: Tile | None,
 ) -> Bool:
-    """(n,) which of the votes :func:`denying` names, of the changes among the decided ``states`` (256, 256)."""
+    """(n,) which of the votes :func:`denying` names, of the changes among the decided ``states`` (256, 256); ``tile``:
+    as it is now, None if no vote on it is spent."""
     changed = np.flatnonzero((states == CellState.CHANGED_OCCUPIED) | (states == CellState.CHANGED_EMPTY))
     if settings.max_denial >= 1.0 or not len(changed):
         return np.zeros(len(votes), dtype=np.bool_)
-    true = np.array([bearing_out.get(vote.vehicle, 0) for vote in votes], dtype=np.int64)
-    return denying(states_of(votes, changed), states.reshape(-1)[changed], settings.max_denial, true)
+    came_true = np.zeros(len(votes), dtype=np.int64) if tile is None else borne_out(votes, tile)
+    return denying(states_of(votes, changed), states.reshape(-1)[changed], settings.max_denial, came_true)
 
 
-def borne_out(votes: Iterable[TileVote], tile: Tile) -> dict[str, int]:
-    """By vehicle, in how many cells its vote does not count any more because they are now as it said: built on, or
-    empty."""
-    silenced = [vote for vote in votes if vote.unrestricted is not None and vote.states is not None]
-    if not silenced:
-        return {}
+def borne_out(votes: Sequence[TileVote], tile: Tile) -> I64:
+    """(n,) in how many cells each vote does not count any more because they are now as it said: built on, or empty."""
+    found = np.zeros(len(votes), dtype=np.int64)
+    if all(vote.unrestricted is None for vote in votes):
+        return found
     as_is = np.where(tile.obstacle_words != 0, np.uint8(CellState.CHANGED_OCCUPIED), np.uint8(CellState.CHANGED_EMPTY))
-    return {v.vehicle: int(np.count_nonzero((v.states == NO_VOTE) & (v.unrestricted == as_is))) for v in silenced}
+    for i, vote in enumerate(votes):
+        if vote.unrestricted is not None:
+            found[i] = np.count_nonzero((vote.states == NO_VOTE) & (vote.unrestricted == as_is))
+    return found
 
 
 @numba.njit(cache=True, nogil=True)

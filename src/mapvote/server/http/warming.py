@@ -31,8 +31,7 @@ def settle() -> None:
 
 
 async def keep_overview(parts: Services) -> None:
-    """Make the overview of each new version, until it is cancelled; one tile at a time, and no more once the server
-    stops."""
+    """Make the overview of each new version, until it is cancelled; no tile is begun once the server stops."""
     known = None
     while True:
         with suppress(Unavailable):
@@ -49,5 +48,5 @@ async def _make(parts: Services, version: int) -> None:
         await to_thread.run_sync(make, version, stop, limiter=parts.threads.fetching)
     except Unavailable:
         raise
-    except MapvoteError as error:  # a damaged tile: whoever asks for the picture is told
+    except MapvoteError as error:  # damaged beyond a tile: whoever asks for the picture is told
         structlog.get_logger("mapvote").warning("overview", version=version, error=str(error)[:200])

@@ -178,11 +178,10 @@ def change_objects(changed: Iterable[ChangedCells], min_cells: int = 1, reach_m:
     things = group(cells.rows, cells.cols, kinds, found.objects, reach_m)
     beside = alike_beside(cells.rows, cells.cols, kinds)
     probability = change_probability(cells.states, cells.votes, cells.against, beside)
-    sides = np.stack([_lengths(cells.rows, cells.cols, found.objects) * CELL_SIZE,
-                      widths_m(cells.rows, cells.cols, found.objects)], axis=1)[found.objects]  # fmt: skip
+    sizes_m = [size(cells.rows, cells.cols, found.objects)[found.objects] for size in (_lengths_m, widths_m)]
     by_thing = np.split(np.argsort(things, kind="stable"), np.cumsum(np.bincount(things))[:-1])
     return [
-        _object(cells, probability, sides, mine, [outlines[p] for p in np.unique(found.polygons[mine])])
+        _object(cells, probability, mine, sizes_m, [outlines[p] for p in np.unique(found.polygons[mine])])
         for mine in by_thing
         if len(mine) >= min_cells
     ]
@@ -197,8 +196,8 @@ def _sorted(parts: Sequence[ChangedCells]) -> ChangedCells | None:
     return ChangedCells(**{name: values[order] for name, values in whole.items()})
 
 
-def _lengths(rows: I64, cols: I64, pieces: I32) -> I64:
-    """(k,) cells along the longer side of the box around each piece."""
+def _lengths_m(rows: I64, cols: I64, pieces: I32) -> F64:
+    """(k,) metres along the longer side of the box around each piece."""
     k = int(pieces.max()) + 1
     sides = []
     for along in (rows, cols):
@@ -206,10 +205,14 @@ def _lengths(rows: I64, cols: I64, pieces: I32) -> I64:
         np.minimum.at(low, pieces, along)
         np.maximum.at(high, pieces, along)
         sides.append(high - low + 1)
-    return np.maximum(*sides)
+    return np.maximum(*sides) * CELL_SIZE
 
 
-def _object(cells: ChangedCells, probability: F64, sides_m: F64, mine: I64, outline: list[list[Ring]]) -> ChangeObject:
+def _object(
+    cells: ChangedCells, probability: F64, mine: I64, sizes_m: Sequence[F64], outline: list[list[Ring]]
+) -> ChangeObject:
+    """``mine``: the cells of one thing; ``sizes_m``: of every cell, how long and how wide its piece is."""
+    longest_m, width_m = (float(of_piece[mine].max()) for of_piece in sizes_m)
     rows, cols, versions = cells.rows[mine], cells.cols[mine], cells.versions[mine]
     kind = KINDS[int(cells.states[mine[0]])]
     made_in = sorted({int(v) for v in versions} - {0})
@@ -223,8 +226,8 @@ def _object(cells: ChangedCells, probability: F64, sides_m: F64, mine: I64, outl
         cells=len(mine),
         where=(rows, cols),
         box=(float(cols.min()), float(rows.min()), float(cols.max() + 1), float(rows.max() + 1)),
-        longest_m=float(sides_m[mine, 0].max()),
-        width_m=float(sides_m[mine, 1].max()),
+        longest_m=longest_m,
+        width_m=width_m,
         height_m=float(cells.top_m[mine].max()),
         volume_m3=float(columns.sum() * CELL_SIZE**2),
         points=int(cells.points[mine].sum()),

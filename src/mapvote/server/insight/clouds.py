@@ -66,8 +66,7 @@ class Clouds:
             if known is not None:
                 self._made.move_to_end(hashes)
                 return known
-        with self._store.database.reading() as connection:
-            tile = load_tile(connection, _ANYWHERE, TileHashes(hashes.points, hashes.ground, None))
+        (tile,) = self._load(hashes)
         made = make_levels(tile.points, tile.ground_z)
         with self._lock:
             if hashes not in self._made:
@@ -106,11 +105,15 @@ class Clouds:
             parts = list(pool.map(made, tiles))
         return None if stop() else [part for of_tile in parts for part in of_tile]
 
+    def _load(self, *states: TileHashes | None) -> list[Tile]:
+        """Tiles, of which points and ground alone are read."""
+        with self._store.database.reading() as connection:
+            return [load_tile(connection, _ANYWHERE, h and replace(h, free=None, memory=None)) for h in states]
+
     def _sound(self, *states: TileHashes | None) -> list[Tile]:
-        """Points and ground of tiles; none where one is damaged: who asks for the tile itself is told."""
+        """The same; none where one is damaged: who asks for the tile itself is told."""
         try:
-            with self._store.database.reading() as connection:
-                return [load_tile(connection, _ANYWHERE, h and replace(h, free=None, memory=None)) for h in states]
+            return self._load(*states)
         except Unavailable:
             raise
         except MapvoteError:

@@ -22,14 +22,15 @@ from mapvote.server.insight.heard import Place, decided_on, ended, heard_by, is_
 from mapvote.server.store import schema
 from mapvote.server.store.eligible_votes import (
     DAMAGED,
+    Electorate,
     StoredVote,
     counted_votes,
     electorate_now,
+    from_sound_ballots,
     judged_votes,
     read_votes,
     recent_votes,
 )
-from mapvote.server.store.quarantine import DamagedBallots
 from mapvote.server.store.queries import current_version, tile_as_of
 from mapvote.server.store.store import Store
 from mapvote.server.store.tile_jobs import unpack_tally_plane
@@ -154,15 +155,13 @@ def _probability(connection: sa.Connection, index: TileIndex, cell: tuple[int, i
 
 def _undamaged(connection: sa.Connection, place: Place) -> Place:
     """The same, without ballots that cannot be read."""
-    try:
-        read_votes(connection, place.tile.index, [vote for vote, why in _judged(connection, place) if why != DAMAGED])
-    except DamagedBallots as error:
-        return replace(place, asked=place.asked.leaving_out(error.found))
-    return place
+    index = place.tile.index
 
+    def readable(asked: Electorate) -> Electorate:
+        read_votes(connection, index, [vote for vote, why in judged_votes(connection, index, asked) if why != DAMAGED])
+        return asked
 
-def _judged(connection: sa.Connection, place: Place) -> list[tuple[StoredVote, str]]:
-    return judged_votes(connection, place.tile.index, place.asked)
+    return replace(place, asked=from_sound_ballots(connection, place.asked, readable))
 
 
 def _everyone(
@@ -172,7 +171,7 @@ def _everyone(
 
     ``counted``: those that count on the tile.
     """
-    judged = _judged(connection, now)
+    judged = judged_votes(connection, now.tile.index, now.asked)
     readable = [vote for vote, why in judged if why != DAMAGED]
     said = dict(zip((vote.seq for vote in readable), read_votes(connection, now.tile.index, readable), strict=True))
     obeyed = {stored.seq: vote for stored, vote in counted}
