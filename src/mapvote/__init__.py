@@ -8,6 +8,8 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from mapvote.kernel_cache import choose_kernel_cache
+
 if TYPE_CHECKING:
     from mapvote.client import MapClient as MapClient
     from mapvote.codec.ballot import Ballot as Ballot
@@ -53,6 +55,8 @@ _HOME = {
     "write_map": "formats",
 }
 __all__ = sorted(_HOME)
+
+choose_kernel_cache()
 
 
 def __getattr__(name: str) -> Any:

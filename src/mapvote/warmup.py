@@ -1,7 +1,7 @@
 """Compile every kernel that a vehicle and the map's update need, by doing once what they do, on a street of no size.
 
-Compiled kernels stay in numba's cache: beside the program, or where that is read-only in the user's own cache (or in
-``NUMBA_CACHE_DIR``), so that later runs start at once.
+Compiled kernels stay in numba's cache: beside the program, where that is read-only in the user's own cache, and where
+there is none in a temporary folder (or in ``NUMBA_CACHE_DIR``), so that later runs start at once.
 """
 
 from __future__ import annotations
