@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from mapvote.cli.options import EVALUATE, Config, Scenario, Seed
 from mapvote.cli.terminal import print_table, progress, stages
+
+if TYPE_CHECKING:
+    from mapvote.evaluation.evaluate import Evaluation
 
 
 def register(app: typer.Typer) -> None:
@@ -124,20 +127,28 @@ def evaluate(
         write_text(as_json(result), json)
         print(f"{json}: all numbers")
     if out is not None:
-        from mapvote.evaluation.reporting.budget_figure import budget_figure
-        from mapvote.evaluation.reporting.style import save
-
-        for name, causes in evaluation.causes.items():
-            picture = out / f"explained_{name.replace(' ', '_')}.png"
-            save(budget_figure(name, causes, evaluation.window), picture)
-            print(f"{picture}")
+        _draw_causes(evaluation, out)
     if figures is not None:
-        from mapvote.evaluation.reporting.gallery import gallery
-        from mapvote.evaluation.reporting.style import FORMATS
+        _draw_figures(evaluation, figures)
 
-        with progress("drawing"):
-            drawn = gallery(evaluation, evaluation.best, figures, FORMATS)
-        print(f"{figures}: {len(drawn)} figures, each as PNG, SVG and PDF")
+
+def _draw_causes(evaluation: Evaluation, out: Path) -> None:
+    from mapvote.evaluation.reporting.budget_figure import budget_figure
+    from mapvote.evaluation.reporting.style import save
+
+    for name, causes in evaluation.causes.items():
+        picture = out / f"explained_{name.replace(' ', '_')}.png"
+        save(budget_figure(name, causes, evaluation.window), picture)
+        print(f"{picture}")
+
+
+def _draw_figures(evaluation: Evaluation, out: Path) -> None:
+    from mapvote.evaluation.reporting.gallery import gallery
+    from mapvote.evaluation.reporting.style import FORMATS
+
+    with progress("drawing"):
+        drawn = gallery(evaluation, evaluation.best, out, FORMATS)
+    print(f"{out}: {len(drawn)} figures, each as PNG, SVG and PDF")
 
 
 def _evaluate_real(
@@ -185,8 +196,8 @@ def demo(
     from rich.console import Console
     from rich.markup import escape
 
-    from mapvote.evaluation.demo import CASE, commands
     from mapvote.evaluation.demo import demo as run
+    from mapvote.evaluation.demo_report import CASE, commands
 
     console = Console(soft_wrap=True)
     console.print("The first run compiles its kernels, which takes some seconds in each stage.", style="dim")
