@@ -61,6 +61,7 @@ class Say:
     gone: U64 | None = None
     new_points: F32 | None = None
     free: U64 | None = None
+    intensity: U8 | None = None
 
     def packed(self, tile: TileIndex) -> BallotTile:
         return BallotTile(
@@ -70,6 +71,7 @@ class Say:
             gone=None if self.gone is None else pack_words(self.gone),
             new_points=None if self.new_points is None else pack_plane(self.new_points, 1),
             free=None if self.free is None else pack_words(self.free),
+            intensity=None if self.intensity is None else pack_plane(self.intensity, 1),
         )
 
 

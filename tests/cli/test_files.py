@@ -11,7 +11,6 @@ from typer.testing import CliRunner
 
 from hand_made import two_walls
 from mapvote.cli import app
-from mapvote.cli.looks import map_for_store
 from mapvote.codec.ballot import Ballot, BallotTile, encode, pack_plane
 from mapvote.core.point_map import all_points, map_from_points
 from mapvote.core.sensors import SENSORS
@@ -57,18 +56,6 @@ def test_import_then_info_then_export_keeps_every_point(tmp_path: Path, run: Cli
         invoke(run, "export", tmp_path / "m", tmp_path / "c.pcd", "--offset", "1,2")
     invoke(run, "export", tmp_path / "m", tmp_path / "c.ply", "--offset", "100,0,0")
     assert all_points(read_map(tmp_path / "c.ply"))[:, 0].max() < 0
-
-
-def test_a_store_says_which_fields_of_a_map_it_will_not_keep(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    bright = {"intensity": np.arange(4000, dtype=np.uint16)}
-    for name, fields, said in (("a", {}, ""), ("b", bright, "not the points' intensity")):
-        write_map(map_from_points(cloud(), fields=fields), tmp_path / name)
-        map_for_store(tmp_path / name)
-        told = capsys.readouterr().err
-        assert said in told
-        assert bool(said) == ("keeps positions only" in told)
 
 
 def test_info_of_a_drive_and_doctor(tmp_path: Path, run: CliRunner) -> None:

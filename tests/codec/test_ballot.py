@@ -10,14 +10,10 @@ from hypothesis import strategies as st
 
 from hand_made import Say, make_ballot, states_plane, two_walls, wall
 from mapvote.codec.arrays import pack_plane
-from mapvote.codec.ballot import BallotTile, decode, encode, unpack_offer, validate
+from mapvote.codec.ballot import decode, encode, unpack_offer, validate
 from mapvote.core.types import MapvoteError
 
 POINTS = wall([(3, 3)], [0.5, 0.8, 1.1])
-
-
-def offer(points: bytes | None, intensity: bytes | None) -> BallotTile:
-    return BallotTile(tile=(0, 0), states=pack_plane(states_plane(), 1), new_points=points, intensity=intensity)
 
 
 @settings(max_examples=30, deadline=None)
@@ -29,7 +25,7 @@ def test_intensity_comes_back_beside_its_points(values: list[int]) -> None:
     tile = msgspec.structs.replace(sent.tiles[0], intensity=pack_plane(bright))
     got = decode(encode(msgspec.structs.replace(sent, tiles=[tile])))
     validate(got)
-    back, intensity = unpack_offer(got.tiles[0])
+    back, intensity = unpack_offer(got.tiles[0].new_points, got.tiles[0].intensity)
     assert back is not None
     assert intensity is not None
     assert back.tobytes() == points.tobytes()
@@ -38,8 +34,8 @@ def test_intensity_comes_back_beside_its_points(values: list[int]) -> None:
 
 def test_a_ballot_without_intensity_has_none_and_every_point_must_have_one() -> None:
     points = pack_plane(POINTS)
-    assert unpack_offer(offer(points, None))[1] is None
+    assert unpack_offer(points, None)[1] is None
     with pytest.raises(MapvoteError, match="2 bytes, expected 3"):
-        unpack_offer(offer(points, pack_plane(np.zeros(2, np.uint8))))
+        unpack_offer(points, pack_plane(np.zeros(2, np.uint8)))
     with pytest.raises(MapvoteError, match="none of those"):
-        unpack_offer(offer(None, pack_plane(np.zeros(2, np.uint8))))
+        unpack_offer(None, pack_plane(np.zeros(2, np.uint8)))

@@ -32,15 +32,6 @@ def sound_map(path: Path | str) -> PointMap:
     return point_map
 
 
-def map_for_store(path: Path | str) -> PointMap:
-    """The first map of a store, as :func:`sound_map`; what the store will not keep of it is said aloud."""
-    point_map = sound_map(path)
-    if point_map.field_names:
-        what = f"a store keeps positions only, not the points' {', '.join(point_map.field_names)}"
-        print(f"warning: {path}: {what}; update a map folder to keep them (mapvote update)", file=sys.stderr)
-    return point_map
-
-
 def look_at_map(path: str, point_map: PointMap) -> None:
     """MapvoteError for a map whose points cannot be used so."""
     from mapvote.doctor import check_cloud, tile_by_tile, usable

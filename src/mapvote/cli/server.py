@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from mapvote.cli.looks import map_for_store
+from mapvote.cli.looks import sound_map
 from mapvote.cli.options import SERVER, Config, KeyFile, Reason, StoreName, StoreOrUrl
 from mapvote.cli.remote import is_url, server_at
 from mapvote.cli.store import opened_store, store_url, when, who
@@ -49,7 +49,7 @@ def serve(
     log_as_json()
     with waiting(f"opening {store}"):
         opened, new = open_or_create(
-            store_url(store), map_path, None if config is None else Policy.of(settings), read=map_for_store
+            store_url(store), map_path, None if config is None else Policy.of(settings), read=sound_map
         )
     try:
         if new and not open_:

@@ -21,6 +21,7 @@ import numpy as np
 from mapvote.client.connection import Connection, Refused, Unreachable
 from mapvote.client.spool import Spool, server_folder
 from mapvote.codec.ballot import Ballot, decode, encode
+from mapvote.codec.fields import unpack_fields
 from mapvote.codec.tile_file import digest_of_tiles
 from mapvote.core.grid import CELL_SIZE, Grid, Lattice, TileIndex
 from mapvote.core.point_map import PointMap
@@ -39,9 +40,11 @@ class _Plane(msgspec.Struct):
     points: str
     ground: str
     free: str | None = None
+    fields: str | None = None
+    """Of what the points carry besides; None also from an older server."""
 
     def hashes(self) -> list[str]:
-        return [digest for digest in (self.points, self.ground, self.free) if digest is not None]
+        return [digest for digest in (self.points, self.ground, self.free, self.fields) if digest is not None]
 
 
 class _Lattice(msgspec.Struct):
@@ -57,12 +60,15 @@ class _Manifest(msgspec.Struct):
     georeference: dict[str, str] = {}
     digest: str = ""
     """Of all tiles of the version; "" from an older server."""
+    fields_digest: str = ""
+    """Of the fields of their points; "" where there are none."""
     removed: list[str] = []
 
     def whole(self) -> bool:
         """Whether these are all tiles of the version, and as the server has them."""
         total = digest_of_tiles((key, p.points, p.ground, p.free) for key, p in self.tiles.items())
-        return self.digest == f"{total:064x}"
+        fields = digest_of_tiles((key, p.fields) for key, p in self.tiles.items() if p.fields is not None)
+        return self.digest == f"{total:064x}" and self.fields_digest == (f"{fields:064x}" if fields else "")
 
     def followed_by(self, since: _Manifest) -> _Manifest:
         """The newer manifest that ``since``, which tells only what changed, makes of this one."""
@@ -91,7 +97,8 @@ class MapClient:
         self._server = Connection(url, key=key, attempts=attempts, timeout_s=timeout_s, sleep=sleep)
         self._url = url
         self._planes, self._spool = home / "planes", Spool(home, url)
-        self._kept_manifest = server_folder(home, url) / "manifest.json"
+        self._kept_manifest = server_folder(home, url) / "manifest_2.json"
+        """Not the file of a mapvote that knew of no fields: what it kept lacks them."""
         self._cache_bytes = cache_bytes
         self.version: int | None = None
         """Version of the map last fetched."""
@@ -212,7 +219,10 @@ class MapClient:
         free = (
             None if planes.free is None else np.frombuffer(self._plane(planes.free), dtype="<u8").reshape(window.shape)
         )
-        return Tile(window, points, ground_z, free)
+        fields = {}
+        if planes.fields is not None:
+            fields = unpack_fields(self._plane(planes.fields), len(points), f"{self._url}: {planes.fields[:12]}")
+        return Tile(window, points, ground_z, free, fields=fields)
 
     def _plane(self, digest: str) -> bytes:
         kept = self._planes / digest

@@ -128,15 +128,15 @@ def unpack_points(data: bytes) -> F32:
     return points
 
 
-def unpack_offer(tile: BallotTile) -> tuple[F32 | None, U8 | None]:
-    """The new points (m, 3) of a tile and their intensity (m,); MapvoteError as :func:`unpack_points`, and if there is
-    not one for each."""
-    points = None if tile.new_points is None else unpack_points(tile.new_points)
-    if tile.intensity is None:
+def unpack_offer(new_points: bytes | None, intensity: bytes | None) -> tuple[F32 | None, U8 | None]:
+    """The new points (m, 3) of a tile and their intensity (m,), of their planes; MapvoteError as
+    :func:`unpack_points`, and if there is not one for each."""
+    points = None if new_points is None else unpack_points(new_points)
+    if intensity is None:
         return points, None
     if points is None:
-        raise MapvoteError(f"ballot: tile {tile.tile} has the intensity of new points, but none of those")
-    return points, unpack_plane(tile.intensity, "|u1", (len(points),), "ballot: intensity")
+        raise MapvoteError("ballot: a tile has the intensity of new points, but none of those")
+    return points, unpack_plane(intensity, "|u1", (len(points),), "ballot: intensity")
 
 
 @numba.njit(cache=True, nogil=True)
@@ -220,6 +220,6 @@ def validate(ballot: Ballot, max_bytes: int | None = None) -> None:
         for what, words in (("gone", tile.gone), ("free", tile.free)):
             if words is not None:
                 size += sum(part.nbytes for part in unpack_sparse(words, what))
-        size += sum(part.nbytes for part in unpack_offer(tile) if part is not None)
+        size += sum(part.nbytes for part in unpack_offer(tile.new_points, tile.intensity) if part is not None)
         if max_bytes is not None and size > max_bytes:
             raise MapvoteError(f"ballot: larger than {max_bytes} bytes when decompressed; send a shorter drive")

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapvote.codec.arrays import pack_plane, unpack_plane
+from mapvote.codec.fields import check_kind, kind_of
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Grid
 from mapvote.core.memory import PLANES, Memory
 from mapvote.core.tile import Tile
@@ -22,7 +23,6 @@ MAX_TILE_POINTS = 50_000_000
 DIGESTS = 1 << 256
 """Sums of hashes are taken modulo this."""
 _LEVEL = 3
-_FIELD_TYPES = ("|u1", "|i1", "<u2", "<i2", "<u4", "<i4", "<u8", "<i8", "<f4", "<f8")
 _SHAPE = (TILE_CELLS, TILE_CELLS)
 
 
@@ -44,11 +44,12 @@ def content_hash(tile_points: F32) -> str:
     return hashlib.sha256(np.ascontiguousarray(tile_points, dtype="<f4").tobytes()).hexdigest()
 
 
-def digest_of_tiles(tiles: Iterable[tuple[str, str, str, str | None]]) -> int:
+def digest_of_tiles(tiles: Iterable[tuple[str, *tuple[str | None, ...]]]) -> int:
     """The sum, modulo :data:`DIGESTS`, of a SHA-256 for each tile: of its key ("row,col") and its planes' hashes
-    (points, ground, free), "-" for none. Who keeps a manifest up to date by what changed can tell whether it still is
-    the server's; so can the server, at little cost: sums of what changed can be added and taken away."""
-    lines = (f"{key.replace(',', ' ')} {points} {ground} {free or '-'}" for key, points, ground, free in tiles)
+    (points, ground, free; in a digest of their own fields, of tiles that have any), "-" for none. Who keeps a manifest
+    up to date by what changed can tell whether it still is the server's; so can the server, at little cost: sums of
+    what changed can be added and taken away."""
+    lines = (" ".join([key.replace(",", " "), *(plane or "-" for plane in planes)]) for key, *planes in tiles)
     return sum(int.from_bytes(hashlib.sha256(line.encode()).digest()) for line in lines) % DIGESTS
 
 
@@ -72,7 +73,7 @@ def encode_tile(tile: Tile) -> bytes:
             ground_z=pack_plane(tile.ground_z, _LEVEL),
             free=None if tile.free is None else pack_plane(tile.free, _LEVEL),
             memory=None if tile.memory is None else pack_plane(tile.memory.planes, _LEVEL),
-            fields={name: (c.dtype.newbyteorder("<").str, pack_plane(c, _LEVEL)) for name, c in tile.fields.items()},
+            fields={name: (kind_of(c), pack_plane(c, _LEVEL)) for name, c in tile.fields.items()},
         )
     )
 
@@ -100,8 +101,7 @@ def decode_tile(data: bytes, window: Grid, what: str = "tile") -> Tile:
 
 def _unpack_field(kind: str, data: bytes, n: int, what: str) -> NDArray[Any]:
     """(n,) one field; MapvoteError if it is damaged or no column of numbers."""
-    if kind not in _FIELD_TYPES:
-        raise MapvoteError(f"{what}: of type {kind[:20]!r}, which no field has; fetch it again")
+    check_kind(kind, what)
     return unpack_plane(data, kind, (n,), what)
 
 

@@ -30,7 +30,7 @@ from mapvote.fusion.tile_vote import TileVote, select
 
 def tile_vote(ballot: Ballot, tile: BallotTile, digest: str) -> TileVote:
     """One tile of a ballot with its planes unpacked; MapvoteError if a plane is damaged."""
-    new_points, intensity = unpack_offer(tile)
+    new_points, intensity = unpack_offer(tile.new_points, tile.intensity)
     return TileVote(
         vehicle=ballot.vehicle,
         end_ns=ballot.end_ns,

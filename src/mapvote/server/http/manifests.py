@@ -57,8 +57,11 @@ class Manifests:
 
 def _as_json(manifest: Manifest) -> dict[str, Any]:
     tiles = {
-        tile_key(index): {"points": h.points, "ground": h.ground, "free": h.free} for index, h in manifest.tiles.items()
+        tile_key(index): {"points": h.points, "ground": h.ground, "free": h.free}
+        | ({"fields": h.fields} if h.fields is not None else {})
+        for index, h in manifest.tiles.items()
     }
+    fields = {"fields_digest": manifest.fields_digest} if manifest.fields_digest else {}
     return {
         "map_id": manifest.map_id,
         "version": manifest.version,
@@ -67,4 +70,4 @@ def _as_json(manifest: Manifest) -> dict[str, Any]:
         "tiles": tiles,
         "digest": manifest.digest,
         "removed": [tile_key(index) for index in manifest.removed],
-    }
+    } | fields

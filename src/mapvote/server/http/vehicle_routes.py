@@ -63,7 +63,8 @@ async def one_version(request: Request, number: Number, since: VersionQuery | No
     summary="One plane of a tile",
 )
 async def plane(request: Request, digest: Annotated[str, Path(pattern=r"^[0-9a-f]{64}$")]) -> Response:
-    """Raw little-endian values, zstd on the wire where the client takes it. Immutable: the hash is of the values."""
+    """Raw little-endian values (of ``fields`` a msgpack map of name to type and values), zstd on the wire where the
+    client takes it. Immutable: the hash is of the values."""
     headers = {
         "ETag": f'"{digest}"',
         "Cache-Control": "private, max-age=31536000, immutable",

@@ -108,7 +108,8 @@ class Clouds:
     def _load(self, *states: TileHashes | None) -> list[Tile]:
         """Tiles, of which points and ground alone are read."""
         with self._store.database.reading() as connection:
-            return [load_tile(connection, _ANYWHERE, h and replace(h, free=None, memory=None)) for h in states]
+            drawn = [h and replace(h, free=None, memory=None, fields=None) for h in states]
+            return [load_tile(connection, _ANYWHERE, hashes) for hashes in drawn]
 
     def _sound(self, *states: TileHashes | None) -> list[Tile]:
         """The same; none where one is damaged: who asks for the tile itself is told."""

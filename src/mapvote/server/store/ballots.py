@@ -16,7 +16,7 @@ from mapvote.server.store.database import insert_rows
 from mapvote.server.store.policy import RoundPolicy, policy_in
 from mapvote.server.store.queries import log_event, next_seq
 from mapvote.server.store.store import Store
-from mapvote.server.store.sums import sum_of
+from mapvote.server.store.sums import sum_of_planes
 from mapvote.server.store.version_driven import NO_SUCH_BASE, version_driven
 
 
@@ -123,8 +123,8 @@ def unlike(asked: RoundPolicy, incoming: Incoming) -> MapvoteError | None:
 def _tile_row(seq: int, ballot: Ballot, tile: BallotTile) -> tuple[Any, ...]:
     """In the order of the table's columns."""
     base = ballot.base[tile_key(tile.tile)]
-    planes = tile.states, tile.tally, tile.gone, tile.new_points, tile.free
-    return *tile.tile, seq, base, *planes, sum_of(base, *planes)
+    planes = [getattr(tile, plane) for plane in schema.BALLOT_PLANES]
+    return *tile.tile, seq, base, *planes, sum_of_planes(base, planes)
 
 
 def withdraw(store: Store, vehicle: str | None, drive: str | None = None, *, by: str) -> int:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -10,13 +11,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapvote.codec.arrays import compress, unpack_bytes
+from mapvote.codec.ballot import tile_key
+from mapvote.codec.fields import pack_fields, unpack_fields
+from mapvote.codec.tile_file import MAX_TILE_POINTS
 from mapvote.core.grid import CELLS, TILE_CELLS, Grid
 from mapvote.core.memory import PLANES, Memory
 from mapvote.core.tile import Tile
 from mapvote.core.types import F32, U64, Bool, MapvoteError
 
 _ZSTD_LEVEL = 3
-MAX_PLANE_BYTES = CELLS * 64 * 12 * 4
+MAX_PLANE_BYTES = 16 * MAX_TILE_POINTS
+"""800 MB: 16 bytes for each point of the densest tile there may be."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,6 +33,8 @@ class TileHashes:
     free: str | None
     memory: str | None = field(default=None, compare=False)
     """What the server remembers of the tile; no part of the map, so tiles that differ in nothing else are equal."""
+    fields: str | None = None
+    """What its points carry besides their place; None: nothing."""
 
     @classmethod
     def none(cls) -> TileHashes:
@@ -43,32 +50,42 @@ def pack_tile(tile: Tile, edited_from: tuple[Tile, TileHashes] | None = None) ->
     blobs: dict[str, bytes] = {}
     old, known = edited_from or (None, TileHashes.none())
 
-    def pack(plane: NDArray[Any], dtype: str) -> str:
-        raw = np.ascontiguousarray(plane, dtype=dtype).tobytes()
+    def pack(raw: bytes, what: str) -> str:
+        if len(raw) > MAX_PLANE_BYTES:
+            too_large = f"{len(raw)} bytes, {MAX_PLANE_BYTES} are the most: thin the map out, or leave fields out"
+            raise MapvoteError(f"tile {tile_key(tile.index)}: its {what} take {too_large}")
         digest = hashlib.sha256(raw).hexdigest()
         blobs[digest] = compress(raw, _ZSTD_LEVEL)
         return digest
 
-    points = pack(tile.points, "<f4")
-    ground = known.ground if old is not None and tile.ground_z is old.ground_z else pack(tile.ground_z, "<f4")
-    same = old is not None and tile.free is old.free
-    free = known.free if same or tile.free is None else pack(tile.free, "<u8")
-    if tile.memory is None:
-        return TileHashes(points, ground, free), blobs
-    memory, plane = pack_memory(tile.memory)
-    return TileHashes(points, ground, free, memory), blobs | plane
+    same_ground, same_free, same_fields = (
+        old is not None and getattr(tile, plane) is getattr(old, plane) for plane in ("ground_z", "free", "fields")
+    )
+    hashes = TileHashes(
+        points=pack(_raw(tile.points, "<f4"), "points"),
+        ground=known.ground if same_ground else pack(_raw(tile.ground_z, "<f4"), "ground"),
+        free=known.free if same_free or tile.free is None else pack(_raw(tile.free, "<u8"), "free columns"),
+        memory=None if tile.memory is None else pack(_raw(tile.memory.planes, "<u4"), "memory"),
+        fields=known.fields if same_fields else pack(pack_fields(tile.fields), "fields") if tile.fields else None,
+    )
+    return hashes, blobs
 
 
-def unpack_tile(
-    window: Grid, hashes: TileHashes, points: bytes, ground: bytes, free: bytes | None, memory: bytes | None = None
-) -> Tile:
-    """A tile of its planes; MapvoteError if one is not what its hash says."""
+def _raw(plane: NDArray[Any], dtype: str) -> bytes:
+    return np.ascontiguousarray(plane, dtype=dtype).tobytes()
+
+
+def unpack_tile(window: Grid, hashes: TileHashes, planes: Mapping[str, bytes]) -> Tile:
+    """A tile of its ``planes`` by name, of those that ``hashes`` names; MapvoteError if one is not what its hash
+    says."""
+    points = unpack_points_plane(planes["points"], hashes.points)
     return Tile(
         window,
-        points=unpack_points_plane(points, hashes.points),
-        ground_z=unpack_ground_plane(ground, hashes.ground),
-        free=None if free is None or hashes.free is None else unpack_free_plane(free, hashes.free),
-        memory=None if memory is None or hashes.memory is None else unpack_memory_plane(memory, hashes.memory),
+        points=points,
+        ground_z=unpack_ground_plane(planes["ground"], hashes.ground),
+        free=None if hashes.free is None else unpack_free_plane(planes["free"], hashes.free),
+        memory=None if hashes.memory is None else unpack_memory_plane(planes["memory"], hashes.memory),
+        fields={} if hashes.fields is None else unpack_fields_plane(planes["fields"], hashes.fields, len(points)),
     )
 
 
@@ -87,6 +104,11 @@ def unpack_free_plane(data: bytes, digest: str) -> U64:
     return np.frombuffer(_unpack(data, digest), dtype="<u8").reshape(TILE_CELLS, TILE_CELLS)
 
 
+def unpack_fields_plane(data: bytes, digest: str, n: int) -> dict[str, NDArray[Any]]:
+    """The fields of a tile's ``n`` points alone."""
+    return unpack_fields(_unpack(data, digest), n, f"tile plane {digest[:12]}")
+
+
 def _unpack(data: bytes, digest: str) -> bytes:
     raw = unpack_bytes(data, MAX_PLANE_BYTES, f"tile plane {digest[:12]}")
     if hashlib.sha256(raw).hexdigest() != digest:
@@ -96,7 +118,7 @@ def _unpack(data: bytes, digest: str) -> bytes:
 
 def pack_memory(memory: Memory) -> tuple[str, dict[str, bytes]]:
     """What a tile remembers as (hash, plane by hash)."""
-    raw = np.ascontiguousarray(memory.planes, dtype="<u4").tobytes()
+    raw = _raw(memory.planes, "<u4")
     digest = hashlib.sha256(raw).hexdigest()
     return digest, {digest: compress(raw, _ZSTD_LEVEL)}
 

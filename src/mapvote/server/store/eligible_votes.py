@@ -11,7 +11,7 @@ from typing import NamedTuple, TypeVar
 
 import sqlalchemy as sa
 
-from mapvote.codec.ballot import unpack_many_states, unpack_points, unpack_tally
+from mapvote.codec.ballot import unpack_many_states, unpack_offer, unpack_tally
 from mapvote.config import FuseSettings
 from mapvote.core.grid import TileIndex
 from mapvote.core.tile import Tile
@@ -87,6 +87,7 @@ class _Planes(NamedTuple):
     gone: bytes | None
     new_points: bytes | None
     free: bytes | None
+    intensity: bytes | None
 
 
 def _stands_at(mark: int | sa.BindParameter[int]) -> sa.ColumnElement[bool]:
@@ -111,9 +112,9 @@ _REVIEWS_ON = (
     .where(_C.c.row == _ROW, _C.c.col == _COL, _W.c.verdict.in_(("held", "rejected")))
     .where(_W.c.seq <= _MARK, _W.c.gone_seq.is_(None) | (_W.c.gone_seq > _MARK))
 )
-_PLANES_OF = sa.select(
-    _T.c.ballot, _T.c.states, _T.c.tally, _T.c.gone, _T.c.new_points, _T.c.free, _T.c.base, _T.c.sum
-).where(_T.c.row == _ROW, _T.c.col == _COL, _T.c.ballot.in_(sa.bindparam("ballots", expanding=True)))
+_PLANES_OF = sa.select(_T.c.ballot, *(_T.c[plane] for plane in schema.BALLOT_PLANES), _T.c.base, _T.c.sum).where(
+    _T.c.row == _ROW, _T.c.col == _COL, _T.c.ballot.in_(sa.bindparam("ballots", expanding=True))
+)
 
 
 def standing_tiles(connection: sa.Connection, mark: int, since: int | None = None) -> list[TileIndex]:
@@ -242,13 +243,14 @@ def _planes(connection: sa.Connection, index: TileIndex, ballots: Sequence[int])
         for row in connection.execute(_PLANES_OF, asked_of).all():
             if row.sum != ballot_sum(row):
                 damaged.append(Damage("ballot", ballot_name(row.ballot, *index), "is not what its sum says"))
-            out[row.ballot] = _Planes(row.states, row.tally, row.gone, row.new_points, row.free)
+            out[row.ballot] = _Planes(*(getattr(row, plane) for plane in schema.BALLOT_PLANES))
     if damaged:
         raise DamagedBallots(damaged)
     return out
 
 
 def _vote(stored: StoredVote, planes: _Planes, states: U8 | None) -> TileVote:
+    new_points, intensity = unpack_offer(planes.new_points, planes.intensity)
     return TileVote(
         vehicle=stored.vehicle,
         end_ns=stored.end_ns,
@@ -257,6 +259,7 @@ def _vote(stored: StoredVote, planes: _Planes, states: U8 | None) -> TileVote:
         states=states,
         tally=None if planes.tally is None else unpack_tally(planes.tally),
         gone=None if planes.gone is None else Words.unpack(planes.gone, "gone"),
-        new_points=None if planes.new_points is None else unpack_points(planes.new_points),
+        new_points=new_points,
+        intensity=intensity,
         free=None if planes.free is None else Words.unpack(planes.free, "free"),
     )

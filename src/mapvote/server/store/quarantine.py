@@ -17,7 +17,7 @@ from mapvote.core.grid import TileIndex
 from mapvote.core.types import MapvoteError
 from mapvote.server.store import schema
 from mapvote.server.store.queries import log_event
-from mapvote.server.store.sums import sum_of
+from mapvote.server.store.sums import sum_of_planes
 
 MENDED = "mended"
 """The kind of the event by which a plane is again what it was."""
@@ -55,7 +55,7 @@ def ballot_name(seq: int, row: int, col: int) -> str:
 
 def ballot_sum(row: Any) -> str:
     """The sum of a row of ballot_tiles."""
-    return sum_of(row.base, *(getattr(row, plane) for plane in schema.BALLOT_PLANES))
+    return sum_of_planes(row.base, [getattr(row, plane) for plane in schema.BALLOT_PLANES])
 
 
 def set_aside(connection: sa.Connection) -> dict[tuple[str, str], str]:

@@ -67,14 +67,19 @@ def tiles_of(
     last = newest.group_by(t.c.row, t.c.col).subquery()
     same = (t.c.row == last.c.row) & (t.c.col == last.c.col) & (t.c.version == last.c.version)
     rows = connection.execute(sa.select(t).join(last, same).where(t.c.points.is_not(None)).order_by(t.c.row, t.c.col))
-    tiles = {(row.row, row.col): TileHashes(row.points, row.ground, row.free, row.memory) for row in rows}
+    tiles = {(row.row, row.col): _hashes(row) for row in rows}
     return tiles if only is None else {index: tiles[index] for index in only if index in tiles}
 
 
 def tile_of(connection: sa.Connection, number: int, index: TileIndex) -> TileHashes | None:
     """Hashes of one tile of a version; None where the map has none."""
     row = connection.execute(_TILE, {"row": index[0], "col": index[1], "number": number}).one_or_none()
-    return None if row is None or row.points is None else TileHashes(row.points, row.ground, row.free, row.memory)
+    return None if row is None or row.points is None else _hashes(row)
+
+
+def _hashes(row: Any) -> TileHashes:
+    """Of a row of version_tiles."""
+    return TileHashes(**{plane: getattr(row, plane) for plane in schema.TILE_PLANES})
 
 
 def memory_of(connection: sa.Connection, number: int, index: TileIndex) -> Memory | None:
@@ -115,10 +120,8 @@ def load_tile(connection: sa.Connection, window: Grid, hashes: TileHashes | None
     """The tile over ``window`` by its hashes; the empty one where there are none."""
     if hashes is None:
         return Tile.empty(window)
-    free = None if hashes.free is None else load_blob(connection, hashes.free)
-    memory = None if hashes.memory is None else load_blob(connection, hashes.memory)
-    points, ground = load_blob(connection, hashes.points), load_blob(connection, hashes.ground)
-    return unpack_tile(window, hashes, points, ground, free, memory)
+    named = {plane: getattr(hashes, plane) for plane in schema.TILE_PLANES}
+    return unpack_tile(window, hashes, {p: load_blob(connection, digest) for p, digest in named.items() if digest})
 
 
 def tile_as_of(connection: sa.Connection, window: Grid, number: int) -> Tile:
@@ -225,7 +228,7 @@ _ONE_BY_ONE = 200
 """So many tiles are sooner asked for one by one than found among all of the map's."""
 _T = schema.version_tiles
 _TILE = (
-    sa.select(_T.c.points, _T.c.ground, _T.c.free, _T.c.memory)
+    sa.select(*(_T.c[plane] for plane in schema.TILE_PLANES))
     .where(_T.c.row == sa.bindparam("row"), _T.c.col == sa.bindparam("col"), _T.c.version <= sa.bindparam("number"))
     .order_by(_T.c.version.desc())
     .limit(1)

@@ -19,10 +19,10 @@ metadata = sa.MetaData(
     }
 )
 _Hash = sa.String(64)
-TILE_PLANES = "points", "ground", "free", "memory"
+TILE_PLANES = "points", "ground", "free", "memory", "fields"
 """Columns of version_tiles: hashes of planes."""
-BALLOT_PLANES = "states", "tally", "gone", "new_points", "free"
-"""Columns of ballot_tiles that hold planes."""
+BALLOT_PLANES = "states", "tally", "gone", "new_points", "free", "intensity"
+"""Columns of ballot_tiles that hold planes, those that came later last."""
 
 maps = sa.Table(
     "maps",
@@ -109,10 +109,12 @@ version_tiles = sa.Table(
     sa.Column("ground", _Hash),
     sa.Column("free", _Hash),
     sa.Column("memory", _Hash),
+    sa.Column("fields", _Hash),
     sa.Index("ix_version_tiles_tile", "row", "col", "version"),
 )
 """Only tiles that the version set; a tile that it does not name is as in its parent. Null points: no such tile.
-``memory``: for every cell the version of its last change, and what came and went; null: nothing ever did."""
+``memory``: for every cell the version of its last change, and what came and went; null: nothing ever did.
+``fields``: what its points carry besides (codec/fields.py); null: nothing."""
 
 ballots = sa.Table(
     "ballots",
@@ -162,10 +164,11 @@ ballot_tiles = sa.Table(
     sa.Column("gone", sa.LargeBinary),
     sa.Column("new_points", sa.LargeBinary),
     sa.Column("free", sa.LargeBinary),
+    sa.Column("intensity", sa.LargeBinary),
     sa.Column("sum", sa.String(64), nullable=False),
     sa.Index("ix_ballot_tiles_ballot", "ballot"),
 )
-"""``sum``: SHA-256 over base and planes."""
+"""``sum``: over base and planes, see :func:`mapvote.server.store.sums.sum_of_planes`."""
 
 paths = sa.Table(
     "paths",

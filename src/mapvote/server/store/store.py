@@ -57,14 +57,20 @@ class Manifest:
     georeference: Mapping[str, str]
     tiles: Mapping[TileIndex, TileHashes]
     digest: str
-    """Of all tiles of the version, see :func:`digest_of`."""
+    """Of all tiles of the version, see :func:`digests_of`."""
+    fields_digest: str = ""
+    """Likewise of the fields of its points; empty where no tile has any."""
     removed: Sequence[TileIndex] = ()
     """With ``since``: tiles that the older version had and this one has not."""
 
 
-def digest_of(tiles: Mapping[TileIndex, TileHashes]) -> int:
-    """See :func:`mapvote.codec.tile_file.digest_of_tiles`."""
-    return digest_of_tiles((tile_key(index), h.points, h.ground, h.free) for index, h in tiles.items())
+def digests_of(tiles: Mapping[TileIndex, TileHashes]) -> tuple[int, int]:
+    """Of tiles, and of the fields of those that have any; see :func:`mapvote.codec.tile_file.digest_of_tiles`."""
+    fields = {index: h.fields for index, h in tiles.items() if h.fields is not None}
+    return (
+        digest_of_tiles((tile_key(index), h.points, h.ground, h.free) for index, h in tiles.items()),
+        digest_of_tiles((tile_key(index), digest) for index, digest in fields.items()),
+    )
 
 
 def url_of(store: str) -> str:
@@ -102,7 +108,7 @@ class Store:
         self.lattice = Lattice(row.x0, row.y0)
         self.georeference: Mapping[str, str] = row.georeference
         self.surveyed_ns: int | None = row.surveyed_ns
-        self._digests: dict[int, int] = {}
+        self._digests: dict[int, tuple[int, int]] = {}
 
     @classmethod
     def create(
@@ -181,11 +187,12 @@ class Store:
                 version_of(connection, since, cleared=True)
             if since is None:
                 tiles, removed = tiles_of(connection, number), list[TileIndex]()
-                self._digests[number] = digest_of(tiles)
+                self._digests[number] = digests_of(tiles)
             else:
                 tiles, removed = self._changed(connection, since, number)
-            digest = self._digest(connection, number)
-        return Manifest(number, self.map_id, self.lattice, self.georeference, tiles, f"{digest:064x}", removed)
+            digest, fields = self._digest(connection, number)
+        told = f"{digest:064x}", f"{fields:064x}" if fields else ""
+        return Manifest(number, self.map_id, self.lattice, self.georeference, tiles, *told, removed)
 
     def _changed(
         self, connection: sa.Connection, since: int, number: int
@@ -196,15 +203,17 @@ class Store:
         changed = {index: hashes for index, hashes in now.items() if then.get(index) != hashes}
         return changed, sorted(then.keys() - now.keys())
 
-    def _digest(self, connection: sa.Connection, number: int) -> int:
+    def _digest(self, connection: sa.Connection, number: int) -> tuple[int, int]:
         """Of a version: what is known of the last one before it, and what changed since."""
         before = max((known for known in self._digests if known <= number), default=None)
         if before is None:
-            self._digests[number] = digest_of(tiles_of(connection, number))
+            self._digests[number] = digests_of(tiles_of(connection, number))
         elif before < number:
             touched = tiles_set_between(connection, before, number)
-            then, now = (digest_of(tiles_of(connection, version, touched)) for version in (before, number))
-            self._digests[number] = (self._digests[before] - then + now) % DIGESTS
+            then, now = (digests_of(tiles_of(connection, version, touched)) for version in (before, number))
+            known = zip(self._digests[before], then, now, strict=True)
+            tiles, fields = ((whole - old + new) % DIGESTS for whole, old, new in known)
+            self._digests[number] = tiles, fields
         return self._digests[number]
 
     def blob(self, digest: str) -> bytes:

@@ -23,6 +23,14 @@ def sum_of(*parts: Any) -> str:
     return digest.hexdigest()
 
 
+def sum_of_planes(base: str, planes: Sequence[bytes | None]) -> str:
+    """The sum of a ballot's votes on one tile, of all ``BALLOT_PLANES`` in their order.
+
+    Intensity counts only where there is one: what was written before there was that plane keeps its sum.
+    """
+    return sum_of(base, *(planes[:-1] if planes[-1] is None else planes))
+
+
 def _raw(part: Any) -> bytes:
     if part is None:
         return b""

@@ -1,0 +1,50 @@
+"""Fields of a tile's points <-> bytes: columns of numbers by their names."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from mapvote.core.types import MapvoteError
+
+FIELD_TYPES = ("|u1", "|i1", "<u2", "<i2", "<u4", "<i4", "<u8", "<i8", "<f4", "<f8")
+
+
+def pack_fields(fields: Mapping[str, NDArray[Any]]) -> bytes:
+    """Columns (n,) as a msgpack map of name to (type, little-endian values), in their order: equal fields, equal
+    bytes."""
+    return msgspec.msgpack.encode({name: (kind_of(c), _little(c).tobytes()) for name, c in fields.items()})
+
+
+def unpack_fields(raw: bytes, n: int, what: str) -> dict[str, NDArray[Any]]:
+    """The inverse, of ``n`` points; MapvoteError, by the name of ``what``, if it is damaged or not of so many."""
+    try:
+        packed = msgspec.msgpack.decode(raw, type=dict[str, tuple[str, bytes]])
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise MapvoteError(f"{what}: no fields of points ({error}); fetch it again") from error
+    fields = {}
+    for name, (kind, values) in packed.items():
+        check_kind(kind, f"{what}: {name}")
+        if len(values) != n * np.dtype(kind).itemsize:
+            raise MapvoteError(f"{what}: {name} has {len(values)} bytes, but there are {n} points; fetch it again")
+        fields[name] = np.frombuffer(values, dtype=kind)
+    return fields
+
+
+def kind_of(column: NDArray[Any]) -> str:
+    """The type of a column's values as it is written: "<f4", "|u1"."""
+    return column.dtype.newbyteorder("<").str
+
+
+def check_kind(kind: str, what: str) -> None:
+    """MapvoteError for what is no type of a field."""
+    if kind not in FIELD_TYPES:
+        raise MapvoteError(f"{what}: of type {kind[:20]!r}, which no field has; fetch it again")
+
+
+def _little(column: NDArray[Any]) -> NDArray[Any]:
+    return np.ascontiguousarray(column.astype(kind_of(column), copy=False))
