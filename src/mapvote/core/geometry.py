@@ -33,6 +33,16 @@ def _transformed(T: F64, points: NDArray[np.floating]) -> F64:
     return out
 
 
+@numba.njit(cache=True, nogil=True)
+def rows_from(points: F64, origin: F64) -> NDArray[np.float32]:
+    """(3, n) float32: points (n, 3) from ``origin`` (3,), in rows of x, y and z, which loops over points vectorise."""
+    rows = np.empty((3, len(points)), np.float32)
+    x, y, z = rows[0], rows[1], rows[2]
+    for i in range(np.uint64(0), np.uint64(len(points))):  # unsigned: an index that cannot be negative vectorises
+        x[i], y[i], z[i] = points[i, 0] - origin[0], points[i, 1] - origin[1], points[i, 2] - origin[2]
+    return rows
+
+
 def inverse(T_a_b: F64) -> F64:
     """T_b_a of T_a_b, by the transpose of the rotation (exact for rigid motions)."""
     T = np.eye(4)

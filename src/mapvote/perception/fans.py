@@ -1,7 +1,8 @@
 """Rays gathered into fans of about a beam's width in azimuth, and the cells that a fan crosses.
 
-A fan is walked once over the cells; each of its rays then marks the voxels between its height on entering and on
-leaving each of them. One walk thus serves all beams of a firing, and the loop along a ray runs over vectors of cells.
+A fan is walked once over the cells, from where it marks; each of its rays that comes so far then marks the voxels
+between its height on entering and on leaving each of them. One walk thus serves all beams of a firing, and the loop
+along a ray runs over vectors of cells, in halves of a column's word: numbers of 32 bits make vectors twice as long.
 """
 
 from __future__ import annotations
@@ -12,89 +13,114 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from mapvote.core.columns import TOP_BIT
 from mapvote.core.geometry import turn
 from mapvote.core.grid import CELL_SIZE
-from mapvote.core.types import F32, F64, I32, U8, U64
+from mapvote.core.types import F32, F64, I32, U64
 
+U32 = NDArray[np.uint32]
 FANS = 2048
 """Fans in a turn (0.18 deg, a firing or two): two cross every cell at 40 m. A fan's direction is its rays' mean."""
 FULL_RANGE_M = 25.0
 """Nearer than this every second fan suffices for two to a cell, nearer than half of it every fourth, and so on."""
-INFINITY = np.float32(np.inf)
+_LANES = 16
+"""Cells that a ray is entered into at once: where it ends within them, the rest is masked."""
+_HALF = 32
+"""Voxels of half a column."""
+
+
+class Rays(NamedTuple):
+    """Where rays go, (n,) each."""
+
+    reach: F32
+    """Horizontal metres to the return."""
+    x: F32
+    """Horizontal direction, of length 1."""
+    y: F32
+    slope: F32
+    """Voxels of height per metre of horizontal way."""
+    stop: F32
+    """Horizontal metres to the end of what the ray proves."""
+    fan: I32
 
 
 class Fans(NamedTuple):
-    """Rays by fan."""
+    """Rays by fan: those that come to where their fan marks."""
 
-    start: I32
-    """(FANS + 1,) first ray of each fan."""
+    first: I32
+    """(FANS,) first ray of each fan, and ..."""
+    last: I32
+    """... the one after its last."""
     slope: F32
-    """Voxels of height per metre of horizontal way, of every ray."""
+    """Voxels of height per metre of horizontal way, of every ray; between two fans one is left free."""
     stop: F32
     """Horizontal metres to the end of what the ray proves."""
     end: F32
     """(FANS,) the largest of them in each fan; 0 without rays."""
     direction: F64
-    """(FANS, 2) mean direction of the rays, of length 1."""
-    nearest: F32
-    """(FANS,) horizontal metres to the nearest obstacle ..."""
-    farthest: F32
-    """... and to the farthest return."""
+    """(FANS, 2) mean direction of all rays, of length 1; 0 without any."""
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _rays(points: F64, origin: F64, clearance: float) -> tuple[F32, F32, F32, F32, F32, I32]:
-    """(reach, direction x, y, slope, stop, fan) of every ray, each (n,): see :class:`Fans`. Without a branch, and by an
-    index that cannot be negative, so that it vectorises."""
-    n = len(points)
+def follow_rays(rows: F32, clearance: float) -> Rays:
+    """The rays that end ``rows`` (3, n) metres from the sensor, and prove nothing from ``clearance`` before that on.
+
+    Without a branch, in float32 alone and by an index that cannot be negative, so that it vectorises.
+    """
+    across, along, up = rows[0], rows[1], rows[2]
+    n = len(across)
     reach, slope, stop = np.empty(n, np.float32), np.empty(n, np.float32), np.empty(n, np.float32)
     x, y, fan = np.empty(n, np.float32), np.empty(n, np.float32), np.empty(n, np.int32)
+    clear, layer = np.float32(clearance), np.float32(CELL_SIZE)
     for i in range(np.uint64(0), np.uint64(n)):
-        dx, dy = np.float32(points[i, 0] - origin[0]), np.float32(points[i, 1] - origin[1])
-        dz = np.float32(points[i, 2] - origin[2])
+        dx, dy, dz = across[i], along[i], up[i]
         h = np.sqrt(dx * dx + dy * dy)
         reach[i], x[i], y[i] = h, dx / h, dy / h
-        slope[i] = dz / (np.float32(CELL_SIZE) * h)
-        stop[i] = h - np.float32(clearance) * h / np.sqrt(h * h + dz * dz)
+        slope[i] = dz / (layer * h)
+        stop[i] = h - clear * h / np.sqrt(h * h + dz * dz)
         fan[i] = min(np.int32(turn(dx, dy) * np.float32(FANS)), np.int32(FANS - 1))
-    return reach, x, y, slope, stop, fan
+    return Rays(reach, x, y, slope, stop, fan)
 
 
-@numba.njit(cache=True, nogil=True)
-def gather_rays(points: F64, obstacle: NDArray[np.bool_], origin: F64, clearance: float) -> Fans:
-    """Sort rays into fans."""
-    reach, x, y, rise, end, fan = _rays(points, origin, clearance)
-    start = np.zeros(FANS + 1, np.int32)
-    direction = np.zeros((FANS, 2))
-    nearest = np.full(FANS, INFINITY, np.float32)
-    farthest = np.zeros(FANS, np.float32)
-    for i in range(len(points)):
-        h, f = reach[i], fan[i]
-        if not h >= CELL_SIZE:  # the sensor's own cell proves nothing
-            continue
-        start[f + 1] += 1
-        direction[f, 0] += x[i]
-        direction[f, 1] += y[i]
-        farthest[f] = max(farthest[f], h)
-        if obstacle[i] and h < nearest[f]:
-            nearest[f] = h
+def _marks_from() -> F32:
+    """(FANS,) horizontal metres from which each fan marks what it passes, see FULL_RANGE_M."""
+    halved = np.array([(f & -f).bit_length() - 1 if f else 64 for f in range(FANS)])
+    marks_from = FULL_RANGE_M * 0.5**halved
+    return np.where(marks_from <= CELL_SIZE, 0.0, marks_from).astype(np.float32)
+
+
+_MARKS_FROM = _marks_from()
+_TOO_SHORT = (_MARKS_FROM - 1.5 * CELL_SIZE).astype(np.float32)
+"""A ray that ends before this comes to no cell that its fan marks: a cell is 1.42 sides across."""
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def gather_rays(rays: Rays) -> Fans:
+    """Sort rays into fans. What lies in the sensor's own cell proves nothing."""
+    n, own = np.uint64(len(rays.reach)), np.float32(CELL_SIZE)
+    first, direction = np.zeros(FANS, np.int32), np.zeros((FANS, 2))
+    for i in range(n):
+        fan = np.uint64(rays.fan[i])
+        if rays.reach[i] >= own:
+            direction[fan, 0] += rays.x[i]
+            direction[fan, 1] += rays.y[i]
+            first[fan] += 1 if rays.stop[i] > _TOO_SHORT[fan] else 0
+    room = 0
     for f in range(FANS):
-        start[f + 1] += start[f]
+        room, first[f] = room + first[f] + 1, room
         norm = np.sqrt(direction[f, 0] ** 2 + direction[f, 1] ** 2)
         if norm > 0.0:
             direction[f, 0] /= norm
             direction[f, 1] /= norm
-    slope, stop, last = np.empty(start[FANS], np.float32), np.empty(start[FANS], np.float32), np.zeros(FANS, np.float32)
-    filled = start[:FANS].copy()
-    for i in range(len(points)):
-        if not reach[i] >= CELL_SIZE:
-            continue
-        f = fan[i]
-        slope[filled[f]], stop[filled[f]] = rise[i], end[i]
-        last[f] = max(last[f], end[i])
-        filled[f] += 1
-    return Fans(start, slope, stop, last, direction, nearest, farthest)
+    slope, stop, end = np.empty(room, np.float32), np.empty(room, np.float32), np.zeros(FANS, np.float32)
+    last = first.copy()
+    for i in range(n):  # what is not kept is written over, so that nothing hangs on a guess
+        fan, e = np.uint64(rays.fan[i]), rays.stop[i]
+        keep = (rays.reach[i] >= own) & (e > _TOO_SHORT[fan])
+        k = np.uint64(last[fan])
+        slope[k], stop[k] = rays.slope[i], e
+        last[fan] += 1 if keep else 0
+        end[fan] = max(end[fan], e if keep else np.float32(0.0))
+    return Fans(first, last, slope, stop, end, direction)
 
 
 class Way(NamedTuple):
@@ -114,7 +140,7 @@ class Way(NamedTuple):
 
 
 @numba.njit(cache=True, nogil=True)
-def _set_out(x: float, y: float, dx: float, dy: float, at: float) -> Way:
+def set_out(x: float, y: float, dx: float, dy: float, at: float) -> Way:
     """The way from (x, y), in cells, in direction (dx, dy), where it has come ``at`` metres."""
     far, along = 1e18, 1e-9  # what runs along an axis never comes to the next row or column
     c, r = int(np.floor(x + dx * at / CELL_SIZE)), int(np.floor(y + dy * at / CELL_SIZE))
@@ -125,17 +151,8 @@ def _set_out(x: float, y: float, dx: float, dy: float, at: float) -> Way:
     return Way(r, c, max(0.0, next_c - width_c, next_r - width_r), next_r, next_c, width_r, width_c)
 
 
-@numba.njit(cache=True, nogil=True)
-def _marks_from(f: int) -> float:
-    """Horizontal metres from which fan ``f`` marks what it passes, see FULL_RANGE_M."""
-    marks_from = FULL_RANGE_M
-    while f % 2 == 0 and marks_from > CELL_SIZE:
-        marks_from, f = 0.5 * marks_from, f // 2
-    return 0.0 if marks_from <= CELL_SIZE else marks_from
-
-
 class Crossed(NamedTuple):
-    """The cells that a fan crosses, in order."""
+    """The cells that a fan crosses, in order, and _LANES more that hold nothing."""
 
     cell: I32
     """row * cols + col."""
@@ -143,53 +160,73 @@ class Crossed(NamedTuple):
     """Horizontal metres at which the fan comes into each, and behind the last one at which it leaves."""
     bottom: I32
     """Bit 0 of each column, as a layer counted from the sensor's."""
-    words: U64
-    """What the fan's rays pass of each."""
+    low: U32
+    """What the fan's rays pass of the lower half of each column ..."""
+    high: U32
+    """... and of the upper."""
+
+
+@numba.njit(cache=True, nogil=True)
+def _room_for(cells: int) -> Crossed:
+    room = cells + _LANES
+    low, high = np.zeros(room, np.uint32), np.zeros(room, np.uint32)
+    return Crossed(np.zeros(room, np.int32), np.zeros(room + 1, np.float32), np.zeros(room, np.int32), low, high)
 
 
 @numba.njit(cache=True, nogil=True)
 def _cross_cells(way: Way, ahead: tuple[int, int], end: float, base: I32, layer: int, out: Crossed) -> int:
     """Fill ``out`` with the cells of a way that steps ``ahead`` rows and columns, up to ``end`` metres or the window's
-    edge. Returns how many there are."""
+    edge. Returns how many there are. Which way a step goes is chosen, not branched to: nobody can guess it."""
     rows, cols = base.shape
     r, c, t, next_r, next_c, width_r, width_c = way
+    flat = base.ravel()
     n = 0
     while 0 <= r < rows and 0 <= c < cols and t < end:
-        out.cell[n], out.entered[n], out.bottom[n], out.words[n] = r * cols + c, t, base[r, c] - layer, 0
+        k = np.uint64(r * cols + c)
+        out.cell[n], out.entered[n], out.bottom[n] = k, t, flat[k] - layer
         n += 1
         t = min(next_c, next_r)
-        if next_c < next_r:
-            c += ahead[1]
-            next_c += width_c
-        else:
-            r += ahead[0]
-            next_r += width_r
-    out.entered[n] = t
+        column = next_c < next_r
+        c += ahead[1] if column else 0
+        r += 0 if column else ahead[0]
+        next_c += width_c if column else 0.0
+        next_r += 0.0 if column else width_r
+    for j in range(n, n + _LANES):
+        out.entered[j], out.bottom[j] = t, 0
     return n
 
 
-@numba.njit(inline="always")
-def _entered_before(entered: F32, n: int, stop: np.float32) -> np.uint64:
-    """How many of the first ``n`` ascending numbers lie below ``stop``."""
-    low, high = np.uint64(0), np.uint64(n)
-    while low < high:
-        middle = (low + high) >> np.uint64(1)
-        low, high = (middle + np.uint64(1), high) if entered[middle] < stop else (low, middle)
-    return low
-
-
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _pass(slope: np.float32, stop: np.float32, height: np.float32, n: np.uint64, crossed: Crossed) -> None:
+def _pass(
+    slope: np.float32, stop: np.float32, height: np.float32, up: int, n: int, crossed: Crossed, words: U32
+) -> None:
     """Enter what one ray passes of the first ``n`` cells: in each, the voxels between its heights on entering and on
-    leaving. ``height`` of the sensor over its layer, in voxels. One vector lane a cell."""
-    t, bottom, words = crossed.entered, crossed.bottom, crossed.words
-    none, top, one = np.int32(0), np.int32(TOP_BIT), np.int32(1)
-    for j in range(np.uint64(0), n):  # unsigned: an index that cannot be negative vectorises
-        enter = np.int32(np.floor(height + slope * t[j])) - bottom[j]
-        leave = np.int32(np.floor(height + slope * min(t[j + np.uint64(1)], stop))) - bottom[j]
-        low = min(max(np.int32(min(enter, leave)), none), top)
-        high = min(max(np.int32(max(enter, leave) + one), none), top)
-        words[j] |= (np.uint64(1) << np.uint64(high)) - (np.uint64(1) << np.uint64(low))
+    leaving. ``height`` of the sensor over its layer, in voxels; ``words`` begin ``up`` voxels above the columns."""
+    t, bottom = crossed.entered, crossed.bottom
+    none, most = np.int32(0), np.int32(_HALF - 1)
+    b = np.uint64(0)
+    while b < np.uint64(n) and t[b] < stop:
+        for i in range(np.uint64(_LANES)):  # unsigned: an index that cannot be negative vectorises
+            j = b + i
+            enter = np.int32(np.floor(height + slope * t[j]))
+            leave = np.int32(np.floor(height + slope * min(t[j + np.uint64(1)], stop)))
+            from_ = np.int32(min(enter, leave) - np.int32(bottom[j] + up))
+            to = np.int32(max(enter, leave) - np.int32(bottom[j] + up))
+            here = (t[j] < stop) & (to >= none) & (from_ <= most)
+            first, last = np.uint32(min(max(from_, none), most)), np.uint32(min(max(to, none), most))
+            bits = np.uint32(np.uint32(2) << last) - np.uint32(np.uint32(1) << first)
+            words[j] |= np.uint32(bits) if here else np.uint32(0)
+        b += np.uint64(_LANES)
+
+
+@numba.njit(cache=True, nogil=True)
+def _enter(crossed: Crossed, n: int, passed: U64) -> None:
+    """What a fan passed into the plane (flat), and the words empty again. Bit 63, all above, is never passed."""
+    for j in range(n):
+        low, high = np.uint64(crossed.low[j]), np.uint64(crossed.high[j] & np.uint32(0x7FFFFFFF))
+        passed[np.uint64(crossed.cell[j])] |= low | high << np.uint64(_HALF)
+    crossed.low[: n + _LANES] = 0
+    crossed.high[: n + _LANES] = 0
 
 
 @numba.njit(cache=True, nogil=True)
@@ -199,43 +236,17 @@ def mark_passed(fans: Fans, origin: F64, corner: tuple[float, float], base: I32,
     layer = int(np.floor(origin[2] / CELL_SIZE))
     height = np.float32(origin[2] / CELL_SIZE - layer)
     x, y = (origin[0] - corner[0]) / CELL_SIZE, (origin[1] - corner[1]) / CELL_SIZE
-    start, slope, stop = fans.start, fans.slope, fans.stop
-    most = rows + cols + 1
-    crossed = Crossed(
-        np.empty(most, np.int32), np.empty(most + 1, np.float32), np.empty(most, np.int32), np.empty(most, np.uint64)
-    )
+    crossed = _room_for(rows + cols + 1)
     for f in range(FANS):
-        marks_from = _marks_from(f)
-        if fans.end[f] <= marks_from:
+        if fans.end[f] <= _MARKS_FROM[f]:
             continue
         dx, dy = fans.direction[f]
         ahead = (1 if dy > 0 else -1), (1 if dx > 0 else -1)
-        n = _cross_cells(_set_out(x, y, dx, dy, marks_from), ahead, fans.end[f], base, layer, crossed)
-        for k in range(start[f], start[f + 1]):
-            _pass(slope[k], stop[k], height, _entered_before(crossed.entered, n, stop[k]), crossed)
-        for j in range(n):
-            passed[crossed.cell[j]] |= crossed.words[j]
-
-
-@numba.njit(cache=True, nogil=True)
-def mark_sight(fans: Fans, origin: F64, corner: tuple[float, float], sight: U8) -> None:
-    """Walk every fan from the sensor to the edge of the window, and enter how far it sees into ``sight``."""
-    rows, cols = sight.shape
-    x, y = (origin[0] - corner[0]) / CELL_SIZE, (origin[1] - corner[1]) / CELL_SIZE
-    for f in range(FANS):
-        if fans.start[f] == fans.start[f + 1]:
-            continue
-        dx, dy = fans.direction[f]
-        step_r, step_c = (1 if dy > 0 else -1), (1 if dx > 0 else -1)
-        r, c, t0, next_r, next_c, width_r, width_c = _set_out(x, y, dx, dy, 0.0)
-        while 0 <= r < rows and 0 <= c < cols:
-            level = 1 if t0 > fans.farthest[f] else (2 if t0 > fans.nearest[f] else 3)
-            if sight[r, c] < level:
-                sight[r, c] = level
-            t0 = min(next_c, next_r)
-            if next_c < next_r:
-                c += step_c
-                next_c += width_c
-            else:
-                r += step_r
-                next_r += width_r
+        n = _cross_cells(set_out(x, y, dx, dy, _MARKS_FROM[f]), ahead, fans.end[f], base, layer, crossed)
+        lowest = crossed.bottom[:n].min() if n else 0
+        for k in range(fans.first[f], fans.last[f]):
+            slope, stop = fans.slope[k], fans.stop[k]
+            _pass(slope, stop, height, 0, n, crossed, crossed.low)
+            if height + max(slope, np.float32(0.0)) * stop >= lowest + _HALF:
+                _pass(slope, stop, height, _HALF, n, crossed, crossed.high)
+        _enter(crossed, n, passed)

@@ -13,9 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapvote.core.columns import GROUND_MARGIN_M, column_bit, height_above
+from mapvote.core.geometry import rows_from
 from mapvote.core.grid import CELL_SIZE, Grid
 from mapvote.core.types import F32, F64, I32, U8, U64, Bool, Reference
-from mapvote.perception.fans import gather_rays, mark_passed, mark_sight
+from mapvote.perception.fans import follow_rays, gather_rays, mark_passed
+from mapvote.perception.sight import mark_sight
 
 CLEARANCE_M = 0.45
 """A ray proves emptiness only up to here before its own hit: half a voxel's diagonal, range noise and pose error."""
@@ -115,7 +117,9 @@ def cast_rays(
     sight = np.zeros(grid.shape if with_sight else (0, 0), dtype=np.uint8)
     base = np.ascontiguousarray(reference.base)
     _enter_hits(points_map, cell, obstacle & ~moving, base.ravel(), counts.ravel(), hit.ravel())
-    fans = gather_rays(points_map, obstacle, origin_map, CLEARANCE_M)
+    rays = follow_rays(rows_from(points_map, origin_map), CLEARANCE_M)
+    fans = gather_rays(rays)
     mark_passed(fans, origin_map, (grid.x0, grid.y0), base, passed.ravel())
-    mark_sight(fans, origin_map, (grid.x0, grid.y0), sight)
+    if with_sight:
+        mark_sight(rays, obstacle, fans, origin_map, (grid.x0, grid.y0), sight)
     return ScanView(grid, counts, hit, passed, sight)
