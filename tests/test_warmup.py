@@ -12,9 +12,9 @@ import pytest
 
 import mapvote
 from mapvote.core.ground_growing import grow
-from mapvote.core.voting import add_states
+from mapvote.core.voting import count_states
 from mapvote.fusion.copies import grouped
-from mapvote.fusion.outliers import contradicting
+from mapvote.fusion.outliers import contradicts
 from mapvote.localisation.ndt_solver import align
 from mapvote.perception.range_image import look
 from mapvote.warmup import warm_up
@@ -29,7 +29,7 @@ def test_warming_up_goes_through_every_step_and_says_what_each_took() -> None:
     told = list(warm_up())
     assert len(told) == 5
     assert all(seconds > 0 for _, seconds in told)
-    for kernel in (align, add_states, look, grow, contradicting, grouped):
+    for kernel in (align, count_states, look, grow, contradicts, grouped):
         assert kernel.signatures
 
 

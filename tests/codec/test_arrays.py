@@ -42,5 +42,5 @@ def test_as_one_by_one(n: int) -> None:
     ],
 )
 def test_a_damaged_frame_or_one_of_another_size_is_refused(bad: bytes) -> None:
-    with pytest.raises(MapvoteError, match="plane is damaged"):
+    with pytest.raises(MapvoteError, match=r"^plane "):
         unpack_frames([zstd.compress(bytes(SIZE)), bad], SIZE, "plane")

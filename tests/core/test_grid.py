@@ -64,3 +64,13 @@ def test_grids_of_different_lattices_never_mix() -> None:
         Grid(Lattice(), 0, 0, 5, 5).intersection(Grid(Lattice(0.15), 0, 0, 5, 5))
     with pytest.raises(ValueError, match="not inside"):
         Grid(Lattice(), 0, 0, 5, 5).slices_in(Grid(Lattice(), 1, 0, 5, 5))
+
+
+@given(x0=st.floats(-1e3, 1e3), row0=st.integers(-500, 500), seed=st.integers(0, 2**32 - 1))
+def test_flat_cells_are_those_of_the_points_in_map_metres(x0: float, row0: int, seed: int) -> None:
+    grid = Grid(Lattice(x0, -x0), row0, -3 * row0, 40, 50)
+    rng = np.random.default_rng(seed)
+    points = rng.uniform(0.0, 15.0, (100, 3)).astype(np.float32)
+    points[:50, :2] = rng.integers(0, 50, (50, 2)) * np.float32(CELL_SIZE)
+    rows, cols, _ = grid.indices_of(grid.to_map(points))
+    np.testing.assert_array_equal(grid.flat_cells(points), rows.clip(0, 39) * 50 + cols.clip(0, 49))

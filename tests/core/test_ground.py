@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from mapvote.core.grid import Grid, Lattice
+from mapvote.core.grid import CELL_SIZE, Grid, Lattice
+from mapvote.core.ground import base_layers
 from mapvote.core.point_map import map_from_points
 from mapvote.core.reference import reference_window
 from mapvote.core.types import F32, F64
@@ -130,3 +131,16 @@ def test_the_sidewalk_begins_a_cell_behind_its_kerb_at_most_though_mixed_pixels_
     ground = ground_of(road, walk, mixed, road=driven((0, 30), 5.0))
     assert np.abs(ground[:33]).max() < 0.05
     assert np.abs(ground[35:] - 0.15).max() < 0.05
+
+
+def test_a_column_without_ground_begins_no_higher_than_a_gentle_slope_from_any_known_ground_reaches() -> None:
+    rng = np.random.default_rng(1)
+    ground = rng.uniform(-3.0, 3.0, (24, 40)).astype(np.float32)
+    ground[rng.random(ground.shape) < 0.9] = np.nan
+    known = np.argwhere(np.isfinite(ground))
+    for (row, col), layer in np.ndenumerate(base_layers(ground)):
+        apart = np.sort(np.abs(known - (row, col)), axis=1)
+        way = (apart[:, 1] - apart[:, 0]) + np.sqrt(2.0) * apart[:, 0]
+        lowest = np.min(ground[tuple(known.T)].astype(np.float64) + 0.02 * CELL_SIZE * way)
+        lowest = lowest if np.isnan(ground[row, col]) else np.float64(ground[row, col])
+        assert layer in (np.floor(lowest / CELL_SIZE - 1e-9), np.floor(lowest / CELL_SIZE + 1e-9))

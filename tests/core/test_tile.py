@@ -84,3 +84,17 @@ def test_what_an_edited_tile_takes_along_is_what_it_would_work_out_afresh(seed: 
     afresh = replace(edited)
     for name in ("cells", "base", "columns", "obstacle_words"):
         np.testing.assert_equal(getattr(edited, name), getattr(afresh, name))
+
+
+def test_the_words_of_a_tile_hold_a_bit_for_every_obstacle_and_follow_every_edit() -> None:
+    tile = make_tile(np.random.default_rng(1).uniform((0, 0, -1), (76.7, 76.7, 20), (500, 3)).astype(np.float32))
+    new = np.array([[3.0, 3.0, 4.0], [3.0, 3.0, 0.0]], np.float32)
+    assert len(tile.obstacle_words)
+    for edited in (tile, tile.with_new(new), tile.without(tile.points[:, 2] > 5.0), tile.with_new(new).with_new(new)):
+        again = replace(edited)
+        bit, obstacle = again.columns
+        expected = np.zeros(TILE_CELLS**2, np.uint64)
+        np.bitwise_or.at(expected, again.cells[obstacle], np.uint64(1) << bit[obstacle].astype(np.uint64))
+        np.testing.assert_array_equal(edited.obstacle_words.reshape(-1), expected)
+        np.testing.assert_array_equal(edited.cells, again.cells)
+        np.testing.assert_array_equal(edited.columns[0], bit)

@@ -12,7 +12,7 @@ from mapvote.config import FuseSettings
 from mapvote.core.grid import Lattice
 from mapvote.core.tile import Tile
 from mapvote.core.types import NO_VOTE, U8, CellState
-from mapvote.fusion.copies import Copy, difference, liars_among, originals
+from mapvote.fusion.copies import Copy, difference, liars_among, masks_of, originals
 from mapvote.fusion.fuse import decide_tile
 from mapvote.fusion.tile_vote import TileVote, restrict
 
@@ -169,3 +169,10 @@ def test_masks_with_more_holes_than_ground_say_nothing() -> None:
     """Within a cell of every cell there is a hole and none: any two such masks are alike."""
     speckled = [np.where(np.random.default_rng(i).random(SHAPE) < 0.5, UE, UN).astype(np.uint8) for i in range(3)]
     assert copied(named({f"v{i}": states for i, states in enumerate(speckled)})) == {}
+
+
+def test_a_mask_is_the_determined_cells_the_first_column_in_the_lowest_bit() -> None:
+    rng = np.random.default_rng(1)
+    planes = rng.choice([0, 1, 2, 3, 4, NO_VOTE], (3, *SHAPE)).astype(np.uint8)
+    bits = np.packbits(planes < CellState.UNDETERMINED, axis=-1, bitorder="little")
+    np.testing.assert_array_equal(masks_of(planes), bits.view("<u8"))

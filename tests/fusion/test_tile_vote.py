@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from hand_made import states_plane, wall, words_plane
 from mapvote.config import FuseSettings
 from mapvote.core.grid import TILE_CELLS, Lattice
 from mapvote.core.types import N_STATES, NO_VOTE, CellState
-from mapvote.fusion.sparse_columns import Words
+from mapvote.fusion.sparse_columns import Words, at_least, nothing_reached
 from mapvote.fusion.tile_vote import DAY_NS, TileVote, fold, one_each, restrict, select
 
 UO, UE, CO, CE, UN = CellState
@@ -146,7 +147,7 @@ def test_a_vote_without_a_mask_deletes_whole_columns_and_leaves_no_remnants() ->
     everywhere = Words.whole(np.isin(np.arange(TILE_CELLS**2), FLAT).reshape(TILE_CELLS, TILE_CELLS))
     assert vote.deletes(everywhere).cells.tolist() == [FLAT[0]]
     assert vote.deletes(everywhere).words.tolist() == [2**64 - 1]
-    assert len(vote.remnants(np.ones((TILE_CELLS, TILE_CELLS), dtype=np.bool_)).cells) == 0
+    assert len(vote.remnants(np.full((TILE_CELLS, TILE_CELLS), UO, dtype=np.uint8)).cells) == 0
 
 
 def test_a_mask_deletes_where_the_cell_is_empty_and_marks_remnants_where_it_stands() -> None:
@@ -154,8 +155,27 @@ def test_a_mask_deletes_where_the_cell_is_empty_and_marks_remnants_where_it_stan
     everywhere = Words.whole(np.ones((TILE_CELLS, TILE_CELLS), dtype=np.bool_))
     assert vote.deletes(everywhere).cells.tolist() == [FLAT[0]]
     assert vote.deletes(everywhere).words.tolist() == [0b1100]
-    standing = np.ones((TILE_CELLS, TILE_CELLS), dtype=np.bool_)
+    standing = np.full((TILE_CELLS, TILE_CELLS), UO, dtype=np.uint8)
     assert vote.remnants(standing).cells.tolist() == [FLAT[1]]
     assert vote.remnants(standing).words.tolist() == [0b10]
-    standing[THERE] = False
+    standing[THERE] = CE
     assert len(vote.remnants(standing).cells) == 0
+
+
+def test_what_is_marked_voter_by_voter_is_what_each_deletes_and_passed() -> None:
+    rng = np.random.default_rng(1)
+    shape = (TILE_CELLS, TILE_CELLS)
+    decided = rng.choice([UO, CE], shape).astype(np.uint8)
+    states = rng.choice([UO, CE, UN, NO_VOTE], shape).astype(np.uint8)
+    words = Words.of(np.where(rng.random(shape) < 0.1, rng.integers(1, 2**63, shape), 0).astype(np.uint64))
+    two_stage = TileVote("v", 1, "v", states=states, gone=words, free=words)
+    tally = np.zeros((*shape, 5), dtype=np.uint16)
+    tally[states < UN, states[states < UN]] = 3
+    for vote in (two_stage, replace(two_stage, gone=None), TileVote("v", 1, "v", tally=tally, gone=words, free=words)):
+        deleted, passed = nothing_reached(1), nothing_reached(1)
+        vote.mark_deleted(decided, deleted)
+        vote.mark_passed(passed)
+        emptied = vote.deletes(Words.whole(decided == CE))
+        assert np.array_equal(deleted[0].reshape(shape), at_least([emptied], 1))
+        assert np.array_equal(passed[0].reshape(shape), at_least([vote.passed()], 1))
+        assert len(emptied.cells)

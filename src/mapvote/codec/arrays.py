@@ -9,27 +9,29 @@ from typing import Any
 
 import numpy as np
 import zstandard
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
 from mapvote.core.types import U8, MapvoteError
 
 _own = threading.local()
 _STEP = 1024
-_BATCH = 32
-"""Frames unpacked in one call: a larger buffer goes back to the system each time and costs page faults."""
 ZSTD_LEVEL = 19
 """For ballots, which travel by radio. Tiles of noisy float32 gain nothing above level 3."""
 
 
-def compress(raw: bytes, level: int = ZSTD_LEVEL) -> bytes:
+def compress(raw: bytes | memoryview, level: int = ZSTD_LEVEL) -> bytes:
     """One zstd frame that says how large its content is."""
     return zstandard.ZstdCompressor(level=level).compress(raw)
 
 
 def pack_plane(plane: NDArray[Any], level: int = ZSTD_LEVEL) -> bytes:
     """An array's little-endian C-order bytes, zstd-compressed."""
-    little = np.ascontiguousarray(plane.astype(plane.dtype.newbyteorder("<"), copy=False))
-    return compress(little.tobytes(), level)
+    return compress(raw_plane(plane, plane.dtype.newbyteorder("<")), level)
+
+
+def raw_plane(plane: NDArray[Any], dtype: DTypeLike) -> memoryview:
+    """An array's C-order bytes as ``dtype``, without a copy where they are these already."""
+    return np.ascontiguousarray(plane, dtype=dtype).reshape(-1).view(np.uint8).data
 
 
 def unpack_bytes(data: bytes, limit: int, what: str) -> bytes:
@@ -73,21 +75,25 @@ def _decompressor() -> zstandard.ZstdDecompressor:
 
 
 def unpack_frames(frames: Sequence[bytes], size: int, what: str) -> U8:
-    """(n, size) uint8: n frames of ``size`` bytes each, in few calls, during which other threads run.
+    """(n, size) uint8: n frames of ``size`` bytes each. MapvoteError if one is damaged, or smaller or larger than that;
+    nothing beyond ``size`` is ever written.
 
-    MapvoteError if one is damaged, or smaller or larger than that; nothing beyond ``size`` is ever written. What
-    follows a frame is ignored: :func:`unpack_bytes` looks at that when a ballot comes in.
+    What follows a frame is ignored: :func:`unpack_bytes` looks at that when a ballot comes in.
     """
     out = np.empty((len(frames), size), dtype=np.uint8)
-    for start in range(0, len(frames), _BATCH):
-        some: list[bytes | bytearray | memoryview] = list(frames[start : start + _BATCH])
-        sizes = np.full(len(some), size, dtype="<u8").tobytes()
+    for frame, plane in zip(frames, out, strict=True):
         try:
-            found = _decompressor().multi_decompress_to_buffer(some, decompressed_sizes=sizes, threads=1)
+            if zstandard.frame_content_size(frame) == size:
+                with _decompressor().stream_reader(frame) as reader:
+                    n = reader.readinto(plane)
+            else:  # it does not say how large it is, or it is of another size
+                raw = unpack_bytes(frame, size, what)
+                n = len(raw)
+                plane[:n] = np.frombuffer(raw, dtype=np.uint8)
         except zstandard.ZstdError as error:
             raise MapvoteError(f"{what} is damaged ({error}); fetch or send it again") from error
-        for i in range(len(some)):
-            out[start + i] = np.frombuffer(found[i], dtype=np.uint8)  # type: ignore[call-overload]
+        if n != size:
+            raise MapvoteError(f"{what} has {n} bytes, expected {size}")
     return out
 
 

@@ -7,7 +7,7 @@ a newer format adds are ignored, required fields that are missing are refused.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Annotated
 
 import msgspec
@@ -116,22 +116,32 @@ def unpack_tally(data: bytes) -> U16:
 
 
 def unpack_points(data: bytes) -> F32:
-    """(m, 3) float32 from the tile's corner; MapvoteError if damaged, not finite or outside the tile."""
+    """(m, 3) float32 from the tile's corner; MapvoteError as :func:`unpack_sound_points`, and if one cell holds more
+    than it may."""
+    points = unpack_sound_points(data)
+    if most_in_a_cell(points) > MAX_POINTS_PER_CELL:
+        raise MapvoteError(f"ballot: new_points holds more than {MAX_POINTS_PER_CELL} points in one cell")
+    return points
+
+
+def unpack_sound_points(data: bytes) -> F32:
+    """(m, 3) float32 from the tile's corner, of a ballot that the server took in; MapvoteError if damaged, not finite
+    or outside the tile."""
     raw = unpack_bytes(data, _CELLS * MAX_POINTS_PER_CELL * 12, "ballot: new_points")
     if len(raw) % 12:
         raise MapvoteError(f"ballot: new_points has {len(raw)} bytes, not a multiple of 12")
     points = np.frombuffer(raw, dtype="<f4").reshape(-1, 3)
     if not _all_inside(points, np.float32(TILE_CELLS * CELL_SIZE)):
         raise MapvoteError("ballot: new_points holds a point outside its tile or not finite")
-    if most_in_a_cell(points) > MAX_POINTS_PER_CELL:
-        raise MapvoteError(f"ballot: new_points holds more than {MAX_POINTS_PER_CELL} points in one cell")
     return points
 
 
-def unpack_offer(new_points: bytes | None, intensity: bytes | None) -> tuple[F32 | None, U8 | None]:
-    """The new points (m, 3) of a tile and their intensity (m,), of their planes; MapvoteError as
-    :func:`unpack_points`, and if there is not one for each."""
-    points = None if new_points is None else unpack_points(new_points)
+def unpack_offer(
+    new_points: bytes | None, intensity: bytes | None, unpack: Callable[[bytes], F32] = unpack_points
+) -> tuple[F32 | None, U8 | None]:
+    """The new points (m, 3) of a tile and their intensity (m,), of their planes; MapvoteError as ``unpack`` (of a
+    ballot that the server took in, :func:`unpack_sound_points`), and if there is not one for each."""
+    points = None if new_points is None else unpack(new_points)
     if intensity is None:
         return points, None
     if points is None:

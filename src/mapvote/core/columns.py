@@ -44,6 +44,16 @@ def column_bits(z: F64, ground_z: F32, base: I32) -> tuple[I64, Bool]:
 
 
 @numba.njit(cache=True, nogil=True)
+def words_of(cells: I64, bit: I64, obstacle: Bool, size: int) -> U64:
+    """(size,) column words of the points that are obstacles: flat ``cells``, ``bit`` and ``obstacle`` (n,)."""
+    words = np.zeros(size, dtype=np.uint64)
+    for i in range(len(cells)):
+        if obstacle[i]:
+            words[cells[i]] |= np.uint64(1) << np.uint64(bit[i])
+    return words
+
+
+@numba.njit(cache=True, nogil=True)
 def fill_columns(
     rows: I64, cols: I64, z: F64, ground_z: F32, base: I32, words: U64, counts: I32, bottom_z: F32, top_z: F32
 ) -> None:

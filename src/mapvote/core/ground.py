@@ -36,9 +36,10 @@ def base_layers(ground_z: F32) -> I32:
     if not known.any():
         return np.zeros(ground_z.shape, dtype=np.int32)
     low = ground_z.astype(np.float64)
-    low[~known] = np.inf
-    _lower_envelope(low, 0.02 * CELL_SIZE, 0.02 * CELL_SIZE * np.sqrt(2.0))
-    np.copyto(low, ground_z, where=known)
+    if not known.all():
+        low[~known] = np.inf
+        _lower_envelope(low, 0.02 * CELL_SIZE, 0.02 * CELL_SIZE * np.sqrt(2.0))
+        np.copyto(low, ground_z, where=known)
     low /= CELL_SIZE
     return np.floor(low, out=low).astype(np.int32)
 
@@ -48,29 +49,26 @@ def _lower_envelope(z: F64, straight: float, diagonal: float) -> None:
     """Two-pass chamfer: z[c] = min over c' of z[c'] + grade * |c - c'|, in place (Borgefors 1986)."""
     rows, cols = z.shape
     for r in range(rows):
-        for c in range(cols):
-            best = z[r, c]
-            if c > 0:
-                best = min(best, z[r, c - 1] + straight)
-            if r > 0:
-                best = min(best, z[r - 1, c] + straight)
-                if c > 0:
-                    best = min(best, z[r - 1, c - 1] + diagonal)
-                if c + 1 < cols:
-                    best = min(best, z[r - 1, c + 1] + diagonal)
-            z[r, c] = best
+        if r > 0:
+            _reach_from(z[r - 1], z[r], straight, diagonal)
+        for c in range(1, cols):
+            z[r, c] = min(z[r, c], z[r, c - 1] + straight)
     for r in range(rows - 1, -1, -1):
-        for c in range(cols - 1, -1, -1):
-            best = z[r, c]
-            if c + 1 < cols:
-                best = min(best, z[r, c + 1] + straight)
-            if r + 1 < rows:
-                best = min(best, z[r + 1, c] + straight)
-                if c + 1 < cols:
-                    best = min(best, z[r + 1, c + 1] + diagonal)
-                if c > 0:
-                    best = min(best, z[r + 1, c - 1] + diagonal)
-            z[r, c] = best
+        if r + 1 < rows:
+            _reach_from(z[r + 1], z[r], straight, diagonal)
+        for c in range(cols - 2, -1, -1):
+            z[r, c] = min(z[r, c], z[r, c + 1] + straight)
+
+
+@numba.njit(cache=True, nogil=True)
+def _reach_from(beside: F64, row: F64, straight: float, diagonal: float) -> None:
+    """What a row takes from the one beside it: no cell waits for another, so the compiler makes vectors of it."""
+    last = len(row) - 1
+    for c in range(last + 1):
+        row[c] = min(row[c], beside[c] + straight)
+    for c in range(last):
+        row[c] = min(row[c], beside[c + 1] + diagonal)
+        row[c + 1] = min(row[c + 1], beside[c] + diagonal)
 
 
 @numba.njit(cache=True, nogil=True)

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mapvote.core.columns import column_bits
+from mapvote.core.columns import column_bits, words_of
 from mapvote.core.grid import CELLS, Grid, TileIndex
 from mapvote.core.ground import base_layers
 from mapvote.core.memory import Memory
@@ -20,7 +20,7 @@ _SCALES = (1.0, 255.0, 4095.0, 65535.0)
 """What files give the brightest point: 1, or the largest number of 8, 12 or 16 bits, whatever type they keep it in."""
 
 
-_FOLLOWS_FROM = {
+_FOLLOWS_FROM: dict[str, set[str]] = {
     "cells": {"points"},
     "base": {"ground_z"},
     "columns": {"points", "ground_z"},
@@ -50,9 +50,15 @@ class Tile:
     """Columns (n,) that came with the points of an imported map: intensity, red, classification, gps_time ..."""
 
     def __post_init__(self) -> None:
-        check_array(self.points, "Tile.points", (None, 3), np.float32)
-        check_array(self.ground_z, "Tile.ground_z", self.window.shape, np.float32, finite=False)
-        if self.free is not None:
+        self._check({"points", "ground_z", "free"})
+
+    def _check(self, planes: Collection[str]) -> None:
+        """Of these planes, and of all fields of the points."""
+        if "points" in planes:
+            check_array(self.points, "Tile.points", (None, 3), np.float32)
+        if "ground_z" in planes:
+            check_array(self.ground_z, "Tile.ground_z", self.window.shape, np.float32, finite=False)
+        if "free" in planes and self.free is not None:
             check_array(self.free, "Tile.free", self.window.shape, np.uint64)
         for name, column in self.fields.items():
             if column.shape != (len(self.points),):
@@ -73,17 +79,17 @@ class Tile:
 
     def but(self, **planes: Any) -> Tile:
         """The tile with other ``planes``; what was worked out of those that stay goes along."""
-        other = replace(self, **planes)
-        for name, of in _FOLLOWS_FROM.items():
-            if name in self.__dict__ and not of & planes.keys():
-                other.__dict__[name] = self.__dict__[name]
+        stays = {name for name in self.__dict__ if not _FOLLOWS_FROM.get(name, set()) & planes.keys()}
+        other = object.__new__(Tile)
+        other.__dict__.update({name: self.__dict__[name] for name in stays} | planes)
+        other._check(planes)
         return other
 
     def without(self, dropped: Bool) -> Tile:
         """The tile without some of its points (n,); the others keep their fields."""
-        left = ~dropped
+        left = np.flatnonzero(~dropped)
         fields = {name: column[left] for name, column in self.fields.items()}
-        other = self.but(points=self.points[left], fields=fields)
+        other = self.but(points=self.points.take(left, axis=0), fields=fields)
         other.__dict__["cells"] = self.cells[left]
         bit, obstacle = self.columns
         other.__dict__["columns"] = bit[left], obstacle[left]
@@ -100,7 +106,12 @@ class Tile:
             if name == "intensity" and intensity is not None:
                 new = (intensity * (brightest(column) / 255.0)).astype(column.dtype)
             fields[name] = np.concatenate([column, new])
-        return self.but(points=np.concatenate([self.points, points]), fields=fields)
+        other = self.but(points=np.concatenate([self.points, points]), fields=fields)
+        cells = self.window.flat_cells(points)
+        columns = self._columns_of(points, cells)
+        other.__dict__["cells"] = np.concatenate([self.cells, cells])
+        other.__dict__["columns"] = tuple(np.concatenate(pair) for pair in zip(self.columns, columns, strict=True))
+        return other
 
     @property
     def index(self) -> TileIndex:
@@ -130,16 +141,17 @@ class Tile:
     @cached_property
     def columns(self) -> tuple[I64, Bool]:
         """(bit of its column word (n,), is it an obstacle (n,)) of each point."""
-        ground = self.ground_z.reshape(-1)[self.cells]
-        return column_bits(self.points[:, 2].astype(np.float64), ground, self.base.reshape(-1)[self.cells])
+        return self._columns_of(self.points, self.cells)
+
+    def _columns_of(self, points: F32, cells: I64) -> tuple[I64, Bool]:
+        ground = self.ground_z.reshape(-1)[cells]
+        bit, obstacle = column_bits(points[:, 2].astype(np.float64), ground, self.base.reshape(-1)[cells])
+        return bit, obstacle
 
     @cached_property
     def obstacle_words(self) -> U64:
         """(256, 256) column words of the obstacle points."""
-        bit, obstacle = self.columns
-        words = np.zeros(CELLS, dtype=np.uint64)
-        np.bitwise_or.at(words, self.cells[obstacle], np.uint64(1) << bit[obstacle].astype(np.uint64))
-        return words.reshape(self.window.shape)
+        return np.asarray(words_of(self.cells, *self.columns, CELLS)).reshape(self.window.shape)
 
 
 def brightest(intensity: NDArray[Any]) -> float:

@@ -6,6 +6,8 @@ not depend on their order. A decided ballot is a one-hot tally; the server alway
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from itertools import islice
 from typing import Any
 
 import numba
@@ -110,27 +112,35 @@ def one_hot(states: U8) -> I32:
     return tally
 
 
-@numba.njit(cache=True, nogil=True)
-def add_states(states: U8, tally: NDArray[Any]) -> None:
-    """Add the decided ``states`` (n, cells) of n voters to ``tally`` (5, cells), a vote each: the server's hot loop.
+def add_states(voters: Iterable[U8], tally: NDArray[Any]) -> None:
+    """Add what each of some voters decided, ``states`` (cells,), to ``tally`` (5, cells), a vote each.
 
-    The same as adding ``one_hot`` of each. Votes are counted in bytes first, as many voters as a byte can count and as
-    many cells as stay in the cache: the compiler turns that into vector instructions.
+    The same as adding ``one_hot`` of each. Votes are counted in bytes first, as many voters as a byte can count.
     """
-    voters, cells = states.shape
-    counts = np.empty((N_STATES, _CACHED_CELLS), dtype=np.uint8)
-    for start in range(0, cells, _CACHED_CELLS):
-        for first in range(0, voters, _BYTE_MAX):
-            counts[:] = 0
-            for own in states[first : first + _BYTE_MAX, start : start + _CACHED_CELLS]:
-                for state in range(N_STATES):
-                    count = counts[state, : len(own)]
-                    for c in range(len(own)):
-                        count[c] += own[c] == state
-            for state in range(N_STATES):
-                plane = tally[state, start : start + _CACHED_CELLS]
-                for c in range(len(plane)):
-                    plane[c] += VOTE_UNIT * counts[state, c]
+    counts, voters = np.empty(tally.shape, dtype=np.uint8), iter(voters)
+    while batch := list(islice(voters, _BYTE_MAX)):
+        counts[:] = 0
+        for states in batch:
+            count_states(states, counts)
+        _add_counts(counts, tally)
+
+
+@numba.njit(cache=True, nogil=True)
+def count_states(states: U8, counts: U8) -> None:
+    """One more voter in ``counts`` (5, cells): the server's hot loop, of which the compiler makes vectors."""
+    for start in range(0, len(states), _CACHED_CELLS):
+        own = states[start : start + _CACHED_CELLS]
+        for state in range(N_STATES):
+            count = counts[state, start : start + _CACHED_CELLS]
+            for c in range(len(own)):
+                count[c] += own[c] == state
+
+
+@numba.njit(cache=True, nogil=True)
+def _add_counts(counts: U8, tally: NDArray[Any]) -> None:
+    for state in range(N_STATES):
+        for c in range(counts.shape[1]):
+            tally[state, c] += VOTE_UNIT * counts[state, c]
 
 
 @numba.njit(cache=True, nogil=True)

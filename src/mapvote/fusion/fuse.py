@@ -23,16 +23,14 @@ from mapvote.fusion.copies import Copy, liars_among, originals
 from mapvote.fusion.edit import add_points, delete_points
 from mapvote.fusion.outliers import contradictors, deniers
 from mapvote.fusion.persistence import denied_last, doubtful, remembered, temporary
-from mapvote.fusion.sparse_columns import Words, at_least, counted, packed
+from mapvote.fusion.sparse_columns import counted, nothing_reached, packed
 from mapvote.fusion.spent import changed_in
-from mapvote.fusion.tile_vote import TileVote, one_each, states_of
+from mapvote.fusion.tile_vote import TileVote, one_each
 from mapvote.fusion.turning import turned
 
 Rule = Literal["paper", "columns"]
 History = Callable[[], Sequence[TileVote]]
 """Gives the votes of a tile over a longer time."""
-_BATCH = 32
-"""Votes counted in one call: their states are copied side by side, into no more than stays in the cache."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,8 +81,7 @@ def count(votes: Sequence[TileVote], rule: Rule, min_votes: int) -> tuple[U8, ND
             )
         states = decide_cells(tally, backers, abstain, quorum)
     else:
-        for start in range(0, len(votes), _BATCH):
-            add_states(states_of(votes[start : start + _BATCH]), tally)
+        add_states((vote.states.reshape(-1) for vote in votes if vote.states is not None), tally)
         states = decide_cells(tally, tally, abstain, quorum * VOTE_UNIT)
     shape = (TILE_CELLS, TILE_CELLS)
     return states.reshape(shape), np.moveaxis(tally.reshape(N_STATES, *shape), 0, -1)
@@ -197,36 +194,36 @@ def supported_words(votes: Sequence[TileVote], states: U8, min_votes: int) -> U6
     In cells decided changed-empty, the voxels that ``min_votes`` voters for it mark. In cells decided
     unchanged-occupied, remnants that ``min_votes`` vehicles mark and more than half of those that determined the cell.
     """
-    decided, standing = Words.whole(states == CellState.CHANGED_EMPTY), states == CellState.UNCHANGED_OCCUPIED
-    gone = at_least([vote.deletes(decided) for vote in votes], min_votes) if len(decided.cells) else None
-    left = [found for found in (vote.remnants(standing) for vote in votes) if len(found.cells)]
+    gone = None
+    if (states == CellState.CHANGED_EMPTY).any():
+        reached = nothing_reached(min_votes)
+        for vote in votes:
+            vote.mark_deleted(states, reached)
+        gone = reached[-1].reshape(states.shape)
+    left = [found for found in (vote.remnants(states) for vote in votes) if len(found.cells)]
     if len(left) < min_votes:
         return gone
     cells, marks = counted(left)
     determined = np.sum([vote.determined(cells) for vote in votes], axis=0)
     remnants = packed((marks >= min_votes) & (2 * marks > determined[:, None]))
-    gone = np.zeros(states.shape, dtype=np.uint64) if gone is None else gone
+    gone = np.zeros(states.shape, dtype=np.uint64) if gone is None else gone.copy()
     gone.reshape(-1)[cells] |= remnants
     return gone
 
 
 def _offered(votes: Sequence[TileVote], states: U8, grid: Grid) -> tuple[F32, U8, I64, I32]:
     """(points, intensity, cells, voters) offered for cells decided changed-occupied, by vehicles that voted so."""
-    offers = [np.empty((0, 3), np.float32) if vote.new_points is None else vote.new_points for vote in votes]
-    if not any(map(len, offers)):
-        return np.empty((0, 3), np.float32), np.empty(0, np.uint8), np.empty(0, np.int64), np.empty(0, np.int32)
-    points = np.concatenate(offers)
-    cells = grid.flat_cells(points)
-    voters = np.repeat(np.arange(len(votes), dtype=np.int32), [len(offer) for offer in offers])
-    wanted = np.flatnonzero((states == CellState.CHANGED_OCCUPIED).reshape(-1)[cells])
-    first = np.searchsorted(voters[wanted], np.arange(len(votes) + 1))
-    meant = [
-        mine[vote.supports(CellState.CHANGED_OCCUPIED, cells[mine])]
-        for vote, mine in zip(votes, np.split(wanted, first[1:-1]), strict=True)
+    found: list[tuple[F32, U8, I64, I32]] = [
+        (np.empty((0, 3), np.float32), np.empty(0, np.uint8), np.empty(0, np.int64), np.empty(0, np.int32))
     ]
-    keep = np.concatenate(meant)
-    intensity = np.concatenate([vote.measured() for vote in votes])
-    return points[keep], intensity[keep], cells[keep], voters[keep]
+    for number, vote in enumerate(votes):
+        if vote.new_points is not None and len(vote.new_points):
+            cells = grid.flat_cells(vote.new_points)
+            keep = vote.agreed(cells, states, CellState.CHANGED_OCCUPIED)
+            whose = np.full(len(keep), number, dtype=np.int32)
+            found.append((vote.new_points.take(keep, axis=0), vote.measured()[keep], cells[keep], whose))
+    points, intensity, cells, voters = (np.concatenate(parts) for parts in zip(*found, strict=True))
+    return points, intensity, cells, voters
 
 
 def _learn_free(tile: Tile, votes: Sequence[TileVote], min_votes: int, points_added: bool) -> Tile:
@@ -236,14 +233,17 @@ def _learn_free(tile: Tile, votes: Sequence[TileVote], min_votes: int, points_ad
     map is never free. Until enough vehicles have passed, a tile that never learned stays so: no free voxel at all would
     say that nothing new can be known there.
     """
-    passed = [vote.passed() for vote in votes if vote.free is not None]
+    passed = [vote for vote in votes if vote.free is not None]
     if tile.free is None and len(passed) < max(min_votes, 1):
         return tile
     if not passed and not points_added:
         return tile
     free = tile.free if tile.free is not None else np.zeros((TILE_CELLS, TILE_CELLS), dtype=np.uint64)
     if len(passed) >= min_votes:
-        free = free | at_least(passed, min_votes)
+        reached = nothing_reached(min_votes)
+        for vote in passed:
+            vote.mark_passed(reached)
+        free = free | reached[-1].reshape(free.shape)
     free = free & ~tile.obstacle_words
     return tile if tile.free is not None and np.array_equal(free, tile.free) else tile.but(free=free)
 

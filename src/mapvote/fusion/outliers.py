@@ -35,12 +35,14 @@ _ASKED, _AGREED, _OPPOSED = 0b1, 0b10, 0b100
 def contradictors(
     votes: Sequence[TileVote], states: U8, tally: NDArray[Any], quorum: int, settings: FuseSettings
 ) -> Bool:
-    """(n,) which of the votes :func:`contradicting` names, by all that they say; ``tally`` (256, 256, 5)."""
+    """(n,) which of the votes :func:`contradicts` names, by all that they say; ``tally`` (256, 256, 5)
+    in VOTE_UNITs of all of them, a vote each."""
     if settings.max_contradiction >= 1.0:
         return np.zeros(len(votes), dtype=np.bool_)
     planes = np.moveaxis(tally, -1, 0).reshape(N_STATES, -1)
-    asked = states_of(votes, _ASKED_CELLS)
-    return np.asarray(contradicting(asked, planes[:, _ASKED_CELLS], settings.max_contradiction, quorum))
+    others, most = others_say(planes[:, _ASKED_CELLS], quorum), settings.max_contradiction
+    own = (vote.states.reshape(-1)[_ASKED_CELLS] for vote in votes if vote.states is not None)
+    return np.array([contradicts(one, others, most) for one in own], dtype=np.bool_)
 
 
 def deniers(
@@ -73,24 +75,20 @@ def borne_out(votes: Sequence[TileVote], tile: Tile) -> I64:
 
 
 @numba.njit(cache=True, nogil=True)
-def contradicting(states: U8, tally: NDArray[Any], most: float, quorum: int) -> Bool:
-    """(n,) which vehicles' ``states`` (n, asked) oppose the others in more than ``most`` of the cells they agree on.
+def contradicts(own: U8, others: U8, most: float) -> bool:
+    """Whether a vehicle's ``own`` states (asked,) oppose the ``others`` (asked, 8), see :func:`others_say`, in more
+    than ``most`` of the cells they agree on.
 
-    ``tally`` (5, asked) in VOTE_UNITs of all these vehicles, a vote each. Nothing is said of a vehicle unless a
-    majority of the others, and at least ``quorum``, agree on most cells that so many of them determined.
+    Nothing is said of it unless a majority of the others, and at least the quorum, agree on most cells that so many of
+    them determined.
     """
-    found = np.zeros(len(states), dtype=np.bool_)
-    others = _others(tally, quorum)
-    for vehicle in range(len(states)):
-        own = states[vehicle]
-        asked, agreed, opposed = 0, 0, 0
-        for i in range(len(others)):
-            said = others[i, own[i] & 7]
-            asked += said & 1
-            agreed += (said >> 1) & 1
-            opposed += said >> 2
-        found[vehicle] = agreed >= _MIN_ASKED and 2 * agreed > asked and opposed > most * agreed
-    return found
+    asked, agreed, opposed = 0, 0, 0
+    for i in range(len(others)):
+        said = others[i, own[i] & 7]
+        asked += said & 1
+        agreed += (said >> 1) & 1
+        opposed += said >> 2
+    return bool(agreed >= _MIN_ASKED and 2 * agreed > asked and opposed > most * agreed)
 
 
 def denying(states: U8, decided: U8, most: float, came_true: I64) -> Bool:
@@ -107,7 +105,7 @@ def denying(states: U8, decided: U8, most: float, came_true: I64) -> Bool:
 
 
 @numba.njit(cache=True, nogil=True)
-def _others(tally: NDArray[Any], quorum: int) -> U8:
+def others_say(tally: NDArray[Any], quorum: int) -> U8:
     """(asked, 8) what the others say of a cell, by the last three bits of what a vehicle says there itself.
 
     _ASKED if ``quorum`` of them determined it, _AGREED if more than half of those, and as many, alike, _OPPOSED if not

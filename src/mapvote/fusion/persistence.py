@@ -17,12 +17,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
+import numba
 import numpy as np
+from numpy.typing import NDArray
 
 from mapvote.config import FuseSettings
 from mapvote.core.memory import Memory
 from mapvote.core.tile import Tile
-from mapvote.core.types import F64, U8, Bool, CellState
+from mapvote.core.types import F64, I64, U8, Bool, CellState
 from mapvote.fusion.tile_vote import TileVote
 from mapvote.fusion.turning import in_order
 
@@ -115,7 +117,15 @@ def _first_s(votes: Sequence[TileVote], cells: Bool, state: int) -> np.ndarray:
     for vote in votes:
         if vote.states is not None:
             end_s = np.uint32(min(max(vote.end_ns // 10**9, 1), 2**32 - 2))
-            np.minimum(first, end_s, out=first, where=vote.states.reshape(-1)[flat] == state)
+            _earliest(first, end_s, vote.states.reshape(-1), flat, state)
     out = np.zeros(cells.shape, dtype=np.uint32)
     out.reshape(-1)[flat] = np.where(first == np.iinfo(np.uint32).max, np.uint32(0), first)
     return out
+
+
+@numba.njit(cache=True, nogil=True)
+def _earliest(first: NDArray[np.uint32], end_s: np.uint32, states: U8, cells: I64, state: int) -> None:
+    """Of a vote that ended at ``end_s``: no later than that is ``first`` (n,) where it says ``state`` of ``cells``."""
+    for i in range(len(cells)):
+        if states[cells[i]] == state and end_s < first[i]:
+            first[i] = end_s

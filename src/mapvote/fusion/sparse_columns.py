@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from mapvote.codec.words import unpack_sparse
 from mapvote.core.columns import EVERY_BIT
 from mapvote.core.grid import CELLS, TILE_CELLS
-from mapvote.core.types import I32, U64, Bool
+from mapvote.core.types import I32, NO_VOTE, U8, U64, Bool
 
 _BLOCK = 64
 _BITS = np.arange(64, dtype=np.uint64)
@@ -59,8 +59,8 @@ class Words:
         near[near == len(others.cells)] = 0
         return self.at(others.cells[near] == self.cells if len(others.cells) else near > 0)
 
-    def at(self, keep: Bool) -> Words:
-        """Only those where ``keep`` (n,) is set."""
+    def at(self, keep: Bool | NDArray[np.intp]) -> Words:
+        """Only those where ``keep`` (n,) is set, or of these indices."""
         return Words(self.cells[keep], self.words[keep])
 
 
@@ -71,10 +71,15 @@ def union(marked: Sequence[Words]) -> Words:
 
 def at_least(marked: Sequence[Words], k: int) -> U64:
     """(256, 256) the bits that at least ``k`` of ``marked`` set: a bitwise running count, no loop over bits."""
-    reached = np.zeros((k, CELLS), dtype=np.uint64)
+    reached = nothing_reached(k)
     for mine in marked:
-        _mark(reached, mine.cells, mine.words)
-    return reached[k - 1].reshape(TILE_CELLS, TILE_CELLS)
+        mark(reached, mine.cells, mine.words)
+    return reached[-1].reshape(TILE_CELLS, TILE_CELLS)
+
+
+def nothing_reached(k: int) -> U64:
+    """(k, 65536) the bits that one, two .. k voters set, before any is asked; see :func:`mark`."""
+    return np.zeros((k, CELLS), dtype=np.uint64)
 
 
 def counted(marked: Sequence[Words]) -> tuple[NDArray[np.intp], I32]:
@@ -113,10 +118,35 @@ def _not_zero(words: U64) -> tuple[NDArray[np.intp], U64]:
 
 
 @numba.njit(cache=True, nogil=True)
-def _mark(reached: U64, cells: NDArray[np.intp], words: U64) -> None:
-    """One more voter: bits that ``reached[i]`` had are now in ``reached[i + 1]`` where it sets them too."""
+def mark(reached: U64, cells: NDArray[np.intp], words: U64) -> None:
+    """One more voter in ``reached`` (k, cells): bits that ``reached[i]`` had are now in ``reached[i + 1]`` where it
+    sets them too. It ends as the bits that one, two .. k voters set."""
     for i in range(len(cells)):
-        cell, word = cells[i], words[i]
-        for level in range(reached.shape[0] - 1, 0, -1):
-            reached[level, cell] |= reached[level - 1, cell] & word
-        reached[0, cell] |= word
+        _mark_one(reached, cells[i], words[i])
+
+
+@numba.njit(cache=True, nogil=True)
+def mark_spoken(reached: U64, cells: NDArray[np.intp], words: U64, own: U8) -> None:
+    """:func:`mark` of the cells of which the voter's ``own`` states (cells,) say anything."""
+    for i in range(len(cells)):
+        if own[cells[i]] != NO_VOTE:
+            _mark_one(reached, cells[i], words[i])
+
+
+@numba.njit(cache=True, nogil=True)
+def agreed(cells: NDArray[np.intp], own: U8, decided: U8, state: int) -> NDArray[np.intp]:
+    """Indices of the flat ``cells`` (n,) that are ``state`` in a voter's ``own`` states and in the ``decided`` ones,
+    (65536,) each."""
+    found = np.empty(len(cells), dtype=np.intp)
+    n = 0
+    for i in range(len(cells)):
+        found[n] = i
+        n += (decided[cells[i]] == state) & (own[cells[i]] == state)
+    return found[:n]
+
+
+@numba.njit(cache=True, nogil=True)
+def _mark_one(reached: U64, cell: int, word: np.uint64) -> None:
+    for level in range(reached.shape[0] - 1, 0, -1):
+        reached[level, cell] |= reached[level - 1, cell] & word
+    reached[0, cell] |= word

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from mapvote.config import FuseSettings
 from mapvote.core.grid import CELLS, TILE_CELLS, Grid
-from mapvote.core.types import F32, N_STATES, NO_VOTE, U8, U16, Bool, CellState
-from mapvote.fusion.sparse_columns import Words, union
+from mapvote.core.types import F32, N_STATES, NO_VOTE, U8, U16, U64, Bool, CellState
+from mapvote.fusion.sparse_columns import Words, agreed, mark, mark_spoken, union
 
 DAY_NS = 86_400_000_000_000
 
@@ -71,6 +71,13 @@ class TileVote:
         assert self.tally is not None
         return np.asarray(self.tally[cells // TILE_CELLS, cells % TILE_CELLS, int(state)] > 0)
 
+    def agreed(self, cells: NDArray[np.intp], decided: U8, state: CellState) -> NDArray[np.intp]:
+        """Indices of those of the flat ``cells`` (n,) that are ``decided`` (256, 256) as ``state``, which this vote
+        supports."""
+        if self.states is not None:
+            return np.asarray(agreed(cells, self.states.reshape(-1), decided.reshape(-1), int(state)))
+        return np.flatnonzero((decided.reshape(-1)[cells] == state) & self.supports(state, cells))
+
     def determined(self, cells: NDArray[np.intp]) -> Bool:
         """(n,) at which of the flat ``cells`` this vote says anything but undetermined."""
         if self.states is not None:
@@ -81,24 +88,37 @@ class TileVote:
 
     def passed(self) -> Words:
         """The voxels that rays passed through, of cells that this vote speaks of."""
-        if self.free is None:
-            return Words.none()
-        if self.states is None:
-            return self.free.within(self.spoken())
-        return self.free.at(self.states.reshape(-1)[self.free.cells] != NO_VOTE)
+        return Words.none() if self.free is None else self.free.within(self.spoken())
+
+    def mark_passed(self, reached: U64) -> None:
+        """One more voter in ``reached`` (see :func:`mapvote.fusion.sparse_columns.mark`): of what it has
+        :meth:`passed`."""
+        if self.states is not None and self.free is not None:
+            mark_spoken(reached, self.free.cells, self.free.words, self.states.reshape(-1))
+        else:
+            passed = self.passed()
+            mark(reached, passed.cells, passed.words)
+
+    def mark_deleted(self, decided: U8, reached: U64) -> None:
+        """One more voter in ``reached``: of what it :meth:`deletes` of the cells ``decided`` (256, 256) so."""
+        emptied = CellState.CHANGED_EMPTY
+        if self.states is not None and self.gone is not None:
+            deleted = self.gone.at(self.agreed(self.gone.cells, decided, emptied))
+        else:
+            deleted = self.deletes(Words.whole(decided == emptied))
+        mark(reached, deleted.cells, deleted.words)
 
     def deletes(self, among: Words) -> Words:
         """The voxels that this vote says are gone, of the cells that ``among`` names."""
         marked = among if self.gone is None else self.gone.where(among)
         return marked.at(self.supports(CellState.CHANGED_EMPTY, marked.cells))
 
-    def remnants(self, standing: Bool) -> Words:
-        """The voxels that this vote says are gone though the cell stands, of the (256, 256) cells ``standing``."""
+    def remnants(self, decided: U8) -> Words:
+        """The voxels that this vote says are gone though the cell stands, of the (256, 256) cells ``decided`` so."""
         if self.gone is None:
             return Words.none()
-        marked = self.gone.within(standing)
-        stands = self.supports(CellState.UNCHANGED_OCCUPIED, marked.cells)
-        return marked.at(stands & ~self.supports(CellState.CHANGED_EMPTY, marked.cells))
+        marked = self.gone.at(self.agreed(self.gone.cells, decided, CellState.UNCHANGED_OCCUPIED))
+        return marked if self.tally is None else marked.at(~self.supports(CellState.CHANGED_EMPTY, marked.cells))
 
 
 def states_of(votes: Sequence[TileVote], cells: slice | NDArray[np.intp] = slice(None)) -> U8:
@@ -168,13 +188,14 @@ def fold(drives: Sequence[TileVote], grid: Grid) -> TileVote:
     points: list[F32] = []
     intensity: list[U8] = []
     free: list[Words] = []
+    stands = np.uint8(CellState.UNCHANGED_OCCUPIED)
     for i, drive in enumerate(ordered):
         mine = source == i
         if states is not None and drive.states is not None:
             states[mine] = drive.states[mine]
         if tally is not None and drive.tally is not None:
             tally[mine] = drive.tally[mine]
-        gone += [drive.deletes(Words.whole(mine)), drive.remnants(mine)]
+        gone += [drive.deletes(Words.whole(mine)), drive.remnants(np.where(mine, stands, np.uint8(NO_VOTE)))]
         if drive.free is not None:
             free.append(drive.passed())
         if drive.new_points is not None:

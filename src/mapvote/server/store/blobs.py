@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mapvote.codec.arrays import compress, unpack_bytes
+from mapvote.codec.arrays import compress, raw_plane, unpack_bytes
 from mapvote.codec.ballot import tile_key
 from mapvote.codec.fields import pack_fields, unpack_fields
 from mapvote.codec.tile_file import MAX_TILE_POINTS
@@ -50,7 +50,7 @@ def pack_tile(tile: Tile, edited_from: tuple[Tile, TileHashes] | None = None) ->
     blobs: dict[str, bytes] = {}
     old, known = edited_from or (None, TileHashes.none())
 
-    def pack(raw: bytes, what: str) -> str:
+    def pack(raw: bytes | memoryview, what: str) -> str:
         if len(raw) > MAX_PLANE_BYTES:
             too_large = f"{len(raw)} bytes, {MAX_PLANE_BYTES} are the most: thin the map out, or leave fields out"
             raise MapvoteError(f"tile {tile_key(tile.index)}: its {what} take {too_large}")
@@ -62,17 +62,13 @@ def pack_tile(tile: Tile, edited_from: tuple[Tile, TileHashes] | None = None) ->
         old is not None and getattr(tile, plane) is getattr(old, plane) for plane in ("ground_z", "free", "fields")
     )
     hashes = TileHashes(
-        points=pack(_raw(tile.points, "<f4"), "points"),
-        ground=known.ground if same_ground else pack(_raw(tile.ground_z, "<f4"), "ground"),
-        free=known.free if same_free or tile.free is None else pack(_raw(tile.free, "<u8"), "free columns"),
-        memory=None if tile.memory is None else pack(_raw(tile.memory.planes, "<u4"), "memory"),
+        points=pack(raw_plane(tile.points, "<f4"), "points"),
+        ground=known.ground if same_ground else pack(raw_plane(tile.ground_z, "<f4"), "ground"),
+        free=known.free if same_free or tile.free is None else pack(raw_plane(tile.free, "<u8"), "free columns"),
+        memory=None if tile.memory is None else pack(raw_plane(tile.memory.planes, "<u4"), "memory"),
         fields=known.fields if same_fields else pack(pack_fields(tile.fields), "fields") if tile.fields else None,
     )
     return hashes, blobs
-
-
-def _raw(plane: NDArray[Any], dtype: str) -> bytes:
-    return np.ascontiguousarray(plane, dtype=dtype).tobytes()
 
 
 def unpack_tile(window: Grid, hashes: TileHashes, planes: Mapping[str, bytes]) -> Tile:
@@ -118,7 +114,7 @@ def _unpack(data: bytes, digest: str) -> bytes:
 
 def pack_memory(memory: Memory) -> tuple[str, dict[str, bytes]]:
     """What a tile remembers as (hash, plane by hash)."""
-    raw = _raw(memory.planes, "<u4")
+    raw = raw_plane(memory.planes, "<u4")
     digest = hashlib.sha256(raw).hexdigest()
     return digest, {digest: compress(raw, _ZSTD_LEVEL)}
 

@@ -11,7 +11,7 @@ from typing import NamedTuple, TypeVar
 
 import sqlalchemy as sa
 
-from mapvote.codec.ballot import unpack_many_states, unpack_offer, unpack_tally
+from mapvote.codec.ballot import unpack_many_states, unpack_offer, unpack_sound_points, unpack_tally
 from mapvote.config import FuseSettings
 from mapvote.core.grid import TileIndex
 from mapvote.core.tile import Tile
@@ -250,7 +250,7 @@ def _planes(connection: sa.Connection, index: TileIndex, ballots: Sequence[int])
 
 
 def _vote(stored: StoredVote, planes: _Planes, states: U8 | None) -> TileVote:
-    new_points, intensity = unpack_offer(planes.new_points, planes.intensity)
+    new_points, intensity = unpack_offer(planes.new_points, planes.intensity, unpack_sound_points)
     return TileVote(
         vehicle=stored.vehicle,
         end_ns=stored.end_ns,

@@ -16,11 +16,11 @@ def sum_of(*parts: Any) -> str:
 
     Parts are bytes, text, integers, what JSON can say, or None. No floats by themselves: databases round them.
     """
-    digest = hashlib.sha256()
+    pieces = []
     for part in parts:
-        raw = _raw(part)
-        digest.update(f"{-1 if part is None else len(raw)}:".encode() + raw)
-    return digest.hexdigest()
+        raw = part if isinstance(part, bytes) else _raw(part)
+        pieces += [b"-1:" if part is None else b"%d:" % len(raw), raw]
+    return hashlib.sha256(b"".join(pieces)).hexdigest()
 
 
 def sum_of_planes(base: str, planes: Sequence[bytes | None]) -> str:
@@ -38,7 +38,7 @@ def _raw(part: Any) -> bytes:
         return part.encode()
     if isinstance(part, dict | list):
         return json.dumps(part, sort_keys=True).encode()
-    if isinstance(part, bytes | bytearray | memoryview):
+    if isinstance(part, bytearray | memoryview):
         return bytes(part)
     return str(operator.index(part)).encode()
 

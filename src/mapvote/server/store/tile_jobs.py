@@ -16,7 +16,7 @@ import numpy as np
 import sqlalchemy as sa
 from numpy.typing import NDArray
 
-from mapvote.codec.arrays import pack_plane, unpack_bytes
+from mapvote.codec.arrays import compress, pack_plane, raw_plane, unpack_bytes
 from mapvote.codec.ballot import tile_key
 from mapvote.core.grid import CELLS, TILE_CELLS, Grid, TileIndex
 from mapvote.core.tile import Tile
@@ -202,7 +202,7 @@ def pack_tally(tally: NDArray[Any]) -> bytes:
     """(256, 256, 5) as a zstd frame of little-endian planes, class by class, which packs four times better than cell
     by cell: uint16 if it comes so, else int32. The length tells which."""
     dtype = "<u2" if tally.dtype == np.uint16 else "<i4"
-    return pack_plane(np.moveaxis(tally, -1, 0).astype(dtype), 1)
+    return compress(raw_plane(np.moveaxis(tally, -1, 0), dtype), 1)
 
 
 def unpack_tally_plane(data: bytes) -> I32:
