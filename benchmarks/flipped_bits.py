@@ -105,7 +105,7 @@ def touches(place: Place, index: TileIndex, hashes: TileHashes) -> bool:
     """Whether the damage is of this tile or of its votes."""
     table, _, key = place
     if table is schema.blobs:
-        return key["hash"] in (hashes.points, hashes.ground, hashes.free, hashes.memory)
+        return key["hash"] in (hashes.points, hashes.ground, hashes.free, hashes.memory, hashes.fields)
     return key.get("row", index[0]) == index[0] and key.get("col", index[1]) == index[1]
 
 

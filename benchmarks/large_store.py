@@ -32,7 +32,7 @@ from mapvote.server.store.database import insert_rows
 from mapvote.server.store.policy import Policy, current_policy
 from mapvote.server.store.publish import publish
 from mapvote.server.store.store import Store
-from mapvote.server.store.sums import sum_of
+from mapvote.server.store.sums import sum_of_planes
 from postgres_cluster import PostgresCluster
 
 WALL = [(10, 10 + c) for c in range(8)]
@@ -45,10 +45,10 @@ def fill(store: Store, tiles: int) -> None:
     side = max(1, int(tiles**0.5))
     places = [(i // side, i % side) for i in range(tiles)]
     hashes = pack_tile(make_tile(wall(WALL, [0.05, 0.45])))[0]
-    planes = hashes.points, hashes.ground, None, None
+    planes = hashes.points, hashes.ground, None, None, None
     states = pack_plane(states_plane({(30, 30): CellState.UNCHANGED_EMPTY}), 1)
-    nothing = None, None, None, None
-    total = sum_of(hashes.points, states, *nothing)
+    nothing = None, None, None, None, None
+    total = sum_of_planes(hashes.points, [states, *nothing])
     policy, now = current_policy(store).model_dump_json(), store.clock()
     ballots = ROWS_A_TILE * tiles // TILES_A_BALLOT
     with store.database.writing() as connection:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -9,7 +10,7 @@ import typer
 
 from mapvote.cli.looks import look_at_map
 from mapvote.cli.options import DRIVE, MAP, KeyFile, Projector, Rate, Topic, with_drive_options
-from mapvote.cli.remote import is_store, is_url, map_of, overview_of
+from mapvote.cli.remote import is_store, is_url, map_at, overview_of
 from mapvote.cli.store import opened_store
 from mapvote.cli.terminal import stages_that_vanish, waiting
 
@@ -175,22 +176,31 @@ def export(
     mapvote export my_map city.pcd
     """
     from mapvote.core.types import MapvoteError
-    from mapvote.formats import export_map
 
     try:
         x, y, z = (float(v) for v in offset.split(","))
     except ValueError as error:
         raise MapvoteError(f"--offset {offset!r}: give three numbers, for example 367000,3951000,0") from error
-    with waiting(f"reading {source}"):
-        point_map = map_of(source, key_file, version)
-        older = None if since is None else map_of(source, key_file, since)
-    if not out.suffix and (is_url(source) or is_store(source)):
-        _lay(point_map, out, older, projector)
-        return
-    if since is not None:
-        raise MapvoteError("export: --since writes Autoware tiles: give a folder, not a file")
+    live = not out.suffix and (is_url(source) or is_store(source))
+    if since is not None and not live:
+        raise MapvoteError("export: --since writes Autoware tiles of a store or a server: give a folder, not a file")
+    with ExitStack() as open_maps:
+        with waiting(f"reading {source}"):
+            point_map = open_maps.enter_context(map_at(source, key_file, version))
+            older = None if since is None else open_maps.enter_context(map_at(source, key_file, since))
+        if live:
+            _lay(point_map, out, older, projector)
+        else:
+            _export(point_map, out, (x, y, z), crs, projector)
+
+
+def _export(
+    point_map: PointMap, out: Path, offset: tuple[float, float, float], crs: str | None, projector: str | None
+) -> None:
+    from mapvote.formats import export_map
+
     with waiting(f"writing {out}"):
-        kind, frame = export_map(point_map, out, (x, y, z), crs=crs, projector=projector)
+        kind, frame = export_map(point_map, out, offset, crs=crs, projector=projector)
     print(f"{out}: {point_map.n_points} points as {kind}")
     print(f"coordinates: {frame.told()}")
     dropped = ["ground heights (measured again on import)"]
@@ -202,11 +212,11 @@ def export(
 
 
 def _lay(point_map: PointMap, out: Path, older: PointMap | None, projector: str | None) -> None:
-    from mapvote.cli.follow import autoware_cloud
     from mapvote.formats.maps.autoware_live import lay_version, names_of
+    from mapvote.formats.maps.exporting import autoware_pieces
 
-    cloud = autoware_cloud(point_map, out, projector)
-    known = frozenset(names_of(str(out), autoware_cloud(older, out, projector))) if older is not None else frozenset()
+    cloud = autoware_pieces(point_map, out, projector)
+    known = frozenset(names_of(str(out), autoware_pieces(older, out, projector))) if older is not None else frozenset()
     with waiting(f"writing {out}"):
         change = lay_version(out, cloud, point_map.version or 0, known=known)
     print(f"{out}: version {change.version}, {change.tiles} Autoware tiles, {change.written} written")

@@ -12,9 +12,7 @@ from mapvote.cli.options import SERVER, KeyFile, Projector, key_in
 
 if TYPE_CHECKING:
     from mapvote.client import MapClient
-    from mapvote.core.point_map import PointMap
     from mapvote.formats.maps.autoware_live import Change
-    from mapvote.formats.maps.cloud import Cloud
 
 
 def register(app: typer.Typer) -> None:
@@ -67,22 +65,10 @@ def follow_once(client: MapClient, folder: Path, projector: str | None, keep: in
     The frame is chosen once, with the first version, unless ``projector`` names one: a map that grows does not move.
     """
     from mapvote.formats.maps.autoware_live import laid_version, lay_version
+    from mapvote.formats.maps.exporting import autoware_pieces
 
     if laid_version(folder) == client.newest():
         return None
-    cloud = autoware_cloud(client.fetch(), folder, projector)
+    cloud = autoware_pieces(client.fetch(), folder, projector)
     assert client.version is not None
     return lay_version(folder, cloud, client.version, keep=keep)
-
-
-def autoware_cloud(point_map: PointMap, folder: Path, projector: str | None) -> Cloud:
-    """A map's points in a frame that Autoware knows: ``projector``'s, else the one that the folder has already."""
-    from mapvote.core.point_map import all_points
-    from mapvote.formats.geo.frame import frame_of
-    from mapvote.formats.geo.projector import PROJECTOR, autoware_frame
-    from mapvote.formats.maps.cloud import Cloud
-
-    cloud = Cloud(all_points(point_map), frame=frame_of(point_map.georeference))
-    chosen = folder / PROJECTOR
-    wanted = projector or (str(chosen) if chosen.is_file() and not cloud.frame.is_local else None)
-    return cloud.in_metres(str(folder), autoware_frame(cloud.frame, cloud.points, wanted), sure=True)

@@ -56,22 +56,27 @@ def client_of(url: str, key: str | None) -> MapClient:
     return MapClient(url, key=key, home=cache_folder())
 
 
-def map_of(name: str, key_file: Path | None, version: int | None = None, region: Region | None = None) -> PointMap:
-    """The newest map of a store or a server, or one version of it; or a map in any file format. ``region``: only
-    the tiles of a server's that meet it."""
+@contextmanager
+def map_at(
+    name: str, key_file: Path | None, version: int | None = None, region: Region | None = None
+) -> Iterator[PointMap]:
+    """The newest map of a store or a server, or one version of it; or a map in any file format. Of a map larger than
+    memory tiles are read as long as this is open. ``region``: only the tiles of a server's that meet it."""
     from mapvote.core.types import MapvoteError
 
     if is_url(name):
         with client_of(name, key_in(key_file)) as client:
-            return client.fetch(version, region=region)
+            yield client.fetch(version, region=region)
+        return
     if region is not None:
         raise MapvoteError(f"{name}: only a server sends a part of its map; leave out --region")
     if is_store(name):
         with opened_store(name) as store:
-            return store.point_map(version)
+            yield store.point_map(version)
+        return
     if version is not None:
         raise MapvoteError(f"{name}: only a store or a server has versions")
-    return sound_map(name)
+    yield sound_map(name)
 
 
 def region_in(text: str) -> Region:

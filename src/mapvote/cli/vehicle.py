@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -9,7 +10,7 @@ import typer
 
 from mapvote.cli.looks import look_at
 from mapvote.cli.options import DRIVE, Config, DrivePath, KeyFile, key_in, with_drive_options
-from mapvote.cli.remote import client_of, map_of, region_in
+from mapvote.cli.remote import client_of, map_at, region_in
 from mapvote.cli.terminal import progress, waiting
 
 if TYPE_CHECKING:
@@ -138,18 +139,20 @@ def vote(
     settings = load_settings(config)
     if case is not None:
         settings = choose_case(settings, case)
-    with waiting(f"reading {where}"):
-        point_map = map_of(where, key_file, region=None if region is None else region_in(region))
-    frame = frame_of(point_map.georeference)
-    drive = open_drive(drive_path, vehicle=vehicle, frame=frame, **drive_options)
-    look_at(drive)
-    localise = None
-    if trust_prior:
-        if drive.T_map_lidar_prior is None:
-            raise MapvoteError(f"{drive_path}: has no prior to trust; give one with --prior, or let it be localised")
-        localise = GivenPoses(drive.stamps_ns, drive.T_map_lidar_prior)
-    with progress("voting") as tell:
-        ballot, report = vote_drive(drive, point_map, settings, localise=localise, progress=tell)
+    with ExitStack() as open_map:
+        with waiting(f"reading {where}"):
+            wanted = None if region is None else region_in(region)
+            point_map = open_map.enter_context(map_at(where, key_file, region=wanted))
+        drive = open_drive(drive_path, vehicle=vehicle, frame=frame_of(point_map.georeference), **drive_options)
+        look_at(drive)
+        localise = None
+        if trust_prior:
+            if drive.T_map_lidar_prior is None:
+                missing = "has no prior to trust; give one with --prior, or let it be localised"
+                raise MapvoteError(f"{drive_path}: {missing}")
+            localise = GivenPoses(drive.stamps_ns, drive.T_map_lidar_prior)
+        with progress("voting") as tell:
+            ballot, report = vote_drive(drive, point_map, settings, localise=localise, progress=tell)
     data = encode(ballot)
     if out is not None:
         with whole_file(out) as partial:

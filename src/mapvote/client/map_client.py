@@ -24,6 +24,7 @@ from mapvote.codec.ballot import Ballot, decode, encode
 from mapvote.codec.fields import unpack_fields
 from mapvote.codec.tile_file import digest_of_tiles
 from mapvote.core.grid import CELL_SIZE, Grid, Lattice, TileIndex
+from mapvote.core.lazy_tiles import made_in_turn
 from mapvote.core.point_map import PointMap
 from mapvote.core.tile import Tile
 from mapvote.core.types import MapvoteError
@@ -127,7 +128,7 @@ class MapClient:
         wanted = {_index(key): planes for key, planes in manifest.tiles.items()}
         if region is not None:
             wanted = {index: planes for index, planes in wanted.items() if _meets(lattice.tile(index), region)}
-        tiles = {index: self._tile(lattice.tile(index), planes) for index, planes in wanted.items()}
+        tiles = made_in_turn(lambda index: self._tile(lattice.tile(index), wanted[index]), wanted)
         self._bound_cache({digest for planes in wanted.values() for digest in planes.hashes()})
         self.version = manifest.version
         return PointMap(manifest.map_id, lattice, tiles, manifest.georeference, version=manifest.version)

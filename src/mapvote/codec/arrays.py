@@ -13,6 +13,8 @@ from numpy.typing import DTypeLike, NDArray
 
 from mapvote.core.types import U8, MapvoteError
 
+FRAME_HEAD = 18
+"""Bytes of the longest header of a zstd frame (RFC 8878, 3.1.1.1)."""
 _own = threading.local()
 _STEP = 1024
 ZSTD_LEVEL = 19
@@ -48,6 +50,17 @@ def unpack_bytes(data: bytes, limit: int, what: str) -> bytes:
     if size > limit:
         raise MapvoteError(f"{what} is larger than {limit} bytes when decompressed")
     return _unpack_unsaid(data, limit, what)
+
+
+def frame_size(head: bytes, what: str) -> int:
+    """How many bytes a frame of ours holds, which it says at its beginning; MapvoteError if it does not."""
+    try:
+        size = zstandard.frame_content_size(head)
+    except zstandard.ZstdError as error:
+        raise MapvoteError(f"{what} is damaged ({error}); fetch or send it again") from error
+    if size < 0:
+        raise MapvoteError(f"{what} does not say how large it is; fetch or send it again")
+    return size
 
 
 def _unpack_unsaid(data: bytes, limit: int, what: str) -> bytes:

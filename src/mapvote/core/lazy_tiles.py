@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import weakref
 from collections import OrderedDict
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from threading import RLock
 
 from mapvote.core.grid import TileIndex
@@ -63,9 +63,30 @@ class LazyTiles(Mapping[TileIndex, Tile]):
         return len(self._points)
 
 
+def is_small(n_points: int) -> bool:
+    """Whether the tiles of a map of so many points are held in memory as they are."""
+    return n_points <= KEPT_POINTS
+
+
 def in_memory_if_small(tiles: LazyTiles) -> Mapping[TileIndex, Tile]:
     """All tiles made at once, unless there are too many points for that."""
-    return tiles if tiles.n_points > KEPT_POINTS else dict(tiles)
+    return dict(tiles) if is_small(tiles.n_points) else tiles
+
+
+def made_in_turn(load: Callable[[TileIndex], Tile], indices: Iterable[TileIndex]) -> Mapping[TileIndex, Tile]:
+    """Every tile made once, and all held unless there are too many points for that."""
+    made: dict[TileIndex, Tile] = {}
+    points: dict[TileIndex, int] = {}
+    total = 0
+    for index in indices:
+        tile = load(index)
+        points[index] = len(tile.points)
+        total += len(tile.points)
+        if is_small(total):
+            made[index] = tile
+        else:
+            made.clear()
+    return made if is_small(total) else LazyTiles(load, points)
 
 
 def with_changed(tiles: Mapping[TileIndex, Tile], changed: Mapping[TileIndex, Tile]) -> Mapping[TileIndex, Tile]:

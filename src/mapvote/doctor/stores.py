@@ -30,10 +30,9 @@ def check_store(store: Store) -> list[Finding]:
         found.append(Finding("warning", what, f"{_MEND} brings back what a backup has"))
     found += _keys(store)
     try:
-        point_map = store.point_map()
+        return in_order(found + check_whole(store.point_map()))
     except MapvoteError as error:
         return in_order([*found, Finding("error", f"its newest map cannot be read: {error}", _MEND)])
-    return in_order(found + check_whole(point_map))
 
 
 def _damage(store: Store) -> list[Finding]:

@@ -14,13 +14,17 @@ from fastapi.testclient import TestClient
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from pypcd4 import PointCloud
 
 from hand_made import Say, make_ballot, states_plane, two_walls, wall
+from mapvote.cli.follow import follow_once
 from mapvote.client import MapClient
 from mapvote.codec.ballot import Ballot, encode
 from mapvote.codec.fields import FIELD_TYPES, pack_fields, unpack_fields
 from mapvote.codec.tile_file import encode_tile
 from mapvote.config import FuseSettings
+from mapvote.core import lazy_tiles
+from mapvote.core.lazy_tiles import LazyTiles
 from mapvote.core.point_map import PointMap, all_fields, all_points, map_from_points
 from mapvote.core.tile import Tile
 from mapvote.core.types import CellState, MapvoteError
@@ -224,6 +228,34 @@ def test_vehicles_and_exports_get_them_and_of_a_map_without_nothing_is_told(tmp_
         assert fetched.field_names == []
         assert np.array_equal(all_points(fetched), all_points(street()))
     plain.close()
+
+
+def test_of_a_map_larger_than_memory_tiles_are_read_one_by_one_and_the_files_are_the_same(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store = Store.create(f"sqlite:///{tmp_path / 'a.db'}", street(), POLICY)
+    vote(store)
+    found = []
+    for limit, kind in ((10_000_000, dict), (100, LazyTiles)):
+        monkeypatch.setattr(lazy_tiles, "KEPT_POINTS", limit)
+        with TestClient(create_app(store, opened=True), base_url="http://localhost") as app:
+            client = client_of(app, tmp_path / f"home{limit}")
+            maps = store.point_map(), client.fetch()
+            change = follow_once(client, tmp_path / f"follow{limit}", None, 3)
+        assert all(type(point_map.tiles) is kind for point_map in maps)
+        assert all(all_carried(point_map) == all_carried(street()) for point_map in maps)
+        assert change is not None
+        assert change.tiles > 10
+        for i, point_map in enumerate(maps):
+            export_map(point_map, tmp_path / f"{limit}_{i}.las")
+        out = sorted((tmp_path / f"follow{limit}").glob("pointcloud_map.pcd/*"))
+        files = [*out, *(tmp_path / f"{limit}_{i}.las" for i in range(2))]
+        found.append([file.read_bytes() for file in files])
+        names = PointCloud.from_path(out[0]).fields
+        assert tuple(names) == ("x", "y", "z", "intensity")
+    assert found[0] == found[1]
+    assert publish(store).published
+    store.close()
 
 
 def test_a_manifest_kept_before_fields_were_known_is_not_taken_for_whole(tmp_path: Path) -> None:

@@ -21,6 +21,7 @@ from mapvote.formats.atomic import whole_file
 from mapvote.formats.geo.projector import PROJECTOR, projector_of
 from mapvote.formats.maps.autoware import METADATA, SIDE_M, TILES, metadata, squares
 from mapvote.formats.maps.cloud import Cloud
+from mapvote.formats.maps.cloud_pieces import CloudPieces
 from mapvote.formats.maps.pcd import save_pcd
 
 HISTORY = ".mapvote_versions.json"
@@ -50,14 +51,14 @@ def laid_version(folder: Path) -> int | None:
     return history[-1].version if history and (folder / METADATA).is_file() else None
 
 
-def names_of(where: str, cloud: Cloud, side_m: int = SIDE_M) -> list[str]:
+def names_of(where: str, cloud: Cloud | CloudPieces, side_m: int = SIDE_M) -> list[str]:
     """The files that a cloud's tiles would be; ``where`` is for messages."""
     return [f"{x}_{y}_{_hash8(tile)}.pcd" for (x, y), tile in squares(where, cloud, side_m)]
 
 
 def lay_version(
     folder: Path,
-    cloud: Cloud,
+    cloud: Cloud | CloudPieces,
     version: int,
     *,
     keep: int = 3,

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mapvote.codec.arrays import compress, raw_plane, unpack_bytes
+from mapvote.codec.arrays import compress, frame_size, raw_plane, unpack_bytes
 from mapvote.codec.ballot import tile_key
 from mapvote.codec.fields import pack_fields, unpack_fields
 from mapvote.codec.tile_file import MAX_TILE_POINTS
@@ -88,6 +88,12 @@ def unpack_tile(window: Grid, hashes: TileHashes, planes: Mapping[str, bytes]) -
 def unpack_points_plane(data: bytes, digest: str) -> F32:
     """The points plane of a tile alone."""
     return np.frombuffer(_unpack(data, digest), dtype="<f4").reshape(-1, 3)
+
+
+def points_in_plane(head: bytes, digest: str) -> int:
+    """How many points a points plane holds, of the first ``FRAME_HEAD`` bytes of its frame; MapvoteError if they are no
+    frame's."""
+    return frame_size(head, f"tile plane {digest[:12]}") // 12
 
 
 def unpack_ground_plane(data: bytes, digest: str) -> F32:

@@ -15,6 +15,7 @@ import sqlalchemy as sa
 
 from mapvote.config import FuseSettings
 from mapvote.core.grid import Grid, TileIndex
+from mapvote.core.lazy_tiles import with_changed
 from mapvote.core.memory import Memory
 from mapvote.core.point_map import PointMap
 from mapvote.core.tile import Tile
@@ -183,7 +184,7 @@ def reasons_to_hold(store: Store, plan: Plan, changed: Sequence[Fused], gate: Ga
     edited = {
         f.index: edited_tile(f, old.tiles.get(f.index) or Tile.empty(store.lattice.tile(f.index))) for f in changed
     }
-    return [*held, *gate(asked, old, replace(old, tiles=dict(old.tiles) | edited))]
+    return [*held, *gate(asked, old, replace(old, tiles=with_changed(old.tiles, edited)))]
 
 
 def commit(store: Store, plan: Plan, fused: Sequence[Fused], by: str, why: str) -> int:

@@ -21,6 +21,7 @@ import sqlalchemy as sa
 from mapvote.codec.ballot import Id, tile_key
 from mapvote.codec.tile_file import DIGESTS, digest_of_tiles
 from mapvote.core.grid import Lattice, TileIndex
+from mapvote.core.lazy_tiles import LazyTiles, is_small
 from mapvote.core.point_map import PointMap
 from mapvote.core.tile import Tile
 from mapvote.core.types import MapvoteError
@@ -38,6 +39,7 @@ from mapvote.server.store.queries import (
     load_blob,
     load_tile,
     log_event,
+    points_of,
     tile_of,
     tiles_of,
     tiles_set_between,
@@ -229,12 +231,19 @@ class Store:
             return None if hashes is None else load_tile(connection, self.lattice.tile(index), hashes)
 
     def point_map(self, number: int | None = None) -> PointMap:
-        """A whole version."""
+        """A whole version; of one larger than memory tiles are read when they are asked for: keep the store open."""
         with self.database.reading() as connection:
             number = current_number(connection) if number is None else number
             version_of(connection, number)
-            tiles = {
-                index: load_tile(connection, self.lattice.tile(index), hashes)
-                for index, hashes in tiles_of(connection, number).items()
-            }
+            hashes = tiles_of(connection, number)
+            points = points_of(connection, hashes)
+            tiles: Mapping[TileIndex, Tile]
+            if is_small(sum(points.values())):
+                tiles = {index: load_tile(connection, self.lattice.tile(index), h) for index, h in hashes.items()}
+            else:
+                tiles = LazyTiles(lambda index: self._load(index, hashes[index]), points)
         return PointMap(self.map_id, self.lattice, tiles, self.georeference, (), number, self.surveyed_ns)
+
+    def _load(self, index: TileIndex, hashes: TileHashes) -> Tile:
+        with self.database.reading() as connection:
+            return load_tile(connection, self.lattice.tile(index), hashes)
