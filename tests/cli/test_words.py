@@ -39,7 +39,7 @@ NOT_RUN = {
     r"^mapvote serve ": "runs until it is stopped: tests/cli/test_interrupt.py does both",
     r"^python benchmarks/": "takes minutes to hours: only its options are looked up here",
 }
-SLOW = r"^mapvote (demo|simulate|evaluate|warmup)\b"
+SLOW = r"^mapvote (demo|simulate|evaluate|warmup|build)\b"
 STANDS_FOR = {"VERSION": "1"}
 """Placeholders that no file can be called by."""
 

@@ -29,6 +29,7 @@ def ground() -> np.ndarray:
     return np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)])
 
 
+@pytest.mark.slow
 def test_by_http_and_by_files_the_map_is_the_same(tmp_path: Path) -> None:
     first_map = map_from_points(np.vstack([ground(), wall(20.05)]), map_id="street")
     write_map(first_map, tmp_path / "map")

@@ -9,7 +9,7 @@ from mapvote.core.geometry import exp, from_xyz_rpy, hat, inverse, log, transfor
 from mapvote.core.types import F64
 from mapvote.localisation.ndt import LEVELS, NdtGrid, NdtMap, build_ndt, in_rows, thin_for_levels
 from mapvote.localisation.ndt_kernels import CUTOFF_E, INLIER_E, Pairs, linearise, mean_likelihood, pair_up, room_for
-from mapvote.localisation.ndt_solver import _move, _turn_between, inverse_of
+from mapvote.localisation.ndt_solver import _move, _to_prior, inverse_of
 from streets import street
 
 T_TRUE = from_xyz_rpy(3.0, -1.0, 1.8, 0.01, -0.015, 0.3)
@@ -116,4 +116,6 @@ def test_a_turn_is_the_same_by_rodrigues_and_by_the_exponential() -> None:
         np.testing.assert_allclose(T[:3, 3] - T_TRUE[:3, 3], step[:3], atol=1e-12)
         between = np.eye(4)
         between[:3, :3] = T[:3, :3] @ T_TRUE[:3, :3].T
-        np.testing.assert_allclose(_turn_between(T, T_TRUE), log(between)[3:], atol=1e-9)
+        back = _to_prior(T_TRUE, T)[:, 0]  # the step from there to here
+        np.testing.assert_allclose(back[:3], step[:3], atol=1e-12)
+        np.testing.assert_allclose(back[3:], log(between)[3:], atol=1e-9)

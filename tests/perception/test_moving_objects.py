@@ -83,8 +83,25 @@ AHEAD: tuple[Box, float] = ((2.0, -1.0, 6.4, 0.8, 1.5), 10.0)
 WALKER: tuple[Box, float] = ((4.0, -5.0, 4.5, -4.5, 1.8), 1.4)
 
 
-@pytest.mark.parametrize("rate_hz", [2.0, 5.0, 10.0])
-@pytest.mark.parametrize("sensor_name", ["vlp16", "hdl32e", "hdl64e"])
+@pytest.mark.parametrize(
+    ("sensor_name", "rate_hz"),
+    [
+        ("vlp16", 10.0),
+        ("hdl32e", 2.0),
+        *(
+            pytest.param(name, rate_hz, marks=pytest.mark.slow)
+            for name, rate_hz in (
+                ("vlp16", 2.0),
+                ("vlp16", 5.0),
+                ("hdl32e", 5.0),
+                ("hdl32e", 10.0),
+                ("hdl64e", 2.0),
+                ("hdl64e", 5.0),
+                ("hdl64e", 10.0),
+            )
+        ),
+    ],
+)
 def test_movers_are_found_and_nothing_else_at_any_rate_and_number_of_beams(sensor_name: str, rate_hz: float) -> None:
     sensor = coarse(sensor_name)
     street = Street(sensor, rate_hz, 4.0, [ONCOMING, AHEAD, WALKER])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import os
 import subprocess
 from collections.abc import Iterator
@@ -12,7 +11,7 @@ import pytest
 
 from postgres_cluster import PostgresCluster, programs
 
-_number = itertools.count()
+_DATABASE = "mapvote"
 
 
 @pytest.fixture(scope="session")
@@ -26,12 +25,16 @@ def postgres_cluster() -> Iterator[PostgresCluster]:
     cluster.close()
 
 
+@pytest.fixture(scope="session")
+def postgres_database(postgres_cluster: PostgresCluster) -> str:
+    return postgres_cluster.create(_DATABASE)
+
+
 @pytest.fixture
-def postgres_url(postgres_cluster: PostgresCluster) -> Iterator[str]:
-    """The SQLAlchemy URL of an empty PostgreSQL database, dropped after the test."""
-    name = f"mapvote_{next(_number)}"
-    yield postgres_cluster.create(name)
-    postgres_cluster.drop(name)
+def postgres_url(postgres_cluster: PostgresCluster, postgres_database: str) -> Iterator[str]:
+    """The SQLAlchemy URL of an empty PostgreSQL database, emptied after the test."""
+    yield postgres_database
+    postgres_cluster.empty(_DATABASE)
 
 
 @pytest.fixture(params=["sqlite", "postgresql"])

@@ -23,6 +23,7 @@ def corner(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
+@pytest.mark.slow
 def test_every_drive_has_scans_times_priors_and_true_poses(corner: Path) -> None:
     drives = sorted(p.name for p in corner.iterdir() if p.name != "truth")
     assert drives == ["survey_1", "survey_2", "v1", "v2", "v3"]
@@ -51,6 +52,7 @@ def square(T: F64) -> F64:
     return np.vstack([T, [0, 0, 0, 1]])
 
 
+@pytest.mark.slow
 def test_only_vehicles_meet_what_was_built_after_the_survey(corner: Path) -> None:
     gained = np.load(corner / "truth" / "truth.npz")["strict"] == 1
     hits = {"survey_1": 0, "v1": 0}
@@ -64,6 +66,7 @@ def test_only_vehicles_meet_what_was_built_after_the_survey(corner: Path) -> Non
     assert hits["survey_1"] < 0.005 * hits["v1"]
 
 
+@pytest.mark.slow
 def test_the_sensor_moves_while_it_turns(corner: Path) -> None:
     surface = np.load(corner / "truth" / "surface.npz")
     tree = cKDTree(surface["points"][surface["label"] != 2])
@@ -77,6 +80,7 @@ def test_the_sensor_moves_while_it_turns(corner: Path) -> None:
     assert far < 0.9
 
 
+@pytest.mark.slow
 def test_truth_names_what_was_built_and_demolished(corner: Path) -> None:
     objects = json.loads((corner / "truth" / "objects.json").read_text())["objects"]
     kinds = [o["kind"] for o in objects if o["what"] == "building"]

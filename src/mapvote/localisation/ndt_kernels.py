@@ -133,7 +133,7 @@ def _sum_block(points: F32, of: F32, first: int, last: int, R: F32, d: F32, sums
     of which Gauss-Newton drops the other terms), the upper triangle of the sum of g_i g_i^T, likelihoods, inliers.
     J = [I, -[p]x] is the derivative of the point by (rho, phi). One vector lane a point; no stores, no branches.
     """
-    zero = np.float32(0.0)
+    zero, at = np.float32(0.0), np.int64(0)  # a number: by seven literals _pull would be compiled seven times
     h00, h01, h02, h11, h12, h22 = zero, zero, zero, zero, zero, zero
     q00, q01, q02, q10, q11, q12, q20, q21, q22 = zero, zero, zero, zero, zero, zero, zero, zero, zero
     r00, r01, r02, r11, r12, r22 = zero, zero, zero, zero, zero, zero
@@ -147,10 +147,10 @@ def _sum_block(points: F32, of: F32, first: int, last: int, R: F32, d: F32, sums
         py = R[1, 0] * x + R[1, 1] * y + R[1, 2] * z
         pz = R[2, 0] * x + R[2, 1] * y + R[2, 2] * z
         x, y, z = px + d[0], py + d[1], pz + d[2]
-        pull = _both(_pull(of, 0, i, x, y, z), _pull(of, 1, i, x, y, z))
-        pull = _both(pull, _both(_pull(of, 2, i, x, y, z), _pull(of, 3, i, x, y, z)))
-        pull = _both(pull, _both(_pull(of, 4, i, x, y, z), _pull(of, 5, i, x, y, z)))
-        e, c00, c01, c02, c11, c12, c22, g0, g1, g2 = _both(pull, _pull(of, 6, i, x, y, z))
+        pull = _both(_pull(of, at, i, x, y, z), _pull(of, at + 1, i, x, y, z))
+        pull = _both(pull, _both(_pull(of, at + 2, i, x, y, z), _pull(of, at + 3, i, x, y, z)))
+        pull = _both(pull, _both(_pull(of, at + 4, i, x, y, z), _pull(of, at + 5, i, x, y, z)))
+        e, c00, c01, c02, c11, c12, c22, g0, g1, g2 = _both(pull, _pull(of, at + 6, i, x, y, z))
         likelihood += _likelihood(e)
         inliers += np.float32(1.0) if e < np.float32(INLIER_E) else zero
         # Columns of Q = C (-[p]x) = C times ((0, pz, -py), (-pz, 0, px), (py, -px, 0)).

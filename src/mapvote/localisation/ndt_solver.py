@@ -86,41 +86,49 @@ def _covariance(H_inv: F64, M: F64, floor: float, known: Certainty) -> F64:
 
 
 @numba.njit(cache=True, nogil=True)
-def _turn_between(T_to: F64, T_from: F64) -> F64:
-    """(3,) phi with R_to = exp(phi) R_from, for turns below pi."""
-    R = _times(T_to[:3, :3].copy(), T_from[:3, :3].T.copy())
-    phi = 0.5 * np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
-    sine = np.sqrt(phi[0] ** 2 + phi[1] ** 2 + phi[2] ** 2)
-    angle = np.arctan2(sine, 0.5 * (R[0, 0] + R[1, 1] + R[2, 2] - 1.0))
-    return phi * (angle / sine if sine > 1e-9 else 1.0)
-
-
-@numba.njit(cache=True, nogil=True)
 def _move(T: F64, step: F64) -> None:
     """Shift the sensor by rho and turn it by phi, both in map axes, in place (Rodrigues)."""
     x, y, z = step[3, 0], step[4, 0], step[5, 0]
     angle = np.sqrt(x * x + y * y + z * z)
-    W = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     s = np.sin(angle) / angle if angle > 1e-8 else 1.0
     c = 2.0 * (np.sin(0.5 * angle) / angle) ** 2 if angle > 1e-8 else 0.5
-    T[:3, :3] = _times(np.eye(3) + s * W + c * _times(W, W), T[:3, :3].copy())
-    T[:3, 3] += step[:3, 0]
+    W = np.zeros((3, 3))
+    W[0, 1], W[0, 2], W[1, 0], W[1, 2], W[2, 0], W[2, 1] = -z, y, z, -x, -y, x
+    turn = _times(W, W)
+    for i in range(3):
+        for j in range(3):
+            turn[i, j] = (1.0 if i == j else 0.0) + s * W[i, j] + c * turn[i, j]
+    turned = _times(turn, T)  # its last row takes no part
+    for i in range(3):
+        for j in range(3):
+            T[i, j] = turned[i, j]
+        T[i, 3] += step[i, 0]
 
 
 @numba.njit(cache=True, nogil=True)
 def _length(step: F64) -> float:
     """How far a step shifts the sensor, or a point 20 m away by its turn, whichever is more."""
-    shift, turn = np.sqrt((step[:3] ** 2).sum()), np.sqrt((step[3:] ** 2).sum())
+    shift = np.sqrt(step[0, 0] ** 2 + step[1, 0] ** 2 + step[2, 0] ** 2)
+    turn = np.sqrt(step[3, 0] ** 2 + step[4, 0] ** 2 + step[5, 0] ** 2)
     return max(shift, turn * LEVER_M)
 
 
 @numba.njit(cache=True, nogil=True)
 def _to_prior(T: F64, T_prior: F64) -> F64:
-    """(6, 1) the step that leads to the prior."""
-    out = np.empty((6, 1))
-    out[:3, 0] = T_prior[:3, 3] - T[:3, 3]
-    out[3:, 0] = _turn_between(T_prior, T)
-    return out
+    """(6, 1) the step that leads to the prior: phi with R_prior = exp(phi) R, for turns below pi."""
+    R, step = np.zeros((3, 3)), np.empty((6, 1))
+    for r in range(3):
+        for k in range(3):
+            for c in range(3):
+                R[r, c] += T_prior[r, k] * T[c, k]
+    x, y, z = 0.5 * (R[2, 1] - R[1, 2]), 0.5 * (R[0, 2] - R[2, 0]), 0.5 * (R[1, 0] - R[0, 1])
+    sine = np.sqrt(x * x + y * y + z * z)
+    angle = np.arctan2(sine, 0.5 * (R[0, 0] + R[1, 1] + R[2, 2] - 1.0))
+    share = angle / sine if sine > 1e-9 else 1.0
+    step[3, 0], step[4, 0], step[5, 0] = x * share, y * share, z * share
+    for k in range(3):
+        step[k, 0] = T_prior[k, 3] - T[k, 3]
+    return step
 
 
 @numba.njit(cache=True, nogil=True)
@@ -142,7 +150,10 @@ def align(points: F32, T: F64, level: Place, known: Certainty, pairs: Pairs) -> 
         iterations += 1
         pair_up(points, T, level.window, level.cells, pairs)
         likelihood, inliers = linearise(points, pairs, T, H, M, g)
-        floor = 1e-6 * max(np.trace(H), 1.0)
+        trace = 0.0
+        for k in range(6):
+            trace += H[k, k]
+        floor = 1e-6 * max(trace, 1.0)
         for k in range(6):
             H[k, k] += floor
         H_inv = inverse_of(H)

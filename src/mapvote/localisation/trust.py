@@ -148,7 +148,10 @@ def height_above_lowest(points: F64) -> F64:
         r = np.int64(np.floor(points[i, 1] / _CELL_M)) + half + 1
         c = np.int64(np.floor(points[i, 0] / _CELL_M)) + half + 1
         if 0 < r <= 2 * half and 0 < c <= 2 * half:
-            out[i] = points[i, 2] - low[r - 1 : r + 2, c - 1 : c + 2].min()
+            lowest = low[r, c]
+            for near in range(9):
+                lowest = min(lowest, low[r - 1 + near // 3, c - 1 + near % 3])
+            out[i] = points[i, 2] - lowest
     return out
 
 
@@ -182,7 +185,7 @@ def _self_likelihood(points: F64, lowest: I64, size: float, index: I32, cells: F
     """
     out = np.full(len(points), -1.0)
     nx, ny, nz = index.shape
-    S, C = np.empty((3, 3)), np.empty((3, 3))
+    S, C, A = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
     for i in range(len(points)):
         ix = np.int64(np.floor(points[i, 0] / size)) - lowest[0]
         iy = np.int64(np.floor(points[i, 1] / size)) - lowest[1]
@@ -202,5 +205,16 @@ def _self_likelihood(points: F64, lowest: I64, size: float, index: I32, cells: F
         C[0, 0], C[0, 1], C[0, 2] = cells[k, 3], cells[k, 4], cells[k, 5]
         C[1, 0], C[1, 1], C[1, 2] = cells[k, 4], cells[k, 6], cells[k, 7]
         C[2, 0], C[2, 1], C[2, 2] = cells[k, 5], cells[k, 7], cells[k, 8]
-        out[i] = 1.0 / np.sqrt(max(np.linalg.det(np.eye(3) + S @ C), 1.0))
+        for r in range(3):
+            for s in range(3):
+                A[r, s] = (1.0 if r == s else 0.0) + S[r, 0] * C[0, s] + S[r, 1] * C[1, s] + S[r, 2] * C[2, s]
+        out[i] = 1.0 / np.sqrt(max(_determinant(A), 1.0))
     return out
+
+
+@numba.njit(cache=True, nogil=True)
+def _determinant(A: F64) -> float:
+    """Of (3, 3), along its first row."""
+    first = A[0, 0] * (A[1, 1] * A[2, 2] - A[1, 2] * A[2, 1])
+    second = A[0, 1] * (A[1, 0] * A[2, 2] - A[1, 2] * A[2, 0])
+    return first - second + A[0, 2] * (A[1, 0] * A[2, 1] - A[1, 1] * A[2, 0])

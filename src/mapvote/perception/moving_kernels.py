@@ -12,9 +12,11 @@ from mapvote.core.voxels import slot_of, voxel_key
 @numba.njit(cache=True, nogil=True)
 def voxels(points: F64, obstacle: Bool, origin: F64, reach: float, cell: float) -> tuple[I32, I64]:
     """(voxel_of (n,), first point of each voxel (m,)), voxels in order of their first points; -1 for no voxel."""
-    n = len(points)
+    n, most = len(points), 0
+    for i in range(n):
+        most += obstacle[i]
     size = 1024
-    while size < 2 * obstacle.sum():
+    while size < 2 * most:
         size *= 2
     keys, rows = np.zeros(size, dtype=np.int64), np.empty(size, dtype=np.int32)
     first = np.empty(n, dtype=np.int64)

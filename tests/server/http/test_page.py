@@ -241,6 +241,7 @@ def test_who_decides_after_another_is_told_so_on_the_page(browser: Chromium, sto
         browser.wait("document.querySelector('#pending').innerText.includes('accepted by operator')")
 
 
+@pytest.mark.slow
 def test_what_lies_in_the_middle_is_chosen_by_keyboard(browser: Chromium, store: Path, tmp_path: Path) -> None:
     with serving(store, "--open", log=tmp_path / "log") as (url, _):
         ready(browser, url)
@@ -270,9 +271,8 @@ def test_tab_alone_comes_to_every_control_that_is_shown(browser: Chromium, store
         assert browser.run(f"{shown}.filter(e => !e.reached).map(e => e.outerHTML.slice(0, 80))") == []
 
 
-@pytest.mark.parametrize(
-    ("width", "height", "zoom"), [(360, 740, 1), *(pytest.param(1280, 800, z, marks=pytest.mark.slow) for z in (1, 2))]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize(("width", "height", "zoom"), [(360, 740, 1), (1280, 800, 1), (1280, 800, 2)])
 def test_axe_finds_nothing_and_nothing_is_cut_off(
     browser: Chromium, store: Path, tmp_path: Path, width: int, height: int, zoom: int
 ) -> None:
