@@ -51,3 +51,10 @@ class Memory:
         planes = self.planes.copy()
         planes[0][cells] = version
         return Memory(planes)
+
+    @classmethod
+    def first_change(cls, cells: Bool, version: int) -> Memory:
+        """Of a tile that remembered nothing until ``cells`` (256, 256) changed in ``version``."""
+        memory = cls.none()
+        memory.planes[0][cells] = version
+        return memory

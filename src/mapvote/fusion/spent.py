@@ -43,7 +43,10 @@ def differing(a: Tile, b: Tile) -> Bool:
 
 def changed_in(version: int, before: Tile, after: Tile) -> Memory:
     """What ``after`` remembers if ``version`` made it of ``before``."""
-    return (before.memory or Memory.none()).with_changed(differing(before, after), version)
+    changed = differing(before, after)
+    return (
+        Memory.first_change(changed, version) if before.memory is None else before.memory.with_changed(changed, version)
+    )
 
 
 def _digests(tile: Tile) -> U64:

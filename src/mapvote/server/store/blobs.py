@@ -19,7 +19,7 @@ from mapvote.core.memory import PLANES, Memory
 from mapvote.core.tile import Tile
 from mapvote.core.types import F32, U64, Bool, MapvoteError
 
-_ZSTD_LEVEL = 3
+_ZSTD_LEVEL = 2
 MAX_PLANE_BYTES = 16 * MAX_TILE_POINTS
 """800 MB: 16 bytes for each point of the densest tile there may be."""
 
@@ -65,7 +65,7 @@ def pack_tile(tile: Tile, edited_from: tuple[Tile, TileHashes] | None = None) ->
         points=pack(raw_plane(tile.points, "<f4"), "points"),
         ground=known.ground if same_ground else pack(raw_plane(tile.ground_z, "<f4"), "ground"),
         free=known.free if same_free or tile.free is None else pack(raw_plane(tile.free, "<u8"), "free columns"),
-        memory=None if tile.memory is None else pack(raw_plane(tile.memory.planes, "<u4"), "memory"),
+        memory=None if tile.memory is None else pack(_raw_memory(tile.memory), "memory"),
         fields=known.fields if same_fields else pack(pack_fields(tile.fields), "fields") if tile.fields else None,
     )
     return hashes, blobs
@@ -120,14 +120,30 @@ def _unpack(data: bytes, digest: str) -> bytes:
 
 def pack_memory(memory: Memory) -> tuple[str, dict[str, bytes]]:
     """What a tile remembers as (hash, plane by hash)."""
-    raw = raw_plane(memory.planes, "<u4")
+    raw = _raw_memory(memory)
     digest = hashlib.sha256(raw).hexdigest()
     return digest, {digest: compress(raw, _ZSTD_LEVEL)}
 
 
+def _raw_memory(memory: Memory) -> bytes:
+    """The cells of which anything is remembered, for they are few: the way to each from the one before, two bytes, and
+    then their values, plane by plane."""
+    flat = memory.planes.reshape(PLANES, CELLS)
+    cells = np.flatnonzero(np.bitwise_or.reduce(flat, axis=0))
+    return np.diff(cells, prepend=0).astype("<u2").tobytes() + flat[:, cells].astype("<u4").tobytes()
+
+
 def unpack_memory_plane(data: bytes, digest: str) -> Memory:
-    """The inverse; MapvoteError if it is not what its hash says."""
-    return Memory(np.frombuffer(_unpack(data, digest), dtype="<u4").reshape(PLANES, TILE_CELLS, TILE_CELLS))
+    """What a tile remembers; MapvoteError if it is not what its hash says. An older mapvote wrote whole planes: so many
+    bytes are no number of cells."""
+    raw = _unpack(data, digest)
+    if len(raw) == 4 * PLANES * CELLS:
+        return Memory(np.frombuffer(raw, dtype="<u4").reshape(PLANES, TILE_CELLS, TILE_CELLS))
+    n = len(raw) // (2 + 4 * PLANES)
+    cells = np.cumsum(np.frombuffer(raw, dtype="<u2", count=n), dtype=np.int64)
+    planes = np.zeros((PLANES, CELLS), dtype=np.uint32)
+    planes[:, cells] = np.frombuffer(raw, dtype="<u4", offset=2 * n).reshape(PLANES, n)
+    return Memory(planes.reshape(PLANES, TILE_CELLS, TILE_CELLS))
 
 
 def pack_cells(cells: Bool) -> bytes:

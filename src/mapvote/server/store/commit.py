@@ -49,8 +49,7 @@ def write_version(store: Store, version: Version, new: NewTiles, unvoted: str | 
             if version.kind != "publish":
                 version = replace(version, mark=seq)
             connection.execute(schema.versions.insert().values(**version_row(version)))
-            for some in new.planes:
-                add_blobs(connection, some)
+            add_blobs(connection, {digest: data for some in new.planes for digest, data in some.items()})
             if new.tiles:
                 rows = [tile_row(version.number, index, hashes) for index, hashes in new.tiles.items()]
                 connection.execute(schema.version_tiles.insert(), rows)

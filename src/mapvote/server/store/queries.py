@@ -22,6 +22,7 @@ from mapvote.server.store.blobs import (
     unpack_memory_plane,
     unpack_tile,
 )
+from mapvote.server.store.database import insert_rows
 
 
 def current_number(connection: sa.Connection) -> int:
@@ -184,10 +185,11 @@ def next_seq(connection: sa.Connection) -> int:
 
 def add_blobs(connection: sa.Connection, planes: Mapping[str, bytes]) -> None:
     """Store planes that are not there yet."""
-    for digest, data in planes.items():
-        known = sa.select(schema.blobs.c.hash).where(schema.blobs.c.hash == digest)
-        if connection.execute(known).first() is None:
-            connection.execute(schema.blobs.insert().values(hash=digest, data=data))
+    digests = list(planes)
+    for start in range(0, len(digests), 500):  # SQLite's limit on variables in one statement
+        some = digests[start : start + 500]
+        known = set(connection.execute(_KNOWN_BLOBS, {"digests": some}).scalars())
+        insert_rows(connection, schema.blobs, [(digest, planes[digest]) for digest in some if digest not in known])
 
 
 def add_version(connection: sa.Connection, version: Version, tiles: Mapping[TileIndex, Tile]) -> None:
@@ -252,4 +254,5 @@ _TILE = (
     .order_by(_T.c.version.desc())
     .limit(1)
 )
+_KNOWN_BLOBS = sa.select(schema.blobs.c.hash).where(schema.blobs.c.hash.in_(sa.bindparam("digests", expanding=True)))
 _BLOB = sa.select(schema.blobs.c.data).where(schema.blobs.c.hash == sa.bindparam("digest"))
