@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -87,27 +86,23 @@ def _decompressor() -> zstandard.ZstdDecompressor:
     return decompressor
 
 
-def unpack_frames(frames: Sequence[bytes], size: int, what: str) -> U8:
-    """(n, size) uint8: n frames of ``size`` bytes each. MapvoteError if one is damaged, or smaller or larger than that;
-    nothing beyond ``size`` is ever written.
+def unpack_into(data: bytes, plane: U8, what: str) -> None:
+    """Fill ``plane`` (n,) with a frame's n bytes. MapvoteError if it is damaged, or smaller or larger than that.
 
     What follows a frame is ignored: :func:`unpack_bytes` looks at that when a ballot comes in.
     """
-    out = np.empty((len(frames), size), dtype=np.uint8)
-    for frame, plane in zip(frames, out, strict=True):
-        try:
-            if zstandard.frame_content_size(frame) == size:
-                with _decompressor().stream_reader(frame) as reader:
-                    n = reader.readinto(plane)
-            else:  # it does not say how large it is, or it is of another size
-                raw = unpack_bytes(frame, size, what)
-                n = len(raw)
-                plane[:n] = np.frombuffer(raw, dtype=np.uint8)
-        except zstandard.ZstdError as error:
-            raise MapvoteError(f"{what} is damaged ({error}); fetch or send it again") from error
-        if n != size:
-            raise MapvoteError(f"{what} has {n} bytes, expected {size}")
-    return out
+    try:
+        if zstandard.frame_content_size(data) == len(plane):
+            with _decompressor().stream_reader(data) as reader:
+                n = reader.readinto(plane)
+        else:  # it does not say how large it is, or it is of another size
+            raw = unpack_bytes(data, len(plane), what)
+            n = len(raw)
+            plane[:n] = np.frombuffer(raw, dtype=np.uint8)
+    except zstandard.ZstdError as error:
+        raise MapvoteError(f"{what} is damaged ({error}); fetch or send it again") from error
+    if n != len(plane):
+        raise MapvoteError(f"{what} has {n} bytes, expected {len(plane)}")
 
 
 def unpack_plane(data: bytes, dtype: str, shape: tuple[int, ...], what: str) -> NDArray[Any]:

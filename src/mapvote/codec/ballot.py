@@ -7,7 +7,7 @@ a newer format adds are ignored, required fields that are missing are refused.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Annotated
 
 import msgspec
@@ -15,7 +15,7 @@ import numba
 import numpy as np
 
 from mapvote.codec.arrays import pack_plane as pack_plane
-from mapvote.codec.arrays import unpack_bytes, unpack_frames, unpack_plane
+from mapvote.codec.arrays import unpack_bytes, unpack_into, unpack_plane
 from mapvote.codec.path import check_path
 from mapvote.codec.words import unpack_sparse
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, TileIndex
@@ -98,9 +98,11 @@ def unpack_states(data: bytes) -> U8:
     return check_states(unpack_plane(data, "<u1", (TILE_CELLS, TILE_CELLS), "ballot: states"))
 
 
-def unpack_many_states(planes: Sequence[bytes]) -> U8:
-    """(n, 256, 256) uint8: the states of n ballots that the server took in; MapvoteError as :func:`unpack_states`."""
-    return check_states(unpack_frames(planes, _CELLS, "ballot: states").reshape(-1, TILE_CELLS, TILE_CELLS))
+def unpack_sound_states(data: bytes) -> U8:
+    """(256, 256) uint8, of a ballot that the server took in; MapvoteError as :func:`unpack_states`."""
+    states = np.empty(_CELLS, dtype=np.uint8)
+    unpack_into(data, states, "ballot: states")
+    return check_states(states.reshape(TILE_CELLS, TILE_CELLS))
 
 
 def check_states(states: U8) -> U8:

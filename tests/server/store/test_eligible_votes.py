@@ -28,13 +28,13 @@ from mapvote.server.store.eligible_votes import (
     Electorate,
     counting_votes,
     judged_votes,
-    read_votes,
     recent_votes,
     standing_tiles,
 )
 from mapvote.server.store.policy import Policy, RoundPolicy, set_policy
 from mapvote.server.store.quarantine import ballot_name
 from mapvote.server.store.store import Store
+from mapvote.server.store.stored_votes import read_votes
 from standing_clock import Clock
 
 CELL, OTHER = (10, 10), (10, 11)

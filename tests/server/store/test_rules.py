@@ -10,6 +10,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import pytest
+import sqlalchemy as sa
 
 from hand_made import two_walls
 from histories import START_S, live
@@ -17,7 +18,7 @@ from mapvote.config import FuseSettings
 from mapvote.fusion import fuse
 from mapvote.fusion.copies import Copy
 from mapvote.fusion.tile_vote import TileVote
-from mapvote.server.store import eligible_votes
+from mapvote.server.store import eligible_votes, schema, stored_votes
 from mapvote.server.store.store import Store
 from standing_clock import Clock
 
@@ -38,6 +39,24 @@ def disagreements(make: MakeStore, seeds: range, steps: int = 25) -> list[str]:
 
 def test_store_and_rules_agree(sqlite_stores: MakeStore) -> None:
     assert disagreements(sqlite_stores, range(4)) == []
+
+
+@pytest.mark.parametrize("seed", [0, 3])
+def test_what_was_read_before_changes_nothing_that_is_decided(
+    seed: int, sqlite_stores: MakeStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    written = []
+    for most_bytes in (0, 300_000, stored_votes.REMEMBERED_BYTES):  # nothing, a few votes, all
+        monkeypatch.setattr(stored_votes, "remembered", stored_votes.Remembered(most_bytes))
+        stores: list[Store] = []
+        live(seed, lambda clock, stores=stores: stores.append(sqlite_stores(clock)) or stores[0], 25)  # type: ignore
+        with stores[0].database.reading() as connection:
+            tables = schema.version_tiles, schema.decisions, schema.quarantine
+            written.append(
+                [connection.execute(sa.select(table).order_by(*table.primary_key)).all() for table in tables]
+            )
+    assert written[0][1]
+    assert written[0] == written[1] == written[2]
 
 
 @pytest.mark.slow

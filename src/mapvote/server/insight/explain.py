@@ -23,16 +23,15 @@ from mapvote.server.store import schema
 from mapvote.server.store.eligible_votes import (
     DAMAGED,
     Electorate,
-    StoredVote,
     counted_votes,
     electorate_now,
     from_sound_ballots,
     judged_votes,
-    read_votes,
     recent_votes,
 )
 from mapvote.server.store.queries import current_version, tile_as_of
 from mapvote.server.store.store import Store
+from mapvote.server.store.stored_votes import StoredVote, read_votes
 from mapvote.server.store.tile_jobs import unpack_tally_plane
 
 _LOOKED_INTO = 30

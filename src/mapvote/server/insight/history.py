@@ -30,12 +30,12 @@ from mapvote.server.store.eligible_votes import (
     counting_votes,
     from_sound_ballots,
     judged_votes,
-    read_votes,
     standing_tiles,
 )
 from mapvote.server.store.policy import policy_in
 from mapvote.server.store.queries import current_version, load_tile, tile_as_of, tiles_of, tiles_that_differ, version_of
 from mapvote.server.store.store import Store
+from mapvote.server.store.stored_votes import read_votes
 from mapvote.server.store.tile_jobs import unpack_tally_plane
 
 

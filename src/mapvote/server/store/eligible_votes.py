@@ -7,23 +7,22 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple, TypeVar
+from typing import TypeVar
 
 import sqlalchemy as sa
 
-from mapvote.codec.ballot import unpack_many_states, unpack_offer, unpack_sound_points, unpack_tally
 from mapvote.config import FuseSettings
 from mapvote.core.grid import TileIndex
 from mapvote.core.tile import Tile
-from mapvote.core.types import U8, Bool
-from mapvote.fusion.sparse_columns import Words
+from mapvote.core.types import Bool
 from mapvote.fusion.spent import unspent
 from mapvote.fusion.tile_vote import DAY_NS, TileVote, restrict, select
 from mapvote.server.store import schema
 from mapvote.server.store.blobs import unpack_cells
 from mapvote.server.store.policy import Policy, policy_in, recorded
-from mapvote.server.store.quarantine import Damage, DamagedBallots, ballot_name, ballot_sum, set_aside
+from mapvote.server.store.quarantine import Damage, DamagedBallots, ballot_name, set_aside
 from mapvote.server.store.queries import Version
+from mapvote.server.store.stored_votes import StoredVote, read_votes
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,40 +53,11 @@ class Electorate:
         return replace(self, set_aside=frozenset({*self.set_aside, *(damage.name for damage in damaged)}))
 
 
-@dataclass(frozen=True, slots=True)
-class StoredVote:
-    """A standing ballot's row for one tile, planes not read yet."""
-
-    seq: int
-    first_seq: int
-    vehicle: str
-    drive: str
-    end_ns: int
-    received_ns: int
-    digest: str
-    base: str
-    version: int
-    """Of the map that its vehicle drove with."""
-    settings_hash: str
-    cast_by: str
-
-
 Read = TypeVar("Read")
 FOREVER = (1 << 63) - 1
 YOUNG = "waits for the minimum age"
 DAMAGED = "damaged, and set aside"
 OTHERWISE = "cast by another method or other settings than the policy asks for"
-
-
-class _Planes(NamedTuple):
-    """What a ballot holds of a tile, compressed."""
-
-    states: bytes | None
-    tally: bytes | None
-    gone: bytes | None
-    new_points: bytes | None
-    free: bytes | None
-    intensity: bytes | None
 
 
 def _stands_at(mark: int | sa.BindParameter[int]) -> sa.ColumnElement[bool]:
@@ -111,9 +81,6 @@ _REVIEWS_ON = (
     .join(_C, _C.c.review == _W.c.seq)
     .where(_C.c.row == _ROW, _C.c.col == _COL, _W.c.verdict.in_(("held", "rejected")))
     .where(_W.c.seq <= _MARK, _W.c.gone_seq.is_(None) | (_W.c.gone_seq > _MARK))
-)
-_PLANES_OF = sa.select(_T.c.ballot, *(_T.c[plane] for plane in schema.BALLOT_PLANES), _T.c.base, _T.c.sum).where(
-    _T.c.row == _ROW, _T.c.col == _COL, _T.c.ballot.in_(sa.bindparam("ballots", expanding=True))
 )
 
 
@@ -222,44 +189,3 @@ def from_sound_ballots(connection: sa.Connection, asked: Electorate, read: Calla
 def ballots_aside(connection: sa.Connection) -> frozenset[str]:
     """Ballots in quarantine, as an electorate leaves them out."""
     return frozenset(name for kind, name in set_aside(connection) if kind == "ballot")
-
-
-def read_votes(connection: sa.Connection, index: TileIndex, stored: Sequence[StoredVote]) -> list[TileVote]:
-    """The planes of stored votes, in their order, nothing silenced. DamagedBallots, naming them, if some are."""
-    found = _planes(connection, index, [vote.seq for vote in stored])
-    planes = [found[vote.seq] for vote in stored]
-    decided = iter(unpack_many_states([mine.states for mine in planes if mine.states is not None]))
-    return [
-        _vote(vote, mine, None if mine.states is None else next(decided))
-        for vote, mine in zip(stored, planes, strict=True)
-    ]
-
-
-def _planes(connection: sa.Connection, index: TileIndex, ballots: Sequence[int]) -> dict[int, _Planes]:
-    out: dict[int, _Planes] = {}
-    damaged: list[Damage] = []
-    for start in range(0, len(ballots), 500):  # SQLite's limit on variables in one statement
-        asked_of = {"row": index[0], "col": index[1], "ballots": ballots[start : start + 500]}
-        for row in connection.execute(_PLANES_OF, asked_of).all():
-            if row.sum != ballot_sum(row):
-                damaged.append(Damage("ballot", ballot_name(row.ballot, *index), "is not what its sum says"))
-            out[row.ballot] = _Planes(*(getattr(row, plane) for plane in schema.BALLOT_PLANES))
-    if damaged:
-        raise DamagedBallots(damaged)
-    return out
-
-
-def _vote(stored: StoredVote, planes: _Planes, states: U8 | None) -> TileVote:
-    new_points, intensity = unpack_offer(planes.new_points, planes.intensity, unpack_sound_points)
-    return TileVote(
-        vehicle=stored.vehicle,
-        end_ns=stored.end_ns,
-        digest=stored.digest,
-        version=stored.version,
-        states=states,
-        tally=None if planes.tally is None else unpack_tally(planes.tally),
-        gone=None if planes.gone is None else Words.unpack(planes.gone, "gone"),
-        new_points=new_points,
-        intensity=intensity,
-        free=None if planes.free is None else Words.unpack(planes.free, "free"),
-    )

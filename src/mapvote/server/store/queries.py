@@ -189,7 +189,9 @@ def add_blobs(connection: sa.Connection, planes: Mapping[str, bytes]) -> None:
     for start in range(0, len(digests), 500):  # SQLite's limit on variables in one statement
         some = digests[start : start + 500]
         known = set(connection.execute(_KNOWN_BLOBS, {"digests": some}).scalars())
-        insert_rows(connection, schema.blobs, [(digest, planes[digest]) for digest in some if digest not in known])
+        new = [(digest, planes[digest]) for digest in some if digest not in known]
+        if new:
+            insert_rows(connection, schema.blobs, new)
 
 
 def add_version(connection: sa.Connection, version: Version, tiles: Mapping[TileIndex, Tile]) -> None:

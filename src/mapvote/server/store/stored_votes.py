@@ -1,0 +1,139 @@
+"""A ballot's votes on one tile as they are stored, read, and remembered for the next time.
+
+What was unpacked is kept by the sum over all that is in the row: it is what it was whatever was published, rolled back,
+replaced or set aside since, and two rows of the same sum say the same. So of a tile on which one vehicle voted anew
+only that ballot is unpacked. Nothing of it outlives the process.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from threading import Lock
+from typing import Any
+
+import numpy as np
+import sqlalchemy as sa
+
+from mapvote.codec.ballot import unpack_offer, unpack_sound_points, unpack_sound_states, unpack_tally
+from mapvote.core.grid import TileIndex
+from mapvote.fusion.sparse_columns import Words
+from mapvote.fusion.tile_vote import TileVote
+from mapvote.server.store import schema
+from mapvote.server.store.quarantine import Damage, DamagedBallots, ballot_name, ballot_sum
+
+REMEMBERED_BYTES = 128 << 20
+"""Some 1,500 votes of a vehicle on a tile."""
+_AT_ONCE = 500
+"""SQLite's limit on variables in one statement."""
+_T = schema.ballot_tiles
+_PLANES_OF = sa.select(_T.c.ballot, *(_T.c[plane] for plane in schema.BALLOT_PLANES), _T.c.base, _T.c.sum).where(
+    _T.c.row == sa.bindparam("row", type_=sa.BigInteger),
+    _T.c.col == sa.bindparam("col", type_=sa.BigInteger),
+    _T.c.ballot.in_(sa.bindparam("ballots", expanding=True)),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class StoredVote:
+    """A standing ballot's row for one tile, planes not read yet."""
+
+    seq: int
+    first_seq: int
+    vehicle: str
+    drive: str
+    end_ns: int
+    received_ns: int
+    digest: str
+    base: str
+    version: int
+    """Of the map that its vehicle drove with."""
+    settings_hash: str
+    cast_by: str
+
+
+class Remembered:
+    """Votes as they were unpacked, by the sum of their rows; those not asked for longest go first. Threads may share
+    it."""
+
+    def __init__(self, most_bytes: int) -> None:
+        self.most_bytes, self.bytes = most_bytes, 0
+        self._votes: OrderedDict[str, TileVote] = OrderedDict()
+        self._lock = Lock()
+
+    def get(self, sums: Iterable[str]) -> dict[str, TileVote]:
+        """Those that are known, by sum."""
+        with self._lock:
+            found = {digest: vote for digest in sums if (vote := self._votes.get(digest)) is not None}
+            for digest in found:
+                self._votes.move_to_end(digest)
+        return found
+
+    def put(self, votes: dict[str, TileVote]) -> None:
+        """Remember these too."""
+        with self._lock:
+            for digest, vote in votes.items():
+                if digest not in self._votes:
+                    self._votes[digest] = vote
+                    self.bytes += _size(vote)
+            while self.bytes > self.most_bytes:
+                self.bytes -= _size(self._votes.popitem(last=False)[1])
+
+
+remembered = Remembered(REMEMBERED_BYTES)
+"""What this process unpacked."""
+
+
+def read_votes(connection: sa.Connection, index: TileIndex, stored: Sequence[StoredVote]) -> list[TileVote]:
+    """The planes of stored votes, in their order, nothing silenced. DamagedBallots, naming them, if some are."""
+    rows = _rows(connection, index, [vote.seq for vote in stored])
+    sums = [rows[vote.seq].sum for vote in stored]
+    known = remembered.get(sums)
+    new = {row.sum: _unpacked(row) for row in rows.values() if row.sum not in known}
+    remembered.put(new)
+    known |= new
+    return [
+        replace(known[digest], vehicle=vote.vehicle, end_ns=vote.end_ns, digest=vote.digest, version=vote.version)
+        for digest, vote in zip(sums, stored, strict=True)
+    ]
+
+
+def _rows(connection: sa.Connection, index: TileIndex, ballots: Sequence[int]) -> dict[int, Any]:
+    """By ballot, each what its sum says: whoever is remembered is read too, or what is decided would follow from what
+    this process happened to read before the disk lost it."""
+    found: dict[int, Any] = {}
+    damaged: list[Damage] = []
+    for start in range(0, len(ballots), _AT_ONCE):
+        asked_of = {"row": index[0], "col": index[1], "ballots": ballots[start : start + _AT_ONCE]}
+        for row in connection.execute(_PLANES_OF, asked_of).all():
+            if row.sum != ballot_sum(row):
+                damaged.append(Damage("ballot", ballot_name(row.ballot, *index), "is not what its sum says"))
+            found[row.ballot] = row
+    if damaged:
+        raise DamagedBallots(damaged)
+    return found
+
+
+def _unpacked(row: Any) -> TileVote:
+    """A row's planes, of nobody yet."""
+    new_points, intensity = unpack_offer(row.new_points, row.intensity, unpack_sound_points)
+    return TileVote(
+        vehicle="",
+        end_ns=0,
+        digest="",
+        states=None if row.states is None else unpack_sound_states(row.states),
+        tally=None if row.tally is None else unpack_tally(row.tally),
+        gone=None if row.gone is None else Words.unpack(row.gone, "gone"),
+        new_points=new_points,
+        intensity=intensity,
+        free=None if row.free is None else Words.unpack(row.free, "free"),
+    )
+
+
+def _size(vote: TileVote) -> int:
+    """Bytes of all planes."""
+    planes: list[np.ndarray | None] = [vote.states, vote.tally, vote.new_points, vote.intensity]
+    for words in (vote.gone, vote.free):
+        planes += [] if words is None else [words.cells, words.words]
+    return sum(plane.nbytes for plane in planes if plane is not None)
