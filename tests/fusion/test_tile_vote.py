@@ -179,3 +179,31 @@ def test_what_is_marked_voter_by_voter_is_what_each_deletes_and_passed() -> None
         assert np.array_equal(deleted[0].reshape(shape), at_least([emptied], 1))
         assert np.array_equal(passed[0].reshape(shape), at_least([vote.passed()], 1))
         assert len(emptied.cells)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_folded_drives_say_cell_by_cell_what_the_last_that_spoke_there_says(seed: int) -> None:
+    rng, shape, cells = np.random.default_rng(seed), (TILE_CELLS, TILE_CELLS), range(0, TILE_CELLS**2, 331)
+    drives = []
+    for i in range(3):
+        states = rng.choice([UO, UE, CE, UN, NO_VOTE], shape).astype(np.uint8)
+        gone, free = (np.where(rng.random(shape) < 0.5, rng.integers(1, 2**63, shape), 0) for _ in range(2))
+        words = None if i == seed else Words.of(gone.astype(np.uint64))
+        vote = TileVote("v", i, str(i), states=states, gone=words, free=Words.of(free.astype(np.uint64)))
+        drives.append(restrict(vote, rng.random(shape) < 0.7) if i != 1 else vote)
+    folded = fold([drives[i] for i in rng.permutation(3)], Lattice().tile((0, 0)))
+    planes = [at_least([Words.none() if w is None else w], 1) for d in (*drives, folded) for w in (d.gone, d.free)]
+    gone, free = (np.stack(some).reshape(4, -1) for some in (planes[::2], planes[1::2]))
+    said, sent = (np.stack([d.states, d.sent]).reshape(2, -1) for d in drives), folded.sent  # type: ignore[list-item]
+    by_drive = np.stack(list(said))
+    assert folded.states is not None
+    assert sent is not None
+    for c in cells:
+        spoke = [i for i in range(3) if by_drive[i, 0, c] != NO_VOTE]
+        last = by_drive[spoke[-1], 0, c] if spoke else NO_VOTE
+        assert folded.states.reshape(-1)[c] == last
+        assert sent.reshape(-1)[c] == next((v for v in by_drive[::-1, 1, c] if v != NO_VOTE), NO_VOTE)
+        whole = 2**64 - 1 if last == CE else 0
+        marked = 0 if not spoke or last not in (CE, UO) else whole if spoke[-1] == seed else int(gone[spoke[-1], c])
+        assert int(gone[3, c]) == marked
+        assert free[3, c] == np.bitwise_or.reduce(free[spoke, c], initial=np.uint64(0))

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from mapvote.config import FuseSettings
 from mapvote.core.tile import Tile
-from mapvote.core.types import I64, N_STATES, NO_VOTE, U8, Bool, CellState
+from mapvote.core.types import I64, N_STATES, NO_VOTE, U8, U64, Bool, CellState
 from mapvote.core.voting import VOTE_UNIT
 from mapvote.fusion.tile_vote import TileVote, states_of
 
@@ -28,7 +28,7 @@ _ASKED_CELLS = slice(None, None, 13)
 """The flat cells asked, enough for a share; the stride divides no tile's side, so that no column is left out."""
 _MIN_ASKED = 64
 """With fewer cells to go by nobody is judged: 75 m2 that the others agree on, or 6 m2 of changes."""
-_UN = int(CellState.UNDETERMINED)
+_CO, _CE, _UN = (int(CellState[name]) for name in ("CHANGED_OCCUPIED", "CHANGED_EMPTY", "UNDETERMINED"))
 _ASKED, _AGREED, _OPPOSED = 0b1, 0b10, 0b100
 
 
@@ -67,11 +67,21 @@ def borne_out(votes: Sequence[TileVote], tile: Tile) -> I64:
     found = np.zeros(len(votes), dtype=np.int64)
     if all(vote.unrestricted is None for vote in votes):
         return found
-    as_is = np.where(tile.obstacle_words != 0, np.uint8(CellState.CHANGED_OCCUPIED), np.uint8(CellState.CHANGED_EMPTY))
+    holds = tile.obstacle_words.reshape(-1)
     for i, vote in enumerate(votes):
-        if vote.unrestricted is not None:
-            found[i] = np.count_nonzero((vote.states == NO_VOTE) & (vote.unrestricted == as_is))
+        if vote.unrestricted is not None and vote.states is not None:
+            found[i] = _came_true(vote.states.reshape(-1), vote.unrestricted.reshape(-1), holds)
     return found
+
+
+@numba.njit(cache=True, nogil=True)
+def _came_true(states: U8, sent: U8, holds: U64) -> int:
+    """In how many cells what was ``sent`` counts no more, and is so: obstacles where it ``holds`` a word, else none."""
+    count = 0
+    for c in range(len(states)):
+        if states[c] == NO_VOTE and (sent[c] == _CO or sent[c] == _CE):
+            count += (sent[c] == _CO) == (holds[c] != 0)
+    return count
 
 
 @numba.njit(cache=True, nogil=True)

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapvote.config import FuseSettings
-from mapvote.core.memory import Memory
+from mapvote.core.memory import PLANES, Memory
 from mapvote.core.tile import Tile
 from mapvote.core.types import F64, I64, U8, Bool, CellState
 from mapvote.fusion.tile_vote import TileVote
@@ -97,30 +97,30 @@ def denied_last(states: U8, memory: Memory | None, drives: Sequence[TileVote]) -
 
 def remembered(memory: Memory, before: Tile, after: Tile, votes: Sequence[TileVote], states: U8) -> Memory:
     """``memory`` with what came and what went between two versions of a tile, by the votes that decided it."""
-    held, holds = (tile.obstacle_words != 0 for tile in (before, after))
-    came, went = holds & ~held, held & ~holds & (memory.came_s > 0)
-    if not came.any() and not went.any():
+    held, holds = (tile.obstacle_words.reshape(-1) != 0 for tile in (before, after))
+    came = np.flatnonzero(holds & ~held)
+    went = np.flatnonzero(held & ~holds & (memory.came_s.reshape(-1) > 0))
+    if not len(came) and not len(went):
         return memory
     planes = memory.planes.copy()
-    planes[1][came] = _first_s(votes, came & (states == CellState.CHANGED_OCCUPIED), _CO)[came]
-    ended = np.maximum(_first_s(votes, went, _CE), memory.came_s)
-    planes[2][went] += 1
-    planes[3][went] += (ended - memory.came_s)[went]
-    planes[1][went] = 0
+    came_s, stays, stayed_s = planes.reshape(PLANES, -1)[1:]
+    risen = states.reshape(-1)[came] == CellState.CHANGED_OCCUPIED
+    came_s[came] = np.where(risen, _first_s(votes, came, _CO), np.uint32(0))
+    ended = np.maximum(_first_s(votes, went, _CE), came_s[went])
+    stays[went] += 1
+    stayed_s[went] += ended - came_s[went]
+    came_s[went] = 0
     return replace(memory, planes=planes)
 
 
-def _first_s(votes: Sequence[TileVote], cells: Bool, state: int) -> np.ndarray:
-    """(256, 256) uint32 when the first of ``votes`` said ``state`` in ``cells``, seconds; 0 where none did."""
-    flat = np.flatnonzero(cells)
-    first = np.full(len(flat), np.iinfo(np.uint32).max, dtype=np.uint32)
+def _first_s(votes: Sequence[TileVote], cells: I64, state: int) -> NDArray[np.uint32]:
+    """(n,) when the first of ``votes`` said ``state`` of flat ``cells`` (n,), seconds; 0 where none did."""
+    first = np.full(len(cells), np.iinfo(np.uint32).max, dtype=np.uint32)
     for vote in votes:
         if vote.states is not None:
             end_s = np.uint32(min(max(vote.end_ns // 10**9, 1), 2**32 - 2))
-            _earliest(first, end_s, vote.states.reshape(-1), flat, state)
-    out = np.zeros(cells.shape, dtype=np.uint32)
-    out.reshape(-1)[flat] = np.where(first == np.iinfo(np.uint32).max, np.uint32(0), first)
-    return out
+            _earliest(first, end_s, vote.states.reshape(-1), cells, state)
+    return np.where(first == np.iinfo(np.uint32).max, np.uint32(0), first)
 
 
 @numba.njit(cache=True, nogil=True)

@@ -66,7 +66,13 @@ class Words:
 
 def union(marked: Sequence[Words]) -> Words:
     """The bits that any of ``marked`` sets."""
-    return Words.of(at_least(marked, 1))
+    cells = np.concatenate([mine.cells for mine in marked])
+    if not len(cells):
+        return Words.none()
+    order = np.argsort(cells, kind="stable")
+    first = np.flatnonzero(np.diff(cells[order], prepend=-1))
+    words = np.concatenate([mine.words for mine in marked])[order]
+    return Words(cells[order][first], np.bitwise_or.reduceat(words, first))
 
 
 def at_least(marked: Sequence[Words], k: int) -> U64:

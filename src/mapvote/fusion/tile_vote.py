@@ -9,12 +9,13 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol, TypeVar
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from mapvote.config import FuseSettings
 from mapvote.core.grid import CELLS, TILE_CELLS, Grid
-from mapvote.core.types import F32, N_STATES, NO_VOTE, U8, U16, U64, Bool, CellState
+from mapvote.core.types import F32, I32, N_STATES, NO_VOTE, U8, U16, U64, Bool, CellState
 from mapvote.fusion.sparse_columns import Words, agreed, mark, mark_spoken, union
 
 DAY_NS = 86_400_000_000_000
@@ -179,35 +180,27 @@ def fold(drives: Sequence[TileVote], grid: Grid) -> TileVote:
     if len(drives) == 1:
         return drives[0]
     ordered = sorted(drives, key=lambda drive: (drive.end_ns, drive.digest))
-    source = np.full((TILE_CELLS, TILE_CELLS), -1, dtype=np.int32)
-    for i, drive in enumerate(ordered):
-        source[drive.spoken()] = i
-    states = None if ordered[0].states is None else np.full(source.shape, NO_VOTE, dtype=np.uint8)
-    tally = None if ordered[0].tally is None else np.zeros((*source.shape, N_STATES), dtype=np.uint16)
-    gone: list[Words] = []
+    source = np.full(CELLS, -1, dtype=np.int32)
+    states = tally = unrestricted = None
+    if ordered[0].states is not None:
+        states = _laid_over([drive.states for drive in ordered], source)
+    else:
+        tally = np.zeros((TILE_CELLS, TILE_CELLS, N_STATES), dtype=np.uint16)
+        for i, drive in enumerate(ordered):
+            spoken = drive.spoken()
+            source[spoken.reshape(-1)] = i
+            if drive.tally is not None:
+                tally[spoken] = drive.tally[spoken]
+    if any(drive.unrestricted is not None for drive in ordered):
+        unrestricted = _laid_over([drive.sent for drive in ordered], np.empty_like(source))
     points: list[F32] = []
     intensity: list[U8] = []
-    free: list[Words] = []
-    stands = np.uint8(CellState.UNCHANGED_OCCUPIED)
     for i, drive in enumerate(ordered):
-        mine = source == i
-        if states is not None and drive.states is not None:
-            states[mine] = drive.states[mine]
-        if tally is not None and drive.tally is not None:
-            tally[mine] = drive.tally[mine]
-        gone += [drive.deletes(Words.whole(mine)), drive.remnants(np.where(mine, stands, np.uint8(NO_VOTE)))]
-        if drive.free is not None:
-            free.append(drive.passed())
         if drive.new_points is not None:
-            here = mine.ravel()[grid.flat_cells(drive.new_points)]
+            here = source[grid.flat_cells(drive.new_points)] == i
             points.append(drive.new_points[here])
             intensity.append(drive.measured()[here])
-    unrestricted = None
-    if states is not None and any(drive.unrestricted is not None for drive in ordered):
-        unrestricted = np.full(source.shape, NO_VOTE, dtype=np.uint8)
-        for drive in ordered:
-            if drive.sent is not None:
-                np.copyto(unrestricted, drive.sent, where=drive.sent != NO_VOTE)
+    free = [drive.passed() for drive in ordered if drive.free is not None]
     return TileVote(
         vehicle=ordered[-1].vehicle,
         end_ns=ordered[-1].end_ns,
@@ -215,11 +208,38 @@ def fold(drives: Sequence[TileVote], grid: Grid) -> TileVote:
         states=states,
         unrestricted=unrestricted,
         tally=tally,
-        gone=union(gone),
+        gone=union([_marked(drive, source == i) for i, drive in enumerate(ordered)]),
         new_points=np.concatenate(points) if points else None,
         intensity=np.concatenate(intensity) if any(drive.intensity is not None for drive in ordered) else None,
         free=union(free) if free else None,
     )
+
+
+def _laid_over(planes: Sequence[U8 | None], source: I32) -> U8:
+    """(256, 256) the last of the ``planes`` that says anything of a cell; which one that is goes into ``source``
+    (65536,)."""
+    out = np.full(CELLS, NO_VOTE, dtype=np.uint8)
+    for i, plane in enumerate(planes):
+        if plane is not None:
+            _lay(plane.reshape(-1), i, out, source)
+    return out.reshape(TILE_CELLS, TILE_CELLS)
+
+
+@numba.njit(cache=True, nogil=True)
+def _lay(states: U8, number: int, out: U8, source: I32) -> None:
+    for c in range(len(out)):
+        spoken = states[c] != NO_VOTE
+        out[c] = states[c] if spoken else out[c]
+        source[c] = number if spoken else source[c]
+
+
+def _marked(drive: TileVote, mine: Bool) -> Words:
+    """What a drive deletes, and its remnants, in the flat cells ``mine`` (65536,)."""
+    if drive.gone is None:
+        return drive.deletes(Words.whole(mine))
+    marked = drive.gone.within(mine)
+    emptied, stands = CellState.CHANGED_EMPTY, CellState.UNCHANGED_OCCUPIED
+    return marked.at(drive.supports(emptied, marked.cells) | drive.supports(stands, marked.cells))
 
 
 def one_each(drives: Iterable[TileVote], grid: Grid) -> list[TileVote]:
