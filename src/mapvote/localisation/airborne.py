@@ -46,13 +46,14 @@ def _table_for(rays: NDArray[np.floating]) -> I64:
 def _hits_around(rays: NDArray[np.floating], few: F64, table: I64) -> I64:
     """(m,) how many of ``rays`` (n, 3) end in the voxel of each of ``few``; ``table``: see :func:`_table_for`."""
     keys, counts = table[0], table[1]
-    far2 = (_REACH_M + 2.0 * _VOXEL_M) ** 2
+    far2, slot = (_REACH_M + 2.0 * _VOXEL_M) ** 2, np.int64(0)
     for i in range(len(rays)):
         if rays[i, 0] ** 2 + rays[i, 1] ** 2 + rays[i, 2] ** 2 > far2:
             continue
         key = voxel_key(rays[i, 0], rays[i, 1], rays[i, 2], _VOXEL_M)
-        slot = slot_of(key, keys)
-        keys[slot] = key
+        if key != keys[slot]:  # neighbours in a scan mostly share a voxel
+            slot = slot_of(key, keys)
+            keys[slot] = key
         counts[slot] += 1
     out = np.empty(len(few), dtype=np.int64)
     for i in range(len(few)):

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from mapvote.core.types import F32, F64, I64, Drive, Registration, check_array
 from mapvote.core.voxels import thin
-from mapvote.localisation.ndt_kernels import mean_likelihood, room_for
+from mapvote.localisation.ndt_kernels import likelihoods, mean_likelihood, room_for
 from mapvote.localisation.ndt_solver import Certainty, Place, align
 from mapvote.localisation.ndt_voxels import Voxels, Window, enter_points, join_voxels, reindex
 
@@ -62,7 +62,7 @@ class NdtGrid:
         shape = (round(2 * half / size), round(2 * half / size), round((BELOW_M + ABOVE_M) / size))
         self.level = level
         self.reach = np.array([half, half, BELOW_M])
-        self.window = Window(np.full(shape, -1, dtype=np.int32), np.zeros(3, dtype=np.int64), size)
+        self.window = Window(np.empty(shape, dtype=np.int32), np.zeros(3, dtype=np.int64), size)  # recentred next
         self.voxels = room_for_voxels(1024)
         self.n = 0
 
@@ -214,11 +214,14 @@ def refine(
     return Registration(T, covariance, score, inlier_share, iterations, converged)
 
 
+_MAP_VARIANCE = np.array([MAP_SIGMA_M**2] * 3 + [MAP_SIGMA_RAD**2] * 3)
+_NO_PRIOR = Certainty(COVARIANCE_SCALE, _MAP_VARIANCE, np.eye(4), np.zeros((6, 6)))
+
+
 def _known(prior: PosePrior | None) -> Certainty:
-    variance = np.array([MAP_SIGMA_M**2] * 3 + [MAP_SIGMA_RAD**2] * 3)
     if prior is None:
-        return Certainty(COVARIANCE_SCALE, variance, np.eye(4), np.zeros((6, 6)))
-    return Certainty(COVARIANCE_SCALE, variance, np.ascontiguousarray(prior.T_map_lidar), prior.information)
+        return _NO_PRIOR
+    return Certainty(COVARIANCE_SCALE, _MAP_VARIANCE, np.ascontiguousarray(prior.T_map_lidar), prior.information)
 
 
 def fitness(ndt_map: NdtMap, clouds: list[F32], T_map_lidar: F64, level: int = 0) -> float:
@@ -226,3 +229,10 @@ def fitness(ndt_map: NdtMap, clouds: list[F32], T_map_lidar: F64, level: int = 0
     grid = ndt_map.levels[level]
     likelihood: float = mean_likelihood(clouds[level], T_map_lidar, grid.window, grid.voxels.cells)
     return likelihood
+
+
+def fitnesses(ndt_map: NdtMap, cloud: F32, T_map_lidar: F64, level: int = 0) -> F64:
+    """(m,) :func:`fitness` of a cloud (3, n) at many poses (m, 4, 4)."""
+    grid = ndt_map.levels[level]
+    out: F64 = likelihoods(cloud, np.ascontiguousarray(T_map_lidar), grid.window, grid.voxels.cells)
+    return out

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
-from mapvote.core.types import F32, F64, I32
+from mapvote.core.types import F32, F64, I32, I64
 from mapvote.localisation.ndt_voxels import Vector, Window, holds, voxel_of
 
 INLIER_E = 7.81
@@ -21,6 +21,8 @@ CUTOFF_E = 25.0
 """Beyond this a voxel's pull on a point, exp(-e / 2), is nothing."""
 _BLOCK = 1024
 """Points whose sums are taken in float32 before they are added up in float64."""
+_TOGETHER = 64
+"""Points that are paired together."""
 _MEAN, _PRECISION, _ROWS = 0, 3, 9
 
 
@@ -62,30 +64,52 @@ def _in_map(points: F32, T: F64, i: int) -> Vector:
 
 
 @numba.njit(cache=True, nogil=True)
-def pair_up(points: F32, T: F64, window: Window, cells: F64, pairs: Pairs) -> None:
-    """Pair those of the points (3, n) that lie in another voxel at pose T (4, 4) than when they were last paired."""
-    rows, lowest, size = window  # unpacked once: a group handed on for each point would cost a little
-    of, home, origin = pairs
-    low = lowest * size - origin
-    for i in range(points.shape[1]):
+def _moved(points: F32, T: F64, window: Window, home: I32, of: range, moved: I64) -> int:
+    """Which points of a block lie in another voxel than their ``home``, which is set: into ``moved``, returns how
+    many."""
+    lowest, size = window.lowest, window.size
+    count = 0
+    for i in range(of.start, of.stop):
         x, y, z = _in_map(points, T, i)
         ax, ay, az = voxel_of(size, x, y, z)
         ix, iy, iz = ax - lowest[0], ay - lowest[1], az - lowest[2]
-        if ix == home[0, i] and iy == home[1, i] and iz == home[2, i]:
-            continue
+        moved[count] = i
+        count += 1 if (ix != home[0, i]) | (iy != home[1, i]) | (iz != home[2, i]) else 0
         home[0, i], home[1, i], home[2, i] = ix, iy, iz
-        inside = holds(rows, ix, iy, iz, 1)
+    return count
+
+
+@numba.njit(cache=True, nogil=True)
+def pair_up(points: F32, T: F64, window: Window, cells: F64, pairs: Pairs) -> None:
+    """Pair those of the points (3, n) that lie in another voxel at pose T (4, 4) than when they were last paired.
+
+    Block by block: who has moved, where their partners are, what these say. No step waits for the memory of the one
+    before, nor guesses whether there is a partner: where there is none, the first voxel's numbers are masked.
+    """
+    rows, lowest, size = window
+    of, home, origin = pairs
+    low, flat, strides = lowest * size - origin, rows.ravel(), (rows.shape[1] * rows.shape[2], rows.shape[2])
+    moved, partner = np.empty(_TOGETHER, np.int64), np.empty((7, _TOGETHER), np.int32)
+    for first in range(0, points.shape[1], _TOGETHER):
+        m = _moved(points, T, window, home, range(first, min(first + _TOGETHER, points.shape[1])), moved)
+        for w in range(m):
+            ix, iy, iz = np.int64(home[0, moved[w]]), np.int64(home[1, moved[w]]), np.int64(home[2, moved[w]])
+            inside = holds(rows, ix, iy, iz, 1)
+            at = ix * strides[0] + iy * strides[1] + iz if inside else strides[0] + strides[1] + 1
+            for j in range(7):
+                dx, dy, dz = _neighbour(j)
+                k = flat[np.uint64(at + dx * strides[0] + dy * strides[1] + dz)]
+                partner[j, w] = k if inside else np.int32(-1)
         for j in range(7):
             dx, dy, dz = _neighbour(j)
-            k = rows[ix + dx, iy + dy, iz + dz] if inside else np.int32(-1)
-            if k < 0:
-                of[j, :, i] = 0.0
-                continue
-            of[j, _MEAN, i] = (ix + dx + 0.5) * size + low[0] + cells[k, 0]
-            of[j, _MEAN + 1, i] = (iy + dy + 0.5) * size + low[1] + cells[k, 1]
-            of[j, _MEAN + 2, i] = (iz + dz + 0.5) * size + low[2] + cells[k, 2]
-            for c in range(6):
-                of[j, _PRECISION + c, i] = cells[k, 3 + c]
+            for w in range(m):
+                i, k = moved[w], np.uint64(max(partner[j, w], np.int32(0)))
+                there = np.float32(1.0) if partner[j, w] >= 0 else np.float32(0.0)
+                of[j, _MEAN, i] = there * np.float32((home[0, i] + dx + 0.5) * size + low[0] + cells[k, 0])
+                of[j, _MEAN + 1, i] = there * np.float32((home[1, i] + dy + 0.5) * size + low[1] + cells[k, 1])
+                of[j, _MEAN + 2, i] = there * np.float32((home[2, i] + dz + 0.5) * size + low[2] + cells[k, 2])
+                for c in range(6):
+                    of[j, _PRECISION + c, i] = there * np.float32(cells[k, 3 + c])
 
 
 @numba.njit(inline="always")
@@ -228,3 +252,12 @@ def mean_likelihood(points: F32, T: F64, window: Window, cells: F64) -> float:
             nearest = min(nearest, _misfit(cells, k, ux, uy, uz))
         total += np.float64(_likelihood(np.float32(nearest)))
     return total / max(1, points.shape[1])
+
+
+@numba.njit(cache=True, nogil=True)
+def likelihoods(points: F32, T: F64, window: Window, cells: F64) -> F64:
+    """(m,) :func:`mean_likelihood` at each of many poses T (m, 4, 4)."""
+    out = np.empty(len(T))
+    for k in range(len(T)):
+        out[k] = mean_likelihood(points, T[k], window, cells)
+    return out

@@ -145,7 +145,7 @@ def align(points: F32, T: F64, level: Place, known: Certainty, pairs: Pairs) -> 
     pairs.home[:] = _UNPAIRED
     pairs.origin[:] = T[:3, 3]
     converged, iterations, likelihood, inliers = False, 0, 0.0, 0.0
-    covariance = np.eye(6)
+    covariance, H_inv, floor = np.eye(6), np.eye(6), 0.0
     while iterations < level.iterations and not converged:
         iterations += 1
         pair_up(points, T, level.window, level.cells, pairs)
@@ -158,8 +158,8 @@ def align(points: F32, T: F64, level: Place, known: Certainty, pairs: Pairs) -> 
             H[k, k] += floor
         H_inv = inverse_of(H)
         step = -_times(H_inv, g)
-        covariance = _covariance(H_inv, M, floor, known)
         if has_prior:
+            covariance = _covariance(H_inv, M, floor, known)
             information = inverse_of(covariance)
             pull = _times(information, step) + _times(known.information, _to_prior(T, known.T_prior))
             covariance = inverse_of(information + known.information)
@@ -169,4 +169,6 @@ def align(points: F32, T: F64, level: Place, known: Certainty, pairs: Pairs) -> 
             step *= 0.5 * size / length
         _move(T, step)
         converged = length < level.tolerance_m
+    if iterations and not has_prior:
+        covariance = _covariance(H_inv, M, floor, known)
     return covariance, likelihood, inliers, iterations, converged

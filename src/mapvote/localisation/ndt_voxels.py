@@ -237,7 +237,12 @@ def join_voxels(others: Voxels, window: Window, voxels: Voxels, n: int, floor_m:
             n_shared += 1
             continue
         rows[ix, iy, iz] = n
-        voxels.place[n], voxels.sums[n], voxels.cells[n] = others.place[j], others.sums[j], others.cells[j]
+        for c in range(3):
+            voxels.place[n, c] = others.place[j, c]
+        for c in range(11):
+            voxels.sums[n, c] = others.sums[j, c]
+        for c in range(9):
+            voxels.cells[n, c] = others.cells[j, c]
         n += 1
     _refresh(voxels, shared[:n_shared], size, floor_m, min_points)
     return n

@@ -16,7 +16,7 @@ import numpy as np
 from mapvote.config import TrustSettings
 from mapvote.core.geometry import from_xyz_rpy
 from mapvote.core.types import F64, I32, I64, Bool
-from mapvote.localisation.ndt import NdtMap, fitness, in_rows, refine
+from mapvote.localisation.ndt import NdtMap, fitness, fitnesses, in_rows, refine
 
 MIN_KNOWN = 0.3
 """Share of the standing points that must lie where the map has been: with fewer, what fits there proves little."""
@@ -35,6 +35,20 @@ _REFINED = 3
 _STEP_M = 1.0
 _COARSE = 300
 """Standing points that rank the places before any is refined."""
+
+
+def _arms() -> list[F64]:
+    """(m, 4, 4) each: steps ahead, back, left, right, and along the street but turned about."""
+    away = np.arange(_NEAR_M - _STEP_M, _FAR_M + 0.5 * _STEP_M, _STEP_M)
+    ways = (1.0, 0.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, -1.0, 0.0), (1.0, 0.0, np.pi)
+    steps = [away if yaw == 0.0 else np.concatenate([-away[::-1], away]) for _, _, yaw in ways]
+    return [
+        np.array([from_xyz_rpy(x * s, y * s, 0.0, 0.0, 0.0, yaw) for s in along])
+        for (x, y, yaw), along in zip(ways, steps, strict=True)
+    ]
+
+
+_ARMS = _arms()
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,21 +125,19 @@ class Judge:
     def _others(self, ndt_map: NdtMap, few: F64, standing: F64, T: F64) -> list[F64]:
         """Refined poses of the best other places: the coarse peaks along four arms and turned about, and just
         ahead and behind."""
-        away = np.arange(_NEAR_M - _STEP_M, _FAR_M + 0.5 * _STEP_M, _STEP_M)
-        coarse = [in_rows(standing[:: max(1, len(standing) // _COARSE)])]
+        coarse = in_rows(standing[:: max(1, len(standing) // _COARSE)])
         peaks = []
-        for x, y, yaw in ((1.0, 0.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, -1.0, 0.0), (1.0, 0.0, np.pi)):
-            steps = away if yaw == 0.0 else np.concatenate([-away[::-1], away])
-            guesses = [T @ from_xyz_rpy(x * s, y * s, 0.0, 0.0, 0.0, yaw) for s in steps]
-            fits = np.array([fitness(ndt_map, coarse, guess) for guess in guesses])
+        for arm in _ARMS:
+            guesses = T @ arm
+            fits = fitnesses(ndt_map, coarse, guesses)
             rising = fits[1:] > fits[:-1]
             falling = np.append(fits[1:-1] >= fits[2:], True)
             peaks += [(float(fits[k]), guesses[k]) for k in np.flatnonzero(rising & falling) + 1]
         peaks.sort(key=lambda peak: -peak[0])
-        unsettled = [T @ from_xyz_rpy(s, 0.0, 0.0) for s in (away[0], -away[0])]
+        unsettled = [T @ _ARMS[0][0], T @ _ARMS[1][0]]
         clouds = [in_rows(few)] * len(ndt_map.levels)
-        guesses = [*unsettled, *(guess for _, guess in peaks[:_REFINED])]
-        return [refine(ndt_map, clouds, guess).T_map_lidar for guess in guesses]
+        starts = [*unsettled, *(guess for _, guess in peaks[:_REFINED])]
+        return [refine(ndt_map, clouds, start).T_map_lidar for start in starts]
 
 
 def stands_above_ground(points_lidar: F64, T_map_lidar: F64) -> Bool:
