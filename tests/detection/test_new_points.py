@@ -25,9 +25,11 @@ def test_points_are_taken_from_the_voxels_of_a_word_and_of_what_stands_still(see
     words = rng.integers(0, 2**63, 4).astype(np.uint64)
     words[0] = 0
     base = rng.integers(-5, 5, 4).astype(np.int32)
-    found = select(points, cell, stationary, words, base)
+    moving = rng.random(60) < 0.1
+    found = np.zeros(60, dtype=np.bool_)
+    found[select(points, cell, stationary, moving, words, base)] = True
     for i in range(60):
-        if cell[i] < 0 or not stationary[i]:
+        if cell[i] < 0 or moving[i] or not stationary[i]:
             assert not found[i]
             continue
         bit = min(max(int(np.floor(points[i, 2] / CELL_SIZE)) - int(base[cell[i]]), 0), 63)

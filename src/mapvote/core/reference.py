@@ -85,12 +85,13 @@ def above_ground_points(point_map: PointMap, grid: Grid) -> U64:
 
 
 def cut_reference(outer: Reference, window: Grid) -> Reference:
-    """The planes of ``outer`` over ``window``, which lies inside it; views, nothing is copied."""
+    """The planes of ``outer`` over ``window``, which lies inside it: views, but for ``base``, whose cells points and
+    rays find by one number."""
     cut = window.slices_in(outer.grid)
     return Reference(
         window,
         outer.ground_z[cut],
-        outer.base[cut],
+        np.ascontiguousarray(outer.base[cut]),
         outer.occupied[cut],
         outer.counts[cut],
         outer.bottom_z[cut],

@@ -18,14 +18,24 @@ REACH_M = 70.0
 
 
 @numba.njit(cache=True, nogil=True)
-def select(points: F64, cell: I32, stationary: Bool, words: U64, base: I32) -> Bool:
-    """(n,) which of the ``stationary`` points (n, 3) lie in a voxel of ``words`` (cells,); ``cell`` (n,) -1 outside."""
-    out = np.zeros(len(points), dtype=np.bool_)
-    for i in range(len(points)):
-        if stationary[i] and cell[i] >= 0 and words[cell[i]]:
-            bit = int(np.floor(points[i, 2] / CELL_SIZE)) - base[cell[i]]
-            out[i] = (words[cell[i]] >> np.uint64(min(max(bit, 0), 63))) & np.uint64(1) != 0
-    return out
+def select(points: F64, cell: I32, wanted: Bool, unwanted: Bool, words: U64, base: I32) -> I64:
+    """Indices of the points (n, 3), ``wanted`` and not ``unwanted``, that lie in a voxel of ``words`` (cells,).
+
+    ``cell`` (n,) -1 outside. All is entered and some of it written over: nobody can guess which point is chosen.
+    """
+    chosen, near = np.empty(len(points) + 1, np.int64), np.uint64(0)
+    for i in range(np.uint64(0), np.uint64(len(points))):
+        k = np.uint64(max(cell[i], np.int32(0)))
+        here = wanted[i] & (not unwanted[i]) & (cell[i] >= 0)
+        chosen[near] = i
+        near += np.uint64(1) if here & (words[k] != 0) else np.uint64(0)
+    found = np.uint64(0)
+    for w in range(np.uint64(0), near):
+        point = np.uint64(chosen[w])
+        k = np.uint64(cell[point])
+        chosen[found] = point
+        found += words[k] >> np.uint64(column_bit(points[point, 2], base[k])) & np.uint64(1)
+    return chosen[:found].copy()
 
 
 @numba.njit(cache=True, nogil=True)
@@ -69,10 +79,8 @@ class NewPoints:
     def gather(self, seen: Observation, may_be_new: U64) -> None:
         """The points of one scan: of its view, those in voxels of ``may_be_new`` (rows, cols); and what lies beyond."""
         scan = seen.scan
-        chosen = select(
-            scan.points_map, scan.cell, scan.obstacle & ~seen.moving, may_be_new.ravel(), _flat_base(scan.reference)
-        )
-        self._offer_of(scan, np.flatnonzero(chosen))
+        words, base = may_be_new.ravel(), _flat_base(scan.reference)
+        self._offer_of(scan, select(scan.points_map, scan.cell, scan.obstacle, seen.moving, words, base))
         if self.beyond:
             self._offer_of(scan, self._strange_beyond(scan))
 
@@ -128,8 +136,8 @@ def points_in(window: Grid, points_map: F64, words: U64, base: I32) -> tuple[F32
     corner, and the intensity (m,) of those that came with one, 255 for 1.0."""
     rows, cols, _ = window.indices_of(points_map)
     cell = (rows * window.cols + cols).astype(np.int32)
-    wanted = select(points_map, cell, np.ones(len(points_map), np.bool_), words.ravel(), base.ravel())
-    kept = points_map[wanted]
+    every = np.ones(len(points_map), np.bool_)
+    kept = points_map[select(points_map, cell, every, ~every, words.ravel(), base.ravel())]
     return window.from_map(kept[:, :3]), np.rint(kept[:, 3] * 255.0).astype(np.uint8) if kept.shape[1] == 4 else None
 
 

@@ -12,7 +12,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from mapvote.core.geometry import turn
+from mapvote.core.geometry import rows_from, turn
 from mapvote.core.types import F32, F64, I32, U8
 
 U16 = NDArray[np.uint16]
@@ -67,19 +67,28 @@ def _aim(x: np.float32, y: np.float32, z: np.float32, pixels: Pixels) -> tuple[n
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
+def _pixels_of(rows: F32, pixels: Pixels) -> tuple[I32, I32]:
+    """(pixel (n,), range (n,) in steps) of places (3, n) from the sensor; one pixel past the last is nowhere."""
+    x, y, z = rows[0], rows[1], rows[2]
+    n, slopes, nowhere = len(x), np.int32(pixels.slopes), np.int32(pixels.turns * pixels.slopes)
+    pixel, steps = np.empty(n, np.int32), np.empty(n, np.int32)
+    for i in range(np.uint64(0), np.uint64(n)):  # unsigned: an index that cannot be negative vectorises
+        rho, a, b = _aim(x[i], y[i], z[i], pixels)
+        pixel[i] = np.int32(a * slopes + b) if (rho >= NEAR_M) & (b >= 0) & (b < slopes) else nowhere
+        steps[i] = np.int32(min(rho * PER_M + np.float32(0.5), np.float32(NOTHING - 1)))
+    return pixel, steps
+
+
+@numba.njit(cache=True, nogil=True)
 def range_image(points: F64, origin: F64, pixels: Pixels) -> U16:
     """(turns, slopes) nearest horizontal range among the returns (n, 3) in each direction and to its left and right."""
-    n = len(points)
-    rho, a, b = np.empty(n, np.float32), np.empty(n, np.int32), np.empty(n, np.int32)
-    for i in range(np.uint64(0), np.uint64(n)):  # unsigned: an index that cannot be negative vectorises
-        x, y = np.float32(points[i, 0] - origin[0]), np.float32(points[i, 1] - origin[1])
-        rho[i], a[i], b[i] = _aim(x, y, np.float32(points[i, 2] - origin[2]), pixels)
+    pixel, steps = _pixels_of(rows_from(points, origin), pixels)
     turns, slopes = pixels.turns, pixels.slopes
-    alone = np.full((turns, slopes), NOTHING, dtype=np.uint16)
-    for i in range(n):
-        if rho[i] >= NEAR_M and 0 <= b[i] < slopes:
-            r = np.uint16(min(rho[i] * PER_M + np.float32(0.5), np.float32(NOTHING - 1)))
-            alone[a[i], b[i]] = min(alone[a[i], b[i]], r)
+    flat = np.full(turns * slopes + 1, NOTHING, dtype=np.uint16)
+    for i in range(np.uint64(0), np.uint64(len(pixel))):
+        here = np.uint64(pixel[i])
+        flat[here] = min(flat[here], np.uint16(steps[i]))
+    alone = flat[:-1].reshape((turns, slopes))
     out = np.empty_like(alone)
     for k in range(turns):
         left, here, right = alone[k - 1], alone[k], alone[k + 1 if k + 1 < turns else 0]
