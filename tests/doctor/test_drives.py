@@ -11,11 +11,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from mapvote.config import TrustSettings
 from mapvote.core import geometry
-from mapvote.core.point_map import map_from_points
+from mapvote.core.grid import Lattice
+from mapvote.core.point_map import PointMap, cut_tiles, map_from_points
 from mapvote.core.sensors import SENSORS
-from mapvote.core.types import F64
+from mapvote.core.tile import Tile
+from mapvote.core.types import F64, Scan
 from mapvote.doctor import Finding, diagnose
+from mapvote.doctor.other_unit import in_another_unit
 from mapvote.doctor.readings import CAMERA_TO_LIDAR
 from mapvote.formats import DriveWriter
 from mapvote.formats.drives.kitti import write_poses
@@ -176,6 +180,24 @@ def test_jumps_bodies_and_thin_scans_are_named(tmp_path: Path, scans: list[F64])
         assert illness in found
 
 
+@pytest.mark.parametrize(
+    ("numbers", "name"),
+    [(1 / 0.3048, "in feet"), (1 / 0.0254, "in inches"), (0.3048, "converted as if they were feet")],
+)
+def test_of_a_map_that_is_not_in_metres_the_unit_is_named(scans: list[F64], numbers: float, name: str) -> None:
+    points = world()
+    points = points[(np.abs(points[:, :2] - [8.0, 5.0]) < 30.0).all(axis=1)]
+    seen = {i: Scan(0, scans[i].astype(np.float32)) for i in (0, 12, 23)}
+    tiles = {}
+    for index, mine in cut_tiles(numbers * points, Lattice()):
+        empty = Tile.empty(Lattice().tile(index))
+        tiles[index] = empty.but(points=empty.window.from_map(numbers * points[mine]))
+    found = in_another_unit(PointMap("m", Lattice(), tiles), seen, poses(), TrustSettings(), 0.02, None)
+    assert found is not None
+    assert name in found.what
+    assert "fits 3 of 3 scans" in found.what
+
+
 @pytest.mark.slow
 def test_drive_and_map_that_do_not_belong_together(tmp_path: Path, scans: list[F64]) -> None:
     write(tmp_path / "d", scans)
@@ -188,6 +210,8 @@ def test_drive_and_map_that_do_not_belong_together(tmp_path: Path, scans: list[F
     larger = map_from_points(1.04 * world())
     found = serious(diagnose(tmp_path / "d", None, larger).findings)
     assert any("scaled by 1.0" in what for what in found), found
+    feet = map_from_points(world()[::4] / 0.3048)
+    assert "the map is in feet" in serious(diagnose(tmp_path / "d", None, feet).findings)[0]
     bare = world()
     bare = bare[bare[:, 0] < -30]
     corner = map_from_points(np.concatenate([bare, [[10.0, 5.0, 0.0]]]))

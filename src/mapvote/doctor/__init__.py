@@ -18,7 +18,7 @@ from mapvote.doctor.clouds import check_cloud, tile_by_tile
 from mapvote.doctor.drives import cheap_checks, examine_drive
 from mapvote.doctor.finding import Finding, Progress, in_order
 from mapvote.doctor.maps import check_whole, examine_map
-from mapvote.doctor.on_map import check_on_map
+from mapvote.doctor.on_map import check_on_map, check_unit
 from mapvote.doctor.prior import NO_PRIOR
 from mapvote.formats.drives.options import DriveOptions
 from mapvote.formats.drives.rosbag import is_rosbag
@@ -56,9 +56,13 @@ def diagnose(
     more, drive, T = examine_drive(path, options, progress)
     found += more
     if point_map is not None:
-        found += _of_the_map(point_map)
-        if drive is not None and T is not None and not any(f.severity == "error" for f in found):
-            more, T = check_on_map(drive, T, point_map, progress)
+        sound, of_map = not any(f.severity == "error" for f in found), _of_the_map(point_map)
+        found += of_map
+        if drive is not None and T is not None and sound:
+            if any(f.severity == "error" for f in of_map):
+                more = check_unit(drive, T, point_map, progress)
+            else:
+                more, T = check_on_map(drive, T, point_map, progress)
             if all(f.severity == "note" for f in more):
                 found = [f for f in found if not f.map_tells]
             found += more

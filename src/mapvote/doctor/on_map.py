@@ -15,6 +15,7 @@ from mapvote.core.types import F32, F64, Drive, MapvoteError, Scan
 from mapvote.doctor.difference import Difference, difference_of
 from mapvote.doctor.finding import Finding, Progress, Severity
 from mapvote.doctor.other_scale import in_another_scale
+from mapvote.doctor.other_unit import in_another_unit
 from mapvote.doctor.places import Place, fitting, register_all, total_fit
 from mapvote.doctor.road import find_road
 from mapvote.localisation.deskew import deskew, motion_at
@@ -32,8 +33,7 @@ _TURN_DEG, _TILT_DEG, _SCALE = 0.5, 1.5, 0.01
 def check_on_map(drive: Drive, T: F64, point_map: PointMap, tell: Progress | None = None) -> tuple[list[Finding], F64]:
     """(findings, the poses (n, 4, 4) as they lie on the map), by a prior (n, 4, 4) that suits the scans."""
     found = _outside(T, point_map)
-    index = np.unique(np.linspace(0, len(drive) - 1, _PLACES).astype(np.int64))
-    scans = {int(i): _deskewed(drive, T, int(i)) for i in index}
+    scans = _some_scans(drive, T)
     settings, trust = NdtSettings(), TrustSettings()
     around = MapWindow(point_map)
     road = find_road([scan.points for scan in scans.values()])
@@ -49,6 +49,9 @@ def check_on_map(drive: Drive, T: F64, point_map: PointMap, tell: Progress | Non
             scale = 1.0
     if len(fitting(places)) < 0.5 * len(places):
         scale = 1.0
+        unit = in_another_unit(point_map, scans, T, trust, drive.sensor.range_sigma_m, tell)
+        if unit is not None:
+            return [unit], T
         search = GlobalSearch(point_map, settings, trust, drive.sensor.range_sigma_m)
         better, mirrored = _searched(search, around, drive, T, scans, trust, tell)
         if mirrored:
@@ -63,6 +66,18 @@ def check_on_map(drive: Drive, T: F64, point_map: PointMap, tell: Progress | Non
     found += _differs(difference, drive)
     mended = np.array([difference.applied(one) for one in T])
     return found + _heights(point_map, mended, drive), mended
+
+
+def check_unit(drive: Drive, T: F64, point_map: PointMap, tell: Progress | None = None) -> list[Finding]:
+    """Of a map that cannot be in metres: in which unit scans of the drive fit it."""
+    unit = in_another_unit(point_map, _some_scans(drive, T), T, TrustSettings(), drive.sensor.range_sigma_m, tell)
+    return [] if unit is None else [unit]
+
+
+def _some_scans(drive: Drive, T: F64) -> dict[int, Scan]:
+    """Along the drive, by their numbers."""
+    index = np.unique(np.linspace(0, len(drive) - 1, _PLACES).astype(np.int64))
+    return {int(i): _deskewed(drive, T, int(i)) for i in index}
 
 
 def _deskewed(drive: Drive, T: F64, i: int) -> Scan:
