@@ -113,7 +113,9 @@ class Served:
 
     def __init__(self, verb: list[str]) -> None:
         began, self.most = time.monotonic(), 0.0
-        self.process = subprocess.Popen([sys.executable, "-m", "mapvote", *verb], stdout=subprocess.PIPE, text=True)
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "mapvote", *verb], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
+        )
         assert self.process.stdout is not None
         while not select.select([self.process.stdout], [], [], 0.1)[0]:
             self.look()

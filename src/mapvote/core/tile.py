@@ -154,6 +154,12 @@ class Tile:
         return np.asarray(words_of(self.cells, *self.columns, CELLS)).reshape(self.window.shape)
 
 
+def in_bytes(intensity: NDArray[Any]) -> U8:
+    """(n,) a field of intensities as ballots have them, 255 for 1.0."""
+    shares = np.nan_to_num(np.asarray(intensity, dtype=np.float64)) / max(brightest(intensity), 1e-9)
+    return np.asarray(np.rint(255.0 * np.clip(shares, 0.0, 1.0)), dtype=np.uint8)
+
+
 def brightest(intensity: NDArray[Any]) -> float:
     """The value that means 1.0 in a field of a map: the smallest scale in use that holds all of the values (n,)."""
     highest = float(np.nanmax(intensity, initial=0.0))

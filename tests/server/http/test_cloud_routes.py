@@ -16,10 +16,11 @@ from fastapi.testclient import TestClient
 from msgspec.structs import replace
 from PIL import Image
 
-from hand_made import Say, make_ballot, states_plane, two_walls
+from hand_made import Say, make_ballot, make_map, states_plane, two_walls
 from mapvote.codec.ballot import encode
 from mapvote.codec.path import pack_path
 from mapvote.config import FuseSettings
+from mapvote.core.tile import Tile
 from mapvote.core.types import CellState
 from mapvote.fusion.probability import change_probability
 from mapvote.server.http.app import create_app
@@ -58,6 +59,31 @@ def cloud(data: bytes, at: int = 0) -> tuple[np.ndarray, int]:
     assert magic == 0x3143564D
     end = at + 16 + 8 * n
     return np.frombuffer(data[at + 16 : end], "<u2").reshape(n, 4), end
+
+
+def test_the_intensity_of_each_point_travels_behind_the_places_where_the_map_has_any(tmp_path: Path) -> None:
+    def bright(tile: Tile) -> Tile:
+        return tile.but(fields={"intensity": (1000 * tile.points[:, 2]).astype(np.uint16)})
+
+    tiles = two_walls().tiles
+    store = Store.create(f"sqlite:///{tmp_path / 'b.db'}", make_map({(0, 0): bright(tiles[0, 0]), (0, 1): tiles[0, 1]}))
+    with TestClient(create_app(store, opened=True), base_url="http://localhost") as client:
+        hashes = client.get("/v1/map").json()["tiles"]["0,0"]
+        for level in range(6):
+            route = f"/v1/clouds/{hashes['points']}/{hashes['ground']}/{level}"
+            data = client.get(route, params={"fields": hashes["fields"]}).content
+            packed, end = cloud(data)
+            assert client.get(route).content == data[:end], "who does not ask for it gets what there was before"
+            above_cm = packed[:, 3].astype(int) - 1000
+            assert np.abs(np.frombuffer(data, "u1", offset=end) - above_cm * 10 * 255 / 4095).max(initial=0) < 1
+        coarse = client.get("/v1/clouds/overview").content
+        counts = [struct.unpack_from("<I", coarse, 8 + 24 * i + 12)[0] for i in range(2)]
+        assert counts == [12, 12]
+        assert len(coarse) == 8 + 2 * 24 + 24 * 8 + 24
+        lit = np.frombuffer(coarse, "u1", offset=8 + 2 * 24 + 24 * 8)
+        assert lit[:12].max() == round(1050 * 255 / 4095)
+        assert not lit[12:].any()
+    store.close()
 
 
 def test_the_levels_of_a_tile_hold_its_points_and_no_more(client: TestClient) -> None:

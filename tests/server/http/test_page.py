@@ -47,7 +47,8 @@ def village(database: str) -> None:
     """A store of a village where a house was taken down in version 2, and a shed would go with the next."""
     ground = wall([(r, c) for r in range(0, 256, 2) for c in range(0, 256, 2)], [0.05])
     houses = np.concatenate([ground, wall(HOUSE, HEIGHTS), wall(SHED, HEIGHTS)])
-    opened = Store.create(database, make_map({(0, 0): make_tile(houses)}))
+    bright = {"intensity": (1000 * houses[:, 2]).astype(np.uint16)}
+    opened = Store.create(database, make_map({(0, 0): make_tile(houses).but(fields=bright)}))
     lax = policy.current_policy(opened).model_copy(update={"fuse": FuseSettings(max_deleted_share=1.0)})
     policy.set_policy(opened, lax, by="test")
     for number, gone in enumerate((HOUSE, SHED)):
@@ -121,8 +122,11 @@ def test_the_cloud_is_drawn_and_nobody_else_is_asked(browser: Chromium, store: P
         press(browser, "3")
         for way in ("before", "swipe", "blink", "after"):
             browser.run(f"(s => (s.value = '{way}', s.onchange()))(document.querySelector('#compare'))")
-        for colour in ("plain", "age", "votes", "probability", "state", "height"):
+        browser.wait("!document.querySelector('#colour [value=intensity]').disabled")
+        for colour in ("intensity", "plain", "age", "votes", "probability", "state", "height"):
             browser.run(f"(s => (s.value = '{colour}', s.onchange()))(document.querySelector('#colour'))")
+            if colour == "intensity":
+                browser.wait(f"{pixels}('#31446b') > 50")  # the ground is dark, and drawn in the ramp's first colour
             if colour == "state":
                 browser.wait("location.hash.includes('vehicle=v1')")
         for low, told in (("3", "above 3.0 m"), ("-2", "all heights")):

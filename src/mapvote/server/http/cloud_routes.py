@@ -56,10 +56,16 @@ def changed(request: Request, old: From, new: To) -> Response:
     summary="One level of detail of a tile",
 )
 def level_of(
-    request: Request, points: Digest, ground: Digest, level: Annotated[int, Path(ge=0, lt=N_LEVELS)]
+    request: Request,
+    points: Digest,
+    ground: Digest,
+    level: Annotated[int, Path(ge=0, lt=N_LEVELS)],
+    fields: Annotated[str | None, Query(pattern=r"^[0-9a-f]{64}$")] = None,
 ) -> Response:
-    """Immutable. Levels add to one another: every point is in exactly one of the six."""
-    return _packed(request, services(request).clouds.levels(TileHashes(points, ground, None)).part(level), _FOR_EVER)
+    """Immutable. Levels add to one another: every point is in exactly one of the six. With the hash of the tile's
+    ``fields`` the intensity of each point follows, a byte, if there is one."""
+    hashes = TileHashes(points, ground, None, fields=fields)
+    return _packed(request, services(request).clouds.levels(hashes).part(level), _FOR_EVER)
 
 
 @router.get(

@@ -12,16 +12,16 @@ import numpy as np
 
 from mapvote.core.grid import TILE_CELLS, Lattice, TileIndex
 from mapvote.core.rows import found_among
-from mapvote.core.tile import Tile
+from mapvote.core.tile import Tile, in_bytes
 from mapvote.core.types import F64, I64, NO_VOTE, U8, CellState, MapvoteError
 from mapvote.fusion.probability import alike_beside, change_probability
 from mapvote.fusion.tile_vote import TileVote
 from mapvote.server.errors import Unavailable
 from mapvote.server.insight.levels import Levels, cloud_bytes, make_levels, pack
-from mapvote.server.store.blobs import TileHashes
+from mapvote.server.store.blobs import TileHashes, unpack_fields_plane
 from mapvote.server.store.eligible_votes import DAMAGED, FOREVER, Electorate, from_sound_ballots, judged_votes
 from mapvote.server.store.policy import policy_in
-from mapvote.server.store.queries import load_tile, tiles_of, tiles_that_differ, version_of
+from mapvote.server.store.queries import load_blob, load_tile, tiles_of, tiles_that_differ, version_of
 from mapvote.server.store.store import Store
 from mapvote.server.store.stored_votes import read_votes
 
@@ -61,21 +61,22 @@ class Clouds:
                 self._made.move_to_end(hashes)
                 return known
         (tile,) = self._load(hashes)
-        made = make_levels(tile.points, tile.ground_z)
+        made = make_levels(tile.points, tile.ground_z, bright=self._bright(hashes, tile))
         with self._lock:
             if hashes not in self._made:
                 self._made[hashes] = made
-                self._room -= made.packed.nbytes
+                self._room -= made.nbytes
             while self._room < 0 and len(self._made) > 1:
                 _, dropped = self._made.popitem(last=False)
-                self._room += dropped.packed.nbytes
+                self._room += dropped.nbytes
         return made
 
     def overview(self, version: int, stop: Callable[[], bool] = lambda: False) -> bytes:
         """All tiles of a version, coarse: as many whole levels as 150,000 points allow, or an even share of the first.
 
         uint32 0x3143564F, uint32 number of tiles; for each tile int32 row, int32 col, int32 last whole level (-1: a
-        part of the first), uint32 points, float32 z0_m, float32 z_step_m; then all points as in :class:`Levels`.
+        part of the first), uint32 points, float32 z0_m, float32 z_step_m; then all points as in :class:`Levels`, and if
+        any tile has intensity then that of all, a byte each.
         ``stop`` ends the work early, with nothing to show. NotFound if there is no such version.
         """
         with self._making:  # of many who ask, one makes it
@@ -93,11 +94,26 @@ class Clouds:
 
         def made(index: TileIndex) -> list[tuple[TileIndex, Levels]]:
             sound = [] if stop() else self._sound(tiles[index])
-            return [(index, make_levels(t.points, t.ground_z, _SPARE * OVERVIEW_POINTS // len(tiles))) for t in sound]
+            most = _SPARE * OVERVIEW_POINTS // len(tiles)
+            return [(index, make_levels(t.points, t.ground_z, most, self._bright(tiles[index], t))) for t in sound]
 
         with ThreadPoolExecutor(_AT_ONCE, "coarse") as pool:
             parts = list(pool.map(made, tiles))
         return None if stop() else [part for of_tile in parts for part in of_tile]
+
+    def _bright(self, hashes: TileHashes, tile: Tile) -> U8 | None:
+        """(n,) the intensity of a tile's points, 255 for 1.0; None if it has none, or that is damaged."""
+        if hashes.fields is None:
+            return None
+        try:
+            with self._store.database.reading() as connection:
+                packed = load_blob(connection, hashes.fields)
+            intensity = unpack_fields_plane(packed, hashes.fields, len(tile.points)).get("intensity")
+        except Unavailable:
+            raise
+        except MapvoteError:
+            return None
+        return None if intensity is None else in_bytes(intensity)
 
     def _load(self, *states: TileHashes | None) -> list[Tile]:
         """Tiles, of which points and ground alone are read."""
@@ -141,15 +157,17 @@ def _overview_bytes(made: Sequence[tuple[TileIndex, Levels]]) -> bytes:
     fits = np.flatnonzero(ends.sum(axis=0) <= OVERVIEW_POINTS)
     finest = int(fits[-1]) if len(fits) else -1
     share = OVERVIEW_POINTS // max(len(made), 1)
-    rows, clouds = [], []
+    rows, clouds, bright = [], [], []
+    any_bright = any(levels.bright is not None for _, levels in made)
     for index, levels in made:
         whole = min(finest, int(np.searchsorted(levels.ends, len(levels.packed), side="right")) - 1)
         points = int(levels.ends[whole]) if whole >= 0 else min(share, len(levels.packed))
         rows.append((*index, whole, points, levels.z0_m, levels.z_step_m))
         clouds.append(np.ascontiguousarray(levels.packed[:points], dtype="<u2").tobytes())
-    return b"".join(
-        [np.array([_MAGIC, len(made)], dtype="<u4").tobytes(), np.array(rows, dtype=_HEAD).tobytes(), *clouds]
-    )
+        if any_bright:
+            bright.append(bytes(points) if levels.bright is None else levels.bright[:points].tobytes())
+    head = np.array([_MAGIC, len(made)], dtype="<u4").tobytes(), np.array(rows, dtype=_HEAD).tobytes()
+    return b"".join([*head, *clouds, *bright])
 
 
 def evidence(store: Store, index: TileIndex, vehicle: str | None = None) -> U8:

@@ -39,18 +39,26 @@ class Levels:
     """(6,) where each level ends."""
     z0_m: float
     z_step_m: float
+    bright: U8 | None = None
+    """(n,) the intensity of each, 255 for 1.0; None where nobody knows it."""
 
     def part(self, level: int) -> bytes:
-        """One level for the wire, see :func:`cloud_bytes`."""
-        start = 0 if level == 0 else int(self.ends[level - 1])
-        return cloud_bytes(self.packed[start : int(self.ends[level])], self.z0_m, self.z_step_m)
+        """One level for the wire, see :func:`cloud_bytes`; behind it the intensity of each point, a byte, if known."""
+        some = slice(0 if level == 0 else int(self.ends[level - 1]), int(self.ends[level]))
+        bright = b"" if self.bright is None else self.bright[some].tobytes()
+        return cloud_bytes(self.packed[some], self.z0_m, self.z_step_m) + bright
+
+    @property
+    def nbytes(self) -> int:
+        """What it takes in memory."""
+        return self.packed.nbytes + (0 if self.bright is None else self.bright.nbytes)
 
 
-def make_levels(points: F32, ground_z: F32, most: int | None = None) -> Levels:
+def make_levels(points: F32, ground_z: F32, most: int | None = None, bright: U8 | None = None) -> Levels:
     """Sort points (n, 3), from the tile's corner, into levels; ``ground_z`` (256, 256) as in the tile.
 
     ``most``: only the coarsest level and what else of the coarse ones fits into so many points, ``ends`` as if it were
-    all: for a picture of a whole map.
+    all: for a picture of a whole map. ``bright`` (n,): their intensity, 255 for 1.0.
     """
     sizes = np.array(SPACINGS_M)
     low, high = _heights(points)
@@ -63,7 +71,7 @@ def make_levels(points: F32, ground_z: F32, most: int | None = None) -> Levels:
     shuffled = np.random.default_rng(0).permutation(chosen)
     coarse_first = shuffled[np.argsort(level[shuffled], kind="stable")][:room]
     packed, z0, step = pack(points[coarse_first], ground_z)
-    return Levels(packed, ends, z0, step)
+    return Levels(packed, ends, z0, step, None if bright is None else bright[coarse_first])
 
 
 def pack(points: F32, ground_z: F32) -> tuple[U16, float, float]:

@@ -44,7 +44,8 @@ export const changes = async (from, to) => (await ask("changes", { from, to })).
 export const coverage = async () => (await ask("coverage")).json();
 export const vehicles = async () => (await ask("vehicles")).json();
 export const overview = async (version) => (await ask("clouds/overview", version ? { version } : {})).arrayBuffer();
-export const cloudPart = async ({ points, ground }, level) => (await ask(`clouds/${points}/${ground}/${level}`)).arrayBuffer();
+export const cloudPart = async ({ points, ground, fields }, level) =>
+  (await ask(`clouds/${points}/${ground}/${level}`, fields ? { fields } : {})).arrayBuffer();
 export const evidence = async (tile, vehicle) => (await ask(`evidence/${tile.replace(",", "/")}`, vehicle ? { vehicle } : {})).arrayBuffer();
 export const paths = async (vehicle) => (await ask("paths", vehicle ? { vehicle } : {})).json();
 export const versionMap = async (number) => (await ask(`map/versions/${number}`)).json();

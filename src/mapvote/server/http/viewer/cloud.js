@@ -69,9 +69,10 @@ export class Cloud {
   }
 
   // One part of a tile whose corner is (x, y) in map metres. `side`: "old", "new" or "both"; returns what remove() takes.
-  add({ x, y, z0, zStep, packed, spacing, side = "both", mark = MARK.none, evidence = null, tile = null, level = 0 }) {
+  add({ x, y, z0, zStep, packed, bright = null, spacing, side = "both", mark = MARK.none, evidence = null, tile = null, level = 0 }) {
     const geometry = new BufferGeometry();
     geometry.setAttribute("place", new BufferAttribute(packed, 4));
+    if (bright) geometry.setAttribute("bright", new BufferAttribute(bright, 1, true));
     geometry.setDrawRange(0, packed.length / 4);
     geometry.boundingSphere = new Sphere(new Vector3(38.4, 38.4, z0), 60);
     const own = { z0: { value: z0 }, zStep: { value: zStep }, spacing: { value: spacing }, mark: { value: mark }, evidence: { value: evidence ?? this.blank } };

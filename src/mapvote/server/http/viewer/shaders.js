@@ -1,7 +1,7 @@
 // How a point looks: its place from four small integers, its colour from a ramp, its shape from what happened to it.
 
 export const MARK = { none: 0, removed: 1, added: 2 };
-export const COLOUR = { height: 0, plain: 1, age: 2, votes: 3, probability: 4, state: 5 };
+export const COLOUR = { height: 0, plain: 1, age: 2, votes: 3, probability: 4, state: 5, intensity: 6 };
 
 export const POINT_VERTEX = `
 precision highp float;
@@ -13,6 +13,7 @@ uniform int colour, mark;
 uniform sampler2D evidence, ramp;
 uniform vec3 ground, plain, removed, added;
 in vec4 place;
+in float bright;
 out vec3 shade;
 out float side;
 
@@ -35,7 +36,8 @@ void main() {
   if (mark == 0) {
     shade = above < 0.25 ? ground : texture(ramp, vec2(clamp(0.06 + above / 15.0, 0.0, 1.0), 0.5)).rgb;
     if (colour == 1) shade = mix(plain, ground, above < 0.25 ? 1.0 : 0.0) * (0.8 + 0.2 * clamp(above / 8.0, 0.0, 1.0));
-    if (colour > 1) shade = by_evidence(texture(evidence, place.xy / 65535.0));
+    if (colour == 6) shade = texture(ramp, vec2(sqrt(bright), 0.5)).rgb;
+    else if (colour > 1) shade = by_evidence(texture(evidence, place.xy / 65535.0));
     gl_PointSize = clamp(size, 1.4 * ratio, 9.0 * ratio);
   } else {
     shade = mark == 1 ? removed : added;

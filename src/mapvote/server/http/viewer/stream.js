@@ -49,21 +49,25 @@ export class Stream {
   // The first picture: every tile, coarse.
   overview(buffer, side = "new") {
     const view = new DataView(buffer), n = view.getUint32(4, true);
-    let at = 8 + HEAD * n;
+    const counts = Array.from({ length: n }, (_, i) => view.getUint32(8 + HEAD * i + 12, true));
+    let at = 8 + HEAD * n, lit = at + 8 * counts.reduce((sum, count) => sum + count, 0);
+    this.bright = lit < buffer.byteLength;
     for (let i = 0; i < n; i++) {
-      const read = 8 + HEAD * i, name = `${view.getInt32(read, true)},${view.getInt32(read + 4, true)}`;
-      const whole = view.getInt32(read + 8, true), count = view.getUint32(read + 12, true);
+      const read = 8 + HEAD * i, count = counts[i], name = `${view.getInt32(read, true)},${view.getInt32(read + 4, true)}`;
+      const whole = view.getInt32(read + 8, true);
       const tile = this.tiles.find((t) => t.name === name && (t.side === "both" || t.side === side));
       const z0 = view.getFloat32(read + 16, true), zStep = view.getFloat32(read + 20, true);
       const packed = new Uint16Array(buffer.slice(at, at + 8 * count));
+      const bright = this.bright ? new Uint8Array(buffer.slice(lit, lit + count)) : null;
       at += 8 * count;
-      if (tile) this.take(tile, Math.max(whole, 0), { z0, zStep, packed }, whole < 0 ? 0 : whole + 1, SPACING[Math.max(whole, 0)]);
+      lit += count;
+      if (tile) this.take(tile, Math.max(whole, 0), { z0, zStep, packed, bright }, whole < 0 ? 0 : whole + 1, SPACING[Math.max(whole, 0)]);
     }
   }
 
   take(tile, level, cloud, next, spacing) {
-    const { z0, zStep, packed } = cloud;
-    const part = this.cloud.add({ ...tile, z0, zStep, packed, spacing, tile, level, evidence: tile.evidence });
+    const { z0, zStep, packed, bright } = cloud;
+    const part = this.cloud.add({ ...tile, z0, zStep, packed, bright, spacing, tile, level, evidence: tile.evidence });
     if (!tile.levels.length) {
       Object.assign(tile, { low: z0, ground: groundOf(cloud) });
       let top = 0;
@@ -171,7 +175,9 @@ export class Stream {
       tile.levels = tile.levels.filter((p) => p !== tile.partial);
       tile.partial = null;
     }
-    this.take(tile, level, unpack(buffer), level + 1, SPACING[level]);
+    const cloud = unpack(buffer);
+    if (cloud.end < buffer.byteLength) cloud.bright = new Uint8Array(buffer, cloud.end);
+    this.take(tile, level, cloud, level + 1, SPACING[level]);
     this.tidy();
   }
 

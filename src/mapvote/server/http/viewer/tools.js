@@ -9,6 +9,7 @@ const BLINK_MS = 800, HIGHEST = 40;
 const LEGENDS = {
   height: ["ground", "15 m and more above it"], plain: [], age: ["2 months ago or more", "seen today"], votes: ["no vote", "9 vehicles and more"],
   probability: ["0: nobody says so", "1"], state: ["unchanged", "changed"],
+  intensity: ["dark", "bright"],
 };
 
 export class Tools {
@@ -27,6 +28,9 @@ export class Tools {
     if (asked.slice) [$("slice-low").value, $("slice-high").value] = asked.slice.split(",");
     $("colour").value = asked.colour in COLOUR && asked.colour !== "state" ? asked.colour : "height";
     $("compare").value = ["before", "swipe", "blink"].includes(asked.compare) ? asked.compare : "after";
+    const known = $("colour").querySelector("[value=intensity]");
+    known.hidden = known.disabled = !this.stream.bright;
+    if (known.disabled && $("colour").value === "intensity") $("colour").value = "height";
     this.slice();
     if ($("colour").value !== "height") this.colour($("colour").value);
     if ($("compare").value !== "after") this.compare($("compare").value);
@@ -38,7 +42,7 @@ export class Tools {
     $("vehicle-row").hidden = name !== "state";
     this.legend(name);
     try {
-      await this.stream.evidence(COLOUR[name] >= 2, name === "state" ? $("vehicle").value : undefined);
+      await this.stream.evidence(COLOUR[name] >= COLOUR.age && name !== "intensity", name === "state" ? $("vehicle").value : undefined);
     } catch (error) {
       return notice(error.message);
     }
