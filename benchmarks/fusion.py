@@ -1,13 +1,19 @@
 """How many votes on a cell the server fuses a second, from ballots in the store to what would be published.
 
-    python benchmarks/fusion.py                        # 25 to 200 vehicles, 4 to 16 tiles, one and two threads
+    python benchmarks/fusion.py                        # 25 to 200 vehicles, 4 to 16 tiles
     python benchmarks/fusion.py --planes states        # votes alone: no delete masks, no points, no free space
 
 A run is `preview()`: it reads every ballot from the database, decompresses it, checks which cells count,
 decides, edits the tiles and packs them. One vehicle on one tile is 65,536 cell-votes, spoken or not. The ballots are
 shaped like those of simulated drives: a corridor of street seen, noise along its borders, a house that fell and a
-kiosk that rose. The peer is the same decision in plain numpy (`numpy_round`), from the same database with sqlite3 and
-zstd, without edits and without looking at other planes; both take turns in one run.
+kiosk that rose. All take turns in one run:
+
+    mapvote            as a process that has just begun: every ballot is unpacked
+    mapvote, 1 new     one more vehicle has voted since: the others' ballots were unpacked before
+    numpy              the same decision in plain numpy, from the same database with sqlite3 and zstd: states alone, no
+                       check of any sum, no copies, no edits (`numpy_tile`)
+    numpy, whole       that, and masks, points and free space are read too and counted in plain numpy: what goes, what
+                       comes and what is free, though no tile is loaded, edited or packed (`numpy_whole_tile`)
 """
 
 from __future__ import annotations
@@ -19,8 +25,8 @@ import statistics
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Sequence
+from contextlib import closing
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -37,6 +43,7 @@ from mapvote.core.grid import TileIndex
 from mapvote.core.point_map import PointMap
 from mapvote.core.types import NO_VOTE, U8, CellState
 from mapvote.fusion.tile_vote import DAY_NS
+from mapvote.server.store import stored_votes
 from mapvote.server.store.admission import accept, examine
 from mapvote.server.store.ballots import Receipt
 from mapvote.server.store.publish import preview
@@ -75,21 +82,27 @@ def said(rng: np.random.Generator) -> Say:
     return Say(states, gone=gone, free=free, new_points=points)
 
 
-def fill(store: Store, tiles: Sequence[TileIndex], vehicles: int, planes: str) -> float:
-    """One ballot of every vehicle on all tiles; mean bytes a ballot and tile. No two say the same of a tile: such would
-    be copies."""
-    rng = np.random.default_rng(1)
-    kinds = [said(rng) for _ in range(max(vehicles, 40))]
-    base, size = store.point_map(), 0
-    for vehicle in range(vehicles):
-        says = {tile: kinds[(vehicle + i) % len(kinds)] for i, tile in enumerate(tiles)}
-        if planes == "states":
-            says = {tile: Say(say.states) for tile, say in says.items()}
-        data = encode(make_ballot(base, says, f"v{vehicle:03}", "d", end_ns=DAY_NS + vehicle))
-        size += len(data)
-        (receipt,) = accept(store, [examine(data)])
-        assert isinstance(receipt, Receipt), receipt
-    return size / vehicles / len(tiles)
+class Fleet:
+    """Vehicles that vote on all tiles of a store, one after another. No two say the same of a tile: such would be
+    copies."""
+
+    def __init__(self, store: Store, tiles: Sequence[TileIndex], most: int, planes: str) -> None:
+        rng = np.random.default_rng(1)
+        self.store, self.tiles, self.base, self.planes = store, tiles, store.point_map(), planes
+        self.kinds = [said(rng) for _ in range(max(most, 40))]
+        self.vehicles, self.bytes = 0, 0
+
+    def vote(self, vehicles: int) -> None:
+        """So many more."""
+        for vehicle in range(self.vehicles, self.vehicles + vehicles):
+            says = {tile: self.kinds[(vehicle + i) % len(self.kinds)] for i, tile in enumerate(self.tiles)}
+            if self.planes == "states":
+                says = {tile: Say(say.states) for tile, say in says.items()}
+            data = encode(make_ballot(self.base, says, f"v{vehicle:03}", "d", end_ns=DAY_NS + vehicle))
+            self.bytes += len(data)
+            (receipt,) = accept(self.store, [examine(data)])
+            assert isinstance(receipt, Receipt), receipt
+        self.vehicles += vehicles
 
 
 def numpy_tile(connection: sqlite3.Connection, tile: TileIndex) -> U8:
@@ -107,62 +120,80 @@ def numpy_tile(connection: sqlite3.Connection, tile: TileIndex) -> U8:
     return states
 
 
-def numpy_round(file: Path, tiles: Sequence[TileIndex], threads: int) -> float:
-    """Seconds for the peer."""
-
-    def share(mine: Sequence[TileIndex]) -> None:
-        connection = sqlite3.connect(file)
-        for tile in mine:
-            numpy_tile(connection, tile)
-        connection.close()
-
-    start = time.perf_counter()
-    with ThreadPoolExecutor(threads) as pool:
-        list(pool.map(share, [tiles[i::threads] for i in range(threads)]))
-    return time.perf_counter() - start
+def unpacked_words(data: bytes) -> tuple[np.ndarray, np.ndarray]:
+    """(flat cells, words) of a mask or of free space, see codec/words.py."""
+    raw = np.frombuffer(zstd.decompress(data), np.uint8)
+    n = len(raw) // 10
+    ways = raw[:n].astype(np.int64) + 256 * raw[n : 2 * n].astype(np.int64)
+    return np.cumsum(ways), np.ascontiguousarray(raw[2 * n :].reshape(8, n).T).view("<u8").reshape(-1)
 
 
-def our_round(store: Store, policy: FuseSettings, threads: int) -> float:
-    """Seconds for a dry run."""
-    with ThreadPoolExecutor(threads) as pool:
-        start = time.perf_counter()
-        preview(store, policy, executor=pool)
-        return time.perf_counter() - start
+def numpy_whole_tile(connection: sqlite3.Connection, tile: TileIndex) -> tuple[U8, np.ndarray, np.ndarray, np.ndarray]:
+    """The peer with all planes: (states, bits that go, voxels that come, bits that are free), each by two vehicles."""
+    decided = numpy_tile(connection, tile)
+    query = "SELECT states, gone, new_points, free FROM ballot_tiles WHERE row = ? AND col = ?"
+    gone, free = np.zeros((2, 2, len(decided)), np.uint64)
+    offered = []
+    for states, mask, points, passed in connection.execute(query, tile):
+        own = np.frombuffer(zstd.decompress(states), np.uint8)
+        for data, reached, counts in ((mask, gone, (own == 3) & (decided == 3)), (passed, free, own != NO_VOTE)):
+            cells, words = unpacked_words(data)
+            cells, words = cells[counts[cells]], words[counts[cells]]
+            reached[1][cells] |= reached[0][cells] & words
+            reached[0][cells] |= words
+        xyz = np.frombuffer(zstd.decompress(points), "<f4").reshape(-1, 3)
+        layers = np.floor(xyz.astype(np.float64) / 0.3).astype(np.int64)
+        cells = layers[:, 1] * 256 + layers[:, 0]
+        counts = (own[cells] == 2) & (decided[cells] == 2)
+        offered.append(np.unique(cells[counts] * 1024 + layers[counts, 2]))
+    voxels, vehicles = np.unique(np.concatenate(offered), return_counts=True)
+    return decided, gone[1], voxels[vehicles >= 2], free[1]
+
+
+PEERS = {"numpy": numpy_tile, "numpy, whole": numpy_whole_tile}
 
 
 def measure(folder: Path, vehicles: int, n_tiles: int, planes: str, repeats: int) -> dict[str, Any]:
-    """Medians over ``repeats`` turns of ours and the peer's with one and two threads, after one turn to warm up; also
-    the best turn and the processor time of the cheapest, which a busy machine spoils less."""
+    """Milliseconds of CPU a tile over ``repeats`` turns, after one to warm up, and their ratios. Every turn has one
+    vehicle more."""
     tiles = [(0, col) for col in range(n_tiles)]
     file = folder / f"{planes}_{vehicles}_{n_tiles}.db"
     store = Store.create(f"sqlite:///{file}", street(tiles))
-    size = fill(store, tiles, vehicles, planes)
-    policy = FuseSettings(latest_vehicles=vehicles, max_deleted_share=1.0)
-    ours, theirs = partial(our_round, store, policy), partial(numpy_round, file, tiles)
-    seconds: dict[str, list[float]] = {}
-    cpu: dict[str, list[float]] = {}
-    for turn in range(repeats + 1):
-        for threads in (1, 2):
-            for who, run in (("mapvote", ours), ("numpy", theirs)):
-                start = time.process_time()
-                took = run(threads)
-                if turn:
-                    seconds.setdefault(f"{who}_{threads}", []).append(took)
-                    cpu.setdefault(f"{who}_{threads}", []).append(time.process_time() - start)
+    fleet = Fleet(store, tiles, vehicles + repeats + 1, planes)
+    fleet.vote(vehicles - 1)
+    peers = {name: peer for name, peer in PEERS.items() if planes == "all" or peer is numpy_tile}
+    cpu: dict[str, list[float]] = {name: [] for name in ("mapvote", "mapvote, 1 new", *peers)}
+
+    def timed(name: str, act: Callable[[], object]) -> None:
+        start = time.process_time()
+        act()
+        cpu[name].append(1e3 * (time.process_time() - start) / n_tiles)
+
+    for _ in range(repeats + 1):
+        policy = FuseSettings(latest_vehicles=fleet.vehicles + 1, max_deleted_share=1.0)
+        stored_votes.remembered.clear()
+        preview(store, policy)
+        fleet.vote(1)
+        timed("mapvote, 1 new", partial(preview, store, policy))
+        stored_votes.remembered.clear()
+        timed("mapvote", partial(preview, store, policy))
+        with closing(sqlite3.connect(file)) as connection:
+            for name, peer in peers.items():
+                timed(name, lambda connection=connection, peer=peer: [peer(connection, tile) for tile in tiles])
     store.close()
     file.unlink()
-    votes = 256 * 256 * vehicles * n_tiles
-    rate = {who: votes / statistics.median(s) / 1e9 for who, s in seconds.items()}
-    best = {who: votes / min(s) / 1e9 for who, s in seconds.items()}
+    median = {name: statistics.median(took[1:]) for name, took in cpu.items()}
     return {
         "planes": planes,
         "vehicles": vehicles,
         "tiles": n_tiles,
-        "bytes_a_ballot_and_tile": round(size),
-        "G_cell_votes_per_s": {who: round(r, 3) for who, r in rate.items()},
-        "best_turn": {who: round(r, 3) for who, r in best.items()},
-        "cpu_ms_a_tile": {who: round(1e3 * min(s) / n_tiles, 2) for who, s in cpu.items()},
-        "ratio_to_numpy_2_threads": round(rate["mapvote_2"] / rate["numpy_2"], 2),
+        "bytes_a_ballot_and_tile": round(fleet.bytes / fleet.vehicles / n_tiles),
+        "cpu_ms_a_tile": {name: round(took, 2) for name, took in median.items()},
+        "mean": {name: round(statistics.fmean(took[1:]), 2) for name, took in cpu.items()},
+        "times": {
+            f"{us} / {peer}": round(median[peer] / median[us], 2) for us in cpu for peer in peers if us not in peers
+        },
+        "G_cell_votes_per_cpu_s": round(256 * 256 * vehicles / median["mapvote"] / 1e6, 3),
     }
 
 

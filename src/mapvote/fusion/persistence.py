@@ -119,13 +119,14 @@ def _first_s(votes: Sequence[TileVote], cells: I64, state: int) -> NDArray[np.ui
     for vote in votes:
         if vote.states is not None:
             end_s = np.uint32(min(max(vote.end_ns // 10**9, 1), 2**32 - 2))
-            _earliest(first, end_s, vote.states.reshape(-1), cells, state)
+            _earliest(first, end_s, vote.states, cells, state)
     return np.where(first == np.iinfo(np.uint32).max, np.uint32(0), first)
 
 
 @numba.njit(cache=True, nogil=True)
 def _earliest(first: NDArray[np.uint32], end_s: np.uint32, states: U8, cells: I64, state: int) -> None:
     """Of a vote that ended at ``end_s``: no later than that is ``first`` (n,) where it says ``state`` of ``cells``."""
+    states = states.reshape(-1)
     for i in range(len(cells)):
         if states[cells[i]] == state and end_s < first[i]:
             first[i] = end_s

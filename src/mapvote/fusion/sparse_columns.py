@@ -133,7 +133,8 @@ def mark(reached: U64, cells: NDArray[np.intp], words: U64) -> None:
 
 @numba.njit(cache=True, nogil=True)
 def mark_spoken(reached: U64, cells: NDArray[np.intp], words: U64, own: U8) -> None:
-    """:func:`mark` of the cells of which the voter's ``own`` states (cells,) say anything."""
+    """:func:`mark` of the cells of which the voter's ``own`` states (256, 256) say anything."""
+    own = own.reshape(-1)
     for i in range(len(cells)):
         if own[cells[i]] != NO_VOTE:
             _mark_one(reached, cells[i], words[i])
@@ -142,7 +143,8 @@ def mark_spoken(reached: U64, cells: NDArray[np.intp], words: U64, own: U8) -> N
 @numba.njit(cache=True, nogil=True)
 def agreed(cells: NDArray[np.intp], own: U8, decided: U8, state: int) -> NDArray[np.intp]:
     """Indices of the flat ``cells`` (n,) that are ``state`` in a voter's ``own`` states and in the ``decided`` ones,
-    (65536,) each."""
+    (256, 256) each."""
+    own, decided = own.reshape(-1), decided.reshape(-1)
     found = np.empty(len(cells), dtype=np.intp)
     n = 0
     for i in range(len(cells)):

@@ -76,7 +76,7 @@ class TileVote:
         """Indices of those of the flat ``cells`` (n,) that are ``decided`` (256, 256) as ``state``, which this vote
         supports."""
         if self.states is not None:
-            return np.asarray(agreed(cells, self.states.reshape(-1), decided.reshape(-1), int(state)))
+            return np.asarray(agreed(cells, self.states, decided, int(state)))
         return np.flatnonzero((decided.reshape(-1)[cells] == state) & self.supports(state, cells))
 
     def determined(self, cells: NDArray[np.intp]) -> Bool:
@@ -95,7 +95,7 @@ class TileVote:
         """One more voter in ``reached`` (see :func:`mapvote.fusion.sparse_columns.mark`): of what it has
         :meth:`passed`."""
         if self.states is not None and self.free is not None:
-            mark_spoken(reached, self.free.cells, self.free.words, self.states.reshape(-1))
+            mark_spoken(reached, self.free.cells, self.free.words, self.states)
         else:
             passed = self.passed()
             mark(reached, passed.cells, passed.words)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from threading import Lock
 from typing import Any
 
@@ -80,6 +80,12 @@ class Remembered:
             while self.bytes > self.most_bytes:
                 self.bytes -= _size(self._votes.popitem(last=False)[1])
 
+    def clear(self) -> None:
+        """As a process that has just begun."""
+        with self._lock:
+            self._votes.clear()
+            self.bytes = 0
+
 
 remembered = Remembered(REMEMBERED_BYTES)
 """What this process unpacked."""
@@ -93,10 +99,22 @@ def read_votes(connection: sa.Connection, index: TileIndex, stored: Sequence[Sto
     new = {row.sum: _unpacked(row) for row in rows.values() if row.sum not in known}
     remembered.put(new)
     known |= new
-    return [
-        replace(known[digest], vehicle=vote.vehicle, end_ns=vote.end_ns, digest=vote.digest, version=vote.version)
-        for digest, vote in zip(sums, stored, strict=True)
-    ]
+    return [_said_by(vote, known[digest]) for digest, vote in zip(sums, stored, strict=True)]
+
+
+def _said_by(stored: StoredVote, said: TileVote) -> TileVote:
+    return TileVote(
+        vehicle=stored.vehicle,
+        end_ns=stored.end_ns,
+        digest=stored.digest,
+        version=stored.version,
+        states=said.states,
+        tally=said.tally,
+        gone=said.gone,
+        new_points=said.new_points,
+        intensity=said.intensity,
+        free=said.free,
+    )
 
 
 def _rows(connection: sa.Connection, index: TileIndex, ballots: Sequence[int]) -> dict[int, Any]:
