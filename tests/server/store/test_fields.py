@@ -33,12 +33,12 @@ from mapvote.fusion.offline import update_map
 from mapvote.server.http.app import create_app
 from mapvote.server.store import migrate, schema
 from mapvote.server.store.admission import accept, examine
-from mapvote.server.store.blobs import pack_tile
 from mapvote.server.store.check import check
 from mapvote.server.store.clearing import clear
 from mapvote.server.store.database import Database
 from mapvote.server.store.policy import Policy, set_values
 from mapvote.server.store.publish import publish, rollback
+from mapvote.server.store.quarantine import set_aside
 from mapvote.server.store.replay import replay
 from mapvote.server.store.store import Store
 
@@ -140,10 +140,11 @@ def test_a_flipped_bit_in_them_is_found_and_the_tile_waits_until_it_is_mended(st
         connection.execute(b.update().where(b.c.hash == digest).values(data=broken))
     assert [(damage.kind, damage.name) for damage in check(store)] == [("plane", digest)]
     assert not publish(store).published, "its points would lose them"
-    _, planes = pack_tile(street().tiles[0, 0])
-    assert digest is not None
+    with store.database.reading() as connection:
+        assert list(set_aside(connection)) == [("plane", digest)]
     check(store, mend=True, source=lambda asked: pack_fields(street().tiles[0, 0].fields) if asked == digest else None)
-    assert digest in planes
+    with store.database.reading() as connection:
+        assert not set_aside(connection), "mended, it is in quarantine no more"
     assert publish(store).published
     t = schema.ballot_tiles
     with store.database.writing() as connection:

@@ -25,6 +25,7 @@ from mapvote.fusion.copies import Copy
 from mapvote.fusion.fuse import fuse_tile, rule_of
 from mapvote.fusion.tile_vote import TileVote
 from mapvote.server.errors import Unavailable
+from mapvote.server.store import schema
 from mapvote.server.store.blobs import TileHashes, pack_tile
 from mapvote.server.store.database import Database, address_of
 from mapvote.server.store.eligible_votes import Electorate, counting_votes, recent_votes
@@ -109,12 +110,16 @@ def fuse_stored(task: Task, database: Database | None = None) -> Fused:
         except Unavailable:
             raise
         except MapvoteError as error:
-            lost = Damage("plane", _plane_of(task), str(error)[:180])
+            lost = Damage("plane", _plane_of(task, str(error)), str(error)[:180])
             return Fused.nothing(task.window.tile_index, [*damaged, lost])
 
 
-def _plane_of(task: Task) -> str:
-    return task.tile.points if isinstance(task.tile, TileHashes) else f"of tile {tile_key(task.window.tile_index)}"
+def _plane_of(task: Task, error: str) -> str:
+    """Which plane an error is about: by its hash, so that mending it takes it out of quarantine."""
+    if not isinstance(task.tile, TileHashes):
+        return f"of tile {tile_key(task.window.tile_index)}"
+    planes = [getattr(task.tile, name) for name in schema.TILE_PLANES]
+    return next((digest for digest in planes if digest and digest[:12] in error), task.tile.points)
 
 
 def _fuse(connection: sa.Connection, task: Task) -> Fused:
