@@ -111,7 +111,7 @@ def one_hot(states: U8) -> I32:
     """One vote for each cell's state: (...) uint8 -> (..., 5) int32; NO_VOTE gives none."""
     tally = np.zeros((*states.shape, N_STATES), dtype=np.int32)
     for state in CellState:
-        tally[..., state] = (states == state) * VOTE_UNIT
+        tally[..., state] = (states == int(state)) * VOTE_UNIT
     return tally
 
 

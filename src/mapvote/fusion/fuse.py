@@ -157,7 +157,7 @@ def _edit(tile: Tile, votes: Sequence[TileVote], states: U8, quorum: int) -> tup
     if gone is not None:
         edited, deleted = delete_points(edited, gone)
     added = 0
-    if (states == CellState.CHANGED_OCCUPIED).any():
+    if (states == int(CellState.CHANGED_OCCUPIED)).any():
         edited, added = add_points(edited, *_offered(votes, states, tile.window), quorum)
     return _learn_free(edited, votes, quorum, points_added=added > 0), added, deleted
 
@@ -195,7 +195,7 @@ def supported_words(votes: Sequence[TileVote], states: U8, min_votes: int) -> U6
     unchanged-occupied, remnants that ``min_votes`` vehicles mark and more than half of those that determined the cell.
     """
     gone = None
-    if (states == CellState.CHANGED_EMPTY).any():
+    if (states == int(CellState.CHANGED_EMPTY)).any():
         reached = nothing_reached(min_votes)
         for vote in votes:
             vote.mark_deleted(states, reached)

@@ -55,7 +55,7 @@ def deniers(
 ) -> Bool:
     """(n,) which of the votes :func:`denying` names, of the changes among the decided ``states`` (256, 256); ``tile``:
     as it is now, None if no vote on it is spent."""
-    changed = np.flatnonzero((states == CellState.CHANGED_OCCUPIED) | (states == CellState.CHANGED_EMPTY))
+    changed = np.flatnonzero((states == _CO) | (states == _CE))
     if settings.max_denial >= 1.0 or not len(changed):
         return np.zeros(len(votes), dtype=np.bool_)
     came_true = np.zeros(len(votes), dtype=np.int64) if tile is None else borne_out(votes, tile)

@@ -42,7 +42,7 @@ def expected_days(memory: Memory | None, cells: Bool, age_days: F64 | float, set
 
 def doubtful(states: U8, memory: Memory | None, settings: FuseSettings) -> Bool:
     """(256, 256) cells decided changed-occupied in which only time can tell whether the thing will stay."""
-    out = states == CellState.CHANGED_OCCUPIED
+    out = np.asarray(states == _CO)  # compared with a CellState numpy would make 64-bit numbers of all of them
     out[out] = expected_days(memory, out, 0.0, settings) < settings.stay_days
     return np.asarray(out)
 
@@ -104,7 +104,7 @@ def remembered(memory: Memory, before: Tile, after: Tile, votes: Sequence[TileVo
         return memory
     planes = memory.planes.copy()
     came_s, stays, stayed_s = planes.reshape(PLANES, -1)[1:]
-    risen = states.reshape(-1)[came] == CellState.CHANGED_OCCUPIED
+    risen = states.reshape(-1)[came] == _CO
     came_s[came] = np.where(risen, _first_s(votes, came, _CO), np.uint32(0))
     ended = np.maximum(_first_s(votes, went, _CE), came_s[went])
     stays[went] += 1

@@ -37,7 +37,7 @@ def turned(states: U8, drives: Sequence[TileVote], tally: NDArray[Any], quorum: 
     planes = np.moveaxis(tally, -1, 0).reshape(N_STATES, CELLS)
     flat, out = states.reshape(-1), states
     for before, after in _TURNS:
-        cells = np.flatnonzero(((flat == before) | (flat == _UN)) & (planes[int(after)] > quorum * VOTE_UNIT))
+        cells = _may_turn(flat, planes[int(after)], int(before), quorum * VOTE_UNIT)
         if len(cells):
             said, ends_ns, whose = in_order(drives, cells)
             found = cells[_turn(said, ends_ns, whose, int(before), int(after))]
@@ -79,3 +79,16 @@ def _turn(said: U8, ends_ns: I64, whose: I64, before: int, after: int) -> NDArra
                 other = True
         found[cell] = not other and newest_before < oldest_after
     return found
+
+
+@numba.njit(cache=True, nogil=True)
+def _may_turn(states: U8, votes: NDArray[Any], before: int, most: int) -> I64:
+    """Flat cells that are ``before`` or undetermined though more than ``most`` VOTE_UNITs say otherwise; (65536,)
+    each."""
+    found = np.empty(len(states), dtype=np.int64)
+    n = 0
+    for c in range(len(states)):
+        if votes[c] > most and (states[c] == before or states[c] == _UN):
+            found[n] = c
+            n += 1
+    return found[:n].copy()

@@ -129,7 +129,7 @@ def _raw_memory(memory: Memory) -> bytes:
     """The cells of which anything is remembered, for they are few: the way to each from the one before, two bytes, and
     then their values, plane by plane."""
     flat = memory.planes.reshape(PLANES, CELLS)
-    cells = np.flatnonzero(flat[0] | flat[1] | flat[2] | flat[3])
+    cells = np.flatnonzero((flat[0] | flat[1] | flat[2] | flat[3]) != 0)
     return np.diff(cells, prepend=0).astype("<u2").tobytes() + flat[:, cells].astype("<u4").tobytes()
 
 

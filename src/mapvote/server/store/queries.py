@@ -138,8 +138,9 @@ def load_tile(connection: sa.Connection, window: Grid, hashes: TileHashes | None
     """The tile over ``window`` by its hashes; the empty one where there are none."""
     if hashes is None:
         return Tile.empty(window)
-    named = {plane: getattr(hashes, plane) for plane in schema.TILE_PLANES}
-    return unpack_tile(window, hashes, {p: load_blob(connection, digest) for p, digest in named.items() if digest})
+    named = {plane: digest for plane in schema.TILE_PLANES if (digest := getattr(hashes, plane))}
+    found = {row.hash: row.data for row in connection.execute(_PLANES, dict.fromkeys(schema.TILE_PLANES) | named)}
+    return unpack_tile(window, hashes, {p: _there(found.get(digest), digest) for p, digest in named.items()})
 
 
 def tile_as_of(connection: sa.Connection, window: Grid, number: int) -> Tile:
@@ -157,7 +158,10 @@ def load_memory(connection: sa.Connection, digest: str) -> Memory:
 
 def load_blob(connection: sa.Connection, digest: str) -> bytes:
     """One plane, still compressed; NotFound if no version ever held it."""
-    data = connection.execute(_BLOB, {"digest": digest}).scalar_one_or_none()
+    return _there(connection.execute(_BLOB, {"digest": digest}).scalar_one_or_none(), digest)
+
+
+def _there(data: bytes | None, digest: str) -> bytes:
     if data is None:
         raise NotFound(f"no tile plane has the hash {digest[:64]!r}; take the hashes from a manifest")
     return bytes(data)
@@ -258,3 +262,6 @@ _TILE = (
 )
 _KNOWN_BLOBS = sa.select(schema.blobs.c.hash).where(schema.blobs.c.hash.in_(sa.bindparam("digests", expanding=True)))
 _BLOB = sa.select(schema.blobs.c.data).where(schema.blobs.c.hash == sa.bindparam("digest"))
+_PLANES = sa.select(schema.blobs).where(
+    schema.blobs.c.hash.in_([sa.bindparam(p, type_=sa.String) for p in schema.TILE_PLANES])
+)
