@@ -22,17 +22,25 @@ def pack_fields(fields: Mapping[str, NDArray[Any]]) -> bytes:
 
 def unpack_fields(raw: bytes, n: int, what: str) -> dict[str, NDArray[Any]]:
     """The inverse, of ``n`` points; MapvoteError, by the name of ``what``, if it is damaged or not of so many."""
-    try:
-        packed = msgspec.msgpack.decode(raw, type=dict[str, tuple[str, bytes]])
-    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise MapvoteError(f"{what}: no fields of points ({error}); fetch it again") from error
     fields = {}
-    for name, (kind, values) in packed.items():
+    for name, (kind, values) in _decoded(raw, what).items():
         check_kind(kind, f"{what}: {name}")
         if len(values) != n * np.dtype(kind).itemsize:
             raise MapvoteError(f"{what}: {name} has {len(values)} bytes, but there are {n} points; fetch it again")
         fields[name] = np.frombuffer(values, dtype=kind)
     return fields
+
+
+def field_names(raw: bytes, what: str) -> list[str]:
+    """Of packed fields; MapvoteError if they are none."""
+    return list(_decoded(raw, what))
+
+
+def _decoded(raw: bytes, what: str) -> dict[str, tuple[str, bytes]]:
+    try:
+        return msgspec.msgpack.decode(raw, type=dict[str, tuple[str, bytes]])
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise MapvoteError(f"{what}: no fields of points ({error}); fetch it again") from error
 
 
 def kind_of(column: NDArray[Any]) -> str:

@@ -28,7 +28,7 @@ def describe(path: Path, *, rate_hz: float | None = None, topic: str | None = No
         return "mapvote map", _map(read_map(path))
     for kind, layout in MAPS.items():
         if layout.recognised(path):
-            about: dict[str, dict[str, None]] = {"fields": {}, "other fields": {}, "stored as": {}}
+            about: dict[str, dict[str, None]] = {"other fields": {}, "stored as": {}}
             point_map = map_of(str(path), in_map_metres(str(path), _noted(layout.stream(path), about)))
             return kind, _map(point_map) + [(name, ", ".join(found) or "none") for name, found in about.items()]
     for kind, drive_layout in DRIVES.items():
@@ -45,7 +45,6 @@ def describe(path: Path, *, rate_hz: float | None = None, topic: str | None = No
 
 def _noted(pieces: Iterator[Cloud], about: dict[str, dict[str, None]]) -> Iterator[Cloud]:
     for piece in pieces:
-        about["fields"] |= dict.fromkeys(piece.fields)
         about["other fields"] |= dict.fromkeys(piece.dropped)
         about["stored as"] |= {str(piece.points.dtype): None}
         yield piece
@@ -53,11 +52,13 @@ def _noted(pieces: Iterator[Cloud], about: dict[str, dict[str, None]]) -> Iterat
 
 def _map(point_map: PointMap) -> Rows:
     low, high, known, learned = np.full(3, np.inf), np.full(3, -np.inf), 0.0, 0
+    fields: dict[str, str] = {}
     for tile in point_map.tiles.values():
         low = np.minimum(low, tile.points_map.min(axis=0, initial=np.inf))
         high = np.maximum(high, tile.points_map.max(axis=0, initial=-np.inf))
         known += float(np.isfinite(tile.ground_z).mean()) / len(point_map.tiles)
         learned += tile.free is not None
+        fields |= {name: f"{name} ({column.dtype})" for name, column in tile.fields.items()}
     rows = [
         ("map id", point_map.map_id),
         ("version", str(point_map.version or "unknown")),
@@ -68,6 +69,7 @@ def _map(point_map: PointMap) -> Rows:
         ("z", f"{low[2]:.2f} to {high[2]:.2f} m"),
         ("lattice", f"cells of {CELL_SIZE} m from ({point_map.lattice.x0}, {point_map.lattice.y0})"),
         ("ground", f"known in {known:.0%} of the tiles' cells"),
+        ("fields", ", ".join(fields.values()) or "none"),
         ("known free", f"learned in {learned} tiles" if learned else "never learned"),
     ]
     rows += [(f"drive {k}", str(check_heights(point_map, path))) for k, path in enumerate(point_map.driven, 1)]

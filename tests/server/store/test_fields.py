@@ -31,6 +31,7 @@ from mapvote.core.types import CellState, MapvoteError
 from mapvote.formats import export_map, read_map
 from mapvote.fusion.offline import update_map
 from mapvote.server.http.app import create_app
+from mapvote.server.insight.overview import overview
 from mapvote.server.store import migrate, schema
 from mapvote.server.store.admission import accept, examine
 from mapvote.server.store.check import check
@@ -140,6 +141,7 @@ def test_a_flipped_bit_in_them_is_found_and_the_tile_waits_until_it_is_mended(st
         connection.execute(b.update().where(b.c.hash == digest).values(data=broken))
     assert [(damage.kind, damage.name) for damage in check(store)] == [("plane", digest)]
     assert not publish(store).published, "its points would lose them"
+    assert overview(store)["fields"] == ", ".join(KINDS), "the other tile's"
     with store.database.reading() as connection:
         assert list(set_aside(connection)) == [("plane", digest)]
     check(store, mend=True, source=lambda asked: pack_fields(street().tiles[0, 0].fields) if asked == digest else None)

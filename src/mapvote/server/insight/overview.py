@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from itertools import islice
 from typing import Any
 
 import sqlalchemy as sa
 
+from mapvote.core.types import MapvoteError
+from mapvote.server.errors import Unavailable
 from mapvote.server.insight.history import events
 from mapvote.server.store import schema
+from mapvote.server.store.blobs import TileHashes, names_in_plane
 from mapvote.server.store.quarantine import set_aside
-from mapvote.server.store.queries import current_version, oldest_kept, tiles_of
+from mapvote.server.store.queries import current_version, load_blob, oldest_kept, tiles_of
 from mapvote.server.store.store import Store
+
+_LOOKED_AT = 3
 
 
 def overview(store: Store) -> dict[str, Any]:
@@ -24,12 +31,14 @@ def overview(store: Store) -> dict[str, Any]:
             sa.select(sa.func.count(), sa.func.coalesce(sa.func.sum(sa.func.length(schema.blobs.c.data)), 0))
         ).one()
         votes = connection.execute(sa.select(sa.func.count()).select_from(t)).scalar_one()
+        tiles = tiles_of(connection, newest.number)
         return {
             "map_id": store.map_id,
             "version": newest.number,
             "published_ns": newest.created_ns,
             "oldest_version": oldest_kept(connection),
-            "tiles": len(tiles_of(connection, newest.number)),
+            "tiles": len(tiles),
+            "fields": _fields(connection, tiles.values()),
             "ballots": ballots,
             "vehicles": vehicles,
             "votes_on_tiles": votes,
@@ -37,6 +46,19 @@ def overview(store: Store) -> dict[str, Any]:
             "plane_bytes": int(size),
             "quarantined": len(set_aside(connection)),
         }
+
+
+def _fields(connection: sa.Connection, tiles: Iterable[TileHashes]) -> str:
+    """What points carry besides their place, by some of the tiles that have anything and can be read."""
+    names: dict[str, None] = {}
+    for digest in islice((hashes.fields for hashes in tiles if hashes.fields is not None), _LOOKED_AT):
+        try:
+            names |= dict.fromkeys(names_in_plane(load_blob(connection, digest), digest))
+        except Unavailable:
+            raise
+        except MapvoteError:
+            continue
+    return ", ".join(names) or "none"
 
 
 def log_of(store: Store, last: int) -> dict[str, Any]:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from mapvote.codec.arrays import compress, frame_size, raw_plane, unpack_bytes
 from mapvote.codec.ballot import tile_key
-from mapvote.codec.fields import pack_fields, unpack_fields
+from mapvote.codec.fields import field_names, pack_fields, unpack_fields
 from mapvote.codec.tile_file import MAX_TILE_POINTS
 from mapvote.core.grid import CELLS, TILE_CELLS, Grid
 from mapvote.core.memory import PLANES, Memory
@@ -109,6 +109,11 @@ def unpack_free_plane(data: bytes, digest: str) -> U64:
 def unpack_fields_plane(data: bytes, digest: str, n: int) -> dict[str, NDArray[Any]]:
     """The fields of a tile's ``n`` points alone."""
     return unpack_fields(_unpack(data, digest), n, f"tile plane {digest[:12]}")
+
+
+def names_in_plane(data: bytes, digest: str) -> list[str]:
+    """What a plane of fields holds."""
+    return field_names(_unpack(data, digest), f"tile plane {digest[:12]}")
 
 
 def _unpack(data: bytes, digest: str) -> bytes:
