@@ -31,9 +31,11 @@ Clock = Callable[[str, Callable[[], Any]], Any]
 
 
 class Vgicp:
-    """Tracks by constant velocity: 0.5 m down-sampling, covariances of 10 neighbours, 1 m voxels.
+    """Tracks with a perfect odometry: 0.5 m down-sampling, covariances of 10 neighbours, 1 m voxels.
 
-    Starts with the true motion, and anew from the true pose where it is more than LOST_M off.
+    Each guess is its last pose moved on by the true motion since. By constant velocity it was lost on 20 of 70 scans of
+    ``street`` 2: where a street tells little along itself it slides by centimetres, and its own guesses make metres of
+    them. It begins at the true pose, and anew from it where it is more than LOST_M off.
     """
 
     def __init__(self, map_points: F64, T_true: F64) -> None:
@@ -48,7 +50,7 @@ class Vgicp:
 
     def __call__(self, points: F32, clock: Clock) -> F64:
         i = len(self.poses)
-        guess = self.T_true[i].copy() if i < 2 else self.poses[-1] @ inverse(self.poses[-2]) @ self.poses[-1]
+        guess = self.T_true[i].copy() if i < 1 else self.poses[-1] @ inverse(self.T_true[i - 1]) @ self.T_true[i]
         guess[:3, 3] -= self.middle
         cloud = points.astype(np.float64)
         T = clock("localise", lambda: self._align(cloud, guess)).copy()

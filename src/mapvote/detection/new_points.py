@@ -9,6 +9,7 @@ from mapvote.core.columns import GROUND_MARGIN_M, column_bit, height_above
 from mapvote.core.grid import CELL_SIZE, Grid, Lattice, TileIndex, tile_of_cells
 from mapvote.core.types import F32, F64, I32, I64, U8, U64, Bool, Reference
 from mapvote.core.voxels import voxel_keys
+from mapvote.detection.shelf import Place, Shelf
 from mapvote.perception.frontend import Observation, PlacedScan
 
 _COMPACT_AT = 50_000
@@ -71,8 +72,10 @@ class NewPoints:
         does not look there: only rules that ask more of a new voxel than that a scan struck it can take it.
         ``intensity``: keep it with each point."""
         self.lattice, self.beyond, self.intensity = lattice, beyond, intensity
-        self._runs: list[F64] = []
+        self._shelf, self._runs = Shelf(), list[Place]()
         """Points in ascending order of their voxels, each run with one point a voxel."""
+        self._last: F64 | None = None
+        """The run that is still small."""
         self._waiting: list[F64] = []
         self._count = 0
 
@@ -113,9 +116,17 @@ class NewPoints:
 
     def _compact(self) -> None:
         """Sort what came since the last run; a run that is still small is sorted in again, an older one never."""
-        last = [self._runs.pop()] if self._runs and len(self._runs[-1]) < _COMPACT_AT else []
-        self._runs.append(self._one_a_voxel([*last, *self._waiting]))
+        run = self._one_a_voxel([*self._short(), *self._waiting])
+        self._last = run if len(run) < _COMPACT_AT else None
+        if self._last is None:
+            self._runs.append(self._shelf.put(run.tobytes()))
         self._waiting, self._count = [], 0
+
+    def _short(self) -> list[F64]:
+        return [] if self._last is None else [self._last]
+
+    def _run(self, place: Place) -> F64:
+        return self._shelf.read(place).view(np.float64).reshape(-1, 4 if self.intensity else 3)
 
     def _one_a_voxel(self, clouds: list[F64]) -> F64:
         every = np.concatenate([np.zeros((0, 4 if self.intensity else 3)), *clouds])
@@ -125,7 +136,7 @@ class NewPoints:
 
     def by_tile(self) -> dict[TileIndex, F64]:
         """Points (m, 3) in map metres of each tile, sorted by voxel key; (m, 4) with their intensity."""
-        points = self._one_a_voxel([*self._runs, *self._waiting])
+        points = self._one_a_voxel([*map(self._run, self._runs), *self._short(), *self._waiting])
         rows, cols = tile_of_cells(*self.lattice.cells_of(points))
         tiles = sorted({(int(r), int(c)) for r, c in zip(*np.unique([rows, cols], axis=1), strict=True)})
         return {(r, c): points[(rows == r) & (cols == c)] for r, c in tiles}

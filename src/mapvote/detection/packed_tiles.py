@@ -9,6 +9,7 @@ import numpy as np
 from mapvote.codec.arrays import compress, unpack_bytes
 from mapvote.core.grid import CELLS, TILE_CELLS, Grid, Lattice, TileIndex
 from mapvote.core.types import U64
+from mapvote.detection.shelf import Place, Shelf
 
 _FAST = 1
 """zstd level: packed while driving, and read once or twice."""
@@ -22,7 +23,7 @@ class PackedTiles(Mapping[TileIndex, U64]):
     def __init__(self, lattice: Lattice, words: int) -> None:
         self.lattice, self.words = lattice, words
         self._open: dict[TileIndex, U64] = {}
-        self._packed: dict[TileIndex, bytes] = {}
+        self._shelf, self._packed = Shelf(), dict[TileIndex, Place]()
         self._spare: list[U64] = []
         """Planes of tiles that were left, for the next: given back, they would leave holes that the heap grows by."""
 
@@ -52,7 +53,7 @@ class PackedTiles(Mapping[TileIndex, U64]):
         for tile, planes in self._open.items():
             common = self.lattice.tile(tile).intersection(around)
             if common.rows == 0 or common.cols == 0:
-                self._packed[tile] = _packed(planes)
+                self._packed[tile] = self._shelf.put(_packed(planes))
                 self._spare.append(self._open.pop(tile))
                 return
 
@@ -66,8 +67,9 @@ class PackedTiles(Mapping[TileIndex, U64]):
         planes[:] = 0
         return planes
 
-    def _unpacked(self, data: bytes, planes: U64) -> U64:
+    def _unpacked(self, place: Place, planes: U64) -> U64:
         """``planes``, which come empty, with what was packed."""
+        data = self._shelf.read(place).tobytes()
         raw = np.frombuffer(unpack_bytes(data, CELLS * 8 * (self.words + 1), "evidence"), dtype=np.uint64)
         cells, *words = raw.reshape(self.words + 1, -1)
         planes.reshape(CELLS, self.words)[cells.astype(np.intp)] = np.stack(words, axis=1)
