@@ -79,6 +79,19 @@ def test_a_map_of_walls_alone_has_no_axis_that_points_up(points: F64) -> None:
     assert not [what for what in serious(check_cloud(in_memory(walls))) if "up" in what]
 
 
+def test_house_fronts_behind_each_other_are_not_taken_for_the_ground() -> None:
+    """Two blocks and a row of houses before them: along y more points lie on the last front than on the ground."""
+    rng = np.random.default_rng(2)
+    n = 12_000
+    ground = np.column_stack([rng.uniform(0, 150, n // 3), rng.uniform(0, 90, n // 3), rng.normal(0, 0.02, n // 3)])
+    fronts = [(0, 150, 85), (0, 60, 40), (0, 60, 5)]
+    walls = [
+        np.column_stack([rng.uniform(a, b, n), rng.normal(y, 0.02, n), rng.uniform(0, 20, n)]) for a, b, y in fronts
+    ]
+    houses = np.concatenate([ground, *walls])
+    assert not [what for what in serious(check_cloud(in_memory(houses))) if "up" in what]
+
+
 def test_a_second_road_above_the_first_is_a_ghost(points: F64) -> None:
     twice = map_from_points(np.concatenate([points, points + np.array([0, 0, 0.6])]))
     assert any("the road lies there twice, 0.6" in what for what in serious(check_map(twice)))

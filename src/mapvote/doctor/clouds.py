@@ -24,6 +24,8 @@ _STRAY_M = 300.0
 """Farther off they make the map larger than it is; nearer ones are reflections."""
 _HIGHEST_M = 3000.0
 """No map of streets is higher."""
+_SLENDER = 2.0
+"""Times as high as it is wide a street may be."""
 _LEAST_SHEET = 0.09
 """Of a street's points .12 to .17 lie on its ground (simulated ones and KITTI); with less nothing says what is up."""
 
@@ -47,7 +49,7 @@ def check_cloud(pieces: Pieces) -> list[Finding]:
     low, high = np.quantile(some, 0.001, axis=0), np.quantile(some, 0.999, axis=0)
     found = _strays(pieces, n, low, high)
     apart_m = spacing(pieces, some)
-    return found + (_units(high - low, apart_m) or _axes(some)) + _copies(apart_m) + _rounded(some)
+    return found + (_units(high - low, apart_m) or _axes(some, high - low)) + _copies(apart_m) + _rounded(some)
 
 
 def _every(pieces: Pieces, step: int) -> F64:
@@ -103,9 +105,11 @@ def _units(wide: F64, apart: F64) -> list[Finding]:
     return []
 
 
-def _axes(some: F64) -> list[Finding]:
-    """Which way is up: a street is a sheet of ground with things on it, none below."""
-    share = {name: _sheet_share(some, up) for name, up in UPS.items()}
+def _axes(some: F64, wide: F64) -> list[Finding]:
+    """Which way is up: a street is a sheet of ground with things on it, none below, and not higher than it is wide:
+    rows of house fronts behind each other are no ground. ``wide`` (3,): the extent of the points."""
+    possible = {name: up for name, up in UPS.items() if wide[np.argmax(np.abs(up))] <= _SLENDER * wide[2]}
+    share = {name: _sheet_share(some, up) for name, up in possible.items()}
     best = max(share, key=lambda name: share[name])
     opposite = ("-" if best[0] == "+" else "+") + best[1]
     # Between two walls, as much lies at one end of an axis as at the other: that is no ground.

@@ -20,6 +20,8 @@ from mapvote.doctor.places import Place, fitting, register_all
 from mapvote.localisation.map_window import MapWindow
 
 _FEET_M = 0.3048
+_SENSOR_M = 2.0
+"""Height of a sensor over the road, about."""
 _AROUND_M = 120.0
 """Of the drive: what its scans can see, and then some."""
 _LOOKED_AT = 3
@@ -55,7 +57,8 @@ def in_another_unit(
     range_sigma_m: float,
     tell: Progress | None,
 ) -> Finding | None:
-    """What the map is in, if scans fit it once it is made metres about its origin or its middle; None if none does.
+    """What the map is in, if scans fit it once it is made metres about its origin, about its middle or about the road
+    below the middle of the drive; None if none does.
 
     ``T`` (n, 4, 4): the prior, metres.
     """
@@ -68,7 +71,7 @@ def in_another_unit(
     for k, unit in enumerate(UNITS):
         if tell is not None:
             tell("trying other units", k + 1, len(UNITS))
-        for centre in (np.zeros(3), _middle(point_map)):
+        for centre in (np.zeros(3), _middle(point_map), T[:, :3, 3].mean(axis=0) - [0.0, 0.0, _SENSOR_M]):
             metres = _in_metres(point_map, unit.metres, centre, T)
             if metres is None:
                 continue
