@@ -184,6 +184,22 @@ def test_a_server_that_was_restored_to_another_past_is_asked_for_everything(serv
     }
 
 
+def test_a_server_set_up_anew_with_another_map_of_the_same_version_is_not_taken_for_the_old_one(
+    served: Served, tmp_path: Path
+) -> None:
+    _, _, client = served
+    client().fetch()
+    other = Store.create(f"sqlite:///{tmp_path / 'other.db'}", make_map({(0, 0): make_tile(wall([(7, 7)], [0.9]))}))
+    with TestClient(create_app(other, opened=True), base_url="http://localhost") as app:
+        made = client()
+        made._server._http = app
+        fetched = made.fetch()
+    assert fetched.version == 1
+    assert list(fetched.tiles) == [(0, 0)]
+    assert fetched.tiles[0, 0].points.tobytes() == other.point_map().tiles[0, 0].points.tobytes()
+    other.close()
+
+
 def test_a_region_is_fetched_without_the_rest(served: Served) -> None:
     _, counted, client = served
     found = client().fetch(region=(80.0, 0.0, 160.0, 10.0))

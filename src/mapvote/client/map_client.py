@@ -22,7 +22,7 @@ from mapvote.client.connection import Connection, Refused, Unreachable
 from mapvote.client.spool import Spool, server_folder
 from mapvote.codec.ballot import Ballot, decode, encode
 from mapvote.codec.fields import unpack_fields
-from mapvote.codec.tile_file import digest_of_tiles
+from mapvote.codec.tile_file import digest_of_tiles, manifest_tag
 from mapvote.core.grid import CELL_SIZE, Grid, Lattice, TileIndex
 from mapvote.core.lazy_tiles import made_in_turn
 from mapvote.core.point_map import PointMap
@@ -178,7 +178,7 @@ class MapClient:
         """The newest manifest: what is kept of the last one, and what changed since."""
         kept = self._kept()
         if kept is not None:
-            tag = f'"{kept.version}-{kept.version}"'
+            tag = manifest_tag(kept.version, kept.version, (kept.digest, kept.fields_digest))
             try:
                 answer = self._server.ask("GET", f"/v1/map?since={kept.version}", headers={"If-None-Match": tag})
             except Refused as error:

@@ -53,6 +53,13 @@ def digest_of_tiles(tiles: Iterable[tuple[str, *tuple[str | None, ...]]]) -> int
     return sum(int.from_bytes(hashlib.sha256(line.encode()).digest()) for line in lines) % DIGESTS
 
 
+def manifest_tag(version: int, since: int | None, digests: Iterable[str]) -> str:
+    """The ETag of a manifest, or of what changed ``since`` a version: of its number and what it consists of. A server
+    that was set up anew has the numbers of the old one, and another map."""
+    told = "-".join(digest[:16] for digest in digests)
+    return f'"{version}-{told}"' if since is None else f'"{version}-{since}-{told}"'
+
+
 def base_hash(tile: Tile | None) -> str:
     """The content hash that a ballot gives for this tile: "" where the map has none."""
     return "" if tile is None else content_hash(tile.points)

@@ -4,16 +4,26 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import msgspec
 
 from mapvote.codec.ballot import tile_key
+from mapvote.codec.tile_file import manifest_tag
 from mapvote.server.store.quarantine import set_aside
 from mapvote.server.store.queries import current_number
 from mapvote.server.store.store import Manifest, Store
 
 _KEPT = 16
+
+
+class Made(NamedTuple):
+    """A manifest on its way out."""
+
+    content: bytes
+    """JSON."""
+    tag: str
+    """Its ETag."""
 
 
 class Manifests:
@@ -22,7 +32,7 @@ class Manifests:
     def __init__(self, store: Store) -> None:
         self._store = store
         self._lock = threading.Lock()
-        self._made: dict[tuple[int, int | None], bytes] = {}
+        self._made: dict[tuple[int, int | None], Made] = {}
 
     def newest(self, asked: Sequence[None]) -> list[int]:
         """The newest version's number, for each who asks: one query for all of them."""
@@ -39,16 +49,18 @@ class Manifests:
             found = [f"{kind} {name}: {why}" for (kind, name), why in sorted(set_aside(connection).items())]
         return [found] * len(asked)
 
-    def ready(self, number: int, since: int | None) -> bytes | None:
+    def ready(self, number: int, since: int | None) -> Made | None:
         """A manifest that was made before."""
         return self._made.get((number, since))
 
-    def make(self, number: int, since: int | None) -> bytes:
-        """JSON of a version; ``since`` as in :meth:`Store.manifest`. NotFound if there is no such version."""
+    def make(self, number: int, since: int | None) -> Made:
+        """A version; ``since`` as in :meth:`Store.manifest`. NotFound if there is no such version."""
         with self._lock:  # of many who ask for a new version, one makes it
             made = self._made.get((number, since))
             if made is None:
-                made = msgspec.json.encode(_as_json(self._store.manifest(number, since=since)))
+                manifest = self._store.manifest(number, since=since)
+                tag = manifest_tag(number, since, (manifest.digest, manifest.fields_digest))
+                made = Made(msgspec.json.encode(_as_json(manifest)), tag)
                 while len(self._made) >= _KEPT:
                     del self._made[next(iter(self._made))]
                 self._made[number, since] = made

@@ -91,11 +91,10 @@ async def unvote(request: Request, vehicle: Name, drive: Name) -> dict[str, int]
 async def _manifest(request: Request, number: int | None, since: int | None) -> Response:
     parts = services(request)
     number = await parts.newest.put(None) if number is None else number
-    etag = f'"{number}"' if since is None else f'"{number}-{since}"'
-    headers = {"ETag": etag, "Cache-Control": "private, no-cache"}
-    content = parts.manifests.ready(number, since) or await to_thread.run_sync(
-        parts.manifests.make, number, since, limiter=parts.threads.fetching
-    )
-    if request.headers.get("if-none-match") == etag:
+    made = parts.manifests.ready(number, since)
+    if made is None:
+        made = await to_thread.run_sync(parts.manifests.make, number, since, limiter=parts.threads.fetching)
+    headers = {"ETag": made.tag, "Cache-Control": "private, no-cache"}
+    if request.headers.get("if-none-match") == made.tag:
         return Response(status_code=304, headers=headers)
-    return Response(content, media_type="application/json", headers=headers)
+    return Response(made.content, media_type="application/json", headers=headers)
