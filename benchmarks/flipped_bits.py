@@ -19,6 +19,7 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import sqlalchemy as sa
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
@@ -50,11 +51,17 @@ def make(url: str) -> None:
         index: make_tile(wall(CELLS, [0.05, 0.45, 0.75 + 0.01 * index[1]]), ground=0.001 * index[1], index=index)
         for index in TILES
     }
+    for index, tile in tiles.items():  # no two tiles carry the same
+        bright = np.arange(len(tile.points), dtype=np.uint16) + 100 * index[1]
+        tiles[index] = tile.but(fields={"intensity": bright, "gps_time": bright * 0.5})
     store = Store.create(url, make_map(tiles), Policy(fuse=FuseSettings(max_deleted_share=1.0)))
     for step, cell in enumerate(CELLS[:3]):
         base = store.point_map()
         for vehicle in ("a", "b", "c"):
-            say = Say(states_plane({cell: CellState.CHANGED_EMPTY}, fill=CellState.UNDETERMINED))
+            built = (50, 50 + step)
+            states = {cell: CellState.CHANGED_EMPTY, built: CellState.CHANGED_OCCUPIED}
+            say = Say(states_plane(states, fill=CellState.UNDETERMINED), new_points=wall([built], [0.45, 0.75]))
+            say.intensity = np.array([51, 204], dtype=np.uint8)
             ballot = make_ballot(base, dict.fromkeys(TILES, say), vehicle, f"d{step}", store.clock() - 10**9)
             (receipt,) = accept(store, [examine(encode(ballot))])
             assert isinstance(receipt, Receipt), receipt

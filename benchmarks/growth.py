@@ -27,7 +27,7 @@ from mapvote.server.store.store import Store
 
 _BLOBS = {
     "planes of tiles": (schema.blobs, ("data",)),
-    "ballots": (schema.ballot_tiles, ("states", "tally", "gone", "new_points", "free")),
+    "ballots": (schema.ballot_tiles, schema.BALLOT_PLANES),
     "decisions": (schema.decisions, ("states", "tally")),
 }
 
