@@ -80,10 +80,6 @@ class Scan:
         start = T_map_lidar[:3, 3] if self.origin is None else T_map_lidar[:3, :3] @ self.origin + T_map_lidar[:3, 3]
         return np.array(start, dtype=np.float64)
 
-    def only(self, few: I64) -> Scan:
-        """The scan of some of its points (m,), without what only all of them need."""
-        return Scan(self.stamp_ns, self.points[few], None if self.time_s is None else self.time_s[few])
-
     def seen_from(self, T_first_other: F64) -> Scan:
         """The scan of another LiDAR of the vehicle in the frame of its first one."""
         points = (self.points @ T_first_other[:3, :3].T + T_first_other[:3, 3]).astype(np.float32)

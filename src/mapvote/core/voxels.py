@@ -144,8 +144,23 @@ def voxel_keys(points: NDArray[np.floating], x0: float, y0: float, size: float =
 
 def voxel_downsample(points: NDArray[np.floating], size: float, x0: float = 0.0, y0: float = 0.0) -> I64:
     """Indices (m,) of one point per voxel, the first of each in input order, ascending. Deterministic."""
-    _, first = np.unique(voxel_keys(points, x0, y0, size), return_index=True)
-    return np.sort(first)
+    return first_of_each(voxel_keys(points, x0, y0, size))
+
+
+@numba.njit(cache=True, nogil=True)
+def first_of_each(keys: I64) -> I64:
+    """(m,) indices, ascending, of the first of each of the keys (n,) > 0."""
+    size = 1024
+    while size < 2 * len(keys):
+        size *= 2
+    table, first, m = np.zeros(size, np.int64), np.empty(len(keys), np.int64), 0
+    for i in range(len(keys)):
+        slot = slot_of(keys[i], table)
+        if table[slot] == 0:
+            table[slot] = keys[i]
+            first[m] = i
+            m += 1
+    return first[:m].copy()
 
 
 @numba.njit(cache=True, nogil=True)

@@ -8,7 +8,7 @@ import numpy as np
 from mapvote.core.columns import GROUND_MARGIN_M, column_bit, height_above
 from mapvote.core.grid import CELL_SIZE, Grid, Lattice, TileIndex, tile_of_cells
 from mapvote.core.types import F32, F64, I32, I64, U8, U64, Bool, Reference
-from mapvote.core.voxels import voxel_keys
+from mapvote.core.voxels import first_of_each, voxel_keys
 from mapvote.detection.shelf import Place, Shelf
 from mapvote.perception.frontend import Observation, PlacedScan
 
@@ -131,8 +131,8 @@ class NewPoints:
     def _one_a_voxel(self, clouds: list[F64]) -> F64:
         every = np.concatenate([np.zeros((0, 4 if self.intensity else 3)), *clouds])
         keys = voxel_keys(every, self.lattice.x0, self.lattice.y0)
-        _, first = np.unique(keys, return_index=True)  # sorted by key; the earliest of each
-        return every[first]
+        first = first_of_each(keys)
+        return every[first[np.argsort(keys[first])]]
 
     def by_tile(self) -> dict[TileIndex, F64]:
         """Points (m, 3) in map metres of each tile, sorted by voxel key; (m, 4) with their intensity."""

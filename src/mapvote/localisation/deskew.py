@@ -29,9 +29,14 @@ def deskew(scan: Scan, twist: F64) -> F32:
 
     ``twist`` is (velocity, angular velocity) in the lidar frame. Scans without point times come back as they are.
     """
-    if scan.time_s is None:
-        return scan.points
-    return _deskew(scan.points, scan.time_s, twist[:3].astype(np.float32), twist[3:].astype(np.float32))
+    return deskewed(scan.points, scan.time_s, twist)
+
+
+def deskewed(points: F32, time_s: F32 | None, twist: F64) -> F32:
+    """:func:`deskew` of points (n, 3) measured at ``time_s`` (n,) from the stamp."""
+    if time_s is None:
+        return points
+    return _deskew(points, time_s, twist[:3].astype(np.float32), twist[3:].astype(np.float32))
 
 
 def twist_between(T_map_lidar_0: F64, T_map_lidar_1: F64, seconds: float) -> F64:

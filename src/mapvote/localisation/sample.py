@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from mapvote.core.types import F32, F64, Scan
-from mapvote.localisation.deskew import deskew
+from mapvote.localisation.deskew import deskewed
 from mapvote.localisation.ndt import LEVELS, in_rows, thinned
 
 
@@ -11,13 +11,17 @@ class Sample:
     """The points of one scan that each level compares with the map."""
 
     def __init__(self, scan: Scan) -> None:
-        self._scans = {size: scan.only(few) for size, few in thinned(scan.points).items()}
+        time_s = scan.time_s
+        self._parts = {
+            size: (scan.points[few], None if time_s is None else time_s[few])
+            for size, few in thinned(scan.points).items()
+        }
 
     def clouds(self, twist: F64) -> list[F32]:
         """(3, m) by level, at the scan's stamp if the sensor's motion per second was ``twist`` (6,)."""
-        clouds = {size: in_rows(deskew(scan, twist)) for size, scan in self._scans.items()}
+        clouds = {size: in_rows(deskewed(*part, twist)) for size, part in self._parts.items()}
         return [clouds[level.points_m] for level in LEVELS]
 
     def coarse(self, twist: F64) -> list[F32]:
         """The same, of the fewest points at every level: to try many guesses."""
-        return [in_rows(deskew(self._scans[max(self._scans)], twist))] * len(LEVELS)
+        return [in_rows(deskewed(*self._parts[max(self._parts)], twist))] * len(LEVELS)

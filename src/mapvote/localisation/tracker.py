@@ -90,16 +90,18 @@ class Tracker:
         result = refine(ndt_map, clouds, seed, prior, self._first_level(reach))
         if result.score < _POOR * self._usual_score:
             result = self._reconsider(ndt_map, clouds, scan.stamp_ns, result, prior)
-        if not self.is_sound(result):
+        trusted = self.is_sound(result)
+        if not trusted:
             centre = prior.T_map_lidar if prior is not None else seed
             result = self._search(ndt_map, clouds, centre, reach, prior)
+            trusted = self.is_sound(result)
         for _ in range(_ROUNDS):
             found = self._motion_to(result.T_map_lidar, scan.stamp_ns)
             if scan.time_s is None or found is None or not _differ(twist, found):
                 break
             twist = found
             result = refine(ndt_map, sample.clouds(twist), result.T_map_lidar, prior, len(LEVELS) - 1)
-        trusted = self.is_sound(result)
+            trusted = self.is_sound(result)
         if trusted:
             self._accept(result.T_map_lidar, scan.stamp_ns, twist)
             rate = 0.2 if self._usual_score else 1.0
