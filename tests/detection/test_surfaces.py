@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
@@ -12,10 +13,19 @@ from mapvote.config import VotingSettings
 from mapvote.core.grid import CELL_SIZE
 from mapvote.core.point_map import PointMap
 from mapvote.core.reference import reference_window
-from mapvote.core.types import F64, U64, CellState
+from mapvote.core.types import F64, U64, Bool, CellState
 from mapvote.detection.counters import PLANES, count_of
 from mapvote.detection.surface_counts import CROSSED, HIT_REACH_M, MET, WORDS, SurfaceEvidence
-from mapvote.detection.surfaces import GONE_RAYS, HIT_RAYS, SUPPORT, SurfaceVoter, settled, weigh_surfaces
+from mapvote.detection.surfaces import (
+    GONE_RAYS,
+    HIT_RAYS,
+    SUPPORT,
+    SurfaceVoter,
+    grown,
+    met_again,
+    settled,
+    weigh_surfaces,
+)
 from mapvote.detection.votes import TileVotes
 from mapvote.perception.frontend import Observation, PlacedScan
 from mapvote.perception.raycast import ScanView, find_obstacles
@@ -86,6 +96,35 @@ def test_a_pole_that_went_is_a_change_and_a_twig_is_none() -> None:
 def test_what_two_scans_crossed_is_not_gone_yet() -> None:
     gone_after = [after(street(WALL, HEIGHTS), standing_at(OLD_Y + 9), n).states[ROW, 105] for n in (2, GONE_RAYS)]
     assert gone_after == [UN, CE]
+
+
+def test_what_few_rays_crossed_and_none_met_goes_with_what_many_crossed_beside_it() -> None:
+    point_map = street(WALL, HEIGHTS)
+    voter = SurfaceVoter(VotingSettings(), point_map)
+    for scan in range(GONE_RAYS):
+        seen = one_scan(point_map, standing_at(OLD_Y + 9))
+        if scan:
+            seen.view.passed[:, 106:] = 0  # half of the wall is out of sight but once
+        voter.observe(seen)
+    assert all(voter.votes()[0, 0].states[cell] == CE for cell in WALL)
+
+
+@given(strong=arrays(np.bool_, (6, 6)), weak=arrays(np.bool_, (6, 6)))
+def test_what_grows_is_weak_and_growing_twice_grows_no_more(strong: Bool, weak: Bool) -> None:
+    out = grown(strong, weak)
+    assert (out >= strong).all()
+    assert (out <= strong | weak).all()
+    np.testing.assert_array_equal(grown(out, weak), out)
+
+
+@pytest.mark.parametrize(("beside", "counts"), [(0, True), (1, True), (2, False)])
+def test_what_one_scan_met_counts_where_it_touches_what_two_met(beside: int, counts: bool) -> None:
+    planes = np.zeros((1, 4, WORDS), np.uint64)
+    planes[0, 0, MET + 1] = planes[0, beside, MET] = 4  # voxel 2: met twice in the first cell, once in the other
+    new = np.full((1, 4), 4, np.uint64)
+    kept = met_again(new, planes, np.zeros((1, 4), np.int32))
+    assert (kept[0, beside] == 4) == counts
+    assert kept[0, 0] == 4
 
 
 def test_what_is_no_higher_than_a_kerb_is_never_gone() -> None:

@@ -1,8 +1,9 @@
 """One rule of evidence: what did a drive's rays do to each surface of the map, and what stands where it was free?
 
 A mapped voxel is gone that was crossed more often than HIT_RAYS times its hits, and stands that was met and is not. A
-cell is changed-empty if a voxel of it is gone and none stands: what no ray could decide in it goes along. Cells that no
-ray could decide go with what falls, as columns have it (rule H). A free voxel met more often than rays spoke against it
+cell is changed-empty if a voxel of it is gone and none stands: what no ray could decide in it goes along. So do cells
+beside it in which rays crossed something and met nothing, however few, and theirs; and cells that no ray could decide
+go with what falls, as columns have it (rule H). A free voxel met more often than rays spoke against it
 is new. Support, not area, makes a change of either: a pole is narrow and tall, a speck is neither. docs/method.md.
 """
 
@@ -22,7 +23,7 @@ from mapvote.core.point_map import PointMap
 from mapvote.core.reference import bordered
 from mapvote.core.types import I32, NO_VOTE, U8, U64, Bool, CellState, Reference
 from mapvote.core.voting import one_hot
-from mapvote.detection.counters import count_of, newly_free
+from mapvote.detection.counters import PLANES, count_of, newly_free
 from mapvote.detection.regions import HALO, JOIN_CELLS, beyond_tiles, fallen, unexplained
 from mapvote.detection.surface_counts import CROSSED, MET, PASSED, SurfaceEvidence
 from mapvote.detection.votes import TileVotes
@@ -53,6 +54,8 @@ class _Judged:
     """Met where the map knew nothing and has nothing beside it."""
     beside: Bool
     """Cells whose new voxels all lie next to mapped ones."""
+    crossed: Bool
+    """Mapped cells in which rays crossed a voxel that none met, and met none that stands."""
     adrift: Bool
     """Mapped cells that no ray decided, with rays through half of what is under them or more."""
     states: U8
@@ -88,6 +91,12 @@ def supported(cells: Bool, voxels: U64) -> Bool:
     group, count = ndimage.label(cells, structure=np.ones((3, 3)))
     votes = np.bincount(group.ravel(), weights=np.bitwise_count(voxels).ravel(), minlength=count + 1)
     return np.asarray(cells & (votes >= SUPPORT)[group])
+
+
+def grown(strong: Bool, weak: Bool) -> Bool:
+    """(rows, cols) ``strong`` cells, and ``weak`` ones that touch them (8) directly or through each other: hysteresis
+    (Canny 1986). Few rays cross the far wall of what fell, and none of them met it."""
+    return np.asarray(ndimage.binary_propagation(strong, np.ones((3, 3)), mask=strong | weak))
 
 
 def settled(gone: U64, stands: U64, mapped: U64, base: I32) -> U64:
@@ -131,7 +140,8 @@ class SurfaceVoter:
             free = newly_free(self.evidence.tiles[tile], here)
             known = ~np.uint64(0) if here.free is None else here.free
             top = _below_tops(found.new)
-            new = np.where(found.new != 0, found.new | found.beyond | ~(top | known), np.uint64(0))
+            sure = met_again(found.new, self.evidence.tiles[tile], here.base)
+            new = np.where(sure != 0, sure | found.beyond | ~(top | known), np.uint64(0))
             out[tile] = TileVotes(one_hot(found.states), found.states, found.gone, found.remnants, new, free)
         return out
 
@@ -155,6 +165,7 @@ class SurfaceVoter:
         states[mapped & (passed != 0)] = CellState.UNDETERMINED
         states[~mapped & (beyond != 0)] = CellState.UNDETERMINED
         states[stands != 0] = CellState.UNCHANGED_OCCUPIED
+        never_met = _any(planes, CROSSED) & ~_any(planes, MET) & here.occupied
         return _Judged(
             here=here,
             gone=np.where(low, np.uint64(0), gone),
@@ -162,10 +173,23 @@ class SurfaceVoter:
             new=np.where(mapped, np.uint64(0), new),
             beyond=beyond,
             beside=(new != 0) & (new & ~near == 0),
+            crossed=mapped & ~low & (stands == 0) & ((gone | never_met) != 0),
             adrift=mapped & ~low & (gone | stands == 0) & (under != 0) & clear,
             states=states,
             remnants=np.zeros_like(gone),
         )
+
+
+def _any(planes: U64, first: int) -> U64:
+    """(rows, cols) voxels whose counter, which begins at ``first``, is not 0."""
+    return np.asarray(np.bitwise_or.reduce(planes[..., first : first + PLANES], axis=-1))
+
+
+def met_again(new: U64, planes: U64, base: I32) -> U64:
+    """(rows, cols) of the ``new`` voxels those that two scans met, and those that touch one: what a single scan met
+    beside nothing else may be a mixed pixel, and lies on no surface more often than not."""
+    twice = new & np.bitwise_or.reduce(planes[..., MET + 1 : MET + PLANES], axis=-1)
+    return np.asarray(twice | (new & dilated(twice, base, 1)))
 
 
 @numba.njit(cache=True, nogil=True)
@@ -183,6 +207,10 @@ def _decide_mapped(tiles: dict[TileIndex, _Judged], lattice: Lattice) -> None:
     empty = {tile: (found.gone != 0) & (found.stands == 0) for tile, found in tiles.items()}
     for tile, cells in beyond_tiles(lattice, HALO, supported, (empty, False), (gone, 0)).items():
         tiles[tile].states[empty[tile]] = CellState.UNDETERMINED
+        tiles[tile].states[cells] = CellState.CHANGED_EMPTY
+    strong = {tile: found.states == CellState.CHANGED_EMPTY for tile, found in tiles.items()}
+    crossed = {tile: found.crossed for tile, found in tiles.items()}
+    for tile, cells in beyond_tiles(lattice, HALO, grown, (strong, False), (crossed, False)).items():
         tiles[tile].states[cells] = CellState.CHANGED_EMPTY
     states, adrift = _states(tiles), {tile: found.adrift for tile, found in tiles.items()}
 
