@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from hand_made import make_map, make_tile, wall
@@ -19,7 +19,7 @@ from mapvote.core.sensors import SENSORS
 from mapvote.core.types import NO_VOTE, U64, CellState, Reference
 from mapvote.core.voting import VOTE_UNIT, vote_weight
 from mapvote.detection.paper import PaperVoter, classify_paper, reading_table
-from mapvote.detection.sightings import BEGINS_ABOVE, WORDS, encode
+from mapvote.detection.sightings import BEGINS_ABOVE, WORDS, encode, votes_in
 from mapvote.perception.frontend import Observation, PlacedScan
 from mapvote.perception.raycast import ScanView, Sight, cast_rays, find_obstacles
 
@@ -115,6 +115,32 @@ def test_case_5_knows_how_the_sensor_leans() -> None:
         up = from_xyz_rpy(0, 0, 0, 0, np.radians(pitch_deg), 0)[:3, 2]
         words = encode(view, reference, ORIGIN, SENSOR, up_map=up)
         assert (words[0, -1] & BEGINS_ABOVE != 0) == invalid
+
+
+@given(
+    st.tuples(*[st.floats(-4.0, 4.0)] * 3),
+    st.tuples(st.floats(-0.2, 0.2), st.floats(-0.2, 0.2)),
+    st.floats(0.5, 9.0),
+)
+def test_a_map_begins_above_the_view_where_plain_trigonometry_says(
+    origin: tuple[float, float, float], lean: tuple[float, float], bottom_z: float
+) -> None:
+    view, reference = one_cell(0, Sight.CLEAR, map_bits=1 << 12, bottom_z=bottom_z, far=12)
+    up = from_xyz_rpy(0, 0, 0, *lean, 0)[:3, 2]
+    away = np.array([12.5 * CELL_SIZE, 0.5 * CELL_SIZE, np.float32(bottom_z)]) - origin
+    elevation = np.arcsin(np.clip(away @ up / np.linalg.norm(away), -1.0, 1.0))
+    assume(abs(elevation - np.radians(SENSOR.fov_top_deg)) > 1e-4)
+    word = encode(view, reference, np.array(origin), SENSOR, up_map=up)[0, -1]
+    assert (word & BEGINS_ABOVE != 0) == (elevation > np.radians(SENSOR.fov_top_deg))
+
+
+def test_scans_vote_in_a_square_around_the_vehicle_wherever_it_is() -> None:
+    grid = Grid(Lattice(), 0, 0, 100, 140)
+    inside = votes_in(grid, np.array([24.0, 9.0, 3.0]), 6.0)
+    rows, cols = np.nonzero(inside)
+    assert (rows.min(), cols.min()) == (20, 70)
+    assert (rows.max(), cols.max()) == (40, 90), "cells that the square ends in"
+    assert len(rows) == 21 * 21
 
 
 def test_case_5_read_literally_skips_cells_where_the_map_is_higher_than_the_scan() -> None:

@@ -37,6 +37,14 @@ def test_hits_that_all_lie_beside_mapped_ones_are_given_up() -> None:
     assert not unexplained(states, np.zeros(states.shape, dtype=np.bool_), 6).any()
 
 
+@pytest.mark.parametrize(("row", "col"), [(9, 9), (9, 10), (10, 9), (11, 11), (12, 10), (8, 10), (10, 12)])
+def test_the_reach_is_a_square(row: int, col: int) -> None:
+    states = plane((slice(5, 16), slice(5, 16), CO))
+    beside = np.ones(states.shape, dtype=np.bool_)
+    beside[10, 10] = False
+    assert unexplained(states, beside, 1)[row, col] == (max(abs(row - 10), abs(col - 10)) > 1)
+
+
 def test_the_reach_goes_along_changed_cells_only() -> None:
     states = plane((10, 10, CO), (10, 12, CO))
     beside = np.zeros(states.shape, dtype=np.bool_)

@@ -13,7 +13,7 @@ from mapvote.config import VotingSettings
 from mapvote.core.grid import CELL_SIZE
 from mapvote.core.point_map import PointMap
 from mapvote.core.reference import reference_window
-from mapvote.core.types import F64, U64, Bool, CellState
+from mapvote.core.types import F64, NO_VOTE, U64, Bool, CellState
 from mapvote.detection.counters import PLANES, count_of
 from mapvote.detection.surface_counts import CROSSED, HIT_REACH_M, MET, WORDS, SurfaceEvidence
 from mapvote.detection.surfaces import (
@@ -142,6 +142,27 @@ def test_a_roof_that_no_ray_could_reach_falls_with_the_wall_that_bore_it() -> No
         seen.view.passed[:] &= np.uint64((1 << 12) - 1)  # no ray rises to the roof
         voter.observe(seen)
     assert all(voter.votes()[0, 0].states[cell] == CE for cell in roof)
+
+
+def test_a_cell_in_which_something_stands_is_not_empty_whatever_else_of_it_is_gone() -> None:
+    points = standing_at(OLD_Y, HEIGHTS[:2])  # the upper half of the wall went
+    votes = after(street(WALL, HEIGHTS), points)
+    assert all(votes.states[cell] == UO for cell in WALL)
+    assert votes.remnants is not None
+    assert votes.remnants[ROW, 105] == np.uint64(0b100000), "the voxel on what stands may be its upper edge"
+
+
+def test_a_place_where_nothing_is_mapped_and_rays_passed_is_empty_and_one_that_none_passed_has_no_vote() -> None:
+    point_map = street(WALL, HEIGHTS)
+    voter = SurfaceVoter(VotingSettings(), point_map)
+    for _ in range(8):
+        seen = one_scan(point_map, standing_at(OLD_Y))
+        seen.view.passed[:, :105] = 0
+        voter.observe(seen)
+    states = voter.votes()[0, 0].states
+    assert states[ROW + 5, 110] == CellState.UNCHANGED_EMPTY
+    assert states[ROW + 5, 100] == NO_VOTE
+    assert states[ROW, 100] == UO, "hits need no rays beside them"
 
 
 @given(crossed=st.integers(0, 120), met=st.integers(0, 20))

@@ -7,9 +7,10 @@ import pytest
 
 from hand_made import states_plane, two_walls
 from mapvote.config import FuseSettings
-from mapvote.core.types import CellState
+from mapvote.core.types import NO_VOTE, CellState
 from mapvote.fusion.fuse import fuse_tile
 from mapvote.fusion.tile_vote import TileVote
+from mapvote.fusion.turning import _turn
 
 UO, UE, CO, CE, UN = (int(state) for state in list(CellState)[:5])
 CELL = (10, 10)
@@ -63,3 +64,9 @@ def test_of_a_vehicle_the_last_word_counts_once() -> None:
     whose = ["a", "b", "c", "d", "e", "f", "a", "b", "b"]
     assert decided(*[UO] * 6, CE, CE, CE, whose=whose) == UO, "two vehicles, three drives"
     assert decided(*[UO] * 6, CE, CE, CE, whose=[*whose[:8], "c"]) == CE
+
+
+def test_a_vehicle_that_never_spoke_of_a_cell_does_not_stand_for_another() -> None:
+    said = np.array([[CE], [UO], [NO_VOTE], [CE]], dtype=np.uint8)
+    ends_ns, whose = np.arange(4, dtype=np.int64), np.array([2, 0, 1, 0], dtype=np.int64)
+    assert _turn(said, ends_ns, whose, UO, CE).all(), "both that spoke say so in the end"

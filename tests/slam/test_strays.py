@@ -55,6 +55,14 @@ def test_a_wall_two_centimetres_from_a_face_is_one_wall(axis: int, side: float) 
     assert len(kept) == np.count_nonzero(~over)
 
 
+@pytest.mark.parametrize("lattice", [Lattice(), Lattice(100.1, -57.2)])
+def test_where_a_voxel_begins_is_the_lattices_business(lattice: Lattice) -> None:
+    face = np.array([lattice.x0 + 30 * 0.3, lattice.y0 + 7.1 * 0.3, 2.1])
+    points = face + np.array([[-0.02, 0.0, 0.0], [0.02, 0.0, 0.0], [0.62, 0.0, 0.0]])
+    spilled = strays(points, np.array([3, 30, 3], np.int32), np.zeros((0, 3)), lattice)
+    assert spilled.tolist() == [True, False, False]
+
+
 def test_two_walls_a_hand_apart_stay_two() -> None:
     cloud = VoxelCloud(LATTICE)
     for x in (2.93, 3.05):
