@@ -9,7 +9,6 @@ from __future__ import annotations
 import os
 import stat
 import sys
-import tempfile
 from pathlib import Path
 
 _VARIABLE = "NUMBA_CACHE_DIR"
@@ -20,7 +19,7 @@ def choose_kernel_cache() -> None:
     users = Path(os.environ.get("XDG_CACHE_HOME") or Path("~/.cache").expanduser())
     if os.environ.get(_VARIABLE) or _may_write(Path(__file__).parent) or _may_write(users):
         return
-    os.environ[_VARIABLE] = folder = _private_folder(Path(tempfile.gettempdir()))
+    os.environ[_VARIABLE] = folder = _private_folder()
     if "numba" in sys.modules:  # which has read its variables already
         sys.modules["numba"].config.CACHE_DIR = folder
 
@@ -31,8 +30,11 @@ def _may_write(folder: Path) -> bool:
     return existing is not None and os.access(existing, os.W_OK | os.X_OK)
 
 
-def _private_folder(within: Path) -> str:
+def _private_folder() -> str:
     """The same one at each start; one for this process alone if others may have put kernels there, for they are run."""
+    import tempfile  # takes a while, and hardly anybody needs it
+
+    within = Path(tempfile.gettempdir())
     user = os.getuid() if hasattr(os, "getuid") else 0
     folder = within / f"mapvote-kernels-{user}"
     folder.mkdir(mode=0o700, exist_ok=True)

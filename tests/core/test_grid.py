@@ -5,6 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from mapvote.core.cells import flat_cells
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Grid, Lattice, tile_of_cells, window_around
 
 small = st.integers(-2000, 2000)
@@ -73,4 +74,4 @@ def test_flat_cells_are_those_of_the_points_in_map_metres(x0: float, row0: int, 
     points = rng.uniform(0.0, 15.0, (100, 3)).astype(np.float32)
     points[:50, :2] = rng.integers(0, 50, (50, 2)) * np.float32(CELL_SIZE)
     rows, cols, _ = grid.indices_of(grid.to_map(points))
-    np.testing.assert_array_equal(grid.flat_cells(points), rows.clip(0, 39) * 50 + cols.clip(0, 49))
+    np.testing.assert_array_equal(flat_cells(grid, points), rows.clip(0, 39) * 50 + cols.clip(0, 49))

@@ -7,6 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hand_made import SHAPE, make_map, make_tile, wall
+from mapvote.core.cells import flat_cells
 from mapvote.core.grid import CELL_SIZE, Lattice
 from mapvote.core.reference import reference_window
 from mapvote.core.tile import Tile
@@ -60,12 +61,12 @@ def test_one_point_a_voxel_the_nearest_to_the_mean_whoever_came_first(seed: int,
     voters = rng.integers(0, 4, len(points)).astype(np.int32)
     tile = make_tile(wall([(1, 1)], [0.45]))
     bright = rng.integers(0, 256, len(points)).astype(np.uint8)
-    edited, added = add_points(tile, points, bright, GRID.flat_cells(points), voters, min_votes)
+    edited, added = add_points(tile, points, bright, flat_cells(GRID, points), voters, min_votes)
     order = rng.permutation(len(points))
-    again, _ = add_points(tile, points[order], bright[order], GRID.flat_cells(points[order]), voters[order], min_votes)
+    again, _ = add_points(tile, points[order], bright[order], flat_cells(GRID, points[order]), voters[order], min_votes)
     assert again.points.tobytes() == edited.points.tobytes()
 
-    cell, layer = GRID.flat_cells(points), np.floor(points[:, 2].astype(np.float64) / CELL_SIZE)
+    cell, layer = flat_cells(GRID, points), np.floor(points[:, 2].astype(np.float64) / CELL_SIZE)
     expected = 0
     for c, k in sorted(set(zip(cell.tolist(), layer.tolist(), strict=True))):
         mine = points[(cell == c) & (layer == k)].astype(np.float64)

@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -93,12 +92,6 @@ class Grid:
             out[:, axis] = np.clip(out[:, axis], np.float32(0.0), edge)
         return out
 
-    def flat_cells(self, points: NDArray[np.float32]) -> NDArray[np.int64]:
-        """(n,) row * cols + col of points from this window's corner; the outermost cells take what rounding moved."""
-        corner = self.x0, self.y0, self.lattice.x0, self.lattice.y0
-        flat: NDArray[np.int64] = _flat_cells(points, *corner, self.row0, self.col0, self.rows, self.cols)
-        return flat
-
     @property
     def tile_index(self) -> TileIndex:
         """The tile whose lower-left corner is this window's; for windows made by :meth:`Lattice.tile`."""
@@ -161,17 +154,3 @@ def tile_of_cells(rows: NDArray[np.int64], cols: NDArray[np.int64]) -> tuple[NDA
 
 
 CELLS = TILE_CELLS * TILE_CELLS
-
-
-@numba.njit(cache=True, nogil=True)
-def _flat_cells(
-    points: NDArray[np.float32], x0: float, y0: float, lattice_x0: float, lattice_y0: float, row0: int, col0: int,
-    rows: int, cols: int,
-) -> NDArray[np.int64]:  # fmt: skip
-    """As :meth:`Grid.indices_of` of :meth:`Grid.to_map` has them, to the last bit, in one pass."""
-    flat = np.empty(len(points), dtype=np.int64)
-    for i in range(len(points)):
-        row = int(np.floor((np.float64(points[i, 1]) + y0 - lattice_y0) / CELL_SIZE)) - row0
-        col = int(np.floor((np.float64(points[i, 0]) + x0 - lattice_x0) / CELL_SIZE)) - col0
-        flat[i] = min(max(row, 0), rows - 1) * cols + min(max(col, 0), cols - 1)
-    return flat

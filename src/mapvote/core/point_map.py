@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mapvote.core.cells import flat_cells
 from mapvote.core.grid import Lattice, TileIndex, tile_of_cells
 from mapvote.core.ground import Heights, lay_ground
 from mapvote.core.lazy_tiles import LazyTiles
@@ -82,7 +83,7 @@ def cut_tiles(points_map: NDArray[np.floating], lattice: Lattice) -> Iterator[tu
 
 
 def _heights(points: Mapping[TileIndex, F32], lattice: Lattice) -> dict[TileIndex, Heights]:
-    return {tile: (lattice.tile(tile).flat_cells(p), p[:, 2]) for tile, p in points.items()}
+    return {tile: (flat_cells(lattice.tile(tile), p), p[:, 2]) for tile, p in points.items()}
 
 
 def _stored(points_map: NDArray[np.floating], lattice: Lattice) -> dict[TileIndex, F32]:

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mapvote.core.cells import flat_cells
 from mapvote.core.columns import column_bits, words_of
 from mapvote.core.grid import CELLS, Grid, TileIndex
 from mapvote.core.ground import base_layers
@@ -107,7 +108,7 @@ class Tile:
                 new = (intensity * (brightest(column) / 255.0)).astype(column.dtype)
             fields[name] = np.concatenate([column, new])
         other = self.but(points=np.concatenate([self.points, points]), fields=fields)
-        cells = self.window.flat_cells(points)
+        cells = flat_cells(self.window, points)
         columns = self._columns_of(points, cells)
         other.__dict__["cells"] = np.concatenate([self.cells, cells])
         other.__dict__["columns"] = tuple(np.concatenate(pair) for pair in zip(self.columns, columns, strict=True))
@@ -126,7 +127,7 @@ class Tile:
     @cached_property
     def cells(self) -> I64:
         """(n,) flat cell of each point."""
-        return self.window.flat_cells(self.points)
+        return flat_cells(self.window, self.points)
 
     @cached_property
     def base(self) -> I32:

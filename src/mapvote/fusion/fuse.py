@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapvote.config import FuseSettings
+from mapvote.core.cells import flat_cells
 from mapvote.core.grid import CELLS, TILE_CELLS, Grid, Lattice, TileIndex
 from mapvote.core.tile import Tile
 from mapvote.core.types import F32, I32, I64, N_STATES, NO_VOTE, U8, U64, Bool, CellState, MapvoteError
@@ -218,7 +219,7 @@ def _offered(votes: Sequence[TileVote], states: U8, grid: Grid) -> tuple[F32, U8
     ]
     for number, vote in enumerate(votes):
         if vote.new_points is not None and len(vote.new_points):
-            cells = grid.flat_cells(vote.new_points)
+            cells = flat_cells(grid, vote.new_points)
             keep = vote.agreed(cells, states, CellState.CHANGED_OCCUPIED)
             whose = np.full(len(keep), number, dtype=np.int32)
             found.append((vote.new_points.take(keep, axis=0), vote.measured()[keep], cells[keep], whose))

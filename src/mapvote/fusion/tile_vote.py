@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapvote.config import FuseSettings
+from mapvote.core.cells import flat_cells
 from mapvote.core.grid import CELLS, TILE_CELLS, Grid
 from mapvote.core.types import F32, I32, N_STATES, NO_VOTE, U8, U16, U64, Bool, CellState
 from mapvote.fusion.sparse_columns import Words, agreed, mark, mark_spoken, union
@@ -197,7 +198,7 @@ def fold(drives: Sequence[TileVote], grid: Grid) -> TileVote:
     intensity: list[U8] = []
     for i, drive in enumerate(ordered):
         if drive.new_points is not None:
-            here = source[grid.flat_cells(drive.new_points)] == i
+            here = source[flat_cells(grid, drive.new_points)] == i
             points.append(drive.new_points[here])
             intensity.append(drive.measured()[here])
     free = [drive.passed() for drive in ordered if drive.free is not None]

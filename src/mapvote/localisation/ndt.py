@@ -214,14 +214,11 @@ def refine(
     return Registration(T, covariance, score, inlier_share, iterations, converged)
 
 
-_MAP_VARIANCE = np.array([MAP_SIGMA_M**2] * 3 + [MAP_SIGMA_RAD**2] * 3)
-_NO_PRIOR = Certainty(COVARIANCE_SCALE, _MAP_VARIANCE, np.eye(4), np.zeros((6, 6)))
-
-
 def _known(prior: PosePrior | None) -> Certainty:
+    variance = np.array([MAP_SIGMA_M**2] * 3 + [MAP_SIGMA_RAD**2] * 3)
     if prior is None:
-        return _NO_PRIOR
-    return Certainty(COVARIANCE_SCALE, _MAP_VARIANCE, np.ascontiguousarray(prior.T_map_lidar), prior.information)
+        return Certainty(COVARIANCE_SCALE, variance, np.eye(4), np.zeros((6, 6)))
+    return Certainty(COVARIANCE_SCALE, variance, np.ascontiguousarray(prior.T_map_lidar), prior.information)
 
 
 def fitness(ndt_map: NdtMap, clouds: list[F32], T_map_lidar: F64, level: int = 0) -> float:

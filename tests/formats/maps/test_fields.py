@@ -12,6 +12,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from mapvote.core.cells import flat_cells
 from mapvote.core.point_map import all_fields
 from mapvote.formats import export_map, read_map, write_map
 from mapvote.formats.maps.cloud import Cloud
@@ -60,7 +61,7 @@ def test_fields_survive_an_edit_for_every_point_that_stays(tmp_path: Path) -> No
     before = {tuple(p): tile.fields["intensity"][i] for i, p in enumerate(tile.points.tolist())}
     edited, gone = delete_points(tile, np.full((256, 256), 2**64 - 1, dtype=np.uint64))
     new = np.array([[5.0, 5.0, 40.0]], dtype=np.float32)
-    cells = edited.window.flat_cells(new)
+    cells = flat_cells(edited.window, new)
     bright = np.array([51], dtype=np.uint8)
     edited, came = add_points(edited, new, bright, cells, np.zeros(1, dtype=np.int32), 1)
     assert gone > 0

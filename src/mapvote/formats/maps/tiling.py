@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from mapvote.core.cells import flat_cells
 from mapvote.core.grid import Lattice, TileIndex
 from mapvote.core.ground import Heights, lay_ground
 from mapvote.core.lazy_tiles import LazyTiles, in_memory_if_small
@@ -182,7 +183,7 @@ class _Parts:
         return _Asked(dict.fromkeys(self._grounded), ground)
 
     def _heights(self, index: TileIndex, points: F32) -> Heights:
-        return self._lattice.tile(index).flat_cells(points), points[:, 2]
+        return flat_cells(self._lattice.tile(index), points), points[:, 2]
 
 
 class _Asked(Mapping[TileIndex, Heights]):
