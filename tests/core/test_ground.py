@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
+import pytest
 
 from mapvote.core.grid import CELL_SIZE, Grid, Lattice
 from mapvote.core.ground import base_layers
@@ -131,6 +134,38 @@ def test_the_sidewalk_begins_a_cell_behind_its_kerb_at_most_though_mixed_pixels_
     ground = ground_of(road, walk, mixed, road=driven((0, 30), 5.0))
     assert np.abs(ground[:33]).max() < 0.05
     assert np.abs(ground[35:] - 0.15).max() < 0.05
+
+
+@pytest.mark.parametrize("turn", [np.flipud, np.fliplr, np.transpose, np.rot90])
+def test_which_way_is_north_does_not_matter(turn: Callable[[F32], F32]) -> None:
+    """A road on one side, a bank and a hedge on the other, a hole where something stood: laid out any way round."""
+    rng = np.random.default_rng(6)
+    xy = spread(rng, 50_000, (0, 30), (0, 30))
+    xy = xy[~((abs(xy[:, 0] - 12.0) < 2.0) & (abs(xy[:, 1] - 14.0) < 1.5))]
+    bank = np.maximum(0.0, 0.12 * (xy[:, 1] - 16.0)) + 0.04 * xy[:, 0]
+    hedge = np.column_stack([spread(rng, 3000, (0, 30), (22, 23)), rng.uniform(3.0, 5.0, 3000)])
+    points = np.vstack([at(xy, bank), hedge])
+    road = driven((0, 30), 6.0)
+    road[:, 2] = 0.04 * road[:, 0]
+    ground = turn(ground_of(points, road=road))
+    # the same cells of a square turned likewise, metres from its corner
+    where = turn(np.arange(100 * 100, dtype=np.float32).reshape(100, 100)).ravel().astype(int)
+    to = np.empty((10_000, 2))
+    to[where] = np.argwhere(np.ones((100, 100)))
+    cell = np.floor(points[:, :2] / CELL_SIZE).astype(int).clip(0, 99)
+    turned = [np.column_stack([CELL_SIZE * (to[c[:, 1] * 100 + c[:, 0]][:, ::-1] + 0.5), z]) for c, z in (
+        (cell, points[:, 2]), (np.floor(road[:, :2] / CELL_SIZE).astype(int).clip(0, 99), road[:, 2]))]  # fmt: skip
+    again = ground_of(turned[0], road=turned[1])
+    assert np.isnan(again).mean() == np.isnan(ground).mean()
+    assert np.nanquantile(np.abs(again - ground), 0.999) < 0.05, "who comes first to a cell may differ"
+
+
+def test_of_points_that_lie_close_the_ground_takes_the_one_that_continues_it() -> None:
+    rng = np.random.default_rng(8)
+    xy = spread(rng, 60_000, (0, 30), (0, 30))
+    lower = at(spread(rng, 6_000, (0, 30), (12, 30)), 9.95)  # worn tarmac, mixed pixels: five centimetres below
+    ground = ground_of(at(xy, 10.0), lower, road=driven((0, 30), 5.0, 10.0))
+    assert np.mean(np.abs(ground - 10.0) > 0.01) < 0.01, "but where no other point lies"
 
 
 def test_a_column_without_ground_begins_no_higher_than_a_gentle_slope_from_any_known_ground_reaches() -> None:
