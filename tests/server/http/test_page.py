@@ -187,7 +187,8 @@ def test_the_desk_is_worked_by_keyboard_and_publishing_obeys(
         browser.wait("document.activeElement.className === 'yes'")
         press(browser, "Enter")
         browser.wait("document.querySelector('#which-map').innerText.endsWith('version 4')")
-        assert browser.errors == []
+        # a picture asked for while its change is published may be gone by then; the page shows none
+        assert [said for said in browser.errors if "404" not in said or "/desk/pictures?" not in said] == []
 
 
 @contextmanager
