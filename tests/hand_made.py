@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -15,6 +15,7 @@ from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Lattice, TileIndex
 from mapvote.core.point_map import PointMap
 from mapvote.core.tile import Tile
 from mapvote.core.types import F32, NO_VOTE, U8, U16, U64, Scan
+from mapvote.fusion.sparse_columns import Words, mark, nothing_reached
 from mapvote.localisation.ndt import PosePrior
 from mapvote.localisation.tracker import Fix
 
@@ -43,6 +44,14 @@ def states_plane(cells: Mapping[Cell, int] | None = None, fill: int = NO_VOTE) -
     for cell, state in (cells or {}).items():
         plane[cell] = state
     return plane
+
+
+def at_least(marked: Sequence[Words], k: int) -> U64:
+    """(256, 256) the bits that at least ``k`` of ``marked`` set."""
+    reached = nothing_reached(k)
+    for mine in marked:
+        mark(reached, mine.cells, mine.words)
+    return np.asarray(reached[-1].reshape(SHAPE))
 
 
 def words_plane(cells: Mapping[Cell, int]) -> U64:

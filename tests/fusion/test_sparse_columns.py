@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hand_made import SHAPE, words_plane
+from hand_made import SHAPE, at_least, words_plane
 from mapvote.codec.ballot import pack_plane
 from mapvote.core.types import MapvoteError
-from mapvote.fusion.sparse_columns import Words, at_least
+from mapvote.fusion.sparse_columns import Words
 
 CELL = (10, 10)
 

@@ -10,11 +10,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hand_made import states_plane, wall, words_plane
+from hand_made import at_least, states_plane, wall, words_plane
 from mapvote.config import FuseSettings
 from mapvote.core.grid import TILE_CELLS, Lattice
 from mapvote.core.types import N_STATES, NO_VOTE, CellState
-from mapvote.fusion.sparse_columns import Words, at_least, nothing_reached
+from mapvote.fusion.sparse_columns import Words, nothing_reached
 from mapvote.fusion.tile_vote import DAY_NS, TileVote, fold, one_each, restrict, select
 
 UO, UE, CO, CE, UN = CellState

@@ -9,6 +9,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from mapvote.codec.arrays import raw_plane
 from mapvote.core.types import MapvoteError
 
 FIELD_TYPES = ("|u1", "|i1", "<u2", "<i2", "<u4", "<i4", "<u8", "<i8", "<f4", "<f8")
@@ -17,7 +18,7 @@ FIELD_TYPES = ("|u1", "|i1", "<u2", "<i2", "<u4", "<i4", "<u8", "<i8", "<f4", "<
 def pack_fields(fields: Mapping[str, NDArray[Any]]) -> bytes:
     """Columns (n,) as a msgpack map of name to (type, little-endian values), in their order: equal fields, equal
     bytes."""
-    return msgspec.msgpack.encode({name: (kind_of(c), _little(c).tobytes()) for name, c in fields.items()})
+    return msgspec.msgpack.encode({name: (kind_of(c), raw_plane(c, kind_of(c))) for name, c in fields.items()})
 
 
 def unpack_fields(raw: bytes, n: int, what: str) -> dict[str, NDArray[Any]]:
@@ -52,7 +53,3 @@ def check_kind(kind: str, what: str) -> None:
     """MapvoteError for what is no type of a field."""
     if kind not in FIELD_TYPES:
         raise MapvoteError(f"{what}: of type {kind[:20]!r}, which no field has; fetch it again")
-
-
-def _little(column: NDArray[Any]) -> NDArray[Any]:
-    return np.ascontiguousarray(column.astype(kind_of(column), copy=False))

@@ -54,6 +54,17 @@ def words_of(cells: I64, bit: I64, obstacle: Bool, size: int) -> U64:
 
 
 @numba.njit(cache=True, nogil=True)
+def outside(words: U64, occupied: U64) -> U64:
+    """(rows, cols) the voxels of ``words`` that are not ``occupied``: in one pass over both."""
+    out = np.empty_like(words)
+    for r in range(len(words)):
+        mine, held, left = words[r], occupied[r], out[r]
+        for c in range(np.uint64(0), np.uint64(len(left))):
+            left[c] = mine[c] & ~held[c]
+    return out
+
+
+@numba.njit(cache=True, nogil=True)
 def fill_columns(
     rows: I64, cols: I64, z: F64, ground_z: F32, base: I32, words: U64, counts: I32, bottom_z: F32, top_z: F32
 ) -> None:

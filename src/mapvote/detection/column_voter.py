@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 
-import numba
 import numpy as np
 
 from mapvote.config import VotingSettings
+from mapvote.core.columns import outside
 from mapvote.core.grid import TileIndex
 from mapvote.core.point_map import PointMap
 from mapvote.core.reference import bordered
@@ -44,7 +44,7 @@ class ColumnVoter:
         """Count one scan; returns (rows, cols) words of voxels whose points may be new."""
         reach = 2 if seen.scan.sigma_m > WIDE_SIGMA_M else 1
         self.evidence.count(seen.view, seen.reference, reach)
-        return _new(seen.view.hit, seen.reference.occupied)
+        return outside(seen.view.hit, seen.reference.occupied)
 
     def votes(self) -> dict[TileIndex, TileVotes]:
         """Every tile with evidence, in ascending order."""
@@ -87,17 +87,6 @@ class ColumnVoter:
         weighed = weigh(counts, outer.base, here.occupied, near, known, low, self.rules)
         crowded = beside_new(counts, outer.occupied, outer.base)[1:-1, 1:-1]
         return Judged(here, weighed, weighed.states(), crowded, np.zeros_like(weighed.gone))
-
-
-@numba.njit(cache=True, nogil=True)
-def _new(hit: U64, occupied: U64) -> U64:
-    """(rows, cols) what is struck and not occupied: in one pass over both."""
-    out = np.empty_like(hit)
-    for r in range(len(hit)):
-        struck, held, new = hit[r], occupied[r], out[r]
-        for c in range(np.uint64(0), np.uint64(len(new))):
-            new[c] = struck[c] & ~held[c]
-    return out
 
 
 def _votes_of(found: Judged, counters: U64) -> TileVotes:

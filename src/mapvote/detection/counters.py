@@ -67,6 +67,11 @@ def count_of(planes: U64, first: int, bit: int) -> int:
     return value
 
 
+def ever(planes: U64, first: int) -> U64:
+    """(rows, cols) voxels whose count, which begins at ``first``, is not 0."""
+    return np.asarray(np.bitwise_or.reduce(planes[..., first : first + PLANES], axis=-1))
+
+
 @numba.njit(cache=True, nogil=True)
 def is_open(planes: U64, bit: int) -> bool:
     """Whether rays went through a voxel from side to side, and did not only graze it along a slab.

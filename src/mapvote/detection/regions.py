@@ -18,7 +18,7 @@ from mapvote.config import VotingSettings
 from mapvote.core.columns import TOP_BIT, dilated, remnants
 from mapvote.core.grid import Grid, Lattice, TileIndex
 from mapvote.core.types import I32, NO_VOTE, U8, U64, Bool, CellState
-from mapvote.detection.counters import PLANES, STRUCK_ITSELF, THROUGH_ITSELF
+from mapvote.detection.counters import PLANES, STRUCK_ITSELF, THROUGH_ITSELF, ever
 from mapvote.detection.rules import Rules
 from mapvote.detection.votes import Judged
 
@@ -155,7 +155,7 @@ def drop_specks(states: U8, min_cells: int) -> Bool:
 
 def beside_new(planes: U64, occupied: U64, base: I32) -> U64:
     """(rows, cols) voxels in which, or next to which, something was struck where the map holds nothing."""
-    struck = np.bitwise_or.reduce(planes[..., PLANES : 2 * PLANES], axis=-1)
+    struck = ever(planes, PLANES)
     return dilated(struck & ~occupied, base, 1)
 
 
@@ -164,6 +164,6 @@ def loose_voxels(planes: U64) -> U64:
     and below them: grazing a roof says nothing (rule A). The ground bounds the lowest, the end of the word the highest.
     """
     itself = planes[..., THROUGH_ITSELF]
-    through = np.bitwise_or.reduce(planes[..., :PLANES], axis=-1) | itself
+    through = ever(planes, 0) | itself
     below, above = through << np.uint64(1) | _LOWEST, through >> np.uint64(1) | _HIGHEST
     return np.asarray(itself & ~planes[..., STRUCK_ITSELF] & below & above)

@@ -2,9 +2,9 @@
 
 A mapped voxel is gone that was crossed more often than HIT_RAYS times its hits, and stands that was met and is not. A
 cell is changed-empty if a voxel of it is gone and none stands: what no ray could decide in it goes along. So do cells
-beside it in which rays crossed something and met nothing, however few, and theirs; and cells that no ray could decide
-go with what falls, as columns have it (rule H). A free voxel met more often than rays spoke against it
-is new. Support, not area, makes a change of either: a pole is narrow and tall, a speck is neither. docs/method.md.
+beside it in which rays crossed something and met nothing, however few; and cells that no ray could decide go with what
+falls, as columns have it (rule H). A free voxel met more often than rays spoke against it is new. Support, not area,
+makes a change of either: a pole is narrow and tall, a speck is neither. docs/method.md.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ import numpy as np
 from scipy import ndimage
 
 from mapvote.config import VotingSettings
-from mapvote.core.columns import below_top, dilated
+from mapvote.core.columns import below_top, dilated, outside
 from mapvote.core.grid import Lattice, TileIndex
 from mapvote.core.point_map import PointMap
 from mapvote.core.reference import bordered
 from mapvote.core.types import I32, NO_VOTE, U8, U64, Bool, CellState, Reference
 from mapvote.core.voting import one_hot
-from mapvote.detection.counters import PLANES, count_of, newly_free
+from mapvote.detection.counters import PLANES, count_of, ever, newly_free
 from mapvote.detection.regions import HALO, JOIN_CELLS, beyond_tiles, fallen, unexplained
 from mapvote.detection.surface_counts import CROSSED, MET, PASSED, SurfaceEvidence
 from mapvote.detection.votes import TileVotes
@@ -125,7 +125,7 @@ class SurfaceVoter:
     def observe(self, seen: Observation) -> U64:
         """Count one scan; returns (rows, cols) words of voxels whose points may be new."""
         self.evidence.count(seen)
-        return seen.view.hit & ~seen.reference.occupied
+        return outside(seen.view.hit, seen.reference.occupied)
 
     def votes(self) -> dict[TileIndex, TileVotes]:
         """Every tile with evidence, in ascending order."""
@@ -165,7 +165,7 @@ class SurfaceVoter:
         states[mapped & (passed != 0)] = CellState.UNDETERMINED
         states[~mapped & (beyond != 0)] = CellState.UNDETERMINED
         states[stands != 0] = CellState.UNCHANGED_OCCUPIED
-        never_met = _any(planes, CROSSED) & ~_any(planes, MET) & here.occupied
+        never_met = ever(planes, CROSSED) & ~ever(planes, MET) & here.occupied
         return _Judged(
             here=here,
             gone=np.where(low, np.uint64(0), gone),
@@ -178,11 +178,6 @@ class SurfaceVoter:
             states=states,
             remnants=np.zeros_like(gone),
         )
-
-
-def _any(planes: U64, first: int) -> U64:
-    """(rows, cols) voxels whose counter, which begins at ``first``, is not 0."""
-    return np.asarray(np.bitwise_or.reduce(planes[..., first : first + PLANES], axis=-1))
 
 
 def met_again(new: U64, planes: U64, base: I32) -> U64:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from mapvote.codec.words import unpack_sparse
 from mapvote.core.columns import EVERY_BIT
-from mapvote.core.grid import CELLS, TILE_CELLS
+from mapvote.core.grid import CELLS
 from mapvote.core.types import I32, NO_VOTE, U8, U64, Bool
 
 _BLOCK = 64
@@ -75,14 +75,6 @@ def union(marked: Sequence[Words]) -> Words:
     return Words(cells[order][first], np.bitwise_or.reduceat(words, first))
 
 
-def at_least(marked: Sequence[Words], k: int) -> U64:
-    """(256, 256) the bits that at least ``k`` of ``marked`` set: a bitwise running count, no loop over bits."""
-    reached = nothing_reached(k)
-    for mine in marked:
-        mark(reached, mine.cells, mine.words)
-    return reached[-1].reshape(TILE_CELLS, TILE_CELLS)
-
-
 def nothing_reached(k: int) -> U64:
     """(k, 65536) the bits that one, two .. k voters set, before any is asked; see :func:`mark`."""
     return np.zeros((k, CELLS), dtype=np.uint64)
@@ -125,8 +117,9 @@ def _not_zero(words: U64) -> tuple[NDArray[np.intp], U64]:
 
 @numba.njit(cache=True, nogil=True)
 def mark(reached: U64, cells: NDArray[np.intp], words: U64) -> None:
-    """One more voter in ``reached`` (k, cells): bits that ``reached[i]`` had are now in ``reached[i + 1]`` where it
-    sets them too. It ends as the bits that one, two .. k voters set."""
+    """One more voter in ``reached`` (k, cells), a running count of bits without a loop over them: bits that
+    ``reached[i]`` had are now in ``reached[i + 1]`` where it sets them too. It ends as the bits that one, two .. k
+    voters set."""
     for i in range(len(cells)):
         _mark_one(reached, cells[i], words[i])
 

@@ -54,8 +54,8 @@ def pack_tile(tile: Tile, edited_from: tuple[Tile, TileHashes] | None = None) ->
         if len(raw) > MAX_PLANE_BYTES:
             too_large = f"{len(raw)} bytes, {MAX_PLANE_BYTES} are the most: thin the map out, or leave fields out"
             raise MapvoteError(f"tile {tile_key(tile.index)}: its {what} take {too_large}")
-        digest = hashlib.sha256(raw).hexdigest()
-        blobs[digest] = compress(raw, _ZSTD_LEVEL)
+        digest, plane = _packed(raw)
+        blobs.update(plane)
         return digest
 
     same_ground, same_free, same_fields = (
@@ -125,7 +125,10 @@ def _unpack(data: bytes, digest: str) -> bytes:
 
 def pack_memory(memory: Memory) -> tuple[str, dict[str, bytes]]:
     """What a tile remembers as (hash, plane by hash)."""
-    raw = _raw_memory(memory)
+    return _packed(_raw_memory(memory))
+
+
+def _packed(raw: bytes | memoryview) -> tuple[str, dict[str, bytes]]:
     digest = hashlib.sha256(raw).hexdigest()
     return digest, {digest: compress(raw, _ZSTD_LEVEL)}
 

@@ -73,6 +73,10 @@ class Database:
         self.engine.dispose()
 
 
+MOST_ASKED = 500
+"""In one statement: SQLite limits its variables."""
+
+
 def address_of(url: sa.URL) -> str:
     """A database URL without its password: what may be shown, logged, and sent to a cluster."""
     return url._replace(password=None).render_as_string()

@@ -22,7 +22,7 @@ from mapvote.server.store.blobs import (
     unpack_memory_plane,
     unpack_tile,
 )
-from mapvote.server.store.database import insert_rows
+from mapvote.server.store.database import MOST_ASKED, insert_rows
 
 
 def current_number(connection: sa.Connection) -> int:
@@ -94,8 +94,9 @@ def points_of(connection: sa.Connection, tiles: Mapping[TileIndex, TileHashes]) 
     """How many points each tile holds, as their planes say at their beginning: none is unpacked."""
     b, found = schema.blobs.c, dict[str, int]()
     digests = sorted({hashes.points for hashes in tiles.values()})
-    for start in range(0, len(digests), _AT_ONCE):
-        heads = sa.select(b.hash, sa.func.substr(b.data, 1, FRAME_HEAD)).where(b.hash.in_(digests[start:][:_AT_ONCE]))
+    for start in range(0, len(digests), MOST_ASKED):
+        some = b.hash.in_(digests[start : start + MOST_ASKED])
+        heads = sa.select(b.hash, sa.func.substr(b.data, 1, FRAME_HEAD)).where(some)
         found |= {digest: points_in_plane(bytes(head), digest) for digest, head in connection.execute(heads)}
     return {index: found.get(hashes.points, 0) for index, hashes in tiles.items()}
 
@@ -190,8 +191,8 @@ def next_seq(connection: sa.Connection) -> int:
 def add_blobs(connection: sa.Connection, planes: Mapping[str, bytes]) -> None:
     """Store planes that are not there yet."""
     digests = list(planes)
-    for start in range(0, len(digests), 500):  # SQLite's limit on variables in one statement
-        some = digests[start : start + 500]
+    for start in range(0, len(digests), MOST_ASKED):
+        some = digests[start : start + MOST_ASKED]
         known = set(connection.execute(_KNOWN_BLOBS, {"digests": some}).scalars())
         new = [(digest, planes[digest]) for digest in some if digest not in known]
         if new:
@@ -251,8 +252,6 @@ VERSION_COLUMNS = [column for column in schema.versions.c if column.name != "sum
 """What a :class:`Version` is made of."""
 _ONE_BY_ONE = 200
 """So many tiles are sooner asked for one by one than found among all of the map's."""
-_AT_ONCE = 500
-"""SQLite's limit on variables in one statement."""
 _T = schema.version_tiles
 _TILE = (
     sa.select(*(_T.c[plane] for plane in schema.TILE_PLANES))

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from threading import Lock
 from typing import Any
 
@@ -21,12 +21,11 @@ from mapvote.core.grid import TileIndex
 from mapvote.fusion.sparse_columns import Words
 from mapvote.fusion.tile_vote import TileVote
 from mapvote.server.store import schema
+from mapvote.server.store.database import MOST_ASKED
 from mapvote.server.store.quarantine import Damage, DamagedBallots, ballot_name, ballot_sum
 
 REMEMBERED_BYTES = 128 << 20
 """Some 1,500 votes of a vehicle on a tile."""
-_AT_ONCE = 500
-"""SQLite's limit on variables in one statement."""
 _T = schema.ballot_tiles
 _PLANES_OF = sa.select(_T.c.ballot, *(_T.c[plane] for plane in schema.BALLOT_PLANES), _T.c.base, _T.c.sum).where(
     _T.c.row == sa.bindparam("row", type_=sa.BigInteger),
@@ -103,18 +102,7 @@ def read_votes(connection: sa.Connection, index: TileIndex, stored: Sequence[Sto
 
 
 def _said_by(stored: StoredVote, said: TileVote) -> TileVote:
-    return TileVote(
-        vehicle=stored.vehicle,
-        end_ns=stored.end_ns,
-        digest=stored.digest,
-        version=stored.version,
-        states=said.states,
-        tally=said.tally,
-        gone=said.gone,
-        new_points=said.new_points,
-        intensity=said.intensity,
-        free=said.free,
-    )
+    return replace(said, vehicle=stored.vehicle, end_ns=stored.end_ns, digest=stored.digest, version=stored.version)
 
 
 def _rows(connection: sa.Connection, index: TileIndex, ballots: Sequence[int]) -> dict[int, Any]:
@@ -122,8 +110,8 @@ def _rows(connection: sa.Connection, index: TileIndex, ballots: Sequence[int]) -
     this process happened to read before the disk lost it."""
     found: dict[int, Any] = {}
     damaged: list[Damage] = []
-    for start in range(0, len(ballots), _AT_ONCE):
-        asked_of = {"row": index[0], "col": index[1], "ballots": ballots[start : start + _AT_ONCE]}
+    for start in range(0, len(ballots), MOST_ASKED):
+        asked_of = {"row": index[0], "col": index[1], "ballots": ballots[start : start + MOST_ASKED]}
         for row in connection.execute(_PLANES_OF, asked_of).all():
             if row.sum != ballot_sum(row):
                 damaged.append(Damage("ballot", ballot_name(row.ballot, *index), "is not what its sum says"))
