@@ -59,7 +59,7 @@ def slowed(verb_words: list[str], patch: str) -> list[str]:
 
 VERBS = {
     "info my_map": "import mapvote.formats.describe as m; m.describe = wait",
-    "doctor MY_DRIVE": "import mapvote.doctor as m; m.diagnose = wait",
+    "doctor MY_DRIVE": "import mapvote.doctor.diagnosis as m; m.diagnose = wait",
     "build MY_DRIVE --out new": "import mapvote.slam.build as m; m.build_map = wait",
     "vote MY_DRIVE --map my_map --out new": "import mapvote.vehicle as m; m.vote_drive = wait",
     "update my_map car_1.ballot --out new": "import mapvote.fusion.offline as m; m.update_map = wait",

@@ -18,7 +18,8 @@ from mapvote.core.point_map import PointMap, cut_tiles, map_from_points
 from mapvote.core.sensors import SENSORS
 from mapvote.core.tile import Tile
 from mapvote.core.types import F64, Scan
-from mapvote.doctor import Finding, diagnose
+from mapvote.doctor.diagnosis import diagnose
+from mapvote.doctor.finding import Finding
 from mapvote.doctor.other_unit import in_another_unit
 from mapvote.doctor.readings import CAMERA_TO_LIDAR
 from mapvote.formats import DriveWriter

@@ -16,7 +16,7 @@ from mapvote.cli.terminal import stages_that_vanish, waiting
 
 if TYPE_CHECKING:
     from mapvote.core.point_map import PointMap
-    from mapvote.doctor import Finding
+    from mapvote.doctor.finding import Finding
 
 
 def register(app: typer.Typer) -> None:
@@ -78,7 +78,7 @@ def doctor(
     from rich.console import Console
 
     from mapvote.core.types import MapvoteError
-    from mapvote.doctor import Diagnosis, diagnose
+    from mapvote.doctor.diagnosis import Diagnosis, diagnose
     from mapvote.formats import read_map
     from mapvote.formats.drives.options import DriveOptions
 

@@ -1,8 +1,10 @@
-"""The doctor's cheap looks, before a verb works on a drive or a map: an error stops it, warnings are said aloud."""
+"""The doctor's cheap looks at what a verb works with: an error stops it, warnings are said aloud."""
 
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -11,16 +13,39 @@ from mapvote.cli.terminal import progress
 if TYPE_CHECKING:
     from mapvote.core.point_map import PointMap
     from mapvote.core.types import Drive
+    from mapvote.doctor.cheap import LookedAt
+    from mapvote.doctor.finding import Finding
 
 
-def look_at(drive: Drive) -> None:
-    """MapvoteError for a drive that cannot be used so. Every scan is read once."""
-    from mapvote.doctor import must_be_usable
+@contextmanager
+def usable_drives(drives: Sequence[Drive]) -> Iterator[list[Drive]]:
+    """The drives, looked at while they are read; nothing may be written before this ends.
 
-    with progress(f"looking at {drive.path}") as tell:
-        warnings = must_be_usable(drive, lambda stage, done, total: tell(done, total))
-    for finding in warnings:
-        print(f"warning: {drive.path}: {finding.what}", file=sys.stderr)
+    MapvoteError for one that cannot be used so: at once if some of its scans show it, else at the end. Whatever else
+    stops the work, what is wrong with a drive is told rather than what came of it.
+    """
+    from mapvote.core.types import MapvoteError
+    from mapvote.doctor.cheap import LookedAt
+
+    watching = []
+    for drive in drives:
+        with progress(f"looking at {drive.path}") as tell:
+            watching.append(LookedAt(drive, tell))
+    try:
+        yield [one.drive for one in watching]
+    except MapvoteError:
+        _warnings_of(watching)
+        raise
+    for path, found in _warnings_of(watching):
+        _warn(path, found)
+
+
+def _warnings_of(watching: list[LookedAt]) -> list[tuple[str, list[Finding]]]:
+    found = []
+    for one in watching:
+        with progress(f"looking at {one.drive.path}") as tell:
+            found.append((str(one.drive.path), one.warnings(tell)))
+    return found
 
 
 def sound_map(path: Path | str) -> PointMap:
@@ -34,7 +59,12 @@ def sound_map(path: Path | str) -> PointMap:
 
 def look_at_map(path: str, point_map: PointMap) -> None:
     """MapvoteError for a map whose points cannot be used so."""
-    from mapvote.doctor import check_cloud, tile_by_tile, usable
+    from mapvote.doctor.clouds import check_cloud, tile_by_tile
+    from mapvote.doctor.finding import usable
 
-    for finding in usable(path, check_cloud(tile_by_tile(point_map))):
+    _warn(path, usable(path, check_cloud(tile_by_tile(point_map))))
+
+
+def _warn(path: str, found: list[Finding]) -> None:
+    for finding in found:
         print(f"warning: {path}: {finding.what}", file=sys.stderr)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from mapvote.cli.looks import look_at
+from mapvote.cli.looks import usable_drives
 from mapvote.cli.options import DRIVE, Config, DrivePath, KeyFile, key_in, with_drive_options
 from mapvote.cli.remote import client_of, map_at, region_in
 from mapvote.cli.terminal import progress, waiting
@@ -49,10 +49,8 @@ def build(
         raise typer.BadParameter(f"{out} exists; name a new folder", param_hint="--out")
     settings = load_settings(config)
     opened = [open_drive(path, **drive_options) for path in drives]
-    for drive in opened:
-        look_at(drive)
-    with progress("mapping") as tell:
-        point_map, report = build_map(opened, settings, progress=tell)
+    with usable_drives(opened) as looked_at, progress("mapping") as tell:
+        point_map, report = build_map(looked_at, settings, progress=tell)
     with waiting(f"writing {out}"):
         write_map(point_map, out)
     _tell(report, out)
@@ -144,14 +142,13 @@ def vote(
             wanted = None if region is None else region_in(region)
             point_map = open_map.enter_context(map_at(where, key_file, region=wanted))
         drive = open_drive(drive_path, vehicle=vehicle, frame=frame_of(point_map.georeference), **drive_options)
-        look_at(drive)
         localise = None
         if trust_prior:
             if drive.T_map_lidar_prior is None:
                 missing = "has no prior to trust; give one with --prior, or let it be localised"
                 raise MapvoteError(f"{drive_path}: {missing}")
             localise = GivenPoses(drive.stamps_ns, drive.T_map_lidar_prior)
-        with progress("voting") as tell:
+        with usable_drives([drive]) as (drive,), progress("voting") as tell:
             ballot, report = vote_drive(drive, point_map, settings, localise=localise, progress=tell)
     data = encode(ballot)
     if out is not None:

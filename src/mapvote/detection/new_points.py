@@ -138,8 +138,8 @@ class NewPoints:
         """Points (m, 3) in map metres of each tile, sorted by voxel key; (m, 4) with their intensity."""
         points = self._one_a_voxel([*map(self._run, self._runs), *self._short(), *self._waiting])
         rows, cols = tile_of_cells(*self.lattice.cells_of(points))
-        tiles = sorted({(int(r), int(c)) for r, c in zip(*np.unique([rows, cols], axis=1), strict=True)})
-        return {(r, c): points[(rows == r) & (cols == c)] for r, c in tiles}
+        tiles = ((r, c) for r in np.unique(rows) for c in np.unique(cols[rows == r]))
+        return {(int(r), int(c)): points[(rows == r) & (cols == c)] for r, c in tiles}
 
 
 def points_in(window: Grid, points_map: F64, words: U64, base: I32) -> tuple[F32, U8 | None]:

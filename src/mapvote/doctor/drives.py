@@ -8,14 +8,14 @@ from pathlib import Path
 import numpy as np
 
 from mapvote.core.types import F32, F64, Drive, MapvoteError
+from mapvote.doctor.cheap import IN_MAP_FRAME, cheap_checks
 from mapvote.doctor.finding import Finding, Progress, in_order
 from mapvote.doctor.frames import check_agreement
 from mapvote.doctor.looks import Looks, look_at_all
 from mapvote.doctor.motion import Run, follow, starts_across, starts_of_runs
-from mapvote.doctor.movement import check_scan_motion, in_map_frame
-from mapvote.doctor.prior import NO_PRIOR, check_prior, check_times
+from mapvote.doctor.movement import check_scan_motion
+from mapvote.doctor.prior import NO_PRIOR
 from mapvote.doctor.road import Road, find_road
-from mapvote.doctor.scans import check_scans
 from mapvote.doctor.scatter import range_scatter_m
 from mapvote.doctor.whole import CHAIN_SCANS
 from mapvote.formats import open_drive
@@ -27,11 +27,6 @@ _SCATTER_M = 0.25
 """Sound sensors show 0.02 to 0.04 m."""
 _HIGHEST_M = 4.5
 """Of a sensor over the road."""
-IN_MAP_FRAME = Finding(
-    "error",
-    "the points are in the map's frame already: they move along with the prior",
-    "give them in the sensor's frame: p_lidar = inverse(T_map_lidar) p_map, one pose a scan",
-)
 
 
 def open_for_examination(path: Path, options: DriveOptions) -> tuple[Drive | None, list[Finding]]:
@@ -46,16 +41,6 @@ def open_for_examination(path: Path, options: DriveOptions) -> tuple[Drive | Non
         return None, found
 
 
-def cheap_checks(drive: Drive, progress: Progress | None = None) -> tuple[list[Finding], Looks]:
-    """What shows without registering a scan; every file is looked at."""
-    looks = look_at_all(drive, None if progress is None else lambda done, n: progress("looking at scans", done, n))
-    T = drive.T_map_lidar_prior
-    if T is not None and len(looks.index) and in_map_frame(T, looks):
-        return [IN_MAP_FRAME], looks
-    found = check_times(drive) + check_scans(drive, looks)
-    return found + (check_prior(drive) if len(drive) >= 2 else []), looks
-
-
 def examine_drive(
     path: Path, options: DriveOptions | None = None, progress: Progress | None = None
 ) -> tuple[list[Finding], Drive | None, F64 | None]:
@@ -63,7 +48,8 @@ def examine_drive(
     drive, found = open_for_examination(path, options or DriveOptions())
     if drive is None:
         return found, None, None
-    more, looks = cheap_checks(drive, progress)
+    looks = look_at_all(drive, None if progress is None else lambda done, n: progress("looking at scans", done, n))
+    more = cheap_checks(drive, looks)
     if found:  # the prior could not be read: that there is none, goes without saying
         more = [f for f in more if f != NO_PRIOR]
     found += more

@@ -6,6 +6,8 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Literal
 
+from mapvote.core.types import MapvoteError
+
 Severity = Literal["error", "warning", "note"]
 Progress = Callable[[str, int, int], None]
 """Told (stage, done, in all)."""
@@ -26,3 +28,12 @@ class Finding:
 def in_order(found: Iterable[Finding]) -> list[Finding]:
     """Errors first; the same said once."""
     return sorted(dict.fromkeys(found), key=lambda f: _ORDER[f.severity])
+
+
+def usable(path: str, found: list[Finding]) -> list[Finding]:
+    """The warnings among what was found at ``path``; MapvoteError with the first error, if there is one."""
+    errors = [f for f in found if f.severity == "error"]
+    if errors:
+        more = f" ({len(errors) - 1} more errors: mapvote doctor {path})" if len(errors) > 1 else ""
+        raise MapvoteError(f"{path}: {errors[0].what}. {errors[0].mend}{more}")
+    return [f for f in found if f.severity == "warning"]

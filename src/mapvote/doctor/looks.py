@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable
+from contextlib import suppress
+from dataclasses import dataclass, replace
 
 import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from mapvote.core.types import F32, F64, I64, Drive, MapvoteError
+from mapvote.core.types import F32, F64, I64, Drive, MapvoteError, Scan
 
 SECTORS = 36
 _POINTS = 12_000
@@ -59,50 +60,81 @@ class Looks:
         return leaps
 
 
+class Looking:
+    """A drive of which every scan is looked at when it is first read, whoever reads it."""
+
+    def __init__(self, drive: Drive) -> None:
+        self.drive = replace(drive, read_scan=self._read)
+        """The same drive, looked at on the way."""
+        self._unseen = drive
+        self._rows: dict[int, F64] = {}
+        self._counts: dict[int, int] = {}
+        self._refused: dict[int, str] = {}
+        self._times = self._intensity = False
+
+    def _read(self, i: int) -> Scan:
+        try:
+            scan = self._unseen.read_scan(i)
+        except MapvoteError as error:
+            self._refused[i] = str(error)
+            raise
+        if i not in self._rows:
+            self._rows[i] = _look(scan.points, max(1, len(scan.points) // _POINTS), np.array(QUANTA_M))
+            self._counts[i] = len(scan.points)
+            self._times |= scan.time_s is not None
+            self._intensity |= scan.intensity is not None
+        return scan
+
+    def look(self, indices: Iterable[int], progress: Callable[[int, int], None] | None = None) -> Looks:
+        """Read those scans that nobody has read yet; returns what all that were read until now show. ``progress`` is
+        told (done, in all)."""
+        left = [i for i in indices if i not in self._rows and i not in self._refused]
+        for done, i in enumerate(left):
+            with suppress(MapvoteError):  # it is kept among the refused
+                self._read(i)
+            if progress is not None:
+                progress(done + 1, len(left))
+        index = np.array(sorted(self._rows), dtype=np.int64)
+        table: NDArray[np.float64] = np.array([self._rows[i] for i in index.tolist()]).reshape(len(index), _WIDTH)
+        low, high, mean, range_m, sectors, near, unit, rounded, turns, print_ = np.split(
+            table, np.cumsum(_PARTS)[:-1], axis=1
+        )
+        return Looks(
+            index=index,
+            count=np.array([self._counts[i] for i in index.tolist()], dtype=np.int64),
+            low=low,
+            high=high,
+            mean=mean,
+            range_m=range_m,
+            sectors=sectors,
+            near=near[:, 0],
+            unit=unit,
+            rounded=rounded,
+            turns=turns[:, 0],
+            print_=print_[:, 0],
+            has_times=self._times,
+            has_intensity=self._intensity,
+            refused=dict(self._refused),
+        )
+
+
 def look_at_all(drive: Drive, progress: Callable[[int, int], None] | None = None) -> Looks:
     """Every scan of the drive read once. ``progress`` is told (done, in all)."""
-    rows: list[F64] = []
-    counts: list[int] = []
-    index: list[int] = []
-    refused: dict[int, str] = {}
-    times = intensity = False
-    for i in range(len(drive)):
-        try:
-            scan = drive.read_scan(i)
-        except MapvoteError as error:
-            refused[i] = str(error)
-        else:
-            rows.append(_look(scan.points, max(1, len(scan.points) // _POINTS), np.array(QUANTA_M)))
-            counts.append(len(scan.points))
-            index.append(i)
-            times |= scan.time_s is not None
-            intensity |= scan.intensity is not None
-        if progress is not None:
-            progress(i + 1, len(drive))
-    table: NDArray[np.float64] = np.array(rows).reshape(len(rows), -1 if rows else _WIDTH)
-    parts = np.split(table, np.cumsum(_PARTS)[:-1], axis=1)
-    low, high, mean, range_m, sectors, near, unit, rounded, turns, print_ = parts
-    return Looks(
-        np.array(index, dtype=np.int64),
-        np.array(counts, dtype=np.int64),
-        low,
-        high,
-        mean,
-        range_m,
-        sectors,
-        near[:, 0],
-        unit,
-        rounded,
-        turns[:, 0],
-        print_[:, 0],
-        times,
-        intensity,
-        refused,
-    )
+    return Looking(drive).look(range(len(drive)), progress)
 
 
 _PARTS = (3, 3, 3, 3, SECTORS, 1, 3, len(QUANTA_M), 1, 1)
 _WIDTH = sum(_PARTS)
+
+
+@numba.njit(cache=True, nogil=True)
+def _is_whole(points: F32, i: int, quantum: float) -> bool:
+    """Whether all coordinates of the i-th of points (n, 3) are multiples of ``quantum``: mostly the first is not."""
+    for axis in range(3):
+        v = np.float64(points[i, axis]) / quantum
+        if not abs(v - np.round(v)) < 1e-3:
+            return False
+    return True
 
 
 @numba.njit(cache=True, nogil=True)
@@ -130,11 +162,7 @@ def _look(points: F32, stride: int, quanta: F64) -> F64:
             turns += step / (2.0 * np.pi)
         before = azimuth
         for k in range(len(quanta)):
-            whole = True
-            for axis in range(3):
-                v = np.float64(points[i, axis]) / quanta[k]
-                whole = whole and abs(v - np.round(v)) < 1e-3
-            rounded[k] += whole
+            rounded[k] += _is_whole(points, i, quanta[k])
         print_ += (n % 97 + 1.0) * distance
         n += 1
     out = np.empty(3 + 3 + 3 + 3 + 36 + 1 + 3 + len(quanta) + 1 + 1)

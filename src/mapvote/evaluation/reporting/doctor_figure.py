@@ -11,7 +11,7 @@ import numpy as np
 from mapvote.core.geometry import transform
 from mapvote.core.point_map import PointMap, all_points
 from mapvote.core.types import F32, F64, Drive, MapvoteError
-from mapvote.doctor import Diagnosis
+from mapvote.doctor.diagnosis import Diagnosis
 from mapvote.evaluation.reporting import style
 
 _SCANS = 6
