@@ -110,7 +110,7 @@ def write_ballot(
             "is the drive on this map, and its prior in the map's frame?"
         )
     points, two_stage = new_points.by_tile(), settings.voting.two_stage
-    tiles = [_ballot_tile(point_map, tile, votes, points.get(tile), two_stage) for tile, votes in voter.each()]
+    tiles = [_ballot_tile(point_map, tile, votes, points(tile), two_stage) for tile, votes in voter.each()]
     tiles.sort(key=lambda tile: tile.tile)
     return Ballot(
         map_id=point_map.map_id,
@@ -133,16 +133,14 @@ def write_ballot(
     )
 
 
-def _ballot_tile(
-    point_map: PointMap, tile: TileIndex, votes: TileVotes, points: F64 | None, two_stage: bool
-) -> BallotTile:
+def _ballot_tile(point_map: PointMap, tile: TileIndex, votes: TileVotes, points: F64, two_stage: bool) -> BallotTile:
     """One-stage, the server decides: then every cell that got such a vote may need its points and its mask."""
     changed = {
         change: votes.states == change if two_stage else votes.tally[..., change] > 0
         for change in (CellState.CHANGED_OCCUPIED, CellState.CHANGED_EMPTY)
     }
     new_points = intensity = None
-    if points is not None:
+    if len(points):
         window = point_map.lattice.tile(tile)
         base = reference_window(point_map, window).base
         new = np.where(changed[CellState.CHANGED_OCCUPIED], votes.new, np.uint64(0))

@@ -48,7 +48,7 @@ def test_of_each_voxel_the_first_point_that_was_offered_is_kept(seed: int) -> No
     new = NewPoints(LATTICE)
     for points in offered:
         new.offer(points)
-    kept = np.concatenate(list(new.by_tile().values()))
+    kept = np.concatenate([new.by_tile()(tile) for tile in ((-1, -1), (-1, 0), (0, -1), (0, 0))])
     everything = np.concatenate(offered)
     assert len(kept) == len(voxels(kept)) == len(voxels(everything))
     for point in kept:
@@ -60,15 +60,15 @@ def test_points_come_back_by_tile_in_ascending_order_and_asking_twice_changes_no
     new = NewPoints(LATTICE)
     new.offer(np.array([[80.0, 1.0, 1.0], [1.0, 1.0, 2.0], [1.0, 1.0, 1.0], [-1.0, 1.0, 1.0]]))
     new.offer(np.zeros((0, 3)))
-    first = new.by_tile()
-    assert list(first) == [(0, -1), (0, 0), (0, 1)]
-    assert first[0, 0][:, 2].tolist() == [1.0, 2.0]
-    again = new.by_tile()
-    assert all(again[tile].tobytes() == first[tile].tobytes() for tile in first)
+    first, again = new.by_tile(), new.by_tile()
+    assert [len(first((0, col))) for col in range(-2, 3)] == [0, 1, 2, 1, 0]
+    assert first((0, 0))[:, 2].tolist() == [1.0, 2.0]
+    for col in range(-1, 2):
+        np.testing.assert_array_equal(again((0, col)), first((0, col)))
 
 
-def test_a_drive_without_new_points_has_no_tiles() -> None:
-    assert NewPoints(LATTICE).by_tile() == {}
+def test_a_drive_without_new_points_has_none_in_any_tile() -> None:
+    assert NewPoints(LATTICE).by_tile()((0, 0)).shape == (0, 3)
 
 
 def test_points_of_a_tile_are_cut_to_a_word_and_told_from_its_corner() -> None:
@@ -113,6 +113,6 @@ def test_runs_that_are_sorted_on_the_way_keep_the_first_point_of_each_voxel(monk
     monkeypatch.setattr(new_points, "_COMPACT_AT", 100)
     for points in offered:
         on_the_way.offer(points)
-    assert len(on_the_way._runs) > 2
-    for tile, kept in at_once.by_tile().items():
-        np.testing.assert_array_equal(on_the_way.by_tile()[tile], kept)
+    assert len(on_the_way._runs[0, 0]) > 2
+    for tile in ((-1, -1), (-1, 0), (0, -1), (0, 0)):
+        np.testing.assert_array_equal(on_the_way.by_tile()(tile), at_once.by_tile()(tile))

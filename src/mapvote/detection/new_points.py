@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
+from collections.abc import Callable
+
 import numba
 import numpy as np
 
@@ -72,8 +75,8 @@ class NewPoints:
         does not look there: only rules that ask more of a new voxel than that a scan struck it can take it.
         ``intensity``: keep it with each point."""
         self.lattice, self.beyond, self.intensity = lattice, beyond, intensity
-        self._shelf, self._runs = Shelf(), list[Place]()
-        """Points in ascending order of their voxels, each run with one point a voxel."""
+        self._shelf, self._runs = Shelf(), defaultdict[TileIndex, list[Place]](list)
+        """Of each tile points in ascending order of their voxels, each run with one point a voxel."""
         self._last: F64 | None = None
         """The run that is still small."""
         self._waiting: list[F64] = []
@@ -119,14 +122,15 @@ class NewPoints:
         run = self._one_a_voxel([*self._short(), *self._waiting])
         self._last = run if len(run) < _COMPACT_AT else None
         if self._last is None:
-            self._runs.append(self._shelf.put(run.tobytes()))
+            for tile, points in self._of_tiles(run).items():
+                self._runs[tile].append(self._shelf.put(points.tobytes()))
         self._waiting, self._count = [], 0
 
     def _short(self) -> list[F64]:
         return [] if self._last is None else [self._last]
 
     def _run(self, place: Place) -> F64:
-        return self._shelf.read(place).view(np.float64).reshape(-1, 4 if self.intensity else 3)
+        return np.frombuffer(self._shelf.read(place)).reshape(-1, 4 if self.intensity else 3)
 
     def _one_a_voxel(self, clouds: list[F64]) -> F64:
         every = np.concatenate([np.zeros((0, 4 if self.intensity else 3)), *clouds])
@@ -134,9 +138,18 @@ class NewPoints:
         first = first_of_each(keys)
         return every[first[np.argsort(keys[first])]]
 
-    def by_tile(self) -> dict[TileIndex, F64]:
-        """Points (m, 3) in map metres of each tile, sorted by voxel key; (m, 4) with their intensity."""
-        points = self._one_a_voxel([*map(self._run, self._runs), *self._short(), *self._waiting])
+    def by_tile(self) -> Callable[[TileIndex], F64]:
+        """What gives the points (m, 3) of a tile, map metres, sorted by voxel key; (m, 4) with their intensity. Those
+        of all tiles of a long drive are never held together."""
+        rest = self._of_tiles(self._one_a_voxel([*self._short(), *self._waiting]))
+
+        def of_tile(tile: TileIndex) -> F64:
+            last = [rest[tile]] if tile in rest else []
+            return self._one_a_voxel([*map(self._run, self._runs.get(tile, [])), *last])
+
+        return of_tile
+
+    def _of_tiles(self, points: F64) -> dict[TileIndex, F64]:
         rows, cols = tile_of_cells(*self.lattice.cells_of(points))
         tiles = ((r, c) for r in np.unique(rows) for c in np.unique(cols[rows == r]))
         return {(int(r), int(c)): points[(rows == r) & (cols == c)] for r, c in tiles}

@@ -69,7 +69,7 @@ class PackedTiles(Mapping[TileIndex, U64]):
 
     def _unpacked(self, place: Place, planes: U64) -> U64:
         """``planes``, which come empty, with what was packed."""
-        data = self._shelf.read(place).tobytes()
+        data = self._shelf.read(place)
         raw = np.frombuffer(unpack_bytes(data, CELLS * 8 * (self.words + 1), "evidence"), dtype=np.uint64)
         cells, *words = raw.reshape(self.words + 1, -1)
         planes.reshape(CELLS, self.words)[cells.astype(np.intp)] = np.stack(words, axis=1)

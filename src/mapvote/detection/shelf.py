@@ -1,23 +1,23 @@
-"""Bytes that are kept for long, in blocks of their own: laid among what comes and goes with every scan, each would keep
-a hole open around it, and the process would grow by its holes."""
+"""Bytes that are kept to the end of a drive and asked for once or twice: the first of them in memory, the others in a
+file without a name, so that a vehicle needs no more memory for a long road than for a short one."""
 
 from __future__ import annotations
 
-from typing import NamedTuple
+import mmap
+import tempfile
+import weakref
+from typing import BinaryIO, NamedTuple
 
-import numpy as np
+from mapvote.core.types import MapvoteError
 
-from mapvote.core.types import U8
-
-BLOCK = 64 << 20
-"""Bytes of a block: more than the heap ever takes for itself (32 MB), so that the system lends it apart from the heap,
-and lends memory only for what is written."""
+IN_MEMORY = 16 << 20
+"""Bytes held before a file is begun: a drive of a kilometre or two asks the disk for nothing. They lie apart from the
+heap: laid among what comes and goes with every scan, each thing would keep a hole open around it."""
 
 
 class Place(NamedTuple):
-    """Where something lies on a shelf."""
+    """Where something lies on a shelf, in bytes."""
 
-    block: int
     start: int
     stop: int
 
@@ -26,19 +26,43 @@ class Shelf:
     """Bytes are put down one after another, and never moved. What is put down is not taken away again."""
 
     def __init__(self) -> None:
-        self._blocks: list[U8] = []
-        self._used = 0
-        """Bytes of the last block."""
+        self._memory: mmap.mmap | None = None
+        self._file: BinaryIO | None = None
+        self._used = self._in_file = 0
+        """Bytes in memory and in the file."""
 
     def put(self, data: bytes | memoryview) -> Place:
-        """Where a copy of ``data`` lies."""
-        if not self._blocks or self._used + len(data) > len(self._blocks[-1]):
-            self._blocks.append(np.empty(max(BLOCK, len(data)), dtype=np.uint8))
-            self._used = 0
-        start, self._used = self._used, self._used + len(data)
-        self._blocks[-1][start : self._used] = np.frombuffer(data, dtype=np.uint8)
-        return Place(len(self._blocks) - 1, start, self._used)
+        """Where a copy of ``data`` lies. MapvoteError if it no longer fits into memory, and no file can be written."""
+        if self._memory is None:
+            self._memory = mmap.mmap(-1, IN_MEMORY)
+        start, stop = self._used, self._used + len(data)
+        if stop > IN_MEMORY:
+            return self._put_in_file(memoryview(data))
+        self._memory[start:stop] = data
+        self._used = stop
+        return Place(start, stop)
 
-    def read(self, place: Place) -> U8:
-        """(n,) what lies there; a view."""
-        return self._blocks[place.block][place.start : place.stop]
+    def _put_in_file(self, data: memoryview) -> Place:
+        start, stop = self._in_file, self._in_file + len(data)
+        try:
+            if self._file is None:
+                self._file = tempfile.TemporaryFile(prefix="mapvote_drive_", buffering=0)  # noqa: SIM115
+                weakref.finalize(self, self._file.close)
+            self._file.seek(start)
+            while data:
+                data = data[self._file.write(data) :]
+        except OSError as error:
+            raise MapvoteError(
+                f"{tempfile.gettempdir()}: what a long drive keeps, 20 MB a kilometre, could not be written there "
+                f"({error.strerror}): make room, or name another folder in TMPDIR"
+            ) from error
+        self._in_file = stop
+        return Place(IN_MEMORY + start, IN_MEMORY + stop)
+
+    def read(self, place: Place) -> bytes:
+        """What lies there."""
+        if place.stop <= IN_MEMORY:
+            return b"" if self._memory is None else self._memory[place.start : place.stop]
+        assert self._file is not None
+        self._file.seek(place.start - IN_MEMORY)
+        return self._file.read(place.stop - place.start)
