@@ -16,13 +16,14 @@ FRAME_HEAD = 18
 """Bytes of the longest header of a zstd frame (RFC 8878, 3.1.1.1)."""
 _own = threading.local()
 _STEP = 1024
+_QUICK = 3
 ZSTD_LEVEL = 19
 """For ballots, which travel by radio. Tiles of noisy float32 gain nothing above level 3."""
 
 
 def compress(raw: bytes | memoryview, level: int = ZSTD_LEVEL) -> bytes:
     """One zstd frame that says how large its content is."""
-    return zstandard.ZstdCompressor(level=level).compress(raw)
+    return _compressor(level).compress(raw)
 
 
 def pack_plane(plane: NDArray[Any], level: int = ZSTD_LEVEL) -> bytes:
@@ -76,6 +77,17 @@ def _unpack_unsaid(data: bytes, limit: int, what: str) -> bytes:
     if len(raw) > limit or not frame.eof or frame.unused_data or start + _STEP < len(data):
         raise MapvoteError(f"{what} is truncated or larger than {limit} bytes when decompressed")
     return bytes(raw)
+
+
+def _compressor(level: int) -> zstandard.ZstdCompressor:
+    """One for each thread and quick level, used again and again, as :func:`_decompressor`. Those of high levels keep
+    tens of megabytes, and take longer for a plane than to be made."""
+    if level > _QUICK:
+        return zstandard.ZstdCompressor(level=level)
+    own: dict[int, zstandard.ZstdCompressor] = _own.__dict__.setdefault("compressors", {})
+    if level not in own:
+        own[level] = zstandard.ZstdCompressor(level=level)
+    return own[level]
 
 
 def _decompressor() -> zstandard.ZstdDecompressor:

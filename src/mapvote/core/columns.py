@@ -44,13 +44,13 @@ def column_bits(z: F64, ground_z: F32, base: I32) -> tuple[I64, Bool]:
 
 
 @numba.njit(cache=True, nogil=True)
-def words_of(cells: I64, bit: I64, obstacle: Bool, size: int) -> U64:
-    """(size,) column words of the points that are obstacles: flat ``cells``, ``bit`` and ``obstacle`` (n,)."""
-    words = np.zeros(size, dtype=np.uint64)
+def mark_obstacles(words: U64, points: F32, cells: I64, ground_z: F32, base: I32) -> None:
+    """Enter the points (n, 3) that are obstacles into the column ``words`` (cells,), by their flat ``cells`` (n,) and
+    the rule of :func:`column_bits`; ``ground_z``, ``base`` (cells,)."""
     for i in range(len(cells)):
-        if obstacle[i]:
-            words[cells[i]] |= np.uint64(1) << np.uint64(bit[i])
-    return words
+        cell, z = cells[i], np.float64(points[i, 2])
+        if height_above(z, ground_z[cell], base[cell]) >= GROUND_MARGIN_M:
+            words[cell] |= np.uint64(1) << np.uint64(column_bit(z, base[cell]))
 
 
 @numba.njit(cache=True, nogil=True)

@@ -40,8 +40,17 @@ def base_layers(ground_z: F32) -> I32:
         low[~known] = np.inf
         _lower_envelope(low, 0.02 * CELL_SIZE, 0.02 * CELL_SIZE * np.sqrt(2.0))
         np.copyto(low, ground_z, where=known)
-    low /= CELL_SIZE
-    return np.floor(low, out=low).astype(np.int32)
+    return _layers(low)
+
+
+@numba.njit(cache=True, nogil=True)
+def _layers(z: F64) -> I32:
+    """(rows, cols) the lattice layers of heights, every one of which is known."""
+    layers = np.empty(z.shape, dtype=np.int32)
+    for r in range(z.shape[0]):
+        for c in range(z.shape[1]):
+            layers[r, c] = np.int32(np.floor(z[r, c] / CELL_SIZE))
+    return layers
 
 
 @numba.njit(cache=True, nogil=True)

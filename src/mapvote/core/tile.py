@@ -7,11 +7,12 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from mapvote.core.cells import flat_cells
-from mapvote.core.columns import column_bits, words_of
+from mapvote.core.columns import column_bits, mark_obstacles
 from mapvote.core.grid import CELLS, Grid, TileIndex
 from mapvote.core.ground import base_layers
 from mapvote.core.memory import Memory
@@ -80,20 +81,24 @@ class Tile:
 
     def but(self, **planes: Any) -> Tile:
         """The tile with other ``planes``; what was worked out of those that stay goes along."""
+        other = self._with(planes)
+        other._check(planes)
+        return other
+
+    def _with(self, planes: Mapping[str, Any]) -> Tile:
+        """:meth:`but` of planes that are known to be sound."""
         stays = {name for name in self.__dict__ if not _FOLLOWS_FROM.get(name, set()) & planes.keys()}
         other = object.__new__(Tile)
         other.__dict__.update({name: self.__dict__[name] for name in stays} | planes)
-        other._check(planes)
         return other
 
     def without(self, dropped: Bool) -> Tile:
         """The tile without some of its points (n,); the others keep their fields."""
-        left = np.flatnonzero(~dropped)
-        fields = {name: column[left] for name, column in self.fields.items()}
-        other = self.but(points=self.points.take(left, axis=0), fields=fields)
-        other.__dict__["cells"] = self.cells[left]
-        bit, obstacle = self.columns
-        other.__dict__["columns"] = bit[left], obstacle[left]
+        points, cells = _left(self.points, self.cells, dropped)
+        fields = {name: column[~dropped] for name, column in self.fields.items()}
+        other, words = self._with({"points": points, "fields": fields}), self.obstacle_words.reshape(-1).copy()
+        _mark_left(words, self.points, self.cells, dropped, self.ground_z.reshape(-1), self.base.reshape(-1))
+        other.__dict__.update(cells=cells, obstacle_words=words.reshape(self.window.shape))
         return other
 
     def with_new(self, points: F32, intensity: U8 | None = None) -> Tile:
@@ -101,17 +106,18 @@ class Tile:
 
         ``intensity`` (m,), 255 for 1.0, goes into the field of that name, on its scale; every other field is 0.
         """
+        check_array(points, "Tile.points", (None, 3), np.float32)
         fields = {}
         for name, column in self.fields.items():
             new = np.zeros(len(points), dtype=column.dtype)
             if name == "intensity" and intensity is not None:
                 new = (intensity * (brightest(column) / 255.0)).astype(column.dtype)
             fields[name] = np.concatenate([column, new])
-        other = self.but(points=np.concatenate([self.points, points]), fields=fields)
-        cells = flat_cells(self.window, points)
-        columns = self._columns_of(points, cells)
-        other.__dict__["cells"] = np.concatenate([self.cells, cells])
-        other.__dict__["columns"] = tuple(np.concatenate(pair) for pair in zip(self.columns, columns, strict=True))
+        other = self._with({"points": np.concatenate([self.points, points]), "fields": fields})
+        cells, words = flat_cells(self.window, points), self.obstacle_words.reshape(-1).copy()
+        mark_obstacles(words, points, cells, self.ground_z.reshape(-1), self.base.reshape(-1))
+        words = words.reshape(self.window.shape)
+        other.__dict__.update(cells=np.concatenate([self.cells, cells]), obstacle_words=words)
         return other
 
     @property
@@ -142,17 +148,43 @@ class Tile:
     @cached_property
     def columns(self) -> tuple[I64, Bool]:
         """(bit of its column word (n,), is it an obstacle (n,)) of each point."""
-        return self._columns_of(self.points, self.cells)
-
-    def _columns_of(self, points: F32, cells: I64) -> tuple[I64, Bool]:
-        ground = self.ground_z.reshape(-1)[cells]
-        bit, obstacle = column_bits(points[:, 2].astype(np.float64), ground, self.base.reshape(-1)[cells])
+        ground = self.ground_z.reshape(-1)[self.cells]
+        base = self.base.reshape(-1)[self.cells]
+        bit, obstacle = column_bits(self.points[:, 2].astype(np.float64), ground, base)
         return bit, obstacle
 
     @cached_property
     def obstacle_words(self) -> U64:
         """(256, 256) column words of the obstacle points."""
-        return np.asarray(words_of(self.cells, *self.columns, CELLS)).reshape(self.window.shape)
+        words = np.zeros(CELLS, dtype=np.uint64)
+        mark_obstacles(words, self.points, self.cells, self.ground_z.reshape(-1), self.base.reshape(-1))
+        return words.reshape(self.window.shape)
+
+
+@numba.njit(cache=True, nogil=True)
+def _left(points: F32, cells: I64, dropped: Bool) -> tuple[F32, I64]:
+    """The points (n, 3) that are not ``dropped``, and their cells."""
+    left, where = np.empty((len(cells), 3), dtype=np.float32), np.empty(len(cells), dtype=np.int64)
+    n = 0
+    for i in range(len(cells)):
+        left[n, 0], left[n, 1], left[n, 2], where[n] = points[i, 0], points[i, 1], points[i, 2], cells[i]
+        n += not dropped[i]
+    return left[:n].copy(), where[:n].copy()
+
+
+@numba.njit(cache=True, nogil=True)
+def _mark_left(words: U64, points: F32, cells: I64, dropped: Bool, ground_z: F32, base: I32) -> None:
+    """Make column ``words`` (65536,) of points (n, 3) those of the points that are not ``dropped``, anew where any
+    is."""
+    touched = np.zeros(len(words), dtype=np.bool_)
+    for i in range(len(cells)):
+        if dropped[i]:
+            touched[cells[i]] = True
+            words[cells[i]] = 0
+    for i in range(len(cells)):
+        cell = cells[i]
+        if touched[cell] and not dropped[i]:
+            mark_obstacles(words, points[i : i + 1], cells[i : i + 1], ground_z, base)
 
 
 def in_bytes(intensity: NDArray[Any]) -> U8:

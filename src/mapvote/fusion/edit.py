@@ -5,7 +5,7 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from mapvote.core.columns import EVERY_BIT
+from mapvote.core.columns import EVERY_BIT, GROUND_MARGIN_M, column_bit, height_above
 from mapvote.core.grid import CELL_SIZE, CELLS
 from mapvote.core.tile import Tile
 from mapvote.core.types import F32, I32, I64, U8, U64, Bool
@@ -17,16 +17,25 @@ def delete_points(tile: Tile, gone: U64) -> tuple[Tile, int]:
     Ground points are never deleted. In a tile whose ground nobody knows, words have no agreed beginning, so any mark
     takes the whole column.
     """
-    words = gone.reshape(-1)[tile.cells]
-    if not words.any():
-        return tile, 0
-    bit, obstacle = tile.columns
     if not tile.has_ground:
-        words = np.where(words == 0, words, EVERY_BIT)
-    dropped = obstacle & ((words >> bit.astype(np.uint64)) & np.uint64(1)).astype(np.bool_)
-    if not dropped.any():
-        return tile, 0
-    return tile.without(dropped), int(dropped.sum())
+        gone = np.where(gone == 0, gone, EVERY_BIT)
+    ground, base = tile.ground_z.reshape(-1), tile.base.reshape(-1)
+    dropped = _marked(tile.points, tile.cells, gone.reshape(-1), ground, base)
+    deleted = int(dropped.sum())
+    return (tile.without(dropped), deleted) if deleted else (tile, 0)
+
+
+@numba.njit(cache=True, nogil=True)
+def _marked(points: F32, cells: I64, gone: U64, ground_z: F32, base: I32) -> Bool:
+    """(n,) which points (n, 3) are obstacles in voxels that ``gone`` (cells,) marks."""
+    found = np.zeros(len(cells), dtype=np.bool_)
+    for i in range(len(cells)):
+        cell = cells[i]
+        if gone[cell]:
+            z = np.float64(points[i, 2])
+            marked = (gone[cell] >> np.uint64(column_bit(z, base[cell]))) & np.uint64(1)
+            found[i] = marked and height_above(z, ground_z[cell], base[cell]) >= GROUND_MARGIN_M
+    return found
 
 
 def add_points(tile: Tile, points: F32, intensity: U8, cells: I64, voters: I32, min_votes: int) -> tuple[Tile, int]:
@@ -38,23 +47,40 @@ def add_points(tile: Tile, points: F32, intensity: U8, cells: I64, voters: I32, 
     """
     if not len(points):
         return tile, 0
-    layers = np.floor(points[:, 2].astype(np.float64) / CELL_SIZE).astype(np.int64)
-    touched = np.zeros(CELLS, dtype=np.bool_)
-    touched[cells] = True
-    near = touched[tile.cells]
-    own_layers = np.floor(tile.points[near, 2].astype(np.float64) / CELL_SIZE).astype(np.int64)
-    taken = np.isin(_voxel(cells, layers), _voxel(tile.cells[near], own_layers))
-    voxels = _voxel(cells, layers)
+    voxels = _voxels(cells, points)
     order = np.argsort(voxels)
+    taken = _taken(tile.points, tile.cells, voxels, order)
     chosen = _representatives(points, intensity, voxels, voters, taken, order, min_votes)
     if not len(chosen):
         return tile, 0
     return tile.with_new(points[chosen], intensity[chosen]), len(chosen)
 
 
-def _voxel(cells: I64, layers: I64) -> I64:
-    """One number for each voxel, ascending by cell, then layer; neighbours above each other differ by one."""
-    return cells * (1 << 24) + layers + (1 << 23)
+@numba.njit(cache=True, nogil=True)
+def _voxels(cells: I64, points: F32) -> I64:
+    """(n,) a number for the voxel of each point, ascending by cell, then layer; neighbours above each other differ by
+    one."""
+    voxels = np.empty(len(cells), dtype=np.int64)
+    for i in range(len(cells)):
+        voxels[i] = cells[i] * (1 << 24) + int(np.floor(np.float64(points[i, 2]) / CELL_SIZE)) + (1 << 23)
+    return voxels
+
+
+@numba.njit(cache=True, nogil=True)
+def _taken(points: F32, cells: I64, voxels: I64, order: I64) -> Bool:
+    """(n,) which of the ``voxels``, that ``order`` sorts, hold one of the ``points`` (m, 3) in ``cells`` (m,)."""
+    first = np.full(CELLS, len(order), dtype=np.int32)
+    for k in range(len(order) - 1, -1, -1):
+        first[voxels[order[k]] >> 24] = k
+    taken = np.zeros(len(voxels), dtype=np.bool_)
+    for i in range(len(cells)):
+        k = first[cells[i]]
+        if k < len(order):
+            voxel = cells[i] * (1 << 24) + int(np.floor(np.float64(points[i, 2]) / CELL_SIZE)) + (1 << 23)
+            while k < len(order) and voxels[order[k]] <= voxel:
+                taken[order[k]] |= voxels[order[k]] == voxel
+                k += 1
+    return taken
 
 
 @numba.njit(cache=True, nogil=True)

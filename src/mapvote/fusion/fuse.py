@@ -24,7 +24,7 @@ from mapvote.fusion.copies import Copy, liars_among, originals
 from mapvote.fusion.edit import add_points, delete_points
 from mapvote.fusion.outliers import contradictors, deniers
 from mapvote.fusion.persistence import denied_last, doubtful, remembered, temporary
-from mapvote.fusion.sparse_columns import counted, nothing_reached, packed
+from mapvote.fusion.sparse_columns import counted, learned, nothing_reached, packed
 from mapvote.fusion.spent import changed_in
 from mapvote.fusion.tile_vote import TileVote, one_each
 from mapvote.fusion.turning import turned
@@ -147,7 +147,8 @@ def decide_tile(
     denied = denied_last(states, tile.memory, spoken)
     doubt = doubtful(states, tile.memory, settings).any()
     passing = temporary(states, tile, originals(history(), settings)[0], settings) if doubt else np.zeros_like(denied)
-    states = np.where(denied | passing, np.uint8(CellState.UNDETERMINED), states)
+    states = states.copy()
+    states[denied | passing] = int(CellState.UNDETERMINED)
     return Heard(votes, states, tally, quorum, denied, passing, copies)
 
 
@@ -240,13 +241,11 @@ def _learn_free(tile: Tile, votes: Sequence[TileVote], min_votes: int, points_ad
     if not passed and not points_added:
         return tile
     free = tile.free if tile.free is not None else np.zeros((TILE_CELLS, TILE_CELLS), dtype=np.uint64)
-    if len(passed) >= min_votes:
-        reached = nothing_reached(min_votes)
-        for vote in passed:
-            vote.mark_passed(reached)
-        free = free | reached[-1].reshape(free.shape)
-    free = free & ~tile.obstacle_words
-    return tile if tile.free is not None and np.array_equal(free, tile.free) else tile.but(free=free)
+    reached = nothing_reached(min_votes if len(passed) >= min_votes else 1)
+    for vote in passed if len(passed) >= min_votes else []:
+        vote.mark_passed(reached)
+    differs = learned(free.reshape(-1), tile.obstacle_words.reshape(-1), reached[-1])
+    return tile.but(free=reached[-1].reshape(free.shape)) if differs or tile.free is None else tile
 
 
 def states_over(lattice: Lattice, decisions: Mapping[TileIndex, Decision]) -> tuple[U8, Grid]:

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from mapvote.config import FuseSettings
 from mapvote.core.memory import PLANES, Memory
 from mapvote.core.tile import Tile
-from mapvote.core.types import F64, I64, U8, Bool, CellState
+from mapvote.core.types import F64, I64, U8, U64, Bool, CellState
 from mapvote.fusion.tile_vote import TileVote
 from mapvote.fusion.turning import in_order
 
@@ -97,9 +97,8 @@ def denied_last(states: U8, memory: Memory | None, drives: Sequence[TileVote]) -
 
 def remembered(memory: Memory, before: Tile, after: Tile, votes: Sequence[TileVote], states: U8) -> Memory:
     """``memory`` with what came and what went between two versions of a tile, by the votes that decided it."""
-    held, holds = (tile.obstacle_words.reshape(-1) != 0 for tile in (before, after))
-    came = np.flatnonzero(holds & ~held)
-    went = np.flatnonzero(held & ~holds & (memory.came_s.reshape(-1) > 0))
+    went, came = emptied_and_filled(before.obstacle_words.reshape(-1), after.obstacle_words.reshape(-1))
+    went = went[memory.came_s.reshape(-1)[went] > 0]
     if not len(came) and not len(went):
         return memory
     planes = memory.planes.copy()
@@ -111,6 +110,22 @@ def remembered(memory: Memory, before: Tile, after: Tile, votes: Sequence[TileVo
     stayed_s[went] += ended - came_s[went]
     came_s[went] = 0
     return replace(memory, planes=planes)
+
+
+@numba.njit(cache=True, nogil=True)
+def emptied_and_filled(before: U64, after: U64) -> tuple[I64, I64]:
+    """Indices of the words (n,) that are zero only after, and only before."""
+    emptied, filled = np.empty(len(before), dtype=np.int64), np.empty(len(before), dtype=np.int64)
+    n, m = 0, 0
+    for c in range(len(before)):
+        if (before[c] == 0) != (after[c] == 0):
+            if after[c] == 0:
+                emptied[n] = c
+                n += 1
+            else:
+                filled[m] = c
+                m += 1
+    return emptied[:n].copy(), filled[:m].copy()
 
 
 def _first_s(votes: Sequence[TileVote], cells: I64, state: int) -> NDArray[np.uint32]:

@@ -134,6 +134,17 @@ def mark_spoken(reached: U64, cells: NDArray[np.intp], words: U64, own: U8) -> N
 
 
 @numba.njit(cache=True, nogil=True)
+def learned(free: U64, occupied: U64, passed: U64) -> bool:
+    """Make of the words ``passed`` (65536,) those that are ``free`` then: with what was free before, without what is
+    ``occupied``. Whether that is anything else than before."""
+    differs = np.uint64(0)
+    for c in range(len(passed)):
+        passed[c] = (passed[c] | free[c]) & ~occupied[c]
+        differs |= passed[c] ^ free[c]
+    return bool(differs)
+
+
+@numba.njit(cache=True, nogil=True)
 def agreed(cells: NDArray[np.intp], own: U8, decided: U8, state: int) -> NDArray[np.intp]:
     """Indices of the flat ``cells`` (n,) that are ``state`` in a voter's ``own`` states and in the ``decided`` ones,
     (256, 256) each."""

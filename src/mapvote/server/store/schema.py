@@ -192,7 +192,7 @@ decisions = sa.Table(
     sa.Column("deleted", sa.Integer, nullable=False),
     sa.Column("sum", sa.String(64), nullable=False),
 )
-"""``tally``: (5, 65536) uint16 or int32 in VOTE_UNITs, compressed."""
+"""``tally``: (5, 65536), compressed, see :func:`mapvote.server.store.tile_jobs.pack_tally`."""
 
 reviews = sa.Table(
     "reviews",

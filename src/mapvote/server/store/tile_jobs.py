@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from typing import Any
 
+import numba
 import numpy as np
 import sqlalchemy as sa
 from numpy.typing import NDArray
@@ -20,9 +21,11 @@ from mapvote.codec.arrays import compress, pack_plane, raw_plane, unpack_bytes
 from mapvote.codec.ballot import tile_key
 from mapvote.core.grid import CELLS, TILE_CELLS, Grid, TileIndex
 from mapvote.core.tile import Tile
-from mapvote.core.types import I32, I64, N_STATES, U8, Bool, MapvoteError
+from mapvote.core.types import I32, I64, N_STATES, U8, U16, Bool, MapvoteError
+from mapvote.core.voting import VOTE_UNIT
 from mapvote.fusion.copies import Copy
 from mapvote.fusion.fuse import fuse_tile, rule_of
+from mapvote.fusion.persistence import emptied_and_filled
 from mapvote.fusion.tile_vote import TileVote
 from mapvote.server.errors import Unavailable
 from mapvote.server.store import schema
@@ -32,7 +35,7 @@ from mapvote.server.store.eligible_votes import Electorate, counting_votes, rece
 from mapvote.server.store.quarantine import Damage, DamagedBallots
 from mapvote.server.store.queries import load_tile, tile_as_of
 
-_NOWHERE = np.zeros(CELLS, dtype=np.bool_)
+_NOWHERE = (np.empty(0, dtype=np.uint64),) * 2
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,7 +62,7 @@ class Fused:
     states: bytes
     """(256, 256) uint8, a zstd frame, as in a ballot."""
     tally: bytes
-    """(5, 65536) uint16 or int32, a zstd frame, see :func:`pack_tally`."""
+    """(5, 65536), a zstd frame, see :func:`pack_tally`."""
     vehicles: int
     points: int
     """Before."""
@@ -134,7 +137,9 @@ def _fuse(connection: sa.Connection, task: Task) -> Fused:
     decision, edited = fuse_tile(tile, votes, rule_of(cast.method), task.asked.settings, task.version, recent)
     stored = (tile, task.tile) if isinstance(task.tile, TileHashes) else None
     hashes, planes = (None, {}) if edited is tile else pack_tile(edited, stored)
-    held, holds = ((tile.obstacle_words != 0), (edited.obstacle_words != 0)) if hashes else (_NOWHERE, _NOWHERE)
+    gone, new = (
+        emptied_and_filled(*(each.obstacle_words.reshape(-1) for each in (tile, edited))) if hashes else _NOWHERE
+    )
     return Fused(
         index=tile.index,
         states=pack_states(decision.states),
@@ -145,8 +150,8 @@ def _fuse(connection: sa.Connection, task: Task) -> Fused:
         deleted=decision.deleted,
         hashes=hashes,
         planes=planes,
-        cells_gone=np.flatnonzero(held & ~holds),
-        cells_new=np.flatnonzero(holds & ~held),
+        cells_gone=gone,
+        cells_new=new,
         freed=0 if tile.free is edited.free or tile.free is None else int((tile.free != edited.free).sum()),
         tile=None if task.misread is None else edited,
         copies=decision.copies,
@@ -205,17 +210,33 @@ def pack_states(states: U8) -> bytes:
 
 def pack_tally(tally: NDArray[Any]) -> bytes:
     """(256, 256, 5) as a zstd frame of little-endian planes, class by class, which packs four times better than cell
-    by cell: uint16 if it comes so, else int32. The length tells which."""
-    dtype = "<u2" if tally.dtype == np.uint16 else "<i4"
-    return compress(raw_plane(np.moveaxis(tally, -1, 0), dtype), 1)
+    by cell: uint16 if it comes so, else int32; but uint8 if these are whole votes and no more than that holds. The
+    length tells which."""
+    planes = np.moveaxis(tally, -1, 0)
+    if tally.dtype != np.uint16:
+        return compress(raw_plane(planes, "<i4"), 1)
+    votes = np.empty(planes.shape, dtype=np.uint8)
+    if _in_votes(np.ascontiguousarray(planes).reshape(-1), votes.reshape(-1)):
+        return compress(raw_plane(votes, "|u1"), 1)
+    return compress(raw_plane(planes, "<u2"), 1)
+
+
+@numba.njit(cache=True, nogil=True)
+def _in_votes(tally: U16, votes: U8) -> bool:
+    """Fill ``votes`` (n,) with a ``tally`` (n,) in VOTE_UNITs; whether that loses nothing."""
+    lost = np.uint16(0)
+    for i in range(len(tally)):
+        votes[i] = tally[i] // np.uint16(VOTE_UNIT)
+        lost |= tally[i] ^ np.uint16(np.uint16(votes[i]) * np.uint16(VOTE_UNIT))
+    return bool(lost == 0)
 
 
 def unpack_tally_plane(data: bytes) -> I32:
     """The inverse of :func:`pack_tally`, (256, 256, 5) int32."""
     raw = unpack_bytes(data, 4 * N_STATES * CELLS, "decision: tally")
-    dtype = "<u2" if len(raw) == 2 * N_STATES * CELLS else "<i4"
+    dtype, unit = {N_STATES * CELLS: ("|u1", VOTE_UNIT), 2 * N_STATES * CELLS: ("<u2", 1)}.get(len(raw), ("<i4", 1))
     planes = np.frombuffer(raw, dtype=dtype).reshape(N_STATES, TILE_CELLS, TILE_CELLS)
-    return np.ascontiguousarray(np.moveaxis(planes, 0, -1), dtype=np.int32)
+    return np.ascontiguousarray(np.moveaxis(planes, 0, -1), dtype=np.int32) * unit
 
 
 @lru_cache(maxsize=4)
