@@ -5,9 +5,10 @@ Everything is asked as of an event number (``mark``), so that a past round can b
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import sqlalchemy as sa
 
@@ -22,7 +23,7 @@ from mapvote.server.store.blobs import unpack_cells
 from mapvote.server.store.policy import Policy, policy_in, recorded
 from mapvote.server.store.quarantine import Damage, DamagedBallots, ballot_name, set_aside
 from mapvote.server.store.queries import Version
-from mapvote.server.store.stored_votes import StoredVote, read_votes
+from mapvote.server.store.stored_votes import Rows, StoredVote, read_rows, read_votes
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,23 +66,53 @@ def _stands_at(mark: int | sa.BindParameter[int]) -> sa.ColumnElement[bool]:
     return (b.c.seq <= mark) & (b.c.gone_seq.is_(None) | (b.c.gone_seq > mark))
 
 
-# Asked for every tile of a round: building such a statement takes SQLAlchemy as long as the database takes to answer.
+# Asked for the tiles of a round: building such a statement takes SQLAlchemy as long as the database takes to answer.
 _B, _T = schema.ballots, schema.ballot_tiles
-_ROW, _COL, _MARK = (sa.bindparam(name, type_=sa.BigInteger) for name in ("row", "col", "mark"))
+_MARK, _TILES = sa.bindparam("mark", type_=sa.BigInteger), sa.bindparam("tiles", expanding=True)
 _VOTES_ON = (
-    sa.select(_B.c.seq, _B.c.first_seq, _B.c.vehicle, _B.c.drive, _B.c.end_ns, _B.c.received_ns, _B.c.digest, _T.c.base)
-    .add_columns(_B.c.version, _B.c.settings_hash, _B.c.cast_by)
+    sa.select(_T.c.row, _T.c.col, _B.c.seq, _B.c.first_seq, _B.c.vehicle, _B.c.drive, _B.c.end_ns, _B.c.received_ns)
+    .add_columns(_B.c.digest, _T.c.base, _B.c.version, _B.c.settings_hash, _B.c.cast_by)
     .join(_T, _T.c.ballot == _B.c.seq)
-    .where(_T.c.row == _ROW, _T.c.col == _COL, _stands_at(_MARK))
+    .where(sa.tuple_(_T.c.row, _T.c.col).in_(_TILES), _stands_at(_MARK))
     .order_by(_B.c.seq)
 )
 _W, _C = schema.reviews, schema.review_cells
 _REVIEWS_ON = (
-    sa.select(_W.c.seq, _W.c.verdict, _C.c.cells)
+    sa.select(_C.c.row, _C.c.col, _W.c.seq, _W.c.verdict, _C.c.cells)
     .join(_C, _C.c.review == _W.c.seq)
-    .where(_C.c.row == _ROW, _C.c.col == _COL, _W.c.verdict.in_(("held", "rejected")))
+    .where(sa.tuple_(_C.c.row, _C.c.col).in_(_TILES), _W.c.verdict.in_(("held", "rejected")))
     .where(_W.c.seq <= _MARK, _W.c.gone_seq.is_(None) | (_W.c.gone_seq > _MARK))
 )
+
+
+@dataclass(frozen=True, slots=True)
+class Polled:
+    """What stands on some tiles, each read by one statement for all of them."""
+
+    standing: Mapping[TileIndex, Sequence[StoredVote]]
+    """Ballots, in the order in which they came."""
+    bars: Mapping[TileIndex, Sequence[tuple[int | None, Bool]]]
+    """(event, cells (256, 256)) of changes that reviewers rejected then, or hold: None."""
+    rows: Rows
+    """Of the votes that count there."""
+
+
+def poll(connection: sa.Connection, tiles: Sequence[TileIndex], asked: Electorate) -> Polled:
+    """All that :func:`counted_votes` asks of some tiles; a few, for the planes of their votes lie in memory then."""
+    standing, bars = _standing_on(connection, tiles, asked.mark), defaultdict[TileIndex, list[Any]](list)
+    for row, col, seq, verdict, cells in connection.execute(_REVIEWS_ON, {"tiles": tiles, "mark": asked.mark}):
+        bars[row, col].append((None if verdict == "held" else seq, unpack_cells(cells)))
+    counting = [(i, vote) for i in tiles for vote, why in _judged(standing[i], i, asked) if not why]
+    return Polled(standing, bars, read_rows(connection, counting))
+
+
+def _standing_on(
+    connection: sa.Connection, tiles: Sequence[TileIndex], mark: int
+) -> Mapping[TileIndex, Sequence[StoredVote]]:
+    found = defaultdict[TileIndex, list[StoredVote]](list)
+    for row, col, *stored in connection.execute(_VOTES_ON, {"tiles": tiles, "mark": mark}):
+        found[row, col].append(StoredVote(*stored))
+    return found
 
 
 def standing_tiles(connection: sa.Connection, mark: int, since: int | None = None) -> list[TileIndex]:
@@ -105,9 +136,11 @@ def standing_tiles(connection: sa.Connection, mark: int, since: int | None = Non
 def judged_votes(connection: sa.Connection, index: TileIndex, asked: Electorate) -> list[tuple[StoredVote, str]]:
     """Every standing vote on a tile, and why it does not count there at all; "" if it does, in cells where it is not
     spent (:func:`mapvote.fusion.spent.unspent`)."""
-    asked_of = {"row": index[0], "col": index[1], "mark": asked.mark}
-    found = [StoredVote(*row) for row in connection.execute(_VOTES_ON, asked_of).all()]
-    found = [vote for vote in found if vote.vehicle not in asked.without]
+    return _judged(_standing_on(connection, [index], asked.mark)[index], index, asked)
+
+
+def _judged(standing: Sequence[StoredVote], index: TileIndex, asked: Electorate) -> list[tuple[StoredVote, str]]:
+    found = [vote for vote in standing if vote.vehicle not in asked.without]
     why = {vote.seq: _unready(vote, index, asked) for vote in found}
     settings = asked.settings
     inside = {vote.seq for vote in select([vote for vote in found if not why[vote.seq]], settings)}
@@ -137,24 +170,33 @@ def _unready(vote: StoredVote, index: TileIndex, asked: Electorate) -> str:
 
 
 def counting_votes(
-    connection: sa.Connection, tile: Tile, asked: Electorate, misread: Mapping[int, Bool] | None = None
+    connection: sa.Connection,
+    tile: Tile,
+    asked: Electorate,
+    misread: Mapping[int, Bool] | None = None,
+    polled: Polled | None = None,
 ) -> list[TileVote]:
     """The votes that count on ``tile`` as it is now, each restricted to the cells where it is not spent.
 
-    ``misread``: see :func:`mapvote.fusion.spent.unspent`.
+    ``misread``: see :func:`mapvote.fusion.spent.unspent`. ``polled``: what stands there, if it was asked before.
     """
-    return [vote for _, vote in counted_votes(connection, tile, asked, misread)]
+    return [vote for _, vote in counted_votes(connection, tile, asked, misread, polled)]
 
 
 def counted_votes(
-    connection: sa.Connection, tile: Tile, asked: Electorate, misread: Mapping[int, Bool] | None = None
+    connection: sa.Connection,
+    tile: Tile,
+    asked: Electorate,
+    misread: Mapping[int, Bool] | None = None,
+    polled: Polled | None = None,
 ) -> list[tuple[StoredVote, TileVote]]:
     """As :func:`counting_votes`, each beside its ballot."""
-    chosen = [vote for vote, why in judged_votes(connection, tile.index, asked) if not why]
-    reviewed = connection.execute(_REVIEWS_ON, {"row": tile.index[0], "col": tile.index[1], "mark": asked.mark}).all()
-    bars = [(None if verdict == "held" else seq, unpack_cells(cells)) for seq, verdict, cells in reviewed]
-    votes = zip(chosen, read_votes(connection, tile.index, chosen), strict=True)
-    return [(stored, _obedient(unspent(vote, tile, misread), stored.first_seq, bars)) for stored, vote in votes]
+    index = tile.index
+    polled = polled or poll(connection, [index], asked)
+    chosen = [vote for vote, why in _judged(polled.standing[index], index, asked) if not why]
+    votes, bars = read_votes(connection, index, chosen, polled.rows), polled.bars[index]
+    said = zip(chosen, votes, strict=True)
+    return [(stored, _obedient(unspent(vote, tile, misread), stored.first_seq, bars)) for stored, vote in said]
 
 
 def _obedient(vote: TileVote, first_seq: int, bars: Sequence[tuple[int | None, Bool]]) -> TileVote:
@@ -166,14 +208,22 @@ def _obedient(vote: TileVote, first_seq: int, bars: Sequence[tuple[int | None, B
 
 
 def recent_votes(
-    connection: sa.Connection, tile: Tile, asked: Electorate, misread: Mapping[int, Bool] | None = None
+    connection: sa.Connection,
+    tile: Tile,
+    asked: Electorate,
+    misread: Mapping[int, Bool] | None = None,
+    polled: Polled | None = None,
 ) -> list[TileVote]:
     """As :func:`counting_votes`, of every vehicle and of the last ``stay_days``: what has come and gone here?"""
-    judged = judged_votes(connection, tile.index, asked)
+    index = tile.index
+    standing, rows = (
+        (_standing_on(connection, [index], asked.mark), None) if polled is None else (polled.standing, polled.rows)
+    )
+    judged = _judged(standing[index], index, asked)
     ready = [vote for vote, why in judged if why not in (YOUNG, OTHERWISE, DAMAGED)]
     oldest = max((vote.end_ns for vote in ready), default=0) - asked.settings.stay_days * DAY_NS
     chosen = [vote for vote in ready if vote.end_ns >= oldest]
-    return [unspent(vote, tile, misread) for vote in read_votes(connection, tile.index, chosen)]
+    return [unspent(vote, tile, misread) for vote in read_votes(connection, index, chosen, rows)]
 
 
 def from_sound_ballots(connection: sa.Connection, asked: Electorate, read: Callable[[Electorate], Read]) -> Read:

@@ -8,7 +8,7 @@ only that ballot is unpacked. Nothing of it outlives the process.
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from threading import Lock
 from typing import Any
@@ -27,11 +27,13 @@ from mapvote.server.store.quarantine import Damage, DamagedBallots, ballot_name,
 REMEMBERED_BYTES = 128 << 20
 """Some 1,500 votes of a vehicle on a tile."""
 _T = schema.ballot_tiles
-_PLANES_OF = sa.select(_T.c.ballot, *(_T.c[plane] for plane in schema.BALLOT_PLANES), _T.c.base, _T.c.sum).where(
-    _T.c.row == sa.bindparam("row", type_=sa.BigInteger),
-    _T.c.col == sa.bindparam("col", type_=sa.BigInteger),
-    _T.c.ballot.in_(sa.bindparam("ballots", expanding=True)),
+_PLANES_OF = sa.select(_T.c.row, _T.c.col, _T.c.ballot, *(_T.c[p] for p in schema.BALLOT_PLANES), _T.c.base, _T.c.sum)
+_PLANES_OF = _PLANES_OF.where(
+    sa.tuple_(_T.c.row, _T.c.col, _T.c.ballot).in_(sa.bindparam("asked", expanding=True)),
 )
+_AT_ONCE = MOST_ASKED // 3
+Rows = Mapping[tuple[int, int, int], Any]
+"""By tile and ballot, what is stored of its planes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,35 +92,46 @@ remembered = Remembered(REMEMBERED_BYTES)
 """What this process unpacked."""
 
 
-def read_votes(connection: sa.Connection, index: TileIndex, stored: Sequence[StoredVote]) -> list[TileVote]:
-    """The planes of stored votes, in their order, nothing silenced. DamagedBallots, naming them, if some are."""
-    rows = _rows(connection, index, [vote.seq for vote in stored])
-    sums = [rows[vote.seq].sum for vote in stored]
-    known = remembered.get(sums)
-    new = {row.sum: _unpacked(row) for row in rows.values() if row.sum not in known}
+def read_rows(connection: sa.Connection, votes: Iterable[tuple[TileIndex, StoredVote]]) -> Rows:
+    """The rows of votes on tiles, as they are."""
+    asked = sorted({(*index, vote.seq) for index, vote in votes})
+    found: dict[tuple[int, int, int], Any] = {}
+    for start in range(0, len(asked), _AT_ONCE):
+        rows = connection.execute(_PLANES_OF, {"asked": asked[start : start + _AT_ONCE]}).all()
+        found |= {(row.row, row.col, row.ballot): row for row in rows}
+    return found
+
+
+def read_votes(
+    connection: sa.Connection, index: TileIndex, stored: Sequence[StoredVote], known: Rows | None = None
+) -> list[TileVote]:
+    """The planes of stored votes, in their order, nothing silenced. DamagedBallots, naming them, if some are.
+
+    ``known``: rows that were read before.
+    """
+    rows = {} if known is None else known
+    rows = {**rows, **read_rows(connection, ((index, vote) for vote in stored if (*index, vote.seq) not in rows))}
+    mine = {vote.seq: rows[*index, vote.seq] for vote in stored}
+    _check(mine.values())
+    sums = [mine[vote.seq].sum for vote in stored]
+    unpacked = remembered.get(sums)
+    new = {row.sum: _unpacked(row) for row in mine.values() if row.sum not in unpacked}
     remembered.put(new)
-    known |= new
-    return [_said_by(vote, known[digest]) for digest, vote in zip(sums, stored, strict=True)]
+    unpacked |= new
+    return [_said_by(vote, unpacked[digest]) for digest, vote in zip(sums, stored, strict=True)]
 
 
 def _said_by(stored: StoredVote, said: TileVote) -> TileVote:
     return replace(said, vehicle=stored.vehicle, end_ns=stored.end_ns, digest=stored.digest, version=stored.version)
 
 
-def _rows(connection: sa.Connection, index: TileIndex, ballots: Sequence[int]) -> dict[int, Any]:
-    """By ballot, each what its sum says: whoever is remembered is read too, or what is decided would follow from what
-    this process happened to read before the disk lost it."""
-    found: dict[int, Any] = {}
-    damaged: list[Damage] = []
-    for start in range(0, len(ballots), MOST_ASKED):
-        asked_of = {"row": index[0], "col": index[1], "ballots": ballots[start : start + MOST_ASKED]}
-        for row in connection.execute(_PLANES_OF, asked_of).all():
-            if row.sum != ballot_sum(row):
-                damaged.append(Damage("ballot", ballot_name(row.ballot, *index), "is not what its sum says"))
-            found[row.ballot] = row
-    if damaged:
-        raise DamagedBallots(damaged)
-    return found
+def _check(rows: Iterable[Any]) -> None:
+    """DamagedBallots if some are not what their sums say. Whoever is remembered is read too, or what is decided would
+    follow from what this process happened to read before the disk lost it."""
+    not_so = "is not what its sum says"
+    names = [ballot_name(row.ballot, row.row, row.col) for row in rows if row.sum != ballot_sum(row)]
+    if names:
+        raise DamagedBallots([Damage("ballot", name, not_so) for name in names])
 
 
 def _unpacked(row: Any) -> TileVote:

@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
+from itertools import accumulate
 from typing import Any
 
 import numba
@@ -31,10 +32,12 @@ from mapvote.server.errors import Unavailable
 from mapvote.server.store import schema
 from mapvote.server.store.blobs import TileHashes, pack_tile
 from mapvote.server.store.database import Database, address_of
-from mapvote.server.store.eligible_votes import Electorate, counting_votes, recent_votes
+from mapvote.server.store.eligible_votes import Electorate, Polled, counting_votes, poll, recent_votes
 from mapvote.server.store.quarantine import Damage, DamagedBallots
 from mapvote.server.store.queries import load_tile, tile_as_of
 
+_GROUP = 4
+"""Tiles that are fused within one reading of the database."""
 _NOWHERE = (np.empty(0, dtype=np.uint64),) * 2
 
 
@@ -96,17 +99,23 @@ class Fused:
         return cls(index, b"", b"", 0, 0, 0, 0, None, {}, nowhere, nowhere, 0, None, damaged)
 
 
-def fuse_stored(task: Task, database: Database | None = None) -> Fused:
-    """Read the votes that count on one tile, decide, edit. Pure but for reading the database.
+def fuse_stored(tasks: Sequence[Task], database: Database | None = None) -> list[Fused]:
+    """Read the votes that count on some tiles of one round, decide, edit. Pure but for reading the database.
 
     Damaged ballots are left out and named; a damaged tile stays as it is and is named. In another process, where there
-    is no ``database`` at hand, one is opened by ``task.url`` and kept.
+    is no ``database`` at hand, one is opened by the tasks' ``url`` and kept.
     """
+    with (database or _database(tasks[0].url)).reading() as connection:
+        polled = poll(connection, [task.window.tile_index for task in tasks], tasks[0].asked)
+        return [_fuse_sound(connection, task, polled) for task in tasks]
+
+
+def _fuse_sound(connection: sa.Connection, task: Task, polled: Polled) -> Fused:
+    """One tile, without what is damaged."""
     damaged: list[Damage] = []
     while True:
         try:
-            with (database or _database(task.url)).reading() as connection:
-                return replace(_fuse(connection, task), damaged=damaged)
+            return replace(_fuse(connection, task, polled), damaged=damaged)
         except DamagedBallots as error:
             damaged += error.found
             task = replace(task, asked=task.asked.leaving_out(error.found))
@@ -125,13 +134,13 @@ def _plane_of(task: Task, error: str) -> str:
     return next((digest for digest in planes if digest and digest[:12] in error), task.tile.points)
 
 
-def _fuse(connection: sa.Connection, task: Task) -> Fused:
+def _fuse(connection: sa.Connection, task: Task, polled: Polled) -> Fused:
     tile = _tile(connection, task)
-    votes = counting_votes(connection, tile, task.asked, task.misread)
+    votes = counting_votes(connection, tile, task.asked, task.misread, polled)
     cast = task.asked.policy.round
 
     def history() -> list[TileVote]:
-        return recent_votes(connection, tile, task.asked, task.misread)
+        return recent_votes(connection, tile, task.asked, task.misread, polled)
 
     recent = history if cast.stage == "two-stage" else None
     decision, edited = fuse_tile(tile, votes, rule_of(cast.method), task.asked.settings, task.version, recent)
@@ -184,23 +193,23 @@ class Watched(Executor):
     def map(
         self, fn: Callable[..., Any], *iterables: Iterable[Any], timeout: float | None = None, chunksize: int = 1
     ) -> Iterator[Any]:
-        """As the other does, in order."""
-        tasks = [list(some) for some in iterables]
-        of = min(map(len, tasks), default=0)
-        self._told(0, of)
-        results = self.within.map(fn, *tasks, timeout=timeout, chunksize=chunksize)
-        for done in range(1, of + 1):
+        """As the other does, in order, of groups of tiles."""
+        groups = [list(some) for some in iterables]
+        sizes = [len(group) for group in groups[0]]
+        self._told(0, sum(sizes))
+        results = self.within.map(fn, *groups, timeout=timeout, chunksize=chunksize)
+        for done in accumulate(sizes):
             yield next(results)
-            self._told(done, of)
+            self._told(done, sum(sizes))
 
 
-def fuse_round(tasks: Iterable[Task], database: Database, executor: Executor | None = None) -> list[Fused]:
-    """Fuse every tile; results in the order of the tasks. Without an executor, one after another."""
+def fuse_round(tasks: Sequence[Task], database: Database, executor: Executor | None = None) -> list[Fused]:
+    """Fuse every tile of a round; results in the order of the tasks. Without an executor, one after another."""
     where = executor.within if isinstance(executor, Watched) else executor
     here = partial(fuse_stored, database=database)
-    if executor is None:
-        return [here(task) for task in tasks]
-    return list(executor.map(here if isinstance(where, ThreadPoolExecutor) else fuse_stored, tasks))
+    groups = [tasks[start : start + _GROUP] for start in range(0, len(tasks), _GROUP)]
+    work = here if executor is None or isinstance(where, ThreadPoolExecutor) else fuse_stored
+    return [fused for some in (executor.map if executor else map)(work, groups) for fused in some]
 
 
 def pack_states(states: U8) -> bytes:
