@@ -85,7 +85,7 @@ class Tile:
         other._check(planes)
         return other
 
-    def _with(self, planes: Mapping[str, Any]) -> Tile:
+    def _with(self, planes: dict[str, Any]) -> Tile:
         """:meth:`but` of planes that are known to be sound."""
         stays = {name for name in self.__dict__ if not _FOLLOWS_FROM.get(name, set()) & planes.keys()}
         other = object.__new__(Tile)

@@ -68,19 +68,20 @@ def _stands_at(mark: int | sa.BindParameter[int]) -> sa.ColumnElement[bool]:
 
 # Asked for the tiles of a round: building such a statement takes SQLAlchemy as long as the database takes to answer.
 _B, _T = schema.ballots, schema.ballot_tiles
-_MARK, _TILES = sa.bindparam("mark", type_=sa.BigInteger), sa.bindparam("tiles", expanding=True)
+_ROW, _MARK = (sa.bindparam(name, type_=sa.BigInteger) for name in ("row", "mark"))
+_COLS: sa.BindParameter[list[int]] = sa.bindparam("cols", expanding=True)
 _VOTES_ON = (
-    sa.select(_T.c.row, _T.c.col, _B.c.seq, _B.c.first_seq, _B.c.vehicle, _B.c.drive, _B.c.end_ns, _B.c.received_ns)
+    sa.select(_T.c.col, _B.c.seq, _B.c.first_seq, _B.c.vehicle, _B.c.drive, _B.c.end_ns, _B.c.received_ns)
     .add_columns(_B.c.digest, _T.c.base, _B.c.version, _B.c.settings_hash, _B.c.cast_by)
     .join(_T, _T.c.ballot == _B.c.seq)
-    .where(sa.tuple_(_T.c.row, _T.c.col).in_(_TILES), _stands_at(_MARK))
+    .where(_T.c.row == _ROW, _T.c.col.in_(_COLS), _stands_at(_MARK))
     .order_by(_B.c.seq)
 )
 _W, _C = schema.reviews, schema.review_cells
 _REVIEWS_ON = (
-    sa.select(_C.c.row, _C.c.col, _W.c.seq, _W.c.verdict, _C.c.cells)
+    sa.select(_C.c.col, _W.c.seq, _W.c.verdict, _C.c.cells)
     .join(_C, _C.c.review == _W.c.seq)
-    .where(sa.tuple_(_C.c.row, _C.c.col).in_(_TILES), _W.c.verdict.in_(("held", "rejected")))
+    .where(_C.c.row == _ROW, _C.c.col.in_(_COLS), _W.c.verdict.in_(("held", "rejected")))
     .where(_W.c.seq <= _MARK, _W.c.gone_seq.is_(None) | (_W.c.gone_seq > _MARK))
 )
 
@@ -97,20 +98,22 @@ class Polled:
     """Of the votes that count there."""
 
 
-def poll(connection: sa.Connection, tiles: Sequence[TileIndex], asked: Electorate) -> Polled:
-    """All that :func:`counted_votes` asks of some tiles; a few, for the planes of their votes lie in memory then."""
-    standing, bars = _standing_on(connection, tiles, asked.mark), defaultdict[TileIndex, list[Any]](list)
-    for row, col, seq, verdict, cells in connection.execute(_REVIEWS_ON, {"tiles": tiles, "mark": asked.mark}):
+def poll(connection: sa.Connection, row: int, cols: Sequence[int], asked: Electorate) -> Polled:
+    """All that :func:`counted_votes` asks of some tiles of a row; of a few, for the planes of their votes lie in memory
+    then."""
+    standing, bars = _standing_on(connection, row, cols, asked.mark), defaultdict[TileIndex, list[Any]](list)
+    reviewed = connection.execute(_REVIEWS_ON, {"row": row, "cols": cols, "mark": asked.mark}).all()
+    for col, seq, verdict, cells in reviewed:
         bars[row, col].append((None if verdict == "held" else seq, unpack_cells(cells)))
-    counting = [(i, vote) for i in tiles for vote, why in _judged(standing[i], i, asked) if not why]
-    return Polled(standing, bars, read_rows(connection, counting))
+    counting = [(c, vote) for c in cols for vote, why in _judged(standing[row, c], (row, c), asked) if not why]
+    return Polled(standing, bars, read_rows(connection, row, counting))
 
 
 def _standing_on(
-    connection: sa.Connection, tiles: Sequence[TileIndex], mark: int
+    connection: sa.Connection, row: int, cols: Sequence[int], mark: int
 ) -> Mapping[TileIndex, Sequence[StoredVote]]:
     found = defaultdict[TileIndex, list[StoredVote]](list)
-    for row, col, *stored in connection.execute(_VOTES_ON, {"tiles": tiles, "mark": mark}):
+    for col, *stored in connection.execute(_VOTES_ON, {"row": row, "cols": cols, "mark": mark}).all():
         found[row, col].append(StoredVote(*stored))
     return found
 
@@ -136,7 +139,7 @@ def standing_tiles(connection: sa.Connection, mark: int, since: int | None = Non
 def judged_votes(connection: sa.Connection, index: TileIndex, asked: Electorate) -> list[tuple[StoredVote, str]]:
     """Every standing vote on a tile, and why it does not count there at all; "" if it does, in cells where it is not
     spent (:func:`mapvote.fusion.spent.unspent`)."""
-    return _judged(_standing_on(connection, [index], asked.mark)[index], index, asked)
+    return _judged(_standing_on(connection, index[0], [index[1]], asked.mark)[index], index, asked)
 
 
 def _judged(standing: Sequence[StoredVote], index: TileIndex, asked: Electorate) -> list[tuple[StoredVote, str]]:
@@ -192,7 +195,7 @@ def counted_votes(
 ) -> list[tuple[StoredVote, TileVote]]:
     """As :func:`counting_votes`, each beside its ballot."""
     index = tile.index
-    polled = polled or poll(connection, [index], asked)
+    polled = polled or poll(connection, index[0], [index[1]], asked)
     chosen = [vote for vote, why in _judged(polled.standing[index], index, asked) if not why]
     votes, bars = read_votes(connection, index, chosen, polled.rows), polled.bars[index]
     said = zip(chosen, votes, strict=True)
@@ -216,14 +219,12 @@ def recent_votes(
 ) -> list[TileVote]:
     """As :func:`counting_votes`, of every vehicle and of the last ``stay_days``: what has come and gone here?"""
     index = tile.index
-    standing, rows = (
-        (_standing_on(connection, [index], asked.mark), None) if polled is None else (polled.standing, polled.rows)
-    )
-    judged = _judged(standing[index], index, asked)
+    polled = polled or poll(connection, index[0], [index[1]], asked)
+    judged = _judged(polled.standing[index], index, asked)
     ready = [vote for vote, why in judged if why not in (YOUNG, OTHERWISE, DAMAGED)]
     oldest = max((vote.end_ns for vote in ready), default=0) - asked.settings.stay_days * DAY_NS
     chosen = [vote for vote in ready if vote.end_ns >= oldest]
-    return [unspent(vote, tile, misread) for vote in read_votes(connection, index, chosen, rows)]
+    return [unspent(vote, tile, misread) for vote in read_votes(connection, index, chosen, polled.rows)]
 
 
 def from_sound_ballots(connection: sa.Connection, asked: Electorate, read: Callable[[Electorate], Read]) -> Read:

@@ -29,9 +29,10 @@ REMEMBERED_BYTES = 128 << 20
 _T = schema.ballot_tiles
 _PLANES_OF = sa.select(_T.c.row, _T.c.col, _T.c.ballot, *(_T.c[p] for p in schema.BALLOT_PLANES), _T.c.base, _T.c.sum)
 _PLANES_OF = _PLANES_OF.where(
-    sa.tuple_(_T.c.row, _T.c.col, _T.c.ballot).in_(sa.bindparam("asked", expanding=True)),
+    _T.c.row == sa.bindparam("row", type_=sa.BigInteger),
+    _T.c.col.in_(sa.bindparam("cols", expanding=True)),
+    _T.c.ballot.in_(sa.bindparam("ballots", expanding=True)),
 )
-_AT_ONCE = MOST_ASKED // 3
 Rows = Mapping[tuple[int, int, int], Any]
 """By tile and ballot, what is stored of its planes."""
 
@@ -92,13 +93,14 @@ remembered = Remembered(REMEMBERED_BYTES)
 """What this process unpacked."""
 
 
-def read_rows(connection: sa.Connection, votes: Iterable[tuple[TileIndex, StoredVote]]) -> Rows:
-    """The rows of votes on tiles, as they are."""
-    asked = sorted({(*index, vote.seq) for index, vote in votes})
+def read_rows(connection: sa.Connection, row: int, votes: Sequence[tuple[int, StoredVote]]) -> Rows:
+    """What is stored of votes on tiles of a ``row``, each beside its column."""
     found: dict[tuple[int, int, int], Any] = {}
-    for start in range(0, len(asked), _AT_ONCE):
-        rows = connection.execute(_PLANES_OF, {"asked": asked[start : start + _AT_ONCE]}).all()
-        found |= {(row.row, row.col, row.ballot): row for row in rows}
+    cols, ballots = sorted({col for col, _ in votes}), sorted({vote.seq for _, vote in votes})
+    for start in range(0, len(ballots), MOST_ASKED):
+        asked_of = {"row": row, "cols": cols, "ballots": ballots[start : start + MOST_ASKED]}
+        rows = connection.execute(_PLANES_OF, asked_of).all()
+        found |= {(stored.row, stored.col, stored.ballot): stored for stored in rows}
     return found
 
 
@@ -109,8 +111,8 @@ def read_votes(
 
     ``known``: rows that were read before.
     """
-    rows = {} if known is None else known
-    rows = {**rows, **read_rows(connection, ((index, vote) for vote in stored if (*index, vote.seq) not in rows))}
+    rows = dict(known or {})
+    rows |= read_rows(connection, index[0], [(index[1], vote) for vote in stored if (*index, vote.seq) not in rows])
     mine = {vote.seq: rows[*index, vote.seq] for vote in stored}
     _check(mine.values())
     sums = [mine[vote.seq].sum for vote in stored]

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
-from itertools import accumulate
+from itertools import accumulate, groupby
 from typing import Any
 
 import numba
@@ -37,8 +37,8 @@ from mapvote.server.store.quarantine import Damage, DamagedBallots
 from mapvote.server.store.queries import load_tile, tile_as_of
 
 _GROUP = 4
-"""Tiles that are fused within one reading of the database."""
-_NOWHERE = (np.empty(0, dtype=np.uint64),) * 2
+"""Tiles side by side that are fused within one reading of the database."""
+_NOWHERE = np.empty(0, dtype=np.uint64)
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,13 +100,14 @@ class Fused:
 
 
 def fuse_stored(tasks: Sequence[Task], database: Database | None = None) -> list[Fused]:
-    """Read the votes that count on some tiles of one round, decide, edit. Pure but for reading the database.
+    """Read the votes that count on some tiles of a row, in one round, decide, edit. Pure but for reading the database.
 
     Damaged ballots are left out and named; a damaged tile stays as it is and is named. In another process, where there
     is no ``database`` at hand, one is opened by the tasks' ``url`` and kept.
     """
     with (database or _database(tasks[0].url)).reading() as connection:
-        polled = poll(connection, [task.window.tile_index for task in tasks], tasks[0].asked)
+        tiles = [task.window.tile_index for task in tasks]
+        polled = poll(connection, tiles[0][0], [col for _, col in tiles], tasks[0].asked)
         return [_fuse_sound(connection, task, polled) for task in tasks]
 
 
@@ -146,9 +147,8 @@ def _fuse(connection: sa.Connection, task: Task, polled: Polled) -> Fused:
     decision, edited = fuse_tile(tile, votes, rule_of(cast.method), task.asked.settings, task.version, recent)
     stored = (tile, task.tile) if isinstance(task.tile, TileHashes) else None
     hashes, planes = (None, {}) if edited is tile else pack_tile(edited, stored)
-    gone, new = (
-        emptied_and_filled(*(each.obstacle_words.reshape(-1) for each in (tile, edited))) if hashes else _NOWHERE
-    )
+    held, holds = (tile.obstacle_words, edited.obstacle_words) if hashes else (_NOWHERE, _NOWHERE)
+    emptied, filled = emptied_and_filled(held.reshape(-1), holds.reshape(-1))
     return Fused(
         index=tile.index,
         states=pack_states(decision.states),
@@ -159,8 +159,8 @@ def _fuse(connection: sa.Connection, task: Task, polled: Polled) -> Fused:
         deleted=decision.deleted,
         hashes=hashes,
         planes=planes,
-        cells_gone=gone,
-        cells_new=new,
+        cells_gone=emptied,
+        cells_new=filled,
         freed=0 if tile.free is edited.free or tile.free is None else int((tile.free != edited.free).sum()),
         tile=None if task.misread is None else edited,
         copies=decision.copies,
@@ -207,7 +207,8 @@ def fuse_round(tasks: Sequence[Task], database: Database, executor: Executor | N
     """Fuse every tile of a round; results in the order of the tasks. Without an executor, one after another."""
     where = executor.within if isinstance(executor, Watched) else executor
     here = partial(fuse_stored, database=database)
-    groups = [tasks[start : start + _GROUP] for start in range(0, len(tasks), _GROUP)]
+    rows = [list(row) for _, row in groupby(tasks, lambda task: task.window.row0)]
+    groups = [row[start : start + _GROUP] for row in rows for start in range(0, len(row), _GROUP)]
     work = here if executor is None or isinstance(where, ThreadPoolExecutor) else fuse_stored
     return [fused for some in (executor.map if executor else map)(work, groups) for fused in some]
 
