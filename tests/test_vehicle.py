@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from hand_made import AtOnce
-from mapvote.codec.ballot import decode, encode, unpack_offer, unpack_points, unpack_states, unpack_tally, validate
+from mapvote.codec.ballot import decode, encode, unpack_offer, unpack_states, unpack_tally, validate
+from mapvote.codec.points import unpack_points
 from mapvote.codec.words import unpack_words
 from mapvote.config import FuseSettings, Settings, VotingSettings
 from mapvote.core.grid import TILE_CELLS

@@ -8,6 +8,7 @@ import numpy as np
 
 from mapvote.codec.ballot import Ballot, BallotTile, pack_plane, tile_key
 from mapvote.codec.path import pack_path
+from mapvote.codec.points import pack_points
 from mapvote.codec.tile_file import base_hash
 from mapvote.codec.words import pack_words
 from mapvote.config import Settings
@@ -145,7 +146,7 @@ def _ballot_tile(point_map: PointMap, tile: TileIndex, votes: TileVotes, points:
         base = reference_window(point_map, window).base
         new = np.where(changed[CellState.CHANGED_OCCUPIED], votes.new, np.uint64(0))
         kept, bright = points_in(window, points, new, base)
-        new_points = pack_plane(kept) if len(kept) else None
+        new_points = pack_points(kept) if len(kept) else None
         intensity = pack_plane(bright) if len(kept) and bright is not None and bright.any() else None
     gone, left = votes.gone, np.uint64(0) if votes.remnants is None else votes.remnants
     if gone is not None:

@@ -15,17 +15,17 @@ import numba
 import numpy as np
 
 from mapvote.codec.arrays import pack_plane as pack_plane
-from mapvote.codec.arrays import unpack_bytes, unpack_into, unpack_plane
+from mapvote.codec.arrays import unpack_into, unpack_plane
 from mapvote.codec.path import check_path
+from mapvote.codec.points import unpack_points
 from mapvote.codec.words import unpack_sparse
-from mapvote.core.grid import CELL_SIZE, TILE_CELLS, TileIndex
+from mapvote.core.grid import TILE_CELLS, TileIndex
 from mapvote.core.types import F32, N_STATES, NO_VOTE, U8, U16, MapvoteError
 
-FORMAT_VERSION = 2
-"""2: masks and free space as the words of some cells; 1, which is still read: as whole planes."""
+FORMAT_VERSION = 3
+"""3: new points by their voxels; 2: as float32, masks and free space as the words of some cells; 1: these as whole
+planes. All are read."""
 MAX_TILES = 4096
-MAX_POINTS_PER_CELL = 64
-"""One new point per voxel of a column: no honest ballot has more."""
 MAX_TILE_INDEX = 1 << 20
 _CELLS = TILE_CELLS * TILE_CELLS
 
@@ -48,7 +48,8 @@ class BallotTile(msgspec.Struct, frozen=True, kw_only=True):
     gone: bytes | None = None
     """(256, 256) uint64, see codec/words.py: which voxels of a changed-empty cell are gone (delete mask)."""
     new_points: bytes | None = None
-    """(m, 3) float32 from the tile's corner, sorted by voxel key: one per 0.3 m voxel of changed-occupied cells."""
+    """(m, 3) from the tile's corner, see codec/points.py, sorted by voxel key: one per 0.3 m voxel of changed-occupied
+    cells."""
     intensity: bytes | None = None
     """(m,) uint8 of each of them, 255 for 1.0; None: the map holds no intensity, or the sensor measures none."""
     free: bytes | None = None
@@ -117,27 +118,6 @@ def unpack_tally(data: bytes) -> U16:
     return np.moveaxis(unpack_plane(data, "<u2", (N_STATES, TILE_CELLS, TILE_CELLS), "ballot: tally"), 0, -1)
 
 
-def unpack_points(data: bytes) -> F32:
-    """(m, 3) float32 from the tile's corner; MapvoteError as :func:`unpack_sound_points`, and if one cell holds more
-    than it may."""
-    points = unpack_sound_points(data)
-    if most_in_a_cell(points) > MAX_POINTS_PER_CELL:
-        raise MapvoteError(f"ballot: new_points holds more than {MAX_POINTS_PER_CELL} points in one cell")
-    return points
-
-
-def unpack_sound_points(data: bytes) -> F32:
-    """(m, 3) float32 from the tile's corner, of a ballot that the server took in; MapvoteError if damaged, not finite
-    or outside the tile."""
-    raw = unpack_bytes(data, _CELLS * MAX_POINTS_PER_CELL * 12, "ballot: new_points")
-    if len(raw) % 12:
-        raise MapvoteError(f"ballot: new_points has {len(raw)} bytes, not a multiple of 12")
-    points = np.frombuffer(raw, dtype="<f4").reshape(-1, 3)
-    if not _all_inside(points, np.float32(TILE_CELLS * CELL_SIZE)):
-        raise MapvoteError("ballot: new_points holds a point outside its tile or not finite")
-    return points
-
-
 def unpack_offer(
     new_points: bytes | None, intensity: bytes | None, unpack: Callable[[bytes], F32] = unpack_points
 ) -> tuple[F32 | None, U8 | None]:
@@ -157,27 +137,6 @@ def _all_states(values: U8) -> bool:
     for value in values:  # without a way out: that the compiler turns into vectors
         sound &= (value < N_STATES) | (value == NO_VOTE)
     return sound
-
-
-@numba.njit(cache=True, nogil=True)
-def _all_inside(points: F32, side: np.float32) -> bool:
-    """Whether all points (m, 3) are finite and within a tile; NaN fails every comparison."""
-    sound = True
-    for x, y, z in points:
-        sound &= 0 <= x < side and 0 <= y < side and abs(z) <= 1e5
-    return sound
-
-
-@numba.njit(cache=True, nogil=True)
-def most_in_a_cell(points: F32) -> int:
-    """The most of these points (m, 3), from the tile's corner and inside it, that lie in one cell."""
-    counts = np.zeros(TILE_CELLS * TILE_CELLS, dtype=np.uint16)  # one that runs over has been counted as the most
-    most = 0
-    for x, y, _ in points:
-        cell = min(int(y / CELL_SIZE), TILE_CELLS - 1) * TILE_CELLS + min(int(x / CELL_SIZE), TILE_CELLS - 1)
-        counts[cell] += 1
-        most = max(most, counts[cell])
-    return most
 
 
 def encode(ballot: Ballot) -> bytes:

@@ -8,7 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from mapvote.codec.ballot import Ballot, decode, unpack_points, unpack_states
+from mapvote.codec.ballot import Ballot, decode, unpack_states
+from mapvote.codec.points import unpack_points
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS
 from mapvote.core.heights import check_heights
 from mapvote.core.point_map import PointMap

@@ -11,7 +11,8 @@ from typing import TypeVar
 import msgspec
 import numpy as np
 
-from mapvote.codec.ballot import Ballot, BallotTile, pack_plane, unpack_points, unpack_states
+from mapvote.codec.ballot import Ballot, BallotTile, pack_plane, unpack_states
+from mapvote.codec.points import pack_points, unpack_points
 from mapvote.codec.words import pack_words, unpack_words
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS
 from mapvote.core.point_map import PointMap
@@ -103,7 +104,7 @@ def _claim(ballot: Ballot, point_map: PointMap, lie: Callable[[U8, Bool], U8]) -
             tile,
             states=pack_plane(states),
             gone=pack_words(gone),
-            new_points=pack_plane(points) if len(points) else None,
+            new_points=pack_points(points) if len(points) else None,
             intensity=None,
         )
 
@@ -132,7 +133,7 @@ def _moved(ballot: Ballot, by: int) -> Ballot:
             states=None if tile.states is None else pack_plane(_shifted(unpack_states(tile.states), NO_VOTE, by)),
             gone=None if tile.gone is None else pack_words(_shifted(unpack_words(tile.gone, "gone"), 0, by)),
             free=None if tile.free is None else pack_words(_shifted(unpack_words(tile.free, "free"), 0, by)),
-            new_points=None if points is None else pack_plane(points),
+            new_points=None if points is None else pack_points(points),
             intensity=None,
         )
 

@@ -7,7 +7,8 @@ from collections.abc import Callable, Collection, Iterator, Mapping
 import numpy as np
 import sqlalchemy as sa
 
-from mapvote.codec.ballot import Ballot, BallotTile, tile_key, unpack_points
+from mapvote.codec.ballot import Ballot, BallotTile, tile_key
+from mapvote.codec.points import unpack_points
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, TileIndex
 from mapvote.core.types import F64, Bool, MapvoteError
 from mapvote.fusion.offline import tile_vote

@@ -16,7 +16,8 @@ from typing import Any
 import numpy as np
 import sqlalchemy as sa
 
-from mapvote.codec.ballot import unpack_offer, unpack_sound_points, unpack_sound_states, unpack_tally
+from mapvote.codec.ballot import unpack_offer, unpack_sound_states, unpack_tally
+from mapvote.codec.points import unpack_sound_points
 from mapvote.core.grid import TileIndex
 from mapvote.fusion.sparse_columns import Words
 from mapvote.fusion.tile_vote import TileVote

@@ -1,0 +1,115 @@
+"""New points of a tile <-> bytes: the voxel of each, and where in it to a 128th of its side.
+
+A millimetre is less than a sensor sees and a vehicle knows of its place, yet as float32 three quarters of a ballot were
+such digits. So vehicles round: a point stays in its voxel and moves by 1.2 mm along each axis at the most. Under zstd
+lie a mark, the ways from each point's cell to the next as two planes of bytes, from each layer to the next as four, and
+the places in the voxels as three. Older ballots hold (m, 3) float32: the length tells which.
+"""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+
+from mapvote.codec.arrays import compress, unpack_bytes
+from mapvote.core.grid import CELL_SIZE, CELLS, TILE_CELLS
+from mapvote.core.types import F32, U8, MapvoteError
+
+MAX_POINTS_PER_CELL = 64
+"""One new point per voxel of a column: no honest ballot has more."""
+MOST_OFF_M = 0.5 * CELL_SIZE / 128
+"""How far rounding moves a point along an axis, but for what float32 adds."""
+_MARK = b"\x03"
+"""With it the length is never a multiple of three, as that of float32 always is."""
+_BYTES, _STEPS = 9, 128
+_MAX_BYTES = CELLS * MAX_POINTS_PER_CELL * 12
+_TOP_M = 1e5
+
+
+def pack_points(points: F32) -> bytes:
+    """(m, 3) from the tile's corner, inside it, in any order."""
+    return compress(_MARK + _planes(points).tobytes())
+
+
+def unpack_points(data: bytes) -> F32:
+    """(m, 3) float32 from the tile's corner; MapvoteError as :func:`unpack_sound_points`, and if one cell holds more
+    than it may."""
+    points = unpack_sound_points(data)
+    if most_in_a_cell(points) > MAX_POINTS_PER_CELL:
+        raise MapvoteError(f"ballot: new_points holds more than {MAX_POINTS_PER_CELL} points in one cell")
+    return points
+
+
+def unpack_sound_points(data: bytes) -> F32:
+    """(m, 3) float32 from the tile's corner, of a ballot that the server took in; MapvoteError if damaged, not finite
+    or outside the tile."""
+    raw = np.frombuffer(unpack_bytes(data, _MAX_BYTES, "ballot: new_points"), dtype=np.uint8)
+    if len(raw) % 12 == 0:
+        points, sound = raw.view("<f4").reshape(-1, 3), True
+    elif len(raw) % _BYTES == 1 and raw[0] == _MARK[0]:
+        points = np.empty((len(raw) // _BYTES, 3), dtype=np.float32)
+        sound = _placed(raw[1:].reshape(_BYTES, -1), points)
+    else:
+        raise MapvoteError(f"ballot: new_points has {len(raw)} bytes, which is no number of points")
+    if not sound or not _all_inside(points, np.float32(TILE_CELLS * CELL_SIZE)):
+        raise MapvoteError("ballot: new_points holds a point outside its tile or not finite")
+    return points
+
+
+@numba.njit(cache=True, nogil=True)
+def _planes(points: F32) -> U8:
+    """(9, m) of points (m, 3): differences modulo 2 ** 16 and 2 ** 32, lowest byte first, and 128ths of a voxel."""
+    planes = np.empty((_BYTES, len(points)), dtype=np.uint8)
+    last_cell, last_layer = np.int64(0), np.int64(0)
+    voxel = np.empty(3, dtype=np.int64)
+    for i in range(len(points)):
+        for axis in range(3):
+            place = np.float64(points[i, axis]) / CELL_SIZE
+            voxel[axis] = int(np.floor(place))
+            if axis < 2:
+                voxel[axis] = min(max(voxel[axis], 0), TILE_CELLS - 1)
+            planes[6 + axis, i] = min(max(int((place - voxel[axis]) * _STEPS), 0), _STEPS - 1)
+        cell = voxel[1] * TILE_CELLS + voxel[0]
+        for k in range(2):
+            planes[k, i] = ((cell - last_cell) >> (8 * k)) & 0xFF
+        for k in range(4):
+            planes[2 + k, i] = ((voxel[2] - last_layer) >> (8 * k)) & 0xFF
+        last_cell, last_layer = cell, voxel[2]
+    return planes
+
+
+@numba.njit(cache=True, nogil=True)
+def _placed(planes: U8, points: F32) -> bool:
+    """Fill ``points`` (m, 3) from (9, m); whether each lies in its voxel."""
+    cell, layer, sound = np.int64(0), np.int64(0), True
+    for i in range(len(points)):
+        cell = (cell + np.int64(planes[0, i]) + (np.int64(planes[1, i]) << 8)) & (CELLS - 1)
+        way = np.int64(0)
+        for k in range(4):
+            way |= np.int64(planes[2 + k, i]) << (8 * k)
+        layer = ((layer + way + (1 << 31)) & 0xFFFFFFFF) - (1 << 31)
+        for axis, voxel in enumerate((cell % TILE_CELLS, cell // TILE_CELLS, layer)):
+            points[i, axis] = (voxel + (planes[6 + axis, i] + 0.5) / _STEPS) * CELL_SIZE
+            sound &= planes[6 + axis, i] < _STEPS
+    return sound
+
+
+@numba.njit(cache=True, nogil=True)
+def _all_inside(points: F32, side: np.float32) -> bool:
+    """Whether all points (m, 3) are finite and within a tile; NaN fails every comparison."""
+    sound = True
+    for x, y, z in points:
+        sound &= 0 <= x < side and 0 <= y < side and abs(z) <= _TOP_M
+    return sound
+
+
+@numba.njit(cache=True, nogil=True)
+def most_in_a_cell(points: F32) -> int:
+    """The most of these points (m, 3), from the tile's corner and inside it, that lie in one cell."""
+    counts = np.zeros(TILE_CELLS * TILE_CELLS, dtype=np.uint16)  # one that runs over has been counted as the most
+    most = 0
+    for x, y, _ in points:
+        cell = min(int(y / CELL_SIZE), TILE_CELLS - 1) * TILE_CELLS + min(int(x / CELL_SIZE), TILE_CELLS - 1)
+        counts[cell] += 1
+        most = max(most, counts[cell])
+    return most
