@@ -12,12 +12,12 @@ from hypothesis import strategies as st
 from mapvote.core.types import N_STATES, NO_VOTE, CellState
 from mapvote.core.voting import (
     VOTE_UNIT,
-    add_states,
     add_tally,
     decide,
     decide_cells,
     decide_change,
     one_hot,
+    tally_of,
     to_wire,
     vote_weight,
     weight_table,
@@ -75,14 +75,13 @@ def test_no_quorum_is_asked_of_what_stays_as_it_is() -> None:
         assert decide_cells(tally, np.zeros_like(tally), True, 99).tolist() == [state]
 
 
-@pytest.mark.parametrize("voters", [1, 255, 256, 600])
+@pytest.mark.parametrize("voters", [0, 1, 15, 16, 255, 256, 600])
 def test_votes_counted_in_bytes_are_the_votes_counted_one_by_one(voters: int) -> None:
     """More voters than a byte counts, and more cells than are counted at once."""
     rng = np.random.default_rng(voters)
     states = rng.choice([UO, UE, CO, CE, UN, NO_VOTE], (voters, 5000)).astype(np.uint8)
-    tally = np.ones((N_STATES, 5000), dtype=np.int32)
-    add_states(states, tally)
-    expected = 1 + VOTE_UNIT * np.stack([(states == state).sum(axis=0) for state in range(N_STATES)])
+    tally = tally_of(list(states), 5000)
+    expected = VOTE_UNIT * np.stack([(states == state).sum(axis=0) for state in range(N_STATES)])
     np.testing.assert_array_equal(tally, expected)
 
 

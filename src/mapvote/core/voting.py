@@ -6,13 +6,12 @@ not depend on their order. A decided ballot is a one-hot tally; the server alway
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from itertools import islice
+from collections.abc import Sequence
 from typing import Any
 
 import numba
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from mapvote.core.types import I32, N_STATES, NO_VOTE, U8, U16, CellState
 
@@ -21,6 +20,7 @@ VOTE_UNIT = 16
 _CACHED_CELLS = 2048
 _BYTE_MAX, _AT_ONCE = 255, 4
 """Voters whose votes a byte can count; that are counted in one pass."""
+_TALLIES: dict[Any, DTypeLike] = {np.dtype(np.uint8): np.uint8, np.dtype(np.uint16): np.uint16}
 _UO, _UE, _CO, _CE, _UN = (int(state) for state in CellState)
 
 
@@ -115,19 +115,25 @@ def one_hot(states: U8) -> I32:
     return tally
 
 
-def add_states(voters: Iterable[U8], tally: NDArray[Any]) -> None:
-    """Add what each of some voters decided, ``states`` (cells,), to ``tally`` (5, cells), a vote each.
+def tally_of(voters: Sequence[U8], cells: int) -> NDArray[Any]:
+    """(5, cells) the tally of what each of some voters decided, ``states`` (cells,), a vote each: the sum of their
+    ``one_hot``, class by class, as uint8 or uint16 where no sum can exceed that.
 
-    The same as adding ``one_hot`` of each. Votes are counted in bytes first, as many voters as a byte can count.
+    Votes are counted in bytes first, as many voters as a byte can count; of few that is the tally.
     """
-    counts, voters = np.empty(tally.shape, dtype=np.uint8), iter(voters)
-    silent = np.full(tally.shape[1], NO_VOTE, dtype=np.uint8)
-    while batch := list(islice(voters, _BYTE_MAX)):
-        counts[:] = 0
+    shape, silent = (N_STATES, cells), np.full(cells, NO_VOTE, dtype=np.uint8)
+    tally = np.zeros(shape, dtype=_TALLIES.get(np.min_scalar_type(VOTE_UNIT * len(voters)), np.int32))
+    for start in range(0, len(voters), _BYTE_MAX):
+        counts = tally if tally.dtype == np.uint8 else np.zeros(shape, dtype=np.uint8)
+        batch = voters[start : start + _BYTE_MAX]
         for first in range(0, len(batch), _AT_ONCE):
             some = batch[first : first + _AT_ONCE]
             count_states(*some, *[silent] * (_AT_ONCE - len(some)), counts)
-        _add_counts(counts, tally)
+        if counts is tally:
+            tally *= np.uint8(VOTE_UNIT)
+        else:
+            _add_counts(counts, tally)
+    return tally
 
 
 @numba.njit(cache=True, nogil=True)

@@ -19,7 +19,7 @@ from mapvote.core.cells import flat_cells
 from mapvote.core.grid import CELLS, TILE_CELLS, Grid, Lattice, TileIndex
 from mapvote.core.tile import Tile
 from mapvote.core.types import F32, I32, I64, N_STATES, NO_VOTE, U8, U64, Bool, CellState, MapvoteError
-from mapvote.core.voting import VOTE_UNIT, add_states, add_tally, decide_cells
+from mapvote.core.voting import VOTE_UNIT, add_tally, decide_cells, tally_of
 from mapvote.fusion.copies import Copy, liars_among, originals
 from mapvote.fusion.edit import add_points, delete_points
 from mapvote.fusion.outliers import contradictors, deniers
@@ -66,15 +66,12 @@ def count(votes: Sequence[TileVote], rule: Rule, min_votes: int) -> tuple[U8, ND
     ``paper``: undetermined competes and a plain majority decides. ``columns``: undetermined abstains and a change
     needs a majority of the vehicles that determined the cell. A change that fewer than ``min_votes`` vehicles back is
     undetermined; in one stage a vehicle backs what its own tally alone would decide. The tally is (256, 256, 5) in
-    VOTE_UNITs, class by class in memory, uint16 where no sum can exceed that.
+    VOTE_UNITs, class by class in memory, uint8 or uint16 where no sum can exceed that.
     """
     abstain = rule == "columns"
     quorum = min_votes if min_votes > 1 else 0
-    one_stage = any(vote.tally is not None for vote in votes)
-    small = not one_stage and len(votes) * VOTE_UNIT <= np.iinfo(np.uint16).max
-    tally = np.zeros((N_STATES, CELLS), dtype=np.uint16 if small else np.int32)
-    if one_stage:
-        backers = np.zeros((N_STATES, CELLS), dtype=np.int32)
+    if any(vote.tally is not None for vote in votes):
+        tally, backers = (np.zeros((N_STATES, CELLS), dtype=np.int32) for _ in range(2))
         for vote in votes:
             assert vote.tally is not None
             add_tally(
@@ -82,7 +79,7 @@ def count(votes: Sequence[TileVote], rule: Rule, min_votes: int) -> tuple[U8, ND
             )
         states = decide_cells(tally, backers, abstain, quorum)
     else:
-        add_states((vote.states.reshape(-1) for vote in votes if vote.states is not None), tally)
+        tally = tally_of([vote.states.reshape(-1) for vote in votes if vote.states is not None], CELLS)
         states = decide_cells(tally, tally, abstain, quorum * VOTE_UNIT)
     shape = (TILE_CELLS, TILE_CELLS)
     return states.reshape(shape), np.moveaxis(tally.reshape(N_STATES, *shape), 0, -1)

@@ -13,7 +13,6 @@ from functools import lru_cache, partial
 from itertools import accumulate, groupby
 from typing import Any
 
-import numba
 import numpy as np
 import sqlalchemy as sa
 from numpy.typing import NDArray
@@ -22,7 +21,7 @@ from mapvote.codec.arrays import compress, pack_plane, raw_plane, unpack_bytes
 from mapvote.codec.ballot import tile_key
 from mapvote.core.grid import CELLS, TILE_CELLS, Grid, TileIndex
 from mapvote.core.tile import Tile
-from mapvote.core.types import I32, I64, N_STATES, U8, U16, Bool, MapvoteError
+from mapvote.core.types import I32, I64, N_STATES, U8, Bool, MapvoteError
 from mapvote.core.voting import VOTE_UNIT
 from mapvote.fusion.copies import Copy
 from mapvote.fusion.fuse import fuse_tile, rule_of
@@ -39,6 +38,7 @@ from mapvote.server.store.queries import load_tile, tile_as_of
 _GROUP = 4
 """Tiles side by side that are fused within one reading of the database."""
 _NOWHERE = np.empty(0, dtype=np.uint64)
+_BYTE_MAX = 255
 
 
 @dataclass(frozen=True, slots=True)
@@ -220,25 +220,16 @@ def pack_states(states: U8) -> bytes:
 
 def pack_tally(tally: NDArray[Any]) -> bytes:
     """(256, 256, 5) as a zstd frame of little-endian planes, class by class, which packs four times better than cell
-    by cell: uint16 if it comes so, else int32; but uint8 if these are whole votes and no more than that holds. The
-    length tells which."""
+    by cell: uint16 if it comes so, else int32; but of unsigned numbers uint8, if these are whole votes and no more than
+    that holds. The length tells which."""
     planes = np.moveaxis(tally, -1, 0)
-    if tally.dtype != np.uint16:
+    if planes.dtype == np.int32:
         return compress(raw_plane(planes, "<i4"), 1)
-    votes = np.empty(planes.shape, dtype=np.uint8)
-    if _in_votes(np.ascontiguousarray(planes).reshape(-1), votes.reshape(-1)):
+    unit = planes.dtype.type(VOTE_UNIT)
+    votes = planes // unit
+    if votes.max() <= _BYTE_MAX and np.array_equal(votes * unit, planes):
         return compress(raw_plane(votes, "|u1"), 1)
     return compress(raw_plane(planes, "<u2"), 1)
-
-
-@numba.njit(cache=True, nogil=True)
-def _in_votes(tally: U16, votes: U8) -> bool:
-    """Fill ``votes`` (n,) with a ``tally`` (n,) in VOTE_UNITs; whether that loses nothing."""
-    lost = np.uint16(0)
-    for i in range(len(tally)):
-        votes[i] = tally[i] // np.uint16(VOTE_UNIT)
-        lost |= tally[i] ^ np.uint16(np.uint16(votes[i]) * np.uint16(VOTE_UNIT))
-    return bool(lost == 0)
 
 
 def unpack_tally_plane(data: bytes) -> I32:
