@@ -164,13 +164,15 @@ def grow(start: I32 | I64, heights: F32, neighbours: I32, ground: F32, gap: U8) 
 
     Seeds are all entered before any of them is left: only the rim of what they cover waits in the queue.
     """
+    width = np.int64(1)  # not a literal, for which all steps would be compiled once more
     for cell in range(len(gap)):
         if gap[cell] == SEED:
-            _enter(cell, ground[cell], 1, start, heights, neighbours, ground, gap)
+            _enter(cell, ground[cell], width, start, heights, neighbours, ground, gap)
     cells, expected = np.empty(1024, np.int64), np.empty(1024, np.float32)
     following = np.empty(1024, np.int32)
     first, last = np.full(WIDEST + 4, -1, np.int32), np.full(WIDEST + 4, -1, np.int32)
-    n, spare, width, looked_at = 0, -1, 0, 0
+    n, spare, looked_at = 0, -1, 0
+    width = np.int64(0)
     while width <= WIDEST:
         if looked_at < len(gap):
             cell = looked_at

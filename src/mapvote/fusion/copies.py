@@ -32,6 +32,8 @@ _UN = int(CellState.UNDETERMINED)
 _LAST = TILE_CELLS - 1
 _APART = 3
 """Cells; and of so many rows one is looked at, which is enough for a share."""
+_RIM = np.int64(1)
+"""Columns on either side that are not compared. No literal, for which numba would compile once more."""
 _ASKED = slice(None, None, 7)
 
 
@@ -90,7 +92,7 @@ def difference(a: U8, b: U8) -> tuple[int, int]:
     The tile's rim is not: what lies beside it is not known.
     """
     moved, looked = _look(masks_of([a, b]))
-    return int(_differing(looked[0], looked[1], 1, TILE_CELLS**2)), int(moved.min())
+    return int(_differing(looked[0], looked[1], _RIM, TILE_CELLS**2)), int(moved.min())
 
 
 def masks_of(planes: Iterable[U8]) -> U64:
@@ -131,14 +133,15 @@ def _agreement(drive: TileVote, others: Sequence[TileVote]) -> int:
 def grouped(masks: U64, whose: I64, least: float) -> I64:
     """(n,) the first of all drives that are alike to a drive, or to one that is alike to it, and so on."""
     moved, looked = _look(masks)
-    group = np.arange(len(masks))
+    group = np.empty(len(masks), dtype=np.int64)
     for i in range(len(masks)):
+        group[i] = i
         for k in range(i):
             whole = min(moved[i], moved[k])
             if whose[i] == whose[k] or group[i] == group[k] or whole < LEAST_MOVED:
                 continue
             most = int(np.ceil(least * whole)) - 1
-            if _differing(looked[i], looked[k], 1, most) <= most:
+            if _differing(looked[i], looked[k], _RIM, most) <= most:
                 older, newer = min(group[i], group[k]), max(group[i], group[k])
                 for other in range(i + 1):
                     if group[other] == newer:
@@ -166,8 +169,8 @@ def _look(masks: U64) -> tuple[I64, U64]:
             for plane in range(3):
                 for w in range(4):
                     east[n, plane, w] = _from_west(looked[i, n, plane], w, _APART)
-        moved[i] = _differing(looked[i, 1:], looked[i, :-1], 1, TILE_CELLS**2)
-        moved[i] += _differing(looked[i], east, 1 + _APART, TILE_CELLS**2)
+        moved[i] = _differing(looked[i, 1:], looked[i, :-1], _RIM, TILE_CELLS**2)
+        moved[i] += _differing(looked[i], east, _RIM + _APART, TILE_CELLS**2)
         moved[i] //= 2
     return moved, looked
 

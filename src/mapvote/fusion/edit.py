@@ -94,8 +94,10 @@ def _representatives(
     """
     n = len(voxels)
     out = np.empty(n, dtype=np.int64)
-    found = 0
-    seen = np.full(0 if n == 0 else voters.max() + 1, -1, dtype=np.int64)
+    found, last_voter = 0, -1
+    for i in range(n):
+        last_voter = max(last_voter, voters[i])
+    seen = np.full(last_voter + 1, -1, dtype=np.int64)
     low, start = 0, 0
     while start < n:
         voxel = voxels[order[start]]
@@ -124,7 +126,7 @@ def _nearest_to_mean(points: F32, intensity: U8, some: I64) -> int:
     for k in range(3):
         total = 0
         for i in some:
-            total += int(np.round(np.float64(points[i, k]) * 1e6))
+            total += int(np.rint(np.float64(points[i, k]) * 1e6))
         mean[k] = total / (1e6 * len(some))
     best, nearest = some[0], np.inf
     for i in some:

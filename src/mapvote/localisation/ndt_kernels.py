@@ -88,7 +88,8 @@ def pair_up(points: F32, T: F64, window: Window, cells: F64, pairs: Pairs) -> No
     """
     rows, lowest, size = window
     of, home, origin = pairs
-    low, flat, strides = lowest * size - origin, rows.ravel(), (rows.shape[1] * rows.shape[2], rows.shape[2])
+    flat, strides = rows.ravel(), (rows.shape[1] * rows.shape[2], rows.shape[2])
+    low = lowest[0] * size - origin[0], lowest[1] * size - origin[1], lowest[2] * size - origin[2]
     moved, partner = np.empty(_TOGETHER, np.int64), np.empty((7, _TOGETHER), np.int32)
     for first in range(0, points.shape[1], _TOGETHER):
         m = _moved(points, T, window, home, range(first, min(first + _TOGETHER, points.shape[1])), moved)
@@ -208,7 +209,11 @@ def linearise(points: F32, pairs: Pairs, T: F64, H: F64, M: F64, g: F64) -> tupl
     """The reweighted least squares of points (3, n) at pose T, for pairs made there: fills H (6, 6), the scatter M
     (6, 6) of the points' own gradients, and g (6, 1). Returns (mean likelihood, share of inliers)."""
     sums = np.zeros(50)
-    R, d = T[:3, :3].astype(np.float32), (T[:3, 3] - pairs.origin).astype(np.float32)
+    R, d = np.empty((3, 3), np.float32), np.empty(3, np.float32)
+    for r in range(3):
+        d[r] = T[r, 3] - pairs.origin[r]
+        for c in range(3):
+            R[r, c] = T[r, c]
     n = points.shape[1]
     for first in range(0, n, _BLOCK):
         _sum_block(points, pairs.of, first, min(first + _BLOCK, n), R, d, sums)

@@ -46,7 +46,9 @@ class Certainty(NamedTuple):
 @numba.njit(cache=True, nogil=True)
 def inverse_of(A: F64) -> F64:
     """The inverse of a symmetric positive definite (6, 6) matrix (Gauss and Jordan; no pivots are needed)."""
-    out, left = np.eye(6), A.copy()
+    out, left = np.zeros((6, 6)), A.copy()
+    for k in range(6):
+        out[k, k] = 1.0
     for k in range(6):
         pivot = 1.0 / left[k, k]
         for c in range(6):
@@ -73,13 +75,31 @@ def _times(A: F64, B: F64) -> F64:
 
 
 @numba.njit(cache=True, nogil=True)
+def _scale(A: F64, by: float) -> F64:
+    """A, multiplied in place. Array expressions and slices would take longer to compile than all else here."""
+    for r in range(A.shape[0]):
+        for c in range(A.shape[1]):
+            A[r, c] *= by
+    return A
+
+
+@numba.njit(cache=True, nogil=True)
+def _add(A: F64, B: F64) -> F64:
+    """A, with B added in place."""
+    for r in range(A.shape[0]):
+        for c in range(A.shape[1]):
+            A[r, c] += B[r, c]
+    return A
+
+
+@numba.njit(cache=True, nogil=True)
 def _covariance(H_inv: F64, M: F64, floor: float, known: Certainty) -> F64:
     """The robust ("sandwich") estimate H^-1 M H^-1, M being the scatter of the points' own gradients, times ``scale``
     for what neighbouring points have in common, plus what the map itself is off by."""
     out = M.copy()
     for k in range(6):
         out[k, k] += floor
-    out = _times(_times(H_inv, out), H_inv) * known.scale
+    out = _scale(_times(_times(H_inv, out), H_inv), known.scale)
     for k in range(6):
         out[k, k] += known.map_variance[k]
     return out
@@ -142,10 +162,13 @@ def align(points: F32, T: F64, level: Place, known: Certainty, pairs: Pairs) -> 
     H, M, g = np.empty((6, 6)), np.empty((6, 6)), np.empty((6, 1))
     size = level.window.size
     has_prior = known.information[0, 0] > 0.0
-    pairs.home[:] = _UNPAIRED
-    pairs.origin[:] = T[:3, 3]
+    pairs.home.fill(_UNPAIRED)
+    for k in range(3):
+        pairs.origin[k] = T[k, 3]
     converged, iterations, likelihood, inliers = False, 0, 0.0, 0.0
-    covariance, H_inv, floor = np.eye(6), np.eye(6), 0.0
+    covariance, H_inv, floor = np.zeros((6, 6)), np.zeros((6, 6)), 0.0
+    for k in range(6):
+        covariance[k, k] = 1.0
     while iterations < level.iterations and not converged:
         iterations += 1
         pair_up(points, T, level.window, level.cells, pairs)
@@ -157,16 +180,16 @@ def align(points: F32, T: F64, level: Place, known: Certainty, pairs: Pairs) -> 
         for k in range(6):
             H[k, k] += floor
         H_inv = inverse_of(H)
-        step = -_times(H_inv, g)
+        step = _scale(_times(H_inv, g), -1.0)
         if has_prior:
             covariance = _covariance(H_inv, M, floor, known)
             information = inverse_of(covariance)
-            pull = _times(information, step) + _times(known.information, _to_prior(T, known.T_prior))
-            covariance = inverse_of(information + known.information)
+            pull = _add(_times(information, step), _times(known.information, _to_prior(T, known.T_prior)))
+            covariance = inverse_of(_add(information, known.information))
             step = _times(covariance, pull)
         length = _length(step)
         if length > 0.5 * size:
-            step *= 0.5 * size / length
+            step = _scale(step, 0.5 * size / length)
         _move(T, step)
         converged = length < level.tolerance_m
     if iterations and not has_prior:

@@ -46,8 +46,9 @@ class Voxels(NamedTuple):
 @numba.njit(cache=True, nogil=True)
 def _diagonalise(A: F64, V: F64) -> None:
     """Jacobi's method on the upper triangle of a symmetric (3, 3) A, in place; the columns of V are eigenvectors."""
-    V[:] = 0.0
-    V[0, 0] = V[1, 1] = V[2, 2] = 1.0
+    for r in range(3):
+        for k in range(3):
+            V[r, k] = 1.0 if r == k else 0.0
     for _ in range(8):
         off = abs(A[0, 1]) + abs(A[0, 2]) + abs(A[1, 2])
         if off < 1e-10 * (abs(A[0, 0]) + abs(A[1, 1]) + abs(A[2, 2])):
@@ -145,7 +146,8 @@ def _set_precision(cells: F64, k: int, A: F64, V: F64, floor_variance: float, ev
     filling, less two standard deviations of its sample variance, is taken off (``even``); otherwise the rhythm of the
     voxels would hold a vehicle in place on a bare road.
     """
-    cells[k, 3:] = 0.0
+    for c in range(3, 9):
+        cells[k, c] = 0.0
     for d in range(3):
         b = max(0.0, 1.0 / (max(A[d, d], 0.0) + floor_variance) - even)
         cells[k, 3] += b * V[0, d] * V[0, d]
@@ -166,7 +168,8 @@ def _refresh(voxels: Voxels, touched: I64, size: float, floor_m: float, min_poin
         sums[k, 10] = 0.0
         m = sums[k, 0]
         if m < min_points:
-            voxels.cells[k, :] = 0.0
+            for c in range(9):
+                voxels.cells[k, c] = 0.0
             continue
         voxels.cells[k, 0], voxels.cells[k, 1], voxels.cells[k, 2] = _mean_and_covariance(sums, k, A)
         flat = A[2, 2] < thin
@@ -206,7 +209,8 @@ def enter_points(
             n += 1
             rows[ix, iy, iz] = k
             voxels.place[k, 0], voxels.place[k, 1], voxels.place[k, 2] = ax, ay, az
-            sums[k, :] = 0.0
+            for c in range(11):
+                sums[k, c] = 0.0
         if sums[k, 10] == 0.0:
             sums[k, 10] = 1.0
             touched[n_touched] = k
@@ -232,7 +236,8 @@ def join_voxels(others: Voxels, window: Window, voxels: Voxels, n: int, floor_m:
             continue
         k = rows[ix, iy, iz]
         if k >= 0:
-            voxels.sums[k] += others.sums[j]
+            for c in range(11):
+                voxels.sums[k, c] += others.sums[j, c]
             shared[n_shared] = k
             n_shared += 1
             continue
@@ -252,7 +257,7 @@ def join_voxels(others: Voxels, window: Window, voxels: Voxels, n: int, floor_m:
 def reindex(window: Window, place: I64, n: int) -> None:
     """Find the first ``n`` voxels, whose world voxels are ``place`` (m, 3), in a window that has moved."""
     rows, lowest, _ = window
-    rows[:] = -1
+    rows.fill(-1)
     for k in range(n):
         ix, iy, iz = place[k, 0] - lowest[0], place[k, 1] - lowest[1], place[k, 2] - lowest[2]
         if holds(rows, ix, iy, iz, 0):

@@ -225,8 +225,8 @@ def _enter(crossed: Crossed, n: int, passed: U64) -> None:
     for j in range(n):
         low, high = np.uint64(crossed.low[j]), np.uint64(crossed.high[j] & np.uint32(0x7FFFFFFF))
         passed[np.uint64(crossed.cell[j])] |= low | high << np.uint64(_HALF)
-    crossed.low[: n + _LANES] = 0
-    crossed.high[: n + _LANES] = 0
+    for j in range(n + _LANES):
+        crossed.low[j] = crossed.high[j] = 0
 
 
 @numba.njit(cache=True, nogil=True)
@@ -243,7 +243,9 @@ def mark_passed(fans: Fans, origin: F64, corner: tuple[float, float], base: I32,
         dx, dy = fans.direction[f]
         ahead = (1 if dy > 0 else -1), (1 if dx > 0 else -1)
         n = _cross_cells(set_out(x, y, dx, dy, _MARKS_FROM[f]), ahead, fans.end[f], base, layer, crossed)
-        lowest = crossed.bottom[:n].min() if n else 0
+        lowest = crossed.bottom[0]
+        for j in range(1, n):
+            lowest = min(lowest, crossed.bottom[j])
         for k in range(fans.first[f], fans.last[f]):
             slope, stop = fans.slope[k], fans.stop[k]
             _pass(slope, stop, height, 0, n, crossed, crossed.low)

@@ -29,7 +29,7 @@ def mark_sight(
             continue
         dx, dy = fans.direction[f]
         step_r, step_c = (1 if dy > 0 else -1), (1 if dx > 0 else -1)
-        r, c, t0, next_r, next_c, width_r, width_c = set_out(x, y, dx, dy, 0.0)
+        r, c, t0, next_r, next_c, width_r, width_c = set_out(x, y, dx, dy, np.float32(0.0))
         while 0 <= r < rows and 0 <= c < cols:
             level = 1 if t0 > farthest[f] else (2 if t0 > nearest[f] else 3)
             if sight[r, c] < level:
