@@ -164,7 +164,7 @@ def grow(start: I32 | I64, heights: F32, neighbours: I32, ground: F32, gap: U8) 
 
     Seeds are all entered before any of them is left: only the rim of what they cover waits in the queue.
     """
-    width = np.int64(1)  # not a literal, for which all steps would be compiled once more
+    width = int(np.int64(1))  # no literal, for which all steps would be compiled once more
     for cell in range(len(gap)):
         if gap[cell] == SEED:
             _enter(cell, ground[cell], width, start, heights, neighbours, ground, gap)
@@ -172,7 +172,7 @@ def grow(start: I32 | I64, heights: F32, neighbours: I32, ground: F32, gap: U8) 
     following = np.empty(1024, np.int32)
     first, last = np.full(WIDEST + 4, -1, np.int32), np.full(WIDEST + 4, -1, np.int32)
     n, spare, looked_at = 0, -1, 0
-    width = np.int64(0)
+    width = int(np.int64(0))
     while width <= WIDEST:
         if looked_at < len(gap):
             cell = looked_at
