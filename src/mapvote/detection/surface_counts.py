@@ -14,9 +14,10 @@ import numba
 import numpy as np
 
 from mapvote.core.columns import TOP_BIT, column_bit
-from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Lattice, TileIndex
+from mapvote.core.grid import CELL_SIZE, Lattice
 from mapvote.core.types import F32, F64, I32, U64, Bool
 from mapvote.detection.counters import PLANES, add_one, halve, is_full
+from mapvote.detection.packed_tiles import PackedTiles
 from mapvote.perception.frontend import Observation
 from mapvote.perception.raycast import find_obstacles
 
@@ -69,11 +70,14 @@ def _gather(planes: U64, row0: int, col0: int, hit: U64, near: U64, passed: U64,
 
 
 class SurfaceEvidence:
-    """Counters of a drive by tile: (256, 256, WORDS) uint64, crossed first, met after, then what rays passed."""
+    """Counters of a drive by tile: (256, 256, WORDS) uint64, crossed first, met after, then what rays passed.
+
+    Memory is bounded by the tiles around the vehicle, and some hundred kilobytes for each that it has left.
+    """
 
     def __init__(self, lattice: Lattice) -> None:
         self.lattice = lattice
-        self.tiles: dict[TileIndex, U64] = {}
+        self.tiles = PackedTiles(lattice, WORDS)
 
     def count(self, seen: Observation) -> None:
         """Count one scan."""
@@ -85,10 +89,9 @@ class SurfaceEvidence:
         for tile in view.grid.tiles():
             window = self.lattice.tile(tile)
             common = window.intersection(view.grid)
-            if tile not in self.tiles:
-                self.tiles[tile] = np.zeros((TILE_CELLS, TILE_CELLS, WORDS), dtype=np.uint64)
             row0, col0 = common.row0 - view.grid.row0, common.col0 - view.grid.col0
             _gather(
-                self.tiles[tile][common.slices_in(window)], row0, col0, view.hit, near, view.passed, here.occupied,
+                self.tiles.near(tile)[common.slices_in(window)], row0, col0, view.hit, near, view.passed, here.occupied,
                 here.ground_z,
             )  # fmt: skip
+        self.tiles.leave(view.grid)

@@ -63,6 +63,12 @@ class _Judged:
 
 
 @numba.njit(cache=True, nogil=True)
+def is_gone(cell: U64, bit: int) -> bool:
+    """Whether the surface in one voxel of a cell (WORDS,) was crossed so much more often than met that it is gone."""
+    return count_of(cell, CROSSED, bit) >= GONE_RAYS + HIT_RAYS * count_of(cell, MET, bit)
+
+
+@numba.njit(cache=True, nogil=True)
 def weigh_surfaces(
     planes: U64, occupied: U64, free: U64, near: U64, gone: U64, stands: U64, new: U64, beyond: U64
 ) -> None:
@@ -75,7 +81,7 @@ def weigh_surfaces(
                 one = np.uint64(1) << np.uint64(bit)
                 crossed, met = count_of(cell, CROSSED, bit), count_of(cell, MET, bit)
                 if occupied[r, c] & one:
-                    if crossed >= GONE_RAYS + HIT_RAYS * met:
+                    if is_gone(cell, bit):
                         gone[r, c] |= one
                     elif met:
                         stands[r, c] |= one

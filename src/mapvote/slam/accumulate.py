@@ -3,7 +3,9 @@
 A draft of the map gives the ground and says which voxels anything ever struck. Every voxel's scans are then counted:
 in how many was it struck, in how many seen through. What was struck only rarely by scans that could have struck it is
 the trail of something that moved and escaped the filter: it leaves the map, and its voxels are unknown, not free. So
-does what is no surface at all (slam/strays.py).
+does what is no surface at all (slam/strays.py), and what the surveys saw through as often as a vehicle that calls it
+gone: beside a parked car the trail of one that passes is struck by every hit on the other, and only a hit that knows
+where it lies tells them apart (detection/surface_counts.py).
 
 What enters the map has been before the filter, at whatever range: a car that drives ahead of the surveyor, too far off
 for the counting, would else leave its trail unchallenged. Returns from beyond the filter's reach are left out.
@@ -11,7 +13,7 @@ for the counting, would else leave its trail unchallenged. Returns from beyond t
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 
 import numba
@@ -26,6 +28,8 @@ from mapvote.core.reference import LocalMap, reference_window
 from mapvote.core.types import F64, I32, I64, U64, Bool, Drive
 from mapvote.core.voxels import VoxelCloud
 from mapvote.detection.counters import PLANES, Evidence, count_of, free_words, is_open
+from mapvote.detection.surface_counts import SurfaceEvidence
+from mapvote.detection.surfaces import is_gone
 from mapvote.localisation.localiser import GivenPoses
 from mapvote.perception.frontend import Frontend, Observation, PlacedScan
 from mapvote.perception.moving_objects import MovingFilter
@@ -46,7 +50,7 @@ class Layer:
         """``road`` (n, 3), map metres: where vehicles drove, from which the ground grows."""
         self.draft, self.road, self.settings = draft, road, settings
         self.cloud = VoxelCloud(draft.lattice)
-        self.evidence = Evidence(draft.lattice)
+        self.evidence, self.surfaces = Evidence(draft.lattice), SurfaceEvidence(draft.lattice)
         self._driven: list[F64] = []
         self._around = LocalMap(draft, 2.0 * settings.mapping.reach_m)
         self._near = LocalMap(draft, settings.voting.window_m)
@@ -72,6 +76,7 @@ class Layer:
             far = np.einsum("ij,ij->i", offset, offset) > self.settings.mapping.reach_m**2
             self.cloud.enter(scan.points_map, moving | _beneath(scan, moving) | far)
             self.evidence.count(observation.view, observation.reference)
+            self.surfaces.count(observation)
 
     def finish(self) -> PointMap:
         """The map of everything laid."""
@@ -84,6 +89,7 @@ class Layer:
         driven = np.concatenate(self._driven) if self._driven else np.zeros((0, 3))
         dropped = self._trails(points, obstacle) | mirrored(points, laid, self.road)
         if self.settings.mapping.drop_strays:
+            dropped |= self._seen_through(points, obstacle)
             dropped |= obstacle & strays(points, scans, driven, self.draft.lattice)
         point_map = map_from_points(points[~dropped], lattice=self.draft.lattice, road=self.road)
         tiles = {tile: replace(content, free=self._free(tile, point_map)) for tile, content in point_map.tiles.items()}
@@ -95,16 +101,26 @@ class Layer:
         Only those of ``obstacle`` (n,) are judged, and only voxels that rays crossed from side to side: what merely
         grazes a thin slab says nothing against it.
         """
-        trail = np.zeros(len(points), dtype=np.bool_)
+        return self._judge(points, obstacle, self.evidence.tiles, _are_trails)
+
+    def _seen_through(self, points: F64, obstacle: Bool) -> Bool:
+        """Which of the ``obstacle`` points (n, 3) lie in voxels that the surveys would vote out of the map."""
+        return self._judge(points, obstacle, self.surfaces.tiles, _are_gone)
+
+    def _judge(
+        self, points: F64, obstacle: Bool, counters: Mapping[TileIndex, U64], rule: Callable[[U64, I64, I64, I64], Bool]
+    ) -> Bool:
+        """(n,) which of the ``obstacle`` points (n, 3) a ``rule`` names by the counts of their voxels, tile by tile."""
+        out = np.zeros(len(points), dtype=np.bool_)
         rows, cols = self.draft.lattice.cells_of(points)
-        for tile, planes in self.evidence.tiles.items():
+        for tile, planes in counters.items():
             reference = reference_window(self.draft, self.draft.lattice.tile(tile))
             r, c = rows - reference.grid.row0, cols - reference.grid.col0
             here = np.flatnonzero((r >= 0) & (r < TILE_CELLS) & (c >= 0) & (c < TILE_CELLS) & obstacle)
             r, c = r[here], c[here]
             bits = np.floor(points[here, 2] / CELL_SIZE).astype(np.int64) - reference.base[r, c]
-            trail[here] = _are_trails(planes, r, c, bits, _MIN_THROUGH, _TRAIL_SHARE)
-        return trail
+            out[here] = rule(planes, r, c, bits)
+        return out
 
     def _free(self, tile: TileIndex, point_map: PointMap) -> U64:
         """Known-free columns of one tile of the finished map, on its own ground."""
@@ -142,15 +158,24 @@ def _beneath(scan: PlacedScan, moving: Bool) -> Bool:
 
 
 @numba.njit(cache=True, nogil=True)
-def _are_trails(planes: U64, rows: I64, cols: I64, bits: I64, min_through: int, share: float) -> Bool:
+def _are_trails(planes: U64, rows: I64, cols: I64, bits: I64) -> Bool:
     """(n,) of voxels (row, col, bit) of a tile; those outside the columns are none."""
     out = np.zeros(len(bits), dtype=np.bool_)
     for i in range(len(bits)):
         if 0 <= bits[i] < TOP_BIT:
             cell = planes[rows[i], cols[i]]
             through, struck = count_of(cell, 0, bits[i]), count_of(cell, PLANES, bits[i])
-            rarely = through >= min_through and struck < share * (struck + through)
+            rarely = through >= _MIN_THROUGH and struck < _TRAIL_SHARE * (struck + through)
             out[i] = rarely and is_open(cell, bits[i])
+    return out
+
+
+@numba.njit(cache=True, nogil=True)
+def _are_gone(planes: U64, rows: I64, cols: I64, bits: I64) -> Bool:
+    """(n,) of voxels (row, col, bit) of a tile; those outside the columns are none."""
+    out = np.zeros(len(bits), dtype=np.bool_)
+    for i in range(len(bits)):
+        out[i] = 0 <= bits[i] < TOP_BIT and is_gone(planes[rows[i], cols[i]], bits[i])
     return out
 
 
