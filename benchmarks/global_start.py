@@ -26,6 +26,7 @@ from mapvote.core.types import F64, Scan
 from mapvote.core.voxels import thin
 from mapvote.localisation.deskew import deskew, motion_at
 from mapvote.localisation.global_search import GlobalSearch
+from mapvote.localisation.trust import MIN_FIT, MIN_LEAD
 from survey_gnss import bent_drives
 from trust import kitti
 
@@ -66,7 +67,7 @@ def simulated_starts(chosen: list[tuple[int, int]], rng: np.random.Generator) ->
 
 def measure(name: str, point_map: PointMap, starts: Iterator[Start], range_sigma_m: float, near_m: float) -> None:
     """One row: how many were found, trusted, wrong; error and time."""
-    search = GlobalSearch(point_map, SETTINGS.ndt, SETTINGS.trust, range_sigma_m)
+    search = GlobalSearch(point_map, SETTINGS.ndt, range_sigma_m)
     right, trusted, astray, seconds, off_m = 0, 0, 0, [], []
     n = 0
     for n, (scan, true) in enumerate(starts, 1):
@@ -79,7 +80,7 @@ def measure(name: str, point_map: PointMap, starts: Iterator[Start], range_sigma
             continue
         off = inverse(true) @ found.T_map_lidar
         is_right = np.linalg.norm(off[:3, 3]) < near_m and rotation_angle(off) < np.radians(1.0)
-        believed = found.fit >= SETTINGS.trust.min_fit and found.lead >= SETTINGS.trust.min_lead
+        believed = found.fit >= MIN_FIT and found.lead >= MIN_LEAD
         right += bool(is_right and believed)
         trusted += believed
         astray += bool(believed and not is_right)

@@ -143,7 +143,7 @@ def place(drives: list[Drive]) -> tuple[list[F64], list[F64], float, float]:
     start = time.process_time()
     surveyor = Surveyor(Settings())
     found = [surveyor.follow(drive, lambda: None) for drive in drives]
-    settled = settle(drives, found, Settings().mapping)
+    settled = settle(drives, found)
     registered = float(np.mean(np.concatenate([one.registered for one in found])))
     return settled.T_map_lidar, settled.sigma_m, registered, time.process_time() - start
 

@@ -30,6 +30,8 @@ def test_the_environment_wins_over_the_file_and_each_source_is_known(tmp_path: P
         ("[paper]\nn_min = 'many'\n", r"paper\.n_min = 'many'"),
         ("[paper]\noccluded = 'perhaps'\n", r"paper\.occluded = 'perhaps'.*'votes' or 'abstains'"),
         ("[voting]\nocclusion = 'column'\n", r"voting\.occlusion is called paper\.line_of_sight"),
+        ("[trust]\nmin_fit = 0.5\n", r"s\.toml: trust\.min_fit is no setting any more .*localisation/trust\.py"),
+        ("[mapping]\nprior_memory_s = 9\n", r"mapping\.prior_memory_s is no setting any more"),
         ("n_min = 7\n", "outside a section"),
         ("[voting\n", "cannot be read"),
     ],

@@ -11,7 +11,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mapvote.config import TrustSettings
 from mapvote.core import geometry
 from mapvote.core.grid import Lattice
 from mapvote.core.point_map import PointMap, cut_tiles, map_from_points
@@ -193,7 +192,7 @@ def test_of_a_map_that_is_not_in_metres_the_unit_is_named(scans: list[F64], numb
     for index, mine in cut_tiles(numbers * points, Lattice()):
         empty = Tile.empty(Lattice().tile(index))
         tiles[index] = empty.but(points=empty.window.from_map(numbers * points[mine]))
-    found = in_another_unit(PointMap("m", Lattice(), tiles), seen, poses(), TrustSettings(), 0.02, None)
+    found = in_another_unit(PointMap("m", Lattice(), tiles), seen, poses(), 0.02, None)
     assert found is not None
     assert name in found.what
     assert "fits 3 of 3 scans" in found.what

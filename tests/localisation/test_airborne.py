@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from mapvote.config import TrustSettings
 from mapvote.core.types import Bool
 from mapvote.localisation.airborne import solid_sample
 from mapvote.localisation.ndt import build_ndt
@@ -58,7 +57,7 @@ def test_drops_leave_a_scan_and_what_stands_stays(rain: float) -> None:
 
 def test_a_right_pose_fits_in_the_rain_as_it_does_in_the_dry() -> None:
     street = build_ndt(room(2, 0.0)[0].astype(np.float64))
-    judge = Judge(TrustSettings(), 0.02)
+    judge = Judge(0.02)
     dry, wet = (judge.fit(street, solid_sample(room(seed, rain)[0], 0.2), HERE) for seed, rain in ((3, 0.0), (4, 0.1)))
     assert dry == pytest.approx(1.0, abs=0.1)
     assert wet > dry - 0.08

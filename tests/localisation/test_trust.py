@@ -7,7 +7,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mapvote.config import TrustSettings
 from mapvote.core.geometry import from_xyz_rpy, inverse, transform
 from mapvote.core.types import F64
 from mapvote.localisation import trust
@@ -64,20 +63,20 @@ def test_a_scan_drawn_from_the_map_itself_fits_as_the_map_leads_to_expect() -> N
     scan = with_ground(clusters(2, 2500, NOISE_M))
     for T in (HERE, from_xyz_rpy(2.0, -1.0, 0.5, 0.0, 0.0, 0.7)):
         points = transform(inverse(T), scan)
-        assert Judge(TrustSettings(), NOISE_M, ALL_POINTS).fit(far_map(), points, T) == pytest.approx(1.0, abs=0.02)
+        assert Judge(NOISE_M, ALL_POINTS).fit(far_map(), points, T) == pytest.approx(1.0, abs=0.02)
 
 
 def test_more_noise_than_the_sensor_has_fits_worse_than_expected() -> None:
     noisy = with_ground(clusters(2, 2500, 0.4))
-    assert Judge(TrustSettings(), NOISE_M, ALL_POINTS).fit(far_map(), noisy, HERE) < 0.8
-    assert Judge(TrustSettings(), 0.4, ALL_POINTS).fit(far_map(), noisy, HERE) == pytest.approx(1.0, abs=0.04)
+    assert Judge(NOISE_M, ALL_POINTS).fit(far_map(), noisy, HERE) < 0.8
+    assert Judge(0.4, ALL_POINTS).fit(far_map(), noisy, HERE) == pytest.approx(1.0, abs=0.04)
 
 
 def test_points_where_the_map_has_never_been_count_for_nothing_but_are_told() -> None:
     """Half of the scan stands 12 m above everything: the fit of the other half is what it was."""
     cloud = clusters(2, 2500, NOISE_M)
     scan = with_ground(np.concatenate([cloud, cloud + TWELVE_UP]))
-    verdict = Judge(TrustSettings(), NOISE_M, ALL_POINTS).judge(far_map(), scan, HERE)
+    verdict = Judge(NOISE_M, ALL_POINTS).judge(far_map(), scan, HERE)
     assert verdict.known == pytest.approx(0.5)
     assert verdict.fit == pytest.approx(1.0, abs=0.02)
 
@@ -87,13 +86,13 @@ def test_where_less_is_known_than_asked_for_nothing_fits(monkeypatch: pytest.Mon
     scan = with_ground(np.concatenate([cloud, cloud + TWELVE_UP]))
     for least, fits in ((0.49, True), (0.5, True), (0.51, False)):
         monkeypatch.setattr(trust, "MIN_KNOWN", least)
-        judge = Judge(TrustSettings(), NOISE_M, ALL_POINTS)
+        judge = Judge(NOISE_M, ALL_POINTS)
         assert (judge.fit(far_map(), scan, HERE) > 0.9) == fits
 
 
 def test_a_scan_that_meets_nothing_of_the_map_fits_nowhere() -> None:
     up = with_ground(clusters(2, 100) + TWELVE_UP)
-    verdict = Judge(TrustSettings(), NOISE_M, ALL_POINTS).judge(far_map(), up, HERE)
+    verdict = Judge(NOISE_M, ALL_POINTS).judge(far_map(), up, HERE)
     assert (verdict.fit, verdict.known) == (0.0, 0.0)
 
 
@@ -113,7 +112,7 @@ def test_known_is_the_share_of_points_in_or_beside_a_voxel_of_the_map(seed: int)
         known += inside and any((x + i, y + j, z + k) in filled for i, j, k in ways)
     x, y = np.meshgrid(np.arange(-12.0, 13.0), np.arange(-12.0, 13.0))
     scan = np.concatenate([points, np.column_stack([x.ravel(), y.ravel(), np.full(x.size, -20.0)])])
-    verdict = Judge(TrustSettings(), NOISE_M, ALL_POINTS).judge(ndt_map, scan, HERE)
+    verdict = Judge(NOISE_M, ALL_POINTS).judge(ndt_map, scan, HERE)
     assert verdict.known == pytest.approx(known / len(points))
 
 
@@ -145,7 +144,7 @@ def verdict(fit: float = 1.0, known: float = 1.0, lead: float = 1.0) -> Verdict:
 
 
 def test_a_verdict_speaks_for_a_pose_if_fit_knowledge_and_lead_are_all_good_enough() -> None:
-    judge = Judge(TrustSettings(min_fit=0.6, min_lead=0.05), NOISE_M)
+    judge = Judge(NOISE_M)
     assert judge.holds(verdict())
     assert judge.holds(verdict(0.6, 0.3, 0.05)), "just good enough"
     assert not judge.holds(verdict(fit=0.59))
@@ -188,7 +187,7 @@ def seen_from(T: F64, seed: int = 3) -> F64:
     return transform(inverse(T), points + rng.normal(0, 0.02, points.shape))
 
 
-JUDGE = Judge(TrustSettings(), 0.02, 3000)
+JUDGE = Judge(0.02, 3000)
 TRUTH = from_xyz_rpy(0.5, -0.4, 1.8, 0.0, 0.0, 0.3)
 
 
@@ -243,6 +242,6 @@ def test_where_a_street_repeats_itself_no_place_leads() -> None:
 
 
 def test_a_handful_of_points_is_enough_and_costs_no_more(square: NdtMap) -> None:
-    few = Judge(TrustSettings(), 0.02, 400).judge(square, seen_from(TRUTH), TRUTH)
+    few = Judge(0.02, 400).judge(square, seen_from(TRUTH), TRUTH)
     assert few.fit == pytest.approx(JUDGE.judge(square, seen_from(TRUTH), TRUTH).fit, abs=0.1)
     assert few.lead > 0.2

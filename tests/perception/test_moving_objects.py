@@ -13,7 +13,7 @@ from mapvote.core.sensors import SENSORS, Sensor
 from mapvote.core.types import F64, Bool
 from mapvote.perception import moving_objects
 from mapvote.perception.moving_kernels import voxels
-from mapvote.perception.moving_objects import MovingFilter
+from mapvote.perception.moving_objects import REACH_M, MovingFilter
 
 LIDAR_HEIGHT = 1.9
 Box = tuple[float, float, float, float, float]
@@ -117,7 +117,7 @@ def test_whatever_can_vote_is_looked_at_up_to_the_corners_of_the_local_grid(x: f
     corners = np.column_stack([grid.x0 + CELL_SIZE * cols, grid.y0 + CELL_SIZE * rows, np.ones(4)])
     origin = np.array([x, x, LIDAR_HEIGHT])
     assert np.linalg.norm(corners - origin, axis=1).max() > 56.5
-    voxel_of, _ = voxels(corners, np.ones(4, np.bool_), origin, MovingSettings().reach_m, CELL_SIZE)
+    voxel_of, _ = voxels(corners, np.ones(4, np.bool_), origin, REACH_M, CELL_SIZE)
     assert (voxel_of >= 0).all()
 
 

@@ -37,23 +37,10 @@ class NdtSettings(Section):
     max_sigma_m: float = Field(default=0.15, description="abstain when the pose is less certain than this")
 
 
-class TrustSettings(Section):
-    """When a sound pose may be voted with (localisation/trust.py, localisation/localiser.py)."""
-
-    min_fit: float = Field(default=0.6, description="fit, as a share of what the map leads to expect")
-    min_lead: float = Field(default=0.05, description="by how much the best other place must fit worse, same scale")
-    scans: int = Field(default=3, ge=1, description="looks in turn that must hold before the first vote")
-
-
 class MovingSettings(Section):
     """perception/moving_objects.py ([9])."""
 
     lookahead_s: float = Field(default=1.0, ge=0, le=1.0, description="how late a scan is decided")
-    reach_m: float = Field(
-        default=57.0,
-        gt=0,
-        description="points farther away are never called moving; the corners of the local grid are 56.7 m away",
-    )
 
 
 class MappingSettings(Section):
@@ -65,8 +52,6 @@ class MappingSettings(Section):
     drop_strays: bool = Field(
         default=True, description="leave out points that are no surface of their own; false: as paper II, keep them"
     )
-    precise_prior_m: float = Field(default=0.1, description="a prior at least this good holds the map's frame")
-    prior_memory_s: float = Field(default=20.0, gt=0, description="how long the errors of a coarser prior stay alike")
 
 
 class VotingSettings(Section):
@@ -119,7 +104,6 @@ class Settings(Section):
     """All of them. ``mapvote config`` prints this page."""
 
     ndt: NdtSettings = NdtSettings()
-    trust: TrustSettings = TrustSettings()
     moving: MovingSettings = MovingSettings()
     mapping: MappingSettings = MappingSettings()
     voting: VotingSettings = VotingSettings()
@@ -133,7 +117,7 @@ class Settings(Section):
 
         Settings and METHOD_VERSION: two programs that would vote otherwise on the same drive never share a round.
         """
-        settings = self.model_dump_json(include={"ndt", "trust", "moving", "voting", "paper"})
+        settings = self.model_dump_json(include={"ndt", "moving", "voting", "paper"})
         return hashlib.sha256(f"{METHOD_VERSION} {settings}".encode()).hexdigest()
 
 
@@ -154,6 +138,15 @@ MOVED = {
     "voting.occlusion": "paper.line_of_sight (first_hit: points, farthest_return: farthest, column: column)",
 }
 """Settings that had another name."""
+FIXED = {
+    "trust.min_fit": "MIN_FIT of localisation/trust.py",
+    "trust.min_lead": "MIN_LEAD of localisation/trust.py",
+    "trust.scans": "LOOKS of localisation/localiser.py",
+    "moving.reach_m": "REACH_M of perception/moving_objects.py",
+    "mapping.precise_prior_m": "PRECISE_PRIOR_M of slam/surveyor.py",
+    "mapping.prior_memory_s": "PRIOR_MEMORY_S of slam/settle.py",
+}
+"""Settings that are constants now: nobody could judge them by looking."""
 
 
 def did_you_mean(key: str, known: Iterable[str]) -> str:
@@ -177,6 +170,8 @@ def load_with_sources(
     values: dict[str, dict[str, Any]] = {}
     sources: dict[str, str] = {}
     for section, key, value, source in (*_from_file(path), *_from_env(os.environ if env is None else env)):
+        if constant := FIXED.get(f"{section}.{key}"):
+            raise MapvoteError(f"{source}: {section}.{key} is no setting any more ({constant}); leave it out")
         if section not in Settings.model_fields:
             raise MapvoteError(f"{source}: unknown section {section!r}{did_you_mean(section, Settings.model_fields)}")
         known = type(getattr(Settings(), section)).model_fields

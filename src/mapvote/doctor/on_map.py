@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from mapvote.config import NdtSettings, TrustSettings
+from mapvote.config import NdtSettings
 from mapvote.core.geometry import from_xyz_rpy, inverse
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS
 from mapvote.core.heights import LEVEL_M, check_heights, heights_over_ground
@@ -21,6 +21,7 @@ from mapvote.doctor.road import find_road
 from mapvote.localisation.deskew import deskew, motion_at
 from mapvote.localisation.global_search import GlobalSearch
 from mapvote.localisation.map_window import MapWindow
+from mapvote.localisation.trust import MIN_FIT
 
 _PLACES = 6
 _SEARCHED = 4
@@ -34,33 +35,32 @@ def check_on_map(drive: Drive, T: F64, point_map: PointMap, tell: Progress | Non
     """(findings, the poses (n, 4, 4) as they lie on the map), by a prior (n, 4, 4) that suits the scans."""
     found = _outside(T, point_map)
     scans = _some_scans(drive, T)
-    settings, trust = NdtSettings(), TrustSettings()
     around = MapWindow(point_map)
     road = find_road([scan.points for scan in scans.values()])
     depth_m = road.depth_m if road.up == "+z" and road.is_there else None
     guesses = {i: _on_ground(T[i], point_map, depth_m) for i in scans}
-    places = register_all(around, scans, guesses, trust, drive.sensor.range_sigma_m, tell)
+    places = register_all(around, scans, guesses, drive.sensor.range_sigma_m, tell)
     scale = 1.0
     if len(fitting(places)) < _FEW * len(places):
-        scale, better = in_another_scale(around, scans, T, trust, drive.sensor.range_sigma_m, tell)
+        scale, better = in_another_scale(around, scans, T, drive.sensor.range_sigma_m, tell)
         if total_fit(better) > 1.2 * total_fit(places):
             places = better
         else:
             scale = 1.0
     if len(fitting(places)) < 0.5 * len(places):
         scale = 1.0
-        unit = in_another_unit(point_map, scans, T, trust, drive.sensor.range_sigma_m, tell)
+        unit = in_another_unit(point_map, scans, T, drive.sensor.range_sigma_m, tell)
         if unit is not None:
             return [unit], T
-        search = GlobalSearch(point_map, settings, trust, drive.sensor.range_sigma_m)
-        better, mirrored = _searched(search, around, drive, T, scans, trust, tell)
+        search = GlobalSearch(point_map, NdtSettings(), drive.sensor.range_sigma_m)
+        better, mirrored = _searched(search, around, drive, T, scans, tell)
         if mirrored:
             what = f"the map is mirrored against the scans: {mirrored} mirrored scans fit it, as they are none does"
             return [*found, Finding("error", what, "negate y of the map's points, or of the scans'")], T
         places = better if len(fitting(better)) > len(fitting(places)) else places
     good = fitting(places)
     if len(good) < 2:
-        return [*found, _fits_nowhere(places, trust)], T
+        return [*found, _fits_nowhere(places)], T
     found += _where_not(places, good)
     difference = difference_of(np.array([T[p.index] for p in good]), np.array([p.T_map_lidar for p in good]), scale)
     found += _differs(difference, drive)
@@ -70,7 +70,7 @@ def check_on_map(drive: Drive, T: F64, point_map: PointMap, tell: Progress | Non
 
 def check_unit(drive: Drive, T: F64, point_map: PointMap, tell: Progress | None = None) -> list[Finding]:
     """Of a map that cannot be in metres: in which unit scans of the drive fit it."""
-    unit = in_another_unit(point_map, _some_scans(drive, T), T, TrustSettings(), drive.sensor.range_sigma_m, tell)
+    unit = in_another_unit(point_map, _some_scans(drive, T), T, drive.sensor.range_sigma_m, tell)
     return [] if unit is None else [unit]
 
 
@@ -122,7 +122,6 @@ def _searched(
     drive: Drive,
     T: F64,
     scans: dict[int, Scan],
-    trust: TrustSettings,
     tell: Progress | None,
 ) -> tuple[list[Place], int]:
     """(the places under the difference that suits most of them, how many scans fit mirrored where none fits so)."""
@@ -133,31 +132,31 @@ def _searched(
     for k, i in enumerate(chosen):
         if tell is not None:
             tell("searching the map", k + 1, len(chosen))
-        found = _find(search, scans[i], trust)
+        found = _find(search, scans[i])
         if found is not None:
             D = found @ inverse(T[i])
-            places = register_all(around, scans, {j: [D @ T[j]] for j in scans}, trust, sigma_m, None)
+            places = register_all(around, scans, {j: [D @ T[j]] for j in scans}, sigma_m, None)
             best = max(best, places, key=lambda p: len(fitting(p)))
             if len(fitting(best)) > 0.6 * len(scans):
                 return best, 0
-        elif _find(search, Scan(scans[i].stamp_ns, scans[i].points * _MIRROR), trust) is not None:
+        elif _find(search, Scan(scans[i].stamp_ns, scans[i].points * _MIRROR)) is not None:
             mirrored += 1
     return best, mirrored if mirrored >= 2 and len(fitting(best)) < 2 else 0
 
 
-def _find(search: GlobalSearch, scan: Scan, trust: TrustSettings) -> F64 | None:
+def _find(search: GlobalSearch, scan: Scan) -> F64 | None:
     try:
         found = search.find(scan)
     except MapvoteError:  # too large to search
         return None
-    return None if found is None or found.fit < trust.min_fit else found.T_map_lidar
+    return None if found is None or found.fit < MIN_FIT else found.T_map_lidar
 
 
-def _fits_nowhere(places: Sequence[Place], trust: TrustSettings) -> Finding:
+def _fits_nowhere(places: Sequence[Place]) -> Finding:
     best = max(places, key=lambda p: p.fit)
     what = (
         f"the drive fits the map nowhere: at best to {best.fit:.2f} (scan {best.index}), a place that is the same "
-        f"street fits above {trust.min_fit}"
+        f"street fits above {MIN_FIT}"
     )
     return Finding("error", what, "is it the map of another street, in another scale or tilt, or all changed?")
 

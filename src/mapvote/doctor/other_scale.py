@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from mapvote.config import TrustSettings
 from mapvote.core.types import F64, Scan
 from mapvote.doctor.finding import Progress
 from mapvote.doctor.places import Place, register_all, total_fit
@@ -29,7 +28,6 @@ def in_another_scale(
     around: MapWindow,
     scans: Mapping[int, Scan],
     T: F64,
-    trust: TrustSettings,
     range_sigma_m: float,
     tell: Progress | None,
 ) -> tuple[float, list[Place]]:
@@ -43,7 +41,7 @@ def in_another_scale(
     def places(scale: float, index: Sequence[int]) -> list[Place]:
         scaled = {i: Scan(scans[i].stamp_ns, np.asarray(scale * scans[i].points, dtype=np.float32)) for i in index}
         guesses = {i: [_scaled_guess(T[i], scale, middle)] for i in index}
-        return register_all(around, scaled, guesses, trust, range_sigma_m, None)
+        return register_all(around, scaled, guesses, range_sigma_m, None)
 
     tried: list[tuple[float, float]] = []
     for k, scale in enumerate(_SCALES):

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mapvote.config import TrustSettings
 from mapvote.core.grid import Lattice
 from mapvote.core.point_map import PointMap, cut_tiles
 from mapvote.core.tile import Tile
@@ -53,7 +52,6 @@ def in_another_unit(
     point_map: PointMap,
     scans: Mapping[int, Scan],
     T: F64,
-    trust: TrustSettings,
     range_sigma_m: float,
     tell: Progress | None,
 ) -> Finding | None:
@@ -66,7 +64,7 @@ def in_another_unit(
 
     def places(around: MapWindow, index: list[int]) -> list[Place]:
         guesses = {i: [T[i]] for i in index}
-        return register_all(around, {i: scans[i] for i in index}, guesses, trust, range_sigma_m, None)
+        return register_all(around, {i: scans[i] for i in index}, guesses, range_sigma_m, None)
 
     for k, unit in enumerate(UNITS):
         if tell is not None:

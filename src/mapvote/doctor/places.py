@@ -7,14 +7,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mapvote.config import TrustSettings
 from mapvote.core.geometry import from_xyz_rpy
 from mapvote.core.types import F32, F64, Scan
 from mapvote.doctor.finding import Progress
 from mapvote.localisation.airborne import solid_sample
 from mapvote.localisation.map_window import MapWindow
 from mapvote.localisation.ndt import LEVELS, NdtMap, fitness, refine, thin_for_levels
-from mapvote.localisation.trust import Judge
+from mapvote.localisation.trust import MIN_FIT, Judge
 
 _OFFSETS_M = np.arange(-6.0, 6.1, 1.0)
 _YAWS = np.radians([0.0, -3.0, 3.0])
@@ -48,14 +47,13 @@ def register_all(
     around: MapWindow,
     scans: Mapping[int, Scan],
     guesses: Mapping[int, Sequence[F64]],
-    trust: TrustSettings,
     range_sigma_m: float,
     tell: Progress | None,
 ) -> list[Place]:
     """Every scan in the map around its guesses."""
     out = []
     for k, (i, scan) in enumerate(scans.items()):
-        out.append(place_of(around, i, scan, guesses[i], Judge(trust, range_sigma_m)))
+        out.append(place_of(around, i, scan, guesses[i], Judge(range_sigma_m)))
         if tell is not None:
             tell("registering to the map", k + 1, len(scans))
     return out
@@ -65,7 +63,7 @@ def place_of(around: MapWindow, i: int, scan: Scan, guesses: Sequence[F64], judg
     """From the guesses themselves, and from the best of a grid of 6 m and 3 deg around them if none of them fits."""
     clouds = thin_for_levels(scan.points)
     few = solid_sample(scan.points, LEVELS[-1].points_m)
-    best = Place(i, guesses[0], 0.0, 0.0, judge.settings.min_fit)
+    best = Place(i, guesses[0], 0.0, 0.0, MIN_FIT)
     for guess in guesses:
         ndt_map = around(guess[:3, 3])
         known = _known(ndt_map, clouds[0].T.astype(np.float64), guess)

@@ -15,7 +15,7 @@ import numba
 import numpy as np
 from scipy import ndimage
 
-from mapvote.config import NdtSettings, TrustSettings
+from mapvote.config import NdtSettings
 from mapvote.core.geometry import inverse
 from mapvote.core.grid import CELL_SIZE
 from mapvote.core.point_map import PointMap
@@ -25,7 +25,7 @@ from mapvote.localisation.deskew import deskew
 from mapvote.localisation.map_window import MapWindow
 from mapvote.localisation.ndt import LEVELS, refine, thin_for_levels
 from mapvote.localisation.tracker import Tracker
-from mapvote.localisation.trust import MIN_KNOWN, Judge, height_above_lowest
+from mapvote.localisation.trust import MIN_FIT, MIN_KNOWN, MIN_LEAD, Judge, height_above_lowest
 
 _CELL_M = 1.0
 _LAYER_M = 1.0
@@ -75,10 +75,10 @@ class _Layout:
 class GlobalSearch:
     """The whole map, laid out for searching when first asked."""
 
-    def __init__(self, point_map: PointMap, ndt: NdtSettings, trust: TrustSettings, range_sigma_m: float) -> None:
-        self.point_map, self.ndt, self.trust = point_map, ndt, trust
+    def __init__(self, point_map: PointMap, ndt: NdtSettings, range_sigma_m: float) -> None:
+        self.point_map, self.ndt = point_map, ndt
         self.map_around = MapWindow(point_map)
-        self.judge = Judge(trust, range_sigma_m)
+        self.judge = Judge(range_sigma_m)
 
     @cached_property
     def _layout(self) -> _Layout:
@@ -87,7 +87,7 @@ class GlobalSearch:
     def __call__(self, scan: Scan) -> F64 | None:
         """The pose (4, 4) of the scan, or None if no place holds or another fits as well."""
         found = self.find(scan)
-        if found is None or found.fit < self.trust.min_fit or found.lead < self.trust.min_lead:
+        if found is None or found.fit < MIN_FIT or found.lead < MIN_LEAD:
             return None
         return found.T_map_lidar
 
@@ -111,7 +111,7 @@ class GlobalSearch:
         """(share, x, y, yaw) of the best places, sharpened on single cells."""
         lay = self._layout
         yaws = np.arange(_YAWS) * (2.0 * np.pi / _YAWS)
-        hopeless = int(0.5 * self.trust.min_fit * MIN_KNOWN * _FIRST)
+        hopeless = int(0.5 * MIN_FIT * MIN_KNOWN * _FIRST)
         scores = _correlate(lay.wide, lay.rows, lay.cols, xy, bits, yaws, hopeless, _FIRST)
         flat = scores.ravel()
         likely = np.argsort(flat, kind="stable")[::-1][: 400 * _PEAKS]

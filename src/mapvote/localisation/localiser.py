@@ -27,6 +27,8 @@ from mapvote.localisation.ndt import LEVELS, PosePrior, refine, thin_for_levels
 from mapvote.localisation.tracker import TWIST_AGE_S, Fix, Tracker
 from mapvote.localisation.trust import Judge, Verdict
 
+LOOKS = 3
+"""In turn that must hold before the first vote."""
 WAIT_SCANS = 40
 """Scans that wait at most until their track is confirmed: what a vehicle can hold, 4 s at 10 Hz."""
 _LEAVING = 20
@@ -73,11 +75,10 @@ class Localiser:
         settings: Settings,
         sensor: Sensor,
     ) -> None:
-        self.trust = settings.trust
-        self.search = GlobalSearch(point_map, settings.ndt, settings.trust, sensor.range_sigma_m)
+        self.search = GlobalSearch(point_map, settings.ndt, sensor.range_sigma_m)
         self.map_around = MapWindow(point_map)
         self.tracker = Tracker(self.map_around, settings.ndt)
-        self.judge = Judge(settings.trust, sensor.range_sigma_m)
+        self.judge = Judge(sensor.range_sigma_m)
         self.misfit = np.zeros(3)
         """How far trusted fixes lately lay off their priors, map metres."""
         self._waiting: deque[_Waiting] = deque()
@@ -157,7 +158,7 @@ class Localiser:
         self._looked_at = self._waiting[-1].fix
         if self._looked_at.trusted and self.judge.holds(verdict):
             self._held += 1
-            self._confirmed = self._confirmed or self._held >= self.trust.scans
+            self._confirmed = self._confirmed or self._held >= LOOKS
         else:
             self._held, self._confirmed = 0, False
 

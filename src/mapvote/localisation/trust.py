@@ -13,11 +13,15 @@ from dataclasses import dataclass
 import numba
 import numpy as np
 
-from mapvote.config import TrustSettings
 from mapvote.core.geometry import from_xyz_rpy
 from mapvote.core.types import F64, I32, I64, Bool
 from mapvote.localisation.ndt import NdtMap, fitness, fitnesses, in_rows, refine
 
+MIN_FIT = 0.6
+"""Of what the map leads to expect, from which a pose may be voted with; benchmarks/trust.py shows the fits of right
+and of wrong poses."""
+MIN_LEAD = 0.05
+"""By how much the best other place must fit worse, in the same scale."""
 MIN_KNOWN = 0.3
 """Share of the standing points that must lie where the map has been: with fewer, what fits there proves little."""
 _POINTS = 1000
@@ -68,9 +72,8 @@ class Verdict:
 class Judge:
     """Looks at one scan at one pose of a map."""
 
-    def __init__(self, settings: TrustSettings, range_sigma_m: float, most_points: int = _POINTS) -> None:
-        self.settings, self.most_points = settings, most_points
-        self.range_sigma_m = range_sigma_m
+    def __init__(self, range_sigma_m: float, most_points: int = _POINTS) -> None:
+        self.range_sigma_m, self.most_points = range_sigma_m, most_points
 
     def judge(self, ndt_map: NdtMap, points_lidar: F64, T_map_lidar: F64) -> Verdict:
         """``points_lidar`` (n, 3) de-skewed and thinned; a few thousand are plenty."""
@@ -96,8 +99,7 @@ class Judge:
 
     def holds(self, verdict: Verdict) -> bool:
         """Whether the verdict speaks for the pose."""
-        s = self.settings
-        return verdict.fit >= s.min_fit and verdict.known >= MIN_KNOWN and verdict.lead >= s.min_lead
+        return verdict.fit >= MIN_FIT and verdict.known >= MIN_KNOWN and verdict.lead >= MIN_LEAD
 
     def _expected(self, ndt_map: NdtMap, standing: F64, T: F64) -> tuple[float, float]:
         """(mean likelihood that the standing points should have, share of them where the map has been)."""

@@ -35,6 +35,8 @@ from mapvote.perception.range_image import U16, Counts, Pixels, Samples, look, r
 
 # Set on the development streets of the simulator; what half and twice of each cost,
 # benchmarks/moving_accuracy.py --sweep measures.
+REACH_M = 57.0
+"""Points farther away are never called moving: the corners of the local grid are 56.7 m away."""
 PAST_S = 2.0
 """How far back other scans are asked."""
 LOOKS_PAST = 6
@@ -83,8 +85,9 @@ class MovingFilter:
     Scans go in with :meth:`push`, in order of time; masks come out as soon as ``lookahead_s`` has been seen.
     """
 
-    def __init__(self, sensor: Sensor, settings: MovingSettings) -> None:
-        self.settings = settings
+    def __init__(self, sensor: Sensor, settings: MovingSettings, reach_m: float | None = None) -> None:
+        """``reach_m``: how far it looks, REACH_M if nothing is said."""
+        self.settings, self.reach_m = settings, REACH_M if reach_m is None else reach_m
         slope_min = np.tan(np.radians(max(sensor.fov_bottom_deg - TILT_DEG, -60.0)))
         slope_max = np.tan(np.radians(min(sensor.fov_top_deg + TILT_DEG, 60.0)))
         per_slope = 1.0 / np.tan(np.radians(0.5 * PIXEL_DEG))
@@ -108,7 +111,7 @@ class MovingFilter:
         points = np.ascontiguousarray(points_map, dtype=np.float64)
         origin = np.asarray(origin_map, dtype=np.float64)
         nearest = range_image(points, origin, self._pixels)
-        voxel_of, first = voxels(points, obstacle, origin, self.settings.reach_m, CELL_SIZE)
+        voxel_of, first = voxels(points, obstacle, origin, self.reach_m, CELL_SIZE)
         self._window.append(_Scan(stamp_ns, origin, nearest, voxel_of, points[first]))
         self._waiting += 1
         return self._decide(stamp_ns - round(self.settings.lookahead_s * 1e9))
@@ -133,7 +136,7 @@ class MovingFilter:
 
     def _moving(self, at: int) -> Bool:
         """The mask of the window's scan ``at``, from the other scans of the window."""
-        s, scan = self.settings, self._window[at]
+        scan = self._window[at]
         m = left = len(scan.samples)
         counts = Counts(np.zeros(m, np.int32), np.zeros(m, np.int32), np.zeros(m, np.uint8))
         x, y, z = (scan.samples - scan.origin_map).astype(np.float32).T.copy()
@@ -143,7 +146,7 @@ class MovingFilter:
             left = look(waiting, left, other.nearest, sensor, self._pixels, (MARGIN_M, HEIGHT_M, ENOUGH), counts)
         free, seen = counts.free, counts.free + counts.hit
         brief = (counts.sides == 3) & (free >= MIN_FREE) & (free >= FREE_SHARE * seen)
-        half = int(np.ceil(s.reach_m / CELL_SIZE)) + 2
+        half = int(np.ceil(self.reach_m / CELL_SIZE)) + 2
         cells = np.floor(scan.samples[:, :2] / CELL_SIZE).astype(np.int64)
         cells -= np.floor(scan.origin_map[:2] / CELL_SIZE).astype(np.int64) - half
         rows, cols, share = cells[:, 1], cells[:, 0], (SHARE_WHOLE, SHARE_PART)

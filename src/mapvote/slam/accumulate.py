@@ -57,8 +57,7 @@ class Layer:
 
     def lay(self, drive: Drive, T_map_lidar: F64, registered: Bool, count: Callable[[], None]) -> None:
         """Enter every registered scan of one drive at its pose (n, 4, 4). ``count`` is called after each scan read."""
-        mapping = self.settings.mapping
-        movers = MovingFilter(drive.sensor, self.settings.moving.model_copy(update={"reach_m": mapping.reach_m}))
+        movers = MovingFilter(drive.sensor, self.settings.moving, self.settings.mapping.reach_m)
         frontend = Frontend(
             GivenPoses(drive.stamps_ns, T_map_lidar), movers, self._around, self._near, with_sight=False
         )

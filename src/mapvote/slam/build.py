@@ -91,7 +91,7 @@ def build_map(
     count = _counter(progress, 2 * sum(len(drive) for drive in drives))
     surveyor = Surveyor(settings)
     found = [surveyor.follow(drive, count) for drive in drives]
-    settled = settle(drives, found, settings.mapping)
+    settled = settle(drives, found)
     registered, poses = [one.registered for one in found], settled.T_map_lidar
     cloud = transform(settled.T_map_draft, surveyor.draft.points()[0])
     roads = [road_under(T, mask, cloud) for T, mask in zip(poses, registered, strict=True)]
@@ -104,7 +104,7 @@ def build_map(
     point_map = replace(point_map, surveyed_ns=_last_stamp(drives))
     heights = [_agreed_heights(drive, point_map, path) for drive, path in zip(drives, driven, strict=True)]
     tracks = tuple(_track(*each) for each in zip(drives, poses, found, heights, settled.sigma_m, strict=True))
-    held = any(is_precise(drive, settings.mapping) for drive in drives)
+    held = any(is_precise(drive) for drive in drives)
     points = sum(len(tile.points) for tile in point_map.tiles.values())
     return point_map, BuildReport(tracks, points, held, two_levels(road) if len(road) else None)
 

@@ -14,13 +14,14 @@ from itertools import pairwise
 import numpy as np
 from scipy.spatial import cKDTree
 
-from mapvote.config import MappingSettings
 from mapvote.core.geometry import inverse
 from mapvote.core.types import F64, I64, Drive
 from mapvote.slam.frame import fit_to_priors, trust_in
 from mapvote.slam.pose_graph import Anchors, Links, optimise, position_sigmas
-from mapvote.slam.surveyor import Surveyed, is_precise
+from mapvote.slam.surveyor import PRECISE_PRIOR_M, Surveyed, is_precise
 
+PRIOR_MEMORY_S = 20.0
+"""How long the errors of a coarser prior stay alike: those of GNSS without corrections change over such times."""
 _SLACK = 5.0
 """Widens a precise prior's sigma: its errors are alike for a while."""
 _LINK_SIGMA_M, _LINK_SIGMA_RAD = 0.003, float(np.radians(0.01))
@@ -45,7 +46,7 @@ class Settled:
     """(n,) standard deviation of each position in the frame of the priors; nan without any prior."""
 
 
-def settle(drives: Sequence[Drive], found: Sequence[Surveyed], settings: MappingSettings) -> Settled:
+def settle(drives: Sequence[Drive], found: Sequence[Surveyed]) -> Settled:
     """Poses of all drives that agree with each other's motion and with all priors; as given if there are none."""
     poses = [one.T_map_lidar for one in found]
     starts = np.cumsum([0] + [len(T) for T in poses])
@@ -53,11 +54,11 @@ def settle(drives: Sequence[Drive], found: Sequence[Surveyed], settings: Mapping
     T_map_draft = np.eye(4)
     if not any(drive.T_map_lidar_prior is not None for drive in drives):
         return Settled(poses, T_map_draft, [np.full(len(p), np.nan) for p in poses])
-    if not any(is_precise(drive, settings) for drive in drives):
+    if not any(is_precise(drive) for drive in drives):
         T_map_draft = _laid_on_priors(drives, T, known, starts)
         T = T_map_draft @ T
     links = _links(drives, T, known, _pieces(found, starts))
-    anchors = _anchors(drives, T, starts, settings)
+    anchors = _anchors(drives, T, starts)
     for _ in range(_REWEIGHTED):
         T = optimise(T, links, anchors)
         anchors = [replace(a, weights=trust_in(_off(T, a), a.said_m)) for a in anchors]
@@ -93,24 +94,24 @@ def _laid_on_priors(drives: Sequence[Drive], T: F64, known: I64, starts: I64) ->
     return fit_to_priors(np.concatenate(positions), np.concatenate(priors), max(said))
 
 
-def _anchors(drives: Sequence[Drive], T: F64, starts: I64, settings: MappingSettings) -> list[Anchors]:
+def _anchors(drives: Sequence[Drive], T: F64, starts: I64) -> list[Anchors]:
     """All priors of all drives; of errors that last, as many scans as share one share one weight."""
     out = []
     for start, drive in zip(starts, drives, strict=False):
         if drive.T_map_lidar_prior is None:
             continue
         slack = _SLACK
-        if not is_precise(drive, settings):
+        if not is_precise(drive):
             seconds = 1e-9 * float(drive.stamps_ns[-1] - drive.stamps_ns[0])
-            alike = min(1.0, settings.prior_memory_s / max(seconds, 1e-3)) * len(drive)
+            alike = min(1.0, PRIOR_MEMORY_S / max(seconds, 1e-3)) * len(drive)
             slack = float(np.sqrt(max(alike, 1.0)))
         sigma_rad = _SLACK * slack * float(np.radians(drive.prior_sigma_deg))
         anchor = Anchors(
             np.arange(start, start + len(drive)),
             drive.T_map_lidar_prior,
             slack * drive.prior_sigma_m,
-            sigma_rad if not is_precise(drive, settings) else slack * float(np.radians(drive.prior_sigma_deg)),
-            said_m=max(drive.prior_sigma_m, settings.precise_prior_m),
+            sigma_rad if not is_precise(drive) else slack * float(np.radians(drive.prior_sigma_deg)),
+            said_m=max(drive.prior_sigma_m, PRECISE_PRIOR_M),
         )
         out.append(replace(anchor, weights=trust_in(_off(T, anchor), anchor.said_m)))
     return out

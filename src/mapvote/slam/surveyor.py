@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mapvote.config import MappingSettings, Settings
+from mapvote.config import Settings
 from mapvote.core.geometry import exp, inverse, transform
 from mapvote.core.grid import Lattice
 from mapvote.core.types import F64, Bool, Drive, MapvoteError, Scan
@@ -23,6 +23,8 @@ from mapvote.localisation.ndt import LEVELS, NdtMap, PosePrior, in_rows, refine
 from mapvote.localisation.tracker import ACCELERATION_MPS2, Fix, Tracker
 from mapvote.slam.frame import fit_to_priors
 
+PRECISE_PRIOR_M = 0.1
+"""A prior at least this good is a surveyor's, and holds the map's frame."""
 _MIN_INLIER_SHARE = 0.4
 """As the setting of ndt, while the map is still growing: half of a scan may look at what nobody has seen yet."""
 _POINTS_M = 0.3
@@ -49,16 +51,15 @@ class Surveyed:
     """Scans at which the track began anew, tied to what was before by priors alone."""
 
 
-def is_precise(drive: Drive, settings: MappingSettings) -> bool:
+def is_precise(drive: Drive) -> bool:
     """Whether a drive's prior is a surveyor's."""
-    return drive.T_map_lidar_prior is not None and drive.prior_sigma_m <= settings.precise_prior_m
+    return drive.T_map_lidar_prior is not None and drive.prior_sigma_m <= PRECISE_PRIOR_M
 
 
 class Surveyor:
     """The NDT map as it grows, drive after drive."""
 
     def __init__(self, settings: Settings) -> None:
-        self.mapping = settings.mapping
         self.ndt = settings.ndt.model_copy(update={"min_inlier_share": _MIN_INLIER_SHARE})
         self.ndt_map: NdtMap | None = None
         self.fine_map: NdtMap | None = None
@@ -72,8 +73,8 @@ class Surveyor:
     def follow(self, drive: Drive, count: Callable[[], None]) -> Surveyed:
         """Where one drive went, each scan entered once it is registered. MapvoteError if fewer than half could be."""
         tracker = Tracker(self._map_around, self.ndt)
-        tracker.twist = _first_motion(drive, self.mapping)
-        precise = is_precise(drive, self.mapping)
+        tracker.twist = _first_motion(drive)
+        precise = is_precise(drive)
         poses, registered, broken, lost = [], [], [], 0
         for i, scan in enumerate(drive):
             prior = PosePrior.of(drive, i)
@@ -164,15 +165,15 @@ class Surveyor:
             self._told.append(drive.T_map_lidar_prior[i, :3, 3])
 
 
-def _first_motion(drive: Drive, settings: MappingSettings) -> F64:
+def _first_motion(drive: Drive) -> F64:
     """(6,) motion per second at the start by the priors: to the next scan, or the middle one of several over a second
     if they are coarse, of which one may be wild."""
     told = drive.T_map_lidar_prior
     if told is None or len(drive) < 2:
         return np.zeros(6)
     seconds = 1e-9 * (drive.stamps_ns - drive.stamps_ns[0]).astype(np.float64)
-    k = 1 if is_precise(drive, settings) else max(1, int(np.searchsorted(seconds, 1.0)))
+    k = 1 if is_precise(drive) else max(1, int(np.searchsorted(seconds, 1.0)))
     k = min(k, len(drive) - 1)
-    tries = 1 if is_precise(drive, settings) else min(k, len(drive) - k)
+    tries = 1 if is_precise(drive) else min(k, len(drive) - k)
     motions = [twist_between(told[i], told[i + k], float(seconds[i + k] - seconds[i])) for i in range(tries)]
     return np.asarray(np.median(motions, axis=0))
