@@ -127,6 +127,14 @@ def test_what_one_scan_met_counts_where_it_touches_what_two_met(beside: int, cou
     assert kept[0, 0] == 4
 
 
+def test_a_point_that_touches_no_other_goes_along_only_where_most_of_what_is_around_it_goes() -> None:
+    before, at_the_end = (ROW + 1, 105), (ROW, COLUMNS[-1] + 1)
+    ground = wall([(r, c) for r in range(85, 125) for c in range(85, 135)], [0.0])
+    mapped = np.concatenate([wall(WALL, HEIGHTS), wall([before, at_the_end], [4.05]), ground])
+    votes = after(make_map({(0, 0): make_tile(mapped)}), standing_at(OLD_Y + 9))
+    assert [votes.states[cell] for cell in (before, at_the_end)] == [CE, UN]
+
+
 def test_what_is_no_higher_than_a_kerb_is_never_gone() -> None:
     assert not (after(street(WALL, [0.45]), standing_at(OLD_Y + 9)).states == CE).any()
 

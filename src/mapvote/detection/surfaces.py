@@ -3,8 +3,9 @@
 A mapped voxel is gone that was crossed more often than HIT_RAYS times its hits, and stands that was met and is not. A
 cell is changed-empty if a voxel of it is gone and none stands: what no ray could decide in it goes along. So do cells
 beside it in which rays crossed something and met nothing, however few; and cells that no ray could decide go with what
-falls, as columns have it (rule H). A free voxel met more often than rays spoke against it is new. Support, not area,
-makes a change of either: a pole is narrow and tall, a speck is neither. docs/method.md.
+falls, as columns have it (rule H). Points that touch no other go with most of what is around them, or not at all. A
+free voxel met more often than rays spoke against it is new. Support, not area, makes a change of either: a pole is
+narrow and tall, a speck is neither. docs/method.md.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from mapvote.core.reference import bordered
 from mapvote.core.types import I32, NO_VOTE, U8, U64, Bool, CellState, Reference
 from mapvote.core.voting import one_hot
 from mapvote.detection.counters import PLANES, count_of, ever, newly_free
+from mapvote.detection.lone_points import lone_cells, no_change
 from mapvote.detection.regions import HALO, JOIN_CELLS, beyond_tiles, fallen, unexplained
 from mapvote.detection.surface_counts import CROSSED, MET, PASSED, SurfaceEvidence
 from mapvote.detection.votes import TileVotes
@@ -58,6 +60,8 @@ class _Judged:
     """Mapped cells in which rays crossed a voxel that none met, and met none that stands."""
     adrift: Bool
     """Mapped cells that no ray decided, with rays through half of what is under them or more."""
+    lone: Bool
+    """Mapped cells whose voxels touch no other mapped one."""
     states: U8
     remnants: U64
 
@@ -158,7 +162,7 @@ class SurfaceVoter:
     def _judge(self, tile: TileIndex) -> _Judged:
         """What the tile's own evidence says, voxel by voxel and cell by cell."""
         window = self.point_map.lattice.tile(tile)
-        here, _, near, known = bordered(self.point_map, window)
+        here, outer, near, known = bordered(self.point_map, window)
         planes = self.evidence.tiles[tile]
         gone, stands, new, beyond = (np.zeros(window.shape, dtype=np.uint64) for _ in range(4))
         weigh_surfaces(planes, here.occupied, known, near, gone, stands, new, beyond)
@@ -181,6 +185,7 @@ class SurfaceVoter:
             beside=(new != 0) & (new & ~near == 0),
             crossed=mapped & ~low & (stands == 0) & ((gone | never_met) != 0),
             adrift=mapped & ~low & (gone | stands == 0) & (under != 0) & clear,
+            lone=lone_cells(outer.occupied, outer.base)[1:-1, 1:-1],
             states=states,
             remnants=np.zeros_like(gone),
         )
@@ -220,6 +225,9 @@ def _decide_mapped(tiles: dict[TileIndex, _Judged], lattice: Lattice) -> None:
 
     for tile, cells in beyond_tiles(lattice, HALO, fall, (states, NO_VOTE), (adrift, False)).items():
         tiles[tile].states[cells] = CellState.CHANGED_EMPTY
+    states, lone = _states(tiles), {tile: found.lone for tile, found in tiles.items()}
+    for tile, cells in beyond_tiles(lattice, 1, no_change, (states, NO_VOTE), (lone, False)).items():
+        tiles[tile].states[cells] = CellState.UNDETERMINED
     for found in tiles.values():
         down = found.states == CellState.CHANGED_EMPTY
         found.gone = np.where(down, found.here.occupied, found.gone)
