@@ -19,7 +19,7 @@ CE = CellState.CHANGED_EMPTY
     base=arrays(np.int32, (3, 4), elements=st.integers(-2, 2)),
 )
 def test_a_cell_is_lone_if_no_voxel_of_it_touches_another_on_whatever_ground(words: U64, base: I32) -> None:
-    voxels = {(r, c, b + base[r, c]) for (r, c), w in np.ndenumerate(words) for b in range(6) if int(w) >> b & 1}
+    voxels = {(r, c, b + int(base[r, c])) for (r, c), w in np.ndenumerate(words) for b in range(6) if int(w) >> b & 1}
 
     def touches(r: int, c: int, z: int) -> bool:
         around = {(r + i, c + j, z + k) for i in (-1, 0, 1) for j in (-1, 0, 1) for k in (-1, 0, 1)}
