@@ -13,6 +13,7 @@ from mapvote.core.grid import Lattice
 from mapvote.core.tile import Tile
 from mapvote.core.types import NO_VOTE, U8, CellState
 from mapvote.fusion.fuse import count, fuse_tile, hear
+from mapvote.fusion.outliers import borne_out, denying
 from mapvote.fusion.spent import unspent
 from mapvote.fusion.tile_vote import TileVote
 
@@ -142,3 +143,26 @@ def test_what_waits_for_the_last_who_looked_still_waits_when_all_else_is_publish
     again = [*votes, TileVote("v3", 4 * 10**9, "v3b", states=passed, version=1)]
     left = [unspent(vote, published) for vote in again]
     assert fuse_tile(published, left, "columns", policy, 3, lambda: left)[1] is published, "drives are folded"
+
+
+def test_who_left_cells_undetermined_denied_nothing_there_and_was_not_asked() -> None:
+    decided = np.full(1000, CO, dtype=np.uint8)
+    unsure, contrary = np.full(1000, UN, dtype=np.uint8), np.full(1000, UE, dtype=np.uint8)
+    few = unsure.copy()
+    few[:64] = UE
+    found = denying(np.stack([unsure, contrary, few, decided]), decided, 0.9, np.zeros(4, dtype=np.int64))
+    assert found.tolist() == [False, True, True, False]
+
+
+def test_only_changes_that_count_no_more_can_have_come_true() -> None:
+    tile = make_tile(wall([(10, 10)], [0.5, 1.5]))
+    stands = (10, 10)
+    silent = states_plane({})
+    for sent, expected in ((CO, 1), (CE, 0), (UO, 0), (UE, 0)):
+        spent = TileVote("v", 0, "d", states=silent, unrestricted=states_plane({stands: sent}))
+        assert borne_out([spent], tile).tolist() == [expected]
+    for sent, expected in ((CO, 0), (CE, 1), (UO, 0), (UE, 0)):
+        spent = TileVote("v", 0, "d", states=silent, unrestricted=states_plane({(99, 99): sent}))
+        assert borne_out([spent], tile).tolist() == [expected]
+    counts = TileVote("v", 0, "d", states=states_plane({stands: CO}), unrestricted=states_plane({stands: CO}))
+    assert borne_out([counts], tile).tolist() == [0]

@@ -16,7 +16,7 @@ from mapvote.core.memory import Memory
 from mapvote.core.tile import Tile
 from mapvote.core.types import Bool, CellState
 from mapvote.fusion.fuse import fuse_tile
-from mapvote.fusion.persistence import DAY_S, ages_days, doubtful, expected_days, remembered, temporary
+from mapvote.fusion.persistence import DAY_S, ages_days, denied_last, doubtful, expected_days, remembered, temporary
 from mapvote.fusion.tile_vote import TileVote
 
 UO, UE, CO, CE, UN = (int(state) for state in CellState)
@@ -215,3 +215,16 @@ def test_without_a_history_everything_new_is_there_to_stay() -> None:
     assert len(fuse_tile(tile, votes, "columns", SETTINGS)[1].points) == 1
     states = fuse_tile(tile, votes, "columns", SETTINGS, 2, lambda: votes)[0].states
     assert states[CELL] == UN
+
+
+@pytest.mark.parametrize(
+    ("said", "denied"), [([UE, CO], False), ([CO, UE], True), ([CO, UN], False), ([UE, CO, UN], False)]
+)
+def test_the_last_who_could_tell_has_a_veto_and_those_before_have_none(said: list[int], denied: bool) -> None:
+    passed = [drive(day, {CELL: state}, f"v{day}") for day, state in enumerate(said)]
+    assert denied_last(states_plane({CELL: CO}), None, passed)[CELL] == denied
+
+
+def test_what_stands_where_nothing_new_was_decided_did_not_come() -> None:
+    same = remembered(Memory.none(), BARE, STANDS, [second("a", START_S, CO)], states_plane({CELL: UO}))
+    assert same.came_s[CELL] == 0

@@ -207,3 +207,23 @@ def test_folded_drives_say_cell_by_cell_what_the_last_that_spoke_there_says(seed
         marked = 0 if not spoke or last not in (CE, UO) else whole if spoke[-1] == seed else int(gone[spoke[-1], c])
         assert int(gone[3, c]) == marked
         assert free[3, c] == np.bitwise_or.reduce(free[spoke, c], initial=np.uint64(0))
+
+
+def test_of_two_drives_that_sent_tallies_the_later_one_speaks_where_it_counted_anything() -> None:
+    early, late = counted({HERE: [0, 0, 9, 0, 0], THERE: [7, 0, 0, 0, 0]}), counted({HERE: [0, 0, 0, 5, 0]})
+    one = fold([replace(late, end_ns=2, digest="late"), replace(early, end_ns=1, digest="early")], WINDOW)
+    assert one.tally is not None
+    assert one.tally[HERE].tolist() == [0, 0, 0, 5, 0]
+    assert one.tally[THERE].tolist() == [7, 0, 0, 0, 0]
+    assert one.tally.sum() == 12
+
+
+def test_points_whose_intensity_one_drive_did_not_measure_have_none_and_the_others_keep_theirs() -> None:
+    first, second = np.array([[1.0, 1.0, 0.5]], np.float32), np.array([[5.0, 5.0, 0.5]], np.float32)
+    bare = drive("v", 1, {(3, 3): CO}, new_points=first)
+    full = drive("v", 2, {(16, 16): CO}, new_points=second, intensity=np.array([77], np.uint8))
+    one = fold([bare, full], WINDOW)
+    assert one.new_points is not None
+    assert one.intensity is not None
+    assert sorted(zip(one.new_points[:, 0].tolist(), one.intensity.tolist(), strict=True)) == [(1.0, 0), (5.0, 77)]
+    assert len(drive("v", 3, {}).measured()) == 0

@@ -8,7 +8,7 @@ import pytest
 from hand_made import states_plane, two_walls
 from mapvote.config import FuseSettings
 from mapvote.core.types import NO_VOTE, CellState
-from mapvote.fusion.fuse import fuse_tile
+from mapvote.fusion.fuse import Rule, fuse_tile
 from mapvote.fusion.tile_vote import TileVote
 from mapvote.fusion.turning import _turn
 
@@ -16,7 +16,13 @@ UO, UE, CO, CE, UN = (int(state) for state in list(CellState)[:5])
 CELL = (10, 10)
 
 
-def decided(*said: int, min_votes: int = 2, ends_s: list[int] | None = None, whose: list[str] | None = None) -> int:
+def decided(
+    *said: int,
+    min_votes: int = 2,
+    ends_s: list[int] | None = None,
+    whose: list[str] | None = None,
+    rule: Rule = "columns",
+) -> int:
     """What is decided of a cell if the vehicles pass one after the other and say this."""
     votes = [
         TileVote(
@@ -31,7 +37,7 @@ def decided(*said: int, min_votes: int = 2, ends_s: list[int] | None = None, who
     tile = two_walls().tiles[0, 0]
     shuffled = [votes[i] for i in rng.permutation(len(votes))]
     settings = FuseSettings(min_votes=min_votes, latest_vehicles=99)
-    return int(fuse_tile(tile, shuffled, "columns", settings)[0].states[CELL])
+    return int(fuse_tile(tile, shuffled, rule, settings)[0].states[CELL])
 
 
 def test_a_house_that_many_saw_standing_is_gone_once_three_in_turn_say_so() -> None:
@@ -39,6 +45,10 @@ def test_a_house_that_many_saw_standing_is_gone_once_three_in_turn_say_so() -> N
     assert decided(*[UO] * 6, CE, CE, CE) == CE
     assert decided(*[UO] * 50, CE, CE, CE) == CE
     assert decided(*[UE] * 6, CO, CO, CO) == CO
+
+
+def test_by_the_papers_rule_the_majority_decides_whoever_came_last() -> None:
+    assert decided(*[UO] * 6, CE, CE, CE, rule="paper") == UO
 
 
 def test_one_more_than_the_quorum_must_say_so() -> None:

@@ -112,6 +112,8 @@ def dilated(words: U64, base: I32, reach: int) -> U64:
 
 
 EVERY_BIT = ~np.uint64(0)
+_BESIDE = np.int64(1)
+"""One cell to all sides; no literal, for which :func:`neighbourhood` would be compiled once more."""
 
 
 @numba.njit(cache=True, nogil=True)
@@ -145,7 +147,7 @@ def remnants(gone: U64, loose: U64, base: I32) -> U64:
             for c in range(cols):
                 left = loose[r, c] & ~reached[r, c]
                 if left:
-                    more = left & neighbourhood(reached, base, r, c, 1)
+                    more = left & neighbourhood(reached, base, r, c, _BESIDE)
                     if more:
                         found[r, c] |= more
                         reached[r, c] |= more

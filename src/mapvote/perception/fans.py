@@ -93,7 +93,7 @@ _TOO_SHORT = (_MARKS_FROM - 1.5 * CELL_SIZE).astype(np.float32)
 """A ray that ends before this comes to no cell that its fan marks: a cell is 1.42 sides across."""
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True)
 def gather_rays(rays: Rays) -> Fans:
     """Sort rays into fans. What lies in the sensor's own cell proves nothing."""
     n, own = np.uint64(len(rays.reach)), np.float32(CELL_SIZE)
