@@ -227,3 +227,12 @@ def test_points_whose_intensity_one_drive_did_not_measure_have_none_and_the_othe
     assert one.intensity is not None
     assert sorted(zip(one.new_points[:, 0].tolist(), one.intensity.tolist(), strict=True)) == [(1.0, 0), (5.0, 77)]
     assert len(drive("v", 3, {}).measured()) == 0
+
+
+def test_a_new_point_in_a_cell_of_which_nobody_speaks_is_left_out_whoever_sent_it() -> None:
+    silent, spoken = [1.0, 1.0, 0.5], [5.0, 5.0, 0.5]
+    points = np.array([silent, spoken], np.float32)
+    first, second = (drive("v", end, {(16, 16): CO}, new_points=points) for end in (1, 2))
+    one = fold([first, second], WINDOW)
+    assert one.new_points is not None
+    assert one.new_points.tolist() == [spoken]
