@@ -109,6 +109,12 @@ def test_what_few_rays_crossed_and_none_met_goes_with_what_many_crossed_beside_i
     assert all(voter.votes()[0, 0].states[cell] == CE for cell in WALL)
 
 
+def test_a_house_wall_that_two_scans_crossed_is_gone_and_the_trail_of_a_van_so_crossed_is_not() -> None:
+    house = [0.45 + 0.3 * k for k in range(14)]
+    states = [after(street(WALL, heights), standing_at(OLD_Y + 9), 2).states for heights in (house, HEIGHTS)]
+    assert [{int(s[cell]) for cell in WALL} for s in states] == [{CE}, {UN}]
+
+
 @given(strong=arrays(np.bool_, (6, 6)), weak=arrays(np.bool_, (6, 6)))
 def test_what_grows_is_weak_and_growing_twice_grows_no_more(strong: Bool, weak: Bool) -> None:
     out = grown(strong, weak)
