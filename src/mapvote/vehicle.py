@@ -142,8 +142,9 @@ def _ballot_tile(point_map: PointMap, tile: TileIndex, votes: TileVotes, points:
     }
     new_points = intensity = None
     if len(points):
-        window = point_map.lattice.tile(tile)
-        base = reference_window(point_map, window).base
+        window, mapped = point_map.lattice.tile(tile), point_map.tiles.get(tile)
+        known = mapped is not None and mapped.has_ground
+        base = mapped.base if mapped is not None and known else reference_window(point_map, window).base
         new = np.where(changed[CellState.CHANGED_OCCUPIED], votes.new, np.uint64(0))
         kept, bright = points_in(window, points, new, base)
         new_points = pack_points(kept) if len(kept) else None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 
+import numba
 import numpy as np
 
 from mapvote.codec.arrays import compress, unpack_bytes
@@ -71,9 +72,17 @@ class PackedTiles(Mapping[TileIndex, U64]):
         """``planes``, which come empty, with what was packed."""
         data = self._shelf.read(place)
         raw = np.frombuffer(unpack_bytes(data, CELLS * 8 * (self.words + 1), "evidence"), dtype=np.uint64)
-        cells, *words = raw.reshape(self.words + 1, -1)
-        planes.reshape(CELLS, self.words)[cells.astype(np.intp)] = np.stack(words, axis=1)
+        _lay(raw.reshape(self.words + 1, -1), planes.reshape(CELLS, self.words))
         return planes
+
+
+@numba.njit(cache=True, nogil=True)
+def _lay(packed: U64, flat: U64) -> None:
+    """Words (words + 1, n), the cells first, to where they were in (cells, words)."""
+    for i in range(packed.shape[1]):
+        cell = np.int64(packed[0, i])
+        for k in range(flat.shape[1]):
+            flat[cell, k] = packed[k + 1, i]
 
 
 def _packed(planes: U64) -> bytes:

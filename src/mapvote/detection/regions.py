@@ -132,7 +132,7 @@ def fallen(states: U8, adrift: Bool, reach: int) -> Bool:
     connected group of those that go falls if a changed-empty cell lies within ``reach`` cells of it.
     """
     gone, kept = states == CellState.CHANGED_EMPTY, states == CellState.UNCHANGED_OCCUPIED
-    if not gone.any():
+    if not (gone.any() and adrift.any()):
         return np.zeros_like(adrift)
     to_gone = ndimage.distance_transform_cdt(~gone, "chessboard")
     goes = adrift & (to_gone < ndimage.distance_transform_cdt(~kept, "chessboard")) if kept.any() else adrift

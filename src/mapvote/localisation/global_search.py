@@ -11,37 +11,40 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 
-import numba
 import numpy as np
-from scipy import ndimage
 
 from mapvote.config import NdtSettings
 from mapvote.core.geometry import inverse
-from mapvote.core.grid import CELL_SIZE
 from mapvote.core.point_map import PointMap
-from mapvote.core.types import F64, I64, U8, U64, MapvoteError, Scan
+from mapvote.core.types import F64, U32, Scan
 from mapvote.localisation.airborne import solid_sample
+from mapvote.localisation.correlation import (
+    CELL_M,
+    HIGH_M,
+    LAYER_M,
+    LOW_M,
+    MARGIN,
+    CoarseMap,
+    apart,
+    correlate,
+    highest,
+    laid_out,
+    sharpened,
+)
 from mapvote.localisation.deskew import deskew
 from mapvote.localisation.map_window import MapWindow
 from mapvote.localisation.ndt import LEVELS, refine, thin_for_levels
 from mapvote.localisation.tracker import Tracker
 from mapvote.localisation.trust import MIN_FIT, MIN_KNOWN, MIN_LEAD, Judge, height_above_lowest
 
-_CELL_M = 1.0
-_LAYER_M = 1.0
-_LOW_M, _HIGH_M = 0.8, 30.0
-"""Heights above the ground that are looked at."""
 _REACH_M = 45.0
 _POINTS = 200
 _FIRST = 48
 """Points after which a hopeless place is given up."""
-_STEP_CELLS = 2
 _YAWS = 120
 _SPREAD_M, _SPREAD_RAD = 3.0, np.radians(15.0)
 """Peaks nearer to each other than this are one."""
 _PEAKS, _REFINED, _JUDGED = 60, 12, 3
-_MAX_CELLS = 40_000_000
-"""Of one metre: a box of 6 km by 6 km."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,23 +58,6 @@ class Found:
     """By how much it fits better than the best place elsewhere."""
 
 
-@dataclass(frozen=True, slots=True)
-class _Layout:
-    """The map in cells of a metre."""
-
-    x0: float
-    y0: float
-    ground_z: F64
-    """(rows, cols) map metres, NaN where unknown."""
-    words: U64
-    """(rows, cols) what stands, by layers of a metre above the ground."""
-    wide: U64
-    """The same, dilated."""
-    rows: I64
-    cols: I64
-    """Cells on a coarser raster in which a vehicle can stand."""
-
-
 class GlobalSearch:
     """The whole map, laid out for searching when first asked."""
 
@@ -81,8 +67,8 @@ class GlobalSearch:
         self.judge = Judge(range_sigma_m)
 
     @cached_property
-    def _layout(self) -> _Layout:
-        return _laid_out(self.point_map)
+    def _layout(self) -> CoarseMap:
+        return laid_out(self.point_map)
 
     def __call__(self, scan: Scan) -> F64 | None:
         """The pose (4, 4) of the scan, or None if no place holds or another fits as well."""
@@ -96,10 +82,10 @@ class GlobalSearch:
         few = solid_sample(scan.points, 1.0)
         height = height_above_lowest(few)
         near = few[:, 0] ** 2 + few[:, 1] ** 2 < _REACH_M**2
-        sample = few[near & (height > _LOW_M) & (height < _HIGH_M)]
+        sample = few[near & (height > LOW_M) & (height < HIGH_M)]
         if len(sample) < _FIRST:
             return None
-        bits = np.floor(height[near & (height > _LOW_M) & (height < _HIGH_M)] / _LAYER_M).astype(np.int64)
+        bits = np.floor(height[near & (height > LOW_M) & (height < HIGH_M)] / LAYER_M).astype(np.uint32)
         order = np.random.default_rng(0).permutation(len(sample))[:_POINTS]  # any will do, the same each time
         xy, bits = sample[order, :2], bits[order]
         below = few[few[:, 0] ** 2 + few[:, 1] ** 2 < 36.0, 2]
@@ -107,18 +93,17 @@ class GlobalSearch:
         best = sorted(self._peaks(xy, bits), key=lambda peak: -peak[0])[:_REFINED]
         return self._choose(scan, [self._pose(peak, sensor_m) for peak in best])
 
-    def _peaks(self, xy: F64, bits: I64) -> list[tuple[float, float, float, float]]:
+    def _peaks(self, xy: F64, bits: U32) -> list[tuple[float, float, float, float]]:
         """(share, x, y, yaw) of the best places, sharpened on single cells."""
         lay = self._layout
         yaws = np.arange(_YAWS) * (2.0 * np.pi / _YAWS)
         hopeless = int(0.5 * MIN_FIT * MIN_KNOWN * _FIRST)
-        scores = _correlate(lay.wide, lay.rows, lay.cols, xy, bits, yaws, hopeless, _FIRST)
-        flat = scores.ravel()
-        likely = np.argsort(flat, kind="stable")[::-1][: 400 * _PEAKS]
+        scores = correlate(lay.wide, lay.spans, lay.cols // 2 + MARGIN, xy, bits, yaws, hopeless, _FIRST)
+        likely = highest(scores.ravel(), 400 * _PEAKS)
         place, heading = likely // _YAWS, likely % _YAWS
         x, y = lay.cols[place] + 0.5, lay.rows[place] + 0.5
-        kept = _apart(x * _CELL_M, y * _CELL_M, yaws[heading], _PEAKS, _SPREAD_M, _SPREAD_RAD)
-        return [_sharpened(lay.words, x[k], y[k], yaws[heading[k]], xy, bits) for k in kept]
+        kept = apart(x * CELL_M, y * CELL_M, yaws[heading], _PEAKS, _SPREAD_M, _SPREAD_RAD)
+        return [sharpened(lay.words, x[k], y[k], yaws[heading[k]], xy, bits) for k in kept]
 
     def _pose(self, peak: tuple[float, float, float, float], sensor_m: float) -> F64:
         """(4, 4) on the map's ground at a peak, level with it."""
@@ -134,7 +119,7 @@ class GlobalSearch:
         ahead /= np.linalg.norm(ahead)
         T = np.eye(4)
         T[:3, 0], T[:3, 1], T[:3, 2] = ahead, np.cross(up, ahead), up
-        T[:3, 3] = np.array([lay.x0 + x * _CELL_M, lay.y0 + y * _CELL_M, z]) + sensor_m * up
+        T[:3, 3] = np.array([lay.x0 + x * CELL_M, lay.y0 + y * CELL_M, z]) + sensor_m * up
         return T
 
     def _choose(self, scan: Scan, guesses: list[F64]) -> Found | None:
@@ -172,109 +157,3 @@ def _distinct(poses: list[F64]) -> list[F64]:
         if all(_differ(T, other) for other in out):
             out.append(T)
     return out
-
-
-def _laid_out(point_map: PointMap) -> _Layout:
-    windows = [tile.window for tile in point_map.tiles.values()]
-    x0, y0 = min(w.x0 for w in windows), min(w.y0 for w in windows)
-    cols = int(np.ceil((max(w.x0 + w.cols * CELL_SIZE for w in windows) - x0) / _CELL_M))
-    rows = int(np.ceil((max(w.y0 + w.rows * CELL_SIZE for w in windows) - y0) / _CELL_M))
-    if rows * cols > _MAX_CELLS:
-        raise MapvoteError(
-            f"map {point_map.map_id} is {cols} m by {rows} m: too large to search; give the drive a prior (--prior)"
-        )
-    words, ground_z = np.zeros((rows, cols), dtype=np.uint64), np.full((rows, cols), np.nan)
-    for tile in point_map.tiles.values():
-        x, y = tile.window.centres()
-        known = np.nonzero(np.isfinite(tile.ground_z))
-        at = ((y[known[0]] - y0) / _CELL_M).astype(np.int64), ((x[known[1]] - x0) / _CELL_M).astype(np.int64)
-        ground_z[at] = tile.ground_z[known]
-        points = tile.points_map
-        height = points[:, 2] - tile.ground_z.reshape(-1)[tile.cells]
-        tall = (height > _LOW_M) & (height < _HIGH_M)  # nowhere over unknown ground
-        bit = np.uint64(1) << np.floor(height[tall] / _LAYER_M).astype(np.uint64)
-        at = ((points[tall, 1] - y0) / _CELL_M).astype(np.int64), ((points[tall, 0] - x0) / _CELL_M).astype(np.int64)
-        np.bitwise_or.at(words, at, bit)
-    low = ndimage.binary_dilation((words & np.uint64(0b11)) != 0)
-    r, c = np.nonzero(np.isfinite(ground_z) & ~low)
-    chosen = (r % _STEP_CELLS == 0) & (c % _STEP_CELLS == 0)
-    return _Layout(x0, y0, ground_z, words, _dilated(words), r[chosen], c[chosen])
-
-
-def _dilated(words: U64) -> U64:
-    """Every column with those of its eight neighbours, and one layer up and down."""
-    wide = words | (words << np.uint64(1)) | (words >> np.uint64(1))
-    out = wide.copy()
-    out[1:] |= wide[:-1]
-    out[:-1] |= wide[1:]
-    rows = out.copy()
-    out[:, 1:] |= rows[:, :-1]
-    out[:, :-1] |= rows[:, 1:]
-    return out
-
-
-@numba.njit(cache=True, nogil=True)
-def _correlate(words: U64, rows: I64, cols: I64, xy: F64, bits: I64, yaws: F64, hopeless: int, first: int) -> U8:
-    """(places, headings) how many of the points (n <= 255) meet something of their height there; 0 where hopeless."""
-    out = np.zeros((len(rows), len(yaws)), dtype=np.uint8)
-    dr, dc = np.empty(len(xy), dtype=np.int64), np.empty(len(xy), dtype=np.int64)
-    height, width = words.shape
-    for a in range(len(yaws)):
-        c, s = np.cos(yaws[a]), np.sin(yaws[a])
-        for i in range(len(xy)):
-            dr[i] = np.int64(np.floor(s * xy[i, 0] + c * xy[i, 1] + 0.5))
-            dc[i] = np.int64(np.floor(c * xy[i, 0] - s * xy[i, 1] + 0.5))
-        for p in range(len(rows)):
-            hits = np.int64(0)
-            for i in range(len(xy)):
-                if i == first and hits <= hopeless:
-                    hits = np.int64(0)
-                    break
-                r, k = rows[p] + dr[i], cols[p] + dc[i]
-                if 0 <= r < height and 0 <= k < width:
-                    hits += np.int64((words[r, k] >> np.uint64(bits[i])) & np.uint64(1))
-            out[p, a] = hits
-    return out
-
-
-@numba.njit(cache=True, nogil=True)
-def _apart(x: F64, y: F64, yaw: F64, most: int, spread_m: float, spread_rad: float) -> I64:
-    """Indices of the first ``most`` that lie apart from all chosen before."""
-    chosen = np.empty(most, dtype=np.int64)
-    n = 0
-    for i in range(len(x)):
-        fresh = True
-        for k in range(n):
-            j = chosen[k]
-            turn = abs(np.arctan2(np.sin(yaw[i] - yaw[j]), np.cos(yaw[i] - yaw[j])))
-            if (x[i] - x[j]) ** 2 + (y[i] - y[j]) ** 2 < spread_m**2 and turn < spread_rad:
-                fresh = False
-                break
-        if fresh:
-            chosen[n] = i
-            n += 1
-            if n == most:
-                break
-    return chosen[:n]
-
-
-@numba.njit(cache=True, nogil=True)
-def _sharpened(words: U64, x: float, y: float, yaw: float, xy: F64, bits: I64) -> tuple[float, float, float, float]:
-    """(share, x, y, yaw) of the best place and heading around one, on single cells; x and y in cells."""
-    best, at = -1.0, (x, y, yaw)
-    height, width = words.shape
-    for da in range(-3, 4):
-        a = yaw + np.radians(0.75) * da
-        c, s = np.cos(a), np.sin(a)
-        for dx in range(-4, 5):
-            for dy in range(-4, 5):
-                px, py, hits = x + 0.5 * dx, y + 0.5 * dy, np.int64(0)
-                for i in range(len(xy)):
-                    r = np.int64(np.floor(py + s * xy[i, 0] + c * xy[i, 1]))
-                    k = np.int64(np.floor(px + c * xy[i, 0] - s * xy[i, 1]))
-                    if 0 <= r < height and 0 <= k < width:
-                        column = words[r, k] | (words[r, k] << np.uint64(1)) | (words[r, k] >> np.uint64(1))
-                        hits += np.int64((column >> np.uint64(bits[i])) & np.uint64(1))
-                if hits > best:
-                    best, at = float(hits), (px, py, a)
-    return best / len(xy), at[0], at[1], at[2]
