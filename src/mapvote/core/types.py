@@ -34,15 +34,18 @@ class MapvoteError(Exception):
 
 def check_array(array: Any, name: str, shape: tuple[int | None, ...], dtype: DTypeLike, finite: bool = True) -> None:
     """MapvoteError unless ``array`` has this dtype and shape (None: any length) and, if ``finite``, no NaN or inf."""
-    wanted = f"{name}: expected {np.dtype(dtype)} ({', '.join('n' if side is None else str(side) for side in shape)})"
     if not isinstance(array, np.ndarray):
-        raise MapvoteError(f"{wanted}, got a {type(array).__name__}")
+        raise MapvoteError(f"{_wanted(name, shape, dtype)}, got a {type(array).__name__}")
     like = tuple(is_ if side is None else side for is_, side in zip(array.shape, shape, strict=False))
     if array.dtype != dtype or array.ndim != len(shape) or array.shape != like:
-        raise MapvoteError(f"{wanted}, got {array.dtype} {array.shape}")
+        raise MapvoteError(f"{_wanted(name, shape, dtype)}, got {array.dtype} {array.shape}")
     if finite and not np.isfinite(array).all():
         bad = np.argwhere(~np.isfinite(array))
         raise MapvoteError(f"{name}: {len(bad)} numbers are not finite, the first at {bad[0].tolist()}; leave them out")
+
+
+def _wanted(name: str, shape: tuple[int | None, ...], dtype: DTypeLike) -> str:
+    return f"{name}: expected {np.dtype(dtype)} ({', '.join('n' if side is None else str(side) for side in shape)})"
 
 
 class CellState(IntEnum):

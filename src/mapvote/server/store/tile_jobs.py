@@ -220,16 +220,13 @@ def pack_states(states: U8) -> bytes:
 
 def pack_tally(tally: NDArray[Any]) -> bytes:
     """(256, 256, 5) as a zstd frame of little-endian planes, class by class, which packs four times better than cell
-    by cell: uint16 if it comes so, else int32; but of unsigned numbers uint8, if these are whole votes and no more than
-    that holds. The length tells which."""
+    by cell: int32, or of unsigned numbers, which are whole votes, these as uint8; as they are if that holds too little.
+    The length tells which."""
     planes = np.moveaxis(tally, -1, 0)
     if planes.dtype == np.int32:
         return compress(raw_plane(planes, "<i4"), 1)
-    unit = planes.dtype.type(VOTE_UNIT)
-    votes = planes // unit
-    if votes.max() <= _BYTE_MAX and np.array_equal(votes * unit, planes):
-        return compress(raw_plane(votes, "|u1"), 1)
-    return compress(raw_plane(planes, "<u2"), 1)
+    votes = planes // planes.dtype.type(VOTE_UNIT)
+    return compress(raw_plane(votes, "|u1") if votes.max() <= _BYTE_MAX else raw_plane(planes, "<u2"), 1)
 
 
 def unpack_tally_plane(data: bytes) -> I32:
