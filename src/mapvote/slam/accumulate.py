@@ -18,7 +18,6 @@ from dataclasses import replace
 
 import numba
 import numpy as np
-from scipy import ndimage
 
 from mapvote.config import Settings
 from mapvote.core.columns import TOP_BIT, shifted
@@ -146,9 +145,11 @@ def _standing(points: F64, ground: PointMap) -> Bool:
 def _beneath(scan: PlacedScan, moving: Bool) -> Bool:
     """Points (n,) too low to be obstacles, in or next to cells where something moves: wheels and bumpers, not road."""
     inside = scan.cell >= 0
-    cells = np.zeros(scan.reference.grid.shape, dtype=np.bool_)
-    cells.ravel()[scan.cell[moving & inside]] = True
-    cells = ndimage.binary_dilation(cells, np.ones((3, 3)))
+    rows, cols = scan.reference.grid.shape
+    cells = np.zeros((rows, cols), dtype=np.bool_)
+    r, c = np.divmod(np.unique(scan.cell[moving & inside]), cols)
+    for beside in range(9):  # few cells: a dilation of the whole window takes a tenth of a scan's time
+        cells[np.clip(r + beside // 3 - 1, 0, rows - 1), np.clip(c + beside % 3 - 1, 0, cols - 1)] = True
     low = np.zeros(len(moving), dtype=np.bool_)
     near = np.flatnonzero(inside)
     near = near[cells.ravel()[scan.cell[near]]]
