@@ -141,7 +141,9 @@ WRITERS = {
 }
 
 
-@pytest.mark.parametrize("what", WRITERS)
+@pytest.mark.parametrize(
+    "what", [pytest.param(w, marks=() if w in ("map", "the disk's own time") else (pytest.mark.slow,)) for w in WRITERS]
+)
 def test_ctrl_c_while_writing_leaves_what_was_there_and_no_litter(what: str, made: Path, desk: Desk) -> None:
     line, patch = WRITERS[what]
     words = line.split()
