@@ -60,7 +60,7 @@ async def publishing_now(request: Request) -> dict[str, Any]:
 
 @router.delete("/v1/publish", responses=problems(403, 404), summary="Cancel what is being published")
 async def cancel_publishing(request: Request) -> dict[str, int]:
-    """Every publish under way ends before its next tile with 409, and nothing of it is published."""
+    """Every publish under way ends before its next tiles with 409, and nothing of it is published."""
     return {"cancelled": services(request).publishing.cancel(operator(request))}
 
 

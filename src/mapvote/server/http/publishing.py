@@ -55,7 +55,7 @@ class Publishing:
             return list(self._rounds)
 
     def cancel(self, by: str) -> int:
-        """Stop every publish under way before its next tile; how many. What only looks goes on. NotFound if none is."""
+        """Stop every publish under way before its next tiles; how many. What only looks goes on. NotFound if none."""
         stopped = [one for one in self.now() if not one.dry_run]
         if not stopped:
             raise NotFound("nothing is being published")
