@@ -21,7 +21,7 @@ TALL_M = 4.0
 
 
 @numba.njit(cache=True, nogil=True)
-def crossings(planes: U64, occupied: U64, hit_rays: int) -> I32:
+def often_crossed(planes: U64, occupied: U64, hit_rays: int) -> I32:
     """(rows, cols) how often the mapped voxels of each cell were crossed, beyond ``hit_rays`` for each time they were
     met, from counters (rows, cols, WORDS) and the map's words."""
     out = np.zeros(occupied.shape, dtype=np.int32)

@@ -25,7 +25,7 @@ from mapvote.core.reference import bordered
 from mapvote.core.types import F32, I32, NO_VOTE, U8, U64, Bool, CellState, Reference
 from mapvote.core.voting import one_hot
 from mapvote.detection.counters import PLANES, count_of, ever, newly_free
-from mapvote.detection.faint_walls import crossings, faintly_gone
+from mapvote.detection.faint_walls import faintly_gone, often_crossed
 from mapvote.detection.lone_points import lone_cells, no_change
 from mapvote.detection.regions import HALO, JOIN_CELLS, beyond_tiles, fallen, unexplained
 from mapvote.detection.surface_counts import CROSSED, MET, PASSED, SurfaceEvidence
@@ -187,7 +187,7 @@ class SurfaceVoter:
             beyond=beyond,
             beside=(new != 0) & (new & ~near == 0),
             crossed=mapped & ~low & (stands == 0) & ((gone | never_met) != 0),
-            crossings=crossings(planes, here.occupied, HIT_RAYS),
+            crossings=often_crossed(planes, here.occupied, HIT_RAYS),
             adrift=mapped & ~low & (gone | stands == 0) & (under != 0) & clear,
             lone=lone_cells(outer.occupied, outer.base)[1:-1, 1:-1],
             states=states,
