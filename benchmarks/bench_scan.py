@@ -35,7 +35,8 @@ def timed(drive: Drive, point_map: PointMap, settings: Settings) -> DriveReport:
 
 def table(report: DriveReport, points: float) -> str:
     """Median and 95th percentile by stage, and of the whole."""
-    whole = np.sum([report.stage_s[stage] for stage in STAGES], axis=0)
+    scans = min(len(report.stage_s[stage]) for stage in STAGES)  # lost ones end early, and the drive's end is one more
+    whole = np.sum([report.stage_s[stage][:scans] for stage in STAGES], axis=0)
     rows = [(stage, np.array(report.stage_s[stage])) for stage in STAGES] + [("whole scan", whole)]
     lines = [f"{len(whole)} scans of {points:.0f} points, ms      median    95 %"]
     lines += [f"  {n:<36}{1e3 * np.median(s):>8.2f}{1e3 * np.percentile(s, 95):>8.2f}" for n, s in rows]
