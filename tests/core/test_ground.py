@@ -7,8 +7,9 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from mapvote.core.grid import CELL_SIZE, Grid, Lattice
+from mapvote.core.grid import CELL_SIZE, CELLS, Grid, Lattice
 from mapvote.core.ground import base_layers
+from mapvote.core.ground_growing import UNREACHED, _bounds, tiles_around
 from mapvote.core.point_map import map_from_points
 from mapvote.core.reference import reference_window
 from mapvote.core.types import F32, F64
@@ -88,6 +89,25 @@ def test_a_ramp_down_beside_a_retaining_wall_does_not_pull_the_street_down() -> 
     assert np.abs(ground[:32]).max() < 0.05
     x = 0.3 * (np.arange(100) + 0.5)
     assert np.abs(ground[36:] + 0.1 * x[None, :]).max() < 0.2
+
+
+def test_a_point_may_lie_as_far_off_the_ground_beside_it_as_slopes_and_noise_allow() -> None:
+    ground, gap = np.zeros(CELLS, np.float32), np.full(CELLS, UNREACHED, np.uint8)
+    gap[0], gap[2] = 0, 0
+    ground[2] = 0.02
+    low, steep, high = _bounds(256, ground, gap, tiles_around([(0, 0)]))  # a row up: 0.3 m from one, 0.67 m from two
+    assert low == pytest.approx(-0.15 * 0.3 - 0.06)
+    assert steep == pytest.approx(-0.5 * 0.3 - 0.06)
+    assert high == pytest.approx(0.15 * 0.3 + 0.06)
+
+
+def test_tiles_know_those_around_them() -> None:
+    around = tiles_around([(0, 0), (0, 1), (-1, 0)])
+    assert around.tolist() == [
+        [[-1, 2, -1], [-1, 0, 1], [-1, -1, -1]],
+        [[2, -1, -1], [0, 1, -1], [-1, -1, -1]],
+        [[-1, -1, -1], [-1, 2, -1], [-1, 0, 1]],
+    ]
 
 
 def _bridge(rng: np.random.Generator) -> F64:

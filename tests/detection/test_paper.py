@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import assume, given
+from hypothesis import assume, example, given
 from hypothesis import strategies as st
 
 from hand_made import make_map, make_tile, wall
@@ -14,12 +14,13 @@ from mapvote.config import PaperSettings, VotingSettings
 from mapvote.core.columns import below_top, span_of
 from mapvote.core.geometry import from_xyz_rpy
 from mapvote.core.grid import CELL_SIZE, Grid, Lattice, window_around
+from mapvote.core.point_map import PointMap
 from mapvote.core.reference import reference_window
 from mapvote.core.sensors import SENSORS
 from mapvote.core.types import NO_VOTE, U64, CellState, Reference
 from mapvote.core.voting import VOTE_UNIT, vote_weight
 from mapvote.detection.paper import PaperVoter, classify_paper, reading_table
-from mapvote.detection.sightings import BEGINS_ABOVE, WORDS, encode, votes_in
+from mapvote.detection.sightings import BEGINS_ABOVE, WORDS, encode, sightings, votes_in
 from mapvote.perception.frontend import Observation, PlacedScan
 from mapvote.perception.raycast import ScanView, Sight, cast_rays, find_obstacles
 
@@ -122,6 +123,7 @@ def test_case_5_knows_how_the_sensor_leans() -> None:
     st.tuples(st.floats(-0.2, 0.2), st.floats(-0.2, 0.2)),
     st.floats(0.5, 9.0),
 )
+@example((0.0, 0.0, 0.0), (0.0, 0.0), 0.695)  # 0.2 deg below the view's upper end
 def test_a_map_begins_above_the_view_where_plain_trigonometry_says(
     origin: tuple[float, float, float], lean: tuple[float, float], bottom_z: float
 ) -> None:
@@ -200,8 +202,8 @@ def test_whatever_is_read_n_min_points_make_a_cell_occupied_and_the_map_says_cha
     assert weights[n >= n_min].min() == 2 * VOTE_UNIT
 
 
-def seen_twice() -> tuple[PaperVoter, U64]:
-    """Two scans of a street over two tiles: a wall of the map is struck eight times, and so is a new thing."""
+def observed() -> tuple[PointMap, Observation]:
+    """A scan of a street over two tiles: a wall of the map is struck eight times, and so is a new thing."""
     tiles = {(0, 0): make_tile(wall([(10, 250)], [0.75, 1.05])), (0, 1): make_tile(wall([], []), index=(0, 1))}
     point_map = make_map(tiles)
     origin = np.array([254.5, 20.5, 6.0]) * CELL_SIZE
@@ -214,9 +216,25 @@ def seen_twice() -> tuple[PaperVoter, U64]:
     view = cast_rays(points, origin, obstacle, moving, reference)
     up = np.array([0.0, 0.0, 1.0])
     placed = PlacedScan(0, points, origin, up, 0.01, reference, reference, obstacle, cell)
+    return point_map, Observation(placed, moving, view, reference)
+
+
+def test_nothing_is_said_of_cells_outside_the_square_that_votes() -> None:
+    _, seen = observed()
+    asked = PaperSettings(window_m=6.0)
+    words = sightings(seen, SENSOR, 5, asked)
+    inside = votes_in(seen.view.grid, seen.scan.origin_map, asked.window_m)
+    assert words[inside].any()
+    assert not words[~inside].any()
+    assert sightings(seen, SENSOR, 5)[~inside].any()
+
+
+def seen_twice() -> tuple[PaperVoter, U64]:
+    """Two scans of it."""
+    point_map, seen = observed()
     voter = PaperVoter(VotingSettings(), PaperSettings(), SENSOR, point_map)
     for _ in range(2):
-        may_be_new = voter.observe(Observation(placed, moving, view, reference))
+        may_be_new = voter.observe(seen)
     return voter, may_be_new
 
 

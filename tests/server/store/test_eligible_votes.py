@@ -33,6 +33,7 @@ from mapvote.server.store.eligible_votes import (
 )
 from mapvote.server.store.policy import Policy, RoundPolicy, set_policy
 from mapvote.server.store.quarantine import ballot_name
+from mapvote.server.store.queries import Version
 from mapvote.server.store.store import Store
 from mapvote.server.store.stored_votes import read_votes
 from standing_clock import Clock
@@ -167,6 +168,12 @@ def test_a_ballot_waits_for_its_minimum_age(store: Store, clock: Clock) -> None:
     assert judged(store, asked(store, received_by_ns=received)) == {"a": ""}
 
 
+def test_a_version_is_asked_of_again_with_the_minimum_age_that_it_had(store: Store) -> None:
+    policy = {"fuse": {"min_age_s": 90.0}}
+    version = Version(2, 1, "publish", None, NOW_S * 10**9, "anna", "", 7, policy)
+    assert Electorate.of(version).received_by_ns == (NOW_S - 90) * 10**9
+
+
 def test_ballots_cast_by_other_methods_or_settings_than_the_policy_asks_for_do_not_count(store: Store) -> None:
     cast(store, "a")
     cast(store, "b", method="paper")
@@ -225,6 +232,8 @@ def test_what_reviewers_hold_is_silent_for_all_until_they_let_go(store: Store) -
     assert [spoken(vote) for vote in counting(store, asked(store))] == [[OTHER], [OTHER]]
     reviews.undo(store, seq, by="anna")
     assert [spoken(vote) for vote in counting(store, asked(store))] == [[CELL, OTHER]] * 2
+    at_once = counting(store, asked(store, mark=last + 1))
+    assert [spoken(vote) for vote in at_once] == [[CELL, OTHER]] * 2, "from the moment of letting go"
     held_then = counting(store, asked(store, mark=last))
     assert [spoken(vote) for vote in held_then] == [[OTHER], [OTHER]], "as of then it was held"
 
