@@ -2,11 +2,20 @@
 
 from __future__ import annotations
 
+import signal
 import sys
+import threading
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from sys import UnraisableHookArgs
+
+_SOON_S = 0.05
 
 
 def main() -> None:
     """Run the command line. Ctrl-C ends it with one line and exit code 130, also while it still imports."""
+    sys.unraisablehook = _interrupt_again
     try:
         from mapvote.cli import run
 
@@ -14,6 +23,17 @@ def main() -> None:
     except KeyboardInterrupt:
         print("mapvote: interrupted", file=sys.stderr)
         sys.exit(130)
+
+
+def _interrupt_again(lost: UnraisableHookArgs) -> None:
+    """Python drops what is raised while it takes an object away: a Ctrl-C that comes just then is sent once more."""
+    if issubclass(lost.exc_type, KeyboardInterrupt):
+        main_thread = threading.main_thread().ident or 0
+        again = threading.Timer(_SOON_S, signal.pthread_kill, (main_thread, signal.SIGINT))  # here it would be lost too
+        again.daemon = True
+        again.start()
+    else:
+        sys.__unraisablehook__(lost)
 
 
 if __name__ == "__main__":

@@ -198,6 +198,22 @@ def test_ctrl_c_while_the_program_still_imports_is_one_line(tmp_path: Path) -> N
     assert stopped_by_a_line(done)
 
 
+def test_a_ctrl_c_that_comes_while_an_object_is_taken_away_is_not_lost(tmp_path: Path) -> None:
+    """There Python drops whatever is raised: a server that had just started went on for ever."""
+    code = (
+        "import os, signal, time, weakref\nimport mapvote.cli as cli\nfrom mapvote.__main__ import main\n"
+        "class Thing: pass\n"
+        "def run():\n"
+        "    thing = Thing()\n"
+        "    watch = weakref.ref(thing, lambda _: (os.kill(os.getpid(), signal.SIGINT), time.sleep(0.1)))\n"
+        "    del thing\n"
+        "    time.sleep(60)\n"
+        "cli.run = run\nmain()"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=30, check=False)
+    assert stopped_by_a_line(done)
+
+
 def test_a_server_started_as_the_help_says_ends_on_ctrl_c(desk: Desk) -> None:
     here = desk("my_map")
     words = ["serve", "fleet.db", "--map", "my_map", "--port", "0"]
