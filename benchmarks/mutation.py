@@ -41,7 +41,9 @@ from numba_caches import link_others  # noqa: E402
 
 TESTS = {
     "core/voting.py": ["core/test_voting.py", "core/test_voting_model.py", "fusion/test_fuse.py"],
-    "fusion/fuse.py": ["fusion/test_fuse.py", "fusion/test_outliers.py"],
+    "fusion/fuse.py": [
+        *(f"fusion/test_{n}.py" for n in ("fuse", "outliers", "turning", "last_word", "persistence", "copies"))
+    ],
     "fusion/tile_vote.py": ["fusion/test_tile_vote.py", "fusion/test_fuse.py"],
     "fusion/edit.py": ["fusion/test_edit.py", "fusion/test_fuse.py"],
     "fusion/outliers.py": ["fusion/test_outliers.py"],
@@ -58,7 +60,7 @@ TESTS = {
     "detection/sightings.py": ["detection/test_paper.py"],
     "detection/surfaces.py": ["detection/test_surfaces.py"],
     "perception/moving_kernels.py": ["perception/test_moving_objects.py"],
-    "perception/fans.py": ["perception/test_raycast.py"],
+    "perception/fans.py": ["perception/test_fans.py", "perception/test_raycast.py"],
     "perception/raycast.py": ["perception/test_raycast.py"],
     "core/ground_growing.py": ["core/test_ground.py"],
     "slam/strays.py": ["slam/test_strays.py"],

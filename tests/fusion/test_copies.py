@@ -123,6 +123,16 @@ def test_little_says_nothing() -> None:
     assert copied(named({"a": few, "b": few, "c": few})) == {}
 
 
+@pytest.mark.parametrize(("rows", "cols", "changed", "judged"), [(103, 97, 200, True), (106, 93, 199, False)])
+def test_masks_are_judged_from_200_cells_on_that_three_cells_change(
+    rows: int, cols: int, changed: int, judged: bool
+) -> None:
+    square = np.full(SHAPE, NO_VOTE, dtype=np.uint8)
+    square[100 : 100 + rows, 100 : 100 + cols] = UE
+    assert difference(square, square) == (0, changed)
+    assert copied(named({"a": square, "b": square})) == ({"b": "a"} if judged else {})
+
+
 def test_where_one_vehicle_may_change_the_map_and_where_it_is_not_asked_nobody_is_judged() -> None:
     votes = named({"a": drive_along(1), "b": drive_along(1)})
     assert copied(votes) == {"b": "a"}

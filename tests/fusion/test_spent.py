@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from hand_made import SHAPE, make_tile, states_plane, wall, words_plane
@@ -96,6 +96,22 @@ def test_the_last_bit_of_any_coordinate_is_a_difference(axis: int, cell: tuple[i
     mine = [i for i, p in enumerate(points) if (int(p[1] / CELL_SIZE), int(p[0] / CELL_SIZE)) == cell]
     points[mine[0], axis] = np.nextafter(points[mine[0], axis], np.float32(np.inf))
     assert cells_of(differing(TILE, make_tile(points))) == [list(cell)]
+
+
+Point = tuple[float, float, float]
+POINTS = st.lists(st.tuples(*map(st.sampled_from, ([0.1, 0.4], [0.1, 0.2, 0.4], [0.1, 0.2]))), max_size=4)
+
+
+@given(POINTS, POINTS)
+@settings(max_examples=60, deadline=None)
+@example([(0.1, 0.1, 0.2)], [(0.1, 0.2, 0.2)])
+def test_cells_differ_that_hold_other_points_whatever_coordinates_these_share(a: list[Point], b: list[Point]) -> None:
+    def of_cell(points: list[Point], r: int, c: int) -> list[Point]:
+        return [p for p in points if (p[1] >= CELL_SIZE, p[0] >= CELL_SIZE) == (r, c)]
+
+    one, other = (make_tile(np.array(points, np.float32).reshape(-1, 3)) for points in (a, b))
+    cells = [[r, c] for r in (0, 1) for c in (0, 1) if of_cell(a, r, c) != of_cell(b, r, c)]
+    assert cells_of(differing(one, other)) == cells
 
 
 def test_points_that_swap_their_heights_are_other_points() -> None:
