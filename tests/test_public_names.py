@@ -23,3 +23,12 @@ def test_dir_lists_the_public_names_and_nothing_else() -> None:
 def test_importing_the_package_loads_nothing_heavy() -> None:
     code = "import sys, mapvote; print('numba' in sys.modules, 'numpy' in sys.modules)"
     assert subprocess.check_output([sys.executable, "-c", code], text=True).split() == ["False", "False"]
+
+
+def test_a_client_and_a_server_start_without_the_parts_of_scipy_that_few_requests_need() -> None:
+    """They would be a fifth of their start. ``import scipy`` loads a part when it is first asked for."""
+    for room in ("mapvote.client", "mapvote.server.http.serve"):
+        code = (
+            f"import sys, {room}; print([n for n in ('spatial', 'sparse', 'special') if f'scipy.{{n}}' in sys.modules])"
+        )
+        assert subprocess.check_output([sys.executable, "-c", code], text=True).strip() == "[]", room

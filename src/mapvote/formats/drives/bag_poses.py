@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
+import scipy
 
 from mapvote.core import geometry
 from mapvote.core.types import F64, MapvoteError
@@ -105,6 +105,6 @@ def _stamp_ns(message: Any) -> int:
 
 def _matrix(p: Any, q: Any) -> F64:
     T = np.eye(4)
-    T[:3, :3] = Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix()
+    T[:3, :3] = scipy.spatial.transform.Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix()
     T[:3, 3] = p.x, p.y, p.z
     return T

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
+from mapvote.core.geometry import from_xyz_rpy
 from mapvote.core.types import F64, Drive, MapvoteError
 from mapvote.formats.clean import log
 from mapvote.formats.drives.options import DriveOptions, read_drive_file
@@ -16,10 +17,8 @@ from mapvote.formats.drives.trajectory import Trajectory, read_trajectory
 from mapvote.formats.maps.pcd import read_pcd_table
 
 _FOLDERS = ("raw_format/ouster_scan", "ouster_scan")
-T_BASE_LIDAR = np.eye(4)
+T_BASE_LIDAR = from_xyz_rpy(-0.084, -0.025, 0.050, yaw=2.0 * math.atan2(0.924, 0.383))
 """The camera that carries the poses to the Ouster (Ramezani et al. 2020)."""
-T_BASE_LIDAR[:3, :3] = Rotation.from_quat([0.0, 0.0, 0.924, 0.383]).as_matrix()
-T_BASE_LIDAR[:3, 3] = -0.084, -0.025, 0.050
 
 
 def _scans(path: Path) -> Path | None:

@@ -11,8 +11,8 @@ from typing import Any
 
 import msgspec
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from mapvote.core.types import F64, Drive, MapvoteError
 from mapvote.formats.clean import log
@@ -23,7 +23,7 @@ from mapvote.formats.drives.scan_folder import ScanFolder, open_scan_folder
 from mapvote.formats.drives.trajectory import Trajectory
 
 _FOLDERS = ("samples/LIDAR_TOP", "sweeps/LIDAR_TOP")
-_FORWARD = Rotation.from_euler("z", 90, degrees=True).as_matrix()
+_FORWARD = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 """R_nuscenes_lidar: their y is our x."""
 Table = dict[str, dict[str, Any]]
 
@@ -101,6 +101,6 @@ def _read(file: Path) -> Table:
 
 def _pose(row: dict[str, Any]) -> F64:
     T = np.eye(4)
-    T[:3, :3] = Rotation.from_quat(row["rotation"], scalar_first=True).as_matrix()
+    T[:3, :3] = scipy.spatial.transform.Rotation.from_quat(row["rotation"], scalar_first=True).as_matrix()
     T[:3, 3] = row["translation"]
     return T

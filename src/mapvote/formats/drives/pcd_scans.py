@@ -9,8 +9,8 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from mapvote.core import geometry
 from mapvote.core.types import F64, Drive
@@ -68,7 +68,7 @@ def _viewpoints(files: list[Path]) -> F64 | None:
         return None
     T = np.tile(np.eye(4), (len(rows), 1, 1))
     T[:, :3, 3] = rows[:, :3]
-    T[:, :3, :3] = Rotation.from_quat(rows[:, 3:], scalar_first=True).as_matrix()
+    T[:, :3, :3] = scipy.spatial.transform.Rotation.from_quat(rows[:, 3:], scalar_first=True).as_matrix()
     check_rigid(T, f"{files[0].parent} (VIEWPOINT)")
     return T
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation
+import scipy
 
 from mapvote.core import geometry
 from mapvote.core.types import F64, I64, MapvoteError
@@ -136,7 +136,7 @@ def _of_quaternions(rows: F64) -> F64:
     norms = np.linalg.norm(rows[:, 3:], axis=1)
     if len(rows) and not (np.abs(norms - 1.0) < 0.05).all():
         raise MapvoteError(f"row {int(np.argmax(np.abs(norms - 1.0)))} of the trajectory has no unit quaternion")
-    T[:, :3, :3] = Rotation.from_quat(rows[:, 3:]).as_matrix() if len(rows) else T[:, :3, :3]
+    T[:, :3, :3] = scipy.spatial.transform.Rotation.from_quat(rows[:, 3:]).as_matrix() if len(rows) else T[:, :3, :3]
     T[:, :3, 3] = rows[:, :3]
     return T
 

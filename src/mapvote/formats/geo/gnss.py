@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 
 import numpy as np
-from scipy.spatial.transform import Rotation
+import scipy
 
 from mapvote.core.types import F64, MapvoteError
 from mapvote.formats.geo.frame import MapFrame, enu_frame
@@ -33,7 +33,7 @@ def poses_from_gnss(lonlat: F64, rpy: F64, frame: MapFrame | None) -> tuple[F64,
         frame = enu_frame(lat, lon, height)
     T = np.tile(np.eye(4), (len(lonlat), 1, 1))
     T[:, :3, 3] = frame.from_lonlat(lonlat)
-    R_enu_base = Rotation.from_euler("ZYX", rpy[:, ::-1]).as_matrix()
+    R_enu_base = scipy.spatial.transform.Rotation.from_euler("ZYX", rpy[:, ::-1]).as_matrix()
     T[:, :3, :3] = frame.axes_at(lonlat) @ R_enu_base
     return T, frame
 
@@ -47,5 +47,5 @@ def yaw_from_track(T: F64) -> F64:
         return out
     nearest = moving[np.clip(np.searchsorted(moving, np.arange(len(T)), side="right") - 1, 0, len(moving) - 1)]
     yaw = np.arctan2(ahead[nearest, 1], ahead[nearest, 0])
-    out[:, :3, :3] = Rotation.from_euler("z", yaw[:, None]).as_matrix()
+    out[:, :3, :3] = scipy.spatial.transform.Rotation.from_euler("z", yaw[:, None]).as_matrix()
     return out

@@ -7,7 +7,7 @@ buildings, although their fronts, a cell thick or two, touch across it.
 from __future__ import annotations
 
 import numpy as np
-from scipy import ndimage
+import scipy
 
 from mapvote.core.types import F64, I32, I64, Bool
 from mapvote.server.insight.polygons import Pieces, pieces
@@ -62,7 +62,7 @@ def _beyond_cut(rows: I64, cols: I64) -> Bool | None:
     r, c = rows - rows.min() + margin, cols - cols.min() + margin
     image = np.zeros((r.max() + margin + 1, c.max() + margin + 1), dtype=np.bool_)
     image[r, c] = True
-    slots, count = ndimage.label(ndimage.binary_closing(image, _DISK) & ~image, np.ones((3, 3)))
+    slots, count = scipy.ndimage.label(scipy.ndimage.binary_closing(image, _DISK) & ~image, np.ones((3, 3)))
     at = np.stack([r, c], axis=1).astype(np.float64)
     best: tuple[float, Bool] | None = None
     for k in range(1, count + 1):

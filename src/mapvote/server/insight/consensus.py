@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from scipy.special import betainc
+import scipy
 
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Lattice, TileIndex
 from mapvote.core.types import I64, U8, CellState
@@ -157,7 +157,7 @@ def _tail(mine: int, others: int, my_exposure: float, others_exposure: float) ->
     if mine == 0 or others_exposure == 0:
         return 1.0
     share = my_exposure / (my_exposure + others_exposure)
-    return float(betainc(mine, others + 1, share))
+    return float(scipy.special.betainc(mine, others + 1, share))
 
 
 def _objects(entries: Sequence[Compared], lattice: Lattice, min_cells: int) -> tuple[Contradiction, ...]:

@@ -12,9 +12,8 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
+import scipy
 import structlog
-from scipy.spatial import cKDTree
-from scipy.special import stdtrit
 
 from mapvote.config import GateSettings, NdtSettings
 from mapvote.core.geometry import from_xyz_rpy
@@ -152,7 +151,7 @@ def scans_near(old: PointMap, new: PointMap, T_map_lidar_prior: F64, reach_m: fl
     if not len(rows):
         return np.zeros(0, dtype=np.int64)
     middles = np.stack([cols + 0.5, rows + 0.5], axis=1) * CELL_SIZE + np.array([old.lattice.x0, old.lattice.y0])
-    distance, _ = cKDTree(middles).query(T_map_lidar_prior[:, :2, 3], distance_upper_bound=reach_m)
+    distance, _ = scipy.spatial.cKDTree(middles).query(T_map_lidar_prior[:, :2, 3], distance_upper_bound=reach_m)
     return np.flatnonzero(np.isfinite(distance))
 
 
@@ -187,7 +186,7 @@ def compare(pairs: Sequence[tuple[Localised, Localised]], settings: GateSettings
         olds, news = (np.array([getattr(pair[side], field) for pair in pairs]) for side in (0, 1))
         blocks = np.array([b.mean() for b in np.array_split(sign * (news - olds), len(pairs) // BLOCK_SCANS)])
         spread = float(blocks.std(ddof=1)) / np.sqrt(len(blocks))
-        uncertainty = float(stdtrit(len(blocks) - 1, 0.95)) * spread
+        uncertainty = float(scipy.special.stdtrit(len(blocks) - 1, 0.95)) * spread
         gain = float(sign * (news.mean() - olds.mean()))
         out.append(Measure(name, float(olds.mean()), float(news.mean()), gain, float(uncertainty), tolerance))
     return tuple(out)

@@ -6,8 +6,7 @@ from dataclasses import dataclass
 
 import numba
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
+import scipy
 
 from mapvote.core.types import I32, I64
 
@@ -89,8 +88,8 @@ def _pairs(key: I64, kinds: I64, rows: I64, cols: I64) -> tuple[I64, I64]:
 def _labels(pairs: list[tuple[I64, I64]], n: int) -> I32:
     i = np.concatenate([a for a, _ in pairs])
     j = np.concatenate([b for _, b in pairs])
-    graph = coo_array((np.ones(len(i), dtype=np.int8), (i, j)), shape=(n, n))
-    _, found = connected_components(graph, directed=False)
+    graph = scipy.sparse.coo_array((np.ones(len(i), dtype=np.int8), (i, j)), shape=(n, n))
+    _, found = scipy.sparse.csgraph.connected_components(graph, directed=False)
     _, first, label = np.unique(found, return_index=True, return_inverse=True)
     rank = np.empty(len(first), dtype=np.int32)
     rank[np.argsort(first)] = np.arange(len(first), dtype=np.int32)

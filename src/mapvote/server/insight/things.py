@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.spatial import ConvexHull
+import scipy
 
 from mapvote.core.grid import CELL_SIZE
 from mapvote.core.types import F64, I32, I64
@@ -49,7 +49,7 @@ def group(rows: I64, cols: I64, kinds: I64, pieces: I32, reach_m: float = REACH_
             owner[piece] = min(fits)[1]
         else:
             leaders[int(kind[piece])].append(piece)
-            hulls[piece] = ConvexHull(corners[piece]).equations
+            hulls[piece] = scipy.spatial.ConvexHull(corners[piece]).equations
     return _in_order(owner[pieces])
 
 
@@ -61,7 +61,7 @@ def widths_m(rows: I64, cols: I64, pieces: I32) -> F64:
 
 
 def _width(corners: F64) -> float:
-    across = corners @ ConvexHull(corners).equations[:, :2].T
+    across = corners @ scipy.spatial.ConvexHull(corners).equations[:, :2].T
     return float(np.ptp(across, axis=0).min())
 
 

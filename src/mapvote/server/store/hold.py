@@ -8,8 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
+import scipy
 
 from mapvote.codec.ballot import tile_key
 from mapvote.config import FuseSettings
@@ -60,6 +59,6 @@ def areas_m2(rows: I64, cols: I64) -> np.ndarray:
         touching = np.flatnonzero(ordered[near] == keys + step)
         pairs.append(np.stack([touching, order[near[touching]]]))
     a, b = np.concatenate(pairs, axis=1)
-    links = coo_array((np.ones(len(a), dtype=np.int8), (a, b)), shape=(len(keys), len(keys)))
-    labels = connected_components(links, directed=False)[1]
+    links = scipy.sparse.coo_array((np.ones(len(a), dtype=np.int8), (a, b)), shape=(len(keys), len(keys)))
+    labels = scipy.sparse.csgraph.connected_components(links, directed=False)[1]
     return np.bincount(labels) * CELL_SIZE**2
