@@ -8,7 +8,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -20,6 +20,14 @@ from mapvote.server.insight.history import events
 from mapvote.server.store.store import Store
 
 Desk = Callable[..., Path]
+
+
+@pytest.fixture(autouse=True)
+def _ctrl_c_is_heard() -> Iterator[None]:
+    """What a shell starts in the background hears no Ctrl-C, nor does what that starts: the tests may run there."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
 
 
 def interrupt(command: list[str], folder: Path, when: Callable[[], bool]) -> subprocess.CompletedProcess[str]:
