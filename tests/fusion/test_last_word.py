@@ -30,7 +30,7 @@ def brought(tile: Tile, cell: tuple[int, int]) -> Tile:
     """The tile, remembering that vehicles put there what stands in a cell."""
     planes = Memory.none().planes.copy()
     planes[1][cell] = 1
-    return Tile(tile.window, tile.points, tile.ground_z, memory=Memory(planes))
+    return Tile(tile.window, tile.points, tile.ground_z, memory=Memory.of(planes))
 
 
 def test_a_car_that_had_left_before_the_last_vehicle_passed_waits_for_the_next() -> None:

@@ -33,9 +33,9 @@ def at(*cells: tuple[int, int]) -> Bool:
 
 
 def memory(stays: int = 0, stayed_days: float = 0.0, came_s: int = 0, cell: tuple[int, int] = CELL) -> Memory:
-    planes = Memory.none().planes
+    planes = Memory.none().planes.copy()
     planes[1][cell], planes[2][cell], planes[3][cell] = came_s, stays, stayed_days * DAY_S
-    return Memory(planes)
+    return Memory.of(planes)
 
 
 def drive(day: float, states: dict[tuple[int, int], int], vehicle: str = "v") -> TileVote:

@@ -24,10 +24,10 @@ TILE = make_tile(wall([CELL, OTHER], [0.45, 0.75]))
 
 
 def changed(**versions: int) -> Tile:
-    memory = Memory.none()
+    planes = Memory.none().planes.copy()
     for cell, version in zip((CELL, OTHER, THIRD), versions.values(), strict=False):
-        memory.planes[0][cell] = version
-    return replace(TILE, memory=memory)
+        planes[0][cell] = version
+    return replace(TILE, memory=Memory.of(planes))
 
 
 def vote(version: int) -> TileVote:

@@ -114,4 +114,4 @@ def _unpack_field(kind: str, data: bytes, n: int, what: str) -> NDArray[Any]:
 
 def unpack_memory(data: bytes, what: str) -> Memory:
     """What a tile remembers, of its packed planes; MapvoteError if damaged."""
-    return Memory(unpack_plane(data, "<u4", (PLANES, *_SHAPE), what))
+    return Memory.of(unpack_plane(data, "<u4", (PLANES, *_SHAPE), what))

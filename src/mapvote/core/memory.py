@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mapvote.core.grid import TILE_CELLS
-from mapvote.core.types import Bool
+from mapvote.core.grid import CELLS, TILE_CELLS
+from mapvote.core.types import I64
 
 U32 = NDArray[np.uint32]
 PLANES = 4
@@ -16,14 +17,31 @@ PLANES = 4
 
 @dataclass(frozen=True)
 class Memory:
-    """One plane each, stacked (4, 256, 256) uint32, so that they are stored as one. All zero: nothing ever changed."""
+    """Of the cells of which there is anything to remember, for they are few; of all others every value is zero."""
 
-    planes: U32
+    cells: I64
+    """(n,) flat, ascending."""
+    values: U32
+    """(4, n) of each cell what the four planes below hold; never all zero."""
 
     @classmethod
     def none(cls) -> Memory:
         """Of a tile that is as it was surveyed."""
-        return cls(np.zeros((PLANES, TILE_CELLS, TILE_CELLS), dtype=np.uint32))
+        return cls(np.empty(0, dtype=np.int64), np.empty((PLANES, 0), dtype=np.uint32))
+
+    @classmethod
+    def of(cls, planes: U32) -> Memory:
+        """From planes (4, 256, 256)."""
+        flat = planes.reshape(PLANES, CELLS)
+        cells = np.flatnonzero(flat.any(axis=0))
+        return cls(cells, flat[:, cells])
+
+    @cached_property
+    def planes(self) -> U32:
+        """(4, 256, 256) the planes below, one after another."""
+        flat = np.zeros((PLANES, CELLS), dtype=np.uint32)
+        flat[:, self.cells] = self.values
+        return flat.reshape(PLANES, TILE_CELLS, TILE_CELLS)
 
     @property
     def changed(self) -> U32:
@@ -46,15 +64,35 @@ class Memory:
         """(256, 256) how long they stayed, all together, seconds."""
         return self.planes[3]
 
-    def with_changed(self, cells: Bool, version: int) -> Memory:
-        """The same, but ``cells`` (256, 256) changed in ``version``."""
-        planes = self.planes.copy()
-        planes[0][cells] = version
-        return Memory(planes)
+    @property
+    def brought(self) -> I64:
+        """(m,) flat cells that hold what vehicles put there."""
+        return self.cells[self.values[1] > 0]
 
-    @classmethod
-    def first_change(cls, cells: Bool, version: int) -> Memory:
-        """Of a tile that remembered nothing until ``cells`` (256, 256) changed in ``version``."""
-        memory = cls.none()
-        memory.planes[0][cells] = version
-        return memory
+    def changed_after(self, version: int) -> I64:
+        """(m,) flat cells that changed after ``version``."""
+        return self.cells[self.values[0] > version]
+
+    def at(self, cells: I64) -> U32:
+        """(4, m) what is remembered of flat ``cells`` (m,), in any order."""
+        found = np.zeros((PLANES, len(cells)), dtype=np.uint32)
+        if len(self.cells):
+            near = np.minimum(np.searchsorted(self.cells, cells), len(self.cells) - 1)
+            known = self.cells[near] == cells
+            found[:, known] = self.values[:, near[known]]
+        return found
+
+    def but(self, cells: I64, values: U32) -> Memory:
+        """The same, but of flat ``cells`` (m,), none of them twice, these ``values`` (4, m)."""
+        stay = np.isin(self.cells, cells, assume_unique=True, invert=True)
+        some = np.concatenate([self.cells[stay], cells]), np.concatenate([self.values[:, stay], values], axis=1)
+        order = np.argsort(some[0])
+        cells, planes = some[0][order], some[1][:, order]
+        kept = np.flatnonzero(planes.any(axis=0))
+        return Memory(cells[kept], planes[:, kept])
+
+    def with_changed(self, cells: I64, version: int) -> Memory:
+        """The same, but flat ``cells`` (m,) changed in ``version``."""
+        values = self.at(cells)
+        values[0] = version
+        return self.but(cells, values)

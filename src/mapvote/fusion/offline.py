@@ -81,7 +81,7 @@ def _on_this_tile(ballot: Ballot, index: TileIndex, point_map: PointMap) -> bool
         return True
     memory = point_map.tile(index).memory
     older = ballot.version is not None and point_map.version is not None and ballot.version < point_map.version
-    return older and memory is not None and bool((memory.changed > (ballot.version or 0)).any())
+    return older and memory is not None and len(memory.changed_after(ballot.version or 0)) > 0
 
 
 def staged(ballot: Ballot) -> str:

@@ -15,14 +15,13 @@ by a quorum alone, so that nobody who denies it can hold it up.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from mapvote.config import FuseSettings
-from mapvote.core.memory import PLANES, Memory
+from mapvote.core.memory import Memory
 from mapvote.core.tile import Tile
 from mapvote.core.types import F64, I64, U8, U64, Bool, CellState
 from mapvote.fusion.tile_vote import TileVote
@@ -35,8 +34,7 @@ _UN = int(CellState.UNDETERMINED)
 
 def expected_days(memory: Memory | None, cells: Bool, age_days: F64 | float, settings: FuseSettings) -> F64:
     """(n,) how long what stands in ``cells`` (256, 256) since ``age_days`` (n,) can be expected to stay."""
-    n = int(cells.sum())
-    past = np.zeros((2, n)) if memory is None else np.stack([memory.stays[cells], memory.stayed_s[cells]]).astype(float)
+    past = (memory or Memory.none()).at(np.flatnonzero(cells))[2:].astype(float)
     return np.asarray((settings.prior_stay_days + past[1] / DAY_S + age_days) / (1.0 + past[0]))
 
 
@@ -83,8 +81,10 @@ def temporary(states: U8, tile: Tile, drives: Sequence[TileVote], settings: Fuse
 def denied_last(states: U8, memory: Memory | None, drives: Sequence[TileVote]) -> Bool:
     """(256, 256) cells of which something new, or the end of what vehicles brought, is decided, though the last of
     ``drives`` that determined them says otherwise."""
-    brought = np.zeros(states.shape, dtype=np.bool_) if memory is None else memory.came_s > 0
-    out = np.asarray((states == _CO) | ((states == _CE) & brought))
+    out = np.asarray(states == _CO)
+    if memory is not None:
+        brought = memory.brought
+        out.reshape(-1)[brought[states.reshape(-1)[brought] == _CE]] = True
     cells = np.flatnonzero(out)
     if len(cells):
         said = in_order(drives, cells)[0]
@@ -98,18 +98,17 @@ def denied_last(states: U8, memory: Memory | None, drives: Sequence[TileVote]) -
 def remembered(memory: Memory, before: Tile, after: Tile, votes: Sequence[TileVote], states: U8) -> Memory:
     """``memory`` with what came and what went between two versions of a tile, by the votes that decided it."""
     went, came = emptied_and_filled(before.obstacle_words.reshape(-1), after.obstacle_words.reshape(-1))
-    went = went[memory.came_s.reshape(-1)[went] > 0]
+    went = went[memory.at(went)[1] > 0]
     if not len(came) and not len(went):
         return memory
-    planes = memory.planes.copy()
-    came_s, stays, stayed_s = planes.reshape(PLANES, -1)[1:]
+    of_new, of_gone = memory.at(came), memory.at(went)
     risen = states.reshape(-1)[came] == _CO
-    came_s[came] = np.where(risen, _first_s(votes, came, _CO), np.uint32(0))
-    ended = np.maximum(_first_s(votes, went, _CE), came_s[went])
-    stays[went] += 1
-    stayed_s[went] += ended - came_s[went]
-    came_s[went] = 0
-    return replace(memory, planes=planes)
+    of_new[1] = np.where(risen, _first_s(votes, came, _CO), np.uint32(0))
+    came_s, stays, stayed_s = of_gone[1:]
+    stays += 1
+    stayed_s += np.maximum(_first_s(votes, went, _CE), came_s) - came_s
+    came_s[:] = 0
+    return memory.but(np.concatenate([came, went]), np.concatenate([of_new, of_gone], axis=1))
 
 
 @numba.njit(cache=True, nogil=True)

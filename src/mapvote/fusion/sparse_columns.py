@@ -59,6 +59,11 @@ class Words:
         near[near == len(others.cells)] = 0
         return self.at(others.cells[near] == self.cells if len(others.cells) else near > 0)
 
+    def outside(self, cells: NDArray[np.intp]) -> Words:
+        """Only those not of the flat ``cells`` (m,), ascending."""
+        near = np.minimum(np.searchsorted(cells, self.cells), len(cells) - 1)
+        return self.at(cells[near] != self.cells) if len(cells) else self
+
     def at(self, keep: Bool | NDArray[np.intp]) -> Words:
         """Only those where ``keep`` (n,) is set, or of these indices."""
         return Words(self.cells[keep], self.words[keep])

@@ -17,17 +17,17 @@ from mapvote.core.grid import CELLS, TILE_CELLS
 from mapvote.core.memory import Memory
 from mapvote.core.tile import Tile
 from mapvote.core.types import I64, U8, U64, Bool
-from mapvote.fusion.tile_vote import TileVote, restrict
+from mapvote.fusion.tile_vote import TileVote, silenced
 
 
 def unspent(vote: TileVote, tile: Tile, misread: Mapping[int, Bool] | None = None) -> TileVote:
     """The vote in the cells where it counts on ``tile``: those that have not changed since the version that its vehicle
     drove with. ``misread``: by version, (256, 256) cells in which that version showed what no longer is history."""
-    counts = None if tile.memory is None else tile.memory.changed <= vote.version
+    spent = None if tile.memory is None else tile.memory.changed_after(vote.version)
     wrong = None if misread is None else misread.get(vote.version)
     if wrong is not None:
-        counts = ~wrong if counts is None else counts & ~wrong
-    return restrict(vote, counts)
+        spent = np.union1d(np.flatnonzero(wrong), [] if spent is None else spent).astype(np.int64)
+    return vote if spent is None else silenced(vote, spent)
 
 
 def differing(a: Tile, b: Tile) -> Bool:
@@ -42,10 +42,7 @@ def differing(a: Tile, b: Tile) -> Bool:
 
 def changed_in(version: int, before: Tile, after: Tile) -> Memory:
     """What ``after`` remembers if ``version`` made it of ``before``."""
-    changed = differing(before, after)
-    return (
-        Memory.first_change(changed, version) if before.memory is None else before.memory.with_changed(changed, version)
-    )
+    return (before.memory or Memory.none()).with_changed(np.flatnonzero(differing(before, after)), version)
 
 
 def _other_points(a: Tile, b: Tile) -> Bool:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol, TypeVar
+from typing import Any, Protocol, TypeVar
 
 import numba
 import numpy as np
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from mapvote.config import FuseSettings
 from mapvote.core.cells import flat_cells
 from mapvote.core.grid import CELLS, TILE_CELLS, Grid
-from mapvote.core.types import F32, I32, N_STATES, NO_VOTE, U8, U16, U64, Bool, CellState
+from mapvote.core.types import F32, I32, I64, N_STATES, NO_VOTE, U8, U16, U64, Bool, CellState
 from mapvote.fusion.sparse_columns import Words, agreed, mark, mark_spoken, union
 
 DAY_NS = 86_400_000_000_000
@@ -161,15 +161,27 @@ def select(votes: Iterable[D], settings: FuseSettings) -> list[D]:
 
 def restrict(vote: TileVote, counts: Bool | None) -> TileVote:
     """The vote with every cell outside ``counts`` (256, 256) silenced; None means that all of it counts."""
-    if counts is None or counts.all():
+    return vote if counts is None else silenced(vote, np.flatnonzero(~counts))
+
+
+def silenced(vote: TileVote, cells: I64) -> TileVote:
+    """The vote without the flat ``cells`` (n,), ascending."""
+    if not len(cells):
         return vote
     return replace(
         vote,
-        states=None if vote.states is None else np.where(counts, vote.states, np.uint8(NO_VOTE)),
+        states=None if vote.states is None else _but(vote.states, cells, NO_VOTE),
         unrestricted=vote.sent,
-        tally=None if vote.tally is None else np.where(counts[..., None], vote.tally, np.uint16(0)),
-        free=None if vote.free is None else vote.free.within(counts),
+        tally=None if vote.tally is None else _but(vote.tally, cells, 0),
+        free=None if vote.free is None else vote.free.outside(cells),
     )
+
+
+def _but(plane: NDArray[Any], cells: I64, value: int) -> NDArray[Any]:
+    """The plane (256, 256, ...) with ``value`` in flat ``cells``."""
+    flat = plane.reshape(CELLS, -1).copy()
+    flat[cells] = value
+    return flat.reshape(plane.shape)
 
 
 def fold(drives: Sequence[TileVote], grid: Grid) -> TileVote:

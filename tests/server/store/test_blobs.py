@@ -20,7 +20,7 @@ from mapvote.server.store.blobs import pack_memory, unpack_memory_plane
 def test_what_a_tile_remembers_comes_back_whether_of_few_cells_or_of_all(seed: int, share: float) -> None:
     rng = np.random.default_rng(seed)
     planes = np.where(rng.random((PLANES, *SHAPE)) < share, rng.integers(1, 2**32, (PLANES, *SHAPE)), 0)
-    digest, packed = pack_memory(Memory(planes.astype(np.uint32)))
+    digest, packed = pack_memory(Memory.of(planes.astype(np.uint32)))
     np.testing.assert_array_equal(unpack_memory_plane(packed[digest], digest).planes, planes)
 
 

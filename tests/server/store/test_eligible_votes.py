@@ -212,8 +212,7 @@ def test_the_window_is_of_the_votes_that_are_ready(store: Store, clock: Clock) -
 
 def test_a_vote_counts_in_the_cells_that_have_not_changed_since(store: Store) -> None:
     cast(store, "a")
-    memory = Memory.none()
-    memory.planes[0][CELL] = 2
+    memory = Memory.none().with_changed(np.array([CELL[0] * 256 + CELL[1]]), 2)
     (vote,) = counting(store, asked(store), memory=memory)
     assert spoken(vote) == [OTHER]
 
@@ -292,8 +291,7 @@ def test_the_recent_past_knows_no_ballot_that_is_not_ready(store: Store, clock: 
 
 def test_in_the_recent_past_spent_cells_are_silent_too(store: Store) -> None:
     cast(store, "a")
-    memory = Memory.none()
-    memory.planes[0][CELL] = 2
+    memory = Memory.none().with_changed(np.array([CELL[0] * 256 + CELL[1]]), 2)
     tile = replace(store.point_map().tiles[HERE], memory=memory)
     with store.database.reading() as connection:
         (vote,) = recent_votes(connection, tile, asked(store))

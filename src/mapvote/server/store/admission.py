@@ -238,6 +238,6 @@ def _counts_somewhere(
         memory = memory_of(connection, (1 << 31) - 1, tile.tile)
     elif now.memory is not None:
         memory = load_memory(connection, now.memory)
-    if memory is None or not (memory.changed > version).any():
+    if memory is None or not len(memory.changed_after(version)):
         return True
     return bool((tile_vote(ballot, tile, "").spoken() & (memory.changed <= version)).any())

@@ -7,7 +7,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -18,10 +17,9 @@ from mapvote.codec.tile_file import MAX_TILE_POINTS
 from mapvote.core.grid import CELLS, TILE_CELLS, Grid
 from mapvote.core.memory import PLANES, Memory
 from mapvote.core.tile import Tile
-from mapvote.core.types import F32, I64, U64, Bool, MapvoteError
+from mapvote.core.types import F32, U64, Bool, MapvoteError
 
 _ZSTD_LEVEL = 2
-_BLOCK = 64
 MAX_PLANE_BYTES = 16 * MAX_TILE_POINTS
 """800 MB: 16 bytes for each point of the densest tile there may be."""
 
@@ -138,25 +136,8 @@ def _packed(raw: bytes | memoryview) -> tuple[str, dict[str, bytes]]:
 def _raw_memory(memory: Memory) -> bytes:
     """The cells of which anything is remembered, for they are few: the way to each from the one before, two bytes, and
     then their values, plane by plane."""
-    flat = memory.planes.reshape(PLANES, CELLS)
-    cells = _remembering(flat)
-    return np.diff(cells, prepend=0).astype("<u2").tobytes() + flat[:, cells].astype("<u4").tobytes()
-
-
-@numba.njit(cache=True, nogil=True)
-def _remembering(planes: NDArray[np.uint32]) -> I64:
-    """Of planes (4, 65536), the cells of which any remembers something."""
-    found = np.empty(CELLS, dtype=np.int64)
-    n = 0
-    for start in range(0, CELLS, _BLOCK):
-        some = np.uint32(0)
-        for plane in planes:
-            for value in plane[start : start + _BLOCK]:  # most are zero, and that is seen with vector instructions
-                some |= value
-        for cell in range(start, start + _BLOCK if some else start):
-            found[n] = cell
-            n += (planes[0, cell] | planes[1, cell] | planes[2, cell] | planes[3, cell]) != 0
-    return found[:n].copy()
+    ways = np.diff(memory.cells, prepend=0)
+    return ways.astype("<u2").tobytes() + memory.values.astype("<u4", order="C").tobytes()
 
 
 def unpack_memory_plane(data: bytes, digest: str) -> Memory:
@@ -164,12 +145,10 @@ def unpack_memory_plane(data: bytes, digest: str) -> Memory:
     bytes are no number of cells."""
     raw = _unpack(data, digest)
     if len(raw) == 4 * PLANES * CELLS:
-        return Memory(np.frombuffer(raw, dtype="<u4").reshape(PLANES, TILE_CELLS, TILE_CELLS))
+        return Memory.of(np.frombuffer(raw, dtype="<u4").reshape(PLANES, TILE_CELLS, TILE_CELLS))
     n = len(raw) // (2 + 4 * PLANES)
     cells = np.cumsum(np.frombuffer(raw, dtype="<u2", count=n), dtype=np.int64)
-    planes = np.zeros((PLANES, CELLS), dtype=np.uint32)
-    planes[:, cells] = np.frombuffer(raw, dtype="<u4", offset=2 * n).reshape(PLANES, n)
-    return Memory(planes.reshape(PLANES, TILE_CELLS, TILE_CELLS))
+    return Memory(cells, np.frombuffer(raw, dtype="<u4", offset=2 * n).reshape(PLANES, n))
 
 
 def pack_cells(cells: Bool) -> bytes:

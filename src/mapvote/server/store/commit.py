@@ -11,13 +11,14 @@ from mapvote.core.grid import TileIndex
 from mapvote.server.errors import Conflict
 from mapvote.server.store import schema
 from mapvote.server.store.blobs import TileHashes
+from mapvote.server.store.database import insert_rows
 from mapvote.server.store.queries import (
     Version,
     add_blobs,
     current_version,
     end_votes,
     log_event,
-    tile_row,
+    set_tiles,
     version_of,
     version_row,
 )
@@ -50,13 +51,10 @@ def write_version(store: Store, version: Version, new: NewTiles, unvoted: str | 
                 version = replace(version, mark=seq)
             connection.execute(schema.versions.insert().values(**version_row(version)))
             add_blobs(connection, {digest: data for some in new.planes for digest, data in some.items()})
-            if new.tiles:
-                rows = [tile_row(version.number, index, hashes) for index, hashes in new.tiles.items()]
-                connection.execute(schema.version_tiles.insert(), rows)
-            if new.fused:
-                connection.execute(
-                    schema.decisions.insert(), [_decision_row(version.number, f) for f in new.fused if not f.lost]
-                )
+            set_tiles(connection, version.number, new.tiles)
+            rows = [_decision_row(version.number, fused) for fused in new.fused if not fused.lost]
+            if rows:
+                insert_rows(connection, schema.decisions, rows)
             if unvoted is not None:
                 end_votes(connection, unvoted, seq)
     except IntegrityError as error:
@@ -66,7 +64,7 @@ def write_version(store: Store, version: Version, new: NewTiles, unvoted: str | 
     return version
 
 
-def _decision_row(number: int, fused: Fused) -> dict[str, object]:
-    counts = {name: getattr(fused, name) for name in ("states", "tally", "vehicles", "added", "deleted")}
-    total = sum_of(fused.states, fused.tally)
-    return {"version": number, "row": fused.index[0], "col": fused.index[1], "sum": total} | counts
+def _decision_row(number: int, fused: Fused) -> tuple[object, ...]:
+    """In the order of the table's columns."""
+    counts = fused.vehicles, fused.added, fused.deleted
+    return number, *fused.index, fused.states, fused.tally, *counts, sum_of(fused.states, fused.tally)

@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
 
+import numpy as np
 import sqlalchemy as sa
 
 from mapvote.config import FuseSettings
@@ -230,10 +231,8 @@ def rollback(store: Store, to: int, *, by: str = "operator", reason: str = "") -
 
 def turned_back(version: int, now: Tile, then: Tile) -> Memory:
     """What a tile remembers that is again as it was ``then``: cells that turn back forget what came and went since."""
-    differ = differing(now, then)
-    planes = (now.memory or Memory.none()).planes.copy()
-    planes[:, differ] = (then.memory or Memory.none()).planes[:, differ]
-    return Memory(planes).with_changed(differ, version)
+    differ, none = np.flatnonzero(differing(now, then)), Memory.none()
+    return (now.memory or none).but(differ, (then.memory or none).at(differ)).with_changed(differ, version)
 
 
 def _of_two(

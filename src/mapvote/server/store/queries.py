@@ -22,7 +22,7 @@ from mapvote.server.store.blobs import (
     unpack_memory_plane,
     unpack_tile,
 )
-from mapvote.server.store.database import MOST_ASKED, insert_rows
+from mapvote.server.store.database import MOST_ASKED, Question, insert_rows
 
 
 def current_number(connection: sa.Connection) -> int:
@@ -81,7 +81,7 @@ def tiles_of(
 
 def tile_of(connection: sa.Connection, number: int, index: TileIndex) -> TileHashes | None:
     """Hashes of one tile of a version; None where the map has none."""
-    row = connection.execute(_TILE, {"row": index[0], "col": index[1], "number": number}).one_or_none()
+    row = _TILE.ask(connection, row=index[0], col=index[1], number=number).one_or_none()
     return None if row is None or row.points is None else _hashes(row)
 
 
@@ -103,7 +103,7 @@ def points_of(connection: sa.Connection, tiles: Mapping[TileIndex, TileHashes]) 
 
 def memory_of(connection: sa.Connection, number: int, index: TileIndex) -> Memory | None:
     """What is remembered of a place as of a version, also where the map has no tile any more."""
-    row = connection.execute(_TILE, {"row": index[0], "col": index[1], "number": number}).one_or_none()
+    row = _TILE.ask(connection, row=index[0], col=index[1], number=number).one_or_none()
     return None if row is None or row.memory is None else load_memory(connection, row.memory)
 
 
@@ -140,7 +140,7 @@ def load_tile(connection: sa.Connection, window: Grid, hashes: TileHashes | None
     if hashes is None:
         return Tile.empty(window)
     named = {plane: digest for plane in schema.TILE_PLANES if (digest := getattr(hashes, plane))}
-    found = {row.hash: row.data for row in connection.execute(_PLANES, dict.fromkeys(schema.TILE_PLANES) | named)}
+    found = {row.hash: row.data for row in _PLANES.ask(connection, **dict.fromkeys(schema.TILE_PLANES) | named)}
     return unpack_tile(window, hashes, {p: _there(found.get(digest), digest) for p, digest in named.items()})
 
 
@@ -202,13 +202,11 @@ def add_blobs(connection: sa.Connection, planes: Mapping[str, bytes]) -> None:
 def add_version(connection: sa.Connection, version: Version, tiles: Mapping[TileIndex, Tile]) -> None:
     """Insert a version that sets ``tiles``; sqlalchemy's IntegrityError if its number is taken."""
     connection.execute(schema.versions.insert().values(**version_row(version)))
-    rows = []
+    packed = {}
     for index, tile in tiles.items():
-        hashes, planes = pack_tile(tile)
+        packed[index], planes = pack_tile(tile)
         add_blobs(connection, planes)
-        rows.append(tile_row(version.number, index, hashes))
-    if rows:
-        connection.execute(schema.version_tiles.insert(), rows)
+    set_tiles(connection, version.number, packed)
 
 
 def version_row(version: Version) -> dict[str, Any]:
@@ -216,11 +214,11 @@ def version_row(version: Version) -> dict[str, Any]:
     return {column.name: getattr(version, column.name) for column in VERSION_COLUMNS}
 
 
-def tile_row(number: int, index: TileIndex, hashes: TileHashes) -> dict[str, Any]:
-    """One row of version_tiles."""
-    return {"version": number, "row": index[0], "col": index[1]} | {
-        plane: getattr(hashes, plane) or None for plane in schema.TILE_PLANES
-    }
+def set_tiles(connection: sa.Connection, number: int, tiles: Mapping[TileIndex, TileHashes]) -> None:
+    """What a version sets: the rows of version_tiles."""
+    rows = [(number, *i, *(getattr(h, plane) or None for plane in schema.TILE_PLANES)) for i, h in tiles.items()]
+    if rows:
+        insert_rows(connection, schema.version_tiles, rows)
 
 
 def names(tiles: Iterable[TileIndex]) -> str:
@@ -253,7 +251,7 @@ VERSION_COLUMNS = [column for column in schema.versions.c if column.name != "sum
 _ONE_BY_ONE = 200
 """So many tiles are sooner asked for one by one than found among all of the map's."""
 _T = schema.version_tiles
-_TILE = (
+_TILE = Question(
     sa.select(*(_T.c[plane] for plane in schema.TILE_PLANES))
     .where(_T.c.row == sa.bindparam("row"), _T.c.col == sa.bindparam("col"), _T.c.version <= sa.bindparam("number"))
     .order_by(_T.c.version.desc())
@@ -261,6 +259,8 @@ _TILE = (
 )
 _KNOWN_BLOBS = sa.select(schema.blobs.c.hash).where(schema.blobs.c.hash.in_(sa.bindparam("digests", expanding=True)))
 _BLOB = sa.select(schema.blobs.c.data).where(schema.blobs.c.hash == sa.bindparam("digest"))
-_PLANES = sa.select(schema.blobs).where(
-    schema.blobs.c.hash.in_([sa.bindparam(p, type_=sa.String) for p in schema.TILE_PLANES])
+_PLANES = Question(
+    sa.select(schema.blobs).where(
+        schema.blobs.c.hash.in_([sa.bindparam(p, type_=sa.String) for p in schema.TILE_PLANES])
+    )
 )

@@ -35,9 +35,9 @@ from mapvote.server.store.eligible_votes import Electorate, Polled, counting_vot
 from mapvote.server.store.quarantine import Damage, DamagedBallots
 from mapvote.server.store.queries import load_tile, tile_as_of
 
-_GROUP, _ROUND = 4, 8
+_GROUP, _ROUND = 8, 8
 """Tiles side by side that are fused within one reading of the database, at most; into how many groups a round is cut at
-the least, so that all who fuse have work and a round can be cancelled on its way."""
+the least, so that all who fuse have work and a round can be cancelled on its way, unless nobody else fuses."""
 _NOWHERE = np.empty(0, dtype=np.uint64)
 _BYTE_MAX = 255
 
@@ -209,7 +209,7 @@ def fuse_round(tasks: Sequence[Task], database: Database, executor: Executor | N
     where = executor.within if isinstance(executor, Watched) else executor
     here = partial(fuse_stored, database=database)
     rows = [list(row) for _, row in groupby(tasks, lambda task: task.window.row0)]
-    size = min(_GROUP, max(1, len(tasks) // _ROUND))
+    size = min(_GROUP, max(1, len(tasks) // _ROUND)) if executor else _GROUP
     groups = [row[start : start + size] for row in rows for start in range(0, len(row), size)]
     work = here if executor is None or isinstance(where, ThreadPoolExecutor) else fuse_stored
     return [fused for some in (executor.map if executor else map)(work, groups) for fused in some]
