@@ -7,9 +7,9 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from mapvote.core.grid import CELL_SIZE, CELLS, Grid, Lattice
+from mapvote.core.grid import CELL_SIZE, CELLS, TILE_CELLS, Grid, Lattice
 from mapvote.core.ground import base_layers
-from mapvote.core.ground_growing import UNREACHED, _bounds, tiles_around
+from mapvote.core.ground_growing import SEED, UNREACHED, WIDEST, _bounds, _like, grow, tiles_around
 from mapvote.core.point_map import map_from_points
 from mapvote.core.reference import reference_window
 from mapvote.core.types import F32, F64
@@ -99,6 +99,28 @@ def test_a_point_may_lie_as_far_off_the_ground_beside_it_as_slopes_and_noise_all
     assert low == pytest.approx(-0.15 * 0.3 - 0.06)
     assert steep == pytest.approx(-0.5 * 0.3 - 0.06)
     assert high == pytest.approx(0.15 * 0.3 + 0.06)
+
+
+def test_of_24_cells_around_those_count_that_hold_a_point_at_a_like_height_and_the_cell_itself_never() -> None:
+    around = [(r, c) for r in range(8, 13) for c in range(8, 13)]
+    cells = np.array([r * TILE_CELLS + c for r, c in around])
+    heights, middle = np.linspace(-0.05, 0.05, 25).astype(np.float32), 10 * TILE_CELLS + 10
+    for held, count in ((cells == middle, 0), (cells == middle + TILE_CELLS, 1), (cells > 0, 24)):
+        points = np.bincount(cells[held], minlength=CELLS)
+        start = np.concatenate([[0], np.cumsum(points)]).astype(np.int32)
+        assert _like(middle, 0.0, 0.0, np.inf, 0.0, start, heights[held], tiles_around([(0, 0)])) == count
+
+
+def test_where_nothing_was_measured_the_gap_widens_by_two_from_cell_to_cell_and_by_three_across_a_corner() -> None:
+    ground, gap = np.full(CELLS, np.nan, np.float32), np.full(CELLS, UNREACHED, np.uint8)
+    ground[120 * TILE_CELLS + 90], gap[120 * TILE_CELLS + 90] = 7.0, SEED
+    grow(np.zeros(CELLS + 1, np.int32), np.empty(0, np.float32), tiles_around([(0, 0)]), ground, gap)
+    rows, cols = np.indices((TILE_CELLS, TILE_CELLS))
+    apart = np.sort([abs(rows - 120), abs(cols - 90)], axis=0)
+    away = 1 + 3 * apart[0] + 2 * (apart[1] - apart[0])
+    assert np.array_equal(gap.reshape(rows.shape), np.where(away > WIDEST, UNREACHED, away))
+    assert np.array_equal(np.isfinite(ground), gap <= WIDEST)
+    assert (ground[gap <= WIDEST] == 7.0).all()
 
 
 def test_tiles_know_those_around_them() -> None:

@@ -102,3 +102,11 @@ def test_what_rays_pass_is_what_the_rule_says_of_each_cell_and_each_ray(seed: in
     wanted = plain_passed(plain_rays(points), base)
     np.testing.assert_array_equal(passed.reshape(base.shape), wanted)
     assert (wanted >> np.uint64(40)).any(), "the upper halves of the words are looked at too"
+
+
+def test_what_a_ray_proves_up_to_the_edge_of_a_cell_is_nothing_of_the_cell_behind_the_edge() -> None:
+    end = np.float32(2 * CELL_SIZE)
+    rays = Rays(*(np.array([value], np.float32) for value in (9.0, 1.0, 0.0, 0.0, end)), np.zeros(1, np.int32))
+    passed = np.zeros(5, np.uint64)
+    mark_passed(gather_rays(rays), np.array([0.0, 0.15, 0.75]), (0.0, 0.0), np.zeros((1, 5), np.int32), passed)
+    assert passed.tolist() == [0b100, 0b100, 0, 0, 0]

@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from mapvote.core.columns import GROUND_MARGIN_M, column_bits
 from mapvote.core.grid import CELL_SIZE, Grid, Lattice
 from mapvote.core.types import Reference
 from mapvote.perception.fans import FANS
@@ -108,12 +109,14 @@ def test_a_ray_to_the_ground_proves_the_air_above_it_empty() -> None:
     assert view.counts.sum() == 0
 
 
-def test_points_are_obstacles_above_the_margin_and_outside_the_window_nothing() -> None:
-    points = np.array([[1.0, 1.0, 0.29], [1.0, 1.0, 0.31], [40.0, 0.0, 3.0]])
+def test_points_are_obstacles_from_the_margin_on_as_in_the_map_and_outside_the_window_nothing() -> None:
+    points = np.array([[1.0, 1.0, 0.29], [1.0, 1.0, GROUND_MARGIN_M], [1.0, 1.0, 0.31], [40.0, 0.0, 3.0]])
     obstacle, cell = find_obstacles(points, flat_reference())
-    assert obstacle.tolist() == [False, True, False]
-    assert cell[0] == cell[1] >= 0
-    assert cell[2] == -1
+    assert obstacle.tolist() == [False, True, True, False]
+    assert cell[0] == cell[1] == cell[2] >= 0
+    assert cell[3] == -1
+    in_map = column_bits(points[:3, 2], np.zeros(3, np.float32), np.zeros(3, np.int32))[1]
+    assert in_map.tolist() == [False, True, True]
 
 
 def test_ranges_on_the_edge_of_a_sorting_step_are_sorted_all_the_same() -> None:
