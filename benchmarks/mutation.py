@@ -59,7 +59,7 @@ TESTS = {
     "detection/regions.py": ["detection/test_regions.py", "detection/test_columns.py", "detection/test_voters.py"],
     "detection/sightings.py": ["detection/test_paper.py"],
     "detection/surfaces.py": ["detection/test_surfaces.py"],
-    "perception/moving_kernels.py": ["perception/test_moving_objects.py"],
+    "perception/moving_kernels.py": ["perception/test_moving_kernels.py", "perception/test_moving_objects.py"],
     "perception/fans.py": ["perception/test_fans.py", "perception/test_raycast.py"],
     "perception/raycast.py": ["perception/test_raycast.py"],
     "core/ground_growing.py": ["core/test_ground.py"],

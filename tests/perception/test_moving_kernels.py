@@ -1,0 +1,50 @@
+"""Cells that move together: components of the plane, and which of them move."""
+
+from __future__ import annotations
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis.extra.numpy import arrays
+from scipy import ndimage
+
+from mapvote.core.types import I32, Bool
+from mapvote.perception.moving_kernels import flood, moving_components
+
+SIDE = 10
+
+
+def plane(inner: Bool) -> Bool:
+    """(SIDE, SIDE) with a rim of nothing."""
+    return np.pad(inner, 1)
+
+
+@given(arrays(np.bool_, (SIDE - 2, SIDE - 2)), arrays(np.bool_, (SIDE - 2, SIDE - 2)))
+@settings(max_examples=40, deadline=None)
+def test_wanted_cells_are_of_one_component_that_touch_or_are_joined_by_other_wanted_ones(
+    held: Bool, want: Bool
+) -> None:
+    """As scipy labels a picture."""
+    cells = np.flatnonzero(plane(held))
+    wanted = plane(want).ravel()[cells]
+    expected = ndimage.label(plane(held & want), structure=np.ones((3, 3)))[0].ravel()[cells] - 1
+    np.testing.assert_array_equal(flood(cells, wanted, SIDE), expected)
+
+
+def moving(at: list[tuple[int, int]], brief: list[bool], voxel_of: I32, min_voxels: int = 4) -> list[bool]:
+    rows, cols = np.array(at).T
+    seen = np.ones(len(at), np.bool_)
+    return moving_components(rows, cols, SIDE, seen, np.array(brief), min_voxels, 0.5, 0.6, voxel_of).tolist()
+
+
+def test_the_voxels_over_one_cell_count_together_and_all_their_points_move() -> None:
+    walker, post = [(2, 3)] * 4, [(7, 7)] * 4
+    points = np.array([-1, 0, 3, 3, 4, 7], np.int32)
+    assert moving(walker + post, [True] * 4 + [False] * 4, points) == [False, True, True, True, False, False]
+    assert moving(post + walker, [False] * 4 + [True] * 4, points) == [False, False, False, False, True, True]
+    assert not any(moving(walker + post, [True] * 4 + [False] * 4, points, min_voxels=5))
+
+
+def test_two_things_with_a_free_cell_between_them_move_each_by_itself() -> None:
+    car, wall = [(r, c) for r in (2, 3) for c in (2, 3)], [(r, 5) for r in range(1, 9)]
+    brief = [True] * len(car) + [False] * len(wall)
+    assert moving(car + wall, brief, np.arange(len(brief), dtype=np.int32)) == brief
