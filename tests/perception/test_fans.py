@@ -106,7 +106,8 @@ def test_what_rays_pass_is_what_the_rule_says_of_each_cell_and_each_ray(seed: in
 
 def test_what_a_ray_proves_up_to_the_edge_of_a_cell_is_nothing_of_the_cell_behind_the_edge() -> None:
     end = np.float32(2 * CELL_SIZE)
-    rays = Rays(*(np.array([value], np.float32) for value in (9.0, 1.0, 0.0, 0.0, end)), np.zeros(1, np.int32))
+    reach, x, y, slope, stop = (np.array([value], np.float32) for value in (9.0, 1.0, 0.0, 0.0, end))
+    rays = Rays(reach, x, y, slope, stop, np.zeros(1, np.int32))
     passed = np.zeros(5, np.uint64)
     mark_passed(gather_rays(rays), np.array([0.0, 0.15, 0.75]), (0.0, 0.0), np.zeros((1, 5), np.int32), passed)
     assert passed.tolist() == [0b100, 0b100, 0, 0, 0]

@@ -33,7 +33,8 @@ def test_wanted_cells_are_of_one_component_that_touch_or_are_joined_by_other_wan
 def moving(at: list[tuple[int, int]], brief: list[bool], voxel_of: I32, min_voxels: int = 4) -> list[bool]:
     rows, cols = np.array(at).T
     seen = np.ones(len(at), np.bool_)
-    return moving_components(rows, cols, SIDE, seen, np.array(brief), min_voxels, 0.5, 0.6, voxel_of).tolist()
+    found: Bool = moving_components(rows, cols, SIDE, seen, np.array(brief), min_voxels, 0.5, 0.6, voxel_of)
+    return list(found.tolist())
 
 
 def test_the_voxels_over_one_cell_count_together_and_all_their_points_move() -> None:
