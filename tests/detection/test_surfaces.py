@@ -109,6 +109,16 @@ def test_what_few_rays_crossed_and_none_met_goes_with_what_many_crossed_beside_i
     assert all(voter.votes()[0, 0].states[cell] == CE for cell in WALL)
 
 
+def test_what_no_ray_ever_crossed_does_not_go_with_the_rest_of_its_wall() -> None:
+    voter = SurfaceVoter(VotingSettings(), street(WALL, HEIGHTS))
+    for _ in range(GONE_RAYS):
+        seen = one_scan(voter.point_map, standing_at(OLD_Y + 9))
+        seen.view.passed[:, 106:] = 0
+        voter.observe(seen)
+    states = voter.votes()[0, 0].states
+    assert [int(states[cell]) for cell in WALL] == [CE] * 6 + [NO_VOTE] * 6
+
+
 def test_a_house_wall_that_two_scans_crossed_is_gone_and_the_trail_of_a_van_so_crossed_is_not() -> None:
     house = [0.45 + 0.3 * k for k in range(14)]
     states = [after(street(WALL, heights), standing_at(OLD_Y + 9), 2).states for heights in (house, HEIGHTS)]
@@ -143,6 +153,14 @@ def test_a_point_that_touches_no_other_goes_along_only_where_most_of_what_is_aro
 
 def test_what_is_no_higher_than_a_kerb_is_never_gone() -> None:
     assert not (after(street(WALL, [0.45]), standing_at(OLD_Y + 9)).states == CE).any()
+
+
+def test_a_kerb_stays_before_a_wall_that_was_pulled_down() -> None:
+    kerb = [(ROW - 2, c) for c in COLUMNS]
+    ground = wall([(r, c) for r in range(85, 125) for c in range(85, 135)], [0.0])
+    point_map = make_map({(0, 0): make_tile(np.concatenate([wall(WALL, HEIGHTS), wall(kerb, [0.45]), ground]))})
+    states = after(point_map, standing_at(OLD_Y + 9)).states
+    assert [{int(states[cell]) for cell in cells} for cells in (WALL, kerb)] == [{CE}, {UN}]
 
 
 def test_a_roof_that_no_ray_could_reach_falls_with_the_wall_that_bore_it() -> None:
