@@ -5,12 +5,14 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from hypothesis import given
+import pytest
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from mapvote.core.columns import remnants
 from mapvote.core.types import NO_VOTE, U64, CellState
+from mapvote.core.voting import VOTE_UNIT
 from mapvote.detection.columns import weigh
 from mapvote.detection.counters import PLANES, STRUCK_ITSELF, THROUGH_ITSELF, WORDS
 from mapvote.detection.regions import drop_specks, fallen, unexplained
@@ -53,6 +55,16 @@ def test_a_mapped_voxel_struck_is_unchanged_and_seen_through_is_gone() -> None:
     assert state({}, {3: 5}, occupied=0b1000) == UO
     assert state(around({3: 20}), {}, occupied=0b1000) == CE
     assert state({}, {}, occupied=0b1000) == NO_VOTE
+
+
+@given(st.dictionaries(st.integers(0, 63), st.integers(1, 9)), st.integers(1, 2**64 - 1))
+@settings(max_examples=20, deadline=None)
+@example({0: 1}, 1)
+def test_votes_for_what_is_mapped_are_the_pairs_of_a_scan_and_a_mapped_voxel_that_it_struck(
+    struck: dict[int, int], occupied: int
+) -> None:
+    pairs = sum(scans for bit, scans in struck.items() if occupied >> bit & 1)
+    assert judge({}, struck, occupied=occupied).tally[0, 0, UO] == VOTE_UNIT * pairs
 
 
 def test_rule_a_rays_that_graze_a_slab_without_crossing_it_say_nothing() -> None:
@@ -120,6 +132,19 @@ def test_rule_g_what_was_struck_in_few_of_the_scans_that_saw_through_it_has_only
     assert state(around({4: 12}), {4: 4}, rules=Rules(brief_is_passing=False)) == CO
     assert state(around({4: 12}), {4: 4, 5: 9}) == CO, "what is next to it was struck often: an edge"
     assert state({4: 12, 5: 30}, {4: 4}) == CO, "rays only grazed it: a slab"
+
+
+@pytest.mark.parametrize(("higher", "edge"), [(-2, False), (-1, True), (0, True), (1, True), (2, False)])
+def test_rule_g_on_a_slope_what_is_next_to_it_is_told_by_its_height(higher: int, edge: bool) -> None:
+    """The ground of the cell beside lies two layers lower, so its voxels count from there."""
+    planes, base, none = np.zeros((3, 3, WORDS), np.uint64), np.zeros((3, 3), np.int32), np.zeros((1, 1), np.uint64)
+    planes[1, 1], planes[1, 2], base[1, 2] = (
+        cell(around({9: 12}), {9: 4})[0, 0],
+        cell({}, {9 + higher + 2: 9})[0, 0],
+        -2,
+    )
+    weighed = weigh(planes, base, none, none, np.full((1, 1), FREE), np.zeros((1, 1), np.bool_))
+    assert (int(weighed.states()[0, 0]) == CO) == edge
 
 
 def test_rule_g_what_hardly_rises_above_the_ground_is_never_called_gone() -> None:
