@@ -172,13 +172,14 @@ def test_what_is_marked_voter_by_voter_is_what_each_deletes_and_passed() -> None
     tally = np.zeros((*shape, 5), dtype=np.uint16)
     tally[states < UN, states[states < UN]] = 3
     for vote in (two_stage, replace(two_stage, gone=None), TileVote("v", 1, "v", tally=tally, gone=words, free=words)):
-        deleted, passed = nothing_reached(1), nothing_reached(1)
-        vote.mark_deleted(decided, deleted)
+        among = Words.whole(decided == CE)
+        marked, passed = nothing_reached(1, len(among.cells)), nothing_reached(1)
+        vote.mark_deleted(among, marked)
         vote.mark_passed(passed)
-        emptied = vote.deletes(Words.whole(decided == CE))
-        assert np.array_equal(deleted[0].reshape(shape), at_least([emptied], 1))
+        deleted = vote.deletes(among)
+        assert np.array_equal(marked[0], at_least([deleted], 1).reshape(-1)[among.cells])
         assert np.array_equal(passed[0].reshape(shape), at_least([vote.passed()], 1))
-        assert len(emptied.cells)
+        assert len(deleted.cells)
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -84,7 +84,9 @@ class Memory:
 
     def but(self, cells: I64, values: U32) -> Memory:
         """The same, but of flat ``cells`` (m,), none of them twice, these ``values`` (4, m)."""
-        stay = np.isin(self.cells, cells, assume_unique=True, invert=True)
+        other = np.zeros(CELLS, dtype=np.bool_)
+        other[cells] = True
+        stay = ~other[self.cells]
         some = np.concatenate([self.cells[stay], cells]), np.concatenate([self.values[:, stay], values], axis=1)
         order = np.argsort(some[0])
         cells, planes = some[0][order], some[1][:, order]

@@ -164,12 +164,16 @@ class Tile:
 @numba.njit(cache=True, nogil=True)
 def _left(points: F32, cells: I64, dropped: Bool) -> tuple[F32, I64]:
     """The points (n, 3) that are not ``dropped``, and their cells."""
-    left, where = np.empty((len(cells), 3), dtype=np.float32), np.empty(len(cells), dtype=np.int64)
     n = 0
     for i in range(len(cells)):
-        left[n, 0], left[n, 1], left[n, 2], where[n] = points[i, 0], points[i, 1], points[i, 2], cells[i]
         n += not dropped[i]
-    return left[:n].copy(), where[:n].copy()
+    left, where = np.empty((n, 3), dtype=np.float32), np.empty(n, dtype=np.int64)
+    n = 0
+    for i in range(len(cells)):
+        if not dropped[i]:
+            left[n, 0], left[n, 1], left[n, 2], where[n] = points[i, 0], points[i, 1], points[i, 2], cells[i]
+            n += 1
+    return left, where
 
 
 @numba.njit(cache=True, nogil=True)

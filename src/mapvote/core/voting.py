@@ -22,6 +22,8 @@ _BYTE_MAX, _AT_ONCE = 255, 4
 """Voters whose votes a byte can count; that are counted in one pass."""
 _TALLIES: dict[Any, DTypeLike] = {np.dtype(np.uint8): np.uint8, np.dtype(np.uint16): np.uint16}
 _UO, _UE, _CO, _CE, _UN = (int(state) for state in CellState)
+_OPEN = 254
+"""A cell that is not decided yet: no state, and not NO_VOTE."""
 
 
 def vote_weight(n: ArrayLike, a: float = 2.0, b: float = 3.0, k: float = 0.5, n_min: int = 5) -> NDArray[np.float64]:
@@ -82,16 +84,16 @@ def decide_cells(tally: NDArray[Any], backers: NDArray[Any], abstain: bool, min_
     ``tally`` (5, cells); ``backers`` (5, cells) in the same units as ``min_votes`` -> (cells,) uint8.
     """
     states = np.empty(tally.shape[1], dtype=np.uint8)
-    for c in range(tally.shape[1]):
-        uo, ue, co = np.int64(tally[0, c]), np.int64(tally[1, c]), np.int64(tally[2, c])
-        ce, un = np.int64(tally[3, c]), np.int64(tally[4, c])
-        if uo | co | ce | un == 0:  # most cells: nobody looked, or all saw that nothing is there
-            states[c] = _UE if ue > 0 else NO_VOTE
-            continue
-        s = verdict(uo, ue, co, ce, un, abstain)
-        if s in (_CO, _CE) and backers[s, c] < min_votes:
-            s = _UN
-        states[c] = s
+    uos, ues, cos, ces, uns = tally[0], tally[1], tally[2], tally[3], tally[4]
+    for c in range(len(states)):  # of most cells nobody says anything, or all that nothing is there: seen in vectors
+        empty, more = np.int64(ues[c]), np.int64(uos[c] | cos[c] | ces[c] | uns[c])
+        s = _UE if empty != 0 else NO_VOTE
+        states[c] = _OPEN if more != 0 else s
+    for c in range(len(states)):
+        if states[c] == _OPEN:
+            uo, ue, co = np.int64(uos[c]), np.int64(ues[c]), np.int64(cos[c])
+            s = verdict(uo, ue, co, np.int64(ces[c]), np.int64(uns[c]), abstain)
+            states[c] = _UN if s in (_CO, _CE) and backers[s, c] < min_votes else s
     return states
 
 

@@ -21,7 +21,7 @@ def delete_points(tile: Tile, gone: U64) -> tuple[Tile, int]:
         gone = np.where(gone == 0, gone, EVERY_BIT)
     ground, base = tile.ground_z.reshape(-1), tile.base.reshape(-1)
     dropped = _marked(tile.points, tile.cells, gone.reshape(-1), ground, base)
-    deleted = int(dropped.sum())
+    deleted = int(np.count_nonzero(dropped))
     return (tile.without(dropped), deleted) if deleted else (tile, 0)
 
 

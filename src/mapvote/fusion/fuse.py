@@ -24,7 +24,7 @@ from mapvote.fusion.copies import Copy, liars_among, originals
 from mapvote.fusion.edit import add_points, delete_points
 from mapvote.fusion.outliers import contradictors, deniers
 from mapvote.fusion.persistence import denied_last, doubtful, remembered, temporary
-from mapvote.fusion.sparse_columns import counted, learned, nothing_reached, packed
+from mapvote.fusion.sparse_columns import Words, counted, learned, nothing_reached, packed
 from mapvote.fusion.spent import changed_in
 from mapvote.fusion.tile_vote import TileVote, one_each
 from mapvote.fusion.turning import turned
@@ -193,19 +193,20 @@ def supported_words(votes: Sequence[TileVote], states: U8, min_votes: int) -> U6
     In cells decided changed-empty, the voxels that ``min_votes`` voters for it mark. In cells decided
     unchanged-occupied, remnants that ``min_votes`` vehicles mark and more than half of those that determined the cell.
     """
-    gone = None
-    if (states == int(CellState.CHANGED_EMPTY)).any():
-        reached = nothing_reached(min_votes)
+    gone, emptied = None, Words.whole(states == int(CellState.CHANGED_EMPTY))
+    if len(emptied.cells):
+        reached = nothing_reached(min_votes, len(emptied.cells))
         for vote in votes:
-            vote.mark_deleted(states, reached)
-        gone = reached[-1].reshape(states.shape)
+            vote.mark_deleted(emptied, reached)
+        gone = np.zeros(states.shape, dtype=np.uint64)
+        gone.reshape(-1)[emptied.cells] = reached[-1]
     left = [found for found in (vote.remnants(states) for vote in votes) if len(found.cells)]
     if len(left) < min_votes:
         return gone
     cells, marks = counted(left)
     determined = np.sum([vote.determined(cells) for vote in votes], axis=0)
     remnants = packed((marks >= min_votes) & (2 * marks > determined[:, None]))
-    gone = np.zeros(states.shape, dtype=np.uint64) if gone is None else gone.copy()
+    gone = np.zeros(states.shape, dtype=np.uint64) if gone is None else gone
     gone.reshape(-1)[cells] |= remnants
     return gone
 

@@ -71,18 +71,15 @@ class Words:
 
 def union(marked: Sequence[Words]) -> Words:
     """The bits that any of ``marked`` sets."""
-    cells = np.concatenate([mine.cells for mine in marked])
-    if not len(cells):
-        return Words.none()
-    order = np.argsort(cells, kind="stable")
-    first = np.flatnonzero(np.diff(cells[order], prepend=-1))
-    words = np.concatenate([mine.words for mine in marked])[order]
-    return Words(cells[order][first], np.bitwise_or.reduceat(words, first))
+    both = Words.none()
+    for mine in marked:
+        both = Words(*_either(both.cells, both.words, mine.cells, mine.words)) if len(both.cells) else mine
+    return both
 
 
-def nothing_reached(k: int) -> U64:
-    """(k, 65536) the bits that one, two .. k voters set, before any is asked; see :func:`mark`."""
-    return np.zeros((k, CELLS), dtype=np.uint64)
+def nothing_reached(k: int, cells: int = CELLS) -> U64:
+    """(k, cells) the bits that one, two .. k voters set, before any is asked; see :func:`mark`."""
+    return np.zeros((k, cells), dtype=np.uint64)
 
 
 def counted(marked: Sequence[Words]) -> tuple[NDArray[np.intp], I32]:
@@ -97,6 +94,28 @@ def counted(marked: Sequence[Words]) -> tuple[NDArray[np.intp], I32]:
 def packed(bits: Bool) -> U64:
     """(n,) words of bits (n, 64)."""
     return np.asarray((bits.astype(np.uint64) << _BITS).sum(axis=1, dtype=np.uint64))
+
+
+@numba.njit(cache=True, nogil=True)
+def _either(
+    cells_a: NDArray[np.intp], words_a: U64, cells_b: NDArray[np.intp], words_b: U64
+) -> tuple[NDArray[np.intp], U64]:
+    """Two lists of cells, ascending, and their words as one."""
+    most = len(cells_a) + len(cells_b)
+    cells, words = np.empty(most, dtype=np.intp), np.empty(most, dtype=np.uint64)
+    i, k, n = 0, 0, 0
+    while i < len(cells_a) or k < len(cells_b):
+        a = cells_a[i] if i < len(cells_a) else CELLS
+        b = cells_b[k] if k < len(cells_b) else CELLS
+        cells[n], words[n] = min(a, b), np.uint64(0)
+        if a == cells[n]:
+            words[n] |= words_a[i]
+            i += 1
+        if b == cells[n]:
+            words[n] |= words_b[k]
+            k += 1
+        n += 1
+    return cells[:n].copy(), words[:n].copy()
 
 
 @numba.njit(cache=True, nogil=True)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from mapvote.config import FuseSettings
 from mapvote.core.cells import flat_cells
 from mapvote.core.grid import CELLS, TILE_CELLS, Grid
-from mapvote.core.types import F32, I32, I64, N_STATES, NO_VOTE, U8, U16, U64, Bool, CellState
+from mapvote.core.types import F32, I64, N_STATES, NO_VOTE, U8, U16, U64, Bool, CellState
 from mapvote.fusion.sparse_columns import Words, agreed, mark, mark_spoken, union
 
 DAY_NS = 86_400_000_000_000
@@ -101,14 +101,10 @@ class TileVote:
             passed = self.passed()
             mark(reached, passed.cells, passed.words)
 
-    def mark_deleted(self, decided: U8, reached: U64) -> None:
-        """One more voter in ``reached``: of what it :meth:`deletes` of the cells ``decided`` (256, 256) so."""
-        emptied = CellState.CHANGED_EMPTY
-        if self.states is not None and self.gone is not None:
-            deleted = self.gone.at(self.agreed(self.gone.cells, decided, emptied))
-        else:
-            deleted = self.deletes(Words.whole(decided == emptied))
-        mark(reached, deleted.cells, deleted.words)
+    def mark_deleted(self, emptied: Words, reached: U64) -> None:
+        """One more voter in ``reached`` (k, n): of what it :meth:`deletes` among the n cells ``emptied``."""
+        deleted = self.deletes(emptied)
+        mark(reached, np.searchsorted(emptied.cells, deleted.cells), deleted.words)
 
     def deletes(self, among: Words) -> Words:
         """The voxels that this vote says are gone, of the cells that ``among`` names."""
@@ -193,27 +189,26 @@ def fold(drives: Sequence[TileVote], grid: Grid) -> TileVote:
     if len(drives) == 1:
         return drives[0]
     ordered = sorted(drives, key=lambda drive: (drive.end_ns, drive.digest))
-    source = np.full(CELLS, -1, dtype=np.int32)
+    spoken = [drive.spoken().reshape(-1) for drive in ordered]
+    last = _last_words(spoken)
     states = tally = unrestricted = None
     if ordered[0].states is not None:
-        states = _laid_over([drive.states for drive in ordered], source)
+        states = _laid_over([drive.states for drive in ordered])
     else:
         tally = np.zeros((TILE_CELLS, TILE_CELLS, N_STATES), dtype=np.uint16)
-        for i, drive in enumerate(ordered):
-            spoken = drive.spoken()
-            source[spoken.reshape(-1)] = i
+        for drive, mine in zip(ordered, last, strict=True):
             if drive.tally is not None:
-                tally[spoken] = drive.tally[spoken]
+                tally[mine.reshape(tally.shape[:2])] = drive.tally[mine.reshape(tally.shape[:2])]
     if any(drive.unrestricted is not None for drive in ordered):
-        unrestricted = _laid_over([drive.sent for drive in ordered], np.empty_like(source))
+        unrestricted = _laid_over([drive.sent for drive in ordered])
     points: list[F32] = []
     intensity: list[U8] = []
-    for i, drive in enumerate(ordered):
+    for drive, mine in zip(ordered, last, strict=True):
         if drive.new_points is not None:
-            here = source[flat_cells(grid, drive.new_points)] == i
+            here = mine[flat_cells(grid, drive.new_points)]
             points.append(drive.new_points[here])
             intensity.append(drive.measured()[here])
-    free = [drive.passed() for drive in ordered if drive.free is not None]
+    free = [drive.free.within(said) for drive, said in zip(ordered, spoken, strict=True) if drive.free is not None]
     return TileVote(
         vehicle=ordered[-1].vehicle,
         end_ns=ordered[-1].end_ns,
@@ -221,29 +216,35 @@ def fold(drives: Sequence[TileVote], grid: Grid) -> TileVote:
         states=states,
         unrestricted=unrestricted,
         tally=tally,
-        gone=union([_marked(drive, source == i) for i, drive in enumerate(ordered)]),
+        gone=union([_marked(drive, mine) for drive, mine in zip(ordered, last, strict=True)]),
         new_points=np.concatenate(points) if points else None,
         intensity=np.concatenate(intensity) if any(drive.intensity is not None for drive in ordered) else None,
         free=union(free) if free else None,
     )
 
 
-def _laid_over(planes: Sequence[U8 | None], source: I32) -> U8:
-    """(256, 256) the last of the ``planes`` that says anything of a cell; which one that is goes into ``source``
-    (65536,)."""
+def _last_words(spoken: Sequence[Bool]) -> list[Bool]:
+    """Of drives in the order of time, in which flat cells (65536,) each has spoken, and none after it."""
+    since, found = np.zeros(CELLS, dtype=np.bool_), []
+    for mine in reversed(spoken):
+        found.append(mine > since)
+        since = since | mine
+    return found[::-1]
+
+
+def _laid_over(planes: Sequence[U8 | None]) -> U8:
+    """(256, 256) the last of the ``planes`` that says anything of a cell."""
     out = np.full(CELLS, NO_VOTE, dtype=np.uint8)
-    for i, plane in enumerate(planes):
+    for plane in planes:
         if plane is not None:
-            _lay(plane.reshape(-1), i, out, source)
+            _lay(plane.reshape(-1), out)
     return out.reshape(TILE_CELLS, TILE_CELLS)
 
 
 @numba.njit(cache=True, nogil=True)
-def _lay(states: U8, number: int, out: U8, source: I32) -> None:
+def _lay(states: U8, out: U8) -> None:
     for c in range(len(out)):
-        spoken = states[c] != NO_VOTE
-        out[c] = states[c] if spoken else out[c]
-        source[c] = number if spoken else source[c]
+        out[c] = states[c] if states[c] != NO_VOTE else out[c]
 
 
 def _marked(drive: TileVote, mine: Bool) -> Words:
