@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -64,11 +65,13 @@ def report(results: Sequence[Result]) -> None:
     rows = [
         _row(f"`{name}`", [r for r in results if r.module == name], why) for name in dict.fromkeys(_modules(results))
     ]
+    least = min(Counter(r.module for r in results).values())
     lines = [
         "# Do the tests notice a changed operator?",
         "",
         "Random one-operator mutants of the modules that decide, each held against the tests that name its module (an",
-        "operator, a small constant or a negation changed, `min` for `max`, `any` for `all`), as many of every module.",
+        f"operator, a small constant or a negation changed, `min` for `max`, `any` for `all`), {least} of every module or",
+        "more: where most of so few were equal, as many again were drawn (`--mutants 448 --only MODULE`).",
         "*At first* is before anybody had looked at the survivors; then tests were written that state what they break.",
         "*Equal* ones no test can tell from the original; they count as not killed. What is not in the",
         "table has not been run yet: the command goes on where it stopped.",

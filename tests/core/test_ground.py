@@ -9,7 +9,7 @@ import pytest
 
 from mapvote.core.grid import CELL_SIZE, CELLS, TILE_CELLS, Grid, Lattice
 from mapvote.core.ground import base_layers
-from mapvote.core.ground_growing import SEED, UNREACHED, WIDEST, _bounds, _like, grow, tiles_around
+from mapvote.core.ground_growing import SEED, UNREACHED, WIDEST, _bounds, _continued, _like, grow, tiles_around
 from mapvote.core.point_map import map_from_points
 from mapvote.core.reference import reference_window
 from mapvote.core.types import F32, F64
@@ -99,6 +99,17 @@ def test_a_point_may_lie_as_far_off_the_ground_beside_it_as_slopes_and_noise_all
     assert low == pytest.approx(-0.15 * 0.3 - 0.06)
     assert steep == pytest.approx(-0.5 * 0.3 - 0.06)
     assert high == pytest.approx(0.15 * 0.3 + 0.06)
+
+
+@pytest.mark.parametrize(("z", "continues"), [(-1.51, False), (-1.5, True), (0.0, True), (1.5, True), (1.51, False)])
+def test_across_a_gap_ground_may_rise_and_fall_as_far_as_a_slope_and_noise_allow(z: float, continues: bool) -> None:
+    """Over 64 units, 9.6 m, at .15 m a metre and 6 cm: 1.5 m."""
+    cells, ground = 10 * TILE_CELLS + np.arange(10, 13), np.full(CELLS, np.nan, np.float32)
+    start = np.concatenate([[0], np.cumsum(np.bincount(cells, minlength=CELLS))]).astype(np.int32)
+    heights, unreached = np.full(3, z, np.float32), np.full(CELLS, UNREACHED, np.uint8)
+    found = _continued(cells[1], 0.0, 64, start, heights, ground, unreached, tiles_around([(0, 0)]))
+    assert np.isfinite(found) == continues
+    assert not continues or found == np.float32(z)
 
 
 def test_of_24_cells_around_those_count_that_hold_a_point_at_a_like_height_and_the_cell_itself_never() -> None:
