@@ -119,7 +119,9 @@ def try_module(module: str, share: int, seed: int, out: Path, until: float, at_m
     every = list(mutants_of(module, source))
     drawn = random.Random(f"{seed} {module}").sample(every, min(share, len(every)))
     of_source, of_tests = digest(ROOT / "src/mapvote" / module), digest(*(ROOT / "tests" / t for t in TESTS[module]))
-    tried = {(r.seed, r.place): r for r in read_results(out) if r.module == module and r.source == of_source}
+    known = [r for r in read_results(out) if r.module == module]
+    firsts = {r.change: r.first for r in known}  # tests may have been written since the module was as it was then
+    tried = {(r.seed, r.place): r for r in known if r.source == of_source}
     write_results(out, [*(r for r in read_results(out) if r.module != module), *tried.values()])
     done = {r.place for r in tried.values() if r.seed == seed and (r.outcome != "survived" or r.tests == of_tests)}
     waiting = [mutant for mutant in drawn if mutant.place not in done][:at_most]
@@ -131,7 +133,7 @@ def try_module(module: str, share: int, seed: int, out: Path, until: float, at_m
             return
         outcome, seconds = try_mutant(mutant, limit_s)
         before = tried.get((seed, mutant.place))
-        first = before.first if before else outcome
+        first = before.first if before else firsts.get(mutant.change, outcome)
         result = Result(
             seed, module, mutant.place, mutant.line, mutant.change, outcome, first, seconds, of_source, of_tests
         )

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from itertools import permutations
+
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -78,3 +81,13 @@ def test_one_point_a_voxel_the_nearest_to_the_mean_whoever_came_first(seed: int,
         assert abs(chosen - away.min()) < 1e-5
         expected += 1
     assert added == expected == len(edited.points) - 1
+
+
+def test_of_a_point_that_two_vehicles_offer_the_darker_is_taken_whoever_came_first() -> None:
+    """And whatever is offered beside it, to the east and to the west."""
+    tile = replace(make_tile(wall([], [])), fields={"intensity": np.empty(0, np.uint8)})
+    points = wall([(5, 5), (5, 5), (5, 2), (5, 8)], [0.45])
+    bright, voters = np.array([200, 100, 255, 255], np.uint8), np.array([0, 1, 0, 0], np.int32)
+    for order in map(list, permutations(range(4))):
+        edited, _ = add_points(tile, points[order], bright[order], flat_cells(GRID, points[order]), voters[order], 1)
+        assert sorted(edited.fields["intensity"].tolist()) == [100, 255, 255]

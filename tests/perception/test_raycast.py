@@ -119,6 +119,17 @@ def test_points_are_obstacles_from_the_margin_on_as_in_the_map_and_outside_the_w
     assert in_map.tolist() == [False, True, True]
 
 
+def test_every_cell_of_the_window_up_to_its_rim_has_a_number_and_those_around_it_have_none() -> None:
+    reference = flat_reference()
+    rows, cols = (index.ravel() - 1 for index in np.indices((SIDE + 2, SIDE + 2)))
+    middle = np.column_stack(
+        [reference.grid.x0 + CELL_SIZE * (cols + 0.5), reference.grid.y0 + CELL_SIZE * (rows + 0.5)]
+    )
+    cell = find_obstacles(np.column_stack([middle, np.zeros(len(middle))]), reference)[1].reshape(SIDE + 2, SIDE + 2)
+    assert cell[1:-1, 1:-1].ravel().tolist() == list(range(SIDE * SIDE))
+    assert (cell == -1).sum() == 4 * SIDE + 4
+
+
 def test_ranges_on_the_edge_of_a_sorting_step_are_sorted_all_the_same() -> None:
     reach = np.concatenate([np.arange(1, 60) * 0.25 + e for e in (-1e-9, 0.0, 1e-9)])
     points = np.column_stack([reach, np.full(len(reach), 1e-5), np.full(len(reach), 1.8)])
