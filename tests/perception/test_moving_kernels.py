@@ -49,3 +49,10 @@ def test_two_things_with_a_free_cell_between_them_move_each_by_itself() -> None:
     car, wall = [(r, c) for r in (2, 3) for c in (2, 3)], [(r, 5) for r in range(1, 9)]
     brief = [True] * len(car) + [False] * len(wall)
     assert moving(car + wall, brief, np.arange(len(brief), dtype=np.int32)) == brief
+
+
+def test_a_walker_who_touches_a_wall_moves_without_it_though_something_of_the_wall_was_brief_too() -> None:
+    touched, wall, walker = [(4, 4)] * 4, [(4, c) for c in range(1, 9)] * 3, [(5, 4)] * 4
+    brief = [True] + [False] * (len(touched) - 1 + len(wall)) + [True] * len(walker)
+    moves = moving(touched + wall + walker, brief, np.arange(len(brief), dtype=np.int32))
+    assert moves == [False] * (len(touched) + len(wall)) + [True] * len(walker)
