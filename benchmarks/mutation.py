@@ -20,6 +20,7 @@ import signal
 import sys
 import tempfile
 import time
+from collections import Counter
 from pathlib import Path
 from typing import NoReturn
 
@@ -120,7 +121,8 @@ def try_module(module: str, share: int, seed: int, out: Path, until: float, at_m
     drawn = random.Random(f"{seed} {module}").sample(every, min(share, len(every)))
     of_source, of_tests = digest(ROOT / "src/mapvote" / module), digest(*(ROOT / "tests" / t for t in TESTS[module]))
     known = [r for r in read_results(out) if r.module == module]
-    firsts = {r.change: r.first for r in known}  # tests may have been written since the module was as it was then
+    alike = Counter(r.change for r in known)  # tests may have been written since the module was as it was then
+    firsts = {r.change: r.first for r in known if alike[r.change] == 1}
     tried = {(r.seed, r.place): r for r in known if r.source == of_source}
     write_results(out, [*(r for r in read_results(out) if r.module != module), *tried.values()])
     done = {r.place for r in tried.values() if r.seed == seed and (r.outcome != "survived" or r.tests == of_tests)}

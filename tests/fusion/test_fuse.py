@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -192,6 +193,15 @@ def test_one_stage_is_the_sum_of_the_tallies() -> None:
     assert states[CELL] == OCCUPIED
     assert tally[CELL].tolist() == [60 * VOTE_UNIT, 0, 100 * VOTE_UNIT, 0, 10 * VOTE_UNIT]
     assert count(votes, "paper", 2)[0][CELL] == CellState.UNDETERMINED
+
+
+def test_where_points_are_added_the_map_no_longer_knows_free_space_though_no_vehicle_tells_of_rays() -> None:
+    tile = replace(make_tile(wall([], [])), free=words_plane({CELL: 0b1111, (50, 50): 0b1111}))
+    new = vote("a", states_plane({CELL: OCCUPIED}), new_points=wall([CELL], [0.75]))
+    edited = fuse(tile, [new])[1]
+    assert edited.points.tolist() == wall([CELL], [0.75]).tolist()
+    assert edited.free is not None
+    assert [int(edited.free[cell]) for cell in (CELL, (50, 50))] == [0b1011, 0b1111]
 
 
 def test_free_space_is_learned_by_enough_vehicles_and_not_where_the_map_has_points() -> None:
