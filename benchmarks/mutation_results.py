@@ -71,7 +71,7 @@ def report(results: Sequence[Result]) -> None:
         "",
         "Random one-operator mutants of the modules that decide, each held against the tests that name its module (an",
         "operator, a small constant or a negation changed, `min` for `max`, `any` for `all`).",
-        f"{least} of each were drawn, or more: where over two of those were equal, as many again were",
+        f"{least} of each were drawn; where more than two of those were equal, as many again",
         "(`--mutants 448 --only MODULE`).",
         "*At first* is before anybody had looked at the survivors; then tests were written that state what they break.",
         "*Equal* ones no test can tell from the original; they count as not killed. What is not in the",
