@@ -13,11 +13,14 @@ from mapvote.codec.tile_file import base_hash
 from mapvote.codec.words import pack_words
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Lattice, TileIndex
 from mapvote.core.point_map import PointMap
+from mapvote.core.reference import reference_window
 from mapvote.core.tile import Tile
-from mapvote.core.types import F32, NO_VOTE, U8, U16, U64, Scan
+from mapvote.core.types import F32, F64, NO_VOTE, U8, U16, U64, Scan
 from mapvote.fusion.sparse_columns import Words, mark, nothing_reached
 from mapvote.localisation.ndt import PosePrior
 from mapvote.localisation.tracker import Fix
+from mapvote.perception.frontend import Observation, PlacedScan
+from mapvote.perception.raycast import ScanView, find_obstacles
 
 Cell = tuple[int, int]
 SETTINGS = "5e771465" * 8
@@ -37,6 +40,20 @@ def make_tile(points: F32, ground: float = 0.0, index: TileIndex = (0, 0)) -> Ti
 
 def make_map(tiles: Mapping[TileIndex, Tile]) -> PointMap:
     return PointMap("test-map", Lattice(), dict(tiles))
+
+
+def one_scan(point_map: PointMap, points: F64) -> Observation:
+    """A scan of the tile (0, 0): rays through everything but these points (n, 3), map metres."""
+    grid = point_map.lattice.tile((0, 0))
+    here = reference_window(point_map, grid)
+    obstacle, cell = find_obstacles(points, here)
+    hit = np.zeros(grid.shape, np.uint64)
+    for k, z in zip(cell, points[:, 2], strict=True):
+        hit.ravel()[k] |= np.uint64(1 << int(z / CELL_SIZE))
+    still, origin = np.zeros(len(points), np.bool_), np.zeros(3)
+    scan = PlacedScan(0, points, origin, np.array([0.0, 0.0, 1.0]), 0.01, here, here, obstacle, cell)
+    view = ScanView(grid, (hit != 0).astype(np.int32), hit, ~hit, np.zeros((0, 0), np.uint8))
+    return Observation(scan, still, view, here)
 
 
 def states_plane(cells: Mapping[Cell, int] | None = None, fill: int = NO_VOTE) -> U8:

@@ -13,7 +13,7 @@ from hypothesis.extra.numpy import arrays
 from mapvote.core.columns import remnants
 from mapvote.core.types import NO_VOTE, U64, CellState
 from mapvote.core.voting import VOTE_UNIT
-from mapvote.detection.columns import weigh
+from mapvote.detection.columns import CLEAR_SCANS, weigh
 from mapvote.detection.counters import PLANES, STRUCK_ITSELF, THROUGH_ITSELF, WORDS
 from mapvote.detection.regions import drop_specks, fallen, unexplained
 from mapvote.detection.rules import ALL_RULES, Rules
@@ -84,6 +84,14 @@ def test_rule_e_what_is_hardly_ever_seen_through_is_not_called_gone() -> None:
     through = {1: 40, **around({12: 3})}
     assert state(through, {}, occupied=1 << 12) == UN
     assert state(through, {}, occupied=1 << 12, rules=Rules(rays_count_less=False)) == CE
+
+
+def test_rule_e_what_one_scan_alone_saw_through_is_not_called_gone() -> None:
+    assert state(around({3: CLEAR_SCANS - 1}), {}, occupied=0b1000) == UN
+    assert state(around({3: CLEAR_SCANS}), {}, occupied=0b1000) == CE
+    many = around(dict.fromkeys(range(2, 30), 1))
+    assert state(many, {}, occupied=(1 << 30) - 4) == UN, "nor if it saw through a whole wall"
+    assert state(around({3: 1}), {}, occupied=0b1000, rules=Rules(rays_count_less=False)) == CE
 
 
 def test_rule_c_sets_apart_what_lies_only_next_to_mapped_voxels() -> None:

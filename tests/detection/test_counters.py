@@ -103,6 +103,14 @@ def test_a_mapped_voxel_also_keeps_what_befell_it_alone() -> None:
     assert (cell[STRUCK_ITSELF], cell[THROUGH_ITSELF]) == (0b1100, 0b100)
 
 
+def test_a_mapped_voxel_within_the_error_of_a_hit_beside_it_was_struck_itself() -> None:
+    hit = NOTHING.copy()
+    hit[3, 3] = 0b100
+    evidence = Evidence(Lattice())
+    evidence.count(view_of(hit, middle(0b100)), reference_of(middle(0b100)), touched=middle(0b110))
+    assert evidence.tiles[(0, 0)][AT][STRUCK_ITSELF] == 0b100
+
+
 def test_a_scan_that_is_unsure_of_its_pose_says_of_no_single_voxel_that_a_ray_went_through() -> None:
     evidence = Evidence(Lattice())
     evidence.count(view_of(NOTHING, middle(0b100)), reference_of(middle(0b100)), 2)

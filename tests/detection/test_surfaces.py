@@ -8,14 +8,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from hand_made import make_map, make_tile, wall
+from hand_made import make_map, make_tile, one_scan, wall
 from mapvote.config import VotingSettings
 from mapvote.core.grid import CELL_SIZE
 from mapvote.core.point_map import PointMap
-from mapvote.core.reference import reference_window
 from mapvote.core.types import F64, NO_VOTE, U64, Bool, CellState
 from mapvote.detection.counters import PLANES, count_of
-from mapvote.detection.surface_counts import CROSSED, HIT_REACH_M, MET, WORDS, SurfaceEvidence
+from mapvote.detection.near_hits import HIT_REACH_M
+from mapvote.detection.surface_counts import CROSSED, MET, WORDS, SurfaceEvidence
 from mapvote.detection.surfaces import (
     GONE_RAYS,
     HIT_RAYS,
@@ -27,12 +27,9 @@ from mapvote.detection.surfaces import (
     weigh_surfaces,
 )
 from mapvote.detection.votes import TileVotes
-from mapvote.perception.frontend import Observation, PlacedScan
-from mapvote.perception.raycast import ScanView, find_obstacles
 
 ROW, COLUMNS = 100, range(100, 112)
 HEIGHTS = [0.75, 1.05, 1.35, 1.65]
-ALL_BITS = ~np.uint64(0) >> np.uint64(1)
 UO, CO, CE, UN = (
     CellState.UNCHANGED_OCCUPIED, CellState.CHANGED_OCCUPIED, CellState.CHANGED_EMPTY, CellState.UNDETERMINED,
 )  # fmt: skip
@@ -41,20 +38,6 @@ UO, CO, CE, UN = (
 def street(standing: list[tuple[int, int]], heights: list[float]) -> PointMap:
     ground = wall([(r, c) for r in range(85, 125) for c in range(85, 135)], [0.0])
     return make_map({(0, 0): make_tile(np.concatenate([wall(standing, heights), ground]))})
-
-
-def one_scan(point_map: PointMap, points: F64) -> Observation:
-    """Rays through everything but these points (n, 3)."""
-    grid = point_map.lattice.tile((0, 0))
-    here = reference_window(point_map, grid)
-    obstacle, cell = find_obstacles(points, here)
-    hit = np.zeros(grid.shape, np.uint64)
-    for k, z in zip(cell, points[:, 2], strict=True):
-        hit.ravel()[k] |= np.uint64(1 << int(z / CELL_SIZE))
-    still, origin = np.zeros(len(points), np.bool_), np.zeros(3)
-    scan = PlacedScan(0, points, origin, np.array([0.0, 0.0, 1.0]), 0.01, here, here, obstacle, cell)
-    view = ScanView(grid, (hit != 0).astype(np.int32), hit, ~hit & ALL_BITS, np.zeros((0, 0), np.uint8))
-    return Observation(scan, still, view, here)
 
 
 def after(point_map: PointMap, points: F64, scans: int = 8) -> TileVotes:

@@ -5,13 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hand_made import make_map, make_tile, wall
+from hand_made import make_map, make_tile, one_scan, wall
 from mapvote.config import VotingSettings
+from mapvote.core.grid import CELL_SIZE
 from mapvote.core.point_map import PointMap
 from mapvote.core.reference import reference_window
 from mapvote.core.types import CellState
 from mapvote.detection.column_voter import ColumnVoter
 from mapvote.detection.counters import Evidence
+from mapvote.detection.near_hits import HIT_REACH_M
 from mapvote.detection.regions import beside_new
 from mapvote.detection.rules import ALL_RULES, Rules
 from mapvote.detection.votes import TileVotes
@@ -77,6 +79,23 @@ def test_no_cell_falls_as_a_remnant_next_to_hits_on_something_new() -> None:
     """An error of pose puts what stands beside its place in the map: voxels may go, the cell does not change."""
     votes = after({(ROW + 1, POST - 1): [0.75, 1.05]})
     assert votes.states[ROW, POST - 1] == CellState.UNCHANGED_OCCUPIED
+
+
+def test_what_is_hit_some_centimetres_beside_its_voxel_is_no_remnant() -> None:
+    """A twig beside the wall that went: its leaf is mapped in one voxel, and met in the next."""
+
+    def left_of_the_cornice(apart_m: float) -> bool:
+        voter = ColumnVoter(VotingSettings(), street())
+        y, x, beside_x = (ROW + 0.5) * CELL_SIZE, (POST + 0.5) * CELL_SIZE, (POST + 1) * CELL_SIZE + apart_m
+        for _ in range(8):
+            voter.observe(one_scan(voter.point_map, np.array([*((x, y, z) for z in POST_Z), (beside_x, y, CORNICE_Z)])))
+        votes = voter.votes()[0, 0]
+        assert votes.states[ROW, WALL[0]] == CellState.CHANGED_EMPTY
+        assert votes.remnants is not None
+        return bool(votes.remnants[ROW, POST] & bits([CORNICE_Z]))
+
+    assert not left_of_the_cornice(0.5 * HIT_REACH_M)
+    assert left_of_the_cornice(1.5 * HIT_REACH_M)
 
 
 @pytest.mark.parametrize("bit", [3, 40])

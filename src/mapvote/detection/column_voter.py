@@ -14,6 +14,7 @@ from mapvote.core.reference import bordered
 from mapvote.core.types import U64
 from mapvote.detection.columns import weigh
 from mapvote.detection.counters import Evidence, newly_free
+from mapvote.detection.near_hits import near_hits
 from mapvote.detection.regions import apply_region_rules, around, beside_new
 from mapvote.detection.rules import ALL_RULES, Rules
 from mapvote.detection.votes import Judged, TileVotes
@@ -43,7 +44,7 @@ class ColumnVoter:
     def observe(self, seen: Observation) -> U64:
         """Count one scan; returns (rows, cols) words of voxels whose points may be new."""
         reach = 2 if seen.scan.sigma_m > WIDE_SIGMA_M else 1
-        self.evidence.count(seen.view, seen.reference, reach)
+        self.evidence.count(seen.view, seen.reference, reach, near_hits(seen))
         return outside(seen.view.hit, seen.reference.occupied)
 
     def votes(self) -> dict[TileIndex, TileVotes]:

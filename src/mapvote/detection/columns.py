@@ -28,6 +28,9 @@ GONE_VOTES = 0.125
 """Rule E: votes of a ray through a mapped voxel, against one for a hit near it: foliage lets seven of eight through."""
 CLEAR_SHARE = 0.3
 """Rule E: of the scans with rays through a cell, the share that must have seen through what it held."""
+CLEAR_SCANS = 2
+"""Rule E: of how many scans one voxel must have been seen through. What is wrong with a scan, where it was taken or
+what mirrored it, is wrong with all its rays; free space is learned from two scans as well."""
 BRIEF_SHARE = 0.35
 """Rule G: a new voxel struck in fewer of the scans able to was only passed by."""
 
@@ -96,6 +99,7 @@ class Weights(NamedTuple):
     empty_votes: float
     gone_votes: float
     clear_share: float
+    clear_scans: int
     brief_share: float
 
 
@@ -157,8 +161,8 @@ def _weigh(maps: Maps, w: Weights, tally: I32, gone: U64, new: U64, beside: Bool
             rays, votes = _most_through(cell), tally[r, c]
             if mapped:
                 kept, lost, clear, gone[r, c] = _weigh_mapped(cell, mapped, w)
-                if low or clear < w.clear_share * rays:
-                    lost = 0  # hardly ever seen through: foliage, or the end of the view
+                if low or clear < max(w.clear_share * rays, w.clear_scans):
+                    lost = 0  # hardly ever seen through: foliage, the end of the view, or what one scan erred in
                 if lost and not kept:
                     gone[r, c] |= mapped & ~struck  # what no ray reached goes with what it stood on
                 if not (kept or lost or low):
@@ -212,5 +216,6 @@ def _weights(rules: Rules) -> Weights:
         empty_votes=EMPTY_VOTES if f else 1.0,
         gone_votes=GONE_VOTES if e else 1.0,
         clear_share=CLEAR_SHARE if e else 0.0,
+        clear_scans=CLEAR_SCANS if e else 0,
         brief_share=BRIEF_SHARE if g else 0.0,
     )

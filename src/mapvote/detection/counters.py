@@ -4,8 +4,8 @@ Two counters a voxel, kept as bit planes: plane k of a cell is a 64-bit word tha
 counts of its 64 voxels, so that one scan adds to a whole column with a few word operations. A voxel that the map
 holds counts as struck if anything near it was hit (8 neighbouring cells, one layer up or down), and
 then not as seen through, whatever grazed past it in the same scan; any other voxel must be hit itself.
-Two more words a cell say of its mapped voxels, whatever lies next to them, whether a hit ever fell into them and
-whether a ray ever went through (rule I).
+Two more words a cell say of its mapped voxels, whatever lies next to them, whether a hit ever fell into them, or beside
+them within its own error, and whether a ray ever went through (rule I).
 Cells whose ground the map does not know gather nothing: heights would mean nothing there, and the map knows nothing.
 """
 
@@ -89,6 +89,7 @@ def is_open(planes: U64, bit: int) -> bool:
 def _gather(
     planes: U64, shape: tuple[int, int], row0: int, col0: int,
     hit: U64, passed: U64, sight: U8, occupied: U64, ground_z: F32, base: I32, reach: int, by_ray: bool, veto: bool,
+    touched: U64,
 ) -> None:  # fmt: skip
     """Add one scan to a tile: the first ``shape`` cells of ``planes``, from (row0, col0) of the window."""
     for i in range(shape[0]):
@@ -106,7 +107,7 @@ def _gather(
             if through or struck:
                 cell = planes[i, j]
                 if mapped:
-                    cell[STRUCK_ITSELF] |= hit[r, c] & mapped
+                    cell[STRUCK_ITSELF] |= (hit[r, c] | touched[r, c]) & mapped
                     if reach == 1:  # where a scan is not sure of its pose, single voxels mean nothing
                         cell[THROUGH_ITSELF] |= passed[r, c] & mapped & ~hit[r, c]
                 if is_full(cell, _THROUGH, through) or is_full(cell, _STRUCK, struck):
@@ -127,8 +128,10 @@ class Evidence:
         self.lattice, self.by_ray, self.veto = lattice, by_ray, veto
         self.tiles = PackedTiles(lattice, WORDS)
 
-    def count(self, view: ScanView, reference: Reference, reach: int = 1) -> None:
-        """Count a scan seen against ``reference``; ``reach`` cells around a hit it may stand for (pose uncertainty)."""
+    def count(self, view: ScanView, reference: Reference, reach: int = 1, touched: U64 | None = None) -> None:
+        """Count a scan seen against ``reference``; ``reach`` cells around a hit it may stand for (pose uncertainty).
+        ``touched`` (rows, cols): voxels within a hit's own error, for rule I; else only those that were hit."""
+        touched = view.hit if touched is None else touched
         for tile in view.grid.tiles():
             window = self.lattice.tile(tile)
             common = window.intersection(view.grid)
@@ -137,6 +140,7 @@ class Evidence:
             _gather(
                 planes, common.shape, row0, col0, view.hit, view.passed, view.sight,
                 reference.occupied, reference.ground_z, reference.base, reach, self.by_ray, self.veto,
+                touched,
             )  # fmt: skip
         self.tiles.leave(view.grid)
 

@@ -160,8 +160,9 @@ def beside_new(planes: U64, occupied: U64, base: I32) -> U64:
 
 
 def loose_voxels(planes: U64) -> U64:
-    """(rows, cols) mapped voxels into which no hit ever fell, and through which rays went, as through the voxels above
-    and below them: grazing a roof says nothing (rule A). The ground bounds the lowest, the end of the word the highest.
+    """(rows, cols) mapped voxels into which, or beside which within its own error, no hit ever fell, and through which
+    rays went, as through the voxels above and below them: grazing a roof says nothing (rule A). The ground bounds the
+    lowest, the end of the word the highest.
     """
     itself = planes[..., THROUGH_ITSELF]
     through = ever(planes, 0) | itself

@@ -13,41 +13,20 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from mapvote.core.columns import TOP_BIT, column_bit
-from mapvote.core.grid import CELL_SIZE, Lattice
-from mapvote.core.types import F32, F64, I32, U64, Bool
+from mapvote.core.columns import TOP_BIT
+from mapvote.core.grid import Lattice
+from mapvote.core.types import F32, U64
 from mapvote.detection.counters import PLANES, add_one, halve, is_full
+from mapvote.detection.near_hits import near_hits
 from mapvote.detection.packed_tiles import PackedTiles
 from mapvote.perception.frontend import Observation
-from mapvote.perception.raycast import find_obstacles
 
-HIT_REACH_M = 0.1
-"""How far from it a hit may speak for a surface: range noise and pose sigma together, three times over (docs/decisions/
-evidence.md has what other reaches do)."""
 CROSSED, MET = 0, PLANES
 PASSED = 2 * PLANES
 WORDS = 2 * PLANES + 1
 """Words a cell: the two counters, and what any ray passed."""
 _LOWEST, _HIGHEST = np.uint64(0b11), np.uint64(1) << np.uint64(TOP_BIT - 1)
 """The ground bounds the lowest voxel, the end of the word the highest."""
-
-
-@numba.njit(cache=True, nogil=True)
-def _mark_near(
-    points: F64, cell: I32, chosen: Bool, base: I32, corner: tuple[float, float], reach: float, near: U64
-) -> None:
-    """Enter into ``near`` (rows, cols) the voxels that come within ``reach`` metres, along each axis, of the points."""
-    rows, cols = base.shape
-    for i in range(len(points)):
-        if not chosen[i] or cell[i] < 0:
-            continue
-        r, c = cell[i] // cols, cell[i] % cols
-        x, y, z = points[i, 0] - corner[0] - c * CELL_SIZE, points[i, 1] - corner[1] - r * CELL_SIZE, points[i, 2]
-        last_r, last_c = min(r + (y > CELL_SIZE - reach), rows - 1), min(c + (x > CELL_SIZE - reach), cols - 1)
-        for k in range(max(r - (y < reach), 0), last_r + 1):
-            for j in range(max(c - (x < reach), 0), last_c + 1):
-                low, high = column_bit(z - reach, base[k, j]), column_bit(z + reach, base[k, j])
-                near[k, j] |= (np.uint64(2) << np.uint64(high)) - (np.uint64(1) << np.uint64(low))
 
 
 @numba.njit(cache=True, nogil=True)
@@ -81,11 +60,7 @@ class SurfaceEvidence:
 
     def count(self, seen: Observation) -> None:
         """Count one scan."""
-        view, here, scan = seen.view, seen.reference, seen.scan
-        near, base = np.zeros(view.grid.shape, dtype=np.uint64), np.ascontiguousarray(here.base)
-        cell = scan.cell if here is scan.reference else find_obstacles(scan.points_map, here)[1]
-        still = scan.obstacle & ~seen.moving
-        _mark_near(scan.points_map, cell, still, base, (view.grid.x0, view.grid.y0), HIT_REACH_M, near)
+        view, here, near = seen.view, seen.reference, near_hits(seen)
         for tile in view.grid.tiles():
             window = self.lattice.tile(tile)
             common = window.intersection(view.grid)
