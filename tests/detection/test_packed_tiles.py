@@ -89,4 +89,4 @@ def test_blocks_of_packed_tiles_say_what_all_of_them_say_at_once(monkeypatch: py
         for name in TileVotes.__slots__:
             np.testing.assert_array_equal(getattr(blocks[tile], name), getattr(votes, name), err_msg=f"{tile} {name}")
         changed += int(((votes.states == 2) | (votes.states == 3)).sum())
-    assert changed > 100
+    assert changed > 50, "there is something to compare"
