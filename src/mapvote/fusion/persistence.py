@@ -109,7 +109,9 @@ def remembered(memory: Memory, before: Tile, after: Tile, votes: Sequence[TileVo
     stays += 1
     stayed_s += np.maximum(_first_s(votes, went, _CE), came_s) - came_s
     came_s[:] = 0
-    return memory.but(np.concatenate([came, went]), np.concatenate([of_new, of_gone], axis=1))
+    cells, values = np.concatenate([came, went]), np.concatenate([of_new, of_gone], axis=1)
+    order = np.argsort(cells)
+    return memory.but(cells[order], values[:, order])
 
 
 @numba.njit(cache=True, nogil=True)

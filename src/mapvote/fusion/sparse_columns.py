@@ -158,6 +158,18 @@ def mark_spoken(reached: U64, cells: NDArray[np.intp], words: U64, own: U8) -> N
 
 
 @numba.njit(cache=True, nogil=True)
+def mark_among(reached: U64, cells: NDArray[np.intp], words: U64, own: U8, said: int, among: NDArray[np.intp]) -> None:
+    """:func:`mark` of the cells that are ``among`` these (n,), ascending too, and that the voter's ``own`` states
+    (256, 256) call ``said``; of ``reached`` (k, n) by their place among them."""
+    own, k = own.reshape(-1), 0
+    for i in range(len(cells)):
+        while k < len(among) and among[k] < cells[i]:
+            k += 1
+        if k < len(among) and among[k] == cells[i] and own[cells[i]] == said:
+            _mark_one(reached, k, words[i])
+
+
+@numba.njit(cache=True, nogil=True)
 def learned(free: U64, occupied: U64, passed: U64) -> bool:
     """Make of the words ``passed`` (65536,) those that are ``free`` then: with what was free before, without what is
     ``occupied``. Whether that is anything else than before."""

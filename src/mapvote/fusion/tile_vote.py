@@ -17,7 +17,7 @@ from mapvote.config import FuseSettings
 from mapvote.core.cells import flat_cells
 from mapvote.core.grid import CELLS, TILE_CELLS, Grid
 from mapvote.core.types import F32, I64, N_STATES, NO_VOTE, U8, U16, U64, Bool, CellState
-from mapvote.fusion.sparse_columns import Words, agreed, mark, mark_spoken, union
+from mapvote.fusion.sparse_columns import Words, agreed, mark, mark_among, mark_spoken, union
 
 DAY_NS = 86_400_000_000_000
 
@@ -103,8 +103,12 @@ class TileVote:
 
     def mark_deleted(self, emptied: Words, reached: U64) -> None:
         """One more voter in ``reached`` (k, n): of what it :meth:`deletes` among the n cells ``emptied``."""
-        deleted = self.deletes(emptied)
-        mark(reached, np.searchsorted(emptied.cells, deleted.cells), deleted.words)
+        if self.states is not None and self.gone is not None:
+            said = int(CellState.CHANGED_EMPTY)
+            mark_among(reached, self.gone.cells, self.gone.words, self.states, said, emptied.cells)
+        else:
+            deleted = self.deletes(emptied)
+            mark(reached, np.searchsorted(emptied.cells, deleted.cells), deleted.words)
 
     def deletes(self, among: Words) -> Words:
         """The voxels that this vote says are gone, of the cells that ``among`` names."""
