@@ -106,8 +106,8 @@ def _sparse(cells: I64, values: U32, sure: bool) -> Memory:
 
 @numba.njit(cache=True, nogil=True)
 def _joined(known: I64, values: U32, cells: I64) -> tuple[I64, U32, I64]:
-    """(all of the cells ``known`` (n,) and ``cells`` (m,), ascending like both; their ``values`` (4, n), zero where they
-    are new; which of all each of ``cells`` is (m,))."""
+    """(all of the cells ``known`` (n,) and ``cells`` (m,), ascending like both; their ``values`` (4, n), zero where
+    they are new; which of all each of ``cells`` is (m,))."""
     most = len(known) + len(cells)
     joined, planes = np.empty(most, dtype=np.int64), np.zeros((PLANES, most), dtype=np.uint32)
     at = np.empty(len(cells), dtype=np.int64)
