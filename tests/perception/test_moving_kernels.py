@@ -19,7 +19,7 @@ def plane(inner: Bool) -> Bool:
 
 
 @given(arrays(np.bool_, (SIDE - 2, SIDE - 2)), arrays(np.bool_, (SIDE - 2, SIDE - 2)))
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=15, deadline=None)
 def test_wanted_cells_are_of_one_component_that_touch_or_are_joined_by_other_wanted_ones(
     held: Bool, want: Bool
 ) -> None:
