@@ -112,7 +112,7 @@ def test_cells_differ_that_hold_other_points_whatever_coordinates_these_share(a:
 
     one, other = (make_tile(np.array(points, np.float32).reshape(-1, 3)) for points in (a, b))
     cells = [[r, c] for r in (0, 1) for c in (0, 1) if of_cell(a, r, c) != of_cell(b, r, c)]
-    assert cells_of(differing(one, other)) == cells
+    assert cells_of(differing(one, other)) == cells_of(differing(other, one)) == cells
 
 
 def test_points_that_swap_their_heights_are_other_points() -> None:
