@@ -22,9 +22,9 @@ from mapvote.codec.words import unpack_sparse
 from mapvote.core.grid import TILE_CELLS, TileIndex
 from mapvote.core.types import F32, N_STATES, NO_VOTE, U8, U16, MapvoteError
 
-FORMAT_VERSION = 3
-"""3: new points by their voxels; 2: as float32, masks and free space as the words of some cells; 1: these as whole
-planes. All are read."""
+FORMAT_VERSION = 4
+"""4: new points by their voxels, to 32nds; 3: to 128ths; 2: as float32, masks and free space as the words of some
+cells; 1: these as whole planes. All are read."""
 MAX_TILES = 4096
 MAX_TILE_INDEX = 1 << 20
 _CELLS = TILE_CELLS * TILE_CELLS

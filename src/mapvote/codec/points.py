@@ -1,9 +1,9 @@
-"""New points of a tile <-> bytes: the voxel of each, and where in it to a 128th of its side.
+"""New points of a tile <-> bytes: the voxel of each, and where in it to a 32nd of its side.
 
-A millimetre is less than a sensor sees and a vehicle knows of its place, yet as float32 three quarters of a ballot were
-such digits. So vehicles round: a point stays in its voxel and moves by 1.2 mm along each axis at the most. Under zstd
-lie a mark, the ways from each point's cell to the next as two planes of bytes, from each layer to the next as four, and
-the places in the voxels as three. Older ballots hold (m, 3) float32: the length tells which.
+Half a centimetre is less than a sensor sees and a vehicle knows of its place, yet as float32 three quarters of a ballot
+were such digits. So vehicles round: a point stays in its voxel and moves by 4.7 mm along each axis at the most. Under
+zstd lie a mark, the ways from each point's cell to the next as two planes of bytes, from each layer to the next as
+four, and the places in the voxels as three. Older ballots hold finer places, or (m, 3) float32: mark and length tell.
 """
 
 from __future__ import annotations
@@ -17,18 +17,20 @@ from mapvote.core.types import F32, U8, MapvoteError
 
 MAX_POINTS_PER_CELL = 64
 """One new point per voxel of a column: no honest ballot has more."""
-MOST_OFF_M = 0.5 * CELL_SIZE / 128
+_MARK, _STEPS = 4, 32
+"""A voxel's side has so many steps, as the mark says. With it the length is never a multiple of three, as that of
+float32 always is."""
+_STEPS_OF = {3: 128, _MARK: _STEPS}
+MOST_OFF_M = 0.5 * CELL_SIZE / _STEPS
 """How far rounding moves a point along an axis, but for what float32 adds."""
-_MARK = b"\x03"
-"""With it the length is never a multiple of three, as that of float32 always is."""
-_BYTES, _STEPS = 9, 128
+_BYTES = 9
 _MAX_BYTES = CELLS * MAX_POINTS_PER_CELL * 12
 _TOP_M = 1e5
 
 
 def pack_points(points: F32) -> bytes:
     """(m, 3) from the tile's corner, inside it, in any order."""
-    return compress(_MARK + _planes(points).tobytes())
+    return compress(bytes([_MARK]) + _planes(points).tobytes())
 
 
 def unpack_points(data: bytes) -> F32:
@@ -46,9 +48,9 @@ def unpack_sound_points(data: bytes) -> F32:
     raw = np.frombuffer(unpack_bytes(data, _MAX_BYTES, "ballot: new_points"), dtype=np.uint8)
     if len(raw) % 12 == 0:
         points, sound = raw.view("<f4").reshape(-1, 3), True
-    elif len(raw) % _BYTES == 1 and raw[0] == _MARK[0]:
+    elif len(raw) % _BYTES == 1 and int(raw[0]) in _STEPS_OF:
         points = np.empty((len(raw) // _BYTES, 3), dtype=np.float32)
-        sound = _placed(raw[1:].reshape(_BYTES, -1), points)
+        sound = _placed(raw[1:].reshape(_BYTES, -1), _STEPS_OF[int(raw[0])], points)
     else:
         raise MapvoteError(f"ballot: new_points has {len(raw)} bytes, which is no number of points")
     if not sound or not _all_inside(points, np.float32(TILE_CELLS * CELL_SIZE)):
@@ -58,7 +60,7 @@ def unpack_sound_points(data: bytes) -> F32:
 
 @numba.njit(cache=True, nogil=True)
 def _planes(points: F32) -> U8:
-    """(9, m) of points (m, 3): differences modulo 2 ** 16 and 2 ** 32, lowest byte first, and 128ths of a voxel."""
+    """(9, m) of points (m, 3): differences modulo 2 ** 16 and 2 ** 32, lowest byte first, and steps in a voxel."""
     planes = np.empty((_BYTES, len(points)), dtype=np.uint8)
     last_cell, last_layer = np.int64(0), np.int64(0)
     voxel = np.empty(3, dtype=np.int64)
@@ -79,7 +81,7 @@ def _planes(points: F32) -> U8:
 
 
 @numba.njit(cache=True, nogil=True)
-def _placed(planes: U8, points: F32) -> bool:
+def _placed(planes: U8, steps: int, points: F32) -> bool:
     """Fill ``points`` (m, 3) from (9, m); whether each lies in its voxel."""
     cell, layer, sound = np.int64(0), np.int64(0), True
     for i in range(len(points)):
@@ -89,8 +91,8 @@ def _placed(planes: U8, points: F32) -> bool:
             way |= np.int64(planes[2 + k, i]) << (8 * k)
         layer = ((layer + way + (1 << 31)) & 0xFFFFFFFF) - (1 << 31)
         for axis, voxel in enumerate((cell % TILE_CELLS, cell // TILE_CELLS, layer)):
-            points[i, axis] = (voxel + (planes[6 + axis, i] + 0.5) / _STEPS) * CELL_SIZE
-            sound &= planes[6 + axis, i] < _STEPS
+            points[i, axis] = (voxel + (planes[6 + axis, i] + 0.5) / steps) * CELL_SIZE
+            sound &= planes[6 + axis, i] < steps
     return sound
 
 

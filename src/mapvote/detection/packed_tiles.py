@@ -9,6 +9,7 @@ import numpy as np
 
 from mapvote.codec.arrays import compress, unpack_bytes
 from mapvote.core.grid import CELLS, TILE_CELLS, Grid, Lattice, TileIndex
+from mapvote.core.heap import give_back_free_pages
 from mapvote.core.types import U64
 from mapvote.detection.shelf import Place, Shelf
 
@@ -56,6 +57,7 @@ class PackedTiles(Mapping[TileIndex, U64]):
             if common.rows == 0 or common.cols == 0:
                 self._packed[tile] = self._shelf.put(_packed(planes))
                 self._spare.append(self._open.pop(tile))
+                give_back_free_pages()
                 return
 
     def _new(self) -> U64:
