@@ -125,7 +125,7 @@ def test_ctrl_c_while_a_version_is_being_written_leaves_no_version(line: str, de
     """Its row is there by then, in a transaction that never ends."""
     here = desk("STORE")
     before = what_is_in(here / "STORE")
-    patch = "import mapvote.server.store.commit as m; m.tile_row = wait"
+    patch = "import mapvote.server.store.commit as m; m.set_tiles = wait"
     done = interrupt(slowed(line.split(), patch), here, (here / "ready").exists)
     assert stopped_by_a_line(done)
     assert what_is_in(here / "STORE") == before
