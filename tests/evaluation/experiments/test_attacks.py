@@ -7,7 +7,7 @@ import pytest
 
 from hand_made import SHAPE, Say, make_ballot, states_plane, two_walls, wall, words_plane
 from mapvote.codec.ballot import Ballot, decode, encode, unpack_states
-from mapvote.codec.points import unpack_points
+from mapvote.codec.points import MOST_OFF_M, unpack_points
 from mapvote.codec.words import unpack_words
 from mapvote.config import FuseSettings
 from mapvote.core.point_map import PointMap
@@ -93,7 +93,7 @@ def test_shifting_moves_states_masks_and_points_together() -> None:
     assert unpack_states(tile.states)[BUILT[0] + k, BUILT[1] + k] == CellState.CHANGED_OCCUPIED
     assert unpack_words(tile.gone, "gone")[GONE[0] + k, GONE[1] + k] == 0b1110
     moved = unpack_points(tile.new_points) - wall([BUILT], [0.45, 0.75, 1.05])
-    np.testing.assert_allclose(moved, np.tile([0.3 * k, 0.3 * k, 0.0], (3, 1)), atol=2e-3)
+    np.testing.assert_allclose(moved, np.tile([0.3 * k, 0.3 * k, 0.0], (3, 1)), atol=MOST_OFF_M + 1e-4)
 
 
 def test_false_points_leave_the_states_right_and_delete_whole_columns() -> None:
