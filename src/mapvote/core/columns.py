@@ -94,8 +94,9 @@ def neighbourhood(words: U64, base: I32, r: int, c: int, reach: int) -> np.uint6
     """Voxels of column (r, c) within ``reach`` cells (a square) and one layer of a set bit; bases may differ."""
     rows, cols = words.shape
     near = np.uint64(0)
-    for i in range(max(r - reach, 0), min(r + reach + 1, rows)):
-        for j in range(max(c - reach, 0), min(c + reach + 1, cols)):
+    first, last = np.uint64(max(c - reach, 0)), np.uint64(min(c + reach + 1, cols))
+    for i in range(np.uint64(max(r - reach, 0)), np.uint64(min(r + reach + 1, rows))):
+        for j in range(first, last):
             if words[i, j]:
                 near |= shifted(words[i, j], base[i, j] - base[r, c])
     return near | (near << np.uint64(1)) | (near >> np.uint64(1))

@@ -92,14 +92,14 @@ def _gather(
     touched: U64,
 ) -> None:  # fmt: skip
     """Add one scan to a tile: the first ``shape`` cells of ``planes``, from (row0, col0) of the window."""
-    for i in range(shape[0]):
-        for j in range(shape[1]):
-            r, c = row0 + i, col0 + j
-            if np.isnan(ground_z[r, c]):
-                continue
+    for i in range(np.uint64(0), np.uint64(shape[0])):
+        for j in range(np.uint64(0), np.uint64(shape[1])):
+            r, c = np.uint64(row0) + i, np.uint64(col0) + j
             through, struck, mapped = passed[r, c] & ~hit[r, c], hit[r, c], occupied[r, c]
+            if not (through | struck | mapped) or np.isnan(ground_z[r, c]):
+                continue
             if mapped:
-                near = neighbourhood(hit, base, r, c, reach) & mapped if veto else hit[r, c] & mapped
+                near = neighbourhood(hit, base, np.int64(r), np.int64(c), reach) & mapped if veto else hit[r, c] & mapped
                 if not by_ray and sight[r, c] >= _BEHIND and not hit[r, c]:
                     through |= mapped
                 struck = (struck & ~mapped) | near

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from mapvote.core.columns import column_bit
+from mapvote.core.columns import TOP_BIT
 from mapvote.core.grid import CELL_SIZE
 from mapvote.core.types import F64, I32, U64, Bool
 from mapvote.perception.frontend import Observation
@@ -16,28 +16,39 @@ HIT_REACH_M = 0.1
 evidence.md has what other reaches do)."""
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(inline="always")
+def _mark(cell: int, lowest: int, highest: int, base: I32, near: U64) -> None:
+    """The layers ``lowest`` to ``highest`` of the world into a column; what is outside its word goes to its ends."""
+    low, high = min(max(lowest - base[cell], 0), TOP_BIT), min(max(highest - base[cell], 0), TOP_BIT)
+    near[cell] |= (np.uint64(2) << np.uint64(high)) - (np.uint64(1) << np.uint64(low))
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _mark_near(
-    points: F64, cell: I32, chosen: Bool, base: I32, corner: tuple[float, float], reach: float, near: U64
+    points: F64, cell: I32, chosen: Bool, base: I32, cols: int, corner: tuple[float, float], reach: float, near: U64
 ) -> None:
-    """Enter into ``near`` (rows, cols) the voxels that come within ``reach`` metres, along each axis, of the points."""
-    rows, cols = base.shape
-    for i in range(len(points)):
+    """Enter into ``near`` the voxels that come within ``reach`` cells, along each axis, of the points; it and ``base``
+    are flat planes, ``cols`` wide. Four cells a point, mostly the same ones: to ask which would take longer."""
+    last_row, last_col = len(base) // cols - 1, cols - 1
+    for i in range(np.uint64(0), np.uint64(len(points))):
         if not chosen[i] or cell[i] < 0:
             continue
-        r, c = cell[i] // cols, cell[i] % cols
-        x, y, z = points[i, 0] - corner[0] - c * CELL_SIZE, points[i, 1] - corner[1] - r * CELL_SIZE, points[i, 2]
-        last_r, last_c = min(r + (y > CELL_SIZE - reach), rows - 1), min(c + (x > CELL_SIZE - reach), cols - 1)
-        for k in range(max(r - (y < reach), 0), last_r + 1):
-            for j in range(max(c - (x < reach), 0), last_c + 1):
-                low, high = column_bit(z - reach, base[k, j]), column_bit(z + reach, base[k, j])
-                near[k, j] |= (np.uint64(2) << np.uint64(high)) - (np.uint64(1) << np.uint64(low))
+        x, y = (points[i, 0] - corner[0]) / CELL_SIZE, (points[i, 1] - corner[1]) / CELL_SIZE
+        left, right = max(int(x - reach), 0), min(int(x + reach), last_col)
+        first, last = cols * max(int(y - reach), 0), cols * min(int(y + reach), last_row)
+        z = points[i, 2] / CELL_SIZE
+        lowest, highest = int(np.floor(z - reach)), int(np.floor(z + reach))
+        _mark(np.uint64(first + left), lowest, highest, base, near)
+        _mark(np.uint64(first + right), lowest, highest, base, near)
+        _mark(np.uint64(last + left), lowest, highest, base, near)
+        _mark(np.uint64(last + right), lowest, highest, base, near)
 
 
 def near_hits(seen: Observation) -> U64:
     """(rows, cols) words of the voxels that come within HIT_REACH_M of an obstacle point that does not move."""
     here, scan, grid = seen.reference, seen.scan, seen.view.grid
-    near, base = np.zeros(grid.shape, dtype=np.uint64), np.ascontiguousarray(here.base)
+    near, base = np.zeros(grid.shape, dtype=np.uint64), here.base.ravel()
     cell = scan.cell if here is scan.reference else find_obstacles(scan.points_map, here)[1]
-    _mark_near(scan.points_map, cell, scan.obstacle & ~seen.moving, base, (grid.x0, grid.y0), HIT_REACH_M, near)
+    chosen, reach = scan.obstacle & ~seen.moving, HIT_REACH_M / CELL_SIZE
+    _mark_near(scan.points_map, cell, chosen, base, grid.shape[1], (grid.x0, grid.y0), reach, near.ravel())
     return near
