@@ -1,0 +1,59 @@
+"""What a hit speaks for, against every voxel's box held beside every point."""
+
+from __future__ import annotations
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from mapvote.core.columns import TOP_BIT
+from mapvote.core.grid import CELL_SIZE, Grid, Lattice
+from mapvote.core.types import Reference
+from mapvote.detection.near_hits import HIT_REACH_M, near_hits
+from mapvote.perception.frontend import Observation, PlacedScan
+from mapvote.perception.raycast import ScanView, find_obstacles
+
+SIDE = 7
+
+
+def seen(points: np.ndarray, base: np.ndarray, moving: np.ndarray) -> Observation:
+    """A scan over a window of SIDE by SIDE cells whose columns begin at the layers ``base``; no ray is followed."""
+    grid = Grid(Lattice(0.05, -0.1), 3, -4, SIDE, SIDE)
+    none = np.full(grid.shape, np.inf, np.float32)
+    words, counts = np.zeros(grid.shape, np.uint64), np.zeros(grid.shape, np.int32)
+    ground_z = (base * CELL_SIZE).astype(np.float32)
+    reference = Reference(grid, ground_z, base, words, counts, none, -none, None)
+    obstacle, cell = find_obstacles(points, reference)
+    up = np.array([0.0, 0.0, 1.0])
+    scan = PlacedScan(0, points, np.zeros(3), up, 0.02, reference, reference, obstacle, cell)
+    view = ScanView(grid, counts, words, words, np.zeros((0, 0), np.uint8))
+    return Observation(scan, moving, view, reference)
+
+
+def by_boxes(here: Observation) -> np.ndarray:
+    """(rows, cols) words: every voxel whose box, widened by the reach, holds a point that counts."""
+    grid, base = here.view.grid, here.reference.base
+    near, (x, y) = np.zeros(grid.shape, np.uint64), grid.centres()
+    stands = here.scan.points_map[here.scan.obstacle & ~here.moving & (here.scan.cell >= 0)]
+    for r, c in np.ndindex(*grid.shape):
+        off_x, off_y = stands[:, 0] - x[c], stands[:, 1] - y[r]
+        for z in stands[np.maximum(np.abs(off_x), np.abs(off_y)) <= CELL_SIZE / 2 + HIT_REACH_M, 2]:
+            for layer in range(int(np.floor((z - HIT_REACH_M) / CELL_SIZE)), int((z + HIT_REACH_M) // CELL_SIZE) + 1):
+                near[r, c] |= np.uint64(1) << np.uint64(np.clip(layer - base[r, c], 0, TOP_BIT))
+    return near
+
+
+@settings(max_examples=60)
+@given(st.integers(0, 2**31), st.integers(0, 40))
+def test_a_hit_speaks_for_every_voxel_whose_box_it_comes_within_reach_of(seed: int, n: int) -> None:
+    rng = np.random.default_rng(seed)
+    base = rng.integers(-3, 4, (SIDE, SIDE)).astype(np.int32)
+    low, high = np.array([-1.3, 0.7, -2.0]), np.array([1.1, 3.1, 24.0])
+    here = seen(rng.uniform(low, high, (n, 3)), base, rng.random(n) < 0.2)
+    assert np.array_equal(near_hits(here), by_boxes(here))
+
+
+def test_what_moves_and_what_is_ground_speaks_for_nothing() -> None:
+    flat = np.zeros((SIDE, SIDE), np.int32)
+    points = np.array([[0.0, 1.9, 0.1], [0.0, 1.9, 1.0]])
+    assert not near_hits(seen(points, flat, np.array([False, True]))).any()
