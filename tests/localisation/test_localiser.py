@@ -1,5 +1,7 @@
 """A vehicle votes only from places that it has made sure of, and finds its place when what it was told is wrong."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -8,9 +10,10 @@ from mapvote.core.geometry import from_xyz_rpy, transform
 from mapvote.core.point_map import PointMap, map_from_points
 from mapvote.core.sensors import SENSORS
 from mapvote.core.types import F64, Scan
-from mapvote.localisation.localiser import WAIT_SCANS, Localiser
-from mapvote.localisation.ndt import PosePrior
+from mapvote.localisation.localiser import LOOKS, WAIT_SCANS, Localiser
+from mapvote.localisation.ndt import NdtMap, PosePrior
 from mapvote.localisation.tracker import Fix
+from mapvote.localisation.trust import Verdict
 from streets import path, street, sweep, twist_of
 
 SETTINGS = Settings()
@@ -66,6 +69,24 @@ def test_a_prior_metres_off_moves_no_vehicle_and_silences_none(point_map: PointM
     assert len(fixes) == len(POSES)
     assert all(fix.trusted for fix in fixes)
     assert off(fixes).max() < 0.15
+
+
+def test_a_track_that_holds_is_looked_at_quickly_and_with_care_where_that_leaves_a_doubt(
+    point_map: PointMap, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    one, looks = localiser(point_map), []
+    judge = one.judge.judge
+
+    def doubting(ndt_map: NdtMap, few: F64, T_map_lidar: F64, quick: bool = False) -> Verdict:
+        looks.append(quick)
+        verdict = judge(ndt_map, few, T_map_lidar, quick)
+        return replace(verdict, lead=0.0) if quick else verdict
+
+    monkeypatch.setattr(one.judge, "judge", doubting)
+    assert all(fix.trusted for fix in drive(one, POSES))
+    first = looks.index(True)
+    assert first == LOOKS, "before the place is confirmed nothing is saved"
+    assert looks[first:] == [True, False] * (len(looks[first:]) // 2)
 
 
 def test_a_steady_error_of_the_prior_is_learned(point_map: PointMap) -> None:

@@ -191,8 +191,9 @@ JUDGE = Judge(0.02, 3000)
 TRUTH = from_xyz_rpy(0.5, -0.4, 1.8, 0.0, 0.0, 0.3)
 
 
-def test_the_right_place_leads_clearly(square: NdtMap) -> None:
-    found = JUDGE.judge(square, seen_from(TRUTH), TRUTH)
+@pytest.mark.parametrize("quick", [False, True])
+def test_the_right_place_leads_clearly(square: NdtMap, quick: bool) -> None:
+    found = JUDGE.judge(square, seen_from(TRUTH), TRUTH, quick)
     assert JUDGE.holds(found)
     assert found.fit == pytest.approx(JUDGE.fit(square, seen_from(TRUTH), TRUTH))
     assert 0.75 < found.fit < 1.3
@@ -200,15 +201,16 @@ def test_the_right_place_leads_clearly(square: NdtMap) -> None:
     assert found.lead > 0.3
 
 
+@pytest.mark.parametrize("quick", [False, True])
 @pytest.mark.parametrize(
     "wrong",
     [(6.0, 0.0, 0.0), (-9.0, 0.0, 0.0), (0.0, 7.0, 0.0), (0.0, -5.0, 0.0), (0.0, 0.0, np.pi), (-4.0, 0.0, np.pi)],
 )
 def test_from_a_wrong_place_the_right_one_is_seen_along_and_across_the_street_and_turned_about(
-    square: NdtMap, wrong: tuple[float, float, float]
+    square: NdtMap, wrong: tuple[float, float, float], quick: bool
 ) -> None:
     told = TRUTH @ from_xyz_rpy(wrong[0], wrong[1], 0.0, 0.0, 0.0, wrong[2])
-    found = JUDGE.judge(square, seen_from(TRUTH), told)
+    found = JUDGE.judge(square, seen_from(TRUTH), told, quick)
     assert found.lead < -0.3
     assert not JUDGE.holds(found)
     assert found.T_map_lidar_other is not None
@@ -216,22 +218,26 @@ def test_from_a_wrong_place_the_right_one_is_seen_along_and_across_the_street_an
     assert np.abs(away - np.eye(4)).max() < 0.05
 
 
-def test_a_pose_that_has_not_settled_yields_to_the_one_beside_it_and_a_settled_one_does_not(square: NdtMap) -> None:
+@pytest.mark.parametrize("quick", [False, True])
+def test_a_pose_that_has_not_settled_yields_to_the_one_beside_it_and_a_settled_one_does_not(
+    square: NdtMap, quick: bool
+) -> None:
     """Two fixes nearer than 1.5 m are one place: only a better one, and more than 0.2 m off, is another."""
-    off = JUDGE.judge(square, seen_from(TRUTH), TRUTH @ from_xyz_rpy(0.8, 0.0, 0.0))
+    off = JUDGE.judge(square, seen_from(TRUTH), TRUTH @ from_xyz_rpy(0.8, 0.0, 0.0), quick)
     assert off.lead < 0.0
     assert off.T_map_lidar_other is not None
     assert np.linalg.norm((off.T_map_lidar_other - TRUTH)[:3, 3]) < 0.05
-    near = JUDGE.judge(square, seen_from(TRUTH), TRUTH @ from_xyz_rpy(0.1, 0.0, 0.0))
+    near = JUDGE.judge(square, seen_from(TRUTH), TRUTH @ from_xyz_rpy(0.1, 0.0, 0.0), quick)
     assert near.lead > 0.0
 
 
-def test_where_a_street_repeats_itself_no_place_leads() -> None:
+@pytest.mark.parametrize("quick", [False, True])
+def test_where_a_street_repeats_itself_no_place_leads(quick: bool) -> None:
     boxes = np.concatenate([box(x, y) for x in np.arange(-45.0, 45.0, 6.0) for y in (-8.0, 8.0)])
     street = np.concatenate([boxes, road(np.random.default_rng(1), 45.0, 10.0)])
     ndt_map = build_ndt(street, np.zeros(3))
     near = street[np.abs(street[:, 0]) < 20.0]
-    found = JUDGE.judge(ndt_map, transform(inverse(from_xyz_rpy(0, 0, 1.8)), near), from_xyz_rpy(0, 0, 1.8))
+    found = JUDGE.judge(ndt_map, transform(inverse(from_xyz_rpy(0, 0, 1.8)), near), from_xyz_rpy(0, 0, 1.8), quick)
     assert found.fit > 0.75
     assert abs(found.lead) < 0.05
     assert not JUDGE.holds(found)

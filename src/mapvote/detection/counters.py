@@ -99,7 +99,9 @@ def _gather(
             if not (through | struck | mapped) or np.isnan(ground_z[r, c]):
                 continue
             if mapped:
-                near = neighbourhood(hit, base, np.int64(r), np.int64(c), reach) & mapped if veto else hit[r, c] & mapped
+                near = (
+                    neighbourhood(hit, base, np.int64(r), np.int64(c), reach) & mapped if veto else hit[r, c] & mapped
+                )
                 if not by_ray and sight[r, c] >= _BEHIND and not hit[r, c]:
                     through |= mapped
                 struck = (struck & ~mapped) | near

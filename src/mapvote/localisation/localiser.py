@@ -167,6 +167,10 @@ class Localiser:
         T_map_lidar = fix.registration.T_map_lidar
         ndt_map = self.map_around(T_map_lidar[:3, 3])
         few = solid_sample(fix.points, LEVELS[-1].points_m)
+        if self._confirmed:  # a track that held is held again at less cost; where it is doubted, nothing is saved
+            verdict = self.judge.judge(ndt_map, few, T_map_lidar, quick=True)
+            if self.judge.holds(verdict):
+                return verdict
         return self.judge.judge(ndt_map, few, T_map_lidar)
 
     def _move(self, T_map_lidar: F64) -> None:

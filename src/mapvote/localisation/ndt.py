@@ -43,6 +43,8 @@ HALF_WINDOW_M, BELOW_M, ABOVE_M = 96.0, 24.0, 40.0
 """How far the window reaches to the sides, below and above its centre: as far as a scan has points to speak of."""
 CENTRAL_M = 24.0
 """A vehicle this far from the window's centre still has 72 m of map to all sides."""
+SETTLED = 0.05, 0.01
+"""A step shorter than this share of a level's floor has converged: on the way, and at the finest level."""
 MIN_POINTS = 3
 """A voxel with fewer points has no distribution: two make a line."""
 COVARIANCE_SCALE = 5.0
@@ -197,15 +199,20 @@ def register(
 
 
 def refine(
-    ndt_map: NdtMap, clouds: list[F32], T_map_lidar_guess: F64, prior: PosePrior | None = None, first_level: int = 0
+    ndt_map: NdtMap,
+    clouds: list[F32],
+    T_map_lidar_guess: F64,
+    prior: PosePrior | None = None,
+    first_level: int = 0,
+    settled: tuple[float, float] = SETTLED,
 ) -> Registration:
-    """:func:`register` for a scan already thinned by :func:`thin_for_levels`."""
+    """:func:`register` for a scan already thinned by :func:`thin_for_levels`; ``settled``: see SETTLED."""
     T = np.array(T_map_lidar_guess, dtype=np.float64)
     iterations = 0
     last = len(ndt_map.levels) - 1
     for i in range(first_level, last + 1):
         grid = ndt_map.levels[i]
-        tolerance = max(0.001, (0.01 if i == last else 0.05) * grid.level.floor_m)
+        tolerance = max(0.001, settled[i == last] * grid.level.floor_m)
         where = Place(grid.window, grid.voxels.cells, grid.level.iterations, tolerance)
         known = _known(prior if i == last else None)
         pairs = room_for(clouds[i].shape[1])
