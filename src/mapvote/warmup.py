@@ -18,9 +18,13 @@ from msgspec import structs
 from mapvote.codec.ballot import Ballot, decode, encode
 from mapvote.config import Settings, choose_case
 from mapvote.core.geometry import from_xyz_rpy, inverse, transform
+from mapvote.core.grid import TILE_CELLS, Grid, Lattice
 from mapvote.core.point_map import PointMap, map_from_points
 from mapvote.core.sensors import SENSORS
 from mapvote.core.types import F64, Drive, Scan
+from mapvote.core.voxels import VoxelCloud
+from mapvote.detection.packed_tiles import PackedTiles
+from mapvote.doctor.looks import Looking
 from mapvote.fusion.offline import update_map
 from mapvote.slam.build import build_map
 from mapvote.vehicle import vote_drive
@@ -47,6 +51,7 @@ def warm_up() -> Iterator[tuple[str, float]]:
         ("a drive that votes by columns", vote("columns")),
         ("a drive that votes by the paper's rule", vote("5")),
         ("ballots sent and fused", lambda: _fuse(built[0], ballots, settings)),
+        ("a drive looked at, and what only a long one needs", lambda: _go_far(_drive(old, turning=True))),
     ]
     with _seldom_collecting():
         for what, work in steps:
@@ -75,6 +80,16 @@ def _fuse(point_map: PointMap, ballots: list[Ballot], settings: Settings) -> Non
         same = [decode(encode(structs.replace(ballot, vehicle=name))) for name in ("a", "b", "c")]
         for least in (settings.fuse.min_difference, 0.0):
             update_map(point_map, same, settings.fuse.model_copy(update={"min_difference": least}))
+
+
+def _go_far(drive: Drive) -> None:
+    """What verbs look at before they use a drive; a tile left and come back to; more points than a table begins with."""
+    Looking(drive).look(range(2))
+    tiles, far = PackedTiles(Lattice(), 1), 10 * TILE_CELLS
+    tiles.near((0, 0))[:] = 1
+    tiles.leave(Grid(Lattice(), far, far, 1, 1))
+    tiles.near((0, 0))
+    VoxelCloud(Lattice()).enter(np.zeros((100_000, 3)))
 
 
 def _street(demolished: bool) -> F64:

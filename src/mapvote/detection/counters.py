@@ -15,7 +15,7 @@ import numba
 import numpy as np
 
 from mapvote.core.columns import TOP_BIT, neighbourhood
-from mapvote.core.grid import Lattice
+from mapvote.core.grid import Grid, Lattice
 from mapvote.core.types import F32, I32, U8, U64, Reference
 from mapvote.detection.packed_tiles import PackedTiles
 from mapvote.perception.raycast import ScanView, Sight
@@ -87,14 +87,14 @@ def is_open(planes: U64, bit: int) -> bool:
 
 @numba.njit(cache=True, nogil=True)
 def _gather(
-    planes: U64, shape: tuple[int, int], row0: int, col0: int,
+    planes: U64, rows: tuple[int, int], cols: tuple[int, int], down: int, right: int,
     hit: U64, passed: U64, sight: U8, occupied: U64, ground_z: F32, base: I32, reach: int, by_ray: bool, veto: bool,
     touched: U64,
 ) -> None:  # fmt: skip
-    """Add one scan to a tile: the first ``shape`` cells of ``planes``, from (row0, col0) of the window."""
-    for i in range(np.uint64(0), np.uint64(shape[0])):
-        for j in range(np.uint64(0), np.uint64(shape[1])):
-            r, c = np.uint64(row0) + i, np.uint64(col0) + j
+    """Add ``rows`` and ``cols`` of one scan's window to a tile, in which they lie so much further ``down`` and
+    ``right``. ``planes`` are the whole tile's: a part of them would be another kind of array, to be compiled for."""
+    for r in range(np.uint64(rows[0]), np.uint64(rows[1])):
+        for c in range(np.uint64(cols[0]), np.uint64(cols[1])):
             through, struck, mapped = passed[r, c] & ~hit[r, c], hit[r, c], occupied[r, c]
             if not (through | struck | mapped) or np.isnan(ground_z[r, c]):
                 continue
@@ -107,7 +107,7 @@ def _gather(
                 struck = (struck & ~mapped) | near
                 through &= ~near
             if through or struck:
-                cell = planes[i, j]
+                cell = planes[np.uint64(np.int64(r) + down), np.uint64(np.int64(c) + right)]
                 if mapped:
                     cell[STRUCK_ITSELF] |= (hit[r, c] | touched[r, c]) & mapped
                     if reach == 1:  # where a scan is not sure of its pose, single voxels mean nothing
@@ -116,6 +116,12 @@ def _gather(
                     halve(cell)
                 add_one(cell, _THROUGH, through)
                 add_one(cell, _STRUCK, struck)
+
+
+def common_cells(view: Grid, window: Grid) -> tuple[tuple[int, int], tuple[int, int]]:
+    """Which rows and columns of ``view``, from and to, lie in ``window``."""
+    rows, cols = window.intersection(view).slices_in(view)
+    return (rows.start, rows.stop), (cols.start, cols.stop)
 
 
 class Evidence:
@@ -136,11 +142,10 @@ class Evidence:
         touched = view.hit if touched is None else touched
         for tile in view.grid.tiles():
             window = self.lattice.tile(tile)
-            common = window.intersection(view.grid)
-            row0, col0 = common.row0 - view.grid.row0, common.col0 - view.grid.col0
-            planes = self.tiles.near(tile)[common.slices_in(window)]
+            rows, cols = common_cells(view.grid, window)
+            down, right = view.grid.row0 - window.row0, view.grid.col0 - window.col0
             _gather(
-                planes, common.shape, row0, col0, view.hit, view.passed, view.sight,
+                self.tiles.near(tile), rows, cols, down, right, view.hit, view.passed, view.sight,
                 reference.occupied, reference.ground_z, reference.base, reach, self.by_ray, self.veto,
                 touched,
             )  # fmt: skip

@@ -16,7 +16,7 @@ import numpy as np
 from mapvote.core.columns import TOP_BIT
 from mapvote.core.grid import Lattice
 from mapvote.core.types import F32, U64
-from mapvote.detection.counters import PLANES, add_one, halve, is_full
+from mapvote.detection.counters import PLANES, add_one, common_cells, halve, is_full
 from mapvote.detection.near_hits import near_hits
 from mapvote.detection.packed_tiles import PackedTiles
 from mapvote.perception.frontend import Observation
@@ -30,14 +30,16 @@ _LOWEST, _HIGHEST = np.uint64(0b11), np.uint64(1) << np.uint64(TOP_BIT - 1)
 
 
 @numba.njit(cache=True, nogil=True)
-def _gather(planes: U64, row0: int, col0: int, hit: U64, near: U64, passed: U64, occupied: U64, ground_z: F32) -> None:
-    """Add one scan to a tile's cells ``planes``, which begin at (row0, col0) of the window."""
-    for i in range(planes.shape[0]):
-        for j in range(planes.shape[1]):
-            r, c = row0 + i, col0 + j
+def _gather(
+    planes: U64, rows: tuple[int, int], cols: tuple[int, int], down: int, right: int,
+    hit: U64, near: U64, passed: U64, occupied: U64, ground_z: F32,
+) -> None:  # fmt: skip
+    """Add one scan to a whole tile, as that of mapvote.detection.counters does."""
+    for r in range(rows[0], rows[1]):
+        for c in range(cols[0], cols[1]):
             if np.isnan(ground_z[r, c]) or not hit[r, c] | near[r, c] | passed[r, c]:
                 continue
-            cell, rays, mapped = planes[i, j], passed[r, c], occupied[r, c]
+            cell, rays, mapped = planes[r + down, c + right], passed[r, c], occupied[r, c]
             above, below = rays >> np.uint64(1) | _HIGHEST, rays << np.uint64(1) | _LOWEST
             crossed = rays & above & below & ~near[r, c]
             met = (near[r, c] & mapped) | (hit[r, c] & ~mapped)
@@ -63,10 +65,10 @@ class SurfaceEvidence:
         view, here, near = seen.view, seen.reference, near_hits(seen)
         for tile in view.grid.tiles():
             window = self.lattice.tile(tile)
-            common = window.intersection(view.grid)
-            row0, col0 = common.row0 - view.grid.row0, common.col0 - view.grid.col0
+            rows, cols = common_cells(view.grid, window)
+            down, right = view.grid.row0 - window.row0, view.grid.col0 - window.col0
             _gather(
-                self.tiles.near(tile)[common.slices_in(window)], row0, col0, view.hit, near, view.passed, here.occupied,
+                self.tiles.near(tile), rows, cols, down, right, view.hit, near, view.passed, here.occupied,
                 here.ground_z,
             )  # fmt: skip
         self.tiles.leave(view.grid)

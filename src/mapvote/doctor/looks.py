@@ -137,6 +137,14 @@ def _is_whole(points: F32, i: int, quantum: float) -> bool:
     return True
 
 
+@numba.njit(inline="always")
+def _put(out: F64, at: int, values: F64, share: float) -> None:
+    """``values``, each times ``share``, into ``out`` from ``at`` on. A slice would be compiled four times as long: for
+    the message of its error numba brings its strings along."""
+    for k in range(len(values)):
+        out[at + k] = values[k] * share
+
+
 @numba.njit(cache=True, nogil=True)
 def _look(points: F32, stride: int, quanta: F64) -> F64:
     """One row of :class:`Looks`, its parts one after the other; every ``stride``-th of the points (n, 3)."""
@@ -167,16 +175,18 @@ def _look(points: F32, stride: int, quanta: F64) -> F64:
         n += 1
     out = np.empty(3 + 3 + 3 + 3 + 36 + 1 + 3 + len(quanta) + 1 + 1)
     share = 1.0 / max(n, 1)
-    out[0:3], out[3:6], out[6:9] = low, high, total * share
+    _put(out, 0, low, 1.0)
+    _put(out, 3, high, 1.0)
+    _put(out, 6, total, share)
     seen, wanted = 0.0, 0
     for k in range(_BINS):
         seen += ranges[k]
         while wanted < 3 and seen >= (0.1 * n if wanted == 0 else 0.5 * n if wanted == 1 else 0.99 * n):
             out[9 + wanted] = (k + 0.5) * _BIN_M
             wanted += 1
-    out[12:48] = sectors * share
+    _put(out, 12, sectors, share)
     out[48] = near * share
-    out[49:52] = unit * share
-    out[52 : 52 + len(quanta)] = rounded * share
-    out[-2], out[-1] = turns, print_
+    _put(out, 49, unit, share)
+    _put(out, 52, rounded, share)
+    out[52 + len(quanta)], out[53 + len(quanta)] = turns, print_
     return out

@@ -31,7 +31,7 @@ def solid_sample(points_lidar: NDArray[np.floating], size: float) -> F64:
     ``points_lidar`` (n, 3) is a whole scan, metres from the sensor, de-skewed or not.
     """
     few = points_lidar[thin(points_lidar, size)].astype(np.float64)
-    rays = points_lidar[:: -(-len(points_lidar) // _RAYS) or 1]
+    rays = np.ascontiguousarray(points_lidar[:: -(-len(points_lidar) // _RAYS) or 1])  # of one kind: one compilation
     range2 = (few**2).sum(axis=1)
     expected = len(rays) / _SOLID_ANGLE * _VOXEL_M**2 / np.maximum(range2, _VOXEL_M**2)
     return few[(range2 > _REACH_M**2) | (_hits_around(rays, few, _table_for(rays)) > _SHARE * expected)]
