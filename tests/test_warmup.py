@@ -17,6 +17,7 @@ from mapvote.fusion.copies import grouped
 from mapvote.fusion.outliers import contradicts
 from mapvote.localisation.ndt_solver import align
 from mapvote.perception.range_image import look
+from mapvote.simulation import simulate
 from mapvote.warmup import warm_up
 
 SOURCES = Path(mapvote.__file__).parent
@@ -27,10 +28,43 @@ _BOUND = "-dac_override,-dac_read_search"
 @pytest.mark.slow
 def test_warming_up_goes_through_every_step_and_says_what_each_took() -> None:
     told = list(warm_up())
-    assert len(told) == 5
+    assert len(told) == 6
     assert all(seconds > 0 for _, seconds in told)
     for kernel in (align, count_states, look, grow, contradicts, grouped):
         assert kernel.signatures
+
+
+LISTENING = """
+import sys
+import numba
+from mapvote.__main__ import main
+
+class Compiled(numba.core.event.Listener):
+    def on_start(self, event): print("compiled", event.data["dispatcher"].py_func.__qualname__, event.data["args"])
+    def on_end(self, event): pass
+
+numba.core.event.register("numba:compile", Compiled())
+main()
+"""
+
+
+@pytest.mark.slow
+def test_once_warmed_up_no_verb_compiles_anything(tmp_path: Path) -> None:
+    """A drive that stops for seconds in its middle, for a kernel to be compiled, was warmed up for nothing."""
+
+    def run(*words: str) -> list[str]:
+        command = [sys.executable, "-c", LISTENING, *words]
+        environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "kernels"), "OMP_NUM_THREADS": "1"}
+        done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
+        assert done.returncode == 0, done.stderr
+        return [line for line in done.stdout.splitlines() if line.startswith("compiled")]
+
+    simulate("corner", tmp_path / "street")
+    assert len(run("warmup")) > 100
+    assert not run("build", "street/survey_1", "--scans", ":40", "--out", "map")
+    for vehicle in ("v1", "v2"):
+        assert not run("vote", f"street/{vehicle}", "--map", "map", "--out", f"{vehicle}.ballot")
+    assert not run("update", "map", "v1.ballot", "v2.ballot", "--out", "map_2")
 
 
 @pytest.mark.slow

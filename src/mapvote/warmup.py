@@ -25,6 +25,7 @@ from mapvote.core.types import F64, Drive, Scan
 from mapvote.core.voxels import VoxelCloud
 from mapvote.detection.packed_tiles import PackedTiles
 from mapvote.doctor.looks import Looking
+from mapvote.formats.clean import BadPoints, RawScan, clean_scan
 from mapvote.fusion.offline import update_map
 from mapvote.slam.build import build_map
 from mapvote.vehicle import vote_drive
@@ -83,7 +84,7 @@ def _fuse(point_map: PointMap, ballots: list[Ballot], settings: Settings) -> Non
 
 
 def _go_far(drive: Drive) -> None:
-    """What verbs look at before they use a drive; a tile left and come back to; more points than a table begins with."""
+    """What verbs look at before they use a drive; a tile left and come back to; more points than a table takes."""
     Looking(drive).look(range(2))
     tiles, far = PackedTiles(Lattice(), 1), 10 * TILE_CELLS
     tiles.near((0, 0))[:] = 1
@@ -93,7 +94,8 @@ def _go_far(drive: Drive) -> None:
 
 
 def _street(demolished: bool) -> F64:
-    """(n, 3) points of 50 m of road between two rows of houses; one may be gone, and something built on the road."""
+    """(n, 3) points of 50 m of road between two rows of houses; one may be gone, so that a wall behind it is seen, and
+    something built on the road."""
     rng = np.random.default_rng(0)
 
     def surface(low: tuple[float, ...], high: tuple[float, ...]) -> F64:
@@ -101,7 +103,7 @@ def _street(demolished: bool) -> F64:
         n = int(np.prod(sides[sides > 0]) / _SPACING_M**2)
         return np.asarray(rng.uniform(low, high, (n, 3)) + rng.normal(0.0, 0.01, (n, 3)))
 
-    pieces = [surface((-25, -11, 0), (25, 11, 0))]
+    pieces = [surface((-25, -11, 0), (25, 11, 0)), surface((-25, 18, 0), (25, 18, 6))]
     for x in (-24.0, -10.0, 4.0):
         for y in (-10.0, 10.0):
             if not (demolished and (x, y) == (-10.0, 10.0)):
@@ -119,11 +121,13 @@ def _drive(street_map: F64, turning: bool) -> Drive:
     poses = np.array([from_xyz_rpy(_STEP_M * (i - _SCANS / 2), 0.3, 1.8, 0.0, 0.0, 0.01 * i) for i in range(_SCANS)])
     stamps_ns = 10**9 + np.arange(_SCANS, dtype=np.int64) * 10**8
 
+    sensor = SENSORS["vlp16"]
+
     def read_scan(i: int) -> Scan:
         points = transform(inverse(poses[i]), street_map).astype(np.float32)
         points = points[np.hypot(points[:, 0], points[:, 1]) > 1.5]
         time_s = np.zeros(len(points), dtype=np.float32) if turning else None
-        return Scan(int(stamps_ns[i]), points, time_s)
+        raw = RawScan(i, int(stamps_ns[i]), points, np.full(len(points), 100.0, dtype=np.float32), time_s)
+        return clean_scan("warmup", raw, sensor, BadPoints("warmup"))
 
-    sensor = SENSORS["vlp16"]
     return Drive(Path("warmup"), "warmup", "warmup", sensor, stamps_ns, read_scan, poses, 0.02, 0.1)

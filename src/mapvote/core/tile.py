@@ -16,7 +16,7 @@ from mapvote.core.columns import column_bits, mark_obstacles
 from mapvote.core.grid import CELLS, Grid, TileIndex
 from mapvote.core.ground import base_layers
 from mapvote.core.memory import Memory
-from mapvote.core.types import F32, F64, I32, I64, U8, U64, Bool, check_array
+from mapvote.core.types import F32, F64, I32, I64, U8, U64, Bool, check_array, read_only
 
 _SCALES = (1.0, 255.0, 4095.0, 65535.0)
 """What files give the brightest point: 1, or the largest number of 8, 12 or 16 bits, whatever type they keep it in."""
@@ -53,6 +53,12 @@ class Tile:
 
     def __post_init__(self) -> None:
         self._check({"points", "ground_z", "free"})
+        self._keep({"points": self.points, "ground_z": self.ground_z, "free": self.free})
+
+    def _keep(self, planes: Mapping[str, Any]) -> None:
+        """These planes, as nobody can write to."""
+        for name, plane in planes.items():
+            self.__dict__[name] = read_only(plane) if isinstance(plane, np.ndarray) else plane
 
     def _check(self, planes: Collection[str]) -> None:
         """Of these planes, and of all fields of the points."""
@@ -89,7 +95,8 @@ class Tile:
         """:meth:`but` of planes that are known to be sound."""
         stays = {name for name in self.__dict__ if not _FOLLOWS_FROM.get(name, set()) & planes.keys()}
         other = object.__new__(Tile)
-        other.__dict__.update({name: self.__dict__[name] for name in stays} | planes)
+        other.__dict__.update({name: self.__dict__[name] for name in stays})
+        other._keep(planes)
         return other
 
     def without(self, dropped: Bool) -> Tile:

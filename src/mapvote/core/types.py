@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
@@ -26,10 +26,21 @@ U64 = NDArray[np.uint64]
 I32 = NDArray[np.int32]
 I64 = NDArray[np.int64]
 Bool = NDArray[np.bool_]
+_Number = TypeVar("_Number", bound=np.generic)
 
 
 class MapvoteError(Exception):
     """What a user can mend: the message says what, where and how. Printed without a traceback, exit code 1."""
+
+
+def read_only(array: NDArray[_Number]) -> NDArray[_Number]:
+    """The array itself, or a view of it, that nobody can write to. What a file's bytes are seen as is so anyway: all of
+    one kind, they need one compilation of a kernel, not one each."""
+    if not array.flags.writeable:
+        return array
+    view = array.view()
+    view.flags.writeable = False
+    return view
 
 
 def check_array(array: Any, name: str, shape: tuple[int | None, ...], dtype: DTypeLike, finite: bool = True) -> None:

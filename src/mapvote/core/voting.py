@@ -13,7 +13,7 @@ import numba
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
-from mapvote.core.types import I32, N_STATES, NO_VOTE, U8, U16, CellState
+from mapvote.core.types import I32, N_STATES, NO_VOTE, U8, U16, CellState, read_only
 
 VOTE_UNIT = 16
 """One vote in the units of a tally: Eq. (1) is rounded to sixteenths."""
@@ -123,13 +123,13 @@ def tally_of(voters: Sequence[U8], cells: int) -> NDArray[Any]:
 
     Votes are counted in bytes first, as many voters as a byte can count; of few that is the tally.
     """
-    shape, silent = (N_STATES, cells), np.full(cells, NO_VOTE, dtype=np.uint8)
+    shape, silent = (N_STATES, cells), read_only(np.full(cells, NO_VOTE, dtype=np.uint8))
     tally = np.zeros(shape, dtype=_TALLIES.get(np.min_scalar_type(VOTE_UNIT * len(voters)), np.int32))
     for start in range(0, len(voters), _BYTE_MAX):
         counts = tally if tally.dtype == np.uint8 else np.zeros(shape, dtype=np.uint8)
         batch = voters[start : start + _BYTE_MAX]
         for first in range(0, len(batch), _AT_ONCE):
-            some = batch[first : first + _AT_ONCE]
+            some = [read_only(voter) for voter in batch[first : first + _AT_ONCE]]
             count_states(*some, *[silent] * (_AT_ONCE - len(some)), counts)
         if counts is tally:
             tally *= np.uint8(VOTE_UNIT)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from mapvote.config import FuseSettings
 from mapvote.core.cells import flat_cells
 from mapvote.core.grid import CELLS, TILE_CELLS, Grid
-from mapvote.core.types import F32, I64, N_STATES, NO_VOTE, U8, U16, U64, Bool, CellState
+from mapvote.core.types import F32, I64, N_STATES, NO_VOTE, U8, U16, U64, Bool, CellState, read_only
 from mapvote.fusion.sparse_columns import Words, agreed, mark, mark_among, mark_spoken, union
 
 DAY_NS = 86_400_000_000_000
@@ -105,7 +105,7 @@ class TileVote:
         """One more voter in ``reached`` (k, n): of what it :meth:`deletes` among the n cells ``emptied``."""
         if self.states is not None and self.gone is not None:
             said = int(CellState.CHANGED_EMPTY)
-            mark_among(reached, self.gone.cells, self.gone.words, self.states, said, emptied.cells)
+            mark_among(reached, self.gone.cells, self.gone.words, read_only(self.states), said, emptied.cells)
         else:
             deleted = self.deletes(emptied)
             mark(reached, np.searchsorted(emptied.cells, deleted.cells), deleted.words)
