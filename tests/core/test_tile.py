@@ -98,3 +98,14 @@ def test_the_words_of_a_tile_hold_a_bit_for_every_obstacle_and_follow_every_edit
         np.testing.assert_array_equal(edited.obstacle_words.reshape(-1), expected)
         np.testing.assert_array_equal(edited.cells, again.cells)
         np.testing.assert_array_equal(edited.columns[0], bit)
+
+
+def test_nothing_of_a_tile_can_be_written_to_and_what_it_was_made_of_still_can() -> None:
+    points = np.zeros((2, 3), dtype=np.float32)
+    tile = make_tile(points)
+    made = tile, tile.without(np.array([True, False])), tile.with_new(points), tile.but(points=points)
+    for one in made:
+        for plane in (one.points, one.ground_z):
+            with pytest.raises(ValueError, match="read-only"):
+                plane[:] = 1.0
+    points[:] = 1.0
