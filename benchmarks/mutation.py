@@ -56,6 +56,7 @@ TESTS = {
     "server/store/hold.py": ["server/store/test_hold.py"],
     "detection/paper.py": ["detection/test_paper.py"],
     "detection/counters.py": ["detection/test_counters.py"],
+    "detection/near_hits.py": ["detection/test_near_hits.py"],
     "detection/columns.py": ["detection/test_columns.py", "detection/test_voters.py"],
     "detection/regions.py": ["detection/test_regions.py", "detection/test_columns.py", "detection/test_voters.py"],
     "detection/sightings.py": ["detection/test_paper.py"],

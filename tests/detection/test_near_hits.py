@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from mapvote.core.columns import TOP_BIT
 from mapvote.core.grid import CELL_SIZE, Grid, Lattice
 from mapvote.core.types import Reference
-from mapvote.detection.near_hits import HIT_REACH_M, near_hits
+from mapvote.detection.near_hits import HIT_REACH_M, _mark_near, near_hits
 from mapvote.perception.frontend import Observation, PlacedScan
 from mapvote.perception.raycast import ScanView, find_obstacles
 
@@ -57,3 +57,16 @@ def test_what_moves_and_what_is_ground_speaks_for_nothing() -> None:
     flat = np.zeros((SIDE, SIDE), np.int32)
     points = np.array([[0.0, 1.9, 0.1], [0.0, 1.9, 1.0]])
     assert not near_hits(seen(points, flat, np.array([False, True]))).any()
+
+
+def test_no_hit_speaks_beyond_the_window() -> None:
+    """Hits at all four borders; behind the planes lies a row of zeros that nobody may touch."""
+    cells = SIDE * SIDE
+    base, near = np.zeros(cells + SIDE, np.int32), np.zeros(cells + SIDE, np.uint64)
+    low, high = 0.01, SIDE * CELL_SIZE - 0.01
+    points = np.array([[x, y, 1.0] for x in (low, 1.0, high) for y in (low, 1.0, high)])
+    cell = (points[:, :2] // CELL_SIZE).astype(np.int32) @ np.array([1, SIDE], dtype=np.int32)
+    chosen, reach = np.ones(len(points), np.bool_), HIT_REACH_M / CELL_SIZE
+    _mark_near(points, cell, chosen, base[:cells], SIDE, (0.0, 0.0), reach, near)
+    assert set(cell[cell < cells]) <= set(np.flatnonzero(near))
+    assert not near[cells:].any()
