@@ -25,9 +25,15 @@ def height_above(z: float, ground_z: float, base: int) -> float:
 
 
 @numba.njit(cache=True, nogil=True, inline="always")
+def layer_bit(layer: int, base: int) -> int:
+    """Which bit of its column's word a layer of the world is; what lies beyond the word goes to its ends."""
+    return min(max(layer - base, 0), TOP_BIT)
+
+
+@numba.njit(cache=True, nogil=True, inline="always")
 def column_bit(z: float, base: int) -> int:
-    """Which bit of its column's word a height belongs to; what is higher or lower than the word goes to its ends."""
-    return min(max(int(np.floor(z / CELL_SIZE)) - base, 0), TOP_BIT)
+    """Which bit of its column's word a height belongs to, see :func:`layer_bit`."""
+    return layer_bit(int(np.floor(z / CELL_SIZE)), base)
 
 
 @numba.njit(cache=True, nogil=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from mapvote.core.types import F32, F64, I32, Bool
+from mapvote.core.types import F32, F64, I32, Bool, read_only
 
 
 def found_among(rows: F32 | F64, others: F32 | F64) -> Bool:
@@ -15,9 +15,7 @@ def found_among(rows: F32 | F64, others: F32 | F64) -> Bool:
 
 
 def _words(rows: F32 | F64) -> I32:
-    words = np.ascontiguousarray(rows).view(np.int32)
-    words.flags.writeable = False  # one kernel serves all: compiled code tells arrays that are read only from others
-    return words
+    return read_only(np.ascontiguousarray(rows).view(np.int32))
 
 
 @numba.njit(cache=True, nogil=True)

@@ -129,7 +129,7 @@ def tally_of(voters: Sequence[U8], cells: int) -> NDArray[Any]:
         counts = tally if tally.dtype == np.uint8 else np.zeros(shape, dtype=np.uint8)
         batch = voters[start : start + _BYTE_MAX]
         for first in range(0, len(batch), _AT_ONCE):
-            some = [read_only(voter) for voter in batch[first : first + _AT_ONCE]]
+            some = batch[first : first + _AT_ONCE]
             count_states(*some, *[silent] * (_AT_ONCE - len(some)), counts)
         if counts is tally:
             tally *= np.uint8(VOTE_UNIT)

@@ -15,9 +15,9 @@ import numba
 import numpy as np
 
 from mapvote.core.columns import TOP_BIT, neighbourhood
-from mapvote.core.grid import Grid, Lattice
+from mapvote.core.grid import Lattice
 from mapvote.core.types import F32, I32, U8, U64, Reference
-from mapvote.detection.packed_tiles import PackedTiles
+from mapvote.detection.packed_tiles import Overlap, PackedTiles
 from mapvote.perception.raycast import ScanView, Sight
 
 PLANES = 7
@@ -87,14 +87,13 @@ def is_open(planes: U64, bit: int) -> bool:
 
 @numba.njit(cache=True, nogil=True)
 def _gather(
-    planes: U64, rows: tuple[int, int], cols: tuple[int, int], down: int, right: int,
+    planes: U64, part: Overlap,
     hit: U64, passed: U64, sight: U8, occupied: U64, ground_z: F32, base: I32, reach: int, by_ray: bool, veto: bool,
     touched: U64,
 ) -> None:  # fmt: skip
-    """Add ``rows`` and ``cols`` of one scan's window to a tile, in which they lie so much further ``down`` and
-    ``right``. ``planes`` are the whole tile's: a part of them would be another kind of array, to be compiled for."""
-    for r in range(np.uint64(rows[0]), np.uint64(rows[1])):
-        for c in range(np.uint64(cols[0]), np.uint64(cols[1])):
+    """Add to a tile's ``planes`` the ``part`` of one scan's window that lies on it."""
+    for r in range(np.uint64(part.row), np.uint64(part.end_row)):
+        for c in range(np.uint64(part.col), np.uint64(part.end_col)):
             through, struck, mapped = passed[r, c] & ~hit[r, c], hit[r, c], occupied[r, c]
             if not (through | struck | mapped) or np.isnan(ground_z[r, c]):
                 continue
@@ -107,7 +106,7 @@ def _gather(
                 struck = (struck & ~mapped) | near
                 through &= ~near
             if through or struck:
-                cell = planes[np.uint64(np.int64(r) + down), np.uint64(np.int64(c) + right)]
+                cell = planes[np.uint64(np.int64(r) + part.down), np.uint64(np.int64(c) + part.right)]
                 if mapped:
                     cell[STRUCK_ITSELF] |= (hit[r, c] | touched[r, c]) & mapped
                     if reach == 1:  # where a scan is not sure of its pose, single voxels mean nothing
@@ -116,12 +115,6 @@ def _gather(
                     halve(cell)
                 add_one(cell, _THROUGH, through)
                 add_one(cell, _STRUCK, struck)
-
-
-def common_cells(view: Grid, window: Grid) -> tuple[tuple[int, int], tuple[int, int]]:
-    """Which rows and columns of ``view``, from and to, lie in ``window``."""
-    rows, cols = window.intersection(view).slices_in(view)
-    return (rows.start, rows.stop), (cols.start, cols.stop)
 
 
 class Evidence:
@@ -133,19 +126,16 @@ class Evidence:
     def __init__(self, lattice: Lattice, by_ray: bool = True, veto: bool = True) -> None:
         """``by_ray`` (rule A): a mapped voxel is seen through only by a ray through it, else wherever the cell was
         visible. ``veto`` (rule B): hits near a mapped voxel strike it, else only hits in it."""
-        self.lattice, self.by_ray, self.veto = lattice, by_ray, veto
+        self.by_ray, self.veto = by_ray, veto
         self.tiles = PackedTiles(lattice, WORDS)
 
     def count(self, view: ScanView, reference: Reference, reach: int = 1, touched: U64 | None = None) -> None:
         """Count a scan seen against ``reference``; ``reach`` cells around a hit it may stand for (pose uncertainty).
         ``touched`` (rows, cols): voxels within a hit's own error, for rule I; else only those that were hit."""
         touched = view.hit if touched is None else touched
-        for tile in view.grid.tiles():
-            window = self.lattice.tile(tile)
-            rows, cols = common_cells(view.grid, window)
-            down, right = view.grid.row0 - window.row0, view.grid.col0 - window.col0
+        for planes, part in self.tiles.under(view.grid):
             _gather(
-                self.tiles.near(tile), rows, cols, down, right, view.hit, view.passed, view.sight,
+                planes, part, view.hit, view.passed, view.sight,
                 reference.occupied, reference.ground_z, reference.base, reach, self.by_ray, self.veto,
                 touched,
             )  # fmt: skip

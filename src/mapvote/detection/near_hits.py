@@ -5,7 +5,7 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from mapvote.core.columns import TOP_BIT
+from mapvote.core.columns import layer_bit
 from mapvote.core.grid import CELL_SIZE
 from mapvote.core.types import F64, I32, U64, Bool
 from mapvote.perception.frontend import Observation
@@ -18,8 +18,8 @@ evidence.md has what other reaches do)."""
 
 @numba.njit(inline="always")
 def _mark(cell: int, lowest: int, highest: int, base: I32, near: U64) -> None:
-    """The layers ``lowest`` to ``highest`` of the world into a column; what is outside its word goes to its ends."""
-    low, high = min(max(lowest - base[cell], 0), TOP_BIT), min(max(highest - base[cell], 0), TOP_BIT)
+    """The layers ``lowest`` to ``highest`` of the world into a column."""
+    low, high = layer_bit(lowest, base[cell]), layer_bit(highest, base[cell])
     near[cell] |= (np.uint64(2) << np.uint64(high)) - (np.uint64(1) << np.uint64(low))
 
 

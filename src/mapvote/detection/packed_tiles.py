@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from typing import NamedTuple
 
 import numba
 import numpy as np
@@ -17,6 +18,19 @@ _FAST = 1
 """zstd level: packed while driving, and read once or twice."""
 _FAR_CELLS = 64
 """A tile this far from the view has been left: a vehicle that turns round comes back to it, and it is unpacked."""
+
+
+class Overlap(NamedTuple):
+    """What a window has in common with a tile: rows and columns of the window, from and to, and how much further down
+    and to the right they lie in the tile. A kernel is given this and the whole tile: a part of its planes would be
+    another kind of array, to be compiled for."""
+
+    row: int
+    end_row: int
+    col: int
+    end_col: int
+    down: int
+    right: int
 
 
 class PackedTiles(Mapping[TileIndex, U64]):
@@ -48,6 +62,14 @@ class PackedTiles(Mapping[TileIndex, U64]):
             packed, planes = self._packed.pop(tile, None), self._zeros()
             self._open[tile] = planes if packed is None else self._unpacked(packed, planes)
         return self._open[tile]
+
+    def under(self, view: Grid) -> Iterator[tuple[U64, Overlap]]:
+        """The planes of each tile that ``view`` lies on, as :meth:`near` has them, and where it lies in them."""
+        for tile in view.tiles():
+            window = self.lattice.tile(tile)
+            rows, cols = window.intersection(view).slices_in(view)
+            off = view.row0 - window.row0, view.col0 - window.col0
+            yield self.near(tile), Overlap(rows.start, rows.stop, cols.start, cols.stop, *off)
 
     def leave(self, view: Grid) -> None:
         """Pack one tile that lies far from ``view``, if there is any: for every scan, so that none has it all."""

@@ -16,9 +16,9 @@ import numpy as np
 from mapvote.core.columns import TOP_BIT
 from mapvote.core.grid import Lattice
 from mapvote.core.types import F32, U64
-from mapvote.detection.counters import PLANES, add_one, common_cells, halve, is_full
+from mapvote.detection.counters import PLANES, add_one, halve, is_full
 from mapvote.detection.near_hits import near_hits
-from mapvote.detection.packed_tiles import PackedTiles
+from mapvote.detection.packed_tiles import Overlap, PackedTiles
 from mapvote.perception.frontend import Observation
 
 CROSSED, MET = 0, PLANES
@@ -30,16 +30,13 @@ _LOWEST, _HIGHEST = np.uint64(0b11), np.uint64(1) << np.uint64(TOP_BIT - 1)
 
 
 @numba.njit(cache=True, nogil=True)
-def _gather(
-    planes: U64, rows: tuple[int, int], cols: tuple[int, int], down: int, right: int,
-    hit: U64, near: U64, passed: U64, occupied: U64, ground_z: F32,
-) -> None:  # fmt: skip
-    """Add one scan to a whole tile, as that of mapvote.detection.counters does."""
-    for r in range(rows[0], rows[1]):
-        for c in range(cols[0], cols[1]):
+def _gather(planes: U64, part: Overlap, hit: U64, near: U64, passed: U64, occupied: U64, ground_z: F32) -> None:
+    """Add to a tile's ``planes`` the ``part`` of one scan's window that lies on it."""
+    for r in range(part.row, part.end_row):
+        for c in range(part.col, part.end_col):
             if np.isnan(ground_z[r, c]) or not hit[r, c] | near[r, c] | passed[r, c]:
                 continue
-            cell, rays, mapped = planes[r + down, c + right], passed[r, c], occupied[r, c]
+            cell, rays, mapped = planes[r + part.down, c + part.right], passed[r, c], occupied[r, c]
             above, below = rays >> np.uint64(1) | _HIGHEST, rays << np.uint64(1) | _LOWEST
             crossed = rays & above & below & ~near[r, c]
             met = (near[r, c] & mapped) | (hit[r, c] & ~mapped)
@@ -57,18 +54,11 @@ class SurfaceEvidence:
     """
 
     def __init__(self, lattice: Lattice) -> None:
-        self.lattice = lattice
         self.tiles = PackedTiles(lattice, WORDS)
 
     def count(self, seen: Observation) -> None:
         """Count one scan."""
         view, here, near = seen.view, seen.reference, near_hits(seen)
-        for tile in view.grid.tiles():
-            window = self.lattice.tile(tile)
-            rows, cols = common_cells(view.grid, window)
-            down, right = view.grid.row0 - window.row0, view.grid.col0 - window.col0
-            _gather(
-                self.tiles.near(tile), rows, cols, down, right, view.hit, near, view.passed, here.occupied,
-                here.ground_z,
-            )  # fmt: skip
+        for planes, part in self.tiles.under(view.grid):
+            _gather(planes, part, view.hit, near, view.passed, here.occupied, here.ground_z)
         self.tiles.leave(view.grid)

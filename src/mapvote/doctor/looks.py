@@ -188,5 +188,5 @@ def _look(points: F32, stride: int, quanta: F64) -> F64:
     out[48] = near * share
     _put(out, 49, unit, share)
     _put(out, 52, rounded, share)
-    out[52 + len(quanta)], out[53 + len(quanta)] = turns, print_
+    out[-2], out[-1] = turns, print_
     return out

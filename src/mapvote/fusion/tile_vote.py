@@ -48,6 +48,10 @@ class TileVote:
     unrestricted: U8 | None = None
     """Its states as they were sent, where :func:`restrict` has silenced some."""
 
+    def __post_init__(self) -> None:
+        if self.states is not None:
+            object.__setattr__(self, "states", read_only(self.states))
+
     @property
     def sent(self) -> U8 | None:
         """(256, 256) the states that were sent, whether they count or not; None in one stage."""
@@ -105,7 +109,7 @@ class TileVote:
         """One more voter in ``reached`` (k, n): of what it :meth:`deletes` among the n cells ``emptied``."""
         if self.states is not None and self.gone is not None:
             said = int(CellState.CHANGED_EMPTY)
-            mark_among(reached, self.gone.cells, self.gone.words, read_only(self.states), said, emptied.cells)
+            mark_among(reached, self.gone.cells, self.gone.words, self.states, said, emptied.cells)
         else:
             deleted = self.deletes(emptied)
             mark(reached, np.searchsorted(emptied.cells, deleted.cells), deleted.words)
