@@ -25,7 +25,7 @@ from mapvote.core.types import F64, Drive, Scan
 from mapvote.core.voxels import VoxelCloud
 from mapvote.detection.packed_tiles import PackedTiles
 from mapvote.doctor.looks import Looking
-from mapvote.formats.clean import BadPoints, RawScan, clean_scan
+from mapvote.formats.clean import BadPoints, RawScan, clean_scan, spinning_time_s
 from mapvote.fusion.offline import update_map
 from mapvote.slam.build import build_map
 from mapvote.vehicle import vote_drive
@@ -84,8 +84,10 @@ def _fuse(point_map: PointMap, ballots: list[Ballot], settings: Settings) -> Non
 
 
 def _go_far(drive: Drive) -> None:
-    """What verbs look at before they use a drive; a tile left and come back to; more points than a table takes."""
+    """What verbs look at before they use a drive; points that bring no times; a tile left and come back to; more points
+    than a table takes."""
     Looking(drive).look(range(2))
+    spinning_time_s(np.zeros((1, 3), np.float32), drive.sensor.rate_hz)
     tiles, far = PackedTiles(Lattice(), 1), 10 * TILE_CELLS
     tiles.near((0, 0))[:] = 1
     tiles.leave(Grid(Lattice(), far, far, 1, 1))

@@ -9,6 +9,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from mapvote.core.azimuth import azimuth_32
 from mapvote.core.sensors import Sensor
 from mapvote.core.types import F32, I64, MapvoteError, Scan
 
@@ -18,6 +19,7 @@ MAX_BAD_SHARE = 0.05
 """A scan with more broken points than this is refused: it is damaged, or not the format it claims to be."""
 FAR_M = 2000.0
 """No LiDAR of ours measures farther; float64 or integers read as float32 do."""
+_BLOCK = 512
 
 
 @dataclass(slots=True)
@@ -145,8 +147,20 @@ def spinning_time_s(points: F32, rate_hz: float, *, clockwise: bool = True) -> F
 
     The sensor faces forward at the stamp: -azimuth / (2 pi rate) if it turns clockwise seen from above.
     """
-    azimuth = np.arctan2(points[:, 1], points[:, 0])
-    return ((-azimuth if clockwise else azimuth) / (2.0 * np.pi * rate_hz)).astype(np.float32)
+    return _spinning_time_s(points, np.float32((-2.0 if clockwise else 2.0) * np.pi * rate_hz))
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _spinning_time_s(points: F32, turn_per_s: np.float32) -> F32:
+    """(n,) block by block: x and y, which lie three numbers apart, are laid side by side first, for vectors."""
+    out, x, y = np.empty(len(points), np.float32), np.empty(_BLOCK, np.float32), np.empty(_BLOCK, np.float32)
+    for start in range(0, len(points), _BLOCK):
+        n = min(_BLOCK, len(points) - start)
+        for i in range(n):
+            x[i], y[i] = points[start + i, 0], points[start + i, 1]
+        for i in range(n):
+            out[start + i] = azimuth_32(y[i], x[i]) / turn_per_s
+    return out
 
 
 def stamps_from_rate(n: int, rate_hz: float, start_ns: int) -> I64:

@@ -43,12 +43,13 @@ def scan_from_fields(
         next((name for name in known if name in names), None) for known in (INTENSITY_FIELDS, RING_FIELDS, TIME_FIELDS)
     )
     time_s = None if time is None else point_times_s(f"{where}: {time}", table[time], stamp_ns, sensor)
+    points = points.astype(np.float32, copy=False)
     if time_s is None and spinning:
-        time_s = spinning_time_s(points.astype(np.float32), sensor.rate_hz, clockwise=sensor.clockwise)
+        time_s = spinning_time_s(points, sensor.rate_hz, clockwise=sensor.clockwise)
     raw = RawScan(
         index,
         stamp_ns,
-        points.astype(np.float32, copy=False),
+        points,
         intensity=None if intensity is None else table[intensity].astype(np.float32),
         time_s=time_s,
         ring=None if ring is None else table[ring],
