@@ -8,35 +8,44 @@ import numpy as np
 from mapvote.core.types import F64, I32, I64, Bool
 from mapvote.core.voxels import slot_of, voxel_key
 
+_SLOTS = np.int64(1 << 14)
+"""Of the hash table that is tried first: scans of 66,000 points have 7,000 voxels, and this much the caches hold."""
+
 
 @numba.njit(cache=True, nogil=True)
 def voxels(points: F64, obstacle: Bool, origin: F64, reach: float, cell: float) -> tuple[I32, I64]:
     """(voxel_of (n,), first point of each voxel (m,)), voxels in order of their first points; -1 for no voxel."""
-    n, most = len(points), 0
-    for i in range(n):
-        most += obstacle[i]
-    size = 1024
-    while size < 2 * most:
-        size *= 2
-    keys, rows = np.zeros(size, dtype=np.int64), np.empty(size, dtype=np.int32)
-    first = np.empty(n, dtype=np.int64)
-    voxel_of = np.full(n, -1, dtype=np.int32)
-    m, last, row = 0, np.int64(0), np.int32(-1)
-    for i in range(n):
-        if not obstacle[i]:
-            continue
+    n, count = np.uint64(len(points)), np.uint64(0)
+    chosen, keys = np.empty(n, np.int32), np.empty(n, np.int64)
+    for i in range(n):  # what is not chosen is written over, so that nothing hangs on a guess
         x, y = points[i, 0] - origin[0], points[i, 1] - origin[1]
-        if x * x + y * y > reach * reach:
-            continue
-        key = voxel_key(points[i, 0], points[i, 1], points[i, 2], cell)
-        if key != last:  # neighbours in a scan mostly share a voxel
-            slot = slot_of(key, keys)
-            if keys[slot] == 0:
-                keys[slot], rows[slot], first[m] = key, m, i
-                m += 1
-            last, row = key, rows[slot]
-        voxel_of[i] = row
-    return voxel_of, first[:m].copy()
+        chosen[count] = i
+        count += np.uint64(1) if obstacle[i] & (x * x + y * y <= reach * reach) else np.uint64(0)
+    for k in range(count):
+        p = np.uint64(chosen[k])
+        keys[k] = voxel_key(points[p, 0], points[p, 1], points[p, 2], cell)
+    voxel_of, first = np.full(n, -1, dtype=np.int32), np.empty(count, dtype=np.int64)
+    slots, found = _SLOTS, -1
+    while found < 0:
+        found = _number(keys[:count], chosen, slots, voxel_of, first)
+        slots *= 4
+    return voxel_of, first[:found].copy()
+
+
+@numba.njit(cache=True, nogil=True)
+def _number(keys: I64, chosen: I32, slots: int, voxel_of: I32, first: I64) -> int:
+    """Number the voxels ``keys`` of the points ``chosen``, see :func:`voxels`. Returns how many there are, -1 if more
+    than half of the ``slots`` would be taken."""
+    table, rows, m = np.zeros(slots, np.int64), np.empty(slots, np.int32), 0
+    for k in range(np.uint64(len(keys))):
+        slot = slot_of(keys[k], table)
+        if table[slot] == 0:
+            if 2 * m >= slots:
+                return -1
+            table[slot], rows[slot], first[m] = keys[k], m, chosen[k]
+            m += 1
+        voxel_of[np.uint64(chosen[k])] = rows[slot]
+    return m
 
 
 @numba.njit(cache=True, nogil=True)

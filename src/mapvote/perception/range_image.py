@@ -97,42 +97,93 @@ def range_image(points: F64, origin: F64, pixels: Pixels) -> U16:
     return out
 
 
+class _Sought(NamedTuple):
+    """Where samples lie as one scan saw them, (n,) each."""
+
+    steps: I32
+    """Horizontal range."""
+    pixel: I32
+    """Index into the flat image; 0 where the image cannot tell."""
+    around: I32
+    """Pixels above and below within which rays bear witness."""
+
+
+_UNTOLD, _SIDES, _THROUGH, _STRUCK = np.uint8(0), np.uint8(3), np.uint8(4), np.uint8(8)
+"""What a scan says of a sample. With _THROUGH come the sides."""
+_LEAST, _MOST = 2, 8
+"""Pixels above and below that are looked at: at 8 m and beyond the least."""
+
+
 @numba.njit(cache=True, nogil=True, error_model="numpy")
+def _seek(samples: Samples, n: int, sensor: F32, pixels: Pixels, height_m: np.float32) -> _Sought:
+    x, y, z, _ = samples
+    steps, pixel, around = np.empty(n, np.int32), np.empty(n, np.int32), np.empty(n, np.int32)
+    near, slopes, reach = np.int32(NEAR_M * PER_M), np.int32(pixels.slopes), height_m * pixels.per_slope
+    for i in range(np.uint64(0), np.uint64(n)):
+        rho, a, b = _aim(x[i] - sensor[0], y[i] - sensor[1], z[i] - sensor[2], pixels)
+        steps[i] = np.int32(rho * PER_M + np.float32(0.5))
+        k = np.int32(min(max(reach / max(rho, NEAR_M), np.float32(_LEAST)), np.float32(_MOST)))
+        inside = (steps[i] >= near) & (b >= k) & (b + k < slopes)
+        pixel[i] = np.int32(a * slopes + b) if inside else np.int32(0)
+        around[i] = k
+    return _Sought(steps, pixel, around)
+
+
+@numba.njit(cache=True, nogil=True)
+def _read(sought: _Sought, nearest: U16) -> tuple[U16, U16, U16]:
+    """(range at each sample's pixel, least range below it, and above). Most look no farther than _LEAST, so that the
+    first loop is short: the more pixels it is after at once, the less it waits for memory."""
+    n, image = np.uint64(len(sought.pixel)), nearest.ravel()
+    here, below, above = np.empty(n, np.uint16), np.empty(n, np.uint16), np.empty(n, np.uint16)
+    for w in range(n):
+        p = np.uint64(max(sought.pixel[w], np.int32(_LEAST)))
+        here[w] = image[p]
+        below[w] = min(image[p - np.uint64(1)], image[p - np.uint64(2)])
+        above[w] = min(image[p + np.uint64(1)], image[p + np.uint64(2)])
+    for w in range(n):
+        p = np.uint64(sought.pixel[w])
+        if (sought.around[w] > _LEAST) & (p > 0):
+            for s in range(np.uint64(_LEAST + 1), np.uint64(sought.around[w] + 1)):
+                below[w], above[w] = min(below[w], image[p - s]), min(above[w], image[p + s])
+    return here, below, above
+
+
+@numba.njit(cache=True, nogil=True)
+def _tell(sought: _Sought, nearest: U16, margin: np.int32) -> U8:
+    """(n,) what a scan says of each sample: none of it by a branch, which nobody could foresee."""
+    here, below, above = _read(sought, nearest)
+    told = np.empty(len(here), np.uint8)
+    for w in range(np.uint64(0), np.uint64(len(here))):
+        r, steps = np.int32(min(here[w], min(below[w], above[w]))), sought.steps[w]
+        known = (sought.pixel[w] > 0) & (r != np.int32(NOTHING)) & (r >= steps - margin)
+        low = np.uint8(1) if below[w] < NOTHING else np.uint8(0)
+        high = np.uint8(2) if above[w] < NOTHING else np.uint8(0)
+        through, struck = low | high | _THROUGH, _STRUCK if known else _UNTOLD
+        told[w] = through if known & (r > steps + margin) else struck
+    return told
+
+
+@numba.njit(cache=True, nogil=True)
 def look(
     samples: Samples, n: int, nearest: U16, sensor: F32, pixels: Pixels, rule: tuple[float, float, int], counts: Counts
 ) -> int:
     """Ask one scan about the first ``n`` samples. Counts go up in place; returns how many samples still wait.
 
     ``sensor`` (3,) where the scan was taken, from the samples' common point. ``rule``: (metres behind a place that a
-    ray must end to have seen through it, metres above and below within which rays bear witness, enough). A sample of
-    which ``enough`` scans said the same, and none the contrary, waits no longer.
+    ray must end to have seen through it, metres above and below within which rays bear witness, enough > 0). A sample
+    of which ``enough`` scans said the same, and none the contrary, waits no longer.
     """
     x, y, z, of = samples
     free, hit, sides = counts
-    rho, a, b, around = np.empty(n, np.int32), np.empty(n, np.int32), np.empty(n, np.int32), np.empty(n, np.int32)
-    reach = np.float32(rule[1]) * pixels.per_slope
-    for i in range(np.uint64(0), np.uint64(n)):
-        h, a[i], b[i] = _aim(x[i] - sensor[0], y[i] - sensor[1], z[i] - sensor[2], pixels)
-        rho[i] = np.int32(h * PER_M + np.float32(0.5))
-        around[i] = np.int32(min(max(reach / max(h, NEAR_M), np.float32(2.0)), np.float32(8.0)))
-    near, margin, enough, left = np.int32(NEAR_M * PER_M), np.int32(rule[0] * PER_M), rule[2], 0
-    for w in range(n):
-        i, row, k = of[w], b[w], around[w]
-        x[left], y[left], z[left], of[left] = x[w], y[w], z[w], i
-        left += 1
-        if rho[w] < near or row < k or row + k >= pixels.slopes:
-            continue
-        below, above = NOTHING, NOTHING
-        for s in range(1, k + 1):
-            below, above = min(below, nearest[a[w], row - s]), min(above, nearest[a[w], row + s])
-        r = min(nearest[a[w], row], min(below, above))
-        if r == NOTHING or r < rho[w] - margin:
-            continue
-        if r > rho[w] + margin:
-            free[i] += 1
-            sides[i] |= (1 if below < NOTHING else 0) | (2 if above < NOTHING else 0)
-        else:
-            hit[i] += 1
-        if (free[i] == 0 and hit[i] >= enough) or (hit[i] == 0 and free[i] >= enough and sides[i] == 3):
-            left -= 1
-    return left
+    told = _tell(_seek(samples, n, sensor, pixels, np.float32(rule[1])), nearest, np.int32(rule[0] * PER_M))
+    enough, left = rule[2], np.uint64(0)
+    for w in range(np.uint64(0), np.uint64(n)):
+        i = np.uint64(of[w])
+        x[left], y[left], z[left], of[left] = x[w], y[w], z[w], of[w]
+        free[i] += 1 if told[w] & _THROUGH else 0
+        hit[i] += 1 if told[w] & _STRUCK else 0
+        sides[i] |= told[w] & _SIDES
+        through = (hit[i] == 0) & (free[i] >= enough) & (sides[i] == _SIDES)
+        settled = through | ((free[i] == 0) & (hit[i] >= enough))
+        left += np.uint64(0) if settled else np.uint64(1)
+    return int(left)
