@@ -3,29 +3,21 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from hand_made import make_map, make_tile, one_scan, wall
 from mapvote.config import VotingSettings
+from mapvote.core.columns import dilated
 from mapvote.core.grid import CELL_SIZE
 from mapvote.core.point_map import PointMap
-from mapvote.core.types import F64, NO_VOTE, U64, Bool, CellState
+from mapvote.core.types import F64, I32, NO_VOTE, U64, Bool, CellState
 from mapvote.detection.counters import PLANES, count_of
 from mapvote.detection.near_hits import HIT_REACH_M
-from mapvote.detection.surface_counts import CROSSED, MET, WORDS, SurfaceEvidence
-from mapvote.detection.surfaces import (
-    GONE_RAYS,
-    HIT_RAYS,
-    SUPPORT,
-    SurfaceVoter,
-    grown,
-    met_again,
-    settled,
-    weigh_surfaces,
-)
+from mapvote.detection.surface_counts import CROSSED, MET, PASSES, WORDS, SurfaceEvidence
+from mapvote.detection.surface_regions import SUPPORT, grown, lasting, settled
+from mapvote.detection.surfaces import GONE_RAYS, HIT_RAYS, NEW_RAYS, SurfaceVoter, weigh_surfaces
 from mapvote.detection.votes import TileVotes
 
 ROW, COLUMNS = 100, range(100, 112)
@@ -116,16 +108,6 @@ def test_what_grows_is_weak_and_growing_twice_grows_no_more(strong: Bool, weak: 
     np.testing.assert_array_equal(grown(out, weak), out)
 
 
-@pytest.mark.parametrize(("beside", "counts"), [(0, True), (1, True), (2, False)])
-def test_what_one_scan_met_counts_where_it_touches_what_two_met(beside: int, counts: bool) -> None:
-    planes = np.zeros((1, 4, WORDS), np.uint64)
-    planes[0, 0, MET + 1] = planes[0, beside, MET] = 4  # voxel 2: met twice in the first cell, once in the other
-    new = np.full((1, 4), 4, np.uint64)
-    kept = met_again(new, planes, np.zeros((1, 4), np.int32))
-    assert (kept[0, beside] == 4) == counts
-    assert kept[0, 0] == 4
-
-
 def test_a_point_that_touches_no_other_goes_along_only_where_most_of_what_is_around_it_goes() -> None:
     before, at_the_end = (ROW + 1, 105), (ROW, COLUMNS[-1] + 1)
     ground = wall([(r, c) for r in range(85, 125) for c in range(85, 135)], [0.0])
@@ -180,18 +162,68 @@ def test_a_place_where_nothing_is_mapped_and_rays_passed_is_empty_and_one_that_n
     assert states[ROW, 100] == UO, "hits need no rays beside them"
 
 
+def weighed(mapped: int, free: int, **counts: int) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """Voxel 5 of one cell with these counts: (gone, stands, new, beyond; met and passes of what is new)."""
+    planes, bit = np.zeros((1, 1, WORDS), np.uint64), 5
+    for first, name in ((CROSSED, "crossed"), (MET, "met"), (PASSES, "passes")):
+        for k in range(PLANES):
+            planes[0, 0, first + k] = np.uint64((counts.get(name, 0) >> k & 1) << bit)
+    found = [np.zeros((1, 1), np.uint64) for _ in range(4)]
+    sums = [np.zeros((1, 1), np.int32) for _ in range(2)]
+    words_of = [np.full((1, 1), word << bit, np.uint64) for word in (mapped, free, 0)]
+    weigh_surfaces(planes, *words_of, *found, *sums)
+    return found, sums
+
+
 @given(crossed=st.integers(0, 120), met=st.integers(0, 20))
 def test_one_hit_outweighs_as_many_rays_as_is_said(crossed: int, met: int) -> None:
-    planes = np.zeros((1, 1, WORDS), np.uint64)
-    for first, count in ((CROSSED, crossed), (MET, met)):
-        for k in range(PLANES):
-            planes[0, 0, first + k] = np.uint64((count >> k & 1) << 5)
-    gone, stands, new, beyond = (np.zeros((1, 1), np.uint64) for _ in range(4))
-    mapped, none = np.full((1, 1), 1 << 5, np.uint64), np.zeros((1, 1), np.uint64)
-    weigh_surfaces(planes, mapped, none, none, gone, stands, new, beyond)
+    (gone, stands, new, beyond), _ = weighed(1, 0, crossed=crossed, met=met)
     assert (gone[0, 0] != 0) == (crossed >= GONE_RAYS + HIT_RAYS * met)
     assert (stands[0, 0] != 0) == (met > 0 and gone[0, 0] == 0)
     assert not (new | beyond).any()
+
+
+@given(crossed=st.integers(0, 120), met=st.integers(0, 60), passes=st.integers(0, 127))
+def test_a_free_voxel_is_new_by_hits_against_crossings_and_tells_how_often_rays_passed(
+    crossed: int, met: int, passes: int
+) -> None:
+    (gone, stands, new, beyond), (of_met, of_passes) = weighed(0, 1, crossed=crossed, met=met, passes=passes)
+    assert (new[0, 0] != 0) == (met >= 1 + NEW_RAYS * crossed)
+    assert (of_met[0, 0], of_passes[0, 0]) == ((met, passes) if new[0, 0] else (0, 0))
+    assert not (gone | stands | beyond).any()
+
+
+def test_what_was_met_more_often_than_rays_passed_it_lasts_and_takes_its_seldom_met_edges_along() -> None:
+    cells = np.array([[1, 1, 1, 0, 1, 1]], np.bool_)
+    met, passes = np.array([[9, 9, 1, 0, 2, 1]], np.int32), np.array([[0, 3, 16, 0, 3, 1]], np.int32)
+    assert lasting(cells, met, passes).tolist() == [[True, True, True, False, False, False]]
+
+
+@given(
+    cells=arrays(np.bool_, (6, 6)),
+    met=arrays(np.int32, (6, 6), elements=st.integers(0, 50)),
+    passes=arrays(np.int32, (6, 6), elements=st.integers(0, 50)),
+)
+def test_of_what_lasts_more_hits_take_nothing_away_and_no_ray_leaves_anything_out(
+    cells: Bool, met: I32, passes: I32
+) -> None:
+    assert (lasting(cells, met + 1, passes) >= lasting(cells, met, passes)).all()
+    np.testing.assert_array_equal(lasting(cells, met, np.zeros_like(met)), cells)
+
+
+def test_a_car_that_drove_by_far_off_is_nothing_new_and_one_that_parked_is() -> None:
+    """30 m away beams lie wider apart than voxels: nothing of the place is ever crossed from side to side."""
+    point_map = street(WALL, HEIGHTS)
+    car = standing_at(OLD_Y - 3.0)
+    states = []
+    for scans_there in (2, 12):
+        voter = SurfaceVoter(VotingSettings(), point_map)
+        for scan in range(16):
+            seen = one_scan(point_map, car if scan < scans_there else standing_at(OLD_Y + 9))
+            seen.view.passed[:] &= np.uint64(0x5555555555555555)  # every other voxel
+            voter.observe(seen)
+        states.append(voter.votes()[0, 0].states)
+    assert [(s == CO).any() for s in states] == [False, True]
 
 
 words = arrays(np.uint64, (4, 4), elements=st.integers(0, 2**63 - 1))
@@ -204,8 +236,9 @@ def test_what_is_undecided_goes_with_what_reaches_it_first_and_nothing_that_stan
 ) -> None:
     gone = gone & ~stands
     settled_words = settled(gone, stands, mapped, np.zeros((4, 4), np.int32))
-    assert (settled_words & gone == gone).all()
-    assert not (settled_words & stands).any()
+    beside = dilated(stands, np.zeros((4, 4), np.int32), 1)
+    np.testing.assert_array_equal(settled_words & gone, gone & ~beside)
+    assert not (settled_words & beside).any(), "what touches what stands may be a part of it"
     assert not (settled_words & ~(gone | mapped)).any()
 
 

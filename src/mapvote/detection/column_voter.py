@@ -12,6 +12,7 @@ from mapvote.core.grid import TileIndex
 from mapvote.core.point_map import PointMap
 from mapvote.core.reference import bordered
 from mapvote.core.types import U64
+from mapvote.detection.blocks import blocks
 from mapvote.detection.columns import weigh
 from mapvote.detection.counters import Evidence, newly_free
 from mapvote.detection.near_hits import near_hits
@@ -22,9 +23,6 @@ from mapvote.perception.frontend import Observation
 
 WIDE_SIGMA_M = 0.1
 """A pose less certain than this makes a hit speak for two cells around it, not one."""
-_AT_ONCE = 24
-"""Tiles that are judged together; of more, blocks of _BLOCK by _BLOCK with the tiles around them, 15 MB each."""
-_BLOCK = 3
 
 
 class ColumnVoter:
@@ -52,19 +50,10 @@ class ColumnVoter:
         return dict(sorted(self.each()))
 
     def each(self) -> Iterator[tuple[TileIndex, TileVotes]]:
-        """The same one by one, in an order of its own: a drive of many tiles is judged block by block.
-
-        No rule looks farther than a tile (JOIN_CELLS, twice the halo and a speck are less), so a block is judged as in
-        the whole if the tiles around it are judged along.
-        """
-        tiles = sorted(self.evidence.tiles)
-        if len(tiles) <= _AT_ONCE:
-            yield from self._of_block(tiles, tiles)
-            return
-        for row, col in sorted({(r // _BLOCK, c // _BLOCK) for r, c in tiles}):
-            inner = [t for t in tiles if (t[0] // _BLOCK, t[1] // _BLOCK) == (row, col)]
-            around = {(r + i, c + j) for r, c in inner for i in (-1, 0, 1) for j in (-1, 0, 1)}
-            yield from self._of_block(inner, [t for t in tiles if t in around])
+        """The same one by one, in an order of its own: a drive of many tiles is judged block by block
+        (JOIN_CELLS, twice the halo and a speck are less than a tile)."""
+        for wanted, tiles in blocks(self.evidence.tiles):
+            yield from self._of_block(wanted, tiles)
 
     def _of_block(self, wanted: list[TileIndex], tiles: list[TileIndex]) -> Iterator[tuple[TileIndex, TileVotes]]:
         """The votes of the tiles ``wanted``, judged together with all of ``tiles``."""

@@ -5,6 +5,10 @@ where one stood is another wall. A voxel that the map holds is met by a hit so n
 and what was met is not crossed in the same scan, whatever grazed past. Crossed is a voxel if one scan's rays pass it
 and the voxels above and below it: of a slab (roof, awning, ceiling) they reach only one of the two.
 
+Of a voxel that the map does not hold it is counted, too, in how many scans a ray passed it at all. Where beams lie
+wider apart than voxels no scan's rays pass a voxel and those above and below it; what drove there would otherwise never
+meet with anything that speaks against it.
+
 Counts are kept as those of columns (detection/counters.py), with a word a cell of what any ray ever passed.
 """
 
@@ -16,17 +20,26 @@ import numpy as np
 from mapvote.core.columns import TOP_BIT
 from mapvote.core.grid import Lattice
 from mapvote.core.types import F32, U64
-from mapvote.detection.counters import PLANES, add_one, halve, is_full
+from mapvote.detection.counters import PLANES, add_one, is_full
 from mapvote.detection.near_hits import near_hits
 from mapvote.detection.packed_tiles import Overlap, PackedTiles
 from mapvote.perception.frontend import Observation
 
-CROSSED, MET = 0, PLANES
-PASSED = 2 * PLANES
-WORDS = 2 * PLANES + 1
-"""Words a cell: the two counters, and what any ray passed."""
+CROSSED, MET, PASSES = 0, PLANES, 2 * PLANES
+PASSED = 3 * PLANES
+WORDS = 3 * PLANES + 1
+"""Words a cell: the three counters, and what any ray passed."""
 _LOWEST, _HIGHEST = np.uint64(0b11), np.uint64(1) << np.uint64(TOP_BIT - 1)
 """The ground bounds the lowest voxel, the end of the word the highest."""
+
+
+@numba.njit(cache=True, nogil=True)
+def _halve(cell: U64) -> None:
+    """All three counters, so that what is weighed against each other keeps its ratio."""
+    for first in (CROSSED, MET, PASSES):
+        for k in range(first, first + PLANES - 1):
+            cell[k] = cell[k + 1]
+        cell[first + PLANES - 1] = 0
 
 
 @numba.njit(cache=True, nogil=True)
@@ -40,15 +53,17 @@ def _gather(planes: U64, part: Overlap, hit: U64, near: U64, passed: U64, occupi
             above, below = rays >> np.uint64(1) | _HIGHEST, rays << np.uint64(1) | _LOWEST
             crossed = rays & above & below & ~near[r, c]
             met = (near[r, c] & mapped) | (hit[r, c] & ~mapped)
+            missed = rays & ~(near[r, c] | mapped)
             cell[PASSED] |= rays
-            if is_full(cell, CROSSED, crossed) or is_full(cell, MET, met):
-                halve(cell)
+            if is_full(cell, CROSSED, crossed) or is_full(cell, MET, met) or is_full(cell, PASSES, missed):
+                _halve(cell)
             add_one(cell, CROSSED, crossed)
             add_one(cell, MET, met)
+            add_one(cell, PASSES, missed)
 
 
 class SurfaceEvidence:
-    """Counters of a drive by tile: (256, 256, WORDS) uint64, crossed first, met after, then what rays passed.
+    """Counters of a drive by tile: (256, 256, WORDS) uint64: crossed, met, passes, then what rays passed.
 
     Memory is bounded by the tiles around the vehicle, and some hundred kilobytes for each that it has left.
     """

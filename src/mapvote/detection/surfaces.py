@@ -4,8 +4,8 @@ A mapped voxel is gone that was crossed more often than HIT_RAYS times its hits,
 cell is changed-empty if a voxel of it is gone and none stands: what no ray could decide in it goes along. So do cells
 beside it in which rays crossed something and met nothing, however few, and whole walls of such cells; and cells that
 no ray could decide go with what falls, as columns have it (rule H). Points that touch no other go with most of what is
-around them, or not at all. A free voxel met more often than rays spoke against it is new. Support, not area, makes a
-change of either: a pole is narrow and tall, a speck is neither. docs/method.md.
+around them, or not at all. A free voxel met more often than rays spoke against it is new, if the whole of what it
+belongs to was met as often as rays passed it. docs/method.md.
 """
 
 from __future__ import annotations
@@ -15,20 +15,21 @@ from dataclasses import dataclass
 
 import numba
 import numpy as np
-from scipy import ndimage
 
 from mapvote.config import VotingSettings
-from mapvote.core.columns import below_top, dilated, outside
+from mapvote.core.columns import below_top, outside
 from mapvote.core.grid import Lattice, TileIndex
 from mapvote.core.point_map import PointMap
 from mapvote.core.reference import bordered
 from mapvote.core.types import F32, I32, NO_VOTE, U8, U64, Bool, CellState, Reference
 from mapvote.core.voting import one_hot
-from mapvote.detection.counters import PLANES, count_of, ever, newly_free
+from mapvote.detection.blocks import blocks
+from mapvote.detection.counters import count_of, ever, newly_free
 from mapvote.detection.faint_walls import faintly_gone, often_crossed
 from mapvote.detection.lone_points import lone_cells, no_change
 from mapvote.detection.regions import HALO, JOIN_CELLS, beyond_tiles, fallen, unexplained
-from mapvote.detection.surface_counts import CROSSED, MET, PASSED, SurfaceEvidence
+from mapvote.detection.surface_counts import CROSSED, MET, PASSED, PASSES, SurfaceEvidence
+from mapvote.detection.surface_regions import SUPPORT, grown, lasting, settled, supported
 from mapvote.detection.votes import TileVotes
 from mapvote.perception.frontend import Observation
 
@@ -39,10 +40,10 @@ GONE_RAYS = 3
 """Scans that must have crossed it beyond those: two may be an error of two poses."""
 NEW_RAYS = 0.5
 """Of the scans in which a free voxel was met, one goes against two that crossed it."""
-SUPPORT = 6
-"""Voxels that a change must be decided by, over its 8-connected cells: a pole of 1.8 m, or half a square metre."""
 FALL_CELLS = 8
 """How far what is gone takes cells with it that no ray could decide: 2.4 m, where columns allow 4.5."""
+_NEAR = 32
+"""Cells around a tile from which what is gone and what stands may reach what no ray decided."""
 
 
 @dataclass(slots=True)
@@ -53,6 +54,10 @@ class _Judged:
     gone: U64
     stands: U64
     new: U64
+    met: I32
+    """In how many scans the new voxels of each cell were met, summed over them."""
+    passes: I32
+    """In how many a ray passed them and met nothing."""
     beyond: U64
     """Met where the map knew nothing and has nothing beside it."""
     beside: Bool
@@ -77,10 +82,11 @@ def is_gone(cell: U64, bit: int) -> bool:
 
 @numba.njit(cache=True, nogil=True)
 def weigh_surfaces(
-    planes: U64, occupied: U64, free: U64, near: U64, gone: U64, stands: U64, new: U64, beyond: U64
-) -> None:
-    """Fill the last four planes (rows, cols), which come empty, from counters (rows, cols, WORDS) and the map's words:
-    ``free`` it knows to be, ``near`` its points."""
+    planes: U64, occupied: U64, free: U64, near: U64,
+    gone: U64, stands: U64, new: U64, beyond: U64, met_new: I32, passes_new: I32,
+) -> None:  # fmt: skip
+    """Fill the last six planes (rows, cols), which come empty, from counters (rows, cols, WORDS) and the map's words:
+    ``free`` it knows to be, ``near`` its points. See :class:`_Judged` for each."""
     for r in range(occupied.shape[0]):
         for c in range(occupied.shape[1]):
             cell = planes[r, c]
@@ -95,37 +101,10 @@ def weigh_surfaces(
                 elif met >= 1 + NEW_RAYS * crossed:
                     if free[r, c] & one:
                         new[r, c] |= one
+                        met_new[r, c] += met
+                        passes_new[r, c] += count_of(cell, PASSES, bit)
                     elif not near[r, c] & one:
                         beyond[r, c] |= one
-
-
-def supported(cells: Bool, voxels: U64) -> Bool:
-    """(rows, cols) those of ``cells`` whose 8-connected group has SUPPORT set bits in ``voxels`` (rows, cols)."""
-    group, count = ndimage.label(cells, structure=np.ones((3, 3)))
-    votes = np.bincount(group.ravel(), weights=np.bitwise_count(voxels).ravel(), minlength=count + 1)
-    return np.asarray(cells & (votes >= SUPPORT)[group])
-
-
-def grown(strong: Bool, weak: Bool) -> Bool:
-    """(rows, cols) ``strong`` cells, and ``weak`` ones that touch them (8) directly or through each other: hysteresis
-    (Canny 1986). Few rays cross the far wall of what fell, and none of them met it."""
-    return np.asarray(ndimage.binary_propagation(strong, np.ones((3, 3)), mask=strong | weak))
-
-
-def settled(gone: U64, stands: U64, mapped: U64, base: I32) -> U64:
-    """(rows, cols) ``gone``, and those ``mapped`` voxels that neither plane holds and that it reaches before ``stands``
-    does, from voxel to touching voxel (26); where both come at once, they stand."""
-    gone, stands = gone.copy(), stands.copy()
-    left = mapped & ~gone & ~stands
-    while left.any():
-        more_stand = dilated(stands, base, 1) & left
-        more_gone = dilated(gone, base, 1) & left & ~more_stand
-        if not (more_stand.any() or more_gone.any()):
-            break
-        stands |= more_stand
-        gone |= more_gone
-        left &= ~(more_stand | more_gone)
-    return gone
 
 
 class SurfaceVoter:
@@ -142,25 +121,18 @@ class SurfaceVoter:
 
     def votes(self) -> dict[TileIndex, TileVotes]:
         """Every tile with evidence, in ascending order."""
-        judged = {tile: self._judge(tile) for tile in sorted(self.evidence.tiles)}
-        _decide_mapped(judged, self.point_map.lattice)
-        _decide_new(judged, self.point_map.lattice)
-        out = {}
-        for tile, found in judged.items():
-            here = found.here
-            if (found.states == NO_VOTE).all():
-                continue
-            free = newly_free(self.evidence.tiles[tile], here)
-            known = ~np.uint64(0) if here.free is None else here.free
-            top = _below_tops(found.new)
-            sure = met_again(found.new, self.evidence.tiles[tile], here.base)
-            new = np.where(sure != 0, sure | found.beyond | ~(top | known), np.uint64(0))
-            out[tile] = TileVotes(one_hot(found.states), found.states, found.gone, found.remnants, new, free)
-        return out
+        return dict(sorted(self.each()))
 
     def each(self) -> Iterator[tuple[TileIndex, TileVotes]]:
-        """The same one by one; all tiles are judged together."""
-        yield from self.votes().items()
+        """The same one by one, in an order of its own: a drive of many tiles is judged block by block
+        (three halos, a lone point and what settles are less than a tile)."""
+        for wanted, tiles in blocks(self.evidence.tiles):
+            judged = {tile: self._judge(tile) for tile in tiles}
+            _decide_mapped(judged, self.point_map.lattice)
+            _decide_new(judged, self.point_map.lattice)
+            for tile in wanted:
+                if (judged[tile].states != NO_VOTE).any():
+                    yield tile, _votes_of(judged[tile], self.evidence.tiles[tile])
 
     def _judge(self, tile: TileIndex) -> _Judged:
         """What the tile's own evidence says, voxel by voxel and cell by cell."""
@@ -168,7 +140,8 @@ class SurfaceVoter:
         here, outer, near, known = bordered(self.point_map, window)
         planes = self.evidence.tiles[tile]
         gone, stands, new, beyond = (np.zeros(window.shape, dtype=np.uint64) for _ in range(4))
-        weigh_surfaces(planes, here.occupied, known, near, gone, stands, new, beyond)
+        met, passes = np.zeros(window.shape, dtype=np.int32), np.zeros(window.shape, dtype=np.int32)
+        weigh_surfaces(planes, here.occupied, known, near, gone, stands, new, beyond, met, passes)
         mapped, passed = here.occupied != 0, planes[..., PASSED]
         low = mapped & ~(here.top_z - here.ground_z >= self.voting.min_height_m)
         under = np.where(mapped, (here.occupied & (~here.occupied + np.uint64(1))) - np.uint64(1), np.uint64(0))
@@ -184,6 +157,8 @@ class SurfaceVoter:
             gone=np.where(low, np.uint64(0), gone),
             stands=stands,
             new=np.where(mapped, np.uint64(0), new),
+            met=met,
+            passes=passes,
             beyond=beyond,
             beside=(new != 0) & (new & ~near == 0),
             crossed=mapped & ~low & (stands == 0) & ((gone | never_met) != 0),
@@ -195,11 +170,12 @@ class SurfaceVoter:
         )
 
 
-def met_again(new: U64, planes: U64, base: I32) -> U64:
-    """(rows, cols) of the ``new`` voxels those that two scans met, and those that touch one: what a single scan met
-    beside nothing else may be a mixed pixel, and lies on no surface more often than not."""
-    twice = new & np.bitwise_or.reduce(planes[..., MET + 1 : MET + PLANES], axis=-1)
-    return np.asarray(twice | (new & dilated(twice, base, 1)))
+def _votes_of(found: _Judged, planes: U64) -> TileVotes:
+    """What a new thing has where the map knew neither free space nor points comes along, and so do its upper parts."""
+    known = ~np.uint64(0) if found.here.free is None else found.here.free
+    new = np.where(found.new != 0, found.new | found.beyond | ~(_below_tops(found.new) | known), np.uint64(0))
+    free = newly_free(planes, found.here)
+    return TileVotes(one_hot(found.states), found.states, found.gone, found.remnants, new, free)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -244,22 +220,24 @@ def _decide_mapped(tiles: dict[TileIndex, _Judged], lattice: Lattice) -> None:
     gone = {tile: found.gone for tile, found in tiles.items()}
     stands, base = {t: found.stands for t, found in tiles.items()}, {t: found.here.base for t, found in tiles.items()}
     mapped = {tile: np.where(found.stands != 0, found.here.occupied, 0) for tile, found in tiles.items()}
-    for tile, words in beyond_tiles(lattice, HALO, settled, (gone, 0), (stands, 0), (mapped, 0), (base, 0)).items():
+    for tile, words in beyond_tiles(lattice, _NEAR, settled, (gone, 0), (stands, 0), (mapped, 0), (base, 0)).items():
         tiles[tile].remnants = np.where(tiles[tile].stands != 0, words, np.uint64(0))
 
 
 def _decide_new(tiles: dict[TileIndex, _Judged], lattice: Lattice) -> None:
-    """Where something new stands, but for what an error of pose explains (rule C) and for specks."""
+    """Where something new stands, but for what an error of pose explains (rule C), for specks, and for traffic."""
     occupied = np.uint8(CellState.CHANGED_OCCUPIED)
     candidates = {tile: np.where(found.new != 0, occupied, np.uint8(NO_VOTE)) for tile, found in tiles.items()}
     beside = {tile: found.beside for tile, found in tiles.items()}
     new = {tile: found.new for tile, found in tiles.items()}
+    met, passes = {t: found.met for t, found in tiles.items()}, {t: found.passes for t, found in tiles.items()}
 
-    def stand(states: U8, beside: Bool, new: U64) -> Bool:
+    def stand(states: U8, beside: Bool, new: U64, met: I32, passes: I32) -> Bool:
         given_up = unexplained(states, beside, JOIN_CELLS)
-        return supported((states == occupied) & ~given_up, new)
+        cells = (states == occupied) & ~given_up
+        return supported(cells, new) & lasting(cells, met, passes)
 
-    planes = (candidates, NO_VOTE), (beside, False), (new, 0)
+    planes = (candidates, NO_VOTE), (beside, False), (new, 0), (met, 0), (passes, 0)
     for tile, cells in beyond_tiles(lattice, HALO, stand, *planes).items():
         tiles[tile].states[tiles[tile].new != 0] = CellState.UNDETERMINED
         tiles[tile].states[cells] = occupied
