@@ -6,16 +6,19 @@ what it touches. And what stands is met at least as often as rays go by where it
 
 from __future__ import annotations
 
+import numba
 import numpy as np
 from scipy import ndimage
 
-from mapvote.core.columns import dilated
-from mapvote.core.types import I32, U64, Bool
+from mapvote.core.columns import neighbourhood
+from mapvote.core.types import I32, I64, U64, Bool
 
 SUPPORT = 6
 """Voxels that a change must be decided by, over its 8-connected cells: a pole of 1.8 m, or half a square metre.
 docs/decisions/evidence.md has what other numbers do."""
 EVERY_SIDE = np.ones((3, 3))
+_BESIDE = np.int64(1)
+"""One cell to all sides; no literal, for which :func:`neighbourhood` would be compiled once more."""
 
 
 def supported(cells: Bool, voxels: U64) -> Bool:
@@ -44,15 +47,30 @@ def settled(gone: U64, stands: U64, mapped: U64, base: I32) -> U64:
     """(rows, cols) ``gone``, and those ``mapped`` voxels that neither plane holds and that it reaches before ``stands``
     does, from voxel to touching voxel (26); where both come at once, they stand. So does what touches a voxel of
     ``stands``: a leaf or a ledge that one vehicle met others may see past."""
-    gone, stands = gone.copy(), stands.copy()
-    beside = dilated(stands, base, 1)
-    left = mapped & ~gone & ~stands
-    while left.any():
-        more_stand = dilated(stands, base, 1) & left
-        more_gone = dilated(gone, base, 1) & left & ~more_stand
-        if not (more_stand.any() or more_gone.any()):
-            break
-        stands |= more_stand
-        gone |= more_gone
-        left &= ~(more_stand | more_gone)
-    return gone & ~beside
+    rows, cols = np.nonzero(mapped & ~gone & ~stands)
+    return _settle(gone, stands, mapped, base, rows, cols)
+
+
+@numba.njit(cache=True, nogil=True)
+def _settle(gone: U64, stands: U64, mapped: U64, base: I32, rows: I64, cols: I64) -> U64:
+    """``rows`` and ``cols`` (n,): the cells with anything undecided. Round by round, so that their order says nothing."""
+    fell, stood = gone.copy(), stands.copy()
+    falls, stays = np.empty(len(rows), np.uint64), np.empty(len(rows), np.uint64)
+    more = True
+    while more:
+        more = False
+        for i in range(len(rows)):
+            r, c = rows[i], cols[i]
+            left = mapped[r, c] & ~fell[r, c] & ~stood[r, c]
+            stays[i] = left & neighbourhood(stood, base, r, c, _BESIDE) if left else left
+            falls[i] = left & ~stays[i] & neighbourhood(fell, base, r, c, _BESIDE) if left else left
+        for i in range(len(rows)):
+            if stays[i] | falls[i]:
+                stood[rows[i], cols[i]] |= stays[i]
+                fell[rows[i], cols[i]] |= falls[i]
+                more = True
+    for r in range(fell.shape[0]):
+        for c in range(fell.shape[1]):
+            if fell[r, c]:
+                fell[r, c] &= ~neighbourhood(stands, base, r, c, _BESIDE)
+    return fell

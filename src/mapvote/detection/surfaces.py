@@ -24,7 +24,7 @@ from mapvote.core.reference import bordered
 from mapvote.core.types import F32, I32, NO_VOTE, U8, U64, Bool, CellState, Reference
 from mapvote.core.voting import one_hot
 from mapvote.detection.blocks import blocks
-from mapvote.detection.counters import count_of, ever, newly_free
+from mapvote.detection.counters import PLANES, count_of, ever, newly_free
 from mapvote.detection.faint_walls import faintly_gone, often_crossed
 from mapvote.detection.lone_points import lone_cells, no_change
 from mapvote.detection.regions import HALO, JOIN_CELLS, beyond_tiles, fallen, unexplained
@@ -90,8 +90,15 @@ def weigh_surfaces(
     for r in range(occupied.shape[0]):
         for c in range(occupied.shape[1]):
             cell = planes[r, c]
+            asked = occupied[r, c]
+            for k in range(PLANES):
+                asked |= cell[MET + k]
+            if not asked:
+                continue
             for bit in range(64):
                 one = np.uint64(1) << np.uint64(bit)
+                if not asked & one:
+                    continue
                 crossed, met = count_of(cell, CROSSED, bit), count_of(cell, MET, bit)
                 if occupied[r, c] & one:
                     if is_gone(cell, bit):
