@@ -53,7 +53,7 @@ def settled(gone: U64, stands: U64, mapped: U64, base: I32) -> U64:
 
 @numba.njit(cache=True, nogil=True)
 def _settle(gone: U64, stands: U64, mapped: U64, base: I32, rows: I64, cols: I64) -> U64:
-    """``rows`` and ``cols`` (n,): the cells with anything undecided. Round by round, so that their order says nothing."""
+    """``rows`` and ``cols`` (n,): cells with anything undecided. Round by round, so that their order says nothing."""
     fell, stood = gone.copy(), stands.copy()
     falls, stays = np.empty(len(rows), np.uint64), np.empty(len(rows), np.uint64)
     more = True
