@@ -61,12 +61,12 @@ def test_voxels_are_numbered_by_their_first_points_however_many_there_are(count:
     rng = np.random.default_rng(count)
     origin = np.array([500.0, -300.0, 8.0])
     points, obstacle = origin + rng.uniform(-12.0, 12.0, (3 * count, 3)), rng.random(3 * count) < 0.7
-    voxel_of, first = voxels(points, obstacle, origin, 11.0, 0.3)
+    voxel_of, samples = voxels(points, obstacle, origin, 11.0, 0.3)
     chosen = np.flatnonzero(obstacle & (np.hypot(*(points - origin)[:, :2].T) <= 11.0))
     _, at, number = np.unique(np.floor(points[chosen] / 0.3), axis=0, return_index=True, return_inverse=True)
     in_order = np.argsort(at)
-    np.testing.assert_array_equal(first, chosen[at[in_order]])
-    assert count < 1000 or len(first) > 8192
+    np.testing.assert_array_equal(samples, points[chosen[at[in_order]]])
+    assert count < 1000 or len(samples) > 8192
     expected = np.full(len(points), -1)
     expected[chosen] = np.argsort(in_order)[number.ravel()]
     np.testing.assert_array_equal(voxel_of, expected)

@@ -26,7 +26,8 @@ _AHEAD_M, _KEPT_M = HALF_WINDOW_M + 2 * CENTRAL_M, HALF_WINDOW_M + 4 * CENTRAL_M
 
 
 class MapWindow:
-    """Built anew when the vehicle leaves its middle: in a millisecond or two where :meth:`prepare` has been called.
+    """Built anew when the vehicle leaves its middle: in a millisecond or two where :meth:`prepare` has been called, and
+    in the memory of the one before, which whoever asked earlier must not use any longer.
 
     Memory is bounded by the tiles around the vehicle.
     """
@@ -39,7 +40,7 @@ class MapWindow:
 
     def __call__(self, position: F64) -> NdtMap:
         if self.ndt_map is None or not self.ndt_map.is_central(position):
-            self.ndt_map = self._laid_out(position)
+            return self._laid_out(position)
         return self.ndt_map
 
     def prepare(self, position: F64) -> None:
@@ -61,13 +62,17 @@ class MapWindow:
     def _laid_out(self, position: F64) -> NdtMap:
         kept = set(self._around(position, _KEPT_M))
         self._ready = {tile: ready for tile, ready in self._ready.items() if tile in kept}
-        ndt_map, here = NdtMap(position), self._around(position, HALF_WINDOW_M)
+        here = self._around(position, HALF_WINDOW_M)
         for tile in here:
             while len(self._ready.get(tile, [])) < len(LEVELS):
                 self._step(tile)
-        for i, grid in enumerate(ndt_map.levels):
+        if self.ndt_map is None:
+            self.ndt_map = NdtMap(position)
+        else:
+            self.ndt_map.begin_anew(position)
+        for i, grid in enumerate(self.ndt_map.levels):
             grid.join([voxels for tile in here for voxels in self._ready[tile][i]])
-        return ndt_map
+        return self.ndt_map
 
 
 def tiles_within(point_map: PointMap, position: F64, half_m: float = HALF_WINDOW_M) -> list[TileIndex]:

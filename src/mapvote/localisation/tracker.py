@@ -95,15 +95,16 @@ class Tracker:
             centre = prior.T_map_lidar if prior is not None else seed
             result = self._search(ndt_map, clouds, centre, reach, prior)
             trusted = self.is_sound(result)
+        found = self._motion_to(result.T_map_lidar, scan.stamp_ns)
         for _ in range(_ROUNDS):
-            found = self._motion_to(result.T_map_lidar, scan.stamp_ns)
             if scan.time_s is None or found is None or not _differ(twist, found):
                 break
             twist = found
             result = refine(ndt_map, sample.clouds(twist), result.T_map_lidar, prior, len(LEVELS) - 1)
             trusted = self.is_sound(result)
+            found = self._motion_to(result.T_map_lidar, scan.stamp_ns)
         if trusted:
-            self._accept(result.T_map_lidar, scan.stamp_ns, twist)
+            self._accept(result.T_map_lidar, scan.stamp_ns, found, twist)
             rate = 0.2 if self._usual_score else 1.0
             self._usual_score += rate * (result.score - self._usual_score)
         return Fix(scan, result, deskew(scan, twist), trusted)
@@ -132,7 +133,7 @@ class Tracker:
 
     def begin(self, scan: Scan, T_map_lidar: F64) -> Fix:
         """Take the first pose as given: where there is no map yet, the first scan makes it."""
-        self._accept(T_map_lidar, scan.stamp_ns, self.twist)
+        self._accept(T_map_lidar, scan.stamp_ns, self._motion_to(T_map_lidar, scan.stamp_ns), self.twist)
         registration = Registration(T_map_lidar, np.zeros((6, 6)), 1.0, 1.0, 0, True)
         return Fix(scan, registration, deskew(scan, self.twist), True)
 
@@ -170,9 +171,12 @@ class Tracker:
 
     def is_sound(self, result: Registration) -> bool:
         """Whether a registration converged, met the map and is certain enough; that it is the right place says more."""
-        s = self.settings
-        sigma_m = float(np.sqrt(np.linalg.eigvalsh(result.covariance[:3, :3])[-1]))
-        return result.converged and result.inlier_share >= s.min_inlier_share and sigma_m <= s.max_sigma_m
+        s, position = self.settings, result.covariance[:3, :3]
+        if not result.converged or result.inlier_share < s.min_inlier_share:
+            return False
+        if np.sqrt(position[0, 0] + position[1, 1] + position[2, 2]) < 0.99 * s.max_sigma_m:
+            return True  # no direction has more than all of them together, which takes less to ask
+        return bool(np.sqrt(np.linalg.eigvalsh(position)[-1]) <= s.max_sigma_m)
 
     def _reconsider(
         self, ndt_map: NdtMap, clouds: list[F32], stamp_ns: int, result: Registration, prior: PosePrior | None
@@ -209,8 +213,8 @@ class Tracker:
             return None
         return twist_between(self.last_pose, T_map_lidar, seconds)
 
-    def _accept(self, T_map_lidar: F64, stamp_ns: int, twist: F64) -> None:
-        found = self._motion_to(T_map_lidar, stamp_ns)
+    def _accept(self, T_map_lidar: F64, stamp_ns: int, found: F64 | None, twist: F64) -> None:
+        """The track goes on from this pose with the motion that was ``found`` to lead there, else with ``twist``."""
         self.twist = twist if found is None else found
         self._measured = self._measured or found is not None
         self.last_pose, self.last_stamp_ns = T_map_lidar, stamp_ns

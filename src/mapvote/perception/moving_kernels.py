@@ -7,14 +7,15 @@ import numpy as np
 
 from mapvote.core.types import F64, I32, I64, Bool
 from mapvote.core.voxels import slot_of, voxel_key
+from mapvote.perception.range_image import BOTH_SIDES, Counts
 
 _SLOTS = np.int64(1 << 14)
 """Of the hash table that is tried first: scans of 66,000 points have 7,000 voxels, and this much the caches hold."""
 
 
 @numba.njit(cache=True, nogil=True)
-def voxels(points: F64, obstacle: Bool, origin: F64, reach: float, cell: float) -> tuple[I32, I64]:
-    """(voxel_of (n,), first point of each voxel (m,)), voxels in order of their first points; -1 for no voxel."""
+def voxels(points: F64, obstacle: Bool, origin: F64, reach: float, cell: float) -> tuple[I32, F64]:
+    """(voxel_of (n,), first point of each voxel (m, 3)), voxels in order of their first points; -1 for no voxel."""
     n, count = np.uint64(len(points)), np.uint64(0)
     chosen, keys = np.empty(n, np.int32), np.empty(n, np.int64)
     for i in range(n):  # what is not chosen is written over, so that nothing hangs on a guess
@@ -29,7 +30,11 @@ def voxels(points: F64, obstacle: Bool, origin: F64, reach: float, cell: float) 
     while found < 0:
         found = _number(keys[:count], chosen, slots, voxel_of, first)
         slots *= 4
-    return voxel_of, first[:found].copy()
+    samples = np.empty((found, 3))
+    for v in range(found):
+        for axis in range(3):
+            samples[v, axis] = points[first[v], axis]
+    return voxel_of, samples
 
 
 @numba.njit(cache=True, nogil=True)
@@ -46,6 +51,29 @@ def _number(keys: I64, chosen: I32, slots: int, voxel_of: I32, first: I64) -> in
             m += 1
         voxel_of[np.uint64(chosen[k])] = rows[slot]
     return m
+
+
+@numba.njit(cache=True, nogil=True)
+def cells_of(samples: F64, lowest: I64, cell: float) -> tuple[I64, I64]:
+    """(rows (m,), cols (m,)) of places (m, 3) in a plane that begins at cell ``lowest`` (x, y) of the world."""
+    m = np.uint64(len(samples))
+    rows, cols = np.empty(m, np.int64), np.empty(m, np.int64)
+    for i in range(m):
+        rows[i] = np.int64(np.floor(samples[i, 1] / cell)) - lowest[1]
+        cols[i] = np.int64(np.floor(samples[i, 0] / cell)) - lowest[0]
+    return rows, cols
+
+
+@numba.njit(cache=True, nogil=True)
+def decidable(counts: Counts, min_free: int, free_share: float) -> tuple[Bool, Bool]:
+    """(seen (m,), brief (m,)): which voxels ``min_free`` scans could see, and which of them were occupied briefly."""
+    m = np.uint64(len(counts.free))
+    seen, brief = np.empty(m, np.bool_), np.empty(m, np.bool_)
+    for i in range(m):
+        free, total = counts.free[i], counts.free[i] + counts.hit[i]
+        seen[i] = total >= min_free
+        brief[i] = (counts.sides[i] == BOTH_SIDES) & (free >= min_free) & (free >= free_share * total)
+    return seen, brief
 
 
 @numba.njit(cache=True, nogil=True)

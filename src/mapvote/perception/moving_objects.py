@@ -27,10 +27,11 @@ from itertools import zip_longest
 import numpy as np
 
 from mapvote.config import MovingSettings
+from mapvote.core.geometry import rows_from
 from mapvote.core.grid import CELL_SIZE
 from mapvote.core.sensors import Sensor
 from mapvote.core.types import F64, I32, Bool
-from mapvote.perception.moving_kernels import moving_components, voxels
+from mapvote.perception.moving_kernels import cells_of, decidable, moving_components, voxels
 from mapvote.perception.range_image import U16, Counts, Pixels, Samples, look, range_image
 
 # Set on the development streets of the simulator; what half and twice of each cost,
@@ -111,8 +112,8 @@ class MovingFilter:
         points = np.ascontiguousarray(points_map, dtype=np.float64)
         origin = np.asarray(origin_map, dtype=np.float64)
         nearest = range_image(points, origin, self._pixels)
-        voxel_of, first = voxels(points, obstacle, origin, self.reach_m, CELL_SIZE)
-        self._window.append(_Scan(stamp_ns, origin, nearest, voxel_of, points[first]))
+        voxel_of, samples = voxels(points, obstacle, origin, self.reach_m, CELL_SIZE)
+        self._window.append(_Scan(stamp_ns, origin, nearest, voxel_of, samples))
         self._waiting += 1
         return self._decide(stamp_ns - round(self.settings.lookahead_s * 1e9))
 
@@ -139,18 +140,17 @@ class MovingFilter:
         scan = self._window[at]
         m = left = len(scan.samples)
         counts = Counts(np.zeros(m, np.int32), np.zeros(m, np.int32), np.zeros(m, np.uint8))
-        x, y, z = (scan.samples - scan.origin_map).astype(np.float32).T.copy()
+        x, y, z = rows_from(scan.samples, scan.origin_map)
         waiting = Samples(x, y, z, np.arange(m, dtype=np.int32))
         for other in self._witnesses(at):
             sensor = (other.origin_map - scan.origin_map).astype(np.float32)
             left = look(waiting, left, other.nearest, sensor, self._pixels, (MARGIN_M, HEIGHT_M, ENOUGH), counts)
-        free, seen = counts.free, counts.free + counts.hit
-        brief = (counts.sides == 3) & (free >= MIN_FREE) & (free >= FREE_SHARE * seen)
+        seen, brief = decidable(counts, MIN_FREE, FREE_SHARE)
         half = int(np.ceil(self.reach_m / CELL_SIZE)) + 2
-        cells = np.floor(scan.samples[:, :2] / CELL_SIZE).astype(np.int64)
-        cells -= np.floor(scan.origin_map[:2] / CELL_SIZE).astype(np.int64) - half
-        rows, cols, share = cells[:, 1], cells[:, 0], (SHARE_WHOLE, SHARE_PART)
-        return moving_components(rows, cols, 2 * half + 1, seen >= MIN_FREE, brief, MIN_VOXELS, *share, scan.voxel_of)
+        lowest = np.floor(scan.origin_map[:2] / CELL_SIZE).astype(np.int64) - half
+        rows, cols = cells_of(scan.samples, lowest, CELL_SIZE)
+        share = SHARE_WHOLE, SHARE_PART
+        return moving_components(rows, cols, 2 * half + 1, seen, brief, MIN_VOXELS, *share, scan.voxel_of)
 
     def _witnesses(self, at: int) -> list[_Scan]:
         """Up to ``looks`` other scans spread evenly over the time before, and over the time after, scan ``at``.

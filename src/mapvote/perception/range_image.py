@@ -108,7 +108,9 @@ class _Sought(NamedTuple):
     """Pixels above and below within which rays bear witness."""
 
 
-_UNTOLD, _SIDES, _THROUGH, _STRUCK = np.uint8(0), np.uint8(3), np.uint8(4), np.uint8(8)
+BOTH_SIDES = np.uint8(3)
+"""Rays went through below and above."""
+_UNTOLD, _THROUGH, _STRUCK = np.uint8(0), np.uint8(4), np.uint8(8)
 """What a scan says of a sample. With _THROUGH come the sides."""
 _LEAST, _MOST = 2, 8
 """Pixels above and below that are looked at: at 8 m and beyond the least."""
@@ -182,8 +184,8 @@ def look(
         x[left], y[left], z[left], of[left] = x[w], y[w], z[w], of[w]
         free[i] += 1 if told[w] & _THROUGH else 0
         hit[i] += 1 if told[w] & _STRUCK else 0
-        sides[i] |= told[w] & _SIDES
-        through = (hit[i] == 0) & (free[i] >= enough) & (sides[i] == _SIDES)
+        sides[i] |= told[w] & BOTH_SIDES
+        through = (hit[i] == 0) & (free[i] >= enough) & (sides[i] == BOTH_SIDES)
         settled = through | ((free[i] == 0) & (hit[i] >= enough))
         left += np.uint64(0) if settled else np.uint64(1)
     return int(left)
