@@ -54,7 +54,7 @@ def _number(keys: I64, chosen: I32, slots: int, voxel_of: I32, first: I64) -> in
 
 
 @numba.njit(cache=True, nogil=True)
-def cells_of(samples: F64, lowest: I64, cell: float) -> tuple[I64, I64]:
+def cells_in_plane(samples: F64, lowest: I64, cell: float) -> tuple[I64, I64]:
     """(rows (m,), cols (m,)) of places (m, 3) in a plane that begins at cell ``lowest`` (x, y) of the world."""
     m = np.uint64(len(samples))
     rows, cols = np.empty(m, np.int64), np.empty(m, np.int64)

@@ -31,7 +31,7 @@ from mapvote.core.geometry import rows_from
 from mapvote.core.grid import CELL_SIZE
 from mapvote.core.sensors import Sensor
 from mapvote.core.types import F64, I32, Bool
-from mapvote.perception.moving_kernels import cells_of, decidable, moving_components, voxels
+from mapvote.perception.moving_kernels import cells_in_plane, decidable, moving_components, voxels
 from mapvote.perception.range_image import U16, Counts, Pixels, Samples, look, range_image
 
 # Set on the development streets of the simulator; what half and twice of each cost,
@@ -148,7 +148,7 @@ class MovingFilter:
         seen, brief = decidable(counts, MIN_FREE, FREE_SHARE)
         half = int(np.ceil(self.reach_m / CELL_SIZE)) + 2
         lowest = np.floor(scan.origin_map[:2] / CELL_SIZE).astype(np.int64) - half
-        rows, cols = cells_of(scan.samples, lowest, CELL_SIZE)
+        rows, cols = cells_in_plane(scan.samples, lowest, CELL_SIZE)
         share = SHARE_WHOLE, SHARE_PART
         return moving_components(rows, cols, 2 * half + 1, seen, brief, MIN_VOXELS, *share, scan.voxel_of)
 
