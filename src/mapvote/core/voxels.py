@@ -169,23 +169,21 @@ def _thin(points: NDArray[np.float32], every: int, size: float, table: I64) -> I
 
     ``table`` (2^k,) holds zeros; the answer is empty when it became half full and a larger one is needed.
     """
-    keep = np.empty(len(table) // 2, dtype=np.int64)
-    n = 0
-    scale = 1.0 / size
-    last = np.int64(0)
-    for i in range(0, len(points), every):
+    keep, scale, middle = np.empty(len(table) // 2, np.int64), 1.0 / size, float(_MIDDLE)
+    m, step, n = np.uint64((len(points) + every - 1) // every), np.uint64(every), 0
+    keys = np.empty(m, np.int64)
+    for j in range(m):  # apart from the search, so that it vectorises; int32 does too, and holds what is within reach
+        i = j * step
         # The middle is added first: cutting off is then rounding down, and quicker than floor.
-        ix, iy = np.int64(points[i, 0] * scale + float(_MIDDLE)), np.int64(points[i, 1] * scale + float(_MIDDLE))
-        key = packed(ix, iy, np.int64(points[i, 2] * scale + float(_MIDDLE)))
-        if key == last:  # neighbours in a scan mostly share a voxel
-            continue
-        last = key
-        slot = slot_of(key, table)
+        ix, iy = np.int32(points[i, 0] * scale + middle), np.int32(points[i, 1] * scale + middle)
+        keys[j] = packed(np.int64(ix), np.int64(iy), np.int64(np.int32(points[i, 2] * scale + middle)))
+    for j in range(m):
+        slot = slot_of(keys[j], table)
         if table[slot] == 0:
             if n == len(keep):
                 return keep[:0]
-            table[slot] = key
-            keep[n] = i
+            table[slot] = keys[j]
+            keep[n] = j * step
             n += 1
     return keep[:n].copy()
 

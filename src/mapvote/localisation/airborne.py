@@ -30,32 +30,37 @@ def solid_sample(points_lidar: NDArray[np.floating], size: float) -> F64:
 
     ``points_lidar`` (n, 3) is a whole scan, metres from the sensor, de-skewed or not.
     """
-    few = points_lidar[thin(points_lidar, size)].astype(np.float64)
-    rays = np.ascontiguousarray(points_lidar[:: -(-len(points_lidar) // _RAYS) or 1])  # of one kind: one compilation
+    few = points_lidar.take(thin(points_lidar, size), axis=0).astype(np.float64)
+    every = -(-len(points_lidar) // _RAYS) or 1
     range2 = (few**2).sum(axis=1)
-    expected = len(rays) / _SOLID_ANGLE * _VOXEL_M**2 / np.maximum(range2, _VOXEL_M**2)
-    return few[(range2 > _REACH_M**2) | (_hits_around(rays, few, _table_for(rays)) > _SHARE * expected)]
-
-
-def _table_for(rays: NDArray[np.floating]) -> I64:
-    """(2, 2^k) zeros: the keys of voxels, and how many rays end in each."""
-    return np.zeros((2, 1 << max(10, int(2 * len(rays)).bit_length())), dtype=np.int64)
+    rays = -(-len(points_lidar) // every)
+    expected = rays / _SOLID_ANGLE * _VOXEL_M**2 / np.maximum(range2, _VOXEL_M**2)
+    hits = _hits_around(np.ascontiguousarray(points_lidar), every, few)
+    return few[(range2 > _REACH_M**2) | (hits > _SHARE * expected)]
 
 
 @numba.njit(cache=True, nogil=True)
-def _hits_around(rays: NDArray[np.floating], few: F64, table: I64) -> I64:
-    """(m,) how many of ``rays`` (n, 3) end in the voxel of each of ``few``; ``table``: see :func:`_table_for`."""
-    keys, counts = table[0], table[1]
-    far2, slot = (_REACH_M + 2.0 * _VOXEL_M) ** 2, np.int64(0)
-    for i in range(len(rays)):
-        if rays[i, 0] ** 2 + rays[i, 1] ** 2 + rays[i, 2] ** 2 > far2:
+def _hits_around(points: NDArray[np.floating], every: int, few: F64) -> I64:
+    """(m,) how many of every ``every``-th of ``points`` (n, 3) end in the voxel of each of ``few``.
+
+    The table holds these voxels alone, and at most a quarter of it: rays that end elsewhere leave it as it is.
+    """
+    size = 1024
+    while size < 4 * len(few):
+        size *= 2
+    keys, counts, far2 = np.zeros(size, np.int64), np.zeros(size, np.int64), (_REACH_M + 2.0 * _VOXEL_M) ** 2
+    at = np.empty(len(few), np.int64)
+    for i in range(len(few)):
+        key = voxel_key(few[i, 0], few[i, 1], few[i, 2], _VOXEL_M)
+        at[i] = slot_of(key, keys)
+        keys[at[i]] = key
+    for i in range(0, len(points), every):
+        if points[i, 0] ** 2 + points[i, 1] ** 2 + points[i, 2] ** 2 > far2:
             continue
-        key = voxel_key(rays[i, 0], rays[i, 1], rays[i, 2], _VOXEL_M)
-        if key != keys[slot]:  # neighbours in a scan mostly share a voxel
-            slot = slot_of(key, keys)
-            keys[slot] = key
-        counts[slot] += 1
+        key = voxel_key(points[i, 0], points[i, 1], points[i, 2], _VOXEL_M)
+        slot = slot_of(key, keys)
+        counts[slot] += 1 if keys[slot] == key else 0
     out = np.empty(len(few), dtype=np.int64)
     for i in range(len(few)):
-        out[i] = counts[slot_of(voxel_key(few[i, 0], few[i, 1], few[i, 2], _VOXEL_M), keys)]
+        out[i] = counts[at[i]]
     return out

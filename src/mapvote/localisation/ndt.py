@@ -185,7 +185,7 @@ def thinned(points_lidar: F32) -> dict[float, I64]:
     few = thin(points_lidar, sizes[0], every=max(1, (len(points_lidar) // _ENOUGH - 1) | 1))
     chosen = {sizes[0]: few}
     for size in sizes[1:]:
-        few = few[thin(points_lidar[few], size)]
+        few = few[thin(points_lidar.take(few, axis=0), size)]
         chosen[size] = few
     return chosen
 

@@ -13,7 +13,7 @@ class Sample:
     def __init__(self, scan: Scan) -> None:
         time_s = scan.time_s
         self._parts = {
-            size: (scan.points[few], None if time_s is None else time_s[few])
+            size: (scan.points.take(few, axis=0), None if time_s is None else time_s.take(few))
             for size, few in thinned(scan.points).items()
         }
 
