@@ -6,10 +6,8 @@ there is none in a temporary folder (or in ``NUMBA_CACHE_DIR``), so that later r
 
 from __future__ import annotations
 
-import gc
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -19,11 +17,13 @@ from mapvote.codec.ballot import Ballot, decode, encode
 from mapvote.config import Settings, choose_case
 from mapvote.core.geometry import from_xyz_rpy, inverse, transform
 from mapvote.core.grid import TILE_CELLS, Grid, Lattice
+from mapvote.core.heap import seldom_collecting
 from mapvote.core.point_map import PointMap, map_from_points
 from mapvote.core.sensors import SENSORS
 from mapvote.core.types import F64, Drive, Scan
 from mapvote.core.voxels import VoxelCloud
 from mapvote.detection.packed_tiles import PackedTiles
+from mapvote.doctor.clouds import check_cloud, in_memory
 from mapvote.doctor.looks import Looking
 from mapvote.formats.clean import BadPoints, RawScan, clean_scan, spinning_time_s
 from mapvote.fusion.offline import update_map
@@ -52,26 +52,13 @@ def warm_up() -> Iterator[tuple[str, float]]:
         ("a drive that votes by columns", vote("columns")),
         ("a drive that votes by the paper's rule", vote("5")),
         ("ballots sent and fused", lambda: _fuse(built[0], ballots, settings)),
-        ("a drive looked at, and what only a long one needs", lambda: _go_far(_drive(old, turning=True))),
+        ("a drive and a map looked at, and what only a long one needs", lambda: _go_far(_drive(old, turning=True))),
     ]
-    with _seldom_collecting():
+    with seldom_collecting():
         for what, work in steps:
             start = time.process_time()
             work()
             yield what, time.process_time() - start
-
-
-@contextmanager
-def _seldom_collecting() -> Iterator[None]:
-    """A compiler makes millions of small objects that live on; the collector would walk over them again and again."""
-    usual = gc.get_threshold()
-    gc.freeze()
-    gc.set_threshold(50_000, 50, 50)
-    try:
-        yield
-    finally:
-        gc.set_threshold(*usual)
-        gc.unfreeze()
 
 
 def _fuse(point_map: PointMap, ballots: list[Ballot], settings: Settings) -> None:
@@ -84,9 +71,10 @@ def _fuse(point_map: PointMap, ballots: list[Ballot], settings: Settings) -> Non
 
 
 def _go_far(drive: Drive) -> None:
-    """What verbs look at before they use a drive; points that bring no times; a tile left and come back to; more points
-    than a table takes."""
+    """What verbs look at before they use drive and map; points that bring no times; a tile left and come back to; more
+    points than a table takes."""
     Looking(drive).look(range(2))
+    check_cloud(in_memory(drive.read_scan(0).points.astype(np.float64)))
     spinning_time_s(np.zeros((1, 3), np.float32), drive.sensor.rate_hz)
     tiles, far = PackedTiles(Lattice(), 1), 10 * TILE_CELLS
     tiles.near((0, 0))[:] = 1

@@ -11,6 +11,8 @@ from typing import Annotated, Any, get_type_hints
 
 import typer
 
+from mapvote.core.heap import seldom_collecting
+
 DRIVE, MAP, SERVER, EVALUATE, SETUP = "Drive", "Map", "Server", "Simulate and evaluate", "Set up"
 """Headings of ``mapvote --help``."""
 
@@ -84,7 +86,8 @@ def with_drive_options(verb: Callable[..., None]) -> Callable[..., None]:
     @wraps(verb)
     def command(**arguments: Any) -> None:
         drive_options = {name: arguments.pop(name) for name in DRIVE_OPTIONS}
-        verb(**arguments, drive_options=drive_options)
+        with seldom_collecting():
+            verb(**arguments, drive_options=drive_options)
 
     hints = get_type_hints(verb, include_extras=True)
     own = inspect.signature(verb).parameters.values()

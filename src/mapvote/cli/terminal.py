@@ -6,6 +6,7 @@ Progress goes to stderr, so that stdout can be piped.
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
@@ -40,6 +41,9 @@ def print_table(headings: Iterable[str], rows: Iterable[Iterable[str]], title: s
 @contextmanager
 def waiting(what: str) -> Iterator[None]:
     """A turning wheel beside ``what`` for work that cannot say how far it is; nothing where there is no terminal."""
+    if not sys.stderr.isatty():  # rich is not even imported
+        yield
+        return
     from rich.console import Console
     from rich.markup import escape
 
@@ -55,6 +59,9 @@ def waiting(what: str) -> Iterator[None]:
 def progress(what: str) -> Iterator[Callable[..., None]]:
     """A bar for one piece of work, told (done, in all), perhaps a new name; gone at the end. Nothing where there is no
     terminal."""
+    if not sys.stderr.isatty():  # rich is not even imported
+        yield lambda *_: None
+        return
     from rich.console import Console
     from rich.markup import escape
     from rich.progress import Progress

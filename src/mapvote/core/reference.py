@@ -6,7 +6,6 @@ from collections.abc import Generator
 from typing import NamedTuple
 
 import numpy as np
-from scipy import ndimage
 
 from mapvote.core.columns import dilated, fill_columns
 from mapvote.core.grid import TILE_CELLS, Grid, TileIndex, window_around
@@ -80,7 +79,8 @@ def above_ground_points(point_map: PointMap, grid: Grid) -> U64:
             tile = point_map.tiles[index]
             rows, cols, here = wide.indices_of(tile.points_map[~tile.columns[1]])
             seen[rows[here], cols[here]] = True
-    near = ndimage.binary_dilation(seen, structure=np.ones((3, 3)))[1:-1, 1:-1]
+    seen[1:-1] |= seen[:-2] | seen[2:]
+    near = seen[1:-1, :-2] | seen[1:-1, 1:-1] | seen[1:-1, 2:]
     return np.where(near, ~np.uint64(0), np.uint64(0))
 
 

@@ -12,7 +12,6 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from scipy import ndimage
 
 from mapvote.config import VotingSettings
 from mapvote.core.columns import TOP_BIT, dilated, remnants
@@ -20,6 +19,7 @@ from mapvote.core.grid import Grid, Lattice, TileIndex
 from mapvote.core.types import I32, NO_VOTE, U8, U64, Bool, CellState
 from mapvote.detection.counters import PLANES, STRUCK_ITSELF, THROUGH_ITSELF, ever
 from mapvote.detection.rules import Rules
+from mapvote.detection.spreading import flooded, small_groups, steps_to
 from mapvote.detection.votes import Judged
 
 _LOWEST, _HIGHEST = np.uint64(0b11), np.uint64(3) << np.uint64(TOP_BIT - 1)
@@ -119,9 +119,7 @@ def unexplained(states: U8, beside: Bool, reach: int) -> Bool:
     there alone. A new thing that touches an old one also stands where nothing explains it: the cells next to it that
     are ``reach`` cells or less from such a place belong to it."""
     changed = states == CellState.CHANGED_OCCUPIED
-    core = changed & ~beside
-    joined = ndimage.binary_dilation(core, np.ones((3, 3)), iterations=reach, mask=changed)
-    return np.asarray(changed & ~(core | joined))
+    return np.asarray(changed & ~flooded(changed & ~beside, changed, reach))
 
 
 def fallen(states: U8, adrift: Bool, reach: int) -> Bool:
@@ -134,23 +132,15 @@ def fallen(states: U8, adrift: Bool, reach: int) -> Bool:
     gone, kept = states == CellState.CHANGED_EMPTY, states == CellState.UNCHANGED_OCCUPIED
     if not (gone.any() and adrift.any()):
         return np.zeros_like(adrift)
-    to_gone = ndimage.distance_transform_cdt(~gone, "chessboard")
-    goes = adrift & (to_gone < ndimage.distance_transform_cdt(~kept, "chessboard")) if kept.any() else adrift
-    group, count = ndimage.label(goes, structure=np.ones((3, 3)))
-    falls = np.bincount(group[to_gone <= reach], minlength=count + 1) > 0
-    falls[0] = False
-    return np.asarray(falls[group])
+    to_gone = steps_to(gone)
+    goes = adrift & (to_gone < steps_to(kept)) if kept.any() else adrift
+    return np.asarray(flooded(goes & (to_gone <= reach), goes, goes.size))
 
 
 def drop_specks(states: U8, min_cells: int) -> Bool:
     """(rows, cols) changed cells whose 8-connected component of equal state has fewer than ``min_cells`` (rule G)."""
-    specks = np.zeros(states.shape, dtype=np.bool_)
-    for change in (CellState.CHANGED_OCCUPIED, CellState.CHANGED_EMPTY):
-        label, _ = ndimage.label(states == change, structure=np.ones((3, 3)))
-        size = np.bincount(label.ravel())
-        size[0] = min_cells
-        specks |= size[label] < min_cells
-    return specks
+    there, gone = states == CellState.CHANGED_OCCUPIED, states == CellState.CHANGED_EMPTY
+    return np.asarray(small_groups(there, min_cells) | small_groups(gone, min_cells))
 
 
 def beside_new(planes: U64, occupied: U64, base: I32) -> U64:

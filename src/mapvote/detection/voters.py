@@ -12,13 +12,12 @@ from mapvote.core.sensors import Sensor
 from mapvote.core.types import U64
 from mapvote.detection.column_voter import ColumnVoter
 from mapvote.detection.paper import PaperVoter
-from mapvote.detection.surfaces import SurfaceVoter
 from mapvote.detection.votes import TileVotes
 from mapvote.perception.frontend import Observation
 
 
 class Voter(Protocol):
-    """:class:`PaperVoter`, :class:`ColumnVoter` or :class:`SurfaceVoter`: scan after scan goes in, votes come out tile
+    """:class:`PaperVoter`, :class:`ColumnVoter` or a ``SurfaceVoter``: scan after scan goes in, votes come out tile
     by tile."""
 
     def observe(self, seen: Observation) -> U64:
@@ -37,5 +36,7 @@ def make_voter(settings: Settings, sensor: Sensor, point_map: PointMap) -> Voter
     if settings.voting.method == "columns":
         return ColumnVoter(settings.voting, point_map)
     if settings.voting.method == "surfaces":
+        from mapvote.detection.surfaces import SurfaceVoter  # brings half of scipy, which columns need nothing of
+
         return SurfaceVoter(settings.voting, point_map)
     return PaperVoter(settings.voting, settings.paper, sensor, point_map)

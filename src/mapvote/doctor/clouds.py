@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from mapvote.core.point_map import PointMap
-from mapvote.core.types import F64
+from mapvote.core.types import F64, I64
 from mapvote.doctor.finding import Finding
 from mapvote.doctor.road import UPS
 
@@ -46,7 +46,7 @@ def check_cloud(pieces: Pieces) -> list[Finding]:
     if n < _FEW:
         return [Finding("warning", f"the map holds {n} points only", "is the file cut off, or the wrong one?")]
     some = _every(pieces, max(1, n // _SOME))
-    low, high = np.quantile(some, 0.001, axis=0), np.quantile(some, 0.999, axis=0)
+    low, high = np.quantile(some, (0.001, 0.999), axis=0)
     found = _strays(pieces, n, low, high)
     apart_m = spacing(pieces, some)
     return found + (_units(high - low, apart_m) or _axes(some, high - low)) + _copies(apart_m) + _rounded(some)
@@ -64,7 +64,10 @@ def _every(pieces: Pieces, step: int) -> F64:
 def _strays(pieces: Pieces, n: int, low: F64, high: F64) -> list[Finding]:
     wide, strays, far_m = high - low, 0, 0.0
     for points in pieces():
-        outside = ((points < low - wide - 20.0) | (points > high + wide + 20.0)).any(axis=1)
+        outside = np.zeros(len(points), np.bool_)
+        for axis in range(3):  # three columns are read faster than rows of three
+            along = points[:, axis]
+            outside |= (along < (low - wide - 20.0)[axis]) | (along > (high + wide + 20.0)[axis])
         strays += int(outside.sum())
         far_m = max(far_m, float(np.abs(points[outside] - 0.5 * (low + high)).max(initial=0.0)))
     if not strays:
@@ -79,14 +82,36 @@ def spacing(pieces: Pieces, some: F64) -> F64:
     centre = np.median(some[:: max(1, len(some) // 1000)], axis=0)
     near, away = np.empty((0, 3)), np.empty(0)
     for points in pieces():
-        distance = np.abs(points[:, :2] - centre[:2]).max(axis=1)
+        distance = np.maximum(np.abs(points[:, 0] - centre[0]), np.abs(points[:, 1] - centre[1]))
         close = distance <= (away.max() if len(away) == _NEAR else np.inf)
+        if not close.any():
+            continue
         near, away = np.concatenate([near, points[close]]), np.concatenate([away, distance[close]])
         if len(near) > _NEAR:
             chosen = np.sort(np.argpartition(away, _NEAR - 1)[:_NEAR])
             near, away = near[chosen], away[chosen]
-    beside, _ = cKDTree(near).query(near[:: max(1, len(near) // 2000)], k=2)
-    return np.asarray(beside[:, 1])
+    axis = int(np.argmax(np.ptp(near, axis=0)))
+    order = np.argsort(near[:, axis])
+    place = np.empty(len(order), np.int64)
+    place[order] = np.arange(len(order))
+    return _to_nearest(near[order], axis, place[:: max(1, len(near) // 2000)])
+
+
+@numba.njit(cache=True, nogil=True)
+def _to_nearest(points: F64, axis: int, which: I64) -> F64:
+    """(m,) from those of the points (n, 3), which ascend along ``axis``, to the nearest other one: a tree would ask for
+    half of scipy, whose import takes longer than all of the look."""
+    out = np.full(len(which), np.inf)
+    for w in range(len(which)):
+        i, best = which[w], np.inf
+        for way in (-1, 1):
+            j = i + way
+            while 0 <= j < len(points) and (points[j, axis] - points[i, axis]) ** 2 < best:
+                x, y, z = points[j, 0] - points[i, 0], points[j, 1] - points[i, 1], points[j, 2] - points[i, 2]
+                best = min(best, x * x + y * y + z * z)
+                j += way
+        out[w] = np.sqrt(best)
+    return out
 
 
 def _units(wide: F64, apart: F64) -> list[Finding]:
@@ -108,8 +133,10 @@ def _units(wide: F64, apart: F64) -> list[Finding]:
 def _axes(some: F64, wide: F64) -> list[Finding]:
     """Which way is up: a street is a sheet of ground with things on it, none below, and not higher than it is wide:
     rows of house fronts behind each other are no ground. ``wide`` (3,): the extent of the points."""
-    possible = {name: up for name, up in UPS.items() if wide[np.argmax(np.abs(up))] <= _SLENDER * wide[2]}
-    share = {name: _sheet_share(some, up) for name, up in possible.items()}
+    share = dict.fromkeys(UPS, 0.0)
+    for axis, name in enumerate("xyz"):
+        if wide[axis] <= _SLENDER * wide[2]:
+            share["+" + name], share["-" + name] = _sheet_shares(some, axis)
     best = max(share, key=lambda name: share[name])
     opposite = ("-" if best[0] == "+" else "+") + best[1]
     # Between two walls, as much lies at one end of an axis as at the other: that is no ground.
@@ -122,20 +149,25 @@ def _axes(some: F64, wide: F64) -> list[Finding]:
     return [Finding("error", what, "turn the points so that z is up (x east, y north)")]
 
 
-def _sheet_share(points: F64, up: F64) -> float:
-    """Share of the points that lie within 0.2 m of the lowest of their column of 2 m, along ``up``."""
-    axis = int(np.argmax(np.abs(up)))
-    height = points[:, axis] * up[axis]
+def _sheet_shares(points: F64, axis: int) -> tuple[float, float]:
+    """Share of the points that lie within 0.2 m of the lowest of their column of 2 m along ``axis``; and of the highest
+    one, the lowest along its opposite."""
     others = [a for a in range(3) if a != axis]
     cells = np.floor((points[:, others] - points[:, others].min(axis=0)) / _COLUMN_M).astype(np.int64)
     key = cells[:, 0] * (cells[:, 1].max() + 1) + cells[:, 1]
-    order = np.lexsort((height, key))
-    key, height = key[order], height[order]
+    order = np.argsort(points[:, axis])
+    key = key[order]  # short numbers are sorted without comparing them
+    columns = np.argsort(key.astype(np.uint16) if key.max() < 1 << 16 else key, kind="stable")
+    key, height = key[columns], points[order[columns], axis]
     starts = np.flatnonzero(np.diff(key, prepend=-1))
     counts = np.diff(np.append(starts, len(key)))
-    lowest = np.repeat(height[starts + counts // 20], counts)
-    tall = np.repeat(height[starts + counts - 1] - height[starts] > 1.5, counts)
-    return float(((np.abs(height - lowest) < _SHEET_M) & tall).mean())
+    ends = starts + counts - 1
+    tall = np.repeat(height[ends] - height[starts] > 1.5, counts)
+
+    def share(sheet: F64) -> float:
+        return float(((np.abs(height - np.repeat(sheet, counts)) < _SHEET_M) & tall).mean())
+
+    return share(height[starts + counts // 20]), share(height[ends - counts // 20])
 
 
 def _copies(apart_m: F64) -> list[Finding]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy import ndimage
 
 from mapvote.core.types import Drive
 from mapvote.doctor.finding import Finding, Severity
@@ -119,7 +118,7 @@ def _units(looks: Looks) -> list[Finding]:
 def _counts(drive: Drive, looks: Looks) -> list[Finding]:
     found = []
     usual = float(np.median(looks.count))
-    around = ndimage.median_filter(looks.count, size=9, mode="nearest")
+    around = np.median(np.lib.stride_tricks.sliding_window_view(np.pad(looks.count, 4, mode="edge"), 9), axis=1)
     cut = np.flatnonzero(looks.count < _CUT_SHARE * around)
     if len(cut):
         k = int(cut[np.argmin(looks.count[cut] / around[cut])])

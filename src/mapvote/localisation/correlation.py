@@ -7,12 +7,11 @@ from dataclasses import dataclass
 
 import numba
 import numpy as np
-from scipy import ndimage
 
 from mapvote.core.cells import flat_cells
 from mapvote.core.grid import CELL_SIZE
 from mapvote.core.point_map import PointMap
-from mapvote.core.types import F32, F64, I64, U8, U32, MapvoteError
+from mapvote.core.types import F32, F64, I64, U8, U32, Bool, MapvoteError
 
 CELL_M = 1.0
 LAYER_M = 1.0
@@ -68,7 +67,7 @@ def laid_out(point_map: PointMap) -> CoarseMap:
         bit = np.uint32(1) << np.floor(height[tall] / LAYER_M).astype(np.uint32)
         at = ((points[tall, 1] - y0) / CELL_M).astype(np.int64), ((points[tall, 0] - x0) / CELL_M).astype(np.int64)
         np.bitwise_or.at(words, at, bit)
-    low = ndimage.binary_dilation((words & np.uint32(0b11)) != 0)
+    low = _with_beside((words & np.uint32(0b11)) != 0)
     r, c = np.nonzero((np.isfinite(ground_z) & ~low)[::2, ::2])
     first = np.flatnonzero((np.diff(r, prepend=-1) != 0) | (np.diff(c // _SPAN, prepend=-1) != 0))
     spans = np.column_stack([r[first] + MARGIN, c[first] + MARGIN, first])
@@ -89,6 +88,16 @@ def highest(scores: U8, most: int) -> I64:
     least = 255 - int(np.searchsorted(counts, most))
     found = np.flatnonzero(scores >= max(least, 0))
     return found[np.argsort(scores[found], kind="stable")[::-1][:most]]
+
+
+def _with_beside(cells: Bool) -> Bool:
+    """Every cell with its four neighbours."""
+    out = cells.copy()
+    out[1:] |= cells[:-1]
+    out[:-1] |= cells[1:]
+    out[:, 1:] |= cells[:, :-1]
+    out[:, :-1] |= cells[:, 1:]
+    return out
 
 
 def _dilated(words: U32) -> U32:

@@ -1,0 +1,78 @@
+"""Cells that lie together or near each other: how far they spread, how many there are, how far away they lie.
+
+The eight cells around a cell are beside it. Kernels of our own, for scipy's take longer to import than to work.
+"""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+
+from mapvote.core.types import I32, I64, Bool
+
+_NOWHERE = np.int32(1 << 30)
+
+
+@numba.njit(cache=True, nogil=True)
+def _flood(reached: Bool, within: Bool, queue: I64, n: int, steps: int) -> int:
+    """Go from the first ``n`` flat cells in ``queue``, which are ``reached``, through the cells of ``within``, so many
+    ``steps`` at most; returns how many are in the queue now."""
+    rows, cols = within.shape
+    done = 0
+    while done < n and steps > 0:
+        ring = n
+        while done < ring:
+            r, c = queue[done] // cols, queue[done] % cols
+            done += 1
+            for i in range(max(r - 1, 0), min(r + 2, rows)):
+                for j in range(max(c - 1, 0), min(c + 2, cols)):
+                    if within[i, j] and not reached[i, j]:
+                        reached[i, j] = True
+                        queue[n] = i * cols + j
+                        n += 1
+        steps -= 1
+    return n
+
+
+@numba.njit(cache=True, nogil=True)
+def flooded(seeds: Bool, within: Bool, steps: int) -> Bool:
+    """(rows, cols) the seeds, and the cells of ``within`` so many ``steps`` at most from one, through others."""
+    reached, queue, n = seeds.copy(), np.empty(seeds.size, np.int64), 0
+    for r in range(seeds.shape[0]):
+        for c in range(seeds.shape[1]):
+            if seeds[r, c]:
+                queue[n] = r * seeds.shape[1] + c
+                n += 1
+    _flood(reached, within, queue, n, steps)
+    return reached
+
+
+@numba.njit(cache=True, nogil=True)
+def small_groups(cells: Bool, least: int) -> Bool:
+    """(rows, cols) the cells that belong to a group of fewer than ``least``."""
+    reached, small, queue = np.zeros_like(cells), np.zeros_like(cells), np.empty(cells.size, np.int64)
+    cols = cells.shape[1]
+    for r in range(cells.shape[0]):
+        for c in range(cols):
+            if cells[r, c] and not reached[r, c]:
+                reached[r, c], queue[0] = True, r * cols + c
+                n = _flood(reached, cells, queue, 1, cells.size)
+                for k in range(n if n < least else 0):
+                    small[queue[k] // cols, queue[k] % cols] = True
+    return small
+
+
+@numba.njit(cache=True, nogil=True)
+def steps_to(cells: Bool) -> I32:
+    """(rows, cols) how many steps it is to the nearest of ``cells``, over whatever lies between."""
+    rows, cols = cells.shape
+    out = np.full((rows + 2, cols + 2), _NOWHERE)  # with a border, so that none needs to be asked for
+    for r in range(1, rows + 1):
+        for c in range(1, cols + 1):
+            before = min(min(out[r - 1, c - 1], out[r - 1, c]), min(out[r - 1, c + 1], out[r, c - 1]))
+            out[r, c] = np.int32(0) if cells[r - 1, c - 1] else before + np.int32(1)
+    for r in range(rows, 0, -1):
+        for c in range(cols, 0, -1):
+            after = min(min(out[r + 1, c + 1], out[r + 1, c]), min(out[r + 1, c - 1], out[r, c + 1]))
+            out[r, c] = min(out[r, c], after + np.int32(1))
+    return out[1:-1, 1:-1]
