@@ -10,7 +10,7 @@ import numpy as np
 
 from mapvote.core.types import I32, I64, Bool
 
-_NOWHERE = np.int32(1 << 30)
+_NOWHERE = 1 << 30
 
 
 @numba.njit(cache=True, nogil=True)
@@ -37,7 +37,8 @@ def _flood(reached: Bool, within: Bool, queue: I64, n: int, steps: int) -> int:
 @numba.njit(cache=True, nogil=True)
 def flooded(seeds: Bool, within: Bool, steps: int) -> Bool:
     """(rows, cols) the seeds, and the cells of ``within`` so many ``steps`` at most from one, through others."""
-    reached, queue, n = seeds.copy(), np.empty(seeds.size, np.int64), 0
+    reached, queue = seeds.copy(), np.empty(seeds.size, np.int64)
+    n = np.int64(0)  # no literal, for which all that it is given to would be compiled once more
     for r in range(seeds.shape[0]):
         for c in range(seeds.shape[1]):
             if seeds[r, c]:
@@ -51,12 +52,12 @@ def flooded(seeds: Bool, within: Bool, steps: int) -> Bool:
 def small_groups(cells: Bool, least: int) -> Bool:
     """(rows, cols) the cells that belong to a group of fewer than ``least``."""
     reached, small, queue = np.zeros_like(cells), np.zeros_like(cells), np.empty(cells.size, np.int64)
-    cols = cells.shape[1]
+    cols, one = cells.shape[1], np.int64(1)
     for r in range(cells.shape[0]):
         for c in range(cols):
             if cells[r, c] and not reached[r, c]:
                 reached[r, c], queue[0] = True, r * cols + c
-                n = _flood(reached, cells, queue, 1, cells.size)
+                n = _flood(reached, cells, queue, one, cells.size)
                 for k in range(n if n < least else 0):
                     small[queue[k] // cols, queue[k] % cols] = True
     return small
@@ -66,13 +67,18 @@ def small_groups(cells: Bool, least: int) -> Bool:
 def steps_to(cells: Bool) -> I32:
     """(rows, cols) how many steps it is to the nearest of ``cells``, over whatever lies between."""
     rows, cols = cells.shape
-    out = np.full((rows + 2, cols + 2), _NOWHERE)  # with a border, so that none needs to be asked for
+    out = np.empty((rows + 2, cols + 2), np.int32)  # with a border, so that nobody asks where the window ends
+    out[:] = _NOWHERE
     for r in range(1, rows + 1):
         for c in range(1, cols + 1):
+            if cells[r - 1, c - 1]:
+                out[r, c] = 0
+                continue
             before = min(min(out[r - 1, c - 1], out[r - 1, c]), min(out[r - 1, c + 1], out[r, c - 1]))
-            out[r, c] = np.int32(0) if cells[r - 1, c - 1] else before + np.int32(1)
+            out[r, c] = before + 1
     for r in range(rows, 0, -1):
         for c in range(cols, 0, -1):
             after = min(min(out[r + 1, c + 1], out[r + 1, c]), min(out[r + 1, c - 1], out[r, c + 1]))
-            out[r, c] = min(out[r, c], after + np.int32(1))
+            if after < out[r, c]:
+                out[r, c] = after + 1
     return out[1:-1, 1:-1]

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import numba
 import numpy as np
 from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
@@ -38,17 +39,27 @@ class Caster:
             n = len(origins)
             return np.full(n, np.inf, np.float32), np.full(n, NOTHING, np.int32), np.ones(n, np.float32)
         hit = self._scene.run(origins, directions, output=1)
-        normals = hit["Ng"]
-        length = np.sqrt(np.einsum("ij,ij->i", normals, normals)) + 1e-12
-        cosine = np.abs(np.einsum("ij,ij->i", normals, directions)) / length
-        missed = hit["primID"] < 0
-        ranges = np.where(missed, np.float32(np.inf), hit["tfar"])
-        return ranges, self._owners[hit["primID"]], cosine.astype(np.float32)
+        return _told(hit["tfar"], hit["primID"], hit["Ng"], directions, self._owners)
 
     def normals(self, origins: F32, directions: F32) -> F32:
         """(n, 3) unit normals of the surfaces that these rays hit, each of which must hit one."""
         normals = self._scene.run(origins, directions, output=1)["Ng"]
         return (normals / (np.linalg.norm(normals, axis=1, keepdims=True) + 1e-12)).astype(np.float32)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _told(far: F32, triangle: I32, normals: F32, directions: F32, owners: I32) -> tuple[F32, I32, F32]:
+    """What :meth:`Caster.cast` says of rays that met a ``triangle`` each (n,), or -1."""
+    n = len(far)
+    ranges, objects, cosine = np.full(n, np.inf, np.float32), np.empty(n, np.int32), np.zeros(n, np.float32)
+    for i in range(n):
+        objects[i] = owners[triangle[i]]
+        if triangle[i] >= 0:
+            ranges[i] = far[i]
+            x, y, z = normals[i, 0], normals[i, 1], normals[i, 2]
+            along = x * directions[i, 0] + y * directions[i, 1] + z * directions[i, 2]
+            cosine[i] = abs(along) / (np.sqrt(x * x + y * y + z * z) + np.float32(1e-12))
+    return ranges, objects, cosine
 
 
 @dataclass(frozen=True)
