@@ -24,7 +24,7 @@ from mapvote.core.columns import TOP_BIT, shifted
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, TileIndex, tile_of_cells
 from mapvote.core.point_map import PointMap, map_from_points
 from mapvote.core.reference import LocalMap, reference_window
-from mapvote.core.types import F64, I32, I64, U64, Bool, Drive
+from mapvote.core.types import F32, F64, I32, I64, U64, Bool, Drive
 from mapvote.core.voxels import VoxelCloud
 from mapvote.detection.counters import PLANES, Evidence, count_of, free_words, is_open
 from mapvote.detection.surface_counts import SurfaceEvidence
@@ -70,9 +70,7 @@ class Layer:
     def _enter(self, seen: list[Observation]) -> None:
         for observation in seen:
             scan, moving = observation.scan, observation.moving
-            offset = scan.points_map[:, :2] - scan.origin_map[:2]
-            far = np.einsum("ij,ij->i", offset, offset) > self.settings.mapping.reach_m**2
-            self.cloud.enter(scan.points_map, moving | _beneath(scan, moving) | far)
+            self.cloud.enter(scan.points_map, _left_out(scan, moving, self.settings.mapping.reach_m))
             self.evidence.count(observation.view, observation.reference)
             self.surfaces.count(observation)
 
@@ -142,19 +140,32 @@ def _standing(points: F64, ground: PointMap) -> Bool:
     return out
 
 
-def _beneath(scan: PlacedScan, moving: Bool) -> Bool:
-    """Points (n,) too low to be obstacles, in or next to cells where something moves: wheels and bumpers, not road."""
-    inside = scan.cell >= 0
+def _left_out(scan: PlacedScan, moving: Bool, reach_m: float) -> Bool:
+    """Points (n,) that do not enter the map: what moves, what is beyond ``reach_m``, and what is too low to be an
+    obstacle, in or next to cells where something moves: wheels and bumpers, not road."""
     rows, cols = scan.reference.grid.shape
     cells = np.zeros((rows, cols), dtype=np.bool_)
-    r, c = np.divmod(np.unique(scan.cell[moving & inside]), cols)
+    r, c = np.divmod(np.unique(scan.cell[moving & (scan.cell >= 0)]), cols)
     for beside in range(9):  # few cells: a dilation of the whole window takes a tenth of a scan's time
         cells[np.clip(r + beside // 3 - 1, 0, rows - 1), np.clip(c + beside % 3 - 1, 0, cols - 1)] = True
-    low = np.zeros(len(moving), dtype=np.bool_)
-    near = np.flatnonzero(inside)
-    near = near[cells.ravel()[scan.cell[near]]]
-    low[near] = scan.points_map[near, 2] - scan.reference.ground_z.ravel()[scan.cell[near]] > ROAD_M
-    return low & ~scan.obstacle
+    ground_z = np.ascontiguousarray(scan.reference.ground_z).ravel()
+    return _no_map(
+        scan.points_map, scan.origin_map, reach_m**2, moving, scan.obstacle, scan.cell, cells.ravel(), ground_z
+    )
+
+
+@numba.njit(cache=True, nogil=True)
+def _no_map(
+    points: F64, origin: F64, reach_squared: float, moving: Bool, obstacle: Bool, cell: I32, beside: Bool, ground_z: F32
+) -> Bool:
+    """(n,) which of the points (n, 3) :func:`_left_out` means; ``beside`` (cells,): something moves there or next."""
+    out = np.empty(len(points), np.bool_)
+    for i in range(len(points)):
+        x, y, k = points[i, 0] - origin[0], points[i, 1] - origin[1], max(cell[i], 0)
+        out[i] = moving[i] | (x * x + y * y > reach_squared)
+        if cell[i] >= 0 and beside[k] and not obstacle[i]:
+            out[i] |= points[i, 2] - ground_z[k] > ROAD_M
+    return out
 
 
 @numba.njit(cache=True, nogil=True)
