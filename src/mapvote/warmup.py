@@ -44,12 +44,13 @@ def warm_up() -> Iterator[tuple[str, float]]:
     ballots: list[Ballot] = []
 
     def vote(case: str) -> Callable[[], object]:
-        drive = _drive(new, turning=case == "columns")
+        drive = _drive(new, turning=case == "surfaces")
         return lambda: ballots.append(vote_drive(drive, built[0], choose_case(settings, case))[0])
 
     steps: list[tuple[str, Callable[[], object]]] = [
         ("a map cut into tiles, its ground", lambda: map_from_points(old)),
         ("a map built by SLAM", lambda: built.append(build_map([_drive(old, turning=True)], settings)[0])),
+        ("a drive that votes by surfaces", vote("surfaces")),
         ("a drive that votes by columns", vote("columns")),
         ("a drive that votes by the paper's rule", vote("5")),
         ("ballots sent and fused", lambda: _fuse(built[0], ballots, settings)),

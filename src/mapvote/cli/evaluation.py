@@ -46,7 +46,7 @@ def evaluate(
     case: Annotated[
         str,
         typer.Option(metavar="CASES", help='1..5, "1 column", columns, surfaces, yardsticks, by commas, or all'),
-    ] = "1,2,3,4,5,columns",
+    ] = "1,2,3,4,5,surfaces",
     poses: Annotated[
         str, typer.Option(metavar="ndt|truth", help="whether vehicles localise, or are told where they are")
     ] = "ndt",
@@ -82,7 +82,7 @@ def evaluate(
 ) -> None:
     """Simulate, map, vote, and score: Tables II to IV of the paper with its figures beside ours.
 
-    mapvote evaluate corner --seed 2 --case 1,5,columns
+    mapvote evaluate corner --seed 2 --case 1,5,surfaces
 
     mapvote evaluate as_published --case 1,2,3,4,5 --readings --explain 1 --out pictures
 
@@ -164,17 +164,18 @@ def _evaluate_real(
     from mapvote.evaluation.results import to_json
 
     settings = load_settings(config)
-    cases, _ = choose_cases(settings, "columns")
+    method = settings.voting.method
+    cases, _ = choose_cases(settings, "5" if method == "paper" else method)
     with stages() as told:
         result = bench(drive, settings, cases, told, scans=scans, seed=seed)
-    sheets = real_tables(result, "columns")
+    sheets = real_tables(result, cases[0].name)
     for sheet in sheets:
         print_table(sheet.headings, sheet.rows, sheet.title)
     if json is not None:
-        write_text(to_json(result.figures("columns")), json)
+        write_text(to_json(result.figures(cases[0].name)), json)
         print(f"{json}: all numbers")
     if out is not None:
-        pictures = draw_worst(result, "columns", out)
+        pictures = draw_worst(result, cases[0].name, out)
         command = f"mapvote evaluate real {drive}{f' --scans {scans}' if scans else ''} --seed {seed} --out {out}"
         write_text(as_markdown(sheets, command), out / "tables.md")
         for file in [out / "tables.md", *pictures]:

@@ -57,7 +57,7 @@ class MappingSettings(Section):
 class VotingSettings(Section):
     """The paper's rule, and which of its cases (paper III, V). ``"columns"`` and ``"surfaces"``: docs/method.md."""
 
-    method: Literal["paper", "columns", "surfaces"] = "columns"
+    method: Literal["paper", "columns", "surfaces"] = "surfaces"
     weighted: bool = Field(default=True, description="multiple votes per scan by Eq. (1); false: one vote per scan")
     two_stage: bool = Field(default=True, description="the vehicle decides its cells; false: it sends its tally")
     skip_tall_cells: bool = Field(default=True, description="case 5: no vote where the map begins above the view")

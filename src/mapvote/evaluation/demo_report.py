@@ -22,7 +22,7 @@ from mapvote.evaluation.scoring.map_points import same_rows
 from mapvote.evaluation.scoring.truths import BANDS
 from mapvote.server.insight.cutout import Cutout, fragment
 
-CASE = "columns"
+CASE = "surfaces"
 """Whose updated map the demo shows: the product's own rule; the paper's cases stand beside it in the tables."""
 Picture = tuple[Path, str]
 """A file and its caption."""

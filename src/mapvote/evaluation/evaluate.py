@@ -40,7 +40,7 @@ class Evaluation:
     causes: Mapping[str, Causes]
     """By case that was to be explained: every true and false cell of the provenance truth and its cause."""
     best: str
-    """The case whose updated map is shown: columns, else the first."""
+    """The case whose updated map is shown: the one that the settings vote by, else columns, else the first."""
 
 
 def evaluate(
@@ -60,7 +60,7 @@ def evaluate(
     truth, first_map = scene.truth, scene.point_map
     beams = scene.drive(drives[0].vehicle).sensor.beams
     jury = Jury(first_map, truth)
-    best = "columns" if any(case.name == "columns" for case in cases) else cases[0].name
+    best = _best(scene, cases)
     outcomes, entries = _scored(scene, cases, drives, jury, progress)
     found = study.of(scene, cases, jury, outcomes, progress)
     T_map_world = map_frame(scene)
@@ -103,6 +103,11 @@ def evaluate(
         ),
     )
     return Evaluation(result, scene, truth, jury.window, first_map, outcomes, drives, found.causes, best)
+
+
+def _best(scene: Scene, cases: Sequence[Case]) -> str:
+    names = [case.name for case in cases]
+    return next((name for name in (scene.settings.voting.method, "columns") if name in names), names[0])
 
 
 def _scored(

@@ -96,7 +96,7 @@ class EvaluationResult(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=
     cells: int
     """In the truth's window."""
     coverage: float
-    """Of columns, or of the first case."""
+    """Of the case whose updated map is shown."""
     settings: dict[str, Any]
     map_shift: MapShift
     localisation: dict[str, PoseErrors]

@@ -6,6 +6,7 @@ short goes on where it stopped, and experiments that share drives, maps or ballo
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from dataclasses import dataclass, field, replace
@@ -72,16 +73,17 @@ def growing(drives: Sequence[Pass], cases: Sequence[Case], first_map: PointMap) 
 
 
 def with_liars(drives: Sequence[Pass], cases: Sequence[Case], first_map: PointMap) -> Iterator[BallotSet]:
-    """Columns, for k = 1, 2, 3: 2k + 1 vehicles with min_votes = k + 1, all honest, and the last k of them lying."""
-    for k in (1, 2, 3):
+    """Of each of our methods that voted, for k = 1, 2, 3: 2k + 1 vehicles with min_votes = k + 1, all honest, and the
+    last k of them lying."""
+    for method, k in itertools.product(("columns", "surfaces"), (1, 2, 3)):
         n = 2 * k + 1
-        if n > len(drives):
+        if n > len(drives) or method not in drives[0].ballots:
             continue
-        honest = [drive.ballots["columns"] for drive in drives[:n]]
-        yield BallotSet(f"columns, {n} honest", k + 1, honest)
+        honest = [drive.ballots[method] for drive in drives[:n]]
+        yield BallotSet(f"{method}, {n} honest", k + 1, honest)
         for name, attack in ATTACKS.items():
             lies = [attack(ballot, first_map, honest[0]) for ballot in honest[-k:]]
-            yield BallotSet(f"columns, {k} of {n} {name}", k + 1, [*honest[:-k], *lies])
+            yield BallotSet(f"{method}, {k} of {n} {name}", k + 1, [*honest[:-k], *lies])
 
 
 @dataclass(frozen=True)
@@ -97,9 +99,9 @@ class Experiment:
     """Besides, columns on the first map without its known-free columns: who votes in turn; see ``imported.in_turn``."""
 
 
-_BOTH = "1 column,columns"
+_BOTH = "1 column,columns,surfaces"
 """Experiments with the same cases on the same drives share their ballots."""
-_STAGES = "1 column,columns,columns one-stage"
+_STAGES = "1 column,columns,columns one-stage,surfaces"
 _TEN = {"vehicles": 10}
 EXPERIMENTS: Mapping[str, Experiment] = {
     "main": Experiment("all"),

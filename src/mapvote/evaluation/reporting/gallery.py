@@ -90,11 +90,11 @@ def drawn(evaluation: Evaluation, case: str) -> list[tuple[str, Figure, str]]:
         )
     nearest = _scan_near(evaluation, areas)
     v, n_min = evaluation.scene.settings.voting, evaluation.scene.settings.paper.n_min
-    decided = {n: evaluation.outcomes[n].states for n in ("1", "5", "columns") if n in evaluation.outcomes}
+    decided = {n: evaluation.outcomes[n].states for n in ("1", "5", "columns", "surfaces") if n in evaluation.outcomes}
     panels = [("Truth (strict)", _as_states(evaluation.truth.strict))]
     panels += [(case_name(n).capitalize(), states) for n, states in decided.items()]
     states = figures.cell_states(panels, evaluation.window, outlines=outlines)
-    shown = {n: e for n, e in evaluation.result.cases.items() if n in (*"12345", "columns", *YARDSTICKS)}
+    shown = {n: e for n, e in evaluation.result.cases.items() if n in (*"12345", "columns", "surfaces", *YARDSTICKS)}
     names = {n: case_name(n) for n in shown}
     bars = figures.score_bars(shown, names)
     pictures += [
@@ -114,14 +114,14 @@ def drawn(evaluation: Evaluation, case: str) -> list[tuple[str, Figure, str]]:
         ("classes", figures.class_bars(shown, names), "Precision and recall of each class: Tables II and III."),
         ("bytes", figures.byte_bars(shown, names), "What a vehicle sends, by case."),
     ]
-    return [*pictures, *_of_columns(evaluation)]
+    return [*pictures, *_of_our_own(evaluation)]
 
 
-def _of_columns(evaluation: Evaluation) -> list[tuple[str, Figure, str]]:
-    """Of columns, where they voted: their probabilities, and what each rule is worth where they voted rule by rule."""
+def _of_our_own(evaluation: Evaluation) -> list[tuple[str, Figure, str]]:
+    """Of our own methods: their probabilities, and what each rule of columns is worth if they voted rule by rule."""
     out = []
-    if "columns" in evaluation.outcomes:
-        decisions, lattice = evaluation.outcomes["columns"].decisions, evaluation.first_map.lattice
+    if evaluation.best in ("columns", "surfaces"):
+        decisions, lattice = evaluation.outcomes[evaluation.best].decisions, evaluation.first_map.lattice
         found = {
             state: reliability(decisions, lattice, evaluation.truth.strict, evaluation.window, state)
             for state in (CellState.CHANGED_OCCUPIED, CellState.CHANGED_EMPTY)
@@ -232,7 +232,7 @@ def _local_grid(evaluation: Evaluation, index: int) -> Figure:
     panels = [("One scan, case 1", lay_on(once, grid, window))]
     panels += [
         (f"The whole drive, {case_name(n)}", lay_on(*ballot_states(first.ballots[n], evaluation.first_map), window))
-        for n in ("1", "columns")
+        for n in dict.fromkeys(("1", evaluation.best))
         if n in first.ballots
     ]
     return figures.cell_states(panels, window)
