@@ -57,6 +57,16 @@ def test_of_vehicles_that_passed_at_the_same_moment_the_later_name_goes_first() 
     assert sorted(v.vehicle for v in select(votes, FuseSettings(latest_vehicles=2))) == ["b", "c"]
 
 
+@pytest.mark.parametrize(
+    "vote", [counted({HERE: [0, 0, 3, 1, 0], THERE: [0, 0, 2, 5, 0]}), drive("v", 0, {HERE: CO, THERE: CO})]
+)
+def test_a_vote_agrees_where_it_backs_what_was_decided_and_not_where_something_else_was(vote: TileVote) -> None:
+    decided = states_plane({HERE: CO, THERE: CE})
+    assert vote.agreed(FLAT, decided, CO).tolist() == [0]
+    assert vote.agreed(FLAT[::-1].copy(), decided, CO).tolist() == [1]
+    assert vote.agreed(FLAT, decided, UO).tolist() == []
+
+
 def test_in_a_cell_the_drive_that_ended_last_speaks_and_silence_overrides_nothing() -> None:
     early, late = drive("v", 1, {HERE: CE, THERE: UO}), drive("v", 2, {HERE: UE})
     one = fold([late, early], WINDOW)
