@@ -64,7 +64,7 @@ TESTS = {
     "detection/surface_regions.py": ["detection/test_surfaces.py"],
     "detection/surface_counts.py": ["detection/test_surfaces.py"],
     "detection/faint_walls.py": ["detection/test_faint_walls.py"],
-    "detection/lone_points.py": ["detection/test_surfaces.py"],
+    "detection/lone_points.py": ["detection/test_lone_points.py"],
     "perception/moving_kernels.py": ["perception/test_moving_kernels.py", "perception/test_moving_objects.py"],
     "perception/fans.py": ["perception/test_fans.py", "perception/test_raycast.py"],
     "perception/raycast.py": ["perception/test_raycast.py"],
