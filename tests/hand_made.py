@@ -107,7 +107,7 @@ def make_ballot(
     vehicle: str = "v1",
     drive: str = "d1",
     end_ns: int = 1_000_000_000,
-    method: str = "columns",
+    method: str = "surfaces",
     settings_hash: str = SETTINGS,
     map_id: str | None = None,
     base: Mapping[TileIndex, str] | None = None,

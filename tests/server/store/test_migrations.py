@@ -125,7 +125,7 @@ def test_the_first_schema_becomes_todays_without_loss(first_store: str) -> None:
         ("vehicle", "v1", False),
     ]
     say = {(0, 0): Say(states_plane({(10, 12): CellState.CHANGED_EMPTY}))}
-    ballot = make_ballot(maps[-1], say, "v6", "d1", end_ns=1_700_000_100 * 10**9, settings_hash="s")
+    ballot = make_ballot(maps[-1], say, "v6", "d1", end_ns=1_700_000_100 * 10**9, settings_hash="s", method="columns")
     (receipt,) = accept(store, [examine(encode(ballot))])
     assert isinstance(receipt, Receipt), "a ballot like those that stand is taken in"
     done = publish(store, FuseSettings())

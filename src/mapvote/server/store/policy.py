@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 class RoundPolicy(Section):
     """How the ballots of a round are cast. Others are refused, and those that stand already do not count."""
 
-    method: Literal["paper", "columns", "surfaces"] = "columns"
+    method: Literal["paper", "columns", "surfaces"] = "surfaces"
     stage: Literal["one-stage", "two-stage"] = "two-stage"
     settings_hash: str = Field(
         default="",
@@ -89,8 +89,9 @@ class PolicyChange:
 
 def recorded(row: Mapping[str, Any]) -> Policy:
     """The policy of a row or a version. What this program does not know any more is left out; versions of the second
-    schema and before recorded the settings of fusion alone."""
-    sections = row if "fuse" in row or "round" in row else {"fuse": row}
+    schema and before recorded the settings of fusion alone, and all voted by columns."""
+    sections = dict(row if "fuse" in row or "round" in row else {"fuse": row})
+    sections["round"] = {"method": "columns", **sections.get("round", {})}
     known = {
         name: {key: value for key, value in sections.get(name, {}).items() if key in field.annotation.model_fields}
         for name, field in Policy.model_fields.items()
