@@ -47,27 +47,26 @@ def settled(gone: U64, stands: U64, mapped: U64, base: I32) -> U64:
     """(rows, cols) ``gone``, and those ``mapped`` voxels that neither plane holds and that it reaches before ``stands``
     does, from voxel to touching voxel (26); where both come at once, they stand. So does what touches a voxel of
     ``stands``: a leaf or a ledge that one vehicle met others may see past."""
-    rows, cols = np.nonzero(mapped & ~gone & ~stands)
-    return _settle(gone, stands, mapped, base, rows, cols)
+    return _settle(gone, stands, mapped, base, np.flatnonzero(mapped & ~gone & ~stands))
 
 
 @numba.njit(cache=True, nogil=True)
-def _settle(gone: U64, stands: U64, mapped: U64, base: I32, rows: I64, cols: I64) -> U64:
-    """``rows`` and ``cols`` (n,): cells with anything undecided. Round by round, so that their order says nothing."""
-    fell, stood = gone.copy(), stands.copy()
-    falls, stays = np.empty(len(rows), np.uint64), np.empty(len(rows), np.uint64)
+def _settle(gone: U64, stands: U64, mapped: U64, base: I32, cells: I64) -> U64:
+    """``cells`` (n,), flat: those with anything undecided. Round by round, so that their order says nothing."""
+    fell, stood, wide = gone.copy(), stands.copy(), gone.shape[1]
+    falls, stays = np.empty(len(cells), np.uint64), np.empty(len(cells), np.uint64)
     more = True
     while more:
         more = False
-        for i in range(len(rows)):
-            r, c = rows[i], cols[i]
+        for i in range(len(cells)):
+            r, c = cells[i] // wide, cells[i] % wide
             left = mapped[r, c] & ~fell[r, c] & ~stood[r, c]
             stays[i] = left & neighbourhood(stood, base, r, c, _BESIDE) if left else left
             falls[i] = left & ~stays[i] & neighbourhood(fell, base, r, c, _BESIDE) if left else left
-        for i in range(len(rows)):
+        for i in range(len(cells)):
             if stays[i] | falls[i]:
-                stood[rows[i], cols[i]] |= stays[i]
-                fell[rows[i], cols[i]] |= falls[i]
+                stood[cells[i] // wide, cells[i] % wide] |= stays[i]
+                fell[cells[i] // wide, cells[i] % wide] |= falls[i]
                 more = True
     for r in range(fell.shape[0]):
         for c in range(fell.shape[1]):
