@@ -16,7 +16,7 @@ from mapvote.core.types import F64, I32, NO_VOTE, U64, Bool, CellState
 from mapvote.detection.counters import PLANES, count_of
 from mapvote.detection.near_hits import HIT_REACH_M
 from mapvote.detection.surface_counts import CROSSED, MET, PASSES, WORDS, SurfaceEvidence
-from mapvote.detection.surface_regions import SUPPORT, grown, lasting, settled
+from mapvote.detection.surface_regions import SUPPORT, apart, grown, lasting
 from mapvote.detection.surfaces import GONE_RAYS, HIT_RAYS, NEW_RAYS, SurfaceVoter, weigh_surfaces
 from mapvote.detection.votes import TileVotes
 
@@ -229,17 +229,31 @@ def test_a_car_that_drove_by_far_off_is_nothing_new_and_one_that_parked_is() -> 
 words = arrays(np.uint64, (4, 4), elements=st.integers(0, 2**63 - 1))
 
 
-@given(words, words, words)
+@given(words, words)
 @settings(max_examples=25, deadline=None)
-def test_what_is_undecided_goes_with_what_reaches_it_first_and_nothing_that_stands_goes(
-    gone: U64, stands: U64, mapped: U64
-) -> None:
-    gone = gone & ~stands
-    settled_words = settled(gone, stands, mapped, np.zeros((4, 4), np.int32))
-    beside = dilated(stands, np.zeros((4, 4), np.int32), 1)
-    np.testing.assert_array_equal(settled_words & gone, gone & ~beside)
-    assert not (settled_words & beside).any(), "what touches what stands may be a part of it"
-    assert not (settled_words & ~(gone | mapped)).any()
+def test_of_what_is_gone_exactly_that_is_apart_which_touches_nothing_that_stands(gone: U64, stands: U64) -> None:
+    level = np.zeros((4, 4), np.int32)
+    kept = gone & ~apart(gone, stands, level)
+    np.testing.assert_array_equal(kept, gone & dilated(stands, level, 1))
+    np.testing.assert_array_equal(apart(gone, np.zeros_like(stands), level), gone)
+
+
+def test_an_upper_storey_that_no_ray_reached_stays_where_the_lower_one_stands_beside_a_house_that_went() -> None:
+    storeys = [0.45 + 0.3 * k for k in range(14)]
+    ground = wall([(r, c) for r in range(85, 125) for c in range(85, 135)], [0.0])
+    gone_too = [(ROW + 1, c) for c in COLUMNS]
+    mapped = np.concatenate([wall(WALL, storeys), wall(gone_too, storeys), ground])
+    point_map = make_map({(0, 0): make_tile(mapped)})
+    voter = SurfaceVoter(VotingSettings(), point_map)
+    for _ in range(8):
+        seen = one_scan(point_map, standing_at(OLD_Y, [0.75, 1.05]))
+        seen.view.passed[:] &= np.uint64(0b1111111)
+        seen.view.passed[ROW + 1] = np.uint64(2**15 - 1)  # behind it all of a house is seen to be gone
+        voter.observe(seen)
+    votes = voter.votes()[0, 0]
+    assert all(votes.states[cell] == UO for cell in WALL)
+    assert votes.remnants is not None
+    assert not any(votes.remnants[cell] >> np.uint64(7) for cell in WALL)
 
 
 @given(st.lists(st.tuples(*[st.floats(0.6, 3.0)] * 3), min_size=1, max_size=6))

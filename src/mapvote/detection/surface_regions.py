@@ -1,24 +1,21 @@
 """What a drive's evidence says together: the rules of surfaces that look beyond a voxel, and beyond a cell.
 
-Support makes a change, and not area: a pole is narrow and tall, a speck is neither. What no ray decided goes along with
-what it touches. And what stands is met at least as often as rays go by where it is.
+Support makes a change, and not area: a pole is narrow and tall, a speck is neither. What few rays decided goes along
+with what it touches. And what stands is met at least as often as rays go by where it is.
 """
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 from scipy import ndimage
 
-from mapvote.core.columns import neighbourhood
-from mapvote.core.types import I32, I64, U64, Bool
+from mapvote.core.columns import dilated
+from mapvote.core.types import I32, U64, Bool
 
 SUPPORT = 6
 """Voxels that a change must be decided by, over its 8-connected cells: a pole of 1.8 m, or half a square metre.
 docs/decisions/evidence.md has what other numbers do."""
 EVERY_SIDE = np.ones((3, 3))
-_BESIDE = np.int64(1)
-"""One cell to all sides; no literal, for which :func:`neighbourhood` would be compiled once more."""
 
 
 def supported(cells: Bool, voxels: U64) -> Bool:
@@ -43,33 +40,7 @@ def grown(strong: Bool, weak: Bool) -> Bool:
     return np.asarray(ndimage.binary_propagation(strong, EVERY_SIDE, mask=strong | weak))
 
 
-def settled(gone: U64, stands: U64, mapped: U64, base: I32) -> U64:
-    """(rows, cols) ``gone``, and those ``mapped`` voxels that neither plane holds and that it reaches before ``stands``
-    does, from voxel to touching voxel (26); where both come at once, they stand. So does what touches a voxel of
-    ``stands``: a leaf or a ledge that one vehicle met others may see past."""
-    return _settle(gone, stands, mapped, base, np.flatnonzero(mapped & ~gone & ~stands))
-
-
-@numba.njit(cache=True, nogil=True)
-def _settle(gone: U64, stands: U64, mapped: U64, base: I32, cells: I64) -> U64:
-    """``cells`` (n,), flat: those with anything undecided. Round by round, so that their order says nothing."""
-    fell, stood, wide = gone.copy(), stands.copy(), gone.shape[1]
-    falls, stays = np.empty(len(cells), np.uint64), np.empty(len(cells), np.uint64)
-    more = True
-    while more:
-        more = False
-        for i in range(len(cells)):
-            r, c = cells[i] // wide, cells[i] % wide
-            left = mapped[r, c] & ~fell[r, c] & ~stood[r, c]
-            stays[i] = left & neighbourhood(stood, base, r, c, _BESIDE) if left else left
-            falls[i] = left & ~stays[i] & neighbourhood(fell, base, r, c, _BESIDE) if left else left
-        for i in range(len(cells)):
-            if stays[i] | falls[i]:
-                stood[cells[i] // wide, cells[i] % wide] |= stays[i]
-                fell[cells[i] // wide, cells[i] % wide] |= falls[i]
-                more = True
-    for r in range(fell.shape[0]):
-        for c in range(fell.shape[1]):
-            if fell[r, c]:
-                fell[r, c] &= ~neighbourhood(stands, base, r, c, _BESIDE)
-    return fell
+def apart(gone: U64, stands: U64, base: I32) -> U64:
+    """(rows, cols) those of ``gone`` that touch (26) no voxel of ``stands``: a leaf or a ledge that one vehicle met
+    others may see past."""
+    return np.asarray(gone & ~dilated(stands, base, 1))

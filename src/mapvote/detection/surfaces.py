@@ -29,7 +29,7 @@ from mapvote.detection.faint_walls import faintly_gone, often_crossed
 from mapvote.detection.lone_points import lone_cells, no_change
 from mapvote.detection.regions import HALO, JOIN_CELLS, beyond_tiles, fallen, unexplained
 from mapvote.detection.surface_counts import CROSSED, MET, PASSED, PASSES, SurfaceEvidence
-from mapvote.detection.surface_regions import SUPPORT, grown, lasting, settled, supported
+from mapvote.detection.surface_regions import SUPPORT, apart, grown, lasting, supported
 from mapvote.detection.votes import TileVotes
 from mapvote.perception.frontend import Observation
 
@@ -42,8 +42,6 @@ NEW_RAYS = 0.5
 """Of the scans in which a free voxel was met, one goes against two that crossed it."""
 FALL_CELLS = 8
 """How far what is gone takes cells with it that no ray could decide: 2.4 m, where columns allow 4.5."""
-_NEAR = 32
-"""Cells around a tile from which what is gone and what stands may reach what no ray decided."""
 
 
 @dataclass(slots=True)
@@ -132,7 +130,7 @@ class SurfaceVoter:
 
     def each(self) -> Iterator[tuple[TileIndex, TileVotes]]:
         """The same one by one, in an order of its own: a drive of many tiles is judged block by block
-        (three halos, a lone point and what settles are less than a tile)."""
+        (three halos and a lone point are less than a tile)."""
         for wanted, tiles in blocks(self.evidence.tiles):
             judged = {tile: self._judge(tile) for tile in tiles}
             _decide_mapped(judged, self.point_map.lattice)
@@ -226,8 +224,7 @@ def _decide_mapped(tiles: dict[TileIndex, _Judged], lattice: Lattice) -> None:
         found.gone = np.where(down, found.here.occupied, found.gone)
     gone = {tile: found.gone for tile, found in tiles.items()}
     stands, base = {t: found.stands for t, found in tiles.items()}, {t: found.here.base for t, found in tiles.items()}
-    mapped = {tile: np.where(found.stands != 0, found.here.occupied, 0) for tile, found in tiles.items()}
-    for tile, words in beyond_tiles(lattice, _NEAR, settled, (gone, 0), (stands, 0), (mapped, 0), (base, 0)).items():
+    for tile, words in beyond_tiles(lattice, 1, apart, (gone, 0), (stands, 0), (base, 0)).items():
         tiles[tile].remnants = np.where(tiles[tile].stands != 0, words, np.uint64(0))
 
 
