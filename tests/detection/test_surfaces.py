@@ -16,7 +16,7 @@ from mapvote.core.types import F64, I32, NO_VOTE, U64, Bool, CellState
 from mapvote.detection.counters import PLANES, count_of
 from mapvote.detection.near_hits import HIT_REACH_M
 from mapvote.detection.surface_counts import CROSSED, MET, PASSES, WORDS, SurfaceEvidence
-from mapvote.detection.surface_regions import SUPPORT, apart, grown, lasting
+from mapvote.detection.surface_regions import SUPPORT, detached, grown, lasting
 from mapvote.detection.surfaces import GONE_RAYS, HIT_RAYS, NEW_RAYS, SurfaceVoter, weigh_surfaces
 from mapvote.detection.votes import TileVotes
 
@@ -233,9 +233,9 @@ words = arrays(np.uint64, (4, 4), elements=st.integers(0, 2**63 - 1))
 @settings(max_examples=25, deadline=None)
 def test_of_what_is_gone_exactly_that_is_apart_which_touches_nothing_that_stands(gone: U64, stands: U64) -> None:
     level = np.zeros((4, 4), np.int32)
-    kept = gone & ~apart(gone, stands, level)
+    kept = gone & ~detached(gone, stands, level)
     np.testing.assert_array_equal(kept, gone & dilated(stands, level, 1))
-    np.testing.assert_array_equal(apart(gone, np.zeros_like(stands), level), gone)
+    np.testing.assert_array_equal(detached(gone, np.zeros_like(stands), level), gone)
 
 
 def test_an_upper_storey_that_no_ray_reached_stays_where_the_lower_one_stands_beside_a_house_that_went() -> None:

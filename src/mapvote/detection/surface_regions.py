@@ -40,7 +40,7 @@ def grown(strong: Bool, weak: Bool) -> Bool:
     return np.asarray(ndimage.binary_propagation(strong, EVERY_SIDE, mask=strong | weak))
 
 
-def apart(gone: U64, stands: U64, base: I32) -> U64:
+def detached(gone: U64, stands: U64, base: I32) -> U64:
     """(rows, cols) those of ``gone`` that touch (26) no voxel of ``stands``: a leaf or a ledge that one vehicle met
     others may see past."""
     return np.asarray(gone & ~dilated(stands, base, 1))
