@@ -62,7 +62,7 @@ TESTS = {
     "detection/sightings.py": ["detection/test_paper.py"],
     "detection/surfaces.py": ["detection/test_surfaces.py"],
     "detection/surface_regions.py": ["detection/test_surfaces.py"],
-    "detection/surface_counts.py": ["detection/test_surfaces.py"],
+    "detection/surface_counts.py": ["detection/test_surface_counts.py", "detection/test_surfaces.py"],
     "detection/faint_walls.py": ["detection/test_faint_walls.py"],
     "detection/lone_points.py": ["detection/test_lone_points.py"],
     "perception/moving_kernels.py": ["perception/test_moving_kernels.py", "perception/test_moving_objects.py"],

@@ -68,6 +68,14 @@ def test_a_pole_that_went_is_a_change_and_a_twig_is_none() -> None:
     assert after(street([(ROW, 105)], tall[1:]), standing_at(OLD_Y + 9)).states[ROW, 105] == UN
 
 
+def test_twigs_at_the_edge_of_all_that_is_known_are_no_pole_together() -> None:
+    ground = wall([(r, c) for r in range(30) for c in range(95, 125)], [0.0])
+    twigs = wall([(0, 105), (0, 107)], [0.75 + 0.3 * k for k in range(SUPPORT - 1)])
+    point_map = make_map({(0, 0): make_tile(np.concatenate([twigs, ground]))})
+    states = after(point_map, standing_at(20.5 * CELL_SIZE)).states
+    assert [int(states[0, c]) for c in (105, 107)] == [UN, UN]
+
+
 def test_what_two_scans_crossed_is_not_gone_yet() -> None:
     gone_after = [after(street(WALL, HEIGHTS), standing_at(OLD_Y + 9), n).states[ROW, 105] for n in (2, GONE_RAYS)]
     assert gone_after == [UN, CE]

@@ -1,0 +1,84 @@
+"""What a scan adds to the evidence of each voxel: crossed, met, passed by, held against a reference bit by bit."""
+
+from __future__ import annotations
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from hand_made import make_map, make_tile, one_scan, wall
+from mapvote.core.columns import TOP_BIT
+from mapvote.core.point_map import PointMap
+from mapvote.core.types import F64
+from mapvote.detection.counters import PLANES, count_of
+from mapvote.detection.near_hits import near_hits
+from mapvote.detection.surface_counts import CROSSED, MET, PASSED, PASSES, SurfaceEvidence
+from mapvote.perception.frontend import Observation
+
+ROWS, COLS = range(100, 104), range(100, 105)
+FULL = 2**PLANES - 1
+
+
+def street() -> PointMap:
+    ground = wall([(r, c) for r in range(98, 107) for c in range(98, 108)], [0.0])
+    mapped = wall([(101, c) for c in COLS], [0.45, 0.75, 1.05, 2.25])
+    return make_map({(0, 0): make_tile(np.concatenate([mapped, ground]))})
+
+
+def seen_from(point_map: PointMap, points: F64, seed: int) -> Observation:
+    """A scan with these points, whose rays passed some voxels of each column, or none, and now and then hit a column
+    that no ray passed."""
+    seen, rng = one_scan(point_map, points), np.random.default_rng(seed)
+    some = rng.integers(0, 2**63, seen.view.passed.shape, dtype=np.uint64)
+    some |= rng.integers(0, 2**63, seen.view.passed.shape, dtype=np.uint64)
+    seen.view.passed[:] = np.where(rng.random(some.shape) < 0.3, np.uint64(0), some)
+    return seen
+
+
+def told_of(seen: Observation, r: int, c: int, bit: int) -> tuple[bool, bool, bool, bool]:
+    """(crossed, met, passes, passed) of one voxel, by the words of docs/method.md."""
+
+    def has(plane: np.ndarray, k: int = bit) -> bool:
+        return bool(int(plane[r, c]) >> k & 1)
+
+    passed, near, mapped = seen.view.passed, near_hits(seen), seen.reference.occupied
+    above = bit + 1 >= TOP_BIT or has(passed, bit + 1)
+    below = bit <= 1 or has(passed, bit - 1)
+    crossed = has(passed) and above and below and not has(near)
+    met = has(near) if has(mapped) else has(seen.view.hit)
+    return crossed, met, has(passed) and not has(near) and not has(mapped), has(passed)
+
+
+@given(
+    st.lists(st.tuples(*[st.floats(29.8, 31.6)] * 2, st.floats(0.35, 3.0)), min_size=1, max_size=5),
+    st.integers(0, 1000),
+)
+@settings(max_examples=20, deadline=None)
+def test_a_voxel_counts_what_one_scan_tells_of_it(offsets: list[tuple[float, float, float]], seed: int) -> None:
+    point_map = street()
+    seen = seen_from(point_map, np.array(offsets), seed)
+    evidence = SurfaceEvidence(point_map.lattice)
+    evidence.count(seen)
+    for r in ROWS:
+        for c in COLS:
+            cell = evidence.tiles[0, 0][r, c]
+            for bit in range(1, TOP_BIT):
+                counted = [bool(count_of(cell, first, bit)) for first in (CROSSED, MET, PASSES)]
+                assert (*counted, bool(int(cell[PASSED]) >> bit & 1)) == told_of(seen, r, c, bit)
+
+
+def test_a_cell_in_which_a_count_is_full_is_halved_as_a_whole_and_its_ratios_stay() -> None:
+    point_map = street()
+    evidence = SurfaceEvidence(point_map.lattice)
+    hit = np.array([[102.5 * 0.3, 102.5 * 0.3, 1.05]])  # where nothing is mapped
+    empty = np.array([[104.5 * 0.3, 104.5 * 0.3, 1.05]])
+    for scan in range(FULL + 1):
+        seen = one_scan(point_map, hit if scan % 4 == 0 else empty)
+        if scan % 2:
+            seen.view.passed[102, 102] &= ~np.uint64(1 << 4)  # what is above the hit is not passed then
+        evidence.count(seen)
+    cell = evidence.tiles[0, 0][102, 102]
+    assert count_of(cell, PASSES, 10) == FULL // 2 + 1, "full after 127, so 63 and the last one"
+    assert count_of(cell, MET, 3) == 32 // 2
+    assert count_of(cell, CROSSED, 3) == 32 // 2, "of four scans one hit it, one crossed it, and two passed it only"
+    assert count_of(cell, PASSES, 3) == 96 // 2
