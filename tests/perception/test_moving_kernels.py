@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from scipy import ndimage
 
 from mapvote.core.types import I32, Bool
-from mapvote.perception.moving_kernels import flood, moving_components, voxels
+from mapvote.perception.moving_kernels import cells_in_plane, decidable, flood, moving_components, voxels
+from mapvote.perception.range_image import BOTH_SIDES, Counts
 
 SIDE = 10
 
@@ -53,6 +56,27 @@ def test_a_walker_who_touches_a_wall_moves_without_it_though_something_of_the_wa
     brief = [True] + [False] * (len(touched) - 1 + len(wall)) + [True] * len(walker)
     moves = moving(touched + wall + walker, brief, np.arange(len(brief), dtype=np.int32))
     assert moves == [False] * (len(touched) + len(wall)) + [True] * len(walker)
+
+
+@given(
+    st.lists(st.tuples(st.integers(0, 13), st.integers(0, 13), st.integers(0, BOTH_SIDES)), min_size=1, max_size=30),
+    st.integers(1, 5),
+)
+def test_what_was_brief_was_seen_often_enough_mostly_free_and_from_both_sides(
+    told: list[tuple[int, int, int]], min_free: int
+) -> None:
+    free, hit, sides = (np.array(part, np.int32) for part in zip(*told, strict=True))
+    seen, brief = decidable(Counts(free=free, hit=hit, sides=sides.astype(np.uint8)), min_free, 0.75)
+    for i, (f, h, s) in enumerate(told):
+        assert seen[i] == (f + h >= min_free)
+        assert brief[i] == (s == BOTH_SIDES and f >= min_free and f >= 0.75 * (f + h))
+
+
+def test_places_lie_in_the_cells_of_a_plane_counted_from_its_lowest() -> None:
+    places = np.array([[-0.1, 0.2, 5.0], [0.0, -0.7, 1.0], [3.05, 1.6, 0.0]])
+    rows, cols = cells_in_plane(places, np.array([-3, -5]), 0.3)
+    assert rows.tolist() == [5, 2, 10]
+    assert cols.tolist() == [2, 3, 13]
 
 
 @pytest.mark.parametrize("count", [0, 50, 20_000])
