@@ -202,6 +202,37 @@ def test_a_vehicle_that_was_measured_to_stand_still_is_one_whose_motion_is_known
     assert first_look(tracker, 51 * TENTH, at(7.0, 0.02)) == [100.0, 0.0, 1.8]
 
 
+def test_two_scans_from_the_same_place_measure_that_a_vehicle_stands() -> None:
+    tracker = elsewhere()
+    for stamp_ns in (49 * TENTH, 50 * TENTH):
+        tracker.begin(blind(stamp_ns), from_xyz_rpy(100.0, 0.0, 1.8))
+    assert first_look(tracker, 51 * TENTH, at(7.0, 0.02)) == [100.0, 0.0, 1.8]
+
+
+@pytest.mark.parametrize(("reach", "steps"), [(0.2, 1), (1.5, 2), (3.0, 3), (99.0, 10)])
+def test_a_lost_vehicle_is_looked_for_metre_by_metre_as_far_to_all_sides(
+    reach: float, steps: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tried: list[F64] = []
+    sampled: list[int] = []
+
+    def poor(ndt_map: NdtMap, clouds: list[F64], guess: F64) -> float:
+        sampled.append(clouds[0].shape[1])
+        tried.append(guess)
+        return 0.0
+
+    monkeypatch.setattr("mapvote.localisation.tracker.fitness", poor)
+    found = registered(np.eye(3))
+    monkeypatch.setattr("mapvote.localisation.tracker.refine", lambda *_: found)
+    cloud = np.zeros((3, 1500), np.float32)
+    assert elsewhere()._search(NdtMap(np.zeros(3)), [cloud], from_xyz_rpy(5.0, -7.0, 0.0), reach, None) is found
+    offsets = sorted({(round(T[0, 3] - 5.0, 6), round(T[1, 3] + 7.0, 6)) for T in tried})
+    every = [float(k) for k in range(-steps, steps + 1)]
+    assert offsets == [(x, y) for x in every for y in every]
+    assert len(tried) == 3 * len(offsets), "with three headings each"
+    assert set(sampled) == {1500}, "by all of a thousand points or little more"
+
+
 def test_the_first_pose_of_a_survey_is_taken_as_given() -> None:
     tracker = elsewhere()
     fix = tracker.begin(BLIND, POSES[3])

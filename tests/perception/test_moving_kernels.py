@@ -59,7 +59,9 @@ def test_a_walker_who_touches_a_wall_moves_without_it_though_something_of_the_wa
 
 
 @given(
-    st.lists(st.tuples(st.integers(0, 13), st.integers(0, 13), st.integers(0, BOTH_SIDES)), min_size=1, max_size=30),
+    st.lists(
+        st.tuples(st.integers(0, 13), st.integers(0, 13), st.integers(0, int(BOTH_SIDES))), min_size=1, max_size=30
+    ),
     st.integers(1, 5),
 )
 def test_what_was_brief_was_seen_often_enough_mostly_free_and_from_both_sides(
