@@ -42,3 +42,8 @@ def test_a_faint_wall_is_gone_if_it_is_large_and_crossed_enough_and_tall(
     out = faintly_gone(faint, np.full((5, 8), times, np.int32), height, 6, 18)
     np.testing.assert_array_equal(out[2], faint[2] & gone)
     assert not out[0].any()
+
+
+def test_where_no_cell_was_crossed_no_wall_is_gone() -> None:
+    nothing = np.zeros((4, 5), np.bool_)
+    assert not faintly_gone(nothing, np.zeros((4, 5), np.int32), np.zeros((4, 5), np.float32), 6, 18).any()
