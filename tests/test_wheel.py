@@ -5,17 +5,16 @@ from __future__ import annotations
 import os
 import shutil
 import subprocess
-import sys
 import venv
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from fresh_wheel import packed
 from mapvote.formats import write_pcd
 from mapvote.formats.maps.cloud import Cloud
 
-ROOT = Path(__file__).parents[1]
 pytestmark = pytest.mark.slow
 
 BASE_LACKS = ["sqlalchemy", "alembic", "fastapi", "uvicorn", "structlog", "embreex", "matplotlib", "small_gicp"]
@@ -28,12 +27,7 @@ TRIES = {
 
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("wheel")
-    source = shutil.copytree(ROOT, folder / "source", ignore=shutil.ignore_patterns(".venv", ".git", "out", ".*_cache"))
-    subprocess.run(
-        [sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "-w", folder, source], check=True, timeout=300
-    )
-    return next(folder.glob("*.whl"))
+    return packed(tmp_path_factory.mktemp("wheel"))
 
 
 def install(folder: Path, what: str) -> Path:

@@ -9,15 +9,14 @@ from __future__ import annotations
 import os
 import re
 import shlex
-import shutil
 import subprocess
-import sys
 import venv
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
+from fresh_wheel import packed
 from hand_made import Say, make_ballot, states_plane, two_walls
 from mapvote.codec.ballot import encode
 from mapvote.core.types import CellState
@@ -37,10 +36,8 @@ def mapvote(tmp_path_factory: pytest.TempPathFactory) -> str:
     if "MAPVOTE_PROGRAM" in os.environ:
         return os.environ["MAPVOTE_PROGRAM"]
     home = tmp_path_factory.mktemp("fresh")
-    source = shutil.copytree(ROOT, home / "source", ignore=shutil.ignore_patterns(".venv", ".git", "out", ".*_cache"))
-    subprocess.run([sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "-w", home, source], check=True)
     venv.create(home / "venv", with_pip=True)
-    wheel = f"{next(home.glob('*.whl'))}[server,postgres]"
+    wheel = f"{packed(home)}[server,postgres]"
     subprocess.run([home / "venv/bin/pip", "install", "-q", wheel], check=True, timeout=900)
     return str(home / "venv/bin/mapvote")
 
