@@ -3,29 +3,30 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numba
 import numpy as np
 import pytest
 
 from mapvote.core.azimuth import azimuth_32, azimuth_64
-from mapvote.core.types import F32, F64
+from mapvote.core.types import F64
 
 
-@numba.njit(error_model="numpy")  # type: ignore[untyped-decorator]
-def _all_32(y: F32, x: F32) -> F32:
-    out = np.empty_like(x)
-    for i in range(len(x)):
-        out[i] = azimuth_32(y[i], x[i])
-    return out
+def _for_all(azimuth: Any) -> Any:
+    """A kernel of (n,) y and x for one of a number."""
+
+    @numba.njit(error_model="numpy")  # type: ignore[untyped-decorator]
+    def every(y: F64, x: F64) -> F64:
+        out = np.empty_like(x)
+        for i in range(len(x)):
+            out[i] = azimuth(y[i], x[i])
+        return out
+
+    return every
 
 
-@numba.njit(error_model="numpy")  # type: ignore[untyped-decorator]
-def _all_64(y: F64, x: F64) -> F64:
-    out = np.empty_like(x)
-    for i in range(len(x)):
-        out[i] = azimuth_64(y[i], x[i])
-    return out
+_all_32, _all_64 = _for_all(azimuth_32), _for_all(azimuth_64)
 
 
 def _points(n: int) -> tuple[F64, F64]:

@@ -144,8 +144,8 @@ class Grid:
 def window_around(lattice: Lattice, x: float, y: float, side_m: float) -> Grid:
     """The square window of about ``side_m`` metres centred on the cell of (x, y) (paper III-A: 80 m)."""
     half = round(0.5 * side_m / CELL_SIZE)
-    row, col = np.floor((y - lattice.y0) / CELL_SIZE), np.floor((x - lattice.x0) / CELL_SIZE)  # as cells_of, for one
-    return Grid(lattice, int(row) - half, int(col) - half, 2 * half + 1, 2 * half + 1)
+    rows, cols = lattice.cells_of(np.array([[x, y]]))
+    return Grid(lattice, int(rows[0]) - half, int(cols[0]) - half, 2 * half + 1, 2 * half + 1)
 
 
 def tile_of_cells(rows: NDArray[np.int64], cols: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

@@ -51,8 +51,9 @@ def add_one(planes: U64, first: int, word: np.uint64) -> None:
 
 
 @numba.njit(cache=True, nogil=True)
-def halve(planes: U64) -> None:
-    for first in (_THROUGH, _STRUCK):
+def halve(planes: U64, counters: int) -> None:
+    """The counts of all ``counters`` of a cell: what is weighed against each other keeps its ratio."""
+    for first in range(0, counters * PLANES, PLANES):
         for k in range(first, first + PLANES - 1):
             planes[k] = planes[k + 1]
         planes[first + PLANES - 1] = 0
@@ -112,7 +113,7 @@ def _gather(
                     if reach == 1:  # where a scan is not sure of its pose, single voxels mean nothing
                         cell[THROUGH_ITSELF] |= passed[r, c] & mapped & ~hit[r, c]
                 if is_full(cell, _THROUGH, through) or is_full(cell, _STRUCK, struck):
-                    halve(cell)
+                    halve(cell, 2)
                 add_one(cell, _THROUGH, through)
                 add_one(cell, _STRUCK, struck)
 

@@ -20,7 +20,7 @@ import numpy as np
 from mapvote.core.columns import TOP_BIT
 from mapvote.core.grid import Lattice
 from mapvote.core.types import F32, U64
-from mapvote.detection.counters import PLANES, add_one, is_full
+from mapvote.detection.counters import PLANES, add_one, halve, is_full
 from mapvote.detection.near_hits import near_hits
 from mapvote.detection.packed_tiles import Overlap, PackedTiles
 from mapvote.perception.frontend import Observation
@@ -31,15 +31,6 @@ WORDS = 3 * PLANES + 1
 """Words a cell: the three counters, and what any ray passed."""
 _LOWEST, _HIGHEST = np.uint64(0b11), np.uint64(1) << np.uint64(TOP_BIT - 1)
 """The ground bounds the lowest voxel, the end of the word the highest."""
-
-
-@numba.njit(cache=True, nogil=True)
-def _halve(cell: U64) -> None:
-    """All three counters, so that what is weighed against each other keeps its ratio."""
-    for first in (CROSSED, MET, PASSES):
-        for k in range(first, first + PLANES - 1):
-            cell[k] = cell[k + 1]
-        cell[first + PLANES - 1] = 0
 
 
 @numba.njit(cache=True, nogil=True)
@@ -56,7 +47,7 @@ def _gather(planes: U64, part: Overlap, hit: U64, near: U64, passed: U64, occupi
             missed = rays & ~(near[r, c] | mapped)
             cell[PASSED] |= rays
             if is_full(cell, CROSSED, crossed) or is_full(cell, MET, met) or is_full(cell, PASSES, missed):
-                _halve(cell)
+                halve(cell, 3)
             add_one(cell, CROSSED, crossed)
             add_one(cell, MET, met)
             add_one(cell, PASSES, missed)

@@ -52,10 +52,8 @@ class _Judged:
     gone: U64
     stands: U64
     new: U64
-    met: I32
-    """In how many scans the new voxels of each cell were met, summed over them."""
-    passes: I32
-    """In how many a ray passed them and met nothing."""
+    balance: I32
+    """In how many scans the new voxels of each cell were met, less in how many a ray passed them, summed over them."""
     beyond: U64
     """Met where the map knew nothing and has nothing beside it."""
     beside: Bool
@@ -70,6 +68,8 @@ class _Judged:
     """Mapped cells whose voxels touch no other mapped one."""
     states: U8
     remnants: U64
+    free: U64
+    """Seen to be free where the map knew nothing."""
 
 
 @numba.njit(cache=True, nogil=True)
@@ -81,9 +81,9 @@ def is_gone(cell: U64, bit: int) -> bool:
 @numba.njit(cache=True, nogil=True)
 def weigh_surfaces(
     planes: U64, occupied: U64, free: U64, near: U64,
-    gone: U64, stands: U64, new: U64, beyond: U64, met_new: I32, passes_new: I32,
+    gone: U64, stands: U64, new: U64, beyond: U64, balance: I32,
 ) -> None:  # fmt: skip
-    """Fill the last six planes (rows, cols), which come empty, from counters (rows, cols, WORDS) and the map's words:
+    """Fill the last five planes (rows, cols), which come empty, from counters (rows, cols, WORDS) and the map's words:
     ``free`` it knows to be, ``near`` its points. See :class:`_Judged` for each."""
     for r in range(occupied.shape[0]):
         for c in range(occupied.shape[1]):
@@ -106,8 +106,7 @@ def weigh_surfaces(
                 elif met >= 1 + NEW_RAYS * crossed:
                     if free[r, c] & one:
                         new[r, c] |= one
-                        met_new[r, c] += met
-                        passes_new[r, c] += count_of(cell, PASSES, bit)
+                        balance[r, c] += met - count_of(cell, PASSES, bit)
                     elif not near[r, c] & one:
                         beyond[r, c] |= one
 
@@ -137,7 +136,7 @@ class SurfaceVoter:
             _decide_new(judged, self.point_map.lattice)
             for tile in wanted:
                 if (judged[tile].states != NO_VOTE).any():
-                    yield tile, _votes_of(judged[tile], self.evidence.tiles[tile])
+                    yield tile, _votes_of(judged[tile])
 
     def _judge(self, tile: TileIndex) -> _Judged:
         """What the tile's own evidence says, voxel by voxel and cell by cell."""
@@ -145,8 +144,8 @@ class SurfaceVoter:
         here, outer, near, known = bordered(self.point_map, window)
         planes = self.evidence.tiles[tile]
         gone, stands, new, beyond = (np.zeros(window.shape, dtype=np.uint64) for _ in range(4))
-        met, passes = np.zeros(window.shape, dtype=np.int32), np.zeros(window.shape, dtype=np.int32)
-        weigh_surfaces(planes, here.occupied, known, near, gone, stands, new, beyond, met, passes)
+        balance = np.zeros(window.shape, dtype=np.int32)
+        weigh_surfaces(planes, here.occupied, known, near, gone, stands, new, beyond, balance)
         mapped, passed = here.occupied != 0, planes[..., PASSED]
         low = mapped & ~(here.top_z - here.ground_z >= self.voting.min_height_m)
         under = np.where(mapped, (here.occupied & (~here.occupied + np.uint64(1))) - np.uint64(1), np.uint64(0))
@@ -162,8 +161,7 @@ class SurfaceVoter:
             gone=np.where(low, np.uint64(0), gone),
             stands=stands,
             new=np.where(mapped, np.uint64(0), new),
-            met=met,
-            passes=passes,
+            balance=balance,
             beyond=beyond,
             beside=(new != 0) & (new & ~near == 0),
             crossed=mapped & ~low & (stands == 0) & ((gone | never_met) != 0),
@@ -172,15 +170,15 @@ class SurfaceVoter:
             lone=lone_cells(outer.occupied, outer.base)[1:-1, 1:-1],
             states=states,
             remnants=np.zeros_like(gone),
+            free=newly_free(planes, here),
         )
 
 
-def _votes_of(found: _Judged, planes: U64) -> TileVotes:
+def _votes_of(found: _Judged) -> TileVotes:
     """What a new thing has where the map knew neither free space nor points comes along, and so do its upper parts."""
     known = ~np.uint64(0) if found.here.free is None else found.here.free
     new = np.where(found.new != 0, found.new | found.beyond | ~(_below_tops(found.new) | known), np.uint64(0))
-    free = newly_free(planes, found.here)
-    return TileVotes(one_hot(found.states), found.states, found.gone, found.remnants, new, free)
+    return TileVotes(one_hot(found.states), found.states, found.gone, found.remnants, new, found.free)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -234,14 +232,14 @@ def _decide_new(tiles: dict[TileIndex, _Judged], lattice: Lattice) -> None:
     candidates = {tile: np.where(found.new != 0, occupied, np.uint8(NO_VOTE)) for tile, found in tiles.items()}
     beside = {tile: found.beside for tile, found in tiles.items()}
     new = {tile: found.new for tile, found in tiles.items()}
-    met, passes = {t: found.met for t, found in tiles.items()}, {t: found.passes for t, found in tiles.items()}
+    balance = {tile: found.balance for tile, found in tiles.items()}
 
-    def stand(states: U8, beside: Bool, new: U64, met: I32, passes: I32) -> Bool:
+    def stand(states: U8, beside: Bool, new: U64, balance: I32) -> Bool:
         given_up = unexplained(states, beside, JOIN_CELLS)
         cells = (states == occupied) & ~given_up
-        return supported(cells, new) & lasting(cells, met, passes)
+        return supported(cells, new) & lasting(cells, balance)
 
-    planes = (candidates, NO_VOTE), (beside, False), (new, 0), (met, 0), (passes, 0)
+    planes = (candidates, NO_VOTE), (beside, False), (new, 0), (balance, 0)
     for tile, cells in beyond_tiles(lattice, HALO, stand, *planes).items():
         tiles[tile].states[tiles[tile].new != 0] = CellState.UNDETERMINED
         tiles[tile].states[cells] = occupied
