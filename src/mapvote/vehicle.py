@@ -54,6 +54,7 @@ class Vehicle:
             MovingFilter(sensor, self.settings.moving),
             LocalMap(point_map, self.settings.voting.window_m),
             with_sight=self.settings.voting.method == "paper",
+            sensor=sensor,
         )
         self._voter = make_voter(self.settings, sensor, point_map)
         self._new_points = NewPoints(

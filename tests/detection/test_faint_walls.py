@@ -23,7 +23,7 @@ def test_a_cell_was_crossed_as_often_as_its_mapped_voxels_less_what_each_was_met
                 add_one(planes[0, 0], first, np.uint64(1 << bit))
     mapped: U64 = np.array([[0b101101]], np.uint64)
     expected = sum(max(int(often[bit]) - 8 * int(met[bit]), 0) for bit in (0, 2, 3, 5))
-    assert often_crossed(planes, mapped, 8)[0, 0] == expected
+    assert often_crossed(planes, mapped, 8, 2)[0, 0] == expected
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ from mapvote.core.point_map import PointMap
 from mapvote.core.types import F64
 from mapvote.detection.counters import PLANES, count_of
 from mapvote.detection.near_hits import near_hits
-from mapvote.detection.surface_counts import CROSSED, MET, PASSED, PASSES, SurfaceEvidence
+from mapvote.detection.surface_counts import CROSSED, MET, PASSED, PASSES, WORDS, SurfaceEvidence, times_crossed
 from mapvote.perception.frontend import Observation
 
 ROWS, COLS = range(100, 104), range(100, 105)
@@ -46,7 +46,7 @@ def told_of(seen: Observation, r: int, c: int, bit: int) -> tuple[bool, bool, bo
     below = bit <= 1 or has(passed, bit - 1)
     crossed = has(passed) and above and below and not has(near)
     met = has(near) if has(mapped) else has(seen.view.hit)
-    return crossed, met, has(passed) and not has(near) and not has(mapped), has(passed)
+    return crossed, met, has(passed) and not has(near), has(passed)
 
 
 @given(
@@ -82,3 +82,28 @@ def test_a_cell_in_which_a_count_is_full_is_halved_as_a_whole_and_its_ratios_sta
     assert count_of(cell, MET, 3) == 32 // 2
     assert count_of(cell, CROSSED, 3) == 32 // 2, "of four scans one hit it, one crossed it, and two passed it only"
     assert count_of(cell, PASSES, 3) == 96 // 2
+
+
+def cell_with(bit: int, crossed: int, passes: tuple[int, int, int]) -> np.ndarray:
+    """(WORDS,) of a cell: how often its voxel ``bit`` was crossed; ``passes`` of that below, of it, of that above."""
+    cell = np.zeros(WORDS, np.uint64)
+    for k in range(PLANES):
+        cell[CROSSED + k] |= np.uint64((crossed >> k & 1) << bit)
+        for beside, often in zip((-1, 0, 1), passes, strict=True):
+            if 0 <= bit + beside < TOP_BIT:
+                cell[PASSES + k] |= np.uint64((often >> k & 1) << bit + beside)
+    return cell
+
+
+@given(st.integers(1, TOP_BIT - 1), st.integers(0, FULL), st.tuples(*[st.integers(0, FULL)] * 3), st.integers(1, 4))
+def test_rays_of_all_scans_together_cross_a_voxel_by_what_they_passed_least_of_three(
+    bit: int, crossed: int, passes: tuple[int, int, int], every: int
+) -> None:
+    below, own, above = passes
+    asked = [own] + [below] * (bit > 1) + [above] * (bit + 1 < TOP_BIT)
+    assert times_crossed(cell_with(bit, crossed, passes), bit, every) == max(crossed, min(asked) // every)
+
+
+def test_rays_that_only_graze_a_roof_never_cross_it_whatever_their_number() -> None:
+    assert times_crossed(cell_with(7, 0, (0, FULL, FULL)), 7, 2) == 0
+    assert times_crossed(cell_with(7, 0, (FULL, FULL, 0)), 7, 2) == 0

@@ -171,12 +171,12 @@ def test_a_place_where_nothing_is_mapped_and_rays_passed_is_empty_and_one_that_n
 
 
 def weighed(mapped: int, free: int, **counts: int) -> tuple[list[np.ndarray], int]:
-    """Voxel 5 of one cell with these counts: (gone, stands, new, beyond; of what is new, met less passed)."""
+    """Voxel 5 of one cell with these counts: (gone, stands, unmet, new, beyond; of what is new, met less passed)."""
     planes, bit = np.zeros((1, 1, WORDS), np.uint64), 5
     for first, name in ((CROSSED, "crossed"), (MET, "met"), (PASSES, "passes")):
         for k in range(PLANES):
             planes[0, 0, first + k] = np.uint64((counts.get(name, 0) >> k & 1) << bit)
-    found = [np.zeros((1, 1), np.uint64) for _ in range(4)]
+    found = [np.zeros((1, 1), np.uint64) for _ in range(5)]
     balance = np.zeros((1, 1), np.int32)
     words_of = [np.full((1, 1), word << bit, np.uint64) for word in (mapped, free, 0)]
     weigh_surfaces(planes, *words_of, *found, balance)
@@ -185,9 +185,10 @@ def weighed(mapped: int, free: int, **counts: int) -> tuple[list[np.ndarray], in
 
 @given(crossed=st.integers(0, 120), met=st.integers(0, 20))
 def test_one_hit_outweighs_as_many_rays_as_is_said(crossed: int, met: int) -> None:
-    (gone, stands, new, beyond), _ = weighed(1, 0, crossed=crossed, met=met)
+    (gone, stands, unmet, new, beyond), _ = weighed(1, 0, crossed=crossed, met=met)
     assert (gone[0, 0] != 0) == (crossed >= GONE_RAYS + HIT_RAYS * met)
     assert (stands[0, 0] != 0) == (met > 0 and gone[0, 0] == 0)
+    assert (unmet[0, 0] != 0) == (met == 0 and 0 < crossed < GONE_RAYS)
     assert not (new | beyond).any()
 
 
@@ -195,10 +196,10 @@ def test_one_hit_outweighs_as_many_rays_as_is_said(crossed: int, met: int) -> No
 def test_a_free_voxel_is_new_by_hits_against_crossings_and_tells_how_often_rays_passed(
     crossed: int, met: int, passes: int
 ) -> None:
-    (gone, stands, new, beyond), balance = weighed(0, 1, crossed=crossed, met=met, passes=passes)
+    (gone, stands, unmet, new, beyond), balance = weighed(0, 1, crossed=crossed, met=met, passes=passes)
     assert (new[0, 0] != 0) == (met >= 1 + NEW_RAYS * crossed)
     assert balance == (met - passes if new[0, 0] else 0)
-    assert not (gone | stands | beyond).any()
+    assert not (gone | stands | unmet | beyond).any()
 
 
 def test_what_was_met_more_often_than_rays_passed_it_lasts_and_takes_its_seldom_met_edges_along() -> None:

@@ -21,7 +21,7 @@ from mapvote.config.server import GateSettings as GateSettings
 from mapvote.config.server import ServerSettings
 from mapvote.core.types import MapvoteError
 
-METHOD_VERSION = 8
+METHOD_VERSION = 9
 """Goes up whenever a constant or a rule changes by which vehicles vote; the numbers below are only what a user sets."""
 
 

@@ -14,23 +14,24 @@ from scipy import ndimage
 
 from mapvote.core.types import F32, I32, U64, Bool
 from mapvote.detection.counters import count_of
-from mapvote.detection.surface_counts import CROSSED, MET
+from mapvote.detection.surface_counts import MET, times_crossed
 
 TALL_M = 4.0
 """No lorry is taller (Directive 96/53/EC); docs/decisions/evidence.md has what stood and what drove."""
 
 
 @numba.njit(cache=True, nogil=True)
-def often_crossed(planes: U64, occupied: U64, hit_rays: int) -> I32:
+def often_crossed(planes: U64, occupied: U64, hit_rays: int, every: int) -> I32:
     """(rows, cols) how often the mapped voxels of each cell were crossed, beyond ``hit_rays`` for each time they were
-    met, from counters (rows, cols, WORDS) and the map's words."""
+    met, from counters (rows, cols, WORDS) and the map's words; ``every`` as in
+    :func:`mapvote.detection.surface_counts.times_crossed`."""
     out = np.zeros(occupied.shape, dtype=np.int32)
     for r in range(occupied.shape[0]):
         for c in range(occupied.shape[1]):
             for bit in range(64):
                 if occupied[r, c] >> np.uint64(bit) & np.uint64(1):
-                    often = count_of(planes[r, c], CROSSED, bit)
-                    out[r, c] += max(often - hit_rays * count_of(planes[r, c], MET, bit), 0)
+                    met = count_of(planes[r, c], MET, bit)
+                    out[r, c] += max(times_crossed(planes[r, c], bit, every) - hit_rays * met, 0)
     return out
 
 

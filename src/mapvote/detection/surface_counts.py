@@ -5,9 +5,9 @@ where one stood is another wall. A voxel that the map holds is met by a hit so n
 and what was met is not crossed in the same scan, whatever grazed past. Crossed is a voxel if one scan's rays pass it
 and the voxels above and below it: of a slab (roof, awning, ceiling) they reach only one of the two.
 
-Of a voxel that the map does not hold it is counted, too, in how many scans a ray passed it at all. Where beams lie
-wider apart than voxels no scan's rays pass a voxel and those above and below it; what drove there would otherwise never
-meet with anything that speaks against it.
+It is counted, too, in how many scans a ray passed a voxel at all, and met nothing there. Where beams lie wider apart
+than voxels no scan's rays pass a voxel and those above and below it; what drove there, or was pulled down, would
+otherwise never meet with anything that speaks against it.
 
 Counts are kept as those of columns (detection/counters.py), with a word a cell of what any ray ever passed.
 """
@@ -20,7 +20,7 @@ import numpy as np
 from mapvote.core.columns import TOP_BIT
 from mapvote.core.grid import Lattice
 from mapvote.core.types import F32, U64
-from mapvote.detection.counters import PLANES, add_one, halve, is_full
+from mapvote.detection.counters import PLANES, add_one, count_of, halve, is_full
 from mapvote.detection.near_hits import near_hits
 from mapvote.detection.packed_tiles import Overlap, PackedTiles
 from mapvote.perception.frontend import Observation
@@ -44,13 +44,26 @@ def _gather(planes: U64, part: Overlap, hit: U64, near: U64, passed: U64, occupi
             above, below = rays >> np.uint64(1) | _HIGHEST, rays << np.uint64(1) | _LOWEST
             crossed = rays & above & below & ~near[r, c]
             met = (near[r, c] & mapped) | (hit[r, c] & ~mapped)
-            missed = rays & ~(near[r, c] | mapped)
+            missed = rays & ~near[r, c]
             cell[PASSED] |= rays
             if is_full(cell, CROSSED, crossed) or is_full(cell, MET, met) or is_full(cell, PASSES, missed):
                 halve(cell, 3)
             add_one(cell, CROSSED, crossed)
             add_one(cell, MET, met)
             add_one(cell, PASSES, missed)
+
+
+@numba.njit(cache=True, nogil=True)
+def times_crossed(cell: U64, bit: int, every: int) -> int:
+    """How often a mapped voxel of a cell (WORDS,) was crossed: by single scans, or by the rays of all together.
+
+    These pass it and the voxels above and below it one after the other; of the three that were passed least counts,
+    and of its passes only one of ``every`` so many.
+    """
+    passes = count_of(cell, PASSES, bit)
+    above = count_of(cell, PASSES, bit + 1) if bit + 1 < TOP_BIT else passes
+    below = count_of(cell, PASSES, bit - 1) if bit > 1 else passes
+    return max(count_of(cell, CROSSED, bit), min(passes, min(above, below)) // every)
 
 
 class SurfaceEvidence:

@@ -24,11 +24,11 @@ from mapvote.core.reference import bordered
 from mapvote.core.types import F32, I32, NO_VOTE, U8, U64, Bool, CellState, Reference
 from mapvote.core.voting import one_hot
 from mapvote.detection.blocks import blocks
-from mapvote.detection.counters import PLANES, count_of, ever, newly_free
+from mapvote.detection.counters import PLANES, count_of, newly_free
 from mapvote.detection.faint_walls import faintly_gone, often_crossed
 from mapvote.detection.lone_points import lone_cells, no_change
 from mapvote.detection.regions import HALO, JOIN_CELLS, beyond_tiles, fallen, unexplained
-from mapvote.detection.surface_counts import CROSSED, MET, PASSED, PASSES, SurfaceEvidence
+from mapvote.detection.surface_counts import CROSSED, MET, PASSED, PASSES, SurfaceEvidence, times_crossed
 from mapvote.detection.surface_regions import SUPPORT, detached, grown, lasting, supported
 from mapvote.detection.votes import TileVotes
 from mapvote.perception.frontend import Observation
@@ -38,6 +38,8 @@ HIT_RAYS = 8
 """Scans that crossed a mapped voxel, against one that met it."""
 GONE_RAYS = 3
 """Scans that must have crossed it beyond those: two may be an error of two poses."""
+TOGETHER = 2
+"""Scans whose rays cross it only together count as one of so many."""
 NEW_RAYS = 0.5
 """Of the scans in which a free voxel was met, one goes against two that crossed it."""
 FALL_CELLS = 8
@@ -73,17 +75,18 @@ class _Judged:
 
 
 @numba.njit(cache=True, nogil=True)
-def is_gone(cell: U64, bit: int) -> bool:
-    """Whether the surface in one voxel of a cell (WORDS,) was crossed so much more often than met that it is gone."""
-    return count_of(cell, CROSSED, bit) >= GONE_RAYS + HIT_RAYS * count_of(cell, MET, bit)
+def is_gone(cell: U64, bit: int, every: int) -> bool:
+    """Whether the surface in one voxel of a cell (WORDS,) was crossed so much more often than met that it is gone;
+    ``every`` as in :func:`times_crossed`."""
+    return times_crossed(cell, bit, every) >= GONE_RAYS + HIT_RAYS * count_of(cell, MET, bit)
 
 
 @numba.njit(cache=True, nogil=True)
 def weigh_surfaces(
     planes: U64, occupied: U64, free: U64, near: U64,
-    gone: U64, stands: U64, new: U64, beyond: U64, balance: I32,
+    gone: U64, stands: U64, unmet: U64, new: U64, beyond: U64, balance: I32,
 ) -> None:  # fmt: skip
-    """Fill the last five planes (rows, cols), which come empty, from counters (rows, cols, WORDS) and the map's words:
+    """Fill the last six planes (rows, cols), which come empty, from counters (rows, cols, WORDS) and the map's words:
     ``free`` it knows to be, ``near`` its points. See :class:`_Judged` for each."""
     for r in range(occupied.shape[0]):
         for c in range(occupied.shape[1]):
@@ -97,13 +100,15 @@ def weigh_surfaces(
                 one = np.uint64(1) << np.uint64(bit)
                 if not asked & one:
                     continue
-                crossed, met = count_of(cell, CROSSED, bit), count_of(cell, MET, bit)
+                met = count_of(cell, MET, bit)
                 if occupied[r, c] & one:
-                    if is_gone(cell, bit):
+                    if is_gone(cell, bit, TOGETHER):
                         gone[r, c] |= one
                     elif met:
                         stands[r, c] |= one
-                elif met >= 1 + NEW_RAYS * crossed:
+                    elif times_crossed(cell, bit, TOGETHER):
+                        unmet[r, c] |= one
+                elif met >= 1 + NEW_RAYS * count_of(cell, CROSSED, bit):
                     if free[r, c] & one:
                         new[r, c] |= one
                         balance[r, c] += met - count_of(cell, PASSES, bit)
@@ -143,9 +148,9 @@ class SurfaceVoter:
         window = self.point_map.lattice.tile(tile)
         here, outer, near, known = bordered(self.point_map, window)
         planes = self.evidence.tiles[tile]
-        gone, stands, new, beyond = (np.zeros(window.shape, dtype=np.uint64) for _ in range(4))
+        gone, stands, unmet, new, beyond = (np.zeros(window.shape, dtype=np.uint64) for _ in range(5))
         balance = np.zeros(window.shape, dtype=np.int32)
-        weigh_surfaces(planes, here.occupied, known, near, gone, stands, new, beyond, balance)
+        weigh_surfaces(planes, here.occupied, known, near, gone, stands, unmet, new, beyond, balance)
         mapped, passed = here.occupied != 0, planes[..., PASSED]
         low = mapped & ~(here.top_z - here.ground_z >= self.voting.min_height_m)
         under = np.where(mapped, (here.occupied & (~here.occupied + np.uint64(1))) - np.uint64(1), np.uint64(0))
@@ -155,7 +160,6 @@ class SurfaceVoter:
         states[mapped & (passed != 0)] = CellState.UNDETERMINED
         states[~mapped & (beyond != 0)] = CellState.UNDETERMINED
         states[stands != 0] = CellState.UNCHANGED_OCCUPIED
-        never_met = ever(planes, CROSSED) & ~ever(planes, MET) & here.occupied
         return _Judged(
             here=here,
             gone=np.where(low, np.uint64(0), gone),
@@ -164,8 +168,8 @@ class SurfaceVoter:
             balance=balance,
             beyond=beyond,
             beside=(new != 0) & (new & ~near == 0),
-            crossed=mapped & ~low & (stands == 0) & ((gone | never_met) != 0),
-            crossings=often_crossed(planes, here.occupied, HIT_RAYS),
+            crossed=mapped & ~low & (stands == 0) & ((gone | unmet) != 0),
+            crossings=often_crossed(planes, here.occupied, HIT_RAYS, TOGETHER),
             adrift=mapped & ~low & (gone | stands == 0) & (under != 0) & clear,
             lone=lone_cells(outer.occupied, outer.base)[1:-1, 1:-1],
             states=states,

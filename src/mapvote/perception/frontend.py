@@ -13,17 +13,20 @@ from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Protocol
 
 import numpy as np
 
 from mapvote.core.geometry import transform
 from mapvote.core.reference import LocalMap
+from mapvote.core.sensors import Sensor
 from mapvote.core.types import F32, F64, I32, Bool, MapvoteError, Reference, Scan
 from mapvote.localisation.localiser import Localise
 from mapvote.localisation.ndt import PosePrior
 from mapvote.localisation.tracker import Fix
 from mapvote.perception.raycast import ScanView, cast_rays, find_obstacles
+from mapvote.perception.sky import Sky
 
 
 class Movers(Protocol):
@@ -113,6 +116,8 @@ class PlacedScan:
     """(n,) points that stand above the ground of ``reference``; none outside it."""
     cell: I32
     """(n,) each point's cell in ``reference``, row * cols + col; -1 outside it."""
+    by_first: bool = True
+    """Whether the vehicle's first LiDAR took it, which the drive's sensor is."""
     intensity: F32 | None = None
     """(n,) in [0, 1]; None: the sensor does not measure it."""
 
@@ -135,7 +140,8 @@ class Frontend:
 
     ``ground`` tells points from the ground, and is where the filter looks; rays are followed in ``compared``, by
     default the same window, and to its edge only ``with_sight``, which columns do not ask for. ``localise`` and
-    ``movers`` as above, with a state of their own: fresh ones for each drive.
+    ``movers`` as above, with a state of their own: fresh ones for each drive. ``sensor``: follow its rays without
+    return, too.
     """
 
     def __init__(
@@ -146,10 +152,11 @@ class Frontend:
         compared: LocalMap | None = None,
         *,
         with_sight: bool = True,
+        sensor: Sensor | None = None,
     ) -> None:
         self.report = DriveReport()
         self._localise, self._movers, self._ground, self._compared = localise, movers, ground, compared
-        self._with_sight = with_sight
+        self._with_sight, self._sky = with_sight, None if sensor is None else Sky(sensor)
         self._waiting: deque[PlacedScan] = deque()
         self._ended = False
 
@@ -196,8 +203,9 @@ class Frontend:
         reference, outer = self._ground.at(origin_map)
         obstacle, cell = find_obstacles(points_map, reference)
         up_map = T_map_lidar[:3, 2]
+        by_first, intensity = fix.scan.origin is None, fix.scan.intensity
         return PlacedScan(
-            index, points_map, origin_map, up_map, sigma_m, reference, outer, obstacle, cell, fix.scan.intensity
+            index, points_map, origin_map, up_map, sigma_m, reference, outer, obstacle, cell, by_first, intensity
         )
 
     def _see(self, decided: list[Bool]) -> list[Observation]:
@@ -209,8 +217,9 @@ class Frontend:
             with self.report.timed("see"):
                 reference = scan.reference if self._compared is None else self._compared.at(scan.origin_map)[0]
                 cell = scan.cell if self._compared is None else None
+                sky = partial(self._sky.rays, scan.up_map) if self._sky is not None and scan.by_first else None
                 view = cast_rays(
-                    scan.points_map, scan.origin_map, scan.obstacle, moving, reference, cell, self._with_sight
+                    scan.points_map, scan.origin_map, scan.obstacle, moving, reference, cell, self._with_sight, sky
                 )
             out.append(Observation(scan, moving, view, reference))
         return out

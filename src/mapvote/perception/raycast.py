@@ -5,6 +5,7 @@ The walk over the cells is in mapvote.perception.fans: the 3D question becomes a
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import IntEnum
 
@@ -16,7 +17,7 @@ from mapvote.core.columns import GROUND_MARGIN_M, column_bit, height_above
 from mapvote.core.geometry import rows_from
 from mapvote.core.grid import CELL_SIZE, Grid
 from mapvote.core.types import F32, F64, I32, U8, U64, Bool, Reference
-from mapvote.perception.fans import follow_rays, gather_rays, mark_passed
+from mapvote.perception.fans import Rays, follow_rays, gather_rays, mark_passed
 from mapvote.perception.sight import mark_sight
 
 CLEARANCE_M = 0.45
@@ -100,13 +101,15 @@ def cast_rays(
     reference: Reference,
     cell: I32 | None = None,
     with_sight: bool = True,
+    sky: Callable[[Rays], Rays] | None = None,
 ) -> ScanView:
     """One scan's planes over ``reference.grid``, which must hold the sensor.
 
     ``points_map`` (n, 3) and ``origin_map`` (3,) map metres; ``obstacle`` (n,) as :func:`find_obstacles` gives it
     (which also gives ``cell``, if it is not to be computed again). Points of ``moving`` objects occlude but do not
     occupy (docs/decisions/paper.md); the rays of ground points prove emptiness above the ground. Without ``with_sight``
-    the view has none: rays are followed to their ends only.
+    the view has none: rays are followed to their ends only. ``sky``: which rays went into the
+    sky (perception/sky.py); they are followed, too.
     """
     if cell is None:
         _, cell = find_obstacles(points_map, reference)
@@ -118,8 +121,9 @@ def cast_rays(
     base = np.ascontiguousarray(reference.base)
     _enter_hits(points_map, cell, obstacle & ~moving, base.ravel(), counts.ravel(), hit.ravel())
     rays = follow_rays(rows_from(points_map, origin_map), CLEARANCE_M)
-    fans = gather_rays(rays)
-    mark_passed(fans, origin_map, (grid.x0, grid.y0), base, passed.ravel())
+    mark_passed(gather_rays(rays), origin_map, (grid.x0, grid.y0), base, passed.ravel())
+    if sky is not None:
+        mark_passed(gather_rays(sky(rays)), origin_map, (grid.x0, grid.y0), base, passed.ravel())
     if with_sight:
-        mark_sight(rays, obstacle, fans, origin_map, (grid.x0, grid.y0), sight)
+        mark_sight(rays, obstacle, gather_rays(rays), origin_map, (grid.x0, grid.y0), sight)
     return ScanView(grid, counts, hit, passed, sight)

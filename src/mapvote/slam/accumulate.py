@@ -15,19 +15,22 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from typing import Any
 
 import numba
 import numpy as np
+from numpy.typing import NDArray
 
 from mapvote.config import Settings
 from mapvote.core.columns import TOP_BIT, shifted
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, TileIndex, tile_of_cells
+from mapvote.core.heights import heights_over_ground
 from mapvote.core.point_map import PointMap, map_from_points
 from mapvote.core.reference import LocalMap, reference_window
 from mapvote.core.types import F32, F64, I32, I64, U64, Bool, Drive
 from mapvote.core.voxels import VoxelCloud
 from mapvote.detection.counters import PLANES, Evidence, count_of, free_words, is_open
-from mapvote.detection.surface_counts import SurfaceEvidence
+from mapvote.detection.surface_counts import MET, PASSES, SurfaceEvidence
 from mapvote.detection.surfaces import is_gone
 from mapvote.localisation.localiser import GivenPoses
 from mapvote.perception.frontend import Frontend, Observation, PlacedScan
@@ -35,6 +38,7 @@ from mapvote.perception.moving_objects import MovingFilter
 from mapvote.perception.raycast import find_obstacles
 from mapvote.slam.mirrored import mirrored
 from mapvote.slam.strays import strays
+from mapvote.slam.trails import trails
 
 _MIN_THROUGH, _TRAIL_SHARE = 3, 0.45
 """A voxel is a trail if so many scans saw through it, and of those able to a smaller share struck it."""
@@ -58,7 +62,12 @@ class Layer:
         """Enter every registered scan of one drive at its pose (n, 4, 4). ``count`` is called after each scan read."""
         movers = MovingFilter(drive.sensor, self.settings.moving, self.settings.mapping.reach_m)
         frontend = Frontend(
-            GivenPoses(drive.stamps_ns, T_map_lidar), movers, self._around, self._near, with_sight=False
+            GivenPoses(drive.stamps_ns, T_map_lidar),
+            movers,
+            self._around,
+            self._near,
+            with_sight=False,
+            sensor=drive.sensor,
         )
         self._driven.append(T_map_lidar[registered, :3, 3])
         for i, scan in enumerate(drive):
@@ -86,6 +95,9 @@ class Layer:
         dropped = self._trails(points, obstacle) | mirrored(points, laid, self.road)
         if self.settings.mapping.drop_strays:
             dropped |= self._seen_through(points, obstacle)
+            left = np.flatnonzero(obstacle & ~dropped)
+            height = heights_over_ground(laid, points[left])
+            dropped[left] |= trails(points[left], self._balance(points[left]), height, self.draft.lattice)
             dropped |= obstacle & strays(points, scans, driven, self.draft.lattice)
         point_map = map_from_points(points[~dropped], lattice=self.draft.lattice, road=self.road)
         tiles = {tile: replace(content, free=self._free(tile, point_map)) for tile, content in point_map.tiles.items()}
@@ -97,17 +109,26 @@ class Layer:
         Only those of ``obstacle`` (n,) are judged, and only voxels that rays crossed from side to side: what merely
         grazes a thin slab says nothing against it.
         """
-        return self._judge(points, obstacle, self.evidence.tiles, _are_trails)
+        return self._judge(points, obstacle, self.evidence.tiles, _are_trails) != 0
 
     def _seen_through(self, points: F64, obstacle: Bool) -> Bool:
         """Which of the ``obstacle`` points (n, 3) lie in voxels that the surveys would vote out of the map."""
-        return self._judge(points, obstacle, self.surfaces.tiles, _are_gone)
+        return self._judge(points, obstacle, self.surfaces.tiles, _are_gone) != 0
+
+    def _balance(self, points: F64) -> I64:
+        """(n,) in how many scans the voxels of these points were met, less in how many rays passed and met nothing."""
+        return self._judge(points, np.ones(len(points), np.bool_), self.surfaces.tiles, _balances).astype(np.int64)
 
     def _judge(
-        self, points: F64, obstacle: Bool, counters: Mapping[TileIndex, U64], rule: Callable[[U64, I64, I64, I64], Bool]
-    ) -> Bool:
-        """(n,) which of the ``obstacle`` points (n, 3) a ``rule`` names by the counts of their voxels, tile by tile."""
-        out = np.zeros(len(points), dtype=np.bool_)
+        self,
+        points: F64,
+        obstacle: Bool,
+        counters: Mapping[TileIndex, U64],
+        rule: Callable[[U64, I64, I64, I64], NDArray[Any]],
+    ) -> NDArray[Any]:
+        """(n,) what a ``rule`` says of the ``obstacle`` points (n, 3) by the counts of their voxels, tile by tile; 0 of
+        the others."""
+        out = np.zeros(len(points), dtype=np.int64)
         rows, cols = self.draft.lattice.cells_of(points)
         for tile, planes in counters.items():
             reference = reference_window(self.draft, self.draft.lattice.tile(tile))
@@ -183,10 +204,22 @@ def _are_trails(planes: U64, rows: I64, cols: I64, bits: I64) -> Bool:
 
 @numba.njit(cache=True, nogil=True)
 def _are_gone(planes: U64, rows: I64, cols: I64, bits: I64) -> Bool:
-    """(n,) of voxels (row, col, bit) of a tile; those outside the columns are none."""
+    """(n,) of voxels (row, col, bit) of a tile; those outside the columns are none. All rays count, so that the map
+    holds nothing which the next vehicle calls gone for no other reason than that it passes more often."""
     out = np.zeros(len(bits), dtype=np.bool_)
     for i in range(len(bits)):
-        out[i] = 0 <= bits[i] < TOP_BIT and is_gone(planes[rows[i], cols[i]], bits[i])
+        out[i] = 0 <= bits[i] < TOP_BIT and is_gone(planes[rows[i], cols[i]], bits[i], 1)
+    return out
+
+
+@numba.njit(cache=True, nogil=True)
+def _balances(planes: U64, rows: I64, cols: I64, bits: I64) -> I64:
+    """(n,) of voxels (row, col, bit) of a tile: in how many scans met, less in how many passed; 0 outside columns."""
+    out = np.zeros(len(bits), dtype=np.int64)
+    for i in range(len(bits)):
+        if 0 <= bits[i] < TOP_BIT:
+            cell = planes[rows[i], cols[i]]
+            out[i] = count_of(cell, MET, bits[i]) - count_of(cell, PASSES, bits[i])
     return out
 
 

@@ -48,6 +48,7 @@ class SharedPass:
             localise or Localiser(point_map, settings, drive.sensor),
             movers or MovingFilter(drive.sensor, settings.moving),
             LocalMap(point_map, settings.voting.window_m),
+            sensor=drive.sensor,
         )
         self._voters: dict[tuple[VotingSettings, PaperSettings, Rules], Voter] = {}
         self._observing: list[PaperVoter | ColumnVoter | SurfaceVoter] = []
