@@ -101,3 +101,22 @@ def test_what_moves_does_not_count_as_struck_and_given_poses_need_no_prior() -> 
     assert seen.moving.sum() == 2
     assert seen.view.counts.sum() == 0
     assert seen.view.passed.any(), "its rays prove what they passed all the same"
+
+
+def test_rays_without_return_are_followed_of_the_vehicles_first_lidar_alone() -> None:
+    sensor = SENSORS["hdl32e"]
+    azimuth, elevation = np.meshgrid(np.arange(0.0, 360.0, sensor.azimuth_step_deg), sensor.elevations_deg)
+    a, e = np.radians(azimuth.ravel()), np.radians(elevation.ravel())
+    road = (e < -0.05) & (e > -0.35)
+    points = (
+        1.8
+        / np.sin(-e[road])[:, None]
+        * np.column_stack([np.cos(a) * np.cos(e), np.sin(a) * np.cos(e), np.sin(e)])[road]
+    )
+    passed = {}
+    for name, origin in (("first", None), ("second", np.zeros(3))):
+        whole = Frontend(localise(), MovingFilter(sensor, MovingSettings()), LocalMap(street(), 40.0), sensor=sensor)
+        seen = whole.observe(Scan(0, points.astype(np.float32), origin=origin)) + whole.finish()
+        passed[name] = int(np.bitwise_count(seen[0].view.passed & ~np.uint64(0b1111111)).sum())
+    assert passed["second"] == 0, "the road is far below"
+    assert passed["first"] > 10_000
