@@ -7,6 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from mapvote.codec.ballot import Ballot, BallotTile, pack_plane, tile_key
+from mapvote.codec.odds import changed_cells_of, in_steps, pack_odds
 from mapvote.codec.path import pack_path
 from mapvote.codec.points import pack_points
 from mapvote.codec.tile_file import base_hash
@@ -16,9 +17,11 @@ from mapvote.core.grid import TileIndex
 from mapvote.core.point_map import PointMap
 from mapvote.core.reference import LocalMap, reference_window
 from mapvote.core.sensors import Sensor
-from mapvote.core.types import F64, CellState, Drive, MapvoteError, Scan
+from mapvote.core.tile import Tile
+from mapvote.core.types import F32, F64, CellState, Drive, MapvoteError, Scan
 from mapvote.core.voting import to_wire
 from mapvote.detection.new_points import NewPoints, points_in
+from mapvote.detection.surface_odds import deepest_m, log_odds
 from mapvote.detection.voters import Voter, make_voter
 from mapvote.detection.votes import TileVotes
 from mapvote.localisation.localiser import Localise, Localiser
@@ -141,9 +144,9 @@ def _ballot_tile(point_map: PointMap, tile: TileIndex, votes: TileVotes, points:
         change: votes.states == change if two_stage else votes.tally[..., change] > 0
         for change in (CellState.CHANGED_OCCUPIED, CellState.CHANGED_EMPTY)
     }
-    new_points = intensity = None
+    window, mapped = point_map.lattice.tile(tile), point_map.tiles.get(tile)
+    kept, new_points, intensity = np.empty((0, 3), dtype=np.float32), None, None
     if len(points):
-        window, mapped = point_map.lattice.tile(tile), point_map.tiles.get(tile)
         known = mapped is not None and mapped.has_ground
         base = mapped.base if mapped is not None and known else reference_window(point_map, window).base
         new = np.where(changed[CellState.CHANGED_OCCUPIED], votes.new, np.uint64(0))
@@ -161,7 +164,20 @@ def _ballot_tile(point_map: PointMap, tile: TileIndex, votes: TileVotes, points:
         new_points=new_points,
         intensity=intensity,
         free=None if votes.free is None else pack_words(votes.free),
+        odds=pack_odds(in_steps(_sureness(mapped, votes, kept))) if two_stage and votes.looked is not None else None,
     )
+
+
+def _sureness(mapped: Tile | None, votes: TileVotes, new_points: F32) -> F64:
+    """(m,) log-odds of each changed cell, ascending: what went lies as the map's obstacles lie, what came as the new
+    points (n, 3) do."""
+    assert votes.looked is not None
+    cells = changed_cells_of(votes.states)
+    states, depth_m = votes.states.reshape(-1)[cells], deepest_m(new_points, cells)
+    if mapped is not None:
+        gone = states == CellState.CHANGED_EMPTY
+        depth_m[gone] = deepest_m(mapped.points[mapped.columns[1]], cells[gone])
+    return log_odds(states, votes.looked, depth_m)
 
 
 def vote_drive(

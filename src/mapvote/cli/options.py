@@ -42,6 +42,13 @@ MinVotes = Annotated[
     int | None, typer.Option(min=1, metavar="N", help="vehicles that a change needs; else as the settings say")
 ]
 
+FalseDeletions = Annotated[
+    float | None,
+    typer.Option(
+        metavar="P", help="a cell waits that is emptied with a larger probability of deleting what stands, such as 0.01"
+    ),
+]
+
 Rate = Annotated[
     float | None, typer.Option("--rate", metavar="HZ", help="revolutions per second, where the drive has no times")
 ]

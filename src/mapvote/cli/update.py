@@ -9,13 +9,15 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from mapvote.cli.looks import sound_map
-from mapvote.cli.options import MAP, MapPath, MinVotes
+from mapvote.cli.options import MAP, FalseDeletions, MapPath, MinVotes
 from mapvote.cli.terminal import print_table, waiting
 
 if TYPE_CHECKING:
-    from mapvote.core.grid import TileIndex
+    from mapvote.core.grid import Lattice, TileIndex
     from mapvote.core.types import U8
     from mapvote.fusion.fuse import Decision
+
+_MOST_PLACES = 10
 
 
 def register(app: typer.Typer) -> None:
@@ -30,11 +32,13 @@ def update(
     dry_run: Annotated[bool, typer.Option("--dry-run", help="decide and report, write no map")] = False,
     cells: Annotated[Path | None, typer.Option(metavar="NPZ", help="also write the decided states of cells")] = None,
     min_votes: MinVotes = None,
+    false_deletions: FalseDeletions = None,
 ) -> None:
     """Fuse ballots offline and edit the map: add, delete, keep.
 
     A change needs a majority of the vehicles that determined the cell, and --min-votes of them: by default as many as
-    the settings say, but one where the ballots were cast by the paper's rule.
+    the settings say, but one where the ballots were cast by the paper's rule. With --false-deletions a cell keeps its
+    points, and is told of, while deleting something that stands there is likelier than that.
 
         mapvote update my_map car_1.ballot car_2.ballot --out my_map_updated
     """
@@ -55,9 +59,16 @@ def update(
             raise MapvoteError(f"{file}: cannot be read ({error.strerror})") from error
         except MapvoteError as error:
             raise MapvoteError(f"{file}: {error}") from error
+    if false_deletions is not None and not 0.0 < false_deletions <= 1.0:
+        raise MapvoteError(f"--false-deletions {false_deletions:g}: give a probability above 0, such as 0.01; 1: none")
     settings = FuseSettings()
     paper = bool(ballots) and ballots[0].method == "paper"
-    settings = settings.model_copy(update={"min_votes": min_votes or (1 if paper else settings.min_votes)})
+    settings = settings.model_copy(
+        update={
+            "min_votes": min_votes or (1 if paper else settings.min_votes),
+            "false_deletions": settings.false_deletions if false_deletions is None else false_deletions,
+        }
+    )
     with waiting(f"reading {map_path}"):
         before = sound_map(map_path)
     with waiting("deciding"):
@@ -68,7 +79,9 @@ def update(
     if out is not None and not dry_run:
         with waiting(f"writing {out}"):
             write_map(after, out)
-    _report(decisions, len({ballot.vehicle for ballot in ballots}), settings.min_votes, None if dry_run else out)
+    _report(decisions, len({ballot.vehicle for ballot in ballots}), settings.min_votes)
+    _report_pending(decisions, before.lattice, settings.false_deletions)
+    print(f"updated map: {out}" if out is not None and not dry_run else "dry run: no map written")
 
 
 def _write_cells(path: Path, states: U8, x0: float, y0: float) -> None:
@@ -87,7 +100,7 @@ def _copies(decisions: dict[TileIndex, Decision]) -> Counter[tuple[str, str]]:
     return Counter((copy.vehicle, copy.heard_vehicle) for d in decisions.values() for copy in d.copies)
 
 
-def _report(decisions: dict[TileIndex, Decision], vehicles: int, min_votes: int, out: Path | None) -> None:
+def _report(decisions: dict[TileIndex, Decision], vehicles: int, min_votes: int) -> None:
     from mapvote.core.types import CellState
 
     rows = []
@@ -106,4 +119,18 @@ def _report(decisions: dict[TileIndex, Decision], vehicles: int, min_votes: int,
         print(f"{vehicle} sent what {heard} sent, on {where}: the two count as one vehicle there")
     if vehicles < min_votes:
         print(f"A change needs {min_votes} vehicles and {vehicles} voted, so nothing can change: --min-votes 1")
-    print(f"updated map: {out}" if out is not None else "dry run: no map written")
+
+
+def _report_pending(decisions: dict[TileIndex, Decision], lattice: Lattice, budget: float) -> None:
+    """Deletions that wait, the largest first, and where somebody should drive by."""
+    from mapvote.fusion.pending import places
+
+    waiting = places({index: d.pending for index, d in decisions.items()}, lattice)
+    if not waiting:
+        return
+    cells = sum(place.cells for place in waiting)
+    print(f"{cells} cells keep their points: that something there still stands is likelier than {budget:g}. Drive by:")
+    rows = [(f"{p.x:.1f}, {p.y:.1f}", str(p.cells), f"{p.probability:.2g}") for p in waiting[:_MOST_PLACES]]
+    print_table(("x, y (map metres)", "cells", "likeliest"), rows)
+    if len(waiting) > _MOST_PLACES:
+        print(f"and {len(waiting) - _MOST_PLACES} smaller places")

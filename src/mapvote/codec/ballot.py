@@ -16,15 +16,16 @@ import numpy as np
 
 from mapvote.codec.arrays import pack_plane as pack_plane
 from mapvote.codec.arrays import unpack_into, unpack_plane
+from mapvote.codec.odds import changed_cells_of, unpack_odds
 from mapvote.codec.path import check_path
 from mapvote.codec.points import unpack_points
 from mapvote.codec.words import unpack_sparse
 from mapvote.core.grid import TILE_CELLS, TileIndex
-from mapvote.core.types import F32, N_STATES, NO_VOTE, U8, U16, MapvoteError
+from mapvote.core.types import F32, I8, N_STATES, NO_VOTE, U8, U16, MapvoteError
 
-FORMAT_VERSION = 4
-"""4: new points by their voxels, to 32nds; 3: to 128ths; 2: as float32, masks and free space as the words of some
-cells; 1: these as whole planes. All are read."""
+FORMAT_VERSION = 5
+"""5: how sure the vehicle is of its changed cells; 4: new points by their voxels, to 32nds; 3: to 128ths; 2: as
+float32, masks and free space as the words of some cells; 1: these as whole planes. All are read."""
 MAX_TILES = 4096
 MAX_TILE_INDEX = 1 << 20
 _CELLS = TILE_CELLS * TILE_CELLS
@@ -54,6 +55,9 @@ class BallotTile(msgspec.Struct, frozen=True, kw_only=True):
     """(m,) uint8 of each of them, 255 for 1.0; None: the map holds no intensity, or the sensor measures none."""
     free: bytes | None = None
     """(256, 256) uint64, likewise: voxels that this drive's rays passed through."""
+    odds: bytes | None = None
+    """(changed cells,) int8 in the order of the states, see codec/odds.py: how sure the vehicle is of each; two-stage
+    alone. None: it does not say."""
 
 
 class Ballot(msgspec.Struct, frozen=True, kw_only=True):
@@ -131,6 +135,16 @@ def unpack_offer(
     return points, unpack_plane(intensity, "|u1", (len(points),), "ballot: intensity")
 
 
+def unpack_sureness(odds: bytes | None, states: U8 | None) -> I8 | None:
+    """(changed cells of ``states`` (256, 256),) how sure the vehicle is of each, see codec/odds.py; None if it does not
+    say. MapvoteError as :func:`mapvote.codec.odds.unpack_odds`, and if there are odds but no states."""
+    if odds is None:
+        return None
+    if states is None:
+        raise MapvoteError("ballot: a tile has the odds of changed cells, but no states")
+    return unpack_odds(odds, len(changed_cells_of(states)))
+
+
 @numba.njit(cache=True, nogil=True)
 def _all_states(values: U8) -> bool:
     sound = True
@@ -184,8 +198,9 @@ def validate(ballot: Ballot, max_bytes: int | None = None) -> None:
     if ballot.path is not None:
         check_path(ballot.path, [tile.tile for tile in ballot.tiles])
     for tile in ballot.tiles:
-        if tile.states is not None:
-            size += unpack_states(tile.states).nbytes
+        states = None if tile.states is None else unpack_states(tile.states)
+        sureness = unpack_sureness(tile.odds, states)
+        size += sum(plane.nbytes for plane in (states, sureness) if plane is not None)
         if tile.tally is not None:
             size += unpack_tally(tile.tally).nbytes
         for what, words in (("gone", tile.gone), ("free", tile.free)):

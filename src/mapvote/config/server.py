@@ -50,6 +50,12 @@ class FuseSettings(Section):
         description="how long what is new is expected to stay where nothing is known to come and go; less than "
         "stay_days: it must be seen for the difference first",
     )
+    false_deletions: float = Field(
+        default=1.0,
+        gt=0,
+        le=1,
+        description="a cell waits that is emptied with a larger probability of deleting what stands; 1: none does",
+    )
     max_deleted_share: float = Field(
         default=0.5, ge=0, le=1, description="hold a version that deletes more of the points of any tile"
     )

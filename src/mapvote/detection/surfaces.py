@@ -21,7 +21,7 @@ from mapvote.core.columns import below_top, outside
 from mapvote.core.grid import Lattice, TileIndex
 from mapvote.core.point_map import PointMap
 from mapvote.core.reference import bordered
-from mapvote.core.types import F32, I32, NO_VOTE, U8, U64, Bool, CellState, Reference
+from mapvote.core.types import F32, F64, I32, NO_VOTE, U8, U64, Bool, CellState, Reference
 from mapvote.core.voting import one_hot
 from mapvote.detection.blocks import blocks
 from mapvote.detection.counters import PLANES, count_of, newly_free
@@ -29,6 +29,7 @@ from mapvote.detection.faint_walls import faintly_gone, often_crossed
 from mapvote.detection.lone_points import lone_cells, no_change
 from mapvote.detection.regions import HALO, JOIN_CELLS, beyond_tiles, fallen, unexplained
 from mapvote.detection.surface_counts import CROSSED, MET, PASSED, PASSES, SurfaceEvidence, times_crossed
+from mapvote.detection.surface_looks import amounts, looks
 from mapvote.detection.surface_regions import SUPPORT, detached, grown, lasting, supported
 from mapvote.detection.votes import TileVotes
 from mapvote.perception.frontend import Observation
@@ -68,6 +69,8 @@ class _Judged:
     """Mapped cells that no ray decided, with rays through half of what is under them or more."""
     lone: Bool
     """Mapped cells whose voxels touch no other mapped one."""
+    amount: I32
+    """How much of a thing is in each cell (detection/surface_looks.py)."""
     states: U8
     remnants: U64
     free: U64
@@ -139,9 +142,11 @@ class SurfaceVoter:
             judged = {tile: self._judge(tile) for tile in tiles}
             _decide_mapped(judged, self.point_map.lattice)
             _decide_new(judged, self.point_map.lattice)
+            states, amount = _states(judged), {tile: found.amount for tile, found in judged.items()}
             for tile in wanted:
                 if (judged[tile].states != NO_VOTE).any():
-                    yield tile, _votes_of(judged[tile])
+                    height_m = judged[tile].here.top_z - judged[tile].here.ground_z
+                    yield tile, _votes_of(judged[tile], looks(self.point_map.lattice, tile, states, amount, height_m))
 
     def _judge(self, tile: TileIndex) -> _Judged:
         """What the tile's own evidence says, voxel by voxel and cell by cell."""
@@ -172,17 +177,18 @@ class SurfaceVoter:
             crossings=often_crossed(planes, here.occupied, HIT_RAYS, TOGETHER),
             adrift=mapped & ~low & (gone | stands == 0) & (under != 0) & clear,
             lone=lone_cells(outer.occupied, outer.base)[1:-1, 1:-1],
+            amount=amounts(planes, here.occupied, new),
             states=states,
             remnants=np.zeros_like(gone),
             free=newly_free(planes, here),
         )
 
 
-def _votes_of(found: _Judged) -> TileVotes:
+def _votes_of(found: _Judged, looked: F64) -> TileVotes:
     """What a new thing has where the map knew neither free space nor points comes along, and so do its upper parts."""
     known = ~np.uint64(0) if found.here.free is None else found.here.free
     new = np.where(found.new != 0, found.new | found.beyond | ~(_below_tops(found.new) | known), np.uint64(0))
-    return TileVotes(one_hot(found.states), found.states, found.gone, found.remnants, new, found.free)
+    return TileVotes(one_hot(found.states), found.states, found.gone, found.remnants, new, found.free, looked)
 
 
 @numba.njit(cache=True, nogil=True)

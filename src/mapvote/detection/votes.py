@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mapvote.core.types import I32, U8, U64, Bool, CellState, Reference
+from mapvote.core.types import F64, I32, U8, U64, Bool, CellState, Reference
 from mapvote.core.voting import decide, one_hot
 
 
@@ -66,3 +66,5 @@ class TileVotes:
     """(256, 256) voxels whose points are new where the cell is changed-occupied."""
     free: U64 | None
     """(256, 256) voxels seen to be free in cells where the map knew of none; None: not asked."""
+    looked: F64 | None = None
+    """(m, k) what speaks for each changed cell, ascending (detection/surface_looks.py); None: not asked."""

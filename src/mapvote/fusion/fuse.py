@@ -7,7 +7,7 @@ same one is always taken.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, Literal
 
@@ -22,7 +22,9 @@ from mapvote.core.types import F32, I32, I64, N_STATES, NO_VOTE, U8, U64, Bool, 
 from mapvote.core.voting import VOTE_UNIT, add_tally, decide_cells, tally_of
 from mapvote.fusion.copies import Copy, liars_among, originals
 from mapvote.fusion.edit import add_points, delete_points
+from mapvote.fusion.odds import Odds, agreed_odds
 from mapvote.fusion.outliers import contradictors, deniers
+from mapvote.fusion.pending import Pending, beyond_budget
 from mapvote.fusion.persistence import denied_last, doubtful, remembered, temporary
 from mapvote.fusion.sparse_columns import Words, counted, learned, nothing_reached, packed
 from mapvote.fusion.spent import changed_in
@@ -49,6 +51,10 @@ class Decision:
     """Points deleted from the tile."""
     copies: Sequence[Copy] = ()
     """Drives that are not heard because another vehicle's is, that is alike."""
+    odds: Odds = field(default_factory=Odds.none)
+    """How sure of the changed cells those are who voted for them, see :func:`agreed_odds`."""
+    pending: Pending = field(default_factory=Pending.none)
+    """Deletions that wait because they are beyond the budget; undetermined among the states."""
 
 
 def rule_of(method: str) -> Rule:
@@ -100,6 +106,9 @@ class Heard:
     passing: Bool | None = None
     """New things that stay out because they come and go."""
     copies: Sequence[Copy] = ()
+    odds: Odds = field(default_factory=Odds.none)
+    """See :class:`Decision`."""
+    pending: Pending = field(default_factory=Pending.none)
 
 
 def fuse_tile(
@@ -119,13 +128,14 @@ def fuse_tile(
     if edited is not tile:
         memory = changed_in(version, tile, edited)
         edited = edited.but(memory=remembered(memory, tile, edited, heard.votes, heard.states))
-    return Decision(heard.states, heard.tally, len(heard.votes), added, deleted, heard.copies), edited
+    voters, why = len(heard.votes), (heard.copies, heard.odds, heard.pending)
+    return Decision(heard.states, heard.tally, voters, added, deleted, *why), edited
 
 
 def decide_tile(
     tile: Tile, drives: Iterable[TileVote], rule: Rule, settings: FuseSettings, history: History | None = None
 ) -> Heard:
-    """What the votes decide: counted, then in the order of time.
+    """What the votes decide: counted, then in the order of time, then within the budget of false deletions.
 
     ``drives`` are the votes that count on this tile (``select`` in fusion/tile_vote.py, ``unspent`` in
     fusion/spent.py), any order. ``history``: asked, where something comes and goes, for all votes that count of the
@@ -139,14 +149,20 @@ def decide_tile(
     names = {vote.vehicle for vote in votes}
     spoken = [drive for drive in drives if drive.vehicle in names]
     states = turned(states, spoken, tally, quorum) if rule == "columns" else states
-    if history is None:
-        return Heard(votes, states, tally, quorum, copies=copies)
-    denied = denied_last(states, tile.memory, spoken)
-    doubt = doubtful(states, tile.memory, settings).any()
-    passing = temporary(states, tile, originals(history(), settings)[0], settings) if doubt else np.zeros_like(denied)
-    states = states.copy()
-    states[denied | passing] = int(CellState.UNDETERMINED)
-    return Heard(votes, states, tally, quorum, denied, passing, copies)
+    denied = passing = None
+    if history is not None:
+        denied = denied_last(states, tile.memory, spoken)
+        doubt = doubtful(states, tile.memory, settings).any()
+        past = originals(history(), settings)[0] if doubt else []
+        passing = temporary(states, tile, past, settings) if doubt else np.zeros_like(denied)
+        states = states.copy()
+        states[denied | passing] = int(CellState.UNDETERMINED)
+    odds = agreed_odds(votes, states, quorum)
+    pending = beyond_budget(states, odds, settings)
+    if len(pending.cells):
+        states = states.copy()
+        states.reshape(-1)[pending.cells] = int(CellState.UNDETERMINED)
+    return Heard(votes, states, tally, quorum, denied, passing, copies, odds, pending)
 
 
 def _edit(tile: Tile, votes: Sequence[TileVote], states: U8, quorum: int) -> tuple[Tile, int, int]:

@@ -13,6 +13,7 @@ from mapvote.codec.ballot import (
     tile_key,
     unpack_offer,
     unpack_states,
+    unpack_sureness,
     unpack_tally,
 )
 from mapvote.codec.tile_file import base_hash
@@ -23,6 +24,7 @@ from mapvote.core.point_map import PointMap
 from mapvote.core.tile import Tile
 from mapvote.core.types import MapvoteError
 from mapvote.fusion.fuse import Decision, Rule, fuse_tile, rule_of
+from mapvote.fusion.odds import Odds
 from mapvote.fusion.sparse_columns import Words
 from mapvote.fusion.spent import unspent
 from mapvote.fusion.tile_vote import TileVote, select
@@ -31,17 +33,20 @@ from mapvote.fusion.tile_vote import TileVote, select
 def tile_vote(ballot: Ballot, tile: BallotTile, digest: str) -> TileVote:
     """One tile of a ballot with its planes unpacked; MapvoteError if a plane is damaged."""
     new_points, intensity = unpack_offer(tile.new_points, tile.intensity)
+    states = None if tile.states is None else unpack_states(tile.states)
+    sureness = unpack_sureness(tile.odds, states)
     return TileVote(
         vehicle=ballot.vehicle,
         end_ns=ballot.end_ns,
         digest=digest,
         version=ballot.version or 0,
-        states=None if tile.states is None else unpack_states(tile.states),
+        states=states,
         tally=None if tile.tally is None else unpack_tally(tile.tally),
         gone=None if tile.gone is None else Words.unpack(tile.gone, "gone"),
         new_points=new_points,
         intensity=intensity,
         free=None if tile.free is None else Words.unpack(tile.free, "free"),
+        odds=None if states is None else Odds.of(states, sureness),
     )
 
 

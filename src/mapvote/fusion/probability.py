@@ -1,36 +1,76 @@
-"""How likely it is that a cell decided as changed did change: calibrated on simulated streets, whose truth is known.
+"""How likely it is that a cell decided as changed did change, and that emptying it takes something that stands.
 
-A logistic curve over what a server knows of any change: how many vehicles say so, how many say otherwise, and how many
-of the eight cells around changed likewise. It was fitted to the decisions of three vehicles on a corner (seeds 1 and 2)
-and a street (seed 2), each scene weighed alike, and checked on others: docs/measurements/probability.md. It judges
-cells: at the rim of a thing that did change, centimetres decide which of two cells holds its surface.
+Both are logistic curves, calibrated on simulated streets, whose truth is known. The first is over how many vehicles say
+so, how many say otherwise, how many of the eight cells around changed likewise, and how sure those are who say so
+(fusion/odds.py). It judges cells: at the rim of a thing that did change, centimetres decide which of two cells holds
+its surface, and that does no harm to the map. The second asks for harm: whether a point is deleted that lies on a
+surface that still stands. Such cells are few, so it has few parameters.
+
+docs/measurements/probability.md has what was fitted, on what, and how it does elsewhere.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from mapvote.core.types import F64, I32, I64, U8, CellState
+from mapvote.codec.odds import in_nats
+from mapvote.core.types import F64, I8, I32, I64, U8, CellState
 
-_BUILT = np.array([-0.78, 1.13, -0.01, 2.96])
-_DEMOLISHED = np.array([-1.37, 1.15, -0.57, 3.18])
-"""Log-odds of a lone cell with two votes for it and none against; what a third adds, one against, eight such cells."""
 _MOST_VOTES = 3
 """It was fitted to three vehicles: what more of them say is told as if three did."""
 
+# By votes alone, of ballots that do not say how sure their vehicle is: of columns, and of older formats.
+_BUILT = np.array([-0.78, 1.13, -0.01, 2.96])
+_DEMOLISHED = np.array([-1.37, 1.15, -0.57, 3.18])
+"""Log-odds of a lone cell with two votes for it and none against; what a third adds, one against, eight such cells."""
+# By benchmarks/probability.py, as are those below.
+_BUILT_SAID = np.array([-0.78, 1.13, -0.01, 2.96, 1.0])
+_DEMOLISHED_SAID = np.array([-1.37, 1.15, -0.57, 3.18, 1.0])
+"""The same, and of a nat that they say."""
+_FALSE_DELETION = np.array([-3.0, -4.0])
+"""Log-odds that something that stands goes with a lone cell; what eight cells around it add that are emptied too."""
+_FALSE_DELETION_SAID = np.array([-4.01, -3.41, -0.37])
+"""The same, and of a nat that they say."""
 
-def change_probability(states: U8, votes: I32 | I64, against: I32 | I64, beside: I32 | I64) -> F64:
+
+def change_probability(
+    states: U8, votes: I32 | I64, against: I32 | I64, beside: I32 | I64, odds: I8 | None = None
+) -> F64:
     """(n,) probability that cells decided as ``states``, CHANGED_OCCUPIED or CHANGED_EMPTY, did change: vehicles that
-    say so, vehicles that say otherwise (not: undetermined), and how many of the eight cells around changed likewise;
-    (n,) each."""
-    curve = np.where((states == CellState.CHANGED_OCCUPIED)[:, None], _BUILT, _DEMOLISHED)
-    told = [
-        np.ones(len(states)),
-        np.minimum(votes, _MOST_VOTES) - 2.0,
-        against,
-        np.asarray(beside, dtype=np.float64) / 8.0,
-    ]
-    return np.asarray(1.0 / (1.0 + np.exp(-(curve * np.column_stack(told)).sum(axis=1))))
+    say so, vehicles that say otherwise (not: undetermined), how many of the eight cells around changed likewise, and
+    how sure they are, UNSAID where nobody says; (n,) each."""
+    built = states == CellState.CHANGED_OCCUPIED
+    more = np.minimum(votes, _MOST_VOTES) - 2.0
+    told: F64 = np.column_stack([np.ones(len(states)), more, np.asarray(against, dtype=np.float64), _share(beside)])
+    by_votes = np.where(built[:, None], _BUILT, _DEMOLISHED)
+    curve = np.where(built[:, None], _BUILT_SAID, _DEMOLISHED_SAID)
+    return _by_what_is_said(told, by_votes, curve, odds)
+
+
+def false_deletion_probability(beside: I32 | I64, odds: I8) -> F64:
+    """(n,) probability that of what goes with cells decided changed-empty something still stands: by how many of the
+    eight cells around are emptied too, and how sure the vehicles are, UNSAID where nobody says; (n,) each."""
+    told = np.column_stack([np.ones(len(odds)), _share(beside)])
+    return _by_what_is_said(told, _FALSE_DELETION, _FALSE_DELETION_SAID, odds)
+
+
+def _share(beside: I32 | I64) -> F64:
+    return np.asarray(beside, dtype=np.float64) / 8.0
+
+
+def _by_what_is_said(told: F64, by_votes: F64, curve: F64, odds: I8 | None) -> F64:
+    """(n,) probabilities of what is ``told`` (n, k), by the ``curve`` (k + 1,) or (n, k + 1) that takes the odds (n,)
+    besides, and where these are unsaid ``by_votes`` (k,) or (n, k) alone."""
+    alone = (by_votes * told).sum(axis=1)
+    if odds is None:
+        return _logistic(alone)
+    said = in_nats(odds)
+    with_odds = (curve * np.column_stack([told, said])).sum(axis=1)
+    return _logistic(np.where(np.isnan(said), alone, with_odds))
+
+
+def _logistic(log_odds: F64) -> F64:
+    return np.asarray(1.0 / (1.0 + np.exp(-log_odds)))
 
 
 def alike_beside(rows: I64, cols: I64, kinds: I64) -> I32:

@@ -17,6 +17,7 @@ from mapvote.config import FuseSettings
 from mapvote.core.cells import flat_cells
 from mapvote.core.grid import CELLS, TILE_CELLS, Grid
 from mapvote.core.types import F32, I64, N_STATES, NO_VOTE, U8, U16, U64, Bool, CellState, read_only
+from mapvote.fusion.odds import Odds, folded
 from mapvote.fusion.sparse_columns import Words, agreed, mark, mark_among, mark_spoken, union
 
 DAY_NS = 86_400_000_000_000
@@ -43,6 +44,8 @@ class TileVote:
     """(m,) of the new points, 255 for 1.0; None: nobody measured it."""
     free: Words | None = None
     """Column words that rays passed through."""
+    odds: Odds | None = None
+    """How sure it is of the cells that it calls changed; None: it does not say."""
     version: int = 0
     """Of the map that the vehicle drove with."""
     unrestricted: U8 | None = None
@@ -228,6 +231,7 @@ def fold(drives: Sequence[TileVote], grid: Grid) -> TileVote:
         new_points=np.concatenate(points) if points else None,
         intensity=np.concatenate(intensity) if any(drive.intensity is not None for drive in ordered) else None,
         free=union(free) if free else None,
+        odds=folded(ordered, last),
     )
 
 

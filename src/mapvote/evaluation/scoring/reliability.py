@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mapvote.core.grid import Grid, Lattice, TileIndex
+from mapvote.core.grid import TILE_CELLS, Grid, Lattice, TileIndex
 from mapvote.core.types import F64, I64, U8, Bool, CellState
 from mapvote.core.voting import VOTE_UNIT
 from mapvote.evaluation.scoring.cells import UNSCORED, ratio
@@ -42,10 +42,10 @@ def reliability(
     As the server tells them (:func:`mapvote.fusion.probability.change_probability`); votes are of vehicles, so
     ``decisions`` are two-stage ones.
     """
-    rows, cols, votes, against = _decided(decisions, lattice, state)
+    rows, cols, votes, against, odds = _decided(decisions, lattice, state)
     kinds = np.zeros(len(rows), dtype=np.int64)
     states = np.full(len(rows), state, dtype=np.uint8)
-    said = change_probability(states, votes, against, alike_beside(rows, cols, kinds))
+    said = change_probability(states, votes, against, alike_beside(rows, cols, kinds), odds.astype(np.int8))
     r, c = rows - window.row0, cols - window.col0
     inside = (r >= 0) & (r < window.rows) & (c >= 0) & (c < window.cols)
     found = truth[r[inside], c[inside]]
@@ -70,15 +70,19 @@ def binned(said: F64, true: Bool) -> Reliability:
     )
 
 
-def _decided(decisions: Mapping[TileIndex, Decision], lattice: Lattice, state: CellState) -> tuple[I64, I64, I64, I64]:
-    """(rows, cols on the lattice, votes for it, votes for something else; undetermined ones say nothing), (n,) each."""
-    parts = [np.zeros((4, 0), dtype=np.int64)]
+def _decided(
+    decisions: Mapping[TileIndex, Decision], lattice: Lattice, state: CellState
+) -> tuple[I64, I64, I64, I64, I64]:
+    """(rows, cols on the lattice, votes for it, votes for something else; undetermined ones say nothing; how sure those
+    for it are), (n,) each."""
+    parts = [np.zeros((5, 0), dtype=np.int64)]
     for index, decision in decisions.items():
         tile = lattice.tile(index)
         r, c = np.nonzero(decision.states == state)
         told = decision.tally[r, c].astype(np.int64) // VOTE_UNIT
         votes = told[:, state]
         others = told[:, : CellState.UNDETERMINED].sum(axis=1) - votes
-        parts.append(np.stack([tile.row0 + r, tile.col0 + c, votes, others]))
-    rows, cols, votes, against = np.concatenate(parts, axis=1)
-    return rows, cols, votes, against
+        odds = decision.odds.at(r * TILE_CELLS + c)
+        parts.append(np.stack([tile.row0 + r, tile.col0 + c, votes, others, odds]))
+    rows, cols, votes, against, odds = np.concatenate(parts, axis=1)
+    return rows, cols, votes, against, odds

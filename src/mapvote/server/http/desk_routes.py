@@ -35,17 +35,19 @@ class ReviewAsk(BaseModel):
     summary="What a publish would change now",
 )
 def whole_desk(request: Request, format: Places = "json") -> Response:
-    """Pending changes as GeoJSON, with the verdicts so far; what was held and rejected; why the policy would hold.
+    """Pending changes as GeoJSON, with the verdicts so far; deletions that wait for somebody to drive by, beyond the
+    policy's budget; what was held and rejected; why the policy would hold.
 
-    As ``geojson`` or ``csv``: pending and reviewed changes in one list.
+    As ``geojson`` or ``csv``: all of them in one list.
     """
     reviewer(request)
     parts = services(request)
     found = desk(parts.store, parts.fusing, parts.gate)
     left_out = [verdict_of(one) for one in found.reviewed]
     if format == "json":
-        return as_json({"version": found.version, "held": found.held, "pending": found.pending, "reviewed": left_out})
-    listed = found.pending | {"features": [*found.pending["features"], *left_out]}
+        told = {"version": found.version, "held": found.held, "pending": found.pending}
+        return as_json(told | {"waiting": found.waiting, "reviewed": left_out})
+    listed = found.pending | {"features": [*found.pending["features"], *found.waiting, *left_out]}
     return as_json(listed) if format == "geojson" else as_table([_flat(row) for row in feature_rows(listed)])
 
 

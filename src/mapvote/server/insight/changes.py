@@ -7,16 +7,18 @@ decisions in between say who voted for it. Objects are found on the lattice, not
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from typing import Literal
 
 import numpy as np
 
+from mapvote.codec.odds import UNSAID
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS
 from mapvote.core.rows import found_among
 from mapvote.core.tile import Tile
-from mapvote.core.types import F64, I32, I64, U8, CellState
+from mapvote.core.types import F64, I8, I32, I64, U8, CellState
 from mapvote.core.voting import VOTE_UNIT
+from mapvote.fusion.odds import Odds
 from mapvote.fusion.probability import alike_beside, change_probability
 from mapvote.server.insight.adjoining import buildings
 from mapvote.server.insight.polygons import Ring, rings
@@ -47,6 +49,8 @@ class Decided:
     """(256, 256, 5) in VOTE_UNITs."""
     drives: Sequence[tuple[int, U8]] = ()
     """(end_ns, (256, 256) states) of every vote that was counted."""
+    odds: Odds = field(default_factory=Odds.none)
+    """How sure those were who voted for a change (fusion/odds.py)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,6 +77,8 @@ class ChangedCells:
     last_ns: I64
     versions: I64
     """The last version that decided this change; 0 where none is known."""
+    odds: I8
+    """How sure those were who voted for it in that version; UNSAID where nobody said."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,7 +154,7 @@ def changed_cells(before: Tile, after: Tile, decided: Iterable[Decided] = ()) ->
     np.minimum.at(bottom, cell[tells], z[tells])
     ground = np.where(np.isnan(after.ground_z), before.ground_z, after.ground_z).reshape(-1).astype(np.float64)
     ground = np.where(np.isnan(ground), bottom, ground)
-    votes, against, first, last, version = _evidence(flat, states, decided)
+    votes, against, first, last, version, odds = _evidence(flat, states, decided)
     return ChangedCells(
         rows=index[0] * TILE_CELLS + flat // TILE_CELLS,
         cols=index[1] * TILE_CELLS + flat % TILE_CELLS,
@@ -161,6 +167,7 @@ def changed_cells(before: Tile, after: Tile, decided: Iterable[Decided] = ()) ->
         first_ns=first,
         last_ns=last,
         versions=version,
+        odds=odds,
     )
 
 
@@ -177,7 +184,7 @@ def change_objects(changed: Iterable[ChangedCells], min_cells: int = 1, reach_m:
     outlines = rings(cells.rows, cells.cols, found.polygons)
     things = group(cells.rows, cells.cols, kinds, found.objects, reach_m)
     beside = alike_beside(cells.rows, cells.cols, kinds)
-    probability = change_probability(cells.states, cells.votes, cells.against, beside)
+    probability = change_probability(cells.states, cells.votes, cells.against, beside, cells.odds)
     sizes_m = [size(cells.rows, cells.cols, found.objects)[found.objects] for size in (_lengths_m, widths_m)]
     by_thing = np.split(np.argsort(things, kind="stable"), np.cumsum(np.bincount(things))[:-1])
     return [
@@ -241,11 +248,12 @@ def _object(
     )
 
 
-def _evidence(flat: I64, states: U8, decided: Iterable[Decided]) -> tuple[I32, I32, I64, I64, I64]:
-    """(votes, against, first_ns, last_ns, version) of the changed cells, as the last decision for it counted them."""
+def _evidence(flat: I64, states: U8, decided: Iterable[Decided]) -> tuple[I32, I32, I64, I64, I64, I8]:
+    """(votes, against, first_ns, last_ns, version, odds) of the changed cells, as the last decision for it counted
+    them."""
     votes = np.zeros(len(flat), dtype=np.int32)
     against = np.zeros(len(flat), dtype=np.int32)
-    version = np.zeros(len(flat), dtype=np.int64)
+    version, odds = np.zeros(len(flat), dtype=np.int64), np.full(len(flat), UNSAID, dtype=np.int8)
     first = np.full(len(flat), _NEVER)
     last = np.full(len(flat), _UNTIL)
     for decision in decided:
@@ -256,8 +264,9 @@ def _evidence(flat: I64, states: U8, decided: Iterable[Decided]) -> tuple[I32, I
         votes = np.where(agrees, counted // VOTE_UNIT, votes)
         against = np.where(agrees, others // VOTE_UNIT, against)
         version = np.where(agrees, decision.version, version)
+        odds = np.where(agrees, decision.odds.at(flat), odds)
         for end_ns, drive in decision.drives:
             said_so = agrees & (drive.reshape(-1)[flat] == states)
             first = np.where(said_so, np.minimum(first, end_ns), first)
             last = np.where(said_so, np.maximum(last, end_ns), last)
-    return votes.astype(np.int32), against.astype(np.int32), first, last, version
+    return votes.astype(np.int32), against.astype(np.int32), first, last, version, odds

@@ -12,6 +12,7 @@ import numpy as np
 from mapvote.core.grid import TILE_CELLS, TileIndex
 from mapvote.core.tile import Tile
 from mapvote.core.types import Bool
+from mapvote.fusion.odds import unpack_agreed
 from mapvote.server.errors import NotFound
 from mapvote.server.insight.changes import ChangeObject, Decided, change_objects, changed_cells
 from mapvote.server.insight.cutout import cut_out
@@ -19,6 +20,8 @@ from mapvote.server.insight.explain import states_of
 from mapvote.server.insight.geojson import to_geojson
 from mapvote.server.insight.history import tiles_at
 from mapvote.server.insight.picture import before_and_after
+from mapvote.server.insight.waiting import waiting_features
+from mapvote.server.store.policy import current_policy
 from mapvote.server.store.publish import Gate, edited_tile, preview
 from mapvote.server.store.queries import load_tile, tile_of
 from mapvote.server.store.reviews import Review, Verdict, decide, standing
@@ -38,6 +41,8 @@ class Desk:
     """Why the policy would hold the version back."""
     pending: dict[str, Any]
     """Changes that a publish would make, GeoJSON; those that somebody accepted carry the verdict."""
+    waiting: list[dict[str, Any]]
+    """Deletions that it would not make because they are beyond the policy's budget, GeoJSON features."""
     reviewed: list[Review]
     """Held and rejected changes, which a publish leaves out."""
     cells: Mapping[str, Mapping[TileIndex, Bool]]
@@ -48,9 +53,10 @@ class Desk:
 
 def desk(store: Store, executor: Executor | None = None, gate: Gate | None = None) -> Desk:
     """What a publish would do now, in the words of the list of changes. Nothing is written."""
-    outcome = preview(store, executor=executor, gate=gate)
+    budget = current_policy(store).fuse.false_deletions
+    outcome = preview(store, executor=executor, gate=gate, every=budget < 1.0)
     tiles = [_before_and_after(store, outcome.version, fused) for fused in outcome.fused if fused.hashes is not None]
-    told = {f.index: Decided(0, states_of(f.states), unpack_tally_plane(f.tally)) for f in outcome.fused}
+    told = {f.index: _decided(f) for f in outcome.fused if not f.lost}
     objects = change_objects(changed_cells(old, new, [told[old.index]]) for old, new in tiles)
     pending = to_geojson(objects, store.lattice, map_id=store.map_id, from_version=outcome.version)
     reviews = standing(store)
@@ -61,7 +67,13 @@ def desk(store: Store, executor: Executor | None = None, gate: Gate | None = Non
     cells |= {f"{_OF_REVIEW}{review.seq}": theirs for review, theirs in reviews}
     left_out = [review for review, _ in reviews if review.verdict != "accepted"]
     edited = {new.index: new for _, new in tiles}
-    return Desk(outcome.version, list(outcome.held), pending, left_out, cells, edited)
+    waiting = waiting_features(store, outcome.version, outcome.fused, budget)
+    return Desk(outcome.version, list(outcome.held), pending, waiting, left_out, cells, edited)
+
+
+def _decided(fused: Fused) -> Decided:
+    states = states_of(fused.states)
+    return Decided(0, states, unpack_tally_plane(fused.tally), odds=unpack_agreed(fused.odds, states))
 
 
 def pending_picture(store: Store, change: str, executor: Executor | None = None) -> bytes:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
@@ -10,10 +11,12 @@ import numpy as np
 import sqlalchemy as sa
 
 from mapvote.codec.arrays import unpack_plane
+from mapvote.codec.odds import in_nats
 from mapvote.core.grid import TILE_CELLS, TileIndex
 from mapvote.core.types import NO_VOTE, U8, CellState, MapvoteError
 from mapvote.core.voting import VOTE_UNIT
 from mapvote.fusion.fuse import Heard, decide_tile, rule_of
+from mapvote.fusion.odds import unpack_agreed
 from mapvote.fusion.persistence import expected_days
 from mapvote.fusion.probability import alike_beside, change_probability
 from mapvote.fusion.spent import unspent
@@ -54,6 +57,8 @@ class CellVote:
     """Lower case; no_vote where it says nothing."""
     marks: int | None
     """Voxels of the map that it says are gone here, of a changed cell or beside what stands; None: it sent no mask."""
+    sure: float | None
+    """Probability that the cell did change so, by its own evidence; None where it does not say."""
     end_ns: int
     counts: bool
     """Whether the next version hears it."""
@@ -135,10 +140,13 @@ def _probability(connection: sa.Connection, index: TileIndex, cell: tuple[int, i
     """That the cell changed as ``version`` decided; cells of other tiles are not asked for what changed beside it. None
     if it decided on no change, or on what cannot be read any more."""
     d = schema.decisions
-    query = sa.select(d.c.states, d.c.tally).where(d.c.row == index[0], d.c.col == index[1], d.c.version == version)
+    query = sa.select(d.c.states, d.c.tally, d.c.odds).where(
+        d.c.row == index[0], d.c.col == index[1], d.c.version == version
+    )
     row = connection.execute(query).one()
     try:
         states, counted = states_of(row.states), unpack_tally_plane(row.tally)[cell].astype(np.int64) // VOTE_UNIT
+        odds = unpack_agreed(row.odds, states).at(np.array([cell[0] * TILE_CELLS + cell[1]]))
     except MapvoteError:
         return None
     state = int(states[cell])
@@ -147,9 +155,8 @@ def _probability(connection: sa.Connection, index: TileIndex, cell: tuple[int, i
     rows, cols = np.nonzero(states == state)
     beside = alike_beside(rows, cols, np.zeros(len(rows), np.int64))[(rows == cell[0]) & (cols == cell[1])]
     against = counted[: CellState.UNDETERMINED].sum() - counted[state]
-    return float(
-        change_probability(states[cell].reshape(1), np.array([counted[state]]), np.array([against]), beside)[0]
-    )
+    asked = np.array([counted[state]]), np.array([against])
+    return float(change_probability(states[cell].reshape(1), *asked, beside, odds)[0])
 
 
 def _undamaged(connection: sa.Connection, place: Place) -> Place:
@@ -196,9 +203,11 @@ def _why_not(vote: TileVote, obeyed: TileVote | None, now: Place, heard: Heard) 
 
 
 def _vote(stored: StoredVote, vote: TileVote | None, why: str, now: Place, heard: tuple[int, ...]) -> CellVote:
-    state, marks = (UNREADABLE, None) if vote is None else (_said(vote, now.cell), _marks(vote, now.cell))
     whose = stored.vehicle, stored.drive, stored.version
-    return CellVote(*whose, state, marks, stored.end_ns, not why, why, heard)
+    told: tuple[str, int | None, float | None] = UNREADABLE, None, None
+    if vote is not None:
+        told = _said(vote, now.cell), _marks(vote, now.cell), _sure(vote, now.cell)
+    return CellVote(*whose, *told, stored.end_ns, not why, why, heard)
 
 
 def _thing(connection: sa.Connection, now: Place, drives: Sequence[TileVote]) -> str:
@@ -214,6 +223,12 @@ def _thing(connection: sa.Connection, now: Place, drives: Sequence[TileVote]) ->
             told.append("temporary: what is new here is not expected to stay, and stays out of the map")
         elif found.denied is not None and found.denied[cell]:
             told.append("waits: the last vehicle that looked says otherwise")
+        likely = found.pending.at(cell)
+        if likely is not None:
+            told.append(
+                f"pending: that emptying it deletes something that stands is likelier ({likely:.2g}) than the policy "
+                f"allows ({policy.fuse.false_deletions:g}); it goes once vehicles that drive by are surer"
+            )
     if tile.obstacle_words[cell]:
         brought = tile.memory is not None and tile.memory.came_s[cell] > 0
         told.append("stands: brought by vehicles" if brought else "stands: surveyed")
@@ -242,3 +257,11 @@ def _marks(vote: TileVote, cell: tuple[int, int]) -> int | None:
         return None
     mine = vote.gone.words[vote.gone.cells == cell[0] * TILE_CELLS + cell[1]]
     return int(mine[0]).bit_count() if len(mine) else 0
+
+
+def _sure(vote: TileVote, cell: tuple[int, int]) -> float | None:
+    """The probability that a vehicle gives a change of the cell; None if it gives none."""
+    if vote.odds is None:
+        return None
+    nats = float(in_nats(vote.odds.at(np.array([cell[0] * TILE_CELLS + cell[1]])))[0])
+    return None if math.isnan(nats) else round(1.0 / (1.0 + math.exp(-nats)), 4)

@@ -15,6 +15,7 @@ from mapvote.core.grid import TileIndex
 from mapvote.core.tile import Tile
 from mapvote.core.types import U8, MapvoteError
 from mapvote.core.voting import decide
+from mapvote.fusion.odds import unpack_agreed
 from mapvote.fusion.tile_vote import DAY_NS, TileVote, one_each
 from mapvote.server.errors import Unavailable
 from mapvote.server.insight.changes import Decided, change_objects, changed_cells
@@ -118,13 +119,14 @@ def tiles_at(store: Store, version: int) -> Tiles:
 
 def _decided(store: Store, connection: sa.Connection, index: TileIndex, old: int, new: int) -> Iterable[Decided]:
     d = schema.decisions
-    query = sa.select(d.c.version, d.c.states, d.c.tally).where(d.c.row == index[0], d.c.col == index[1])
+    query = sa.select(d.c.version, d.c.states, d.c.tally, d.c.odds).where(d.c.row == index[0], d.c.col == index[1])
     for row in connection.execute(query.where(d.c.version > old, d.c.version <= new).order_by(d.c.version)).all():
         version = version_of(connection, row.version)
         tile = tile_as_of(connection, store.lattice.tile(index), row.version - 1)
         votes = from_sound_ballots(connection, Electorate.of(version), partial(counting_votes, connection, tile))
         drives = [(vote.end_ns, vote.states) for vote in votes if vote.states is not None]
-        yield Decided(row.version, states_of(row.states), unpack_tally_plane(row.tally), drives)
+        states = states_of(row.states)
+        yield Decided(row.version, states, unpack_tally_plane(row.tally), drives, unpack_agreed(row.odds, states))
 
 
 def coverage(store: Store) -> list[dict[str, Any]]:

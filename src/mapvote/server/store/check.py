@@ -22,7 +22,7 @@ from mapvote.server.store.database import insert_rows
 from mapvote.server.store.quarantine import MENDED, Damage, ballot_name, ballot_sum, quarantine
 from mapvote.server.store.queries import log_event, oldest_kept, shows_in_kept
 from mapvote.server.store.store import Store
-from mapvote.server.store.sums import sum_of, summed
+from mapvote.server.store.sums import sum_of, sum_of_decision, summed
 
 Source = Callable[[str], bytes | None]
 """A plane's values by hash, from another store or a map folder; None if it is not there."""
@@ -118,7 +118,7 @@ def _ballots(connection: sa.Connection) -> Iterator[Damage]:
 def _decisions(connection: sa.Connection) -> Iterator[Damage]:
     d = schema.decisions
     for row in _in_batches(connection, sa.select(d).order_by(d.c.version, d.c.row, d.c.col)):
-        if row.sum and row.sum != sum_of(row.states, row.tally):
+        if row.sum and row.sum != sum_of_decision(row.states, row.tally, row.odds):
             yield Damage(
                 "decision", f"{row.version} on tile {tile_key((row.row, row.col))}", "is not what its sum says"
             )

@@ -23,7 +23,7 @@ from mapvote.server.store.queries import (
     version_row,
 )
 from mapvote.server.store.store import Store
-from mapvote.server.store.sums import sum_of
+from mapvote.server.store.sums import sum_of_decision
 from mapvote.server.store.tile_jobs import Fused
 
 
@@ -66,5 +66,5 @@ def write_version(store: Store, version: Version, new: NewTiles, unvoted: str | 
 
 def _decision_row(number: int, fused: Fused) -> tuple[object, ...]:
     """In the order of the table's columns."""
-    counts = fused.vehicles, fused.added, fused.deleted
-    return number, *fused.index, fused.states, fused.tally, *counts, sum_of(fused.states, fused.tally)
+    counts, said = (fused.vehicles, fused.added, fused.deleted), (fused.states, fused.tally, fused.odds)
+    return number, *fused.index, *said[:2], *counts, fused.odds, sum_of_decision(*said)

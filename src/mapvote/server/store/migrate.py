@@ -15,7 +15,7 @@ from mapvote.core.types import MapvoteError
 from mapvote.server.store.database import Database
 
 FIRST = "0001"
-HEAD = "0012"
+HEAD = "0013"
 """The revision that :mod:`mapvote.server.store.schema` describes."""
 
 

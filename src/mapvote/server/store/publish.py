@@ -88,9 +88,11 @@ def preview(
     parent: int | None = None,
     gate: Gate | None = None,
     executor: Executor | None = None,
+    every: bool = False,
 ) -> Outcome:
-    """What :func:`publish` would do now. Nothing is written."""
-    return _decide(store, settings, parent, gate, executor)[1]
+    """What :func:`publish` would do now. Nothing is written. ``every``: look again at the tiles, too, on which nothing
+    has come or gone, for what waits there."""
+    return _decide(store, settings, parent, gate, executor, every)[1]
 
 
 def publish(
@@ -133,10 +135,15 @@ def publish(
 
 
 def _decide(
-    store: Store, settings: FuseSettings | None, parent: int | None, gate: Gate | None, executor: Executor | None
+    store: Store,
+    settings: FuseSettings | None,
+    parent: int | None,
+    gate: Gate | None,
+    executor: Executor | None,
+    every: bool = False,
 ) -> tuple[Plan, Outcome]:
     """What there is to publish, and what speaks against it."""
-    plan = make_plan(store, settings)
+    plan = make_plan(store, settings, every)
     if parent is not None and parent != plan.newest.number:
         raise Conflict(f"the newest version is {plan.newest.number}, not {parent}: look at it, then publish")
     fused = fuse_round(plan.tasks, store.database, executor)
@@ -146,15 +153,15 @@ def _decide(
     return plan, Outcome(plan.newest.number, False, [f.index for f in changed], added, deleted, held, fused)
 
 
-def make_plan(store: Store, settings: FuseSettings | None = None) -> Plan:
-    """Which tiles to fuse, with whose votes: all that a ballot touched since they were last fused. The clock is read
-    here and nowhere else."""
+def make_plan(store: Store, settings: FuseSettings | None = None, every: bool = False) -> Plan:
+    """Which tiles to fuse, with whose votes: all that a ballot touched since they were last fused, or ``every`` one.
+    The clock is read here and nowhere else."""
     now = store.clock()
     with store.database.reading() as connection:
         newest = current_version(connection)
         mark = connection.execute(sa.select(sa.func.max(schema.events.c.seq))).scalar_one()
         asked = electorate_now(connection, now, mark, settings)
-        dirty = _dirty(connection, newest, asked)
+        dirty = standing_tiles(connection, mark) if every else _dirty(connection, newest, asked)
         hashes = tiles_of(connection, newest.number, dirty)
     made, url = newest.number + 1, address_of(store.database.url)
     tasks = [Task(url, store.lattice.tile(i), made, hashes.get(i), asked) for i in dirty]

@@ -21,7 +21,7 @@ metadata = sa.MetaData(
 _Hash = sa.String(64)
 TILE_PLANES = "points", "ground", "free", "memory", "fields"
 """Columns of version_tiles: hashes of planes."""
-BALLOT_PLANES = "states", "tally", "gone", "new_points", "free", "intensity"
+BALLOT_PLANES = "states", "tally", "gone", "new_points", "free", "intensity", "odds"
 """Columns of ballot_tiles that hold planes, those that came later last."""
 
 maps = sa.Table(
@@ -165,6 +165,7 @@ ballot_tiles = sa.Table(
     sa.Column("new_points", sa.LargeBinary),
     sa.Column("free", sa.LargeBinary),
     sa.Column("intensity", sa.LargeBinary),
+    sa.Column("odds", sa.LargeBinary),
     sa.Column("sum", sa.String(64), nullable=False),
     sa.Index("ix_ballot_tiles_ballot", "ballot"),
 )
@@ -190,9 +191,11 @@ decisions = sa.Table(
     sa.Column("vehicles", sa.Integer, nullable=False),
     sa.Column("added", sa.Integer, nullable=False),
     sa.Column("deleted", sa.Integer, nullable=False),
+    sa.Column("odds", sa.LargeBinary),
     sa.Column("sum", sa.String(64), nullable=False),
 )
-"""``tally``: (5, 65536), compressed, see :func:`mapvote.server.store.tile_jobs.pack_tally`."""
+"""``tally``: (5, 65536), compressed, see :func:`mapvote.server.store.tile_jobs.pack_tally`. ``odds``: how sure of the
+changed cells those are who voted for them, see :func:`mapvote.fusion.odds.pack_agreed`; null: nobody says."""
 
 reviews = sa.Table(
     "reviews",

@@ -16,9 +16,10 @@ from typing import Any
 import numpy as np
 import sqlalchemy as sa
 
-from mapvote.codec.ballot import unpack_offer, unpack_sound_states, unpack_tally
+from mapvote.codec.ballot import unpack_offer, unpack_sound_states, unpack_sureness, unpack_tally
 from mapvote.codec.points import unpack_sound_points
 from mapvote.core.grid import TileIndex
+from mapvote.fusion.odds import Odds
 from mapvote.fusion.sparse_columns import Words
 from mapvote.fusion.tile_vote import TileVote
 from mapvote.server.store import schema
@@ -140,16 +141,19 @@ def _check(rows: Iterable[Any]) -> None:
 def _unpacked(row: Any) -> TileVote:
     """A row's planes, of nobody yet."""
     new_points, intensity = unpack_offer(row.new_points, row.intensity, unpack_sound_points)
+    states = None if row.states is None else unpack_sound_states(row.states)
+    sureness = unpack_sureness(row.odds, states)
     return TileVote(
         vehicle="",
         end_ns=0,
         digest="",
-        states=None if row.states is None else unpack_sound_states(row.states),
+        states=states,
         tally=None if row.tally is None else unpack_tally(row.tally),
         gone=None if row.gone is None else Words.unpack(row.gone, "gone"),
         new_points=new_points,
         intensity=intensity,
         free=None if row.free is None else Words.unpack(row.free, "free"),
+        odds=None if states is None else Odds.of(states, sureness),
     )
 
 
@@ -158,4 +162,5 @@ def _size(vote: TileVote) -> int:
     planes: list[np.ndarray | None] = [vote.states, vote.tally, vote.new_points, vote.intensity]
     for words in (vote.gone, vote.free):
         planes += [] if words is None else [words.cells, words.words]
+    planes += [] if vote.odds is None else [vote.odds.cells, vote.odds.steps]
     return sum(plane.nbytes for plane in planes if plane is not None)

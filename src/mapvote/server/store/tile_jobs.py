@@ -8,7 +8,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
 from itertools import accumulate, groupby
 from typing import Any
@@ -25,6 +25,8 @@ from mapvote.core.types import I32, I64, N_STATES, U8, Bool, MapvoteError
 from mapvote.core.voting import VOTE_UNIT
 from mapvote.fusion.copies import Copy
 from mapvote.fusion.fuse import fuse_tile, rule_of
+from mapvote.fusion.odds import pack_agreed
+from mapvote.fusion.pending import Pending
 from mapvote.fusion.persistence import emptied_and_filled
 from mapvote.fusion.tile_vote import TileVote
 from mapvote.server.errors import Unavailable
@@ -87,6 +89,10 @@ class Fused:
     """What could not be read, and was left out."""
     copies: Sequence[Copy] = ()
     """Drives that were not heard because another vehicle's was, that is alike."""
+    odds: bytes | None = None
+    """How sure of the changed cells those are who voted for them, see :func:`mapvote.fusion.odds.pack_agreed`."""
+    pending: Pending = field(default_factory=Pending.none)
+    """Deletions that wait because they are beyond the budget."""
 
     @property
     def lost(self) -> bool:
@@ -165,6 +171,8 @@ def _fuse(connection: sa.Connection, task: Task, polled: Polled) -> Fused:
         freed=0 if tile.free is edited.free or tile.free is None else int((tile.free != edited.free).sum()),
         tile=None if task.misread is None else edited,
         copies=decision.copies,
+        odds=pack_agreed(decision.odds, decision.states),
+        pending=decision.pending,
     )
 
 
