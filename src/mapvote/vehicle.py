@@ -17,17 +17,18 @@ from mapvote.core.grid import TileIndex
 from mapvote.core.point_map import PointMap
 from mapvote.core.reference import LocalMap, reference_window
 from mapvote.core.sensors import Sensor
-from mapvote.core.tile import Tile
-from mapvote.core.types import F32, F64, CellState, Drive, MapvoteError, Scan
+from mapvote.core.types import F32, F64, U8, U64, CellState, Drive, MapvoteError, Scan
 from mapvote.core.voting import to_wire
 from mapvote.detection.new_points import NewPoints, points_in
-from mapvote.detection.surface_odds import deepest_m, log_odds
+from mapvote.detection.surface_odds import depths_m, log_odds
 from mapvote.detection.voters import Voter, make_voter
 from mapvote.detection.votes import TileVotes
 from mapvote.localisation.localiser import Localise, Localiser
 from mapvote.localisation.ndt import PosePrior
 from mapvote.perception.frontend import DriveReport, Frontend, Observation
 from mapvote.perception.moving_objects import MovingFilter
+
+NOTHING = np.uint64(0)
 
 
 class Vehicle:
@@ -144,40 +145,36 @@ def _ballot_tile(point_map: PointMap, tile: TileIndex, votes: TileVotes, points:
         change: votes.states == change if two_stage else votes.tally[..., change] > 0
         for change in (CellState.CHANGED_OCCUPIED, CellState.CHANGED_EMPTY)
     }
-    window, mapped = point_map.lattice.tile(tile), point_map.tiles.get(tile)
-    kept, new_points, intensity = np.empty((0, 3), dtype=np.float32), None, None
-    if len(points):
-        known = mapped is not None and mapped.has_ground
-        base = mapped.base if mapped is not None and known else reference_window(point_map, window).base
-        new = np.where(changed[CellState.CHANGED_OCCUPIED], votes.new, np.uint64(0))
-        kept, bright = points_in(window, points, new, base)
-        new_points = pack_points(kept) if len(kept) else None
-        intensity = pack_plane(bright) if len(kept) and bright is not None and bright.any() else None
-    gone, left = votes.gone, np.uint64(0) if votes.remnants is None else votes.remnants
+    kept, bright = offered(point_map, tile, np.where(changed[CellState.CHANGED_OCCUPIED], votes.new, NOTHING), points)
+    gone, left = votes.gone, NOTHING if votes.remnants is None else votes.remnants
     if gone is not None:
         gone = np.where(changed[CellState.CHANGED_EMPTY], gone, left)
+    odds = None
+    if two_stage and votes.looked is not None:
+        changes = votes.states.reshape(-1)[changed_cells_of(votes.states)]
+        depth_m = depths_m(votes.states, point_map.tiles.get(tile), kept)
+        odds = pack_odds(in_steps(log_odds(changes, votes.looked, depth_m)))
     return BallotTile(
         tile=tile,
         states=pack_plane(votes.states) if two_stage else None,
         tally=None if two_stage else pack_plane(np.moveaxis(to_wire(votes.tally), -1, 0)),
         gone=None if gone is None else pack_words(gone),
-        new_points=new_points,
-        intensity=intensity,
+        new_points=pack_points(kept) if len(kept) else None,
+        intensity=pack_plane(bright) if len(kept) and bright is not None and bright.any() else None,
         free=None if votes.free is None else pack_words(votes.free),
-        odds=pack_odds(in_steps(_sureness(mapped, votes, kept))) if two_stage and votes.looked is not None else None,
+        odds=odds,
     )
 
 
-def _sureness(mapped: Tile | None, votes: TileVotes, new_points: F32) -> F64:
-    """(m,) log-odds of each changed cell, ascending: what went lies as the map's obstacles lie, what came as the new
-    points (n, 3) do."""
-    assert votes.looked is not None
-    cells = changed_cells_of(votes.states)
-    states, depth_m = votes.states.reshape(-1)[cells], deepest_m(new_points, cells)
-    if mapped is not None:
-        gone = states == CellState.CHANGED_EMPTY
-        depth_m[gone] = deepest_m(mapped.points[mapped.columns[1]], cells[gone])
-    return log_odds(states, votes.looked, depth_m)
+def offered(point_map: PointMap, tile: TileIndex, new: U64, points: F64) -> tuple[F32, U8 | None]:
+    """Those of a tile's ``points`` (n, 3 or 4), map metres, that lie in its ``new`` voxels (256, 256): (m, 3) from its
+    corner, and the intensity (m,) of those that came with one."""
+    if not len(points):
+        return np.empty((0, 3), dtype=np.float32), None
+    window, mapped = point_map.lattice.tile(tile), point_map.tiles.get(tile)
+    known = mapped is not None and mapped.has_ground
+    base = mapped.base if mapped is not None and known else reference_window(point_map, window).base
+    return points_in(window, points, new, base)
 
 
 def vote_drive(

@@ -25,8 +25,8 @@ def in_steps(log_odds: F64) -> I8:
 
 
 def in_nats(steps: I8) -> F64:
-    """(n,) log-odds in nats; NaN where UNSAID."""
-    return np.where(steps == UNSAID, np.nan, steps / STEPS)
+    """(n,) log-odds in nats; UNSAID has no meaning."""
+    return steps.astype(np.float64) / STEPS
 
 
 def changed_cells_of(states: U8) -> I64:

@@ -16,7 +16,7 @@ from mapvote.config import FuseSettings
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Lattice, TileIndex
 from mapvote.core.types import F64, I64, U8, CellState
 from mapvote.fusion.odds import Odds
-from mapvote.fusion.probability import alike_beside, false_deletion_probability
+from mapvote.fusion.probability import false_deletion_probability
 
 PLACE_CELLS = 20
 """6 m: who drives by sees all of it."""
@@ -45,16 +45,25 @@ class Pending:
 def beyond_budget(states: U8, odds: Odds, settings: FuseSettings) -> Pending:
     """Of the cells that ``states`` (256, 256) empty those that are beyond the budget.
 
-    ``odds``: how sure those are who voted so, see :func:`mapvote.fusion.odds.agreed_odds`. Cells of other tiles are not
-    asked for what goes beside one, so at a tile's border a cell waits rather than goes.
+    ``odds``: how sure those are who voted so, see :func:`mapvote.fusion.odds.agreed_odds`.
     """
     if settings.false_deletions >= 1.0:
         return Pending.none()
     cells = np.flatnonzero(states == int(CellState.CHANGED_EMPTY))
-    beside = alike_beside(cells // TILE_CELLS, cells % TILE_CELLS, np.zeros(len(cells), dtype=np.int64))
-    probability = false_deletion_probability(beside, odds.at(cells))
+    probability = false_deletion_probability(standing_beside(states, cells), odds.at(cells))
     waits = probability > settings.false_deletions
     return Pending(cells[waits], probability[waits])
+
+
+def standing_beside(states: U8, cells: I64) -> I64:
+    """(n,) how many of the eight cells around each of the flat ``cells`` (n,) stand by ``states`` (256, 256).
+
+    Beyond the tile's border all is taken to be as just within.
+    """
+    stands = np.pad(states == int(CellState.UNCHANGED_OCCUPIED), 1, mode="edge")
+    rows, cols = cells // TILE_CELLS + 1, cells % TILE_CELLS + 1
+    beside = [stands[rows + i, cols + j] for i in (-1, 0, 1) for j in (-1, 0, 1) if i or j]
+    return np.sum(beside, axis=0, dtype=np.int64)
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,10 +1,11 @@
 """How likely it is that a cell decided as changed did change, and that emptying it takes something that stands.
 
-Both are logistic curves, calibrated on simulated streets, whose truth is known. The first is over how many vehicles say
-so, how many say otherwise, how many of the eight cells around changed likewise, and how sure those are who say so
-(fusion/odds.py). It judges cells: at the rim of a thing that did change, centimetres decide which of two cells holds
-its surface, and that does no harm to the map. The second asks for harm: whether a point is deleted that lies on a
-surface that still stands. Such cells are few, so it has few parameters.
+Both are logistic curves, calibrated on simulated streets, whose truth is known. The first is over how sure those are
+who say so (fusion/odds.py) or, where they do not say, over how many vehicles say so, how many say otherwise, and how
+many of the eight cells around changed likewise. It judges cells: at the rim of a thing that did change, centimetres
+decide which of two cells holds its surface, and that does no harm to the map. The second asks for harm: whether a point
+is deleted that lies on a surface that still stands. Such cells are few, so it has few parameters; nearly all lie before
+a wall that stands, where range noise put some of its points and rays pass now.
 
 docs/measurements/probability.md has what was fitted, on what, and how it does elsewhere.
 """
@@ -13,7 +14,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from mapvote.codec.odds import in_nats
+from mapvote.codec.odds import UNSAID, in_nats
 from mapvote.core.types import F64, I8, I32, I64, U8, CellState
 
 _MOST_VOTES = 3
@@ -24,13 +25,15 @@ _BUILT = np.array([-0.78, 1.13, -0.01, 2.96])
 _DEMOLISHED = np.array([-1.37, 1.15, -0.57, 3.18])
 """Log-odds of a lone cell with two votes for it and none against; what a third adds, one against, eight such cells."""
 # By benchmarks/probability.py, as are those below.
-_BUILT_SAID = np.array([-0.78, 1.13, -0.01, 2.96, 1.0])
-_DEMOLISHED_SAID = np.array([-1.37, 1.15, -0.57, 3.18, 1.0])
+_BUILT_SAID = np.array([0.188, 1.328])
+_DEMOLISHED_SAID = np.array([0.115, 1.026])
+"""Log-odds of a cell of which they say that it is as likely as not; of each nat that they say."""
+_FALSE_DELETION = np.array([-8.526, 5.278])
+"""Log-odds that something that stands goes with a cell beside which nothing stands; what a row of STANDING adds."""
+_FALSE_DELETION_SAID = np.array([-8.022, 4.625, -0.339])
 """The same, and of a nat that they say."""
-_FALSE_DELETION = np.array([-3.0, -4.0])
-"""Log-odds that something that stands goes with a lone cell; what eight cells around it add that are emptied too."""
-_FALSE_DELETION_SAID = np.array([-4.01, -3.41, -0.37])
-"""The same, and of a nat that they say."""
+STANDING = 3
+"""Cells that stand beside one: so many are a row of a wall, before which noise put points; more add nothing."""
 
 
 def change_probability(
@@ -39,34 +42,23 @@ def change_probability(
     """(n,) probability that cells decided as ``states``, CHANGED_OCCUPIED or CHANGED_EMPTY, did change: vehicles that
     say so, vehicles that say otherwise (not: undetermined), how many of the eight cells around changed likewise, and
     how sure they are, UNSAID where nobody says; (n,) each."""
-    built = states == CellState.CHANGED_OCCUPIED
+    built = (states == CellState.CHANGED_OCCUPIED)[:, None]
     more = np.minimum(votes, _MOST_VOTES) - 2.0
-    told: F64 = np.column_stack([np.ones(len(states)), more, np.asarray(against, dtype=np.float64), _share(beside)])
-    by_votes = np.where(built[:, None], _BUILT, _DEMOLISHED)
-    curve = np.where(built[:, None], _BUILT_SAID, _DEMOLISHED_SAID)
-    return _by_what_is_said(told, by_votes, curve, odds)
-
-
-def false_deletion_probability(beside: I32 | I64, odds: I8) -> F64:
-    """(n,) probability that of what goes with cells decided changed-empty something still stands: by how many of the
-    eight cells around are emptied too, and how sure the vehicles are, UNSAID where nobody says; (n,) each."""
-    told = np.column_stack([np.ones(len(odds)), _share(beside)])
-    return _by_what_is_said(told, _FALSE_DELETION, _FALSE_DELETION_SAID, odds)
-
-
-def _share(beside: I32 | I64) -> F64:
-    return np.asarray(beside, dtype=np.float64) / 8.0
-
-
-def _by_what_is_said(told: F64, by_votes: F64, curve: F64, odds: I8 | None) -> F64:
-    """(n,) probabilities of what is ``told`` (n, k), by the ``curve`` (k + 1,) or (n, k + 1) that takes the odds (n,)
-    besides, and where these are unsaid ``by_votes`` (k,) or (n, k) alone."""
-    alone = (by_votes * told).sum(axis=1)
+    told = np.column_stack([np.ones(len(states)), more, against, np.asarray(beside, dtype=np.float64) / 8.0])
+    alone = (np.where(built, _BUILT, _DEMOLISHED) * told).sum(axis=1)
     if odds is None:
         return _logistic(alone)
-    said = in_nats(odds)
-    with_odds = (curve * np.column_stack([told, said])).sum(axis=1)
-    return _logistic(np.where(np.isnan(said), alone, with_odds))
+    curve = np.where(built, _BUILT_SAID, _DEMOLISHED_SAID)
+    return _logistic(np.where(odds == UNSAID, alone, curve[:, 0] + curve[:, 1] * in_nats(odds)))
+
+
+def false_deletion_probability(standing: I32 | I64, odds: I8) -> F64:
+    """(n,) probability that of what goes with cells decided changed-empty something still stands: by how many of the
+    eight cells around are decided to stand, and how sure the vehicles are, UNSAID where nobody says; (n,) each."""
+    row = np.minimum(standing, STANDING) / STANDING
+    alone = _FALSE_DELETION[0] + _FALSE_DELETION[1] * row
+    curve = _FALSE_DELETION_SAID
+    return _logistic(np.where(odds == UNSAID, alone, curve[0] + curve[1] * row + curve[2] * in_nats(odds)))
 
 
 def _logistic(log_odds: F64) -> F64:

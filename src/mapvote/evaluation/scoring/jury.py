@@ -44,7 +44,8 @@ class Jury:
         """Over the truth's window."""
         self.truths = {name: judge(truth, self.first_map) for name, judge in TRUTHS.items()}
         """(rows, cols) of each, by name."""
-        self._points = MapJudge(map_obstacles(first_map), *_above_ground(self.first_map, truth))
+        self.points = MapJudge(map_obstacles(first_map), *_above_ground(self.first_map, truth))
+        """What became of the first map's points."""
         self._objects = [{"kind": o["kind"], "cells": truth.cells_of(o["footprint"])} for o in truth.objects]
 
     def of_states(self, states: U8, vehicle_states: Sequence[U8]) -> Judgement:
@@ -53,7 +54,7 @@ class Jury:
 
     def of_update(self, outcome: Outcome) -> Judgement:
         """The same, and what became of the map's points."""
-        points = self._points.score(map_obstacles(outcome.updated))
+        points = self.points.score(map_obstacles(outcome.updated))
         return self._judge(outcome.states, outcome.vehicle_states, points)
 
     def ceilings(self) -> dict[str, Scores]:

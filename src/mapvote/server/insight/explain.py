@@ -11,7 +11,7 @@ import numpy as np
 import sqlalchemy as sa
 
 from mapvote.codec.arrays import unpack_plane
-from mapvote.codec.odds import in_nats
+from mapvote.codec.odds import UNSAID, in_nats
 from mapvote.core.grid import TILE_CELLS, TileIndex
 from mapvote.core.types import NO_VOTE, U8, CellState, MapvoteError
 from mapvote.core.voting import VOTE_UNIT
@@ -263,5 +263,5 @@ def _sure(vote: TileVote, cell: tuple[int, int]) -> float | None:
     """The probability that a vehicle gives a change of the cell; None if it gives none."""
     if vote.odds is None:
         return None
-    nats = float(in_nats(vote.odds.at(np.array([cell[0] * TILE_CELLS + cell[1]])))[0])
-    return None if math.isnan(nats) else round(1.0 / (1.0 + math.exp(-nats)), 4)
+    said = vote.odds.at(np.array([cell[0] * TILE_CELLS + cell[1]]))
+    return None if said[0] == UNSAID else round(1.0 / (1.0 + math.exp(-float(in_nats(said)[0]))), 4)
