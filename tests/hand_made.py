@@ -9,13 +9,14 @@ from typing import Literal
 import numpy as np
 
 from mapvote.codec.ballot import Ballot, BallotTile, pack_plane, tile_key
+from mapvote.codec.odds import pack_odds
 from mapvote.codec.tile_file import base_hash
 from mapvote.codec.words import pack_words
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Lattice, TileIndex
 from mapvote.core.point_map import PointMap
 from mapvote.core.reference import reference_window
 from mapvote.core.tile import Tile
-from mapvote.core.types import F32, F64, NO_VOTE, U8, U16, U64, Scan
+from mapvote.core.types import F32, F64, I8, NO_VOTE, U8, U16, U64, Scan
 from mapvote.fusion.sparse_columns import Words, mark, nothing_reached
 from mapvote.localisation.ndt import PosePrior
 from mapvote.localisation.tracker import Fix
@@ -88,6 +89,7 @@ class Say:
     new_points: F32 | None = None
     free: U64 | None = None
     intensity: U8 | None = None
+    odds: I8 | None = None
 
     def packed(self, tile: TileIndex) -> BallotTile:
         return BallotTile(
@@ -98,6 +100,7 @@ class Say:
             new_points=None if self.new_points is None else pack_plane(self.new_points, 1),
             free=None if self.free is None else pack_words(self.free),
             intensity=None if self.intensity is None else pack_plane(self.intensity, 1),
+            odds=None if self.odds is None else pack_odds(self.odds),
         )
 
 

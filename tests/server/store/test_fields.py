@@ -164,6 +164,8 @@ def test_a_store_of_the_schema_before_is_upgraded_and_its_ballots_stand(database
         for statement in (
             "ALTER TABLE version_tiles DROP COLUMN fields",
             "ALTER TABLE ballot_tiles DROP COLUMN intensity",
+            "ALTER TABLE ballot_tiles DROP COLUMN odds",
+            "ALTER TABLE decisions DROP COLUMN odds",
             "UPDATE alembic_version SET version_num = '0011'",
         ):
             connection.execute(sa.text(statement))

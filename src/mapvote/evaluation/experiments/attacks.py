@@ -11,12 +11,14 @@ from typing import TypeVar
 import msgspec
 import numpy as np
 
-from mapvote.codec.ballot import Ballot, BallotTile, pack_plane, unpack_states
+from mapvote.codec.ballot import Ballot, BallotTile, pack_plane, unpack_states, unpack_sureness
+from mapvote.codec.odds import MOST, changed_cells_of, pack_odds
 from mapvote.codec.points import pack_points, unpack_points
 from mapvote.codec.words import pack_words, unpack_words
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS
 from mapvote.core.point_map import PointMap
 from mapvote.core.types import F32, NO_VOTE, U8, U64, Bool, CellState
+from mapvote.fusion.odds import Odds
 
 Attack = Callable[[Ballot, PointMap, Ballot], Ballot]
 """(the liar's honest ballot, the map, an honest vehicle's ballot) -> what the liar sends."""
@@ -89,7 +91,8 @@ ATTACKS: Mapping[str, Attack] = {
 
 
 def _claim(ballot: Ballot, point_map: PointMap, lie: Callable[[U8, Bool], U8]) -> Ballot:
-    """The ballot with ``lie``'s states; all that is mapped gone, false points where changed-occupied."""
+    """The ballot with ``lie``'s states, as sure of them as can be; all that is mapped gone, false points where
+    changed-occupied."""
 
     def told(tile: BallotTile) -> BallotTile:
         if tile.states is None:
@@ -106,6 +109,7 @@ def _claim(ballot: Ballot, point_map: PointMap, lie: Callable[[U8, Bool], U8]) -
             gone=pack_words(gone),
             new_points=pack_points(points) if len(points) else None,
             intensity=None,
+            odds=pack_odds(np.full(len(changed_cells_of(states)), MOST, dtype=np.int8)),
         )
 
     return msgspec.structs.replace(ballot, tiles=[told(tile) for tile in ballot.tiles])
@@ -128,9 +132,17 @@ def _moved(ballot: Ballot, by: int) -> Ballot:
             way = np.array([by * CELL_SIZE, by * CELL_SIZE, 0.0], dtype=np.float32)
             shifted = unpack_points(tile.new_points) + way
             points = shifted[(shifted[:, :2] < TILE_CELLS * CELL_SIZE - 0.01).all(axis=1)]
+        states = odds = None
+        if tile.states is not None:
+            before = unpack_states(tile.states)
+            states = _shifted(before, NO_VOTE, by)
+            said = Odds.of(before, unpack_sureness(tile.odds, before))
+            if said is not None:
+                odds = pack_odds(said.at(changed_cells_of(states) - by * (TILE_CELLS + 1)))
         return msgspec.structs.replace(
             tile,
-            states=None if tile.states is None else pack_plane(_shifted(unpack_states(tile.states), NO_VOTE, by)),
+            states=None if states is None else pack_plane(states),
+            odds=odds,
             gone=None if tile.gone is None else pack_words(_shifted(unpack_words(tile.gone, "gone"), 0, by)),
             free=None if tile.free is None else pack_words(_shifted(unpack_words(tile.free, "free"), 0, by)),
             new_points=None if points is None else pack_points(points),

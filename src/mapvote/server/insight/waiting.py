@@ -45,7 +45,7 @@ def waiting_features(store: Store, version: int, fused: Sequence[Fused], budget:
             "waits": f"deleting it takes something that stands with a probability of up to {likeliest:.2g}; "
             f"the policy allows {budget:g}",
             "false_deletion": round(likeliest, 6),
-            "drive_by": [round(float(value), 1) for value in middle],
+            "drive_by": [round(float(value), 2) for value in middle],
         }
     return features
 

@@ -28,6 +28,9 @@ export async function showDesk() {
     : `Nothing waits: a publish would change nothing in version ${version}.`;
   $("desk-held").replaceChildren(...held.map((reason) => element("li", {}, [`would be held: ${reason}`])));
   $("pending").replaceChildren(...[...waiting, ...reviewed].map(row));
+  const stays = [...(desk.waiting ?? [])].sort((a, b) => size(a) - size(b));
+  $("waiting-tally").textContent = stays.length ? "Left as it is: something that stands may go with it. Somebody should drive by." : "";
+  $("waiting").replaceChildren(...stays.map(left));
   $("publish").disabled = !waiting.length;
   $("publish").textContent = held.length ? "Publish in spite of that" : "Publish";
   const wanted = chosen?.id ?? address.read().pending;
@@ -44,6 +47,26 @@ const row = (f) => {
   ]);
   button.dataset.change = f.id;
   return element("li", {}, [button]);
+};
+
+// What is beyond the policy's budget of false deletions: to look at, not to decide about.
+const left = (f) => {
+  const { kind, area_m2: area, false_deletion: risk, drive_by: [x, y], waits } = f.properties;
+  const look = () => {
+    choose(null);
+    const shown = drawable(f);
+    state.view.setPending(shown);
+    state.view.fit(shown.box, 0.38, { elevation: 0.5, height: shown.height });
+    $("difference").textContent = `It stays: ${waits}. Drive by x ${x.toFixed(1)}, y ${y.toFixed(1)}.`;
+  };
+  return element("li", {}, [
+    element("button", { title: waits, onclick: look }, [
+      dot(kind),
+      "Stays",
+      element("span", { className: "number" }, [`${area.toFixed(1)} m\u00b2`]),
+      element("span", { className: "number" }, [`risk ${(100 * risk).toPrecision(2)} %`]),
+    ]),
+  ]);
 };
 
 function choose(feature, visit = false) {

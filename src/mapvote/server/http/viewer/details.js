@@ -96,12 +96,13 @@ export async function showCell([x, y]) {
   const vote = (v) =>
     element("li", { className: v.counts ? "" : "silent" }, [
       element("div", { className: "head" }, [element("b", {}, [`${v.vehicle} / ${v.drive}`]), element("time", {}, [when(v.end)])]),
-      element("div", {}, [CHANGE[v.state] && dot(CHANGE[v.state]), STATES[v.state] ?? v.state]),
+      element("div", {}, [CHANGE[v.state] && dot(CHANGE[v.state]), STATES[v.state] ?? v.state, sure(v)]),
       v.marks > 0 && v.state === "unchanged_occupied"
         && element("div", {}, [`but ${v.marks} of its voxels ${v.marks > 1 ? "are" : "is"} gone`]),
       !v.counts && element("div", { className: "why" }, [`does not count: ${v.why || "no reason given"}`]),
     ]);
   const decided = answer.decisions.map((d) => `Version ${d.version} decided: ${STATES[d.state] ?? d.state}.`);
+  if (answer.thing?.startsWith("pending:")) decided.push(`${answer.thing}.`);
   details(title, null, [
     ...decided.map((text) => element("p", {}, [text])),
     answer.votes.length
@@ -109,6 +110,9 @@ export async function showCell([x, y]) {
       : element("p", { className: "hint" }, ["No vehicle has voted on this cell."]),
   ]);
 }
+
+// What a vehicle says of its own evidence, if it does.
+const sure = (vote) => (Number.isFinite(vote.sure) ? `, ${Math.round(100 * vote.sure)} % sure` : "");
 
 function details(title, kind, content) {
   $("details").replaceChildren(

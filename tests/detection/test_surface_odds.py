@@ -1,0 +1,80 @@
+"""How sure a vehicle is of what it calls changed: by how much of the thing is in the cell."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from hand_made import make_tile, states_plane, wall
+from mapvote.core.grid import CELL_SIZE, Lattice
+from mapvote.core.types import I32, NO_VOTE, U8, CellState
+from mapvote.detection.surface_counts import WORDS
+from mapvote.detection.surface_looks import LOOKS, MOST_CELLS, MOST_HEIGHT_M, amounts, looks
+from mapvote.detection.surface_odds import depths_m, log_odds
+
+CO, CE = CellState.CHANGED_OCCUPIED, CellState.CHANGED_EMPTY
+LATTICE = Lattice()
+LOW = np.full((256, 256), 1.0, dtype=np.float32)
+
+
+def seen(states: U8, amount: I32 | None = None) -> np.ndarray:
+    full = np.ones((256, 256), dtype=np.int32) if amount is None else amount
+    return looks(LATTICE, (0, 0), {(0, 0): states}, {(0, 0): full}, LOW)
+
+
+def test_a_cell_is_seen_in_its_thing_and_against_the_fullest_beside_it() -> None:
+    states = states_plane({(5, 5): CE, (5, 6): CE, (6, 7): CE, (5, 7): CO, (40, 40): CE}, fill=1)
+    amount = np.ones((256, 256), dtype=np.int32)
+    amount[5, 6] = 9
+    found = seen(states, amount)
+    assert found.shape == (5, LOOKS)
+    assert np.exp(found[:, 0]) - 1 == pytest.approx([3, 3, 1, 3, 1]), "cells of the thing"
+    assert found[:, 1] * 8 == pytest.approx([1, 2, 0, 1, 0]), "alike around"
+    assert found[:, 2] == pytest.approx([np.log(2 / 10), np.log(10 / 2), np.log(2), np.log(2 / 10), np.log(2)])
+    assert found[:, 3] == pytest.approx([1.0, 1.0, 0.0, 1.0, 1.0]), "the map rises in what is gone"
+
+
+def test_a_thing_goes_on_where_tiles_meet_and_is_as_large_as_any_at_last() -> None:
+    left, right = (states_plane({(r, c): CE for r in range(20)}) for c in (255, 0))
+    states = {(0, 0): left, (0, 1): right}
+    full = {tile: np.ones((256, 256), dtype=np.int32) for tile in states}
+    found = looks(LATTICE, (0, 0), states, full, LOW)
+    assert np.exp(found[:, 0]) - 1 == pytest.approx(40)
+    assert found[10, 1] * 8 == pytest.approx(5)
+    whole = seen(np.full((256, 256), CE, dtype=np.uint8))
+    assert np.exp(whole[:, 0]) - 1 == pytest.approx(np.full(65536, MOST_CELLS))
+    assert looks(LATTICE, (0, 0), {(0, 0): left}, full, 99 * LOW)[:, 3].max() == MOST_HEIGHT_M
+
+
+def test_of_what_is_gone_the_voxels_count_and_of_what_is_new_the_hits() -> None:
+    planes = np.zeros((1, 3, WORDS), dtype=np.uint64)
+    planes[0, 1, 7], planes[0, 1, 8] = 0b110, 0b100  # met once, and three times
+    occupied, new = (np.array([words], dtype=np.uint64) for words in ([0b1011, 0, 0], [0b1, 0b110, 0]))
+    assert amounts(planes, occupied, new).tolist() == [[3, 4, 0]]
+
+
+def test_a_surface_is_as_deep_as_its_point_that_is_farthest_from_the_cells_sides() -> None:
+    rim = np.array(
+        [[3 * CELL_SIZE + 0.01, 2.5 * CELL_SIZE, 0.75], [3.5 * CELL_SIZE, 9.4 * CELL_SIZE, 0.75]], np.float32
+    )
+    middle = wall([(2, 3)], [0.75])
+    states = states_plane({(2, 3): CE, (9, 3): CO, (9, 9): CO})
+    assert depths_m(states, make_tile(rim[:1]), rim) == pytest.approx([0.01, 0.4 * CELL_SIZE, 0.0], abs=1e-6)
+    assert depths_m(states, make_tile(np.concatenate([rim[:1], middle])), rim)[0] == pytest.approx(0.5 * CELL_SIZE)
+    ground = make_tile(wall([(2, 3)], [0.05]))
+    assert depths_m(states, ground, rim).tolist()[0] == 0.0, "ground is no surface that goes"
+    assert depths_m(states_plane({(9, 3): CO}), None, rim) == pytest.approx([0.4 * CELL_SIZE])
+    assert depths_m(states_plane(fill=NO_VOTE), None, rim[:0]).shape == (0,)
+
+
+@settings(max_examples=30, deadline=None)
+@given(arrays(np.float64, (2, LOOKS), elements=st.floats(0, 5)), st.floats(0, 0.15), st.sampled_from([CO, CE]))
+def test_a_deeper_surface_and_a_larger_thing_make_it_surer(looked: np.ndarray, deep: float, state: CellState) -> None:
+    states = np.array([state], dtype=np.uint8)
+    low, high = looked.min(axis=0)[None], looked.max(axis=0)[None]
+    shallow = log_odds(states, low, np.array([0.0]))[0]
+    assert shallow <= log_odds(states, low, np.array([deep]))[0]
+    assert shallow <= log_odds(states, high, np.array([0.0]))[0]

@@ -1,0 +1,118 @@
+"""Within a budget of false deletions a cell goes; beyond it its points stay, and it is told where to drive by."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from hand_made import Say, make_ballot, make_map, make_tile, states_plane, wall
+from mapvote.codec.odds import MOST, UNSAID
+from mapvote.config import FuseSettings, load_settings
+from mapvote.core.grid import Lattice
+from mapvote.core.point_map import PointMap
+from mapvote.core.types import U8, CellState, MapvoteError
+from mapvote.fusion.odds import Odds
+from mapvote.fusion.offline import update_map
+from mapvote.fusion.pending import Pending, beyond_budget, places, standing_beside
+from mapvote.fusion.probability import false_deletion_probability
+
+CELLS = [(10, 10), (10, 11), (10, 12)]
+EMPTY, STANDS = CellState.CHANGED_EMPTY, CellState.UNCHANGED_OCCUPIED
+
+
+def street() -> PointMap:
+    return make_map({(0, 0): make_tile(wall(CELLS, [0.45, 0.75, 1.05]))})
+
+
+def said(sure: list[int]) -> Say:
+    """All cells of the wall are gone; how sure of each."""
+    return Say(states_plane(dict.fromkeys(CELLS, EMPTY)), odds=np.array(sure, np.int8))
+
+
+def updated(budget: float, *says: Say) -> tuple[int, Pending]:
+    """(points left, what waits) of vehicles that say so."""
+    ballots = [make_ballot(street(), {(0, 0): say}, f"v{i}") for i, say in enumerate(says)]
+    after, decisions = update_map(street(), ballots, FuseSettings(false_deletions=budget))
+    return sum(len(tile.points) for tile in after.tiles.values()), decisions[0, 0].pending
+
+
+def test_a_cell_beyond_the_budget_keeps_its_points_and_is_pending() -> None:
+    unsure = said([40, -MOST, 40])
+    left, waits = updated(0.01, unsure, unsure)
+    assert left == 3, "those of the cell in the middle"
+    assert waits.cells.tolist() == [10 * 256 + 11]
+    assert waits.probability[0] > 0.01
+    assert waits.at((10, 11)) == waits.probability[0]
+    assert waits.at((10, 10)) is None
+
+
+def test_without_a_budget_nothing_waits_however_unsure_they_are() -> None:
+    unsure = said([-MOST] * 3)
+    left, waits = updated(1.0, unsure, unsure)
+    assert left == 0
+    assert not len(waits.cells)
+
+
+def test_one_who_is_sure_does_not_carry_two_who_are_not() -> None:
+    sure, unsure = said([MOST] * 3), said([-MOST] * 3)
+    assert updated(0.01, sure, unsure, unsure)[0] == 9
+    assert updated(0.01, sure, sure, unsure)[0] == 0
+
+
+def test_of_ballots_that_do_not_say_the_votes_and_what_stands_beside_are_asked() -> None:
+    silent = Say(states_plane(dict.fromkeys(CELLS, EMPTY)))
+    before = Say(states_plane(dict.fromkeys(CELLS, EMPTY) | {(11, c): STANDS for c in range(9, 14)}))
+    assert updated(0.01, silent, silent)[0] == 0
+    assert updated(0.01, before, before)[0] == 9, "a row before a wall that stands"
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.dictionaries(st.integers(0, 65535), st.sampled_from(range(5)), max_size=60), st.floats(1e-6, 0.9))
+def test_a_smaller_budget_never_lets_more_go(cells: dict[int, int], budget: float) -> None:
+    states = states_plane().reshape(-1)
+    states[list(cells)] = list(cells.values())
+    plane: U8 = states.reshape(256, 256)
+    odds = Odds(np.array(sorted(cells), np.int64), np.array([c % 255 - MOST for c in sorted(cells)], np.int8))
+    waits = [
+        set(beyond_budget(plane, odds, FuseSettings(false_deletions=b)).cells.tolist()) for b in (budget, budget / 2)
+    ]
+    assert waits[0] <= waits[1] <= set(np.flatnonzero(states == EMPTY).tolist())
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.sets(st.tuples(st.integers(0, 255), st.integers(0, 255)), max_size=60), st.integers(0, 65535))
+def test_what_stands_beside_is_counted_as_by_hand(stands: set[tuple[int, int]], cell: int) -> None:
+    states = states_plane(dict.fromkeys(stands, int(STANDS)))
+    row, col = divmod(cell, 256)
+    clip = lambda at: min(max(at, 0), 255)  # noqa: E731
+    around = [(clip(row + i), clip(col + j)) for i in (-1, 0, 1) for j in (-1, 0, 1) if i or j]
+    assert standing_beside(states, np.array([cell])).tolist() == [sum(one in stands for one in around)]
+
+
+def test_what_stands_beside_raises_the_risk_and_sureness_lowers_it() -> None:
+    standing, odds = np.array([0, 1, 3, 8]), np.full(4, 8, np.int8)
+    by_standing = false_deletion_probability(standing, odds)
+    assert (np.diff(by_standing[:3]) > 0).all()
+    assert by_standing[2] == by_standing[3], "three are a row; more add nothing"
+    by_odds = false_deletion_probability(np.zeros(3, np.int64), np.array([-80, 0, 80], np.int8))
+    assert (np.diff(by_odds) < 0).all()
+    unsaid = false_deletion_probability(standing, np.full(4, UNSAID, np.int8))
+    assert ((unsaid > 0) & (unsaid < 1)).all()
+
+
+def test_places_to_drive_by_lie_in_the_middle_of_what_waits_the_largest_first() -> None:
+    lattice = Lattice(x0=100.0, y0=50.0)
+    near = Pending(np.array([5 * 256 + 5, 5 * 256 + 6, 5 * 256 + 7]), np.array([0.1, 0.3, 0.2]))
+    found = places({(0, 1): Pending(np.array([0]), np.array([0.9])), (0, 0): near, (1, 0): Pending.none()}, lattice)
+    assert [(place.cells, place.probability) for place in found] == [(3, 0.3), (1, 0.9)]
+    assert (found[0].x, found[0].y) == pytest.approx((100.0 + 6.5 * 0.3, 50.0 + 5.5 * 0.3))
+    assert (found[1].x, found[1].y) == pytest.approx((100.0 + 256.5 * 0.3, 50.0 + 0.5 * 0.3))
+    assert places({(1, 0): Pending.none()}, lattice) == []
+
+
+@pytest.mark.parametrize("value", ["0", "-0.1", "1.5", "never"])
+def test_a_budget_that_is_no_probability_is_one_clear_error(value: str) -> None:
+    with pytest.raises(MapvoteError, match=r"fuse\.false_deletions"):
+        load_settings(env={"MAPVOTE_FUSE__FALSE_DELETIONS": value})

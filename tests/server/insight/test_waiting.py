@@ -1,0 +1,148 @@
+"""Deletions beyond the policy's budget: a publish leaves them, desk and cell tell of them, surer vehicles end them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+import sqlalchemy as sa
+
+from hand_made import Say, make_ballot, states_plane, two_walls
+from mapvote.codec.ballot import encode
+from mapvote.codec.odds import MOST
+from mapvote.config import FuseSettings
+from mapvote.core.types import CellState, MapvoteError
+from mapvote.server.insight.desk import desk, review
+from mapvote.server.insight.explain import CellStory, explain_cell
+from mapvote.server.insight.history import changes_between
+from mapvote.server.store import migrate, schema
+from mapvote.server.store.admission import accept, examine
+from mapvote.server.store.ballots import Receipt
+from mapvote.server.store.check import check
+from mapvote.server.store.database import Database
+from mapvote.server.store.policy import Policy, current_policy, set_values
+from mapvote.server.store.publish import publish
+from mapvote.server.store.replay import replay
+from mapvote.server.store.store import Store
+
+WALL = [(10, 10), (10, 11), (10, 12)]
+BUDGET = Policy(fuse=FuseSettings(max_deleted_share=1.0, false_deletions=0.01))
+SURE, UNSURE = [40, 40, 40], [40, -MOST, 40]
+
+
+@pytest.fixture
+def store(database_url: str) -> Iterator[Store]:
+    store = Store.create(database_url, two_walls(), BUDGET)
+    yield store
+    store.close()
+
+
+def vote(store: Store, drive: str, sure: list[int] | None, vehicles: str = "ab") -> None:
+    """These say that the wall of the first tile is gone, and how sure they are of each of its cells."""
+    odds = None if sure is None else np.array(sure, dtype=np.int8)
+    for name in vehicles:
+        says = {(0, 0): Say(states_plane(dict.fromkeys(WALL, CellState.CHANGED_EMPTY)), odds=odds)}
+        ballot = make_ballot(store.point_map(), says, name, drive, end_ns=store.clock())
+        (receipt,) = accept(store, [examine(encode(ballot))])
+        assert isinstance(receipt, Receipt), receipt
+
+
+def middle(store: Store) -> CellStory:
+    return explain_cell(store, 11.5 * 0.3, 10.5 * 0.3)
+
+
+def test_a_cell_beyond_the_budget_keeps_its_points_until_vehicles_are_surer(store: Store) -> None:
+    vote(store, "d1", UNSURE)
+    now = desk(store)
+    assert [f["properties"]["cells"] for f in now.pending["features"]] == [1, 1], "the two of which they are sure"
+    (waits,) = now.waiting
+    assert waits["properties"]["kind"] == "demolished"
+    assert waits["properties"]["drive_by"] == [3.45, 3.15], "the middle of the cell"
+    assert waits["properties"]["false_deletion"] > 0.01
+    assert "the policy allows 0.01" in waits["properties"]["waits"]
+    assert publish(store).deleted == 6
+    story = middle(store)
+    assert "pending: that emptying it deletes something that stands" in story.thing
+    assert "stands: surveyed" in story.thing
+    assert [w["id"] for w in desk(store).waiting] == [waits["id"]], "though nothing has come since"
+    assert not publish(store).published
+    vote_middle(store, "d2", 40)
+    assert desk(store).waiting == []
+    assert publish(store).deleted == 3
+
+
+def vote_middle(store: Store, drive: str, sure: int) -> None:
+    """Both drive by again, and say of the cell in the middle alone how sure they are now."""
+    for name in "ab":
+        say = Say(states_plane({WALL[1]: CellState.CHANGED_EMPTY}), odds=np.array([sure], np.int8))
+        ballot = make_ballot(store.point_map(), {(0, 0): say}, name, drive, end_ns=store.clock())
+        accept(store, [examine(encode(ballot))])
+
+
+def test_what_waits_is_nothing_that_a_reviewer_decides_about(store: Store) -> None:
+    vote(store, "d1", UNSURE)
+    (waits,) = desk(store).waiting
+    with pytest.raises(MapvoteError, match="pending any more"):
+        review(store, waits["id"], "accepted", by="anna")
+
+
+def test_a_policy_without_a_budget_lets_it_go(store: Store) -> None:
+    vote(store, "d1", UNSURE)
+    set_values(store, {"fuse.false_deletions": "1"}, by="boss")
+    assert current_policy(store).fuse.false_deletions == 1.0
+    assert desk(store).waiting == []
+    assert publish(store).deleted == 9
+    with pytest.raises(MapvoteError, match=r"policy: fuse\.false_deletions = '0'"):
+        set_values(store, {"fuse.false_deletions": "0"}, by="boss")
+
+
+def test_how_sure_they_were_is_told_of_cells_and_changes_and_outlives_the_round(store: Store) -> None:
+    vote(store, "d1", SURE, "a")
+    vote(store, "d1", [10, 10, 10], "b")
+    assert publish(store).deleted == 9
+    story = middle(store)
+    assert [vote.sure for vote in story.votes] == [pytest.approx(1 / (1 + np.exp(-s / 8)), abs=1e-4) for s in (40, 10)]
+    assert story.probability == pytest.approx(0.80, abs=0.02), "as the one says who is less sure"
+    (change,) = changes_between(store, 1, 2)["features"]
+    assert change["properties"]["probability"] == pytest.approx(story.probability, abs=1e-3)
+    assert check(store) == []
+    with store.database.writing() as connection:
+        connection.execute(schema.decisions.update().values(odds=None))
+    assert {damage.kind for damage in check(store)} == {"decision"}, "its sum covers how sure they were"
+
+
+def test_ballots_that_do_not_say_are_told_by_their_votes(store: Store) -> None:
+    vote(store, "d1", None)
+    assert publish(store).deleted == 9
+    assert [vote.sure for vote in middle(store).votes] == [None, None]
+    assert middle(store).probability is not None
+
+
+def test_a_round_without_a_vehicle_waits_as_it_would_have(store: Store) -> None:
+    vote(store, "d1", SURE, "ab")
+    vote(store, "d1", UNSURE, "c")
+    assert publish(store).deleted == 9, "two of three are sure"
+    replay(store, "a", dry_run=False)
+    assert middle(store).thing == "stands: surveyed", "without the liar one of two was not"
+    assert not store.point_map().tiles[0, 0].obstacle_words[WALL[0]], "of the cell beside both were"
+
+
+def test_a_store_of_the_schema_before_is_upgraded_and_its_ballots_stand(database_url: str) -> None:
+    store = Store.create(database_url, two_walls(), BUDGET)
+    vote(store, "d1", None)
+    store.close()
+    database = Database(database_url)
+    with database.writing() as connection:
+        for statement in (
+            "ALTER TABLE ballot_tiles DROP COLUMN odds",
+            "ALTER TABLE decisions DROP COLUMN odds",
+            "UPDATE alembic_version SET version_num = '0012'",
+        ):
+            connection.execute(sa.text(statement))
+    assert migrate.upgrade(database) == ("0012", migrate.HEAD)
+    database.close()
+    store = Store.open(database_url)
+    assert check(store) == []
+    assert publish(store).deleted == 9
+    store.close()
