@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from hand_made import AtOnce
-from mapvote.codec.ballot import decode, encode, unpack_offer, unpack_states, unpack_tally, validate
+from mapvote.codec.ballot import decode, encode, unpack_offer, unpack_states, unpack_sureness, unpack_tally, validate
 from mapvote.codec.points import unpack_points
 from mapvote.codec.words import unpack_words
 from mapvote.config import FuseSettings, Settings, VotingSettings
@@ -92,6 +92,27 @@ def test_a_ballot_tells_what_was_built_and_taken_down() -> None:
     assert state_at(vehicle, 20.25, -2.0) == CellState.UNCHANGED_OCCUPIED
     assert state_at(vehicle, 4.0, 0.0) == CellState.UNCHANGED_EMPTY
     assert state_at(vehicle, 20.25, 9.0) == CellState.UNDETERMINED  # behind the new wall
+
+
+def test_by_surfaces_a_ballot_says_how_sure_it_is_of_every_changed_cell_and_by_no_other_method() -> None:
+    told: dict[tuple[str, bool], set[bool]] = {}
+    asked: list[tuple[Literal["surfaces", "columns", "paper"], bool]]
+    asked = [("surfaces", True), ("surfaces", False), ("columns", True), ("paper", True)]
+    for method, stages in asked:
+        voting = VotingSettings(method=method, two_stage=stages)
+        ballot = decode(encode(drive(make(street_map(), Settings(voting=voting))).ballot()))
+        validate(ballot)
+        told[method, stages] = {tile.odds is not None for tile in ballot.tiles}
+        for tile in ballot.tiles if stages and method == "surfaces" else []:
+            assert tile.states is not None
+            states = unpack_states(tile.states)
+            odds = unpack_sureness(tile.odds, states)
+            assert odds is not None
+            assert len(odds) == np.isin(states, [CellState.CHANGED_OCCUPIED, CellState.CHANGED_EMPTY]).sum()
+            if len(odds) > 20:
+                assert odds.max() > 0, "in the middle of a wall"
+    assert told.pop(("surfaces", True)) == {True}
+    assert set().union(*told.values()) == {False}
 
 
 def test_new_points_lie_in_changed_occupied_cells_one_to_a_voxel() -> None:

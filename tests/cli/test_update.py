@@ -39,7 +39,7 @@ def test_what_is_beyond_the_budget_stays_and_is_told_with_where_to_drive_by(
 ) -> None:
     said = update(*round_of_two, "--out", tmp_path / "new", "--false-deletions", "0.01")
     assert "6 deleted" in said
-    assert "1 cells keep their points: that something there still stands is likelier than 0.01. Drive by:" in said
+    assert "1 cell keeps its points: that something there still stands is likelier than 0.01. Drive by:" in said
     assert "3.4, 3.1" in said
     kept = read_map(tmp_path / "new").tiles[0, 0].obstacle_words
     assert [bool(kept[cell]) for cell in WALL] == [False, True, False]

@@ -86,8 +86,8 @@ def test_a_smaller_budget_never_lets_more_go(cells: dict[int, int], budget: floa
 def test_what_stands_beside_is_counted_as_by_hand(stands: set[tuple[int, int]], cell: int) -> None:
     states = states_plane(dict.fromkeys(stands, int(STANDS)))
     row, col = divmod(cell, 256)
-    clip = lambda at: min(max(at, 0), 255)  # noqa: E731
-    around = [(clip(row + i), clip(col + j)) for i in (-1, 0, 1) for j in (-1, 0, 1) if i or j]
+    rows, cols = ([min(max(at + step, 0), 255) for step in (-1, 0, 1)] for at in (row, col))
+    around = [(r, c) for i, r in enumerate(rows) for j, c in enumerate(cols) if (i, j) != (1, 1)]
     assert standing_beside(states, np.array([cell])).tolist() == [sum(one in stands for one in around)]
 
 

@@ -74,8 +74,9 @@ def explain(
         heard = ", ".join(str(number) for number in v["heard"])
         counts = "counts" if v["counts"] else v["why"]
         ended = v["end"][:19].replace("T", " ") + "Z" if "end" in v else when(v["end_ns"])
-        rows.append((v["vehicle"], v["drive"], ended, str(v["version"]), v["state"], heard, counts))
-    print_table(("vehicle", "drive", "ended", "drove with", "says", "heard in", "now"), rows)
+        sure = "" if v.get("sure") is None else f"{100 * v['sure']:.0f} %"
+        rows.append((v["vehicle"], v["drive"], ended, str(v["version"]), v["state"], sure, heard, counts))
+    print_table(("vehicle", "drive", "ended", "drove with", "says", "sure", "heard in", "now"), rows)
 
 
 def vehicles(store: StoreName) -> None:

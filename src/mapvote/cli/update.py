@@ -129,7 +129,8 @@ def _report_pending(decisions: dict[TileIndex, Decision], lattice: Lattice, budg
     if not waiting:
         return
     cells = sum(place.cells for place in waiting)
-    print(f"{cells} cells keep their points: that something there still stands is likelier than {budget:g}. Drive by:")
+    keep = "1 cell keeps its" if cells == 1 else f"{cells} cells keep their"
+    print(f"{keep} points: that something there still stands is likelier than {budget:g}. Drive by:")
     rows = [(f"{p.x:.1f}, {p.y:.1f}", str(p.cells), f"{p.probability:.2g}") for p in waiting[:_MOST_PLACES]]
     print_table(("x, y (map metres)", "cells", "likeliest"), rows)
     if len(waiting) > _MOST_PLACES:

@@ -14,6 +14,7 @@ from mapvote.core.grid import TILE_CELLS, Lattice, TileIndex
 from mapvote.core.rows import found_among
 from mapvote.core.tile import Tile, in_bytes
 from mapvote.core.types import F64, I64, NO_VOTE, U8, CellState, MapvoteError
+from mapvote.fusion.odds import agreed_odds, folded
 from mapvote.fusion.probability import alike_beside, change_probability
 from mapvote.fusion.tile_vote import TileVote
 from mapvote.server.errors import Unavailable
@@ -177,21 +178,23 @@ def evidence(store: Store, index: TileIndex, vehicle: str | None = None) -> U8:
     probable it is that the cell changed, in 1/255; and the state that most of them say (NO_VOTE: nobody).
     """
     with store.database.reading() as connection:
+        policy = policy_in(connection)
 
         def said(asked: Electorate) -> list[TileVote]:
             judged = [vote for vote, why in judged_votes(connection, index, asked) if why != DAMAGED]
             return read_votes(connection, index, [v for v in judged if vehicle is None or v.vehicle == vehicle])
 
-        votes = from_sound_ballots(connection, Electorate(FOREVER, policy_in(connection), FOREVER), said)
-    newest: dict[str, tuple[int, U8]] = {}
+        votes = from_sound_ballots(connection, Electorate(FOREVER, policy, FOREVER), said)
+    silent = TileVote("", 0, "", states=np.full((TILE_CELLS, TILE_CELLS), NO_VOTE, np.uint8))
+    newest: dict[str, TileVote] = {}
     last = np.full((TILE_CELLS, TILE_CELLS), -1, dtype=np.int64)
     for vote in sorted(votes, key=lambda vote: (vote.end_ns, vote.digest)):
-        states = decided_states(vote.states, vote.tally)
+        states, before = decided_states(vote.states, vote.tally), newest.get(vote.vehicle, silent)
         spoken = (states != NO_VOTE) & (states != CellState.UNDETERMINED)
         last[spoken] = vote.end_ns
-        before = newest.get(vote.vehicle, (0, np.full(states.shape, NO_VOTE, np.uint8)))[1]
-        newest[vote.vehicle] = vote.end_ns, np.where(spoken, states, before)
-    return _summary([states for _, states in newest.values()], last, store.clock())
+        odds = folded([before, vote], [~spoken.reshape(-1), spoken.reshape(-1)])
+        newest[vote.vehicle] = replace(silent, states=np.where(spoken, states, before.states), odds=odds)
+    return _summary(list(newest.values()), last, store.clock(), policy.fuse.min_votes)
 
 
 def decided_states(states: U8 | None, tally: np.ndarray | None) -> U8:
@@ -202,22 +205,22 @@ def decided_states(states: U8 | None, tally: np.ndarray | None) -> U8:
     return np.where(tally.any(axis=-1), tally.argmax(axis=-1), NO_VOTE).astype(np.uint8)
 
 
-def _summary(planes: list[U8], last: I64, now_ns: int) -> U8:
+def _summary(votes: Sequence[TileVote], last: I64, now_ns: int, quorum: int) -> U8:
     said = np.zeros((4, TILE_CELLS, TILE_CELLS), dtype=np.int64)
-    for plane in planes:
+    for vote in votes:
         for state in range(4):
-            said[state] += plane == state
+            said[state] += vote.states == state
     total = said.sum(axis=0)
     days = np.clip((now_ns - last) // _DAY_NS, 0, _NEVER_SEEN - 1)
     out = np.empty((TILE_CELLS, TILE_CELLS, 4), dtype=np.uint8)
     out[..., 0] = np.minimum(total, 255)
     out[..., 1] = np.where(last < 0, _NEVER_SEEN, days)
-    out[..., 2] = np.rint(255 * _probability(said))
+    out[..., 2] = np.rint(255 * _probability(said, votes, quorum))
     out[..., 3] = np.where(total > 0, said.argmax(axis=0), NO_VOTE)
     return out
 
 
-def _probability(said: I64) -> F64:
+def _probability(said: I64, vehicles: Sequence[TileVote], quorum: int) -> F64:
     """(256, 256) that a cell changed as most vehicles say that say so, of vehicles by state (4, 256, 256); 0 where
     nobody does."""
     changes = said[CellState.CHANGED_OCCUPIED : CellState.CHANGED_EMPTY + 1]
@@ -226,6 +229,8 @@ def _probability(said: I64) -> F64:
     votes = changes[kinds, rows, cols]
     states = (kinds + CellState.CHANGED_OCCUPIED).astype(np.uint8)
     against = said[:, rows, cols].sum(axis=0) - votes
-    out = np.zeros(said.shape[1:])
-    out[rows, cols] = change_probability(states, votes, against, alike_beside(rows, cols, kinds))
+    out, told = np.zeros(said.shape[1:]), np.full(said.shape[1:], NO_VOTE, dtype=np.uint8)
+    told[rows, cols] = states
+    odds = agreed_odds(vehicles, told, quorum).at(rows * TILE_CELLS + cols)
+    out[rows, cols] = change_probability(states, votes, against, alike_beside(rows, cols, kinds), odds)
     return out
