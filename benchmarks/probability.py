@@ -149,11 +149,13 @@ def within(budget: float, scene: str, cells: Cells) -> dict[str, object]:
     stale = int(cells.stale[goes].sum()) / max(int(cells.stale.sum()), 1)
     wait = 1.0 - n / max(len(said), 1)
     rate = lost / max(n, 1)
-    told = f"{int(cells.harm.sum())}, {lost} ({rate:.1e}), {promised:.1e}"
+    of_waiting = [float(one[~goes].mean()) if n < len(said) else 0.0 for one in (cells.harm, said)]
+    told = f"{int(cells.harm.sum())}, {lost} ({rate:.1e}), {promised:.1e} | {of_waiting[0]:.1e}, {of_waiting[1]:.1e}"
     print(f"{budget:g} | {scene} | {len(said)} | {n} | {100 * wait:.1f} % | {told} | {100 * stale:.1f} %")
     return {
         "scene": scene, "kind": "false deletions", "budget": budget, "emptied": len(said), "go": n,
         "false_before": int(cells.harm.sum()), "false": lost, "promised": promised, "stale_share": stale,
+        "waiting_false": of_waiting[0], "waiting_said": of_waiting[1],
     }  # fmt: skip
 
 

@@ -190,6 +190,7 @@ def evidence(store: Store, index: TileIndex, vehicle: str | None = None) -> U8:
     last = np.full((TILE_CELLS, TILE_CELLS), -1, dtype=np.int64)
     for vote in sorted(votes, key=lambda vote: (vote.end_ns, vote.digest)):
         states, before = decided_states(vote.states, vote.tally), newest.get(vote.vehicle, silent)
+        assert before.states is not None
         spoken = (states != NO_VOTE) & (states != CellState.UNDETERMINED)
         last[spoken] = vote.end_ns
         odds = folded([before, vote], [~spoken.reshape(-1), spoken.reshape(-1)])
