@@ -19,7 +19,7 @@ from mapvote.codec.ballot import Ballot, BallotTile, encode
 from mapvote.codec.points import pack_points, unpack_points
 from mapvote.formats import open_drive, read_map
 
-PLANES = "states", "tally", "gone", "free", "intensity"
+PLANES = "states", "tally", "gone", "free", "intensity", "odds"
 
 
 def by_voxels(tile: BallotTile) -> BallotTile:

@@ -23,7 +23,7 @@ from mapvote.evaluation.experiments.conditions import Conditions
 from mapvote.evaluation.experiments.scene import BALLOTS_FROM, Scene, key_of, sources_digest
 from mapvote.evaluation.scoring.cells import UNSCORED
 from mapvote.evaluation.scoring.jury import Jury
-from mapvote.evaluation.scoring.map_points import map_obstacles, same_rows
+from mapvote.evaluation.scoring.map_points import MapJudge, map_obstacles, same_rows
 from mapvote.evaluation.scoring.truth import Truth
 from mapvote.fusion.fuse import Decision
 from mapvote.fusion.offline import update_map
@@ -145,10 +145,17 @@ def decided(street: Street, number: int, curves: tuple[F64, F64], fewest: int) -
                     np.bincount(flat[here & kind], minlength=CELLS) for kind in (jury.points.valid, jury.points.stale)
                 ]
                 truth = _truth_of(jury, street.point_map, tile)
-                yield _of_decision(number, many, decision, truth, lost)
+                yield of_decision(number, many, decision, truth, lost)
 
 
-def _of_decision(number: int, vehicles: int, decision: Decision, truth: U8, lost: Sequence[I64]) -> Cells:
+def judged(street: Street) -> tuple[F64, MapJudge]:
+    """The obstacle points (n, 3) of its first map, and what is true of each."""
+    return map_obstacles(street.point_map), Jury(street.point_map, street.truth).points
+
+
+def of_decision(number: int, vehicles: int, decision: Decision, truth: U8, lost: Sequence[I64]) -> Cells:
+    """The cells of a tile that are decided as changed. ``truth`` (65536,) of its cells, ``lost``: (65536,) valid and
+    stale points that went with each."""
     cells = changed_cells_of(decision.states)
     states = decision.states.reshape(-1)[cells]
     told = decision.tally.reshape(CELLS, -1)[cells].astype(np.int64) // VOTE_UNIT

@@ -15,7 +15,7 @@ from mapvote.core.point_map import PointMap
 from mapvote.core.types import U8, CellState, MapvoteError
 from mapvote.fusion.odds import Odds
 from mapvote.fusion.offline import update_map
-from mapvote.fusion.pending import Pending, beyond_budget, places, standing_beside
+from mapvote.fusion.pending import Pending, beyond_budget, standing_beside, waypoints
 from mapvote.fusion.probability import false_deletion_probability
 
 CELLS = [(10, 10), (10, 11), (10, 12)]
@@ -102,14 +102,14 @@ def test_what_stands_beside_raises_the_risk_and_sureness_lowers_it() -> None:
     assert ((unsaid > 0) & (unsaid < 1)).all()
 
 
-def test_places_to_drive_by_lie_in_the_middle_of_what_waits_the_largest_first() -> None:
+def test_waypoints_lie_in_the_middle_of_what_waits_the_largest_first() -> None:
     lattice = Lattice(x0=100.0, y0=50.0)
     near = Pending(np.array([5 * 256 + 5, 5 * 256 + 6, 5 * 256 + 7]), np.array([0.1, 0.3, 0.2]))
-    found = places({(0, 1): Pending(np.array([0]), np.array([0.9])), (0, 0): near, (1, 0): Pending.none()}, lattice)
+    found = waypoints({(0, 1): Pending(np.array([0]), np.array([0.9])), (0, 0): near, (1, 0): Pending.none()}, lattice)
     assert [(place.cells, place.probability) for place in found] == [(3, 0.3), (1, 0.9)]
     assert (found[0].x, found[0].y) == pytest.approx((100.0 + 6.5 * 0.3, 50.0 + 5.5 * 0.3))
     assert (found[1].x, found[1].y) == pytest.approx((100.0 + 256.5 * 0.3, 50.0 + 0.5 * 0.3))
-    assert places({(1, 0): Pending.none()}, lattice) == []
+    assert waypoints({(1, 0): Pending.none()}, lattice) == []
 
 
 @pytest.mark.parametrize("value", ["0", "-0.1", "1.5", "never"])

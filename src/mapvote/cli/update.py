@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from mapvote.core.types import U8
     from mapvote.fusion.fuse import Decision
 
-_MOST_PLACES = 10
+_MOST_WAYPOINTS = 10
 
 
 def register(app: typer.Typer) -> None:
@@ -123,15 +123,15 @@ def _report(decisions: dict[TileIndex, Decision], vehicles: int, min_votes: int)
 
 def _report_pending(decisions: dict[TileIndex, Decision], lattice: Lattice, budget: float) -> None:
     """Deletions that wait, the largest first, and where somebody should drive by."""
-    from mapvote.fusion.pending import places
+    from mapvote.fusion.pending import waypoints
 
-    waiting = places({index: d.pending for index, d in decisions.items()}, lattice)
+    waiting = waypoints({index: d.pending for index, d in decisions.items()}, lattice)
     if not waiting:
         return
-    cells = sum(place.cells for place in waiting)
+    cells = sum(point.cells for point in waiting)
     keep = "1 cell keeps its" if cells == 1 else f"{cells} cells keep their"
     print(f"{keep} points: that something there still stands is likelier than {budget:g}. Drive by:")
-    rows = [(f"{p.x:.1f}, {p.y:.1f}", str(p.cells), f"{p.probability:.2g}") for p in waiting[:_MOST_PLACES]]
+    rows = [(f"{p.x:.1f}, {p.y:.1f}", str(p.cells), f"{p.probability:.2g}") for p in waiting[:_MOST_WAYPOINTS]]
     print_table(("x, y (map metres)", "cells", "likeliest"), rows)
-    if len(waiting) > _MOST_PLACES:
-        print(f"and {len(waiting) - _MOST_PLACES} smaller places")
+    if len(waiting) > _MOST_WAYPOINTS:
+        print(f"and {len(waiting) - _MOST_WAYPOINTS} smaller ones")

@@ -18,7 +18,7 @@ from mapvote.core.types import F64, I64, U8, CellState
 from mapvote.fusion.odds import Odds
 from mapvote.fusion.probability import false_deletion_probability
 
-PLACE_CELLS = 20
+WAYPOINT_CELLS = 20
 """6 m: who drives by sees all of it."""
 
 
@@ -67,7 +67,7 @@ def standing_beside(states: U8, cells: I64) -> I64:
 
 
 @dataclass(frozen=True, slots=True)
-class Place:
+class Waypoint:
     """Cells that wait near each other: somebody should drive by there."""
 
     x: float
@@ -78,15 +78,15 @@ class Place:
     """Of the likeliest of them."""
 
 
-def places(pending: Mapping[TileIndex, Pending], lattice: Lattice) -> list[Place]:
-    """What waits on some tiles, by squares of PLACE_CELLS cells, those with the most cells first."""
+def waypoints(pending: Mapping[TileIndex, Pending], lattice: Lattice) -> list[Waypoint]:
+    """What waits on some tiles, by squares of WAYPOINT_CELLS cells, those with the most cells first."""
     found = [(tile, waits) for tile, waits in pending.items() if len(waits.cells)]
     if not found:
         return []
     rows = np.concatenate([tile[0] * TILE_CELLS + waits.cells // TILE_CELLS for tile, waits in found])
     cols = np.concatenate([tile[1] * TILE_CELLS + waits.cells % TILE_CELLS for tile, waits in found])
     probability = np.concatenate([waits.probability for _, waits in found])
-    squares = np.stack([rows // PLACE_CELLS, cols // PLACE_CELLS], axis=1)
+    squares = np.stack([rows // WAYPOINT_CELLS, cols // WAYPOINT_CELLS], axis=1)
     square, size = np.unique(squares, axis=0, return_inverse=True, return_counts=True)[1:]
     square = square.reshape(-1)
     x = lattice.x0 + CELL_SIZE * (np.bincount(square, weights=cols) / size + 0.5)
@@ -94,4 +94,4 @@ def places(pending: Mapping[TileIndex, Pending], lattice: Lattice) -> list[Place
     likeliest = np.zeros(len(size))
     np.maximum.at(likeliest, square, probability)
     ranked = np.argsort(-size, kind="stable")
-    return [Place(float(x[i]), float(y[i]), int(size[i]), float(likeliest[i])) for i in ranked]
+    return [Waypoint(float(x[i]), float(y[i]), int(size[i]), float(likeliest[i])) for i in ranked]

@@ -208,3 +208,17 @@ def test_a_publish_tells_how_far_it_is_and_can_be_cancelled(server: Server) -> N
             assert client.get("/v1/publish", headers=who["boss"]).json() == {"running": []}
             again = client.post("/v1/publish", headers=who["boss"], json={}).json()
             assert again["published"], "the votes still stand"
+
+
+def test_what_is_beyond_the_budget_is_listed_apart_with_where_to_drive_by(server: Server) -> None:
+    """Ballots that do not say how sure they are: a budget so small lets nothing go."""
+    client, store, who = server
+    policy.set_values(store, {"fuse.false_deletions": "1e-6"}, by="test")
+    told = client.get("/v1/desk", headers=who["anna"]).json()
+    assert told["pending"]["features"] == []
+    assert [f["properties"]["drive_by"] for f in told["waiting"]] == [[3.45, 3.15], [80.25, 3.15]]
+    listed = client.get("/v1/desk", params={"format": "csv"}, headers=who["anna"]).text.splitlines()
+    assert len(listed) == 3
+    assert "drive_by" in listed[0]
+    assert all(row.startswith("waits.demolished.") for row in listed[1:])
+    assert published(server)["published"] is False

@@ -10,7 +10,7 @@ import sqlalchemy as sa
 
 from hand_made import Say, make_ballot, states_plane, two_walls
 from mapvote.codec.ballot import encode
-from mapvote.codec.odds import MOST
+from mapvote.codec.odds import MOST, STEPS
 from mapvote.config import FuseSettings
 from mapvote.core.types import CellState, MapvoteError
 from mapvote.server.insight.desk import desk, review
@@ -28,7 +28,7 @@ from mapvote.server.store.store import Store
 
 WALL = [(10, 10), (10, 11), (10, 12)]
 BUDGET = Policy(fuse=FuseSettings(max_deleted_share=1.0, false_deletions=0.01))
-SURE, UNSURE = [40, 40, 40], [40, -MOST, 40]
+SURE, UNSURE = [20, 20, 20], [20, -MOST, 20]
 
 
 @pytest.fixture
@@ -67,7 +67,7 @@ def test_a_cell_beyond_the_budget_keeps_its_points_until_vehicles_are_surer(stor
     assert "stands: surveyed" in story.thing
     assert [w["id"] for w in desk(store).waiting] == [waits["id"]], "though nothing has come since"
     assert not publish(store).published
-    vote_middle(store, "d2", 40)
+    vote_middle(store, "d2", 20)
     assert desk(store).waiting == []
     assert publish(store).deleted == 3
 
@@ -99,10 +99,12 @@ def test_a_policy_without_a_budget_lets_it_go(store: Store) -> None:
 
 def test_how_sure_they_were_is_told_of_cells_and_changes_and_outlives_the_round(store: Store) -> None:
     vote(store, "d1", SURE, "a")
-    vote(store, "d1", [10, 10, 10], "b")
+    vote(store, "d1", [5, 5, 5], "b")
     assert publish(store).deleted == 9
     story = middle(store)
-    assert [vote.sure for vote in story.votes] == [pytest.approx(1 / (1 + np.exp(-s / 8)), abs=1e-4) for s in (40, 10)]
+    assert [vote.sure for vote in story.votes] == [
+        pytest.approx(1 / (1 + np.exp(-steps / STEPS)), abs=1e-4) for steps in (20, 5)
+    ]
     assert story.probability == pytest.approx(0.80, abs=0.02), "as the one says who is less sure"
     (change,) = changes_between(store, 1, 2)["features"]
     assert change["properties"]["probability"] == pytest.approx(story.probability, abs=1e-3)
