@@ -26,6 +26,7 @@ from mapvote.fusion.odds import Odds, agreed_odds
 from mapvote.fusion.outliers import contradictors, deniers
 from mapvote.fusion.pending import Pending, beyond_budget
 from mapvote.fusion.persistence import denied_last, doubtful, remembered, temporary
+from mapvote.fusion.rims import without_rims
 from mapvote.fusion.sparse_columns import Words, counted, learned, nothing_reached, packed
 from mapvote.fusion.spent import changed_in
 from mapvote.fusion.tile_vote import TileVote, one_each
@@ -41,7 +42,7 @@ class Decision:
     """What the vehicles decided about one tile, and what came of it."""
 
     states: U8
-    """(256, 256) CellState or NO_VOTE."""
+    """(256, 256) CellState or NO_VOTE; of rims what the world is, not what was voted (fusion/rims.py)."""
     tally: NDArray[Any]
     """(256, 256, 5) in VOTE_UNITs, see :func:`count`."""
     vehicles: int
@@ -109,6 +110,13 @@ class Heard:
     odds: Odds = field(default_factory=Odds.none)
     """See :class:`Decision`."""
     pending: Pending = field(default_factory=Pending.none)
+    voted: U8 | None = None
+    """(256, 256) as the points are edited, where that differs from ``states``: at rims (fusion/rims.py)."""
+
+    @property
+    def edits(self) -> U8:
+        """(256, 256) the states by which the tile's points come and go."""
+        return self.states if self.voted is None else self.voted
 
 
 def fuse_tile(
@@ -124,10 +132,10 @@ def fuse_tile(
     it. The rest as in :func:`decide_tile`.
     """
     heard = decide_tile(tile, drives, rule, settings, history)
-    edited, added, deleted = _edit(tile, heard.votes, heard.states, heard.quorum)
+    edited, added, deleted = _edit(tile, heard.votes, heard.edits, heard.quorum)
     if edited is not tile:
         memory = changed_in(version, tile, edited)
-        edited = edited.but(memory=remembered(memory, tile, edited, heard.votes, heard.states))
+        edited = edited.but(memory=remembered(memory, tile, edited, heard.votes, heard.edits))
     voters, why = len(heard.votes), (heard.copies, heard.odds, heard.pending)
     return Decision(heard.states, heard.tally, voters, added, deleted, *why), edited
 
@@ -162,7 +170,7 @@ def decide_tile(
     if len(pending.cells):
         states = states.copy()
         states.reshape(-1)[pending.cells] = int(CellState.UNDETERMINED)
-    return Heard(votes, states, tally, quorum, denied, passing, copies, odds, pending)
+    return Heard(votes, without_rims(states, odds), tally, quorum, denied, passing, copies, odds, pending, states)
 
 
 def _edit(tile: Tile, votes: Sequence[TileVote], states: U8, quorum: int) -> tuple[Tile, int, int]:
