@@ -148,3 +148,13 @@ def test_a_store_of_the_schema_before_is_upgraded_and_its_ballots_stand(database
     assert check(store) == []
     assert publish(store).deleted == 9
     store.close()
+
+
+def test_a_rim_goes_with_the_wall_beside_it_and_its_story_says_that_nothing_changed_there(database_url: str) -> None:
+    store = Store.create(database_url, two_walls(), Policy(fuse=FuseSettings(max_deleted_share=1.0)))
+    vote(store, "d1", UNSURE)
+    assert "rim: holds the noise of what changed in the next cell" in middle(store).thing
+    assert "rim" not in explain_cell(store, 10.5 * 0.3, 10.5 * 0.3).thing
+    assert publish(store).deleted == 9, "three points a cell, the rim's among them"
+    assert [state for _, state in middle(store).decisions] == ["unchanged_empty"]
+    store.close()
