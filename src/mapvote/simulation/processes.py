@@ -3,23 +3,31 @@
 from __future__ import annotations
 
 import multiprocessing
+import os
 import signal
 import sys
-from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor, wait
-from contextlib import contextmanager
+import threading
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ProcessPoolExecutor, wait
+from contextlib import contextmanager, suppress
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from sys import UnraisableHookArgs
+
+_SOON_S = 0.05
 
 
 @contextmanager
 def processes(workers: int) -> Iterator[ProcessPoolExecutor]:
-    """``workers`` spawned processes. On an error or Ctrl-C, what waits is dropped and what runs is ended at once.
+    """``workers`` spawned processes. On an error or Ctrl-C what waits is dropped, what runs is ended, and waited for.
 
     A terminal sends Ctrl-C to every process; here only the first one hears it. The others are told to end, so that
     they leave their own files whole, and nobody prints a traceback.
     """
     spawn = multiprocessing.get_context("spawn")
     before = set(multiprocessing.active_children())
-    with ProcessPoolExecutor(workers, mp_context=spawn, initializer=_end_when_told) as pool:
+    with _Pool(workers, mp_context=spawn, initializer=_listen) as pool:
         heard = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # a new process inherits what is blocked
         started = [pool.submit(_nothing) for _ in range(workers)]
         signal.pthread_sigmask(signal.SIG_SETMASK, heard)
@@ -27,14 +35,65 @@ def processes(workers: int) -> Iterator[ProcessPoolExecutor]:
             wait(started)
             yield pool
         except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
-            for process in set(multiprocessing.active_children()) - before:
-                process.terminate()
+            if all(start.done() for start in started):  # a process that does not listen yet would be killed by it
+                for process in set(multiprocessing.active_children()) - before:
+                    with suppress(ProcessLookupError):
+                        os.kill(process.pid or 0, signal.SIGUSR1)
+            pool.shutdown(wait=True, cancel_futures=True)
             raise
 
 
-def _end_when_told() -> None:
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
+class _Pool(ProcessPoolExecutor):
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        return super().submit(_until_told, fn, *args, **kwargs)
+
+
+class _Ear:
+    """What a process has been told. It may end in the middle of a task only: between two of them it may hold half a
+    result, which the first process would wait for for ever."""
+
+    told = False
+    working = False
+
+
+def _listen() -> None:
+    signal.signal(signal.SIGUSR1, _hear)
+    sys.unraisablehook = _hear_again
+    threading.Thread(target=_end_with_the_first, daemon=True).start()
+
+
+def _end_with_the_first() -> None:
+    """A first process that was killed tells nobody: without this the others would work, and then wait, for ever."""
+    first = multiprocessing.parent_process()
+    assert first is not None
+    first.join()
+    os._exit(143)
+
+
+def _hear(*_: object) -> None:
+    _Ear.told = True
+    if _Ear.working:
+        sys.exit(143)
+
+
+def _hear_again(lost: UnraisableHookArgs) -> None:
+    """Python drops what is raised while it takes an object away: what was told just then is told once more."""
+    if issubclass(lost.exc_type, SystemExit):
+        again = threading.Timer(_SOON_S, os.kill, (os.getpid(), signal.SIGUSR1))
+        again.daemon = True
+        again.start()
+    else:
+        sys.__unraisablehook__(lost)
+
+
+def _until_told(task: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
+    _Ear.working = True
+    try:
+        if _Ear.told:
+            sys.exit(143)
+        return task(*args, **kwargs)
+    finally:
+        _Ear.working = False
 
 
 def _nothing() -> None:
