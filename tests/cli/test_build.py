@@ -31,6 +31,7 @@ def survey(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return Path("survey")
 
 
+@pytest.mark.slow
 def test_build_draws_how_the_drives_fit_and_tells_the_height_over_the_ground(survey: Path) -> None:
     said = type_in(f"mapvote build {survey} --out map --report fit.png")
     assert "car: 24 of 24 scans, 23 m; off its prior by" in said

@@ -21,7 +21,7 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 
 def deaf(_):
     pathlib.Path("ready").touch()
-    return sum(range(40_000_000))  # seconds in one call: nothing is heard meanwhile
+    return sum(range(25_000_000))  # seconds in one call: nothing is heard meanwhile
 
 def long(_):
     pathlib.Path("ready").touch()
@@ -73,9 +73,10 @@ def interrupted(folder: Path, task: str, tasks: int, wait_s: float = 0.0, stop: 
 
 def test_ctrl_c_ends_a_process_that_waits_beside_one_that_hears_nothing(tmp_path: Path) -> None:
     """The one that waited ended first, and the other, told twice at once, waited for a next task for ever."""
-    assert interrupted(tmp_path, "deaf", 1, 0.2) == 130
+    assert interrupted(tmp_path, "deaf", 1, 0.1) == 130
 
 
+@pytest.mark.slow
 def test_ctrl_c_lets_a_task_leave_its_files_whole(tmp_path: Path) -> None:
     assert interrupted(tmp_path, "long", 4) == 130
     assert (tmp_path / "whole").exists()
@@ -88,10 +89,12 @@ def test_ctrl_c_while_a_large_result_is_on_its_way(tmp_path: Path, wait_s: float
     assert interrupted(tmp_path, "large", 40, wait_s) == 130
 
 
+@pytest.mark.slow
 def test_processes_end_with_a_first_one_that_was_killed(tmp_path: Path) -> None:
     assert interrupted(tmp_path, "long", 4, stop=signal.SIGKILL) == -signal.SIGKILL
 
 
+@pytest.mark.slow
 def test_an_error_in_one_task_ends_the_others_and_is_raised() -> None:
     start = time.monotonic()
     with pytest.raises(ZeroDivisionError), processes(2) as pool:

@@ -48,6 +48,7 @@ def test_pcd_round_trip_in_every_encoding(tmp_path: Path, encoding: str, double:
 everyone = st.tuples(st.integers(1, 50), st.integers(0, 2**31), st.floats(-4e6, 4e6))
 
 
+@pytest.mark.slow
 @settings(max_examples=8, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(everyone)
 def test_ply_and_las_keep_world_coordinates(tmp_path: Path, case: tuple[int, int, float]) -> None:

@@ -101,6 +101,7 @@ def test_a_stalled_body_is_cut(line: socket.socket, target: str) -> None:
     assert until_cut(line, 0.2, b" ") == b""
 
 
+@pytest.mark.slow
 def test_a_client_that_never_reads_is_cut(url: str, line: socket.socket) -> None:
     plane = httpx2.get(f"{url}/v1/map").json()["tiles"]["0,0"]["points"]
     line.sendall(f"GET /v1/tiles/{plane} HTTP/1.1\r\nHost: localhost\r\n\r\n".encode() * 3)

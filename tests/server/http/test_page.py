@@ -101,6 +101,7 @@ def ready(browser: Chromium, url: str) -> None:
     browser.wait("document.querySelectorAll('#pending button').length", 60)
 
 
+@pytest.mark.slow
 def test_the_cloud_is_drawn_and_nobody_else_is_asked(browser: Chromium, store: Path, tmp_path: Path) -> None:
     with serving(store, "--open", log=tmp_path / "log") as (url, _):
         ready(browser, url)

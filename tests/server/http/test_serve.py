@@ -70,6 +70,7 @@ def test_an_open_server_is_for_this_machine_alone(tmp_path: Path, host: str) -> 
     assert "this machine alone" in done.stderr
 
 
+@pytest.mark.slow
 def test_a_key_that_is_issued_later_closes_a_running_server_at_once(tmp_path: Path) -> None:
     """A revoked one leaves it closed: only keys can have been the reason to open it."""
     Store.create(f"sqlite:///{tmp_path / 's.db'}", two_walls()).close()

@@ -82,6 +82,7 @@ def test_the_verb_says_the_same(town: tuple[Path, str]) -> None:
     assert "contradi" in line, "a narrow terminal cuts or wraps the word"
 
 
+@pytest.mark.slow
 def test_the_page_on_a_real_server(town: tuple[Path, str], tmp_path: Path) -> None:
     if program() is None:
         pytest.skip("Chromium is not installed: apt-get install chromium")
