@@ -94,10 +94,9 @@ def count(votes: Sequence[TileVote], rule: Rule, min_votes: int) -> tuple[U8, ND
 
 @dataclass(frozen=True, slots=True)
 class Heard:
-    """What comes of the votes on a tile, before it is edited."""
+    """What comes of the votes on a tile, before it is edited: of those that are heard, one a vehicle."""
 
     votes: Sequence[TileVote]
-    """Those that are heard, one a vehicle."""
     states: U8
     """(256, 256) CellState or NO_VOTE."""
     tally: NDArray[Any]
@@ -170,7 +169,8 @@ def decide_tile(
     if len(pending.cells):
         states = states.copy()
         states.reshape(-1)[pending.cells] = int(CellState.UNDETERMINED)
-    return Heard(votes, without_rims(states, odds), tally, quorum, denied, passing, copies, odds, pending, states)
+    told = without_rims(states, odds, tile, votes)
+    return Heard(votes, told, tally, quorum, denied, passing, copies, odds, pending, voted=states)
 
 
 def _edit(tile: Tile, votes: Sequence[TileVote], states: U8, quorum: int) -> tuple[Tile, int, int]:

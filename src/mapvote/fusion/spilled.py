@@ -1,0 +1,138 @@
+"""Cells that changed by noise alone: the surface that came or went stands in the cell beside them.
+
+A wall two centimetres from the border of its cell leaves a part of its points in the next one. A plane through all
+points about, of both cells, tells nearly to the centimetre on which side it stands.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numba
+import numpy as np
+
+from mapvote.core.cells import flat_cells
+from mapvote.core.columns import column_bits
+from mapvote.core.grid import CELL_SIZE, CELLS, TILE_CELLS, Grid
+from mapvote.core.tile import Tile
+from mapvote.core.types import F32, F64, I64, U8, Bool, CellState
+from mapvote.fusion.tile_vote import TileVote
+
+REACH_M = 0.6
+"""How far about a point its plane is fitted: the points of voxels of .3 m, some ten of a wall's."""
+NEAR_M = 0.15
+"""As far as noise carries, half a cell: what lies deeper in its cell belongs there."""
+_ENOUGH = 6
+_FLAT = 2.0
+"""A plane: as many points, which spread as many times as far along it as across it."""
+_UPRIGHT = 0.5
+"""Sine of how far a wall may lean."""
+_STAY = 0.05
+"""As large a part of a cell's points may stay in it: beside them stands no plane."""
+
+
+def spilled(tile: Tile, votes: Sequence[TileVote], states: U8) -> I64:
+    """(n,) flat cells, ascending, that ``states`` (256, 256) call changed and that hold what spilled over.
+
+    What went is told by the points of the ``tile``, what came by those that ``votes`` offer; points in the next tile
+    are not asked. Every such cell lies beside a changed one of its kind with more points.
+    """
+    flat = states.reshape(-1)
+    found = [
+        _beside_their_surface(points, flat == kind, tile.window)
+        for points, kind in (
+            (_going(tile, flat), int(CellState.CHANGED_EMPTY)),
+            (_coming(votes, states, tile.window), int(CellState.CHANGED_OCCUPIED)),
+        )
+        if len(points) >= _ENOUGH
+    ]
+    return np.sort(np.concatenate([np.zeros(0, np.int64), *found]))
+
+
+def _going(tile: Tile, states: U8) -> F32:
+    points, cells = (part[states[tile.cells] == int(CellState.CHANGED_EMPTY)] for part in (tile.points, tile.cells))
+    z, ground, base = points[:, 2].astype(np.float64), tile.ground_z.reshape(-1)[cells], tile.base.reshape(-1)[cells]
+    return np.asarray(points[column_bits(z, ground, base)[1]])
+
+
+def _coming(votes: Sequence[TileVote], states: U8, window: Grid) -> F32:
+    found = [np.zeros((0, 3), dtype=np.float32)]
+    for vote in votes:
+        if vote.new_points is not None and len(vote.new_points):
+            cells = flat_cells(window, vote.new_points)
+            found.append(vote.new_points[vote.agreed(cells, states, CellState.CHANGED_OCCUPIED)])
+    return np.concatenate(found)
+
+
+def _beside_their_surface(points: F32, changed: Bool, window: Grid) -> I64:
+    """(n,) flat cells whose ``points`` (m, 3) lie at their borders, and on planes that stand in the next ``changed``
+    (65536,) cell."""
+    points = points[np.lexsort(points.T)]  # no sum may depend on the order of votes
+    cells = flat_cells(window, points)
+    order = np.argsort(cells, kind="stable")
+    points, cells = points[order], cells[order]
+    count = np.bincount(cells, minlength=CELLS)
+    asked = np.flatnonzero(_at_a_fuller_one(points, cells, count, changed)[cells])
+    stands = _on_planes(points, asked, np.concatenate([[0], np.cumsum(count)]), cells)
+    own, to = cells[asked], flat_cells(window, stands.astype(np.float32))
+    away = np.bincount(own[(to != own) & changed[to] & (count[to] > count[own])], minlength=CELLS)
+    return np.flatnonzero((away > 0) & (away >= (1.0 - _STAY) * count))
+
+
+def _at_a_fuller_one(points: F32, cells: I64, count: I64, changed: Bool) -> Bool:
+    """(65536,) of which flat cells all points (m, 3) lie near one side, and across it lies a ``changed`` cell with more
+    of them. ``cells`` (m,) of the points, ``count`` (65536,) how many each has."""
+    found = np.zeros(CELLS, dtype=np.bool_)
+    wide = TILE_CELLS + 2
+    held = np.pad(np.where(changed, count, 0).reshape(TILE_CELLS, TILE_CELLS), 1).reshape(-1)
+    within = CELL_SIZE * (points[:, :2] / np.float32(CELL_SIZE) % 1.0)
+    for axis, across, along in ((0, 1, wide), (1, wide, 1)):
+        for depth, step in ((within[:, axis], -across), (CELL_SIZE - within[:, axis], across)):
+            deep = np.bincount(cells[depth > NEAR_M], minlength=CELLS)
+            near = np.flatnonzero((count > 0) & (deep <= _STAY * count))
+            beside = (near // TILE_CELLS + 1) * wide + near % TILE_CELLS + 1 + step
+            fullest = np.max([held[beside - along], held[beside], held[beside + along]], axis=0)
+            found[near[fullest > count[near]]] = True
+    return found
+
+
+def _on_planes(points: F32, asked: I64, first: I64, cells: I64) -> F64:
+    """(k, 3) the points that are ``asked`` (k,), each moved onto the upright plane through those about it, where there
+    is one and it is near."""
+    about = points[asked].astype(np.float64)
+    n, mean, spread = _moments(points, asked, first, cells)
+    variance, axes = np.linalg.eigh(spread)
+    normal = axes[:, :, 0]
+    plane = (n >= _ENOUGH) & (variance[:, 1] > _FLAT**2 * variance[:, 0]) & (np.abs(normal[:, 2]) < _UPRIGHT)
+    off = (mean * normal).sum(axis=1)
+    plane &= np.abs(off) <= NEAR_M
+    return np.asarray(about + np.where(plane, off, 0.0)[:, None] * normal)
+
+
+@numba.njit(cache=True, nogil=True)
+def _moments(points: F32, asked: I64, first: I64, cells: I64) -> tuple[I64, F64, F64]:
+    """(n (k,), mean (k, 3) from the point itself, covariance (k, 3, 3)) of the points within REACH_M of each that is
+    ``asked`` (k,). ``points`` (m, 3) in the order of their ``cells`` (m,); ``first`` (65537,) of each cell."""
+    reach = int(np.ceil(REACH_M / CELL_SIZE))
+    number, mean, spread = np.zeros(len(asked), np.int64), np.zeros((len(asked), 3)), np.zeros((len(asked), 3, 3))
+    away = np.empty(3)
+    for k in range(len(asked)):
+        point = points[asked[k]]
+        row, col = divmod(cells[asked[k]], TILE_CELLS)
+        for r in range(max(row - reach, 0), min(row + reach + 1, TILE_CELLS)):
+            left, right = max(col - reach, 0), min(col + reach, TILE_CELLS - 1)
+            for i in range(first[r * TILE_CELLS + left], first[r * TILE_CELLS + right + 1]):
+                for a in range(3):
+                    away[a] = np.float64(points[i, a]) - np.float64(point[a])
+                if away[0] ** 2 + away[1] ** 2 + away[2] ** 2 <= REACH_M**2:
+                    number[k] += 1
+                    for a in range(3):
+                        mean[k, a] += away[a]
+                        for b in range(3):
+                            spread[k, a, b] += away[a] * away[b]
+        for a in range(3):
+            mean[k, a] /= number[k]
+        for a in range(3):
+            for b in range(3):
+                spread[k, a, b] = spread[k, a, b] / number[k] - mean[k, a] * mean[k, b]
+    return number, mean, spread

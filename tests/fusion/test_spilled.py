@@ -1,0 +1,149 @@
+"""A plane through what came or went tells which of two cells it stands in, however its points are strewn."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from mapvote.core.grid import CELL_SIZE, CELLS, TILE_CELLS, Lattice
+from mapvote.core.tile import Tile
+from mapvote.core.types import F32, U8, CellState
+from mapvote.fusion.spilled import REACH_M, _moments, spilled
+from mapvote.fusion.tile_vote import TileVote
+
+CE, CO = CellState.CHANGED_EMPTY, CellState.CHANGED_OCCUPIED
+WINDOW = Lattice().tile((0, 0))
+BORDER_M = 30.0
+"""x of a border of cells, between columns 99 and 100."""
+
+
+def wall(x: float, spill: F32 | None = None, length_m: float = 3.0, height_m: float = 3.0) -> F32:
+    """(n, 3) float32: voxels' points of a wall along y at ``x``, with ``spill``, its points at other x."""
+    y, z = np.meshgrid(np.arange(40.05, 40.0 + length_m, 0.3), np.arange(0.45, 0.3 + height_m, 0.3))
+    points = np.column_stack([np.full(y.size, x), y.ravel(), z.ravel()]).astype(np.float32)
+    return points if spill is None else np.concatenate([points, spill])
+
+
+def spill_at(x: float, every: int = 3) -> F32:
+    """Some voxels' worth of the wall's points that noise carried to ``x``."""
+    points = wall(x)[::every].copy()
+    points[:, 1] += np.float32(0.1)
+    return points
+
+
+def tile_of(points: F32) -> Tile:
+    flat = np.zeros((TILE_CELLS, TILE_CELLS), np.float32)
+    return Tile(WINDOW, points, flat)
+
+
+def cells_of(points: F32) -> set[int]:
+    at = np.floor(points[:, :2] / np.float32(CELL_SIZE)).astype(int)
+    return set((at[:, 1] * TILE_CELLS + at[:, 0]).tolist())
+
+
+def states_of(points: F32, state: CellState) -> U8:
+    states = np.full(CELLS, CellState.UNCHANGED_EMPTY, np.uint8)
+    states[sorted(cells_of(points))] = state
+    return states.reshape(TILE_CELLS, TILE_CELLS)
+
+
+def vote_for(points: F32, name: str = "a") -> TileVote:
+    return TileVote(vehicle=name, end_ns=0, digest=name, states=states_of(points, CO), new_points=points)
+
+
+def all_but_the_ends(found: set[int], cells: set[int]) -> bool:
+    """At a wall's ends few points make no plane."""
+    return sorted(cells)[1:-1] == sorted(found & set(sorted(cells)[1:-1])) and found <= cells
+
+
+@pytest.mark.parametrize("side", [-1, 1])
+def test_of_a_wall_that_went_at_a_cells_border_only_the_cell_that_it_stood_in_changed(side: int) -> None:
+    there, beyond = wall(BORDER_M + side * 0.04), spill_at(BORDER_M - side * 0.01)
+    points = np.concatenate([there, beyond])
+    found = set(spilled(tile_of(points), [], states_of(points, CE)).tolist())
+    assert all_but_the_ends(found, cells_of(beyond))
+
+
+def test_of_a_wall_that_came_likewise_by_the_points_that_all_vehicles_offer() -> None:
+    there, beyond = wall(BORDER_M + 0.04), spill_at(BORDER_M - 0.01)
+    points = np.concatenate([there, beyond])
+    votes = [vote_for(points[::2]), vote_for(points[1::2], "b"), TileVote(vehicle="c", end_ns=0, digest="c")]
+    found = set(spilled(Tile.empty(WINDOW), votes, states_of(points, CO)).tolist())
+    assert all_but_the_ends(found, cells_of(beyond))
+
+
+@pytest.mark.parametrize(
+    ("why", "spill"),
+    [
+        ("it holds points that no noise carries so far", spill_at(BORDER_M - 0.17)),
+        ("it holds as many points as the other", spill_at(BORDER_M - 0.05, every=1)),
+    ],
+)
+def test_the_cell_beside_a_wall_changed_too_if(why: str, spill: F32) -> None:
+    points = wall(BORDER_M + 0.05, spill)
+    assert not len(spilled(tile_of(points), [], states_of(points, CE))), why
+
+
+def test_what_lies_flat_or_stands_alone_spills_nothing() -> None:
+    x, y = np.meshgrid(np.arange(29.91, 30.6, 0.3), np.arange(40.05, 43.0, 0.3))
+    roof = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, 3.0)]).astype(np.float32)
+    pole = np.column_stack([np.tile([29.98, 30.02, 30.03], 2), np.full(6, 40.1), np.arange(6) * 0.3 + 0.45])
+    for points in (roof, pole.astype(np.float32)):
+        assert not len(spilled(tile_of(points), [], states_of(points, CE)))
+
+
+def test_a_wall_whose_other_cell_did_not_change_keeps_what_did() -> None:
+    there, beyond = wall(BORDER_M + 0.04), spill_at(BORDER_M - 0.01)
+    points = np.concatenate([there, beyond])
+    assert not len(spilled(tile_of(points), [], states_of(beyond, CE)))
+
+
+def test_ground_that_lies_in_changed_cells_says_nothing_of_them() -> None:
+    there, beyond = wall(BORDER_M + 0.04), spill_at(BORDER_M - 0.01)
+    ground = np.column_stack([np.full(10, 29.75), np.arange(10) * 0.3 + 40.15, np.zeros(10)]).astype(np.float32)
+    points = np.concatenate([there, beyond, ground])
+    states = states_of(np.concatenate([there, beyond]), CE)
+    assert all_but_the_ends(set(spilled(tile_of(points), [], states).tolist()), cells_of(beyond))
+
+
+def test_at_a_tiles_edge_nothing_is_asked_of_the_next_tile() -> None:
+    edge = TILE_CELLS * CELL_SIZE
+    points = np.concatenate([wall(edge - 0.05), wall(0.05)])
+    assert not len(spilled(tile_of(points), [], states_of(points, CE)))
+
+
+@given(st.lists(st.integers(0, 10**6), min_size=3, max_size=3), st.floats(-0.06, 0.06))
+def test_neither_the_order_of_points_nor_of_votes_matters_and_only_changed_cells_are_found(
+    seeds: list[int], at: float
+) -> None:
+    rng = np.random.default_rng(seeds)
+    points = wall(BORDER_M + at)
+    points[:, 0] += rng.normal(0.0, 0.03, len(points)).astype(np.float32)
+    states = states_of(points, CO)
+    votes = [vote_for(points[i::3], str(i)) for i in range(3)]
+    found = spilled(Tile.empty(WINDOW), votes, states)
+    assert np.isin(states.reshape(-1)[found], [CO]).all()
+    assert (np.diff(found) > 0).all()
+    mixed = [vote_for(rng.permutation(points[i::3]), str(i)) for i in (2, 0, 1)]
+    assert (spilled(Tile.empty(WINDOW), mixed, states) == found).all()
+    went = spilled(tile_of(points), [], states_of(points, CE))
+    assert (went == found).all(), "what came and what went are judged alike"
+
+
+def test_moments_are_those_of_all_points_within_reach() -> None:
+    rng = np.random.default_rng(5)
+    points = rng.uniform((0, 0, 0), (3, 3, 2), (400, 3)).astype(np.float32)
+    cells = (points[:, 1] // np.float32(CELL_SIZE) * TILE_CELLS + points[:, 0] // np.float32(CELL_SIZE)).astype(int)
+    order = np.argsort(cells, kind="stable")
+    points, cells = points[order], cells[order]
+    first = np.concatenate([[0], np.cumsum(np.bincount(cells, minlength=CELLS))])
+    asked = np.arange(0, 400, 7)
+    number, mean, spread = _moments(points, asked, first, cells)
+    for k, i in enumerate(asked):
+        off = points.astype(np.float64) - points[i]
+        near = off[np.linalg.norm(off, axis=1) <= REACH_M]
+        assert number[k] == len(near)
+        np.testing.assert_allclose(mean[k], near.mean(axis=0), atol=1e-9)
+        np.testing.assert_allclose(spread[k], np.cov(near.T, bias=True), atol=1e-9)
