@@ -18,13 +18,13 @@ from mapvote.core.tile import Tile
 from mapvote.core.types import F32, F64, I64, U8, Bool, CellState
 from mapvote.fusion.tile_vote import TileVote
 
-REACH_M = 0.6
-"""How far about a point its plane is fitted: the points of voxels of .3 m, some ten of a wall's."""
+REACH_M = 0.45
+"""How far about a point its plane is fitted, a voxel and a half: some eight points of a wall."""
 NEAR_M = 0.15
 """As far as noise carries, half a cell: what lies deeper in its cell belongs there."""
 _ENOUGH = 6
-_FLAT = 2.0
-"""A plane: as many points, which spread as many times as far along it as across it."""
+_FLAT = 3.0
+"""A plane: as many points, whose variance is as many times as large along it as across it."""
 _UPRIGHT = 0.5
 """Sine of how far a wall may lean."""
 _STAY = 0.05
@@ -103,7 +103,7 @@ def _on_planes(points: F32, asked: I64, first: I64, cells: I64) -> F64:
     n, mean, spread = _moments(points, asked, first, cells)
     variance, axes = np.linalg.eigh(spread)
     normal = axes[:, :, 0]
-    plane = (n >= _ENOUGH) & (variance[:, 1] > _FLAT**2 * variance[:, 0]) & (np.abs(normal[:, 2]) < _UPRIGHT)
+    plane = (n >= _ENOUGH) & (variance[:, 1] > _FLAT * variance[:, 0]) & (np.abs(normal[:, 2]) < _UPRIGHT)
     off = (mean * normal).sum(axis=1)
     plane &= np.abs(off) <= NEAR_M
     return np.asarray(about + np.where(plane, off, 0.0)[:, None] * normal)
