@@ -60,7 +60,7 @@ TESTS = {
     "server/store/eligible_votes.py": ["server/store/test_eligible_votes.py"],
     "server/store/hold.py": ["server/store/test_hold.py"],
     "detection/paper.py": ["detection/test_paper.py"],
-    "detection/counters.py": ["detection/test_counters.py"],
+    "detection/counters.py": ["detection/test_counters.py", "detection/test_surface_counts.py"],
     "detection/near_hits.py": ["detection/test_near_hits.py"],
     "detection/columns.py": ["detection/test_columns.py", "detection/test_voters.py"],
     "detection/regions.py": ["detection/test_regions.py", "detection/test_columns.py", "detection/test_voters.py"],

@@ -56,6 +56,12 @@ def test_a_wall_set_back_by_half_a_metre_is_an_old_wall_gone_and_a_new_one_come(
     assert votes.gone[ROW, 105] == np.uint64(0b111100)
 
 
+def test_of_a_new_wall_its_own_voxels_are_new_and_nothing_of_what_did_not_change() -> None:
+    votes = after(street(WALL, HEIGHTS), standing_at(OLD_Y + 0.6))
+    assert votes.new[ROW + 2, 105] == np.uint64(0b111100)
+    assert not votes.new[votes.states != CO].any()
+
+
 def test_a_wall_met_some_centimetres_off_its_place_stands() -> None:
     votes = after(street(WALL, HEIGHTS), standing_at(OLD_Y + 0.5 * CELL_SIZE + 0.5 * HIT_REACH_M))
     assert all(votes.states[cell] == UO for cell in WALL)

@@ -51,6 +51,13 @@ def test_where_nobody_says_how_sure_he_is_there_is_no_rim() -> None:
     assert without_rims(states, Odds.none(), BARE, []) is states
 
 
+def test_a_rim_touches_a_likely_cell_on_any_side_and_two_cells_away_is_none() -> None:
+    for row, col in [(i, j) for i in range(7, 12) for j in range(7, 12) if (i, j) != (9, 9)]:
+        states, odds = tile_of({(9, 9): (CE, SURE), (row, col): (CE, UNSURE)})
+        beside = max(abs(row - 9), abs(col - 9)) == 1
+        assert rims(states, odds).tolist() == ([row * TILE_CELLS + col] if beside else [])
+
+
 def test_across_a_tiles_border_nothing_is_a_rim_and_its_corners_are_no_trouble() -> None:
     end = TILE_CELLS - 1
     states, odds = tile_of({(0, 0): (CE, UNSURE), (end, end): (CE, SURE), (0, end): (CO, UNSURE), (end, 0): (CO, SURE)})

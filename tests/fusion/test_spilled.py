@@ -66,6 +66,17 @@ def test_of_a_wall_that_went_at_a_cells_border_only_the_cell_that_it_stood_in_ch
     assert all_but_the_ends(found, cells_of(beyond))
 
 
+@pytest.mark.parametrize("side", [-1, 1])
+def test_likewise_of_a_wall_along_the_other_axis_as_near_to_the_tiles_last_column_as_can_be(side: int) -> None:
+    there, beyond = wall(BORDER_M + side * 0.04), spill_at(BORDER_M - side * 0.01)
+    shift = np.float32((TILE_CELLS - 144) * CELL_SIZE)
+    points = np.concatenate([there, beyond])[:, [1, 0, 2]] + np.array([shift, 0, 0], np.float32)
+    spill = beyond[:, [1, 0, 2]] + np.array([shift, 0, 0], np.float32)
+    assert points[:, 0].max() > (TILE_CELLS - 2) * CELL_SIZE
+    found = set(spilled(tile_of(points), [], states_of(points, CE)).tolist())
+    assert all_but_the_ends(found, cells_of(spill))
+
+
 def test_of_a_wall_that_came_likewise_by_the_points_that_all_vehicles_offer() -> None:
     there, beyond = wall(BORDER_M + 0.04), spill_at(BORDER_M - 0.01)
     points = np.concatenate([there, beyond])
