@@ -68,6 +68,8 @@ def test_a_surface_is_as_deep_as_its_point_that_is_farthest_from_the_cells_sides
     assert depths_m(states, ground, rim).tolist()[0] == 0.0, "ground is no surface that goes"
     assert depths_m(states_plane({(9, 3): CO}), None, rim) == pytest.approx([0.4 * CELL_SIZE])
     assert depths_m(states_plane(fill=NO_VOTE), None, rim[:0]).shape == (0,)
+    last = np.array([[76.7, 76.6, 1.0], [76.8, 76.8, 1.0]], np.float32)
+    assert depths_m(states_plane({(255, 255): CO}), None, last) == pytest.approx([0.1], abs=1e-5), "at the tile's end"
 
 
 @settings(max_examples=30, deadline=None)

@@ -74,6 +74,15 @@ def test_a_pole_that_went_is_a_change_and_a_twig_is_none() -> None:
     assert after(street([(ROW, 105)], tall[1:]), standing_at(OLD_Y + 9)).states[ROW, 105] == UN
 
 
+def test_a_twig_near_a_wall_that_went_does_not_fall_with_it_for_rays_decided_what_it_is() -> None:
+    ground = wall([(r, c) for r in range(85, 125) for c in range(85, 135)], [0.0])
+    twig = wall([(ROW + 4, 105)], [0.75 + 0.3 * k for k in range(SUPPORT - 1)])
+    votes = after(
+        make_map({(0, 0): make_tile(np.concatenate([wall(WALL, HEIGHTS), twig, ground]))}), standing_at(OLD_Y + 9)
+    )
+    assert [votes.states[ROW, 105], votes.states[ROW + 4, 105]] == [CE, UN]
+
+
 def test_twigs_at_the_edge_of_all_that_is_known_are_no_pole_together() -> None:
     ground = wall([(r, c) for r in range(30) for c in range(95, 125)], [0.0])
     twigs = wall([(0, 105), (0, 107)], [0.75 + 0.3 * k for k in range(SUPPORT - 1)])

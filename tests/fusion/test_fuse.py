@@ -109,6 +109,7 @@ def standing(masks: list[int], state: int = KEPT) -> list[TileVote]:
         ([0b0110, 0b0000, 0b0000], [0.45, 0.75, 1.05]),
         ([0b0110, 0b0100, 0b0000], [0.45, 1.05]),
         ([0b0110, 0b0110, 0, 0], [0.45, 0.75, 1.05]),
+        ([0b0110, 0b0110, 0b0110, 0, 0], [1.05]),
     ],
 )
 def test_remnants_go_from_a_cell_that_stands_if_most_vehicles_mark_them(masks: list[int], left: list[float]) -> None:
@@ -215,6 +216,7 @@ def test_free_space_is_learned_by_enough_vehicles_and_not_where_the_map_has_poin
     assert int(edited.free[CELL]) == 0b1011
     assert int(edited.free[50, 50]) == 0b1111
     assert alone is tile, "one vehicle teaches nothing, and a map that never learned must not look like one that did"
+    assert fuse(tile, votes[:1])[1].free is not None, "unless one is all that a change takes"
 
 
 def test_a_drive_that_is_silent_never_overrides_and_the_later_one_wins() -> None:

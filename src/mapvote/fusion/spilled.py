@@ -83,16 +83,15 @@ def _at_a_fuller_one(points: F32, cells: I64, count: I64, changed: Bool) -> Bool
     """(65536,) of which flat cells all points (m, 3) lie near one side, and across it lies a ``changed`` cell with more
     of them. ``cells`` (m,) of the points, ``count`` (65536,) how many each has."""
     found = np.zeros(CELLS, dtype=np.bool_)
-    wide = TILE_CELLS + 2
+    filled, wide = np.flatnonzero(count), TILE_CELLS + 2
     held = np.pad(np.where(changed, count, 0).reshape(TILE_CELLS, TILE_CELLS), 1).reshape(-1)
     within = CELL_SIZE * (points[:, :2] / np.float32(CELL_SIZE) % 1.0)
-    for axis, across, along in ((0, 1, wide), (1, wide, 1)):
-        for depth, step in ((within[:, axis], -across), (CELL_SIZE - within[:, axis], across)):
+    for axis, step in ((0, 1), (1, wide)):
+        for depth, across in ((within[:, axis], -step), (CELL_SIZE - within[:, axis], step)):
             deep = np.bincount(cells[depth > NEAR_M], minlength=CELLS)
-            near = np.flatnonzero((count > 0) & (deep <= _STAY * count))
-            beside = (near // TILE_CELLS + 1) * wide + near % TILE_CELLS + 1 + step
-            fullest = np.max([held[beside - along], held[beside], held[beside + along]], axis=0)
-            found[near[fullest > count[near]]] = True
+            near = filled[deep[filled] <= _STAY * count[filled]]
+            beside = held[(near // TILE_CELLS + 1) * wide + near % TILE_CELLS + 1 + across]
+            found[near[beside > count[near]]] = True
     return found
 
 
