@@ -15,8 +15,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from mapvote.config import Settings
-from mapvote.core.geometry import inverse, rotation_angle, transform
+from mapvote.core.geometry import transform
 from mapvote.core.heights import Heights, check_heights, two_levels
+from mapvote.core.motions import inverses, rotation_angles
 from mapvote.core.point_map import PointMap, map_from_points
 from mapvote.core.types import F64, Bool, Drive, MapvoteError
 from mapvote.slam.accumulate import Layer
@@ -143,7 +144,7 @@ def _track(drive: Drive, T_map_lidar: F64, found: Surveyed, heights: Heights, si
     if drive.T_map_lidar_prior is not None:
         prior = drive.T_map_lidar_prior
         off = np.linalg.norm(T_map_lidar[:, :3, 3] - prior[:, :3, 3], axis=1)
-        turn = [rotation_angle(inverse(a) @ b) for a, b in zip(prior, T_map_lidar, strict=True)]
+        turn = rotation_angles(inverses(prior) @ T_map_lidar)
         drift = Drift(float(np.median(off)), float(off.max()), float(off[-1]), float(np.degrees(np.median(turn))))
     return DriveTrack(
         drive.vehicle, drive.drive_id, T_map_lidar, found.registered, length, drift, heights, found.broken, sigma_m

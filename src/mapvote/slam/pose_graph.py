@@ -13,7 +13,7 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse.linalg import splu, spsolve
 
-from mapvote.core.geometry import exp, hat, inverse, log
+from mapvote.core.motions import adjoints, exps, inverses, logs
 from mapvote.core.types import F64, I64
 
 
@@ -44,22 +44,13 @@ class Anchors:
     """(k,) in (0, 1], how far each is believed; None: all."""
 
 
-def adjoint(T: F64) -> F64:
-    """(6, 6) with exp(adjoint(T) xi) = T exp(xi) T^-1 (translation first)."""
-    R = T[:3, :3]
-    out = np.zeros((6, 6))
-    out[:3, :3] = out[3:, 3:] = R
-    out[:3, 3:] = hat(T[:3, 3]) @ R
-    return out
-
-
 def optimise(T_map: F64, links: list[Links], anchors: list[Anchors], iterations: int = 4) -> F64:
     """Poses (n, 4, 4) moved to the least-squares solution; those that nothing fixes stay where they are."""
     poses = T_map.copy()
     for _ in range(iterations):
         H, gradient = _normal_equations(poses, links, anchors)
         step = -np.asarray(spsolve(H, gradient.ravel())).reshape(len(poses), 6)
-        poses = np.array([T @ exp(xi) for T, xi in zip(poses, step, strict=True)])
+        poses = poses @ exps(step)
         if np.abs(step).max(initial=0.0) < 1e-6:
             break
     return poses
@@ -81,36 +72,35 @@ def _normal_equations(poses: F64, links: list[Links], anchors: list[Anchors]) ->
     """(6n, 6n) and (n, 6) of a Gauss-Newton step T exp(step). A tiny weight on the step itself keeps what is free."""
     n = len(poses)
     gradient = np.zeros((n, 6))
-    blocks: dict[tuple[int, int], F64] = {(i, i): 1e-6 * np.eye(6) for i in range(n)}
-
-    def enter(i: int, j: int, block: F64) -> None:
-        blocks[i, j] = blocks.get((i, j), np.zeros((6, 6))) + block
-
+    every = np.arange(n)
+    blocks = [(every, every, np.broadcast_to(1e-6 * np.eye(6), (n, 6, 6)))]
     for link in links:
-        W = _weight(link.sigma_m, link.sigma_rad)
-        for i, j, Z in zip(link.first.tolist(), link.second.tolist(), link.T_first_second, strict=True):
-            T_i_j = inverse(poses[i]) @ poses[j]
-            r = log(inverse(Z) @ T_i_j)
-            A = -adjoint(inverse(T_i_j))
-            gradient[i] += A.T @ W @ r
-            gradient[j] += W @ r
-            enter(i, i, A.T @ W @ A)
-            enter(j, j, W)
-            enter(i, j, A.T @ W)
-            enter(j, i, W @ A)
+        W, (i, j) = _weight(link.sigma_m, link.sigma_rad), (link.first, link.second)
+        T_i_j = inverses(poses[i]) @ poses[j]
+        r = logs(inverses(link.T_first_second) @ T_i_j)
+        A_t = -adjoints(inverses(T_i_j)).transpose(0, 2, 1)
+        A_t_W = A_t * W
+        np.add.at(gradient, i, (A_t_W * r[:, None, :]).sum(axis=2))
+        np.add.at(gradient, j, W * r)
+        blocks += [
+            (i, i, A_t_W @ A_t.transpose(0, 2, 1)),
+            (j, j, np.broadcast_to(np.diag(W), (len(j), 6, 6))),
+            (i, j, A_t_W),
+            (j, i, A_t_W.transpose(0, 2, 1)),
+        ]
     for anchor in anchors:
-        W = _weight(anchor.sigma_m, anchor.sigma_rad)
-        believed = np.ones(len(anchor.pose)) if anchor.weights is None else anchor.weights
-        for i, P, w in zip(anchor.pose.tolist(), anchor.T_map, believed, strict=True):
-            gradient[i] += w * W @ log(inverse(P) @ poses[i])
-            enter(i, i, w * W)
-    keys = np.array(list(blocks))
-    row = 6 * keys[:, 0, None, None] + np.arange(6)[None, :, None] + np.zeros((1, 1, 6), dtype=np.int64)
-    col = 6 * keys[:, 1, None, None] + np.arange(6)[None, None, :] + np.zeros((1, 6, 1), dtype=np.int64)
-    values = np.array(list(blocks.values()))
+        W, i = _weight(anchor.sigma_m, anchor.sigma_rad), anchor.pose
+        believed = np.ones(len(i)) if anchor.weights is None else anchor.weights
+        np.add.at(gradient, i, believed[:, None] * W * logs(inverses(anchor.T_map) @ poses[i]))
+        blocks.append((i, i, believed[:, None, None] * np.diag(W)))
+    first, second, values = (np.concatenate(part) for part in zip(*blocks, strict=True))
+    row = np.broadcast_to(6 * first[:, None, None] + np.arange(6)[:, None], values.shape)
+    col = np.broadcast_to(6 * second[:, None, None] + np.arange(6), values.shape)
+    # Blocks that stand in the same place add up.
     H = sparse.csc_matrix((values.ravel(), (row.ravel(), col.ravel())), shape=(6 * n, 6 * n))
     return H, gradient
 
 
 def _weight(sigma_m: float, sigma_rad: float) -> F64:
-    return np.diag([sigma_m**-2] * 3 + [sigma_rad**-2] * 3)
+    """(6,) the diagonal of an information matrix."""
+    return np.array([sigma_m**-2] * 3 + [sigma_rad**-2] * 3)

@@ -14,7 +14,7 @@ from itertools import pairwise
 import numpy as np
 from scipy.spatial import cKDTree
 
-from mapvote.core.geometry import inverse
+from mapvote.core.motions import inverses
 from mapvote.core.types import F64, I64, Drive
 from mapvote.slam.frame import fit_to_priors, trust_in
 from mapvote.slam.pose_graph import Anchors, Links, optimise, position_sigmas
@@ -135,10 +135,7 @@ def _links(drives: Sequence[Drive], T: F64, known: I64, piece_of: I64) -> list[L
             first.append(min(older, key=lambda i: (float(np.linalg.norm(T[i, :3, 3] - T[j, :3, 3])), i)))
             second.append(j)
     pairs.append((np.array(first, dtype=np.int64), np.array(second, dtype=np.int64)))
-    return [
-        Links(a, b, np.array([inverse(T[i]) @ T[j] for i, j in zip(a, b, strict=True)]), _LINK_SIGMA_M, _LINK_SIGMA_RAD)
-        for a, b in pairs
-    ]
+    return [Links(a, b, inverses(T[a]) @ T[b], _LINK_SIGMA_M, _LINK_SIGMA_RAD) for a, b in pairs]
 
 
 def _apart(stamps_ns: I64, i: int, j: int) -> bool:
