@@ -3,6 +3,7 @@
 from itertools import pairwise
 
 import numpy as np
+
 from mapvote.core.geometry import exp, from_xyz_rpy, inverse, log
 from mapvote.core.types import F64
 from mapvote.slam.pose_graph import Anchors, Links, optimise

@@ -22,11 +22,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapvote.config import Settings
-from mapvote.core.columns import TOP_BIT, shifted
+from mapvote.core.columns import TOP_BIT, column_bits, shifted
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, TileIndex, tile_of_cells
 from mapvote.core.heights import heights_over_ground
 from mapvote.core.point_map import PointMap, map_from_points
-from mapvote.core.reference import LocalMap, reference_window
+from mapvote.core.reference import LocalMap
+from mapvote.core.tile import Tile
 from mapvote.core.types import F32, F64, I32, I64, U64, Bool, Drive
 from mapvote.core.voxels import VoxelCloud
 from mapvote.detection.counters import PLANES, Evidence, count_of, free_words, is_open
@@ -35,7 +36,6 @@ from mapvote.detection.surfaces import is_gone
 from mapvote.localisation.localiser import GivenPoses
 from mapvote.perception.frontend import Frontend, Observation, PlacedScan
 from mapvote.perception.moving_objects import MovingFilter
-from mapvote.perception.raycast import find_obstacles
 from mapvote.slam.mirrored import mirrored
 from mapvote.slam.strays import strays
 from mapvote.slam.trails import trails
@@ -100,7 +100,7 @@ class Layer:
             dropped[left] |= trails(points[left], self._balance(points[left]), height, self.draft.lattice)
             dropped |= obstacle & strays(points, scans, driven, self.draft.lattice)
         point_map = map_from_points(points[~dropped], lattice=self.draft.lattice, road=self.road)
-        tiles = {tile: replace(content, free=self._free(tile, point_map)) for tile, content in point_map.tiles.items()}
+        tiles = {tile: replace(content, free=self._free(content)) for tile, content in point_map.tiles.items()}
         return replace(point_map, tiles=tiles)
 
     def _trails(self, points: F64, obstacle: Bool) -> Bool:
@@ -129,24 +129,24 @@ class Layer:
         """(n,) what a ``rule`` says of the ``obstacle`` points (n, 3) by the counts of their voxels, tile by tile; 0 of
         the others."""
         out = np.zeros(len(points), dtype=np.int64)
-        rows, cols = self.draft.lattice.cells_of(points)
+        asked = np.flatnonzero(obstacle)
+        rows, cols = self.draft.lattice.cells_of(points[asked])
+        tile_rows, tile_cols = tile_of_cells(rows, cols)
         for tile, planes in counters.items():
-            reference = reference_window(self.draft, self.draft.lattice.tile(tile))
-            r, c = rows - reference.grid.row0, cols - reference.grid.col0
-            here = np.flatnonzero((r >= 0) & (r < TILE_CELLS) & (c >= 0) & (c < TILE_CELLS) & obstacle)
-            r, c = r[here], c[here]
-            bits = np.floor(points[here, 2] / CELL_SIZE).astype(np.int64) - reference.base[r, c]
+            mine = np.flatnonzero((tile_rows == tile[0]) & (tile_cols == tile[1]))
+            r, c, here = rows[mine] - tile[0] * TILE_CELLS, cols[mine] - tile[1] * TILE_CELLS, asked[mine]
+            bits = np.floor(points[here, 2] / CELL_SIZE).astype(np.int64) - self.draft.tile(tile).base[r, c]
             out[here] = rule(planes, r, c, bits)
         return out
 
-    def _free(self, tile: TileIndex, point_map: PointMap) -> U64:
+    def _free(self, after: Tile) -> U64:
         """Known-free columns of one tile of the finished map, on its own ground."""
-        grid = self.draft.lattice.tile(tile)
-        if tile not in self.evidence.tiles:
-            return np.zeros(grid.shape, dtype=np.uint64)
-        before, after = reference_window(self.draft, grid), reference_window(point_map, grid)
-        free = free_words(self.evidence.tiles[tile], np.zeros(grid.shape, dtype=np.uint64))
-        out = _rebased(free, before.base, after.base) & ~after.occupied
+        if after.index not in self.evidence.tiles:
+            return np.zeros(after.window.shape, dtype=np.uint64)
+        before = self.draft.tile(after.index).base
+        free = free_words(self.evidence.tiles[after.index], np.zeros(after.window.shape, dtype=np.uint64))
+        after = replace(after)  # what it works out for this alone goes with it
+        out = _rebased(free, before, after.base) & ~after.obstacle_words
         out[np.isnan(after.ground_z)] = 0
         return out
 
@@ -154,38 +154,43 @@ class Layer:
 def _standing(points: F64, ground: PointMap) -> Bool:
     """(n,) which points (n, 3) stand above the ground of ``ground``; none outside its tiles."""
     out = np.zeros(len(points), dtype=np.bool_)
-    rows, cols = tile_of_cells(*ground.lattice.cells_of(points))
-    for row, col in ground.tiles:
-        here = np.flatnonzero((rows == row) & (cols == col))
-        out[here] = find_obstacles(points[here], reference_window(ground, ground.lattice.tile((row, col))))[0]
+    rows, cols = ground.lattice.cells_of(points)
+    tile_rows, tile_cols = tile_of_cells(rows, cols)
+    for (row, col), tile in ground.tiles.items():
+        here = np.flatnonzero((tile_rows == row) & (tile_cols == col))
+        r, c = rows[here] - row * TILE_CELLS, cols[here] - col * TILE_CELLS
+        out[here] = column_bits(points[here, 2], tile.ground_z[r, c], tile.base[r, c])[1]
     return out
 
 
 def _left_out(scan: PlacedScan, moving: Bool, reach_m: float) -> Bool:
     """Points (n,) that do not enter the map: what moves, what is beyond ``reach_m``, and what is too low to be an
     obstacle, in or next to cells where something moves: wheels and bumpers, not road."""
-    rows, cols = scan.reference.grid.shape
-    cells = np.zeros((rows, cols), dtype=np.bool_)
-    r, c = np.divmod(np.unique(scan.cell[moving & (scan.cell >= 0)]), cols)
-    for beside in range(9):  # few cells: a dilation of the whole window takes a tenth of a scan's time
-        cells[np.clip(r + beside // 3 - 1, 0, rows - 1), np.clip(c + beside % 3 - 1, 0, cols - 1)] = True
-    ground_z = np.ascontiguousarray(scan.reference.ground_z).ravel()
     return _no_map(
-        scan.points_map, scan.origin_map, reach_m**2, moving, scan.obstacle, scan.cell, cells.ravel(), ground_z
+        scan.points_map, scan.origin_map, reach_m**2, moving, scan.obstacle, scan.cell, scan.reference.ground_z
     )
 
 
 @numba.njit(cache=True, nogil=True)
 def _no_map(
-    points: F64, origin: F64, reach_squared: float, moving: Bool, obstacle: Bool, cell: I32, beside: Bool, ground_z: F32
+    points: F64, origin: F64, reach_squared: float, moving: Bool, obstacle: Bool, cell: I32, ground_z: F32
 ) -> Bool:
-    """(n,) which of the points (n, 3) :func:`_left_out` means; ``beside`` (cells,): something moves there or next."""
-    out = np.empty(len(points), np.bool_)
+    """(n,) which of the points (n, 3) :func:`_left_out` means; ``cell`` (n,) row * cols + col of ``ground_z`` (rows,
+    cols), -1 outside it."""
+    rows, cols = ground_z.shape
+    out, beside = np.empty(len(points), np.bool_), np.zeros(rows * cols, np.bool_)
     for i in range(len(points)):
-        x, y, k = points[i, 0] - origin[0], points[i, 1] - origin[1], max(cell[i], 0)
+        if moving[i] and cell[i] >= 0:
+            r, c = divmod(cell[i], cols)
+            for k in range(max(r - 1, 0), min(r + 2, rows)):
+                for j in range(max(c - 1, 0), min(c + 2, cols)):
+                    beside[k * cols + j] = True
+    for i in range(len(points)):
+        x, y = points[i, 0] - origin[0], points[i, 1] - origin[1]
         out[i] = moving[i] | (x * x + y * y > reach_squared)
-        if cell[i] >= 0 and beside[k] and not obstacle[i]:
-            out[i] |= points[i, 2] - ground_z[k] > ROAD_M
+        if cell[i] >= 0 and beside[cell[i]] and not obstacle[i]:
+            r, c = divmod(cell[i], cols)
+            out[i] |= points[i, 2] - ground_z[r, c] > ROAD_M
     return out
 
 

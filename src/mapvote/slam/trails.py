@@ -26,13 +26,21 @@ def trails(points: F64, balance: I64, height_m: F64, lattice: Lattice) -> Bool:
     """
     if not len(points):
         return np.zeros(0, dtype=np.bool_)
-    cells, at = np.unique(np.column_stack(lattice.cells_of(points)), axis=0, return_inverse=True)
+    cells, at = _cells(points, lattice)
     top = np.full(len(cells), -np.inf)
     np.maximum.at(top, at, np.nan_to_num(height_m, nan=np.inf))
     of_cell = np.bincount(at, weights=balance, minlength=len(cells))
     group, count = _groups(cells)
     passed = np.bincount(group, weights=of_cell, minlength=count)[group] < 0
     return np.asarray((passed & (top < TALL_M))[at])
+
+
+def _cells(points: F64, lattice: Lattice) -> tuple[I64, I64]:
+    """((m, 2) row and column of every cell that one of the points (n, 3) is in, (n,) which of them each is in)."""
+    rows, cols = lattice.cells_of(points)
+    width = int(cols.max()) + 1 - int(cols.min())  # one number a cell: pairs are sorted 20 times as slowly
+    flat, at = np.unique((rows - rows.min()) * width + cols - cols.min(), return_inverse=True)
+    return np.column_stack([flat // width, flat % width]), at
 
 
 def _groups(cells: I64) -> tuple[I64, int]:
