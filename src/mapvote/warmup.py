@@ -74,7 +74,7 @@ def _fuse(point_map: PointMap, ballots: list[Ballot], settings: Settings) -> Non
 
 def _go_far(drive: Drive) -> None:
     """What verbs look at before they use drive and map; points that bring no times; a roof that falls; a tile
-    left and come back to; more points than a table takes."""
+    left and come back to; more voxels than a table takes."""
     Looking(drive).look(range(2))
     check_cloud(in_memory(drive.read_scan(0).points.astype(np.float64)))
     spinning_time_s(np.zeros((1, 3), np.float32), drive.sensor.rate_hz)
@@ -83,7 +83,7 @@ def _go_far(drive: Drive) -> None:
     tiles.near((0, 0))[:] = 1
     tiles.leave(Grid(Lattice(), far, far, 1, 1))
     tiles.near((0, 0))
-    VoxelCloud(Lattice()).enter(np.zeros((100_000, 3)))
+    VoxelCloud(Lattice()).enter(np.repeat(np.arange(40_000.0)[:, None], 3, axis=1))
 
 
 def _street(demolished: bool) -> F64:

@@ -5,6 +5,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mapvote.core.grid import CELL_SIZE, Lattice
+from mapvote.core.types import F64
 from mapvote.core.voxels import VoxelCloud, first_of_each, voxel_downsample, voxel_keys
 
 
@@ -27,6 +28,28 @@ def test_every_voxel_holds_the_mean_of_its_points_and_counts_its_scans(seed: int
     np.testing.assert_array_equal(met, expected)
 
 
+@settings(max_examples=15, deadline=None)
+@given(st.integers(0, 2**31), st.floats(0.2, 30), st.sampled_from([0.0, 5e5]))
+def test_gathered_by_scan_the_sums_are_those_of_one_point_after_the_other(
+    seed: int, spread: float, offset: float
+) -> None:
+    """To the last bit: what a scan has in a voxel goes on from what was in it."""
+    rng = np.random.default_rng(seed)
+    cloud = VoxelCloud(Lattice(offset, 0.0))
+    first: dict[int, F64] = {}
+    moments: dict[int, F64] = {}
+    count: dict[int, int] = {}
+    for n in (300, 0, 2000, 700):
+        scan, skip = rng.normal((offset, 0.0, 0.0), spread, (n, 3)), rng.random(n) < 0.2
+        cloud.enter(scan, skip)
+        for key, point in zip(voxel_keys(scan[~skip], offset, 0.0).tolist(), scan[~skip], strict=True):
+            origin = first.setdefault(key, point)
+            moments[key] = moments.get(key, np.zeros(3)) + (point - origin)
+            count[key] = count.get(key, 0) + 1
+    expected = np.array([first[key] + moments[key] / count[key] for key in sorted(first)])
+    np.testing.assert_array_equal(cloud.points()[0], expected)
+
+
 def test_skipped_points_leave_no_trace() -> None:
     rng = np.random.default_rng(1)
     points = rng.uniform(-5, 5, (1000, 3))
@@ -43,6 +66,9 @@ def test_it_grows_past_its_first_table() -> None:
     cloud = VoxelCloud(Lattice())
     cloud.enter(points)
     assert len(cloud) == len(voxel_downsample(points, CELL_SIZE))
+    cloud.enter(points)
+    assert (cloud.points()[1] == 2).all()
+    assert len(cloud) == len(cloud.points()[0]) == len(voxel_downsample(points, CELL_SIZE))
 
 
 @given(st.lists(st.integers(1, 40), max_size=300))

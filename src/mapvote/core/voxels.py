@@ -6,6 +6,8 @@ whole error in range and pose; the mean is as unbiased and several times less no
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numba
 import numpy as np
 from numpy.typing import NDArray
@@ -43,40 +45,60 @@ def slot_of(key: np.int64, table: I64) -> np.int64:
 
 
 @numba.njit(cache=True, nogil=True)
-def _enter(
-    points: F64,
-    skip: Bool,
-    x0: float,
-    y0: float,
-    scan: int,
-    table_keys: I64,
-    table_rows: I32,
-    sums: F64,
-    scans: I32,
-    n: int,
-) -> int:
+def _gather(points: F64, skip: Bool, x0: float, y0: float, table: I64, place_of: I32, of_point: I32, keys: I64) -> int:
+    """How many voxels the points (n, 3) lie in that ``skip`` (n,) leaves: their ``keys``, in the order in which points
+    come to them, and ``of_point`` (n,) the place there of each point's, -1 where skipped.
+
+    ``table`` and ``place_of`` (2^k,), 2^k > n: scratch.
+    """
+    table[:] = 0
+    m = 0
     for i in range(len(points)):
+        of_point[i] = -1
         if skip[i]:
             continue
         key = voxel_key(points[i, 0] - x0, points[i, 1] - y0, points[i, 2], CELL_SIZE)
-        slot = slot_of(key, table_keys)
+        slot = slot_of(key, table)
+        if table[slot] == 0:
+            table[slot], place_of[slot], keys[m] = key, m, key
+            m += 1
+        of_point[i] = place_of[slot]
+    return m
+
+
+@numba.njit(cache=True, nogil=True)
+def _find(keys: I64, table_keys: I64, table_rows: I32, n: int, rows: I32) -> int:
+    """The ``rows`` (m,) of voxels with ``keys`` (m,) in a cloud of n; new ones come last. Returns the new n."""
+    for j in range(len(keys)):
+        slot = slot_of(keys[j], table_keys)
         if table_keys[slot] == 0:
-            table_keys[slot] = key
-            table_rows[slot] = n
-            scans[n, 1] = -1
+            table_keys[slot], table_rows[slot] = keys[j], n
             n += 1
-        k = table_rows[slot]
-        # Moments are taken from the first point: large world coordinates would eat the digits.
-        if sums[k, 0] == 0.0:
-            sums[k, 4], sums[k, 5], sums[k, 6] = points[i, 0], points[i, 1], points[i, 2]
-        sums[k, 0] += 1.0
-        sums[k, 1] += points[i, 0] - sums[k, 4]
-        sums[k, 2] += points[i, 1] - sums[k, 5]
-        sums[k, 3] += points[i, 2] - sums[k, 6]
-        if scans[k, 1] != scan:
-            scans[k, 0] += 1
-            scans[k, 1] = scan
+        rows[j] = table_rows[slot]
     return n
+
+
+@numba.njit(cache=True, nogil=True)
+def _add(points: F64, of_point: I32, rows: I32, sums: F64, near: F64) -> None:
+    """Points (n, 3) into the ``sums`` of their voxels' ``rows`` (m,), worked out in ``near``, the rows side by side."""
+    for j in range(len(rows)):
+        for c in range(8):
+            near[j, c] = sums[rows[j], c]
+        near[j, 7] += 1.0
+    for i in range(len(points)):
+        k = of_point[i]
+        if k < 0:
+            continue
+        # Moments are taken from the first point: large world coordinates would eat the digits.
+        if near[k, 0] == 0.0:
+            near[k, 4], near[k, 5], near[k, 6] = points[i, 0], points[i, 1], points[i, 2]
+        near[k, 0] += 1.0
+        near[k, 1] += points[i, 0] - near[k, 4]
+        near[k, 2] += points[i, 1] - near[k, 5]
+        near[k, 3] += points[i, 2] - near[k, 6]
+    for j in range(len(rows)):
+        for c in range(8):
+            sums[rows[j], c] = near[j, c]
 
 
 @numba.njit(cache=True, nogil=True)
@@ -88,6 +110,31 @@ def _rehash(old_keys: I64, old_rows: I32, table_keys: I64, table_rows: I32) -> N
             table_rows[slot] = old_rows[i]
 
 
+class _Scratch(NamedTuple):
+    """Room to gather a scan in, kept for the next one; arrays as :func:`_gather`, :func:`_find` and :func:`_add` have
+    them."""
+
+    table: I64
+    place_of: I32
+    of_point: I32
+    keys: I64
+    rows: I32
+    near: F64
+
+
+def _room_for(n: int) -> _Scratch:
+    """Room for a scan of n points."""
+    slots = 1 << (2 * n).bit_length()
+    return _Scratch(
+        np.zeros(slots, dtype=np.int64),
+        np.zeros(slots, dtype=np.int32),
+        np.empty(n, dtype=np.int32),
+        np.empty(n, dtype=np.int64),
+        np.empty(n, dtype=np.int32),
+        np.empty((n, 8)),
+    )
+
+
 class VoxelCloud:
     """Sums of points per lattice voxel, and the number of scans that met each voxel."""
 
@@ -95,28 +142,35 @@ class VoxelCloud:
         self.lattice = lattice
         self._keys = np.zeros(1 << 16, dtype=np.int64)
         self._rows = np.zeros(1 << 16, dtype=np.int32)
-        self._sums = np.zeros((1 << 15, 7))
-        self._scans = np.zeros((1 << 15, 2), dtype=np.int32)
+        self._sums = np.zeros((1 << 15, 8))
+        """Count, moments from the first point, the first point, scans: a row is one line of the processor's cache."""
         self._n = 0
-        self._entered = 0
+        self._scratch = _room_for(0)
 
     def enter(self, points_map: F64, skip: Bool | None = None) -> None:
-        """Enter one scan: points (n, 3) in map metres, those of ``skip`` (n,) left out."""
+        """Enter one scan: points (n, 3) in map metres, those of ``skip`` (n,) left out.
+
+        Five points of a scan share a voxel: they are gathered before the cloud, which no cache holds, is asked.
+        """
         points = np.ascontiguousarray(points_map, dtype=np.float64)
         mask = np.zeros(len(points), dtype=np.bool_) if skip is None else skip
-        while self._n + len(points) > len(self._sums):
+        if len(points) > len(self._scratch.keys):
+            self._scratch = _room_for(len(points))
+        table, place_of, of_point, keys, rows, near = self._scratch
+        m = _gather(points, mask, self.lattice.x0, self.lattice.y0, table, place_of, of_point, keys)
+        while self._n + m > len(self._sums):
             self._grow()
-        x0, y0 = self.lattice.x0, self.lattice.y0
-        self._n = _enter(points, mask, x0, y0, self._entered, self._keys, self._rows, self._sums, self._scans, self._n)
-        self._entered += 1
+        self._n = _find(keys[:m], self._keys, self._rows, self._n, rows)
+        _add(points, of_point, rows[:m], self._sums, near)
 
     def _grow(self) -> None:
         keys = np.zeros(2 * len(self._keys), dtype=np.int64)
         rows = np.zeros(2 * len(self._rows), dtype=np.int32)
         _rehash(self._keys, self._rows, keys, rows)
         self._keys, self._rows = keys, rows
-        self._sums = np.concatenate([self._sums, np.zeros_like(self._sums)])
-        self._scans = np.concatenate([self._scans, np.zeros_like(self._scans)])
+        sums = np.zeros((2 * len(self._sums), 8))  # rows that nobody has written to take no memory yet
+        sums[: self._n] = self._sums[: self._n]
+        self._sums = sums
 
     def __len__(self) -> int:
         return self._n
@@ -126,7 +180,7 @@ class VoxelCloud:
         found = np.flatnonzero(self._keys)
         rows: NDArray[np.int32] = self._rows[found[np.argsort(self._keys[found])]]
         sums = self._sums[rows]
-        return sums[:, 4:7] + sums[:, 1:4] / sums[:, :1], self._scans[rows, 0]
+        return sums[:, 4:7] + sums[:, 1:4] / sums[:, :1], sums[:, 7].astype(np.int32)
 
 
 @numba.njit(cache=True, nogil=True)
