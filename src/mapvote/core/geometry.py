@@ -43,6 +43,16 @@ def rows_from(points: F64, origin: F64) -> NDArray[np.float32]:
     return rows
 
 
+@numba.njit(cache=True, nogil=True)
+def from_origin(points: F64, origin: F64) -> NDArray[np.float32]:
+    """(n, 3) float32: points (n, 3) from ``origin`` (3,). Numpy goes through rows of three one by one."""
+    out = np.empty(points.shape, np.float32)
+    for i in range(len(points)):
+        for k in range(3):
+            out[i, k] = points[i, k] - origin[k]
+    return out
+
+
 def inverse(T_a_b: F64) -> F64:
     """T_b_a of T_a_b, by the transpose of the rotation (exact for rigid motions)."""
     T = np.eye(4)

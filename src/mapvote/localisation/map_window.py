@@ -12,12 +12,13 @@ from mapvote.localisation.ndt import (
     CENTRAL_M,
     HALF_WINDOW_M,
     LEVELS,
+    MIN_POINTS,
     Level,
     NdtMap,
     entered,
     room_for_voxels,
 )
-from mapvote.localisation.ndt_voxels import Voxels, Window
+from mapvote.localisation.ndt_voxels import Voxels, Window, refresh
 
 _SLAB_M = 252.0
 """Height of what is laid out at a time, a whole number of voxels at every level: a stray point costs no tower."""
@@ -98,5 +99,7 @@ def _voxels_of(points_map: F64, level: Level) -> Voxels:
     lowest = np.floor(points_map.min(axis=0) / level.voxel_m).astype(np.int64)
     shape = np.floor(points_map.max(axis=0) / level.voxel_m).astype(np.int64) - lowest + 1
     window = Window(np.full(shape, -1, dtype=np.int32), lowest, level.voxel_m)
-    voxels, n = entered(points_map, window, room_for_voxels(1024), 0, level.floor_m)
+    voxels, n, touched = entered(points_map, window, room_for_voxels(1024), 0)
+    for rows in touched:
+        refresh(voxels, rows, level.voxel_m, level.floor_m, MIN_POINTS)
     return Voxels(voxels.place[:n].copy(), voxels.sums[:n].copy(), voxels.cells[:n].copy())

@@ -20,7 +20,7 @@ from mapvote.core.types import F32, F64, I64, Drive, Registration, check_array
 from mapvote.core.voxels import thin
 from mapvote.localisation.ndt_kernels import likelihoods, mean_likelihood, room_for
 from mapvote.localisation.ndt_solver import Certainty, Place, align
-from mapvote.localisation.ndt_voxels import Voxels, Window, enter_points, join_voxels, reindex
+from mapvote.localisation.ndt_voxels import Voxels, Window, enter_points, join_voxels, refresh, reindex
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,37 +65,54 @@ class NdtGrid:
         self.level = level
         self.reach = np.array([half, half, BELOW_M])
         self.window = Window(np.empty(shape, dtype=np.int32), np.zeros(3, dtype=np.int64), size)  # recentred next
-        self.voxels = room_for_voxels(1024)
         self.n = 0
+        self._voxels, self._stale = room_for_voxels(1024), list[I64]()
+
+    @property
+    def voxels(self) -> Voxels:
+        """With the distributions of all that was entered, worked out when they are asked for: of a map that grows the
+        coarse levels hardly ever are."""
+        for rows in self._stale:
+            refresh(self._voxels, rows, self.level.voxel_m, self.level.floor_m, MIN_POINTS)
+        self._stale.clear()
+        return self._voxels
+
+    def clear(self) -> None:
+        """Forget all voxels; their memory stays."""
+        self.n = 0
+        self._stale.clear()
 
     def recentre(self, centre: F64) -> None:
         """Move the window; what was entered before and lies inside is found again."""
         self.window.lowest[:] = np.round((centre - self.reach) / self.level.voxel_m).astype(np.int64)
-        reindex(self.window, self.voxels.place, self.n)
+        reindex(self.window, self._voxels.place, self.n)
 
     def enter(self, points_map: F64) -> None:
         """Enter points (n, 3) in map metres; those outside the window are left out."""
-        self.voxels, self.n = entered(points_map, self.window, self.voxels, self.n, self.level.floor_m)
+        self._voxels, self.n, touched = entered(points_map, self.window, self._voxels, self.n)
+        self._stale += touched
 
     def join(self, others: Sequence[Voxels]) -> None:
         """Add voxels of this level, of points that were not entered; those outside the window are left out."""
         room = self.n + sum(len(more.place) for more in others)
-        if room > len(self.voxels.place):
+        if room > len(self._voxels.place):
             more = room_for_voxels(room - self.n)
-            self.voxels = Voxels(*(np.concatenate([a[: self.n], b]) for a, b in zip(self.voxels, more, strict=True)))
+            self._voxels = Voxels(*(np.concatenate([a[: self.n], b]) for a, b in zip(self._voxels, more, strict=True)))
         for part in others:
-            self.n = join_voxels(part, self.window, self.voxels, self.n, self.level.floor_m, MIN_POINTS)
+            self.n = join_voxels(part, self.window, self._voxels, self.n, self.level.floor_m, MIN_POINTS)
 
 
-def entered(points_map: F64, window: Window, voxels: Voxels, n: int, floor_m: float) -> tuple[Voxels, int]:
-    """(voxels with points (n, 3) in map metres entered, how many there are): with more room where they need it."""
-    left = points_map
+def entered(points_map: F64, window: Window, voxels: Voxels, n: int) -> tuple[Voxels, int, list[I64]]:
+    """(voxels with points (n, 3) in map metres entered into their sums, how many there are, the rows to refresh): with
+    more room where they need it."""
+    left, stale = points_map, []
     while len(left):
         if n == len(voxels.place):
             voxels = Voxels(*(np.concatenate([a, np.zeros_like(a)]) for a in voxels))
-        n, looked_at = enter_points(left, window, voxels, n, floor_m, MIN_POINTS)
+        n, looked_at, touched = enter_points(left, window, voxels, n)
+        stale.append(touched)
         left = left[looked_at:]
-    return voxels, n
+    return voxels, n, stale
 
 
 def room_for_voxels(n: int) -> Voxels:
@@ -120,7 +137,7 @@ class NdtMap:
         """Forget all voxels and put the middle at ``centre`` (3,), in the same memory: to ask for as much again, 15 MB,
         takes longer than to fill it."""
         for grid in self.levels:
-            grid.n = 0
+            grid.clear()
         self.recentre(centre)
 
     def is_central(self, position: F64) -> bool:

@@ -38,7 +38,8 @@ class Voxels(NamedTuple):
     place: I64
     """(m, 3) world voxel of each row."""
     sums: F64
-    """(m, 11) count, first and second moments about the voxel's centre (x y z xx xy xz yy yz zz), scratch."""
+    """(m, 11) count, first and second moments about the voxel's centre (x y z xx xy xz yy yz zz), 1 if the distribution
+    is older than they are."""
     cells: F64
     """(m, 9) mean from the voxel's centre, and the precision as a :data:`Symmetric`; zero without a distribution."""
 
@@ -159,8 +160,9 @@ def _set_precision(cells: F64, k: int, A: F64, V: F64, floor_variance: float, ev
 
 
 @numba.njit(cache=True, nogil=True)
-def _refresh(voxels: Voxels, touched: I64, size: float, floor_m: float, min_points: int) -> None:
-    """The distributions of the rows ``touched`` (m,), from their sums."""
+def refresh(voxels: Voxels, touched: I64, size: float, floor_m: float, min_points: int) -> None:
+    """The distributions of the rows ``touched`` (m,), from their sums. A distribution needs ``min_points``, and is
+    widened by ``floor_m`` to all sides; ``size``: side of a voxel, metres."""
     sums = voxels.sums
     A, V = np.empty((3, 3)), np.empty((3, 3))
     thin, floor_variance = (FLATNESS * size) * (FLATNESS * size), floor_m * floor_m
@@ -182,14 +184,12 @@ def _refresh(voxels: Voxels, touched: I64, size: float, floor_m: float, min_poin
 
 
 @numba.njit(cache=True, nogil=True)
-def enter_points(
-    points: F64, window: Window, voxels: Voxels, n: int, floor_m: float, min_points: int
-) -> tuple[int, int]:
-    """Enter points (n, 3) in map metres, and refresh the distributions they touch.
+def enter_points(points: F64, window: Window, voxels: Voxels, n: int) -> tuple[int, int, I64]:
+    """Enter points (n, 3) in map metres into the sums of their voxels.
 
-    Returns (the new number of rows, how many points were looked at): fewer than all where ``voxels`` has no row left,
-    so that rows are made for voxels and not for points. Points outside ``window`` are left out. A distribution needs
-    ``min_points``, and is widened by ``floor_m`` to all sides.
+    Returns (the new number of rows, how many points were looked at, the rows (k,) to :func:`refresh` that were not
+    before): fewer points than all where ``voxels`` has no row left, so that rows are made for voxels and not for
+    points. Points outside ``window`` are left out.
     """
     rows, lowest, size = window
     sums = voxels.sums
@@ -217,8 +217,7 @@ def enter_points(
             n_touched += 1
         x, y, z = points[i, 0] - (ax + 0.5) * size, points[i, 1] - (ay + 0.5) * size, points[i, 2] - (az + 0.5) * size
         _add_moments(sums, k, x, y, z)
-    _refresh(voxels, touched[:n_touched], size, floor_m, min_points)
-    return n, looked_at
+    return n, looked_at, touched[:n_touched].copy()
 
 
 @numba.njit(cache=True, nogil=True)
@@ -249,7 +248,7 @@ def join_voxels(others: Voxels, window: Window, voxels: Voxels, n: int, floor_m:
         for c in range(9):
             voxels.cells[n, c] = others.cells[j, c]
         n += 1
-    _refresh(voxels, shared[:n_shared], size, floor_m, min_points)
+    refresh(voxels, shared[:n_shared], size, floor_m, min_points)
     return n
 
 

@@ -90,14 +90,15 @@ def build_map(
     if sum(len(drive) for drive in drives) == 0:
         raise MapvoteError("nothing to map: no drive with at least one scan")
     count = _counter(progress, 2 * sum(len(drive) for drive in drives))
-    surveyor = Surveyor(settings)
+    surveyor = Surveyor(settings, all(is_precise(drive) for drive in drives))
     found = [surveyor.follow(drive, count) for drive in drives]
     settled = settle(drives, found)
     registered, poses = [one.registered for one in found], settled.T_map_lidar
-    cloud = transform(settled.T_map_draft, surveyor.draft.points()[0])
+    cloud, lattice = transform(settled.T_map_draft, surveyor.draft.points()[0]), surveyor.draft.lattice
+    del surveyor  # and with it the largest part of what the first pass took
     roads = [road_under(T, mask, cloud) for T, mask in zip(poses, registered, strict=True)]
     road = all_roads(roads)
-    layer = Layer(map_from_points(cloud, lattice=surveyor.draft.lattice, road=road), settings, road)
+    layer = Layer(map_from_points(cloud, lattice=lattice, road=road), settings, road)
     for drive, T_map_lidar, mask in zip(drives, poses, registered, strict=True):
         layer.lay(drive, T_map_lidar, mask, count)
     driven = tuple(T[mask][:, :3, 3] for T, mask in zip(poses, registered, strict=True))

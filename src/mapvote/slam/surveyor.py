@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from mapvote.config import Settings
-from mapvote.core.geometry import exp, inverse, transform
+from mapvote.core.geometry import exp, from_origin, inverse, transform
 from mapvote.core.grid import Lattice
 from mapvote.core.types import F64, Bool, Drive, MapvoteError, Scan
 from mapvote.core.voxels import VoxelCloud, thin
@@ -59,7 +59,9 @@ def is_precise(drive: Drive) -> bool:
 class Surveyor:
     """The NDT map as it grows, drive after drive."""
 
-    def __init__(self, settings: Settings) -> None:
+    def __init__(self, settings: Settings, all_precise: bool = False) -> None:
+        """``all_precise``: only drives with a surveyor's prior will come, at which nobody takes a last look."""
+        self._all_precise = all_precise
         self.ndt = settings.ndt.model_copy(update={"min_inlier_share": _MIN_INLIER_SHARE})
         self.ndt_map: NdtMap | None = None
         self.fine_map: NdtMap | None = None
@@ -154,11 +156,12 @@ class Surveyor:
     def _enter(self, fix: Fix, drive: Drive, i: int) -> None:
         T_map_lidar = fix.registration.T_map_lidar
         points_map, position = transform(T_map_lidar, fix.points), T_map_lidar[:3, 3]
-        spread = thin(points_map - position, _POINTS_M)
-        self._map_around(position).enter(points_map[spread])
-        if self.fine_map is None:
-            self.fine_map = NdtMap(position, (_FINE,))
-        self.fine_map.enter(points_map[spread])
+        spread = points_map.take(thin(from_origin(points_map, position), _POINTS_M), axis=0)
+        self._map_around(position).enter(spread)
+        if not self._all_precise:
+            if self.fine_map is None:
+                self.fine_map = NdtMap(position, (_FINE,))
+            self.fine_map.enter(spread)
         self.draft.enter(points_map)
         if drive.T_map_lidar_prior is not None:
             self._found.append(position.copy())
