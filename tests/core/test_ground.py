@@ -6,9 +6,11 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from mapvote.core.grid import CELL_SIZE, CELLS, TILE_CELLS, Grid, Lattice
-from mapvote.core.ground import base_layers
+from mapvote.core.ground import _sorted_by_cell, base_layers
 from mapvote.core.ground_growing import SEED, UNREACHED, WIDEST, _bounds, _continued, _like, grow, tiles_around
 from mapvote.core.point_map import map_from_points
 from mapvote.core.reference import reference_window
@@ -211,6 +213,30 @@ def test_which_way_is_north_does_not_matter(turn: Callable[[F32], F32]) -> None:
     again = ground_of(turned[0], road=turned[1])
     assert np.isnan(again).mean() == np.isnan(ground).mean()
     assert np.nanquantile(np.abs(again - ground), 0.999) < 0.05, "who comes first to a cell may differ"
+
+
+@pytest.mark.parametrize("cells", [206, 207, 200])
+def test_where_a_tile_ends_does_not_matter(cells: int) -> None:
+    """A sloping road, a bank and a hole where something stood, with a corner of four tiles in their midst."""
+    rng = np.random.default_rng(9)
+    xy = spread(rng, 50_000, (0, 30), (0, 30))
+    xy = xy[~((abs(xy[:, 0] - 14.0) < 2.0) & (abs(xy[:, 1] - 14.0) < 1.5))]
+    points = at(xy, np.maximum(0.0, 0.12 * (xy[:, 1] - 16.0)) + 0.04 * xy[:, 0])
+    road = driven((0, 30), 6.0)
+    road[:, 2] = 0.04 * road[:, 0]
+    far = Lattice(-CELL_SIZE * cells, -CELL_SIZE * cells)
+    cut = map_from_points(points, lattice=far, road=road)
+    assert len(cut.tiles) == 4
+    ground, again = ground_of(points, road=road), reference_window(cut, Grid(far, cells, cells, 100, 100)).ground_z
+    assert np.array_equal(np.isnan(again), np.isnan(ground))
+    assert np.nanquantile(np.abs(again - ground), 0.999) < 0.05, "who comes first to a cell may differ"
+
+
+@given(st.lists(st.tuples(st.integers(0, 5), st.floats(-1e6, 1e6, width=32)), max_size=50))
+def test_heights_are_sorted_within_their_cells_as_pairs_are(points: list[tuple[int, float]]) -> None:
+    cells = np.array([cell for cell, _ in points], dtype=np.int64)
+    z = np.array([height for _, height in points], dtype=np.float32)
+    np.testing.assert_array_equal(_sorted_by_cell(cells, z), z[np.lexsort((z, cells))])
 
 
 def test_of_points_that_lie_close_the_ground_takes_the_one_that_continues_it() -> None:

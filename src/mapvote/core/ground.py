@@ -145,10 +145,20 @@ def _by_cell(points: Iterable[Heights], tiles: int) -> tuple[I32 | I64, F32]:
             start = start.astype(np.int64)
         # Resized, not concatenated: nothing is there twice.
         heights.resize(n + len(z), refcheck=False)
-        heights[n:] = z[np.lexsort((z, cells))]
+        heights[n:] = _sorted_by_cell(cells, z)
         start[k * CELLS + 1 : (k + 1) * CELLS + 1] = n + np.cumsum(np.bincount(cells, minlength=CELLS))
         n += len(z)
     return start, heights
+
+
+def _sorted_by_cell(cells: I64, z: F32) -> F32:
+    """Heights (n,) of the points of one cell (n,) after the other, lowest first: cell and height make one number, for
+    numbers are sorted in a tenth of the time that pairs take."""
+    bits = z.view(np.int32)
+    rank = bits ^ ((bits >> 31) & np.int32(0x7FFFFFFF))  # floats as integers of the same order; of itself the inverse
+    both = np.sort((cells << 32) + rank)
+    rank = (both - ((both + (1 << 31)) >> 32 << 32)).astype(np.int32)
+    return (rank ^ ((rank >> 31) & np.int32(0x7FFFFFFF))).view(np.float32)
 
 
 def _lowest_of_each(cells: I64, z: F32) -> Heights:
