@@ -68,7 +68,6 @@ TESTS = {
     "detection/surfaces.py": ["detection/test_surfaces.py"],
     "detection/surface_regions.py": ["detection/test_surfaces.py"],
     "detection/surface_counts.py": ["detection/test_surface_counts.py", "detection/test_surfaces.py"],
-    "detection/faint_walls.py": ["detection/test_faint_walls.py"],
     "detection/lone_points.py": ["detection/test_lone_points.py"],
     "detection/surface_odds.py": ["detection/test_surface_odds.py"],
     "detection/surface_looks.py": ["detection/test_surface_odds.py"],

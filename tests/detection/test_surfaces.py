@@ -117,12 +117,6 @@ def test_what_no_ray_ever_crossed_does_not_go_with_the_rest_of_its_wall() -> Non
     assert [int(states[cell]) for cell in WALL] == [CE] * 6 + [NO_VOTE] * 6
 
 
-def test_a_house_wall_that_two_scans_crossed_is_gone_and_the_trail_of_a_van_so_crossed_is_not() -> None:
-    house = [0.45 + 0.3 * k for k in range(14)]
-    states = [after(street(WALL, heights), standing_at(OLD_Y + 9), 2).states for heights in (house, HEIGHTS)]
-    assert [{int(s[cell]) for cell in WALL} for s in states] == [{CE}, {UN}]
-
-
 @given(strong=arrays(np.bool_, (6, 6)), weak=arrays(np.bool_, (6, 6)))
 def test_what_grows_is_weak_and_growing_twice_grows_no_more(strong: Bool, weak: Bool) -> None:
     out = grown(strong, weak)

@@ -8,8 +8,7 @@ from hypothesis import strategies as st
 
 from mapvote.core.grid import CELL_SIZE, Lattice
 from mapvote.core.types import F64, I64
-from mapvote.detection.faint_walls import TALL_M
-from mapvote.slam.trails import trails
+from mapvote.slam.trails import TALL_M, trails
 
 LATTICE = Lattice()
 

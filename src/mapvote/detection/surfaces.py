@@ -2,8 +2,8 @@
 
 A mapped voxel is gone that was crossed more often than HIT_RAYS times its hits, and stands that was met and is not. A
 cell is changed-empty if a voxel of it is gone and none stands: what no ray could decide in it goes along. So do cells
-beside it in which rays crossed something and met nothing, however few, and whole walls of such cells; and cells that
-no ray could decide go with what falls, as columns have it (rule H). Points that touch no other go with most of what is
+beside it in which rays crossed something and met nothing, however few; and cells that no ray could decide go with what
+falls, as columns have it (rule H). Points that touch no other go with most of what is
 around them, or not at all. A free voxel met more often than rays spoke against it is new, if the whole of what it
 belongs to was met as often as rays passed it. docs/method.md.
 """
@@ -21,16 +21,15 @@ from mapvote.core.columns import below_top, outside
 from mapvote.core.grid import Lattice, TileIndex
 from mapvote.core.point_map import PointMap
 from mapvote.core.reference import bordered
-from mapvote.core.types import F32, F64, I32, NO_VOTE, U8, U64, Bool, CellState, Reference
+from mapvote.core.types import F64, I32, NO_VOTE, U8, U64, Bool, CellState, Reference
 from mapvote.core.voting import one_hot
 from mapvote.detection.blocks import blocks
 from mapvote.detection.counters import PLANES, count_of, newly_free
-from mapvote.detection.faint_walls import faintly_gone, often_crossed
 from mapvote.detection.lone_points import lone_cells, no_change
 from mapvote.detection.regions import HALO, JOIN_CELLS, beyond_tiles, fallen, unexplained
 from mapvote.detection.surface_counts import CROSSED, MET, PASSED, PASSES, SurfaceEvidence, times_crossed
 from mapvote.detection.surface_looks import amounts, looks
-from mapvote.detection.surface_regions import SUPPORT, detached, grown, lasting, supported
+from mapvote.detection.surface_regions import detached, grown, lasting, supported
 from mapvote.detection.votes import TileVotes
 from mapvote.perception.frontend import Observation
 
@@ -63,8 +62,6 @@ class _Judged:
     """Cells whose new voxels all lie next to mapped ones."""
     crossed: Bool
     """Mapped cells in which rays crossed a voxel that none met, and met none that stands."""
-    crossings: I32
-    """How often their voxels were, less what speaks against it."""
     adrift: Bool
     """Mapped cells that no ray decided, with rays through half of what is under them or more."""
     lone: Bool
@@ -174,7 +171,6 @@ class SurfaceVoter:
             beyond=beyond,
             beside=(new != 0) & (new & ~near == 0),
             crossed=mapped & ~low & (stands == 0) & ((gone | unmet) != 0),
-            crossings=often_crossed(planes, here.occupied, HIT_RAYS, TOGETHER),
             adrift=mapped & ~low & (gone | stands == 0) & (under != 0) & clear,
             lone=lone_cells(outer.occupied, outer.base)[1:-1, 1:-1],
             amount=amounts(planes, here.occupied, new),
@@ -208,14 +204,8 @@ def _decide_mapped(tiles: dict[TileIndex, _Judged], lattice: Lattice) -> None:
         tiles[tile].states[empty[tile]] = CellState.UNDETERMINED
         tiles[tile].states[cells] = CellState.CHANGED_EMPTY
     strong = {tile: found.states == CellState.CHANGED_EMPTY for tile, found in tiles.items()}
-    crossed, often = {t: found.crossed for t, found in tiles.items()}, {t: f.crossings for t, f in tiles.items()}
-    height = {t: np.where(f.crossed, f.here.top_z - f.here.ground_z, np.float32(0.0)) for t, f in tiles.items()}
-
-    def grow(strong: Bool, crossed: Bool, often: I32, height_m: F32) -> Bool:
-        return grown(strong | faintly_gone(crossed, often, height_m, SUPPORT, SUPPORT * GONE_RAYS), crossed)
-
-    planes = (strong, False), (crossed, False), (often, 0), (height, 0)
-    for tile, cells in beyond_tiles(lattice, HALO, grow, *planes).items():
+    crossed = {tile: found.crossed for tile, found in tiles.items()}
+    for tile, cells in beyond_tiles(lattice, HALO, grown, (strong, False), (crossed, False)).items():
         tiles[tile].states[cells] = CellState.CHANGED_EMPTY
     states, adrift = _states(tiles), {tile: found.adrift for tile, found in tiles.items()}
 

@@ -14,7 +14,9 @@ from scipy.spatial import cKDTree
 
 from mapvote.core.grid import Lattice
 from mapvote.core.types import F64, I64, Bool
-from mapvote.detection.faint_walls import TALL_M
+
+TALL_M = 4.0
+"""No lorry is taller (Directive 96/53/EC)."""
 
 
 def trails(points: F64, balance: I64, height_m: F64, lattice: Lattice) -> Bool:
