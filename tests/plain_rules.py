@@ -272,7 +272,7 @@ def fuse(
     knows = before.knows_free or learns >= max(quorum, 1)
     lately = [c for c in ripe if max(r.end_s for r in ripe) - c.end_s <= settings.stay_days * DAY_S]
     lately = without_copies(lately, settings)
-    cells, added = {}, False
+    cells, added, decided = {}, False, {}
     for cell, held in before.cells.items():
 
         def counts(cast: Cast, cell: Cell = cell, held: CellMap = held) -> bool:
@@ -285,9 +285,19 @@ def fuse(
             if counts(cast) and obeys(cast, cell):
                 heard.setdefault(cast.vehicle, []).append(cast)
         recent = sorted((c for c in lately if counts(c)), key=lambda c: c.end_s)
-        new = decide_cell(held, heard, last, recent, cell, settings, quorum)
-        added = added or len(new.heights) > len(held.heights)
-        cells[cell] = new
+        says = {vehicle: drives[-1].says[cell] for vehicle, drives in heard.items()}
+        decided[cell] = state_of(held, heard, says, recent, cell, settings, quorum), says, last
+    stay = [
+        (cell, layer)
+        for cell, (state, says, _) in decided.items()
+        if state == UO
+        for layer in layers(before.cells[cell])
+        if layer and not marked(layer, says, quorum, 1, 2)
+    ]
+    for cell, held in before.cells.items():
+        beside = {n for (r, c), n in stay if abs(r - cell[0]) <= 1 and abs(c - cell[1]) <= 1}
+        cells[cell] = edited(held, *decided[cell], quorum, {n + step for n in beside for step in (-1, 0, 1)})
+        added = added or len(cells[cell].heights) > len(held.heights)
     for cell, held in before.cells.items():
         free = held.free
         if knows and learns >= quorum:
@@ -306,17 +316,16 @@ def fuse(
     return cells, knows
 
 
-def decide_cell(
+def state_of(
     held: CellMap,
     heard: dict[str, list[Cast]],
-    last: dict[str, int],
+    says: dict[str, Spoken],
     recent: list[Cast],
     cell: Cell,
     settings: FuseSettings,
     quorum: int,
-) -> CellMap:
-    """One cell: one vote a vehicle, its latest drive that says anything; then delete, add, remember."""
-    says = {vehicle: drives[-1].says[cell] for vehicle, drives in heard.items()}
+) -> int:
+    """What is decided of one cell: one vote a vehicle, its latest drive that says anything."""
     state = decide([s.state for s in says.values()], quorum)
     said = [(drives[-1].end_s, drives[-1].says[cell].state) for drives in heard.values()]
     state = state if state in (CO, CE) else turn(said, quorum) or state
@@ -324,15 +333,27 @@ def decide_cell(
         state = UN
     if (state == CO or (state == CE and held.came_s)) and last_word(heard, cell) != state:
         state = UN
+    return state
+
+
+def layers(held: CellMap) -> set[int]:
+    """Those in which a cell has points; 0 is the ground."""
+    return {int(z // LAYER_M) for z in held.heights}
+
+
+def edited(
+    held: CellMap, state: int, says: dict[str, Spoken], last: dict[str, int], quorum: int, touched: set[int]
+) -> CellMap:
+    """One cell after its points went and came, and what it remembers; ``touched`` layers lie beside what stays."""
     heights = held.heights
     if state in (CE, UO):
-        heights = tuple(z for z in heights if z < LAYER_M or not goes(int(z // LAYER_M), state, says, quorum))
+        heights = tuple(z for z in heights if z < LAYER_M or not goes(int(z // LAYER_M), state, says, quorum, touched))
     if state == CO:
-        layers = {int(z // LAYER_M) for z in heights}
+        taken = layers(held)
         offered = {v: {int(z // LAYER_M): z for z in s.heights} for v, s in says.items() if s.state == CO}
         for layer in sorted({layer for mine in offered.values() for layer in mine}):
             backing = sum(any(near in mine for near in (layer - 1, layer, layer + 1)) for mine in offered.values())
-            if backing >= quorum and layer not in layers:
+            if backing >= quorum and layer not in taken:
                 heights += (next(mine[layer] for mine in offered.values() if layer in mine),)
     new = replace(held, heights=heights)
     if new.stands() and not held.stands():
@@ -374,14 +395,19 @@ def last_word(heard: dict[str, list[Cast]], cell: Cell) -> int:
     return max(determined)[1]
 
 
-def goes(layer: int, state: int, says: dict[str, Spoken], quorum: int) -> bool:
+def goes(layer: int, state: int, says: dict[str, Spoken], quorum: int, touched: set[int]) -> bool:
     """Whether enough vehicles say that this voxel is gone, of a cell that is empty now or that stands."""
     if state == CE:
         marks = [EVERY if s.gone is None else s.gone for s in says.values() if s.state == CE]
         return sum(m >> layer & 1 for m in marks) >= quorum
-    marks = [s.gone or 0 for s in says.values() if s.state == UO]
+    return marked(layer, says, quorum, 2, 3) or (layer not in touched and marked(layer, says, quorum, 1, 2))
+
+
+def marked(layer: int, says: dict[str, Spoken], quorum: int, share: int, of: int) -> bool:
+    """Whether so many say that a voxel is gone of a cell that stands, and more than ``share`` in ``of`` who decided."""
+    marks = [s.gone or 0 for s in says.values() if s.state in (UO, CE)]
     marking, determined = sum(m >> layer & 1 for m in marks), sum(s.state != UN for s in says.values())
-    return marking >= quorum and 2 * marking > determined
+    return marking >= quorum and of * marking > share * determined
 
 
 def is_temporary(held: CellMap, recent: list[Cast], cell: Cell, settings: FuseSettings) -> bool:

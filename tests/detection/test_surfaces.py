@@ -9,14 +9,13 @@ from hypothesis.extra.numpy import arrays
 
 from hand_made import make_map, make_tile, one_scan, wall
 from mapvote.config import VotingSettings
-from mapvote.core.columns import dilated
 from mapvote.core.grid import CELL_SIZE
 from mapvote.core.point_map import PointMap
-from mapvote.core.types import F64, I32, NO_VOTE, U64, Bool, CellState
+from mapvote.core.types import F64, I32, NO_VOTE, Bool, CellState
 from mapvote.detection.counters import PLANES, count_of
 from mapvote.detection.near_hits import HIT_REACH_M
 from mapvote.detection.surface_counts import CROSSED, MET, PASSES, WORDS, SurfaceEvidence
-from mapvote.detection.surface_regions import SUPPORT, detached, grown, lasting
+from mapvote.detection.surface_regions import SUPPORT, grown, lasting
 from mapvote.detection.surfaces import GONE_RAYS, HIT_RAYS, NEW_RAYS, SurfaceVoter, weigh_surfaces
 from mapvote.detection.votes import TileVotes
 
@@ -242,18 +241,6 @@ def test_a_car_that_drove_by_far_off_is_nothing_new_and_one_that_parked_is() -> 
             voter.observe(seen)
         states.append(voter.votes()[0, 0].states)
     assert [(s == CO).any() for s in states] == [False, True]
-
-
-words = arrays(np.uint64, (4, 4), elements=st.integers(0, 2**63 - 1))
-
-
-@given(words, words)
-@settings(max_examples=25, deadline=None)
-def test_of_what_is_gone_exactly_that_is_apart_which_touches_nothing_that_stands(gone: U64, stands: U64) -> None:
-    level = np.zeros((4, 4), np.int32)
-    kept = gone & ~detached(gone, stands, level)
-    np.testing.assert_array_equal(kept, gone & dilated(stands, level, 1))
-    np.testing.assert_array_equal(detached(gone, np.zeros_like(stands), level), gone)
 
 
 def test_an_upper_storey_that_no_ray_reached_stays_where_the_lower_one_stands_beside_a_house_that_went() -> None:

@@ -102,34 +102,6 @@ def standing(masks: list[int], state: int = KEPT) -> list[TileVote]:
     return [vote(f"v{i}", states_plane({CELL: state}), gone=marks(mask)) for i, mask in enumerate(masks)]
 
 
-@pytest.mark.parametrize(
-    ("masks", "left"),
-    [
-        ([0b0110, 0b0110, 0b0000], [1.05]),
-        ([0b0110, 0b0000, 0b0000], [0.45, 0.75, 1.05]),
-        ([0b0110, 0b0100, 0b0000], [0.45, 1.05]),
-        ([0b0110, 0b0110, 0, 0], [0.45, 0.75, 1.05]),
-        ([0b0110, 0b0110, 0b0110, 0, 0], [1.05]),
-    ],
-)
-def test_remnants_go_from_a_cell_that_stands_if_most_vehicles_mark_them(masks: list[int], left: list[float]) -> None:
-    tile = make_tile(wall([CELL], [0.45, 0.75, 1.05]))
-    states, edited = fuse(tile, standing(masks), SURE)
-    assert states[CELL] == KEPT
-    assert edited.points[:, 2].tolist() == pytest.approx(left)
-    assert (edited is tile) == (len(left) == 3)
-
-
-def test_marks_count_only_of_those_who_say_that_the_cell_stands_and_only_if_it_does() -> None:
-    tile = make_tile(wall([CELL], [0.45]))
-    for other in (CellState.UNDETERMINED, CellState.UNCHANGED_EMPTY, NO_VOTE):
-        votes = [*standing([0b10, 0, 0]), vote("z", states_plane({CELL: other}), gone=marks(0b10))]
-        assert fuse(tile, votes, SURE)[1] is tile
-    assert fuse(tile, standing([0b10] * 3, CellState.UNDETERMINED), SURE)[1] is tile
-    whole = [vote(v, states_plane({CELL: KEPT})) for v in "abc"]
-    assert fuse(tile, whole, SURE)[1] is tile, "no mask marks nothing in a cell that stands"
-
-
 def test_a_drive_s_remnants_are_its_vehicle_s() -> None:
     early, late = standing([0b10, 0b100])
     late = TileVote("v0", 5, "late", states=late.states, gone=late.gone)

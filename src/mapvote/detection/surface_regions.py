@@ -9,7 +9,6 @@ from __future__ import annotations
 import numpy as np
 from scipy import ndimage
 
-from mapvote.core.columns import dilated
 from mapvote.core.types import F64, I32, U8, U64, Bool
 from mapvote.detection.spreading import flooded
 
@@ -40,9 +39,3 @@ def grown(strong: Bool, weak: Bool) -> Bool:
     """(rows, cols) ``strong`` cells, and ``weak`` ones that touch them (8) directly or through each other: hysteresis
     (Canny 1986). Few rays cross the far wall of what fell, and none of them met it."""
     return np.asarray(flooded(strong, strong | weak, strong.size))
-
-
-def detached(gone: U64, stands: U64, base: I32) -> U64:
-    """(rows, cols) those of ``gone`` that touch (26) no voxel of ``stands``: a leaf or a ledge that one vehicle met
-    others may see past."""
-    return np.asarray(gone & ~dilated(stands, base, 1))

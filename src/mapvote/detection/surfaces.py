@@ -29,7 +29,7 @@ from mapvote.detection.lone_points import lone_cells, no_change
 from mapvote.detection.regions import HALO, JOIN_CELLS, beyond_tiles, fallen, unexplained
 from mapvote.detection.surface_counts import CROSSED, MET, PASSED, PASSES, SurfaceEvidence, times_crossed
 from mapvote.detection.surface_looks import amounts, looks
-from mapvote.detection.surface_regions import detached, grown, lasting, supported
+from mapvote.detection.surface_regions import grown, lasting, supported
 from mapvote.detection.votes import TileVotes
 from mapvote.perception.frontend import Observation
 
@@ -220,10 +220,7 @@ def _decide_mapped(tiles: dict[TileIndex, _Judged], lattice: Lattice) -> None:
     for found in tiles.values():
         down = found.states == CellState.CHANGED_EMPTY
         found.gone = np.where(down, found.here.occupied, found.gone)
-    gone = {tile: found.gone for tile, found in tiles.items()}
-    stands, base = {t: found.stands for t, found in tiles.items()}, {t: found.here.base for t, found in tiles.items()}
-    for tile, words in beyond_tiles(lattice, 1, detached, (gone, 0), (stands, 0), (base, 0)).items():
-        tiles[tile].remnants = np.where(tiles[tile].stands != 0, words, np.uint64(0))
+        found.remnants = np.where(found.stands != 0, found.gone, np.uint64(0))
 
 
 def _decide_new(tiles: dict[TileIndex, _Judged], lattice: Lattice) -> None:

@@ -18,16 +18,17 @@ from mapvote.config import FuseSettings
 from mapvote.core.cells import flat_cells
 from mapvote.core.grid import CELLS, TILE_CELLS, Grid, Lattice, TileIndex
 from mapvote.core.tile import Tile
-from mapvote.core.types import F32, I32, I64, N_STATES, NO_VOTE, U8, U64, Bool, CellState, MapvoteError
+from mapvote.core.types import F32, I32, I64, N_STATES, NO_VOTE, U8, Bool, CellState, MapvoteError
 from mapvote.core.voting import VOTE_UNIT, add_tally, decide_cells, tally_of
 from mapvote.fusion.copies import Copy, liars_among, originals
+from mapvote.fusion.deletions import words_gone
 from mapvote.fusion.edit import add_points, delete_points
 from mapvote.fusion.odds import Odds, agreed_odds
 from mapvote.fusion.outliers import contradictors, deniers
 from mapvote.fusion.pending import Pending, beyond_budget
 from mapvote.fusion.persistence import denied_last, doubtful, remembered, temporary
 from mapvote.fusion.rims import without_rims
-from mapvote.fusion.sparse_columns import Words, counted, learned, nothing_reached, packed
+from mapvote.fusion.sparse_columns import learned, nothing_reached
 from mapvote.fusion.spent import changed_in
 from mapvote.fusion.tile_vote import TileVote, one_each
 from mapvote.fusion.turning import turned
@@ -176,7 +177,7 @@ def decide_tile(
 def _edit(tile: Tile, votes: Sequence[TileVote], states: U8, quorum: int) -> tuple[Tile, int, int]:
     """(the tile as decided, points added, points deleted)."""
     edited, deleted = tile, 0
-    gone = supported_words(votes, states, quorum)
+    gone = words_gone(votes, states, quorum, tile)
     if gone is not None:
         edited, deleted = delete_points(edited, gone)
     added = 0
@@ -209,30 +210,6 @@ def hear(
             quorum = max(2, quorum - int(found.sum()))
             states, tally = count(heard, rule, quorum)
     return heard, states, tally, quorum
-
-
-def supported_words(votes: Sequence[TileVote], states: U8, min_votes: int) -> U64 | None:
-    """(256, 256) delete mask, None if there is nothing to delete.
-
-    In cells decided changed-empty, the voxels that ``min_votes`` voters for it mark. In cells decided
-    unchanged-occupied, remnants that ``min_votes`` vehicles mark and more than half of those that determined the cell.
-    """
-    gone, emptied = None, Words.whole(states == int(CellState.CHANGED_EMPTY))
-    if len(emptied.cells):
-        reached = nothing_reached(min_votes, len(emptied.cells))
-        for vote in votes:
-            vote.mark_deleted(emptied, reached)
-        gone = np.zeros(states.shape, dtype=np.uint64)
-        gone.reshape(-1)[emptied.cells] = reached[-1]
-    left = [found for found in (vote.remnants(states) for vote in votes) if len(found.cells)]
-    if len(left) < min_votes:
-        return gone
-    cells, marks = counted(left)
-    determined = np.sum([vote.determined(cells) for vote in votes], axis=0)
-    remnants = packed((marks >= min_votes) & (2 * marks > determined[:, None]))
-    gone = np.zeros(states.shape, dtype=np.uint64) if gone is None else gone
-    gone.reshape(-1)[cells] |= remnants
-    return gone
 
 
 def _offered(votes: Sequence[TileVote], states: U8, grid: Grid) -> tuple[F32, U8, I64, I32]:

@@ -1,0 +1,67 @@
+"""Which voxels of a tile lose their points: all that its voters saw gone in cells that were emptied, and what is left
+of gone things in cells that stand.
+
+In a cell that stands one vehicle may have seen past what another met: a twig, a ledge, the edge of a wall. So half of
+the vehicles can take only what stands apart. What touches something that stays goes if more than two thirds say so.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from mapvote.core.columns import EVERY_BIT, neighbourhood
+from mapvote.core.grid import TILE_CELLS
+from mapvote.core.tile import Tile
+from mapvote.core.types import I32, U8, U64, CellState
+from mapvote.fusion.sparse_columns import Words, counted, nothing_reached, packed
+from mapvote.fusion.tile_vote import TileVote
+
+
+def words_gone(votes: Sequence[TileVote], states: U8, quorum: int, tile: Tile) -> U64 | None:
+    """(256, 256) delete mask of ``tile``, None if there is nothing to delete; ``states`` (256, 256) as decided.
+
+    In cells decided changed-empty, the voxels that ``quorum`` voters for it mark. In cells decided unchanged-occupied,
+    :func:`_remnants`.
+    """
+    gone, emptied = None, Words.whole(states == int(CellState.CHANGED_EMPTY))
+    if len(emptied.cells):
+        reached = nothing_reached(quorum, len(emptied.cells))
+        for vote in votes:
+            vote.mark_deleted(emptied, reached)
+        gone = np.zeros(states.shape, dtype=np.uint64)
+        gone.reshape(-1)[emptied.cells] = reached[-1]
+    left = [found for found in (vote.remnants(states) for vote in votes) if len(found.cells)]
+    if len(left) < quorum:
+        return gone
+    remnants = _remnants(left, votes, states, quorum, tile)
+    gone = np.zeros(states.shape, dtype=np.uint64) if gone is None else gone
+    gone.reshape(-1)[remnants.cells] |= remnants.words
+    return gone
+
+
+def _remnants(left: Sequence[Words], votes: Sequence[TileVote], states: U8, quorum: int, tile: Tile) -> Words:
+    """What of cells that stand goes: the voxels that are among those ``left`` by ``quorum`` vehicles or more, and by
+    more than half of those that determined the cell, if they touch (26) nothing of the map that stays; else by more
+    than two thirds. What lies beyond the tile's edge stays for all that is known here."""
+    cells, marks = counted(left)
+    determined = np.sum([vote.determined(cells) for vote in votes], axis=0)[:, None]
+    most = packed((marks >= quorum) & (2 * marks > determined))
+    nearly_all = packed((marks >= quorum) & (3 * marks > 2 * determined))
+    stays = np.where(states == int(CellState.UNCHANGED_OCCUPIED), tile.obstacle_words, np.uint64(0))
+    stays.reshape(-1)[cells] &= ~most
+    return Words(cells, nearly_all | (most & ~_touched(cells, stays, tile.base)))
+
+
+@numba.njit(cache=True, nogil=True)
+def _touched(cells: NDArray[np.intp], stays: U64, base: I32) -> U64:
+    """(n,) the voxels of flat ``cells`` that touch one of ``stays``, or the tile's edge."""
+    out = np.full(len(cells), EVERY_BIT)
+    for i in range(len(cells)):
+        row, col = cells[i] // TILE_CELLS, cells[i] % TILE_CELLS
+        if 0 < row < TILE_CELLS - 1 and 0 < col < TILE_CELLS - 1:
+            out[i] = neighbourhood(stays, base, row, col, np.int64(1))
+    return out

@@ -1,0 +1,131 @@
+"""Which voxels lose their points: whose marks count, how many it takes, and what lies beside what stays."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from hand_made import SHAPE, Cell, make_tile, states_plane, wall, words_plane
+from mapvote.core.grid import TILE_CELLS
+from mapvote.core.tile import Tile
+from mapvote.core.types import NO_VOTE, CellState
+from mapvote.fusion.deletions import words_gone
+from mapvote.fusion.sparse_columns import Words
+from mapvote.fusion.tile_vote import TileVote
+
+UO, UE, CO, CE, UN = CellState
+CELL = (10, 10)
+APART = [0.45, 1.05, 1.65]
+"""Heights of voxels 1, 3 and 5, none of which touches another."""
+
+
+def says(masks: Sequence[int], states: Sequence[int], cell: Cell = CELL) -> list[TileVote]:
+    return [
+        TileVote(f"v{i}", 0, f"d{i}", states=states_plane({cell: state}), gone=Words.of(words_plane({cell: mask})))
+        for i, (mask, state) in enumerate(zip(masks, states, strict=True))
+    ]
+
+
+def gone(tile: Tile, votes: list[TileVote], decided: int = UO, cell: Cell = CELL) -> int:
+    """The voxels of a cell that go, of those that the tile has points in."""
+    words = words_gone(votes, states_plane({cell: decided}), 2, tile)
+    return 0 if words is None else int(words[cell] & tile.obstacle_words[cell])
+
+
+def of_standing(masks: Sequence[int], heights: list[float] = APART, cell: Cell = CELL) -> int:
+    return gone(make_tile(wall([cell], heights)), says(masks, [UO] * len(masks), cell), UO, cell)
+
+
+@pytest.mark.parametrize(
+    ("masks", "goes"),
+    [
+        ([0b1010, 0b1010, 0], 0b1010),
+        ([0b1010, 0, 0], 0),
+        ([0b1010, 0b1000, 0], 0b1000),
+        ([0b1010, 0b1010, 0, 0], 0),
+        ([0b1010, 0b1010, 0b1010, 0, 0], 0b1010),
+    ],
+)
+def test_what_stands_apart_goes_from_a_cell_that_stands_if_most_vehicles_mark_it(masks: list[int], goes: int) -> None:
+    assert of_standing(masks) == goes
+
+
+@pytest.mark.parametrize(
+    ("marking", "of", "goes"), [(2, 2, True), (2, 3, False), (3, 3, True), (3, 4, True), (4, 6, False), (5, 7, True)]
+)
+def test_what_touches_what_stays_goes_if_more_than_two_thirds_mark_it(marking: int, of: int, goes: bool) -> None:
+    assert of_standing([0b100] * marking + [0] * (of - marking), [0.45, 0.75]) == (0b100 if goes else 0)
+
+
+def test_what_touches_what_stays_in_the_next_cell_only_touches_it_too() -> None:
+    twig, votes = wall([CELL], APART), says([0b1010] * 2 + [0], [UO] * 3)
+    for beside, other, stays in (
+        ((10, 11), UO, True),
+        ((11, 9), UO, True),
+        ((10, 12), UO, False),
+        ((10, 11), UN, False),
+    ):
+        tile = make_tile(np.concatenate([twig, wall([beside], [0.75])]))
+        decided = states_plane({CELL: UO, beside: other})
+        words = words_gone(votes, decided, 2, tile)
+        assert words is not None
+        assert words[CELL] == (0 if stays else 0b1010)
+
+
+def test_of_two_voxels_that_go_together_neither_holds_the_other() -> None:
+    assert of_standing([0b110] * 2 + [0], [0.45, 0.75, 1.65]) == 0b110
+
+
+@pytest.mark.parametrize("cell", [(0, 10), (TILE_CELLS - 1, 10), (10, 0), (10, TILE_CELLS - 1)])
+def test_at_the_tile_s_edge_all_may_touch_what_stays_beyond_it(cell: Cell) -> None:
+    assert of_standing([0b1010] * 2 + [0], cell=cell) == 0
+    assert of_standing([0b1010] * 3, cell=cell) == 0b1010
+
+
+def test_who_says_that_the_whole_cell_is_empty_marks_what_goes_of_it_too() -> None:
+    tile = make_tile(wall([CELL], APART))
+    assert gone(tile, says([0b1010, 0b101010, 0, 0], [UO, CE, UO, UO])) == 0, "two of four"
+    assert gone(tile, says([0b1010, 0b101010, 0], [UO, CE, UO])) == 0b1010
+    touching = make_tile(wall([CELL], [0.45, 0.75]))
+    assert gone(touching, says([0b100, 0b100, 0b110], [UO, UO, CE])) == 0b100, "all three say so"
+
+
+def test_marks_count_of_nobody_who_says_anything_else_and_only_if_the_cell_stands() -> None:
+    tile = make_tile(wall([CELL], [0.45]))
+    for other in (UN, UE, NO_VOTE):
+        assert gone(tile, says([0b10, 0, 0, 0b10], [UO, UO, UO, other])) == 0
+    assert gone(tile, says([0b10] * 3, [UN] * 3), UN) == 0
+    whole = [TileVote(v, 0, v, states=states_plane({CELL: UO})) for v in "abc"]
+    assert gone(tile, whole) == 0, "no mask marks nothing in a cell that stands"
+
+
+def test_in_one_stage_a_mask_of_a_cell_that_may_be_empty_says_nothing_of_one_that_stands() -> None:
+    tile, votes = make_tile(wall([CELL], APART)), []
+    for i, counts in enumerate(([3, 0, 0, 1, 0], [3, 0, 0, 0, 0], [3, 0, 0, 0, 0])):
+        tally = np.zeros((*SHAPE, 5), np.uint16)
+        tally[CELL] = counts
+        votes.append(TileVote(f"v{i}", 0, "d", tally=tally, gone=Words.of(words_plane({CELL: 0b1010}))))
+    assert gone(tile, votes) == 0b1010
+    votes[1].tally[CELL] = [3, 0, 0, 1, 0]  # type: ignore[index]
+    assert gone(tile, votes) == 0
+
+
+@given(
+    masks=st.lists(st.integers(0, 0b111110), min_size=1, max_size=6),
+    states=st.lists(st.sampled_from([UO, CE, UE, UN]), min_size=6, max_size=6),
+    layers=st.sets(st.integers(1, 5), min_size=1),
+    more=st.integers(0, 0b111110),
+)
+@settings(max_examples=60, deadline=None)
+def test_the_order_of_votes_is_nothing_and_one_mark_more_never_takes_less(
+    masks: list[int], states: list[int], layers: set[int], more: int
+) -> None:
+    tile = make_tile(wall([CELL], [0.3 * layer + 0.15 for layer in sorted(layers)]))
+    votes = says(masks, states[: len(masks)])
+    before = gone(tile, votes)
+    assert gone(tile, votes[::-1]) == before
+    assert gone(tile, says([masks[0] | more, *masks[1:]], states[: len(masks)])) & before == before
