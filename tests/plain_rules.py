@@ -292,7 +292,7 @@ def fuse(
         for cell, (state, says, _) in decided.items()
         if state == UO
         for layer in layers(before.cells[cell])
-        if layer and not marked(layer, says, quorum, 1, 2)
+        if layer and not is_left(layer, says, quorum)
     ]
     for cell, held in before.cells.items():
         beside = {n for (r, c), n in stay if abs(r - cell[0]) <= 1 and abs(c - cell[1]) <= 1}
@@ -400,14 +400,21 @@ def goes(layer: int, state: int, says: dict[str, Spoken], quorum: int, touched: 
     if state == CE:
         marks = [EVERY if s.gone is None else s.gone for s in says.values() if s.state == CE]
         return sum(m >> layer & 1 for m in marks) >= quorum
-    return marked(layer, says, quorum, 2, 3) or (layer not in touched and marked(layer, says, quorum, 1, 2))
+    return is_marked(layer, says, max(quorum, 2), (UO, CE), 2 / 3) or (
+        layer not in touched and is_left(layer, says, quorum)
+    )
 
 
-def marked(layer: int, says: dict[str, Spoken], quorum: int, share: int, of: int) -> bool:
-    """Whether so many say that a voxel is gone of a cell that stands, and more than ``share`` in ``of`` who decided."""
-    marks = [s.gone or 0 for s in says.values() if s.state in (UO, CE)]
+def is_left(layer: int, says: dict[str, Spoken], quorum: int) -> bool:
+    """Whether half of the vehicles say that a voxel is gone of a cell that stands."""
+    return is_marked(layer, says, quorum, (UO,), 1 / 2)
+
+
+def is_marked(layer: int, says: dict[str, Spoken], quorum: int, saying: tuple[int, ...], share: float) -> bool:
+    """Whether so many of those ``saying`` this of the cell mark a voxel, and more than a ``share`` of who decided."""
+    marks = [s.gone or 0 for s in says.values() if s.state in saying]
     marking, determined = sum(m >> layer & 1 for m in marks), sum(s.state != UN for s in says.values())
-    return marking >= quorum and of * marking > share * determined
+    return marking >= quorum and marking > share * determined + 1e-9
 
 
 def is_temporary(held: CellMap, recent: list[Cast], cell: Cell, settings: FuseSettings) -> bool:

@@ -61,6 +61,14 @@ def test_what_touches_what_stays_goes_if_more_than_two_thirds_mark_it(marking: i
     assert of_standing([0b100] * marking + [0] * (of - marking), [0.45, 0.75]) == (0b100 if goes else 0)
 
 
+def test_nobody_alone_takes_what_touches_what_stays() -> None:
+    for heights, goes in (([0.45, 0.75], 0), ([0.45, 1.05], 0b1000)):
+        tile, votes = make_tile(wall([CELL], heights)), says([0b1100], [UO])
+        words = words_gone(votes, states_plane({CELL: UO}), 1, tile)
+        assert words is not None
+        assert int(words[CELL] & tile.obstacle_words[CELL]) == goes
+
+
 def test_what_touches_what_stays_in_the_next_cell_only_touches_it_too() -> None:
     twig, votes = wall([CELL], APART), says([0b1010] * 2 + [0], [UO] * 3)
     for beside, other, stays in (
@@ -86,12 +94,11 @@ def test_at_the_tile_s_edge_all_may_touch_what_stays_beyond_it(cell: Cell) -> No
     assert of_standing([0b1010] * 3, cell=cell) == 0b1010
 
 
-def test_who_says_that_the_whole_cell_is_empty_marks_what_goes_of_it_too() -> None:
-    tile = make_tile(wall([CELL], APART))
-    assert gone(tile, says([0b1010, 0b101010, 0, 0], [UO, CE, UO, UO])) == 0, "two of four"
-    assert gone(tile, says([0b1010, 0b101010, 0], [UO, CE, UO])) == 0b1010
-    touching = make_tile(wall([CELL], [0.45, 0.75]))
-    assert gone(touching, says([0b100, 0b100, 0b110], [UO, UO, CE])) == 0b100, "all three say so"
+def test_who_has_the_whole_cell_empty_counts_among_two_thirds_but_not_among_half() -> None:
+    for heights, mask in (([0.45, 0.75], 0b100), (APART, 0b1010)):
+        tile = make_tile(wall([CELL], heights))
+        assert gone(tile, says([mask, mask, 0b111110], [UO, UO, CE])) == mask, "all three say so"
+        assert gone(tile, says([mask, 0b111110, 0], [UO, CE, UO])) == 0, "two of three, of whom one saw nothing stand"
 
 
 def test_marks_count_of_nobody_who_says_anything_else_and_only_if_the_cell_stands() -> None:

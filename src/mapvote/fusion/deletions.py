@@ -2,7 +2,8 @@
 of gone things in cells that stand.
 
 In a cell that stands one vehicle may have seen past what another met: a twig, a ledge, the edge of a wall. So half of
-the vehicles can take only what stands apart. What touches something that stays goes if more than two thirds say so.
+the vehicles can take only what stands apart. What touches something that stays goes if more than two thirds say so,
+those among them who have the whole cell empty.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from numpy.typing import NDArray
 from mapvote.core.columns import EVERY_BIT, neighbourhood
 from mapvote.core.grid import TILE_CELLS
 from mapvote.core.tile import Tile
-from mapvote.core.types import I32, U8, U64, CellState
+from mapvote.core.types import I32, U8, U64, Bool, CellState
 from mapvote.fusion.sparse_columns import Words, counted, nothing_reached, packed
 from mapvote.fusion.tile_vote import TileVote
 
@@ -24,8 +25,8 @@ from mapvote.fusion.tile_vote import TileVote
 def words_gone(votes: Sequence[TileVote], states: U8, quorum: int, tile: Tile) -> U64 | None:
     """(256, 256) delete mask of ``tile``, None if there is nothing to delete; ``states`` (256, 256) as decided.
 
-    In cells decided changed-empty, the voxels that ``quorum`` voters for it mark. In cells decided unchanged-occupied,
-    :func:`_remnants`.
+    In cells decided changed-empty, the voxels that ``quorum`` voters for it mark. In cells decided unchanged-occupied
+    see :func:`_remnants`.
     """
     gone, emptied = None, Words.whole(states == int(CellState.CHANGED_EMPTY))
     if len(emptied.cells):
@@ -34,24 +35,39 @@ def words_gone(votes: Sequence[TileVote], states: U8, quorum: int, tile: Tile) -
             vote.mark_deleted(emptied, reached)
         gone = np.zeros(states.shape, dtype=np.uint64)
         gone.reshape(-1)[emptied.cells] = reached[-1]
-    left = [found for found in (vote.remnants(states) for vote in votes) if len(found.cells)]
-    if len(left) < quorum:
+    stands = states == int(CellState.UNCHANGED_OCCUPIED)
+    left = [vote.remnants(states) for vote in votes]
+    emptied_by = [_emptied(vote, stands) for vote in votes]
+    if sum(len(a.cells) + len(b.cells) > 0 for a, b in zip(left, emptied_by, strict=True)) < quorum:
         return gone
-    remnants = _remnants(left, votes, states, quorum, tile)
+    remnants = _remnants(left, emptied_by, votes, stands, quorum, tile)
     gone = np.zeros(states.shape, dtype=np.uint64) if gone is None else gone
     gone.reshape(-1)[remnants.cells] |= remnants.words
     return gone
 
 
-def _remnants(left: Sequence[Words], votes: Sequence[TileVote], states: U8, quorum: int, tile: Tile) -> Words:
-    """What of cells that stand goes: the voxels that are among those ``left`` by ``quorum`` vehicles or more, and by
-    more than half of those that determined the cell, if they touch (26) nothing of the map that stays; else by more
-    than two thirds. What lies beyond the tile's edge stays for all that is known here."""
-    cells, marks = counted(left)
+def _emptied(vote: TileVote, stands: Bool) -> Words:
+    """The voxels that a vote says are gone with the whole cell, of those of which it was decided that it ``stands``; a
+    mask in one stage only tells what would go."""
+    if vote.gone is None or vote.tally is not None:
+        return Words.none()
+    marked = vote.gone.within(stands)
+    return marked.at(vote.supports(CellState.CHANGED_EMPTY, marked.cells))
+
+
+def _remnants(
+    left: Sequence[Words], emptied_by: Sequence[Words], votes: Sequence[TileVote], stands: Bool, quorum: int, tile: Tile
+) -> Words:
+    """What of cells that stand goes: the voxels that ``quorum`` vehicles or more, and more than half of those that
+    determined the cell, say are ``left`` of something, if they touch (26) nothing of the map that stays; and those that
+    more than two thirds, two at least, say are left or gone with the whole cell. What lies beyond the tile's edge stays
+    for all that is known here."""
+    cells, marks = counted([*left, *emptied_by])
+    halves = counted([Words(cells, np.zeros(len(cells), np.uint64)), *left])[1]
     determined = np.sum([vote.determined(cells) for vote in votes], axis=0)[:, None]
-    most = packed((marks >= quorum) & (2 * marks > determined))
-    nearly_all = packed((marks >= quorum) & (3 * marks > 2 * determined))
-    stays = np.where(states == int(CellState.UNCHANGED_OCCUPIED), tile.obstacle_words, np.uint64(0))
+    most = packed((halves >= quorum) & (2 * halves > determined))
+    nearly_all = packed((marks >= max(quorum, 2)) & (3 * marks > 2 * determined))
+    stays = np.where(stands, tile.obstacle_words, np.uint64(0))
     stays.reshape(-1)[cells] &= ~most
     return Words(cells, nearly_all | (most & ~_touched(cells, stays, tile.base)))
 

@@ -123,14 +123,11 @@ class TileVote:
         return marked.at(self.supports(CellState.CHANGED_EMPTY, marked.cells))
 
     def remnants(self, decided: U8) -> Words:
-        """The voxels that this vote says are gone, of the (256, 256) cells ``decided`` to stand, whether it says so of
-        the cell too or has it empty. A mask in one stage may mean the latter alone, and is not asked then."""
+        """The voxels that this vote says are gone though the cell stands, of the (256, 256) cells ``decided`` so."""
         if self.gone is None:
             return Words.none()
-        stands = self.gone.at(decided.reshape(-1)[self.gone.cells] == int(CellState.UNCHANGED_OCCUPIED))
-        agrees = self.supports(CellState.UNCHANGED_OCCUPIED, stands.cells)
-        empties = self.supports(CellState.CHANGED_EMPTY, stands.cells)
-        return stands.at(agrees | empties if self.tally is None else agrees & ~empties)
+        marked = self.gone.at(self.agreed(self.gone.cells, decided, CellState.UNCHANGED_OCCUPIED))
+        return marked if self.tally is None else marked.at(~self.supports(CellState.CHANGED_EMPTY, marked.cells))
 
 
 def states_of(votes: Sequence[TileVote], cells: slice | NDArray[np.intp] = slice(None)) -> U8:
