@@ -54,6 +54,7 @@ TESTS = {
     "fusion/turning.py": ["fusion/test_turning.py"],
     "fusion/rims.py": ["fusion/test_rims.py"],
     "fusion/spilled.py": ["fusion/test_spilled.py"],
+    "fusion/deletions.py": ["fusion/test_deletions.py"],
     "fusion/odds.py": ["fusion/test_odds.py"],
     "fusion/pending.py": ["fusion/test_pending.py"],
     "fusion/probability.py": ["fusion/test_probability.py", "fusion/test_pending.py"],

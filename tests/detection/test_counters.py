@@ -175,3 +175,9 @@ def test_shifting_a_column_drops_what_leaves_it() -> None:
     assert shifted(np.uint64(0b11), 2) == 0b1100
     assert shifted(np.uint64(0b11), -1) == 0b1
     assert shifted(np.uint64(1), 64) == shifted(np.uint64(1 << 63), -64) == 0
+
+
+def test_free_words_are_told_of_windows_of_any_shape() -> None:
+    planes = np.zeros((3, 1, 2 * PLANES + 2), np.uint64)
+    planes[2, 0, 1] = 1 << 5  # seen through twice
+    assert free_words(planes, np.zeros((3, 1), np.uint64)).tolist() == [[0], [0], [1 << 5]]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
@@ -201,6 +201,7 @@ def test_one_hit_outweighs_as_many_rays_as_is_said(crossed: int, met: int) -> No
 
 
 @given(crossed=st.integers(0, 120), met=st.integers(0, 60), passes=st.integers(0, 127))
+@example(crossed=0, met=1, passes=0)
 def test_a_free_voxel_is_new_by_hits_against_crossings_and_tells_how_often_rays_passed(
     crossed: int, met: int, passes: int
 ) -> None:

@@ -53,3 +53,28 @@ def test_in_whichever_order_points_come_they_are_judged_alike_and_met_ones_stay(
     turned = trails(points[::-1].copy(), balance[::-1].copy(), points[:, 2], LATTICE)
     np.testing.assert_array_equal(found, turned[::-1])
     assert not trails(points, np.abs(balance), points[:, 2], LATTICE).any()
+
+
+def by_hand(cells: dict[tuple[int, int], int]) -> set[tuple[int, int]]:
+    """The cells whose 8-connected group has a sum below zero."""
+    left, out = set(cells), set()
+    while left:
+        group, ring = set(), {left.pop()}
+        while ring:
+            group |= ring
+            ring = {(r + i, c + k) for r, c in ring for i in (-1, 0, 1) for k in (-1, 0, 1)} & left
+            left -= ring
+        out |= group if sum(cells[cell] for cell in group) < 0 else set()
+    return out
+
+
+@given(
+    st.dictionaries(st.tuples(st.integers(-300, -290), st.integers(-6, 6)), st.integers(-9, 9), min_size=1, max_size=50)
+)
+def test_trails_are_the_groups_of_cells_that_touch_and_were_passed_more_often_on_either_side_of_the_origin(
+    cells: dict[tuple[int, int], int],
+) -> None:
+    points = np.array([[(c + 0.5) * CELL_SIZE, (r + 0.5) * CELL_SIZE, 1.0] for r, c in cells])
+    balance: I64 = np.array(list(cells.values()))
+    found = trails(points, balance, points[:, 2], LATTICE)
+    assert {cell for cell, is_trail in zip(cells, found, strict=True) if is_trail} == by_hand(cells)
