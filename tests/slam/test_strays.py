@@ -7,8 +7,8 @@ import pytest
 
 from mapvote.core.grid import Lattice
 from mapvote.core.types import F64
-from mapvote.core.voxels import VoxelCloud
-from mapvote.slam.strays import NEAR_M, strays
+from mapvote.core.voxels import VoxelCloud, thin, voxel_downsample
+from mapvote.slam.strays import MET_SHARE, NEAR_M, strays
 
 LATTICE = Lattice()
 
@@ -30,6 +30,19 @@ def test_where_few_scans_were_taken_or_from_afar_one_is_enough() -> None:
     assert not strays(points, once, road(14), LATTICE).any(), "2 Hz"
     assert not strays(points, once, road(60) - np.array([0.0, NEAR_M, 0.0]), LATTICE).any()
     assert not strays(points, once, np.zeros((0, 3)), LATTICE).any()
+
+
+def test_wherever_it_lies_a_point_is_asked_of_all_places_within_twenty_metres() -> None:
+    """One after the other, as the words have it."""
+    rng = np.random.default_rng(2)
+    driven = np.concatenate([road(60), road(60) * 1.3 + [40.0, 5.0, 0.0], [[200.0, 0.0, 0.0]]])
+    points, scans = rng.uniform(-45.0, 90.0, (3000, 3)), rng.integers(1, 6, 3000).astype(np.int32)
+    places = driven[thin(driven, 1.0)]
+    passed = (np.hypot(*(points[:, None, :2] - places[None, :, :2]).transpose(2, 0, 1)) < NEAR_M).sum(axis=1)
+    assert 0 < (scans < MET_SHARE * passed).sum() < 3000
+    apart = voxel_downsample(points, 3.0)
+    expected = (scans < MET_SHARE * passed)[apart]
+    np.testing.assert_array_equal(strays(points[apart], scans[apart], driven, LATTICE), expected)
 
 
 def test_who_waits_at_a_light_asks_no_more_of_a_wall() -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from functools import lru_cache
 
 import numba
@@ -197,22 +197,24 @@ class _Lows:
 
 def _sow(lows: _Lows, neighbours: I32, least: int) -> None:
     """Seeds: cells whose lowest point most cells around agree with, and which no lower ground explains as things."""
-    low = lru_cache(maxsize=_NEAR_TILES)(lows.low)
+    # What is sown here was not known before and is not called so yet: neither plane changes on the way.
+    low, known = (lru_cache(maxsize=_NEAR_TILES)(plane) for plane in (lows.low, lows.known))
     nothing = np.full((TILE_CELLS, TILE_CELLS), np.inf, dtype=np.float32)
     near = slice(TILE_CELLS - _AROUND_CELLS, 2 * TILE_CELLS + _AROUND_CELLS)
-    own = slice(TILE_CELLS, 2 * TILE_CELLS)
-
-    def window(tile: int, plane: Callable[[int], F32]) -> F32:
-        return np.block([[plane(j) if j >= 0 else nothing for j in row] for row in neighbours[tile].tolist()])
+    thirds = [slice(k * TILE_CELLS, (k + 1) * TILE_CELLS) for k in range(3)]
 
     @lru_cache(maxsize=_NEAR_TILES)
     def supported(tile: int) -> F32:
         if not np.isfinite(low(tile)).any():
             return nothing
-        return _supported(window(tile, low)[near, near], _AROUND_CELLS, _GRADE * CELL_SIZE, _AGREEING, least)
+        around = np.block([[low(j) if j >= 0 else nothing for j in row] for row in neighbours[tile].tolist()])
+        return _supported(around[near, near], _AROUND_CELLS, _GRADE * CELL_SIZE, _AGREEING, least)
 
+    envelope = np.empty((3 * TILE_CELLS, 3 * TILE_CELLS))
     for k in range(len(neighbours)):
         if np.isfinite(supported(k)).any():
-            envelope = np.minimum(window(k, supported), window(k, lows.known)).astype(np.float64)
+            for i, row in enumerate(neighbours[k].tolist()):
+                for j, tile in enumerate(row):
+                    envelope[thirds[i], thirds[j]] = np.minimum(supported(tile), known(tile)) if tile >= 0 else np.inf
             _lower_envelope(envelope, _GRADE * CELL_SIZE, _GRADE * CELL_SIZE * np.sqrt(2.0))
-            lows.sow(k, np.isfinite(supported(k)) & (supported(k) <= envelope[own, own] + 0.1))
+            lows.sow(k, np.isfinite(supported(k)) & (supported(k) <= envelope[thirds[1], thirds[1]] + 0.1))

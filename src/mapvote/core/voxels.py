@@ -179,8 +179,9 @@ class VoxelCloud:
         """(mean point (m, 3) map metres, scans that met it (m,)) of every voxel, in the lattice's x, y, z order."""
         found = np.flatnonzero(self._keys)
         rows: NDArray[np.int32] = self._rows[found[np.argsort(self._keys[found])]]
-        sums = self._sums[rows]
-        return sums[:, 4:7] + sums[:, 1:4] / sums[:, :1], sums[:, 7].astype(np.int32)
+        sums = self._sums[: self._n]  # as they came one after the other in memory; put in order when they are few
+        means = sums[:, 4:7] + sums[:, 1:4] / sums[:, :1]
+        return means.take(rows, axis=0), sums[:, 7].astype(np.int32)[rows]
 
 
 @numba.njit(cache=True, nogil=True)

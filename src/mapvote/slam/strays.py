@@ -38,9 +38,14 @@ def strays(points: F64, scans: I32, driven: F64, lattice: Lattice) -> Bool:
 
 def _hardly_met(points: F64, scans: I32, places: F64) -> Bool:
     out = np.zeros(len(points), dtype=np.bool_)
-    asked = np.flatnonzero(scans < _MOST_ASKED)
-    if len(places) and len(asked):
-        passed = cKDTree(places[:, :2]).query_ball_point(points[asked, :2], NEAR_M, return_length=True)
+    if not len(places):
+        return out
+    tree = cKDTree(places[:, :2])
+    # Places near to one point are near to each other: what was met oftener than the most of them ask is not counted.
+    most = tree.query_ball_point(places[:, :2], 2.001 * NEAR_M, return_length=True).max()
+    asked = np.flatnonzero(scans < min(_MOST_ASKED, MET_SHARE * most))
+    if len(asked):
+        passed = tree.query_ball_point(points[asked, :2], NEAR_M, return_length=True)
         out[asked] = scans[asked] < MET_SHARE * passed
     return out
 
