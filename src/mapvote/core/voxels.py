@@ -79,26 +79,21 @@ def _find(keys: I64, table_keys: I64, table_rows: I32, n: int, rows: I32) -> int
 
 
 @numba.njit(cache=True, nogil=True)
-def _add(points: F64, of_point: I32, rows: I32, sums: F64, near: F64) -> None:
-    """Points (n, 3) into the ``sums`` of their voxels' ``rows`` (m,), worked out in ``near``, the rows side by side."""
-    for j in range(len(rows)):
-        for c in range(8):
-            near[j, c] = sums[rows[j], c]
-        near[j, 7] += 1.0
+def _add(points: F64, of_point: I32, rows: I32, sums: F64) -> None:
+    """Points (n, 3) into the ``sums`` of their voxels, whose ``rows`` (m,) these are; ``of_point`` (n,) says which."""
+    for j in range(len(rows)):  # all rows are asked for before any is waited for
+        sums[rows[j], 7] += 1.0
     for i in range(len(points)):
-        k = of_point[i]
-        if k < 0:
+        if of_point[i] < 0:
             continue
+        k = rows[of_point[i]]
         # Moments are taken from the first point: large world coordinates would eat the digits.
-        if near[k, 0] == 0.0:
-            near[k, 4], near[k, 5], near[k, 6] = points[i, 0], points[i, 1], points[i, 2]
-        near[k, 0] += 1.0
-        near[k, 1] += points[i, 0] - near[k, 4]
-        near[k, 2] += points[i, 1] - near[k, 5]
-        near[k, 3] += points[i, 2] - near[k, 6]
-    for j in range(len(rows)):
-        for c in range(8):
-            sums[rows[j], c] = near[j, c]
+        if sums[k, 0] == 0.0:
+            sums[k, 4], sums[k, 5], sums[k, 6] = points[i, 0], points[i, 1], points[i, 2]
+        sums[k, 0] += 1.0
+        sums[k, 1] += points[i, 0] - sums[k, 4]
+        sums[k, 2] += points[i, 1] - sums[k, 5]
+        sums[k, 3] += points[i, 2] - sums[k, 6]
 
 
 @numba.njit(cache=True, nogil=True)
@@ -119,7 +114,6 @@ class _Scratch(NamedTuple):
     of_point: I32
     keys: I64
     rows: I32
-    near: F64
 
 
 def _room_for(n: int) -> _Scratch:
@@ -131,7 +125,6 @@ def _room_for(n: int) -> _Scratch:
         np.empty(n, dtype=np.int32),
         np.empty(n, dtype=np.int64),
         np.empty(n, dtype=np.int32),
-        np.empty((n, 8)),
     )
 
 
@@ -156,12 +149,12 @@ class VoxelCloud:
         mask = np.zeros(len(points), dtype=np.bool_) if skip is None else skip
         if len(points) > len(self._scratch.keys):
             self._scratch = _room_for(len(points))
-        table, place_of, of_point, keys, rows, near = self._scratch
+        table, place_of, of_point, keys, rows = self._scratch
         m = _gather(points, mask, self.lattice.x0, self.lattice.y0, table, place_of, of_point, keys)
         while self._n + m > len(self._sums):
             self._grow()
         self._n = _find(keys[:m], self._keys, self._rows, self._n, rows)
-        _add(points, of_point, rows[:m], self._sums, near)
+        _add(points, of_point, rows[:m], self._sums)
 
     def _grow(self) -> None:
         keys = np.zeros(2 * len(self._keys), dtype=np.int64)
