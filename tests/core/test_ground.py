@@ -258,3 +258,24 @@ def test_a_column_without_ground_begins_no_higher_than_a_gentle_slope_from_any_k
         lowest = np.min(ground[tuple(known.T)].astype(np.float64) + 0.02 * CELL_SIZE * way)
         lowest = lowest if np.isnan(ground[row, col]) else np.float64(ground[row, col])
         assert layer in (np.floor(lowest / CELL_SIZE - 1e-9), np.floor(lowest / CELL_SIZE + 1e-9))
+
+
+def test_ground_that_is_sown_later_grows_and_what_had_grown_stays() -> None:
+    """As it does where all of it is looked at again."""
+    rng = np.random.default_rng(11)
+    cells = np.sort(rng.choice(CELLS, CELLS // 3, replace=False))
+    heights = rng.normal(0.0, 0.03, len(cells)).astype(np.float32)
+    start = np.searchsorted(cells, np.arange(CELLS + 1)).astype(np.int32)
+    around = tiles_around([(0, 0)])
+    ground, gap = np.full(CELLS, np.nan, np.float32), np.full(CELLS, UNREACHED, np.uint8)
+    ground[10 * TILE_CELLS + 10], gap[10 * TILE_CELLS + 10] = 0.0, SEED
+    grow(start, heights, around, ground, gap)
+    before = ground.copy(), gap.copy()
+    grow(start, heights, around, ground, gap)
+    assert np.array_equal(ground, before[0], equal_nan=True)
+    assert np.array_equal(gap, before[1])
+    assert (gap[cells] == 0).mean() > 0.8
+    ground[-1], gap[-1] = 5.0, SEED
+    grow(start, heights, around, ground, gap)
+    assert (gap <= before[1]).all()
+    assert gap[-1] <= 1

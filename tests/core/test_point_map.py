@@ -15,9 +15,9 @@ from matplotlib import image
 
 import mapvote
 from hand_made import make_map, two_walls
-from mapvote.core.grid import Lattice
+from mapvote.core.grid import TILE_CELLS, Lattice
 from mapvote.core.picture import SIDE, heights, paint
-from mapvote.core.point_map import all_points
+from mapvote.core.point_map import all_points, cut_tiles
 from mapvote.core.sensors import SENSORS
 from mapvote.core.tile import Tile
 from mapvote.core.types import F32, Drive, MapvoteError, Scan
@@ -137,3 +137,14 @@ def test_a_map_from_points_holds_them() -> None:
     found = all_points(point_map)
     order, stored = np.lexsort(points.T), np.lexsort(found.T)
     np.testing.assert_allclose(found[stored], points[order], atol=1e-5)
+
+
+@pytest.mark.parametrize("side_m", [300.0, 90_000.0])
+def test_points_are_cut_into_tiles_in_ascending_order_and_keep_theirs_within_each(side_m: float) -> None:
+    """Of a few tiles as of more than two bytes can number."""
+    points = np.random.default_rng(4).uniform(-side_m, side_m, (2000, 3))
+    rows, cols = (cells // TILE_CELLS for cells in Lattice().cells_of(points))
+    cut = list(cut_tiles(points, Lattice()))
+    assert [tile for tile, _ in cut] == sorted(set(zip(rows.tolist(), cols.tolist(), strict=True)))
+    np.testing.assert_array_equal(np.concatenate([mine for _, mine in cut]), np.lexsort((cols, rows)))
+    assert all((rows[mine] == row).all() and (cols[mine] == col).all() for (row, col), mine in cut)

@@ -176,22 +176,23 @@ def grow(start: I32 | I64, heights: F32, neighbours: I32, ground: F32, gap: U8) 
 
     Seeds are all entered before any of them is left: only the rim of what they cover waits in the queue.
     """
+    # The narrowest gap over which each cell waits in the queue: who comes over as wide a one finds it entered.
+    waits = np.full(len(gap), UNREACHED, np.uint8)
     width = int(np.int64(1))  # no literal, for which all steps would be compiled once more
     for cell in range(len(gap)):
         if gap[cell] == SEED:
+            waits[cell] = 0
             _enter(cell, ground[cell], width, start, heights, neighbours, ground, gap)
     cells, expected = np.empty(1024, np.int64), np.empty(1024, np.float32)
     following = np.empty(1024, np.int32)
     first, last = np.full(WIDEST + 4, -1, np.int32), np.full(WIDEST + 4, -1, np.int32)
-    # The narrowest gap over which each cell waits in the queue: who comes over as wide a one finds it entered.
-    waits = np.full(len(gap), UNREACHED, np.uint8)
     n, spare, looked_at = 0, -1, 0
     width = int(np.int64(0))
     while width <= WIDEST:
         if looked_at < len(gap):
             cell = looked_at
             looked_at += 1
-            if gap[cell] > 1:
+            if waits[cell] != 0:  # no seed: what ground has grown from before it has grown from on all sides
                 continue
         else:
             entry = first[width]

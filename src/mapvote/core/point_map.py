@@ -16,7 +16,7 @@ from mapvote.core.ground import Heights, lay_ground
 from mapvote.core.lazy_tiles import LazyTiles
 from mapvote.core.picture import html_picture
 from mapvote.core.tile import Tile
-from mapvote.core.types import F32, F64, I64, MapvoteError
+from mapvote.core.types import F32, F64, I32, I64, MapvoteError
 
 _EXTENT_M = 1e7
 _CHUNK = 1_000_000
@@ -75,11 +75,21 @@ def cut_tiles(points_map: NDArray[np.floating], lattice: Lattice) -> Iterator[tu
     for start in range(0, len(points_map), _CHUNK):
         piece = slice(start, start + _CHUNK)
         tiles[piece, 0], tiles[piece, 1] = tile_of_cells(*lattice.cells_of(points_map[piece]))
-    order = np.lexsort((tiles[:, 1], tiles[:, 0]))
-    seams = np.flatnonzero((tiles[order[1:]] != tiles[order[:-1]]).any(axis=1)) + 1
+    number = _numbered(tiles)
+    order = np.argsort(number, kind="stable")
+    seams = np.flatnonzero(np.diff(number[order])) + 1
     for piece_of_order in np.split(order, seams):
         row, col = tiles[piece_of_order[0]].tolist()
         yield (row, col), piece_of_order
+
+
+def _numbered(tiles: I32) -> NDArray[np.integer]:
+    """(n,) a number for each of the tiles (n, 2), ascending as they do; of two bytes if these are enough, for numpy
+    sorts such ten times as fast."""
+    low, high = tiles.min(axis=0).astype(np.int64), tiles.max(axis=0).astype(np.int64)
+    rows, cols = (high - low + 1).tolist()
+    kind = np.uint16 if rows * cols <= 1 << 16 else np.int64
+    return ((tiles[:, 0] - low[0]) * cols + (tiles[:, 1] - low[1])).astype(kind)
 
 
 def _heights(points: Mapping[TileIndex, F32], lattice: Lattice) -> dict[TileIndex, Heights]:
