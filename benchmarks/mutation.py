@@ -52,7 +52,6 @@ TESTS = {
     "fusion/persistence.py": ["fusion/test_persistence.py"],
     "fusion/copies.py": ["fusion/test_copies.py"],
     "fusion/turning.py": ["fusion/test_turning.py"],
-    "fusion/rims.py": ["fusion/test_rims.py"],
     "fusion/spilled.py": ["fusion/test_spilled.py"],
     "fusion/deletions.py": ["fusion/test_deletions.py"],
     "fusion/odds.py": ["fusion/test_odds.py"],

@@ -42,6 +42,8 @@ BUDGETS = (1e-2, 3e-3, 1e-3, 3e-4, 1e-4)
 FEWEST = 2
 """Vehicles that a change needs."""
 KINDS = {"built": CellState.CHANGED_OCCUPIED, "demolished": CellState.CHANGED_EMPTY}
+RANGES = {"top_m": (0.0, 1.0, 2.0, 4.0, 8.0), "off_m": (0.0, 5.0, 10.0, 15.0, 20.0)}
+"""Heights of what came or went over the ground, distances from where the vehicles drove, metres: lower ends."""
 NOTHING_TRUE = np.zeros(CELLS, dtype=np.uint8)
 NOWHERE = np.zeros(CELLS, dtype=np.int64)
 RIDGE = 0.1
@@ -114,6 +116,15 @@ def check(names: Sequence[str], cache: Path, out: Path | None) -> None:
         of_all = [taken(c, c.scored & (c.states == state) & (c.vehicles == c.vehicles.max())) for c in every]
         for scene, cells in [*zip(names, of_all, strict=True), ("all", stacked(of_all))]:
             rows += reliability_of(scene, name, cells)
+    print("\nrange | cells | true | said | ECE | Brier")
+    for name, state in KINDS.items():
+        mine = stacked([taken(c, c.scored & (c.states == state) & (c.vehicles == c.vehicles.max())) for c in every])
+        for what, edges in RANGES.items():
+            for low, high in zip(edges, [*edges[1:], np.inf], strict=True):
+                measured = getattr(mine, what)
+                rows += by_range(
+                    f"{name}, {what} {low:g} to {high:g}", taken(mine, (measured >= low) & (measured < high))
+                )
     print(
         "\nbudget | scene | emptied | go | wait | lost what stands: before, now, promised | "
         "of what waits: lost, said | stale points that go"
@@ -195,6 +206,17 @@ def reliability_of(scene: str, kind: str, cells: Cells) -> list[dict[str, object
         for k, (p, t, n) in enumerate(zip(found.predicted, found.true, found.cells, strict=True))
         if n
     ]
+
+
+def by_range(name: str, cells: Cells) -> list[dict[str, object]]:
+    """A row of decided cells of one kind at one height or distance; none of none."""
+    if not len(cells.states):
+        return []
+    said = probability.change_probability(cells.states, cells.votes, cells.against, cells.beside, cells.odds)
+    found, true = binned(said, cells.true), float(cells.true.mean())
+    print(f"{name} | {len(said)} | {true:.3f} | {said.mean():.3f} | {found.calibration_error:.3f} | {found.brier:.3f}")
+    whole = {"scene": "all", "kind": name, "cells": len(said), "ece": found.calibration_error, "brier": found.brier}
+    return [whole | {"predicted": float(said.mean()), "true": true}]
 
 
 def within(budget: float, scene: str, cells: Cells) -> dict[str, object]:

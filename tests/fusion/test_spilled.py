@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from mapvote.config import FuseSettings
 from mapvote.core.grid import CELL_SIZE, CELLS, TILE_CELLS, Lattice
 from mapvote.core.tile import Tile
-from mapvote.core.types import F32, U8, CellState
-from mapvote.fusion.spilled import REACH_M, _moments, spilled
+from mapvote.core.types import F32, F64, I64, U8, CellState
+from mapvote.fusion.fuse import fuse_tile
+from mapvote.fusion.odds import Odds
+from mapvote.fusion.spilled import REACH_M, _moments, spilled, without_spilled
 from mapvote.fusion.tile_vote import TileVote
 
 CE, CO = CellState.CHANGED_EMPTY, CellState.CHANGED_OCCUPIED
@@ -166,3 +169,48 @@ def test_moments_are_those_of_all_points_within_reach() -> None:
         assert number[k] == len(near)
         np.testing.assert_allclose(mean[k], near.mean(axis=0), atol=1e-9)
         np.testing.assert_allclose(spread[k], np.cov(near.T, bias=True), atol=1e-9)
+
+
+@given(heading_deg=st.floats(8.0, 82.0), off_m=st.floats(0.0, 0.3), seed=st.integers(0, 99))
+@settings(max_examples=40, deadline=None)
+def test_of_a_slanted_wall_no_cell_is_given_up_that_holds_a_tenth_of_a_metre_of_it(
+    heading_deg: float, off_m: float, seed: int
+) -> None:
+    rng, heading = np.random.default_rng(seed), np.radians(heading_deg)
+    along = np.linspace(0.0, 6.0, 601)
+    line = np.array([[30.0 + off_m, 30.0]]) + along[:, None] * [np.cos(heading), np.sin(heading)]
+    cells, held = np.unique(flat_of(line), return_counts=True)
+    u, z = np.meshgrid(np.arange(0.05, 6.0, 0.1), np.arange(0.45, 3.0, 0.15))
+    across = rng.normal(0.0, 0.02, u.size)
+    x = 30.0 + off_m + u.ravel() * np.cos(heading) - across * np.sin(heading)
+    y = 30.0 + u.ravel() * np.sin(heading) + across * np.cos(heading)
+    points = np.column_stack([x, y, z.ravel()]).astype(np.float32)
+    given_up = spilled(tile_of(points), [], states_of(points, CE))
+    assert not np.isin(given_up, cells[held >= 10]).any()
+
+
+def flat_of(points: F64) -> I64:
+    at = np.floor(points[:, :2] / CELL_SIZE).astype(np.int64)
+    return np.asarray(at[:, 1] * TILE_CELLS + at[:, 0])
+
+
+def test_what_spilled_is_told_as_empty_and_goes_with_its_wall_as_was_voted() -> None:
+    beyond = spill_at(BORDER_M + 0.01)
+    points = np.concatenate([wall(BORDER_M - 0.04), beyond])
+    tile, states = tile_of(points), states_of(points, CE)
+    changed = np.flatnonzero(states == CE)
+    votes = [
+        TileVote(name, 0, name, states=states, odds=Odds(changed, np.full(len(changed), 12, np.int8))) for name in "ab"
+    ]
+    decision, edited = fuse_tile(tile, votes, "columns", FuseSettings())
+    told = {int(cell) for cell in changed if decision.states.reshape(-1)[cell] == CellState.UNCHANGED_EMPTY}
+    assert all_but_the_ends(told, cells_of(beyond))
+    assert len(edited.points) == 0
+    unsaid = [TileVote(vote.vehicle, 0, vote.digest, states=states) for vote in votes]
+    assert (fuse_tile(tile, unsaid, "columns", FuseSettings())[0].states == states).all(), "of surfaces' ballots alone"
+
+
+def test_where_nothing_spilled_the_states_are_told_as_they_are() -> None:
+    points = wall(BORDER_M + 0.15)
+    states = states_of(points, CE)
+    assert without_spilled(states, tile_of(points), []) is states

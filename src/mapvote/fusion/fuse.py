@@ -27,9 +27,9 @@ from mapvote.fusion.odds import Odds, agreed_odds
 from mapvote.fusion.outliers import contradictors, deniers
 from mapvote.fusion.pending import Pending, beyond_budget
 from mapvote.fusion.persistence import denied_last, doubtful, remembered, temporary
-from mapvote.fusion.rims import without_rims
 from mapvote.fusion.sparse_columns import learned, nothing_reached
 from mapvote.fusion.spent import changed_in
+from mapvote.fusion.spilled import without_spilled
 from mapvote.fusion.tile_vote import TileVote, one_each
 from mapvote.fusion.turning import turned
 
@@ -43,7 +43,8 @@ class Decision:
     """What the vehicles decided about one tile, and what came of it."""
 
     states: U8
-    """(256, 256) CellState or NO_VOTE; of rims what the world is, not what was voted (fusion/rims.py)."""
+    """(256, 256) CellState or NO_VOTE; where noise spilled over what the world is, not what was voted
+    (fusion/spilled.py)."""
     tally: NDArray[Any]
     """(256, 256, 5) in VOTE_UNITs, see :func:`count`."""
     vehicles: int
@@ -111,7 +112,8 @@ class Heard:
     """See :class:`Decision`."""
     pending: Pending = field(default_factory=Pending.none)
     voted: U8 | None = None
-    """(256, 256) as the points are edited, where that differs from ``states``: at rims (fusion/rims.py)."""
+    """(256, 256) as the points are edited, where that differs from ``states``: where noise spilled over
+    (fusion/spilled.py)."""
 
     @property
     def edits(self) -> U8:
@@ -170,7 +172,7 @@ def decide_tile(
     if len(pending.cells):
         states = states.copy()
         states.reshape(-1)[pending.cells] = int(CellState.UNDETERMINED)
-    told = without_rims(states, odds, tile, votes)
+    told = without_spilled(states, tile, votes) if len(odds.cells) else states  # of surfaces' ballots alone
     return Heard(votes, told, tally, quorum, denied, passing, copies, odds, pending, voted=states)
 
 

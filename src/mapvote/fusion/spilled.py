@@ -1,7 +1,10 @@
 """Cells that changed by noise alone: the surface that came or went stands in the cell beside them.
 
-A wall two centimetres from the border of its cell leaves a part of its points in the next one. A plane through all
-points about, of both cells, tells nearly to the centimetre on which side it stands.
+A wall two centimetres from the border of its cell leaves a part of its points in the next one, which noise carried
+there. When it goes, or comes, vehicles see that cell change, too, and they are right: its points have to go, or come,
+with the wall. But nothing of the world changed in it. So its points are edited as was voted, and the cell is told as
+what it was and is: empty. A plane through all points about, of both cells, tells nearly to the centimetre on which
+side the wall stands.
 """
 
 from __future__ import annotations
@@ -29,6 +32,17 @@ _UPRIGHT = 0.5
 """Sine of how far a wall may lean."""
 _STAY = 0.05
 """As large a part of a cell's points may stay in it: beside them stands no plane."""
+
+
+def without_spilled(states: U8, tile: Tile, votes: Sequence[TileVote]) -> U8:
+    """The states (256, 256) as they are told: of cells that changed by noise alone, that they are empty. ``tile``: as
+    it was; the rest as in :func:`spilled`. The same object where there is no such cell."""
+    cells = spilled(tile, votes, states)
+    if not len(cells):
+        return states
+    told = states.copy()
+    told.reshape(-1)[cells] = int(CellState.UNCHANGED_EMPTY)
+    return told
 
 
 def spilled(tile: Tile, votes: Sequence[TileVote], states: U8) -> I64:

@@ -24,7 +24,7 @@ from mapvote.simulation.lidar import Caster, measure, sweep
 from mapvote.simulation.processes import processes
 from mapvote.simulation.routes import Route, make_routes
 from mapvote.simulation.scenario import Scenario, load_scenario
-from mapvote.simulation.truth import count_hits, dense_survey, ground_cells, truth_grid, write_truth
+from mapvote.simulation.truth import T_map_street, count_hits, dense_survey, ground_cells, on_grid, write_truth
 from mapvote.simulation.world import Role, World, make_world
 
 _CHUNK = 40
@@ -65,8 +65,9 @@ def simulate(
             dense = run(_survey, [(spec, seed, drive) for drive in range(len(stage.routes))])
             survey, vehicles, densest = _drive_all(stage, partial, run, progress)
             for index, (route, writer) in enumerate(zip(stage.routes, writers, strict=True)):
-                writer.close(route.stamps_ns, route.priors(np.random.default_rng([seed, 4, index])))
-                write_poses(partial / "truth" / route.name / "poses.txt", route.poses(route.time_s))
+                T = T_map_street(spec)
+                writer.close(route.stamps_ns, T @ route.priors(np.random.default_rng([seed, 4, index])))
+                write_poses(partial / "truth" / route.name / "poses.txt", T @ route.poses(route.time_s))
             write_truth(partial / "truth", stage.world, spec, list(dense), survey, vehicles, densest)
         os.replace(partial, out)
     finally:
@@ -99,7 +100,7 @@ def _stage(scenario: Scenario, seed: int) -> Stage:
         np.array([body.kind == kind for body in world.bodies], dtype=np.bool_) for kind in ("building", "parked car")
     )
     kinds = Kinds(glazed, painted, seed)
-    return Stage(scenario, seed, sensor, world, routes, ground_cells(world, truth_grid(scenario)), kinds)
+    return Stage(scenario, seed, sensor, world, routes, ground_cells(world, scenario), kinds)
 
 
 @lru_cache(maxsize=1)
@@ -173,7 +174,7 @@ def _survey(task: tuple[Scenario, int, int]) -> tuple[I32, F32, U8]:
     """The noise-free survey of one route, for the truth."""
     scenario, seed, drive = task
     stage = _stage(scenario, seed)
-    return dense_survey(stage.world, stage.routes[drive], stage.sensor, truth_grid(scenario))
+    return dense_survey(stage.world, stage.routes[drive], stage.sensor, scenario)
 
 
 _Task = tuple[Scenario, int, Path, int, int, int]
@@ -213,7 +214,7 @@ def _drive(task: _Task) -> tuple[I32, I32, U8]:
         solid = kept & ~moving & ~false
         points = rays.origins[solid] + ranges[solid, None] * rays.directions[solid]
         before = counts[Role.ADDED].copy()
-        count_hits(points, objects[solid], roles, stage.ground, CELL_SIZE, GROUND_MARGIN_M, counts)
+        count_hits(on_grid(points, scenario), objects[solid], roles, stage.ground, CELL_SIZE, GROUND_MARGIN_M, counts)
         np.maximum(most, counts[Role.ADDED] - before, out=most)
     where = np.flatnonzero(counts).astype(np.int32)
     return where, counts.ravel()[where], most.clip(max=255).astype(np.uint8)

@@ -85,6 +85,9 @@ class Scenario(_Table):
     )
     mount_height_m: float = 1.9
     motion_distortion: bool = True
+    heading_deg: float = Field(
+        default=0.0, ge=-180, le=180, description="of the road, from the map's x axis; 0: walls run along its cells"
+    )
     max_grade: float = Field(default=0.03, ge=0, le=0.12)
     crown: float = Field(default=0.02, ge=0)
     crossing_m: float | None = Field(default=None, description="where a second street crosses, metres from the west")

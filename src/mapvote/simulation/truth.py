@@ -23,6 +23,7 @@ import numpy as np
 from scipy.spatial import ConvexHull
 
 from mapvote.core.columns import GROUND_MARGIN_M
+from mapvote.core.geometry import from_xyz_rpy, inverse, transform
 from mapvote.core.grid import CELL_SIZE, Grid, Lattice
 from mapvote.core.sensors import Sensor
 from mapvote.core.types import F32, F64, I32, U8
@@ -53,15 +54,35 @@ class Reason(IntEnum):
     CAR_OF_SOME_PASSES = 4
 
 
+def T_map_street(scenario: Scenario) -> F64:
+    """(4, 4) from the frame in which a street is laid out, along x, to that of its truth and its drives."""
+    return from_xyz_rpy(0.0, 0.0, 0.0, 0.0, 0.0, np.radians(scenario.heading_deg))
+
+
 def truth_grid(scenario: Scenario) -> Grid:
-    """The scored window: the road in its middle, lower-left corner at map (0, 0)."""
-    return Grid(Lattice(), 0, 0, round(scenario.width_m / CELL_SIZE), round(scenario.length_m / CELL_SIZE))
+    """The scored window around the street, the road in its middle, its first corner at map (0, 0)."""
+    far = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]]) * (scenario.length_m, scenario.width_m, 0.0)
+    corners = transform(T_map_street(scenario), far)[:, :2]
+    (col, row), (end_col, end_row) = (
+        np.rint(side(corners, axis=0) / CELL_SIZE).astype(int) for side in (np.min, np.max)
+    )
+    return Grid(Lattice(), int(row), int(col), int(end_row - row), int(end_col - col))
 
 
-def ground_cells(world: World, grid: Grid) -> F64:
-    """(rows, cols) height of the ground at the cells' centres."""
-    x, y = grid.centres()
-    return world.terrain.height(x[None, :], y[:, None])
+def on_grid(points: F32, scenario: Scenario) -> F32:
+    """Points (n, 3) of the street's frame in that of :func:`truth_grid`, metres from its corner."""
+    if not scenario.heading_deg:
+        return points
+    grid = truth_grid(scenario)
+    return (transform(T_map_street(scenario), points) - (grid.x0, grid.y0, 0.0)).astype(np.float32)
+
+
+def ground_cells(world: World, scenario: Scenario) -> F64:
+    """(rows, cols) height of the ground at the centres of :func:`truth_grid`'s cells."""
+    grid = truth_grid(scenario)
+    x, y = np.meshgrid(*grid.centres())
+    street = transform(inverse(T_map_street(scenario)), np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)]))
+    return world.terrain.height(street[:, 0].reshape(grid.shape), street[:, 1].reshape(grid.shape))
 
 
 @numba.njit(cache=True, nogil=True)
@@ -77,17 +98,18 @@ def count_hits(points: F32, objects: I32, roles: I32, ground: F64, size: float, 
             counts[roles[objects[i]], r, c] += 1
 
 
-def dense_survey(world: World, route: Route, sensor: Sensor, grid: Grid) -> tuple[I32, F32, U8]:
+def dense_survey(world: World, route: Route, sensor: Sensor, scenario: Scenario) -> tuple[I32, F32, U8]:
     """Noise-free rays from the true poses of one route, into the street before and the street after.
 
-    Gives counts (2, roles, rows, cols) of hits, and samples (m, 3) of surfaces that came or went, with their role (m,).
+    Gives counts (2, roles, rows, cols) of hits, and samples (m, 3) of surfaces that came or went, street metres, with
+    their role (m,).
     Only rays towards bodies that changed are cast: elsewhere nothing could change.
     """
-    roles, ground = world.roles(), ground_cells(world, grid)
+    roles, ground = world.roles(), ground_cells(world, scenario)
     changed = [i for i, role in enumerate(roles) if role in (Role.ADDED, Role.REMOVED)]
     circles = np.array([_circle(world.bodies[i].triangles) for i in changed]).reshape(-1, 3)
     poses = route.poses(np.arange(0.0, route.length / route.speed, _STEP_M / route.speed))
-    hits = np.zeros((2, len(Role), *grid.shape), dtype=np.int32)
+    hits = np.zeros((2, len(Role), *ground.shape), dtype=np.int32)
     samples, labels = [], []
     for when, role in enumerate((Role.REMOVED, Role.ADDED)):
         caster = Caster(*world.mesh([i for i, r in enumerate(roles) if r in (Role.KEPT, role)]))
@@ -98,7 +120,7 @@ def dense_survey(world: World, route: Route, sensor: Sensor, grid: Grid) -> tupl
             ranges, objects, _ = caster.cast(origins, directions)
             met = objects != NOTHING
             points, objects = origins[met] + ranges[met, None] * directions[met], objects[met]
-            count_hits(points, objects, roles, ground, CELL_SIZE, GROUND_MARGIN_M, hits[when])
+            count_hits(on_grid(points, scenario), objects, roles, ground, CELL_SIZE, GROUND_MARGIN_M, hits[when])
             found.append(points[roles[objects] == role])
         cloud = np.concatenate(found)
         samples.append(cloud[voxel_downsample(cloud, _SAMPLE_M)])
@@ -200,18 +222,21 @@ def write_truth(
     changed, roles = np.concatenate([d[1] for d in dense]), np.concatenate([d[2] for d in dense])
     first = voxel_downsample(changed, _SAMPLE_M)
     label = np.concatenate([np.full(len(kept), Role.KEPT, dtype=np.uint8), roles[first]])
-    np.savez(folder / "surface.npz", points=np.concatenate([kept, changed[first]]), label=label)
-    objects = [_describe(i, world) for i, b in enumerate(world.bodies) if b.role in (Role.ADDED, Role.REMOVED)]
+    T = T_map_street(scenario)
+    surface = transform(T, np.concatenate([kept, changed[first]])).astype(np.float32)
+    np.savez(folder / "surface.npz", points=surface, label=label)
+    objects = [_describe(i, world, T) for i, b in enumerate(world.bodies) if b.role in (Role.ADDED, Role.REMOVED)]
     unscored = {r.name.lower(): int((reason == r).sum()) for r in Reason}
     summary = {"scenario": scenario.name, "cells": reason.size, "unscored": unscored, "objects": objects}
     (folder / "objects.json").write_text(json.dumps(summary, indent=1) + "\n")
 
 
-def _describe(index: int, world: World) -> dict[str, object]:
+def _describe(index: int, world: World, T_map_street: F64) -> dict[str, object]:
     body = world.bodies[index]
     corners = body.triangles.reshape(-1, 3)
     hull = corners[ConvexHull(corners[:, :2]).vertices, :2]
     ground = float(world.terrain.height(*hull.mean(axis=0)))
+    hull = transform(T_map_street, np.column_stack([hull, np.zeros(len(hull))]))[:, :2]
     return {
         "id": index,
         "what": body.kind,
