@@ -23,7 +23,7 @@ Scenario = Annotated[
     str,
     typer.Argument(
         metavar="SCENARIO",
-        help="street570, as_published, clear, street, slanted, junction, terrace, half_gone, corner, or your own TOML file",
+        help="street570, as_published, clear, street, slanted, junction, terrace, half_gone, corner, or a TOML file",
     ),
 ]
 Seed = Annotated[int, typer.Option(metavar="N", help="decides layout, clutter, traffic and noise")]
