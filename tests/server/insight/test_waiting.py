@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import sqlalchemy as sa
 
-from hand_made import Say, make_ballot, states_plane, two_walls
+from hand_made import Say, make_ballot, make_map, make_tile, states_plane, two_walls
 from mapvote.codec.ballot import encode
 from mapvote.codec.odds import MOST, STEPS
 from mapvote.config import FuseSettings
@@ -150,11 +150,22 @@ def test_a_store_of_the_schema_before_is_upgraded_and_its_ballots_stand(database
     store.close()
 
 
-def test_a_rim_goes_with_the_wall_beside_it_and_its_story_says_that_nothing_changed_there(database_url: str) -> None:
-    store = Store.create(database_url, two_walls(), Policy(fuse=FuseSettings(max_deleted_share=1.0)))
-    vote(store, "d1", UNSURE)
-    assert "rim: holds the noise of what changed in the next cell" in middle(store).thing
-    assert "rim" not in explain_cell(store, 10.5 * 0.3, 10.5 * 0.3).thing
-    assert publish(store).deleted == 9, "three points a cell, the rim's among them"
-    assert [state for _, state in middle(store).decisions] == ["unchanged_empty"]
+def test_what_spilled_over_goes_with_its_wall_and_its_story_says_that_nothing_changed_there(database_url: str) -> None:
+    y, z = np.meshgrid(np.arange(40.05, 43.0, 0.3), np.arange(0.45, 3.0, 0.3))
+    wall = np.column_stack([np.full(y.size, 30.04), y.ravel(), z.ravel()]).astype(np.float32)
+    spill = wall[::3] + np.array([-0.05, 0.1, 0.0], np.float32)  # a centimetre beyond the cells' border
+    point_map = make_map({(0, 0): make_tile(np.concatenate([wall, spill]))})
+    store = Store.create(database_url, point_map, Policy(fuse=FuseSettings(max_deleted_share=1.0)))
+    cells = sorted({(int(p[1] // 0.3), int(p[0] // 0.3)) for p in np.concatenate([wall, spill]).tolist()})
+    states, odds = states_plane(dict.fromkeys(cells, CellState.CHANGED_EMPTY)), np.full(len(cells), 20, np.int8)
+    for name in "ab":
+        ballot = make_ballot(store.point_map(), {(0, 0): Say(states, odds=odds)}, name, "d1", end_ns=store.clock())
+        (receipt,) = accept(store, [examine(encode(ballot))])
+        assert isinstance(receipt, Receipt), receipt
+    beside, there = (explain_cell(store, x, 41.55) for x in (29.85, 30.15))
+    assert "the noise of what changed in the next cell" in beside.thing
+    assert "the noise of" not in there.thing
+    assert publish(store).deleted == len(wall) + len(spill)
+    told = [explain_cell(store, x, 41.55).decisions for x in (29.85, 30.15)]
+    assert [[state for _, state in each] for each in told] == [["unchanged_empty"], ["changed_empty"]]
     store.close()

@@ -224,7 +224,9 @@ def _thing(connection: sa.Connection, now: Place, drives: Sequence[TileVote]) ->
         elif found.denied is not None and found.denied[cell]:
             told.append("waits: the last vehicle that looked says otherwise")
         if found.edits[cell] != found.states[cell]:
-            told.append("rim: holds the noise of what changed in the next cell, and its points come or go with that")
+            told.append(
+                "unchanged: it holds the noise of what changed in the next cell, and its points come or go with that"
+            )
         likely = found.pending.at(cell)
         if likely is not None:
             told.append(
