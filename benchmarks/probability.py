@@ -35,7 +35,7 @@ from mapvote.fusion.offline import update_map
 from mapvote.vehicle import vote_drive
 from probability_scenes import Cells, called, decided, driven, judged, of_decision, stacked, taken
 
-FIT = ("corner:1", "corner:22", "corner:44", "corner:61", "junction:1", "street:2")
+FIT = ("corner:1", "corner:22", "corner:44", "corner:61", "junction:1", "street:2", "slanted:1")
 CHECK = ("corner:32", "corner:42", "corner:62", "corner:63", "corner:64", "corner:65", "junction:2", "junction:3",
          "street:10", "street:11", "street:13", "corner:61:::5", "junction:2:::5", "street:2:::5")  # fmt: skip
 BUDGETS = (1e-2, 3e-3, 1e-3, 3e-4, 1e-4)

@@ -13,6 +13,7 @@ from mapvote.codec.ballot import encode
 from mapvote.codec.odds import MOST, STEPS
 from mapvote.config import FuseSettings
 from mapvote.core.types import CellState, MapvoteError
+from mapvote.fusion.probability import change_probability
 from mapvote.server.insight.desk import desk, review
 from mapvote.server.insight.explain import CellStory, explain_cell
 from mapvote.server.insight.history import changes_between
@@ -105,7 +106,11 @@ def test_how_sure_they_were_is_told_of_cells_and_changes_and_outlives_the_round(
     assert [vote.sure for vote in story.votes] == [
         pytest.approx(1 / (1 + np.exp(-steps / STEPS)), abs=1e-4) for steps in (20, 5)
     ]
-    assert story.probability == pytest.approx(0.80, abs=0.02), "as the one says who is less sure"
+    one = np.ones(1, np.int64)
+    told = change_probability(
+        np.array([CellState.CHANGED_EMPTY], np.uint8), 2 * one, 0 * one, one, np.array([5], np.int8)
+    )
+    assert story.probability == pytest.approx(told[0], abs=1e-3), "as the one says who is less sure"
     (change,) = changes_between(store, 1, 2)["features"]
     assert change["properties"]["probability"] == pytest.approx(story.probability, abs=1e-3)
     assert check(store) == []
