@@ -412,7 +412,7 @@ def is_left(layer: int, says: dict[str, Spoken], quorum: int) -> bool:
 
 def is_marked(layer: int, says: dict[str, Spoken], quorum: int, saying: tuple[int, ...], share: float) -> bool:
     """Whether so many of those ``saying`` this of the cell mark a voxel, and more than a ``share`` of who decided."""
-    marks = [s.gone or 0 for s in says.values() if s.state in saying]
+    marks = [s.gone or 0 if s.gone is not None or s.state == UO else EVERY for s in says.values() if s.state in saying]
     marking, determined = sum(m >> layer & 1 for m in marks), sum(s.state != UN for s in says.values())
     return marking >= quorum and marking > share * determined + 1e-9
 

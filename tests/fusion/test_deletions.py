@@ -99,6 +99,8 @@ def test_who_has_the_whole_cell_empty_counts_among_two_thirds_but_not_among_half
         tile = make_tile(wall([CELL], heights))
         assert gone(tile, says([mask, mask, 0b111110], [UO, UO, CE])) == mask, "all three say so"
         assert gone(tile, says([mask, 0b111110, 0], [UO, CE, UO])) == 0, "two of three, of whom one saw nothing stand"
+        whole = TileVote("w", 0, "w", states=states_plane({CELL: CE}))
+        assert gone(tile, [*says([mask, mask], [UO, UO]), whole]) == mask, "no mask is all of an emptied cell"
 
 
 def test_marks_count_of_nobody_who_says_anything_else_and_only_if_the_cell_stands() -> None:

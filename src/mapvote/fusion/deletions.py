@@ -36,23 +36,15 @@ def words_gone(votes: Sequence[TileVote], states: U8, quorum: int, tile: Tile) -
         gone = np.zeros(states.shape, dtype=np.uint64)
         gone.reshape(-1)[emptied.cells] = reached[-1]
     stands = states == int(CellState.UNCHANGED_OCCUPIED)
-    left = [vote.remnants(states) for vote in votes]
-    emptied_by = [_emptied(vote, stands) for vote in votes]
+    left, standing = [vote.remnants(states) for vote in votes], Words.whole(stands)
+    # A mask in one stage only tells what would go.
+    emptied_by = [vote.deletes(standing) if vote.tally is None else Words.none() for vote in votes]
     if sum(len(a.cells) + len(b.cells) > 0 for a, b in zip(left, emptied_by, strict=True)) < quorum:
         return gone
     remnants = _remnants(left, emptied_by, votes, stands, quorum, tile)
     gone = np.zeros(states.shape, dtype=np.uint64) if gone is None else gone
     gone.reshape(-1)[remnants.cells] |= remnants.words
     return gone
-
-
-def _emptied(vote: TileVote, stands: Bool) -> Words:
-    """The voxels that a vote says are gone with the whole cell, of those of which it was decided that it ``stands``; a
-    mask in one stage only tells what would go."""
-    if vote.gone is None or vote.tally is not None:
-        return Words.none()
-    marked = vote.gone.within(stands)
-    return marked.at(vote.supports(CellState.CHANGED_EMPTY, marked.cells))
 
 
 def _remnants(
