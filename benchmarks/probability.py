@@ -111,14 +111,17 @@ def check(names: Sequence[str], cache: Path, out: Path | None) -> None:
     curves = surface_odds._BUILT, surface_odds._DEMOLISHED
     every = [stacked(list(decided(driven(name, cache), k, curves, FEWEST))) for k, name in enumerate(names)]
     rows: list[dict[str, object]] = []
-    for name, state in KINDS.items():
+    by_kind = {
+        name: [taken(c, c.scored & (c.states == state) & (c.vehicles == c.vehicles.max())) for c in every]
+        for name, state in KINDS.items()
+    }
+    for name, of_all in by_kind.items():
         print(f"\n{name}: scene | cells | true | ECE, by votes | Brier, by votes, share alone | bins")
-        of_all = [taken(c, c.scored & (c.states == state) & (c.vehicles == c.vehicles.max())) for c in every]
         for scene, cells in [*zip(names, of_all, strict=True), ("all", stacked(of_all))]:
             rows += reliability_of(scene, name, cells)
     print("\nrange | cells | true | said | ECE | Brier")
-    for name, state in KINDS.items():
-        mine = stacked([taken(c, c.scored & (c.states == state) & (c.vehicles == c.vehicles.max())) for c in every])
+    for name, of_all in by_kind.items():
+        mine = stacked(of_all)
         for what, edges in RANGES.items():
             for low, high in zip(edges, [*edges[1:], np.inf], strict=True):
                 measured = getattr(mine, what)

@@ -54,8 +54,9 @@ def _remnants(
     determined the cell, say are ``left`` of something, if they touch (26) nothing of the map that stays; and those that
     more than two thirds, two at least, say are left or gone with the whole cell. What lies beyond the tile's edge stays
     for all that is known here."""
-    cells, marks = counted([*left, *emptied_by])
-    halves = counted([Words(cells, np.zeros(len(cells), np.uint64)), *left])[1]
+    cells = np.unique(np.concatenate([found.cells for found in (*left, *emptied_by)]))
+    halves = counted(cells, left)
+    marks = halves + counted(cells, emptied_by)
     determined = np.sum([vote.determined(cells) for vote in votes], axis=0)[:, None]
     most = packed((halves >= quorum) & (2 * halves > determined))
     nearly_all = packed((marks >= max(quorum, 2)) & (3 * marks > 2 * determined))

@@ -82,13 +82,12 @@ def nothing_reached(k: int, cells: int = CELLS) -> U64:
     return np.zeros((k, cells), dtype=np.uint64)
 
 
-def counted(marked: Sequence[Words]) -> tuple[NDArray[np.intp], I32]:
-    """(cells (n,), how many of ``marked`` set each of their bits (n, 64)), for a few cells."""
-    cells = np.unique(np.concatenate([mine.cells for mine in marked]))
+def counted(cells: NDArray[np.intp], marked: Sequence[Words]) -> I32:
+    """(n, 64) how many of ``marked`` set each bit of the flat ``cells`` (n,), few, ascending, all they name."""
     counts = np.zeros((len(cells), 64), dtype=np.int32)
     for mine in marked:
         counts[np.searchsorted(cells, mine.cells)] += ((mine.words[:, None] >> _BITS) & np.uint64(1)).astype(np.int32)
-    return cells, counts
+    return counts
 
 
 def packed(bits: Bool) -> U64:

@@ -64,8 +64,8 @@ def simulate(
         with _pool(workers or _processes(stage)) as run:
             dense = run(_survey, [(spec, seed, drive) for drive in range(len(stage.routes))])
             survey, vehicles, densest = _drive_all(stage, partial, run, progress)
+            T = T_map_street(spec)
             for index, (route, writer) in enumerate(zip(stage.routes, writers, strict=True)):
-                T = T_map_street(spec)
                 writer.close(route.stamps_ns, T @ route.priors(np.random.default_rng([seed, 4, index])))
                 write_poses(partial / "truth" / route.name / "poses.txt", T @ route.poses(route.time_s))
             write_truth(partial / "truth", stage.world, spec, list(dense), survey, vehicles, densest)
