@@ -96,8 +96,8 @@ def test_a_ballot_tells_what_was_built_and_taken_down() -> None:
 
 def test_by_surfaces_a_ballot_says_how_sure_it_is_of_every_changed_cell_and_by_no_other_method() -> None:
     told: dict[tuple[str, bool], set[bool]] = {}
-    asked: list[tuple[Literal["surfaces", "columns", "paper"], bool]]
-    asked = [("surfaces", True), ("surfaces", False), ("columns", True), ("paper", True)]
+    asked: list[tuple[Literal["surfaces", "paper"], bool]]
+    asked = [("surfaces", True), ("surfaces", False), ("paper", True)]
     for method, stages in asked:
         voting = VotingSettings(method=method, two_stage=stages)
         ballot = decode(encode(drive(make(street_map(), Settings(voting=voting))).ballot()))
@@ -159,7 +159,7 @@ def test_new_points_have_the_sensors_intensity_if_the_map_holds_one(kind: type |
 
 def test_the_paper_takes_no_new_points_from_beyond_its_local_grid_where_no_filter_looks() -> None:
     """The new wall stands 8.25 m ahead; a grid of 12 m ends before it."""
-    narrow = VotingSettings(method="paper", window_m=12.0), VotingSettings(method="columns", window_m=12.0)
+    narrow = VotingSettings(method="paper", window_m=12.0), VotingSettings(window_m=12.0)
     for voting, there in zip(narrow, (False, True), strict=True):
         points = drive(make(street_map(), Settings(voting=voting)))._new_points.by_tile()
         assert any((points((row, 0))[:, 0] > 8.0).any() for row in (-1, 0)) == there
@@ -213,9 +213,9 @@ def test_the_moving_object_filter_delays_votes_but_loses_none() -> None:
     assert len(vehicle.report.stage_s["vote"]) == 6
 
 
-@pytest.mark.parametrize("method", ["paper", "columns"])
+@pytest.mark.parametrize("method", ["paper", "surfaces"])
 def test_asking_for_a_ballot_in_mid_drive_says_what_has_voted_so_far_and_changes_nothing(
-    method: Literal["paper", "columns"],
+    method: Literal["paper", "surfaces"],
 ) -> None:
     scans, point_map = [scan_of(-1.0 + 0.1 * i, i) for i in range(15)], street_map()
     asked, left_alone = (make(point_map, Settings(voting=VotingSettings(method=method))) for _ in range(2))
@@ -240,11 +240,8 @@ def test_a_drive_that_has_ended_takes_no_more_scans() -> None:
         vehicle.observe(*scan_of(0.0, 9))
 
 
-COLUMNS = VotingSettings(method="columns")
-
-
-def test_columns_tell_what_was_taken_down_and_which_voxels_are_gone() -> None:
-    vehicle = drive(make(street_map(), Settings(voting=COLUMNS)))
+def test_by_surfaces_a_ballot_tells_what_was_taken_down_and_which_voxels_are_gone() -> None:
+    vehicle = drive(make(street_map(), Settings()))
     assert state_at(vehicle, 8.25, -1.5) == CellState.CHANGED_EMPTY
     assert state_at(vehicle, 20.25, -2.0) == CellState.UNCHANGED_OCCUPIED
     for tile in vehicle.ballot().tiles:
@@ -257,11 +254,11 @@ def test_columns_tell_what_was_taken_down_and_which_voxels_are_gone() -> None:
         assert (gone[states != CellState.CHANGED_EMPTY] == 0).all()
 
 
-def test_columns_believe_new_things_only_where_the_map_knew_free_space() -> None:
+def test_by_surfaces_new_things_are_believed_only_where_the_map_knew_free_space() -> None:
     unknown = street_map()
     tiles = {t: replace(tile, free=np.zeros((256, 256), np.uint64)) for t, tile in unknown.tiles.items()}
     known = {t: replace(tile, free=np.full((256, 256), ~np.uint64(0))) for t, tile in unknown.tiles.items()}
     for free, state in ((tiles, CellState.UNCHANGED_EMPTY), (known, CellState.CHANGED_OCCUPIED)):
-        vehicle = drive(make(replace(unknown, tiles=free), Settings(voting=COLUMNS)))
+        vehicle = drive(make(replace(unknown, tiles=free), Settings()))
         assert state_at(vehicle, 8.25, 3.5) in (state, CellState.UNDETERMINED)
     assert state_at(vehicle, 8.25, 3.5) == CellState.CHANGED_OCCUPIED

@@ -51,7 +51,6 @@ def warm_up() -> Iterator[tuple[str, float]]:
         ("a map cut into tiles, its ground", lambda: map_from_points(old)),
         ("a map built by SLAM", lambda: built.append(build_map([_drive(old, turning=True)], settings)[0])),
         ("a drive that votes by surfaces", vote("surfaces")),
-        ("a drive that votes by columns", vote("columns")),
         ("a drive that votes by the paper's rule", vote("5")),
         ("ballots sent and fused", lambda: _fuse(built[0], ballots, settings)),
         ("a drive and a map looked at, and what only a long one needs", lambda: _go_far(_drive(old, turning=True))),

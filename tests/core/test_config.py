@@ -32,6 +32,11 @@ def test_the_environment_wins_over_the_file_and_each_source_is_known(tmp_path: P
         ("[voting]\nocclusion = 'column'\n", r"voting\.occlusion is called paper\.line_of_sight"),
         ("[trust]\nmin_fit = 0.5\n", r"s\.toml: trust\.min_fit is no setting any more .*localisation/trust\.py"),
         ("[mapping]\nprior_memory_s = 9\n", r"mapping\.prior_memory_s is no setting any more"),
+        ("[voting]\nmin_cells = 4\n", r"s\.toml: voting\.min_cells is no setting any more .*columns.*; leave it out"),
+        (
+            "[voting]\nmethod = 'columns'\n",
+            r"s\.toml: voting\.method = 'columns': .*left the product.*'surfaces'",
+        ),
         ("n_min = 7\n", "outside a section"),
         ("[voting\n", "cannot be read"),
     ],

@@ -1,4 +1,4 @@
-"""Rules that look beyond a cell: what joins, what falls, what is too small, across the edges of tiles too."""
+"""Rules that look beyond a cell: what joins, what falls, across the edges of tiles too."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from mapvote.core.grid import Lattice
 from mapvote.core.types import U8, CellState
-from mapvote.detection.regions import around, drop_specks, fallen, unexplained
+from mapvote.detection.regions import around, fallen, unexplained
 
 UO, UE, CO, CE, UN = (int(state) for state in CellState)
 
@@ -79,23 +79,6 @@ def test_without_anything_gone_nothing_falls_and_without_anything_standing_all_o
 def test_what_is_not_adrift_never_falls() -> None:
     states = plane((20, 4, CE))
     assert not fallen(states, np.zeros(states.shape, dtype=np.bool_), 15).any()
-
-
-@pytest.mark.parametrize("state", [CO, CE])
-def test_groups_smaller_than_asked_are_specks_and_corners_join(state: int) -> None:
-    states = plane((5, slice(5, 8), state), (20, 20, state), (21, 21, state), (22, 22, state), (23, 23, state))
-    specks = drop_specks(states, 4)
-    assert np.flatnonzero(specks.any(axis=1)).tolist() == [5]
-    assert specks.sum() == 3
-    assert not drop_specks(states, 3).any()
-
-
-def test_two_kinds_of_change_do_not_make_one_group() -> None:
-    assert drop_specks(plane((5, slice(5, 8), CO), (6, slice(5, 8), CE)), 4).sum() == 6
-
-
-def test_cells_that_did_not_change_are_no_specks() -> None:
-    assert not drop_specks(plane((5, 5, UO), (9, 9, UN)), 4).any()
 
 
 @settings(max_examples=20)

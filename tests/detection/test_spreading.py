@@ -1,4 +1,4 @@
-"""Cells beside cells: groups, steps and floods, as scipy has them."""
+"""Cells beside cells: steps and floods, as scipy has them."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import pytest
 from scipy import ndimage
 
 from mapvote.core.types import Bool
-from mapvote.detection.spreading import flooded, small_groups, steps_to
+from mapvote.detection.spreading import flooded, steps_to
 
 BESIDE = np.ones((3, 3))
 
@@ -29,16 +29,6 @@ def test_what_spreads_goes_as_far_as_its_steps_and_stays_within(seed: int) -> No
         assert (flooded(seeds, within, steps) == wanted).all()
     assert (flooded(seeds, within, within.size) == ndimage.binary_propagation(seeds, BESIDE, mask=within)).all()
     assert (flooded(seeds, within, 0) == seeds).all()
-
-
-@pytest.mark.parametrize("seed", range(8))
-def test_groups_are_told_by_their_size(seed: int) -> None:
-    cells, some = _patches(seed)
-    cells = cells ^ some
-    label, _ = ndimage.label(cells, BESIDE)
-    size = np.bincount(label.ravel())[label]
-    for least in (1, 2, 7):
-        assert (small_groups(cells, least) == (cells & (size < least))).all()
 
 
 @pytest.mark.parametrize("seed", range(8))

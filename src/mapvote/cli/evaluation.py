@@ -44,9 +44,13 @@ def evaluate(
     ] = None,
     seed: Seed = 1,
     case: Annotated[
-        str,
-        typer.Option(metavar="CASES", help='1..5, "1 column", columns, surfaces, yardsticks, by commas, or all'),
-    ] = "1,2,3,4,5,surfaces",
+        str | None,
+        typer.Option(
+            metavar="CASES",
+            help='1..5, "1 column", columns_v1, surfaces, yardsticks, by commas, or all [default: 1,2,3,4,5,surfaces]; '
+            "real: one of them [default: by the settings]",
+        ),
+    ] = None,
     poses: Annotated[
         str, typer.Option(metavar="ndt|truth", help="whether vehicles localise, or are told where they are")
     ] = "ndt",
@@ -103,7 +107,7 @@ def evaluate(
             raise typer.BadParameter("name the drive: mapvote evaluate real DRIVE", param_hint="DRIVE")
         if figures is not None:
             raise typer.BadParameter("of a recorded drive --out draws the pictures", param_hint="--figures")
-        _evaluate_real(drive, scans, seed, json, out, config)
+        _evaluate_real(drive, case, scans, seed, json, out, config)
         return
     if drive is not None:
         raise typer.BadParameter(f"{drive}: a drive follows the word real only", param_hint="DRIVE")
@@ -111,7 +115,7 @@ def evaluate(
         raise typer.BadParameter(f"{poses!r}: choose ndt or truth", param_hint="--poses")
     settings, sources = load_with_sources(config)
     settings = as_paper(settings, scenario, sources, reading)
-    cases, with_yardsticks = choose_cases(settings, case)
+    cases, with_yardsticks = choose_cases(settings, case or "1,2,3,4,5,surfaces")
     overrides: dict[str, str | int] = {"sensor": sensor} if sensor else {}
     if cars is not None:
         overrides["temporary_cars"] = cars
@@ -152,9 +156,16 @@ def _draw_figures(evaluation: Evaluation, out: Path) -> None:
 
 
 def _evaluate_real(
-    drive: Path, scans: str | None, seed: int, json: Path | None, out: Path | None, config: Path | None
+    drive: Path,
+    case: str | None,
+    scans: str | None,
+    seed: int,
+    json: Path | None,
+    out: Path | None,
+    config: Path | None,
 ) -> None:
-    """The bench of a recorded drive; its own blocks are map and vehicles, nothing is simulated but the changes."""
+    """The bench of a recorded drive; its own blocks are map and vehicles, nothing is simulated but the changes.
+    ``case``: one of them; None: by the settings."""
     from mapvote.config import load_settings
     from mapvote.evaluation.experiments.cases import choose_cases
     from mapvote.evaluation.experiments.real.bench import bench
@@ -165,7 +176,9 @@ def _evaluate_real(
 
     settings = load_settings(config)
     method = settings.voting.method
-    cases, _ = choose_cases(settings, "5" if method == "paper" else method)
+    cases, _ = choose_cases(settings, case or ("5" if method == "paper" else method))
+    if len(cases) > 1:
+        raise typer.BadParameter(f"{case}: of a recorded drive one case is judged at a time", param_hint="--case")
     with stages() as told:
         result = bench(drive, settings, cases, told, scans=scans, seed=seed)
     sheets = real_tables(result, cases[0].name)
@@ -176,7 +189,8 @@ def _evaluate_real(
         print(f"{json}: all numbers")
     if out is not None:
         pictures = draw_worst(result, cases[0].name, out)
-        command = f"mapvote evaluate real {drive}{f' --scans {scans}' if scans else ''} --seed {seed} --out {out}"
+        chosen = "".join(f" --{name} {value}" for name, value in (("case", case), ("scans", scans)) if value)
+        command = f"mapvote evaluate real {drive}{chosen} --seed {seed} --out {out}"
         write_text(as_markdown(sheets, command), out / "tables.md")
         for file in [out / "tables.md", *pictures]:
             print(f"{file}")

@@ -105,7 +105,7 @@ def vote(
     ] = None,
     case: Annotated[
         str | None,
-        typer.Option(metavar="CASE", help="columns, surfaces, or the paper's 1 to 5; else by the settings"),
+        typer.Option(metavar="CASE", help="surfaces, or the paper's 1 to 5; else by the settings"),
     ] = None,
     trust_prior: Annotated[
         bool, typer.Option("--trust-prior", help="take the prior for the pose, do not localise")

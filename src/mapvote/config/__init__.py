@@ -55,9 +55,9 @@ class MappingSettings(Section):
 
 
 class VotingSettings(Section):
-    """The paper's rule, and which of its cases (paper III, V). ``"columns"`` and ``"surfaces"``: docs/method.md."""
+    """Surfaces, or the paper's rule, and which of its cases (paper III, V): docs/method.md."""
 
-    method: Literal["paper", "columns", "surfaces"] = "surfaces"
+    method: Literal["paper", "surfaces"] = "surfaces"
     weighted: bool = Field(default=True, description="multiple votes per scan by Eq. (1); false: one vote per scan")
     two_stage: bool = Field(default=True, description="the vehicle decides its cells; false: it sends its tally")
     skip_tall_cells: bool = Field(default=True, description="case 5: no vote where the map begins above the view")
@@ -66,14 +66,13 @@ class VotingSettings(Section):
     k: float = 0.5
     window_m: float = Field(default=80.0, description="side of the local grid (paper III-A)")
     min_height_m: float = Field(
-        default=0.6, description="columns, surfaces: a cell whose map rises no higher than this is never changed-empty"
+        default=0.6, description="surfaces: a cell whose map rises no higher than this is never changed-empty"
     )
-    min_cells: int = Field(default=4, description="columns: smaller groups of changed cells are dropped")
 
 
 class PaperSettings(Section):
-    """How the paper's open sentences are read (detection/readings.py has each with its quotation). Columns have no part
-    in it."""
+    """How the paper's open sentences are read (detection/readings.py has each with its quotation). Surfaces have no
+    part in it."""
 
     occluded: Literal["votes", "abstains"] = Field(
         default="votes", description="a scan that cannot see a cell votes undetermined there, or gives no vote"
@@ -138,6 +137,10 @@ MOVED = {
     "voting.occlusion": "paper.line_of_sight (first_hit: points, farthest_return: farthest, column: column)",
 }
 """Settings that had another name."""
+COLUMNS_LEFT = "columns left the product in this version"
+"""Surfaces replaced them: whoever asks for them is told so."""
+LEFT = {("voting.method", "columns"): f"{COLUMNS_LEFT}; write 'surfaces', the default, or leave it out"}
+"""Values that a setting could have."""
 FIXED = {
     "trust.min_fit": "MIN_FIT of localisation/trust.py",
     "trust.min_lead": "MIN_LEAD of localisation/trust.py",
@@ -145,8 +148,9 @@ FIXED = {
     "moving.reach_m": "REACH_M of perception/moving_objects.py",
     "mapping.precise_prior_m": "PRECISE_PRIOR_M of slam/surveyor.py",
     "mapping.prior_memory_s": "PRIOR_MEMORY_S of slam/settle.py",
+    "voting.min_cells": f"it was of columns, and {COLUMNS_LEFT}",
 }
-"""Settings that are constants now: nobody could judge them by looking."""
+"""Settings that are constants now: nobody could judge them by looking; or that have left."""
 
 
 def did_you_mean(key: str, known: Iterable[str]) -> str:
@@ -177,6 +181,8 @@ def load_with_sources(
         known = type(getattr(Settings(), section)).model_fields
         if f"{section}.{key}" in MOVED:
             raise MapvoteError(f"{source}: {section}.{key} is called {MOVED[f'{section}.{key}']} now")
+        if why := LEFT.get((f"{section}.{key}", str(value))):
+            raise MapvoteError(f"{source}: {section}.{key} = {value!r}: {why}")
         if key not in known:
             raise MapvoteError(f"{source}: unknown setting {section}.{key}{did_you_mean(key, known)}")
         values.setdefault(section, {})[key] = value
@@ -212,14 +218,15 @@ def _from_env(env: Mapping[str, str]) -> Iterable[tuple[str, str, Any, str]]:
 
 
 def choose_case(settings: Settings, case: str) -> Settings:
-    """``settings`` with the vote of one of the paper's cases, "1" to "5", of "columns" or of "surfaces".
+    """``settings`` with the vote of one of the paper's cases, "1" to "5", or of "surfaces".
 
     MapvoteError for another.
     """
-    if case in ("columns", "surfaces"):
+    if case == "surfaces":
         chosen: dict[str, object] = {"method": case}
     elif case in CASES:
         chosen = {"method": "paper", **CASES[case]}
     else:
-        raise MapvoteError(f"no case {case!r}; choose columns, surfaces or one of {', '.join(CASES)}")
+        gone = f" ({COLUMNS_LEFT})" if case == "columns" else ""
+        raise MapvoteError(f"no case {case!r}{gone}; choose surfaces or one of {', '.join(CASES)}")
     return settings.model_copy(update={"voting": settings.voting.model_copy(update=chosen)})

@@ -119,8 +119,6 @@ def dilated(words: U64, base: I32, reach: int) -> U64:
 
 
 EVERY_BIT = ~np.uint64(0)
-_BESIDE = np.int64(1)
-"""One cell to all sides; no literal, for which :func:`neighbourhood` would be compiled once more."""
 
 
 @numba.njit(cache=True, nogil=True)
@@ -136,27 +134,3 @@ def span_of(word: np.uint64) -> np.uint64:
     """The bits from the lowest to the highest set one: the height span of a column; 0 for 0."""
     lowest = word & (~word + np.uint64(1))
     return below_top(word) & ~(lowest - np.uint64(1)) if word else np.uint64(0)
-
-
-@numba.njit(cache=True, nogil=True)
-def remnants(gone: U64, loose: U64, base: I32) -> U64:
-    """(rows, cols) rule I: voxels of ``loose`` that touch one of ``gone``, or another that does (26 neighbours).
-
-    What is left of a demolished thing beside something that stands: hits on that veto it (rule B), but none ever fell
-    into its own voxels, and rays went through them. ``base`` (rows, cols): the layers of the words' bits 0.
-    """
-    rows, cols = gone.shape
-    found, reached = np.zeros_like(gone), gone.copy()
-    grown = True
-    while grown:
-        grown = False
-        for r in range(rows):
-            for c in range(cols):
-                left = loose[r, c] & ~reached[r, c]
-                if left:
-                    more = left & neighbourhood(reached, base, r, c, _BESIDE)
-                    if more:
-                        found[r, c] |= more
-                        reached[r, c] |= more
-                        grown = True
-    return found

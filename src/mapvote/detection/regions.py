@@ -1,92 +1,26 @@
-"""What the cells of a drive say together: the rules that look beyond a cell, over all its tiles (docs/method.md).
+"""What the cells of a drive say together, over all its tiles (docs/method.md).
 
-Rule C gives up hits that an error of pose explains, H lets roofs fall with their walls, G drops specks, and I takes
-down what is left of demolished things beside what stands. Each looks at a tile with some cells of its neighbours
-around it, so that what lies across an edge is judged alike from both sides.
+An error of pose explains hits beside what is mapped, and roofs fall with their walls. Each rule looks at a tile with
+some cells of its neighbours around it, so that what lies across an edge is judged alike from both sides.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from functools import partial
 from typing import Any
 
 import numpy as np
 
-from mapvote.config import VotingSettings
-from mapvote.core.columns import TOP_BIT, dilated, remnants
 from mapvote.core.grid import Grid, Lattice, TileIndex
-from mapvote.core.types import I32, NO_VOTE, U8, U64, Bool, CellState
-from mapvote.detection.counters import PLANES, STRUCK_ITSELF, THROUGH_ITSELF, ever
-from mapvote.detection.rules import Rules
-from mapvote.detection.spreading import flooded, small_groups, steps_to
-from mapvote.detection.votes import Judged
+from mapvote.core.types import U8, Bool, CellState
+from mapvote.detection.spreading import flooded, steps_to
 
-_LOWEST, _HIGHEST = np.uint64(0b11), np.uint64(3) << np.uint64(TOP_BIT - 1)
 JOIN_CELLS = 6
-"""Rule C: how far a new thing reaches along mapped cells."""
-FALL_CELLS = 15
-"""Rule H: how far what is gone takes unseen cells with it."""
+"""How far a new thing reaches along mapped cells."""
 HALO = 64
-"""Cells around a tile that rules H and I look at: 19 m, a house."""
+"""Cells around a tile that are looked at: 19 m, a house."""
 Plane = Any
 """An array of one tile or window, of any type."""
-
-
-Tiles = Mapping[TileIndex, Judged]
-
-
-def apply_region_rules(tiles: Tiles, lattice: Lattice, voting: VotingSettings, rules: Rules) -> None:
-    """Apply the rules C, H, G and I, in this order, as far as ``rules`` has them hold."""
-    if rules.pose_explains:
-        _give_up_explained(tiles, lattice, JOIN_CELLS)
-    if rules.roofs_fall:
-        _let_fall(tiles, lattice, FALL_CELLS)
-    if rules.brief_is_passing:
-        _drop_specks(tiles, lattice, voting.min_cells)
-    if rules.remnants_go:
-        _take_remnants(tiles, lattice)
-
-
-def _give_up_explained(tiles: Tiles, lattice: Lattice, join_cells: int) -> None:
-    beside = {tile: judged.weighed.beside for tile, judged in tiles.items()}
-    rule = partial(unexplained, reach=join_cells)
-    for tile, cells in beyond_tiles(lattice, join_cells, rule, (_states(tiles), NO_VOTE), (beside, False)).items():
-        tiles[tile].overrule(cells, CellState.UNDETERMINED)
-
-
-def _let_fall(tiles: Tiles, lattice: Lattice, fall_cells: int) -> None:
-    adrift = {tile: judged.weighed.adrift for tile, judged in tiles.items()}
-    rule = partial(fallen, reach=fall_cells)
-    for tile, cells in beyond_tiles(lattice, HALO, rule, (_states(tiles), NO_VOTE), (adrift, False)).items():
-        tiles[tile].overrule(cells, CellState.CHANGED_EMPTY)
-        tiles[tile].weighed.gone[cells] = tiles[tile].here.occupied[cells]
-
-
-def _drop_specks(tiles: Tiles, lattice: Lattice, min_cells: int) -> None:
-    rule = partial(drop_specks, min_cells=min_cells)
-    for tile, cells in beyond_tiles(lattice, min_cells, rule, (_states(tiles), NO_VOTE)).items():
-        tiles[tile].states[cells] = CellState.UNDETERMINED
-
-
-def _take_remnants(tiles: Tiles, lattice: Lattice) -> None:
-    """A cell of which nothing is left is changed-empty, unless new hits lie next to what went: they may be what stands
-    there, put beside it by an error of pose."""
-    empty = int(CellState.CHANGED_EMPTY)
-    loose = {tile: judged.weighed.loose for tile, judged in tiles.items()}
-    base = {tile: judged.here.base for tile, judged in tiles.items()}
-    gone = {t: np.where(judged.states == empty, judged.weighed.gone, np.uint64(0)) for t, judged in tiles.items()}
-    for tile, left in beyond_tiles(lattice, HALO, remnants, (gone, 0), (loose, 0), (base, 0)).items():
-        judged = tiles[tile]
-        nothing_left = ((left | gone[tile]) == judged.here.occupied) & (left & judged.crowded == 0)
-        judged.overrule((left != 0) & nothing_left & (judged.states != empty), CellState.CHANGED_EMPTY)
-        down = judged.states == empty
-        judged.weighed.gone[down] |= left[down]
-        judged.remnants = np.where(down, np.uint64(0), left)
-
-
-def _states(tiles: Tiles) -> dict[TileIndex, U8]:
-    return {tile: judged.states for tile, judged in tiles.items()}
 
 
 def beyond_tiles(
@@ -135,26 +69,3 @@ def fallen(states: U8, adrift: Bool, reach: int) -> Bool:
     to_gone = steps_to(gone)
     goes = adrift & (to_gone < steps_to(kept)) if kept.any() else adrift
     return np.asarray(flooded(goes & (to_gone <= reach), goes, goes.size))
-
-
-def drop_specks(states: U8, min_cells: int) -> Bool:
-    """(rows, cols) changed cells whose 8-connected component of equal state has fewer than ``min_cells`` (rule G)."""
-    there, gone = states == CellState.CHANGED_OCCUPIED, states == CellState.CHANGED_EMPTY
-    return np.asarray(small_groups(there, min_cells) | small_groups(gone, min_cells))
-
-
-def beside_new(planes: U64, occupied: U64, base: I32) -> U64:
-    """(rows, cols) voxels in which, or next to which, something was struck where the map holds nothing."""
-    struck = ever(planes, PLANES)
-    return dilated(struck & ~occupied, base, 1)
-
-
-def loose_voxels(planes: U64) -> U64:
-    """(rows, cols) mapped voxels into which, or beside which within its own error, no hit ever fell, and through which
-    rays went, as through the voxels above and below them: grazing a roof says nothing (rule A). The ground bounds the
-    lowest, the end of the word the highest.
-    """
-    itself = planes[..., THROUGH_ITSELF]
-    through = ever(planes, 0) | itself
-    below, above = through << np.uint64(1) | _LOWEST, through >> np.uint64(1) | _HIGHEST
-    return np.asarray(itself & ~planes[..., STRUCK_ITSELF] & below & above)

@@ -1,4 +1,4 @@
-"""Cells that lie together or near each other: how far they spread, how many there are, how far away they lie.
+"""Cells that lie together or near each other: how far they spread, how far away they lie.
 
 The eight cells around a cell are beside it. Kernels of our own, for scipy's take longer to import than to work.
 """
@@ -14,7 +14,7 @@ _NOWHERE = 1 << 30
 
 
 @numba.njit(cache=True, nogil=True)
-def _flood(reached: Bool, within: Bool, queue: I64, n: int, steps: int) -> int:
+def flood_on(reached: Bool, within: Bool, queue: I64, n: int, steps: int) -> int:
     """Go from the first ``n`` flat cells in ``queue``, which are ``reached``, through the cells of ``within``, so many
     ``steps`` at most; returns how many are in the queue now."""
     rows, cols = within.shape
@@ -44,23 +44,8 @@ def flooded(seeds: Bool, within: Bool, steps: int) -> Bool:
             if seeds[r, c]:
                 queue[n] = r * seeds.shape[1] + c
                 n += 1
-    _flood(reached, within, queue, n, steps)
+    flood_on(reached, within, queue, n, steps)
     return reached
-
-
-@numba.njit(cache=True, nogil=True)
-def small_groups(cells: Bool, least: int) -> Bool:
-    """(rows, cols) the cells that belong to a group of fewer than ``least``."""
-    reached, small, queue = np.zeros_like(cells), np.zeros_like(cells), np.empty(cells.size, np.int64)
-    cols, one = cells.shape[1], np.int64(1)
-    for r in range(cells.shape[0]):
-        for c in range(cols):
-            if cells[r, c] and not reached[r, c]:
-                reached[r, c], queue[0] = True, r * cols + c
-                n = _flood(reached, cells, queue, one, cells.size)
-                for k in range(n if n < least else 0):
-                    small[queue[k] // cols, queue[k] % cols] = True
-    return small
 
 
 @numba.njit(cache=True, nogil=True)

@@ -1,4 +1,4 @@
-"""Three ways to count a drive, one interface: the paper's votes per scan, columns of evidence, and surfaces."""
+"""Two ways to count a drive, one interface: the paper's votes per scan, and surfaces."""
 
 from __future__ import annotations
 
@@ -10,15 +10,13 @@ from mapvote.core.grid import TileIndex
 from mapvote.core.point_map import PointMap
 from mapvote.core.sensors import Sensor
 from mapvote.core.types import U64
-from mapvote.detection.column_voter import ColumnVoter
 from mapvote.detection.paper import PaperVoter
 from mapvote.detection.votes import TileVotes
 from mapvote.perception.frontend import Observation
 
 
 class Voter(Protocol):
-    """:class:`PaperVoter`, :class:`ColumnVoter` or a ``SurfaceVoter``: scan after scan goes in, votes come out tile
-    by tile."""
+    """:class:`PaperVoter` or a ``SurfaceVoter``: scan after scan goes in, votes come out tile by tile."""
 
     def observe(self, seen: Observation) -> U64:
         """Take in one scan; returns (rows, cols) words of the voxels of its view whose points may be new."""
@@ -33,10 +31,10 @@ class Voter(Protocol):
 
 def make_voter(settings: Settings, sensor: Sensor, point_map: PointMap) -> Voter:
     """The voter that ``voting.method`` names."""
-    if settings.voting.method == "columns":
-        return ColumnVoter(settings.voting, point_map)
     if settings.voting.method == "surfaces":
-        from mapvote.detection.surfaces import SurfaceVoter  # brings half of scipy, which columns need nothing of
+        from mapvote.detection.surfaces import (
+            SurfaceVoter,  # brings half of scipy, which the paper's rule needs nothing of
+        )
 
         return SurfaceVoter(settings.voting, point_map)
     return PaperVoter(settings.voting, settings.paper, sensor, point_map)

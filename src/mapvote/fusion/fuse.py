@@ -64,7 +64,7 @@ def rule_of(method: str) -> Rule:
     """The server's half of a ballot's method; MapvoteError for one that this version does not know."""
     if method == "paper":
         return "paper"
-    if method in ("columns", "surfaces"):  # they differ in how a vehicle decides
+    if method in ("columns", "surfaces"):  # they differ in how a vehicle decided: none casts columns any more
         return "columns"
     raise MapvoteError(f"ballot: method {method!r} is unknown; this version fuses 'paper', 'columns' and 'surfaces'")
 

@@ -115,7 +115,7 @@ def test_the_whole_machinery_on_a_corner_twice_and_without_the_drives(tmp_path: 
     assert asked == {demand.what for demand in DEMANDS if demand.experiment in names}
     assert all(what in text for what in asked)
     main = results["main"][1].rounds
-    assert main["columns"].provenance.macro_f1 > main["1 column"].provenance.macro_f1
+    assert main["columns_v1"].provenance.macro_f1 > main["1 column"].provenance.macro_f1
     own, *_, taught = results["imported"][1].rounds.values()  # known-free columns learned as good as our own
     assert taught.provenance.macro_f1 >= own.provenance.macro_f1 - 0.01
     scene = matrix.scene(EXPERIMENTS["main"], 1)

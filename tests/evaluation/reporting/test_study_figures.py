@@ -35,7 +35,7 @@ def results(**rounds: float) -> dict[str, dict[int, MatrixResult]]:
         name.replace("_", " "): {
             3: MatrixResult(
                 scenario="corner", seed=3, cells=1, map_shift=shift, localisation={}, ceilings={},
-                rounds={"columns": entry(share)},
+                rounds={"columns_v1": entry(share)},
             )
         }
         for name, share in rounds.items()
@@ -67,13 +67,13 @@ def test_only_cells_that_are_scored_count_wherever_their_tile_lies() -> None:
 
 
 def test_what_was_not_measured_is_not_drawn() -> None:
-    assert ablation({"columns": [entry(0.9)]}) is None
+    assert ablation({"columns_v1": [entry(0.9)]}) is None
     assert robustness(results(main=0.9)) is None
 
 
 def test_what_was_measured_is_drawn_in_every_format(tmp_path: Path) -> None:
     drawn = {
-        "ablation": ablation({"columns A": [entry(0.4), entry(0.5)], "columns": [entry(0.9), entry(0.8)]}),
+        "ablation": ablation({"columns_v1 A": [entry(0.4), entry(0.5)], "columns_v1": [entry(0.9), entry(0.8)]}),
         "robustness": robustness(results(main=0.9, noise=0.3)),
         "reliability": reliability_diagram({CellState.CHANGED_EMPTY: binned(np.array([0.5]), np.array([True]))}),
     }

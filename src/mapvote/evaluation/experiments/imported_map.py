@@ -1,4 +1,4 @@
-"""A map that came without known-free columns, and what the fleet teaches it (docs/method.md, rule D).
+"""A map that came without known-free columns, and what the fleet teaches it (docs/columns-v1.md, rule D).
 
 Rounds are held in turn: what one round of ballots makes of the map, its points and its known-free columns, is what
 the next one votes on.
@@ -18,10 +18,10 @@ from mapvote.evaluation.experiments.scene import BALLOTS_FROM, Progress, Scene, 
 from mapvote.evaluation.scoring.jury import Outcome
 from mapvote.formats import write_map
 
-TAUGHT = "columns, imported, taught on the old street"
+TAUGHT = "columns_v1, imported, taught on the old street"
 CHAINS: Mapping[str, Sequence[str]] = {
-    "columns, imported": ("v",),
-    "columns, imported, the same vehicles again": ("v", "v"),
+    "columns_v1, imported": ("v",),
+    "columns_v1, imported, the same vehicles again": ("v", "v"),
     TAUGHT: ("survey_", "v"),
 }
 """Who votes in turn, by the first letters of the drives' names. The simulated vehicles all drive in the changed street;

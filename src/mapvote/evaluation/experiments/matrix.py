@@ -22,7 +22,7 @@ from mapvote.codec.ballot import Ballot
 from mapvote.config import Settings
 from mapvote.core.point_map import PointMap
 from mapvote.evaluation.experiments.attacks import ATTACKS
-from mapvote.evaluation.experiments.cases import Case, choose_cases, fuse_case
+from mapvote.evaluation.experiments.cases import COLUMNS_V1, Case, choose_cases, fuse_case
 from mapvote.evaluation.experiments.conditions import Conditions
 from mapvote.evaluation.experiments.imported_map import CHAINS, in_turn
 from mapvote.evaluation.experiments.passes import Pass, have_voted, passes
@@ -61,8 +61,8 @@ def as_sent(drives: Sequence[Pass], cases: Sequence[Case], first_map: PointMap) 
 
 
 def columns_alone(drives: Sequence[Pass], cases: Sequence[Case], first_map: PointMap) -> Iterator[BallotSet]:
-    """Our own method, all vehicles."""
-    return as_sent(drives, [case for case in cases if case.name == "columns"], first_map)
+    """Columns_v1, all vehicles."""
+    return as_sent(drives, [case for case in cases if case.name == COLUMNS_V1], first_map)
 
 
 def growing(drives: Sequence[Pass], cases: Sequence[Case], first_map: PointMap) -> Iterator[BallotSet]:
@@ -75,7 +75,7 @@ def growing(drives: Sequence[Pass], cases: Sequence[Case], first_map: PointMap) 
 def with_liars(drives: Sequence[Pass], cases: Sequence[Case], first_map: PointMap) -> Iterator[BallotSet]:
     """Of each of our methods that voted, for k = 1, 2, 3: 2k + 1 vehicles with min_votes = k + 1, all honest, and the
     last k of them lying."""
-    for method, k in itertools.product(("columns", "surfaces"), (1, 2, 3)):
+    for method, k in itertools.product((COLUMNS_V1, "surfaces"), (1, 2, 3)):
         n = 2 * k + 1
         if n > len(drives) or method not in drives[0].ballots:
             continue
@@ -96,12 +96,12 @@ class Experiment:
     conditions: Conditions = field(default_factory=Conditions)
     rounds: BallotSets = as_sent
     chains: Mapping[str, Sequence[str]] = field(default_factory=dict)
-    """Besides, columns on the first map without its known-free columns: who votes in turn; see ``imported.in_turn``."""
+    """Besides, columns_v1 on the first map without its known-free columns: who votes in turn, see ``in_turn``."""
 
 
-_BOTH = "1 column,columns,surfaces"
+_BOTH = f"1 column,{COLUMNS_V1},surfaces"
 """Experiments with the same cases on the same drives share their ballots."""
-_STAGES = "1 column,columns,columns one-stage,surfaces"
+_STAGES = f"1 column,{COLUMNS_V1},{COLUMNS_V1} one-stage,surfaces"
 _TEN = {"vehicles": 10}
 EXPERIMENTS: Mapping[str, Experiment] = {
     "main": Experiment("all"),
@@ -191,7 +191,7 @@ class Matrix:
             outcome = fuse_case(first_map, turn.ballots, turn.min_votes, self.settings.fuse, jury.window)
             entries[turn.name] = _judged(outcome, jury)
         for name, voters in experiment.chains.items():
-            [columns] = [case for case in cases if case.name == "columns"]
+            [columns] = [case for case in cases if case.name == COLUMNS_V1]
             entries[name] = _judged(in_turn(scene, columns, voters, jury.window, self.workers, progress), jury)
         return MatrixResult(
             scenario=self.scenario,

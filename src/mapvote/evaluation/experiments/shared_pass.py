@@ -9,19 +9,18 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from msgspec import structs
 
 from mapvote.codec.ballot import Ballot
 from mapvote.config import PaperSettings, Settings, VotingSettings
 from mapvote.core.point_map import PointMap
 from mapvote.core.reference import LocalMap
 from mapvote.core.types import Drive, Scan
-from mapvote.detection.column_voter import ColumnVoter
-from mapvote.detection.counters import Evidence
 from mapvote.detection.new_points import NewPoints
-from mapvote.detection.paper import PaperVoter
-from mapvote.detection.rules import Rules
-from mapvote.detection.surfaces import SurfaceVoter
-from mapvote.detection.voters import Voter
+from mapvote.detection.voters import Voter, make_voter
+from mapvote.evaluation.columns_v1.counters import ColumnEvidence
+from mapvote.evaluation.columns_v1.rules import Rules
+from mapvote.evaluation.columns_v1.voter import ColumnVoter
 from mapvote.evaluation.experiments.cases import Case
 from mapvote.localisation.localiser import Localise, Localiser
 from mapvote.localisation.ndt import PosePrior
@@ -50,15 +49,15 @@ class SharedPass:
             LocalMap(point_map, settings.voting.window_m),
             sensor=drive.sensor,
         )
-        self._voters: dict[tuple[VotingSettings, PaperSettings, Rules], Voter] = {}
-        self._observing: list[PaperVoter | ColumnVoter | SurfaceVoter] = []
-        """Those of them that fill the counters."""
-        self._evidence: dict[tuple[bool, bool], Evidence] = {}
+        self._voters: dict[tuple[VotingSettings, PaperSettings, Rules | None], Voter] = {}
+        self._observing: list[tuple[str, Voter]] = []
+        """Those of them that fill the counters, each with its method."""
+        self._evidence: dict[tuple[bool, bool], ColumnEvidence] = {}
         for case in cases:
             self._enrol(case)
         self._new_points = {
             method: NewPoints(point_map.lattice, beyond=method != "paper")
-            for method in {voter.voting.method for voter in self._observing}
+            for method in {method for method, _ in self._observing}
         }
 
     def _enrol(self, case: Case) -> None:
@@ -66,21 +65,16 @@ class SharedPass:
         if key in self._voters:
             return
         voting, paper, rules = key
-        if voting.method == "paper":
-            by_scan = PaperVoter(voting, paper, self.drive.sensor, self.point_map)
-            self._voters[key] = by_scan
-            self._observing.append(by_scan)
-            return
-        if voting.method == "surfaces":
-            of_surfaces = SurfaceVoter(voting, self.point_map)
-            self._voters[key] = of_surfaces
-            self._observing.append(of_surfaces)
+        if rules is None:
+            settings = self.settings.model_copy(update={"voting": voting, "paper": paper})
+            self._voters[key] = make_voter(settings, self.drive.sensor, self.point_map)
+            self._observing.append((case.method, self._voters[key]))
             return
         counted_by = rules.empty_by_ray, rules.hits_veto
         voter = ColumnVoter(voting, self.point_map, rules, self._evidence.get(counted_by))
         if counted_by not in self._evidence:
             self._evidence[counted_by] = voter.evidence
-            self._observing.append(voter)
+            self._observing.append((case.method, voter))
         self._voters[key] = voter
 
     @property
@@ -100,8 +94,8 @@ class SharedPass:
         for seen in observations:
             with self.report.timed("vote"):
                 may_be_new = {method: np.zeros(seen.view.grid.shape, dtype=np.uint64) for method in self._new_points}
-                for voter in self._observing:
-                    may_be_new[voter.voting.method] |= voter.observe(seen)
+                for method, voter in self._observing:
+                    may_be_new[method] |= voter.observe(seen)
                 for method, words in may_be_new.items():
                     self._new_points[method].gather(seen, words)
         return observations
@@ -109,12 +103,13 @@ class SharedPass:
     def ballot(self, case: Case) -> Ballot:
         """What the vehicle says by one of its cases. MapvoteError if no scan has voted."""
         settings = self.settings.model_copy(update={"voting": case.voting, "paper": case.paper})
-        return write_ballot(
+        ballot = write_ballot(
             self.drive.vehicle, self.drive.drive_id, self.point_map, settings, self.report,
-            self._voters[_counts_as(case)], self._new_points[case.voting.method],
+            self._voters[_counts_as(case)], self._new_points[case.method],
         )  # fmt: skip
+        return ballot if case.rules is None else structs.replace(ballot, method="columns")  # as vehicles called it
 
 
-def _counts_as(case: Case) -> tuple[VotingSettings, PaperSettings, Rules]:
+def _counts_as(case: Case) -> tuple[VotingSettings, PaperSettings, Rules | None]:
     """Voters that differ only in who decides (one stage or two) count alike."""
     return case.voting.model_copy(update={"two_stage": True}), case.paper, case.rules

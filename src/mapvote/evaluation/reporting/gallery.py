@@ -16,7 +16,7 @@ from mapvote.core.point_map import PointMap, all_points
 from mapvote.core.types import F32, F64, U8, Bool, CellState
 from mapvote.evaluation.baselines.nearest_neighbour import heights
 from mapvote.evaluation.evaluate import Evaluation
-from mapvote.evaluation.experiments.cases import YARDSTICKS, ballot_states, paper_cases
+from mapvote.evaluation.experiments.cases import COLUMNS_V1, YARDSTICKS, ballot_states, paper_cases
 from mapvote.evaluation.reporting import birdseye, figures, study_figures, style
 from mapvote.evaluation.reporting.tables import case_name
 from mapvote.evaluation.scoring.cells import UNSCORED
@@ -90,11 +90,11 @@ def drawn(evaluation: Evaluation, case: str) -> list[tuple[str, Figure, str]]:
         )
     nearest = _scan_near(evaluation, areas)
     v, n_min = evaluation.scene.settings.voting, evaluation.scene.settings.paper.n_min
-    decided = {n: evaluation.outcomes[n].states for n in ("1", "5", "columns", "surfaces") if n in evaluation.outcomes}
+    decided = {n: evaluation.outcomes[n].states for n in ("1", "5", COLUMNS_V1, "surfaces") if n in evaluation.outcomes}
     panels = [("Truth (strict)", _as_states(evaluation.truth.strict))]
     panels += [(case_name(n).capitalize(), states) for n, states in decided.items()]
     states = figures.cell_states(panels, evaluation.window, outlines=outlines)
-    shown = {n: e for n, e in evaluation.result.cases.items() if n in (*"12345", "columns", "surfaces", *YARDSTICKS)}
+    shown = {n: e for n, e in evaluation.result.cases.items() if n in (*"12345", COLUMNS_V1, "surfaces", *YARDSTICKS)}
     names = {n: case_name(n) for n in shown}
     bars = figures.score_bars(shown, names)
     pictures += [
@@ -118,9 +118,9 @@ def drawn(evaluation: Evaluation, case: str) -> list[tuple[str, Figure, str]]:
 
 
 def _of_our_own(evaluation: Evaluation) -> list[tuple[str, Figure, str]]:
-    """Of our own methods: their probabilities, and what each rule of columns is worth if they voted rule by rule."""
+    """Of our own methods: their probabilities, and what each rule of columns_v1 is worth if they voted rule by rule."""
     out = []
-    if evaluation.best in ("columns", "surfaces"):
+    if evaluation.best in (COLUMNS_V1, "surfaces"):
         decisions, lattice = evaluation.outcomes[evaluation.best].decisions, evaluation.first_map.lattice
         found = {
             state: reliability(decisions, lattice, evaluation.truth.strict, evaluation.window, state)
@@ -130,7 +130,7 @@ def _of_our_own(evaluation: Evaluation) -> list[tuple[str, Figure, str]]:
         out.append(("reliability", study_figures.reliability_diagram(found), caption))
     ablation = study_figures.ablation({name: [entry] for name, entry in evaluation.result.cases.items()})
     if ablation is not None:
-        out.append(("ablation", ablation, "What each rule of columns is worth, added one by one (strict truth)."))
+        out.append(("ablation", ablation, "What each rule of columns_v1 is worth, added one by one (strict truth)."))
     return out
 
 

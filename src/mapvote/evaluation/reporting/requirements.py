@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from mapvote.evaluation.experiments.attacks import ATTACKS
+from mapvote.evaluation.experiments.cases import COLUMNS_V1
 from mapvote.evaluation.experiments.imported_map import TAUGHT
 from mapvote.evaluation.reporting.matrix_tables import FIGURES, Results, rounds_of, spread
 
@@ -62,7 +63,7 @@ class Demand:
 
 
 _CASE_1 = ("1", "1 farthest_return", "1 column")
-_COLUMNS = ("columns",)
+_COLUMNS = (COLUMNS_V1,)
 
 
 def _loss(what: str, experiment: str, figure: str, must: float, aim: float, rounds: Sequence[str] = _COLUMNS) -> Demand:
@@ -71,8 +72,8 @@ def _loss(what: str, experiment: str, figure: str, must: float, aim: float, roun
 
 def _liars(experiment: str, k: int) -> list[Demand]:
     n = 2 * k + 1
-    rounds = [f"columns, {k} of {n} {name}" for name in ATTACKS]
-    honest = (experiment, (f"columns, {n} honest",))
+    rounds = [f"{COLUMNS_V1}, {k} of {n} {name}" for name in ATTACKS]
+    honest = (experiment, (f"{COLUMNS_V1}, {n} honest",))
     what = f"{k} of {n} lie, the worst lie: macro"
     return [
         Demand(f"{what} {figure}", experiment, rounds, figure, -0.04, -0.01, against=honest)
@@ -81,8 +82,10 @@ def _liars(experiment: str, k: int) -> list[Demand]:
 
 
 def _more_vehicles(few: int, many: int) -> Demand:
-    what, rounds = f"{many} vehicles against {few}: macro strict", (f"columns, {many} vehicles",)
-    return Demand(what, "vehicles", rounds, "strict", -0.02, 0.0, -0.02, ("vehicles", (f"columns, {few} vehicles",)))
+    what, rounds = f"{many} vehicles against {few}: macro strict", (f"{COLUMNS_V1}, {many} vehicles",)
+    return Demand(
+        what, "vehicles", rounds, "strict", -0.02, 0.0, -0.02, ("vehicles", (f"{COLUMNS_V1}, {few} vehicles",))
+    )
 
 
 DEMANDS: Sequence[Demand] = (
@@ -113,7 +116,7 @@ DEMANDS: Sequence[Demand] = (
     _loss("12 parked cars a pass: macro provenance", "parked", "provenance", 0.04, 0.01),
     Demand(
         "12 parked cars: above one-stage, macro strict", "parked", _COLUMNS, "strict", 0.0, 0.0,
-        against=("parked", ("columns one-stage",)),
+        against=("parked", (f"{COLUMNS_V1} one-stage",)),
     ),
     Demand("2 Hz: macro strict", "2 Hz", _COLUMNS, "strict", 0.88, 0.93),
     Demand("16 beams: macro strict", "16 beams", _COLUMNS, "strict", 0.92, 0.93),

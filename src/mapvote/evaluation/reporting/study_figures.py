@@ -11,9 +11,9 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from mapvote.core.types import CellState
-from mapvote.detection.rules import Rules
+from mapvote.evaluation.columns_v1.rules import LETTERS, Rules
 from mapvote.evaluation.experiments.attacks import ATTACKS
-from mapvote.evaluation.experiments.cases import LETTERS
+from mapvote.evaluation.experiments.cases import COLUMNS_V1
 from mapvote.evaluation.experiments.imported_map import TAUGHT
 from mapvote.evaluation.reporting import style
 from mapvote.evaluation.reporting.matrix_tables import FIGURES, Results, rounds_of
@@ -34,13 +34,13 @@ _BY_CASE = "1 column"
 class _Condition:
     told: str
     experiment: str
-    columns: Sequence[str] = ("columns",)
+    columns: Sequence[str] = (COLUMNS_V1,)
     """Rounds, of which the worst is shown seed by seed."""
     paper: Sequence[str] = (_BY_CASE,)
 
 
 def _lying(k: int, experiment: str) -> _Condition:
-    rounds = [f"columns, {k} of {2 * k + 1} {name}" for name in ATTACKS]
+    rounds = [f"{COLUMNS_V1}, {k} of {2 * k + 1} {name}" for name in ATTACKS]
     return _Condition(f"{k} of {2 * k + 1} lie, the worst lie", experiment, rounds, ())
 
 
@@ -55,7 +55,7 @@ _CONDITIONS = (
     _Condition("12 parked cars a pass", "parked"),
     _Condition("a map of points alone, taught", "imported", (TAUGHT,), ()),
     *(
-        _Condition(f"{n} vehicles", "vehicles", (f"columns, {n} vehicles",), (f"{_BY_CASE}, {n} vehicles",))
+        _Condition(f"{n} vehicles", "vehicles", (f"{COLUMNS_V1}, {n} vehicles",), (f"{_BY_CASE}, {n} vehicles",))
         for n in (3, 5, 7, 10)
     ),
     _lying(1, "liars"),
@@ -64,11 +64,11 @@ _CONDITIONS = (
 
 
 def ablation(entries: Mapping[str, Sequence[Judgement]]) -> Figure | None:
-    """F1 as columns grow rule by rule, strict truth: the mean over seeds, and a line down to the worst.
+    """F1 as columns_v1 grow rule by rule, strict truth: the mean over seeds, and a line down to the worst.
 
     ``entries``: by case, one a seed. None where fewer than two of its steps were measured.
     """
-    steps = {"columns " + LETTERS[:n]: n for n in range(1, len(LETTERS))} | {"columns": len(LETTERS)}
+    steps = {f"{COLUMNS_V1} {LETTERS[:n]}": n for n in range(1, len(LETTERS))} | {COLUMNS_V1: len(LETTERS)}
     shown = [name for name in steps if entries.get(name)]
     if len(shown) < 2:
         return None
@@ -106,8 +106,8 @@ def matrix_ablation(results: Results) -> Figure | None:
 
 
 def robustness(results: Results) -> Figure | None:
-    """Macro-F1 under every condition that was measured, by both truths: columns, and the paper's best case beside them;
-    the mean over seeds, and a line to the worst. None where there is nothing but the street as it is."""
+    """Macro-F1 under every condition that was measured, by both truths: columns_v1, and the paper's best case beside
+    them; the mean over seeds, and a line to the worst. None where there is nothing but the street as it is."""
     shown = [c for c in _CONDITIONS if _worst(results, c.experiment, c.columns, "strict")]
     if len(shown) < 2:
         return None
@@ -129,7 +129,7 @@ def robustness(results: Results) -> Figure | None:
         _plain(axis)
     axes[0, 0].set_yticks(range(len(shown)), [c.told for c in reversed(shown)])
     seeds = len(_worst(results, shown[0].experiment, shown[0].columns, "strict"))
-    marks = {"columns": (style.STANDING, "o"), f"the paper's case {_BY_CASE}": (style.UNSURE, "s")}
+    marks = {COLUMNS_V1: (style.STANDING, "o"), f"the paper's case {_BY_CASE}": (style.UNSURE, "s")}
     handles = [
         Line2D([], [], color=colour, marker=marker, mec=style.INK, mew=0.6, label=name)
         for name, (colour, marker) in marks.items()

@@ -1,8 +1,8 @@
-"""Which of the columns' rules hold: all of them, but in an ablation (docs/method.md tells each, by its letter)."""
+"""Which of the rules hold: all of them, but in an ablation (docs/columns-v1.md tells each, by its letter)."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,3 +30,10 @@ class Rules:
 
 
 ALL_RULES = Rules()
+LETTERS = "ABCDEFGHI"
+"""The names that docs/columns-v1.md gives to the fields of :class:`Rules`, in their order."""
+
+
+def by_letters(letters: str) -> Rules:
+    """Only the rules of these letters hold: "AB" is the first two."""
+    return Rules(**{rule.name: letter in letters for letter, rule in zip(LETTERS, fields(Rules), strict=True)})

@@ -1,4 +1,4 @@
-"""Columns as a voter: evidence per voxel over the drive, weighed at its end (docs/method.md)."""
+"""Columns as a voter: evidence per voxel over the drive, weighed at its end (docs/columns-v1.md)."""
 
 from __future__ import annotations
 
@@ -13,12 +13,15 @@ from mapvote.core.point_map import PointMap
 from mapvote.core.reference import bordered
 from mapvote.core.types import U64
 from mapvote.detection.blocks import blocks
-from mapvote.detection.columns import weigh
-from mapvote.detection.counters import Evidence, newly_free
+from mapvote.detection.counters import newly_free
 from mapvote.detection.near_hits import near_hits
-from mapvote.detection.regions import apply_region_rules, around, beside_new
-from mapvote.detection.rules import ALL_RULES, Rules
-from mapvote.detection.votes import Judged, TileVotes
+from mapvote.detection.regions import around
+from mapvote.detection.votes import TileVotes
+from mapvote.evaluation.columns_v1.counters import ColumnEvidence
+from mapvote.evaluation.columns_v1.judged import Judged
+from mapvote.evaluation.columns_v1.regions import apply_region_rules, beside_new
+from mapvote.evaluation.columns_v1.rules import ALL_RULES, Rules
+from mapvote.evaluation.columns_v1.weighing import weigh
 from mapvote.perception.frontend import Observation
 
 WIDE_SIGMA_M = 0.1
@@ -33,11 +36,11 @@ class ColumnVoter:
         voting: VotingSettings,
         point_map: PointMap,
         rules: Rules = ALL_RULES,
-        evidence: Evidence | None = None,
+        evidence: ColumnEvidence | None = None,
     ) -> None:
         """``evidence``: counters that another voter fills (who may be the only one to observe), else its own."""
         self.voting, self.point_map, self.rules = voting, point_map, rules
-        self.evidence = evidence or Evidence(point_map.lattice, rules.empty_by_ray, rules.hits_veto)
+        self.evidence = evidence or ColumnEvidence(point_map.lattice, rules.empty_by_ray, rules.hits_veto)
 
     def observe(self, seen: Observation) -> U64:
         """Count one scan; returns (rows, cols) words of voxels whose points may be new."""
@@ -63,7 +66,7 @@ class ColumnVoter:
             found = self._judge(tile, counters)
             if found.weighed.tally.any():
                 judged[tile] = found
-        apply_region_rules(judged, self.point_map.lattice, self.voting, self.rules)
+        apply_region_rules(judged, self.point_map.lattice, self.rules)
         for tile in wanted:
             if tile in judged:
                 yield tile, _votes_of(judged[tile], counters[tile])

@@ -1,4 +1,4 @@
-"""A drive's evidence voter by voter, over whole tiles: what falls with a demolished wall, and what stays beside it."""
+"""A drive's evidence by columns_v1, over whole tiles: what falls with a demolished wall, and what stays beside it."""
 
 from __future__ import annotations
 
@@ -6,17 +6,18 @@ import numpy as np
 import pytest
 
 from hand_made import make_map, make_tile, one_scan, wall
+from long_street import blocks_say_the_same, long_street
 from mapvote.config import VotingSettings
-from mapvote.core.grid import CELL_SIZE
+from mapvote.core.grid import CELL_SIZE, Lattice
 from mapvote.core.point_map import PointMap
-from mapvote.core.reference import reference_window
+from mapvote.core.reference import LocalMap, reference_window
 from mapvote.core.types import CellState
-from mapvote.detection.column_voter import ColumnVoter
-from mapvote.detection.counters import Evidence
 from mapvote.detection.near_hits import HIT_REACH_M
-from mapvote.detection.regions import beside_new
-from mapvote.detection.rules import ALL_RULES, Rules
 from mapvote.detection.votes import TileVotes
+from mapvote.evaluation.columns_v1.counters import ColumnEvidence
+from mapvote.evaluation.columns_v1.regions import beside_new
+from mapvote.evaluation.columns_v1.rules import ALL_RULES, Rules
+from mapvote.evaluation.columns_v1.voter import ColumnVoter
 from mapvote.perception.raycast import ScanView, Sight
 
 ROW = 100
@@ -49,7 +50,7 @@ def after(more_hits: dict[tuple[int, int], list[float]] | None = None, rules: Ru
         hit[cell] = bits(heights)
     passed = np.where(hit != 0, ~hit & ALL_BITS, ALL_BITS)
     view = ScanView(grid, (hit != 0).astype(np.int32), hit, passed, np.full(grid.shape, int(Sight.CLEAR), np.uint8))
-    evidence = Evidence(point_map.lattice)
+    evidence = ColumnEvidence(point_map.lattice)
     for _ in range(20):
         evidence.count(view, reference)
     return ColumnVoter(VotingSettings(), point_map, rules, evidence).votes()[0, 0]
@@ -106,3 +107,26 @@ def test_beside_new_is_everything_within_a_voxel_of_a_hit_that_the_map_does_not_
     near = beside_new(planes, occupied, np.zeros((5, 5), np.int32))
     assert (near[1:4, 1:4] == np.uint64(0b111) << np.uint64(bit - 1)).all()
     assert np.count_nonzero(near) == 9
+
+
+def drive(evidence: ColumnEvidence, local: LocalMap) -> None:
+    """Along a row of tiles and back; walls stand and fall, and things rise, at random."""
+    rng = np.random.default_rng(6)
+    gone = rng.random((3000, 3000)) < 0.5
+    for x in [*np.arange(20.0, 300.0, 60.0), 240.0, 20.0, 280.0]:
+        reference, _ = local.at(np.array([x, 35.0, 1.8]))
+        grid = reference.grid
+        gone_here = gone[: grid.rows, grid.col0 % 1000 : grid.col0 % 1000 + grid.cols]
+        hit = np.where(gone_here, np.uint64(0), reference.occupied)
+        hit |= np.where(rng.random(grid.shape) < 0.001, np.uint64(0b110), np.uint64(0))
+        passed = ~hit >> np.uint64(1)
+        evidence.count(ScanView(grid, (hit != 0).astype(np.int32), hit, passed, np.zeros((0, 0), np.uint8)), reference)
+
+
+@pytest.mark.slow
+def test_blocks_of_tiles_say_what_all_of_them_say_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    point_map = long_street()
+    evidence = ColumnEvidence(Lattice())
+    drive(evidence, LocalMap(point_map, 40.0))
+    assert evidence.tiles._packed
+    blocks_say_the_same(ColumnVoter(VotingSettings(), point_map, evidence=evidence), monkeypatch)

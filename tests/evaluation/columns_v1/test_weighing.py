@@ -10,14 +10,15 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from mapvote.core.columns import remnants
 from mapvote.core.types import NO_VOTE, U64, CellState
 from mapvote.core.voting import VOTE_UNIT
-from mapvote.detection.columns import CLEAR_SCANS, weigh
-from mapvote.detection.counters import PLANES, STRUCK_ITSELF, THROUGH_ITSELF, WORDS
-from mapvote.detection.regions import drop_specks, fallen, unexplained
-from mapvote.detection.rules import ALL_RULES, Rules
-from mapvote.detection.votes import Weighed
+from mapvote.detection.counters import PLANES
+from mapvote.detection.regions import fallen, unexplained
+from mapvote.evaluation.columns_v1.counters import STRUCK_ITSELF, THROUGH_ITSELF, WORDS
+from mapvote.evaluation.columns_v1.judged import Weighed
+from mapvote.evaluation.columns_v1.regions import drop_specks, remnants
+from mapvote.evaluation.columns_v1.rules import ALL_RULES, Rules
+from mapvote.evaluation.columns_v1.weighing import CLEAR_SCANS, weigh
 
 UO, UE, CO, CE, UN = CellState
 FREE = ~np.uint64(0)

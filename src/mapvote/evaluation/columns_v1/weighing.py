@@ -1,4 +1,4 @@
-"""From the evidence of a drive to votes (docs/method.md, rules C to I): sums over the voxels that matter in each cell.
+"""From the evidence of a drive to votes (docs/columns-v1.md, rules C to I): sums over the voxels that matter in a cell.
 
 A cell's votes are numbers of (scan, voxel) pairs: mapped voxels struck speak for unchanged-occupied, mapped voxels
 seen through for changed-empty, free voxels struck for changed-occupied, and seen through for unchanged-empty. What is
@@ -16,9 +16,9 @@ from mapvote.core.columns import TOP_BIT, below_top
 from mapvote.core.types import I32, U64, Bool, CellState
 from mapvote.core.voting import VOTE_UNIT
 from mapvote.detection.counters import PLANES, count_of, is_open
-from mapvote.detection.regions import loose_voxels
-from mapvote.detection.rules import ALL_RULES, Rules
-from mapvote.detection.votes import Weighed
+from mapvote.evaluation.columns_v1.judged import Weighed
+from mapvote.evaluation.columns_v1.regions import loose_voxels
+from mapvote.evaluation.columns_v1.rules import ALL_RULES, Rules
 
 # Set on the development streets (seeds 1, 11 and 12 of `street570`); docs/measurements/columns.md has what
 # each rule is worth on others.
@@ -148,7 +148,7 @@ def _weigh_empty(maps: Maps, r: int, c: int, struck: np.uint64, w: Weights) -> t
 
 @numba.njit(cache=True, nogil=True)
 def _weigh(maps: Maps, w: Weights, tally: I32, gone: U64, new: U64, beside: Bool, adrift: Bool) -> None:
-    """Fill the five planes, which come empty, cell by cell. See :class:`mapvote.detection.votes.Weighed`."""
+    """Fill the five planes, which come empty, cell by cell. See :class:`Weighed`."""
     for r in range(maps.occupied.shape[0]):
         for c in range(maps.occupied.shape[1]):
             cell, mapped, low = maps.planes[r + 1, c + 1], maps.occupied[r, c], maps.low[r, c]

@@ -1,0 +1,37 @@
+"""A street of four tiles, and whether a voter says the same of it block by block."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from hand_made import make_map, make_tile, wall
+from mapvote.core.point_map import PointMap
+from mapvote.detection import blocks
+from mapvote.detection.voters import Voter
+from mapvote.detection.votes import TileVotes
+
+
+def long_street() -> PointMap:
+    """Walls along it, with gaps."""
+    rng = np.random.default_rng(1)
+    walls = [(int(r), c) for r in range(60, 200, 20) for c in range(256) if rng.random() < 0.8]
+    ground = [(r, c) for r in range(40, 200, 2) for c in range(0, 256, 2)]
+    points = np.concatenate([wall(walls, [0.75, 1.05, 1.35]), wall(ground, [0.0])])
+    return make_map({(0, c): make_tile(points, index=(0, c)) for c in range(4)})
+
+
+def blocks_say_the_same(voter: Voter, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Judged tile by tile, what a drive says is what all tiles say at once."""
+    whole = voter.votes()
+    monkeypatch.setattr(blocks, "_AT_ONCE", 1)
+    monkeypatch.setattr(blocks, "_BLOCK", 1)
+    by_blocks = voter.votes()
+    assert list(by_blocks) == list(whole)
+    changed = []
+    for tile, votes in whole.items():
+        for name in TileVotes.__slots__:
+            mine, theirs = getattr(by_blocks[tile], name), getattr(votes, name)
+            np.testing.assert_array_equal(mine, theirs, err_msg=f"{tile} {name}")
+        changed.append(int(((votes.states == 2) | (votes.states == 3)).sum()))
+    assert sum(changed) > 50, "there is something to compare"
