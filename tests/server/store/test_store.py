@@ -22,6 +22,7 @@ from mapvote.server.errors import Conflict, Held, NotFound, Unavailable
 from mapvote.server.insight.explain import explain_cell
 from mapvote.server.store.admission import accept, examine
 from mapvote.server.store.ballots import Receipt, withdraw
+from mapvote.server.store.check import check
 from mapvote.server.store.policy import (
     GatePolicy,
     Policy,
@@ -33,6 +34,7 @@ from mapvote.server.store.policy import (
     set_values,
 )
 from mapvote.server.store.publish import preview, publish, rollback
+from mapvote.server.store.replay import replay
 from mapvote.server.store.store import Store
 
 EMPTY, KEEPS = CellState.CHANGED_EMPTY, CellState.UNCHANGED_OCCUPIED
@@ -253,6 +255,24 @@ def test_the_policy_says_how_a_round_votes_and_never_mixes(store: Store, other: 
     send(store, says(base, "d", EMPTY, **other))
     assert publish(store, POLICY).deleted == 3
     assert [(change.by, change.reason) for change in policy_changes(store)][-1] == ("ann", "a new release")
+
+
+def test_a_round_of_columns_from_before_goes_on_until_it_is_moved_and_none_begins_anew(store: Store) -> None:
+    """Vehicles of this version vote by surfaces; those of the one before may not have been updated yet."""
+    set_policy(store, Policy(round=RoundPolicy(method="columns")))
+    base = store.point_map()
+    with pytest.raises(Conflict, match=r"columns left the product.*round\.method=surfaces round\.settings_hash=DIGEST"):
+        send(store, says(base, "a", EMPTY, method="surfaces"))
+    send(store, *(says(base, vehicle, EMPTY, method="columns") for vehicle in "ab"))
+    set_values(store, {"fuse.min_votes": "2", "round.method": "columns"})
+    assert publish(store, POLICY).deleted == 3
+    set_values(store, {"round.method": "surfaces"})
+    with pytest.raises(MapvoteError, match=r"round\.method = 'columns': columns left.*round\.method=surfaces"):
+        set_values(store, {"round.method": "columns"})
+    published = store.point_map().tiles[0, 0].points.tobytes()
+    assert replay(store, "a").added == 3, "gone through again by the policy that held: b alone was not enough"
+    assert store.point_map().tiles[0, 0].points.tobytes() == published
+    assert check(store) == []
 
 
 def test_a_policy_is_changed_by_name_and_a_wrong_name_is_told(store: Store) -> None:

@@ -9,11 +9,12 @@ from typing import Any
 import sqlalchemy as sa
 
 from mapvote.codec.ballot import Ballot, BallotTile, tile_key
+from mapvote.config import COLUMNS_LEFT
 from mapvote.core.types import MapvoteError
 from mapvote.server.errors import Conflict, NotFound, Unauthorised
 from mapvote.server.store import keys, schema
 from mapvote.server.store.database import insert_rows
-from mapvote.server.store.policy import RoundPolicy, policy_in
+from mapvote.server.store.policy import MOVE_ON, RoundPolicy, policy_in
 from mapvote.server.store.queries import log_event, next_seq
 from mapvote.server.store.store import Store
 from mapvote.server.store.sums import sum_of_planes
@@ -117,6 +118,8 @@ def unlike(asked: RoundPolicy, incoming: Incoming) -> MapvoteError | None:
     theirs = f"{incoming.cast_by}, settings {settings[:16]}"
     ours = f"{asked.cast_by}, settings {asked.settings_hash[:16] or 'of any kind'}"
     mend = "vote again with the fleet's configuration (mapvote config)"
+    if asked.method == "columns":
+        mend = f"{COLUMNS_LEFT}; for the operator: {MOVE_ON}"
     return Conflict(f"this round votes by {ours}, the ballot by {theirs}: one round never mixes them; {mend}")
 
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import sqlalchemy as sa
 from pydantic import Field, ValidationError
 
-from mapvote.config import FuseSettings, GateSettings, Section, Settings, did_you_mean
+from mapvote.config import COLUMNS_LEFT, FuseSettings, GateSettings, Section, Settings, did_you_mean
 from mapvote.core.types import MapvoteError
 from mapvote.server.store import schema
 from mapvote.server.store.queries import log_event
@@ -22,10 +22,19 @@ if TYPE_CHECKING:
     from mapvote.server.store.store import Store
 
 
+MOVE_ON = (
+    "once the fleet has this version, move the round over: mapvote policy STORE round.method=surfaces "
+    "round.settings_hash=DIGEST (mapvote config shows it)"
+)
+"""What to do about a round that still asks for columns."""
+
+
 class RoundPolicy(Section):
     """How the ballots of a round are cast. Others are refused, and those that stand already do not count."""
 
-    method: Literal["paper", "columns", "surfaces"] = "surfaces"
+    method: Literal["paper", "columns", "surfaces"] = Field(
+        default="surfaces", description="paper or surfaces; a round of columns, from before, goes on until it is moved"
+    )
     stage: Literal["one-stage", "two-stage"] = "two-stage"
     settings_hash: str = Field(
         default="",
@@ -145,6 +154,8 @@ def changed(policy: Policy, values: Mapping[str, Any]) -> Policy:
     for name, value in values.items():
         if name not in known:
             raise MapvoteError(f"policy: there is no {name!r}{did_you_mean(name, known)}")
+        if name == "round.method" and value == "columns" != policy.round.method:
+            raise MapvoteError(f"policy: round.method = 'columns': {COLUMNS_LEFT}; write round.method=surfaces")
         section, _, key = name.partition(".")
         sections[section][key] = value
     try:
