@@ -1,6 +1,6 @@
 """Milliseconds of a whole scan by stage: localise, ground, remove movers, see, classify and vote. One thread, warm.
 
-    python benchmarks/bench_scan.py [SIMULATED_FOLDER] [--case columns]
+    python benchmarks/bench_scan.py [SIMULATED_FOLDER] [--case surfaces]
 
 SIMULATED_FOLDER is what ``mapvote simulate`` wrote; without one the scenario ``corner`` is simulated first. The map is
 built by our SLAM from the surveys. The first vehicle drives twice: the first drive compiles the kernels and warms the
@@ -46,7 +46,7 @@ def table(report: DriveReport, points: float) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", nargs="?", type=Path)
-    parser.add_argument("--case", default="columns", help="columns, or 1 to 5")
+    parser.add_argument("--case", default="surfaces", help="surfaces, or 1 to 5")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as scratch:
         folder = options.folder

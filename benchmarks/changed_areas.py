@@ -13,7 +13,7 @@ import argparse
 from pathlib import Path
 
 from mapvote.config import cache_folder, load_settings
-from mapvote.evaluation.experiments.cases import choose_cases, fuse_case
+from mapvote.evaluation.experiments.cases import COLUMNS_V1, choose_cases, fuse_case
 from mapvote.evaluation.experiments.changed_areas import in_changed_areas, survey_anew
 from mapvote.evaluation.experiments.passes import passes
 from mapvote.evaluation.experiments.pose_errors import map_frame
@@ -30,9 +30,9 @@ def measure(scene: Scene, workers: int) -> dict[str, PoseErrors]:
     scene.prepare()
     cases, _ = choose_cases(scene.settings, "all")
     drives = passes(scene, cases, workers)
-    [columns] = [case for case in cases if case.name == "columns"]
+    [columns] = [case for case in cases if case.name == COLUMNS_V1]
     first_map, truth = scene.point_map, scene.truth
-    ballots = [drive.ballots["columns"] for drive in drives]
+    ballots = [drive.ballots[COLUMNS_V1] for drive in drives]
     window = truth.grid_on(first_map.lattice)
     updated = fuse_case(first_map, ballots, columns.min_votes, scene.settings.fuse, window).updated
     T_map_world = map_frame(scene)

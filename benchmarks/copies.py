@@ -24,7 +24,7 @@ import numpy as np
 from mapvote.codec.ballot import Ballot, unpack_states
 from mapvote.config import FuseSettings, Settings
 from mapvote.evaluation.experiments.attacks import jitter, replay
-from mapvote.evaluation.experiments.cases import choose_cases, fuse_case
+from mapvote.evaluation.experiments.cases import COLUMNS_V1, choose_cases, fuse_case
 from mapvote.evaluation.experiments.passes import have_voted, passes
 from mapvote.evaluation.experiments.scene import Scene
 from mapvote.evaluation.scoring.jury import Jury
@@ -40,11 +40,11 @@ ALIKE: dict[str, Any] = {
 
 
 def fleet(scene: Scene) -> list[Ballot]:
-    """What every vehicle of a scene says, by columns."""
-    cases, _ = choose_cases(scene.settings, "columns,columns one-stage")
+    """What every vehicle of a scene says, by columns_v1."""
+    cases, _ = choose_cases(scene.settings, f"{COLUMNS_V1},{COLUMNS_V1} one-stage")
     if not have_voted(scene, cases):
         scene.prepare()
-    ballots = [drive.ballots["columns"] for drive in passes(scene, cases, 1)]
+    ballots = [drive.ballots[COLUMNS_V1] for drive in passes(scene, cases, 1)]
     scene.drop_drives()
     return ballots
 

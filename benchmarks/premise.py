@@ -3,7 +3,7 @@
     python benchmarks/premise.py --seeds 1,2,3 --csv results/premise.csv
 
 On `half_gone`, where half of a block's facades go and little else stands, and on the same street with those facades
-built instead. Each vehicle follows its drive in the old map and in the updated one (columns) by NDT with voxels of one
+built instead. Each vehicle follows its drive in the old map and in the updated one (columns_v1) by NDT with voxels of one
 size, as the paper has it: the next pose is guessed from the last two, there is no prior and no second opinion. Beside
 it the product's own tracker, with its prior. Counted are scans within 30 m of a change. A scan is lost where its pose
 is off by more than half a metre; the next one starts from the truth again.
@@ -24,7 +24,7 @@ from mapvote.core.geometry import exp
 from mapvote.core.point_map import PointMap
 from mapvote.core.types import F64, Drive
 from mapvote.core.voxels import thin
-from mapvote.evaluation.experiments.cases import choose_cases, fuse_case
+from mapvote.evaluation.experiments.cases import COLUMNS_V1, choose_cases, fuse_case
 from mapvote.evaluation.experiments.changed_areas import localise_in, scans_near_changes
 from mapvote.evaluation.experiments.passes import passes
 from mapvote.evaluation.experiments.pose_errors import map_frame
@@ -80,11 +80,11 @@ def summary(T_found: F64, T_true: F64) -> list[str]:
 def measure(street: str, scene: Scene) -> Iterator[list[str]]:
     """A row for each vehicle, way of localising and map."""
     scene.prepare()
-    cases, _ = choose_cases(scene.settings, "columns")
+    cases, _ = choose_cases(scene.settings, COLUMNS_V1)
     drives = passes(scene, cases, 1)
     old, T_map_world = scene.point_map, map_frame(scene)
     window = scene.truth.grid_on(old.lattice)
-    ballots = [drive.ballots["columns"] for drive in drives]
+    ballots = [drive.ballots[COLUMNS_V1] for drive in drives]
     updated = fuse_case(old, ballots, cases[0].min_votes, scene.settings.fuse, window).updated
     for name in scene.drive_names("v"):
         drive, T_true = scene.drive(name), T_map_world @ scene.true_poses(name)

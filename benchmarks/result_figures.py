@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 
 ROOT = Path(__file__).parent.parent
 MATRIX = ROOT / "docs/matrix.md"
-CASES = "1", "2", "3", "4", "5", "1 column", "5 column", "columns one-stage", "columns"
+CASES = "1", "2", "3", "4", "5", "1 column", "5 column", "columns_v1 one-stage", "columns_v1"
 TRUTHS = ("macro strict", "#24476b"), ("macro prov.", "#8fb3d9")
 WORTH = ("F1 ch.-occ. strict", "#c0392b"), ("F1 ch.-empty strict", "#2471a3"), ("macro strict", "#444444")
 
@@ -67,8 +67,8 @@ def main() -> None:
     pictures = ROOT / "docs/pictures"
     draw(CASES, [name.replace(" ", "\n") for name in CASES], TRUTHS, pictures / "cases.png")
     rows = table(MATRIX.read_text(), "main")
-    grown = [*sorted((name for name in rows if re.fullmatch(r"columns [A-H]+", name)), key=len), "columns"]
-    labels = [f"+ {name[-1]}" if name != "columns" else "+ I\n(all)" for name in grown]
+    grown = [*sorted((name for name in rows if re.fullmatch(r"columns_v1 [A-H]+", name)), key=len), "columns_v1"]
+    labels = [f"+ {name[-1]}" if name != "columns_v1" else "+ I\n(all)" for name in grown]
     draw(grown, labels, WORTH, pictures / "rules.png")
 
 
