@@ -49,7 +49,7 @@ def around(lattice: Lattice, planes: Mapping[TileIndex, Plane], wide: Grid, else
 
 
 def unexplained(states: U8, beside: Bool, reach: int) -> Bool:
-    """(rows, cols) cells of ``beside`` that rule C gives up: an error of pose puts hits next to what is mapped, and
+    """(rows, cols) cells of ``beside`` that are given up: an error of pose puts hits next to what is mapped, and
     there alone. A new thing that touches an old one also stands where nothing explains it: the cells next to it that
     are ``reach`` cells or less from such a place belong to it."""
     changed = states == CellState.CHANGED_OCCUPIED
@@ -57,7 +57,7 @@ def unexplained(states: U8, beside: Bool, reach: int) -> Bool:
 
 
 def fallen(states: U8, adrift: Bool, reach: int) -> Bool:
-    """(rows, cols) cells of rule H: what stood on things that are gone, and no ray could reach, is gone with them.
+    """(rows, cols) cells that fall: what stood on things that are gone, and no ray could reach, is gone with them.
 
     The roof of a demolished house, too high for the sensor once nothing is behind it. An ``adrift`` cell goes with the
     changed-empty or the unchanged-occupied cell that is nearer, so that of two roofs that meet only one falls; a

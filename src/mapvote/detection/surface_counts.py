@@ -9,7 +9,7 @@ It is counted, too, in how many scans a ray passed a voxel at all, and met nothi
 than voxels no scan's rays pass a voxel and those above and below it; what drove there, or was pulled down, would
 otherwise never meet with anything that speaks against it.
 
-Counts are kept as those of columns (detection/counters.py), with a word a cell of what any ray ever passed.
+Counts are kept as those of a survey (detection/counters.py), with a word a cell of what any ray ever passed.
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
 A mapped voxel is gone that was crossed more often than HIT_RAYS times its hits, and stands that was met and is not. A
 cell is changed-empty if a voxel of it is gone and none stands: what no ray could decide in it goes along. So do cells
 beside it in which rays crossed something and met nothing, however few; and cells that no ray could decide go with what
-falls, as columns have it (rule H). Points that touch no other go with most of what is
+falls. Points that touch no other go with most of what is
 around them, or not at all. A free voxel met more often than rays spoke against it is new, if the whole of what it
 belongs to was met as often as rays passed it. docs/method.md.
 """
@@ -43,7 +43,7 @@ TOGETHER = 2
 NEW_RAYS = 0.5
 """Of the scans in which a free voxel was met, one goes against two that crossed it."""
 FALL_CELLS = 8
-"""How far what is gone takes cells with it that no ray could decide: 2.4 m, where columns allow 4.5."""
+"""How far what is gone takes cells with it that no ray could decide: 2.4 m."""
 
 
 @dataclass(slots=True)
@@ -224,7 +224,7 @@ def _decide_mapped(tiles: dict[TileIndex, _Judged], lattice: Lattice) -> None:
 
 
 def _decide_new(tiles: dict[TileIndex, _Judged], lattice: Lattice) -> None:
-    """Where something new stands, but for what an error of pose explains (rule C), for specks, and for traffic."""
+    """Where something new stands, but for what an error of pose explains, for specks, and for traffic."""
     occupied = np.uint8(CellState.CHANGED_OCCUPIED)
     candidates = {tile: np.where(found.new != 0, occupied, np.uint8(NO_VOTE)) for tile, found in tiles.items()}
     beside = {tile: found.beside for tile, found in tiles.items()}

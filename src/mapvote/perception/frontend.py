@@ -139,7 +139,7 @@ class Frontend:
     """One vehicle's sensor on one drive. Memory is bounded: the scans of a second wait, and the map around the vehicle.
 
     ``ground`` tells points from the ground, and is where the filter looks; rays are followed in ``compared``, by
-    default the same window, and to its edge only ``with_sight``, which columns do not ask for. ``localise`` and
+    default the same window, and to its edge only ``with_sight``, which surfaces do not ask for. ``localise`` and
     ``movers`` as above, with a state of their own: fresh ones for each drive. ``sensor``: follow its rays without
     return, too.
     """
