@@ -28,7 +28,7 @@ def main() -> None:
     parser.add_argument("--scenario", default="street570", help="a scenario's name or file (default street570)")
     parser.add_argument("--seeds", default="3,5,6,7,8", help="comma-separated (default 3,5,6,7,8)")
     parser.add_argument("--experiments", help=f"comma-separated, of: {', '.join(EXPERIMENTS)} (default all)")
-    parser.add_argument("--cases", help='instead of all, in main and liars: "1,1 column,columns_v1" takes half the time')
+    parser.add_argument("--cases", help='instead of all, in main and liars: "1,1 column,columns_v1" is half of it')
     parser.add_argument("--parked", type=int, help="cars parked during each pass in parked (default 12; corner: 2)")
     parser.add_argument("--out", type=Path, default=Path("out/matrix"))
     parser.add_argument("--cache", type=Path, default=cache_folder(), help="where drives, maps and ballots are kept")

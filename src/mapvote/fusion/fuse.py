@@ -34,6 +34,7 @@ from mapvote.fusion.tile_vote import TileVote, one_each
 from mapvote.fusion.turning import turned
 
 Rule = Literal["paper", "columns"]
+"""How votes are counted, see :func:`count`; ``columns``, after the ballots that first were, those of surfaces too."""
 History = Callable[[], Sequence[TileVote]]
 """Gives the votes of a tile over a longer time."""
 
