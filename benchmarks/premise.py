@@ -4,9 +4,9 @@
 
 On `half_gone`, where half of a block's facades go and little else stands, and on the same street with those facades
 built instead. Each vehicle follows its drive in the old map and in the one updated by columns_v1, by NDT with voxels of
-one size, as the paper has it: the next pose is guessed from the last two, there is no prior and no second opinion. Beside
-it the product's own tracker, with its prior. Counted are scans within 30 m of a change. A scan is lost where its pose
-is off by more than half a metre; the next one starts from the truth again.
+one size, as the paper has it: the next pose is guessed from the last two, there is no prior and no second opinion.
+Beside it the product's own tracker, with its prior. Counted are scans within 30 m of a change. A scan is lost where its
+pose is off by more than half a metre; the next one starts from the truth again.
 """
 
 from __future__ import annotations
