@@ -16,13 +16,14 @@ from mapvote.perception.raycast import ScanView, find_obstacles
 SIDE = 7
 
 
-def seen(points: np.ndarray, base: np.ndarray, moving: np.ndarray) -> Observation:
+def seen(points: np.ndarray, base: np.ndarray, moving: np.ndarray, occupied: np.ndarray | None = None) -> Observation:
     """A scan over a window of SIDE by SIDE cells whose columns begin at the layers ``base``; no ray is followed."""
     grid = Grid(Lattice(0.05, -0.1), 3, -4, SIDE, SIDE)
     none = np.full(grid.shape, np.inf, np.float32)
     words, counts = np.zeros(grid.shape, np.uint64), np.zeros(grid.shape, np.int32)
     ground_z = (base * CELL_SIZE).astype(np.float32)
-    reference = Reference(grid, ground_z, base, words, counts, none, -none, None)
+    mapped = words if occupied is None else occupied
+    reference = Reference(grid, ground_z, base, mapped, counts, none, -none, None)
     obstacle, cell = find_obstacles(points, reference)
     up = np.array([0.0, 0.0, 1.0])
     scan = PlacedScan(0, points, np.zeros(3), up, 0.02, reference, reference, obstacle, cell)
@@ -50,23 +51,44 @@ def test_a_hit_speaks_for_every_voxel_whose_box_it_comes_within_reach_of(seed: i
     base = rng.integers(-3, 4, (SIDE, SIDE)).astype(np.int32)
     low, high = np.array([-1.3, 0.7, -2.0]), np.array([1.1, 3.1, 24.0])
     here = seen(rng.uniform(low, high, (n, 3)), base, rng.random(n) < 0.2)
-    assert np.array_equal(near_hits(here), by_boxes(here))
+    assert np.array_equal(near_hits(here)[0], by_boxes(here))
+
+
+@settings(max_examples=60)
+@given(st.integers(0, 2**31), st.integers(0, 40))
+def test_a_hit_that_speaks_for_a_mapped_voxel_strikes_no_other(seed: int, n: int) -> None:
+    rng = np.random.default_rng(seed)
+    base = rng.integers(-3, 4, (SIDE, SIDE)).astype(np.int32)
+    mapped = rng.integers(0, 2**63, (SIDE, SIDE), np.uint64) & rng.integers(0, 2**63, (SIDE, SIDE), np.uint64)
+    points = rng.uniform([-1.3, 0.7, -2.0], [1.1, 3.1, 12.0], (n, 3))
+    here = seen(points, base, rng.random(n) < 0.2, mapped)
+    struck = np.zeros_like(mapped)
+    for k in np.flatnonzero(here.scan.obstacle & ~here.moving & (here.scan.cell >= 0)):
+        alone = seen(points[k : k + 1], base, np.array([False]), mapped)
+        if not (by_boxes(alone) & mapped).any():
+            row, col = divmod(int(here.scan.cell[k]), SIDE)
+            layer = int(points[k, 2] // CELL_SIZE) - base[row, col]
+            struck[row, col] |= np.uint64(1) << np.uint64(np.clip(layer, 0, TOP_BIT))
+    assert np.array_equal(near_hits(here)[1], struck)
 
 
 def test_what_moves_and_what_is_ground_speaks_for_nothing() -> None:
     flat = np.zeros((SIDE, SIDE), np.int32)
     points = np.array([[0.0, 1.9, 0.1], [0.0, 1.9, 1.0]])
-    assert not near_hits(seen(points, flat, np.array([False, True]))).any()
+    assert not any(words.any() for words in near_hits(seen(points, flat, np.array([False, True]))))
 
 
 def test_no_hit_speaks_beyond_the_window() -> None:
     """Hits at all four borders; behind the planes lies a row of zeros that nobody may touch."""
     cells = SIDE * SIDE
-    base, near = np.zeros(cells + SIDE, np.int32), np.zeros(cells + SIDE, np.uint64)
+    base, near, apart = np.zeros(cells + SIDE, np.int32), *np.zeros((2, cells + SIDE), np.uint64)
     low, high = 0.01, SIDE * CELL_SIZE - 0.01
     points = np.array([[x, y, 1.0] for x in (low, 1.0, high) for y in (low, 1.0, high)])
     cell = (points[:, :2] // CELL_SIZE).astype(np.int32) @ np.array([1, SIDE], dtype=np.int32)
     chosen, reach = np.ones(len(points), np.bool_), HIT_REACH_M / CELL_SIZE
-    _mark_near(points, cell, chosen, base[:cells], SIDE, (0.0, 0.0), reach, near)
+    mapped = np.zeros(cells, np.uint64)
+    _mark_near(points, cell, chosen, base[:cells], mapped, SIDE, (0.0, 0.0), reach, near, apart)
     assert set(cell[cell < cells]) <= set(np.flatnonzero(near))
+    assert set(cell[cell < cells]) == set(np.flatnonzero(apart))
     assert not near[cells:].any()
+    assert not apart[cells:].any()

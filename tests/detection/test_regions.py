@@ -1,4 +1,4 @@
-"""Rules that look beyond a cell: what joins, what falls, across the edges of tiles too."""
+"""Rules that look beyond a cell: what falls, across the edges of tiles too."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from mapvote.core.grid import Lattice
 from mapvote.core.types import U8, CellState
-from mapvote.detection.regions import around, fallen, unexplained
+from mapvote.detection.regions import around, fallen
 
 UO, UE, CO, CE, UN = (int(state) for state in CellState)
 
@@ -19,37 +19,6 @@ def plane(*marks: tuple[slice | int, slice | int, int], fill: int = UE, side: in
     for rows, cols, state in marks:
         out[rows, cols] = state
     return out
-
-
-@pytest.mark.parametrize(("reach", "kept"), [(1, 1), (3, 3), (6, 6)])
-def test_new_hits_beside_mapped_ones_count_as_far_from_free_standing_ones_as_the_reach(reach: int, kept: int) -> None:
-    states = plane((10, slice(10, 22), CO))
-    beside = np.zeros(states.shape, dtype=np.bool_)
-    beside[10, 11:22] = True  # only the first cell stands free
-    given_up = unexplained(states, beside, reach)
-    assert given_up.sum() == 11 - kept
-    assert not given_up[10, : 11 + kept].any()
-
-
-def test_hits_that_all_lie_beside_mapped_ones_are_given_up() -> None:
-    states = plane((10, slice(10, 14), CO))
-    assert unexplained(states, states == CO, 6).sum() == 4
-    assert not unexplained(states, np.zeros(states.shape, dtype=np.bool_), 6).any()
-
-
-@pytest.mark.parametrize(("row", "col"), [(9, 9), (9, 10), (10, 9), (11, 11), (12, 10), (8, 10), (10, 12)])
-def test_the_reach_is_a_square(row: int, col: int) -> None:
-    states = plane((slice(5, 16), slice(5, 16), CO))
-    beside = np.ones(states.shape, dtype=np.bool_)
-    beside[10, 10] = False
-    assert unexplained(states, beside, 1)[row, col] == (max(abs(row - 10), abs(col - 10)) > 1)
-
-
-def test_the_reach_goes_along_changed_cells_only() -> None:
-    states = plane((10, 10, CO), (10, 12, CO))
-    beside = np.zeros(states.shape, dtype=np.bool_)
-    beside[10, 12] = True
-    assert unexplained(states, beside, 6)[10, 12]
 
 
 @pytest.mark.parametrize(("gap", "falls"), [(1, True), (15, True), (16, False)])

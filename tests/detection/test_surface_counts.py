@@ -41,11 +41,11 @@ def told_of(seen: Observation, r: int, c: int, bit: int) -> tuple[bool, bool, bo
     def has(plane: np.ndarray, k: int = bit) -> bool:
         return bool(int(plane[r, c]) >> k & 1)
 
-    passed, near, mapped = seen.view.passed, near_hits(seen), seen.reference.occupied
+    passed, (near, apart), mapped = seen.view.passed, near_hits(seen), seen.reference.occupied
     above = bit + 1 >= TOP_BIT or has(passed, bit + 1)
     below = bit <= 1 or has(passed, bit - 1)
     crossed = has(passed) and above and below and not has(near)
-    met = has(near) if has(mapped) else has(seen.view.hit)
+    met = has(near) if has(mapped) else has(apart)
     return crossed, met, has(passed) and not has(near), has(passed)
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
@@ -10,7 +12,7 @@ from scipy import ndimage
 
 from hand_made import make_map, make_tile, one_scan, wall
 from mapvote.config import VotingSettings
-from mapvote.core.grid import CELL_SIZE
+from mapvote.core.grid import CELL_SIZE, TILE_CELLS
 from mapvote.core.point_map import PointMap
 from mapvote.core.types import F64, I32, NO_VOTE, Bool, CellState
 from mapvote.detection.counters import PLANES, count_of
@@ -68,15 +70,55 @@ def test_a_wall_met_some_centimetres_off_its_place_stands() -> None:
     assert not (votes.states == CO).any()
 
 
+TWIG = [1.65 + 0.3 * k for k in range(SUPPORT - 1)]
+"""Heights of something that does not stand on the ground."""
+BOLLARD = [0.45, 0.75]
+
+
 def test_a_pole_that_went_is_a_change_and_a_twig_is_none() -> None:
     tall = [0.45 + 0.3 * k for k in range(SUPPORT)]
     assert after(street([(ROW, 105)], tall), standing_at(OLD_Y + 9)).states[ROW, 105] == CE
-    assert after(street([(ROW, 105)], tall[1:]), standing_at(OLD_Y + 9)).states[ROW, 105] == UN
+    assert after(street([(ROW, 105)], TWIG), standing_at(OLD_Y + 9)).states[ROW, 105] == UN
+
+
+def test_a_bollard_that_went_or_came_is_a_change_for_it_stands_on_the_ground_and_on_its_own() -> None:
+    gone = after(street([(ROW, 105)], BOLLARD), standing_at(OLD_Y + 9))
+    assert gone.states[ROW, 105] == CE
+    here = [((105 + 0.5) * CELL_SIZE, OLD_Y, z) for z in BOLLARD]
+    built = after(street([], []), np.concatenate([here, standing_at(OLD_Y + 9)]))
+    assert built.states[ROW, 105] == CO
+
+
+def test_one_voxel_that_came_or_went_is_no_bollard() -> None:
+    assert after(street([(ROW, 105)], BOLLARD[1:]), standing_at(OLD_Y + 9)).states[ROW, 105] == UN
+    speck = np.array([[105.5 * CELL_SIZE, OLD_Y, BOLLARD[1]]])
+    assert not (after(street([], []), speck).states == CO).any()
+
+
+def test_what_a_hit_of_a_wall_explains_is_nothing_new_in_the_cell_beside_it() -> None:
+    """Range noise puts every second hit behind the wall's face, into voxels that the map knows to be free."""
+    beside = OLD_Y + 0.5 * CELL_SIZE + 0.8 * HIT_REACH_M
+    voter = SurfaceVoter(VotingSettings(), street(WALL, HEIGHTS))
+    struck = [voter.observe(one_scan(voter.point_map, standing_at(y)))[ROW + 1].any() for y in (beside, beside + 0.1)]
+    assert struck == [False, True]
+
+
+def test_a_wall_that_went_shows_what_stands_behind_it_and_one_that_stands_does_not() -> None:
+    """Behind a wall the map knows no free space; whether what is met there is new, only the wall can tell."""
+    states = []
+    for where in (OLD_Y + 9, OLD_Y):
+        tile = street(WALL, HEIGHTS).tiles[0, 0]
+        free = np.full((TILE_CELLS, TILE_CELLS), ~np.uint64(0))
+        free[ROW:] = 0
+        hidden = make_map({(0, 0): replace(tile, free=free)})
+        states.append(after(hidden, np.concatenate([standing_at(where), standing_at(OLD_Y + 0.6)])).states[ROW + 2])
+    assert [bool((row == CO).any()) for row in states] == [True, False]
+    assert all(states[0][c] == CO for c in COLUMNS)
 
 
 def test_a_twig_near_a_wall_that_went_does_not_fall_with_it_for_rays_decided_what_it_is() -> None:
     ground = wall([(r, c) for r in range(85, 125) for c in range(85, 135)], [0.0])
-    twig = wall([(ROW + 4, 105)], [0.75 + 0.3 * k for k in range(SUPPORT - 1)])
+    twig = wall([(ROW + 4, 105)], TWIG)
     votes = after(
         make_map({(0, 0): make_tile(np.concatenate([wall(WALL, HEIGHTS), twig, ground]))}), standing_at(OLD_Y + 9)
     )
@@ -85,7 +127,7 @@ def test_a_twig_near_a_wall_that_went_does_not_fall_with_it_for_rays_decided_wha
 
 def test_twigs_at_the_edge_of_all_that_is_known_are_no_pole_together() -> None:
     ground = wall([(r, c) for r in range(30) for c in range(95, 125)], [0.0])
-    twigs = wall([(0, 105), (0, 107)], [0.75 + 0.3 * k for k in range(SUPPORT - 1)])
+    twigs = wall([(0, 105), (0, 107)], TWIG)
     point_map = make_map({(0, 0): make_tile(np.concatenate([twigs, ground]))})
     states = after(point_map, standing_at(20.5 * CELL_SIZE)).states
     assert [int(states[0, c]) for c in (105, 107)] == [UN, UN]
@@ -188,7 +230,7 @@ def weighed(mapped: int, free: int, **counts: int) -> tuple[list[np.ndarray], in
             planes[0, 0, first + k] = np.uint64((counts.get(name, 0) >> k & 1) << bit)
     found = [np.zeros((1, 1), np.uint64) for _ in range(5)]
     balance = np.zeros((1, 1), np.int32)
-    words_of = [np.full((1, 1), word << bit, np.uint64) for word in (mapped, free, 0)]
+    words_of = [np.full((1, 1), word << bit, np.uint64) for word in (mapped, free)]
     weigh_surfaces(planes, *words_of, *found, balance)
     return found, int(balance[0, 0])
 

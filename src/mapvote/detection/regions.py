@@ -1,7 +1,7 @@
 """What the cells of a drive say together, over all its tiles (docs/method.md).
 
-An error of pose explains hits beside what is mapped, and roofs fall with their walls. Each rule looks at a tile with
-some cells of its neighbours around it, so that what lies across an edge is judged alike from both sides.
+Roofs fall with their walls. Each rule looks at a tile with some cells of its neighbours around it, so that what lies
+across an edge is judged alike from both sides.
 """
 
 from __future__ import annotations
@@ -15,8 +15,6 @@ from mapvote.core.grid import Grid, Lattice, TileIndex
 from mapvote.core.types import U8, Bool, CellState
 from mapvote.detection.spreading import flooded, steps_to
 
-JOIN_CELLS = 6
-"""How far a new thing reaches along mapped cells."""
 HALO = 64
 """Cells around a tile that are looked at: 19 m, a house."""
 Plane = Any
@@ -46,14 +44,6 @@ def around(lattice: Lattice, planes: Mapping[TileIndex, Plane], wide: Grid, else
             common = grid.intersection(wide)
             out[common.slices_in(wide)] = planes[tile][common.slices_in(grid)]
     return out
-
-
-def unexplained(states: U8, beside: Bool, reach: int) -> Bool:
-    """(rows, cols) cells of ``beside`` that are given up: an error of pose puts hits next to what is mapped, and
-    there alone. A new thing that touches an old one also stands where nothing explains it: the cells next to it that
-    are ``reach`` cells or less from such a place belong to it."""
-    changed = states == CellState.CHANGED_OCCUPIED
-    return np.asarray(changed & ~flooded(changed & ~beside, changed, reach))
 
 
 def fallen(states: U8, adrift: Bool, reach: int) -> Bool:

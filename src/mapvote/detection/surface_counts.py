@@ -34,16 +34,16 @@ _LOWEST, _HIGHEST = np.uint64(0b11), np.uint64(1) << np.uint64(TOP_BIT - 1)
 
 
 @numba.njit(cache=True, nogil=True)
-def _gather(planes: U64, part: Overlap, hit: U64, near: U64, passed: U64, occupied: U64, ground_z: F32) -> None:
+def _gather(planes: U64, part: Overlap, apart: U64, near: U64, passed: U64, occupied: U64, ground_z: F32) -> None:
     """Add to a tile's ``planes`` the ``part`` of one scan's window that lies on it."""
     for r in range(part.row, part.end_row):
         for c in range(part.col, part.end_col):
-            if np.isnan(ground_z[r, c]) or not hit[r, c] | near[r, c] | passed[r, c]:
+            if np.isnan(ground_z[r, c]) or not near[r, c] | passed[r, c]:
                 continue
             cell, rays, mapped = planes[r + part.down, c + part.right], passed[r, c], occupied[r, c]
             above, below = rays >> np.uint64(1) | _HIGHEST, rays << np.uint64(1) | _LOWEST
             crossed = rays & above & below & ~near[r, c]
-            met = (near[r, c] & mapped) | (hit[r, c] & ~mapped)
+            met = (near[r, c] & mapped) | apart[r, c]
             missed = rays & ~near[r, c]
             cell[PASSED] |= rays
             if is_full(cell, CROSSED, crossed) or is_full(cell, MET, met) or is_full(cell, PASSES, missed):
@@ -75,9 +75,11 @@ class SurfaceEvidence:
     def __init__(self, lattice: Lattice) -> None:
         self.tiles = PackedTiles(lattice, WORDS)
 
-    def count(self, seen: Observation) -> None:
-        """Count one scan."""
-        view, here, near = seen.view, seen.reference, near_hits(seen)
+    def count(self, seen: Observation) -> U64:
+        """Count one scan; returns (rows, cols) words of voxels that it struck and nothing of the map explains."""
+        view, here = seen.view, seen.reference
+        near, apart = near_hits(seen)
         for planes, part in self.tiles.under(view.grid):
-            _gather(planes, part, view.hit, near, view.passed, here.occupied, here.ground_z)
+            _gather(planes, part, apart, near, view.passed, here.occupied, here.ground_z)
         self.tiles.leave(view.grid)
+        return apart

@@ -5,7 +5,8 @@ cell is changed-empty if a voxel of it is gone and none stands: what no ray coul
 beside it in which rays crossed something and met nothing, however few; and cells that no ray could decide go with what
 falls. Points that touch no other go with most of what is
 around them, or not at all. A free voxel met more often than rays spoke against it is new, if the whole of what it
-belongs to was met as often as rays passed it. docs/method.md.
+belongs to was met as often as rays passed it; so is what hits show behind something that went, for a wall set back has
+an old side and a new one. docs/method.md.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ import numba
 import numpy as np
 
 from mapvote.config import VotingSettings
-from mapvote.core.columns import below_top, outside
+from mapvote.core.columns import below_top, dilated
 from mapvote.core.grid import Lattice, TileIndex
 from mapvote.core.point_map import PointMap
 from mapvote.core.reference import bordered
@@ -26,10 +27,10 @@ from mapvote.core.voting import one_hot
 from mapvote.detection.blocks import blocks
 from mapvote.detection.counters import PLANES, count_of, newly_free
 from mapvote.detection.lone_points import lone_cells, no_change
-from mapvote.detection.regions import HALO, JOIN_CELLS, beyond_tiles, fallen, unexplained
+from mapvote.detection.regions import HALO, beyond_tiles, fallen
 from mapvote.detection.surface_counts import CROSSED, MET, PASSED, PASSES, SurfaceEvidence, times_crossed
 from mapvote.detection.surface_looks import amounts, looks
-from mapvote.detection.surface_regions import grown, lasting, supported
+from mapvote.detection.surface_regions import apart, grown, lasting, moved, on_its_own, supported
 from mapvote.detection.votes import TileVotes
 from mapvote.perception.frontend import Observation
 
@@ -43,7 +44,7 @@ TOGETHER = 2
 NEW_RAYS = 0.5
 """Of the scans in which a free voxel was met, one goes against two that crossed it."""
 FALL_CELLS = 8
-"""How far what is gone takes cells with it that no ray could decide: 2.4 m, where columns allow 4.5."""
+"""How far what is gone takes cells with it that no ray could decide: 2.4 m."""
 
 
 @dataclass(slots=True)
@@ -57,9 +58,7 @@ class _Judged:
     balance: I32
     """In how many scans the new voxels of each cell were met, less in how many a ray passed them, summed over them."""
     beyond: U64
-    """Met where the map knew nothing and has nothing beside it."""
-    beside: Bool
-    """Cells whose new voxels all lie next to mapped ones."""
+    """Met where the map knew nothing, in no mapped cell."""
     crossed: Bool
     """Mapped cells in which rays crossed a voxel that none met, and met none that stands."""
     adrift: Bool
@@ -83,11 +82,11 @@ def is_gone(cell: U64, bit: int, every: int) -> bool:
 
 @numba.njit(cache=True, nogil=True)
 def weigh_surfaces(
-    planes: U64, occupied: U64, free: U64, near: U64,
+    planes: U64, occupied: U64, free: U64,
     gone: U64, stands: U64, unmet: U64, new: U64, beyond: U64, balance: I32,
 ) -> None:  # fmt: skip
     """Fill the last six planes (rows, cols), which come empty, from counters (rows, cols, WORDS) and the map's words:
-    ``free`` it knows to be, ``near`` its points. See :class:`_Judged` for each."""
+    ``free`` it knows to be. See :class:`_Judged` for each."""
     for r in range(occupied.shape[0]):
         for c in range(occupied.shape[1]):
             cell = planes[r, c]
@@ -112,7 +111,7 @@ def weigh_surfaces(
                     if free[r, c] & one:
                         new[r, c] |= one
                         balance[r, c] += met - count_of(cell, PASSES, bit)
-                    elif not near[r, c] & one:
+                    else:
                         beyond[r, c] |= one
 
 
@@ -125,8 +124,7 @@ class SurfaceVoter:
 
     def observe(self, seen: Observation) -> U64:
         """Count one scan; returns (rows, cols) words of voxels whose points may be new."""
-        self.evidence.count(seen)
-        return outside(seen.view.hit, seen.reference.occupied)
+        return self.evidence.count(seen)
 
     def votes(self) -> dict[TileIndex, TileVotes]:
         """Every tile with evidence, in ascending order."""
@@ -148,11 +146,11 @@ class SurfaceVoter:
     def _judge(self, tile: TileIndex) -> _Judged:
         """What the tile's own evidence says, voxel by voxel and cell by cell."""
         window = self.point_map.lattice.tile(tile)
-        here, outer, near, known = bordered(self.point_map, window)
+        here, outer, _, known = bordered(self.point_map, window)
         planes = self.evidence.tiles[tile]
         gone, stands, unmet, new, beyond = (np.zeros(window.shape, dtype=np.uint64) for _ in range(5))
         balance = np.zeros(window.shape, dtype=np.int32)
-        weigh_surfaces(planes, here.occupied, known, near, gone, stands, unmet, new, beyond, balance)
+        weigh_surfaces(planes, here.occupied, known, gone, stands, unmet, new, beyond, balance)
         mapped, passed = here.occupied != 0, planes[..., PASSED]
         low = mapped & ~(here.top_z - here.ground_z >= self.voting.min_height_m)
         under = np.where(mapped, (here.occupied & (~here.occupied + np.uint64(1))) - np.uint64(1), np.uint64(0))
@@ -168,8 +166,7 @@ class SurfaceVoter:
             stands=stands,
             new=np.where(mapped, np.uint64(0), new),
             balance=balance,
-            beyond=beyond,
-            beside=(new != 0) & (new & ~near == 0),
+            beyond=np.where(mapped, np.uint64(0), beyond),
             crossed=mapped & ~low & (stands == 0) & ((gone | unmet) != 0),
             adrift=mapped & ~low & (gone | stands == 0) & (under != 0) & clear,
             lone=lone_cells(outer.occupied, outer.base)[1:-1, 1:-1],
@@ -200,7 +197,12 @@ def _decide_mapped(tiles: dict[TileIndex, _Judged], lattice: Lattice) -> None:
     """What is gone, what falls with it, and what is left of it beside what stands."""
     gone = {tile: found.gone for tile, found in tiles.items()}
     empty = {tile: (found.gone != 0) & (found.stands == 0) for tile, found in tiles.items()}
-    for tile, cells in beyond_tiles(lattice, HALO, supported, (empty, False), (gone, 0)).items():
+    mapped = {tile: found.here.occupied for tile, found in tiles.items()}
+
+    def firm(empty: Bool, gone: U64, mapped: U64) -> Bool:
+        return supported(empty, gone) | on_its_own(empty, gone, mapped, (mapped != 0) & ~empty)
+
+    for tile, cells in beyond_tiles(lattice, HALO, firm, (empty, False), (gone, 0), (mapped, 0)).items():
         tiles[tile].states[empty[tile]] = CellState.UNDETERMINED
         tiles[tile].states[cells] = CellState.CHANGED_EMPTY
     strong = {tile: found.states == CellState.CHANGED_EMPTY for tile, found in tiles.items()}
@@ -224,22 +226,26 @@ def _decide_mapped(tiles: dict[TileIndex, _Judged], lattice: Lattice) -> None:
 
 
 def _decide_new(tiles: dict[TileIndex, _Judged], lattice: Lattice) -> None:
-    """Where something new stands, but for what an error of pose explains, for specks, and for traffic."""
-    occupied = np.uint8(CellState.CHANGED_OCCUPIED)
-    candidates = {tile: np.where(found.new != 0, occupied, np.uint8(NO_VOTE)) for tile, found in tiles.items()}
-    beside = {tile: found.beside for tile, found in tiles.items()}
+    """Where something new stands: in what was free, and behind what went; but for the rest of what stands, for specks,
+    and for traffic."""
+    states, beyond = _states(tiles), {tile: found.beyond for tile, found in tiles.items()}
+    for tile, cells in beyond_tiles(lattice, HALO, moved, (states, NO_VOTE), (beyond, 0)).items():
+        tiles[tile].new |= np.where(cells, beyond[tile], np.uint64(0))
     new = {tile: found.new for tile, found in tiles.items()}
     balance = {tile: found.balance for tile, found in tiles.items()}
+    kept = {tile: found.here.occupied & ~found.gone for tile, found in tiles.items()}
+    stands = {tile: found.stands & ~found.gone for tile, found in tiles.items()}
+    base = {tile: found.here.base for tile, found in tiles.items()}
 
-    def stand(states: U8, beside: Bool, new: U64, balance: I32) -> Bool:
-        given_up = unexplained(states, beside, JOIN_CELLS)
-        cells = (states == occupied) & ~given_up
-        return supported(cells, new) & lasting(cells, balance)
+    def stand(states: U8, new: U64, balance: I32, kept: U64, stands: U64, base: I32) -> Bool:
+        cells = new != 0
+        firm = supported(cells, new) | on_its_own(cells, new, new, kept != 0)
+        return firm & lasting(cells, balance) & apart(cells, new, dilated(stands, base, 1), states)
 
-    planes = (candidates, NO_VOTE), (beside, False), (new, 0), (balance, 0)
+    planes = (states, NO_VOTE), (new, 0), (balance, 0), (kept, 0), (stands, 0), (base, 0)
     for tile, cells in beyond_tiles(lattice, HALO, stand, *planes).items():
-        tiles[tile].states[tiles[tile].new != 0] = CellState.UNDETERMINED
-        tiles[tile].states[cells] = occupied
+        tiles[tile].states[new[tile] != 0] = CellState.UNDETERMINED
+        tiles[tile].states[cells] = CellState.CHANGED_OCCUPIED
 
 
 def _states(tiles: dict[TileIndex, _Judged]) -> dict[TileIndex, U8]:

@@ -13,10 +13,10 @@ from hypothesis.extra.numpy import arrays
 from mapvote.core.types import NO_VOTE, U64, CellState
 from mapvote.core.voting import VOTE_UNIT
 from mapvote.detection.counters import PLANES
-from mapvote.detection.regions import fallen, unexplained
+from mapvote.detection.regions import fallen
 from mapvote.evaluation.columns_v1.counters import STRUCK_ITSELF, THROUGH_ITSELF, WORDS
 from mapvote.evaluation.columns_v1.judged import Weighed
-from mapvote.evaluation.columns_v1.regions import drop_specks, remnants
+from mapvote.evaluation.columns_v1.regions import drop_specks, remnants, unexplained
 from mapvote.evaluation.columns_v1.rules import ALL_RULES, Rules
 from mapvote.evaluation.columns_v1.weighing import CLEAR_SCANS, weigh
 

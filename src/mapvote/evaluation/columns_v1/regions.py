@@ -16,13 +16,16 @@ from mapvote.core.columns import TOP_BIT, dilated, neighbourhood
 from mapvote.core.grid import Lattice, TileIndex
 from mapvote.core.types import I32, NO_VOTE, U8, U64, Bool, CellState
 from mapvote.detection.counters import PLANES
-from mapvote.detection.regions import HALO, JOIN_CELLS, beyond_tiles, fallen, unexplained
+from mapvote.detection.regions import HALO, beyond_tiles, fallen
+from mapvote.detection.spreading import flooded
 from mapvote.evaluation.columns_v1.counters import STRUCK_ITSELF, THROUGH_ITSELF, ever
 from mapvote.evaluation.columns_v1.judged import Judged
 from mapvote.evaluation.columns_v1.rules import Rules
 from mapvote.evaluation.columns_v1.specks import small_groups
 
 _LOWEST, _HIGHEST = np.uint64(0b11), np.uint64(3) << np.uint64(TOP_BIT - 1)
+JOIN_CELLS = 6
+"""Rule C: how far a new thing reaches along mapped cells."""
 FALL_CELLS = 15
 """Rule H: how far what is gone takes unseen cells with it."""
 MIN_CELLS = 4
@@ -81,6 +84,14 @@ def _take_remnants(tiles: Tiles, lattice: Lattice) -> None:
         down = judged.states == empty
         judged.weighed.gone[down] |= left[down]
         judged.remnants = np.where(down, np.uint64(0), left)
+
+
+def unexplained(states: U8, beside: Bool, reach: int) -> Bool:
+    """(rows, cols) cells of ``beside`` that rule C gives up: an error of pose puts hits next to what is mapped, and
+    there alone. A new thing that touches an old one also stands where nothing explains it: the cells next to it that
+    are ``reach`` cells or less from such a place belong to it."""
+    changed = states == CellState.CHANGED_OCCUPIED
+    return np.asarray(changed & ~flooded(changed & ~beside, changed, reach))
 
 
 def _states(tiles: Tiles) -> dict[TileIndex, U8]:

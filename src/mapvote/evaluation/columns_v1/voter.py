@@ -45,7 +45,7 @@ class ColumnVoter:
     def observe(self, seen: Observation) -> U64:
         """Count one scan; returns (rows, cols) words of voxels whose points may be new."""
         reach = 2 if seen.scan.sigma_m > WIDE_SIGMA_M else 1
-        self.evidence.count(seen.view, seen.reference, reach, near_hits(seen))
+        self.evidence.count(seen.view, seen.reference, reach, near_hits(seen)[0])
         return outside(seen.view.hit, seen.reference.occupied)
 
     def votes(self) -> dict[TileIndex, TileVotes]:

@@ -1,0 +1,90 @@
+"""The rules of surfaces that look beyond a cell: what is enough, what stands apart, what a wall leaves behind it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from mapvote.core.types import U8, U64, Bool, CellState
+from mapvote.detection.surface_regions import APART_SHARE, MOVED_CELLS, SUPPORT, apart, moved, on_its_own, supported
+
+CE, UE = CellState.CHANGED_EMPTY, CellState.UNCHANGED_EMPTY
+SIDE = 20
+NOTHING = np.zeros((SIDE, SIDE), np.uint64)
+
+
+def words(*marks: tuple[int, int, int]) -> U64:
+    out = NOTHING.copy()
+    for row, col, word in marks:
+        out[row, col] = word
+    return out
+
+
+def alone(voxels: U64, whole: U64 | None = None, others: Bool | None = None) -> bool:
+    """Whether all cells with ``voxels`` are a thing of its own."""
+    cells = voxels != 0
+    nobody = np.zeros((SIDE, SIDE), np.bool_)
+    found = on_its_own(cells, voxels, voxels if whole is None else whole, nobody if others is None else others)
+    assert not found[~cells].any()
+    return bool(found[cells].all())
+
+
+def test_two_voxels_on_the_ground_on_top_of_each_other_are_a_thing() -> None:
+    assert alone(words((5, 5, 0b110)))
+    assert alone(words((5, 5, 0b110), (5, 6, 0b110))), "a bollard on the border of two cells"
+
+
+@pytest.mark.parametrize(
+    ("voxels", "why"),
+    [
+        (words((5, 5, 0b10)), "one voxel alone"),
+        (words((5, 5, 0b1010)), "two that do not touch"),
+        (words((5, 5, 0b110000)), "in the air"),
+        (words((5, 5, 0b110), (6, 6, 0b110000)), "a part of it in the air"),
+        (words((5, 5, 0b10), (5, 6, 0b10)), "no taller than a kerb"),
+    ],
+)
+def test_specks_are_no_things(voxels: U64, why: str) -> None:
+    assert not alone(voxels), why
+
+
+def test_what_touches_something_else_is_no_thing_of_its_own() -> None:
+    others = np.zeros((SIDE, SIDE), np.bool_)
+    others[7, 7] = True
+    assert alone(words((5, 5, 0b110)), others=others)
+    assert not alone(words((6, 6, 0b110)), others=others)
+
+
+def test_half_of_a_thing_must_have_gone_for_the_whole_to_go() -> None:
+    assert alone(words((5, 5, 0b110)), whole=words((5, 5, 0b11110)))
+    assert not alone(words((5, 5, 0b110)), whole=words((5, 5, 0b111110)))
+
+
+@given(st.lists(st.tuples(st.integers(0, 9), st.integers(0, 9), st.integers(1, 2**63)), max_size=12))
+def test_support_is_asked_of_groups_and_not_of_cells(marks: list[tuple[int, int, int]]) -> None:
+    voxels = words(*((2 * row, 2 * col, word) for row, col, word in marks))  # no two cells touch
+    enough = supported(voxels != 0, voxels)
+    assert np.array_equal(enough, np.bitwise_count(voxels) >= SUPPORT)
+
+
+@pytest.mark.parametrize("free", range(9))
+def test_a_quarter_of_what_is_new_must_touch_nothing_that_stands(free: int) -> None:
+    new, near = words((5, 5, 0xFF0)), words((5, 5, 0xFF0 & ~(2**free - 1 << 4)))
+    kept = apart(new != 0, new, near, np.full((SIDE, SIDE), UE, np.uint8))
+    assert kept[5, 5] == (free >= 8 * APART_SHARE)
+
+
+@pytest.mark.parametrize("steps", [1, MOVED_CELLS, MOVED_CELLS + 1])
+def test_beside_what_went_new_things_may_touch_what_stands_and_hits_need_no_known_free_space(steps: int) -> None:
+    states: U8 = np.full((SIDE, SIDE), UE, np.uint8)
+    states[5, 5] = CE
+    met = words((5, 5 + steps, 0b1110))
+    assert moved(states, met)[5, 5 + steps] == (steps <= MOVED_CELLS)
+    assert apart(met != 0, met, met, states)[5, 5 + steps] == (steps <= MOVED_CELLS)
+
+
+def test_where_nothing_went_nothing_was_moved() -> None:
+    everywhere = np.full((SIDE, SIDE), 2, np.uint64)
+    assert not moved(np.full((SIDE, SIDE), UE, np.uint8), everywhere).any()
