@@ -51,8 +51,8 @@ def apart(cells: Bool, new: U64, near: U64, states: U8) -> Bool:
 
 
 def moved(states: U8, beyond: U64) -> Bool:
-    """(rows, cols) cells with voxels met ``beyond`` what the map knew, near what went by ``states`` (both (rows, cols)):
-    the new side of what was set back."""
+    """(rows, cols) cells with voxels met ``beyond`` what the map knew, near what went by ``states`` (planes alike): the
+    new side of what was set back."""
     return np.asarray((beyond != 0) & _near_gone(states))
 
 

@@ -55,6 +55,14 @@ def test_rays_end_on_a_new_pole_and_all_others_stay() -> None:
     np.testing.assert_allclose(pole.met[0], after[hit], atol=1e-3)
 
 
+def test_what_stands_behind_another_thing_is_not_met_in_whatever_order_they_were_put_there() -> None:
+    near, far = box(9.9, 10.1, -3.0, 3.0, 0.0, 4.0), box(14.9, 15.1, -1.0, 1.0, 0.0, 1.0)
+    for first in (0, 1):
+        things = [Thing("wall", near), Thing("cabinet", far)]
+        seen(things[::-1] if first else things)
+        assert [len(np.concatenate(thing.met)) > 0 for thing in things] == [True, False]
+
+
 def test_what_lies_behind_the_return_is_not_seen() -> None:
     before, after = seen([Thing("house", box(25.0, 30.0, -5.0, 5.0, 0.0, 6.0))])
     np.testing.assert_array_equal(before, after)

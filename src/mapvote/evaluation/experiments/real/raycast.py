@@ -13,7 +13,7 @@ import numpy as np
 
 from mapvote.core.geometry import inverse, transform
 from mapvote.core.grid import CELL_SIZE
-from mapvote.core.types import F32, F64, Bool, Drive, Scan
+from mapvote.core.types import F32, F64, I64, Bool, Drive, Scan
 from mapvote.localisation.deskew import deskew, motion_at
 from mapvote.simulation.lidar import Caster
 from mapvote.simulation.shapes import box
@@ -57,13 +57,17 @@ def with_things(drive: Drive, things: Sequence[Thing], reference: F64) -> Drive:
         scan, T = drive.read_scan(i), reference[i]
         points = deskew(scan, motion_at(drive.stamps_ns, reference, i)).astype(np.float32)
         rng = np.random.default_rng([i, 2])
-        keep = np.ones(len(points), dtype=np.bool_)
-        for thing in things:
+        keep, at, ends_on = np.ones(len(points), dtype=np.bool_), points.copy(), np.full(len(points), -1)
+        for k, thing in enumerate(things):
             if np.linalg.norm(thing.centre - T[:2, 3]) < REACH_M:
                 if thing.goes is not None:
-                    points, keep = _taken_out(points, keep, thing, T, drive.sensor.range_sigma_m, rng)
+                    inside, on = _take_out(points, keep, at, thing, T, drive.sensor.range_sigma_m, rng)
+                    ends_on[inside], ends_on[on] = -1, k
                 if len(thing.comes):
-                    points = _put_in(points, thing, T, drive.sensor.range_sigma_m, rng)
+                    ends_on[_put_in(points, at, thing, T, drive.sensor.range_sigma_m, rng)] = k
+        for k, thing in enumerate(things):
+            met = keep & (ends_on == k)  # and not on what stands before it, whichever was put in first
+            thing.met.append(transform(T, at[met]))
         intensity = None if scan.intensity is None else scan.intensity[keep]
         return replace(scan, points=points[keep], time_s=None, intensity=intensity)
 
@@ -82,39 +86,40 @@ def _directions(points: F32) -> tuple[F32, F32]:
     return reach, (points / reach[:, None]).astype(np.float32)
 
 
-def _put_in(points: F32, thing: Thing, T: F64, sigma_m: float, rng: np.random.Generator) -> F32:
+def _put_in(points: F32, at: F32, thing: Thing, T: F64, sigma_m: float, rng: np.random.Generator) -> Bool:
+    """(n,) the rays that end on the thing now; ``points`` (n, 3) and, without noise, ``at`` (n, 3) are told where."""
     reach, directions = _directions(points)
     hit = _cast(thing.comes, T, directions)
     nearer = hit < reach - _AGAIN_M
-    thing.met.append(transform(T, directions[nearer] * hit[nearer, None]))
+    at[nearer] = directions[nearer] * hit[nearer, None]
     noisy = hit[nearer] + sigma_m * rng.standard_normal(np.count_nonzero(nearer), dtype=np.float32)
-    points = points.copy()
     points[nearer] = directions[nearer] * noisy[:, None]
-    return points
+    return nearer
 
 
-def _taken_out(
-    points: F32, keep: Bool, thing: Thing, T: F64, sigma_m: float, rng: np.random.Generator
-) -> tuple[F32, Bool]:
+def _take_out(
+    points: F32, keep: Bool, at: F32, thing: Thing, T: F64, sigma_m: float, rng: np.random.Generator
+) -> tuple[Bool, I64]:
+    """((n,) the rays that had ended in what goes, (m,) those of them that go on to the thing itself, set back); as
+    :func:`_put_in` the rest, and ``keep`` (n,) loses those that meet nothing within REACH_M."""
     assert thing.goes is not None
     T_ref_box, half = thing.goes
     inside = keep & (np.abs(transform(inverse(T_ref_box) @ T, points)) <= half).all(axis=1)
-    if not inside.any():
-        return points, keep
+    rays = np.flatnonzero(inside)
+    if not len(rays):
+        return inside, rays
     thing.left.append(transform(T, points[inside]))
     reach, directions = _directions(points[inside])
     beyond = np.full(len(reach), np.inf, dtype=np.float32)
     if len(thing.behind):
         beyond = _cast(thing.behind, T, directions)
         beyond[beyond < reach] = np.inf
-        if len(thing.comes):  # what the rays go on to is the thing itself, set back
-            on = np.isfinite(beyond)
-            thing.met.append(transform(T, directions[on] * beyond[on, None]))
+    on = rays[np.isfinite(beyond)] if len(thing.comes) else rays[:0]
+    at[inside] = directions * np.where(np.isfinite(beyond), beyond, 1.0)[:, None]
     beyond += sigma_m * rng.standard_normal(len(beyond), dtype=np.float32)
-    points, keep = points.copy(), keep.copy()
-    keep[np.flatnonzero(inside)[~(beyond < REACH_M)]] = False
+    keep[rays[~(beyond < REACH_M)]] = False
     points[inside] = directions * np.where(beyond < REACH_M, beyond, 1.0)[:, None]
-    return points, keep
+    return inside, on
 
 
 def voxel_boxes(points: F64) -> F64:
