@@ -41,7 +41,7 @@ def on_its_own(cells: Bool, voxels: U64, whole: U64, others: Bool) -> Bool:
     return np.asarray(cells & tall & alone)
 
 
-def apart(cells: Bool, new: U64, near: U64, states: U8) -> Bool:
+def stands_apart(cells: Bool, new: U64, near: U64, states: U8) -> Bool:
     """(rows, cols) those of ``cells`` whose 8-connected group stands apart from what stands: APART_SHARE of its voxels
     ``new`` are not ``near`` such (all planes (rows, cols)); else it is the rest of that, seen from where no survey
     drove. What lies by something that went, by ``states``, need not: that is its new side."""
@@ -50,7 +50,7 @@ def apart(cells: Bool, new: U64, near: U64, states: U8) -> Bool:
     return np.asarray(cells & (went | (far >= APART_SHARE * size)))
 
 
-def moved(states: U8, beyond: U64) -> Bool:
+def new_sides(states: U8, beyond: U64) -> Bool:
     """(rows, cols) cells with voxels met ``beyond`` what the map knew, near what went by ``states`` (planes alike): the
     new side of what was set back."""
     return np.asarray((beyond != 0) & _near_gone(states))

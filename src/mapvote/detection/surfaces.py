@@ -30,7 +30,7 @@ from mapvote.detection.lone_points import lone_cells, no_change
 from mapvote.detection.regions import HALO, beyond_tiles, fallen
 from mapvote.detection.surface_counts import CROSSED, MET, PASSED, PASSES, SurfaceEvidence, times_crossed
 from mapvote.detection.surface_looks import amounts, looks
-from mapvote.detection.surface_regions import apart, grown, lasting, moved, on_its_own, supported
+from mapvote.detection.surface_regions import grown, lasting, new_sides, on_its_own, stands_apart, supported
 from mapvote.detection.votes import TileVotes
 from mapvote.perception.frontend import Observation
 
@@ -229,7 +229,7 @@ def _decide_new(tiles: dict[TileIndex, _Judged], lattice: Lattice) -> None:
     """Where something new stands: in what was free, and behind what went; but for the rest of what stands, for specks,
     and for traffic."""
     states, beyond = _states(tiles), {tile: found.beyond for tile, found in tiles.items()}
-    for tile, cells in beyond_tiles(lattice, HALO, moved, (states, NO_VOTE), (beyond, 0)).items():
+    for tile, cells in beyond_tiles(lattice, HALO, new_sides, (states, NO_VOTE), (beyond, 0)).items():
         tiles[tile].new |= np.where(cells, beyond[tile], np.uint64(0))
     new = {tile: found.new for tile, found in tiles.items()}
     balance = {tile: found.balance for tile, found in tiles.items()}
@@ -240,7 +240,7 @@ def _decide_new(tiles: dict[TileIndex, _Judged], lattice: Lattice) -> None:
     def stand(states: U8, new: U64, balance: I32, kept: U64, stands: U64, base: I32) -> Bool:
         cells = new != 0
         firm = supported(cells, new) | on_its_own(cells, new, new, kept != 0)
-        return firm & lasting(cells, balance) & apart(cells, new, dilated(stands, base, 1), states)
+        return firm & lasting(cells, balance) & stands_apart(cells, new, dilated(stands, base, 1), states)
 
     planes = (states, NO_VOTE), (new, 0), (balance, 0), (kept, 0), (stands, 0), (base, 0)
     for tile, cells in beyond_tiles(lattice, HALO, stand, *planes).items():
