@@ -32,12 +32,16 @@ def draw_worst(bench: Bench, case: str, folder: Path) -> list[Path]:
         worst = max(bench.runs, key=lambda name: bench.runs[name].changed_share(case, with_movers=False))
         for name in dict.fromkeys([next(iter(bench.runs)), worst]):
             run = bench.runs[name]
-            written.append(folder / f"false_{name.replace(' ', '_').replace(',', '').replace('%', 'percent')}.png")
+            written.append(folder / f"false_{_file_name(name)}.png")
             draw_false_changes(run, case, largest_false_changes(run, case), written[-1])
     for name, (run, asked) in bench.changed.items():
-        written.append(folder / f"{name}.png")
+        written.append(folder / f"{_file_name(name)}.png")
         draw_things(run, case, asked, written[-1])
     return written
+
+
+def _file_name(run: str) -> str:
+    return run.replace(" ", "_").replace(",", "").replace("%", "percent")
 
 
 def draw_false_changes(run: RealRun, case: str, found: Sequence[FalseChange], path: Path) -> None:

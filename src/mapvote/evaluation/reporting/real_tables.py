@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from mapvote.evaluation.experiments.real.bench import Bench, unchanged_figures
-from mapvote.evaluation.experiments.real.changes import precision_near, score
+from mapvote.evaluation.experiments.real.bench import BUILT, BUILT_IN_RAIN, Bench, unchanged_figures
+from mapvote.evaluation.experiments.real.changes import Found, precision_near, score
 from mapvote.evaluation.experiments.real.street import largest_false_changes
 
 
@@ -22,7 +22,7 @@ class Sheet:
 def real_tables(bench: Bench, case: str) -> list[Sheet]:
     """The ground, the unchanged street, its poses and largest false changes, and what was cast into the scans."""
     unchanged = _unchanged(bench, case), _poses(bench, case), _largest(bench, case)
-    sheets = [_ground(bench), *unchanged, _changed(bench, case), _skipped(bench)]
+    sheets = [_ground(bench), *unchanged, _changed(bench, case), _in_rain(bench, case), _skipped(bench)]
     return [sheet for sheet in sheets if sheet.rows]
 
 
@@ -80,12 +80,36 @@ def _largest(bench: Bench, case: str) -> Sheet:
 def _changed(bench: Bench, case: str) -> Sheet:
     headings = ("thing", "asked", "half found", "touched", "cell recall", "rays a scan")
     rows, said = [], []
-    for name, (run, asked) in bench.changed.items():
-        said.append(f"{precision_near(asked, run.states[case], run.street.grid):.2f} ({name})")
-        for f in score(asked, run.states[case]):
+    for name in bench.changed:
+        said.append(f"{_precision(bench, case, name):.2f} ({name})")
+        for f in [] if name == BUILT_IN_RAIN else _found(bench, case, name):
             rows.append((f.kind, str(f.things), str(f.half), str(f.touched), f"{f.cell_recall:.2f}", f"{f.rays:.0f}"))
     title = f"{bench.name}: cast into the scans, {case}; precision within 1.5 m of them {', '.join(said)}"
     return Sheet(title, headings, rows)
+
+
+def _in_rain(bench: Bench, case: str) -> Sheet:
+    """Beside the dry run, which was asked for the same cells; no rows where it did not rain."""
+    headings = ("thing", "asked", "half found", "in rain", "cell recall", "in rain")
+    pairs = zip(_found(bench, case, BUILT), _found(bench, case, BUILT_IN_RAIN), strict=False)
+    rows = [
+        (dry.kind, str(dry.things), str(dry.half), str(wet.half), f"{dry.cell_recall:.2f}", f"{wet.cell_recall:.2f}")
+        for dry, wet in pairs
+    ]
+    return Sheet(f"{bench.name}: {BUILT_IN_RAIN}, {case}, beside the dry run", headings, rows)
+
+
+def _found(bench: Bench, case: str, name: str) -> list[Found]:
+    """By kind; nothing of a run that was not made."""
+    if name not in bench.changed:
+        return []
+    run, asked = bench.changed[name]
+    return score(asked, run.states[case])
+
+
+def _precision(bench: Bench, case: str, name: str) -> float:
+    run, asked = bench.changed[name]
+    return precision_near(asked, run.states[case], run.street.grid)
 
 
 def _skipped(bench: Bench) -> Sheet:

@@ -9,6 +9,7 @@ from mapvote.config import Settings
 from mapvote.core.types import MapvoteError
 from mapvote.evaluation.experiments.cases import choose_cases
 from mapvote.evaluation.experiments.real.bench import ground_of
+from mapvote.evaluation.experiments.real.changes import built, score, survey_site
 from mapvote.evaluation.experiments.real.sensing import disturbed, every_other_beam
 from mapvote.evaluation.experiments.real.street import (
     Edit,
@@ -79,3 +80,16 @@ def test_no_reflection_sinks_the_ground_under_the_driven_path(drive: str) -> Non
     assert abs(ground.sensor_height_m - 1.73) <= 0.05
     assert abs(ground.worst_off_m) <= 0.2
     assert ground.occupied_share <= 0.01
+
+
+@needs_kitti
+@pytest.mark.slow
+def test_in_rain_the_same_cells_are_asked_for_and_most_things_are_found_still() -> None:
+    cases, _ = choose_cases(Settings(), "surfaces")
+    street = laid(KITTI.with_name("2011_09_26_0005"))
+    (dry, asked), (wet, asked_in_rain) = built(street, survey_site(street), cases, 1, 4)
+    for one, other in zip(asked, asked_in_rain, strict=True):
+        assert (one.kind, one.rays) == (other.kind, other.rays)
+        np.testing.assert_array_equal(one.cells, other.cells)
+    found = [sum(f.half for f in score(asked, run.states["surfaces"])) for run in (dry, wet)]
+    assert found[1] >= 0.5 * found[0] > 0

@@ -11,6 +11,7 @@ from mapvote.core.geometry import from_xyz_rpy, transform
 from mapvote.core.sensors import SENSORS
 from mapvote.core.types import F64, Drive, Scan
 from mapvote.evaluation.experiments.real.raycast import Thing, voxel_boxes, with_things
+from mapvote.evaluation.experiments.real.sensing import in_rain
 from mapvote.evaluation.experiments.real.things import Site
 from mapvote.simulation.shapes import box
 
@@ -78,6 +79,18 @@ def test_where_a_wall_is_taken_away_rays_go_on_or_return_nothing() -> None:
     np.testing.assert_allclose(after[middle, 0].max(), 30.0, atol=0.01)
     assert len(after) < len(before), "above what stands behind there is sky"
     np.testing.assert_allclose(thing.left[0][:, 0], WALL_X, atol=0.01)
+
+
+def test_rain_falls_before_what_was_cast_and_the_same_rays_are_noted_as_if_it_were_dry() -> None:
+    plain, T = drive()
+    dry, wet = (Thing("pole", box(9.9, 10.1, -0.1, 0.1, 0.0, 4.0)) for _ in range(2))
+    before = with_things(plain, [dry], T).read_scan(0).points
+    after = in_rain(0.1)(with_things(plain, [wet], T)).read_scan(0).points
+    on_pole = np.linalg.norm(before - plain.read_scan(0).points, axis=1) > 0.01
+    reach = np.linalg.norm(after, axis=1) / np.linalg.norm(before, axis=1)
+    assert 0 < (reach[on_pole] < 0.99).sum() < 0.3 * on_pole.sum()
+    assert (reach <= 1.0 + 1e-6).all()
+    np.testing.assert_array_equal(wet.met[0], dry.met[0])
 
 
 def street() -> Site:

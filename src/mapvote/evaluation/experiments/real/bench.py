@@ -27,6 +27,10 @@ from mapvote.evaluation.experiments.real.street import (
 from mapvote.evaluation.scoring.cells import determined, ratio
 
 BLOCKS = (12, 25)
+RAIN = f"rain, {100 * sensing.RAIN:g} % of the rays"
+BUILT, BUILT_IN_RAIN, DEMOLISHED = "built", f"built in {RAIN}", "demolished"
+CASTS = {(BUILT, BUILT_IN_RAIN): changes.built, (DEMOLISHED,): changes.demolished}
+"""The runs that each yields in turn."""
 PRIORS: Mapping[str, Edit] = {
     "disturbed by 0.5 m, 2 deg": sensing.disturbed(),
     **{f"late by {s:g} s": sensing.late(s) for s in (0.2, 0.5, 1.0, 2.0)},
@@ -58,7 +62,7 @@ class Bench:
     ground: Ground
     runs: dict[str, RealRun] = field(default_factory=dict)
     """Nothing changed in any of them."""
-    changed: dict[str, tuple[RealRun, list[changes.Asked]]] = field(default_factory=dict)
+    changed: dict[str, changes.Changed] = field(default_factory=dict)
     skipped: dict[str, str] = field(default_factory=dict)
     """Run: why it could not be made on this drive."""
 
@@ -112,7 +116,7 @@ def bench(
     street = lay_street(recording, settings, reference, block=BLOCKS[0])
     result = Bench(folder.resolve().name, len(recording), ground_of(street))
     jobs = _unchanged(recording, settings, reference, street, cases)
-    total = len(jobs) + 2
+    total = len(jobs) + sum(map(len, CASTS))
     for k, (name, job) in enumerate(jobs.items()):
         tell("real street", k, total)
         try:
@@ -120,12 +124,14 @@ def bench(
         except MapvoteError as error:
             result.skipped[name] = str(error)
     site = changes.survey_site(street)
-    for k, (name, cast) in enumerate({"built": changes.built, "demolished": changes.demolished}.items()):
-        tell("real street", len(jobs) + k, total)
+    tell("real street", len(jobs), total)
+    for names, cast in CASTS.items():
         try:
-            result.changed[name] = cast(street, site, cases, seed, each)
+            for name, changed in zip(names, cast(street, site, cases, seed, each), strict=True):
+                result.changed[name] = changed
+                tell("real street", len(jobs) + len(result.changed), total)
         except MapvoteError as error:
-            result.skipped[name] = str(error)
+            result.skipped |= {name: str(error) for name in names if name not in result.changed}
     tell("real street", total, total)
     return result
 
@@ -146,7 +152,7 @@ def _unchanged(
     jobs["map ends half way"] = on(laid(-(-len(reference) // 2)))
     jobs["every other beam"] = on(lambda: street, sensing.every_other_beam)
     jobs["70 % of the points lost"] = on(lambda: street, sensing.thinned(0.7))
-    jobs["rain, 10 % of the rays"] = on(lambda: street, sensing.in_rain(0.1))
+    jobs[RAIN] = on(lambda: street, sensing.in_rain(sensing.RAIN))
     if recording.T_map_lidar_prior is not None:
         jobs["first pose only"] = lambda: vote_on(street, cases, first_pose_only=True)
         jobs |= {f"prior {name}": on(lambda: street, edit) for name, edit in PRIORS.items()}

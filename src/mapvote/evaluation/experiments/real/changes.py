@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,6 +15,7 @@ from mapvote.core.reference import LocalMap, reference_window
 from mapvote.core.types import F64, U8, Bool, CellState
 from mapvote.core.voxels import VoxelCloud
 from mapvote.evaluation.experiments.cases import Case
+from mapvote.evaluation.experiments.real import sensing
 from mapvote.evaluation.experiments.real.raycast import Thing, with_things
 from mapvote.evaluation.experiments.real.street import Edit, RealRun, Street, changed, lay_street, met_cells, vote_on
 from mapvote.evaluation.experiments.real.things import Site
@@ -36,6 +37,10 @@ class Asked:
     """(rows, cols) that must be decided so: rays met it there, or had met it in the map's scans."""
     rays: float = 0.0
     """That met it, in the mean of the scans in which any did."""
+
+
+Changed = tuple[RealRun, list[Asked]]
+"""A run, and what it had to find."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,8 +87,11 @@ def among(things: Sequence[Thing], street: Street) -> Edit:
     return lambda recording: with_things(recording, things, street.T_map_lidar)
 
 
-def built(street: Street, site: Site, cases: Sequence[Case], seed: int, each: int) -> tuple[RealRun, list[Asked]]:
-    """The vehicles find new things, walls moved by half a metre, and parked cars gone; hedges stood before, too."""
+def built(street: Street, site: Site, cases: Sequence[Case], seed: int, each: int) -> Iterator[Changed]:
+    """The vehicles find new things, walls moved by half a metre, and parked cars gone; hedges stood before, too.
+
+    Then the same vehicles in rain. They are asked for the same cells, those that dry scans show.
+    """
     things, hedges = site.placed(seed, each)
     standing = [Thing("hedge", triangles) for triangles in hedges]
     moved = site.moved_walls(seed, 2 * each)
@@ -94,15 +102,17 @@ def built(street: Street, site: Site, cases: Sequence[Case], seed: int, each: in
             survey_edit=among(standing, street),
         )  # fmt: skip
     after = among([*standing, *things, *moved, *gone], street)
-    run = vote_on(street, cases, edit=after)
+    dry = vote_on(street, cases, edit=after)
     asked = [_new(street, thing) for thing in [*things, *moved]]
     still = met_cells(street, after)
     left = [thing for thing in [*moved, *gone] if thing.kind != "wall set forward"]
     asked += [_gone(street, thing, thing.left, still) for thing in left]
-    return run, asked
+    yield dry, asked
+    rain = sensing.in_rain(sensing.RAIN)  # over what was cast: drops hide the things as they hide the street
+    yield vote_on(street, cases, edit=lambda recording: rain(after(recording))), asked
 
 
-def demolished(street: Street, site: Site, cases: Sequence[Case], seed: int, each: int) -> tuple[RealRun, list[Asked]]:
+def demolished(street: Street, site: Site, cases: Sequence[Case], seed: int, each: int) -> Iterator[Changed]:
     """The map was made among things that the vehicles do not find any more."""
     things = [thing for thing in site.placed(seed + 100, each)[0] if thing.kind != "wall behind a hedge"]
     before = lay_street(
@@ -111,7 +121,7 @@ def demolished(street: Street, site: Site, cases: Sequence[Case], seed: int, eac
     T_map_old = before.T_map_lidar[0] @ inverse(street.T_map_lidar[0])
     still = met_cells(before)
     asked = [_gone(before, thing, [transform(T_map_old, p) for p in thing.met], still) for thing in things]
-    return vote_on(before, cases), asked
+    yield vote_on(before, cases), asked
 
 
 def _new(street: Street, thing: Thing) -> Asked:

@@ -11,6 +11,8 @@ from mapvote.core.geometry import exp, from_xyz_rpy
 from mapvote.core.types import F64, Bool, Drive, MapvoteError, Scan
 from mapvote.evaluation.experiments.real.street import Edit
 
+RAIN = 0.1
+"""Share of the rays that end on drops where rain is asked for."""
 _DROPS_M = 5.0
 
 
