@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hand_made import make_map, make_tile, one_scan, wall
 from mapvote.core.columns import TOP_BIT
+from mapvote.core.grid import TILE_CELLS, Grid, Lattice
 from mapvote.core.point_map import PointMap
+from mapvote.core.reference import reference_window
 from mapvote.core.types import F64
 from mapvote.detection.counters import PLANES, count_of
 from mapvote.detection.near_hits import near_hits
 from mapvote.detection.surface_counts import CROSSED, MET, PASSED, PASSES, WORDS, SurfaceEvidence, times_crossed
 from mapvote.perception.frontend import Observation
+from mapvote.perception.raycast import ScanView
 
 ROWS, COLS = range(100, 104), range(100, 105)
 FULL = 2**PLANES - 1
@@ -67,6 +72,23 @@ def test_a_voxel_counts_what_one_scan_tells_of_it(offsets: list[tuple[float, flo
                 assert (*counted, bool(int(cell[PASSED]) >> bit & 1)) == told_of(seen, r, c, bit)
 
 
+def test_a_window_across_tiles_counts_each_cell_where_it_lies() -> None:
+    point_map, window = street(), Grid(Lattice(), -5, 7, 120, 110)
+    here = reference_window(point_map, window)
+    seen, none = one_scan(point_map, np.zeros((0, 3))), np.zeros(window.shape, np.uint64)
+    passed, ground_z = none.copy(), np.zeros(window.shape, np.float32)
+    places = {(-5, 7): 4, (-1, 40): 5, (0, 20): 6, (101, 102): 7}
+    for (row, col), bit in places.items():
+        passed[row + 5, col - 7] = np.uint64(1 << bit)
+    view = ScanView(window, none.astype(np.int32), none, passed, np.zeros((0, 0), np.uint8))
+    evidence = SurfaceEvidence(point_map.lattice)
+    evidence.count(replace(seen, view=view, reference=replace(here, ground_z=ground_z)))
+    for (row, col), bit in places.items():
+        planes = evidence.tiles[row // TILE_CELLS, 0]
+        assert planes[row % TILE_CELLS, col, PASSED] == np.uint64(1 << bit)
+    assert sum(np.count_nonzero(evidence.tiles[tile][..., PASSED]) for tile in evidence.tiles) == len(places)
+
+
 def test_a_cell_in_which_a_count_is_full_is_halved_as_a_whole_and_its_ratios_stay() -> None:
     point_map = street()
     evidence = SurfaceEvidence(point_map.lattice)
@@ -82,6 +104,7 @@ def test_a_cell_in_which_a_count_is_full_is_halved_as_a_whole_and_its_ratios_sta
     assert count_of(cell, MET, 3) == 32 // 2
     assert count_of(cell, CROSSED, 3) == 32 // 2, "of four scans one hit it, one crossed it, and two passed it only"
     assert count_of(cell, PASSES, 3) == 96 // 2
+    assert cell[PASSED] == ~np.uint64(0), "what rays ever passed is no count"
 
 
 def cell_with(bit: int, crossed: int, passes: tuple[int, int, int]) -> np.ndarray:

@@ -67,6 +67,7 @@ def test_what_touches_something_else_is_no_thing_of_its_own() -> None:
 
 def test_half_of_a_thing_must_have_gone_for_the_whole_to_go() -> None:
     assert alone(words((5, 5, 0b110)), whole=words((5, 5, 0b11110)))
+    assert alone(words((5, 5, 0b1110)), whole=words((5, 5, 0b1111110)))
     assert not alone(words((5, 5, 0b110)), whole=words((5, 5, 0b111110)))
 
 

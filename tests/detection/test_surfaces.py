@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
@@ -87,6 +88,12 @@ def test_a_bollard_that_went_or_came_is_a_change_for_it_stands_on_the_ground_and
     here = [((105 + 0.5) * CELL_SIZE, OLD_Y, z) for z in BOLLARD]
     built = after(street([], []), np.concatenate([here, standing_at(OLD_Y + 9)]))
     assert built.states[ROW, 105] == CO
+
+
+def test_a_bollard_at_the_end_of_the_map_stands_on_its_own_too() -> None:
+    ground = wall([(r, c) for r in range(30) for c in range(95, 125)], [0.0])
+    point_map = make_map({(0, 0): make_tile(np.concatenate([wall([(0, 105)], BOLLARD), ground]))})
+    assert after(point_map, standing_at(20.5 * CELL_SIZE)).states[0, 105] == CE
 
 
 def test_one_voxel_that_came_or_went_is_no_bollard() -> None:
@@ -180,8 +187,9 @@ def test_what_is_no_higher_than_a_kerb_is_never_gone() -> None:
     assert not (after(street(WALL, [0.45]), standing_at(OLD_Y + 9)).states == CE).any()
 
 
-def test_a_kerb_stays_before_a_wall_that_was_pulled_down() -> None:
-    kerb = [(ROW - 2, c) for c in COLUMNS]
+@pytest.mark.parametrize("off", [1, 2])
+def test_a_kerb_stays_before_a_wall_that_was_pulled_down(off: int) -> None:
+    kerb = [(ROW - off, c) for c in COLUMNS]
     ground = wall([(r, c) for r in range(85, 125) for c in range(85, 135)], [0.0])
     point_map = make_map({(0, 0): make_tile(np.concatenate([wall(WALL, HEIGHTS), wall(kerb, [0.45]), ground]))})
     states = after(point_map, standing_at(OLD_Y + 9)).states
