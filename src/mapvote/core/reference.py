@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mapvote.core.columns import dilated, fill_columns
+from mapvote.core.columns import fill_columns
 from mapvote.core.grid import TILE_CELLS, Grid, TileIndex, window_around
 from mapvote.core.ground import base_layers
 from mapvote.core.point_map import PointMap
@@ -106,8 +106,6 @@ class Bordered(NamedTuple):
     here: Reference
     outer: Reference
     """With a cell more on each side."""
-    near: U64
-    """(rows, cols) voxels that the map holds, or that touch such a one."""
     known: U64
     """(rows, cols) voxels that the map knows to be free, or has to be taken to know (:func:`above_ground_points`)."""
 
@@ -116,8 +114,7 @@ def bordered(point_map: PointMap, window: Grid) -> Bordered:
     """What the rules of detection ask of the map over ``window``."""
     outer = reference_window(point_map, window.padded(1))
     here = cut_reference(outer, window)
-    near = dilated(outer.occupied, outer.base, 1)[1:-1, 1:-1]
-    return Bordered(here, outer, near, here.free if here.free is not None else above_ground_points(point_map, window))
+    return Bordered(here, outer, here.free if here.free is not None else above_ground_points(point_map, window))
 
 
 class LocalMap:

@@ -3,10 +3,10 @@
 A mapped voxel is gone that was crossed more often than HIT_RAYS times its hits, and stands that was met and is not. A
 cell is changed-empty if a voxel of it is gone and none stands: what no ray could decide in it goes along. So do cells
 beside it in which rays crossed something and met nothing, however few; and cells that no ray could decide go with what
-falls. Points that touch no other go with most of what is
-around them, or not at all. A free voxel met more often than rays spoke against it is new, if the whole of what it
-belongs to was met as often as rays passed it; so is what hits show behind something that went, for a wall set back has
-an old side and a new one. docs/method.md.
+falls. Points that touch no other go with most of what is around them, or not at all. A free voxel met more often than
+rays spoke against it is new, if the whole of what it belongs to was met as often as rays passed it, and is not the rest
+of what stands; so is what hits show behind something that went, for a wall set back has an old side and a new one.
+docs/method.md.
 """
 
 from __future__ import annotations
@@ -146,7 +146,7 @@ class SurfaceVoter:
     def _judge(self, tile: TileIndex) -> _Judged:
         """What the tile's own evidence says, voxel by voxel and cell by cell."""
         window = self.point_map.lattice.tile(tile)
-        here, outer, _, known = bordered(self.point_map, window)
+        here, outer, known = bordered(self.point_map, window)
         planes = self.evidence.tiles[tile]
         gone, stands, unmet, new, beyond = (np.zeros(window.shape, dtype=np.uint64) for _ in range(5))
         balance = np.zeros(window.shape, dtype=np.int32)

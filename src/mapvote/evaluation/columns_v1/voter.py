@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 
 from mapvote.config import VotingSettings
-from mapvote.core.columns import outside
+from mapvote.core.columns import dilated, outside
 from mapvote.core.grid import TileIndex
 from mapvote.core.point_map import PointMap
 from mapvote.core.reference import bordered
@@ -74,7 +74,8 @@ class ColumnVoter:
     def _judge(self, tile: TileIndex, counters: Mapping[TileIndex, U64]) -> Judged:
         """What the tile's own evidence says, cell by cell."""
         lattice = self.point_map.lattice
-        here, outer, near, known = bordered(self.point_map, lattice.tile(tile))
+        here, outer, known = bordered(self.point_map, lattice.tile(tile))
+        near = dilated(outer.occupied, outer.base, 1)[1:-1, 1:-1]
         counts = around(lattice, counters, outer.grid, 0)
         low = here.top_z - here.ground_z < self.voting.min_height_m
         weighed = weigh(counts, outer.base, here.occupied, near, known, low, self.rules)
