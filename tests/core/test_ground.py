@@ -56,6 +56,18 @@ def test_ground_far_from_any_point_is_unknown() -> None:
     assert np.isnan(ground[50, 50])
 
 
+def test_the_ground_of_strays_costs_no_memory_and_changes_nothing_of_the_street() -> None:
+    rng = np.random.default_rng(3)
+    street = at(spread(rng, 20_000, (0, 30), (0, 30)), 0.0)
+    strays = at(spread(rng, 5_000, (-90_000, 90_000), (-90_000, 90_000)), 0.0)
+    strays = strays[np.abs(strays).max(axis=1) > 300.0]
+    alone, among = (map_from_points(np.vstack(clouds), lattice=LATTICE) for clouds in ([street], [street, strays]))
+    assert len(among.tiles) > 4_000
+    assert len({tile.ground_z.ctypes.data for tile in among.tiles.values()}) < 20
+    for index, tile in alone.tiles.items():
+        np.testing.assert_array_equal(tile.ground_z, among.tiles[index].ground_z)
+
+
 def test_reflections_below_the_road_do_not_sink_the_ground_alone_or_in_a_cluster() -> None:
     """As behind a van in KITTI drive 0005: twenty points within a metre, four metres below the road."""
     rng = np.random.default_rng(1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Callable
 from pathlib import Path
 
@@ -15,6 +16,9 @@ from mapvote.doctor.diagnosis import diagnose
 from mapvote.doctor.finding import Finding
 from mapvote.doctor.maps import check_map
 from mapvote.formats import write_map
+from mapvote.formats.maps.cloud import Cloud
+from mapvote.formats.maps.las import write_las
+from mapvote.formats.maps.pcd import save_pcd
 
 
 def street() -> F64:
@@ -113,6 +117,25 @@ def test_coordinates_without_a_name_are_told(points: F64) -> None:
 def test_a_tile_that_is_missing_between_others_is_told(sound: PointMap, points: F64) -> None:
     long = map_from_points(np.concatenate([points, points + np.array([260.0, 0, 2.6])]))
     assert any("missing between others" in what for what in serious(check_map(long)))
+
+
+@pytest.mark.parametrize("share", [0.001, 0.5])
+def test_points_that_are_not_finite_are_counted_or_an_error(tmp_path: Path, points: F64, share: float) -> None:
+    broken = points.astype(np.float32)
+    broken[: int(share * len(points))] = np.nan
+    save_pcd(tmp_path / "m.pcd", broken)
+    found = diagnose(tmp_path / "m.pcd").findings
+    assert any(f"{int(share * len(points))} of {len(points)} points are not finite" in f.what for f in found)
+    assert any(f.severity == "error" for f in found) == (share > 0.05)
+
+
+def test_a_las_whose_scales_are_no_numbers_is_an_error(tmp_path: Path, points: F64) -> None:
+    write_las(tmp_path / "m.las", Cloud(points))
+    data = bytearray((tmp_path / "m.las").read_bytes())
+    data[131:155] = struct.pack("<3d", *[np.nan] * 3)
+    (tmp_path / "m.las").write_bytes(data)
+    errors = [f.what for f in diagnose(tmp_path / "m.las").findings if f.severity == "error"]
+    assert errors == [f"{len(points)} of {len(points)} points are not finite"]
 
 
 def test_examine_takes_map_folders_and_ballots(tmp_path: Path, sound: PointMap) -> None:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from mapvote.cli.looks import look_at_map
+from mapvote.cli.looks import look_at_points
 from mapvote.cli.options import DRIVE, MAP, KeyFile, Projector, Rate, Topic, with_drive_options
 from mapvote.cli.remote import is_store, is_url, map_at, overview_of
 from mapvote.cli.store import opened_store
@@ -142,8 +142,8 @@ def import_map(
     from mapvote.formats.maps.importing import import_cloud
 
     with waiting(f"reading {source}"):
-        point_map, told = import_cloud(source, frame_wanted(crs, projector), from_crs, folder_beside(out))
-    look_at_map(str(source), point_map)
+        wanted = frame_wanted(crs, projector)
+        point_map, told = import_cloud(source, wanted, from_crs, folder_beside(out), look_at_points(str(source)))
     with waiting(f"writing {out}"):
         write_map(point_map, out)
     print(f"{out}: {point_map.n_points} points in {len(point_map.tiles)} tiles, map {point_map.map_id}")

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from mapvote.core.types import Drive
     from mapvote.doctor.cheap import LookedAt
     from mapvote.doctor.finding import Finding
+    from mapvote.formats.maps.tiling import Look
 
 
 @contextmanager
@@ -52,17 +53,15 @@ def sound_map(path: Path | str) -> PointMap:
     """A map in any file format; MapvoteError for one that cannot be used so."""
     from mapvote.formats import read_map
 
-    point_map = read_map(path)
-    look_at_map(str(path), point_map)
-    return point_map
+    return read_map(path, look_at_points(str(path)))
 
 
-def look_at_map(path: str, point_map: PointMap) -> None:
-    """MapvoteError for a map whose points cannot be used so."""
-    from mapvote.doctor.clouds import check_cloud, tile_by_tile
+def look_at_points(path: str) -> Look:
+    """What looks at the points of a map before ground is laid: MapvoteError if they cannot be used so."""
+    from mapvote.doctor.clouds import check_cloud
     from mapvote.doctor.finding import usable
 
-    _warn(path, usable(path, check_cloud(tile_by_tile(point_map))))
+    return lambda pieces: _warn(path, usable(path, check_cloud(pieces)))
 
 
 def _warn(path: str, found: list[Finding]) -> None:

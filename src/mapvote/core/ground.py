@@ -10,7 +10,7 @@ import numpy as np
 
 from mapvote.core.grid import CELL_SIZE, CELLS, TILE_CELLS, TileIndex
 from mapvote.core.ground_growing import SEED, STEP_M, UNREACHED, grow, tiles_around
-from mapvote.core.types import F32, F64, I32, I64, U8, Bool
+from mapvote.core.types import F32, F64, I32, I64, U8, Bool, read_only
 
 KNOWN_M = 3.0
 """Farther than this from any measured ground it is unknown."""
@@ -23,6 +23,9 @@ _AGREEING = 0.5
 """Share of the measured cells within 2.1 m that must agree before the ground may start from a cell."""
 _BROAD = 30
 """Cells of them that must, where a driven path has shown the ground: apart from it many points are reflections."""
+_FEW_TILES, _POINTS_A_TILE, _POINTS_AROUND = 64, 4000, 1000
+"""A map of more tiles than 64 and one for each 4000 points is a street with strays, or not in metres: where a tile and
+its eight neighbours hold fewer than 1000 points its ground is unknown. So memory grows with points, not with extent."""
 _NEAR_TILES = 128
 """Planes kept, of 256 kB, while the windows around neighbouring tiles are looked at: three rows of them and more."""
 
@@ -111,15 +114,18 @@ def _supported(low: F32, reach: int, grade: float, share: float, least: int) -> 
     return out
 
 
-def lay_ground(points: Mapping[TileIndex, Heights], road: Mapping[TileIndex, Heights]) -> dict[TileIndex, F32]:
+def lay_ground(
+    points: Mapping[TileIndex, Heights], road: Mapping[TileIndex, Heights], n_points: Mapping[TileIndex, int]
+) -> dict[TileIndex, F32]:
     """Height of the ground in every cell of every tile, (256, 256) float32 map metres, NaN where unknown.
 
-    ``road``: where vehicles drove, the height of the road under them. The ground grows from there
-    (:mod:`mapvote.core.ground_growing`). Where it does not come to, and in maps of which nobody knows the path, it
-    starts from places that the measured cells around agree on and above which nothing rises as gently as ground.
-    Tiles are asked for one by one, in ascending order: of a large map only the heights are held.
+    ``n_points``: of each tile. ``road``: where vehicles drove, the height of the road under them. The ground grows
+    from there (:mod:`mapvote.core.ground_growing`). Where it does not come to, and in maps of which nobody knows the
+    path, it starts from places that the measured cells around agree on and above which nothing rises as gently as
+    ground. Tiles are read one by one, in ascending order: of a large map only the heights are held, and no cell of
+    tiles that a few strays make (:data:`_POINTS_AROUND`).
     """
-    tiles = sorted(points)
+    tiles = _populated(n_points)
     start, heights = _by_cell((points[tile] for tile in tiles), len(tiles))
     ground = np.full(len(tiles) * CELLS, np.nan, dtype=np.float32)
     gap = np.full(len(tiles) * CELLS, UNREACHED, dtype=np.uint8)
@@ -133,7 +139,18 @@ def lay_ground(points: Mapping[TileIndex, Heights], road: Mapping[TileIndex, Hei
     _sow(_Lows(start, heights, gap, ground), neighbours, _BROAD if road else 2)
     grow(start, heights, neighbours, ground, gap)
     ground[gap > KNOWN_M / STEP_M] = np.nan
-    return dict(zip(tiles, ground.reshape(-1, TILE_CELLS, TILE_CELLS), strict=True))
+    laid = dict(zip(tiles, ground.reshape(-1, TILE_CELLS, TILE_CELLS), strict=True))
+    unknown = read_only(np.full((TILE_CELLS, TILE_CELLS), np.nan, dtype=np.float32))
+    return laid if len(tiles) == len(points) else dict.fromkeys(points, unknown) | laid
+
+
+def _populated(n_points: Mapping[TileIndex, int]) -> list[TileIndex]:
+    """The tiles whose ground is looked for, in ascending order."""
+    tiles = sorted(n_points)
+    if len(tiles) <= _FEW_TILES + sum(n_points.values()) // _POINTS_A_TILE:
+        return tiles
+    around = [(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1)]
+    return [(r, c) for r, c in tiles if sum(n_points.get((r + i, c + j), 0) for i, j in around) >= _POINTS_AROUND]
 
 
 def _by_cell(points: Iterable[Heights], tiles: int) -> tuple[I32 | I64, F32]:

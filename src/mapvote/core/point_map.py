@@ -127,7 +127,9 @@ def map_from_points(
         digest.update(piece.tobytes())
     stored = _stored(points, lattice)
     known = {} if road is None or len(road) == 0 else _stored(road, lattice)
-    ground = lay_ground(_heights(stored, lattice), _heights(known, lattice))
+    ground = lay_ground(
+        _heights(stored, lattice), _heights(known, lattice), {tile: len(p) for tile, p in stored.items()}
+    )
     tiles = {tile: Tile(lattice.tile(tile), stored[tile], ground[tile]) for tile in stored}
     if fields:
         for tile, mine in cut_tiles(points, lattice):

@@ -35,5 +35,6 @@ def usable(path: str, found: list[Finding]) -> list[Finding]:
     errors = [f for f in found if f.severity == "error"]
     if errors:
         more = f" ({len(errors) - 1} more errors: mapvote doctor {path})" if len(errors) > 1 else ""
-        raise MapvoteError(f"{path}: {errors[0].what}. {errors[0].mend}{more}")
+        stop = "" if errors[0].what.endswith("?") else "."
+        raise MapvoteError(f"{path}: {errors[0].what}{stop} {errors[0].mend}{more}")
     return [f for f in found if f.severity == "warning"]

@@ -17,6 +17,7 @@ from mapvote.doctor.finding import Finding, in_order
 from mapvote.doctor.ghosts import ghost_layer, ghost_shift
 from mapvote.doctor.on_map import check_ground
 from mapvote.formats import read_cloud, read_map
+from mapvote.formats.clean import MAX_BAD_SHARE
 from mapvote.formats.geo.frame import frame_of
 from mapvote.formats.maps.cloud import Cloud
 from mapvote.formats.maps.mapvote_folder import is_map_folder
@@ -34,7 +35,7 @@ def examine_map(path: Path) -> tuple[list[Finding], PointMap | None]:
     """(findings, errors first; the map, if one can be made of it) of a map in any format."""
     try:
         if not is_map_folder(path):
-            return examine_points(str(path), read_cloud(path).in_metres(str(path)))
+            return examine_points(str(path), read_cloud(path))
         point_map = read_map(path)
     except MapvoteError as error:
         return [Finding("error", str(error))], None
@@ -42,8 +43,14 @@ def examine_map(path: Path) -> tuple[list[Finding], PointMap | None]:
 
 
 def examine_points(where: str, cloud: Cloud) -> tuple[list[Finding], PointMap | None]:
-    """The same of points in metres that no map has been made of yet."""
-    found = check_cloud(in_memory(cloud.points))
+    """The same of points as a file has them, of which no map has been made yet. MapvoteError if their coordinates
+    cannot be made metres."""
+    finite = np.isfinite(cloud.points).all(axis=1)
+    found = _not_finite(len(finite) - int(finite.sum()), len(finite))
+    if not any(f.severity == "error" for f in found):
+        fields = {name: column[finite] for name, column in cloud.fields.items()}
+        cloud = replace(cloud, points=cloud.points[finite], fields=fields).in_metres(where)
+        found += check_cloud(in_memory(cloud.points))
     if any(f.severity == "error" for f in found):
         return in_order(found), None
     try:
@@ -51,6 +58,15 @@ def examine_points(where: str, cloud: Cloud) -> tuple[list[Finding], PointMap | 
     except MapvoteError as error:
         return in_order([*found, Finding("error", str(error))]), None
     return in_order(found + check_map(point_map)), point_map
+
+
+def _not_finite(bad: int, n: int) -> list[Finding]:
+    if not bad:
+        return []
+    what = f"{bad} of {n} points are not finite"
+    if bad > MAX_BAD_SHARE * n:
+        return [Finding("error", what, "export the file again; of a LAS the header's scales and offsets may be broken")]
+    return [Finding("note", f"{what}: import leaves them out")]
 
 
 def check_whole(point_map: PointMap) -> list[Finding]:

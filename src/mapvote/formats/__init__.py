@@ -18,7 +18,7 @@ from mapvote.formats.maps.cloud import Cloud, joined
 from mapvote.formats.maps.exporting import export_map
 from mapvote.formats.maps.mapvote_folder import is_map_folder, read_map_folder, write_map_folder
 from mapvote.formats.maps.pcd import write_pcd
-from mapvote.formats.maps.tiling import in_map_metres, map_of
+from mapvote.formats.maps.tiling import Look, in_map_metres, map_of
 from mapvote.formats.registry import DRIVES, MAPS
 
 __all__ = [
@@ -52,15 +52,18 @@ def open_drive(path: Path | str, **said: Unpack[SaidOfDrive]) -> Drive:
     raise MapvoteError(f"{path}: {_what_is_there(path)}; a drive is one of: {', '.join(DRIVES)}")
 
 
-def read_map(path: Path | str) -> PointMap:
+def read_map(path: Path | str, look: Look | None = None) -> PointMap:
     """A map of any known format. A format that has only points gets its ground measured and a map_id from its content.
 
-    Raises MapvoteError if there is no map at ``path`` or it is damaged.
+    ``look`` sees the points before ground is laid. Raises MapvoteError if there is no map at ``path`` or it is damaged.
     """
     path = Path(path)
     if is_map_folder(path):
-        return read_map_folder(path)
-    return map_of(str(path), in_map_metres(str(path), stream_cloud(path)))
+        point_map = read_map_folder(path)
+        if look is not None:
+            look(lambda: (point_map.tiles[index].points_map for index in sorted(point_map.tiles)))
+        return point_map
+    return map_of(str(path), in_map_metres(str(path), stream_cloud(path)), look=look)
 
 
 def stream_cloud(path: Path | str) -> Iterator[Cloud]:

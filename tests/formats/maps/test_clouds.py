@@ -19,9 +19,11 @@ from mapvote.core.point_map import all_points, map_from_points
 from mapvote.core.types import F64, MapvoteError
 from mapvote.formats import export_map, read_cloud, read_map, write_map, write_pcd
 from mapvote.formats.maps.autoware import stream_autoware, write_autoware
+from mapvote.formats.maps.autoware_live import lay_version
 from mapvote.formats.maps.cloud import Cloud, joined, lattice_of
+from mapvote.formats.maps.cloud_pieces import CloudPieces
 from mapvote.formats.maps.las import read_las, write_las
-from mapvote.formats.maps.pcd import ENCODINGS
+from mapvote.formats.maps.pcd import ENCODINGS, read_pcd_table
 from mapvote.formats.maps.ply import read_ply, write_ply
 
 UTM = np.array([367_123.0, 3_951_876.0, 40.0])
@@ -33,6 +35,32 @@ def points(n: int = 500, seed: int = 0) -> F64:
 
 def by_row(p: NDArray[np.floating]) -> NDArray[np.floating]:
     return p[np.lexsort(p.T)]
+
+
+@pytest.mark.parametrize("encoding", ENCODINGS)
+def test_a_pcd_longer_than_its_header_says_is_refused_and_blank_lines_are_not(tmp_path: Path, encoding: str) -> None:
+    for more, whole in ((b"1 2 3\n" * 2 if encoding == "ascii" else bytes(24), False), (b"\n\n", True)):
+        write_pcd(tmp_path / "a.pcd", Cloud(points()), encoding=encoding)
+        with (tmp_path / "a.pcd").open("ab") as file:
+            file.write(more)
+        for read in (read_cloud, read_pcd_table):
+            if whole:
+                read(tmp_path / "a.pcd")
+            else:
+                with pytest.raises(MapvoteError, match="its header says 500 points, but data for 2 more follow"):
+                    read(tmp_path / "a.pcd")
+
+
+def test_autoware_tiles_that_nobody_lists_are_said_aloud_but_those_kept_for_a_running_stack(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    lay_version(tmp_path / "live", CloudPieces.of(Cloud(points())), 1)
+    lay_version(tmp_path / "live", CloudPieces.of(Cloud(points(400))), 2)
+    list(stream_autoware(tmp_path / "live"))
+    assert not caplog.records
+    (tmp_path / "live" / "pointcloud_map.pcd" / "extra.pcd").write_bytes(b"")
+    list(stream_autoware(tmp_path / "live"))
+    assert "lists no corner of 1 of the PCD files there (first: extra.pcd): they are left out" in caplog.text
 
 
 @pytest.mark.parametrize("encoding", ENCODINGS)

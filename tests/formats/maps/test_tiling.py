@@ -57,6 +57,21 @@ def test_pieces_make_the_same_bytes_as_the_whole(
     assert files(map_of("it", iter(pieces)), folder / "a") == files(whole, folder / "b")
 
 
+def test_points_are_looked_at_before_tiles_are_cut(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    def look(pieces: Any) -> None:
+        seen.extend(pieces())
+        raise MapvoteError("these are millimetres")
+
+    seen: list[Any] = []
+    points, _ = street(3)
+    write_pcd(tmp_path / "mm.pcd", Cloud(1000.0 * points))
+    monkeypatch.setattr("mapvote.formats.maps.tiling.lay_ground", lambda *_: pytest.fail("the ground was laid"))
+    for read in (lambda: read_map(tmp_path / "mm.pcd", look), lambda: import_cloud(tmp_path / "mm.pcd", look=look)):
+        with pytest.raises(MapvoteError, match="these are millimetres"):
+            read()
+    assert sum(map(len, seen)) == 2 * len(points)
+
+
 @pytest.fixture
 def large(monkeypatch: pytest.MonkeyPatch) -> None:
     """Everything counts as larger than memory."""

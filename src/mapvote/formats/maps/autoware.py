@@ -6,6 +6,7 @@ Points are in the map frame, not relative to their tile, as autoware_map_loader 
 from __future__ import annotations
 
 import logging
+import re
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -30,6 +31,10 @@ METADATA = "pointcloud_map_metadata.yaml"
 TILES = "pointcloud_map.pcd"
 """The folder of tiles really is called so, by Autoware's convention."""
 SIDE_M = 20
+HISTORY = ".mapvote_versions.json"
+"""Beside tiles that ``mapvote follow`` laid: which version has which."""
+FOLLOWED = re.compile(r"-?\d+_-?\d+_[0-9a-f]{8}\.pcd")
+"""How it names them: X_Y_HASH8.pcd."""
 CONTENT = "it lists x_resolution, y_resolution and NAME.pcd: [x, y] for every tile"
 
 
@@ -38,7 +43,8 @@ def is_autoware(path: Path) -> bool:
 
 
 def stream_autoware(path: Path) -> Iterator[Cloud]:
-    """The tiles that the metadata lists, in its order; every point is checked to lie in its tile.
+    """The tiles that the metadata lists, in its order; every point is checked to lie in its tile. A warning names tiles
+    that lie there unlisted, but for those that ``mapvote follow`` keeps of versions before.
 
     MapvoteError names a tile that is missing, broken, or whose points lie outside it by more than a centimetre.
     """
@@ -52,6 +58,7 @@ def stream_autoware(path: Path) -> Iterator[Cloud]:
     except (KeyError, TypeError, ValueError) as error:
         raise MapvoteError(f"{file}: not Autoware's metadata ({error}); {CONTENT}") from error
     frame = _frame(path)
+    _warn_of_unlisted(path, set(corners))
     for name, corner in corners.items():
         tile = next((f for f in (path / name, path / TILES / name) if f.is_file()), None)
         if tile is None:
@@ -64,6 +71,20 @@ def stream_autoware(path: Path) -> Iterator[Cloud]:
                 f"are its points relative to the tile, or is the corner wrong?"
             )
         yield replace(cloud, frame=frame)
+
+
+def _warn_of_unlisted(path: Path, listed: set[str]) -> None:
+    kept = (path / HISTORY).is_file()
+    there = {file.name for folder in (path, path / TILES) for file in folder.glob("*.pcd") if file.is_file()}
+    unlisted = sorted(name for name in there - listed if not (kept and FOLLOWED.fullmatch(name)))
+    if unlisted:
+        log.warning(
+            "%s: %s lists no corner of %d of the PCD files there (first: %s): they are left out",
+            path,
+            METADATA,
+            len(unlisted),
+            unlisted[0],
+        )
 
 
 def is_autoware_default(path: Path) -> bool:

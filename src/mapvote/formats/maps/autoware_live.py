@@ -8,7 +8,6 @@ the last few versions stay for loaders that still go by older metadata.
 from __future__ import annotations
 
 import hashlib
-import re
 from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,13 +18,10 @@ import numpy as np
 from mapvote.core.types import MapvoteError
 from mapvote.formats.atomic import whole_file
 from mapvote.formats.geo.projector import PROJECTOR, projector_of
-from mapvote.formats.maps.autoware import METADATA, SIDE_M, TILES, metadata, squares
+from mapvote.formats.maps.autoware import FOLLOWED, HISTORY, METADATA, SIDE_M, TILES, metadata, squares
 from mapvote.formats.maps.cloud import Cloud
 from mapvote.formats.maps.cloud_pieces import CloudPieces
 from mapvote.formats.maps.pcd import save_pcd
-
-HISTORY = ".mapvote_versions.json"
-_OURS = re.compile(r"-?\d+_-?\d+_[0-9a-f]{8}\.pcd")
 
 
 class _Laid(msgspec.Struct):
@@ -91,7 +87,7 @@ def lay_version(
     _write(folder / PROJECTOR, projector_of(cloud.frame).encode())
     _write(folder / METADATA, metadata(corners, side_m).encode())
     needed = {name for laid in history[-keep - 1 :] for name in laid.tiles}
-    stale = [file for file in tiles.iterdir() if _OURS.fullmatch(file.name) and file.name not in needed]
+    stale = [file for file in tiles.iterdir() if FOLLOWED.fullmatch(file.name) and file.name not in needed]
     for file in stale:
         file.unlink()
     return Change(version, len(corners), written, len(stale))

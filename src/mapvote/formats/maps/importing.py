@@ -12,28 +12,31 @@ from mapvote.core.point_map import PointMap
 from mapvote.formats import stream_cloud
 from mapvote.formats.geo.frame import LOCAL, MapFrame
 from mapvote.formats.maps.cloud import Cloud
-from mapvote.formats.maps.tiling import in_map_metres, map_of
+from mapvote.formats.maps.tiling import Look, in_map_metres, map_of
 
 NOISE = (7, 18)
 """ASPRS classes: low noise, high noise."""
 
 
 def import_cloud(
-    path: Path, wanted: MapFrame | None = None, from_crs: str | None = None, folder: Path | None = None
+    path: Path,
+    wanted: MapFrame | None = None,
+    from_crs: str | None = None,
+    folder: Path | None = None,
+    look: Look | None = None,
 ) -> tuple[PointMap, list[str]]:
     """(the map, lines that say what became of the file's coordinates, classes and fields).
 
     ``wanted``: the frame to project to. ``from_crs``: what the file is in, where it says nothing or the wrong thing.
-    ``folder``: where temporary files may lie.
+    ``folder``: where temporary files may lie. ``look``: sees the points, in metres, before a map is made of them.
     """
     pieces = stream_cloud(path)
     if from_crs is not None:
         said = MapFrame(LOCAL if from_crs.lower() == LOCAL else from_crs)
         pieces = (replace(piece, frame=said) for piece in pieces)
     left = _LeftOut()
-    point_map = map_of(
-        str(path), left.noise(in_map_metres(str(path), pieces, wanted, sure=from_crs is not None)), folder
-    )
+    metres = in_map_metres(str(path), pieces, wanted, sure=from_crs is not None)
+    point_map = map_of(str(path), left.noise(metres), folder, look)
     return point_map, left.told()
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import struct
 from collections.abc import Iterator, Mapping
 from itertools import islice
 from pathlib import Path
@@ -38,7 +40,9 @@ def read_pcd_table(path: Path) -> tuple[NDArray[np.void], F64]:
     except Exception as error:
         raise _unreadable(path, error) from error
     table = np.atleast_1d(cloud.pc_data)
-    _check_count(path, len(table), cloud.metadata)
+    with path.open("rb") as file:
+        about = _header(file)
+        _check_count(path, len(table), about, _rest(file, about, skip=True))
     return table, np.array(cloud.metadata.viewpoint, dtype=np.float64)
 
 
@@ -49,7 +53,14 @@ def _unreadable(path: Path, error: Exception) -> MapvoteError:
     return MapvoteError(f"{path}: not a whole PCD file ({first_line(error)}); copy or export it again")
 
 
-def _check_count(path: Path, found: int, about: MetaData) -> None:
+def _check_count(path: Path, found: int, about: MetaData, beyond: int = 0) -> None:
+    """``beyond``: bytes that follow the points that the header promises."""
+    if beyond >= about.build_dtype().itemsize:
+        more = beyond // about.build_dtype().itemsize
+        raise MapvoteError(
+            f"{path}: its header says {about.points} points, but data for {more} more follow; mend WIDTH, HEIGHT and "
+            "POINTS, or export it again"
+        )
     if found != about.points:
         raise MapvoteError(f"{path}: cut off: {found} points, but its header says {about.points}; copy it again")
 
@@ -71,7 +82,7 @@ def stream_pcd(path: Path) -> Iterator[Cloud]:
             for table in tables:
                 found += len(table)
                 yield Cloud(xyz(str(path), table), other_fields(table.dtype.names or ()), fields=kept_fields(table))
-            _check_count(path, found, about)
+            _check_count(path, found, about, 0 if compressed else _rest(file, about))
     except MapvoteError:
         raise
     except Exception as error:
@@ -97,7 +108,7 @@ def _blocks(file: BinaryIO, about: MetaData) -> Iterator[NDArray[np.void]]:
         yield np.empty(0, dtype=dtype)
     while left > 0:
         if about.data == Encoding.ASCII:
-            lines = list(islice(file, _BLOCK))
+            lines = list(islice(file, min(left, _BLOCK)))
             table = np.atleast_1d(np.loadtxt(lines, dtype, delimiter=" ")) if lines else np.empty(0, dtype=dtype)
         else:
             raw = file.read(min(left, _BLOCK) * dtype.itemsize)
@@ -106,6 +117,19 @@ def _blocks(file: BinaryIO, about: MetaData) -> Iterator[NDArray[np.void]]:
             return
         left -= len(table)
         yield table
+
+
+def _rest(file: BinaryIO, about: MetaData, *, skip: bool = False) -> int:
+    """Bytes that are left of a file (of text, as many as its lines would be); ``skip``: beyond the points that follow."""
+    if about.data == Encoding.ASCII:
+        lines = (line for line in file if line.strip())
+        return about.build_dtype().itemsize * sum(1 for _ in islice(lines, about.points if skip else 0, None))
+    if skip and about.data == Encoding.BINARY:
+        file.seek(about.points * about.build_dtype().itemsize, os.SEEK_CUR)
+    elif skip:
+        file.seek(struct.unpack("<I", file.read(8)[:4].ljust(4, b"\0"))[0], os.SEEK_CUR)
+    start = file.tell()
+    return max(0, file.seek(0, os.SEEK_END) - start)
 
 
 def write_pcd(path: Path, cloud: Cloud | CloudPieces, *, encoding: str = "binary", double: bool = False) -> None:

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mapvote.core.cells import flat_cells
 from mapvote.core.grid import Lattice, TileIndex
@@ -34,6 +35,9 @@ log = logging.getLogger("mapvote.formats")
 _SOME = 1_000_000
 """Points looked at to tell degrees from metres; and points in a piece."""
 _XYZ = "xyz"
+
+Look = Callable[[Callable[[], Iterator[NDArray[np.floating]]]], None]
+"""Given the points (n, 3) of a map, metres, piece by piece as often as it asks; raises MapvoteError to stop."""
 
 
 def in_map_metres(
@@ -57,17 +61,19 @@ def to_map(where: str, cloud: Cloud) -> PointMap:
     return map_of(where, [cloud])
 
 
-def map_of(where: str, pieces: Iterable[Cloud], folder: Path | None = None) -> PointMap:
+def map_of(where: str, pieces: Iterable[Cloud], folder: Path | None = None, look: Look | None = None) -> PointMap:
     """The map of a cloud in pieces: tiles cut, ground laid, map_id from the content. Broken points are dropped and
     counted. Points that the file classifies as ground are ground.
 
     ``folder``: where temporary files may lie. Of a map larger than memory the tiles are read from them.
-    MapvoteError if the cloud is empty or more than 5 % of it is not finite.
+    ``look`` sees the points before tiles are cut and ground is laid. MapvoteError if the cloud is empty or more than 5 % of it is not finite.
     """
     taken = _Taken(where, Spill(folder))
     for piece in pieces:
         taken.take(piece)
     lattice = taken.lattice()
+    if look is not None:
+        look(lambda: (block[_XYZ] for block in taken.blocks()))
     parts = _Parts(lattice, Spill(folder))
     digest = hashlib.sha256(np.array([lattice.x0, lattice.y0]).tobytes())
     done = 0
@@ -78,7 +84,7 @@ def map_of(where: str, pieces: Iterable[Cloud], folder: Path | None = None) -> P
         digest.update(points.tobytes())
         parts.cut(block)
     taken.spill.close()
-    ground = lay_ground(parts.heights, parts.road)
+    ground = lay_ground(parts.heights, parts.road, parts.points)
     tiles = in_memory_if_small(LazyTiles(lambda index: parts.tile(index, ground[index]), parts.points))
     return PointMap(digest.hexdigest()[:16], lattice, tiles, taken.frame.georeference())
 
