@@ -120,7 +120,7 @@ def _blocks(file: BinaryIO, about: MetaData) -> Iterator[NDArray[np.void]]:
 
 
 def _rest(file: BinaryIO, about: MetaData, *, skip: bool = False) -> int:
-    """Bytes that are left of a file (of text, as many as its lines would be); ``skip``: beyond the points that follow."""
+    """Bytes left of a file (of text, as many as its lines would be); ``skip``: beyond the points that follow."""
     if about.data == Encoding.ASCII:
         lines = (line for line in file if line.strip())
         return about.build_dtype().itemsize * sum(1 for _ in islice(lines, about.points if skip else 0, None))

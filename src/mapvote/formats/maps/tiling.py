@@ -66,7 +66,8 @@ def map_of(where: str, pieces: Iterable[Cloud], folder: Path | None = None, look
     counted. Points that the file classifies as ground are ground.
 
     ``folder``: where temporary files may lie. Of a map larger than memory the tiles are read from them.
-    ``look`` sees the points before tiles are cut and ground is laid. MapvoteError if the cloud is empty or more than 5 % of it is not finite.
+    ``look`` sees the points before tiles are cut and ground is laid.
+    MapvoteError if the cloud is empty or more than 5 % of it is not finite.
     """
     taken = _Taken(where, Spill(folder))
     for piece in pieces:
