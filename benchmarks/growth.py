@@ -60,7 +60,7 @@ def main() -> None:
         before = sizes(store)
         print(f"the map: {before['planes of tiles'][0]} planes, {before['planes of tiles'][1]:,} bytes")
         for number, ballot in enumerate(ballots):
-            mine = msgspec.structs.replace(ballot, vehicle=f"v{number}", version=None, map_id=store.map_id)
+            mine = msgspec.structs.replace(ballot, vehicle=f"v{number}", version=1, map_id=store.map_id)
             (receipt,) = accept(store, [examine(encode(mine))])
             assert isinstance(receipt, Receipt), receipt
         voted = sizes(store)

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 
 from mapvote.codec.ballot import Ballot, BallotTile, pack_plane, tile_key
 from mapvote.codec.odds import pack_odds
+from mapvote.codec.points import pack_points
 from mapvote.codec.tile_file import base_hash
 from mapvote.codec.words import pack_words
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Lattice, TileIndex
@@ -97,7 +97,7 @@ class Say:
             states=None if self.states is None else pack_plane(self.states, 1),
             tally=None if self.tally is None else pack_plane(np.moveaxis(self.tally, -1, 0), 1),
             gone=None if self.gone is None else pack_words(self.gone),
-            new_points=None if self.new_points is None else pack_plane(self.new_points, 1),
+            new_points=None if self.new_points is None else pack_points(self.new_points),
             free=None if self.free is None else pack_words(self.free),
             intensity=None if self.intensity is None else pack_plane(self.intensity, 1),
             odds=None if self.odds is None else pack_odds(self.odds),
@@ -114,13 +114,13 @@ def make_ballot(
     settings_hash: str = SETTINGS,
     map_id: str | None = None,
     base: Mapping[TileIndex, str] | None = None,
-    version: int | Literal["of the map"] | None = "of the map",
+    version: int | None = None,
 ) -> Ballot:
     hashes = {tile: base_hash(point_map.tiles.get(tile)) for tile in says} | dict(base or {})
     return Ballot(
         map_id=map_id or point_map.map_id,
         base={tile_key(tile): digest for tile, digest in hashes.items()},
-        version=point_map.version if version == "of the map" else version,
+        version=version or point_map.version or 1,
         vehicle=vehicle,
         drive=drive,
         start_ns=end_ns - 1_000_000_000,

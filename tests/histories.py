@@ -108,14 +108,8 @@ class History:
         for cell, spoken in says.items():
             states[cell] = spoken.state
         end_s = self._end_s(self.now_s - rng.choice([1, 30, 5_000, 2 * DAY_S]) - self.drives)
-        named: int | None = version
-        if rng.random() < 0.15:  # of an older mapvote: read by the last version with its tiles
-            first = [c.seq for c in self.rules.casts if (c.vehicle, c.drive) == (vehicle, drive)]
-            named, version = None, self._last_like(version, min(first, default=None))
-            if version == 0:
-                return
         counts = bool(way) or self.rules.counts_anywhere(version, says)
-        if self._send(vehicle, drive, end_s, named, version, states, says, masks, has_free) != counts:
+        if self._send(vehicle, drive, end_s, version, states, says, masks, has_free) != counts:
             raise AssertionError(f"{vehicle}/{drive} counts: {counts}, and the store thinks otherwise")
         if counts:
             plane = states.tobytes()
@@ -128,22 +122,6 @@ class History:
             about -= 1
         return about
 
-    def _last_like(self, version: int, heard_at: int | None) -> int:
-        """The last version whose points are those of ``version``, of those that were there when the drive was heard
-        of; 0 if there was none."""
-        wanted = [cell.heights for cell in self.rules.versions[version].cells.values()]
-        alike = [
-            n
-            for n, v in self.rules.versions.items()
-            if [cell.heights for cell in v.cells.values()] == wanted and (heard_at is None or self._made(n) < heard_at)
-        ]
-        return max(alike, default=0)
-
-    def _made(self, number: int) -> int:
-        """The event by which a version was made."""
-        version = self.rules.versions[number]
-        return version.mark if version.kind != "publish" else self.published[number]
-
     def _say(self, cell: Cell, version: int, masks: bool, has_free: bool) -> Spoken:
         """Mostly the truth, as seen against that version."""
         rng = self.rng
@@ -155,7 +133,7 @@ class History:
         return Spoken(state, gone if masks else None, heights, rng.choice([0, 0b111000, 0b110]) if has_free else 0)
 
     def _send(
-        self, vehicle: str, drive: str, end_s: int, named: int | None, version: int, states: U8,
+        self, vehicle: str, drive: str, end_s: int, version: int, states: U8,
         says: dict[Cell, Spoken], masks: bool, has_free: bool,
     ) -> bool:  # fmt: skip
         points = [wall([cell], list(s.heights)) for cell, s in says.items() if s.heights]
@@ -166,7 +144,7 @@ class History:
             free=words_plane({cell: s.free for cell, s in says.items()}) if has_free else None,
         )
         base = {(0, 0): self.hashes[version]}
-        ballot = make_ballot(two_walls(), {(0, 0): say}, vehicle, drive, end_s * 10**9, base=base, version=named)
+        ballot = make_ballot(two_walls(), {(0, 0): say}, vehicle, drive, end_s * 10**9, base=base, version=version)
         (receipt,) = accept(self.store, [examine(encode(ballot))])
         assert isinstance(receipt, Receipt | Conflict), receipt
         return isinstance(receipt, Receipt)

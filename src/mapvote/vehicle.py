@@ -120,7 +120,7 @@ def write_ballot(
     tiles.sort(key=lambda tile: tile.tile)
     return Ballot(
         map_id=point_map.map_id,
-        version=point_map.version,
+        version=point_map.version or 1,
         base={tile_key(tile.tile): base_hash(point_map.tiles.get(tile.tile)) for tile in tiles},
         vehicle=vehicle,
         drive=drive,

@@ -93,6 +93,7 @@ def test_info_of_a_ballot(tmp_path: Path, run: CliRunner) -> None:
     ballot = Ballot(
         map_id="m",
         base={"0,0": ""},
+        version=1,
         vehicle="v9",
         drive="d",
         start_ns=0,

@@ -11,9 +11,10 @@ from hypothesis import strategies as st
 from hand_made import Say, make_ballot, states_plane, two_walls, wall
 from mapvote.codec.arrays import pack_plane
 from mapvote.codec.ballot import decode, encode, unpack_offer, validate
+from mapvote.codec.points import pack_points, unpack_points
 from mapvote.core.types import MapvoteError
 
-POINTS = wall([(3, 3)], [0.5, 0.8, 1.1])
+POINTS = unpack_points(pack_points(wall([(3, 3)], [0.5, 0.8, 1.1])))
 
 
 @settings(max_examples=30, deadline=None)
@@ -33,7 +34,7 @@ def test_intensity_comes_back_beside_its_points(values: list[int]) -> None:
 
 
 def test_a_ballot_without_intensity_has_none_and_every_point_must_have_one() -> None:
-    points = pack_plane(POINTS)
+    points = pack_points(POINTS)
     assert unpack_offer(points, None)[1] is None
     with pytest.raises(MapvoteError, match="2 bytes, expected 3"):
         unpack_offer(points, pack_plane(np.zeros(2, np.uint8)))

@@ -74,12 +74,3 @@ def test_what_no_vehicle_says_is_one_clear_error(data: bytes, says: str) -> None
 def test_odds_are_of_states_and_a_tally_has_none() -> None:
     with pytest.raises(MapvoteError, match="no states"):
         unpack_sureness(pack_odds(np.zeros(2, np.int8)), None)
-
-
-@pytest.mark.parametrize("older", [1, 2, 3, 4])
-def test_ballots_of_older_formats_say_nothing_of_it_and_are_read(older: int) -> None:
-    ballot = decode(
-        encode(msgspec.structs.replace(saying({(3, 3): CellState.CHANGED_EMPTY}, None), format_version=older))
-    )
-    validate(ballot)
-    assert unpack_sureness(ballot.tiles[0].odds, states_plane()) is None

@@ -1,4 +1,4 @@
-"""New points travel as their voxels and where in them, and in older ballots as they are."""
+"""New points travel as their voxels and where in them."""
 
 from __future__ import annotations
 
@@ -43,13 +43,6 @@ def test_what_was_rounded_once_is_never_moved_again(seed: int) -> None:
     sent = rng.uniform((0.0, 0.0, -50.0), (EDGE, EDGE, 150.0), (200, 3)).astype(np.float32)
     once = unpack_points(pack_points(sent))
     assert unpack_points(pack_points(once)).tobytes() == once.tobytes()
-    assert unpack_points(pack_plane(once)).tobytes() == once.tobytes(), "as older ballots hold it"
-
-
-def test_ballots_with_sixteen_times_as_fine_places_are_read_as_they_were_written() -> None:
-    """127 of 128 steps along x, none along y, half along z; the voxel in the corner."""
-    found = unpack_points(compress(b"\x03" + bytes(6) + bytes([127, 0, 64]), 1))
-    np.testing.assert_allclose(found, [[127.5 / 128 * 0.3, 0.5 / 128 * 0.3, 64.5 / 128 * 0.3]], rtol=1e-6)
 
 
 def test_points_of_a_street_take_less_than_half_of_what_float32_takes() -> None:
@@ -63,15 +56,12 @@ def test_points_of_a_street_take_less_than_half_of_what_float32_takes() -> None:
 @pytest.mark.parametrize(
     ("raw", "why"),
     [
-        (b"\x04" + bytes(8), "is no number of points"),
-        (b"\x02" + bytes(9), "is no number of points"),
-        (b"\x04" + bytes(6) + b"\x20" + bytes(2), "outside its tile or not finite"),
-        (b"\x03" + bytes(6) + b"\x80" + bytes(2), "outside its tile or not finite"),
-        (b"\x04" + bytes(4) + b"\x00\x10" + bytes(3), "outside its tile or not finite"),
-        (np.array([0, np.nan, 0], np.float32).tobytes(), "outside its tile or not finite"),
-        (b"\x04" + bytes(9 * 65), "more than 64 points in one cell"),
+        (bytes(8), "is no number of points"),
+        (bytes(6) + b"\x20" + bytes(2), "outside its tile or not finite"),
+        (bytes(4) + b"\x00\x10" + bytes(3), "outside its tile or not finite"),
+        (bytes(9 * 65), "more than 64 points in one cell"),
     ],
-    ids=["half", "another mark", "beyond its voxel", "in finer steps", "in the sky", "nowhere", "too many in a cell"],
+    ids=["half", "beyond its voxel", "in the sky", "too many in a cell"],
 )
 def test_what_no_vehicle_wrote_is_refused(raw: bytes, why: str) -> None:
     with pytest.raises(MapvoteError, match=why):

@@ -16,7 +16,6 @@ from mapvote.doctor.ballots import check_ballot
 from mapvote.doctor.stores import check_store
 from mapvote.server.store import schema
 from mapvote.server.store.keys import issue
-from mapvote.server.store.policy import Policy, RoundPolicy, set_policy
 from mapvote.server.store.store import Store
 
 SAME, GONE = int(CellState.UNCHANGED_OCCUPIED), int(CellState.CHANGED_EMPTY)
@@ -59,9 +58,6 @@ def test_a_store_is_read_to_the_last_byte(tmp_path: Path) -> None:
         found = check_store(store)
         assert not [f for f in found if f.severity == "error"]
         assert any("version 1: 2 tiles, 0 ballots" in f.what for f in found)
-        assert not any("columns" in f.what for f in found)
-        set_policy(store, Policy(round=RoundPolicy(method="columns")))
-        assert any("asks for columns" in f.what and "round.method=surfaces" in f.mend for f in check_store(store))
         with store.database.writing() as connection:
             connection.execute(sa.update(schema.blobs).values(data=b"damaged"))
         errors = [f for f in check_store(store) if f.severity == "error"]

@@ -1,7 +1,7 @@
 """Ballot <-> bytes: all that passes between vehicle and server (docs/decisions/data.md).
 
-A msgpack envelope of zstd-compressed planes. Reading checks every size before it allocates; planes that
-a newer format adds are ignored, required fields that are missing are refused.
+A msgpack envelope of zstd-compressed planes. Reading checks every size before it allocates memory; a ballot of another
+format, or without a required field, is refused.
 """
 
 from __future__ import annotations
@@ -23,9 +23,7 @@ from mapvote.codec.words import unpack_sparse
 from mapvote.core.grid import TILE_CELLS, TileIndex
 from mapvote.core.types import F32, I8, N_STATES, NO_VOTE, U8, U16, MapvoteError
 
-FORMAT_VERSION = 5
-"""5: how sure the vehicle is of its changed cells; 4: new points by their voxels, to 32nds; 3: to 128ths; 2: as
-float32, masks and free space as the words of some cells; 1: these as whole planes. All are read."""
+FORMAT_VERSION = 1
 MAX_TILES = 4096
 MAX_TILE_INDEX = 1 << 20
 _CELLS = TILE_CELLS * TILE_CELLS
@@ -67,9 +65,8 @@ class Ballot(msgspec.Struct, frozen=True, kw_only=True):
     map_id: _Text
     base: dict[str, _Hash]
     """Content hash of every tile the votes were cast against, by "row,col"; "" for a tile the map lacked."""
-    version: Annotated[int, msgspec.Meta(ge=1, le=(1 << 31) - 1)] | None = None
-    """Of the map that the vehicle drove with. None: of an older mapvote, or cast against a map that does not say; it is
-    the last version whose tiles have these hashes."""
+    version: Annotated[int, msgspec.Meta(ge=1, le=(1 << 31) - 1)]
+    """Of the map that the vehicle drove with."""
     vehicle: Id
     drive: Id
     start_ns: int
@@ -164,8 +161,8 @@ def decode(data: bytes) -> Ballot:
         ballot = msgspec.msgpack.decode(data, type=Ballot)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:  # ValidationError is a DecodeError
         raise MapvoteError(f"ballot: not readable ({error}); was it written by this version of mapvote?") from error
-    if ballot.format_version < 1 or ballot.format_version > FORMAT_VERSION:
-        raise MapvoteError(f"ballot: format {ballot.format_version}; this version reads up to {FORMAT_VERSION}")
+    if ballot.format_version != FORMAT_VERSION:
+        raise MapvoteError(f"ballot: format {ballot.format_version}; this mapvote reads format {FORMAT_VERSION}")
     indices = [t.tile for t in ballot.tiles]
     if len(indices) > MAX_TILES or len(set(indices)) != len(indices):
         raise MapvoteError(f"ballot: {len(indices)} tiles; at most {MAX_TILES}, each once")

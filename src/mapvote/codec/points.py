@@ -1,9 +1,9 @@
 """New points of a tile <-> bytes: the voxel of each, and where in it to a 32nd of its side.
 
-Half a centimetre is less than a sensor sees and a vehicle knows of its place, yet as float32 three quarters of a ballot
-were such digits. So vehicles round: a point stays in its voxel and moves by 4.7 mm along each axis at the most. Under
-zstd lie a mark, the ways from each point's cell to the next as two planes of bytes, from each layer to the next as
-four, and the places in the voxels as three. Older ballots hold finer places, or (m, 3) float32: mark and length tell.
+Half a centimetre is less than a sensor resolves and less than a vehicle knows of its position, yet as float32 three
+quarters of a ballot were such digits. So vehicles round: a point stays in its voxel and moves by at most 4.7 mm along
+each axis. Under zstd lie nine planes of bytes: the difference from each point's cell to the next (two), from each layer
+to the next (four), and the place in the voxel (three).
 """
 
 from __future__ import annotations
@@ -17,20 +17,18 @@ from mapvote.core.types import F32, U8, MapvoteError
 
 MAX_POINTS_PER_CELL = 64
 """One new point per voxel of a column: no honest ballot has more."""
-_MARK, _STEPS = 4, 32
-"""A voxel's side has so many steps, as the mark says. With it the length is never a multiple of three, as that of
-float32 always is."""
-_STEPS_OF = {3: 128, _MARK: _STEPS}
+_STEPS = 32
+"""Of a voxel's side."""
 MOST_OFF_M = 0.5 * CELL_SIZE / _STEPS
 """How far rounding moves a point along an axis, but for what float32 adds."""
 _BYTES = 9
-_MAX_BYTES = CELLS * MAX_POINTS_PER_CELL * 12
+_MAX_BYTES = CELLS * MAX_POINTS_PER_CELL * _BYTES
 _TOP_M = 1e5
 
 
 def pack_points(points: F32) -> bytes:
     """(m, 3) from the tile's corner, inside it, in any order."""
-    return compress(bytes([_MARK]) + _planes(points).tobytes())
+    return compress(_planes(points).tobytes())
 
 
 def unpack_points(data: bytes) -> F32:
@@ -46,13 +44,10 @@ def unpack_sound_points(data: bytes) -> F32:
     """(m, 3) float32 from the tile's corner, of a ballot that the server took in; MapvoteError if damaged, not finite
     or outside the tile."""
     raw = np.frombuffer(unpack_bytes(data, _MAX_BYTES, "ballot: new_points"), dtype=np.uint8)
-    if len(raw) % 12 == 0:
-        points, sound = raw.view("<f4").reshape(-1, 3), True
-    elif len(raw) % _BYTES == 1 and int(raw[0]) in _STEPS_OF:
-        points = np.empty((len(raw) // _BYTES, 3), dtype=np.float32)
-        sound = _placed(raw[1:].reshape(_BYTES, -1), _STEPS_OF[int(raw[0])], points)
-    else:
+    if len(raw) % _BYTES:
         raise MapvoteError(f"ballot: new_points has {len(raw)} bytes, which is no number of points")
+    points = np.empty((len(raw) // _BYTES, 3), dtype=np.float32)
+    sound = _placed(raw.reshape(_BYTES, -1), points)
     if not sound or not _all_inside(points, np.float32(TILE_CELLS * CELL_SIZE)):
         raise MapvoteError("ballot: new_points holds a point outside its tile or not finite")
     return points
@@ -81,7 +76,7 @@ def _planes(points: F32) -> U8:
 
 
 @numba.njit(cache=True, nogil=True)
-def _placed(planes: U8, steps: int, points: F32) -> bool:
+def _placed(planes: U8, points: F32) -> bool:
     """Fill ``points`` (m, 3) from (9, m); whether each lies in its voxel."""
     cell, layer, sound = np.int64(0), np.int64(0), True
     for i in range(len(points)):
@@ -91,8 +86,8 @@ def _placed(planes: U8, steps: int, points: F32) -> bool:
             way |= np.int64(planes[2 + k, i]) << (8 * k)
         layer = ((layer + way + (1 << 31)) & 0xFFFFFFFF) - (1 << 31)
         for axis, voxel in enumerate((cell % TILE_CELLS, cell // TILE_CELLS, layer)):
-            points[i, axis] = (voxel + (planes[6 + axis, i] + 0.5) / steps) * CELL_SIZE
-            sound &= planes[6 + axis, i] < steps
+            points[i, axis] = (voxel + (planes[6 + axis, i] + 0.5) / _STEPS) * CELL_SIZE
+            sound &= planes[6 + axis, i] < _STEPS
     return sound
 
 

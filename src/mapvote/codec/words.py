@@ -1,8 +1,7 @@
 """Column words of a tile <-> bytes: only those that are not zero, for masks and free space mark few of its cells.
 
 Under zstd lie the ways from each cell to the next as two planes of bytes, then the words as eight: bytes that mean the
-same lie together, which packs a fifth smaller than the words as they are. Ballots of format 1 hold the whole plane,
-524,288 bytes, which is no whole number of cells of ten: the length tells which.
+same lie together, which packs a fifth smaller than the words as they are.
 """
 
 from __future__ import annotations
@@ -27,15 +26,11 @@ def pack_words(plane: U64) -> bytes:
 
 
 def unpack_sparse(data: bytes, what: str) -> tuple[NDArray[np.intp], U64]:
-    """(flat cells (n,), ascending; their words (n,), none of them 0), of either format. MapvoteError if damaged.
+    """(flat cells (n,), ascending; their words (n,), none of them 0). MapvoteError if damaged.
 
     ``what`` names the plane in messages, e.g. "gone".
     """
     raw = np.frombuffer(unpack_bytes(data, CELLS * (_WAY + _WORD), f"ballot: {what}"), dtype=np.uint8)
-    if len(raw) == CELLS * _WORD:
-        plane = raw.view("<u8")
-        cells = np.flatnonzero(plane)
-        return cells, plane[cells]
     n, left = divmod(len(raw), _WAY + _WORD)
     cells, words = np.empty(n, dtype=np.intp), np.empty(n, dtype=np.uint64)
     if left or not _ascending(raw, cells, words):

@@ -10,7 +10,6 @@ from mapvote.doctor.maps import check_whole
 from mapvote.server.insight.overview import overview
 from mapvote.server.store.check import check
 from mapvote.server.store.keys import listed
-from mapvote.server.store.policy import MOVE_ON, current_policy
 from mapvote.server.store.store import Store
 
 _MEND = "mapvote check STORE --mend --from BACKUP"
@@ -29,7 +28,7 @@ def check_store(store: Store) -> list[Finding]:
     if at_a_glance["quarantined"]:
         what = f"{at_a_glance['quarantined']} damaged things were set aside: their votes and tiles do not count"
         found.append(Finding("warning", what, f"{_MEND} brings back what a backup has"))
-    found += _round(store) + _keys(store)
+    found += _keys(store)
     try:
         return in_order(found + check_whole(store.point_map()))
     except MapvoteError as error:
@@ -46,12 +45,6 @@ def _damage(store: Store) -> list[Finding]:
         if count > _TOLD:
             found.append(Finding("error", f"damaged: {count - _TOLD} more of the kind {kind}", _MEND))
     return found
-
-
-def _round(store: Store) -> list[Finding]:
-    if current_policy(store).round.method != "columns":
-        return []
-    return [Finding("warning", "its round asks for columns, which vehicles of this version do not cast", MOVE_ON)]
 
 
 def _keys(store: Store) -> list[Finding]:

@@ -6,7 +6,6 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
-import sqlalchemy as sa
 
 from hand_made import Say, make_ballot, make_map, make_tile, states_plane, two_walls
 from mapvote.codec.ballot import encode
@@ -17,11 +16,10 @@ from mapvote.fusion.probability import change_probability
 from mapvote.server.insight.desk import desk, review
 from mapvote.server.insight.explain import CellStory, explain_cell
 from mapvote.server.insight.history import changes_between
-from mapvote.server.store import migrate, schema
+from mapvote.server.store import schema
 from mapvote.server.store.admission import accept, examine
 from mapvote.server.store.ballots import Receipt
 from mapvote.server.store.check import check
-from mapvote.server.store.database import Database
 from mapvote.server.store.policy import Policy, current_policy, set_values
 from mapvote.server.store.publish import publish
 from mapvote.server.store.replay import replay
@@ -133,26 +131,6 @@ def test_a_round_without_a_vehicle_waits_as_it_would_have(store: Store) -> None:
     replay(store, "a", dry_run=False)
     assert middle(store).thing == "stands: surveyed", "without the liar one of two was not"
     assert not store.point_map().tiles[0, 0].obstacle_words[WALL[0]], "of the cell beside both were"
-
-
-def test_a_store_of_the_schema_before_is_upgraded_and_its_ballots_stand(database_url: str) -> None:
-    store = Store.create(database_url, two_walls(), BUDGET)
-    vote(store, "d1", None)
-    store.close()
-    database = Database(database_url)
-    with database.writing() as connection:
-        for statement in (
-            "ALTER TABLE ballot_tiles DROP COLUMN odds",
-            "ALTER TABLE decisions DROP COLUMN odds",
-            "UPDATE alembic_version SET version_num = '0012'",
-        ):
-            connection.execute(sa.text(statement))
-    assert migrate.upgrade(database) == ("0012", migrate.HEAD)
-    database.close()
-    store = Store.open(database_url)
-    assert check(store) == []
-    assert publish(store).deleted == 9
-    store.close()
 
 
 def test_what_spilled_over_goes_with_its_wall_and_its_story_says_that_nothing_changed_there(database_url: str) -> None:

@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-import hashlib
-
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hand_made import SHAPE
-from mapvote.codec.arrays import compress
 from mapvote.core.memory import PLANES, Memory
 from mapvote.server.store.blobs import pack_memory, unpack_memory_plane
 
@@ -22,10 +18,3 @@ def test_what_a_tile_remembers_comes_back_whether_of_few_cells_or_of_all(seed: i
     planes = np.where(rng.random((PLANES, *SHAPE)) < share, rng.integers(1, 2**32, (PLANES, *SHAPE)), 0)
     digest, packed = pack_memory(Memory.of(planes.astype(np.uint32)))
     np.testing.assert_array_equal(unpack_memory_plane(packed[digest], digest).planes, planes)
-
-
-@pytest.mark.parametrize("value", [0, 7])
-def test_the_whole_planes_of_an_older_mapvote_are_still_read(value: int) -> None:
-    planes = np.full((PLANES, *SHAPE), value, dtype="<u4")
-    digest = hashlib.sha256(planes.tobytes()).hexdigest()
-    np.testing.assert_array_equal(unpack_memory_plane(compress(planes.tobytes()), digest).planes, planes)

@@ -13,6 +13,7 @@ import pytest
 
 from hand_made import SETTINGS, Say, make_ballot, states_plane, two_walls, wall, words_plane
 from mapvote.codec.ballot import encode
+from mapvote.codec.points import pack_points, unpack_points
 from mapvote.config import FuseSettings
 from mapvote.core.grid import TileIndex
 from mapvote.core.memory import Memory
@@ -122,7 +123,7 @@ def test_a_standing_vote_counts_and_says_what_was_sent(store: Store) -> None:
     assert vote.free is not None
     assert vote.new_points is not None
     assert (vote.gone.words.tolist(), vote.free.words.tolist()) == ([0b10], [0b11])
-    assert vote.new_points.tobytes() == points.tobytes()
+    assert vote.new_points.tobytes() == unpack_points(pack_points(points)).tobytes()
 
 
 def test_a_tally_is_read_as_a_tally(store: Store) -> None:

@@ -16,11 +16,12 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from pypcd4 import PointCloud
 
-from hand_made import Say, make_ballot, states_plane, two_walls, wall
+from hand_made import Say, make_ballot, states_plane, wall
 from mapvote.cli.follow import follow_once
 from mapvote.client import MapClient
 from mapvote.codec.ballot import Ballot, encode
 from mapvote.codec.fields import FIELD_TYPES, pack_fields, unpack_fields
+from mapvote.codec.points import pack_points, unpack_points
 from mapvote.codec.tile_file import encode_tile
 from mapvote.config import FuseSettings
 from mapvote.core import lazy_tiles
@@ -32,11 +33,10 @@ from mapvote.formats import export_map, read_map
 from mapvote.fusion.offline import update_map
 from mapvote.server.http.app import create_app
 from mapvote.server.insight.overview import overview
-from mapvote.server.store import migrate, schema
+from mapvote.server.store import schema
 from mapvote.server.store.admission import accept, examine
 from mapvote.server.store.check import check
 from mapvote.server.store.clearing import clear
-from mapvote.server.store.database import Database
 from mapvote.server.store.policy import Policy, set_values
 from mapvote.server.store.publish import publish, rollback
 from mapvote.server.store.quarantine import set_aside
@@ -44,7 +44,7 @@ from mapvote.server.store.replay import replay
 from mapvote.server.store.store import Store
 
 POLICY = Policy(fuse=FuseSettings(max_deleted_share=1.0))
-BUILT = wall([(200, 200)], [0.45, 0.75])
+BUILT = unpack_points(pack_points(wall([(200, 200)], [0.45, 0.75])))
 BRIGHT = np.array([51, 204], dtype=np.uint8)
 KINDS = {"intensity": "u2", "red": "u2", "green": "u2", "blue": "u2", "classification": "u1", "gps_time": "f8"}
 
@@ -152,32 +152,6 @@ def test_a_flipped_bit_in_them_is_found_and_the_tile_waits_until_it_is_mended(st
     with store.database.writing() as connection:
         connection.execute(t.update().values(intensity=None))
     assert {damage.kind for damage in check(store)} == {"ballot"}, "what a ballot said of it is covered too"
-
-
-def test_a_store_of_the_schema_before_is_upgraded_and_its_ballots_stand(database_url: str) -> None:
-    store = Store.create(database_url, two_walls(), POLICY)
-    say = {(0, 0): Say(states_plane({(10, 10): CellState.CHANGED_EMPTY}), new_points=BUILT)}
-    accept(store, [examine(encode(make_ballot(two_walls(), say, vehicle))) for vehicle in "ab"])
-    store.close()
-    database = Database(database_url)
-    with database.writing() as connection:
-        for statement in (
-            "ALTER TABLE version_tiles DROP COLUMN fields",
-            "ALTER TABLE ballot_tiles DROP COLUMN intensity",
-            "ALTER TABLE ballot_tiles DROP COLUMN odds",
-            "ALTER TABLE decisions DROP COLUMN odds",
-            "UPDATE alembic_version SET version_num = '0011'",
-        ):
-            connection.execute(sa.text(statement))
-    with pytest.raises(MapvoteError, match="mapvote upgrade STORE"):
-        Store.open(database_url)
-    assert migrate.upgrade(database) == ("0011", migrate.HEAD)
-    database.close()
-    store = Store.open(database_url)
-    assert check(store) == []
-    assert publish(store).deleted == 3
-    assert store.point_map().field_names == []
-    store.close()
 
 
 @settings(max_examples=25, deadline=None)

@@ -22,7 +22,6 @@ from mapvote.server.errors import Conflict, Held, NotFound, Unavailable
 from mapvote.server.insight.explain import explain_cell
 from mapvote.server.store.admission import accept, examine
 from mapvote.server.store.ballots import Receipt, withdraw
-from mapvote.server.store.check import check
 from mapvote.server.store.policy import (
     GatePolicy,
     Policy,
@@ -34,7 +33,6 @@ from mapvote.server.store.policy import (
     set_values,
 )
 from mapvote.server.store.publish import preview, publish, rollback
-from mapvote.server.store.replay import replay
 from mapvote.server.store.store import Store
 
 EMPTY, KEEPS = CellState.CHANGED_EMPTY, CellState.UNCHANGED_OCCUPIED
@@ -148,8 +146,6 @@ def test_a_vote_on_what_has_changed_since_counts_no_more(store: Store) -> None:
     publish(store, POLICY)
     with pytest.raises(Conflict, match="has changed since version 1"):
         send(store, says(base, "c", EMPTY))
-    with pytest.raises(Conflict, match="no version had the tiles"):
-        send(store, says(base, "c", EMPTY, base={(0, 0): "f" * 64}, version=None))
     with pytest.raises(Conflict, match="is not that of version 1"):
         send(store, says(base, "c", EMPTY, NEXT, base={(0, 0): "f" * 64}))
     with pytest.raises(Conflict, match="no version 7 yet"):
@@ -173,20 +169,6 @@ def test_votes_are_spent_by_the_version_that_they_made(store: Store) -> None:
     for vehicle in "abc":
         say(vehicle, CellState.UNCHANGED_EMPTY)
         assert not publish(store, POLICY).published
-
-
-def test_a_ballot_of_an_older_mapvote_is_read_by_the_last_version_with_its_tiles(store: Store) -> None:
-    base = store.point_map()
-    old = [says(base, v, EMPTY, version=None) for v in "ab"]
-    send(store, *old)
-    publish(store, POLICY)
-    rollback(store, 1)
-    assert [receipt.repeated for receipt in send(store, *old)] == [True, True]
-    again = says(base, "a", EMPTY, NEXT, version=None, drive=old[0].drive)
-    send(store, again, says(base, "c", EMPTY, version=None))
-    story = explain_cell(store, (CELL[1] + 0.5) * 0.3, (CELL[0] + 0.5) * 0.3)
-    heard = {vote.vehicle: (vote.version, vote.counts) for vote in story.votes}
-    assert heard == {"a": (1, False), "b": (1, False), "c": (3, True)}, "a drive cannot have seen a later version"
 
 
 def test_a_rollback_does_not_come_back_by_itself_but_by_new_votes(store: Store) -> None:
@@ -255,24 +237,6 @@ def test_the_policy_says_how_a_round_votes_and_never_mixes(store: Store, other: 
     send(store, says(base, "d", EMPTY, **other))
     assert publish(store, POLICY).deleted == 3
     assert [(change.by, change.reason) for change in policy_changes(store)][-1] == ("ann", "a new release")
-
-
-def test_a_round_of_columns_from_before_goes_on_until_it_is_moved_and_none_begins_anew(store: Store) -> None:
-    """Vehicles of this version vote by surfaces; those of the one before may not have been updated yet."""
-    set_policy(store, Policy(round=RoundPolicy(method="columns")))
-    base = store.point_map()
-    with pytest.raises(Conflict, match=r"columns left the product.*round\.method=surfaces round\.settings_hash=DIGEST"):
-        send(store, says(base, "a", EMPTY, method="surfaces"))
-    send(store, *(says(base, vehicle, EMPTY, method="columns") for vehicle in "ab"))
-    set_values(store, {"fuse.min_votes": "2", "round.method": "columns"})
-    assert publish(store, POLICY).deleted == 3
-    set_values(store, {"round.method": "surfaces"})
-    with pytest.raises(MapvoteError, match=r"round\.method = 'columns': columns left.*round\.method=surfaces"):
-        set_values(store, {"round.method": "columns"})
-    published = store.point_map().tiles[0, 0].points.tobytes()
-    assert replay(store, "a").added == 3, "gone through again by the policy that held: b alone was not enough"
-    assert store.point_map().tiles[0, 0].points.tobytes() == published
-    assert check(store) == []
 
 
 def test_a_policy_is_changed_by_name_and_a_wrong_name_is_told(store: Store) -> None:

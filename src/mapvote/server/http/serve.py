@@ -15,7 +15,7 @@ import msgspec
 import structlog
 import uvicorn
 
-from mapvote.config import COLUMNS_LEFT, Settings
+from mapvote.config import Settings
 from mapvote.core.point_map import PointMap
 from mapvote.core.types import MapvoteError
 from mapvote.formats import read_map
@@ -25,7 +25,7 @@ from mapvote.server.http.connections import Connection, Crowd, Patience
 from mapvote.server.http.services import Services
 from mapvote.server.http.warming import settle
 from mapvote.server.store import keys
-from mapvote.server.store.policy import MOVE_ON, Policy, current_policy
+from mapvote.server.store.policy import Policy
 from mapvote.server.store.store import Store
 
 _FILES = 300
@@ -96,8 +96,6 @@ def serve(
     except OSError as error:
         listener.close()
         raise MapvoteError(f"cannot listen on {host}:{port} ({error.strerror}): choose another --port") from error
-    if current_policy(store).round.method == "columns":
-        structlog.get_logger("mapvote").warning("round", asks_for="columns", why=COLUMNS_LEFT, mend=MOVE_ON)
     settle()
     shown = f"[{host}]" if ":" in host else host
     ready(f"http://{shown}:{listener.getsockname()[1]}")

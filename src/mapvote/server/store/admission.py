@@ -32,7 +32,6 @@ from mapvote.server.store.queries import (
 from mapvote.server.store.quotas import Quota, Quotas
 from mapvote.server.store.reach import LowestGround, refuse_out_of_height, refuse_out_of_reach
 from mapvote.server.store.store import Store
-from mapvote.server.store.version_driven import NO_SUCH_BASE, version_driven
 
 MAX_CLOCK_AHEAD_NS = 300 * 10**9
 """A drive may end this much after the server's own time: clocks differ, but a vehicle from the future would make all
@@ -156,9 +155,7 @@ class Intake:
         impossible = impossible or refuse_out_of_height(ballot, current, partial(self._lowest.look_up, connection))
         if impossible is not None:
             return impossible
-        version = version_driven(connection, ballot, self._heard_at(connection, ballot))
-        if version is None:
-            return Conflict(NO_SUCH_BASE)
+        version = ballot.version
         if version > self._current[0]:
             return Conflict(f"there is no version {version} yet; the newest is {self._current[0]}: fetch it")
         counts = False
@@ -182,13 +179,6 @@ class Intake:
         if self._store.surveyed_ns is not None and ballot.end_ns < self._store.surveyed_ns:
             return MapvoteError("ballot: the drive ended before the map was surveyed; set the vehicle's clock")
         return None
-
-    def _heard_at(self, connection: sa.Connection, ballot: Ballot) -> int | None:
-        if ballot.version is not None:
-            return None
-        b = schema.ballots
-        mine = (b.c.vehicle == ballot.vehicle) & (b.c.drive == ballot.drive)
-        return connection.execute(sa.select(sa.func.min(b.c.first_seq)).where(mine)).scalar_one()
 
 
 def _brought_up(

@@ -9,16 +9,14 @@ from typing import Any
 import sqlalchemy as sa
 
 from mapvote.codec.ballot import Ballot, BallotTile, tile_key
-from mapvote.config import COLUMNS_LEFT
 from mapvote.core.types import MapvoteError
 from mapvote.server.errors import Conflict, NotFound, Unauthorised
 from mapvote.server.store import keys, schema
 from mapvote.server.store.database import insert_rows
-from mapvote.server.store.policy import MOVE_ON, RoundPolicy, policy_in
+from mapvote.server.store.policy import RoundPolicy, policy_in
 from mapvote.server.store.queries import log_event, next_seq
 from mapvote.server.store.store import Store
 from mapvote.server.store.sums import sum_of_planes
-from mapvote.server.store.version_driven import NO_SUCH_BASE, version_driven
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,17 +79,13 @@ def put_in(connection: sa.Connection, ballots: Sequence[Incoming], now: int) -> 
         if why is not None:
             results.append(why)
             continue
-        drove_with = version_driven(connection, ballot, first.get(key))
-        if drove_with is None:
-            results.append(Conflict(NO_SUCH_BASE))
-            continue
         if old is not None:
             replaced.append({"old": old[0], "by": seq})
         first.setdefault(key, seq)
         standing[key] = seq, incoming.digest
         log.append((seq, now, "ballot", *key))
         times = ballot.start_ns, ballot.end_ns, now
-        how = ballot.settings_hash[:128], incoming.cast_by, incoming.size, drove_with
+        how = ballot.settings_hash[:128], incoming.cast_by, incoming.size, ballot.version
         rows.append((seq, first[key], None, *key, incoming.digest, *times, *how))
         tiles += [_tile_row(seq, ballot, tile) for tile in ballot.tiles]
         if ballot.path is not None:
@@ -118,8 +112,6 @@ def unlike(asked: RoundPolicy, incoming: Incoming) -> MapvoteError | None:
     theirs = f"{incoming.cast_by}, settings {settings[:16]}"
     ours = f"{asked.cast_by}, settings {asked.settings_hash[:16] or 'of any kind'}"
     mend = "vote again with the fleet's configuration (mapvote config)"
-    if asked.method == "columns":
-        mend = f"{COLUMNS_LEFT}; for the operator: {MOVE_ON}"
     return Conflict(f"this round votes by {ours}, the ballot by {theirs}: one round never mixes them; {mend}")
 
 

@@ -141,11 +141,8 @@ def _raw_memory(memory: Memory) -> bytes:
 
 
 def unpack_memory_plane(data: bytes, digest: str) -> Memory:
-    """What a tile remembers; MapvoteError if it is not what its hash says. An older mapvote wrote whole planes: so many
-    bytes are no number of cells."""
+    """What a tile remembers; MapvoteError if it is not what its hash says."""
     raw = _unpack(data, digest)
-    if len(raw) == 4 * PLANES * CELLS:
-        return Memory.of(np.frombuffer(raw, dtype="<u4").reshape(PLANES, TILE_CELLS, TILE_CELLS))
     n = len(raw) // (2 + 4 * PLANES)
     cells = np.cumsum(np.frombuffer(raw, dtype="<u2", count=n), dtype=np.int64)
     return Memory(cells, np.frombuffer(raw, dtype="<u4", offset=2 * n).reshape(PLANES, n))

@@ -111,14 +111,14 @@ def _ends(connection: sa.Connection) -> Iterator[Damage]:
 def _ballots(connection: sa.Connection) -> Iterator[Damage]:
     t = schema.ballot_tiles
     for row in _in_batches(connection, sa.select(t).order_by(t.c.row, t.c.col, t.c.ballot)):
-        if row.sum and row.sum != ballot_sum(row):
+        if row.sum != ballot_sum(row):
             yield Damage("ballot", ballot_name(row.ballot, row.row, row.col), "is not what its sum says")
 
 
 def _decisions(connection: sa.Connection) -> Iterator[Damage]:
     d = schema.decisions
     for row in _in_batches(connection, sa.select(d).order_by(d.c.version, d.c.row, d.c.col)):
-        if row.sum and row.sum != sum_of_decision(row.states, row.tally, row.odds):
+        if row.sum != sum_of_decision(row.states, row.tally, row.odds):
             yield Damage(
                 "decision", f"{row.version} on tile {tile_key((row.row, row.col))}", "is not what its sum says"
             )

@@ -14,7 +14,7 @@ import sqlalchemy as sa
 
 from mapvote.fusion.tile_vote import DAY_NS
 from mapvote.server.store import schema
-from mapvote.server.store.policy import policy_in, recorded
+from mapvote.server.store.policy import Policy, policy_in
 from mapvote.server.store.queries import current_number, log_event, oldest_kept, shows_in_kept, version_of
 from mapvote.server.store.store import Store
 
@@ -105,7 +105,7 @@ def _longest_window_days(connection: sa.Connection, oldest: int) -> float:
     """By the policy that holds, and those by which the versions that are left would be made again."""
     v = schema.versions
     made_by = connection.execute(sa.select(v.c.policy).where(v.c.number >= oldest, v.c.kind == "publish")).scalars()
-    policies = [policy_in(connection), *(recorded(one) for one in made_by)]
+    policies = [policy_in(connection), *(Policy.model_validate(one) for one in made_by)]
     return max(max(policy.fuse.max_age_days, policy.fuse.stay_days) for policy in policies)
 
 

@@ -20,7 +20,7 @@ from mapvote.fusion.spent import unspent
 from mapvote.fusion.tile_vote import DAY_NS, TileVote, restrict, select
 from mapvote.server.store import schema
 from mapvote.server.store.blobs import unpack_cells
-from mapvote.server.store.policy import Policy, policy_in, recorded
+from mapvote.server.store.policy import Policy, policy_in
 from mapvote.server.store.quarantine import Damage, DamagedBallots, ballot_name, set_aside
 from mapvote.server.store.queries import Version
 from mapvote.server.store.stored_votes import Rows, StoredVote, read_rows, read_votes
@@ -45,7 +45,7 @@ class Electorate:
     @classmethod
     def of(cls, version: Version, without: Collection[str] = (), set_aside: Collection[str] = ()) -> Electorate:
         """Whose votes a version asked for, by the policy that it was made by."""
-        policy = recorded(version.policy)
+        policy = Policy.model_validate(version.policy)
         received_by_ns = version.created_ns - round(policy.fuse.min_age_s * 1e9)
         return cls(version.mark, policy, received_by_ns, without, set_aside)
 

@@ -1,6 +1,7 @@
-"""The schema's own history: a fresh store gets the newest, an older one is upgraded when told to, a newer one refused.
+"""The schema's history: a new store gets the newest schema, ``mapvote upgrade`` upgrades an older one, a newer one is
+refused.
 
-The revisions lie in ``migrations/versions``, one file each, run by alembic within one transaction: a store is at one
+The revisions lie in ``migrations/versions``, one file each. Alembic runs them within one transaction: a store is at one
 revision or at the next, never in between. There is no way down: restore the backup instead.
 """
 
@@ -14,17 +15,16 @@ import sqlalchemy as sa
 from mapvote.core.types import MapvoteError
 from mapvote.server.store.database import Database
 
-FIRST = "0001"
-HEAD = "0013"
+HEAD = "0001"
 """The revision that :mod:`mapvote.server.store.schema` describes."""
+REVISIONS = Path(__file__).parent / "migrations"
 
 
 def revision_of(connection: sa.Connection) -> str | None:
     """The schema revision of a database; None if it holds no store."""
-    inspector = sa.inspect(connection)
-    if inspector.has_table("alembic_version"):
-        return connection.execute(sa.text("SELECT version_num FROM alembic_version")).scalar_one_or_none()
-    return FIRST if inspector.has_table("maps") else None  # the first stores did not say which schema they have
+    if not sa.inspect(connection).has_table("alembic_version"):
+        return None
+    return connection.execute(sa.text("SELECT version_num FROM alembic_version")).scalar_one_or_none()
 
 
 def check(connection: sa.Connection) -> None:
@@ -48,8 +48,6 @@ def run_migrations(connection: sa.Connection) -> None:
 
     config = _config()
     config.attributes["connection"] = connection
-    if not sa.inspect(connection).has_table("alembic_version") and revision_of(connection) == FIRST:
-        command.stamp(config, FIRST)
     command.upgrade(config, "head")
 
 
@@ -78,5 +76,5 @@ def _config() -> Any:
     except ImportError as error:
         raise MapvoteError("creating or upgrading a store needs alembic: pip install 'mapvote[server]'") from error
     config = Config()
-    config.set_main_option("script_location", str(Path(__file__).parent / "migrations"))
+    config.set_main_option("script_location", str(REVISIONS))
     return config

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import sqlalchemy as sa
 from pydantic import Field, ValidationError
 
-from mapvote.config import COLUMNS_LEFT, FuseSettings, GateSettings, Section, Settings, did_you_mean
+from mapvote.config import FuseSettings, GateSettings, Section, Settings, did_you_mean
 from mapvote.core.types import MapvoteError
 from mapvote.server.store import schema
 from mapvote.server.store.queries import log_event
@@ -22,19 +22,10 @@ if TYPE_CHECKING:
     from mapvote.server.store.store import Store
 
 
-MOVE_ON = (
-    "once the fleet has this version, move the round over: mapvote policy STORE round.method=surfaces "
-    "round.settings_hash=DIGEST (mapvote config shows it)"
-)
-"""What to do about a round that still asks for columns."""
-
-
 class RoundPolicy(Section):
     """How the ballots of a round are cast. Others are refused, and those that stand already do not count."""
 
-    method: Literal["paper", "columns", "surfaces"] = Field(
-        default="surfaces", description="paper or surfaces; a round of columns, from before, goes on until it is moved"
-    )
+    method: Literal["paper", "surfaces"] = Field(default="surfaces", description="paper or surfaces")
     stage: Literal["one-stage", "two-stage"] = "two-stage"
     settings_hash: str = Field(
         default="",
@@ -96,24 +87,11 @@ class PolicyChange:
     policy: Policy
 
 
-def recorded(row: Mapping[str, Any]) -> Policy:
-    """The policy of a row or a version. What this program does not know any more is left out; versions of the second
-    schema and before recorded the settings of fusion alone, and all voted by columns."""
-    sections = dict(row if "fuse" in row or "round" in row else {"fuse": row})
-    sections["round"] = {"method": "columns", **sections.get("round", {})}
-    known = {
-        name: {key: value for key, value in sections.get(name, {}).items() if key in field.annotation.model_fields}
-        for name, field in Policy.model_fields.items()
-        if field.annotation is not None
-    }
-    return Policy.model_validate(known)
-
-
 def policy_in(connection: sa.Connection) -> Policy:
     """The newest policy."""
     p = schema.policies
     newest = sa.select(p.c.policy).order_by(p.c.seq.desc()).limit(1)
-    return recorded(connection.execute(newest).scalar_one())
+    return Policy.model_validate(connection.execute(newest).scalar_one())
 
 
 def current_policy(store: Store) -> Policy:
@@ -128,7 +106,7 @@ def policy_changes(store: Store) -> list[PolicyChange]:
     rows = sa.select(p.c.seq, e.c.at_ns, e.c.actor, e.c.detail, p.c.policy).join(e, e.c.seq == p.c.seq)
     with store.database.reading() as connection:
         found = connection.execute(rows.order_by(p.c.seq)).all()
-    return [PolicyChange(*row[:4], recorded(row[4])) for row in found]
+    return [PolicyChange(*row[:4], Policy.model_validate(row[4])) for row in found]
 
 
 def set_policy(store: Store, policy: Policy, *, by: str = "operator", reason: str = "") -> int:
@@ -154,8 +132,6 @@ def changed(policy: Policy, values: Mapping[str, Any]) -> Policy:
     for name, value in values.items():
         if name not in known:
             raise MapvoteError(f"policy: there is no {name!r}{did_you_mean(name, known)}")
-        if name == "round.method" and value == "columns" != policy.round.method:
-            raise MapvoteError(f"policy: round.method = 'columns': {COLUMNS_LEFT}; write round.method=surfaces")
         section, _, key = name.partition(".")
         sections[section][key] = value
     try:

@@ -22,7 +22,7 @@ _Hash = sa.String(64)
 TILE_PLANES = "points", "ground", "free", "memory", "fields"
 """Columns of version_tiles: hashes of planes."""
 BALLOT_PLANES = "states", "tally", "gone", "new_points", "free", "intensity", "odds"
-"""Columns of ballot_tiles that hold planes, those that came later last."""
+"""Columns of ballot_tiles that hold planes."""
 
 maps = sa.Table(
     "maps",

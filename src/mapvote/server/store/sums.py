@@ -10,9 +10,6 @@ from typing import Any
 
 import sqlalchemy as sa
 
-_FIRST_PLANES = 5
-"""Of a ballot's planes, from the beginning."""
-
 
 def sum_of(*parts: Any) -> str:
     """SHA-256 over the parts of a row, each with its length, so that none can pass for another.
@@ -27,19 +24,13 @@ def sum_of(*parts: Any) -> str:
 
 
 def sum_of_planes(base: str, planes: Sequence[bytes | None]) -> str:
-    """The sum of a ballot's votes on one tile, of all ``BALLOT_PLANES`` in their order.
-
-    Intensity and odds count only where there are any: what was written before there were these planes keeps its sum.
-    """
-    n = len(planes)
-    while n > _FIRST_PLANES and planes[n - 1] is None:
-        n -= 1
-    return sum_of(base, *planes[:n])
+    """The sum of a ballot's votes on one tile, of all ``BALLOT_PLANES`` in their order."""
+    return sum_of(base, *planes)
 
 
 def sum_of_decision(states: bytes, tally: bytes, odds: bytes | None) -> str:
-    """The sum of what was decided about one tile; of the odds only where there are any, as those of planes."""
-    return sum_of(states, tally, *(() if odds is None else (odds,)))
+    """The sum of what was decided about one tile."""
+    return sum_of(states, tally, odds)
 
 
 def _raw(part: Any) -> bytes:
