@@ -62,7 +62,6 @@ def build(
 
 
 def _tell(report: BuildReport, out: Path) -> None:
-    import numpy as np
 
     for track in report.tracks:
         line = (
@@ -86,10 +85,23 @@ def _tell(report: BuildReport, out: Path) -> None:
             "one ground: it keeps the road whose path is nearer, below both the lower one; who drives the other cannot "
             "vote there. (Less than a metre apart it is one road, mapped twice: the drives' heights do not agree.)"
         )
+    print(f"{out}: {report.points} points")
+    print(f"{out}: {_frame(report)}")
+
+
+def _frame(report: BuildReport) -> str:
+    """What the priors did to the map, in a sentence."""
+    import numpy as np
+
     sigma_m = max(float(np.median(track.sigma_m)) for track in report.tracks)
-    frame = "held in its frame by a precise prior" if report.held_by_prior else "laid on all priors together"
-    frame = f"{frame}, to {sigma_m:.2f} m" if sigma_m == sigma_m else "in the frame of its first scan"
-    print(f"{out}: {report.points} points, {frame}")
+    if np.isnan(sigma_m):
+        return "no drive has a prior: the frame of the map is that of its first scan"
+    if report.held_by_prior:
+        start = "the precise priors hold the map in their frame"
+    else:
+        start = "the priors are coarse: the whole survey was shifted and turned about the vertical to fit them"
+    bent = f"they then moved single scans by up to {report.bent_m:.2f} m"
+    return f"{start}; {bent}; positions are good to {sigma_m:.2f} m (1 sigma)"
 
 
 def vote(

@@ -15,14 +15,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from mapvote.config import Settings
-from mapvote.core.geometry import transform
 from mapvote.core.heights import Heights, check_heights, two_levels
 from mapvote.core.motions import inverses, rotation_angles
 from mapvote.core.point_map import PointMap, map_from_points
 from mapvote.core.types import F64, Bool, Drive, MapvoteError
 from mapvote.slam.accumulate import Layer
 from mapvote.slam.road import all_roads, road_under
-from mapvote.slam.settle import settle
+from mapvote.slam.settle import carried_along, settle
 from mapvote.slam.surveyor import Surveyed, Surveyor, is_precise
 
 Progress = Callable[[int, int], None]
@@ -73,6 +72,9 @@ class BuildReport:
     points: int
     held_by_prior: bool
     """Whether a precise prior fixed the map's frame; otherwise all priors together, or the first scan, did."""
+    bent_m: float
+    """How far the priors moved a scan at most, after the whole survey was shifted and turned to fit them; 0 without
+    priors."""
     two_levels: tuple[float, float, float] | None
     """(x, y, metres apart) where drives ran above each other, the farthest apart: of the two, each cell keeps the road
     whose path is nearer, below both the lower one. None if nowhere."""
@@ -94,7 +96,7 @@ def build_map(
     found = [surveyor.follow(drive, count) for drive in drives]
     settled = settle(drives, found)
     registered, poses = [one.registered for one in found], settled.T_map_lidar
-    cloud, lattice = transform(settled.T_map_draft, surveyor.draft.points()[0]), surveyor.draft.lattice
+    cloud, lattice = carried_along(surveyor.draft.points()[0], found, poses), surveyor.draft.lattice
     del surveyor  # and with it the largest part of what the first pass took
     roads = [road_under(T, mask, cloud) for T, mask in zip(poses, registered, strict=True)]
     road = all_roads(roads)
@@ -108,7 +110,7 @@ def build_map(
     tracks = tuple(_track(*each) for each in zip(drives, poses, found, heights, settled.sigma_m, strict=True))
     held = any(is_precise(drive) for drive in drives)
     points = sum(len(tile.points) for tile in point_map.tiles.values())
-    return point_map, BuildReport(tracks, points, held, two_levels(road) if len(road) else None)
+    return point_map, BuildReport(tracks, points, held, settled.bent_m, two_levels(road) if len(road) else None)
 
 
 def _place_on_earth(drives: Sequence[Drive]) -> Mapping[str, str]:

@@ -30,6 +30,8 @@ _REVISIT_M, _REVISIT_S = 10.0, 10.0
 """A scan this near to one at least so much older is linked to it."""
 _REWEIGHTED = 3
 """How often the priors' weights are taken anew."""
+_TOGETHER = 100_000
+"""Points that are moved together: each needs its own motion."""
 _ASKED = 12
 """Poses of a drive whose covariance is worked out; the others lie between."""
 
@@ -40,10 +42,10 @@ class Settled:
 
     T_map_lidar: list[F64]
     """(n, 4, 4) of each drive."""
-    T_map_draft: F64
-    """(4, 4) how the draft was moved as a whole, before it was bent a little."""
     sigma_m: list[F64]
     """(n,) standard deviation of each position in the frame of the priors; nan without any prior."""
+    bent_m: float
+    """How far the priors moved a scan at most, after the whole had been shifted and turned to fit them."""
 
 
 def settle(drives: Sequence[Drive], found: Sequence[Surveyed]) -> Settled:
@@ -51,18 +53,37 @@ def settle(drives: Sequence[Drive], found: Sequence[Surveyed]) -> Settled:
     poses = [one.T_map_lidar for one in found]
     starts = np.cumsum([0] + [len(T) for T in poses])
     T, known = np.concatenate(poses), np.flatnonzero(np.concatenate([one.registered for one in found]))
-    T_map_draft = np.eye(4)
     if not any(drive.T_map_lidar_prior is not None for drive in drives):
-        return Settled(poses, T_map_draft, [np.full(len(p), np.nan) for p in poses])
+        return Settled(poses, [np.full(len(p), np.nan) for p in poses], 0.0)
     if not any(is_precise(drive) for drive in drives):
-        T_map_draft = _laid_on_priors(drives, T, known, starts)
-        T = T_map_draft @ T
+        T = _laid_on_priors(drives, T, known, starts) @ T
+    rigid = T
     links = _links(drives, T, known, _pieces(found, starts))
     anchors = _anchors(drives, T, starts)
     for _ in range(_REWEIGHTED):
         T = optimise(T, links, anchors)
         anchors = [replace(a, weights=trust_in(_off(T, a), a.said_m)) for a in anchors]
-    return Settled(np.split(T, starts[1:-1]), T_map_draft, _sigmas(T, links, anchors, starts))
+    bent_m = float(np.linalg.norm((T - rigid)[:, :3, 3], axis=1).max())
+    return Settled(np.split(T, starts[1:-1]), _sigmas(T, links, anchors, starts), bent_m)
+
+
+def carried_along(points: F64, found: Sequence[Surveyed], settled: Sequence[F64]) -> F64:
+    """Points (n, 3) of the draft, each moved as the nearest scan was when its drive's poses (m, 4, 4) were settled.
+
+    The draft was measured at the poses of the first pass. A road that is looked for under settled poses in a draft that
+    is not bent alike lies too high here and too low there, by all that the first pass has drifted.
+    """
+    before, after = (np.concatenate(poses) for poses in ([one.T_map_lidar for one in found], list(settled)))
+    known = np.concatenate([one.registered for one in found])
+    before, after = before[known], after[known]
+    if np.array_equal(before, after):
+        return points
+    moved, tree, out = after @ inverses(before), cKDTree(before[:, :3, 3]), np.empty_like(points)
+    for first in range(0, len(points), _TOGETHER):
+        some = points[first : first + _TOGETHER]
+        T = moved[tree.query(some)[1]]
+        out[first : first + _TOGETHER] = np.einsum("nij,nj->ni", T[:, :3, :3], some) + T[:, :3, 3]
+    return out
 
 
 def _sigmas(T: F64, links: list[Links], anchors: list[Anchors], starts: I64) -> list[F64]:

@@ -22,7 +22,7 @@ def survey() -> tuple[Drive, DriveTrack]:
 
 def test_the_picture_is_the_same_each_time(tmp_path: Path) -> None:
     drive, track = survey()
-    report = BuildReport((track,), 1, False, None)
+    report = BuildReport((track,), 1, False, 0.0, None)
     for name in ("one.png", "two.png"):
         draw_survey([drive], report, tmp_path / name)
     assert (tmp_path / "one.png").read_bytes()[:4] == b"\x89PNG"
@@ -31,5 +31,7 @@ def test_the_picture_is_the_same_each_time(tmp_path: Path) -> None:
 
 def test_a_drive_without_priors_is_drawn_too(tmp_path: Path) -> None:
     drive, track = survey()
-    draw_survey([replace(drive, T_map_lidar_prior=None)], BuildReport((track,), 1, False, None), tmp_path / "x.png")
+    draw_survey(
+        [replace(drive, T_map_lidar_prior=None)], BuildReport((track,), 1, False, 0.0, None), tmp_path / "x.png"
+    )
     assert (tmp_path / "x.png").stat().st_size > 1000
