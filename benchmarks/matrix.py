@@ -1,6 +1,6 @@
 """The experiment matrix: every case, every condition, over seeds; tables in Markdown and all numbers in JSON.
 
-    python benchmarks/matrix.py --seeds 3,5,6,7,8 --out out/matrix  # everything (docs/measurements/columns.md)
+    python benchmarks/matrix.py --seeds 3,5,6,7,8 --out out/matrix  # everything
     python benchmarks/matrix.py --scenario corner --seeds 1 --experiments main # minutes
 
 A run that was cut short goes on where it stopped; what is done is written after every experiment. Seed 1 of

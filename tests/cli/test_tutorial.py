@@ -19,7 +19,7 @@ DRIVE = ROOT / "../shared/data/kitti/2011_09_26_0001"
 def test_the_tutorial_works_word_for_word(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     os.symlink(DRIVE.resolve(), "2011_09_26_drive_0001_sync")
-    text = (ROOT / "docs/tutorial.md").read_text()
+    text = (ROOT / "docs/vehicles.md").read_text()
     for block in re.findall(r"^```\n(.*?)^```", text, re.MULTILINE | re.DOTALL):
         for line in block.splitlines():
             type_in(line)

@@ -20,7 +20,7 @@ from mapvote.evaluation.columns_v1.judged import Weighed
 from mapvote.evaluation.columns_v1.regions import loose_voxels
 from mapvote.evaluation.columns_v1.rules import ALL_RULES, Rules
 
-# Set on the development streets (seeds 1, 11 and 12 of `street570`); docs/measurements/columns.md has what
+# Set on the development streets (seeds 1, 11 and 12 of `street570`); the measurements had what
 # each rule is worth on others.
 EMPTY_VOTES = 0.1
 """Rule F: votes of a ray through a free voxel, against one for a hit in it."""
