@@ -1,4 +1,4 @@
-"""Columns of evidence: every 0.3 m cell is one 64-bit word, bit i = voxel i of that column (docs/decisions/evidence.md).
+"""Columns: every 0.3 m cell has one 64-bit word, bit i = voxel i of that column (docs/decisions/evidence.md).
 
 Voxels lie on the world lattice: layer = floor(z / 0.3). Bit 0 is the layer that holds the ground of the
 cell (``base``), so words follow the terrain and 64 bits reach 19.2 m above the road; the top bit
