@@ -6,7 +6,7 @@
 A real server process on loopback, with keys. Against it, in a process of their own, everything at once or each alone:
 48 clients that ask for the most expensive reads again and again, 30 uploads that announce 10 MB and send a byte a
 second, 1,100 connections that never finish their headers and come back a second after they are cut, 8 clients with
-wrong keys.
+wrong keys, 8 clients whose headers have 40 MB each.
 Meanwhile one vehicle sends a ballot of about 20 kB every 100 ms, and somebody asks for /healthz as often, each on a
 connection of its own. Ends with 1 if, with everything at once, one ballot in a hundred waits longer than 1 s or one
 look at the health longer than 100 ms, or if any is refused.
@@ -51,7 +51,7 @@ from postgres_cluster import PostgresCluster
 
 TILES = [(row, col) for row in range(6) for col in range(6)]
 CELLS = [(r, c) for r in range(4, 252, 8) for c in range(4, 252, 8)]
-READS, UPLOADS, HALF_OPEN, WRONG = 48, 30, 1100, 8
+READS, UPLOADS, HALF_OPEN, WRONG, HEADS = 48, 30, 1100, 8, 8
 MOST_BALLOT_S, MOST_HEALTH_S = 1.0, 0.1
 Address = tuple[str, int]
 
@@ -152,13 +152,26 @@ async def wrong_key(address: Address, turn: int) -> None:
     ANSWERS[f"wrong key {status}"] += 1
 
 
+async def large_head(address: Address) -> None:
+    reader, writer = await asyncio.open_connection(*address)
+    try:
+        writer.write(b"GET /v1/map HTTP/1.1\r\nHost: localhost\r\nX-Long: ")
+        for _ in range(40):
+            writer.write(bytes(1_000_000).replace(b"\0", b"a"))
+            await writer.drain()
+        writer.write(b"\r\n\r\n")
+        ANSWERS[f"40 MB head {(await reader.read(100)).split()[1].decode()}"] += 1
+    finally:
+        writer.close()
+
+
 ANSWERS: Counter[str] = Counter()
 HERE: set[int] = set()
 """Half-open connections that have been made once."""
 
 
 async def attack(address: Address, keys: dict[str, str], kinds: set[str]) -> None:
-    """All of the kinds at once, until killed; once a second, what came of it on stdout."""
+    """All of the kinds at once, until killed."""
     tasks: list[asyncio.Task[None]] = []
 
     def start(n: int, work: Callable[[int], Coroutine[Any, Any, object]]) -> None:
@@ -172,6 +185,8 @@ async def attack(address: Address, keys: dict[str, str], kinds: set[str]) -> Non
         start(HALF_OPEN, lambda i: half_open(address, i))
     if "wrong keys" in kinds:
         start(WRONG, lambda i: wrong_key(address, i))
+    if "heads" in kinds:
+        start(HEADS, lambda i: large_head(address))
     await asyncio.gather(*tasks)
 
 
@@ -297,7 +312,7 @@ def main() -> None:
     parser.add_argument("--database", choices=("sqlite", "postgresql"), default="sqlite")
     parser.add_argument("--only-all", action="store_true", help="only everything at once")
     options = parser.parse_args()
-    every = {"reads", "uploads", "half-open", "wrong keys"}
+    every = {"reads", "uploads", "half-open", "wrong keys", "heads"}
     kinds = [every] if options.only_all else [set(), *({kind} for kind in sorted(every)), every]
     print(json.dumps({"database": options.database, "cores": len(os.sched_getaffinity(0))}), flush=True)
     with tempfile.TemporaryDirectory() as name:

@@ -113,11 +113,37 @@ def test_a_client_that_never_reads_is_cut(url: str, line: socket.socket) -> None
     assert received < 2 * 12 * POINTS
 
 
-def test_requests_by_the_thousand_in_one_go_are_refused(url: str, line: socket.socket) -> None:
+def test_requests_in_one_go_are_answered_one_after_another(line: socket.socket) -> None:
+    line.sendall(b"GET /healthz HTTP/1.1\r\nHost: localhost\r\n\r\n" * 200)
+    assert until_cut(line).count(b"HTTP/1.1 200 ") == 200
+
+
+@pytest.mark.parametrize("before", [b"", b"GET /healthz HTTP/1.1\r\nHost: localhost\r\n\r\n"])
+def test_a_head_of_more_than_32_kb_is_431_and_the_end_of_the_connection(line: socket.socket, before: bytes) -> None:
+    line.sendall(before)
+    assert not before or line.recv(1 << 16).startswith(b"HTTP/1.1 200 ")
+    line.sendall(b"GET /healthz HTTP/1.1\r\nHost: localhost\r\nX-Long: ")
+    start = time.monotonic()
     with suppress(ConnectionError):
-        line.sendall(b"GET /healthz HTTP/1.1\r\nHost: localhost\r\n\r\n" * 20_000)
-    assert b"HTTP/1.1 400 " in until_cut(line)
-    assert httpx2.get(f"{url}/healthz", timeout=PATIENT_S).status_code == 200
+        line.sendall(b"a" * 40_000_000)  # thrown away as it comes, or cut
+    assert b"HTTP/1.1 431 " in until_cut(line)
+    assert time.monotonic() - start < PATIENT_S
+
+
+def test_a_head_just_below_32_kb_is_read(url: str) -> None:
+    assert httpx2.get(f"{url}/healthz", headers={"X-Long": "a" * 30_000}).status_code == 200
+
+
+@pytest.mark.parametrize("start", [b"a" * 20, b"1;" + b"a" * 20, b"0\r\nX-Trailer: "])
+def test_a_chunk_line_or_a_trailer_without_end_is_cut(line: socket.socket, start: bytes) -> None:
+    head = b"POST /v1/publish HTTP/1.1\r\nHost: localhost\r\nTransfer-Encoding: chunked\r\n\r\n"
+    line.sendall(head + start)
+    sent = 0
+    with suppress(ConnectionError):
+        for _ in range(10_000):
+            line.sendall(b"a" * 4000)
+            sent += 4000
+    assert sent < 20_000_000
 
 
 def test_more_connections_than_allowed_cost_the_longest_silent_one(url: str) -> None:

@@ -1,20 +1,28 @@
-"""How long a connection may take, and how many there may be.
+"""Time limits and a head limit for each connection, and a limit on their number.
 
-uvicorn waits for ever for a request's headers, for its body, and for a reader to take the answer; it limits only the
-pause between two requests. Here every connection is always under one of four clocks, and when there are too many, the
-one that has kept silent longest makes room: half-open connections cannot keep an honest vehicle out.
+uvicorn limits only the pause between two requests. :class:`Connection` stands between the socket and uvicorn's
+protocol. It uses only the interface of :class:`asyncio.Protocol`. :func:`tracked` tells it when a request begins and
+ends. h11 limits what uvicorn keeps of an unfinished event (heads, chunk lines, trailers) to :data:`HEAD_BYTES`, too.
 """
 
 from __future__ import annotations
 
 import asyncio
+import re
+from collections.abc import Callable
+from contextvars import ContextVar
 from dataclasses import dataclass
-from typing import Any
+from typing import cast
 
-from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol, RequestResponseCycle
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-_TOO_SLOW = b"HTTP/1.1 408 Request Timeout\r\nConnection: close\r\nContent-Length: 0\r\n\r\n"
-_PIPELINED = 16
+HEAD_BYTES = 32_000
+"""A request's line and headers."""
+_LINGER_S = 1.0
+_END_OF_HEAD = re.compile(rb"\n\r?\n")
+_REFUSAL = "HTTP/1.1 {}\r\nConnection: close\r\nContent-Length: 0\r\n\r\n"
+_TOO_SLOW = _REFUSAL.format("408 Request Timeout").encode()
+_TOO_LARGE = _REFUSAL.format("431 Request Header Fields Too Large").encode()
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,7 +39,7 @@ class Patience:
 
 
 class Crowd:
-    """All connections of a server, and which of them have asked for nothing yet, the oldest first."""
+    """All connections of a server, and which of them have no request under way, the oldest first."""
 
     def __init__(self, most: int) -> None:
         self._most = most
@@ -48,7 +56,7 @@ class Crowd:
             oldest.transport.abort()
 
     def silent(self, connection: Connection) -> None:
-        """It has had its answer and asks for nothing at the moment."""
+        """Its request is answered."""
         if connection in self._all:
             self._silent[connection] = None
 
@@ -62,94 +70,145 @@ class Crowd:
         self._silent.pop(connection, None)
 
 
-class Connection(HttpToolsProtocol):
-    """One connection of uvicorn's, watched."""
+class Connection(asyncio.Protocol):
+    """One connection: hands everything to ``inner``, and cuts a client that keeps the server waiting."""
 
-    def __init__(self, *, patience: Patience, crowd: Crowd, **uvicorns: Any) -> None:
-        super().__init__(**uvicorns)
-        self._patience, self._crowd = patience, crowd
+    def __init__(self, inner: asyncio.Protocol, patience: Patience, crowd: Crowd) -> None:
+        self._inner, self._patience, self._crowd = inner, patience, crowd
+        self._loop = asyncio.get_running_loop()
         self._clock: asyncio.TimerHandle | None = None
-        """Runs while something is awaited from the client."""
+        """Runs while a head or a body is awaited."""
         self._unread: asyncio.TimerHandle | None = None
         """Runs while the client takes nothing of an answer."""
-        self._answering: RequestResponseCycle | None = None
-        """The request that is being answered; uvicorn's ``cycle`` is the one that came last."""
+        self._head: bytearray | None = bytearray()
+        """What has come of a head; None from its end to the end of its request's body."""
+        self._asked = self._answering = False
+        self._body_left = self._refused = False
 
-    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        """Wait for headers."""
-        super().connection_made(transport)
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        """Wait for a head."""
+        self.transport = cast("asyncio.Transport", transport)  # uvloop's is none by its class
+        self._inner.connection_made(transport)
         self._start(self._patience.header_s)
         self._crowd.add(self)
 
-    def connection_lost(self, exc: Exception | None) -> None:
-        """Stop every clock, and whatever still writes to nobody; uvicorn tells only the request that came last."""
-        super().connection_lost(exc)
-        self.pipeline.clear()
-        if self._answering is not None:
-            self._answering.disconnected = True
-            self._answering.message_event.set()
-        self._crowd.remove(self)
-        self._stop()
-        self.resume_writing()
-
     def data_received(self, data: bytes) -> None:
-        """Whatever comes between two requests, even a single byte, starts the clock of the next one's headers."""
-        super().data_received(data)
-        if self._idle() and self._clock is None and self.timeout_keep_alive_task is None:
+        """Whatever comes between two requests, even a single byte, starts the clock of the next one's head."""
+        if self._refused:
+            return
+        if self._head is not None:
+            self._head += data
+            if _END_OF_HEAD.search(self._head, 0, HEAD_BYTES):
+                self._head = None
+            elif len(self._head) > HEAD_BYTES:
+                self._refuse(_TOO_LARGE)
+                return
+        _CONNECTION.set(self)
+        self._inner.data_received(data)
+        if self._clock is None and not self._answering:
             self._start(self._patience.header_s)
 
-    def on_headers_complete(self) -> None:
-        """Wait for the body. Of requests that come before an answer uvicorn would queue any number."""
-        if len(self.pipeline) >= _PIPELINED:
-            raise ValueError("too many requests in one go")  # uvicorn answers 400 and hangs up
-        self._start(self._patience.body_s)
-        self._crowd.busy(self)
-        super().on_headers_complete()
+    def eof_received(self) -> bool | None:
+        """As the server wishes."""
+        return self._inner.eof_received()
 
-    def on_message_complete(self) -> None:
-        """Now the client waits for us."""
+    def connection_lost(self, error: Exception | None) -> None:
+        """Stop both clocks."""
+        self._crowd.remove(self)
         self._stop()
-        super().on_message_complete()
-
-    def on_response_complete(self) -> None:
-        """Silent until the next request: uvicorn's own clock runs. What is left of an unread body stays under ours."""
-        super().on_response_complete()
-        if self._idle():
-            self._crowd.silent(self)
-
-    def _start_asgi_task(self, cycle: RequestResponseCycle, app: Any) -> None:
-        self._answering = cycle
-        super()._start_asgi_task(cycle, app)
+        self._read_again()
+        self._inner.connection_lost(error)
 
     def pause_writing(self) -> None:
         """The client does not read."""
-        super().pause_writing()
-        self._unread = self.loop.call_later(self._patience.answer_s, self.transport.abort)
+        self._unread = self._loop.call_later(self._patience.answer_s, self.transport.abort)
+        self._inner.pause_writing()
 
     def resume_writing(self) -> None:
         """It does again."""
-        if self._unread is not None:
-            self._unread.cancel()
-            self._unread = None
-        super().resume_writing()
+        self._read_again()
+        self._inner.resume_writing()
 
-    def _idle(self) -> bool:
-        return self.cycle is None or bool(self.cycle.response_complete)
+    def begin_request(self, has_body: bool) -> None:
+        """A head is complete: wait for its body, if it has one."""
+        self._head, self._asked, self._answering, self._body_left = None, True, True, has_body
+        self._crowd.busy(self)
+        self._stop()
+        if has_body:
+            self._start(self._patience.body_s)
+
+    def end_body(self) -> None:
+        """Now the client waits for the server."""
+        self._body_left = False
+        self._stop()
+
+    def end_request(self) -> None:
+        """Its answer is sent. What is left of an unread body stays under its clock; h11 throws it away."""
+        self._answering = False
+        self._head = None if self._body_left else bytearray()
+        self._crowd.silent(self)
 
     def _start(self, seconds: float) -> None:
-        self._stop()
-        self._clock = self.loop.call_later(seconds, self._too_slow)
+        self._clock = self._loop.call_later(seconds, self._too_slow)
 
     def _stop(self) -> None:
         if self._clock is not None:
             self._clock.cancel()
             self._clock = None
 
+    def _read_again(self) -> None:
+        if self._unread is not None:
+            self._unread.cancel()
+            self._unread = None
+
     def _too_slow(self) -> None:
-        """Before any answer has begun there is room for one; else the line is cut."""
         self._clock = None
-        if self.cycle is None and not self.transport.is_closing():
-            self.transport.write(_TOO_SLOW)
-            self.transport.close()
-        else:
+        if self._asked:
             self.transport.abort()
+        else:
+            self._refuse(_TOO_SLOW)
+
+    def _refuse(self, answer: bytes) -> None:
+        """Answer and hang up. What still comes is thrown away for a moment: to close at once would reset the line, and
+        the client would never read the answer."""
+        self._refused = True
+        self._stop()
+        if not self.transport.is_closing():
+            self.transport.write(answer)
+            self.transport.write_eof()
+            self._clock = self._loop.call_later(_LINGER_S, self.transport.abort)
+
+
+_CONNECTION: ContextVar[Connection | None] = ContextVar("mapvote_connection", default=None)
+"""The connection that a request came by: uvicorn starts a request's task while it is handed the bytes."""
+
+
+def watched(inner: Callable[..., asyncio.Protocol], patience: Patience) -> Callable[..., asyncio.Protocol]:
+    """A factory of protocols as uvicorn's own, each behind a :class:`Connection`."""
+    crowd = Crowd(patience.connections)
+    return lambda **uvicorns: Connection(inner(**uvicorns), patience, crowd)
+
+
+def tracked(app: ASGIApp) -> ASGIApp:
+    """``app``, which tells the connection of each request when the request begins, has a whole body, and ends."""
+
+    async def run(scope: Scope, receive: Receive, send: Send) -> None:
+        connection = _CONNECTION.get()
+        if connection is None or scope["type"] != "http":
+            await app(scope, receive, send)
+            return
+
+        async def received() -> Message:
+            message = await receive()
+            if message["type"] == "http.request" and not message.get("more_body", False):
+                connection.end_body()
+            return message
+
+        sized = {name: value for name, value in scope["headers"] if name in (b"content-length", b"transfer-encoding")}
+        connection.begin_request(has_body=bool(sized) and sized.get(b"content-length") != b"0")
+        try:
+            await app(scope, received, send)
+        finally:
+            connection.end_request()
+
+    return run

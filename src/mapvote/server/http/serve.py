@@ -8,7 +8,6 @@ import resource
 import socket
 import sys
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 
 import msgspec
@@ -21,8 +20,7 @@ from mapvote.core.types import MapvoteError
 from mapvote.formats import read_map
 from mapvote.server.http.app import create_app
 from mapvote.server.http.browsers import HEADERS
-from mapvote.server.http.connections import Connection, Crowd, Patience
-from mapvote.server.http.services import Services
+from mapvote.server.http.connections import HEAD_BYTES, Patience, tracked, watched
 from mapvote.server.http.warming import settle
 from mapvote.server.store import keys
 from mapvote.server.store.policy import Policy
@@ -102,8 +100,9 @@ def serve(
     most = settings.server
     patience = Patience(most.header_timeout_s, most.body_timeout_s, most.answer_timeout_s, _room_for(most.connections))
     config = uvicorn.Config(
-        app,
-        http=partial(Connection, patience=patience, crowd=Crowd(patience.connections)),  # type: ignore[arg-type]
+        tracked(app),
+        http="h11",
+        h11_max_incomplete_event_size=HEAD_BYTES,
         ws="none",
         access_log=False,
         forwarded_allow_ips=["127.0.0.1", "::1"],  # a proxy on this machine says whom it speaks for
@@ -112,9 +111,11 @@ def serve(
         server_header=False,
         headers=list(HEADERS),
     )
+    config.load()
+    config.http_protocol_class = watched(config.http_protocol_class, patience)  # type: ignore[assignment]
     sys.setswitchinterval(_SWITCH_S)
     with listener:
-        _Server(config).run(sockets=[listener])
+        _Server(config, app.state.services.stop_fusing).run(sockets=[listener])
 
 
 def _room_for(connections: int) -> int:
@@ -130,9 +131,12 @@ def _room_for(connections: int) -> int:
 class _Server(uvicorn.Server):
     """Lets go of a publish under way when it is told to stop: what waits to be fused is dropped."""
 
+    def __init__(self, config: uvicorn.Config, stop_fusing: Callable[[], None]) -> None:
+        super().__init__(config)
+        self._stop_fusing = stop_fusing
+
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
-        parts: Services = self.config.app.state.services  # type: ignore[union-attr]
-        parts.stop_fusing()
+        self._stop_fusing()
         await super().shutdown(sockets)
 
 
