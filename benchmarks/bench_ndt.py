@@ -23,8 +23,8 @@ from mapvote.formats import open_drive, read_T_map_lidar
 from mapvote.localisation.deskew import deskew, motion_at
 from mapvote.localisation.map_window import window_points
 from mapvote.localisation.ndt import CENTRAL_M, build_ndt, register
-from mapvote.simulation import simulate
 from mapvote.slam.build import build_map
+from mapvote_lab.simulation import simulate
 
 
 def vgicp(target: small_gicp.GaussianVoxelMap, points: F64, guess: F64) -> F64:

@@ -21,9 +21,9 @@ from mapvote.core.point_map import PointMap
 from mapvote.core.types import Drive
 from mapvote.formats import open_drive
 from mapvote.perception.frontend import DriveReport
-from mapvote.simulation import simulate
 from mapvote.slam.build import build_map
 from mapvote.vehicle import vote_drive
+from mapvote_lab.simulation import simulate
 
 STAGES = ("localise", "ground", "moving", "see", "vote")
 

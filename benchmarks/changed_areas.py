@@ -13,20 +13,20 @@ import argparse
 from pathlib import Path
 
 from mapvote.config import cache_folder, load_settings
-from mapvote.evaluation.experiments.cases import COLUMNS_V1, choose_cases, fuse_case
-from mapvote.evaluation.experiments.changed_areas import in_changed_areas, survey_anew
-from mapvote.evaluation.experiments.passes import passes
-from mapvote.evaluation.experiments.pose_errors import map_frame
-from mapvote.evaluation.experiments.scene import Scene
-from mapvote.evaluation.results import to_json
-from mapvote.evaluation.scoring.truth import PoseErrors
 from mapvote.formats.atomic import whole_file
+from mapvote_lab.evaluation.experiments.cases import COLUMNS_V1, choose_cases, fuse_case
+from mapvote_lab.evaluation.experiments.changed_areas import in_changed_areas, survey_anew
+from mapvote_lab.evaluation.experiments.passes import passes
+from mapvote_lab.evaluation.experiments.pose_errors import map_frame
+from mapvote_lab.evaluation.experiments.scene import Scene
+from mapvote_lab.evaluation.results import to_json
+from mapvote_lab.evaluation.scoring.truth import PoseErrors
 
 OLD, UPDATED, ANEW = "old map", "updated map", "map surveyed anew"
 
 
 def measure(scene: Scene, workers: int) -> dict[str, PoseErrors]:
-    """Errors by map, as :func:`mapvote.evaluation.scoring.truth.error_summary` gives them."""
+    """Errors by map, as :func:`mapvote_lab.evaluation.scoring.truth.error_summary` gives them."""
     scene.prepare()
     cases, _ = choose_cases(scene.settings, "all")
     drives = passes(scene, cases, workers)

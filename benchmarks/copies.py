@@ -23,13 +23,13 @@ import numpy as np
 
 from mapvote.codec.ballot import Ballot, unpack_states
 from mapvote.config import FuseSettings, Settings
-from mapvote.evaluation.experiments.attacks import jitter, replay
-from mapvote.evaluation.experiments.cases import COLUMNS_V1, choose_cases, fuse_case
-from mapvote.evaluation.experiments.passes import have_voted, passes
-from mapvote.evaluation.experiments.scene import Scene
-from mapvote.evaluation.scoring.jury import Jury
 from mapvote.fusion.copies import LEAST_MOVED, difference
 from mapvote.fusion.offline import update_map
+from mapvote_lab.evaluation.experiments.attacks import jitter, replay
+from mapvote_lab.evaluation.experiments.cases import COLUMNS_V1, choose_cases, fuse_case
+from mapvote_lab.evaluation.experiments.passes import have_voted, passes
+from mapvote_lab.evaluation.experiments.scene import Scene
+from mapvote_lab.evaluation.scoring.jury import Jury
 
 ALIKE: dict[str, Any] = {
     "vehicle_lanes": ["east outer"],

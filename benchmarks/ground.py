@@ -21,10 +21,10 @@ from mapvote.core.grid import CELL_SIZE, Grid
 from mapvote.core.reference import reference_window
 from mapvote.core.types import F64
 from mapvote.formats import open_drive
-from mapvote.simulation import simulate
-from mapvote.simulation.drives import _stage
-from mapvote.simulation.scenario import load_scenario
 from mapvote.slam.build import build_map
+from mapvote_lab.simulation import simulate
+from mapvote_lab.simulation.drives import _stage
+from mapvote_lab.simulation.scenario import load_scenario
 
 NEAR_M = 10.0
 ONE_VEHICLE = {"vehicles": 1}

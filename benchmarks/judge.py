@@ -23,7 +23,7 @@ from typing import Any
 
 from judge_run import STAGES, WARM_UP, WHOLE, judge
 from judge_streets import recorded, simulated
-from mapvote.evaluation.reporting.style import GONE, STANDING, new_figure, save
+from mapvote.plots import GONE, STANDING, new_figure, save
 
 PEERS = {"localise": "VGICP", "moving": "dufomap", "see + vote": "cloud-to-cloud", WHOLE: "the three"}
 

@@ -16,13 +16,13 @@ from mapvote.core.columns import GROUND_MARGIN_M
 from mapvote.core.point_map import all_points
 from mapvote.core.types import F64, U64, Bool
 from mapvote.detection.voters import Voter
-from mapvote.evaluation.baselines.nearest_neighbour import heights
-from mapvote.evaluation.experiments.cases import ballot_states
-from mapvote.evaluation.scoring.cells import score_cells
-from mapvote.evaluation.scoring.truth import Truth, error_summary, lay_on, rigid_between
 from mapvote.localisation.deskew import deskew, motion_at
 from mapvote.perception.frontend import Observation
 from mapvote.vehicle import Vehicle
+from mapvote_lab.evaluation.baselines.nearest_neighbour import heights
+from mapvote_lab.evaluation.experiments.cases import ballot_states
+from mapvote_lab.evaluation.scoring.cells import score_cells
+from mapvote_lab.evaluation.scoring.truth import Truth, error_summary, lay_on, rigid_between
 
 WARM_UP = 25
 """Scans: the first leaves for the voter after some fifteen."""

@@ -7,10 +7,10 @@ from pathlib import Path
 
 from mapvote.core.point_map import PointMap
 from mapvote.core.types import F64, Drive
-from mapvote.evaluation.scoring.truth import Truth, read_truth
 from mapvote.formats import open_drive, read_map, read_T_map_lidar, write_map
-from mapvote.simulation import simulate
 from mapvote.slam.build import build_map
+from mapvote_lab.evaluation.scoring.truth import Truth, read_truth
+from mapvote_lab.simulation import simulate
 
 
 @dataclass(frozen=True)

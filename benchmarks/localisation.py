@@ -26,8 +26,8 @@ from mapvote.localisation.deskew import deskew, motion_at
 from mapvote.localisation.map_window import MapWindow
 from mapvote.localisation.ndt import PosePrior, register
 from mapvote.localisation.tracker import Tracker
-from mapvote.simulation import simulate
 from mapvote.slam.build import build_map
+from mapvote_lab.simulation import simulate
 
 SETTINGS = Settings()
 

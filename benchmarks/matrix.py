@@ -16,11 +16,12 @@ from pathlib import Path
 
 from rich.console import Console
 
+from mapvote import plots as style
 from mapvote.config import cache_folder, load_settings
-from mapvote.evaluation.experiments.matrix import EXPERIMENTS, Matrix
-from mapvote.evaluation.reporting import matrix_tables, requirements, study_figures, style
-from mapvote.evaluation.results import MatrixResult, to_json
 from mapvote.formats.atomic import whole_file
+from mapvote_lab.evaluation.experiments.matrix import EXPERIMENTS, Matrix
+from mapvote_lab.evaluation.reporting import matrix_tables, requirements, study_figures
+from mapvote_lab.evaluation.results import MatrixResult, to_json
 
 
 def main() -> None:

@@ -28,12 +28,12 @@ from mapvote.core.point_map import map_from_points
 from mapvote.core.reference import reference_window
 from mapvote.core.types import F32, F64, Bool, Drive
 from mapvote.core.voxels import voxel_downsample
-from mapvote.evaluation.baselines.occupied_briefly import OccupiedBriefly
 from mapvote.formats import open_drive
 from mapvote.perception import moving_objects
 from mapvote.perception.frontend import Movers
 from mapvote.perception.moving_objects import MovingFilter
-from mapvote.simulation import simulate
+from mapvote_lab.evaluation.baselines.occupied_briefly import OccupiedBriefly
+from mapvote_lab.simulation import simulate
 
 
 @dataclass

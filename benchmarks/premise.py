@@ -24,15 +24,15 @@ from mapvote.core.geometry import exp
 from mapvote.core.point_map import PointMap
 from mapvote.core.types import F64, Drive
 from mapvote.core.voxels import thin
-from mapvote.evaluation.experiments.cases import COLUMNS_V1, choose_cases, fuse_case
-from mapvote.evaluation.experiments.changed_areas import localise_in, scans_near_changes
-from mapvote.evaluation.experiments.passes import passes
-from mapvote.evaluation.experiments.pose_errors import map_frame
-from mapvote.evaluation.experiments.scene import Scene
-from mapvote.evaluation.scoring.truth import pose_errors
 from mapvote.localisation.deskew import deskew, motion_at, twist_between
 from mapvote.localisation.map_window import window_points
 from mapvote.localisation.ndt import Level, NdtMap, in_rows, refine
+from mapvote_lab.evaluation.experiments.cases import COLUMNS_V1, choose_cases, fuse_case
+from mapvote_lab.evaluation.experiments.changed_areas import localise_in, scans_near_changes
+from mapvote_lab.evaluation.experiments.passes import passes
+from mapvote_lab.evaluation.experiments.pose_errors import map_frame
+from mapvote_lab.evaluation.experiments.scene import Scene
+from mapvote_lab.evaluation.scoring.truth import pose_errors
 
 SCENARIO = "half_gone"
 LEVELS = {"NDT, .5 m": Level(0.5, 0.05, 0.5, 30), "NDT, 1 m": Level(1.0, 0.1, 0.5, 30)}

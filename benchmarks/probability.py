@@ -26,13 +26,13 @@ from mapvote.config import FuseSettings, Settings
 from mapvote.core.grid import CELLS
 from mapvote.core.types import F64, I64, Bool, CellState
 from mapvote.detection import surface_odds
-from mapvote.evaluation.experiments.attacks import ATTACKS
-from mapvote.evaluation.experiments.real.street import lay_street, open_recording, part_of
-from mapvote.evaluation.scoring.map_points import map_obstacles, same_rows
-from mapvote.evaluation.scoring.reliability import binned
 from mapvote.fusion import probability
 from mapvote.fusion.offline import update_map
 from mapvote.vehicle import vote_drive
+from mapvote_lab.evaluation.experiments.attacks import ATTACKS
+from mapvote_lab.evaluation.experiments.real.street import lay_street, open_recording, part_of
+from mapvote_lab.evaluation.scoring.map_points import map_obstacles, same_rows
+from mapvote_lab.evaluation.scoring.reliability import binned
 from probability_scenes import Cells, called, decided, driven, judged, of_decision, stacked, taken
 
 FIT = ("corner:1", "corner:22", "corner:44", "corner:61", "junction:1", "street:2", "slanted:1")

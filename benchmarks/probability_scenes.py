@@ -22,17 +22,17 @@ from mapvote.core.tile import Tile
 from mapvote.core.types import F64, I8, I64, U8, Bool, CellState
 from mapvote.core.voting import VOTE_UNIT
 from mapvote.detection.surface_odds import depths_m
-from mapvote.evaluation.experiments.conditions import Conditions
-from mapvote.evaluation.experiments.scene import BALLOTS_FROM, Scene, key_of, sources_digest
-from mapvote.evaluation.scoring.cells import UNSCORED
-from mapvote.evaluation.scoring.jury import Jury
-from mapvote.evaluation.scoring.map_points import MapJudge, map_obstacles, same_rows
-from mapvote.evaluation.scoring.truth import Truth
 from mapvote.fusion.fuse import Decision
 from mapvote.fusion.offline import update_map
 from mapvote.fusion.pending import standing_beside
 from mapvote.fusion.probability import alike_beside
 from mapvote.vehicle import NOTHING, Vehicle, offered
+from mapvote_lab.evaluation.experiments.conditions import Conditions
+from mapvote_lab.evaluation.experiments.scene import BALLOTS_FROM, Scene, key_of, sources_digest
+from mapvote_lab.evaluation.scoring.cells import UNSCORED
+from mapvote_lab.evaluation.scoring.jury import Jury
+from mapvote_lab.evaluation.scoring.map_points import MapJudge, map_obstacles, same_rows
+from mapvote_lab.evaluation.scoring.truth import Truth
 
 Told = Mapping[TileIndex, tuple[F64, F64]]
 """By tile what was looked at in its changed cells (m, k), and how deep in them their surface lies (m,), metres."""

@@ -22,7 +22,7 @@ from statistics import fmean
 from typing import Any
 
 from mapvote.core.sensors import SENSORS
-from mapvote.simulation.scenario import load_scenario
+from mapvote_lab.simulation.scenario import load_scenario
 
 CASES = "1", "2", "3", "4", "5"
 PAPER = {"1": 0.830, "2": 0.829, "3": 0.811, "4": 0.807, "5": 0.850}

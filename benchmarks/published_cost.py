@@ -21,11 +21,11 @@ import numpy as np
 
 from mapvote.config import Settings, cache_folder
 from mapvote.core.sensors import SENSORS
-from mapvote.evaluation.baselines.run import yardsticks
-from mapvote.evaluation.experiments.cases import choose_cases
-from mapvote.evaluation.experiments.passes import passes
-from mapvote.evaluation.experiments.scene import Scene
-from mapvote.evaluation.experiments.study import as_paper
+from mapvote_lab.evaluation.baselines.run import yardsticks
+from mapvote_lab.evaluation.experiments.cases import choose_cases
+from mapvote_lab.evaluation.experiments.passes import passes
+from mapvote_lab.evaluation.experiments.scene import Scene
+from mapvote_lab.evaluation.experiments.study import as_paper
 
 STRETCH: Mapping[str, Any] = {
     "length_m": 90.0,

@@ -21,17 +21,17 @@ import numpy as np
 from mapvote.config import Settings, cache_folder
 from mapvote.core.point_map import PointMap, all_points, map_from_points
 from mapvote.core.reference import reference_window
-from mapvote.evaluation.experiments.cases import choose_cases
-from mapvote.evaluation.experiments.kept import read_kept
-from mapvote.evaluation.experiments.passes import pass_folder
-from mapvote.evaluation.experiments.scene import Scene
-from mapvote.evaluation.experiments.study import as_paper
-from mapvote.evaluation.experiments.sweep import decided
-from mapvote.evaluation.scoring.cells import CLASSES, Scores, score_cells
-from mapvote.evaluation.scoring.paper_tables import F1, PRECISION, RECALL
-from mapvote.simulation.scenario import load_scenario
 from mapvote.slam.accumulate import Layer
 from mapvote.slam.road import all_roads, road_under
+from mapvote_lab.evaluation.experiments.cases import choose_cases
+from mapvote_lab.evaluation.experiments.kept import read_kept
+from mapvote_lab.evaluation.experiments.passes import pass_folder
+from mapvote_lab.evaluation.experiments.scene import Scene
+from mapvote_lab.evaluation.experiments.study import as_paper
+from mapvote_lab.evaluation.experiments.sweep import decided
+from mapvote_lab.evaluation.scoring.cells import CLASSES, Scores, score_cells
+from mapvote_lab.evaluation.scoring.paper_tables import F1, PRECISION, RECALL
+from mapvote_lab.simulation.scenario import load_scenario
 
 SCENARIO, CASES = "as_published", "1,2,3,4,5"
 VOTED, DROPPED, KEPT = "as voted on", "laid again, without strays", "laid again, with strays"

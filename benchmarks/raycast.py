@@ -19,9 +19,9 @@ import numpy as np
 import open3d as o3d
 
 from mapvote.core.types import F32, I32
-from mapvote.simulation.drives import _stage, _street
-from mapvote.simulation.lidar import Caster, sweep
-from mapvote.simulation.scenario import load_scenario
+from mapvote_lab.simulation.drives import _stage, _street
+from mapvote_lab.simulation.lidar import Caster, sweep
+from mapvote_lab.simulation.scenario import load_scenario
 
 _Answer = tuple[F32, I32, F32]
 

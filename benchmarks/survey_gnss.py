@@ -21,15 +21,15 @@ from mapvote.config import Settings
 from mapvote.core.geometry import from_xyz_rpy
 from mapvote.core.sensors import SENSORS
 from mapvote.core.types import F32, F64, Drive, Scan
-from mapvote.evaluation.scoring.truth import rigid_between
 from mapvote.formats import open_drive
-from mapvote.simulation.lidar import Caster, measure, sweep
-from mapvote.simulation.routes import make_routes
-from mapvote.simulation.scenario import load_scenario
-from mapvote.simulation.world import make_world
 from mapvote.slam.frame import fit_to_priors
 from mapvote.slam.settle import settle
 from mapvote.slam.surveyor import Surveyor
+from mapvote_lab.evaluation.scoring.truth import rigid_between
+from mapvote_lab.simulation.lidar import Caster, measure, sweep
+from mapvote_lab.simulation.routes import make_routes
+from mapvote_lab.simulation.scenario import load_scenario
+from mapvote_lab.simulation.world import make_world
 
 RATE_HZ = 5.0
 SIGMA_M, MEMORY_S = 1.5, 20.0

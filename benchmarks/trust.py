@@ -21,12 +21,12 @@ from mapvote.config import Settings
 from mapvote.core.geometry import from_xyz_rpy, interpolate, inverse, rotation_angle
 from mapvote.core.point_map import PointMap
 from mapvote.core.types import F64, Drive
-from mapvote.evaluation.scoring.truth import rigid_between
 from mapvote.formats import open_drive, read_T_map_lidar
 from mapvote.localisation.localiser import Localiser
 from mapvote.localisation.ndt import PosePrior
-from mapvote.simulation import simulate
 from mapvote.slam.build import build_map
+from mapvote_lab.evaluation.scoring.truth import rigid_between
+from mapvote_lab.simulation import simulate
 
 SETTINGS = Settings()
 Case = tuple[PointMap, Drive, F64]

@@ -17,8 +17,8 @@ from mapvote.fusion.copies import grouped
 from mapvote.fusion.outliers import contradicts
 from mapvote.localisation.ndt_solver import align
 from mapvote.perception.range_image import look
-from mapvote.simulation import simulate
 from mapvote.warmup import warm_up
+from mapvote_lab.simulation import simulate
 
 SOURCES = Path(mapvote.__file__).parent
 _BOUND = "-dac_override,-dac_read_search"

@@ -20,7 +20,7 @@ pytestmark = pytest.mark.slow
 BASE_LACKS = ["sqlalchemy", "alembic", "fastapi", "uvicorn", "structlog", "embreex", "matplotlib", "small_gicp"]
 TRIES = {
     "server": ["log", "no-store.db"],
-    "sim": ["simulate", "no-scenario", "out"],
+    "lab": ["simulate", "no-scenario", "out"],
 }
 """A verb of each extra, and words that make it fail without it, and otherwise at something else."""
 

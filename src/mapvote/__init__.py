@@ -27,7 +27,6 @@ if TYPE_CHECKING:
     from mapvote.formats import write_map as write_map
     from mapvote.formats.drives.point_fields import scan_from_point_cloud2 as scan_from_point_cloud2
     from mapvote.fusion.offline import update_map as update_map
-    from mapvote.simulation import simulate as simulate
     from mapvote.slam.build import build_map as build_map
     from mapvote.vehicle import Vehicle as Vehicle
     from mapvote.vehicle import vote_drive as vote_drive
@@ -49,7 +48,6 @@ _HOME = {
     "open_drive": "formats",
     "read_map": "formats",
     "scan_from_point_cloud2": "formats.drives.point_fields",
-    "simulate": "simulation",
     "update_map": "fusion.offline",
     "vote_drive": "vehicle",
     "write_map": "formats",

@@ -78,8 +78,8 @@ VERBS = {
     "changes STORE --out new": "import mapvote.server.insight.history as m; m.changes_between = wait",
     "vehicles STORE": "import mapvote.server.insight.history as m; m.vehicle_standings = wait",
     "config": "import mapvote.config as m; m.load_with_sources = wait",
-    "demo --quick --out new": "import mapvote.evaluation.demo as m; m.evaluate = wait",
-    "evaluate tiny.toml --json new": "import mapvote.evaluation.evaluate as m; m.evaluate = wait",
+    "demo --quick --out new": "import mapvote_lab.evaluation.demo as m; m.evaluate = wait",
+    "evaluate tiny.toml --json new": "import mapvote_lab.evaluation.evaluate as m; m.evaluate = wait",
     "warmup": "import mapvote.warmup as m; m.warm_up = wait",
     "follow http://localhost:9 new --autoware": "import mapvote.client as m; m.MapClient.newest = wait",
     "policy STORE": "import mapvote.server.store.policy as m; m.policy_told = wait",
@@ -185,7 +185,7 @@ def test_ctrl_c_between_the_two_renames_of_a_map_brings_the_old_one_back(made: P
 @pytest.mark.slow
 def test_ctrl_c_while_processes_simulate_leaves_no_process_and_no_folder(made: Path, desk: Desk) -> None:
     here = desk("tiny.toml")
-    patch = "import mapvote.simulation.drives as m; m._processes = lambda stage: 2"
+    patch = "import mapvote_lab.simulation.drives as m; m._processes = lambda stage: 2"
     done = interrupt(
         slowed(["simulate", "tiny.toml", "street"], patch), here,
         lambda: any(here.glob(".street.partial/.*/velodyne/*.bin")),

@@ -11,8 +11,8 @@ from mapvote.core.geometry import from_xyz_rpy
 from mapvote.core.point_map import map_from_points
 from mapvote.core.sensors import SENSORS
 from mapvote.core.types import MapvoteError
-from mapvote.evaluation.loopback import running_server
 from mapvote.formats import DriveWriter, write_map
+from mapvote_lab.evaluation.loopback import running_server
 
 
 def street(wall_y: float) -> np.ndarray:

@@ -16,13 +16,13 @@ from mapvote.config import Settings
 from mapvote.core.geometry import exp, from_xyz_rpy
 from mapvote.core.grid import Lattice
 from mapvote.core.types import MapvoteError
-from mapvote.evaluation.evaluate import Evaluation, evaluate
-from mapvote.evaluation.experiments.cases import choose_cases
-from mapvote.evaluation.experiments.scene import Scene
-from mapvote.evaluation.reporting import tables
-from mapvote.evaluation.reporting.html import Section, page
-from mapvote.evaluation.results import EvaluationResult, to_json
-from mapvote.evaluation.scoring.truth import error_summary, pose_errors, rigid_between
+from mapvote_lab.evaluation.evaluate import Evaluation, evaluate
+from mapvote_lab.evaluation.experiments.cases import choose_cases
+from mapvote_lab.evaluation.experiments.scene import Scene
+from mapvote_lab.evaluation.reporting import tables
+from mapvote_lab.evaluation.reporting.html import Section, page
+from mapvote_lab.evaluation.results import EvaluationResult, to_json
+from mapvote_lab.evaluation.scoring.truth import error_summary, pose_errors, rigid_between
 
 SLOWER = {"rate_hz": 4.0, "sensor": "vlp16"}
 """Fewer scans and beams than the paper has: a test asks whether it works, not how well."""
@@ -101,7 +101,7 @@ def test_a_misspelt_case_is_named_and_one_that_was_renamed() -> None:
 
 
 def test_no_truth_no_score(tmp_path: Path) -> None:
-    from mapvote.evaluation.scoring.truth import read_truth
+    from mapvote_lab.evaluation.scoring.truth import read_truth
 
     with pytest.raises(MapvoteError, match="no usable truth"):
         read_truth(tmp_path)
@@ -143,7 +143,7 @@ def test_the_page_needs_nothing_else_and_escapes_what_it_is_given() -> None:
 
 @pytest.mark.slow
 def test_the_demo_tells_its_story(tmp_path: Path) -> None:
-    from mapvote.evaluation.demo import demo
+    from mapvote_lab.evaluation.demo import demo
 
     evaluation, story = demo(tmp_path / "out", quick=True)
     assert story.found == story.objects > 0

@@ -12,11 +12,11 @@ from mapvote.core.geometry import from_xyz_rpy
 from mapvote.core.point_map import all_points, map_from_points
 from mapvote.core.sensors import SENSORS
 from mapvote.core.types import MapvoteError, Scan
-from mapvote.evaluation.loopback import running_server, vote_by_http
 from mapvote.formats import write_map
 from mapvote.fusion.offline import update_map
 from mapvote.localisation.localiser import GivenPoses
 from mapvote.vehicle import Vehicle
+from mapvote_lab.evaluation.loopback import running_server, vote_by_http
 
 
 def wall(y: float) -> np.ndarray:

@@ -15,13 +15,13 @@ WRITTEN = [
     "sqlalchemy<2.2,>=2.1; extra == 'server'",
     "prometheus-client>=0.21; extra == 'server'",
     'uvloop>=0.21; (sys_platform != "win32") and extra == "server"',
-    "embreex>=2.17.7; extra == 'sim'",
+    "embreex>=2.17.7; extra == 'lab'",
 ]
 
 
 @pytest.mark.parametrize(
     ("module", "extra"),
-    [("sqlalchemy.orm", "server"), ("prometheus_client", "server"), ("uvloop", "server"), ("embreex", "sim")],
+    [("sqlalchemy.orm", "server"), ("prometheus_client", "server"), ("uvloop", "server"), ("embreex", "lab")],
 )
 def test_the_smallest_extra_that_brings_a_module_is_named(
     module: str, extra: str, monkeypatch: pytest.MonkeyPatch

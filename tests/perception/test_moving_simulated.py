@@ -16,7 +16,7 @@ from mapvote.core.reference import reference_window
 from mapvote.core.types import Bool
 from mapvote.formats import open_drive
 from mapvote.perception.moving_objects import MovingFilter
-from mapvote.simulation import simulate
+from mapvote_lab.simulation import simulate
 
 
 def labels(street: Path, vehicle: str, stride: int) -> tuple[Bool, Bool]:

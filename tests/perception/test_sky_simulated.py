@@ -14,10 +14,10 @@ from mapvote.formats.drives.poses import read_poses
 from mapvote.localisation.deskew import deskew, motion_at
 from mapvote.perception.fans import follow_rays
 from mapvote.perception.sky import Sky
-from mapvote.simulation import simulate
-from mapvote.simulation.lidar import Caster
-from mapvote.simulation.scenario import load_scenario
-from mapvote.simulation.world import make_world
+from mapvote_lab.simulation import simulate
+from mapvote_lab.simulation.lidar import Caster
+from mapvote_lab.simulation.scenario import load_scenario
+from mapvote_lab.simulation.world import make_world
 
 WINDOW_M = 40.0
 

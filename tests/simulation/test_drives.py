@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 
 from mapvote.core.geometry import inverse, log, transform
 from mapvote.core.types import F64, MapvoteError
-from mapvote.simulation import simulate
+from mapvote_lab.simulation import simulate
 
 FEW = {"length_m": 30.0, "speed_kmh": 90.0, "vehicles": 2, "changes": [], "sensor": "vlp16"}
 

@@ -9,11 +9,11 @@ import pytest
 
 from mapvote.core.sensors import SENSORS
 from mapvote.core.types import F32, F64
-from mapvote.simulation import shapes, simulate
-from mapvote.simulation.drives import _stage
-from mapvote.simulation.flaws import PULSE_M, Hits, Kinds, chance_of, mixed, spoil
-from mapvote.simulation.lidar import Caster, Sweep, measure, sweep
-from mapvote.simulation.scenario import Flaws, load_scenario
+from mapvote_lab.simulation import shapes, simulate
+from mapvote_lab.simulation.drives import _stage
+from mapvote_lab.simulation.flaws import PULSE_M, Hits, Kinds, chance_of, mixed, spoil
+from mapvote_lab.simulation.lidar import Caster, Sweep, measure, sweep
+from mapvote_lab.simulation.scenario import Flaws, load_scenario
 
 SENSOR = SENSORS["hdl32e"]
 NONE = Flaws(reflection_share=0, mixed_share=0, wet_share=0, glass_share=0, dark_share=0)

@@ -10,10 +10,10 @@ import pytest
 from mapvote.core.geometry import inverse, transform
 from mapvote.core.grid import CELL_SIZE
 from mapvote.core.types import F64, U8
-from mapvote.evaluation.scoring.truth import Truth, read_truth
-from mapvote.simulation import simulate
-from mapvote.simulation.scenario import load_scenario
-from mapvote.simulation.truth import T_map_street, truth_grid
+from mapvote_lab.evaluation.scoring.truth import Truth, read_truth
+from mapvote_lab.simulation import simulate
+from mapvote_lab.simulation.scenario import load_scenario
+from mapvote_lab.simulation.truth import T_map_street, truth_grid
 
 SHORT = {"length_m": 36.0, "width_m": 60.0, "speed_kmh": 90.0, "vehicles": 1, "sensor": "vlp16"}
 

@@ -7,10 +7,10 @@ import pytest
 
 from mapvote.core.sensors import SENSORS
 from mapvote.core.types import F32, F64
-from mapvote.simulation import shapes
-from mapvote.simulation.drives import _stage
-from mapvote.simulation.lidar import NOTHING, Caster, measure, sweep
-from mapvote.simulation.scenario import load_scenario
+from mapvote_lab.simulation import shapes
+from mapvote_lab.simulation.drives import _stage
+from mapvote_lab.simulation.lidar import NOTHING, Caster, measure, sweep
+from mapvote_lab.simulation.scenario import load_scenario
 
 
 def at(T: F64) -> F64:

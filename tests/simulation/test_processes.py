@@ -11,11 +11,11 @@ from pathlib import Path
 
 import pytest
 
-from mapvote.simulation.processes import processes
+from mapvote_lab.simulation.processes import processes
 
 TASKS = """
 import pathlib, signal, sys, time
-from mapvote.simulation.processes import processes
+from mapvote_lab.simulation.processes import processes
 
 signal.signal(signal.SIGINT, signal.default_int_handler)
 

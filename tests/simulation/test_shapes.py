@@ -8,9 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mapvote.core.types import F64
-from mapvote.simulation import buildings, furniture, shapes
-from mapvote.simulation.scenario import load_scenario
-from mapvote.simulation.terrain import KERB_HEIGHT_M, KERB_M, make_terrain
+from mapvote_lab.simulation import buildings, furniture, shapes
+from mapvote_lab.simulation.scenario import load_scenario
+from mapvote_lab.simulation.terrain import KERB_HEIGHT_M, KERB_M, make_terrain
 
 sizes = st.floats(0.2, 5.0)
 few = settings(max_examples=20)

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from mapvote.core.types import MapvoteError
-from mapvote.simulation.actors import make_traffic
-from mapvote.simulation.routes import make_routes
-from mapvote.simulation.scenario import load_scenario, names
-from mapvote.simulation.truth import CHANGED_EMPTY, CHANGED_OCCUPIED, UNCHANGED, UNSCORED, label_cells, truth_grid
-from mapvote.simulation.world import Body, Role, make_world
+from mapvote_lab.simulation.actors import make_traffic
+from mapvote_lab.simulation.routes import make_routes
+from mapvote_lab.simulation.scenario import load_scenario, names
+from mapvote_lab.simulation.truth import CHANGED_EMPTY, CHANGED_OCCUPIED, UNCHANGED, UNSCORED, label_cells, truth_grid
+from mapvote_lab.simulation.world import Body, Role, make_world
 
 
 @pytest.mark.parametrize("name", ["as_published", "street570"])

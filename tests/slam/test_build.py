@@ -13,13 +13,13 @@ from mapvote.core.point_map import all_points, map_from_points
 from mapvote.core.reference import reference_window
 from mapvote.core.sensors import SENSORS
 from mapvote.core.types import F64, Drive, MapvoteError, Scan
-from mapvote.evaluation.scoring.truth import rigid_between
 from mapvote.formats import open_drive, read_T_map_lidar
 from mapvote.localisation.map_window import MapWindow
 from mapvote.localisation.ndt import PosePrior
 from mapvote.localisation.tracker import Tracker
-from mapvote.simulation import simulate
 from mapvote.slam.build import BuildReport, _agreed_heights, build_map
+from mapvote_lab.evaluation.scoring.truth import rigid_between
+from mapvote_lab.simulation import simulate
 from streets import drive_along, path, street
 
 SURVEY = path(25, -15.0)

@@ -104,7 +104,7 @@ def doctor(
     warnings = sum(f.severity == "warning" for f in diagnosis.findings)
     print(f"{path}: {errors} errors, {warnings} warnings" if errors or warnings else f"{path}: sound")
     if png is not None:
-        from mapvote.evaluation.reporting.doctor_figure import draw_diagnosis
+        from mapvote.plots import draw_diagnosis
 
         draw_diagnosis(diagnosis, point_map, png)
         print(f"{png}: the scans as read, and as mended")

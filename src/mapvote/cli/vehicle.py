@@ -55,7 +55,7 @@ def build(
         write_map(point_map, out)
     _tell(report, out)
     if report_png is not None:
-        from mapvote.evaluation.reporting.survey_figure import draw_survey
+        from mapvote.plots import draw_survey
 
         draw_survey(opened, report, report_png)
         print(f"{report_png}: where the drives went, and how far off their priors")

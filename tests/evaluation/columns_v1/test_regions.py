@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mapvote.core.types import U8, CellState
-from mapvote.evaluation.columns_v1.regions import unexplained
+from mapvote_lab.evaluation.columns_v1.regions import unexplained
 
 UE, CO = CellState.UNCHANGED_EMPTY, CellState.CHANGED_OCCUPIED
 

@@ -1,6 +1,6 @@
 """Rules and their letters."""
 
-from mapvote.evaluation.columns_v1.rules import ALL_RULES, Rules, by_letters
+from mapvote_lab.evaluation.columns_v1.rules import ALL_RULES, Rules, by_letters
 
 
 def test_rules_are_named_by_the_letters_of_the_manual() -> None:

@@ -7,8 +7,8 @@ import pytest
 from scipy import ndimage
 
 from mapvote.core.types import U8, CellState
-from mapvote.evaluation.columns_v1.regions import drop_specks
-from mapvote.evaluation.columns_v1.specks import small_groups
+from mapvote_lab.evaluation.columns_v1.regions import drop_specks
+from mapvote_lab.evaluation.columns_v1.specks import small_groups
 
 UO, UE, CO, CE, UN = (int(state) for state in CellState)
 

@@ -14,11 +14,11 @@ from mapvote.core.reference import LocalMap, reference_window
 from mapvote.core.types import CellState
 from mapvote.detection.near_hits import HIT_REACH_M
 from mapvote.detection.votes import TileVotes
-from mapvote.evaluation.columns_v1.counters import ColumnEvidence
-from mapvote.evaluation.columns_v1.regions import beside_new
-from mapvote.evaluation.columns_v1.rules import ALL_RULES, Rules
-from mapvote.evaluation.columns_v1.voter import ColumnVoter
 from mapvote.perception.raycast import ScanView, Sight
+from mapvote_lab.evaluation.columns_v1.counters import ColumnEvidence
+from mapvote_lab.evaluation.columns_v1.regions import beside_new
+from mapvote_lab.evaluation.columns_v1.rules import ALL_RULES, Rules
+from mapvote_lab.evaluation.columns_v1.voter import ColumnVoter
 
 ROW = 100
 WALL, POST = range(100, 112), 112

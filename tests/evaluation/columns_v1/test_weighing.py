@@ -14,11 +14,11 @@ from mapvote.core.types import NO_VOTE, U64, CellState
 from mapvote.core.voting import VOTE_UNIT
 from mapvote.detection.counters import PLANES
 from mapvote.detection.regions import fallen
-from mapvote.evaluation.columns_v1.counters import STRUCK_ITSELF, THROUGH_ITSELF, WORDS
-from mapvote.evaluation.columns_v1.judged import Weighed
-from mapvote.evaluation.columns_v1.regions import drop_specks, remnants, unexplained
-from mapvote.evaluation.columns_v1.rules import ALL_RULES, Rules
-from mapvote.evaluation.columns_v1.weighing import CLEAR_SCANS, weigh
+from mapvote_lab.evaluation.columns_v1.counters import STRUCK_ITSELF, THROUGH_ITSELF, WORDS
+from mapvote_lab.evaluation.columns_v1.judged import Weighed
+from mapvote_lab.evaluation.columns_v1.regions import drop_specks, remnants, unexplained
+from mapvote_lab.evaluation.columns_v1.rules import ALL_RULES, Rules
+from mapvote_lab.evaluation.columns_v1.weighing import CLEAR_SCANS, weigh
 
 UO, UE, CO, CE, UN = CellState
 FREE = ~np.uint64(0)

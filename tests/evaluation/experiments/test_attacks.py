@@ -12,7 +12,8 @@ from mapvote.codec.words import unpack_words
 from mapvote.config import FuseSettings
 from mapvote.core.point_map import PointMap
 from mapvote.core.types import NO_VOTE, CellState
-from mapvote.evaluation.experiments.attacks import (
+from mapvote.fusion.offline import update_map
+from mapvote_lab.evaluation.experiments.attacks import (
     ATTACKS,
     SHIFT_CELLS,
     all_changed,
@@ -22,7 +23,6 @@ from mapvote.evaluation.experiments.attacks import (
     shift,
     stale,
 )
-from mapvote.fusion.offline import update_map
 
 TILE = (0, 0)
 STANDS, FREE, BUILT, GONE = (10, 10), (40, 40), (50, 50), (10, 12)

@@ -9,7 +9,10 @@ import pytest
 
 from hand_made import AtOnce, two_walls
 from mapvote.core.types import Drive, Registration, Scan
-from mapvote.evaluation.experiments.conditions import (
+from mapvote.formats import open_drive
+from mapvote.localisation.ndt import PosePrior
+from mapvote.localisation.tracker import Fix
+from mapvote_lab.evaluation.experiments.conditions import (
     NOISE_MEMORY_S,
     Conditions,
     Shaken,
@@ -17,13 +20,10 @@ from mapvote.evaluation.experiments.conditions import (
     ar1,
     with_true_ground,
 )
-from mapvote.evaluation.scoring.truth import read_truth
-from mapvote.formats import open_drive
-from mapvote.localisation.ndt import PosePrior
-from mapvote.localisation.tracker import Fix
-from mapvote.simulation import simulate
-from mapvote.simulation.scenario import load_scenario
-from mapvote.simulation.world import make_world
+from mapvote_lab.evaluation.scoring.truth import read_truth
+from mapvote_lab.simulation import simulate
+from mapvote_lab.simulation.scenario import load_scenario
+from mapvote_lab.simulation.world import make_world
 
 
 def test_ar1_noise_has_its_deviation_and_its_memory() -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from mapvote.core.types import CellState
-from mapvote.evaluation.experiments.imported_map import over_both_rounds
+from mapvote_lab.evaluation.experiments.imported_map import over_both_rounds
 
 KEPT, FREE = CellState.UNCHANGED_OCCUPIED, CellState.UNCHANGED_EMPTY
 BUILT, GONE = CellState.CHANGED_OCCUPIED, CellState.CHANGED_EMPTY

@@ -9,14 +9,14 @@ import msgspec
 import pytest
 
 from mapvote.config import Settings
-from mapvote.evaluation.experiments.matrix import EXPERIMENTS, Matrix
-from mapvote.evaluation.reporting import requirements
-from mapvote.evaluation.reporting.matrix_tables import FIGURES, Spread, class_table, spread, table
-from mapvote.evaluation.reporting.requirements import DEMANDS, Demand
-from mapvote.evaluation.results import CaseResult, MapShift, MatrixResult, RoundResult, to_json
-from mapvote.evaluation.scoring.cells import ByClass, Scores
-from mapvote.evaluation.scoring.map_points import MapScores
-from mapvote.evaluation.scoring.objects import ObjectScores
+from mapvote_lab.evaluation.experiments.matrix import EXPERIMENTS, Matrix
+from mapvote_lab.evaluation.reporting import requirements
+from mapvote_lab.evaluation.reporting.matrix_tables import FIGURES, Spread, class_table, spread, table
+from mapvote_lab.evaluation.reporting.requirements import DEMANDS, Demand
+from mapvote_lab.evaluation.results import CaseResult, MapShift, MatrixResult, RoundResult, to_json
+from mapvote_lab.evaluation.scoring.cells import ByClass, Scores
+from mapvote_lab.evaluation.scoring.map_points import MapScores
+from mapvote_lab.evaluation.scoring.objects import ObjectScores
 
 
 def scores(macro: float) -> Scores:

@@ -10,19 +10,19 @@ import pytest
 from mapvote.config import Settings
 from mapvote.core.types import MapvoteError
 from mapvote.detection.readings import OPEN_SENTENCES, read
-from mapvote.evaluation.evaluate import Evaluation, evaluate
-from mapvote.evaluation.experiments.cases import choose_cases, paper_cases
-from mapvote.evaluation.experiments.kept import read_kept
-from mapvote.evaluation.experiments.passes import pass_folder
-from mapvote.evaluation.experiments.scene import Scene
-from mapvote.evaluation.experiments.study import Study
-from mapvote.evaluation.experiments.sweep import decided
-from mapvote.evaluation.reporting.budget_figure import budget_figure
-from mapvote.evaluation.reporting.style import save
-from mapvote.evaluation.reporting.tables import as_json, as_text
-from mapvote.evaluation.scoring.budget import Budget
-from mapvote.evaluation.scoring.cells import UNSCORED, confusion
-from mapvote.evaluation.scoring.jury import Jury
+from mapvote.plots import save
+from mapvote_lab.evaluation.evaluate import Evaluation, evaluate
+from mapvote_lab.evaluation.experiments.cases import choose_cases, paper_cases
+from mapvote_lab.evaluation.experiments.kept import read_kept
+from mapvote_lab.evaluation.experiments.passes import pass_folder
+from mapvote_lab.evaluation.experiments.scene import Scene
+from mapvote_lab.evaluation.experiments.study import Study
+from mapvote_lab.evaluation.experiments.sweep import decided
+from mapvote_lab.evaluation.reporting.budget_figure import budget_figure
+from mapvote_lab.evaluation.reporting.tables import as_json, as_text
+from mapvote_lab.evaluation.scoring.budget import Budget
+from mapvote_lab.evaluation.scoring.cells import UNSCORED, confusion
+from mapvote_lab.evaluation.scoring.jury import Jury
 
 pytestmark = pytest.mark.slow
 

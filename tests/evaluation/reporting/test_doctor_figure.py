@@ -9,7 +9,7 @@ import pytest
 from mapvote.core.point_map import map_from_points
 from mapvote.doctor.diagnosis import Diagnosis
 from mapvote.doctor.finding import Finding
-from mapvote.evaluation.reporting.doctor_figure import draw_diagnosis
+from mapvote.plots import draw_diagnosis
 from streets import drive_along, path
 
 

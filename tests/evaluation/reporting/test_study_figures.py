@@ -8,16 +8,16 @@ from typing import Any
 import numpy as np
 import pytest
 
+from mapvote import plots as style
 from mapvote.core.grid import Grid, Lattice
 from mapvote.core.types import NO_VOTE, CellState
 from mapvote.core.voting import VOTE_UNIT
-from mapvote.evaluation.reporting import style
-from mapvote.evaluation.reporting.study_figures import ablation, reliability_diagram, robustness
-from mapvote.evaluation.results import MapShift, MatrixResult, RoundResult
-from mapvote.evaluation.scoring.cells import ByClass, Scores
-from mapvote.evaluation.scoring.objects import ObjectScores
-from mapvote.evaluation.scoring.reliability import binned, reliability
 from mapvote.fusion.fuse import Decision
+from mapvote_lab.evaluation.reporting.study_figures import ablation, reliability_diagram, robustness
+from mapvote_lab.evaluation.results import MapShift, MatrixResult, RoundResult
+from mapvote_lab.evaluation.scoring.cells import ByClass, Scores
+from mapvote_lab.evaluation.scoring.objects import ObjectScores
+from mapvote_lab.evaluation.scoring.reliability import binned, reliability
 
 
 def entry(share: float) -> RoundResult:

@@ -7,7 +7,7 @@ import numpy as np
 
 from mapvote.core.heights import Heights
 from mapvote.core.types import Drive
-from mapvote.evaluation.reporting.survey_figure import draw_survey
+from mapvote.plots import draw_survey
 from mapvote.slam.build import BuildReport, DriveTrack
 from streets import drive_along, path
 

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from mapvote.core.grid import CELL_SIZE
-from mapvote.evaluation.scoring.border import BORDER_M, border, ceiling
-from mapvote.evaluation.scoring.cells import UNSCORED
-from mapvote.evaluation.scoring.truth import Truth
+from mapvote_lab.evaluation.scoring.border import BORDER_M, border, ceiling
+from mapvote_lab.evaluation.scoring.cells import UNSCORED
+from mapvote_lab.evaluation.scoring.truth import Truth
 
 KEPT, ADDED, REMOVED = range(3)
 

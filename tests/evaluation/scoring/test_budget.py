@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mapvote.evaluation.scoring.budget import in_tenths
+from mapvote_lab.evaluation.scoring.budget import in_tenths
 
 
 @given(st.lists(st.integers(0, 100_000), min_size=1, max_size=12))

@@ -16,9 +16,9 @@ from msgspec.structs import asdict
 from hand_made import make_map, make_tile
 from hand_made import wall as tile_wall
 from mapvote.core.types import NO_VOTE, CellState
-from mapvote.evaluation.results import to_json
-from mapvote.evaluation.scoring import paper_tables
-from mapvote.evaluation.scoring.cells import (
+from mapvote_lab.evaluation.results import to_json
+from mapvote_lab.evaluation.scoring import paper_tables
+from mapvote_lab.evaluation.scoring.cells import (
     UNSCORED,
     ByClass,
     Scores,
@@ -29,8 +29,8 @@ from mapvote.evaluation.scoring.cells import (
     ratio,
     score_cells,
 )
-from mapvote.evaluation.scoring.map_points import MapJudge, map_obstacles, same_rows
-from mapvote.evaluation.scoring.objects import ObjectScores, score_objects
+from mapvote_lab.evaluation.scoring.map_points import MapJudge, map_obstacles, same_rows
+from mapvote_lab.evaluation.scoring.objects import ObjectScores, score_objects
 
 
 @pytest.mark.parametrize("case", ["1", "2", "3", "4", "5"])

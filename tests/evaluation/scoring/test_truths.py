@@ -9,9 +9,9 @@ import pytest
 
 from mapvote.core.grid import Grid, Lattice
 from mapvote.core.types import F64, Reference
-from mapvote.evaluation.scoring.cells import UNSCORED
-from mapvote.evaluation.scoring.truth import Truth
-from mapvote.evaluation.scoring.truths import BANDS, TRUTHS, lowest_surface, sizes_by_height
+from mapvote_lab.evaluation.scoring.cells import UNSCORED
+from mapvote_lab.evaluation.scoring.truth import Truth
+from mapvote_lab.evaluation.scoring.truths import BANDS, TRUTHS, lowest_surface, sizes_by_height
 
 GRID = Grid(Lattice(), 0, 0, 1, 6)
 PROVENANCE = [[0, 1, 1, 2, 2, UNSCORED]]

@@ -7,11 +7,11 @@ import pytest
 
 from mapvote.config import Settings
 from mapvote.core.types import MapvoteError
-from mapvote.evaluation.experiments.cases import choose_cases
-from mapvote.evaluation.experiments.real.bench import ground_of
-from mapvote.evaluation.experiments.real.changes import built, score, survey_site
-from mapvote.evaluation.experiments.real.sensing import disturbed, every_other_beam
-from mapvote.evaluation.experiments.real.street import (
+from mapvote_lab.evaluation.experiments.cases import choose_cases
+from mapvote_lab.evaluation.experiments.real.bench import ground_of
+from mapvote_lab.evaluation.experiments.real.changes import built, score, survey_site
+from mapvote_lab.evaluation.experiments.real.sensing import disturbed, every_other_beam
+from mapvote_lab.evaluation.experiments.real.street import (
     Edit,
     Street,
     lay_street,

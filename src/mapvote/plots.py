@@ -1,0 +1,178 @@
+"""Pictures of a survey and of what the doctor found, and the look of all pictures: a colour always means the same.
+
+Needs matplotlib (extra ``plots``)."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import ListedColormap
+from matplotlib.figure import Figure
+
+from mapvote.core.geometry import transform
+from mapvote.core.point_map import PointMap, all_points
+from mapvote.core.types import F32, F64, NO_VOTE, U8, CellState, Drive, MapvoteError
+from mapvote.formats.atomic import whole_file
+
+if TYPE_CHECKING:
+    from mapvote.doctor.diagnosis import Diagnosis
+    from mapvote.slam.build import BuildReport
+
+Format = Literal["png", "svg", "pdf"]
+FORMATS: tuple[Format, ...] = "png", "svg", "pdf"
+INK, PAPER_WHITE, FAINT = "#22303c", "#ffffff", "#8795a1"
+NEW, GONE, STANDING, EMPTY, UNSURE = "#d7263d", "#1673c4", "#51687c", "#e6ecf1", "#f2c230"
+STATE_COLOURS = {
+    CellState.UNCHANGED_OCCUPIED: STANDING,
+    CellState.UNCHANGED_EMPTY: EMPTY,
+    CellState.CHANGED_OCCUPIED: NEW,
+    CellState.CHANGED_EMPTY: GONE,
+    CellState.UNDETERMINED: UNSURE,
+}
+STATE_NAMES = {
+    CellState.UNCHANGED_OCCUPIED: "unchanged (occupied)",
+    CellState.UNCHANGED_EMPTY: "unchanged (empty)",
+    CellState.CHANGED_OCCUPIED: "changed (occupied)",
+    CellState.CHANGED_EMPTY: "changed (empty)",
+    CellState.UNDETERMINED: "undetermined",
+}
+STATE_MAP = ListedColormap([*STATE_COLOURS.values(), PAPER_WHITE])
+VEHICLE_COLOURS = ("#22303c", "#e07b00", "#2a8f5b", "#8e44ad", "#7f5539", "#0b7a75", "#b5179e", "#6c757d")
+"""Never red nor blue: those mean change."""
+_LEAST_M = 0.01
+"""Lower end of the logarithmic scale of prior errors; a very wrong prior then leaves the others legible."""
+_SCANS = 6
+_POINTS_OF_A_SCAN, _POINTS_OF_THE_MAP = 6_000, 200_000
+_CLOSE_M = 25.0
+"""Half the side of the doctor's lower pictures."""
+_SAID = 3
+"""Findings above the doctor's picture."""
+_FONT = {
+    "font.family": "DejaVu Sans",
+    "font.size": 9.5,
+    "axes.edgecolor": FAINT,
+    "axes.labelcolor": INK,
+    "axes.titlecolor": INK,
+    "axes.titlesize": 10.5,
+    "xtick.color": INK,
+    "ytick.color": INK,
+    "text.color": INK,
+    "axes.linewidth": 0.8,
+}
+
+
+def state_image(states: U8) -> U8:
+    """States as indices of STATE_MAP."""
+    return np.where(states == NO_VOTE, len(CellState), states).astype(np.uint8)
+
+
+def new_figure(width: float, height: float, rows: int = 1, cols: int = 1, **grid: Any) -> tuple[Figure, Any]:
+    """A figure of inches and its axes, without pyplot and its global state."""
+    import matplotlib
+
+    with matplotlib.rc_context(_FONT):
+        figure = Figure(figsize=(width, height), layout="constrained")
+        FigureCanvasAgg(figure)
+        return figure, figure.subplots(rows, cols, squeeze=False, **grid)
+
+
+def save(figure: Figure, path: Path, format: Format = "png") -> None:
+    """Without dates or versions in it, whole or not at all: same picture, same bytes."""
+    import matplotlib
+
+    undated = {"png": {"Software": None}, "svg": {"Date": None, "Creator": None}, "pdf": {"CreationDate": None}}
+    fixed = {"svg.hashsalt": "mapvote", "svg.fonttype": "none", "pdf.fonttype": 42}
+    with matplotlib.rc_context(_FONT | fixed), whole_file(path) as partial:
+        figure.savefig(partial, format=format, dpi=140, metadata=undated[format])
+
+
+def draw_survey(drives: Sequence[Drive], report: BuildReport, path: Path) -> None:
+    """Write a PNG: every drive from above with its priors, and their distance along the road. Crosses: scans that were
+    not registered; a dashed line: where the map is broken."""
+    figure, axes = new_figure(9.0, 8.0, rows=2)
+    above, along = axes[:, 0]
+    for k, (drive, track) in enumerate(zip(drives, report.tracks, strict=True)):
+        colour = VEHICLE_COLOURS[k % len(VEHICLE_COLOURS)]
+        found = track.T_map_lidar[:, :3, 3]
+        way = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(found, axis=0), axis=1)))
+        above.plot(found[:, 0], found[:, 1], color=colour, label=f"{track.vehicle}/{track.drive_id}")
+        lost = found[~track.registered]
+        above.plot(lost[:, 0], lost[:, 1], "x", color=INK)
+        if drive.T_map_lidar_prior is not None:
+            told = drive.T_map_lidar_prior[:, :3, 3]
+            above.plot(told[:, 0], told[:, 1], ".", color=colour, alpha=0.5, markersize=3)
+            off = np.linalg.norm(found[:, :2] - told[:, :2], axis=1)
+            along.plot(way, np.maximum(off, _LEAST_M), ".", color=colour, markersize=3)
+            along.axhline(drive.prior_sigma_m, color=colour, linestyle=":")
+        for i in track.broken:
+            along.axvline(way[i], color=colour, linestyle="--")
+    above.set(title="where the survey went (lines), and its priors (dots)", xlabel="x, m", ylabel="y, m")
+    above.set_aspect("equal", adjustable="datalim")
+    above.legend()
+    along.set(title="distance from the priors, and what they claim (dotted)", xlabel="along the road, m", ylabel="m")
+    along.set_yscale("log")
+    save(figure, path)
+
+
+def draw_diagnosis(diagnosis: Diagnosis, point_map: PointMap | None, path: Path) -> None:
+    """Write a PNG: scans from above, coloured by time, over the map (grey): left as read, right as mended; below a
+    part of it from near. Where the doctor knows no way to mend, the right side says so."""
+    figure, axes = new_figure(11.0, 11.5, rows=2, cols=2)
+    ground = None if point_map is None else _thinned(all_points(point_map), _POINTS_OF_THE_MAP)
+    drive, read, mended = diagnosis.drive, diagnosis.T_read, diagnosis.T_mended
+    scans = {} if drive is None else _some_scans(drive)
+    for column, (title, T) in enumerate((("as read", read), ("as mended", mended))):
+        wide, near = axes[:, column]
+        wide.set_title(title)
+        if T is None or drive is None:
+            missing = "no prior: nothing says where the scans lie" if column == 0 else "not known how to mend it"
+            for axis in (wide, near):
+                axis.text(0.5, 0.5, missing, ha="center", transform=axis.transAxes)
+                axis.set_axis_off()
+            continue
+        for axis in (wide, near):
+            if ground is not None:
+                axis.plot(ground[:, 0], ground[:, 1], ",", color=FAINT, alpha=0.4)
+            _draw_scans(axis, scans, T, len(drive))
+            axis.plot(T[:, 0, 3], T[:, 1, 3], "-", color=INK, linewidth=1.0)
+            axis.set(xlabel="x, m", ylabel="y, m")
+            axis.set_aspect("equal", adjustable="box" if axis is near else "datalim")
+        x, y = T[len(T) // 2, :2, 3]
+        near.set_xlim(x - _CLOSE_M, x + _CLOSE_M)
+        near.set_ylim(y - _CLOSE_M, y + _CLOSE_M)
+    figure.suptitle(_headline(diagnosis), ha="left", x=0.01, fontsize=9.5)
+    save(figure, path)
+
+
+def _headline(diagnosis: Diagnosis) -> str:
+    serious = [f"{f.severity}: {f.what}" for f in diagnosis.findings if f.severity != "note"][:_SAID] or ["sound"]
+    return "\n".join(textwrap.fill(line, 120, subsequent_indent="    ") for line in serious)
+
+
+def _some_scans(drive: Drive) -> dict[int, F32]:
+    """A few scans along the drive, without the road below and what is far."""
+    scans = {}
+    for i in np.unique(np.linspace(0, len(drive) - 1, _SCANS).astype(np.int64)):
+        try:
+            points = drive.read_scan(int(i)).points
+        except MapvoteError:
+            continue
+        scans[int(i)] = _thinned(points, _POINTS_OF_A_SCAN)
+    return scans
+
+
+def _thinned(points: Any, most: int) -> Any:
+    return points[:: max(1, len(points) // most)]
+
+
+def _draw_scans(axis: Any, scans: dict[int, F32], T: F64, n: int) -> None:
+    for i, points in scans.items():
+        placed = transform(T[i], points.astype(np.float64))
+        axis.scatter(
+            placed[:, 0], placed[:, 1], s=0.3, c=np.full(len(placed), i), cmap="viridis", vmin=0, vmax=max(n - 1, 1)
+        )

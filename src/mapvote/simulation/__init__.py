@@ -1,5 +1,0 @@
-"""Streets, LiDARs and drives that never existed, with the truth beside them (paper V)."""
-
-from mapvote.simulation.drives import simulate
-
-__all__ = ["simulate"]

@@ -1,0 +1,137 @@
+"""``mapvote evaluate``: a scenario and a seed become Tables II-IV and what else there is to measure (paper V)."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from msgspec.structs import asdict
+
+from mapvote.codec.ballot import Ballot
+from mapvote.core.grid import Grid
+from mapvote.core.point_map import PointMap
+from mapvote_lab.evaluation.baselines.run import yardsticks
+from mapvote_lab.evaluation.experiments.cases import COLUMNS_V1, Case, fuse_case
+from mapvote_lab.evaluation.experiments.changed_areas import in_changed_areas, survey_anew
+from mapvote_lab.evaluation.experiments.passes import Pass, passes
+from mapvote_lab.evaluation.experiments.pose_errors import localisation, map_frame, map_shift
+from mapvote_lab.evaluation.experiments.scene import Progress, Scene
+from mapvote_lab.evaluation.experiments.study import NOTHING_BESIDES, Study
+from mapvote_lab.evaluation.results import CaseResult, Cost, EvaluationResult, Timings
+from mapvote_lab.evaluation.scoring.budget import Causes
+from mapvote_lab.evaluation.scoring.jury import Jury, Outcome
+from mapvote_lab.evaluation.scoring.truth import Truth
+from mapvote_lab.evaluation.scoring.truths import SIDE_BY_SIDE, sizes_by_height
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """The numbers, and what pictures need."""
+
+    result: EvaluationResult
+    scene: Scene
+    truth: Truth
+    window: Grid
+    first_map: PointMap
+    outcomes: Mapping[str, Outcome]
+    drives: Sequence[Pass]
+    causes: Mapping[str, Causes]
+    """By case that was to be explained: every true and false cell of the provenance truth and its cause."""
+    best: str
+    """The case whose updated map is shown: the one that the settings vote by, else columns_v1, else the first."""
+
+
+def evaluate(
+    scene: Scene,
+    cases: Sequence[Case],
+    with_yardsticks: bool = False,
+    progress: Progress | None = None,
+    study: Study = NOTHING_BESIDES,
+) -> Evaluation:
+    """Run what the cache lacks, decide and score every case. Two processes where there are two cores."""
+    started = time.perf_counter()
+    scene.prepare(progress)
+    prepared = time.perf_counter()
+    workers = min(2, os.cpu_count() or 1)
+    drives = passes(scene, cases, workers, progress, keep=study.wanted)
+    voted = time.perf_counter()
+    truth, first_map = scene.truth, scene.point_map
+    beams = scene.drive(drives[0].vehicle).sensor.beams
+    jury = Jury(first_map, truth)
+    best = _best(scene, cases)
+    outcomes, entries = _scored(scene, cases, drives, jury, progress)
+    found = study.of(scene, cases, jury, outcomes, progress)
+    T_map_world = map_frame(scene)
+    maps = {
+        "old map": (first_map, T_map_world),
+        f"updated map ({best})": (outcomes[best].updated, T_map_world),
+    }
+    scored = time.perf_counter()
+    costs = {}
+    if with_yardsticks:
+        maps["map surveyed anew"] = survey_anew(scene, drives[0].vehicle, progress)
+        measured, costs["case 5"] = yardsticks(scene, drives, workers, progress)
+        for name, yardstick in measured.items():
+            costs[name] = yardstick.cost
+            judgement = jury.of_states(yardstick.states, yardstick.vehicle_states)
+            entries[name] = CaseResult(**asdict(judgement), bytes_per_vehicle=[])
+    result = EvaluationResult(
+        scenario=scene.scenario,
+        seed=scene.seed,
+        poses="truth" if scene.conditions.true_poses else "ndt",
+        cells=int(truth.strict.size),
+        coverage=entries[best].coverage,
+        settings=scene.settings.model_dump(mode="json"),
+        map_shift=map_shift(scene),
+        localisation=localisation(scene, drives),
+        changed_areas=in_changed_areas(scene, truth, drives[0].vehicle, maps),
+        ceilings=jury.ceilings(),
+        truth_sizes={name: sizes_by_height(jury.truths[name], truth, jury.first_map) for name in SIDE_BY_SIDE},
+        cases=entries,
+        readings=found.readings,
+        budgets=found.budgets,
+        timings=Timings(
+            prepare_s=prepared - started,
+            vote_s=voted - prepared,
+            score_s=scored - voted,
+            yardsticks_s=time.perf_counter() - scored,
+            methods={name: Cost(beams, cost["ms_per_scan"], cost["memory_bytes"]) for name, cost in costs.items()},
+            stages_ms={drive.vehicle: drive.stage_ms for drive in drives},
+            fuse_s={name: outcome.seconds for name, outcome in outcomes.items()},
+        ),
+    )
+    return Evaluation(result, scene, truth, jury.window, first_map, outcomes, drives, found.causes, best)
+
+
+def _best(scene: Scene, cases: Sequence[Case]) -> str:
+    names = [case.name for case in cases]
+    return next((name for name in (scene.settings.voting.method, COLUMNS_V1) if name in names), names[0])
+
+
+def _scored(
+    scene: Scene, cases: Sequence[Case], drives: Sequence[Pass], jury: Jury, progress: Progress | None
+) -> tuple[dict[str, Outcome], dict[str, CaseResult]]:
+    """By case: what the server makes of its ballots, and the scores."""
+    outcomes: dict[str, Outcome] = {}
+    entries: dict[str, CaseResult] = {}
+    for i, case in enumerate(cases):
+        if progress:
+            progress("scoring", i, len(cases))
+        ballots = [drive.ballots[case.name] for drive in drives]
+        outcome = fuse_case(scene.point_map, ballots, case.min_votes, scene.settings.fuse, jury.window)
+        outcomes[case.name] = outcome
+        entries[case.name] = CaseResult(
+            **asdict(jury.of_update(outcome)),
+            bytes_per_vehicle=[drive.sizes[case.name] for drive in drives],
+            state_bytes_per_vehicle=[_state_bytes(ballot) for ballot in ballots],
+        )
+    if progress:
+        progress("scoring", len(cases), len(cases))
+    return outcomes, entries
+
+
+def _state_bytes(ballot: Ballot) -> int:
+    """Bytes of the votes alone, without new points and other planes."""
+    return sum(len(tile.states or tile.tally or b"") for tile in ballot.tiles)

@@ -1,0 +1,280 @@
+"""A real street, driven once, that did not change (paper VI asks for it).
+
+The map comes from alternating blocks of a drive's scans, three vehicles from the blocks between, every third scan
+each. All is still one pass: same viewpoints, same parked cars, minutes at most between map and vote. What is
+measured here is a lower bound of what a fleet meets.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from scipy import ndimage
+
+from mapvote.codec.ballot import Ballot
+from mapvote.config import Settings
+from mapvote.core.geometry import transform
+from mapvote.core.grid import CELL_SIZE, Grid, window_around
+from mapvote.core.point_map import PointMap
+from mapvote.core.reference import LocalMap, reference_window
+from mapvote.core.types import F64, I64, NO_VOTE, U8, Bool, CellState, Drive, MapvoteError
+from mapvote.formats import open_drive, read_T_map_lidar
+from mapvote.formats.drives.options import parse_scans
+from mapvote.localisation.localiser import GivenPoses
+from mapvote.localisation.ndt import PosePrior
+from mapvote.perception.frontend import DriveReport, Frontend, Observation
+from mapvote.perception.moving_objects import MovingFilter
+from mapvote.perception.raycast import find_obstacles
+from mapvote.slam.build import BuildReport, build_map
+from mapvote_lab.evaluation.experiments.cases import Case, fuse_case
+from mapvote_lab.evaluation.experiments.shared_pass import SharedPass
+from mapvote_lab.evaluation.scoring.cells import determined, ratio
+from mapvote_lab.evaluation.scoring.truth import pose_errors, rigid_between
+
+VEHICLES = 3
+WRONG_M = 0.5
+"""A pose farther off than this is wrong."""
+LEAST_SCANS = 4
+"""Of each vehicle: a place counts as found once three scans agree on it."""
+Edit = Callable[[Drive], Drive]
+"""Changes a whole recording before any of it is used: what its sensor sees, or what it believes."""
+
+
+def unedited(recording: Drive) -> Drive:
+    """As recorded."""
+    return recording
+
+
+def part_of(recording: Drive, scans: I64, vehicle: str | None = None) -> Drive:
+    """These scans (m,) of a recording, in ascending order, driven by ``vehicle``."""
+    prior = recording.T_map_lidar_prior
+    return replace(
+        recording,
+        vehicle=vehicle or recording.vehicle,
+        stamps_ns=recording.stamps_ns[scans],
+        read_scan=lambda i: recording.read_scan(int(scans[i])),
+        T_map_lidar_prior=None if prior is None else prior[scans],
+    )
+
+
+def split(n: int, block: int) -> tuple[I64, list[I64]]:
+    """(scans of the map, of each vehicle) of a recording of ``n``: blocks in turn, every third scan each.
+
+    MapvoteError if that leaves too few to vote.
+    """
+    blocks = np.arange(n) // block
+    mapped, rest = np.flatnonzero(blocks % 2 == 0), np.flatnonzero(blocks % 2 == 1)
+    if len(rest) < LEAST_SCANS * VEHICLES:
+        raise MapvoteError(
+            f"of {n} scans in blocks of {block}, {len(rest)} are left to vote: {LEAST_SCANS * VEHICLES} are needed"
+        )
+    return mapped, [rest[(rest % block) % VEHICLES == k] for k in range(VEHICLES)]
+
+
+@dataclass(frozen=True)
+class Street:
+    """The map of every other block, and what is needed to judge those who vote on it."""
+
+    recording: Drive
+    point_map: PointMap
+    built: BuildReport
+    block: int
+    voting: Sequence[I64]
+    """The scans of each vehicle."""
+    T_map_lidar: F64
+    """(n, 4, 4) the reference trajectory of the whole recording in the map's frame."""
+    grid: Grid
+    movers: Bool
+    """Cells in which something moved while the map was made."""
+    settings: Settings
+
+    @property
+    def mapped(self) -> Bool:
+        """(rows, cols) cells in which the map holds an obstacle."""
+        return np.asarray(reference_window(self.point_map, self.grid).occupied != 0)
+
+
+@dataclass(frozen=True)
+class RealRun:
+    """Three vehicles on a street."""
+
+    street: Street
+    states: Mapping[str, U8]
+    """Decided by each case, over the street's grid."""
+    movers: Bool
+    """Cells in or next to which something moved, by the filter on the map's and the vehicles' scans."""
+    reports: Sequence[DriveReport]
+    error_m: F64
+    """Of every scan that was localised, against the reference in the map's frame."""
+    error_deg: F64
+    prior_error_m: F64
+    scans: int
+
+    @property
+    def ballots(self) -> int:
+        """Vehicles that found themselves at all, and so sent one."""
+        return sum(len(report.lost) < report.scans for report in self.reports)
+
+    @property
+    def lost_share(self) -> float:
+        """Of the scans: abstained."""
+        return 1.0 - len(self.error_m) / self.scans
+
+    @property
+    def wrong_share(self) -> float:
+        """Of the scans: voted from a place WRONG_M or more beside the true one."""
+        return float(np.count_nonzero(self.error_m >= WRONG_M)) / self.scans
+
+    def changed_share(self, case: str, *, with_movers: bool, of_mapped: bool = False) -> float:
+        """Share of determined cells (of those in which the map holds something) decided as changed, where nothing did.
+
+        With ``of_mapped`` only cells that hold an obstacle in the map are counted, above and below the line.
+        """
+        scored = determined(self.states[case]) & (np.ones_like(self.movers) if with_movers else ~self.movers)
+        scored &= self.street.mapped if of_mapped else np.ones_like(scored)
+        return ratio(np.count_nonzero(changed(self.states[case]) & scored), np.count_nonzero(scored))
+
+
+def changed(states: U8) -> Bool:
+    """Cells decided changed, either way."""
+    return (states == CellState.CHANGED_OCCUPIED) | (states == CellState.CHANGED_EMPTY)
+
+
+def open_recording(folder: Path, settings: Settings, scans: str | None = None) -> tuple[Drive, F64]:
+    """The drive at ``folder`` and where (n, 4, 4) its scans were taken: by ``poses.txt`` where there is one, else by
+    SLAM over all that is opened. ``scans``: as ``--scans`` of any verb. MapvoteError if the two do not match.
+    """
+    whole = open_drive(folder)
+    chosen = parse_scans(scans, len(whole), str(folder))
+    recording, file = part_of(whole, chosen), folder / "poses.txt"
+    if not file.is_file():
+        return recording, build_map([recording], settings)[1].tracks[0].T_map_lidar
+    T = read_T_map_lidar(file, folder)
+    if len(T) != len(whole):
+        raise MapvoteError(f"{file}: {len(T)} poses for {len(whole)} scans: give a row for every scan")
+    return recording, T[chosen]
+
+
+def lay_street(
+    recording: Drive, settings: Settings, reference: F64, *, block: int = 12, survey_edit: Edit = unedited
+) -> Street:
+    """The map of every other block of a recording; ``reference`` (n, 4, 4) is for scoring only."""
+    mapped, voting = split(len(reference), block)
+    survey = part_of(survey_edit(recording), mapped)
+    point_map, built = build_map([survey], settings)
+    T_map_survey = built.tracks[0].T_map_lidar
+    T_map_lidar = rigid_between(T_map_survey, reference[mapped]) @ reference
+    grid = _window(point_map, T_map_lidar)
+    movers = _moving_cells(survey, T_map_survey, point_map, grid, settings)
+    return Street(recording, point_map, built, block, voting, T_map_lidar, grid, movers, settings)
+
+
+def vote_on(street: Street, cases: Sequence[Case], *, edit: Edit = unedited, first_pose_only: bool = False) -> RealRun:
+    """Three vehicles drive the street's other blocks; every case is decided."""
+    recording, movers = edit(street.recording), street.movers.copy()
+    ballots: dict[str, list[Ballot]] = {case.name: [] for case in cases}
+    reports, metres, degrees, prior_metres = [], [], [], []
+    for k, scans in enumerate(street.voting):
+        drive = part_of(recording, scans, f"v{k + 1}")
+        T_true = street.T_map_lidar[scans]
+        vehicle = SharedPass(drive, street.point_map, street.settings, cases)
+        for i, scan in enumerate(drive):
+            known = i == 0 or not first_pose_only
+            _note_movers(vehicle.observe(scan, PosePrior.of(drive, i) if known else None), street.grid, movers)
+        _note_movers(vehicle.finish(), street.grid, movers)
+        there = np.setdiff1d(np.arange(len(drive)), vehicle.report.lost)
+        reports.append(vehicle.report)
+        if len(there):  # who never found himself sends no ballot
+            for case in cases:
+                ballots[case.name].append(vehicle.ballot(case))
+            off_m, off_rad = pose_errors(np.array(vehicle.report.T_map_lidar)[there], T_true[there])
+            metres.append(off_m)
+            degrees.append(np.degrees(off_rad))
+        if drive.T_map_lidar_prior is not None:
+            prior_metres.append(pose_errors(drive.T_map_lidar_prior, T_true)[0])
+    states = {case.name: _decided(street, ballots[case.name], case) for case in cases}
+    near_movers = ndimage.binary_dilation(movers, np.ones((3, 3)))
+    off_m, off_deg, prior_m = (np.concatenate([np.zeros(0), *parts]) for parts in (metres, degrees, prior_metres))
+    total = sum(report.scans for report in reports)
+    return RealRun(street, states, near_movers, reports, off_m, off_deg, prior_m, total)
+
+
+def _decided(street: Street, ballots: list[Ballot], case: Case) -> U8:
+    if not ballots:
+        return np.full(street.grid.shape, NO_VOTE, dtype=np.uint8)
+    fuse = street.settings.fuse.model_copy(update={"min_difference": 0.0})  # they share one drive, and are no copies
+    return fuse_case(street.point_map, ballots, case.min_votes, fuse, street.grid).states
+
+
+def _moving_cells(survey: Drive, T_map_lidar: F64, point_map: PointMap, grid: Grid, settings: Settings) -> Bool:
+    """Cells in which something moved while the map was made."""
+    cells = np.zeros(grid.shape, dtype=np.bool_)
+    frontend = Frontend(
+        GivenPoses(survey.stamps_ns, T_map_lidar),
+        MovingFilter(survey.sensor, settings.moving),
+        LocalMap(point_map, 2.0 * settings.mapping.reach_m),
+    )
+    for scan in survey:
+        _note_movers(frontend.observe(scan), grid, cells)
+    _note_movers(frontend.finish(), grid, cells)
+    return cells
+
+
+def _note_movers(observations: list[Observation], grid: Grid, cells: Bool) -> None:
+    """Mark the ``cells`` (rows, cols of ``grid``) in which the filter found moving points."""
+    for seen in observations:
+        rows, cols, inside = grid.indices_of(seen.scan.points_map[seen.moving])
+        cells[rows[inside], cols[inside]] = True
+
+
+def met_cells(street: Street, edit: Edit = unedited) -> Bool:
+    """(rows, cols) cells in which a vehicle's scan met something above the ground, at the reference poses."""
+    met = np.zeros(street.grid.shape, dtype=np.bool_)
+    around = LocalMap(street.point_map, street.settings.voting.window_m)
+    recording = edit(street.recording)
+    for i in np.concatenate(street.voting).tolist():
+        T = street.T_map_lidar[i]
+        points = transform(T, recording.read_scan(i).points)
+        rows, cols, inside = street.grid.indices_of(points[find_obstacles(points, around.at(T[:3, 3])[0])[0]])
+        met[rows[inside], cols[inside]] = True
+    return met
+
+
+def _window(point_map: PointMap, reference: F64) -> Grid:
+    """The window around the whole drive in which cells are counted: 40 m to every side, as a vehicle sees."""
+    ends = [window_around(point_map.lattice, T[0, 3], T[1, 3], 80.0) for T in reference]
+    window = ends[0]
+    for end in ends[1:]:
+        window = window.union(end)
+    return window
+
+
+@dataclass(frozen=True, slots=True)
+class FalseChange:
+    """One connected group of cells decided changed though nothing changed."""
+
+    kind: str
+    x: float
+    y: float
+    m2: float
+    on_mover: bool
+
+
+def largest_false_changes(run: RealRun, case: str, most: int = 10) -> list[FalseChange]:
+    """The largest groups, 8-connected, one class each, largest first."""
+    out = []
+    x, y = run.street.grid.centres()
+    for state in (CellState.CHANGED_OCCUPIED, CellState.CHANGED_EMPTY):
+        label, count = ndimage.label(run.states[case] == state, structure=np.ones((3, 3)))
+        for k in range(1, count + 1):
+            rows, cols = np.nonzero(label == k)
+            out.append(
+                FalseChange(
+                    state.name.lower(), round(float(x[cols].mean()), 1), round(float(y[rows].mean()), 1),
+                    round(len(rows) * CELL_SIZE**2, 2), bool(run.movers[rows, cols].mean() >= 0.5),
+                )
+            )  # fmt: skip
+    return sorted(out, key=lambda f: (-f.m2, f.x, f.y))[:most]

@@ -1,0 +1,180 @@
+"""What is built and demolished on a real street, and where: beside the path, in room that the scans show to be free.
+
+Placed by the recording's own points, never by what a map knows to be free: a method must not choose its own questions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import ndimage
+from scipy.spatial import cKDTree
+
+from mapvote.core.columns import GROUND_MARGIN_M
+from mapvote.core.geometry import from_xyz_rpy
+from mapvote.core.grid import CELL_SIZE
+from mapvote.core.types import F64
+from mapvote_lab.evaluation.experiments.real.raycast import Thing, voxel_boxes
+from mapvote_lab.simulation.furniture import sign
+from mapvote_lab.simulation.shapes import box, cylinder, hedge, join, place
+
+APART_M = 5.0
+"""Between the middles of two things: one must not hide another, nor decide its cells."""
+_PATH_M = (3.5, 15.0)
+_ALONG_M = 15.0
+"""Before the drive's first scan and behind its last there is a street, too."""
+_TRIES = 4000
+_WALL_SIDE_M = 4.0
+_WALL_SHIFT_M = 0.5
+_AROUND_M = 40.0
+
+SHAPES: dict[str, tuple[float, Callable[[np.random.Generator], F64]]] = {
+    "pole": (0.1, lambda rng: cylinder(0.08, 0.0, 5.0, 8)),
+    "sign": (0.4, lambda rng: sign(rng)),
+    "bollard": (0.1, lambda rng: cylinder(0.08, 0.0, 0.9, 8)),
+    "cabinet": (0.5, lambda rng: box(-0.4, 0.4, -0.2, 0.2, 0.0, 1.3)),
+    "container": (1.7, lambda rng: box(-1.5, 1.5, -0.8, 0.8, 0.0, 1.6)),
+    "wall": (2.1, lambda rng: box(-2.0, 2.0, -0.1, 0.1, 0.0, 2.2)),
+    "wall behind a hedge": (2.3, lambda rng: box(-2.0, 2.0, 0.5, 0.7, 0.0, 2.2)),
+}
+"""Kind: (radius of the room it needs, its triangles (n, 3, 3) with the foot's middle at the origin), metres."""
+
+
+@dataclass(frozen=True)
+class Site:
+    """What the recording shows of its street, in the frame of the reference trajectory."""
+
+    obstacles: F64
+    """(n, 3) points that stand above the ground, one a voxel."""
+    ground: Callable[[F64], F64]
+    """Height (m,) of the ground at points (m, 2); NaN where unknown."""
+    path: F64
+    """(k, 3) where the sensor was."""
+
+    def placed(self, seed: int, each: int) -> tuple[list[Thing], list[F64]]:
+        """(``each`` things of every kind that find room, hedges (n, 3, 3) that stand before and after)."""
+        rng = np.random.default_rng(seed)
+        tree = cKDTree(self.obstacles[:, :2])
+        things: list[Thing] = []
+        hedges = []
+        for kind, (radius, shape) in [*SHAPES.items()] * each:  # one of each before the second of any
+            spot = self._room(rng, tree, radius, things)
+            if spot is None:
+                continue
+            x, y, z, yaw = spot
+            things.append(Thing(kind, place(shape(rng), x, y, z, yaw)))
+            if kind == "wall behind a hedge":
+                hedges.append(place(hedge(rng, 4.0, 0.5, 1.1) - np.array([2.0, 0, 0]), x, y, z, yaw))
+        return things, hedges
+
+    def _room(
+        self, rng: np.random.Generator, tree: cKDTree, radius: float, taken: list[Thing]
+    ) -> tuple[float, float, float, float] | None:
+        """(x, y, ground, yaw) of a free place beside the path, its back turned to it; None if there is none."""
+        for _ in range(_TRIES):
+            k = int(rng.integers(1, len(self.path)))
+            ahead = self.path[k, :2] - self.path[k - 1, :2]
+            if np.linalg.norm(ahead) < 1e-3:
+                continue
+            yaw = float(np.arctan2(ahead[1], ahead[0]))
+            side, away = rng.choice([-1.0, 1.0]), rng.uniform(*_PATH_M)
+            spot = self.path[k, :2] + side * away * np.array([-np.sin(yaw), np.cos(yaw)])
+            spot = spot + rng.uniform(-_ALONG_M, _ALONG_M) * np.array([np.cos(yaw), np.sin(yaw)])
+            z = float(self.ground(spot[None])[0])
+            clear = tree.query(spot)[0] > radius + 0.6
+            off_path = np.linalg.norm(self.path[:, :2] - spot, axis=1).min() > radius + 1.5
+            apart = all(np.linalg.norm(thing.centre - spot) > APART_M for thing in taken)
+            if clear and off_path and apart and np.isfinite(z):
+                return float(spot[0]), float(spot[1]), z, yaw if side > 0 else yaw + np.pi
+        return None
+
+    def moved_walls(self, seed: int, most: int) -> list[Thing]:
+        """Pieces of real walls, 4 m long, set back and forward by 0.5 m in turn."""
+        rng = np.random.default_rng([seed, 1])
+        cells = np.floor(self.obstacles[:, :2] / CELL_SIZE)
+        _, column, layers = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
+        tall = self.obstacles[layers[column.ravel()] >= 5, :2]
+        tree, out = cKDTree(tall) if len(tall) else None, list[Thing]()
+        for k in rng.permutation(len(tall)):
+            assert tree is not None
+            near = tall[tree.query_ball_point(tall[k], 0.5 * _WALL_SIDE_M)]
+            away = np.linalg.norm(self.path[:, :2] - tall[k], axis=1).min()
+            if len(near) < 50 or not _PATH_M[0] < away < 20.0:
+                continue
+            middle = near.mean(axis=0)
+            spread, axes = np.linalg.eigh(np.cov((near - middle).T))
+            if np.sqrt(spread[0]) > 0.13 or any(np.linalg.norm(t.centre - middle) < 2 * APART_M for t in out):
+                continue
+            thing = self._moved_wall(middle, axes[:, 0], "set back" if len(out) % 2 == 0 else "set forward")
+            if thing is not None:
+                out.append(thing)
+            if len(out) == most:
+                break
+        return out
+
+    def _moved_wall(self, middle: F64, normal: F64, how: str) -> Thing | None:
+        toward = self.path[np.linalg.norm(self.path[:, :2] - middle, axis=1).argmin(), :2] - middle
+        normal = normal if normal @ toward > 0 else -normal  # towards the path
+        ground = float(self.ground(middle[None])[0])
+        if not np.isfinite(ground):
+            return None
+        shift = -_WALL_SHIFT_M if how == "set back" else _WALL_SHIFT_M
+        yaw = float(np.arctan2(normal[1], normal[0]) - 0.5 * np.pi)  # y of the wall's own frame is its normal
+        near = self.obstacles[np.linalg.norm(self.obstacles[:, :2] - middle, axis=1) < 0.5 * _WALL_SIDE_M]
+        top = float(near[:, 2].max())
+        half = 0.5 * _WALL_SIDE_M
+        plane = place(
+            box(-half, half, shift - 0.02, shift + 0.02, 0.0, top - ground), middle[0], middle[1], ground, yaw
+        )
+        T = from_xyz_rpy(middle[0], middle[1], ground + 0.5 * (top - ground) + 0.1, yaw=yaw)
+        goes = T, np.array([half, 0.3, 0.5 * (top - ground)])
+        return Thing(f"wall {how}", plane, goes, behind=plane if how == "set back" else np.zeros((0, 3, 3)))
+
+    def gone_cars(self, most: int) -> list[Thing]:
+        """Things of a parked car's size that stood there all along, taken away."""
+        low = self.obstacles[self._heights(self.obstacles) < 2.2]
+        if len(low) == 0:
+            return []
+        origin = np.floor(low[:, :2].min(axis=0) / CELL_SIZE) - 1
+        cells = (np.floor(low[:, :2] / CELL_SIZE) - origin).astype(np.int64)
+        plane = np.zeros(cells.max(axis=0) + 2, dtype=np.bool_)
+        plane[cells[:, 0], cells[:, 1]] = True
+        label, _ = ndimage.label(plane, np.ones((3, 3)))
+        mine = label[cells[:, 0], cells[:, 1]]
+        out: list[Thing] = []
+        for k, slices in enumerate(ndimage.find_objects(label), 1):
+            if max(s.stop - s.start for s in slices) * CELL_SIZE > 7.0:
+                continue
+            thing = self._gone_car(low[mine == k])
+            if thing is not None and all(np.linalg.norm(t.centre - thing.centre) > APART_M for t in out):
+                out.append(thing)
+        out.sort(key=lambda t: float(np.linalg.norm(self.path[:, :2] - t.centre, axis=1).min()))
+        return out[:most]
+
+    def _gone_car(self, points: F64) -> Thing | None:
+        middle = points[:, :2].mean(axis=0)
+        spread, axes = np.linalg.eigh(np.cov((points[:, :2] - middle).T)) if len(points) > 20 else (None, np.eye(2))
+        local = (points[:, :2] - middle) @ axes[:, ::-1]
+        low, high = local.min(axis=0), local.max(axis=0)
+        length, width = high - low
+        tall = float(self._heights(points).max())
+        if spread is None or not (2.8 < length < 5.8 and 1.0 < width < 2.6 and 1.1 < tall < 2.1):
+            return None
+        centre = middle + axes[:, ::-1] @ (0.5 * (low + high))
+        away = np.linalg.norm(self.path[:, :2] - centre, axis=1).min()
+        ground = float(self.ground(centre[None])[0])
+        if not (2.0 < away < 20.0 and np.isfinite(ground)):
+            return None
+        yaw = float(np.arctan2(axes[1, 1], axes[0, 1]))
+        T = from_xyz_rpy(centre[0], centre[1], ground + GROUND_MARGIN_M + 0.5 * tall, yaw=yaw)
+        half = np.array([0.5 * length + 0.2, 0.5 * width + 0.2, 0.5 * tall + 0.1])
+        near = self.obstacles[np.linalg.norm(self.obstacles[:, :2] - centre, axis=1) < _AROUND_M]
+        outside = (np.abs((near - T[:3, 3]) @ T[:3, :3]) > half).any(axis=1)
+        road = place(box(-_AROUND_M, _AROUND_M, -_AROUND_M, _AROUND_M, -0.05, 0.0), centre[0], centre[1], ground)
+        return Thing("parked car gone", np.zeros((0, 3, 3)), (T, half), join([voxel_boxes(near[outside]), road]))
+
+    def _heights(self, points: F64) -> F64:
+        above: F64 = points[:, 2] - self.ground(points[:, :2])
+        return np.where(np.isfinite(above), above, np.inf)

@@ -1,0 +1,104 @@
+"""Every reading of the paper on kept drives: cells decided by cases and readings, without driving again (paper III-IV).
+
+The same tables, votes and verdicts as the product's own (detection/paper.py, core/voting.py), scan by scan; only points
+and files are left out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+
+import numba
+import numpy as np
+
+from mapvote.config import PaperSettings, Settings, VotingSettings
+from mapvote.core.grid import CELL_SIZE
+from mapvote.core.types import I32, N_STATES, NO_VOTE, U8, U16, Bool
+from mapvote.core.voting import decide, one_hot, to_wire
+from mapvote.detection.paper import reading_table
+from mapvote.detection.readings import readings_of
+from mapvote_lab.evaluation.experiments.cases import Case, paper_cases
+from mapvote_lab.evaluation.experiments.kept import KeptDrive
+from mapvote_lab.evaluation.scoring.cells import Scores, score_cells
+
+Rule = tuple[VotingSettings, PaperSettings]
+"""By which a vehicle counts."""
+
+
+@numba.njit(cache=True, nogil=True)
+def _cast(
+    words: U16, row0: int, col0: int, margin: int, mapped: Bool, states: U8, weights: I32, no_vote: int, tally: I32
+) -> None:
+    """Add one scan's ``words``, from (row0, col0) of the window, to ``tally`` (rows, cols, classes), in place.
+
+    ``margin``: cells at the rim of the scan's window that do not vote.
+    """
+    rows, cols = mapped.shape
+    for i in range(max(margin, -row0), min(words.shape[0] - margin, rows - row0)):
+        for j in range(max(margin, -col0), min(words.shape[1] - margin, cols - col0)):
+            r, c, word = row0 + i, col0 + j, words[i, j]
+            state = states[np.int64(mapped[r, c]), word]
+            if state != no_vote:
+                tally[r, c, state] += weights[word]
+
+
+def tallies(
+    drive: KeptDrive, mapped: Bool, rules: Iterable[Rule], tables: Callable[..., tuple[U8, I32]] = reading_table,
+    classes: int = N_STATES,
+) -> dict[Rule, I32]:  # fmt: skip
+    """(rows, cols, classes) votes in VOTE_UNITs of one drive by each rule, over the truth's window, in one reading.
+
+    ``mapped`` (rows, cols): where the map holds obstacle points. ``tables`` and ``classes``: what a word counts as.
+    """
+    found = {rule: np.zeros((*mapped.shape, classes), dtype=np.int32) for rule in rules}
+    for row0, col0, words in drive.words():
+        for rule, tally in found.items():
+            half = round(0.5 * rule[1].window_m / CELL_SIZE)
+            margin = max(0, words.shape[0] // 2 - half)
+            _cast(words, row0, col0, margin, mapped, *tables(*rule), NO_VOTE, tally)
+    return found
+
+
+def rule_of(case: Case) -> Rule:
+    """Cases that differ only in who decides count alike."""
+    return case.voting.model_copy(update={"two_stage": True}), case.paper
+
+
+def decided(drives: Sequence[KeptDrive], mapped: Bool, cases: Sequence[Case]) -> dict[str, tuple[U8, list[U8]]]:
+    """By case's name: (what the server decides, what each vehicle does), over the truth's window."""
+    rules = list(dict.fromkeys(rule_of(case) for case in cases))
+    counted = [tallies(drive, mapped, rules) for drive in drives]
+    own = {rule: [decide(one[rule]) for one in counted] for rule in rules}
+    out = {}
+    for case in cases:
+        rule = rule_of(case)
+        if case.voting.two_stage:
+            votes = [one_hot(states) for states in own[rule]]
+        else:
+            votes = [to_wire(one[rule]).astype(np.int32) for one in counted]
+        out[case.name] = decide(np.stack(votes).sum(axis=0, dtype=np.int32)), own[rule]
+    return out
+
+
+def swept(
+    drives: Sequence[KeptDrive], mapped: Bool, settings: Settings, truths: Mapping[str, U8],
+    only: str | None = None, progress: Callable[[str, int, int], None] | None = None,
+) -> dict[str, dict[str, dict[str, Scores]]]:  # fmt: skip
+    """Scores by reading, case and truth: as ``settings`` read the paper, and one sentence at a time read otherwise.
+
+    ``only``: the sentence (a setting of ``[paper]``) whose readings are wanted; None: all.
+    """
+    readings = readings_of(settings.paper, only)
+    out: dict[str, dict[str, dict[str, Scores]]] = {}
+    for k, (name, paper) in enumerate(readings.items()):
+        if progress:
+            progress("reading the paper", k, len(readings))
+        every = paper_cases(settings.model_copy(update={"paper": paper}))
+        states = decided(drives, mapped, [every[number] for number in "12345"])
+        out[name] = {
+            number: {truth: score_cells(server, cells) for truth, cells in truths.items()}
+            for number, (server, _) in states.items()
+        }
+    if progress:
+        progress("reading the paper", len(readings), len(readings))
+    return out

@@ -1,0 +1,226 @@
+"""Pictures from above and charts, in the manner of the paper's Figures 2-4 and 6, and Table IV as bars."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch, Polygon
+from matplotlib.ticker import LogLocator, NullLocator
+from scipy import ndimage
+
+from mapvote import plots as style
+from mapvote.core.grid import CELL_SIZE, Grid
+from mapvote.core.types import F64, U8, Bool, CellState
+from mapvote.core.voting import vote_weight
+from mapvote_lab.evaluation.results import CaseResult
+from mapvote_lab.evaluation.scoring import paper_tables
+from mapvote_lab.evaluation.scoring.cells import CLASSES
+
+Outline = tuple[str, F64]
+"""Kind ("built" or "demolished") and footprint corners (m, 2), map metres."""
+
+
+def _extent(grid: Grid) -> tuple[float, float, float, float]:
+    return grid.x0, grid.x0 + grid.cols * CELL_SIZE, grid.y0, grid.y0 + grid.rows * CELL_SIZE
+
+
+def _from_above(points: F64, height: F64, grid: Grid) -> np.ndarray:
+    """(rows, cols, 3): highest point of each cell as a shade; white where there is none."""
+    rows, cols, inside = grid.indices_of(points)
+    top = np.full(grid.shape, -np.inf)
+    np.maximum.at(top, (rows[inside], cols[inside]), height[inside])
+    known = np.isfinite(top)
+    share = np.clip(top / 10.0, 0.0, 1.0)[..., None]
+    share[~known] = 0.0
+    low, high = np.array([0.83, 0.86, 0.89]), np.array([0.16, 0.25, 0.34])
+    image = low + (high - low) * np.sqrt(share)
+    image[~known] = 1.0
+    return image
+
+
+def _thicken(cells: Bool) -> Bool:
+    """A cell of a long street is finer than a pixel: a change is drawn one cell wider there, so that it is not lost."""
+    return ndimage.binary_dilation(cells, structure=np.ones((3, 3))) if cells.shape[1] > 900 else cells
+
+
+def _panel(axis: Any, image: np.ndarray, grid: Grid, title: str, **how: Any) -> None:
+    axis.imshow(image, origin="lower", extent=_extent(grid), interpolation="nearest", **how)
+    axis.autoscale(False)
+    axis.set_title(title, loc="left")
+    axis.set_ylabel("y (m)")
+
+
+def _outline(axis: Any, outlines: Sequence[Outline]) -> None:
+    for kind, corners in outlines:
+        colour = style.NEW if kind == "built" else style.GONE
+        away = corners - corners.mean(axis=0)
+        corners = corners + 1.5 * np.sign(away)  # beside the walls, not over them
+        axis.add_patch(Polygon(corners, closed=True, fill=False, edgecolor=colour, lw=1.2, ls=(0, (4, 2))))
+
+
+def _stack(grid: Grid, panels: int, width: float = 13.0) -> tuple[Figure, Any]:
+    shape = grid.rows / grid.cols
+    side_by_side = shape > 0.5
+    if side_by_side:
+        return style.new_figure(width, width / panels * shape + 1.1, 1, panels)
+    return style.new_figure(width, (width * 0.93 * shape + 0.55) * panels + 0.7, panels, 1, sharex=True)
+
+
+def street(
+    old: tuple[F64, F64],
+    updated: tuple[F64, F64],
+    added: F64,
+    deleted: F64,
+    grid: Grid,
+    *,
+    outlines: Sequence[Outline] = (),
+    areas: Sequence[tuple[str, F64]] = (),
+    paths: Sequence[tuple[str, F64]] = (),
+) -> Figure:
+    """The street from above (Figure 6): the old map with what was deleted, the new one with what was added.
+
+    ``old`` and ``updated``: points (n, 3), map metres, and their heights above ground (n,); ``areas`` (name,
+    corner-to-corner (2, 2) box); ``paths`` of vehicles (name, (m, 3)).
+    """
+    figure, axes = _stack(grid, 2)
+    axes = axes.ravel()
+    for axis, (points, height), marked, colour, title in (
+        (axes[0], old, deleted, style.GONE, "(a) First map, deleted points in blue"),
+        (axes[1], updated, added, style.NEW, "(b) Updated map, added points in red"),
+    ):
+        image = _from_above(points, height, grid)
+        rows, cols, inside = grid.indices_of(marked)
+        cells = np.zeros(grid.shape, dtype=np.bool_)
+        cells[rows[inside], cols[inside]] = True
+        image[_thicken(cells)] = to_rgb(colour)
+        _panel(axis, image, grid, title)
+        _outline(axis, outlines)
+        for name, box in areas:
+            axis.text(*box[1], f" {name}", va="top", ha="right", fontsize=8.5, color=style.INK)
+            corners = [box[0], (box[1][0], box[0][1]), box[1], (box[0][0], box[1][1])]
+            axis.add_patch(Polygon(corners, closed=True, fill=False, edgecolor=style.FAINT, lw=0.9))
+    for i, (_, path) in enumerate(paths):
+        axes[1].plot(path[:, 0], path[:, 1], color=style.VEHICLE_COLOURS[i % 8], lw=1.0)
+    axes[-1].set_xlabel("x (m)")
+    handles: list[Any] = [
+        Patch(facecolor=style.GONE, label="deleted"),
+        Patch(facecolor=style.NEW, label="added"),
+        Line2D([], [], color=style.GONE, ls="--", label="truth: demolished"),
+        Line2D([], [], color=style.NEW, ls="--", label="truth: built"),
+    ]
+    handles += [Line2D([], [], color=style.VEHICLE_COLOURS[i % 8], label=name) for i, (name, _) in enumerate(paths)]
+    figure.legend(handles=handles, loc="outside lower center", ncols=7, frameon=False)
+    return figure
+
+
+def cell_states(panels: Sequence[tuple[str, U8]], grid: Grid, *, outlines: Sequence[Outline] = ()) -> Figure:
+    """Grids of states (Figures 2 and 3), each over ``grid``."""
+    figure, axes = _stack(grid, len(panels))
+    for axis, (title, states) in zip(axes.ravel(), panels, strict=True):
+        image = style.state_image(states)
+        for change in (CellState.CHANGED_OCCUPIED, CellState.CHANGED_EMPTY):
+            image[_thicken(states == change)] = change
+        _panel(axis, image, grid, title, cmap=style.STATE_MAP, vmin=-0.5, vmax=len(CellState) + 0.5)
+        _outline(axis, outlines)
+    for axis in axes[-1]:
+        axis.set_xlabel("x (m)")
+    handles = [
+        Patch(facecolor=style.STATE_COLOURS[s], edgecolor=style.FAINT, label=style.STATE_NAMES[s]) for s in CellState
+    ]
+    handles.append(Patch(facecolor=style.PAPER_WHITE, edgecolor=style.FAINT, label="never seen"))
+    figure.legend(handles=handles, loc="outside lower center", ncols=6, frameon=False)
+    return figure
+
+
+def vote_curve(a: float, b: float, k: float, n_min: int) -> Figure:
+    """Votes per scan of an occupied cell against its points, Eq. (1) (Figure 4)."""
+    figure, axes = style.new_figure(6.2, 3.4)
+    axis = axes[0, 0]
+    n = np.arange(n_min, 31)
+    axis.plot(n, vote_weight(n, a, b, k, n_min), color=style.STANDING, lw=1.8, marker="o", ms=3.5)
+    axis.hlines(0, 0, n_min - 1, color=style.UNSURE, lw=3)
+    axis.annotate(f"fewer than {n_min} points:\nnot occupied", (n_min - 1, 0), (8, 0.45), fontsize=9,
+                  arrowprops={"arrowstyle": "-", "color": style.FAINT})  # fmt: skip
+    axis.axhline(b, color=style.FAINT, lw=0.8, ls=":")
+    axis.set_xlim(0, 30)
+    axis.set_ylim(-0.1, 1.1 * b)
+    axis.set_xlabel("measurement points n in the cell")
+    axis.set_ylabel("votes w(n)")
+    axis.set_title(loc="left", label=f"w(n) = a + (b − a)(1 − exp(−k (n − {n_min}))),  a = {a:g}, b = {b:g}, k = {k:g}")
+    axis.spines[["top", "right"]].set_visible(False)
+    return figure
+
+
+def score_bars(cases: Mapping[str, CaseResult], names: Mapping[str, str]) -> Figure:
+    """Table IV as bars: macro F1 of ``cases`` in both truths, the paper's beside it."""
+    shown = list(cases)
+    figure, axes = style.new_figure(max(7.5, 0.95 * len(shown) + 1.5), 4.0)
+    axis = axes[0, 0]
+    series: list[tuple[str, str, list[float | None]]] = [
+        ("paper, Table IV", style.EMPTY, [paper_tables.F1.get(case) for case in shown]),
+        ("ours, strict truth", style.STANDING, [cases[case].strict.macro_f1 for case in shown]),
+        ("ours, provenance truth", "#a3b6c6", [cases[case].provenance.macro_f1 for case in shown]),
+    ]
+    for k, (label, colour, values) in enumerate(series):
+        x = np.array([i + 0.27 * (k - 1) for i, v in enumerate(values) if v is not None])
+        y = np.array([v for v in values if v is not None])
+        axis.bar(x, y, width=0.25, color=colour, edgecolor=style.FAINT if k == 0 else "none", label=label)
+        for xi, yi in zip(x, y, strict=True):
+            axis.text(xi, yi + 0.01, f"{yi:.2f}".lstrip("0") if yi < 1 else "1.00", ha="center", fontsize=7.5)
+    axis.set_xticks(range(len(shown)), [names.get(case, case).replace(", ", ",\n") for case in shown])
+    axis.set_ylim(0, 1.08)
+    axis.set_ylabel("F1, mean of the three classes")
+    axis.spines[["top", "right"]].set_visible(False)
+    figure.legend(loc="outside upper center", ncols=3, frameon=False)
+    return figure
+
+
+def class_bars(cases: Mapping[str, CaseResult], names: Mapping[str, str]) -> Figure:
+    """Precision and recall of each class by the strict truth (Tables II and III); the paper's as a tick across."""
+    shown = list(cases)
+    figure, axes = style.new_figure(max(7.5, 0.95 * len(shown) + 1.5), 5.6, 2, 1, sharex=True)
+    colours = {"unchanged": style.STANDING, "changed_occupied": style.NEW, "changed_empty": style.GONE}
+    for axis, measure in zip(axes.ravel(), ("precision", "recall"), strict=True):
+        for k, name in enumerate(CLASSES):
+            x = np.arange(len(shown)) + 0.27 * (k - 1)
+            values = [getattr(getattr(cases[case].strict, measure), name) for case in shown]
+            axis.bar(x, values, width=0.25, color=colours[name], label=name.replace("_", ", "))
+            both = [(at, paper_tables.SCORES[case]) for at, case in zip(x, shown, strict=True) if case in "12345"]
+            theirs = [(at, getattr(getattr(scores, measure), name)) for at, scores in both]
+            axis.hlines([y for _, y in theirs], [at - 0.12 for at, _ in theirs], [at + 0.12 for at, _ in theirs],
+                        color=style.INK, lw=1.6, label="paper" if k == 0 else None)  # fmt: skip
+        axis.set_ylabel(measure)
+        axis.set_ylim(0, 1.04)
+        axis.spines[["top", "right"]].set_visible(False)
+    axes[-1, 0].set_xticks(range(len(shown)), [names.get(case, case).replace(", ", ",\n") for case in shown])
+    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside upper center", ncols=4, frameon=False)
+    return figure
+
+
+def byte_bars(cases: Mapping[str, CaseResult], names: Mapping[str, str]) -> Figure:
+    """Kilobytes that a vehicle sends in all, and of its votes alone; the mean of the vehicles. Yardsticks send none."""
+    shown = [case for case in cases if cases[case].bytes_per_vehicle]
+    figure, axes = style.new_figure(max(5.0, 0.95 * len(shown) + 1.5), 3.2)
+    axis = axes[0, 0]
+    for k, (label, colour, field) in enumerate(
+        (
+            ("all that is sent", style.STANDING, "bytes_per_vehicle"),
+            ("votes alone", "#a3b6c6", "state_bytes_per_vehicle"),
+        )
+    ):
+        values = [np.mean(getattr(cases[case], field) or [np.nan]) / 1000 for case in shown]
+        axis.bar(np.arange(len(shown)) + 0.4 * (k - 0.5), values, width=0.38, color=colour, label=label)
+    axis.set_yscale("log")
+    axis.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axis.yaxis.set_major_formatter("{x:g}")
+    axis.yaxis.set_minor_locator(NullLocator())
+    axis.set_ylabel("kB a vehicle")
+    axis.set_xticks(range(len(shown)), [names.get(case, case).replace(", ", ",\n") for case in shown])
+    axis.spines[["top", "right"]].set_visible(False)
+    figure.legend(loc="outside upper center", ncols=2, frameon=False)
+    return figure

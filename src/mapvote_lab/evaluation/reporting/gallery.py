@@ -1,0 +1,239 @@
+"""The pictures of one evaluation, in the manner of the paper's Figures 2-8, into a folder."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
+
+from mapvote import plots as style
+from mapvote.core.geometry import transform
+from mapvote.core.grid import window_around
+from mapvote.core.point_map import PointMap, all_points
+from mapvote.core.types import F32, F64, U8, Bool, CellState
+from mapvote.localisation.localiser import GivenPoses
+from mapvote.vehicle import Vehicle
+from mapvote_lab.evaluation.baselines.nearest_neighbour import heights
+from mapvote_lab.evaluation.evaluate import Evaluation
+from mapvote_lab.evaluation.experiments.cases import COLUMNS_V1, YARDSTICKS, ballot_states, paper_cases
+from mapvote_lab.evaluation.reporting import birdseye, figures, study_figures
+from mapvote_lab.evaluation.reporting.tables import case_name
+from mapvote_lab.evaluation.scoring.cells import UNSCORED
+from mapvote_lab.evaluation.scoring.map_points import same_rows
+from mapvote_lab.evaluation.scoring.reliability import reliability
+from mapvote_lab.evaluation.scoring.truth import lay_on
+from mapvote_lab.simulation.scenario import load_scenario
+
+MOVER = "#e07b00"
+
+
+@dataclass(frozen=True, slots=True)
+class Area:
+    """A place where the world changed."""
+
+    name: str
+    kind: str
+    box: F64
+    """(2, 2) corner to corner, x and y, map metres."""
+    objects: int
+
+
+def areas_of(evaluation: Evaluation) -> list[Area]:
+    """The scenario's changed areas, numbered in its order (the paper's Figure 6), by the footprints built there."""
+    out = []
+    scene = evaluation.scene
+    for i, change in enumerate(load_scenario(scene.scenario, scene.overrides).changes):
+        corners = [np.asarray(o["footprint"]) for o in evaluation.truth.objects if o["kind"] == change.kind]
+        mine = [c for c in corners if change.from_m - 2 <= c[:, 0].mean() <= change.to_m + 2]
+        if mine:
+            every = np.concatenate(mine)
+            box = np.array([every.min(axis=0) - 4.0, every.max(axis=0) + 4.0])
+            out.append(Area(f"area {i + 1}", change.kind, box, len(mine)))
+    return out
+
+
+def gallery(
+    evaluation: Evaluation, case: str, folder: Path, formats: Sequence[style.Format] = ("png",)
+) -> list[tuple[Path, str]]:
+    """Draw everything; ``case`` is the one whose updated map is shown. Returns (picture, caption)."""
+    folder.mkdir(parents=True, exist_ok=True)
+    out = []
+    for name, picture, caption in drawn(evaluation, case):
+        for format in formats:
+            style.save(picture, folder / f"{name}.{format}", format)
+        out.append((folder / f"{name}.{formats[0]}", caption))
+    return out
+
+
+def drawn(evaluation: Evaluation, case: str) -> list[tuple[str, Figure, str]]:
+    """(name, figure, caption) of every picture."""
+    old, new = all_points(evaluation.first_map), all_points(evaluation.outcomes[case].updated)
+    survived, added = same_rows(old, new)
+    deleted = old[~survived]
+    paths = _paths(evaluation)
+    areas = areas_of(evaluation)
+    outlines = [(o["kind"], np.asarray(o["footprint"])) for o in evaluation.truth.objects]
+    boxes = [(area.name, area.box) for area in areas]
+    street = figures.street(
+        (old, heights(evaluation.first_map, old)), (new, heights(evaluation.first_map, new)), added, deleted,
+        evaluation.window, outlines=outlines, areas=boxes, paths=paths,
+    )  # fmt: skip
+    pictures = [("street", street, f"The street from above before and after the vote ({case_name(case)}): Figure 6.")]
+    for area in areas:
+        verb, figure = ("added in red", 7) if area.kind == "built" else ("deleted in blue", 8)
+        caption = f"{area.name.capitalize()} in bird's-eye view, points {verb}: Figure {figure}."
+        pictures.append(
+            (area.name.replace(" ", "_"), _area(evaluation.first_map, area, old, survived, added, paths), caption)
+        )
+    nearest = _scan_near(evaluation, areas)
+    v, n_min = evaluation.scene.settings.voting, evaluation.scene.settings.paper.n_min
+    decided = {n: evaluation.outcomes[n].states for n in ("1", "5", COLUMNS_V1, "surfaces") if n in evaluation.outcomes}
+    panels = [("Truth (strict)", _as_states(evaluation.truth.strict))]
+    panels += [(case_name(n).capitalize(), states) for n, states in decided.items()]
+    states = figures.cell_states(panels, evaluation.window, outlines=outlines)
+    shown = {n: e for n, e in evaluation.result.cases.items() if n in (*"12345", COLUMNS_V1, "surfaces", *YARDSTICKS)}
+    names = {n: case_name(n) for n in shown}
+    bars = figures.score_bars(shown, names)
+    pictures += [
+        ("scan", _scan(evaluation, nearest), "One scan of a vehicle, bodies that move in orange: Figure 5."),
+        ("local_grid", _local_grid(evaluation, nearest), "The 80 m local grid of one vehicle: Figures 2 and 3."),
+        (
+            "vote_curve",
+            figures.vote_curve(v.a, v.b, v.k, n_min),
+            "Votes of an occupied cell, Eq. (1): Figure 4.",
+        ),
+        (
+            "states",
+            states,
+            "What the server decided, cell by cell; yellow in the truth: unscored.",
+        ),
+        ("table_iv", bars, "Table IV as bars, the paper's figures beside ours."),
+        ("classes", figures.class_bars(shown, names), "Precision and recall of each class: Tables II and III."),
+        ("bytes", figures.byte_bars(shown, names), "What a vehicle sends, by case."),
+    ]
+    return [*pictures, *_of_our_own(evaluation)]
+
+
+def _of_our_own(evaluation: Evaluation) -> list[tuple[str, Figure, str]]:
+    """Of our own methods: their probabilities, and what each rule of columns_v1 is worth if they voted rule by rule."""
+    out = []
+    if evaluation.best in (COLUMNS_V1, "surfaces"):
+        decisions, lattice = evaluation.outcomes[evaluation.best].decisions, evaluation.first_map.lattice
+        found = {
+            state: reliability(decisions, lattice, evaluation.truth.strict, evaluation.window, state)
+            for state in (CellState.CHANGED_OCCUPIED, CellState.CHANGED_EMPTY)
+        }
+        caption = "How often cells changed that were told to, by the probability they were told with (strict truth)."
+        out.append(("reliability", study_figures.reliability_diagram(found), caption))
+    ablation = study_figures.ablation({name: [entry] for name, entry in evaluation.result.cases.items()})
+    if ablation is not None:
+        out.append(("ablation", ablation, "What each rule of columns_v1 is worth, added one by one (strict truth)."))
+    return out
+
+
+def _as_states(truth: U8) -> U8:
+    """A truth grid in the colours of states; what is not scored looks undetermined."""
+    states = np.full(truth.shape, CellState.UNCHANGED_EMPTY, dtype=np.uint8)
+    for value, state in (
+        (1, CellState.CHANGED_OCCUPIED),
+        (2, CellState.CHANGED_EMPTY),
+        (UNSCORED, CellState.UNDETERMINED),
+    ):
+        states[truth == value] = state
+    return states
+
+
+def _paths(evaluation: Evaluation) -> list[tuple[str, F64]]:
+    """Where each vehicle believed to drive, on the road below its sensor."""
+    out = []
+    for drive in evaluation.drives:
+        position = drive.T_map_lidar[np.isfinite(drive.T_map_lidar).all(axis=(1, 2)), :3, 3]
+        height = evaluation.scene.drive(drive.vehicle).T_base_lidar[2, 3]
+        out.append((drive.vehicle.replace("v", "vehicle "), position - [0.0, 0.0, height]))
+    return out
+
+
+def _area(
+    first_map: PointMap, area: Area, old: F64, survived: Bool, added: F64, paths: list[tuple[str, F64]]
+) -> Figure:
+    """Before and after, from across the road; what stands on the near side of it is left out of the way."""
+    road_y = float(np.mean(np.concatenate([path[:, 1] for _, path in paths])))
+    middle = area.box.mean(axis=0)
+    north = middle[1] > road_y
+    low, high = area.box[0] - [22.0, 6.0], area.box[1] + [22.0, 6.0]
+    low[1], high[1] = (road_y - 9.0, high[1]) if north else (low[1], road_y + 9.0)
+    ground_z = float(np.median(np.concatenate([path[:, 2] for _, path in paths])))
+
+    def inside(points: F64) -> Bool:
+        return ((points[:, :2] > low) & (points[:, :2] < high)).all(axis=1)
+
+    def coloured(points: F64, marked: Bool, colour: str) -> tuple[F64, F32]:
+        here = inside(points)
+        colours = birdseye.shades(heights(first_map, points[here]))
+        colours[marked[here]] = to_rgb(colour)
+        return points[here], colours
+
+    kept_first = np.concatenate([old[survived], added])
+    fresh = np.arange(len(kept_first)) >= int(survived.sum())
+    width = float(area.box[1, 0] - area.box[0, 0])
+    target = float(middle[0]), float(0.6 * middle[1] + 0.4 * road_y), ground_z + 2.0
+    camera = birdseye.Camera(target, 30.0 + 0.85 * width, -72.0 if north else 72.0, 34.0)
+    shown = [(name, path[inside(path)]) for name, path in paths]
+    panels = [
+        ("(a) First map", *coloured(old, ~survived, style.GONE)),
+        ("(b) Updated map", *coloured(kept_first, fresh, style.NEW)),
+    ]
+    return birdseye.draw(panels, camera, paths=shown, legend=[("deleted", style.GONE), ("added", style.NEW)])
+
+
+def _scan_near(evaluation: Evaluation, areas: list[Area]) -> int:
+    """The scan of the first vehicle nearest to the first demolition (or to the first area, or its middle scan)."""
+    T = evaluation.drives[0].T_map_lidar
+    chosen = [a for a in areas if a.kind == "demolished"] or areas
+    if not chosen:
+        return len(T) // 2
+    distance = np.linalg.norm(T[:, :2, 3] - chosen[0].box.mean(axis=0), axis=1)
+    return int(np.nanargmin(distance))
+
+
+def _scan(evaluation: Evaluation, index: int) -> Figure:
+    drive = evaluation.scene.drive(evaluation.drives[0].vehicle)
+    T_map_lidar = evaluation.drives[0].T_map_lidar[index]
+    scan, moving = drive.read_scan(index), evaluation.truth.moving(evaluation.drives[0].vehicle, index)
+    points = transform(T_map_lidar, scan.points)
+    ground_z = float(T_map_lidar[2, 3] - drive.T_base_lidar[2, 3])
+    colours = birdseye.shades(heights(evaluation.first_map, points))
+    if len(moving) == len(points):
+        colours[moving] = to_rgb(MOVER)
+    near = np.linalg.norm(points[:, :2] - T_map_lidar[:2, 3], axis=1) < 45.0
+    camera = birdseye.Camera((*T_map_lidar[:2, 3], ground_z), 62.0, 205.0, 38.0)
+    title = f"{drive.vehicle}, scan {index}: {len(points):,} points, {100 * moving.mean():.0f} % on moving bodies"
+    return birdseye.draw([(title, points[near], colours[near])], camera, size_m=0.1, legend=[("moving", MOVER)])
+
+
+def _local_grid(evaluation: Evaluation, index: int) -> Figure:
+    """What one scan alone makes of the local grid under the paper's rule, and what the whole drive made of it."""
+    first = evaluation.drives[0]
+    scene, name = evaluation.scene, first.vehicle
+    drive = scene.drive(name)
+    voting = paper_cases(scene.settings)["1"].voting
+    there = np.isfinite(first.T_map_lidar).all(axis=(1, 2))
+    localise = GivenPoses(drive.stamps_ns[there], first.T_map_lidar[there])
+    settings = scene.settings.model_copy(update={"voting": voting})
+    vehicle = Vehicle(name, drive.sensor, evaluation.first_map, settings, localise=localise)
+    vehicle.observe(drive.read_scan(index))
+    vehicle.finish()
+    once, grid = ballot_states(vehicle.ballot(), evaluation.first_map)
+    x, y = first.T_map_lidar[index, :2, 3]
+    window = window_around(evaluation.first_map.lattice, float(x), float(y), voting.window_m)
+    panels = [("One scan, case 1", lay_on(once, grid, window))]
+    panels += [
+        (f"The whole drive, {case_name(n)}", lay_on(*ballot_states(first.ballots[n], evaluation.first_map), window))
+        for n in dict.fromkeys(("1", evaluation.best))
+        if n in first.ballots
+    ]
+    return figures.cell_states(panels, window)

@@ -1,0 +1,76 @@
+"""What the paper's tables rest on, as tables: readings by case, truths by height, and the budget of a case."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+
+from rich import box
+from rich.table import Table
+
+from mapvote_lab.evaluation.results import EvaluationResult
+from mapvote_lab.evaluation.scoring import paper_tables
+from mapvote_lab.evaluation.scoring.budget import Budget
+from mapvote_lab.evaluation.scoring.cells import Scores
+from mapvote_lab.evaluation.scoring.truths import BANDS
+
+_BUDGETS = {
+    "true_changed_occupied": "truly changed (occupied) cells",
+    "true_changed_empty": "truly changed (empty) cells",
+    "false_changed_occupied": "cells falsely called changed (occupied)",
+    "false_changed_empty": "cells falsely called changed (empty)",
+}
+
+
+def _new(title: str, *headings: str) -> Table:
+    table = Table(title=title, box=box.SIMPLE_HEAD, title_justify="left", title_style="bold")
+    for heading in headings:
+        table.add_column(heading, justify="right" if table.columns else "left")
+    return table
+
+
+def study_tables(result: EvaluationResult) -> Iterator[Table]:
+    """Those of what was asked: nothing but the sizes of the truths, unless readings or budgets were."""
+    yield _sizes(result)
+    if result.readings:
+        truths = list(next(iter(next(iter(result.readings.values())).values())))
+        for truth in truths:
+            yield readings_table(result.readings, truth, result.settings["paper"]["occluded"])
+    for case, by_truth in result.budgets.items():
+        for truth, found in by_truth.items():
+            yield from _budget(case, truth, found)
+
+
+def _sizes(result: EvaluationResult) -> Table:
+    table = _new("The truths: changed cells by the height of their lowest surface", "", "", "all", *BANDS)
+    for truth, by_class in result.truth_sizes.items():
+        for name, bands in by_class.items():
+            cells = [f"{bands[band]:,}" for band in BANDS]
+            table.add_row(truth, name.replace("_", " "), f"{sum(bands.values()):,}", *cells)
+    return table
+
+
+def readings_table(readings: Mapping[str, Mapping[str, Mapping[str, Scores]]], truth: str, occluded: str) -> Table:
+    """A line a reading, macro-F1 by case against one truth; the paper's Table IV last. ``occluded``: as it is set."""
+    cases = list(next(iter(readings.values())))
+    table = _new(f"Readings of the paper: F1, mean of the three classes ({truth} truth)", "reading", *map(_case, cases))
+    for name, by_case in readings.items():
+        shown = f"as set: occluded {occluded}" if name == "as set" else name
+        table.add_row(shown, *(f"{by_case[case][truth].macro_f1:.3f}" for case in cases))
+    table.add_row("paper, Table IV", *(f"{paper_tables.F1[case]:.3f}" for case in cases), style="dim")
+    return table
+
+
+def _case(name: str) -> str:
+    return f"case {name}"
+
+
+def _budget(case: str, truth: str, found: Budget) -> Iterator[Table]:
+    for field, title in _BUDGETS.items():
+        shares = getattr(found, field)
+        total = sum(share.cells for share in shares.values())
+        table = _new(f"Case {case}: the {total:,} {title} ({truth} truth)", "cause", "cells", "%")
+        for cause, share in shares.items():
+            if share.cells:
+                table.add_row(cause, f"{share.cells:,}", f"{share.percent:.1f}")
+        table.add_row("all", f"{total:,}", f"{sum(share.percent for share in shares.values()):.1f}", style="bold")
+        yield table

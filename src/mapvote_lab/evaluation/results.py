@@ -1,0 +1,133 @@
+"""What experiments measure, typed; the same structures are the JSON of ``evaluate --json`` and of the matrix.
+
+Lengths in metres, times in seconds and angles in degrees unless the name says otherwise; shares from 0 to 1.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from typing import Any
+
+import msgspec
+
+from mapvote_lab.evaluation.scoring.budget import Budget
+from mapvote_lab.evaluation.scoring.cells import Scores
+from mapvote_lab.evaluation.scoring.map_points import MapScores
+from mapvote_lab.evaluation.scoring.objects import ObjectScores
+from mapvote_lab.evaluation.scoring.truth import PoseErrors
+
+
+class Judgement(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """How decided cells compare with the truth, and what became of the map."""
+
+    strict: Scores
+    """Against all that changed where a survey's or a vehicle's ray could reach."""
+    provenance: Scores
+    """Against what changed of the points that the first map holds."""
+    coverage: float
+    """Share of the scored cells that some vehicle determined."""
+    objects: ObjectScores
+    also: dict[str, Scores] = {}
+    """By the further truths of ``scoring/truths.py``."""
+    map: MapScores | None = None
+    """None (not in the JSON) where no map was edited: the yardsticks only decide cells."""
+
+
+class CaseResult(Judgement, frozen=True, kw_only=True, omit_defaults=True):
+    """One case of ``evaluate``, or a yardstick, which sends no ballots."""
+
+    bytes_per_vehicle: list[int]
+    state_bytes_per_vehicle: list[int] | None = None
+    """Of the votes alone, without new points and other planes."""
+
+
+class RoundResult(Judgement, frozen=True, kw_only=True, omit_defaults=True):
+    """One set of ballots of the matrix."""
+
+    strict_old_unchanged: Scores
+    """As ``strict``, old surfaces that no survey saw counted as unchanged."""
+    provenance_old_unchanged: Scores
+    determined: float
+    """Share of the scored cells that the fleet determined."""
+
+
+class MapShift(msgspec.Struct, frozen=True):
+    """How far the first map lies from the truth."""
+
+    mean_m: float
+    x_m: float
+    y_m: float
+    z_m: float
+    p95_m: float
+
+
+class Cost(msgspec.Struct, frozen=True):
+    """Of one method on a vehicle."""
+
+    beams: int
+    ms_per_scan: float
+    """Median, milliseconds."""
+    memory_bytes: float
+    """Of its grid."""
+
+
+class Timings(msgspec.Struct, frozen=True, kw_only=True):
+    """Wall time; what is left of a run whose other numbers are all repeatable."""
+
+    prepare_s: float
+    vote_s: float
+    score_s: float
+    yardsticks_s: float
+    methods: dict[str, Cost]
+    stages_ms: dict[str, dict[str, float]]
+    """By vehicle and stage: median milliseconds a scan."""
+    fuse_s: dict[str, float]
+    """By case."""
+
+
+class EvaluationResult(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """One scenario and seed: what ``evaluate --json`` writes."""
+
+    scenario: str
+    seed: int
+    poses: str
+    """"ndt" or "truth"."""
+    cells: int
+    """In the truth's window."""
+    coverage: float
+    """Of the case whose updated map is shown."""
+    settings: dict[str, Any]
+    map_shift: MapShift
+    localisation: dict[str, PoseErrors]
+    """By vehicle."""
+    changed_areas: dict[str, PoseErrors]
+    """One vehicle's scans near changes, by map."""
+    ceilings: dict[str, Scores]
+    """By truth: what perfect labels on every measured point would score in cells."""
+    truth_sizes: dict[str, dict[str, dict[str, int]]]
+    """By truth, class and height of the lowest surface: changed cells."""
+    cases: dict[str, CaseResult]
+    readings: dict[str, dict[str, dict[str, Scores]]] = {}
+    """By reading of the paper, case and truth, if asked for."""
+    budgets: dict[str, dict[str, Budget]] = {}
+    """By case and truth, if asked for."""
+    timings: Timings
+
+
+class MatrixResult(msgspec.Struct, frozen=True, kw_only=True):
+    """One experiment of the matrix on one seed."""
+
+    scenario: str
+    seed: int
+    cells: int
+    map_shift: MapShift
+    localisation: dict[str, PoseErrors]
+    ceilings: dict[str, Scores]
+    """As of ``evaluate``."""
+    rounds: dict[str, RoundResult]
+
+
+def to_json(result: msgspec.Struct | Mapping[str, Any], *, sort_keys: bool = False) -> str:
+    """Indented; ValueError if a number is NaN or infinite."""
+    return json.dumps(msgspec.to_builtins(result), indent=1, sort_keys=sort_keys, allow_nan=False) + "\n"

@@ -1,0 +1,220 @@
+"""``simulate``: a scenario and a seed become drive folders, and the truth apart from them (paper V)."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mapvote.core.columns import GROUND_MARGIN_M
+from mapvote.core.grid import CELL_SIZE
+from mapvote.core.sensors import SENSORS, Sensor
+from mapvote.core.types import F32, F64, I32, U8, MapvoteError
+from mapvote.formats.drives.kitti import DriveWriter, write_poses
+from mapvote_lab.simulation.actors import Traffic, make_traffic
+from mapvote_lab.simulation.flaws import Hits, Kinds, spoil
+from mapvote_lab.simulation.lidar import Caster, measure, sweep
+from mapvote_lab.simulation.processes import processes
+from mapvote_lab.simulation.routes import Route, make_routes
+from mapvote_lab.simulation.scenario import Scenario, load_scenario
+from mapvote_lab.simulation.truth import T_map_street, count_hits, dense_survey, ground_cells, on_grid, write_truth
+from mapvote_lab.simulation.world import Role, World, make_world
+
+_CHUNK = 40
+"""Scans per task: small enough to keep two processes busy to the end."""
+
+Progress = Callable[[int, int], None]
+"""Called with (scans done, scans in all)."""
+
+
+def simulate(
+    scenario: str | Path,
+    out: Path,
+    seed: int = 1,
+    *,
+    progress: Progress | None = None,
+    overrides: Mapping[str, Any] | None = None,
+    workers: int | None = None,
+) -> None:
+    """Write the drive folders ``out``/survey_1.., ``out``/v1.. and ``out``/truth; ``out`` appears whole.
+
+    ``scenario`` is a name (:func:`mapvote_lab.simulation.scenario.names`) or a TOML file, ``overrides`` replace its
+    fields. The bytes written depend on scenario and seed only, not on ``workers`` (default: one process per core
+    for long drives). MapvoteError if ``out`` exists or the scenario is not valid.
+    """
+    out = Path(out)
+    if out.exists():
+        raise MapvoteError(f"{out}: exists already; remove it or choose another folder")
+    spec = load_scenario(scenario, overrides)
+    stage = _stage(spec, seed)
+    partial = out.with_name(f".{out.name}.partial")
+    shutil.rmtree(partial, ignore_errors=True)
+    partial.mkdir(parents=True)
+    try:
+        writers = [_writer(partial, route, stage).open() for route in stage.routes]
+        for route in stage.routes:
+            (partial / "truth" / route.name / "moving").mkdir(parents=True)
+        with _pool(workers or _processes(stage)) as run:
+            dense = run(_survey, [(spec, seed, drive) for drive in range(len(stage.routes))])
+            survey, vehicles, densest = _drive_all(stage, partial, run, progress)
+            T = T_map_street(spec)
+            for index, (route, writer) in enumerate(zip(stage.routes, writers, strict=True)):
+                writer.close(route.stamps_ns, T @ route.priors(np.random.default_rng([seed, 4, index])))
+                write_poses(partial / "truth" / route.name / "poses.txt", T @ route.poses(route.time_s))
+            write_truth(partial / "truth", stage.world, spec, list(dense), survey, vehicles, densest)
+        os.replace(partial, out)
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+
+
+@dataclass(frozen=True)
+class Stage:
+    """Everything that a scenario and a seed decide, the same in every process."""
+
+    scenario: Scenario
+    seed: int
+    sensor: Sensor
+    world: World
+    routes: tuple[Route, ...]
+    ground: F64
+    """(rows, cols) of the scored window."""
+    kinds: Kinds
+
+
+@lru_cache(maxsize=1)
+def _stage(scenario: Scenario, seed: int) -> Stage:
+    world = make_world(scenario, seed)
+    model = SENSORS[scenario.sensor]
+    noise = scenario.flaws.range_sigma_m
+    sigma_m = model.range_sigma_m if noise is None else noise
+    sensor = replace(model, rate_hz=max(model.rate_hz, scenario.rate_hz), range_sigma_m=sigma_m)
+    routes = tuple(make_routes(scenario, world.terrain, seed))
+    glazed, painted = (
+        np.array([body.kind == kind for body in world.bodies], dtype=np.bool_) for kind in ("building", "parked car")
+    )
+    kinds = Kinds(glazed, painted, seed)
+    return Stage(scenario, seed, sensor, world, routes, ground_cells(world, scenario), kinds)
+
+
+@lru_cache(maxsize=1)
+def _street(scenario: Scenario, seed: int, drive: int) -> tuple[Caster, Traffic]:
+    """What stands and what moves during one drive."""
+    stage = _stage(scenario, seed)
+    route = stage.routes[drive]
+    still = Caster(*stage.world.mesh(stage.world.standing(route.vehicle)))
+    duration = route.scans / route.rate_hz
+    rng = np.random.default_rng([seed, 5, drive])
+    return still, make_traffic(scenario, stage.world.terrain, route.lane, duration, rng)
+
+
+def _writer(folder: Path, route: Route, stage: Stage) -> DriveWriter:
+    mount = np.eye(4)
+    mount[2, 3] = route.mount_height_m
+    return DriveWriter(
+        folder / route.name,
+        vehicle=route.name,
+        sensor=stage.sensor,
+        start_ns=route.start_ns,
+        prior_sigma_m=route.prior_sigma_m,
+        prior_sigma_deg=route.prior_sigma_deg,
+        T_base_lidar=mount,
+        motion_compensated=not stage.scenario.motion_distortion,
+    )
+
+
+_Run = Callable[[Callable[[Any], Any], list[Any]], Iterable[Any]]
+
+
+@contextmanager
+def _pool(workers: int) -> Iterator[_Run]:
+    """A map over tasks whose results come in the order of the tasks: in this process or in spawned ones."""
+    if workers == 1:
+        yield map
+        return
+    with processes(workers) as pool:
+        yield pool.map
+
+
+def _processes(stage: Stage) -> int:
+    """One per core where a drive is long enough to pay for starting them."""
+    return (os.cpu_count() or 1) if sum(route.scans for route in stage.routes) > 400 else 1
+
+
+def _drive_all(stage: Stage, folder: Path, run: _Run, progress: Progress | None) -> tuple[I32, I32, I32]:
+    """Drive every route; (survey, vehicles) counts (roles, rows, cols) of the recorded points that stand still, and
+    (rows, cols) the most of them that one scan of a vehicle had on built bodies."""
+    tasks = [
+        (stage.scenario, stage.seed, folder, drive, first, min(first + _CHUNK, route.scans))
+        for drive, route in enumerate(stage.routes)
+        for first in range(0, route.scans, _CHUNK)
+    ]
+    scans = sum(route.scans for route in stage.routes)
+    totals = np.zeros((2, len(Role), *stage.ground.shape), dtype=np.int32)
+    densest = np.zeros(stage.ground.shape, dtype=np.int32)
+    done = 0
+    for task, (where, hits, most) in zip(tasks, run(_drive, tasks), strict=True):
+        survey = stage.routes[task[3]].vehicle is None
+        totals[0 if survey else 1].ravel()[where] += hits
+        if not survey:
+            np.maximum(densest, most, out=densest)
+        done += task[5] - task[4]
+        if progress:
+            progress(done, scans)
+    return totals[0], totals[1], densest
+
+
+def _survey(task: tuple[Scenario, int, int]) -> tuple[I32, F32, U8]:
+    """The noise-free survey of one route, for the truth."""
+    scenario, seed, drive = task
+    stage = _stage(scenario, seed)
+    return dense_survey(stage.world, stage.routes[drive], stage.sensor, scenario)
+
+
+_Task = tuple[Scenario, int, Path, int, int, int]
+
+
+def _drive(task: _Task) -> tuple[I32, I32, U8]:
+    """Simulate and write some scans of one drive; (flat index, count) of the hits by role and cell, and the most that
+    one scan had on built bodies (rows, cols), 255 at most."""
+    scenario, seed, folder, drive, first, last = task
+    stage = _stage(scenario, seed)
+    still, traffic = _street(scenario, seed, drive)
+    route, sensor, roles = stage.routes[drive], stage.sensor, stage.world.roles()
+    writer = _writer(folder, route, stage)
+    counts = np.zeros((len(Role), *stage.ground.shape), dtype=np.int32)
+    most = np.zeros(stage.ground.shape, dtype=np.int32)
+    for index in range(first, last):
+        rng = np.random.default_rng(np.random.SeedSequence([seed, 6, drive, index]))
+        stamp_s = index / route.rate_hz
+        rays = sweep(sensor, route.poses, stamp_s, rng.uniform(), scenario.motion_distortion)
+        ranges, objects, cosine = still.cast(rays.origins, rays.directions)
+        T_map_lidar = route.poses(np.array([stamp_s]))[0]
+        turning = sensor.rate_hz if scenario.motion_distortion else None
+        bodies = Caster(*traffic.mesh(stamp_s, T_map_lidar, turning, sensor.max_range_m))
+        near, passing, body_cosine = bodies.cast(rays.origins, rays.directions)
+        moving = near < ranges
+        ranges, cosine = np.where(moving, near, ranges), np.where(moving, body_cosine, cosine)
+        hits = Hits(ranges, np.where(moving, passing, objects), cosine, moving)
+        reported, false, lost = spoil(
+            rays, hits, stage.kinds, (still, bodies), traffic.tails(stamp_s), sensor, scenario.flaws,
+            np.random.default_rng(np.random.SeedSequence([seed, 7, drive, index])),
+        )  # fmt: skip
+        noisy, kept = measure(sensor, reported, cosine, rng)
+        kept &= ~lost
+        writer.write_scan(index, noisy[kept, None] * rays.directions_lidar[kept], cosine[kept])
+        moving = moving & ~false
+        np.save(folder / "truth" / route.name / "moving" / f"{index:06d}.npy", moving[kept])
+        solid = kept & ~moving & ~false
+        points = rays.origins[solid] + ranges[solid, None] * rays.directions[solid]
+        before = counts[Role.ADDED].copy()
+        count_hits(on_grid(points, scenario), objects[solid], roles, stage.ground, CELL_SIZE, GROUND_MARGIN_M, counts)
+        np.maximum(most, counts[Role.ADDED] - before, out=most)
+    where = np.flatnonzero(counts).astype(np.int32)
+    return where, counts.ravel()[where], most.clip(max=255).astype(np.uint8)

@@ -1,0 +1,169 @@
+"""What a real LiDAR gives besides the truth: mirrors, mixed pixels, surfaces that send nothing back, rain, exhaust.
+
+* A smooth surface (a puddle, a pane, a car's paint) sends the beam on. What comes back over it is reported where the
+  beam would have been without the mirror: below the road, behind the glass, inside the car.
+* A beam is a cone. At an edge it meets two surfaces less than a pulse's length apart, and reports a range between them.
+* Wet asphalt under a flat angle, glass and dark paint return too little to be seen.
+* Drops near the sensor return the beam before it arrives; so does the exhaust behind a car in the cold.
+
+Where a surface is wet, glazed or dark is a property of the place: all drives of a seed agree on it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from mapvote.core.sensors import Sensor
+from mapvote.core.types import F32, F64, I32, I64, Bool
+from mapvote_lab.simulation.lidar import Caster, Sweep
+from mapvote_lab.simulation.scenario import Flaws
+
+PULSE_M = 1.5
+"""Half of a pulse of 10 ns: surfaces less far apart come back as one."""
+_EDGE_M = 0.15
+_PATCH_M = 2.0
+_PANE_M = 1.5
+_GRAZING = 0.25
+"""Cosine of incidence under which a wet road sends nothing back: 75 deg, 7 m before a car's sensor."""
+_DROPS_M = 5.0
+"""Mean range at which a drop is near enough to be seen."""
+_PLUME_M = 0.7
+
+
+@dataclass(frozen=True)
+class Kinds:
+    """What each object id is made of, (objects,)."""
+
+    glazed: Bool
+    painted: Bool
+    seed: int
+
+
+@dataclass(frozen=True)
+class Hits:
+    """What the rays of one revolution truly met; arrays (rays,)."""
+
+    ranges: F32
+    objects: I32
+    """Body id; of a moving body its number in the traffic."""
+    cosine: F32
+    moving: Bool
+
+
+def chance_of(cells: F64, seed: int) -> F64:
+    """(n,) a number in [0, 1) for each row of whole numbers, always the same for the same row and seed."""
+    h = np.full(len(cells), seed & 0xFFFF_FFFF, dtype=np.uint64)
+    for axis in cells.astype(np.int64).astype(np.uint64).T:
+        h = (h ^ axis) * np.uint64(0x9E3779B97F4A7C15)
+        h ^= h >> np.uint64(29)
+        h *= np.uint64(0xBF58476D1CE4E5B9)
+        h ^= h >> np.uint64(32)
+    return (h >> np.uint64(11)).astype(np.float64) / float(1 << 53)
+
+
+def surfaces(hits: Hits, points: F64, kinds: Kinds, flaws: Flaws) -> tuple[Bool, Bool, Bool, Bool]:
+    """(wet road, glass, paint, dark paint), each (rays,): what the rays that ended at ``points`` (rays, 3) have met."""
+    met = np.isfinite(hits.ranges)
+    still = met & ~hits.moving
+    body = np.where(still, hits.objects, 0)
+    road = still & (hits.objects == 0)
+    facade = still & kinds.glazed[body]
+    paint = hits.moving | (still & kinds.painted[body])
+    wet, glass, dark = (np.zeros(len(met), dtype=np.bool_) for _ in range(3))
+    wet[road] = chance_of(np.floor(points[road, :2] / _PATCH_M), kinds.seed) < flaws.wet_share
+    glass[facade] = chance_of(np.floor(points[facade] / _PANE_M), kinds.seed + 1) < flaws.glass_share
+    car = np.column_stack([hits.objects[paint], hits.moving[paint]])
+    dark[paint] = chance_of(car, kinds.seed + 2) < flaws.dark_share
+    return wet, glass, paint, dark
+
+
+def swallowed(wet: Bool, glass: Bool, dark: Bool, hits: Hits, sensor: Sensor, rng: np.random.Generator) -> Bool:
+    """(rays,) which rays get nothing back: wet road under a flat angle, glass, dark paint the farther off it is."""
+    chance = 0.9 * (wet & (hits.cosine < _GRAZING)) + 0.8 * glass
+    far = np.minimum(np.where(np.isfinite(hits.ranges), hits.ranges, 0.0) / (0.3 * sensor.max_range_m), 1.0)
+    chance = chance + 0.9 * far * dark
+    lost: Bool = rng.random(len(wet)) < chance
+    return lost
+
+
+def mirrored(
+    rays: Sweep, hits: Hits, smooth: Bool, casters: tuple[Caster, Caster], wanted: int, sensor: Sensor,
+    rng: np.random.Generator,
+) -> tuple[I64, F32]:  # fmt: skip
+    """(indices, ranges) of at most ``wanted`` rays of those that met a ``smooth`` surface (rays,): the range over it.
+
+    ``casters``: of what stands, of what moves. What the mirror shows is what stands.
+    """
+    chosen = rng.permutation(np.flatnonzero(smooth))[: 4 * wanted]
+    indices, ranges = [np.zeros(0, dtype=np.int64)], [np.zeros(0, dtype=np.float32)]
+    for caster, mine in zip(casters, (~hits.moving[chosen], hits.moving[chosen]), strict=True):
+        some = chosen[mine]
+        if len(some):
+            normals = caster.normals(rays.origins[some], rays.directions[some])
+            away = rays.directions[some]
+            bounced = away - 2.0 * np.einsum("ij,ij->i", away, normals)[:, None] * normals
+            mirror = rays.origins[some] + hits.ranges[some, None] * away
+            beyond, _, _ = casters[0].cast((mirror + 0.01 * bounced).astype(np.float32), bounced.astype(np.float32))
+            indices.append(some)
+            ranges.append((hits.ranges[some] + beyond).astype(np.float32))
+    index, way = np.concatenate(indices), np.concatenate(ranges)
+    seen = np.flatnonzero(way < sensor.max_range_m)[:wanted]
+    return index[seen], way[seen]
+
+
+def mixed(ranges: F32, beams: int, share: float, rng: np.random.Generator) -> Bool:
+    """Mix ranges (rays,) in place where the beam beside meets something else within a pulse; which were, (rays,).
+
+    Rays are in firing order, ``beams`` of one azimuth together: the neighbour in azimuth is ``beams`` rays on.
+    """
+    beside = np.roll(ranges, -beams)
+    with np.errstate(invalid="ignore"):
+        apart = np.abs(beside - ranges)
+    edge: Bool = (apart > _EDGE_M) & (apart < PULSE_M) & (rng.random(len(ranges)) < share)
+    part = rng.random(len(ranges), dtype=np.float32)[edge]
+    ranges[edge] += part * (beside[edge] - ranges[edge])
+    return edge
+
+
+def shortened(rays: Sweep, ranges: F32, tails: F64, flaws: Flaws, rng: np.random.Generator) -> Bool:
+    """Let rays (in place) end on drops and in the exhaust behind ``tails`` (n, 3); which did, (rays,)."""
+    short = np.zeros(len(ranges), dtype=np.bool_)
+    if flaws.rain > 0:
+        drop = rng.exponential(_DROPS_M, len(ranges)).astype(np.float32)
+        wet = (rng.random(len(ranges)) < flaws.rain) & (drop < ranges)
+        ranges[wet], short = drop[wet], short | wet
+    for k in np.flatnonzero(rng.random(len(tails)) < flaws.exhaust):
+        offset = tails[k] - rays.origins
+        along = np.einsum("ij,ij->i", offset, rays.directions)
+        miss = np.einsum("ij,ij->i", offset, offset) - along**2
+        inside = (along > 0) & (miss < _PLUME_M**2) & (rng.random(len(ranges)) < 0.3)
+        where = (along + rng.uniform(-1.0, 1.0, len(ranges)) * np.sqrt(np.maximum(_PLUME_M**2 - miss, 0.0))).astype(
+            "f4"
+        )
+        inside &= where < ranges
+        ranges[inside], short = where[inside], short | inside
+    return short
+
+
+def spoil(
+    rays: Sweep, hits: Hits, kinds: Kinds, casters: tuple[Caster, Caster], tails: F64, sensor: Sensor, flaws: Flaws,
+    rng: np.random.Generator,
+) -> tuple[F32, Bool, Bool]:  # fmt: skip
+    """(ranges as reported, false, lost), each (rays,): what becomes of the true ``hits`` of one revolution.
+
+    ``false``: the ray reports a place where nothing is, ``lost``: it reports nothing. ``casters``: of what stands, of
+    what moves; ``tails`` (n, 3): where exhausts may be.
+    """
+    ranges = hits.ranges.copy()
+    points = (rays.origins + np.where(np.isfinite(ranges), ranges, 0.0)[:, None] * rays.directions).astype(np.float64)
+    wet, glass, paint, dark = surfaces(hits, points, kinds, flaws)
+    lost = swallowed(wet, glass, dark, hits, sensor, rng)
+    false = mixed(ranges, sensor.beams, flaws.mixed_share, rng)
+    wanted = round(flaws.reflection_share * np.count_nonzero(hits.ranges < sensor.max_range_m))
+    if wanted:
+        index, way = mirrored(rays, hits, wet | glass | paint, casters, wanted, sensor, rng)
+        ranges[index], false[index], lost[index] = way, True, False
+    short = shortened(rays, ranges, tails, flaws, rng)
+    return ranges, false | short, lost & ~short

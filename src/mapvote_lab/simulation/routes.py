@@ -1,0 +1,129 @@
+"""How vehicles move through the street, and what they believe about it (docs/decisions/truth.md)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from mapvote.core.geometry import from_xyz_rpy
+from mapvote.core.types import F64, I64
+from mapvote_lab.simulation.scenario import LANES, Scenario
+from mapvote_lab.simulation.terrain import Terrain
+
+RTK_SIGMA_M = 0.02
+RTK_SIGMA_DEG = 0.05
+_SECOND_NS = 1_000_000_000
+_FIRST_DRIVE_NS = 1_756_720_800 * _SECOND_NS
+"""2025-09-01 10:00 UTC: the first survey."""
+
+
+@dataclass(frozen=True)
+class Route:
+    """One drive through the street: a lane at an almost constant speed, swaying as vehicles do."""
+
+    name: str
+    vehicle: int | None
+    """Which voting vehicle (from 0); None for a survey."""
+    lane: str
+    start_ns: int
+    scans: int
+    rate_hz: float
+    speed: float
+    length: float
+    mount_height_m: float
+    sway: F64
+    """(5,) seeded phases."""
+    prior_sigma_m: float
+    prior_sigma_deg: float
+    terrain: Terrain
+
+    @property
+    def time_s(self) -> F64:
+        """(scans,) stamps from the start of the drive."""
+        return np.arange(self.scans) / self.rate_hz
+
+    @property
+    def stamps_ns(self) -> I64:
+        """(scans,) stamps."""
+        return self.start_ns + np.round(self.time_s * _SECOND_NS).astype(np.int64)
+
+    def poses(self, time_s: F64) -> F64:
+        """T_map_lidar (n, 4, 4) at any times (n,) from the start of the drive."""
+        direction, offset = LANES[self.lane]
+        p = self.sway
+        along = self.speed * time_s + 1.2 * (np.sin(0.23 * time_s + p[0]) - np.sin(p[0]))
+        aside = 0.18 * np.sin(0.55 * time_s + p[1])
+        tilt = 0.18 * 0.55 * np.cos(0.55 * time_s + p[1]) / self.speed
+        x = along if direction > 0 else self.length - along
+        y = self.terrain.axis_y + offset + direction * aside
+        yaw = tilt + (0.0 if direction > 0 else np.pi)
+        c, s = np.cos(yaw), np.sin(yaw)
+        ahead = self.terrain.height(x + 1.4 * c, y + 1.4 * s), self.terrain.height(x - 1.4 * c, y - 1.4 * s)
+        across = self.terrain.height(x - 0.8 * s, y + 0.8 * c), self.terrain.height(x + 0.8 * s, y - 0.8 * c)
+        pitch = -np.arctan2(ahead[0] - ahead[1], 2.8) + np.radians(0.12) * np.sin(7.5 * time_s + p[2])
+        roll = np.arctan2(across[0] - across[1], 1.6) + np.radians(0.10) * np.sin(5.9 * time_s + p[3])
+        height = 0.25 * sum(ahead + across) + 0.008 * np.sin(8.3 * time_s + p[4])
+        T = _from_xyz_rpy(x, y, height, roll, pitch, yaw)
+        T[:, :3, 3] += self.mount_height_m * T[:, :3, 2]
+        return T
+
+    def priors(self, rng: np.random.Generator) -> F64:
+        """What the vehicle believes at the stamps, (scans, 4, 4): the truth with a smooth AR(1) error."""
+        memory = np.exp(-1.0 / self.rate_hz / 10.0)
+        tilt = self.prior_sigma_deg if self.vehicle is None else 0.3 * self.prior_sigma_deg
+        sigma = np.array([*[self.prior_sigma_m] * 3, *np.radians([tilt, tilt, self.prior_sigma_deg])])
+        kicks = rng.normal(size=(self.scans, 6)) * sigma
+        error = kicks.copy()
+        for i in range(1, self.scans):
+            error[i] = memory * error[i - 1] + np.sqrt(1.0 - memory**2) * kicks[i]
+        T = self.poses(self.time_s)
+        for i, e in enumerate(error):
+            T[i, :3, :3] = T[i, :3, :3] @ from_xyz_rpy(0, 0, 0, *e[3:])[:3, :3]
+            T[i, :3, 3] += e[:3]
+        return T
+
+
+def make_routes(scenario: Scenario, terrain: Terrain, seed: int) -> list[Route]:
+    """Surveys first, then the voting vehicles, each at its own hour."""
+    speed = scenario.speed_kmh / 3.6
+    scans = int(scenario.length_m / speed * scenario.rate_hz + 1e-6) + 1
+    routes = []
+    lanes = scenario.vehicle_lanes
+    drives: list[tuple[str, int | None, str]] = [
+        (f"survey_{i + 1}", None, lane) for i, lane in enumerate(scenario.surveys)
+    ]
+    drives += [(f"v{i + 1}", i, lanes[i % len(lanes)]) for i in range(scenario.vehicles)]
+    for index, (name, vehicle, lane) in enumerate(drives):
+        rng = np.random.default_rng([seed, 3, index])
+        survey = vehicle is None
+        after = index * 1200 if survey else 30 * 86_400 + index * 5_400
+        routes.append(
+            Route(
+                name=name,
+                vehicle=vehicle,
+                lane=lane,
+                start_ns=_FIRST_DRIVE_NS + after * _SECOND_NS,
+                scans=scans,
+                rate_hz=scenario.rate_hz,
+                speed=speed,
+                length=scenario.length_m,
+                mount_height_m=scenario.mount_height_m,
+                sway=rng.uniform(0, 2 * np.pi, 5),
+                prior_sigma_m=RTK_SIGMA_M if survey else round(rng.uniform(0.3, 1.0), 2),
+                prior_sigma_deg=RTK_SIGMA_DEG if survey else 1.0,
+                terrain=terrain,
+            )
+        )
+    return routes
+
+
+def _from_xyz_rpy(x: F64, y: F64, z: F64, roll: F64, pitch: F64, yaw: F64) -> F64:
+    """core.geometry.from_xyz_rpy over (n,) arrays: (n, 4, 4)."""
+    cr, sr, cp, sp, cy, sy = np.cos(roll), np.sin(roll), np.cos(pitch), np.sin(pitch), np.cos(yaw), np.sin(yaw)
+    T = np.zeros((len(x), 4, 4))
+    T[:, 0, 0], T[:, 0, 1], T[:, 0, 2] = cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr
+    T[:, 1, 0], T[:, 1, 1], T[:, 1, 2] = sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr
+    T[:, 2, 0], T[:, 2, 1], T[:, 2, 2] = -sp, cp * sr, cp * cr
+    T[:, 0, 3], T[:, 1, 3], T[:, 2, 3], T[:, 3, 3] = x, y, z, 1.0
+    return T

@@ -1,0 +1,249 @@
+"""The verbs demo, simulate and evaluate. The entry point group ``mapvote.verbs`` adds them to the command line."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from mapvote.cli.options import EVALUATE, Config, Scenario, Seed
+from mapvote.cli.terminal import print_table, progress, stages
+
+if TYPE_CHECKING:
+    from mapvote_lab.evaluation.evaluate import Evaluation
+
+
+def register(app: typer.Typer) -> None:
+    """Add demo, simulate and evaluate."""
+    app.command(rich_help_panel=EVALUATE)(demo)
+    app.command(rich_help_panel=EVALUATE)(simulate)
+    app.command(rich_help_panel=EVALUATE)(evaluate)
+
+
+def _need_lab(verb: str) -> None:
+    """MapvoteError naming the extra if a package of the laboratory is missing."""
+    from mapvote.formats.extras import require
+
+    for package in ("embreex", "matplotlib"):
+        require(package, "lab", f"mapvote {verb}")
+
+
+def simulate(
+    scenario: Scenario,
+    out: Annotated[Path, typer.Argument(metavar="FOLDER", help="what to write; it must not exist yet")],
+    seed: Seed = 1,
+) -> None:
+    """Simulate a street before and after: survey drives, voting vehicles' drives, and the truth apart from them.
+
+    mapvote simulate corner my_street --seed 2
+    """
+    _need_lab("simulate")
+    from mapvote_lab.simulation import simulate as run
+
+    with progress(f"simulating {scenario}") as tell:
+        run(scenario, out, seed, progress=tell)
+    print(f"{out}: drives {', '.join(sorted(p.name for p in out.iterdir() if p.name != 'truth'))}; truth in truth/")
+
+
+def evaluate(
+    scenario: Scenario,
+    drive: Annotated[
+        Path | None, typer.Argument(metavar="[DRIVE]", help="a recorded drive, after the word real", show_default=False)
+    ] = None,
+    seed: Seed = 1,
+    case: Annotated[
+        str | None,
+        typer.Option(
+            metavar="CASES",
+            help='1..5, "1 column", columns_v1, surfaces, yardsticks, by commas, or all [default: 1,2,3,4,5,surfaces]; '
+            "real: one of them [default: by the settings]",
+        ),
+    ] = None,
+    poses: Annotated[
+        str, typer.Option(metavar="ndt|truth", help="whether vehicles localise, or are told where they are")
+    ] = "ndt",
+    json: Annotated[Path | None, typer.Option(metavar="FILE", help="also write all numbers to this file")] = None,
+    cache: Annotated[
+        Path | None, typer.Option(metavar="FOLDER", help="where drives, maps and ballots are kept")
+    ] = None,
+    sensor: Annotated[
+        str | None, typer.Option(metavar="NAME", help="vlp16, hdl32e or hdl64e; else the scenario's")
+    ] = None,
+    cars: Annotated[
+        int | None, typer.Option(metavar="N", min=0, help="cars that park during one vehicle's pass only, for each")
+    ] = None,
+    reading: Annotated[
+        str | None,
+        typer.Option(metavar="KEY=VALUE,..", help="how the paper's open sentences are read: keys of [paper]"),
+    ] = None,
+    readings: Annotated[bool, typer.Option("--readings", help="every reading of the paper by case")] = False,
+    explain: Annotated[
+        str, typer.Option(metavar="CASES", help="of the paper's cases: every true and false cell and its cause")
+    ] = "",
+    out: Annotated[
+        Path | None,
+        typer.Option(metavar="FOLDER", help="where pictures of what is explained go; real: tables, pictures of worst"),
+    ] = None,
+    figures: Annotated[
+        Path | None, typer.Option(metavar="FOLDER", help="also draw the paper's figures here: PNG, SVG and PDF")
+    ] = None,
+    scans: Annotated[
+        str | None, typer.Option(metavar="SLICES", help="real: which scans of the drive: 0:300, say")
+    ] = None,
+    config: Config = None,
+) -> None:
+    """Simulate, map, vote, and score: Tables II to IV of the paper with its figures beside ours.
+
+    mapvote evaluate corner --seed 2 --case 1,5,surfaces
+
+    mapvote evaluate as_published --case 1,2,3,4,5 --readings --explain 1 --out pictures
+
+    mapvote evaluate real my_drive --out report
+    """
+    _need_lab("evaluate")
+    from rich.console import Console
+
+    from mapvote.config import cache_folder, load_with_sources
+    from mapvote_lab.evaluation.evaluate import evaluate as run
+    from mapvote_lab.evaluation.experiments.cases import choose_cases
+    from mapvote_lab.evaluation.experiments.conditions import Conditions
+    from mapvote_lab.evaluation.experiments.scene import Scene
+    from mapvote_lab.evaluation.experiments.study import PUBLISHED, Study, as_paper
+    from mapvote_lab.evaluation.reporting.tables import as_json, tables, write_text
+
+    if scenario == "real":
+        if drive is None:
+            raise typer.BadParameter("name the drive: mapvote evaluate real DRIVE", param_hint="DRIVE")
+        if figures is not None:
+            raise typer.BadParameter("of a recorded drive --out draws the pictures", param_hint="--figures")
+        _evaluate_real(drive, case, scans, seed, json, out, config)
+        return
+    if drive is not None:
+        raise typer.BadParameter(f"{drive}: a drive follows the word real only", param_hint="DRIVE")
+    if poses not in ("ndt", "truth"):
+        raise typer.BadParameter(f"{poses!r}: choose ndt or truth", param_hint="--poses")
+    settings, sources = load_with_sources(config)
+    settings = as_paper(settings, scenario, sources, reading)
+    cases, with_yardsticks = choose_cases(settings, case or "1,2,3,4,5,surfaces")
+    overrides: dict[str, str | int] = {"sensor": sensor} if sensor else {}
+    if cars is not None:
+        overrides["temporary_cars"] = cars
+    names = tuple(name.strip() for name in explain.split(",") if name.strip())
+    study = Study(readings, scenario in PUBLISHED, names)
+    scene = Scene(scenario, seed, settings, cache or cache_folder(), overrides, Conditions(true_poses=poses == "truth"))
+    with stages() as told:
+        evaluation = run(scene, cases, with_yardsticks, told, study)
+    result = evaluation.result
+    for table in tables(result):
+        Console(width=140).print(table)
+    if json is not None:
+        write_text(as_json(result), json)
+        print(f"{json}: all numbers")
+    if out is not None:
+        _draw_causes(evaluation, out)
+    if figures is not None:
+        _draw_figures(evaluation, figures)
+
+
+def _draw_causes(evaluation: Evaluation, out: Path) -> None:
+    from mapvote.plots import save
+    from mapvote_lab.evaluation.reporting.budget_figure import budget_figure
+
+    for name, causes in evaluation.causes.items():
+        picture = out / f"explained_{name.replace(' ', '_')}.png"
+        save(budget_figure(name, causes, evaluation.window), picture)
+        print(f"{picture}")
+
+
+def _draw_figures(evaluation: Evaluation, out: Path) -> None:
+    from mapvote.plots import FORMATS
+    from mapvote_lab.evaluation.reporting.gallery import gallery
+
+    with progress("drawing"):
+        drawn = gallery(evaluation, evaluation.best, out, FORMATS)
+    print(f"{out}: {len(drawn)} figures, each as PNG, SVG and PDF")
+
+
+def _evaluate_real(
+    drive: Path,
+    case: str | None,
+    scans: str | None,
+    seed: int,
+    json: Path | None,
+    out: Path | None,
+    config: Path | None,
+) -> None:
+    """The bench of a recorded drive; its own blocks are map and vehicles, nothing is simulated but the changes.
+    ``case``: one of them; None: by the settings."""
+    from mapvote.config import load_settings
+    from mapvote_lab.evaluation.experiments.cases import choose_cases
+    from mapvote_lab.evaluation.experiments.real.bench import bench
+    from mapvote_lab.evaluation.reporting.real_figures import draw_worst
+    from mapvote_lab.evaluation.reporting.real_tables import as_markdown, real_tables
+    from mapvote_lab.evaluation.reporting.tables import write_text
+    from mapvote_lab.evaluation.results import to_json
+
+    settings = load_settings(config)
+    method = settings.voting.method
+    cases, _ = choose_cases(settings, case or ("5" if method == "paper" else method))
+    if len(cases) > 1:
+        raise typer.BadParameter(f"{case}: of a recorded drive one case is judged at a time", param_hint="--case")
+    with stages() as told:
+        result = bench(drive, settings, cases, told, scans=scans, seed=seed)
+    sheets = real_tables(result, cases[0].name)
+    for sheet in sheets:
+        print_table(sheet.headings, sheet.rows, sheet.title)
+    if json is not None:
+        write_text(to_json(result.figures(cases[0].name)), json)
+        print(f"{json}: all numbers")
+    if out is not None:
+        pictures = draw_worst(result, cases[0].name, out)
+        chosen = "".join(f" --{name} {value}" for name, value in (("case", case), ("scans", scans)) if value)
+        command = f"mapvote evaluate real {drive}{chosen} --seed {seed} --out {out}"
+        write_text(as_markdown(sheets, command), out / "tables.md")
+        for file in [out / "tables.md", *pictures]:
+            print(f"{file}")
+
+
+def demo(
+    out: Annotated[Path, typer.Option(metavar="FOLDER", help="where maps, tables, pictures and report.html go")] = Path(
+        "out"
+    ),
+    quick: Annotated[
+        bool, typer.Option("--quick", help="a street corner instead of a street: a minute at most")
+    ] = False,
+) -> None:
+    """The whole story on a simulated street: build a map, let three vehicles vote, update it, tell how good it is.
+
+    mapvote demo --quick
+    """
+    _need_lab("demo")
+    from rich.console import Console
+    from rich.markup import escape
+
+    from mapvote_lab.evaluation.demo import demo as run
+    from mapvote_lab.evaluation.demo_report import CASE, commands
+
+    console = Console(soft_wrap=True)
+    console.print("The first run compiles its kernels, which takes some seconds in each stage.", style="dim")
+    with stages() as told:
+        evaluation, story = run(out, quick, told)
+    console.print("\n[bold]What changed[/]", highlight=False)
+    for area, deleted, added in story.areas:
+        console.print(
+            f"  {area.name}: {area.objects} {area.kind}; {deleted} points deleted, {added} added", highlight=False
+        )
+    f1 = evaluation.result.cases[CASE].strict.macro_f1
+    console.print(
+        f"  in all {story.deleted} points deleted, {story.added} added; "
+        f"{story.found} of {story.objects} changed objects found, {story.false_objects} false; F1 {f1:.3f}",
+        highlight=False,
+    )
+    console.print("\n[bold]Where to look[/]")
+    place = escape(str(out))
+    console.print(f"  {place}/report.html: the story with pictures and tables", highlight=False)
+    console.print(f"  {place}/map_before.pcd and {place}/map_after.pcd: the maps", highlight=False)
+    console.print(f"  {place}/tables.txt, results.json, results.csv, pictures/", highlight=False)
+    console.print("\n[bold]What to try next[/]")
+    console.print(escape("".join(f"  {line}\n" for line in commands(evaluation, out).splitlines())), highlight=False)
