@@ -5,8 +5,9 @@
 
 A source is a sound drive with a prior of its own, for maps with a map of the same street; it is judged as it is first.
 DRIVE@START:STOP:STEP takes some of the scans. Verdicts: "right", an error or a warning names the illness (alone or
-together with what cannot be told from it); "vague", something is wrong but not what; "wrong", an error names something
-else; "sound". Of maps that were moved, what the doctor measures is held against what was done.
+together with what cannot be told from it); "open", a note says that the drive cannot decide it; "vague", something is
+wrong but not what; "wrong", an error names something else; "sound". Of maps that were moved, what the doctor measures
+is held against what was done.
 """
 
 from __future__ import annotations
@@ -148,7 +149,7 @@ def verdict(right: str, found: list[Finding]) -> str:
     if any(re.search(right, f.what) for f in told):
         return "right"
     if not told:
-        return "sound"
+        return "open" if right != "^$" and any(re.search(right, f.what) for f in found) else "sound"
     return "wrong" if any(f.severity == "error" and not re.search(VAGUE, f.what) for f in told) else "vague"
 
 
@@ -179,7 +180,7 @@ def summary(source: str, rows: list[dict]) -> str:
     count = Counter(r["verdict"] for r in mine)
     grave = sum(r["verdict"] == "sound" and r["grave"] for r in mine)
     shares = ", ".join(
-        f"{count[v]} {v} ({count[v] / max(len(mine), 1):.0%})" for v in ("right", "vague", "wrong", "sound")
+        f"{count[v]} {v} ({count[v] / max(len(mine), 1):.0%})" for v in ("right", "open", "vague", "wrong", "sound")
     )
     return f"{source}: {len(mine)} kinds: {shares}; grave ones called sound: {grave}"
 

@@ -56,9 +56,9 @@ def runs_of(T: F64) -> list[Run]:
     return [run_of(T, start, start + 31) for start in range(0, len(T) - 31, 31)]
 
 
-def found_in(T: F64, prior: F64) -> list[Finding]:
+def found_in(T: F64, prior: F64, sigma_m: float = 0.3) -> list[Finding]:
     stamps = np.arange(len(T)) * 100_000_000
-    return check_small(prior, run_of(T, 0, len(T)), runs_of(T), None, stamps)
+    return check_small(prior, run_of(T, 0, len(T)), runs_of(T), None, stamps, sigma_m)
 
 
 @pytest.mark.parametrize("curved", [False, True])
@@ -77,20 +77,23 @@ def test_scale_and_heading_are_told_apart_within_their_errors(curved: bool) -> N
     assert again.scale.value == pytest.approx(1.0, abs=0.001)
 
 
-def test_positions_four_per_cent_too_small_are_named_on_a_street_and_never_called_sound_on_forty_metres() -> None:
+def test_positions_four_per_cent_too_small_are_named_on_a_street_and_undecided_on_forty_metres() -> None:
     street, short = along(250.0), along(42.0)
     for seed in range(5):
         assert all(f.severity == "note" for f in found_in(street, straying(street, 0.3, seed)))
         named = found_in(street, smaller(straying(street, 0.3, seed), 0.96))
         assert any("differ in scale" in f.what for f in named if f.severity != "note"), named
-        unsure = found_in(short, smaller(straying(short, 0.6, seed), 0.96))
-        assert any(f.severity != "note" for f in unsure), unsure
+        unsure = " ".join(f.what for f in found_in(short, smaller(straying(short, 0.6, seed), 0.96), 0.6))
+        assert "that may be chance" in unsure or int(unsure.split("show from ")[1].split("%")[0]) > 4, unsure
 
 
 def test_a_prior_may_stray_without_being_blamed_for_it() -> None:
     short = along(60.0)
     for seed in range(5):
-        assert all(f.severity != "error" for f in found_in(short, straying(short, 0.8, seed)))
+        assert all(f.severity == "note" for f in found_in(short, straying(short, 0.8, seed), 0.8))
+        slowly = short.copy()
+        slowly[:, :3, 3] += np.linspace(0.0, 1.5, len(short))[:, None] * [1.0, -0.5, 0.2]
+        assert all(f.severity == "note" for f in found_in(short, slowly, 1.0))
 
 
 def test_a_straight_street_along_x_cannot_tell_a_mirrored_track_and_a_bend_can() -> None:
@@ -101,7 +104,8 @@ def test_a_straight_street_along_x_cannot_tell_a_mirrored_track_and_a_bend_can()
         stamps = np.arange(len(T)) * 100_000_000
         drive = Drive(Path("d"), "v", "d", SENSORS["hdl32e"], stamps, lambda i: Scan(0, np.zeros((0, 3), np.float32)))
         found, _ = check_agreement(drive, mirrored, runs_of(T), ROAD, 0.0, partial(run_of, T, 0, len(T)))
-        told = [f.what for f in found if f.severity != "note"]
+        told = [f.what for f in found]
+        assert curved or all(f.severity == "note" for f in found)
         if curved:
             assert any("the prior's track is mirrored" in what and CANNOT_TELL not in what for what in told), told
         else:
@@ -130,7 +134,7 @@ def test_a_place_where_a_scan_does_not_fit_those_before_it_is_named() -> None:
     chain = run_of(T, 0, len(T))
     fit = np.where(np.arange(len(chain.fit)) == 20, 0.3, chain.fit)
     stamps = np.arange(len(T)) * 100_000_000
-    told = check_small(T, Run(chain.indices, chain.T_first_lidar, fit), runs_of(T), None, stamps)
+    told = check_small(T, Run(chain.indices, chain.T_first_lidar, fit), runs_of(T), None, stamps, 0.3)
     assert any("between scans 57 and 60" in f.what for f in told), told
 
 

@@ -16,7 +16,7 @@ _ORDER = {"error": 0, "warning": 1, "note": 2}
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """``error``: it cannot be used so. ``warning``: results will suffer. ``note``: worth knowing."""
+    """``error``: it cannot be used so. ``warning``: results will suffer. ``note``: worth knowing, or undecidable."""
 
     severity: Severity
     what: str

@@ -68,7 +68,7 @@ def check_agreement(
         return [_named(group, as_it_is, best, length_m)], best.reading.poses(T)
     if as_it_is.median > floor_m:
         return [_nothing_fits(as_it_is, runs, length_m, told_m)], T
-    found = check_small(T, chain(), runs, time, drive.stamps_ns)
+    found = check_small(T, chain(), runs, time, drive.stamps_ns, drive.prior_sigma_m)
     found += _places(as_it_is, runs) + _scatter(drive, as_it_is, length_m)
     found += _cannot_tell(as_it_is, held, length_m, turns, drive.sensor.clockwise)
     return found, T
@@ -216,4 +216,4 @@ def _cannot_tell(
     what = f"{CANNOT_TELL}: {names}"
     if any(_is_left_handed(reading) for reading in like) and turns > 0.5 and clockwise:
         what += " (the points go round counter-clockwise, most sensors clockwise)"
-    return [Finding("warning", what, "check with a drive that turns, or against a map (--map)", map_tells=True)]
+    return [Finding("note", what, "check with a drive that turns, or against a map (--map)", map_tells=True)]

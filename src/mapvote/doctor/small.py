@@ -18,23 +18,27 @@ _LEAST = {"scale": 0.02, "turn": 2.0, "pitch": 2.0, "time": 0.15}
 _SURE, _LIKELY = 4.0, 2.0
 """Standard errors: what is more than so many is an error, and may be one."""
 _SURE_OF_TIME = 5.0
-_SHORT = 0.05
-"""A drive that shows no smaller mistake of scale is too short, or its prior too coarse, to be called sound."""
 
 
-def check_small(T: F64, chain: Run, runs: Sequence[Run], time: Measured | None, stamps_ns: I64) -> list[Finding]:
-    """Of the prior's poses T (n, 4, 4): scale, turn and pitch by the chain, the shift in time by the runs as well."""
+def check_small(
+    T: F64, chain: Run, runs: Sequence[Run], time: Measured | None, stamps_ns: I64, prior_sigma_m: float
+) -> list[Finding]:
+    """Of the prior's poses T (n, 4, 4): scale, turn and pitch by the chain, the shift in time by the runs as well.
+
+    What is no larger than four standard errors cannot be decided: a note.
+    """
     followed, chain = chain, unbroken(chain)
     broken = _broken(followed, len(chain.indices))
-    whole = held_against(T, chain)
+    whole = held_against(T, chain, prior_sigma_m)
     if time is not None and _shows(time, T, runs) and strays_less(T, stamps_ns, time.value, chain) > 0.2:
         grave = abs(time.value) > 2.0 * _LEAST["time"]
         return [*broken, Finding("error" if grave else "warning", *small_words(time))]
     if whole is None:
         what = "too few scans fit each other to measure scale and heading"
-        return [*broken, Finding("warning", what, "drive farther")]
-    found = broken + [f for m in (whole.scale, whole.turn, whole.pitch) for f in _told(m)]
-    return found or [_not_shown(whole, time)]
+        return [*broken, Finding("note", what, "drive farther")]
+    found = [f for m in (whole.scale, whole.turn, whole.pitch) for f in _told(m)]
+    shown = any(f.severity != "note" for f in found)
+    return broken + found + ([] if shown else [_not_shown(whole, time)])
 
 
 def _broken(chain: Run, after: int) -> list[Finding]:
@@ -57,7 +61,7 @@ def _told(m: Measured) -> list[Finding]:
         return []
     what, mend = small_words(m)
     if off <= _SURE * sigma:
-        return [Finding("warning", f"{what}; that may be chance", f"a longer drive tells; else: {mend}")]
+        return [Finding("note", f"{what}; that may be chance", f"a longer drive tells; else: {mend}")]
     severity: Severity = "error" if off > 2.0 * _LEAST[m.kind] else "warning"
     return [Finding(severity, what, mend)]
 
@@ -77,7 +81,7 @@ def _not_shown(whole: Whole, time: Measured | None) -> Finding:
     told = [f"{least['scale']:.0%} of scale", f"{least['turn']:.0f} deg of heading"]
     told += [f"{_least_time(time):.1f} s"] if time is not None else []
     what = f"over {whole.length_m:.0f} m mistakes of the prior show from {', '.join(told)} on"
-    return Finding("warning" if least["scale"] > _SHORT else "note", what, "a longer drive with turns tells more")
+    return Finding("note", what, "a longer drive with turns tells more")
 
 
 def small_words(m: Measured) -> tuple[str, str]:

@@ -43,8 +43,12 @@ def unbroken(chain: Run) -> Run:
     return Run(chain.indices[:end], chain.T_first_lidar[:end], chain.fit[:end])
 
 
-def held_against(T: F64, chain: Run) -> Whole | None:
-    """The prior's poses T (n, 4, 4) against the chain; None where it is too short or hardly moves."""
+def held_against(T: F64, chain: Run, prior_sigma_m: float = 0.0) -> Whole | None:
+    """The prior's poses T (n, 4, 4) against the chain; None where it is too short or hardly moves.
+
+    ``prior_sigma_m``: an error that grows along the drive looks like a scale, and across it like a turn; from one end
+    to the other two errors of the prior differ by sqrt(2) of it.
+    """
     told, seen = T[chain.indices], chain.T_first_lidar
     if len(seen) < 5 or _spread(seen[:, :3, 3]) < 1.0:
         return None
@@ -60,12 +64,15 @@ def held_against(T: F64, chain: Run) -> Whole | None:
     start = np.concatenate([(R_told * R_seen.inv()).mean().as_rotvec(), np.zeros(6)])
     x = optimize.least_squares(off, start, loss="soft_l1", max_nfev=60).x
     strayed = off(x)[: p.size].reshape(-1, 3) * _POSITION_M
-    share = float(np.linalg.norm(strayed, axis=1).mean()) / _spread(p)
+    length_m = float(np.linalg.norm(np.ptp(p, axis=0)))
+    share = float(
+        np.hypot(np.linalg.norm(strayed, axis=1).mean() / _spread(p), np.sqrt(2.0) * prior_sigma_m / length_m)
+    )
     return _whole(x, share, float(np.linalg.norm(seen[-1, :3, 3])))
 
 
 def _whole(x: F64, share: float, length_m: float) -> Whole:
-    """``share``: by how much the prior strays from the chain, of what the chain extends."""
+    """``share``: by how much the prior may stray from the chain, of what the chain extends."""
     factor, yaw, pitch = float(np.exp(x[6])), float(x[7]), float(x[8])
     back = np.eye(4)
     back[:3, :3] = Rotation.from_euler("zy", [yaw, pitch]).inv().as_matrix()
