@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -48,11 +49,11 @@ def test_no_scan_is_read_only_to_be_looked_at_but_a_few_at_first() -> None:
     recording = Recording()
     watched = LookedAt(recording.drive())
     first = recording.reads.sum()
-    assert first == 25  # 24, and one of them again for its columns
+    assert first == 28  # 24, one of them again for its columns, three for their beams
     for _ in watched.drive:
         pass
     assert watched.warnings() == []
-    assert recording.reads.sum() == first + N + 1
+    assert recording.reads.sum() == first + N + 4
 
 
 def test_what_is_said_at_the_end_is_what_a_look_at_every_scan_says() -> None:
@@ -87,3 +88,18 @@ def test_what_is_wrong_with_many_scans_stops_before_the_work_begins() -> None:
         LookedAt(Recording(torn=0).drive())
     with pytest.raises(MapvoteError, match=r"scan 4 holds 1000 points, those around it 3000: cut off\?.*29 such scans"):
         LookedAt(Recording(cut=range(0, N, 4)).drive())
+
+
+def test_a_drive_whose_sensor_is_stated_wrongly_is_refused_and_a_measured_one_is_not_asked() -> None:
+    elevation, azimuth = (a.ravel() for a in np.meshgrid(np.linspace(10.67, -30.67, 32), np.arange(-180, 180, 0.4)))
+    away = 20.0 + 10.0 * np.sin(np.radians(5.0 * azimuth))
+    c = np.cos(np.radians(elevation))
+    ray = np.column_stack(
+        [c * np.cos(np.radians(azimuth)), c * np.sin(np.radians(azimuth)), np.sin(np.radians(elevation))]
+    )
+    drive = Recording().drive()
+    seen = replace(drive, read_scan=lambda i: Scan(i, ((away + 0.01 * i)[:, None] * ray).astype("f4")))
+    with pytest.raises(MapvoteError, match=r"32 beams from .* as a hdl32e has, but a vlp16 has 16 from"):
+        LookedAt(seen)
+    for stated in ({"sensor": SENSORS["hdl32e"]}, {"sensor_told": "measured: by its rings"}):
+        LookedAt(replace(seen, **stated))

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from mapvote.core.types import Drive
+from mapvote.core.types import Drive, Scan
 from mapvote.doctor.finding import Finding, Severity
 from mapvote.doctor.looks import QUANTA_M, SECTORS, Looks
+from mapvote.formats.drives.sensor_estimate import unlike
 
 _CUT_SHARE = 0.6
 """A scan with fewer points than this share of its neighbours' is cut off."""
@@ -23,9 +24,10 @@ def check_scans(drive: Drive, looks: Looks) -> list[Finding]:
     found = _refused(drive, looks)
     if len(looks.index) == 0:
         return found
+    scan = drive.read_scan(int(looks.index[len(looks.index) // 2]))
     units = _units(looks)
-    columns = _columns(drive, looks)
-    found += columns or units
+    columns = _columns(drive, looks, scan)
+    found += columns or units or _beams(drive, looks)
     found += _counts(drive, looks) + _doubled(looks) + _body(looks)
     found += [] if columns or units else _sectors(drive, looks) + _reach(looks)
     found += _rounded(looks)
@@ -54,9 +56,22 @@ def _refused(drive: Drive, looks: Looks) -> list[Finding]:
     return [Finding("error", why + others, mend)]
 
 
-def _columns(drive: Drive, looks: Looks) -> list[Finding]:
+def _beams(drive: Drive, looks: Looks) -> list[Finding]:
+    """The sensor that somebody stated, against the rings of some scans: rays that never were would demolish walls."""
+    if drive.sensor_told.startswith("measured"):
+        return []
+    some = (drive.read_scan(int(looks.index[k])) for k in sorted({0, len(looks.index) // 2, len(looks.index) - 1}))
+    what = next(filter(None, (unlike(drive.sensor, scan) for scan in some)), "")
+    return (
+        [Finding("error", what, "leave out --sensor, and the sensor in drive.toml: it is measured then")]
+        if what
+        else []
+    )
+
+
+def _columns(drive: Drive, looks: Looks, scan: Scan) -> list[Finding]:
     """A coordinate that is something else: an intensity, a constant."""
-    found = _period(drive, looks)
+    found = _period(scan)
     if found:
         return found
     unit = np.median(looks.unit, axis=0)
@@ -73,9 +88,8 @@ def _columns(drive: Drive, looks: Looks) -> list[Finding]:
     return found
 
 
-def _period(drive: Drive, looks: Looks) -> list[Finding]:
+def _period(scan: Scan) -> list[Finding]:
     """After how many numbers a scan repeats itself: neighbouring points are alike, column by column."""
-    scan = drive.read_scan(int(looks.index[len(looks.index) // 2]))
     points = scan.points[:_PERIOD_POINTS].astype(np.float64)
     # Intensities may have been scaled when they were read: their column only keeps its place.
     flat = (points if scan.intensity is None else np.pad(points, ((0, 0), (0, 1)), constant_values=np.nan)).ravel()

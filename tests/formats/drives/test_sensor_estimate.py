@@ -7,7 +7,7 @@ import pytest
 
 from mapvote.core.sensors import SENSORS
 from mapvote.core.types import F64, Scan
-from mapvote.formats.drives.sensor_estimate import estimate_sensor
+from mapvote.formats.drives.sensor_estimate import estimate_sensor, unlike
 
 VLP32C = (15, 10.333, 7, 4.667, *np.linspace(3.333, -4, 23), -4.667, -5.333, -6.148, -7.254, -8.843)
 MODELS: dict[str, tuple[tuple[float, ...], float]] = {
@@ -98,3 +98,23 @@ def test_a_non_repeating_scanner_gets_a_model_without_rings() -> None:
     assert "no rings" in found.told
     assert found.sensor.blind_sectors_deg[0][1] - found.sensor.blind_sectors_deg[0][0] > 250
     assert -36 < found.sensor.fov_bottom_deg < -5
+
+
+@pytest.mark.parametrize("order", ["ring by ring", "firing by firing"])
+@pytest.mark.parametrize(("model", "its_own"), [("VLP-16", "vlp16"), ("HDL-32E", "hdl32e"), ("HDL-64E", "hdl64e")])
+def test_a_sensor_stated_wrongly_contradicts_the_rings_and_the_right_one_does_not(
+    model: str, its_own: str, order: str
+) -> None:
+    for name, stated in SENSORS.items():
+        said = unlike(stated, scan(model, order))
+        assert (said == "") == (name == its_own), (name, said)
+
+
+def test_a_scan_of_every_second_beam_and_one_without_rings_contradict_no_sensor() -> None:
+    whole = scan("HDL-64E", "ring by ring", ring=True)
+    assert whole.ring is not None
+    half = whole.ring % 2 == 0
+    assert unlike(SENSORS["hdl64e"], Scan(0, whole.points[half], ring=whole.ring[half])) == ""
+    rng = np.random.default_rng(1)
+    points, _ = street(rng.uniform(-25, 25, 60_000), rng.uniform(-180, 180, 60_000), rng)
+    assert unlike(SENSORS["vlp16"], Scan(0, points.astype(np.float32))) == ""

@@ -16,6 +16,8 @@ _FAR_M = 8.0
 """Nearer points are left out: the beams of large sensors do not start in one point."""
 _SURE = 0.7
 """Share of points that must lie on a ring for the rings to be believed."""
+_EDGE_DEG, _MORE = 1.5, 1.3
+"""A stated sensor is another one if scans show beams so far beyond its own, or so many times as many."""
 _SECTOR_DEG = 2.0
 _BLIND_DEG = 10.0
 
@@ -59,6 +61,29 @@ def estimate_sensor(scans: Sequence[Scan], rate_hz: float) -> Estimate:
         blind_sectors_deg=blind,
     )
     return Estimate(sensor, share, f"measured: {seen}, azimuth step {step:.3f} deg")
+
+
+def unlike(stated: Sensor, scan: Scan) -> str:
+    """How the rings that a scan surely shows contradict the ``stated`` sensor; "" if they do not, or are not sure.
+
+    Beams that see nothing are missed in a scan, so fewer rings than stated are no contradiction.
+    """
+    if not stated.rings or stated.beams < 2:
+        return ""
+    found = estimate_sensor([scan], stated.rate_hz)
+    if not found.sensor.rings or found.on_rings < _SURE:
+        return ""
+    seen, beams = (np.sort(np.array(s.elevations_deg))[::-1] for s in (found.sensor, stated))
+    spacing = float(np.median(np.abs(np.diff(beams))))
+    outside = seen[0] > beams[0] + _EDGE_DEG or seen[-1] < beams[-1] - _EDGE_DEG
+    off_deg = float(np.median(np.abs(seen - _nearest(beams, seen))))
+    if not outside and len(seen) <= _MORE * len(beams) and off_deg <= max(0.3 * spacing, 0.15):
+        return ""
+    name = f", as a {found.sensor.name} has" if found.sensor.name in SENSORS else ""
+    return (
+        f"the scans show {len(seen)} beams from {seen[-1]:.1f} to {seen[0]:.1f} deg{name}, but a {stated.name} has "
+        f"{len(beams)} from {beams[-1]:.1f} to {beams[0]:.1f} deg"
+    )
 
 
 def _angles(scan: Scan) -> tuple[F64, F64, F64]:
