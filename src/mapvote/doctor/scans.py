@@ -7,7 +7,7 @@ import numpy as np
 from mapvote.core.types import Drive, Scan
 from mapvote.doctor.finding import Finding, Severity
 from mapvote.doctor.looks import QUANTA_M, SECTORS, Looks
-from mapvote.formats.drives.sensor_estimate import unlike
+from mapvote.formats.drives.sensor_estimate import contradiction
 
 _CUT_SHARE = 0.6
 """A scan with fewer points than this share of its neighbours' is cut off."""
@@ -61,7 +61,7 @@ def _beams(drive: Drive, looks: Looks) -> list[Finding]:
     if drive.sensor_told.startswith("measured"):
         return []
     some = (drive.read_scan(int(looks.index[k])) for k in sorted({0, len(looks.index) // 2, len(looks.index) - 1}))
-    what = next(filter(None, (unlike(drive.sensor, scan) for scan in some)), "")
+    what = next(filter(None, (contradiction(drive.sensor, scan) for scan in some)), "")
     return (
         [Finding("error", what, "leave out --sensor, and the sensor in drive.toml: it is measured then")]
         if what

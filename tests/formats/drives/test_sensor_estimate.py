@@ -7,7 +7,7 @@ import pytest
 
 from mapvote.core.sensors import SENSORS
 from mapvote.core.types import F64, Scan
-from mapvote.formats.drives.sensor_estimate import estimate_sensor, unlike
+from mapvote.formats.drives.sensor_estimate import contradiction, estimate_sensor
 
 VLP32C = (15, 10.333, 7, 4.667, *np.linspace(3.333, -4, 23), -4.667, -5.333, -6.148, -7.254, -8.843)
 MODELS: dict[str, tuple[tuple[float, ...], float]] = {
@@ -106,7 +106,7 @@ def test_a_sensor_stated_wrongly_contradicts_the_rings_and_the_right_one_does_no
     model: str, its_own: str, order: str
 ) -> None:
     for name, stated in SENSORS.items():
-        said = unlike(stated, scan(model, order))
+        said = contradiction(stated, scan(model, order))
         assert (said == "") == (name == its_own), (name, said)
 
 
@@ -114,7 +114,7 @@ def test_a_scan_of_every_second_beam_and_one_without_rings_contradict_no_sensor(
     whole = scan("HDL-64E", "ring by ring", ring=True)
     assert whole.ring is not None
     half = whole.ring % 2 == 0
-    assert unlike(SENSORS["hdl64e"], Scan(0, whole.points[half], ring=whole.ring[half])) == ""
+    assert contradiction(SENSORS["hdl64e"], Scan(0, whole.points[half], ring=whole.ring[half])) == ""
     rng = np.random.default_rng(1)
     points, _ = street(rng.uniform(-25, 25, 60_000), rng.uniform(-180, 180, 60_000), rng)
-    assert unlike(SENSORS["vlp16"], Scan(0, points.astype(np.float32))) == ""
+    assert contradiction(SENSORS["vlp16"], Scan(0, points.astype(np.float32))) == ""

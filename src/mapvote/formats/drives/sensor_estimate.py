@@ -63,7 +63,7 @@ def estimate_sensor(scans: Sequence[Scan], rate_hz: float) -> Estimate:
     return Estimate(sensor, share, f"measured: {seen}, azimuth step {step:.3f} deg")
 
 
-def unlike(stated: Sensor, scan: Scan) -> str:
+def contradiction(stated: Sensor, scan: Scan) -> str:
     """How the rings that a scan surely shows contradict the ``stated`` sensor; "" if they do not, or are not sure.
 
     Beams that see nothing are missed in a scan, so fewer rings than stated are no contradiction.
