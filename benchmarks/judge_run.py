@@ -15,7 +15,7 @@ from mapvote.config import Settings
 from mapvote.core.columns import GROUND_MARGIN_M
 from mapvote.core.point_map import all_points
 from mapvote.core.types import F64, U64, Bool
-from mapvote.detection.voters import Voter
+from mapvote.detection.voter import Voter
 from mapvote.localisation.deskew import deskew, motion_at
 from mapvote.perception.frontend import Observation
 from mapvote.vehicle import Vehicle

@@ -2,7 +2,7 @@
 
     python benchmarks/probability.py CACHE [--fit SCENE:SEED[:SCANS] ...] [--check ...] [--out results/probability.csv]
 
-One command: drives what CACHE lacks, prints the numbers that detection/surface_odds.py and fusion/probability.py hold
+One command: drives what CACHE lacks, prints the numbers that detection/confidence.py and fusion/probability.py hold
 (a test does not: paste them), then what docs/measurements/probability.md shows, of the scenes that nothing was fitted
 to: ECE, Brier score and bins, beside those of the votes alone, and for each budget of false deletions what waits, what
 goes, what was promised of that and what came of it. ``--as-is`` fits nothing and checks the numbers that the program
@@ -25,7 +25,7 @@ from mapvote.codec.odds import STEPS, UNSAID
 from mapvote.config import FuseSettings, Settings
 from mapvote.core.grid import CELLS
 from mapvote.core.types import F64, I64, Bool, CellState
-from mapvote.detection import surface_odds
+from mapvote.detection import confidence
 from mapvote.fusion import probability
 from mapvote.fusion.offline import update_map
 from mapvote.vehicle import vote_drive
@@ -78,8 +78,8 @@ def fit(streets: Sequence[str], cache: Path) -> None:
     for name, state in KINDS.items():
         mine = taken(alone, alone.scored & (alone.states == state))
         told = np.column_stack([np.ones(len(mine.states)), mine.looked, mine.depth_m])
-        curves.append(told_as("detection/surface_odds.py", name, fitted(told, mine.true, evenly(mine.scene))))
-    surface_odds._BUILT, surface_odds._DEMOLISHED = curves
+        curves.append(told_as("detection/confidence.py", name, fitted(told, mine.true, evenly(mine.scene))))
+    confidence._BUILT, confidence._DEMOLISHED = curves
     parts = [cells for k, street in enumerate(driven_streets) for cells in decided(street, k, curves, FEWEST)]
     every = stacked(parts)
     said = taken(every, every.scored & (every.vehicles == every.vehicles.max()) & (every.odds != UNSAID))
@@ -108,7 +108,7 @@ def told_as(where: str, name: str, curve: F64) -> F64:
 
 def check(names: Sequence[str], cache: Path, out: Path | None) -> None:
     """Print, and write as CSV, how the program's numbers do on these scenes."""
-    curves = surface_odds._BUILT, surface_odds._DEMOLISHED
+    curves = confidence._BUILT, confidence._DEMOLISHED
     every = [stacked(list(decided(driven(name, cache), k, curves, FEWEST))) for k, name in enumerate(names)]
     rows: list[dict[str, object]] = []
     by_kind = {

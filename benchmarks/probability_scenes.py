@@ -21,7 +21,7 @@ from mapvote.core.point_map import PointMap
 from mapvote.core.tile import Tile
 from mapvote.core.types import F64, I8, I64, U8, Bool, CellState
 from mapvote.core.voting import VOTE_UNIT
-from mapvote.detection.surface_odds import depths_m
+from mapvote.detection.confidence import depths_m
 from mapvote.fusion.fuse import Decision
 from mapvote.fusion.offline import update_map
 from mapvote.fusion.pending import standing_beside
@@ -216,7 +216,7 @@ def _with_odds(ballot: Ballot, told: Told, curves: tuple[F64, F64]) -> Ballot:
 
 
 def sure(states: U8, looked: F64, depth_m: F64, curves: tuple[F64, F64]) -> F64:
-    """(n,) log-odds by curves (k + 2,), as detection/surface_odds.py has them by its own."""
+    """(n,) log-odds by curves (k + 2,), as detection/confidence.py has them by its own."""
     told = np.column_stack([np.ones(len(states)), looked, depth_m])
     return np.where(states == CellState.CHANGED_OCCUPIED, told @ curves[0], told @ curves[1])
 

@@ -7,9 +7,8 @@ import pytest
 
 from hand_made import make_map, make_tile, wall
 from mapvote.core.point_map import PointMap
-from mapvote.detection import blocks
-from mapvote.detection.voters import Voter
-from mapvote.detection.votes import TileVotes
+from mapvote.detection import surfaces
+from mapvote.detection.voter import TileVotes, Voter
 
 
 def long_street() -> PointMap:
@@ -24,8 +23,7 @@ def long_street() -> PointMap:
 def blocks_say_the_same(voter: Voter, monkeypatch: pytest.MonkeyPatch) -> None:
     """Judged tile by tile, what a drive says is what all tiles say at once."""
     whole = voter.votes()
-    monkeypatch.setattr(blocks, "_AT_ONCE", 1)
-    monkeypatch.setattr(blocks, "_BLOCK", 1)
+    monkeypatch.setattr(surfaces, "_BLOCK", 1)
     by_blocks = voter.votes()
     assert list(by_blocks) == list(whole)
     changed = []

@@ -20,9 +20,8 @@ from mapvote.core.sensors import Sensor
 from mapvote.core.types import F32, F64, U8, U64, CellState, Drive, MapvoteError, Scan
 from mapvote.core.voting import to_wire
 from mapvote.detection.new_points import NewPoints, points_in
-from mapvote.detection.surface_odds import depths_m, log_odds
-from mapvote.detection.voters import Voter, make_voter
-from mapvote.detection.votes import TileVotes
+from mapvote.detection.paper import PaperVoter
+from mapvote.detection.voter import TileVotes, Voter
 from mapvote.localisation.localiser import Localise, Localiser
 from mapvote.localisation.ndt import PosePrior
 from mapvote.perception.frontend import DriveReport, Frontend, Observation
@@ -97,6 +96,15 @@ class Vehicle:
         )
 
 
+def make_voter(settings: Settings, sensor: Sensor, point_map: PointMap) -> Voter:
+    """The voter that ``voting.method`` names."""
+    if settings.voting.method == "surfaces":
+        from mapvote.detection.surfaces import SurfaceVoter  # brings half of scipy, which the paper's rule does without
+
+        return SurfaceVoter(settings.voting, point_map)
+    return PaperVoter(settings.voting, settings.paper, sensor, point_map)
+
+
 def write_ballot(
     vehicle: str,
     drive: str,
@@ -151,6 +159,8 @@ def _ballot_tile(point_map: PointMap, tile: TileIndex, votes: TileVotes, points:
         gone = np.where(changed[CellState.CHANGED_EMPTY], gone, left)
     odds = None
     if two_stage and votes.looked is not None:
+        from mapvote.detection.confidence import depths_m, log_odds  # brings scipy, as surfaces do
+
         changes = votes.states.reshape(-1)[changed_cells_of(votes.states)]
         depth_m = depths_m(votes.states, point_map.tiles.get(tile), kept)
         odds = pack_odds(in_steps(log_odds(changes, votes.looked, depth_m)))

@@ -23,7 +23,6 @@ from mapvote.core.sensors import SENSORS
 from mapvote.core.types import F64, Drive, Scan
 from mapvote.core.voxels import VoxelCloud
 from mapvote.detection.packed_tiles import PackedTiles
-from mapvote.detection.spreading import steps_to
 from mapvote.doctor.clouds import check_cloud, in_memory
 from mapvote.doctor.looks import Looking
 from mapvote.formats.clean import BadPoints, RawScan, clean_scan, spinning_time_s
@@ -72,12 +71,11 @@ def _fuse(point_map: PointMap, ballots: list[Ballot], settings: Settings) -> Non
 
 
 def _go_far(drive: Drive) -> None:
-    """What verbs look at before they use drive and map; points that bring no times; a roof that falls; a tile
-    left and come back to; more voxels than a table takes."""
+    """What verbs look at before they use drive and map; points that bring no times; a tile left
+    and come back to; more voxels than a table takes."""
     Looking(drive).look(range(2))
     check_cloud(in_memory(drive.read_scan(0).points.astype(np.float64)))
     spinning_time_s(np.zeros((1, 3), np.float32), drive.sensor.rate_hz)
-    steps_to(np.zeros((2, 2), np.bool_))
     tiles, far = PackedTiles(Lattice(), 1), 10 * TILE_CELLS
     tiles.near((0, 0))[:] = 1
     tiles.leave(Grid(Lattice(), far, far, 1, 1))

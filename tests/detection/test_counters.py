@@ -9,7 +9,7 @@ from hypothesis.extra.numpy import arrays
 
 from mapvote.core.columns import dilated, neighbourhood, shifted
 from mapvote.core.grid import Lattice
-from mapvote.detection.counters import PLANES, WORDS, Evidence, count_of, free_words
+from mapvote.detection.evidence import PLANES, Evidence, count_of, free_words
 from small_window import AT, GRID, NOTHING, SIDE, middle, reference_of, view_of, words
 
 
@@ -114,6 +114,6 @@ def test_shifting_a_column_drops_what_leaves_it() -> None:
 
 
 def test_free_words_are_told_of_windows_of_any_shape() -> None:
-    planes = np.zeros((3, 1, WORDS), np.uint64)
+    planes = np.zeros((3, 1, 2 * PLANES), np.uint64)
     planes[2, 0, 1] = 1 << 5  # seen through twice
     assert free_words(planes, np.zeros((3, 1), np.uint64)).tolist() == [[0], [0], [1 << 5]]

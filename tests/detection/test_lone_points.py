@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from mapvote.core.types import I32, NO_VOTE, U64, CellState
-from mapvote.detection.lone_points import FIRM_BESIDE, lone_cells, no_change
+from mapvote.detection.surface_rules import FIRM_BESIDE, lone_cells, no_change
 
 CE = CellState.CHANGED_EMPTY
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from mapvote.core.columns import TOP_BIT
 from mapvote.core.grid import CELL_SIZE, Grid, Lattice
 from mapvote.core.types import Reference
-from mapvote.detection.near_hits import HIT_REACH_M, _mark_near, near_hits
+from mapvote.detection.evidence import HIT_REACH_M, _mark_near, near_hits
 from mapvote.perception.frontend import Observation, PlacedScan
 from mapvote.perception.raycast import ScanView, find_obstacles
 

@@ -10,8 +10,8 @@ from mapvote.config import VotingSettings
 from mapvote.core.grid import Grid, Lattice
 from mapvote.core.point_map import PointMap
 from mapvote.core.types import U64
+from mapvote.detection.evidence import CROSSED, HIT, PASSED, PASSES
 from mapvote.detection.packed_tiles import PackedTiles
-from mapvote.detection.surface_counts import CROSSED, MET, PASSED, PASSES
 from mapvote.detection.surfaces import SurfaceVoter
 
 LATTICE = Lattice()
@@ -59,9 +59,9 @@ def surfaces_after_a_drive(point_map: PointMap) -> SurfaceVoter:
         fate = rng.random(mapped.shape)
         planes[..., CROSSED : CROSSED + 3] = np.where(fate < 0.4, mapped, np.uint64(0))[..., None]
         planes[..., CROSSED] |= np.where(fate > 0.8, mapped, np.uint64(0))
-        planes[..., MET] = np.where((fate > 0.4) & (fate < 0.6), mapped, np.uint64(0))
+        planes[..., HIT] = np.where((fate > 0.4) & (fate < 0.6), mapped, np.uint64(0))
         rose = np.where(rng.random(mapped.shape) < 0.02, np.uint64(0b111110), np.uint64(0)) & ~mapped
-        planes[..., MET + 1] |= rose
+        planes[..., HIT + 1] |= rose
         planes[..., PASSES] = rose & np.uint64(0b110)
         planes[..., PASSED] = ~rose
     return voter

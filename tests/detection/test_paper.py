@@ -19,8 +19,16 @@ from mapvote.core.reference import reference_window
 from mapvote.core.sensors import SENSORS
 from mapvote.core.types import NO_VOTE, U64, CellState, Reference
 from mapvote.core.voting import VOTE_UNIT, vote_weight
-from mapvote.detection.paper import PaperVoter, classify_paper, reading_table
-from mapvote.detection.sightings import BEGINS_ABOVE, WORDS, encode, sightings, votes_in
+from mapvote.detection.paper import (
+    BEGINS_ABOVE,
+    WORDS,
+    PaperVoter,
+    classify_paper,
+    encode,
+    reading_table,
+    sightings,
+    votes_in,
+)
 from mapvote.perception.frontend import Observation, PlacedScan
 from mapvote.perception.raycast import ScanView, Sight, cast_rays, find_obstacles
 

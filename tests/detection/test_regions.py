@@ -4,12 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
-from mapvote.core.grid import Lattice
 from mapvote.core.types import U8, CellState
-from mapvote.detection.regions import around, fallen
+from mapvote.detection.surface_rules import fallen
 
 UO, UE, CO, CE, UN = (int(state) for state in CellState)
 
@@ -48,16 +45,3 @@ def test_without_anything_gone_nothing_falls_and_without_anything_standing_all_o
 def test_what_is_not_adrift_never_falls() -> None:
     states = plane((20, 4, CE))
     assert not fallen(states, np.zeros(states.shape, dtype=np.bool_), 15).any()
-
-
-@settings(max_examples=20)
-@given(st.integers(0, 2**32 - 1), st.integers(1, 70))
-def test_a_window_over_several_tiles_is_cut_from_each(seed: int, halo: int) -> None:
-    rng = np.random.default_rng(seed)
-    lattice = Lattice()
-    tiles = {(r, c): rng.integers(0, 5, (256, 256)).astype(np.uint8) for r in (0, 1) for c in (0, 1)}
-    whole = np.block([[tiles[0, 0], tiles[0, 1]], [tiles[1, 0], tiles[1, 1]]])
-    seen = around(lattice, tiles, lattice.tile((0, 0)).padded(halo), 9)
-    assert (seen[:halo] == 9).all()
-    assert (seen[:, :halo] == 9).all()
-    np.testing.assert_array_equal(seen[halo:, halo:], whole[: 256 + halo, : 256 + halo])

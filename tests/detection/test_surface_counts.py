@@ -14,9 +14,18 @@ from mapvote.core.grid import TILE_CELLS, Grid, Lattice
 from mapvote.core.point_map import PointMap
 from mapvote.core.reference import reference_window
 from mapvote.core.types import F64
-from mapvote.detection.counters import PLANES, count_of
-from mapvote.detection.near_hits import near_hits
-from mapvote.detection.surface_counts import CROSSED, MET, PASSED, PASSES, WORDS, SurfaceEvidence, times_crossed
+from mapvote.detection.evidence import (
+    CROSSED,
+    HIT,
+    PASSED,
+    PASSES,
+    PLANES,
+    WORDS,
+    SurfaceEvidence,
+    count_of,
+    near_hits,
+)
+from mapvote.detection.surface_rules import times_crossed
 from mapvote.perception.frontend import Observation
 from mapvote.perception.raycast import ScanView
 
@@ -68,7 +77,7 @@ def test_a_voxel_counts_what_one_scan_tells_of_it(offsets: list[tuple[float, flo
         for c in COLS:
             cell = evidence.tiles[0, 0][r, c]
             for bit in range(1, TOP_BIT):
-                counted = [bool(count_of(cell, first, bit)) for first in (CROSSED, MET, PASSES)]
+                counted = [bool(count_of(cell, first, bit)) for first in (CROSSED, HIT, PASSES)]
                 assert (*counted, bool(int(cell[PASSED]) >> bit & 1)) == told_of(seen, r, c, bit)
 
 
@@ -101,7 +110,7 @@ def test_a_cell_in_which_a_count_is_full_is_halved_as_a_whole_and_its_ratios_sta
         evidence.count(seen)
     cell = evidence.tiles[0, 0][102, 102]
     assert count_of(cell, PASSES, 10) == FULL // 2 + 1, "full after 127, so 63 and the last one"
-    assert count_of(cell, MET, 3) == 32 // 2
+    assert count_of(cell, HIT, 3) == 32 // 2
     assert count_of(cell, CROSSED, 3) == 32 // 2, "of four scans one hit it, one crossed it, and two passed it only"
     assert count_of(cell, PASSES, 3) == 96 // 2
     assert cell[PASSED] == ~np.uint64(0), "what rays ever passed is no count"

@@ -16,12 +16,29 @@ from mapvote.config import VotingSettings
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS
 from mapvote.core.point_map import PointMap
 from mapvote.core.types import F64, I32, NO_VOTE, Bool, CellState
-from mapvote.detection.counters import PLANES, count_of
-from mapvote.detection.near_hits import HIT_REACH_M
-from mapvote.detection.surface_counts import CROSSED, MET, PASSES, WORDS, SurfaceEvidence
-from mapvote.detection.surface_regions import SUPPORT, grown, lasting
-from mapvote.detection.surfaces import GONE_RAYS, HIT_RAYS, NEW_RAYS, SurfaceVoter, weigh_surfaces
-from mapvote.detection.votes import TileVotes
+from mapvote.detection.evidence import (
+    CROSSED,
+    HIT,
+    HIT_REACH_M,
+    PASSES,
+    PLANES,
+    WORDS,
+    SurfaceEvidence,
+    count_of,
+)
+from mapvote.detection.packed_tiles import Overlap
+from mapvote.detection.surface_rules import (
+    GONE_RAYS,
+    HIT_RAYS,
+    NEW_RAYS,
+    SUPPORT,
+    grown,
+    lasting,
+    no_facts,
+    weigh_voxels,
+)
+from mapvote.detection.surfaces import SurfaceVoter
+from mapvote.detection.voter import TileVotes
 
 ROW, COLUMNS = 100, range(100, 112)
 HEIGHTS = [0.75, 1.05, 1.35, 1.65]
@@ -231,16 +248,15 @@ def test_a_place_where_nothing_is_mapped_and_rays_passed_is_empty_and_one_that_n
 
 
 def weighed(mapped: int, free: int, **counts: int) -> tuple[list[np.ndarray], int]:
-    """Voxel 5 of one cell with these counts: (gone, stands, unmet, new, beyond; of what is new, met less passed)."""
+    """Voxel 5 of one cell with these counts: (gone, stands, unmet, new, beyond; of what is new, hits less passes)."""
     planes, bit = np.zeros((1, 1, WORDS), np.uint64), 5
-    for first, name in ((CROSSED, "crossed"), (MET, "met"), (PASSES, "passes")):
+    for first, name in ((CROSSED, "crossed"), (HIT, "met"), (PASSES, "passes")):
         for k in range(PLANES):
             planes[0, 0, first + k] = np.uint64((counts.get(name, 0) >> k & 1) << bit)
-    found = [np.zeros((1, 1), np.uint64) for _ in range(5)]
-    balance = np.zeros((1, 1), np.int32)
     words_of = [np.full((1, 1), word << bit, np.uint64) for word in (mapped, free)]
-    weigh_surfaces(planes, *words_of, *found, balance)
-    return found, int(balance[0, 0])
+    out = no_facts((1, 1))
+    weigh_voxels(planes, Overlap(0, 1, 0, 1, 0, 0), *words_of, out)
+    return list(out[:5]), int(out.balance[0, 0])
 
 
 @given(crossed=st.integers(0, 120), met=st.integers(0, 20))
@@ -327,4 +343,4 @@ def test_a_hit_meets_exactly_the_mapped_voxels_within_its_reach(offsets: list[tu
             low = np.array([c, r, bit]) * CELL_SIZE
             apart = np.maximum(low - points, points - low - CELL_SIZE).max(axis=1).min()
             if abs(apart - HIT_REACH_M) > 1e-6 and abs(apart) > 1e-6:
-                assert count_of(evidence.tiles[0, 0][r, c], MET, bit) == (apart < HIT_REACH_M)
+                assert count_of(evidence.tiles[0, 0][r, c], HIT, bit) == (apart < HIT_REACH_M)

@@ -66,10 +66,13 @@ class PackedTiles(Mapping[TileIndex, U64]):
     def under(self, view: Grid) -> Iterator[tuple[U64, Overlap]]:
         """The planes of each tile that ``view`` lies on, as :meth:`near` has them, and where it lies in them."""
         for tile in view.tiles():
-            window = self.lattice.tile(tile)
-            rows, cols = window.intersection(view).slices_in(view)
-            off = view.row0 - window.row0, view.col0 - window.col0
-            yield self.near(tile), Overlap(rows.start, rows.stop, cols.start, cols.stop, *off)
+            yield self.near(tile), self.overlap(tile, view)
+
+    def overlap(self, tile: TileIndex, view: Grid) -> Overlap:
+        """What ``view`` has in common with a tile."""
+        window = self.lattice.tile(tile)
+        rows, cols = window.intersection(view).slices_in(view)
+        return Overlap(rows.start, rows.stop, cols.start, cols.stop, view.row0 - window.row0, view.col0 - window.col0)
 
     def leave(self, view: Grid) -> None:
         """Pack one tile that lies far from ``view``, if there is any: for every scan, so that none has it all."""

@@ -5,7 +5,7 @@ in how many was it struck, in how many seen through. What was struck only rarely
 the trail of something that moved and escaped the filter: it leaves the map, and its voxels are unknown, not free. So
 does what is no surface at all (slam/strays.py), and what the surveys saw through as often as a vehicle that calls it
 gone: beside a parked car the trail of one that passes is struck by every hit on the other, and only a hit that knows
-where it lies tells them apart (detection/surface_counts.py).
+where it lies tells them apart (detection/evidence.py).
 
 What enters the map has been before the filter, at whatever range: a car that drives ahead of the surveyor, too far off
 for the counting, would else leave its trail unchallenged. Returns from beyond the filter's reach are left out.
@@ -30,9 +30,17 @@ from mapvote.core.reference import LocalMap
 from mapvote.core.tile import Tile
 from mapvote.core.types import F32, F64, I32, I64, U64, Bool, Drive
 from mapvote.core.voxels import VoxelCloud
-from mapvote.detection.counters import PLANES, Evidence, count_of, free_words, is_open
-from mapvote.detection.surface_counts import MET, PASSES, SurfaceEvidence
-from mapvote.detection.surfaces import is_gone
+from mapvote.detection.evidence import (
+    HIT,
+    PASSES,
+    PLANES,
+    Evidence,
+    SurfaceEvidence,
+    count_of,
+    free_words,
+    is_open,
+)
+from mapvote.detection.surface_rules import is_gone
 from mapvote.localisation.localiser import GivenPoses
 from mapvote.perception.frontend import Frontend, Observation, PlacedScan
 from mapvote.perception.moving_objects import MovingFilter
@@ -224,7 +232,7 @@ def _balances(planes: U64, rows: I64, cols: I64, bits: I64) -> I64:
     for i in range(len(bits)):
         if 0 <= bits[i] < TOP_BIT:
             cell = planes[rows[i], cols[i]]
-            out[i] = count_of(cell, MET, bits[i]) - count_of(cell, PASSES, bits[i])
+            out[i] = count_of(cell, HIT, bits[i]) - count_of(cell, PASSES, bits[i])
     return out
 
 

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mapvote.core.grid import Lattice
-from mapvote.detection.counters import PLANES, Evidence, count_of
+from mapvote.detection.evidence import PLANES, Evidence, count_of
 from mapvote.perception.raycast import Sight
 from mapvote_lab.evaluation.columns_v1.counters import STRUCK_ITSELF, THROUGH_ITSELF, ColumnEvidence
 from small_window import AT, NOTHING, middle, reference_of, view_of, words

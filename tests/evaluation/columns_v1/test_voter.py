@@ -12,8 +12,8 @@ from mapvote.core.grid import CELL_SIZE, Lattice
 from mapvote.core.point_map import PointMap
 from mapvote.core.reference import LocalMap, reference_window
 from mapvote.core.types import CellState
-from mapvote.detection.near_hits import HIT_REACH_M
-from mapvote.detection.votes import TileVotes
+from mapvote.detection.evidence import HIT_REACH_M
+from mapvote.detection.voter import TileVotes
 from mapvote.perception.raycast import ScanView, Sight
 from mapvote_lab.evaluation.columns_v1.counters import ColumnEvidence
 from mapvote_lab.evaluation.columns_v1.regions import beside_new

@@ -12,8 +12,8 @@ from hypothesis.extra.numpy import arrays
 
 from mapvote.core.types import NO_VOTE, U64, CellState
 from mapvote.core.voting import VOTE_UNIT
-from mapvote.detection.counters import PLANES
-from mapvote.detection.regions import fallen
+from mapvote.detection.evidence import PLANES
+from mapvote.detection.surface_rules import fallen
 from mapvote_lab.evaluation.columns_v1.counters import STRUCK_ITSELF, THROUGH_ITSELF, WORDS
 from mapvote_lab.evaluation.columns_v1.judged import Weighed
 from mapvote_lab.evaluation.columns_v1.regions import drop_specks, remnants, unexplained

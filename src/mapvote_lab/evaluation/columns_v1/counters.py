@@ -15,7 +15,7 @@ import numpy as np
 from mapvote.core.columns import neighbourhood
 from mapvote.core.grid import Lattice
 from mapvote.core.types import F32, I32, U8, U64, Reference
-from mapvote.detection.counters import PLANES, add_one, halve, is_full
+from mapvote.detection.evidence import PLANES, add_one, halve, is_full
 from mapvote.detection.packed_tiles import Overlap, PackedTiles
 from mapvote.perception.raycast import ScanView, Sight
 

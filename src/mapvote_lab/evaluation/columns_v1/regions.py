@@ -15,13 +15,14 @@ import numpy as np
 from mapvote.core.columns import TOP_BIT, dilated, neighbourhood
 from mapvote.core.grid import Lattice, TileIndex
 from mapvote.core.types import I32, NO_VOTE, U8, U64, Bool, CellState
-from mapvote.detection.counters import PLANES
-from mapvote.detection.regions import HALO, beyond_tiles, fallen
-from mapvote.detection.spreading import flooded
+from mapvote.detection.evidence import PLANES
+from mapvote.detection.surface_rules import fallen
 from mapvote_lab.evaluation.columns_v1.counters import STRUCK_ITSELF, THROUGH_ITSELF, ever
 from mapvote_lab.evaluation.columns_v1.judged import Judged
 from mapvote_lab.evaluation.columns_v1.rules import Rules
 from mapvote_lab.evaluation.columns_v1.specks import small_groups
+from mapvote_lab.evaluation.columns_v1.spreading import flooded
+from mapvote_lab.evaluation.columns_v1.tile_windows import HALO, beyond_tiles
 
 _LOWEST, _HIGHEST = np.uint64(0b11), np.uint64(3) << np.uint64(TOP_BIT - 1)
 JOIN_CELLS = 6

@@ -6,7 +6,7 @@ import numba
 import numpy as np
 
 from mapvote.core.types import Bool
-from mapvote.detection.spreading import flood_on
+from mapvote_lab.evaluation.columns_v1.spreading import flood_on
 
 
 @numba.njit(cache=True, nogil=True)

@@ -12,16 +12,15 @@ from mapvote.core.grid import TileIndex
 from mapvote.core.point_map import PointMap
 from mapvote.core.reference import bordered
 from mapvote.core.types import U64
-from mapvote.detection.blocks import blocks
-from mapvote.detection.counters import newly_free
-from mapvote.detection.near_hits import near_hits
-from mapvote.detection.regions import around
-from mapvote.detection.votes import TileVotes
+from mapvote.detection.evidence import free_words, near_hits
+from mapvote.detection.voter import TileVotes
 from mapvote.perception.frontend import Observation
+from mapvote_lab.evaluation.columns_v1.blocks import blocks_and_around
 from mapvote_lab.evaluation.columns_v1.counters import ColumnEvidence
 from mapvote_lab.evaluation.columns_v1.judged import Judged
 from mapvote_lab.evaluation.columns_v1.regions import apply_region_rules, beside_new
 from mapvote_lab.evaluation.columns_v1.rules import ALL_RULES, Rules
+from mapvote_lab.evaluation.columns_v1.tile_windows import around
 from mapvote_lab.evaluation.columns_v1.weighing import weigh
 
 WIDE_SIGMA_M = 0.1
@@ -55,7 +54,7 @@ class ColumnVoter:
     def each(self) -> Iterator[tuple[TileIndex, TileVotes]]:
         """The same one by one, in an order of its own: a drive of many tiles is judged block by block
         (JOIN_CELLS, twice the halo and a speck are less than a tile)."""
-        for wanted, tiles in blocks(self.evidence.tiles):
+        for wanted, tiles in blocks_and_around(self.evidence.tiles):
             yield from self._of_block(wanted, tiles)
 
     def _of_block(self, wanted: list[TileIndex], tiles: list[TileIndex]) -> Iterator[tuple[TileIndex, TileVotes]]:
@@ -84,5 +83,7 @@ class ColumnVoter:
 
 
 def _votes_of(found: Judged, counters: U64) -> TileVotes:
-    weighed, free = found.weighed, newly_free(counters, found.here)
+    weighed, free = found.weighed, free_words(counters, found.here.occupied)
+    if found.here.free is not None:
+        free[found.here.free != 0] = 0
     return TileVotes(weighed.tally, found.states, weighed.gone, found.remnants, weighed.new, free)

@@ -15,7 +15,7 @@ import numpy as np
 from mapvote.core.columns import TOP_BIT, below_top
 from mapvote.core.types import I32, U64, Bool, CellState
 from mapvote.core.voting import VOTE_UNIT
-from mapvote.detection.counters import PLANES, count_of, is_open
+from mapvote.detection.evidence import PLANES, count_of, is_open
 from mapvote_lab.evaluation.columns_v1.judged import Weighed
 from mapvote_lab.evaluation.columns_v1.regions import loose_voxels
 from mapvote_lab.evaluation.columns_v1.rules import ALL_RULES, Rules

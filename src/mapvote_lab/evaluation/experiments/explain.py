@@ -10,8 +10,7 @@ import numpy as np
 from mapvote.config import PaperSettings, VotingSettings
 from mapvote.core.grid import Grid
 from mapvote.core.types import I32, NO_VOTE, U8, Bool, CellState, Reference
-from mapvote.detection.paper import reading_table
-from mapvote.detection.sightings import MOST_POINTS, WORDS
+from mapvote.detection.paper import MOST_POINTS, WORDS, reading_table
 from mapvote_lab.evaluation.experiments.cases import Case
 from mapvote_lab.evaluation.experiments.kept import KeptDrive
 from mapvote_lab.evaluation.experiments.scene import Scene

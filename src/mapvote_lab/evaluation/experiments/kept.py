@@ -17,7 +17,7 @@ from mapvote.core.grid import Grid
 from mapvote.core.sensors import Sensor
 from mapvote.core.types import I32, U16, Bool
 from mapvote.detection.new_points import REACH_M
-from mapvote.detection.sightings import sightings
+from mapvote.detection.paper import sightings
 from mapvote.perception.frontend import Observation, PlacedScan
 from mapvote.perception.raycast import find_obstacles
 

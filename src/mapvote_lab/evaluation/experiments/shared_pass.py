@@ -17,12 +17,12 @@ from mapvote.core.point_map import PointMap
 from mapvote.core.reference import LocalMap
 from mapvote.core.types import Drive, Scan
 from mapvote.detection.new_points import NewPoints
-from mapvote.detection.voters import Voter, make_voter
+from mapvote.detection.voter import Voter
 from mapvote.localisation.localiser import Localise, Localiser
 from mapvote.localisation.ndt import PosePrior
 from mapvote.perception.frontend import DriveReport, Frontend, Movers, Observation
 from mapvote.perception.moving_objects import MovingFilter
-from mapvote.vehicle import write_ballot
+from mapvote.vehicle import make_voter, write_ballot
 from mapvote_lab.evaluation.columns_v1.counters import ColumnEvidence
 from mapvote_lab.evaluation.columns_v1.rules import Rules
 from mapvote_lab.evaluation.columns_v1.voter import ColumnVoter

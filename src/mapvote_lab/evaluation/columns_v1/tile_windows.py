@@ -12,8 +12,6 @@ from typing import Any
 import numpy as np
 
 from mapvote.core.grid import Grid, Lattice, TileIndex
-from mapvote.core.types import U8, Bool, CellState
-from mapvote.detection.spreading import flooded, steps_to
 
 HALO = 64
 """Cells around a tile that are looked at: 19 m, a house."""
@@ -44,18 +42,3 @@ def around(lattice: Lattice, planes: Mapping[TileIndex, Plane], wide: Grid, else
             common = grid.intersection(wide)
             out[common.slices_in(wide)] = planes[tile][common.slices_in(grid)]
     return out
-
-
-def fallen(states: U8, adrift: Bool, reach: int) -> Bool:
-    """(rows, cols) cells that fall: what stood on things that are gone, and no ray could reach, is gone with them.
-
-    The roof of a demolished house, too high for the sensor once nothing is behind it. An ``adrift`` cell goes with the
-    changed-empty or the unchanged-occupied cell that is nearer, so that of two roofs that meet only one falls; a
-    connected group of those that go falls if a changed-empty cell lies within ``reach`` cells of it.
-    """
-    gone, kept = states == CellState.CHANGED_EMPTY, states == CellState.UNCHANGED_OCCUPIED
-    if not (gone.any() and adrift.any()):
-        return np.zeros_like(adrift)
-    to_gone = steps_to(gone)
-    goes = adrift & (to_gone < steps_to(kept)) if kept.any() else adrift
-    return np.asarray(flooded(goes & (to_gone <= reach), goes, goes.size))

@@ -7,18 +7,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mapvote.core.types import U8, U64, Bool, CellState
-from mapvote.detection.surface_regions import (
+from mapvote.core.types import U64, Bool
+from mapvote.detection.surface_rules import (
     APART_SHARE,
-    MOVED_CELLS,
     SUPPORT,
-    new_sides,
     on_its_own,
     stands_apart,
     supported,
 )
 
-CE, UE = CellState.CHANGED_EMPTY, CellState.UNCHANGED_EMPTY
 SIDE = 20
 NOTHING = np.zeros((SIDE, SIDE), np.uint64)
 
@@ -81,19 +78,5 @@ def test_support_is_asked_of_groups_and_not_of_cells(marks: list[tuple[int, int,
 @pytest.mark.parametrize("free", range(9))
 def test_a_quarter_of_what_is_new_must_touch_nothing_that_stands(free: int) -> None:
     new, near = words((5, 5, 0xFF0)), words((5, 5, 0xFF0 & ~(2**free - 1 << 4)))
-    kept = stands_apart(new != 0, new, near, np.full((SIDE, SIDE), UE, np.uint8))
+    kept = stands_apart(new != 0, new, near, np.zeros((SIDE, SIDE), np.bool_))
     assert kept[5, 5] == (free >= 8 * APART_SHARE)
-
-
-@pytest.mark.parametrize("steps", [1, MOVED_CELLS, MOVED_CELLS + 1])
-def test_beside_what_went_new_things_may_touch_what_stands_and_hits_need_no_known_free_space(steps: int) -> None:
-    states: U8 = np.full((SIDE, SIDE), UE, np.uint8)
-    states[5, 5] = CE
-    met = words((5, 5 + steps, 0b1110))
-    assert new_sides(states, met)[5, 5 + steps] == (steps <= MOVED_CELLS)
-    assert stands_apart(met != 0, met, met, states)[5, 5 + steps] == (steps <= MOVED_CELLS)
-
-
-def test_where_nothing_went_nothing_was_moved() -> None:
-    everywhere = np.full((SIDE, SIDE), 2, np.uint64)
-    assert not new_sides(np.full((SIDE, SIDE), UE, np.uint8), everywhere).any()

@@ -9,20 +9,27 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from hand_made import make_tile, states_plane, wall
-from mapvote.core.grid import CELL_SIZE, Lattice
+from mapvote.core.grid import CELL_SIZE, TILE_CELLS
 from mapvote.core.types import I32, NO_VOTE, U8, CellState
-from mapvote.detection.surface_counts import WORDS
-from mapvote.detection.surface_looks import LOOKS, MOST_CELLS, MOST_HEIGHT_M, amounts, looks
-from mapvote.detection.surface_odds import depths_m, log_odds
+from mapvote.detection.confidence import LOOKS, MOST_CELLS, MOST_HEIGHT_M, depths_m, log_odds, looks
 
 CO, CE = CellState.CHANGED_OCCUPIED, CellState.CHANGED_EMPTY
-LATTICE = Lattice()
-LOW = np.full((256, 256), 1.0, dtype=np.float32)
+TILE = slice(1, TILE_CELLS + 1), slice(1, TILE_CELLS + 1)
+"""Of a window that reaches one cell beyond it, and a tile to the right."""
+LOW = np.full((TILE_CELLS + 2, 2 * TILE_CELLS + 1), 1.0, dtype=np.float32)
+
+
+def windowed(left: np.ndarray, right: np.ndarray | None = None, fill: int = NO_VOTE) -> np.ndarray:
+    out = np.full(LOW.shape, fill, left.dtype)
+    out[1:-1, 1 : TILE_CELLS + 1] = left
+    if right is not None:
+        out[1:-1, TILE_CELLS + 1 :] = right
+    return out
 
 
 def seen(states: U8, amount: I32 | None = None) -> np.ndarray:
     full = np.ones((256, 256), dtype=np.int32) if amount is None else amount
-    return looks(LATTICE, (0, 0), {(0, 0): states}, {(0, 0): full}, LOW)
+    return looks(windowed(states), windowed(full, fill=0), LOW, TILE)
 
 
 def test_a_cell_is_seen_in_its_thing_and_against_the_fullest_beside_it() -> None:
@@ -39,21 +46,13 @@ def test_a_cell_is_seen_in_its_thing_and_against_the_fullest_beside_it() -> None
 
 def test_a_thing_goes_on_where_tiles_meet_and_is_as_large_as_any_at_last() -> None:
     left, right = (states_plane({(r, c): CE for r in range(20)}) for c in (255, 0))
-    states = {(0, 0): left, (0, 1): right}
-    full = {tile: np.ones((256, 256), dtype=np.int32) for tile in states}
-    found = looks(LATTICE, (0, 0), states, full, LOW)
+    full = np.ones(LOW.shape, dtype=np.int32)
+    found = looks(windowed(left, right), full, LOW, TILE)
     assert np.exp(found[:, 0]) - 1 == pytest.approx(40)
     assert found[10, 1] * 8 == pytest.approx(5)
     whole = seen(np.full((256, 256), CE, dtype=np.uint8))
     assert np.exp(whole[:, 0]) - 1 == pytest.approx(np.full(65536, MOST_CELLS))
-    assert looks(LATTICE, (0, 0), {(0, 0): left}, full, 99 * LOW)[:, 3].max() == MOST_HEIGHT_M
-
-
-def test_of_what_is_gone_the_voxels_count_and_of_what_is_new_the_hits() -> None:
-    planes = np.zeros((1, 3, WORDS), dtype=np.uint64)
-    planes[0, 1, 7], planes[0, 1, 8] = 0b110, 0b100  # met once, and three times
-    occupied, new = (np.array([words], dtype=np.uint64) for words in ([0b1011, 0, 0], [0b1, 0b110, 0]))
-    assert amounts(planes, occupied, new).tolist() == [[3, 4, 0]]
+    assert looks(windowed(left), full, 99 * LOW, TILE)[:, 3].max() == MOST_HEIGHT_M
 
 
 def test_a_surface_is_as_deep_as_its_point_that_is_farthest_from_the_cells_sides() -> None:

@@ -14,7 +14,7 @@ _AT_ONCE = 24
 _BLOCK = 3
 
 
-def blocks(tiles: Iterable[TileIndex]) -> Iterator[tuple[list[TileIndex], list[TileIndex]]]:
+def blocks_and_around(tiles: Iterable[TileIndex]) -> Iterator[tuple[list[TileIndex], list[TileIndex]]]:
     """Pairs (the tiles whose votes are wanted, those and the ones around them), each tile in one block."""
     every = sorted(tiles)
     if len(every) <= _AT_ONCE:

@@ -7,7 +7,7 @@ import pytest
 from scipy import ndimage
 
 from mapvote.core.types import Bool
-from mapvote.detection.spreading import flooded, steps_to
+from mapvote_lab.evaluation.columns_v1.spreading import flooded, steps_to
 
 BESIDE = np.ones((3, 3))
 

@@ -1,0 +1,276 @@
+"""The rule of surfaces on one page: what a drive's counts say of every cell of a window of tiles (docs/method.md)."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numba
+import numpy as np
+from scipy import ndimage
+
+from mapvote.core.columns import TOP_BIT, dilated, shifted
+from mapvote.core.types import F32, F64, I32, NO_VOTE, U8, U64, Bool, CellState
+from mapvote.detection.evidence import CROSSED, HIT, PASSED, PASSES, PLANES, count_of
+from mapvote.detection.packed_tiles import Overlap
+
+# Set on corner 1 and 2, street 2 and KITTI 0001 in blocks of 12 and 25 scans: docs/decisions/evidence.md has each.
+HIT_RAYS = 8
+"""Scans that crossed a mapped voxel, against one that hit it."""
+GONE_RAYS = 3
+"""Scans that must have crossed it beyond those: two may be an error of two poses."""
+TOGETHER = 2
+"""Scans whose rays cross it only together count as one of so many."""
+NEW_RAYS = 0.5
+"""Of the scans in which a free voxel was hit, one against two that crossed it."""
+SUPPORT = 6
+"""Voxels that a change must be decided by, over its 8-connected cells: a pole of 1.8 m, or half a square metre."""
+APART_SHARE = 0.25
+"""Of the voxels of what is new, those that must touch nothing that stands."""
+MOVED_CELLS = 3
+"""How far behind what went its new side may lie: .9 m."""
+FALL_CELLS = 8
+"""How far what is gone takes cells with it that no ray could decide: 2.4 m."""
+FIRM_BESIDE = 3
+"""Of the eight cells around one that holds lone points only, how many must go for it to go."""
+_AROUND = np.ones((3, 3))
+_LOW = np.uint64(0b1111)
+"""A column that has one of these voxels begins within 1.2 m of the ground."""
+NOTHING = np.uint64(0)
+
+
+class VoxelFacts(NamedTuple):
+    """What the counts say of each voxel of a window: column words (rows, cols)."""
+
+    gone: U64
+    stands: U64
+    unmet: U64
+    """Mapped, crossed, but neither gone nor ever hit."""
+    new: U64
+    beyond: U64
+    """As new, but the map did not know the voxel to be free."""
+    passed: U64
+    """What any ray passed."""
+    balance: I32
+    """Over a cell's new voxels: in how many scans they were hit, less in how many they were passed."""
+    hits: I32
+    """Over a cell's new voxels: in how many scans they were hit."""
+
+
+class Mapped(NamedTuple):
+    """What the map knows of the same window, (rows, cols)."""
+
+    occupied: U64
+    known_free: U64
+    base: I32
+    height_m: F32
+    """How high its points rise over the ground; not finite where there are none."""
+
+
+class WindowStates(NamedTuple):
+    """What the drive says of each cell, and by which voxels: (rows, cols)."""
+
+    states: U8
+    gone: U64
+    remnants: U64
+    new: U64
+
+
+def no_facts(shape: tuple[int, int]) -> VoxelFacts:
+    """Of a window in which nothing was counted."""
+    gone, stands, unmet, new, beyond, passed = (np.zeros(shape, np.uint64) for _ in range(6))
+    return VoxelFacts(gone, stands, unmet, new, beyond, passed, np.zeros(shape, np.int32), np.zeros(shape, np.int32))
+
+
+@numba.njit(cache=True, nogil=True)
+def times_crossed(cell: U64, bit: int, every: int) -> int:
+    """C of :func:`judge_window` for a mapped voxel of a cell (WORDS,), with ``every`` for TOGETHER."""
+    passes = count_of(cell, PASSES, bit)
+    above = count_of(cell, PASSES, bit + 1) if bit + 1 < TOP_BIT else passes
+    below = count_of(cell, PASSES, bit - 1) if bit > 1 else passes
+    return max(count_of(cell, CROSSED, bit), min(passes, min(above, below)) // every)
+
+
+@numba.njit(cache=True, nogil=True)
+def is_gone(cell: U64, bit: int, every: int) -> bool:
+    """Whether the surface in one mapped voxel of a cell (WORDS,) is gone; ``every`` as in :func:`times_crossed`."""
+    return times_crossed(cell, bit, every) >= GONE_RAYS + HIT_RAYS * count_of(cell, HIT, bit)
+
+
+@numba.njit(cache=True, nogil=True)
+def weigh_voxels(planes: U64, part: Overlap, occupied: U64, known_free: U64, out: VoxelFacts) -> None:
+    """Fill the ``part`` of a window that lies on a tile from its counters (256, 256, WORDS): the first lines of
+    :func:`judge_window`. ``out`` comes empty (:func:`no_facts`)."""
+    for r in range(part.row, part.end_row):
+        for c in range(part.col, part.end_col):
+            cell, mapped = planes[r + part.down, c + part.right], occupied[r, c]
+            out.passed[r, c] = cell[PASSED]
+            asked = mapped
+            for k in range(PLANES):
+                asked |= cell[HIT + k]
+            for bit in range(64 if asked else 0):
+                one = np.uint64(1) << np.uint64(bit)
+                if not asked & one:
+                    continue
+                hit = count_of(cell, HIT, bit)
+                if mapped & one:
+                    if is_gone(cell, bit, TOGETHER):
+                        out.gone[r, c] |= one
+                    elif hit:
+                        out.stands[r, c] |= one
+                    elif times_crossed(cell, bit, TOGETHER):
+                        out.unmet[r, c] |= one
+                elif hit >= 1 + NEW_RAYS * count_of(cell, CROSSED, bit):
+                    if known_free[r, c] & one:
+                        out.new[r, c] |= one
+                        out.balance[r, c] += hit - count_of(cell, PASSES, bit)
+                        out.hits[r, c] += hit
+                    else:
+                        out.beyond[r, c] |= one
+
+
+def judge_window(drive: VoxelFacts, here: Mapped, min_height_m: float) -> WindowStates:
+    """What a drive says of a window.
+
+    Of a voxel, over the drive's scans: h hits, c crossed, p passes (detection/evidence.py); a and b the passes of the
+    voxels above and below it.
+
+        C = max(c, min(p, a, b) / TOGETHER)
+        mapped voxel:  gone if C >= GONE_RAYS + HIT_RAYS h;  else stands if h >= 1
+        free voxel:    new if h >= 1 + NEW_RAYS c
+
+    A cell is empty if a voxel of it is gone and none stands. Of an 8-connected group of empty cells with N gone voxels,
+
+        changed-empty  if N >= SUPPORT, or it is a thing of its own on the ground
+
+    and with it what :func:`_grown`, :func:`_fallen` and :func:`_lone` say. Of an 8-connected group of cells with N new
+    voxels, among them those that were hit beyond what the map knew within MOVED_CELLS of changed-empty,
+
+        changed-occupied  if (N >= SUPPORT, or it is a thing of its own on the ground), sum h >= sum p, and
+                          APART_SHARE N of them touch nothing that stands or it lies within MOVED_CELLS of changed-empty
+
+    What rises less than ``min_height_m`` is never gone.
+    """
+    mapped, nothing = here.occupied != 0, drive.gone | drive.stands == 0
+    high = mapped & (here.height_m >= min_height_m)
+    gone: U64 = np.where(high, drive.gone, NOTHING)
+    beyond: U64 = np.where(mapped, NOTHING, drive.beyond)
+    states = np.full(mapped.shape, NO_VOTE, dtype=np.uint8)
+    states[drive.passed != 0] = CellState.UNCHANGED_EMPTY
+    states[(mapped & (drive.passed != 0)) | (beyond != 0)] = CellState.UNDETERMINED
+    states[drive.stands != 0] = CellState.UNCHANGED_OCCUPIED
+
+    empty = (gone != 0) & (drive.stands == 0)
+    firm = supported(empty, gone) | on_its_own(empty, gone, here.occupied, mapped & ~empty)
+    crossed = high & (drive.stands == 0) & ((drive.gone | drive.unmet) != 0)
+    states[empty] = CellState.UNDETERMINED
+    states[grown(firm, crossed)] = CellState.CHANGED_EMPTY
+    states[fallen(states, high & nothing & _hollow_below(here.occupied, drive.passed), FALL_CELLS)] = (
+        CellState.CHANGED_EMPTY
+    )
+    states[no_change(states, lone_cells(here.occupied, here.base))] = CellState.UNDETERMINED
+    went = states == CellState.CHANGED_EMPTY
+    gone = np.where(went, here.occupied, gone)
+
+    near = ndimage.maximum_filter(went, 2 * MOVED_CELLS + 1, mode="constant")
+    new: U64 = np.bitwise_or(np.where(mapped, NOTHING, drive.new), np.where(near, beyond, NOTHING))
+    cells, stays = new != 0, dilated(drive.stands & ~gone, here.base, 1)
+    firm = supported(cells, new) | on_its_own(cells, new, new, here.occupied & ~gone != 0)
+    states[cells] = CellState.UNDETERMINED
+    states[firm & lasting(cells, drive.balance) & stands_apart(cells, new, stays, near)] = CellState.CHANGED_OCCUPIED
+    return WindowStates(states, gone, np.where(drive.stands != 0, gone, NOTHING), new)
+
+
+def supported(cells: Bool, voxels: U64) -> Bool:
+    """(rows, cols) those of ``cells`` whose 8-connected group has SUPPORT set bits in ``voxels`` (rows, cols)."""
+    return np.asarray(cells & (_over_groups(cells, np.bitwise_count(voxels)) >= SUPPORT))
+
+
+def on_its_own(cells: Bool, voxels: U64, whole: U64, others: Bool) -> Bool:
+    """(rows, cols) those of ``cells`` whose 8-connected group is a thing of its own that stands on the ground, however
+    small: a bollard. It touches none of the ``others``, each of its columns begins near the ground, half of its voxels
+    ``whole`` are in ``voxels`` (all planes (rows, cols)), and two of these lie on top of each other."""
+    size = _over_groups(cells, np.bitwise_count(voxels))
+    tall = _over_groups(cells, voxels & (voxels >> np.uint64(1)) != 0) > 0
+    tied = ndimage.binary_dilation(others, _AROUND) | (whole & _LOW == 0)
+    alone = (_over_groups(cells, tied) == 0) & (2 * size >= _over_groups(cells, np.bitwise_count(whole)))
+    return np.asarray(cells & tall & alone)
+
+
+def stands_apart(cells: Bool, new: U64, near: U64, went: Bool) -> Bool:
+    """(rows, cols) those of ``cells`` whose 8-connected group stands apart from what stands: APART_SHARE of its voxels
+    ``new`` are not ``near`` such (all planes (rows, cols)); else it is the rest of that, seen from where no survey
+    drove. What reaches cells where something ``went`` need not: that is its new side."""
+    size, far = (_over_groups(cells, np.bitwise_count(words)) for words in (new, new & ~near))
+    return np.asarray(cells & ((_over_groups(cells, went) > 0) | (far >= APART_SHARE * size)))
+
+
+def lasting(cells: Bool, balance: I32) -> Bool:
+    """(rows, cols) those of ``cells`` whose 8-connected group was hit in as many scans as passed it, or more: by cell
+    the ``balance`` is of the voxels in question, what they were hit less what they were passed. What drove there was
+    hit once or twice, and passed many times before and after."""
+    return np.asarray(cells & (_over_groups(cells, balance) >= 0))
+
+
+def _over_groups(cells: Bool, amounts: U8 | I32 | Bool) -> F64:
+    """(rows, cols) the sum of ``amounts`` (rows, cols) over the 8-connected group of ``cells`` that a cell is in."""
+    group, count = ndimage.label(cells, structure=_AROUND)
+    return np.asarray(np.bincount(group.ravel(), weights=amounts.ravel(), minlength=count + 1)[group])
+
+
+def grown(strong: Bool, weak: Bool) -> Bool:
+    """(rows, cols) ``strong`` cells, and ``weak`` ones that touch them (8) directly or through each other: hysteresis
+    (Canny 1986). Few rays cross the far wall of what fell, and none of them hit it."""
+    both = strong | weak
+    return np.asarray(both & (_over_groups(both, strong) > 0))
+
+
+def fallen(states: U8, adrift: Bool, reach: int) -> Bool:
+    """(rows, cols) cells that fall: what stood on things that are gone, and no ray could reach, is gone with them.
+
+    The roof of a demolished house, too high for the sensor once nothing is behind it. An ``adrift`` cell goes with the
+    changed-empty or the unchanged-occupied cell that is nearer, so that of two roofs that meet only one falls; a
+    connected group of those that go falls if a changed-empty cell lies within ``reach`` cells of it.
+    """
+    gone, kept = states == CellState.CHANGED_EMPTY, states == CellState.UNCHANGED_OCCUPIED
+    if not (gone.any() and adrift.any()):
+        return np.zeros_like(adrift)
+    to_gone = _steps_to(gone)
+    goes = adrift & (to_gone < _steps_to(kept)) if kept.any() else adrift
+    return grown(goes & (to_gone <= reach), goes)
+
+
+def _steps_to(cells: Bool) -> I32:
+    """(rows, cols) how many steps, diagonal ones too, it is to the nearest of ``cells``; there must be one."""
+    return np.asarray(ndimage.distance_transform_cdt(~cells, metric="chessboard"))
+
+
+def _hollow_below(occupied: U64, passed: U64) -> Bool:
+    """(rows, cols) mapped cells with something under their lowest voxel, half of which or more rays passed."""
+    under = np.where(occupied != 0, (occupied & (~occupied + np.uint64(1))) - np.uint64(1), NOTHING)
+    return np.asarray((under != 0) & (2 * np.bitwise_count(under & passed) >= np.bitwise_count(under)))
+
+
+@numba.njit(cache=True, nogil=True)
+def lone_cells(occupied: U64, base: I32) -> Bool:
+    """(rows, cols) cells of the words ``occupied`` in which no set voxel touches (26) another one, of any cell."""
+    out = np.zeros(occupied.shape, dtype=np.bool_)
+    for r in range(occupied.shape[0]):
+        for c in range(occupied.shape[1]):
+            word, others = occupied[r, c], np.uint64(0)
+            if not word or word & (word << np.uint64(1)):
+                continue
+            for i in range(max(r - 1, 0), min(r + 2, occupied.shape[0])):
+                for j in range(max(c - 1, 0), min(c + 2, occupied.shape[1])):
+                    if (i != r or j != c) and occupied[i, j]:
+                        others |= shifted(occupied[i, j], base[i, j] - base[r, c])
+            others |= others << np.uint64(1) | others >> np.uint64(1)
+            out[r, c] = not word & others
+    return out
+
+
+def no_change(states: U8, lone: Bool) -> Bool:
+    """(rows, cols) those of the ``lone`` cells decided changed-empty around which fewer than FIRM_BESIDE cells are:
+    mixed pixels, and rooms that a pane mirrored. No surface of the world went with them."""
+    gone = states == CellState.CHANGED_EMPTY
+    beside = ndimage.convolve(gone.astype(np.int32), np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]]), mode="constant")
+    return np.asarray(gone & lone & (beside < FIRM_BESIDE))
