@@ -21,7 +21,7 @@ from mapvote.core.types import CellState
 from mapvote.server.http.app import create_app
 from mapvote.server.store import keys, policy
 from mapvote.server.store.admission import accept, examine
-from mapvote.server.store.publish import make_plan
+from mapvote.server.store.round import round_at
 from mapvote.server.store.store import Store
 
 WALL = [(10, 10), (10, 11), (10, 12)]
@@ -98,9 +98,9 @@ def test_a_verdict_alone_makes_its_tile_one_to_decide_again(server: Server) -> N
     first, _ = pending(server)
     seq = decide(server, "anna", first["id"], "held").json()["seq"]
     assert published(server)["tiles"] == ["0,1"]
-    assert [task.window.tile_index for task in make_plan(store).tasks] == [(0, 1)], "what the newest version changed"
+    assert list(round_at(store, store.clock()).decided) == [(0, 1)], "what the newest version changed"
     assert client.delete(f"/v1/desk/reviews/{seq}", headers=who["anna"]).status_code == 200
-    assert [task.window.tile_index for task in make_plan(store).tasks] == [(0, 0), (0, 1)]
+    assert list(round_at(store, store.clock()).decided) == [(0, 0), (0, 1)]
     (again,) = pending(server)
     assert decide(server, "bert", again["id"], "rejected").status_code == 200
     assert published(server)["published"] is False

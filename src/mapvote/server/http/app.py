@@ -28,7 +28,7 @@ from mapvote.server.http.schemas import unreadable
 from mapvote.server.http.services import READING, make_services
 from mapvote.server.http.warming import keep_overview
 from mapvote.server.http.webhook import deliver
-from mapvote.server.store.publish import Gate
+from mapvote.server.store.round import Gate
 from mapvote.server.store.store import Store
 
 

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from concurrent.futures import Executor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from threading import Lock
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -21,14 +23,14 @@ from mapvote.server.insight.geojson import to_geojson
 from mapvote.server.insight.history import tiles_at
 from mapvote.server.insight.picture import before_and_after
 from mapvote.server.insight.waiting import waiting_features
-from mapvote.server.store.policy import current_policy
-from mapvote.server.store.publish import Gate, edited_tile, preview
 from mapvote.server.store.queries import load_tile, tile_of
 from mapvote.server.store.reviews import Review, Verdict, decide, standing
+from mapvote.server.store.round import Gate, Round, edited_tile, reasons_to_hold, round_at
 from mapvote.server.store.store import Store
 from mapvote.server.store.tile_jobs import Fused, unpack_tally_plane
 
 _OF_REVIEW = "verdict."
+_lock = Lock()
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,14 +53,27 @@ class Desk:
     """Tiles as a publish would make them."""
 
 
+_desks: WeakKeyDictionary[Round, Desk] = WeakKeyDictionary()
+"""Of the rounds that are still kept."""
+
+
 def desk(store: Store, executor: Executor | None = None, gate: Gate | None = None) -> Desk:
-    """What a publish would do now, in the words of the list of changes. Nothing is written."""
-    budget = current_policy(store).fuse.false_deletions
-    outcome = preview(store, executor=executor, gate=gate, every=budget < 1.0)
-    tiles = [_before_and_after(store, outcome.version, fused) for fused in outcome.fused if fused.hashes is not None]
-    told = {f.index: _decided(f) for f in outcome.fused if not f.lost}
+    """What a publish would do now, as a list of changes. Nothing is written, and nothing is computed again as long as
+    the round holds."""
+    found = round_at(store, store.clock(), executor=executor, every=True)
+    with _lock:
+        known = _desks.get(found)
+        if known is None:
+            known = _desks[found] = _desk_of(store, found)
+    return replace(known, held=reasons_to_hold(store, found, gate))
+
+
+def _desk_of(store: Store, found: Round) -> Desk:
+    version, budget = found.newest.number, found.asked.settings.false_deletions
+    tiles = [_before_and_after(store, version, fused) for fused in found.changed]
+    told = {f.index: _decided(f) for f in found.changed}
     objects = change_objects(changed_cells(old, new, [told[old.index]]) for old, new in tiles)
-    pending = to_geojson(objects, store.lattice, map_id=store.map_id, from_version=outcome.version)
+    pending = to_geojson(objects, store.lattice, map_id=store.map_id, from_version=version)
     reviews = standing(store)
     cells = {o.id: _cells_of(o) for o in objects}
     for feature in pending["features"]:
@@ -67,8 +82,8 @@ def desk(store: Store, executor: Executor | None = None, gate: Gate | None = Non
     cells |= {f"{_OF_REVIEW}{review.seq}": theirs for review, theirs in reviews}
     left_out = [review for review, _ in reviews if review.verdict != "accepted"]
     edited = {new.index: new for _, new in tiles}
-    waiting = waiting_features(store, outcome.version, outcome.fused, budget)
-    return Desk(outcome.version, list(outcome.held), pending, waiting, left_out, cells, edited)
+    waiting = waiting_features(store, version, [*found.decided.values(), *found.beside.values()], budget)
+    return Desk(version, [], pending, waiting, left_out, cells, edited)
 
 
 def _decided(fused: Fused) -> Decided:

@@ -26,7 +26,7 @@ from mapvote.localisation.map_window import MapWindow
 from mapvote.localisation.ndt import refine, thin_for_levels
 from mapvote.server.insight.changes import changed_cells
 from mapvote.server.store.policy import GatePolicy
-from mapvote.server.store.publish import Gate
+from mapvote.server.store.round import Gate
 
 Verdict = Literal["pass", "hold", "abstain"]
 REACH_M = 50.0

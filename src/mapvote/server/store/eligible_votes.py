@@ -163,6 +163,17 @@ def electorate_now(
     return Electorate(mark, policy, received_by_ns, set_aside=ballots_aside(connection))
 
 
+def next_ripe_ns(connection: sa.Connection, asked: Electorate) -> int | None:
+    """When the next standing ballot reaches the policy's minimum age; None if there is no such age, or none waits."""
+    age_ns = round(asked.settings.min_age_s * 1e9)
+    if age_ns == 0:
+        return None
+    received = _B.c.received_ns
+    young = sa.select(sa.func.min(received)).where(received > asked.received_by_ns, _stands_at(asked.mark))
+    first = connection.execute(young).scalar_one()
+    return None if first is None else int(first) + age_ns
+
+
 def _unready(vote: StoredVote, index: TileIndex, asked: Electorate) -> str:
     cast = asked.policy.round
     if asked.set_aside and not {str(vote.seq), ballot_name(vote.seq, *index)}.isdisjoint(asked.set_aside):

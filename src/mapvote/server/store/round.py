@@ -1,0 +1,192 @@
+"""What a publish would do now. It is decided once: desk, dry run, picture, review and publish share one :class:`Round`.
+
+A round follows from the newest version, the ballots, the reviews, the policy and one reading of the clock. It holds
+until an event comes that can change it or, with a minimum age, until the next vote is old enough.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass, field, replace
+from threading import Lock
+from weakref import WeakKeyDictionary
+
+import sqlalchemy as sa
+
+from mapvote.config import FuseSettings
+from mapvote.core.grid import TileIndex
+from mapvote.core.lazy_tiles import with_changed
+from mapvote.core.point_map import PointMap
+from mapvote.core.tile import Tile
+from mapvote.server.store import schema
+from mapvote.server.store.blobs import unpack_free_plane, unpack_ground_plane, unpack_points_plane
+from mapvote.server.store.database import address_of
+from mapvote.server.store.eligible_votes import Electorate, electorate_now, next_ripe_ns, standing_tiles
+from mapvote.server.store.hold import hold_reasons
+from mapvote.server.store.policy import GatePolicy
+from mapvote.server.store.quarantine import tiles_hurt_or_mended
+from mapvote.server.store.queries import Version, current_version, tiles_of, tiles_set_by
+from mapvote.server.store.store import Store
+from mapvote.server.store.tile_jobs import Fused, Task, fuse_round
+
+Gate = Callable[[GatePolicy, PointMap, PointMap], Sequence[str]]
+"""Compares (old map, new map) as the policy asks. Returns the reasons to hold the new one; none lets it through."""
+_WITHOUT_EFFECT = "held back", "copy", "key issued"
+"""Kinds of events that change no round."""
+
+
+@dataclass(frozen=True, slots=True, eq=False, weakref_slot=True)
+class Round:
+    """What every tile comes to, as of one event."""
+
+    newest: Version
+    asked: Electorate
+    seq: int
+    """The last event that can have an effect."""
+    until_ns: int | None
+    """When the next vote reaches the minimum age; None: votes need none, or all have it."""
+    decided: Mapping[TileIndex, Fused]
+    """Tiles that may differ from what they were when they were last fused: a publish decides these."""
+    beside: Mapping[TileIndex, Fused]
+    """All other tiles with votes, for what waits there; none unless they were asked for."""
+    every: bool
+    """Whether ``beside`` was asked for."""
+
+    @property
+    def changed(self) -> list[Fused]:
+        """Tiles that a publish would change."""
+        return [fused for fused in self.decided.values() if fused.hashes is not None]
+
+
+@dataclass(slots=True)
+class _Latest:
+    """The latest round of one store, and what its gate said."""
+
+    deciding: Lock = field(default_factory=Lock)
+    judging: Lock = field(default_factory=Lock)
+    round: Round | None = None
+    judged: tuple[Round, Sequence[str]] | None = None
+
+
+_latest: WeakKeyDictionary[Store, _Latest] = WeakKeyDictionary()
+_lock = Lock()
+
+
+def _latest_of(store: Store) -> _Latest:
+    with _lock:
+        return _latest.setdefault(store, _Latest())
+
+
+def round_at(
+    store: Store, now: int, settings: FuseSettings | None = None, executor: Executor | None = None, every: bool = False
+) -> Round:
+    """The round as of ``now``, by the store's clock. Of many threads that ask, one decides it.
+
+    ``settings`` take the place of the policy's ``fuse``, in simulations; such a round is not kept. ``every``: fuse all
+    tiles with votes, for what waits there.
+    """
+    if settings is not None:
+        return _decide(store, now, settings, executor, every, None)
+    latest = _latest_of(store)
+    with latest.deciding:
+        known = latest.round
+        with store.database.reading() as connection:
+            seq = _last_event(connection)
+        holds = known is not None and known.seq == seq and (known.until_ns is None or now < known.until_ns)
+        if known is None or not holds or (every and not known.every):
+            known = latest.round = _decide(store, now, None, executor, every, known)
+        return known
+
+
+def _decide(
+    store: Store, now: int, settings: FuseSettings | None, executor: Executor | None, every: bool, last: Round | None
+) -> Round:
+    """Fuse every tile that the ``last`` round does not answer."""
+    with store.database.reading() as connection:
+        newest, seq = current_version(connection), _last_event(connection)
+        mark = connection.execute(sa.select(sa.func.max(schema.events.c.seq))).scalar_one()
+        asked = electorate_now(connection, now, mark, settings)
+        dirty = _dirty(connection, newest, asked)
+        wanted = (
+            sorted({*dirty, *standing_tiles(connection, mark)})
+            if every and asked.settings.false_deletions < 1.0
+            else dirty
+        )
+        found = _still_true(connection, last, newest, asked)
+        missing = [index for index in wanted if index not in found]
+        hashes = tiles_of(connection, newest.number, missing)
+        until = next_ripe_ns(connection, asked)
+    made, url = newest.number + 1, address_of(store.database.url)
+    tasks = [Task(url, store.lattice.tile(i), made, hashes.get(i), asked) for i in missing]
+    found |= {fused.index: fused for fused in fuse_round(tasks, store.database, executor)}
+    decided = {index: found[index] for index in dirty}
+    beside = {index: found[index] for index in wanted if index not in decided}
+    return Round(newest, asked, seq, until, decided, beside, every)
+
+
+def _last_event(connection: sa.Connection) -> int:
+    """The last event that can change a round."""
+    e = schema.events.c
+    last = sa.select(e.seq).where(e.kind.not_in(_WITHOUT_EFFECT)).order_by(e.seq.desc()).limit(1)
+    return int(connection.execute(last).scalar_one())
+
+
+def _dirty(connection: sa.Connection, newest: Version, asked: Electorate) -> list[TileIndex]:
+    """Tiles that may come to something else than when they were last fused.
+
+    Where the newest version changed something, votes are spent that decided together with others. With another policy,
+    or after a version that was not fused, every tile may differ; with a minimum age votes ripen without any event.
+    """
+    policy = asked.policy
+    fused = newest.kind == "publish" and newest.policy == policy.model_dump(mode="json")
+    if not fused or policy.fuse.min_age_s > 0:
+        return standing_tiles(connection, asked.mark)
+    return sorted({*_touched(connection, asked.mark, newest.mark), *tiles_set_by(connection, newest.number)})
+
+
+def _touched(connection: sa.Connection, mark: int, since: int) -> set[TileIndex]:
+    """Tiles on which votes, reviews or damage came or went after the event ``since``."""
+    return {*standing_tiles(connection, mark, since), *tiles_hurt_or_mended(connection, since)}
+
+
+def _still_true(
+    connection: sa.Connection, last: Round | None, newest: Version, asked: Electorate
+) -> dict[TileIndex, Fused]:
+    """The tiles of the last round on which nothing has changed since."""
+    if last is None or last.newest.number != newest.number or last.asked.policy != asked.policy:
+        return {}
+    if asked.policy.fuse.min_age_s > 0:
+        return {}
+    touched = _touched(connection, asked.mark, last.asked.mark)
+    return {index: fused for index, fused in {**last.decided, **last.beside}.items() if index not in touched}
+
+
+def reasons_to_hold(store: Store, found: Round, gate: Gate | None) -> list[str]:
+    """The reasons of the policy, and of its gate, against the version that a round would make."""
+    changed, asked = found.changed, found.asked.policy.gate
+    held = hold_reasons(changed, found.asked.settings)
+    if gate is None or not asked.drive or not changed:
+        return held
+    latest = _latest_of(store)
+    with latest.judging:
+        if latest.judged is None or latest.judged[0] is not found:
+            old = store.point_map(found.newest.number)
+            edited = {
+                f.index: edited_tile(f, old.tiles.get(f.index) or Tile.empty(store.lattice.tile(f.index)))
+                for f in changed
+            }
+            latest.judged = found, gate(asked, old, replace(old, tiles=with_changed(old.tiles, edited)))
+        return [*held, *latest.judged[1]]
+
+
+def edited_tile(fused: Fused, before: Tile) -> Tile:
+    """The tile that was ``before`` as the round would make it: the planes that change are in ``fused``."""
+    hashes, planes = fused.hashes, fused.planes
+    assert hashes is not None
+    ground, free = before.ground_z, before.free
+    if hashes.ground in planes:
+        ground = unpack_ground_plane(planes[hashes.ground], hashes.ground)
+    if hashes.free is not None and hashes.free in planes:
+        free = unpack_free_plane(planes[hashes.free], hashes.free)
+    return Tile(before.window, unpack_points_plane(planes[hashes.points], hashes.points), ground, free)
