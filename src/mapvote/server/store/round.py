@@ -42,8 +42,6 @@ class Round:
 
     newest: Version
     asked: Electorate
-    seq: int
-    """The last event that can have an effect."""
     until_ns: int | None
     """When the next vote reaches the minimum age; None: votes need none, or all have it."""
     decided: Mapping[TileIndex, Fused]
@@ -91,10 +89,7 @@ def round_at(
     latest = _latest_of(store)
     with latest.deciding:
         known = latest.round
-        with store.database.reading() as connection:
-            seq = _last_event(connection)
-        holds = known is not None and known.seq == seq and (known.until_ns is None or now < known.until_ns)
-        if known is None or not holds or (every and not known.every):
+        if known is None or not _holds(store, known, now) or (every and not known.every):
             known = latest.round = _decide(store, now, None, executor, every, known)
         return known
 
@@ -104,7 +99,7 @@ def _decide(
 ) -> Round:
     """Fuse every tile that the ``last`` round does not answer."""
     with store.database.reading() as connection:
-        newest, seq = current_version(connection), _last_event(connection)
+        newest = current_version(connection)
         mark = connection.execute(sa.select(sa.func.max(schema.events.c.seq))).scalar_one()
         asked = electorate_now(connection, now, mark, settings)
         dirty = _dirty(connection, newest, asked)
@@ -122,14 +117,17 @@ def _decide(
     found |= {fused.index: fused for fused in fuse_round(tasks, store.database, executor)}
     decided = {index: found[index] for index in dirty}
     beside = {index: found[index] for index in wanted if index not in decided}
-    return Round(newest, asked, seq, until, decided, beside, every)
+    return Round(newest, asked, until, decided, beside, every)
 
 
-def _last_event(connection: sa.Connection) -> int:
-    """The last event that can change a round."""
+def _holds(store: Store, known: Round, now: int) -> bool:
+    """Whether no event that can change the round has come since, and no vote has reached the minimum age."""
+    if known.until_ns is not None and now >= known.until_ns:
+        return False
     e = schema.events.c
-    last = sa.select(e.seq).where(e.kind.not_in(_WITHOUT_EFFECT)).order_by(e.seq.desc()).limit(1)
-    return int(connection.execute(last).scalar_one())
+    came = sa.select(e.seq).where(e.seq > known.asked.mark, e.kind.not_in(_WITHOUT_EFFECT)).limit(1)
+    with store.database.reading() as connection:
+        return connection.execute(came).first() is None
 
 
 def _dirty(connection: sa.Connection, newest: Version, asked: Electorate) -> list[TileIndex]:
