@@ -13,7 +13,7 @@ from mapvote.server.store.tile_jobs import Watched
 
 
 @dataclass(slots=True)
-class Round:
+class Progress:
     """One publish, or one look at what it would do."""
 
     by: str
@@ -34,13 +34,13 @@ class Round:
 class Publishing:
     """All rounds under way in this server; thread-safe."""
 
-    _rounds: list[Round] = field(default_factory=list)
+    _rounds: list[Progress] = field(default_factory=list)
     _lock: Lock = field(default_factory=Lock)
 
     @contextmanager
     def watched(self, executor: Executor, by: str, dry_run: bool) -> Iterator[Executor]:
         """An executor for one round, which can be seen and cancelled as long as it lasts."""
-        mine = Round(by, dry_run)
+        mine = Progress(by, dry_run)
         with self._lock:
             self._rounds.append(mine)
         try:
@@ -49,7 +49,7 @@ class Publishing:
             with self._lock:
                 self._rounds.remove(mine)
 
-    def now(self) -> list[Round]:
+    def now(self) -> list[Progress]:
         """The rounds under way, oldest first."""
         with self._lock:
             return list(self._rounds)
