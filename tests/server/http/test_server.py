@@ -177,7 +177,8 @@ def test_a_revoked_key_stops_working_at_once(site: Site) -> None:
     issued = subprocess.run(mapvote("keys", site.store, "issue", "c"), capture_output=True, text=True, check=True)
     key = issued.stdout.strip()
     assert site.ask("GET", "/v1/map", key).status_code == 200
-    ballots = [encode(says(two_walls(), "c", drive, CellState.UNCHANGED_OCCUPIED)) for drive in ("d1", "d2")]
+    newest = replace(two_walls(), version=site.ask("GET", "/v1/map", key).json()["version"])
+    ballots = [encode(says(newest, "c", drive, CellState.UNCHANGED_OCCUPIED)) for drive in ("d1", "d2")]
     assert site.ask("PUT", "/v1/ballots/c/d1", key, content=ballots[0]).status_code == 201
     subprocess.run(mapvote("keys", site.store, "revoke", "c"), capture_output=True, check=True)
     assert site.ask("PUT", "/v1/ballots/c/d2", key, content=ballots[1]).status_code == 401
@@ -185,7 +186,8 @@ def test_a_revoked_key_stops_working_at_once(site: Site) -> None:
 
 
 def test_an_unsent_ballot_waits_in_the_spool(site: Site, tmp_path: Path) -> None:
-    ballot = says(two_walls(), "a", "spooled", CellState.UNCHANGED_OCCUPIED)
+    newest = replace(two_walls(), version=site.ask("GET", "/v1/map", site.a).json()["version"])
+    ballot = says(newest, "a", "spooled", CellState.UNCHANGED_OCCUPIED)
     shut_out = MapClient(site.url, key="of nobody", home=tmp_path)
     with shut_out, pytest.raises(MapvoteError, match=r"refused \(401\).*the ballot waits in"):
         shut_out.send(ballot)
