@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from mapvote.config import Settings
-from mapvote.core.geometry import exp, inverse, rotation_angle
+from mapvote.core.geometry import exp, from_xyz_rpy, inverse, rotation_angle
 from mapvote.core.point_map import all_points, map_from_points
 from mapvote.core.reference import reference_window
 from mapvote.core.sensors import SENSORS
@@ -218,3 +218,24 @@ def test_ground_that_the_path_contradicts_is_refused_with_the_place() -> None:
     with pytest.raises(MapvoteError, match=r"disagree by more than 0.3 m along 42.9% of the path, most by 2.00 m at"):
         _agreed_heights(drive, flat, path)
     assert _agreed_heights(drive, flat, path[:32]).complaint == ""
+
+
+@pytest.mark.slow
+def test_an_ordinary_prior_that_is_tilted_leaves_path_and_ground_in_agreement(tmp_path: Path) -> None:
+    """The first pass of 200 m drifts in height by some tenths of a metre against such priors."""
+    overrides = {
+        "length_m": 200.0,
+        "vehicles": 1,
+        "surveys": ["east inner"],
+        "changes": [],
+        "clutter": {"gantry_m": []},
+    }
+    simulate("street", tmp_path / "street", seed=5, overrides=overrides)
+    drive = open_drive(tmp_path / "street" / "survey_1")
+    assert drive.T_map_lidar_prior is not None
+    pitched = drive.T_map_lidar_prior @ from_xyz_rpy(0.0, 0.0, 0.0, 0.0, np.radians(0.6), 0.0)
+    _, report = build_map([replace(drive, T_map_lidar_prior=pitched, prior_sigma_m=1.0, prior_sigma_deg=1.0)])
+    [track] = report.tracks
+    assert report.bent_m > 0.3
+    assert track.heights.median_m == pytest.approx(1.9, abs=0.03)
+    assert abs(track.heights.worst_off_m) < 0.08

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from mapvote.core.geometry import from_xyz_rpy
 from mapvote.core.types import F64
 from mapvote.slam.road import road_under
 from mapvote.slam.settle import carried_along
-from mapvote.slam.surveyor import Surveyed
+from mapvote.slam.surveyor import Surveyed, is_precise
+from streets import drive_along, path
 
 SENSOR_M = 1.8
 
@@ -56,3 +58,13 @@ def test_a_survey_without_priors_stays_where_it_is_to_the_last_bit() -> None:
     poses = climbing(30, 0.7)
     cloud = road_of(poses, 4)
     assert carried_along(cloud, [surveyed(poses)], [poses]).tobytes() == cloud.tobytes()
+
+
+@pytest.mark.parametrize(
+    ("sigma_m", "sigma_deg", "precise"), [(0.02, 0.05, True), (0.02, 1.0, False), (1.0, 0.05, False)]
+)
+def test_only_a_prior_that_knows_place_and_attitude_guides_registration(
+    sigma_m: float, sigma_deg: float, precise: bool
+) -> None:
+    poses = path(2)
+    assert is_precise(drive_along(poses, 1, poses, sigma_m=sigma_m, sigma_deg=sigma_deg)) is precise

@@ -23,8 +23,9 @@ from mapvote.localisation.ndt import LEVELS, NdtMap, PosePrior, in_rows, refine
 from mapvote.localisation.tracker import ACCELERATION_MPS2, Fix, Tracker
 from mapvote.slam.frame import fit_to_priors
 
-PRECISE_PRIOR_M = 0.1
-"""A prior at least this good is a surveyor's, and holds the map's frame."""
+PRECISE_PRIOR_M, PRECISE_PRIOR_DEG = 0.1, 0.2
+"""A prior at least this good, in both, is a surveyor's: it guides each registration and holds the map's frame. A place
+to 2 cm without an attitude would turn scans to where they meet it: .4 deg, .1 m at 10 m."""
 _MIN_INLIER_SHARE = 0.4
 """As the setting of ndt, while the map is still growing: half of a scan may look at what nobody has seen yet."""
 _POINTS_M = 0.3
@@ -53,7 +54,8 @@ class Surveyed:
 
 def is_precise(drive: Drive) -> bool:
     """Whether a drive's prior is a surveyor's."""
-    return drive.T_map_lidar_prior is not None and drive.prior_sigma_m <= PRECISE_PRIOR_M
+    good = drive.prior_sigma_m <= PRECISE_PRIOR_M and drive.prior_sigma_deg <= PRECISE_PRIOR_DEG
+    return drive.T_map_lidar_prior is not None and good
 
 
 class Surveyor:
