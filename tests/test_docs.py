@@ -7,6 +7,9 @@ from pathlib import Path
 
 import pytest
 
+from mapvote.core.types import MapvoteError
+from mapvote.formats import export_map, read_map, registry
+
 ROOT = Path(__file__).parents[1]
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
 SOURCES = sorted([*(ROOT / "src").rglob("*.py"), *(ROOT / "src").rglob("*.js")])
@@ -38,3 +41,19 @@ def test_no_source_refers_to_a_document_that_is_not_here() -> None:
     for file in SOURCES:
         for link in re.findall(r"docs/[\w/]+\.md", file.read_text()):
             assert (ROOT / link).exists(), f"{file.relative_to(ROOT)} points at {link}"
+
+
+def test_the_map_format_of_the_documents_is_read_and_written(tmp_path: Path) -> None:
+    """The example is run as it stands."""
+    (example,) = re.findall(r"^```python\n(.*?MAPS\[.*?)^```", (ROOT / "docs/extending.md").read_text(), re.M | re.S)
+    exec(example, {})
+    try:
+        source, again = tmp_path / "a.xyz", tmp_path / "b.xyz"
+        source.write_text("".join(f"{x} {y} 0.0\n" for x in range(20) for y in range(20)))
+        export_map(read_map(source), again)
+        assert read_map(again).n_points == 400
+        source.write_text("one two three\n")
+        with pytest.raises(MapvoteError, match="no lines of three numbers"):
+            read_map(source)
+    finally:
+        del registry.WRITERS[".xyz"], registry.MAPS["XYZ file"]

@@ -16,7 +16,7 @@ from live_server import serving
 from mapvote.cli import app
 from mapvote.codec.ballot import encode
 from mapvote.config import FuseSettings
-from mapvote.core.types import CellState
+from mapvote.core.types import CellState, MapvoteError
 from mapvote.server.store import schema
 from mapvote.server.store.admission import accept, examine
 from mapvote.server.store.policy import Policy
@@ -66,6 +66,7 @@ def test_a_server_is_looked_at_run_and_exported_like_its_store(site: tuple[str, 
     assert "spent: version 2 has changed the cell since" in told
     assert "every plane, ballot and version is what it was" in both(site, "check")
     assert re.search(r"ballots +│ 2 ", both(site, "info"))
+    assert "Compared where others agree" in both(site, "vehicles")
     found = json.loads(both(site, "changes", "--metres"))
     assert [f["properties"]["kind"] for f in found["features"]] == ["demolished"]
     pages = [tmp_path / "store.html", tmp_path / "server.html"]
@@ -92,6 +93,48 @@ def test_only_tiles_that_changed_since_a_version_are_written(site: tuple[str, st
     )
     assert delta == new - old
     assert len(delta) == 1
+
+
+def test_a_server_rolls_back_and_withdraws_a_drive(tmp_path: Path) -> None:
+    point_map = make_map({(0, 0): make_tile(wall(WALL, [0.05, 0.45]))})
+    store = Store.create(f"sqlite:///{tmp_path / 's.db'}", point_map)
+    gone = Say(states_plane(dict.fromkeys(WALL, CellState.CHANGED_EMPTY)))
+    accept(store, [examine(encode(make_ballot(point_map, {(0, 0): gone}, name, "d"))) for name in ("a", "b")])
+    store.close()
+    with serving(tmp_path / "s.db", log=tmp_path / "log") as (url, _):
+        assert "version 2 (published)" in say("publish", url, "--override")
+        assert "version 3 is version 1 again" in say("rollback", url, 1, "--reason", "wrong")
+        assert "1 ballots of a withdrawn" in say("unvote", url, "a", "--drive", "d")
+
+
+@pytest.mark.parametrize("verb", [["gc"], ["keys"], ["upgrade"], ["serve"]])
+def test_a_verb_for_the_stores_own_machine_refuses_an_address(verb: list[str]) -> None:
+    result = CliRunner().invoke(app, [*verb, "http://localhost:1"])
+    assert isinstance(result.exception, MapvoteError)
+    assert "on the server's machine" in str(result.exception)
+
+
+@pytest.mark.parametrize("verb", [["serve", "--port", "0", "--open"], ["publish", "--dry-run"]])
+def test_settings_that_a_stores_policy_overrules_are_refused(
+    verb: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    Store.create(f"sqlite:///{tmp_path / 's.db'}", make_map({(0, 0): make_tile(wall(WALL, [0.05]))})).close()
+    (tmp_path / "c.toml").write_text("[fuse]\nmin_votes = 3\n")
+    told = [CliRunner().invoke(app, [verb[0], str(tmp_path / "s.db"), *verb[1:], "--config", str(tmp_path / "c.toml")])]
+    monkeypatch.setenv("MAPVOTE_FUSE__MIN_VOTES", "3")
+    told.append(CliRunner().invoke(app, [verb[0], str(tmp_path / "s.db"), *verb[1:]]))
+    for result in told:
+        assert isinstance(result.exception, MapvoteError), result.output
+        assert "fuse.min_votes has no effect" in str(result.exception)
+        assert "mapvote policy" in str(result.exception)
+
+
+def test_a_copy_of_a_running_store_without_its_wal_says_so(tmp_path: Path) -> None:
+    store = Store.create(f"sqlite:///{tmp_path / 's.db'}", make_map({(0, 0): make_tile(wall(WALL, [0.05]))}))
+    (tmp_path / "copy.db").write_bytes((tmp_path / "s.db").read_bytes())
+    store.close()
+    result = CliRunner().invoke(app, ["info", str(tmp_path / "copy.db")])
+    assert "its -wal file is missing" in str(result.exception)
 
 
 def test_a_server_sets_aside_what_is_damaged(site: tuple[str, str]) -> None:

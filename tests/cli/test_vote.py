@@ -45,6 +45,10 @@ def test_a_ballot_goes_to_the_server_whose_map_it_was_cast_on(tmp_path: Path, mo
     with running_server(tmp_path / "store.db", tmp_path / "map", tmp_path / "log") as url:
         said = vote(recorded, "--map", url, "--send", url)
         again = vote(recorded, "--map", url, "--send", url)
+    monkeypatch.setattr("time.sleep", lambda seconds: None)
+    away = vote(recorded, "--map", url, "--send", url, "--vehicle", "v2")
+    assert "Version 1 is kept here and used" in away
+    assert f"{url} is away: the ballot waits" in away
     assert "20 of 20 scans localised" in said
     assert f"{url}: " in said
     assert f"{url}: " in again  # the same drive twice is harmless

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from mapvote.cli.options import SERVER, KeyFile, StoreName, StoreOrUrl
+from mapvote.cli.options import SERVER, KeyFile, StoreOrUrl
 from mapvote.cli.remote import is_url, server_at
 from mapvote.cli.store import opened_store, when
 from mapvote.cli.terminal import print_table, waiting
@@ -79,20 +79,26 @@ def explain(
     print_table(("vehicle", "drive", "ended", "drove with", "says", "sure", "heard in", "now"), rows)
 
 
-def vehicles(store: StoreName) -> None:
+def vehicles(store: StoreOrUrl, key_file: KeyFile = None) -> None:
     """Which vehicles contradict the others far more than chance, and where.
 
     mapvote vehicles fleet.db
     """
+    from dataclasses import asdict
+
     from mapvote.server.insight.history import vehicle_standings
 
-    with opened_store(store) as opened, waiting("comparing votes"):
-        found = vehicle_standings(opened)
+    if is_url(store):
+        with server_at(store, key_file) as server, waiting("comparing votes"):
+            found = server.ask_json("GET", "/v1/vehicles")["vehicles"]
+    else:
+        with opened_store(store) as opened, waiting("comparing votes"):
+            found = [asdict(standing) for standing in vehicle_standings(opened)]
     rows = []
     for s in found:
-        places = "; ".join(f"{e.says} at {e.x:.1f}, {e.y:.1f} ({e.cells} cells)" for e in s.evidence[:3])
-        counts = str(s.cells), str(s.objects), str(s.others_objects), f"{s.p_value:.2g}"
-        rows.append((s.vehicle, s.verdict, *counts, places))
+        places = "; ".join(f"{e['says']} at {e['x']:.1f}, {e['y']:.1f} ({e['cells']} cells)" for e in s["evidence"][:3])
+        counts = str(s["cells"]), str(s["objects"]), str(s["others_objects"]), f"{s['p_value']:.2g}"
+        rows.append((s["vehicle"], s["verdict"], *counts, places))
     print_table(("vehicle", "verdict", "cells compared", "contradictions", "of the others", "p", "the largest"), rows)
     print(
         "Compared where others agree both before and after a vehicle passed; the first and the last cannot be judged."

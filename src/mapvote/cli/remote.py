@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -58,15 +59,29 @@ def client_of(url: str, key: str | None) -> MapClient:
 
 @contextmanager
 def map_at(
-    name: str, key_file: Path | None, version: int | None = None, region: Region | None = None
+    name: str,
+    key_file: Path | None,
+    version: int | None = None,
+    region: Region | None = None,
+    *,
+    or_kept: bool = False,
 ) -> Iterator[PointMap]:
     """The newest map of a store or a server, or one version of it; or a map in any file format. Of a map larger than
-    memory tiles are read as long as this is open. ``region``: only the tiles of a server's that meet it."""
+    memory tiles are read as long as this is open. ``region``: only the tiles of a server's map that touch it.
+    ``or_kept``: if the server is away, the map that was fetched last, and a warning."""
+    from mapvote.client import Unreachable
     from mapvote.core.types import MapvoteError
 
     if is_url(name):
         with client_of(name, key_in(key_file)) as client:
-            yield client.fetch(version, region=region)
+            try:
+                point_map = client.fetch(version, region=region)
+            except Unreachable as error:
+                if not or_kept:
+                    raise
+                point_map = client.fetch_kept(region)
+                print(f"warning: {error}. Version {point_map.version} is kept here and used", file=sys.stderr)
+            yield point_map
         return
     if region is not None:
         raise MapvoteError(f"{name}: only a server sends a part of its map; leave out --region")

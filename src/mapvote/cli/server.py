@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -39,19 +39,20 @@ def serve(
 
     mapvote serve fleet.db --map my_map
     """
-    from mapvote.config import load_settings
+    from mapvote.config import load_with_sources
     from mapvote.server.http.serve import log_as_json, open_or_create
     from mapvote.server.http.serve import serve as run
     from mapvote.server.store.keys import issue
     from mapvote.server.store.policy import Policy
 
-    settings = load_settings(config)
-    log_as_json()
+    settings, sources = load_with_sources(config)
+    first = Policy.of(settings) if config is not None or _of_policy(sources) else None
     with waiting(f"opening {store}"):
-        opened, new = open_or_create(
-            store_url(store), map_path, None if config is None else Policy.of(settings), read=sound_map
-        )
+        opened, new = open_or_create(store_url(store), map_path, first, read=sound_map)
     try:
+        if not new:
+            _refuse_policy(sources)
+        log_as_json()
         if new and not open_:
             print(
                 f"key of the operator, shown this once: {issue(opened, 'operator', 'operator', by=who())}", flush=True
@@ -59,6 +60,19 @@ def serve(
         run(opened, settings, host=host, port=port, opened=open_, ready=_say_where)
     finally:
         opened.close()
+
+
+def _of_policy(sources: Mapping[str, str]) -> list[str]:
+    """Settings that a store takes as its policy when it is created, and never again."""
+    return [name for name in sources if name.partition(".")[0] in ("fuse", "gate", "voting")]
+
+
+def _refuse_policy(sources: Mapping[str, str]) -> None:
+    from mapvote.core.types import MapvoteError
+
+    for name in _of_policy(sources):
+        mend = "leave the setting out; `mapvote policy STORE` shows and changes the policy"
+        raise MapvoteError(f"{sources[name]}: {name} has no effect, because an existing store has its policy: {mend}")
 
 
 def _say_where(url: str) -> None:
@@ -82,7 +96,7 @@ def publish(
     """
     from concurrent.futures import ThreadPoolExecutor
 
-    from mapvote.config import load_settings
+    from mapvote.config import load_with_sources
     from mapvote.core.types import MapvoteError
     from mapvote.server.insight.localisation_gate import gate_by
     from mapvote.server.store.publish import preview
@@ -99,7 +113,9 @@ def publish(
             told["version"], _what(told["published"], dry_run), added, deleted, "; ".join(told["tiles"]), told["held"]
         )
         return
-    reference = gate_by(load_settings(config).ndt)
+    settings, sources = load_with_sources(config)
+    _refuse_policy(sources)
+    reference = gate_by(settings.ndt)
     workers = dask_cluster(cluster) if cluster else ThreadPoolExecutor(2)
     with opened_store(store) as opened, workers as executor, waiting("deciding"):
         if dry_run:
@@ -148,9 +164,10 @@ def policy(
 
 
 def rollback(
-    store: StoreName,
+    store: StoreOrUrl,
     to: Annotated[int, typer.Argument(metavar="VERSION", help="the version that shall be the map again")],
     reason: Reason = "",
+    key_file: KeyFile = None,
 ) -> None:
     """Publish an older version again, and bar the votes that led away from it.
 
@@ -158,18 +175,23 @@ def rollback(
     """
     from mapvote.server.store.publish import rollback as roll_back
 
-    with opened_store(store) as opened:
-        version = roll_back(opened, to, by=who(), reason=reason)
-    print(f"version {version.number} is version {to} again")
+    if is_url(store):
+        with server_at(store, key_file) as server:
+            number = server.ask_json("POST", "/v1/rollback", json={"to": to, "reason": reason})["version"]
+    else:
+        with opened_store(store) as opened:
+            number = roll_back(opened, to, by=who(), reason=reason).number
+    print(f"version {number} is version {to} again")
 
 
 def unvote(
-    store: StoreName,
+    store: StoreOrUrl,
     vehicle: Annotated[str | None, typer.Argument(metavar="[VEHICLE]", help="whose votes go")] = None,
     everybody: Annotated[bool, typer.Option("--all", help="every vehicle's: begins a new round")] = False,
     drive: Annotated[str | None, typer.Option(metavar="NAME", help="only this drive; else all of them")] = None,
     replay: Annotated[bool, typer.Option("--replay", help="also out of what is published, in a new version")] = False,
     yes: Annotated[bool, typer.Option("--yes", help="with --replay: publish; else only show the difference")] = False,
+    key_file: KeyFile = None,
 ) -> None:
     """Withdraw a vehicle's votes, from what is to come or (--replay) from every version.
 
@@ -183,6 +205,15 @@ def unvote(
         raise MapvoteError("unvote: say whose votes go: a VEHICLE, or --all")
     if replay and (vehicle is None or drive is not None):
         raise MapvoteError("unvote: --replay takes out one whole vehicle; leave out --drive and --all")
+    if is_url(store):
+        if vehicle is None or drive is None:
+            raise MapvoteError(
+                f"unvote: {store} withdraws one drive: name VEHICLE and --drive, or run this on the STORE"
+            )
+        with server_at(store, key_file) as server:
+            count = server.ask_json("DELETE", f"/v1/ballots/{vehicle}/{drive}")["withdrawn"]
+        print(f"{count} ballots of {vehicle} withdrawn")
+        return
     with opened_store(store) as opened:
         if not replay or vehicle is None:
             whose = vehicle or "all vehicles"

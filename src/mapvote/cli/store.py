@@ -172,6 +172,8 @@ def store_url(name: str) -> str:
     given = os.environ.get("MAPVOTE_STORE", "") if name == "-" else name
     if not given:
         raise MapvoteError("STORE is -, but MAPVOTE_STORE is not set")
+    if given.startswith(("http://", "https://")):
+        raise MapvoteError(f"{given}: this is a server. Name the STORE (a file or a database) on the server's machine")
     try:
         password = make_url(url_of(given)).password
     except ArgumentError:

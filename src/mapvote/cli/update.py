@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from mapvote.cli.looks import sound_map
-from mapvote.cli.options import MAP, FalseDeletions, MapPath, MinVotes
+from mapvote.cli.options import MAP, Config, FalseDeletions, MapPath, MinVotes
 from mapvote.cli.terminal import print_table, waiting
 
 if TYPE_CHECKING:
@@ -33,6 +33,7 @@ def update(
     cells: Annotated[Path | None, typer.Option(metavar="NPZ", help="also write the decided states of cells")] = None,
     min_votes: MinVotes = None,
     false_deletions: FalseDeletions = None,
+    config: Config = None,
 ) -> None:
     """Fuse ballots offline and edit the map: add, delete, keep.
 
@@ -43,7 +44,7 @@ def update(
         mapvote update my_map car_1.ballot car_2.ballot --out my_map_updated
     """
     from mapvote.codec.ballot import decode
-    from mapvote.config import FuseSettings
+    from mapvote.config import load_with_sources
     from mapvote.core.types import MapvoteError
     from mapvote.formats import write_map
     from mapvote.fusion.fuse import states_over
@@ -61,8 +62,9 @@ def update(
             raise MapvoteError(f"{file}: {error}") from error
     if false_deletions is not None and not 0.0 < false_deletions <= 1.0:
         raise MapvoteError(f"--false-deletions {false_deletions:g}: give a probability above 0, such as 0.01; 1: none")
-    settings = FuseSettings()
-    paper = bool(ballots) and ballots[0].method == "paper"
+    loaded, sources = load_with_sources(config)
+    settings = loaded.fuse
+    paper = bool(ballots) and ballots[0].method == "paper" and "fuse.min_votes" not in sources
     settings = settings.model_copy(
         update={
             "min_votes": min_votes or (1 if paper else settings.min_votes),

@@ -152,7 +152,7 @@ def vote(
     with ExitStack() as open_map:
         with waiting(f"reading {where}"):
             wanted = None if region is None else region_in(region)
-            point_map = open_map.enter_context(map_at(where, key_file, region=wanted))
+            point_map = open_map.enter_context(map_at(where, key_file, region=wanted, or_kept=True))
         drive = open_drive(drive_path, vehicle=vehicle, frame=frame_of(point_map.georeference), **drive_options)
         localise = None
         if trust_prior:

@@ -124,6 +124,9 @@ class MapClient:
         Unreachable if the server does not answer; MapvoteError if it refuses or what comes is damaged.
         """
         manifest = self._newest() if version is None else self._manifest(f"/v1/map/versions/{version}")
+        return self._as_map(manifest, region)
+
+    def _as_map(self, manifest: _Manifest, region: Region | None) -> PointMap:
         lattice = Lattice(manifest.lattice.x0, manifest.lattice.y0)
         wanted = {_index(key): planes for key, planes in manifest.tiles.items()}
         if region is not None:
@@ -132,6 +135,13 @@ class MapClient:
         self._bound_cache({digest for planes in wanted.values() for digest in planes.hashes()})
         self.version = manifest.version
         return PointMap(manifest.map_id, lattice, tiles, manifest.georeference, version=manifest.version)
+
+    def fetch_kept(self, region: Region | None = None) -> PointMap:
+        """The map that was fetched last, without a request. Unreachable if nothing, or not all of it, is kept."""
+        manifest = self._kept()
+        if manifest is None:
+            raise Unreachable(f"{self._url}: is away, and no version of its map is kept here")
+        return self._as_map(manifest, region)
 
     def newest(self) -> int:
         """The number of the newest version; no tile is downloaded. Raises as :meth:`fetch`."""

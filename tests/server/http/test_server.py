@@ -105,7 +105,8 @@ def test_no_route_answers_without_a_key(site: Site) -> None:
     assert len(paths) >= 12
     for path in [*paths, "/", "/docs", "/openapi.json", "/viewer/app.js", "/nothing"]:
         for key in (None, "wrong"):
-            assert site.ask("GET", path, key).status_code == 401, path
+            probed = key is None and path in ("/livez", "/readyz")
+            assert site.ask("GET", path, key).status_code == (200 if probed else 401), path
 
 
 def test_a_vehicle_touches_its_own_ballots_only_and_never_operates(site: Site) -> None:
@@ -198,6 +199,17 @@ def test_an_unsent_ballot_waits_in_the_spool(site: Site, tmp_path: Path) -> None
         with pytest.raises(MapvoteError, match=r"refused \(409\).*the ballot is kept in"):
             client.send(make_ballot(two_walls(), {(0, 0): Say(states_plane())}, "a", "x", map_id="elsewhere"))
         assert client.flush() == {}
+
+
+@pytest.mark.parametrize("headers", [{}, {"Host": "mapvote.default.svc"}])
+def test_a_probe_needs_no_key_and_no_name_and_learns_nothing_else(site: Site, headers: dict[str, str]) -> None:
+    for path in ("/livez", "/readyz"):
+        answer = httpx2.get(site.url + path, headers=headers)
+        assert (answer.status_code, answer.content) == (200, b"")
+        assert httpx2.post(site.url + path, headers=headers).status_code in (401, 403)
+    assert httpx2.get(site.url + "/healthz", headers=headers).status_code in (401, 403)
+    assert site.ask("GET", "/readyz", "wrong").status_code == 401
+    assert site.ask("GET", "/readyz", site.a).json()["status"] == "ready"
 
 
 def test_a_graceful_stop(tmp_path: Path) -> None:

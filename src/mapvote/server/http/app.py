@@ -23,7 +23,7 @@ from mapvote.server.http import (
 )
 from mapvote.server.http.auth import Guard
 from mapvote.server.http.browsers import Hosts
-from mapvote.server.http.middleware import Watch
+from mapvote.server.http.middleware import Probe, Watch
 from mapvote.server.http.schemas import unreadable
 from mapvote.server.http.services import READING, make_services
 from mapvote.server.http.warming import keep_overview
@@ -73,5 +73,6 @@ def create_app(
         app.include_router(part.router)
     app.add_exception_handler(400, unreadable)
     hosts, guard = Hosts(parts.settings.server.hosts), Guard(store, parts.threads.lookups, opened=opened)
-    app.add_middleware(Watch, hosts=hosts, guard=guard, metrics=parts.metrics)
+    probe = Probe(parts.check_ready)
+    app.add_middleware(Watch, hosts=hosts, guard=guard, metrics=parts.metrics, probe=probe)
     return app

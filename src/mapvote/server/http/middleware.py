@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import asyncio
 import time
+from collections.abc import Awaitable, Callable
 
 import structlog
+from starlette.responses import Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from mapvote.core.types import MapvoteError
-from mapvote.server.errors import Unavailable
+from mapvote.server.errors import Forbidden, Unauthorised, Unavailable
 from mapvote.server.http.auth import Guard
 from mapvote.server.http.browsers import Hosts
 from mapvote.server.http.metrics import Metrics
 from mapvote.server.http.schemas import refuse
 
+_PROBE_S = 1.0
 log = structlog.get_logger("mapvote")
 
 
@@ -23,11 +26,39 @@ def is_ballot(scope: Scope) -> bool:
     return bool(scope["method"] == "PUT" and scope["path"].startswith("/v1/ballots/"))
 
 
+class Probe:
+    """``/livez`` and ``/readyz`` for whoever has no key, by any name of the server: a status, and no content.
+
+    ``ready`` raises Unavailable if no ballot can be taken now. It is asked once a second at most, however many ask.
+    """
+
+    PATHS = ("/livez", "/readyz")
+
+    def __init__(self, ready: Callable[[], Awaitable[object]]) -> None:
+        self._ready = ready
+        self._until, self._status = 0.0, 503
+
+    async def answer(self, path: str) -> Response:
+        """200, or 503 where the server is not ready."""
+        if path == "/livez":
+            return Response(status_code=200)
+        now = time.monotonic()
+        if now >= self._until:
+            self._until = now + _PROBE_S
+            try:
+                await self._ready()
+                self._status = 200
+            except Unavailable:
+                self._status = 503
+        return Response(status_code=self._status)
+
+
 class Watch:
     """The outermost layer. No key, header or query is ever logged."""
 
-    def __init__(self, app: ASGIApp, hosts: Hosts, guard: Guard, metrics: Metrics) -> None:
+    def __init__(self, app: ASGIApp, hosts: Hosts, guard: Guard, metrics: Metrics, probe: Probe) -> None:
         self._app = app
+        self._probe = probe
         self._hosts = hosts
         self._guard = guard
         self._metrics = metrics
@@ -53,6 +84,11 @@ class Watch:
             key, key_hash = whose or (None, None)
             scope.setdefault("state", {}).update(key=key, key_hash=key_hash)
             await self._app(scope, receive, watched)
+        except (Unauthorised, Forbidden) as error:
+            asks = scope["method"] in ("GET", "HEAD") and not any(n == b"authorization" for n, _ in scope["headers"])
+            probed = asks and scope["path"] in Probe.PATHS
+            answer = await self._probe.answer(scope["path"]) if probed else refuse(error)
+            await answer(scope, receive, watched)
         except MapvoteError as error:
             await refuse(error)(scope, receive, watched)
         except asyncio.CancelledError:  # the server stops and waits no longer

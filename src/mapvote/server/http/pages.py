@@ -12,7 +12,7 @@ from typing import Any
 from fastapi import APIRouter, Request, Response
 
 from mapvote.codec.arrays import compress
-from mapvote.server.errors import NotFound, Unavailable
+from mapvote.server.errors import NotFound
 from mapvote.server.http.schemas import problems
 from mapvote.server.http.services import services
 
@@ -29,6 +29,12 @@ _KINDS = {".html": "text/html", ".js": "text/javascript", ".css": "text/css", ".
 router = APIRouter()
 
 
+@router.get("/livez", responses=problems(), response_class=Response, summary="Does the server answer?")
+async def live() -> Response:
+    """200 without content. It needs no key, and neither does `/readyz`, whose answer without a key has no content."""
+    return Response()
+
+
 @router.get("/healthz", responses=problems(), summary="Can the store be read?")
 async def health(request: Request) -> dict[str, Any]:
     """200 with the newest version, 503 if the database does not answer."""
@@ -42,9 +48,7 @@ async def ready(request: Request) -> dict[str, Any]:
     ``quarantine`` names what is damaged and was set aside: all else goes on.
     """
     parts = services(request)
-    if parts.stopping.is_set():
-        raise Unavailable("the server is stopping")
-    version, damaged = await parts.writable.put(None), await parts.damaged.put(None)
+    version, damaged = await parts.check_ready(), await parts.damaged.put(None)
     return {"status": "ready", "version": version, "quarantine": damaged[:_NAMED], "quarantined": len(damaged)}
 
 

@@ -10,6 +10,7 @@ from anyio import CapacityLimiter
 from fastapi import Request
 
 from mapvote.config import Settings
+from mapvote.server.errors import Unavailable
 from mapvote.server.http.batching import Batcher
 from mapvote.server.http.limits import RateLimit, Uploads
 from mapvote.server.http.manifests import Manifests
@@ -84,6 +85,13 @@ class Services:
     uploads: Uploads
     stopping: Event = field(default_factory=Event)
     """Set once the server has been told to stop."""
+
+    async def check_ready(self) -> int:
+        """The newest version, of a database that takes a writer now; Unavailable if it does not, or if the server is
+        stopping."""
+        if self.stopping.is_set():
+            raise Unavailable("the server is stopping")
+        return await self.writable.put(None)
 
     def stop_fusing(self) -> None:
         """Drop what waits to be fused; a publish under way then ends as :class:`Unavailable`."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sqlite3
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
@@ -18,6 +19,12 @@ from mapvote.server.store.sums import with_sums
 _WRITERS_LOCK = 0x6D617076  # any number of our own: PostgreSQL's advisory lock that writers take in turn
 _PAGE_BYTES = 16384
 """A ballot's planes are a few kB each: in SQLite's own 4 kB pages they waste half of the file and of the writing."""
+
+
+COPIED = (
+    "if this file was copied while a server had it open, its -wal file is missing: "
+    'copy by `sqlite3 STORE ".backup COPY"`'
+)
 
 
 class Database:
@@ -123,8 +130,11 @@ def _clear_errors() -> Iterator[None]:
     except exc.IntegrityError:
         raise
     except exc.DBAPIError as error:
-        reason = str(error.orig).strip().splitlines()
-        raise Unavailable(f"the database refuses ({reason[0] if reason else 'no reason given'}); try again") from error
+        if error.statement is None and not isinstance(error.orig, sqlite3.Error):  # its text holds the address
+            raise Unavailable("the database cannot be reached; try again") from error
+        reason = (str(error.orig).strip().splitlines() or ["no reason given"])[0]
+        copied = f": {COPIED}" if "malformed" in reason or "not a database" in reason else ""
+        raise Unavailable(f"the database refuses ({reason}){copied}; try again") from error
     except exc.TimeoutError as error:
         raise Unavailable("all connections to the database are busy; try again") from error
 

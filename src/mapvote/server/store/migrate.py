@@ -13,7 +13,7 @@ from typing import Any
 import sqlalchemy as sa
 
 from mapvote.core.types import MapvoteError
-from mapvote.server.store.database import Database
+from mapvote.server.store.database import COPIED, Database
 
 HEAD = "0001"
 """The revision that :mod:`mapvote.server.store.schema` describes."""
@@ -31,7 +31,8 @@ def check(connection: sa.Connection) -> None:
     """MapvoteError, with the way out, unless the database holds a store of exactly this program's schema."""
     revision, where = revision_of(connection), connection.engine.url.render_as_string()
     if revision is None:
-        raise MapvoteError(f"{where}: holds no map yet; create the store with `mapvote serve STORE --map MAP`")
+        copied = f" ({COPIED})" if connection.dialect.name == "sqlite" else ""
+        raise MapvoteError(f"{where}: holds no map yet; create the store with `mapvote serve STORE --map MAP`{copied}")
     if revision == HEAD:
         return
     if revision in _known():
