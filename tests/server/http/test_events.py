@@ -23,7 +23,7 @@ from mapvote.config.server import ServerSettings
 from mapvote.core.types import CellState
 from mapvote.server.http.event_routes import as_sse
 from mapvote.server.http.webhook import deliver, signature
-from mapvote.server.insight.feed import Event, newest_event, without_names
+from mapvote.server.insight.events import Event, Feed, newest_event, without_names
 from mapvote.server.store import schema
 from mapvote.server.store.queries import log_event
 from mapvote.server.store.store import Store
@@ -106,7 +106,7 @@ def test_a_restart_neither_loses_nor_repeats_what_a_webhook_gets(tmp_path: Path,
     store = Store.create(f"sqlite:///{tmp_path / 's.db'}", two_walls())
     settings = SimpleNamespace(server=ServerSettings(webhook_url=receiver[0], webhook_secret=SECRET))
     threads = SimpleNamespace(fetching=None)
-    parts = cast("Services", SimpleNamespace(store=store, settings=settings, threads=threads))
+    parts = cast("Services", SimpleNamespace(store=store, settings=settings, threads=threads, feed=Feed(store, 0.0)))
 
     async def listen(posts: int) -> list[str]:
         task = asyncio.create_task(deliver(parts))

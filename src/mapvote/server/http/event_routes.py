@@ -15,7 +15,7 @@ from fastapi.responses import StreamingResponse
 from mapvote.server.http.auth import sees_names
 from mapvote.server.http.schemas import problems
 from mapvote.server.http.services import Services, services
-from mapvote.server.insight.feed import Event, events_after, newest_event, without_names
+from mapvote.server.insight.events import Event, newest_event, without_names
 
 _EVERY_S = 1.0
 _STILL_THERE_S = 15.0
@@ -51,7 +51,7 @@ async def _told(request: Request, parts: Services, seq: int, named: bool) -> Asy
     yield b": listening\n\n"
     silent = 0.0
     while not parts.stopping.is_set() and not await request.is_disconnected():
-        found = await to_thread.run_sync(events_after, parts.store, seq, limiter=parts.threads.fetching)
+        found = await to_thread.run_sync(parts.feed.after, seq, limiter=parts.threads.fetching)
         for event in found if named else without_names(found):
             yield as_sse(event)
         if found:

@@ -17,6 +17,7 @@ from mapvote.server.http.manifests import Manifests
 from mapvote.server.http.metrics import Metrics
 from mapvote.server.http.publishing import Publishing
 from mapvote.server.insight.clouds import Clouds
+from mapvote.server.insight.events import Feed
 from mapvote.server.insight.localisation_gate import gate_by
 from mapvote.server.store.admission import Intake, Sent
 from mapvote.server.store.ballots import Incoming, Receipt
@@ -80,6 +81,8 @@ class Services:
     """Rounds under way."""
     clouds: Clouds
     """Levels of detail for the page."""
+    feed: Feed
+    """Events, for all who listen."""
     metrics: Metrics
     limit: RateLimit
     uploads: Uploads
@@ -125,6 +128,7 @@ def make_services(store: Store, settings: Settings, gate: Gate | None, executor:
         manifests=manifests,
         publishing=Publishing(),
         clouds=Clouds(store),
+        feed=Feed(store),
         metrics=Metrics(),
         limit=RateLimit(most.ballots_per_minute, max(1.0, _BURST * most.ballots_per_minute)),
         uploads=Uploads(most.max_body_bytes, _UPLOADS * most.max_body_bytes),

@@ -15,7 +15,7 @@ from anyio import to_thread
 
 from mapvote.server.errors import Unavailable
 from mapvote.server.http.services import Services
-from mapvote.server.insight.feed import events_after, take, taken_up_to
+from mapvote.server.insight.events import take, taken_up_to
 
 _EVERY_S = 1.0
 _TIMEOUT_S = 10.0
@@ -40,7 +40,7 @@ async def deliver(parts: Services) -> None:
     async with httpx2.AsyncClient(timeout=_TIMEOUT_S, follow_redirects=False) as client:
         while True:
             try:
-                events = await ask(events_after, parts.store, seq)
+                events = await ask(parts.feed.after, seq)
                 if events:
                     body = msgspec.json.encode({"map_id": parts.store.map_id, "events": [asdict(e) for e in events]})
                     stamp = str(parts.store.clock() // 10**9)

@@ -1,9 +1,12 @@
-"""What happens in a store, in order, for those who listen: pages, integrators, webhooks."""
+"""The log of a store, in order, for listeners: pages, integrators, webhooks. They share one poll of the database."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from threading import Lock
 
 import sqlalchemy as sa
 
@@ -17,6 +20,8 @@ OF_THE_MAP = ("import", "publish", "rollback", "replay")
 OF_VEHICLES = ("ballot", "withdraw")
 """Kinds that tell the minute of a pass."""
 _MOST = 500
+POLL_S = 0.9
+"""The least time between two polls of the database, however many listeners ask."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,6 +69,37 @@ def events_after(store: Store, seq: int) -> list[Event]:
         rows = connection.execute(query.limit(_MOST)).all()
         version = current_number(connection) if rows else 0
     return [Event(*row, version) for row in rows]
+
+
+class Feed:
+    """The latest events of one store, kept for all listeners. For any number of threads.
+
+    Of many listeners that call :meth:`after` within ``poll_s`` seconds, the first asks the database.
+    """
+
+    def __init__(self, store: Store, poll_s: float = POLL_S, seconds: Callable[[], float] = time.monotonic) -> None:
+        self._store, self._poll_s, self._seconds = store, poll_s, seconds
+        self._lock = Lock()
+        self._recent: deque[Event] = deque(maxlen=_MOST)
+        self._newest: int | None = None
+        self._polled_s = -poll_s
+
+    def after(self, seq: int) -> list[Event]:
+        """The events after ``seq``, oldest first, at most 500. A listener that is farther behind than the events that
+        are kept reads the log itself."""
+        with self._lock:
+            now = self._seconds()
+            if self._newest is None:
+                self._newest, self._polled_s = newest_event(self._store), now
+            elif now - self._polled_s >= self._poll_s:
+                found = events_after(self._store, self._newest)
+                self._recent.extend(found)
+                self._newest, self._polled_s = (found[-1].seq if found else self._newest), now
+            if seq >= self._newest:
+                return []
+            if self._recent and self._recent[0].seq <= seq + 1:
+                return [event for event in self._recent if event.seq > seq]
+        return events_after(self._store, seq)
 
 
 def without_names(events: Sequence[Event]) -> list[Event]:
