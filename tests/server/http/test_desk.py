@@ -210,6 +210,22 @@ def test_a_publish_tells_how_far_it_is_and_can_be_cancelled(server: Server) -> N
             assert again["published"], "the votes still stand"
 
 
+def test_the_list_of_changes_waits_for_nobody_at_the_desk(server: Server) -> None:
+    _, store, who = server
+    go_on = Event()
+    with ThreadPoolExecutor(1) as fusing, ThreadPoolExecutor(3) as beside:
+        blocked = fusing.submit(go_on.wait, 30)
+        with TestClient(create_app(store, executor=fusing), base_url="http://localhost") as client:
+            looks = [beside.submit(client.get, "/v1/desk", headers=who["anna"]) for _ in range(3)]
+            try:
+                assert client.get("/v1/changes?from=1", headers=who["v1"]).status_code == 200
+                assert not blocked.done(), "the desk still waits for tiles to be fused"
+                assert not any(look.done() for look in looks)
+            finally:
+                go_on.set()
+            assert [look.result(30).status_code for look in looks] == [200, 200, 200]
+
+
 def test_what_is_beyond_the_budget_is_listed_apart_with_where_to_drive_by(server: Server) -> None:
     """Ballots that do not say how sure they are: a budget so small lets nothing go."""
     client, store, who = server

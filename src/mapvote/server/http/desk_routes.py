@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 from typing import Annotated, Any, Literal
 
+from anyio import to_thread
 from fastapi import APIRouter, Path, Query, Request, Response
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -34,7 +36,7 @@ class ReviewAsk(BaseModel):
     responses=problems(403) | AS_CSV,
     summary="What a publish would change now",
 )
-def whole_desk(request: Request, format: Places = "json") -> Response:
+async def whole_desk(request: Request, format: Places = "json") -> Response:
     """Pending changes as GeoJSON, with the verdicts so far; deletions that wait for somebody to drive by, beyond the
     policy's budget; what was held and rejected; why the policy would hold.
 
@@ -42,7 +44,8 @@ def whole_desk(request: Request, format: Places = "json") -> Response:
     """
     reviewer(request)
     parts = services(request)
-    found = desk(parts.store, parts.fusing, parts.gate)
+    look = partial(desk, parts.store, parts.fusing, parts.gate)
+    found = await to_thread.run_sync(look, limiter=parts.threads.deciding)
     left_out = [verdict_of(one) for one in found.reviewed]
     if format == "json":
         told = {"version": found.version, "held": found.held, "pending": found.pending}
@@ -57,11 +60,12 @@ def whole_desk(request: Request, format: Places = "json") -> Response:
     response_class=Response,
     summary="A pending change before and after",
 )
-def pending(request: Request, change: Annotated[str, Query(max_length=100)]) -> Response:
+async def pending(request: Request, change: Annotated[str, Query(max_length=100)]) -> Response:
     """PNG as `/v1/pictures` gives it, of the newest version and of what a publish would make of it now."""
     reviewer(request)
     parts = services(request)
-    data = pending_picture(parts.store, change, parts.fusing)
+    look = partial(pending_picture, parts.store, change, parts.fusing)
+    data = await to_thread.run_sync(look, limiter=parts.threads.deciding)
     return Response(data, media_type="image/png", headers={"Cache-Control": "no-store"})
 
 
@@ -72,16 +76,15 @@ def _flat(row: Mapping[str, Any]) -> dict[str, Any]:
 
 
 @router.post("/v1/desk/reviews", responses=problems(403, 404, 409), summary="Accept, hold or reject a change")
-def decide(request: Request, ask: ReviewAsk) -> dict[str, int]:
+async def decide(request: Request, ask: ReviewAsk) -> dict[str, int]:
     """Publishing obeys it: a rejected change does not come back by the votes there are, a held one waits.
 
     409 if somebody else decided meanwhile.
     """
     by, parts = reviewer(request), services(request)
-    seq = review(
-        parts.store, ask.change, ask.verdict, by=by, comment=ask.comment, after=ask.after, executor=parts.fusing
-    )
-    return {"seq": seq}
+    said = partial(review, by=by, comment=ask.comment, after=ask.after, executor=parts.fusing)
+    work = partial(said, parts.store, ask.change, ask.verdict)
+    return {"seq": await to_thread.run_sync(work, limiter=parts.threads.deciding)}
 
 
 @router.delete("/v1/desk/reviews/{seq}", responses=problems(403, 404, 409), summary="Take a verdict back")

@@ -52,6 +52,8 @@ class Threads:
     fetching: CapacityLimiter = field(default_factory=lambda: CapacityLimiter(4))
     """Manifests and tiles."""
     publishing: CapacityLimiter = field(default_factory=lambda: CapacityLimiter(2))
+    deciding: CapacityLimiter = field(default_factory=lambda: CapacityLimiter(2))
+    """The desk: its first look at new votes fuses tiles, for seconds, and nobody else waits for that."""
 
 
 @dataclass(frozen=True, slots=True)
