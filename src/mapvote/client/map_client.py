@@ -42,7 +42,7 @@ class _Plane(msgspec.Struct):
     ground: str
     free: str | None = None
     fields: str | None = None
-    """Of what the points carry besides; None also from an older server."""
+    """Of what the points carry besides."""
 
     def hashes(self) -> list[str]:
         return [digest for digest in (self.points, self.ground, self.free, self.fields) if digest is not None]
@@ -58,9 +58,9 @@ class _Manifest(msgspec.Struct):
     version: int
     lattice: _Lattice
     tiles: dict[str, _Plane]
+    digest: str
+    """Of all tiles of the version."""
     georeference: dict[str, str] = {}
-    digest: str = ""
-    """Of all tiles of the version; "" from an older server."""
     fields_digest: str = ""
     """Of the fields of their points; "" where there are none."""
     removed: list[str] = []
@@ -98,8 +98,7 @@ class MapClient:
         self._server = Connection(url, key=key, attempts=attempts, timeout_s=timeout_s, sleep=sleep)
         self._url = url
         self._planes, self._spool = home / "planes", Spool(home, url)
-        self._kept_manifest = server_folder(home, url) / "manifest_2.json"
-        """Not the file of a mapvote that knew of no fields: what it kept lacks them."""
+        self._kept_manifest = server_folder(home, url) / "manifest.json"
         self._cache_bytes = cache_bytes
         self.version: int | None = None
         """Version of the map last fetched."""

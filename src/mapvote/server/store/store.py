@@ -3,8 +3,8 @@
     store = Store.open("sqlite:///street.db")          # or Store.create(url, point_map)
     store.current(); store.manifest(n); store.tile(n, (0, 0)); store.point_map(n)
 
-What changes it lives beside it, one concern each: ``intake`` (ballots in and out), ``publish`` (publish, roll back,
-un-vote), ``keys``. What explains it: ``standing`` (which votes count), ``explain`` (cells, coverage, log).
+What changes it lies beside it: ``admission`` and ``ballots``, ``publish``, ``replay``, ``reviews``, ``keys``,
+``policy``. What explains it is in :mod:`mapvote.server.insight`.
 """
 
 from __future__ import annotations
