@@ -20,9 +20,9 @@ import small_gicp
 from mapvote.core.geometry import from_xyz_rpy, inverse, rotation_angle
 from mapvote.core.types import F64
 from mapvote.formats import open_drive, read_T_map_lidar
-from mapvote.localisation.deskew import deskew, motion_at
 from mapvote.localisation.map_window import window_points
 from mapvote.localisation.ndt import CENTRAL_M, build_ndt, register
+from mapvote.localisation.prepare import deskew, motion_at
 from mapvote.slam.build import build_map
 from mapvote_lab.simulation import simulate
 

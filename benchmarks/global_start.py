@@ -24,9 +24,9 @@ from mapvote.core.geometry import from_xyz_rpy, inverse, rotation_angle, transfo
 from mapvote.core.point_map import PointMap, map_from_points
 from mapvote.core.types import F64, Scan
 from mapvote.core.voxels import thin
-from mapvote.localisation.deskew import deskew, motion_at
 from mapvote.localisation.global_search import GlobalSearch
-from mapvote.localisation.trust import MIN_FIT, MIN_LEAD
+from mapvote.localisation.pose_check import MIN_FIT, MIN_LEAD
+from mapvote.localisation.prepare import deskew, motion_at
 from survey_gnss import bent_drives
 from trust import kitti
 

@@ -16,7 +16,7 @@ from mapvote.core.columns import GROUND_MARGIN_M
 from mapvote.core.point_map import all_points
 from mapvote.core.types import F64, U64, Bool
 from mapvote.detection.voter import Voter
-from mapvote.localisation.deskew import deskew, motion_at
+from mapvote.localisation.prepare import deskew, motion_at
 from mapvote.perception.frontend import Observation
 from mapvote.vehicle import Vehicle
 from mapvote_lab.evaluation.baselines.nearest_neighbour import heights

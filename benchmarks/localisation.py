@@ -22,10 +22,10 @@ from mapvote.core.geometry import exp, inverse, log, rotation_angle
 from mapvote.core.point_map import PointMap
 from mapvote.core.types import F64
 from mapvote.formats import open_drive, read_T_map_lidar
-from mapvote.localisation.deskew import deskew, motion_at
 from mapvote.localisation.map_window import MapWindow
 from mapvote.localisation.ndt import PosePrior, register
-from mapvote.localisation.tracker import Tracker
+from mapvote.localisation.odometry import Tracker
+from mapvote.localisation.prepare import deskew, motion_at
 from mapvote.slam.build import build_map
 from mapvote_lab.simulation import simulate
 

@@ -79,10 +79,9 @@ TESTS = {
     "perception/raycast.py": ["perception/test_raycast.py"],
     "perception/sky.py": ["perception/test_sky.py"],
     "core/ground_growing.py": ["core/test_ground.py"],
-    "slam/strays.py": ["slam/test_strays.py"],
-    "slam/trails.py": ["slam/test_trails.py"],
-    "localisation/tracker.py": ["localisation/test_tracker.py"],
-    "localisation/trust.py": ["localisation/test_trust.py"],
+    "slam/clean_map.py": ["slam/test_strays.py", "slam/test_trails.py", "slam/test_mirrored.py"],
+    "localisation/odometry.py": ["localisation/test_odometry.py"],
+    "localisation/pose_check.py": ["localisation/test_pose_check.py"],
     "evaluation/columns_v1/weighing.py": [
         "evaluation/columns_v1/test_weighing.py",
         "evaluation/columns_v1/test_voter.py",

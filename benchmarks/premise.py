@@ -24,9 +24,9 @@ from mapvote.core.geometry import exp
 from mapvote.core.point_map import PointMap
 from mapvote.core.types import F64, Drive
 from mapvote.core.voxels import thin
-from mapvote.localisation.deskew import deskew, motion_at, twist_between
 from mapvote.localisation.map_window import window_points
 from mapvote.localisation.ndt import Level, NdtMap, in_rows, refine
+from mapvote.localisation.prepare import deskew, motion_at, twist_between
 from mapvote_lab.evaluation.experiments.cases import COLUMNS_V1, choose_cases, fuse_case
 from mapvote_lab.evaluation.experiments.changed_areas import localise_in, scans_near_changes
 from mapvote_lab.evaluation.experiments.passes import passes

@@ -22,7 +22,7 @@ from mapvote.config import Settings, cache_folder
 from mapvote.core.point_map import PointMap, all_points, map_from_points
 from mapvote.core.reference import reference_window
 from mapvote.slam.accumulate import Layer
-from mapvote.slam.road import all_roads, road_under
+from mapvote.slam.road_prior import all_roads, road_under
 from mapvote_lab.evaluation.experiments.cases import choose_cases
 from mapvote_lab.evaluation.experiments.kept import read_kept
 from mapvote_lab.evaluation.experiments.passes import pass_folder

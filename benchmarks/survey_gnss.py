@@ -22,8 +22,8 @@ from mapvote.core.geometry import from_xyz_rpy
 from mapvote.core.sensors import SENSORS
 from mapvote.core.types import F32, F64, Drive, Scan
 from mapvote.formats import open_drive
-from mapvote.slam.frame import fit_to_priors
-from mapvote.slam.settle import settle
+from mapvote.slam.pose_graph_all import settle
+from mapvote.slam.prior_alignment import fit_to_priors
 from mapvote.slam.surveyor import Surveyor
 from mapvote_lab.evaluation.scoring.truth import rigid_between
 from mapvote_lab.simulation.lidar import Caster, measure, sweep

@@ -19,7 +19,7 @@ from mapvote.core.tile import Tile
 from mapvote.core.types import F32, F64, I8, NO_VOTE, U8, U16, U64, Scan
 from mapvote.fusion.sparse_columns import Words, mark, nothing_reached
 from mapvote.localisation.ndt import PosePrior
-from mapvote.localisation.tracker import Fix
+from mapvote.localisation.odometry import Fix
 from mapvote.perception.frontend import Observation, PlacedScan
 from mapvote.perception.raycast import ScanView, find_obstacles
 

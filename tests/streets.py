@@ -9,7 +9,7 @@ import numpy as np
 from mapvote.core.geometry import exp, from_xyz_rpy, inverse
 from mapvote.core.sensors import SENSORS
 from mapvote.core.types import F64, Drive, Scan
-from mapvote.localisation.deskew import motion_at
+from mapvote.localisation.prepare import motion_at
 
 LENGTH_M = 45.0
 

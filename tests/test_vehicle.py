@@ -20,7 +20,7 @@ from mapvote.core.sensors import SENSORS
 from mapvote.core.types import F64, CellState, MapvoteError, Registration, Scan
 from mapvote.fusion.offline import update_map
 from mapvote.localisation.ndt import PosePrior
-from mapvote.localisation.tracker import Fix
+from mapvote.localisation.odometry import Fix
 from mapvote.vehicle import Vehicle
 
 RNG = np.random.default_rng(7)

@@ -12,8 +12,8 @@ from mapvote.core.sensors import SENSORS
 from mapvote.core.types import F64, Scan
 from mapvote.localisation.localiser import LOOKS, WAIT_SCANS, Localiser
 from mapvote.localisation.ndt import NdtMap, PosePrior
-from mapvote.localisation.tracker import Fix
-from mapvote.localisation.trust import Verdict
+from mapvote.localisation.odometry import Fix
+from mapvote.localisation.pose_check import Verdict
 from streets import path, street, sweep, twist_of
 
 SETTINGS = Settings()

@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 from mapvote.core.geometry import exp, from_xyz_rpy, inverse, rotation_angle, transform
 from mapvote.core.types import F64, Scan
 from mapvote.localisation import ndt
-from mapvote.localisation.deskew import deskew, twist_between
 from mapvote.localisation.ndt import NdtMap, PosePrior, build_ndt, register
+from mapvote.localisation.prepare import deskew, twist_between
 from streets import street, surface
 
 T_TRUE = from_xyz_rpy(3.0, -1.0, 1.8, 0.01, -0.015, 0.3)

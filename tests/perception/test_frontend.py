@@ -14,7 +14,7 @@ from mapvote.core.sensors import SENSORS
 from mapvote.core.types import F64, Bool, MapvoteError, Registration, Scan
 from mapvote.localisation.localiser import GivenPoses, Localise
 from mapvote.localisation.ndt import PosePrior
-from mapvote.localisation.tracker import Fix
+from mapvote.localisation.odometry import Fix
 from mapvote.perception.frontend import Frontend, Observation
 from mapvote.perception.moving_objects import MovingFilter
 

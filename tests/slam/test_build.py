@@ -16,7 +16,7 @@ from mapvote.core.types import F64, Drive, MapvoteError, Scan
 from mapvote.formats import open_drive, read_T_map_lidar
 from mapvote.localisation.map_window import MapWindow
 from mapvote.localisation.ndt import PosePrior
-from mapvote.localisation.tracker import Tracker
+from mapvote.localisation.odometry import Tracker
 from mapvote.slam.build import BuildReport, _agreed_heights, build_map
 from mapvote_lab.evaluation.scoring.truth import rigid_between
 from mapvote_lab.simulation import simulate

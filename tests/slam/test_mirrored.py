@@ -7,7 +7,7 @@ import numpy as np
 from mapvote.core.grid import Lattice
 from mapvote.core.point_map import map_from_points
 from mapvote.core.types import F64
-from mapvote.slam.mirrored import mirrored
+from mapvote.slam.clean_map import mirrored
 
 LATTICE = Lattice(-30.0, -30.0)
 

@@ -8,7 +8,7 @@ import pytest
 from mapvote.core.grid import Lattice
 from mapvote.core.types import F64
 from mapvote.core.voxels import VoxelCloud, thin, voxel_downsample
-from mapvote.slam.strays import MET_SHARE, NEAR_M, strays
+from mapvote.slam.clean_map import MET_SHARE, NEAR_M, strays
 
 LATTICE = Lattice()
 

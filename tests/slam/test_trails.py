@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from mapvote.core.grid import CELL_SIZE, Lattice
 from mapvote.core.types import F64, I64
-from mapvote.slam.trails import TALL_M, trails
+from mapvote.slam.clean_map import TALL_M, trails
 
 LATTICE = Lattice()
 

@@ -31,7 +31,7 @@ def cache_folder() -> Path:
 
 
 class NdtSettings(Section):
-    """When a scan's registration is sound (localisation/tracker.py)."""
+    """When a scan's registration is sound (localisation/odometry.py)."""
 
     min_inlier_share: float = Field(default=0.5, description="below it the vehicle abstains; lost scans have about .4")
     max_sigma_m: float = Field(default=0.15, description="abstain when the pose is less certain than this")
@@ -142,12 +142,12 @@ COLUMNS_LEFT = "columns left the product in this version"
 LEFT = {("voting.method", "columns"): f"{COLUMNS_LEFT}; write 'surfaces', the default, or leave it out"}
 """Values that a setting could have."""
 FIXED = {
-    "trust.min_fit": "MIN_FIT of localisation/trust.py",
-    "trust.min_lead": "MIN_LEAD of localisation/trust.py",
+    "trust.min_fit": "MIN_FIT of localisation/pose_check.py",
+    "trust.min_lead": "MIN_LEAD of localisation/pose_check.py",
     "trust.scans": "LOOKS of localisation/localiser.py",
     "moving.reach_m": "REACH_M of perception/moving_objects.py",
     "mapping.precise_prior_m": "PRECISE_PRIOR_M of slam/surveyor.py",
-    "mapping.prior_memory_s": "PRIOR_MEMORY_S of slam/settle.py",
+    "mapping.prior_memory_s": "PRIOR_MEMORY_S of slam/pose_graph_all.py",
     "voting.min_cells": f"it was of columns, and {COLUMNS_LEFT}",
 }
 """Settings that are constants now: nobody could judge them by looking; or that have left."""

@@ -18,10 +18,10 @@ from mapvote.doctor.other_scale import in_another_scale
 from mapvote.doctor.other_unit import in_another_unit
 from mapvote.doctor.places import Place, fitting, register_all, total_fit
 from mapvote.doctor.road import find_road
-from mapvote.localisation.deskew import deskew, motion_at
 from mapvote.localisation.global_search import GlobalSearch
 from mapvote.localisation.map_window import MapWindow
-from mapvote.localisation.trust import MIN_FIT
+from mapvote.localisation.pose_check import MIN_FIT
+from mapvote.localisation.prepare import deskew, motion_at
 
 _PLACES = 6
 _SEARCHED = 4

@@ -10,10 +10,10 @@ import numpy as np
 from mapvote.core.geometry import from_xyz_rpy
 from mapvote.core.types import F32, F64, Scan
 from mapvote.doctor.finding import Progress
-from mapvote.localisation.airborne import solid_sample
 from mapvote.localisation.map_window import MapWindow
 from mapvote.localisation.ndt import LEVELS, NdtMap, fitness, refine, thin_for_levels
-from mapvote.localisation.trust import MIN_FIT, Judge
+from mapvote.localisation.pose_check import MIN_FIT, Judge
+from mapvote.localisation.prepare import solid_sample
 
 _OFFSETS_M = np.arange(-6.0, 6.1, 1.0)
 _YAWS = np.radians([0.0, -3.0, 3.0])
@@ -27,7 +27,7 @@ class Place:
     index: int
     T_map_lidar: F64
     fit: float
-    """As :class:`mapvote.localisation.trust.Verdict` has it; 0 where the map knows too little to say."""
+    """As :class:`mapvote.localisation.pose_check.Verdict` has it; 0 where the map knows too little to say."""
     known: float
     """Share of the scan's points near which the map has anything, at the guess."""
     least: float

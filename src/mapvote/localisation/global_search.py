@@ -17,7 +17,6 @@ from mapvote.config import NdtSettings
 from mapvote.core.geometry import inverse
 from mapvote.core.point_map import PointMap
 from mapvote.core.types import F64, U32, Scan
-from mapvote.localisation.airborne import solid_sample
 from mapvote.localisation.correlation import (
     CELL_M,
     HIGH_M,
@@ -31,11 +30,11 @@ from mapvote.localisation.correlation import (
     laid_out,
     sharpened,
 )
-from mapvote.localisation.deskew import deskew
 from mapvote.localisation.map_window import MapWindow
 from mapvote.localisation.ndt import LEVELS, refine, thin_for_levels
-from mapvote.localisation.tracker import Tracker
-from mapvote.localisation.trust import MIN_FIT, MIN_KNOWN, MIN_LEAD, Judge, height_above_lowest
+from mapvote.localisation.odometry import Tracker
+from mapvote.localisation.pose_check import MIN_FIT, MIN_KNOWN, MIN_LEAD, Judge, height_above_lowest
+from mapvote.localisation.prepare import deskew, solid_sample
 
 _REACH_M = 45.0
 _POINTS = 200
@@ -53,7 +52,7 @@ class Found:
 
     T_map_lidar: F64
     fit: float
-    """As :class:`mapvote.localisation.trust.Verdict` has it."""
+    """As :class:`mapvote.localisation.pose_check.Verdict` has it."""
     lead: float
     """By how much it fits better than the best place elsewhere."""
 

@@ -19,13 +19,12 @@ from mapvote.core.geometry import inverse
 from mapvote.core.point_map import PointMap
 from mapvote.core.sensors import Sensor
 from mapvote.core.types import F64, I64, Registration, Scan
-from mapvote.localisation.airborne import solid_sample
-from mapvote.localisation.deskew import deskew, motion_at, twist_between
 from mapvote.localisation.global_search import GlobalSearch
 from mapvote.localisation.map_window import MapWindow
 from mapvote.localisation.ndt import LEVELS, PosePrior, refine, thin_for_levels
-from mapvote.localisation.tracker import TWIST_AGE_S, Fix, Tracker
-from mapvote.localisation.trust import Judge, Verdict
+from mapvote.localisation.odometry import TWIST_AGE_S, Fix, Tracker
+from mapvote.localisation.pose_check import Judge, Verdict
+from mapvote.localisation.prepare import deskew, motion_at, solid_sample, twist_between
 
 LOOKS = 3
 """In turn that must hold before the first vote."""

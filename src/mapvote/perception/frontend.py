@@ -24,7 +24,7 @@ from mapvote.core.sensors import Sensor
 from mapvote.core.types import F32, F64, I32, Bool, MapvoteError, Reference, Scan
 from mapvote.localisation.localiser import Localise
 from mapvote.localisation.ndt import PosePrior
-from mapvote.localisation.tracker import Fix
+from mapvote.localisation.odometry import Fix
 from mapvote.perception.raycast import ScanView, cast_rays, find_obstacles
 from mapvote.perception.sky import Sky
 

@@ -3,7 +3,7 @@
 A draft of the map gives the ground and says which voxels anything ever struck. Every voxel's scans are then counted:
 in how many was it struck, in how many seen through. What was struck only rarely by scans that could have struck it is
 the trail of something that moved and escaped the filter: it leaves the map, and its voxels are unknown, not free. So
-does what is no surface at all (slam/strays.py), and what the surveys saw through as often as a vehicle that calls it
+does what is no surface at all (slam/clean_map.py), and what the surveys saw through as often as a vehicle that calls it
 gone: beside a parked car the trail of one that passes is struck by every hit on the other, and only a hit that knows
 where it lies tells them apart (detection/evidence.py).
 
@@ -44,9 +44,7 @@ from mapvote.detection.surface_rules import is_gone
 from mapvote.localisation.localiser import GivenPoses
 from mapvote.perception.frontend import Frontend, Observation, PlacedScan
 from mapvote.perception.moving_objects import MovingFilter
-from mapvote.slam.mirrored import mirrored
-from mapvote.slam.strays import strays
-from mapvote.slam.trails import trails
+from mapvote.slam.clean_map import mirrored, strays, trails
 
 _MIN_THROUGH, _TRAIL_SHARE = 3, 0.45
 """A voxel is a trail if so many scans saw through it, and of those able to a smaller share struck it."""

@@ -20,8 +20,8 @@ from mapvote.core.motions import inverses, rotation_angles
 from mapvote.core.point_map import PointMap, map_from_points
 from mapvote.core.types import F64, Bool, Drive, MapvoteError
 from mapvote.slam.accumulate import Layer
-from mapvote.slam.road import all_roads, road_under
-from mapvote.slam.settle import carried_along, settle
+from mapvote.slam.pose_graph_all import carried_along, settle
+from mapvote.slam.road_prior import all_roads, road_under
 from mapvote.slam.surveyor import Surveyed, Surveyor, is_precise
 
 Progress = Callable[[int, int], None]

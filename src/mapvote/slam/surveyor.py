@@ -18,10 +18,10 @@ from mapvote.core.geometry import exp, from_origin, inverse, transform
 from mapvote.core.grid import Lattice
 from mapvote.core.types import F64, Bool, Drive, MapvoteError, Scan
 from mapvote.core.voxels import VoxelCloud, thin
-from mapvote.localisation.deskew import twist_between
 from mapvote.localisation.ndt import LEVELS, NdtMap, PosePrior, in_rows, refine
-from mapvote.localisation.tracker import ACCELERATION_MPS2, Fix, Tracker
-from mapvote.slam.frame import fit_to_priors
+from mapvote.localisation.odometry import ACCELERATION_MPS2, Fix, Tracker
+from mapvote.localisation.prepare import twist_between
+from mapvote.slam.prior_alignment import fit_to_priors
 
 PRECISE_PRIOR_M, PRECISE_PRIOR_DEG = 0.1, 0.2
 """A prior at least this good, in both, is a surveyor's: it guides each registration and holds the map's frame. A place

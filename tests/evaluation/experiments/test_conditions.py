@@ -11,7 +11,7 @@ from hand_made import AtOnce, two_walls
 from mapvote.core.types import Drive, Registration, Scan
 from mapvote.formats import open_drive
 from mapvote.localisation.ndt import PosePrior
-from mapvote.localisation.tracker import Fix
+from mapvote.localisation.odometry import Fix
 from mapvote_lab.evaluation.experiments.conditions import (
     NOISE_MEMORY_S,
     Conditions,

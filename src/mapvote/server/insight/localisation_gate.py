@@ -21,9 +21,9 @@ from mapvote.core.grid import CELL_SIZE
 from mapvote.core.point_map import PointMap
 from mapvote.core.types import F32, F64, Drive, MapvoteError
 from mapvote.formats import open_drive
-from mapvote.localisation.deskew import deskew, twist_between
 from mapvote.localisation.map_window import MapWindow
 from mapvote.localisation.ndt import refine, thin_for_levels
+from mapvote.localisation.prepare import deskew, twist_between
 from mapvote.server.insight.changes import changed_cells
 from mapvote.server.store.policy import GatePolicy
 from mapvote.server.store.round import Gate

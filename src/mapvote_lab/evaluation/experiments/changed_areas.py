@@ -14,7 +14,7 @@ from mapvote.formats import read_map, write_map
 from mapvote.formats.atomic import whole_folder
 from mapvote.localisation.map_window import MapWindow
 from mapvote.localisation.ndt import PosePrior
-from mapvote.localisation.tracker import Tracker
+from mapvote.localisation.odometry import Tracker
 from mapvote.slam.build import build_map
 from mapvote_lab.evaluation.experiments.conditions import ar1
 from mapvote_lab.evaluation.experiments.scene import Progress, Scene

@@ -15,7 +15,7 @@ from mapvote.core.tile import Tile
 from mapvote.core.types import F64, I64, Bool, Drive, Scan
 from mapvote.localisation.localiser import Localise
 from mapvote.localisation.ndt import PosePrior
-from mapvote.localisation.tracker import Fix
+from mapvote.localisation.odometry import Fix
 from mapvote.perception.frontend import Movers
 from mapvote_lab.evaluation.scoring.truth import Truth
 from mapvote_lab.simulation.scenario import load_scenario

@@ -14,7 +14,7 @@ import numpy as np
 from mapvote.core.geometry import inverse, transform
 from mapvote.core.grid import CELL_SIZE
 from mapvote.core.types import F32, F64, I64, Bool, Drive, Scan
-from mapvote.localisation.deskew import deskew, motion_at
+from mapvote.localisation.prepare import deskew, motion_at
 from mapvote_lab.simulation.lidar import Caster
 from mapvote_lab.simulation.shapes import box
 

@@ -7,8 +7,8 @@ import pytest
 
 from mapvote.core.geometry import from_xyz_rpy
 from mapvote.core.types import F64
-from mapvote.slam.road import road_under
-from mapvote.slam.settle import carried_along
+from mapvote.slam.pose_graph_all import carried_along
+from mapvote.slam.road_prior import road_under
 from mapvote.slam.surveyor import Surveyed, is_precise
 from streets import drive_along, path
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from mapvote.core.types import F64
-from mapvote.slam.road import road_under
+from mapvote.slam.road_prior import road_under
 
 
 def driven(length_m: float, height: float = 1.73, grade: float = 0.0) -> F64:

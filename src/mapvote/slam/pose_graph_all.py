@@ -1,8 +1,8 @@
 """Where all scans of all drives were, settled together: the shape from registration, the place from every prior.
 
 A precise prior (RTK) holds each pose. Ordinary ones (GNSS) err alike for seconds to minutes, jump and go wild: the
-whole is first laid on the robust fit of them all (slam.frame), then the graph lets them bend it only as far as their
-number of *independent* errors says, none of them more than its distance from the others allows.
+whole is first laid on the robust fit of them all (slam.prior_alignment), then the graph lets them bend it only as far
+as their number of *independent* errors says, none of them more than its distance from the others allows.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from scipy.spatial import cKDTree
 
 from mapvote.core.motions import inverses
 from mapvote.core.types import F64, I64, Drive
-from mapvote.slam.frame import fit_to_priors, trust_in
 from mapvote.slam.pose_graph import Anchors, Links, optimise, position_sigmas
+from mapvote.slam.prior_alignment import fit_to_priors, trust_in
 from mapvote.slam.surveyor import PRECISE_PRIOR_M, Surveyed, is_precise
 
 PRIOR_MEMORY_S = 20.0

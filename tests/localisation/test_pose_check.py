@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 
 from mapvote.core.geometry import from_xyz_rpy, inverse, transform
 from mapvote.core.types import F64
-from mapvote.localisation import trust
+from mapvote.localisation import pose_check
 from mapvote.localisation.ndt import Level, NdtMap, build_ndt
-from mapvote.localisation.trust import Judge, Verdict, height_above_lowest, stands_above_ground
+from mapvote.localisation.pose_check import Judge, Verdict, height_above_lowest, stands_above_ground
 
 HERE = np.eye(4)
 ALL_POINTS = 10**6
@@ -85,7 +85,7 @@ def test_where_less_is_known_than_asked_for_nothing_fits(monkeypatch: pytest.Mon
     cloud = clusters(2, 500, NOISE_M)
     scan = with_ground(np.concatenate([cloud, cloud + TWELVE_UP]))
     for least, fits in ((0.49, True), (0.5, True), (0.51, False)):
-        monkeypatch.setattr(trust, "MIN_KNOWN", least)
+        monkeypatch.setattr(pose_check, "MIN_KNOWN", least)
         judge = Judge(NOISE_M, ALL_POINTS)
         assert (judge.fit(far_map(), scan, HERE) > 0.9) == fits
 

@@ -10,7 +10,7 @@ from mapvote.core.point_map import PointMap, map_from_points
 from mapvote.core.types import F64, Registration, Scan
 from mapvote.localisation.map_window import MapWindow, window_points
 from mapvote.localisation.ndt import NdtMap, PosePrior
-from mapvote.localisation.tracker import Tracker
+from mapvote.localisation.odometry import Tracker
 from streets import path, street, sweep, twist_of
 
 SETTINGS = NdtSettings()
@@ -221,9 +221,9 @@ def test_a_lost_vehicle_is_looked_for_metre_by_metre_as_far_to_all_sides(
         tried.append(guess)
         return 0.0
 
-    monkeypatch.setattr("mapvote.localisation.tracker.fitness", poor)
+    monkeypatch.setattr("mapvote.localisation.odometry.fitness", poor)
     found = registered(np.eye(3))
-    monkeypatch.setattr("mapvote.localisation.tracker.refine", lambda *_: found)
+    monkeypatch.setattr("mapvote.localisation.odometry.refine", lambda *_: found)
     cloud = np.zeros((3, 1500), np.float32)
     assert elsewhere()._search(NdtMap(np.zeros(3)), [cloud], from_xyz_rpy(5.0, -7.0, 0.0), reach, None) is found
     offsets = sorted({(round(T[0, 3] - 5.0, 6), round(T[1, 3] + 7.0, 6)) for T in tried})

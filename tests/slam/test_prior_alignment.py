@@ -5,7 +5,7 @@ import pytest
 
 from mapvote.core.geometry import from_xyz_rpy, rotation_angle
 from mapvote.core.types import F64
-from mapvote.slam.frame import fit_to_priors, trust_in
+from mapvote.slam.prior_alignment import fit_to_priors, trust_in
 
 
 def track() -> F64:

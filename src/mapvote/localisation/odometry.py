@@ -13,7 +13,6 @@ import numpy as np
 from mapvote.config import NdtSettings
 from mapvote.core.geometry import exp, from_xyz_rpy
 from mapvote.core.types import F32, F64, Registration, Scan
-from mapvote.localisation.deskew import deskew, twist_between
 from mapvote.localisation.ndt import (
     LEVELS,
     NdtMap,
@@ -21,7 +20,7 @@ from mapvote.localisation.ndt import (
     fitness,
     refine,
 )
-from mapvote.localisation.sample import Sample
+from mapvote.localisation.prepare import Sample, deskew, twist_between
 
 _REFINED = 3
 """How many of the best guesses are refined when the vehicle is lost."""

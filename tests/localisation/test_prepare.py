@@ -5,9 +5,9 @@ import pytest
 from numpy.typing import NDArray
 
 from mapvote.core.types import Bool
-from mapvote.localisation.airborne import solid_sample
 from mapvote.localisation.ndt import build_ndt
-from mapvote.localisation.trust import Judge
+from mapvote.localisation.pose_check import Judge
+from mapvote.localisation.prepare import solid_sample
 
 BEAMS, AZIMUTHS = 32, 1800
 HERE = np.eye(4)

@@ -1,0 +1,172 @@
+"""Which points of a surveyed map are no standing surface. One function a rule: ``mirrored``, ``strays``, ``trails``.
+
+Reflections. A wet road, a window or the side of a car deflects a ray, and the range puts its return below the ground.
+A point below ground that is known and level on all sides is such a return. Beside a leap of the ground it may be a wall
+that goes down to a yard, and near a place where vehicles drove above each other what lies below is real: both stay.
+
+Strays. A beam that grazes an edge returns a place between two surfaces; a pane shows a room that is not there. No ray
+speaks against such points, because other scans saw the wall in front of them. A surface is hit by more than MET_SHARE
+of the scans that pass within NEAR_M of it; strays are not. A wall two centimetres from a voxel's face has points in two
+voxels: the fewer points just over the face belong to the same wall.
+
+Trails. A standing thing is hit as often as rays pass through its voxels, as a whole if not in each voxel. A thing that
+drove was hit once or twice in each place, and rays passed there before and after.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy import ndimage
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from mapvote.core.grid import CELL_SIZE, Lattice
+from mapvote.core.heights import crossings, heights_over_ground
+from mapvote.core.point_map import PointMap
+from mapvote.core.types import F32, F64, I32, I64, Bool
+from mapvote.core.voxels import thin, voxel_keys
+
+BELOW_M = 0.5
+"""A point so far under the ground is no part of it, however rough."""
+_BESIDE_CELLS = 2
+_BRIDGE_M = 80.0
+"""Of a place where two roads cross; as far as scans enter the map from."""
+
+
+def mirrored(points: F64, point_map: PointMap, road: F64 | None) -> Bool:
+    """(n,) which of the points (n, 3), map metres, are reflections below the ground of ``point_map``.
+
+    ``road`` (m, 3): the road under all drives.
+    """
+    out = heights_over_ground(point_map, points) < -BELOW_M
+    asked = np.flatnonzero(out)
+    out[asked] = _is_closed(points[asked], point_map)
+    if road is not None and len(road):
+        above_each_other = road[np.unique(crossings(road))]
+        if len(above_each_other):
+            below = np.flatnonzero(out)
+            tree = cKDTree(above_each_other[:, :2])
+            out[below] = np.isinf(tree.query(points[below, :2], distance_upper_bound=_BRIDGE_M)[0])
+    return out
+
+
+def _is_closed(points: F64, point_map: PointMap) -> Bool:
+    """(n,) whether the ground around the cell of each point (n, 3) is known and level."""
+    out = np.zeros(len(points), dtype=np.bool_)
+    rows, cols = point_map.lattice.cells_of(points)
+    for tile in point_map.tiles.values():
+        r, c = rows - tile.window.row0, cols - tile.window.col0
+        here = np.flatnonzero((r >= 0) & (c >= 0) & (r < tile.window.rows) & (c < tile.window.cols))
+        if len(here):
+            out[here] = _unbroken(tile.ground_z)[r[here], c[here]]
+    return out
+
+
+def _unbroken(ground_z: F32) -> Bool:
+    """(rows, cols) cells around which the ground is known and nowhere leaps."""
+    side, known = 2 * _BESIDE_CELLS + 1, np.isfinite(ground_z)
+    highest = ndimage.maximum_filter(np.where(known, ground_z, np.inf), side, mode="nearest")
+    lowest = ndimage.minimum_filter(np.where(known, ground_z, -np.inf), side, mode="nearest")
+    with np.errstate(invalid="ignore"):
+        return np.asarray(highest - lowest <= BELOW_M)
+
+
+NEAR_M = 20.0
+"""Whoever passes nearer than this, in the plane, should meet what stands."""
+MET_SHARE = 0.03
+"""Of these places, the share from which it must be met: two scans of seventy, at 10 Hz and 40 km/h twice past."""
+SPILL_M = 0.06
+"""Points of two voxels so near on both sides of their common face are one surface: three sigmas of range noise."""
+_PLACE_M = 1.0
+_MOST_ASKED = 16
+"""Voxels met by more scans than this are not asked: 500 places within 20 m are a survey of a dozen passes."""
+
+
+def strays(points: F64, scans: I32, driven: F64, lattice: Lattice) -> Bool:
+    """(n,) which of a map's points (n, 3), one a voxel, in map metres, are no surface of their own.
+
+    ``scans`` (n,): how many scans met each; ``driven`` (m, 3): where all scans were taken. Places count, a metre apart,
+    for who waits at a light sees the same again.
+    """
+    places = driven[thin(driven, _PLACE_M)]
+    return _hardly_met(points, scans, places) | _spilled(points, scans, lattice)
+
+
+def _hardly_met(points: F64, scans: I32, places: F64) -> Bool:
+    out = np.zeros(len(points), dtype=np.bool_)
+    if not len(places):
+        return out
+    tree = cKDTree(places[:, :2])
+    # Places near to one point are near to each other: what was met oftener than the most of them ask is not counted.
+    most = tree.query_ball_point(places[:, :2], 2.001 * NEAR_M, return_length=True).max()
+    asked = np.flatnonzero(scans < min(_MOST_ASKED, MET_SHARE * most))
+    if len(asked):
+        passed = tree.query_ball_point(points[asked, :2], NEAR_M, return_length=True)
+        out[asked] = scans[asked] < MET_SHARE * passed
+    return out
+
+
+def _spilled(points: F64, scans: I32, lattice: Lattice) -> Bool:
+    """Points over the side of a voxel beside which more scans met a surface, less than SPILL_M off."""
+    keys = voxel_keys(points, lattice.x0, lattice.y0)
+    order = np.argsort(keys)
+    out = np.zeros(len(points), dtype=np.bool_)
+    if not len(points):
+        return out
+    for axis, origin in ((0, lattice.x0), (1, lattice.y0)):
+        within = (points[:, axis] - origin) % CELL_SIZE
+        aside = np.zeros(3)
+        for sign in (-1.0, 1.0):
+            aside[axis] = sign * CELL_SIZE
+            wanted = voxel_keys(_middles(points, lattice) + aside, lattice.x0, lattice.y0)
+            beside = order[np.minimum(np.searchsorted(keys, wanted, sorter=order), len(keys) - 1)]
+            mine = CELL_SIZE - within if sign > 0 else within
+            theirs = within[beside] if sign > 0 else CELL_SIZE - within[beside]
+            same = (keys[beside] == wanted) & (mine + theirs < SPILL_M)
+            out |= same & (mine < theirs) & (scans < scans[beside])
+    return out
+
+
+def _middles(points: F64, lattice: Lattice) -> F64:
+    """(n, 3) the middle of each point's voxel: steps from there reach the next one whatever rounding does."""
+    origin = np.array([lattice.x0, lattice.y0, 0.0])
+    return np.asarray((np.floor((points - origin) / CELL_SIZE) + 0.5) * CELL_SIZE + origin)
+
+
+TALL_M = 4.0
+"""No lorry is taller (Directive 96/53/EC)."""
+
+
+def trails(points: F64, balance: I64, height_m: F64, lattice: Lattice) -> Bool:
+    """(n,) which of the points (n, 3), one a voxel, above the ground, are trails.
+
+    ``balance`` (n,): in how many scans each point's voxel was met, less in how many rays passed it and met nothing;
+    ``height_m`` (n,) over the ground, NaN where nobody knows that. What belongs to an 8-connected group of cells that
+    was passed more often than met is a trail, but for cells that rise to TALL_M: those did not drive.
+    """
+    if not len(points):
+        return np.zeros(0, dtype=np.bool_)
+    cells, at = _cells(points, lattice)
+    top = np.full(len(cells), -np.inf)
+    np.maximum.at(top, at, np.nan_to_num(height_m, nan=np.inf))
+    of_cell = np.bincount(at, weights=balance, minlength=len(cells))
+    group, count = _groups(cells)
+    passed = np.bincount(group, weights=of_cell, minlength=count)[group] < 0
+    return np.asarray((passed & (top < TALL_M))[at])
+
+
+def _cells(points: F64, lattice: Lattice) -> tuple[I64, I64]:
+    """((m, 2) row and column of every cell that one of the points (n, 3) is in, (n,) which of them each is in)."""
+    rows, cols = lattice.cells_of(points)
+    width = int(cols.max()) + 1 - int(cols.min())  # one number a cell: pairs are sorted 20 times as slowly
+    flat, at = np.unique((rows - rows.min()) * width + cols - cols.min(), return_inverse=True)
+    return np.column_stack([flat // width, flat % width]), at
+
+
+def _groups(cells: I64) -> tuple[I64, int]:
+    """((n,) the 8-connected group of each of n cells (n, 2), how many there are)."""
+    beside = cKDTree(cells).query_pairs(1.5, output_type="ndarray") if len(cells) else np.zeros((0, 2), np.int64)
+    graph = coo_matrix((np.ones(len(beside), np.bool_), tuple(beside.T)), shape=(len(cells), len(cells)))
+    count, group = connected_components(graph, directed=False)
+    return group.astype(np.int64), int(count)
