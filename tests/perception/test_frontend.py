@@ -120,3 +120,20 @@ def test_rays_without_return_are_followed_of_the_vehicles_first_lidar_alone() ->
         passed[name] = int(np.bitwise_count(seen[0].view.passed & ~np.uint64(0b1111111)).sum())
     assert passed["second"] == 0, "the road is far below"
     assert passed["first"] > 10_000
+
+
+def test_a_sweep_of_two_lidars_is_placed_once_and_each_one_s_rays_begin_where_it_sits() -> None:
+    rear = np.array([-3.0, 0.5, 0.2])
+    whole = frontend()
+    assert whole.observe(Scan.sweep(0, [Scan(0, POINTS), Scan(0, POINTS, origin=rear)])) == []
+    first, second = whole.finish()
+    assert whole.report.scans == 1
+    assert [first.scan.index, second.scan.index] == [0, 0]
+    np.testing.assert_allclose(first.scan.origin_map, SENSOR[:3, 3])
+    np.testing.assert_allclose(second.scan.origin_map, SENSOR[:3, 3] + rear)
+    for seen, origin in ((first, None), (second, rear)):
+        one = frontend()
+        one.observe(Scan(0, POINTS, origin=origin))
+        (by_itself,) = one.finish()
+        np.testing.assert_array_equal(seen.view.passed, by_itself.view.passed)
+        np.testing.assert_array_equal(seen.view.hit, by_itself.view.hit)

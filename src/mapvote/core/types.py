@@ -5,9 +5,10 @@ Frames: ``map`` (the world), ``base`` (the vehicle), ``lidar``. SI units, else t
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -91,8 +92,48 @@ class Scan:
     origin: F64 | None = None
     """(3,) where its rays begin, in the frame of the points; None at (0, 0, 0), as with the vehicle's first LiDAR."""
 
+    others: tuple[tuple[int, F64], ...] = ()
+    """Of a sweep of several LiDARs: from which point on the next LiDAR's follow, and where (3,) their rays begin."""
+
+    @classmethod
+    def sweep(cls, stamp_ns: int, scans: Sequence[Scan]) -> Scan:
+        """Scans that several LiDARs of one vehicle took in one revolution as one, at ``stamp_ns``. Their points must be
+        in one frame (:meth:`seen_from`). Intensity and ring stay where all scans have them."""
+        if all(scan.time_s is None and scan.stamp_ns == stamp_ns for scan in scans):
+            time_s = None
+        else:
+            zero = (np.zeros(len(s.points), np.float32) if s.time_s is None else s.time_s for s in scans)
+            later = (np.float32((s.stamp_ns - stamp_ns) * 1e-9) for s in scans)
+            time_s = np.concatenate([t + late for t, late in zip(zero, later, strict=True)])
+        intensity = [s.intensity for s in scans if s.intensity is not None]
+        ring = [s.ring for s in scans if s.ring is not None]
+        starts = np.cumsum([len(s.points) for s in scans[:-1]]).tolist()
+        origins = [np.zeros(3) if s.origin is None else s.origin for s in scans]
+        return cls(
+            stamp_ns,
+            np.concatenate([s.points for s in scans]),
+            time_s,
+            np.concatenate(intensity) if len(intensity) == len(scans) else None,
+            np.concatenate(ring) if len(ring) == len(scans) else None,
+            scans[0].origin,
+            tuple(zip(starts, origins[1:], strict=True)),
+        )
+
+    def by_lidar(self) -> list[tuple[slice, Scan]]:
+        """Where the points of each LiDAR are, and its own part: one of a scan that one LiDAR took."""
+        if not self.others:
+            return [(slice(None), self)]
+        starts = [0, *(start for start, _ in self.others), len(self.points)]
+        origins = [self.origin, *(origin for _, origin in self.others)]
+        parts = [slice(a, b) for a, b in pairwise(starts)]
+        return [(part, self._part(part, origin)) for part, origin in zip(parts, origins, strict=True)]
+
+    def _part(self, part: slice, origin: F64 | None) -> Scan:
+        time_s, intensity, ring = (v if v is None else v[part] for v in (self.time_s, self.intensity, self.ring))
+        return Scan(self.stamp_ns, self.points[part], time_s, intensity, ring, origin)
+
     def origin_map(self, T_map_lidar: F64) -> F64:
-        """(3,) where its rays begin, in map metres."""
+        """(3,) where its rays begin, in map metres; of a sweep those of its first LiDAR."""
         start = T_map_lidar[:3, 3] if self.origin is None else T_map_lidar[:3, :3] @ self.origin + T_map_lidar[:3, 3]
         return np.array(start, dtype=np.float64)
 

@@ -67,8 +67,10 @@ def measure(drive: Drive, looks: Looks, progress: Progress | None = None) -> tup
     T = drive.T_map_lidar_prior
     usable = np.flatnonzero(np.isin(np.arange(len(drive)), looks.index))
     some = usable[np.linspace(0, len(usable) - 1, min(len(usable), _ROAD_SCANS)).astype(np.int64)]
-    clouds = [drive.read_scan(int(i)).points for i in some]
-    road, scatter_m = find_road(clouds), float(np.median([range_scatter_m(points) for points in clouds]))
+    scans = [drive.read_scan(int(i)) for i in some]
+    road = find_road([scan.points for scan in scans])
+    # Rays of another LiDAR begin elsewhere: beside each other in direction they end on other things.
+    scatter_m = float(np.median([range_scatter_m(scan.by_lidar()[0][1].points) for scan in scans]))
     found = _check_ranges(scatter_m) + _check_road(road, scatter_m, T, some.tolist())
     median_m = float(np.median(looks.range_m[:, 1]))
     if not 1.5 <= median_m <= 150.0 or road.up != "+z":

@@ -61,7 +61,7 @@ def _beams(drive: Drive, looks: Looks) -> list[Finding]:
     if drive.sensor_told.startswith("measured"):
         return []
     some = (drive.read_scan(int(looks.index[k])) for k in sorted({0, len(looks.index) // 2, len(looks.index) - 1}))
-    what = next(filter(None, (contradiction(drive.sensor, scan) for scan in some)), "")
+    what = next(filter(None, (contradiction(drive.sensor, scan.by_lidar()[0][1]) for scan in some)), "")
     return (
         [Finding("error", what, "leave out --sensor, and the sensor in drive.toml: it is measured then")]
         if what

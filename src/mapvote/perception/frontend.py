@@ -189,21 +189,27 @@ class Frontend:
         if not fix.trusted:
             report.lost.append(index)
             return []
-        with report.timed("ground"):
-            placed = self._place(fix, index)
-        self._waiting.append(placed)
-        with report.timed("moving"):
-            decided = self._movers.push(placed.points_map, placed.origin_map, placed.obstacle, fix.scan.stamp_ns)
-        return self._see(decided)
+        out = []
+        # The LiDARs of a sweep are placed together, but their rays begin at different places: each is a scan by itself.
+        for k, (part, scan) in enumerate(fix.scan.by_lidar()):
+            with report.timed("ground"):
+                placed = self._place(fix, fix.points[part], scan, index)
+            self._waiting.append(placed)
+            with report.timed("moving"):
+                stamp_ns = scan.stamp_ns + k
+                decided = self._movers.push(placed.points_map, placed.origin_map, placed.obstacle, stamp_ns)
+            out += self._see(decided)
+        return out
 
-    def _place(self, fix: Fix, index: int) -> PlacedScan:
+    def _place(self, fix: Fix, points: F32, scan: Scan, index: int) -> PlacedScan:
+        """``points`` (n, 3) of one LiDAR of the fix, de-skewed, and its ``scan``."""
         T_map_lidar = fix.registration.T_map_lidar
-        points_map, origin_map = transform(T_map_lidar, fix.points), fix.scan.origin_map(T_map_lidar)
+        points_map, origin_map = transform(T_map_lidar, points), scan.origin_map(T_map_lidar)
         sigma_m = float(np.sqrt(np.linalg.eigvalsh(fix.registration.covariance[:3, :3])[-1]))
         reference, outer = self._ground.at(origin_map)
         obstacle, cell = find_obstacles(points_map, reference)
         up_map = T_map_lidar[:3, 2]
-        by_first, intensity = fix.scan.origin is None, fix.scan.intensity
+        by_first, intensity = scan.origin is None, scan.intensity
         return PlacedScan(
             index, points_map, origin_map, up_map, sigma_m, reference, outer, obstacle, cell, by_first, intensity
         )

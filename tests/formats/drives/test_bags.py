@@ -22,32 +22,55 @@ T_BASE = {
 }
 
 
-def two_lidars(path: Path, *, static: bool = True) -> Path:
+def two_lidars(path: Path, *, static: bool = True, late_ns: int = 4 * 10**7, lost: int = -1) -> Path:
     bag = Recorder(path)
     if static:
         bag.static(T_BASE)
     for i in range(6):
         for late, (frame, T) in enumerate(T_BASE.items()):
-            ns = START + i * 10**8 + late * 4 * 10**7
-            bag.cloud(f"/{frame}/points", frame, ns, geometry.transform(geometry.inverse(T), HALL))
+            if (i, frame) != (lost, "front"):
+                ns = START + i * 10**8 + late * late_ns
+                bag.cloud(f"/{frame}/points", frame, ns, geometry.transform(geometry.inverse(T), HALL))
     bag.bag.close()
     return path
 
 
-def test_several_lidars_of_one_vehicle_are_one_drive(tmp_path: Path) -> None:
-    path = two_lidars(tmp_path / "bag")
-    with pytest.raises(MapvoteError, match="several LiDARs of one vehicle with commas"):
-        open_drive(path)
-    drive = open_drive(path, topic="/front/points,/rear/points", sensor="hdl32e")
-    assert len(drive) == 12
+BOTH = "/front/points,/rear/points"
+
+
+@pytest.mark.parametrize("late_ns", [0, 1_000, -1_000, 40_000_000, 50_000_000])
+def test_what_several_lidars_see_in_one_revolution_is_one_scan(tmp_path: Path, late_ns: int) -> None:
+    drive = open_drive(two_lidars(tmp_path / "bag", late_ns=late_ns), topic=BOTH, sensor="hdl32e")
     T_front_rear = geometry.inverse(T_BASE["front"]) @ T_BASE["rear"]
-    for i, scan in enumerate(drive):
+    assert len(drive) == 6
+    assert np.array_equal(drive.stamps_ns, START + np.arange(6) * 10**8)
+    for scan in drive:
         hall = geometry.transform(T_BASE["front"], scan.points.astype(np.float64))
         assert cKDTree(HALL).query(hall)[0].max() < 1e-4
-        rays_begin = scan.origin_map(np.eye(4))
-        assert np.allclose(rays_begin, np.zeros(3) if i % 2 == 0 else T_front_rear[:3, 3])
+        (first, front), (second, rear) = scan.by_lidar()
+        assert np.allclose(front.origin_map(np.eye(4)), 0.0)
+        assert np.allclose(rear.origin_map(np.eye(4)), T_front_rear[:3, 3])
+        assert len(front.points) + len(rear.points) == len(scan.points)
+        assert np.array_equal(scan.points[first], front.points)
+        if late_ns == 0:
+            assert scan.time_s is None
+        else:
+            assert scan.time_s is not None
+            assert np.allclose(scan.time_s[first], 0.0)
+            assert np.allclose(scan.time_s[second], late_ns * 1e-9)
+
+
+def test_a_lidar_that_misses_a_revolution_leaves_the_other_s_scan_by_itself(tmp_path: Path) -> None:
+    drive = open_drive(two_lidars(tmp_path / "bag", lost=3), topic=BOTH, sensor="hdl32e")
+    assert [len(scan.by_lidar()) for scan in drive] == [2, 2, 2, 1, 2, 2]
+    assert drive.read_scan(3).origin is not None
+
+
+def test_which_lidars_are_meant_and_where_they_sit_must_be_known(tmp_path: Path) -> None:
+    with pytest.raises(MapvoteError, match="several LiDARs of one vehicle with commas"):
+        open_drive(two_lidars(tmp_path / "bag"))
     with pytest.raises(MapvoteError, match="tf_static does not say"):
-        open_drive(two_lidars(tmp_path / "no_tf", static=False), topic="/front/points,/rear/points")
+        open_drive(two_lidars(tmp_path / "no_tf", static=False), topic=BOTH)
 
 
 def test_gnss_fixes_are_a_prior_in_the_maps_frame(tmp_path: Path) -> None:

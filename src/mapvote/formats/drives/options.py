@@ -259,7 +259,8 @@ def _sensor_of(
     if rate_hz is None and len(stamps_ns) > 1:
         rate_hz = float(np.clip(1e9 / np.median(np.diff(stamps_ns)), 0.1, 100.0))
     some = chosen[np.linspace(0, len(chosen) - 1, min(len(chosen), 3)).astype(np.int64)]
-    scans = [read_scan(int(i), replace(UNKNOWN, rate_hz=rate_hz or 10.0)) for i in np.unique(some)]
+    read = (read_scan(int(i), replace(UNKNOWN, rate_hz=rate_hz or 10.0)) for i in np.unique(some))
+    scans = [scan.by_lidar()[0][1] for scan in read]  # the first LiDAR's own
     found = estimate_sensor(scans, rate_hz or 10.0)
     if isinstance(said, dict):
         known = msgspec.to_builtins(found.sensor)

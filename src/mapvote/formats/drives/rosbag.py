@@ -5,6 +5,7 @@ from __future__ import annotations
 import struct
 import weakref
 from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,8 @@ from mapvote.formats.extras import first_line, require
 from mapvote.formats.geo.frame import MapFrame
 
 CLOUD = "sensor_msgs/msg/PointCloud2"
+_SWEEP = 0.55
+"""Revolutions within which the scans of several LiDARs are one sweep: they may turn at opposite phases."""
 PACKETS = ("Packet", "VelodyneScan", "PandarScan", "HesaiScan", "RslidarScan", "CustomMsg")
 """Parts of the names of messages in which drivers record what came over the wire."""
 
@@ -89,28 +92,34 @@ class Bag:
 
 
 def open_rosbag(path: Path, options: DriveOptions) -> Drive:
-    """The drive of one PointCloud2 topic, or of several of one vehicle (--topic /front,/rear), one after the other.
+    """The drive of one PointCloud2 topic, or of several of one vehicle (--topic /front,/rear).
 
-    Points of all LiDARs come in the frame of the first, by /tf_static. MapvoteError lists the topics if there is none
+    What several LiDARs took in one revolution is one scan, at the stamp of the first of them, its points in the frame
+    of the first topic's LiDAR, by /tf_static. MapvoteError lists the topics if there is none
     or a choice to make.
     """
     about = read_drive_file(path) if path.is_dir() else DriveFile()
     bag = Bag(path)
     topics = _choose_topics(bag, options.topic or about.topic)
     mounts = [np.eye(4), *(T_first_lidar(bag, topics[0], other) for other in topics[1:])]
-    which, received_ns, stamps_ns = _stamps(bag, topics)
+    sweeps = _sweeps(bag, topics)
+    stamps_ns = np.array([sweep[0].stamp_ns for sweep in sweeps], dtype=np.int64)
     T_prior, frame = _prior(bag, about, options, stamps_ns)
     bad_points = BadPoints(str(path))
 
-    def read_scan(i: int, sensor: Sensor) -> Scan:
-        start, topic = int(received_ns[i]), topics[which[i]]
+    def read_message(i: int, message: _Message, sensor: Sensor) -> Scan:
+        start, topic = message.received_ns, topics[message.topic]
         where = f"{path} {topic}, scan {i}"
         for connection, _, data in bag.raw(topic, start=start, stop=start + 1):
-            if bag.stamp_ns(data) in (stamps_ns[i], 0):
+            if bag.stamp_ns(data) in (message.stamp_ns, 0):
                 table = point_cloud_table(where, bag.decode(connection, data))
-                scan = scan_from_fields(where, i, int(stamps_ns[i]), table, sensor=sensor, bad_points=bad_points)
-                return scan if which[i] == 0 else scan.seen_from(mounts[which[i]])
+                scan = scan_from_fields(where, i, message.stamp_ns, table, sensor=sensor, bad_points=bad_points)
+                return scan if message.topic == 0 else scan.seen_from(mounts[message.topic])
         raise MapvoteError(f"{where}: gone; the bag changed while it was read")
+
+    def read_scan(i: int, sensor: Sensor) -> Scan:
+        scans = [read_message(i, message, sensor) for message in sweeps[i]]
+        return scans[0] if len(scans) == 1 else Scan.sweep(int(stamps_ns[i]), scans)
 
     return make_drive(
         path, about, options, stamps_ns=stamps_ns, T_map_lidar_prior=T_prior, read_scan=read_scan, frame=frame
@@ -165,16 +174,36 @@ def _choose_topics(bag: Bag, wanted: str | None) -> list[str]:
     return chosen
 
 
-def _stamps(bag: Bag, topics: list[str]) -> tuple[I64, I64, I64]:
-    """(topic, receive time, header stamp) of every scan by stamp; the receive times twice where drivers wrote none."""
-    found = [(k, time_ns, bag.stamp_ns(data)) for k, topic in enumerate(topics) for _, time_ns, data in bag.raw(topic)]
+@dataclass(frozen=True, slots=True)
+class _Message:
+    """One PointCloud2 of a bag."""
+
+    stamp_ns: int
+    topic: int
+    received_ns: int
+
+
+def _sweeps(bag: Bag, topics: list[str]) -> list[list[_Message]]:
+    """The messages of each scan of the drive, by topic: what several LiDARs took within half a revolution."""
+    found = [
+        _Message(bag.stamp_ns(data), k, time_ns)
+        for k, topic in enumerate(topics)
+        for _, time_ns, data in bag.raw(topic)
+    ]
     if not found:
         raise MapvoteError(f"{bag.path}: {', '.join(topics)}: no message can be read; copy the bag again")
-    rows = np.array(found, dtype=np.int64)
-    if (rows[:, 2] == 0).all():
+    if all(message.stamp_ns == 0 for message in found):
         log.warning("%s: %s has no stamps in its headers; the times of receipt are used", bag.path, ", ".join(topics))
-        rows[:, 2] = rows[:, 1]
-    if len(topics) > 1:
-        rows = rows[np.argsort(rows[:, 2], kind="stable")]
-        rows[1:, 2] += np.cumsum(np.diff(rows[:, 2]) == 0)  # of two at one moment the second comes a nanosecond later
-    return rows[:, 0], rows[:, 1], rows[:, 2]
+        found = [replace(message, stamp_ns=message.received_ns) for message in found]
+    if len(topics) == 1:
+        return [[message] for message in found]
+    first_ns = np.array([message.stamp_ns for message in found if message.topic == 0])
+    reach_ns = _SWEEP * float(np.median(np.diff(first_ns))) if len(first_ns) > 1 else 0.0
+    sweeps: list[list[_Message]] = []
+    for message in sorted(found, key=lambda m: (m.stamp_ns, m.topic)):
+        last = sweeps[-1] if sweeps else []
+        if last and message.stamp_ns - last[0].stamp_ns <= reach_ns and message.topic not in {m.topic for m in last}:
+            last.append(message)
+        else:
+            sweeps.append([message])
+    return [sorted(sweep, key=lambda m: m.topic) for sweep in sweeps]
