@@ -129,8 +129,14 @@ class Scan:
         return [(part, self._part(part, origin)) for part, origin in zip(parts, origins, strict=True)]
 
     def _part(self, part: slice, origin: F64 | None) -> Scan:
-        time_s, intensity, ring = (v if v is None else v[part] for v in (self.time_s, self.intensity, self.ring))
-        return Scan(self.stamp_ns, self.points[part], time_s, intensity, ring, origin)
+        return Scan(
+            self.stamp_ns,
+            self.points[part],
+            None if self.time_s is None else self.time_s[part],
+            None if self.intensity is None else self.intensity[part],
+            None if self.ring is None else self.ring[part],
+            origin,
+        )
 
     def origin_map(self, T_map_lidar: F64) -> F64:
         """(3,) where its rays begin, in map metres; of a sweep those of its first LiDAR."""
