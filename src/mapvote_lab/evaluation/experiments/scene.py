@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 
 import mapvote
+import mapvote_lab
 from mapvote.config import Settings
 from mapvote.core.columns import GROUND_MARGIN_M
 from mapvote.core.point_map import PointMap
@@ -50,17 +51,15 @@ BALLOTS_FROM = (
 
 @cache
 def sources_digest(parts: tuple[str, ...]) -> str:
-    """SHA-256 over the program text of some modules and packages of mapvote."""
-    root = Path(mapvote.__file__).parent
-    missing = [part for part in parts if not (root / part).exists()]
-    if missing:
-        raise FileNotFoundError(f"no such part of mapvote: {', '.join(missing)}")
-    files = [
-        f for part in parts for f in ([root / part] if part.endswith(".py") else sorted((root / part).rglob("*.py")))
-    ]
+    """SHA-256 over the program text of some modules and packages of mapvote and of its laboratory."""
+    roots = Path(mapvote.__file__).parent, Path(mapvote_lab.__file__).parent
     digest = hashlib.sha256()
-    for file in files:
-        digest.update(file.relative_to(root).as_posix().encode() + b"\0" + file.read_bytes())
+    for part in parts:
+        root = next((root for root in roots if (root / part).exists()), None)
+        if root is None:
+            raise FileNotFoundError(f"no such part of mapvote: {part}")
+        for file in [root / part] if part.endswith(".py") else sorted((root / part).rglob("*.py")):
+            digest.update(file.relative_to(root).as_posix().encode() + b"\0" + file.read_bytes())
     return digest.hexdigest()
 
 
