@@ -18,6 +18,7 @@ from mapvote.fusion.odds import agreed_odds, folded
 from mapvote.fusion.probability import alike_beside, change_probability
 from mapvote.fusion.tile_vote import TileVote
 from mapvote.server.errors import Unavailable
+from mapvote.server.insight.heard import said_by
 from mapvote.server.insight.levels import Levels, cloud_bytes, make_levels, pack
 from mapvote.server.store.blobs import TileHashes, unpack_fields_plane
 from mapvote.server.store.eligible_votes import DAMAGED, FOREVER, Electorate, from_sound_ballots, judged_votes
@@ -189,21 +190,13 @@ def evidence(store: Store, index: TileIndex, vehicle: str | None = None) -> U8:
     newest: dict[str, TileVote] = {}
     last = np.full((TILE_CELLS, TILE_CELLS), -1, dtype=np.int64)
     for vote in sorted(votes, key=lambda vote: (vote.end_ns, vote.digest)):
-        states, before = decided_states(vote.states, vote.tally), newest.get(vote.vehicle, silent)
+        states, before = said_by(vote), newest.get(vote.vehicle, silent)
         assert before.states is not None
         spoken = (states != NO_VOTE) & (states != CellState.UNDETERMINED)
         last[spoken] = vote.end_ns
         odds = folded([before, vote], [~spoken.reshape(-1), spoken.reshape(-1)])
         newest[vote.vehicle] = replace(silent, states=np.where(spoken, states, before.states), odds=odds)
     return _summary(list(newest.values()), last, store.clock(), policy.fuse.min_votes)
-
-
-def decided_states(states: U8 | None, tally: np.ndarray | None) -> U8:
-    """What a vote says of each cell, of its decisions or of its tally."""
-    if states is not None:
-        return states
-    assert tally is not None
-    return np.where(tally.any(axis=-1), tally.argmax(axis=-1), NO_VOTE).astype(np.uint8)
 
 
 def _summary(votes: Sequence[TileVote], last: I64, now_ns: int, quorum: int) -> U8:

@@ -21,7 +21,7 @@ from mapvote.fusion.persistence import expected_days
 from mapvote.fusion.probability import alike_beside, change_probability
 from mapvote.fusion.spent import unspent
 from mapvote.fusion.tile_vote import TileVote
-from mapvote.server.insight.heard import Place, decided_on, ended, heard_by, is_copy, is_silenced
+from mapvote.server.insight.heard import Place, decided_on, ended, heard_by, is_copy, is_silenced, said_by
 from mapvote.server.store import schema
 from mapvote.server.store.eligible_votes import (
     DAMAGED,
@@ -206,7 +206,7 @@ def _vote(stored: StoredVote, vote: TileVote | None, why: str, now: Place, heard
     whose = stored.vehicle, stored.drive, stored.version
     told: tuple[str, int | None, float | None] = UNREADABLE, None, None
     if vote is not None:
-        told = _said(vote, now.cell), _marks(vote, now.cell), _sure(vote, now.cell)
+        told = state_name(int(said_by(vote)[now.cell])), _marks(vote, now.cell), _sure(vote, now.cell)
     return CellVote(*whose, *told, stored.end_ns, not why, why, heard)
 
 
@@ -247,13 +247,6 @@ def _thing(connection: sa.Connection, now: Place, drives: Sequence[TileVote]) ->
 
 def states_of(data: bytes) -> U8:
     return unpack_plane(data, "<u1", (TILE_CELLS, TILE_CELLS), "decision: states")
-
-
-def _said(vote: TileVote, cell: tuple[int, int]) -> str:
-    if vote.states is not None:
-        return state_name(int(vote.states[cell]))
-    assert vote.tally is not None
-    return state_name(int(vote.tally[cell].argmax())) if vote.tally[cell].any() else "no_vote"
 
 
 def _marks(vote: TileVote, cell: tuple[int, int]) -> int | None:

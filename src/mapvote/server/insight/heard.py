@@ -6,9 +6,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
+import numpy as np
 import sqlalchemy as sa
 
 from mapvote.core.tile import Tile
+from mapvote.core.types import U8
+from mapvote.core.voting import decide
 from mapvote.fusion.fuse import Heard, decide_tile, rule_of
 from mapvote.fusion.tile_vote import TileVote
 from mapvote.server.store import schema
@@ -32,6 +35,15 @@ class Place:
     tile: Tile
     cell: tuple[int, int]
     asked: Electorate
+
+
+def said_by(vote: TileVote) -> U8:
+    """(256, 256) what a vote says of each cell: its states or, of one stage, what its tally alone decides. A tie is
+    undetermined, as in every decision."""
+    if vote.states is not None:
+        return vote.states
+    assert vote.tally is not None
+    return decide(vote.tally.astype(np.int32))
 
 
 def decided_on(place: Place, drives: Sequence[TileVote]) -> Heard:

@@ -7,14 +7,12 @@ from dataclasses import replace
 from functools import cache, partial
 from typing import Any
 
-import numpy as np
 import sqlalchemy as sa
 
 from mapvote.codec.ballot import tile_key
 from mapvote.core.grid import TileIndex
 from mapvote.core.tile import Tile
-from mapvote.core.types import U8, MapvoteError
-from mapvote.core.voting import decide
+from mapvote.core.types import MapvoteError
 from mapvote.fusion.odds import unpack_agreed
 from mapvote.fusion.tile_vote import DAY_NS, TileVote, one_each
 from mapvote.server.errors import Unavailable
@@ -23,6 +21,7 @@ from mapvote.server.insight.consensus import Compared, Spoken, Standing, compare
 from mapvote.server.insight.cutout import Box, Cutout, Tiles, cut_out, of_feature, whole_page
 from mapvote.server.insight.explain import states_of
 from mapvote.server.insight.geojson import to_geojson
+from mapvote.server.insight.heard import said_by
 from mapvote.server.insight.picture import before_and_after
 from mapvote.server.store import schema
 from mapvote.server.store.eligible_votes import (
@@ -161,7 +160,7 @@ def vehicle_standings(store: Store) -> list[Standing]:
         for index in standing_tiles(connection, FOREVER):
             said = from_sound_ballots(connection, everybody, partial(said_on, index))
             folded = one_each(said, store.lattice.tile(index))
-            compared += compare(index, [Spoken(vote.vehicle, vote.end_ns, _decided_states(vote)) for vote in folded])
+            compared += compare(index, [Spoken(vote.vehicle, vote.end_ns, said_by(vote)) for vote in folded])
     return standings_of(compared, store.lattice)
 
 
@@ -171,10 +170,3 @@ def events(store: Store, limit: int = 100) -> list[dict[str, Any]]:
     query = sa.select(e.seq, e.at_ns, e.kind, e.actor, e.detail).order_by(schema.events.c.seq.desc()).limit(limit)
     with store.database.reading() as connection:
         return [dict(row._mapping) for row in connection.execute(query)]
-
-
-def _decided_states(vote: TileVote) -> U8:
-    if vote.states is not None:
-        return vote.states
-    assert vote.tally is not None
-    return decide(vote.tally.astype(np.int32))
