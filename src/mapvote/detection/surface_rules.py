@@ -8,7 +8,7 @@ import numba
 import numpy as np
 from scipy import ndimage
 
-from mapvote.core.columns import TOP_BIT, dilated, shifted
+from mapvote.core.columns import TOP_BIT, shifted
 from mapvote.core.types import F32, F64, I32, NO_VOTE, U8, U64, Bool, CellState
 from mapvote.detection.evidence import CROSSED, HIT, PASSED, PASSES, PLANES, count_of
 from mapvote.detection.packed_tiles import Overlap
@@ -23,9 +23,10 @@ TOGETHER = 2
 NEW_RAYS = 0.5
 """Of the scans in which a free voxel was hit, one against two that crossed it."""
 SUPPORT = 6
-"""Voxels that a change must be decided by, over its 8-connected cells: a pole of 1.8 m, or half a square metre."""
-APART_SHARE = 0.25
-"""Of the voxels of what is new, those that must touch nothing that stands."""
+"""Voxels by which something gone must be decided, in its 8-connected cells: a pole of 1.8 m, half a square metre."""
+NEW_VOXELS, NEW_A_CELL, NEW_ENOUGH = 4, 2, 40
+"""Voxels that something new of A cells must be decided by: 4 + 2 A, or 40. What is thinner is noise beside what stands.
+The bound of 40 keeps large low things."""
 MOVED_CELLS = 3
 """How far behind what went its new side may lie: .9 m."""
 FALL_CELLS = 8
@@ -139,14 +140,15 @@ def judge_window(drive: VoxelFacts, here: Mapped, min_height_m: float) -> Window
         free voxel:    new if h >= 1 + NEW_RAYS c
 
     A cell is empty if a voxel of it is gone and none stands. Of an 8-connected group of empty cells with N gone voxels,
+    those apart that touch (26) no other mapped voxel,
 
         changed-empty  if N >= SUPPORT, or it is a thing of its own on the ground
 
-    and with it what :func:`_grown`, :func:`_fallen` and :func:`_lone` say. Of an 8-connected group of cells with N new
-    voxels, among them those that were hit beyond what the map knew within MOVED_CELLS of changed-empty,
+    and with it what :func:`grown`, :func:`fallen` and :func:`no_change` say. Of an 8-connected group of A cells with N
+    new voxels, among them those that were hit beyond what the map knew within MOVED_CELLS of changed-empty,
 
-        changed-occupied  if (N >= SUPPORT, or it is a thing of its own on the ground), sum h >= sum p, and
-                          APART_SHARE N of them touch nothing that stands or it lies within MOVED_CELLS of changed-empty
+        changed-occupied  if sum h >= sum p, and
+                          N >= min(NEW_VOXELS + NEW_A_CELL A, NEW_ENOUGH) or it is a thing of its own on the ground
 
     What rises less than ``min_height_m`` is never gone.
     """
@@ -159,30 +161,33 @@ def judge_window(drive: VoxelFacts, here: Mapped, min_height_m: float) -> Window
     states[(mapped & (drive.passed != 0)) | (beyond != 0)] = CellState.UNDETERMINED
     states[drive.stands != 0] = CellState.UNCHANGED_OCCUPIED
 
-    empty = (gone != 0) & (drive.stands == 0)
-    firm = supported(empty, gone) | on_its_own(empty, gone, here.occupied, mapped & ~empty)
+    empty, lone = (gone != 0) & (drive.stands == 0), lone_cells(here.occupied, here.base)
+    firm = supported(empty, np.where(lone, NOTHING, gone), SUPPORT) | on_its_own(
+        empty, gone, here.occupied, mapped & ~empty
+    )
     crossed = high & (drive.stands == 0) & ((drive.gone | drive.unmet) != 0)
     states[empty] = CellState.UNDETERMINED
     states[grown(firm, crossed)] = CellState.CHANGED_EMPTY
     states[fallen(states, high & nothing & _hollow_below(here.occupied, drive.passed), FALL_CELLS)] = (
         CellState.CHANGED_EMPTY
     )
-    states[no_change(states, lone_cells(here.occupied, here.base))] = CellState.UNDETERMINED
+    states[no_change(states, lone)] = CellState.UNDETERMINED
     went = states == CellState.CHANGED_EMPTY
     gone = np.where(went, here.occupied, gone)
 
     near = ndimage.maximum_filter(went, 2 * MOVED_CELLS + 1, mode="constant")
     new: U64 = np.bitwise_or(np.where(mapped, NOTHING, drive.new), np.where(near, beyond, NOTHING))
-    cells, stays = new != 0, dilated(drive.stands & ~gone, here.base, 1)
-    firm = supported(cells, new) | on_its_own(cells, new, new, here.occupied & ~gone != 0)
+    cells = new != 0
+    enough = np.minimum(NEW_VOXELS + NEW_A_CELL * _over_groups(cells, cells), NEW_ENOUGH)
+    firm = supported(cells, new, enough) | on_its_own(cells, new, new, here.occupied & ~gone != 0)
     states[cells] = CellState.UNDETERMINED
-    states[firm & lasting(cells, drive.balance) & stands_apart(cells, new, stays, near)] = CellState.CHANGED_OCCUPIED
+    states[firm & lasting(cells, drive.balance)] = CellState.CHANGED_OCCUPIED
     return WindowStates(states, gone, np.where(drive.stands != 0, gone, NOTHING), new)
 
 
-def supported(cells: Bool, voxels: U64) -> Bool:
-    """(rows, cols) those of ``cells`` whose 8-connected group has SUPPORT set bits in ``voxels`` (rows, cols)."""
-    return np.asarray(cells & (_over_groups(cells, np.bitwise_count(voxels)) >= SUPPORT))
+def supported(cells: Bool, voxels: U64, enough: float | F64) -> Bool:
+    """(rows, cols) those of ``cells`` whose 8-connected group has ``enough`` set bits in ``voxels`` (rows, cols)."""
+    return np.asarray(cells & (_over_groups(cells, np.bitwise_count(voxels)) >= enough))
 
 
 def on_its_own(cells: Bool, voxels: U64, whole: U64, others: Bool) -> Bool:
@@ -194,14 +199,6 @@ def on_its_own(cells: Bool, voxels: U64, whole: U64, others: Bool) -> Bool:
     tied = ndimage.binary_dilation(others, _AROUND) | (whole & _LOW == 0)
     alone = (_over_groups(cells, tied) == 0) & (2 * size >= _over_groups(cells, np.bitwise_count(whole)))
     return np.asarray(cells & tall & alone)
-
-
-def stands_apart(cells: Bool, new: U64, near: U64, went: Bool) -> Bool:
-    """(rows, cols) those of ``cells`` whose 8-connected group stands apart from what stands: APART_SHARE of its voxels
-    ``new`` are not ``near`` such (all planes (rows, cols)); else it is the rest of that, seen from where no survey
-    drove. What reaches cells where something ``went`` need not: that is its new side."""
-    size, far = (_over_groups(cells, np.bitwise_count(words)) for words in (new, new & ~near))
-    return np.asarray(cells & ((_over_groups(cells, went) > 0) | (far >= APART_SHARE * size)))
 
 
 def lasting(cells: Bool, balance: I32) -> Bool:
