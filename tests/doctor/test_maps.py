@@ -109,6 +109,13 @@ def test_walls_that_are_there_twice_are_a_ghost_with_its_shift(points: F64) -> N
     assert "3.2 m (x +3.0, y -1.0)" in found[0] or "3.2 m (x -3.0, y +1.0)" in found[0]
 
 
+def test_outliers_far_above_the_road_are_an_error(points: F64) -> None:
+    high = points.copy()
+    high[::20, 2] += 200.0
+    errors = [f.what for f in check_map(map_from_points(high)) if f.severity == "error"]
+    assert "5.0% of the points lie more than 100 m above the ground" in errors
+
+
 def test_coordinates_without_a_name_are_told(points: F64) -> None:
     far = map_from_points(points + np.array([367_000.0, 3_951_000.0, 20.0]))
     assert any("does not say which coordinates" in what for what in serious(check_map(far)))

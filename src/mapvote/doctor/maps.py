@@ -25,6 +25,8 @@ from mapvote.formats.maps.tiling import to_map
 
 _FAR_M = 50_000.0
 _SLOPE_DEG = 6.0
+_ALOFT_M = 100.0
+"""Over the ground hardly anything of a street is so high."""
 _SPARSE_M = 0.4
 """Points farther apart make patterns of their own."""
 _MIDDLE_POINTS = 4_000_000
@@ -127,6 +129,11 @@ def _ground(point_map: PointMap, points: F64, height: F64) -> list[Finding]:
     if below > 0.01:
         what = f"{below:.1%} of the points lie more than 1 m below the ground"
         found.append(Finding("warning", what, "reflections, cellars, or a second layer below"))
+    above = float((height > _ALOFT_M).mean())
+    if above > 0.001:
+        what = f"{above:.1%} of the points lie more than {_ALOFT_M:.0f} m above the ground"
+        mend = "outliers, or another place's points: cut them off; sound among towers only"
+        found.append(Finding("error" if above > 0.01 else "warning", what, mend))
     near = np.abs(height) < 0.15
     if near.sum() < 100:
         return [*found, Finding("warning", "hardly any point lies on the ground", "was the ground cut out of the map?")]
