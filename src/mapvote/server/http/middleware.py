@@ -11,7 +11,7 @@ from starlette.responses import Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from mapvote.core.types import MapvoteError
-from mapvote.server.errors import Forbidden, Unauthorised, Unavailable
+from mapvote.server.errors import Unavailable
 from mapvote.server.http.auth import Guard
 from mapvote.server.http.browsers import Hosts
 from mapvote.server.http.metrics import Metrics
@@ -84,13 +84,11 @@ class Watch:
             key, key_hash = whose or (None, None)
             scope.setdefault("state", {}).update(key=key, key_hash=key_hash)
             await self._app(scope, receive, watched)
-        except (Unauthorised, Forbidden) as error:
+        except MapvoteError as error:
             asks = scope["method"] in ("GET", "HEAD") and not any(n == b"authorization" for n, _ in scope["headers"])
             probed = asks and scope["path"] in Probe.PATHS
             answer = await self._probe.answer(scope["path"]) if probed else refuse(error)
             await answer(scope, receive, watched)
-        except MapvoteError as error:
-            await refuse(error)(scope, receive, watched)
         except asyncio.CancelledError:  # the server stops and waits no longer
             await refuse(Unavailable("the server is stopping: ask again once it is back"))(scope, receive, watched)
         finally:
