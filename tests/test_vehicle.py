@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -17,11 +20,12 @@ from mapvote.core.grid import TILE_CELLS
 from mapvote.core.point_map import PointMap, all_fields, all_points, map_from_points
 from mapvote.core.reference import reference_window
 from mapvote.core.sensors import SENSORS
-from mapvote.core.types import F64, CellState, MapvoteError, Registration, Scan
+from mapvote.core.types import F64, CellState, Drive, MapvoteError, Registration, Scan
 from mapvote.fusion.offline import update_map
 from mapvote.localisation.ndt import PosePrior
 from mapvote.localisation.odometry import Fix
-from mapvote.vehicle import Vehicle
+from mapvote.perception.frontend import DriveReport
+from mapvote.vehicle import Cuts, Road, Vehicle, vote_in_stretches
 
 RNG = np.random.default_rng(7)
 SENSOR_HEIGHT = 1.8
@@ -262,3 +266,48 @@ def test_by_surfaces_new_things_are_believed_only_where_the_map_knew_free_space(
         vehicle = drive(make(replace(unknown, tiles=free), Settings()))
         assert state_at(vehicle, 8.25, 3.5) in (state, CellState.UNDETERMINED)
     assert state_at(vehicle, 8.25, 3.5) == CellState.CHANGED_OCCUPIED
+
+
+def long_drive(n: int = 60) -> Drive:
+    """Past the wall and back, 0.4 m a scan."""
+    there = np.concatenate([np.linspace(-12.0, 0.0, n // 2), np.linspace(0.0, -12.0, n - n // 2)])
+    seen = [scan_of(float(x), i) for i, x in enumerate(there)]
+    stamps, prior = np.array([scan.stamp_ns for scan, _ in seen]), np.array([T for _, T in seen])
+    return Drive(Path("d"), "v1", "d", SENSORS["hdl32e"], stamps, lambda i: seen[i][0], prior)
+
+
+def test_a_drive_cut_into_ballots_has_every_scan_in_exactly_one_of_them() -> None:
+    drive_, point_map = long_drive(), street_map()
+    ballots = [written() for written in vote_in_stretches(drive_, make(point_map), Cuts(length_m=7.0))]
+    assert [ballot.drive for ballot in ballots] == ["d-001", "d-002", "d-003"]
+    assert sum(ballot.scans_localised for ballot in ballots) == sum(b.scans for b in ballots) == len(drive_)
+    assert [b.end_ns < later.start_ns for b, later in pairwise(ballots)] == [True] * 2
+    assert all(6.5 < (b.length_m or 0.0) < 7.5 for b in ballots[:-1])
+
+
+def test_ballots_written_while_the_drive_goes_on_are_those_written_at_once() -> None:
+    """What a stretch says is fixed when it is cut: nothing that comes later changes a bit of it."""
+    drive_, point_map, cuts = long_drive(), street_map(), Cuts(length_m=7.0)
+    at_once = [encode(written()) for written in vote_in_stretches(drive_, make(point_map), cuts)]
+    later = [encode(written()) for written in list(vote_in_stretches(drive_, make(point_map), cuts))]
+    assert at_once == later
+    assert len(set(at_once)) == 3
+
+
+def test_a_ballot_is_closed_by_road_by_time_and_by_a_stop_whichever_comes_first() -> None:
+    def closes(cuts: Cuts, x_of: Callable[[int], float]) -> int | None:
+        report, road = DriveReport(), Road()
+        for i in range(400):
+            T = np.eye(4)
+            T[0, 3] = x_of(i)
+            report.stamps_ns.append(i * 10**9)
+            report.T_map_lidar.append(T)
+            if cuts.due(report, i + 1, road):
+                return i
+        return None
+
+    assert closes(Cuts(length_m=100.0), float) == 100
+    assert closes(Cuts(time_s=50.0), float) == 50
+    assert closes(Cuts(), lambda i: float(min(i, 30))) == 30 + 120
+    assert closes(Cuts(), lambda i: 0.01 * (i % 2)) is None, "who has not driven has not stopped"
+    assert closes(Cuts(), float) is None

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -59,15 +61,27 @@ class Vehicle:
             with_sight=self.settings.voting.method == "paper",
             sensor=sensor,
         )
-        self._voter = make_voter(self.settings, sensor, point_map)
+        self._sensor = sensor
+        self._count_anew()
+
+    def _count_anew(self) -> None:
+        """No scan has voted yet."""
+        self._voter = make_voter(self.settings, self._sensor, self.point_map)
         self._new_points = NewPoints(
-            point_map.lattice, beyond=self.settings.voting.method != "paper", intensity=point_map.has_intensity
+            self.point_map.lattice,
+            beyond=self.settings.voting.method != "paper",
+            intensity=self.point_map.has_intensity,
         )
 
     @property
     def report(self) -> DriveReport:
         """How the drive goes."""
         return self._frontend.report
+
+    @property
+    def done(self) -> int:
+        """How many scans of the report have voted or are lost; those after them still wait."""
+        return self._frontend.done
 
     def observe(self, scan: Scan, T_map_lidar_prior: F64 | None = None) -> None:
         """One scan: localise, find what moves, see, vote. Its vote waits up to a second until it is known what moved.
@@ -80,6 +94,26 @@ class Vehicle:
     def finish(self) -> None:
         """The drive has ended: the scans that still wait vote now."""
         self._vote(self._frontend.finish())
+
+    def cut(self, next_drive_id: str) -> Callable[[], Ballot]:
+        """End this ballot and begin the next one on the same track: the drive goes on.
+
+        Scans that have voted are in the ballot that ends; those that wait vote in the next. Returns what writes the
+        ballot: it may be called later and in another thread, and raises MapvoteError if no scan has voted.
+        """
+        ended = partial(
+            write_ballot,
+            self.name,
+            self.drive_id,
+            self.point_map,
+            self.settings,
+            self._frontend.cut(),
+            self._voter,
+            self._new_points,
+        )
+        self.drive_id = next_drive_id
+        self._count_anew()
+        return ended
 
     def _vote(self, observations: list[Observation]) -> None:
         for seen in observations:
@@ -94,6 +128,55 @@ class Vehicle:
         return write_ballot(
             self.name, self.drive_id, self.point_map, self.settings, self.report, self._voter, self._new_points
         )
+
+
+@dataclass(frozen=True, slots=True)
+class Cuts:
+    """When the ballot of a drive without an end is closed: whichever comes first."""
+
+    length_m: float = 2000.0
+    time_s: float = 600.0
+    stop_s: float = 120.0
+    """The vehicle stood for so long."""
+    stop_m: float = 1.0
+    """Two places nearer than this are one stop."""
+
+    def due(self, report: DriveReport, done: int, road: Road) -> bool:
+        """Whether the ballot of the first ``done`` scans of ``report`` is to be closed now; ``road`` is theirs."""
+        road.follow(report, done, self.stop_m)
+        if not done:
+            return False
+        age_s = 1e-9 * (road.last_ns - report.stamps_ns[0])
+        stood_s = 1e-9 * (road.last_ns - road.moved_ns) if road.moved else 0.0
+        return road.length_m >= self.length_m or age_s >= self.time_s or stood_s >= self.stop_s
+
+
+class Road:
+    """What a drive's localised scans say of its road: followed as scans are done, each looked at once."""
+
+    def __init__(self) -> None:
+        self.followed = 0
+        """Scans looked at."""
+        self.moved = False
+        """Whether the vehicle has left the place where it began."""
+        self.length_m = 0.0
+        self.last_ns = self.moved_ns = 0
+        """Stamps of the last scan, and of the last one that was not at the present place."""
+        self._last: F64 | None = None
+        self._place: F64 | None = None
+
+    def follow(self, report: DriveReport, done: int, stop_m: float) -> None:
+        """Look at those of the first ``done`` scans of ``report`` that were not looked at yet."""
+        lost = set(report.lost) if done > self.followed else set()
+        for i in range(self.followed, done):
+            self.last_ns, position = report.stamps_ns[i], report.T_map_lidar[i][:3, 3]
+            if i not in lost and (self._place is None or np.linalg.norm(position - self._place) > stop_m):
+                self.moved = self._place is not None
+                self._place, self.moved_ns = position, self.last_ns
+            if i not in lost and self._last is not None:
+                self.length_m += float(np.linalg.norm(position - self._last))
+            self._last = None if i in lost else position
+        self.followed = done
 
 
 def make_voter(settings: Settings, sensor: Sensor, point_map: PointMap) -> Voter:
@@ -212,3 +295,22 @@ def vote_drive(
             progress(i + 1, len(drive))
     vehicle.finish()
     return vehicle.ballot(), vehicle.report
+
+
+def vote_in_stretches(drive: Drive, vehicle: Vehicle, cuts: Cuts) -> Iterator[Callable[[], Ballot]]:
+    """Every scan of ``drive`` observed by ``vehicle``, and what writes each ballot where it is closed. The ballots are
+    named DRIVE-001, DRIVE-002 and so on."""
+    name, road, k = drive.drive_id, Road(), 1
+    vehicle.drive_id = stretch_name(name, k)
+    for i, scan in enumerate(drive):
+        vehicle.observe(scan, None if drive.T_map_lidar_prior is None else drive.T_map_lidar_prior[i])
+        if cuts.due(vehicle.report, vehicle.done, road):
+            k, road = k + 1, Road()
+            yield vehicle.cut(stretch_name(name, k))
+    vehicle.finish()
+    yield vehicle.ballot
+
+
+def stretch_name(drive_id: str, k: int) -> str:
+    """The name of the k-th ballot of a drive, from 1."""
+    return f"{drive_id}-{k:03d}"

@@ -12,7 +12,7 @@ import time
 from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Protocol
 
@@ -86,6 +86,15 @@ class DriveReport:
         """What the priors said of themselves; None without priors."""
         said = [prior.sigma_m for prior in self.priors if prior is not None]
         return float(np.median(said)) if said else None
+
+    def split(self, n: int) -> DriveReport:
+        """Keep the first ``n`` scans, all of which have voted or are lost; returns the report of those after them."""
+        later = DriveReport(
+            self.stamps_ns[n:], [i - n for i in self.lost if i >= n], [], self.T_map_lidar[n:], self.priors[n:]
+        )
+        del self.stamps_ns[n:], self.T_map_lidar[n:], self.priors[n:]
+        self.lost = [i for i in self.lost if i < n]
+        return later
 
     @contextmanager
     def timed(self, stage: str) -> Iterator[None]:
@@ -180,6 +189,18 @@ class Frontend:
         with self.report.timed("localise"):
             fixes = self._localise.flush()
         return [seen for fix in fixes for seen in self._take(fix)] + self._see(self._movers.flush())
+
+    @property
+    def done(self) -> int:
+        """How many of the report's scans have voted or are lost; those after them still wait."""
+        return self._waiting[0].index if self._waiting else len(self.report.T_map_lidar)
+
+    def cut(self) -> DriveReport:
+        """The report of the scans that are done; those that still wait are the first of the drive from here on."""
+        done, n = self.report, self.done
+        self.report = done.split(n)
+        self._waiting = deque(replace(scan, index=scan.index - n) for scan in self._waiting)
+        return done
 
     def _take(self, fix: Fix) -> list[Observation]:
         """One more scan is decided: if it is lost it says nothing."""

@@ -1,0 +1,177 @@
+"""Topics of ROS 2 over DDS, by Cyclone DDS (extra ``ros2``): bytes of messages in and out, and who sends what.
+
+Names are ROS 2's: topic /points is ``rt/points`` on the wire, type sensor_msgs/msg/PointCloud2 is
+``sensor_msgs::msg::dds_::PointCloud2_``. The domain is ROS_DOMAIN_ID; CYCLONEDDS_URI names interfaces and peers.
+"""
+
+from __future__ import annotations
+
+import os
+from collections import defaultdict
+from dataclasses import dataclass
+from typing import Any
+
+from mapvote.core.types import MapvoteError
+from mapvote.formats.extras import first_line, require
+from mapvote.live.cdr import NUMBERS, TYPES, Field
+
+_DEPTH = 64
+"""Messages kept between two looks: six seconds of clouds."""
+_BLOCKING_NS = 10**9
+"""How long a reliable writer waits for a slow reader."""
+_ALIVE, _ANY = 16, 0x7F
+"""The instance state of a writer that exists; the mask of every sample, view and instance state."""
+
+
+@dataclass(frozen=True, slots=True)
+class Heard:
+    """A topic of ROS 2 that somebody sends."""
+
+    topic: str
+    kind: str
+    """Its message type, such as sensor_msgs/msg/PointCloud2."""
+    writers: int
+    reliable: bool
+    """Whether every writer is."""
+    transient_local: bool
+    """Whether every writer keeps its last messages for readers that come later."""
+
+
+class Network:
+    """One participant in a DDS domain."""
+
+    def __init__(self, domain: int | None = None) -> None:
+        """``domain`` defaults to ROS_DOMAIN_ID, else 0. MapvoteError without cyclonedds or without a network."""
+        self._core, self._pub, self._sub, self._topic, self._idl, builtin = (
+            require(f"cyclonedds.{name}", "ros2", "ROS 2 topics")
+            for name in ("core", "pub", "sub", "topic", "idl", "builtin")
+        )
+        self.domain = int(os.environ.get("ROS_DOMAIN_ID") or 0) if domain is None else domain
+        try:
+            self._participant = require("cyclonedds.domain", "ros2", "DDS").DomainParticipant(self.domain)
+        except Exception as error:
+            raise MapvoteError(
+                f"DDS domain {self.domain}: cannot be joined ({first_line(error)}); is the network interface up that "
+                "CYCLONEDDS_URI names?"
+            ) from error
+        self._own = str(self._participant.guid)
+        self._waitset = self._core.WaitSet(self._participant)
+        self._writers = builtin.BuiltinDataReader(self._participant, builtin.BuiltinTopicDcpsPublication)
+        self._topics: dict[tuple[str, str], Any] = {}
+        self._types: dict[str, Any] = {}
+
+    def heard(self) -> list[Heard]:
+        """Every topic of ROS 2 that other participants send now, by name."""
+        found: dict[tuple[str, str], list[Any]] = defaultdict(list)
+        for end in self._writers.read(10_000):
+            topic, kind = end.topic_name.removeprefix("rt"), ros_type(end.type_name)
+            alive = end.sample_info.valid_data and end.sample_info.instance_state == _ALIVE
+            if end.topic_name.startswith("rt/") and kind and alive and str(end.participant_key) != self._own:
+                found[topic, kind].append(end.qos)
+        policy = self._core.Policy
+        return [
+            Heard(
+                *name,
+                len(offers),
+                all(qos[policy.Reliability] != policy.Reliability.BestEffort for qos in offers),
+                all(qos[policy.Durability] == policy.Durability.TransientLocal for qos in offers),
+            )
+            for name, offers in sorted(found.items())
+        ]
+
+    def wait(self, seconds: float) -> None:
+        """Until one of the subscribed topics has a message, at most this long."""
+        self._waitset.wait(int(seconds * 1e9))
+
+    def subscribe(
+        self, topic: str, kind: str, *, reliable: bool, transient_local: bool = False, depth: int = _DEPTH
+    ) -> Subscription:
+        """Messages of ``topic`` from now on; a reader asks for no more than its writers offer, or it gets nothing."""
+        qos = self._qos(reliable, transient_local, depth, both=True)
+        reader = self._sub.DataReader(self._participant, self._topic_of(topic, kind), qos=qos)
+        self._waitset.attach(self._core.ReadCondition(reader, _ANY))
+        return Subscription(topic, kind, reader)
+
+    def publish(
+        self, topic: str, kind: str, *, reliable: bool = True, transient_local: bool = False, depth: int = _DEPTH
+    ) -> Publication:
+        """A writer of ``topic``."""
+        qos = self._qos(reliable, transient_local, depth, both=False)
+        return Publication(self._pub.DataWriter(self._participant, self._topic_of(topic, kind), qos=qos))
+
+    def _qos(self, reliable: bool, transient_local: bool, depth: int, *, both: bool) -> Any:
+        policy = self._core.Policy
+        return self._core.Qos(
+            policy.Reliability.Reliable(_BLOCKING_NS) if reliable else policy.Reliability.BestEffort,
+            policy.Durability.TransientLocal if transient_local else policy.Durability.Volatile,
+            policy.History.KeepLast(depth),
+            policy.DataRepresentation(use_cdrv0_representation=True, use_xcdrv2_representation=both),
+        )
+
+    def _topic_of(self, topic: str, kind: str) -> Any:
+        if (topic, kind) not in self._topics:
+            self._topics[topic, kind] = self._topic.Topic(self._participant, f"rt{topic}", self._type(kind))
+        return self._topics[topic, kind]
+
+    def _type(self, kind: str) -> Any:
+        """The type as Cyclone DDS knows it, which checks by it what comes over the wire."""
+        if kind not in self._types:
+            package, of, name = kind.split("/")
+            members = {field.name: self._member(field) for field in TYPES[kind]}
+            self._types[kind] = self._idl.make_idl_struct(name, f"{package}.{of}.dds_.{name}_", members)
+        return self._types[kind]
+
+    def _member(self, field: Field) -> Any:
+        types = require("cyclonedds.idl.types", "ros2", "DDS")
+        one: Any
+        if field.kind == "string":
+            one = str
+        elif field.kind == "bool":
+            one = bool
+        else:
+            one = getattr(types, field.kind) if field.kind in NUMBERS else self._type(field.kind)
+        if field.length is None:
+            return one
+        return types.array[one, field.length] if field.length else types.sequence[one]
+
+
+class Subscription:
+    """Messages of one topic, as they came."""
+
+    def __init__(self, topic: str, kind: str, reader: Any) -> None:
+        self.topic, self.kind, self._reader = topic, kind, reader
+        self._take = require("cyclonedds._clayer", "ros2", "DDS").ddspy_take
+
+    def take(self) -> list[bytes]:
+        """The bytes of every message that came since the last call; the oldest are gone if there were too many."""
+        taken = self._take(self._reader._ref, _ANY, _DEPTH)
+        if isinstance(taken, int):
+            raise MapvoteError(f"{self.topic}: DDS cannot read it (error {taken})")
+        return [data for data, info in taken if info.valid_data]
+
+
+class Publication:
+    """A writer of one topic."""
+
+    def __init__(self, writer: Any) -> None:
+        self._writer = writer
+        self._write = require("cyclonedds._clayer", "ros2", "DDS").ddspy_write
+
+    @property
+    def readers(self) -> int:
+        """How many read it now."""
+        return len(self._writer.get_matched_subscriptions())
+
+    def send(self, data: bytes) -> None:
+        """One message in CDR, as :func:`mapvote.live.cdr.encode` makes it. MapvoteError if DDS refuses it."""
+        result = self._write(self._writer._ref, data + bytes(-len(data) % 4))
+        if result < 0:
+            raise MapvoteError(f"DDS refuses a message of {len(data)} bytes (error {result}); is a reader too slow?")
+
+
+def ros_type(type_name: str) -> str | None:
+    """sensor_msgs/msg/PointCloud2 of ``sensor_msgs::msg::dds_::PointCloud2_``; None if it is no type of ROS 2."""
+    parts = type_name.split("::")
+    if len(parts) != 4 or parts[2] != "dds_" or not parts[3].endswith("_"):
+        return None
+    return f"{parts[0]}/{parts[1]}/{parts[3][:-1]}"
