@@ -14,7 +14,7 @@ from live.loopback_dds import LOOPBACK, domain_of
 from mapvote.core.sensors import SENSORS
 from mapvote.core.types import MapvoteError
 from mapvote.formats.drives.point_fields import scan_from_point_cloud2
-from mapvote.live.cdr import TYPES, blank, decode, encode, header, stamp_ns
+from mapvote.live.cdr import TYPES, blank_message, from_cdr, header_of, stamp_ns, to_cdr
 from mapvote.live.dds import Network, ros_type
 
 pytest.importorskip("cyclonedds")
@@ -25,22 +25,23 @@ START = 1_700_000_000_123_456_789
 def cloud(n: int = 1000) -> bytes:
     points = np.random.default_rng(4).uniform(5, 30, (n, 3)).astype("<f4")
     fields = [
-        blank("sensor_msgs/msg/PointField", name=a, offset=4 * i, datatype=7, count=1) for i, a in enumerate("xyz")
+        blank_message("sensor_msgs/msg/PointField", name=a, offset=4 * i, datatype=7, count=1)
+        for i, a in enumerate("xyz")
     ]
-    message = blank(
-        CLOUD, header=header(START, "lidar"), height=1, width=n, fields=fields, point_step=12, row_step=12 * n
+    message = blank_message(
+        CLOUD, header=header_of(START, "lidar"), height=1, width=n, fields=fields, point_step=12, row_step=12 * n
     )
     message.data = points.tobytes()
-    return encode(CLOUD, message)
+    return to_cdr(CLOUD, message)
 
 
 @pytest.mark.parametrize("kind", sorted(TYPES))
 def test_bytes_are_those_of_another_implementation_of_cdr(kind: str) -> None:
     store = get_typestore(Stores.ROS2_HUMBLE)
-    ours = encode(kind, blank(kind))
+    ours = to_cdr(kind, blank_message(kind))
     theirs = bytes(store.serialize_cdr(store.deserialize_cdr(ours, kind), kind))
     assert ours == theirs + bytes(-len(theirs) % 4)
-    assert encode(kind, decode(kind, theirs)) == ours
+    assert to_cdr(kind, from_cdr(kind, theirs)) == ours
 
 
 def test_what_another_implementation_wrote_is_read_to_the_last_digit() -> None:
@@ -55,7 +56,7 @@ def test_what_another_implementation_wrote_is_read_to_the_last_digit() -> None:
     )
     for big_endian in (False, True):
         data = bytes(store.serialize_cdr(types[TF]([stamped, stamped]), TF, little_endian=not big_endian))
-        second = decode(TF, data).transforms[1]
+        second = from_cdr(TF, data).transforms[1]
         assert (second.header.frame_id, second.child_frame_id) == ("base_link", "lidar_top")
         assert (second.transform.translation.z, second.transform.rotation.w) == (2.0, 0.8)
         assert stamp_ns(second) == 1_700_000_000_000_000_005
@@ -65,9 +66,9 @@ def test_a_message_that_is_cut_off_or_no_cdr_is_refused_and_says_so() -> None:
     whole = cloud()
     for length in (0, 3, 20, 60, len(whole) - 20):
         with pytest.raises(MapvoteError, match="PointCloud2"):
-            decode(CLOUD, whole[:length])
+            from_cdr(CLOUD, whole[:length])
     with pytest.raises(MapvoteError, match="no plain CDR"):
-        decode(CLOUD, b"\0\x03" + whole[2:])
+        from_cdr(CLOUD, b"\0\x03" + whole[2:])
 
 
 def test_only_types_of_ros_2_have_a_ros_2_name() -> None:
@@ -89,7 +90,7 @@ def test_a_cloud_goes_over_dds_and_is_the_scan_that_was_sent(monkeypatch: pytest
     out.send(cloud())
     listener.wait(5.0)
     (data,) = _until(incoming.take)
-    scan = scan_from_point_cloud2(decode(CLOUD, data), SENSORS["hdl32e"])
+    scan = scan_from_point_cloud2(from_cdr(CLOUD, data), SENSORS["hdl32e"])
     assert (scan.stamp_ns, len(scan.points)) == (START, 1000)
 
 
@@ -98,9 +99,9 @@ def test_a_reader_that_comes_late_gets_what_a_durable_writer_sent(monkeypatch: p
     domain = domain_of("late")
     sender, listener = Network(domain), Network(domain)
     out = sender.publish("/tf_static", TF, transient_local=True, depth=1)
-    out.send(encode(TF, blank(TF)))
+    out.send(to_cdr(TF, blank_message(TF)))
     incoming = listener.subscribe("/tf_static", TF, reliable=True, transient_local=True)
-    assert decode(TF, _until(incoming.take)[0]).transforms == []
+    assert from_cdr(TF, _until(incoming.take)[0]).transforms == []
 
 
 def _until(ask: Callable[[], Any]) -> Any:

@@ -85,7 +85,7 @@ def define(definitions: str) -> None:
 define(_DEFINITIONS)
 
 
-def blank(kind: str, **members: Any) -> Any:
+def blank_message(kind: str, **members: Any) -> Any:
     """A message of this type: zeros and empty strings, but for ``members``."""
     out = SimpleNamespace(**{field.name: _blank(field) for field in TYPES[kind]})
     for name, value in members.items():
@@ -98,10 +98,10 @@ def blank(kind: str, **members: Any) -> Any:
 def _blank(field: Field) -> Any:
     if field.length is not None:
         return np.zeros(field.length) if field.length else []
-    return 0 if field.kind in NUMBERS else "" if field.kind == "string" else blank(field.kind)
+    return 0 if field.kind in NUMBERS else "" if field.kind == "string" else blank_message(field.kind)
 
 
-def decode(kind: str, data: bytes) -> Any:
+def from_cdr(kind: str, data: bytes) -> Any:
     """The message, its members as attributes; numbers of a sequence as an array that is a view of ``data``.
 
     MapvoteError if the bytes end too early or are in an encoding that ROS 2 does not use.
@@ -114,7 +114,7 @@ def decode(kind: str, data: bytes) -> Any:
         raise MapvoteError(f"{kind}: a message of {len(data)} bytes is cut off or damaged ({error})") from error
 
 
-def encode(kind: str, message: Any) -> bytes:
+def to_cdr(kind: str, message: Any) -> bytes:
     """The message in little-endian CDR. Sequences of numbers may be given as bytes or arrays."""
     out = bytearray()
     _write(out, kind, message)
@@ -127,10 +127,10 @@ def stamp_ns(message: Any) -> int:
     return int(stamp.sec) * 10**9 + int(stamp.nanosec)
 
 
-def header(time_ns: int, frame_id: str) -> Any:
+def header_of(time_ns: int, frame_id: str) -> Any:
     """A std_msgs/Header."""
-    time = blank("builtin_interfaces/msg/Time", sec=time_ns // 10**9, nanosec=time_ns % 10**9)
-    return blank("std_msgs/msg/Header", stamp=time, frame_id=frame_id)
+    time = blank_message("builtin_interfaces/msg/Time", sec=time_ns // 10**9, nanosec=time_ns % 10**9)
+    return blank_message("std_msgs/msg/Header", stamp=time, frame_id=frame_id)
 
 
 class _Reader:

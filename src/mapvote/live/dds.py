@@ -163,7 +163,7 @@ class Publication:
         return len(self._writer.get_matched_subscriptions())
 
     def send(self, data: bytes) -> None:
-        """One message in CDR, as :func:`mapvote.live.cdr.encode` makes it. MapvoteError if DDS refuses it."""
+        """One message in CDR, as :func:`mapvote.live.cdr.to_cdr` makes it. MapvoteError if DDS refuses it."""
         result = self._write(self._writer._ref, data + bytes(-len(data) % 4))
         if result < 0:
             raise MapvoteError(f"DDS refuses a message of {len(data)} bytes (error {result}); is a reader too slow?")

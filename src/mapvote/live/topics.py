@@ -6,7 +6,7 @@ import time
 from dataclasses import dataclass
 
 from mapvote.core.types import MapvoteError
-from mapvote.live.cdr import TYPES, decode
+from mapvote.live.cdr import TYPES, from_cdr
 from mapvote.live.dds import Heard, Network, Subscription
 
 CLOUD, ODOMETRY, TF, FIX = (
@@ -57,7 +57,7 @@ def listen(network: Network, seconds: float) -> list[Listened]:
 
 def _frame(kind: str, data: bytes) -> str:
     try:
-        return str(getattr(getattr(decode(kind, data), "header", None), "frame_id", ""))
+        return str(getattr(getattr(from_cdr(kind, data), "header", None), "frame_id", ""))
     except MapvoteError as error:
         return f"damaged: {error}"
 
