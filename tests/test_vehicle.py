@@ -25,7 +25,7 @@ from mapvote.fusion.offline import update_map
 from mapvote.localisation.ndt import PosePrior
 from mapvote.localisation.odometry import Fix
 from mapvote.perception.frontend import DriveReport
-from mapvote.vehicle import Cuts, Road, Vehicle, vote_in_stretches
+from mapvote.vehicle import Cuts, RoadDriven, Vehicle, vote_in_stretches
 
 RNG = np.random.default_rng(7)
 SENSOR_HEIGHT = 1.8
@@ -296,7 +296,7 @@ def test_ballots_written_while_the_drive_goes_on_are_those_written_at_once() -> 
 
 def test_a_ballot_is_closed_by_road_by_time_and_by_a_stop_whichever_comes_first() -> None:
     def closes(cuts: Cuts, x_of: Callable[[int], float]) -> int | None:
-        report, road = DriveReport(), Road()
+        report, road = DriveReport(), RoadDriven()
         for i in range(400):
             T = np.eye(4)
             T[0, 3] = x_of(i)

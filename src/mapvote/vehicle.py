@@ -141,7 +141,7 @@ class Cuts:
     stop_m: float = 1.0
     """Two places nearer than this are one stop."""
 
-    def due(self, report: DriveReport, done: int, road: Road) -> bool:
+    def due(self, report: DriveReport, done: int, road: RoadDriven) -> bool:
         """Whether the ballot of the first ``done`` scans of ``report`` is to be closed now; ``road`` is theirs."""
         road.follow(report, done, self.stop_m)
         if not done:
@@ -151,7 +151,7 @@ class Cuts:
         return road.length_m >= self.length_m or age_s >= self.time_s or stood_s >= self.stop_s
 
 
-class Road:
+class RoadDriven:
     """What a drive's localised scans say of its road: followed as scans are done, each looked at once."""
 
     def __init__(self) -> None:
@@ -300,12 +300,12 @@ def vote_drive(
 def vote_in_stretches(drive: Drive, vehicle: Vehicle, cuts: Cuts) -> Iterator[Callable[[], Ballot]]:
     """Every scan of ``drive`` observed by ``vehicle``, and what writes each ballot where it is closed. The ballots are
     named DRIVE-001, DRIVE-002 and so on."""
-    name, road, k = drive.drive_id, Road(), 1
+    name, road, k = drive.drive_id, RoadDriven(), 1
     vehicle.drive_id = stretch_name(name, k)
     for i, scan in enumerate(drive):
         vehicle.observe(scan, None if drive.T_map_lidar_prior is None else drive.T_map_lidar_prior[i])
         if cuts.due(vehicle.report, vehicle.done, road):
-            k, road = k + 1, Road()
+            k, road = k + 1, RoadDriven()
             yield vehicle.cut(stretch_name(name, k))
     vehicle.finish()
     yield vehicle.ballot

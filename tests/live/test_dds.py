@@ -19,15 +19,13 @@ from mapvote.live.dds import Network, ros_type
 
 pytest.importorskip("cyclonedds")
 CLOUD, TF, ODOMETRY = "sensor_msgs/msg/PointCloud2", "tf2_msgs/msg/TFMessage", "nav_msgs/msg/Odometry"
+POINT_FIELD = "sensor_msgs/msg/PointField"
 START = 1_700_000_000_123_456_789
 
 
 def cloud(n: int = 1000) -> bytes:
     points = np.random.default_rng(4).uniform(5, 30, (n, 3)).astype("<f4")
-    fields = [
-        blank_message("sensor_msgs/msg/PointField", name=a, offset=4 * i, datatype=7, count=1)
-        for i, a in enumerate("xyz")
-    ]
+    fields = [blank_message(POINT_FIELD, name=axis, offset=4 * i, datatype=7, count=1) for i, axis in enumerate("xyz")]
     message = blank_message(
         CLOUD, header=header_of(START, "lidar"), height=1, width=n, fields=fields, point_step=12, row_step=12 * n
     )

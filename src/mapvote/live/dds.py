@@ -24,7 +24,7 @@ _ALIVE, _ANY = 16, 0x7F
 
 
 @dataclass(frozen=True, slots=True)
-class Heard:
+class SentTopic:
     """A topic of ROS 2 that somebody sends."""
 
     topic: str
@@ -60,7 +60,7 @@ class Network:
         self._topics: dict[tuple[str, str], Any] = {}
         self._types: dict[str, Any] = {}
 
-    def heard(self) -> list[Heard]:
+    def heard(self) -> list[SentTopic]:
         """Every topic of ROS 2 that other participants send now, by name."""
         found: dict[tuple[str, str], list[Any]] = defaultdict(list)
         for end in self._writers.read(10_000):
@@ -70,7 +70,7 @@ class Network:
                 found[topic, kind].append(end.qos)
         policy = self._core.Policy
         return [
-            Heard(
+            SentTopic(
                 *name,
                 len(offers),
                 all(qos[policy.Reliability] != policy.Reliability.BestEffort for qos in offers),

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from mapvote.core.types import MapvoteError
 from mapvote.live.cdr import TYPES, from_cdr
-from mapvote.live.dds import Heard, Network, Subscription
+from mapvote.live.dds import Network, SentTopic, Subscription
 
 CLOUD, ODOMETRY, TF, FIX = (
     "sensor_msgs/msg/PointCloud2",
@@ -21,7 +21,7 @@ CLOUD, ODOMETRY, TF, FIX = (
 class Listened:
     """A topic that was listened to."""
 
-    heard: Heard
+    heard: SentTopic
     messages: int
     rate_hz: float | None
     """None: its type is none of those that are read here."""
