@@ -270,7 +270,7 @@ def fuse(
     quorum = max(quorum, min(settings.min_votes, 2))
     learns = len({c.vehicle for c in chosen if c.has_free})
     knows = before.knows_free or learns >= max(quorum, 1)
-    lately = [c for c in ripe if max(r.end_s for r in ripe) - c.end_s <= settings.stay_days * DAY_S]
+    lately = [c for c in ripe if max(r.end_s for r in ripe) - c.end_s <= window_days(settings) * DAY_S]
     lately = without_copies(lately, settings)
     cells, added, decided = {}, False, {}
     for cell, held in before.cells.items():
@@ -286,13 +286,18 @@ def fuse(
                 heard.setdefault(cast.vehicle, []).append(cast)
         recent = sorted((c for c in lately if counts(c)), key=lambda c: c.end_s)
         says = {vehicle: drives[-1].says[cell] for vehicle, drives in heard.items()}
-        decided[cell] = state_of(held, heard, says, recent, cell, settings, quorum), says, last
+        decided[cell] = (
+            state_of(held, heard, says, recent, cell, settings, quorum),
+            says,
+            last,
+            unbroken(recent, cell, settings)[0],
+        )
     stay = [
         (cell, layer)
-        for cell, (state, says, _) in decided.items()
-        if state == UO
+        for cell, (state, says, *_) in decided.items()
+        if state != CE
         for layer in layers(before.cells[cell])
-        if layer and not is_left(layer, says, quorum)
+        if layer and (state != UO or not (is_left(layer, says, quorum) or is_nearly_gone(layer, says, quorum)))
     ]
     for cell, held in before.cells.items():
         beside = {n for (r, c), n in stay if abs(r - cell[0]) <= 1 and abs(c - cell[1]) <= 1}
@@ -342,7 +347,13 @@ def layers(held: CellMap) -> set[int]:
 
 
 def edited(
-    held: CellMap, state: int, says: dict[str, Spoken], last: dict[str, int], quorum: int, touched: set[int]
+    held: CellMap,
+    state: int,
+    says: dict[str, Spoken],
+    last: dict[str, int],
+    since: int | None,
+    quorum: int,
+    touched: set[int],
 ) -> CellMap:
     """One cell after its points went and came, and what it remembers; ``touched`` layers lie beside what stays."""
     heights = held.heights
@@ -357,7 +368,8 @@ def edited(
                 heights += (next(mine[layer] for mine in offered.values() if layer in mine),)
     new = replace(held, heights=heights)
     if new.stands() and not held.stands():
-        return replace(new, came_s=min(last[v] for v, s in says.items() if s.state == CO))
+        first = min(last[v] for v, s in says.items() if s.state == CO)
+        return replace(new, came_s=first if since is None else min(since, first))
     if held.stands() and not new.stands() and held.came_s:
         ended = max(min((last[v] for v, s in says.items() if s.state == CE), default=0), held.came_s)
         return replace(new, came_s=0, stays=held.stays + 1, stayed_s=held.stayed_s + ended - held.came_s)
@@ -400,9 +412,12 @@ def goes(layer: int, state: int, says: dict[str, Spoken], quorum: int, touched: 
     if state == CE:
         marks = [EVERY if s.gone is None else s.gone for s in says.values() if s.state == CE]
         return sum(m >> layer & 1 for m in marks) >= quorum
-    return is_marked(layer, says, max(quorum, 2), (UO, CE), 2 / 3) or (
-        layer not in touched and is_left(layer, says, quorum)
-    )
+    return is_nearly_gone(layer, says, quorum) or (layer not in touched and is_left(layer, says, quorum))
+
+
+def is_nearly_gone(layer: int, says: dict[str, Spoken], quorum: int) -> bool:
+    """Whether two thirds of the vehicles say that a voxel is gone, alone or with its whole cell."""
+    return is_marked(layer, says, max(quorum, 2), (UO, CE), 2 / 3)
 
 
 def is_left(layer: int, says: dict[str, Spoken], quorum: int) -> bool:
@@ -417,9 +432,15 @@ def is_marked(layer: int, says: dict[str, Spoken], quorum: int, saying: tuple[in
     return marking >= quorum and marking > share * determined + 1e-9
 
 
-def is_temporary(held: CellMap, recent: list[Cast], cell: Cell, settings: FuseSettings) -> bool:
-    """What is new stays out until it can be expected to stay, by what came and went here before and its own age."""
-    since, seen, absent = None, 0, 0
+def window_days(settings: FuseSettings) -> float:
+    """How far back anybody looks for a first sighting."""
+    return max(2 * settings.stay_days, settings.max_age_days)
+
+
+def unbroken(recent: list[Cast], cell: Cell, settings: FuseSettings) -> tuple[int | None, int]:
+    """When what is seen in a cell without a break was first seen, and last."""
+    since: int | None = None
+    seen = absent = 0
     for cast in recent:
         state = cast.says[cell].state
         if state == UE:
@@ -428,6 +449,12 @@ def is_temporary(held: CellMap, recent: list[Cast], cell: Cell, settings: FuseSe
         if state == CO:
             absent, seen = 0, cast.end_s
             since = cast.end_s if since is None else since
+    return since, seen
+
+
+def is_temporary(held: CellMap, recent: list[Cast], cell: Cell, settings: FuseSettings) -> bool:
+    """What is new stays out until it can be expected to stay, by what came and went here before and its own age."""
+    since, seen = unbroken(recent, cell, settings)
     age = 0.0 if since is None else (seen - since) / DAY_S
     expected = (settings.prior_stay_days + held.stayed_s / DAY_S + age) / (1.0 + held.stays)
     sure = (settings.prior_stay_days + held.stayed_s / DAY_S) / (1.0 + held.stays) >= settings.stay_days

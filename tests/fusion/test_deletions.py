@@ -14,8 +14,9 @@ from mapvote.core.grid import TILE_CELLS
 from mapvote.core.tile import Tile
 from mapvote.core.types import NO_VOTE, CellState
 from mapvote.fusion.deletions import words_gone
+from mapvote.fusion.edit import delete_points
 from mapvote.fusion.sparse_columns import Words
-from mapvote.fusion.tile_vote import TileVote
+from mapvote.fusion.tile_vote import TileVote, silenced
 
 UO, UE, CO, CE, UN = CellState
 CELL = (10, 10)
@@ -75,7 +76,8 @@ def test_what_touches_what_stays_in_the_next_cell_only_touches_it_too() -> None:
         ((10, 11), UO, True),
         ((11, 9), UO, True),
         ((10, 12), UO, False),
-        ((10, 11), UN, False),
+        ((10, 11), UN, True),
+        ((10, 11), CE, False),
     ):
         tile = make_tile(np.concatenate([twig, wall([beside], [0.75])]))
         decided = states_plane({CELL: UO, beside: other})
@@ -138,3 +140,44 @@ def test_the_order_of_votes_is_nothing_and_one_mark_more_never_takes_less(
     before = gone(tile, votes)
     assert gone(tile, votes[::-1]) == before
     assert gone(tile, says([masks[0] | more, *masks[1:]], states[: len(masks)])) & before == before
+
+
+def test_a_mapped_neighbour_that_nobody_decides_stays_and_keeps_what_touches_it() -> None:
+    """Its votes are spent: it stands as before. Else a publish without new votes would delete more."""
+    beside = (CELL[0], CELL[1] + 1)
+    tile = make_tile(wall([CELL, beside], [0.45]))
+    votes = says([0b10, 0b10, 0], [UO, UO, UO])
+    assert gone(tile, votes) == 0
+    assert gone(make_tile(wall([CELL], [0.45])), votes) == 0b10, "alone it is a remnant"
+
+
+@settings(max_examples=60)
+@given(st.data())
+def test_the_same_votes_delete_nothing_more_where_their_cells_have_not_changed(data: st.DataObject) -> None:
+    """Votes on a cell are spent once its points change. The other votes delete nothing in a second publish."""
+    block = [(20 + r, 20 + c) for r in range(3) for c in range(3)]
+    heights = {
+        cell: data.draw(st.lists(st.sampled_from([0.45, 0.75, 1.05]), max_size=3, unique=True)) for cell in block
+    }
+    mapped = [cell for cell in block if heights[cell]]
+    if not mapped:
+        return
+    tile = make_tile(np.concatenate([wall([cell], heights[cell]) for cell in mapped]))
+    decided = {cell: data.draw(st.sampled_from([UO, CE, UN, None])) for cell in mapped}
+    votes = []
+    for i in range(3):
+        masks = {cell: data.draw(st.sampled_from([0, 0b10, 0b100, 0b1110])) for cell in mapped}
+        agree = {cell: state for cell, state in decided.items() if state is not None}
+        votes.append(TileVote(f"v{i}", 0, f"d{i}", states=states_plane(agree), gone=Words.of(words_plane(masks))))
+    states = states_plane({cell: state for cell, state in decided.items() if state is not None})
+    first = words_gone(votes, states, 2, tile)
+    if first is None:
+        return
+    deleted = np.asarray(first & tile.obstacle_words)
+    after, _ = delete_points(tile, first)
+    spent = np.flatnonzero(deleted)
+    again = [silenced(vote, spent) for vote in votes]
+    states = states.copy()
+    states.reshape(-1)[spent] = NO_VOTE
+    second = words_gone(again, states, 2, after)
+    assert second is None or not (second & after.obstacle_words).any()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -16,8 +17,18 @@ from mapvote.core.memory import Memory
 from mapvote.core.tile import Tile
 from mapvote.core.types import Bool, CellState
 from mapvote.fusion.fuse import fuse_tile
-from mapvote.fusion.persistence import DAY_S, ages_days, denied_last, doubtful, expected_days, remembered, temporary
-from mapvote.fusion.tile_vote import TileVote
+from mapvote.fusion.persistence import (
+    DAY_S,
+    ages_days,
+    denied_last,
+    doubtful,
+    expected_days,
+    history_days,
+    remembered,
+    temporary,
+)
+from mapvote.fusion.spent import unspent
+from mapvote.fusion.tile_vote import DAY_NS, TileVote, select
 
 UO, UE, CO, CE, UN = (int(state) for state in CellState)
 CELL, OTHER = (10, 10), (200, 3)
@@ -228,3 +239,42 @@ def test_the_last_who_could_tell_has_a_veto_and_those_before_have_none(said: lis
 def test_what_stands_where_nothing_new_was_decided_did_not_come() -> None:
     same = remembered(Memory.none(), BARE, STANDS, [second("a", START_S, CO)], states_plane({CELL: UO}))
     assert same.came_s[CELL] == 0
+
+
+def enters_on(things: Sequence[tuple[float, float]], rng: np.random.Generator, settings: FuseSettings) -> float | None:
+    """The day on which the last of ``things`` (from, to) enters the map; None if it never does.
+
+    Three perfect vehicles pass every day, each at any minute, and the server publishes after each pass.
+    """
+    tile, seen, version = BARE, list[TileVote](), 1
+    for day in sorted(day + hour / 24 for day in range(int(things[-1][0]) + 120) for hour in rng.uniform(0, 24, 3)):
+        there, mapped = any(start <= day < end for start, end in things), bool(tile.obstacle_words[CELL])
+        state = {(True, True): UO, (True, False): CO, (False, True): CE, (False, False): UE}[there, mapped]
+        new = wall([CELL], [0.75]).astype(np.float32) if state == CO else None
+        seen.append(replace(drive(day, {CELL: state}, f"v{len(seen) % 3}"), version=version, new_points=new))
+        oldest = seen[-1].end_ns - history_days(settings) * DAY_NS
+        seen = [vote for vote in seen if vote.end_ns >= oldest]
+        votes, past = ([unspent(vote, tile) for vote in some] for some in (select(seen, settings), seen))
+        after = fuse_tile(tile, votes, "paper", settings, version + 1, partial(list, past))[1]
+        if after is not tile:
+            tile, version = after, version + 1
+            if tile.obstacle_words[CELL] and day >= things[-1][0]:
+                return float(day)
+    return None
+
+
+@pytest.mark.parametrize("seed", [0, 1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(2, 500))])
+@pytest.mark.parametrize("things", [[(1, 3), (5, 34), (36, 999)], [(1, 4), (10, 50), (60, 999)]])
+def test_what_stands_for_good_enters_the_map_whatever_stood_there_before(
+    things: list[tuple[float, float]], seed: int
+) -> None:
+    """Within ``stay_days`` and three passes, at any minute of the day."""
+    entered = enters_on(things, np.random.default_rng(seed), SETTINGS)
+    assert entered is not None
+    assert entered <= things[-1][0] + SETTINGS.stay_days + 2
+
+
+def test_without_a_prior_what_is_new_enters_after_the_days_that_it_must_stay() -> None:
+    entered = enters_on([(1, 999)], np.random.default_rng(1), SETTINGS.model_copy(update={"prior_stay_days": 0.0}))
+    assert entered is not None
+    assert 31 <= entered <= 33

@@ -41,14 +41,19 @@ def words_gone(votes: Sequence[TileVote], states: U8, quorum: int, tile: Tile) -
     emptied_by = [vote.deletes(standing) if vote.tally is None else Words.none() for vote in votes]
     if sum(len(a.cells) + len(b.cells) > 0 for a, b in zip(left, emptied_by, strict=True)) < quorum:
         return gone
-    remnants = _remnants(left, emptied_by, votes, stands, quorum, tile)
+    remnants = _remnants(left, emptied_by, votes, states != int(CellState.CHANGED_EMPTY), quorum, tile)
     gone = np.zeros(states.shape, dtype=np.uint64) if gone is None else gone
     gone.reshape(-1)[remnants.cells] |= remnants.words
     return gone
 
 
 def _remnants(
-    left: Sequence[Words], emptied_by: Sequence[Words], votes: Sequence[TileVote], stands: Bool, quorum: int, tile: Tile
+    left: Sequence[Words],
+    emptied_by: Sequence[Words],
+    votes: Sequence[TileVote],
+    stays_in: Bool,
+    quorum: int,
+    tile: Tile,
 ) -> Words:
     """What of cells that stand goes: the voxels that ``quorum`` vehicles or more, and more than half of those that
     determined the cell, say are ``left`` of something, if they touch (26) nothing of the map that stays; and those that
@@ -60,8 +65,8 @@ def _remnants(
     determined = np.sum([vote.determined(cells) for vote in votes], axis=0)[:, None]
     most = packed((halves >= quorum) & (2 * halves > determined))
     nearly_all = packed((marks >= max(quorum, 2)) & (3 * marks > 2 * determined))
-    stays = np.where(stands, tile.obstacle_words, np.uint64(0))
-    stays.reshape(-1)[cells] &= ~most
+    stays = np.where(stays_in, tile.obstacle_words, np.uint64(0))
+    stays.reshape(-1)[cells] &= ~(most | nearly_all)
     return Words(cells, nearly_all | (most & ~_touched(cells, stays, tile.base)))
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import partial
+from functools import cache, partial
 from typing import Any, Literal
 
 import numpy as np
@@ -134,13 +134,20 @@ def fuse_tile(
     tile, give :meth:`mapvote.core.tile.Tile.empty`. ``version``: of the map that this makes; the edited tile remembers
     it. The rest as in :func:`decide_tile`.
     """
-    heard = decide_tile(tile, drives, rule, settings, history)
+    past = None if history is None else _once(history, settings)
+    heard = decide_tile(tile, drives, rule, settings, past)
     edited, added, deleted = _edit(tile, heard.votes, heard.edits, heard.quorum)
     if edited is not tile:
         memory = changed_in(version, tile, edited)
-        edited = edited.but(memory=remembered(memory, tile, edited, heard.votes, heard.edits))
+        runs = None if past is None else (past, settings.min_votes)
+        edited = edited.but(memory=remembered(memory, tile, edited, heard.votes, heard.edits, runs))
     voters, why = len(heard.votes), (heard.copies, heard.odds, heard.pending)
     return Decision(heard.states, heard.tally, voters, added, deleted, *why), edited
+
+
+def _once(history: History, settings: FuseSettings) -> History:
+    """``history`` without copies, read when it is first asked for and kept."""
+    return cache(lambda: originals(history(), settings)[0])
 
 
 def decide_tile(
@@ -150,7 +157,8 @@ def decide_tile(
 
     ``drives`` are the votes that count on this tile (``select`` in fusion/tile_vote.py, ``unspent`` in
     fusion/spent.py), any order. ``history``: asked, where something comes and goes, for all votes that count of the
-    last ``stay_days``; without it all is of one moment, and everything new is there to stay.
+    last ``history_days`` (fusion/persistence.py), without copies; without it all is of one moment, and everything new
+    is there to stay.
     """
     drives, copies = originals(list(drives), settings)
     silenced = liars_among(copies, drives)
@@ -164,8 +172,7 @@ def decide_tile(
     if history is not None:
         denied = denied_last(states, tile.memory, spoken)
         doubt = doubtful(states, tile.memory, settings).any()
-        past = originals(history(), settings)[0] if doubt else []
-        passing = temporary(states, tile, past, settings) if doubt else np.zeros_like(denied)
+        passing = temporary(states, tile, history(), settings) if doubt else np.zeros_like(denied)
         states = states.copy()
         states[denied | passing] = int(CellState.UNDETERMINED)
     odds = agreed_odds(votes, states, quorum)

@@ -14,7 +14,7 @@ by a quorum alone, so that nobody who denies it can hold it up.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numba
 import numpy as np
@@ -46,16 +46,27 @@ def doubtful(states: U8, memory: Memory | None, settings: FuseSettings) -> Bool:
     return np.asarray(out)
 
 
-def ages_days(drives: Sequence[TileVote], cells: Bool, breaks: int) -> F64:
-    """(n,) for how long something has been seen in ``cells`` (256, 256): from its first sighting to its last.
+def history_days(settings: FuseSettings) -> float:
+    """How far back votes tell since when a thing has been seen, days.
 
-    Of all ``drives`` that count there, each by itself. So many as ``breaks`` in a row that see nothing begin it anew.
+    Twice ``stay_days``: vehicles pass at any minute, so a window of just ``stay_days`` never holds a first sighting
+    that is ``stay_days`` older than the last one.
     """
-    n = int(cells.sum())
+    return max(2.0 * settings.stay_days, settings.max_age_days)
+
+
+def unbroken(drives: Sequence[TileVote], cells: I64, breaks: int) -> tuple[I64, I64]:
+    """(n,) the first and (n,) the last sighting, seconds, of what is seen in flat ``cells`` (n,) without a break; -1
+    where nothing is.
+
+    Of all ``drives`` that count there, each by itself. ``breaks`` drives in a row that see nothing end a thing.
+    """
+    n = len(cells)
     since, last, absent = np.full(n, -1, np.int64), np.full(n, -1, np.int64), np.zeros(n, np.int64)
     for drive in sorted(drives, key=lambda drive: (drive.end_ns, drive.digest)):
-        assert drive.states is not None
-        seen = drive.states[cells]
+        if drive.states is None:
+            continue
+        seen = drive.states.reshape(-1)[cells]
         there, nothing = seen == _CO, seen == _UE
         absent[there] = 0
         absent[nothing] += 1
@@ -63,13 +74,20 @@ def ages_days(drives: Sequence[TileVote], cells: Bool, breaks: int) -> F64:
         end_s = max(drive.end_ns // 10**9, 0)
         since[there & (since < 0)] = end_s
         last[there] = end_s
+    return since, last
+
+
+def ages_days(drives: Sequence[TileVote], cells: Bool, breaks: int) -> F64:
+    """(n,) for how long something has been seen in ``cells`` (256, 256) without a break; see :func:`unbroken`."""
+    since, last = unbroken(drives, np.flatnonzero(cells), breaks)
     return np.where(since < 0, 0.0, (last - since) / DAY_S)
 
 
 def temporary(states: U8, tile: Tile, drives: Sequence[TileVote], settings: FuseSettings) -> Bool:
     """(256, 256) cells decided changed-occupied by what comes and goes.
 
-    ``drives``: every vote that counts on the tile and is no more than ``stay_days`` older than the newest.
+    ``drives``: every vote that counts on the tile and is no more than :func:`history_days` older than the newest. What
+    is seen for ``stay_days`` without a break enters the map, whatever came and went there before.
     """
     cells = doubtful(states, tile.memory, settings)
     if cells.any():
@@ -96,15 +114,31 @@ def denied_last(states: U8, memory: Memory | None, drives: Sequence[TileVote]) -
     return out
 
 
-def remembered(memory: Memory, before: Tile, after: Tile, votes: Sequence[TileVote], states: U8) -> Memory:
-    """``memory`` with what came and what went between two versions of a tile, by the votes that decided it."""
+def remembered(
+    memory: Memory,
+    before: Tile,
+    after: Tile,
+    votes: Sequence[TileVote],
+    states: U8,
+    past: tuple[Callable[[], Sequence[TileVote]], int] | None = None,
+) -> Memory:
+    """``memory`` with what came and what went between two versions of a tile, by the votes that decided it.
+
+    ``past``: (all votes of the last :func:`history_days`, asked for only if something came; how many drives in a row
+    that see nothing end a thing). A thing came when it was first seen without a break, which may be long before the
+    votes that decided.
+    """
     went, came = emptied_and_filled(before.obstacle_words.reshape(-1), after.obstacle_words.reshape(-1))
     went = went[memory.at(went)[1] > 0]
     if not len(came) and not len(went):
         return memory
     of_new, of_gone = memory.at(came), memory.at(went)
     risen = states.reshape(-1)[came] == _CO
-    of_new[1] = np.where(risen, _first_s(votes, came, _CO), np.uint32(0))
+    first_s = _first_s(votes, came, _CO)
+    if past is not None and risen.any():
+        since = unbroken(past[0](), came, past[1])[0]
+        first_s = np.where(since > 0, np.minimum(since, first_s), first_s).astype(np.uint32)
+    of_new[1] = np.where(risen, first_s, np.uint32(0))
     came_s, stays, stayed_s = of_gone[1:]
     stays += 1
     stayed_s += np.maximum(_first_s(votes, went, _CE), came_s) - came_s

@@ -270,10 +270,10 @@ def recent(store: Store, question: Electorate) -> list[str]:
         return [vote.vehicle for vote in recent_votes(connection, tile, question)]
 
 
-def test_the_recent_past_is_of_every_vehicle_within_the_days_that_a_thing_must_stay(store: Store) -> None:
+def test_the_recent_past_is_of_every_vehicle_within_twice_the_days_that_a_thing_must_stay(store: Store) -> None:
     for day, vehicle in ((0, "a"), (10, "b"), (20, "c"), (30, "d")):
         cast(store, vehicle, day=day)
-    few = FuseSettings(latest_vehicles=1, stay_days=20, max_age_days=5)
+    few = FuseSettings(latest_vehicles=1, stay_days=10, max_age_days=5)
     assert recent(store, asked(store, fuse=few)) == ["b", "c", "d"], "as old as the days, and just so"
     assert [vote.vehicle for vote in counting(store, asked(store, fuse=few))] == ["d"]
 

@@ -15,6 +15,7 @@ from mapvote.codec.odds import UNSAID, in_nats
 from mapvote.core.grid import TILE_CELLS, TileIndex
 from mapvote.core.types import NO_VOTE, U8, CellState, MapvoteError
 from mapvote.core.voting import VOTE_UNIT
+from mapvote.fusion.copies import originals
 from mapvote.fusion.fuse import Heard, decide_tile, rule_of
 from mapvote.fusion.odds import unpack_agreed
 from mapvote.fusion.persistence import expected_days
@@ -217,8 +218,10 @@ def _thing(connection: sa.Connection, now: Place, drives: Sequence[TileVote]) ->
     here[cell] = True
     told = []
     if policy.round.stage == "two-stage":
-        recent = recent_votes(connection, tile, now.asked)
-        found = decide_tile(tile, drives, rule_of(policy.round.method), policy.fuse, lambda: recent)
+        recent, _ = originals(recent_votes(connection, tile, now.asked), policy.fuse)
+        found = decide_tile(
+            tile, drives, rule_of(policy.round.method), policy.fuse, lambda: originals(recent, policy.fuse)[0]
+        )
         if found.passing is not None and found.passing[cell]:
             told.append("temporary: what is new here is not expected to stay, and stays out of the map")
         elif found.denied is not None and found.denied[cell]:

@@ -12,6 +12,7 @@ from typing import Any
 
 import sqlalchemy as sa
 
+from mapvote.fusion.persistence import history_days
 from mapvote.fusion.tile_vote import DAY_NS
 from mapvote.server.store import schema
 from mapvote.server.store.policy import Policy, policy_in
@@ -106,7 +107,7 @@ def _longest_window_days(connection: sa.Connection, oldest: int) -> float:
     v = schema.versions
     made_by = connection.execute(sa.select(v.c.policy).where(v.c.number >= oldest, v.c.kind == "publish")).scalars()
     policies = [policy_in(connection), *(Policy.model_validate(one) for one in made_by)]
-    return max(max(policy.fuse.max_age_days, policy.fuse.stay_days) for policy in policies)
+    return max(history_days(policy.fuse) for policy in policies)
 
 
 def _delete(connection: sa.Connection, table: sa.Table, key: Iterable[str], rows: list[Any]) -> None:

@@ -16,6 +16,7 @@ from mapvote.config import FuseSettings
 from mapvote.core.grid import TileIndex
 from mapvote.core.tile import Tile
 from mapvote.core.types import Bool
+from mapvote.fusion.persistence import history_days
 from mapvote.fusion.spent import unspent
 from mapvote.fusion.tile_vote import DAY_NS, TileVote, restrict, select
 from mapvote.server.store import schema
@@ -228,12 +229,13 @@ def recent_votes(
     misread: Mapping[int, Bool] | None = None,
     polled: Polled | None = None,
 ) -> list[TileVote]:
-    """As :func:`counting_votes`, of every vehicle and of the last ``stay_days``: what has come and gone here?"""
+    """As :func:`counting_votes`, of every vehicle and of the last :func:`history_days`: what has come and gone
+    here, and since when?"""
     index = tile.index
     polled = polled or poll(connection, index[0], [index[1]], asked)
     judged = _judged(polled.standing[index], index, asked)
     ready = [vote for vote, why in judged if why not in (YOUNG, OTHERWISE, DAMAGED)]
-    oldest = max((vote.end_ns for vote in ready), default=0) - asked.settings.stay_days * DAY_NS
+    oldest = max((vote.end_ns for vote in ready), default=0) - history_days(asked.settings) * DAY_NS
     chosen = [vote for vote in ready if vote.end_ns >= oldest]
     return [unspent(vote, tile, misread) for vote in read_votes(connection, index, chosen, polled.rows)]
 
