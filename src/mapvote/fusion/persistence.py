@@ -55,7 +55,7 @@ def history_days(settings: FuseSettings) -> float:
     return max(2.0 * settings.stay_days, settings.max_age_days)
 
 
-def unbroken(drives: Sequence[TileVote], cells: I64, breaks: int) -> tuple[I64, I64]:
+def seen_since(drives: Sequence[TileVote], cells: I64, breaks: int) -> tuple[I64, I64]:
     """(n,) the first and (n,) the last sighting, seconds, of what is seen in flat ``cells`` (n,) without a break; -1
     where nothing is.
 
@@ -78,8 +78,8 @@ def unbroken(drives: Sequence[TileVote], cells: I64, breaks: int) -> tuple[I64, 
 
 
 def ages_days(drives: Sequence[TileVote], cells: Bool, breaks: int) -> F64:
-    """(n,) for how long something has been seen in ``cells`` (256, 256) without a break; see :func:`unbroken`."""
-    since, last = unbroken(drives, np.flatnonzero(cells), breaks)
+    """(n,) for how long something has been seen in ``cells`` (256, 256) without a break; see :func:`seen_since`."""
+    since, last = seen_since(drives, np.flatnonzero(cells), breaks)
     return np.where(since < 0, 0.0, (last - since) / DAY_S)
 
 
@@ -136,7 +136,7 @@ def remembered(
     risen = states.reshape(-1)[came] == _CO
     first_s = _first_s(votes, came, _CO)
     if past is not None and risen.any():
-        since = unbroken(past[0](), came, past[1])[0]
+        since = seen_since(past[0](), came, past[1])[0]
         first_s = np.where(since > 0, np.minimum(since, first_s), first_s).astype(np.uint32)
     of_new[1] = np.where(risen, first_s, np.uint32(0))
     came_s, stays, stayed_s = of_gone[1:]
