@@ -13,6 +13,9 @@ from command_line import type_in
 ROOT = Path(__file__).parents[2]
 DRIVE = ROOT / "../shared/data/kitti/2011_09_26_0001"
 
+NOT_HERE = "python3 -m venv", "mapvote import tiles/"
+"""Installs from the network; reads a map that the reader may have."""
+
 
 @pytest.mark.slow
 @pytest.mark.skipif(not DRIVE.exists(), reason="the KITTI scans are not beside the repository")
@@ -22,5 +25,6 @@ def test_the_tutorial_works_word_for_word(tmp_path: Path, monkeypatch: pytest.Mo
     text = (ROOT / "docs/vehicles.md").read_text()
     for block in re.findall(r"^```\n(.*?)^```", text, re.MULTILINE | re.DOTALL):
         for line in block.splitlines():
-            type_in(line)
+            if not line.startswith(NOT_HERE):
+                type_in(line)
     assert (tmp_path / "street.pcd").exists()
