@@ -263,7 +263,7 @@ def enters_on(things: Sequence[tuple[float, float]], rng: np.random.Generator, s
     return None
 
 
-@pytest.mark.parametrize("seed", [0, 1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(2, 500))])
+@pytest.mark.parametrize("seed", [0, 1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(2, 50))])
 @pytest.mark.parametrize("things", [[(1, 3), (5, 34), (36, 999)], [(1, 4), (10, 50), (60, 999)]])
 def test_what_stands_for_good_enters_the_map_whatever_stood_there_before(
     things: list[tuple[float, float]], seed: int
