@@ -5,7 +5,7 @@
 Every module gives the same number of mutants, drawn by the seed. A mutant is killed if a test of those that name its
 module fails, crashes or takes too long. Results are added to ``results/mutation.csv`` as they come: a run that was cut
 goes on where it stopped, and survivors are tried again once a test has changed. Mutants of a module that has changed
-since are thrown away. ``--report`` runs nothing and writes docs/mutation.md.
+since are thrown away. ``--report`` runs nothing and writes the table.
 """
 
 from __future__ import annotations
@@ -60,20 +60,10 @@ TESTS = {
     "server/store/eligible_votes.py": ["server/store/test_eligible_votes.py"],
     "server/store/hold.py": ["server/store/test_hold.py"],
     "detection/paper.py": ["detection/test_paper.py"],
-    "detection/counters.py": ["detection/test_counters.py", "detection/test_surface_counts.py"],
-    "detection/near_hits.py": ["detection/test_near_hits.py"],
-    "detection/regions.py": [
-        "detection/test_regions.py",
-        "detection/test_surfaces.py",
-        "evaluation/columns_v1/test_voter.py",
-    ],
-    "detection/sightings.py": ["detection/test_paper.py"],
+    "detection/evidence.py": ["detection"],
+    "detection/surface_rules.py": ["detection"],
     "detection/surfaces.py": ["detection/test_surfaces.py"],
-    "detection/surface_regions.py": ["detection/test_surface_regions.py", "detection/test_surfaces.py"],
-    "detection/surface_counts.py": ["detection/test_surface_counts.py", "detection/test_surfaces.py"],
-    "detection/lone_points.py": ["detection/test_lone_points.py"],
-    "detection/surface_odds.py": ["detection/test_surface_odds.py"],
-    "detection/surface_looks.py": ["detection/test_surface_odds.py"],
+    "detection/confidence.py": ["detection"],
     "perception/moving_kernels.py": ["perception/test_moving_kernels.py", "perception/test_moving_objects.py"],
     "perception/fans.py": ["perception/test_fans.py", "perception/test_raycast.py"],
     "perception/raycast.py": ["perception/test_raycast.py"],
@@ -82,14 +72,6 @@ TESTS = {
     "slam/clean_map.py": ["slam/test_strays.py", "slam/test_trails.py", "slam/test_mirrored.py"],
     "localisation/odometry.py": ["localisation/test_odometry.py"],
     "localisation/pose_check.py": ["localisation/test_pose_check.py"],
-    "evaluation/columns_v1/weighing.py": [
-        "evaluation/columns_v1/test_weighing.py",
-        "evaluation/columns_v1/test_voter.py",
-    ],
-    "evaluation/scoring/cells.py": ["evaluation/scoring"],
-    "evaluation/scoring/objects.py": ["evaluation/scoring"],
-    "evaluation/scoring/map_points.py": ["evaluation/scoring"],
-    "evaluation/scoring/truth.py": ["evaluation/scoring"],
 }
 """The deciding modules, and the tests that name them, quick ones first."""
 HOUSE = Path(os.environ.get("MUTATION_HOUSE", Path(tempfile.gettempdir()) / "mapvote-mutation"))
@@ -112,7 +94,7 @@ def main() -> None:
     parser.add_argument("--minutes", type=float, default=1e9, help="stop after this long; the next run goes on")
     parser.add_argument("--at-most", type=int, default=1_000_000, metavar="N", help="new ones of each module")
     parser.add_argument("--out", type=Path, default=ROOT / "results/mutation.csv")
-    parser.add_argument("--report", action="store_true", help="only write docs/mutation.md from the results")
+    parser.add_argument("--report", action="store_true", help="only print the table from the results")
     arguments = parser.parse_args()
     if not arguments.report:
         until = time.monotonic() + 60.0 * arguments.minutes

@@ -1,4 +1,4 @@
-"""What a run of mutants found: rows of results/mutation.csv, and the page made of them, docs/mutation.md."""
+"""What a run of mutants found: rows of results/mutation.csv, and the page made of them, a table."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def write_results(path: Path, results: Sequence[Result]) -> None:
 
 
 def report(results: Sequence[Result]) -> None:
-    """Write docs/mutation.md."""
+    """Print the table and the survivors."""
     why = equal_mutants()
     survivors = [r for r in results if r.outcome == "survived"]
     rows = [
@@ -77,7 +77,7 @@ def report(results: Sequence[Result]) -> None:
         "*Equal* ones no test can tell from the original; they count as not killed. What is not in the",
         "table has not been run yet: the command goes on where it stopped.",
         "",
-        f"Written from results/mutation.csv by `python benchmarks/mutation.py --seed {_seeds(results)}`; do not edit.",
+        f"From results/mutation.csv, `python benchmarks/mutation.py --seed {_seeds(results)}`.",
         "",
         "| module | mutants | killed at first | killed now | of the others: equal |",
         "|---|---|---|---|---|",
@@ -92,7 +92,7 @@ def report(results: Sequence[Result]) -> None:
     for r in survivors:
         change = f"`{r.change}`".replace("|", "\\|")
         lines.append(f"| `{r.module}` {r.line} | {change} | {why.get((r.module, r.change), '')} |")
-    (ROOT / "docs/mutation.md").write_text("\n".join(lines) + "\n")
+    print("\n".join(lines))
 
 
 def _modules(results: Sequence[Result]) -> list[str]:

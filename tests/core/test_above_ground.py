@@ -29,5 +29,3 @@ def test_the_paper_cases_by_number_and_ours_by_name() -> None:
     assert (second.method, second.weighted, second.two_stage, second.skip_tall_cells) == ("paper", False, True, False)
     with pytest.raises(MapvoteError, match="choose surfaces or one of 1, 2, 3, 4, 5"):
         choose_case(Settings(), "6")
-    with pytest.raises(MapvoteError, match=r"no case 'columns' \(columns left the product.*\); choose surfaces"):
-        choose_case(Settings(), "columns")

@@ -131,26 +131,6 @@ CASES: dict[str, dict[str, bool]] = {
 
 
 ENV_PREFIX = "MAPVOTE_"
-MOVED = {
-    "voting.n_min": "paper.n_min",
-    "voting.tall_rule": "paper.tall_rule",
-    "voting.occlusion": "paper.line_of_sight (first_hit: points, farthest_return: farthest, column: column)",
-}
-"""Settings that had another name."""
-COLUMNS_LEFT = "columns left the product in this version"
-"""Surfaces replaced them: whoever asks for them is told so."""
-LEFT = {("voting.method", "columns"): f"{COLUMNS_LEFT}; write 'surfaces', the default, or leave it out"}
-"""Values that a setting could have."""
-FIXED = {
-    "trust.min_fit": "MIN_FIT of localisation/pose_check.py",
-    "trust.min_lead": "MIN_LEAD of localisation/pose_check.py",
-    "trust.scans": "LOOKS of localisation/localiser.py",
-    "moving.reach_m": "REACH_M of perception/moving_objects.py",
-    "mapping.precise_prior_m": "PRECISE_PRIOR_M of slam/surveyor.py",
-    "mapping.prior_memory_s": "PRIOR_MEMORY_S of slam/pose_graph_all.py",
-    "voting.min_cells": f"it was of columns, and {COLUMNS_LEFT}",
-}
-"""Settings that are constants now: nobody could judge them by looking; or that have left."""
 
 
 def did_you_mean(key: str, known: Iterable[str]) -> str:
@@ -174,15 +154,9 @@ def load_with_sources(
     values: dict[str, dict[str, Any]] = {}
     sources: dict[str, str] = {}
     for section, key, value, source in (*_from_file(path), *_from_env(os.environ if env is None else env)):
-        if constant := FIXED.get(f"{section}.{key}"):
-            raise MapvoteError(f"{source}: {section}.{key} is no setting any more ({constant}); leave it out")
         if section not in Settings.model_fields:
             raise MapvoteError(f"{source}: unknown section {section!r}{did_you_mean(section, Settings.model_fields)}")
         known = type(getattr(Settings(), section)).model_fields
-        if f"{section}.{key}" in MOVED:
-            raise MapvoteError(f"{source}: {section}.{key} is called {MOVED[f'{section}.{key}']} now")
-        if why := LEFT.get((f"{section}.{key}", str(value))):
-            raise MapvoteError(f"{source}: {section}.{key} = {value!r}: {why}")
         if key not in known:
             raise MapvoteError(f"{source}: unknown setting {section}.{key}{did_you_mean(key, known)}")
         values.setdefault(section, {})[key] = value
@@ -227,6 +201,5 @@ def choose_case(settings: Settings, case: str) -> Settings:
     elif case in CASES:
         chosen = {"method": "paper", **CASES[case]}
     else:
-        gone = f" ({COLUMNS_LEFT})" if case == "columns" else ""
-        raise MapvoteError(f"no case {case!r}{gone}; choose surfaces or one of {', '.join(CASES)}")
+        raise MapvoteError(f"no case {case!r}; choose surfaces or one of {', '.join(CASES)}")
     return settings.model_copy(update={"voting": settings.voting.model_copy(update=chosen)})

@@ -229,6 +229,6 @@ def test_nothing_is_left_behind_where_it_cannot_be_written(tmp_path: Path) -> No
     (tmp_path / "file").write_text("")
     with pytest.raises(MapvoteError, match="cannot be written"):
         write_pcd(tmp_path / "file" / "a.pcd", Cloud(points()))
-    with pytest.raises(MapvoteError, match=r"no format for \.xyz"):
-        export_map(map_from_points(points()), tmp_path / "a.xyz")
+    with pytest.raises(MapvoteError, match=r"no format for \.abc"):
+        export_map(map_from_points(points()), tmp_path / "a.abc")
     assert os.listdir(tmp_path) == ["file"]
