@@ -1,0 +1,70 @@
+"""A bag is played on DDS, a vehicle drives by it: its ballots are those of `vote` on the same bag and cuts."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from bag_recorder import START, Recorder
+from command_line import type_in
+from live.loopback_dds import LOOPBACK, domain_of
+from mapvote.codec.ballot import encode
+from mapvote.core.point_map import map_from_points
+from mapvote.core.sensors import SENSORS
+from mapvote.formats import open_drive, read_map, write_map
+from mapvote.vehicle import Cuts, Vehicle, vote_in_stretches
+from streets import path, street, sweep, twist_of
+
+pytest.importorskip("cyclonedds")
+SCANS = 40
+
+
+def record(bag: Path) -> None:
+    recorder = Recorder(bag)
+    poses, t = path(SCANS), recorder.types
+    g, kind = "geometry_msgs/msg/", "nav_msgs/msg/Odometry"
+    for i, T in enumerate(poses):
+        ns = START + i * 100_000_000
+        scan = sweep(street(1000 + i, 0.6), T, twist_of(poses, i), ns)
+        pose = t[g + "Pose"](
+            t[g + "Point"](*T[:3, 3].tolist()),
+            t[g + "Quaternion"](*Rotation.from_matrix(T[:3, :3]).as_quat().tolist()),
+        )
+        zero, none = t[g + "Vector3"](0.0, 0.0, 0.0), np.zeros(36)
+        twist = t[g + "TwistWithCovariance"](t[g + "Twist"](zero, zero), none)
+        odometry = t[kind](recorder.header(ns, "map"), "lidar", t[g + "PoseWithCovariance"](pose, none), twist)
+        recorder.write("/odometry", kind, ns, odometry)
+        recorder.cloud("/points", "lidar", ns, scan.points)
+    recorder.bag.close()
+
+
+@pytest.mark.slow
+def test_a_live_drive_by_a_played_bag_casts_the_ballots_of_vote_on_that_bag_bit_for_bit(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("CYCLONEDDS_URI", LOOPBACK)
+    bag, folder = tmp_path / "bag", tmp_path / "ballots"
+    record(bag)
+    write_map(map_from_points(street(1)), tmp_path / "map")
+    folder.mkdir()
+    domain = str(domain_of("drive"))
+    player = subprocess.Popen([sys.executable, "-m", "mapvote", "play", str(bag), "--domain", domain, "--rate", "0.5"])
+    try:
+        said = type_in(
+            f"mapvote drive --map {tmp_path}/map --sensor hdl32e --vehicle car --name day --every-m 12 --idle 12 "
+            f"--out {folder} --domain {domain}"
+        )
+    finally:
+        player.wait(60)
+    drive = open_drive(bag, sensor="hdl32e", vehicle="car", prior="/odometry")
+    voter = Vehicle("car", SENSORS["hdl32e"], read_map(tmp_path / "map"), drive_id="day")
+    wanted = [written() for written in vote_in_stretches(replace(drive, drive_id="day"), voter, Cuts(length_m=12.0))]
+    assert " 0 scans left out, 0 without odometry" in said
+    assert len(wanted) >= 2
+    assert {p.name: p.read_bytes() for p in folder.iterdir()} == {f"car~{b.drive}.ballot": encode(b) for b in wanted}
