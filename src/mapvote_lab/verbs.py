@@ -210,13 +210,11 @@ def demo(
     out: Annotated[Path, typer.Option(metavar="FOLDER", help="where maps, tables, pictures and report.html go")] = Path(
         "out"
     ),
-    quick: Annotated[
-        bool, typer.Option("--quick", help="a street corner instead of a street: a minute at most")
-    ] = False,
+    full: Annotated[bool, typer.Option("--full", help="a street of 250 m instead of a corner: some minutes")] = False,
 ) -> None:
     """The whole story on a simulated street: build a map, let three vehicles vote, update it, tell how good it is.
 
-    mapvote demo --quick
+    mapvote demo
     """
     _need_lab("demo")
     from rich.console import Console
@@ -228,7 +226,7 @@ def demo(
     console = Console(soft_wrap=True)
     console.print("The first run compiles its kernels, which takes some seconds in each stage.", style="dim")
     with stages() as told:
-        evaluation, story = run(out, quick, told)
+        evaluation, story = run(out, full, told)
     console.print("\n[bold]What changed[/]", highlight=False)
     for area, deleted, added in story.areas:
         console.print(

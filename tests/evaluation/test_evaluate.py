@@ -145,7 +145,7 @@ def test_the_page_needs_nothing_else_and_escapes_what_it_is_given() -> None:
 def test_the_demo_tells_its_story(tmp_path: Path) -> None:
     from mapvote_lab.evaluation.demo import demo
 
-    evaluation, story = demo(tmp_path / "out", quick=True)
+    evaluation, story = demo(tmp_path / "out")
     assert story.found == story.objects > 0
     for name in ("report.html", "tables.txt", "results.json", "results.csv", "map_before.pcd", "map_after.pcd"):
         assert (tmp_path / "out" / name).stat().st_size > 100

@@ -24,18 +24,18 @@ from mapvote_lab.evaluation.reporting.gallery import gallery
 from mapvote_lab.evaluation.reporting.tables import as_csv, as_json, as_text, write_text
 from mapvote_lab.evaluation.scoring.map_points import same_rows
 
-SCENARIO, QUICK_SCENARIO = "street", "corner"
+SCENARIO, FULL_SCENARIO = "corner", "street"
 SEED = 2
 """Not the seed that the method was developed on (1)."""
 
 
-def demo(out: Path, quick: bool = False, progress: Progress | None = None) -> tuple[Evaluation, Story]:
+def demo(out: Path, full: bool = False, progress: Progress | None = None) -> tuple[Evaluation, Story]:
     """Simulate, build, let three vehicles vote, update, evaluate; everything into ``out``.
 
     A second run goes on from the first. MapvoteError if ``out`` cannot be written.
     """
     settings = Settings()
-    scene = Scene(QUICK_SCENARIO if quick else SCENARIO, SEED, settings, out / "work")
+    scene = Scene(FULL_SCENARIO if full else SCENARIO, SEED, settings, out / "work")
     cases, _ = choose_cases(settings, f"1,2,3,4,5,{CASE}")
     evaluation = evaluate(scene, cases, progress=progress, study=Study(occluded=True))
     write_map(evaluation.first_map, out / "map_before")
