@@ -25,7 +25,7 @@ from mapvote.core.types import MapvoteError  # noqa: E402
 app = typer.Typer(
     name="mapvote",
     help="Keep 3D point-cloud maps true: vehicles vote on what has changed.",
-    epilog="`mapvote COMMAND --help` is the manual of a command. `mapvote demo` shows the whole in a minute.",
+    epilog="`mapvote COMMAND --help` is the manual of a command. `mapvote demo` shows the whole in two minutes.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     rich_markup_mode="markdown",
