@@ -59,22 +59,25 @@ def first_map(url: str) -> None:
     Store.create(url, make_map(dict.fromkeys(TILES, tile))).close()
 
 
-def votes_on(content: Tile, tile: TileIndex, cell: tuple[int, int], vehicle: str, drive: str) -> list[Ballot]:
-    """Two vehicles that agree: what stands in the cell is gone, or, where nothing stands, it is back."""
+def votes_on(
+    content: Tile, version: int, tile: TileIndex, cell: tuple[int, int], vehicle: str, drive: str
+) -> list[Ballot]:
+    """Two vehicles of this version that agree: what stands in the cell is gone, or what does not stand is back."""
     point_map, points = make_map({tile: content}), content.points
     inside = (np.floor(points[:, 1] / 0.3) == cell[0]) & (np.floor(points[:, 0] / 0.3) == cell[1])
     stands = bool((inside & (points[:, 2] > 0.3)).any())
     state = CellState.CHANGED_EMPTY if stands else CellState.CHANGED_OCCUPIED
     say = Say(states_plane({cell: state}), new_points=None if stands else wall([cell], HEIGHTS))
     now = time.time_ns()
-    return [make_ballot(point_map, {tile: say}, f"{vehicle}{i}", drive, now - S + i) for i in range(2)]
+    return [make_ballot(point_map, {tile: say}, f"{vehicle}{i}", drive, now - S + i, version=version) for i in range(2)]
 
 
-def tile_now(store: Store, tile: TileIndex) -> Tile:
-    """A tile of the newest version."""
-    content = store.tile(store.current(), tile)
+def newest(store: Store, tile: TileIndex) -> tuple[Tile, int]:
+    """A tile of the newest version, and the version's number."""
+    version = store.current()
+    content = store.tile(version, tile)
     assert content is not None
-    return content
+    return content, version
 
 
 def work(url: str, seed: int, acknowledge: int) -> None:
@@ -88,7 +91,7 @@ def work(url: str, seed: int, acknowledge: int) -> None:
                 publish(store, POLICY)
             time.sleep(0.002)
 
-    for ballot in votes_on(tile_now(store, TILES[0]), TILES[0], CELLS[0], "warm", "warm"):
+    for ballot in votes_on(*newest(store, TILES[0]), TILES[0], CELLS[0], "warm", "warm"):
         examine(encode(ballot))  # compiled code is loaded before the clock starts
     threading.Thread(target=publish_for_ever, daemon=True).start()
     os.write(acknowledge, b"ready\n")
@@ -96,7 +99,7 @@ def work(url: str, seed: int, acknowledge: int) -> None:
     while True:
         turn += 1
         tile = rng.choice(TILES)
-        ballots = votes_on(tile_now(store, tile), tile, rng.choice(CELLS), "v", f"{seed}.{turn}")
+        ballots = votes_on(*newest(store, tile), tile, rng.choice(CELLS), "v", f"{seed}.{turn}")
         for receipt in accept(store, [examine(encode(ballot)) for ballot in ballots]):
             if isinstance(receipt, Receipt):
                 os.write(acknowledge, f"{receipt.vehicle} {receipt.drive}\n".encode())

@@ -54,8 +54,9 @@ class Traffic:
                 turn += 1
                 tile, cell = rng.choice(TILES), rng.choice(CELLS)
                 try:
-                    content = client.fetch().tiles[tile]
-                    for ballot in votes_on(content, tile, cell, f"v{number}", f"{self._seed}.{turn}"):
+                    point_map = client.fetch()
+                    content, version = point_map.tiles[tile], point_map.version or 1
+                    for ballot in votes_on(content, version, tile, cell, f"v{number}", f"{self._seed}.{turn}"):
                         if client.send(ballot) != "spooled":
                             self.acknowledged.append((ballot.vehicle, ballot.drive))
                             self.begun.set()
