@@ -21,7 +21,7 @@ from rosbags.typesys import Stores, get_typestore
 from mapvote.core.point_map import map_from_points
 from mapvote.core.sensors import SENSORS
 from mapvote.core.types import MapvoteError
-from mapvote.formats import DriveWriter, open_drive, read_cloud, read_map, write_map
+from mapvote.formats import DriveWriter, open_drive, read_map, stream_cloud, write_map
 from mapvote.formats.drives.trajectory import read_trajectory
 from mapvote.formats.geo.projector import read_projector
 from mapvote.formats.maps.autoware import write_autoware
@@ -42,7 +42,7 @@ def drive(path: Path) -> None:
 
 
 def map_points(path: Path) -> None:
-    read_cloud(path)
+    list(stream_cloud(path))
 
 
 @dataclass(frozen=True)

@@ -16,10 +16,10 @@ from mapvote.doctor.clouds import check_cloud, in_memory, spacing, tile_by_tile
 from mapvote.doctor.finding import Finding, in_order
 from mapvote.doctor.ghosts import ghost_layer, ghost_shift
 from mapvote.doctor.on_map import check_ground
-from mapvote.formats import read_cloud, read_map
+from mapvote.formats import read_map, stream_cloud
 from mapvote.formats.clean import MAX_BAD_SHARE
 from mapvote.formats.geo.frame import frame_of
-from mapvote.formats.maps.cloud import Cloud
+from mapvote.formats.maps.cloud import Cloud, joined
 from mapvote.formats.maps.mapvote_folder import is_map_folder
 from mapvote.formats.maps.tiling import to_map
 
@@ -37,7 +37,7 @@ def examine_map(path: Path) -> tuple[list[Finding], PointMap | None]:
     """(findings, errors first; the map, if one can be made of it) of a map in any format."""
     try:
         if not is_map_folder(path):
-            return examine_points(str(path), read_cloud(path))
+            return examine_points(str(path), joined(list(stream_cloud(path))))
         point_map = read_map(path)
     except MapvoteError as error:
         return [Finding("error", str(error))], None

@@ -7,10 +7,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Unpack
+from typing import Any, Unpack
+
+import numpy as np
+from numpy.typing import NDArray
 
 from mapvote.core.point_map import PointMap
-from mapvote.core.types import Drive, MapvoteError
+from mapvote.core.types import F64, Drive, MapvoteError
 from mapvote.formats.drives.kitti import DriveWriter
 from mapvote.formats.drives.options import DriveOptions, SaidOfDrive
 from mapvote.formats.drives.poses import read_T_map_lidar
@@ -78,12 +81,22 @@ def stream_cloud(path: Path | str) -> Iterator[Cloud]:
     raise MapvoteError(f"{path}: {_what_is_there(path)}; a map is one of: mapvote map, {', '.join(MAPS)}")
 
 
-def read_cloud(path: Path | str) -> Cloud:
-    """The points of a file or folder of any format of ``MAPS`` as they stand, and what a map drops of them.
+def read_cloud(path: Path | str) -> tuple[F64, dict[str, NDArray[Any]]]:
+    """All points of a map or cloud of any known format, and their fields: no tiles are cut, no ground is laid.
 
-    Raises MapvoteError if there is none at ``path`` or it is damaged.
+    Returns points (n, 3), float64, map metres (feet become metres), and columns (n,) in the type that the file has, by
+    LAS's names: intensity, red, classification ... Points that are not finite stay. Of a map in pieces only the fields
+    that all pieces have are returned.
+
+    Raises MapvoteError if there is no map at ``path``, it is damaged, or its coordinates cannot be made metres.
     """
-    return joined(list(stream_cloud(path)))
+    path = Path(path)
+    if is_map_folder(path):
+        tiles = read_map_folder(path).tiles
+        cloud = joined([Cloud(tiles[index].points_map, fields=tiles[index].fields) for index in sorted(tiles)])
+    else:
+        cloud = joined(list(stream_cloud(path))).in_metres(str(path))
+    return cloud.points.astype(np.float64, copy=False), dict(cloud.fields)
 
 
 def write_map(point_map: PointMap, path: Path | str) -> None:

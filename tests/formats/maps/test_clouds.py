@@ -17,7 +17,7 @@ from pypcd4 import PointCloud
 
 from mapvote.core.point_map import all_points, map_from_points
 from mapvote.core.types import F64, MapvoteError
-from mapvote.formats import export_map, read_cloud, read_map, write_map, write_pcd
+from mapvote.formats import export_map, read_cloud, read_map, stream_cloud, write_map, write_pcd
 from mapvote.formats.maps.autoware import stream_autoware, write_autoware
 from mapvote.formats.maps.autoware_live import lay_version
 from mapvote.formats.maps.cloud import Cloud, joined, lattice_of
@@ -25,6 +25,7 @@ from mapvote.formats.maps.cloud_pieces import CloudPieces
 from mapvote.formats.maps.las import read_las, write_las
 from mapvote.formats.maps.pcd import ENCODINGS, read_pcd_table
 from mapvote.formats.maps.ply import read_ply, write_ply
+from mapvote.formats.maps.tiling import to_map
 
 UTM = np.array([367_123.0, 3_951_876.0, 40.0])
 
@@ -68,7 +69,7 @@ def test_autoware_tiles_that_nobody_lists_are_said_aloud_but_those_kept_for_a_ru
 def test_pcd_round_trip_in_every_encoding(tmp_path: Path, encoding: str, double: bool) -> None:
     before = points() if double else points().astype(np.float32)
     write_pcd(tmp_path / "a.pcd", Cloud(before), encoding=encoding, double=double)
-    after = read_cloud(tmp_path / "a.pcd").points
+    after = joined(list(stream_cloud(tmp_path / "a.pcd"))).points
     assert after.dtype == before.dtype
     assert np.allclose(after, before, rtol=1e-6) if encoding == "ascii" else np.array_equal(after, before)
 
@@ -152,6 +153,20 @@ def test_a_utm_map_survives_a_round_trip(tmp_path: Path, name: str) -> None:
         assert after.georeference["crs"] == "EPSG:32654"
 
 
+@pytest.mark.parametrize("name", ["m.pcd", "m.las", "m.ply", "m"])
+def test_a_cloud_is_read_whole_in_map_metres_with_its_fields(tmp_path: Path, name: str) -> None:
+    """The same points from every format; a LAS holds them to 0.05 mm, a PCD and a map folder as float32."""
+    brightness = np.arange(500, dtype=np.uint16)
+    cloud = Cloud(points(), fields={"intensity": brightness})
+    write_map(to_map("test", cloud), tmp_path / "m")
+    {"m.pcd": write_pcd, "m.las": write_las, "m.ply": write_ply, "m": lambda *_: None}[name](tmp_path / name, cloud)
+    read, fields = read_cloud(tmp_path / name)
+    order = np.argsort(fields["intensity"])
+    assert read.dtype == np.float64
+    assert np.abs(read[order] - points()).max() < 1e-4
+    assert np.array_equal(fields["intensity"][order], brightness)
+
+
 def test_the_same_file_is_the_same_map(tmp_path: Path) -> None:
     write_pcd(tmp_path / "a.pcd", Cloud(points()))
     assert read_map(tmp_path / "a.pcd").map_id == read_map(tmp_path / "a.pcd").map_id
@@ -160,7 +175,7 @@ def test_the_same_file_is_the_same_map(tmp_path: Path) -> None:
 def test_import_knows_what_it_drops(tmp_path: Path) -> None:
     rows = np.column_stack([points(), np.linspace(0, 255, 500)]).astype(np.float32)
     PointCloud.from_xyzi_points(rows).save(tmp_path / "a.pcd")
-    cloud = read_cloud(tmp_path / "a.pcd")
+    cloud = joined(list(stream_cloud(tmp_path / "a.pcd")))
     assert cloud.dropped == ()
     assert np.array_equal(cloud.fields["intensity"], rows[:, 3])
 
