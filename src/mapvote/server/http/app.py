@@ -37,15 +37,18 @@ def create_app(
     settings: Settings | None = None,
     *,
     opened: bool = False,
+    owner: str | None = None,
     gate: Gate | None = None,
     executor: Executor | None = None,
 ) -> FastAPI:
     """The app on an open store, which stays the caller's to close. It runs once.
 
     ``opened``: as long as the store holds no key, whoever asks is answered; else no route answers without one.
+    ``owner``: every request is that of an operator of this name, and no quota holds; only within a process
+    (:func:`mapvote.server.http.in_process.in_process`).
     ``gate``: see :mod:`mapvote.server.store.publish`; ``executor``: where tiles are fused, two threads by default.
     """
-    parts = make_services(store, settings or Settings(), gate, executor)
+    parts = make_services(store, settings or Settings(), gate, executor, limited=owner is None)
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
@@ -72,7 +75,7 @@ def create_app(
     for part in (*asked, pages):
         app.include_router(part.router)
     app.add_exception_handler(400, unreadable)
-    hosts, guard = Hosts(parts.settings.server.hosts), Guard(store, parts.threads.lookups, opened=opened)
+    hosts, guard = Hosts(parts.settings.server.hosts), Guard(store, parts.threads.lookups, opened=opened, owner=owner)
     probe = Probe(parts.check_ready)
     app.add_middleware(Watch, hosts=hosts, guard=guard, metrics=parts.metrics, probe=probe)
     return app

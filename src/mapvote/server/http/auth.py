@@ -33,11 +33,12 @@ class Guard:
     until then it is enough to know whose it was, which never changes.
 
     ``opened``: nobody needs a key as long as the store holds none. The first that is issued ends that, in the same
-    moment and for good.
+    moment and for good. ``owner``: every request is that of an operator of this name.
     """
 
-    def __init__(self, store: Store, threads: Executor, *, opened: bool) -> None:
+    def __init__(self, store: Store, threads: Executor, *, opened: bool, owner: str | None = None) -> None:
         self._opened = opened
+        self._owner = None if owner is None else keys.Key(owner, "operator", 0, None)
         self._any_key: Batcher[None, bool] = Batcher(
             lambda asked: [keys.any_issued(store)] * len(asked), _AT_ONCE, threads
         )
@@ -45,12 +46,16 @@ class Guard:
         self._known: dict[str, keys.Key] = {}
         self._wrong = RateLimit(_WRONG_PER_MINUTE, _WRONG_AT_ONCE, "wrong keys")
 
-    async def who(self, authorization: str | None, peer: str, *, ballot: bool = False) -> tuple[keys.Key, str] | None:
-        """The key of a request and its hash; None if the server is open.
+    async def who(
+        self, authorization: str | None, peer: str, *, ballot: bool = False
+    ) -> tuple[keys.Key, str | None] | None:
+        """The key of a request and its hash, which the owner's has not; None if the server is open.
 
         Unauthorised if it is missing, unknown or revoked; of a ``ballot``, that is for the store to say in the end.
         TooMany if ``peer`` has sent so many wrong ones that new ones from there are looked up no more for a while.
         """
+        if self._owner is not None:
+            return self._owner, None
         if self._opened:
             self._opened = not await self._any_key.put(None)
         if self._opened:

@@ -111,10 +111,16 @@ class Services:
             pool.shutdown(cancel_futures=True)
 
 
-def make_services(store: Store, settings: Settings, gate: Gate | None, executor: Executor | None) -> Services:
-    """The parts of an app on an open store; ``executor`` as in :func:`mapvote.server.http.app.create_app`."""
+def make_services(
+    store: Store, settings: Settings, gate: Gate | None, executor: Executor | None, *, limited: bool = True
+) -> Services:
+    """The parts of an app on an open store; ``executor`` as in :func:`mapvote.server.http.app.create_app`.
+
+    ``limited``: whether the quotas of vehicles hold.
+    """
     manifests, threads, most = Manifests(store), Threads(), settings.server
-    intake = Intake(store, Quota(most.drives_a_day, most.tiles_a_drive, most.stored_bytes))
+    quota = Quota(most.drives_a_day, most.tiles_a_drive, most.stored_bytes) if limited else None
+    intake = Intake(store, quota)
     return Services(
         store=store,
         settings=settings,
