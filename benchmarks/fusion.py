@@ -32,7 +32,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from backports import zstd
+
+from mapvote.codec.arrays import zstd
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 

@@ -8,7 +8,8 @@ from typing import Any
 
 import msgspec
 import numpy as np
-from backports import zstd
+
+from mapvote.codec.arrays import zstd
 
 ABSURD: tuple[Any, ...] = (
     None,

@@ -6,9 +6,8 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from backports import zstd
 
-from mapvote.codec.arrays import unpack_bytes, unpack_into
+from mapvote.codec.arrays import unpack_bytes, unpack_into, zstd
 from mapvote.core.types import MapvoteError
 
 SIZE = 1000

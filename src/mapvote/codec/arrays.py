@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 import math
+import sys
 import threading
 from typing import Any
 
 import numpy as np
-import zstandard
 from numpy.typing import DTypeLike, NDArray
 
 from mapvote.core.types import U8, MapvoteError
 
+if sys.version_info >= (3, 14):
+    from compression import zstd as zstd
+else:
+    from backports import zstd as zstd
+
 FRAME_HEAD = 18
 """Bytes of the longest header of a zstd frame (RFC 8878, 3.1.1.1)."""
 _own = threading.local()
-_STEP = 1024
 _QUICK = 3
 ZSTD_LEVEL = 15
 """For ballots, which travel by radio: level 19 takes five times as long for 2 % of their states. Tiles of noisy float32
@@ -23,8 +27,17 @@ gain nothing above level 3."""
 
 
 def compress(raw: bytes | memoryview, level: int = ZSTD_LEVEL) -> bytes:
-    """One zstd frame that says how large its content is."""
-    return _compressor(level).compress(raw)
+    """One zstd frame that says how large its content is.
+
+    Each thread keeps one compressor for each quick level: making one takes as long as packing a small plane. Those of
+    high levels hold tens of megabytes, and are made in a hundredth of the time that a plane takes them.
+    """
+    if level > _QUICK:
+        return zstd.compress(raw, level)
+    own: dict[int, zstd.ZstdCompressor] = _own.__dict__.setdefault("compressors", {})
+    if level not in own:
+        own[level] = zstd.ZstdCompressor(level)
+    return own[level].compress(raw, zstd.ZstdCompressor.FLUSH_FRAME)
 
 
 def pack_plane(plane: NDArray[Any], level: int = ZSTD_LEVEL) -> bytes:
@@ -38,65 +51,12 @@ def raw_plane(plane: NDArray[Any], dtype: DTypeLike) -> memoryview:
 
 
 def unpack_bytes(data: bytes, limit: int, what: str) -> bytes:
-    """Decompress at most ``limit`` bytes; MapvoteError beyond it or on damage (a decompression bomb stops here).
-
-    A frame says how large it is, and one that says so is written into a buffer of that size, never beyond.
-    """
-    try:
-        size = zstandard.frame_content_size(data)
-        if 0 <= size <= limit:
-            return _decompressor().decompress(data, read_across_frames=False, allow_extra_data=False)
-    except zstandard.ZstdError as error:
-        raise MapvoteError(f"{what} is damaged ({error}); fetch or send it again") from error
-    if size > limit:
-        raise MapvoteError(f"{what} is larger than {limit} bytes when decompressed")
-    return _unpack_unsaid(data, limit, what)
-
-
-def frame_size(head: bytes, what: str) -> int:
-    """How many bytes a frame of ours holds, which it says at its beginning; MapvoteError if it does not."""
-    try:
-        size = zstandard.frame_content_size(head)
-    except zstandard.ZstdError as error:
-        raise MapvoteError(f"{what} is damaged ({error}); fetch or send it again") from error
-    if size < 0:
-        raise MapvoteError(f"{what} does not say how large it is; fetch or send it again")
-    return size
-
-
-def _unpack_unsaid(data: bytes, limit: int, what: str) -> bytes:
-    """A frame that does not say how large it is."""
-    frame = zstandard.ZstdDecompressor().decompressobj()
-    raw = bytearray()
-    try:
-        for start in range(0, len(data), _STEP):  # a few kilobytes of frame hold 100 MB at the very most
-            raw += frame.decompress(data[start : start + _STEP])
-            if len(raw) > limit or frame.eof:
-                break
-    except zstandard.ZstdError as error:
-        raise MapvoteError(f"{what} is damaged ({error}); fetch or send it again") from error
-    if len(raw) > limit or not frame.eof or frame.unused_data or start + _STEP < len(data):
-        raise MapvoteError(f"{what} is truncated or larger than {limit} bytes when decompressed")
-    return bytes(raw)
-
-
-def _compressor(level: int) -> zstandard.ZstdCompressor:
-    """One for each thread and quick level, used again and again, as :func:`_decompressor`. Those of high levels keep
-    tens of megabytes, and take longer for a plane than to be made."""
-    if level > _QUICK:
-        return zstandard.ZstdCompressor(level=level)
-    own: dict[int, zstandard.ZstdCompressor] = _own.__dict__.setdefault("compressors", {})
-    if level not in own:
-        own[level] = zstandard.ZstdCompressor(level=level)
-    return own[level]
-
-
-def _decompressor() -> zstandard.ZstdDecompressor:
-    """One for each thread, used again and again: making one takes as long as unpacking a small plane."""
-    if not hasattr(_own, "decompressor"):
-        _own.decompressor = zstandard.ZstdDecompressor()
-    decompressor: zstandard.ZstdDecompressor = _own.decompressor
-    return decompressor
+    """Decompress at most ``limit`` bytes of one frame. MapvoteError beyond ``limit`` (a decompression bomb stops here),
+    on damage, and where something follows the frame."""
+    raw, rest = _unpack(data, limit, what)
+    if rest:
+        raise MapvoteError(f"{what} is damaged ({len(rest)} bytes follow it); fetch or send it again")
+    return raw
 
 
 def unpack_into(data: bytes, plane: U8, what: str) -> None:
@@ -104,18 +64,36 @@ def unpack_into(data: bytes, plane: U8, what: str) -> None:
 
     What follows a frame is ignored: :func:`unpack_bytes` looks at that when a ballot comes in.
     """
+    raw, _ = _unpack(data, len(plane), what)
+    if len(raw) != len(plane):
+        raise MapvoteError(f"{what} has {len(raw)} bytes, expected {len(plane)}")
+    plane[:] = np.frombuffer(raw, dtype=np.uint8)
+
+
+def _unpack(data: bytes, limit: int, what: str) -> tuple[bytes, bytes]:
+    """(the content of the first frame, the bytes that follow that frame)."""
     try:
-        if zstandard.frame_content_size(data) == len(plane):
-            with _decompressor().stream_reader(data) as reader:
-                n = reader.readinto(plane)
-        else:  # it does not say how large it is, or it is of another size
-            raw = unpack_bytes(data, len(plane), what)
-            n = len(raw)
-            plane[:n] = np.frombuffer(raw, dtype=np.uint8)
-    except zstandard.ZstdError as error:
+        size = zstd.get_frame_info(data).decompressed_size
+        if size is not None and size > limit:
+            raise MapvoteError(f"{what} is larger than {limit} bytes when decompressed")
+        frame = zstd.ZstdDecompressor()
+        raw = frame.decompress(data, limit + 1)
+    except zstd.ZstdError as error:
         raise MapvoteError(f"{what} is damaged ({error}); fetch or send it again") from error
-    if n != len(plane):
-        raise MapvoteError(f"{what} has {n} bytes, expected {len(plane)}")
+    if len(raw) > limit or not frame.eof:
+        raise MapvoteError(f"{what} is truncated or larger than {limit} bytes when decompressed")
+    return raw, frame.unused_data
+
+
+def frame_size(head: bytes, what: str) -> int:
+    """How many bytes a frame of ours holds, which it says at its beginning; MapvoteError if it does not."""
+    try:
+        size = zstd.get_frame_info(head).decompressed_size
+    except zstd.ZstdError as error:
+        raise MapvoteError(f"{what} is damaged ({error}); fetch or send it again") from error
+    if size is None:
+        raise MapvoteError(f"{what} does not say how large it is; fetch or send it again")
+    return size
 
 
 def unpack_plane(data: bytes, dtype: str, shape: tuple[int, ...], what: str) -> NDArray[Any]:

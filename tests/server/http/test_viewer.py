@@ -16,9 +16,9 @@ from urllib.parse import parse_qs, urlsplit
 
 import numpy as np
 import pytest
-from backports import zstd
 
 from chromium import Chromium, program
+from mapvote.codec.arrays import zstd
 from mapvote.core.grid import CELL_SIZE, Lattice
 from mapvote.core.point_map import PointMap, map_from_points
 from mapvote.server.insight.changes import Decided, change_objects, changed_cells
