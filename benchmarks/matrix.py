@@ -16,11 +16,10 @@ from pathlib import Path
 
 from rich.console import Console
 
-from mapvote import plots as style
 from mapvote.config import cache_folder, load_settings
 from mapvote.formats.atomic import whole_file
 from mapvote_lab.evaluation.experiments.matrix import EXPERIMENTS, Matrix
-from mapvote_lab.evaluation.reporting import matrix_tables, requirements, study_figures
+from mapvote_lab.evaluation.reporting import matrix_tables
 from mapvote_lab.evaluation.results import MatrixResult, to_json
 
 
@@ -29,14 +28,13 @@ def main() -> None:
     parser.add_argument("--scenario", default="street570", help="a scenario's name or file (default street570)")
     parser.add_argument("--seeds", default="3,5,6,7,8", help="comma-separated (default 3,5,6,7,8)")
     parser.add_argument("--experiments", help=f"comma-separated, of: {', '.join(EXPERIMENTS)} (default all)")
-    parser.add_argument("--cases", help='instead of all, in main and liars: "1,1 column,columns_v1" is half of it')
+    parser.add_argument("--cases", help='instead of all, in main and liars: "1,1 column,surfaces" is half of it')
     parser.add_argument("--parked", type=int, help="cars parked during each pass in parked (default 12; corner: 2)")
     parser.add_argument("--out", type=Path, default=Path("out/matrix"))
     parser.add_argument("--cache", type=Path, default=cache_folder(), help="where drives, maps and ballots are kept")
     parser.add_argument("--config", type=Path, help="settings (TOML)")
     parser.add_argument("--workers", type=int, default=2, help="experiments at a time, each on one core")
     parser.add_argument("--drop-drives", action="store_true", help="delete scans (3 GB a seed) once they are done with")
-    parser.add_argument("--figures", type=Path, help="draw ablation and robustness here: PNG, SVG and PDF")
     parser.add_argument("--tables-only", action="store_true", help="only write what earlier runs measured")
     arguments = parser.parse_args()
     seeds = tuple(int(seed) for seed in arguments.seeds.split(","))
@@ -67,22 +65,7 @@ def main() -> None:
         if arguments.drop_drives:
             matrix.drop_drives(names, seed)
         write({name: dict(sorted(results[name].items())) for name in names if name in results}, arguments.out)
-    if arguments.figures is not None:
-        draw(results, arguments.figures)
-    print(requirements.table(results))
     print(f"{arguments.out / 'matrix.md'}: every table; matrix.json beside it: all numbers")
-
-
-def draw(results: dict[str, dict[int, MatrixResult]], out: Path) -> None:
-    """What was measured of ablation and robustness, each in three formats; says what was not."""
-    drawn = {"ablation": study_figures.matrix_ablation(results), "robustness": study_figures.robustness(results)}
-    for name, figure in drawn.items():
-        if figure is None:
-            print(f"{name}: too little was measured to draw it")
-            continue
-        for kind in style.FORMATS:
-            style.save(figure, out / f"{name}.{kind}", kind)
-            print(out / f"{name}.{kind}")
 
 
 def write(results: dict[str, dict[int, MatrixResult]], out: Path) -> None:
@@ -93,7 +76,7 @@ def write(results: dict[str, dict[int, MatrixResult]], out: Path) -> None:
         text += f"\n### main, class by class\n\n{matrix_tables.class_table(results, 'main')}"
         text += f"\n### main, what perfect labels would score\n\n{matrix_tables.ceiling_table(results, 'main')}"
     with whole_file(out / "matrix.md") as partial:
-        partial.write_text(f"## What must hold\n\n{requirements.table(results)}\n## Experiments\n\n{text}")
+        partial.write_text(text)
     with whole_file(out / "matrix.json") as partial:
         partial.write_text(to_json({name: {str(k): r for k, r in found.items()} for name, found in results.items()}))
 

@@ -56,7 +56,7 @@ def evaluate(
         str | None,
         typer.Option(
             metavar="CASES",
-            help='1..5, "1 column", columns_v1, surfaces, yardsticks, by commas, or all [default: 1,2,3,4,5,surfaces]; '
+            help='1..5, "1 column", surfaces, yardsticks, by commas, or all [default: 1,2,3,4,5,surfaces]; '
             "real: one of them [default: by the settings]",
         ),
     ] = None,

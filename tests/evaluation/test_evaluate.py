@@ -38,7 +38,7 @@ def corner(cache: Path) -> Evaluation:
     settings = Settings()
     with pytest.MonkeyPatch.context() as here:
         here.setattr(os, "cpu_count", lambda: 1)  # the tests run side by side as it is: processes cost their start
-        return evaluate(Scene("corner", 3, settings, cache, SLOWER), choose_cases(settings, "1,3,5,columns_v1")[0])
+        return evaluate(Scene("corner", 3, settings, cache, SLOWER), choose_cases(settings, "1,3,5,surfaces")[0])
 
 
 def without_timings(result: EvaluationResult) -> str:
@@ -49,7 +49,7 @@ def test_the_json_is_as_designed_and_never_nan(corner: Evaluation) -> None:
     result = json.loads(tables.as_json(corner.result))
     assert result["cells"] == corner.truth.strict.size
     assert 0.0 < result["coverage"] <= 1.0
-    for case in ("1", "3", "5", "columns_v1"):
+    for case in ("1", "3", "5", "surfaces"):
         entry = result["cases"][case]
         assert len(entry["bytes_per_vehicle"]) == 3
         for truth in ("strict", "provenance"):
@@ -63,7 +63,7 @@ def test_the_json_is_as_designed_and_never_nan(corner: Evaluation) -> None:
 def test_a_second_run_comes_from_the_cache_and_says_the_same(corner: Evaluation, cache: Path) -> None:
     stages: list[str] = []
     again = evaluate(
-        corner.scene, choose_cases(Settings(), "1,3,5,columns_v1")[0], progress=lambda s, *_: stages.append(s)
+        corner.scene, choose_cases(Settings(), "1,3,5,surfaces")[0], progress=lambda s, *_: stages.append(s)
     )
     assert without_timings(again.result) == without_timings(corner.result)
     assert not {"simulating", "mapping"} & set(stages)
@@ -74,28 +74,26 @@ def test_one_stage_costs_more_bytes_than_two(corner: Evaluation) -> None:
     assert min(cases["3"].state_bytes_per_vehicle or [0]) > 5 * max(cases["1"].state_bytes_per_vehicle or [0]) > 0
 
 
-def test_columns_find_what_changed(corner: Evaluation) -> None:
-    columns = corner.result.cases["columns_v1"]
-    assert all(columns.objects.found)
-    assert columns.map is not None
-    assert columns.map.stale_deleted > 0.5
-    assert columns.map.valid_deleted < 0.01
+def test_surfaces_find_what_changed(corner: Evaluation) -> None:
+    surfaces = corner.result.cases["surfaces"]
+    assert all(surfaces.objects.found)
+    assert surfaces.map is not None
+    assert surfaces.map.stale_deleted > 0.5
+    assert surfaces.map.valid_deleted < 0.01
 
 
 def test_tables_show_every_case_and_the_papers_figures(corner: Evaluation) -> None:
     text = tables.as_text(corner.result)
-    for shown in ("Table II", "Table III", "Table IV", "case 5", "columns_v1", "0.850", "0.645", "What the map is for"):
+    for shown in ("Table II", "Table III", "Table IV", "case 5", "surfaces", "0.850", "0.645", "What the map is for"):
         assert shown in text
     lines = tables.as_csv(corner.result).splitlines()
     assert lines[0] == "case,truth,metric,class,value"
     assert len(lines) > 4 * 2 * 11
 
 
-def test_a_misspelt_case_is_named_and_one_that_was_renamed() -> None:
+def test_a_misspelt_case_is_named() -> None:
     with pytest.raises(MapvoteError, match="no case 'colums'"):
         choose_cases(Settings(), "1,colums")
-    with pytest.raises(MapvoteError, match="no case 'columns AB': it is called 'columns_v1 AB' now"):
-        choose_cases(Settings(), "columns AB")
     with pytest.raises(MapvoteError, match="beside a vote"):
         choose_cases(Settings(), "yardsticks")
 

@@ -13,7 +13,7 @@ from mapvote.codec.ballot import Ballot
 from mapvote.core.grid import Grid
 from mapvote.core.point_map import PointMap
 from mapvote_lab.evaluation.baselines.run import yardsticks
-from mapvote_lab.evaluation.experiments.cases import COLUMNS_V1, Case, fuse_case
+from mapvote_lab.evaluation.experiments.cases import Case, fuse_case
 from mapvote_lab.evaluation.experiments.changed_areas import in_changed_areas, survey_anew
 from mapvote_lab.evaluation.experiments.passes import Pass, passes
 from mapvote_lab.evaluation.experiments.pose_errors import localisation, map_frame, map_shift
@@ -40,7 +40,7 @@ class Evaluation:
     causes: Mapping[str, Causes]
     """By case that was to be explained: every true and false cell of the provenance truth and its cause."""
     best: str
-    """The case whose updated map is shown: the one that the settings vote by, else columns_v1, else the first."""
+    """The case whose updated map is shown: the one that the settings vote by, else the first."""
 
 
 def evaluate(
@@ -107,7 +107,7 @@ def evaluate(
 
 def _best(scene: Scene, cases: Sequence[Case]) -> str:
     names = [case.name for case in cases]
-    return next((name for name in (scene.settings.voting.method, COLUMNS_V1) if name in names), names[0])
+    return scene.settings.voting.method if scene.settings.voting.method in names else names[0]
 
 
 def _scored(

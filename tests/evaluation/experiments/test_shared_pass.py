@@ -67,19 +67,3 @@ def test_each_case_says_what_a_vehicle_of_its_own_would_have_said(street: PointM
         assert together.settings_hash == alone.settings_hash
         said.add(encode(together))
     assert len(said) == len(cases)
-
-
-def test_columns_v1_and_its_ablation_vote_by_their_own_rules_in_the_same_pass(street: PointMap, drive: Drive) -> None:
-    cases, _ = choose_cases(Settings(), "columns_v1 A,columns_v1 AB,columns_v1,columns_v1 one-stage,surfaces")
-    shared = SharedPass(drive, street, Settings(), cases, localise=GivenPoses(STAMPS, POSES))
-    for scan in drive:
-        shared.observe(scan)
-    shared.finish()
-    for case in cases:
-        alone = SharedPass(drive, street, Settings(), [case], localise=GivenPoses(STAMPS, POSES))
-        for scan in drive:
-            alone.observe(scan)
-        alone.finish()
-        assert planes(shared.ballot(case)) == planes(alone.ballot(case))
-        assert shared.ballot(case).method == ("surfaces" if case.name == "surfaces" else "columns")
-    assert planes(shared.ballot(cases[0])) != planes(shared.ballot(cases[2]))

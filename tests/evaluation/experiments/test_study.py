@@ -96,5 +96,5 @@ def test_the_study_is_told_in_tables_numbers_and_a_picture(studied: Evaluation, 
 
 def test_only_the_papers_cases_that_voted_can_be_explained(studied: Evaluation) -> None:
     cases = choose_cases(studied.scene.settings, CASES)[0]
-    with pytest.raises(MapvoteError, match="'columns_v1' cannot be explained"):
-        evaluate(studied.scene, cases, study=Study(explained=("columns_v1",)))
+    with pytest.raises(MapvoteError, match="'surfaces' cannot be explained"):
+        evaluate(studied.scene, cases, study=Study(explained=("surfaces",)))

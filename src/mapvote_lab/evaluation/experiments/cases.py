@@ -1,4 +1,4 @@
-"""What is compared: the paper's five cases, the other occlusion rules, our own method and the one before it (paper V).
+"""What is compared: the paper's five cases (paper V), the same under other rules of sight, and ``surfaces``.
 
 All of them are settings of the one rule. A vehicle casts a ballot by each; the server's rule then decides, and the
 decided cells are scored.
@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -21,7 +21,6 @@ from mapvote.core.types import NO_VOTE, U8, MapvoteError
 from mapvote.core.voting import decide
 from mapvote.fusion.fuse import states_over
 from mapvote.fusion.offline import update_map
-from mapvote_lab.evaluation.columns_v1.rules import ALL_RULES, LETTERS, Rules, by_letters
 from mapvote_lab.evaluation.scoring.jury import Outcome
 from mapvote_lab.evaluation.scoring.truth import lay_on
 
@@ -35,8 +34,6 @@ OCCLUSIONS: Mapping[str, Mapping[str, str]] = {
 
 AS_BEFORE = PaperSettings()
 """The paper as it has been read from the start."""
-COLUMNS_V1 = "columns_v1"
-"""The rule before surfaces (evaluation/columns_v1)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,14 +44,7 @@ class Case:
     voting: VotingSettings
     min_votes: int
     paper: PaperSettings = AS_BEFORE
-    """How the paper is read; others are not asked."""
-    rules: Rules | None = None
-    """Of columns_v1, by which it then votes; None: it votes by the method of ``voting``."""
-
-    @property
-    def method(self) -> str:
-        """By which rule its vehicles vote: "paper", "surfaces" or "columns_v1"."""
-        return self.voting.method if self.rules is None else COLUMNS_V1
+    """How the paper is read; only method "paper" uses it."""
 
 
 def paper_cases(settings: Settings) -> dict[str, Case]:
@@ -69,23 +59,16 @@ def paper_cases(settings: Settings) -> dict[str, Case]:
 
 
 def own_cases(settings: Settings) -> dict[str, Case]:
-    """Our own methods: columns_v1 as they were, decided by the server alone, and growing rule by rule (the ablation);
-    and surfaces."""
+    """The default method, "surfaces"."""
     voting = settings.voting.model_copy(update={"method": "surfaces"})
-    surfaces = Case("surfaces", voting, settings.fuse.min_votes)
-    whole = replace(surfaces, name=COLUMNS_V1, rules=ALL_RULES)
-    one_stage = voting.model_copy(update={"two_stage": False})
-    cases = [whole, replace(whole, name=f"{COLUMNS_V1} one-stage", voting=one_stage)]
-    for n in range(1, len(LETTERS)):
-        cases.append(replace(whole, name=f"{COLUMNS_V1} {LETTERS[:n]}", rules=by_letters(LETTERS[:n])))
-    return {case.name: case for case in (*cases, surfaces)}
+    return {"surfaces": Case("surfaces", voting, settings.fuse.min_votes)}
 
 
 YARDSTICKS = ("nearest", "evidence")
 
 
 def choose_cases(settings: Settings, wanted: str) -> tuple[list[Case], bool]:
-    """Cases by comma-separated names (1 to 5, "1 column" and its like, columns_v1, surfaces, yardsticks, or "all"
+    """Cases by comma-separated names (1 to 5, "1 column" and its like, surfaces, yardsticks, or "all"
     that there is), and whether the yardsticks are wanted.
 
     MapvoteError names one that there is not, or says that no vote is left.
@@ -94,9 +77,7 @@ def choose_cases(settings: Settings, wanted: str) -> tuple[list[Case], bool]:
     names = [*every, "yardsticks"] if wanted == "all" else [name.strip() for name in wanted.split(",")]
     for name in names:
         if name not in every and name not in ("yardsticks", *YARDSTICKS):
-            now = name.replace("columns", COLUMNS_V1, 1)
-            called = f"it is called {now!r} now; " if now in every else ""
-            raise MapvoteError(f"no case {name!r}: {called}choose from all, yardsticks, {', '.join(every)}")
+            raise MapvoteError(f"no case {name!r}: choose from all, yardsticks, {', '.join(every)}")
     chosen = [every[name] for name in names if name in every]
     if not chosen:
         raise MapvoteError("the yardsticks are measured beside a vote: name a case too, as in --case 1,yardsticks")

@@ -6,7 +6,6 @@ short goes on where it stopped, and experiments that share drives, maps or ballo
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from dataclasses import dataclass, field, replace
@@ -23,9 +22,8 @@ from mapvote.config import Settings
 from mapvote.core.point_map import PointMap
 from mapvote.formats.atomic import whole_file
 from mapvote_lab.evaluation.experiments.attacks import ATTACKS
-from mapvote_lab.evaluation.experiments.cases import COLUMNS_V1, Case, choose_cases, fuse_case
+from mapvote_lab.evaluation.experiments.cases import Case, choose_cases, fuse_case
 from mapvote_lab.evaluation.experiments.conditions import Conditions
-from mapvote_lab.evaluation.experiments.imported_map import CHAINS, in_turn
 from mapvote_lab.evaluation.experiments.passes import Pass, have_voted, passes
 from mapvote_lab.evaluation.experiments.pose_errors import localisation, map_shift
 from mapvote_lab.evaluation.experiments.scene import BALLOTS_FROM, Progress, Scene, key_of, sources_digest
@@ -37,7 +35,7 @@ from mapvote_lab.simulation.processes import processes
 _SCORES_FROM = (
     *BALLOTS_FROM, "fusion", "simulation", "evaluation/scoring", "evaluation/evaluate.py", "evaluation/results.py",
     "evaluation/experiments/attacks.py", "evaluation/experiments/cases.py", "evaluation/experiments/conditions.py",
-    "evaluation/experiments/imported_map.py", "evaluation/experiments/matrix.py", "evaluation/experiments/passes.py",
+    "evaluation/experiments/matrix.py", "evaluation/experiments/passes.py",
 )  # fmt: skip
 
 
@@ -60,11 +58,6 @@ def as_sent(drives: Sequence[Pass], cases: Sequence[Case], first_map: PointMap) 
         yield BallotSet(case.name, case.min_votes, [drive.ballots[case.name] for drive in drives])
 
 
-def columns_alone(drives: Sequence[Pass], cases: Sequence[Case], first_map: PointMap) -> Iterator[BallotSet]:
-    """Columns_v1, all vehicles."""
-    return as_sent(drives, [case for case in cases if case.name == COLUMNS_V1], first_map)
-
-
 def growing(drives: Sequence[Pass], cases: Sequence[Case], first_map: PointMap) -> Iterator[BallotSet]:
     """Every case, with the first 3, 5, 7 and 10 vehicles."""
     for case, n in product(cases, (3, 5, 7, 10)):
@@ -73,17 +66,16 @@ def growing(drives: Sequence[Pass], cases: Sequence[Case], first_map: PointMap) 
 
 
 def with_liars(drives: Sequence[Pass], cases: Sequence[Case], first_map: PointMap) -> Iterator[BallotSet]:
-    """Of each of our methods that voted, for k = 1, 2, 3: 2k + 1 vehicles with min_votes = k + 1, all honest, and the
-    last k of them lying."""
-    for method, k in itertools.product((COLUMNS_V1, "surfaces"), (1, 2, 3)):
+    """Surfaces, for k = 1, 2, 3: 2k + 1 vehicles with min_votes = k + 1, all honest, and the last k of them lying."""
+    for k in (1, 2, 3):
         n = 2 * k + 1
-        if n > len(drives) or method not in drives[0].ballots:
-            continue
-        honest = [drive.ballots[method] for drive in drives[:n]]
-        yield BallotSet(f"{method}, {n} honest", k + 1, honest)
+        if n > len(drives):
+            return
+        honest = [drive.ballots["surfaces"] for drive in drives[:n]]
+        yield BallotSet(f"surfaces, {n} honest", k + 1, honest)
         for name, attack in ATTACKS.items():
             lies = [attack(ballot, first_map, honest[0]) for ballot in honest[-k:]]
-            yield BallotSet(f"{method}, {k} of {n} {name}", k + 1, [*honest[:-k], *lies])
+            yield BallotSet(f"surfaces, {k} of {n} {name}", k + 1, [*honest[:-k], *lies])
 
 
 @dataclass(frozen=True)
@@ -95,21 +87,17 @@ class Experiment:
     """Of the scenario."""
     conditions: Conditions = field(default_factory=Conditions)
     rounds: BallotSets = as_sent
-    chains: Mapping[str, Sequence[str]] = field(default_factory=dict)
-    """Besides, columns_v1 on the first map without its known-free columns: who votes in turn, see ``in_turn``."""
 
 
-_BOTH = f"1 column,{COLUMNS_V1},surfaces"
+_BOTH = "1 column,surfaces"
 """Experiments with the same cases on the same drives share their ballots."""
-_STAGES = f"1 column,{COLUMNS_V1},{COLUMNS_V1} one-stage,surfaces"
 _TEN = {"vehicles": 10}
 EXPERIMENTS: Mapping[str, Experiment] = {
     "main": Experiment("all"),
     "liars": Experiment("all", rounds=with_liars),
-    "imported": Experiment("all", rounds=columns_alone, chains=CHAINS),
     "noise": Experiment(_BOTH, conditions=Conditions(noise_m=0.1, noise_deg=0.2)),
     "2 Hz": Experiment(_BOTH, conditions=Conditions(scans="::5")),
-    "parked": Experiment(_STAGES, {"temporary_cars": 12}),
+    "parked": Experiment(_BOTH, {"temporary_cars": 12}),
     "vehicles": Experiment(_BOTH, _TEN, rounds=growing),
     "many liars": Experiment(_BOTH, _TEN, rounds=with_liars),
     "5 Hz": Experiment(_BOTH, conditions=Conditions(scans="::2")),
@@ -190,9 +178,6 @@ class Matrix:
                 progress("scoring", i, 0)
             outcome = fuse_case(first_map, turn.ballots, turn.min_votes, self.settings.fuse, jury.window)
             entries[turn.name] = _judged(outcome, jury)
-        for name, voters in experiment.chains.items():
-            [columns] = [case for case in cases if case.name == COLUMNS_V1]
-            entries[name] = _judged(in_turn(scene, columns, voters, jury.window, self.workers, progress), jury)
         return MatrixResult(
             scenario=self.scenario,
             seed=seed,

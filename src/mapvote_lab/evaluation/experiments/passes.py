@@ -78,7 +78,7 @@ def passes(
 def pass_folder(scene: Scene, cases: Sequence[Case], vehicle: str, keep: bool = False) -> Path:
     """Where a vehicle's ballots lie in the cache."""
     made_by = sources_digest(BALLOTS_FROM), scene.conditions, scene.map_name
-    votes_by = ((c.name, c.voting.model_dump_json(), c.paper.model_dump_json(), c.rules) for c in cases)
+    votes_by = ((c.name, c.voting.model_dump_json(), c.paper.model_dump_json()) for c in cases)
     key = key_of(*made_by, *votes_by)
     return scene.work / f"{'kept' if keep else 'votes'}-{key}" / vehicle
 

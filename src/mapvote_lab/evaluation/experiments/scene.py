@@ -44,7 +44,7 @@ _DROPPED = "dropped"
 """A file of this name says that the scans were deleted to free the disk."""
 _MAP_FROM = ("core", "codec", "formats", "localisation", "perception", "detection", "slam")
 BALLOTS_FROM = (
-    *_MAP_FROM, "vehicle.py", "evaluation/columns_v1", "evaluation/experiments/shared_pass.py",
+    *_MAP_FROM, "vehicle.py", "evaluation/experiments/shared_pass.py",
     "evaluation/experiments/kept.py",
 )  # fmt: skip
 

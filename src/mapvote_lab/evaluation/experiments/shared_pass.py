@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from msgspec import structs
 
 from mapvote.codec.ballot import Ballot
 from mapvote.config import PaperSettings, Settings, VotingSettings
@@ -23,9 +22,6 @@ from mapvote.localisation.ndt import PosePrior
 from mapvote.perception.frontend import DriveReport, Frontend, Movers, Observation
 from mapvote.perception.moving_objects import MovingFilter
 from mapvote.vehicle import make_voter, write_ballot
-from mapvote_lab.evaluation.columns_v1.counters import ColumnEvidence
-from mapvote_lab.evaluation.columns_v1.rules import Rules
-from mapvote_lab.evaluation.columns_v1.voter import ColumnVoter
 from mapvote_lab.evaluation.experiments.cases import Case
 
 
@@ -49,10 +45,9 @@ class SharedPass:
             LocalMap(point_map, settings.voting.window_m),
             sensor=drive.sensor,
         )
-        self._voters: dict[tuple[VotingSettings, PaperSettings, Rules | None], Voter] = {}
+        self._voters: dict[tuple[VotingSettings, PaperSettings], Voter] = {}
         self._observing: list[tuple[str, Voter]] = []
-        """Those of them that fill the counters, each with its method."""
-        self._evidence: dict[tuple[bool, bool], ColumnEvidence] = {}
+        """The same voters, each with its method."""
         for case in cases:
             self._enrol(case)
         self._new_points = {
@@ -64,18 +59,9 @@ class SharedPass:
         key = _counts_as(case)
         if key in self._voters:
             return
-        voting, paper, rules = key
-        if rules is None:
-            settings = self.settings.model_copy(update={"voting": voting, "paper": paper})
-            self._voters[key] = make_voter(settings, self.drive.sensor, self.point_map)
-            self._observing.append((case.method, self._voters[key]))
-            return
-        counted_by = rules.empty_by_ray, rules.hits_veto
-        voter = ColumnVoter(voting, self.point_map, rules, self._evidence.get(counted_by))
-        if counted_by not in self._evidence:
-            self._evidence[counted_by] = voter.evidence
-            self._observing.append((case.method, voter))
-        self._voters[key] = voter
+        settings = self.settings.model_copy(update=dict(zip(("voting", "paper"), key, strict=True)))
+        self._voters[key] = make_voter(settings, self.drive.sensor, self.point_map)
+        self._observing.append((case.voting.method, self._voters[key]))
 
     @property
     def report(self) -> DriveReport:
@@ -103,13 +89,12 @@ class SharedPass:
     def ballot(self, case: Case) -> Ballot:
         """What the vehicle says by one of its cases. MapvoteError if no scan has voted."""
         settings = self.settings.model_copy(update={"voting": case.voting, "paper": case.paper})
-        ballot = write_ballot(
+        return write_ballot(
             self.drive.vehicle, self.drive.drive_id, self.point_map, settings, self.report,
-            self._voters[_counts_as(case)], self._new_points[case.method],
+            self._voters[_counts_as(case)], self._new_points[case.voting.method],
         )  # fmt: skip
-        return ballot if case.rules is None else structs.replace(ballot, method="columns")  # as vehicles called it
 
 
-def _counts_as(case: Case) -> tuple[VotingSettings, PaperSettings, Rules | None]:
+def _counts_as(case: Case) -> tuple[VotingSettings, PaperSettings]:
     """Voters that differ only in who decides (one stage or two) count alike."""
-    return case.voting.model_copy(update={"two_stage": True}), case.paper, case.rules
+    return case.voting.model_copy(update={"two_stage": True}), case.paper

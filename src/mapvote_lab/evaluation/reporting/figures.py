@@ -20,6 +20,7 @@ from mapvote.core.voting import vote_weight
 from mapvote_lab.evaluation.results import CaseResult
 from mapvote_lab.evaluation.scoring import paper_tables
 from mapvote_lab.evaluation.scoring.cells import CLASSES
+from mapvote_lab.evaluation.scoring.reliability import Reliability
 
 Outline = tuple[str, F64]
 """Kind ("built" or "demolished") and footprint corners (m, 2), map metres."""
@@ -224,3 +225,32 @@ def byte_bars(cases: Mapping[str, CaseResult], names: Mapping[str, str]) -> Figu
     axis.spines[["top", "right"]].set_visible(False)
     figure.legend(loc="outside upper center", ncols=2, frameon=False)
     return figure
+
+
+def reliability_diagram(found: Mapping[CellState, Reliability]) -> Figure:
+    """Predicted probability against the share that did change, a panel for each kind; below, how many cells."""
+    figure, axes = style.new_figure(8.2, 4.9, 2, len(found), height_ratios=(3, 1), sharex=True, sharey="row")
+    for column, (state, one) in zip(axes.T, found.items(), strict=True):
+        colour, marker = (style.NEW, "D") if state == CellState.CHANGED_OCCUPIED else (style.GONE, "X")
+        there = one.cells > 0
+        column[0].plot([0, 1], [0, 1], color=style.FAINT, lw=0.9, ls="--")
+        column[0].vlines(one.predicted[there], one.predicted[there], one.true[there], color=colour, lw=0.9)
+        column[0].plot(one.predicted[there], one.true[there], marker, color=colour, ms=7)
+        title = f"{style.STATE_NAMES[state]}, {int(one.cells.sum()):,} cells\n"
+        column[0].set_title(f"{title}calibration error {one.calibration_error:.3f}, Brier {one.brier:.3f}", loc="left")
+        width = 1.0 / len(one.cells)
+        column[1].bar((np.arange(len(one.cells)) + 0.5) * width, one.cells, 0.9 * width, color=colour)
+        column[1].set_xlabel("probability that is told")
+        column[1].set_xlim(0, 1)
+        for axis in column:
+            _plain(axis)
+    axes[0, 0].set_ylim(-0.03, 1.03)
+    axes[0, 0].set_ylabel("share that did change")
+    axes[1, 0].set_ylabel("cells")
+    return figure
+
+
+def _plain(axis: Any) -> None:
+    axis.grid(alpha=0.25, lw=0.6)
+    axis.set_axisbelow(True)
+    axis.spines[["top", "right"]].set_visible(False)

@@ -19,8 +19,8 @@ from mapvote.localisation.localiser import GivenPoses
 from mapvote.vehicle import Vehicle
 from mapvote_lab.evaluation.baselines.nearest_neighbour import heights
 from mapvote_lab.evaluation.evaluate import Evaluation
-from mapvote_lab.evaluation.experiments.cases import COLUMNS_V1, YARDSTICKS, ballot_states, paper_cases
-from mapvote_lab.evaluation.reporting import birdseye, figures, study_figures
+from mapvote_lab.evaluation.experiments.cases import YARDSTICKS, ballot_states, paper_cases
+from mapvote_lab.evaluation.reporting import birdseye, figures
 from mapvote_lab.evaluation.reporting.tables import case_name
 from mapvote_lab.evaluation.scoring.cells import UNSCORED
 from mapvote_lab.evaluation.scoring.map_points import same_rows
@@ -91,11 +91,11 @@ def drawn(evaluation: Evaluation, case: str) -> list[tuple[str, Figure, str]]:
         )
     nearest = _scan_near(evaluation, areas)
     v, n_min = evaluation.scene.settings.voting, evaluation.scene.settings.paper.n_min
-    decided = {n: evaluation.outcomes[n].states for n in ("1", "5", COLUMNS_V1, "surfaces") if n in evaluation.outcomes}
+    decided = {n: evaluation.outcomes[n].states for n in ("1", "5", "surfaces") if n in evaluation.outcomes}
     panels = [("Truth (strict)", _as_states(evaluation.truth.strict))]
     panels += [(case_name(n).capitalize(), states) for n, states in decided.items()]
     states = figures.cell_states(panels, evaluation.window, outlines=outlines)
-    shown = {n: e for n, e in evaluation.result.cases.items() if n in (*"12345", COLUMNS_V1, "surfaces", *YARDSTICKS)}
+    shown = {n: e for n, e in evaluation.result.cases.items() if n in (*"12345", "surfaces", *YARDSTICKS)}
     names = {n: case_name(n) for n in shown}
     bars = figures.score_bars(shown, names)
     pictures += [
@@ -119,19 +119,16 @@ def drawn(evaluation: Evaluation, case: str) -> list[tuple[str, Figure, str]]:
 
 
 def _of_our_own(evaluation: Evaluation) -> list[tuple[str, Figure, str]]:
-    """Of our own methods: their probabilities, and what each rule of columns_v1 is worth if they voted rule by rule."""
+    """The reliability of the probabilities, if the shown case is ours."""
     out = []
-    if evaluation.best in (COLUMNS_V1, "surfaces"):
+    if evaluation.best == "surfaces":
         decisions, lattice = evaluation.outcomes[evaluation.best].decisions, evaluation.first_map.lattice
         found = {
             state: reliability(decisions, lattice, evaluation.truth.strict, evaluation.window, state)
             for state in (CellState.CHANGED_OCCUPIED, CellState.CHANGED_EMPTY)
         }
         caption = "How often cells changed that were told to, by the probability they were told with (strict truth)."
-        out.append(("reliability", study_figures.reliability_diagram(found), caption))
-    ablation = study_figures.ablation({name: [entry] for name, entry in evaluation.result.cases.items()})
-    if ablation is not None:
-        out.append(("ablation", ablation, "What each rule of columns_v1 is worth, added one by one (strict truth)."))
+        out.append(("reliability", figures.reliability_diagram(found), caption))
     return out
 
 

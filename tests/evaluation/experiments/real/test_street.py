@@ -59,15 +59,15 @@ def test_vehicles_find_themselves_within_10_cm_and_none_is_lost(edit: Edit, firs
 @pytest.mark.parametrize("drive", ["0001", "0005"])
 def test_hardly_anything_is_called_changed_where_nothing_changed(drive: str) -> None:
     """Movers apart .2 % of determined cells and a quarter of case 1's share at most, movers included 1 %."""
-    cases, _ = choose_cases(Settings(), "1,columns_v1")
+    cases, _ = choose_cases(Settings(), "1,surfaces")
     folder = KITTI.with_name(f"2011_09_26_{drive}")
     street = laid(folder)
     for edit in (unedited, every_other_beam):
         run = vote_on(street, cases, edit=edit)
-        share = run.changed_share("columns_v1", with_movers=False)
+        share = run.changed_share("surfaces", with_movers=False)
         assert share <= 0.002
         assert share <= 0.25 * run.changed_share("1", with_movers=False)
-        assert run.changed_share("columns_v1", with_movers=True) <= 0.01
+        assert run.changed_share("surfaces", with_movers=True) <= 0.01
 
 
 @needs_kitti
