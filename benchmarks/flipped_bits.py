@@ -32,8 +32,8 @@ from mapvote.core.types import CellState, MapvoteError
 from mapvote.server.store import schema
 from mapvote.server.store.admission import accept, examine
 from mapvote.server.store.ballots import Receipt
-from mapvote.server.store.blobs import TileHashes, unpack_points_plane
-from mapvote.server.store.check import check
+from mapvote.server.store.integrity import check
+from mapvote.server.store.planes import TileHashes, unpack_points_plane
 from mapvote.server.store.policy import Policy
 from mapvote.server.store.publish import publish
 from mapvote.server.store.store import Store

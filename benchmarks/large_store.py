@@ -27,12 +27,12 @@ from mapvote.core.types import CellState
 from mapvote.server.insight.history import changes_between, coverage
 from mapvote.server.store import schema
 from mapvote.server.store.admission import Intake, examine
-from mapvote.server.store.blobs import pack_tile
 from mapvote.server.store.database import insert_rows
-from mapvote.server.store.policy import Policy, current_policy
+from mapvote.server.store.planes import pack_tile
+from mapvote.server.store.policy import Policy
 from mapvote.server.store.publish import publish
+from mapvote.server.store.schema import sum_of_planes
 from mapvote.server.store.store import Store
-from mapvote.server.store.sums import sum_of_planes
 from postgres_cluster import PostgresCluster
 
 WALL = [(10, 10 + c) for c in range(8)]
@@ -49,7 +49,7 @@ def fill(store: Store, tiles: int) -> None:
     states = pack_plane(states_plane({(30, 30): CellState.UNCHANGED_EMPTY}), 1)
     nothing = None, None, None, None, None
     total = sum_of_planes(hashes.points, [states, *nothing])
-    policy, now = current_policy(store).model_dump_json(), store.clock()
+    policy, now = store.policy().model_dump_json(), store.clock()
     ballots = ROWS_A_TILE * tiles // TILES_A_BALLOT
     with store.database.writing() as connection:
         insert_rows(connection, schema.events, [(10 + s, now, "ballot", "old", "") for s in range(ballots + VERSIONS)])

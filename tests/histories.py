@@ -18,7 +18,7 @@ from mapvote.core.types import NO_VOTE, U8, Bool, MapvoteError
 from mapvote.server.errors import Conflict, NotFound
 from mapvote.server.store.admission import accept, examine
 from mapvote.server.store.ballots import Receipt, withdraw
-from mapvote.server.store.policy import Policy, set_policy
+from mapvote.server.store.policy import Policy
 from mapvote.server.store.publish import publish, rollback
 from mapvote.server.store.replay import replay
 from mapvote.server.store.reviews import decide, undo
@@ -59,7 +59,7 @@ class History:
         return self.clock.now // 10**9
 
     def policy(self, settings: FuseSettings) -> None:
-        set_policy(self.store, Policy(fuse=settings))
+        self.store.set_policy(Policy(fuse=settings))
 
     def live(self, steps: int) -> None:
         """So many steps; AssertionError, naming the step, at the first difference."""

@@ -30,7 +30,6 @@ CIRCLES = [
     {"mapvote.formats.drives.bag_poses", "mapvote.formats.drives.rosbag"},
     {"mapvote.formats.geo.frame", "mapvote.formats.geo.projector"},
     {"mapvote.fusion.odds", "mapvote.fusion.tile_vote"},
-    {"mapvote.server.store.policy", "mapvote.server.store.store"},
 ]
 """Import circles that are still there. The goal is none."""
 

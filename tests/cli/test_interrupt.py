@@ -82,12 +82,12 @@ VERBS = {
     "evaluate tiny.toml --json new": "import mapvote_lab.evaluation.evaluate as m; m.evaluate = wait",
     "warmup": "import mapvote.warmup as m; m.warm_up = wait",
     "follow http://localhost:9 new --autoware": "import mapvote.client as m; m.MapClient.newest = wait",
-    "policy STORE": "import mapvote.server.store.policy as m; m.policy_told = wait",
+    "policy STORE": "import mapvote.server.store.store as m; m.Store.policy_changes = wait",
     "rollback STORE 1": "import mapvote.server.store.publish as m; m.rollback = wait",
     "unvote STORE car_1": "import mapvote.server.store.ballots as m; m.withdraw = wait",
-    "check STORE --mend": "import mapvote.server.store.check as m; m.check = wait",
+    "check STORE --mend": "import mapvote.server.store.integrity as m; m.check = wait",
     "explain STORE 3.2 3.2": "import mapvote.server.insight.explain as m; m.explain_cell = wait",
-    "gc STORE --yes": "import mapvote.server.store.clearing as m; m.clear = wait",
+    "gc STORE --yes": "import mapvote.server.store.retention as m; m.clear = wait",
     "upgrade STORE": "import mapvote.server.store.migrate as m; m.upgrade = wait",
     "keys STORE": "import mapvote.server.store.keys as m; m.listed = wait",
 }
@@ -125,7 +125,7 @@ def test_ctrl_c_while_a_version_is_being_written_leaves_no_version(line: str, de
     """Its row is there by then, in a transaction that never ends."""
     here = desk("STORE")
     before = what_is_in(here / "STORE")
-    patch = "import mapvote.server.store.commit as m; m.set_tiles = wait"
+    patch = "import mapvote.server.store.publish as m; m.set_tiles = wait"
     done = interrupt(slowed(line.split(), patch), here, (here / "ready").exists)
     assert stopped_by_a_line(done)
     assert what_is_in(here / "STORE") == before

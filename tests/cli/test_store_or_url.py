@@ -19,8 +19,8 @@ from mapvote.config import FuseSettings
 from mapvote.core.types import CellState, MapvoteError
 from mapvote.server.store import schema
 from mapvote.server.store.admission import accept, examine
+from mapvote.server.store.integrity import set_aside
 from mapvote.server.store.policy import Policy
-from mapvote.server.store.quarantine import set_aside
 from mapvote.server.store.store import Store
 
 WALL = [(10, 10), (10, 11), (10, 12)]

@@ -142,7 +142,6 @@ def policy(
     mapvote policy fleet.db fuse.min_votes=3 --reason "more vehicles now"
     """
     from mapvote.core.types import MapvoteError
-    from mapvote.server.store.policy import policy_told, set_values
 
     pairs = [value.partition("=") for value in values or ()]
     if any(not equals for _, equals, _ in pairs):
@@ -155,8 +154,8 @@ def policy(
     else:
         with opened_store(store) as opened:
             if pairs:
-                set_values(opened, wanted, by=who(), reason=reason)
-            told = policy_told(opened)
+                opened.change_policy(wanted, by=who(), reason=reason)
+            told = opened.policy_changes()[-1].as_json()
     print(f"policy of {when(told['at_ns'])} by {told['by']}" + (f": {told['reason']}" if told["reason"] else ""))
     for section, entries in told["policy"].items():
         for key, value in entries.items():

@@ -12,8 +12,8 @@ from mapvote.cli.options import SERVER, KeyFile, StoreName, StoreOrUrl
 from mapvote.cli.terminal import waiting
 
 if TYPE_CHECKING:
+    from mapvote.server.store.integrity import Damage
     from mapvote.server.store.keys import Key, Role
-    from mapvote.server.store.quarantine import Damage
     from mapvote.server.store.store import Store
 
 
@@ -35,7 +35,7 @@ def check(
     """
     from mapvote.cli.remote import is_url, server_at
     from mapvote.core.types import MapvoteError
-    from mapvote.server.store.quarantine import Damage
+    from mapvote.server.store.integrity import Damage
 
     if is_url(store):
         if other:
@@ -55,8 +55,8 @@ def check(
 def _checked(store: str, mend: bool, other: str | None) -> list[Damage]:
     from mapvote.codec.arrays import unpack_bytes
     from mapvote.core.types import MapvoteError
-    from mapvote.server.store.blobs import MAX_PLANE_BYTES
-    from mapvote.server.store.check import check as look
+    from mapvote.server.store.integrity import check as look
+    from mapvote.server.store.planes import MAX_PLANE_BYTES
 
     def elsewhere(digest: str) -> bytes | None:
         if backup is None:
@@ -79,7 +79,7 @@ def gc(
 
     mapvote gc fleet.db
     """
-    from mapvote.server.store.clearing import clear
+    from mapvote.server.store.retention import clear
 
     with opened_store(store) as opened, waiting("looking for what can go"):
         done = clear(opened, by=who(), dry_run=not yes)

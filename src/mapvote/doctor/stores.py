@@ -8,7 +8,7 @@ from mapvote.core.types import MapvoteError
 from mapvote.doctor.finding import Finding, in_order
 from mapvote.doctor.maps import check_whole
 from mapvote.server.insight.overview import overview
-from mapvote.server.store.check import check
+from mapvote.server.store.integrity import check
 from mapvote.server.store.keys import listed
 from mapvote.server.store.store import Store
 

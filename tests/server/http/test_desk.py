@@ -19,7 +19,7 @@ from mapvote.codec.ballot import encode
 from mapvote.config import FuseSettings
 from mapvote.core.types import CellState
 from mapvote.server.http.app import create_app
-from mapvote.server.store import keys, policy
+from mapvote.server.store import keys
 from mapvote.server.store.admission import accept, examine
 from mapvote.server.store.round import round_at
 from mapvote.server.store.store import Store
@@ -40,8 +40,8 @@ def vote(store: Store, drive: str, vehicles: tuple[str, ...] = ("v1", "v2")) -> 
 def server(database_url: str) -> Iterator[Server]:
     """A server where a publish would take two walls away; keys of two reviewers, an operator and a vehicle."""
     store = Store.create(database_url, two_walls())
-    now = policy.current_policy(store)
-    policy.set_policy(store, now.model_copy(update={"fuse": FuseSettings(max_deleted_share=1.0)}), by="test")
+    now = store.policy()
+    store.set_policy(now.model_copy(update={"fuse": FuseSettings(max_deleted_share=1.0)}), by="test")
     vote(store, "d1")
     people: dict[str, keys.Role] = {"anna": "reviewer", "bert": "reviewer", "boss": "operator", "v1": "vehicle"}
     who = {name: {"Authorization": f"Bearer {keys.issue(store, name, role)}"} for name, role in people.items()}
@@ -229,7 +229,7 @@ def test_the_list_of_changes_waits_for_nobody_at_the_desk(server: Server) -> Non
 def test_what_is_beyond_the_budget_is_listed_apart_with_where_to_drive_by(server: Server) -> None:
     """Ballots that do not say how sure they are: a budget so small lets nothing go."""
     client, store, who = server
-    policy.set_values(store, {"fuse.false_deletions": "1e-6"}, by="test")
+    store.change_policy({"fuse.false_deletions": "1e-6"}, by="test")
     told = client.get("/v1/desk", headers=who["anna"]).json()
     assert told["pending"]["features"] == []
     assert [f["properties"]["drive_by"] for f in told["waiting"]] == [[3.45, 3.15], [80.25, 3.15]]

@@ -26,7 +26,6 @@ from mapvote.core.types import CellState
 from mapvote.server.http.app import create_app
 from mapvote.server.insight.cutout import whole_page
 from mapvote.server.insight.history import changes_between, cutouts_between
-from mapvote.server.store import policy
 from mapvote.server.store.admission import accept, examine
 from mapvote.server.store.publish import publish
 from mapvote.server.store.store import Store
@@ -49,8 +48,8 @@ def village(database: str) -> None:
     houses = np.concatenate([ground, wall(HOUSE, HEIGHTS), wall(SHED, HEIGHTS)])
     bright = {"intensity": (1000 * houses[:, 2]).astype(np.uint16)}
     opened = Store.create(database, make_map({(0, 0): make_tile(houses).but(fields=bright)}))
-    lax = policy.current_policy(opened).model_copy(update={"fuse": FuseSettings(max_deleted_share=1.0)})
-    policy.set_policy(opened, lax, by="test")
+    lax = opened.policy().model_copy(update={"fuse": FuseSettings(max_deleted_share=1.0)})
+    opened.set_policy(lax, by="test")
     for number, gone in enumerate((HOUSE, SHED)):
         for name in ("v1", "v2"):
             states = states_plane(dict.fromkeys(gone, CellState.CHANGED_EMPTY), fill=CellState.UNCHANGED_EMPTY)

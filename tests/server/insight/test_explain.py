@@ -19,7 +19,7 @@ from mapvote.server.store import schema
 from mapvote.server.store.admission import accept, examine
 from mapvote.server.store.ballots import Receipt, withdraw
 from mapvote.server.store.keys import issue, revoke
-from mapvote.server.store.policy import Policy, set_policy
+from mapvote.server.store.policy import Policy
 from mapvote.server.store.publish import publish
 from mapvote.server.store.store import Store
 from standing_clock import Clock
@@ -108,7 +108,7 @@ def test_what_comes_and_goes_is_called_temporary_until_it_can_be_expected_to_sta
 
 
 def test_who_looked_last_holds_up_what_is_new(store: Store, clock: Clock) -> None:
-    set_policy(store, Policy(fuse=FuseSettings()))
+    store.set_policy(Policy(fuse=FuseSettings()))
     for vehicle, state in (("a", "CHANGED_OCCUPIED"), ("b", "CHANGED_OCCUPIED"), ("c", "UNCHANGED_EMPTY")):
         clock.now += 3_600 * 10**9
         say(store, vehicle, CellState[state], LAWN)

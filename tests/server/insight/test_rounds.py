@@ -18,10 +18,10 @@ from mapvote.core.point_map import PointMap
 from mapvote.core.types import CellState
 from mapvote.server.errors import Held
 from mapvote.server.insight.desk import desk, pending_picture, review
-from mapvote.server.store import tile_jobs
+from mapvote.server.store import fusion_jobs
 from mapvote.server.store.admission import Intake, examine
 from mapvote.server.store.ballots import Receipt, withdraw
-from mapvote.server.store.policy import Policy, set_values
+from mapvote.server.store.policy import Policy
 from mapvote.server.store.publish import preview, publish
 from mapvote.server.store.store import Store
 from standing_clock import Clock
@@ -74,13 +74,13 @@ class Counted:
     def __init__(self, store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
         self.fused, self.statements = 0, 0
         self._engine = store.database.engine
-        really = tile_jobs._fuse
+        really = fusion_jobs._fuse
 
         def fuse(*given: Any) -> Any:
             self.fused += 1
             return really(*given)
 
-        monkeypatch.setattr(tile_jobs, "_fuse", fuse)
+        monkeypatch.setattr(fusion_jobs, "_fuse", fuse)
         sa.event.listen(self._engine, "before_cursor_execute", self._asked)
 
     def _asked(self, *_: Any) -> None:
@@ -145,12 +145,12 @@ def test_a_round_ends_with_the_policy_and_with_a_version(make: Callable[..., Sto
     for vehicle in "ab":
         vote(store, [(0, 0)], vehicle)
     assert preview(store).deleted == 18
-    set_values(store, {"fuse.min_votes": "3"})
+    store.change_policy({"fuse.min_votes": "3"})
     assert preview(store).deleted == 0
-    set_values(store, {"fuse.min_votes": "2", "fuse.max_deleted_share": "0.01"})
+    store.change_policy({"fuse.min_votes": "2", "fuse.max_deleted_share": "0.01"})
     with pytest.raises(Held):
         publish(store)
-    set_values(store, {"fuse.max_deleted_share": "1"})
+    store.change_policy({"fuse.max_deleted_share": "1"})
     assert publish(store).version == 2
     assert preview(store).deleted == 0
 

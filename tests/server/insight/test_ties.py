@@ -16,10 +16,10 @@ from mapvote.server.insight.clouds import evidence
 from mapvote.server.insight.explain import explain_cell, states_of
 from mapvote.server.store.admission import Intake, examine
 from mapvote.server.store.ballots import Receipt
+from mapvote.server.store.fusion_jobs import unpack_tally_plane
 from mapvote.server.store.policy import Policy, RoundPolicy
 from mapvote.server.store.publish import preview
 from mapvote.server.store.store import Store
-from mapvote.server.store.tile_jobs import unpack_tally_plane
 
 TIE, CLEAR = (10, 10), (10, 11)
 

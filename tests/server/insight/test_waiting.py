@@ -19,8 +19,8 @@ from mapvote.server.insight.history import changes_between
 from mapvote.server.store import schema
 from mapvote.server.store.admission import accept, examine
 from mapvote.server.store.ballots import Receipt
-from mapvote.server.store.check import check
-from mapvote.server.store.policy import Policy, current_policy, set_values
+from mapvote.server.store.integrity import check
+from mapvote.server.store.policy import Policy
 from mapvote.server.store.publish import publish
 from mapvote.server.store.replay import replay
 from mapvote.server.store.store import Store
@@ -88,12 +88,12 @@ def test_what_waits_is_nothing_that_a_reviewer_decides_about(store: Store) -> No
 
 def test_a_policy_without_a_budget_lets_it_go(store: Store) -> None:
     vote(store, "d1", UNSURE)
-    set_values(store, {"fuse.false_deletions": "1"}, by="boss")
-    assert current_policy(store).fuse.false_deletions == 1.0
+    store.change_policy({"fuse.false_deletions": "1"}, by="boss")
+    assert store.policy().fuse.false_deletions == 1.0
     assert desk(store).waiting == []
     assert publish(store).deleted == 9
     with pytest.raises(MapvoteError, match=r"policy: fuse\.false_deletions = '0'"):
-        set_values(store, {"fuse.false_deletions": "0"}, by="boss")
+        store.change_policy({"fuse.false_deletions": "0"}, by="boss")
 
 
 def test_how_sure_they_were_is_told_of_cells_and_changes_and_outlives_the_round(store: Store) -> None:

@@ -35,12 +35,11 @@ from mapvote.server.http.app import create_app
 from mapvote.server.insight.overview import overview
 from mapvote.server.store import schema
 from mapvote.server.store.admission import accept, examine
-from mapvote.server.store.check import check
-from mapvote.server.store.clearing import clear
-from mapvote.server.store.policy import Policy, set_values
+from mapvote.server.store.integrity import check, set_aside
+from mapvote.server.store.policy import Policy
 from mapvote.server.store.publish import publish, rollback
-from mapvote.server.store.quarantine import set_aside
 from mapvote.server.store.replay import replay
+from mapvote.server.store.retention import clear
 from mapvote.server.store.store import Store
 
 POLICY = Policy(fuse=FuseSettings(max_deleted_share=1.0))
@@ -120,7 +119,7 @@ def test_rolled_back_replayed_and_cleared_they_are_what_they_were_bit_for_bit(st
     rollback(store, 2)
     replay(store, "a", dry_run=False)
     assert store.manifest().tiles == first.tiles, "one vehicle is too few"
-    set_values(store, {"keep.versions": 1}, by="test")
+    store.change_policy({"keep.versions": 1}, by="test")
     assert clear(store, dry_run=False).planes > 0
     assert all_carried(store.point_map()) == all_carried(street())
     assert check(store) == []

@@ -8,9 +8,8 @@ from mapvote.core.types import CellState
 from mapvote.fusion.tile_vote import DAY_NS
 from mapvote.server.errors import TooMany
 from mapvote.server.http.schemas import refuse
-from mapvote.server.store.admission import Intake, examine
+from mapvote.server.store.admission import Intake, Quota, examine
 from mapvote.server.store.ballots import Incoming, Receipt
-from mapvote.server.store.quotas import Quota
 from mapvote.server.store.store import Store
 from standing_clock import Clock
 

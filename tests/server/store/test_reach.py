@@ -8,7 +8,7 @@ from hand_made import Say, make_ballot, states_plane, two_walls
 from mapvote.codec.ballot import Ballot
 from mapvote.core.grid import TileIndex
 from mapvote.core.types import CellState
-from mapvote.server.store.reach import refuse_out_of_reach
+from mapvote.server.store.admission import refuse_out_of_reach
 
 MAP = {(0, 0), (0, 1)}
 

@@ -23,8 +23,7 @@ from mapvote.core.types import CellState, MapvoteError
 from mapvote.server.errors import Conflict, NotFound
 from mapvote.server.store.admission import accept, examine
 from mapvote.server.store.ballots import Receipt
-from mapvote.server.store.commit import write_version
-from mapvote.server.store.publish import publish, rollback
+from mapvote.server.store.publish import publish, rollback, write_version
 from mapvote.server.store.replay import replay
 from mapvote.server.store.store import Store
 

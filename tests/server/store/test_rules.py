@@ -18,7 +18,7 @@ from mapvote.config import FuseSettings
 from mapvote.fusion import fuse
 from mapvote.fusion.copies import Copy
 from mapvote.fusion.tile_vote import TileVote
-from mapvote.server.store import eligible_votes, schema, stored_votes
+from mapvote.server.store import schema, votes
 from mapvote.server.store.store import Store
 from standing_clock import Clock
 
@@ -46,8 +46,8 @@ def test_what_was_read_before_changes_nothing_that_is_decided(
     seed: int, sqlite_stores: MakeStore, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     written = []
-    for most_bytes in (0, 300_000, stored_votes.REMEMBERED_BYTES):  # nothing, a few votes, all
-        monkeypatch.setattr(stored_votes, "remembered", stored_votes.Remembered(most_bytes))
+    for most_bytes in (0, 300_000, votes.REMEMBERED_BYTES):  # nothing, a few votes, all
+        monkeypatch.setattr(votes, "remembered", votes.Remembered(most_bytes))
         stores: list[Store] = []
         live(seed, lambda clock, stores=stores: stores.append(sqlite_stores(clock)) or stores[0], 25)  # type: ignore
         with stores[0].database.reading() as connection:
@@ -86,5 +86,5 @@ def test_the_rules_object_to_a_store_that_lets_votes_count_twice(
     def whatever_came_since(vote: TileVote, *_: object) -> TileVote:
         return vote
 
-    monkeypatch.setattr(eligible_votes, "unspent", whatever_came_since)
+    monkeypatch.setattr(votes, "unspent", whatever_came_since)
     assert disagreements(sqlite_stores, range(6)) != []

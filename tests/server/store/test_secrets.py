@@ -14,7 +14,7 @@ from hand_made import Say, make_ballot, states_plane, two_walls
 from mapvote.codec.ballot import encode
 from mapvote.config import FuseSettings
 from mapvote.core.types import CellState
-from mapvote.server.store import tile_jobs
+from mapvote.server.store import fusion_jobs
 from mapvote.server.store.admission import accept, examine
 from mapvote.server.store.database import address_of
 from mapvote.server.store.publish import publish
@@ -43,13 +43,13 @@ def test_a_task_for_a_cluster_carries_no_password_its_worker_has_its_own(
     says = {(0, 0): Say(states_plane({(10, 10): CellState.CHANGED_EMPTY}))}
     accept(store, [examine(encode(make_ballot(two_walls(), says, vehicle, "d1"))) for vehicle in ("a", "b")])
     monkeypatch.setenv("MAPVOTE_STORE", whole.render_as_string(hide_password=False))
-    tile_jobs._database.cache_clear()
+    fusion_jobs._database.cache_clear()
     cluster = Elsewhere()
     assert publish(store, FuseSettings(max_deleted_share=1.0), executor=cluster).version == 2
     assert cluster.sent
     assert not any(b"a-secret" in sent for sent in cluster.sent)
-    used = tile_jobs._database(address_of(whole))
+    used = fusion_jobs._database(address_of(whole))
     assert used.url.password == "a-secret"
     used.close()
-    tile_jobs._database.cache_clear()
+    fusion_jobs._database.cache_clear()
     store.close()

@@ -27,10 +27,6 @@ from mapvote.server.store.policy import (
     Policy,
     RoundPolicy,
     changed,
-    current_policy,
-    policy_changes,
-    set_policy,
-    set_values,
 )
 from mapvote.server.store.publish import preview, publish, rollback
 from mapvote.server.store.store import Store
@@ -222,25 +218,25 @@ def test_withdrawn_before_publication_it_is_as_if_never_cast(store: Store) -> No
 def test_the_policy_says_how_a_round_votes_and_never_mixes(store: Store, other: Any) -> None:
     """Whoever comes first, right or wrong, decides nothing for the others. With another policy old votes rest."""
     first = RoundPolicy(settings_hash=SETTINGS)
-    set_policy(store, Policy(round=first))
+    store.set_policy(Policy(round=first))
     base = store.point_map()
     for vehicle in "ca":
         with pytest.raises(Conflict, match=r"one round never mixes them; vote again with the fleet's configuration"):
             send(store, says(base, vehicle, EMPTY, **other))
     send(store, says(base, "a", EMPTY))
     wanted = {"method": "paper"} if "method" in other else {"settings_hash": "0" * 16}
-    set_policy(store, Policy(round=first.model_copy(update=wanted)), by="ann", reason="a new release")
+    store.set_policy(Policy(round=first.model_copy(update=wanted)), by="ann", reason="a new release")
     with pytest.raises(Conflict, match="never mixes"):
         send(store, says(base, "b", EMPTY))
     send(store, says(base, "c", EMPTY, **other))
     assert not publish(store, POLICY).published, "a's vote was cast otherwise"
     send(store, says(base, "d", EMPTY, **other))
     assert publish(store, POLICY).deleted == 3
-    assert [(change.by, change.reason) for change in policy_changes(store)][-1] == ("ann", "a new release")
+    assert [(change.by, change.reason) for change in store.policy_changes()][-1] == ("ann", "a new release")
 
 
 def test_a_policy_is_changed_by_name_and_a_wrong_name_is_told(store: Store) -> None:
-    policy = changed(current_policy(store), {"fuse.min_votes": "3", "round.stage": "one-stage"})
+    policy = changed(store.policy(), {"fuse.min_votes": "3", "round.stage": "one-stage"})
     assert (policy.fuse.min_votes, policy.round.stage) == (3, "one-stage")
     with pytest.raises(MapvoteError, match=r"did you mean 'fuse\.min_votes'"):
         changed(policy, {"fuse.min_vote": 3})
@@ -264,7 +260,7 @@ def test_dry_run_changes_nothing_and_a_held_version_says_why(store: Store) -> No
     assert (dry.published, dry.deleted, len(dry.held)) == (False, 3, 1)
     with pytest.raises(Held, match="deletes 25% of the points"):
         publish(store, strict)
-    set_policy(store, Policy(gate=GatePolicy(drive="/drives/ring")))
+    store.set_policy(Policy(gate=GatePolicy(drive="/drives/ring")))
     with pytest.raises(Held, match="worse by /drives/ring"):
         publish(store, POLICY, gate=lambda asked, old, new: [f"worse by {asked.drive}"])
     with pytest.raises(MapvoteError, match="judges versions by /drives/ring: publish by the server or mapvote publish"):
@@ -280,8 +276,8 @@ def test_dry_run_changes_nothing_and_a_held_version_says_why(store: Store) -> No
 )
 def test_a_policy_that_nobody_can_mean_is_refused(store: Store, values: dict[str, str]) -> None:
     with pytest.raises(MapvoteError, match=next(iter(values))):
-        set_values(store, values)
-    assert current_policy(store) == Policy()
+        store.change_policy(values)
+    assert store.policy() == Policy()
 
 
 def test_the_gate_sees_both_maps(store: Store) -> None:
@@ -295,7 +291,7 @@ def test_the_gate_sees_both_maps(store: Store) -> None:
 
     preview(store, POLICY, gate=gate)
     assert seen == [], "the policy names no drive"
-    set_policy(store, Policy(gate=GatePolicy(drive="/drives/ring")))
+    store.set_policy(Policy(gate=GatePolicy(drive="/drives/ring")))
     preview(store, POLICY, gate=gate)
     old, new = seen[0]
     assert len(old.tiles[0, 0].points) - len(new.tiles[0, 0].points) == 3

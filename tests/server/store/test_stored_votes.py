@@ -6,7 +6,7 @@ import numpy as np
 
 from hand_made import SHAPE
 from mapvote.fusion.tile_vote import TileVote
-from mapvote.server.store.stored_votes import Remembered
+from mapvote.server.store.votes import Remembered
 
 BYTES = SHAPE[0] * SHAPE[1]
 

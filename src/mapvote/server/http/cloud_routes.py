@@ -15,7 +15,7 @@ from mapvote.server.insight.clouds import evidence
 from mapvote.server.insight.history import picture_between
 from mapvote.server.insight.levels import N_LEVELS
 from mapvote.server.insight.paths import paths
-from mapvote.server.store.blobs import TileHashes
+from mapvote.server.store.planes import TileHashes
 
 _BYTES: dict[int | str, dict[str, Any]] = {200: {"content": {"application/octet-stream": {}}}}
 _FOR_EVER = "private, max-age=31536000, immutable"

@@ -10,7 +10,7 @@ import msgspec
 
 from mapvote.codec.ballot import tile_key
 from mapvote.codec.tile_file import manifest_tag
-from mapvote.server.store.quarantine import set_aside
+from mapvote.server.store.integrity import set_aside
 from mapvote.server.store.queries import current_number
 from mapvote.server.store.store import Manifest, Store
 

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, generate_latest
 
-from mapvote.server.store.quarantine import KINDS
+from mapvote.server.store.integrity import KINDS
 
 
 class Metrics:

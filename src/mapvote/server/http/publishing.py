@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from threading import Lock
 
 from mapvote.server.errors import Conflict, NotFound
-from mapvote.server.store.tile_jobs import Watched
+from mapvote.server.store.fusion_jobs import Watched
 
 
 @dataclass(slots=True)

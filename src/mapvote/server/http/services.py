@@ -19,9 +19,8 @@ from mapvote.server.http.publishing import Publishing
 from mapvote.server.insight.clouds import Clouds
 from mapvote.server.insight.events import Feed
 from mapvote.server.insight.localisation_gate import gate_by
-from mapvote.server.store.admission import Intake, Sent
+from mapvote.server.store.admission import Intake, Quota, Sent
 from mapvote.server.store.ballots import Incoming, Receipt
-from mapvote.server.store.quotas import Quota
 from mapvote.server.store.round import Gate
 from mapvote.server.store.store import Store
 

@@ -14,8 +14,7 @@ from mapvote.server.http.auth import operator, reviewer
 from mapvote.server.http.schemas import PLAIN, as_json, problems
 from mapvote.server.http.services import services
 from mapvote.server.insight.overview import log_of, overview
-from mapvote.server.store.check import check
-from mapvote.server.store.policy import policy_told, set_values
+from mapvote.server.store.integrity import check
 
 router = APIRouter()
 
@@ -31,15 +30,15 @@ class PolicyAsk(BaseModel):
 @router.get("/v1/policy", response_model=dict[str, Any], responses=problems(), summary="What decides")
 def policy(request: Request) -> Response:
     """The policy that holds, who set it and why."""
-    return as_json(policy_told(services(request).store))
+    return as_json(services(request).store.policy_changes()[-1].as_json())
 
 
 @router.patch("/v1/policy", response_model=dict[str, Any], responses=problems(403), summary="Decide otherwise")
 def change_policy(request: Request, ask: PolicyAsk) -> Response:
     """Holds at once. 422 naming the value that cannot be, or the key that does not exist."""
     by, store = operator(request), services(request).store
-    set_values(store, ask.values, by=by, reason=ask.reason)
-    return as_json(policy_told(store))
+    store.change_policy(ask.values, by=by, reason=ask.reason)
+    return as_json(store.policy_changes()[-1].as_json())
 
 
 @router.get("/v1/info", response_model=dict[str, Any], responses=problems(), summary="What is in the store")

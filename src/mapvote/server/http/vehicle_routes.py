@@ -16,7 +16,7 @@ from mapvote.server.http.auth import own
 from mapvote.server.http.schemas import AS_CSV, Name, Number, Table, VersionQuery, as_json, as_table, iso, problems
 from mapvote.server.http.services import services
 from mapvote.server.store.ballots import withdraw
-from mapvote.server.store.blobs import MAX_PLANE_BYTES
+from mapvote.server.store.planes import MAX_PLANE_BYTES
 
 _AS_YOU_HAVE: dict[int | str, dict[str, Any]] = {304: {"description": "as you have"}}
 router = APIRouter()

@@ -20,12 +20,11 @@ from mapvote.fusion.tile_vote import TileVote
 from mapvote.server.errors import Unavailable
 from mapvote.server.insight.heard import said_by
 from mapvote.server.insight.levels import Levels, cloud_bytes, make_levels, pack
-from mapvote.server.store.blobs import TileHashes, unpack_fields_plane
-from mapvote.server.store.eligible_votes import DAMAGED, FOREVER, Electorate, from_sound_ballots, judged_votes
+from mapvote.server.store.planes import TileHashes, unpack_fields_plane
 from mapvote.server.store.policy import policy_in
 from mapvote.server.store.queries import load_blob, load_tile, tiles_of, tiles_that_differ, version_of
 from mapvote.server.store.store import Store
-from mapvote.server.store.stored_votes import read_votes
+from mapvote.server.store.votes import DAMAGED, FOREVER, Electorate, from_sound_ballots, judged_votes, read_votes
 
 OVERVIEW_POINTS = 150_000
 """Of an overview at most, 1.2 MB: what a slow connection brings in a second or two."""

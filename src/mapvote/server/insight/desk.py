@@ -23,11 +23,11 @@ from mapvote.server.insight.geojson import to_geojson
 from mapvote.server.insight.history import tiles_at
 from mapvote.server.insight.picture import before_and_after
 from mapvote.server.insight.waiting import waiting_features
+from mapvote.server.store.fusion_jobs import Fused, unpack_tally_plane
 from mapvote.server.store.queries import load_tile, tile_of
 from mapvote.server.store.reviews import Review, Verdict, decide, standing
 from mapvote.server.store.round import Gate, Round, edited_tile, reasons_to_hold, round_at
 from mapvote.server.store.store import Store
-from mapvote.server.store.tile_jobs import Fused, unpack_tally_plane
 
 _OF_REVIEW = "verdict."
 _lock = Lock()

@@ -24,19 +24,20 @@ from mapvote.fusion.spent import unspent
 from mapvote.fusion.tile_vote import TileVote
 from mapvote.server.insight.heard import Place, decided_on, ended, heard_by, is_copy, is_silenced, said_by
 from mapvote.server.store import schema
-from mapvote.server.store.eligible_votes import (
+from mapvote.server.store.fusion_jobs import unpack_tally_plane
+from mapvote.server.store.queries import current_version, tile_as_of
+from mapvote.server.store.store import Store
+from mapvote.server.store.votes import (
     DAMAGED,
     Electorate,
+    StoredVote,
     counted_votes,
     electorate_now,
     from_sound_ballots,
     judged_votes,
+    read_votes,
     recent_votes,
 )
-from mapvote.server.store.queries import current_version, tile_as_of
-from mapvote.server.store.store import Store
-from mapvote.server.store.stored_votes import StoredVote, read_votes
-from mapvote.server.store.tile_jobs import unpack_tally_plane
 
 _LOOKED_INTO = 30
 """So many of the last versions that decided a cell are asked which votes they heard."""

@@ -15,10 +15,9 @@ from mapvote.core.voting import decide
 from mapvote.fusion.fuse import Heard, decide_tile, rule_of
 from mapvote.fusion.tile_vote import TileVote
 from mapvote.server.store import schema
-from mapvote.server.store.eligible_votes import Electorate, counted_votes, from_sound_ballots
 from mapvote.server.store.queries import oldest_kept, tile_as_of, version_of
 from mapvote.server.store.store import Store
-from mapvote.server.store.stored_votes import StoredVote
+from mapvote.server.store.votes import Electorate, StoredVote, counted_votes, from_sound_ballots
 
 ENDED = {
     "ballot": "replaced by a later ballot of this drive",

@@ -24,19 +24,19 @@ from mapvote.server.insight.geojson import to_geojson
 from mapvote.server.insight.heard import said_by
 from mapvote.server.insight.picture import before_and_after
 from mapvote.server.store import schema
-from mapvote.server.store.eligible_votes import (
+from mapvote.server.store.fusion_jobs import unpack_tally_plane
+from mapvote.server.store.policy import policy_in
+from mapvote.server.store.queries import current_version, load_tile, tile_as_of, tiles_of, tiles_that_differ, version_of
+from mapvote.server.store.store import Store
+from mapvote.server.store.votes import (
     FOREVER,
     Electorate,
     counting_votes,
     from_sound_ballots,
     judged_votes,
+    read_votes,
     standing_tiles,
 )
-from mapvote.server.store.policy import policy_in
-from mapvote.server.store.queries import current_version, load_tile, tile_as_of, tiles_of, tiles_that_differ, version_of
-from mapvote.server.store.store import Store
-from mapvote.server.store.stored_votes import read_votes
-from mapvote.server.store.tile_jobs import unpack_tally_plane
 
 
 def seen(stamp_ns: int | None, known: bool) -> int | None:

@@ -12,8 +12,8 @@ from mapvote.core.types import MapvoteError
 from mapvote.server.errors import Unavailable
 from mapvote.server.insight.history import events
 from mapvote.server.store import schema
-from mapvote.server.store.blobs import TileHashes, names_in_plane
-from mapvote.server.store.quarantine import set_aside
+from mapvote.server.store.integrity import set_aside
+from mapvote.server.store.planes import TileHashes, names_in_plane
 from mapvote.server.store.queries import current_version, load_blob, oldest_kept, tiles_of
 from mapvote.server.store.store import Store
 

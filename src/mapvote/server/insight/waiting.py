@@ -14,9 +14,9 @@ from mapvote.fusion.edit import delete_points
 from mapvote.fusion.pending import Pending
 from mapvote.server.insight.changes import ChangeObject, change_objects, changed_cells
 from mapvote.server.insight.geojson import to_geojson
+from mapvote.server.store.fusion_jobs import Fused
 from mapvote.server.store.queries import load_tile, tile_of
 from mapvote.server.store.store import Store
-from mapvote.server.store.tile_jobs import Fused
 
 _WAITS = "waits."
 

@@ -3,25 +3,30 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+import threading
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import NamedTuple
 
+import numpy as np
 import sqlalchemy as sa
 
 from mapvote.codec.ballot import Ballot, BallotTile, decode, tile_key, validate
-from mapvote.core.grid import TileIndex
-from mapvote.core.types import MapvoteError
+from mapvote.codec.points import unpack_points
+from mapvote.core.grid import CELL_SIZE, TILE_CELLS, TileIndex
+from mapvote.core.types import F64, Bool, MapvoteError
 from mapvote.fusion.fuse import rule_of
 from mapvote.fusion.offline import staged, tile_vote
-from mapvote.server.errors import Conflict, Unauthorised
+from mapvote.fusion.tile_vote import DAY_NS
+from mapvote.server.errors import Conflict, TooMany, Unauthorised
 from mapvote.server.store import keys, schema
 from mapvote.server.store.ballots import Incoming, Receipt, put_in, unlike
-from mapvote.server.store.blobs import TileHashes
+from mapvote.server.store.planes import TileHashes, unpack_ground_plane
 from mapvote.server.store.policy import policy_in
 from mapvote.server.store.queries import (
     current_number,
+    load_blob,
     load_memory,
     memory_of,
     names,
@@ -29,8 +34,6 @@ from mapvote.server.store.queries import (
     tiles_of,
     tiles_set_between,
 )
-from mapvote.server.store.quotas import Quota, Quotas
-from mapvote.server.store.reach import LowestGround, refuse_out_of_height, refuse_out_of_reach
 from mapvote.server.store.store import Store
 
 MAX_CLOCK_AHEAD_NS = 300 * 10**9
@@ -231,3 +234,174 @@ def _counts_somewhere(
     if memory is None or not len(memory.changed_after(version)):
         return True
     return bool((tile_vote(ballot, tile, "").spoken() & (memory.changed <= version)).any())
+
+
+_COUNTED_AGAIN_NS = DAY_NS // 24
+
+
+@dataclass(frozen=True, slots=True)
+class Quota:
+    """What one vehicle may leave in the store."""
+
+    drives_a_day: int
+    """Ballots in 24 hours; one that replaces another counts too."""
+    tiles_a_drive: int
+    stored_bytes: int
+    """All its ballots together, those that were replaced or withdrawn too, until they are cleared away."""
+
+
+@dataclass(slots=True)
+class _Used:
+    since_ns: int
+    ballots: int
+    size: int
+
+
+class Quotas:
+    """What every vehicle has used of its quota: counted in the store once an hour and before a refusal, in between from
+    what was let through. For any number of threads."""
+
+    def __init__(self, quota: Quota) -> None:
+        self._quota = quota
+        self._lock = threading.Lock()
+        self._used: dict[str, _Used] = {}
+
+    def refusal(self, connection: sa.Connection, incoming: Incoming, now: int) -> MapvoteError | None:
+        """Why a ballot is too much of its vehicle; None lets it through and counts it."""
+        vehicle, tiles = incoming.ballot.vehicle, len(incoming.ballot.tiles)
+        if tiles > self._quota.tiles_a_drive:
+            limit = f"the drive votes on {tiles} tiles, the limit is {self._quota.tiles_a_drive}"
+            return MapvoteError(f"{limit}: send each part of it as a drive of its own")
+        with self._lock:
+            used = self._used.get(vehicle)
+            if used is None or used.since_ns < now - _COUNTED_AGAIN_NS or self._over(used, incoming) is not None:
+                used = self._used[vehicle] = _count(connection, vehicle, now)
+            refused = self._over(used, incoming)
+            if refused is None:
+                used.ballots, used.size = used.ballots + 1, used.size + incoming.size
+            return refused
+
+    def _over(self, used: _Used, incoming: Incoming) -> MapvoteError | None:
+        vehicle, quota = incoming.ballot.vehicle, self._quota
+        if used.ballots >= quota.drives_a_day:
+            said = f"{vehicle!r} has sent {used.ballots} drives in 24 hours, its limit: try again tomorrow"
+            return TooMany(said, _COUNTED_AGAIN_NS / 1e9)
+        if used.size + incoming.size > quota.stored_bytes:
+            full = f"the ballots of {vehicle!r} would take more than {quota.stored_bytes:,} bytes in the store"
+            mend = "ask the operator to clear old ones away, or for a larger quota"
+            return TooMany(f"{full}: {mend}", _COUNTED_AGAIN_NS / 1e9)
+        return None
+
+
+def _count(connection: sa.Connection, vehicle: str, now: int) -> _Used:
+    b = schema.ballots
+    today = sa.func.sum(sa.case((b.c.received_ns > now - DAY_NS, 1), else_=0))
+    row = connection.execute(sa.select(today, sa.func.sum(b.c.bytes)).where(b.c.vehicle == vehicle)).one()
+    return _Used(now, int(row[0] or 0), int(row[1] or 0))
+
+
+MAX_BELOW_M, MAX_ABOVE_M = 10.0, 120.0
+"""New points lie between so much below and so much above the lowest ground of the map around them."""
+MAX_REACH_M = 200.0
+"""Twice what a LiDAR sees: a vote farther from the map than this cannot come from a vehicle that localised in it."""
+_TILE_M = TILE_CELLS * CELL_SIZE
+_TILES_AWAY = int(MAX_REACH_M // _TILE_M) + 1
+
+
+def refuse_out_of_reach(ballot: Ballot, map_tiles: Collection[TileIndex]) -> MapvoteError | None:
+    """Why a ballot votes where its vehicle cannot have been: on a cell more than MAX_REACH_M from every tile of the
+    map, or on tiles in groups that lie farther apart than that. None if it may have been there."""
+    for tile in ballot.tiles:
+        near = [index for index in _around(tile.tile) if index in map_tiles]
+        if _within(tile.tile, near):
+            continue
+        if not near or _farthest_m(ballot, tile, near) > MAX_REACH_M:
+            where = f"tile {tile_key(tile.tile)} has votes more than {MAX_REACH_M:.0f} m from the map"
+            return MapvoteError(f"{where}: a vehicle votes on what it saw while it localised in the map")
+    apart = _first_apart([tile.tile for tile in ballot.tiles])
+    if apart is not None:
+        first, other = (tile_key(index) for index in apart)
+        why = f"tiles {first} and {other} lie on ways more than {MAX_REACH_M:.0f} m apart"
+        return MapvoteError(f"{why}: a drive is one way; send each part as a drive of its own")
+    return None
+
+
+class LowestGround:
+    """How deep the ground of each tile lies, by its plane's hash: looked up in the store once. For any threads."""
+
+    def __init__(self) -> None:
+        self._known: dict[str, float] = {}
+
+    def look_up(self, connection: sa.Connection, ground: str) -> float:
+        """Map metres; inf where the ground is unknown, or its plane damaged."""
+        if ground not in self._known:
+            try:
+                plane = unpack_ground_plane(load_blob(connection, ground), ground)
+            except MapvoteError:
+                return np.inf
+            known = plane[np.isfinite(plane)]
+            self._known[ground] = float(known.min()) if len(known) else np.inf
+        return self._known[ground]
+
+
+def refuse_out_of_height(
+    ballot: Ballot, map_tiles: Mapping[TileIndex, TileHashes], lowest_m: Callable[[str], float]
+) -> MapvoteError | None:
+    """Why a ballot brings points deeper or higher than anything on this map can be; None if it may.
+
+    ``lowest_m``: of a ground plane by its hash. The nearest tiles tell: itself and its neighbours, else those in reach.
+    """
+    for tile in ballot.tiles:
+        heights = () if tile.new_points is None else unpack_points(tile.new_points)[:, 2]
+        if not len(heights):
+            continue
+        near = [index for index in _around(tile.tile) if index in map_tiles]
+        touching = [index for index in near if max(abs(index[0] - tile.tile[0]), abs(index[1] - tile.tile[1])) <= 1]
+        lowest = min((lowest_m(map_tiles[index].ground) for index in touching or near), default=np.inf)
+        if np.isfinite(lowest) and not lowest - MAX_BELOW_M <= min(heights) <= max(heights) <= lowest + MAX_ABOVE_M:
+            span = f"{min(heights):.1f} to {max(heights):.1f} m on tile {tile_key(tile.tile)}"
+            allowed = (
+                f"{MAX_BELOW_M:g} m below to {MAX_ABOVE_M:g} m above the map's lowest ground there, {lowest:.1f} m"
+            )
+            return MapvoteError(f"new points at {span} are not within {allowed}: is the vehicle on this level?")
+    return None
+
+
+def _around(index: TileIndex) -> Iterator[TileIndex]:
+    """The tiles that are within reach of any part of a tile, itself too."""
+    for row in range(-_TILES_AWAY, _TILES_AWAY + 1):
+        for col in range(-_TILES_AWAY, _TILES_AWAY + 1):
+            if _TILE_M * float(np.hypot(max(abs(row) - 1, 0), max(abs(col) - 1, 0))) <= MAX_REACH_M:
+                yield index[0] + row, index[1] + col
+
+
+def _within(index: TileIndex, near: Collection[TileIndex]) -> bool:
+    """Whether the whole tile is within reach, since it, or one that it touches, is in the map."""
+    return any(abs(index[0] - row) <= 1 and abs(index[1] - col) <= 1 for row, col in near)
+
+
+def _farthest_m(ballot: Ballot, tile: BallotTile, near: Collection[TileIndex]) -> float:
+    """From the map's nearest tile to the cell that is farthest from all of them, of those voted on; metres."""
+    spoken: Bool = tile_vote(ballot, tile, "").spoken()
+    rows, cols = np.nonzero(spoken)
+    if not len(rows):
+        return 0.0
+    y = (tile.tile[0] * TILE_CELLS + rows + 0.5) * CELL_SIZE
+    x = (tile.tile[1] * TILE_CELLS + cols + 0.5) * CELL_SIZE
+    least: F64 = np.full(len(rows), np.inf)
+    for row, col in near:
+        dy = np.maximum(np.maximum(row * _TILE_M - y, y - (row + 1) * _TILE_M), 0.0)
+        dx = np.maximum(np.maximum(col * _TILE_M - x, x - (col + 1) * _TILE_M), 0.0)
+        least = np.minimum(least, np.hypot(dx, dy))
+    return float(least.max())
+
+
+def _first_apart(tiles: list[TileIndex]) -> tuple[TileIndex, TileIndex] | None:
+    """The first tile, and one that cannot be reached from it over the others; None if there is none."""
+    left = set(tiles[1:]) - {tiles[0]}
+    reached = [tiles[0]]
+    while reached and left:
+        found = [index for index in _around(reached.pop()) if index in left]
+        left.difference_update(found)
+        reached += found
+    return (tiles[0], min(left)) if left else None

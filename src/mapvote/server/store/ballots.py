@@ -15,8 +15,8 @@ from mapvote.server.store import keys, schema
 from mapvote.server.store.database import insert_rows
 from mapvote.server.store.policy import RoundPolicy, policy_in
 from mapvote.server.store.queries import log_event, next_seq
+from mapvote.server.store.schema import sum_of_planes
 from mapvote.server.store.store import Store
-from mapvote.server.store.sums import sum_of_planes
 
 
 @dataclass(frozen=True, slots=True)

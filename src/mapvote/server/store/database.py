@@ -14,7 +14,7 @@ from sqlalchemy.sql.compiler import SQLCompiler
 
 from mapvote.core.types import MapvoteError
 from mapvote.server.errors import Unavailable
-from mapvote.server.store.sums import with_sums
+from mapvote.server.store.schema import with_sums
 
 _WRITERS_LOCK = 0x6D617076  # any number of our own: PostgreSQL's advisory lock that writers take in turn
 _PAGE_BYTES = 16384
@@ -111,7 +111,7 @@ def address_of(url: sa.URL) -> str:
 
 def insert_rows(connection: sa.Connection, table: sa.Table, rows: Sequence[tuple[Any, ...]]) -> None:
     """Many rows, each with a value for every column of ``table`` in its order, as the driver takes them; the sums of
-    heads (:func:`mapvote.server.store.sums.sum_over`) are added here.
+    heads (:func:`mapvote.server.store.schema.sum_over`) are added here.
 
     SQLAlchemy's own work on each row would cost more than the database's.
     """

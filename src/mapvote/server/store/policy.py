@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import sqlalchemy as sa
 from pydantic import Field, ValidationError
@@ -17,9 +17,6 @@ from mapvote.config import FuseSettings, GateSettings, Section, Settings, did_yo
 from mapvote.core.types import MapvoteError
 from mapvote.server.store import schema
 from mapvote.server.store.queries import log_event
-
-if TYPE_CHECKING:
-    from mapvote.server.store.store import Store
 
 
 class RoundPolicy(Section):
@@ -51,7 +48,7 @@ class GatePolicy(GateSettings):
 
 
 class KeepPolicy(Section):
-    """What is cleared away (:mod:`mapvote.server.store.clearing`)."""
+    """What is cleared away (:mod:`mapvote.server.store.retention`)."""
 
     versions: int = Field(
         default=0, ge=0, le=1_000_000, description="older ones than the last so many may go; 0: none ever"
@@ -86,6 +83,11 @@ class PolicyChange:
     reason: str
     policy: Policy
 
+    def as_json(self) -> dict[str, Any]:
+        """The policy, who set it, when and why."""
+        told = {"by": self.by, "at_ns": self.at_ns, "reason": self.reason}
+        return told | {"policy": self.policy.model_dump(mode="json")}
+
 
 def policy_in(connection: sa.Connection) -> Policy:
     """The newest policy."""
@@ -94,29 +96,8 @@ def policy_in(connection: sa.Connection) -> Policy:
     return Policy.model_validate(connection.execute(newest).scalar_one())
 
 
-def current_policy(store: Store) -> Policy:
-    """What holds now."""
-    with store.database.reading() as connection:
-        return policy_in(connection)
-
-
-def policy_changes(store: Store) -> list[PolicyChange]:
-    """Every change, oldest first."""
-    p, e = schema.policies, schema.events
-    rows = sa.select(p.c.seq, e.c.at_ns, e.c.actor, e.c.detail, p.c.policy).join(e, e.c.seq == p.c.seq)
-    with store.database.reading() as connection:
-        found = connection.execute(rows.order_by(p.c.seq)).all()
-    return [PolicyChange(*row[:4], Policy.model_validate(row[4])) for row in found]
-
-
-def set_policy(store: Store, policy: Policy, *, by: str = "operator", reason: str = "") -> int:
-    """Let another policy hold from now on; the number of the event."""
-    with store.database.writing() as connection:
-        return write_policy(connection, policy, store.clock(), by, reason)
-
-
 def write_policy(connection: sa.Connection, policy: Policy, now: int, by: str, reason: str) -> int:
-    """As :func:`set_policy`, within a transaction."""
+    """Let another policy hold from now on; the number of the event."""
     seq = log_event(connection, now, "policy", by, reason)
     connection.execute(schema.policies.insert().values(seq=seq, policy=policy.model_dump(mode="json")))
     return seq
@@ -142,17 +123,9 @@ def changed(policy: Policy, values: Mapping[str, Any]) -> Policy:
         raise MapvoteError(f"policy: {where} = {first['input']!r}: {first['msg']}") from error
 
 
-def set_values(store: Store, values: Mapping[str, Any], *, by: str = "operator", reason: str = "") -> int:
-    """Change some values of the policy that holds, by "section.key", in one transaction; the number of the event.
-
-    MapvoteError as :func:`changed`.
-    """
-    with store.database.writing() as connection:
-        return write_policy(connection, changed(policy_in(connection), values), store.clock(), by, reason)
-
-
-def policy_told(store: Store) -> dict[str, Any]:
-    """The policy that holds, who set it, when and why, as JSON."""
-    last = policy_changes(store)[-1]
-    told = {"by": last.by, "at_ns": last.at_ns, "reason": last.reason}
-    return told | {"policy": last.policy.model_dump(mode="json")}
+def changes_of(connection: sa.Connection) -> list[PolicyChange]:
+    """Every change, oldest first."""
+    p, e = schema.policies, schema.events
+    rows = sa.select(p.c.seq, e.c.at_ns, e.c.actor, e.c.detail, p.c.policy).join(e, e.c.seq == p.c.seq)
+    found = connection.execute(rows.order_by(p.c.seq)).all()
+    return [PolicyChange(*row[:4], Policy.model_validate(row[4])) for row in found]

@@ -15,14 +15,14 @@ from mapvote.core.memory import Memory
 from mapvote.core.tile import Tile
 from mapvote.server.errors import NotFound
 from mapvote.server.store import schema
-from mapvote.server.store.blobs import (
+from mapvote.server.store.database import MOST_ASKED, Question, insert_rows
+from mapvote.server.store.planes import (
     TileHashes,
     pack_tile,
     points_in_plane,
     unpack_memory_plane,
     unpack_tile,
 )
-from mapvote.server.store.database import MOST_ASKED, Question, insert_rows
 
 
 def current_number(connection: sa.Connection) -> int:

@@ -22,14 +22,13 @@ from mapvote.core.types import Bool
 from mapvote.fusion.spent import differing
 from mapvote.server.errors import NotFound
 from mapvote.server.store import schema
-from mapvote.server.store.blobs import TileHashes, pack_tile
-from mapvote.server.store.commit import NewTiles, write_version
 from mapvote.server.store.database import address_of
-from mapvote.server.store.eligible_votes import Electorate, ballots_aside, standing_tiles
-from mapvote.server.store.publish import Outcome, turned_back
+from mapvote.server.store.fusion_jobs import Task, fuse_round
+from mapvote.server.store.planes import TileHashes, pack_tile
+from mapvote.server.store.publish import NewTiles, Outcome, turned_back, write_version
 from mapvote.server.store.queries import Version, load_tile, memory_of, tile_of, tiles_of
 from mapvote.server.store.store import Store
-from mapvote.server.store.tile_jobs import Task, fuse_round
+from mapvote.server.store.votes import Electorate, ballots_aside, standing_tiles
 
 
 @dataclass(frozen=True, slots=True)

@@ -20,15 +20,15 @@ from mapvote.core.lazy_tiles import with_changed
 from mapvote.core.point_map import PointMap
 from mapvote.core.tile import Tile
 from mapvote.server.store import schema
-from mapvote.server.store.blobs import unpack_free_plane, unpack_ground_plane, unpack_points_plane
 from mapvote.server.store.database import address_of
-from mapvote.server.store.eligible_votes import Electorate, electorate_now, next_ripe_ns, standing_tiles
-from mapvote.server.store.hold import hold_reasons
+from mapvote.server.store.fusion_jobs import Fused, Task, fuse_round
+from mapvote.server.store.integrity import tiles_hurt_or_mended
+from mapvote.server.store.planes import unpack_free_plane, unpack_ground_plane, unpack_points_plane
 from mapvote.server.store.policy import GatePolicy
-from mapvote.server.store.quarantine import tiles_hurt_or_mended
+from mapvote.server.store.publish_limits import hold_reasons
 from mapvote.server.store.queries import Version, current_version, tiles_of, tiles_set_by
 from mapvote.server.store.store import Store
-from mapvote.server.store.tile_jobs import Fused, Task, fuse_round
+from mapvote.server.store.votes import Electorate, electorate_now, next_ripe_ns, standing_tiles
 
 Gate = Callable[[GatePolicy, PointMap, PointMap], Sequence[str]]
 """Compares (old map, new map) as the policy asks. Returns the reasons to hold the new one; none lets it through."""

@@ -27,9 +27,9 @@ from mapvote.core.tile import Tile
 from mapvote.core.types import MapvoteError
 from mapvote.server.errors import Unavailable
 from mapvote.server.store import migrate, schema
-from mapvote.server.store.blobs import TileHashes
 from mapvote.server.store.database import Database
-from mapvote.server.store.policy import Policy, write_policy
+from mapvote.server.store.planes import TileHashes
+from mapvote.server.store.policy import Policy, PolicyChange, changed, changes_of, policy_in, write_policy
 from mapvote.server.store.queries import (
     VERSION_COLUMNS,
     Version,
@@ -165,6 +165,29 @@ class Store:
     def close(self) -> None:
         """Close every connection."""
         self.database.close()
+
+    def policy(self) -> Policy:
+        """What holds now."""
+        with self.database.reading() as connection:
+            return policy_in(connection)
+
+    def policy_changes(self) -> list[PolicyChange]:
+        """Every change of the policy, oldest first."""
+        with self.database.reading() as connection:
+            return changes_of(connection)
+
+    def set_policy(self, policy: Policy, *, by: str = "operator", reason: str = "") -> int:
+        """Let another policy hold from now on; the number of the event."""
+        with self.database.writing() as connection:
+            return write_policy(connection, policy, self.clock(), by, reason)
+
+    def change_policy(self, values: Mapping[str, Any], *, by: str = "operator", reason: str = "") -> int:
+        """Change some values of the policy, by "section.key", in one transaction; the number of the event.
+
+        MapvoteError as :func:`mapvote.server.store.policy.changed`.
+        """
+        with self.database.writing() as connection:
+            return write_policy(connection, changed(policy_in(connection), values), self.clock(), by, reason)
 
     def current(self) -> int:
         """Number of the newest version."""

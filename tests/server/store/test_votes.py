@@ -22,21 +22,21 @@ from mapvote.fusion.tile_vote import DAY_NS, TileVote
 from mapvote.server.store import reviews
 from mapvote.server.store.admission import accept, examine
 from mapvote.server.store.ballots import Receipt, withdraw
-from mapvote.server.store.eligible_votes import (
+from mapvote.server.store.integrity import ballot_name
+from mapvote.server.store.policy import Policy, RoundPolicy
+from mapvote.server.store.queries import Version
+from mapvote.server.store.store import Store
+from mapvote.server.store.votes import (
     DAMAGED,
     OTHERWISE,
     YOUNG,
     Electorate,
     counting_votes,
     judged_votes,
+    read_votes,
     recent_votes,
     standing_tiles,
 )
-from mapvote.server.store.policy import Policy, RoundPolicy, set_policy
-from mapvote.server.store.quarantine import ballot_name
-from mapvote.server.store.queries import Version
-from mapvote.server.store.store import Store
-from mapvote.server.store.stored_votes import read_votes
 from standing_clock import Clock
 
 CELL, OTHER = (10, 10), (10, 11)
@@ -79,7 +79,7 @@ def cast(
     end_ns = (NOW_S - 100 * 86_400) * 10**9 + round(day * DAY_NS)
     ballot = make_ballot(two_walls(), dict.fromkeys(tiles, say), vehicle, drive, end_ns, **more)
     stage = "one-stage" if say.tally is not None else "two-stage"
-    set_policy(store, Policy(round=RoundPolicy.model_validate({"method": ballot.method, "stage": stage})))
+    store.set_policy(Policy(round=RoundPolicy.model_validate({"method": ballot.method, "stage": stage})))
     (receipt,) = accept(store, [examine(encode(ballot))])
     assert isinstance(receipt, Receipt), receipt
     return receipt.seq

@@ -19,11 +19,10 @@ from mapvote.server.insight.history import changes_between, vehicle_standings
 from mapvote.server.store import schema
 from mapvote.server.store.admission import accept, examine
 from mapvote.server.store.ballots import Receipt
-from mapvote.server.store.blobs import pack_tile
-from mapvote.server.store.check import check
+from mapvote.server.store.integrity import ballot_name, check, set_aside
+from mapvote.server.store.planes import pack_tile
 from mapvote.server.store.policy import Policy
 from mapvote.server.store.publish import publish
-from mapvote.server.store.quarantine import ballot_name, set_aside
 from mapvote.server.store.store import Store
 
 CELL = (10, 10)

@@ -14,7 +14,7 @@ from mapvote.codec.ballot import tile_key
 from mapvote.config import FuseSettings
 from mapvote.core.grid import CELL_SIZE, CELLS, TILE_CELLS
 from mapvote.core.types import I64
-from mapvote.server.store.tile_jobs import Fused
+from mapvote.server.store.fusion_jobs import Fused
 
 
 def hold_reasons(changed: Sequence[Fused], settings: FuseSettings) -> list[str]:

@@ -31,11 +31,11 @@ from mapvote.fusion.persistence import emptied_and_filled
 from mapvote.fusion.tile_vote import TileVote
 from mapvote.server.errors import Unavailable
 from mapvote.server.store import schema
-from mapvote.server.store.blobs import TileHashes, pack_tile
 from mapvote.server.store.database import Database, address_of
-from mapvote.server.store.eligible_votes import Electorate, Polled, counting_votes, poll, recent_votes
-from mapvote.server.store.quarantine import Damage, DamagedBallots
+from mapvote.server.store.integrity import Damage, DamagedBallots
+from mapvote.server.store.planes import TileHashes, pack_tile
 from mapvote.server.store.queries import load_tile, tile_as_of
+from mapvote.server.store.votes import Electorate, Polled, counting_votes, poll, recent_votes
 
 _GROUP, _ROUND = 8, 8
 """Tiles side by side that are fused within one reading of the database, at most; into how many groups a round is cut at

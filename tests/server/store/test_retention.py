@@ -18,12 +18,12 @@ from mapvote.server.insight.explain import explain_cell
 from mapvote.server.store import schema
 from mapvote.server.store.admission import accept, examine
 from mapvote.server.store.ballots import Receipt
-from mapvote.server.store.blobs import pack_tile
-from mapvote.server.store.check import check
-from mapvote.server.store.clearing import clear
-from mapvote.server.store.policy import KeepPolicy, Policy, set_policy
+from mapvote.server.store.integrity import check
+from mapvote.server.store.planes import pack_tile
+from mapvote.server.store.policy import KeepPolicy, Policy
 from mapvote.server.store.publish import publish, rollback
 from mapvote.server.store.replay import replay
+from mapvote.server.store.retention import clear
 from mapvote.server.store.store import Store
 from standing_clock import Clock
 
@@ -130,10 +130,10 @@ def test_a_vehicle_gets_its_quota_back(store: Store, clock: Clock) -> None:
 
 
 def test_the_policy_clears_by_itself_and_keeps_everything_unless_told(store: Store, clock: Clock) -> None:
-    set_policy(store, Policy(fuse=FUSE))
+    store.set_policy(Policy(fuse=FUSE))
     come_and_go(store, clock, 5)
     assert clear(store).versions == 0
-    set_policy(store, Policy(fuse=FUSE, keep=KeepPolicy(versions=2, automatic=True)))
+    store.set_policy(Policy(fuse=FUSE, keep=KeepPolicy(versions=2, automatic=True)))
     come_and_go(store, clock, 1)
     assert clear(store).versions == 0
     with pytest.raises(NotFound, match="the oldest that is kept is 6"):
