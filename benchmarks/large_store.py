@@ -24,7 +24,6 @@ from hand_made import Say, make_ballot, make_map, make_tile, states_plane, wall
 from mapvote.codec.ballot import encode, pack_plane
 from mapvote.config import FuseSettings
 from mapvote.core.types import CellState
-from mapvote.server.insight.history import changes_between, coverage
 from mapvote.server.store import schema
 from mapvote.server.store.admission import Intake, examine
 from mapvote.server.store.database import insert_rows
@@ -33,6 +32,7 @@ from mapvote.server.store.policy import Policy
 from mapvote.server.store.publish import publish
 from mapvote.server.store.schema import sum_of_planes
 from mapvote.server.store.store import Store
+from mapvote.server.views.history import changes_between, coverage
 from postgres_cluster import PostgresCluster
 
 WALL = [(10, 10 + c) for c in range(8)]

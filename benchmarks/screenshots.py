@@ -27,9 +27,9 @@ from PIL import Image
 from chromium import Chromium
 from hand_made import make_map
 from live_server import serving
-from mapvote.server.insight.history import changes_between, page_between
 from mapvote.server.store import keys
 from mapvote.server.store.store import Store
+from mapvote.server.views.history import changes_between, page_between
 from page import town
 
 PICTURES = Path(__file__).parents[1] / "docs/pictures"

@@ -16,8 +16,8 @@ from typer.main import get_command
 
 from live_server import mapvote
 from mapvote.cli import app
-from mapvote.server.insight.history import events
 from mapvote.server.store.store import Store
+from mapvote.server.views.events import last_events
 
 Desk = Callable[..., Path]
 
@@ -75,8 +75,8 @@ VERBS = {
     "export my_map new.pcd": "import mapvote.formats as m; m.export_map = wait",
     "publish STORE": "import mapvote.server.store.publish as m; m.publish = wait",
     "log STORE": "import mapvote.server.store.store as m; m.Store.versions = wait",
-    "changes STORE --out new": "import mapvote.server.insight.history as m; m.changes_between = wait",
-    "vehicles STORE": "import mapvote.server.insight.history as m; m.vehicle_standings = wait",
+    "changes STORE --out new": "import mapvote.server.views.history as m; m.changes_between = wait",
+    "vehicles STORE": "import mapvote.server.views.history as m; m.vehicle_standings = wait",
     "config": "import mapvote.config as m; m.load_with_sources = wait",
     "demo --out new": "import mapvote_lab.evaluation.demo as m; m.evaluate = wait",
     "evaluate tiny.toml --json new": "import mapvote_lab.evaluation.evaluate as m; m.evaluate = wait",
@@ -86,7 +86,7 @@ VERBS = {
     "rollback STORE 1": "import mapvote.server.store.publish as m; m.rollback = wait",
     "unvote STORE car_1": "import mapvote.server.store.ballots as m; m.withdraw = wait",
     "check STORE --mend": "import mapvote.server.store.integrity as m; m.check = wait",
-    "explain STORE 3.2 3.2": "import mapvote.server.insight.explain as m; m.explain_cell = wait",
+    "explain STORE 3.2 3.2": "import mapvote.server.views.explain as m; m.explain_cell = wait",
     "gc STORE --yes": "import mapvote.server.store.retention as m; m.clear = wait",
     "upgrade STORE": "import mapvote.server.store.migrate as m; m.upgrade = wait",
     "keys STORE": "import mapvote.server.store.keys as m; m.listed = wait",
@@ -135,7 +135,7 @@ def test_ctrl_c_while_a_version_is_being_written_leaves_no_version(line: str, de
 def what_is_in(path: Path) -> tuple[list[int], list[str]]:
     """Versions and events of a store."""
     store = Store.open(f"sqlite:///{path}")
-    found = [v.number for v in store.versions()], [str(event) for event in events(store, 99)]
+    found = [v.number for v in store.versions()], [str(event) for event in last_events(store, 99)]
     store.close()
     return found
 

@@ -12,10 +12,10 @@ from mapvote.cli.server import policy
 from mapvote.cli.store import keys
 from mapvote.codec.ballot import encode
 from mapvote.core.types import CellState
-from mapvote.server.insight.events import events_after, newest_event
 from mapvote.server.store.admission import accept, examine
 from mapvote.server.store.keys import ballots_standing, issue
 from mapvote.server.store.store import Store
+from mapvote.server.views.events import events_after, newest_event
 
 
 class Terminal(io.StringIO):

@@ -28,7 +28,7 @@ def log(
 
     mapvote log fleet.db --events 20
     """
-    from mapvote.server.insight.overview import log_of
+    from mapvote.server.views.overview import log_of
 
     if is_url(store):
         with server_at(store, key_file) as server:
@@ -56,7 +56,7 @@ def explain(
 
     mapvote explain fleet.db 12.5 -- -3.0
     """
-    from mapvote.server.insight.explain import as_told, explain_cell
+    from mapvote.server.views.explain import as_told, explain_cell
 
     if is_url(store):
         with server_at(store, key_file) as server:
@@ -86,7 +86,7 @@ def vehicles(store: StoreOrUrl, key_file: KeyFile = None) -> None:
     """
     from dataclasses import asdict
 
-    from mapvote.server.insight.history import vehicle_standings
+    from mapvote.server.views.history import vehicle_standings
 
     if is_url(store):
         with server_at(store, key_file) as server, waiting("comparing votes"):
@@ -127,7 +127,7 @@ def changes(
     mapvote changes fleet.db --out changes.geojson
     """
     from mapvote.formats.atomic import whole_file
-    from mapvote.server.insight.history import changes_between, page_between
+    from mapvote.server.views.history import changes_between, page_between
 
     package = out is not None and out.suffix.lower() == ".gpkg"
     if is_url(store):

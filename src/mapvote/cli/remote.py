@@ -113,7 +113,7 @@ def overview_of(name: str, key_file: Path | None) -> list[tuple[str, str]] | Non
         with server_at(name, key_file) as server:
             found = server.ask_json("GET", "/v1/info")
     elif is_store(name):
-        from mapvote.server.insight.overview import overview
+        from mapvote.server.views.overview import overview
 
         with opened_store(name) as store:
             found = overview(store)

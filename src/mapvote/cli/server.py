@@ -98,9 +98,9 @@ def publish(
 
     from mapvote.config import load_with_sources
     from mapvote.core.types import MapvoteError
-    from mapvote.server.insight.localisation_gate import gate_by
     from mapvote.server.store.publish import preview
     from mapvote.server.store.publish import publish as publish_version
+    from mapvote.server.views.localisation_gate import gate_by
 
     if is_url(store):
         if cluster or config:

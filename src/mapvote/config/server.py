@@ -71,7 +71,7 @@ class FuseSettings(Section):
 
 
 class GateSettings(Section):
-    """server/insight/localisation_gate.py: when a new version may be published, judged by a reference drive."""
+    """server/views/localisation_gate.py: when a new version may be published, judged by a reference drive."""
 
     tolerance_found: float = Field(default=0.02, ge=0, description="allowed loss of the share of scans localised")
     tolerance_inlier_share: float = Field(default=0.01, ge=0, description="allowed loss of inlier share")

@@ -7,10 +7,10 @@ from collections import Counter
 from mapvote.core.types import MapvoteError
 from mapvote.doctor.finding import Finding, in_order
 from mapvote.doctor.maps import check_whole
-from mapvote.server.insight.overview import overview
 from mapvote.server.store.integrity import check
 from mapvote.server.store.keys import listed
 from mapvote.server.store.store import Store
+from mapvote.server.views.overview import overview
 
 _MEND = "mapvote check STORE --mend --from BACKUP"
 _TOLD = 5

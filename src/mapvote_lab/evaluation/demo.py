@@ -11,9 +11,9 @@ from mapvote.formats import write_map
 from mapvote.formats.atomic import whole_file
 from mapvote.formats.maps.cloud import Cloud
 from mapvote.formats.maps.pcd import write_pcd
-from mapvote.server.insight.cutout import Cutout
-from mapvote.server.insight.history import changes_between, cutouts_between
 from mapvote.server.store.store import Store, url_of
+from mapvote.server.views.cutout import Cutout
+from mapvote.server.views.history import changes_between, cutouts_between
 from mapvote_lab.evaluation.demo_report import CASE, Story, report_page, tell
 from mapvote_lab.evaluation.evaluate import Evaluation, evaluate
 from mapvote_lab.evaluation.experiments.cases import choose_cases

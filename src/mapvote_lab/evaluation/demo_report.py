@@ -10,7 +10,7 @@ import numpy as np
 
 from mapvote.core.grid import CELL_SIZE
 from mapvote.core.point_map import all_points
-from mapvote.server.insight.cutout import Cutout, fragment
+from mapvote.server.views.cutout import Cutout, fragment
 from mapvote_lab.evaluation.evaluate import Evaluation
 from mapvote_lab.evaluation.loopback import Published
 from mapvote_lab.evaluation.reporting.gallery import Area, areas_of

@@ -23,10 +23,10 @@ from mapvote.config.server import ServerSettings
 from mapvote.core.types import CellState
 from mapvote.server.http.event_routes import as_sse
 from mapvote.server.http.webhook import deliver, signature
-from mapvote.server.insight.events import Event, Feed, newest_event, without_names
 from mapvote.server.store import schema
 from mapvote.server.store.queries import log_event
 from mapvote.server.store.store import Store
+from mapvote.server.views.events import Event, Feed, newest_event, without_names
 
 if TYPE_CHECKING:
     from mapvote.server.http.services import Services

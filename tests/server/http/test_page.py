@@ -24,11 +24,11 @@ from mapvote.codec.path import pack_path
 from mapvote.config import FuseSettings
 from mapvote.core.types import CellState
 from mapvote.server.http.app import create_app
-from mapvote.server.insight.cutout import whole_page
-from mapvote.server.insight.history import changes_between, cutouts_between
 from mapvote.server.store.admission import accept, examine
 from mapvote.server.store.publish import publish
 from mapvote.server.store.store import Store
+from mapvote.server.views.cutout import whole_page
+from mapvote.server.views.history import changes_between, cutouts_between
 
 HOUSE = [(r, c) for r in range(40, 60) for c in range(40, 70) if r in (40, 59) or c in (40, 69)]
 SHED = [(r, c) for r in range(150, 160) for c in range(150, 160) if r in (150, 159) or c in (150, 159)]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import stat
 import subprocess
@@ -13,8 +14,9 @@ import pytest
 from hand_made import Say, make_ballot, states_plane, two_walls
 from live_server import mapvote, serving
 from mapvote.client import MapClient
-from mapvote.codec.ballot import encode
+from mapvote.codec.ballot import _all_states, encode
 from mapvote.formats import write_map
+from mapvote.server.http.serve import settle
 from mapvote.server.store import keys
 from mapvote.server.store.store import Store
 
@@ -159,3 +161,13 @@ def test_who_sends_wrong_keys_by_the_hundred_is_looked_up_no_more_and_the_right_
         assert http.get("/v1/map", headers=with_key(secret)).status_code == 200
         elsewhere = with_key("wrong too") | {"X-Forwarded-For": "192.0.2.7"}
         assert http.get("/v1/map", headers=elsewhere).status_code == 401
+
+
+def test_what_a_server_has_loaded_is_ready_for_the_first_ballot_and_never_looked_at_again_by_the_collector() -> None:
+    before = gc.get_freeze_count()
+    try:
+        settle()
+        assert gc.get_freeze_count() > before + 10_000
+        assert _all_states.signatures
+    finally:
+        gc.unfreeze()

@@ -21,8 +21,8 @@ from chromium import Chromium, program
 from mapvote.codec.arrays import zstd
 from mapvote.core.grid import CELL_SIZE, Lattice
 from mapvote.core.point_map import PointMap, map_from_points
-from mapvote.server.insight.changes import Decided, change_objects, changed_cells
-from mapvote.server.insight.geojson import to_geojson
+from mapvote.server.views.change_objects import Decided, change_objects, changed_cells
+from mapvote.server.views.geojson import to_geojson
 
 KEY = "operator-key-1"
 TYPES = {"html": "text/html; charset=utf-8", "css": "text/css", "js": "text/javascript"}

@@ -14,12 +14,12 @@ from live_server import mapvote, serving
 from mapvote.codec.ballot import encode
 from mapvote.config import FuseSettings
 from mapvote.core.types import CellState
-from mapvote.server.insight.history import vehicle_standings
 from mapvote.server.store import keys
 from mapvote.server.store.admission import accept, examine
 from mapvote.server.store.ballots import Receipt
 from mapvote.server.store.publish import publish
 from mapvote.server.store.store import Store
+from mapvote.server.views.history import vehicle_standings
 
 HOUSE = [(r, c) for r in range(40, 60) for c in range(40, 70) if r in (40, 59) or c in (40, 69)]
 GHOSTS = [(r + i, c + j) for r in range(100, 250, 30) for c in range(100, 250, 30) for i in range(3) for j in range(3)]

@@ -32,7 +32,6 @@ from mapvote.core.types import CellState, MapvoteError
 from mapvote.formats import export_map, read_map
 from mapvote.fusion.offline import update_map
 from mapvote.server.http.app import create_app
-from mapvote.server.insight.overview import overview
 from mapvote.server.store import schema
 from mapvote.server.store.admission import accept, examine
 from mapvote.server.store.integrity import check, set_aside
@@ -41,6 +40,7 @@ from mapvote.server.store.publish import publish, rollback
 from mapvote.server.store.replay import replay
 from mapvote.server.store.retention import clear
 from mapvote.server.store.store import Store
+from mapvote.server.views.overview import overview
 
 POLICY = Policy(fuse=FuseSettings(max_deleted_share=1.0))
 BUILT = unpack_points(pack_points(wall([(200, 200)], [0.45, 0.75])))

@@ -14,8 +14,6 @@ from mapvote.codec.ballot import encode
 from mapvote.config import FuseSettings
 from mapvote.core.tile import Tile
 from mapvote.core.types import CellState
-from mapvote.server.insight.clouds import Clouds, evidence
-from mapvote.server.insight.history import changes_between, vehicle_standings
 from mapvote.server.store import schema
 from mapvote.server.store.admission import accept, examine
 from mapvote.server.store.ballots import Receipt
@@ -24,6 +22,8 @@ from mapvote.server.store.planes import pack_tile
 from mapvote.server.store.policy import Policy
 from mapvote.server.store.publish import publish
 from mapvote.server.store.store import Store
+from mapvote.server.views.history import changes_between, vehicle_standings
+from mapvote.server.views.point_lod import Clouds, evidence
 
 CELL = (10, 10)
 POLICY = Policy(fuse=FuseSettings(max_deleted_share=1.0))

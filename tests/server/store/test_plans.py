@@ -13,11 +13,11 @@ from hand_made import Say, make_ballot, states_plane, two_walls
 from mapvote.codec.ballot import encode
 from mapvote.config import FuseSettings
 from mapvote.core.types import CellState
-from mapvote.server.insight.history import changes_between
 from mapvote.server.store.admission import Intake, examine
 from mapvote.server.store.policy import Policy
 from mapvote.server.store.publish import publish
 from mapvote.server.store.store import Store
+from mapvote.server.views.history import changes_between
 
 LARGE = ("ballots", "ballot_tiles", "version_tiles", "blobs", "decisions", "events")
 """Tables that grow with the fleet, the map and time."""

@@ -14,7 +14,6 @@ from mapvote.config import FuseSettings
 from mapvote.core.types import CellState
 from mapvote.fusion.tile_vote import DAY_NS
 from mapvote.server.errors import NotFound
-from mapvote.server.insight.explain import explain_cell
 from mapvote.server.store import schema
 from mapvote.server.store.admission import accept, examine
 from mapvote.server.store.ballots import Receipt
@@ -25,6 +24,7 @@ from mapvote.server.store.publish import publish, rollback
 from mapvote.server.store.replay import replay
 from mapvote.server.store.retention import clear
 from mapvote.server.store.store import Store
+from mapvote.server.views.explain import explain_cell
 from standing_clock import Clock
 
 CELL = (20, 20)

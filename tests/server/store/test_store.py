@@ -19,7 +19,6 @@ from mapvote.core.types import U64, CellState, MapvoteError
 from mapvote.fusion.offline import update_map
 from mapvote.fusion.tile_vote import DAY_NS
 from mapvote.server.errors import Conflict, Held, NotFound, Unavailable
-from mapvote.server.insight.explain import explain_cell
 from mapvote.server.store.admission import accept, examine
 from mapvote.server.store.ballots import Receipt, withdraw
 from mapvote.server.store.policy import (
@@ -30,6 +29,7 @@ from mapvote.server.store.policy import (
 )
 from mapvote.server.store.publish import preview, publish, rollback
 from mapvote.server.store.store import Store
+from mapvote.server.views.explain import explain_cell
 
 EMPTY, KEEPS = CellState.CHANGED_EMPTY, CellState.UNCHANGED_OCCUPIED
 POLICY = FuseSettings(min_votes=2)

@@ -5,31 +5,47 @@ from __future__ import annotations
 import asyncio
 from collections.abc import AsyncIterator
 from concurrent.futures import Executor
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, suppress
 
+import structlog
 from anyio import to_thread
 from fastapi import FastAPI
 
 from mapvote.config import Settings
+from mapvote.core.types import MapvoteError
+from mapvote.server.errors import Unavailable
 from mapvote.server.http import (
     ballot_route,
     cloud_routes,
     desk_routes,
     event_routes,
+    health_routes,
     operator_routes,
     pages,
     store_routes,
     vehicle_routes,
 )
 from mapvote.server.http.auth import Guard
-from mapvote.server.http.browsers import Hosts
-from mapvote.server.http.middleware import Probe, Watch
+from mapvote.server.http.health_routes import Probe
 from mapvote.server.http.schemas import unreadable
-from mapvote.server.http.services import READING, make_services
-from mapvote.server.http.warming import keep_overview
+from mapvote.server.http.security import Hosts, Watch
+from mapvote.server.http.services import READING, Services, make_services
 from mapvote.server.http.webhook import deliver
 from mapvote.server.store.round import Gate
 from mapvote.server.store.store import Store
+
+_EVERY_S = 2.0
+_ROUTES = (
+    ballot_route,
+    vehicle_routes,
+    operator_routes,
+    store_routes,
+    desk_routes,
+    cloud_routes,
+    event_routes,
+    health_routes,
+    pages,
+)
 
 
 def create_app(
@@ -71,7 +87,16 @@ def create_app(
         redoc_url=None,
     )
     app.state.services = parts
-    asked = ballot_route, vehicle_routes, operator_routes, store_routes, desk_routes, cloud_routes, event_routes
+    asked = (
+        ballot_route,
+        vehicle_routes,
+        operator_routes,
+        store_routes,
+        desk_routes,
+        cloud_routes,
+        event_routes,
+        health_routes,
+    )
     for part in (*asked, pages):
         app.include_router(part.router)
     app.add_exception_handler(400, unreadable)
@@ -79,3 +104,25 @@ def create_app(
     probe = Probe(parts.check_ready)
     app.add_middleware(Watch, hosts=hosts, guard=guard, metrics=parts.metrics, probe=probe)
     return app
+
+
+async def keep_overview(parts: Services) -> None:
+    """Make the overview of each new version, until it is cancelled; no tile is begun once the server stops."""
+    known = None
+    while True:
+        with suppress(Unavailable):
+            newest = await parts.newest.put(None)
+            if newest != known:
+                known = newest
+                await _make(parts, newest)
+        await asyncio.sleep(_EVERY_S)
+
+
+async def _make(parts: Services, version: int) -> None:
+    try:
+        make, stop = parts.clouds.overview, parts.stopping.is_set
+        await to_thread.run_sync(make, version, stop, limiter=parts.threads.fetching)
+    except Unavailable:
+        raise
+    except MapvoteError as error:  # damaged beyond a tile: whoever asks for the picture is told
+        structlog.get_logger("mapvote").warning("overview", version=version, error=str(error)[:200])

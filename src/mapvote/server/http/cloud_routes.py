@@ -11,11 +11,10 @@ from mapvote.core.types import MapvoteError
 from mapvote.server.http.auth import reviewer
 from mapvote.server.http.schemas import AS_CSV, From, Places, To, VersionQuery, as_json, as_table, problems
 from mapvote.server.http.services import services
-from mapvote.server.insight.clouds import evidence
-from mapvote.server.insight.history import picture_between
-from mapvote.server.insight.levels import N_LEVELS
-from mapvote.server.insight.paths import paths
 from mapvote.server.store.planes import TileHashes
+from mapvote.server.views.history import picture_between
+from mapvote.server.views.paths import paths
+from mapvote.server.views.point_lod import N_LEVELS, evidence
 
 _BYTES: dict[int | str, dict[str, Any]] = {200: {"content": {"application/octet-stream": {}}}}
 _FOR_EVER = "private, max-age=31536000, immutable"

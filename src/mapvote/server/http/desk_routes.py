@@ -13,9 +13,9 @@ from pydantic import BaseModel, ConfigDict, Field
 from mapvote.server.http.auth import reviewer
 from mapvote.server.http.schemas import AS_CSV, PLAIN, Places, as_json, as_table, problems
 from mapvote.server.http.services import services
-from mapvote.server.insight.desk import desk, pending_picture, review, verdict_of
-from mapvote.server.insight.geojson import feature_rows
 from mapvote.server.store.reviews import undo
+from mapvote.server.views.desk import desk, pending_picture, review, verdict_of
+from mapvote.server.views.geojson import feature_rows
 
 router = APIRouter()
 

@@ -15,7 +15,7 @@ from fastapi.responses import StreamingResponse
 from mapvote.server.http.auth import sees_names
 from mapvote.server.http.schemas import problems
 from mapvote.server.http.services import Services, services
-from mapvote.server.insight.events import Event, newest_event, without_names
+from mapvote.server.views.events import Event, newest_event, without_names
 
 _EVERY_S = 1.0
 _STILL_THERE_S = 15.0

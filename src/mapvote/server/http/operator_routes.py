@@ -31,13 +31,12 @@ from mapvote.server.http.schemas import (
     problems,
 )
 from mapvote.server.http.services import Services, services
-from mapvote.server.insight.explain import as_told, explain_cell
-from mapvote.server.insight.geojson import feature_rows
-from mapvote.server.insight.history import changes_between, coverage, page_between, seen, vehicle_standings
-from mapvote.server.insight.lists import contradictions, standing_rows, tile_squares
 from mapvote.server.store.keys import pseudonyms
 from mapvote.server.store.publish import preview, publish, rollback
 from mapvote.server.store.queries import log_event
+from mapvote.server.views.explain import as_told, explain_cell
+from mapvote.server.views.geojson import contradictions, feature_rows, standing_rows, tile_squares
+from mapvote.server.views.history import changes_between, coverage, page_between, seen, vehicle_standings
 
 _MOST_EVIDENCE = 50
 router = APIRouter()

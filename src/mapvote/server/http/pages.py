@@ -1,4 +1,4 @@
-"""Health, metrics, the API's documentation and the operator's page."""
+"""The operator's page, and the API's documentation."""
 
 from __future__ import annotations
 
@@ -7,14 +7,11 @@ import html
 from dataclasses import dataclass
 from functools import cache
 from importlib import resources
-from typing import Any
 
 from fastapi import APIRouter, Request, Response
 
 from mapvote.codec.arrays import compress
 from mapvote.server.errors import NotFound
-from mapvote.server.http.schemas import problems
-from mapvote.server.http.services import services
 
 _OPEN = b"""<p class="open-server" role="alert">This server is open: whoever uses this machine can vote, publish and
 roll back. Issue a key to close it: <code>mapvote keys STORE issue NAME --operator</code></p>"""
@@ -23,42 +20,8 @@ _DOCS = """<!doctype html><html lang="en"><head><meta charset="utf-8"><title>map
 <body class="plain"><h1>mapvote API</h1><p>For machines: <a href=openapi.json>openapi.json</a></p>
 <table><tr><th>Method<th>Path<th>What<th>How<th>Answers</tr>ROWS</table></body></html>"""
 _STYLE = b'<link rel="stylesheet" href="viewer/pages.css">'
-_NAMED = 20
-"""Damaged things that /readyz names; the log has all."""
 _KINDS = {".html": "text/html", ".js": "text/javascript", ".css": "text/css", ".svg": "image/svg+xml"}
 router = APIRouter()
-
-
-@router.get("/livez", responses=problems(), response_class=Response, summary="Does the server answer?")
-async def live() -> Response:
-    """200 without content. It needs no key, and neither does `/readyz`, whose answer without a key has no content."""
-    return Response()
-
-
-@router.get("/healthz", responses=problems(), summary="Can the store be read?")
-async def health(request: Request) -> dict[str, Any]:
-    """200 with the newest version, 503 if the database does not answer."""
-    return {"status": "ok", "version": await services(request).newest.put(None)}
-
-
-@router.get("/readyz", responses=problems(), summary="Can ballots be taken in?")
-async def ready(request: Request) -> dict[str, Any]:
-    """200 if the database can be written now, 503 with what it says if not, or if the server is stopping.
-
-    ``quarantine`` names what is damaged and was set aside: all else goes on.
-    """
-    parts = services(request)
-    version, damaged = await parts.check_ready(), await parts.damaged.put(None)
-    return {"status": "ready", "version": version, "quarantine": damaged[:_NAMED], "quarantined": len(damaged)}
-
-
-@router.get("/metrics", responses=problems(), response_class=Response, summary="Prometheus metrics")
-async def metrics(request: Request) -> Response:
-    """Counters, latencies, the newest version."""
-    parts = services(request)
-    parts.metrics.version.set(await parts.newest.put(None))
-    parts.metrics.tell_damaged(await parts.damaged.put(None))
-    return Response(parts.metrics.text(), media_type="text/plain; version=0.0.4; charset=utf-8")
 
 
 @router.get("/docs", include_in_schema=False)

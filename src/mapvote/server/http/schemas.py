@@ -14,7 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from mapvote.core.types import MapvoteError
 from mapvote.server.errors import Conflict, Forbidden, Held, NotFound, TooLarge, TooMany, Unauthorised, Unavailable
-from mapvote.server.insight.geojson import as_csv
+from mapvote.server.views.geojson import as_csv
 
 STATUS: Mapping[type[MapvoteError], int] = {
     Unauthorised: 401,

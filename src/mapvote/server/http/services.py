@@ -11,18 +11,18 @@ from fastapi import Request
 
 from mapvote.config import Settings
 from mapvote.server.errors import Unavailable
-from mapvote.server.http.batching import Batcher
 from mapvote.server.http.limits import RateLimit, Uploads
 from mapvote.server.http.manifests import Manifests
 from mapvote.server.http.metrics import Metrics
 from mapvote.server.http.publishing import Publishing
-from mapvote.server.insight.clouds import Clouds
-from mapvote.server.insight.events import Feed
-from mapvote.server.insight.localisation_gate import gate_by
+from mapvote.server.http.writer import Batcher
 from mapvote.server.store.admission import Intake, Quota, Sent
 from mapvote.server.store.ballots import Incoming, Receipt
 from mapvote.server.store.round import Gate
 from mapvote.server.store.store import Store
+from mapvote.server.views.events import Feed
+from mapvote.server.views.localisation_gate import gate_by
+from mapvote.server.views.point_lod import Clouds
 
 READING = 1
 """Threads for whatever an operator looks at. Python computes in one thread at a time: more would only take turns with

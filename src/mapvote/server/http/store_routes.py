@@ -13,8 +13,8 @@ from pydantic import BaseModel, ConfigDict, Field
 from mapvote.server.http.auth import operator, reviewer
 from mapvote.server.http.schemas import PLAIN, as_json, problems
 from mapvote.server.http.services import services
-from mapvote.server.insight.overview import log_of, overview
 from mapvote.server.store.integrity import check
+from mapvote.server.views.overview import log_of, overview
 
 router = APIRouter()
 

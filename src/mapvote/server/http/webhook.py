@@ -15,7 +15,7 @@ from anyio import to_thread
 
 from mapvote.server.errors import Unavailable
 from mapvote.server.http.services import Services
-from mapvote.server.insight.events import take, taken_up_to
+from mapvote.server.views.events import take, taken_up_to
 
 _EVERY_S = 1.0
 _TIMEOUT_S = 10.0

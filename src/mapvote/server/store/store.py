@@ -4,7 +4,7 @@
     store.current(); store.manifest(n); store.tile(n, (0, 0)); store.point_map(n)
 
 What changes it lies beside it: ``admission`` and ``ballots``, ``publish``, ``replay``, ``reviews``, ``keys``,
-``policy``. What explains it is in :mod:`mapvote.server.insight`.
+``policy``. What explains it is in :mod:`mapvote.server.views`.
 """
 
 from __future__ import annotations

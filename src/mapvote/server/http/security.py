@@ -1,0 +1,142 @@
+"""The outermost layer: whom a request may be addressed to, whose it is, what a browser may do with the answer; one line
+of log each.
+
+A page on the Internet can give its own name the address 127.0.0.1 (DNS rebinding) and so speak to a server on the
+visitor's machine as if it were its own. The browser still says in ``Host`` and ``Origin`` whose page it was.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import ipaddress
+import re
+import time
+from collections.abc import Iterable, Sequence
+from functools import lru_cache
+
+import structlog
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from mapvote.core.types import MapvoteError
+from mapvote.server.errors import Forbidden, Unavailable
+from mapvote.server.http.auth import Guard
+from mapvote.server.http.health_routes import Probe
+from mapvote.server.http.metrics import Metrics
+from mapvote.server.http.schemas import refuse
+
+HEADERS = (
+    ("X-Content-Type-Options", "nosniff"),
+    ("Referrer-Policy", "no-referrer"),
+    (
+        "Content-Security-Policy",
+        "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob:; connect-src 'self'; "
+        "base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
+    ),
+    ("Cross-Origin-Resource-Policy", "same-origin"),
+)
+"""On every answer, errors too: no guessing of types, no address told to others, nothing loaded from elsewhere."""
+
+
+class Hosts:
+    """What this server goes by: localhost, any address in digits (no page can rebind one), and ``allowed`` names."""
+
+    def __init__(self, allowed: Sequence[str]) -> None:
+        self._allowed = frozenset(name.lower() for name in allowed) | {"localhost"}
+        self._ours = lru_cache(maxsize=256)(self._is_ours)
+
+    def check(self, headers: Iterable[tuple[bytes, bytes]]) -> None:
+        """Forbidden for a request addressed to another name, or sent by another server's page."""
+        host = origin = None
+        for name, value in headers:
+            if name == b"host":
+                host = value.decode("latin-1") if host is None else ""
+            elif name == b"origin":
+                origin = value.decode("latin-1")
+        if not host or not self._ours(host):
+            raise Forbidden(f"this server does not go by the name {(host or '')[:80]!r}: {_MEND}")
+        if origin is not None and not self._comes_from_us(origin, host):
+            raise Forbidden(f"pages of {origin[:80]!r} may not use this server: {_MEND}")
+
+    def _is_ours(self, host: str) -> bool:
+        name = _name_in(host)
+        return name in self._allowed or _is_address(name)
+
+    def _comes_from_us(self, origin: str, host: str) -> bool:
+        """Of an address in digits only the very one asked: another machine's page has an address too."""
+        theirs = origin.partition("://")[2].lower()
+        return theirs == host.lower() or _name_in(theirs) in self._allowed - {"localhost"}
+
+
+_HOST = re.compile(r"(?:\[([0-9a-f:.]+)\]|([a-z0-9._-]+))(?::[0-9]{1,5})?")
+_MEND = "name it in the server's configuration, [server] hosts, if it should"
+
+
+def _name_in(host: str) -> str:
+    """The name or address in ``name:port``, without brackets; "" if it is neither."""
+    found = _HOST.fullmatch(host.lower())
+    return (found[1] or found[2]) if found else ""
+
+
+def _is_address(name: str) -> bool:
+    try:
+        ipaddress.ip_address(name)
+    except ValueError:
+        return False
+    return True
+
+
+log = structlog.get_logger("mapvote")
+
+
+def is_ballot(scope: Scope) -> bool:
+    """Whether a vehicle votes."""
+    return bool(scope["method"] == "PUT" and scope["path"].startswith("/v1/ballots/"))
+
+
+class Watch:
+    """The outermost layer. No key, header or query is ever logged."""
+
+    def __init__(self, app: ASGIApp, hosts: Hosts, guard: Guard, metrics: Metrics, probe: Probe) -> None:
+        self._app = app
+        self._probe = probe
+        self._hosts = hosts
+        self._guard = guard
+        self._metrics = metrics
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] != "http":
+            await self._app(scope, receive, send)
+            return
+        start, status, key = time.perf_counter(), 500, None
+
+        async def watched(message: Message) -> None:
+            nonlocal status
+            if message["type"] == "http.response.start":
+                status = message["status"]
+            await send(message)
+
+        try:
+            self._hosts.check(scope["headers"])
+            sent = next((value for name, value in scope["headers"] if name == b"authorization"), None)
+            authorization = None if sent is None else sent.decode("latin-1")
+            peer = (scope["client"] or ("",))[0]
+            whose = await self._guard.who(authorization, peer, ballot=is_ballot(scope))
+            key, key_hash = whose or (None, None)
+            scope.setdefault("state", {}).update(key=key, key_hash=key_hash)
+            await self._app(scope, receive, watched)
+        except MapvoteError as error:
+            asks = scope["method"] in ("GET", "HEAD") and not any(n == b"authorization" for n, _ in scope["headers"])
+            probed = asks and scope["path"] in Probe.PATHS
+            answer = await self._probe.answer(scope["path"]) if probed else refuse(error)
+            await answer(scope, receive, watched)
+        except asyncio.CancelledError:  # the server stops and waits no longer
+            await refuse(Unavailable("the server is stopping: ask again once it is back"))(scope, receive, watched)
+        finally:
+            seconds = time.perf_counter() - start
+            method = scope["method"]
+            counted = self._metrics.of(method, status)
+            counted.requests.inc()
+            counted.seconds.observe(seconds)
+            tell = log.warning if status >= 500 else log.info
+            name = key.name if key else "-"
+            tell("request", method=method, path=scope["path"], status=status, key=name, ms=round(seconds * 1e3, 1))

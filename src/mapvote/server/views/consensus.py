@@ -1,0 +1,182 @@
+"""Does a vehicle contradict the others far more often than they contradict each other?
+
+Three things make this honest. A cell that looks different before and after a vehicle passed may simply have changed:
+a vote is compared only where others say the same both before it and after it. Neighbouring cells fail together: what
+is counted is objects (8-connected cells), not cells. And few data prove nothing: the test is exact, and "undecidable"
+is one of its answers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import scipy
+
+from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Lattice, TileIndex
+from mapvote.core.types import I64, U8, CellState
+from mapvote.server.views.outlines import pieces
+
+Stance = Literal["contradicts", "consistent", "undecidable"]
+Claim = Literal["occupied", "empty"]
+_SAYS_OCCUPIED = (CellState.UNCHANGED_OCCUPIED, CellState.CHANGED_OCCUPIED)
+_SAYS_EMPTY = (CellState.UNCHANGED_EMPTY, CellState.CHANGED_EMPTY)
+
+
+@dataclass(frozen=True, slots=True)
+class Spoken:
+    """One vehicle's vote on one tile: all its drives folded into one."""
+
+    vehicle: str
+    end_ns: int
+    states: U8
+    """(256, 256) CellState or NO_VOTE."""
+
+
+@dataclass(frozen=True, slots=True)
+class Compared:
+    """One vehicle against the others on one tile."""
+
+    vehicle: str
+    cells: int
+    """Cells where the others agree, before it and after it, and it says something too."""
+    rows: I64
+    """(n,) the cells among them where it says the opposite, on the lattice of the map, by row, then column."""
+    cols: I64
+    occupied: U8
+    """(n,) 1 where the vehicle says occupied, 0 where it says empty."""
+
+
+@dataclass(frozen=True, slots=True)
+class Contradiction:
+    """One thing that the vehicle sees otherwise than all around it."""
+
+    x: float
+    """Middle of its cells, map metres."""
+    y: float
+    cells: int
+    says: Claim
+
+
+@dataclass(frozen=True, slots=True)
+class Standing:
+    """How a vehicle stands to the consensus, with all that the verdict rests on."""
+
+    vehicle: str
+    verdict: Stance
+    cells: int
+    """Cells compared."""
+    objects: int
+    """Contradictions of at least ``min_cells`` cells among them."""
+    others_cells: int
+    others_objects: int
+    p_value: float
+    """Chance of as many objects or more if its rate were ``tolerated`` times that of the others; not yet adjusted."""
+    threshold: float
+    """What ``p_value`` had to stay below: the significance shared out among the vehicles tested (Bonferroni)."""
+    evidence: tuple[Contradiction, ...]
+    """Largest first."""
+
+
+def compare(index: TileIndex, votes: Iterable[Spoken]) -> list[Compared]:
+    """Each vehicle's vote on a tile against the others', one entry per vehicle in order of name.
+
+    In a cell the others agree if more of them say one thing (occupied or empty now) than the other, and at least one
+    of these passed before the vehicle and one after it. Undetermined cells and cells without a vote say nothing.
+    """
+    ordered = sorted(votes, key=lambda vote: (vote.end_ns, vote.vehicle))
+    if not ordered:
+        return []
+    states = np.stack([vote.states.reshape(-1) for vote in ordered])
+    occupied, empty = np.isin(states, _SAYS_OCCUPIED), np.isin(states, _SAYS_EMPTY)
+    until_occupied, until_empty = (np.cumsum(claim, axis=0, dtype=np.int32) for claim in (occupied, empty))
+    all_occupied, all_empty = until_occupied[-1], until_empty[-1]
+    out = []
+    for i, vote in enumerate(ordered):
+        before_occupied, before_empty = until_occupied[i] - occupied[i], until_empty[i] - empty[i]
+        after_occupied, after_empty = all_occupied - until_occupied[i], all_empty - until_empty[i]
+        more = np.sign((before_occupied + after_occupied) - (before_empty + after_empty))
+        agree_occupied = (more > 0) & (before_occupied > 0) & (after_occupied > 0)
+        agree_empty = (more < 0) & (before_empty > 0) & (after_empty > 0)
+        opposed = np.flatnonzero((agree_occupied & empty[i]) | (agree_empty & occupied[i]))
+        compared = int(((agree_occupied | agree_empty) & (occupied[i] | empty[i])).sum())
+        out.append(
+            Compared(
+                vehicle=vote.vehicle,
+                cells=compared,
+                rows=index[0] * TILE_CELLS + opposed // TILE_CELLS,
+                cols=index[1] * TILE_CELLS + opposed % TILE_CELLS,
+                occupied=occupied[i][opposed].astype(np.uint8),
+            )
+        )
+    return sorted(out, key=lambda entry: entry.vehicle)
+
+
+def standings_of(
+    compared: Iterable[Compared],
+    lattice: Lattice,
+    *,
+    tolerated: float = 2.0,
+    significance: float = 0.01,
+    min_cells: int = 4,
+) -> list[Standing]:
+    """The standing of every vehicle over all tiles, in order of name.
+
+    Under the hypothesis that a vehicle contradicts at ``tolerated`` times the others' rate per compared cell, its share
+    of all objects is binomial (the exact comparison of two Poisson rates, Przyborowski and Wilenski 1940). It
+    "contradicts" if the chance of what was seen is below ``significance`` shared out among the vehicles tested;
+    it is "undecidable" if nothing could be compared, or if its rate is above the tolerated one but the data are too
+    few to say so. Objects of fewer than ``min_cells`` cells are the flicker of single cells and not counted.
+    """
+    by_vehicle: dict[str, list[Compared]] = {}
+    for entry in compared:
+        by_vehicle.setdefault(entry.vehicle, []).append(entry)
+    names = sorted(by_vehicle)
+    cells = {name: sum(entry.cells for entry in by_vehicle[name]) for name in names}
+    evidence = {name: _objects(by_vehicle[name], lattice, min_cells) for name in names}
+    all_cells, all_objects = sum(cells.values()), sum(len(found) for found in evidence.values())
+    threshold = significance / max(1, sum(n > 0 for n in cells.values()))
+    out = []
+    for name in names:
+        mine, found = cells[name], len(evidence[name])
+        others, others_found = all_cells - mine, all_objects - found
+        p_value = _tail(found, others_found, tolerated * mine, others)
+        verdict: Stance = "undecidable"
+        if mine and p_value < threshold:
+            verdict = "contradicts"
+        elif mine and found * others <= tolerated * mine * others_found:
+            verdict = "consistent"
+        out.append(Standing(name, verdict, mine, found, others, others_found, p_value, threshold, evidence[name]))
+    return out
+
+
+def _tail(mine: int, others: int, my_exposure: float, others_exposure: float) -> float:
+    """P(X >= mine), X binomial of mine + others objects, each mine by my share of the exposure."""
+    if mine == 0 or others_exposure == 0:
+        return 1.0
+    share = my_exposure / (my_exposure + others_exposure)
+    return float(scipy.special.betainc(mine, others + 1, share))
+
+
+def _objects(entries: Sequence[Compared], lattice: Lattice, min_cells: int) -> tuple[Contradiction, ...]:
+    """The 8-connected contradictions of one vehicle, over all tiles, largest first."""
+    rows, cols = np.concatenate([e.rows for e in entries]), np.concatenate([e.cols for e in entries])
+    says = np.concatenate([e.occupied for e in entries])
+    order = np.lexsort((cols, rows))
+    rows, cols, says = rows[order], cols[order], says[order]
+    if not len(rows):
+        return ()
+    label = pieces(rows, cols, says.astype(np.int64)).objects
+    size = np.bincount(label)
+    x = lattice.x0 + CELL_SIZE * (np.bincount(label, weights=cols) / size + 0.5)
+    y = lattice.y0 + CELL_SIZE * (np.bincount(label, weights=rows) / size + 0.5)
+    first = np.unique(label, return_index=True)[1]
+    ranked = [int(i) for i in np.argsort(-size, kind="stable") if size[i] >= min_cells]
+    return tuple(
+        Contradiction(
+            round(float(x[i]), 2), round(float(y[i]), 2), int(size[i]), "occupied" if says[first[i]] else "empty"
+        )
+        for i in ranked
+    )

@@ -1,0 +1,219 @@
+"""The desk: what a publish would change now, what it leaves for lack of evidence, and what reviewers decided."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass, replace
+from threading import Lock
+from typing import Any
+from weakref import WeakKeyDictionary
+
+import numpy as np
+
+from mapvote.core.columns import EVERY_BIT
+from mapvote.core.grid import CELL_SIZE, CELLS, TILE_CELLS, TileIndex
+from mapvote.core.tile import Tile
+from mapvote.core.types import Bool
+from mapvote.fusion.edit import delete_points
+from mapvote.fusion.odds import unpack_agreed
+from mapvote.fusion.pending import Pending
+from mapvote.server.errors import NotFound
+from mapvote.server.store.fusion_jobs import Fused, unpack_tally_plane
+from mapvote.server.store.queries import load_tile, tile_of
+from mapvote.server.store.reviews import Review, Verdict, decide, standing
+from mapvote.server.store.round import Gate, Round, edited_tile, reasons_to_hold, round_at
+from mapvote.server.store.store import Store
+from mapvote.server.views.change_objects import ChangeObject, Decided, change_objects, changed_cells
+from mapvote.server.views.cutout import cut_out
+from mapvote.server.views.explain import states_of
+from mapvote.server.views.geojson import to_geojson
+from mapvote.server.views.history import tiles_at
+from mapvote.server.views.picture import before_and_after
+
+_OF_REVIEW = "verdict."
+_lock = Lock()
+
+
+@dataclass(frozen=True, slots=True)
+class Desk:
+    """What lies on the desk at one moment."""
+
+    version: int
+    """The newest, on which a publish would build."""
+    held: list[str]
+    """Why the policy would hold the version back."""
+    pending: dict[str, Any]
+    """Changes that a publish would make, GeoJSON; those that somebody accepted carry the verdict."""
+    waiting: list[dict[str, Any]]
+    """Deletions that it would not make because they are beyond the policy's budget, GeoJSON features."""
+    reviewed: list[Review]
+    """Held and rejected changes, which a publish leaves out."""
+    cells: Mapping[str, Mapping[TileIndex, Bool]]
+    """Of every change by its id."""
+    edited: Mapping[TileIndex, Tile]
+    """Tiles as a publish would make them."""
+
+
+_desks: WeakKeyDictionary[Round, Desk] = WeakKeyDictionary()
+"""Of the rounds that are still kept."""
+
+
+def desk(store: Store, executor: Executor | None = None, gate: Gate | None = None) -> Desk:
+    """What a publish would do now, as a list of changes. Nothing is written, and nothing is computed again as long as
+    the round holds."""
+    found = round_at(store, store.clock(), executor=executor, every=True)
+    with _lock:
+        known = _desks.get(found)
+        if known is None:
+            known = _desks[found] = _desk_of(store, found)
+    return replace(known, held=reasons_to_hold(store, found, gate))
+
+
+def _desk_of(store: Store, found: Round) -> Desk:
+    version, budget = found.newest.number, found.asked.settings.false_deletions
+    tiles = [_before_and_after(store, version, fused) for fused in found.changed]
+    told = {f.index: _decided(f) for f in found.changed}
+    objects = change_objects(changed_cells(old, new, [told[old.index]]) for old, new in tiles)
+    pending = to_geojson(objects, store.lattice, map_id=store.map_id, from_version=version)
+    reviews = standing(store)
+    cells = {o.id: _cells_of(o) for o in objects}
+    for feature in pending["features"]:
+        mine = cells[feature["id"]]
+        feature["properties"]["verdict"] = next((_told(r) for r, theirs in reviews if _meet(mine, theirs)), None)
+    cells |= {f"{_OF_REVIEW}{review.seq}": theirs for review, theirs in reviews}
+    left_out = [review for review, _ in reviews if review.verdict != "accepted"]
+    edited = {new.index: new for _, new in tiles}
+    waiting = waiting_features(store, version, [*found.decided.values(), *found.beside.values()], budget)
+    return Desk(version, [], pending, waiting, left_out, cells, edited)
+
+
+def _decided(fused: Fused) -> Decided:
+    states = states_of(fused.states)
+    return Decided(0, states, unpack_tally_plane(fused.tally), odds=unpack_agreed(fused.odds, states))
+
+
+def pending_picture(store: Store, change: str, executor: Executor | None = None) -> bytes:
+    """PNG of the place of a pending change, as it is and as a publish would make it, side by side.
+
+    NotFound if no such change is pending any more.
+    """
+    now = desk(store, executor)
+    feature = next((f for f in now.pending["features"] if f["id"] == change), None)
+    if feature is None:
+        raise NotFound(f"no change {change[:80]!r} is pending any more: look again")
+    low, high = feature["properties"]["box"]
+    before = tiles_at(store, now.version)
+    after = lambda index: now.edited[index] if index in now.edited else before(index)  # noqa: E731
+    return before_and_after(cut_out("", "", (*low, *high), 0.0, (before, after), store.lattice))
+
+
+def review(
+    store: Store,
+    change: str,
+    verdict: Verdict,
+    *,
+    by: str,
+    comment: str = "",
+    after: int | None = None,
+    executor: Executor | None = None,
+) -> int:
+    """Decide about a pending change, or about one that was held or rejected (``verdict.N``); the verdict's number.
+
+    ``after`` as in :func:`mapvote.server.store.reviews.decide`. NotFound if no such change is pending any more.
+    """
+    now = desk(store, executor)
+    features = {f["id"]: f for f in now.pending["features"]}
+    features |= {f"{_OF_REVIEW}{r.seq}": dict(r.feature) for r in now.reviewed}
+    if change not in features:
+        raise NotFound(f"no change {change[:80]!r} is pending any more: look again")
+    feature = features[change] | {"properties": features[change]["properties"] | {"verdict": None}}
+    return decide(store, verdict, feature, now.cells[change], by=by, comment=comment, after=after)
+
+
+def verdict_of(review: Review) -> dict[str, Any]:
+    """A held or rejected change as GeoJSON, as it was when it was decided, with the verdict."""
+    properties = dict(review.feature["properties"]) | {"verdict": _told(review)}
+    return dict(review.feature) | {"id": f"{_OF_REVIEW}{review.seq}", "properties": properties}
+
+
+def _told(review: Review) -> dict[str, Any]:
+    return {
+        "seq": review.seq,
+        "verdict": review.verdict,
+        "by": review.by,
+        "comment": review.comment,
+        "at_ns": review.at_ns,
+    }
+
+
+def _before_and_after(store: Store, version: int, fused: Fused) -> tuple[Tile, Tile]:
+    window = store.lattice.tile(fused.index)
+    with store.database.reading() as connection:
+        before = load_tile(connection, window, tile_of(connection, version, fused.index))
+    return before, edited_tile(fused, before)
+
+
+def _cells_of(change: ChangeObject) -> dict[TileIndex, Bool]:
+    found: dict[TileIndex, Bool] = {}
+    rows, cols = change.where
+    tiles = np.stack([rows // TILE_CELLS, cols // TILE_CELLS], axis=1)
+    for index in np.unique(tiles, axis=0):
+        mine = (tiles == index).all(axis=1)
+        plane = np.zeros((TILE_CELLS, TILE_CELLS), dtype=np.bool_)
+        plane[rows[mine] % TILE_CELLS, cols[mine] % TILE_CELLS] = True
+        found[int(index[0]), int(index[1])] = plane
+    return found
+
+
+def _meet(mine: Mapping[TileIndex, Bool], theirs: Mapping[TileIndex, Bool]) -> bool:
+    return any((mine[i] & theirs[i]).any() for i in mine.keys() & theirs.keys())
+
+
+_WAITS = "waits."
+
+
+def waiting_features(store: Store, version: int, fused: Sequence[Fused], budget: float) -> list[dict[str, Any]]:
+    """What would go from a version's tiles but for the ``budget``, as GeoJSON features in map metres.
+
+    With "waits", the reason; "false_deletion", the largest of its cells' probabilities that something that stands goes;
+    "drive_by", the middle of its cells.
+    """
+    waits = {one.index: one.pending for one in fused if len(one.pending.cells)}
+    tiles = {}
+    for index in waits:
+        window = store.lattice.tile(index)
+        with store.database.reading() as connection:
+            tiles[index] = load_tile(connection, window, tile_of(connection, version, index))
+    objects = change_objects(changed_cells(tile, _emptied(tile, waits[index])) for index, tile in tiles.items())
+    features: list[dict[str, Any]] = to_geojson(objects, store.lattice, map_id=store.map_id)["features"]
+    for change, feature in zip(objects, features, strict=True):
+        rows, cols = change.where
+        likeliest = _likeliest(change, waits)
+        middle = [store.lattice.x0, store.lattice.y0] + CELL_SIZE * (np.array([cols.mean(), rows.mean()]) + 0.5)
+        feature["id"] = _WAITS + change.id
+        feature["properties"] |= {
+            "verdict": None,
+            "waits": f"deleting it takes something that stands with a probability of up to {likeliest:.2g}; "
+            f"the policy allows {budget:g}",
+            "false_deletion": round(likeliest, 6),
+            "drive_by": [round(float(value), 2) for value in middle],
+        }
+    return features
+
+
+def _emptied(tile: Tile, waits: Pending) -> Tile:
+    words = np.zeros(CELLS, dtype=np.uint64)
+    words[waits.cells] = EVERY_BIT
+    return delete_points(tile, words.reshape(TILE_CELLS, TILE_CELLS))[0]
+
+
+def _likeliest(change: ChangeObject, waits: Mapping[TileIndex, Pending]) -> float:
+    """Of the probabilities of its cells the largest."""
+    rows, cols = change.where
+    largest = 0.0
+    for index, pending in waits.items():
+        mine = (rows // TILE_CELLS == index[0]) & (cols // TILE_CELLS == index[1])
+        cells = rows[mine] % TILE_CELLS * TILE_CELLS + cols[mine] % TILE_CELLS
+        largest = max(largest, float(pending.probability[np.isin(pending.cells, cells)].max(initial=0.0)))
+    return largest

@@ -1,0 +1,178 @@
+"""Change objects, tiles and contradictions as GeoJSON, and any list of the server as CSV."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime
+from typing import Any
+
+import numpy as np
+
+from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Lattice
+from mapvote.core.types import F64
+from mapvote.formats.geo.frame import MapFrame, frame_of
+from mapvote.server.views.change_objects import ChangeObject
+from mapvote.server.views.consensus import Standing
+from mapvote.server.views.outlines import Ring
+
+
+def to_geojson(
+    objects: Sequence[ChangeObject],
+    lattice: Lattice,
+    *,
+    map_id: str,
+    from_version: int | None = None,
+    to_version: int | None = None,
+    georeference: Mapping[str, str] | None = None,
+    lonlat: bool = False,
+) -> dict[str, Any]:
+    """The objects as a GeoJSON FeatureCollection (RFC 7946), ready for ``json.dumps``; its member "frame" says where
+    coordinates lie.
+
+    ``lonlat``: longitude and latitude, as the RFC wants them, where the map knows its place on Earth; else map metres.
+    """
+    frame = frame_of(georeference or {})
+    features = [_feature(o, lattice, _neighbours(o, objects)) for o in objects]
+    if lonlat and not frame.is_local:
+        for feature in features:
+            _to_lonlat(feature["geometry"], frame)
+    return {
+        "type": "FeatureCollection",
+        "frame": "WGS 84 longitude, latitude" if lonlat and not frame.is_local else f"{MAP_METRES}: {frame.told()}",
+        "map_id": map_id,
+        "georeference": dict(georeference or {}),
+        "from_version": from_version,
+        "to_version": to_version,
+        "features": features,
+    }
+
+
+def _to_lonlat(geometry: dict[str, Any], frame: MapFrame) -> None:
+    """Rings in map metres to degrees, in place; 1e-8 degrees are a millimetre. The sense of the rings stays."""
+    polygons = [geometry["coordinates"]] if geometry["type"] == "Polygon" else geometry["coordinates"]
+    for polygon in polygons:
+        for i, ring in enumerate(polygon):
+            corners = np.column_stack([np.array(ring), np.zeros(len(ring))])
+            polygon[i] = np.round(frame.to_lonlat(corners)[:, :2], 8).tolist()
+
+
+def as_csv(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Rows as CSV with a header; lists by spaces. What a spreadsheet would take for a formula gets a quote."""
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    names = list(dict.fromkeys(name for row in rows for name in row))
+    writer.writerow(names)
+    writer.writerows([[_cell(row.get(name)) for name in names] for row in rows])
+    return out.getvalue()
+
+
+def feature_rows(collection: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """The features of :func:`to_geojson` without their outlines, for a table."""
+    return [{"id": f["id"]} | f["properties"] for f in collection["features"]]
+
+
+def _cell(value: Any) -> Any:
+    if isinstance(value, list | tuple):
+        value = " ".join(map(str, value))
+    return f"'{value}" if isinstance(value, str) and value[:1] in tuple("=+-@\t\r") else value
+
+
+def _neighbours(change: ChangeObject, objects: Sequence[ChangeObject]) -> list[str]:
+    """What lies near it: ids of other large things whose box is within 15 m, nearest first."""
+    near = [(_distance_m(change, o), o.id) for o in objects if o is not change and o.size == "large"]
+    return [name for distance, name in sorted(near) if distance <= NEAR_M][:MOST_NEIGHBOURS]
+
+
+def _distance_m(a: ChangeObject, b: ChangeObject) -> float:
+    gaps = [max(a.box[i] - b.box[i + 2], b.box[i] - a.box[i + 2], 0.0) for i in (0, 1)]
+    return CELL_SIZE * math.hypot(*gaps)
+
+
+def _feature(change: ChangeObject, lattice: Lattice, near: list[str]) -> dict[str, Any]:
+    polygons = [[_corners(ring, lattice) for ring in polygon] for polygon in change.outline]
+    single = len(polygons) == 1
+    return {
+        "type": "Feature",
+        "id": change.id,
+        "geometry": {
+            "type": "Polygon" if single else "MultiPolygon",
+            "coordinates": polygons[0] if single else polygons,
+        },
+        "properties": {
+            "kind": change.kind,
+            "size": change.size,
+            "area_m2": round(change.area_m2, 2),
+            "height_m": round(change.height_m, 2),
+            "volume_m3": round(change.volume_m3, 2),
+            "cells": change.cells,
+            "points": change.points,
+            "votes_min": change.votes_min,
+            "votes_median": change.votes_median,
+            "against_median": change.against_median,
+            "share_for": None if change.share_for is None else round(change.share_for, 3),
+            "probability": None if change.probability is None else round(change.probability, 3),
+            "first_seen": utc(change.first_seen_ns),
+            "last_seen": utc(change.last_seen_ns),
+            "versions": change.versions,
+            "box": _corners(np.reshape(change.box, (2, 2)), lattice),
+            "near": near,
+        },
+    }
+
+
+def _corners(ring: Ring | F64, lattice: Lattice) -> list[list[float]]:
+    metres = np.round(ring * CELL_SIZE + np.array([lattice.x0, lattice.y0]), 3) + 0.0  # + 0.0: no "-0.0" in the file
+    corners: list[list[float]] = metres.tolist()
+    return corners
+
+
+def utc(stamp_ns: int | None) -> str | None:
+    """ISO 8601, whole seconds; ``None`` where unknown."""
+    if stamp_ns is None:
+        return None
+    return datetime.fromtimestamp(stamp_ns // 1_000_000_000, UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
+
+
+NEAR_M = 15.0
+MOST_NEIGHBOURS = 5
+MAP_METRES = "map metres, not the longitude and latitude of RFC 7946"
+
+
+def tile_squares(tiles: Sequence[Mapping[str, Any]], lattice: Lattice) -> dict[str, Any]:
+    """Tiles (each with row and col) as GeoJSON polygons in map metres, everything said of them as properties."""
+    return _collection([(_square(lattice, tile["row"], tile["col"]), dict(tile)) for tile in tiles])
+
+
+def contradictions(standings: Sequence[Standing]) -> dict[str, Any]:
+    """Where vehicles contradict the others, as GeoJSON points in map metres."""
+    return _collection(
+        [
+            (
+                {"type": "Point", "coordinates": [e.x, e.y]},
+                {"vehicle": s.vehicle, "verdict": s.verdict, "says": e.says, "cells": e.cells},
+            )
+            for s in standings
+            for e in s.evidence
+        ]
+    )
+
+
+def standing_rows(standings: Sequence[Standing]) -> list[dict[str, Any]]:
+    """A row a vehicle, without the places."""
+    told = ("vehicle", "verdict", "cells", "objects", "others_cells", "others_objects", "p_value", "threshold")
+    return [{name: getattr(s, name) for name in told} for s in standings]
+
+
+def _collection(things: Sequence[tuple[dict[str, Any], dict[str, Any]]]) -> dict[str, Any]:
+    features = [{"type": "Feature", "geometry": geometry, "properties": told} for geometry, told in things]
+    return {"type": "FeatureCollection", "frame": MAP_METRES, "features": features}
+
+
+def _square(lattice: Lattice, row: int, col: int) -> dict[str, Any]:
+    window = lattice.tile((row, col))
+    side = TILE_CELLS * CELL_SIZE
+    x, y, x1, y1 = (round(v, 3) for v in (window.x0, window.y0, window.x0 + side, window.y0 + side))
+    return {"type": "Polygon", "coordinates": [[[x, y], [x1, y], [x1, y1], [x, y1], [x, y]]]}

@@ -1,0 +1,163 @@
+"""What happened: changes between versions, coverage, vehicles, events."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
+from functools import cache, partial
+from typing import Any
+
+import sqlalchemy as sa
+
+from mapvote.codec.ballot import tile_key
+from mapvote.core.grid import TileIndex
+from mapvote.core.tile import Tile
+from mapvote.core.types import MapvoteError
+from mapvote.fusion.odds import unpack_agreed
+from mapvote.fusion.tile_vote import DAY_NS, TileVote, one_each
+from mapvote.server.errors import Unavailable
+from mapvote.server.store import schema
+from mapvote.server.store.fusion_jobs import unpack_tally_plane
+from mapvote.server.store.policy import policy_in
+from mapvote.server.store.queries import current_version, load_tile, tile_as_of, tiles_of, tiles_that_differ, version_of
+from mapvote.server.store.store import Store
+from mapvote.server.store.votes import (
+    FOREVER,
+    Electorate,
+    counting_votes,
+    from_sound_ballots,
+    judged_votes,
+    read_votes,
+    standing_tiles,
+)
+from mapvote.server.views.change_objects import Decided, change_objects, changed_cells
+from mapvote.server.views.consensus import Compared, Spoken, Standing, compare, standings_of
+from mapvote.server.views.cutout import Box, Cutout, Tiles, cut_out, of_feature, whole_page
+from mapvote.server.views.explain import said_by, states_of
+from mapvote.server.views.geojson import to_geojson
+from mapvote.server.views.picture import before_and_after
+
+
+def seen(stamp_ns: int | None, known: bool) -> int | None:
+    """When a vehicle passed, or, to whom it is not ``known`` which, only on which day: of a road with few vehicles the
+    minute would tell who it was."""
+    return stamp_ns if known or stamp_ns is None else stamp_ns // DAY_NS * DAY_NS
+
+
+def changes_between(
+    store: Store, old: int, new: int, min_cells: int = 1, *, lonlat: bool = False, known: bool = True
+) -> dict[str, Any]:
+    """Change objects from version ``old`` to ``new`` as GeoJSON in map metres, or longitude and latitude (``lonlat``).
+    ``known``: see :func:`seen`. Tiles that cannot be read are left out, and named as "damaged".
+
+    NotFound if one of the versions does not exist.
+    """
+    with store.database.reading() as connection:
+        found, damaged = [], []
+        for index, *pair in tiles_that_differ(connection, old, new):
+            try:
+                tiles = [load_tile(connection, store.lattice.tile(index), hashes) for hashes in pair]
+                decided = list(_decided(store, connection, index, min(old, new), max(old, new)))
+            except Unavailable:
+                raise
+            except MapvoteError:
+                damaged.append(tile_key(index))
+                continue
+            found.append(changed_cells(tiles[0], tiles[1], decided))
+    told = to_geojson(
+        [
+            replace(thing, first_seen_ns=seen(thing.first_seen_ns, known), last_seen_ns=seen(thing.last_seen_ns, known))
+            for thing in change_objects(found, min_cells)
+        ],
+        store.lattice,
+        map_id=store.map_id,
+        from_version=old,
+        to_version=new,
+        georeference=store.georeference,
+        lonlat=lonlat,
+    )
+    return told | ({"damaged": damaged} if damaged else {})
+
+
+def cutouts_between(store: Store, old: int, new: int, found: Mapping[str, Any], most: int = 12) -> list[Cutout]:
+    """The largest things of :func:`changes_between` with what stands around them, before and after."""
+    tiles = tiles_at(store, old), tiles_at(store, new)
+    large = [f for f in found["features"] if f["properties"]["size"] == "large"] or list(found["features"])
+    largest = sorted(large, key=lambda f: -f["properties"]["area_m2"])[:most]
+    return [of_feature(feature, tiles, store.lattice) for feature in largest]
+
+
+def page_between(store: Store, old: int, new: int, found: Mapping[str, Any]) -> str:
+    """HTML of :func:`cutouts_between`, a file that needs nothing else."""
+    return whole_page(f"{found['map_id']}: version {old} to {new}", cutouts_between(store, old, new, found))
+
+
+def picture_between(store: Store, old: int, new: int, box: Box) -> bytes:
+    """PNG of what stands in and 10 m around a box (x0, y0, x1, y1), map metres, in two versions, side by side.
+
+    NotFound if one of the versions does not exist.
+    """
+    tiles = tiles_at(store, old), tiles_at(store, new)
+    return before_and_after(cut_out("", "", box, 0.0, tiles, store.lattice))
+
+
+def tiles_at(store: Store, version: int) -> Tiles:
+    """Tiles of one version by their index, each loaded once. NotFound if there is no such version."""
+    with store.database.reading() as connection:
+        version_of(connection, version)
+        hashes = tiles_of(connection, version)
+
+    @cache
+    def load(index: TileIndex) -> Tile:
+        with store.database.reading() as connection:
+            return load_tile(connection, store.lattice.tile(index), hashes.get(index))
+
+    return load
+
+
+def _decided(store: Store, connection: sa.Connection, index: TileIndex, old: int, new: int) -> Iterable[Decided]:
+    d = schema.decisions
+    query = sa.select(d.c.version, d.c.states, d.c.tally, d.c.odds).where(d.c.row == index[0], d.c.col == index[1])
+    for row in connection.execute(query.where(d.c.version > old, d.c.version <= new).order_by(d.c.version)).all():
+        version = version_of(connection, row.version)
+        tile = tile_as_of(connection, store.lattice.tile(index), row.version - 1)
+        votes = from_sound_ballots(connection, Electorate.of(version), partial(counting_votes, connection, tile))
+        drives = [(vote.end_ns, vote.states) for vote in votes if vote.states is not None]
+        states = states_of(row.states)
+        yield Decided(row.version, states, unpack_tally_plane(row.tally), drives, unpack_agreed(row.odds, states))
+
+
+def coverage(store: Store) -> list[dict[str, Any]]:
+    """Per tile of the map or of a standing ballot: when it was last driven past (ns), by how many vehicles."""
+    b, t = schema.ballots, schema.ballot_tiles
+    seen = sa.select(t.c.row, t.c.col, sa.func.max(b.c.end_ns), sa.func.count(sa.distinct(b.c.vehicle)))
+    seen = seen.join(b, b.c.seq == t.c.ballot).where(b.c.gone_seq.is_(None)).group_by(t.c.row, t.c.col)
+    with store.database.reading() as connection:
+        tiles: dict[TileIndex, tuple[int | None, int]] = dict.fromkeys(
+            tiles_of(connection, current_version(connection).number), (None, 0)
+        )
+        tiles |= {(row[0], row[1]): (row[2], row[3]) for row in connection.execute(seen)}
+    return [
+        {"row": index[0], "col": index[1], "last_seen_ns": last, "vehicles": vehicles}
+        for index, (last, vehicles) in sorted(tiles.items())
+    ]
+
+
+def vehicle_standings(store: Store) -> list[Standing]:
+    """How each vehicle stands to what the others say, over every vote inside the window, in order of name.
+
+    What is compared is the world (occupied or empty now), so votes on an older base count here too.
+    """
+    with store.database.reading() as connection:
+        everybody = Electorate(FOREVER, policy_in(connection), FOREVER)
+        compared: list[Compared] = []
+
+        def said_on(index: TileIndex, asked: Electorate) -> list[TileVote]:
+            chosen = [vote for vote, why in judged_votes(connection, index, asked) if not why]
+            return read_votes(connection, index, chosen)
+
+        for index in standing_tiles(connection, FOREVER):
+            said = from_sound_ballots(connection, everybody, partial(said_on, index))
+            folded = one_each(said, store.lattice.tile(index))
+            compared += compare(index, [Spoken(vote.vehicle, vote.end_ns, said_by(vote)) for vote in folded])
+    return standings_of(compared, store.lattice)

@@ -1,0 +1,298 @@
+"""Changed cells as shapes on the lattice: connected pieces, buildings side by side, things, polygons.
+
+Nothing here knows of tiles, so no tile border shows.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+import scipy
+
+from mapvote.core.grid import CELL_SIZE
+from mapvote.core.types import F64, I32, I64, Bool
+
+Ring = I64
+"""(n, 2) corners (col, row) of the lattice, closed: the first corner is repeated at the end."""
+_RIGHT, _ABOVE = (0, 1), (1, 0)
+_DIAGONALS = (1, -1), (1, 1)
+_SHIFT = np.int64(32)
+_STEP = np.array([(1, 0), (0, 1), (-1, 0), (0, -1)], dtype=np.int64)
+"""(col, row) step of each edge direction: counter-clockwise round a cell, which lies to the left."""
+
+
+@dataclass(frozen=True, slots=True)
+class Pieces:
+    """Labels (n,) of n cells; numbers follow the cells' order, by row and then by column, of their first cell."""
+
+    objects: I32
+    """8-connected: what counts as one change."""
+    polygons: I32
+    """4-connected: what one polygon can cover, as two squares that meet at a corner are two polygons."""
+
+
+def pieces(rows: I64, cols: I64, kinds: I64) -> Pieces:
+    """Connected cells of the same kind; cells (n,) on the lattice, sorted by row, then column, each once."""
+    key = _key(rows, cols)
+    straight = [_pairs(key, kinds, rows + dr, cols + dc) for dr, dc in (_RIGHT, _ABOVE)]
+    diagonal = [_pairs(key, kinds, rows + dr, cols + dc) for dr, dc in _DIAGONALS]
+    return Pieces(_labels(straight + diagonal, len(rows)), _labels(straight, len(rows)))
+
+
+def rings(rows: I64, cols: I64, polygons: I32) -> list[list[Ring]]:
+    """The outline of every 4-connected piece: first its outer ring, counter-clockwise, then its holes, clockwise.
+
+    ``polygons`` (n,) are the labels of the cells, 0 ... k - 1. Rings are simple, turn at every corner and begin at
+    their lowest, then leftmost corner: valid by RFC 7946 and OGC Simple Features, equal for equal cells.
+    """
+    if not len(rows):
+        return []
+    cell = _key(rows, cols)
+    start, direction, label = [], [], []
+    corners = ((0, 0), (1, 0), (1, 1), (0, 1))
+    beyond = ((-1, 0), (0, 1), (1, 0), (0, -1))
+    for d in range(4):
+        other = _find(cell, _key(rows + beyond[d][0], cols + beyond[d][1]))
+        open_side = (other < 0) | (polygons[other] != polygons)
+        start.append(np.stack([cols + corners[d][0], rows + corners[d][1]], axis=1)[open_side])
+        direction.append(np.full(int(open_side.sum()), d, dtype=np.int64))
+        label.append(polygons[open_side].astype(np.int64))
+    corner, way, owner = np.concatenate(start), np.concatenate(direction), np.concatenate(label)
+    order = np.lexsort((way, corner[:, 0], corner[:, 1], owner))
+    corner, way, owner = corner[order], way[order], owner[order]
+    follow = _successors(corner, way, owner)
+    out: list[list[Ring]] = [[] for _ in range(int(owner[-1]) + 1)]
+    turns, ends = _walk(way, follow)
+    for edges in np.split(turns, ends[:-1]):
+        out[int(owner[edges[0]])].append(np.concatenate([corner[edges], corner[edges[:1]]]))
+    return out
+
+
+def _key(rows: I64, cols: I64) -> I64:
+    """One sortable number per cell: by row, then by column; indices within +-2^30."""
+    key: I64 = (rows << _SHIFT) + cols
+    return key
+
+
+def _find(sorted_keys: I64, wanted: I64) -> I64:
+    """Index of each wanted key in ``sorted_keys``, -1 where it is missing."""
+    at = np.minimum(np.searchsorted(sorted_keys, wanted), len(sorted_keys) - 1)
+    return np.where(sorted_keys[at] == wanted, at, -1)
+
+
+def _pairs(key: I64, kinds: I64, rows: I64, cols: I64) -> tuple[I64, I64]:
+    """(i, j) of cells i whose neighbour at (rows, cols) is cell j of the same kind."""
+    other = _find(key, _key(rows, cols))
+    joined = np.flatnonzero((other >= 0) & (kinds[other] == kinds))
+    return joined, other[joined]
+
+
+def _labels(pairs: list[tuple[I64, I64]], n: int) -> I32:
+    i = np.concatenate([a for a, _ in pairs])
+    j = np.concatenate([b for _, b in pairs])
+    graph = scipy.sparse.coo_array((np.ones(len(i), dtype=np.int8), (i, j)), shape=(n, n))
+    _, found = scipy.sparse.csgraph.connected_components(graph, directed=False)
+    _, first, label = np.unique(found, return_index=True, return_inverse=True)
+    rank = np.empty(len(first), dtype=np.int32)
+    rank[np.argsort(first)] = np.arange(len(first), dtype=np.int32)
+    return rank[label]
+
+
+def _successors(corner: I64, way: I64, owner: I64) -> I64:
+    """The edge that follows each edge of its polygon.
+
+    Where two edges of one polygon leave a corner, the right turn keeps to the same cell outside, so that a ring
+    never touches itself: what it encloses becomes a hole of its own.
+    """
+    n = len(way)
+    stop = corner + _STEP[way]
+    _, vertex = np.unique(
+        np.concatenate([_key(corner[:, 1], corner[:, 0]), _key(stop[:, 1], stop[:, 0])]), return_inverse=True
+    )
+    place = owner * (2 * n) + vertex[:n]
+    next_place = owner * (2 * n) + vertex[n:]
+    name = place * 4 + way
+    by_name = np.argsort(name)
+    follow = np.full(n, -1, dtype=np.int64)
+    for turn in (1, 0, -1):  # the last that fits is kept: right before straight before left
+        found = _find(name[by_name], next_place * 4 + (way + turn) % 4)
+        follow = np.where(found >= 0, by_name[found], follow)
+    return follow
+
+
+@numba.njit(cache=True, nogil=True)
+def _walk(way: I64, follow: I64) -> tuple[I64, I64]:
+    """(edges that begin at a turn, ring after ring; the end of each ring in that list)."""
+    n = len(way)
+    done = np.zeros(n, dtype=np.bool_)
+    edges = np.empty(n, dtype=np.int64)
+    ends = np.empty(n, dtype=np.int64)
+    found, count = 0, 0
+    for first in range(n):
+        if done[first]:
+            continue
+        edge = first
+        before = -1
+        while not done[edge]:
+            done[edge] = True
+            if way[edge] != before:
+                edges[found] = edge
+                found += 1
+            before = way[edge]
+            edge = follow[edge]
+        ends[count] = found
+        count += 1
+    return edges[:found], ends[:count]
+
+
+SLOT_CELLS = 4
+"""1.2 m: two walls no farther apart are not those of one room."""
+WALL_CELLS = 10
+"""3 m: how long a slot is at least."""
+LEAST_SHARE = 0.2
+"""Of the cells that either side of a cut holds at least: no wall is cut off its building."""
+_MOST_CUTS = 12
+"""One after the other: of a row of buildings each is cut off by itself."""
+_DISK = np.hypot(*np.indices((SLOT_CELLS + 1, SLOT_CELLS + 1)) - SLOT_CELLS // 2) <= SLOT_CELLS / 2 + 0.25
+
+
+def buildings(rows: I64, cols: I64, kinds: I64) -> Pieces:
+    """Connected cells of one kind, see :func:`pieces`, cut between buildings that stand side by side."""
+    found = pieces(rows, cols, kinds)
+    part = np.zeros(len(rows), dtype=np.int64)
+    done: set[tuple[int, int]] = set()
+    for turn in range(1, _MOST_CUTS + 1):
+        fresh = _cut_each(rows, cols, found.objects, done)
+        if not fresh.any():
+            break
+        part[fresh] += 1 << turn
+        _, apart = np.unique(np.stack([kinds, part]), axis=1, return_inverse=True)
+        found = pieces(rows, cols, apart.reshape(-1))
+    return found
+
+
+def _cut_each(rows: I64, cols: I64, objects: I32, done: set[tuple[int, int]]) -> Bool:
+    """(n,) the cells on one side of the cut through each piece that has one. ``done``: pieces without, by their first
+    cell and size, which need not be asked again."""
+    fresh = np.zeros(len(rows), dtype=np.bool_)
+    sizes = np.bincount(objects)
+    for label in np.flatnonzero(sizes >= 2 * WALL_CELLS / LEAST_SHARE):
+        mine = np.flatnonzero(objects == label)
+        name = int(mine[0]), len(mine)
+        if name in done:
+            continue
+        side = _beyond_cut(rows[mine], cols[mine])
+        if side is None:
+            done.add(name)
+        else:
+            fresh[mine[side]] = True
+    return fresh
+
+
+def _beyond_cut(rows: I64, cols: I64) -> Bool | None:
+    """(n,) the cells beyond the cut along the longest slot that has enough on either side; None without one."""
+    margin = SLOT_CELLS
+    r, c = rows - rows.min() + margin, cols - cols.min() + margin
+    image = np.zeros((r.max() + margin + 1, c.max() + margin + 1), dtype=np.bool_)
+    image[r, c] = True
+    slots, count = scipy.ndimage.label(scipy.ndimage.binary_closing(image, _DISK) & ~image, np.ones((3, 3)))
+    at = np.stack([r, c], axis=1).astype(np.float64)
+    best: tuple[float, Bool] | None = None
+    for k in range(1, count + 1):
+        slot = np.argwhere(slots == k).astype(np.float64)
+        if len(slot) < WALL_CELLS:
+            continue
+        middle, along, length, width = _line(slot)
+        across = (at - middle) @ np.array([-along[1], along[0]])
+        beyond, bridge = across > 0, 0.5 * np.count_nonzero(np.abs(across) < 1)
+        narrow = max(WALL_CELLS, bridge) <= length and width <= SLOT_CELLS
+        enough = LEAST_SHARE <= beyond.mean() <= 1 - LEAST_SHARE
+        if narrow and enough and (best is None or length > best[0]):
+            best = length, beyond
+    return None if best is None else best[1]
+
+
+def _line(cells: F64) -> tuple[F64, F64, float, float]:
+    """(middle (2,), direction (2,), length, width) of cells (n, 2), in cells, along their principal axis."""
+    middle = cells.mean(axis=0)
+    along = np.linalg.svd(cells - middle, full_matrices=False)[2][0]
+    offset = cells - middle
+    length, width = (np.ptp(offset @ way) + 1.0 for way in (along, np.array([-along[1], along[0]])))
+    return middle, along, float(length), float(width)
+
+
+REACH_M = 1.5
+"""How far from a thing's hull a piece may lie and still be part of it: a gap that occlusion leaves in a wall."""
+PART_SHARE = 1 / 3
+"""A piece larger than this share of its neighbour is a thing of its own, unless their hulls overlap: houses stand
+closer to each other than the walls of one house."""
+
+TOUCH_CELLS = 1.0
+"""Hulls that overlap no more than that only touch: houses wall to wall."""
+
+
+def group(rows: I64, cols: I64, kinds: I64, pieces: I32, reach_m: float = REACH_M) -> I32:
+    """(n,) labels of things, 0 ... k - 1, of cells (n,) whose ``pieces`` are 8-connected and of one kind each.
+
+    From the largest piece down, each joins the nearest thing of its kind within ``reach_m`` of whose convex hull it
+    lies, or becomes one. A label's number follows the order of its first cell.
+    """
+    if not len(rows):
+        return np.zeros(0, dtype=np.int32)
+    members = np.split(np.argsort(pieces, kind="stable"), np.cumsum(np.bincount(pieces))[:-1])
+    corners = [_corners(rows[m], cols[m]) for m in members]
+    low = np.array([c.min(axis=0) for c in corners])
+    high = np.array([c.max(axis=0) for c in corners])
+    size = np.array([len(m) for m in members])
+    kind = np.array([kinds[m[0]] for m in members])
+    owner = np.arange(len(members))
+    reach = reach_m / CELL_SIZE
+    leaders: dict[int, list[int]] = {int(k): [] for k in np.unique(kind)}
+    hulls: dict[int, F64] = {}
+    for piece in np.argsort(-size, kind="stable").tolist():
+        same = np.array(leaders[int(kind[piece])], dtype=np.int64)
+        near = same[((low[same] <= high[piece] + reach) & (high[same] >= low[piece] - reach)).all(axis=1)]
+        gaps = [_gap(hulls[leader], corners[piece]) for leader in near.tolist()]
+        fits = [
+            (gap, leader)
+            for gap, leader in zip(gaps, near.tolist(), strict=True)
+            if gap < -TOUCH_CELLS or (gap <= reach and size[piece] <= PART_SHARE * size[leader])
+        ]
+        if fits:
+            owner[piece] = min(fits)[1]
+        else:
+            leaders[int(kind[piece])].append(piece)
+            hulls[piece] = scipy.spatial.ConvexHull(corners[piece]).equations
+    return _in_order(owner[pieces])
+
+
+def widths_m(rows: I64, cols: I64, pieces: I32) -> F64:
+    """(k,) metres: the narrowest gate that each piece (n,) labels 0 ... k - 1 would fit through, across a side of its
+    convex hull."""
+    members = np.split(np.argsort(pieces, kind="stable"), np.cumsum(np.bincount(pieces))[:-1])
+    return np.array([_width(_corners(rows[m], cols[m])) for m in members]) * CELL_SIZE
+
+
+def _width(corners: F64) -> float:
+    across = corners @ scipy.spatial.ConvexHull(corners).equations[:, :2].T
+    return float(np.ptp(across, axis=0).min())
+
+
+def _corners(rows: I64, cols: I64) -> F64:
+    """(4 n, 2) corners of cells, in cells."""
+    lower = np.stack([cols, rows], axis=1).astype(np.float64)
+    return np.concatenate([lower + corner for corner in np.array([(0, 0), (1, 0), (0, 1), (1, 1)])])
+
+
+def _gap(hull: F64, corners: F64) -> float:
+    """Cells from a convex hull (k, 3) to the nearest of some corners, beyond its farthest side; negative inside."""
+    return float((corners @ hull[:, :2].T + hull[:, 2]).max(axis=1).min())
+
+
+def _in_order(label: I64) -> I32:
+    _, first, inverse = np.unique(label, return_index=True, return_inverse=True)
+    rank = np.empty(len(first), dtype=np.int32)
+    rank[np.argsort(first)] = np.arange(len(first), dtype=np.int32)
+    return rank[inverse]

@@ -1,0 +1,70 @@
+"""Where the vehicles drove whose ballots stand: lines on the ground of the newest map."""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any
+
+import numpy as np
+import sqlalchemy as sa
+
+from mapvote.codec.path import unpack_path
+from mapvote.core.grid import CELL_SIZE, TILE_CELLS, TileIndex
+from mapvote.core.types import F32, I64
+from mapvote.server.store import schema
+from mapvote.server.store.queries import current_version, load_tile, tiles_of
+from mapvote.server.store.store import Store
+from mapvote.server.views.geojson import MAP_METRES, utc
+
+MOST_PATHS = 500
+"""Of the drives that ended last."""
+
+
+def paths(store: Store, vehicle: str | None = None) -> dict[str, Any]:
+    """GeoJSON lines [x, y, z] in map metres of standing ballots that tell of their path, the newest drive first; of one
+    ``vehicle`` only, if named. A piece of road that the map has no ground for lies as high as the piece before it."""
+    b, p = schema.ballots.c, schema.paths.c
+    query = sa.select(b.vehicle, b.drive, b.start_ns, b.end_ns, b.version, p.path)
+    query = query.join(schema.ballots, b.seq == p.ballot).where(b.gone_seq.is_(None))
+    if vehicle is not None:
+        query = query.where(b.vehicle == vehicle)
+    with store.database.reading() as connection:
+        rows = connection.execute(query.order_by(b.end_ns.desc()).limit(MOST_PATHS)).all()
+        driven = [unpack_path(row.path) for row in rows]
+        touched = {(int(r), int(c)) for path in driven for r, c in np.unique(path // TILE_CELLS, axis=0)}
+        known = tiles_of(connection, current_version(connection).number, sorted(touched)) if touched else {}
+
+        @cache
+        def ground(index: TileIndex) -> F32:
+            return load_tile(connection, store.lattice.tile(index), known.get(index)).ground_z
+
+        lines = [_line(store, path, ground) for path in driven]
+    features = [
+        {
+            "type": "Feature",
+            "geometry": {"type": "LineString", "coordinates": line},
+            "properties": {
+                "vehicle": row.vehicle,
+                "drive": row.drive,
+                "start": utc(row.start_ns),
+                "end": utc(row.end_ns),
+                "version": row.version,
+                "length_m": round(float(np.hypot(*np.diff(np.array(line)[:, :2], axis=0).T).sum()), 1),
+            },
+        }
+        for row, line in zip(rows, lines, strict=True)
+    ]
+    return {"type": "FeatureCollection", "frame": MAP_METRES, "features": features}
+
+
+def _line(store: Store, path: I64, ground: Any) -> list[list[float]]:
+    rows, cols = path.T
+    z = np.array(
+        [ground((int(r) // TILE_CELLS, int(c) // TILE_CELLS))[r % TILE_CELLS, c % TILE_CELLS] for r, c in path]
+    )
+    known = np.maximum.accumulate(np.where(np.isfinite(z), np.arange(len(z)), -1))
+    first = z[np.isfinite(z)][0] if np.isfinite(z).any() else 0.0
+    height = np.where(known >= 0, z[known], first)
+    x, y = store.lattice.x0 + (cols + 0.5) * CELL_SIZE, store.lattice.y0 + (rows + 0.5) * CELL_SIZE
+    line: list[list[float]] = np.round(np.column_stack([x, y, height]), 2).tolist()
+    return line

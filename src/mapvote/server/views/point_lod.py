@@ -1,0 +1,365 @@
+"""The 3D page's point clouds: a tile's points in levels of detail, overviews, what came and went, votes per cell.
+
+Any prefix of a tile's levels is an even, thinner picture of the tile. Each point belongs to the coarsest level in whose
+voxels it is the tile's first; within a level the order is random, and the same on every run. Levels are added to one
+another, so nothing is sent twice (Potree's additive levels, Schuetz 2016, on our tiles instead of an octree: a tile is
+one node, whose parts are its levels).
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import OrderedDict
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+
+import numba
+import numpy as np
+
+from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Lattice, TileIndex
+from mapvote.core.rows import found_among
+from mapvote.core.tile import Tile, in_bytes
+from mapvote.core.types import F32, F64, I64, NO_VOTE, U8, U16, CellState, MapvoteError
+from mapvote.fusion.odds import agreed_odds, folded
+from mapvote.fusion.probability import alike_beside, change_probability
+from mapvote.fusion.tile_vote import TileVote
+from mapvote.server.errors import Unavailable
+from mapvote.server.store.planes import TileHashes, unpack_fields_plane
+from mapvote.server.store.policy import policy_in
+from mapvote.server.store.queries import load_blob, load_tile, tiles_of, tiles_that_differ, version_of
+from mapvote.server.store.store import Store
+from mapvote.server.store.votes import DAMAGED, FOREVER, Electorate, from_sound_ballots, judged_votes, read_votes
+from mapvote.server.views.explain import said_by
+
+SPACINGS_M = (4.8, 2.4, 1.2, 0.6, 0.3)
+"""Voxel side of each level; one more level takes what is left."""
+N_LEVELS = len(SPACINGS_M) + 1
+SIDE_M = TILE_CELLS * CELL_SIZE
+ABOVE_OFFSET_M = 10.0
+_STEPS = 65535
+_LEAST_Z_STEP_M = 0.002
+_MOST_LAYERS = 512
+"""Of voxels, upwards: beyond, heights count as one."""
+_BYTES = "<u4,<u4,<f4,<f4"
+_CLOUD_MAGIC = 0x3143564D
+
+
+@dataclass(frozen=True, slots=True)
+class Levels:
+    """One tile's points, coarse first."""
+
+    packed: U16
+    """(n, 4): x and y from the tile's corner in 1/65535 of its side, z in ``z_step_m`` from ``z0_m``, and centimetres
+    above ground plus 1000."""
+    ends: I64
+    """(6,) where each level ends."""
+    z0_m: float
+    z_step_m: float
+    bright: U8 | None = None
+    """(n,) the intensity of each, 255 for 1.0; None where nobody knows it."""
+
+    def part(self, level: int) -> bytes:
+        """One level for the wire, see :func:`cloud_bytes`; behind it the intensity of each point, a byte, if known."""
+        some = slice(0 if level == 0 else int(self.ends[level - 1]), int(self.ends[level]))
+        bright = b"" if self.bright is None else self.bright[some].tobytes()
+        return cloud_bytes(self.packed[some], self.z0_m, self.z_step_m) + bright
+
+    @property
+    def nbytes(self) -> int:
+        """What it takes in memory."""
+        return self.packed.nbytes + (0 if self.bright is None else self.bright.nbytes)
+
+
+def make_levels(points: F32, ground_z: F32, most: int | None = None, bright: U8 | None = None) -> Levels:
+    """Sort points (n, 3), from the tile's corner, into levels; ``ground_z`` (256, 256) as in the tile.
+
+    ``most``: only the coarsest level and what else of the coarse ones fits into so many points, ``ends`` as if it were
+    all: for a picture of a whole map. ``bright`` (n,): their intensity, 255 for 1.0.
+    """
+    sizes = np.array(SPACINGS_M)
+    low, high = _heights(points)
+    sides = np.ceil(SIDE_M / sizes).astype(np.int64) + 1
+    layers = np.minimum(((high - low) / sizes).astype(np.int64) + 1, _MOST_LAYERS)
+    level = _levels(points, low, sizes, sides, layers)  # in the tile's own order: what is near comes soon, and is cheap
+    ends = np.cumsum(np.bincount(level, minlength=N_LEVELS))
+    room = len(points) if most is None else max(most, int(ends[0]))
+    chosen = np.flatnonzero(level <= np.searchsorted(ends, room))
+    shuffled = np.random.default_rng(0).permutation(chosen)
+    coarse_first = shuffled[np.argsort(level[shuffled], kind="stable")][:room]
+    packed, z0, step = pack(points[coarse_first], ground_z)
+    return Levels(packed, ends, z0, step, None if bright is None else bright[coarse_first])
+
+
+def pack(points: F32, ground_z: F32) -> tuple[U16, float, float]:
+    """(packed (n, 4), z0_m, z_step_m) of points from a tile's corner, in their order, see :class:`Levels`."""
+    if not len(points):
+        return np.zeros((0, 4), dtype=np.uint16), 0.0, _LEAST_Z_STEP_M
+    low, high = _heights(points)
+    step = max(_LEAST_Z_STEP_M, (high - low) / _STEPS)
+    known = ground_z[np.isfinite(ground_z)]
+    elsewhere = float(np.median(known)) if len(known) else low
+    return _pack(points, ground_z, elsewhere, low, step), low, step
+
+
+def _heights(points: F32) -> tuple[float, float]:
+    return (float(points[:, 2].min()), float(points[:, 2].max())) if len(points) else (0.0, 0.0)
+
+
+def cloud_bytes(packed: U16, z0_m: float, z_step_m: float) -> bytes:
+    """Sixteen bytes (0x3143564D, number of points, z0_m, z_step_m as uint32, uint32, float32, float32), then
+    (n, 4) uint16, all little-endian."""
+    head = np.array([(_CLOUD_MAGIC, len(packed), z0_m, z_step_m)], dtype=_BYTES)
+    return head.tobytes() + np.ascontiguousarray(packed, dtype="<u2").tobytes()
+
+
+def unpack_cloud(data: bytes) -> F64:
+    """(n, 3) metres from the tile's corner, of what :func:`cloud_bytes` gave."""
+    _, n, z0, step = np.frombuffer(data, dtype=_BYTES, count=1)[0]
+    packed = np.frombuffer(data, dtype="<u2", offset=16).reshape(int(n), 4).astype(np.float64)
+    return packed[:, :3] * [SIDE_M / _STEPS, SIDE_M / _STEPS, float(step)] + [0.0, 0.0, float(z0)]
+
+
+@numba.njit(cache=True, nogil=True)
+def _levels(points: F32, low: float, sizes: F64, sides: I64, layers: I64) -> U8:
+    """(n,) level of each point: the coarsest in whose voxel no point came before.
+
+    Voxels of a level lie whole in those of the coarser one, so that whoever takes a voxel takes all that hold it.
+    """
+    first = np.zeros(len(sizes) + 1, dtype=np.int64)
+    for k in range(len(sizes)):
+        first[k + 1] = first[k] + sides[k] * sides[k] * layers[k]
+    taken = np.zeros(first[-1], dtype=np.bool_)
+    out = np.full(len(points), len(sizes), dtype=np.uint8)
+    for i in range(len(points)):
+        x, y, z = points[i, 0], points[i, 1], points[i, 2] - low
+        for k in range(len(sizes) - 1, -1, -1):
+            col = min(max(int(x / sizes[k]), 0), sides[k] - 1)
+            row = min(max(int(y / sizes[k]), 0), sides[k] - 1)
+            voxel = first[k] + (min(int(z / sizes[k]), layers[k] - 1) * sides[k] + row) * sides[k] + col
+            if taken[voxel]:
+                break
+            taken[voxel] = True
+            out[i] = k
+    return out
+
+
+@numba.njit(cache=True, nogil=True)
+def _pack(points: F32, ground_z: F32, elsewhere: float, z0: float, step: float) -> U16:
+    """(n, 4), see :class:`Levels`. ``elsewhere``: the ground where a cell knows none."""
+    out = np.empty((len(points), 4), dtype=np.uint16)
+    for i in range(len(points)):
+        x, y, z = points[i, 0], points[i, 1], points[i, 2]
+        row = min(max(int(y / CELL_SIZE), 0), TILE_CELLS - 1)
+        col = min(max(int(x / CELL_SIZE), 0), TILE_CELLS - 1)
+        ground = float(ground_z[row, col])
+        if not np.isfinite(ground):
+            ground = elsewhere
+        out[i, 0] = min(max(round(x * (_STEPS / SIDE_M)), 0), _STEPS)
+        out[i, 1] = min(max(round(y * (_STEPS / SIDE_M)), 0), _STEPS)
+        out[i, 2] = round((z - z0) / step)
+        out[i, 3] = min(max(round((z - ground + ABOVE_OFFSET_M) * 100), 0), _STEPS)
+    return out
+
+
+OVERVIEW_POINTS = 150_000
+"""Of an overview at most, 1.2 MB: what a slow connection brings in a second or two."""
+_SPARE = 4
+"""Times the even share of it that is kept of a tile while an overview is made: a map of any size fits in memory."""
+_AT_ONCE = 2
+"""Tiles of an overview: reading and sorting them leaves the interpreter free, and somebody waits."""
+_ANYWHERE = Lattice().tile((0, 0))
+"""Levels count from a tile's corner, wherever that is."""
+_KEPT_BYTES = 256_000_000
+_HEAD = "<i4,<i4,<i4,<u4,<f4,<f4"
+_OVERVIEW_MAGIC = 0x3143564F
+_DAY_NS = 86_400 * 10**9
+_NEVER_SEEN = 255
+
+
+class Clouds:
+    """Levels of detail of a store's tiles, made when first asked for and kept, the last used longest; thread-safe.
+
+    A tile's levels follow from its hashes alone, so what is kept never grows stale.
+    """
+
+    def __init__(self, store: Store, kept_bytes: int = _KEPT_BYTES) -> None:
+        self._store = store
+        self._room = kept_bytes
+        self._lock, self._making = threading.Lock(), threading.Lock()
+        self._made: OrderedDict[TileHashes, Levels] = OrderedDict()
+        self._overview: tuple[int, bytes] = 0, b""
+
+    def levels(self, hashes: TileHashes) -> Levels:
+        """The levels of one tile; NotFound if no version ever held it."""
+        with self._lock:
+            known = self._made.get(hashes)
+            if known is not None:
+                self._made.move_to_end(hashes)
+                return known
+        (tile,) = self._load(hashes)
+        made = make_levels(tile.points, tile.ground_z, bright=self._bright(hashes, tile))
+        with self._lock:
+            if hashes not in self._made:
+                self._made[hashes] = made
+                self._room -= made.nbytes
+            while self._room < 0 and len(self._made) > 1:
+                _, dropped = self._made.popitem(last=False)
+                self._room += dropped.nbytes
+        return made
+
+    def overview(self, version: int, stop: Callable[[], bool] = lambda: False) -> bytes:
+        """All tiles of a version, coarse: as many whole levels as 150,000 points allow, or an even share of the first.
+
+        uint32 0x3143564F, uint32 number of tiles; for each tile int32 row, int32 col, int32 last whole level (-1: a
+        part of the first), uint32 points, float32 z0_m, float32 z_step_m; then all points as in :class:`Levels`, and if
+        any tile has intensity then that of all, a byte each.
+        ``stop`` ends the work early, with nothing to show. NotFound if there is no such version.
+        """
+        with self._making:  # of many who ask, one makes it
+            if self._overview[0] != version:
+                made = self._coarse(version, stop)
+                if made is None:
+                    return b""
+                self._overview = version, _overview_bytes(made)
+            return self._overview[1]
+
+    def _coarse(self, version: int, stop: Callable[[], bool]) -> list[tuple[TileIndex, Levels]] | None:
+        with self._store.database.reading() as connection:
+            version_of(connection, version)
+            tiles = tiles_of(connection, version)
+
+        def made(index: TileIndex) -> list[tuple[TileIndex, Levels]]:
+            sound = [] if stop() else self._sound(tiles[index])
+            most = _SPARE * OVERVIEW_POINTS // len(tiles)
+            return [(index, make_levels(t.points, t.ground_z, most, self._bright(tiles[index], t))) for t in sound]
+
+        with ThreadPoolExecutor(_AT_ONCE, "coarse") as pool:
+            parts = list(pool.map(made, tiles))
+        return None if stop() else [part for of_tile in parts for part in of_tile]
+
+    def _bright(self, hashes: TileHashes, tile: Tile) -> U8 | None:
+        """(n,) the intensity of a tile's points, 255 for 1.0; None if it has none, or that is damaged."""
+        if hashes.fields is None:
+            return None
+        try:
+            with self._store.database.reading() as connection:
+                packed = load_blob(connection, hashes.fields)
+            intensity = unpack_fields_plane(packed, hashes.fields, len(tile.points)).get("intensity")
+        except Unavailable:
+            raise
+        except MapvoteError:
+            return None
+        return None if intensity is None else in_bytes(intensity)
+
+    def _load(self, *states: TileHashes | None) -> list[Tile]:
+        """Tiles, of which points and ground alone are read."""
+        with self._store.database.reading() as connection:
+            drawn = [h and replace(h, free=None, memory=None, fields=None) for h in states]
+            return [load_tile(connection, _ANYWHERE, hashes) for hashes in drawn]
+
+    def _sound(self, *states: TileHashes | None) -> list[Tile]:
+        """The same; none where one is damaged: who asks for the tile itself is told."""
+        try:
+            return self._load(*states)
+        except Unavailable:
+            raise
+        except MapvoteError:
+            return []
+
+    def changed(self, old: int, new: int) -> bytes:
+        """What came and went from version ``old`` to ``new``: of each tile that differs int32 row, int32 col, the
+        points that only ``old`` has, then those that only ``new`` has, both as :func:`cloud_bytes`. Damaged tiles are
+        left out.
+
+        NotFound if one of the versions does not exist.
+        """
+        with self._store.database.reading() as connection:
+            differ = tiles_that_differ(connection, old, new)
+        told = []
+        for index, *states in differ:
+            pair = self._sound(*states)
+            if not pair:
+                continue
+            before, after = pair
+            ground = (after if states[1] is not None else before).ground_z
+            gone, come = ~found_among(before.points, after.points), ~found_among(after.points, before.points)
+            told.append(np.array(index, dtype="<i4").tobytes())
+            told += [cloud_bytes(*pack(some, ground)) for some in (before.points[gone], after.points[come])]
+        return b"".join(told)
+
+
+def _overview_bytes(made: Sequence[tuple[TileIndex, Levels]]) -> bytes:
+    ends = np.array([levels.ends for _, levels in made]).reshape(len(made), -1)
+    fits = np.flatnonzero(ends.sum(axis=0) <= OVERVIEW_POINTS)
+    finest = int(fits[-1]) if len(fits) else -1
+    share = OVERVIEW_POINTS // max(len(made), 1)
+    rows, clouds, bright = [], [], []
+    any_bright = any(levels.bright is not None for _, levels in made)
+    for index, levels in made:
+        whole = min(finest, int(np.searchsorted(levels.ends, len(levels.packed), side="right")) - 1)
+        points = int(levels.ends[whole]) if whole >= 0 else min(share, len(levels.packed))
+        rows.append((*index, whole, points, levels.z0_m, levels.z_step_m))
+        clouds.append(np.ascontiguousarray(levels.packed[:points], dtype="<u2").tobytes())
+        if any_bright:
+            bright.append(bytes(points) if levels.bright is None else levels.bright[:points].tobytes())
+    head = np.array([_OVERVIEW_MAGIC, len(made)], dtype="<u4").tobytes(), np.array(rows, dtype=_HEAD).tobytes()
+    return b"".join([*head, *clouds, *bright])
+
+
+def evidence(store: Store, index: TileIndex, vehicle: str | None = None) -> U8:
+    """(256, 256, 4) what standing ballots say of a tile's cells now, of all vehicles or of one.
+
+    Vehicles that determined the cell (255: or more); days since the last drive that did, 254 at most (255: never); how
+    probable it is that the cell changed, in 1/255; and the state that most of them say (NO_VOTE: nobody).
+    """
+    with store.database.reading() as connection:
+        policy = policy_in(connection)
+
+        def said(asked: Electorate) -> list[TileVote]:
+            judged = [vote for vote, why in judged_votes(connection, index, asked) if why != DAMAGED]
+            return read_votes(connection, index, [v for v in judged if vehicle is None or v.vehicle == vehicle])
+
+        votes = from_sound_ballots(connection, Electorate(FOREVER, policy, FOREVER), said)
+    silent = TileVote("", 0, "", states=np.full((TILE_CELLS, TILE_CELLS), NO_VOTE, np.uint8))
+    newest: dict[str, TileVote] = {}
+    last = np.full((TILE_CELLS, TILE_CELLS), -1, dtype=np.int64)
+    for vote in sorted(votes, key=lambda vote: (vote.end_ns, vote.digest)):
+        states, before = said_by(vote), newest.get(vote.vehicle, silent)
+        assert before.states is not None
+        spoken = (states != NO_VOTE) & (states != CellState.UNDETERMINED)
+        last[spoken] = vote.end_ns
+        odds = folded([before, vote], [~spoken.reshape(-1), spoken.reshape(-1)])
+        newest[vote.vehicle] = replace(silent, states=np.where(spoken, states, before.states), odds=odds)
+    return _summary(list(newest.values()), last, store.clock(), policy.fuse.min_votes)
+
+
+def _summary(votes: Sequence[TileVote], last: I64, now_ns: int, quorum: int) -> U8:
+    said = np.zeros((4, TILE_CELLS, TILE_CELLS), dtype=np.int64)
+    for vote in votes:
+        for state in range(4):
+            said[state] += vote.states == state
+    total = said.sum(axis=0)
+    days = np.clip((now_ns - last) // _DAY_NS, 0, _NEVER_SEEN - 1)
+    out = np.empty((TILE_CELLS, TILE_CELLS, 4), dtype=np.uint8)
+    out[..., 0] = np.minimum(total, 255)
+    out[..., 1] = np.where(last < 0, _NEVER_SEEN, days)
+    out[..., 2] = np.rint(255 * _probability(said, votes, quorum))
+    out[..., 3] = np.where(total > 0, said.argmax(axis=0), NO_VOTE)
+    return out
+
+
+def _probability(said: I64, vehicles: Sequence[TileVote], quorum: int) -> F64:
+    """(256, 256) that a cell changed as most vehicles say that say so, of vehicles by state (4, 256, 256); 0 where
+    nobody does."""
+    changes = said[CellState.CHANGED_OCCUPIED : CellState.CHANGED_EMPTY + 1]
+    rows, cols = np.nonzero(changes.any(axis=0))
+    kinds = changes[:, rows, cols].argmax(axis=0)
+    votes = changes[kinds, rows, cols]
+    states = (kinds + CellState.CHANGED_OCCUPIED).astype(np.uint8)
+    against = said[:, rows, cols].sum(axis=0) - votes
+    out, told = np.zeros(said.shape[1:]), np.full(said.shape[1:], NO_VOTE, dtype=np.uint8)
+    told[rows, cols] = states
+    odds = agreed_odds(vehicles, told, quorum).at(rows * TILE_CELLS + cols)
+    out[rows, cols] = change_probability(states, votes, against, alike_beside(rows, cols, kinds), odds)
+    return out

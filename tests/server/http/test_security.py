@@ -1,0 +1,86 @@
+"""Other people's web pages at a server on the visitor's machine."""
+
+from __future__ import annotations
+
+import socket
+from collections.abc import Iterator
+
+import httpx2
+import pytest
+
+from hand_made import Say, make_ballot, states_plane, two_walls
+from live_server import serving
+from mapvote.codec.ballot import encode
+from mapvote.core.types import CellState
+from mapvote.server.http.security import HEADERS
+from mapvote.server.store.admission import accept, examine
+from mapvote.server.store.store import Store
+
+
+@pytest.fixture(scope="module")
+def url(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """An open server with ballots that wait to be published."""
+    home = tmp_path_factory.mktemp("browsers")
+    store = Store.create(f"sqlite:///{home / 's.db'}", two_walls())
+    says = {(0, 0): Say(states_plane({(10, 10): CellState.CHANGED_EMPTY}))}
+    accept(store, [examine(encode(make_ballot(two_walls(), says, vehicle, "d1"))) for vehicle in ("a", "b")])
+    (home / "server.toml").write_text('[server]\nhosts = ["maps.example.org"]\n')
+    with serving(home / "s.db", "--config", home / "server.toml", log=home / "log") as (address, _):
+        yield address
+    assert store.current() == 1
+    store.close()
+
+
+@pytest.mark.parametrize(
+    "headers",
+    [
+        {"Host": "evil.example"},
+        {"Host": "evil.example:8080", "Origin": "http://evil.example:8080"},
+        {"Host": "maps.example.org.evil.example"},
+        {"Host": "127.0.0.1.evil.example"},
+        {"Host": "[::1].evil.example"},
+        {"Host": "["},
+        {"Origin": "http://evil.example"},
+        {"Origin": "null"},
+        {"Origin": "http://192.0.2.1"},
+        {"Origin": "http://localhost"},
+        {"Origin": "http://127.0.0.1"},
+    ],
+)
+def test_a_rebound_name_or_a_foreign_page_publishes_nothing(url: str, headers: dict[str, str]) -> None:
+    for method, path, body in (("POST", "/v1/publish", {"override": True}), ("GET", "/v1/map", None)):
+        answer = httpx2.request(method, url + path, json=body, headers=headers)
+        assert answer.status_code == 403, answer.text
+        assert "[server] hosts" in answer.json()["detail"]
+
+
+def test_a_request_without_a_host_is_refused(url: str) -> None:
+    host, _, port = url.removeprefix("http://").partition(":")
+    with socket.create_connection((host, int(port))) as connection:
+        connection.sendall(b"GET /v1/map HTTP/1.0\r\n\r\n")
+        assert connection.recv(100).split()[1] in (b"400", b"403")
+
+
+def test_its_own_page_and_the_name_that_the_operator_gave_it_are_let_in(url: str) -> None:
+    for headers in (
+        {},
+        {"Origin": url},
+        {"Host": "maps.example.org", "Origin": "https://maps.example.org"},
+        {"Origin": "https://MAPS.example.org"},
+        {"Host": "localhost:8080"},
+    ):
+        assert httpx2.post(f"{url}/v1/publish", json={"dry_run": True}, headers=headers).status_code == 200
+
+
+@pytest.mark.parametrize("path", ["/", "/docs", "/viewer/app.js", "/v1/map", "/healthz", "/nothing", "/openapi.json"])
+def test_every_answer_tells_the_browser_to_load_nothing_from_elsewhere(url: str, path: str) -> None:
+    answer = httpx2.get(url + path)
+    for name, value in HEADERS:
+        assert answer.headers[name] == value
+    policy = answer.headers["content-security-policy"]
+    assert "default-src 'none'" in policy
+    assert "unsafe-inline" not in policy
+    assert "http" not in policy
+    if answer.headers["content-type"].startswith("text/html"):
+        assert "style=" not in answer.text
+        assert "<style" not in answer.text

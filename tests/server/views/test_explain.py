@@ -1,0 +1,191 @@
+"""Why a cell is as it is: what the votes said, which of them counted, and a tie."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import sqlalchemy as sa
+
+from hand_made import Say, make_ballot, states_plane, two_walls, wall
+from mapvote.codec.ballot import encode
+from mapvote.config import FuseSettings
+from mapvote.core.types import N_STATES, NO_VOTE, CellState
+from mapvote.core.voting import VOTE_UNIT
+from mapvote.fusion.tile_vote import DAY_NS
+from mapvote.server.store import schema
+from mapvote.server.store.admission import Intake, accept, examine
+from mapvote.server.store.ballots import Receipt, withdraw
+from mapvote.server.store.fusion_jobs import unpack_tally_plane
+from mapvote.server.store.keys import issue, revoke
+from mapvote.server.store.policy import Policy, RoundPolicy
+from mapvote.server.store.publish import preview, publish
+from mapvote.server.store.store import Store
+from mapvote.server.views.events import last_events
+from mapvote.server.views.explain import COPY, CellStory, as_told, explain_cell, states_of
+from mapvote.server.views.point_lod import evidence
+from standing_clock import Clock
+
+WALL, LAWN = (10, 10), (20, 20)
+START_NS = 1_700_000_000 * 10**9
+
+
+@pytest.fixture
+def clock() -> Clock:
+    return Clock(START_NS)
+
+
+@pytest.fixture
+def store(database_url: str, clock: Clock) -> Iterator[Store]:
+    policy = Policy(fuse=FuseSettings(max_deleted_share=1.0, prior_stay_days=10.0))
+    store = Store.create(database_url, two_walls(), policy, clock=clock)
+    yield store
+    store.close()
+
+
+def say(store: Store, vehicle: str, state: CellState, cell: tuple[int, int] = WALL) -> None:
+    points = wall([cell], [0.45, 0.75]) if state == CellState.CHANGED_OCCUPIED else None
+    now, base = store.clock(), store.point_map()
+    ballot = make_ballot(base, {(0, 0): Say(states_plane({cell: state}), new_points=points)}, vehicle, f"d{now}", now)
+    (receipt,) = accept(store, [examine(encode(ballot))])
+    assert isinstance(receipt, Receipt), receipt
+
+
+def story(store: Store, cell: tuple[int, int] = WALL) -> CellStory:
+    return explain_cell(store, (cell[1] + 0.5) * 0.3, (cell[0] + 0.5) * 0.3)
+
+
+def test_a_vote_that_a_version_heard_stays_in_the_story_when_it_is_taken_back(store: Store, clock: Clock) -> None:
+    for vehicle in ("a", "b", "c"):
+        say(store, vehicle, CellState.CHANGED_EMPTY)
+    assert publish(store).version == 2
+    withdraw(store, "a", by="a")
+    issue(store, "b", "vehicle")
+    revoke(store, "b")
+    found = {vote.vehicle: vote for vote in story(store).votes}
+    assert [(found[name].state, found[name].heard, found[name].counts) for name in "abc"] == [
+        ("changed_empty", (2,), False)
+    ] * 3
+    assert (found["a"].why, found["b"].why) == ("withdrawn", "its vehicle's key was revoked")
+    assert found["c"].why.startswith("spent")
+    with store.database.writing() as connection:
+        connection.execute(schema.ballot_tiles.update().values(states=b"rot"))
+    assert [vote.state for vote in story(store).votes] == ["unreadable"], "of those that stand"
+
+
+def test_a_vote_is_named_with_the_version_that_heard_it_or_why_it_does_not_count(store: Store, clock: Clock) -> None:
+    for vehicle in ("a", "b"):
+        say(store, vehicle, CellState.CHANGED_EMPTY)
+    assert [(v.counts, v.heard) for v in story(store).votes] == [(True, ()), (True, ())]
+    assert publish(store).version == 2
+    clock.now += DAY_NS
+    say(store, "c", CellState.UNCHANGED_EMPTY)
+    told = story(store)
+    assert [(v.vehicle, v.version, v.heard, v.counts) for v in told.votes] == [
+        ("a", 1, (2,), False), ("b", 1, (2,), False), ("c", 2, (), True)
+    ]  # fmt: skip
+    assert told.votes[0].why == "spent: version 2 has changed the cell since"
+    assert told.decisions == [(2, "changed_empty")]
+    assert told.probability is not None
+    assert 0.0 < told.probability < 1.0
+    assert as_told(told)["probability"] == round(told.probability, 3)
+
+
+def test_what_comes_and_goes_is_called_temporary_until_it_can_be_expected_to_stay(store: Store, clock: Clock) -> None:
+    for vehicle in ("a", "b"):
+        say(store, vehicle, CellState.CHANGED_OCCUPIED, LAWN)
+    assert story(store, LAWN).thing.startswith("temporary:")
+    assert not publish(store).published
+    clock.now += 21 * DAY_NS
+    say(store, "c", CellState.CHANGED_OCCUPIED, LAWN)
+    assert story(store, LAWN).thing == ""
+    assert publish(store).published
+    assert story(store, LAWN).thing == "stands: brought by vehicles"
+    assert [v.heard for v in story(store, LAWN).votes] == [(2,)] * 3
+    for vehicle in ("a", "b"):
+        say(store, vehicle, CellState.CHANGED_EMPTY, LAWN)
+    assert publish(store).published
+    assert story(store, LAWN).thing.startswith("1 things came and went here, after 21.0 days on average; the next can")
+    assert story(store, WALL).thing == "stands: surveyed"
+
+
+def test_who_looked_last_holds_up_what_is_new(store: Store, clock: Clock) -> None:
+    store.set_policy(Policy(fuse=FuseSettings()))
+    for vehicle, state in (("a", "CHANGED_OCCUPIED"), ("b", "CHANGED_OCCUPIED"), ("c", "UNCHANGED_EMPTY")):
+        clock.now += 3_600 * 10**9
+        say(store, vehicle, CellState[state], LAWN)
+    assert story(store, LAWN).thing == "waits: the last vehicle that looked says otherwise"
+    assert not publish(store).published
+
+
+def test_a_damaged_ballot_is_told_and_hides_no_other(store: Store) -> None:
+    for vehicle in ("a", "b", "c"):
+        say(store, vehicle, CellState.CHANGED_EMPTY)
+    with store.database.writing() as connection:
+        t = schema.ballot_tiles
+        first = connection.execute(sa.select(sa.func.min(t.c.ballot))).scalar_one()
+        connection.execute(t.update().where(t.c.ballot == first).values(states=b"rot"))
+    assert [(v.state, v.counts) for v in story(store).votes] == [
+        ("unreadable", False), ("changed_empty", True), ("changed_empty", True)
+    ]  # fmt: skip
+
+
+def test_a_damaged_decision_is_told_and_hides_no_vote(store: Store) -> None:
+    for vehicle in ("a", "b"):
+        say(store, vehicle, CellState.CHANGED_EMPTY)
+    publish(store)
+    with store.database.writing() as connection:
+        connection.execute(schema.decisions.update().values(states=b"rot"))
+    told = story(store)
+    assert told.decisions == [(2, "unreadable")]
+    assert told.probability is None
+    assert [vote.heard for vote in told.votes] == [(2,), (2,)]
+
+
+def test_of_copies_the_story_says_that_one_is_heard_and_the_log_whose_they_are_once(store: Store, clock: Clock) -> None:
+    wandering = np.random.default_rng(1).integers(-5, 6, (4, 256)).cumsum(axis=1).clip(-30, 30)
+    for name, way in (("a", wandering[:2]), ("liar", wandering[:2]), ("b", wandering[2:])):
+        rows = np.arange(256)[:, None]
+        seen = (rows > 60 + way[0]) & (rows < 180 + way[1])
+        states = np.where(seen, CellState.UNCHANGED_EMPTY, CellState.UNDETERMINED).astype(np.uint8)
+        states[WALL] = CellState.CHANGED_EMPTY
+        ballot = make_ballot(store.point_map(), {(0, 0): Say(states)}, name, "d", clock.now - ord(name[0]))
+        assert isinstance(accept(store, [examine(encode(ballot))])[0], Receipt)
+    assert {vote.vehicle: vote.why for vote in story(store).votes} == {"a": COPY, "b": "", "liar": ""}
+    assert publish(store).published
+    publish(store)
+    assert {vote.vehicle: vote.heard for vote in story(store).votes} == {"a": (), "b": (2,), "liar": (2,)}
+    (told,) = [event for event in last_events(store) if event["kind"] == "copy"]
+    assert told["detail"].startswith("a's ballot ")
+    assert "is a copy of liar's " in told["detail"]
+
+
+TIE, CLEAR = (10, 10), (10, 11)
+
+
+@pytest.fixture
+def one_stage(tmp_path: Path) -> Iterator[Store]:
+    policy = Policy(round=RoundPolicy(stage="one-stage"))
+    store = Store.create(f"sqlite:///{tmp_path / 's.db'}", two_walls(), policy)
+    yield store
+    store.close()
+
+
+def test_a_tie_of_a_one_stage_ballot_is_undetermined_everywhere(one_stage: Store) -> None:
+    store = one_stage
+    tally = np.zeros((256, 256, N_STATES), dtype=np.uint16)
+    for state in (CellState.UNCHANGED_OCCUPIED, CellState.CHANGED_EMPTY):
+        tally[TIE][state] = 3 * VOTE_UNIT
+    tally[CLEAR][CellState.CHANGED_EMPTY] = 3 * VOTE_UNIT
+    ballot = make_ballot(store.point_map(), {(0, 0): Say(tally=tally)}, end_ns=store.clock())
+    (receipt,) = Intake(store).accept([examine(encode(ballot))])
+    assert isinstance(receipt, Receipt), receipt
+    said = [explain_cell(store, (c + 0.5) * 0.3, (r + 0.5) * 0.3).votes[0].state for r, c in (TIE, CLEAR)]
+    assert said == ["undetermined", "changed_empty"]
+    page = evidence(store, (0, 0))
+    assert [page[TIE][3], page[CLEAR][3]] == [NO_VOTE, CellState.CHANGED_EMPTY]
+    (fused,) = preview(store).fused
+    assert unpack_tally_plane(fused.tally)[TIE].any()
+    assert states_of(fused.states)[TIE] == CellState.UNDETERMINED

@@ -1,0 +1,154 @@
+"""Deletions beyond the policy's budget: a publish leaves them, desk and cell tell of them, surer vehicles end them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from hand_made import Say, make_ballot, make_map, make_tile, states_plane, two_walls
+from mapvote.codec.ballot import encode
+from mapvote.codec.odds import MOST, STEPS
+from mapvote.config import FuseSettings
+from mapvote.core.types import CellState, MapvoteError
+from mapvote.fusion.probability import change_probability
+from mapvote.server.store import schema
+from mapvote.server.store.admission import accept, examine
+from mapvote.server.store.ballots import Receipt
+from mapvote.server.store.integrity import check
+from mapvote.server.store.policy import Policy
+from mapvote.server.store.publish import publish
+from mapvote.server.store.replay import replay
+from mapvote.server.store.store import Store
+from mapvote.server.views.desk import desk, review
+from mapvote.server.views.explain import CellStory, explain_cell
+from mapvote.server.views.history import changes_between
+
+WALL = [(10, 10), (10, 11), (10, 12)]
+BUDGET = Policy(fuse=FuseSettings(max_deleted_share=1.0, false_deletions=0.01))
+SURE, UNSURE = [20, 20, 20], [20, -MOST, 20]
+
+
+@pytest.fixture
+def store(database_url: str) -> Iterator[Store]:
+    store = Store.create(database_url, two_walls(), BUDGET)
+    yield store
+    store.close()
+
+
+def vote(store: Store, drive: str, sure: list[int] | None, vehicles: str = "ab") -> None:
+    """These say that the wall of the first tile is gone, and how sure they are of each of its cells."""
+    odds = None if sure is None else np.array(sure, dtype=np.int8)
+    for name in vehicles:
+        says = {(0, 0): Say(states_plane(dict.fromkeys(WALL, CellState.CHANGED_EMPTY)), odds=odds)}
+        ballot = make_ballot(store.point_map(), says, name, drive, end_ns=store.clock())
+        (receipt,) = accept(store, [examine(encode(ballot))])
+        assert isinstance(receipt, Receipt), receipt
+
+
+def middle(store: Store) -> CellStory:
+    return explain_cell(store, 11.5 * 0.3, 10.5 * 0.3)
+
+
+def test_a_cell_beyond_the_budget_keeps_its_points_until_vehicles_are_surer(store: Store) -> None:
+    vote(store, "d1", UNSURE)
+    now = desk(store)
+    assert [f["properties"]["cells"] for f in now.pending["features"]] == [1, 1], "the two of which they are sure"
+    (waits,) = now.waiting
+    assert waits["properties"]["kind"] == "demolished"
+    assert waits["properties"]["drive_by"] == [3.45, 3.15], "the middle of the cell"
+    assert waits["properties"]["false_deletion"] > 0.01
+    assert "the policy allows 0.01" in waits["properties"]["waits"]
+    assert publish(store).deleted == 6
+    story = middle(store)
+    assert "pending: that emptying it deletes something that stands" in story.thing
+    assert "stands: surveyed" in story.thing
+    assert [w["id"] for w in desk(store).waiting] == [waits["id"]], "though nothing has come since"
+    assert not publish(store).published
+    vote_middle(store, "d2", 20)
+    assert desk(store).waiting == []
+    assert publish(store).deleted == 3
+
+
+def vote_middle(store: Store, drive: str, sure: int) -> None:
+    """Both drive by again, and say of the cell in the middle alone how sure they are now."""
+    for name in "ab":
+        say = Say(states_plane({WALL[1]: CellState.CHANGED_EMPTY}), odds=np.array([sure], np.int8))
+        ballot = make_ballot(store.point_map(), {(0, 0): say}, name, drive, end_ns=store.clock())
+        accept(store, [examine(encode(ballot))])
+
+
+def test_what_waits_is_nothing_that_a_reviewer_decides_about(store: Store) -> None:
+    vote(store, "d1", UNSURE)
+    (waits,) = desk(store).waiting
+    with pytest.raises(MapvoteError, match="pending any more"):
+        review(store, waits["id"], "accepted", by="anna")
+
+
+def test_a_policy_without_a_budget_lets_it_go(store: Store) -> None:
+    vote(store, "d1", UNSURE)
+    store.change_policy({"fuse.false_deletions": "1"}, by="boss")
+    assert store.policy().fuse.false_deletions == 1.0
+    assert desk(store).waiting == []
+    assert publish(store).deleted == 9
+    with pytest.raises(MapvoteError, match=r"policy: fuse\.false_deletions = '0'"):
+        store.change_policy({"fuse.false_deletions": "0"}, by="boss")
+
+
+def test_how_sure_they_were_is_told_of_cells_and_changes_and_outlives_the_round(store: Store) -> None:
+    vote(store, "d1", SURE, "a")
+    vote(store, "d1", [5, 5, 5], "b")
+    assert publish(store).deleted == 9
+    story = middle(store)
+    assert [vote.sure for vote in story.votes] == [
+        pytest.approx(1 / (1 + np.exp(-steps / STEPS)), abs=1e-4) for steps in (20, 5)
+    ]
+    one = np.ones(1, np.int64)
+    told = change_probability(
+        np.array([CellState.CHANGED_EMPTY], np.uint8), 2 * one, 0 * one, one, np.array([5], np.int8)
+    )
+    assert story.probability == pytest.approx(told[0], abs=1e-3), "as the one says who is less sure"
+    (change,) = changes_between(store, 1, 2)["features"]
+    assert change["properties"]["probability"] == pytest.approx(story.probability, abs=1e-3)
+    assert check(store) == []
+    with store.database.writing() as connection:
+        connection.execute(schema.decisions.update().values(odds=None))
+    assert {damage.kind for damage in check(store)} == {"decision"}, "its sum covers how sure they were"
+
+
+def test_ballots_that_do_not_say_are_told_by_their_votes(store: Store) -> None:
+    vote(store, "d1", None)
+    assert publish(store).deleted == 9
+    assert [vote.sure for vote in middle(store).votes] == [None, None]
+    assert middle(store).probability is not None
+
+
+def test_a_round_without_a_vehicle_waits_as_it_would_have(store: Store) -> None:
+    vote(store, "d1", SURE, "ab")
+    vote(store, "d1", UNSURE, "c")
+    assert publish(store).deleted == 9, "two of three are sure"
+    replay(store, "a", dry_run=False)
+    assert middle(store).thing == "stands: surveyed", "without the liar one of two was not"
+    assert not store.point_map().tiles[0, 0].obstacle_words[WALL[0]], "of the cell beside both were"
+
+
+def test_what_spilled_over_goes_with_its_wall_and_its_story_says_that_nothing_changed_there(database_url: str) -> None:
+    y, z = np.meshgrid(np.arange(40.05, 43.0, 0.3), np.arange(0.45, 3.0, 0.3))
+    wall = np.column_stack([np.full(y.size, 30.04), y.ravel(), z.ravel()]).astype(np.float32)
+    spill = wall[::3] + np.array([-0.05, 0.1, 0.0], np.float32)  # a centimetre beyond the cells' border
+    point_map = make_map({(0, 0): make_tile(np.concatenate([wall, spill]))})
+    store = Store.create(database_url, point_map, Policy(fuse=FuseSettings(max_deleted_share=1.0)))
+    cells = sorted({(int(p[1] // 0.3), int(p[0] // 0.3)) for p in np.concatenate([wall, spill]).tolist()})
+    states, odds = states_plane(dict.fromkeys(cells, CellState.CHANGED_EMPTY)), np.full(len(cells), 20, np.int8)
+    for name in "ab":
+        ballot = make_ballot(store.point_map(), {(0, 0): Say(states, odds=odds)}, name, "d1", end_ns=store.clock())
+        (receipt,) = accept(store, [examine(encode(ballot))])
+        assert isinstance(receipt, Receipt), receipt
+    beside, there = (explain_cell(store, x, 41.55) for x in (29.85, 30.15))
+    assert "the noise of what changed in the next cell" in beside.thing
+    assert "the noise of" not in there.thing
+    assert publish(store).deleted == len(wall) + len(spill)
+    told = [explain_cell(store, x, 41.55).decisions for x in (29.85, 30.15)]
+    assert [[state for _, state in each] for each in told] == [["unchanged_empty"], ["changed_empty"]]
+    store.close()
