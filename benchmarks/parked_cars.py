@@ -2,8 +2,8 @@
 
 python benchmarks/parked_cars.py
 
-Cars stay for a while and go, some days later the next one comes. Every day three vehicles of the fleet pass at their
-hours, each with the newest map, and say what is there; after every pass (``--nightly``: after the last of a day) the
+Cars stay for a while and go, some days later the next one comes. Every day three vehicles of the fleet pass at random
+minutes, each with the newest map, and say what is there; after every pass (``--nightly``: after the last of a day) the
 server publishes. "against the truth" counts published changes that make a space other than it is at that moment;
 "hours" is from a change of the world to its publication, median and worst. Changes that were never published were
 overtaken by the next, or are of what comes and goes and is kept out of the map. With noise every vehicle is wrong about
@@ -113,8 +113,9 @@ def live(stay_days: float, fleet: int, noise: float, days: int, prior_days: floa
         store = Store.create(url, ground, Policy(fuse=settings), clock=lambda: now[0])
         point_map = store.point_map()
         for day in range(days):
-            for k, vehicle in enumerate(rng.sample(range(fleet), 3)):
-                hour = 24 * day + 7 + 5 * k
+            minutes = sorted(rng.sample(range(24 * 60), 3))
+            for k, (vehicle, minute) in enumerate(zip(rng.sample(range(fleet), 3), minutes, strict=True)):
+                hour = 24 * day + minute / 60
                 street.move_on(hour)
                 now[0] = START_NS + round(hour * HOUR_NS)
                 seen = [there != (rng.random() < noise) for there in street.parked]
