@@ -20,7 +20,7 @@ from mapvote.core.types import F64, I8, I32, I64, U8, CellState
 from mapvote.core.voting import VOTE_UNIT
 from mapvote.fusion.odds import Odds
 from mapvote.fusion.probability import alike_beside, change_probability
-from mapvote.server.views.outlines import REACH_M, Ring, buildings, group, rings, widths_m
+from mapvote.server.views.outlines import REACH_M, Ring, buildings, group, members, rings, widths_m
 
 Kind = Literal["built", "demolished"]
 Size = Literal["large", "vehicle", "small"]
@@ -184,10 +184,9 @@ def change_objects(changed: Iterable[ChangedCells], min_cells: int = 1, reach_m:
     beside = alike_beside(cells.rows, cells.cols, kinds)
     probability = change_probability(cells.states, cells.votes, cells.against, beside, cells.odds)
     sizes_m = [size(cells.rows, cells.cols, found.objects)[found.objects] for size in (_lengths_m, widths_m)]
-    by_thing = np.split(np.argsort(things, kind="stable"), np.cumsum(np.bincount(things))[:-1])
     return [
         _object(cells, probability, mine, sizes_m, [outlines[p] for p in np.unique(found.polygons[mine])])
-        for mine in by_thing
+        for mine in members(things)
         if len(mine) >= min_cells
     ]
 

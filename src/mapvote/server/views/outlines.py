@@ -7,9 +7,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 import scipy
+import shapely
 
 from mapvote.core.grid import CELL_SIZE
 from mapvote.core.types import F64, I32, I64, Bool
@@ -19,8 +19,6 @@ Ring = I64
 _RIGHT, _ABOVE = (0, 1), (1, 0)
 _DIAGONALS = (1, -1), (1, 1)
 _SHIFT = np.int64(32)
-_STEP = np.array([(1, 0), (0, 1), (-1, 0), (0, -1)], dtype=np.int64)
-"""(col, row) step of each edge direction: counter-clockwise round a cell, which lies to the left."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,27 +45,29 @@ def rings(rows: I64, cols: I64, polygons: I32) -> list[list[Ring]]:
     ``polygons`` (n,) are the labels of the cells, 0 ... k - 1. Rings are simple, turn at every corner and begin at
     their lowest, then leftmost corner: valid by RFC 7946 and OGC Simple Features, equal for equal cells.
     """
-    if not len(rows):
-        return []
-    cell = _key(rows, cols)
-    start, direction, label = [], [], []
-    corners = ((0, 0), (1, 0), (1, 1), (0, 1))
-    beyond = ((-1, 0), (0, 1), (1, 0), (0, -1))
-    for d in range(4):
-        other = _find(cell, _key(rows + beyond[d][0], cols + beyond[d][1]))
-        open_side = (other < 0) | (polygons[other] != polygons)
-        start.append(np.stack([cols + corners[d][0], rows + corners[d][1]], axis=1)[open_side])
-        direction.append(np.full(int(open_side.sum()), d, dtype=np.int64))
-        label.append(polygons[open_side].astype(np.int64))
-    corner, way, owner = np.concatenate(start), np.concatenate(direction), np.concatenate(label)
-    order = np.lexsort((way, corner[:, 0], corner[:, 1], owner))
-    corner, way, owner = corner[order], way[order], owner[order]
-    follow = _successors(corner, way, owner)
-    out: list[list[Ring]] = [[] for _ in range(int(owner[-1]) + 1)]
-    turns, ends = _walk(way, follow)
-    for edges in np.split(turns, ends[:-1]):
-        out[int(owner[edges[0]])].append(np.concatenate([corner[edges], corner[edges[:1]]]))
-    return out
+    squares = shapely.box(cols, rows, cols + 1, rows + 1)
+    return [_outline(shapely.coverage_union_all(squares[mine])) for mine in members(polygons)]
+
+
+def _outline(polygon: shapely.Polygon) -> list[Ring]:
+    outer, *holes = shapely.get_rings(polygon)
+    return [_ring(outer, True), *sorted((_ring(hole, False) for hole in holes), key=lambda hole: tuple(hole[0, ::-1]))]
+
+
+def _ring(ring: shapely.LinearRing, counter_clockwise: bool) -> Ring:
+    """The corners where a ring turns, in one sense of rotation, from the lowest, then leftmost on."""
+    corners = shapely.get_coordinates(ring)[:-1].astype(np.int64)
+    if shapely.is_ccw(ring) != counter_clockwise:
+        corners = corners[::-1]
+    turns = (np.roll(corners, 1, axis=0) != np.roll(corners, -1, axis=0)).all(axis=1)
+    corners = corners[turns]
+    corners = np.roll(corners, -np.lexsort(corners.T)[0], axis=0)
+    return np.concatenate([corners, corners[:1]])
+
+
+def members(labels: I32) -> list[I64]:
+    """The indices of each label 0 ... k - 1, ascending."""
+    return np.split(np.argsort(labels, kind="stable"), np.cumsum(np.bincount(labels))[:-1]) if len(labels) else []
 
 
 def _key(rows: I64, cols: I64) -> I64:
@@ -94,57 +94,7 @@ def _labels(pairs: list[tuple[I64, I64]], n: int) -> I32:
     j = np.concatenate([b for _, b in pairs])
     graph = scipy.sparse.coo_array((np.ones(len(i), dtype=np.int8), (i, j)), shape=(n, n))
     _, found = scipy.sparse.csgraph.connected_components(graph, directed=False)
-    _, first, label = np.unique(found, return_index=True, return_inverse=True)
-    rank = np.empty(len(first), dtype=np.int32)
-    rank[np.argsort(first)] = np.arange(len(first), dtype=np.int32)
-    return rank[label]
-
-
-def _successors(corner: I64, way: I64, owner: I64) -> I64:
-    """The edge that follows each edge of its polygon.
-
-    Where two edges of one polygon leave a corner, the right turn keeps to the same cell outside, so that a ring
-    never touches itself: what it encloses becomes a hole of its own.
-    """
-    n = len(way)
-    stop = corner + _STEP[way]
-    _, vertex = np.unique(
-        np.concatenate([_key(corner[:, 1], corner[:, 0]), _key(stop[:, 1], stop[:, 0])]), return_inverse=True
-    )
-    place = owner * (2 * n) + vertex[:n]
-    next_place = owner * (2 * n) + vertex[n:]
-    name = place * 4 + way
-    by_name = np.argsort(name)
-    follow = np.full(n, -1, dtype=np.int64)
-    for turn in (1, 0, -1):  # the last that fits is kept: right before straight before left
-        found = _find(name[by_name], next_place * 4 + (way + turn) % 4)
-        follow = np.where(found >= 0, by_name[found], follow)
-    return follow
-
-
-@numba.njit(cache=True, nogil=True)
-def _walk(way: I64, follow: I64) -> tuple[I64, I64]:
-    """(edges that begin at a turn, ring after ring; the end of each ring in that list)."""
-    n = len(way)
-    done = np.zeros(n, dtype=np.bool_)
-    edges = np.empty(n, dtype=np.int64)
-    ends = np.empty(n, dtype=np.int64)
-    found, count = 0, 0
-    for first in range(n):
-        if done[first]:
-            continue
-        edge = first
-        before = -1
-        while not done[edge]:
-            done[edge] = True
-            if way[edge] != before:
-                edges[found] = edge
-                found += 1
-            before = way[edge]
-            edge = follow[edge]
-        ends[count] = found
-        count += 1
-    return edges[:found], ends[:count]
+    return _in_order(found)
 
 
 SLOT_CELLS = 4
@@ -241,13 +191,13 @@ def group(rows: I64, cols: I64, kinds: I64, pieces: I32, reach_m: float = REACH_
     """
     if not len(rows):
         return np.zeros(0, dtype=np.int32)
-    members = np.split(np.argsort(pieces, kind="stable"), np.cumsum(np.bincount(pieces))[:-1])
-    corners = [_corners(rows[m], cols[m]) for m in members]
+    each = members(pieces)
+    corners = [_corners(rows[mine], cols[mine]) for mine in each]
     low = np.array([c.min(axis=0) for c in corners])
     high = np.array([c.max(axis=0) for c in corners])
-    size = np.array([len(m) for m in members])
-    kind = np.array([kinds[m[0]] for m in members])
-    owner = np.arange(len(members))
+    size = np.array([len(mine) for mine in each])
+    kind = np.array([kinds[mine[0]] for mine in each])
+    owner = np.arange(len(each))
     reach = reach_m / CELL_SIZE
     leaders: dict[int, list[int]] = {int(k): [] for k in np.unique(kind)}
     hulls: dict[int, F64] = {}
@@ -271,8 +221,7 @@ def group(rows: I64, cols: I64, kinds: I64, pieces: I32, reach_m: float = REACH_
 def widths_m(rows: I64, cols: I64, pieces: I32) -> F64:
     """(k,) metres: the narrowest gate that each piece (n,) labels 0 ... k - 1 would fit through, across a side of its
     convex hull."""
-    members = np.split(np.argsort(pieces, kind="stable"), np.cumsum(np.bincount(pieces))[:-1])
-    return np.array([_width(_corners(rows[m], cols[m])) for m in members]) * CELL_SIZE
+    return np.array([_width(_corners(rows[mine], cols[mine])) for mine in members(pieces)]) * CELL_SIZE
 
 
 def _width(corners: F64) -> float:
