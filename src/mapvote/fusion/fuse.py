@@ -6,7 +6,7 @@ same one is always taken.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache, partial
 from typing import Any, Literal
@@ -59,6 +59,8 @@ class Decision:
     """How sure of the changed cells those are who voted for them, see :func:`agreed_odds`."""
     pending: Pending = field(default_factory=Pending.none)
     """Deletions that wait because they are beyond the budget; undetermined among the states."""
+    heard: Collection[str] = ()
+    """The vehicles whose votes were counted."""
 
 
 def rule_of(method: str) -> Rule:
@@ -141,8 +143,8 @@ def fuse_tile(
         memory = changed_in(version, tile, edited)
         runs = None if past is None else (past, settings.min_votes)
         edited = edited.but(memory=remembered(memory, tile, edited, heard.votes, heard.edits, runs))
-    voters, why = len(heard.votes), (heard.copies, heard.odds, heard.pending)
-    return Decision(heard.states, heard.tally, voters, added, deleted, *why), edited
+    names, why = frozenset(vote.vehicle for vote in heard.votes), (heard.copies, heard.odds, heard.pending)
+    return Decision(heard.states, heard.tally, len(names), added, deleted, *why, names), edited
 
 
 def _once(history: History, settings: FuseSettings) -> History:

@@ -10,7 +10,7 @@ from mapvote.codec.arrays import unpack_bytes
 from mapvote.core.grid import CELLS, TILE_CELLS
 from mapvote.core.types import N_STATES
 from mapvote.core.voting import VOTE_UNIT
-from mapvote.server.store.fusion_jobs import pack_tally, unpack_tally_plane
+from mapvote.server.store.decisions import pack_tally, unpack_tally_plane
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,7 @@ from mapvote.fusion.tile_vote import DAY_NS
 from mapvote.server.store import schema
 from mapvote.server.store.admission import Intake, accept, examine
 from mapvote.server.store.ballots import Receipt, withdraw
-from mapvote.server.store.fusion_jobs import unpack_tally_plane
+from mapvote.server.store.decisions import unpack_tally_plane
 from mapvote.server.store.keys import issue, revoke
 from mapvote.server.store.policy import Policy, RoundPolicy
 from mapvote.server.store.publish import preview, publish

@@ -15,7 +15,6 @@ from mapvote.server.store import keys, schema
 from mapvote.server.store.database import insert_rows
 from mapvote.server.store.policy import RoundPolicy, policy_in
 from mapvote.server.store.queries import log_event, next_seq
-from mapvote.server.store.schema import sum_of_planes
 from mapvote.server.store.store import Store
 
 
@@ -117,9 +116,8 @@ def unlike(asked: RoundPolicy, incoming: Incoming) -> MapvoteError | None:
 
 def _tile_row(seq: int, ballot: Ballot, tile: BallotTile) -> tuple[Any, ...]:
     """In the order of the table's columns."""
-    base = ballot.base[tile_key(tile.tile)]
     planes = [getattr(tile, plane) for plane in schema.BALLOT_PLANES]
-    return *tile.tile, seq, base, *planes, sum_of_planes(base, planes)
+    return *tile.tile, seq, ballot.base[tile_key(tile.tile)], *planes
 
 
 def withdraw(store: Store, vehicle: str | None, drive: str | None = None, *, by: str) -> int:

@@ -15,16 +15,13 @@ from typing import Any
 
 import numpy as np
 import sqlalchemy as sa
-from numpy.typing import NDArray
 
-from mapvote.codec.arrays import compress, pack_plane, raw_plane, unpack_bytes
 from mapvote.codec.ballot import tile_key
-from mapvote.core.grid import CELLS, TILE_CELLS, Grid, TileIndex
+from mapvote.core.grid import Grid, TileIndex
 from mapvote.core.tile import Tile
-from mapvote.core.types import I32, I64, N_STATES, U8, Bool, MapvoteError
-from mapvote.core.voting import VOTE_UNIT
+from mapvote.core.types import I64, Bool, MapvoteError
 from mapvote.fusion.copies import Copy
-from mapvote.fusion.fuse import fuse_tile, rule_of
+from mapvote.fusion.fuse import Decision, fuse_tile, rule_of
 from mapvote.fusion.odds import pack_agreed
 from mapvote.fusion.pending import Pending
 from mapvote.fusion.persistence import emptied_and_filled
@@ -32,16 +29,27 @@ from mapvote.fusion.tile_vote import TileVote
 from mapvote.server.errors import Unavailable
 from mapvote.server.store import schema
 from mapvote.server.store.database import Database, address_of
+from mapvote.server.store.decisions import Standing, Why, pack_standings, pack_states, pack_tally, packed_cells
 from mapvote.server.store.integrity import Damage, DamagedBallots
 from mapvote.server.store.planes import TileHashes, pack_tile
 from mapvote.server.store.queries import load_tile, tile_as_of
-from mapvote.server.store.votes import Electorate, Polled, counting_votes, poll, recent_votes
+from mapvote.server.store.votes import (
+    DAMAGED,
+    OTHERWISE,
+    YOUNG,
+    Electorate,
+    Judged,
+    Polled,
+    judged_on,
+    poll,
+    recent_votes,
+)
 
 _GROUP, _ROUND = 8, 8
 """Tiles side by side that are fused within one reading of the database, at most; into how many groups a round is cut at
 the least, so that all who fuse have work and a round can be cancelled on its way, unless nobody else fuses."""
+_WHY: dict[str, Why] = {"": "", YOUNG: "young", OTHERWISE: "otherwise", DAMAGED: "damaged"}
 _NOWHERE = np.empty(0, dtype=np.uint64)
-_BYTE_MAX = 255
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,7 +76,7 @@ class Fused:
     states: bytes
     """(256, 256) uint8, a zstd frame, as in a ballot."""
     tally: bytes
-    """(5, 65536), a zstd frame, see :func:`pack_tally`."""
+    """(5, 65536), a zstd frame, see :func:`mapvote.server.store.decisions.pack_tally`."""
     vehicles: int
     points: int
     """Before."""
@@ -93,6 +101,8 @@ class Fused:
     """How sure of the changed cells those are who voted for them, see :func:`mapvote.fusion.odds.pack_agreed`."""
     pending: Pending = field(default_factory=Pending.none)
     """Deletions that wait because they are beyond the budget."""
+    standings: bytes = b""
+    """What became of every ballot that stood on the tile, see :func:`mapvote.server.store.decisions.pack_standings`."""
 
     @property
     def lost(self) -> bool:
@@ -144,7 +154,8 @@ def _plane_of(task: Task, error: str) -> str:
 
 def _fuse(connection: sa.Connection, task: Task, polled: Polled) -> Fused:
     tile = _tile(connection, task)
-    votes = counting_votes(connection, tile, task.asked, task.misread, polled)
+    judged = judged_on(connection, tile, task.asked, task.misread, polled)
+    votes = [one.vote for one in judged if one.vote is not None]
     cast = task.asked.policy.round
 
     def history() -> list[TileVote]:
@@ -173,7 +184,22 @@ def _fuse(connection: sa.Connection, task: Task, polled: Polled) -> Fused:
         copies=decision.copies,
         odds=pack_agreed(decision.odds, decision.states),
         pending=decision.pending,
+        standings=pack_standings(_standings(judged, decision)),
     )
+
+
+def _standings(judged: Sequence[Judged], decision: Decision) -> Iterator[Standing]:
+    """What became of every ballot that stood on the tile."""
+    copies = {(copy.vehicle, copy.digest): copy for copy in decision.copies}
+    seqs = {(one.stored.vehicle, one.stored.digest): one.stored.seq for one in judged}
+    for one in judged:
+        seq, why, alike = one.stored.seq, _WHY.get(one.why, "window"), 0
+        copy = copies.get((one.stored.vehicle, one.stored.digest))
+        if copy is not None:
+            why, alike = "copy", seqs[copy.heard_vehicle, copy.heard_digest]
+        elif not why and one.stored.vehicle not in decision.heard:
+            why = "opposes"
+        yield Standing(seq, why, packed_cells(one.spent), packed_cells(one.reviewed), alike)
 
 
 def _tile(connection: sa.Connection, task: Task) -> Tile:
@@ -221,30 +247,6 @@ def fuse_round(tasks: Sequence[Task], database: Database, executor: Executor | N
     groups = [row[start : start + size] for row in rows for start in range(0, len(row), size)]
     work = here if executor is None or isinstance(where, ThreadPoolExecutor) else fuse_stored
     return [fused for some in (executor.map if executor else map)(work, groups) for fused in some]
-
-
-def pack_states(states: U8) -> bytes:
-    """Quick rather than small: decisions are written once for each published tile."""
-    return pack_plane(states, 1)
-
-
-def pack_tally(tally: NDArray[Any]) -> bytes:
-    """(256, 256, 5) as a zstd frame of little-endian planes, class by class, which packs four times better than cell
-    by cell: int32, or of unsigned numbers, which are whole votes, these as uint8; as they are if that holds too little.
-    The length tells which."""
-    planes = np.moveaxis(tally, -1, 0)
-    if planes.dtype == np.int32:
-        return compress(raw_plane(planes, "<i4"), 1)
-    votes = planes // planes.dtype.type(VOTE_UNIT)
-    return compress(raw_plane(votes, "|u1") if votes.max() <= _BYTE_MAX else raw_plane(planes, "<u2"), 1)
-
-
-def unpack_tally_plane(data: bytes) -> I32:
-    """The inverse of :func:`pack_tally`, (256, 256, 5) int32."""
-    raw = unpack_bytes(data, 4 * N_STATES * CELLS, "decision: tally")
-    dtype, unit = {N_STATES * CELLS: ("|u1", VOTE_UNIT), 2 * N_STATES * CELLS: ("<u2", 1)}.get(len(raw), ("<i4", 1))
-    planes = np.frombuffer(raw, dtype=dtype).reshape(N_STATES, TILE_CELLS, TILE_CELLS)
-    return np.ascontiguousarray(np.moveaxis(planes, 0, -1), dtype=np.int32) * unit
 
 
 @lru_cache(maxsize=4)

@@ -7,7 +7,7 @@ on as if nothing had happened.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -21,7 +21,6 @@ from mapvote.server.store import schema
 from mapvote.server.store.database import insert_rows
 from mapvote.server.store.planes import MAX_PLANE_BYTES
 from mapvote.server.store.queries import log_event, oldest_kept, shows_in_kept
-from mapvote.server.store.schema import sum_of, sum_of_decision, sum_of_planes, summed
 from mapvote.server.store.store import Store
 
 Source = Callable[[str], bytes | None]
@@ -35,8 +34,7 @@ def check(
     """Everything that is damaged, and with ``mend`` what was done about it. What cannot be mended is set aside."""
     with store.database.reading() as connection:
         found = [*_database(connection, store), *_planes(connection), *_chain(connection)]
-        found += [*_heads(connection), *_ends(connection)]
-        found += [*_ballots(connection), *_decisions(connection)]
+        found += [*_rows(connection), *_ends(connection)]
     if mend and found:
         with store.database.writing() as connection:
             found = [_mend(connection, damage, source, store.clock(), by) for damage in found]
@@ -86,14 +84,19 @@ def _chain(connection: sa.Connection) -> Iterator[Damage]:
             )
 
 
-def _heads(connection: sa.Connection) -> Iterator[Damage]:
-    """What is written once of versions, ballots, the log, keys, policies and reviews."""
-    for kind, table in schema.HEADS.items():
-        over, key = summed(table), list(table.primary_key)
+def _rows(connection: sa.Connection) -> Iterator[Damage]:
+    """Rows that are not what their sums say."""
+    for kind, table in schema.SUMMED.items():
+        key = list(table.primary_key)
         for row in _in_batches(connection, sa.select(table).order_by(*key)):
-            if row.sum != sum_of(*(getattr(row, name) for name in over)):
-                name = " ".join(str(getattr(row, column.name))[:64] for column in key)
-                yield Damage(kind, name, "its head is not what its sum says")
+            if not schema.is_sound(table, row):
+                yield _damaged_row(kind, row, [str(getattr(row, column.name))[:64] for column in key])
+
+
+def _damaged_row(kind: str, row: Any, key: Sequence[str]) -> Damage:
+    if kind == "votes":
+        return Damage("ballot", ballot_name(row.ballot, row.row, row.col), NOT_ITS_SUM)
+    return Damage(kind, " ".join(key), NOT_ITS_SUM)
 
 
 def _ends(connection: sa.Connection) -> Iterator[Damage]:
@@ -106,22 +109,6 @@ def _ends(connection: sa.Connection) -> Iterator[Damage]:
         lost = ended.not_in(sa.select(e.seq)) | (ended <= came)
         for row in connection.execute(sa.select(name, ended).where(ended.is_not(None), lost)):
             yield Damage(kind, str(row[0]), f"ended by event {row[1]}, which cannot be")
-
-
-def _ballots(connection: sa.Connection) -> Iterator[Damage]:
-    t = schema.ballot_tiles
-    for row in _in_batches(connection, sa.select(t).order_by(t.c.row, t.c.col, t.c.ballot)):
-        if row.sum != ballot_sum(row):
-            yield Damage("ballot", ballot_name(row.ballot, row.row, row.col), "is not what its sum says")
-
-
-def _decisions(connection: sa.Connection) -> Iterator[Damage]:
-    d = schema.decisions
-    for row in _in_batches(connection, sa.select(d).order_by(d.c.version, d.c.row, d.c.col)):
-        if row.sum != sum_of_decision(row.states, row.tally, row.odds):
-            yield Damage(
-                "decision", f"{row.version} on tile {tile_key((row.row, row.col))}", "is not what its sum says"
-            )
 
 
 def _in_batches(connection: sa.Connection, query: sa.Select[Any]) -> Iterator[Any]:
@@ -144,7 +131,8 @@ def _mend(connection: sa.Connection, damage: Damage, source: Source, now: int, b
 
 MENDED = "mended"
 """The kind of the event by which a plane is again what it was."""
-KINDS = ("plane", "decision", *schema.HEADS, "row", "database")
+KINDS = ("plane", *schema.SUMMED.keys() - {"votes"}, "row", "database")
+NOT_ITS_SUM = "is not what its sum says"
 
 
 @dataclass(frozen=True, slots=True)
@@ -174,11 +162,6 @@ class DamagedBallots(MapvoteError):
 def ballot_name(seq: int, row: int, col: int) -> str:
     """One ballot's votes on one tile."""
     return f"{seq} on tile {tile_key((row, col))}"
-
-
-def ballot_sum(row: Any) -> str:
-    """The sum of a row of ballot_tiles."""
-    return sum_of_planes(row.base, [getattr(row, plane) for plane in schema.BALLOT_PLANES])
 
 
 def set_aside(connection: sa.Connection) -> dict[tuple[str, str], str]:

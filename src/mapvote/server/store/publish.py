@@ -44,7 +44,6 @@ from mapvote.server.store.queries import (
 )
 from mapvote.server.store.retention import clear
 from mapvote.server.store.round import Gate, Round, reasons_to_hold, round_at
-from mapvote.server.store.schema import sum_of_decision
 from mapvote.server.store.store import Store
 
 
@@ -231,5 +230,5 @@ def write_version(store: Store, version: Version, new: NewTiles, unvoted: str | 
 
 def _decision_row(number: int, fused: Fused) -> tuple[object, ...]:
     """In the order of the table's columns."""
-    counts, said = (fused.vehicles, fused.added, fused.deleted), (fused.states, fused.tally, fused.odds)
-    return number, *fused.index, *said[:2], *counts, fused.odds, sum_of_decision(*said)
+    counts = fused.vehicles, fused.added, fused.deleted
+    return number, *fused.index, fused.states, fused.tally, *counts, fused.odds, fused.standings

@@ -27,16 +27,6 @@ def sum_of(*parts: Any) -> str:
     return hashlib.sha256(b"".join(pieces)).hexdigest()
 
 
-def sum_of_planes(base: str, planes: Sequence[bytes | None]) -> str:
-    """The sum of a ballot's votes on one tile, of all ``BALLOT_PLANES`` in their order."""
-    return sum_of(base, *planes)
-
-
-def sum_of_decision(states: bytes, tally: bytes, odds: bytes | None) -> str:
-    """The sum of what was decided about one tile."""
-    return sum_of(states, tally, odds)
-
-
 def _raw(part: Any) -> bytes:
     if part is None:
         return b""
@@ -60,9 +50,14 @@ def sum_over(*names: str) -> sa.Column[str]:
 
 
 def summed(table: sa.Table) -> Sequence[str]:
-    """The columns that the table's sum is over; none where rows carry none, or another kind."""
-    over: Sequence[str] = table.c["sum"].info.get("over", ()) if "sum" in table.c else ()
+    """The columns that the table's sum is over; none where rows carry none."""
+    over: Sequence[str] = table.c["sum"].info["over"] if "sum" in table.c else ()
     return over
+
+
+def is_sound(table: sa.Table, row: Any) -> bool:
+    """Whether a row with all columns of its table's sum is what was written."""
+    return bool(row.sum == sum_of(*(getattr(row, name) for name in summed(table))))
 
 
 def with_sums(table: sa.Table, rows: Sequence[tuple[Any, ...]]) -> Sequence[tuple[Any, ...]]:
@@ -229,10 +224,10 @@ ballot_tiles = sa.Table(
     sa.Column("free", sa.LargeBinary),
     sa.Column("intensity", sa.LargeBinary),
     sa.Column("odds", sa.LargeBinary),
-    sa.Column("sum", sa.String(64), nullable=False),
+    sum_over("base", *BALLOT_PLANES),
     sa.Index("ix_ballot_tiles_ballot", "ballot"),
 )
-"""``sum``: over base and planes, see :func:`mapvote.server.store.schema.sum_of_planes`."""
+"""Two rows of the same sum say the same."""
 
 paths = sa.Table(
     "paths",
@@ -255,10 +250,12 @@ decisions = sa.Table(
     sa.Column("added", sa.Integer, nullable=False),
     sa.Column("deleted", sa.Integer, nullable=False),
     sa.Column("odds", sa.LargeBinary),
-    sa.Column("sum", sa.String(64), nullable=False),
+    sa.Column("standings", sa.LargeBinary, nullable=False),
+    sum_over("states", "tally", "odds", "standings"),
 )
-"""``tally``: (5, 65536), compressed, see :func:`mapvote.server.store.fusion_jobs.pack_tally`. ``odds``: how sure of the
-changed cells those are who voted for them, see :func:`mapvote.fusion.odds.pack_agreed`; null: nobody says."""
+"""The decision record (store/decisions.py). ``tally``: (5, 65536), compressed. ``odds``: how sure of the changed cells
+those are who voted for them, see :func:`mapvote.fusion.odds.pack_agreed`; null: nobody says. ``standings``: which
+ballots counted, and why the others did not."""
 
 reviews = sa.Table(
     "reviews",
@@ -302,8 +299,8 @@ deliveries = sa.Table(
 )
 """Up to which event a webhook has taken them, by the hash of its address."""
 
-HEADS = {
+SUMMED = {
     "map": maps, "policy": policies, "key": keys, "event": events, "version": versions, "ballot": ballots,
-    "review": reviews, "reviewed": review_cells, "path": paths,
+    "votes": ballot_tiles, "decision": decisions, "review": reviews, "reviewed": review_cells, "path": paths,
 }  # fmt: skip
-"""What carries a sum over all of a row that is written once, by the kind of damage."""
+"""Tables whose rows carry a sum over all that is written once, by the kind of damage."""

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections import OrderedDict, defaultdict
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from threading import Lock
 from typing import Any, TypeVar
 
@@ -19,7 +19,7 @@ from mapvote.codec.points import unpack_sound_points
 from mapvote.config import FuseSettings
 from mapvote.core.grid import TileIndex
 from mapvote.core.tile import Tile
-from mapvote.core.types import Bool
+from mapvote.core.types import I64, Bool
 from mapvote.fusion.odds import Odds
 from mapvote.fusion.persistence import history_days
 from mapvote.fusion.sparse_columns import Words
@@ -27,7 +27,7 @@ from mapvote.fusion.spent import unspent
 from mapvote.fusion.tile_vote import DAY_NS, TileVote, restrict, select
 from mapvote.server.store import schema
 from mapvote.server.store.database import MOST_ASKED
-from mapvote.server.store.integrity import Damage, DamagedBallots, ballot_name, ballot_sum, set_aside
+from mapvote.server.store.integrity import NOT_ITS_SUM, Damage, DamagedBallots, ballot_name, set_aside
 from mapvote.server.store.planes import unpack_cells
 from mapvote.server.store.policy import Policy, policy_in
 from mapvote.server.store.queries import Version
@@ -77,13 +77,13 @@ def _stands_at(mark: int | sa.BindParameter[int]) -> sa.ColumnElement[bool]:
 _B, _T = schema.ballots, schema.ballot_tiles
 _ROW, _MARK = (sa.bindparam(name, type_=sa.BigInteger) for name in ("row", "mark"))
 _COLS: sa.BindParameter[list[int]] = sa.bindparam("cols", expanding=True)
-_VOTES_ON = (
+_VOTES = (
     sa.select(_T.c.col, _B.c.seq, _B.c.first_seq, _B.c.vehicle, _B.c.drive, _B.c.end_ns, _B.c.received_ns)
     .add_columns(_B.c.digest, _T.c.base, _B.c.version, _B.c.settings_hash, _B.c.cast_by)
     .join(_T, _T.c.ballot == _B.c.seq)
-    .where(_T.c.row == _ROW, _T.c.col.in_(_COLS), _stands_at(_MARK))
     .order_by(_B.c.seq)
 )
+_VOTES_ON = _VOTES.where(_T.c.row == _ROW, _T.c.col.in_(_COLS), _stands_at(_MARK))
 _W, _C = schema.reviews, schema.review_cells
 _REVIEWS_ON = (
     sa.select(_C.c.col, _W.c.seq, _W.c.verdict, _C.c.cells)
@@ -123,6 +123,13 @@ def _standing_on(
     for col, *stored in connection.execute(_VOTES_ON, {"row": row, "cols": cols, "mark": mark}).all():
         found[row, col].append(StoredVote(*stored))
     return found
+
+
+def stored_votes(connection: sa.Connection, index: TileIndex, ballots: Collection[int]) -> list[StoredVote]:
+    """The votes of some ballots on a tile, whether they stand or not, in the order of the ballots; of those that were
+    cleared away nothing."""
+    mine = _VOTES.where(_T.c.row == index[0], _T.c.col == index[1], _B.c.seq.in_(ballots))
+    return [StoredVote(*stored) for _, *stored in connection.execute(mine).all()]
 
 
 def standing_tiles(connection: sa.Connection, mark: int, since: int | None = None) -> list[TileIndex]:
@@ -190,34 +197,63 @@ def _unready(vote: StoredVote, index: TileIndex, asked: Electorate) -> str:
     return YOUNG if vote.received_ns > asked.received_by_ns else ""
 
 
-def counting_votes(
+def counting_votes(connection: sa.Connection, tile: Tile, asked: Electorate) -> list[TileVote]:
+    """The votes that count on ``tile`` as it is now, each restricted to the cells where it is not spent."""
+    return [vote for _, vote in counted_votes(connection, tile, asked)]
+
+
+def counted_votes(connection: sa.Connection, tile: Tile, asked: Electorate) -> list[tuple[StoredVote, TileVote]]:
+    """As :func:`counting_votes`, each beside its ballot."""
+    return [(one.stored, one.vote) for one in judged_on(connection, tile, asked) if one.vote is not None]
+
+
+@dataclass(frozen=True, slots=True)
+class Judged:
+    """One standing vote on a tile, and what becomes of it before the votes are compared with each other."""
+
+    stored: StoredVote
+    why: str
+    """Why it does not count on the tile; "" if it does."""
+    vote: TileVote | None = None
+    """In the cells where it counts; None if it does not."""
+    spent: I64 = field(default_factory=lambda: np.empty(0, dtype=np.int64))
+    """(n,) flat cells of which it speaks, and which have changed since its vehicle drove."""
+    reviewed: I64 = field(default_factory=lambda: np.empty(0, dtype=np.int64))
+    """(n,) flat cells of which it speaks, of a change that a reviewer held or rejected."""
+
+
+def judged_on(
     connection: sa.Connection,
     tile: Tile,
     asked: Electorate,
     misread: Mapping[int, Bool] | None = None,
     polled: Polled | None = None,
-) -> list[TileVote]:
-    """The votes that count on ``tile`` as it is now, each restricted to the cells where it is not spent.
+) -> list[Judged]:
+    """Every standing vote on ``tile`` as it is now, in the order of the ballots.
 
     ``misread``: see :func:`mapvote.fusion.spent.unspent`. ``polled``: what stands there, if it was asked before.
     """
-    return [vote for _, vote in counted_votes(connection, tile, asked, misread, polled)]
-
-
-def counted_votes(
-    connection: sa.Connection,
-    tile: Tile,
-    asked: Electorate,
-    misread: Mapping[int, Bool] | None = None,
-    polled: Polled | None = None,
-) -> list[tuple[StoredVote, TileVote]]:
-    """As :func:`counting_votes`, each beside its ballot."""
     index = tile.index
     polled = polled or poll(connection, index[0], [index[1]], asked)
-    chosen = [vote for vote, why in _judged(polled.standing[index], index, asked) if not why]
-    votes, bars = read_votes(connection, index, chosen, polled.rows), polled.bars[index]
-    said = zip(chosen, votes, strict=True)
-    return [(stored, _obedient(unspent(vote, tile, misread), stored.first_seq, bars)) for stored, vote in said]
+    standing = _judged(polled.standing[index], index, asked)
+    votes = iter(read_votes(connection, index, [vote for vote, why in standing if not why], polled.rows))
+    found = []
+    for stored, why in standing:
+        if why:
+            found.append(Judged(stored, why))
+            continue
+        sent = next(votes)
+        fresh = unspent(sent, tile, misread)
+        obedient = _obedient(fresh, stored.first_seq, polled.bars[index])
+        found.append(Judged(stored, "", obedient, _cells_lost(sent, fresh), _cells_lost(fresh, obedient)))
+    return found
+
+
+def _cells_lost(before: TileVote, after: TileVote) -> I64:
+    """(n,) flat cells of which only the vote ``before`` speaks."""
+    if before is after:
+        return np.empty(0, dtype=np.int64)
+    return np.flatnonzero(before.spoken() & ~after.spoken())
 
 
 def _obedient(vote: TileVote, first_seq: int, bars: Sequence[tuple[int | None, Bool]]) -> TileVote:
@@ -367,10 +403,9 @@ def _said_by(stored: StoredVote, said: TileVote) -> TileVote:
 def _check(rows: Iterable[Any]) -> None:
     """DamagedBallots if some are not what their sums say. Whoever is remembered is read too, or what is decided would
     follow from what this process happened to read before the disk lost it."""
-    not_so = "is not what its sum says"
-    names = [ballot_name(row.ballot, row.row, row.col) for row in rows if row.sum != ballot_sum(row)]
-    if names:
-        raise DamagedBallots([Damage("ballot", name, not_so) for name in names])
+    damaged = [ballot_name(row.ballot, row.row, row.col) for row in rows if not schema.is_sound(_T, row)]
+    if damaged:
+        raise DamagedBallots([Damage("ballot", name, NOT_ITS_SUM) for name in damaged])
 
 
 def _unpacked(row: Any) -> TileVote:

@@ -19,7 +19,8 @@ from mapvote.fusion.edit import delete_points
 from mapvote.fusion.odds import unpack_agreed
 from mapvote.fusion.pending import Pending
 from mapvote.server.errors import NotFound
-from mapvote.server.store.fusion_jobs import Fused, unpack_tally_plane
+from mapvote.server.store.decisions import unpack_tally_plane
+from mapvote.server.store.fusion_jobs import Fused
 from mapvote.server.store.queries import load_tile, tile_of
 from mapvote.server.store.reviews import Review, Verdict, decide, standing
 from mapvote.server.store.round import Gate, Round, edited_tile, reasons_to_hold, round_at

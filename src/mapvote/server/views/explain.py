@@ -25,7 +25,7 @@ from mapvote.fusion.probability import alike_beside, change_probability
 from mapvote.fusion.spent import unspent
 from mapvote.fusion.tile_vote import TileVote
 from mapvote.server.store import schema
-from mapvote.server.store.fusion_jobs import unpack_tally_plane
+from mapvote.server.store.decisions import unpack_tally_plane
 from mapvote.server.store.queries import current_version, oldest_kept, tile_as_of, version_of
 from mapvote.server.store.store import Store
 from mapvote.server.store.votes import (

@@ -17,7 +17,7 @@ from mapvote.fusion.odds import unpack_agreed
 from mapvote.fusion.tile_vote import DAY_NS, TileVote, one_each
 from mapvote.server.errors import Unavailable
 from mapvote.server.store import schema
-from mapvote.server.store.fusion_jobs import unpack_tally_plane
+from mapvote.server.store.decisions import unpack_tally_plane
 from mapvote.server.store.policy import policy_in
 from mapvote.server.store.queries import current_version, load_tile, tile_as_of, tiles_of, tiles_that_differ, version_of
 from mapvote.server.store.store import Store

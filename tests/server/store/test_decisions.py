@@ -1,0 +1,164 @@
+"""The decision record says who counted and who did not, as fusing the version once more finds it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+import sqlalchemy as sa
+
+from hand_made import Say, make_ballot, two_walls
+from histories import START_S, WALL, History, seen_along
+from mapvote.codec.ballot import encode
+from mapvote.config import FuseSettings
+from mapvote.core.grid import CELLS
+from mapvote.core.types import CellState
+from mapvote.fusion.fuse import decide_tile, rule_of
+from mapvote.server.store import schema
+from mapvote.server.store.admission import accept, examine
+from mapvote.server.store.ballots import Receipt
+from mapvote.server.store.decisions import REASONS, Record, Standing, packed_cells, records_of
+from mapvote.server.store.policy import Policy
+from mapvote.server.store.publish import publish
+from mapvote.server.store.queries import oldest_kept, tile_as_of
+from mapvote.server.store.reviews import decide
+from mapvote.server.store.store import Store, Version
+from mapvote.server.store.votes import Electorate, from_sound_ballots, judged_on, read_votes, stored_votes
+from standing_clock import Clock
+
+HERE = (0, 0)
+CELL, OTHER = WALL[0], WALL[1]
+FLAT = CELL[0] * 256 + CELL[1]
+CE = int(CellState.CHANGED_EMPTY)
+
+
+@pytest.fixture
+def clock() -> Clock:
+    return Clock(START_S * 10**9)
+
+
+@pytest.fixture
+def store(tmp_path: Path, clock: Clock) -> Iterator[Store]:
+    policy = Policy(fuse=FuseSettings(max_deleted_share=1.0, max_freed_share=1.0))
+    store = Store.create(f"sqlite:///{tmp_path / 'store.db'}", two_walls(), policy, clock=clock)
+    yield store
+    store.close()
+
+
+def cast(store: Store, clock: Clock, vehicle: str, cell: tuple[int, int] = CELL, way: str = "", by: int = 0) -> int:
+    """A vehicle says that a cell of the wall is empty, now; the ballot's number."""
+    clock.now += 10**9
+    states = seen_along(way, by)
+    states[cell] = CE
+    base = {HERE: store.manifest(1).tiles[HERE].points}
+    ballot = make_ballot(two_walls(), {HERE: Say(states)}, vehicle, f"d{clock.now}", clock.now, base=base, version=1)
+    (receipt,) = accept(store, [examine(encode(ballot))])
+    assert isinstance(receipt, Receipt), receipt
+    return receipt.seq
+
+
+def records(store: Store) -> list[Record]:
+    with store.database.reading() as connection:
+        return records_of(connection, HERE)
+
+
+def test_a_record_names_those_that_counted_and_why_the_others_did_not(store: Store, clock: Clock) -> None:
+    store.change_policy({"fuse.latest_vehicles": 3, "fuse.min_age_s": 60})
+    old, a, b = (cast(store, clock, name) for name in ("old", "a", "b"))
+    c = cast(store, clock, "c")
+    clock.now += 120 * 10**9
+    young = cast(store, clock, "young")
+    assert publish(store).version == 2
+    (record,) = records(store)
+    assert {s.ballot: s.why for s in record.standings} == {old: "window", a: "", b: "", c: "", young: "young"}
+    assert record.states[CELL] == CE
+    assert record.tally[CELL].sum() > 0
+
+
+def test_of_a_spent_and_of_a_reviewed_cell_the_record_says_so(store: Store, clock: Clock) -> None:
+    first = [cast(store, clock, name) for name in "ab"]
+    assert publish(store).published
+    cells = np.zeros((256, 256), dtype=np.bool_)
+    cells[OTHER] = True
+    feature = {"id": "x", "properties": {"kind": "demolished"}}
+    late = [cast(store, clock, name, OTHER) for name in "cd"]
+    decide(store, "held", feature, {HERE: cells}, by="anna")
+    last = [cast(store, clock, name, WALL[2]) for name in "ef"]
+    assert publish(store).published
+    record = records(store)[-1]
+    found = {s.ballot: s for s in record.standings}
+    assert [found[seq].why_not(FLAT) for seq in first] == ["spent"] * 2
+    assert [found[seq].why_not(OTHER[0] * 256 + OTHER[1]) for seq in late] == ["reviewed"] * 2
+    assert [found[seq].why_not(WALL[2][0] * 256 + WALL[2][1]) for seq in last] == [""] * 2
+
+
+def test_a_copy_names_the_ballot_that_counted_for_both(store: Store, clock: Clock) -> None:
+    a, liar, b = (
+        cast(store, clock, name, way=way) for name, way in (("a", "north"), ("liar", "north"), ("b", "south"))
+    )
+    assert publish(store).published
+    found = {s.ballot: (s.why, s.alike) for s in records(store)[0].standings}
+    assert sorted([found[a], found[liar]]) == [("", 0), ("copy", a if found[a] == ("", 0) else liar)]
+    assert found[b] == ("", 0)
+
+
+def test_a_damaged_ballot_is_in_the_record_as_damaged(store: Store, clock: Clock) -> None:
+    seqs = [cast(store, clock, name) for name in "abc"]
+    t = schema.ballot_tiles
+    with store.database.writing() as connection:
+        connection.execute(t.update().where(t.c.ballot == seqs[0]).values(states=b"rot"))
+    assert publish(store).published
+    assert [s.why for s in records(store)[0].standings] == ["damaged", "", ""]
+
+
+def test_every_reason_has_words_and_a_cell_is_found_whatever_its_number() -> None:
+    assert all(REASONS.values())
+    assert "" not in REASONS
+    last = Standing(1, spent=packed_cells(np.array([0, CELLS - 1])))
+    assert [last.why_not(cell) for cell in (0, 1, CELLS - 1)] == ["spent", "", "spent"]
+
+
+def heard_again(store: Store, connection: sa.Connection, version: Version) -> dict[int, list[int]]:
+    """Ballot -> flat cells on which it counted, by fusing the version once more."""
+    tile = tile_as_of(connection, store.lattice.tile(HERE), version.number - 1)
+    asked = Electorate.of(version)
+    judged = from_sound_ballots(connection, asked, partial(judged_on, connection, tile))
+    votes = [one.vote for one in judged if one.vote is not None]
+    policy = asked.policy
+    heard = decide_tile(tile, votes, rule_of(policy.round.method), policy.fuse)
+    copies = {(copy.vehicle, copy.digest) for copy in heard.copies}
+    names = {vote.vehicle for vote in heard.votes}
+    return {
+        one.stored.seq: np.flatnonzero(one.vote.spoken()).tolist()
+        for one in judged
+        if one.vote is not None and one.vote.vehicle in names and (one.vote.vehicle, one.vote.digest) not in copies
+    }
+
+
+@pytest.mark.parametrize("seed", [0, 1, 3])
+def test_the_records_of_a_random_history_say_what_fusing_it_again_finds(seed: int, tmp_path: Path) -> None:
+    history = History(seed, lambda clock: Store.create(f"sqlite:///{tmp_path / 'store.db'}", two_walls(), clock=clock))
+    history.live(25)
+    compared = 0
+    with history.store.database.reading() as connection:
+        found = {record.version: record for record in records_of(connection, HERE)}
+        for version in history.store.versions():
+            if version.kind != "publish" or version.number <= oldest_kept(connection) or version.number not in found:
+                continue
+            counted = [s for s in found[version.number].standings if not s.why]
+            with_planes = _sent(connection, [s.ballot for s in counted])
+            mine = {s.ballot: [cell for cell in with_planes[s.ballot] if not s.why_not(cell)] for s in counted}
+            assert mine == heard_again(history.store, connection, version)
+            compared += 1
+    history.store.close()
+    assert compared
+
+
+def _sent(connection: sa.Connection, seqs: list[int]) -> dict[int, list[int]]:
+    """Ballot -> flat cells of which it speaks, as it was sent."""
+    stored = stored_votes(connection, HERE, seqs)
+    votes = read_votes(connection, HERE, stored)
+    return {s.seq: np.flatnonzero(v.spoken()).tolist() for s, v in zip(stored, votes, strict=True)}
