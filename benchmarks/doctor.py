@@ -30,10 +30,10 @@ from map_kinds import MAP_KINDS, NOWHERE, MapKind, around, moved_poses
 from mapvote.core.geometry import inverse, rotation_angle
 from mapvote.core.point_map import all_points
 from mapvote.core.types import Drive
-from mapvote.doctor.drives import examine_drive
+from mapvote.doctor.diagnosis import diagnose
 from mapvote.doctor.finding import Finding
+from mapvote.doctor.map_fit import check_on_map
 from mapvote.doctor.maps import examine_points
-from mapvote.doctor.on_map import check_on_map
 from mapvote.formats import open_drive, read_map
 from mapvote.formats.atomic import whole_file
 from mapvote.formats.maps.cloud import Cloud
@@ -92,7 +92,7 @@ def judge_drive(source: str, kind: Kind, sound: Recording) -> dict:
         kind.drive(sound).write(folder)
         kind.files(folder)
         started = time.process_time()
-        found, _, _ = examine_drive(folder)
+        found = diagnose(folder).findings
         seconds = time.process_time() - started
         shutil.rmtree(folder)
     return row(source, kind.name, kind.grave, kind.right, found, seconds, str(folder))

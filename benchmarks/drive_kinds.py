@@ -40,7 +40,7 @@ from broken_drives import (
     with_yaw,
 )
 from mapvote.core.geometry import inverse
-from mapvote.doctor.readings import CAMERA_TO_LIDAR
+from mapvote.doctor.prior import CAMERA_TO_LIDAR
 
 CAMERA = CAMERA_TO_LIDAR[:3, :3]
 MIRROR = "left-handed|mirrored"

@@ -27,8 +27,7 @@ from mapvote.core.motions import inverses
 from mapvote.core.point_map import PointMap
 from mapvote.core.reference import reference_window
 from mapvote.core.types import F64, Bool, Drive, MapvoteError
-from mapvote.doctor.drives import measure
-from mapvote.doctor.looks import look_at_all
+from mapvote.doctor.diagnosis import examine_drive
 from mapvote.formats import open_drive, read_T_map_lidar
 from mapvote.slam.build import BuildReport, build_map
 from mapvote_lab.simulation import simulate
@@ -135,7 +134,7 @@ def worst_of(report: BuildReport) -> str:
 
 def doctors_word(drive: Drive) -> str:
     """The gravest thing that the doctor measures."""
-    found = [f.severity for f in measure(drive, look_at_all(drive))[0]]
+    found = [f.severity for f in examine_drive(drive)[0]]
     return next((grave for grave in ("error", "warning") if grave in found), "sound")
 
 

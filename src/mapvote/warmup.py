@@ -23,8 +23,8 @@ from mapvote.core.sensors import SENSORS
 from mapvote.core.types import F64, Drive, Scan
 from mapvote.core.voxels import VoxelCloud
 from mapvote.detection.packed_tiles import PackedTiles
-from mapvote.doctor.clouds import check_cloud, in_memory
-from mapvote.doctor.looks import Looking
+from mapvote.doctor.maps import check_cloud, in_memory
+from mapvote.doctor.scans import Looking
 from mapvote.formats.clean import BadPoints, RawScan, clean_scan, spinning_time_s
 from mapvote.fusion.offline import update_map
 from mapvote.slam.build import build_map

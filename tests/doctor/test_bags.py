@@ -11,8 +11,8 @@ import pytest
 from bag_recorder import START, Recorder
 from mapvote.core import geometry
 from mapvote.core.types import F64
-from mapvote.doctor.bags import check_bag
 from mapvote.doctor.finding import Finding
+from mapvote.doctor.records import check_bag
 from mapvote.formats.drives.options import DriveOptions
 
 T_BASE_LIDAR = geometry.from_xyz_rpy(1.2, 0.0, 1.8, 0.01, 0.02, np.pi / 2)

@@ -11,8 +11,7 @@ import pytest
 from mapvote.core.geometry import from_xyz_rpy
 from mapvote.core.sensors import SENSORS
 from mapvote.core.types import F32, Drive, MapvoteError, Scan
-from mapvote.doctor.cheap import LookedAt, cheap_checks
-from mapvote.doctor.looks import look_at_all
+from mapvote.doctor.scans import LookedAt, cheap_checks, look_at_all
 
 N = 120
 UNSAMPLED = 60

@@ -16,11 +16,11 @@ from mapvote.core.grid import Lattice
 from mapvote.core.point_map import PointMap, cut_tiles, map_from_points
 from mapvote.core.sensors import SENSORS
 from mapvote.core.tile import Tile
-from mapvote.core.types import F64, Scan
+from mapvote.core.types import F64, Drive, Scan
 from mapvote.doctor.diagnosis import diagnose
 from mapvote.doctor.finding import Finding
-from mapvote.doctor.other_unit import in_another_unit
-from mapvote.doctor.readings import CAMERA_TO_LIDAR
+from mapvote.doctor.map_fit import Laid, in_another_unit
+from mapvote.doctor.prior import CAMERA_TO_LIDAR
 from mapvote.formats import DriveWriter
 from mapvote.formats.drives.kitti import write_poses
 
@@ -187,15 +187,16 @@ def test_jumps_bodies_and_thin_scans_are_named(tmp_path: Path, scans: list[F64])
 def test_of_a_map_that_is_not_in_metres_the_unit_is_named(scans: list[F64], numbers: float, name: str) -> None:
     points = world()
     points = points[(np.abs(points[:, :2] - [8.0, 5.0]) < 30.0).all(axis=1)]
-    seen = {i: Scan(0, scans[i].astype(np.float32)) for i in (0, 12, 23)}
+    stamps_ns = np.arange(N) * 100_000_000
+    drive = Drive(Path("d"), "v", "d", SENSORS["hdl32e"], stamps_ns, lambda i: Scan(0, scans[i].astype(np.float32)))
     tiles = {}
     for index, mine in cut_tiles(numbers * points, Lattice()):
         empty = Tile.empty(Lattice().tile(index))
         tiles[index] = empty.but(points=empty.window.from_map(numbers * points[mine]))
-    found = in_another_unit(PointMap("m", Lattice(), tiles), seen, poses(), 0.02, None)
+    found = in_another_unit(Laid(drive, poses(), PointMap("m", Lattice(), tiles)))
     assert found is not None
     assert name in found.what
-    assert "fits 3 of 3 scans" in found.what
+    assert "fits 6 of 6 scans" in found.what
 
 
 @pytest.mark.slow

@@ -11,10 +11,9 @@ import pytest
 
 from mapvote.core.point_map import PointMap, map_from_points
 from mapvote.core.types import F64
-from mapvote.doctor.clouds import check_cloud, in_memory
 from mapvote.doctor.diagnosis import diagnose
 from mapvote.doctor.finding import Finding
-from mapvote.doctor.maps import check_map
+from mapvote.doctor.maps import check_cloud, check_map, in_memory
 from mapvote.formats import write_map
 from mapvote.formats.maps.cloud import Cloud
 from mapvote.formats.maps.las import write_las

@@ -12,11 +12,8 @@ from mapvote.core import geometry
 from mapvote.core.sensors import SENSORS
 from mapvote.core.types import F64, Drive, Scan
 from mapvote.doctor.finding import Finding
-from mapvote.doctor.frames import CANNOT_TELL, check_agreement
-from mapvote.doctor.motion import Run
-from mapvote.doctor.road import Road
-from mapvote.doctor.small import check_small
-from mapvote.doctor.whole import held_against
+from mapvote.doctor.motion import Road, Run
+from mapvote.doctor.prior_fit import CANNOT_TELL, check_agreement, check_small, held_against
 
 ROAD = Road("+z", 1.8, 0.4, np.array([0.0, 0.0, 1.0]), 0.02)
 

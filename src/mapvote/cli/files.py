@@ -89,7 +89,7 @@ def doctor(
         with waiting(f"reading {map_path}"):
             point_map = read_map(map_path)
     if is_store(path):
-        from mapvote.doctor.stores import check_store
+        from mapvote.doctor.records import check_store
 
         with opened_store(path) as store, waiting("reading every byte"):
             diagnosis = Diagnosis(check_store(store))

@@ -13,8 +13,8 @@ from mapvote.cli.terminal import progress
 if TYPE_CHECKING:
     from mapvote.core.point_map import PointMap
     from mapvote.core.types import Drive
-    from mapvote.doctor.cheap import LookedAt
     from mapvote.doctor.finding import Finding
+    from mapvote.doctor.scans import LookedAt
     from mapvote.formats.maps.tiling import Look
 
 
@@ -26,7 +26,7 @@ def usable_drives(drives: Sequence[Drive]) -> Iterator[list[Drive]]:
     stops the work, what is wrong with a drive is told rather than what came of it.
     """
     from mapvote.core.types import MapvoteError
-    from mapvote.doctor.cheap import LookedAt
+    from mapvote.doctor.scans import LookedAt
 
     watching = []
     for drive in drives:
@@ -58,8 +58,8 @@ def sound_map(path: Path | str) -> PointMap:
 
 def look_at_points(path: str) -> Look:
     """What looks at the points of a map before ground is laid: MapvoteError if they cannot be used so."""
-    from mapvote.doctor.clouds import check_cloud
     from mapvote.doctor.finding import usable
+    from mapvote.doctor.maps import check_cloud
 
     return lambda pieces: _warn(path, usable(path, check_cloud(pieces)))
 

@@ -1,22 +1,42 @@
-"""What is wrong at a path, whatever lies there: a map, a ballot or a drive, and a drive on a map."""
+"""What is wrong at a path, whatever lies there: a map, a ballot, a drive, or a drive on a map."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
+from functools import cached_property
 from pathlib import Path
 
+import numpy as np
+
 from mapvote.core.point_map import PointMap
-from mapvote.core.types import F64, Drive
-from mapvote.doctor.bags import check_bag
-from mapvote.doctor.ballots import check_ballot
-from mapvote.doctor.drives import examine_drive
+from mapvote.core.types import F32, F64, I64, Drive, MapvoteError
 from mapvote.doctor.finding import Finding, Progress, in_order
-from mapvote.doctor.maps import check_whole, examine_map
-from mapvote.doctor.on_map import check_on_map, check_unit
+from mapvote.doctor.map_fit import Laid, check_on_map, in_another_unit
+from mapvote.doctor.maps import check_cloud, check_map, examine_map, tile_by_tile
+from mapvote.doctor.motion import (
+    Road,
+    Run,
+    check_ranges,
+    check_road,
+    check_scan_motion,
+    find_road,
+    follow,
+    range_scatter_m,
+    starts_across,
+    starts_of_runs,
+)
+from mapvote.doctor.prior import NO_PRIOR
+from mapvote.doctor.prior_fit import CHAIN_SCANS, check_agreement
+from mapvote.doctor.records import check_bag, check_ballot
+from mapvote.doctor.scans import IN_MAP_FRAME, Looks, cheap_checks, in_map_frame, look_at_all
+from mapvote.formats import open_drive
 from mapvote.formats.drives.options import DriveOptions
 from mapvote.formats.drives.rosbag import is_rosbag
 from mapvote.formats.maps.mapvote_folder import is_map_folder
 from mapvote.formats.registry import DRIVES, MAPS
+
+_ROAD_SCANS = 7
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,6 +51,118 @@ class Diagnosis:
     """(n, 4, 4) what takes its points, as they are in the files, to where they belong; None where nobody knows."""
 
 
+@dataclass(frozen=True)
+class Evidence:
+    """What the checks of a drive ask for: scans, road, registrations. Each is made once, when it is first asked for."""
+
+    drive: Drive
+    progress: Progress | None = None
+
+    @cached_property
+    def looks(self) -> Looks:
+        return look_at_all(self.drive, lambda done, n: self.tell("looking at scans", done, n))
+
+    def tell(self, stage: str, done: int, n: int) -> None:
+        if self.progress is not None:
+            self.progress(stage, done, n)
+
+    @property
+    def T(self) -> F64 | None:
+        """(n, 4, 4) the prior as it was read."""
+        return self.drive.T_map_lidar_prior
+
+    @property
+    def in_map_frame(self) -> bool:
+        """Whether the points are in the map's frame: then nothing else can be said of them."""
+        return self.T is not None and len(self.looks.index) > 0 and in_map_frame(self.T, self.looks)
+
+    @cached_property
+    def readable(self) -> I64:
+        """(m,) scans that could be read."""
+        return self.looks.index
+
+    def points(self, i: int) -> F32:
+        """(p, 3) of the i-th scan that could be read."""
+        return self.drive.read_scan(int(self.readable[i])).points
+
+    @cached_property
+    def some(self) -> I64:
+        """A few of the readable scans, spread evenly."""
+        return np.linspace(0, len(self.readable) - 1, min(len(self.readable), _ROAD_SCANS)).astype(np.int64)
+
+    @cached_property
+    def road(self) -> Road:
+        return find_road([self.points(int(i)) for i in self.some])
+
+    @cached_property
+    def scatter_m(self) -> float:
+        """Of ranges, of the first LiDAR: rays of another one begin elsewhere, and end on other things."""
+        scans = [self.drive.read_scan(int(self.readable[i])) for i in self.some]
+        return float(np.median([range_scatter_m(scan.by_lidar()[0][1].points) for scan in scans]))
+
+    @property
+    def can_be_registered(self) -> bool:
+        """Else whatever seems wrong with the motion may be its consequence."""
+        return (
+            len(self.readable) > 2
+            and 1.5 <= float(np.median(self.looks.range_m[:, 1])) <= 150.0
+            and self.road.up == "+z"
+        )
+
+    @cached_property
+    def runs(self) -> tuple[list[Run], list[Run]]:
+        """(runs spread over the drive, these and runs across the places where scans differ most)."""
+        spread = starts_of_runs(len(self.readable), None if self.T is None else self.T[self.readable])
+        starts = dict.fromkeys([*spread.tolist(), *starts_across(self.looks.leaps, len(self.readable)).tolist()])
+        every = []
+        for k, start in enumerate(starts):
+            every.append(self.run(start))
+            self.tell("registering scans", k + 1, len(starts))
+        return every[: len(spread)], every
+
+    def run(self, start: int, **most: int) -> Run:
+        run = follow(self.points, start, len(self.readable), self.road, **most)
+        return replace(run, indices=self.readable[run.indices])
+
+    @cached_property
+    def leaps(self) -> list[Finding]:
+        """What is wrong with the scans' own motion; while there is anything, a prior cannot be held against it."""
+        return check_scan_motion(self.drive, self.runs[1]) if self.can_be_registered else []
+
+    @cached_property
+    def agreement(self) -> tuple[list[Finding], F64 | None]:
+        """(how prior and scans differ, the prior as it would be mended)."""
+        if self.T is None or not self.can_be_registered or self.leaps:
+            return [], self.T
+        turns = float(np.median(self.looks.turns))
+        return check_agreement(
+            self.drive, self.T, self.runs[0], self.road, turns, lambda: self.run(0, scans=CHAIN_SCANS)
+        )
+
+
+def _ranges_and_road(e: Evidence) -> list[Finding]:
+    if len(e.readable) <= 2:
+        return []
+    return check_ranges(e.scatter_m) + check_road(e.road, e.scatter_m, e.T, e.readable[e.some].tolist())
+
+
+CHECKS: tuple[Callable[[Evidence], list[Finding]], ...] = (
+    lambda e: cheap_checks(e.drive, e.looks),
+    _ranges_and_road,
+    lambda e: e.leaps,
+    lambda e: e.agreement[0],
+)
+"""Of a drive by itself, in the order in which one needs the other."""
+
+
+def examine_drive(drive: Drive, progress: Progress | None = None) -> tuple[list[Finding], F64 | None]:
+    """(findings, errors first; the prior (n, 4, 4) as it would be mended) of a drive."""
+    e = Evidence(drive, progress)
+    if e.in_map_frame:
+        return [IN_MAP_FRAME], np.tile(np.eye(4), (len(drive), 1, 1))
+    return in_order(f for check in CHECKS for f in check(e)), e.agreement[1]
+
+
 def diagnose(
     path: Path,
     options: DriveOptions | None = None,
@@ -43,26 +175,45 @@ def diagnose(
     if path.is_file() and not any(layout.recognised(path) for layout in DRIVES.values()):
         return Diagnosis(check_ballot(path.read_bytes()))
     options = options or DriveOptions()
-    found = check_bag(path, options) if is_rosbag(path) else []
-    more, drive, T = examine_drive(path, options, progress)
-    found += more
+    drive, unopened = _opened(path, options)
+    found = unopened + (check_bag(path, options) if is_rosbag(path) else [])
+    T = None
+    if drive is not None:
+        more, T = examine_drive(drive, progress)
+        # That a prior that could not be read is missing goes without saying.
+        found += [f for f in more if not (unopened and f == NO_PRIOR)]
     if point_map is not None:
-        sound, of_map = not any(f.severity == "error" for f in found), _of_the_map(point_map)
-        found += of_map
-        if drive is not None and T is not None and sound:
-            if any(f.severity == "error" for f in of_map):
-                more = check_unit(drive, T, point_map, progress)
-            else:
-                more, T = check_on_map(drive, T, point_map, progress)
-            if all(f.severity == "note" for f in more):
-                found = [f for f in found if not f.map_tells]
-            found += more
+        found, T = _with_map(found, drive, T, point_map, progress)
     read = None if drive is None else drive.T_map_lidar_prior
     unknown = T is read and any(f.severity == "error" for f in found)
     return Diagnosis(in_order(found), drive, read, None if unknown else T)
 
 
-def _of_the_map(point_map: PointMap) -> list[Finding]:
-    """What is wrong with a map, among findings about a drive."""
-    found = [f for f in check_whole(point_map) if f.severity != "note"]
-    return [replace(f, what=f"the map: {f.what}") for f in found]
+def _opened(path: Path, options: DriveOptions) -> tuple[Drive | None, list[Finding]]:
+    """(the drive, what stopped it from opening as it is): a broken prior hides nothing else."""
+    try:
+        return open_drive(path, **asdict(options)), []
+    except MapvoteError as error:
+        found = [Finding("error", str(error))]
+    try:
+        return open_drive(path, **asdict(replace(options, prior="none"))), found
+    except MapvoteError:
+        return None, found
+
+
+def _with_map(
+    found: list[Finding], drive: Drive | None, T: F64 | None, point_map: PointMap, progress: Progress | None
+) -> tuple[list[Finding], F64 | None]:
+    """(also what is wrong with the map, and with the drive on it; the poses (n, 4, 4) as they lie on the map)."""
+    of_points = [f for f in check_cloud(tile_by_tile(point_map)) if f.severity != "note"]
+    of_map = of_points + [f for f in check_map(point_map) if f.severity != "note"]
+    named = [replace(f, what=f"the map: {f.what}") for f in of_map]
+    if drive is None or T is None or any(f.severity == "error" for f in found):
+        return found + named, T
+    if any(f.severity == "error" for f in of_points):  # as it is, no scan can fit it
+        unit = in_another_unit(Laid(drive, T, point_map, progress))
+        return [*found, *named, *([unit] if unit is not None else [])], T
+    more, T = check_on_map(drive, T, point_map, progress)
+    if not of_map and all(f.severity == "note" for f in more):
+        found = [f for f in found if not f.map_tells]
+    return [*found, *named, *more], T

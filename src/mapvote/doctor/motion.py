@@ -1,21 +1,43 @@
-"""How the sensor moved, by its scans alone: runs of consecutive scans, each registered to those before it.
+"""What the scans alone show once they are compared: ranges that scatter, the road below, and how the sensor moved.
 
-Nothing of the prior is used, not even as a guess, so that whatever is wrong with it can be measured against this. A run
-is some twenty metres of driving: long enough for a few centimetres of error to be a fraction of a per cent.
+Nothing of the prior is used, not even as a guess: whatever is wrong with it can be measured against this. A run is some
+twenty metres of consecutive scans, each registered to those before it: long enough for a few centimetres of error to be
+a fraction of a per cent.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 
 from mapvote.core.geometry import exp, from_xyz_rpy, inverse, log, transform
-from mapvote.core.types import F32, F64, I64, Bool, Registration
-from mapvote.doctor.road import UPS, Road
+from mapvote.core.types import F32, F64, I64, Bool, Drive, Registration
+from mapvote.doctor.finding import Finding
 from mapvote.localisation.ndt import NdtMap, fitness, refine, thin_for_levels
 
+UPS = {
+    "+x": np.array([1.0, 0, 0]),
+    "-x": np.array([-1.0, 0, 0]),
+    "+y": np.array([0, 1.0, 0]),
+    "-y": np.array([0, -1.0, 0]),
+    "+z": np.array([0, 0, 1.0]),
+    "-z": np.array([0, 0, -1.0]),
+}
+_NEAR_M = 15.0
+_ROAD_SHARE = 0.1
+"""A plane with fewer of a scan's near points than this is no road."""
+_UNSTEADY_M = 0.3
+_THICK_M = 0.12
+_DEPTH_M = (0.2, 12.0)
+_TRIES = 300
+_RAYS = 500
+_BESIDE = 8
+_QUARTER = 0.3186
+"""Of a normal distribution's absolute values a quarter is smaller than this many standard deviations."""
+_NEAREST_M, _FARTHEST_M = 3.0, 40.0
 _HALF_WINDOW_M = 60.0
 """Of the NDT map of a run: its scans reach 50 m."""
 RUNS = 8
@@ -29,6 +51,165 @@ _REACH_M = 50.0
 _GOOD_FIT = 0.7
 _STANDS_M = 0.4
 _REFINED = 4
+_ROUGH_M = 0.12
+_SCATTER_M = 0.25
+"""Sound sensors show 0.02 to 0.04 m."""
+_HIGHEST_M = 4.5
+"""Of a sensor over the road."""
+LEAST_FIT = 0.55
+"""Sound scans, a step apart, agree in .75 to .95 of their points; scans of different places in .2 to .5."""
+
+
+@dataclass(frozen=True, slots=True)
+class Road:
+    """The plane that most of the low points near the sensor lie in."""
+
+    up: str
+    """Which axis of the points points up: "+z" as it should."""
+    depth_m: float
+    """Of the road below the sensor."""
+    share: float
+    """Of the points within 15 m that lie within 0.12 m of the plane; below 0.1 it may be no road."""
+    normal: F64
+    """(3,) of the road, upwards, in the frame of the points."""
+    scatter_m: float
+    """By how much points near the plane leave it, robust standard deviation."""
+    unsteady_m: float = 0.0
+    """By how much the depth differs from scan to scan, robust standard deviation."""
+
+    @property
+    def is_there(self) -> bool:
+        """Whether it can be a road: some points lie in it, and as deep in every scan."""
+        return self.share >= _ROAD_SHARE and self.unsteady_m < _UNSTEADY_M
+
+    @property
+    def tilt_deg(self) -> float:
+        """Of the sensor against the road."""
+        return float(np.degrees(np.arccos(np.clip(self.normal @ UPS[self.up], -1.0, 1.0))))
+
+
+def find_road(scans: Sequence[F32]) -> Road:
+    """The road that several scans show. Another axis than z must hold half as much again: a wall is no road."""
+    near = [_low_points(scan) for scan in scans]
+    planes = [_best_planes(points, np.random.default_rng(k)) for k, points in enumerate(near)]
+    share = {name: float(np.mean([one[name][0] for one in planes])) for name in UPS}
+    best = max(share, key=lambda name: share[name])
+    if share[best] < max(1.5 * share["+z"], _ROAD_SHARE):
+        best = "+z"
+    fitted = [_fitted(points, *one[best][1:]) for points, one in zip(near, planes, strict=True)]
+    normal = np.median([normal for normal, _, _ in fitted], axis=0)
+    depth_m, scatter_m = (float(np.median([one[k] for one in fitted])) for k in (1, 2))
+    unsteady_m = 1.4826 * float(np.median([abs(depth - depth_m) for _, depth, _ in fitted]))
+    return Road(best, depth_m, share[best], normal / np.linalg.norm(normal), scatter_m, unsteady_m)
+
+
+def _low_points(scan: F32) -> F64:
+    distance = np.linalg.norm(scan, axis=1)
+    points = scan[(distance < _NEAR_M) & (distance > 2.0)].astype(np.float64)
+    return points[:: max(1, len(points) // 3000)]
+
+
+def _best_planes(points: F64, rng: np.random.Generator) -> dict[str, tuple[float, F64, float]]:
+    """For each axis that may point up (share, normal, depth) of the plane below the sensor with most of the points.
+
+    Planes through three points each (Fischler and Bolles, Random Sample Consensus, 1981).
+    """
+    out: dict[str, tuple[float, F64, float]] = {name: (0.0, up, 0.0) for name, up in UPS.items()}
+    if len(points) < 30:
+        return out
+    a, b, c = (points[rng.integers(0, len(points), _TRIES)] for _ in range(3))
+    normals = np.cross(b - a, c - a)
+    length = np.linalg.norm(normals, axis=1)
+    normals = normals[length > 1e-3] / length[length > 1e-3, None]
+    depth = -np.einsum("ij,ij->i", normals, a[length > 1e-3])
+    normals, depth = normals * np.sign(depth)[:, None], np.abs(depth)  # towards the sensor
+    for normal, d in zip(normals, depth, strict=True):
+        axis = int(np.argmax(np.abs(normal)))
+        if not _DEPTH_M[0] <= d <= _DEPTH_M[1] or abs(normal[axis]) < np.cos(np.radians(35.0)):
+            continue
+        share = float((np.abs(points @ normal + d) < _THICK_M).mean())
+        name = ("+" if normal[axis] > 0 else "-") + "xyz"[axis]
+        if share > out[name][0]:
+            out[name] = (share, normal, float(d))
+    return out
+
+
+def _fitted(points: F64, normal: F64, depth_m: float) -> tuple[F64, float, float]:
+    """(normal, depth, robust scatter) of the plane fitted to the points near a first guess of it, twice."""
+    scatter = 0.0
+    for _ in range(2):
+        off = points @ normal + depth_m
+        p = points[np.abs(off) < 3.0 * _THICK_M]
+        if len(p) < 50:
+            return normal, depth_m, 0.0
+        centre = p.mean(axis=0)
+        fitted = np.linalg.svd(p - centre, full_matrices=False)[2][2]
+        normal = fitted if fitted @ normal > 0 else -fitted
+        depth_m = -float(normal @ centre)
+        scatter = 1.4826 * float(np.median(np.abs((p - centre) @ normal)))
+    return normal, depth_m, scatter
+
+
+def range_scatter_m(points: F32) -> float:
+    """Standard deviation of a range from the surface that the rays beside it show, metres; 0 for a scan of few points.
+
+    On a plane the inverse range is linear in the direction: it is fitted to the eight nearest directions. Edges and
+    leaves scatter without being wrong, so the better quarter of the rays is taken for all.
+    """
+    length = np.linalg.norm(points, axis=1).astype(np.float64)
+    inside = (length > _NEAREST_M) & (length < _FARTHEST_M)
+    if inside.sum() < 20 * _BESIDE:
+        return 0.0
+    length, direction = length[inside], points[inside] / length[inside, None]
+    chosen = np.linspace(0, len(length) - 1, _RAYS).astype(np.int64)
+    _, beside = scipy.spatial.cKDTree(direction).query(direction[chosen], k=_BESIDE + 1)
+    beside = beside[:, 1:]
+    plane = np.linalg.pinv(direction[beside]) @ (1.0 / length[beside])[:, :, None]
+    inverse = (direction[chosen][:, None, :] @ plane)[:, 0, 0]
+    off = np.abs(1.0 / np.maximum(inverse, 1e-3) - length[chosen])
+    return float(np.quantile(off, 0.25)) / _QUARTER
+
+
+def check_ranges(scatter_m: float) -> list[Finding]:
+    if scatter_m <= _SCATTER_M:
+        return []
+    what = f"ranges scatter by {scatter_m:.2f} m against those of the rays beside them (sound sensors: 0.01 to 0.04 m)"
+    mend = "is the sensor calibrated, and does each point carry its own range? Such scans blur the map"
+    return [Finding("error" if scatter_m > 2.0 * _SCATTER_M else "warning", what, mend)]
+
+
+def check_road(road: Road, scatter_m: float, T: F64 | None, indices: list[int]) -> list[Finding]:
+    if road.up == "-z":
+        what = f"the sensor is upside down: the road lies {road.depth_m:.1f} m above it (z points down)"
+        mend = "negate y and z of every point (or only z, if right and left are right already)"
+        return [Finding("error", what, mend)]
+    if road.up != "+z":
+        what = f"the points' axis {road.up} points up (the road lies {road.depth_m:.1f} m along its opposite), not z"
+        mend = "turn the points to x forward, y left, z up (camera axes are x right, y down, z forward)"
+        return [Finding("error", what, mend)]
+    found = []
+    rough = road.scatter_m > _ROUGH_M
+    if not road.is_there or (rough and scatter_m <= _SCATTER_M):
+        what = f"no road lies below the sensor (the fullest layer holds {road.share:.0%} of the near points"
+        what += f", {road.scatter_m:.2f} m thick, its depth +-{road.unsteady_m:.2f} m from scan to scan)"
+        mend = "are the lower beams missing, the points cut, or z measured from elsewhere?"
+        return [Finding("warning", what, mend)]
+    found.append(Finding("note", f"by the scans themselves the sensor stands {road.depth_m:.1f} m over the road"))
+    if road.depth_m < 0.5:
+        what = f"the road lies only {road.depth_m:.1f} m below the points' origin"
+        found.append(Finding("warning", what, "are the points in the vehicle's frame? Give them in the sensor's"))
+    if road.depth_m > _HIGHEST_M:
+        what = f"the road lies {road.depth_m:.1f} m below the sensor: no vehicle is so high, the scans are too large"
+        found.append(Finding("warning", what, f"are the points in feet (then it is {0.3048 * road.depth_m:.1f} m)?"))
+    normal = road.normal if T is None else np.mean([T[i, :3, :3] @ road.normal for i in indices], axis=0)
+    tilt_deg = float(np.degrees(np.arccos(np.clip(normal[2] / np.linalg.norm(normal), -1.0, 1.0))))
+    if T is not None and tilt_deg > 4.0:
+        pitch, roll = np.degrees(np.arcsin(-road.normal[0])), np.degrees(np.arcsin(road.normal[1]))
+        own = f"in the scans: pitch {pitch:.1f}, roll {roll:.1f}"
+        what = f"by prior and scans the road is tilted by {tilt_deg:.1f} deg ({own})"
+        mend = "level the points by that, or put the sensor's tilt into the prior's rotations; on a hill all is well"
+        found.append(Finding("error" if tilt_deg > 8.0 else "warning", what, mend))
+    return found
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,3 +332,26 @@ def agree_with_time(run: Run, stamps_ns: I64, most_mps2: float = 8.0) -> Bool:
     change = np.linalg.norm(np.diff(velocity, axis=0), axis=1)
     out: Bool = change < 1.0 + most_mps2 * 0.5 * (seconds[1:] + seconds[:-1])
     return out
+
+
+def check_scan_motion(drive: Drive, runs: Sequence[Run]) -> list[Finding]:
+    """Do consecutive scans fit each other, and follow each other as a vehicle moves?"""
+    fit = float(np.median([np.median(run.fit[1:]) for run in runs]))
+    broken = [run for run in runs if np.median(run.fit[1:]) < LEAST_FIT]
+    mend = "are the files in order of time (names, times.txt), of one drive, and whole?"
+    if len(broken) > 0.5 * len(runs):
+        what = f"scans do not fit those before them: {fit:.0%} of the points agree, of sound drives 75 to 95 %"
+        return [Finding("error", what, mend)]
+    leaps = np.concatenate([~agree_with_time(run, drive.stamps_ns) for run in runs])
+    if len(leaps) and leaps.mean() > 0.25:
+        what = f"the vehicle would brake or start as none can in {leaps.mean():.0%} of the steps"
+        return [Finding("error", f"the scans leap: they are out of order, or their times are wrong ({what})", mend)]
+    speed = [run.length_m / (1e-9 * float(np.diff(drive.stamps_ns[run.indices[[0, -1]]])[0])) for run in runs]
+    if np.median(speed) > 70.0:
+        what = f"by scans and times the vehicle drives at {np.median(speed):.0f} m/s"
+        return [Finding("error", what, "check the times (seconds), and that the points are metres")]
+    if broken:
+        first, last = broken[0].indices[[0, -1]]
+        what = f"scans {first} to {last} do not fit each other ({len(broken)} of {len(runs)} places looked at)"
+        return [Finding("error", what, mend)]
+    return []

@@ -1,12 +1,21 @@
-"""What times and prior show by themselves: units, holes, jumps, rows that stand still, tilts."""
+"""What times and prior show by themselves, and the ways in which poses or axes of a drive get read wrongly.
+
+By themselves: units, holes, jumps, rows that stand still, tilts. A reading is a rule that turns the prior's poses
+T_map_lidar (n, 4, 4) into poses whose motions, from scan to scan, are the ones that the scans show if that is what is
+wrong. Whatever frame the poses stand in cancels out; so do scans that were turned or mirrored by C, whose motions are
+C M C^-1: T C^-1 moves so.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
+
 import numpy as np
 
+from mapvote.core import geometry
 from mapvote.core.types import F64, Bool, Drive
 from mapvote.doctor.finding import Finding
-from mapvote.doctor.readings import course, heading
 
 _FASTEST_MPS = 70.0
 NO_PRIOR = Finding(
@@ -14,6 +23,9 @@ NO_PRIOR = Finding(
     "no prior: the vehicle must find itself in the map",
     "write prior.txt (3 x 4 rows T_map_lidar), or expect to be asked for the first pose",
 )
+CAMERA_TO_LIDAR = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+"""From x right, y down, z forward to x forward, y left, z up."""
+_DEGREE_M = 111_320.0
 
 
 def check_times(drive: Drive) -> list[Finding]:
@@ -108,3 +120,185 @@ def drift_angle_deg(T: F64) -> float:
     """By how much the headings told differ from the course of the positions, median, degrees counter-clockwise."""
     apart = heading(T) - course(T)
     return float(np.degrees(np.arctan2(np.median(np.sin(apart)), np.median(np.cos(apart)))))
+
+
+@dataclass(frozen=True, slots=True)
+class Reading:
+    """What may be wrong, and how to mend it."""
+
+    name: str
+    mend: str
+    poses: Callable[[F64], F64]
+    told_by: str = "prior"
+    """Which side is wrong: "prior", "scans", or "order"."""
+    catch_all: bool = False
+    """Fits much that is wrong otherwise: named only where nothing more special fits."""
+    angle: bool = False
+    """Tells by how many degrees something is turned: a straight drive shows many a mistake as that."""
+
+
+def scaled(factor: float) -> Callable[[F64], F64]:
+    def read(T: F64) -> F64:
+        out = T.copy()
+        out[:, :3, 3] *= factor
+        return out
+
+    return read
+
+
+def turned(*, yaw_deg: float) -> Callable[[F64], F64]:
+    C = geometry.from_xyz_rpy(0, 0, 0, yaw=np.radians(yaw_deg))
+    return lambda T: np.asarray(T @ C)
+
+
+def _flipped(x: float, y: float) -> Callable[[F64], F64]:
+    C = np.diag([x, y, 1.0, 1.0])
+    return lambda T: np.asarray(T @ C)
+
+
+def _inverse(T: F64) -> F64:
+    return np.array([geometry.inverse(one) for one in T])
+
+
+def _transposed(T: F64) -> F64:
+    out = T.copy()
+    out[:, :3, :3] = np.swapaxes(T[:, :3, :3], 1, 2)
+    return out
+
+
+def _headed(T: F64, yaw: F64) -> F64:
+    out = np.tile(np.eye(4), (len(T), 1, 1))
+    c, s = np.cos(yaw), np.sin(yaw)
+    out[:, 0, 0], out[:, 0, 1], out[:, 1, 0], out[:, 1, 1] = c, -s, s, c
+    out[:, :3, 3] = T[:, :3, 3]
+    return out
+
+
+def heading(T: F64) -> F64:
+    """(n,) yaw of poses, radians."""
+    yaw: F64 = np.arctan2(T[:, 1, 0], T[:, 0, 0])
+    return yaw
+
+
+def course(T: F64) -> F64:
+    """(n,) direction in which the positions move, over a metre or so on either side, radians."""
+    p = T[:, :2, 3]
+    step = np.median(np.linalg.norm(np.diff(p, axis=0), axis=1)) if len(p) > 1 else 0.0
+    k = int(np.clip(np.ceil(1.5 / max(float(step), 0.01)), 1, max(1, len(p) // 4)))
+    last, first = np.minimum(np.arange(len(p)) + k, len(p) - 1), np.maximum(np.arange(len(p)) - k, 0)
+    way = p[last] - p[first]
+    return np.asarray(np.arctan2(way[:, 1], way[:, 0]))
+
+
+def _from_deltas(T: F64) -> F64:
+    out = [np.eye(4)]
+    for one in T[1:]:
+        out.append(out[-1] @ one)
+    return np.array(out)
+
+
+def _degrees(first: int) -> Callable[[F64], F64]:
+    """Positions as longitude and latitude in degrees; ``first``: column of the longitude."""
+
+    def read(T: F64) -> F64:
+        out = T.copy()
+        longitude, latitude = T[:, first, 3], T[:, 1 - first, 3]
+        out[:, 0, 3] = longitude * _DEGREE_M * np.cos(np.radians(np.clip(latitude[0], -89, 89)))
+        out[:, 1, 3] = latitude * _DEGREE_M
+        return out
+
+    return read
+
+
+def _mirrored_positions(T: F64) -> F64:
+    out = T.copy()
+    out[:, 1, 3] *= -1.0
+    return out
+
+
+def _swapped_positions(T: F64) -> F64:
+    out = T.copy()
+    out[:, :2, 3] = T[:, 1::-1, 3]
+    return out
+
+
+def _still(T: F64) -> F64:
+    return np.tile(np.eye(4), (len(T), 1, 1))
+
+
+def _in_map_axes(T: F64) -> F64:
+    out = _still(T)
+    out[:, :3, 3] = T[:, :3, 3]
+    return out
+
+
+def _quarter_turns(yaw_deg: int) -> tuple[Reading, Reading]:
+    """What custom confuses, of the scans and of the prior: both move the same way."""
+    rule = turned(yaw_deg=-yaw_deg)
+    scans = {
+        90: "the scans are turned by 90 deg about z (x right, y forward)",
+        -90: "the scans are turned by -90 deg about z (x left, y to the rear)",
+        180: "the scans face backwards (x to the rear): they are turned by 180 deg about z",
+    }
+    prior = f"the prior's headings are off by {yaw_deg} deg, counter-clockwise"
+    return (
+        Reading(scans[yaw_deg], "turn the points, or T_base_lidar, so that x is forward", rule, "scans", angle=True),
+        Reading(prior, f"turn its rotations by {-yaw_deg} deg about z", rule, angle=True),
+    )
+
+
+AS_IT_IS = Reading("as it is", "", lambda T: T)
+STILL = Reading("the scans do not move against each other", "", _still, "scans")
+READINGS = (
+    Reading("the prior holds inverse poses (T_lidar_map)", "write T_map_lidar, the inverse of each matrix", _inverse),
+    Reading(
+        "the prior is in camera axes (x right, y down, z forward)",
+        "put KITTI's calib.txt into the drive, or write T_map_lidar",
+        lambda T: np.asarray(CAMERA_TO_LIDAR @ T @ CAMERA_TO_LIDAR.T),
+    ),
+    Reading(
+        "the prior's rotations are transposed (or its angles clockwise)", "transpose the 3 x 3 rotations", _transposed
+    ),
+    Reading(
+        "the prior's heading is a compass bearing (0 north, clockwise)",
+        "use yaw = 90 deg - bearing",
+        lambda T: _headed(T, np.pi / 2 - heading(T)),
+    ),
+    Reading("the prior's positions are in millimetres", "divide its positions by 1000", scaled(1e-3)),
+    Reading("the prior's positions are in centimetres", "divide its positions by 100", scaled(1e-2)),
+    Reading("the prior's positions are in kilometres", "multiply its positions by 1000", scaled(1e3)),
+    Reading("the prior's positions are degrees (longitude, latitude)", "project them to metres", _degrees(0)),
+    Reading("the prior's positions are degrees (latitude, longitude)", "project them to metres", _degrees(1)),
+    Reading("the prior's x and y are swapped", "swap the first two coordinates", _swapped_positions),
+    Reading("the prior's track is mirrored (y negated)", "negate y of its positions", _mirrored_positions),
+    Reading(
+        "each pose of the prior counts from the one before (odometry steps)",
+        "chain them: T_map_lidar of a scan is the product of all steps up to it",
+        _from_deltas,
+    ),
+    Reading("the scans, or the prior's rows, are in reverse order", "reverse one of them", lambda T: T[::-1], "order"),
+    Reading(
+        "the scans are left-handed (y to the right)", "negate y of every point", _flipped(1.0, -1.0), told_by="scans"
+    ),
+    Reading("the scans are mirrored (x negated)", "negate x of every point", _flipped(-1.0, 1.0), told_by="scans"),
+    Reading(
+        "x and y of the scans are swapped",
+        "swap x and y of every point",
+        lambda T: np.asarray(T @ np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])),
+        told_by="scans",
+    ),
+    *(reading for yaw_deg in (90, -90, 180) for reading in _quarter_turns(yaw_deg)),
+    Reading(
+        "the scans are turned into the map's axes already, about the sensor",
+        "turn the points back by the prior's rotation, or give poses without rotation",
+        _in_map_axes,
+        told_by="scans",
+    ),
+    Reading(
+        "the prior's rotations do not belong to its positions (missing, or angles in the wrong unit)",
+        "check its angles: radians or degrees, which is yaw, which way they count",
+        lambda T: _headed(T, course(T)),
+        catch_all=True,
+    ),
+)
+"""Every one but the right one, and what a number tells: scale, turn, time (:mod:`mapvote.doctor.measured`)."""

@@ -1,0 +1,419 @@
+"""Does the drive lie on the map? Scans along it are registered to the map, and the poses found are compared with the
+prior.
+
+Where few scans fit, the map is tried in other scales, in other units, at other places and mirrored.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from mapvote.config import NdtSettings
+from mapvote.core.geometry import from_xyz_rpy, inverse
+from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Lattice
+from mapvote.core.heights import LEVEL_M, check_heights, heights_over_ground
+from mapvote.core.point_map import PointMap, cut_tiles
+from mapvote.core.tile import Tile
+from mapvote.core.types import F32, F64, Drive, MapvoteError, Scan
+from mapvote.doctor.finding import Finding, Progress, Severity
+from mapvote.doctor.motion import find_road
+from mapvote.doctor.similarity import Similarity, fit_similarity
+from mapvote.localisation.global_search import GlobalSearch
+from mapvote.localisation.map_window import MapWindow
+from mapvote.localisation.ndt import LEVELS, NdtMap, fitness, refine, thin_for_levels
+from mapvote.localisation.pose_check import MIN_FIT, Judge
+from mapvote.localisation.prepare import deskew, motion_at, solid_sample
+
+_PLACES = 6
+_SEARCHED = 4
+_FEW = 0.8
+"""If fewer scans fit, the map may be in another scale."""
+_MIRROR = np.array([1.0, -1.0, 1.0], dtype=np.float32)
+_TURN_DEG, _TILT_DEG, _SCALE = 0.5, 1.5, 0.01
+_POSITION_M, _ROTATION_RAD = 0.03, np.radians(0.15)
+"""Errors of one registration; they weigh positions against rotations."""
+_POINTS_SCALE = 0.01
+"""Error of the scale that points show; it stands where a drive is too short to tell it."""
+_OFFSETS_M = np.arange(-6.0, 6.1, 1.0)
+_YAWS = np.radians([0.0, -3.0, 3.0])
+_RANKED = 3
+_SCALES = (0.92, 0.94, 0.96, 0.98, 1.02, 1.04, 1.06, 1.08)
+"""A fit shows up to 1.5 % beside the right one."""
+_FINER = 0.01
+_LOOKED_AT = 3
+"""Scans registered in another scale or unit, to choose one."""
+_FEET_M = 0.3048
+_SENSOR_M = 2.0
+"""Height of a sensor over the road, about."""
+_AROUND_M = 120.0
+"""Of the drive: what its scans can see, and then some."""
+_FEWEST = 1000
+"""Points of a map around a drive."""
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """One scan at its best pose near a guess."""
+
+    index: int
+    T_map_lidar: F64
+    fit: float
+    """As :class:`mapvote.localisation.pose_check.Verdict` has it; 0 where the map knows too little to say."""
+    known: float
+    """Share of the scan's points near which the map has anything, at the guess."""
+    least: float
+    """Fit from which it is the place."""
+
+
+def fitting(places: Sequence[Place]) -> list[Place]:
+    return [p for p in places if p.fit >= p.least]
+
+
+def total_fit(places: Sequence[Place]) -> float:
+    """Of those that fit: tells a few good ones from many."""
+    return sum(p.fit for p in fitting(places))
+
+
+@dataclass(frozen=True)
+class Laid:
+    """Some scans of a drive on a map, as a prior has them."""
+
+    drive: Drive
+    T: F64
+    """(n, 4, 4) the prior, metres."""
+    point_map: PointMap
+    tell: Progress | None = None
+
+    @cached_property
+    def scans(self) -> dict[int, Scan]:
+        """Along the drive, by their numbers; de-skewed by the prior's motion."""
+        index = np.unique(np.linspace(0, len(self.drive) - 1, _PLACES).astype(np.int64)).tolist()
+        return {i: self._deskewed(i) for i in index}
+
+    def _deskewed(self, i: int) -> Scan:
+        scan = self.drive.read_scan(i)
+        points = deskew(scan, motion_at(self.drive.stamps_ns, self.T, i))
+        return Scan(scan.stamp_ns, np.ascontiguousarray(points, dtype=np.float32))
+
+    @property
+    def some(self) -> list[int]:
+        """A few of the scans, to choose a scale or a unit by."""
+        return list(self.scans)[:: max(1, len(self.scans) // _LOOKED_AT)][:_LOOKED_AT]
+
+    @cached_property
+    def around(self) -> MapWindow:
+        return MapWindow(self.point_map)
+
+    def places(
+        self, guesses: Mapping[int, Sequence[F64]], around: MapWindow | None = None, scale: float = 1.0
+    ) -> list[Place]:
+        """The scans of ``guesses``, made ``scale`` times as large, each registered to the map around its guesses."""
+        judge = Judge(self.drive.sensor.range_sigma_m)
+        scaled = {i: Scan(0, np.asarray(scale * self.scans[i].points, dtype=np.float32)) for i in guesses}
+        return [_place_of(around or self.around, i, scaled[i], guesses[i], judge) for i in guesses]
+
+    def told(self, what: str, steps: Iterable[Any]) -> Iterator[Any]:
+        """The steps, each told as begun."""
+        every = list(steps)
+        for k, step in enumerate(every):
+            if self.tell is not None:
+                self.tell(what, k + 1, len(every))
+            yield step
+
+
+def check_on_map(drive: Drive, T: F64, point_map: PointMap, tell: Progress | None = None) -> tuple[list[Finding], F64]:
+    """(findings, the poses (n, 4, 4) as they lie on the map), by a prior (n, 4, 4) that suits the scans."""
+    laid = Laid(drive, T, point_map, tell)
+    found = _outside(T, point_map)
+    road = find_road([scan.points for scan in laid.scans.values()])
+    depth_m = road.depth_m if road.up == "+z" and road.is_there else None
+    places: list[Place] = []
+    for i in laid.told("registering to the map", laid.scans):
+        places += laid.places({i: _on_ground(T[i], point_map, depth_m)})
+    scale = 1.0
+    if len(fitting(places)) < _FEW * len(places):
+        other, better = _in_another_scale(laid)
+        if total_fit(better) > 1.2 * total_fit(places):
+            scale, places = other, better
+    if len(fitting(places)) < 0.5 * len(places):
+        scale = 1.0
+        unit = in_another_unit(laid)
+        if unit is not None:
+            return [unit], T
+        better, mirrored = _searched(laid)
+        if mirrored:
+            what = f"the map is mirrored against the scans: {mirrored} mirrored scans fit it, as they are none does"
+            return [*found, Finding("error", what, "negate y of the map's points, or of the scans'")], T
+        places = max(places, better, key=lambda one: len(fitting(one)))
+    good = fitting(places)
+    if len(good) < 2:
+        return [*found, _fits_nowhere(places)], T
+    found += _where_not(places, good)
+    pairs = np.array([T[p.index] for p in good]), np.array([p.T_map_lidar for p in good])
+    fit = fit_similarity(*pairs, position_m=_POSITION_M, rotation_rad=_ROTATION_RAD, scale=(scale, _POINTS_SCALE))
+    mended = fit.applied(T)
+    return found + _differs(fit, len(good), drive) + _heights(point_map, mended, drive), mended
+
+
+def _in_another_scale(laid: Laid) -> tuple[float, list[Place]]:
+    """(the scale under which most scans fit, their places so); (1, []) if none does.
+
+    Scans and the prior's positions are scaled together, about the middle of the drive.
+    """
+    middle = laid.T[:, :3, 3].mean(axis=0)
+
+    def places(scale: float, index: Iterable[int]) -> list[Place]:
+        guesses = {}
+        for i in index:
+            guess = laid.T[i].copy()
+            guess[:3, 3] = middle + scale * (guess[:3, 3] - middle)
+            guesses[i] = [guess]
+        return laid.places(guesses, scale=scale)
+
+    fits = {scale: total_fit(places(scale, laid.some)) for scale in laid.told("trying other scales", _SCALES)}
+    scale = max(fits, key=lambda one: fits[one])
+    if fits[scale] == 0.0:
+        return 1.0, []
+    beside = [total_fit(places(scale * (1.0 + step), laid.some)) for step in (-_FINER, _FINER)]
+    scale *= 1.0 + _FINER * _peak(beside[0], fits[scale], beside[1])
+    return scale, places(scale, laid.scans)
+
+
+def in_another_unit(laid: Laid) -> Finding | None:
+    """What the map is in, if scans fit it once it is made metres about its origin, about its middle or about the road
+    below the middle of the drive; None if none does.
+
+    The map's points are made metres, not the scans feet: voxels have the size that suits points in metres.
+    """
+    centres = np.zeros(3), _middle(laid.point_map), laid.T[:, :3, 3].mean(axis=0) - [0.0, 0.0, _SENSOR_M]
+    for unit in laid.told("trying other units", UNITS):
+        for centre in centres:
+            metres = _in_metres(laid.point_map, unit.metres, centre, laid.T)
+            if metres is None:
+                continue
+            around = MapWindow(metres)
+            if 2 * len(fitting(laid.places({i: [laid.T[i]] for i in laid.some}, around))) > len(laid.some):
+                fits = len(fitting(laid.places({i: [laid.T[i]] for i in laid.scans}, around)))
+                what = f"the map is {unit.name}: made metres, it fits {fits} of {len(laid.scans)} scans looked at"
+                return Finding("error", what, unit.mend)
+    return None
+
+
+@dataclass(frozen=True, slots=True)
+class Unit:
+    """What the map's numbers may be instead of metres."""
+
+    name: str
+    metres: float
+    mend: str
+
+
+_BY = "multiply the map's points by {:.6g}, then import it (a LAS that names its unit is converted by itself)"
+UNITS = [
+    Unit("in feet", _FEET_M, _BY.format(_FEET_M)),
+    Unit("in centimetres", 0.01, _BY.format(0.01)),
+    Unit("in millimetres", 0.001, _BY.format(0.001)),
+    Unit("in inches", 0.0254, _BY.format(0.0254)),
+    Unit("in kilometres", 1000.0, _BY.format(1000.0)),
+    Unit("in metres that were converted as if they were feet", 1.0 / _FEET_M, "import it without converting feet"),
+]
+
+
+def _middle(point_map: PointMap) -> F64:
+    """The mean of its points."""
+    sums = [(tile.points_map.sum(axis=0), len(tile.points)) for tile in point_map.tiles.values()]
+    return np.asarray(sum(total for total, _ in sums) / max(1, sum(n for _, n in sums)))
+
+
+def _in_metres(point_map: PointMap, scale: float, centre: F64, T: F64) -> PointMap | None:
+    """Its points around the drive, ``scale`` times as large about ``centre``; None if there are hardly any."""
+    low, high = T[:, :2, 3].min(axis=0) - _AROUND_M, T[:, :2, 3].max(axis=0) + _AROUND_M
+    parts = []
+    for tile in point_map.tiles.values():
+        points = centre + scale * (tile.points_map - centre)
+        parts.append(points[((points[:, :2] > low) & (points[:, :2] < high)).all(axis=1)])
+    points = np.concatenate([np.empty((0, 3)), *parts])
+    if len(points) < _FEWEST:
+        return None
+    lattice = Lattice()
+    tiles = {}
+    for index, mine in cut_tiles(points, lattice):
+        empty = Tile.empty(lattice.tile(index))
+        tiles[index] = empty.but(points=empty.window.from_map(points[mine]))
+    return PointMap(point_map.map_id, lattice, tiles)
+
+
+def _searched(laid: Laid) -> tuple[list[Place], int]:
+    """(the places under the difference that suits most of them, how many scans fit mirrored where none fits so)."""
+    search = GlobalSearch(laid.point_map, NdtSettings(), laid.drive.sensor.range_sigma_m)
+    chosen = list(laid.scans)[:: max(1, len(laid.scans) // _SEARCHED)][:_SEARCHED]
+    best: list[Place] = []
+    mirrored = 0
+    for i in laid.told("searching the map", chosen):
+        scan = laid.scans[i]
+        found = _find(search, scan)
+        if found is not None:
+            D = found @ inverse(laid.T[i])
+            best = max(best, laid.places({j: [D @ laid.T[j]] for j in laid.scans}), key=lambda p: len(fitting(p)))
+            if len(fitting(best)) > 0.6 * len(laid.scans):
+                return best, 0
+        elif _find(search, Scan(scan.stamp_ns, scan.points * _MIRROR)) is not None:
+            mirrored += 1
+    return best, mirrored if mirrored >= 2 and len(fitting(best)) < 2 else 0
+
+
+def _find(search: GlobalSearch, scan: Scan) -> F64 | None:
+    try:
+        found = search.find(scan)
+    except MapvoteError:  # too large to search
+        return None
+    return None if found is None or found.fit < MIN_FIT else found.T_map_lidar
+
+
+def _place_of(around: MapWindow, i: int, scan: Scan, guesses: Sequence[F64], judge: Judge) -> Place:
+    """From the guesses themselves, and from the best of a grid of 6 m and 3 deg around them if none of them fits."""
+    clouds = thin_for_levels(scan.points)
+    few = solid_sample(scan.points, LEVELS[-1].points_m)
+    best = Place(i, guesses[0], 0.0, 0.0, MIN_FIT)
+    for guess in guesses:
+        ndt_map = around(guess[:3, 3])
+        known = _known(ndt_map, clouds[0].T.astype(np.float64), guess)
+        if known < 0.1:
+            best = max(best, Place(i, guess, 0.0, known, best.least), key=lambda p: p.known)
+            continue
+        starts = [guess]
+        for attempt in range(2):
+            for start in starts:
+                T = refine(ndt_map, clouds, start).T_map_lidar
+                best = max(best, Place(i, T, judge.fit(ndt_map, few, T), known, best.least), key=lambda p: p.fit)
+            if best.fit >= best.least or attempt:
+                break
+            starts = _around(ndt_map, clouds, guess)
+    return best
+
+
+def _around(ndt_map: NdtMap, clouds: list[F32], guess: F64) -> list[F64]:
+    sample = [np.ascontiguousarray(clouds[0][:, :: max(1, clouds[0].shape[1] // 500)])]
+    grid = [
+        from_xyz_rpy(x, y, 0.0) @ guess @ from_xyz_rpy(0, 0, 0, yaw=yaw)
+        for x in _OFFSETS_M
+        for y in _OFFSETS_M
+        for yaw in _YAWS
+    ]
+    return sorted(grid, key=lambda start: -fitness(ndt_map, sample, start))[:_RANKED]
+
+
+def _known(ndt_map: NdtMap, points: F64, T: F64) -> float:
+    """Share of the points (n, 3) that fall near anything of the map, whatever it is."""
+    grid = ndt_map.levels[0]
+    placed = points @ T[:3, :3].T + T[:3, 3]
+    cells = np.floor(placed / grid.level.voxel_m).astype(np.int64)[:, :2] - grid.window.lowest[:2]
+    rows = grid.window.rows
+    columns = np.asarray((rows >= 0).any(axis=2))
+    inside = ((cells >= 0) & (cells < np.array(columns.shape))).all(axis=1)
+    hit = np.zeros(len(cells), dtype=np.bool_)
+    hit[inside] = columns[cells[inside, 0], cells[inside, 1]]
+    return float(hit.mean())
+
+
+def _peak(before: float, at: float, after: float) -> float:
+    """Where the parabola through three values one step apart is highest, in steps, at most one."""
+    bend = before - 2.0 * at + after
+    return float(np.clip(0.5 * (before - after) / bend, -1.0, 1.0)) if bend < 0 else float(np.sign(after - before))
+
+
+def _outside(T: F64, point_map: PointMap) -> list[Finding]:
+    """How much of the drive lies outside the map's tiles, and how far."""
+    windows = [point_map.lattice.tile(t) for t in point_map.tiles]
+    side = TILE_CELLS * CELL_SIZE
+    low = np.array([[w.x0, w.y0] for w in windows])
+    outside_m = np.array(
+        [np.linalg.norm(np.maximum(np.maximum(low - p, p - low - side), 0), axis=1).min() for p in T[:, :2, 3]]
+    )
+    share = float((outside_m == 0).mean())
+    if share == 0:
+        a, b = low.min(axis=0), low.max(axis=0) + side
+        what = (
+            f"drive and map do not overlap: the drive starts at ({T[0, 0, 3]:.0f}, {T[0, 1, 3]:.0f}), "
+            f"the map covers ({a[0]:.0f}, {a[1]:.0f}) to ({b[0]:.0f}, {b[1]:.0f}), {outside_m.min():.0f} m away"
+        )
+        mend = "have prior and map the same frame and origin (for oxts: origin in drive.toml)?"
+        return [Finding("error", what, mend)]
+    if share < 0.95:
+        return [Finding("note", f"{1 - share:.0%} of the drive lies outside the map", "there it cannot vote")]
+    return []
+
+
+def _on_ground(T: F64, point_map: PointMap, depth_m: float | None) -> list[F64]:
+    """The prior's pose; and that pose over the map's ground, where the prior's height is far off it."""
+    height = float(heights_over_ground(point_map, T[None, :3, 3])[0])
+    if depth_m is None or not np.isfinite(height) or abs(height - depth_m) < 1.0:
+        return [T]
+    return [T, from_xyz_rpy(0, 0, depth_m - height) @ T]
+
+
+def _fits_nowhere(places: Sequence[Place]) -> Finding:
+    best = max(places, key=lambda p: p.fit)
+    what = (
+        f"the drive fits the map nowhere: at best to {best.fit:.2f} (scan {best.index}), a place that is the same "
+        f"street fits above {MIN_FIT}"
+    )
+    return Finding("error", what, "is it the map of another street, in another scale or tilt, or all changed?")
+
+
+def _where_not(places: Sequence[Place], good: Sequence[Place]) -> list[Finding]:
+    empty = [p for p in places if p.known < 0.3]
+    if empty:
+        scans = ", ".join(str(p.index) for p in empty)
+        grave: Severity = "error" if len(empty) >= 0.4 * len(places) else "warning"
+        what = f"the map holds nothing around {len(empty)} of {len(places)} places looked at (scans {scans})"
+        return [Finding(grave, what, "part of the map is missing, or the drive leaves it: there it cannot vote")]
+    if len(good) < 0.7 * len(places):
+        what = f"scans fit the map at {len(good)} of {len(places)} places only"
+        return [Finding("warning", what, "elsewhere the street has changed, or the map is bent")]
+    return []
+
+
+def _differs(d: Similarity, places: int, drive: Drive) -> list[Finding]:
+    """What the difference between prior and map amounts to, with its error."""
+    parts, grave = [], 0
+    off_m, sigma_m = float(np.linalg.norm(d.offset_m)), drive.prior_sigma_m
+    x, y, z = d.offset_m
+    if off_m > max(0.15, 0.4 * sigma_m, 3.0 * d.sigma_m):
+        parts.append(f"shifted by {off_m:.2f} m (x {x:+.2f}, y {y:+.2f}, z {z:+.2f}; +-{d.sigma_m:.2f})")
+        grave = max(grave, 1 + (off_m > max(0.3, 3.0 * sigma_m)))
+    for name, value, sigma, least in (
+        ("turned about z", d.yaw_deg, d.yaw_sigma_deg, _TURN_DEG),
+        ("tilted", d.tilt_deg, d.tilt_sigma_deg, _TILT_DEG),
+    ):
+        if abs(value) > max(least, 4.0 * sigma):
+            parts.append(f"{name} by {value:.2f} deg (+-{sigma:.2f})")
+            grave = max(grave, 1 + (abs(value) > 2.0 * least))
+    if abs(d.scale - 1.0) > max(_SCALE, 4.0 * d.scale_sigma):
+        parts.append(f"scaled by {d.scale:.4f} (+-{d.scale_sigma:.4f})")
+        grave = 2
+    if not parts:
+        what = f"prior and map agree to {off_m:.2f} m and {abs(d.yaw_deg):.2f} deg ({places} places)"
+        return [Finding("note", what)]
+    what = f"the map is {', '.join(parts)} against the prior, at the middle of the drive ({places} places)"
+    mend = "if the map is right, move the prior by that (--mount for a constant one, CRS and origin for the rest)"
+    return [Finding("error" if grave > 1 else "warning", what, mend)]
+
+
+def _heights(point_map: PointMap, T: F64, drive: Drive) -> list[Finding]:
+    """Of the sensor over the map's ground, once the difference is taken out."""
+    height = check_heights(point_map, T[:, :3, 3])
+    if not np.isfinite(height.median_m):
+        return []
+    if not -0.5 < height.median_m < 6.0:
+        what = f"the sensor is {height.median_m:.1f} m above the map's ground"
+        return [Finding("error", what, "the map's ground lies wrong under this drive: build it anew")]
+    if abs(height.worst_off_m) > LEVEL_M + 3.0 * drive.prior_sigma_m:
+        mend = "if the prior's heights are sound, so much is wrong with the map's ground: build it anew from its drives"
+        return [Finding("warning", f"by the prior, {height.complaint}", mend)]
+    return [Finding("note", f"by the prior: {height}")]

@@ -1,0 +1,474 @@
+"""Do prior and scans agree? The motion that the scans show is held against the prior under every reading of it.
+
+First what is grossly wrong, by runs of some twenty metres: the reading that leaves least unexplained. Then, of a prior
+that is right but for a little, scale, heading and pitch by one fit to a chain of some 300 m. The error of that fit is
+how the prior strays from the chain: positions err alike for seconds, so many scans say hardly more than a few would.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import scipy
+
+from mapvote.core import geometry
+from mapvote.core.types import F64, I64, Drive
+from mapvote.doctor.finding import Finding, Severity
+from mapvote.doctor.motion import LEAST_FIT, Road, Run
+from mapvote.doctor.prior import AS_IT_IS, READINGS, Reading, drift_angle_deg, scaled
+from mapvote.doctor.similarity import fit_similarity
+
+LEVER_M = 10.0
+"""A rotation counts as what it moves at this distance."""
+_TIME_S = 3.0
+"""Shifts in time are looked for so far, and over a quarter of the drive: beyond, little is left to compare."""
+CHAIN_SCANS = 150
+"""Of a chain: some 300 m."""
+_POSITION_M, _ROTATION_RAD = 0.15, np.radians(0.25)
+"""Errors of a prior's pose against a chain: they weigh positions against rotations."""
+_CHAIN_SCALE, _CHAIN_RAD = 0.003, np.radians(0.15)
+"""What the chain itself may err by."""
+_LEAST = {"scale": 0.02, "turn": 2.0, "pitch": 2.0, "time": 0.15}
+"""Share, degrees, degrees, seconds. Less is not complained of: priors err so much by themselves."""
+_SURE, _LIKELY = 4.0, 2.0
+"""Standard errors: what is more than so many is an error, and may be one."""
+_SURE_OF_TIME = 5.0
+_HEIGHT_M = (0.8, 4.0)
+"""Of a LiDAR over the road."""
+CANNOT_TELL = "this drive cannot tell without a turn whether"
+
+
+@dataclass(frozen=True, slots=True)
+class Measured:
+    """One number, fitted."""
+
+    kind: str
+    """ "scale", "turn", "pitch" or "time"."""
+    value: float
+    """Factor that the prior's positions are too large by; degrees; seconds."""
+    sigma: float
+    poses: Callable[[F64], F64]
+    """The prior mended."""
+
+    @property
+    def off(self) -> tuple[float, float]:
+        """(by how much, its standard error), of a scale as a share."""
+        if self.kind == "scale":
+            return abs(float(np.log(self.value))), self.sigma / self.value
+        return abs(self.value), self.sigma
+
+    @property
+    def least(self) -> float:
+        """What the drive can surely show."""
+        return max(_LEAST[self.kind], (_SURE_OF_TIME if self.kind == "time" else _SURE) * self.off[1])
+
+    @property
+    def words(self) -> tuple[str, str]:
+        """(what, how to mend it)."""
+        if self.kind == "scale":
+            what = f"prior and scans differ in scale: the prior is {self.value:.3f} times as large (+-{self.sigma:.3f})"
+            return what, "compare with a known length: a projection's scale (Mercator), feet, the sensor's calibration"
+        if self.kind == "time":
+            side = "late" if self.value > 0 else "early"
+            return (
+                f"the prior is {abs(self.value):.2f} s {side} (+-{self.sigma:.2f})",
+                "shift its times against the scans",
+            )
+        if self.kind == "pitch":
+            what = f"the scans are pitched by {self.value:.1f} deg (+-{self.sigma:.1f}) against the prior's motion"
+            return what, "level the points, or put the sensor's pitch into T_base_lidar and the prior's rotations"
+        what = f"headings and scans are turned against each other by {self.value:.1f} deg (+-{self.sigma:.1f})"
+        return what, "mend the yaw of T_base_lidar, or of the prior"
+
+
+def residuals(T: F64, runs: Sequence[Run]) -> F64:
+    """(2 * runs, 6) position (m) and rotation (rad) by which the motion told by poses T (n, 4, 4) differs from the one
+    seen, at the middle and at the end of every run, in the frame of its first scan."""
+    out = []
+    for run in runs:
+        for k in (len(run.indices) // 2, len(run.indices) - 1):
+            told, seen = geometry.inverse(T[run.indices[0]]) @ T[run.indices[k]], run.T_first_lidar[k]
+            apart = geometry.inverse(seen) @ told
+            if np.linalg.det(apart[:3, :3]) < 0:
+                out.append(np.array([*apart[:3, 3], np.pi, np.pi, np.pi]))
+            else:
+                out.append(np.concatenate([told[:3, 3] - seen[:3, 3], geometry.log(apart)[3:]]))
+    return np.array(out)
+
+
+def misfits(T: F64, runs: Sequence[Run]) -> F64:
+    """(runs,) metres by which the motion of each run differs, a rotation by what it moves 10 m away."""
+    r = residuals(T, runs)
+    each = np.linalg.norm(r[:, :3], axis=1) + LEVER_M * np.linalg.norm(r[:, 3:], axis=1)
+    return np.asarray(each.reshape(-1, 2).mean(axis=1))
+
+
+def at_times(T: F64, stamps_ns: I64, shift_s: float) -> F64:
+    """The poses (n, 4, 4) told for ``shift_s`` later than each stamp; held at the ends."""
+    seconds = (stamps_ns - stamps_ns[0]) * 1e-9
+    wanted = np.clip(seconds + shift_s, seconds[0], seconds[-1])
+    out = np.tile(np.eye(4), (len(T), 1, 1))
+    rotations = scipy.spatial.transform.Rotation.from_matrix(T[:, :3, :3])
+    out[:, :3, :3] = scipy.spatial.transform.Slerp(seconds, rotations)(wanted).as_matrix()
+    for axis in range(3):
+        out[:, axis, 3] = np.interp(wanted, seconds, T[:, axis, 3])
+    return out
+
+
+def _fit_rule(
+    rule: Callable[[F64], Callable[[F64], F64]], starts: list[F64], T: F64, runs: Sequence[Run]
+) -> tuple[F64, F64]:
+    """(parameters (p,) of ``rule`` that fit the runs best, their standard errors (p,)): robust, from several starts."""
+    weights = np.array([1.0, 1.0, 1.0, LEVER_M, LEVER_M, LEVER_M])
+
+    def off(parameters: F64) -> F64:
+        return np.asarray((residuals(rule(parameters)(T), runs) * weights).ravel())
+
+    costs = [float(np.abs(off(start)).sum()) for start in starts]
+    best = starts[int(np.argmin(costs))]
+    found = scipy.optimize.least_squares(off, best, loss="soft_l1", f_scale=0.3, max_nfev=30)
+    spread = 1.4826 * float(np.median(np.abs(found.fun))) + 0.02
+    # Neighbouring numbers of a run err alike: two of every three are taken to say nothing new.
+    covariance = np.linalg.pinv(found.jac.T @ found.jac) * 3.0 * spread**2
+    return np.asarray(found.x), np.sqrt(np.diag(covariance))
+
+
+def measure_scale(T: F64, runs: Sequence[Run]) -> Measured:
+    """By which factor the prior's positions are too large."""
+    told_m = sum(float(np.linalg.norm(T[r.indices[-1], :3, 3] - T[r.indices[0], :3, 3])) for r in runs)
+    seen_m = sum(float(np.linalg.norm(r.end[:3, 3])) for r in runs)
+    start = np.log(max(seen_m, 1e-3) / max(told_m, 1e-6))
+    x, sigma = _fit_rule(lambda p: scaled(float(np.exp(p[0]))), [np.array([start]), np.zeros(1)], T, runs)
+    factor = float(np.exp(-x[0]))
+    return Measured("scale", factor, factor * float(sigma[0]), scaled(1.0 / factor))
+
+
+def measure_turn(T: F64, runs: Sequence[Run]) -> tuple[Measured, Measured]:
+    """(yaw, pitch) by which the headings told are turned against the scans: degrees, counter-clockwise; nose up.
+
+    Roll hardly shows in a motion; it is left to the road.
+    """
+
+    def rule(p: F64) -> Callable[[F64], F64]:
+        C = geometry.from_xyz_rpy(0, 0, 0, pitch=float(p[1]), yaw=float(p[0]))
+        return lambda T: np.asarray(T @ C)
+
+    starts = [np.array([yaw, 0.0]) for yaw in np.radians(np.arange(-180, 180, 30))]
+    x, sigma = _fit_rule(rule, starts, T, runs)
+    yaw, pitch = np.degrees((x + np.pi) % (2 * np.pi) - np.pi)
+    yaw_sigma, pitch_sigma = np.degrees(sigma)
+    turn = Measured("turn", -float(yaw), float(yaw_sigma), rule(x))
+    return turn, Measured("pitch", float(pitch), float(pitch_sigma), rule(x))
+
+
+def measure_time(T: F64, runs: Sequence[Run], stamps_ns: I64) -> Measured | None:
+    """How much later than the scans the prior's times are; None if no shift that the drive can show fits."""
+    most_s = min(_TIME_S, (stamps_ns[-1] - stamps_ns[0]) * 1e-9 / 4.0)
+
+    def rule(p: F64) -> Callable[[F64], F64]:
+        return lambda T: at_times(T, stamps_ns, float(p[0]))
+
+    starts = [np.array([s]) for s in np.arange(-most_s, most_s + 0.01, min(0.2, most_s))]
+    x, sigma = _fit_rule(rule, starts, T, runs)
+    return None if abs(x[0]) >= most_s else Measured("time", float(x[0]), float(sigma[0]), rule(x))
+
+
+@dataclass(frozen=True, slots=True)
+class Whole:
+    """How the prior differs from a chain of scans."""
+
+    scale: Measured
+    turn: Measured
+    pitch: Measured
+    length_m: float
+    """Of the chain, end to end."""
+    rms_m: float
+    """How far the prior strays from the chain once scale and turn are taken out."""
+
+
+def unbroken(chain: Run) -> Run:
+    """Up to the first scan that does not fit those before it."""
+    bad = np.flatnonzero(chain.fit < LEAST_FIT)
+    end = int(bad[0]) if len(bad) else len(chain.fit)
+    return Run(chain.indices[:end], chain.T_first_lidar[:end], chain.fit[:end])
+
+
+def held_against(T: F64, chain: Run, prior_sigma_m: float = 0.0) -> Whole | None:
+    """The prior's poses T (n, 4, 4) against the chain; None where it is too short or hardly moves.
+
+    ``prior_sigma_m``: an error that grows along the drive looks like a scale, and across it like a turn; from one end
+    to the other two errors of the prior differ by sqrt(2) of it.
+    """
+    seen = chain.T_first_lidar
+    if len(seen) < 5:
+        return None
+    away = seen[:, :3, 3] - seen[:, :3, 3].mean(axis=0)
+    reach_m, extent_m = float(np.sqrt((away**2).sum(axis=1).mean())), float(np.linalg.norm(np.ptp(away, axis=0)))
+    if reach_m < 1.0:
+        return None
+    fit = fit_similarity(seen, T[chain.indices], position_m=_POSITION_M, rotation_rad=_ROTATION_RAD, own_turn=True)
+    strays = float(np.linalg.norm(fit.off_m, axis=1).mean()) / reach_m
+    share = float(np.hypot(strays, np.sqrt(2.0) * prior_sigma_m / extent_m))
+    yaw_deg, pitch_deg = fit.own_deg
+    back = np.eye(4)
+    back[:3, :3] = scipy.spatial.transform.Rotation.from_euler("zy", fit.own_deg, degrees=True).inv().as_matrix()
+    sigma_deg = float(np.degrees(np.hypot(share, _CHAIN_RAD)))
+
+    def turned(T: F64) -> F64:
+        return np.asarray(T @ back)
+
+    return Whole(
+        Measured("scale", fit.scale, fit.scale * float(np.hypot(share, _CHAIN_SCALE)), scaled(1.0 / fit.scale)),
+        Measured("turn", yaw_deg, sigma_deg, turned),
+        Measured("pitch", -pitch_deg, sigma_deg, turned),
+        float(np.linalg.norm(seen[-1, :3, 3])),
+        fit.rms_m,
+    )
+
+
+def check_small(
+    T: F64, chain: Run, runs: Sequence[Run], time: Measured | None, stamps_ns: I64, prior_sigma_m: float
+) -> list[Finding]:
+    """Of the prior's poses T (n, 4, 4): scale, turn and pitch by the chain, the shift in time by the runs as well.
+
+    What is no larger than four standard errors cannot be decided: a note.
+    """
+    followed, chain = chain, unbroken(chain)
+    found = _broken(followed, len(chain.indices))
+    whole = held_against(T, chain, prior_sigma_m)
+    if time is not None and _shows(time, T, runs):
+        later = held_against(at_times(T, stamps_ns, time.value), chain, prior_sigma_m)
+        if whole is not None and later is not None and later.rms_m < 0.8 * whole.rms_m:
+            return [*found, Finding("error" if abs(time.value) > 2.0 * _LEAST["time"] else "warning", *time.words)]
+    if whole is None:
+        return [*found, Finding("note", "too few scans fit each other to measure scale and heading", "drive farther")]
+    small = [f for m in (whole.scale, whole.turn, whole.pitch) for f in _told(m)]
+    shown = any(f.severity != "note" for f in small)
+    return found + small + ([] if shown else [_not_shown(whole, time)])
+
+
+def _broken(chain: Run, after: int) -> list[Finding]:
+    """Where a scan does not fit the ``after`` ones before it, though the runs do by themselves."""
+    if after == len(chain.indices):
+        return []
+    before, scan = chain.indices[after - 1], chain.indices[after]
+    what = f"between scans {before} and {scan} the sensor is elsewhere at once: they do not fit each other"
+    return [Finding("warning", what, "are scans missing there, or out of order?")]
+
+
+def _shows(time: Measured, T: F64, runs: Sequence[Run]) -> bool:
+    before, after = (float(np.median(misfits(one, runs))) for one in (T, time.poses(T)))
+    return abs(time.value) > time.least and before - after > 0.25 * before
+
+
+def _told(m: Measured) -> list[Finding]:
+    off, sigma = m.off
+    if off <= max(_LEAST[m.kind], _LIKELY * sigma):
+        return []
+    what, mend = m.words
+    if off <= _SURE * sigma:
+        return [Finding("note", f"{what}; that may be chance", f"a longer drive tells; else: {mend}")]
+    return [Finding("error" if off > 2.0 * _LEAST[m.kind] else "warning", what, mend)]
+
+
+def _not_shown(whole: Whole, time: Measured | None) -> Finding:
+    """How large a mistake may be before this drive shows it: a short one shows little."""
+    told = [f"{whole.scale.least:.0%} of scale", f"{whole.turn.least:.0f} deg of heading"]
+    told += [f"{time.least:.1f} s"] if time is not None else []
+    what = f"over {whole.length_m:.0f} m mistakes of the prior show from {', '.join(told)} on"
+    return Finding("note", what, "a longer drive with turns tells more")
+
+
+@dataclass(frozen=True, slots=True)
+class _Held:
+    """A reading held against the runs."""
+
+    reading: Reading
+    misfit: F64
+    """(runs,) metres."""
+    special: bool
+    """False: a number or a catch-all, named only where nothing more special fits."""
+
+    @property
+    def median(self) -> float:
+        return float(np.median(self.misfit))
+
+
+def check_agreement(
+    drive: Drive, T: F64, runs: Sequence[Run], road: Road, turns: float, chain: Callable[[], Run]
+) -> tuple[list[Finding], F64]:
+    """(findings, the poses (n, 4, 4) mended as far as is known). ``turns``: how the points go round, for a mirror;
+    ``chain``: a long run, asked for where the prior is right but for a little."""
+    length_m = float(np.median([run.length_m for run in runs]))
+    told_m = float(np.median([np.linalg.norm(T[r.indices[-1], :3, 3] - T[r.indices[0], :3, 3]) for r in runs]))
+    if length_m < 1.0 and told_m < 1.0:
+        return [Finding("note", "the vehicle hardly moves: prior and scans cannot be compared")], T
+    if length_m < min(1.0, 0.1 * told_m):
+        what = f"the scans stand still where the prior moves {told_m:.1f} m"
+        return [Finding("error", what, "is it the trajectory of this drive? Are the points in the map's frame?")], T
+    as_it_is = _held(AS_IT_IS, T, runs)
+    held = [_held(reading, T, runs) for reading in READINGS]
+    turn, pitch = measure_turn(T, runs)
+    time = measure_time(T, runs, drive.stamps_ns)
+    numbers = [measure_scale(T, runs), turn, pitch, *([time] if time is not None else [])]
+    wordy = [m for m in numbers if m is not (turn if abs(pitch.value) > abs(turn.value) else pitch)]
+    held += [_held(_number_reading(m, T, runs, road), T, runs, special=False) for m in wordy]
+    best = min([as_it_is, *held], key=lambda h: h.median)
+    floor_m = 0.1 + 0.12 * length_m + 2.0 * min(drive.prior_sigma_m, 1.5)
+    if _clearly_better(best, as_it_is, length_m):
+        if best.median > floor_m:
+            return [_nothing_fits(as_it_is, runs, length_m, told_m)], T
+        group = _like_the_best(best, held, length_m, runs)
+        return [_named(group, as_it_is, best, length_m)], best.reading.poses(T)
+    if as_it_is.median > floor_m:
+        return [_nothing_fits(as_it_is, runs, length_m, told_m)], T
+    found = check_small(T, chain(), runs, time, drive.stamps_ns, drive.prior_sigma_m)
+    found += _places(as_it_is, runs) + _scatter(drive, as_it_is, length_m)
+    found += _cannot_tell(as_it_is, held, length_m, turns, drive.sensor.clockwise)
+    return found, T
+
+
+def _held(reading: Reading, T: F64, runs: Sequence[Run], special: bool = True) -> _Held:
+    return _Held(reading, misfits(reading.poses(T), runs), special and not reading.catch_all)
+
+
+def _clearly_better(best: _Held, other: _Held, length_m: float) -> bool:
+    """In the median, and in most runs by itself: a jump of the prior spoils some runs under every reading. A number
+    fits much a little: it must leave less."""
+    runs = float((best.misfit < 0.6 * other.misfit).mean())
+    return (
+        best.median < (0.5 if best.special else 0.4) * other.median
+        and other.median - best.median > 0.15 + 0.005 * length_m
+        and runs > 0.6
+    )
+
+
+def _worse(one: _Held, best: _Held, length_m: float) -> bool:
+    """Whether the runs tell ``one`` from the best."""
+    more = one.misfit - best.misfit
+    error = float(more.std()) / np.sqrt(len(more)) + 0.02
+    return bool(np.median(more) > max(0.05, 0.004 * length_m) and more.mean() > 2.0 * error)
+
+
+def _like_the_best(best: _Held, held: Sequence[_Held], length_m: float, runs: Sequence[Run]) -> list[_Held]:
+    """What the runs do not tell from the best. The side that breaks the custom (x is forward) goes first."""
+    group = [h for h in held if h is best or not _worse(h, best, length_m)]
+    special = [h for h in group if h.special]
+    wanted = "prior" if abs(forward_deg(runs)) < 15.0 else "scans"
+    by_convention = [h for h in special if h.reading.told_by in (wanted, "order") or _is_left_handed(h.reading)]
+    numbers = [h for h in group if not h.special and h.reading.told_by == wanted]
+    chosen = by_convention or numbers or special or group
+    if not any(h.reading.angle for h in chosen):
+        chosen += [h for h in numbers if h.reading.angle]
+    return sorted(chosen, key=lambda h: h.median)
+
+
+def _is_left_handed(reading: Reading) -> bool:
+    return "left-handed" in reading.name
+
+
+def forward_deg(runs: Sequence[Run]) -> float:
+    """The azimuth in the scans towards which the vehicle moves, median over the runs' first steps."""
+    ahead = [run.T_first_lidar[1, :2, 3] for run in runs if np.linalg.norm(run.T_first_lidar[1, :2, 3]) > 0.05]
+    if not ahead:
+        return 0.0
+    angle = np.array([np.arctan2(y, x) for x, y in ahead])
+    return float(np.degrees(np.arctan2(np.median(np.sin(angle)), np.median(np.cos(angle)))))
+
+
+def _number_reading(m: Measured, T: F64, runs: Sequence[Run], road: Road) -> Reading:
+    if m.kind == "scale":
+        return Reading(*_scale_words(m, road), m.poses)
+    if m.kind == "time":
+        return Reading(m.words[0], f"shift its times by {-m.value:+.2f} s, or its rows against the scans", m.poses)
+    if m.kind == "pitch":
+        side = "scans" if road.tilt_deg > 0.5 * abs(m.value) else "prior"
+        return Reading(*m.words, m.poses, side, angle=True)
+    forward, drift = forward_deg(runs), drift_angle_deg(T)
+    if abs(forward) > max(0.5 * abs(m.value), 2.0 * abs(drift)):
+        back = "face backwards (x to the rear): they " if abs(forward) > 170.0 else ""
+        what = f"the scans {back}are turned by {forward:.1f} deg about z (+-{m.sigma:.1f}) from the direction of travel"
+        return Reading(what, "turn the points, or T_base_lidar, so that x is forward", m.poses, "scans", angle=True)
+    what = f"the prior's headings are off by {m.value:.1f} deg (+-{m.sigma:.1f}), counter-clockwise"
+    return Reading(what, f"turn its rotations by {-m.value:.1f} deg about z", m.poses, angle=True)
+
+
+def _scale_words(m: Measured, road: Road) -> tuple[str, str]:
+    """Which side has the wrong scale shows by the sensor's height over the road."""
+    low, high = _HEIGHT_M
+    size = f"{m.value:.3f} times (+-{m.sigma:.3f})" if 0.1 < m.value < 10 else f"{m.value:.3g} times"
+    usual, other = low <= road.depth_m <= high, low <= road.depth_m * m.value <= high
+    if road.is_there and other and not usual:
+        what = f"the scans are {1 / m.value:.3f} times too large (+-{m.sigma / m.value**2:.3f})"
+        return (
+            f"{what}: by them the road lies {road.depth_m:.1f} m below",
+            f"multiply their points by {m.value:.4f} (feet are 0.3048 m)",
+        )
+    if road.is_there and usual and not other:
+        return f"the prior's positions are {size} too large", f"divide its positions by {m.value:.4f}"
+    what = f"the prior's positions are {size} too large, or the scans that much too small"
+    return what, "compare with a length that you know; Mercator's metres need a projection (UTM), feet 0.3048"
+
+
+def _named(group: Sequence[_Held], as_it_is: _Held, best: _Held, length_m: float) -> Finding:
+    names = "; or ".join(h.reading.name for h in group)
+    mends = "; or ".join(dict.fromkeys(h.reading.mend for h in group))
+    apart = " (this drive cannot tell which: a turn would)" if len(group) > 1 else ""
+    so = f": so {best.median:.2f} m remain over {length_m:.0f} m driven, else {as_it_is.median:.2f} m"
+    return Finding("error", names + apart + so, mends)
+
+
+def _nothing_fits(as_it_is: _Held, runs: Sequence[Run], length_m: float, told_m: float) -> Finding:
+    fits = as_it_is.misfit < 0.1 + 0.1 * length_m
+    if fits.mean() >= 0.25:
+        bad = [run for run, good in zip(runs, fits, strict=True) if not good]
+        first, last = bad[0].indices[0], bad[-1].indices[-1]
+        places = f"in {fits.sum()} of {len(fits)} places"
+        what = f"the prior fits the scans in {places} only; it does not between scans {first} and {last}"
+        return Finding("error", what, "did it stand still, jump or change its frame there? Leave that part out")
+    what = (
+        f"prior and scans do not belong together under any reading: the scans move {length_m:.1f} m where the prior "
+        f"moves {told_m:.1f} m, {as_it_is.median:.1f} m apart"
+    )
+    return Finding("error", what, "is it the trajectory of this drive, one row for each scan, in order?")
+
+
+def _places(as_it_is: _Held, runs: Sequence[Run]) -> list[Finding]:
+    usual = as_it_is.median
+    bad = np.flatnonzero(as_it_is.misfit > 4.0 * usual + 1.0)
+    if not len(bad):
+        return []
+    run = runs[int(bad[np.argmax(as_it_is.misfit[bad])])]
+    what = (
+        f"between scans {run.indices[0]} and {run.indices[-1]} the prior is {as_it_is.misfit[bad].max():.1f} m off the "
+        f"scans' motion, elsewhere {usual:.1f} m ({len(bad)} of {len(runs)} places)"
+    )
+    grave: Severity = "error" if as_it_is.misfit[bad].max() > 5.0 else "warning"
+    return [Finding(grave, what, "a jump, or rows that belong to other scans: mend or leave out that part")]
+
+
+def _scatter(drive: Drive, as_it_is: _Held, length_m: float) -> list[Finding]:
+    expected = 1.5 * drive.prior_sigma_m + 10.0 * np.radians(2.0 * drive.prior_sigma_deg) + 0.01 * length_m
+    if as_it_is.median < 0.8 * expected:
+        return []
+    what = (
+        f"the prior is off the scans' motion by {as_it_is.median:.1f} m over {length_m:.0f} m, but prior_sigma_m says "
+        f"{drive.prior_sigma_m:g}"
+    )
+    return [Finding("warning", what, "say how far it may be off: prior_sigma_m, prior_sigma_deg in drive.toml")]
+
+
+def _cannot_tell(
+    as_it_is: _Held, held: Sequence[_Held], length_m: float, turns: float, clockwise: bool
+) -> list[Finding]:
+    """Readings that this drive would not betray. Of a mirror the way in which the points go round is a hint."""
+    like = [h.reading for h in held if h.special and not _worse(h, as_it_is, length_m)]
+    if not like:
+        return []
+    names = "; ".join(reading.name for reading in like)
+    what = f"{CANNOT_TELL}: {names}"
+    if any(_is_left_handed(reading) for reading in like) and turns > 0.5 and clockwise:
+        what += " (the points go round counter-clockwise, most sensors clockwise)"
+    return [Finding("note", what, "check with a drive that turns, or against a map (--map)", map_tells=True)]
