@@ -52,7 +52,7 @@ def explain(
     y: Annotated[float, typer.Argument(metavar="Y", help="map metres")],
     key_file: KeyFile = None,
 ) -> None:
-    """Why a cell of the map is as it is: every vote on it, which version heard it, or why it does not count.
+    """Why a cell of the map is as it is: every vote on it, which version counted it, or why it does not count.
 
     mapvote explain fleet.db 12.5 -- -3.0
     """
@@ -71,12 +71,12 @@ def explain(
         print(f"the last of them is right with a probability of {told['probability']:.2f}")
     rows = []
     for v in told["votes"]:
-        heard = ", ".join(str(number) for number in v["heard"])
+        counted = ", ".join(str(number) for number in v["counted_in"])
         counts = "counts" if v["counts"] else v["why"]
         ended = v["end"][:19].replace("T", " ") + "Z" if "end" in v else when(v["end_ns"])
         sure = "" if v.get("sure") is None else f"{100 * v['sure']:.0f} %"
-        rows.append((v["vehicle"], v["drive"], ended, str(v["version"]), v["state"], sure, heard, counts))
-    print_table(("vehicle", "drive", "ended", "drove with", "says", "sure", "heard in", "now"), rows)
+        rows.append((v["vehicle"], v["drive"], ended, str(v["version"]), v["state"], sure, counted, counts))
+    print_table(("vehicle", "drive", "ended", "drove with", "says", "sure", "counted in", "now"), rows)
 
 
 def vehicles(store: StoreOrUrl, key_file: KeyFile = None) -> None:

@@ -12,7 +12,7 @@ from scipy.stats import binom
 
 from mapvote.core.grid import TILE_CELLS, Lattice
 from mapvote.core.types import NO_VOTE, U8, CellState
-from mapvote.server.views.consensus import Spoken, Standing, compare, standings_of
+from mapvote.server.views.consensus import Spoken, VehicleStanding, compare, standings_of
 
 DAY = 86_400_000_000_000
 UO, UE, CO, CE, UN = CellState
@@ -31,7 +31,7 @@ def ghosts(n: int, fill: int = CellState.UNCHANGED_EMPTY) -> U8:
     return states
 
 
-def standings(*votes: tuple[str, int, U8]) -> dict[str, Standing]:
+def standings(*votes: tuple[str, int, U8]) -> dict[str, VehicleStanding]:
     compared = compare((0, 0), [Spoken(name, day * DAY, states) for name, day, states in votes])
     return {s.vehicle: s for s in standings_of(compared, Lattice())}
 

@@ -2,29 +2,34 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import sqlalchemy as sa
 
 from hand_made import Say, make_ballot, states_plane, two_walls, wall
+from mapvote.codec.arrays import unpack_plane
 from mapvote.codec.ballot import encode
 from mapvote.config import FuseSettings
 from mapvote.core.types import N_STATES, NO_VOTE, CellState
 from mapvote.core.voting import VOTE_UNIT
+from mapvote.fusion.fuse import decide_tile
 from mapvote.fusion.tile_vote import DAY_NS
 from mapvote.server.store import schema
 from mapvote.server.store.admission import Intake, accept, examine
 from mapvote.server.store.ballots import Receipt, withdraw
-from mapvote.server.store.decisions import unpack_tally_plane
+from mapvote.server.store.decisions import REASONS, unpack_tally_plane
 from mapvote.server.store.keys import issue, revoke
 from mapvote.server.store.policy import Policy, RoundPolicy
 from mapvote.server.store.publish import preview, publish
 from mapvote.server.store.store import Store
+from mapvote.server.views import explain
 from mapvote.server.views.events import last_events
-from mapvote.server.views.explain import COPY, CellStory, as_told, explain_cell, states_of
+from mapvote.server.views.explain import COPY, CellStory, as_told, explain_cell
 from mapvote.server.views.point_lod import evidence
 from standing_clock import Clock
 
@@ -57,7 +62,7 @@ def story(store: Store, cell: tuple[int, int] = WALL) -> CellStory:
     return explain_cell(store, (cell[1] + 0.5) * 0.3, (cell[0] + 0.5) * 0.3)
 
 
-def test_a_vote_that_a_version_heard_stays_in_the_story_when_it_is_taken_back(store: Store, clock: Clock) -> None:
+def test_a_vote_that_a_version_counted_stays_in_the_story_when_it_is_taken_back(store: Store, clock: Clock) -> None:
     for vehicle in ("a", "b", "c"):
         say(store, vehicle, CellState.CHANGED_EMPTY)
     assert publish(store).version == 2
@@ -65,7 +70,7 @@ def test_a_vote_that_a_version_heard_stays_in_the_story_when_it_is_taken_back(st
     issue(store, "b", "vehicle")
     revoke(store, "b")
     found = {vote.vehicle: vote for vote in story(store).votes}
-    assert [(found[name].state, found[name].heard, found[name].counts) for name in "abc"] == [
+    assert [(found[name].state, found[name].counted_in, found[name].counts) for name in "abc"] == [
         ("changed_empty", (2,), False)
     ] * 3
     assert (found["a"].why, found["b"].why) == ("withdrawn", "its vehicle's key was revoked")
@@ -75,15 +80,15 @@ def test_a_vote_that_a_version_heard_stays_in_the_story_when_it_is_taken_back(st
     assert [vote.state for vote in story(store).votes] == ["unreadable"], "of those that stand"
 
 
-def test_a_vote_is_named_with_the_version_that_heard_it_or_why_it_does_not_count(store: Store, clock: Clock) -> None:
+def test_a_vote_is_named_with_the_version_that_counted_it_or_why_it_does_not_count(store: Store, clock: Clock) -> None:
     for vehicle in ("a", "b"):
         say(store, vehicle, CellState.CHANGED_EMPTY)
-    assert [(v.counts, v.heard) for v in story(store).votes] == [(True, ()), (True, ())]
+    assert [(v.counts, v.counted_in) for v in story(store).votes] == [(True, ()), (True, ())]
     assert publish(store).version == 2
     clock.now += DAY_NS
     say(store, "c", CellState.UNCHANGED_EMPTY)
     told = story(store)
-    assert [(v.vehicle, v.version, v.heard, v.counts) for v in told.votes] == [
+    assert [(v.vehicle, v.version, v.counted_in, v.counts) for v in told.votes] == [
         ("a", 1, (2,), False), ("b", 1, (2,), False), ("c", 2, (), True)
     ]  # fmt: skip
     assert told.votes[0].why == "spent: version 2 has changed the cell since"
@@ -103,7 +108,7 @@ def test_what_comes_and_goes_is_called_temporary_until_it_can_be_expected_to_sta
     assert story(store, LAWN).thing == ""
     assert publish(store).published
     assert story(store, LAWN).thing == "stands: brought by vehicles"
-    assert [v.heard for v in story(store, LAWN).votes] == [(2,)] * 3
+    assert [v.counted_in for v in story(store, LAWN).votes] == [(2,)] * 3
     for vehicle in ("a", "b"):
         say(store, vehicle, CellState.CHANGED_EMPTY, LAWN)
     assert publish(store).published
@@ -141,10 +146,10 @@ def test_a_damaged_decision_is_told_and_hides_no_vote(store: Store) -> None:
     told = story(store)
     assert told.decisions == [(2, "unreadable")]
     assert told.probability is None
-    assert [vote.heard for vote in told.votes] == [(2,), (2,)]
+    assert [vote.counted_in for vote in told.votes] == [(2,), (2,)]
 
 
-def test_of_copies_the_story_says_that_one_is_heard_and_the_log_whose_they_are_once(store: Store, clock: Clock) -> None:
+def test_of_copies_the_story_says_that_one_counts_and_the_log_whose_they_are_once(store: Store, clock: Clock) -> None:
     wandering = np.random.default_rng(1).integers(-5, 6, (4, 256)).cumsum(axis=1).clip(-30, 30)
     for name, way in (("a", wandering[:2]), ("liar", wandering[:2]), ("b", wandering[2:])):
         rows = np.arange(256)[:, None]
@@ -156,10 +161,36 @@ def test_of_copies_the_story_says_that_one_is_heard_and_the_log_whose_they_are_o
     assert {vote.vehicle: vote.why for vote in story(store).votes} == {"a": COPY, "b": "", "liar": ""}
     assert publish(store).published
     publish(store)
-    assert {vote.vehicle: vote.heard for vote in story(store).votes} == {"a": (), "b": (2,), "liar": (2,)}
+    assert {vote.vehicle: vote.counted_in for vote in story(store).votes} == {"a": (), "b": (2,), "liar": (2,)}
+    assert {vote.vehicle: vote.left_out_of for vote in story(store).votes} == {
+        "a": ((2, REASONS["copy"]),), "b": (), "liar": ()
+    }  # fmt: skip
     (told,) = [event for event in last_events(store) if event["kind"] == "copy"]
     assert told["detail"].startswith("a's ballot ")
     assert "is a copy of liar's " in told["detail"]
+
+
+def test_the_story_of_a_cell_of_many_versions_decides_its_tile_once(
+    store: Store, clock: Clock, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store.set_policy(Policy(fuse=FuseSettings(max_deleted_share=1.0, prior_stay_days=1000.0)))
+    for k in range(4):
+        clock.now += 40 * DAY_NS
+        for vehicle in ("a", "b"):
+            say(store, vehicle, CellState.CHANGED_EMPTY if k % 2 == 0 else CellState.CHANGED_OCCUPIED)
+        assert publish(store).published
+    decided, statements = Counter[str](), list[object]()
+
+    def decide(*given: Any) -> Any:
+        decided["tile"] += 1
+        return decide_tile(*given)
+
+    monkeypatch.setattr(explain, "decide_tile", decide)
+    sa.event.listen(store.database.engine, "before_cursor_execute", lambda *given: statements.append(given[2]))
+    told = story(store)
+    assert [version for version, _ in told.decisions] == [2, 3, 4, 5]
+    assert [vote.counted_in for vote in told.votes] == [(k,) for k in range(2, 6) for _ in "ab"]
+    assert (decided["tile"], len(statements) <= 20) == (1, True), len(statements)
 
 
 TIE, CLEAR = (10, 10), (10, 11)
@@ -188,4 +219,4 @@ def test_a_tie_of_a_one_stage_ballot_is_undetermined_everywhere(one_stage: Store
     assert [page[TIE][3], page[CLEAR][3]] == [NO_VOTE, CellState.CHANGED_EMPTY]
     (fused,) = preview(store).fused
     assert unpack_tally_plane(fused.tally)[TIE].any()
-    assert states_of(fused.states)[TIE] == CellState.UNDETERMINED
+    assert unpack_plane(fused.states, "<u1", (256, 256), "states")[TIE] == CellState.UNDETERMINED

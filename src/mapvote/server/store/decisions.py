@@ -117,16 +117,16 @@ class Record:
         return unpack_standings(self.packed_standings)
 
 
-def records_of(
-    connection: sa.Connection, index: TileIndex, *, last: int | None = None, version: int | None = None
-) -> list[Record]:
-    """The decision records of a tile, oldest version first: all, the ``last`` so many, or that of one ``version``."""
+def records_of(connection: sa.Connection, index: TileIndex, *, after: int = 0, upto: int | None = None) -> list[Record]:
+    """The decision records of a tile, oldest version first: of all versions, or of those ``after`` one ``upto``
+    another, the latter included."""
     d = schema.decisions
     query = sa.select(d.c.version, d.c.states, d.c.tally, d.c.odds, d.c.standings)
-    query = query.where(d.c.row == index[0], d.c.col == index[1]).order_by(d.c.version.desc()).limit(last)
-    if version is not None:
-        query = query.where(d.c.version == version)
-    return [Record(*row) for row in connection.execute(query).all()[::-1]]
+    query = query.where(d.c.row == index[0], d.c.col == index[1]).order_by(d.c.version)
+    query = query.where(d.c.version > after)
+    if upto is not None:
+        query = query.where(d.c.version <= upto)
+    return [Record(*row) for row in connection.execute(query).all()]
 
 
 def pack_states(states: U8) -> bytes:

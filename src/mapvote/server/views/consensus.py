@@ -61,7 +61,7 @@ class Contradiction:
 
 
 @dataclass(frozen=True, slots=True)
-class Standing:
+class VehicleStanding:
     """How a vehicle stands to the consensus, with all that the verdict rests on."""
 
     vehicle: str
@@ -121,7 +121,7 @@ def standings_of(
     tolerated: float = 2.0,
     significance: float = 0.01,
     min_cells: int = 4,
-) -> list[Standing]:
+) -> list[VehicleStanding]:
     """The standing of every vehicle over all tiles, in order of name.
 
     Under the hypothesis that a vehicle contradicts at ``tolerated`` times the others' rate per compared cell, its share
@@ -148,7 +148,9 @@ def standings_of(
             verdict = "contradicts"
         elif mine and found * others <= tolerated * mine * others_found:
             verdict = "consistent"
-        out.append(Standing(name, verdict, mine, found, others, others_found, p_value, threshold, evidence[name]))
+        out.append(
+            VehicleStanding(name, verdict, mine, found, others, others_found, p_value, threshold, evidence[name])
+        )
     return out
 
 

@@ -16,10 +16,9 @@ from mapvote.core.grid import CELL_SIZE, CELLS, TILE_CELLS, TileIndex
 from mapvote.core.tile import Tile
 from mapvote.core.types import Bool
 from mapvote.fusion.edit import delete_points
-from mapvote.fusion.odds import unpack_agreed
 from mapvote.fusion.pending import Pending
 from mapvote.server.errors import NotFound
-from mapvote.server.store.decisions import unpack_tally_plane
+from mapvote.server.store.decisions import Record
 from mapvote.server.store.fusion_jobs import Fused
 from mapvote.server.store.queries import load_tile, tile_of
 from mapvote.server.store.reviews import Review, Verdict, decide, standing
@@ -27,7 +26,6 @@ from mapvote.server.store.round import Gate, Round, edited_tile, reasons_to_hold
 from mapvote.server.store.store import Store
 from mapvote.server.views.change_objects import ChangeObject, Decided, change_objects, changed_cells
 from mapvote.server.views.cutout import cut_out
-from mapvote.server.views.explain import states_of
 from mapvote.server.views.geojson import to_geojson
 from mapvote.server.views.history import tiles_at
 from mapvote.server.views.picture import before_and_after
@@ -90,8 +88,8 @@ def _desk_of(store: Store, found: Round) -> Desk:
 
 
 def _decided(fused: Fused) -> Decided:
-    states = states_of(fused.states)
-    return Decided(0, states, unpack_tally_plane(fused.tally), odds=unpack_agreed(fused.odds, states))
+    record = Record(0, fused.states, fused.tally, fused.odds, fused.standings)
+    return Decided(0, record.states, record.tally, odds=record.odds)
 
 
 def pending_picture(store: Store, change: str, executor: Executor | None = None) -> bytes:

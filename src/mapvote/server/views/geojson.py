@@ -15,7 +15,7 @@ from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Lattice
 from mapvote.core.types import F64
 from mapvote.formats.geo.frame import MapFrame, frame_of
 from mapvote.server.views.change_objects import ChangeObject
-from mapvote.server.views.consensus import Standing
+from mapvote.server.views.consensus import VehicleStanding
 from mapvote.server.views.outlines import Ring
 
 
@@ -146,7 +146,7 @@ def tile_squares(tiles: Sequence[Mapping[str, Any]], lattice: Lattice) -> dict[s
     return _collection([(_square(lattice, tile["row"], tile["col"]), dict(tile)) for tile in tiles])
 
 
-def contradictions(standings: Sequence[Standing]) -> dict[str, Any]:
+def contradictions(standings: Sequence[VehicleStanding]) -> dict[str, Any]:
     """Where vehicles contradict the others, as GeoJSON points in map metres."""
     return _collection(
         [
@@ -160,7 +160,7 @@ def contradictions(standings: Sequence[Standing]) -> dict[str, Any]:
     )
 
 
-def standing_rows(standings: Sequence[Standing]) -> list[dict[str, Any]]:
+def standing_rows(standings: Sequence[VehicleStanding]) -> list[dict[str, Any]]:
     """A row a vehicle, without the places."""
     told = ("vehicle", "verdict", "cells", "objects", "others_cells", "others_objects", "p_value", "threshold")
     return [{name: getattr(s, name) for name in told} for s in standings]

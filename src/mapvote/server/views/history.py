@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cache, partial
 from typing import Any
@@ -12,28 +12,27 @@ import sqlalchemy as sa
 from mapvote.codec.ballot import tile_key
 from mapvote.core.grid import TileIndex
 from mapvote.core.tile import Tile
-from mapvote.core.types import MapvoteError
-from mapvote.fusion.odds import unpack_agreed
+from mapvote.core.types import NO_VOTE, U8, MapvoteError
 from mapvote.fusion.tile_vote import DAY_NS, TileVote, one_each
 from mapvote.server.errors import Unavailable
 from mapvote.server.store import schema
-from mapvote.server.store.decisions import unpack_tally_plane
+from mapvote.server.store.decisions import Standing, cells_in, records_of
 from mapvote.server.store.policy import policy_in
-from mapvote.server.store.queries import current_version, load_tile, tile_as_of, tiles_of, tiles_that_differ, version_of
+from mapvote.server.store.queries import current_version, load_tile, tiles_of, tiles_that_differ, version_of
 from mapvote.server.store.store import Store
 from mapvote.server.store.votes import (
     FOREVER,
     Electorate,
-    counting_votes,
+    StoredVote,
     from_sound_ballots,
     judged_votes,
     read_votes,
     standing_tiles,
 )
 from mapvote.server.views.change_objects import Decided, change_objects, changed_cells
-from mapvote.server.views.consensus import Compared, Spoken, Standing, compare, standings_of
+from mapvote.server.views.consensus import Compared, Spoken, VehicleStanding, compare, standings_of
 from mapvote.server.views.cutout import Box, Cutout, Tiles, cut_out, of_feature, whole_page
-from mapvote.server.views.explain import said_by, states_of
+from mapvote.server.views.explain import said_by, sound_votes
 from mapvote.server.views.geojson import to_geojson
 from mapvote.server.views.picture import before_and_after
 
@@ -57,7 +56,7 @@ def changes_between(
         for index, *pair in tiles_that_differ(connection, old, new):
             try:
                 tiles = [load_tile(connection, store.lattice.tile(index), hashes) for hashes in pair]
-                decided = list(_decided(store, connection, index, min(old, new), max(old, new)))
+                decided = _decided(connection, index, min(old, new), max(old, new))
             except Unavailable:
                 raise
             except MapvoteError:
@@ -115,16 +114,28 @@ def tiles_at(store: Store, version: int) -> Tiles:
     return load
 
 
-def _decided(store: Store, connection: sa.Connection, index: TileIndex, old: int, new: int) -> Iterable[Decided]:
-    d = schema.decisions
-    query = sa.select(d.c.version, d.c.states, d.c.tally, d.c.odds).where(d.c.row == index[0], d.c.col == index[1])
-    for row in connection.execute(query.where(d.c.version > old, d.c.version <= new).order_by(d.c.version)).all():
-        version = version_of(connection, row.version)
-        tile = tile_as_of(connection, store.lattice.tile(index), row.version - 1)
-        votes = from_sound_ballots(connection, Electorate.of(version), partial(counting_votes, connection, tile))
-        drives = [(vote.end_ns, vote.states) for vote in votes if vote.states is not None]
-        states = states_of(row.states)
-        yield Decided(row.version, states, unpack_tally_plane(row.tally), drives, unpack_agreed(row.odds, states))
+def _decided(connection: sa.Connection, index: TileIndex, old: int, new: int) -> list[Decided]:
+    """What the versions after ``old`` up to ``new`` decided about a tile, and what the ballots said that counted."""
+    records = records_of(connection, index, after=old, upto=new)
+    counted = {standing.ballot for record in records for standing in record.standings if not standing.why}
+    sound = sound_votes(connection, index, counted)
+    return [
+        Decided(record.version, record.states, record.tally, _drives(record.standings, sound), record.odds)
+        for record in records
+    ]
+
+
+def _drives(standings: Sequence[Standing], sound: Mapping[int, tuple[StoredVote, TileVote]]) -> list[tuple[int, U8]]:
+    """(end_ns, states) of the ballots that counted, in the cells where they did."""
+    found = []
+    for standing in standings:
+        _, vote = sound.get(standing.ballot, (None, None))
+        if not standing.why and vote is not None and vote.states is not None:
+            states = vote.states.copy()
+            for cells in (standing.spent, standing.reviewed):
+                states.reshape(-1)[cells_in(cells)] = NO_VOTE
+            found.append((vote.end_ns, states))
+    return found
 
 
 def coverage(store: Store) -> list[dict[str, Any]]:
@@ -143,7 +154,7 @@ def coverage(store: Store) -> list[dict[str, Any]]:
     ]
 
 
-def vehicle_standings(store: Store) -> list[Standing]:
+def vehicle_standings(store: Store) -> list[VehicleStanding]:
     """How each vehicle stands to what the others say, over every vote inside the window, in order of name.
 
     What is compared is the world (occupied or empty now), so votes on an older base count here too.
