@@ -16,7 +16,6 @@ import json
 import os
 import subprocess
 import sys
-from collections import defaultdict
 from pathlib import Path
 from statistics import fmean
 from typing import Any
@@ -42,7 +41,7 @@ def driven(seed: int, folder: Path, cars: int, sensor: str, drop_strays: bool) -
     file = folder / f"{name}.json"
     if not file.exists():
         words = ["evaluate", SCENARIO, "--seed", str(seed), "--case", ",".join(CASES), "--readings"]
-        words += ["--explain", "1,5", "--json", str(file), "--out", str(folder / f"pictures_{name}")]
+        words += ["--json", str(file)]
         words += ["--cars", str(cars), "--sensor", sensor]
         environment = {**os.environ, "MAPVOTE_MAPPING__DROP_STRAYS": str(drop_strays).lower()}
         subprocess.run([sys.executable, "-m", "mapvote", *words], check=True, env=environment)
@@ -64,7 +63,7 @@ def mean_and_range(values: list[float]) -> str:
 
 
 def tables(runs: list[dict[str, Any]]) -> None:
-    """Table IV beside the paper's, every reading, and the causes of what case 1 and 5 lose."""
+    """Table IV beside the paper's, and every reading."""
     rows = [["the paper, on its street", *(f"{PAPER[case]:.3f}" for case in CASES)]]
     for reading in (SET, VOTES):
         for truth in TRUTHS:
@@ -76,23 +75,6 @@ def tables(runs: list[dict[str, Any]]) -> None:
         [name, *(f"{fmean(macro(r, case, 'provenance', name) for r in runs):.3f}" for case in CASES)] for name in names
     ]
     table(["reading; provenance, mean", *(f"case {case}" for case in CASES)], rows)
-    for case in ("1", "5"):
-        causes(runs, case)
-
-
-def causes(runs: list[dict[str, Any]], case: str) -> None:
-    """Of all true and false cells of all seeds, how many go to each cause."""
-    rows = []
-    for kind in runs[0]["budgets"][case]["provenance"]:
-        cells: dict[str, int] = defaultdict(int)
-        for run in runs:
-            for cause, counted in run["budgets"][case]["provenance"][kind].items():
-                cells[cause] += counted["cells"]
-        total = sum(cells.values())
-        most = sorted((n, cause) for cause, n in cells.items() if n)[::-1]
-        told = "; ".join(f"{cause} {100 * n / total:.1f} %" for n, cause in most)
-        rows.append([kind.replace("_", " "), str(total), told])
-    table([f"case {case}, provenance", "cells", "causes"], rows)
 
 
 def demands(runs: list[dict[str, Any]]) -> None:

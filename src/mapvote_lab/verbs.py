@@ -78,12 +78,9 @@ def evaluate(
         typer.Option(metavar="KEY=VALUE,..", help="how the paper's open sentences are read: keys of [paper]"),
     ] = None,
     readings: Annotated[bool, typer.Option("--readings", help="every reading of the paper by case")] = False,
-    explain: Annotated[
-        str, typer.Option(metavar="CASES", help="of the paper's cases: every true and false cell and its cause")
-    ] = "",
     out: Annotated[
         Path | None,
-        typer.Option(metavar="FOLDER", help="where pictures of what is explained go; real: tables, pictures of worst"),
+        typer.Option(metavar="FOLDER", help="real: where tables and pictures of the worst cells go"),
     ] = None,
     figures: Annotated[
         Path | None, typer.Option(metavar="FOLDER", help="also draw the paper's figures here: PNG, SVG and PDF")
@@ -97,7 +94,7 @@ def evaluate(
 
     mapvote evaluate corner --seed 2 --case 1,5,surfaces
 
-    mapvote evaluate as_published --case 1,2,3,4,5 --readings --explain 1 --out pictures
+    mapvote evaluate as_published --case 1,2,3,4,5 --readings
 
     mapvote evaluate real my_drive --out report
     """
@@ -108,8 +105,8 @@ def evaluate(
     from mapvote_lab.evaluation.evaluate import evaluate as run
     from mapvote_lab.evaluation.experiments.cases import choose_cases
     from mapvote_lab.evaluation.experiments.conditions import Conditions
+    from mapvote_lab.evaluation.experiments.paper_readings import PUBLISHED, as_paper
     from mapvote_lab.evaluation.experiments.scene import Scene
-    from mapvote_lab.evaluation.experiments.study import PUBLISHED, Study, as_paper
     from mapvote_lab.evaluation.reporting.tables import as_json, tables, write_text
 
     if scenario == "real":
@@ -129,31 +126,18 @@ def evaluate(
     overrides: dict[str, str | int] = {"sensor": sensor} if sensor else {}
     if cars is not None:
         overrides["temporary_cars"] = cars
-    names = tuple(name.strip() for name in explain.split(",") if name.strip())
-    study = Study(readings, scenario in PUBLISHED, names)
+    sentences = "all" if readings else "occluded" if scenario in PUBLISHED else None
     scene = Scene(scenario, seed, settings, cache or cache_folder(), overrides, Conditions(true_poses=poses == "truth"))
     with stages() as told:
-        evaluation = run(scene, cases, with_yardsticks, told, study)
+        evaluation = run(scene, cases, with_yardsticks, told, sentences)
     result = evaluation.result
     for table in tables(result):
         Console(width=140).print(table)
     if json is not None:
         write_text(as_json(result), json)
         print(f"{json}: all numbers")
-    if out is not None:
-        _draw_causes(evaluation, out)
     if figures is not None:
         _draw_figures(evaluation, figures)
-
-
-def _draw_causes(evaluation: Evaluation, out: Path) -> None:
-    from mapvote.plots import save
-    from mapvote_lab.evaluation.reporting.budget_figure import budget_figure
-
-    for name, causes in evaluation.causes.items():
-        picture = out / f"explained_{name.replace(' ', '_')}.png"
-        save(budget_figure(name, causes, evaluation.window), picture)
-        print(f"{picture}")
 
 
 def _draw_figures(evaluation: Evaluation, out: Path) -> None:

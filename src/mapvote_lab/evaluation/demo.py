@@ -18,7 +18,6 @@ from mapvote_lab.evaluation.demo_report import CASE, Story, report_page, tell
 from mapvote_lab.evaluation.evaluate import Evaluation, evaluate
 from mapvote_lab.evaluation.experiments.cases import choose_cases
 from mapvote_lab.evaluation.experiments.scene import Progress, Scene
-from mapvote_lab.evaluation.experiments.study import Study
 from mapvote_lab.evaluation.loopback import vote_by_http
 from mapvote_lab.evaluation.reporting.gallery import gallery
 from mapvote_lab.evaluation.reporting.tables import as_csv, as_json, as_text, write_text
@@ -37,7 +36,7 @@ def demo(out: Path, full: bool = False, progress: Progress | None = None) -> tup
     settings = Settings()
     scene = Scene(FULL_SCENARIO if full else SCENARIO, SEED, settings, out / "work")
     cases, _ = choose_cases(settings, f"1,2,3,4,5,{CASE}")
-    evaluation = evaluate(scene, cases, progress=progress, study=Study(occluded=True))
+    evaluation = evaluate(scene, cases, progress=progress, readings="occluded")
     write_map(evaluation.first_map, out / "map_before")
     if progress:
         progress("a server's round", 0, 1)

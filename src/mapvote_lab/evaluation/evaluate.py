@@ -15,12 +15,13 @@ from mapvote.core.point_map import PointMap
 from mapvote_lab.evaluation.baselines.run import yardsticks
 from mapvote_lab.evaluation.experiments.cases import Case, fuse_case
 from mapvote_lab.evaluation.experiments.changed_areas import in_changed_areas, survey_anew
-from mapvote_lab.evaluation.experiments.passes import Pass, passes
+from mapvote_lab.evaluation.experiments.kept import read_kept
+from mapvote_lab.evaluation.experiments.paper_readings import swept
+from mapvote_lab.evaluation.experiments.passes import Pass, pass_folder, passes
 from mapvote_lab.evaluation.experiments.pose_errors import localisation, map_frame, map_shift
 from mapvote_lab.evaluation.experiments.scene import Progress, Scene
-from mapvote_lab.evaluation.experiments.study import NOTHING_BESIDES, Study
 from mapvote_lab.evaluation.results import CaseResult, Cost, EvaluationResult, Timings
-from mapvote_lab.evaluation.scoring.budget import Causes
+from mapvote_lab.evaluation.scoring.cells import Scores
 from mapvote_lab.evaluation.scoring.jury import Jury, Outcome
 from mapvote_lab.evaluation.scoring.truth import Truth
 from mapvote_lab.evaluation.scoring.truths import SIDE_BY_SIDE, sizes_by_height
@@ -37,8 +38,6 @@ class Evaluation:
     first_map: PointMap
     outcomes: Mapping[str, Outcome]
     drives: Sequence[Pass]
-    causes: Mapping[str, Causes]
-    """By case that was to be explained: every true and false cell of the provenance truth and its cause."""
     best: str
     """The case whose updated map is shown: the one that the settings vote by, else the first."""
 
@@ -48,21 +47,25 @@ def evaluate(
     cases: Sequence[Case],
     with_yardsticks: bool = False,
     progress: Progress | None = None,
-    study: Study = NOTHING_BESIDES,
+    readings: str | None = None,
 ) -> Evaluation:
-    """Run what the cache lacks, decide and score every case. Two processes where there are two cores."""
+    """Run what the cache lacks, decide and score every case. Two processes where there are two cores.
+
+    ``readings``: the open sentence of the paper (a setting of ``[paper]``) whose other readings are scored too; "all":
+    every sentence; None: no other reading.
+    """
     started = time.perf_counter()
     scene.prepare(progress)
     prepared = time.perf_counter()
     workers = min(2, os.cpu_count() or 1)
-    drives = passes(scene, cases, workers, progress, keep=study.wanted)
+    drives = passes(scene, cases, workers, progress, keep=readings is not None)
     voted = time.perf_counter()
     truth, first_map = scene.truth, scene.point_map
     beams = scene.drive(drives[0].vehicle).sensor.beams
     jury = Jury(first_map, truth)
     best = _best(scene, cases)
     outcomes, entries = _scored(scene, cases, drives, jury, progress)
-    found = study.of(scene, cases, jury, outcomes, progress)
+    swept_readings = {} if readings is None else _readings(scene, cases, jury, readings, progress)
     T_map_world = map_frame(scene)
     maps = {
         "old map": (first_map, T_map_world),
@@ -90,8 +93,7 @@ def evaluate(
         ceilings=jury.ceilings(),
         truth_sizes={name: sizes_by_height(jury.truths[name], truth, jury.first_map) for name in SIDE_BY_SIDE},
         cases=entries,
-        readings=found.readings,
-        budgets=found.budgets,
+        readings=swept_readings,
         timings=Timings(
             prepare_s=prepared - started,
             vote_s=voted - prepared,
@@ -102,7 +104,16 @@ def evaluate(
             fuse_s={name: outcome.seconds for name, outcome in outcomes.items()},
         ),
     )
-    return Evaluation(result, scene, truth, jury.window, first_map, outcomes, drives, found.causes, best)
+    return Evaluation(result, scene, truth, jury.window, first_map, outcomes, drives, best)
+
+
+def _readings(
+    scene: Scene, cases: Sequence[Case], jury: Jury, only: str, progress: Progress | None
+) -> dict[str, dict[str, dict[str, Scores]]]:
+    """Scores by reading, case and truth, from what the scans of the vehicles' drives said."""
+    kept = [read_kept(pass_folder(scene, cases, name, True)) for name in scene.drive_names("v")]
+    truths = {name: jury.truths[name] for name in SIDE_BY_SIDE}
+    return swept(kept, jury.first_map.counts > 0, scene.settings, truths, None if only == "all" else only, progress)
 
 
 def _best(scene: Scene, cases: Sequence[Case]) -> str:

@@ -11,7 +11,6 @@ from typing import Any
 
 import msgspec
 
-from mapvote_lab.evaluation.scoring.budget import Budget
 from mapvote_lab.evaluation.scoring.cells import Scores
 from mapvote_lab.evaluation.scoring.map_points import MapScores
 from mapvote_lab.evaluation.scoring.objects import ObjectScores
@@ -110,8 +109,6 @@ class EvaluationResult(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=
     cases: dict[str, CaseResult]
     readings: dict[str, dict[str, dict[str, Scores]]] = {}
     """By reading of the paper, case and truth, if asked for."""
-    budgets: dict[str, dict[str, Budget]] = {}
-    """By case and truth, if asked for."""
     timings: Timings
 
 

@@ -6,7 +6,7 @@ import pytest
 
 from mapvote.config import Settings
 from mapvote.core.types import MapvoteError
-from mapvote_lab.evaluation.experiments.study import as_paper
+from mapvote_lab.evaluation.experiments.paper_readings import as_paper
 
 
 def test_on_the_papers_street_an_occluded_scan_abstains_and_the_map_keeps_whatever_stood_still() -> None:

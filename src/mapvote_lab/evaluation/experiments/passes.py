@@ -15,7 +15,6 @@ from mapvote.core.point_map import PointMap
 from mapvote.core.types import F64, Drive
 from mapvote.formats import open_drive
 from mapvote.formats.atomic import whole_folder
-from mapvote.formats.drives.options import parse_scans
 from mapvote.localisation.localiser import GivenPoses, Localise, Localiser
 from mapvote.localisation.ndt import PosePrior
 from mapvote_lab.evaluation.experiments.cases import Case
@@ -114,11 +113,7 @@ def drive_once(scene: Scene, cases: Sequence[Case], name: str, keep: bool = Fals
 
 
 def _keeper(scene: Scene, drive: Drive, point_map: PointMap) -> Keeper:
-    """Keeps what each scan says, with the simulator's own word on what moves beside the filter's."""
-    truth, name = scene.truth, drive.path.name
-    numbers = parse_scans(scene.conditions.scans, len(truth.poses(name)), name)
-    window, n_min = truth.grid_on(point_map.lattice), scene.settings.paper.n_min
-    return Keeper(window, drive.sensor, n_min, lambda index: truth.moving(name, int(numbers[index])))
+    return Keeper(scene.truth.grid_on(point_map.lattice), drive.sensor, scene.settings.paper.n_min)
 
 
 def _localise(scene: Scene, drive: Drive, point_map: PointMap) -> Localise:

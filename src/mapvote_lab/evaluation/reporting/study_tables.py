@@ -1,4 +1,4 @@
-"""What the paper's tables rest on, as tables: readings by case, truths by height, and the budget of a case."""
+"""What the paper's tables rest on, as tables: readings by case, and truths by height."""
 
 from __future__ import annotations
 
@@ -9,16 +9,8 @@ from rich.table import Table
 
 from mapvote_lab.evaluation.results import EvaluationResult
 from mapvote_lab.evaluation.scoring import paper_tables
-from mapvote_lab.evaluation.scoring.budget import Budget
 from mapvote_lab.evaluation.scoring.cells import Scores
 from mapvote_lab.evaluation.scoring.truths import BANDS
-
-_BUDGETS = {
-    "true_changed_occupied": "truly changed (occupied) cells",
-    "true_changed_empty": "truly changed (empty) cells",
-    "false_changed_occupied": "cells falsely called changed (occupied)",
-    "false_changed_empty": "cells falsely called changed (empty)",
-}
 
 
 def _new(title: str, *headings: str) -> Table:
@@ -29,15 +21,12 @@ def _new(title: str, *headings: str) -> Table:
 
 
 def study_tables(result: EvaluationResult) -> Iterator[Table]:
-    """Those of what was asked: nothing but the sizes of the truths, unless readings or budgets were."""
+    """Those of what was asked: nothing but the sizes of the truths, unless readings were."""
     yield _sizes(result)
     if result.readings:
         truths = list(next(iter(next(iter(result.readings.values())).values())))
         for truth in truths:
             yield readings_table(result.readings, truth, result.settings["paper"]["occluded"])
-    for case, by_truth in result.budgets.items():
-        for truth, found in by_truth.items():
-            yield from _budget(case, truth, found)
 
 
 def _sizes(result: EvaluationResult) -> Table:
@@ -62,15 +51,3 @@ def readings_table(readings: Mapping[str, Mapping[str, Mapping[str, Scores]]], t
 
 def _case(name: str) -> str:
     return f"case {name}"
-
-
-def _budget(case: str, truth: str, found: Budget) -> Iterator[Table]:
-    for field, title in _BUDGETS.items():
-        shares = getattr(found, field)
-        total = sum(share.cells for share in shares.values())
-        table = _new(f"Case {case}: the {total:,} {title} ({truth} truth)", "cause", "cells", "%")
-        for cause, share in shares.items():
-            if share.cells:
-                table.add_row(cause, f"{share.cells:,}", f"{share.percent:.1f}")
-        table.add_row("all", f"{total:,}", f"{sum(share.percent for share in shares.values()):.1f}", style="bold")
-        yield table

@@ -1,12 +1,12 @@
-"""Every reading of the paper on kept drives: cells decided by cases and readings, without driving again (paper III-IV).
+"""How the paper's open sentences are read, and every reading on kept drives: cells decided by cases and readings,
+without driving again (paper III-IV).
 
-The same tables, votes and verdicts as the product's own (detection/paper.py, core/voting.py), scan by scan; only points
-and files are left out.
+The same tables, votes and verdicts as the product's own (detection/paper.py, core/voting.py), scan by scan.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 
 import numba
 import numpy as np
@@ -16,10 +16,29 @@ from mapvote.core.grid import CELL_SIZE
 from mapvote.core.types import I32, N_STATES, NO_VOTE, U8, U16, Bool
 from mapvote.core.voting import decide, one_hot, to_wire
 from mapvote.detection.paper import reading_table
-from mapvote.detection.readings import readings_of
+from mapvote.detection.readings import read, readings_of
 from mapvote_lab.evaluation.experiments.cases import Case, paper_cases
 from mapvote_lab.evaluation.experiments.kept import KeptDrive
 from mapvote_lab.evaluation.scoring.cells import Scores, score_cells
+
+PUBLISHED = {"as_published": "occluded=abstains"}
+"""How the paper is read on a scenario unless told otherwise; both readings of an occluded scan stand side by side.
+There the first map keeps its strays too: the paper's holds whatever stood still (II), and its cases vote on that."""
+
+
+def as_paper(settings: Settings, scenario: str, told: Collection[str] = (), reading: str | None = None) -> Settings:
+    """``settings`` with the paper read as ``reading`` says, and what suits the scenario of the rest.
+
+    ``told``: names ("mapping.drop_strays") of what the user set: that stays. MapvoteError for a reading there is not.
+    """
+    known, published = settings, scenario in PUBLISHED
+    said = reading or ("" if any(key.startswith("paper.") for key in told) else PUBLISHED.get(scenario, ""))
+    if said:
+        known = known.model_copy(update={"paper": read(known.paper, said)})
+    if published and "mapping.drop_strays" not in told:
+        known = known.model_copy(update={"mapping": known.mapping.model_copy(update={"drop_strays": False})})
+    return known
+
 
 Rule = tuple[VotingSettings, PaperSettings]
 """By which a vehicle counts."""
@@ -42,20 +61,17 @@ def _cast(
                 tally[r, c, state] += weights[word]
 
 
-def tallies(
-    drive: KeptDrive, mapped: Bool, rules: Iterable[Rule], tables: Callable[..., tuple[U8, I32]] = reading_table,
-    classes: int = N_STATES,
-) -> dict[Rule, I32]:  # fmt: skip
-    """(rows, cols, classes) votes in VOTE_UNITs of one drive by each rule, over the truth's window, in one reading.
+def tallies(drive: KeptDrive, mapped: Bool, rules: Iterable[Rule]) -> dict[Rule, I32]:
+    """(rows, cols, 5) votes in VOTE_UNITs of one drive by each rule, over the truth's window.
 
-    ``mapped`` (rows, cols): where the map holds obstacle points. ``tables`` and ``classes``: what a word counts as.
+    ``mapped`` (rows, cols): where the map holds obstacle points.
     """
-    found = {rule: np.zeros((*mapped.shape, classes), dtype=np.int32) for rule in rules}
+    found = {rule: np.zeros((*mapped.shape, N_STATES), dtype=np.int32) for rule in rules}
     for row0, col0, words in drive.words():
         for rule, tally in found.items():
             half = round(0.5 * rule[1].window_m / CELL_SIZE)
             margin = max(0, words.shape[0] // 2 - half)
-            _cast(words, row0, col0, margin, mapped, *tables(*rule), NO_VOTE, tally)
+            _cast(words, row0, col0, margin, mapped, *reading_table(*rule), NO_VOTE, tally)
     return found
 
 
