@@ -65,12 +65,8 @@ def evaluate(
     jury = Jury(first_map, truth)
     best = _best(scene, cases)
     outcomes, entries = _scored(scene, cases, drives, jury, progress)
-    swept_readings = {} if readings is None else _readings(scene, cases, jury, readings, progress)
     T_map_world = map_frame(scene)
-    maps = {
-        "old map": (first_map, T_map_world),
-        f"updated map ({best})": (outcomes[best].updated, T_map_world),
-    }
+    maps = {"old map": (first_map, T_map_world), f"updated map ({best})": (outcomes[best].updated, T_map_world)}
     scored = time.perf_counter()
     costs = {}
     if with_yardsticks:
@@ -93,7 +89,7 @@ def evaluate(
         ceilings=jury.ceilings(),
         truth_sizes={name: sizes_by_height(jury.truths[name], truth, jury.first_map) for name in SIDE_BY_SIDE},
         cases=entries,
-        readings=swept_readings,
+        readings={} if readings is None else _readings(scene, cases, jury, readings, progress),
         timings=Timings(
             prepare_s=prepared - started,
             vote_s=voted - prepared,
