@@ -70,13 +70,11 @@ def main() -> None:
 
 def write(results: dict[str, dict[int, MatrixResult]], out: Path) -> None:
     """matrix.json and matrix.md into ``out``."""
-    titles = {name: f"{name} (seeds {', '.join(str(seed) for seed in by_seed)})" for name, by_seed in results.items()}
-    text = "\n".join(f"### {titles[name]}\n\n{matrix_tables.table(results, name)}" for name in results)
+    sheets = [matrix_tables.table(results, name) for name in results]
     if "main" in results:
-        text += f"\n### main, class by class\n\n{matrix_tables.class_table(results, 'main')}"
-        text += f"\n### main, what perfect labels would score\n\n{matrix_tables.ceiling_table(results, 'main')}"
+        sheets += [matrix_tables.class_table(results, "main"), matrix_tables.ceiling_table(results, "main")]
     with whole_file(out / "matrix.md") as partial:
-        partial.write_text(text)
+        partial.write_text("\n".join(sheet.to_markdown() for sheet in sheets))
     with whole_file(out / "matrix.json") as partial:
         partial.write_text(to_json({name: {str(k): r for k, r in found.items()} for name, found in results.items()}))
 

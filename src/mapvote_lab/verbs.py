@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from mapvote.cli.options import EVALUATE, Config, Scenario, Seed
-from mapvote.cli.terminal import print_table, progress, stages
+from mapvote.cli.terminal import progress, stages
 
 if TYPE_CHECKING:
     from mapvote_lab.evaluation.evaluate import Evaluation
@@ -131,8 +131,8 @@ def evaluate(
     with stages() as told:
         evaluation = run(scene, cases, with_yardsticks, told, sentences)
     result = evaluation.result
-    for table in tables(result):
-        Console(width=140).print(table)
+    for sheet in tables(result):
+        Console(width=140).print(sheet.to_rich())
     if json is not None:
         write_text(as_json(result), json)
         print(f"{json}: all numbers")
@@ -160,6 +160,8 @@ def _evaluate_real(
 ) -> None:
     """The bench of a recorded drive; its own blocks are map and vehicles, nothing is simulated but the changes.
     ``case``: one of them; None: by the settings."""
+    from rich.console import Console
+
     from mapvote.config import load_settings
     from mapvote_lab.evaluation.experiments.cases import choose_cases
     from mapvote_lab.evaluation.experiments.real.bench import bench
@@ -177,7 +179,7 @@ def _evaluate_real(
         result = bench(drive, settings, cases, told, scans=scans, seed=seed)
     sheets = real_tables(result, cases[0].name)
     for sheet in sheets:
-        print_table(sheet.headings, sheet.rows, sheet.title)
+        Console().print(sheet.to_rich())
     if json is not None:
         write_text(to_json(result.figures(cases[0].name)), json)
         print(f"{json}: all numbers")

@@ -15,8 +15,7 @@ from mapvote_lab.evaluation.evaluate import Evaluation
 from mapvote_lab.evaluation.loopback import Published
 from mapvote_lab.evaluation.reporting.gallery import Area, areas_of
 from mapvote_lab.evaluation.reporting.html import Section, page
-from mapvote_lab.evaluation.reporting.study_tables import readings_table
-from mapvote_lab.evaluation.reporting.tables import case_name, tables
+from mapvote_lab.evaluation.reporting.tables import case_name, readings_table, tables
 from mapvote_lab.evaluation.results import EvaluationResult
 from mapvote_lab.evaluation.scoring import paper_tables
 from mapvote_lab.evaluation.scoring.map_points import same_rows

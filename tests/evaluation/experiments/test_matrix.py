@@ -69,14 +69,18 @@ def test_objects_are_counted_in_halves_found_and_above_two_square_metres() -> No
 
 
 def test_the_table_has_a_line_a_round_and_a_cell_a_figure() -> None:
-    lines = table({"main": {2: of_rounds(a=entry(0.5)), 3: of_rounds(a=entry(0.7))}}, "main").splitlines()
+    lines = (
+        table({"main": {2: of_rounds(a=entry(0.5)), 3: of_rounds(a=entry(0.7))}}, "main")
+        .to_markdown(with_title=False)
+        .splitlines()
+    )
     assert len(lines) == 3
     assert lines[2].startswith("| a | 0.600 ± 0.141 (0.500) |")
     assert {line.count("|") for line in lines} == {len(FIGURES) + 2}
 
 
 def test_precision_and_recall_are_means_over_the_seeds_class_by_class() -> None:
-    text = class_table({"main": {2: of_rounds(a=entry(0.5)), 3: of_rounds(a=entry(1.0))}}, "main")
+    text = class_table({"main": {2: of_rounds(a=entry(0.5)), 3: of_rounds(a=entry(1.0))}}, "main").to_markdown()
     assert "| a | 0.7500 / 0.7500 | 0.750 / 0.750 | 0.750 / 0.750 |" in text
 
 

@@ -11,7 +11,8 @@ from mapvote.core.grid import Grid, Lattice
 from mapvote.core.types import CellState
 from mapvote_lab.evaluation.experiments.real.bench import BUILT, BUILT_IN_RAIN, DEMOLISHED, Bench, Ground
 from mapvote_lab.evaluation.experiments.real.changes import Asked, Changed
-from mapvote_lab.evaluation.reporting.real_tables import Sheet, real_tables
+from mapvote_lab.evaluation.reporting.real_tables import real_tables
+from mapvote_lab.evaluation.reporting.sheets import Sheet
 
 GRID = Grid(Lattice(), 0, 0, 10, 10)
 

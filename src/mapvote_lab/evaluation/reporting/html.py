@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from html import escape
 from pathlib import Path
 
-from rich.table import Table
+from mapvote_lab.evaluation.reporting.sheets import Sheet
 
 _STYLE = """
 :root { color-scheme: light; }
@@ -47,7 +47,7 @@ class Section:
     heading: str
     text: Sequence[str] = ()
     pictures: Sequence[tuple[Path, str]] = ()
-    tables: Sequence[Table] = ()
+    tables: Sequence[Sheet] = ()
     commands: str = ""
     markup: str = ""
     """HTML as it is, from those who made it safe."""
@@ -77,21 +77,7 @@ def _section(section: Section) -> str:
             f'<figure><img width="{width}" alt="{escape(caption, quote=True)}" src="data:image/png;base64,{data}">'
             f"<figcaption>{escape(caption)}</figcaption></figure>"
         )
-    parts += [_table(table) for table in section.tables]
+    parts += [table.to_html() for table in section.tables]
     if section.commands:
         parts.append(f"<pre>{escape(section.commands)}</pre>")
     return "\n".join(parts)
-
-
-def _table(table: Table) -> str:
-    """The same rich table that the terminal prints."""
-    kinds = ["dim" if column.style == "dim" else "" for column in table.columns]
-    cells = [list(column.cells) for column in table.columns]
-    titles = [escape(str(column.header)) for column in table.columns]
-    heads = "".join(f'<th class="{kind}">{title}</th>' for kind, title in zip(kinds, titles, strict=True))
-    rows = "\n".join(
-        "<tr>" + "".join(f'<td class="{k}">{escape(str(c))}</td>' for k, c in zip(kinds, row, strict=True)) + "</tr>"
-        for row in zip(*cells, strict=True)
-    )
-    caption = f"<caption>{escape(str(table.title))}</caption>" if table.title else ""
-    return f'<div class="scroll"><table>{caption}<tr>{heads}</tr>\n{rows}</table></div>'

@@ -1,4 +1,4 @@
-"""Mean, spread and worst over seeds, and what must hold, as Markdown and JSON."""
+"""Mean, spread and worst over seeds."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import statistics
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
+from mapvote_lab.evaluation.reporting.sheets import Sheet
 from mapvote_lab.evaluation.results import MatrixResult, RoundResult
 from mapvote_lab.evaluation.scoring.cells import CLASSES
 from mapvote_lab.evaluation.scoring.map_points import MapScores
@@ -92,43 +93,39 @@ def rounds_of(results: Results, experiment: str) -> dict[str, dict[int, RoundRes
     return out
 
 
-def table(results: Results, experiment: str) -> str:
-    """Markdown: a line for each round, "mean ± deviation (worst)" for each figure."""
-    lines = [
-        "| | " + " | ".join(f.title + ", %" * f.percent for f in FIGURES.values()) + " |",
-        "|---" * (len(FIGURES) + 1) + "|",
-    ]
-    for name, entries in rounds_of(results, experiment).items():
-        cells = []
-        for figure in FIGURES.values():
-            s = spread([figure.of(e) for e in entries.values()], figure.more_is_better)
-            cells.append(figure.text(s))
-        lines.append(f"| {name} | " + " | ".join(cells) + " |")
-    return "\n".join(lines) + "\n"
+def _over_seeds(figure: Figure, entries: Mapping[int, RoundResult]) -> str:
+    return figure.text(spread([figure.of(entry) for entry in entries.values()], figure.more_is_better))
 
 
-def ceiling_table(results: Results, experiment: str) -> str:
-    """Markdown: what perfect labels would score, seed by seed: macro-F1, then changed-occupied / changed-empty."""
+def table(results: Results, experiment: str) -> Sheet:
+    """A line for each round, "mean ± deviation (worst)" for each figure."""
+    headings = ["", *(f.title + ", %" * f.percent for f in FIGURES.values())]
+    found = rounds_of(results, experiment)
+    rows = [[name, *(_over_seeds(f, entries) for f in FIGURES.values())] for name, entries in found.items()]
+    return Sheet(f"{experiment} (seeds {', '.join(map(str, results.get(experiment, {})))})", headings, rows)
+
+
+def ceiling_table(results: Results, experiment: str) -> Sheet:
+    """What perfect labels would score, seed by seed: macro-F1, then changed-occupied / changed-empty."""
     found = results.get(experiment, {})
     names = list(next(iter(found.values())).ceilings) if found else []
-    lines = ["| seed | " + " | ".join(names) + " |", "|---" * (len(names) + 1) + "|"]
+    rows = []
     for seed, result in found.items():
         scores = [result.ceilings[name] for name in names]
-        cells = [f"{s.macro_f1:.3f} ({s.f1.changed_occupied:.3f} / {s.f1.changed_empty:.3f})" for s in scores]
-        lines.append(f"| {seed} | " + " | ".join(cells) + " |")
-    return "\n".join(lines) + "\n"
+        shown = [f"{s.macro_f1:.3f} ({s.f1.changed_occupied:.3f} / {s.f1.changed_empty:.3f})" for s in scores]
+        rows.append([str(seed), *shown])
+    return Sheet(f"{experiment}, what perfect labels would score", ["seed", *names], rows)
 
 
-def class_table(results: Results, experiment: str) -> str:
-    """Markdown: precision / recall of the paper's three classes (Tables II and III), means over the seeds, strict."""
-    head = "| | " + " | ".join(f"{name.replace('_', '-')} P / R" for name in CLASSES) + " |"
-    lines = [head, "|---" * (len(CLASSES) + 1) + "|"]
+def class_table(results: Results, experiment: str) -> Sheet:
+    """Precision / recall of the paper's three classes (Tables II and III), means over the seeds, strict truth."""
+    rows = []
     for name, entries in rounds_of(results, experiment).items():
-        precision = zip(*(entry.strict.precision for entry in entries.values()), strict=True)
-        recall = zip(*(entry.strict.recall for entry in entries.values()), strict=True)
-        cells = []
-        for k, seeds in zip(CLASSES, zip(precision, recall, strict=True), strict=True):
-            p, r = map(statistics.fmean, seeds)
-            cells.append(f"{p:.4f} / {r:.4f}" if k == CLASSES[0] else f"{p:.3f} / {r:.3f}")
-        lines.append(f"| {name} | " + " | ".join(cells) + " |")
-    return "\n".join(lines) + "\n"
+        row = [name]
+        for label in CLASSES:
+            p = statistics.fmean(getattr(entry.strict.precision, label) for entry in entries.values())
+            r = statistics.fmean(getattr(entry.strict.recall, label) for entry in entries.values())
+            row.append(f"{p:.4f} / {r:.4f}" if label == CLASSES[0] else f"{p:.3f} / {r:.3f}")
+        rows.append(row)
+    headings = ["", *(f"{name.replace('_', '-')} P / R" for name in CLASSES)]
+    return Sheet(f"{experiment}, class by class", headings, rows)

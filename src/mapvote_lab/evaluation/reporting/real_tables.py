@@ -2,21 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-
 from mapvote_lab.evaluation.experiments.real.bench import BUILT, BUILT_IN_RAIN, Bench, unchanged_figures
 from mapvote_lab.evaluation.experiments.real.changes import Found, precision_near, score
 from mapvote_lab.evaluation.experiments.real.street import largest_false_changes
-
-
-@dataclass(frozen=True, slots=True)
-class Sheet:
-    """One table; the first column names the row."""
-
-    title: str
-    headings: tuple[str, ...]
-    rows: Sequence[tuple[str, ...]]
+from mapvote_lab.evaluation.reporting.sheets import Sheet
 
 
 def real_tables(bench: Bench, case: str) -> list[Sheet]:
@@ -28,11 +17,7 @@ def real_tables(bench: Bench, case: str) -> list[Sheet]:
 
 def as_markdown(sheets: list[Sheet], command: str) -> str:
     """A page of them, with the command that made it."""
-    parts = [f"```\n{command}\n```"]
-    for sheet in sheets:
-        lines = [sheet.headings, tuple("---" for _ in sheet.headings), *sheet.rows]
-        parts.append(f"**{sheet.title}**\n\n" + "\n".join(f"| {' | '.join(line)} |" for line in lines))
-    return "\n\n".join(parts) + "\n"
+    return "\n".join([f"```\n{command}\n```\n", *(sheet.to_markdown() for sheet in sheets)])
 
 
 def _ground(bench: Bench) -> Sheet:

@@ -8,15 +8,14 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 from msgspec.structs import asdict
-from rich import box
 from rich.console import Console
-from rich.table import Table
 
 from mapvote.formats.atomic import whole_file
-from mapvote_lab.evaluation.reporting.study_tables import study_tables
+from mapvote_lab.evaluation.reporting.sheets import Sheet
 from mapvote_lab.evaluation.results import CaseResult, EvaluationResult, to_json
 from mapvote_lab.evaluation.scoring import paper_tables
 from mapvote_lab.evaluation.scoring.cells import CLASSES, ByClass, Scores, ratio
+from mapvote_lab.evaluation.scoring.truths import BANDS
 
 HEADINGS = {"unchanged": "unchanged", "changed_occupied": "changed (occ.)", "changed_empty": "changed (empty)"}
 
@@ -38,117 +37,134 @@ def _by_truth(entry: CaseResult) -> dict[str, Scores]:
     return {"strict": entry.strict, "provenance": entry.provenance, **entry.also}
 
 
-def _class_table(title: str, ours: Mapping[str, ByClass], printed: Mapping[str, tuple[float, ...]]) -> Table:
+def _class_table(title: str, ours: Mapping[str, ByClass], printed: Mapping[str, tuple[float, ...]]) -> Sheet:
     """A line a case, our figure and the paper's for each class."""
-    table = Table(title=title, box=box.SIMPLE_HEAD, title_justify="left", title_style="bold")
-    table.add_column("")
-    for name in CLASSES:
-        table.add_column(HEADINGS[name], justify="right")
-        table.add_column("paper", justify="right", style="dim")
+    rows = []
     for case, values in ours.items():
-        cells = [case_name(case)]
-        for k, value in enumerate(values):
-            cells += [_share(value), _share(printed[case][k] if case in printed else None)]
-        table.add_row(*cells)
-    return table
+        pairs = zip(values, printed.get(case, (None,) * len(CLASSES)), strict=True)
+        rows.append([case_name(case), *(_share(value) for pair in pairs for value in pair)])
+    return Sheet(title, ["", *(h for name in CLASSES for h in (HEADINGS[name], "paper"))], rows, faint="paper")
 
 
-def tables(result: EvaluationResult) -> Iterator[Table]:
-    """Tables II, III and IV with the paper's figures beside ours, then the map, the poses and the yardsticks' cost."""
+def tables(result: EvaluationResult) -> Iterator[Sheet]:
+    """Tables II, III and IV with the paper's figures beside ours, then the truths, the readings of the paper if asked
+    for, the map, the poses and the yardsticks' cost."""
     for truth in ("strict", "provenance"):
         scores = {case: _by_truth(entry)[truth] for case, entry in result.cases.items()}
         precision, recall = ({c: s.precision for c, s in scores.items()}, {c: s.recall for c, s in scores.items()})
         yield _class_table(f"Table II: precision ({truth} truth)", precision, paper_tables.PRECISION)
         yield _class_table(f"Table III: recall ({truth} truth)", recall, paper_tables.RECALL)
-    f1 = Table(
-        title="Table IV: F1, mean of the three classes; coverage; upload", box=box.SIMPLE_HEAD,
-        title_justify="left", title_style="bold",
-    )  # fmt: skip
-    also = list(result.ceilings)[2:]
-    for heading in ("", "strict", "provenance", *also, "paper", "Kim's F1, strict", "coverage", "kB a ballot"):
-        f1.add_column(heading, justify="right" if heading else "left", style="dim" if heading == "paper" else "")
-    for case, entry in result.cases.items():
-        sent = entry.bytes_per_vehicle
-        f1.add_row(
-            case_name(case),
-            *(_share(scores.macro_f1) for scores in _by_truth(entry).values()),
-            _share(paper_tables.F1.get(case)),
-            _share(entry.strict.kim_f1),
-            _share(entry.coverage),
-            f"{sum(sent) / len(sent) / 1000:.1f}" if sent else "",
-        )
-    f1.add_row("perfect labels", *(_share(scores.macro_f1) for scores in result.ceilings.values()), style="dim")
-    yield f1
-    yield from study_tables(result)
+    yield _f1_table(result)
+    yield _truth_sizes(result)
+    if result.readings:
+        for truth in next(iter(next(iter(result.readings.values())).values())):
+            yield readings_table(result.readings, truth, result.settings["paper"]["occluded"])
     yield from _map_table(result)
     yield from _localisation_tables(result)
     yield from _cost_table(result)
 
 
-def _map_table(result: EvaluationResult) -> Iterator[Table]:
-    rows = {case: (entry.map, entry.objects) for case, entry in result.cases.items() if entry.map is not None}
-    if not rows:
-        return
-    table = Table(title="The updated map", box=box.SIMPLE_HEAD, title_justify="left", title_style="bold")
-    for heading in ("", "stale deleted", "valid deleted", "new surface added", "added on no surface", "objects found",
-                    "false objects"):  # fmt: skip
-        table.add_column(heading, justify="right" if heading else "left")
-    for case, (scores, objects) in rows.items():
-        false = objects.false_m2
-        table.add_row(
-            case_name(case),
-            _percent(scores.stale_deleted, 2),
-            _percent(scores.valid_deleted, 3),
-            _percent(scores.new_added, 2),
-            _percent(scores.added_false, 2),
-            f"{sum(objects.found)} of {len(objects.found)}",
-            f"{len(false)}, largest {false[0]:.1f} m²" if false else "none",
+def _f1_table(result: EvaluationResult) -> Sheet:
+    rows = []
+    for case, entry in result.cases.items():
+        sent = entry.bytes_per_vehicle
+        rows.append(
+            [
+                case_name(case),
+                *(_share(scores.macro_f1) for scores in _by_truth(entry).values()),
+                _share(paper_tables.F1.get(case)),
+                _share(entry.strict.kim_f1),
+                _share(entry.coverage),
+                f"{sum(sent) / len(sent) / 1000:.1f}" if sent else "",
+            ]
         )
-    yield table
+    perfect = [_share(scores.macro_f1) for scores in result.ceilings.values()]
+    rows.append(["perfect labels", *perfect, "", "", "", ""])
+    headings = ["", *result.ceilings, "paper", "Kim's F1, strict", "coverage", "kB a ballot"]
+    return Sheet("Table IV: F1, mean of the three classes; coverage; upload", headings, rows, faint="paper")
 
 
-def _localisation_tables(result: EvaluationResult) -> Iterator[Table]:
+def _truth_sizes(result: EvaluationResult) -> Sheet:
+    rows = []
+    for truth, by_class in result.truth_sizes.items():
+        for name, bands in by_class.items():
+            counts = [sum(bands.values()), *(bands[band] for band in BANDS)]
+            rows.append([f"{truth}, {name.replace('_', ' ')}", *(f"{n:,}" for n in counts)])
+    return Sheet("The truths: changed cells by the height of their lowest surface", ["", "all", *BANDS], rows)
+
+
+def readings_table(readings: Mapping[str, Mapping[str, Mapping[str, Scores]]], truth: str, occluded: str) -> Sheet:
+    """A line a reading, macro-F1 by case against one truth; the paper's Table IV last. ``occluded``: as it is set."""
+    cases = list(next(iter(readings.values())))
+    rows = []
+    for name, by_case in readings.items():
+        shown = f"as set: occluded {occluded}" if name == "as set" else name
+        rows.append([shown, *(f"{by_case[case][truth].macro_f1:.3f}" for case in cases)])
+    rows.append(["paper, Table IV", *(f"{paper_tables.F1[case]:.3f}" for case in cases)])
+    title = f"Readings of the paper: F1, mean of the three classes ({truth} truth)"
+    return Sheet(title, ["reading", *(f"case {case}" for case in cases)], rows)
+
+
+def _map_table(result: EvaluationResult) -> Iterator[Sheet]:
+    rows = []
+    for case, entry in result.cases.items():
+        if entry.map is not None:
+            scores, objects, false = entry.map, entry.objects, entry.objects.false_m2
+            rows.append(
+                [
+                    case_name(case),
+                    _percent(scores.stale_deleted, 2),
+                    _percent(scores.valid_deleted, 3),
+                    _percent(scores.new_added, 2),
+                    _percent(scores.added_false, 2),
+                    f"{sum(objects.found)} of {len(objects.found)}",
+                    f"{len(false)}, largest {false[0]:.1f} m²" if false else "none",
+                ]
+            )
+    headings = [
+        "", "stale deleted", "valid deleted", "new surface added", "added on no surface", "objects found",
+        "false objects",
+    ]  # fmt: skip
+    if rows:
+        yield Sheet("The updated map", headings, rows)
+
+
+def _localisation_tables(result: EvaluationResult) -> Iterator[Sheet]:
     of_title = {
         "Localisation against the true poses, in the map's frame": result.localisation,
         "What the map is for: one vehicle's scans within 30 m of a change": result.changed_areas,
     }
+    headings = ["", "scans", "localised", "median", "99 %", "largest", "median angle"]
     for title, errors in of_title.items():
-        if not errors:
-            continue
-        table = Table(title=title, box=box.SIMPLE_HEAD, title_justify="left", title_style="bold")
-        for heading in ("", "scans", "localised", "median", "99 %", "largest", "median angle"):
-            table.add_column(heading, justify="right" if heading else "left")
-        for name, entry in errors.items():
-            table.add_row(
+        rows = [
+            [
                 name,
                 str(entry.scans),
                 _percent(ratio(entry.localised, entry.scans)),
-                f"{100 * entry.median_m:.1f} cm",
-                f"{100 * entry.p99_m:.1f} cm",
-                f"{100 * entry.max_m:.1f} cm",
+                *(f"{100 * metres:.1f} cm" for metres in (entry.median_m, entry.p99_m, entry.max_m)),
                 f"{entry.median_deg:.3f}°",
-            )
-        yield table
+            ]
+            for name, entry in errors.items()
+        ]
+        if rows:
+            yield Sheet(title, headings, rows)
 
 
-def _cost_table(result: EvaluationResult) -> Iterator[Table]:
-    costs = result.timings.methods
-    if not costs:
-        return
-    table = Table(title="Cost on the vehicle", box=box.SIMPLE_HEAD, title_justify="left", title_style="bold")
-    for heading in ("", "beams", "ms a scan, median", "memory of its grid"):
-        table.add_column(heading, justify="right" if heading else "left")
-    for name, entry in costs.items():
-        table.add_row(name, str(entry.beams), f"{entry.ms_per_scan:.1f}", f"{entry.memory_bytes / 1e6:.1f} MB")
-    yield table
+def _cost_table(result: EvaluationResult) -> Iterator[Sheet]:
+    rows = [
+        [name, str(entry.beams), f"{entry.ms_per_scan:.1f}", f"{entry.memory_bytes / 1e6:.1f} MB"]
+        for name, entry in result.timings.methods.items()
+    ]
+    if rows:
+        yield Sheet("Cost on the vehicle", ["", "beams", "ms a scan, median", "memory of its grid"], rows)
 
 
 def as_text(result: EvaluationResult) -> str:
     """All tables, plain, 140 columns."""
     out = io.StringIO()
     console = Console(file=out, width=140, color_system=None, highlight=False)
-    for table in tables(result):
-        console.print(table)
+    for sheet in tables(result):
+        console.print(sheet.to_rich())
     return "\n".join(line.rstrip() for line in out.getvalue().splitlines()) + "\n"
 
 
