@@ -9,6 +9,7 @@ import numpy as np
 
 from mapvote.codec.ballot import Ballot, BallotTile, pack_plane, tile_key
 from mapvote.codec.odds import pack_odds
+from mapvote.codec.path import check_path
 from mapvote.codec.points import pack_points
 from mapvote.codec.tile_file import base_hash
 from mapvote.codec.words import pack_words
@@ -18,6 +19,7 @@ from mapvote.core.reference import reference_window
 from mapvote.core.tile import Tile
 from mapvote.core.types import F32, F64, I8, NO_VOTE, U8, U16, U64, Scan
 from mapvote.fusion.sparse_columns import Words, mark, nothing_reached
+from mapvote.fusion.tile_vote import TileVote
 from mapvote.localisation.ndt import PosePrior
 from mapvote.localisation.odometry import Fix
 from mapvote.perception.frontend import Observation, PlacedScan
@@ -139,6 +141,13 @@ def two_walls() -> PointMap:
     cells = [(10, 10), (10, 11), (10, 12)]
     points = np.concatenate([wall(cells, [0.05]), wall(cells, [0.45, 0.75, 1.05])])
     return make_map({(0, 0): make_tile(points), (0, 1): make_tile(points.copy())})
+
+
+def unpack_all(ballot: Ballot) -> list[TileVote]:
+    """Every plane unpacked; MapvoteError on the first that is damaged or impossible."""
+    if ballot.path is not None:
+        check_path(ballot.path, [tile.tile for tile in ballot.tiles])
+    return [TileVote.unpack(tile) for tile in ballot.tiles]
 
 
 class AtOnce:

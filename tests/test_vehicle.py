@@ -11,8 +11,8 @@ from typing import Any, Literal
 import numpy as np
 import pytest
 
-from hand_made import AtOnce
-from mapvote.codec.ballot import decode, encode, unpack_offer, unpack_states, unpack_sureness, unpack_tally, validate
+from hand_made import AtOnce, unpack_all
+from mapvote.codec.ballot import decode, encode, unpack_offer, unpack_states, unpack_sureness, unpack_tally
 from mapvote.codec.points import unpack_points
 from mapvote.codec.words import unpack_words
 from mapvote.config import FuseSettings, Settings, VotingSettings
@@ -105,7 +105,7 @@ def test_by_surfaces_a_ballot_says_how_sure_it_is_of_every_changed_cell_and_by_n
     for method, stages in asked:
         voting = VotingSettings(method=method, two_stage=stages)
         ballot = decode(encode(drive(make(street_map(), Settings(voting=voting))).ballot()))
-        validate(ballot)
+        unpack_all(ballot)
         told[method, stages] = {tile.odds is not None for tile in ballot.tiles}
         for tile in ballot.tiles if stages and method == "surfaces" else []:
             assert tile.states is not None
@@ -180,7 +180,7 @@ def test_two_vehicles_with_the_same_scans_say_the_same_bytes() -> None:
         vehicle.finish()
         said.append(encode(vehicle.ballot()))
     assert said[0] == said[1]
-    validate(decode(said[0]))
+    unpack_all(decode(said[0]))
 
 
 def test_a_one_stage_ballot_carries_the_tally_and_leaves_the_decision_to_the_server() -> None:

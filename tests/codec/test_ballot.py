@@ -8,9 +8,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hand_made import Say, make_ballot, states_plane, two_walls, wall
+from hand_made import Say, make_ballot, states_plane, two_walls, unpack_all, wall
 from mapvote.codec.arrays import pack_plane
-from mapvote.codec.ballot import decode, encode, unpack_offer, validate
+from mapvote.codec.ballot import decode, encode, unpack_offer
 from mapvote.codec.points import pack_points, unpack_points
 from mapvote.core.types import MapvoteError
 
@@ -25,7 +25,7 @@ def test_intensity_comes_back_beside_its_points(values: list[int]) -> None:
     sent = make_ballot(two_walls(), {(0, 0): Say(states_plane(), new_points=points)})
     tile = msgspec.structs.replace(sent.tiles[0], intensity=pack_plane(bright))
     got = decode(encode(msgspec.structs.replace(sent, tiles=[tile])))
-    validate(got)
+    unpack_all(got)
     back, intensity = unpack_offer(got.tiles[0].new_points, got.tiles[0].intensity)
     assert back is not None
     assert intensity is not None

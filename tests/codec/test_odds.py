@@ -8,9 +8,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hand_made import Say, make_ballot, states_plane, two_walls
+from hand_made import Say, make_ballot, states_plane, two_walls, unpack_all
 from mapvote.codec.arrays import compress
-from mapvote.codec.ballot import Ballot, decode, encode, unpack_states, unpack_sureness, validate
+from mapvote.codec.ballot import Ballot, decode, encode, unpack_states, unpack_sureness
 from mapvote.codec.odds import MOST, STEPS, UNSAID, in_nats, in_steps, pack_odds, unpack_odds
 from mapvote.core.types import I8, CellState, MapvoteError
 
@@ -35,7 +35,7 @@ def test_every_changed_cell_gets_its_own_byte_back_and_no_other_cell_has_one(
     bytes_of = {cell: odds for cell, (state, odds) in sorted(said.items()) if state in CHANGES}
     sent = saying({cell: state for cell, (state, _) in said.items()}, np.array(list(bytes_of.values()), np.int8))
     got = decode(encode(sent))
-    validate(got)
+    unpack_all(got)
     (tile,) = got.tiles
     assert tile.states is not None
     odds = unpack_sureness(tile.odds, unpack_states(tile.states))
@@ -68,7 +68,7 @@ def test_what_no_vehicle_says_is_one_clear_error(data: bytes, says: str) -> None
     sent = saying({(3, 3): CellState.CHANGED_EMPTY, (3, 4): CellState.CHANGED_OCCUPIED}, None)
     tile = msgspec.structs.replace(sent.tiles[0], odds=data)
     with pytest.raises(MapvoteError, match="ballot: odds"):
-        validate(msgspec.structs.replace(sent, tiles=[tile]))
+        unpack_all(msgspec.structs.replace(sent, tiles=[tile]))
 
 
 def test_odds_are_of_states_and_a_tally_has_none() -> None:

@@ -17,9 +17,7 @@ import numpy as np
 from mapvote.codec.arrays import pack_plane as pack_plane
 from mapvote.codec.arrays import unpack_into, unpack_plane
 from mapvote.codec.odds import changed_cells_of, unpack_odds
-from mapvote.codec.path import check_path
 from mapvote.codec.points import unpack_points
-from mapvote.codec.words import unpack_sparse
 from mapvote.core.grid import TILE_CELLS, TileIndex
 from mapvote.core.types import F32, I8, N_STATES, NO_VOTE, U8, U16, MapvoteError
 
@@ -156,7 +154,7 @@ def encode(ballot: Ballot) -> bytes:
 
 
 def decode(data: bytes) -> Ballot:
-    """Check the envelope; planes are checked when unpacked (:func:`validate` does all). MapvoteError if unusable."""
+    """Check the envelope; planes are checked when they are unpacked. MapvoteError if unusable."""
     try:
         ballot = msgspec.msgpack.decode(data, type=Ballot)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:  # ValidationError is a DecodeError
@@ -184,25 +182,3 @@ def decode(data: bytes) -> Ballot:
         if value is not None and not 0.0 <= value < math.inf:
             raise MapvoteError(f"ballot: {name} = {value} is no distance")
     return ballot
-
-
-def validate(ballot: Ballot, max_bytes: int | None = None) -> None:
-    """Unpack every plane once; MapvoteError on the first that is damaged or impossible.
-
-    ``max_bytes``: also refuse a ballot whose planes are larger than that, together and decompressed.
-    """
-    size = 0
-    if ballot.path is not None:
-        check_path(ballot.path, [tile.tile for tile in ballot.tiles])
-    for tile in ballot.tiles:
-        states = None if tile.states is None else unpack_states(tile.states)
-        sureness = unpack_sureness(tile.odds, states)
-        size += sum(plane.nbytes for plane in (states, sureness) if plane is not None)
-        if tile.tally is not None:
-            size += unpack_tally(tile.tally).nbytes
-        for what, words in (("gone", tile.gone), ("free", tile.free)):
-            if words is not None:
-                size += sum(part.nbytes for part in unpack_sparse(words, what))
-        size += sum(part.nbytes for part in unpack_offer(tile.new_points, tile.intensity) if part is not None)
-        if max_bytes is not None and size > max_bytes:
-            raise MapvoteError(f"ballot: larger than {max_bytes} bytes when decompressed; send a shorter drive")

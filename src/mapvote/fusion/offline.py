@@ -8,13 +8,8 @@ from dataclasses import replace
 
 from mapvote.codec.ballot import (
     Ballot,
-    BallotTile,
     encode,
     tile_key,
-    unpack_offer,
-    unpack_states,
-    unpack_sureness,
-    unpack_tally,
 )
 from mapvote.codec.tile_file import base_hash
 from mapvote.config import FuseSettings
@@ -24,30 +19,8 @@ from mapvote.core.point_map import PointMap
 from mapvote.core.tile import Tile
 from mapvote.core.types import MapvoteError
 from mapvote.fusion.fuse import Decision, Rule, fuse_tile, rule_of
-from mapvote.fusion.odds import Odds
-from mapvote.fusion.sparse_columns import Words
 from mapvote.fusion.spent import unspent
 from mapvote.fusion.tile_vote import TileVote, select
-
-
-def tile_vote(ballot: Ballot, tile: BallotTile, digest: str) -> TileVote:
-    """One tile of a ballot with its planes unpacked; MapvoteError if a plane is damaged."""
-    new_points, intensity = unpack_offer(tile.new_points, tile.intensity)
-    states = None if tile.states is None else unpack_states(tile.states)
-    sureness = unpack_sureness(tile.odds, states)
-    return TileVote(
-        vehicle=ballot.vehicle,
-        end_ns=ballot.end_ns,
-        digest=digest,
-        version=ballot.version or 0,
-        states=states,
-        tally=None if tile.tally is None else unpack_tally(tile.tally),
-        gone=None if tile.gone is None else Words.unpack(tile.gone, "gone"),
-        new_points=new_points,
-        intensity=intensity,
-        free=None if tile.free is None else Words.unpack(tile.free, "free"),
-        odds=None if states is None else Odds.of(states, sureness),
-    )
 
 
 def check_round(ballots: Sequence[Ballot], point_map: PointMap) -> Rule:
@@ -133,4 +106,4 @@ def _votes_on(index: TileIndex, ballots: dict[str, Ballot]) -> Iterator[TileVote
     for digest, ballot in ballots.items():
         for tile in ballot.tiles:
             if tile.tile == index:
-                yield tile_vote(ballot, tile, digest)
+                yield TileVote.unpack(tile, ballot.vehicle, ballot.end_ns, digest, ballot.version)

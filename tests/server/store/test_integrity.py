@@ -142,6 +142,17 @@ def test_a_turned_letter_in_a_head_is_named(store: Store, table: str, column: st
     assert [fused.vehicles for fused in publish(store).fused] == [counted, counted], "who spoke is not known any more"
 
 
+def test_a_ballot_on_a_tile_whose_memory_is_damaged_is_admitted_and_waits(store: Store) -> None:
+    late = make_ballot(two_walls(), {(0, 0): Say(states_plane({CELL: CellState.CHANGED_EMPTY}))}, "late", version=1)
+    assert publish(store).version == 2
+    memory = store.manifest(2).tiles[0, 0].memory
+    assert memory is not None
+    flip(store, schema.blobs, "data", schema.blobs.c.hash == memory)
+    (receipt,) = accept(store, [examine(encode(late))])
+    assert isinstance(receipt, Receipt), receipt
+    assert not publish(store).published
+
+
 def test_a_ballot_that_ended_by_no_event_is_named(store: Store) -> None:
     b = schema.ballots
     with store.database.writing() as connection:

@@ -41,7 +41,7 @@ def vote(store: Store, intake: Intake, drive: str, cell: tuple[int, int], vehicl
     say = Say(states_plane({cell: CellState.CHANGED_EMPTY}))
     base = store.point_map()
     ballots = [examine(encode(make_ballot(base, {(0, 0): say}, vehicle, drive))) for vehicle in vehicles]
-    assert not [answer for answer in intake.accept(ballots) if isinstance(answer, Exception)]
+    assert not [answer for answer in intake.write(ballots) if isinstance(answer, Exception)]
 
 
 def scans(store: Store, act: Callable[[], object]) -> list[str]:
@@ -89,7 +89,7 @@ def test_a_ballot_is_taken_in_without_reading_the_others(store: Store) -> None:
     say = Say(states_plane({(10, 12): CellState.UNCHANGED_EMPTY}))
     ballot = examine(encode(make_ballot(two_walls(), {(0, 0): say}, "c", "d4", base=base, version=store.current())))
     answers: list[object] = []
-    assert scans(store, lambda: answers.extend(intake.accept([ballot]))) == []
+    assert scans(store, lambda: answers.extend(intake.write([ballot]))) == []
     assert not isinstance(answers[0], Exception), answers
 
 

@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import pytest
 
 from hand_made import Say, make_ballot, states_plane, two_walls
-from mapvote.codec.ballot import Ballot
+from mapvote.codec.ballot import encode
 from mapvote.core.grid import TileIndex
 from mapvote.core.types import CellState
-from mapvote.server.store.admission import refuse_out_of_reach
+from mapvote.server.store.admission import examine, refuse_out_of_reach
+from mapvote.server.store.ballots import Votes
 
 MAP = {(0, 0), (0, 1)}
 
 
-def votes_on(*tiles: TileIndex, cell: tuple[int, int] | None = None) -> Ballot:
+def votes_on(*tiles: TileIndex, cell: tuple[int, int] | None = None) -> Sequence[Votes]:
     fill = CellState.UNCHANGED_EMPTY
     plane = states_plane(fill=fill) if cell is None else states_plane({cell: fill})
-    return make_ballot(two_walls(), dict.fromkeys(tiles, Say(plane)))
+    return examine(encode(make_ballot(two_walls(), dict.fromkeys(tiles, Say(plane))))).votes
 
 
 def test_votes_on_the_map_and_beside_it_are_heard() -> None:

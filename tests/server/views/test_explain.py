@@ -211,7 +211,7 @@ def test_a_tie_of_a_one_stage_ballot_is_undetermined_everywhere(one_stage: Store
         tally[TIE][state] = 3 * VOTE_UNIT
     tally[CLEAR][CellState.CHANGED_EMPTY] = 3 * VOTE_UNIT
     ballot = make_ballot(store.point_map(), {(0, 0): Say(tally=tally)}, end_ns=store.clock())
-    (receipt,) = Intake(store).accept([examine(encode(ballot))])
+    (receipt,) = Intake(store).write([examine(encode(ballot))])
     assert isinstance(receipt, Receipt), receipt
     said = [explain_cell(store, (c + 0.5) * 0.3, (r + 0.5) * 0.3).votes[0].state for r, c in (TIE, CLEAR)]
     assert said == ["undetermined", "changed_empty"]

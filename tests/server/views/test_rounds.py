@@ -64,7 +64,7 @@ def vote(store: Store, tiles: list[TileIndex], vehicle: str, drive: str = "d1") 
     ballot = make_ballot(
         store.point_map(), {index: Say(states, odds=odds) for index in tiles}, vehicle, drive, end_ns=store.clock()
     )
-    (receipt,) = Intake(store).accept([examine(encode(ballot))])
+    (receipt,) = Intake(store).write([examine(encode(ballot))])
     assert isinstance(receipt, Receipt), receipt
 
 

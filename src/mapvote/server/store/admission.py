@@ -12,18 +12,18 @@ from typing import NamedTuple
 import numpy as np
 import sqlalchemy as sa
 
-from mapvote.codec.ballot import Ballot, BallotTile, decode, tile_key, validate
-from mapvote.codec.points import unpack_points
+from mapvote.codec.ballot import Ballot, decode, tile_key
+from mapvote.codec.path import check_path
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, TileIndex
 from mapvote.core.types import F64, Bool, MapvoteError
 from mapvote.fusion.fuse import rule_of
-from mapvote.fusion.offline import staged, tile_vote
-from mapvote.fusion.tile_vote import DAY_NS
-from mapvote.server.errors import Conflict, TooMany, Unauthorised
+from mapvote.fusion.offline import staged
+from mapvote.fusion.tile_vote import DAY_NS, TileVote
+from mapvote.server.errors import Conflict, TooMany, Unauthorised, Unavailable
 from mapvote.server.store import keys, schema
-from mapvote.server.store.ballots import Incoming, Receipt, put_in, unlike
+from mapvote.server.store.ballots import Incoming, Receipt, Votes, write_ballots
 from mapvote.server.store.planes import TileHashes, unpack_ground_plane
-from mapvote.server.store.policy import policy_in
+from mapvote.server.store.policy import RoundPolicy, policy_in
 from mapvote.server.store.queries import (
     current_number,
     load_blob,
@@ -59,16 +59,35 @@ class Sent(NamedTuple):
 
 
 def examine(data: bytes) -> Incoming:
-    """Decode a ballot and unpack every plane once; MapvoteError on the first defect. Touches no database."""
+    """Decode a ballot and unpack every plane, once; MapvoteError on the first defect. Touches no database."""
     ballot = decode(data)
-    validate(ballot, MAX_UNPACKED_BYTES)
     if not ballot.tiles:
         raise MapvoteError("ballot: votes on no tile")
     _check_founded(ballot)
     rule_of(ballot.method)
     if any((tile.states is None) != (ballot.tiles[0].states is None) for tile in ballot.tiles):
         raise MapvoteError("ballot: some tiles hold states and some a tally; a ballot is either two-stage or one-stage")
-    return Incoming(ballot, hashlib.sha256(data).hexdigest(), f"{ballot.method}, {staged(ballot)}", len(data))
+    if ballot.path is not None:
+        check_path(ballot.path, [tile.tile for tile in ballot.tiles])
+    votes, size = [], 0
+    for tile in ballot.tiles:
+        vote = TileVote.unpack(tile)
+        size += vote.nbytes
+        if size > MAX_UNPACKED_BYTES:
+            raise MapvoteError(
+                f"ballot: larger than {MAX_UNPACKED_BYTES} bytes when decompressed; send a shorter drive"
+            )
+        votes.append(_told_by(tile.tile, vote))
+    cast_by = f"{ballot.method}, {staged(ballot)}"
+    return Incoming(ballot, votes, hashlib.sha256(data).hexdigest(), cast_by, len(data))
+
+
+def _told_by(tile: TileIndex, vote: TileVote) -> Votes:
+    spoken = np.packbits(vote.spoken()).tobytes()
+    if vote.new_points is None or not len(vote.new_points):
+        return Votes(tile, spoken, None, None)
+    heights = vote.new_points[:, 2]
+    return Votes(tile, spoken, float(heights.min()), float(heights.max()))
 
 
 def _check_founded(ballot: Ballot) -> None:
@@ -89,7 +108,8 @@ def _check_founded(ballot: Ballot) -> None:
 
 
 class Intake:
-    """Takes ballots into a store, in two steps that may run side by side; remembers the newest version's tiles.
+    """Admits ballots to a store: what is sound in itself is looked at side by side, what fits the map is decided within
+    the transaction that writes it. Remembers the newest version's tiles.
 
     ``quota``: what one vehicle may leave in the store; None: as much as it likes.
     """
@@ -100,88 +120,89 @@ class Intake:
         self._current: tuple[int, Mapping[TileIndex, TileHashes]] = (0, {})
         self._lowest = LowestGround()
 
-    def look_at(self, received: Sequence[Sent]) -> list[Incoming | Exception]:
-        """Everything but writing: each ballot, or why it is refused. Unavailable is raised for all.
-
-        MapvoteError: unsound, or not what its address says. Unauthorised: its key is not valid. Conflict: see
-        ``_misfits``.
-        """
-        found = [_sound(sent) for sent in received]
+    def look_at(self, received: Sequence[Sent]) -> list[Incoming | MapvoteError]:
+        """Each ballot decoded, or why it is refused: Unauthorised if its key is not valid, MapvoteError if it is
+        unsound or not what its address says. Unavailable is raised for all."""
+        asked = {sent.key_hash for sent in received if sent.key_hash is not None}
         with self._store.database.reading() as connection:
-            asked = {sent.key_hash for sent in received if sent.key_hash is not None}
             valid = keys.of(connection, asked, self._store.clock())
-            for i, sent in enumerate(received):
-                if sent.key_hash is not None and sent.key_hash not in valid:
-                    found[i] = Unauthorised(keys.UNKNOWN)
-            sound = [incoming for incoming in found if isinstance(incoming, Incoming)]
-            misfits = iter(self._misfits(connection, sound))
-        return [next(misfits) or one if isinstance(one, Incoming) else one for one in found]
+        return [Unauthorised(keys.UNKNOWN) if _unknown(sent.key_hash, valid) else _sound(sent) for sent in received]
 
-    def accept(self, ballots: Sequence[Incoming]) -> list[Receipt | Exception]:
-        """Those that fit, written as by :meth:`write`; Conflict in the place of the others."""
-        with self._store.database.reading() as connection:
-            misfits = self._misfits(connection, ballots)
-        fit = [ballot for ballot, misfit in zip(ballots, misfits, strict=True) if misfit is None]
-        receipts = iter(self.write(fit))
-        return [misfit or next(receipts) for misfit in misfits]
+    def write(self, ballots: Sequence[Incoming]) -> list[Receipt | MapvoteError]:
+        """Store the ballots that are admitted, in one durable transaction: a receipt, or why not.
 
-    def write(self, ballots: Sequence[Incoming]) -> list[Receipt | Exception]:
-        """Store ballots in one durable transaction: a receipt, or Conflict where one votes by another method or other
-        settings than the round. Unavailable is raised for all."""
+        Conflict: another map, method, settings or base than the store's, or no cell that still counts. Unauthorised:
+        its key was revoked meanwhile. TooMany: beyond its vehicle's quota. MapvoteError: from the future, or from where
+        its vehicle cannot have been. Unavailable is raised for all.
+        """
         if not ballots:
             return []
+        now = self._store.clock()
         with self._store.database.writing() as connection:
-            return put_in(connection, ballots, self._store.clock())
+            newest = current_number(connection)
+            self._current = newest, _brought_up(connection, newest, *self._current)
+            asked = policy_in(connection).round
+            came_with = {ballot.key_hash for ballot in ballots if ballot.key_hash is not None}
+            valid = keys.of(connection, came_with, now)
 
-    def _misfits(self, connection: sa.Connection, ballots: Sequence[Incoming]) -> list[MapvoteError | None]:
-        """Conflict for each ballot on another map, cast by other settings, with an unknown base or without a cell that
-        still counts; MapvoteError for one from the future or from where its vehicle cannot have been, TooMany for more
-        than its vehicle's quota."""
-        newest = current_number(connection)
-        self._current = newest, _brought_up(connection, newest, *self._current)
-        asked, repeated = policy_in(connection).round, _standing(connection, ballots)
-        return [
-            None
-            if one.digest in repeated
-            else unlike(asked, one) or self._misfit(connection, one.ballot) or self._too_much(connection, one)
-            for one in ballots
-        ]
+            def refusal(one: Incoming) -> MapvoteError | None:
+                if _unknown(one.key_hash, valid):
+                    return Unauthorised(keys.UNKNOWN)
+                misfit = _unlike(asked, one) or self._misfit(connection, one, now)
+                if misfit is None and self._quotas is not None:
+                    return self._quotas.refusal(connection, one, now)
+                return misfit
 
-    def _too_much(self, connection: sa.Connection, one: Incoming) -> MapvoteError | None:
-        return None if self._quotas is None else self._quotas.refusal(connection, one, self._store.clock())
+            return write_ballots(connection, ballots, now, refusal)
 
-    def _misfit(self, connection: sa.Connection, ballot: Ballot) -> MapvoteError | None:
-        current = self._current[1]
+    def _misfit(self, connection: sa.Connection, one: Incoming, now: int) -> MapvoteError | None:
+        """Why a ballot does not fit the map as it is; None if it does."""
+        ballot, (newest, current) = one.ballot, self._current
         if ballot.map_id != self._store.map_id:
             return Conflict(f"this server keeps map {self._store.map_id!r}, the ballot votes on {ballot.map_id!r}")
-        impossible = self._wrong_time(ballot) or refuse_out_of_reach(ballot, current.keys())
-        impossible = impossible or refuse_out_of_height(ballot, current, partial(self._lowest.look_up, connection))
+        impossible = self._wrong_time(ballot, now) or refuse_out_of_reach(one.votes, current.keys())
+        impossible = impossible or refuse_out_of_height(one.votes, current, partial(self._lowest.look_up, connection))
         if impossible is not None:
             return impossible
-        version = ballot.version
-        if version > self._current[0]:
-            return Conflict(f"there is no version {version} yet; the newest is {self._current[0]}: fetch it")
-        counts = False
-        for tile in ballot.tiles:
-            base, now = ballot.base[tile_key(tile.tile)], current.get(tile.tile)
-            then = now if version == self._current[0] else tile_of(connection, version, tile.tile)
+        if ballot.version > newest:
+            return Conflict(f"there is no version {ballot.version} yet; the newest is {newest}: fetch it")
+        counts = ballot.version == newest
+        for votes in one.votes:
+            base, now_there = ballot.base[tile_key(votes.tile)], current.get(votes.tile)
+            then = now_there if ballot.version == newest else tile_of(connection, ballot.version, votes.tile)
             if base != ("" if then is None else then.points):
-                known = f"the base of tile {tile_key(tile.tile)} is not that of version {version}"
+                known = f"the base of tile {tile_key(votes.tile)} is not that of version {ballot.version}"
                 return Conflict(f"{known}: fetch the map and vote again")
-            counts = counts or _counts_somewhere(connection, ballot, tile, version, now)
+            counts = counts or _counts_somewhere(connection, votes, ballot.version, now_there)
         if not counts:
-            stale = names(tile.tile for tile in ballot.tiles)
+            stale = names(votes.tile for votes in one.votes)
             return Conflict(
-                f"every cell voted on has changed since version {version}: fetch tiles {stale} and vote again"
+                f"every cell voted on has changed since version {ballot.version}: fetch tiles {stale} and vote again"
             )
         return None
 
-    def _wrong_time(self, ballot: Ballot) -> MapvoteError | None:
-        if ballot.end_ns > self._store.clock() + MAX_CLOCK_AHEAD_NS:
+    def _wrong_time(self, ballot: Ballot, now: int) -> MapvoteError | None:
+        if ballot.end_ns > now + MAX_CLOCK_AHEAD_NS:
             return MapvoteError("ballot: the drive ends in the future; set the vehicle's clock")
         if self._store.surveyed_ns is not None and ballot.end_ns < self._store.surveyed_ns:
             return MapvoteError("ballot: the drive ended before the map was surveyed; set the vehicle's clock")
         return None
+
+
+def _unknown(key_hash: str | None, valid: Collection[str]) -> bool:
+    """Whether a ballot came with a key that opens nothing; by a client of this machine it may come without one."""
+    return key_hash is not None and key_hash not in valid
+
+
+def _unlike(asked: RoundPolicy, incoming: Incoming) -> MapvoteError | None:
+    """Why a ballot does not fit the round that the policy asks for; None if it does."""
+    settings = incoming.ballot.settings_hash
+    if asked.cast_by == incoming.cast_by and settings.startswith(asked.settings_hash):
+        return None
+    theirs = f"{incoming.cast_by}, settings {settings[:16]}"
+    ours = f"{asked.cast_by}, settings {asked.settings_hash[:16] or 'of any kind'}"
+    mend = "vote again with the fleet's configuration (mapvote config)"
+    return Conflict(f"this round votes by {ours}, the ballot by {theirs}: one round never mixes them; {mend}")
 
 
 def _brought_up(
@@ -198,42 +219,45 @@ def _brought_up(
     return kept | tiles_of(connection, number, touched)
 
 
-def accept(store: Store, ballots: Sequence[Incoming]) -> list[Receipt | Exception]:
-    """:meth:`Intake.accept`, once."""
-    return Intake(store).accept(ballots)
+def accept(store: Store, ballots: Sequence[Incoming]) -> list[Receipt | MapvoteError]:
+    """:meth:`Intake.write`, once."""
+    return Intake(store).write(ballots)
 
 
-def _sound(sent: Sent) -> Incoming | Exception:
+def _sound(sent: Sent) -> Incoming | MapvoteError:
     try:
         incoming = examine(sent.data)
     except MapvoteError as error:
         return error
-    theirs = incoming.ballot
-    if (theirs.vehicle, theirs.drive) != (sent.vehicle, sent.drive):
+    if incoming.drive != (sent.vehicle, sent.drive):
         address = f"{sent.vehicle[:64]}/{sent.drive[:64]}"
-        return MapvoteError(f"the ballot is of {theirs.vehicle}/{theirs.drive}, not {address}")
+        return MapvoteError(f"the ballot is of {'/'.join(incoming.drive)}, not {address}")
     return replace(incoming, key_hash=sent.key_hash)
 
 
-def _standing(connection: sa.Connection, ballots: Sequence[Incoming]) -> set[str]:
-    """Which of these stand already: sending again is harmless, whatever became of the votes."""
-    b = schema.ballots
-    drives = sa.tuple_(b.c.vehicle, b.c.drive).in_({(one.ballot.vehicle, one.ballot.drive) for one in ballots})
-    return set(connection.execute(sa.select(b.c.digest).where(drives, b.c.gone_seq.is_(None))).scalars())
+def _counts_somewhere(connection: sa.Connection, votes: Votes, version: int, now: TileHashes | None) -> bool:
+    """Whether there is a cell that a ballot speaks of and that has not changed since ``version``.
 
-
-def _counts_somewhere(
-    connection: sa.Connection, ballot: Ballot, tile: BallotTile, version: int, now: TileHashes | None
-) -> bool:
-    """Whether there is a cell that the ballot speaks of and that has not changed since."""
-    memory = None
-    if now is None:
-        memory = memory_of(connection, (1 << 31) - 1, tile.tile)
-    elif now.memory is not None:
-        memory = load_memory(connection, now.memory)
+    Of a tile whose memory is damaged nobody knows: its votes are admitted, and wait until the plane is mended.
+    """
+    try:
+        if now is None:
+            memory = memory_of(connection, (1 << 31) - 1, votes.tile)
+        else:
+            memory = None if now.memory is None else load_memory(connection, now.memory)
+    except Unavailable:
+        raise
+    except MapvoteError:
+        return True
     if memory is None or not len(memory.changed_after(version)):
         return True
-    return bool((tile_vote(ballot, tile, "").spoken() & (memory.changed <= version)).any())
+    return bool((_cells(votes.spoken) & (memory.changed <= version)).any())
+
+
+def _cells(spoken: bytes) -> Bool:
+    """(256, 256) bool."""
+    bits = np.unpackbits(np.frombuffer(spoken, dtype=np.uint8))
+    return bits.astype(np.bool_).reshape(TILE_CELLS, TILE_CELLS)
 
 
 _COUNTED_AGAIN_NS = DAY_NS // 24
@@ -308,17 +332,17 @@ _TILE_M = TILE_CELLS * CELL_SIZE
 _TILES_AWAY = int(MAX_REACH_M // _TILE_M) + 1
 
 
-def refuse_out_of_reach(ballot: Ballot, map_tiles: Collection[TileIndex]) -> MapvoteError | None:
+def refuse_out_of_reach(said: Sequence[Votes], map_tiles: Collection[TileIndex]) -> MapvoteError | None:
     """Why a ballot votes where its vehicle cannot have been: on a cell more than MAX_REACH_M from every tile of the
     map, or on tiles in groups that lie farther apart than that. None if it may have been there."""
-    for tile in ballot.tiles:
-        near = [index for index in _around(tile.tile) if index in map_tiles]
-        if _within(tile.tile, near):
+    for votes in said:
+        near = [index for index in _around(votes.tile) if index in map_tiles]
+        if _within(votes.tile, near):
             continue
-        if not near or _farthest_m(ballot, tile, near) > MAX_REACH_M:
-            where = f"tile {tile_key(tile.tile)} has votes more than {MAX_REACH_M:.0f} m from the map"
+        if not near or _farthest_m(votes, near) > MAX_REACH_M:
+            where = f"tile {tile_key(votes.tile)} has votes more than {MAX_REACH_M:.0f} m from the map"
             return MapvoteError(f"{where}: a vehicle votes on what it saw while it localised in the map")
-    apart = _first_apart([tile.tile for tile in ballot.tiles])
+    apart = _first_apart([votes.tile for votes in said])
     if apart is not None:
         first, other = (tile_key(index) for index in apart)
         why = f"tiles {first} and {other} lie on ways more than {MAX_REACH_M:.0f} m apart"
@@ -345,23 +369,22 @@ class LowestGround:
 
 
 def refuse_out_of_height(
-    ballot: Ballot, map_tiles: Mapping[TileIndex, TileHashes], lowest_m: Callable[[str], float]
+    said: Sequence[Votes], map_tiles: Mapping[TileIndex, TileHashes], lowest_m: Callable[[str], float]
 ) -> MapvoteError | None:
     """Why a ballot brings points deeper or higher than anything on this map can be; None if it may.
 
     ``lowest_m``: of a ground plane by its hash. The nearest tiles tell: itself and its neighbours, else those in reach.
     """
-    for tile in ballot.tiles:
-        heights = () if tile.new_points is None else unpack_points(tile.new_points)[:, 2]
-        if not len(heights):
+    for tile, _, low_m, high_m in said:
+        if low_m is None or high_m is None:
             continue
-        near = [index for index in _around(tile.tile) if index in map_tiles]
-        touching = [index for index in near if max(abs(index[0] - tile.tile[0]), abs(index[1] - tile.tile[1])) <= 1]
-        lowest = min((lowest_m(map_tiles[index].ground) for index in touching or near), default=np.inf)
-        if np.isfinite(lowest) and not lowest - MAX_BELOW_M <= min(heights) <= max(heights) <= lowest + MAX_ABOVE_M:
-            span = f"{min(heights):.1f} to {max(heights):.1f} m on tile {tile_key(tile.tile)}"
+        near = [index for index in _around(tile) if index in map_tiles]
+        touching = [index for index in near if max(abs(index[0] - tile[0]), abs(index[1] - tile[1])) <= 1]
+        ground_m = min((lowest_m(map_tiles[index].ground) for index in touching or near), default=np.inf)
+        if np.isfinite(ground_m) and not ground_m - MAX_BELOW_M <= low_m <= high_m <= ground_m + MAX_ABOVE_M:
+            span = f"{low_m:.1f} to {high_m:.1f} m on tile {tile_key(tile)}"
             allowed = (
-                f"{MAX_BELOW_M:g} m below to {MAX_ABOVE_M:g} m above the map's lowest ground there, {lowest:.1f} m"
+                f"{MAX_BELOW_M:g} m below to {MAX_ABOVE_M:g} m above the map's lowest ground there, {ground_m:.1f} m"
             )
             return MapvoteError(f"new points at {span} are not within {allowed}: is the vehicle on this level?")
     return None
@@ -380,14 +403,13 @@ def _within(index: TileIndex, near: Collection[TileIndex]) -> bool:
     return any(abs(index[0] - row) <= 1 and abs(index[1] - col) <= 1 for row, col in near)
 
 
-def _farthest_m(ballot: Ballot, tile: BallotTile, near: Collection[TileIndex]) -> float:
+def _farthest_m(votes: Votes, near: Collection[TileIndex]) -> float:
     """From the map's nearest tile to the cell that is farthest from all of them, of those voted on; metres."""
-    spoken: Bool = tile_vote(ballot, tile, "").spoken()
-    rows, cols = np.nonzero(spoken)
+    rows, cols = np.nonzero(_cells(votes.spoken))
     if not len(rows):
         return 0.0
-    y = (tile.tile[0] * TILE_CELLS + rows + 0.5) * CELL_SIZE
-    x = (tile.tile[1] * TILE_CELLS + cols + 0.5) * CELL_SIZE
+    y = (votes.tile[0] * TILE_CELLS + rows + 0.5) * CELL_SIZE
+    x = (votes.tile[1] * TILE_CELLS + cols + 0.5) * CELL_SIZE
     least: F64 = np.full(len(rows), np.inf)
     for row, col in near:
         dy = np.maximum(np.maximum(row * _TILE_M - y, y - (row + 1) * _TILE_M), 0.0)

@@ -2,20 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
 
 import sqlalchemy as sa
 
 from mapvote.codec.ballot import Ballot, BallotTile, tile_key
+from mapvote.core.grid import TileIndex
 from mapvote.core.types import MapvoteError
-from mapvote.server.errors import Conflict, NotFound, Unauthorised
-from mapvote.server.store import keys, schema
+from mapvote.server.errors import NotFound
+from mapvote.server.store import schema
 from mapvote.server.store.database import insert_rows
-from mapvote.server.store.policy import RoundPolicy, policy_in
 from mapvote.server.store.queries import log_event, next_seq
 from mapvote.server.store.store import Store
+
+
+class Votes(NamedTuple):
+    """What admission asks of a ballot's votes on one tile. The unpacked planes themselves are not kept."""
+
+    tile: TileIndex
+    spoken: bytes
+    """The cells that it votes on: 65536 bits, row by row."""
+    lowest_m: float | None
+    """Height of its lowest new point, map metres; None: it brings none."""
+    highest_m: float | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,13 +34,21 @@ class Incoming:
     """A ballot that is sound in itself."""
 
     ballot: Ballot
+    votes: Sequence[Votes]
+    """Of each of its tiles."""
     digest: str
+    """SHA-256 of the ballot as it was sent."""
     cast_by: str
     """Method and stage: all ballots of a round agree on them."""
     size: int
     """Bytes."""
     key_hash: str | None = None
     """Of the key that it came with."""
+
+    @property
+    def drive(self) -> tuple[str, str]:
+        """(vehicle, drive)."""
+        return self.ballot.vehicle, self.ballot.drive
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,14 +63,41 @@ class Receipt:
     seq: int
 
 
-def put_in(connection: sa.Connection, ballots: Sequence[Incoming], now: int) -> list[Receipt | Exception]:
-    """Write ballots within a transaction: a receipt each, or Conflict where one votes otherwise than the round,
-    Unauthorised where its key was revoked since it was looked at."""
+def write_ballots(
+    connection: sa.Connection,
+    ballots: Sequence[Incoming],
+    now: int,
+    refusal: Callable[[Incoming], MapvoteError | None],
+) -> list[Receipt | MapvoteError]:
+    """Write ballots within a transaction: a receipt each, or why ``refusal`` does not admit it. A ballot that stands
+    already is not judged again: whoever got no answer may send it once more, whatever became of the votes."""
+    first, standing = _heard_of(connection, ballots)
+    seq, rows = next_seq(connection), _Rows()
+    results: list[Receipt | MapvoteError] = []
+    for incoming in ballots:
+        old = standing.get(incoming.drive)
+        if old is not None and old[1] == incoming.digest:
+            results.append(Receipt(*incoming.drive, created=False, repeated=True, seq=old[0]))
+            continue
+        why = refusal(incoming)
+        if why is not None:
+            results.append(why)
+            continue
+        first.setdefault(incoming.drive, seq)
+        rows.add(incoming, seq, first[incoming.drive], now, None if old is None else old[0])
+        standing[incoming.drive] = seq, incoming.digest
+        results.append(Receipt(*incoming.drive, created=old is None, repeated=False, seq=seq))
+        seq += 1
+    rows.insert(connection)
+    return results
+
+
+def _heard_of(
+    connection: sa.Connection, ballots: Sequence[Incoming]
+) -> tuple[dict[tuple[str, str], int], dict[tuple[str, str], tuple[int, str]]]:
+    """Of the drives of these ballots: (when each was first heard of, number and digest of the ballot that stands)."""
     b = schema.ballots
-    asked_keys = {incoming.key_hash for incoming in ballots if incoming.key_hash is not None}
-    valid = keys.of(connection, asked_keys, now)
-    asked = policy_in(connection).round
-    drives = sa.tuple_(b.c.vehicle, b.c.drive).in_({(i.ballot.vehicle, i.ballot.drive) for i in ballots})
+    drives = sa.tuple_(b.c.vehicle, b.c.drive).in_({incoming.drive for incoming in ballots})
     query = sa.select(b.c.vehicle, b.c.drive, b.c.seq, b.c.first_seq, b.c.gone_seq, b.c.digest).where(drives)
     first: dict[tuple[str, str], int] = {}
     standing: dict[tuple[str, str], tuple[int, str]] = {}
@@ -59,59 +105,42 @@ def put_in(connection: sa.Connection, ballots: Sequence[Incoming], now: int) -> 
         first.setdefault((row.vehicle, row.drive), row.first_seq)
         if row.gone_seq is None:
             standing[row.vehicle, row.drive] = row.seq, row.digest
-    seq = next_seq(connection)
-    results: list[Receipt | Exception] = []
-    log: list[tuple[Any, ...]] = []
-    rows: list[tuple[Any, ...]] = []
-    tiles: list[tuple[Any, ...]] = []
-    paths: list[tuple[Any, ...]] = []
-    replaced: list[dict[str, int]] = []
-    for incoming in ballots:
-        ballot, key = incoming.ballot, (incoming.ballot.vehicle, incoming.ballot.drive)
-        old = standing.get(key)
-        if old is not None and old[1] == incoming.digest:
-            results.append(Receipt(*key, created=False, repeated=True, seq=old[0]))
-            continue
-        why = unlike(asked, incoming)
-        if incoming.key_hash is not None and incoming.key_hash not in valid:
-            why = Unauthorised(keys.UNKNOWN)
-        if why is not None:
-            results.append(why)
-            continue
-        if old is not None:
-            replaced.append({"old": old[0], "by": seq})
-        first.setdefault(key, seq)
-        standing[key] = seq, incoming.digest
-        log.append((seq, now, "ballot", *key))
+    return first, standing
+
+
+@dataclass(slots=True)
+class _Rows:
+    """The rows of several ballots, each in the order of its table's columns."""
+
+    log: list[tuple[Any, ...]] = field(default_factory=list)
+    ballots: list[tuple[Any, ...]] = field(default_factory=list)
+    tiles: list[tuple[Any, ...]] = field(default_factory=list)
+    paths: list[tuple[Any, ...]] = field(default_factory=list)
+    replaced: list[dict[str, int]] = field(default_factory=list)
+
+    def add(self, incoming: Incoming, seq: int, first_seq: int, now: int, old: int | None) -> None:
+        """A ballot that replaces ``old``, if there is one."""
+        ballot = incoming.ballot
+        self.log.append((seq, now, "ballot", *incoming.drive))
         times = ballot.start_ns, ballot.end_ns, now
         how = ballot.settings_hash[:128], incoming.cast_by, incoming.size, ballot.version
-        rows.append((seq, first[key], None, *key, incoming.digest, *times, *how))
-        tiles += [_tile_row(seq, ballot, tile) for tile in ballot.tiles]
+        self.ballots.append((seq, first_seq, None, *incoming.drive, incoming.digest, *times, *how))
+        self.tiles += [_tile_row(seq, ballot, tile) for tile in ballot.tiles]
         if ballot.path is not None:
-            paths.append((seq, ballot.path))
-        results.append(Receipt(*key, created=old is None, repeated=False, seq=seq))
-        seq += 1
-    if rows:
-        insert_rows(connection, schema.events, log)
-        insert_rows(connection, b, rows)
-        insert_rows(connection, schema.ballot_tiles, tiles)
-    if paths:
-        insert_rows(connection, schema.paths, paths)
-    if replaced:
-        mark = b.update().where(b.c.seq == sa.bindparam("old")).values(gone_seq=sa.bindparam("by"))
-        connection.execute(mark, replaced)
-    return results
+            self.paths.append((seq, ballot.path))
+        if old is not None:
+            self.replaced.append({"old": old, "by": seq})
 
-
-def unlike(asked: RoundPolicy, incoming: Incoming) -> MapvoteError | None:
-    """Why a ballot does not fit the round that the policy asks for; None if it does."""
-    settings = incoming.ballot.settings_hash
-    if asked.cast_by == incoming.cast_by and settings.startswith(asked.settings_hash):
-        return None
-    theirs = f"{incoming.cast_by}, settings {settings[:16]}"
-    ours = f"{asked.cast_by}, settings {asked.settings_hash[:16] or 'of any kind'}"
-    mend = "vote again with the fleet's configuration (mapvote config)"
-    return Conflict(f"this round votes by {ours}, the ballot by {theirs}: one round never mixes them; {mend}")
+    def insert(self, connection: sa.Connection) -> None:
+        b = schema.ballots
+        for table, rows in (
+            (schema.events, self.log), (b, self.ballots), (schema.ballot_tiles, self.tiles), (schema.paths, self.paths)
+        ):  # fmt: skip
+            if rows:
+                insert_rows(connection, table, rows)
+        if self.replaced:
+            mark = b.update().where(b.c.seq == sa.bindparam("old")).values(gone_seq=sa.bindparam("by"))
+            connection.execute(mark, self.replaced)
 
 
 def _tile_row(seq: int, ballot: Ballot, tile: BallotTile) -> tuple[Any, ...]:

@@ -14,15 +14,11 @@ from typing import Any, TypeVar
 import numpy as np
 import sqlalchemy as sa
 
-from mapvote.codec.ballot import unpack_offer, unpack_sound_states, unpack_sureness, unpack_tally
-from mapvote.codec.points import unpack_sound_points
 from mapvote.config import FuseSettings
 from mapvote.core.grid import TileIndex
 from mapvote.core.tile import Tile
 from mapvote.core.types import I64, Bool
-from mapvote.fusion.odds import Odds
 from mapvote.fusion.persistence import history_days
-from mapvote.fusion.sparse_columns import Words
 from mapvote.fusion.spent import unspent
 from mapvote.fusion.tile_vote import DAY_NS, TileVote, restrict, select
 from mapvote.server.store import schema
@@ -351,9 +347,9 @@ class Remembered:
             for digest, vote in votes.items():
                 if digest not in self._votes:
                     self._votes[digest] = vote
-                    self.bytes += _size(vote)
+                    self.bytes += vote.nbytes
             while self.bytes > self.most_bytes:
-                self.bytes -= _size(self._votes.popitem(last=False)[1])
+                self.bytes -= self._votes.popitem(last=False)[1].nbytes
 
     def clear(self) -> None:
         """As a process that has just begun."""
@@ -390,7 +386,7 @@ def read_votes(
     _check(mine.values())
     sums = [mine[vote.seq].sum for vote in stored]
     unpacked = remembered.get(sums)
-    new = {row.sum: _unpacked(row) for row in mine.values() if row.sum not in unpacked}
+    new = {row.sum: TileVote.unpack(row, sound=True) for row in mine.values() if row.sum not in unpacked}
     remembered.put(new)
     unpacked |= new
     return [_said_by(vote, unpacked[digest]) for digest, vote in zip(sums, stored, strict=True)]
@@ -406,31 +402,3 @@ def _check(rows: Iterable[Any]) -> None:
     damaged = [ballot_name(row.ballot, row.row, row.col) for row in rows if not schema.is_sound(_T, row)]
     if damaged:
         raise DamagedBallots([Damage("ballot", name, NOT_ITS_SUM) for name in damaged])
-
-
-def _unpacked(row: Any) -> TileVote:
-    """A row's planes, of nobody yet."""
-    new_points, intensity = unpack_offer(row.new_points, row.intensity, unpack_sound_points)
-    states = None if row.states is None else unpack_sound_states(row.states)
-    sureness = unpack_sureness(row.odds, states)
-    return TileVote(
-        vehicle="",
-        end_ns=0,
-        digest="",
-        states=states,
-        tally=None if row.tally is None else unpack_tally(row.tally),
-        gone=None if row.gone is None else Words.unpack(row.gone, "gone"),
-        new_points=new_points,
-        intensity=intensity,
-        free=None if row.free is None else Words.unpack(row.free, "free"),
-        odds=None if states is None else Odds.of(states, sureness),
-    )
-
-
-def _size(vote: TileVote) -> int:
-    """Bytes of all planes."""
-    planes: list[np.ndarray | None] = [vote.states, vote.tally, vote.new_points, vote.intensity]
-    for words in (vote.gone, vote.free):
-        planes += [] if words is None else [words.cells, words.words]
-    planes += [] if vote.odds is None else [vote.odds.cells, vote.odds.steps]
-    return sum(plane.nbytes for plane in planes if plane is not None)
