@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import struct
 from collections.abc import Callable
 from pathlib import Path
@@ -9,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from mapvote.core import geometry
 from mapvote.core.point_map import PointMap, map_from_points
 from mapvote.core.types import F64
 from mapvote.doctor.diagnosis import diagnose
@@ -18,6 +20,8 @@ from mapvote.formats import write_map
 from mapvote.formats.maps.cloud import Cloud
 from mapvote.formats.maps.las import write_las
 from mapvote.formats.maps.pcd import save_pcd
+
+Change = Callable[[F64], F64]
 
 
 def street() -> F64:
@@ -70,7 +74,7 @@ def test_a_sound_map_is_not_blamed(points: F64, sound: PointMap) -> None:
         (lambda p: p[:10], "10 points only"),
     ],
 )
-def test_what_is_wrong_with_points_is_named(points: F64, change: Callable[[F64], F64], name: str) -> None:
+def test_what_is_wrong_with_points_is_named(points: F64, change: Change, name: str) -> None:
     assert any(name in what for what in serious(check_cloud(in_memory(change(points))))), check_cloud(
         in_memory(change(points))
     )
@@ -96,16 +100,34 @@ def test_house_fronts_behind_each_other_are_not_taken_for_the_ground() -> None:
     assert not [what for what in serious(check_cloud(in_memory(houses))) if "up" in what]
 
 
-def test_a_second_road_above_the_first_is_a_ghost(points: F64) -> None:
-    twice = map_from_points(np.concatenate([points, points + np.array([0, 0, 0.6])]))
-    assert any("the road lies there twice, 0.6" in what for what in serious(check_map(twice)))
+def again(*shift_m: float) -> Change:
+    return lambda p: np.concatenate([p, p + np.array(shift_m)])
 
 
-def test_walls_that_are_there_twice_are_a_ghost_with_its_shift(points: F64) -> None:
-    twice = map_from_points(np.concatenate([points, points + np.array([3.0, -1.0, 0])]))
-    found = [what for what in serious(check_map(twice)) if "walls and poles are there twice" in what]
-    assert found
-    assert "3.2 m (x +3.0, y -1.0)" in found[0] or "3.2 m (x -3.0, y +1.0)" in found[0]
+def pitched(p: F64) -> F64:
+    return np.asarray(p @ geometry.from_xyz_rpy(0, 0, 0, pitch=np.radians(3.0))[:3, :3].T)
+
+
+FAULTS: list[tuple[Change, list[str]]] = [
+    (again(0, 0, 0.6), [r"the road lies there twice, 0\.6"]),
+    (
+        again(3.0, -1.0, 0),
+        [r"are there twice, shifted by 3\.2 m \(x [+-]3.0, y [+-]1.0\)"],
+    ),
+    (again(0.35, 0.49, 0), [r"walls and poles are there twice, shifted by 0\.6 m"]),
+    (pitched, [r"walls and poles lean by (2\.9|3\.[01]) deg"]),
+    (lambda p: again(0.35, 0.49, 0)(pitched(p)), ["are there twice, shifted by 0", "lean by"]),
+    (lambda p: again(0, 0, 0.6)(pitched(p)), ["road lies there twice", "lean by"]),
+]
+
+
+@pytest.mark.parametrize(("change", "names"), FAULTS)
+def test_layers_that_are_there_twice_and_a_tilt_are_named_alone_and_together(
+    points: F64, change: Change, names: list[str]
+) -> None:
+    told = serious(check_map(map_from_points(change(points))))
+    for name in names:
+        assert any(re.search(name, what) for what in told), told
 
 
 def test_outliers_far_above_the_road_are_an_error(points: F64) -> None:

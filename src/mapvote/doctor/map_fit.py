@@ -31,20 +31,22 @@ from mapvote.localisation.prepare import deskew, motion_at, solid_sample
 
 _PLACES = 6
 _SEARCHED = 4
-_FEW = 0.8
-"""If fewer scans fit, the map may be in another scale."""
 _MIRROR = np.array([1.0, -1.0, 1.0], dtype=np.float32)
 _TURN_DEG, _TILT_DEG, _SCALE = 0.5, 1.5, 0.01
 _POSITION_M, _ROTATION_RAD = 0.03, np.radians(0.15)
 """Errors of one registration; they weigh positions against rotations."""
-_POINTS_SCALE = 0.01
-"""Error of the scale that points show; it stands where a drive is too short to tell it."""
+_POINTS_SCALE = 0.002
+"""Error of the scale that points show."""
+_WITHIN = 2.0
+"""Errors of the prior, as drive.toml states them: a shift of no more cannot be told from them."""
+_UNKNOWN_SCALE = 0.01
+"""By which the scale errs where points do not show it: it stands where a drive is too short to tell it."""
 _OFFSETS_M = np.arange(-6.0, 6.1, 1.0)
 _YAWS = np.radians([0.0, -3.0, 3.0])
 _RANKED = 3
-_SCALES = (0.92, 0.94, 0.96, 0.98, 1.02, 1.04, 1.06, 1.08)
-"""A fit shows up to 1.5 % beside the right one."""
 _FINER = 0.01
+_SCALES = 1.0 + _FINER * np.arange(-9, 10)
+"""A scan fits at no more than one step beside the right one."""
 _LOOKED_AT = 3
 """Scans registered in another scale or unit, to choose one."""
 _FEET_M = 0.3048
@@ -105,6 +107,13 @@ class Laid:
         """A few of the scans, to choose a scale or a unit by."""
         return list(self.scans)[:: max(1, len(self.scans) // _LOOKED_AT)][:_LOOKED_AT]
 
+    def scaled(self, i: int, scale: float) -> F64:
+        """The prior's pose (4, 4) of a scan in a map that is so many times as large about the middle of the drive."""
+        out = self.T[i].copy()
+        middle = self.T[:, :3, 3].mean(axis=0)
+        out[:3, 3] = middle + scale * (out[:3, 3] - middle)
+        return out
+
     @cached_property
     def around(self) -> MapWindow:
         return MapWindow(self.point_map)
@@ -135,13 +144,14 @@ def check_on_map(drive: Drive, T: F64, point_map: PointMap, tell: Progress | Non
     places: list[Place] = []
     for i in laid.told("registering to the map", laid.scans):
         places += laid.places({i: _on_ground(T[i], point_map, depth_m)})
-    scale = 1.0
-    if len(fitting(places)) < _FEW * len(places):
-        other, better = _in_another_scale(laid)
+    scale, scale_sigma = _scale_by_points(laid, places)
+    if abs(scale - 1.0) > 0.5 * _SCALE:
+        better = laid.places({p.index: [p.T_map_lidar, laid.scaled(p.index, scale)] for p in places}, scale=scale)
         if total_fit(better) > 1.2 * total_fit(places):
-            scale, places = other, better
+            places = better
+        else:
+            scale_sigma = float("inf")
     if len(fitting(places)) < 0.5 * len(places):
-        scale = 1.0
         unit = in_another_unit(laid)
         if unit is not None:
             return [unit], T
@@ -154,34 +164,42 @@ def check_on_map(drive: Drive, T: F64, point_map: PointMap, tell: Progress | Non
     if len(good) < 2:
         return [*found, _fits_nowhere(places)], T
     found += _where_not(places, good)
-    pairs = np.array([T[p.index] for p in good]), np.array([p.T_map_lidar for p in good])
-    fit = fit_similarity(*pairs, position_m=_POSITION_M, rotation_rad=_ROTATION_RAD, scale=(scale, _POINTS_SCALE))
+    # Places far apart tell the scale as well, but no better than the prior's positions are known.
+    fit = fit_similarity(
+        np.array([T[p.index] for p in good]),
+        np.array([p.T_map_lidar for p in good]),
+        position_m=float(np.hypot(_POSITION_M, drive.prior_sigma_m)),
+        rotation_rad=float(np.hypot(_ROTATION_RAD, np.radians(drive.prior_sigma_deg))),
+        scale=(scale, scale_sigma) if np.isfinite(scale_sigma) else (1.0, _UNKNOWN_SCALE),
+    )
     mended = fit.applied(T)
     return found + _differs(fit, len(good), drive) + _heights(point_map, mended, drive), mended
 
 
-def _in_another_scale(laid: Laid) -> tuple[float, list[Place]]:
-    """(the scale under which most scans fit, their places so); (1, []) if none does.
+def _scale_by_points(laid: Laid, places: Sequence[Place]) -> tuple[float, float]:
+    """(how many times as large as the scans the map is, its standard error), by the points of each scan alone.
 
-    Scans and the prior's positions are scaled together, about the middle of the drive.
+    Scans made larger and smaller are registered anew; at the right scale many more of their points agree. A sound scan
+    shows it to .0005. Where scans contradict each other, (1, inf).
     """
-    middle = laid.T[:, :3, 3].mean(axis=0)
-
-    def places(scale: float, index: Iterable[int]) -> list[Place]:
-        guesses = {}
-        for i in index:
-            guess = laid.T[i].copy()
-            guess[:3, 3] = middle + scale * (guess[:3, 3] - middle)
-            guesses[i] = [guess]
-        return laid.places(guesses, scale=scale)
-
-    fits = {scale: total_fit(places(scale, laid.some)) for scale in laid.told("trying other scales", _SCALES)}
-    scale = max(fits, key=lambda one: fits[one])
-    if fits[scale] == 0.0:
-        return 1.0, []
-    beside = [total_fit(places(scale * (1.0 + step), laid.some)) for step in (-_FINER, _FINER)]
-    scale *= 1.0 + _FINER * _peak(beside[0], fits[scale], beside[1])
-    return scale, places(scale, laid.scans)
+    peaks = []
+    for place in laid.told("trying other scales", places):
+        ndt_map = laid.around(place.T_map_lidar[:3, 3])
+        fits = []
+        for scale in _SCALES:
+            clouds = thin_for_levels(np.asarray(scale * laid.scans[place.index].points, dtype=np.float32))
+            starts = [place.T_map_lidar]
+            if place.fit < place.least:  # it may be elsewhere: where the prior has it, in a map so much larger
+                starts.append(laid.scaled(place.index, scale))
+            found = [refine(ndt_map, clouds, start).T_map_lidar for start in starts]
+            fits.append(max(fitness(ndt_map, clouds, T, len(clouds) - 1) for T in found))
+        best = int(np.clip(np.argmax(fits), 1, len(fits) - 2))
+        peaks.append(_SCALES[best] + _FINER * _peak(fits[best - 1], fits[best], fits[best + 1]))
+    scale = float(np.median(peaks))
+    off = np.abs(np.array(peaks) - scale)
+    if (off > 0.5 * _FINER).mean() > 0.5:
+        return 1.0, float("inf")
+    return scale, max(_POINTS_SCALE, 1.4826 * float(np.median(off)) / np.sqrt(len(peaks)))
 
 
 def in_another_unit(laid: Laid) -> Finding | None:
@@ -384,7 +402,7 @@ def _differs(d: Similarity, places: int, drive: Drive) -> list[Finding]:
     parts, grave = [], 0
     off_m, sigma_m = float(np.linalg.norm(d.offset_m)), drive.prior_sigma_m
     x, y, z = d.offset_m
-    if off_m > max(0.15, 0.4 * sigma_m, 3.0 * d.sigma_m):
+    if off_m > max(0.15, _WITHIN * sigma_m, 3.0 * d.sigma_m):
         parts.append(f"shifted by {off_m:.2f} m (x {x:+.2f}, y {y:+.2f}, z {z:+.2f}; +-{d.sigma_m:.2f})")
         grave = max(grave, 1 + (off_m > max(0.3, 3.0 * sigma_m)))
     for name, value, sigma, least in (
@@ -399,6 +417,8 @@ def _differs(d: Similarity, places: int, drive: Drive) -> list[Finding]:
         grave = 2
     if not parts:
         what = f"prior and map agree to {off_m:.2f} m and {abs(d.yaw_deg):.2f} deg ({places} places)"
+        if off_m > 0.15:
+            what += f": the map is shifted by x {x:+.2f}, y {y:+.2f}, z {z:+.2f}, within prior_sigma_m {sigma_m:g}"
         return [Finding("note", what)]
     what = f"the map is {', '.join(parts)} against the prior, at the middle of the drive ({places} places)"
     mend = "if the map is right, move the prior by that (--mount for a constant one, CRS and origin for the rest)"

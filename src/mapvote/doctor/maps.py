@@ -11,7 +11,6 @@ from pathlib import Path
 
 import numba
 import numpy as np
-import scipy
 from numpy.typing import NDArray
 
 from mapvote.core.grid import TileIndex
@@ -21,6 +20,7 @@ from mapvote.core.point_map import PointMap, all_points
 from mapvote.core.tile import Tile
 from mapvote.core.types import F64, I64, MapvoteError
 from mapvote.doctor.finding import Finding, in_order
+from mapvote.doctor.standing import check_lean, ghost_layer, ghost_shift
 from mapvote.formats import read_map, stream_cloud
 from mapvote.formats.clean import MAX_BAD_SHARE
 from mapvote.formats.geo.frame import frame_of
@@ -43,14 +43,6 @@ _SLENDER = 2.0
 """Times as high as it is wide a street may be."""
 _LEAST_SHEET = 0.09
 """Of a street's points .12 to .17 lie on its ground (simulated ones and KITTI); with less nothing says what is up."""
-_BIN_M = 0.05
-_CELL_M, _SIDE = 0.2, 640
-"""A square of 128 m in cells of 0.2 m is looked at."""
-_NEAREST_M, _FARTHEST_M = 1.0, 8.0
-"""Nearer copies are lost in the thickness of the walls themselves."""
-_PEAK = 5.3
-"""Times the usual unevenness. Sound maps of streets give 2 at most, of 24 scans with side walls alike 4.7; copies
-shifted by 1 to 5 m 6 to 20."""
 _FAR_M = 50_000.0
 _SLOPE_DEG = 6.0
 _ALOFT_M = 100.0
@@ -272,12 +264,14 @@ def check_map(point_map: PointMap) -> list[Finding]:
     if some is not point_map:
         what = f"ground and copies were looked at in {len(some.tiles)} tiles of {len(point_map.tiles)}, in the middle"
         found.append(Finding("note", what))
+    standing = points[(height > 0.5) & (height < 6.0)]
+    found += check_lean(standing)
     layer = ghost_layer(height)
     if layer is not None:
         what = f"the road lies there twice, {abs(layer):.2f} m apart in height: a ghost layer"
         found.append(Finding("error", what, "two drives of different height were laid over each other: align them"))
     elif float(np.median(spacing(in_memory(points), points))) < _SPARSE_M:
-        shift = ghost_shift(points[(height > 0.5) & (height < 6.0)])
+        shift = ghost_shift(standing)
         if shift is not None:
             x, y = shift
             by = f"{np.hypot(x, y):.1f} m (x {x:+.1f}, y {y:+.1f})"
@@ -384,55 +378,3 @@ def check_ground(point_map: PointMap) -> list[Finding]:
     complaints = [check_heights(point_map, path).complaint for path in point_map.driven]
     mend = "build the map anew; where drives run above each other it keeps one level, and the other cannot vote there"
     return [Finding("warning", what, mend) for what in complaints if what]
-
-
-def ghost_layer(height: F64) -> float | None:
-    """How far above (+) or below the ground a second one lies, metres; None if there is none.
-
-    ``height`` (n,) of points over the ground. A second road is as sharp a peak of their histogram as the first; kerbs,
-    cars and hedges are broad.
-    """
-    if (np.abs(height) < 1.0).sum() < _FEW:
-        return None
-    count, edges = np.histogram(height[np.isfinite(height)], bins=np.arange(-2.5, 2.5, _BIN_M))
-    peak = np.convolve(count, np.ones(3), mode="same")
-    middle = 0.5 * (edges[1:] + edges[:-1])
-    ground = float(peak[np.abs(middle) < 0.15].max())
-    away = np.abs(middle) >= 0.35
-    best = int(np.argmax(np.where(away, peak, 0)))
-    around = np.abs(middle - middle[best])
-    beside = float(np.median(peak[(around > 0.15) & (around < 0.4) & (np.abs(middle) > 0.15)]))
-    return float(middle[best]) if peak[best] > 0.3 * ground and peak[best] > 2.0 * beside else None
-
-
-def ghost_shift(standing: F64) -> tuple[float, float] | None:
-    """(x, y) by which what stands is there twice, metres; None if it is not.
-
-    ``standing`` (n, 3), points of walls and poles. Their picture from above is compared with itself, shifted: apart
-    from no shift at all, and shifts along straight walls, only a copy makes a sharp peak.
-    """
-    if len(standing) < _FEW:
-        return None
-    centre = np.median(standing[:, :2], axis=0)
-    cells = np.floor((standing[:, :2] - centre) / _CELL_M).astype(np.int64) + _SIDE // 2
-    cells = cells[((cells >= 0) & (cells < _SIDE)).all(axis=1)]
-    picture = np.zeros((_SIDE, _SIDE))
-    picture[cells[:, 1], cells[:, 0]] = 1.0
-    picture -= scipy.ndimage.uniform_filter(picture, 25)
-    # Half of the whitening that would leave only phases: walls are like themselves all along, copies are not.
-    spectrum = np.abs(np.fft.rfft2(picture, s=(2 * _SIDE, 2 * _SIDE)))
-    likeness = np.fft.fftshift(np.fft.irfft2(spectrum))
-    reach = int(_FARTHEST_M / _CELL_M)
-    near = likeness[_SIDE - reach : _SIDE + reach + 1, _SIDE - reach : _SIDE + reach + 1]
-    near = scipy.ndimage.uniform_filter(near, 3)
-    usual = 1.4826 * float(np.median(np.abs(near - np.median(near))))
-    # Only what rises above everything half a metre around it is a copy.
-    ring = np.ones((7, 7), dtype=bool)
-    ring[2:5, 2:5] = False
-    sharp = near - scipy.ndimage.percentile_filter(near, 90, footprint=ring)
-    y, x = np.mgrid[-reach : reach + 1, -reach : reach + 1] * _CELL_M
-    sharp[(np.hypot(x, y) < _NEAREST_M) | (near < scipy.ndimage.maximum_filter(near, 5))] = 0.0
-    best = np.unravel_index(int(np.argmax(sharp)), sharp.shape)
-    if sharp[best] < _PEAK * usual:
-        return None
-    return float(x[best]), float(y[best])
