@@ -34,8 +34,7 @@ from mapvote.core.types import F64, I32, Bool
 from mapvote.perception.moving_kernels import cells_in_plane, decidable, moving_components, voxels
 from mapvote.perception.range_image import U16, Counts, Pixels, Samples, look, range_image
 
-# Set on the development streets of the simulator; what half and twice of each cost,
-# benchmarks/moving_accuracy.py --sweep measures.
+# Set on the development streets of the simulator.
 REACH_M = 57.0
 """Points farther away are never called moving: the corners of the local grid are 56.7 m away."""
 PAST_S = 2.0
