@@ -16,7 +16,7 @@ import numpy as np
 from mapvote.core.columns import GROUND_MARGIN_M
 from mapvote.core.grid import CELL_SIZE
 from mapvote.core.sensors import SENSORS, Sensor
-from mapvote.core.types import F32, F64, I32, U8, MapvoteError
+from mapvote.core.types import F32, F64, I32, U8, Bool, MapvoteError
 from mapvote.formats.drives.kitti import DriveWriter, write_poses
 from mapvote_lab.simulation.actors import Traffic, make_traffic
 from mapvote_lab.simulation.flaws import Hits, Kinds, spoil
@@ -24,7 +24,15 @@ from mapvote_lab.simulation.lidar import Caster, measure, sweep
 from mapvote_lab.simulation.processes import processes
 from mapvote_lab.simulation.routes import Route, make_routes
 from mapvote_lab.simulation.scenario import Scenario, load_scenario
-from mapvote_lab.simulation.truth import T_map_street, count_hits, dense_survey, ground_cells, on_grid, write_truth
+from mapvote_lab.simulation.truth import (
+    T_map_street,
+    count_hits,
+    dense_survey,
+    ground_cells,
+    on_grid,
+    passed_surfaces,
+    write_truth,
+)
 from mapvote_lab.simulation.world import Role, World, make_world
 
 _CHUNK = 40
@@ -63,12 +71,12 @@ def simulate(
             (partial / "truth" / route.name / "moving").mkdir(parents=True)
         with _pool(workers or _processes(stage)) as run:
             dense = run(_survey, [(spec, seed, drive) for drive in range(len(stage.routes))])
-            survey, vehicles, densest = _drive_all(stage, partial, run, progress)
+            survey, vehicles, densest, passed = _drive_all(stage, partial, run, progress)
             T = T_map_street(spec)
             for index, (route, writer) in enumerate(zip(stage.routes, writers, strict=True)):
                 writer.close(route.stamps_ns, T @ route.priors(np.random.default_rng([seed, 4, index])))
                 write_poses(partial / "truth" / route.name / "poses.txt", T @ route.poses(route.time_s))
-            write_truth(partial / "truth", stage.world, spec, list(dense), survey, vehicles, densest)
+            write_truth(partial / "truth", stage.world, spec, list(dense), survey, vehicles, densest, passed)
         os.replace(partial, out)
     finally:
         shutil.rmtree(partial, ignore_errors=True)
@@ -147,9 +155,10 @@ def _processes(stage: Stage) -> int:
     return (os.cpu_count() or 1) if sum(route.scans for route in stage.routes) > 400 else 1
 
 
-def _drive_all(stage: Stage, folder: Path, run: _Run, progress: Progress | None) -> tuple[I32, I32, I32]:
-    """Drive every route; (survey, vehicles) counts (roles, rows, cols) of the recorded points that stand still, and
-    (rows, cols) the most of them that one scan of a vehicle had on built bodies."""
+def _drive_all(stage: Stage, folder: Path, run: _Run, progress: Progress | None) -> tuple[I32, I32, I32, Bool]:
+    """Drive every route; (survey, vehicles) counts (roles, rows, cols) of the recorded points that stand still,
+    (rows, cols) the most of them that one scan of a vehicle had on built bodies, and (rows, cols) where a vehicle's
+    ray passed the place of a demolished surface."""
     tasks = [
         (stage.scenario, stage.seed, folder, drive, first, min(first + _CHUNK, route.scans))
         for drive, route in enumerate(stage.routes)
@@ -158,16 +167,18 @@ def _drive_all(stage: Stage, folder: Path, run: _Run, progress: Progress | None)
     scans = sum(route.scans for route in stage.routes)
     totals = np.zeros((2, len(Role), *stage.ground.shape), dtype=np.int32)
     densest = np.zeros(stage.ground.shape, dtype=np.int32)
+    passed = np.zeros(stage.ground.shape, dtype=np.bool_)
     done = 0
-    for task, (where, hits, most) in zip(tasks, run(_drive, tasks), strict=True):
+    for task, (where, hits, most, through) in zip(tasks, run(_drive, tasks), strict=True):
         survey = stage.routes[task[3]].vehicle is None
         totals[0 if survey else 1].ravel()[where] += hits
         if not survey:
             np.maximum(densest, most, out=densest)
+            passed |= through
         done += task[5] - task[4]
         if progress:
             progress(done, scans)
-    return totals[0], totals[1], densest
+    return totals[0], totals[1], densest, passed
 
 
 def _survey(task: tuple[Scenario, int, int]) -> tuple[I32, F32, U8]:
@@ -180,9 +191,9 @@ def _survey(task: tuple[Scenario, int, int]) -> tuple[I32, F32, U8]:
 _Task = tuple[Scenario, int, Path, int, int, int]
 
 
-def _drive(task: _Task) -> tuple[I32, I32, U8]:
-    """Simulate and write some scans of one drive; (flat index, count) of the hits by role and cell, and the most that
-    one scan had on built bodies (rows, cols), 255 at most."""
+def _drive(task: _Task) -> tuple[I32, I32, U8, Bool]:
+    """Simulate and write some scans of one drive; (flat index, count) of the hits by role and cell, the most that one
+    scan had on built bodies (rows, cols), 255 at most, and (rows, cols) where a ray passed a demolished surface."""
     scenario, seed, folder, drive, first, last = task
     stage = _stage(scenario, seed)
     still, traffic = _street(scenario, seed, drive)
@@ -190,6 +201,8 @@ def _drive(task: _Task) -> tuple[I32, I32, U8]:
     writer = _writer(folder, route, stage)
     counts = np.zeros((len(Role), *stage.ground.shape), dtype=np.int32)
     most = np.zeros(stage.ground.shape, dtype=np.int32)
+    removed = [] if route.vehicle is None else np.flatnonzero(roles == Role.REMOVED).tolist()
+    gone, passes = Caster(*stage.world.mesh(removed or [0])), np.zeros_like(counts)
     for index in range(first, last):
         rng = np.random.default_rng(np.random.SeedSequence([seed, 6, drive, index]))
         stamp_s = index / route.rate_hz
@@ -216,5 +229,9 @@ def _drive(task: _Task) -> tuple[I32, I32, U8]:
         before = counts[Role.ADDED].copy()
         count_hits(on_grid(points, scenario), objects[solid], roles, stage.ground, CELL_SIZE, GROUND_MARGIN_M, counts)
         np.maximum(most, counts[Role.ADDED] - before, out=most)
+        if removed:
+            through = on_grid(passed_surfaces(gone, rays.origins, rays.directions, ranges), scenario)
+            owners = np.full(len(through), removed[0], dtype=np.int32)
+            count_hits(through, owners, roles, stage.ground, CELL_SIZE, GROUND_MARGIN_M, passes)
     where = np.flatnonzero(counts).astype(np.int32)
-    return where, counts.ravel()[where], most.clip(max=255).astype(np.uint8)
+    return where, counts.ravel()[where], most.clip(max=255).astype(np.uint8), passes[Role.REMOVED] > 0

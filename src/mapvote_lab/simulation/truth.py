@@ -26,7 +26,7 @@ from mapvote.core.columns import GROUND_MARGIN_M
 from mapvote.core.geometry import from_xyz_rpy, inverse, transform
 from mapvote.core.grid import CELL_SIZE, Grid, Lattice
 from mapvote.core.sensors import Sensor
-from mapvote.core.types import F32, F64, I32, U8
+from mapvote.core.types import F32, F64, I32, U8, Bool
 from mapvote.core.voxels import voxel_downsample
 from mapvote_lab.simulation.lidar import NOTHING, Caster
 from mapvote_lab.simulation.routes import Route
@@ -37,6 +37,11 @@ from mapvote_lab.simulation.world import Role, World
 UNCHANGED, CHANGED_OCCUPIED, CHANGED_EMPTY, UNSCORED = 0, 1, 2, 255
 SUPPORT = 20
 """Points, pooled over the drives at 10 Hz, that make a surface well supported (in proportion at other rates)."""
+MOST_SURFACES = 8
+"""Of demolished bodies, through which one ray is followed: four walls, twice."""
+BEYOND_M = 0.15
+"""Half a voxel: a ray that ends nearer behind a surface did not pass it."""
+_STEP_ON_M = 0.01
 _STEP_M = 1.5
 """Between poses of the noise-free survey."""
 _REACH_M = 50.0
@@ -128,6 +133,19 @@ def dense_survey(world: World, route: Route, sensor: Sensor, scenario: Scenario)
     return hits, np.concatenate(samples), np.concatenate(labels)
 
 
+def passed_surfaces(gone: Caster, origins: F32, directions: F32, ranges: F32) -> F32:
+    """(m, 3) places where rays (n, 3) go through surfaces of ``gone`` bodies, and go on beyond them: they end at
+    ``ranges`` (n,). A ray is followed through MOST_SURFACES surfaces."""
+    at, active, found = np.zeros(len(ranges), dtype=np.float32), np.arange(len(ranges)), [np.zeros((0, 3), np.float32)]
+    for _ in range(MOST_SURFACES):
+        begins = origins[active] + at[active, None] * directions[active]
+        at[active] += gone.cast(begins, directions[active])[0]
+        active = active[at[active] + BEYOND_M < ranges[active]]
+        found.append(origins[active] + at[active, None] * directions[active])
+        at[active] += _STEP_ON_M
+    return np.concatenate(found)
+
+
 def _circle(triangles: F64) -> tuple[float, float, float]:
     low, high = triangles.min(axis=(0, 1)), triangles.max(axis=(0, 1))
     middle = 0.5 * (low + high)
@@ -199,9 +217,11 @@ def write_truth(
     survey: I32,
     vehicles: I32,
     densest: I32,
+    passed: Bool,
 ) -> None:
     """truth.npz, surface.npz and objects.json into ``folder``; ``dense`` holds :func:`dense_survey` of each route,
-    ``densest`` (rows, cols) the most points that one scan of a vehicle had on built bodies."""
+    ``densest`` (rows, cols) the most points that one scan of a vehicle had on built bodies, ``passed`` (rows, cols)
+    where a vehicle's ray went through the place of a demolished surface (:func:`passed_surfaces`)."""
     grid = truth_grid(scenario)
     hits: I32 = np.stack([counts for counts, _, _ in dense]).sum(axis=0, dtype=np.int32)
     strict, provenance, reason = label_cells(hits, survey, vehicles, scenario.rate_hz)
@@ -211,6 +231,8 @@ def write_truth(
         provenance=provenance,
         reason=reason,
         densest=densest.astype(np.uint8),
+        hit=vehicles[Role.ADDED] > 0,
+        passed=passed,
         x0=grid.x0,
         y0=grid.y0,
         cell_size=CELL_SIZE,

@@ -31,7 +31,7 @@ def truth_of(folder: Path, cells: np.ndarray, **walls: float) -> Truth:
         points=np.concatenate(list(samples.values())).astype(np.float32),
         label=np.concatenate([np.full(len(points), labels[name], np.uint8) for name, points in samples.items()]),
     )
-    return Truth(folder / "truth", 0.0, 0.0, cells, cells, np.zeros_like(cells), np.zeros_like(cells), ())
+    return Truth(folder / "truth", 0.0, 0.0, cells, cells, *(np.zeros_like(cells),) * 2, *(cells > 0,) * 2, ())
 
 
 def column_of(kind: int, column: int) -> np.ndarray:

@@ -31,7 +31,14 @@ def write_scene(scene: Path, **planes: np.ndarray) -> Path:
     folder = scene / "truth"
     (folder / "drive_1" / "moving").mkdir(parents=True)
     zero = np.zeros((ROWS, COLS), dtype=np.uint8)
-    every = {"strict": zero, "provenance": zero, "reason": zero, "densest": zero} | planes
+    every = {
+        "strict": zero,
+        "provenance": zero,
+        "reason": zero,
+        "densest": zero,
+        "hit": zero > 0,
+        "passed": zero > 0,
+    } | planes
     np.savez(folder / "truth.npz", x0=X0, y0=Y0, **every)
     (folder / "objects.json").write_text(json.dumps({"objects": [{"kind": "built", "height_m": 3.0}]}))
     points = np.array([[1, 0, 0], [2, 0, 0], [3, 0, 0], [4, 0, 0]], dtype=np.float32)
@@ -105,7 +112,7 @@ def test_the_cells_of_a_footprint_have_their_centres_in_it_or_within_60_cm(
     angle = turned + 2 * np.pi * np.arange(n) / n
     corners = np.column_stack([4.0 + radius * np.cos(angle), 12.0 + 0.7 * radius * np.sin(angle)])
     zero = np.zeros((ROWS, COLS), dtype=np.uint8)
-    truth = Truth(Path(), X0, Y0, zero, zero, zero, zero, ())
+    truth = Truth(Path(), X0, Y0, zero, zero, zero, zero, zero > 0, zero > 0, ())
     found = truth.cells_of((corners[::-1] if clockwise else corners).tolist())
     assert found.any()
     x, y = np.meshgrid(X0 + (np.arange(COLS) + 0.5) * CELL_SIZE, Y0 + (np.arange(ROWS) + 0.5) * CELL_SIZE)

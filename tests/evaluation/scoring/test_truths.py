@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,12 +20,14 @@ PROVENANCE = [[0, 1, 1, 2, 2, UNSCORED]]
 
 @pytest.fixture
 def truth(tmp_path: Path) -> Truth:
-    """Cell 1 had four points in its best scan, cell 2 five; surfaces of them at 1 m and 6 m, of cell 3 at 2 m."""
+    """Cell 1 had four points in its best scan, cell 2 five; surfaces of them at 1 m and 6 m, of cell 3 at 2 m.
+    Vehicles recorded points in cell 1 only, and passed cell 3 only."""
     points = np.array([[0.4, 0.1, 1.0], [0.4, 0.1, 3.0], [0.7, 0.1, 6.0], [1.0, 0.1, 2.0]], np.float32)
     np.savez(tmp_path / "surface.npz", points=points, label=np.array([1, 1, 1, 2], np.uint8))
     cells = np.array(PROVENANCE, np.uint8)
     densest = np.array([[0, 4, 5, 0, 0, 9]], np.uint8)
-    return Truth(tmp_path, 0.0, 0.0, cells.copy(), cells, np.zeros_like(cells), densest, ())
+    passed = np.arange(6)[None] == 3
+    return Truth(tmp_path, 0.0, 0.0, cells.copy(), cells, np.zeros_like(cells), densest, densest == 4, passed, ())
 
 
 @pytest.fixture
@@ -40,6 +43,16 @@ def test_what_no_scan_and_no_map_holds_cannot_be_known(truth: Truth, first_map: 
     known = TRUTHS["could be known"](truth, first_map)
     assert known.tolist() == [[0, UNSCORED, 1, 2, UNSCORED, UNSCORED]]
     assert truth.provenance.tolist() == PROVENANCE, "the truth it is taken from stays as it is"
+
+
+def test_a_cell_that_no_ray_decided_or_where_the_map_holds_a_point_on_nothing_is_not_scored(
+    truth: Truth, first_map: Reference
+) -> None:
+    states = TRUTHS["known"](truth, first_map)
+    assert states.tolist() == [[0, 1, UNSCORED, 2, UNSCORED, UNSCORED]]
+    assert TRUTHS["known"](replace(truth, passed=np.zeros_like(truth.passed)), first_map)[0, 3] == UNSCORED
+    first_map.counts[0, 0] = 1
+    assert TRUTHS["known"](truth, first_map)[0, 0] == UNSCORED, "nothing that stood at the survey is near cell 0"
 
 
 def test_what_could_be_known_is_never_more_than_what_left_points(truth: Truth, first_map: Reference) -> None:

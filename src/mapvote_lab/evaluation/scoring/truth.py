@@ -35,6 +35,10 @@ class Truth:
     """Why a cell is unscored (docs/simulation.md)."""
     densest: U8
     """Most points of built bodies that one scan of a vehicle had in the cell."""
+    hit: Bool
+    """Where a vehicle recorded a point of a built body."""
+    passed: Bool
+    """Where a vehicle's ray went through the place of a demolished surface."""
     objects: tuple[dict[str, Any], ...]
     """``kind`` "built" or "demolished", ``footprint`` [[x, y], ..], ``height_m``."""
 
@@ -89,12 +93,12 @@ def read_truth(scene: Path) -> Truth:
     try:
         with np.load(folder / "truth.npz") as file:
             strict, provenance, reason = file["strict"], file["provenance"], file["reason"]
-            densest = file["densest"]
+            densest, hit, passed = file["densest"], file["hit"], file["passed"]
             x0, y0 = float(file["x0"]), float(file["y0"])
         objects = json.loads((folder / "objects.json").read_text())["objects"]
     except (OSError, KeyError, ValueError) as error:
         raise MapvoteError(f"{folder}: no usable truth ({error}); simulate the scene again") from error
-    return Truth(folder, x0, y0, strict, provenance, reason, densest, tuple(objects))
+    return Truth(folder, x0, y0, strict, provenance, reason, densest, hit, passed, tuple(objects))
 
 
 def lay_on(states: U8, grid: Grid, window: Grid) -> U8:

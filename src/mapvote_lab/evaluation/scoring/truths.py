@@ -5,15 +5,18 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 
 import numpy as np
+from scipy import ndimage
 
 from mapvote.config import PaperSettings
-from mapvote.core.grid import Grid
+from mapvote.core.grid import CELL_SIZE, Grid
 from mapvote.core.types import F32, F64, U8, Reference
 from mapvote_lab.evaluation.scoring.border import border
 from mapvote_lab.evaluation.scoring.cells import UNSCORED
 from mapvote_lab.evaluation.scoring.truth import Truth
 
-_OCCUPIED, _EMPTY = 1, 2
+_UNCHANGED, _OCCUPIED, _EMPTY = 0, 1, 2
+ON_SURFACE_M = 0.3
+"""A map point farther than this from every surface lies on none (as scoring/map_points.py has it)."""
 
 
 def could_be_known(truth: Truth, first_map: Reference) -> U8:
@@ -28,7 +31,26 @@ def could_be_known(truth: Truth, first_map: Reference) -> U8:
     return out
 
 
+def known(truth: Truth, first_map: Reference) -> U8:
+    """``border`` of the strict truth, less the cells of which nobody could know better: (rows, cols).
+
+    Unscored besides are a built surface of which no vehicle recorded a point in the cell, a demolished one through
+    whose place no vehicle's ray went, and an unchanged cell in which the first map holds points on nothing: it has
+    points, and no surface that stood at the survey comes within ON_SURFACE_M of the cell.
+    """
+    out = border(truth, truth.strict)
+    undecided = ((out == _OCCUPIED) & ~truth.hit) | ((out == _EMPTY) & ~truth.passed)
+    kept, _, removed = truth.surfaces()
+    stood = np.zeros(out.shape, dtype=np.bool_)
+    rows, cols, inside = first_map.grid.indices_of(np.concatenate([kept, removed]))
+    stood[rows[inside], cols[inside]] = True
+    near = ndimage.binary_dilation(stood, np.ones((3, 3)), iterations=round(ON_SURFACE_M / CELL_SIZE))
+    on_nothing = (out == _UNCHANGED) & (first_map.counts > 0) & ~near
+    return np.where(undecided | on_nothing, np.uint8(UNSCORED), out)
+
+
 TRUTHS: Mapping[str, Callable[[Truth, Reference], U8]] = {
+    "known": known,
     "strict": lambda truth, first_map: truth.strict,
     "provenance": lambda truth, first_map: truth.provenance,
     "could be known": could_be_known,
