@@ -49,8 +49,9 @@ def as_sent(say: Any) -> Any:
 
 def measure(folder: Path, tiles: int, vehicles: int) -> dict[str, float]:
     """One store, filled and published."""
-    from fusion import Fleet
     from growth import sizes
+
+    from fusion import Fleet
     from mapvote.config import FuseSettings
     from mapvote.server.store.policy import Policy
     from mapvote.server.store.publish import publish
