@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
 from functools import partial
 
@@ -54,19 +54,20 @@ class Vehicle:
         self.name, self.point_map, self.drive_id = name, point_map, drive_id
         self.settings = settings or Settings()
         self._prior_sigmas = prior_sigma_m, float(np.radians(prior_sigma_deg))
+        self._localise = localise or Localiser(point_map, self.settings, sensor)
         self._frontend = Frontend(
-            localise or Localiser(point_map, self.settings, sensor),
+            self._localise,
             MovingFilter(sensor, self.settings.moving),
             LocalMap(point_map, self.settings.voting.window_m),
             with_sight=self.settings.voting.method == "paper",
             sensor=sensor,
         )
-        self._sensor = sensor
+        self.sensor = sensor
         self._count_anew()
 
     def _count_anew(self) -> None:
         """No scan has voted yet."""
-        self._voter = make_voter(self.settings, self._sensor, self.point_map)
+        self._voter = make_voter(self.settings, self.sensor, self.point_map)
         self._new_points = NewPoints(
             self.point_map.lattice,
             beyond=self.settings.voting.method != "paper",
@@ -95,11 +96,12 @@ class Vehicle:
         """The drive has ended: the scans that still wait vote now."""
         self._vote(self._frontend.finish())
 
-    def cut(self, next_drive_id: str) -> Callable[[], Ballot]:
+    def cut(self, next_drive_id: str, point_map: PointMap | None = None) -> Callable[[], Ballot]:
         """End this ballot and begin the next one on the same track: the drive goes on.
 
         Scans that have voted are in the ballot that ends; those that wait vote in the next. Returns what writes the
         ballot: it may be called later and in another thread, and raises MapvoteError if no scan has voted.
+        ``point_map``: another version of the map, which the next ballot holds to.
         """
         ended = partial(
             write_ballot,
@@ -112,6 +114,11 @@ class Vehicle:
             self._new_points,
         )
         self.drive_id = next_drive_id
+        if point_map is not None and point_map is not self.point_map:
+            self.point_map = point_map
+            if isinstance(self._localise, Localiser):
+                self._localise.go_on_in(point_map)
+            self._frontend.go_on_in(point_map)
         self._count_anew()
         return ended
 
@@ -120,14 +127,14 @@ class Vehicle:
             with self.report.timed("vote"):
                 self._new_points.gather(seen, self._voter.observe(seen))
 
-    def ballot(self) -> Ballot:
+    def ballot(self, only: Collection[TileIndex] | None = None) -> Ballot:
         """What the scans that have voted so far say: of all the drive after :meth:`finish`. Asking changes nothing.
 
-        Raises MapvoteError if no scan has voted.
+        ``only``: of these tiles, so that the ballot of a drive that goes on can be kept piece by piece. Raises
+        MapvoteError if no scan has voted.
         """
-        return write_ballot(
-            self.name, self.drive_id, self.point_map, self.settings, self.report, self._voter, self._new_points
-        )
+        state = self.point_map, self.settings, self.report, self._voter, self._new_points
+        return write_ballot(self.name, self.drive_id, *state, only)
 
 
 @dataclass(frozen=True, slots=True)
@@ -196,8 +203,10 @@ def write_ballot(
     report: DriveReport,
     voter: Voter,
     new_points: NewPoints,
+    only: Collection[TileIndex] | None = None,
 ) -> Ballot:
-    """The ballot of one voter, counted under ``settings``. Raises MapvoteError if no scan has voted."""
+    """The ballot of one voter, counted under ``settings``; ``only``: of these tiles. Raises MapvoteError if no scan has
+    voted."""
     voted = len(report.sigmas_m)
     if voted == 0:
         if len(report.lost) < report.scans:
@@ -207,7 +216,7 @@ def write_ballot(
             "is the drive on this map, and its prior in the map's frame?"
         )
     points, two_stage = new_points.by_tile(), settings.voting.two_stage
-    tiles = [_ballot_tile(point_map, tile, votes, points(tile), two_stage) for tile, votes in voter.each()]
+    tiles = [_ballot_tile(point_map, tile, votes, points(tile), two_stage) for tile, votes in voter.each(only)]
     tiles.sort(key=lambda tile: tile.tile)
     return Ballot(
         map_id=point_map.map_id,

@@ -49,6 +49,7 @@ def test_a_live_drive_by_a_played_bag_casts_the_ballots_of_vote_on_that_bag_bit_
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("CYCLONEDDS_URI", LOOPBACK)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     bag, folder = tmp_path / "bag", tmp_path / "ballots"
     record(bag)
     write_map(map_from_points(street(1)), tmp_path / "map")

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import signal
-from collections.abc import Callable
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -13,7 +14,9 @@ from mapvote.cli.options import DRIVE, Config, KeyFile, key_in
 from mapvote.cli.remote import client_of, map_at
 
 if TYPE_CHECKING:
-    from mapvote.codec.ballot import Ballot
+    from mapvote.live.drive import LiveDrive, Maps
+    from mapvote.live.hearing import Hearing
+    from mapvote.live.outbox import Outbox
 
 Domain = Annotated[int | None, typer.Option(min=0, max=232, metavar="N", help="else ROS_DOMAIN_ID, else 0")]
 
@@ -64,13 +67,18 @@ def play(
 def drive(
     where: Annotated[str, typer.Option("--map", metavar="MAP|URL", help="a map in any format, or a server's")],
     vehicle: Annotated[str, typer.Option(metavar="NAME", help="whose ballots")],
-    sensor: Annotated[str, typer.Option(metavar="NAME", help="the LiDAR's model; mapvote info DRIVE measures it")],
-    points: Annotated[str | None, typer.Option(metavar="TOPIC", help="of PointCloud2; else the only one")] = None,
+    sensor: Annotated[str | None, typer.Option(metavar="NAME", help="the LiDAR's model; else measured")] = None,
+    points: Annotated[
+        str | None, typer.Option(metavar="TOPICS", help="of PointCloud2, several LiDARs with commas; else the only one")
+    ] = None,
     odometry: Annotated[
         str | None, typer.Option(metavar="TOPIC", help="of Odometry in the map's frame; else the only one, if any")
     ] = None,
     mount: Annotated[
-        str | None, typer.Option(metavar="NUMBERS", help="the LiDAR on what odometry tracks: x,y,z,roll,pitch,yaw")
+        str | None,
+        typer.Option(
+            metavar="NUMBERS", help="the LiDAR on what odometry tracks: x,y,z,roll,pitch,yaw; else /tf_static"
+        ),
     ] = None,
     send: Annotated[str | None, typer.Option(metavar="URL", help="the server that the ballots go to")] = None,
     out: Annotated[Path | None, typer.Option(metavar="FOLDER", help="the folder that the ballots go to")] = None,
@@ -78,71 +86,88 @@ def drive(
     name: Annotated[str | None, typer.Option(metavar="NAME", help="of the drive; else the time it began")] = None,
     every_m: Annotated[float, typer.Option(min=1.0, metavar="METRES", help="of road a ballot, at most")] = 2000.0,
     idle: Annotated[float, typer.Option(metavar="SECONDS", help="end after so long without a cloud; 0: never")] = 0.0,
+    unchecked: Annotated[bool, typer.Option("--unchecked", help="vote whatever the first ten seconds show")] = False,
     domain: Domain = None,
     config: Config = None,
 ) -> None:
     """Vote while driving, from ROS 2 topics: a ballot leaves every 2 km, 10 minutes or stop of 2 minutes.
 
-    mapvote drive --map URL --sensor hdl32e --vehicle car_1 --send URL
+    mapvote drive --map URL --vehicle car_1 --send URL
     """
+    import logging
     import time
 
     from mapvote.config import load_settings
     from mapvote.core.types import MapvoteError
     from mapvote.formats.drives.options import read_mount, read_sensor
     from mapvote.live.dds import Network
-    from mapvote.live.drive import LiveDrive, choose_topics, messages
-    from mapvote.vehicle import Cuts, Vehicle
+    from mapvote.live.hearing import Hearing, choose_topics
+    from mapvote.live.service import Plan, run
+    from mapvote.vehicle import Cuts
 
     if out is None and send is None:
         raise MapvoteError("drive: say where the ballots go: --send URL, --out FOLDER, or both")
-    model, key, network, stopped = read_sensor(sensor, "--sensor"), key_in(key_file), Network(domain), [False]
+    logging.getLogger("mapvote.live").setLevel(logging.INFO)
+    plan = Plan(
+        vehicle,
+        name or time.strftime("%Y%m%dT%H%M%SZ", time.gmtime()),
+        load_settings(config),
+        Cuts(length_m=every_m),
+        None if mount is None else read_mount(mount, "--mount"),
+        idle,
+        not unchecked,
+    )
+    model, network, stopped = None if sensor is None else read_sensor(sensor, "--sensor"), Network(domain), [False]
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: stopped.append(True))
-    with map_at(where, key_file) as point_map:
-        started = name or time.strftime("%Y%m%dT%H%M%SZ", time.gmtime())
-        voter = Vehicle(vehicle, model, point_map, load_settings(config), drive_id=started)
-        live = LiveDrive(voter, Cuts(length_m=every_m), _sender(send, key, out), read_mount(mount, "--mount"))
-        chosen = choose_topics(network, points, odometry, patience_s=idle or 1e9)
-        print(f"listening to {chosen.points.topic}" + (f" and {chosen.odometry.topic}" if chosen.odometry else ""))
-        last = time.monotonic()
-        for what, value in messages(network, chosen, model, lambda: stopped[-1]):
-            if what == "pose":
-                live.on_pose(*value)
-            elif what == "scan":
-                live.on_scan(value)
-                last = time.monotonic()
-            else:
-                if live.step(chosen.odometry is not None):
-                    last = time.monotonic()
-                if idle and time.monotonic() > last + idle:
-                    break
-        live.finish()
-    print(f"{vehicle}: {live.closed + 1} ballots, {live.left_out} scans left out, {live.without_pose} without odometry")
 
+    def ended() -> bool:
+        return stopped[-1]
 
-def _sender(url: str | None, key: str | None, out: Path | None) -> Callable[[Callable[[], Ballot]], None]:
-    """What writes and sends a ballot that was closed. One that says nothing is left out, and said."""
-    from mapvote.codec.ballot import encode
-    from mapvote.core.types import MapvoteError
-    from mapvote.formats.atomic import whole_file
-
-    def leave(written: Callable[[], Ballot]) -> None:
-        try:
-            ballot = written()
-        except MapvoteError as error:
-            print(f"no ballot: {error}", flush=True)
+    with _maps(where, key_file) as maps, _outbox(vehicle, send, out, key_in(key_file)) as outbox:
+        chosen = choose_topics(network, points.split(",") if points else [], odometry, idle or 1e9, ended)
+        if chosen is None:
             return
-        data, result = encode(ballot), ""
-        if out is not None:
-            with whole_file(out / f"{ballot.vehicle}~{ballot.drive}.ballot") as partial:
-                partial.write_bytes(data)
-        if url is not None:
-            with client_of(url, key) as client:
-                try:
-                    result = client.send(data)
-                except MapvoteError as error:
-                    result = str(error)
-        print(f"{ballot.drive}: {ballot.scans_localised} of {ballot.scans} scans voted {result}", flush=True)
+        topics = [t.topic for t in (*chosen.points, *filter(None, [chosen.odometry]))]
+        print(f"listening to {' and '.join(topics)}", flush=True)
+        hearing = Hearing(network, chosen, model)
+        live = run(plan, hearing, maps, outbox, ended)
+    print(_said(vehicle, live, hearing))
 
-    return leave
+
+@contextmanager
+def _maps(where: str, key_file: Path | None) -> Iterator[Maps]:
+    """The map on the way of a server, or all of a map at once."""
+    from mapvote.live.drive import OneMap
+
+    with map_at(where, key_file, or_kept=True) as point_map:
+        yield OneMap(point_map)
+
+
+@contextmanager
+def _outbox(vehicle: str, url: str | None, folder: Path | None, key: str | None) -> Iterator[Outbox]:
+    """Where ballots wait, until what can be sent now was sent."""
+    from mapvote.config import cache_folder
+    from mapvote.live.outbox import Outbox
+
+    with ExitStack() as stack:
+        client = None if url is None else stack.enter_context(client_of(url, key))
+        outbox = Outbox(
+            cache_folder() / "live", vehicle, client=client, folder=folder, say=lambda text: print(text, flush=True)
+        )
+        try:
+            yield outbox
+        finally:
+            outbox.close()
+
+
+def _said(vehicle: str, live: LiveDrive | None, hearing: Hearing) -> str:
+    """How the drive went, in one line."""
+    if live is None:
+        return f"{vehicle}: no cloud came"
+    c = live.counts
+    return (
+        f"{vehicle}: {c.ballots} ballots, {c.localised} of {c.scans} scans voted, {c.lost} lost, "
+        f"{c.left_out} scans left out, {c.without_pose} without odometry, {c.without_map} without map, "
+        f"{c.unusable} unusable, {c.late} late, {hearing.lost} lost on the network"
+    )

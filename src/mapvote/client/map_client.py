@@ -153,6 +153,15 @@ class MapClient:
         about = ballot if isinstance(ballot, Ballot) else decode(ballot)
         return self._send_spooled(self._spool.put(about.vehicle, about.drive, data))
 
+    def keep(self, data: bytes) -> None:
+        """Put an encoded ballot into the spool; :meth:`flush` sends it. MapvoteError if the disk does not take it."""
+        about = decode(data)
+        self._spool.put(about.vehicle, about.drive, data)
+
+    def waiting(self, vehicle: str | None = None) -> int:
+        """How many ballots the spool holds (of one vehicle)."""
+        return sum(1 for _ in self._spool.waiting(vehicle))
+
     def flush(self, vehicle: str | None = None) -> dict[str, Sent | MapvoteError]:
         """Try again to send what waits for this server (of one vehicle): what came of each, by "vehicle~drive"."""
         results: dict[str, Sent | MapvoteError] = {}

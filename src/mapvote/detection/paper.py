@@ -7,7 +7,7 @@ these words: kept, they answer all readings without the scan.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from functools import lru_cache
 
 import numba
@@ -240,9 +240,9 @@ class PaperVoter:
         """Every tile with a vote, in ascending order."""
         return dict(self.each())
 
-    def each(self) -> Iterator[tuple[TileIndex, TileVotes]]:
-        """The same one by one."""
+    def each(self, only: Collection[TileIndex] | None = None) -> Iterator[tuple[TileIndex, TileVotes]]:
+        """The same one by one; ``only``: of these tiles."""
         for tile, tally in sorted(self._tally.tiles.items()):
-            if tally.any():
+            if (only is None or tile in only) and tally.any():
                 new = np.where(tally[..., CellState.CHANGED_OCCUPIED] > 0, EVERY_BIT, np.uint64(0))
                 yield tile, TileVotes(tally, decide(tally), None, None, new, None)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from functools import reduce
 
 import numpy as np
@@ -42,9 +42,10 @@ class SurfaceVoter:
         """Every tile with evidence, in ascending order."""
         return dict(sorted(self.each()))
 
-    def each(self) -> Iterator[tuple[TileIndex, TileVotes]]:
-        """The same one by one, block by block."""
-        for tiles, window in blocks(self.point_map.lattice, self.evidence.tiles):
+    def each(self, only: Collection[TileIndex] | None = None) -> Iterator[tuple[TileIndex, TileVotes]]:
+        """The same one by one, block by block; ``only``: of these tiles."""
+        counted = self.evidence.tiles
+        for tiles, window in blocks(self.point_map.lattice, counted if only is None else counted.keys() & set(only)):
             yield from self._judge(tiles, window)
 
     def _judge(self, tiles: list[TileIndex], window: Grid) -> Iterator[tuple[TileIndex, TileVotes]]:

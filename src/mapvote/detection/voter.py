@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -42,5 +42,5 @@ class Voter(Protocol):
         """What the scans so far amount to, of every tile that they say anything of, in ascending order. Asking changes
         nothing."""
 
-    def each(self) -> Iterator[tuple[TileIndex, TileVotes]]:
-        """The same tile by tile, in any order: so that no drive is too long for memory."""
+    def each(self, only: Collection[TileIndex] | None = None) -> Iterator[tuple[TileIndex, TileVotes]]:
+        """The same tile by tile, in any order: so that no drive is too long for memory. ``only``: of these tiles."""

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 from collections import defaultdict
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -64,9 +65,10 @@ class Network:
         """Every topic of ROS 2 that other participants send now, by name."""
         found: dict[tuple[str, str], list[Any]] = defaultdict(list)
         for end in self._writers.read(10_000):
+            if not end.sample_info.valid_data or end.sample_info.instance_state != _ALIVE:
+                continue  # a writer that has gone: its sample names nothing
             topic, kind = end.topic_name.removeprefix("rt"), ros_type(end.type_name)
-            alive = end.sample_info.valid_data and end.sample_info.instance_state == _ALIVE
-            if end.topic_name.startswith("rt/") and kind and alive and str(end.participant_key) != self._own:
+            if end.topic_name.startswith("rt/") and kind and str(end.participant_key) != self._own:
                 found[topic, kind].append(end.qos)
         policy = self._core.Policy
         return [
@@ -89,8 +91,9 @@ class Network:
         """Messages of ``topic`` from now on; a reader asks for no more than its writers offer, or it gets nothing."""
         qos = self._qos(reliable, transient_local, depth, both=True)
         reader = self._sub.DataReader(self._participant, self._topic_of(topic, kind), qos=qos)
-        self._waitset.attach(self._core.ReadCondition(reader, _ANY))
-        return Subscription(topic, kind, reader)
+        condition = self._core.ReadCondition(reader, _ANY)
+        self._waitset.attach(condition)
+        return Subscription(topic, kind, reader, reliable, lambda: self._waitset.detach(condition))
 
     def publish(
         self, topic: str, kind: str, *, reliable: bool = True, transient_local: bool = False, depth: int = _DEPTH
@@ -138,16 +141,30 @@ class Network:
 class Subscription:
     """Messages of one topic, as they came."""
 
-    def __init__(self, topic: str, kind: str, reader: Any) -> None:
-        self.topic, self.kind, self._reader = topic, kind, reader
+    def __init__(self, topic: str, kind: str, reader: Any, reliable: bool, detach: Callable[[], object]) -> None:
+        self.topic, self.kind, self.reliable, self._reader, self._detach = topic, kind, reliable, reader, detach
         self._take = require("cyclonedds._clayer", "ros2", "DDS").ddspy_take
 
     def take(self) -> list[bytes]:
         """The bytes of every message that came since the last call; the oldest are gone if there were too many."""
+        return [data for _, data in self.take_sent()]
+
+    def take_sent(self) -> list[tuple[int, bytes]]:
+        """The same, each with the time at which its writer sent it, nanoseconds since 1970 by the writer's clock."""
         taken = self._take(self._reader._ref, _ANY, _DEPTH)
         if isinstance(taken, int):
             raise MapvoteError(f"{self.topic}: DDS cannot read it (error {taken})")
-        return [data for data, info in taken if info.valid_data]
+        return [(info.source_timestamp, data) for data, info in taken if info.valid_data]
+
+    @property
+    def lost(self) -> int:
+        """How many messages were lost on the network, or came while the reader was full, since the start."""
+        return int(self._reader.get_sample_lost_status().total_count)
+
+    def close(self) -> None:
+        """Read no more."""
+        self._detach()
+        self._reader = None
 
 
 class Publication:

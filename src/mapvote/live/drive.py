@@ -1,24 +1,25 @@
-"""A vehicle that votes while it drives: clouds and odometry come from DDS, ballots leave as they are closed."""
+"""A vehicle that votes while it drives: scans and poses go in as they come, ballots leave as they are closed."""
 
 from __future__ import annotations
 
 import logging
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
 from mapvote.codec.ballot import Ballot
+from mapvote.core.grid import TileIndex, window_around
+from mapvote.core.point_map import PointMap
 from mapvote.core.types import F64, MapvoteError, Scan
-from mapvote.formats.drives.point_fields import scan_from_point_cloud2
+from mapvote.doctor.finding import Finding
 from mapvote.formats.drives.trajectory import sorted_trajectory
 from mapvote.formats.geo.frame import MapFrame
-from mapvote.live.cdr import from_cdr, stamp_ns
-from mapvote.live.dds import Network, SentTopic
-from mapvote.live.topics import CLOUD, ODOMETRY
+from mapvote.live.first_seconds import FirstSeconds
+from mapvote.live.outbox import Outbox
 from mapvote.vehicle import Cuts, RoadDriven, Vehicle, stretch_name
 
 log = logging.getLogger("mapvote.live")
@@ -26,133 +27,328 @@ _POSES = 400
 """Poses of odometry that are kept: four seconds at 100 Hz."""
 _PATIENCE_NS = 300_000_000
 """A scan waits so long for a pose later than its own stamp; then the newest ones are extrapolated, or it has none."""
-_LATE_SCANS = 20
-"""Scans that may wait; of more, every other one is left out, and counted."""
+_CROWDED, _RELAXED = 30, 5
+"""If more scans wait some are left out, until fewer wait: a short stop of the process costs no scan."""
+_KEEP_S = 15.0
+"""A tile that got votes is written to the journal after so long. With the scans that wait, and with tiles that are
+written one at a time, a crash costs less than 30 s of road."""
+_BACK_NS, _AHEAD_NS = 10**9, 3600 * 10**9
+"""A stamp so much before the last one, or after it: the clock has jumped."""
+_JUMPED = 3
+"""Scans in turn that say so: one alone is late, or damaged."""
+_LATENCIES = 6000
+"""Latencies that are kept: ten minutes at 10 Hz."""
+
+
+class Waiting(NamedTuple):
+    """A scan that came."""
+
+    stamp_ns: int
+    sent_ns: int
+    """When it was sent, by the clock of this machine; latency counts from the stamp where that agrees, else from
+    here."""
+    read: Callable[[], Scan]
+    """Raises MapvoteError if it cannot be used."""
+
+
+class Maps(Protocol):
+    """Where a live vehicle has its map from."""
+
+    def current(self) -> PointMap:
+        """The newest version there is: the next ballot holds to it."""
+
+    def covers(self, position: F64 | None) -> bool:
+        """Whether the tiles that a vehicle at (3,), map metres, compares with are here. None: it is not known where it
+        is. Those farther ahead are asked for."""
+
+
+class OneMap:
+    """A map from a file or a store: all of it is here, and no other version comes."""
+
+    def __init__(self, point_map: PointMap) -> None:
+        self._point_map = point_map
+
+    def current(self) -> PointMap:
+        """See :class:`Maps`."""
+        return self._point_map
+
+    def covers(self, position: F64 | None) -> bool:
+        """See :class:`Maps`."""
+        return True
+
+
+@dataclass(slots=True)
+class Counts:
+    """What became of the scans that came."""
+
+    scans: int = 0
+    observed: int = 0
+    localised: int = 0
+    """Scans that voted."""
+    lost: int = 0
+    """Scans without a sure place: they cast no vote."""
+    left_out: int = 0
+    """For want of time."""
+    unusable: int = 0
+    """Damaged, or without a usable point."""
+    late: int = 0
+    """Not later than the last one."""
+    without_pose: int = 0
+    """Scans that odometry does not cover; they are localised without a prior."""
+    without_map: int = 0
+    """Left out because tiles around the vehicle had not come yet."""
+    clock_jumps: int = 0
+    ballots: int = 0
+    latencies_s: deque[float] = field(default_factory=lambda: deque(maxlen=_LATENCIES))
+    """From stamp to vote, of the last scans."""
+
+
+class Thinning:
+    """Which scans are left out if there is time for some of them only: evenly, never two where one is enough."""
+
+    def __init__(self) -> None:
+        self._period_s = self._cost_s = self._credit = self._came_s = 0.0
+        self._crowded = False
+
+    def cost(self, seconds: float) -> None:
+        """What a scan took."""
+        self._cost_s += 0.1 * (seconds - self._cost_s)
+
+    def admits(self, came_s: float, waiting: int) -> bool:
+        """Whether the scan that came at ``came_s``, by any clock, shall vote while ``waiting`` others wait."""
+        self._period_s += 0.1 * (min(came_s - self._came_s, 1.0) - self._period_s)
+        self._came_s = came_s
+        if self._crowded != (waiting > (_RELAXED if self._crowded else _CROWDED)):
+            self._crowded, self._credit = not self._crowded, 1.0
+        if not self._crowded:
+            return True
+        self._credit += min(0.95, 0.9 * self._period_s / max(self._cost_s, 1e-3))
+        if self._credit < 1.0:
+            return False
+        self._credit -= 1.0
+        return True
 
 
 class LiveDrive:
-    """Scans and poses as they come, to one :class:`mapvote.vehicle.Vehicle`, whose ballots are closed by ``cuts``."""
+    """One vehicle on a drive without an end."""
 
     def __init__(
-        self, vehicle: Vehicle, cuts: Cuts, send: Callable[[Callable[[], Ballot]], None], T_base_lidar: F64
+        self,
+        make_vehicle: Callable[[PointMap], Vehicle],
+        maps: Maps,
+        outbox: Outbox,
+        *,
+        name: str,
+        cuts: Cuts | None = None,
+        with_poses: bool = True,
+        T_base_lidar: F64 | None = None,
+        first: FirstSeconds | None = None,
     ) -> None:
-        """``send`` is given what writes each ballot. ``T_base_lidar`` (4, 4): the LiDAR on what odometry tracks."""
-        self.vehicle, self.cuts, self.send, self.T_base_lidar = vehicle, cuts, send, T_base_lidar
-        self.name, self.closed, self.left_out, self.without_pose = vehicle.drive_id, 0, 0, 0
-        vehicle.drive_id = stretch_name(self.name, 1)
-        self._road = RoadDriven()
-        self._poses: deque[tuple[int, F64]] = deque(maxlen=_POSES)
-        self._scans: deque[Scan] = deque()
-        self._last_ns = -1
+        """``make_vehicle`` makes a vehicle that has driven nowhere yet. ``with_poses``: scans wait for odometry's.
+        ``T_base_lidar`` (4, 4): the LiDAR on what odometry tracks. ``first``: no ballot leaves before
+        :meth:`first_findings` was asked."""
+        self.counts, self._maps, self._outbox = Counts(), maps, outbox
+        self._make_vehicle, self._cuts, self._with_poses = make_vehicle, cuts or Cuts(), with_poses
+        self._T_base_lidar = np.eye(4) if T_base_lidar is None else T_base_lidar
+        self.name, self.number = name, outbox.begin(name)
+        self.vehicle: Vehicle | None = None
+        """None until the first scan: the map around it may have to come first."""
+        self._road, self._poses = RoadDriven(), deque[tuple[int, F64]](maxlen=_POSES)
+        self._waiting, self._observed = deque[Waiting](), deque[Waiting]()
+        self._touched: dict[TileIndex, float] = {}
+        """Tiles with votes that are not in the journal, and since when."""
+        self._thinning, self._last_ns, self._odd_stamps, self._finished = Thinning(), -1, 0, 0
+        self._first, self._held = first, list[tuple[str, Callable[[], Ballot], str | None]]()
+        self.checked_now = False
+        """Whether the first seconds are over, and nobody asked for what they show."""
+
+    @property
+    def drive_id(self) -> str:
+        """Of the ballot that is open."""
+        return stretch_name(self.name, self.number)
+
+    @property
+    def unchecked(self) -> bool:
+        """Whether :meth:`first_findings` has something to say yet."""
+        return self._first is not None
+
+    @property
+    def waiting(self) -> int:
+        """Scans that came and were not observed yet."""
+        return len(self._waiting)
 
     def on_pose(self, time_ns: int, T_map_base: F64) -> None:
         """One pose of odometry in the map's frame; it may come in any order."""
+        if self._poses and time_ns < self._poses[-1][0] - _BACK_NS:
+            log.warning("odometry's clock jumped back by %.1f s", 1e-9 * (self._poses[-1][0] - time_ns))
+            self._poses.clear()
         self._poses.append((time_ns, T_map_base))
 
-    def on_scan(self, scan: Scan) -> None:
-        """One scan; one that is not later than the last is left out and counted."""
-        if scan.stamp_ns <= self._last_ns:
-            self.left_out += 1
+    def on_scan(self, scan: Waiting) -> None:
+        """One scan as it comes. One that is not later than the last is left out, as are some if too many wait."""
+        self.counts.scans += 1
+        step_ns = scan.stamp_ns - self._last_ns
+        if self._last_ns >= 0 and (step_ns < -_BACK_NS or step_ns > _AHEAD_NS):
+            self._odd_stamps += 1
+            if self._odd_stamps < _JUMPED:
+                self.counts.late += 1
+                return
+            self._jump(step_ns)
+        elif step_ns <= 0:
+            self.counts.late += 1
             log.warning("a scan at %d ns is not later than the last one: left out", scan.stamp_ns)
             return
-        self._last_ns = scan.stamp_ns
-        self._scans.append(scan)
-        if len(self._scans) > _LATE_SCANS:
-            kept = list(self._scans)[::2]
-            self.left_out += len(self._scans) - len(kept)
-            self._scans = deque(kept)
+        self._odd_stamps, self._last_ns = 0, scan.stamp_ns
+        if self._thinning.admits(1e-9 * scan.sent_ns, len(self._waiting)):
+            self._waiting.append(scan)
+        else:
+            self.counts.left_out += 1
 
-    def step(self, with_poses: bool, *, ended: bool = False) -> bool:
-        """Vote with the oldest scan that waits, if its pose is known; returns whether there was one."""
-        if not self._scans:
+    def _jump(self, step_ns: int) -> None:
+        """The clock jumped: what was measured by the old one votes, its ballot is closed, and a new track begins."""
+        self.counts.clock_jumps += 1
+        log.warning("the sensor's clock jumped by %.1f s: a new ballot begins", 1e-9 * step_ns)
+        while self.step(ended=True):
+            pass
+        if self.vehicle is not None:
+            self.vehicle.finish()
+            self._count_votes(self.vehicle)
+            self._leave(self.vehicle.ballot)
+        self.vehicle = None
+        self._observed.clear()
+        new_ns = self._last_ns + step_ns
+        self._poses = deque((p for p in self._poses if abs(p[0] - new_ns) < 10 * _BACK_NS), maxlen=_POSES)
+
+    def step(self, *, ended: bool = False) -> bool:
+        """Vote with the oldest scan that waits, if its pose is known; returns whether there was one. If none waits, or
+        a tile's votes have been unwritten for too long, a tile goes to the journal."""
+        start, scan = time.monotonic(), self._next(ended)
+        oldest_s = min(self._touched.values(), default=np.inf)
+        overdue_s = start - oldest_s - _KEEP_S
+        if self.vehicle is not None and (overdue_s > 0.0 if scan is None else overdue_s > 2.0):
+            tile = min(self._touched, key=lambda index: self._touched[index])
+            del self._touched[tile]
+            self._outbox.keep(self.drive_id, self.vehicle.ballot([tile]))
+        if scan is None:
             return False
-        newest = max((t for t, _ in self._poses), default=0)
-        scan = self._scans[0]
-        unknown = newest < scan.stamp_ns or len(self._poses) < 2
-        if with_poses and not ended and unknown and self._last_ns - scan.stamp_ns < _PATIENCE_NS:
-            return False
-        self._scans.popleft()
-        self.vehicle.observe(scan, self._prior(scan.stamp_ns))
-        if self.cuts.due(self.vehicle.report, self.vehicle.done, self._road):
-            self.closed, self._road = self.closed + 1, RoadDriven()
-            self.send(self.vehicle.cut(stretch_name(self.name, self.closed + 1)))
+        self._observe(scan)
+        self._thinning.cost(time.monotonic() - start)
         return True
 
     def finish(self) -> None:
         """The drive has ended: what waits votes, and the last ballot leaves."""
-        while self.step(True, ended=True):
+        while self.step(ended=True):
             pass
-        self.vehicle.finish()
-        self.send(self.vehicle.ballot)
+        if self.vehicle is not None:
+            self.vehicle.finish()
+            self._count_votes(self.vehicle)
+            self.counts.ballots += 1
+            self._held.append((self.drive_id, self.vehicle.ballot, None))
+            self._release()
+
+    def first_findings(self) -> list[Finding]:
+        """What the first seconds show; with the answer, ballots that wait for it leave. Empty if it was asked before,
+        or nothing was observed."""
+        first, self._first, self.checked_now = self._first, None, False
+        if first is None or self.vehicle is None:
+            return []
+        found = first.findings(self.vehicle, self.vehicle.point_map)
+        if not any(finding.severity == "error" for finding in found):
+            self._release()
+        return found
+
+    def _release(self) -> None:
+        for closed in self._held:
+            self._outbox.leave(*closed)
+        self._held.clear()
+
+    def discard(self) -> None:
+        """The drive is useless: nothing of it leaves, and nothing is kept."""
+        self.vehicle = None
+        self._held.clear()
+        for number in range(1, self.number + 1):
+            self._outbox.discard(stretch_name(self.name, number))
+
+    def _next(self, ended: bool) -> Waiting | None:
+        """The oldest scan, unless a pose that is later than it may still come."""
+        if not self._waiting:
+            return None
+        scan = self._waiting[0]
+        newest = max((t for t, _ in self._poses), default=0)
+        unknown = newest < scan.stamp_ns or len(self._poses) < 2
+        if self._with_poses and not ended and unknown and self._waiting[-1].stamp_ns - scan.stamp_ns < _PATIENCE_NS:
+            return None
+        return self._waiting.popleft()
+
+    def _observe(self, waiting: Waiting) -> None:
+        try:
+            scan = waiting.read()
+        except MapvoteError as error:
+            self.counts.unusable += 1
+            log.warning("%s", error)
+            return
+        prior = self._prior(waiting.stamp_ns)
+        if not self._maps.covers(self._position(prior)):
+            self.counts.without_map += 1
+            return
+        if self.vehicle is None:
+            self.vehicle = self._make_vehicle(self._maps.current())
+            self.vehicle.drive_id, self._road, self._finished = self.drive_id, RoadDriven(), 0
+        vehicle = self.vehicle
+        if self._first is not None:
+            self.checked_now = self._first.add(scan, prior, vehicle)
+        self._observed.append(waiting)
+        self.counts.observed += 1
+        vehicle.observe(scan, prior)
+        self._count_votes(vehicle)
+        if self._cuts.due(vehicle.report, vehicle.done, self._road):
+            newest = self._maps.current()
+            self._road, self._finished = RoadDriven(), 0
+            written = vehicle.cut(stretch_name(self.name, self.number + 1), newest)
+            self._leave(written)
+
+    def _position(self, prior: F64 | None) -> F64 | None:
+        """(3,) where the vehicle is by its last scan, else by its prior."""
+        poses = [] if self.vehicle is None else self.vehicle.report.T_map_lidar
+        if poses:
+            return np.asarray(poses[-1][:3, 3])
+        return None if prior is None else np.asarray(prior[:3, 3])
+
+    def _count_votes(self, vehicle: Vehicle) -> None:
+        """Latencies of the scans that are done, and the tiles that they voted on."""
+        report, now_ns, now_s = vehicle.report, time.time_ns(), time.monotonic()
+        lost = set(report.lost) if vehicle.done > self._finished else set()
+        for i in range(self._finished, vehicle.done):
+            scan = self._observed.popleft()
+            if i in lost:
+                self.counts.lost += 1
+                continue
+            self.counts.localised += 1
+            since_ns = scan.stamp_ns if abs(scan.sent_ns - scan.stamp_ns) < 5 * 10**9 else scan.sent_ns
+            self.counts.latencies_s.append(1e-9 * (now_ns - since_ns))
+            x, y = report.T_map_lidar[i][:2, 3]
+            window = window_around(vehicle.point_map.lattice, x, y, vehicle.settings.voting.window_m)
+            for tile in window.tiles():
+                self._touched.setdefault(tile, now_s)
+        self._finished = vehicle.done
+
+    def _leave(self, written: Callable[[], Ballot]) -> None:
+        """A ballot is closed, and the next one begins."""
+        closed = self.drive_id
+        self.number += 1
+        self.counts.ballots += 1
+        self._touched.clear()
+        self._held.append((closed, written, self.drive_id))
+        if self._first is None:
+            self._release()
 
     def _prior(self, time_ns: int) -> F64 | None:
-        if len(self._poses) < 2:
-            self.without_pose += 1
-            return None
-        times, T = zip(*self._poses, strict=True)
-        found = sorted_trajectory(np.array(times), np.stack(T), of_vehicle=True, frame=MapFrame())
-        try:
-            T_map_base = found.at(np.array([time_ns]), "odometry")[0]
-        except MapvoteError:
-            self.without_pose += 1
-            return None
-        return np.asarray(T_map_base @ self.T_base_lidar)
-
-
-@dataclass(frozen=True, slots=True)
-class Chosen:
-    """The topics of one vehicle."""
-
-    points: SentTopic
-    odometry: SentTopic | None
-
-
-def choose_topics(network: Network, points: str | None, odometry: str | None, patience_s: float) -> Chosen:
-    """The topics named, else the only ones of their types. MapvoteError lists what is sent if they do not come."""
-    end = time.monotonic() + patience_s
-    while True:
-        heard = network.heard()
-        clouds = [h for h in heard if h.kind == CLOUD and points in (None, h.topic)]
-        poses = [h for h in heard if h.kind == ODOMETRY and odometry in (None, h.topic)]
-        if clouds and (poses or time.monotonic() > end):
-            break
-        if time.monotonic() > end:
-            listed = ", ".join(f"{h.topic} [{h.kind}]" for h in heard) or "nothing"
-            raise MapvoteError(f"no topic {points or CLOUD} in DDS domain {network.domain}; sent there: {listed}")
-        network.wait(0.1)
-    for found, option in ((clouds, "--points"), (poses, "--odometry")):
-        if len(found) > 1:
-            raise MapvoteError(f"several topics; choose with {option}: {', '.join(h.topic for h in found)}")
-    if odometry is not None and not poses:
-        raise MapvoteError(f"no topic {odometry} of {ODOMETRY} in DDS domain {network.domain}")
-    return Chosen(clouds[0], poses[0] if poses else None)
-
-
-def matrix_of(position: Any, orientation: Any) -> F64:
-    """T (4, 4) of a message's position and quaternion."""
-    import scipy
-
-    T = np.eye(4)
-    q = orientation
-    T[:3, :3] = scipy.spatial.transform.Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix()
-    T[:3, 3] = position.x, position.y, position.z
-    return T
-
-
-def messages(network: Network, chosen: Chosen, sensor: Any, ended: Callable[[], bool]) -> Iterator[tuple[str, Any]]:
-    """("pose", (stamp, T)), ("scan", Scan) and ("idle", None) as they come, until ``ended``."""
-    clouds = network.subscribe(chosen.points.topic, CLOUD, reliable=chosen.points.reliable)
-    odometry = chosen.odometry
-    poses = None if odometry is None else network.subscribe(odometry.topic, ODOMETRY, reliable=odometry.reliable)
-    while not ended():
-        network.wait(0.05)
-        for data in [] if poses is None else poses.take():
-            message = from_cdr(ODOMETRY, data)
-            pose = message.pose.pose
-            yield "pose", (stamp_ns(message), matrix_of(pose.position, pose.orientation))
-        for data in clouds.take():
+        if len(self._poses) >= 2:
+            times, T = zip(*self._poses, strict=True)
+            found = sorted_trajectory(np.array(times), np.stack(T), of_vehicle=True, frame=MapFrame())
             try:
-                yield "scan", scan_from_point_cloud2(from_cdr(CLOUD, data), sensor)
-            except MapvoteError as error:
-                log.warning("%s", error)
-        yield "idle", None
+                return np.asarray(found.at(np.array([time_ns]), "odometry")[0] @ self._T_base_lidar)
+            except MapvoteError:
+                pass
+        self.counts.without_pose += self._with_poses
+        return None

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 from mapvote.core.types import MapvoteError
@@ -15,9 +14,7 @@ _SEEN_S = 0.5
 """Between the first reader and the first message, so that every reader has found every topic."""
 
 
-def play(
-    bag_path: Path, network: Network, *, rate: float = 1.0, wait_s: float = 0.0, sent: Callable[[int], None] = print
-) -> int:
+def play(bag_path: Path, network: Network, *, rate: float = 1.0, wait_s: float = 0.0) -> int:
     """Send every message of the types that :data:`mapvote.live.cdr.TYPES` knows; returns how many.
 
     ``rate``: times as fast as recorded. ``wait_s``: wait so long for a reader at most. MapvoteError if the bag is of
@@ -43,6 +40,5 @@ def play(
         time.sleep(max(0.0, start + 1e-9 * (time_ns - first) / rate - time.monotonic()))
         out[connection.topic].send(bytes(data))
         count += 1
-        sent(count)
     time.sleep(_SEEN_S)  # a reliable writer that is gone repeats nothing
     return count

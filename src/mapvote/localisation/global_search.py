@@ -65,6 +65,12 @@ class GlobalSearch:
         self.map_around = MapWindow(point_map)
         self.judge = Judge(range_sigma_m)
 
+    def in_map(self, point_map: PointMap) -> GlobalSearch:
+        """The same search in another version of the map."""
+        other = GlobalSearch(point_map, self.ndt, 0.0)
+        other.judge = self.judge
+        return other
+
     @cached_property
     def _layout(self) -> CoarseMap:
         return laid_out(self.point_map)

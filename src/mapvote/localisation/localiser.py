@@ -115,6 +115,11 @@ class Localiser:
         self._decided.clear()
         return left
 
+    def go_on_in(self, point_map: PointMap) -> None:
+        """The map is another version from here on; the track goes on."""
+        self.search = self.search.in_map(point_map)
+        self.map_around.go_on_in(point_map)
+
     def _leave(self) -> list[Fix]:
         count = min(len(self._decided), 1 if len(self._decided) <= _LEAVING else 2)
         return [self._decided.popleft() for _ in range(count)]

@@ -44,6 +44,12 @@ class MapWindow:
             return self._laid_out(position)
         return self.ndt_map
 
+    def go_on_in(self, point_map: PointMap) -> None:
+        """The map is another version from here on: what is ready of tiles that stayed the same remains so."""
+        old, self.point_map, self.ndt_map = self.point_map, point_map, None
+        same = {tile for tile in self._ready if old.tiles.get(tile) is point_map.tiles.get(tile)}
+        self._ready = {tile: ready for tile, ready in self._ready.items() if tile in same}
+
     def prepare(self, position: F64) -> None:
         """One step ahead: one level of the nearest tile that is not ready. For every scan, so that none has it all."""
         ahead = [tile for tile in self._around(position, _AHEAD_M) if len(self._ready.get(tile, [])) < len(LEVELS)]

@@ -19,6 +19,7 @@ from typing import Protocol
 import numpy as np
 
 from mapvote.core.geometry import transform
+from mapvote.core.point_map import PointMap
 from mapvote.core.reference import LocalMap
 from mapvote.core.sensors import Sensor
 from mapvote.core.types import F32, F64, I32, Bool, MapvoteError, Reference, Scan
@@ -201,6 +202,16 @@ class Frontend:
         self.report = done.split(n)
         self._waiting = deque(replace(scan, index=scan.index - n) for scan in self._waiting)
         return done
+
+    def go_on_in(self, point_map: PointMap) -> None:
+        """From here on the map is another version: scans that wait are compared with it, too."""
+        self._ground = LocalMap(point_map, self._ground.window_m)
+        if self._compared is not None:
+            self._compared = LocalMap(point_map, self._compared.window_m)
+        for i, scan in enumerate(self._waiting):
+            reference, outer = self._ground.at(scan.origin_map)
+            obstacle, cell = find_obstacles(scan.points_map, reference)
+            self._waiting[i] = replace(scan, reference=reference, outer=outer, obstacle=obstacle, cell=cell)
 
     def _take(self, fix: Fix) -> list[Observation]:
         """One more scan is decided: if it is lost it says nothing."""

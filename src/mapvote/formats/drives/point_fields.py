@@ -63,7 +63,8 @@ def point_cloud_table(where: str, message: Any) -> NDArray[np.void]:
 
     ``message``: rosbags', rclpy's or any object with its fields. MapvoteError if its sizes contradict each other.
     """
-    data = np.frombuffer(bytes(message.data), dtype=np.uint8)
+    raw = message.data if isinstance(message.data, np.ndarray) else bytes(message.data)  # an array is not copied
+    data = np.frombuffer(raw, dtype=np.uint8)
     row = message.width * message.point_step
     if message.height > 1 and message.row_step != row and len(data) == message.height * message.row_step:
         data = np.ascontiguousarray(data.reshape(message.height, message.row_step)[:, :row]).ravel()
@@ -107,11 +108,15 @@ def point_times_s(where: str, raw: NDArray[np.generic], stamp_ns: int, sensor: S
     The unit is the one of s, ms, us, ns in which the scan lasts nearest to one revolution; values beyond a day are
     absolute (since 1970), others count from the stamp. MapvoteError if no unit makes a revolution of it.
     """
-    known = raw[np.isfinite(raw.astype(np.float64))]
-    if len(known) == 0 or known.min() == known.max():
+    raw = known = np.ascontiguousarray(raw)
+    start: Any
+    start, end = (raw.min(), raw.max()) if len(raw) else (np.nan, np.nan)
+    if not np.isfinite(float(end) - float(start)):
+        known = raw[np.isfinite(raw.astype(np.float64))]
+        start, end = (known.min(), known.max()) if len(known) else (0.0, 0.0)
+    if start == end:
         return None
-    start = known.min()
-    span = float(known.max() - start)
+    span = float(end - start)
     revolution_ns = 1e9 / sensor.rate_hz
     unit = min(_UNITS_NS, key=lambda u: abs(np.log(span * _UNITS_NS[u] / revolution_ns)))
     if not revolution_ns / 20 < span * _UNITS_NS[unit] < revolution_ns * 20:
@@ -120,7 +125,8 @@ def point_times_s(where: str, raw: NDArray[np.generic], stamp_ns: int, sensor: S
             f"or drop the field"
         )
     # Exact for 64-bit nanoseconds: the scan's start is subtracted before anything becomes a float.
-    since_start_ns = (raw - start).astype(np.float64) * _UNITS_NS[unit]
+    out: F64 = (raw - start).astype(np.float64)
+    out *= _UNITS_NS[unit]
     start_ns = int(start) if raw.dtype.kind in "iu" and unit == "ns" else round(float(start) * _UNITS_NS[unit])
     offset_ns = start_ns - stamp_ns if abs(start_ns) > _DAY_NS else start_ns
     if abs(offset_ns) > 1e9:
@@ -128,5 +134,6 @@ def point_times_s(where: str, raw: NDArray[np.generic], stamp_ns: int, sensor: S
             f"{where}: points were measured {offset_ns / 1e9:.3f} s away from their scan's stamp: "
             f"two clocks are mixed; mend the stamps, or drop the field"
         )
-    out: F64 = (since_start_ns + offset_ns) * 1e-9
+    out += offset_ns
+    out *= 1e-9
     return out.astype(np.float32)

@@ -103,6 +103,11 @@ def xyz(where: str, table: NDArray[np.void]) -> NDArray[np.floating]:
     missing = [axis for axis in "xyz" if axis not in names]
     if missing:
         raise MapvoteError(f"{where}: no field {', '.join(missing)} among {', '.join(names)}; points need x, y and z")
+    x, y, z = (table.dtype.fields[axis] for axis in "xyz")  # type: ignore[index]
+    single = x[0] == y[0] == z[0] == np.dtype("<f4") and (y[1], z[1]) == (x[1] + 4, x[1] + 8)
+    if single and table.flags.c_contiguous and len(table):  # as nearly every driver has them: one copy, not three
+        beside = np.ndarray((len(table), 3), "<f4", table.data, x[1], (table.dtype.itemsize, 4))
+        return np.ascontiguousarray(beside, np.float32)
     exact = any(table.dtype[axis] not in (np.float32, np.float16, np.int16, np.uint16) for axis in "xyz")
     out: NDArray[Any] = np.empty((len(table), 3), dtype=np.float64 if exact else np.float32)
     for column, axis in enumerate("xyz"):

@@ -1,0 +1,265 @@
+"""What one vehicle hears on DDS: clouds of its LiDARs joined to scans, poses of its odometry, its fixed frames."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import scipy
+
+from mapvote.core.geometry import inverse
+from mapvote.core.sensors import Sensor
+from mapvote.core.types import F64, MapvoteError, Scan
+from mapvote.formats.drives.bag_poses import Edges, T_from
+from mapvote.formats.drives.point_fields import scan_from_point_cloud2
+from mapvote.formats.drives.sensor_estimate import UNKNOWN, estimate_sensor
+from mapvote.live.cdr import from_cdr, stamp_ns
+from mapvote.live.dds import Network, SentTopic, Subscription
+from mapvote.live.drive import Waiting
+from mapvote.live.topics import CLOUD, ODOMETRY, TF
+
+log = logging.getLogger("mapvote.live")
+_SWEEP = 0.55
+"""Revolutions within which the clouds of several LiDARs are one scan, as in a recorded drive."""
+_REVISIT_S = 2.0
+"""How often it is looked whether writers came or went."""
+_SETTLE_S = 3.0
+"""Frames that nobody has sent for so long will not come."""
+_MEASURED = 10
+"""Scans in which a sensor is measured."""
+_OTHER_CLOCK_NS = 10**9
+"""Stamps of clouds and poses that come together and differ by more are of two clocks."""
+
+
+@dataclass(frozen=True, slots=True)
+class Chosen:
+    """The topics of one vehicle."""
+
+    points: tuple[SentTopic, ...]
+    """The first LiDAR's is the one in whose frame scans are."""
+    odometry: SentTopic | None
+
+
+def choose_topics(
+    network: Network, points: Sequence[str], odometry: str | None, patience_s: float, ended: Callable[[], bool]
+) -> Chosen | None:
+    """The topics named, else the only ones of their types; None if ``ended`` first. MapvoteError lists what is sent if
+    they do not come."""
+    end = time.monotonic() + patience_s
+    while not ended():
+        heard = network.heard()
+        clouds = [h for h in heard if h.kind == CLOUD and (not points or h.topic in points)]
+        poses = [h for h in heard if h.kind == ODOMETRY and odometry in (None, h.topic)]
+        late = time.monotonic() > end
+        if len(clouds) >= max(len(points), 1) and (poses or late):
+            break
+        if late:
+            listed = ", ".join(f"{h.topic} [{h.kind}]" for h in heard) or "nothing"
+            wanted = ", ".join(points) or CLOUD
+            raise MapvoteError(f"no topic {wanted} in DDS domain {network.domain}; sent there: {listed}")
+        network.wait(0.1)
+    else:
+        return None
+    if not points and len(clouds) > 1:
+        names = ",".join(h.topic for h in clouds)
+        raise MapvoteError(f"several LiDARs: choose one, or join several, with --points {names}")
+    if len(poses) > 1:
+        raise MapvoteError(f"several topics; choose with --odometry: {', '.join(h.topic for h in poses)}")
+    if odometry is not None and not poses:
+        raise MapvoteError(f"no topic {odometry} of {ODOMETRY} in DDS domain {network.domain}")
+    by_name = {h.topic: h for h in clouds}
+    return Chosen(tuple(by_name[name] for name in points or by_name), poses[0] if poses else None)
+
+
+def matrix_of(position: Any, orientation: Any) -> F64:
+    """T (4, 4) of a message's position and quaternion."""
+    T = np.eye(4)
+    q = orientation
+    T[:3, :3] = scipy.spatial.transform.Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix()
+    T[:3, 3] = position.x, position.y, position.z
+    return T
+
+
+@dataclass(frozen=True, slots=True)
+class Cloud:
+    """A PointCloud2 as it came."""
+
+    lidar: int
+    stamp_ns: int
+    sent_ns: int
+    data: bytes
+
+
+class Sweeps:
+    """Clouds of several LiDARs joined to scans: what they took within half a revolution."""
+
+    def __init__(self, lidars: int) -> None:
+        self.lidars, self.reach_ns = lidars, 0.55e8
+        self._open: list[Cloud] = []
+        self._firsts: deque[int] = deque(maxlen=20)
+        """Stamps of the first LiDAR: they tell its period."""
+
+    def add(self, cloud: Cloud) -> list[list[Cloud]]:
+        """The scans that are whole by now, each in order of LiDARs."""
+        if self.lidars == 1:
+            return [[cloud]]
+        if cloud.lidar == 0:
+            self._firsts.append(cloud.stamp_ns)
+            if len(self._firsts) > 2:
+                self.reach_ns = _SWEEP * float(np.median(np.diff(sorted(self._firsts))))
+        out = []
+        start = min((c.stamp_ns for c in self._open), default=cloud.stamp_ns)
+        apart = abs(cloud.stamp_ns - start) > self.reach_ns or cloud.lidar in {c.lidar for c in self._open}
+        if self._open and apart:
+            out.append(self._closed())
+        self._open.append(cloud)
+        if len(self._open) == self.lidars:
+            out.append(self._closed())
+        return out
+
+    def _closed(self) -> list[Cloud]:
+        closed, self._open = sorted(self._open, key=lambda c: c.lidar), []
+        return closed
+
+
+class Hearing:
+    """The topics of one vehicle, read as they come. Writers may come, go and change what they offer."""
+
+    def __init__(self, network: Network, chosen: Chosen, sensor: Sensor | None) -> None:
+        """``sensor``: of the first LiDAR; None: it is measured in the first scans."""
+        self.network, self.chosen, self.sensor = network, chosen, sensor
+        self.sensor_told = "stated" if sensor is not None else ""
+        self.frames: list[str] = [""] * len(chosen.points)
+        """Of each LiDAR, as its clouds say."""
+        self.base_frame, self.map_frame = "", ""
+        """What odometry tracks, and in which frame."""
+        self.clock_difference_ns = 0
+        """Stamp of the newest pose less that of the newest cloud, when both came."""
+        self.clouds = 0
+        self._edges: Edges = {}
+        self._sweeps = Sweeps(len(chosen.points))
+        self._points = [self._subscribed(topic) for topic in chosen.points]
+        self._odometry = None if chosen.odometry is None else self._subscribed(chosen.odometry)
+        self._tf = network.subscribe("/tf_static", TF, reliable=True, transient_local=True)
+        self._lost = 0
+        self._mounts: list[F64] | None = None
+        self._newest_pose_ns = 0
+        self._looked_s = time.monotonic()
+
+    def _subscribed(self, topic: SentTopic) -> Subscription:
+        return self.network.subscribe(topic.topic, topic.kind, reliable=topic.reliable)
+
+    @property
+    def lost(self) -> int:
+        """Clouds that were lost between their writers and here."""
+        return self._lost + sum(s.lost for s in self._points)
+
+    def poses(self) -> list[tuple[int, F64]]:
+        """Odometry that came: stamps, and T_map_base."""
+        out = []
+        for data in [] if self._odometry is None else self._odometry.take():
+            message = from_cdr(ODOMETRY, data)
+            pose = message.pose.pose
+            self.base_frame, self.map_frame = (
+                name.strip("/") for name in (message.child_frame_id, message.header.frame_id)
+            )
+            out.append((stamp_ns(message), matrix_of(pose.position, pose.orientation)))
+            self._newest_pose_ns = out[-1][0]
+        return out
+
+    def scans(self) -> list[list[Cloud]]:
+        """Clouds that came, joined to scans."""
+        self._take_frames()
+        out: list[list[Cloud]] = []
+        for lidar, subscription in enumerate(self._points):
+            for sent_ns, data in subscription.take_sent():
+                header = from_cdr("std_msgs/msg/Header", data)
+                self.frames[lidar] = header.frame_id.strip("/")
+                time_ns = int(header.stamp.sec) * 10**9 + int(header.stamp.nanosec)
+                self.clouds += 1
+                if self._newest_pose_ns:
+                    self.clock_difference_ns = self._newest_pose_ns - time_ns
+                out += self._sweeps.add(Cloud(lidar, time_ns, sent_ns, data))
+        if time.monotonic() > self._looked_s + _REVISIT_S:
+            self._revisit()
+        return out
+
+    def _take_frames(self) -> None:
+        for data in self._tf.take():
+            for t in from_cdr(TF, data).transforms:
+                T = matrix_of(t.transform.translation, t.transform.rotation)
+                parent, child = t.header.frame_id.strip("/"), t.child_frame_id.strip("/")
+                for here, there, T_here_there in ((parent, child, T), (child, parent, inverse(T))):
+                    known = [edge for edge in self._edges.get(here, []) if edge[0] != there]
+                    self._edges[here] = [*known, (there, T_here_there)]
+
+    def _revisit(self) -> None:
+        """Read anew what is now sent with another reliability: DDS connects no reliable reader to a writer that is
+        not."""
+        self._looked_s = time.monotonic()
+        now = {(h.topic, h.kind): h.reliable for h in self.network.heard()}
+        for k, topic in enumerate(self.chosen.points):
+            reliable = now.get((topic.topic, topic.kind), self._points[k].reliable)
+            if reliable != self._points[k].reliable:
+                log.warning("%s is now sent %s", topic.topic, "reliably" if reliable else "with best effort")
+                self._lost += self._points[k].lost
+                self._points[k].close()
+                self._points[k] = self.network.subscribe(topic.topic, topic.kind, reliable=reliable)
+
+    def T_base_lidar(self) -> F64 | None:
+        """(4, 4) the first LiDAR on what odometry tracks, by /tf_static; the identity if both are one frame, or nobody
+        names what odometry tracks. None if /tf_static does not say."""
+        if self.base_frame in ("", self.frames[0]):
+            return np.eye(4)
+        return T_from(self._edges, self.base_frame).get(self.frames[0])
+
+    def mounts(self) -> list[F64] | None:
+        """(4, 4) each: T_first_lidar of every LiDAR; None while /tf_static does not say."""
+        if self._mounts is None and all(self.frames):
+            reached = T_from(self._edges, self.frames[0])
+            if all(frame in reached for frame in self.frames):
+                self._mounts = [reached[frame] for frame in self.frames]
+        return self._mounts
+
+    def measure(self, scans: Sequence[list[Cloud]]) -> bool:
+        """Measure the first LiDAR in the first ``scans``, unless it is known; returns whether it is now."""
+        if self.sensor is None and len(scans) >= _MEASURED:
+            firsts = [sweep[0] for sweep in scans if sweep[0].lidar == 0]
+            steps_ns = np.diff([cloud.stamp_ns for cloud in firsts])
+            rate_hz = round(1e9 / float(np.median(steps_ns)), 1)
+            read = [scan_from_point_cloud2(from_cdr(CLOUD, cloud.data), UNKNOWN) for cloud in firsts[:_MEASURED]]
+            found = estimate_sensor(read, rate_hz)
+            self.sensor, self.sensor_told = found.sensor, found.told
+        return self.sensor is not None
+
+    def waiting(self, clouds: list[Cloud]) -> Waiting:
+        """A scan that is read when its turn comes."""
+        return Waiting(min(c.stamp_ns for c in clouds), max(c.sent_ns for c in clouds), lambda: self._read(clouds))
+
+    def _read(self, clouds: list[Cloud]) -> Scan:
+        mounts, sensor = self.mounts(), self.sensor
+        assert sensor is not None
+        scans = []
+        for cloud in clouds:
+            scan = scan_from_point_cloud2(from_cdr(CLOUD, cloud.data), sensor)
+            if cloud.lidar:
+                if mounts is None:
+                    raise MapvoteError(f"/tf_static does not say where {self.frames[cloud.lidar]} sits")
+                scan = scan.seen_from(mounts[cloud.lidar])
+            scans.append(scan)
+        return scans[0] if len(clouds) == 1 else Scan.sweep(min(c.stamp_ns for c in clouds), scans)
+
+    def different_clocks(self) -> str:
+        """What is wrong if odometry and LiDAR do not share a clock; "" if they do."""
+        apart_ns = self.clock_difference_ns
+        if abs(apart_ns) <= _OTHER_CLOCK_NS:
+            return ""
+        return (
+            f"odometry's stamps are {1e-9 * apart_ns:+.1f} s off those of the clouds that come with them: two clocks. "
+            "Synchronise them (PTP, or the driver's own time), or choose another --odometry"
+        )
