@@ -49,19 +49,20 @@ def topics(
 
 
 def play(
-    bag: Annotated[Path, typer.Argument(metavar="BAG", help="a ROS 2 bag, sqlite3 or MCAP")],
+    path: Annotated[Path, typer.Argument(metavar="DRIVE|BAG", help="a ROS 2 bag, or a drive in any format")],
     rate: Annotated[float, typer.Option(min=0.01, metavar="N", help="times as fast as recorded")] = 1.0,
     wait: Annotated[float, typer.Option(min=0.0, metavar="SECONDS", help="for a first reader, at most")] = 60.0,
+    loops: Annotated[int, typer.Option(min=1, metavar="N", help="so many times, each with the same stamps")] = 1,
     domain: Domain = None,
 ) -> None:
-    """Send a recorded ROS 2 bag on DDS, its messages as they were recorded: a vehicle without a vehicle.
+    """Send a recorded drive on DDS, a ROS 2 bag as it was recorded: a vehicle without a vehicle.
 
     mapvote play my_bag
     """
     from mapvote.live.dds import Network
-    from mapvote.live.play import play as play_bag
+    from mapvote.live.play import play as play_drive
 
-    print(f"{bag}: {play_bag(bag, Network(domain), rate=rate, wait_s=wait)} messages sent")
+    print(f"{path}: {play_drive(path, Network(domain), rate=rate, wait_s=wait, loops=loops)} messages sent")
 
 
 def drive(

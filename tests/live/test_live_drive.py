@@ -1,0 +1,160 @@
+"""A drive without an end, in one process: scans come as DDS would bring them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from live.test_outbox import said
+from mapvote.codec.ballot import Ballot, decode
+from mapvote.core.point_map import PointMap, map_from_points
+from mapvote.core.types import F64, Drive, MapvoteError, Scan
+from mapvote.live import drive as drive_module
+from mapvote.live.drive import LiveDrive, OneMap, Thinning, Waiting
+from mapvote.live.outbox import Outbox, ballot_of
+from mapvote.vehicle import Cuts, Vehicle
+from streets import drive_along, path, street
+
+SCANS = 26
+
+
+@cache
+def recorded() -> tuple[PointMap, Drive, list[Scan], F64]:
+    poses = path(SCANS)
+    drive = drive_along(poses, 1, prior=poses)
+    return map_from_points(street(1)), drive, list(drive), poses
+
+
+class Live:
+    """A live drive on the street, and the folder that its ballots go to."""
+
+    def __init__(self, tmp_path: Path, **more: Any) -> None:
+        self.point_map, drive, self.scans, self.poses = recorded()
+        self.said: list[str] = []
+        (tmp_path / "out").mkdir(exist_ok=True)
+        self.outbox = Outbox(tmp_path / "state", "car", folder=tmp_path / "out", say=self.said.append)
+        self.live = LiveDrive(
+            lambda point_map: Vehicle("car", drive.sensor, point_map),
+            more.pop("maps", OneMap(self.point_map)),
+            self.outbox,
+            name="day",
+            **more,
+        )
+
+    def give(self, i: int, shift_ns: int = 0, read: Callable[[], Scan] | None = None) -> None:
+        scan = self.scans[i]
+        stamp_ns = 1_700_000_000 * 10**9 + scan.stamp_ns + shift_ns
+        self.live.on_pose(stamp_ns, self.poses[i])
+        moved = Scan(stamp_ns, scan.points, scan.time_s)
+        self.live.on_scan(Waiting(stamp_ns, stamp_ns, read or (lambda: moved)))
+
+    def drain(self) -> None:
+        while self.live.step():
+            pass
+
+
+def test_of_scans_that_come_twice_as_fast_as_they_are_voted_on_every_other_one_is_left_out_evenly() -> None:
+    thinning, waiting, admitted = Thinning(), 0.0, []
+    for i in range(2000):
+        thinning.cost(0.2)
+        if thinning.admits(0.1 * i, int(waiting)):
+            admitted.append(i)
+            waiting += 1
+        waiting = max(0.0, waiting - 0.5)
+    gaps = [b - a for a, b in pairwise(admitted) if a > 200]
+    assert 0.42 < len([i for i in admitted if i > 200]) / 1800 <= 0.51
+    assert max(gaps) <= 3
+    assert waiting < 35
+
+
+def test_a_stop_of_two_seconds_costs_no_scan() -> None:
+    thinning = Thinning()
+    assert all(thinning.admits(0.1 * i, waiting) for i, waiting in enumerate([0] * 50 + list(range(20)) + [1] * 50))
+
+
+def test_a_clock_that_jumps_back_or_ahead_closes_the_ballot_and_the_drive_goes_on(tmp_path: Path) -> None:
+    hour = 3600 * 10**9
+    live = Live(tmp_path)
+    for i in range(SCANS):
+        live.give(i)
+    for shift_ns in (-hour, 2 * hour):
+        for i in range(SCANS):
+            live.give(i, shift_ns)
+    live.live.finish()
+    live.outbox.close()
+    counts = live.live.counts
+    assert (counts.clock_jumps, counts.late, counts.ballots, counts.scans) == (2, 4, 3, 3 * SCANS)
+    assert said(tmp_path / "out") == {"day-001": SCANS, "day-002": SCANS - 2, "day-003": SCANS - 2}
+    assert counts.localised + counts.lost == 3 * SCANS - 4
+    assert counts.localised > 2 * SCANS
+
+
+def test_one_stamp_that_is_an_hour_off_is_one_scan_less_and_no_jump(tmp_path: Path) -> None:
+    live = Live(tmp_path)
+    for i in range(SCANS):
+        live.give(i, 3600 * 10**9 if i == 9 else 0)
+    live.live.finish()
+    live.outbox.close()
+    assert (live.live.counts.clock_jumps, live.live.counts.late, live.live.counts.ballots) == (0, 1, 1)
+
+
+def test_what_a_kill_leaves_in_the_journal_is_what_the_vehicle_had_said_of_each_tile(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(drive_module, "_KEEP_S", 0.0)
+    live = Live(tmp_path)
+    for i in range(SCANS):
+        live.give(i)
+    live.drain()
+    while live.live._touched:
+        live.live.step()
+    assert live.live.vehicle is not None
+    stated: Ballot = live.live.vehicle.ballot()
+    live.outbox.close()  # what it was given is on disk; nobody finishes the drive
+    found = ballot_of(tmp_path / "state/car/day-001.journal")
+    assert found == stated
+
+
+def test_a_scan_that_cannot_be_read_is_counted_and_the_drive_goes_on(tmp_path: Path) -> None:
+    def damaged() -> Scan:
+        raise MapvoteError("cut off")
+
+    live = Live(tmp_path)
+    for i in range(SCANS):
+        live.give(i, read=damaged if i in (5, 6) else None)
+    live.live.finish()
+    live.outbox.close()
+    assert (live.live.counts.unusable, live.live.counts.observed) == (2, SCANS - 2)
+    assert live.live.counts.latencies_s
+
+
+def test_a_new_version_of_the_map_holds_from_the_next_ballot_on(tmp_path: Path) -> None:
+
+    class Versions:
+        version = 1
+
+        def current(self) -> PointMap:
+            return replace(recorded()[0], version=self.version)
+
+        def covers(self, position: F64 | None) -> bool:
+            return True
+
+    maps = Versions()
+    live = Live(tmp_path, maps=maps, cuts=Cuts(length_m=4.0))
+    for i in range(SCANS):
+        maps.version = 1 + (i > 4)
+        live.give(i)
+        live.drain()
+    live.live.finish()
+    live.outbox.close()
+
+    versions = [decode(f.read_bytes()).version for f in sorted((tmp_path / "out").iterdir())]
+    assert versions[0] == 1
+    assert set(versions[1:]) == {2}
+    assert live.live.counts.localised == SCANS

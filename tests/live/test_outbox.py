@@ -1,0 +1,198 @@
+"""What is on disk survives a kill at any moment: no ballot is lost, none comes twice, none is damaged."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+
+from hand_made import Say, make_ballot, make_map, make_tile, states_plane, wall
+from mapvote.client import MapClient
+from mapvote.codec.ballot import Ballot, decode, encode
+from mapvote.core.types import MapvoteError
+from mapvote.formats.atomic import whole_file as really_whole_file
+from mapvote.live import outbox as outbox_module
+from mapvote.live.outbox import Journal, Outbox, ballot_of, records
+
+MAP = make_map({(0, 0): make_tile(wall([(1, 1)], [1.0])), (0, 1): make_tile(wall([(1, 1)], [1.0]), index=(0, 1))})
+
+
+def ballot(drive: str, scans: int = 10, tile: int = 0) -> Ballot:
+    made = make_ballot(MAP, {(0, tile): Say(states_plane({(1, 1): 3}))}, "car", drive)
+    return msgspec.structs.replace(made, scans=scans, scans_localised=scans)
+
+
+def said(folder: Path) -> dict[str, int]:
+    """By drive, how many scans the ballots in a folder are of."""
+    found = [decode(file.read_bytes()) for file in folder.glob("car~*.ballot")]
+    return {one.drive: one.scans for one in found}
+
+
+def open_outbox(tmp_path: Path, **more: Any) -> Outbox:
+    return Outbox(tmp_path / "state", "car", folder=tmp_path / "out", say=lambda _: None, retry_s=0.05, **more)
+
+
+def left_files(tmp_path: Path) -> list[str]:
+    return sorted(f.name for f in (tmp_path / "state/car").iterdir() if f.name not in (".lock", ".last"))
+
+
+def test_a_journal_cut_off_at_any_byte_gives_the_ballot_of_its_whole_records(tmp_path: Path) -> None:
+    journal = Journal(tmp_path / "a.journal")
+    parts = [ballot("a", 5), ballot("a", 9, tile=1), ballot("a", 12)]
+    ends = []
+    for part in parts:
+        journal.append(encode(part))
+        ends.append(journal.path.stat().st_size)
+    whole = journal.path.read_bytes()
+    for length in {*range(0, len(whole), 7), *ends, *(end - 1 for end in ends)}:
+        journal.path.write_bytes(whole[:length])
+        n = int(np.searchsorted(ends, length, side="right"))
+        assert list(records(journal.path)) == parts[:n]
+        found = ballot_of(journal.path)
+        assert (found is None) == (n == 0)
+        if found is not None:
+            assert (found.scans, [t.tile for t in found.tiles]) == ([5, 9, 12][n - 1], [(0, 0), (0, 1)][: min(n, 2)])
+
+
+def test_a_damaged_record_ends_the_journal_and_what_is_written_next_takes_its_place(tmp_path: Path) -> None:
+    journal = Journal(tmp_path / "a.journal")
+    journal.append(encode(ballot("a", 5)))
+    with journal.path.open("ab") as file:
+        file.write(b"half a record")
+    journal.append(encode(ballot("a", 9)))
+    assert [part.scans for part in records(journal.path)] == [5, 9]
+
+
+class Killed(BaseException):
+    """The process ends here: nothing of it runs on."""
+
+
+@pytest.fixture
+def kill_at(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[int], list[str]]]:
+    """Ends the process at the k-th of the calls by which files are changed; gives the names of those that were made."""
+
+    def arm(k: int) -> list[str]:
+        made: list[str] = []
+
+        def counted(name: str, real: Callable[..., Any]) -> Callable[..., Any]:
+            def call(*args: Any, **kwargs: Any) -> Any:
+                if len(made) >= k:
+                    raise Killed
+                made.append(name)
+                return real(*args, **kwargs)
+
+            return call
+
+        for name in ("replace", "fsync"):
+            monkeypatch.setattr(os, name, counted(name, getattr(os, name)))
+        monkeypatch.setattr(Path, "unlink", counted("unlink", Path.unlink))
+        return made
+
+    yield arm
+    monkeypatch.undo()
+
+
+def test_killed_between_any_two_file_operations_every_closed_ballot_comes_once_and_the_open_one_to_its_last_record(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kill_at: Callable[[int], list[str]]
+) -> None:
+    for k in range(100):
+        home = tmp_path / str(k)
+        (home / "out").mkdir(parents=True)
+        with monkeypatch.context():
+            made = kill_at(k)
+            ended = False
+            box = open_outbox(home)
+            try:
+                assert box.begin("day") == 1
+                box.keep("day-001", ballot("day-001", 5))
+                box.leave("day-001", lambda: ballot("day-001", 10), "day-002")
+                box.keep("day-002", ballot("day-002", 7))
+            except Killed:
+                box._lock.close()
+            else:
+                try:
+                    box.close()
+                    ended = True
+                except Killed:
+                    pass
+        monkeypatch.undo()
+        again = open_outbox(home)
+        number = again.begin("day")
+        again.close()
+        found, written = said(home / "out"), made.count("fsync")
+        assert left_files(home) == []
+        assert found.get("day-001") in ((10,) if ended else (None, 5, 10)), (k, made)
+        assert found.get("day-002") in ((7,) if ended else (None, 7))
+        assert number > max((int(drive[-3:]) for drive in found), default=0)
+        if written > 3:  # .last, the first record, the closed ballot
+            assert "day-001" in found
+        if ended:
+            return
+    raise AssertionError("the drive never came to its end")
+
+
+def test_two_processes_cannot_drive_as_one_vehicle(tmp_path: Path) -> None:
+    first = open_outbox(tmp_path)
+    with pytest.raises(MapvoteError, match="another process drives as car"):
+        open_outbox(tmp_path)
+    first.begin("a")
+    first.close()
+    open_outbox(tmp_path).begin("a")
+
+
+def test_no_number_is_given_twice_to_a_drive_of_one_name(tmp_path: Path) -> None:
+    (tmp_path / "out").mkdir()
+    numbers = []
+    for _ in range(3):
+        box = open_outbox(tmp_path)
+        numbers.append(box.begin("day"))
+        name = f"day-{numbers[-1]:03d}"
+        box.leave(name, lambda name=name: ballot(name))  # type: ignore[misc]
+        box.close()
+    assert numbers == [1, 2, 3]
+    assert set(said(tmp_path / "out")) == {"day-001", "day-002", "day-003"}
+
+
+def test_a_full_disk_is_said_once_and_nothing_is_lost_that_it_takes_later(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    said_of, full = list[str](), [False]
+
+    def whole_file(path: Path, **more: Any) -> Any:
+        if full[0]:
+            raise MapvoteError(f"{path}: cannot be written (No space left on device)")
+        return really_whole_file(path, **more)
+
+    monkeypatch.setattr(outbox_module, "whole_file", whole_file)
+    (tmp_path / "out").mkdir()
+    box = Outbox(tmp_path / "state", "car", folder=tmp_path / "out", say=said_of.append, retry_s=0.02)
+    box.begin("day")
+    full[0] = True
+    for n in range(1, 4):
+        name = f"day-{n:03d}"
+        box.leave(name, lambda name=name: ballot(name), f"day-{n + 1:03d}")  # type: ignore[misc]
+    while box.report.failed_writes < 4:
+        pass
+    assert said(tmp_path / "out") == {}
+    full[0] = False
+    box.close()
+    assert set(said(tmp_path / "out")) == {"day-001", "day-002", "day-003"}
+    assert sum("No space left" in text for text in said_of) == 1
+    assert sum("takes ballots again" in text for text in said_of) == 1
+
+
+def test_while_the_server_is_away_ballots_wait_in_the_spool_and_the_scan_loop_does_not(tmp_path: Path) -> None:
+    away = MapClient("http://127.0.0.1:9", home=tmp_path / "home", attempts=1, timeout_s=0.2, sleep=lambda _: None)
+    box = Outbox(tmp_path / "home/live", "car", client=away, say=lambda _: None, retry_s=0.02)
+    box.begin("day")
+    for n in range(1, 21):
+        name = f"day-{n:03d}"
+        box.leave(name, lambda name=name: ballot(name), f"day-{n + 1:03d}")  # type: ignore[misc]
+    box.close()
+    assert away.waiting("car") == box.report.waiting == 20
+    assert box.report.sent == 0
