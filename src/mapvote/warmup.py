@@ -35,6 +35,11 @@ _STEP_M = 0.8
 _SPACING_M = 0.35
 
 
+def warm_vehicle(settings: Settings) -> None:
+    """Load the kernels of a vehicle's first scans: of live ones none is to wait for them."""
+    vote_drive(_drive(_street(demolished=True), turning=True), map_from_points(_street(demolished=False)), settings)
+
+
 def warm_up() -> Iterator[tuple[str, float]]:
     """(what was compiled, CPU seconds that it took), step by step. With everything in the cache it takes seconds."""
     old, new = _street(demolished=False), _street(demolished=True)

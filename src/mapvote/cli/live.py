@@ -105,6 +105,7 @@ def drive(
     from mapvote.live.hearing import Hearing, choose_topics
     from mapvote.live.service import Plan, run
     from mapvote.vehicle import Cuts
+    from mapvote.warmup import warm_vehicle
 
     if out is None and send is None:
         raise MapvoteError("drive: say where the ballots go: --send URL, --out FOLDER, or both")
@@ -130,6 +131,7 @@ def drive(
         if chosen is None:
             return
         topics = [t.topic for t in (*chosen.points, *filter(None, [chosen.odometry]))]
+        warm_vehicle(plan.settings)
         print(f"listening to {' and '.join(topics)}", flush=True)
         hearing = Hearing(network, chosen, model)
         live = run(plan, hearing, maps, outbox, ended)
@@ -170,5 +172,5 @@ def _said(vehicle: str, live: LiveDrive | None, hearing: Hearing) -> str:
     return (
         f"{vehicle}: {c.ballots} ballots, {c.localised} of {c.scans} scans voted, {c.lost} lost, "
         f"{c.left_out} scans left out, {c.without_pose} without odometry, {c.without_map} without map, "
-        f"{c.unusable} unusable, {c.late} late, {hearing.lost} lost on the network"
+        f"{c.unusable} unusable, {c.late} late, {c.missing} never came"
     )

@@ -151,7 +151,7 @@ class Subscription:
 
     def take_sent(self) -> list[tuple[int, bytes]]:
         """The same, each with the time at which its writer sent it, nanoseconds since 1970 by the writer's clock."""
-        taken = self._take(self._reader._ref, _ANY, _DEPTH)
+        taken = self._take(self._reader._ref, _ANY, 10 * _DEPTH)
         if isinstance(taken, int):
             raise MapvoteError(f"{self.topic}: DDS cannot read it (error {taken})")
         return [(info.source_timestamp, data) for data, info in taken if info.valid_data]

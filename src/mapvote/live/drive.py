@@ -89,6 +89,8 @@ class Counts:
     """Scans without a sure place: they cast no vote."""
     left_out: int = 0
     """For want of time."""
+    missing: int = 0
+    """Scans that never came, by the holes between the stamps of others."""
     unusable: int = 0
     """Damaged, or without a usable point."""
     late: int = 0
@@ -158,6 +160,8 @@ class LiveDrive:
         self._touched: dict[TileIndex, float] = {}
         """Tiles with votes that are not in the journal, and since when."""
         self._thinning, self._last_ns, self._odd_stamps, self._finished = Thinning(), -1, 0, 0
+        self._period_ns = 0
+        """Between scans, by the shortest step of late."""
         self._first, self._held = first, list[tuple[str, Callable[[], Ballot], str | None]]()
         self.checked_now = False
         """Whether the first seconds are over, and nobody asked for what they show."""
@@ -198,6 +202,10 @@ class LiveDrive:
             self.counts.late += 1
             log.warning("a scan at %d ns is not later than the last one: left out", scan.stamp_ns)
             return
+        elif self._last_ns >= 0 and self._period_ns:
+            self.counts.missing += max(0, round(step_ns / self._period_ns) - 1)
+        if 0 < step_ns < _BACK_NS:
+            self._period_ns = step_ns if not self._period_ns else min(step_ns, int(1.02 * self._period_ns))
         self._odd_stamps, self._last_ns = 0, scan.stamp_ns
         if self._thinning.admits(1e-9 * scan.sent_ns, len(self._waiting)):
             self._waiting.append(scan)

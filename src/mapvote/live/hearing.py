@@ -28,8 +28,8 @@ _SWEEP = 0.55
 """Revolutions within which the clouds of several LiDARs are one scan, as in a recorded drive."""
 _REVISIT_S = 2.0
 """How often it is looked whether writers came or went."""
-_SETTLE_S = 3.0
-"""Frames that nobody has sent for so long will not come."""
+_DEPTH = 200
+"""Messages that wait in DDS at most: while the process stands still for 20 s none is lost."""
 _MEASURED = 10
 """Scans in which a sensor is measured."""
 _OTHER_CLOCK_NS = 10**9
@@ -152,7 +152,7 @@ class Hearing:
         self._looked_s = time.monotonic()
 
     def _subscribed(self, topic: SentTopic) -> Subscription:
-        return self.network.subscribe(topic.topic, topic.kind, reliable=topic.reliable)
+        return self.network.subscribe(topic.topic, topic.kind, reliable=topic.reliable, depth=_DEPTH)
 
     @property
     def lost(self) -> int:
@@ -209,7 +209,7 @@ class Hearing:
                 log.warning("%s is now sent %s", topic.topic, "reliably" if reliable else "with best effort")
                 self._lost += self._points[k].lost
                 self._points[k].close()
-                self._points[k] = self.network.subscribe(topic.topic, topic.kind, reliable=reliable)
+                self._points[k] = self.network.subscribe(topic.topic, topic.kind, reliable=reliable, depth=_DEPTH)
 
     def T_base_lidar(self) -> F64 | None:
         """(4, 4) the first LiDAR on what odometry tracks, by /tf_static; the identity if both are one frame, or nobody
