@@ -8,11 +8,10 @@ import numpy as np
 
 from mapvote.core.point_map import PointMap
 from mapvote.core.types import F64, Drive, MapvoteError, Scan
-from mapvote.doctor.cheap import cheap_checks
 from mapvote.doctor.finding import Finding, in_order
-from mapvote.doctor.looks import Looking
-from mapvote.doctor.on_map import check_on_map
+from mapvote.doctor.map_fit import check_on_map
 from mapvote.doctor.prior import NO_PRIOR
+from mapvote.doctor.scans import Looking, cheap_checks
 from mapvote.vehicle import Vehicle
 
 _SECONDS_NS = 10 * 10**9
