@@ -80,7 +80,6 @@ def of_change(browser: Chromium, url: str) -> None:
     browser.open(url)
     browser.wait(LISTED, 90)
     browser.run("document.querySelector('#changes button').click()")
-    browser.wait("document.querySelector('#details figure img')?.naturalWidth > 0", 30)
     settled(browser)
 
 

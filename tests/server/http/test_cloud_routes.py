@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import io
 import re
 import struct
 from collections.abc import Iterator
@@ -14,7 +13,6 @@ import numpy as np
 import pytest
 from fastapi.testclient import TestClient
 from msgspec.structs import replace
-from PIL import Image
 
 from hand_made import Say, make_ballot, make_map, states_plane, two_walls
 from mapvote.codec.ballot import encode
@@ -182,21 +180,3 @@ def test_the_page_has_its_files_and_nobody_reaches_others(client: TestClient) ->
     )
     for name in ("../app.py", "..%2fapp.py", "vendor/../../app.py", "/etc/passwd", "vendor/LICENSE", "vendor"):
         assert client.get(f"/viewer/{name}").status_code == 404, name
-
-
-def test_a_place_before_and_after_is_a_picture_of_both(client: TestClient) -> None:
-    box = {"from": 1, "to": 2, "x0": 3.0, "y0": 3.0, "x1": 3.9, "y1": 3.3}
-    answer = client.get("/v1/pictures", params=box)
-    assert answer.headers["content-type"] == "image/png", answer.text
-    before, after = np.split(np.asarray(Image.open(io.BytesIO(answer.content))).astype(int), [304], axis=1)
-    assert blue(before) > 20, "crosses on the wall that went"
-    assert blue(after) == 0
-    back = np.asarray(Image.open(io.BytesIO(client.get("/v1/pictures", params=box | {"from": 2, "to": 1}).content)))
-    assert blue(back.astype(int)) == 0, "seen the other way round the wall came: red"
-    assert client.get("/v1/pictures", params=box | {"to": 9}).status_code == 404
-    assert client.get("/v1/pictures", params=box | {"x1": 2.0}).status_code == 422
-    assert client.get("/v1/pictures", params=box | {"x1": "nan"}).status_code == 422
-
-
-def blue(image: np.ndarray) -> int:
-    return int((image[..., 2] > image[..., 0] + 60).sum())

@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from threading import Event
 from time import sleep
 from typing import Any
 
-import numpy as np
 import pytest
 from fastapi.testclient import TestClient
-from PIL import Image
 
 from hand_made import Say, make_ballot, states_plane, two_walls
 from mapvote.codec.ballot import encode
@@ -21,8 +18,10 @@ from mapvote.core.types import CellState
 from mapvote.server.http.app import create_app
 from mapvote.server.store import keys
 from mapvote.server.store.admission import accept, examine
+from mapvote.server.store.planes import TileHashes
 from mapvote.server.store.round import round_at
 from mapvote.server.store.store import Store
+from mapvote.server.views.point_lod import Clouds
 
 WALL = [(10, 10), (10, 11), (10, 12)]
 Server = tuple[TestClient, Store, dict[str, dict[str, str]]]
@@ -139,18 +138,18 @@ def test_only_reviewers_and_operators_sit_at_the_desk(server: Server) -> None:
     assert client.get("/v1/desk").status_code == 401
 
 
-def test_a_pending_change_is_pictured_as_it_is_and_as_it_would_be(server: Server) -> None:
-    client, _, who = server
-    first, second = pending(server)
-    shown = client.get("/v1/desk/pictures", params={"change": first["id"]}, headers=who["anna"])
-    picture = np.asarray(Image.open(io.BytesIO(shown.content)).convert("RGB")).astype(int)
-    before, after = np.hsplit(picture, 2)
-    blue = [np.count_nonzero(half[..., 2] - half[..., 0] > 100) for half in (before, after)]
-    assert blue[0] > 20 > 5 > blue[1], "what goes is marked where it still stands"
-    assert client.get("/v1/desk/pictures?change=none", headers=who["anna"]).status_code == 404
-    assert client.get("/v1/desk/pictures", params={"change": first["id"]}, headers=who["v1"]).status_code == 403
-    assert decide(server, "anna", second["id"], "rejected").status_code == 200
-    assert client.get("/v1/desk/pictures", params={"change": second["id"]}, headers=who["anna"]).status_code == 404
+def test_a_pending_change_can_be_looked_at_in_3d_as_it_would_be(server: Server) -> None:
+    client, store, who = server
+    asked = client.get("/v1/desk/clouds", headers=who["anna"])
+    changed = Clouds(store)
+    now = client.get("/v1/desk", headers=who["anna"]).json()
+    (tile,) = [hashes for name, hashes in now["tiles"].items() if name == "0,0"]
+    levels = [client.get(f"/v1/clouds/{tile['points']}/{tile['ground']}/{k}", headers=who["anna"]) for k in range(6)]
+    assert client.get("/v1/desk/clouds", headers=who["v1"]).status_code == 403
+    assert published(server)["version"] == 2
+    assert asked.content == changed.changed(1, 2), "what is shown is what is published"
+    held = changed.levels(TileHashes(tile["points"], tile["ground"], None))
+    assert [answer.content for answer in levels] == [held.part(k) for k in range(6)]
 
 
 def test_a_hostile_comment_is_kept_as_text(server: Server) -> None:

@@ -33,6 +33,12 @@ from mapvote.server.views.history import changes_between, cutouts_between
 HOUSE = [(r, c) for r in range(40, 60) for c in range(40, 70) if r in (40, 59) or c in (40, 69)]
 SHED = [(r, c) for r in range(150, 160) for c in range(150, 160) if r in (150, 159) or c in (150, 159)]
 HEIGHTS = [0.45, 1.05, 1.65, 2.55, 3.15, 4.35]
+PIXELS = """(wanted => { const c = document.querySelector('#cloud'), p = document.createElement('canvas');
+    p.width = c.width; p.height = c.height; const g = p.getContext('2d'); g.drawImage(c, 0, 0);
+    const d = g.getImageData(0, 0, p.width, p.height).data, rgb = parseInt(wanted.slice(1), 16); let n = 0;
+    for (let i = 0; i < d.length; i += 4) n += (d[i] << 16 | d[i + 1] << 8 | d[i + 2]) === rgb;
+    return n; })"""
+"""A function: how many pixels of the cloud have one colour."""
 AXE = Path(__file__).parents[2] / "vendor" / "axe.min.js"
 
 
@@ -112,11 +118,6 @@ def test_the_cloud_is_drawn_and_nobody_else_is_asked(browser: Chromium, store: P
             for (let i = 0; i < d.length; i += 4) seen.add(d[i] << 16 | d[i + 1] << 8 | d[i + 2]);
             return seen.size; })()"""
         browser.wait(f"{colours} > 20")
-        pixels = """(wanted => { const c = document.querySelector('#cloud'), p = document.createElement('canvas');
-            p.width = c.width; p.height = c.height; const g = p.getContext('2d'); g.drawImage(c, 0, 0);
-            const d = g.getImageData(0, 0, p.width, p.height).data, rgb = parseInt(wanted.slice(1), 16); let n = 0;
-            for (let i = 0; i < d.length; i += 4) n += (d[i] << 16 | d[i + 1] << 8 | d[i + 2]) === rgb;
-            return n; })"""
         press(browser, "2")
         assert browser.run("!document.querySelector('#map').hidden && document.querySelector('#cloud').hidden")
         press(browser, "3")
@@ -126,7 +127,7 @@ def test_the_cloud_is_drawn_and_nobody_else_is_asked(browser: Chromium, store: P
         for colour in ("intensity", "plain", "age", "votes", "probability", "state", "height"):
             browser.run(f"(s => (s.value = '{colour}', s.onchange()))(document.querySelector('#colour'))")
             if colour == "intensity":
-                browser.wait(f"{pixels}('#31446b') > 50")  # the ground is dark, and drawn in the ramp's first colour
+                browser.wait(f"{PIXELS}('#31446b') > 50")  # the ground is dark, and drawn in the ramp's first colour
             if colour == "state":
                 browser.wait("location.hash.includes('vehicle=v1')")
         for low, told in (("3", "above 3.0 m"), ("-2", "all heights")):
@@ -139,10 +140,10 @@ def test_the_cloud_is_drawn_and_nobody_else_is_asked(browser: Chromium, store: P
             browser.wait(f"document.querySelector('#measured-text').innerText !== {told!r}")
         assert " m (level " in text(browser, "#measured-text")
         enter(browser, "document.querySelector('#measure')")
-        before = browser.run(f"{pixels}('#c26a00')")
+        before = browser.run(f"{PIXELS}('#c26a00')")
         browser.run("document.querySelector('#paths').click()")
         browser.wait("document.querySelector('#paths-text').innerText === '4 drives, 0.3 km'")
-        browser.wait(f"{pixels}('#c26a00') > {before} + 50")
+        browser.wait(f"{PIXELS}('#c26a00') > {before} + 50")
         browser.wait("location.hash.includes('paths=1')")
         browser.run("document.querySelector('#changes button').click()")
         browser.wait("location.hash.includes('change=demolished.v2')")
@@ -167,8 +168,12 @@ def test_the_desk_is_worked_by_keyboard_and_publishing_obeys(
     with serving(database_url, "--open", log=tmp_path / "log") as (url, _):
         ready(browser, url)
         enter(browser, "document.querySelector('#pending button')")
-        browser.wait("document.querySelector('#pending-picture img')?.naturalWidth === 608")
-        assert text(browser, "#labels").startswith("waits: ×")
+        assert text(browser, "#labels").startswith("pending: ×")
+        marked = f"{PIXELS}('#2f62c4')"
+        browser.wait(f"{marked} > 100")  # the points that would go are blue crosses
+        browser.wait("document.querySelectorAll('#pending-sides button').length === 3")
+        enter(browser, "document.querySelector('#pending-sides button')")
+        browser.wait("document.querySelector('#which').innerText === 'before'")
         browser.wait("location.hash.includes('pending=demolished.')")
         press(browser, "r")
         browser.wait("document.querySelector('#pending').innerText.includes('rejected by operator')")
@@ -187,8 +192,8 @@ def test_the_desk_is_worked_by_keyboard_and_publishing_obeys(
         browser.wait("document.activeElement.className === 'yes'")
         press(browser, "Enter")
         browser.wait("document.querySelector('#which-map').innerText.endsWith('version 4')")
-        # a picture asked for while its change is published may be gone by then; the page shows none
-        assert [said for said in browser.errors if "404" not in said or "/desk/pictures?" not in said] == []
+        # a level of a tile asked for while it is published may be proposed no more
+        assert [said for said in browser.errors if "404" not in said or "/v1/clouds/" not in said] == []
 
 
 @contextmanager

@@ -23,7 +23,7 @@ from mapvote.server.store.ballots import Receipt, withdraw
 from mapvote.server.store.policy import Policy
 from mapvote.server.store.publish import preview, publish
 from mapvote.server.store.store import Store
-from mapvote.server.views.desk import desk, pending_picture, review
+from mapvote.server.views.desk import desk, review
 from standing_clock import Clock
 
 MOST_STATEMENTS = 20
@@ -104,7 +104,7 @@ def test_a_click_with_nothing_new_fuses_nothing_on_64_tiles_with_200_ballots(
     assert counted.of(lambda: desk(store))[0] == 64
     ids = [feature["id"] for feature in desk(store).pending["features"]]
     assert len(ids) == 128
-    for click in (lambda: desk(store), lambda: preview(store), lambda: pending_picture(store, ids[7])):
+    for click in (lambda: desk(store), lambda: preview(store)):
         fused, statements = counted.of(click)
         assert (fused, statements <= MOST_STATEMENTS) == (0, True), statements
     fused, statements = counted.of(lambda: review(store, ids[7], "accepted", by="anna"))

@@ -7,26 +7,23 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Path, Query, Request, Response
 
 from mapvote.codec.arrays import compress
-from mapvote.core.types import MapvoteError
 from mapvote.server.http.auth import reviewer
 from mapvote.server.http.schemas import AS_CSV, From, Places, To, VersionQuery, as_json, as_table, problems
 from mapvote.server.http.services import services
 from mapvote.server.store.planes import TileHashes
-from mapvote.server.views.history import picture_between
 from mapvote.server.views.paths import paths
 from mapvote.server.views.point_lod import N_LEVELS, evidence
 
-_BYTES: dict[int | str, dict[str, Any]] = {200: {"content": {"application/octet-stream": {}}}}
+AS_BYTES: dict[int | str, dict[str, Any]] = {200: {"content": {"application/octet-stream": {}}}}
 _FOR_EVER = "private, max-age=31536000, immutable"
 Digest = Annotated[str, Path(pattern=r"^[0-9a-f]{64}$")]
 _Index = Annotated[int, Path(ge=-(1 << 22), le=1 << 22)]
-_Metres = Annotated[float, Query(ge=-1e8, le=1e8, allow_inf_nan=False)]
 router = APIRouter()
 
 
 @router.get(
     "/v1/clouds/overview",
-    responses=problems(404) | _BYTES,
+    responses=problems(404) | AS_BYTES,
     response_class=Response,
     summary="A whole version, coarse",
 )
@@ -34,23 +31,23 @@ def overview(request: Request, version: VersionQuery | None = None) -> Response:
     """All tiles in as many levels of detail as 150,000 points allow; the layout is in docs/viewer.md."""
     parts = services(request)
     number = parts.store.current() if version is None else version
-    return _packed(request, parts.clouds.overview(number), "private, no-cache")
+    return packed(request, parts.clouds.overview(number), "private, no-cache")
 
 
 @router.get(
     "/v1/clouds/changed",
-    responses=problems(404) | _BYTES,
+    responses=problems(404) | AS_BYTES,
     response_class=Response,
     summary="What came and went between two versions",
 )
 def changed(request: Request, old: From, new: To) -> Response:
     """Tile by tile, two clouds each; the layout is in docs/viewer.md."""
-    return _packed(request, services(request).clouds.changed(old, new), _FOR_EVER)
+    return packed(request, services(request).clouds.changed(old, new), _FOR_EVER)
 
 
 @router.get(
     "/v1/clouds/{points}/{ground}/{level}",
-    responses=problems(404) | _BYTES,
+    responses=problems(404) | AS_BYTES,
     response_class=Response,
     summary="One level of detail of a tile",
 )
@@ -64,35 +61,12 @@ def level_of(
     """Immutable. Levels add to one another: every point is in exactly one of the six. With the hash of the tile's
     ``fields`` the intensity of each point follows, a byte, if there is one."""
     hashes = TileHashes(points, ground, None, fields=fields)
-    return _packed(request, services(request).clouds.levels(hashes).part(level), _FOR_EVER)
-
-
-@router.get(
-    "/v1/pictures",
-    responses=problems(404) | {200: {"content": {"image/png": {}}}},
-    response_class=Response,
-    summary="A place before and after",
-)
-def picture(
-    request: Request,
-    old: From,
-    new: To,
-    x0: _Metres,
-    y0: _Metres,
-    x1: _Metres,
-    y1: _Metres,
-) -> Response:
-    """PNG of two versions side by side, in and around a box in map metres: what went are blue crosses, what came red
-    diamonds. At most 76.8 m from 10 m below its lower-left corner are shown."""
-    if not (x0 <= x1 and y0 <= y1):
-        raise MapvoteError("a box has x0 <= x1 and y0 <= y1, map metres")
-    data = picture_between(services(request).store, old, new, (x0, y0, x1, y1))
-    return Response(data, media_type="image/png", headers={"Cache-Control": _FOR_EVER})
+    return packed(request, services(request).clouds.levels(hashes).part(level), _FOR_EVER)
 
 
 @router.get(
     "/v1/evidence/{row}/{col}",
-    responses=problems(403) | _BYTES,
+    responses=problems(403) | AS_BYTES,
     response_class=Response,
     summary="Votes cell by cell",
 )
@@ -104,7 +78,7 @@ def evidence_of(request: Request, row: _Index, col: _Index, vehicle: str | None 
     if vehicle is not None:
         reviewer(request)
     plane = evidence(services(request).store, (row, col), vehicle)
-    return _packed(request, plane.tobytes(), "private, no-cache")
+    return packed(request, plane.tobytes(), "private, no-cache")
 
 
 @router.get(
@@ -118,7 +92,8 @@ def driven(request: Request, vehicle: str | None = None, format: Places = "json"
     return as_table([feature["properties"] for feature in found["features"]]) if format == "csv" else as_json(found)
 
 
-def _packed(request: Request, data: bytes, cache: str) -> Response:
+def packed(request: Request, data: bytes, cache: str) -> Response:
+    """Bytes, compressed where the client takes it."""
     headers = {"Cache-Control": cache, "Vary": "Accept-Encoding"}
     if "zstd" in request.headers.get("accept-encoding", ""):
         data, headers["Content-Encoding"] = compress(data, 1), "zstd"

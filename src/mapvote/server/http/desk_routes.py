@@ -7,14 +7,18 @@ from functools import partial
 from typing import Annotated, Any, Literal
 
 from anyio import to_thread
-from fastapi import APIRouter, Path, Query, Request, Response
+from fastapi import APIRouter, Path, Request, Response
 from pydantic import BaseModel, ConfigDict, Field
 
+from mapvote.codec.ballot import tile_key
+from mapvote.core.tile import Tile
 from mapvote.server.http.auth import reviewer
+from mapvote.server.http.cloud_routes import AS_BYTES, packed
 from mapvote.server.http.schemas import AS_CSV, PLAIN, Places, as_json, as_table, problems
 from mapvote.server.http.services import services
+from mapvote.server.store.planes import TileHashes
 from mapvote.server.store.reviews import undo
-from mapvote.server.views.desk import desk, pending_picture, review, verdict_of
+from mapvote.server.views.desk import Desk, desk, review, verdict_of
 from mapvote.server.views.geojson import feature_rows
 
 router = APIRouter()
@@ -38,35 +42,45 @@ class ReviewAsk(BaseModel):
 )
 async def whole_desk(request: Request, format: Places = "json") -> Response:
     """Pending changes as GeoJSON, with the verdicts so far; deletions that wait for somebody to drive by, beyond the
-    policy's budget; what was held and rejected; why the policy would hold.
+    policy's budget; what was held and rejected; why the policy would hold; the hashes of the tiles that a publish would
+    make (null: no tile any more), which `/v1/clouds` serves meanwhile.
 
     As ``geojson`` or ``csv``: all of them in one list.
     """
-    reviewer(request)
-    parts = services(request)
-    look = partial(desk, parts.store, parts.fusing, parts.gate)
-    found = await to_thread.run_sync(look, limiter=parts.threads.deciding)
+    found = await _look(request)
     left_out = [verdict_of(one) for one in found.reviewed]
     if format == "json":
         told = {"version": found.version, "held": found.held, "pending": found.pending}
-        return as_json(told | {"waiting": found.waiting, "reviewed": left_out})
+        tiles = {tile_key(index): _hashes(*made) for index, made in found.edited.items()}
+        return as_json(told | {"waiting": found.waiting, "reviewed": left_out, "tiles": tiles})
     listed = found.pending | {"features": [*found.pending["features"], *found.waiting, *left_out]}
     return as_json(listed) if format == "geojson" else as_table([_flat(row) for row in feature_rows(listed)])
 
 
 @router.get(
-    "/v1/desk/pictures",
-    responses=problems(403, 404) | {200: {"content": {"image/png": {}}}},
+    "/v1/desk/clouds",
+    responses=problems(403) | AS_BYTES,
     response_class=Response,
-    summary="A pending change before and after",
+    summary="Points that a publish would add and delete",
 )
-async def pending(request: Request, change: Annotated[str, Query(max_length=100)]) -> Response:
-    """PNG as `/v1/pictures` gives it, of the newest version and of what a publish would make of it now."""
+async def pending_clouds(request: Request) -> Response:
+    """Tile by tile, two clouds each, as `/v1/clouds/changed` gives them."""
+    found = await _look(request)
+    return packed(request, found.clouds, "no-store")
+
+
+def _hashes(hashes: TileHashes, tile: Tile) -> dict[str, str] | None:
+    return {"points": hashes.points, "ground": hashes.ground} if len(tile.points) else None
+
+
+async def _look(request: Request) -> Desk:
+    """The desk as it is now; the clouds know the tiles that a publish would make."""
     reviewer(request)
     parts = services(request)
-    look = partial(pending_picture, parts.store, change, parts.fusing)
-    data = await to_thread.run_sync(look, limiter=parts.threads.deciding)
-    return Response(data, media_type="image/png", headers={"Cache-Control": "no-store"})
+    look = partial(desk, parts.store, parts.fusing, parts.gate)
+    found = await to_thread.run_sync(look, limiter=parts.threads.deciding)
+    parts.clouds.propose(found.edited.values())
+    return found
 
 
 def _flat(row: Mapping[str, Any]) -> dict[str, Any]:

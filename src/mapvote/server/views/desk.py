@@ -20,15 +20,14 @@ from mapvote.fusion.pending import Pending
 from mapvote.server.errors import NotFound
 from mapvote.server.store.decisions import Record
 from mapvote.server.store.fusion_jobs import Fused
+from mapvote.server.store.planes import TileHashes
 from mapvote.server.store.queries import load_tile, tile_of
 from mapvote.server.store.reviews import Review, Verdict, decide, standing
 from mapvote.server.store.round import Gate, Round, edited_tile, reasons_to_hold, round_at
 from mapvote.server.store.store import Store
 from mapvote.server.views.change_objects import ChangeObject, Decided, change_objects, changed_cells
-from mapvote.server.views.cutout import cut_out
 from mapvote.server.views.geojson import to_geojson
-from mapvote.server.views.history import tiles_at
-from mapvote.server.views.picture import before_and_after
+from mapvote.server.views.point_lod import came_and_went
 
 _OF_REVIEW = "verdict."
 _lock = Lock()
@@ -50,8 +49,10 @@ class Desk:
     """Held and rejected changes, which a publish leaves out."""
     cells: Mapping[str, Mapping[TileIndex, Bool]]
     """Of every change by its id."""
-    edited: Mapping[TileIndex, Tile]
+    edited: Mapping[TileIndex, tuple[TileHashes, Tile]]
     """Tiles as a publish would make them."""
+    clouds: bytes
+    """Points that would come and go, as :meth:`mapvote.server.views.point_lod.Clouds.changed` gives them."""
 
 
 _desks: WeakKeyDictionary[Round, Desk] = WeakKeyDictionary()
@@ -82,29 +83,17 @@ def _desk_of(store: Store, found: Round) -> Desk:
         feature["properties"]["verdict"] = next((_told(r) for r, theirs in reviews if _meet(mine, theirs)), None)
     cells |= {f"{_OF_REVIEW}{review.seq}": theirs for review, theirs in reviews}
     left_out = [review for review, _ in reviews if review.verdict != "accepted"]
-    edited = {new.index: new for _, new in tiles}
+    edited = {
+        new.index: (fused.hashes, new) for fused, (_, new) in zip(found.changed, tiles, strict=True) if fused.hashes
+    }
+    clouds = b"".join(came_and_went(old, new) for old, new in tiles)
     waiting = waiting_features(store, version, [*found.decided.values(), *found.beside.values()], budget)
-    return Desk(version, [], pending, waiting, left_out, cells, edited)
+    return Desk(version, [], pending, waiting, left_out, cells, edited, clouds)
 
 
 def _decided(fused: Fused) -> Decided:
     record = Record(0, fused.states, fused.tally, fused.odds, fused.standings)
     return Decided(0, record.states, record.tally, odds=record.odds)
-
-
-def pending_picture(store: Store, change: str, executor: Executor | None = None) -> bytes:
-    """PNG of the place of a pending change, as it is and as a publish would make it, side by side.
-
-    NotFound if no such change is pending any more.
-    """
-    now = desk(store, executor)
-    feature = next((f for f in now.pending["features"] if f["id"] == change), None)
-    if feature is None:
-        raise NotFound(f"no change {change[:80]!r} is pending any more: look again")
-    low, high = feature["properties"]["box"]
-    before = tiles_at(store, now.version)
-    after = lambda index: now.edited[index] if index in now.edited else before(index)  # noqa: E731
-    return before_and_after(cut_out("", "", (*low, *high), 0.0, (before, after), store.lattice))
 
 
 def review(

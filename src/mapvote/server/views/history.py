@@ -31,10 +31,9 @@ from mapvote.server.store.votes import (
 )
 from mapvote.server.views.change_objects import Decided, change_objects, changed_cells
 from mapvote.server.views.consensus import Compared, Spoken, VehicleStanding, compare, standings_of
-from mapvote.server.views.cutout import Box, Cutout, Tiles, cut_out, of_feature, whole_page
+from mapvote.server.views.cutout import Cutout, Tiles, of_feature, whole_page
 from mapvote.server.views.explain import said_by, sound_votes
 from mapvote.server.views.geojson import to_geojson
-from mapvote.server.views.picture import before_and_after
 
 
 def seen(stamp_ns: int | None, known: bool) -> int | None:
@@ -89,15 +88,6 @@ def cutouts_between(store: Store, old: int, new: int, found: Mapping[str, Any], 
 def page_between(store: Store, old: int, new: int, found: Mapping[str, Any]) -> str:
     """HTML of :func:`cutouts_between`, a file that needs nothing else."""
     return whole_page(f"{found['map_id']}: version {old} to {new}", cutouts_between(store, old, new, found))
-
-
-def picture_between(store: Store, old: int, new: int, box: Box) -> bytes:
-    """PNG of what stands in and 10 m around a box (x0, y0, x1, y1), map metres, in two versions, side by side.
-
-    NotFound if one of the versions does not exist.
-    """
-    tiles = tiles_at(store, old), tiles_at(store, new)
-    return before_and_after(cut_out("", "", box, 0.0, tiles, store.lattice))
 
 
 def tiles_at(store: Store, version: int) -> Tiles:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import threading
 from collections import OrderedDict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
@@ -113,13 +113,6 @@ def cloud_bytes(packed: U16, z0_m: float, z_step_m: float) -> bytes:
     return head.tobytes() + np.ascontiguousarray(packed, dtype="<u2").tobytes()
 
 
-def unpack_cloud(data: bytes) -> F64:
-    """(n, 3) metres from the tile's corner, of what :func:`cloud_bytes` gave."""
-    _, n, z0, step = np.frombuffer(data, dtype=_BYTES, count=1)[0]
-    packed = np.frombuffer(data, dtype="<u2", offset=16).reshape(int(n), 4).astype(np.float64)
-    return packed[:, :3] * [SIDE_M / _STEPS, SIDE_M / _STEPS, float(step)] + [0.0, 0.0, float(z0)]
-
-
 @numba.njit(cache=True, nogil=True)
 def _levels(points: F32, low: float, sizes: F64, sides: I64, layers: I64) -> U8:
     """(n,) level of each point: the coarsest in whose voxel no point came before.
@@ -189,15 +182,22 @@ class Clouds:
         self._lock, self._making = threading.Lock(), threading.Lock()
         self._made: OrderedDict[TileHashes, Levels] = OrderedDict()
         self._overview: tuple[int, bytes] = 0, b""
+        self._proposed: Mapping[TileHashes, Tile] = {}
+
+    def propose(self, tiles: Iterable[tuple[TileHashes, Tile]]) -> None:
+        """Tiles that no version holds yet, as a publish would make them: :meth:`levels` knows them until the next
+        proposal."""
+        self._proposed = {_drawn(hashes): tile for hashes, tile in tiles}
 
     def levels(self, hashes: TileHashes) -> Levels:
-        """The levels of one tile; NotFound if no version ever held it."""
+        """The levels of one tile; NotFound if no version ever held it and none is proposed."""
         with self._lock:
             known = self._made.get(hashes)
             if known is not None:
                 self._made.move_to_end(hashes)
                 return known
-        (tile,) = self._load(hashes)
+        proposed = self._proposed.get(hashes)
+        (tile,) = self._load(hashes) if proposed is None else (proposed,)
         made = make_levels(tile.points, tile.ground_z, bright=self._bright(hashes, tile))
         with self._lock:
             if hashes not in self._made:
@@ -255,8 +255,7 @@ class Clouds:
     def _load(self, *states: TileHashes | None) -> list[Tile]:
         """Tiles, of which points and ground alone are read."""
         with self._store.database.reading() as connection:
-            drawn = [h and replace(h, free=None, memory=None, fields=None) for h in states]
-            return [load_tile(connection, _ANYWHERE, hashes) for hashes in drawn]
+            return [load_tile(connection, _ANYWHERE, hashes and _drawn(hashes)) for hashes in states]
 
     def _sound(self, *states: TileHashes | None) -> list[Tile]:
         """The same; none where one is damaged: who asks for the tile itself is told."""
@@ -276,17 +275,23 @@ class Clouds:
         """
         with self._store.database.reading() as connection:
             differ = tiles_that_differ(connection, old, new)
-        told = []
-        for index, *states in differ:
-            pair = self._sound(*states)
-            if not pair:
-                continue
-            before, after = pair
-            ground = (after if states[1] is not None else before).ground_z
-            gone, come = ~found_among(before.points, after.points), ~found_among(after.points, before.points)
-            told.append(np.array(index, dtype="<i4").tobytes())
-            told += [cloud_bytes(*pack(some, ground)) for some in (before.points[gone], after.points[come])]
-        return b"".join(told)
+        pairs = [self._sound(*states) for _, *states in differ]
+        placed = [(index, pair) for (index, *_), pair in zip(differ, pairs, strict=True) if pair]
+        return b"".join(came_and_went(before, after, index) for index, (before, after) in placed)
+
+
+def _drawn(hashes: TileHashes) -> TileHashes:
+    """Of points and ground alone."""
+    return replace(hashes, free=None, memory=None, fields=None)
+
+
+def came_and_went(before: Tile, after: Tile, index: TileIndex | None = None) -> bytes:
+    """What differs between two states of one tile, see :meth:`Clouds.changed`. ``index``: where the tile lies, if it
+    was loaded from anywhere."""
+    ground = (after if len(after.points) else before).ground_z
+    gone, come = ~found_among(before.points, after.points), ~found_among(after.points, before.points)
+    clouds = [cloud_bytes(*pack(some, ground)) for some in (before.points[gone], after.points[come])]
+    return b"".join([np.array(index or after.index, dtype="<i4").tobytes(), *clouds])
 
 
 def _overview_bytes(made: Sequence[tuple[TileIndex, Levels]]) -> bytes:

@@ -49,13 +49,8 @@ export const cloudPart = async ({ points, ground, fields }, level) =>
 export const evidence = async (tile, vehicle) => (await ask(`evidence/${tile.replace(",", "/")}`, vehicle ? { vehicle } : {})).arrayBuffer();
 export const paths = async (vehicle) => (await ask("paths", vehicle ? { vehicle } : {})).json();
 export const versionMap = async (number) => (await ask(`map/versions/${number}`)).json();
-
 export const cloudsChanged = async (from, to) => (await ask("clouds/changed", { from, to })).arrayBuffer();
-
-// A place before and after, as an address that an <img> can show: the key travels with a request, not with a link.
-export const picture = async (asked) => URL.createObjectURL(await (await ask("pictures", asked)).blob());
-
-export const pendingPicture = async (change) => URL.createObjectURL(await (await ask("desk/pictures", { change })).blob());
+export const cloudsPending = async () => (await ask("desk/clouds")).arrayBuffer();
 
 // A list as a file: fetched with the key, which a link cannot carry, and handed to the browser.
 export async function download(path, parameters, name) {
@@ -73,7 +68,28 @@ export const publish = (asked) => send("publish", "POST", asked);
 export const publishing = async () => (await (await ask("publish")).json()).running;
 export const cancelPublish = () => send("publish", "DELETE", undefined);
 export const rollback = (asked) => send("rollback", "POST", asked);
-export const stream = async (signal) => (await ask("events", {}, { signal })).body;
+
+// Events as they happen, until the connection ends; before the first one null, once the server answers.
+export async function* events() {
+  const reader = (await ask("events")).body.pipeThrough(new TextDecoderStream()).getReader();
+  yield null;
+  for (let text = ""; ; ) {
+    const { value, done } = await reader.read();
+    if (done) return;
+    const pieces = (text + value).split("\n\n");
+    text = pieces.pop();
+    yield* pieces.map(parsed).filter(Boolean);
+  }
+}
+
+function parsed(piece) {
+  const data = piece.split("\n").filter((line) => line.startsWith("data:")).map((line) => line.slice(5)).join("\n");
+  try {
+    return data ? JSON.parse(data) : null;
+  } catch {
+    return null;
+  }
+}
 
 export const cell = async (x, y) => (await ask("cells", { x: x.toFixed(3), y: y.toFixed(3) })).json();
 

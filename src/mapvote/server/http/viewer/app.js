@@ -3,15 +3,13 @@
 import * as api from "./api.js";
 import { showTiles } from "./coverage.js";
 import { closeDetails, follow, showCell, showChange } from "./details.js";
-import { $, element, link, notice, when } from "./dom.js";
 import { confirm, goBack, showDesk } from "./desk.js";
 import { showList } from "./list.js";
-import * as address from "./link.js";
-import { state } from "./page.js";
 import { Stage } from "./stage.js";
 import { listen } from "./live.js";
 import { showVehicles } from "./vehicles.js";
 import { TILE } from "./view.js";
+import { $, address, element, link, notice, state, when } from "./page.js";
 
 let queue = Promise.resolve();
 const asked = new Set();  // hashes on their way
@@ -184,19 +182,25 @@ async function showRange(mine = askRange()) {
   await shown;
 }
 
-// The two versions in 3D: the newer one, what came and went, and the older one if it is to be compared.
+// Two states of the map in 3D: the newer one, what came and went, and the older one if it is to be compared. They are
+// the two versions of the range or, while a pending change is looked at, the newest version and what a publish would make.
 async function showClouds(mine = range) {
-  const { version, tiles, lattice } = state.manifest;
+  const { version, tiles, lattice } = state.manifest, { pending } = state;
   const of = async (number) => (Number(number) === version ? tiles : (await api.versionMap(number)).tiles);
+  const [before, after] = pending ? [async () => tiles, async () => withTiles(tiles, pending.tiles)] : [() => of(mine.from), () => of(mine.to)];
   try {
-    const [older, newer, changed] = await Promise.all([state.paired ? of(mine.from) : null, of(mine.to), mine.clouds]);
-    if (!view.cloud || range !== mine) return;
+    const [older, newer, changed] = await Promise.all([state.paired ? before() : null, after(), (pending ?? mine).clouds]);
+    if (!view.cloud || range !== mine || state.pending !== pending) return;
     view.stream.setTiles(lattice, newer, older);
     view.stream.changes(changed, lattice, state.paired);
   } catch (error) {
     notice(error.message);
   }
 }
+
+state.showClouds = () => range && showClouds();
+
+const withTiles = (tiles, made) => Object.fromEntries(Object.entries({ ...tiles, ...made }).filter(([, hashes]) => hashes));
 
 const nothing = (from, to) =>
   state.versions.length < 2

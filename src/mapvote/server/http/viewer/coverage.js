@@ -1,8 +1,7 @@
 // Which tiles there are, and when and by how many vehicles they were seen.
 
-import { $, element, notice } from "./dom.js";
-import { state } from "./page.js";
 import { TILE } from "./view.js";
+import { $, element, notice, state } from "./page.js";
 
 const DAY = 86400e3;
 const SHADES = {

@@ -1,10 +1,8 @@
 // The desk: what a publish would change now, judged one by one; publishing and going back, the difference shown first.
 
 import * as api from "./api.js";
-import { beforeAndAfter, drawable } from "./details.js";
-import { $, dot, element, notice } from "./dom.js";
-import * as address from "./link.js";
-import { state } from "./page.js";
+import { drawable, sides } from "./details.js";
+import { $, address, dot, element, notice, state } from "./page.js";
 
 const SAID = { accepted: "accepted", held: "held", rejected: "rejected" };
 const KEYS = { a: "accepted", h: "held", r: "rejected" };
@@ -70,18 +68,27 @@ const left = (f) => {
 };
 
 function choose(feature, visit = false) {
-  const before = chosen?.id;
   chosen = feature;
   address.write({ pending: feature?.id ?? null });
   state.view.setPending(feature && drawable(feature));
+  inClouds(feature);
   for (const button of $("pending").querySelectorAll("button")) button.setAttribute("aria-current", String(button.dataset.change === feature?.id));
   $("verdict-form").hidden = !feature;
   if (!feature) return;
   const v = feature.properties.verdict, shown = drawable(feature);
   $("verdict-told").textContent = v ? `${v.by} has ${SAID[v.verdict]} it${v.comment ? `: \u201c${v.comment}\u201d` : "."}` : "Nobody has decided about it yet.";
   $("undo").disabled = !v;
-  if (feature.id !== before || visit) $("pending-picture").replaceChildren(feature.id.startsWith(REVIEW) ? "" : beforeAndAfter(feature.properties.kind, api.pendingPicture(feature.id)));
   if (visit) state.view.fit(shown.box, 0.38, { elevation: 0.5, height: shown.height });
+}
+
+// In 3D as a publish would make the map, as long as one of its changes is looked at.
+function inClouds(feature) {
+  const would = Boolean(feature && !feature.id.startsWith(REVIEW) && state.view.cloud);
+  $("pending-sides").replaceChildren(...(would ? [sides()] : []));
+  if (!would && !state.pending) return;
+  if (would) desk.clouds ??= api.cloudsPending();
+  state.pending = would ? desk : null;
+  state.showClouds?.();
 }
 
 async function decide(verdict) {

@@ -1,9 +1,7 @@
 // One change, or one cell and the votes behind it.
 
 import * as api from "./api.js";
-import { $, dot, element, facts, link, number, when } from "./dom.js";
-import * as address from "./link.js";
-import { state } from "./page.js";
+import { $, address, dot, element, facts, link, number, state, when } from "./page.js";
 
 const STATES = {
   unchanged_occupied: "unchanged, occupied",
@@ -49,27 +47,17 @@ export function showChange(id) {
       [p.versions.length > 1 ? "versions" : "version", p.versions.join(", ") || "unknown"],
     ]),
     p.near?.length > 0 && element("p", { className: "hint" }, ["near it: ", ...p.near.map((other) => near(other))]),
-    p.box && beforeAndAfter(p.kind, api.picture(pictured(p.box))),
+    sides(),
     link("Who voted here?", () => showCell([x + 0.15, y + 0.15])),
   ]);
 }
 
-// The server's picture; it comes when it comes, and a change without one is told all the same.
-export function beforeAndAfter(kind, picture) {
-  const figure = element("figure", { hidden: true }, []);
-  picture.then((src) => {
-    const alt = `Before and after: ${kind === "built" ? "what came are red diamonds" : "what went are blue crosses"}`;
-    const image = element("img", { src, alt, width: 608, height: 260 }, []);
-    const large = element("button", { type: "button", title: "Larger, or small again", ariaExpanded: "false" }, [image]);
-    large.onclick = () => (large.ariaExpanded = String(large.ariaExpanded !== "true"));
-    const sides = ["before", "after"].map((side) => element("span", {}, [side]));
-    figure.replaceChildren(large, element("figcaption", {}, sides));
-    figure.hidden = false;
-  }, () => null);
-  return figure;
+// Before and after in 3D, beside the change that they are about.
+export function sides() {
+  if (!state.view.cloud) return false;
+  const side = ([name, text]) => element("button", { type: "button", onclick: () => state.view.compare(name) }, [text]);
+  return element("p", { className: "row sides" }, [["before", "Before"], ["after", "After"], ["swipe", "Swipe"]].map(side));
 }
-
-const pictured = ([[x0, y0], [x1, y1]]) => ({ from: $("from").value, to: $("to").value, x0, y0, x1, y1 });
 
 function near(id) {
   const feature = state.features.find((f) => f.id === id);
@@ -99,7 +87,9 @@ export async function showCell([x, y]) {
       element("div", {}, [CHANGE[v.state] && dot(CHANGE[v.state]), STATES[v.state] ?? v.state, sure(v)]),
       v.marks > 0 && v.state === "unchanged_occupied"
         && element("div", {}, [`but ${v.marks} of its voxels ${v.marks > 1 ? "are" : "is"} gone`]),
-      !v.counts && element("div", { className: "why" }, [`does not count: ${v.why || "no reason given"}`]),
+      v.counted_in?.length > 0 && element("div", { className: "why" }, [`counted in ${versions(v.counted_in)}`]),
+      ...(v.left_out_of ?? []).slice(-2).map(({ version, why }) => element("div", { className: "why" }, [`not counted in version ${version}: it ${why}`])),
+      !v.counts && element("div", { className: "why" }, [`does not count now: ${v.why || "no reason given"}`]),
     ]);
   const decided = answer.decisions.map((d) => `Version ${d.version} decided: ${STATES[d.state] ?? d.state}.`);
   if (answer.thing?.startsWith("pending:")) decided.push(`${answer.thing}.`);
@@ -110,6 +100,8 @@ export async function showCell([x, y]) {
       : element("p", { className: "hint" }, ["No vehicle has voted on this cell."]),
   ]);
 }
+
+const versions = (numbers) => `version${numbers.length > 1 ? "s" : ""} ${numbers.join(", ")}`;
 
 // What a vehicle says of its own evidence, if it does.
 const sure = (vote) => (Number.isFinite(vote.sure) ? `, ${Math.round(100 * vote.sure)} % sure` : "");

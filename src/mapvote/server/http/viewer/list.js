@@ -2,9 +2,7 @@
 
 import * as api from "./api.js";
 import { drawable, showChange, visit } from "./details.js";
-import { $, dot, element } from "./dom.js";
-import * as address from "./link.js";
-import { state } from "./page.js";
+import { $, address, dot, element, state } from "./page.js";
 
 const FOLDS = { vehicle: ["vehicles-maybe", (n) => `${n} that could be ${n > 1 ? "vehicles" : "a vehicle"}`], small: ["small", (n) => `${n} smaller than 1 m\u00b2`] };
 

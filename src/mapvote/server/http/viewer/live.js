@@ -2,8 +2,7 @@
 
 import * as api from "./api.js";
 import { showDesk } from "./desk.js";
-import { $ } from "./dom.js";
-import { state } from "./page.js";
+import { $, state } from "./page.js";
 
 const AGAIN_MS = [1000, 2000, 5000, 10_000];
 let listening = false;
@@ -13,30 +12,16 @@ export async function listen() {
   listening = true;
   for (let failed = 0; ; failed++) {
     try {
-      const reader = (await api.stream()).pipeThrough(new TextDecoderStream()).getReader();
-      $("offline").hidden = true;
-      failed = 0;
-      for (let text = ""; ; ) {
-        const { value, done } = await reader.read();
-        if (done) break;
-        const pieces = (text + value).split("\n\n");
-        text = pieces.pop();
-        pieces.map(read).filter(Boolean).forEach(happened);
+      for await (const event of api.events()) {
+        $("offline").hidden = true;
+        failed = 0;
+        if (event) happened(event);
       }
     } catch (error) {
       if ([401, 403, 404].includes(error.status)) return void (listening = false);
     }
     $("offline").hidden = false;
     await new Promise((go) => setTimeout(go, AGAIN_MS[Math.min(failed, AGAIN_MS.length - 1)]));
-  }
-}
-
-function read(piece) {
-  const data = piece.split("\n").filter((line) => line.startsWith("data:")).map((line) => line.slice(5)).join("\n");
-  try {
-    return data ? JSON.parse(data) : null;
-  } catch {
-    return null;
   }
 }
 

@@ -1,8 +1,6 @@
 // The map, in 3D where the browser can and from above where it cannot or where one likes it: one face to the panels.
 
-import { $, notice } from "./dom.js";
-import { Labels } from "./labels.js";
-import * as link from "./link.js";
+import { $, address, notice } from "./page.js";
 import { View } from "./view.js";
 
 export class Stage {
@@ -22,7 +20,7 @@ export class Stage {
     this.stream = new Stream(this.cloud, this.api, { onLoaded: (s) => this.loaded(s), onError: (error) => notice(error.message) });
     $("to-3d").hidden = false;
     $("how").open = !matchMedia("(max-width: 760px)").matches;  // on a phone the cloud comes first
-    this.show(link.read().view === "2d" ? "flat" : "deep");
+    this.show(address.read().view === "2d" ? "flat" : "deep");
     const buffer = await overview;
     return buffer;
   }
@@ -54,7 +52,7 @@ export class Stage {
     $("to-3d").textContent = deep ? "2D" : "3D";
     $("to-3d").title = deep ? "From above (2)" : "In 3D (3)";
     document.body.classList.toggle("deep", deep);
-    link.write({ view: deep ? null : this.cloud ? "2d" : null });
+    address.write({ view: deep ? null : this.cloud ? "2d" : null });
     if (deep) {
       this.cloud.resize();
       this.stream?.plan();
@@ -119,6 +117,13 @@ export class Stage {
     return near?.ground ?? 0;
   }
 
+  // Of the two states of the map that are known: "before", "after", or both as "swipe".
+  compare(name) {
+    this.show("deep");
+    $("compare").value = name;
+    this.tools?.compare(name);
+  }
+
   zoom(factor) {
     this.mode === "deep" ? this.cloud.orbit.zoom(factor) : this.flat.zoom(factor);
   }
@@ -128,15 +133,14 @@ export class Stage {
     this.stream?.moved();
     this.placeLabels();
     this.tools?.place(this.cloud);
-    if (this.placed) link.write({ eye: this.cloud.orbit.state.map((v) => Number(v.toFixed(2))).join(",") });
+    if (this.placed) address.write({ eye: this.cloud.orbit.state.map((v) => Number(v.toFixed(2))).join(",") });
   }
 
   placeLabels() {
     if (this.mode === "deep" && this.cloud) this.labels.place(this.cloud, this.groundAt.bind(this));
   }
 
-  async picked(px) {
-    const { levelAt, pointAt } = await import("./pick.js");
+  picked(px) {
     const at = pointAt(this.cloud, px) ?? levelAt(this.cloud, px, this.cloud.orbit.target[2]);
     if (!at) return;
     if (this.tools?.take(at)) return;
@@ -150,7 +154,7 @@ export class Stage {
 }
 
 // Whether a place lies in one of a change's polygons: a ray to the east crosses its rings an odd number of times.
-function inside(change, [x, y]) {
+export function inside(change, [x, y]) {
   let odd = false;
   for (const polygon of change.polygons)
     for (const ring of polygon)
@@ -159,4 +163,79 @@ function inside(change, [x, y]) {
         if (y0 > y !== y1 > y && x < x0 + ((y - y0) / (y1 - y0)) * (x1 - x0)) odd = !odd;
       }
   return odd;
+}
+
+const REACH_PX = 8;
+
+// The nearest visible point to the eye within a few pixels of one: [x, y, z] in map metres, or null.
+export function pointAt(cloud, px) {
+  const { from, way } = cloud.ray(px), radius = REACH_PX / (cloud.shared.pixels.value / cloud.shared.ratio.value);
+  let best = null, nearest = Infinity;
+  for (const part of cloud.parts) {
+    if (!part.points.visible) continue;
+    const [ox, oy, oz] = [part.corner[0] - from[0], part.corner[1] - from[1], part.z0 - from[2]];
+    const step = 76.8 / 65535, p = part.packed, [low, high] = cloud.shared.slice.value.toArray();
+    for (let i = 0; i < p.length; i += 4) {
+      const x = ox + p[i] * step, y = oy + p[i + 1] * step, z = oz + p[i + 2] * part.zStep;
+      const along = x * way[0] + y * way[1] + z * way[2];
+      if (along <= 0 || along >= nearest) continue;
+      const off = x * x + y * y + z * z - along * along;
+      if (off > (radius * along) ** 2) continue;
+      const above = p[i + 3] / 100 - 10;
+      if (above < low || above > high) continue;
+      nearest = along;
+      best = [from[0] + x, from[1] + y, from[2] + z];
+    }
+  }
+  return best;
+}
+
+// Where a ray meets the level z, for clicks that meet no point.
+export function levelAt(cloud, px, z) {
+  const { from, way } = cloud.ray(px), t = (z - from[2]) / way[2];
+  return t > 0 && t < 1e5 ? [from[0] + t * way[0], from[1] + t * way[1], z] : null;
+}
+
+export const distance = (a, b) => Math.hypot(...a.map((v, i) => v - b[i]));
+
+// Signs over the large changes: word and sign tell what happened, not colour alone.
+const MOST = 24;
+
+class Labels {
+  constructor(home, onChosen) {
+    Object.assign(this, { home, onChosen, signs: [] });
+  }
+
+  set(changes) {
+    const large = changes.filter((c) => c.size === "large" || c.pending).slice(0, MOST);
+    this.signs = large.map((change) => {
+      const sign = document.createElement("button");
+      sign.type = "button";
+      sign.tabIndex = -1;  // the list beside it holds the same, in order, for the keyboard
+      sign.className = `sign ${change.kind}`;
+      sign.textContent = `${change.pending ? "pending: " : ""}${change.kind === "built" ? "+ built" : "\u00d7 demolished"}${change.height ? ` ${change.height.toFixed(0)} m` : ""}`;
+      sign.onclick = () => this.onChosen(change.id);
+      return { change, sign };
+    });
+    this.home.replaceChildren(...this.signs.map((s) => s.sign));
+  }
+
+  select(id) {
+    for (const { change, sign } of this.signs) sign.classList.toggle("chosen", change.id === id);
+  }
+
+  place(cloud, groundAt) {
+    const taken = [];
+    const [w, h] = [cloud.canvas.clientWidth, cloud.canvas.clientHeight];
+    for (const { change, sign } of this.signs) {
+      const [x0, y0, x1, y1] = change.box;
+      const at = cloud.project([(x0 + x1) / 2, (y0 + y1) / 2, groundAt(change.box) + (change.height ?? 4) + 1.5]);
+      const out = !at || at[0] < 0 || at[1] < 0 || at[0] > w || at[1] > h;
+      const crowded = !out && taken.some((o) => Math.abs(o[0] - at[0]) < 110 && Math.abs(o[1] - at[1]) < 22);
+      sign.hidden = out || crowded;
+      if (sign.hidden) continue;
+      taken.push(at);
+      sign.style.transform = `translate(${at[0]}px, ${at[1]}px) translate(-50%, -100%)`;
+    }
+  }
 }

@@ -1,9 +1,8 @@
 // What one does to the picture: colours, before and after, a slice by height, a measured distance.
 
-import { $, element, notice } from "./dom.js";
-import * as link from "./link.js";
-import { distance } from "./pick.js";
+import { distance } from "./stage.js";
 import { COLOUR } from "./shaders.js";
+import { $, address, element, notice } from "./page.js";
 
 const BLINK_MS = 800, HIGHEST = 40;
 const LEGENDS = {
@@ -18,12 +17,12 @@ export class Tools {
     this.points = [];
     $("colour").onchange = () => this.colour($("colour").value);
     $("vehicle").onchange = () => this.colour("state");
-    this.wanted = link.read().vehicle;  // chosen once the server has told who there is
+    this.wanted = address.read().vehicle;  // chosen once the server has told who there is
     $("compare").onchange = () => this.compare($("compare").value);
     $("swipe").oninput = () => this.swipe();
     for (const id of ["slice-low", "slice-high"]) $(id).oninput = () => this.slice();
     $("measure").onclick = () => this.measure(!this.measuring);
-    const asked = link.read();
+    const asked = address.read();
     if (Number.isFinite(Number(asked.swipe ?? NaN))) $("swipe").value = Number(asked.swipe);
     if (asked.slice) [$("slice-low").value, $("slice-high").value] = asked.slice.split(",");
     $("colour").value = asked.colour in COLOUR && asked.colour !== "state" ? asked.colour : "height";
@@ -38,7 +37,7 @@ export class Tools {
   }
 
   async colour(name) {
-    link.write({ colour: name === "height" ? null : name, vehicle: name === "state" ? $("vehicle").value : null });
+    address.write({ colour: name === "height" ? null : name, vehicle: name === "state" ? $("vehicle").value : null });
     $("vehicle-row").hidden = name !== "state";
     this.legend(name);
     try {
@@ -58,7 +57,7 @@ export class Tools {
   }
 
   compare(name) {
-    link.write({ compare: name === "after" ? null : name, swipe: null });
+    address.write({ compare: name === "after" ? null : name, swipe: null });
     $("swipe-row").hidden = name !== "swipe";
     $("swipe-bar").hidden = name !== "swipe";
     clearInterval(this.blinking);
@@ -81,7 +80,7 @@ export class Tools {
     const share = Number($("swipe").value) / 100;
     this.cloud.sides = share;
     $("swipe-bar").style.left = `${100 * share}%`;
-    link.write({ swipe: share === 0.5 ? null : $("swipe").value });
+    address.write({ swipe: share === 0.5 ? null : $("swipe").value });
     $("which").textContent = "";
     this.stream.plan();
     this.cloud.draw();
@@ -93,7 +92,7 @@ export class Tools {
     this.cloud.shared.slice.value.set(low <= -2 ? -1e4 : low, high >= HIGHEST ? 1e4 : high);
     const [from, to] = [`${low.toFixed(1)} m`, `${high.toFixed(1)} m`];
     $("slice-text").textContent = whole ? "all heights" : high >= HIGHEST ? `above ${from}` : low <= -2 ? `below ${to}` : `${from} to ${to}`;
-    link.write({ slice: whole ? null : `${low},${high}` });
+    address.write({ slice: whole ? null : `${low},${high}` });
     this.cloud.draw();
   }
 
