@@ -1,0 +1,237 @@
+"""Where does one cloud lie in another? A search without a prior, over every shift and every yaw.
+
+Both clouds are level (z up); nothing else is asked of them: neither ground, nor a path, nor a common height. Each is
+drawn from above in cells of a metre, by what stands there: the logarithm of how many layers of half a metre are
+occupied. The drawings are correlated by the fast Fourier transform, yaw by yaw. Heights follow from the cells that
+meet. Candidates are ranked by the likelihood of NDT (Magnusson 2009) and refined by it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import fft
+
+from mapvote.core.geometry import from_xyz_rpy, inverse, transform
+from mapvote.core.types import F64, I64, Bool, MapvoteError
+from mapvote.core.voxels import first_of_each, voxel_downsample
+from mapvote.localisation.ndt import NdtMap, build_ndt, fitness, refine, thin_for_levels
+
+_CELL_M, _LAYER_M = 1.0, 0.5
+_YAWS = 240
+"""Steps of 1.5 deg: 80 m from the middle they are 2 m apart, which the correlation's neighbours and NDT bridge."""
+_LOW_LAYERS = 2
+"""Fewer layers in a cell are ground, kerbs and hedges' tops: nothing that stands."""
+_PEAKS, _REFINED = 40, 8
+_SPREAD_CELLS = 3
+_MOST_CELLS = 64_000_000
+_SAMPLE = 4000
+_DZ_M = 0.25
+_HEIGHTS = (0.0, -1.5, 1.5)
+"""Beside the likeliest difference in height these are tried: walls alone tell it to a metre or two."""
+WINDOW_M = 90.0
+"""How far from the middle of what overlaps points are compared, metres."""
+
+
+@dataclass(frozen=True, slots=True)
+class Placed:
+    """Where a cloud lies in another one."""
+
+    T_a_b: F64
+    score: float
+    """Mean NDT likelihood of the points that overlap, in [0, 1]."""
+    lead: float
+    """By how much of its own score it is ahead of the best place elsewhere, in [0, 1]."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Drawing:
+    """A cloud from above."""
+
+    x0: float
+    y0: float
+    image: F64
+    """(rows, cols) of _CELL_M."""
+
+
+def place_without_prior(points_a: F64, points_b: F64, most_m: float = np.inf) -> Placed:
+    """The rigid motion that takes points_b (m, 3) to points_a (n, 3), both metres with z up.
+
+    ``most_m``: only places at which the middle of b lies so near to the middle of a. MapvoteError if one of them shows
+    nothing that stands.
+    """
+    middle_b = np.append(np.median(points_b[:, :2], axis=0), 0.0)
+    local = points_b - middle_b
+    tall = _standing(local)
+    drawn_a = _draw(points_a)
+    if not len(tall) or not drawn_a.image.any():
+        raise MapvoteError("nothing stands in one of the clouds: two planes of ground cannot be registered")
+    peaks = _correlate(drawn_a, tall)
+    sample = local[np.random.default_rng(0).permutation(len(local))[: 5 * _SAMPLE]]
+    by_cell = _ByCell.of(points_a)
+    guesses = [
+        from_xyz_rpy(x, y, by_cell.height_between(transform(from_xyz_rpy(x, y, 0.0, yaw=yaw), sample)) + dz, yaw=yaw)
+        for x, y, yaw in peaks
+        if np.hypot(*(np.array([x, y]) - np.median(points_a[:, :2], axis=0))) <= most_m
+        for dz in _HEIGHTS
+    ]
+    best = _best_of(points_a, local, guesses)
+    T = best.T_a_b @ from_xyz_rpy(*(-middle_b))
+    return Placed(T, best.score, best.lead)
+
+
+def _standing(points: F64) -> F64:
+    """(k, 3) x, y and weight of the cells of points (n, 3) in which something stands."""
+    cells, weight = _weights(points)
+    return np.column_stack([(cells + 0.5) * _CELL_M, weight])
+
+
+def _weights(points: F64) -> tuple[I64, F64]:
+    """((k, 2) cells x, y of _CELL_M; (k,) logarithm of their occupied layers, where more than ground)."""
+    voxels = np.column_stack([np.floor(points[:, :2] / _CELL_M), np.floor(points[:, 2] / _LAYER_M)]).astype(np.int64)
+    keys = (voxels[:, 0] + (1 << 20) << 42) | (voxels[:, 1] + (1 << 20) << 21) | (voxels[:, 2] + (1 << 20))
+    columns, layers = np.unique(keys[first_of_each(keys)] >> 21, return_counts=True)
+    tall = layers > _LOW_LAYERS
+    columns, layers = columns[tall], layers[tall]
+    cells = np.column_stack([(columns >> 21) - (1 << 20), (columns & ((1 << 21) - 1)) - (1 << 20)])
+    return cells, np.log2(layers.astype(np.float64))
+
+
+def _draw(points: F64) -> _Drawing:
+    cells, weight = _weights(points)
+    if not len(cells):
+        return _Drawing(0.0, 0.0, np.zeros((1, 1)))
+    low = cells.min(axis=0)
+    cols, rows = cells.max(axis=0) - low + 1
+    if rows * cols > _MOST_CELLS:
+        raise MapvoteError(f"a cloud of {cols} m by {rows} m is too large to search without a prior; cut it first")
+    image = np.zeros((rows, cols))
+    image[cells[:, 1] - low[1], cells[:, 0] - low[0]] = weight
+    return _Drawing(low[0] * _CELL_M, low[1] * _CELL_M, image)
+
+
+def _correlate(drawn: _Drawing, tall: F64) -> list[tuple[float, float, float]]:
+    """(x, y, yaw) of the best places of the origin of ``tall`` (k, 3), apart from each other, best first.
+
+    The score is normalised by what the drawing has under the cells of ``tall``, so that a dense wood wins nothing.
+    """
+    reach = int(np.ceil(np.hypot(tall[:, 0], tall[:, 1]).max() / _CELL_M)) + 1
+    shape = [fft.next_fast_len(side + 2 * reach, real=True) for side in drawn.image.shape]
+    spectrum = fft.rfft2(drawn.image, shape)
+    energy = fft.rfft2(drawn.image**2, shape)
+    found: list[tuple[float, float, float, float]] = []
+    for yaw in np.arange(_YAWS) * (2.0 * np.pi / _YAWS):
+        c, s = np.cos(yaw), np.sin(yaw)
+        col = np.floor((c * tall[:, 0] - s * tall[:, 1]) / _CELL_M).astype(np.int64)
+        row = np.floor((s * tall[:, 0] + c * tall[:, 1]) / _CELL_M).astype(np.int64)
+        image, mask = np.zeros(shape), np.zeros(shape)
+        np.maximum.at(image, (row, col), tall[:, 2])
+        mask[row, col] = 1.0
+        met = fft.irfft2(spectrum * np.conj(fft.rfft2(image, shape)), shape)
+        under = fft.irfft2(energy * np.conj(fft.rfft2(mask, shape)), shape)
+        score = met / np.sqrt(np.maximum(under, 0.05 * (image**2).sum()) * (image**2).sum())
+        for k in np.argpartition(score.ravel(), -5)[-5:]:
+            r, q = np.unravel_index(k, shape)
+            shift = [int(i) - side if i >= side - reach else int(i) for i, side in zip((r, q), shape, strict=True)]
+            found.append((float(score[r, q]), float(shift[1]), float(shift[0]), float(yaw)))
+    found.sort(reverse=True)
+    kept: list[tuple[float, float, float]] = []
+    for _, col, row, yaw in found:
+        x, y = drawn.x0 + col * _CELL_M, drawn.y0 + row * _CELL_M
+        apart = [
+            np.hypot(x - u, y - v) > _SPREAD_CELLS * _CELL_M or np.cos(yaw - w) < np.cos(np.radians(4.0))
+            for u, v, w in kept
+        ]
+        if all(apart):
+            kept.append((x, y, yaw))
+        if len(kept) == _PEAKS:
+            break
+    return kept
+
+
+@dataclass(frozen=True, slots=True)
+class _ByCell:
+    """The heights of a cloud, cell by cell."""
+
+    keys: I64
+    """(cells,) ascending."""
+    start: I64
+    z: F64
+
+    @classmethod
+    def of(cls, points: F64) -> _ByCell:
+        keys = _cell_keys(points)
+        order = np.argsort(keys, kind="stable")
+        unique, start = np.unique(keys[order], return_index=True)
+        return cls(unique, np.append(start, len(keys)), points[order, 2])
+
+    def height_between(self, points: F64) -> float:
+        """The likeliest height of the cloud over points (m, 3) in the same cells; 0 where no cell is shared."""
+        at = np.searchsorted(self.keys, _cell_keys(points))
+        at[at == len(self.keys)] = 0
+        shared = self.keys[at] == _cell_keys(points)
+        at, z = at[shared], points[shared, 2]
+        if not len(at):
+            return 0.0
+        rng = np.random.default_rng(0)
+        share = rng.random((8, len(at)))
+        other = self.z[(self.start[at] + share * (self.start[at + 1] - self.start[at])).astype(np.int64)]
+        between = np.floor((other - z).ravel() / _DZ_M).astype(np.int64)
+        low = int(between.min())
+        counts = np.convolve(np.bincount(between - low), np.ones(3), mode="same")
+        return float((np.argmax(counts) + low + 0.5) * _DZ_M)
+
+
+def _cell_keys(points: F64) -> I64:
+    cell = np.floor(points[:, :2] / _CELL_M).astype(np.int64) + (1 << 20)
+    return np.asarray((cell[:, 0] << 21) | cell[:, 1])
+
+
+def _best_of(points_a: F64, local: F64, guesses: list[F64]) -> Placed:
+    """The best of the guesses once refined. Maps of NDT are laid out around where the guesses put the cloud."""
+    thin = local[voxel_downsample(local, 0.5)]
+    ranked: list[tuple[float, F64]] = []
+    windows: dict[tuple[int, int], NdtMap] = {}
+    for T in guesses:
+        ndt_map, clouds, share = _laid_out(points_a, thin, T, windows)
+        ranked.append((share * fitness(ndt_map, clouds, T), T))
+    ranked.sort(key=lambda one: -one[0])
+    refined: list[tuple[float, F64]] = []
+    for _, T in _distinct(ranked)[:_REFINED]:
+        ndt_map, clouds, share = _laid_out(points_a, thin, T, windows)
+        found = refine(ndt_map, clouds, T)
+        refined.append((share * fitness(ndt_map, clouds, found.T_map_lidar, len(ndt_map.levels) - 1), found.T_map_lidar))
+    refined.sort(key=lambda one: -one[0])
+    score, T = refined[0]
+    rival = max((other for other, S in refined[1:] if not _same(T, S)), default=0.0)
+    return Placed(T, score, 1.0 - rival / score if score > 0 else 0.0)
+
+
+def _laid_out(
+    points_a: F64, local: F64, T: F64, windows: dict[tuple[int, int], NdtMap]
+) -> tuple[NdtMap, list[np.ndarray], float]:
+    """(NDT of a around where T puts b, b's points within the window as its levels want them, their share of all)."""
+    key = int(np.floor(T[0, 3] / 20.0)), int(np.floor(T[1, 3] / 20.0))
+    if key not in windows:
+        at = 20.0 * (np.array(key) + 0.5)
+        near = points_a[(np.abs(points_a[:, :2] - at) < WINDOW_M).all(axis=1)]
+        z = float(np.median(near[:, 2])) if len(near) else 0.0
+        windows[key] = build_ndt(near, np.array([*at, z]))
+    centre = windows[key].centre
+    there = transform(T, local)
+    near_b: Bool = (np.abs(there[:, :2] - centre[:2]) < WINDOW_M - 2.0).all(axis=1)
+    return windows[key], thin_for_levels(local[near_b]), float(near_b.mean())
+
+
+def _distinct(ranked: list[tuple[float, F64]]) -> list[tuple[float, F64]]:
+    out: list[tuple[float, F64]] = []
+    for score, T in ranked:
+        if not any(_same(T, S) and abs(T[2, 3] - S[2, 3]) < 1.0 for _, S in out):
+            out.append((score, T))
+    return out
+
+
+def _same(T: F64, S: F64) -> bool:
+    between = inverse(T) @ S
+    return bool(np.linalg.norm(between[:2, 3]) < 1.5 and between[0, 0] > np.cos(np.radians(5.0)))
