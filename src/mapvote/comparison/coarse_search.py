@@ -14,7 +14,7 @@ import numpy as np
 from scipy import fft
 
 from mapvote.core.geometry import from_xyz_rpy, inverse, transform
-from mapvote.core.types import F64, I64, Bool, MapvoteError
+from mapvote.core.types import F32, F64, I64, MapvoteError
 from mapvote.core.voxels import first_of_each, voxel_downsample
 from mapvote.localisation.ndt import NdtMap, build_ndt, fitness, refine, thin_for_levels
 
@@ -189,39 +189,49 @@ def _cell_keys(points: F64) -> I64:
 
 
 def _best_of(points_a: F64, local: F64, guesses: list[F64]) -> Placed:
-    """The best of the guesses once refined. Maps of NDT are laid out around where the guesses put the cloud."""
-    thin = local[voxel_downsample(local, 0.5)]
-    ranked: list[tuple[float, F64]] = []
-    windows: dict[tuple[int, int], NdtMap] = {}
-    for T in guesses:
-        ndt_map, clouds, share = _laid_out(points_a, thin, T, windows)
-        ranked.append((share * fitness(ndt_map, clouds, T), T))
-    ranked.sort(key=lambda one: -one[0])
+    """The best of the guesses once refined. All points move the cloud; what stands ranks the places, for the ground of
+    one place is like that of any other."""
+    windows = _Windows(points_a, local[voxel_downsample(local, 0.5)])
+    ranked = sorted(((windows.score(T, 0), T) for T in guesses), key=lambda one: -one[0])
     refined: list[tuple[float, F64]] = []
     for _, T in _distinct(ranked)[:_REFINED]:
-        ndt_map, clouds, share = _laid_out(points_a, thin, T, windows)
-        found = refine(ndt_map, clouds, T)
-        refined.append((share * fitness(ndt_map, clouds, found.T_map_lidar, len(ndt_map.levels) - 1), found.T_map_lidar))
+        ndt_map, clouds = windows.around(T)
+        found = refine(ndt_map, clouds, T).T_map_lidar
+        refined.append((windows.score(found, -1), found))
     refined.sort(key=lambda one: -one[0])
     score, T = refined[0]
     rival = max((other for other, S in refined[1:] if not _same(T, S)), default=0.0)
     return Placed(T, score, 1.0 - rival / score if score > 0 else 0.0)
 
 
-def _laid_out(
-    points_a: F64, local: F64, T: F64, windows: dict[tuple[int, int], NdtMap]
-) -> tuple[NdtMap, list[np.ndarray], float]:
-    """(NDT of a around where T puts b, b's points within the window as its levels want them, their share of all)."""
-    key = int(np.floor(T[0, 3] / 20.0)), int(np.floor(T[1, 3] / 20.0))
-    if key not in windows:
-        at = 20.0 * (np.array(key) + 0.5)
-        near = points_a[(np.abs(points_a[:, :2] - at) < WINDOW_M).all(axis=1)]
-        z = float(np.median(near[:, 2])) if len(near) else 0.0
-        windows[key] = build_ndt(near, np.array([*at, z]))
-    centre = windows[key].centre
-    there = transform(T, local)
-    near_b: Bool = (np.abs(there[:, :2] - centre[:2]) < WINDOW_M - 2.0).all(axis=1)
-    return windows[key], thin_for_levels(local[near_b]), float(near_b.mean())
+class _Windows:
+    """NDT of a around where b is put, laid out once for each 20 m, and what of b lies in it."""
+
+    def __init__(self, points_a: F64, local: F64) -> None:
+        self._a, self._b = points_a, local
+        tall, _ = _weights(local)
+        cells = np.floor(local[:, :2] / _CELL_M).astype(np.int64)
+        self._stands = np.isin(cells @ [1 << 32, 1], tall @ [1 << 32, 1])
+        self._ndt: dict[tuple[int, int], NdtMap] = {}
+
+    def around(self, T: F64, standing: bool = False) -> tuple[NdtMap, list[F32]]:
+        """(NDT of a, b's points in its window as its levels want them): all, or only what stands."""
+        key = int(np.floor(T[0, 3] / 20.0)), int(np.floor(T[1, 3] / 20.0))
+        if key not in self._ndt:
+            at = 20.0 * (np.array(key) + 0.5)
+            near = self._a[(np.abs(self._a[:, :2] - at) < WINDOW_M).all(axis=1)]
+            self._ndt[key] = build_ndt(near, np.array([*at, float(np.median(near[:, 2])) if len(near) else 0.0]))
+        ndt_map, there = self._ndt[key], transform(T, self._b)
+        inside = (np.abs(there[:, :2] - ndt_map.centre[:2]) < WINDOW_M - 2.0).all(axis=1)
+        return ndt_map, thin_for_levels(self._b[inside & self._stands if standing else inside])
+
+    def score(self, T: F64, level: int) -> float:
+        """Mean likelihood of all that stands in b at one level; what lies outside the window has none."""
+        ndt_map, clouds = self.around(T, standing=True)
+        if clouds[level].shape[1] == 0:
+            return 0.0
+        inside = (np.abs(transform(T, self._b[self._stands])[:, :2] - ndt_map.centre[:2]) < WINDOW_M - 2.0).all(axis=1)
+        return float(inside.mean()) * fitness(ndt_map, clouds, T, level % len(ndt_map.levels))
 
 
 def _distinct(ranked: list[tuple[float, F64]]) -> list[tuple[float, F64]]:

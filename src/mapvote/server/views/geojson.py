@@ -38,7 +38,7 @@ def to_geojson(
     features = [_feature(o, lattice, _neighbours(o, objects)) for o in objects]
     if lonlat and not frame.is_local:
         for feature in features:
-            _to_lonlat(feature["geometry"], frame)
+            rings_to_lonlat(feature["geometry"], frame)
     return {
         "type": "FeatureCollection",
         "frame": "WGS 84 longitude, latitude" if lonlat and not frame.is_local else f"{MAP_METRES}: {frame.told()}",
@@ -50,7 +50,7 @@ def to_geojson(
     }
 
 
-def _to_lonlat(geometry: dict[str, Any], frame: MapFrame) -> None:
+def rings_to_lonlat(geometry: dict[str, Any], frame: MapFrame) -> None:
     """Rings in map metres to degrees, in place; 1e-8 degrees are a millimetre. The sense of the rings stays."""
     polygons = [geometry["coordinates"]] if geometry["type"] == "Polygon" else geometry["coordinates"]
     for polygon in polygons:

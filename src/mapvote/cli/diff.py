@@ -1,0 +1,86 @@
+"""The verbs of whole clouds: diff."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from mapvote.cli.options import DRIVE
+from mapvote.cli.terminal import print_table, waiting
+
+
+def register(app: typer.Typer) -> None:
+    """Add these verbs to ``app``."""
+    app.command(rich_help_panel=DRIVE)(diff)
+
+
+def diff(
+    path_a: Annotated[Path, typer.Argument(metavar="A", help="the older map or cloud, in any format; its frame holds")],
+    path_b: Annotated[Path, typer.Argument(metavar="B", help="the newer one, in any frame")],
+    min_area: Annotated[float, typer.Option(min=0.0, metavar="M2", help="leave out smaller things")] = 0.5,
+    unbend: Annotated[
+        bool, typer.Option("--unbend", help="move bent parts of B piece by piece, if they fit so")
+    ] = False,
+    out: Annotated[Path | None, typer.Option(metavar="FILE", help="also write the footprints as GeoJSON")] = None,
+    csv: Annotated[Path | None, typer.Option(metavar="FILE", help="also write the table as CSV")] = None,
+    page: Annotated[
+        Path | None, typer.Option("--html", metavar="FILE", help="also write one page with both clouds of the largest")
+    ] = None,
+    show_not_seen: Annotated[
+        bool, typer.Option("--not-seen", help="also list what one cloud has and the other could not show")
+    ] = False,
+) -> None:
+    """What differs between two clouds or maps of one place. B is registered to A without a prior, at any heading.
+
+    mapvote diff old_map.las session.pcd --html diff.html
+    """
+    import json
+
+    from mapvote.comparison.cloud_changes import compare_cells, differences
+    from mapvote.comparison.difference_report import difference_geojson, difference_page, difference_rows
+    from mapvote.comparison.two_maps import brought_into
+    from mapvote.formats import read_map
+    from mapvote.formats.atomic import whole_file
+    from mapvote.server.insight.geojson import as_csv
+
+    with waiting(f"reading {path_a} and {path_b}"):
+        map_a, map_b = read_map(path_a), read_map(path_b)
+    with waiting("registering B to A"):
+        map_b, registered = brought_into(map_a, map_b, unbend=unbend)
+    with waiting("comparing"):
+        compared = compare_cells(map_a, map_b, registered)
+        found = differences(compared, min_area)
+    told = registered.told()
+    by_free = compared.a.free.any() or compared.b.free.any()
+    told.append(
+        "gone and new are decided by free space and by ground that the other one shows"
+        if by_free
+        else "neither knows free space: gone and new are decided by geometry alone (the other has ground there, and "
+        "nothing that stands within two cells)"
+    )
+    for line in told:
+        print(line)
+    listed = [one for one in found if show_not_seen or one.kind != "not seen"]
+    rows = difference_rows(listed)
+    shown = ("id", "kind", "x", "y", "area_m2", "height_m", "points", "confidence")
+    print_table(shown, [tuple(str(row[name]) for name in shown) for row in rows])
+    for kind in ("gone", "new", "not seen"):
+        some = [one for one in found if one.kind == kind]
+        print(f"{kind}: {len(some)} things, {sum(one.area_m2 for one in some):.1f} m2")
+    left_out = float(compared.left_out.sum()) * 0.09
+    if left_out:
+        print(f"left out in bent parts: {left_out:.1f} m2 of cells")
+    written = []
+    if out is not None:
+        collection = difference_geojson(found, map_a.lattice, map_a.georeference, told)
+        written.append((out, json.dumps(collection, indent=1) + "\n"))
+    if csv is not None:
+        written.append((csv, as_csv(difference_rows(found))))
+    if page is not None:
+        written.append((page, difference_page(f"{path_a.name} and {path_b.name}", found, map_a, map_b)))
+    for file, text in written:
+        with whole_file(file) as part:
+            part.write_text(text)
+        print(f"{file}")

@@ -1,0 +1,257 @@
+"""What differs between two clouds of one place that lie in one frame: gone, new, and not seen by the other.
+
+A cloud knows neither its rays nor free space. So a thing that one cloud has is gone from the other only where the other
+has ground and nothing that stands within two cells: who measured the ground there would have measured the thing. Where
+a map knows free space, that counts as well. Only what stands in the lowest 2.5 m is compared: crowns, wires and roofs
+are within reach of one survey and out of reach of the next, and rays pass between their points.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import reduce
+from typing import Literal
+
+import numpy as np
+from scipy import ndimage
+from scipy.spatial import KDTree
+
+from mapvote.comparison.patches import SIDE_M
+from mapvote.comparison.register import Registered
+from mapvote.core.geometry import transform
+from mapvote.core.grid import CELL_SIZE, Grid
+from mapvote.core.point_map import PointMap, all_points
+from mapvote.core.reference import above_ground_points, reference_window
+from mapvote.core.types import F32, F64, I64, Bool, MapvoteError
+from mapvote.server.insight.polygons import Ring, pieces, rings
+from mapvote.server.insight.things import group
+
+Kind = Literal["gone", "new", "not seen"]
+BAND = np.uint64(0b1_1111_1100)
+"""The voxels .6 to 2.7 m above the layer of the ground: what is lower is kerb, grass or a slope's error."""
+REACH_CELLS = 2
+GROUND_APART_M = 0.4
+"""Grounds that lie farther apart are not one ground: a roof, a car's floor, a second level."""
+_EXPLAINED_M = 0.45
+"""A point so near to the other cloud under the motion of a bent patch is explained by the bend."""
+_SQUARE = np.ones((3, 3), dtype=np.bool_)
+_ENOUGH_POINTS = 20
+
+
+@dataclass(frozen=True, slots=True)
+class Difference:
+    """A thing that only one of two clouds has."""
+
+    kind: Kind
+    """gone: a has it. new: b has it. not seen: one has it, and nothing tells whether the other should."""
+    outline: list[list[Ring]]
+    """Polygons, each an outer ring and its holes, in lattice corners (col, row)."""
+    area_m2: float
+    height_m: float
+    """Its highest point above the ground."""
+    points: int
+    """Of the cloud that has it, in its cells and above the ground."""
+    box: tuple[float, float, float, float]
+    """x0, y0, x1, y1 in a's frame, metres."""
+    confidence: float
+    """Share of its cells in which the other cloud has ground itself, or free space, not only beside it; less where
+    fewer than 20 points stand for the thing."""
+    by_free_space: float
+    """Share of its cells that free space of the other decides."""
+    has: Literal["a", "b"]
+
+
+@dataclass(frozen=True, slots=True)
+class CloudPlanes:
+    """A map over one window, (rows, cols)."""
+
+    ground_z: F32
+    low: Bool
+    """Something stands in BAND."""
+    stands: Bool
+    """Something stands, at any height."""
+    top_z: F32
+    counts: F64
+    own_ground: Bool
+    """The cell itself has a point of the ground."""
+    seen: Bool
+    """It or one of the eight beside it has."""
+    free: Bool
+    """The map knows half of BAND to be free."""
+
+
+@dataclass(frozen=True, slots=True)
+class Compared:
+    """Two clouds cell by cell: planes (rows, cols) of ``window``."""
+
+    window: Grid
+    a: CloudPlanes
+    b: CloudPlanes
+    gone: Bool
+    new: Bool
+    not_seen_a: Bool
+    """a has something that b does not show, and nothing says that b should."""
+    not_seen_b: Bool
+    left_out: Bool
+    """In a bent part, or explained by its motion."""
+
+
+def planes_of(point_map: PointMap, window: Grid) -> CloudPlanes:
+    """The planes of a map that :func:`compare_cells` looks at."""
+    here = reference_window(point_map, window)
+    known = np.isfinite(here.ground_z)
+    beside = (above_ground_points(point_map, window) != 0) & known
+    own = _ground_points(point_map, window) & known
+    low = here.occupied & BAND != 0
+    free = np.zeros(window.shape, dtype=np.bool_)
+    if here.free is not None:
+        free = np.bitwise_count(here.free & BAND) >= np.bitwise_count(BAND) / 2
+    return CloudPlanes(
+        here.ground_z, low, here.occupied != 0, here.top_z, here.counts.astype(np.float64), own, beside, free
+    )
+
+
+def _ground_points(point_map: PointMap, window: Grid) -> Bool:
+    out = np.zeros(window.shape, dtype=np.bool_)
+    for index in window.tiles():
+        if index in point_map.tiles:
+            tile = point_map.tiles[index]
+            rows, cols, here = window.indices_of(tile.points_map[~tile.columns[1]])
+            out[rows[here], cols[here]] = True
+    return out
+
+
+def compare_cells(map_a: PointMap, map_b: PointMap, registered: Registered | None = None) -> Compared:
+    """Maps of one lattice and frame, cell by cell. ``registered``: how b came there; its bent parts are left out.
+
+    MapvoteError if they do not overlap, or if one of them has no ground.
+    """
+    for name, one in (("A", map_a), ("B", map_b)):
+        if not any(tile.has_ground for tile in one.tiles.values()):
+            raise MapvoteError(
+                f"{name} has no ground: nothing tells where it looked, so whether a thing is gone, new or not seen "
+                "cannot be decided by geometry alone"
+            )
+    window = reduce(Grid.union, (map_a.lattice.tile(tile) for tile in sorted({*map_a.tiles, *map_b.tiles})))
+    a, b = planes_of(map_a, window), planes_of(map_b, window)
+    apart = (np.abs(a.ground_z - b.ground_z) > GROUND_APART_M) & a.own_ground & b.own_ground  # measured, not filled in
+    only_a = a.low & ~_around(b.low, REACH_CELLS)
+    only_b = b.low & ~_around(a.low, REACH_CELLS)
+    left_out = np.zeros(window.shape, dtype=np.bool_)
+    if registered is not None:
+        left_out = _left_out(window, only_a | only_b, registered)
+        _explain(only_a, only_b, left_out, (map_a, map_b), window, registered)
+    seen_by_b, seen_by_a = (b.seen & ~apart) | b.free, (a.seen & ~apart) | a.free
+    return Compared(
+        window, a, b,
+        only_a & seen_by_b & ~left_out,
+        only_b & seen_by_a & ~left_out,
+        only_a & ~seen_by_b & ~left_out,
+        only_b & ~seen_by_a & ~left_out,
+        left_out,
+    )  # fmt: skip
+
+
+def _around(cells: Bool, reach: int) -> Bool:
+    return np.asarray(ndimage.maximum_filter(cells, 2 * reach + 1, mode="constant"))
+
+
+def _left_out(window: Grid, asked: Bool, registered: Registered) -> Bool:
+    rows, cols = np.nonzero(asked)
+    x, y = window.centres()
+    out = np.zeros(window.shape, dtype=np.bool_)
+    out[rows, cols] = ~registered.compared(np.column_stack([x[cols], y[rows]]))
+    return out
+
+
+def _explain(
+    only_a: Bool, only_b: Bool, left_out: Bool, maps: tuple[PointMap, PointMap], window: Grid, registered: Registered
+) -> None:
+    """Mark in ``left_out`` the cells whose points fit the other cloud under the motion of a bent patch near them."""
+    motions = [] if registered.unbent else registered.other_motions()
+    if not motions:
+        return
+    a, b = (all_points(one) for one in maps)
+    mine_a, mine_b = _in_cells(a, only_a & ~left_out, window), _in_cells(b, only_b & ~left_out, window)
+    found = [np.zeros(len(mine_a), dtype=np.bool_), np.zeros(len(mine_b), dtype=np.bool_)]
+    for centre, T in motions:
+        near_a, near_b = (points[_near(points, centre)] for points in (a, b))
+        if not len(near_a) or not len(near_b):
+            continue
+        moved = transform(T, near_b)
+        for points, fits, other, move in (
+            (mine_a, found[0], moved, None),
+            (mine_b, found[1], near_a, T),
+        ):
+            here = np.flatnonzero(_near(points, centre) & ~fits)
+            at = points[here] if move is None else transform(move, points[here])
+            fits[here] = KDTree(other).query(at, distance_upper_bound=_EXPLAINED_M)[0] < _EXPLAINED_M
+    for points, fits in ((mine_a, found[0]), (mine_b, found[1])):
+        rows, cols, _ = window.indices_of(points)
+        total, explained = np.zeros(window.shape), np.zeros(window.shape)
+        np.add.at(total, (rows, cols), 1.0)
+        np.add.at(explained, (rows[fits], cols[fits]), 1.0)
+        left_out |= (total > 0) & (explained >= 0.5 * total)
+
+
+def _near(points: F64, centre: F64) -> Bool:
+    return np.asarray((np.abs(points[:, :2] - centre) < SIDE_M).all(axis=1))
+
+
+def _in_cells(points: F64, cells: Bool, window: Grid) -> F64:
+    rows, cols, inside = window.indices_of(points)
+    mine = np.zeros(len(points), dtype=np.bool_)
+    mine[inside] = cells[rows[inside], cols[inside]]
+    return points[mine]
+
+
+def differences(found: Compared, min_m2: float = 0.5) -> list[Difference]:
+    """Things of at least ``min_m2`` that only one cloud has: gone and new by area, then what was not seen."""
+    out = [
+        *_objects(found, found.gone, "gone", "a", min_m2),
+        *_objects(found, found.new, "new", "b", min_m2),
+        *_objects(found, found.not_seen_a, "not seen", "a", min_m2),
+        *_objects(found, found.not_seen_b, "not seen", "b", min_m2),
+    ]
+    return sorted(out, key=lambda one: (one.kind == "not seen", -one.area_m2))
+
+
+def _objects(found: Compared, cells: Bool, kind: Kind, has: Literal["a", "b"], min_m2: float) -> list[Difference]:
+    rows, cols = (found_at.astype(np.int64) for found_at in np.nonzero(cells))
+    if not len(rows):
+        return []
+    window = found.window
+    owner, other = (found.a, found.b) if has == "a" else (found.b, found.a)
+    kinds = np.zeros(len(rows), dtype=np.int64)
+    hang_together = pieces(rows, cols, kinds)
+    things = group(rows, cols, kinds, hang_together.objects)
+    outlines = rings(rows + window.row0, cols + window.col0, hang_together.polygons)
+    ground = np.where(np.isfinite(owner.ground_z), owner.ground_z, other.ground_z)
+    height = (owner.top_z - ground)[rows, cols]
+    out = []
+    for mine in np.split(np.argsort(things, kind="stable"), np.cumsum(np.bincount(things))[:-1]):
+        area_m2 = len(mine) * CELL_SIZE**2
+        if area_m2 < min_m2 - 1e-9:
+            continue
+        r, c = rows[mine], cols[mine]
+        direct = other.own_ground[r, c] | other.free[r, c]
+        points = int(owner.counts[r, c].sum())
+        out.append(
+            Difference(
+                kind,
+                [outlines[p] for p in np.unique(hang_together.polygons[mine])],
+                area_m2,
+                float(np.nanmax(height[mine], initial=0.0)),
+                points,
+                _box(window, r, c),
+                float(direct.mean()) * min(1.0, points / _ENOUGH_POINTS) if kind != "not seen" else 0.0,
+                float(other.free[r, c].mean()),
+                has,
+            )
+        )
+    return out
+
+
+def _box(window: Grid, rows: I64, cols: I64) -> tuple[float, float, float, float]:
+    x, y = window.x0 + CELL_SIZE * cols, window.y0 + CELL_SIZE * rows
+    return float(x.min()), float(y.min()), float(x.max() + CELL_SIZE), float(y.max() + CELL_SIZE)

@@ -1,0 +1,157 @@
+"""One cloud or map laid on another: where, how surely, and which part of it does not fit a rigid motion."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from mapvote.comparison.coarse_search import place_without_prior
+from mapvote.comparison.patches import (
+    BENT_M,
+    SIDE_M,
+    Patches,
+    RigidFit,
+    fit_rigid,
+    parts_of,
+    register_patches,
+    unbent,
+)
+from mapvote.core.types import F64, Bool, MapvoteError
+
+_LEAST_LEAD = 0.1
+"""A place whose score is not ahead of every other by such a share of it is ambiguous."""
+_LEAST_FITTING = 0.25
+"""Share of the compared patches that must agree on one motion: fewer are chance."""
+_MOST_LEFT = 0.1
+"""Share of the patches that may stay bent after they were moved."""
+
+
+@dataclass(frozen=True, slots=True)
+class BentPart:
+    """A part of a cloud that one rigid motion does not lay on the other."""
+
+    name: str
+    """As "south of y = -45 m", in the frame of a."""
+    most_m: float
+    """How far its patches are off at most."""
+    patches: int
+
+    def told(self) -> str:
+        return f"{self.name} this session is off by up to {self.most_m:.1f} m ({self.patches} patches)"
+
+
+@dataclass(frozen=True, slots=True)
+class Registered:
+    """A cloud b in the frame of a."""
+
+    T_a_b: F64
+    points: F64
+    """(n, 3) b's points in a's frame."""
+    lead: float
+    """By which share of its score the place is ahead of the best place elsewhere."""
+    patches: Patches
+    fit: RigidFit
+    bent: tuple[BentPart, ...]
+    unbent: bool
+    """Whether the points were moved patch by patch."""
+    why_not: str
+    """Why they were not, although it was asked for."""
+
+    def told(self) -> list[str]:
+        """The registration in sentences."""
+        T = self.T_a_b
+        yaw = np.degrees(np.arctan2(T[1, 0], T[0, 0]))
+        tilt = np.degrees(np.arccos(np.clip(T[2, 2], -1.0, 1.0)))
+        x, y, z = T[:3, 3]
+        agree = int((self.patches.compared & ~self.fit.bent).sum())
+        lines = [
+            f"B lies in A at x {x:.3f}, y {y:.3f}, z {z:.3f} m, turned by {yaw:.3f} deg, tilted by {tilt:.3f} deg "
+            f"(+-{self.fit.sigma_m:.3f} m, {self.fit.sigma_deg:.3f} deg)",
+            f"{agree} of {int(self.patches.compared.sum())} patches of {SIDE_M:.0f} m agree on it; the best place "
+            f"elsewhere scores {self.lead:.0%} less",
+        ]
+        lines += [f"bent: {part.told()}" for part in self.bent]
+        if self.unbent:
+            lines.append("the bent parts were moved patch by patch (--unbend)")
+        elif self.why_not:
+            lines.append(f"not unbent: {self.why_not}")
+        return lines
+
+    def compared(self, xy: F64) -> Bool:
+        """(n,) whether places (n, 2) in a's frame lie where a rigid part of b covers them: in a patch that agrees, or
+        outside all patches nearer to one that agrees than to a bent one."""
+        out = np.zeros(len(xy), dtype=np.bool_)
+        doubt = np.zeros(len(xy), dtype=np.bool_)
+        nearest = np.full((2, len(xy)), np.inf)
+        for centre, bent, counts in zip(
+            self.patches.T_a_patch[:, :2, 3], self._set_aside(), self.patches.compared, strict=True
+        ):
+            if counts:
+                far = np.abs(xy - centre).max(axis=1)
+                (doubt if bent else out)[far < SIDE_M / 2] = True
+                nearest[int(bent)] = np.minimum(nearest[int(bent)], far)
+        return np.asarray(out | (~doubt & (nearest[0] <= nearest[1])))
+
+    def _set_aside(self) -> Bool:
+        return np.zeros_like(self.fit.bent) if self.unbent else self.fit.bent
+
+    def other_motions(self) -> list[tuple[F64, F64]]:
+        """((2,) middle of each bent patch in a's frame, (4, 4) T that moves b's points, as they lie in a by the rigid
+        motion, to where the patch itself fits): what looks changed under one motion may fit under another."""
+        out = []
+        for k in np.flatnonzero(self.fit.bent):
+            T_patch = self.patches.T_a_patch[k]
+            before = np.eye(4)
+            before[:3, :3] = self.T_a_b[:3, :3]
+            before[:3, 3] = self.T_a_b[:3, :3] @ self.patches.centre_b[k] + self.T_a_b[:3, 3]
+            out.append((T_patch[:2, 3], T_patch @ np.linalg.inv(before)))
+        return out
+
+
+def register_clouds(points_a: F64, points_b: F64, *, unbend: bool = False) -> Registered:
+    """points_b (m, 3) registered to points_a (n, 3), metres, z up, without a prior.
+
+    ``unbend``: move bent parts patch by patch, if that makes them fit. MapvoteError, with figures, where the place is
+    ambiguous or nothing fits.
+    """
+    placed = place_without_prior(points_a, points_b)
+    if placed.lead < _LEAST_LEAD:
+        raise MapvoteError(
+            f"the clouds fit at several places: the best one scores {placed.score:.2f}, the next one only "
+            f"{placed.lead:.0%} less; are they of one place, and do they overlap by more than a street of equal houses?"
+        )
+    patches = register_patches(points_a, points_b, placed.T_a_b)
+    fit = fit_rigid(patches, placed.T_a_b)
+    agree = int((patches.compared & ~fit.bent).sum())
+    if agree < _LEAST_FITTING * patches.compared.sum() or not patches.compared.any():
+        raise MapvoteError(
+            f"only {agree} of {int(patches.compared.sum())} pieces agree on one motion: not one place, or badly bent"
+        )
+    moved, why = None, ""
+    if unbend and fit.bent.any():
+        moved, why = _unbend(points_a, points_b, patches, fit)
+    rigid = points_b @ fit.T_a_b[:3, :3].T + fit.T_a_b[:3, 3]
+    points = rigid if moved is None else moved
+    return Registered(fit.T_a_b, points, placed.lead, patches, fit, _bent_parts(patches, fit), moved is not None, why)
+
+
+def _bent_parts(patches: Patches, fit: RigidFit) -> tuple[BentPart, ...]:
+    """The parts, the largest first."""
+    shown = np.flatnonzero(patches.compared)
+    parts = parts_of(patches.T_a_patch[shown, :3, 3], fit.bent[shown])
+    return tuple(BentPart(name, float(fit.shift_m[shown][mine].max()), int(mine.sum())) for name, mine in parts)
+
+
+def _unbend(points_a: F64, points_b: F64, patches: Patches, fit: RigidFit) -> tuple[F64 | None, str]:
+    """(points of b moved patch by patch, "") or (None, why that does not help)."""
+    moved = unbent(points_b, patches, fit.T_a_b, patches.compared)
+    again = register_patches(points_a, moved, np.eye(4))
+    still = again.compared & (np.linalg.norm(again.residuals(np.eye(4))[:, :3], axis=1) > BENT_M)
+    if still.sum() > _MOST_LEFT * again.compared.sum():
+        worst = float(np.linalg.norm(again.residuals(np.eye(4))[still, :3], axis=1).max())
+        return None, (
+            f"{int(still.sum())} of {int(again.compared.sum())} patches stay off by up to {worst:.1f} m: within "
+            f"{SIDE_M:.0f} m the session is not rigid, things beside each other are shifted by different amounts"
+        )
+    return moved, ""
