@@ -19,6 +19,8 @@ WALLS: tuple[Box, ...] = (
     (33.0, -10.0, 33.2, 24.0, 7.0),
     (12.0, 19.0, 26.0, 19.2, 4.0),
 )
+_PLACES = np.random.default_rng(7).uniform((-29.0, -20.0, 0.8), (32.0, 23.0, 4.0), (30, 3))
+POSTS: tuple[Box, ...] = tuple((x, y, x + 0.3, y + 0.3, height) for x, y, height in _PLACES.tolist())
 CARS: tuple[Box, ...] = (
     (-20.0, -17.0, -15.6, -15.2, 1.5),
     (-11.0, -17.0, -6.6, -15.2, 1.6),
@@ -40,7 +42,7 @@ def made_court(boxes: tuple[Box, ...] = CARS, *, seed: int = 1, spacing_m: float
     for x0, y0, x1, y1, _ in boxes:
         under |= (x > x0) & (x < x1) & (y > y0) & (y < y1)
     parts = [np.column_stack([x, y, np.zeros_like(x)])[~under]]
-    for x0, y0, x1, y1, height in (*WALLS, *boxes):
+    for x0, y0, x1, y1, height in (*WALLS, *POSTS, *boxes):
         z = np.arange(0.1, height, spacing_m)
         around = [
             *((u, v) for u in np.arange(x0, x1, spacing_m) for v in (y0, y1)),

@@ -5,9 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from made_courts import CARS, court_clouds, made_court
-from mapvote.comparison.cloud_changes import Difference, compare_cells, differences
+from mapvote.comparison.cloud_changes import CloudChange, compare_cells, differences
 from mapvote.comparison.difference_report import difference_geojson, difference_page
 from mapvote.comparison.two_maps import brought_into
 from mapvote.core.geometry import from_xyz_rpy, transform
@@ -17,12 +18,12 @@ from mapvote.formats import read_map
 NEW = (-2.0, -8.0, 2.0, -6.2, 1.5)
 
 
-def compare(map_a: PointMap, map_b: PointMap) -> list[Difference]:
+def compare(map_a: PointMap, map_b: PointMap) -> list[CloudChange]:
     moved, registered = brought_into(map_a, map_b)
     return differences(compare_cells(map_a, moved, registered))
 
 
-def at(found: list[Difference], x: float, y: float) -> list[str]:
+def at(found: list[CloudChange], x: float, y: float) -> list[str]:
     return [d.kind for d in found if d.box[0] - 0.5 < x < d.box[2] + 0.5 and d.box[1] - 0.5 < y < d.box[3] + 0.5]
 
 
@@ -59,12 +60,13 @@ def test_the_page_holds_the_largest_and_the_footprints_are_closed_rings_in_metre
     assert np.abs(ring.mean(axis=0) - [-17.8, -16.1]).max() < 1.0
 
 
-def agreed_changes(folder: Path, session: str) -> tuple[list[Difference], list[str]]:
+def agreed_changes(folder: Path, session: str) -> tuple[list[CloudChange], list[str]]:
     found = compare(read_map(folder / "gtmap.pcd"), read_map(folder / f"{session}.pcd"))
     boxes = {"car": (-3.65, -0.4, "gone"), "structure": (21.7, -28.0, "new"), "thing": (-5.3, 11.9, "new")}
     return found, [name for name, (x, y, kind) in boxes.items() if kind in at(found, x, y)]
 
 
+@pytest.mark.slow
 def test_each_session_alone_shows_the_three_changes_of_the_court_and_no_drift_as_change() -> None:
     folder = court_clouds()
     for session in ("robot1", "robot2", "robot3"):

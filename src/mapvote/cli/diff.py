@@ -53,7 +53,7 @@ def diff(
         compared = compare_cells(map_a, map_b, registered)
         found = differences(compared, min_area)
     told = registered.told()
-    by_free = compared.a.free.any() or compared.b.free.any()
+    by_free = bool(compared.a.free.any() or compared.b.free.any())
     told.append(
         "gone and new are decided by free space and by ground that the other one shows"
         if by_free

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial import KDTree
 
-from mapvote.comparison.cloud_changes import Difference
+from mapvote.comparison.cloud_changes import CloudChange
 from mapvote.core.grid import CELL_SIZE, Lattice, TileIndex
 from mapvote.core.point_map import PointMap
 from mapvote.core.tile import Tile
@@ -21,7 +21,7 @@ from mapvote.server.insight.geojson import MAP_METRES, rings_to_lonlat
 _ON_PAGE = 12
 
 
-def difference_rows(found: Sequence[Difference]) -> list[dict[str, Any]]:
+def difference_rows(found: Sequence[CloudChange]) -> list[dict[str, Any]]:
     """One row a thing, numbered as listed."""
     return [
         {
@@ -42,7 +42,7 @@ def difference_rows(found: Sequence[Difference]) -> list[dict[str, Any]]:
 
 
 def difference_geojson(
-    found: Sequence[Difference], lattice: Lattice, georeference: Mapping[str, str], told: Sequence[str]
+    found: Sequence[CloudChange], lattice: Lattice, georeference: Mapping[str, str], told: Sequence[str]
 ) -> dict[str, Any]:
     """A FeatureCollection (RFC 7946) of the footprints: in longitude and latitude where map A knows its place on Earth,
     else in A's metres; its member "frame" says which. ``told``: sentences on the registration."""
@@ -63,7 +63,7 @@ def difference_geojson(
     }
 
 
-def difference_page(title: str, found: Sequence[Difference], map_a: PointMap, map_b: PointMap) -> str:
+def difference_page(title: str, found: Sequence[CloudChange], map_a: PointMap, map_b: PointMap) -> str:
     """HTML of the largest things that are gone or new, with both clouds around them; a file that needs nothing else.
 
     What both clouds have (a point of B within a voxel of one of A) is drawn as A's. ``map_b`` lies in A's frame.

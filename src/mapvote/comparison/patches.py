@@ -36,6 +36,9 @@ BENT_M = 0.25
 _GAIN = 0.1
 """It is bent if its own place fits better than the motion of the whole by such a share: along a wall without ends every
 place fits alike."""
+_STANDS_M = 0.5
+_LEAST_BENT = 3
+"""Patches side by side that are off: fewer are the sparse fringe of a survey, where NDT finds what it likes."""
 _ROUNDS = 20
 
 
@@ -64,9 +67,10 @@ class Patches:
         return np.column_stack([shift, logs(turned)[:, 3:]])
 
     def gain(self, k: int, T_a_b: F64) -> float:
-        """By which share of its likelihood patch k fits better at its own place than under one motion."""
+        """By which share of its likelihood what stands in patch k fits better at its own place than under one motion:
+        its ground fits everywhere."""
         near, mine = self.points[k]
-        ndt_map, clouds = _ndt(near, self.T_a_patch[k, :3, 3]), thin_for_levels(mine)
+        ndt_map, clouds = _ndt(near, self.T_a_patch[k, :3, 3]), thin_for_levels(mine[_stands(mine)])
         other = T_a_b.copy()
         other[:3, 3] = T_a_b[:3, :3] @ self.centre_b[k] + T_a_b[:3, 3]
         finest = len(ndt_map.levels) - 1
@@ -109,8 +113,17 @@ def register_patches(points_a: F64, points_b: F64, T_a_b: F64) -> Patches:
         compared.append(found.inlier_share > _MIN_INLIERS and sigma_m < _SURE_M)
     if not centres:
         raise MapvoteError("the clouds do not overlap: no piece of one lies where the other has points")
-    arrays = (np.array(one) for one in (centres, poses, covariances, inliers, compared))
-    return Patches(*arrays, points=tuple(kept))
+    return Patches(
+        np.array(centres), np.array(poses), np.array(covariances), np.array(inliers), np.array(compared), tuple(kept)
+    )
+
+
+def _stands(points: F64) -> Bool:
+    """(n,) points that lie higher than _STANDS_M above the lowest one of their square metre."""
+    _, cell = np.unique(np.floor(points[:, :2]).astype(np.int64), axis=0, return_inverse=True)
+    lowest = np.full(len(points), np.inf)
+    np.minimum.at(lowest, cell.reshape(-1), points[:, 2])
+    return np.asarray(points[:, 2] > lowest[cell.reshape(-1)] + _STANDS_M)
 
 
 def _ndt(points: F64, centre: F64) -> NdtMap:
@@ -128,8 +141,11 @@ class RigidFit:
     """(6, 6) of (rho, phi) about the middle of the patches that agree, in a's axes."""
     shift_m: F64
     """(k,) length of each patch's residual shift."""
+    agree: Bool
+    """(k,) compared patches that fit this motion."""
     bent: Bool
-    """(k,) compared patches that are off by more than BENT_M and four of their standard deviations."""
+    """(k,) compared patches that do not, three of them or more side by side. Fewer show no bend, but nothing is
+    compared there."""
 
     @property
     def sigma_m(self) -> float:
@@ -166,18 +182,30 @@ def fit_rigid(patches: Patches, T_a_b: F64) -> RigidFit:
     spread = max(1.0, float(np.einsum("ki,kij,kj->k", r, information, r)[agree].mean() / 6.0)) if agree.any() else 1.0
     # Neighbouring patches share points: a quarter of them are independent.
     covariance = np.linalg.inv(H + 1e-6 * np.eye(6)) * spread * (SIDE_M / STEP_M) ** 2
-    shift = np.linalg.norm(r[:, :3], axis=1)
+    off = bent_under(patches, T)
+    bent = np.zeros_like(off)
+    for mine in _side_by_side(patches.T_a_patch[:, :2, 3], off):
+        bent |= mine & (mine.sum() >= _LEAST_BENT)
+    return RigidFit(T, covariance, np.linalg.norm(r[:, :3], axis=1), patches.compared & ~off, bent)
+
+
+def bent_under(patches: Patches, T_a_b: F64) -> Bool:
+    """(k,) compared patches that are off one motion by more than BENT_M and four of their standard deviations, and
+    that fit better where they are."""
+    shift = np.linalg.norm(patches.residuals(T_a_b)[:, :3], axis=1)
     bent = patches.compared & (shift > np.maximum(BENT_M, 4.0 * patches.sigma_m))
     for k in np.flatnonzero(bent):
-        bent[k] = patches.gain(int(k), T) > _GAIN
-    return RigidFit(T, covariance, shift, bent)
+        bent[k] = patches.gain(int(k), T_a_b) > _GAIN
+    return np.asarray(bent)
 
 
-def unbent(points_b: F64, patches: Patches, T_a_b: F64, used: Bool) -> F64:
-    """points_b (m, 3) in a's frame, each moved by the patches ``used`` (k,) around it, the nearer the more: the twists
-    of their residuals are averaged with Gaussian weights of half a patch's side."""
-    r = patches.residuals(T_a_b)[used]
-    centres = patches.centre_b[used]
+def unbent(points_b: F64, patches: Patches, T_a_b: F64) -> F64:
+    """points_b (m, 3) in a's frame, each moved by the compared patches around it, the nearer the more: the twists of
+    their residuals are averaged with Gaussian weights of half a patch's side. What is off without being bent stays."""
+    residuals = patches.residuals(T_a_b)
+    tells = bent_under(patches, T_a_b) | (np.linalg.norm(residuals[:, :3], axis=1) < BENT_M)
+    r = np.where(tells[:, None], residuals, 0.0)[patches.compared]
+    centres = patches.centre_b[patches.compared]
     coarse, cell = np.unique(np.floor(points_b[:, :2] / 2.0).astype(np.int64), axis=0, return_inverse=True)
     nearest = min(8, len(centres))
     far, index = KDTree(centres[:, :2]).query(2.0 * coarse + 1.0, k=[*range(1, nearest + 1)])
@@ -202,21 +230,27 @@ def parts_of(centre: F64, off: Bool) -> list[tuple[str, Bool]]:
 
     A half-plane divides them if it holds three of four of the group and three of four in it are of the group.
     """
-    members = np.flatnonzero(off)
-    if not len(members):
-        return []
-    pairs = KDTree(centre[members, :2]).sparse_distance_matrix(KDTree(centre[members, :2]), 1.5 * STEP_M)
-    _, label = connected_components(pairs.tocsr(), directed=False)
     out = []
-    for number in np.argsort(-np.bincount(label), kind="stable"):
-        mine = np.zeros(len(off), dtype=np.bool_)
-        mine[members[label == number]] = True
+    for mine in _side_by_side(centre[:, :2], off):
         name = _half_plane(centre, mine, off)
         if name is None:
             low, high = centre[mine].min(axis=0) - SIDE_M / 2, centre[mine].max(axis=0) + SIDE_M / 2
             name = f"in x {low[0]:.0f} to {high[0]:.0f}, y {low[1]:.0f} to {high[1]:.0f} m"
         out.append((name, mine))
     return out
+
+
+def _side_by_side(centre_xy: F64, off: Bool) -> list[Bool]:
+    """(k,) masks of the connected groups of the patches ``off``, the largest first."""
+    members = np.flatnonzero(off)
+    if not len(members):
+        return []
+    tree = KDTree(centre_xy[members])
+    _, label = connected_components(tree.sparse_distance_matrix(tree, 1.5 * STEP_M).tocsr(), directed=False)
+    return [
+        np.isin(np.arange(len(off)), members[label == number])
+        for number in np.argsort(-np.bincount(label), kind="stable")
+    ]
 
 
 def _half_plane(centre: F64, mine: Bool, off: Bool) -> str | None:

@@ -8,10 +8,10 @@ import numpy as np
 
 from mapvote.comparison.coarse_search import place_without_prior
 from mapvote.comparison.patches import (
-    BENT_M,
     SIDE_M,
     Patches,
     RigidFit,
+    bent_under,
     fit_rigid,
     parts_of,
     register_patches,
@@ -64,7 +64,7 @@ class Registered:
         yaw = np.degrees(np.arctan2(T[1, 0], T[0, 0]))
         tilt = np.degrees(np.arccos(np.clip(T[2, 2], -1.0, 1.0)))
         x, y, z = T[:3, 3]
-        agree = int((self.patches.compared & ~self.fit.bent).sum())
+        agree = int(self.fit.agree.sum())
         lines = [
             f"B lies in A at x {x:.3f}, y {y:.3f}, z {z:.3f} m, turned by {yaw:.3f} deg, tilted by {tilt:.3f} deg "
             f"(+-{self.fit.sigma_m:.3f} m, {self.fit.sigma_deg:.3f} deg)",
@@ -84,23 +84,19 @@ class Registered:
         out = np.zeros(len(xy), dtype=np.bool_)
         doubt = np.zeros(len(xy), dtype=np.bool_)
         nearest = np.full((2, len(xy)), np.inf)
-        for centre, bent, counts in zip(
-            self.patches.T_a_patch[:, :2, 3], self._set_aside(), self.patches.compared, strict=True
-        ):
-            if counts:
-                far = np.abs(xy - centre).max(axis=1)
-                (doubt if bent else out)[far < SIDE_M / 2] = True
-                nearest[int(bent)] = np.minimum(nearest[int(bent)], far)
+        shown = self.patches.compared
+        agree = shown if self.unbent else self.fit.agree
+        for centre, off in zip(self.patches.T_a_patch[shown, :2, 3], ~agree[shown], strict=True):
+            far = np.abs(xy - centre).max(axis=1)
+            (doubt if off else out)[far < SIDE_M / 2] = True
+            nearest[int(off)] = np.minimum(nearest[int(off)], far)
         return np.asarray(out | (~doubt & (nearest[0] <= nearest[1])))
-
-    def _set_aside(self) -> Bool:
-        return np.zeros_like(self.fit.bent) if self.unbent else self.fit.bent
 
     def other_motions(self) -> list[tuple[F64, F64]]:
         """((2,) middle of each bent patch in a's frame, (4, 4) T that moves b's points, as they lie in a by the rigid
         motion, to where the patch itself fits): what looks changed under one motion may fit under another."""
         out = []
-        for k in np.flatnonzero(self.fit.bent):
+        for k in np.flatnonzero(self.patches.compared & ~self.fit.agree):
             T_patch = self.patches.T_a_patch[k]
             before = np.eye(4)
             before[:3, :3] = self.T_a_b[:3, :3]
@@ -123,7 +119,7 @@ def register_clouds(points_a: F64, points_b: F64, *, unbend: bool = False) -> Re
         )
     patches = register_patches(points_a, points_b, placed.T_a_b)
     fit = fit_rigid(patches, placed.T_a_b)
-    agree = int((patches.compared & ~fit.bent).sum())
+    agree = int(fit.agree.sum())
     if agree < _LEAST_FITTING * patches.compared.sum() or not patches.compared.any():
         raise MapvoteError(
             f"only {agree} of {int(patches.compared.sum())} pieces agree on one motion: not one place, or badly bent"
@@ -145,9 +141,9 @@ def _bent_parts(patches: Patches, fit: RigidFit) -> tuple[BentPart, ...]:
 
 def _unbend(points_a: F64, points_b: F64, patches: Patches, fit: RigidFit) -> tuple[F64 | None, str]:
     """(points of b moved patch by patch, "") or (None, why that does not help)."""
-    moved = unbent(points_b, patches, fit.T_a_b, patches.compared)
+    moved = unbent(points_b, patches, fit.T_a_b)
     again = register_patches(points_a, moved, np.eye(4))
-    still = again.compared & (np.linalg.norm(again.residuals(np.eye(4))[:, :3], axis=1) > BENT_M)
+    still = bent_under(again, np.eye(4))
     if still.sum() > _MOST_LEFT * again.compared.sum():
         worst = float(np.linalg.norm(again.residuals(np.eye(4))[still, :3], axis=1).max())
         return None, (

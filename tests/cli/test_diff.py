@@ -1,0 +1,43 @@
+"""The verbs of whole clouds, as a user calls them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from made_courts import CARS, made_court
+from mapvote.cli import app
+from mapvote.core.geometry import from_xyz_rpy, transform
+from mapvote.core.types import MapvoteError
+from mapvote.formats import write_pcd
+from mapvote.formats.maps.cloud import Cloud
+
+
+def test_diff_says_where_b_lies_how_it_decided_and_what_left(tmp_path: Path) -> None:
+    moved = transform(from_xyz_rpy(80.0, -20.0, 3.0, yaw=1.0), made_court(CARS[1:], seed=2))
+    write_pcd(tmp_path / "a.pcd", Cloud(made_court()))
+    write_pcd(tmp_path / "b.pcd", Cloud(moved))
+    files = ["--out", str(tmp_path / "d.geojson"), "--csv", str(tmp_path / "d.csv"), "--html", str(tmp_path / "d.html")]
+    result = CliRunner().invoke(app, ["diff", str(tmp_path / "a.pcd"), str(tmp_path / "b.pcd"), *files])
+    assert result.exit_code == 0, result.output
+    assert "turned by -57." in result.output
+    assert "by geometry alone" in result.output
+    assert "gone: 1 things" in result.output
+    assert [f["properties"]["kind"] for f in json.loads((tmp_path / "d.geojson").read_text())["features"]] == ["gone"]
+    assert (tmp_path / "d.csv").read_text().startswith("id,kind,")
+    assert "<canvas" in (tmp_path / "d.html").read_text()
+
+
+def test_a_map_without_ground_cannot_be_compared_and_says_so(tmp_path: Path) -> None:
+    court = made_court()
+    above = court[court[:, 2] - 0.01 * court[:, 0] - 0.005 * court[:, 1] > 0.4]
+    write_pcd(tmp_path / "a.pcd", Cloud(np.concatenate([above, above + 0.05])))
+    write_pcd(tmp_path / "b.pcd", Cloud(court))
+    result = CliRunner().invoke(app, ["diff", str(tmp_path / "a.pcd"), str(tmp_path / "b.pcd")])
+    assert isinstance(result.exception, MapvoteError)
+    with pytest.raises(MapvoteError, match="no ground"):
+        raise result.exception
