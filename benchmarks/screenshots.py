@@ -22,6 +22,7 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
+from page import town
 from PIL import Image
 
 from chromium import Chromium
@@ -30,7 +31,6 @@ from live_server import serving
 from mapvote.server.store import keys
 from mapvote.server.store.store import Store
 from mapvote.server.views.history import changes_between, page_between
-from page import town
 
 PICTURES = Path(__file__).parents[1] / "docs/pictures"
 SHOWN = "performance.getEntriesByName('first-points').length > 0"

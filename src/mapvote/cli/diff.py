@@ -43,7 +43,7 @@ def diff(
     from mapvote.comparison.two_maps import brought_into
     from mapvote.formats import read_map
     from mapvote.formats.atomic import whole_file
-    from mapvote.server.insight.geojson import as_csv
+    from mapvote.server.views.geojson import as_csv
 
     with waiting(f"reading {path_a} and {path_b}"):
         map_a, map_b = read_map(path_a), read_map(path_b)

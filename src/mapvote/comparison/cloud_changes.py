@@ -23,8 +23,7 @@ from mapvote.core.grid import CELL_SIZE, Grid
 from mapvote.core.point_map import PointMap, all_points
 from mapvote.core.reference import above_ground_points, reference_window
 from mapvote.core.types import F32, F64, I32, I64, U64, Bool, MapvoteError
-from mapvote.server.insight.polygons import Ring, pieces, rings
-from mapvote.server.insight.things import group
+from mapvote.server.views.outlines import Ring, group, pieces, rings
 
 Kind = Literal["gone", "new", "not seen"]
 BAND = np.uint64(0b1_1111_1100)

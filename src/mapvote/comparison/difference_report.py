@@ -15,8 +15,8 @@ from mapvote.core.point_map import PointMap
 from mapvote.core.tile import Tile
 from mapvote.core.types import F64, Bool
 from mapvote.formats.geo.frame import frame_of
-from mapvote.server.insight.cutout import cut_out, whole_page
-from mapvote.server.insight.geojson import MAP_METRES, rings_to_lonlat
+from mapvote.server.views.cutout import cut_out, whole_page
+from mapvote.server.views.geojson import MAP_METRES, rings_to_lonlat
 
 _ON_PAGE = 12
 
