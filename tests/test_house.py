@@ -24,8 +24,7 @@ MOST_MODULES_NAMED_TWICE = 22
 
 CIRCLES = [
     {"mapvote.cli.remote", "mapvote.cli.store"},
-    {"mapvote.formats.drives.bag_poses", "mapvote.formats.drives.rosbag"},
-    {"mapvote.formats.geo.frame", "mapvote.formats.geo.projector"},
+    {"mapvote.formats.drives.rosbag"},
     {"mapvote.fusion.odds", "mapvote.fusion.tile_vote"},
 ]
 """Import circles that are still there. The goal is none."""

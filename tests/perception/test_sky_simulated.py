@@ -10,7 +10,7 @@ import pytest
 from mapvote.core.geometry import rows_from
 from mapvote.core.grid import CELL_SIZE
 from mapvote.formats import open_drive
-from mapvote.formats.drives.poses import read_poses
+from mapvote.formats.drives.trajectory import read_poses
 from mapvote.localisation.prepare import deskew, motion_at
 from mapvote.perception.fans import follow_rays
 from mapvote.perception.sky import Sky

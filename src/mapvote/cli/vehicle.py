@@ -139,7 +139,7 @@ def vote(
     from mapvote.core.types import MapvoteError
     from mapvote.formats import open_drive
     from mapvote.formats.atomic import whole_file
-    from mapvote.formats.geo.frame import frame_of
+    from mapvote.formats.geo.projector import frame_of
     from mapvote.localisation.localiser import GivenPoses
     from mapvote.vehicle import vote_drive
 

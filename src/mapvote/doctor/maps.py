@@ -23,7 +23,7 @@ from mapvote.doctor.finding import Finding, in_order
 from mapvote.doctor.standing import check_lean, ghost_layer, ghost_shift
 from mapvote.formats import read_map, stream_cloud
 from mapvote.formats.clean import MAX_BAD_SHARE
-from mapvote.formats.geo.frame import frame_of
+from mapvote.formats.geo.projector import frame_of
 from mapvote.formats.maps.cloud import Cloud, joined
 from mapvote.formats.maps.mapvote_folder import is_map_folder
 from mapvote.formats.maps.tiling import to_map

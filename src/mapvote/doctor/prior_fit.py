@@ -315,6 +315,9 @@ def check_agreement(
     numbers = [measure_scale(T, runs), turn, pitch, *([time] if time is not None else [])]
     wordy = [m for m in numbers if m is not (turn if abs(pitch.value) > abs(turn.value) else pitch)]
     held += [_held(_number_reading(m, T, runs, road), T, runs, special=False) for m in wordy]
+    # What the prior's stated errors of attitude explain is no reason to call its rotations foreign.
+    stated_m = LEVER_M * np.radians(2.0 * drive.prior_sigma_deg) + 0.01 * length_m
+    held = [h for h in held if not h.reading.catch_all or as_it_is.median > stated_m]
     best = min([as_it_is, *held], key=lambda h: h.median)
     floor_m = 0.1 + 0.12 * length_m + 2.0 * min(drive.prior_sigma_m, 1.5)
     if _clearly_better(best, as_it_is, length_m):
@@ -325,7 +328,7 @@ def check_agreement(
     if as_it_is.median > floor_m:
         return [_nothing_fits(as_it_is, runs, length_m, told_m)], T
     found = check_small(T, chain(), runs, time, drive.stamps_ns, drive.prior_sigma_m)
-    found += _places(as_it_is, runs) + _scatter(drive, as_it_is, length_m)
+    found += _places(as_it_is, runs, drive.prior_sigma_m) + _scatter(drive, as_it_is, length_m)
     found += _cannot_tell(as_it_is, held, length_m, turns, drive.sensor.clockwise)
     return found, T
 
@@ -435,17 +438,18 @@ def _nothing_fits(as_it_is: _Held, runs: Sequence[Run], length_m: float, told_m:
     return Finding("error", what, "is it the trajectory of this drive, one row for each scan, in order?")
 
 
-def _places(as_it_is: _Held, runs: Sequence[Run]) -> list[Finding]:
+def _places(as_it_is: _Held, runs: Sequence[Run], prior_sigma_m: float) -> list[Finding]:
+    """Where the prior leaves the scans' motion by far more than elsewhere, and by more than it is said to err."""
     usual = as_it_is.median
-    bad = np.flatnonzero(as_it_is.misfit > 4.0 * usual + 1.0)
+    bad = np.flatnonzero(as_it_is.misfit > max(4.0 * usual + 1.0, 2.0 * prior_sigma_m))
     if not len(bad):
         return []
-    run = runs[int(bad[np.argmax(as_it_is.misfit[bad])])]
+    run, most_m = runs[int(bad[np.argmax(as_it_is.misfit[bad])])], float(as_it_is.misfit[bad].max())
     what = (
-        f"between scans {run.indices[0]} and {run.indices[-1]} the prior is {as_it_is.misfit[bad].max():.1f} m off the "
-        f"scans' motion, elsewhere {usual:.1f} m ({len(bad)} of {len(runs)} places)"
+        f"between scans {run.indices[0]} and {run.indices[-1]} the prior is {most_m:.1f} m off the scans' motion, "
+        f"elsewhere {usual:.1f} m ({len(bad)} of {len(runs)} places)"
     )
-    grave: Severity = "error" if as_it_is.misfit[bad].max() > 5.0 else "warning"
+    grave: Severity = "error" if most_m > max(5.0, 4.0 * prior_sigma_m) else "warning"
     return [Finding(grave, what, "a jump, or rows that belong to other scans: mend or leave out that part")]
 
 

@@ -18,9 +18,8 @@ from mapvote.codec.ballot import Ballot, BallotTile, decode, unpack_states
 from mapvote.core.types import F64, I64, CellState, MapvoteError
 from mapvote.doctor.finding import Finding, in_order
 from mapvote.doctor.maps import check_whole
-from mapvote.formats.drives.bag_poses import GNSS, POSES, T_from, frame_id, static_frames
 from mapvote.formats.drives.options import DriveOptions
-from mapvote.formats.drives.rosbag import CLOUD, Bag
+from mapvote.formats.drives.rosbag import CLOUD, GNSS, POSES, Bag, T_from, frame_id, static_frames
 
 if TYPE_CHECKING:
     from mapvote.server.store.store import Store

@@ -16,7 +16,7 @@ from mapvote.core.point_map import PointMap
 from mapvote.core.types import F64, Drive, MapvoteError
 from mapvote.formats.drives.kitti import DriveWriter
 from mapvote.formats.drives.options import DriveOptions, SaidOfDrive
-from mapvote.formats.drives.poses import read_T_map_lidar
+from mapvote.formats.drives.trajectory import read_T_map_lidar
 from mapvote.formats.maps.cloud import Cloud, joined
 from mapvote.formats.maps.exporting import export_map
 from mapvote.formats.maps.mapvote_folder import is_map_folder, read_map_folder, write_map_folder

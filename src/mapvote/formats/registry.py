@@ -7,17 +7,24 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from mapvote.core.types import Drive
-from mapvote.formats.drives.boreas import is_boreas, open_boreas
-from mapvote.formats.drives.cloud_scans import is_cloud_scans, open_cloud_scans
+from mapvote.formats.drives.datasets import (
+    is_boreas,
+    is_kitti_raw,
+    is_mulran,
+    is_newer_college,
+    is_nuscenes,
+    is_oxford,
+    open_boreas,
+    open_kitti_raw,
+    open_mulran,
+    open_newer_college,
+    open_nuscenes,
+    open_oxford,
+)
 from mapvote.formats.drives.kitti import is_kitti_folder, open_kitti
-from mapvote.formats.drives.kitti_raw import is_kitti_raw, open_kitti_raw
-from mapvote.formats.drives.mulran import is_mulran, open_mulran
-from mapvote.formats.drives.newer_college import is_newer_college, open_newer_college
-from mapvote.formats.drives.nuscenes import is_nuscenes, open_nuscenes
 from mapvote.formats.drives.options import DriveOptions
-from mapvote.formats.drives.oxford import is_oxford, open_oxford
-from mapvote.formats.drives.pcd_scans import is_pcd_drive, open_pcd_drive
 from mapvote.formats.drives.rosbag import is_rosbag, open_rosbag
+from mapvote.formats.drives.scan_files import is_cloud_scans, is_pcd_drive, open_cloud_scans, open_pcd_drive
 from mapvote.formats.maps.autoware import (
     is_autoware,
     is_autoware_default,

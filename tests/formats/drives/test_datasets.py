@@ -15,8 +15,7 @@ from mapvote.core import geometry
 from mapvote.core.point_map import map_from_points
 from mapvote.core.types import F64, Drive, MapvoteError
 from mapvote.formats import export_map, open_drive, read_map
-from mapvote.formats.drives.boreas import COLUMNS
-from mapvote.formats.drives.mulran import T_BASE_LIDAR
+from mapvote.formats.drives.datasets import BOREAS_COLUMNS, MULRAN_MOUNT, NEWER_COLLEGE_MOUNT
 from mapvote.formats.maps.cloud import Cloud
 from mapvote.formats.maps.las import write_las
 from mapvote.formats.maps.ply import write_ply
@@ -126,7 +125,7 @@ def test_columns_of_any_kind_are_named_on_the_command_line(tmp_path: Path) -> No
 def test_boreas_sequence(tmp_path: Path) -> None:
     T = poses()
     bins(tmp_path / "lidar", [f"{START * 10**6 + i * 100_000}.bin" for i in range(N)], T, 1.0, 3.0, 0.0)
-    assert len(COLUMNS) == 6
+    assert len(BOREAS_COLUMNS) == 6
     rows = ["GPSTime,easting,northing,altitude,vel_east,vel_north,vel_up,roll,pitch,heading,wz,wy,wx"]
     for i, T_i in enumerate(T):
         roll, pitch, yaw = Rotation.from_matrix(T_i[:3, :3].T).as_euler("xyz")
@@ -138,7 +137,7 @@ def test_boreas_sequence(tmp_path: Path) -> None:
 
 
 def test_mulran_sequence(tmp_path: Path) -> None:
-    bins(tmp_path / "Ouster", [f"{START * 10**9 + i * 10**8}.bin" for i in range(N)], poses() @ T_BASE_LIDAR, 9.0)
+    bins(tmp_path / "Ouster", [f"{START * 10**9 + i * 10**8}.bin" for i in range(N)], poses() @ MULRAN_MOUNT, 9.0)
     rows = [
         ",".join([str(START * 10**9 + i * 10**8), *(f"{v:.9f}" for v in T[:3].ravel())]) for i, T in enumerate(poses())
     ]
@@ -149,14 +148,14 @@ def test_mulran_sequence(tmp_path: Path) -> None:
 def test_newer_college_experiment(tmp_path: Path) -> None:
     from pypcd4 import PointCloud
 
-    from mapvote.formats.drives.newer_college import T_BASE_LIDAR as MOUNT
-
     folder, truth = tmp_path / "raw_format" / "ouster_scan", tmp_path / "ground_truth"
     folder.mkdir(parents=True)
     truth.mkdir()
     rows = ["sec,nsec,x,y,z,qx,qy,qz,qw"]
     for i, T in enumerate(poses()):
-        PointCloud.from_xyz_points(seen_from(T @ MOUNT)).save(folder / f"cloud_{START}_{i * 10**8:09d}.pcd")
+        PointCloud.from_xyz_points(seen_from(T @ NEWER_COLLEGE_MOUNT)).save(
+            folder / f"cloud_{START}_{i * 10**8:09d}.pcd"
+        )
         values = [*T[:3, 3], *Rotation.from_matrix(T[:3, :3]).as_quat()]
         rows.append(f"{START},{i * 10**8}," + ",".join(f"{v:.9f}" for v in values))
     (truth / "registered_poses.csv").write_text("\n".join(rows) + "\n")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from types import ModuleType
@@ -102,18 +101,6 @@ class MapFrame:
                 "or with --projector map_projector_info.yaml"
             )
         return transformer(self.crs)
-
-
-def frame_of(georeference: Mapping[str, str]) -> MapFrame:
-    """The frame that a map carries; local if it carries none."""
-    from mapvote.formats.geo.projector import frame_of_projector
-
-    projector = georeference.get("map_projector_info.yaml", "")
-    crs = georeference.get("crs") or georeference.get("wkt") or ""
-    if not crs:
-        return frame_of_projector(projector) if projector else MapFrame()
-    offset = [float(v) for v in georeference.get("offset", "0,0,0").split(",")]
-    return MapFrame(crs, (offset[0], offset[1], offset[2]), georeference.get("heights", ""), projector)
 
 
 def enu_frame(latitude: float, longitude: float, height: float) -> MapFrame:

@@ -5,6 +5,7 @@ As autoware_geography_utils reckons: heights count from the origin's altitude, e
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ from numpy.typing import NDArray
 
 from mapvote.core.types import MapvoteError
 from mapvote.formats.extras import read_text, require
-from mapvote.formats.geo.frame import LOCAL, MapFrame, enu_frame, frame_of, read_crs, utm_of
+from mapvote.formats.geo.frame import LOCAL, MapFrame, enu_frame, read_crs, utm_of
 
 PROJECTOR = "map_projector_info.yaml"
 TYPES = ("Local", "MGRS", "LocalCartesianUTM", "LocalCartesian", "TransverseMercator")
@@ -46,6 +47,16 @@ def read_projector(text_or_path: str) -> MapFrame:
         except (ValueError, IndexError) as error:
             raise MapvoteError(f"--projector {text_or_path!r}: write {kind}:LATITUDE,LONGITUDE") from error
     return frame_of_projector(_as_yaml(about), "--projector")
+
+
+def frame_of(georeference: Mapping[str, str]) -> MapFrame:
+    """The frame that a map carries; local if it carries none."""
+    projector = georeference.get(PROJECTOR, "")
+    crs = georeference.get("crs") or georeference.get("wkt") or ""
+    if not crs:
+        return frame_of_projector(projector) if projector else MapFrame()
+    offset = [float(v) for v in georeference.get("offset", "0,0,0").split(",")]
+    return MapFrame(crs, (offset[0], offset[1], offset[2]), georeference.get("heights", ""), projector)
 
 
 def frame_of_projector(text: str, where: str = PROJECTOR) -> MapFrame:

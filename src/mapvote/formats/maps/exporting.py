@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from mapvote.core.point_map import PointMap
 from mapvote.core.tile import Tile
 from mapvote.core.types import F64, U8, MapvoteError
-from mapvote.formats.geo.frame import MapFrame, frame_of
-from mapvote.formats.geo.projector import PROJECTOR, autoware_frame, frame_wanted
+from mapvote.formats.geo.frame import MapFrame
+from mapvote.formats.geo.projector import PROJECTOR, autoware_frame, frame_of, frame_wanted
 from mapvote.formats.geo.units import settle
 from mapvote.formats.maps.cloud import GROUND, UNCLASSIFIED, Cloud
 from mapvote.formats.maps.cloud_pieces import CloudPieces

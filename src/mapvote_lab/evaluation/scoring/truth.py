@@ -13,7 +13,7 @@ import numpy as np
 from mapvote.core.geometry import inverse
 from mapvote.core.grid import CELL_SIZE, Grid, Lattice
 from mapvote.core.types import F64, NO_VOTE, U8, Bool, MapvoteError
-from mapvote.formats.drives.poses import read_poses
+from mapvote.formats.drives.trajectory import read_poses
 
 _KEPT, _ADDED, _REMOVED = 0, 1, 2
 _OLD_NEVER_SURVEYED = 3

@@ -1,0 +1,411 @@
+"""Public datasets as their authors lay them out: KITTI raw, KITTI-360, nuScenes, Boreas, MulRan, Newer College, Oxford.
+
+KITTI raw (Geiger et al. 2013): velodyne_points/data/*.bin with timestamps, oxts/data/*.txt as prior.
+KITTI-360 (Liao et al. 2022): the same layout below data_3d_raw/SEQUENCE; poses of the GPS/IMU in data_poses/SEQUENCE,
+calibration/ beside. The world is local metres with z up.
+nuScenes (Caesar et al. 2020): samples and sweeps of LIDAR_TOP, poses and calibration from its tables. A scene is a
+drive. Its LiDAR looks along y; points and mount are turned so that x is forward.
+Boreas (Burnett et al. 2023): lidar/MICROSECONDS.bin of six columns, applanix/lidar_poses.csv.
+MulRan (Kim et al. 2020): Ouster/NANOSECONDS.bin of four columns, global_pose.csv.
+Newer College (Ramezani et al. 2020): raw_format/ouster_scan/cloud_SECONDS_NANOSECONDS.pcd,
+ground_truth/registered_poses.csv.
+Oxford (Radar) RobotCar (Barnes et al. 2020): velodyne_left/MICROSECONDS.bin, four rows of float32; gps/ins.csv. Its
+frames have x forward, y right and z down; points are turned so that y is left and z up. The mount comes from
+extrinsics/velodyne_left.txt of the SDK, if that lies beside the drive, or from --mount.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from mapvote.core import geometry
+from mapvote.core.types import F64, I64, Drive, MapvoteError
+from mapvote.formats.clean import log
+from mapvote.formats.drives.options import DriveFile, DriveOptions, map_frame, read_drive_file
+from mapvote.formats.drives.scan_files import NUSCENES, BinLayout, layout_of, read_bytes
+from mapvote.formats.drives.scan_folder import (
+    ScanFolder,
+    lines_of_scans,
+    number_of,
+    of_scans,
+    open_scan_folder,
+    read_times_ns,
+    scan_files,
+)
+from mapvote.formats.drives.trajectory import (
+    Trajectory,
+    check_rigid,
+    read_calib,
+    read_numbers,
+    read_trajectory,
+    sorted_trajectory,
+)
+from mapvote.formats.extras import read_text
+from mapvote.formats.geo.frame import MapFrame, utm_of
+from mapvote.formats.geo.gnss import poses_from_gnss
+from mapvote.formats.maps.pcd import read_pcd_table
+
+_LIDAR_TOP = ("samples/LIDAR_TOP", "sweeps/LIDAR_TOP")
+_NUSCENES_AXES = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+"""R_nuscenes_lidar: their y is our x."""
+NuscenesTable = dict[str, dict[str, Any]]
+BOREAS_COLUMNS = ("x", "y", "z", "intensity", "laser_number", "time")
+MULRAN_MOUNT = geometry.from_xyz_rpy(1.7042, -0.021, 1.8047, *np.deg2rad([0.0001, 0.0003, 179.6654]))
+"""The dataset's calib_base2ouster.txt."""
+_NEWER_COLLEGE = ("raw_format/ouster_scan", "ouster_scan")
+NEWER_COLLEGE_MOUNT = geometry.from_xyz_rpy(-0.084, -0.025, 0.050, yaw=2.0 * math.atan2(0.924, 0.383))
+"""The camera that carries the poses to the Ouster (Ramezani et al. 2020)."""
+_OXFORD_LIDARS = ("velodyne_left", "velodyne_right")
+_OXFORD_AXES = np.diag([1.0, -1.0, -1.0, 1.0])
+_NORTH_EAST_DOWN = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]])
+
+
+def _if_there(table: Path, read: Callable[[Path], Trajectory], why: str = "") -> Callable[[], Trajectory | None]:
+    """A prior from ``table``; none, with a warning, where that is missing."""
+
+    def prior() -> Trajectory | None:
+        if table.is_file():
+            return read(table)
+        log.warning("%s: missing%s, so there is no prior", table, why)
+        return None
+
+    return prior
+
+
+def is_kitti_raw(path: Path) -> bool:
+    return (path / "velodyne_points" / "data").is_dir()
+
+
+def open_kitti_raw(path: Path, options: DriveOptions) -> Drive:
+    """The recording in ``path``. Its oxts are the prior, where calib_imu_to_velo.txt is there or one folder up; of
+    KITTI-360 its poses.
+    """
+    about = read_drive_file(path)
+    files = scan_files(path / "velodyne_points" / "data", ".bin")
+    table = path / "velodyne_points" / "timestamps.txt"
+    if not table.is_file():
+        raise MapvoteError(f"{table}: missing; unpack the whole recording")
+    times_ns = read_times_ns(table)
+    stamps_ns: I64 = times_ns[lines_of_scans(len(times_ns), files, table)]
+    wanted = options.prior or about.prior
+    if wanted == "oxts":  # a name of ours, no file
+        options = DriveOptions(**{n: getattr(options, n) for n in DriveOptions.__slots__} | {"prior": None})
+        about = DriveFile(**{n: getattr(about, n) for n in DriveFile.__struct_fields__} | {"prior": None})
+
+    def prior() -> Trajectory | F64 | None:
+        if wanted is None and has_kitti_360_poses(path):
+            return kitti_360_poses(path, files, stamps_ns)
+        return _oxts_prior(path, files, stamps_ns, about, options, wanted=wanted == "oxts")
+
+    layout = layout_of(files, options.columns or about.columns, options.dtype or about.dtype)
+    folder = ScanFolder(files, stamps_ns, layout.read, prior, zero_is_no_return=False)
+    return open_scan_folder(path, about, options, folder)
+
+
+def _oxts_prior(
+    path: Path, files: list[Path], stamps_ns: I64, about: DriveFile, options: DriveOptions, *, wanted: bool
+) -> Trajectory | None:
+    folder = path / "oxts" / "data"
+    calib = next((f for d in (path, path.parent) if (f := d / "calib_imu_to_velo.txt").is_file()), None)
+    if calib is None or not folder.is_dir():
+        message = f"{path}: no prior: {'oxts/data' if calib else 'calib_imu_to_velo.txt'} is missing"
+        if wanted:
+            raise MapvoteError(f"{message}; put it there, or --prior none")
+        log.warning("%s", message)
+        return None
+    numbers = read_calib(calib)
+    if "R" not in numbers or "T" not in numbers or numbers["R"].size != 9 or numbers["T"].size != 3:
+        raise MapvoteError(f"{calib}: no lines R: (9 numbers) and T: (3 numbers)")
+    T_lidar_imu = np.eye(4)
+    T_lidar_imu[:3, :3], T_lidar_imu[:3, 3] = numbers["R"].reshape(3, 3), numbers["T"]
+    check_rigid(T_lidar_imu[None], str(calib))
+    rows = np.concatenate([read_numbers(f, 30) for f in scan_files(folder, ".txt")])
+    T_map_imu, frame = poses_from_gnss(rows[:, [1, 0, 2]], rows[:, 3:6], map_frame(about, options))
+    T_map_lidar = of_scans(T_map_imu @ geometry.inverse(T_lidar_imu), files, folder)
+    return Trajectory(stamps_ns, T_map_lidar, of_vehicle=False, frame=frame)
+
+
+def _pose_file(path: Path) -> Path:
+    return path.resolve().parents[1] / "data_poses" / path.resolve().name / "poses.txt"
+
+
+def has_kitti_360_poses(path: Path) -> bool:
+    """Whether ``path`` is data_3d_raw/SEQUENCE of KITTI-360 with its poses beside."""
+    return len(path.resolve().parents) > 1 and _pose_file(path).is_file()
+
+
+def kitti_360_poses(path: Path, files: list[Path], stamps_ns: I64) -> Trajectory:
+    """The poses of the scans that have one, by the numbers in the scans' names; between them they are interpolated.
+
+    Some frames at the start of a sequence have no pose: MapvoteError says which scans to choose.
+    """
+    file = _pose_file(path)
+    rows = read_numbers(file, 13)
+    T_world_imu = np.tile(np.eye(4), (len(rows), 1, 1))
+    T_world_imu[:, :3] = rows[:, 1:].reshape(-1, 3, 4)
+    check_rigid(T_world_imu, str(file))
+    T_imu_lidar = _T_imu_lidar(path.resolve().parents[1] / "calibration")
+    numbers = np.array([number_of(f) for f in files])
+    first = np.searchsorted(numbers, rows[:, 0])
+    known = (first < len(numbers)) & (numbers[np.minimum(first, len(numbers) - 1)] == rows[:, 0])
+    if not known.any():
+        raise MapvoteError(f"{file}: no pose for any of the scans {files[0].name} to {files[-1].name}; --prior none")
+    return sorted_trajectory(
+        stamps_ns[first[known]], (T_world_imu @ T_imu_lidar)[known], of_vehicle=False, frame=MapFrame()
+    )
+
+
+def _T_imu_lidar(folder: Path) -> F64:
+    """(4, 4) through camera 0: calib_cam_to_pose.txt and calib_cam_to_velo.txt."""
+    calib = read_calib(folder / "calib_cam_to_pose.txt")
+    velo = np.array([float(word) for word in read_text(folder / "calib_cam_to_velo.txt").split()])
+    if "image_00" not in calib or calib["image_00"].size != 12 or velo.size != 12:
+        raise MapvoteError(f"{folder}: calib_cam_to_pose.txt (image_00) and calib_cam_to_velo.txt need 12 numbers each")
+    T_imu_camera, T_lidar_camera = np.eye(4), np.eye(4)
+    T_imu_camera[:3], T_lidar_camera[:3] = calib["image_00"].reshape(3, 4), velo.reshape(3, 4)
+    return T_imu_camera @ geometry.inverse(T_lidar_camera)
+
+
+def is_nuscenes(path: Path) -> bool:
+    return any((path / folder).is_dir() for folder in _LIDAR_TOP) or (path.is_dir() and any(path.glob("*.pcd.bin")))
+
+
+def open_nuscenes(path: Path, options: DriveOptions) -> Drive:
+    """One scene of a dataset, or a folder of .pcd.bin scans without tables. MapvoteError lists the scenes to choose."""
+    about = read_drive_file(path)
+    tables = next((f for f in sorted(path.glob("v1.0-*")) if (f / "sample_data.json").is_file()), None)
+    layout = BinLayout(NUSCENES)
+
+    def read(file: Path) -> NDArray[np.void]:
+        table = layout.read(file).copy()
+        table["x"], table["y"] = table["y"].copy(), -table["x"]
+        return table
+
+    if tables is None:
+        folders = [path / folder for folder in _LIDAR_TOP] if not any(path.glob("*.pcd.bin")) else [path]
+        files = sorted((f for folder in folders for f in folder.glob("*.pcd.bin")), key=_microseconds_in_name)
+        if not files:
+            raise MapvoteError(f"{path}: no *.pcd.bin scans in {', '.join(_LIDAR_TOP)}")
+        log.warning("%s: no tables v1.0-*, so no poses: only the scans are read", path)
+        stamps = np.array([_microseconds_in_name(f) * 1000 for f in files], dtype=np.int64)
+        return open_scan_folder(path, about, options, ScanFolder(files, stamps, read))
+    rows = _scene(path, tables, options.topic or about.topic)
+    files = [path / row["filename"] for row in rows]
+    stamps = np.array([row["timestamp"] * 1000 for row in rows], dtype=np.int64)
+    poses, mounts = _nuscenes_table(tables / "ego_pose.json"), _nuscenes_table(tables / "calibrated_sensor.json")
+    T_base_lidar = _nuscenes_pose(mounts[rows[0]["calibrated_sensor_token"]])
+    T_base_lidar[:3, :3] = T_base_lidar[:3, :3] @ _NUSCENES_AXES
+    T_map_base = np.stack([_nuscenes_pose(poses[row["ego_pose_token"]]) for row in rows])
+
+    def prior() -> Trajectory | F64 | None:
+        return T_map_base @ T_base_lidar
+
+    folder = ScanFolder(files, stamps, read, prior, T_base_lidar=T_base_lidar)
+    return open_scan_folder(path, about, options, folder)
+
+
+def _microseconds_in_name(file: Path) -> int:
+    """Microseconds in a name such as n015-2018-07-24__LIDAR_TOP__1532402927647951.pcd.bin."""
+    return int(number_of(Path(file.name.removesuffix(".pcd.bin").rpartition("__")[2])))
+
+
+def _scene(path: Path, tables: Path, wanted: str | None) -> list[dict[str, Any]]:
+    """The rows of sample_data.json of one scene's LIDAR_TOP whose files are there, by time."""
+    scenes = {row["name"]: row["token"] for row in _nuscenes_table(tables / "scene.json").values()}
+    if wanted is None and len(scenes) == 1:
+        wanted = next(iter(scenes))
+    if wanted not in scenes:
+        raise MapvoteError(f"{path}: choose a scene with --topic: {', '.join(sorted(scenes)) or 'there is none'}")
+    samples = _nuscenes_table(tables / "sample.json")
+    rows = [
+        row
+        for row in _nuscenes_table(tables / "sample_data.json").values()
+        if "LIDAR_TOP" in row["filename"] and samples[row["sample_token"]]["scene_token"] == scenes[wanted]
+    ]
+    there = sorted((row for row in rows if (path / row["filename"]).is_file()), key=lambda row: row["timestamp"])
+    if not there:
+        raise MapvoteError(f"{path}: {wanted} has {len(rows)} scans in its tables, but none of their files is here")
+    if len(there) < len(rows):
+        log.warning("%s: %d of %d scans of %s are not here", path, len(rows) - len(there), len(rows), wanted)
+    return there
+
+
+def _nuscenes_table(file: Path) -> NuscenesTable:
+    try:
+        return {row["token"]: row for row in msgspec.json.decode(file.read_bytes())}
+    except (OSError, msgspec.DecodeError, KeyError, TypeError) as error:
+        raise MapvoteError(f"{file}: not a table of nuScenes ({error}); unpack the metadata again") from error
+
+
+def _nuscenes_pose(row: dict[str, Any]) -> F64:
+    T = np.eye(4)
+    T[:3, :3] = scipy.spatial.transform.Rotation.from_quat(row["rotation"], scalar_first=True).as_matrix()
+    T[:3, 3] = row["translation"]
+    return T
+
+
+def is_boreas(path: Path) -> bool:
+    return (path / "lidar").is_dir() and (path / "applanix").is_dir()
+
+
+def open_boreas(path: Path, options: DriveOptions) -> Drive:
+    """One sequence; its post-processed poses are the prior. The times of points count from the scan's."""
+    about = read_drive_file(path)
+    files = scan_files(path / "lidar", ".bin")
+    stamps_ns = np.array([int(number_of(f)) * 1000 for f in files], dtype=np.int64)
+    table = path / "applanix" / "lidar_poses.csv"
+
+    prior = _if_there(table, read_lidar_poses, " (test sequences keep it secret)")
+    return open_scan_folder(path, about, options, ScanFolder(files, stamps_ns, BinLayout(BOREAS_COLUMNS).read, prior))
+
+
+def read_lidar_poses(file: Path) -> Trajectory:
+    """GPSTime (microseconds), easting, northing, altitude, velocities, roll, pitch, heading (radians).
+
+    Boreas' rotations are those of its development kit: R_enu_lidar is the inverse of the usual roll, pitch, yaw.
+    """
+    with file.open() as stream:
+        header, text = stream.readline(), stream.read()
+    if "easting" not in header.lower():
+        raise MapvoteError(f"{file}: no header with GPSTime, easting, northing, altitude ...; copy it again")
+    rows = np.array([[float(v) for v in line.split(",")[:10]] for line in text.splitlines() if line.strip()])
+    if rows.ndim != 2 or rows.shape[1] < 10:
+        raise MapvoteError(f"{file}: rows need ten columns or more; copy it again")
+    stamps = np.array([int(line.split(",")[0]) for line in text.splitlines() if line.strip()], dtype=np.int64) * 1000
+    T = np.stack([geometry.from_xyz_rpy(0.0, 0.0, 0.0, *(float(v) for v in row[7:10])) for row in rows])
+    T[:, :3, :3] = T[:, :3, :3].swapaxes(1, 2)
+    T[:, :3, 3] = rows[:, 1:4]
+    return sorted_trajectory(stamps, T, of_vehicle=False, frame=MapFrame())
+
+
+def is_mulran(path: Path) -> bool:
+    return (path / "Ouster").is_dir()
+
+
+def open_mulran(path: Path, options: DriveOptions) -> Drive:
+    """One sequence; its global poses (UTM of zone 52, of the vehicle) are the prior."""
+    about = read_drive_file(path)
+    files = scan_files(path / "Ouster", ".bin")
+    stamps_ns = np.array([int(f.stem) if f.stem.isdigit() else int(number_of(f)) for f in files], dtype=np.int64)
+    table = path / "global_pose.csv"
+
+    prior = _if_there(table, _mulran_poses)
+    folder = ScanFolder(files, stamps_ns, BinLayout().read, prior, T_base_lidar=MULRAN_MOUNT)
+    return open_scan_folder(path, about, options, folder)
+
+
+def _mulran_poses(table: Path) -> Trajectory:
+    """T_map_base, in UTM of zone 52 where the coordinates are so large."""
+    rows = read_numbers(table, 13)
+    # The first column as text: float64 does not hold nanoseconds since 1970.
+    first = [line.split(",")[0].strip() for line in read_text(table).splitlines() if line.strip()]
+    times = [int(word) if word.isdigit() else int(float(word)) for word in first]
+    T = np.tile(np.eye(4), (len(rows), 1, 1))
+    T[:, :3] = rows[:, 1:].reshape(-1, 3, 4)
+    check_rigid(T, str(table))
+    frame = MapFrame("EPSG:32652") if np.abs(T[0, :2, 3]).max() > 1e5 else MapFrame()
+    return sorted_trajectory(np.array(times, dtype=np.int64), T, of_vehicle=True, frame=frame)
+
+
+def _newer_college_scans(path: Path) -> Path | None:
+    return next(
+        (path / f for f in _NEWER_COLLEGE if (path / f).is_dir() and any((path / f).glob("cloud_*_*.pcd"))),
+        None,
+    )
+
+
+def is_newer_college(path: Path) -> bool:
+    return _newer_college_scans(path) is not None
+
+
+def open_newer_college(path: Path, options: DriveOptions) -> Drive:
+    """One experiment; its registered poses are the prior."""
+    about = read_drive_file(path)
+    files = sorted((_newer_college_scans(path) or path).glob("cloud_*_*.pcd"), key=_newer_college_stamp_ns)
+    stamps_ns = np.array([_newer_college_stamp_ns(f) for f in files], dtype=np.int64)
+    table = path / "ground_truth" / "registered_poses.csv"
+
+    def read(file: Path) -> NDArray[np.void]:
+        return read_pcd_table(file)[0]
+
+    prior = _if_there(table, lambda file: replace(read_trajectory(file), of_vehicle=True))
+    folder = ScanFolder(files, stamps_ns, read, prior, T_base_lidar=NEWER_COLLEGE_MOUNT)
+    return open_scan_folder(path, about, options, folder)
+
+
+def _newer_college_stamp_ns(file: Path) -> int:
+    words = file.stem.split("_")
+    if len(words) < 3 or not (words[1].isdigit() and words[2].isdigit()):
+        raise MapvoteError(f"{file}: its name is not cloud_SECONDS_NANOSECONDS.pcd")
+    return int(words[1]) * 10**9 + int(words[2])
+
+
+def is_oxford(path: Path) -> bool:
+    return any((path / name).is_dir() for name in _OXFORD_LIDARS)
+
+
+def open_oxford(path: Path, options: DriveOptions) -> Drive:
+    """One LiDAR of a traversal, the left one unless --topic velodyne_right; the INS is the prior."""
+    about = read_drive_file(path)
+    there = [name for name in _OXFORD_LIDARS if (path / name).is_dir()]
+    name = options.topic or about.topic or there[0]
+    if name not in there:
+        raise MapvoteError(f"{path}: no {name}; --topic chooses one of {', '.join(there)}")
+    files = scan_files(path / name, ".bin")
+    stamps_ns = np.array([int(number_of(f)) * 1000 for f in files], dtype=np.int64)
+    table, mount = path / "gps" / "ins.csv", path / "extrinsics" / f"{name}.txt"
+    T_base_lidar = np.eye(4)
+    if mount.is_file():
+        T_base_lidar = (
+            _OXFORD_AXES @ geometry.from_xyz_rpy(*(float(v) for v in read_numbers(mount, 6)[0])) @ _OXFORD_AXES
+        )
+    elif options.mount is None and about.T_base_lidar is None:
+        log.warning("%s: missing, so the LiDAR is taken to sit at the INS; give --mount", mount)
+
+    def prior() -> Trajectory | F64 | None:
+        if not table.is_file():
+            log.warning("%s: missing, so there is no prior", table)
+            return None
+        return read_ins(table)
+
+    return open_scan_folder(
+        path, about, options, ScanFolder(files, stamps_ns, _oxford_rows, prior, T_base_lidar=T_base_lidar)
+    )
+
+
+def _oxford_rows(file: Path) -> NDArray[np.void]:
+    """Four rows of float32 (x, y, z, intensity), one after the other."""
+    data = read_bytes(file)
+    if len(data) % 16:
+        raise MapvoteError(f"{file}: {len(data)} bytes are no four rows of float32: the scan is cut off; copy it again")
+    rows = np.frombuffer(data, dtype="<f4").reshape(4, -1)
+    table = np.empty(rows.shape[1], dtype=[(n, "<f4") for n in ("x", "y", "z", "intensity")])
+    table["x"], table["y"], table["z"], table["intensity"] = rows[0], -rows[1], -rows[2], rows[3]
+    return table
+
+
+def read_ins(file: Path) -> Trajectory:
+    """T_map_base in UTM of ins.csv: microseconds; northing, easting, down (m); roll, pitch, yaw from north (rad)."""
+    lines = [line.split(",") for line in read_text(file).splitlines() if line.strip()]
+    names = [name.strip() for name in lines[0]]
+    wanted = ("northing", "easting", "down", "roll", "pitch", "yaw", "latitude", "longitude")
+    missing = [name for name in ("timestamp", *wanted) if name not in names]
+    if missing or len(lines) < 2:
+        raise MapvoteError(f"{file}: no rows, or no column {', '.join(missing)}")
+    try:
+        rows = np.array([[float(line[names.index(name)]) for name in wanted] for line in lines[1:]])
+        times = np.array([int(line[names.index("timestamp")]) for line in lines[1:]], dtype=np.int64) * 1000
+    except (ValueError, IndexError) as error:
+        raise MapvoteError(f"{file}: a row is not whole ({error}); copy it again") from error
+    T_ned = np.stack([geometry.from_xyz_rpy(*(float(v) for v in row[:6])) for row in rows])
+    frame = MapFrame(utm_of(float(rows[0, 7]), float(rows[0, 6])))
+    return sorted_trajectory(times, _NORTH_EAST_DOWN @ T_ned @ _OXFORD_AXES, of_vehicle=True, frame=frame)
