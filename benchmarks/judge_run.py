@@ -19,7 +19,7 @@ from mapvote.detection.voter import Voter
 from mapvote.localisation.prepare import deskew, motion_at
 from mapvote.perception.frontend import Observation
 from mapvote.vehicle import Vehicle
-from mapvote_lab.evaluation.baselines.nearest_neighbour import heights
+from mapvote_lab.evaluation.baselines.nearest_neighbour import heights_above_ground
 from mapvote_lab.evaluation.experiments.cases import ballot_states
 from mapvote_lab.evaluation.scoring.cells import score_cells
 from mapvote_lab.evaluation.scoring.truth import Truth, error_summary, lay_on, rigid_between
@@ -65,7 +65,7 @@ def judge(street: Street, last: int | None) -> dict[str, Any]:
     watched = vehicle._voter = Watched(vehicle._voter)
     points_map = all_points(street.point_map)
     vgicp, dufo = Vgicp(points_map, street.T_true), Dufomap(LOOK_AHEAD)
-    above = heights(street.point_map, points_map) > GROUND_MARGIN_M
+    above = heights_above_ground(street.point_map, points_map) > GROUND_MARGIN_M
     grid = None if street.truth is None else street.truth.grid_on(street.point_map.lattice)
     half = 0.5 * vehicle.settings.voting.window_m
     clouds = CloudToCloud(points_map[above], grid or _around(street), half)
@@ -155,7 +155,7 @@ def _quality_of_peers(
     out = {"poses": _poses(street, np.array(vgicp.poses)), "lost": vgicp.lost}
     if street.truth is not None:
         out["movers"] = _movers(street, watched, lambda i, n: dufo.masks[i])
-        states = clouds.states(lambda points: heights(street.point_map, points) > GROUND_MARGIN_M)
+        states = clouds.states(lambda points: heights_above_ground(street.point_map, points) > GROUND_MARGIN_M)
         out["changes"] = _changes(street.truth, states)
     return out
 

@@ -107,7 +107,7 @@ def evaluate(
     from mapvote_lab.evaluation.experiments.conditions import Conditions
     from mapvote_lab.evaluation.experiments.paper_readings import PUBLISHED, as_paper
     from mapvote_lab.evaluation.experiments.scene import Scene
-    from mapvote_lab.evaluation.reporting.tables import as_json, tables, write_text
+    from mapvote_lab.evaluation.reporting.tables import result_json, tables, write_text
 
     if scenario == "real":
         if drive is None:
@@ -134,7 +134,7 @@ def evaluate(
     for sheet in tables(result):
         Console(width=140).print(sheet.to_rich())
     if json is not None:
-        write_text(as_json(result), json)
+        write_text(result_json(result), json)
         print(f"{json}: all numbers")
     if figures is not None:
         _draw_figures(evaluation, figures)

@@ -20,7 +20,7 @@ from mapvote_lab.evaluation.evaluate import Evaluation, evaluate
 from mapvote_lab.evaluation.experiments.cases import choose_cases
 from mapvote_lab.evaluation.experiments.scene import Scene
 from mapvote_lab.evaluation.reporting import tables
-from mapvote_lab.evaluation.reporting.html import Section, page
+from mapvote_lab.evaluation.reporting.html import ReportSection, page
 from mapvote_lab.evaluation.results import EvaluationResult, to_json
 from mapvote_lab.evaluation.scoring.truth import error_summary, pose_errors, rigid_between
 
@@ -46,7 +46,7 @@ def without_timings(result: EvaluationResult) -> str:
 
 
 def test_the_json_is_as_designed_and_never_nan(corner: Evaluation) -> None:
-    result = json.loads(tables.as_json(corner.result))
+    result = json.loads(tables.result_json(corner.result))
     assert result["cells"] == corner.truth.strict.size
     assert 0.0 < result["coverage"] <= 1.0
     for case in ("1", "3", "5", "surfaces"):
@@ -86,7 +86,7 @@ def test_tables_show_every_case_and_the_papers_figures(corner: Evaluation) -> No
     text = tables.as_text(corner.result)
     for shown in ("Table II", "Table III", "Table IV", "case 5", "surfaces", "0.850", "0.645", "What the map is for"):
         assert shown in text
-    lines = tables.as_csv(corner.result).splitlines()
+    lines = tables.result_csv(corner.result).splitlines()
     assert lines[0] == "case,truth,metric,class,value"
     assert len(lines) > 4 * 2 * 11
 
@@ -131,7 +131,7 @@ def test_abstentions_are_counted_not_averaged() -> None:
 
 
 def test_the_page_needs_nothing_else_and_escapes_what_it_is_given() -> None:
-    html = page("A <b> title", "lead & more", [("3", "facts")], [Section("One", ["<script>alert(1)</script>"])])
+    html = page("A <b> title", "lead & more", [("3", "facts")], [ReportSection("One", ["<script>alert(1)</script>"])])
     assert "<script" not in html
     assert "A &lt;b&gt; title" in html
     assert "http://" not in html

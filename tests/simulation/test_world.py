@@ -8,7 +8,7 @@ import pytest
 from mapvote.core.types import MapvoteError
 from mapvote_lab.simulation.actors import make_traffic
 from mapvote_lab.simulation.routes import make_routes
-from mapvote_lab.simulation.scenario import load_scenario, names
+from mapvote_lab.simulation.scenario import load_scenario, scenario_names
 from mapvote_lab.simulation.truth import CHANGED_EMPTY, CHANGED_OCCUPIED, UNCHANGED, UNSCORED, label_cells, truth_grid
 from mapvote_lab.simulation.world import Body, Role, make_world
 
@@ -29,7 +29,7 @@ def test_the_papers_street_has_its_514900_cells_and_four_changed_areas(name: str
     assert buildings.count(Role.REMOVED) == 8
 
 
-@pytest.mark.parametrize("name", names())
+@pytest.mark.parametrize("name", scenario_names())
 def test_every_scenario_lays_out_by_seed_and_differently_by_another(name: str) -> None:
     scenario = load_scenario(name)
     one, again, other = (make_world(scenario, seed) for seed in (4, 4, 5))

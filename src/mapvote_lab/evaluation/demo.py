@@ -20,7 +20,7 @@ from mapvote_lab.evaluation.experiments.cases import choose_cases
 from mapvote_lab.evaluation.experiments.scene import Progress, Scene
 from mapvote_lab.evaluation.loopback import vote_by_http
 from mapvote_lab.evaluation.reporting.gallery import gallery
-from mapvote_lab.evaluation.reporting.tables import as_csv, as_json, as_text, write_text
+from mapvote_lab.evaluation.reporting.tables import as_text, result_csv, result_json, write_text
 from mapvote_lab.evaluation.scoring.map_points import same_rows
 
 SCENARIO, FULL_SCENARIO = "corner", "street"
@@ -54,8 +54,8 @@ def demo(out: Path, full: bool = False, progress: Progress | None = None) -> tup
             write_pcd(partial, Cloud(all_points(point_map)))
     pictures = gallery(evaluation, CASE, out / "pictures")
     write_text(as_text(evaluation.result), out / "tables.txt")
-    write_text(as_json(evaluation.result), out / "results.json")
-    write_text(as_csv(evaluation.result), out / "results.csv")
+    write_text(result_json(evaluation.result), out / "results.json")
+    write_text(result_csv(evaluation.result), out / "results.csv")
     write_map(updated, out / "map_after")
     story = tell(evaluation, done)
     write_text(

@@ -12,9 +12,9 @@ from mapvote.core.grid import CELL_SIZE
 from mapvote.core.point_map import all_points
 from mapvote.server.views.cutout import Cutout, fragment
 from mapvote_lab.evaluation.evaluate import Evaluation
-from mapvote_lab.evaluation.loopback import Published
+from mapvote_lab.evaluation.loopback import PublishedRound
 from mapvote_lab.evaluation.reporting.gallery import Area, areas_of
-from mapvote_lab.evaluation.reporting.html import Section, page
+from mapvote_lab.evaluation.reporting.html import ReportSection, page
 from mapvote_lab.evaluation.reporting.tables import case_name, readings_table, tables
 from mapvote_lab.evaluation.results import EvaluationResult
 from mapvote_lab.evaluation.scoring import paper_tables
@@ -44,7 +44,7 @@ class Story:
     """What the server wanted an operator to look at first."""
 
 
-def tell(evaluation: Evaluation, done: Published) -> Story:
+def tell(evaluation: Evaluation, done: PublishedRound) -> Story:
     """Count what the vote changed, area by area."""
     old, new = all_points(evaluation.first_map), all_points(evaluation.outcomes[CASE].updated)
     survived, added = same_rows(old, new)
@@ -74,13 +74,13 @@ def report_page(
     drawn = {path.stem: (path, caption) for path, caption in pictures}
     sections = [
         _what_happened(evaluation, [drawn["street"]]),
-        Section(
+        ReportSection(
             "The changed areas",
             ["Drag to turn the cloud; what went are blue crosses, what came red diamonds."] if cutouts else [],
             markup=fragment(cutouts) if cutouts else "",
             pictures=[drawn[area.name.replace(" ", "_")] for area, _, _ in story.areas],
         ),
-        Section(
+        ReportSection(
             "What a vehicle sees and how it votes",
             [
                 "A scan falls onto a grid of 0.3 m cells, 80 m wide. Each cell is unchanged, changed or "
@@ -92,7 +92,7 @@ def report_page(
         _what_the_server_decided(story, [drawn["states"]]),
         _how_good(evaluation.result, drawn),
         beside_the_paper(evaluation.result),
-        Section(
+        ReportSection(
             "What to try next",
             [f"Maps, tables and pictures lie beside this page; the drives in {evaluation.scene.folder}."],
             commands=commands(evaluation, out),
@@ -119,9 +119,9 @@ def _facts(result: EvaluationResult, story: Story) -> list[tuple[str, str]]:
     ]
 
 
-def _what_happened(evaluation: Evaluation, pictures: list[Picture]) -> Section:
+def _what_happened(evaluation: Evaluation, pictures: list[Picture]) -> ReportSection:
     scans = sum(place.scans for place in evaluation.result.localisation.values())
-    return Section(
+    return ReportSection(
         "What happened",
         [
             f"A survey vehicle mapped {evaluation.window.cols * CELL_SIZE:.0f} m of a simulated street. Then buildings "
@@ -135,8 +135,8 @@ def _what_happened(evaluation: Evaluation, pictures: list[Picture]) -> Section:
     )
 
 
-def _what_the_server_decided(story: Story, pictures: list[Picture]) -> Section:
-    return Section(
+def _what_the_server_decided(story: Story, pictures: list[Picture]) -> ReportSection:
+    return ReportSection(
         "What the server decided",
         [
             "A mapvote server in a process of its own took the ballots by HTTP, decided every cell and published "
@@ -148,8 +148,8 @@ def _what_the_server_decided(story: Story, pictures: list[Picture]) -> Section:
     )
 
 
-def _how_good(result: EvaluationResult, drawn: Mapping[str, Picture]) -> Section:
-    return Section(
+def _how_good(result: EvaluationResult, drawn: Mapping[str, Picture]) -> ReportSection:
+    return ReportSection(
         "How good that is",
         [
             f"F1 is the mean over unchanged, changed (occupied) and changed (empty), as in the paper's Table IV: "
@@ -164,13 +164,13 @@ def _how_good(result: EvaluationResult, drawn: Mapping[str, Picture]) -> Section
     )
 
 
-def beside_the_paper(result: EvaluationResult) -> Section:
+def beside_the_paper(result: EvaluationResult) -> ReportSection:
     """The paper's Table IV, ours in both readings of an occluded scan, and why they differ."""
     built = result.truth_sizes["strict"]["changed_occupied"]
     high = sum(cells for band, cells in built.items() if band != BANDS[0])
     abstains, votes = (result.readings[name] for name in ("occluded abstains", "as set"))
     ours = {case: abstains[case]["provenance"].macro_f1 for case in paper_tables.F1}
-    return Section(
+    return ReportSection(
         "Beside the paper's own table",
         [
             f"What is scored: of the {sum(built.values())} cells that a noise-free survey finds newly occupied, {high} "

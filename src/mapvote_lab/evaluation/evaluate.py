@@ -18,11 +18,11 @@ from mapvote_lab.evaluation.experiments.changed_areas import in_changed_areas, s
 from mapvote_lab.evaluation.experiments.kept import read_kept
 from mapvote_lab.evaluation.experiments.paper_readings import swept
 from mapvote_lab.evaluation.experiments.passes import Pass, pass_folder, passes
-from mapvote_lab.evaluation.experiments.pose_errors import localisation, map_frame, map_shift
+from mapvote_lab.evaluation.experiments.pose_errors import T_map_world_of, localisation, map_shift
 from mapvote_lab.evaluation.experiments.scene import Progress, Scene
 from mapvote_lab.evaluation.results import CaseResult, Cost, EvaluationResult, Timings
 from mapvote_lab.evaluation.scoring.cells import Scores
-from mapvote_lab.evaluation.scoring.jury import Jury, Outcome
+from mapvote_lab.evaluation.scoring.jury import CaseOutcome, Jury
 from mapvote_lab.evaluation.scoring.truth import Truth
 from mapvote_lab.evaluation.scoring.truths import SIDE_BY_SIDE, sizes_by_height
 
@@ -36,7 +36,7 @@ class Evaluation:
     truth: Truth
     window: Grid
     first_map: PointMap
-    outcomes: Mapping[str, Outcome]
+    outcomes: Mapping[str, CaseOutcome]
     drives: Sequence[Pass]
     best: str
     """The case whose updated map is shown: the one that the settings vote by, else the first."""
@@ -65,7 +65,7 @@ def evaluate(
     jury = Jury(first_map, truth)
     best = _best(scene, cases)
     outcomes, entries = _scored(scene, cases, drives, jury, progress)
-    T_map_world = map_frame(scene)
+    T_map_world = T_map_world_of(scene)
     maps = {"old map": (first_map, T_map_world), f"updated map ({best})": (outcomes[best].updated, T_map_world)}
     scored = time.perf_counter()
     costs = {}
@@ -119,9 +119,9 @@ def _best(scene: Scene, cases: Sequence[Case]) -> str:
 
 def _scored(
     scene: Scene, cases: Sequence[Case], drives: Sequence[Pass], jury: Jury, progress: Progress | None
-) -> tuple[dict[str, Outcome], dict[str, CaseResult]]:
+) -> tuple[dict[str, CaseOutcome], dict[str, CaseResult]]:
     """By case: what the server makes of its ballots, and the scores."""
-    outcomes: dict[str, Outcome] = {}
+    outcomes: dict[str, CaseOutcome] = {}
     entries: dict[str, CaseResult] = {}
     for i, case in enumerate(cases):
         if progress:

@@ -20,7 +20,7 @@ _STOP_S = 20.0
 
 
 @dataclass(frozen=True, slots=True)
-class Published:
+class PublishedRound:
     """What a server made of a fleet's ballots."""
 
     updated: PointMap
@@ -54,7 +54,7 @@ def running_server(store: Path, first_map: Path, log: Path) -> Iterator[str]:
                 server.kill()
 
 
-def vote_by_http(ballots: Sequence[Ballot], first_map: Path, folder: Path) -> Published:
+def vote_by_http(ballots: Sequence[Ballot], first_map: Path, folder: Path) -> PublishedRound:
     """Start a server, send every ballot as its vehicle would, publish, and download the newest map.
 
     ``folder`` keeps the store, the clients' homes and the server's log. MapvoteError if the server refuses a ballot.
@@ -77,4 +77,4 @@ def vote_by_http(ballots: Sequence[Ballot], first_map: Path, folder: Path) -> Pu
             raise MapvoteError(f"{url}: publishing failed ({answer.status_code}); see {folder / 'server.log'}")
         with MapClient(url, home=folder / "reader") as client:
             updated = client.fetch()
-            return Published(updated, client.version or 0, held)
+            return PublishedRound(updated, client.version or 0, held)

@@ -18,7 +18,7 @@ class _Table(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
-class Change(_Table):
+class PlannedChange(_Table):
     """Buildings built or demolished between the survey and the vehicles, side by side."""
 
     kind: Literal["built", "demolished"]
@@ -28,7 +28,7 @@ class Change(_Table):
     count: int = Field(default=1, ge=1)
 
 
-class Traffic(_Table):
+class TrafficDensity(_Table):
     """Mean distances between moving bodies on a lane, a kerb side, a sidewalk, metres; 0 = none of them."""
 
     car_spacing_m: float = Field(default=30.0, ge=0)
@@ -99,17 +99,13 @@ class Scenario(_Table):
         description="the front row are plain blocks with flat roofs, near the sidewalk; no second row",
     )
     temporary_cars: int = Field(default=0, ge=0, description="extra cars parked during one vehicle's pass only")
-    traffic: Traffic = Traffic()
+    traffic: TrafficDensity = TrafficDensity()
     clutter: Clutter = Clutter()
     flaws: Flaws = Flaws()
-    changes: tuple[Change, ...] = ()
+    changes: tuple[PlannedChange, ...] = ()
 
 
-ALIASES = {"paper": "street570"}
-"""Older names of scenarios."""
-
-
-def names() -> list[str]:
+def scenario_names() -> list[str]:
     """Scenarios that come with mapvote."""
     return sorted(p.name.removesuffix(".toml") for p in resources.files(__package__).joinpath("scenarios").iterdir())
 
@@ -117,16 +113,17 @@ def names() -> list[str]:
 def load_scenario(scenario: str | Path, overrides: Mapping[str, Any] | None = None) -> Scenario:
     """A scenario by name or TOML file; ``overrides`` replace fields, key by key in its
     tables. MapvoteError names a key that does not exist."""
-    scenario = ALIASES.get(str(scenario), scenario)
     path = Path(scenario)
     if path.suffix == ".toml":
         if not path.is_file():
             raise MapvoteError(f"{path}: no such scenario file")
         text = path.read_text()
-    elif str(scenario) in names():
+    elif str(scenario) in scenario_names():
         text = resources.files(__package__).joinpath("scenarios", f"{scenario}.toml").read_text()
     else:
-        raise MapvoteError(f"no scenario '{scenario}': choose one of {', '.join(names())} or give a .toml file")
+        raise MapvoteError(
+            f"no scenario '{scenario}': choose one of {', '.join(scenario_names())} or give a .toml file"
+        )
     try:
         table = tomllib.loads(text)
         for key, value in (overrides or {}).items():

@@ -19,7 +19,7 @@ from mapvote_lab.evaluation.experiments.attacks import (
     all_changed,
     false_points,
     invert,
-    replay,
+    replayed,
     shift,
     stale,
 )
@@ -78,7 +78,7 @@ def test_an_old_street_knows_no_change() -> None:
 def test_a_replayed_ballot_is_the_other_vehicles_under_ones_own_name() -> None:
     point_map = two_walls()
     mine = make_ballot(point_map, {TILE: Say(states_plane())}, vehicle="liar", drive="d9")
-    copy = replay(mine, point_map, honest(point_map, "v1"))
+    copy = replayed(mine, point_map, honest(point_map, "v1"))
     assert (copy.vehicle, copy.drive) == ("liar", "d9")
     assert copy.tiles == honest(point_map, "v1").tiles
 

@@ -24,7 +24,7 @@ from mapvote_lab.evaluation.scoring.cells import (
     Scores,
     classes_of,
     confusion,
-    coverage,
+    determined_share,
     harmonic_mean,
     ratio,
     score_cells,
@@ -94,8 +94,8 @@ def test_coverage_is_of_any_vehicle_over_scored_cells() -> None:
     truth = np.array([[0, 1, 2, 0, UNSCORED]], dtype=np.uint8)
     one = np.array([[0, 4, 255, 255, 0]], dtype=np.uint8)
     two = np.array([[255, 2, 4, 255, 0]], dtype=np.uint8)
-    assert coverage([one, two], truth) == 0.5
-    assert coverage([], truth) == 0.0
+    assert determined_share([one, two], truth) == 0.5
+    assert determined_share([], truth) == 0.0
 
 
 def wall(x: float) -> np.ndarray:

@@ -19,7 +19,7 @@ DISTANCE_M = 0.5
 _MERGE_EVERY = 16
 
 
-def heights(point_map: PointMap, points: F64) -> F64:
+def heights_above_ground(point_map: PointMap, points: F64) -> F64:
     """(n,) metres above the map's ground of points (n, 3); above the nearest known ground where it is unknown."""
     lattice = point_map.lattice
     rows, cols = lattice.cells_of(points) if len(points) else (np.zeros(1, np.int64), np.zeros(1, np.int64))

@@ -59,14 +59,14 @@ def stale(ballot: Ballot, point_map: PointMap, other: Ballot) -> Ballot:
     return _claim(ballot, point_map, lie)
 
 
-def replay(ballot: Ballot, point_map: PointMap, other: Ballot) -> Ballot:
+def replayed(ballot: Ballot, point_map: PointMap, other: Ballot) -> Ballot:
     """Sends another vehicle's ballot under its own name: that vehicle's errors get more votes."""
     return msgspec.structs.replace(other, vehicle=ballot.vehicle, drive=ballot.drive)
 
 
 def jitter(ballot: Ballot, point_map: PointMap, other: Ballot) -> Ballot:
-    """As :func:`replay`, all of it moved by a cell to the north-east so that nothing is the same."""
-    return _moved(replay(ballot, point_map, other), 1)
+    """As :func:`replayed`, all of it moved by a cell to the north-east so that nothing is the same."""
+    return _moved(replayed(ballot, point_map, other), 1)
 
 
 def shift(ballot: Ballot, point_map: PointMap, other: Ballot) -> Ballot:
@@ -83,7 +83,7 @@ ATTACKS: Mapping[str, Attack] = {
     "inverting": invert,
     "everything changed": all_changed,
     "replaying the old street": stale,
-    "replaying another vehicle": replay,
+    "replaying another vehicle": replayed,
     "replaying another vehicle, moved by a cell": jitter,
     "shifting by 3 cells": shift,
     "right states, false points": false_points,

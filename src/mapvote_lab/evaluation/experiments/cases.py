@@ -21,7 +21,7 @@ from mapvote.core.types import NO_VOTE, U8, MapvoteError
 from mapvote.core.voting import decide
 from mapvote.fusion.fuse import states_over
 from mapvote.fusion.offline import update_map
-from mapvote_lab.evaluation.scoring.jury import Outcome
+from mapvote_lab.evaluation.scoring.jury import CaseOutcome
 from mapvote_lab.evaluation.scoring.truth import lay_on
 
 OCCLUSIONS: Mapping[str, Mapping[str, str]] = {
@@ -86,7 +86,7 @@ def choose_cases(settings: Settings, wanted: str) -> tuple[list[Case], bool]:
 
 def fuse_case(
     point_map: PointMap, ballots: Sequence[Ballot], min_votes: int, fuse: FuseSettings, window: Grid
-) -> Outcome:
+) -> CaseOutcome:
     """The server's side of one case (paper IV): decide every cell, edit the map."""
     start = time.perf_counter()
     settings = fuse.model_copy(update={"min_votes": min_votes})
@@ -94,7 +94,7 @@ def fuse_case(
     seconds = time.perf_counter() - start
     states, grid = states_over(point_map.lattice, decisions)
     own = [lay_on(*ballot_states(ballot, point_map), window) for ballot in ballots]
-    return Outcome(updated, lay_on(states, grid, window), own, decisions, seconds)
+    return CaseOutcome(updated, lay_on(states, grid, window), own, decisions, seconds)
 
 
 def ballot_states(ballot: Ballot, point_map: PointMap) -> tuple[U8, Grid]:

@@ -29,7 +29,7 @@ from mapvote_lab.evaluation.experiments.pose_errors import localisation, map_shi
 from mapvote_lab.evaluation.experiments.scene import BALLOTS_FROM, Progress, Scene, key_of, sources_digest
 from mapvote_lab.evaluation.results import MatrixResult, RoundResult, to_json
 from mapvote_lab.evaluation.scoring.cells import UNSCORED, determined, ratio, score_cells
-from mapvote_lab.evaluation.scoring.jury import Jury, Outcome
+from mapvote_lab.evaluation.scoring.jury import CaseOutcome, Jury
 from mapvote_lab.simulation.processes import processes
 
 _SCORES_FROM = (
@@ -202,7 +202,7 @@ class Matrix:
                 scene.drop_drives()
 
 
-def _judged(outcome: Outcome, jury: Jury) -> RoundResult:
+def _judged(outcome: CaseOutcome, jury: Jury) -> RoundResult:
     """With two more views that others may prefer: old surfaces that no survey saw counted as unchanged, and the share
     of cells that the fleet determined."""
     strict, provenance = jury.truth.with_old_surfaces()

@@ -75,19 +75,19 @@ def tallies(drive: KeptDrive, mapped: Bool, rules: Iterable[Rule]) -> dict[Rule,
     return found
 
 
-def rule_of(case: Case) -> Rule:
+def counting_rule(case: Case) -> Rule:
     """Cases that differ only in who decides count alike."""
     return case.voting.model_copy(update={"two_stage": True}), case.paper
 
 
 def decided(drives: Sequence[KeptDrive], mapped: Bool, cases: Sequence[Case]) -> dict[str, tuple[U8, list[U8]]]:
     """By case's name: (what the server decides, what each vehicle does), over the truth's window."""
-    rules = list(dict.fromkeys(rule_of(case) for case in cases))
+    rules = list(dict.fromkeys(counting_rule(case) for case in cases))
     counted = [tallies(drive, mapped, rules) for drive in drives]
     own = {rule: [decide(one[rule]) for one in counted] for rule in rules}
     out = {}
     for case in cases:
-        rule = rule_of(case)
+        rule = counting_rule(case)
         if case.voting.two_stage:
             votes = [one_hot(states) for states in own[rule]]
         else:

@@ -27,7 +27,7 @@ def map_shift(scene: Scene) -> MapShift:
     )
 
 
-def map_frame(scene: Scene) -> F64:
+def T_map_world_of(scene: Scene) -> F64:
     """T_map_world: the truth's frame in the map's, by the survey's trajectory."""
     names = scene.drive_names("survey_")
     believed = np.concatenate([scene.survey_poses(n) for n in names])
@@ -36,5 +36,5 @@ def map_frame(scene: Scene) -> F64:
 
 def localisation(scene: Scene, drives: Sequence[Pass]) -> dict[str, PoseErrors]:
     """Each vehicle's pose errors in the map's frame."""
-    T_map_world = map_frame(scene)
+    T_map_world = T_map_world_of(scene)
     return {d.vehicle: error_summary(d.T_map_lidar, T_map_world @ scene.true_poses(d.vehicle)) for d in drives}

@@ -17,7 +17,7 @@ from mapvote.core.point_map import PointMap, all_points
 from mapvote.core.types import F32, F64, U8, Bool, CellState
 from mapvote.localisation.localiser import GivenPoses
 from mapvote.vehicle import Vehicle
-from mapvote_lab.evaluation.baselines.nearest_neighbour import heights
+from mapvote_lab.evaluation.baselines.nearest_neighbour import heights_above_ground
 from mapvote_lab.evaluation.evaluate import Evaluation
 from mapvote_lab.evaluation.experiments.cases import YARDSTICKS, ballot_states, paper_cases
 from mapvote_lab.evaluation.reporting import birdseye, figures
@@ -79,7 +79,8 @@ def drawn(evaluation: Evaluation, case: str) -> list[tuple[str, Figure, str]]:
     outlines = [(o["kind"], np.asarray(o["footprint"])) for o in evaluation.truth.objects]
     boxes = [(area.name, area.box) for area in areas]
     street = figures.street(
-        (old, heights(evaluation.first_map, old)), (new, heights(evaluation.first_map, new)), added, deleted,
+        (old, heights_above_ground(evaluation.first_map, old)), (new, heights_above_ground(evaluation.first_map, new)),
+        added, deleted,
         evaluation.window, outlines=outlines, areas=boxes, paths=paths,
     )  # fmt: skip
     pictures = [("street", street, f"The street from above before and after the vote ({case_name(case)}): Figure 6.")]
@@ -170,7 +171,7 @@ def _area(
 
     def coloured(points: F64, marked: Bool, colour: str) -> tuple[F64, F32]:
         here = inside(points)
-        colours = birdseye.shades(heights(first_map, points[here]))
+        colours = birdseye.shades(heights_above_ground(first_map, points[here]))
         colours[marked[here]] = to_rgb(colour)
         return points[here], colours
 
@@ -203,7 +204,7 @@ def _scan(evaluation: Evaluation, index: int) -> Figure:
     scan, moving = drive.read_scan(index), evaluation.truth.moving(evaluation.drives[0].vehicle, index)
     points = transform(T_map_lidar, scan.points)
     ground_z = float(T_map_lidar[2, 3] - drive.T_base_lidar[2, 3])
-    colours = birdseye.shades(heights(evaluation.first_map, points))
+    colours = birdseye.shades(heights_above_ground(evaluation.first_map, points))
     if len(moving) == len(points):
         colours[moving] = to_rgb(MOVER)
     near = np.linalg.norm(points[:, :2] - T_map_lidar[:2, 3], axis=1) < 45.0

@@ -41,7 +41,7 @@ _PIXELS = 1.7
 
 
 @dataclass(frozen=True, slots=True)
-class Section:
+class ReportSection:
     """A heading, paragraphs of plain text, pictures with captions, tables, and lines to type."""
 
     heading: str
@@ -53,7 +53,7 @@ class Section:
     """HTML as it is, from those who made it safe."""
 
 
-def page(title: str, lead: str, facts: Sequence[tuple[str, str]], sections: Sequence[Section]) -> str:
+def page(title: str, lead: str, facts: Sequence[tuple[str, str]], sections: Sequence[ReportSection]) -> str:
     """The page. ``facts`` are (figure, what it is); every text is escaped, every picture inlined as it lies on disk."""
     cards = "".join(f"<div><b>{escape(figure)}</b><span>{escape(what)}</span></div>" for figure, what in facts)
     body = "\n".join(_section(section) for section in sections)
@@ -65,7 +65,7 @@ def page(title: str, lead: str, facts: Sequence[tuple[str, str]], sections: Sequ
     )
 
 
-def _section(section: Section) -> str:
+def _section(section: ReportSection) -> str:
     parts = [f"<h2>{escape(section.heading)}</h2>"]
     parts += [f"<p>{escape(text)}</p>" for text in section.text]
     parts += [section.markup] if section.markup else []

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from mapvote_lab.evaluation.experiments.real.bench import BUILT, BUILT_IN_RAIN, Bench, unchanged_figures
-from mapvote_lab.evaluation.experiments.real.changes import Found, precision_near, score
+from mapvote_lab.evaluation.experiments.real.changes import FoundThings, precision_near, score
 from mapvote_lab.evaluation.experiments.real.street import largest_false_changes
 from mapvote_lab.evaluation.reporting.sheets import Sheet
 
@@ -84,7 +84,7 @@ def _in_rain(bench: Bench, case: str) -> Sheet:
     return Sheet(f"{bench.name}: {BUILT_IN_RAIN}, {case}, beside the dry run", headings, rows)
 
 
-def _found(bench: Bench, case: str, name: str) -> list[Found]:
+def _found(bench: Bench, case: str, name: str) -> list[FoundThings]:
     """By kind; nothing of a run that was not made."""
     if name not in bench.changed:
         return []

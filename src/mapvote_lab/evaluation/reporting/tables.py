@@ -168,12 +168,12 @@ def as_text(result: EvaluationResult) -> str:
     return "\n".join(line.rstrip() for line in out.getvalue().splitlines()) + "\n"
 
 
-def as_json(result: EvaluationResult) -> str:
+def result_json(result: EvaluationResult) -> str:
     """The result with sorted keys; ValueError if a number is NaN or infinite."""
     return to_json(result, sort_keys=True)
 
 
-def as_csv(result: EvaluationResult) -> str:
+def result_csv(result: EvaluationResult) -> str:
     """One line a number: case, truth, metric, class, value."""
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")

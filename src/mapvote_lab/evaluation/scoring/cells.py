@@ -93,7 +93,7 @@ def determined(states: U8) -> Bool:
     return (states != CellState.UNDETERMINED) & (states != NO_VOTE)
 
 
-def coverage(vehicle_states: Sequence[U8], truth: U8) -> float:
+def determined_share(vehicle_states: Sequence[U8], truth: U8) -> float:
     """Share of the scored truth cells that at least one vehicle determined."""
     seen = np.zeros(truth.shape, dtype=np.bool_)
     for states in vehicle_states:

@@ -13,7 +13,7 @@ from mapvote.core.types import F64, U8, Reference
 from mapvote.fusion.fuse import Decision
 from mapvote_lab.evaluation.results import Judgement
 from mapvote_lab.evaluation.scoring.border import ceiling
-from mapvote_lab.evaluation.scoring.cells import Scores, coverage, score_cells
+from mapvote_lab.evaluation.scoring.cells import Scores, determined_share, score_cells
 from mapvote_lab.evaluation.scoring.map_points import MapJudge, MapScores, map_obstacles
 from mapvote_lab.evaluation.scoring.objects import score_objects
 from mapvote_lab.evaluation.scoring.truth import Truth
@@ -21,7 +21,7 @@ from mapvote_lab.evaluation.scoring.truths import TRUTHS
 
 
 @dataclass(frozen=True, slots=True)
-class Outcome:
+class CaseOutcome:
     """What the server made of one case's ballots."""
 
     updated: PointMap
@@ -52,7 +52,7 @@ class Jury:
         """Scores by every truth, coverage, objects; all states over the truth's window."""
         return self._judge(states, vehicle_states, None)
 
-    def of_update(self, outcome: Outcome) -> Judgement:
+    def of_update(self, outcome: CaseOutcome) -> Judgement:
         """The same, and what became of the map's points."""
         points = self.points.score(map_obstacles(outcome.updated))
         return self._judge(outcome.states, outcome.vehicle_states, points)
@@ -67,7 +67,7 @@ class Jury:
             strict=scores.pop("strict"),
             provenance=scores.pop("provenance"),
             also=scores,
-            coverage=coverage(vehicle_states, self.truths["strict"]),
+            coverage=determined_share(vehicle_states, self.truths["strict"]),
             objects=score_objects(states, self.truths["strict"], self._objects, CELL_SIZE),
             map=points,
         )

@@ -73,6 +73,6 @@ def test_rain_shortens_its_share_of_the_rays_and_turns_none(folder: Path) -> Non
 
 def test_a_thinned_scan_is_a_part_of_the_scan(folder: Path) -> None:
     drive = open_drive(folder)
-    whole, few = drive.read_scan(5).points, sensing.thinned(0.7)(drive).read_scan(5).points
+    whole, few = drive.read_scan(5).points, sensing.with_fewer_points(0.7)(drive).read_scan(5).points
     assert 0.2 < len(few) / len(whole) < 0.4
     assert {tuple(p) for p in few.tolist()} <= {tuple(p) for p in whole.tolist()}

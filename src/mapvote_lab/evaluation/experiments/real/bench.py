@@ -151,7 +151,7 @@ def _unchanged(
     jobs |= {f"blocks of {block} scans": on(laid(block)) for block in BLOCKS[1:]}
     jobs["map ends half way"] = on(laid(-(-len(reference) // 2)))
     jobs["every other beam"] = on(lambda: street, sensing.every_other_beam)
-    jobs["70 % of the points lost"] = on(lambda: street, sensing.thinned(0.7))
+    jobs["70 % of the points lost"] = on(lambda: street, sensing.with_fewer_points(0.7))
     jobs[RAIN] = on(lambda: street, sensing.in_rain(sensing.RAIN))
     if recording.T_map_lidar_prior is not None:
         jobs["first pose only"] = lambda: vote_on(street, cases, first_pose_only=True)

@@ -52,7 +52,7 @@ Changed = tuple[RealRun, list[Asked]]
 
 
 @dataclass(frozen=True, slots=True)
-class Found:
+class FoundThings:
     """How much of one kind was found."""
 
     kind: str
@@ -160,7 +160,7 @@ def _cells(street: Street, clouds: Sequence[F64]) -> Bool:
     return out
 
 
-def score(asked: Sequence[Asked], states: U8) -> list[Found]:
+def score(asked: Sequence[Asked], states: U8) -> list[FoundThings]:
     """What ``states`` (rows, cols) say of the things, by kind in the order in which they were asked."""
     out = []
     for kind in dict.fromkeys(a.kind for a in asked):
@@ -171,7 +171,7 @@ def score(asked: Sequence[Asked], states: U8) -> list[Found]:
         half = sum(bool(2 * r >= n) for r, n in zip(right, size, strict=True))
         touched = sum(bool(n.any()) for n in near)
         rays = float(np.median([a.rays for a in these] or [0]))
-        out.append(Found(kind, len(these), half, touched, ratio(sum(right), sum(size)), rays))
+        out.append(FoundThings(kind, len(these), half, touched, ratio(sum(right), sum(size)), rays))
     return out
 
 

@@ -42,7 +42,7 @@ def every_other_beam(drive: Drive) -> Drive:
     return replace(drive, sensor=sensor, read_scan=read_scan)
 
 
-def thinned(share: float) -> Edit:
+def with_fewer_points(share: float) -> Edit:
     """That share of the points is not there, any of them."""
 
     def edit(drive: Drive) -> Drive:
