@@ -59,10 +59,6 @@ def test_as_published_has_what_the_paper_tells_and_nothing_more() -> None:
     assert all(body.role == Role.PASSING for body in world.bodies if body.kind == "parked car")
 
 
-def test_the_older_name_of_the_harder_street_still_holds() -> None:
-    assert load_scenario("paper") == load_scenario("street570")
-
-
 def test_the_road_is_crowned_kerbed_and_no_steeper_than_it_says() -> None:
     scenario = load_scenario("street570")
     terrain = make_world(scenario, 1).terrain
