@@ -15,8 +15,8 @@ import scipy
 from mapvote.core.geometry import inverse
 from mapvote.core.sensors import Sensor
 from mapvote.core.types import F64, MapvoteError, Scan
-from mapvote.formats.drives.rosbag import Edges, T_from
 from mapvote.formats.drives.point_fields import scan_from_point_cloud2
+from mapvote.formats.drives.rosbag import Edges, T_from
 from mapvote.formats.drives.sensor_estimate import UNKNOWN, estimate_sensor
 from mapvote.live.cdr import from_cdr, stamp_ns
 from mapvote.live.dds import Network, SentTopic, Subscription
