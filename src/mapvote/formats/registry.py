@@ -32,8 +32,7 @@ from mapvote.formats.maps.autoware import (
     stream_autoware_default,
     write_autoware,
 )
-from mapvote.formats.maps.cloud import Cloud
-from mapvote.formats.maps.cloud_pieces import CloudPieces
+from mapvote.formats.maps.cloud import Cloud, CloudPieces
 from mapvote.formats.maps.e57 import is_e57, stream_e57
 from mapvote.formats.maps.las import is_las, stream_las, write_las
 from mapvote.formats.maps.pcd import is_pcd, stream_pcd, write_pcd

@@ -20,8 +20,7 @@ from mapvote.core.types import F64, MapvoteError
 from mapvote.formats import export_map, read_cloud, read_map, stream_cloud, write_map, write_pcd
 from mapvote.formats.maps.autoware import stream_autoware, write_autoware
 from mapvote.formats.maps.autoware_live import lay_version
-from mapvote.formats.maps.cloud import Cloud, joined, lattice_of
-from mapvote.formats.maps.cloud_pieces import CloudPieces
+from mapvote.formats.maps.cloud import Cloud, CloudPieces, joined, lattice_of
 from mapvote.formats.maps.las import read_las, write_las
 from mapvote.formats.maps.pcd import ENCODINGS, read_pcd_table
 from mapvote.formats.maps.ply import read_ply, write_ply
@@ -228,7 +227,7 @@ def test_a_file_without_z_is_named(tmp_path: Path) -> None:
         read_map(tmp_path / "a.pcd")
 
 
-@pytest.mark.parametrize(("name", "package", "extra"), [("a.las", "laspy", "las"), ("a.ply", "trimesh", "ply")])
+@pytest.mark.parametrize(("name", "package", "extra"), [("a.las", "laspy", "las"), ("a.ply", "plyfile", "ply")])
 def test_a_missing_package_is_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, package: str, extra: str
 ) -> None:

@@ -20,8 +20,7 @@ from mapvote.formats.atomic import folder_beside, whole_folder
 from mapvote.formats.extras import first_line, read_text
 from mapvote.formats.geo.frame import MapFrame
 from mapvote.formats.geo.projector import PROJECTOR, frame_of_projector, projector_of
-from mapvote.formats.maps.cloud import Cloud, warn_of_float32
-from mapvote.formats.maps.cloud_pieces import CloudPieces
+from mapvote.formats.maps.cloud import Cloud, CloudPieces, warn_of_float32
 from mapvote.formats.maps.pcd import read_pcd, save_pcd, stream_pcd
 from mapvote.formats.maps.spill import Spill
 

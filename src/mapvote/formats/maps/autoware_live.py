@@ -19,8 +19,7 @@ from mapvote.core.types import MapvoteError
 from mapvote.formats.atomic import whole_file
 from mapvote.formats.geo.projector import PROJECTOR, projector_of
 from mapvote.formats.maps.autoware import FOLLOWED, HISTORY, METADATA, SIDE_M, TILES, metadata, squares
-from mapvote.formats.maps.cloud import Cloud
-from mapvote.formats.maps.cloud_pieces import CloudPieces
+from mapvote.formats.maps.cloud import Cloud, CloudPieces
 from mapvote.formats.maps.pcd import save_pcd
 
 

@@ -15,8 +15,7 @@ from mapvote.core.types import F64, U8, MapvoteError
 from mapvote.formats.geo.frame import MapFrame
 from mapvote.formats.geo.projector import PROJECTOR, autoware_frame, frame_of, frame_wanted
 from mapvote.formats.geo.units import settle
-from mapvote.formats.maps.cloud import GROUND, UNCLASSIFIED, Cloud
-from mapvote.formats.maps.cloud_pieces import CloudPieces
+from mapvote.formats.maps.cloud import GROUND, UNCLASSIFIED, Cloud, CloudPieces
 from mapvote.formats.registry import WRITERS
 
 Convert = Callable[[NDArray[np.floating]], NDArray[np.floating]]

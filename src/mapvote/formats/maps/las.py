@@ -21,8 +21,7 @@ from mapvote.formats.extras import require
 from mapvote.formats.geo.frame import ENU, MapFrame, read_crs
 from mapvote.formats.geo.las_keys import frame_of_keys
 from mapvote.formats.maps import laz_subprocess
-from mapvote.formats.maps.cloud import SCALED, Cloud, joined, other_fields
-from mapvote.formats.maps.cloud_pieces import CloudPieces
+from mapvote.formats.maps.cloud import SCALED, Cloud, CloudPieces, joined, other_fields
 from mapvote.formats.maps.laz_subprocess import FIELDS, Head, Piece, read_head, read_pieces
 
 STEP_M = 0.0001

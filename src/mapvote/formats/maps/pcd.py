@@ -17,8 +17,16 @@ from pypcd4 import Encoding, MetaData, PointCloud
 from mapvote.core.types import F64, MapvoteError
 from mapvote.formats.atomic import whole_file
 from mapvote.formats.extras import first_line
-from mapvote.formats.maps.cloud import Cloud, joined, kept_fields, other_fields, table_of, warn_of_float32, xyz
-from mapvote.formats.maps.cloud_pieces import CloudPieces
+from mapvote.formats.maps.cloud import (
+    Cloud,
+    CloudPieces,
+    joined,
+    kept_fields,
+    other_fields,
+    table_of,
+    warn_of_float32,
+    xyz,
+)
 
 _BLOCK = 500_000
 """Points read at a time."""
