@@ -118,12 +118,6 @@ def connection_lost(process: subprocess.Popen[str], browser: Chromium, url: str)
     browser.wait("!document.querySelector('#offline').hidden", 60)
 
 
-def large_town(browser: Chromium, url: str) -> None:
-    """Ten million points."""
-    browser.open(url)
-    settled(browser)
-
-
 Picture = tuple[str, Callable[[Chromium, str], None], dict[str, object]]
 DEMO: list[Picture] = [
     ("page", of_demo, {}),
@@ -198,18 +192,12 @@ def main() -> None:
             for picture in [*DEMO, ("page_lost", partial(connection_lost, process), {})]:
                 if not wanted or picture[0] in wanted:
                     take(picture, url, key, options.to)
-        others: list[tuple[Picture, Callable[[], object]]] = [
-            (("page_empty", nothing_yet, {}), lambda: make_map({})),
-            (("page_town", large_town, {}), lambda: town(10)),
-        ]
-        for picture, made in others:
-            if wanted and picture[0] not in wanted:
-                continue
-            store = Path(folder) / f"{picture[0]}.db"
-            Store.create(f"sqlite:///{store}", made()).close()  # type: ignore[arg-type]
+        if not wanted or "page_empty" in wanted:
+            store = Path(folder) / "empty.db"
+            Store.create(f"sqlite:///{store}", make_map({})).close()
             key = closed(store)
             with serving(store, log=log) as (url, _):
-                take(picture, url, key, options.to)
+                take(("page_empty", nothing_yet, {}), url, key, options.to)
 
 
 if __name__ == "__main__":
