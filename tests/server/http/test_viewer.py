@@ -299,7 +299,7 @@ def test_a_new_server_says_what_is_missing(browser: Chromium, server: FakeServer
     server.answers["coverage"] = {"tiles": []}
     open_page(browser, server)
     assert "Changes appear once vehicles have voted" in text(browser, "#tally")
-    assert text(browser, "#coverage-note") == "No vehicle has reported yet."
+    assert text(browser, "#coverage-note") == "No ballot has come yet."
     assert text(browser, "#notice") == "This map has no tiles yet."
     assert browser.errors == []
 

@@ -204,7 +204,7 @@ const withTiles = (tiles, made) => Object.fromEntries(Object.entries({ ...tiles,
 
 const nothing = (from, to) =>
   state.versions.length < 2
-    ? "Only the first map is here. Changes appear once vehicles have voted and a version is published."
+    ? "There is only the first version. Changes appear once vehicles have voted and a version is published."
     : from === to
       ? "Choose two different versions."
       : `Nothing changed between version ${from} and version ${to}.`;

@@ -33,7 +33,7 @@ export function showTiles() {
   $("legend").replaceChildren(...shade.labels.map(swatch));
   const unseen = [...known.values()].filter((t) => !t.vehicles).length;
   $("coverage-note").textContent = !state.coverage.length
-    ? "No vehicle has reported yet."
+    ? "No ballot has come yet."
     : `${known.size - unseen} of ${known.size} tiles (76.8 m) seen by a vehicle.`;
   if (!known.size) notice("This map has no tiles yet.", true);
 }

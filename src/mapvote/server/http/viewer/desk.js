@@ -23,14 +23,14 @@ export async function showDesk() {
   $("desk").hidden = false;
   $("desk-tally").textContent = waiting.length
     ? `A publish would make ${waiting.length} change${waiting.length > 1 ? "s" : ""} to version ${version}.`
-    : `Nothing waits: a publish would change nothing in version ${version}.`;
-  $("desk-held").replaceChildren(...held.map((reason) => element("li", {}, [`would be held: ${reason}`])));
+    : `No change is pending: a publish would leave version ${version} as it is.`;
+  $("desk-held").replaceChildren(...held.map((reason) => element("li", {}, [`The policy would hold it: ${reason}`])));
   $("pending").replaceChildren(...[...waiting, ...reviewed].map(row));
   const stays = [...(desk.waiting ?? [])].sort((a, b) => size(a) - size(b));
-  $("waiting-tally").textContent = stays.length ? "Left as it is: something that stands may go with it. Somebody should drive by." : "";
+  $("waiting-tally").textContent = stays.length ? "Not deleted yet: the risk of deleting something that stands is above the policy's budget. A vehicle should drive by." : "";
   $("waiting").replaceChildren(...stays.map(left));
   $("publish").disabled = !waiting.length;
-  $("publish").textContent = held.length ? "Publish in spite of that" : "Publish";
+  $("publish").textContent = held.length ? "Publish and override" : "Publish";
   const wanted = chosen?.id ?? address.read().pending;
   choose([...waiting, ...reviewed].find((f) => f.id === wanted) ?? null);
 }
@@ -41,7 +41,7 @@ const row = (f) => {
     dot(p.kind),
     p.kind === "built" ? "Built" : "Demolished",
     element("span", { className: "number" }, [`${p.area_m2.toFixed(1)} m\u00b2`]),
-    element("span", { className: "number" }, [v ? `${SAID[v.verdict]} by ${v.by}` : `${p.votes_median} of ${p.votes_median + p.against_median}`]),
+    element("span", { className: "number" }, [v ? `${SAID[v.verdict]} by ${v.by}` : `${p.votes_median} of ${p.votes_median + p.against_median} votes`]),
   ]);
   button.dataset.change = f.id;
   return element("li", {}, [button]);
@@ -55,12 +55,12 @@ const left = (f) => {
     const shown = drawable(f);
     state.view.setPending(shown);
     state.view.fit(shown.box, 0.38, { elevation: 0.5, height: shown.height });
-    $("difference").textContent = `It stays: ${waits}. Drive by x ${x.toFixed(1)}, y ${y.toFixed(1)}.`;
+    $("difference").textContent = `Not deleted: ${waits}. A vehicle should drive by x ${x.toFixed(1)}, y ${y.toFixed(1)}.`;
   };
   return element("li", {}, [
     element("button", { title: waits, onclick: look }, [
       dot(kind),
-      "Stays",
+      "Not deleted",
       element("span", { className: "number" }, [`${area.toFixed(1)} m\u00b2`]),
       element("span", { className: "number" }, [`risk ${(100 * risk).toPrecision(2)} %`]),
     ]),
@@ -76,7 +76,7 @@ function choose(feature, visit = false) {
   $("verdict-form").hidden = !feature;
   if (!feature) return;
   const v = feature.properties.verdict, shown = drawable(feature);
-  $("verdict-told").textContent = v ? `${v.by} has ${SAID[v.verdict]} it${v.comment ? `: \u201c${v.comment}\u201d` : "."}` : "Nobody has decided about it yet.";
+  $("verdict-told").textContent = v ? `${v.by} ${SAID[v.verdict]} it${v.comment ? `: \u201c${v.comment}\u201d` : "."}` : "No verdict yet.";
   $("undo").disabled = !v;
   if (visit) state.view.fit(shown.box, 0.38, { elevation: 0.5, height: shown.height });
 }

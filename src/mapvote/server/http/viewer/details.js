@@ -37,7 +37,7 @@ export function showChange(id) {
     facts([
       ["area", `${p.area_m2.toFixed(2)} m\u00b2 (${p.cells} cells)`],
       ["height", `${p.height_m.toFixed(1)} m above ground`],
-      p.volume_m3 !== undefined && ["volume", `${p.volume_m3.toFixed(1)} m\u00b3 of its columns`],
+      p.volume_m3 !== undefined && ["volume", `${p.volume_m3.toFixed(1)} m\u00b3, summed over its columns`],
       ["points", `${p.points} ${p.kind === "built" ? "added" : "deleted"}`],
       ["votes for it", p.votes_median ? `${number(p.votes_median)} (fewest ${p.votes_min})` : "unknown"],
       Number.isFinite(p.probability) && ["probability", `${Math.round(100 * p.probability)} %, mean of its cells`],
@@ -48,14 +48,15 @@ export function showChange(id) {
     ]),
     p.near?.length > 0 && element("p", { className: "hint" }, ["near it: ", ...p.near.map((other) => near(other))]),
     sides(),
-    link("Who voted here?", () => showCell([x + 0.15, y + 0.15])),
+    link("Votes on one of its cells", () => showCell([x + 0.15, y + 0.15])),
   ]);
 }
 
 // Before and after in 3D, beside the change that they are about.
 export function sides() {
   if (!state.view.cloud) return false;
-  const side = ([name, text]) => element("button", { type: "button", onclick: () => state.view.compare(name) }, [text]);
+  const shown = $("compare").value;
+  const side = ([name, text]) => element("button", { type: "button", value: name, ariaPressed: String(name === shown), onclick: () => state.view.compare(name) }, [text]);
   return element("p", { className: "row sides" }, [["before", "Before"], ["after", "After"], ["swipe", "Swipe"]].map(side));
 }
 
@@ -97,7 +98,7 @@ export async function showCell([x, y]) {
     ...decided.map((text) => element("p", {}, [text])),
     answer.votes.length
       ? element("ol", { className: "votes" }, answer.votes.map(vote))
-      : element("p", { className: "hint" }, ["No vehicle has voted on this cell."]),
+      : element("p", { className: "hint" }, ["No ballot says anything about this cell."]),
   ]);
 }
 

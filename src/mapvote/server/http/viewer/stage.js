@@ -82,7 +82,7 @@ export class Stage {
   mark() {
     const all = this.pending ? [this.pending, ...this.changes] : this.changes;
     this.flat.setChanges(all);
-    this.labels.set(all);
+    this.labels.set(this.pending ? [this.pending] : this.changes);
     this.placeLabels();
   }
 

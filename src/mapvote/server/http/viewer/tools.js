@@ -1,4 +1,4 @@
-// What one does to the picture: colours, before and after, a slice by height, a measured distance.
+// Tools of the 3D view: colours, before and after, a slice by height, a measured distance.
 
 import { distance } from "./stage.js";
 import { COLOUR } from "./shaders.js";
@@ -6,8 +6,8 @@ import { $, address, element, notice } from "./page.js";
 
 const BLINK_MS = 800, HIGHEST = 40;
 const LEGENDS = {
-  height: ["ground", "15 m and more above it"], plain: [], age: ["2 months ago or more", "seen today"], votes: ["no vote", "9 vehicles and more"],
-  probability: ["0: nobody says so", "1"], state: ["unchanged", "changed"],
+  height: ["ground", "15 m or more above ground"], plain: [], age: ["2 months ago or earlier", "today"], votes: ["no vote", "9 vehicles or more"],
+  probability: ["0", "1"], state: ["unchanged", "changed"],
   intensity: ["dark", "bright"],
 };
 
@@ -58,6 +58,7 @@ export class Tools {
 
   compare(name) {
     address.write({ compare: name === "after" ? null : name, swipe: null });
+    for (const side of document.querySelectorAll(".sides button")) side.ariaPressed = String(side.value === name);
     $("swipe-row").hidden = name !== "swipe";
     $("swipe-bar").hidden = name !== "swipe";
     clearInterval(this.blinking);

@@ -19,9 +19,9 @@ export async function showVehicles() {
   const open = found.filter((v) => v.verdict === "undecidable").length;
   $("vehicles").replaceChildren(...against.map(item));
   $("vehicles-note").textContent = !found.length
-    ? "No vehicle has reported yet."
-    : (against.length ? "" : "No vehicle contradicts the others more than chance. ") +
-      (open ? `${open} of ${found.length} cannot be judged yet: others must agree both before and after them.` : "");
+    ? "No ballot has come yet."
+    : (against.length ? "" : "No vehicle contradicts the others significantly. ") +
+      (open ? `${open} of ${found.length} cannot be judged yet: others must agree before and after them.` : "");
   $("vehicle-section").hidden = false;
 }
 
@@ -65,7 +65,7 @@ export function offerPaths() {
 
 function draw(features) {
   const km = features.reduce((sum, f) => sum + f.properties.length_m, 0) / 1000;
-  $("paths-text").textContent = !$("paths").checked ? "" : features.length ? `${features.length} drives, ${km.toFixed(1)} km` : "no ballot tells of its path";
+  $("paths-text").textContent = !$("paths").checked ? "" : features.length ? `${features.length} drives, ${km.toFixed(1)} km` : "no ballot carries a path";
   const lines = features.flatMap((f) => unbroken(f.geometry.coordinates));
   state.view.setPaths(lines);
 }
