@@ -12,7 +12,7 @@ from mapvote.core.types import CellState, MapvoteError
 from mapvote.fusion.tile_vote import DAY_NS
 from mapvote.server.errors import NotFound, Unauthorised
 from mapvote.server.store import keys
-from mapvote.server.store.admission import Intake, Sent, accept, examine
+from mapvote.server.store.admission import Intake, Sent, accept, examine, sound
 from mapvote.server.store.publish import preview, publish
 from mapvote.server.store.replay import replay
 from mapvote.server.store.store import Store
@@ -102,8 +102,7 @@ def test_what_a_revoked_vehicle_took_part_in_stays_published_and_can_be_replayed
 
 def test_a_ballot_on_its_way_while_its_key_is_revoked_is_refused(store: Store) -> None:
     secret, intake = keys.issue(store, "v1", "vehicle"), Intake(store)
-    (looked_at,) = intake.look_at([Sent(takes_the_wall_down("v1"), "v1", "d1", keys.hash_of(secret))])
-    assert not isinstance(looked_at, Exception)
+    decoded = sound(Sent(takes_the_wall_down("v1"), "v1", "d1", keys.hash_of(secret)))
     keys.revoke(store, "v1")
-    (answer,) = intake.write([looked_at])
+    (answer,) = intake.write([decoded])
     assert isinstance(answer, Unauthorised)

@@ -29,7 +29,7 @@ class Guard:
     """Keys come as ``Authorization: Bearer KEY``, or Basic with the key as password (browsers).
 
     Every request's key is looked up in the store, many in one query: a revoked key works no longer, not even once. A
-    ballot's key is looked up with the ballot itself (:meth:`mapvote.server.store.admission.Intake.look_at`):
+    ballot's key is looked up where the ballot is written (:meth:`mapvote.server.store.admission.Intake.write`):
     until then it is enough to know whose it was, which never changes.
 
     ``opened``: nobody needs a key as long as the store holds none. The first that is issued ends that, in the same
@@ -39,9 +39,8 @@ class Guard:
     def __init__(self, store: Store, threads: Executor, *, opened: bool, owner: str | None = None) -> None:
         self._opened = opened
         self._owner = None if owner is None else keys.Key(owner, "operator", 0, None)
-        self._any_key: Batcher[None, bool] = Batcher(
-            lambda asked: [keys.any_issued(store)] * len(asked), _AT_ONCE, threads
-        )
+        self._any_issued = partial(keys.any_issued, store)
+        self._threads = threads
         self._looked_up: Batcher[str, keys.Key] = Batcher(partial(keys.check, store), _AT_ONCE, threads)
         self._known: dict[str, keys.Key] = {}
         self._wrong = RateLimit(_WRONG_PER_MINUTE, _WRONG_AT_ONCE, "wrong keys")
@@ -57,7 +56,7 @@ class Guard:
         if self._owner is not None:
             return self._owner, None
         if self._opened:
-            self._opened = not await self._any_key.put(None)
+            self._opened = not await asyncio.get_running_loop().run_in_executor(self._threads, self._any_issued)
         if self._opened:
             return None
         secret = _secret_of(authorization)

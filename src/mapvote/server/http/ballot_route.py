@@ -17,13 +17,10 @@ from fastapi.routing import APIRoute
 
 from mapvote.server.http.auth import own
 from mapvote.server.http.schemas import Name, Stored, problems
-from mapvote.server.http.services import Services, services
-from mapvote.server.store.admission import Sent
-from mapvote.server.store.ballots import Incoming
+from mapvote.server.http.services import services
+from mapvote.server.store.admission import Sent, sound
 
 _BYTES: dict[str, Any] = {"application/octet-stream": {"schema": {"type": "string", "format": "binary"}}}
-_SMALL_BYTES = 1 << 18
-"""Ballots up to this size are examined many at once; a larger one would keep them waiting."""
 
 
 class BallotRoute(APIRoute):
@@ -57,17 +54,9 @@ async def vote(request: Request, vehicle: Name, drive: Name) -> Response:
     parts = services(request)
     body = await parts.uploads.read(vehicle, request.stream(), request.headers.get("content-length"))
     sent = Sent(body, vehicle, drive, request.state.key_hash)
-    incoming = await (parts.examiner.put(sent) if len(body) <= _SMALL_BYTES else _apart(parts, sent))
+    incoming = await asyncio.get_running_loop().run_in_executor(parts.threads.ballots, sound, sent)
     receipt = await parts.writer.put(incoming)
     result = "repeated" if receipt.repeated else "created" if receipt.created else "replaced"
     parts.metrics.ballots.labels(result).inc()
     answer = msgspec.json.encode({"vehicle": vehicle, "drive": drive, "result": result})
     return Response(answer, 201 if receipt.created else 200, media_type="application/json")
-
-
-async def _apart(parts: Services, sent: Sent) -> Incoming:
-    loop = asyncio.get_running_loop()
-    (found,) = await loop.run_in_executor(parts.threads.ballots, parts.intake.look_at, [sent])
-    if isinstance(found, Exception):
-        raise found
-    return found

@@ -12,11 +12,19 @@ from starlette.responses import Response
 from mapvote.server.errors import Unavailable
 from mapvote.server.http.schemas import problems
 from mapvote.server.http.services import services
+from mapvote.server.store.integrity import set_aside
+from mapvote.server.store.store import Store
 
 _PROBE_S = 1.0
 _NAMED = 20
 """Damaged things that /readyz names; the log has all."""
 router = APIRouter()
+
+
+def _damaged(store: Store) -> list[str]:
+    """What is in quarantine, "kind name: why"."""
+    with store.database.reading() as connection:
+        return [f"{kind} {name}: {why}" for (kind, name), why in sorted(set_aside(connection).items())]
 
 
 class Probe:
@@ -65,7 +73,7 @@ async def ready(request: Request) -> dict[str, Any]:
     ``quarantine`` names what is damaged and was set aside: all else goes on.
     """
     parts = services(request)
-    version, damaged = await parts.check_ready(), await parts.damaged.put(None)
+    version, damaged = await parts.check_ready(), await parts.look_up(_damaged)
     return {"status": "ready", "version": version, "quarantine": damaged[:_NAMED], "quarantined": len(damaged)}
 
 
@@ -74,5 +82,5 @@ async def metrics(request: Request) -> Response:
     """Counters, latencies, the newest version."""
     parts = services(request)
     parts.metrics.version.set(await parts.newest.put(None))
-    parts.metrics.tell_damaged(await parts.damaged.put(None))
+    parts.metrics.tell_damaged(await parts.look_up(_damaged))
     return Response(parts.metrics.text(), media_type="text/plain; version=0.0.4; charset=utf-8")

@@ -10,8 +10,6 @@ import msgspec
 
 from mapvote.codec.ballot import tile_key
 from mapvote.codec.tile_file import manifest_tag
-from mapvote.server.store.integrity import set_aside
-from mapvote.server.store.queries import current_number
 from mapvote.server.store.store import Manifest, Store
 
 _KEPT = 16
@@ -37,17 +35,6 @@ class Manifests:
     def newest(self, asked: Sequence[None]) -> list[int]:
         """The newest version's number, for each who asks: one query for all of them."""
         return [self._store.current()] * len(asked)
-
-    def newest_if_writable(self, asked: Sequence[None]) -> list[int]:
-        """As :meth:`newest`, of a database that takes a writer now; Unavailable if it does not."""
-        with self._store.database.writing() as connection:
-            return [current_number(connection)] * len(asked)
-
-    def damaged(self, asked: Sequence[None]) -> list[list[str]]:
-        """What is in quarantine, "kind name: why", for each who asks."""
-        with self._store.database.reading() as connection:
-            found = [f"{kind} {name}: {why}" for (kind, name), why in sorted(set_aside(connection).items())]
-        return [found] * len(asked)
 
     def ready(self, number: int, since: int | None) -> Made | None:
         """A manifest that was made before."""

@@ -46,7 +46,7 @@ router = APIRouter()
 async def publish_now(request: Request, ask: PublishAsk) -> Published:
     """Fuse what stands. 409 with the reasons if the policy holds it, or if somebody else published first."""
     by, parts = operator(request), services(request)
-    return await to_thread.run_sync(_publish, parts, ask, by, limiter=parts.threads.publishing)
+    return await to_thread.run_sync(_publish, parts, ask, by, limiter=parts.threads.deciding)
 
 
 @router.get("/v1/publish", response_model=dict[str, Any], responses=problems(403), summary="How far a publish is")
@@ -100,7 +100,7 @@ async def roll_back(request: Request, ask: RollbackAsk) -> dict[str, int]:
     """A new version that is the old one again; the votes that led away from it are barred."""
     by, parts = operator(request), services(request)
     back = partial(rollback, parts.store, ask.to, by=by, reason=ask.reason)
-    return {"version": (await to_thread.run_sync(back, limiter=parts.threads.publishing)).number}
+    return {"version": (await to_thread.run_sync(back, limiter=parts.threads.deciding)).number}
 
 
 @router.get(

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import asyncio
+from collections.abc import Callable
 from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from threading import Event
+from typing import TypeVar
 
 from anyio import CapacityLimiter
 from fastapi import Request
@@ -16,14 +19,16 @@ from mapvote.server.http.manifests import Manifests
 from mapvote.server.http.metrics import Metrics
 from mapvote.server.http.publishing import Publishing
 from mapvote.server.http.writer import Batcher
-from mapvote.server.store.admission import Intake, Quota, Sent
+from mapvote.server.store.admission import Intake, Quota
 from mapvote.server.store.ballots import Incoming, Receipt
+from mapvote.server.store.queries import current_number
 from mapvote.server.store.round import Gate
 from mapvote.server.store.store import Store
 from mapvote.server.views.events import Feed
 from mapvote.server.views.localisation_gate import gate_by
 from mapvote.server.views.point_lod import Clouds
 
+Answer = TypeVar("Answer")
 READING = 1
 """Threads for whatever an operator looks at. Python computes in one thread at a time: more would only take turns with
 those who answer vehicles."""
@@ -50,9 +55,8 @@ class Threads:
     fuse: ThreadPoolExecutor = field(default_factory=lambda: ThreadPoolExecutor(2, "fuse"))
     fetching: CapacityLimiter = field(default_factory=lambda: CapacityLimiter(4))
     """Manifests and tiles."""
-    publishing: CapacityLimiter = field(default_factory=lambda: CapacityLimiter(2))
-    deciding: CapacityLimiter = field(default_factory=lambda: CapacityLimiter(2))
-    """The desk: its first look at new votes fuses tiles, for seconds, and nobody else waits for that."""
+    deciding: CapacityLimiter = field(default_factory=lambda: CapacityLimiter(4))
+    """What takes seconds, as it fuses tiles or reads the whole store: publish, desk, check. No other request waits."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,16 +71,10 @@ class Services:
     """Where tiles are fused."""
     threads: Threads
     intake: Intake
-    examiner: Batcher[Sent, Incoming]
-    """Looks at ballots, many at once."""
     writer: Batcher[Incoming, Receipt]
-    """Writes those that passed, many in one transaction."""
+    """Writes ballots, many in one transaction."""
     newest: Batcher[None, int]
-    """The number of the newest version."""
-    writable: Batcher[None, int]
-    """The same, once a transaction could be begun that might write."""
-    damaged: Batcher[None, list[str]]
-    """What is in quarantine, in words."""
+    """The number of the newest version, read once for all who ask at a time."""
     manifests: Manifests
     publishing: Publishing
     """Rounds under way."""
@@ -95,7 +93,11 @@ class Services:
         stopping."""
         if self.stopping.is_set():
             raise Unavailable("the server is stopping")
-        return await self.writable.put(None)
+        return await self.look_up(_newest_if_writable)
+
+    async def look_up(self, ask: Callable[[Store], Answer]) -> Answer:
+        """What a short question to the store gives, asked in the threads for lookups."""
+        return await asyncio.get_running_loop().run_in_executor(self.threads.lookups, ask, self.store)
 
     def stop_fusing(self) -> None:
         """Drop what waits to be fused; a publish under way then ends as :class:`Unavailable`."""
@@ -104,10 +106,14 @@ class Services:
 
     async def close(self) -> None:
         """Wait until every ballot that was taken in is written."""
-        await self.examiner.close()
         await self.writer.close()
         for pool in (self.threads.fuse, self.threads.ballots, self.threads.lookups):
             pool.shutdown(cancel_futures=True)
+
+
+def _newest_if_writable(store: Store) -> int:
+    with store.database.writing() as connection:
+        return current_number(connection)
 
 
 def make_services(
@@ -127,11 +133,8 @@ def make_services(
         fusing=executor or threads.fuse,
         threads=threads,
         intake=intake,
-        examiner=Batcher(intake.look_at, _BATCH, threads.ballots),
         writer=Batcher(intake.write, _BATCH, threads.ballots),
         newest=Batcher(manifests.newest, _READERS, threads.lookups),
-        writable=Batcher(manifests.newest_if_writable, _READERS, threads.lookups),
-        damaged=Batcher(manifests.damaged, _READERS, threads.lookups),
         manifests=manifests,
         publishing=Publishing(),
         clouds=Clouds(store),

@@ -59,7 +59,7 @@ async def whole(request: Request) -> Response:
     """Reads the whole store; what is damaged is named, nothing is changed."""
     operator(request)
     parts = services(request)
-    found = await to_thread.run_sync(check, parts.store, limiter=parts.threads.publishing)
+    found = await to_thread.run_sync(check, parts.store, limiter=parts.threads.deciding)
     return as_json({"damage": [asdict(damage) for damage in found]})
 
 
@@ -68,5 +68,5 @@ async def mend(request: Request) -> Response:
     """As looking, and what is damaged takes no part from now on. Planes are mended on the server's own machine, from a
     backup."""
     by, parts = operator(request), services(request)
-    found = await to_thread.run_sync(partial(check, parts.store, mend=True, by=by), limiter=parts.threads.publishing)
+    found = await to_thread.run_sync(partial(check, parts.store, mend=True, by=by), limiter=parts.threads.deciding)
     return as_json({"damage": [asdict(damage) for damage in found]})

@@ -82,6 +82,15 @@ def examine(data: bytes) -> Incoming:
     return Incoming(ballot, votes, hashlib.sha256(data).hexdigest(), cast_by, len(data))
 
 
+def sound(sent: Sent) -> Incoming:
+    """A ballot decoded; MapvoteError if it is unsound, or not what its address says. Its key is not looked at."""
+    incoming = examine(sent.data)
+    if incoming.drive != (sent.vehicle, sent.drive):
+        address = f"{sent.vehicle[:64]}/{sent.drive[:64]}"
+        raise MapvoteError(f"the ballot is of {'/'.join(incoming.drive)}, not {address}")
+    return replace(incoming, key_hash=sent.key_hash)
+
+
 def _told_by(tile: TileIndex, vote: TileVote) -> Votes:
     spoken = np.packbits(vote.spoken()).tobytes()
     if vote.new_points is None or not len(vote.new_points):
@@ -108,8 +117,8 @@ def _check_founded(ballot: Ballot) -> None:
 
 
 class Intake:
-    """Admits ballots to a store: what is sound in itself is looked at side by side, what fits the map is decided within
-    the transaction that writes it. Remembers the newest version's tiles.
+    """Admits ballots to a store: what fits the map is decided within the transaction that writes it. Remembers the
+    newest version's tiles.
 
     ``quota``: what one vehicle may leave in the store; None: as much as it likes.
     """
@@ -119,14 +128,6 @@ class Intake:
         self._quotas = None if quota is None else Quotas(quota)
         self._current: tuple[int, Mapping[TileIndex, TileHashes]] = (0, {})
         self._lowest = LowestGround()
-
-    def look_at(self, received: Sequence[Sent]) -> list[Incoming | MapvoteError]:
-        """Each ballot decoded, or why it is refused: Unauthorised if its key is not valid, MapvoteError if it is
-        unsound or not what its address says. Unavailable is raised for all."""
-        asked = {sent.key_hash for sent in received if sent.key_hash is not None}
-        with self._store.database.reading() as connection:
-            valid = keys.of(connection, asked, self._store.clock())
-        return [Unauthorised(keys.UNKNOWN) if _unknown(sent.key_hash, valid) else _sound(sent) for sent in received]
 
     def write(self, ballots: Sequence[Incoming]) -> list[Receipt | MapvoteError]:
         """Store the ballots that are admitted, in one durable transaction: a receipt, or why not.
@@ -222,17 +223,6 @@ def _brought_up(
 def accept(store: Store, ballots: Sequence[Incoming]) -> list[Receipt | MapvoteError]:
     """:meth:`Intake.write`, once."""
     return Intake(store).write(ballots)
-
-
-def _sound(sent: Sent) -> Incoming | MapvoteError:
-    try:
-        incoming = examine(sent.data)
-    except MapvoteError as error:
-        return error
-    if incoming.drive != (sent.vehicle, sent.drive):
-        address = f"{sent.vehicle[:64]}/{sent.drive[:64]}"
-        return MapvoteError(f"the ballot is of {'/'.join(incoming.drive)}, not {address}")
-    return replace(incoming, key_hash=sent.key_hash)
 
 
 def _counts_somewhere(connection: sa.Connection, votes: Votes, version: int, now: TileHashes | None) -> bool:
