@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import signal
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from mapvote.cli.options import DRIVE, Config, KeyFile, key_in
-from mapvote.cli.remote import client_of, map_at
+from mapvote.cli.remote import client_of, is_url, map_at
 
 if TYPE_CHECKING:
     from mapvote.live.drive import LiveDrive, Maps
@@ -142,7 +142,12 @@ def drive(
 def _maps(where: str, key_file: Path | None) -> Iterator[Maps]:
     """The map on the way of a server, or all of a map at once."""
     from mapvote.live.drive import OneMap
+    from mapvote.live.road_map import RoadMap
 
+    if is_url(where):
+        with closing(RoadMap(lambda: client_of(where, key_in(key_file)))) as road_map:
+            yield road_map
+        return
     with map_at(where, key_file, or_kept=True) as point_map:
         yield OneMap(point_map)
 

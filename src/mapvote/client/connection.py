@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import random
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from email.utils import parsedate_to_datetime
 from typing import Any
 
@@ -84,6 +84,18 @@ class Connection:
                 raise Refused(why, answer.status_code)
             return answer
         raise Unreachable(f"{self.url}: no answer after {self._attempts} attempts ({trouble}); try again later")
+
+    def lines(self, path: str) -> Iterator[str]:
+        """The lines of an answer that goes on, as they come; a minute without one ends it. Unreachable if there is no
+        connection, Refused for 4xx."""
+        try:
+            with self._http.stream("GET", path, timeout=_LONGEST_WAIT_S) as answer:
+                if answer.status_code >= 400:
+                    answer.read()
+                    raise Refused(f"{self.url}: refused: {detail_of(answer)}", answer.status_code)
+                yield from answer.iter_lines()
+        except httpx2.TransportError as error:
+            raise Unreachable(f"{self.url}: {error or type(error).__name__}") from error
 
     def ask_json(self, method: str, path: str, *, json: object = None) -> Any:
         """What a server answers, decoded. MapvoteError also if that is no JSON."""

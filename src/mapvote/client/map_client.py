@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import os
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from types import TracebackType
 from typing import Literal
@@ -37,7 +37,9 @@ _KEEP_WAITING = {401, 403}
 """Refusals that a new key mends."""
 
 
-class _Plane(msgspec.Struct):
+class Plane(msgspec.Struct):
+    """One tile of a version: the hashes of its planes."""
+
     points: str
     ground: str
     free: str | None = None
@@ -53,11 +55,13 @@ class _Lattice(msgspec.Struct):
     y0: float
 
 
-class _Manifest(msgspec.Struct):
+class Manifest(msgspec.Struct):
+    """One version of a map: its tiles by "row,col", each with the hashes of its planes."""
+
     map_id: str
     version: int
     lattice: _Lattice
-    tiles: dict[str, _Plane]
+    tiles: dict[str, Plane]
     digest: str
     """Of all tiles of the version."""
     georeference: dict[str, str] = {}
@@ -71,7 +75,7 @@ class _Manifest(msgspec.Struct):
         fields = digest_of_tiles((key, p.fields) for key, p in self.tiles.items() if p.fields is not None)
         return self.digest == f"{total:064x}" and self.fields_digest == (f"{fields:064x}" if fields else "")
 
-    def followed_by(self, since: _Manifest) -> _Manifest:
+    def followed_by(self, since: Manifest) -> Manifest:
         """The newer manifest that ``since``, which tells only what changed, makes of this one."""
         tiles = {key: planes for key, planes in self.tiles.items() if key not in since.removed} | since.tiles
         return msgspec.structs.replace(since, tiles=tiles, removed=[])
@@ -125,7 +129,7 @@ class MapClient:
         manifest = self._newest() if version is None else self._manifest(f"/v1/map/versions/{version}")
         return self._as_map(manifest, region)
 
-    def _as_map(self, manifest: _Manifest, region: Region | None) -> PointMap:
+    def _as_map(self, manifest: Manifest, region: Region | None) -> PointMap:
         lattice = Lattice(manifest.lattice.x0, manifest.lattice.y0)
         wanted = {_index(key): planes for key, planes in manifest.tiles.items()}
         if region is not None:
@@ -144,7 +148,46 @@ class MapClient:
 
     def newest(self) -> int:
         """The number of the newest version; no tile is downloaded. Raises as :meth:`fetch`."""
-        return self._newest().version
+        return self.manifest().version
+
+    def manifest(self) -> Manifest:
+        """The newest version's, of which only what changed since the last is downloaded. Raises as :meth:`fetch`."""
+        return self._newest()
+
+    def kept_manifest(self) -> Manifest | None:
+        """What :meth:`manifest` gave last, without a request; None if nothing is kept."""
+        return self._kept()
+
+    def has(self, planes: Plane) -> bool:
+        """Whether a tile can be read without a request."""
+        return all((self._planes / digest).exists() for digest in planes.hashes())
+
+    def points_of(self, planes: Plane) -> int:
+        """How many points a tile has that :meth:`has` been downloaded."""
+        return (self._planes / planes.points).stat().st_size // 12
+
+    def download(self, planes: Plane) -> None:
+        """Have the planes of a tile that ``home`` lacks. Raises as :meth:`fetch`."""
+        for digest in planes.hashes():
+            if not (self._planes / digest).exists():
+                self._plane(digest)
+
+    def tile(self, window: Grid, planes: Plane) -> Tile:
+        """A tile over ``window``; what ``home`` lacks of it is downloaded. Raises as :meth:`fetch`."""
+        return self._tile(window, planes)
+
+    def forget(self, needed: Iterable[Plane]) -> None:
+        """Keep the cache of planes within its bound; none of ``needed`` leaves it."""
+        self._bound_cache({digest for planes in needed for digest in planes.hashes()})
+
+    def versions(self) -> Iterator[int | None]:
+        """The number of the newest version, whenever something happens at the server (server-sent events), and None at
+        the start and while nothing happens; for as long as the connection holds. Unreachable if there is none."""
+        for line in self._server.lines("/v1/events"):
+            if line.startswith(":"):
+                yield None
+            elif line.startswith("data:"):
+                yield int(msgspec.json.decode(line[5:])["version"])
 
     def send(self, ballot: Ballot | bytes) -> Sent:
         """Send a ballot; "spooled" if the server cannot be reached now. Refused if it refuses, saying where the ballot
@@ -192,7 +235,7 @@ class MapClient:
         result: Sent = answer.json()["result"]
         return result
 
-    def _newest(self) -> _Manifest:
+    def _newest(self) -> Manifest:
         """The newest manifest: what is kept of the last one, and what changed since."""
         kept = self._kept()
         if kept is not None:
@@ -212,27 +255,27 @@ class MapClient:
                     return self._keep(followed)
         return self._keep(self._manifest("/v1/map"))
 
-    def _manifest(self, path: str) -> _Manifest:
+    def _manifest(self, path: str) -> Manifest:
         return self._decoded(self._server.ask("GET", path).content)
 
-    def _decoded(self, content: bytes) -> _Manifest:
+    def _decoded(self, content: bytes) -> Manifest:
         try:
-            return msgspec.json.decode(content, type=_Manifest)
+            return msgspec.json.decode(content, type=Manifest)
         except msgspec.DecodeError as error:
             raise MapvoteError(f"{self._url}: is no mapvote server ({error})") from error
 
-    def _kept(self) -> _Manifest | None:
+    def _kept(self) -> Manifest | None:
         try:
-            return msgspec.json.decode(self._kept_manifest.read_bytes(), type=_Manifest)
+            return msgspec.json.decode(self._kept_manifest.read_bytes(), type=Manifest)
         except (OSError, msgspec.DecodeError):
             return None
 
-    def _keep(self, manifest: _Manifest) -> _Manifest:
+    def _keep(self, manifest: Manifest) -> Manifest:
         with whole_file(self._kept_manifest, private=True) as part:
             part.write_bytes(msgspec.json.encode(manifest))
         return manifest
 
-    def _tile(self, window: Grid, planes: _Plane) -> Tile:
+    def _tile(self, window: Grid, planes: Plane) -> Tile:
         points = np.frombuffer(self._plane(planes.points), dtype="<f4").reshape(-1, 3)
         ground_z = np.frombuffer(self._plane(planes.ground), dtype="<f4").reshape(window.shape)
         free = (

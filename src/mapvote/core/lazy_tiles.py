@@ -24,6 +24,10 @@ class LazyTiles(Mapping[TileIndex, Tile]):
         self._kept: OrderedDict[TileIndex, Tile] = OrderedDict()
         self._held, self._lock = 0, RLock()
 
+    def add(self, index: TileIndex, points: int) -> None:
+        """One more tile can be had from here on."""
+        self._points = dict(sorted({**self._points, index: points}.items()))
+
     @property
     def points_of(self) -> dict[TileIndex, int]:
         """How many each tile holds."""

@@ -230,16 +230,16 @@ class LiveDrive:
     def step(self, *, ended: bool = False) -> bool:
         """Vote with the oldest scan that waits, if its pose is known; returns whether there was one. If none waits, or
         a tile's votes have been unwritten for too long, a tile goes to the journal."""
-        start, scan = time.monotonic(), self._next(ended)
-        oldest_s = min(self._touched.values(), default=np.inf)
-        overdue_s = start - oldest_s - _KEEP_S
-        if self.vehicle is not None and (overdue_s > 0.0 if scan is None else overdue_s > 2.0):
+        start = time.monotonic()
+        ready = self._is_ready(ended)
+        overdue_s = start - min(self._touched.values(), default=np.inf) - _KEEP_S
+        if self.vehicle is not None and overdue_s > (2.0 if ready else 0.0):
             tile = min(self._touched, key=lambda index: self._touched[index])
             del self._touched[tile]
             self._outbox.keep(self.drive_id, self.vehicle.ballot([tile]))
-        if scan is None:
+        if not ready:
             return False
-        self._observe(scan)
+        self._observe(self._waiting.popleft())
         self._thinning.cost(time.monotonic() - start)
         return True
 
@@ -277,16 +277,17 @@ class LiveDrive:
         for number in range(1, self.number + 1):
             self._outbox.discard(stretch_name(self.name, number))
 
-    def _next(self, ended: bool) -> Waiting | None:
-        """The oldest scan, unless a pose that is later than it may still come."""
+    def _is_ready(self, ended: bool) -> bool:
+        """Whether a scan waits, and neither a pose later than it nor the map around it may still come."""
         if not self._waiting:
-            return None
-        scan = self._waiting[0]
-        newest = max((t for t, _ in self._poses), default=0)
+            return False
+        scan, newest = self._waiting[0], max((t for t, _ in self._poses), default=0)
         unknown = newest < scan.stamp_ns or len(self._poses) < 2
         if self._with_poses and not ended and unknown and self._waiting[-1].stamp_ns - scan.stamp_ns < _PATIENCE_NS:
-            return None
-        return self._waiting.popleft()
+            return False
+        if ended or self.vehicle is not None or len(self._waiting) > _CROWDED:
+            return True
+        return self._maps.covers(self._position(self._prior(scan.stamp_ns)))
 
     def _observe(self, waiting: Waiting) -> None:
         try:
@@ -296,9 +297,14 @@ class LiveDrive:
             log.warning("%s", error)
             return
         prior = self._prior(waiting.stamp_ns)
-        if not self._maps.covers(self._position(prior)):
-            self.counts.without_map += 1
-            return
+        self.counts.without_pose += self._with_poses and prior is None
+        position = self._position(prior)
+        if not self._maps.covers(position):
+            newest = self._maps.current()
+            if self.vehicle is None or newest is self.vehicle.point_map or not self._maps.covers(position):
+                self.counts.without_map += 1
+                return
+            self._cut(self.vehicle, newest)  # the version of the open ballot ends here, a newer one does not
         if self.vehicle is None:
             self.vehicle = self._make_vehicle(self._maps.current())
             self.vehicle.drive_id, self._road, self._finished = self.drive_id, RoadDriven(), 0
@@ -310,10 +316,11 @@ class LiveDrive:
         vehicle.observe(scan, prior)
         self._count_votes(vehicle)
         if self._cuts.due(vehicle.report, vehicle.done, self._road):
-            newest = self._maps.current()
-            self._road, self._finished = RoadDriven(), 0
-            written = vehicle.cut(stretch_name(self.name, self.number + 1), newest)
-            self._leave(written)
+            self._cut(vehicle, self._maps.current())
+
+    def _cut(self, vehicle: Vehicle, newest: PointMap) -> None:
+        self._road, self._finished = RoadDriven(), 0
+        self._leave(vehicle.cut(stretch_name(self.name, self.number + 1), newest))
 
     def _position(self, prior: F64 | None) -> F64 | None:
         """(3,) where the vehicle is by its last scan, else by its prior."""
@@ -358,5 +365,4 @@ class LiveDrive:
                 return np.asarray(found.at(np.array([time_ns]), "odometry")[0] @ self._T_base_lidar)
             except MapvoteError:
                 pass
-        self.counts.without_pose += self._with_poses
         return None

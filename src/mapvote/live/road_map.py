@@ -1,0 +1,196 @@
+"""The map on the way: the tiles ahead of a vehicle come before it does, and newer versions as they are published."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+import weakref
+from collections.abc import Callable
+
+import numpy as np
+
+from mapvote.client import Manifest, MapClient, Refused, Unreachable
+from mapvote.core.grid import Lattice, TileIndex, window_around
+from mapvote.core.lazy_tiles import LazyTiles
+from mapvote.core.point_map import PointMap
+from mapvote.core.tile import Tile
+from mapvote.core.types import F64, MapvoteError
+
+log = logging.getLogger("mapvote.live")
+AHEAD_M, NEEDED_M = 300.0, 160.0
+"""Tiles that touch a square reaching so far are asked for; and without those this near no scan is used. What a vehicle
+has laid out around it reaches two tiles, 154 m."""
+_POLL_S = 60.0
+"""Between two questions for the newest version where events do not come."""
+_RETRY_S = 5.0
+
+
+class Version:
+    """One version of the server's map: those of its tiles that are here."""
+
+    def __init__(self, manifest: Manifest, client: MapClient, shared: weakref.WeakValueDictionary[str, Tile]) -> None:
+        """``shared``: tiles of other versions by the hashes of their planes; those that stayed the same are shared."""
+        self._client, self._shared = client, shared
+        lattice = Lattice(manifest.lattice.x0, manifest.lattice.y0)
+        self.planes = {_index(key): planes for key, planes in manifest.tiles.items()}
+        self.tiles = LazyTiles(self._load, {})
+        georeference, number = manifest.georeference, manifest.version
+        self.point_map = PointMap(manifest.map_id, lattice, self.tiles, georeference, version=number)
+
+    def around(self, position: F64 | None, half_m: float) -> list[TileIndex]:
+        """Its tiles that a square around (3,) touches; all of them where ``position`` is None."""
+        if position is None:
+            return sorted(self.planes)
+        window = window_around(self.point_map.lattice, float(position[0]), float(position[1]), 2 * half_m)
+        return [tile for tile in window.tiles() if tile in self.planes]
+
+    def missing(self, position: F64 | None, half_m: float) -> list[TileIndex]:
+        """Those of :meth:`around` that are not here."""
+        return [tile for tile in self.around(position, half_m) if tile not in self.tiles]
+
+    def get(self, tile: TileIndex) -> None:
+        """Have a tile here. Raises as :meth:`MapClient.fetch`."""
+        planes = self.planes[tile]
+        self._client.download(planes)
+        self.tiles.add(tile, self._client.points_of(planes))
+
+    def _load(self, index: TileIndex) -> Tile:
+        planes = self.planes[index]
+        name = " ".join(planes.hashes())
+        tile = self._shared.get(name)
+        if tile is None:
+            tile = self._shared[name] = self._client.tile(self.point_map.lattice.tile(index), planes)
+        return tile
+
+
+class RoadMap:
+    """A server's map for a vehicle on the move (:class:`mapvote.live.drive.Maps`).
+
+    A newer version is the current one as soon as its tiles around the vehicle are here. Without a network the vehicle
+    drives on what it has. Two threads, of which one only listens for versions.
+    """
+
+    def __init__(self, open_client: Callable[[], MapClient], *, poll_s: float = _POLL_S) -> None:
+        """``open_client`` opens a connection: each thread, and who reads tiles, has its own. MapvoteError if the server
+        is away and no version of its map is kept here."""
+        self._reader, self._fetcher, self._listener = open_client(), open_client(), open_client()
+        self._shared: weakref.WeakValueDictionary[str, Tile] = weakref.WeakValueDictionary()
+        self._poll_s = poll_s
+        self._position: F64 | None = None
+        self._located = False
+        """Whether it was asked for tiles at all."""
+        self._wake, self._refresh, self._ended = threading.Event(), threading.Event(), threading.Event()
+        self._asked_s = -np.inf
+        self.events = False
+        """Whether the server's events are heard."""
+        self.away = ""
+        """Why the server cannot be reached now; "" while it can."""
+        try:
+            manifest = self._fetcher.manifest()
+        except Unreachable as error:
+            kept = self._fetcher.kept_manifest()
+            if kept is None:
+                raise
+            log.warning("%s. Version %d is kept here and used", error, kept.version)
+            manifest, self.away = kept, str(error)
+        self._coming = self._current = self._used = self._version(manifest)
+        self._threads = [threading.Thread(target=work, daemon=True) for work in (self._fetch, self._listen)]
+        for thread in self._threads:
+            thread.start()
+
+    def close(self) -> None:
+        """Ask for nothing more."""
+        self._ended.set()
+        self._wake.set()
+        for client in (self._listener, self._fetcher, self._reader):
+            client.close()
+        self._threads[0].join(5.0)
+
+    def current(self) -> PointMap:
+        """See :class:`mapvote.live.drive.Maps`."""
+        self._used = self._current
+        return self._used.point_map
+
+    def covers(self, position: F64 | None) -> bool:
+        """See :class:`mapvote.live.drive.Maps`: of the version that was asked for last."""
+        known = position is not None and self._position is not None
+        if not known or np.abs(position[:2] - self._position[:2]).max() > 0.1 * AHEAD_M:  # type: ignore[index]
+            self._position, self._located = position, True
+            self._wake.set()
+        return not self._used.missing(position, NEEDED_M)
+
+    @property
+    def tiles(self) -> int:
+        """How many tiles of the version in use are here."""
+        return len(self._used.tiles)
+
+    @property
+    def version(self) -> int:
+        """Of the map that the open ballot holds to."""
+        return self._used.point_map.version or 0
+
+    def _version(self, manifest: Manifest) -> Version:
+        """With every tile that ``home`` has around the vehicle."""
+        version = Version(manifest, self._reader, self._shared)
+        for tile in version.planes:
+            if self._fetcher.has(version.planes[tile]):
+                version.tiles.add(tile, self._fetcher.points_of(version.planes[tile]))
+        return version
+
+    def _fetch(self) -> None:
+        while not self._ended.is_set():
+            wait_s = self._poll_s
+            try:
+                self._step()
+                self.away = ""
+            except Unreachable as error:
+                if not self.away:
+                    log.warning("%s. The vehicle drives on the %d tiles that it has", error, self.tiles)
+                self.away, wait_s = str(error), _RETRY_S
+            except MapvoteError as error:
+                log.warning("%s", error)
+                wait_s = _RETRY_S
+            self._wake.wait(wait_s)
+            self._wake.clear()
+
+    def _step(self) -> None:
+        """Ask for the newest version if it is time, and for the tiles ahead."""
+        if self._refresh.is_set() or time.monotonic() - self._asked_s >= self._poll_s:
+            self._refresh.clear()
+            manifest = self._fetcher.manifest()
+            self._asked_s = time.monotonic()
+            if manifest.version != self._coming.point_map.version:
+                self._coming = self._version(manifest)
+                self._fetcher.forget([*self._coming.planes.values(), *self._used.planes.values()])
+        if not self._located:
+            return
+        for version in dict.fromkeys((self._used, self._coming)):
+            for tile in version.missing(self._position, AHEAD_M):
+                try:
+                    version.get(tile)
+                except Refused:
+                    if version is self._coming:
+                        raise
+                    break  # the server has dropped what this version alone had: the next one is coming
+        if self._current is not self._coming:
+            self._current = self._coming
+            log.info("version %d of the map is here", self._coming.point_map.version)
+
+    def _listen(self) -> None:
+        while not self._ended.is_set():
+            try:
+                for version in self._listener.versions():
+                    if not self.events or version not in (None, self._coming.point_map.version):
+                        self._refresh.set()  # at the start, too: something may have come since the last question
+                        self._wake.set()
+                    self.events = True
+            except (MapvoteError, ValueError, KeyError, RuntimeError):  # no events, no server, or closed: it is polled
+                pass
+            self.events = False
+            self._ended.wait(self._poll_s)
+
+
+def _index(key: str) -> TileIndex:
+    row, _, col = key.partition(",")
+    return int(row), int(col)

@@ -1,0 +1,93 @@
+"""The map on the way, from a real server: what is ahead comes, what is published comes, and nothing waits for it."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from client.test_map_client import take_down_a_wall
+from hand_made import make_map, make_tile, wall
+from live_server import serving
+from mapvote.client import MapClient, Unreachable
+from mapvote.config import FuseSettings
+from mapvote.live.road_map import RoadMap
+from mapvote.server.store.policy import Policy
+from mapvote.server.store.store import Store
+
+TILE_M = 76.8
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Iterator[Store]:
+    """A street of thirty tiles, 2.3 km."""
+    cells = [(10, 10), (10, 11), (10, 12)]
+    tiles = {(0, c): make_tile(wall(cells, [0.05, 0.45]), 0.001 * c, (0, c)) for c in range(30)}
+    made = Store.create(
+        f"sqlite:///{tmp_path / 's.db'}", make_map(tiles), Policy(fuse=FuseSettings(max_deleted_share=1))
+    )
+    yield made
+    made.close()
+
+
+def until(true: Callable[[], bool], what: str) -> None:
+    end = time.monotonic() + 20.0
+    while not true():
+        assert time.monotonic() < end, what
+        time.sleep(0.02)
+
+
+def at(tile: int) -> np.ndarray:
+    return np.array([(tile + 0.5) * TILE_M, 10.0, 1.8])
+
+
+def road_map(url: str, tmp_path: Path, poll_s: float = 60.0) -> RoadMap:
+    def client() -> MapClient:
+        return MapClient(url, home=tmp_path / "home", attempts=1, timeout_s=5.0)
+
+    return RoadMap(client, poll_s=poll_s)
+
+
+def test_tiles_come_as_the_vehicle_drives_and_a_version_when_it_is_published(store: Store, tmp_path: Path) -> None:
+    with serving(tmp_path / "s.db", log=tmp_path / "log") as (url, _):
+        road = road_map(url, tmp_path)
+        first = road.current()
+        assert not road.covers(at(0))
+        until(lambda: road.covers(at(0)), "the tiles around the vehicle did not come")
+        until(lambda: road.tiles == 4, "300 m are four tiles")
+        for tile in range(1, 8):
+            until(lambda tile=tile: road.covers(at(tile)), f"tile {tile} did not come")  # type: ignore[misc]
+        assert set(first.tiles) <= {(0, c) for c in range(12)}
+        assert len(first.tiles[0, 7].points) == 6
+        until(lambda: road.events, "no events are heard")
+        before = first.tiles[0, 4]
+        take_down_a_wall(store, (0, 7))
+        until(lambda: road._current.point_map.version == 2, "the new version did not come")
+        assert len(first.tiles[0, 7].points) == 6  # the open ballot holds to the version it began with
+        second = road.current()
+        assert (second.version, len(second.tiles[0, 7].points)) == (2, 5)
+        assert second.tiles[0, 4] is before  # what stayed the same is shared
+        assert road.covers(at(7))
+        road.close()
+
+
+def test_without_a_network_the_vehicle_drives_on_what_it_has_and_polls_until_it_is_back(
+    store: Store, tmp_path: Path
+) -> None:
+    with serving(tmp_path / "s.db", log=tmp_path / "log") as (url, _):
+        road = road_map(url, tmp_path)
+        road.current()
+        road.covers(at(3))
+        until(lambda: road.covers(at(3)) and road.tiles == 8, "the tiles around the vehicle did not come")
+        road.close()
+    away = road_map(url, tmp_path, poll_s=0.05)
+    assert away.away
+    away.current()
+    assert away.covers(at(3))
+    assert not away.covers(at(25))
+    away.close()
+    with pytest.raises(Unreachable):
+        road_map(url, tmp_path / "another")
