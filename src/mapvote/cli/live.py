@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import signal
 from collections.abc import Iterator
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from mapvote.live.drive import LiveDrive, Maps
     from mapvote.live.hearing import Hearing
     from mapvote.live.outbox import Outbox
+    from mapvote.live.status import StatusBoard
 
 Domain = Annotated[int | None, typer.Option(min=0, max=232, metavar="N", help="else ROS_DOMAIN_ID, else 0")]
 
@@ -87,6 +88,10 @@ def drive(
     name: Annotated[str | None, typer.Option(metavar="NAME", help="of the drive; else the time it began")] = None,
     every_m: Annotated[float, typer.Option(min=1.0, metavar="METRES", help="of road a ballot, at most")] = 2000.0,
     idle: Annotated[float, typer.Option(metavar="SECONDS", help="end after so long without a cloud; 0: never")] = 0.0,
+    metrics: Annotated[
+        int | None, typer.Option(min=0, max=65535, metavar="PORT", help="Prometheus' metrics, on 127.0.0.1 alone")
+    ] = None,
+    watch: Annotated[bool, typer.Option("--watch", help="a view in the terminal in place of the log")] = False,
     unchecked: Annotated[bool, typer.Option("--unchecked", help="vote whatever the first ten seconds show")] = False,
     domain: Domain = None,
     config: Config = None,
@@ -104,6 +109,7 @@ def drive(
     from mapvote.live.dds import Network
     from mapvote.live.hearing import Hearing, choose_topics
     from mapvote.live.service import Plan, run
+    from mapvote.live.status import Heartbeat, RosStatus, StatusBoard, serve_metrics
     from mapvote.vehicle import Cuts
     from mapvote.warmup import warm_vehicle
 
@@ -120,10 +126,12 @@ def drive(
         not unchecked,
     )
     model, network, stopped = None if sensor is None else read_sensor(sensor, "--sensor"), Network(domain), [False]
+    heartbeat = Heartbeat()
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: stopped.append(True))
 
     def ended() -> bool:
+        heartbeat()
         return stopped[-1]
 
     with _maps(where, key_file) as maps, _outbox(vehicle, send, out, key_in(key_file)) as outbox:
@@ -133,9 +141,28 @@ def drive(
         topics = [t.topic for t in (*chosen.points, *filter(None, [chosen.odometry]))]
         warm_vehicle(plan.settings)
         print(f"listening to {' and '.join(topics)}", flush=True)
-        hearing = Hearing(network, chosen, model)
-        live = run(plan, hearing, maps, outbox, ended)
+        hearing, ros = Hearing(network, chosen, model), RosStatus(network, vehicle)
+        board = StatusBoard(maps, outbox)
+        board.tell(1.0, ros.diagnose)
+        if metrics is not None:
+            print(f"metrics at http://127.0.0.1:{serve_metrics(board, metrics)}/metrics", flush=True)
+        with _view(board, vehicle) if watch else nullcontext():
+            if not watch:
+                board.tell(60.0, lambda status, *_: print(status.line(), flush=True))
+            live = run(plan, hearing, maps, outbox, ended, [board, ros.poses])
     print(_said(vehicle, live, hearing))
+
+
+@contextmanager
+def _view(board: StatusBoard, vehicle: str) -> Iterator[None]:
+    """A terminal that shows how the drive goes."""
+    from rich.live import Live
+
+    from mapvote.live.status import watched
+
+    with Live(auto_refresh=False) as view:
+        board.tell(0.5, lambda status, *_: view.update(watched(status, vehicle), refresh=True))
+        yield
 
 
 @contextmanager

@@ -41,12 +41,12 @@ sensor_msgs/msg/NavSatFix: Header header, NavSatStatus status, float64 latitude,
 sensor_msgs/msg/Imu: Header header, Quaternion orientation, float64[9] orientation_covariance, Vector3 angular_velocity,
     float64[9] angular_velocity_covariance, Vector3 linear_acceleration, float64[9] linear_acceleration_covariance
 diagnostic_msgs/msg/KeyValue: string key, string value
-diagnostic_msgs/msg/DiagnosticStatus: uint8 level, string name, string message, string hardware_id, KeyValue[] values
+diagnostic_msgs/msg/DiagnosticStatus: byte level, string name, string message, string hardware_id, KeyValue[] values
 diagnostic_msgs/msg/DiagnosticArray: Header header, DiagnosticStatus[] status
 """
 NUMBERS = {
-    "bool": "?", "int8": "b", "uint8": "B", "int16": "h", "uint16": "H", "int32": "i", "uint32": "I", "int64": "q",
-    "uint64": "Q", "float32": "f", "float64": "d",
+    "bool": "?", "byte": "B", "int8": "b", "uint8": "B", "int16": "h", "uint16": "H", "int32": "i", "uint32": "I",
+    "int64": "q", "uint64": "Q", "float32": "f", "float64": "d",
 }  # fmt: skip
 _ENCODINGS = {0: (">", 8), 1: ("<", 8), 6: (">", 4), 7: ("<", 4)}
 """Byte order and largest alignment by the header's second byte: CDR, and the plain encoding of XCDR2."""

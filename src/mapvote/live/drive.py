@@ -14,7 +14,7 @@ import numpy as np
 from mapvote.codec.ballot import Ballot
 from mapvote.core.grid import TileIndex, window_around
 from mapvote.core.point_map import PointMap
-from mapvote.core.types import F64, MapvoteError, Scan
+from mapvote.core.types import F32, F64, MapvoteError, Scan
 from mapvote.doctor.finding import Finding
 from mapvote.formats.drives.trajectory import sorted_trajectory
 from mapvote.formats.geo.frame import MapFrame
@@ -29,6 +29,8 @@ _PATIENCE_NS = 300_000_000
 """A scan waits so long for a pose later than its own stamp; then the newest ones are extrapolated, or it has none."""
 _CROWDED, _RELAXED = 30, 5
 """If more scans wait some are left out, until fewer wait: a short stop of the process costs no scan."""
+_LEAST_SHARE, _MOST = 0.2, 120
+"""Of five scans in turn one is admitted, unless so many wait."""
 _KEEP_S = 15.0
 """A tile that got votes is written to the journal after so long. With the scans that wait, and with tiles that are
 written one at a time, a crash costs less than 30 s of road."""
@@ -49,6 +51,15 @@ class Waiting(NamedTuple):
     here."""
     read: Callable[[], Scan]
     """Raises MapvoteError if it cannot be used."""
+
+
+class Fixed(NamedTuple):
+    """Where a scan was taken, once it is sure."""
+
+    stamp_ns: int
+    T_map_lidar: F64
+    covariance: F32
+    """(6, 6) as :class:`mapvote.core.types.Registration` has it."""
 
 
 class Maps(Protocol):
@@ -124,8 +135,8 @@ class Thinning:
             self._crowded, self._credit = not self._crowded, 1.0
         if not self._crowded:
             return True
-        self._credit += min(0.95, 0.9 * self._period_s / max(self._cost_s, 1e-3))
-        if self._credit < 1.0:
+        self._credit += np.clip(0.9 * self._period_s / max(self._cost_s, 1e-3), _LEAST_SHARE, 0.95)
+        if self._credit < 1.0 or waiting > _MOST:
             return False
         self._credit -= 1.0
         return True
@@ -151,12 +162,14 @@ class LiveDrive:
         :meth:`first_findings` was asked."""
         self.counts, self._maps, self._outbox = Counts(), maps, outbox
         self._make_vehicle, self._cuts, self._with_poses = make_vehicle, cuts or Cuts(), with_poses
-        self._T_base_lidar = np.eye(4) if T_base_lidar is None else T_base_lidar
+        self.T_base_lidar = np.eye(4) if T_base_lidar is None else T_base_lidar
         self.name, self.number = name, outbox.begin(name)
         self.vehicle: Vehicle | None = None
         """None until the first scan: the map around it may have to come first."""
         self._road, self._poses = RoadDriven(), deque[tuple[int, F64]](maxlen=_POSES)
         self._waiting, self._observed = deque[Waiting](), deque[Waiting]()
+        self.fixes: deque[Fixed] = deque(maxlen=_POSES)
+        """Of the scans that voted last; whoever publishes them takes them out."""
         self._touched: dict[TileIndex, float] = {}
         """Tiles with votes that are not in the journal, and since when."""
         self._thinning, self._last_ns, self._odd_stamps, self._finished = Thinning(), -1, 0, 0
@@ -339,6 +352,7 @@ class LiveDrive:
                 self.counts.lost += 1
                 continue
             self.counts.localised += 1
+            self.fixes.append(Fixed(scan.stamp_ns, report.T_map_lidar[i], report.covariances[i]))
             since_ns = scan.stamp_ns if abs(scan.sent_ns - scan.stamp_ns) < 5 * 10**9 else scan.sent_ns
             self.counts.latencies_s.append(1e-9 * (now_ns - since_ns))
             x, y = report.T_map_lidar[i][:2, 3]
@@ -362,7 +376,7 @@ class LiveDrive:
             times, T = zip(*self._poses, strict=True)
             found = sorted_trajectory(np.array(times), np.stack(T), of_vehicle=True, frame=MapFrame())
             try:
-                return np.asarray(found.at(np.array([time_ns]), "odometry")[0] @ self._T_base_lidar)
+                return np.asarray(found.at(np.array([time_ns]), "odometry")[0] @ self.T_base_lidar)
             except MapvoteError:
                 pass
         return None

@@ -50,6 +50,8 @@ class DriveReport:
     """Position sigma of each scan that was observed: one that still waits for the filter is not in it yet."""
     T_map_lidar: list[F64] = field(default_factory=list)
     """Pose of every scan that is decided; of a lost one the best guess."""
+    covariances: list[F32] = field(default_factory=list)
+    """(6, 6) of each of these poses, as :class:`mapvote.core.types.Registration` has it."""
     priors: list[PosePrior | None] = field(default_factory=list)
     """Of every scan."""
     stage_s: dict[str, list[float]] = field(default_factory=dict)
@@ -91,9 +93,14 @@ class DriveReport:
     def split(self, n: int) -> DriveReport:
         """Keep the first ``n`` scans, all of which have voted or are lost; returns the report of those after them."""
         later = DriveReport(
-            self.stamps_ns[n:], [i - n for i in self.lost if i >= n], [], self.T_map_lidar[n:], self.priors[n:]
+            self.stamps_ns[n:],
+            [i - n for i in self.lost if i >= n],
+            [],
+            self.T_map_lidar[n:],
+            self.covariances[n:],
+            self.priors[n:],
         )
-        del self.stamps_ns[n:], self.T_map_lidar[n:], self.priors[n:]
+        del self.stamps_ns[n:], self.T_map_lidar[n:], self.covariances[n:], self.priors[n:]
         self.lost = [i for i in self.lost if i < n]
         return later
 
@@ -218,6 +225,7 @@ class Frontend:
         report = self.report
         index = len(report.T_map_lidar)
         report.T_map_lidar.append(fix.registration.T_map_lidar)
+        report.covariances.append(fix.registration.covariance.astype(np.float32))
         if not fix.trusted:
             report.lost.append(index)
             return []
