@@ -27,6 +27,7 @@ from mapvote.doctor.maps import check_cloud, in_memory
 from mapvote.doctor.scans import Looking
 from mapvote.formats.clean import BadPoints, RawScan, clean_scan, spinning_time_s
 from mapvote.fusion.offline import update_map
+from mapvote.localisation.localiser import GivenPoses
 from mapvote.slam.build import build_map
 from mapvote.vehicle import vote_drive
 
@@ -64,6 +65,26 @@ def warm_up() -> Iterator[tuple[str, float]]:
             start = time.process_time()
             work()
             yield what, time.process_time() - start
+
+
+def compile_for_maps() -> None:
+    """Compile what a map that is built by SLAM needs."""
+    with seldom_collecting():
+        build_map([_drive(_street(demolished=False), turning=True)], Settings())
+
+
+def compile_for_votes() -> None:
+    """Compile what a drive that votes and the fusion need. The localisation comes last, for the SLAM shares most of its
+    kernels: beside :func:`compile_for_maps` in another process they are in the cache by then."""
+    with seldom_collecting():
+        point_map = map_from_points(_street(demolished=False))
+        drive = _drive(_street(demolished=True), turning=True)
+        assert drive.T_map_lidar_prior is not None
+        given = GivenPoses(drive.stamps_ns, drive.T_map_lidar_prior)
+        by_case = [choose_case(Settings(), case) for case in ("surfaces", "5")]
+        ballots = [vote_drive(drive, point_map, settings, localise=given)[0] for settings in by_case]
+        _fuse(point_map, ballots, Settings())
+        vote_drive(drive, point_map, Settings())
 
 
 def _fuse(point_map: PointMap, ballots: list[Ballot], settings: Settings) -> None:

@@ -126,7 +126,7 @@ def evaluate(
     overrides: dict[str, str | int] = {"sensor": sensor} if sensor else {}
     if cars is not None:
         overrides["temporary_cars"] = cars
-    sentences = "all" if readings else "occluded" if scenario in PUBLISHED else None
+    sentences = "all" if readings else "occluded" if scenario == PUBLISHED else None
     scene = Scene(scenario, seed, settings, cache or cache_folder(), overrides, Conditions(true_poses=poses == "truth"))
     with stages() as told:
         evaluation = run(scene, cases, with_yardsticks, told, sentences)
@@ -193,41 +193,61 @@ def _evaluate_real(
 
 
 def demo(
+    drive: Annotated[
+        Path | None,
+        typer.Argument(metavar="[DRIVE]", help="a recorded drive; else a street is simulated", show_default=False),
+    ] = None,
     out: Annotated[Path, typer.Option(metavar="FOLDER", help="where maps, tables, pictures and report.html go")] = Path(
         "out"
     ),
-    full: Annotated[bool, typer.Option("--full", help="a street of 250 m instead of a corner: some minutes")] = False,
+    full: Annotated[bool, typer.Option("--full", help="simulate 250 m of street: takes some minutes")] = False,
+    keep: Annotated[bool, typer.Option("--keep", help="keep the simulated drives, the ballots and the store")] = False,
 ) -> None:
-    """The whole story on a simulated street: build a map, let three vehicles vote, update it, tell how good it is.
+    """Build a map, let three vehicles vote, update the map, and report how good the update is.
 
     mapvote demo
+
+    mapvote demo MY_DRIVE --out report
     """
     _need_lab("demo")
     from rich.console import Console
     from rich.markup import escape
 
-    from mapvote_lab.evaluation.demo import demo as run
-    from mapvote_lab.evaluation.demo_report import CASE, commands
+    console = Console(soft_wrap=True, highlight=False)
 
-    console = Console(soft_wrap=True)
-    console.print("The first run compiles its kernels, which takes some seconds in each stage.", style="dim")
+    def show(picture: Path) -> None:
+        console.print(f"first picture: {escape(str(picture))}")
+
+    console.print("The first run compiles its kernels, which takes up to a minute.", style="dim")
+    if drive is not None:
+        if full or keep:
+            raise typer.BadParameter("a recorded drive is not simulated: leave out --full and --keep")
+        from mapvote_lab.evaluation.demo_drive import demo_drive
+
+        with stages() as told:
+            lines = demo_drive(drive, out, told, show)
+        for line in lines:
+            print(line)
+        return
+    from mapvote_lab.evaluation.demo import demo as run
+    from mapvote_lab.evaluation.demo_report import CASE, commands, drives_sentence
+
     with stages() as told:
-        evaluation, story = run(out, full, told)
-    console.print("\n[bold]What changed[/]", highlight=False)
+        evaluation, story = run(out, full=full, keep=keep, progress=told, show=show)
+    console.print("\n[bold]What changed[/]")
     for area, deleted, added in story.areas:
-        console.print(
-            f"  {area.name}: {area.objects} {area.kind}; {deleted} points deleted, {added} added", highlight=False
-        )
+        console.print(f"  {area.name}: {area.objects} {area.kind}; {deleted} points deleted, {added} added")
     f1 = evaluation.result.cases[CASE].strict.macro_f1
     console.print(
         f"  in all {story.deleted} points deleted, {story.added} added; "
-        f"{story.found} of {story.objects} changed objects found, {story.false_objects} false; F1 {f1:.3f}",
-        highlight=False,
+        f"{story.found} of {story.objects} changed objects found, {story.false_objects} false; F1 {f1:.3f}"
     )
     console.print("\n[bold]Where to look[/]")
     place = escape(str(out))
-    console.print(f"  {place}/report.html: the story with pictures and tables", highlight=False)
-    console.print(f"  {place}/map_before.pcd and {place}/map_after.pcd: the maps", highlight=False)
-    console.print(f"  {place}/tables.txt, results.json, results.csv, pictures/", highlight=False)
+    console.print(f"  {place}/report.html: the story with pictures and tables")
+    console.print(f"  {place}/map_before.pcd and {place}/map_after.pcd: the maps")
+    console.print(f"  {place}/tables.txt, results.json, results.csv, pictures/")
+    console.print(f"  {escape(drives_sentence(story, evaluation.scene.folder))}")
     console.print("\n[bold]What to try next[/]")
-    console.print(escape("".join(f"  {line}\n" for line in commands(evaluation, out).splitlines())), highlight=False)
+    text = commands(evaluation, out, story.kept)
+    console.print(escape("".join(f"  {line}\n" for line in text.splitlines())))

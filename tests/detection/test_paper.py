@@ -68,10 +68,13 @@ def one_cell(
 def vote(
     view: ScanView, reference: Reference, weighted: bool = True, tall: bool = False, **read: Any
 ) -> tuple[int, int]:
-    """State and votes of the last cell, the paper's sentences ``read`` like that."""
+    """State and votes of the last cell, the paper's sentences ``read`` like that; an occluded scan votes, so that it
+    shows."""
     words = encode(view, reference, ORIGIN, SENSOR)
     voting = VotingSettings(weighted=weighted, skip_tall_cells=tall)
-    states, weights = classify_paper(words, reference.counts > 0, voting, PaperSettings.model_validate(read))
+    states, weights = classify_paper(
+        words, reference.counts > 0, voting, PaperSettings.model_validate({"occluded": "votes"} | read)
+    )
     return int(states[0, -1]), int(weights[0, -1])
 
 

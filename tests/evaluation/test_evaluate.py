@@ -141,18 +141,50 @@ def test_the_page_needs_nothing_else_and_escapes_what_it_is_given() -> None:
 
 @pytest.mark.slow
 def test_the_demo_tells_its_story(tmp_path: Path) -> None:
-    from mapvote_lab.evaluation.demo import demo
+    from html import escape
 
-    evaluation, story = demo(tmp_path / "out")
+    from mapvote_lab.evaluation.demo import demo
+    from mapvote_lab.evaluation.demo_report import WHY_HARDER
+
+    shown: list[Path] = []
+    evaluation, story = demo(tmp_path / "out", show=shown.append)
+    assert shown == [tmp_path / "out" / "pictures" / "scans.png"], "the first picture, before a map is there"
+    assert not (tmp_path / "out" / "work").exists()
+    assert story.drives_bytes > sum(file.stat().st_size for file in (tmp_path / "out").rglob("*") if file.is_file())
     assert story.found == story.objects > 0
     for name in ("report.html", "tables.txt", "results.json", "results.csv", "map_before.pcd", "map_after.pcd"):
         assert (tmp_path / "out" / name).stat().st_size > 100
     html = (tmp_path / "out" / "report.html").read_text()
     assert "Beside the paper&#x27;s own table" in html
-    assert "occluded abstains" in html
+    assert evaluation.result.settings["paper"]["occluded"] == "abstains"
+    assert all(escape(sentence) in html for sentence in WHY_HARDER)
     assert len(html) < 12_000_000
     assert "paper, Table IV" in html
     assert html.count("data:image/png;base64,") == len(list((tmp_path / "out" / "pictures").glob("*.png")))
     loads = re.findall(r"""(?:\b(?:src|href)\s*=|\bfrom|\bimport\(|\bfetch\(|url\()\s*["']?https?://[^"')\s]*""", html)
     assert loads == [], "it needs nothing from elsewhere; the scripts inside it may name addresses"
     assert evaluation.result.poses == "ndt"
+
+
+@pytest.mark.slow
+def test_a_recorded_street_is_mapped_and_voted_on_by_the_same_drive(tmp_path: Path) -> None:
+    from mapvote_lab.evaluation.demo_drive import demo_drive
+
+    drive = Path("../shared/data/kitti/2011_09_26_0001")
+    if not drive.exists():
+        pytest.skip("needs the KITTI drive of ../shared/data")
+    shown: list[Path] = []
+    lines = demo_drive(drive, tmp_path / "out", lambda *_: None, shown.append)
+    assert shown == [tmp_path / "out" / "pictures" / "scan.png"]
+    found, of = map(int, re.findall(r"new bodies.*: (\d+) of (\d+)", lines[0])[0])
+    assert 2 * found > of > 6, "most of what was cast into the scans is found"
+    html = (tmp_path / "out" / "report.html").read_text()
+    assert html.count("data:image/png;base64,") == 3
+    assert mapvote_map_points(tmp_path / "out" / "map") > 10_000
+
+
+def mapvote_map_points(folder: Path) -> int:
+    from mapvote.core.point_map import all_points
+    from mapvote.formats import read_map
+
+    return len(all_points(read_map(folder)))

@@ -75,7 +75,8 @@ class PaperSettings(Section):
     part in it."""
 
     occluded: Literal["votes", "abstains"] = Field(
-        default="votes", description="a scan that cannot see a cell votes undetermined there, or gives no vote"
+        default="abstains",
+        description="what a scan does in a cell that it cannot see: abstain, or vote undetermined (votes)",
     )
     few_points: Literal["undetermined", "empty"] = Field(
         default="undetermined", description="what a cell with 1 to n_min - 1 points is for that scan"

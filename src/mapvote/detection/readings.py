@@ -1,6 +1,6 @@
 """The paper's open sentences: what it says, and how that can be read (``[paper]`` in the settings).
 
-The defaults are the readings of which a vote is worth most on a street with much in the way; docs/method.md says why.
+The defaults are the readings that reproduce the paper's Tables II to IV; docs/method.md says why.
 """
 
 from __future__ import annotations

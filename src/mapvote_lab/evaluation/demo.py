@@ -1,7 +1,10 @@
-"""``mapvote demo``: the main job in one command, from a street that never existed to an updated map and its report."""
+"""``mapvote demo``: a simulated street becomes an updated map and a report, with a first picture within seconds."""
 
 from __future__ import annotations
 
+import shutil
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 from mapvote.config import Settings
@@ -14,7 +17,8 @@ from mapvote.formats.maps.pcd import write_pcd
 from mapvote.server.store.store import Store, url_of
 from mapvote.server.views.cutout import Cutout
 from mapvote.server.views.history import changes_between, cutouts_between
-from mapvote_lab.evaluation.demo_report import CASE, Story, report_page, tell
+from mapvote.warmup import compile_for_maps, compile_for_votes
+from mapvote_lab.evaluation.demo_report import CASE, Story, draw_scans, report_page, tell
 from mapvote_lab.evaluation.evaluate import Evaluation, evaluate
 from mapvote_lab.evaluation.experiments.cases import choose_cases
 from mapvote_lab.evaluation.experiments.scene import Progress, Scene
@@ -22,50 +26,64 @@ from mapvote_lab.evaluation.loopback import vote_by_http
 from mapvote_lab.evaluation.reporting.gallery import gallery
 from mapvote_lab.evaluation.reporting.tables import as_text, result_csv, result_json, write_text
 from mapvote_lab.evaluation.scoring.map_points import same_rows
+from mapvote_lab.simulation.processes import processes
 
 SCENARIO, FULL_SCENARIO = "corner", "street"
 SEED = 2
 """Not the seed that the method was developed on (1)."""
 
 
-def demo(out: Path, full: bool = False, progress: Progress | None = None) -> tuple[Evaluation, Story]:
+def demo(
+    out: Path,
+    *,
+    full: bool = False,
+    keep: bool = False,
+    progress: Progress | None = None,
+    show: Callable[[Path], None] | None = None,
+) -> tuple[Evaluation, Story]:
     """Simulate, build, let three vehicles vote, update, evaluate; everything into ``out``.
 
-    A second run goes on from the first. MapvoteError if ``out`` cannot be written.
+    ``show(path)`` is called with the first picture, as soon as the drives are simulated. ``keep``: the drives, the
+    server's store and the vehicles' folders stay in ``out/work``; otherwise they are deleted at the end. A run that
+    was interrupted is continued by the next one. Two processes compile the kernels while this one simulates; the memory
+    that a compiler takes ends with them. MapvoteError if ``out`` cannot be written.
     """
-    settings = Settings()
-    scene = Scene(FULL_SCENARIO if full else SCENARIO, SEED, settings, out / "work")
+    settings, work = Settings(), out / "work"
+    scene = Scene(FULL_SCENARIO if full else SCENARIO, SEED, settings, work)
     cases, _ = choose_cases(settings, f"1,2,3,4,5,{CASE}")
-    evaluation = evaluate(scene, cases, progress=progress, readings="occluded")
+    with processes(2) as compilers:
+        compiling = [compilers.submit(compile_kernels) for compile_kernels in (compile_for_maps, compile_for_votes)]
+        scene.simulate(progress)
+        first = draw_scans(scene, out / "pictures" / "scans.png")
+        if show:
+            show(first[0])
+        for compiled in compiling:
+            compiled.result()
+    evaluation = evaluate(scene, cases, progress=progress)
+    if progress:
+        progress("server and pictures", 0, 1)
     write_map(evaluation.first_map, out / "map_before")
-    if progress:
-        progress("a server's round", 0, 1)
-    done = vote_by_http(
-        [drive.ballots[CASE] for drive in evaluation.drives], out / "map_before", out / "work" / "server"
-    )
-    updated = done.updated
-    if not follows(evaluation.first_map, updated, evaluation.outcomes[CASE].updated):
+    ballots = [drive.ballots[CASE] for drive in evaluation.drives]
+    with ThreadPoolExecutor(1) as waiting:
+        serving = waiting.submit(vote_by_http, ballots, out / "map_before", work / "server")
+        pictures = [first, *gallery(evaluation, CASE, out / "pictures")]
+        done = serving.result()
+    if not follows(evaluation.first_map, done.updated, evaluation.outcomes[CASE].updated):
         raise MapvoteError("the server's map is not the one that the offline rule makes; please report this bug")
-    if progress:
-        progress("a server's round", 1, 1)
-        progress("drawing", 0, 1)
-    for name, point_map in (("map_before", evaluation.first_map), ("map_after", updated)):
+    for name, point_map in (("map_before", evaluation.first_map), ("map_after", done.updated)):
         with whole_file(out / f"{name}.pcd") as partial:
             write_pcd(partial, Cloud(all_points(point_map)))
-    pictures = gallery(evaluation, CASE, out / "pictures")
     write_text(as_text(evaluation.result), out / "tables.txt")
     write_text(result_json(evaluation.result), out / "results.json")
     write_text(result_csv(evaluation.result), out / "results.csv")
-    write_map(updated, out / "map_after")
-    story = tell(evaluation, done)
-    write_text(
-        report_page(
-            evaluation, story, pictures, out, changed_areas(out / "work" / "server" / "store.db", done.version)
-        ),
-        out / "report.html",
-    )
+    write_map(done.updated, out / "map_after")
+    areas = changed_areas(work / "server" / "store.db", done.version)
+    story = tell(evaluation, done, drives_bytes=size_of(work), kept=keep)
+    write_text(report_page(evaluation, story, pictures, out, areas), out / "report.html")
+    if not keep:
+        shutil.rmtree(work)
     if progress:
-        progress("drawing", 1, 1)
+        progress("server and pictures", 1, 1)
     return evaluation, story
 
 
@@ -84,3 +102,8 @@ def changed_areas(store: Path, version: int) -> list[Cutout]:
         return cutouts_between(opened, 1, version, changes_between(opened, 1, version)) if version > 1 else []
     finally:
         opened.close()
+
+
+def size_of(folder: Path) -> int:
+    """Bytes of all files in a folder."""
+    return sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())

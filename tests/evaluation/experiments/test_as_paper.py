@@ -9,7 +9,7 @@ from mapvote.core.types import MapvoteError
 from mapvote_lab.evaluation.experiments.paper_readings import as_paper
 
 
-def test_on_the_papers_street_an_occluded_scan_abstains_and_the_map_keeps_whatever_stood_still() -> None:
+def test_an_occluded_scan_abstains_by_default_and_the_map_of_the_papers_street_keeps_whatever_stood_still() -> None:
     settings = as_paper(Settings(), "as_published")
     assert settings.paper.occluded == "abstains"
     assert not settings.mapping.drop_strays

@@ -21,21 +21,20 @@ from mapvote_lab.evaluation.experiments.cases import Case, paper_cases
 from mapvote_lab.evaluation.experiments.kept import KeptDrive
 from mapvote_lab.evaluation.scoring.cells import Scores, score_cells
 
-PUBLISHED = {"as_published": "occluded=abstains"}
-"""How the paper is read on a scenario unless told otherwise; both readings of an occluded scan stand side by side.
-There the first map keeps its strays too: the paper's holds whatever stood still (II), and its cases vote on that."""
+PUBLISHED = "as_published"
+"""The scenario of the paper's street. Its first map keeps its strays: the paper's holds whatever stood still (II), and
+its cases vote on that. Both readings of an occluded scan stand side by side in its tables."""
 
 
 def as_paper(settings: Settings, scenario: str, told: Collection[str] = (), reading: str | None = None) -> Settings:
-    """``settings`` with the paper read as ``reading`` says, and what suits the scenario of the rest.
+    """``settings`` with the paper read as ``reading`` says, and with a map like the paper's on the paper's street.
 
     ``told``: names ("mapping.drop_strays") of what the user set: that stays. MapvoteError for a reading there is not.
     """
-    known, published = settings, scenario in PUBLISHED
-    said = reading or ("" if any(key.startswith("paper.") for key in told) else PUBLISHED.get(scenario, ""))
-    if said:
-        known = known.model_copy(update={"paper": read(known.paper, said)})
-    if published and "mapping.drop_strays" not in told:
+    known = settings
+    if reading:
+        known = known.model_copy(update={"paper": read(known.paper, reading)})
+    if scenario == PUBLISHED and "mapping.drop_strays" not in told:
         known = known.model_copy(update={"mapping": known.mapping.model_copy(update={"drop_strays": False})})
     return known
 

@@ -5,7 +5,9 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from concurrent.futures import as_completed
+from contextlib import nullcontext
 from dataclasses import dataclass
+from itertools import count
 from pathlib import Path
 
 import numpy as np
@@ -51,26 +53,30 @@ def passes(
     scene: Scene, cases: Sequence[Case], workers: int, progress: Progress | None = None, who: str = "v",
     keep: bool = False,
 ) -> list[Pass]:  # fmt: skip
-    """The passes of all drives called ``who``..., in order of their numbers; those that the cache lacks are driven,
-    in parallel. ``keep``: what each scan says is kept too (experiments/kept.py)."""
+    """The passes of all drives called ``who``..., in order of their numbers; those that the cache lacks are driven.
+
+    The first is driven in this process, the others in ``workers`` - 1 further ones. ``keep``: what each scan says is
+    kept too (experiments/kept.py).
+    """
     names = scene.drive_names(who)
     missing = [name for name in names if not pass_folder(scene, cases, name, keep).exists()]
-    done = len(names) - len(missing)
-    if progress:
-        progress("voting", done, len(names))
-    if workers > 1 and len(missing) > 1:
-        with processes(workers) as pool:
-            for finished in as_completed([pool.submit(drive_once, scene, cases, name, keep) for name in missing]):
-                finished.result()
-                done += 1
-                if progress:
-                    progress("voting", done, len(names))
-    else:
-        for name in missing:
+    done = count(len(names) - len(missing))
+
+    def tell() -> None:
+        finished = next(done)
+        if progress:
+            progress("voting", finished, len(names))
+
+    tell()
+    shared = workers > 1 and len(missing) > 1
+    with processes(workers - 1) if shared else nullcontext() as pool:
+        elsewhere = [pool.submit(drive_once, scene, cases, name, keep) for name in missing[1:]] if pool else []
+        for name in missing[:1] if pool else missing:
             drive_once(scene, cases, name, keep)
-            done += 1
-            if progress:
-                progress("voting", done, len(names))
+            tell()
+        for finished in as_completed(elsewhere):
+            finished.result()
+            tell()
     return [_read_pass(pass_folder(scene, cases, name, keep), cases) for name in names]
 
 

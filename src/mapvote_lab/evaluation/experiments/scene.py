@@ -97,8 +97,8 @@ class Scene:
         key = key_of(sources_digest(_MAP_FROM), *settings, c.scans, c.true_poses, c.true_ground)
         return self.folder.with_name(f"{self.folder.name}-made") / key
 
-    def prepare(self, progress: Progress | None = None) -> None:
-        """Simulate the drives and build the first map, unless the cache holds them."""
+    def simulate(self, progress: Progress | None = None) -> None:
+        """Simulate the drives, unless the cache holds them."""
         if (self.folder / _DROPPED).exists():
             shutil.rmtree(self.folder)
         if not self.folder.exists():
@@ -106,6 +106,10 @@ class Scene:
             partial = self.folder.with_name(f".{self.folder.name}.{os.getpid()}")
             simulate(self.scenario, partial, self.seed, progress=told, overrides=self.overrides)
             os.replace(partial, self.folder) if not self.folder.exists() else shutil.rmtree(partial)
+
+    def prepare(self, progress: Progress | None = None) -> None:
+        """Simulate the drives and build the first map, unless the cache holds them."""
+        self.simulate(progress)
         if not (self.work / "map").exists():
             told = (lambda done, total: progress("mapping", done, total)) if progress else None
             surveys = [self.drive(name) for name in self.drive_names("survey_")]

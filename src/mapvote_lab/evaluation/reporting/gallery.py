@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -69,8 +69,8 @@ def gallery(
     return out
 
 
-def drawn(evaluation: Evaluation, case: str) -> list[tuple[str, Figure, str]]:
-    """(name, figure, caption) of every picture."""
+def drawn(evaluation: Evaluation, case: str) -> Iterator[tuple[str, Figure, str]]:
+    """(name, figure, caption) of every picture, one after the other: a figure takes tens of megabytes."""
     old, new = all_points(evaluation.first_map), all_points(evaluation.outcomes[case].updated)
     survived, added = same_rows(old, new)
     deleted = old[~survived]
@@ -78,59 +78,43 @@ def drawn(evaluation: Evaluation, case: str) -> list[tuple[str, Figure, str]]:
     areas = areas_of(evaluation)
     outlines = [(o["kind"], np.asarray(o["footprint"])) for o in evaluation.truth.objects]
     boxes = [(area.name, area.box) for area in areas]
-    street = figures.street(
-        (old, heights_above_ground(evaluation.first_map, old)), (new, heights_above_ground(evaluation.first_map, new)),
-        added, deleted,
+    yield "street", figures.street(
+        (old, heights_above_ground(evaluation.first_map, old)), (new, heights_above_ground(evaluation.first_map, new)), added, deleted,
         evaluation.window, outlines=outlines, areas=boxes, paths=paths,
-    )  # fmt: skip
-    pictures = [("street", street, f"The street from above before and after the vote ({case_name(case)}): Figure 6.")]
+    ), f"The street from above before and after the vote ({case_name(case)}): Figure 6."  # fmt: skip
     for area in areas:
         verb, figure = ("added in red", 7) if area.kind == "built" else ("deleted in blue", 8)
         caption = f"{area.name.capitalize()} in bird's-eye view, points {verb}: Figure {figure}."
-        pictures.append(
-            (area.name.replace(" ", "_"), _area(evaluation.first_map, area, old, survived, added, paths), caption)
-        )
+        yield area.name.replace(" ", "_"), _area(evaluation.first_map, area, old, survived, added, paths), caption
     nearest = _scan_near(evaluation, areas)
     v, n_min = evaluation.scene.settings.voting, evaluation.scene.settings.paper.n_min
     decided = {n: evaluation.outcomes[n].states for n in ("1", "5", "surfaces") if n in evaluation.outcomes}
     panels = [("Truth (strict)", _as_states(evaluation.truth.strict))]
     panels += [(case_name(n).capitalize(), states) for n, states in decided.items()]
-    states = figures.cell_states(panels, evaluation.window, outlines=outlines)
     shown = {n: e for n, e in evaluation.result.cases.items() if n in (*"12345", "surfaces", *YARDSTICKS)}
     names = {n: case_name(n) for n in shown}
-    bars = figures.score_bars(shown, names)
-    pictures += [
-        ("scan", _scan(evaluation, nearest), "One scan of a vehicle, bodies that move in orange: Figure 5."),
-        ("local_grid", _local_grid(evaluation, nearest), "The 80 m local grid of one vehicle: Figures 2 and 3."),
-        (
-            "vote_curve",
-            figures.vote_curve(v.a, v.b, v.k, n_min),
-            "Votes of an occupied cell, Eq. (1): Figure 4.",
-        ),
-        (
-            "states",
-            states,
-            "What the server decided, cell by cell; yellow in the truth: unscored.",
-        ),
-        ("table_iv", bars, "Table IV as bars, the paper's figures beside ours."),
-        ("classes", figures.class_bars(shown, names), "Precision and recall of each class: Tables II and III."),
-        ("bytes", figures.byte_bars(shown, names), "What a vehicle sends, by case."),
-    ]
-    return [*pictures, *_of_our_own(evaluation)]
+    yield "scan", _scan(evaluation, nearest), "One scan of a vehicle, bodies that move in orange: Figure 5."
+    yield "local_grid", _local_grid(evaluation, nearest), "The 80 m local grid of one vehicle: Figures 2 and 3."
+    yield "vote_curve", figures.vote_curve(v.a, v.b, v.k, n_min), "Votes of an occupied cell, Eq. (1): Figure 4."
+    caption = "What the server decided, cell by cell; yellow in the truth: unscored."
+    yield "states", figures.cell_states(panels, evaluation.window, outlines=outlines), caption
+    yield "table_iv", figures.score_bars(shown, names), "Table IV as bars, the paper's figures beside ours."
+    yield "classes", figures.class_bars(shown, names), "Precision and recall of each class: Tables II and III."
+    yield "bytes", figures.byte_bars(shown, names), "What a vehicle sends, by case."
+    yield from _of_our_own(evaluation)
 
 
-def _of_our_own(evaluation: Evaluation) -> list[tuple[str, Figure, str]]:
+def _of_our_own(evaluation: Evaluation) -> Iterator[tuple[str, Figure, str]]:
     """The reliability of the probabilities, if the shown case is ours."""
-    out = []
-    if evaluation.best == "surfaces":
-        decisions, lattice = evaluation.outcomes[evaluation.best].decisions, evaluation.first_map.lattice
-        found = {
-            state: reliability(decisions, lattice, evaluation.truth.strict, evaluation.window, state)
-            for state in (CellState.CHANGED_OCCUPIED, CellState.CHANGED_EMPTY)
-        }
-        caption = "How often cells changed that were told to, by the probability they were told with (strict truth)."
-        out.append(("reliability", figures.reliability_diagram(found), caption))
-    return out
+    if evaluation.best != "surfaces":
+        return
+    decisions, lattice = evaluation.outcomes[evaluation.best].decisions, evaluation.first_map.lattice
+    found = {
+        state: reliability(decisions, lattice, evaluation.truth.strict, evaluation.window, state)
+        for state in (CellState.CHANGED_OCCUPIED, CellState.CHANGED_EMPTY)
+    }
+    caption = "Share of the cells that really changed, by the probability they were decided with (strict truth)."
+    yield "reliability", figures.reliability_diagram(found), caption
 
 
 def _as_states(truth: U8) -> U8:

@@ -95,6 +95,15 @@ def among(things: Sequence[Thing], street: Street) -> Edit:
     return lambda recording: with_things(recording, things, street.T_map_lidar)
 
 
+def new_things(
+    street: Street, site: Site, cases: Sequence[Case], seed: int, each: int
+) -> tuple[RealRun, list[Asked], list[Thing]]:
+    """The vehicles find ``each`` new things of every kind that needs no hedge, and nothing else has changed."""
+    things = [thing for thing in site.placed(seed, each)[0] if thing.kind != "wall behind a hedge"]
+    run = vote_on(street, cases, edit=among(things, street))
+    return run, [_new(street, thing) for thing in things], things
+
+
 def built(street: Street, site: Site, cases: Sequence[Case], seed: int, each: int) -> Iterator[Changed]:
     """The vehicles find new things, walls moved by half a metre, and parked cars gone; hedges stood before, too.
 
