@@ -243,7 +243,7 @@ def test_nothing_is_said_of_cells_outside_the_square_that_votes() -> None:
 def seen_twice() -> tuple[PaperVoter, U64]:
     """Two scans of it."""
     point_map, seen = observed()
-    voter = PaperVoter(VotingSettings(), PaperSettings(), SENSOR, point_map)
+    voter = PaperVoter(VotingSettings(), PaperSettings(occluded="votes"), SENSOR, point_map)
     for _ in range(2):
         may_be_new = voter.observe(seen)
     return voter, may_be_new
