@@ -79,7 +79,8 @@ def drawn(evaluation: Evaluation, case: str) -> Iterator[tuple[str, Figure, str]
     outlines = [(o["kind"], np.asarray(o["footprint"])) for o in evaluation.truth.objects]
     boxes = [(area.name, area.box) for area in areas]
     yield "street", figures.street(
-        (old, heights_above_ground(evaluation.first_map, old)), (new, heights_above_ground(evaluation.first_map, new)), added, deleted,
+        (old, heights_above_ground(evaluation.first_map, old)), (new, heights_above_ground(evaluation.first_map, new)),
+        added, deleted,
         evaluation.window, outlines=outlines, areas=boxes, paths=paths,
     ), f"The street from above before and after the vote ({case_name(case)}): Figure 6."  # fmt: skip
     for area in areas:
