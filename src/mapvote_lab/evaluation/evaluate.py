@@ -11,7 +11,6 @@ from msgspec.structs import asdict
 
 from mapvote.codec.ballot import Ballot
 from mapvote.core.grid import Grid
-from mapvote.core.heap import give_back_free_pages
 from mapvote.core.point_map import PointMap
 from mapvote_lab.evaluation.baselines.run import yardsticks
 from mapvote_lab.evaluation.experiments.cases import Case, fuse_case
@@ -57,11 +56,9 @@ def evaluate(
     """
     started = time.perf_counter()
     scene.prepare(progress)
-    give_back_free_pages()
     prepared = time.perf_counter()
     workers = min(2, os.cpu_count() or 1)
     drives = passes(scene, cases, workers, progress, keep=readings is not None)
-    give_back_free_pages()
     voted = time.perf_counter()
     truth, first_map = scene.truth, scene.point_map
     beams = scene.drive(drives[0].vehicle).sensor.beams

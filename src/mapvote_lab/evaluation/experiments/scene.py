@@ -23,6 +23,7 @@ import mapvote
 import mapvote_lab
 from mapvote.config import Settings
 from mapvote.core.columns import GROUND_MARGIN_M
+from mapvote.core.heap import give_back_free_pages
 from mapvote.core.point_map import PointMap
 from mapvote.core.types import F64, Drive
 from mapvote.core.voxels import voxel_downsample
@@ -120,6 +121,7 @@ class Scene:
             if self.conditions.true_ground:
                 point_map = with_true_ground(point_map, self.scenario, self.seed, self.overrides)
             write_map(point_map, self.work / "map")
+            give_back_free_pages()
 
     def drop_drives(self) -> None:
         """Free the disk: keep the truth and what was made of the drives; whoever needs them simulates them again."""
