@@ -35,7 +35,7 @@ from mapvote.server.store.round import Gate
 from mapvote.server.store.store import Store
 
 _EVERY_S = 2.0
-_ROUTES = (
+ROUTES = (
     ballot_route,
     vehicle_routes,
     operator_routes,

@@ -15,8 +15,9 @@ import msgspec
 from fastapi import APIRouter, Request, Response
 from fastapi.routing import APIRoute
 
+from mapvote.server.http.answers import Stored
 from mapvote.server.http.auth import own
-from mapvote.server.http.schemas import Name, Stored, problems
+from mapvote.server.http.schemas import Name, problems
 from mapvote.server.http.services import services
 from mapvote.server.store.admission import Sent, sound
 

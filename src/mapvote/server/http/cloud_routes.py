@@ -7,6 +7,7 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Path, Query, Request, Response
 
 from mapvote.codec.arrays import compress
+from mapvote.server.http.answers import Places as PlacesAnswer
 from mapvote.server.http.auth import reviewer
 from mapvote.server.http.schemas import AS_CSV, From, Places, To, VersionQuery, as_json, as_table, problems
 from mapvote.server.http.services import services
@@ -81,9 +82,7 @@ def evidence_of(request: Request, row: _Index, col: _Index, vehicle: str | None 
     return packed(request, plane.tobytes(), "private, no-cache")
 
 
-@router.get(
-    "/v1/paths", response_model=dict[str, Any], responses=problems(403) | AS_CSV, summary="Where vehicles drove"
-)
+@router.get("/v1/paths", response_model=PlacesAnswer, responses=problems(403) | AS_CSV, summary="Where vehicles drove")
 def driven(request: Request, vehicle: str | None = None, format: Places = "json") -> Response:
     """Of standing ballots that tell of it, the newest drive first, 500 at most: GeoJSON lines in map metres; as ``csv``
     without the lines."""

@@ -12,6 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from mapvote.codec.ballot import tile_key
 from mapvote.core.tile import Tile
+from mapvote.server.http.answers import DeskAnswer, Pending, VerdictGiven
 from mapvote.server.http.auth import reviewer
 from mapvote.server.http.cloud_routes import AS_BYTES, packed
 from mapvote.server.http.schemas import AS_CSV, PLAIN, Places, as_json, as_table, problems
@@ -36,7 +37,7 @@ class ReviewAsk(BaseModel):
 
 @router.get(
     "/v1/desk",
-    response_model=dict[str, Any],
+    response_model=DeskAnswer | Pending,
     responses=problems(403) | AS_CSV,
     summary="What a publish would change now",
 )
@@ -90,7 +91,7 @@ def _flat(row: Mapping[str, Any]) -> dict[str, Any]:
 
 
 @router.post("/v1/desk/reviews", responses=problems(403, 404, 409), summary="Accept, hold or reject a change")
-async def decide(request: Request, ask: ReviewAsk) -> dict[str, int]:
+async def decide(request: Request, ask: ReviewAsk) -> VerdictGiven:
     """Publishing obeys it: a rejected change does not come back by the votes there are, a held one waits.
 
     409 if somebody else decided meanwhile.
@@ -98,11 +99,11 @@ async def decide(request: Request, ask: ReviewAsk) -> dict[str, int]:
     by, parts = reviewer(request), services(request)
     said = partial(review, by=by, comment=ask.comment, after=ask.after, executor=parts.fusing)
     work = partial(said, parts.store, ask.change, ask.verdict)
-    return {"seq": await to_thread.run_sync(work, limiter=parts.threads.deciding)}
+    return VerdictGiven(seq=await to_thread.run_sync(work, limiter=parts.threads.deciding))
 
 
 @router.delete("/v1/desk/reviews/{seq}", responses=problems(403, 404, 409), summary="Take a verdict back")
-def take_back(request: Request, seq: Annotated[int, Path(ge=0, lt=1 << 62)]) -> dict[str, int]:
+def take_back(request: Request, seq: Annotated[int, Path(ge=0, lt=1 << 62)]) -> VerdictGiven:
     """The change is pending again."""
     undo(services(request).store, seq, by=reviewer(request))
-    return {"seq": seq}
+    return VerdictGiven(seq=seq)

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import time
 from collections.abc import Awaitable, Callable
-from typing import Any
 
 from fastapi import APIRouter, Request
 from starlette.responses import Response
 
 from mapvote.server.errors import Unavailable
+from mapvote.server.http.answers import Health, Ready
 from mapvote.server.http.schemas import problems
 from mapvote.server.http.services import services
 from mapvote.server.store.integrity import set_aside
@@ -61,20 +61,20 @@ async def live() -> Response:
 
 
 @router.get("/healthz", responses=problems(), summary="Can the store be read?")
-async def health(request: Request) -> dict[str, Any]:
+async def health(request: Request) -> Health:
     """200 with the newest version, 503 if the database does not answer."""
-    return {"status": "ok", "version": await services(request).newest.put(None)}
+    return Health(status="ok", version=await services(request).newest.put(None))
 
 
 @router.get("/readyz", responses=problems(), summary="Can ballots be taken in?")
-async def ready(request: Request) -> dict[str, Any]:
+async def ready(request: Request) -> Ready:
     """200 if the database can be written now, 503 with what it says if not, or if the server is stopping.
 
     ``quarantine`` names what is damaged and was set aside: all else goes on.
     """
     parts = services(request)
     version, damaged = await parts.check_ready(), await parts.look_up(_damaged)
-    return {"status": "ready", "version": version, "quarantine": damaged[:_NAMED], "quarantined": len(damaged)}
+    return Ready(status="ready", version=version, quarantine=damaged[:_NAMED], quarantined=len(damaged))
 
 
 @router.get("/metrics", responses=problems(), response_class=Response, summary="Prometheus metrics")

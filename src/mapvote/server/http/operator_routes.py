@@ -7,7 +7,7 @@ from concurrent.futures import CancelledError
 from contextlib import contextmanager
 from dataclasses import asdict
 from functools import partial
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import structlog
 from anyio import to_thread
@@ -15,6 +15,18 @@ from fastapi import APIRouter, Query, Request, Response
 
 from mapvote.codec.ballot import tile_key
 from mapvote.server.errors import Held, Unavailable
+from mapvote.server.http.answers import (
+    Cancelled,
+    CellAnswer,
+    Changes,
+    Coverage,
+    Published,
+    Publishes,
+    RolledBack,
+    Running,
+    Vehicles,
+)
+from mapvote.server.http.answers import Places as PlacesAnswer
 from mapvote.server.http.auth import operator, reviewer, sees_names
 from mapvote.server.http.schemas import (
     AS_CSV,
@@ -23,7 +35,6 @@ from mapvote.server.http.schemas import (
     Newest,
     Places,
     PublishAsk,
-    Published,
     RollbackAsk,
     as_json,
     as_table,
@@ -49,18 +60,18 @@ async def publish_now(request: Request, ask: PublishAsk) -> Published:
     return await to_thread.run_sync(_publish, parts, ask, by, limiter=parts.threads.deciding)
 
 
-@router.get("/v1/publish", response_model=dict[str, Any], responses=problems(403), summary="How far a publish is")
-async def publishing_now(request: Request) -> dict[str, Any]:
+@router.get("/v1/publish", responses=problems(403), summary="How far a publish is")
+async def publishing_now(request: Request) -> Publishes:
     """Publishes under way, and looks at what one would do: who asked, and how many tiles of how many are fused."""
     reviewer(request)
     rounds = services(request).publishing.now()
-    return {"running": [{"by": r.by, "dry_run": r.dry_run, "done": r.done, "of": r.of} for r in rounds]}
+    return Publishes(running=[Running(by=r.by, dry_run=r.dry_run, done=r.done, of=r.of) for r in rounds])
 
 
 @router.delete("/v1/publish", responses=problems(403, 404), summary="Cancel what is being published")
-async def cancel_publishing(request: Request) -> dict[str, int]:
+async def cancel_publishing(request: Request) -> Cancelled:
     """Every publish under way ends before its next tiles with 409, and nothing of it is published."""
-    return {"cancelled": services(request).publishing.cancel(operator(request))}
+    return Cancelled(cancelled=services(request).publishing.cancel(operator(request)))
 
 
 def _publish(parts: Services, ask: PublishAsk, by: str) -> Published:
@@ -96,16 +107,16 @@ def _publish(parts: Services, ask: PublishAsk, by: str) -> Published:
 
 
 @router.post("/v1/rollback", responses=problems(403, 404, 409), summary="Go back to an older version")
-async def roll_back(request: Request, ask: RollbackAsk) -> dict[str, int]:
+async def roll_back(request: Request, ask: RollbackAsk) -> RolledBack:
     """A new version that is the old one again; the votes that led away from it are barred."""
     by, parts = operator(request), services(request)
     back = partial(rollback, parts.store, ask.to, by=by, reason=ask.reason)
-    return {"version": (await to_thread.run_sync(back, limiter=parts.threads.deciding)).number}
+    return RolledBack(version=(await to_thread.run_sync(back, limiter=parts.threads.deciding)).number)
 
 
 @router.get(
     "/v1/changes",
-    response_model=dict[str, Any],
+    response_model=Changes,
     responses=problems(404) | AS_CSV,
     summary="What changed, as GeoJSON in map metres or as CSV",
 )
@@ -146,7 +157,7 @@ def changes_page(
     return Response(page, media_type="text/html", headers=kept)
 
 
-@router.get("/v1/cells", response_model=dict[str, Any], responses=problems(), summary="The votes behind one cell")
+@router.get("/v1/cells", response_model=CellAnswer, responses=problems(), summary="The votes behind one cell")
 def cell(request: Request, x: float, y: float) -> Response:
     """Who says what about the cell at (x, y), map metres, whether it counts, and what was decided when."""
     parts = services(request)
@@ -160,7 +171,10 @@ def cell(request: Request, x: float, y: float) -> Response:
 
 
 @router.get(
-    "/v1/coverage", response_model=dict[str, Any], responses=problems() | AS_CSV, summary="Freshness of every tile"
+    "/v1/coverage",
+    response_model=Coverage | PlacesAnswer,
+    responses=problems() | AS_CSV,
+    summary="Freshness of every tile",
 )
 def fresh(request: Request, format: Places = "json") -> Response:
     """When each tile was last driven past, and by how many vehicles whose ballots stand."""
@@ -177,7 +191,7 @@ def fresh(request: Request, format: Places = "json") -> Response:
 
 @router.get(
     "/v1/vehicles",
-    response_model=dict[str, Any],
+    response_model=Vehicles | PlacesAnswer,
     responses=problems(403) | AS_CSV,
     summary="Who contradicts the others",
 )

@@ -14,6 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from mapvote.core.types import MapvoteError
 from mapvote.server.errors import Conflict, Forbidden, Held, NotFound, TooLarge, TooMany, Unauthorised, Unavailable
+from mapvote.server.http.answers import Problem
 from mapvote.server.views.geojson import as_csv
 
 STATUS: Mapping[type[MapvoteError], int] = {
@@ -45,21 +46,6 @@ Newest = Annotated[int | None, Query(alias="to", ge=LEAST, le=MOST)]
 MinCells = Annotated[int, Query(ge=1, le=100_000)]
 
 
-class Problem(BaseModel):
-    """What went wrong, and how to mend it."""
-
-    detail: Any
-    reasons: list[str] | None = None
-
-
-class Stored(BaseModel):
-    """A ballot is on disk."""
-
-    vehicle: str
-    drive: str
-    result: str = Field(description="created, replaced, or repeated: the very same ballot stood already")
-
-
 class PublishAsk(BaseModel):
     """How to publish; an empty object publishes what stands."""
 
@@ -68,17 +54,6 @@ class PublishAsk(BaseModel):
     override: bool = Field(default=False, description="publish in spite of the reasons to hold it")
     parent: int | None = Field(default=None, ge=LEAST, le=MOST, description="only if this is still the newest version")
     reason: str = Field(default="", max_length=200, pattern=PLAIN)
-
-
-class Published(BaseModel):
-    """What a publish did, or would do."""
-
-    version: int
-    published: bool
-    tiles: list[str]
-    points_added: int
-    points_deleted: int
-    held: list[str]
 
 
 class RollbackAsk(BaseModel):

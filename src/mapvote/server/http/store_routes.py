@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from dataclasses import asdict
 from functools import partial
-from typing import Annotated, Any
+from typing import Annotated
 
 from anyio import to_thread
 from fastapi import APIRouter, Query, Request, Response
 from pydantic import BaseModel, ConfigDict, Field
 
+from mapvote.server.http.answers import Checked, Info, Log, PolicyAnswer
 from mapvote.server.http.auth import operator, reviewer
 from mapvote.server.http.schemas import PLAIN, as_json, problems
 from mapvote.server.http.services import services
@@ -27,13 +28,13 @@ class PolicyAsk(BaseModel):
     reason: str = Field(default="", max_length=200, pattern=PLAIN)
 
 
-@router.get("/v1/policy", response_model=dict[str, Any], responses=problems(), summary="What decides")
+@router.get("/v1/policy", response_model=PolicyAnswer, responses=problems(), summary="What decides")
 def policy(request: Request) -> Response:
     """The policy that holds, who set it and why."""
     return as_json(services(request).store.policy_changes()[-1].as_json())
 
 
-@router.patch("/v1/policy", response_model=dict[str, Any], responses=problems(403), summary="Decide otherwise")
+@router.patch("/v1/policy", response_model=PolicyAnswer, responses=problems(403), summary="Decide otherwise")
 def change_policy(request: Request, ask: PolicyAsk) -> Response:
     """Holds at once. 422 naming the value that cannot be, or the key that does not exist."""
     by, store = operator(request), services(request).store
@@ -41,20 +42,20 @@ def change_policy(request: Request, ask: PolicyAsk) -> Response:
     return as_json(store.policy_changes()[-1].as_json())
 
 
-@router.get("/v1/info", response_model=dict[str, Any], responses=problems(), summary="What is in the store")
+@router.get("/v1/info", response_model=Info, responses=problems(), summary="What is in the store")
 def info(request: Request) -> Response:
     """The map, its newest version, and how much there is of everything."""
     return as_json(overview(services(request).store))
 
 
-@router.get("/v1/log", response_model=dict[str, Any], responses=problems(403), summary="What happened")
+@router.get("/v1/log", response_model=Log, responses=problems(403), summary="What happened")
 def log(request: Request, events: Annotated[int, Query(ge=0, le=10_000)] = 0) -> Response:
     """Every version, and the last so many events."""
     reviewer(request)
     return as_json(log_of(services(request).store, events))
 
 
-@router.get("/v1/check", response_model=dict[str, Any], responses=problems(403), summary="Is every byte as written?")
+@router.get("/v1/check", response_model=Checked, responses=problems(403), summary="Is every byte as written?")
 async def whole(request: Request) -> Response:
     """Reads the whole store; what is damaged is named, nothing is changed."""
     operator(request)
@@ -63,7 +64,7 @@ async def whole(request: Request) -> Response:
     return as_json({"damage": [asdict(damage) for damage in found]})
 
 
-@router.post("/v1/check", response_model=dict[str, Any], responses=problems(403), summary="Set aside what is damaged")
+@router.post("/v1/check", response_model=Checked, responses=problems(403), summary="Set aside what is damaged")
 async def mend(request: Request) -> Response:
     """As looking, and what is damaged takes no part from now on. Planes are mended on the server's own machine, from a
     backup."""

@@ -12,6 +12,7 @@ from fastapi import APIRouter, Path, Request, Response
 from fastapi.concurrency import run_in_threadpool
 
 from mapvote.codec.arrays import unpack_bytes
+from mapvote.server.http.answers import ManifestAnswer, Versions, Withdrawn
 from mapvote.server.http.auth import own
 from mapvote.server.http.schemas import AS_CSV, Name, Number, Table, VersionQuery, as_json, as_table, iso, problems
 from mapvote.server.http.services import services
@@ -24,7 +25,7 @@ router = APIRouter()
 
 @router.get(
     "/v1/map",
-    response_model=dict[str, Any],
+    response_model=ManifestAnswer,
     responses=problems(404) | _AS_YOU_HAVE,
     summary="Manifest of the newest version",
 )
@@ -33,7 +34,7 @@ async def newest(request: Request, since: VersionQuery | None = None) -> Respons
     return await _manifest(request, None, since)
 
 
-@router.get("/v1/map/versions", response_model=dict[str, Any], responses=problems() | AS_CSV, summary="All versions")
+@router.get("/v1/map/versions", response_model=Versions, responses=problems() | AS_CSV, summary="All versions")
 def versions(request: Request, format: Table = "json") -> Response:
     """Every version, oldest first, with the policy it was made by."""
     listed = []
@@ -47,7 +48,7 @@ def versions(request: Request, format: Table = "json") -> Response:
 
 @router.get(
     "/v1/map/versions/{number}",
-    response_model=dict[str, Any],
+    response_model=ManifestAnswer,
     responses=problems(404) | _AS_YOU_HAVE,
     summary="Manifest of one version",
 )
@@ -82,10 +83,10 @@ async def plane(request: Request, digest: Annotated[str, Path(pattern=r"^[0-9a-f
 
 
 @router.delete("/v1/ballots/{vehicle}/{drive}", responses=problems(403, 404, 429), summary="Un-vote")
-async def unvote(request: Request, vehicle: Name, drive: Name) -> dict[str, int]:
+async def unvote(request: Request, vehicle: Name, drive: Name) -> Withdrawn:
     """Withdraw a ballot: what is published later is as if it had never been cast."""
     by = own(request, vehicle)
-    return {"withdrawn": await run_in_threadpool(withdraw, services(request).store, vehicle, drive, by=by)}
+    return Withdrawn(withdrawn=await run_in_threadpool(withdraw, services(request).store, vehicle, drive, by=by))
 
 
 async def _manifest(request: Request, number: int | None, since: int | None) -> Response:

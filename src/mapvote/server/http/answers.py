@@ -1,0 +1,424 @@
+"""The JSON answers of every route, as OpenAPI declares them to programs in other languages.
+
+Routes encode their answers themselves (:func:`mapvote.server.http.schemas.as_json`). A test holds every answer to its
+model: it has the model's members and no others.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from mapvote.server.views.change_objects import Kind, Size
+from mapvote.server.views.consensus import Claim, Stance
+
+
+class Answer(BaseModel):
+    """Members that a model does not name never come."""
+
+    model_config = ConfigDict(extra="forbid")
+
+
+class Problem(Answer):
+    """What went wrong, and how to mend it."""
+
+    detail: Any
+    reasons: list[str] | None = Field(default=None, description="of a version that the policy holds")
+
+
+class Origin(Answer):
+    """Of the cells' lattice, map metres."""
+
+    x0: float
+    y0: float
+
+
+class Planes(Answer):
+    """SHA-256 of the planes of one tile, see ``/v1/tiles/{digest}``."""
+
+    points: str
+    ground: str
+    free: str | None = None
+    fields: str | None = None
+
+
+class ManifestAnswer(Answer):
+    """One version of the map; tiles by "row,col"."""
+
+    map_id: str
+    version: int
+    lattice: Origin
+    georeference: dict[str, str]
+    tiles: dict[str, Planes]
+    digest: str
+    removed: list[str]
+    fields_digest: str | None = None
+
+
+class VersionEntry(Answer):
+    """How a version came about."""
+
+    number: int
+    parent: int | None
+    kind: Literal["import", "publish", "rollback", "replay"]
+    target: int | None = Field(description="of a rollback or replay: the version it goes back to")
+    published_by: str
+    reason: str
+
+
+class DatedVersion(VersionEntry):
+    """A version with the policy that it was made by."""
+
+    created: str
+    policy: dict[str, Any]
+
+
+class Versions(Answer):
+    """Oldest first."""
+
+    versions: list[DatedVersion]
+
+
+class Stored(Answer):
+    """A ballot is on disk."""
+
+    vehicle: str
+    drive: str
+    result: Literal["created", "replaced", "repeated"] = Field(
+        description="repeated: the very same ballot stood already"
+    )
+
+
+class Withdrawn(Answer):
+    """How many ballots."""
+
+    withdrawn: int
+
+
+class Published(Answer):
+    """What a publish did, or would do."""
+
+    version: int
+    published: bool
+    tiles: list[str]
+    points_added: int
+    points_deleted: int
+    held: list[str]
+
+
+class Running(Answer):
+    """One publish, or one look at what it would do."""
+
+    by: str
+    dry_run: bool
+    done: int = Field(description="tiles fused")
+    of: int
+
+
+class Publishes(Answer):
+    """Those under way, oldest first."""
+
+    running: list[Running]
+
+
+class Cancelled(Answer):
+    """How many publishes."""
+
+    cancelled: int
+
+
+class RolledBack(Answer):
+    """The new version."""
+
+    version: int
+
+
+class VerdictAnswer(Answer):
+    """What a reviewer said of a change."""
+
+    seq: int
+    verdict: Literal["accepted", "held", "rejected"]
+    by: str
+    comment: str
+    at_ns: int
+
+
+class VerdictGiven(Answer):
+    """The verdict's number in the log."""
+
+    seq: int
+
+
+class Geometry(Answer):
+    """As RFC 7946 has it."""
+
+    type: Literal["Point", "LineString", "Polygon", "MultiPolygon"]
+    coordinates: list[Any]
+
+
+class ChangeFacts(Answer):
+    """One thing that was built or demolished."""
+
+    kind: Kind
+    size: Size
+    area_m2: float
+    height_m: float
+    volume_m3: float = Field(description="of its columns")
+    cells: int
+    points: int
+    votes_min: int
+    votes_median: float
+    against_median: float
+    share_for: float | None
+    probability: float | None = Field(description="mean over its cells that each of them changed")
+    first_seen: str | None
+    last_seen: str | None
+    versions: list[int]
+    box: list[list[float]]
+    near: list[str] = Field(description="ids of large things within 15 m")
+
+
+class PendingFacts(ChangeFacts):
+    """A change on the desk."""
+
+    verdict: VerdictAnswer | None
+    waits: str | None = Field(default=None, description="why it is not deleted yet")
+    false_deletion: float | None = Field(
+        default=None, description="largest probability that something that stands goes"
+    )
+    drive_by: list[float] | None = Field(default=None, description="x, y where a vehicle should drive by")
+
+
+class ChangeFeature(Answer):
+    """GeoJSON."""
+
+    type: Literal["Feature"]
+    id: str
+    geometry: Geometry
+    properties: ChangeFacts
+
+
+class PendingFeature(Answer):
+    """GeoJSON."""
+
+    type: Literal["Feature"]
+    id: str
+    geometry: Geometry
+    properties: PendingFacts
+
+
+class _Collection(Answer):
+    """GeoJSON; ``frame`` says what its coordinates are."""
+
+    type: Literal["FeatureCollection"]
+    frame: str
+    map_id: str
+    georeference: dict[str, str]
+    from_version: int | None
+    to_version: int | None
+
+
+class Changes(_Collection):
+    """What differs between two versions."""
+
+    features: list[ChangeFeature]
+    damaged: list[str] | None = Field(default=None, description="tiles that cannot be read")
+
+
+class Pending(_Collection):
+    """What a publish would change."""
+
+    features: list[PendingFeature]
+
+
+class DeskAnswer(Answer):
+    """The review desk."""
+
+    version: int
+    held: list[str] = Field(description="why the policy would hold the version")
+    pending: Pending
+    waiting: list[PendingFeature]
+    reviewed: list[PendingFeature]
+    tiles: dict[str, Planes | None] = Field(description="as a publish would make them; null: without points")
+
+
+class PlacedFeature(Answer):
+    """GeoJSON."""
+
+    type: Literal["Feature"]
+    geometry: Geometry
+    properties: dict[str, Any]
+
+
+class Places(Answer):
+    """GeoJSON in map metres."""
+
+    type: Literal["FeatureCollection"]
+    frame: str
+    features: list[PlacedFeature]
+
+
+class LeftOut(Answer):
+    """A version that did not count a ballot."""
+
+    version: int
+    why: str
+
+
+class CellVoteAnswer(Answer):
+    """What one ballot says about a cell."""
+
+    vehicle: str
+    drive: str
+    version: int
+    state: str
+    marks: int | None = Field(description="voxels of the map that it says are gone")
+    sure: float | None
+    end: str
+    counts: bool
+    why: str
+    counted_in: list[int]
+    left_out_of: list[LeftOut]
+
+
+class CellDecision(Answer):
+    """What a version decided."""
+
+    version: int
+    state: str
+
+
+class CellAnswer(Answer):
+    """One cell: who says what, what was decided, what stands there."""
+
+    row: int
+    col: int
+    thing: str
+    votes: list[CellVoteAnswer]
+    decisions: list[CellDecision]
+    probability: float | None
+
+
+class CoveredTile(Answer):
+    """Row and column of a tile, how many vehicles saw it, and when the last did."""
+
+    row: int
+    col: int
+    vehicles: int
+    last_seen: str | None
+
+
+class Coverage(Answer):
+    """Of all tiles of the map and of standing ballots."""
+
+    tiles: list[CoveredTile]
+
+
+class Contradicted(Answer):
+    """Where a vehicle contradicts the others, map metres."""
+
+    x: float
+    y: float
+    cells: int
+    says: Claim
+
+
+class VehicleAnswer(Answer):
+    """How a vehicle stands to what the others say."""
+
+    vehicle: str
+    verdict: Stance
+    cells: int
+    objects: int
+    others_cells: int
+    others_objects: int
+    p_value: float
+    threshold: float
+    evidence: list[Contradicted]
+
+
+class Vehicles(Answer):
+    """By name."""
+
+    vehicles: list[VehicleAnswer]
+
+
+class PolicyAnswer(Answer):
+    """The policy that holds."""
+
+    policy: dict[str, Any]
+    at_ns: int
+    by: str
+    reason: str
+
+
+class Info(Answer):
+    """What is in the store."""
+
+    map_id: str
+    version: int
+    published_ns: int
+    oldest_version: int
+    tiles: int
+    fields: str
+    ballots: int
+    vehicles: int
+    votes_on_tiles: int
+    planes: int
+    plane_bytes: int
+    quarantined: int
+
+
+class LoggedVersion(VersionEntry):
+    """A version in the log."""
+
+    created_ns: int
+
+
+class LoggedEvent(Answer):
+    """One line of the log."""
+
+    seq: int
+    at_ns: int
+    kind: str
+    actor: str
+    detail: str
+
+
+class Log(Answer):
+    """Versions oldest first, events newest first."""
+
+    versions: list[LoggedVersion]
+    events: list[LoggedEvent]
+
+
+class DamageAnswer(Answer):
+    """One thing that is not as it was written."""
+
+    kind: str
+    name: str
+    why: str
+    mended: str
+
+
+class Checked(Answer):
+    """What is damaged."""
+
+    damage: list[DamageAnswer]
+
+
+class Health(Answer):
+    """The store can be read."""
+
+    status: Literal["ok"]
+    version: int
+
+
+class Ready(Answer):
+    """Ballots are taken in."""
+
+    status: Literal["ready"]
+    version: int
+    quarantine: list[str]
+    quarantined: int

@@ -1,0 +1,115 @@
+"""Every JSON answer is what OpenAPI declares: no member is missing, and none comes that no model names."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from fastapi.routing import APIRoute
+from fastapi.testclient import TestClient
+from msgspec.structs import replace
+from pydantic import TypeAdapter
+
+from hand_made import Say, make_ballot, states_plane, two_walls
+from mapvote.codec.ballot import encode
+from mapvote.codec.path import pack_path
+from mapvote.config import FuseSettings
+from mapvote.core.types import CellState
+from mapvote.server.http.answers import Answer
+from mapvote.server.http.app import ROUTES, create_app
+from mapvote.server.http.health_routes import Probe
+from mapvote.server.store.admission import accept, examine
+from mapvote.server.store.policy import Policy
+from mapvote.server.store.publish import publish
+from mapvote.server.store.store import Store
+
+WALL = [(10, 10), (10, 11), (10, 12)]
+ASKED: list[tuple[str, str, str, Any]] = [
+    ("GET", "/healthz", "", None),
+    ("GET", "/readyz", "", None),
+    ("GET", "/v1/map", "", None),
+    ("GET", "/v1/map/versions", "", None),
+    ("GET", "/v1/map/versions/{number}", "/v1/map/versions/1", None),
+    ("GET", "/v1/changes", "/v1/changes?from=1", None),
+    ("GET", "/v1/changes", "/v1/changes?from=1&lonlat=true", None),
+    ("GET", "/v1/cells", "/v1/cells?x=3.15&y=3.15", None),
+    ("GET", "/v1/coverage", "", None),
+    ("GET", "/v1/coverage", "/v1/coverage?format=geojson", None),
+    ("GET", "/v1/vehicles", "", None),
+    ("GET", "/v1/vehicles", "/v1/vehicles?format=geojson", None),
+    ("GET", "/v1/paths", "", None),
+    ("GET", "/v1/policy", "", None),
+    ("PATCH", "/v1/policy", "", {"values": {"fuse.min_votes": 2}}),
+    ("GET", "/v1/info", "", None),
+    ("GET", "/v1/log", "/v1/log?events=9", None),
+    ("GET", "/v1/check", "", None),
+    ("POST", "/v1/check", "", None),
+    ("GET", "/v1/publish", "", None),
+    ("GET", "/v1/desk", "", None),
+    ("GET", "/v1/desk", "/v1/desk?format=geojson", None),
+    ("POST", "/v1/desk/reviews", "", {"change": "PENDING", "verdict": "held"}),
+    ("GET", "/v1/desk", "", None),
+    ("DELETE", "/v1/desk/reviews/{seq}", "/v1/desk/reviews/SEQ", None),
+    ("POST", "/v1/publish", "", {"dry_run": True}),
+    ("POST", "/v1/rollback", "", {"to": 1}),
+    ("DELETE", "/v1/ballots/{vehicle}/{drive}", "/v1/ballots/a/d2", None),
+    ("PUT", "/v1/ballots/{vehicle}/{drive}", "/v1/ballots/a/d3", "BALLOT"),
+]
+"""Method, route, what is asked where that differs, and what is sent."""
+NEVER_HERE = {("DELETE", "/v1/publish")}
+"""Nothing is being published in this test; see test_desk.py."""
+
+
+def ballot(store: Store, vehicle: str, drive: str, gone: list[tuple[int, int]], tile: tuple[int, int]) -> bytes:
+    states = states_plane(dict.fromkeys(gone, CellState.CHANGED_EMPTY), fill=CellState.UNCHANGED_EMPTY)
+    made = make_ballot(store.point_map(), {tile: Say(states)}, vehicle, drive, end_ns=store.clock())
+    driven = [np.array([x + 76.8 * tile[1], 3.0]) for x in (3.0, 6.0, 9.0)]
+    made = replace(made, path=pack_path(driven, store.lattice))
+    return encode(made)
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Iterator[Store]:
+    """A store where one wall went in version 2, and another would go with the next."""
+    store = Store.create(f"sqlite:///{tmp_path / 's.db'}", two_walls(), Policy(fuse=FuseSettings(max_deleted_share=1)))
+    for number, tile in ((1, (0, 0)), (2, (0, 1))):
+        for vehicle in "ab":
+            accept(store, [examine(ballot(store, vehicle, f"d{number}", WALL, tile))])
+        if number == 1:
+            publish(store)
+    yield store
+    store.close()
+
+
+def test_every_json_answer_is_as_openapi_declares_it(store: Store) -> None:
+    app = create_app(store, opened=True)
+    routes = [route for part in ROUTES for route in part.router.routes if isinstance(route, APIRoute)]
+    models = {(method, route.path): route.response_model for route in routes for method in route.methods or ()}
+    typed = {asked: model for asked, model in models.items() if model is not None}
+    assert {(method, path) for method, path, _, _ in ASKED} | NEVER_HERE == typed.keys()
+    assert all(issubclass(m, Answer) for model in typed.values() for m in getattr(model, "__args__", [model]))
+    kept: dict[str, str] = {}
+    with TestClient(app, base_url="http://localhost") as client:
+        for method, path, asked, sent in ASKED:
+            url = (asked or path).replace("SEQ", kept.get("seq", ""))
+            if sent == "BALLOT":
+                answer = client.put(url, content=ballot(store, "a", "d3", WALL, (0, 1)))
+            else:
+                body = {k: kept["pending"] if v == "PENDING" else v for k, v in sent.items()} if sent else None
+                answer = client.request(method, url, json=body)
+            assert answer.status_code in (200, 201), (method, url, answer.text)
+            TypeAdapter(models[method, path]).validate_json(answer.content)
+            found = answer.json()
+            kept |= {"seq": str(found["seq"])} if "seq" in found else {}
+            if path == "/v1/desk" and not asked:
+                features = [*found["pending"]["features"], *found["reviewed"]]
+                kept["pending"] = features[0]["id"]
+    assert Probe.PATHS[1] in {path for _, path in typed}
+
+
+def test_a_member_that_no_model_names_is_found() -> None:
+    with pytest.raises(ValueError, match="extra"):
+        TypeAdapter(Answer).validate_python({"more": 1})
