@@ -11,6 +11,7 @@ from typer.testing import CliRunner
 
 from made_courts import CARS, made_court
 from mapvote.cli import app
+from mapvote.codec.ballot import decode
 from mapvote.core.geometry import from_xyz_rpy, transform
 from mapvote.core.types import MapvoteError
 from mapvote.formats import write_pcd
@@ -41,3 +42,14 @@ def test_a_map_without_ground_cannot_be_compared_and_says_so(tmp_path: Path) -> 
     assert isinstance(result.exception, MapvoteError)
     with pytest.raises(MapvoteError, match="no ground"):
         raise result.exception
+
+
+def test_a_cloud_votes_by_its_file_and_says_that_no_free_space_is_learned(tmp_path: Path) -> None:
+    write_pcd(tmp_path / "map.pcd", Cloud(made_court()))
+    write_pcd(tmp_path / "robot.pcd", Cloud(made_court(CARS[1:], seed=2)))
+    ballot = tmp_path / "robot.ballot"
+    said = ["vote", str(tmp_path / "robot.pcd"), "--map", str(tmp_path / "map.pcd"), "--out", str(ballot)]
+    result = CliRunner().invoke(app, said)
+    assert result.exit_code == 0, result.output
+    assert "no free space is learned" in result.output
+    assert decode(ballot.read_bytes()).vehicle == "robot"

@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from mapvote.cli.options import DRIVE
 from mapvote.cli.terminal import print_table, waiting
+
+if TYPE_CHECKING:
+    from mapvote.codec.ballot import Ballot
+    from mapvote.config import Settings
+    from mapvote.core.point_map import PointMap
 
 
 def register(app: typer.Typer) -> None:
@@ -84,3 +89,32 @@ def diff(
         with whole_file(file) as part:
             part.write_text(text)
         print(f"{file}")
+
+
+def ballot_of_cloud(
+    path: Path, point_map: PointMap, settings: Settings, vehicle: str | None, trajectory: Path | None
+) -> Ballot:
+    """The ballot of a session's cloud; tells how it was registered and what it does not vote on. It ended when the file
+    was last changed."""
+    from mapvote.comparison.session_votes import vote_of_session
+    from mapvote.formats import read_map
+    from mapvote.formats.drives.poses import read_poses
+
+    with waiting(f"reading {path}"):
+        cloud = read_map(path)
+        driven = None if trajectory is None else read_poses(trajectory)[:, :3, 3]
+    name = path.stem or path.name
+    with waiting("registering and voting"):
+        said = vote_of_session(
+            vehicle or name, name, point_map, cloud, settings, end_ns=path.stat().st_mtime_ns, trajectory=driven
+        )
+    for line in said.registered.told():
+        print(line)
+    if said.registered.bent:
+        print("what is bent does not vote")
+    if not said.by_trajectory:
+        print("no trajectory: gone and new by the ground that the cloud shows, and no free space is learned")
+    for kind in ("gone", "new", "not seen"):
+        some = [one for one in said.changes if one.kind == kind]
+        print(f"{kind}: {len(some)} things, {sum(one.area_m2 for one in some):.1f} m2")
+    return said.ballot

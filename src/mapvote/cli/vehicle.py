@@ -15,6 +15,9 @@ from mapvote.cli.terminal import progress, waiting
 
 if TYPE_CHECKING:
     from mapvote.codec.ballot import Ballot
+    from mapvote.config import Settings
+    from mapvote.core.point_map import PointMap
+    from mapvote.core.types import Drive
     from mapvote.perception.frontend import DriveReport
     from mapvote.slam.build import BuildReport
 
@@ -126,22 +129,29 @@ def vote(
         str | None,
         typer.Option(metavar="X0,Y0,X1,Y1", help="of a server's map only this, 100 m around the drive; map metres"),
     ] = None,
+    trajectory: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE", help="of a session's cloud: the sensor's poses in its frame, rows of 3 x 4 or TUM"
+        ),
+    ] = None,
     config: Config = None,
     *,
     drive_options: dict[str, Any],
 ) -> None:
     """Drive once: localise, remove moving objects, compare with the map, and write one ballot.
 
+    The cloud or map of a session votes as well, in any frame: it is registered to the map first.
+
     mapvote vote ANOTHER_DRIVE --map my_map --vehicle car_1 --out car_1.ballot
     """
+    from mapvote.cli.diff import ballot_of_cloud
     from mapvote.codec.ballot import encode
     from mapvote.config import choose_case, load_settings
     from mapvote.core.types import MapvoteError
-    from mapvote.formats import open_drive
+    from mapvote.formats import is_cloud, open_drive
     from mapvote.formats.atomic import whole_file
     from mapvote.formats.geo.projector import frame_of
-    from mapvote.localisation.localiser import GivenPoses
-    from mapvote.vehicle import vote_drive
 
     if out is None and send is None:
         raise MapvoteError("vote: say where the ballot goes: --out BALLOT, --send URL, or both")
@@ -153,15 +163,11 @@ def vote(
         with waiting(f"reading {where}"):
             wanted = None if region is None else region_in(region)
             point_map = open_map.enter_context(map_at(where, key_file, region=wanted, or_kept=True))
-        drive = open_drive(drive_path, vehicle=vehicle, frame=frame_of(point_map.georeference), **drive_options)
-        localise = None
-        if trust_prior:
-            if drive.T_map_lidar_prior is None:
-                missing = "has no prior to trust; give one with --prior, or let it be localised"
-                raise MapvoteError(f"{drive_path}: {missing}")
-            localise = GivenPoses(drive.stamps_ns, drive.T_map_lidar_prior)
-        with usable_drives([drive]) as (drive,), progress("voting") as tell:
-            ballot, report = vote_drive(drive, point_map, settings, localise=localise, progress=tell)
+        if is_cloud(drive_path):
+            ballot, report = ballot_of_cloud(drive_path, point_map, settings, vehicle, trajectory), None
+        else:
+            drive = open_drive(drive_path, vehicle=vehicle, frame=frame_of(point_map.georeference), **drive_options)
+            ballot, report = _drive_once(drive, point_map, settings, trust_prior)
     data = encode(ballot)
     if out is not None:
         with whole_file(out) as partial:
@@ -169,6 +175,23 @@ def vote(
     _tell_votes(ballot, report, out, len(data))
     if send is not None:
         _send(send, key, data)
+
+
+def _drive_once(
+    drive: Drive, point_map: PointMap, settings: Settings, trust_prior: bool
+) -> tuple[Ballot, DriveReport | None]:
+    from mapvote.core.types import MapvoteError
+    from mapvote.localisation.localiser import GivenPoses
+    from mapvote.vehicle import vote_drive
+
+    localise = None
+    if trust_prior:
+        if drive.T_map_lidar_prior is None:
+            missing = "has no prior to trust; give one with --prior, or let it be localised"
+            raise MapvoteError(f"{drive.path}: {missing}")
+        localise = GivenPoses(drive.stamps_ns, drive.T_map_lidar_prior)
+    with usable_drives([drive]) as (drive,), progress("voting") as tell:
+        return vote_drive(drive, point_map, settings, localise=localise, progress=tell)
 
 
 def _send(url: str, key: str | None, data: bytes) -> None:
@@ -180,11 +203,12 @@ def _send(url: str, key: str | None, data: bytes) -> None:
     print(f"{url}: {result}" if result != "spooled" else f"{url} is away: the ballot waits, the next vote sends it")
 
 
-def _tell_votes(ballot: Ballot, report: DriveReport, out: Path | None, size: int) -> None:
-    print(
-        f"{ballot.vehicle}: {ballot.scans_localised} of {ballot.scans} scans localised "
-        f"(median sigma {ballot.median_sigma_m:.3f} m) over {ballot.length_m or 0.0:.0f} m, the others abstain"
-    )
-    stages = ", ".join(f"{stage} {1000.0 * sorted(s)[len(s) // 2]:.1f}" for stage, s in report.stage_s.items())
-    print(f"milliseconds a scan (median): {stages}")
+def _tell_votes(ballot: Ballot, report: DriveReport | None, out: Path | None, size: int) -> None:
+    if report is not None:
+        print(
+            f"{ballot.vehicle}: {ballot.scans_localised} of {ballot.scans} scans localised "
+            f"(median sigma {ballot.median_sigma_m:.3f} m) over {ballot.length_m or 0.0:.0f} m, the others abstain"
+        )
+        stages = ", ".join(f"{stage} {1000.0 * sorted(s)[len(s) // 2]:.1f}" for stage, s in report.stage_s.items())
+        print(f"milliseconds a scan (median): {stages}")
     print(f"{out or 'ballot'}: {len(ballot.tiles)} tiles, {size / 1000.0:.1f} kB")

@@ -60,6 +60,8 @@ class CloudChange:
     by_free_space: float
     """Share of its cells that free space of the other decides."""
     has: Literal["a", "b"]
+    cells: tuple[I64, I64]
+    """(rows, cols) of its cells in the window of the comparison."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -274,6 +276,7 @@ def _objects(
                 float(direct.mean()) if kind != "not seen" else 0.0,
                 float(found.free[r, c].mean()),
                 has,
+                (r, c),
             )
         )
     return out

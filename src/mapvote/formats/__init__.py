@@ -27,6 +27,7 @@ from mapvote.formats.registry import DRIVES, MAPS
 __all__ = [
     "DriveWriter",
     "export_map",
+    "is_cloud",
     "open_drive",
     "read_T_map_lidar",
     "read_cloud",
@@ -97,6 +98,13 @@ def read_cloud(path: Path | str) -> tuple[F64, dict[str, NDArray[Any]]]:
     else:
         cloud = joined(list(stream_cloud(path))).in_metres(str(path))
     return cloud.points.astype(np.float64, copy=False), dict(cloud.fields)
+
+
+def is_cloud(path: Path | str) -> bool:
+    """Whether a map or cloud lies at ``path``, and no recorded drive."""
+    path = Path(path)
+    held = is_map_folder(path) or any(layout.recognised(path) for layout in MAPS.values())
+    return held and not any(layout.recognised(path) for layout in DRIVES.values())
 
 
 def write_map(point_map: PointMap, path: Path | str) -> None:

@@ -1,0 +1,242 @@
+"""A session's cloud as a voter: what it says of every cell of a map, as one ballot.
+
+The cloud is registered to the map without a prior. It says that something stands where it has points; that something is
+gone or new as :mod:`mapvote.comparison.cloud_changes` decides it, by its ground or by free space; that a cell is empty
+where it has ground and nothing else; and nothing anywhere else. Free space comes from a trajectory only: a ray runs
+from each of its poses to what the cloud shows first in that direction. A bent part says nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy import ndimage
+from scipy.spatial import KDTree
+
+from mapvote.codec.ballot import Ballot
+from mapvote.comparison.cloud_changes import BAND, CellComparison, CloudChange, compare_cells, differences
+from mapvote.comparison.register import Registered, register_clouds
+from mapvote.config import Settings
+from mapvote.core.columns import dilated
+from mapvote.core.geometry import rows_from
+from mapvote.core.grid import Grid, TileIndex, window_around
+from mapvote.core.point_map import PointMap, all_points, map_from_points
+from mapvote.core.reference import reference_window
+from mapvote.core.types import F64, I32, NO_VOTE, U8, U64, Bool, CellState, MapvoteError
+from mapvote.core.voting import one_hot
+from mapvote.detection.new_points import NewPoints
+from mapvote.detection.voter import TileVotes
+from mapvote.perception.fans import follow_rays, gather_rays, mark_passed
+from mapvote.perception.frontend import DriveReport
+from mapvote.perception.raycast import CLEARANCE_M
+from mapvote.vehicle import write_ballot
+
+_RANGE_M = 30.0
+_BIN_RAD = np.radians(1.0)
+_PASSES = 2
+"""Poses whose rays must pass a voxel to make it free: one may be an error of the trajectory."""
+_POSE_STEP_M = 1.0
+_LOW = np.uint64(0b11) | BAND
+"""Voxels that go with a thing in BAND; above them what hangs together with it."""
+
+
+@dataclass(frozen=True, slots=True)
+class SessionVote:
+    """What came of a session's cloud."""
+
+    ballot: Ballot
+    registered: Registered
+    changes: list[CloudChange]
+    by_trajectory: bool
+    """Whether rays of a trajectory told free space."""
+
+
+def vote_of_session(
+    vehicle: str,
+    session: str,
+    point_map: PointMap,
+    cloud: PointMap,
+    settings: Settings,
+    *,
+    end_ns: int,
+    trajectory: F64 | None = None,
+) -> SessionVote:
+    """One ballot of a session's ``cloud`` (a map in any frame) on ``point_map``.
+
+    ``trajectory`` (n, 3): where the sensor was, in the cloud's frame; default: the driven path that the cloud brings.
+    ``end_ns``: when the session ended. MapvoteError if the rule is the paper's, if the cloud cannot be registered, or
+    if map or cloud has no ground.
+    """
+    if settings.voting.method != "surfaces":
+        raise MapvoteError(
+            "a cloud votes by the rule of surfaces only: the paper's rule counts scans, a cloud has none"
+        )
+    registered = register_clouds(all_points(point_map), all_points(cloud))
+    session_map = map_from_points(registered.points, lattice=point_map.lattice)
+    if trajectory is None and cloud.driven:
+        trajectory = np.concatenate(cloud.driven)
+    driven = None
+    if trajectory is not None:
+        driven = trajectory @ registered.T_a_b[:3, :3].T + registered.T_a_b[:3, 3]
+        session_map = with_free_space(session_map, driven)
+    compared = compare_cells(point_map, session_map, registered)
+    changes = differences(compared)
+    voter = _SessionVoter(point_map, compared, changes, registered)
+    offered = NewPoints(point_map.lattice)
+    offered.offer(registered.points)
+    report = _report(registered, driven, end_ns)
+    ballot = write_ballot(vehicle, session, point_map, settings, report, voter, offered)
+    return SessionVote(ballot, registered, changes, driven is not None)
+
+
+def _report(registered: Registered, driven: F64 | None, end_ns: int) -> DriveReport:
+    """The session as a drive: its "scans" are the patches that were compared, those that do not agree are lost."""
+    shown = np.flatnonzero(registered.patches.compared)
+    poses = [registered.patches.T_a_patch[k] for k in shown]
+    lost = [i for i, k in enumerate(shown) if not registered.fit.agree[k]]
+    if driven is not None:
+        poses, lost = [], []
+        for position in driven:
+            T = np.eye(4)
+            T[:3, 3] = position
+            poses.append(T)
+    sigma_m = [registered.fit.sigma_m] * (len(poses) - len(lost))
+    return DriveReport([end_ns] * len(poses), lost, sigma_m, poses, [None] * len(poses))
+
+
+class _SessionVoter:
+    """The votes of a comparison, tile by tile."""
+
+    def __init__(
+        self, point_map: PointMap, compared: CellComparison, changes: list[CloudChange], registered: Registered
+    ) -> None:
+        self._map, self._compared, self._changes, self._registered = point_map, compared, changes, registered
+
+    def each(self, only: Collection[TileIndex] | None = None) -> Iterator[tuple[TileIndex, TileVotes]]:
+        found = self._compared
+        mine, other = found.a, found.b
+        known = np.asarray(self._rigid())
+        there = _rebased(other.words, other.base, mine.base)
+        near = dilated(there, mine.base, 1)
+        states = np.full(mine.low.shape, NO_VOTE, dtype=np.uint8)
+        states[other.own_ground & ~other.stands & ~mine.stands] = CellState.UNCHANGED_EMPTY
+        states[mine.words & near != 0] = CellState.UNCHANGED_OCCUPIED
+        gone, new = np.zeros_like(mine.words), np.zeros_like(mine.words)
+        for change in self._changes:
+            if change.kind == "gone":
+                gone[change.cells] = _hanging_together(mine.words[change.cells]) & ~near[change.cells]
+                states[change.cells] = np.where(gone[change.cells] != 0, np.uint8(CellState.CHANGED_EMPTY), NO_VOTE)
+            elif change.kind == "new":
+                new[change.cells] = there[change.cells] & ~mine.words[change.cells]
+                states[change.cells] = CellState.CHANGED_OCCUPIED
+        states[~known] = NO_VOTE
+        free = _rebased(other.free, other.base, mine.base) & ~near & ~mine.words
+        for tile in found.window.tiles():
+            window = self._map.lattice.tile(tile)
+            cut = window.slices_in(found.window)
+            if (only is None or tile in only) and (states[cut] != NO_VOTE).any():
+                yield tile, _tile_votes(states[cut], gone[cut], new[cut], free[cut] if free.any() else None)
+
+    def votes(self) -> dict[TileIndex, TileVotes]:
+        return dict(self.each())
+
+    def observe(self, seen: object) -> U64:
+        raise MapvoteError("a session votes as a whole")
+
+    def _rigid(self) -> Bool:
+        """(rows, cols) where a part of the session lies that one motion lays on the map."""
+        window = self._compared.window
+        x, y = window.centres()
+        xy = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+        return self._registered.compared(xy).reshape(window.shape) & ~self._compared.left_out
+
+
+def _tile_votes(states: U8, gone: U64, new: U64, free: U64 | None) -> TileVotes:
+    states = np.ascontiguousarray(states)
+    return TileVotes(
+        tally=one_hot(states),
+        states=states,
+        gone=np.ascontiguousarray(gone),
+        remnants=np.zeros_like(gone),
+        new=np.ascontiguousarray(new),
+        free=None if free is None else np.ascontiguousarray(free),
+    )
+
+
+def _rebased(words: U64, base: I32, wanted: I32) -> U64:
+    """Column words (rows, cols) that begin at ``base`` as words that begin at ``wanted``."""
+    apart = np.clip(base.astype(np.int64) - wanted, -63, 63)
+    up, down = np.maximum(apart, 0).astype(np.uint64), np.maximum(-apart, 0).astype(np.uint64)
+    return np.asarray(np.where(apart >= 0, words << up, words >> down))
+
+
+def _hanging_together(words: U64) -> U64:
+    """(n,) the lowest voxels of each column, and above them what follows without a gap of two: a car, not the crown of
+    the tree that it stood under."""
+    out = words & _LOW
+    while True:
+        more = words & ((out << np.uint64(1)) | (out << np.uint64(2)))
+        if not (more & ~out).any():
+            return out
+        out |= more
+
+
+def with_free_space(session_map: PointMap, driven: F64) -> PointMap:
+    """The map with the voxels free that rays from the positions ``driven`` (n, 3), map metres, pass on their way to
+    what they would have measured."""
+    points = all_points(session_map)
+    spacing_m = _spacing(points)
+    kept = [driven[0]]
+    for position in driven[1:]:
+        if np.linalg.norm(position - kept[-1]) >= _POSE_STEP_M:
+            kept.append(position)
+    once: dict[TileIndex, U64] = {}
+    twice: dict[TileIndex, U64] = {}
+    for origin in kept:
+        window = window_around(session_map.lattice, origin[0], origin[1], 2 * _RANGE_M)
+        base = np.ascontiguousarray(reference_window(session_map, window).base)
+        passed = _passed(points, origin, base, window, spacing_m)
+        for tile in window.tiles():
+            if tile in session_map.tiles:
+                common = session_map.lattice.tile(tile).intersection(window)
+                into = common.slices_in(session_map.lattice.tile(tile))
+                seen = passed[common.slices_in(window)]
+                first = once.setdefault(tile, np.zeros(session_map.tiles[tile].window.shape, np.uint64))
+                second = twice.setdefault(tile, np.zeros_like(first))
+                second[into] |= first[into] & seen
+                first[into] |= seen
+    tiles = {
+        index: replace(tile, free=twice[index] & ~tile.obstacle_words) if index in twice else tile
+        for index, tile in session_map.tiles.items()
+    }
+    return replace(session_map, tiles=tiles)
+
+
+def _passed(points: F64, origin: F64, base: I32, window: Grid, spacing_m: float) -> U64:
+    """(rows, cols) column words that rays from ``origin`` pass: one ray for each direction of a degree, to the nearest
+    point there. Near points are as wide as the spacing of the cloud: no ray passes between two of one surface."""
+    away = points - origin
+    away = away[(np.abs(away[:, :2]) < _RANGE_M).all(axis=1)]
+    reach = np.linalg.norm(away, axis=1)
+    away, reach = away[reach > 1.0], reach[reach > 1.0]
+    col = np.floor((np.arctan2(away[:, 1], away[:, 0]) + np.pi) / _BIN_RAD).astype(np.int64) % 360
+    row = np.floor((np.arcsin(away[:, 2] / reach) + np.pi / 2) / _BIN_RAD).astype(np.int64)
+    image = np.full((181, 360), np.inf)
+    np.minimum.at(image, (row, col), reach)
+    nearest = image.copy()
+    for wide in (1, 2, 4, 8):
+        near = np.where(image * _BIN_RAD * wide < 1.5 * spacing_m, image, np.inf)
+        nearest = np.minimum(nearest, ndimage.minimum_filter(near, 2 * wide + 1, mode=("nearest", "wrap")))
+    first = (reach <= image[row, col]) & (reach <= nearest[row, col] + CLEARANCE_M)
+    words = np.zeros(window.shape, dtype=np.uint64)
+    rays = follow_rays(rows_from(away[first] + origin, origin), CLEARANCE_M)
+    mark_passed(gather_rays(rays), origin, (window.x0, window.y0), base, words.ravel())
+    return words
+
+
+def _spacing(points: F64) -> float:
+    """Median distance to the nearest neighbour of a sample of (n, 3) points, metres."""
+    some = points[np.random.default_rng(0).permutation(len(points))[:2000]]
+    return float(np.median(KDTree(points).query(some, k=2)[0][:, 1]))
