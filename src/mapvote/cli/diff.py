@@ -98,7 +98,7 @@ def ballot_of_cloud(
     was last changed."""
     from mapvote.comparison.session_votes import vote_of_session
     from mapvote.formats import read_map
-    from mapvote.formats.drives.poses import read_poses
+    from mapvote.formats.drives.trajectory import read_poses
 
     with waiting(f"reading {path}"):
         cloud = read_map(path)

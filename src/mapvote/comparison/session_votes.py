@@ -103,7 +103,8 @@ def _report(registered: Registered, driven: F64 | None, end_ns: int) -> DriveRep
             T[:3, 3] = position
             poses.append(T)
     sigma_m = [registered.fit.sigma_m] * (len(poses) - len(lost))
-    return DriveReport([end_ns] * len(poses), lost, sigma_m, poses, [None] * len(poses))
+    stamps_ns = [end_ns] * len(poses)
+    return DriveReport(stamps_ns, lost, sigma_m, poses, priors=[None] * len(poses))
 
 
 class _SessionVoter:
