@@ -21,7 +21,7 @@ from mapvote_lab.evaluation.experiments.scene import Scene
 from mapvote_lab.evaluation.loopback import PublishedRound
 from mapvote_lab.evaluation.reporting import birdseye
 from mapvote_lab.evaluation.reporting.gallery import MOVER, Area, areas_of
-from mapvote_lab.evaluation.reporting.html import ReportSection, page
+from mapvote_lab.evaluation.reporting.sheets import ReportSection, page
 from mapvote_lab.evaluation.reporting.tables import case_name, tables
 from mapvote_lab.evaluation.results import EvaluationResult
 from mapvote_lab.evaluation.scoring import paper_tables

@@ -12,13 +12,16 @@ from msgspec.structs import asdict
 from mapvote.codec.ballot import Ballot
 from mapvote.core.grid import Grid
 from mapvote.core.point_map import PointMap
-from mapvote_lab.evaluation.baselines.run import yardsticks
-from mapvote_lab.evaluation.experiments.cases import Case, fuse_case
-from mapvote_lab.evaluation.experiments.changed_areas import in_changed_areas, survey_anew
-from mapvote_lab.evaluation.experiments.kept import read_kept
-from mapvote_lab.evaluation.experiments.paper_readings import swept
-from mapvote_lab.evaluation.experiments.passes import Pass, pass_folder, passes
-from mapvote_lab.evaluation.experiments.pose_errors import T_map_world_of, localisation, map_shift
+from mapvote_lab.evaluation.baselines.baselines import yardsticks
+from mapvote_lab.evaluation.experiments.localisation_errors import (
+    T_map_world_of,
+    in_changed_areas,
+    localisation,
+    map_shift,
+    survey_anew,
+)
+from mapvote_lab.evaluation.experiments.paper_readings import read_kept, swept
+from mapvote_lab.evaluation.experiments.passes import Case, Pass, fuse_case, pass_folder, passes
 from mapvote_lab.evaluation.experiments.scene import Progress, Scene
 from mapvote_lab.evaluation.results import CaseResult, Cost, EvaluationResult, Timings
 from mapvote_lab.evaluation.scoring.cells import Scores

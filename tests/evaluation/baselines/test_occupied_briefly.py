@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from mapvote.core.types import F64
-from mapvote_lab.evaluation.baselines.occupied_briefly import OccupiedBriefly
+from mapvote_lab.evaluation.baselines.baselines import OccupiedBriefly
 
 ORIGIN = np.zeros(3)
 

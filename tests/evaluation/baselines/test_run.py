@@ -11,8 +11,8 @@ from mapvote.core.grid import Grid, Lattice
 from mapvote.core.point_map import PointMap, map_from_points
 from mapvote.core.reference import reference_window
 from mapvote.core.types import CellState
+from mapvote_lab.evaluation.baselines.baselines import NearestNeighbour
 from mapvote_lab.evaluation.baselines.dempster_shafer import EvidenceMap, combine, dempster
-from mapvote_lab.evaluation.baselines.nearest_neighbour import NearestNeighbour
 from mapvote_lab.evaluation.scoring.map_points import map_obstacles
 
 GRID = Grid(Lattice(), 0, 0, 60, 100)

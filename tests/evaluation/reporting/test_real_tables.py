@@ -9,9 +9,16 @@ import numpy as np
 
 from mapvote.core.grid import Grid, Lattice
 from mapvote.core.types import CellState
-from mapvote_lab.evaluation.experiments.real.bench import BUILT, BUILT_IN_RAIN, DEMOLISHED, Bench, Ground
-from mapvote_lab.evaluation.experiments.real.changes import Asked, Changed
-from mapvote_lab.evaluation.reporting.real_tables import real_tables
+from mapvote_lab.evaluation.experiments.real.bench import (
+    BUILT,
+    BUILT_IN_RAIN,
+    DEMOLISHED,
+    Asked,
+    Bench,
+    Changed,
+    Ground,
+)
+from mapvote_lab.evaluation.reporting.real_report import real_tables
 from mapvote_lab.evaluation.reporting.sheets import Sheet
 
 GRID = Grid(Lattice(), 0, 0, 10, 10)

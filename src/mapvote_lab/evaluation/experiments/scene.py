@@ -45,8 +45,8 @@ _DROPPED = "dropped"
 """A file of this name says that the scans were deleted to free the disk."""
 _MAP_FROM = ("core", "codec", "formats", "localisation", "perception", "detection", "slam")
 BALLOTS_FROM = (
-    *_MAP_FROM, "vehicle.py", "evaluation/experiments/shared_pass.py",
-    "evaluation/experiments/kept.py",
+    *_MAP_FROM, "vehicle.py", "evaluation/experiments/passes.py",
+    "evaluation/experiments/paper_readings.py",
 )  # fmt: skip
 
 

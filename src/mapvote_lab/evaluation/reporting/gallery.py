@@ -17,9 +17,9 @@ from mapvote.core.point_map import PointMap, all_points
 from mapvote.core.types import F32, F64, U8, Bool, CellState
 from mapvote.localisation.localiser import GivenPoses
 from mapvote.vehicle import Vehicle
-from mapvote_lab.evaluation.baselines.nearest_neighbour import heights_above_ground
+from mapvote_lab.evaluation.baselines.baselines import heights_above_ground
 from mapvote_lab.evaluation.evaluate import Evaluation
-from mapvote_lab.evaluation.experiments.cases import YARDSTICKS, ballot_states, paper_cases
+from mapvote_lab.evaluation.experiments.passes import YARDSTICKS, ballot_states, paper_cases
 from mapvote_lab.evaluation.reporting import birdseye, figures
 from mapvote_lab.evaluation.reporting.tables import case_name
 from mapvote_lab.evaluation.scoring.cells import UNSCORED
