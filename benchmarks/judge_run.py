@@ -20,7 +20,7 @@ from mapvote.localisation.prepare import deskew, motion_at
 from mapvote.perception.frontend import Observation
 from mapvote.vehicle import Vehicle
 from mapvote_lab.evaluation.baselines.baselines import heights_above_ground
-from mapvote_lab.evaluation.experiments.passes import ballot_states
+from mapvote_lab.evaluation.experiments.cases import ballot_states
 from mapvote_lab.evaluation.scoring.cells import score_cells
 from mapvote_lab.evaluation.scoring.truth import Truth, error_summary, lay_on, rigid_between
 

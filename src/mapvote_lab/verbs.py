@@ -103,9 +103,9 @@ def evaluate(
 
     from mapvote.config import cache_folder, load_with_sources
     from mapvote_lab.evaluation.evaluate import evaluate as run
+    from mapvote_lab.evaluation.experiments.cases import choose_cases
     from mapvote_lab.evaluation.experiments.conditions import Conditions
     from mapvote_lab.evaluation.experiments.paper_readings import PUBLISHED, as_paper
-    from mapvote_lab.evaluation.experiments.passes import choose_cases
     from mapvote_lab.evaluation.experiments.scene import Scene
     from mapvote_lab.evaluation.reporting.tables import result_json, tables, write_text
 
@@ -163,7 +163,7 @@ def _evaluate_real(
     from rich.console import Console
 
     from mapvote.config import load_settings
-    from mapvote_lab.evaluation.experiments.passes import choose_cases
+    from mapvote_lab.evaluation.experiments.cases import choose_cases
     from mapvote_lab.evaluation.experiments.real.bench import bench
     from mapvote_lab.evaluation.reporting.real_report import as_markdown, draw_worst, real_tables
     from mapvote_lab.evaluation.reporting.tables import write_text

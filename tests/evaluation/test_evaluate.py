@@ -17,7 +17,7 @@ from mapvote.core.geometry import exp, from_xyz_rpy
 from mapvote.core.grid import Lattice
 from mapvote.core.types import MapvoteError
 from mapvote_lab.evaluation.evaluate import Evaluation, evaluate
-from mapvote_lab.evaluation.experiments.passes import choose_cases
+from mapvote_lab.evaluation.experiments.cases import choose_cases
 from mapvote_lab.evaluation.experiments.scene import Scene
 from mapvote_lab.evaluation.reporting import tables
 from mapvote_lab.evaluation.reporting.sheets import ReportSection, page

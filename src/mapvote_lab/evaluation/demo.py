@@ -20,7 +20,7 @@ from mapvote.server.views.history import changes_between, cutouts_between
 from mapvote.warmup import compile_for_maps, compile_for_votes
 from mapvote_lab.evaluation.demo_report import CASE, Story, draw_scans, report_page, tell
 from mapvote_lab.evaluation.evaluate import Evaluation, evaluate
-from mapvote_lab.evaluation.experiments.passes import choose_cases
+from mapvote_lab.evaluation.experiments.cases import choose_cases
 from mapvote_lab.evaluation.experiments.scene import Progress, Scene
 from mapvote_lab.evaluation.loopback import vote_by_http
 from mapvote_lab.evaluation.reporting.gallery import gallery

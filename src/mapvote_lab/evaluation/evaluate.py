@@ -13,6 +13,7 @@ from mapvote.codec.ballot import Ballot
 from mapvote.core.grid import Grid
 from mapvote.core.point_map import PointMap
 from mapvote_lab.evaluation.baselines.baselines import yardsticks
+from mapvote_lab.evaluation.experiments.cases import Case, fuse_case
 from mapvote_lab.evaluation.experiments.localisation_errors import (
     T_map_world_of,
     in_changed_areas,
@@ -21,7 +22,7 @@ from mapvote_lab.evaluation.experiments.localisation_errors import (
     survey_anew,
 )
 from mapvote_lab.evaluation.experiments.paper_readings import read_kept, swept
-from mapvote_lab.evaluation.experiments.passes import Case, Pass, fuse_case, pass_folder, passes
+from mapvote_lab.evaluation.experiments.passes import Pass, pass_folder, passes
 from mapvote_lab.evaluation.experiments.scene import Progress, Scene
 from mapvote_lab.evaluation.results import CaseResult, Cost, EvaluationResult, Timings
 from mapvote_lab.evaluation.scoring.cells import Scores

@@ -22,7 +22,8 @@ from mapvote.formats.atomic import whole_folder
 from mapvote.localisation.localiser import GivenPoses
 from mapvote.perception.frontend import Movers, Observation
 from mapvote_lab.evaluation.baselines.dempster_shafer import EvidenceMap, combine
-from mapvote_lab.evaluation.experiments.passes import Pass, SharedPass, paper_cases
+from mapvote_lab.evaluation.experiments.cases import paper_cases
+from mapvote_lab.evaluation.experiments.passes import Pass, SharedPass
 from mapvote_lab.evaluation.experiments.scene import BALLOTS_FROM, Progress, Scene, key_of, sources_digest
 from mapvote_lab.evaluation.scoring.map_points import map_obstacles
 from mapvote_lab.simulation.processes import processes

@@ -22,9 +22,10 @@ from mapvote.config import Settings
 from mapvote.core.point_map import PointMap
 from mapvote.formats.atomic import whole_file
 from mapvote_lab.evaluation.experiments.attacks import ATTACKS
+from mapvote_lab.evaluation.experiments.cases import Case, choose_cases, fuse_case
 from mapvote_lab.evaluation.experiments.conditions import Conditions
 from mapvote_lab.evaluation.experiments.localisation_errors import localisation, map_shift
-from mapvote_lab.evaluation.experiments.passes import Case, Pass, choose_cases, fuse_case, have_voted, passes
+from mapvote_lab.evaluation.experiments.passes import Pass, have_voted, passes
 from mapvote_lab.evaluation.experiments.scene import BALLOTS_FROM, Progress, Scene, key_of, sources_digest
 from mapvote_lab.evaluation.results import MatrixResult, RoundResult, to_json
 from mapvote_lab.evaluation.scoring.cells import UNSCORED, determined, ratio, score_cells
@@ -33,7 +34,7 @@ from mapvote_lab.simulation.processes import processes
 
 _SCORES_FROM = (
     *BALLOTS_FROM, "fusion", "simulation", "evaluation/scoring", "evaluation/evaluate.py", "evaluation/results.py",
-    "evaluation/experiments/attacks.py", "evaluation/experiments/passes.py", "evaluation/experiments/conditions.py",
+    "evaluation/experiments/attacks.py", "evaluation/experiments/cases.py", "evaluation/experiments/conditions.py",
     "evaluation/experiments/matrix.py", "evaluation/experiments/passes.py",
 )  # fmt: skip
 

@@ -21,7 +21,7 @@ from mapvote.core.voting import decide, one_hot, to_wire
 from mapvote.detection.paper import reading_table, sightings
 from mapvote.detection.readings import read, readings_of
 from mapvote.perception.frontend import Observation
-from mapvote_lab.evaluation.experiments.passes import Case, paper_cases
+from mapvote_lab.evaluation.experiments.cases import Case, paper_cases
 from mapvote_lab.evaluation.scoring.cells import Scores, score_cells
 
 _FAST = 1

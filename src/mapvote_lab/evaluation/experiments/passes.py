@@ -1,139 +1,39 @@
-"""What is compared, and the vehicles' passes that vote on it.
+"""The vehicles' passes, whose ballots are kept in the cache.
 
-The paper's five cases (paper V), the same under other rules of sight, and surfaces are settings of one rule. One pass
-over a drive serves them all: what a scan saw is worked out once, each voter counts by its rules. Voters that count
-alike share their counters, and those of a method share the candidates for new points. Ballots are kept in the cache."""
+One pass over a drive serves all cases: what a scan saw is worked out once, each voter counts by its rules. Voters that
+count alike share their counters, and those of a method share the candidates for new points."""
 
 from __future__ import annotations
 
 import json
-import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Sequence
 from concurrent.futures import as_completed
 from contextlib import nullcontext
 from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from mapvote.codec.ballot import Ballot, decode, encode, unpack_states, unpack_tally
-from mapvote.config import CASES, FuseSettings, PaperSettings, Settings, VotingSettings
-from mapvote.core.grid import Grid
+from mapvote.codec.ballot import Ballot, decode, encode
+from mapvote.config import PaperSettings, Settings, VotingSettings
 from mapvote.core.point_map import PointMap
 from mapvote.core.reference import LocalMap
-from mapvote.core.types import F64, NO_VOTE, U8, Drive, MapvoteError, Scan
-from mapvote.core.voting import decide
+from mapvote.core.types import F64, Drive, Scan
 from mapvote.detection.new_points import NewPoints
 from mapvote.detection.voter import Voter
 from mapvote.formats import open_drive
 from mapvote.formats.atomic import whole_folder
-from mapvote.fusion.fuse import states_over
-from mapvote.fusion.offline import update_map
 from mapvote.localisation.localiser import GivenPoses, Localise, Localiser
 from mapvote.localisation.ndt import PosePrior
 from mapvote.perception.frontend import DriveReport, Frontend, Movers, Observation
 from mapvote.perception.moving_objects import MovingFilter
 from mapvote.vehicle import make_voter, write_ballot
+from mapvote_lab.evaluation.experiments.cases import Case
 from mapvote_lab.evaluation.experiments.conditions import Shaken, TrueMovers
 from mapvote_lab.evaluation.experiments.paper_readings import Keeper
 from mapvote_lab.evaluation.experiments.scene import BALLOTS_FROM, Progress, Scene, key_of, sources_digest
-from mapvote_lab.evaluation.scoring.jury import CaseOutcome
-from mapvote_lab.evaluation.scoring.truth import lay_on
 from mapvote_lab.simulation.processes import processes
-
-OCCLUSIONS: Mapping[str, Mapping[str, str]] = {
-    "": {},
-    " farthest_return": {"line_of_sight": "farthest"},
-    " column": {"line_of_sight": "column"},
-}
-"""Readings of sight that stand beside the one that is set, by what they add to a case's name."""
-
-
-AS_BEFORE = PaperSettings()
-"""The paper as it has been read from the start."""
-
-
-@dataclass(frozen=True, slots=True)
-class Case:
-    """One line of the tables: a vote and how it is fused."""
-
-    name: str
-    voting: VotingSettings
-    min_votes: int
-    paper: PaperSettings = AS_BEFORE
-    """How the paper is read; only method "paper" uses it."""
-
-
-def paper_cases(settings: Settings) -> dict[str, Case]:
-    """Cases 1 to 5 as ``[paper]`` reads them, named "1".., and under the other rules of sight, named "1 column".. ."""
-    cases = {}
-    for added, differently in OCCLUSIONS.items():
-        paper = settings.paper.model_copy(update=differently)
-        for number, booleans in CASES.items():
-            voting = settings.voting.model_copy(update={"method": "paper", **booleans})
-            cases[number + added] = Case(number + added, voting, 1, paper)
-    return cases
-
-
-def own_cases(settings: Settings) -> dict[str, Case]:
-    """The default method, "surfaces"."""
-    voting = settings.voting.model_copy(update={"method": "surfaces"})
-    return {"surfaces": Case("surfaces", voting, settings.fuse.min_votes)}
-
-
-YARDSTICKS = ("nearest", "evidence")
-
-
-def choose_cases(settings: Settings, wanted: str) -> tuple[list[Case], bool]:
-    """Cases by comma-separated names (1 to 5, "1 column" and its like, surfaces, yardsticks, or "all"
-    that there is), and whether the yardsticks are wanted.
-
-    MapvoteError names one that there is not, or says that no vote is left.
-    """
-    every = {**paper_cases(settings), **own_cases(settings)}
-    names = [*every, "yardsticks"] if wanted == "all" else [name.strip() for name in wanted.split(",")]
-    for name in names:
-        if name not in every and name not in ("yardsticks", *YARDSTICKS):
-            raise MapvoteError(f"no case {name!r}: choose from all, yardsticks, {', '.join(every)}")
-    chosen = [every[name] for name in names if name in every]
-    if not chosen:
-        raise MapvoteError("the yardsticks are measured beside a vote: name a case too, as in --case 1,yardsticks")
-    return chosen, len(chosen) < len(names)
-
-
-def fuse_case(
-    point_map: PointMap, ballots: Sequence[Ballot], min_votes: int, fuse: FuseSettings, window: Grid
-) -> CaseOutcome:
-    """The server's side of one case (paper IV): decide every cell, edit the map."""
-    start = time.perf_counter()
-    settings = fuse.model_copy(update={"min_votes": min_votes})
-    updated, decisions = update_map(point_map, ballots, settings)
-    seconds = time.perf_counter() - start
-    states, grid = states_over(point_map.lattice, decisions)
-    own = [lay_on(*ballot_states(ballot, point_map), window) for ballot in ballots]
-    return CaseOutcome(updated, lay_on(states, grid, window), own, decisions, seconds)
-
-
-def ballot_states(ballot: Ballot, point_map: PointMap) -> tuple[U8, Grid]:
-    """What the vehicle itself decided, (rows, cols) over the window of its tiles, two-stage or one-stage."""
-    tiles = {tile.tile: tile for tile in ballot.tiles}
-    grids = [point_map.lattice.tile(index) for index in tiles]
-    window = grids[0]
-    for grid in grids[1:]:
-        window = window.union(grid)
-    out = np.full(window.shape, NO_VOTE, dtype=np.uint8)
-    for grid, states in zip(grids, _decided(tiles.values()), strict=True):
-        out[grid.slices_in(window)] = states
-    return out, window
-
-
-def _decided(tiles: Any) -> Iterator[U8]:
-    for tile in tiles:
-        yield (
-            unpack_states(tile.states) if tile.states is not None else decide(unpack_tally(tile.tally).astype(np.int32))
-        )
 
 
 class SharedPass:

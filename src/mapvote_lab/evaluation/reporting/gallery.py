@@ -19,7 +19,7 @@ from mapvote.localisation.localiser import GivenPoses
 from mapvote.vehicle import Vehicle
 from mapvote_lab.evaluation.baselines.baselines import heights_above_ground
 from mapvote_lab.evaluation.evaluate import Evaluation
-from mapvote_lab.evaluation.experiments.passes import YARDSTICKS, ballot_states, paper_cases
+from mapvote_lab.evaluation.experiments.cases import YARDSTICKS, ballot_states, paper_cases
 from mapvote_lab.evaluation.reporting import birdseye, figures
 from mapvote_lab.evaluation.reporting.tables import case_name
 from mapvote_lab.evaluation.scoring.cells import UNSCORED

@@ -7,7 +7,7 @@ import pytest
 
 from mapvote.config import Settings
 from mapvote.core.types import MapvoteError
-from mapvote_lab.evaluation.experiments.passes import choose_cases
+from mapvote_lab.evaluation.experiments.cases import choose_cases
 from mapvote_lab.evaluation.experiments.real.bench import built, ground_of, score, survey_site
 from mapvote_lab.evaluation.experiments.real.sensing import disturbed, every_other_beam
 from mapvote_lab.evaluation.experiments.real.street import (

@@ -29,7 +29,8 @@ from mapvote.perception.frontend import DriveReport, Frontend, Observation
 from mapvote.perception.moving_objects import MovingFilter
 from mapvote.perception.raycast import find_obstacles
 from mapvote.slam.build import BuildReport, build_map
-from mapvote_lab.evaluation.experiments.passes import Case, SharedPass, fuse_case
+from mapvote_lab.evaluation.experiments.cases import Case, fuse_case
+from mapvote_lab.evaluation.experiments.passes import SharedPass
 from mapvote_lab.evaluation.scoring.cells import determined, ratio
 from mapvote_lab.evaluation.scoring.truth import pose_errors, rigid_between
 
