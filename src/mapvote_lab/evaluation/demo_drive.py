@@ -21,12 +21,12 @@ from mapvote.slam.build import build_map
 from mapvote.warmup import compile_for_maps, compile_for_votes
 from mapvote_lab.evaluation.demo_report import CASE
 from mapvote_lab.evaluation.experiments.cases import choose_cases
-from mapvote_lab.evaluation.experiments.real import changes
+from mapvote_lab.evaluation.experiments.real import bench
 from mapvote_lab.evaluation.experiments.real.street import RealRun, Street, lay_street
 from mapvote_lab.evaluation.experiments.scene import Progress
 from mapvote_lab.evaluation.reporting import birdseye
-from mapvote_lab.evaluation.reporting.html import ReportSection, page
-from mapvote_lab.evaluation.reporting.real_figures import draw_things
+from mapvote_lab.evaluation.reporting.real_report import draw_things
+from mapvote_lab.evaluation.reporting.sheets import ReportSection, page
 from mapvote_lab.evaluation.reporting.tables import write_text
 from mapvote_lab.simulation.processes import processes
 
@@ -61,9 +61,9 @@ def demo_drive(folder: Path, out: Path, progress: Progress, show: Callable[[Path
     write_map(street.point_map, out / "map")
     progress("mapping", 2, 2)
     progress("voting", 0, 1)
-    run, asked, things = changes.new_things(street, changes.survey_site(street), cases, SEED, EACH)
+    run, asked, things = bench.new_things(street, bench.survey_site(street), cases, SEED, EACH)
     progress("voting", 1, 1)
-    found = changes.score(asked, run.states[CASE])
+    found = bench.score(asked, run.states[CASE])
     pictures = [
         (scan, "One scan of the drive, coloured by height."),
         (out / "pictures" / "street.png", "The map. Red: returns of new bodies in cells that the vote calls changed "

@@ -140,7 +140,7 @@ def passes(
     """The passes of all drives called ``who``..., in order of their numbers; those that the cache lacks are driven.
 
     The first is driven in this process, the others in ``workers`` - 1 further ones. ``keep``: what each scan says is
-    kept too (experiments/kept.py).
+    kept too.
     """
     names = scene.drive_names(who)
     missing = [name for name in names if not pass_folder(scene, cases, name, keep).exists()]
