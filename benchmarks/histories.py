@@ -4,9 +4,10 @@ python benchmarks/histories.py --sqlite 2000 --postgres 300
 python benchmarks/histories.py --sqlite 100 --postgres 0 --csv results/histories.csv      # goes on where that ends
 
 Drives that repeat, objects that come, go and come back, policies that change, minimum age, withdrawal, rollback,
-replay, verdicts of reviewers and racing publishers, in one of three copies of ballots too (tests/histories.py). Prints
-every disagreement with its seed, and at the end a line for docs/measurements/votes.md. With ``--csv`` every history is
-a row (database, seed, steps, what disagreed), appended as it ends.
+replay, verdicts of reviewers and racing publishers, in one of three copies of ballots too (tests/histories.py). After
+every publish another one without new votes must change nothing. Prints every disagreement with its seed, and at the end
+a line for docs/measurements/votes.md. With ``--csv`` every history is a row (database, seed, steps, what disagreed),
+appended as it ends.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ import shutil
 import sys
 import tempfile
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -90,14 +92,16 @@ def main() -> None:
     asked = parser.parse_args()
     for name, stores, n in (("SQLite", on_sqlite, asked.sqlite), ("PostgreSQL", on_postgres, asked.postgres)):
         if n:
+            counted: Counter[str] = Counter()
             start, wrong, first = time.process_time(), 0, first_seed(asked.csv, name, asked.first)
             with stores() as make:
                 for done, seed in enumerate(range(first, first + n), 1):
-                    found = live(seed, make, asked.steps)
+                    found = live(seed, make, asked.steps, counted)
                     tell(asked.csv, name, seed, asked.steps, found or "")
                     wrong += found is not None
                     if found is not None or done % 100 == 0 or done == n:
                         line = f"| {name} | {done} histories of {asked.steps} steps | {wrong} mismatches |"
+                        line += f" {counted['repeated']} publishes repeated, {counted['remnants']} remnants gone |"
                         print(found or f"{line} {time.process_time() - start:.0f} s of CPU |", flush=True)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+from collections import Counter
 from collections.abc import Callable
 from contextlib import suppress
 from functools import cache
@@ -53,6 +54,12 @@ class History:
         self.there = dict.fromkeys(WALL, True) | dict.fromkeys(LAWN, False)
         self.ways = WAYS if seed % 3 == 0 else ()
         """In one history of three there are copies."""
+        self.masks = 0.9 if seed % 2 else 0.5
+        """Share of ballots that mark voxels as gone; in every other history of nearly all, also in cells that stand."""
+        self.repeated = 0
+        """Publishes that were tried again without new votes."""
+        self.remnants = 0
+        """Cells that stand on in a new version, without some of their points."""
 
     @property
     def now_s(self) -> int:
@@ -99,7 +106,7 @@ class History:
         rng, newest = self.rng, self.rules.newest
         version = newest if rng.random() < 0.6 else rng.randint(max(1, newest - 3), newest)
         has_free = rng.random() < 0.7
-        masks = rng.random() < 0.5
+        masks = rng.random() < self.masks
         says = {c: self._say(c, version, masks, has_free) for c in WALL + LAWN if rng.random() < 0.7}
         if not says:
             return
@@ -150,8 +157,12 @@ class History:
         return isinstance(receipt, Receipt)
 
     def publish(self) -> None:
+        """Then once more: a publish without new votes changes nothing."""
         done = publish(self.store, override=True).published
+        again = publish(self.store, override=True)
+        assert not again.published, f"published without new votes: {again.deleted} points go, {again.added} come"
         assert done == self._publish_by_the_rules(), f"published: {done}"
+        self.repeated += 1
 
     def _publish_by_the_rules(self) -> bool:
         done = self.rules.publish(self.now_s)
@@ -243,6 +254,8 @@ class History:
             free = 0 if tile.free is None else int(tile.free[cell])
             found = CellMap(heights, free, *(int(plane[cell]) for plane in memory.planes))
             assert found == wanted, f"{where}: cell {cell} is {found}, by the rules {wanted}"
+            before = self.rules.versions[newest - 1].cells[cell]
+            self.remnants += wanted.stands() and set(wanted.heights) < set(before.heights)
         assert len(tile.points) == sum(len(cell.heights) for cell in expected.cells.values()), where
 
 
@@ -261,8 +274,10 @@ def seen_along(way: str, by: int) -> U8:
     return np.where(np.roll(_mask(way), by, axis=1), np.uint8(UE), np.uint8(NO_VOTE))
 
 
-def live(seed: int, make_store: Callable[[Clock], Store], steps: int = 40) -> str | None:
-    """One history; what the store and the rules disagree on, None if on nothing."""
+def live(
+    seed: int, make_store: Callable[[Clock], Store], steps: int = 40, counted: Counter[str] | None = None
+) -> str | None:
+    """One history; what the store and the rules disagree on, None if on nothing. ``counted``: adds up what it held."""
     history = History(seed, make_store)
     try:
         history.live(steps)
@@ -270,4 +285,6 @@ def live(seed: int, make_store: Callable[[Clock], Store], steps: int = 40) -> st
         return f"seed {seed}: {type(error).__name__} {error}"
     finally:
         history.store.close()
+        if counted is not None:
+            counted.update(repeated=history.repeated, remnants=history.remnants)
     return None
