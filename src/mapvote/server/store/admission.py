@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import threading
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import NamedTuple
@@ -326,9 +326,9 @@ def refuse_out_of_reach(said: Sequence[Votes], map_tiles: Collection[TileIndex])
     """Why a ballot votes where its vehicle cannot have been: on a cell more than MAX_REACH_M from every tile of the
     map, or on tiles in groups that lie farther apart than that. None if it may have been there."""
     for votes in said:
+        if _touched(votes.tile, map_tiles):
+            continue  # the whole tile is within reach
         near = [index for index in _around(votes.tile) if index in map_tiles]
-        if _within(votes.tile, near):
-            continue
         if not near or _farthest_m(votes, near) > MAX_REACH_M:
             where = f"tile {tile_key(votes.tile)} has votes more than {MAX_REACH_M:.0f} m from the map"
             return MapvoteError(f"{where}: a vehicle votes on what it saw while it localised in the map")
@@ -368,9 +368,8 @@ def refuse_out_of_height(
     for tile, _, low_m, high_m in said:
         if low_m is None or high_m is None:
             continue
-        near = [index for index in _around(tile) if index in map_tiles]
-        touching = [index for index in near if max(abs(index[0] - tile[0]), abs(index[1] - tile[1])) <= 1]
-        ground_m = min((lowest_m(map_tiles[index].ground) for index in touching or near), default=np.inf)
+        near = _touched(tile, map_tiles) or [index for index in _around(tile) if index in map_tiles]
+        ground_m = min((lowest_m(map_tiles[index].ground) for index in near), default=np.inf)
         if np.isfinite(ground_m) and not ground_m - MAX_BELOW_M <= low_m <= high_m <= ground_m + MAX_ABOVE_M:
             span = f"{low_m:.1f} to {high_m:.1f} m on tile {tile_key(tile)}"
             allowed = (
@@ -380,17 +379,24 @@ def refuse_out_of_height(
     return None
 
 
-def _around(index: TileIndex) -> Iterator[TileIndex]:
+_AROUND = [
+    (row, col)
+    for row in range(-_TILES_AWAY, _TILES_AWAY + 1)
+    for col in range(-_TILES_AWAY, _TILES_AWAY + 1)
+    if _TILE_M * float(np.hypot(max(abs(row) - 1, 0), max(abs(col) - 1, 0))) <= MAX_REACH_M
+]
+"""Steps to the tiles within reach of any part of a tile."""
+
+
+def _around(index: TileIndex) -> list[TileIndex]:
     """The tiles that are within reach of any part of a tile, itself too."""
-    for row in range(-_TILES_AWAY, _TILES_AWAY + 1):
-        for col in range(-_TILES_AWAY, _TILES_AWAY + 1):
-            if _TILE_M * float(np.hypot(max(abs(row) - 1, 0), max(abs(col) - 1, 0))) <= MAX_REACH_M:
-                yield index[0] + row, index[1] + col
+    return [(index[0] + row, index[1] + col) for row, col in _AROUND]
 
 
-def _within(index: TileIndex, near: Collection[TileIndex]) -> bool:
-    """Whether the whole tile is within reach, since it, or one that it touches, is in the map."""
-    return any(abs(index[0] - row) <= 1 and abs(index[1] - col) <= 1 for row, col in near)
+def _touched(index: TileIndex, map_tiles: Collection[TileIndex]) -> list[TileIndex]:
+    """The map's tiles that touch a tile, corners included, itself too."""
+    beside = ((index[0] + row, index[1] + col) for row in (-1, 0, 1) for col in (-1, 0, 1))
+    return [tile for tile in beside if tile in map_tiles]
 
 
 def _farthest_m(votes: Votes, near: Collection[TileIndex]) -> float:
