@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from pydantic import Field, field_validator
+from pydantic import Field, field_validator, model_validator
 
 from mapvote.config.section import Section
 
@@ -100,7 +100,17 @@ class ServerSettings(Section):
     webhook_url: str = Field(
         default="", pattern="^(https?://.*)?$", description="where events are posted to; empty: nowhere"
     )
-    webhook_secret: str = Field(default="", description="what they are signed with (HMAC-SHA256)")
+    webhook_secret: str = Field(
+        default="",
+        pattern="^(whsec_[A-Za-z0-9+/]{32,88}={0,2})?$",
+        description="signs the posts (Standard Webhooks): whsec_ and 24 to 64 random bytes in base64",
+    )
+
+    @model_validator(mode="after")
+    def _signed(self) -> ServerSettings:
+        if self.webhook_url and not self.webhook_secret:
+            raise ValueError("webhook_url needs a webhook_secret: whsec_ and the output of `openssl rand -base64 32`")
+        return self
 
     @field_validator("hosts", mode="before")
     @classmethod

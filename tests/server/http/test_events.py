@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import base64
 import json
 import queue
 import threading
@@ -15,6 +16,7 @@ from typing import TYPE_CHECKING, cast
 import httpx2
 import pytest
 import sqlalchemy as sa
+from standardwebhooks import Webhook, WebhookVerificationError
 
 from hand_made import Say, make_ballot, states_plane, two_walls
 from live_server import serving
@@ -22,7 +24,7 @@ from mapvote.client import MapClient
 from mapvote.config.server import ServerSettings
 from mapvote.core.types import CellState
 from mapvote.server.http.event_routes import as_sse
-from mapvote.server.http.webhook import deliver, signature
+from mapvote.server.http.webhook import deliver
 from mapvote.server.store import schema
 from mapvote.server.store.queries import log_event
 from mapvote.server.store.store import Store
@@ -31,8 +33,8 @@ from mapvote.server.views.events import Event, Feed, newest_event, without_names
 if TYPE_CHECKING:
     from mapvote.server.http.services import Services
 
-SECRET = "a secret of both"
-Posts = queue.Queue[tuple[str, str, bytes]]
+SECRET = "whsec_" + base64.b64encode(bytes(range(32))).decode()
+Posts = queue.Queue[tuple[dict[str, str], bytes]]
 
 
 @pytest.fixture
@@ -73,7 +75,7 @@ def receiver() -> Iterator[tuple[str, Posts]]:
             self.send_response(200 if refused.is_set() else 503)
             self.end_headers()
             if refused.is_set():
-                posts.put((self.headers["X-Mapvote-Timestamp"], self.headers["X-Mapvote-Signature"], body))
+                posts.put((dict(self.headers), body))
             refused.set()
 
         def log_message(self, *arguments: object) -> None:
@@ -96,10 +98,19 @@ def test_a_webhook_is_signed_and_sent_again_until_it_is_taken(
     config.write_text(f'[server]\nwebhook_url = "{receiver[0]}"\nwebhook_secret = "{SECRET}"\n')
     with serving(store, "--open", "--config", config, log=tmp_path / "log") as (url, _):
         vote(url, tmp_path / "home")
-        stamp, signed, body = receiver[1].get(timeout=30)
-    assert signed == signature(SECRET, stamp, body)
-    assert signed != signature("another", stamp, body)
-    assert [event["version"] for event in json.loads(body)["events"]] == [1]
+        headers, body = receiver[1].get(timeout=30)
+    told = Webhook(SECRET).verify(body, headers)
+    assert [event["version"] for event in told["events"]] == [1]
+    for other, sent in ((Webhook(SECRET[:-4] + "AAA="), body), (Webhook(SECRET), body + b" ")):
+        with pytest.raises(WebhookVerificationError):
+            other.verify(sent, headers)
+
+
+def test_an_address_without_a_secret_and_a_secret_of_another_form_are_refused() -> None:
+    with pytest.raises(ValueError, match="webhook_secret"):
+        ServerSettings(webhook_url="http://localhost/hook")
+    with pytest.raises(ValueError, match="webhook_secret"):
+        ServerSettings(webhook_secret="a secret of both")
 
 
 def test_a_restart_neither_loses_nor_repeats_what_a_webhook_gets(tmp_path: Path, receiver: tuple[str, Posts]) -> None:
@@ -110,7 +121,7 @@ def test_a_restart_neither_loses_nor_repeats_what_a_webhook_gets(tmp_path: Path,
 
     async def listen(posts: int) -> list[str]:
         task = asyncio.create_task(deliver(parts))
-        heard: list[tuple[str, str, bytes]] = []
+        heard: list[tuple[dict[str, str], bytes]] = []
         while len(heard) < posts or (posts == 0 and not known()):
             await asyncio.sleep(0.02)
             if not receiver[1].empty():
@@ -118,7 +129,7 @@ def test_a_restart_neither_loses_nor_repeats_what_a_webhook_gets(tmp_path: Path,
         while posts and known()[0] < newest_event(store):
             await asyncio.sleep(0.02)
         task.cancel()
-        return [event["detail"] for _, _, body in heard for event in json.loads(body)["events"]]
+        return [event["detail"] for _, body in heard for event in json.loads(body)["events"]]
 
     def known() -> list[int]:
         with store.database.reading() as connection:

@@ -1,30 +1,38 @@
-"""The same events by POST to an integrator's address, signed, in order, again until they are taken."""
+"""Events by POST to an integrator's address, in order, repeated until they are taken, signed as Standard Webhooks."""
 
 from __future__ import annotations
 
 import asyncio
-import hashlib
-import hmac
+from collections.abc import Sequence
 from dataclasses import asdict
+from datetime import UTC, datetime
 from functools import partial
 
 import httpx2
 import msgspec
 import structlog
 from anyio import to_thread
+from standardwebhooks import Webhook
 
 from mapvote.server.errors import Unavailable
 from mapvote.server.http.services import Services
-from mapvote.server.views.events import take, taken_up_to
+from mapvote.server.views.events import Event, take, taken_up_to
 
 _EVERY_S = 1.0
 _TIMEOUT_S = 10.0
 _LONGEST_S = 60.0
 
 
-def signature(secret: str, timestamp: str, body: bytes) -> str:
-    """``sha256=`` and the HMAC-SHA256 of ``timestamp.body`` in hex: tells who sent it, and when."""
-    return "sha256=" + hmac.new(secret.encode(), timestamp.encode() + b"." + body, hashlib.sha256).hexdigest()
+def signed(secret: str, events: Sequence[Event], at: datetime, body: bytes) -> dict[str, str]:
+    """The headers of a post of some events (Standard Webhooks 1.0.0): the same events have the same id when they are
+    sent again."""
+    name = f"events_{events[0].seq}_{events[-1].seq}"
+    return {
+        "Content-Type": "application/json",
+        "webhook-id": name,
+        "webhook-timestamp": str(int(at.timestamp())),
+        "webhook-signature": Webhook(secret).sign(name, at, body.decode()),
+    }
 
 
 async def deliver(parts: Services) -> None:
@@ -43,12 +51,8 @@ async def deliver(parts: Services) -> None:
                 events = await ask(parts.feed.after, seq)
                 if events:
                     body = msgspec.json.encode({"map_id": parts.store.map_id, "events": [asdict(e) for e in events]})
-                    stamp = str(parts.store.clock() // 10**9)
-                    headers = {
-                        "Content-Type": "application/json",
-                        "X-Mapvote-Timestamp": stamp,
-                        "X-Mapvote-Signature": signature(asked.webhook_secret, stamp, body),
-                    }
+                    at = datetime.fromtimestamp(parts.store.clock() // 10**9, UTC)
+                    headers = signed(asked.webhook_secret, events, at, body)
                     (await client.post(asked.webhook_url, content=body, headers=headers)).raise_for_status()
                     seq = events[-1].seq
                 if seq != noted:
