@@ -127,7 +127,7 @@ def test_a_sweep_of_two_lidars_is_placed_once_and_each_one_s_rays_begin_where_it
     whole = frontend()
     assert whole.observe(Scan.sweep(0, [Scan(0, POINTS), Scan(0, POINTS, origin=rear)])) == []
     first, second = whole.finish()
-    assert whole.report.scans == 1
+    assert (whole.report.scans, len(whole.report.sigmas_m)) == (1, 1)
     assert [first.scan.index, second.scan.index] == [0, 0]
     np.testing.assert_allclose(first.scan.origin_map, SENSOR[:3, 3])
     np.testing.assert_allclose(second.scan.origin_map, SENSOR[:3, 3] + rear)

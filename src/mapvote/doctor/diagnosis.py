@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 
 import numpy as np
@@ -37,6 +37,7 @@ from mapvote.formats.maps.mapvote_folder import is_map_folder
 from mapvote.formats.registry import DRIVES, MAPS
 
 _ROAD_SCANS = 7
+_TURNED_OVER = np.diag([1.0, -1.0, -1.0]).astype(np.float32)
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,9 +82,13 @@ class Evidence:
         """(m,) scans that could be read."""
         return self.looks.index
 
-    def points(self, i: int) -> F32:
-        """(p, 3) of the i-th scan that could be read."""
+    def as_read(self, i: int) -> F32:
+        """(p, 3) points of the i-th scan that could be read."""
         return self.drive.read_scan(int(self.readable[i])).points
+
+    def points(self, i: int) -> F32:
+        """The same, turned over where the sensor is upside down: what else is wrong shows only then."""
+        return self.as_read(i) @ _TURNED_OVER if self.road.up == "-z" else self.as_read(i)
 
     @cached_property
     def some(self) -> I64:
@@ -92,7 +97,12 @@ class Evidence:
 
     @cached_property
     def road(self) -> Road:
-        return find_road([self.points(int(i)) for i in self.some])
+        """As the points are read."""
+        return find_road([self.as_read(int(i)) for i in self.some])
+
+    @cached_property
+    def road_below(self) -> Road:
+        return find_road([self.points(int(i)) for i in self.some]) if self.road.up == "-z" else self.road
 
     @cached_property
     def scatter_m(self) -> float:
@@ -106,7 +116,7 @@ class Evidence:
         return (
             len(self.readable) > 2
             and 1.5 <= float(np.median(self.looks.range_m[:, 1])) <= 150.0
-            and self.road.up == "+z"
+            and self.road_below.up == "+z"
         )
 
     @cached_property
@@ -121,7 +131,7 @@ class Evidence:
         return every[: len(spread)], every
 
     def run(self, start: int, **most: int) -> Run:
-        run = follow(self.points, start, len(self.readable), self.road, **most)
+        run = follow(self.points, start, len(self.readable), self.road_below, **most)
         return replace(run, indices=self.readable[run.indices])
 
     @cached_property
@@ -135,9 +145,14 @@ class Evidence:
         if self.T is None or not self.can_be_registered or self.leaps:
             return [], self.T
         turns = float(np.median(self.looks.turns))
-        return check_agreement(
-            self.drive, self.T, self.runs[0], self.road, turns, lambda: self.run(0, scans=CHAIN_SCANS)
-        )
+        chain = partial(self.run, 0, scans=CHAIN_SCANS)
+        found, T = check_agreement(self.drive, self.T, self.runs[0], self.road_below, turns, chain)
+        if self.road.up == "-z":
+            # Nothing wrong with a prior shows surely in scans that are mended by a guess.
+            found = [f for f in found if f.severity == "error"]
+            T = T.copy()
+            T[:, :3, :3] = T[:, :3, :3] @ _TURNED_OVER
+        return found, T
 
 
 def _ranges_and_road(e: Evidence) -> list[Finding]:

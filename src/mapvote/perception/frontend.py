@@ -175,6 +175,7 @@ class Frontend:
         self._localise, self._movers, self._ground, self._compared = localise, movers, ground, compared
         self._with_sight, self._sky = with_sight, None if sensor is None else Sky(sensor)
         self._waiting: deque[PlacedScan] = deque()
+        self._observed = -1
         self._ended = False
 
     def observe(self, scan: Scan, prior: PosePrior | None = None) -> list[Observation]:
@@ -208,6 +209,7 @@ class Frontend:
         done, n = self.report, self.done
         self.report = done.split(n)
         self._waiting = deque(replace(scan, index=scan.index - n) for scan in self._waiting)
+        self._observed -= n
         return done
 
     def go_on_in(self, point_map: PointMap) -> None:
@@ -259,7 +261,9 @@ class Frontend:
         out = []
         for moving in decided:
             scan = self._waiting.popleft()
-            self.report.sigmas_m.append(scan.sigma_m)
+            if scan.index != self._observed:  # the parts of a sweep are one scan
+                self.report.sigmas_m.append(scan.sigma_m)
+                self._observed = scan.index
             with self.report.timed("see"):
                 reference = scan.reference if self._compared is None else self._compared.at(scan.origin_map)[0]
                 cell = scan.cell if self._compared is None else None
