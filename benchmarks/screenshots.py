@@ -1,6 +1,6 @@
 """The pictures of the page in docs/pictures, taken anew: a real server, headless Chromium, software WebGL.
 
-    mapvote demo --out out
+    mapvote demo --full --keep --out out
     python benchmarks/screenshots.py out/work/server/store.db
     python benchmarks/screenshots.py out/work/server/store.db --only dark,phone --to /tmp/pictures
 

@@ -56,14 +56,14 @@ def explain(
 
     mapvote explain fleet.db 12.5 -- -3.0
     """
-    from mapvote.server.views.explain import as_told, explain_cell
+    from mapvote.server.views.explain import explain_cell, story_as_json
 
     if is_url(store):
         with server_at(store, key_file) as server:
             told = server.ask_json("GET", f"/v1/cells?x={x}&y={y}")
     else:
         with opened_store(store) as opened:
-            told = as_told(explain_cell(opened, x, y))
+            told = story_as_json(explain_cell(opened, x, y))
     print(f"cell {told['row']}, {told['col']}: {told['thing'] or 'empty'}")
     for decision in told["decisions"]:
         print(f"version {decision['version']} decided {decision['state']}")

@@ -29,7 +29,7 @@ from mapvote.server.store.publish import preview, publish
 from mapvote.server.store.store import Store
 from mapvote.server.views import explain
 from mapvote.server.views.events import last_events
-from mapvote.server.views.explain import COPY, CellStory, as_told, explain_cell
+from mapvote.server.views.explain import COPY, CellStory, explain_cell, story_as_json
 from mapvote.server.views.point_lod import evidence
 from standing_clock import Clock
 
@@ -95,7 +95,7 @@ def test_a_vote_is_named_with_the_version_that_counted_it_or_why_it_does_not_cou
     assert told.decisions == [(2, "changed_empty")]
     assert told.probability is not None
     assert 0.0 < told.probability < 1.0
-    assert as_told(told)["probability"] == round(told.probability, 3)
+    assert story_as_json(told)["probability"] == round(told.probability, 3)
 
 
 def test_what_comes_and_goes_is_called_temporary_until_it_can_be_expected_to_stay(store: Store, clock: Clock) -> None:

@@ -1,4 +1,4 @@
-"""The server as a FastAPI app on an open store: what its parts are and how long they live."""
+"""The server as a FastAPI app on an open store."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def create_app(
 ) -> FastAPI:
     """The app on an open store, which stays the caller's to close. It runs once.
 
-    ``opened``: as long as the store holds no key, whoever asks is answered; else no route answers without one.
+    ``opened``: as long as the store holds no key, no request needs one; else no route answers without a key.
     ``owner``: every request is that of an operator of this name, and no quota holds; only within a process
     (:func:`mapvote.server.http.in_process.in_process`).
     ``gate``: see :mod:`mapvote.server.store.publish`; ``executor``: where tiles are fused, two threads by default.
@@ -124,5 +124,5 @@ async def _make(parts: Services, version: int) -> None:
         await to_thread.run_sync(make, version, stop, limiter=parts.threads.fetching)
     except Unavailable:
         raise
-    except MapvoteError as error:  # damaged beyond a tile: whoever asks for the picture is told
+    except MapvoteError as error:  # damage beyond a tile: a request for the overview gets this error
         structlog.get_logger("mapvote").warning("overview", version=version, error=str(error)[:200])

@@ -1,4 +1,4 @@
-"""Whose request it is, and what its key may touch."""
+"""The key of a request, and what it permits."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ _WRONG_PER_MINUTE, _WRONG_AT_ONCE = 60.0, 120
 class Guard:
     """Keys come as ``Authorization: Bearer KEY``, or Basic with the key as password (browsers).
 
-    Every request's key is looked up in the store, many in one query: a revoked key works no longer, not even once. A
-    ballot's key is looked up where the ballot is written (:meth:`mapvote.server.store.admission.Intake.write`):
-    until then it is enough to know whose it was, which never changes.
+    The key of every request is looked up in the store, many in one query, so a revoked key works no longer at once. The
+    key of a ballot is looked up in the transaction that writes the ballot
+    (:meth:`mapvote.server.store.admission.Intake.write`). Before that its name suffices, which never changes.
 
-    ``opened``: nobody needs a key as long as the store holds none. The first that is issued ends that, in the same
-    moment and for good. ``owner``: every request is that of an operator of this name.
+    ``opened``: no key is needed as long as the store holds none. The first key that is issued ends that for good.
+    ``owner``: every request is that of an operator of this name.
     """
 
     def __init__(self, store: Store, threads: Executor, *, opened: bool, owner: str | None = None) -> None:
@@ -48,10 +48,10 @@ class Guard:
     async def who(
         self, authorization: str | None, peer: str, *, ballot: bool = False
     ) -> tuple[keys.Key, str | None] | None:
-        """The key of a request and its hash, which the owner's has not; None if the server is open.
+        """The key of a request and its hash (None of the owner); None if the server is open.
 
-        Unauthorised if it is missing, unknown or revoked; of a ``ballot``, that is for the store to say in the end.
-        TooMany if ``peer`` has sent so many wrong ones that new ones from there are looked up no more for a while.
+        Unauthorised if the key is missing, unknown or revoked; of a ``ballot`` a known key passes, and the store
+        decides. TooMany if ``peer`` has sent too many wrong keys: no new key from there is looked up for a while.
         """
         if self._owner is not None:
             return self._owner, None
@@ -76,7 +76,7 @@ class Guard:
             try:
                 self._wrong.check(peer)
             except TooMany:
-                await asyncio.sleep(_PAUSE_S)  # a flood waits for its answers instead of asking for more
+                await asyncio.sleep(_PAUSE_S)  # a flood waits for its answers instead of sending more
                 raise
         try:
             return await self._looked_up.put(digest)
@@ -86,7 +86,8 @@ class Guard:
 
 
 def own(request: Request, vehicle: str) -> str:
-    """Who touches this vehicle's ballots: itself, within its rate, or an operator; Forbidden for anybody else."""
+    """The name on a key that may change this vehicle's ballots: the vehicle within its rate, or an operator. Else
+    Forbidden."""
     key: keys.Key | None = request.state.key
     if key is None:
         return vehicle
@@ -98,17 +99,17 @@ def own(request: Request, vehicle: str) -> str:
 
 
 def operator(request: Request) -> str:
-    """The operator's name; Forbidden for anybody else."""
+    """The operator's name; Forbidden for other roles."""
     return _one_of(request, "operator")
 
 
 def reviewer(request: Request) -> str:
-    """The name of a reviewer or an operator; Forbidden for anybody else."""
+    """The name of a reviewer or an operator; Forbidden for other roles."""
     return _one_of(request, "reviewer", "operator")
 
 
 def sees_names(request: Request) -> bool:
-    """Whether who asks may know which vehicle voted what, and when; others see pseudonyms and days."""
+    """Whether the key permits the names of vehicles and exact times; others get pseudonyms and days."""
     key: keys.Key | None = request.state.key
     return key is None or key.role in ("reviewer", "operator")
 

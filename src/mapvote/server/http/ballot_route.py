@@ -1,8 +1,7 @@
-"""The vehicle's vote: one ASGI route. FastAPI documents it, but reads nothing of its requests.
+"""The route that takes ballots: declared to FastAPI for OpenAPI, but handled without it.
 
-What FastAPI does for a request (dependencies, a parsed body, a response model) takes longer than everything that a
-ballot needs, and a ballot is checked by its own decoder anyway. So :class:`BallotRoute` keeps FastAPI's declaration,
-for OpenAPI, and hands the request to :func:`vote` as it came. There is no second way in.
+FastAPI's handling of a request (dependencies, parsed body, response model) takes longer than all that a ballot needs,
+and the ballot's decoder checks it anyway. So :class:`BallotRoute` hands the request to :func:`vote` as it came.
 """
 
 from __future__ import annotations
@@ -47,9 +46,9 @@ router = APIRouter(route_class=BallotRoute)
     summary="Vote",
 )
 async def vote(request: Request, vehicle: Name, drive: Name) -> Response:
-    """One ballot. 201: stored; 200: it replaced the same drive's, or stood already. On disk once answered.
+    """One ballot, on disk before the answer. 201: new; 200: it replaced one of the same drive, or was there already.
 
-    The names need no check of their own: a ballot whose header does not bear the very same is refused (422).
+    422 if the names in the address are not those in the ballot.
     """
     own(request, vehicle)
     parts = services(request)

@@ -1,4 +1,4 @@
-"""What the page in 3D asks for: levels of detail, what came and went, and evidence cell by cell."""
+"""Data of the 3D page: levels of detail, points that came and went, votes per cell, paths."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def overview(request: Request, version: VersionQuery | None = None) -> Response:
     "/v1/clouds/changed",
     responses=problems(404) | AS_BYTES,
     response_class=Response,
-    summary="What came and went between two versions",
+    summary="Points that came and went between two versions",
 )
 def changed(request: Request, old: From, new: To) -> Response:
     """Tile by tile, two clouds each; the layout is in docs/viewer.md."""
@@ -72,7 +72,7 @@ def level_of(
     summary="Votes cell by cell",
 )
 def evidence_of(request: Request, row: _Index, col: _Index, vehicle: str | None = None) -> Response:
-    """256 x 256 cells of four bytes: vehicles, days since the last one, probability of a change, what most say.
+    """256 x 256 cells of four bytes: vehicles, days since the last one, probability of a change, most frequent state.
 
     Of one ``vehicle`` only for reviewers and operators.
     """
@@ -82,10 +82,10 @@ def evidence_of(request: Request, row: _Index, col: _Index, vehicle: str | None 
     return packed(request, plane.tobytes(), "private, no-cache")
 
 
-@router.get("/v1/paths", response_model=PlacesAnswer, responses=problems(403) | AS_CSV, summary="Where vehicles drove")
+@router.get("/v1/paths", response_model=PlacesAnswer, responses=problems(403) | AS_CSV, summary="Paths of the drives")
 def driven(request: Request, vehicle: str | None = None, format: Places = "json") -> Response:
-    """Of standing ballots that tell of it, the newest drive first, 500 at most: GeoJSON lines in map metres; as ``csv``
-    without the lines."""
+    """Paths of standing ballots that carry one, the newest drive first, 500 at most: GeoJSON lines in map metres; as
+    ``csv`` without the lines."""
     reviewer(request)
     found = paths(services(request).store, vehicle)
     return as_table([feature["properties"] for feature in found["features"]]) if format == "csv" else as_json(found)

@@ -1,7 +1,7 @@
 """Time limits and a head limit for each connection, and a limit on their number.
 
 uvicorn limits only the pause between two requests. :class:`Connection` stands between the socket and uvicorn's
-protocol. It uses only the interface of :class:`asyncio.Protocol`. :func:`tracked` tells it when a request begins and
+protocol. It uses only the interface of :class:`asyncio.Protocol`. :func:`tracked` calls it when a request begins and
 ends. h11 limits what uvicorn keeps of an unfinished event (heads, chunk lines, trailers) to :data:`HEAD_BYTES`, too.
 """
 
@@ -27,7 +27,7 @@ _TOO_LARGE = _REFUSAL.format("431 Request Header Fields Too Large").encode()
 
 @dataclass(frozen=True, slots=True)
 class Patience:
-    """What a server waits for, in seconds, and how many connections it holds at once."""
+    """Time limits in seconds, and the number of connections."""
 
     header_s: float
     """From the connection, or from the first byte of a later request, to the end of its headers."""
@@ -39,7 +39,7 @@ class Patience:
 
 
 class Crowd:
-    """All connections of a server, and which of them have no request under way, the oldest first."""
+    """All connections of a server, and those without a request under way, oldest first."""
 
     def __init__(self, most: int) -> None:
         self._most = most
@@ -47,7 +47,7 @@ class Crowd:
         self._silent: dict[Connection, None] = {}
 
     def add(self, connection: Connection) -> None:
-        """A new one; if that is one too many, the longest silent goes, which may be this one."""
+        """A new one. Beyond the limit the connection that has been idle longest is closed, which may be this one."""
         self._all.add(connection)
         self._silent[connection] = None
         if len(self._all) > self._most:
@@ -71,7 +71,7 @@ class Crowd:
 
 
 class Connection(asyncio.Protocol):
-    """One connection: hands everything to ``inner``, and cuts a client that keeps the server waiting."""
+    """One connection: passes everything on to ``inner``, and closes if the client exceeds a time limit."""
 
     def __init__(self, inner: asyncio.Protocol, patience: Patience, crowd: Crowd) -> None:
         self._inner, self._patience, self._crowd = inner, patience, crowd
@@ -190,7 +190,7 @@ def watched(inner: Callable[..., asyncio.Protocol], patience: Patience) -> Calla
 
 
 def tracked(app: ASGIApp) -> ASGIApp:
-    """``app``, which tells the connection of each request when the request begins, has a whole body, and ends."""
+    """``app`` that reports to the connection when a request begins, when its body is complete, and when it ends."""
 
     async def run(scope: Scope, receive: Receive, send: Send) -> None:
         connection = _CONNECTION.get()

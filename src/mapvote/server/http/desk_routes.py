@@ -1,4 +1,4 @@
-"""The desk by HTTP: what waits to be published, and what reviewers decide about it."""
+"""The review desk: pending changes, and verdicts on them."""
 
 from __future__ import annotations
 
@@ -42,9 +42,9 @@ class ReviewAsk(BaseModel):
     summary="What a publish would change now",
 )
 async def whole_desk(request: Request, format: Places = "json") -> Response:
-    """Pending changes as GeoJSON, with the verdicts so far; deletions that wait for somebody to drive by, beyond the
-    policy's budget; what was held and rejected; why the policy would hold; the hashes of the tiles that a publish would
-    make (null: no tile any more), which `/v1/clouds` serves meanwhile.
+    """Pending changes as GeoJSON with their verdicts; deletions beyond the policy's budget; held and rejected changes;
+    the reasons to hold the version; the hashes of the tiles that a publish would make (null: without points), which
+    `/v1/clouds` serves meanwhile.
 
     As ``geojson`` or ``csv``: all of them in one list.
     """
@@ -75,7 +75,7 @@ def _hashes(hashes: TileHashes, tile: Tile) -> dict[str, str] | None:
 
 
 async def _look(request: Request) -> Desk:
-    """The desk as it is now; the clouds know the tiles that a publish would make."""
+    """The desk as of now; its tiles are proposed to the clouds."""
     reviewer(request)
     parts = services(request)
     look = partial(desk, parts.store, parts.fusing, parts.gate)
@@ -92,9 +92,9 @@ def _flat(row: Mapping[str, Any]) -> dict[str, Any]:
 
 @router.post("/v1/desk/reviews", responses=problems(403, 404, 409), summary="Accept, hold or reject a change")
 async def decide(request: Request, ask: ReviewAsk) -> VerdictGiven:
-    """Publishing obeys it: a rejected change does not come back by the votes there are, a held one waits.
+    """A publish obeys it: the votes of a rejected change do not count any more, those of a held one wait.
 
-    409 if somebody else decided meanwhile.
+    409 if another reviewer decided meanwhile.
     """
     by, parts = reviewer(request), services(request)
     said = partial(review, by=by, comment=ask.comment, after=ask.after, executor=parts.fusing)

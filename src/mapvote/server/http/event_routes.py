@@ -34,10 +34,10 @@ async def listen(
     after: Annotated[int | None, Query(ge=0, le=_MOST)] = None,
     last_event_id: Annotated[int | None, Header(ge=0, le=_MOST)] = None,
 ) -> StreamingResponse:
-    """Ballots, verdicts, versions and publishes that were held, each an event whose id is its number in the log.
+    """Ballots, verdicts, versions and held publishes. The id of an event is its number in the log.
 
-    ``after`` (or ``Last-Event-ID``, which browsers send by themselves): from there on; else what is to come. Of
-    ballots, and by whom else, only reviewers and operators hear.
+    ``after`` (or ``Last-Event-ID``, which browsers send): the events after that number; else those to come. Events of
+    ballots, and the names in all others, go to reviewers and operators only.
     """
     parts, named = services(request), sees_names(request)
     start = last_event_id if last_event_id is not None else after
@@ -65,5 +65,5 @@ async def _told(request: Request, parts: Services, seq: int, named: bool) -> Asy
 
 
 def as_sse(event: Event) -> bytes:
-    """One event on the wire; JSON holds no line break, so nothing in it can begin another event."""
+    """One event on the wire. JSON holds no line break, so no text in it can begin another event."""
     return b"id: %d\ndata: %b\n\n" % (event.seq, msgspec.json.encode(asdict(event)))

@@ -28,9 +28,9 @@ def _damaged(store: Store) -> list[str]:
 
 
 class Probe:
-    """``/livez`` and ``/readyz`` for whoever has no key, by any name of the server: a status, and no content.
+    """``/livez`` and ``/readyz`` for requests without a key, by any name of the server: a status without content.
 
-    ``ready`` raises Unavailable if no ballot can be taken now. It is asked once a second at most, however many ask.
+    ``ready`` raises Unavailable if no ballot can be taken now. It is called at most once a second.
     """
 
     PATHS = ("/livez", "/readyz")
@@ -56,7 +56,7 @@ class Probe:
 
 @router.get("/livez", responses=problems(), response_class=Response, summary="Does the server answer?")
 async def live() -> Response:
-    """200 without content. It needs no key, and neither does `/readyz`, whose answer without a key has no content."""
+    """200 without content. Neither this nor `/readyz` needs a key; without a key `/readyz` has no content either."""
     return Response()
 
 
@@ -68,9 +68,9 @@ async def health(request: Request) -> Health:
 
 @router.get("/readyz", responses=problems(), summary="Can ballots be taken in?")
 async def ready(request: Request) -> Ready:
-    """200 if the database can be written now, 503 with what it says if not, or if the server is stopping.
+    """200 if the database can be written now; 503 with its error if not, or if the server is stopping.
 
-    ``quarantine`` names what is damaged and was set aside: all else goes on.
+    ``quarantine`` names damaged ballots and planes that were set aside. Everything else goes on.
     """
     parts = services(request)
     version, damaged = await parts.check_ready(), await parts.look_up(_damaged)

@@ -1,4 +1,4 @@
-"""What one key may ask for: requests per minute, and bytes on their way."""
+"""Limits per key: requests per minute, and bytes of ballots that are being received."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class RateLimit:
         self.check(name)
         now = self._clock()
         self._buckets[name] = (self._tokens(name, now) - 1.0, now)
-        if len(self._buckets) > 10_000:  # full buckets say nothing: forget them
+        if len(self._buckets) > 10_000:  # full buckets carry no information: drop them
             wait = self._burst / self._per_s
             self._buckets = {n: b for n, b in self._buckets.items() if now - b[1] < wait}
 
@@ -49,8 +49,8 @@ class RateLimit:
 class Uploads:
     """Ballots that are being received. For one thread (the event loop).
 
-    One has at most ``each`` bytes, and all of them together at most ``together`` in memory: beyond that the largest is
-    dropped, so that who sends little is never kept waiting by who sends much. A vehicle sends ``AT_ONCE`` at a time.
+    One has at most ``each`` bytes, all together at most ``together`` in memory. Beyond that the largest is dropped, so
+    small ballots never wait for large ones. A vehicle sends at most ``AT_ONCE`` at a time.
     """
 
     AT_ONCE = 4
@@ -96,7 +96,7 @@ class Uploads:
             raise TooLarge(f"the body is larger than {self._each} bytes: send a shorter drive")
 
     def _forget(self, upload: _Upload) -> None:
-        """Its memory is free at once, even if its sender has fallen silent."""
+        """Free its memory at once, even if its sender stays connected."""
         if upload in self._under_way:
             del self._under_way[upload]
             self._bytes -= upload.size

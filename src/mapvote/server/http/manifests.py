@@ -1,4 +1,4 @@
-"""Manifests ready to send. A version never changes, so each is made once, however many ask for it."""
+"""Manifests as JSON. A version never changes, so each manifest is encoded once."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Made(NamedTuple):
 
 
 class Manifests:
-    """The JSON of manifests asked for of late; for any number of threads."""
+    """The JSON of the manifests that were requested last; thread-safe."""
 
     def __init__(self, store: Store) -> None:
         self._store = store
@@ -33,7 +33,7 @@ class Manifests:
         self._made: dict[tuple[int, int | None], Made] = {}
 
     def newest(self, asked: Sequence[None]) -> list[int]:
-        """The newest version's number, for each who asks: one query for all of them."""
+        """The newest version's number, for each of a batch of requests by one query."""
         return [self._store.current()] * len(asked)
 
     def ready(self, number: int, since: int | None) -> Made | None:
@@ -42,7 +42,7 @@ class Manifests:
 
     def make(self, number: int, since: int | None) -> Made:
         """A version; ``since`` as in :meth:`Store.manifest`. NotFound if there is no such version."""
-        with self._lock:  # of many who ask for a new version, one makes it
+        with self._lock:  # of many requests for a new version, one makes it
             made = self._made.get((number, since))
             if made is None:
                 manifest = self._store.manifest(number, since=since)

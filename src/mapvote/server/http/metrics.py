@@ -1,4 +1,4 @@
-"""What /metrics counts."""
+"""The metrics of /metrics."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from mapvote.server.store.integrity import KINDS
 
 
 class Metrics:
-    """What /metrics tells."""
+    """All metrics of one server."""
 
     def __init__(self) -> None:
         self.registry = CollectorRegistry()

@@ -1,4 +1,4 @@
-"""What operators ask: publish, roll back, and look at what changed and why."""
+"""Routes of operators: publish, roll back, and see what changed and why."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ from mapvote.server.http.services import Services, services
 from mapvote.server.store.keys import pseudonyms
 from mapvote.server.store.publish import preview, publish, rollback
 from mapvote.server.store.queries import log_event
-from mapvote.server.views.explain import as_told, explain_cell
+from mapvote.server.views.explain import explain_cell, story_as_json
 from mapvote.server.views.geojson import contradictions, feature_rows, standing_rows, tile_squares
 from mapvote.server.views.history import changes_between, coverage, page_between, seen, vehicle_standings
 
@@ -55,14 +55,14 @@ router = APIRouter()
 
 @router.post("/v1/publish", responses=problems(403, 409), summary="Publish the next version")
 async def publish_now(request: Request, ask: PublishAsk) -> Published:
-    """Fuse what stands. 409 with the reasons if the policy holds it, or if somebody else published first."""
+    """Fuse the standing ballots. 409 with the reasons if the policy holds the version, or another publish was first."""
     by, parts = operator(request), services(request)
     return await to_thread.run_sync(_publish, parts, ask, by, limiter=parts.threads.deciding)
 
 
 @router.get("/v1/publish", responses=problems(403), summary="How far a publish is")
 async def publishing_now(request: Request) -> Publishes:
-    """Publishes under way, and looks at what one would do: who asked, and how many tiles of how many are fused."""
+    """Publishes and dry runs under way: by whom, and how many tiles of how many are fused."""
     reviewer(request)
     rounds = services(request).publishing.now()
     return Publishes(running=[Running(by=r.by, dry_run=r.dry_run, done=r.done, of=r.of) for r in rounds])
@@ -70,7 +70,7 @@ async def publishing_now(request: Request) -> Publishes:
 
 @router.delete("/v1/publish", responses=problems(403, 404), summary="Cancel what is being published")
 async def cancel_publishing(request: Request) -> Cancelled:
-    """Every publish under way ends before its next tiles with 409, and nothing of it is published."""
+    """Every publish under way ends before its next tiles with 409; no part of it is published."""
     return Cancelled(cancelled=services(request).publishing.cancel(operator(request)))
 
 
@@ -78,7 +78,7 @@ def _publish(parts: Services, ask: PublishAsk, by: str) -> Published:
     with (
         parts.metrics.publish_seconds.time(),
         _unless_stopping(parts),
-        _told_if_held(parts, by),
+        _logged_if_held(parts, by),
         parts.publishing.watched(parts.fusing, by, ask.dry_run) as executor,
     ):
         if ask.dry_run:
@@ -108,7 +108,7 @@ def _publish(parts: Services, ask: PublishAsk, by: str) -> Published:
 
 @router.post("/v1/rollback", responses=problems(403, 404, 409), summary="Go back to an older version")
 async def roll_back(request: Request, ask: RollbackAsk) -> RolledBack:
-    """A new version that is the old one again; the votes that led away from it are barred."""
+    """A new version with the tiles of the old one; the votes that led away from it count no more."""
     by, parts = operator(request), services(request)
     back = partial(rollback, parts.store, ask.to, by=by, reason=ask.reason)
     return RolledBack(version=(await to_thread.run_sync(back, limiter=parts.threads.deciding)).number)
@@ -125,7 +125,7 @@ def changes(
     old: From,
     new: Newest = None,
     min_cells: MinCells = 1,
-    lonlat: Annotated[bool, Query(description="in longitude and latitude, if the map says where it lies")] = False,
+    lonlat: Annotated[bool, Query(description="in longitude and latitude, if the map is georeferenced")] = False,
     format: Literal["geojson", "csv"] = "geojson",
 ) -> Response:
     """Things built and demolished between two versions; ``to`` is the newest by default."""
@@ -159,9 +159,9 @@ def changes_page(
 
 @router.get("/v1/cells", response_model=CellAnswer, responses=problems(), summary="The votes behind one cell")
 def cell(request: Request, x: float, y: float) -> Response:
-    """Who says what about the cell at (x, y), map metres, whether it counts, and what was decided when."""
+    """What each ballot says about the cell at (x, y), map metres, whether it counts, and what each version decided."""
     parts = services(request)
-    told, known = as_told(explain_cell(parts.store, x, y)), sees_names(request)
+    told, known = story_as_json(explain_cell(parts.store, x, y)), sees_names(request)
     shown = {} if known else pseudonyms(parts.store, {vote["vehicle"] for vote in told["votes"]})
     for vote in told["votes"]:
         vote["end"] = iso(seen(vote.pop("end_ns"), known))
@@ -177,7 +177,7 @@ def cell(request: Request, x: float, y: float) -> Response:
     summary="Freshness of every tile",
 )
 def fresh(request: Request, format: Places = "json") -> Response:
-    """When each tile was last driven past, and by how many vehicles whose ballots stand."""
+    """When a vehicle last passed each tile, and the number of vehicles with standing ballots there."""
     store = services(request).store
     tiles, known = coverage(store), sees_names(request)
     told = [
@@ -193,10 +193,10 @@ def fresh(request: Request, format: Places = "json") -> Response:
     "/v1/vehicles",
     response_model=Vehicles | PlacesAnswer,
     responses=problems(403) | AS_CSV,
-    summary="Who contradicts the others",
+    summary="Vehicles that contradict the others",
 )
 def vehicles(request: Request, format: Places = "json") -> Response:
-    """How every vehicle stands to what the others say before and after it, with the places where it differs."""
+    """Each vehicle compared with the others before and after it, with the places where it contradicts them."""
     reviewer(request)
     found = vehicle_standings(services(request).store)
     if format == "csv":
@@ -208,8 +208,8 @@ def vehicles(request: Request, format: Places = "json") -> Response:
 
 
 @contextmanager
-def _told_if_held(parts: Services, by: str) -> Iterator[None]:
-    """A publish that the policy holds is an event: whoever listens can look."""
+def _logged_if_held(parts: Services, by: str) -> Iterator[None]:
+    """A publish that the policy holds is an event for listeners."""
     try:
         yield
     except Held as error:
@@ -220,7 +220,7 @@ def _told_if_held(parts: Services, by: str) -> Iterator[None]:
 
 @contextmanager
 def _unless_stopping(parts: Services) -> Iterator[None]:
-    """A stopping server takes away the threads that fuse: what they had not begun is cancelled, more is refused."""
+    """A stopping server ends the threads that fuse: what they had not begun is cancelled, more is refused."""
     try:
         yield
     except (CancelledError, RuntimeError) as error:

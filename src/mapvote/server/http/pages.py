@@ -13,7 +13,7 @@ from fastapi import APIRouter, Request, Response
 from mapvote.codec.arrays import compress
 from mapvote.server.errors import NotFound
 
-_OPEN = b"""<p class="open-server" role="alert">This server is open: whoever uses this machine can vote, publish and
+_OPEN = b"""<p class="open-server" role="alert">This server is open: every user of this machine can vote, publish and
 roll back. Issue a key to close it: <code>mapvote keys STORE issue NAME --operator</code></p>"""
 _DOCS = """<!doctype html><html lang="en"><head><meta charset="utf-8"><title>mapvote API</title>
 <link rel="stylesheet" href="viewer/pages.css"></head>
@@ -85,7 +85,7 @@ def _assets() -> dict[str, _Asset]:
 
 
 def _page(request: Request, text: bytes) -> Response:
-    """A page, which says so first if nobody needs a key here."""
+    """A page, with a warning at its end if the server needs no key."""
     if request.state.key is None:
         text = text.replace(b"</head>", _STYLE + b"</head>", 1).replace(b"</body>", _OPEN + b"</body>", 1)
     return Response(text, media_type="text/html", headers={"Cache-Control": "no-cache"})

@@ -1,4 +1,4 @@
-"""What is being published at this moment: how far it is, and a way to stop it."""
+"""Publishes under way: their progress, and how to cancel them."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from mapvote.server.store.fusion_jobs import Watched
 
 @dataclass(slots=True)
 class Progress:
-    """One publish, or one look at what it would do."""
+    """One publish or dry run."""
 
     by: str
     dry_run: bool
@@ -23,8 +23,8 @@ class Progress:
     of: int = 0
     cancelled_by: str | None = None
 
-    def told(self, done: int, of: int) -> None:
-        """Of a tile that is done. Raises Conflict, naming who, once somebody has cancelled it."""
+    def report(self, done: int, of: int) -> None:
+        """Note how many tiles are done. Conflict, with the name, once an operator has cancelled the publish."""
         self.done, self.of = done, of
         if self.cancelled_by is not None:
             raise Conflict(f"cancelled by {self.cancelled_by} after {done} of {of} tiles: nothing was published")
@@ -44,7 +44,7 @@ class Publishing:
         with self._lock:
             self._rounds.append(mine)
         try:
-            yield Watched(executor, mine.told)
+            yield Watched(executor, mine.report)
         finally:
             with self._lock:
                 self._rounds.remove(mine)
@@ -55,7 +55,7 @@ class Publishing:
             return list(self._rounds)
 
     def cancel(self, by: str) -> int:
-        """Stop every publish under way before its next tiles; how many. What only looks goes on. NotFound if none."""
+        """Stop every publish under way before its next tiles; how many. Dry runs go on. NotFound if there is none."""
         stopped = [one for one in self.now() if not one.dry_run]
         if not stopped:
             raise NotFound("nothing is being published")

@@ -1,4 +1,4 @@
-"""What is asked and answered by HTTP, and the one table from errors to status codes."""
+"""Parameters and bodies of requests, and the one table from errors to status codes."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ STATUS: Mapping[type[MapvoteError], int] = {
     TooMany: 429,
     Unavailable: 503,
 }
-"""The one error table: a class stands for its subclasses too."""
+"""A class stands for its subclasses too."""
 LEAST, MOST = -(1 << 31), (1 << 31) - 1
-"""What a database can compare a version's number with."""
+"""Range of a version's number in a database."""
 PLAIN = r"^[^\x00-\x1f]*$"
 """No control characters: PostgreSQL stores no NUL."""
 
@@ -37,7 +37,7 @@ Name = Annotated[str, Path(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$")]
 Number = Annotated[int, Path(ge=LEAST, le=MOST)]
 Table = Literal["json", "csv"]
 Places = Literal["json", "geojson", "csv"]
-"""How a list is asked for; what has a place can be GeoJSON too."""
+"""Formats of a list; lists of places can be GeoJSON."""
 VersionQuery = Annotated[int, Query(ge=LEAST, le=MOST)]
 From = Annotated[int, Query(alias="from", ge=LEAST, le=MOST)]
 To = Annotated[int, Query(alias="to", ge=LEAST, le=MOST)]
@@ -47,7 +47,7 @@ MinCells = Annotated[int, Query(ge=1, le=100_000)]
 
 
 class PublishAsk(BaseModel):
-    """How to publish; an empty object publishes what stands."""
+    """How to publish; an empty object publishes the standing ballots."""
 
     model_config = ConfigDict(extra="forbid")
     dry_run: bool = False
@@ -57,7 +57,7 @@ class PublishAsk(BaseModel):
 
 
 class RollbackAsk(BaseModel):
-    """Which version shall be the map again."""
+    """The version to go back to."""
 
     model_config = ConfigDict(extra="forbid")
     to: int = Field(ge=LEAST, le=MOST)
@@ -73,8 +73,8 @@ def problems(*codes: int) -> dict[int | str, dict[str, Any]]:
 
 
 def as_json(content: object) -> Response:
-    """An answer, encoded where it is made: FastAPI would do so on the event loop, and with a large one keep all others
-    waiting."""
+    """An answer, encoded in the calling thread: FastAPI would encode it on the event loop, and a large one would block
+    all others."""
     return Response(msgspec.json.encode(content), media_type="application/json")
 
 
@@ -100,9 +100,9 @@ def refuse(error: Exception) -> Response:
 
 
 async def unreadable(request: Request, error: Exception) -> Response:
-    """A body that is no JSON at all, not even text: FastAPI answers 400, but everything unusable is 422 here.
+    """A body that is not even UTF-8: FastAPI answers 400, but every unusable body is 422 here.
 
-    Not a plain function: FastAPI would let that wait for one of the threads that operators read with.
+    Asynchronous, as FastAPI would run a plain function in one of the threads of :data:`READING`.
     """
     return refuse(MapvoteError("the body is no JSON in UTF-8"))
 

@@ -1,5 +1,4 @@
-"""The outermost layer: whom a request may be addressed to, whose it is, what a browser may do with the answer; one line
-of log each.
+"""The outermost layer of every request: host and origin, key, security headers, metrics, one log line.
 
 A page on the Internet can give its own name the address 127.0.0.1 (DNS rebinding) and so speak to a server on the
 visitor's machine as if it were its own. The browser still says in ``Host`` and ``Origin`` whose page it was.
@@ -34,18 +33,18 @@ HEADERS = (
     ),
     ("Cross-Origin-Resource-Policy", "same-origin"),
 )
-"""On every answer, errors too: no guessing of types, no address told to others, nothing loaded from elsewhere."""
+"""On every answer, errors too: no guessed types, no referrer, nothing loaded from other servers."""
 
 
 class Hosts:
-    """What this server goes by: localhost, any address in digits (no page can rebind one), and ``allowed`` names."""
+    """The names of this server: localhost, any IP address (no page can rebind one), and ``allowed`` names."""
 
     def __init__(self, allowed: Sequence[str]) -> None:
         self._allowed = frozenset(name.lower() for name in allowed) | {"localhost"}
         self._ours = lru_cache(maxsize=256)(self._is_ours)
 
     def check(self, headers: Iterable[tuple[bytes, bytes]]) -> None:
-        """Forbidden for a request addressed to another name, or sent by another server's page."""
+        """Forbidden for a request to another name, or by a page of another server."""
         host = origin = None
         for name, value in headers:
             if name == b"host":
@@ -53,7 +52,7 @@ class Hosts:
             elif name == b"origin":
                 origin = value.decode("latin-1")
         if not host or not self._ours(host):
-            raise Forbidden(f"this server does not go by the name {(host or '')[:80]!r}: {_MEND}")
+            raise Forbidden(f"{(host or '')[:80]!r} is not a name of this server: {_MEND}")
         if origin is not None and not self._comes_from_us(origin, host):
             raise Forbidden(f"pages of {origin[:80]!r} may not use this server: {_MEND}")
 
@@ -62,13 +61,13 @@ class Hosts:
         return name in self._allowed or _is_address(name)
 
     def _comes_from_us(self, origin: str, host: str) -> bool:
-        """Of an address in digits only the very one asked: another machine's page has an address too."""
+        """Of IP addresses only the one that was addressed: another machine's page has an address too."""
         theirs = origin.partition("://")[2].lower()
         return theirs == host.lower() or _name_in(theirs) in self._allowed - {"localhost"}
 
 
 _HOST = re.compile(r"(?:\[([0-9a-f:.]+)\]|([a-z0-9._-]+))(?::[0-9]{1,5})?")
-_MEND = "name it in the server's configuration, [server] hosts, if it should"
+_MEND = "if it should be, add it to [server] hosts in the server's configuration"
 
 
 def _name_in(host: str) -> str:
@@ -89,7 +88,7 @@ log = structlog.get_logger("mapvote")
 
 
 def is_ballot(scope: Scope) -> bool:
-    """Whether a vehicle votes."""
+    """Whether the request sends a ballot."""
     return bool(scope["method"] == "PUT" and scope["path"].startswith("/v1/ballots/"))
 
 

@@ -31,10 +31,10 @@ from mapvote.server.store.store import Store
 _FILES = 300
 """Descriptors beside those of connections: a database's connections, libraries, logs."""
 _SWITCH_S = 5e-4
-"""Python lets a thread that computes keep the others waiting this long at a time, 5 ms unless told; an answer takes
-some twenty such turns."""
+"""How long a computing thread may keep the interpreter while others wait (Python's default: 5 ms). An answer takes some
+twenty such turns."""
 _PATIENCE_S = 5
-"""How long a stopping server waits for answers under way. Ballots take milliseconds."""
+"""A stopping server waits this long for answers under way. Ballots take milliseconds."""
 
 
 def open_or_create(
@@ -78,9 +78,9 @@ def serve(
 
     A publish that is still fusing is answered 503; one that is being written is finished.
 
-    ``ready`` is told the address once it listens. ``opened``: as long as the store holds no key, whoever is on this
-    machine may do anything. MapvoteError without that if there is no key, with it beyond loopback, or if the address
-    is taken.
+    ``ready`` is called with the URL once the server listens. ``opened``: as long as the store holds no key, requests
+    need none; on a loopback address only. MapvoteError if the store holds no key and ``opened`` is not given, if the
+    host is not loopback with it, or if the address is taken.
     """
     if opened and not is_loopback(host):
         raise MapvoteError(f"--open is for this machine alone, {host} can be reached from elsewhere: use keys instead")
@@ -92,7 +92,7 @@ def serve(
     try:
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         listener.bind((host, port))
-        listener.listen(1024)  # from here on nobody is turned away, even before the app has started
+        listener.listen(1024)  # from here on connections wait for the app to start
     except OSError as error:
         listener.close()
         raise MapvoteError(f"cannot listen on {host}:{port} ({error.strerror}): choose another --port") from error
@@ -107,7 +107,7 @@ def serve(
         h11_max_incomplete_event_size=HEAD_BYTES,
         ws="none",
         access_log=False,
-        forwarded_allow_ips=["127.0.0.1", "::1"],  # a proxy on this machine says whom it speaks for
+        forwarded_allow_ips=["127.0.0.1", "::1"],  # a proxy on this machine names its clients
         log_level="warning",
         timeout_graceful_shutdown=_PATIENCE_S,
         server_header=False,
@@ -121,10 +121,10 @@ def serve(
 
 
 def settle() -> None:
-    """Load what the first ballot would wait for, and keep all that is loaded out of the garbage collector's sight.
+    """Load what the first ballot needs, and exempt all loaded objects from garbage collection.
 
-    It stops every thread while it goes through all there is, a quarter of a second on a busy machine, and libraries
-    are nearly all of that.
+    A collection stops every thread while it visits all objects, for a quarter of a second on a busy machine; nearly all
+    of them are the libraries'.
     """
     check_states(np.full(1, NO_VOTE, dtype=np.uint8))
     gc.collect()
@@ -132,7 +132,7 @@ def settle() -> None:
 
 
 def _room_for(connections: int) -> int:
-    """As many connections as wished, or as the system lets this process open beside its files."""
+    """The wanted number of connections, or what the system allows this process beside its files."""
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     needed = connections + _FILES
     if soft < needed:
@@ -142,7 +142,7 @@ def _room_for(connections: int) -> int:
 
 
 class _Server(uvicorn.Server):
-    """Lets go of a publish under way when it is told to stop: what waits to be fused is dropped."""
+    """On shutdown drops what waits to be fused, so that a publish under way ends."""
 
     def __init__(self, config: uvicorn.Config, stop_fusing: Callable[[], None]) -> None:
         super().__init__(config)

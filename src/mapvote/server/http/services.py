@@ -1,4 +1,4 @@
-"""What the routes work with: the parts of one running app, each with its type, made once."""
+"""The parts of one running app, which its routes use."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ from mapvote.server.views.point_lod import Clouds
 
 Answer = TypeVar("Answer")
 READING = 1
-"""Threads for whatever an operator looks at. Python computes in one thread at a time: more would only take turns with
-those who answer vehicles."""
+"""Threads for what operators read. Python computes in one thread at a time: more would only compete with the threads
+that answer vehicles."""
 _BATCH = 64
 """Ballots written in one transaction at most."""
 _BURST = 0.1
@@ -39,19 +39,19 @@ _BURST = 0.1
 _UPLOADS = 8
 """Largest bodies that fit into the memory for all ballots on their way."""
 _READERS = 1024
-"""Readers answered by one look at the newest version."""
+"""Requests answered by one query of the newest version."""
 
 
 @dataclass(frozen=True, slots=True)
 class Threads:
-    """Who waits for whom: each kind of work has threads of its own, so that none can take those of another.
+    """Each kind of work has its own threads, so that none blocks another.
 
-    What is in none of these runs in FastAPI's own pool, :data:`READING` threads: whatever an operator looks at.
+    All other work runs in FastAPI's own pool of :data:`READING` threads: what operators read.
     """
 
     ballots: ThreadPoolExecutor = field(default_factory=lambda: ThreadPoolExecutor(3, "ballots"))
     lookups: ThreadPoolExecutor = field(default_factory=lambda: ThreadPoolExecutor(2, "lookups"))
-    """Keys and the newest version: health, and what comes before every answer."""
+    """Keys, the newest version, health: short questions before every answer."""
     fuse: ThreadPoolExecutor = field(default_factory=lambda: ThreadPoolExecutor(2, "fuse"))
     fetching: CapacityLimiter = field(default_factory=lambda: CapacityLimiter(4))
     """Manifests and tiles."""
@@ -61,12 +61,12 @@ class Threads:
 
 @dataclass(frozen=True, slots=True)
 class Services:
-    """The parts that live as long as the app; a route asks for them by :func:`services`."""
+    """The parts that live as long as the app; :func:`services` gives them to a route."""
 
     store: Store
     settings: Settings
     gate: Gate
-    """Looks at a version before it is published."""
+    """Compares a version with the one before, before it is published."""
     fusing: Executor
     """Where tiles are fused."""
     threads: Threads
@@ -74,19 +74,19 @@ class Services:
     writer: Batcher[Incoming, Receipt]
     """Writes ballots, many in one transaction."""
     newest: Batcher[None, int]
-    """The number of the newest version, read once for all who ask at a time."""
+    """The number of the newest version, read once for all requests that wait for it."""
     manifests: Manifests
     publishing: Publishing
     """Rounds under way."""
     clouds: Clouds
     """Levels of detail for the page."""
     feed: Feed
-    """Events, for all who listen."""
+    """Events, for all listeners."""
     metrics: Metrics
     limit: RateLimit
     uploads: Uploads
     stopping: Event = field(default_factory=Event)
-    """Set once the server has been told to stop."""
+    """Set once the server stops."""
 
     async def check_ready(self) -> int:
         """The newest version, of a database that takes a writer now; Unavailable if it does not, or if the server is
@@ -96,7 +96,7 @@ class Services:
         return await self.look_up(_newest_if_writable)
 
     async def look_up(self, ask: Callable[[Store], Answer]) -> Answer:
-        """What a short question to the store gives, asked in the threads for lookups."""
+        """The result of a short question to the store, in the threads for lookups."""
         return await asyncio.get_running_loop().run_in_executor(self.threads.lookups, ask, self.store)
 
     def stop_fusing(self) -> None:
@@ -105,7 +105,7 @@ class Services:
         self.threads.fuse.shutdown(wait=False, cancel_futures=True)
 
     async def close(self) -> None:
-        """Wait until every ballot that was taken in is written."""
+        """Wait until every accepted ballot is written."""
         await self.writer.close()
         for pool in (self.threads.fuse, self.threads.ballots, self.threads.lookups):
             pool.shutdown(cancel_futures=True)
@@ -146,6 +146,6 @@ def make_services(
 
 
 def services(request: Request) -> Services:
-    """The parts of the app that a request came to."""
+    """The parts of the app of a request."""
     found: Services = request.app.state.services
     return found

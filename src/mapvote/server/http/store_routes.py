@@ -1,4 +1,4 @@
-"""What operators ask about the store itself: its policy, its log, whether it is whole."""
+"""The store itself: its policy, its log, its integrity."""
 
 from __future__ import annotations
 
@@ -28,15 +28,15 @@ class PolicyAsk(BaseModel):
     reason: str = Field(default="", max_length=200, pattern=PLAIN)
 
 
-@router.get("/v1/policy", response_model=PolicyAnswer, responses=problems(), summary="What decides")
+@router.get("/v1/policy", response_model=PolicyAnswer, responses=problems(), summary="The policy")
 def policy(request: Request) -> Response:
-    """The policy that holds, who set it and why."""
+    """The policy in force, who set it and why."""
     return as_json(services(request).store.policy_changes()[-1].as_json())
 
 
-@router.patch("/v1/policy", response_model=PolicyAnswer, responses=problems(403), summary="Decide otherwise")
+@router.patch("/v1/policy", response_model=PolicyAnswer, responses=problems(403), summary="Change the policy")
 def change_policy(request: Request, ask: PolicyAsk) -> Response:
-    """Holds at once. 422 naming the value that cannot be, or the key that does not exist."""
+    """In force at once. 422 names the value that is not possible, or the key that does not exist."""
     by, store = operator(request), services(request).store
     store.change_policy(ask.values, by=by, reason=ask.reason)
     return as_json(store.policy_changes()[-1].as_json())
@@ -57,7 +57,7 @@ def log(request: Request, events: Annotated[int, Query(ge=0, le=10_000)] = 0) ->
 
 @router.get("/v1/check", response_model=Checked, responses=problems(403), summary="Is every byte as written?")
 async def whole(request: Request) -> Response:
-    """Reads the whole store; what is damaged is named, nothing is changed."""
+    """Reads the whole store and names what is damaged. Nothing is changed."""
     operator(request)
     parts = services(request)
     found = await to_thread.run_sync(check, parts.store, limiter=parts.threads.deciding)
@@ -66,8 +66,7 @@ async def whole(request: Request) -> Response:
 
 @router.post("/v1/check", response_model=Checked, responses=problems(403), summary="Set aside what is damaged")
 async def mend(request: Request) -> Response:
-    """As looking, and what is damaged takes no part from now on. Planes are mended on the server's own machine, from a
-    backup."""
+    """As GET; what is damaged is set aside. Planes are mended on the server's own machine, from a backup."""
     by, parts = operator(request), services(request)
     found = await to_thread.run_sync(partial(check, parts.store, mend=True, by=by), limiter=parts.threads.deciding)
     return as_json({"damage": [asdict(damage) for damage in found]})

@@ -1,4 +1,4 @@
-"""What vehicles ask: the map, its tiles, and to take a vote back (:mod:`mapvote.server.http.ballot_route` takes it in).
+"""Routes of vehicles: the map, its tiles, and to withdraw a ballot. :mod:`mapvote.server.http.ballot_route` takes them.
 
 OpenAPI is the contract for vehicles in other languages: every answer is declared at its route.
 """
@@ -82,9 +82,9 @@ async def plane(request: Request, digest: Annotated[str, Path(pattern=r"^[0-9a-f
     return Response(data, media_type="application/octet-stream", headers=headers)
 
 
-@router.delete("/v1/ballots/{vehicle}/{drive}", responses=problems(403, 404, 429), summary="Un-vote")
+@router.delete("/v1/ballots/{vehicle}/{drive}", responses=problems(403, 404, 429), summary="Withdraw a ballot")
 async def unvote(request: Request, vehicle: Name, drive: Name) -> Withdrawn:
-    """Withdraw a ballot: what is published later is as if it had never been cast."""
+    """Withdraw a ballot: later versions are as if it had never been cast."""
     by = own(request, vehicle)
     return Withdrawn(withdrawn=await run_in_threadpool(withdraw, services(request).store, vehicle, drive, by=by))
 

@@ -36,10 +36,10 @@ def signed(secret: str, events: Sequence[Event], at: datetime, body: bytes) -> d
 
 
 async def deliver(parts: Services) -> None:
-    """Send what happens to ``[server] webhook_url``, until it is cancelled: from the first start with that address on,
-    and after a restart from where it was. (Killed between an answer and its note, the last post is sent again.)
+    """Post events to ``[server] webhook_url`` until it is cancelled: from the first start with that address on, and
+    after a restart from where it stopped. (A server killed between an answer and its note sends the last post again.)
 
-    What is not answered by 2xx is sent again, after one second, then two, four, at most sixty; nothing overtakes it.
+    A post that is not answered by 2xx is repeated, after one second, then two, four, at most sixty; none overtakes it.
     """
     asked = parts.settings.server
     ask = partial(to_thread.run_sync, limiter=parts.threads.fetching)

@@ -1,4 +1,4 @@
-"""Many requests, one piece of work: those that arrive while one batch is being worked on go into the next together.
+"""Requests in batches: those that arrive while one batch is processed form the next.
 
 So a hundred ballots cost one fsync, and a hundred keys one query.
 """
@@ -17,8 +17,8 @@ Answer = TypeVar("Answer")
 class Batcher(Generic[Asked, Answer]):
     """Calls ``work`` in one of ``threads``, one batch of at most ``limit`` after another. Lives on one event loop.
 
-    ``work`` gives one answer for each item, in order; an exception among the answers is raised to whoever asked. If
-    ``work`` itself raises, everybody in the batch hears it.
+    ``work`` gives one answer for each item, in order; an exception among the answers is raised to its caller. If
+    ``work`` itself raises, every caller of the batch gets that exception.
     """
 
     def __init__(
@@ -42,14 +42,14 @@ class Batcher(Generic[Asked, Answer]):
         return await future
 
     async def close(self) -> None:
-        """Wait until everything that was taken in is done."""
+        """Wait until every item is done."""
         while self._worker is not None and not self._worker.done():
             await self._worker
 
     async def _run(self) -> None:
         loop = asyncio.get_running_loop()
         while self._waiting:
-            await asyncio.sleep(0)  # who arrived in the same moment comes along
+            await asyncio.sleep(0)  # requests of the same moment join
             some, self._waiting = self._waiting[: self._limit], self._waiting[self._limit :]
             answers: Sequence[Answer | Exception]
             try:

@@ -1,7 +1,7 @@
-"""Changed cells -> change objects: what was built, what was demolished, each one thing.
+"""Changed cells -> change objects: things that were built or demolished.
 
-What changed is read off the two maps themselves, so it holds between any two versions, rollbacks included. The
-decisions in between say who voted for it. Objects are found on the lattice, not in tiles.
+The changed cells follow from the points of the two maps, so they are right between any two versions, rollbacks
+included. Votes and times come from the decision records in between. Objects are found on the lattice, not in tiles.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ Kind = Literal["built", "demolished"]
 Size = Literal["large", "vehicle", "small"]
 SMALL_AREA_M2 = 1.0
 VEHICLE_LENGTH_M, VEHICLE_WIDTH_M, VEHICLE_HEIGHT_M = 12.0, 2.55, 4.0
-"""What fits into these, the largest that a bus or lorry may be (Directive 96/53/EC), may be a vehicle, or the trail of
-one that a survey took for a thing: it is listed apart. Several side by side, which lie within reach of each other, are
-no larger thing: each connected piece is asked."""
+"""The largest bus or lorry (Directive 96/53/EC). A change within these limits may be a vehicle, or the trail of one
+that a survey kept, and is listed apart. Each connected piece is measured, so that several vehicles side by side are no
+larger thing."""
 _BORDER_M = 2 * CELL_SIZE * 2**0.5
 """How much wider the cells of a thing may be than itself: a cell's diagonal on either side."""
 KINDS: dict[int, Kind] = {CellState.CHANGED_OCCUPIED: "built", CellState.CHANGED_EMPTY: "demolished"}
@@ -38,7 +38,7 @@ _UNTIL = np.iinfo(np.int64).min
 
 @dataclass(frozen=True, slots=True)
 class Decided:
-    """What one version decided about one tile, and which drives had said so."""
+    """What one version decided about one tile, and the ballots that counted."""
 
     version: int
     states: U8
@@ -46,9 +46,9 @@ class Decided:
     tally: I32
     """(256, 256, 5) in VOTE_UNITs."""
     drives: Sequence[tuple[int, U8]] = ()
-    """(end_ns, (256, 256) states) of every vote that was counted."""
+    """(end_ns, (256, 256) states) of every ballot that counted."""
     odds: Odds = field(default_factory=Odds.none)
-    """How sure those were who voted for a change (fusion/odds.py)."""
+    """Confidence of the votes for a change (fusion/odds.py)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,22 +61,22 @@ class ChangedCells:
     states: U8
     """CHANGED_OCCUPIED or CHANGED_EMPTY."""
     top_m: F64
-    """Highest point that came or went, above ground."""
+    """Highest point that was added or deleted, metres above ground."""
     points: I64
-    """Points that came or went."""
+    """Points that were added or deleted."""
     bottom_m: F64
-    """Lowest point that came or went, above ground."""
+    """Lowest point that was added or deleted, metres above ground."""
     votes: I32
     """Votes for the change in the version that made it; 0 where no decision is known."""
     against: I32
-    """Votes in that version that say something else; undetermined ones say nothing."""
+    """Votes for other states in that version, undetermined ones excepted."""
     first_ns: I64
     """End of the first drive that voted for it; a very large number where none is known."""
     last_ns: I64
     versions: I64
     """The last version that decided this change; 0 where none is known."""
     odds: I8
-    """How sure those were who voted for it in that version; UNSAID where nobody said."""
+    """Confidence of the votes for it in that version; UNSAID where no vote states one."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,10 +95,10 @@ class ChangeObject:
     longest_m: float
     """The longer side of the box around the longest of its connected pieces."""
     width_m: float
-    """Of the widest of its connected pieces, as the narrowest gate that it would fit through."""
+    """Of the widest of its connected pieces: the width of the narrowest gate that it fits through."""
     height_m: float
     volume_m3: float
-    """Of its columns, each from the lowest to the highest voxel that came or went."""
+    """Sum over its columns, each from the lowest to the highest voxel that was added or deleted."""
     points: int
     votes_min: int
     votes_median: float
@@ -116,7 +116,7 @@ class ChangeObject:
 
     @property
     def size(self) -> Size:
-        """How much of a thing it is, for lists that begin with what matters."""
+        """Size class, for lists that begin with the large changes."""
         if self.area_m2 < SMALL_AREA_M2:
             return "small"
         fits = self.height_m <= VEHICLE_HEIGHT_M and self.longest_m <= VEHICLE_LENGTH_M
@@ -124,13 +124,13 @@ class ChangeObject:
 
     @property
     def share_for(self) -> float | None:
-        """Share of the votes that say so, of those that say anything; None where no decision is known."""
+        """Votes for it over all votes on it, undetermined ones excepted; None where no decision is known."""
         total = self.votes_median + self.against_median
         return self.votes_median / total if total else None
 
 
 def changed_cells(before: Tile, after: Tile, decided: Iterable[Decided] = ()) -> ChangedCells:
-    """Which cells of a tile gained points (built) or lost some (demolished); both at once goes by the larger number.
+    """The cells of a tile that gained points (built) or lost some (demolished); of both the larger number decides.
 
     ``decided`` are the decisions on this tile between the two, in ascending order of version.
     """
@@ -145,11 +145,11 @@ def changed_cells(before: Tile, after: Tile, decided: Iterable[Decided] = ()) ->
     built = n_came >= n_went
     states = np.where(built[flat], np.uint8(CellState.CHANGED_OCCUPIED), np.uint8(CellState.CHANGED_EMPTY))
     is_new = np.arange(len(cell)) < len(new)
-    tells = np.concatenate([came, went]) & (built[cell] == is_new)
+    relevant = np.concatenate([came, went]) & (built[cell] == is_new)
     top = np.full(TILE_CELLS**2, -np.inf)
     bottom = np.full(TILE_CELLS**2, np.inf)
-    np.maximum.at(top, cell[tells], z[tells])
-    np.minimum.at(bottom, cell[tells], z[tells])
+    np.maximum.at(top, cell[relevant], z[relevant])
+    np.minimum.at(bottom, cell[relevant], z[relevant])
     ground = np.where(np.isnan(after.ground_z), before.ground_z, after.ground_z).reshape(-1).astype(np.float64)
     ground = np.where(np.isnan(ground), bottom, ground)
     votes, against, first, last, version, odds = _evidence(flat, states, decided)
@@ -220,7 +220,7 @@ def _object(
     rows, cols, versions = cells.rows[mine], cells.cols[mine], cells.versions[mine]
     kind = KINDS[int(cells.states[mine[0]])]
     made_in = sorted({int(v) for v in versions} - {0})
-    told = mine[versions > 0] if made_in else mine  # remnants in cells that stand have no votes
+    voted = mine[versions > 0] if made_in else mine  # remnants in cells that stand have no votes
     seen_first, seen_last = int(cells.first_ns[mine].min()), int(cells.last_ns[mine].max())
     columns = np.maximum(cells.top_m[mine] - cells.bottom_m[mine], 0.0) + CELL_SIZE
     return ChangeObject(
@@ -235,13 +235,13 @@ def _object(
         height_m=float(cells.top_m[mine].max()),
         volume_m3=float(columns.sum() * CELL_SIZE**2),
         points=int(cells.points[mine].sum()),
-        votes_min=int(cells.votes[told].min()),
-        votes_median=float(np.median(cells.votes[told])),
-        against_median=float(np.median(cells.against[told])),
+        votes_min=int(cells.votes[voted].min()),
+        votes_median=float(np.median(cells.votes[voted])),
+        against_median=float(np.median(cells.against[voted])),
         first_seen_ns=None if seen_first == _NEVER else seen_first,
         last_seen_ns=None if seen_last == _UNTIL else seen_last,
         versions=made_in,
-        probability=float(probability[told].mean()) if made_in else None,
+        probability=float(probability[voted].mean()) if made_in else None,
     )
 
 
@@ -255,9 +255,9 @@ def _evidence(flat: I64, states: U8, decided: Iterable[Decided]) -> tuple[I32, I
     last = np.full(len(flat), _UNTIL)
     for decision in decided:
         agrees = decision.states.reshape(-1)[flat] == states
-        told = decision.tally.reshape(TILE_CELLS**2, -1)[flat]
-        counted = told[np.arange(len(flat)), states]
-        others = told[:, : CellState.UNDETERMINED].sum(axis=1) - counted
+        tally = decision.tally.reshape(TILE_CELLS**2, -1)[flat]
+        counted = tally[np.arange(len(flat)), states]
+        others = tally[:, : CellState.UNDETERMINED].sum(axis=1) - counted
         votes = np.where(agrees, counted // VOTE_UNIT, votes)
         against = np.where(agrees, others // VOTE_UNIT, against)
         version = np.where(agrees, decision.version, version)

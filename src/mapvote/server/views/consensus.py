@@ -1,9 +1,8 @@
-"""Does a vehicle contradict the others far more often than they contradict each other?
+"""Whether a vehicle contradicts the others significantly more often than they contradict each other.
 
-Three things make this honest. A cell that looks different before and after a vehicle passed may simply have changed:
-a vote is compared only where others say the same both before it and after it. Neighbouring cells fail together: what
-is counted is objects (8-connected cells), not cells. And few data prove nothing: the test is exact, and "undecidable"
-is one of its answers.
+A vote is compared only where other vehicles agree both before it and after it, as a cell that differs before and after
+a drive may have changed. Objects (8-connected cells) are counted, not cells, as neighbouring cells fail together. The
+test is exact for few data, and "undecidable" is one of its results.
 """
 
 from __future__ import annotations
@@ -41,17 +40,17 @@ class Compared:
 
     vehicle: str
     cells: int
-    """Cells where the others agree, before it and after it, and it says something too."""
+    """Cells where the others agree before and after it, and it votes too."""
     rows: I64
-    """(n,) the cells among them where it says the opposite, on the lattice of the map, by row, then column."""
+    """(n,) the cells among them where it votes the opposite, on the lattice of the map, by row, then column."""
     cols: I64
     occupied: U8
-    """(n,) 1 where the vehicle says occupied, 0 where it says empty."""
+    """(n,) 1 where the vehicle votes occupied, 0 where it votes empty."""
 
 
 @dataclass(frozen=True, slots=True)
 class Contradiction:
-    """One thing that the vehicle sees otherwise than all around it."""
+    """One object that the vehicle sees differently from all others."""
 
     x: float
     """Middle of its cells, map metres."""
@@ -62,7 +61,7 @@ class Contradiction:
 
 @dataclass(frozen=True, slots=True)
 class VehicleStanding:
-    """How a vehicle stands to the consensus, with all that the verdict rests on."""
+    """A vehicle's verdict, with all figures that it follows from."""
 
     vehicle: str
     verdict: Stance
@@ -83,8 +82,8 @@ class VehicleStanding:
 def compare(index: TileIndex, votes: Iterable[Spoken]) -> list[Compared]:
     """Each vehicle's vote on a tile against the others', one entry per vehicle in order of name.
 
-    In a cell the others agree if more of them say one thing (occupied or empty now) than the other, and at least one
-    of these passed before the vehicle and one after it. Undetermined cells and cells without a vote say nothing.
+    In a cell the others agree if more of them vote one way (occupied or empty now) than the other, and at least one
+    of these passed before the vehicle and one after it. Undetermined cells and cells without a vote are left out.
     """
     ordered = sorted(votes, key=lambda vote: (vote.end_ns, vote.vehicle))
     if not ordered:
@@ -128,7 +127,7 @@ def standings_of(
     of all objects is binomial (the exact comparison of two Poisson rates, Przyborowski and Wilenski 1940). It
     "contradicts" if the chance of what was seen is below ``significance`` shared out among the vehicles tested;
     it is "undecidable" if nothing could be compared, or if its rate is above the tolerated one but the data are too
-    few to say so. Objects of fewer than ``min_cells`` cells are the flicker of single cells and not counted.
+    few for significance. Objects of fewer than ``min_cells`` cells are noise and not counted.
     """
     by_vehicle: dict[str, list[Compared]] = {}
     for entry in compared:

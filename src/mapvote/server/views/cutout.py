@@ -1,4 +1,4 @@
-"""One change with its surroundings, before and after, as a page that needs nothing else: to be mailed, or filed."""
+"""Changes with their surroundings, before and after, as one HTML file without any request."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ Box = tuple[float, float, float, float]
 
 @dataclass(frozen=True, slots=True)
 class Cutout:
-    """What stands around a change, what went and what came."""
+    """The points around a change, those deleted and those added."""
 
     name: str
     facts: str
@@ -77,7 +77,7 @@ def cut_out(name: str, facts: str, box: Box, height_m: float, tiles: tuple[Tiles
 
 
 def of_feature(feature: Mapping[str, Any], tiles: tuple[Tiles, Tiles], lattice: Lattice) -> Cutout:
-    """The cutout of a change as :func:`mapvote.server.views.geojson.to_geojson` tells it."""
+    """The cutout of a feature of :func:`mapvote.server.views.geojson.to_geojson`."""
     p = feature["properties"]
     kind = "Built" if p["kind"] == "built" else "Demolished"
     facts = (
@@ -96,7 +96,7 @@ def of_feature(feature: Mapping[str, Any], tiles: tuple[Tiles, Tiles], lattice: 
 
 
 def fragment(cutouts: Sequence[Cutout]) -> str:
-    """HTML to put into a page: the changes, one shown at a time, to be turned by hand. No request to anywhere."""
+    """HTML to insert into a page: a 3D view of the changes, one at a time. It makes no request."""
     viewer = resources.files("mapvote.server.http") / "viewer"
     modules = {name: (viewer / name).read_text() for name in _MODULES}
     data = [
@@ -127,7 +127,7 @@ def whole_page(title: str, cutouts: Sequence[Cutout]) -> str:
 
 
 def _safe(value: Any) -> str:
-    """JSON that no markup in it can end."""
+    """JSON that is safe inside a script element."""
     return json.dumps(value, ensure_ascii=True).replace("<", "\\u003c")
 
 

@@ -1,4 +1,4 @@
-"""The desk: what a publish would change now, what it leaves for lack of evidence, and what reviewers decided."""
+"""The review desk: changes that a publish would make now, deletions beyond the budget, and verdicts."""
 
 from __future__ import annotations
 
@@ -35,16 +35,16 @@ _lock = Lock()
 
 @dataclass(frozen=True, slots=True)
 class Desk:
-    """What lies on the desk at one moment."""
+    """The desk at one moment."""
 
     version: int
     """The newest, on which a publish would build."""
     held: list[str]
-    """Why the policy would hold the version back."""
+    """The policy's reasons to hold the version."""
     pending: dict[str, Any]
-    """Changes that a publish would make, GeoJSON; those that somebody accepted carry the verdict."""
+    """Changes that a publish would make, GeoJSON; accepted ones carry the verdict."""
     waiting: list[dict[str, Any]]
-    """Deletions that it would not make because they are beyond the policy's budget, GeoJSON features."""
+    """Deletions beyond the policy's budget of false deletions, GeoJSON features."""
     reviewed: list[Review]
     """Held and rejected changes, which a publish leaves out."""
     cells: Mapping[str, Mapping[TileIndex, Bool]]
@@ -60,8 +60,8 @@ _desks: WeakKeyDictionary[Round, Desk] = WeakKeyDictionary()
 
 
 def desk(store: Store, executor: Executor | None = None, gate: Gate | None = None) -> Desk:
-    """What a publish would do now, as a list of changes. Nothing is written, and nothing is computed again as long as
-    the round holds."""
+    """The changes that a publish would make now. Nothing is written, and nothing is computed again while the round
+    holds."""
     found = round_at(store, store.clock(), executor=executor, every=True)
     with _lock:
         known = _desks.get(found)
@@ -73,8 +73,8 @@ def desk(store: Store, executor: Executor | None = None, gate: Gate | None = Non
 def _desk_of(store: Store, found: Round) -> Desk:
     version, budget = found.newest.number, found.asked.settings.false_deletions
     tiles = [_before_and_after(store, version, fused) for fused in found.changed]
-    told = {f.index: _decided(f) for f in found.changed}
-    objects = change_objects(changed_cells(old, new, [told[old.index]]) for old, new in tiles)
+    decided = {f.index: _decided(f) for f in found.changed}
+    objects = change_objects(changed_cells(old, new, [decided[old.index]]) for old, new in tiles)
     pending = to_geojson(objects, store.lattice, map_id=store.map_id, from_version=version)
     reviews = standing(store)
     cells = {o.id: _cells_of(o) for o in objects}
@@ -162,10 +162,10 @@ _WAITS = "waits."
 
 
 def waiting_features(store: Store, version: int, fused: Sequence[Fused], budget: float) -> list[dict[str, Any]]:
-    """What would go from a version's tiles but for the ``budget``, as GeoJSON features in map metres.
+    """Deletions from a version's tiles that only the ``budget`` prevents, as GeoJSON features in map metres.
 
-    With "waits", the reason; "false_deletion", the largest of its cells' probabilities that something that stands goes;
-    "drive_by", the middle of its cells.
+    "waits" is the reason, "false_deletion" the largest probability among its cells that something that stands would be
+    deleted, "drive_by" the middle of its cells.
     """
     waits = {one.index: one.pending for one in fused if len(one.pending.cells)}
     tiles = {}
@@ -197,7 +197,7 @@ def _emptied(tile: Tile, waits: Pending) -> Tile:
 
 
 def _likeliest(change: ChangeObject, waits: Mapping[TileIndex, Pending]) -> float:
-    """Of the probabilities of its cells the largest."""
+    """The largest probability of its cells."""
     rows, cols = change.where
     largest = 0.0
     for index, pending in waits.items():

@@ -1,4 +1,4 @@
-"""The log of a store, in order, for listeners: pages, integrators, webhooks. They share one poll of the database."""
+"""The log of a store in order, for its listeners: pages, integrators, webhooks. They share one poll of the database."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from mapvote.server.store.queries import current_number
 from mapvote.server.store.store import Store
 
 OF_THE_MAP = ("import", "publish", "rollback", "replay")
-"""Kinds that concern the map alone: anybody who may read it may know by whom and why."""
+"""Kinds that concern the map alone: actor and reason are open to every reader."""
 OF_VEHICLES = ("ballot", "withdraw")
-"""Kinds that tell the minute of a pass."""
+"""Kinds that reveal the minute of a drive."""
 _MOST = 500
 POLL_S = 0.9
-"""The least time between two polls of the database, however many listeners ask."""
+"""Least time between two polls of the database."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,7 +45,7 @@ def newest_event(store: Store) -> int:
 
 
 def taken_up_to(store: Store, address: str) -> int:
-    """The last event that a listener at this address took; of one that was never heard of, the newest there is."""
+    """The last event that the listener at this address took; of a new listener the newest event."""
     d = schema.deliveries
     with store.database.writing() as connection:
         taken = connection.execute(sa.select(d.c.seq).where(d.c.address == hash_of(address))).scalar_one_or_none()
@@ -56,14 +56,14 @@ def taken_up_to(store: Store, address: str) -> int:
 
 
 def take(store: Store, address: str, seq: int) -> None:
-    """A listener that was heard of took everything up to this event."""
+    """Note that a known listener took all events up to this one."""
     d = schema.deliveries
     with store.database.writing() as connection:
         connection.execute(d.update().where(d.c.address == hash_of(address)).values(seq=seq))
 
 
 def events_after(store: Store, seq: int) -> list[Event]:
-    """The events after ``seq``, oldest first, 500 at most. Writers take turns, so none ever appears in between."""
+    """The events after ``seq``, oldest first, 500 at most. Writing transactions are serial, so none appears later."""
     e = schema.events
     query = sa.select(e.c.seq, e.c.at_ns, e.c.kind, e.c.actor, e.c.detail).where(e.c.seq > seq).order_by(e.c.seq)
     with store.database.reading() as connection:
@@ -81,9 +81,9 @@ def last_events(store: Store, limit: int = 100) -> list[dict[str, Any]]:
 
 
 class Feed:
-    """The latest events of one store, kept for all listeners. For any number of threads.
+    """The latest events of one store, kept for all listeners; thread-safe.
 
-    Of many listeners that call :meth:`after` within ``poll_s`` seconds, the first asks the database.
+    Of the listeners that call :meth:`after` within ``poll_s`` seconds, the first polls the database.
     """
 
     def __init__(self, store: Store, poll_s: float = POLL_S, seconds: Callable[[], float] = time.monotonic) -> None:
@@ -94,8 +94,7 @@ class Feed:
         self._polled_s = -poll_s
 
     def after(self, seq: int) -> list[Event]:
-        """The events after ``seq``, oldest first, at most 500. A listener that is farther behind than the events that
-        are kept reads the log itself."""
+        """The events after ``seq``, oldest first, at most 500. Older events than those kept are read from the log."""
         with self._lock:
             now = self._seconds()
             if self._newest is None:
@@ -112,6 +111,6 @@ class Feed:
 
 
 def without_names(events: Sequence[Event]) -> list[Event]:
-    """For those who may not know which vehicle did what, and when: nothing of ballots, of the rest that it happened."""
-    told = [e for e in events if e.kind not in OF_VEHICLES]
-    return [e if e.kind in OF_THE_MAP else Event(e.seq, e.at_ns, e.kind, "", "", e.version) for e in told]
+    """Events for readers that may not see vehicles' names: none of ballots, others without actor and detail."""
+    shown = [e for e in events if e.kind not in OF_VEHICLES]
+    return [e if e.kind in OF_THE_MAP else Event(e.seq, e.at_ns, e.kind, "", "", e.version) for e in shown]

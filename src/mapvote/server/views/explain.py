@@ -125,11 +125,11 @@ def explain_cell(store: Store, x: float, y: float) -> CellStory:
         decisions = [(record, state) for record, state in found if state != state_name(NO_VOTE)]
         votes = _votes(connection, now, [record for record, _ in decisions[-MOST_RECORDS:]])
     probability = _probability(decisions[-1][0], cell) if decisions else None
-    told = [(record.version, state) for record, state in decisions]
-    return CellStory(row, col, votes, told, probability, _thing(now))
+    by_version = [(record.version, state) for record, state in decisions]
+    return CellStory(row, col, votes, by_version, probability, _thing(now))
 
 
-def as_told(story: CellStory) -> dict[str, Any]:
+def story_as_json(story: CellStory) -> dict[str, Any]:
     """A story as JSON."""
     votes = [asdict(vote) for vote in story.votes]
     for vote in votes:

@@ -61,7 +61,7 @@ def rings_to_lonlat(geometry: dict[str, Any], frame: MapFrame) -> None:
 
 
 def as_csv(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Rows as CSV with a header; lists by spaces. What a spreadsheet would take for a formula gets a quote."""
+    """Rows as CSV with a header; lists joined by spaces. Text that looks like a formula gets a quote."""
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
     names = list(dict.fromkeys(name for row in rows for name in row))
@@ -82,7 +82,7 @@ def _cell(value: Any) -> Any:
 
 
 def _neighbours(change: ChangeObject, objects: Sequence[ChangeObject]) -> list[str]:
-    """What lies near it: ids of other large things whose box is within 15 m, nearest first."""
+    """Ids of other large things whose box is within 15 m, nearest first."""
     near = [(_distance_m(change, o), o.id) for o in objects if o is not change and o.size == "large"]
     return [name for distance, name in sorted(near) if distance <= NEAR_M][:MOST_NEIGHBOURS]
 
@@ -143,7 +143,7 @@ MAP_METRES = "map metres, not the longitude and latitude of RFC 7946"
 
 
 def tile_squares(tiles: Sequence[Mapping[str, Any]], lattice: Lattice) -> dict[str, Any]:
-    """Tiles (each with row and col) as GeoJSON polygons in map metres, everything said of them as properties."""
+    """Tiles (each with row and col) as GeoJSON polygons in map metres, with their values as properties."""
     return _collection([(_square(lattice, tile["row"], tile["col"]), dict(tile)) for tile in tiles])
 
 
@@ -162,9 +162,9 @@ def contradictions(standings: Sequence[VehicleStanding]) -> dict[str, Any]:
 
 
 def standing_rows(standings: Sequence[VehicleStanding]) -> list[dict[str, Any]]:
-    """A row a vehicle, without the places."""
-    told = ("vehicle", "verdict", "cells", "objects", "others_cells", "others_objects", "p_value", "threshold")
-    return [{name: getattr(s, name) for name in told} for s in standings]
+    """A row per vehicle, without the places."""
+    columns = ("vehicle", "verdict", "cells", "objects", "others_cells", "others_objects", "p_value", "threshold")
+    return [{name: getattr(s, name) for name in columns} for s in standings]
 
 
 def _collection(things: Sequence[tuple[dict[str, Any], dict[str, Any]]]) -> dict[str, Any]:

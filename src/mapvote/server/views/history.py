@@ -1,4 +1,4 @@
-"""What happened: changes between versions, coverage, vehicles, events."""
+"""Changes between versions, coverage of tiles, consistency of vehicles."""
 
 from __future__ import annotations
 
@@ -37,8 +37,8 @@ from mapvote.server.views.geojson import to_geojson
 
 
 def seen(stamp_ns: int | None, known: bool) -> int | None:
-    """When a vehicle passed, or, to whom it is not ``known`` which, only on which day: of a road with few vehicles the
-    minute would tell who it was."""
+    """The time of a drive, or only its day for readers that may not know the vehicle (not ``known``): on a road with
+    few vehicles the minute would identify it."""
     return stamp_ns if known or stamp_ns is None else stamp_ns // DAY_NS * DAY_NS
 
 
@@ -78,7 +78,7 @@ def changes_between(
 
 
 def cutouts_between(store: Store, old: int, new: int, found: Mapping[str, Any], most: int = 12) -> list[Cutout]:
-    """The largest things of :func:`changes_between` with what stands around them, before and after."""
+    """The largest things of :func:`changes_between` with their surroundings, before and after."""
     tiles = tiles_at(store, old), tiles_at(store, new)
     large = [f for f in found["features"] if f["properties"]["size"] == "large"] or list(found["features"])
     largest = sorted(large, key=lambda f: -f["properties"]["area_m2"])[:most]
@@ -86,7 +86,7 @@ def cutouts_between(store: Store, old: int, new: int, found: Mapping[str, Any], 
 
 
 def page_between(store: Store, old: int, new: int, found: Mapping[str, Any]) -> str:
-    """HTML of :func:`cutouts_between`, a file that needs nothing else."""
+    """HTML of :func:`cutouts_between`, one file without any request."""
     return whole_page(f"{found['map_id']}: version {old} to {new}", cutouts_between(store, old, new, found))
 
 
@@ -129,7 +129,7 @@ def _drives(standings: Sequence[Standing], sound: Mapping[int, tuple[StoredVote,
 
 
 def coverage(store: Store) -> list[dict[str, Any]]:
-    """Per tile of the map or of a standing ballot: when it was last driven past (ns), by how many vehicles."""
+    """Per tile of the map or of a standing ballot: end of the last drive past it (ns), number of vehicles."""
     b, t = schema.ballots, schema.ballot_tiles
     seen = sa.select(t.c.row, t.c.col, sa.func.max(b.c.end_ns), sa.func.count(sa.distinct(b.c.vehicle)))
     seen = seen.join(b, b.c.seq == t.c.ballot).where(b.c.gone_seq.is_(None)).group_by(t.c.row, t.c.col)
@@ -145,9 +145,9 @@ def coverage(store: Store) -> list[dict[str, Any]]:
 
 
 def vehicle_standings(store: Store) -> list[VehicleStanding]:
-    """How each vehicle stands to what the others say, over every vote inside the window, in order of name.
+    """Each vehicle compared with the others, over every vote inside the window, in order of name.
 
-    What is compared is the world (occupied or empty now), so votes on an older base count here too.
+    The state of the world (occupied or empty now) is compared, so votes on an older base count too.
     """
     with store.database.reading() as connection:
         everybody = Electorate(FOREVER, policy_in(connection), FOREVER)

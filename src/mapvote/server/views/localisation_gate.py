@@ -1,7 +1,7 @@
-"""The localisation gate: a version in which vehicles find themselves worse is not published.
+"""The localisation gate: a version in which vehicles would localise worse is not published.
 
-The judge is a reference drive: scans with rough poses, recorded lately and not among those that voted. Every scan is
-localised in the old map and in the new one, from the same guesses, and the two are compared in pairs.
+It needs a reference drive: scans with rough poses, recorded recently, whose vehicle did not vote. Every scan is
+localised in the old map and in the new one from the same initial guesses, and the results are compared in pairs.
 """
 
 from __future__ import annotations
@@ -30,16 +30,17 @@ from mapvote.server.views.change_objects import changed_cells
 
 Verdict = Literal["pass", "hold", "abstain"]
 REACH_M = 50.0
-"""Scans farther from every change see no difference."""
+"""Scans farther from every change are left out."""
 MOST_SCANS = 60
 """Scans compared at most, spread evenly."""
 MIN_SCANS = 20
 """With fewer scans near a change the gate abstains: the t distribution's bound is then wider than any tolerance."""
 BLOCK_SCANS = 5
-"""Neighbouring scans that count as one observation: at 10 Hz they meet the same surfaces."""
+"""Neighbouring scans that count as one observation: at 10 Hz they see the same surfaces."""
 START_M = 0.3
+"""Distance of the initial guesses from the prior pose."""
 _SCATTER_M = 1.0
-"""Guesses start this far around the prior pose."""
+"""Upper bound of :attr:`Localised.scatter_m`."""
 _START_ANGLES = np.radians([90.0, 210.0, 330.0])
 
 
@@ -52,9 +53,9 @@ class Localised:
     inlier_share: float
     """Its inlier share."""
     scatter_m: float
-    """RMS distance of the poses found from all guesses to their middle: how well the map pins the scan down."""
+    """RMS distance of the poses found from all guesses to their mean: how well the map determines the pose."""
     found: float
-    """1 if the best pose is one that a vehicle would trust, else 0."""
+    """1 if a vehicle would accept the best pose, else 0."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,7 +73,7 @@ class Measure:
 
     @property
     def worse(self) -> bool:
-        """The new map is worse than tolerated, as far as the scans can tell."""
+        """The measured loss is larger than tolerated."""
         return self.gain < -self.tolerance
 
     @property
@@ -89,22 +90,22 @@ class Measure:
 
 @dataclass(frozen=True, slots=True)
 class GateResult:
-    """What the gate says, and why."""
+    """The gate's verdict and its reasons."""
 
     verdict: Verdict
-    """pass: at least as good. hold: worse. abstain: the drive cannot tell."""
+    """pass: at least as good. hold: worse. abstain: undecided by this drive."""
     reasons: tuple[str, ...]
     scans: int
     """Scans in the drive."""
     scans_near: int
-    """Scans taken near what changed: only these see a difference."""
+    """Scans taken near a change."""
     scans_compared: int
     measures: tuple[Measure, ...]
 
 
 def gate_by(ndt: NdtSettings) -> Gate:
-    """Judges by the policy's reference drive; what that cannot tell is let through. MapvoteError if there is no drive
-    where the policy says."""
+    """The gate of the policy's reference drive; an abstention lets the version through. MapvoteError if the drive is
+    missing."""
 
     def reasons(asked: GatePolicy, old: PointMap, new: PointMap) -> Sequence[str]:
         settings = GateSettings.model_validate(asked.model_dump(exclude={"drive"}))
@@ -174,7 +175,8 @@ def localise_in_both(
 
 
 def compare(pairs: Sequence[tuple[Localised, Localised]], settings: GateSettings) -> tuple[Measure, ...]:
-    """Every figure with its gain and how sure it is. Neighbouring scans err alike: the spread is that of blocks."""
+    """Every figure with its gain and uncertainty. Errors of neighbouring scans are correlated: the spread is that of
+    blocks."""
     kinds = (
         ("share of scans localised", "found", 1.0, settings.tolerance_found),
         ("inlier share", "inlier_share", 1.0, settings.tolerance_inlier_share),
@@ -193,7 +195,7 @@ def compare(pairs: Sequence[tuple[Localised, Localised]], settings: GateSettings
 
 
 def pass_or_hold(measures: Sequence[Measure]) -> tuple[Verdict, tuple[str, ...]]:
-    """hold if any figure is worse than tolerated; pass if none can be; abstain where the scans leave it open."""
+    """hold if any figure is worse than tolerated; pass if none can be; else abstain."""
     worse = [str(m) for m in measures if m.worse]
     if worse:
         return "hold", tuple(f"vehicles would localise worse: {text}" for text in worse)

@@ -98,13 +98,13 @@ def _labels(pairs: list[tuple[I64, I64]], n: int) -> I32:
 
 
 SLOT_CELLS = 4
-"""1.2 m: two walls no farther apart are not those of one room."""
+"""1.2 m: two walls of one room are farther apart."""
 WALL_CELLS = 10
-"""3 m: how long a slot is at least."""
+"""3 m: least length of a slot."""
 LEAST_SHARE = 0.2
-"""Of the cells that either side of a cut holds at least: no wall is cut off its building."""
+"""Least share of the cells on either side of a cut: no wall is cut off its building."""
 _MOST_CUTS = 12
-"""One after the other: of a row of buildings each is cut off by itself."""
+"""Of a row of buildings each needs a cut of its own."""
 _DISK = np.hypot(*np.indices((SLOT_CELLS + 1, SLOT_CELLS + 1)) - SLOT_CELLS // 2) <= SLOT_CELLS / 2 + 0.25
 
 
@@ -174,13 +174,13 @@ def _line(cells: F64) -> tuple[F64, F64, float, float]:
 
 
 REACH_M = 1.5
-"""How far from a thing's hull a piece may lie and still be part of it: a gap that occlusion leaves in a wall."""
+"""Largest distance of a piece from the hull of its thing: a gap that occlusion leaves in a wall."""
 PART_SHARE = 1 / 3
 """A piece larger than this share of its neighbour is a thing of its own, unless their hulls overlap: houses stand
-closer to each other than the walls of one house."""
+closer together than the walls of one house."""
 
 TOUCH_CELLS = 1.0
-"""Hulls that overlap no more than that only touch: houses wall to wall."""
+"""Overlap of hulls, cells, up to which they only touch: houses wall to wall."""
 
 
 def group(rows: I64, cols: I64, kinds: I64, pieces: I32, reach_m: float = REACH_M) -> I32:

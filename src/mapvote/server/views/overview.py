@@ -1,4 +1,4 @@
-"""A store at a glance: how much there is of everything, and what happened."""
+"""Figures of a store, and its log."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _LOOKED_AT = 3
 
 
 def overview(store: Store) -> dict[str, Any]:
-    """What `mapvote info` shows of a store or a server."""
+    """The figures of `mapvote info`."""
     b, t = schema.ballots, schema.ballot_tiles
     standing = sa.select(sa.func.count(), sa.func.count(sa.distinct(b.c.vehicle))).where(b.c.gone_seq.is_(None))
     with store.database.reading() as connection:
@@ -49,7 +49,7 @@ def overview(store: Store) -> dict[str, Any]:
 
 
 def _fields(connection: sa.Connection, tiles: Iterable[TileHashes]) -> str:
-    """What points carry besides their place, by some of the tiles that have anything and can be read."""
+    """Names of the point fields, by the first readable tiles that have any."""
     names: dict[str, None] = {}
     for digest in islice((hashes.fields for hashes in tiles if hashes.fields is not None), _LOOKED_AT):
         try:
@@ -62,7 +62,7 @@ def _fields(connection: sa.Connection, tiles: Iterable[TileHashes]) -> str:
 
 
 def log_of(store: Store, last: int) -> dict[str, Any]:
-    """What `mapvote log` shows: versions, oldest first, and the last so many events, newest first."""
-    told = ("number", "parent", "kind", "target", "created_ns", "published_by", "reason")
-    versions = [{name: getattr(version, name) for name in told} for version in store.versions()]
+    """The versions, oldest first, and the ``last`` so many events, newest first."""
+    columns = ("number", "parent", "kind", "target", "created_ns", "published_by", "reason")
+    versions = [{name: getattr(version, name) for name in columns} for version in store.versions()]
     return {"versions": versions, "events": last_events(store, last) if last else []}

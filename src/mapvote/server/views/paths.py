@@ -1,4 +1,4 @@
-"""Where the vehicles drove whose ballots stand: lines on the ground of the newest map."""
+"""Paths of the drives whose ballots stand, as lines on the ground of the newest map."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from mapvote.server.store.store import Store
 from mapvote.server.views.geojson import MAP_METRES, utc
 
 MOST_PATHS = 500
-"""Of the drives that ended last."""
+"""The last drives."""
 
 
 def paths(store: Store, vehicle: str | None = None) -> dict[str, Any]:
-    """GeoJSON lines [x, y, z] in map metres of standing ballots that tell of their path, the newest drive first; of one
-    ``vehicle`` only, if named. A piece of road that the map has no ground for lies as high as the piece before it."""
+    """GeoJSON lines [x, y, z] in map metres of standing ballots that carry a path, the newest drive first; of one
+    ``vehicle`` only, if named. Where the map has no ground height, the last one along the path is used."""
     b, p = schema.ballots.c, schema.paths.c
     query = sa.select(b.vehicle, b.drive, b.start_ns, b.end_ns, b.version, p.path)
     query = query.join(schema.ballots, b.seq == p.ballot).where(b.gone_seq.is_(None))

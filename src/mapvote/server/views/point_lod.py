@@ -57,17 +57,17 @@ class Levels:
     z0_m: float
     z_step_m: float
     bright: U8 | None = None
-    """(n,) the intensity of each, 255 for 1.0; None where nobody knows it."""
+    """(n,) intensity of each point, 255 for 1.0; None if the map has none."""
 
     def part(self, level: int) -> bytes:
-        """One level for the wire, see :func:`cloud_bytes`; behind it the intensity of each point, a byte, if known."""
+        """One level as :func:`cloud_bytes`, then the intensity of each point, a byte, if there is one."""
         some = slice(0 if level == 0 else int(self.ends[level - 1]), int(self.ends[level]))
         bright = b"" if self.bright is None else self.bright[some].tobytes()
         return cloud_bytes(self.packed[some], self.z0_m, self.z_step_m) + bright
 
     @property
     def nbytes(self) -> int:
-        """What it takes in memory."""
+        """Size in memory."""
         return self.packed.nbytes + (0 if self.bright is None else self.bright.nbytes)
 
 
@@ -81,7 +81,9 @@ def make_levels(points: F32, ground_z: F32, most: int | None = None, bright: U8 
     low, high = _heights(points)
     sides = np.ceil(SIDE_M / sizes).astype(np.int64) + 1
     layers = np.minimum(((high - low) / sizes).astype(np.int64) + 1, _MOST_LAYERS)
-    level = _levels(points, low, sizes, sides, layers)  # in the tile's own order: what is near comes soon, and is cheap
+    level = _levels(
+        points, low, sizes, sides, layers
+    )  # in the tile's own order: near points come soon after each other, which the cache likes
     ends = np.cumsum(np.bincount(level, minlength=N_LEVELS))
     room = len(points) if most is None else max(most, int(ends[0]))
     chosen = np.flatnonzero(level <= np.searchsorted(ends, room))
@@ -117,7 +119,7 @@ def cloud_bytes(packed: U16, z0_m: float, z_step_m: float) -> bytes:
 def _levels(points: F32, low: float, sizes: F64, sides: I64, layers: I64) -> U8:
     """(n,) level of each point: the coarsest in whose voxel no point came before.
 
-    Voxels of a level lie whole in those of the coarser one, so that whoever takes a voxel takes all that hold it.
+    Each voxel lies in one voxel of the coarser level, so a point that takes a voxel takes all those around it.
     """
     first = np.zeros(len(sizes) + 1, dtype=np.int64)
     for k in range(len(sizes)):
@@ -158,11 +160,11 @@ def _pack(points: F32, ground_z: F32, elsewhere: float, z0: float, step: float) 
 OVERVIEW_POINTS = 150_000
 """Of an overview at most, 1.2 MB: what a slow connection brings in a second or two."""
 _SPARE = 4
-"""Times the even share of it that is kept of a tile while an overview is made: a map of any size fits in memory."""
+"""While an overview is made, a tile keeps at most this multiple of its even share: a map of any size fits in memory."""
 _AT_ONCE = 2
-"""Tiles of an overview: reading and sorting them leaves the interpreter free, and somebody waits."""
+"""Threads for an overview: reading and sorting release the interpreter."""
 _ANYWHERE = Lattice().tile((0, 0))
-"""Levels count from a tile's corner, wherever that is."""
+"""Coordinates of levels begin at the tile's corner, so the window does not matter."""
 _KEPT_BYTES = 256_000_000
 _HEAD = "<i4,<i4,<i4,<u4,<f4,<f4"
 _OVERVIEW_MAGIC = 0x3143564F
@@ -171,9 +173,9 @@ _NEVER_SEEN = 255
 
 
 class Clouds:
-    """Levels of detail of a store's tiles, made when first asked for and kept, the last used longest; thread-safe.
+    """Levels of detail of a store's tiles, made at the first request and cached (least recently used go); thread-safe.
 
-    A tile's levels follow from its hashes alone, so what is kept never grows stale.
+    A tile's levels follow from its hashes alone, so the cache is never stale.
     """
 
     def __init__(self, store: Store, kept_bytes: int = _KEPT_BYTES) -> None:
@@ -185,8 +187,7 @@ class Clouds:
         self._proposed: Mapping[TileHashes, Tile] = {}
 
     def propose(self, tiles: Iterable[tuple[TileHashes, Tile]]) -> None:
-        """Tiles that no version holds yet, as a publish would make them: :meth:`levels` knows them until the next
-        proposal."""
+        """Tiles of no version yet, as a publish would make them; :meth:`levels` serves them until the next call."""
         self._proposed = {_drawn(hashes): tile for hashes, tile in tiles}
 
     def levels(self, hashes: TileHashes) -> Levels:
@@ -216,7 +217,7 @@ class Clouds:
         any tile has intensity then that of all, a byte each.
         ``stop`` ends the work early, with nothing to show. NotFound if there is no such version.
         """
-        with self._making:  # of many who ask, one makes it
+        with self._making:  # of concurrent requests, one makes it
             if self._overview[0] != version:
                 made = self._coarse(version, stop)
                 if made is None:
@@ -258,7 +259,7 @@ class Clouds:
             return [load_tile(connection, _ANYWHERE, hashes and _drawn(hashes)) for hashes in states]
 
     def _sound(self, *states: TileHashes | None) -> list[Tile]:
-        """The same; none where one is damaged: who asks for the tile itself is told."""
+        """The same; none where one is damaged (a request for the tile itself gets the error)."""
         try:
             return self._load(*states)
         except Unavailable:
@@ -267,7 +268,7 @@ class Clouds:
             return []
 
     def changed(self, old: int, new: int) -> bytes:
-        """What came and went from version ``old`` to ``new``: of each tile that differs int32 row, int32 col, the
+        """Points that differ from version ``old`` to ``new``: of each tile that differs int32 row, int32 col, the
         points that only ``old`` has, then those that only ``new`` has, both as :func:`cloud_bytes`. Damaged tiles are
         left out.
 
@@ -286,8 +287,8 @@ def _drawn(hashes: TileHashes) -> TileHashes:
 
 
 def came_and_went(before: Tile, after: Tile, index: TileIndex | None = None) -> bytes:
-    """What differs between two states of one tile, see :meth:`Clouds.changed`. ``index``: where the tile lies, if it
-    was loaded from anywhere."""
+    """Points that differ between two states of one tile, see :meth:`Clouds.changed`. ``index``: the tile's, if it was
+    loaded without its window."""
     ground = (after if len(after.points) else before).ground_z
     gone, come = ~found_among(before.points, after.points), ~found_among(after.points, before.points)
     clouds = [cloud_bytes(*pack(some, ground)) for some in (before.points[gone], after.points[come])]
@@ -313,10 +314,10 @@ def _overview_bytes(made: Sequence[tuple[TileIndex, Levels]]) -> bytes:
 
 
 def evidence(store: Store, index: TileIndex, vehicle: str | None = None) -> U8:
-    """(256, 256, 4) what standing ballots say of a tile's cells now, of all vehicles or of one.
+    """(256, 256, 4) the standing votes on a tile's cells, of all vehicles or of one.
 
-    Vehicles that determined the cell (255: or more); days since the last drive that did, 254 at most (255: never); how
-    probable it is that the cell changed, in 1/255; and the state that most of them say (NO_VOTE: nobody).
+    Vehicles that determined the cell (255: or more); days since the last drive that did, 254 at most (255: never);
+    probability that the cell changed, in 1/255; the most frequent state (NO_VOTE: no vote).
     """
     with store.database.reading() as connection:
         policy = policy_in(connection)
@@ -355,16 +356,16 @@ def _summary(votes: Sequence[TileVote], last: I64, now_ns: int, quorum: int) -> 
 
 
 def _probability(said: I64, vehicles: Sequence[TileVote], quorum: int) -> F64:
-    """(256, 256) that a cell changed as most vehicles say that say so, of vehicles by state (4, 256, 256); 0 where
-    nobody does."""
+    """(256, 256) probability of each cell's more frequent change. ``said``: vehicles by state (4, 256, 256). 0 where none
+    votes for a change."""
     changes = said[CellState.CHANGED_OCCUPIED : CellState.CHANGED_EMPTY + 1]
     rows, cols = np.nonzero(changes.any(axis=0))
     kinds = changes[:, rows, cols].argmax(axis=0)
     votes = changes[kinds, rows, cols]
     states = (kinds + CellState.CHANGED_OCCUPIED).astype(np.uint8)
     against = said[:, rows, cols].sum(axis=0) - votes
-    out, told = np.zeros(said.shape[1:]), np.full(said.shape[1:], NO_VOTE, dtype=np.uint8)
-    told[rows, cols] = states
-    odds = agreed_odds(vehicles, told, quorum).at(rows * TILE_CELLS + cols)
+    out, claimed = np.zeros(said.shape[1:]), np.full(said.shape[1:], NO_VOTE, dtype=np.uint8)
+    claimed[rows, cols] = states
+    odds = agreed_odds(vehicles, claimed, quorum).at(rows * TILE_CELLS + cols)
     out[rows, cols] = change_probability(states, votes, against, alike_beside(rows, cols, kinds), odds)
     return out
