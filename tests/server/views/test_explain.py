@@ -193,6 +193,13 @@ def test_the_story_of_a_cell_of_many_versions_decides_its_tile_once(
     assert (decided["tile"], len(statements) <= 20) == (1, True), len(statements)
 
 
+def test_where_as_many_vehicles_say_one_thing_as_another_the_page_shows_undetermined(store: Store) -> None:
+    say(store, "a", CellState.CHANGED_EMPTY)
+    assert evidence(store, (0, 0))[WALL][3] == CellState.CHANGED_EMPTY
+    say(store, "b", CellState.UNCHANGED_OCCUPIED)
+    assert evidence(store, (0, 0))[WALL].tolist()[::3] == [2, CellState.UNDETERMINED]
+
+
 TIE, CLEAR = (10, 10), (10, 11)
 
 

@@ -20,7 +20,8 @@ import numpy as np
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Lattice, TileIndex
 from mapvote.core.rows import found_among
 from mapvote.core.tile import Tile, in_bytes
-from mapvote.core.types import F32, F64, I64, NO_VOTE, U8, U16, CellState, MapvoteError
+from mapvote.core.types import F32, F64, I64, N_STATES, NO_VOTE, U8, U16, CellState, MapvoteError
+from mapvote.core.voting import decide_cells
 from mapvote.fusion.odds import agreed_odds, folded
 from mapvote.fusion.probability import alike_beside, change_probability
 from mapvote.fusion.tile_vote import TileVote
@@ -81,9 +82,7 @@ def make_levels(points: F32, ground_z: F32, most: int | None = None, bright: U8 
     low, high = _heights(points)
     sides = np.ceil(SIDE_M / sizes).astype(np.int64) + 1
     layers = np.minimum(((high - low) / sizes).astype(np.int64) + 1, _MOST_LAYERS)
-    level = _levels(
-        points, low, sizes, sides, layers
-    )  # in the tile's own order: near points come soon after each other, which the cache likes
+    level = _levels(points, low, sizes, sides, layers)  # in the tile's own order: neighbours come close together
     ends = np.cumsum(np.bincount(level, minlength=N_LEVELS))
     room = len(points) if most is None else max(most, int(ends[0]))
     chosen = np.flatnonzero(level <= np.searchsorted(ends, room))
@@ -317,7 +316,8 @@ def evidence(store: Store, index: TileIndex, vehicle: str | None = None) -> U8:
     """(256, 256, 4) the standing votes on a tile's cells, of all vehicles or of one.
 
     Vehicles that determined the cell (255: or more); days since the last drive that did, 254 at most (255: never);
-    probability that the cell changed, in 1/255; the most frequent state (NO_VOTE: no vote).
+    probability that the cell changed, in 1/255; the most frequent state (a tie is
+    undetermined; NO_VOTE: no vote).
     """
     with store.database.reading() as connection:
         policy = policy_in(connection)
@@ -341,7 +341,8 @@ def evidence(store: Store, index: TileIndex, vehicle: str | None = None) -> U8:
 
 
 def _summary(votes: Sequence[TileVote], last: I64, now_ns: int, quorum: int) -> U8:
-    said = np.zeros((4, TILE_CELLS, TILE_CELLS), dtype=np.int64)
+    counts = np.zeros((N_STATES, TILE_CELLS**2), dtype=np.int64)
+    said = counts[:4].reshape(4, TILE_CELLS, TILE_CELLS)
     for vote in votes:
         for state in range(4):
             said[state] += vote.states == state
@@ -351,13 +352,13 @@ def _summary(votes: Sequence[TileVote], last: I64, now_ns: int, quorum: int) -> 
     out[..., 0] = np.minimum(total, 255)
     out[..., 1] = np.where(last < 0, _NEVER_SEEN, days)
     out[..., 2] = np.rint(255 * _probability(said, votes, quorum))
-    out[..., 3] = np.where(total > 0, said.argmax(axis=0), NO_VOTE)
+    out[..., 3] = decide_cells(counts, counts, True, 0).reshape(total.shape)
     return out
 
 
 def _probability(said: I64, vehicles: Sequence[TileVote], quorum: int) -> F64:
-    """(256, 256) probability of each cell's more frequent change. ``said``: vehicles by state (4, 256, 256). 0 where none
-    votes for a change."""
+    """(256, 256) probability of each cell's more frequent change. ``said``: vehicles by state (4, 256, 256). 0 where no
+    vehicle votes for a change."""
     changes = said[CellState.CHANGED_OCCUPIED : CellState.CHANGED_EMPTY + 1]
     rows, cols = np.nonzero(changes.any(axis=0))
     kinds = changes[:, rows, cols].argmax(axis=0)
