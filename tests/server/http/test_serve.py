@@ -10,12 +10,14 @@ from pathlib import Path
 
 import httpx2
 import pytest
+from fastapi.testclient import TestClient
 
 from hand_made import Say, make_ballot, states_plane, two_walls
 from live_server import mapvote, serving
 from mapvote.client import MapClient
 from mapvote.codec.ballot import _all_states, encode
 from mapvote.formats import write_map
+from mapvote.server.http.app import create_app
 from mapvote.server.http.serve import settle
 from mapvote.server.store import keys
 from mapvote.server.store.store import Store
@@ -72,23 +74,25 @@ def test_an_open_server_is_for_this_machine_alone(tmp_path: Path, host: str) -> 
     assert "this machine alone" in done.stderr
 
 
-@pytest.mark.slow
 def test_a_key_that_is_issued_later_closes_a_running_server_at_once(tmp_path: Path) -> None:
     """A revoked one leaves it closed: only keys can have been the reason to open it."""
-    Store.create(f"sqlite:///{tmp_path / 's.db'}", two_walls()).close()
+    store = Store.create(f"sqlite:///{tmp_path / 's.db'}", two_walls())
+    elsewhere = Store.open(f"sqlite:///{tmp_path / 's.db'}")
     ballot = encode(make_ballot(two_walls(), {(0, 0): Say(states_plane())}, "a", "d1"))
-    with serving(tmp_path / "s.db", log=tmp_path / "log") as (url, _):
-        assert httpx2.get(f"{url}/v1/map").status_code == 200
+    with TestClient(create_app(store, opened=True), base_url="http://localhost") as client:
+        assert client.get("/v1/map").status_code == 200
         for page in ("/", "/docs"):
-            assert "This server is open" in httpx2.get(url + page).text
-        secret = run("keys", tmp_path / "s.db", "issue", "boss", "--operator").stdout.strip()
-        assert httpx2.put(f"{url}/v1/ballots/a/d1", content=ballot).status_code == 401
-        assert httpx2.get(f"{url}/v1/map").status_code == 401
-        assert httpx2.get(f"{url}/v1/map", headers=with_key(secret)).status_code == 200
+            assert "This server is open" in client.get(page).text
+        secret = keys.issue(elsewhere, "boss", "operator")
+        assert client.put("/v1/ballots/a/d1", content=ballot).status_code == 401
+        assert client.get("/v1/map").status_code == 401
+        assert client.get("/v1/map", headers=with_key(secret)).status_code == 200
         for page in ("/", "/docs"):
-            assert "This server is open" not in httpx2.get(url + page, headers=with_key(secret)).text
-        run("keys", tmp_path / "s.db", "revoke", "boss")
-        assert httpx2.get(f"{url}/v1/map").status_code == 401
+            assert "This server is open" not in client.get(page, headers=with_key(secret)).text
+        keys.revoke(elsewhere, "boss")
+        assert client.get("/v1/map").status_code == 401
+    elsewhere.close()
+    store.close()
 
 
 def test_a_password_on_the_command_line_is_refused_and_not_repeated() -> None:

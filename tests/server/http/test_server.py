@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import httpx2
 import pytest
+from fastapi.testclient import TestClient
 
 from hand_made import Say, make_ballot, states_plane, two_walls
 from live_server import mapvote, serving
@@ -19,6 +20,7 @@ from mapvote.codec.ballot import Ballot, encode
 from mapvote.config import FuseSettings
 from mapvote.core.point_map import PointMap
 from mapvote.core.types import CellState, MapvoteError
+from mapvote.server.http.app import create_app
 from mapvote.server.store import keys
 from mapvote.server.store.admission import accept, examine
 from mapvote.server.store.publish import publish
@@ -147,21 +149,23 @@ def test_tiles_are_immutable_and_cacheable(site: Site) -> None:
 
 
 def test_a_manifest_is_sent_again_only_when_the_map_is_a_new_one(tmp_path: Path) -> None:
-    """Also when another process published it."""
+    """Also when another process publishes it."""
     store = Store.create(f"sqlite:///{tmp_path / 's.db'}", two_walls())
-    with serving(tmp_path / "s.db", log=tmp_path / "log") as (url, _), httpx2.Client(base_url=url) as http:
+    elsewhere = Store.open(f"sqlite:///{tmp_path / 's.db'}")
+    with TestClient(create_app(store, opened=True), base_url="http://localhost") as http:
         first = http.get("/v1/map")
         known = {"If-None-Match": first.headers["etag"]}
         again = http.get("/v1/map", headers=known)
         assert (again.status_code, again.content) == (304, b"")
         assert http.get("/v1/map?since=1", headers=known).json()["tiles"] == {}
         ballots = [says(store.point_map(), vehicle) for vehicle in ("a", "b")]
-        accept(store, [examine(encode(ballot)) for ballot in ballots])
-        assert publish(store, FuseSettings(max_deleted_share=1.0)).version == 2
+        accept(elsewhere, [examine(encode(ballot)) for ballot in ballots])
+        assert publish(elsewhere, FuseSettings(max_deleted_share=1.0)).version == 2
         new = http.get("/v1/map", headers=known)
         assert (new.status_code, new.json()["version"]) == (200, 2)
         assert list(http.get("/v1/map?since=1").json()["tiles"]) == ["0,0"]
         assert http.get("/v1/map/versions/1", headers=known).status_code == 304
+    elsewhere.close()
     store.close()
 
 
