@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
@@ -53,6 +55,17 @@ def runs_of(T: F64) -> list[Run]:
     return [run_of(T, start, start + 31) for start in range(0, len(T) - 31, 31)]
 
 
+def agreement(prior: F64, T: F64, runs: list[Run] | None = None, sigma_m: float = 1.0) -> list[Finding]:
+    """What the doctor says of a prior (n, 4, 4), where scans would show the motion of T."""
+    stamps = np.arange(len(T)) * 100_000_000
+    drive = Drive(
+        Path("d"), "v", "d", SENSORS["hdl32e"], stamps, lambda i: Scan(0, np.zeros((0, 3), np.float32)),
+        prior_sigma_m=sigma_m,
+    )  # fmt: skip
+    chain = partial(run_of, T, 0, len(T))
+    return check_agreement(drive, prior, runs_of(T) if runs is None else runs, ROAD, 0.0, chain)[0]
+
+
 def found_in(T: F64, prior: F64, sigma_m: float = 0.3) -> list[Finding]:
     stamps = np.arange(len(T)) * 100_000_000
     return check_small(prior, run_of(T, 0, len(T)), runs_of(T), None, stamps, sigma_m)
@@ -98,9 +111,7 @@ def test_a_straight_street_along_x_cannot_tell_a_mirrored_track_and_a_bend_can()
         T = along(120.0, curved)
         mirrored = T * np.array([1.0, -1, 1, 1])[None, :, None]
         mirrored[:, :3, :3] = T[:, :3, :3]
-        stamps = np.arange(len(T)) * 100_000_000
-        drive = Drive(Path("d"), "v", "d", SENSORS["hdl32e"], stamps, lambda i: Scan(0, np.zeros((0, 3), np.float32)))
-        found, _ = check_agreement(drive, mirrored, runs_of(T), ROAD, 0.0, partial(run_of, T, 0, len(T)))
+        found = agreement(mirrored, T)
         told = [f.what for f in found]
         assert curved or all(f.severity == "note" for f in found)
         if curved:
@@ -111,15 +122,13 @@ def test_a_straight_street_along_x_cannot_tell_a_mirrored_track_and_a_bend_can()
 
 def test_on_a_straight_street_turned_scans_swapped_axes_and_turned_headings_are_named_together() -> None:
     T = along(120.0)
-    stamps = np.arange(len(T)) * 100_000_000
-    drive = Drive(Path("d"), "v", "d", SENSORS["hdl32e"], stamps, lambda i: Scan(0, np.zeros((0, 3), np.float32)))
     for yaw_deg, name in ((90, "x and y of the scans are swapped"), (180, "in reverse order")):
         turned = [
             Run(run.indices, C @ run.T_first_lidar @ geometry.inverse(C), run.fit)
             for C in (geometry.from_xyz_rpy(0, 0, 0, yaw=np.radians(yaw_deg)),)
             for run in runs_of(T)
         ]
-        (error,) = check_agreement(drive, T, turned, ROAD, 0.0, partial(run_of, T, 0, len(T)))[0]
+        (error,) = agreement(T, T, turned)
         assert error.severity == "error"
         assert f"turned by {yaw_deg} deg about z" in error.what
         assert name in error.what
@@ -135,14 +144,40 @@ def test_a_place_where_a_scan_does_not_fit_those_before_it_is_named() -> None:
     assert any("between scans 57 and 60" in f.what for f in told), told
 
 
-def test_headings_that_are_off_by_any_angle_are_named_on_a_straight_street() -> None:
-    T = along(120.0) @ geometry.from_xyz_rpy(0, 0, 0)
-    stamps = np.arange(len(T)) * 100_000_000
-    drive = Drive(Path("d"), "v", "d", SENSORS["hdl32e"], stamps, lambda i: Scan(0, np.zeros((0, 3), np.float32)))
-    off = straying(T, 0.1) @ geometry.from_xyz_rpy(0, 0, 0, yaw=np.radians(20.0))
-    (error,) = [
-        f
-        for f in check_agreement(drive, off, runs_of(T), ROAD, 0.0, partial(run_of, T, 0, len(T)))[0]
-        if f.severity == "error"
-    ]
-    assert "headings are off by 20" in error.what or "headings are off by 19" in error.what
+def turned(T: F64, yaw_deg: float) -> F64:
+    return np.asarray(T @ geometry.from_xyz_rpy(0, 0, 0, yaw=np.radians(yaw_deg)))
+
+
+@pytest.mark.parametrize(
+    ("change", "names"),
+    [
+        (lambda T: turned(T, 20.0), ["headings are off by (19|20)"]),
+        (lambda T: smaller(T, 1 / 0.3048), ["positions are 3.2[78]"]),
+        (
+            lambda T: turned(smaller(T, 1 / 0.3048), 20.0),
+            ["positions are 3.[234]", "is mended.* off by (19|20|21)"],
+        ),
+        (lambda T: smaller(np.array([geometry.inverse(one) for one in T]), 1000.0), ["millimetres"]),
+    ],
+)
+def test_one_fault_of_a_prior_and_two_at_once_are_named(change: Callable[[F64], F64], names: list[str]) -> None:
+    T = along(120.0, curved=True)
+    errors = [f.what for f in agreement(change(straying(T, 0.1)), T) if f.severity == "error"]
+    for name in names:
+        assert any(re.search(name, what) for what in errors), errors
+
+
+@pytest.mark.parametrize("sigma_m", [0.02, 0.3, 1.0, 3.0])
+@pytest.mark.parametrize("metres", [40.0, 250.0])
+def test_a_prior_that_errs_as_drive_toml_states_is_sound(metres: float, sigma_m: float) -> None:
+    """Errors that last ten seconds; constant for five seconds, then others; and a tilt of a degree throughout."""
+    T = along(metres, curved=True)
+    for seed in range(4):
+        jumping = T.copy()
+        pieces = np.random.default_rng(seed).normal(0, sigma_m, (len(T) // 50 + 1, 3))
+        jumping[:, :3, 3] += pieces[np.arange(len(T)) // 50]
+        tilted = straying(T, sigma_m, seed) @ geometry.from_xyz_rpy(0, 0, 0, roll=0.015, pitch=-0.01)
+        for prior in (straying(T, sigma_m, seed), jumping, tilted):
+            found = agreement(prior, T, sigma_m=sigma_m)
+            assert [f.what for f in found if f.severity == "error"] == []
+            assert prior is jumping or [f.what for f in found if f.severity == "warning"] == []

@@ -37,8 +37,8 @@ _POSITION_M, _ROTATION_RAD = 0.03, np.radians(0.15)
 """Errors of one registration; they weigh positions against rotations."""
 _POINTS_SCALE = 0.002
 """Error of the scale that points show."""
-_WITHIN = 2.0
-"""Errors of the prior, as drive.toml states them: a shift of no more cannot be told from them."""
+_SHIFT_SIGMAS, _TURN_SIGMAS = 3.0, 2.5
+"""Errors of the prior, as drive.toml states them: a shift (of three axes) or a turn of no more may be them."""
 _UNKNOWN_SCALE = 0.01
 """By which the scale errs where points do not show it: it stands where a drive is too short to tell it."""
 _OFFSETS_M = np.arange(-6.0, 6.1, 1.0)
@@ -399,30 +399,30 @@ def _where_not(places: Sequence[Place], good: Sequence[Place]) -> list[Finding]:
 
 def _differs(d: Similarity, places: int, drive: Drive) -> list[Finding]:
     """What the difference between prior and map amounts to, with its error."""
-    parts, grave = [], 0
-    off_m, sigma_m = float(np.linalg.norm(d.offset_m)), drive.prior_sigma_m
+    off_m, sigma_m, sigma_deg = float(np.linalg.norm(d.offset_m)), drive.prior_sigma_m, drive.prior_sigma_deg
     x, y, z = d.offset_m
-    if off_m > max(0.15, _WITHIN * sigma_m, 3.0 * d.sigma_m):
-        parts.append(f"shifted by {off_m:.2f} m (x {x:+.2f}, y {y:+.2f}, z {z:+.2f}; +-{d.sigma_m:.2f})")
-        grave = max(grave, 1 + (off_m > max(0.3, 3.0 * sigma_m)))
-    for name, value, sigma, least in (
-        ("turned about z", d.yaw_deg, d.yaw_sigma_deg, _TURN_DEG),
-        ("tilted", d.tilt_deg, d.tilt_sigma_deg, _TILT_DEG),
-    ):
-        if abs(value) > max(least, 4.0 * sigma):
-            parts.append(f"{name} by {value:.2f} deg (+-{sigma:.2f})")
-            grave = max(grave, 1 + (abs(value) > 2.0 * least))
-    if abs(d.scale - 1.0) > max(_SCALE, 4.0 * d.scale_sigma):
-        parts.append(f"scaled by {d.scale:.4f} (+-{d.scale_sigma:.4f})")
-        grave = 2
+    shift = f"shifted by {off_m:.2f} m (x {x:+.2f}, y {y:+.2f}, z {z:+.2f}; +-{d.sigma_m:.2f})"
+    yaw = f"turned about z by {d.yaw_deg:.2f} deg (+-{d.yaw_sigma_deg:.2f})"
+    tilt = f"tilted by {d.tilt_deg:.2f} deg (+-{d.tilt_sigma_deg:.2f})"
+    scale = f"scaled by {d.scale:.4f} (+-{d.scale_sigma:.4f})"
+    # by how much; what no drive shows; what the prior's stated errors explain; what is an error
+    rows = [
+        (shift, off_m, max(0.15, 3.0 * d.sigma_m), _SHIFT_SIGMAS * sigma_m, max(0.3, 4.0 * sigma_m)),
+        (yaw, abs(d.yaw_deg), max(_TURN_DEG, 4.0 * d.yaw_sigma_deg), _TURN_SIGMAS * sigma_deg, 2.0 * _TURN_DEG),
+        (tilt, d.tilt_deg, max(_TILT_DEG, 4.0 * d.tilt_sigma_deg), _TURN_SIGMAS * sigma_deg, 2.0 * _TILT_DEG),
+        (scale, abs(d.scale - 1.0), max(_SCALE, 4.0 * d.scale_sigma), 0.0, 0.0),
+    ]
+    parts = [words for words, by, least, explained, _ in rows if by > max(least, explained)]
     if not parts:
         what = f"prior and map agree to {off_m:.2f} m and {abs(d.yaw_deg):.2f} deg ({places} places)"
-        if off_m > 0.15:
-            what += f": the map is shifted by x {x:+.2f}, y {y:+.2f}, z {z:+.2f}, within prior_sigma_m {sigma_m:g}"
+        within = [words for words, by, least, explained, _ in rows if min(least, 0.3 * explained) < by <= explained]
+        if within:
+            what += f"; the map is {', '.join(within)}: no more than prior_sigma_m and prior_sigma_deg explain"
         return [Finding("note", what)]
+    grave = any(by > max(least, explained, error) for _, by, least, explained, error in rows)
     what = f"the map is {', '.join(parts)} against the prior, at the middle of the drive ({places} places)"
     mend = "if the map is right, move the prior by that (--mount for a constant one, CRS and origin for the rest)"
-    return [Finding("error" if grave > 1 else "warning", what, mend)]
+    return [Finding("error" if grave else "warning", what, mend)]
 
 
 def _heights(point_map: PointMap, T: F64, drive: Drive) -> list[Finding]:

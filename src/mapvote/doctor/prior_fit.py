@@ -13,166 +13,35 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy
 
-from mapvote.core import geometry
 from mapvote.core.types import F64, I64, Drive
 from mapvote.doctor.finding import Finding, Severity
 from mapvote.doctor.motion import LEAST_FIT, Road, Run
 from mapvote.doctor.prior import AS_IT_IS, READINGS, Reading, drift_angle_deg, scaled
+from mapvote.doctor.prior_numbers import (
+    LEAST,
+    LEVER_M,
+    LIKELY,
+    SURE,
+    Measured,
+    at_times,
+    measure_scale,
+    measure_time,
+    measure_turn,
+    misfits,
+)
 from mapvote.doctor.similarity import fit_similarity
 
-LEVER_M = 10.0
-"""A rotation counts as what it moves at this distance."""
-_TIME_S = 3.0
-"""Shifts in time are looked for so far, and over a quarter of the drive: beyond, little is left to compare."""
 CHAIN_SCANS = 150
 """Of a chain: some 300 m."""
 _POSITION_M, _ROTATION_RAD = 0.15, np.radians(0.25)
 """Errors of a prior's pose against a chain: they weigh positions against rotations."""
 _CHAIN_SCALE, _CHAIN_RAD = 0.003, np.radians(0.15)
 """What the chain itself may err by."""
-_LEAST = {"scale": 0.02, "turn": 2.0, "pitch": 2.0, "time": 0.15}
-"""Share, degrees, degrees, seconds. Less is not complained of: priors err so much by themselves."""
-_SURE, _LIKELY = 4.0, 2.0
-"""Standard errors: what is more than so many is an error, and may be one."""
-_SURE_OF_TIME = 5.0
+_FIRSTS = 6
+"""Readings that are tried as the first of two faults."""
 _HEIGHT_M = (0.8, 4.0)
 """Of a LiDAR over the road."""
 CANNOT_TELL = "this drive cannot tell without a turn whether"
-
-
-@dataclass(frozen=True, slots=True)
-class Measured:
-    """One number, fitted."""
-
-    kind: str
-    """ "scale", "turn", "pitch" or "time"."""
-    value: float
-    """Factor that the prior's positions are too large by; degrees; seconds."""
-    sigma: float
-    poses: Callable[[F64], F64]
-    """The prior mended."""
-
-    @property
-    def off(self) -> tuple[float, float]:
-        """(by how much, its standard error), of a scale as a share."""
-        if self.kind == "scale":
-            return abs(float(np.log(self.value))), self.sigma / self.value
-        return abs(self.value), self.sigma
-
-    @property
-    def least(self) -> float:
-        """What the drive can surely show."""
-        return max(_LEAST[self.kind], (_SURE_OF_TIME if self.kind == "time" else _SURE) * self.off[1])
-
-    @property
-    def words(self) -> tuple[str, str]:
-        """(what, how to mend it)."""
-        if self.kind == "scale":
-            what = f"prior and scans differ in scale: the prior is {self.value:.3f} times as large (+-{self.sigma:.3f})"
-            return what, "compare with a known length: a projection's scale (Mercator), feet, the sensor's calibration"
-        if self.kind == "time":
-            side = "late" if self.value > 0 else "early"
-            return (
-                f"the prior is {abs(self.value):.2f} s {side} (+-{self.sigma:.2f})",
-                "shift its times against the scans",
-            )
-        if self.kind == "pitch":
-            what = f"the scans are pitched by {self.value:.1f} deg (+-{self.sigma:.1f}) against the prior's motion"
-            return what, "level the points, or put the sensor's pitch into T_base_lidar and the prior's rotations"
-        what = f"headings and scans are turned against each other by {self.value:.1f} deg (+-{self.sigma:.1f})"
-        return what, "mend the yaw of T_base_lidar, or of the prior"
-
-
-def residuals(T: F64, runs: Sequence[Run]) -> F64:
-    """(2 * runs, 6) position (m) and rotation (rad) by which the motion told by poses T (n, 4, 4) differs from the one
-    seen, at the middle and at the end of every run, in the frame of its first scan."""
-    out = []
-    for run in runs:
-        for k in (len(run.indices) // 2, len(run.indices) - 1):
-            told, seen = geometry.inverse(T[run.indices[0]]) @ T[run.indices[k]], run.T_first_lidar[k]
-            apart = geometry.inverse(seen) @ told
-            if np.linalg.det(apart[:3, :3]) < 0:
-                out.append(np.array([*apart[:3, 3], np.pi, np.pi, np.pi]))
-            else:
-                out.append(np.concatenate([told[:3, 3] - seen[:3, 3], geometry.log(apart)[3:]]))
-    return np.array(out)
-
-
-def misfits(T: F64, runs: Sequence[Run]) -> F64:
-    """(runs,) metres by which the motion of each run differs, a rotation by what it moves 10 m away."""
-    r = residuals(T, runs)
-    each = np.linalg.norm(r[:, :3], axis=1) + LEVER_M * np.linalg.norm(r[:, 3:], axis=1)
-    return np.asarray(each.reshape(-1, 2).mean(axis=1))
-
-
-def at_times(T: F64, stamps_ns: I64, shift_s: float) -> F64:
-    """The poses (n, 4, 4) told for ``shift_s`` later than each stamp; held at the ends."""
-    seconds = (stamps_ns - stamps_ns[0]) * 1e-9
-    wanted = np.clip(seconds + shift_s, seconds[0], seconds[-1])
-    out = np.tile(np.eye(4), (len(T), 1, 1))
-    rotations = scipy.spatial.transform.Rotation.from_matrix(T[:, :3, :3])
-    out[:, :3, :3] = scipy.spatial.transform.Slerp(seconds, rotations)(wanted).as_matrix()
-    for axis in range(3):
-        out[:, axis, 3] = np.interp(wanted, seconds, T[:, axis, 3])
-    return out
-
-
-def _fit_rule(
-    rule: Callable[[F64], Callable[[F64], F64]], starts: list[F64], T: F64, runs: Sequence[Run]
-) -> tuple[F64, F64]:
-    """(parameters (p,) of ``rule`` that fit the runs best, their standard errors (p,)): robust, from several starts."""
-    weights = np.array([1.0, 1.0, 1.0, LEVER_M, LEVER_M, LEVER_M])
-
-    def off(parameters: F64) -> F64:
-        return np.asarray((residuals(rule(parameters)(T), runs) * weights).ravel())
-
-    costs = [float(np.abs(off(start)).sum()) for start in starts]
-    best = starts[int(np.argmin(costs))]
-    found = scipy.optimize.least_squares(off, best, loss="soft_l1", f_scale=0.3, max_nfev=30)
-    spread = 1.4826 * float(np.median(np.abs(found.fun))) + 0.02
-    # Neighbouring numbers of a run err alike: two of every three are taken to say nothing new.
-    covariance = np.linalg.pinv(found.jac.T @ found.jac) * 3.0 * spread**2
-    return np.asarray(found.x), np.sqrt(np.diag(covariance))
-
-
-def measure_scale(T: F64, runs: Sequence[Run]) -> Measured:
-    """By which factor the prior's positions are too large."""
-    told_m = sum(float(np.linalg.norm(T[r.indices[-1], :3, 3] - T[r.indices[0], :3, 3])) for r in runs)
-    seen_m = sum(float(np.linalg.norm(r.end[:3, 3])) for r in runs)
-    start = np.log(max(seen_m, 1e-3) / max(told_m, 1e-6))
-    x, sigma = _fit_rule(lambda p: scaled(float(np.exp(p[0]))), [np.array([start]), np.zeros(1)], T, runs)
-    factor = float(np.exp(-x[0]))
-    return Measured("scale", factor, factor * float(sigma[0]), scaled(1.0 / factor))
-
-
-def measure_turn(T: F64, runs: Sequence[Run]) -> tuple[Measured, Measured]:
-    """(yaw, pitch) by which the headings told are turned against the scans: degrees, counter-clockwise; nose up.
-
-    Roll hardly shows in a motion; it is left to the road.
-    """
-
-    def rule(p: F64) -> Callable[[F64], F64]:
-        C = geometry.from_xyz_rpy(0, 0, 0, pitch=float(p[1]), yaw=float(p[0]))
-        return lambda T: np.asarray(T @ C)
-
-    starts = [np.array([yaw, 0.0]) for yaw in np.radians(np.arange(-180, 180, 30))]
-    x, sigma = _fit_rule(rule, starts, T, runs)
-    yaw, pitch = np.degrees((x + np.pi) % (2 * np.pi) - np.pi)
-    yaw_sigma, pitch_sigma = np.degrees(sigma)
-    turn = Measured("turn", -float(yaw), float(yaw_sigma), rule(x))
-    return turn, Measured("pitch", float(pitch), float(pitch_sigma), rule(x))
-
-
-def measure_time(T: F64, runs: Sequence[Run], stamps_ns: I64) -> Measured | None:
-    """How much later than the scans the prior's times are; None if no shift that the drive can show fits."""
-    most_s = min(_TIME_S, (stamps_ns[-1] - stamps_ns[0]) * 1e-9 / 4.0)
-
-    def rule(p: F64) -> Callable[[F64], F64]:
-        return lambda T: at_times(T, stamps_ns, float(p[0]))
-
-    starts = [np.array([s]) for s in np.arange(-most_s, most_s + 0.01, min(0.2, most_s))]
-    x, sigma = _fit_rule(rule, starts, T, runs)
-    return None if abs(x[0]) >= most_s else Measured("time", float(x[0]), float(sigma[0]), rule(x))
 
 
 @dataclass(frozen=True, slots=True)
@@ -246,9 +115,9 @@ def check_small(
             whole is not None
             and later is not None
             and later.rms_m < 0.8 * whole.rms_m
-            and shift_m > _SURE * min(prior_sigma_m, later.rms_m)
+            and shift_m > SURE * min(prior_sigma_m, later.rms_m)
         ):
-            return [*found, Finding("error" if abs(time.value) > 2.0 * _LEAST["time"] else "warning", *time.words)]
+            return [*found, Finding("error" if abs(time.value) > 2.0 * LEAST["time"] else "warning", *time.words)]
     if whole is None:
         return [*found, Finding("note", "too few scans fit each other to measure scale and heading", "drive farther")]
     small = [f for m in (whole.scale, whole.turn, whole.pitch) for f in _told(m)]
@@ -272,12 +141,12 @@ def _shows(time: Measured, T: F64, runs: Sequence[Run]) -> bool:
 
 def _told(m: Measured) -> list[Finding]:
     off, sigma = m.off
-    if off <= max(_LEAST[m.kind], _LIKELY * sigma):
+    if off <= max(LEAST[m.kind], LIKELY * sigma):
         return []
     what, mend = m.words
-    if off <= _SURE * sigma:
+    if off <= SURE * sigma:
         return [Finding("note", f"{what}; that may be chance", f"a longer drive tells; else: {mend}")]
-    return [Finding("error" if off > 2.0 * _LEAST[m.kind] else "warning", what, mend)]
+    return [Finding("error" if off > 2.0 * LEAST[m.kind] else "warning", what, mend)]
 
 
 def _not_shown(whole: Whole, time: Measured | None) -> Finding:
@@ -322,13 +191,20 @@ def check_agreement(
     numbers = [measure_scale(T, runs), turn, pitch, *([time] if time is not None else [])]
     wordy = [m for m in numbers if m is not (turn if abs(pitch.value) > abs(turn.value) else pitch)]
     held += [_held(_number_reading(m, T, runs, road), T, runs, special=False) for m in wordy]
-    # What the prior's own errors explain is no reason to call its rotations foreign, or its scale another.
-    held = [h for h in held if h.special or as_it_is.median > _explained_m(drive, h.reading, h.median, length_m)]
-    best = min([as_it_is, *held], key=lambda h: h.median)
+    # What the prior's own errors explain is no reason to read it otherwise.
+    likely = [h for h in held if as_it_is.median > _explained_m(drive, h.reading, h.median, length_m)]
+    best = min([as_it_is, *likely], key=lambda h: h.median)
     floor_m = 0.1 + 0.12 * length_m + 2.0 * min(drive.prior_sigma_m, 1.5)
     if _clearly_better(best, as_it_is, length_m):
         if best.median > floor_m:
-            return [_nothing_fits(as_it_is, runs, length_m, told_m)], T
+            pair = _two_at_once(T, held, runs, road)
+            if pair is None or pair[1].median > floor_m:
+                return [_nothing_fits(as_it_is, runs, length_m, told_m)], T
+            one, other = pair
+            mended = one.reading.poses(T)
+            first = Finding("error", f"two faults at once: {one.reading.name}", one.reading.mend)
+            behind = _named([other], one, other, length_m)
+            return [first, replace(behind, what=f"and once that is mended: {behind.what}")], other.reading.poses(mended)
         group = _like_the_best(best, held, length_m, runs)
         found, T = [_named(group, as_it_is, best, length_m)], best.reading.poses(T)
         right_handed = bool(np.linalg.det(T[0, :3, :3]) > 0)
@@ -345,9 +221,25 @@ def check_agreement(
     return found, T
 
 
+def _two_at_once(T: F64, held: Sequence[_Held], runs: Sequence[Run], road: Road) -> tuple[_Held, _Held] | None:
+    """The two readings, the second of a prior mended by the first, that leave least of the motion unexplained."""
+    best: tuple[_Held, _Held] | None = None
+    for one in sorted(held, key=lambda h: h.median)[:_FIRSTS]:
+        mended = one.reading.poses(T)
+        if one.reading.catch_all or np.linalg.det(mended[0, :3, :3]) < 0:
+            continue
+        others = [_held(reading, mended, runs) for reading in READINGS if not reading.catch_all]
+        for m in (measure_scale(mended, runs), *measure_turn(mended, runs)):
+            others.append(_held(_number_reading(m, mended, runs, road), mended, runs, special=False))
+        other = min(others, key=lambda h: h.median)
+        if best is None or other.median < best[1].median:
+            best = one, other
+    return best
+
+
 def _explained_m(drive: Drive, reading: Reading, left_m: float, length_m: float) -> float:
-    """By how much the prior's own errors may move the ends of a run. Where ``left_m`` remains once a number is mended,
-    they are hardly more than twice that, whatever drive.toml states. A catch-all levels the prior too."""
+    """By how much the prior's own errors may move the ends of a run. Where ``left_m`` remains under a reading, they are
+    hardly more than twice that, whatever drive.toml states. A catch-all levels the prior too."""
     tilt_m = LEVER_M * np.radians(2.0 * drive.prior_sigma_deg) if reading.catch_all else 0.0
     return float(1.5 * min(drive.prior_sigma_m, 2.0 * left_m) + tilt_m + 0.01 * length_m)
 
@@ -458,9 +350,10 @@ def _nothing_fits(as_it_is: _Held, runs: Sequence[Run], length_m: float, told_m:
 
 
 def _places(as_it_is: _Held, runs: Sequence[Run], prior_sigma_m: float) -> list[Finding]:
-    """Where the prior leaves the scans' motion by far more than elsewhere, and by more than it is said to err."""
+    """Where the prior leaves the scans' motion by far more than elsewhere; a note where it is said to err so much: two
+    errors of it may differ by three standard errors."""
     usual = as_it_is.median
-    bad = np.flatnonzero(as_it_is.misfit > max(4.0 * usual + 1.0, 2.0 * prior_sigma_m))
+    bad = np.flatnonzero(as_it_is.misfit > 4.0 * usual + 1.0)
     if not len(bad):
         return []
     run, most_m = runs[int(bad[np.argmax(as_it_is.misfit[bad])])], float(as_it_is.misfit[bad].max())
@@ -468,13 +361,15 @@ def _places(as_it_is: _Held, runs: Sequence[Run], prior_sigma_m: float) -> list[
         f"between scans {run.indices[0]} and {run.indices[-1]} the prior is {most_m:.1f} m off the scans' motion, "
         f"elsewhere {usual:.1f} m ({len(bad)} of {len(runs)} places)"
     )
-    grave: Severity = "error" if most_m > max(5.0, 4.0 * prior_sigma_m) else "warning"
+    grave: Severity = "note" if most_m <= 3.0 * prior_sigma_m else "warning"
+    if most_m > max(5.0, 4.0 * prior_sigma_m):
+        grave = "error"
     return [Finding(grave, what, "a jump, or rows that belong to other scans: mend or leave out that part")]
 
 
 def _scatter(drive: Drive, as_it_is: _Held, length_m: float) -> list[Finding]:
     expected = 1.5 * drive.prior_sigma_m + LEVER_M * np.radians(2.0 * drive.prior_sigma_deg) + 0.01 * length_m
-    if as_it_is.median < 0.8 * expected:
+    if as_it_is.median < expected:
         return []
     what = (
         f"the prior is off the scans' motion by {as_it_is.median:.1f} m over {length_m:.0f} m, but prior_sigma_m says "
