@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -148,6 +149,7 @@ def vote(
     from mapvote.cli.diff import ballot_of_cloud
     from mapvote.codec.ballot import encode
     from mapvote.config import choose_case, load_settings
+    from mapvote.core.point_map import has_open_ground
     from mapvote.core.types import MapvoteError
     from mapvote.formats import is_cloud, open_drive
     from mapvote.formats.atomic import whole_file
@@ -163,6 +165,13 @@ def vote(
         with waiting(f"reading {where}"):
             wanted = None if region is None else region_in(region)
             point_map = open_map.enter_context(map_at(where, key_file, region=wanted, or_kept=True))
+        if not has_open_ground(point_map):
+            print(
+                "warning: the map has no ground: that a thing stands can be told, but heights above the ground are "
+                "guessed from the feet of walls, and on open ground nothing can be voted; build or import the map with "
+                "its ground",
+                file=sys.stderr,
+            )
         if is_cloud(drive_path):
             ballot, report = ballot_of_cloud(drive_path, point_map, settings, vehicle, trajectory), None
         else:

@@ -20,7 +20,7 @@ from mapvote.comparison.patches import SIDE_M
 from mapvote.comparison.register import Registered
 from mapvote.core.geometry import transform
 from mapvote.core.grid import CELL_SIZE, Grid
-from mapvote.core.point_map import PointMap, all_points
+from mapvote.core.point_map import PointMap, all_points, has_open_ground
 from mapvote.core.reference import above_ground_points, reference_window
 from mapvote.core.types import F32, F64, I32, I64, U64, Bool, MapvoteError
 from mapvote.server.views.outlines import Ring, group, pieces, rings
@@ -31,8 +31,6 @@ BAND = np.uint64(0b1_1111_1100)
 REACH_CELLS = 2
 GROUND_APART_M = 0.4
 """Grounds that lie farther apart are not one ground: a roof, a car's floor, a second level."""
-_OPEN = 0.2
-"""Of the foreign campus map 12 % of the cells look like open ground, of clouds with ground 49 % and more."""
 _EXPLAINED_M = 0.45
 """A point so near to the other cloud under the motion of a bent patch is explained by the bend."""
 _VOXELS, _VOXELS_A_CELL, _VOXELS_ENOUGH = 4, 2, 80
@@ -85,12 +83,6 @@ class CloudPlanes:
     free: U64
     """Column words known to be free; 0 where the map knows of none."""
 
-    @property
-    def has_ground(self) -> bool:
-        """Whether ground lies open, in _OPEN of the cells with any point: of a map whose ground was cut out, the feet
-        of walls are taken for ground, but hardly anything else."""
-        return bool((self.own_ground & ~self.stands).sum() > _OPEN * (self.own_ground | self.stands).sum())
-
 
 @dataclass(frozen=True, slots=True)
 class CellComparison:
@@ -141,8 +133,8 @@ def compare_cells(map_a: PointMap, map_b: PointMap, registered: Registered | Non
     """
     window = reduce(Grid.union, (map_a.lattice.tile(tile) for tile in sorted({*map_a.tiles, *map_b.tiles})))
     a, b = planes_of(map_a, window), planes_of(map_b, window)
-    for name, planes in (("A", a), ("B", b)):
-        if not planes.has_ground:
+    for name, one in (("A", map_a), ("B", map_b)):
+        if not has_open_ground(one):
             raise MapvoteError(
                 f"{name} has no ground: nothing tells where it looked, so whether a thing is gone, new or not seen "
                 "cannot be decided by geometry alone"

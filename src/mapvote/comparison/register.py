@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mapvote.comparison.coarse_search import place_without_prior
 from mapvote.comparison.patches import (
     SIDE_M,
     Patches,
@@ -18,9 +17,8 @@ from mapvote.comparison.patches import (
     unbent,
 )
 from mapvote.core.types import F64, Bool, MapvoteError
+from mapvote.localisation.coarse_search import LEAST_LEAD, place_without_prior
 
-_LEAST_LEAD = 0.1
-"""A place whose score is not ahead of every other by such a share of it is ambiguous."""
 _LEAST_FITTING = 0.25
 """Share of the compared patches that must agree on one motion: fewer are chance."""
 _MOST_LEFT = 0.1
@@ -112,7 +110,7 @@ def register_clouds(points_a: F64, points_b: F64, *, unbend: bool = False) -> Re
     ambiguous or nothing fits.
     """
     placed = place_without_prior(points_a, points_b)
-    if placed.lead < _LEAST_LEAD:
+    if placed.lead < LEAST_LEAD:
         raise MapvoteError(
             f"the clouds fit at several places: the best one scores {placed.score:.2f}, the next one only "
             f"{placed.lead:.0%} less; are they of one place, and do they overlap by more than a street of equal houses?"

@@ -147,6 +147,23 @@ def check_extent(points: F64, before: int = 0) -> None:
         )
 
 
+_OPEN = 0.2
+"""Of a foreign campus map without ground 12 % of the cells look like open ground, of clouds with it 49 % and more."""
+
+
+def has_open_ground(point_map: PointMap) -> bool:
+    """Whether a fifth of the cells that hold points hold ground and nothing that stands on it. Of a map whose ground
+    was cut out, the feet of walls are taken for ground, but hardly anything else is."""
+    ground, any_point = 0, 0
+    for tile in point_map.tiles.values():
+        held, stands = (np.zeros(tile.window.rows * tile.window.cols, dtype=np.bool_) for _ in range(2))
+        held[tile.cells] = True
+        stands[tile.cells[tile.columns[1]]] = True
+        any_point += int(held.sum())
+        ground += int((held & ~stands & np.isfinite(tile.ground_z.reshape(-1))).sum())
+    return ground > _OPEN * any_point
+
+
 def all_points(point_map: PointMap) -> F64:
     """Every point (n, 3) of a map in map metres, tile by tile in ascending order."""
     clouds = [point_map.tiles[tile].points_map for tile in sorted(point_map.tiles)]

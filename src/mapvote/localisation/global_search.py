@@ -15,8 +15,9 @@ import numpy as np
 
 from mapvote.config import NdtSettings
 from mapvote.core.geometry import inverse
-from mapvote.core.point_map import PointMap
+from mapvote.core.point_map import PointMap, all_points, has_open_ground
 from mapvote.core.types import F64, U32, Scan
+from mapvote.localisation.coarse_search import LEAST_LEAD, place_without_prior
 from mapvote.localisation.correlation import (
     CELL_M,
     HIGH_M,
@@ -44,6 +45,8 @@ _YAWS = 120
 _SPREAD_M, _SPREAD_RAD = 3.0, np.radians(15.0)
 """Peaks nearer to each other than this are one."""
 _PEAKS, _REFINED, _JUDGED = 60, 12, 3
+_LEAST_SCORE = 0.4
+"""Mean likelihood of what stands in a scan, of a map without ground."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,11 +75,26 @@ class GlobalSearch:
         return other
 
     @cached_property
+    def _has_ground(self) -> bool:
+        return has_open_ground(self.point_map)
+
+    @cached_property
+    def _points(self) -> F64:
+        return all_points(self.point_map)
+
+    @cached_property
     def _layout(self) -> CoarseMap:
         return laid_out(self.point_map)
 
     def __call__(self, scan: Scan) -> F64 | None:
-        """The pose (4, 4) of the scan, or None if no place holds or another fits as well."""
+        """The pose (4, 4) of the scan, or None if no place holds or another fits as well.
+
+        In a map without ground nobody knows where one could drive, nor heights above it: there every shift and yaw of
+        the scan is tried (localisation/coarse_search.py), which takes some seconds for each square kilometre.
+        """
+        if not self._has_ground:
+            placed = place_without_prior(self._points, scan.points.astype(np.float64))
+            return placed.T_a_b if placed.lead >= LEAST_LEAD and placed.score >= _LEAST_SCORE else None
         found = self.find(scan)
         if found is None or found.fit < MIN_FIT or found.lead < MIN_LEAD:
             return None

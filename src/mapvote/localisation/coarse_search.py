@@ -30,6 +30,8 @@ _SAMPLE = 4000
 _DZ_M = 0.25
 _HEIGHTS = (0.0, -1.5, 1.5)
 """Beside the likeliest difference in height these are tried: walls alone tell it to a metre or two."""
+LEAST_LEAD = 0.1
+"""A place whose score is not ahead of every other by such a share of it is ambiguous."""
 WINDOW_M = 90.0
 """How far from the middle of what overlaps points are compared, metres."""
 
