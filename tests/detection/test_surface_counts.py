@@ -1,4 +1,4 @@
-"""What a scan adds to the evidence of each voxel: crossed, met, passed by, held against a reference bit by bit."""
+"""What a scan adds to the evidence of each voxel: hit, passed, held against a reference bit by bit."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from mapvote.core.point_map import PointMap
 from mapvote.core.reference import reference_window
 from mapvote.core.types import F64
 from mapvote.detection.evidence import (
-    CROSSED,
     HIT,
     PASSED,
     PASSES,
     PLANES,
     WORDS,
-    SurfaceEvidence,
+    Evidence,
     count_of,
+    free_words,
     near_hits,
+    times_crossed,
 )
-from mapvote.detection.surface_rules import times_crossed
 from mapvote.perception.frontend import Observation
 from mapvote.perception.raycast import ScanView
 
@@ -49,18 +49,15 @@ def seen_from(point_map: PointMap, points: F64, seed: int) -> Observation:
     return seen
 
 
-def told_of(seen: Observation, r: int, c: int, bit: int) -> tuple[bool, bool, bool, bool]:
-    """(crossed, met, passes, passed) of one voxel, by the words of docs/method.md."""
+def told_of(seen: Observation, r: int, c: int, bit: int) -> tuple[bool, bool, bool]:
+    """(hit, passes, passed) of one voxel, by the words of detection/evidence.py."""
 
-    def has(plane: np.ndarray, k: int = bit) -> bool:
-        return bool(int(plane[r, c]) >> k & 1)
+    def has(plane: np.ndarray) -> bool:
+        return bool(int(plane[r, c]) >> bit & 1)
 
-    passed, (near, apart), mapped = seen.view.passed, near_hits(seen), seen.reference.occupied
-    above = bit + 1 >= TOP_BIT or has(passed, bit + 1)
-    below = bit <= 1 or has(passed, bit - 1)
-    crossed = has(passed) and above and below and not has(near)
-    met = has(near) if has(mapped) else has(apart)
-    return crossed, met, has(passed) and not has(near), has(passed)
+    passed, (near, apart) = seen.view.passed, near_hits(seen)
+    hit = has(near) if has(seen.reference.occupied) else has(apart)
+    return hit, has(passed) and not has(near), has(passed)
 
 
 @given(
@@ -71,13 +68,13 @@ def told_of(seen: Observation, r: int, c: int, bit: int) -> tuple[bool, bool, bo
 def test_a_voxel_counts_what_one_scan_tells_of_it(offsets: list[tuple[float, float, float]], seed: int) -> None:
     point_map = street()
     seen = seen_from(point_map, np.array(offsets), seed)
-    evidence = SurfaceEvidence(point_map.lattice)
+    evidence = Evidence(point_map.lattice)
     evidence.count(seen)
     for r in ROWS:
         for c in COLS:
             cell = evidence.tiles[0, 0][r, c]
             for bit in range(1, TOP_BIT):
-                counted = [bool(count_of(cell, first, bit)) for first in (CROSSED, HIT, PASSES)]
+                counted = [bool(count_of(cell, first, bit)) for first in (HIT, PASSES)]
                 assert (*counted, bool(int(cell[PASSED]) >> bit & 1)) == told_of(seen, r, c, bit)
 
 
@@ -90,7 +87,7 @@ def test_a_window_across_tiles_counts_each_cell_where_it_lies() -> None:
     for (row, col), bit in places.items():
         passed[row + 5, col - 7] = np.uint64(1 << bit)
     view = ScanView(window, none.astype(np.int32), none, passed, np.zeros((0, 0), np.uint8))
-    evidence = SurfaceEvidence(point_map.lattice)
+    evidence = Evidence(point_map.lattice)
     evidence.count(replace(seen, view=view, reference=replace(here, ground_z=ground_z)))
     for (row, col), bit in places.items():
         planes = evidence.tiles[row // TILE_CELLS, 0]
@@ -100,42 +97,54 @@ def test_a_window_across_tiles_counts_each_cell_where_it_lies() -> None:
 
 def test_a_cell_in_which_a_count_is_full_is_halved_as_a_whole_and_its_ratios_stay() -> None:
     point_map = street()
-    evidence = SurfaceEvidence(point_map.lattice)
+    evidence = Evidence(point_map.lattice)
     hit = np.array([[102.5 * 0.3, 102.5 * 0.3, 1.05]])  # where nothing is mapped
     empty = np.array([[104.5 * 0.3, 104.5 * 0.3, 1.05]])
     for scan in range(FULL + 1):
-        seen = one_scan(point_map, hit if scan % 4 == 0 else empty)
-        if scan % 2:
-            seen.view.passed[102, 102] &= ~np.uint64(1 << 4)  # what is above the hit is not passed then
-        evidence.count(seen)
+        evidence.count(one_scan(point_map, hit if scan % 4 == 0 else empty))
     cell = evidence.tiles[0, 0][102, 102]
     assert count_of(cell, PASSES, 10) == FULL // 2 + 1, "full after 127, so 63 and the last one"
     assert count_of(cell, HIT, 3) == 32 // 2
-    assert count_of(cell, CROSSED, 3) == 32 // 2, "of four scans one hit it, one crossed it, and two passed it only"
     assert count_of(cell, PASSES, 3) == 96 // 2
     assert cell[PASSED] == ~np.uint64(0), "what rays ever passed is no count"
 
 
-def cell_with(bit: int, crossed: int, passes: tuple[int, int, int]) -> np.ndarray:
-    """(WORDS,) of a cell: how often its voxel ``bit`` was crossed; ``passes`` of that below, of it, of that above."""
+def cell_with(bit: int, passes: tuple[int, int, int]) -> np.ndarray:
+    """(WORDS,) of a cell: ``passes`` of the voxel below ``bit``, of it, of the one above."""
     cell = np.zeros(WORDS, np.uint64)
     for k in range(PLANES):
-        cell[CROSSED + k] |= np.uint64((crossed >> k & 1) << bit)
         for beside, often in zip((-1, 0, 1), passes, strict=True):
             if 0 <= bit + beside < TOP_BIT:
                 cell[PASSES + k] |= np.uint64((often >> k & 1) << bit + beside)
     return cell
 
 
-@given(st.integers(1, TOP_BIT - 1), st.integers(0, FULL), st.tuples(*[st.integers(0, FULL)] * 3), st.integers(1, 4))
-def test_rays_of_all_scans_together_cross_a_voxel_by_what_they_passed_least_of_three(
-    bit: int, crossed: int, passes: tuple[int, int, int], every: int
-) -> None:
+@given(st.integers(1, TOP_BIT - 1), st.tuples(*[st.integers(0, FULL)] * 3))
+def test_a_voxel_was_crossed_as_often_as_the_least_passed_of_three(bit: int, passes: tuple[int, int, int]) -> None:
     below, own, above = passes
     asked = [own] + [below] * (bit > 1) + [above] * (bit + 1 < TOP_BIT)
-    assert times_crossed(cell_with(bit, crossed, passes), bit, every) == max(crossed, min(asked) // every)
+    assert times_crossed(cell_with(bit, passes), bit) == min(asked)
 
 
 def test_rays_that_only_graze_a_roof_never_cross_it_whatever_their_number() -> None:
-    assert times_crossed(cell_with(7, 0, (0, FULL, FULL)), 7, 2) == 0
-    assert times_crossed(cell_with(7, 0, (FULL, FULL, 0)), 7, 2) == 0
+    assert times_crossed(cell_with(7, (0, FULL, FULL)), 7) == 0
+    assert times_crossed(cell_with(7, (FULL, FULL, 0)), 7) == 0
+
+
+def test_free_is_what_two_scans_passed_none_hit_and_the_map_does_not_hold() -> None:
+    planes = np.zeros((3, 1, WORDS), np.uint64)
+    planes[2, 0, PASSES + 1] = 0b1110  # passed by two scans
+    planes[2, 0, PASSES] = 0b10000  # by one
+    planes[2, 0, HIT] = 0b0100
+    occupied = np.zeros((3, 1), np.uint64)
+    occupied[2] = 0b1000
+    assert free_words(planes, occupied).tolist() == [[0], [0], [0b0010]]
+
+
+def test_cells_of_unknown_ground_gather_nothing() -> None:
+    point_map = street()
+    seen = one_scan(point_map, np.array([[30.7, 30.7, 1.05]]))
+    unknown = replace(seen.reference, ground_z=np.full_like(seen.reference.ground_z, np.nan))
+    evidence = Evidence(point_map.lattice)
+    evidence.count(replace(seen, reference=unknown))
+    assert not any(planes.any() for planes in evidence.tiles.values())

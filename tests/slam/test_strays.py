@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from mapvote.core.grid import Lattice
 from mapvote.core.types import F64
 from mapvote.core.voxels import VoxelCloud, thin, voxel_downsample
-from mapvote.slam.clean_map import MET_SHARE, NEAR_M, strays
+from mapvote.slam.clean_map import LARGEST_SPECK, MET_SHARE, NEAR_M, SEEN_THROUGH, seen_through, specks, strays
 
 LATTICE = Lattice()
 
@@ -86,3 +88,45 @@ def test_two_walls_a_hand_apart_stay_two() -> None:
 
 def test_no_points_are_no_strays() -> None:
     assert strays(np.zeros((0, 3)), np.zeros(0, np.int32), road(60), LATTICE).shape == (0,)
+
+
+def row_of(n: int, at: int = 0) -> F64:
+    """(n, 3) a point in each of ``n`` voxels that touch."""
+    return np.column_stack([np.arange(n) * 0.3 + 0.1, np.full(n, at * 0.3 + 0.1), np.full(n, 2.1)])
+
+
+def test_a_few_voxels_that_one_scan_hit_and_that_touch_nothing_are_a_speck_and_more_are_a_thing() -> None:
+    points = np.concatenate([row_of(LARGEST_SPECK), row_of(LARGEST_SPECK + 1, at=9)])
+    once = np.ones(len(points), np.int32)
+    assert specks(points, once, LATTICE).tolist() == [True] * LARGEST_SPECK + [False] * (LARGEST_SPECK + 1)
+
+
+def test_a_wire_a_sign_or_a_pole_that_two_scans_hit_is_no_speck_nor_is_what_touches_it() -> None:
+    points = row_of(3)
+    assert not specks(points, np.array([1, 2, 1], np.int32), LATTICE).any()
+    assert specks(points, np.array([1, 1, 1], np.int32), LATTICE).all()
+    two_in_one_voxel = np.concatenate([points, points[:1] + 0.01])
+    assert not specks(two_in_one_voxel, np.ones(4, np.int32), LATTICE).any()
+
+
+@given(st.lists(st.tuples(*[st.integers(-3, 3)] * 3), unique=True, max_size=25), st.data())
+@settings(max_examples=60, deadline=None)
+def test_specks_are_the_small_groups_of_touching_voxels_that_were_hit_once_each(
+    voxels: list[tuple[int, int, int]], data: st.DataObject
+) -> None:
+    times = data.draw(st.lists(st.integers(1, 2), min_size=len(voxels), max_size=len(voxels)))
+    left, expected = set(range(len(voxels))), np.zeros(len(voxels), np.bool_)
+    while left:
+        group, ring = set[int](), {left.pop()}
+        while ring:
+            group |= ring
+            ring = {j for j in left if any(np.abs(np.subtract(voxels[i], voxels[j])).max() <= 1 for i in ring)}
+            left -= ring
+        expected[list(group)] = len(group) <= LARGEST_SPECK and all(times[i] == 1 for i in group)
+    points = 0.3 * (np.array(voxels, dtype=np.float64).reshape(-1, 3) + 0.5)
+    np.testing.assert_array_equal(specks(points, np.array(times, np.int32), LATTICE), expected)
+
+
+def test_a_voxel_that_rays_crossed_often_and_few_scans_hit_was_a_trail() -> None:
+    hit_passed_crossed = np.array([[1, 9, SEEN_THROUGH], [0, 9, SEEN_THROUGH - 1], [9, 9, 9], [2, 40, 0]])
+    assert seen_through(hit_passed_crossed).tolist() == [True, False, False, False]

@@ -18,7 +18,7 @@ for _threads in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     # time. Work is spread over vehicles and tiles instead. Whoever sets a number keeps it.
     os.environ.setdefault(_threads, "1")
 
-from mapvote.cli import diff, files, follow, inspect, live, server, setup, store, update, vehicle  # noqa: E402
+from mapvote.cli import coverage, diff, files, follow, inspect, live, server, setup, store, update, vehicle  # noqa: E402
 from mapvote.cli.terminal import complain  # noqa: E402
 from mapvote.core.types import MapvoteError  # noqa: E402
 
@@ -31,7 +31,7 @@ app = typer.Typer(
     rich_markup_mode="markdown",
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-for verbs in (vehicle, live, diff, files, update, server, store, follow, inspect, setup):
+for verbs in (vehicle, live, diff, files, update, server, store, coverage, follow, inspect, setup):
     verbs.register(app)
 for other_package in entry_points(group="mapvote.verbs"):
     # The laboratory (demo, simulate, evaluate) adds its verbs here; this package does not know of it.

@@ -85,7 +85,7 @@ def _deepest_m(points: F32) -> F64:
 
 def log_odds(states: U8, looked: F64, depth_m: F64) -> F64:
     """(n,) nats that cells called ``states`` (n,), CHANGED_OCCUPIED or CHANGED_EMPTY, did change, by what was
-    looked at (n, k) (detection/surface_looks.py) and how deep in them their surface lies (n,)."""
+    looked at (n, k) (:func:`looks`) and how deep in them their surface lies (n,)."""
     curve = np.where((states == CellState.CHANGED_OCCUPIED)[:, None], _BUILT, _DEMOLISHED)
     told = np.column_stack([np.ones(len(states)), looked, depth_m])
     return np.asarray((curve * told).sum(axis=1))

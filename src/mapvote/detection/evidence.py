@@ -1,13 +1,14 @@
-"""The evidence of a drive: in how many scans each voxel was hit, crossed and passed.
+"""The evidence of a drive, of a vehicle's and of a survey's alike: in how many scans each voxel was hit and passed.
 
 A return speaks for the surfaces within its own error, HIT_REACH_M, in whichever voxel they lie, and for nothing beside
 them: a wall half a metre from where one stood is another wall. In one scan
 
 * a mapped voxel is *hit* if a return lies within HIT_REACH_M of it; any other voxel if a return lies in it that has no
   mapped voxel so near, because what the map explains is nothing new beside it;
-* a voxel is *passed* if a ray goes through it and no return lies within HIT_REACH_M of it;
-* a voxel is *crossed* if it is passed, and rays pass the voxels above and below it too. A ray that grazes a slab (roof,
-  awning, ceiling) passes only one of the two. The ground bounds the lowest voxel, the end of the word the highest.
+* a voxel is *passed* if a ray goes through it and no return lies within HIT_REACH_M of it.
+
+Over the drive a voxel is *crossed* as often as the least passed of three was: it, the one above and the one below
+(:func:`times_crossed`). A ray that grazes a slab (roof, awning, ceiling) passes only one of the two.
 
 Each count is kept as PLANES bit planes: plane k of a cell is a 64-bit word with bit k of the counts of the cell's 64
 voxels, so that one scan is added to a whole column with a few word operations. Returns of moving objects count for
@@ -19,29 +20,23 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from mapvote.core.columns import TOP_BIT, layer_bit, neighbourhood
+from mapvote.core.columns import TOP_BIT, layer_bit
 from mapvote.core.grid import CELL_SIZE, Lattice
-from mapvote.core.types import F32, F64, I32, U64, Bool, Reference
+from mapvote.core.types import F32, F64, I32, U64, Bool
 from mapvote.detection.packed_tiles import Overlap, PackedTiles
 from mapvote.perception.frontend import Observation
-from mapvote.perception.raycast import ScanView, find_obstacles
+from mapvote.perception.raycast import find_obstacles
 
 HIT_REACH_M = 0.1
 """Range noise and pose sigma together, three times over (docs/decisions/evidence.md has what other reaches do)."""
 PLANES = 7
 """Counts up to 127 scans. A cell that would exceed them is halved as a whole, which keeps its ratios."""
-CROSSED, HIT, PASSES = 0, PLANES, 2 * PLANES
+HIT, PASSES = 0, PLANES
 """First plane of each counter."""
-PASSED = 3 * PLANES
+PASSED = 2 * PLANES
 """The word of voxels that any ray ever passed."""
-WORDS = 3 * PLANES + 1
+WORDS = 2 * PLANES + 1
 """Words of a cell."""
-OPEN_SHARE = 0.1
-"""A voxel is open if the voxels above and below it were seen through in more than this share of its own times."""
-_THROUGH, _STRUCK = 0, PLANES
-_BESIDE = np.int64(1)
-"""One cell to all sides; a literal would have :func:`neighbourhood` compiled once more."""
-_LOWEST, _HIGHEST = np.uint64(0b11), np.uint64(1) << np.uint64(TOP_BIT - 1)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -64,9 +59,9 @@ def add_one(planes: U64, first: int, word: np.uint64) -> None:
 
 
 @numba.njit(cache=True, nogil=True)
-def halve(planes: U64, counters: int) -> None:
-    """Halve the counts of all ``counters`` of a cell: what is weighed against each other keeps its ratio."""
-    for first in range(0, counters * PLANES, PLANES):
+def halve(planes: U64) -> None:
+    """Halve the counts of a cell: what is weighed against each other keeps its ratio."""
+    for first in (HIT, PASSES):
         for k in range(first, first + PLANES - 1):
             planes[k] = planes[k + 1]
         planes[first + PLANES - 1] = 0
@@ -79,6 +74,16 @@ def count_of(planes: U64, first: int, bit: int) -> int:
     for k in range(PLANES):
         value |= int((planes[first + k] >> np.uint64(bit)) & np.uint64(1)) << k
     return value
+
+
+@numba.njit(cache=True, nogil=True)
+def times_crossed(cell: U64, bit: int) -> int:
+    """In how many scans rays went through voxel ``bit`` of a cell (WORDS,) from side to side: what they passed least of
+    it, the voxel above and the one below. The ground bounds the lowest voxel, the end of the word the highest."""
+    least = count_of(cell, PASSES, bit)
+    if bit + 1 < TOP_BIT:
+        least = min(least, count_of(cell, PASSES, bit + 1))
+    return min(least, count_of(cell, PASSES, bit - 1)) if bit > 1 else least
 
 
 @numba.njit(inline="always")
@@ -136,20 +141,17 @@ def _count_scan(planes: U64, part: Overlap, apart: U64, near: U64, passed: U64, 
             if np.isnan(ground_z[r, c]) or not near[r, c] | passed[r, c]:
                 continue
             cell, rays, mapped = planes[r + part.down, c + part.right], passed[r, c], occupied[r, c]
-            above, below = rays >> np.uint64(1) | _HIGHEST, rays << np.uint64(1) | _LOWEST
-            crossed = rays & above & below & ~near[r, c]
             hit = (near[r, c] & mapped) | apart[r, c]
             missed = rays & ~near[r, c]
             cell[PASSED] |= rays
-            if is_full(cell, CROSSED, crossed) or is_full(cell, HIT, hit) or is_full(cell, PASSES, missed):
-                halve(cell, 3)
-            add_one(cell, CROSSED, crossed)
+            if is_full(cell, HIT, hit) or is_full(cell, PASSES, missed):
+                halve(cell)
             add_one(cell, HIT, hit)
             add_one(cell, PASSES, missed)
 
 
-class SurfaceEvidence:
-    """Counters of a drive by tile: (256, 256, WORDS) uint64: crossed, hit, passes, then what any ray passed.
+class Evidence:
+    """Counters of a drive by tile: (256, 256, WORDS) uint64: hit, passes, then what any ray passed.
 
     Memory is bounded by the tiles around the vehicle, and some hundred kilobytes for each that it has left.
     """
@@ -169,7 +171,7 @@ class SurfaceEvidence:
 
 @numba.njit(cache=True, nogil=True)
 def free_words(planes: U64, occupied: U64) -> U64:
-    """(rows, cols) voxels that two scans or more crossed, none hit, and that the map does not hold."""
+    """(rows, cols) voxels that two scans or more passed, none hit, and that the map does not hold."""
     out = np.zeros(occupied.shape, dtype=np.uint64)
     for r in range(occupied.shape[0]):
         for c in range(occupied.shape[1]):
@@ -177,59 +179,6 @@ def free_words(planes: U64, occupied: U64) -> U64:
             for k in range(PLANES):
                 struck |= planes[r, c, HIT + k]
                 if k > 0:
-                    often |= planes[r, c, CROSSED + k]
+                    often |= planes[r, c, PASSES + k]
             out[r, c] = often & ~struck
     return out
-
-
-@numba.njit(cache=True, nogil=True)
-def is_open(planes: U64, bit: int) -> bool:
-    """Whether rays went through a voxel from side to side, and did not only graze it along a slab (a survey's counts).
-
-    A roof, an awning or a ceiling is thinner than a voxel: rays that graze it pass through its voxel, but of the voxels
-    above and below they reach only one. The ground bounds the lowest voxel, the end of the word the highest.
-    """
-    through = count_of(planes, _THROUGH, bit)
-    above = count_of(planes, _THROUGH, bit + 1) if bit + 1 < TOP_BIT else through
-    below = count_of(planes, _THROUGH, bit - 1) if bit > 1 else through
-    return min(above, below) > OPEN_SHARE * through
-
-
-@numba.njit(cache=True, nogil=True)
-def _count_struck(
-    planes: U64, part: Overlap, hit: U64, passed: U64, occupied: U64, ground_z: F32, base: I32
-) -> None:  # fmt: skip
-    """Add to a tile's ``planes`` the ``part`` of one scan's window that lies on it."""
-    for r in range(np.uint64(part.row), np.uint64(part.end_row)):
-        for c in range(np.uint64(part.col), np.uint64(part.end_col)):
-            through, struck, mapped = passed[r, c] & ~hit[r, c], hit[r, c], occupied[r, c]
-            if not (through | struck | mapped) or np.isnan(ground_z[r, c]):
-                continue
-            if mapped:
-                near = neighbourhood(hit, base, np.int64(r), np.int64(c), _BESIDE) & mapped
-                struck = (struck & ~mapped) | near
-                through &= ~near
-            if through or struck:
-                cell = planes[np.uint64(np.int64(r) + part.down), np.uint64(np.int64(c) + part.right)]
-                if is_full(cell, _THROUGH, through) or is_full(cell, _STRUCK, struck):
-                    halve(cell, 2)
-                add_one(cell, _THROUGH, through)
-                add_one(cell, _STRUCK, struck)
-
-
-class Evidence:
-    """Counters of a survey by tile: (256, 256, 2 PLANES) uint64, in how many scans seen through, then struck.
-
-    A voxel that the map holds counts as struck if anything near it was hit (8 neighbouring cells, one layer up or
-    down), and then not as seen through; any other voxel must be hit itself.
-    """
-
-    def __init__(self, lattice: Lattice) -> None:
-        self.tiles = PackedTiles(lattice, 2 * PLANES)
-
-    def count(self, view: ScanView, reference: Reference) -> None:
-        """Count a scan seen against ``reference``."""
-        here = reference.occupied, reference.ground_z, reference.base
-        for planes, part in self.tiles.under(view.grid):
-            _count_struck(planes, part, view.hit, view.passed, *here)
-        self.tiles.leave(view.grid)

@@ -15,7 +15,7 @@ from mapvote.core.reference import above_ground_points, reference_window
 from mapvote.core.types import NO_VOTE, U64
 from mapvote.core.voting import one_hot
 from mapvote.detection.confidence import looks
-from mapvote.detection.evidence import SurfaceEvidence, free_words
+from mapvote.detection.evidence import Evidence, free_words
 from mapvote.detection.surface_rules import NOTHING, Mapped, judge_window, no_facts, weigh_voxels
 from mapvote.detection.voter import TileVotes
 from mapvote.perception.frontend import Observation
@@ -32,7 +32,7 @@ class SurfaceVoter:
 
     def __init__(self, voting: VotingSettings, point_map: PointMap) -> None:
         self.voting, self.point_map = voting, point_map
-        self.evidence = SurfaceEvidence(point_map.lattice)
+        self.evidence = Evidence(point_map.lattice)
 
     def observe(self, seen: Observation) -> U64:
         """Count one scan; returns (rows, cols) words of voxels whose points may be new."""

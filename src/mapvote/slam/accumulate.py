@@ -1,53 +1,36 @@
 """Scans at known poses become a map: points without moving objects, ground, known-free columns.
 
-A draft of the map gives the ground and says which voxels anything ever struck. Every voxel's scans are then counted:
-in how many was it struck, in how many seen through. What was struck only rarely by scans that could have struck it is
-the trail of something that moved and escaped the filter: it leaves the map, and its voxels are unknown, not free. So
-does what is no surface at all (slam/clean_map.py), and what the surveys saw through as often as a vehicle that calls it
-gone: beside a parked car the trail of one that passes is struck by every hit on the other, and only a hit that knows
-where it lies tells them apart (detection/evidence.py).
+A draft of the map gives the ground and the occupied voxels. Each scan is then counted as a vehicle counts it: in how
+many scans was a voxel hit, in how many did rays pass it (detection/evidence.py). At the end the rules of
+slam/clean_map.py drop points that are no standing surface. Their voxels are unknown, not free.
 
-What enters the map has been before the filter, at whatever range: a car that drives ahead of the surveyor, too far off
-for the counting, would else leave its trail unchallenged. Returns from beyond the filter's reach are left out.
+Only points that passed the filter of moving objects enter the map, at whatever range: a car that drives ahead of the
+surveyor is too far off for the counting. Returns from beyond the filter's reach are left out.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
 
 from mapvote.config import Settings
 from mapvote.core.columns import TOP_BIT, column_bits, shifted
-from mapvote.core.grid import CELL_SIZE, TILE_CELLS, TileIndex, tile_of_cells
+from mapvote.core.grid import CELL_SIZE, TILE_CELLS, tile_of_cells
 from mapvote.core.heights import heights_over_ground
 from mapvote.core.point_map import PointMap, map_from_points
 from mapvote.core.reference import LocalMap
 from mapvote.core.tile import Tile
 from mapvote.core.types import F32, F64, I32, I64, U64, Bool, Drive
 from mapvote.core.voxels import VoxelCloud
-from mapvote.detection.evidence import (
-    HIT,
-    PASSES,
-    PLANES,
-    Evidence,
-    SurfaceEvidence,
-    count_of,
-    free_words,
-    is_open,
-)
-from mapvote.detection.surface_rules import is_gone
+from mapvote.detection.evidence import HIT, PASSES, Evidence, count_of, free_words, times_crossed
 from mapvote.localisation.localiser import GivenPoses
 from mapvote.perception.frontend import Frontend, Observation, PlacedScan
 from mapvote.perception.moving_objects import MovingFilter
-from mapvote.slam.clean_map import mirrored, strays, trails
+from mapvote.slam.clean_map import mirrored, seen_through, specks, strays, trails
 
-_MIN_THROUGH, _TRAIL_SHARE = 3, 0.45
-"""A voxel is a trail if so many scans saw through it, and of those able to a smaller share struck it."""
 ROAD_M = 0.1
 """Points this low above the ground are the road itself, also under a car."""
 
@@ -59,7 +42,7 @@ class Layer:
         """``road`` (n, 3), map metres: where vehicles drove, from which the ground grows."""
         self.draft, self.road, self.settings = draft, road, settings
         self.cloud = VoxelCloud(draft.lattice)
-        self.evidence, self.surfaces = Evidence(draft.lattice), SurfaceEvidence(draft.lattice)
+        self.evidence = Evidence(draft.lattice)
         self._driven: list[F64] = []
         self._around = LocalMap(draft, 2.0 * settings.mapping.reach_m)
         self._near = LocalMap(draft, settings.voting.window_m)
@@ -86,63 +69,40 @@ class Layer:
         for observation in seen:
             scan, moving = observation.scan, observation.moving
             self.cloud.enter(scan.points_map, _left_out(scan, moving, self.settings.mapping.reach_m))
-            self.evidence.count(observation.view, observation.reference)
-            self.surfaces.count(observation)
+            self.evidence.count(observation)
 
     def finish(self) -> PointMap:
         """The map of everything laid."""
         points, scans = self.cloud.points()
-        kept = ~self._trails(points, _standing(points, self.draft))
-        points, scans = points[kept], scans[kept]
+        counts = self._counts(points)
+        kept = ~(_standing(points, self.draft) & seen_through(counts))
+        points, scans, counts = points[kept], scans[kept], counts[kept]
         # Trails lift the draft's ground; above the true one stand the undersides of cars that had passed for ground.
-        laid = map_from_points(points, lattice=self.draft.lattice, road=self.road)
+        laid, lattice = map_from_points(points, lattice=self.draft.lattice, road=self.road), self.draft.lattice
         obstacle = _standing(points, laid)
-        driven = np.concatenate(self._driven) if self._driven else np.zeros((0, 3))
-        dropped = self._trails(points, obstacle) | mirrored(points, laid, self.road)
+        dropped = (obstacle & seen_through(counts)) | mirrored(points, laid, self.road)
         if self.settings.mapping.drop_strays:
-            dropped |= self._seen_through(points, obstacle)
+            driven = np.concatenate(self._driven) if self._driven else np.zeros((0, 3))
+            dropped |= obstacle & strays(points, scans, driven, lattice)
             left = np.flatnonzero(obstacle & ~dropped)
             height = heights_over_ground(laid, points[left])
-            dropped[left] |= trails(points[left], self._balance(points[left]), height, self.draft.lattice)
-            dropped |= obstacle & strays(points, scans, driven, self.draft.lattice)
-        point_map = map_from_points(points[~dropped], lattice=self.draft.lattice, road=self.road)
+            dropped[left] |= trails(points[left], counts[left, 0] - counts[left, 1], height, lattice)
+            left = np.flatnonzero(obstacle & ~dropped)
+            dropped[left] |= specks(points[left], scans[left], lattice)
+        point_map = map_from_points(points[~dropped], lattice=lattice, road=self.road)
         tiles = {tile: replace(content, free=self._free(content)) for tile, content in point_map.tiles.items()}
         return replace(point_map, tiles=tiles)
 
-    def _trails(self, points: F64, obstacle: Bool) -> Bool:
-        """Which points (n, 3) lie in voxels that were struck in too few of the scans that could have struck them.
-
-        Only those of ``obstacle`` (n,) are judged, and only voxels that rays crossed from side to side: what merely
-        grazes a thin slab says nothing against it.
-        """
-        return self._judge(points, obstacle, self.evidence.tiles, _are_trails) != 0
-
-    def _seen_through(self, points: F64, obstacle: Bool) -> Bool:
-        """Which of the ``obstacle`` points (n, 3) lie in voxels that the surveys would vote out of the map."""
-        return self._judge(points, obstacle, self.surfaces.tiles, _are_gone) != 0
-
-    def _balance(self, points: F64) -> I64:
-        """(n,) in how many scans the voxels of these points were met, less in how many rays passed and met nothing."""
-        return self._judge(points, np.ones(len(points), np.bool_), self.surfaces.tiles, _balances).astype(np.int64)
-
-    def _judge(
-        self,
-        points: F64,
-        obstacle: Bool,
-        counters: Mapping[TileIndex, U64],
-        rule: Callable[[U64, I64, I64, I64], NDArray[Any]],
-    ) -> NDArray[Any]:
-        """(n,) what a ``rule`` says of the ``obstacle`` points (n, 3) by the counts of their voxels, tile by tile; 0 of
-        the others."""
-        out = np.zeros(len(points), dtype=np.int64)
-        asked = np.flatnonzero(obstacle)
-        rows, cols = self.draft.lattice.cells_of(points[asked])
+    def _counts(self, points: F64) -> I64:
+        """(n, 3) in how many scans the voxels of points (n, 3) were hit, passed and crossed; 0 outside columns."""
+        out = np.zeros((len(points), 3), dtype=np.int64)
+        rows, cols = self.draft.lattice.cells_of(points)
         tile_rows, tile_cols = tile_of_cells(rows, cols)
-        for tile, planes in counters.items():
+        for tile, planes in self.evidence.tiles.items():
             mine = np.flatnonzero((tile_rows == tile[0]) & (tile_cols == tile[1]))
-            r, c, here = rows[mine] - tile[0] * TILE_CELLS, cols[mine] - tile[1] * TILE_CELLS, asked[mine]
-            bits = np.floor(points[here, 2] / CELL_SIZE).astype(np.int64) - self.draft.tile(tile).base[r, c]
-            out[here] = rule(planes, r, c, bits)
+            r, c = rows[mine] - tile[0] * TILE_CELLS, cols[mine] - tile[1] * TILE_CELLS
+            bits = np.floor(points[mine, 2] / CELL_SIZE).astype(np.int64) - self.draft.tile(tile).base[r, c]
+            out[mine] = _counts_of(planes, r, c, bits)
         return out
 
     def _free(self, after: Tile) -> U64:
@@ -201,36 +161,14 @@ def _no_map(
 
 
 @numba.njit(cache=True, nogil=True)
-def _are_trails(planes: U64, rows: I64, cols: I64, bits: I64) -> Bool:
-    """(n,) of voxels (row, col, bit) of a tile; those outside the columns are none."""
-    out = np.zeros(len(bits), dtype=np.bool_)
+def _counts_of(planes: U64, rows: I64, cols: I64, bits: I64) -> I64:
+    """(n, 3) of voxels (row, col, bit) of a tile: in how many scans hit, passed and crossed; 0 outside columns."""
+    out = np.zeros((len(bits), 3), dtype=np.int64)
     for i in range(len(bits)):
         if 0 <= bits[i] < TOP_BIT:
             cell = planes[rows[i], cols[i]]
-            through, struck = count_of(cell, 0, bits[i]), count_of(cell, PLANES, bits[i])
-            rarely = through >= _MIN_THROUGH and struck < _TRAIL_SHARE * (struck + through)
-            out[i] = rarely and is_open(cell, bits[i])
-    return out
-
-
-@numba.njit(cache=True, nogil=True)
-def _are_gone(planes: U64, rows: I64, cols: I64, bits: I64) -> Bool:
-    """(n,) of voxels (row, col, bit) of a tile; those outside the columns are none. All rays count, so that the map
-    holds nothing which the next vehicle calls gone for no other reason than that it passes more often."""
-    out = np.zeros(len(bits), dtype=np.bool_)
-    for i in range(len(bits)):
-        out[i] = 0 <= bits[i] < TOP_BIT and is_gone(planes[rows[i], cols[i]], bits[i], 1)
-    return out
-
-
-@numba.njit(cache=True, nogil=True)
-def _balances(planes: U64, rows: I64, cols: I64, bits: I64) -> I64:
-    """(n,) of voxels (row, col, bit) of a tile: in how many scans met, less in how many passed; 0 outside columns."""
-    out = np.zeros(len(bits), dtype=np.int64)
-    for i in range(len(bits)):
-        if 0 <= bits[i] < TOP_BIT:
-            cell = planes[rows[i], cols[i]]
-            out[i] = count_of(cell, HIT, bits[i]) - count_of(cell, PASSES, bits[i])
+            out[i, 0], out[i, 1] = count_of(cell, HIT, bits[i]), count_of(cell, PASSES, bits[i])
+            out[i, 2] = times_crossed(cell, bits[i])
     return out
 
 

@@ -1,4 +1,12 @@
-"""Which points of a surveyed map are no standing surface. One function a rule: ``mirrored``, ``strays``, ``trails``.
+"""Which points of a surveyed map are no standing surface, one function a rule:
+
+| rule | a point is dropped if | what it was |
+|---|---|---|
+| ``seen_through`` | rays crossed its voxel in SEEN_THROUGH scans or more, and most scans did not hit it | a trail |
+| ``trails`` | its low group of cells was passed more often than hit | a trail of what drove far off |
+| ``strays`` | few of the places near by hit it, or it lies just over the face of another surface's voxel | noise |
+| ``specks`` | it is one of a few voxels that touch no other surface, each hit by one scan | noise |
+| ``mirrored`` | it lies below unbroken ground | a reflection |
 
 Reflections. A wet road, a window or the side of a car deflects a ray, and the range puts its return below the ground.
 A point below ground that is known and level on all sides is such a return. Beside a leap of the ground it may be a wall
@@ -9,12 +17,17 @@ speaks against such points, because other scans saw the wall in front of them. A
 of the scans that pass within NEAR_M of it; strays are not. A wall two centimetres from a voxel's face has points in two
 voxels: the fewer points just over the face belong to the same wall.
 
+Specks. Mixed pixels and mirrored rooms leave points that touch nothing, each hit once. A vehicle that comes by denies
+them, and would be right: the map would change where nothing changed. ``import --clean`` asks the same of a map that
+comes from elsewhere, by how many points each voxel holds.
+
 Trails. A standing thing is hit as often as rays pass through its voxels, as a whole if not in each voxel. A thing that
 drove was hit once or twice in each place, and rays passed there before and after.
 """
 
 from __future__ import annotations
 
+import numba
 import numpy as np
 from scipy import ndimage
 from scipy.sparse import coo_matrix
@@ -25,7 +38,7 @@ from mapvote.core.grid import CELL_SIZE, Lattice
 from mapvote.core.heights import crossings, heights_over_ground
 from mapvote.core.point_map import PointMap
 from mapvote.core.types import F32, F64, I32, I64, Bool
-from mapvote.core.voxels import thin, voxel_keys
+from mapvote.core.voxels import slot_of, thin, voxel_keys
 
 BELOW_M = 0.5
 """A point so far under the ground is no part of it, however rough."""
@@ -132,6 +145,65 @@ def _middles(points: F64, lattice: Lattice) -> F64:
     """(n, 3) the middle of each point's voxel: steps from there reach the next one whatever rounding does."""
     origin = np.array([lattice.x0, lattice.y0, 0.0])
     return np.asarray((np.floor((points - origin) / CELL_SIZE) + 0.5) * CELL_SIZE + origin)
+
+
+SEEN_THROUGH = 6
+"""Scans that must have crossed a voxel before it can be a trail."""
+_TRAIL_SHARE = 0.3
+"""Of the scans that crossed or hit a voxel, the share that must have hit it."""
+
+
+def seen_through(counts: I64) -> Bool:
+    """(n,) which voxels scans saw through, by ``counts`` (n, 3): in how many scans hit, passed, crossed.
+
+    A voxel of a standing surface can be crossed, too. So the bound is far below that of a vehicle that calls it gone.
+    """
+    hit, crossed = counts[:, 0], counts[:, 2]
+    return np.asarray((crossed >= SEEN_THROUGH) & (hit < _TRAIL_SHARE * (hit + crossed)))
+
+
+LARGEST_SPECK = 5
+"""Voxels that touch each other and no other surface."""
+
+
+def specks(points: F64, times: I32, lattice: Lattice, largest: int = LARGEST_SPECK) -> Bool:
+    """(n,) which of a map's obstacle points (n, 3), map metres, lie on nothing: in a group of at most ``largest``
+    voxels that touch each other (26), touch no other voxel, and were hit once each.
+
+    ``times`` (n,): how many scans hit the voxel of each point; of a map from elsewhere, how many points it holds.
+    """
+    keys = voxel_keys(points, lattice.x0, lattice.y0)
+    table = np.zeros(1 << max(2 * len(keys), 2).bit_length(), dtype=np.int64)
+    return _specks(keys, times <= 1, largest, table, np.zeros(len(table), dtype=np.bool_))
+
+
+@numba.njit(cache=True, nogil=True)
+def _specks(keys: I64, once: Bool, largest: int, table: I64, often: Bool) -> Bool:
+    """(n,) by flood fill from each voxel hit ``once``, which ends as soon as the group is no speck. ``table``, a hash
+    table of the voxels, and ``often``, whether a voxel of it was hit more than once: scratch, zeros."""
+    for i in range(len(keys)):
+        slot = slot_of(keys[i], table)
+        often[slot] |= not once[i] or table[slot] == keys[i]  # a second point in one voxel
+        table[slot] = keys[i]
+    out, group = np.zeros(len(keys), np.bool_), np.empty(largest + 1, np.int64)
+    for i in range(len(keys)):
+        group[0], n, k = keys[i], 1, 0
+        alone = not often[slot_of(keys[i], table)]
+        while alone and k < n:
+            for around in range(27):
+                dx, dy, dz = around // 9 - 1, around // 3 % 3 - 1, around % 3 - 1
+                beside = group[k] + (np.int64(dx) << 42) + (np.int64(dy) << 21) + dz
+                slot = slot_of(beside, table)
+                if table[slot] == 0 or (group[:n] == beside).any():
+                    continue
+                if often[slot] or n == largest:
+                    alone = False
+                    break
+                group[n] = beside
+                n += 1
+            k += 1
+        out[i] = alone
+    return out
 
 
 TALL_M = 4.0

@@ -45,6 +45,7 @@ from mapvote.server.http.services import Services, services
 from mapvote.server.store.keys import pseudonyms
 from mapvote.server.store.publish import preview, publish, rollback
 from mapvote.server.store.queries import log_event
+from mapvote.server.views.coverage import as_features, wanted_passes
 from mapvote.server.views.explain import explain_cell, story_as_json
 from mapvote.server.views.geojson import contradictions, feature_rows, standing_rows, tile_squares
 from mapvote.server.views.history import changes_between, coverage, page_between, seen, vehicle_standings
@@ -187,6 +188,13 @@ def fresh(request: Request, format: Places = "json") -> Response:
     if format == "csv":
         return as_table(told)
     return as_json(tile_squares(told, store.lattice) if format == "geojson" else {"tiles": told})
+
+
+@router.get("/v1/coverage/passes", response_model=PlacesAnswer, responses=problems(403), summary="Where to drive next")
+def passes(request: Request) -> Response:
+    """Stretches of road on which one more pass would decide cells, as GeoJSON lines in the direction to drive."""
+    reviewer(request)
+    return as_json(as_features(wanted_passes(services(request).store)))
 
 
 @router.get(

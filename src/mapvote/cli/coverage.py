@@ -1,0 +1,57 @@
+"""Where the fleet should drive next."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from mapvote.cli.options import SERVER, KeyFile
+from mapvote.cli.terminal import print_table
+
+
+def register(app: typer.Typer) -> None:
+    """Add coverage."""
+    app.command(rich_help_panel=SERVER)(coverage)
+
+
+def coverage(
+    name: Annotated[str, typer.Argument(metavar="STORE|URL", help="a store, or a server's address")],
+    out: Annotated[Path | None, typer.Option(metavar="FILE", help="also write all stretches as GeoJSON")] = None,
+    most: Annotated[int, typer.Option(metavar="N", min=1, help="rows of the table")] = 20,
+    key_file: KeyFile = None,
+) -> None:
+    """Where one more pass would decide cells: by tile and direction of road, the most cells first.
+
+    A cell counts if one more vehicle that says the same as one before would decide it.
+
+    mapvote coverage map.db --out drive_next.geojson
+    """
+    from mapvote.cli.remote import is_url, server_at
+    from mapvote.cli.store import opened_store
+    from mapvote.formats.atomic import whole_file
+
+    if is_url(name):
+        with server_at(name, key_file) as server:
+            found = server.ask_json("GET", "/v1/coverage/passes")
+    else:
+        from mapvote.server.views.coverage import as_features, wanted_passes
+
+        with opened_store(name) as store:
+            found = as_features(wanted_passes(store))
+    rows = []
+    for feature in found["features"][:most]:
+        told, line = feature["properties"], feature["geometry"]["coordinates"]
+        ends = [f"({x:.0f}, {y:.0f})" for x, y in (line[0], line[-1])]
+        counts = (str(told[what]) for what in ("cells", "built", "gone"))
+        rows.append((f"{told['row']},{told['col']}", f"{told['heading_deg']}°", *ends, *counts))
+    if rows:
+        print_table(("tile", "heading", "from (x, y), m", "to", "cells", "built", "gone"), rows, "One more pass")
+    else:
+        print("no cell waits for one more pass")
+    if out is not None:
+        with whole_file(out) as partial:
+            partial.write_text(json.dumps(found) + "\n")
+        print(f"{out}: {len(found['features'])} stretches of road")

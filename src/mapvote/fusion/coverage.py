@@ -1,0 +1,110 @@
+"""Where one more pass would decide something: cells in which a change lacks one vote, and the road to see them from.
+
+A vehicle that saw a change is the witness of where it can be seen from. One more vehicle that drives the same road in
+the same direction most likely sees the same, and its vote decides the cell.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import scipy
+
+from mapvote.core.grid import Grid, TileIndex
+from mapvote.core.types import F64, NO_VOTE, U8, Bool, CellState
+
+SECTORS = 8
+"""Directions of road that are told apart, 45 deg each."""
+_DETERMINED = (
+    CellState.UNCHANGED_OCCUPIED,
+    CellState.UNCHANGED_EMPTY,
+    CellState.CHANGED_OCCUPIED,
+    CellState.CHANGED_EMPTY,
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Witness:
+    """What one vehicle said of a tile, and where it drove."""
+
+    states: U8
+    """(256, 256) CellState or NO_VOTE."""
+    paths_m: Sequence[F64]
+    """(n, 2) map metres of each of its drives, in the order driven."""
+
+
+@dataclass(frozen=True, slots=True)
+class Stretch:
+    """A piece of road on which one more vehicle would decide cells of one tile."""
+
+    tile: TileIndex
+    heading_rad: float
+    """Of the drive, from the x axis of the map towards y: a multiple of 45 deg."""
+    built: int
+    """Cells that one more vote would decide changed-occupied."""
+    gone: int
+    """Cells that one more vote would decide changed-empty."""
+    path_m: F64
+    """(n, 2) map metres, in the direction to drive."""
+
+    @property
+    def cells(self) -> int:
+        """All of them."""
+        return self.built + self.gone
+
+
+def one_vote_short(states: Sequence[U8], quorum: int) -> U8:
+    """(rows, cols) the change that one more vote for it would decide; NO_VOTE in all other cells.
+
+    ``states``: (rows, cols) of each vehicle. The rule is that of ``fuse.count``: a change needs ``quorum`` votes and a
+    majority of the vehicles that determined the cell. A change for which nobody voted is not asked for.
+    """
+    said = np.stack(states)
+    determined = np.isin(said, _DETERMINED).sum(axis=0)
+    out = np.full(said.shape[1:], NO_VOTE, dtype=np.uint8)
+    for change in (CellState.CHANGED_EMPTY, CellState.CHANGED_OCCUPIED):
+        votes = (said == change).sum(axis=0)
+        decided = (votes >= quorum) & (2 * votes > determined)
+        would = (votes + 1 >= quorum) & (2 * (votes + 1) > determined + 1)
+        out[(votes > 0) & would & ~decided] = change
+    return out
+
+
+def stretches(window: Grid, witnesses: Sequence[Witness], quorum: int) -> list[Stretch]:
+    """The roads of one tile's ``window`` on which one more pass would decide cells, the most cells first.
+
+    A cell is counted for each direction in which a vehicle drove that voted for the change.
+    """
+    if not witnesses:
+        return []
+    short = one_vote_short([witness.states for witness in witnesses], quorum)
+    counted: dict[int, Bool] = {}
+    roads: dict[int, tuple[int, F64]] = {}
+    for witness in witnesses:
+        rows, cols = np.nonzero((short != NO_VOTE) & (witness.states == short))
+        paths = [path for path in witness.paths_m if len(path) > 1]
+        if not len(rows) or not paths:
+            continue
+        at, heading = np.concatenate([path[:-1] for path in paths]), np.concatenate([np.diff(p, axis=0) for p in paths])
+        x, y = window.centres()
+        nearest = scipy.spatial.cKDTree(at).query(np.column_stack([x[cols], y[rows]]))[1]
+        sector = np.round(np.arctan2(*heading[nearest].T[::-1]) * SECTORS / (2 * np.pi)).astype(np.int64) % SECTORS
+        for k in np.unique(sector).tolist():
+            mine = sector == k
+            counted.setdefault(k, np.zeros(short.shape, dtype=np.bool_))[rows[mine], cols[mine]] = True
+            if mine.sum() > roads.get(k, (0, at))[0]:
+                road = at[nearest[mine].min() : nearest[mine].max() + 1]
+                roads[k] = int(mine.sum()), np.concatenate([road, road[-1:] + heading[nearest[mine].max()]])
+    out = [
+        Stretch(
+            window.tile_index,
+            2 * np.pi * k / SECTORS,
+            int((short[cells] == CellState.CHANGED_OCCUPIED).sum()),
+            int((short[cells] == CellState.CHANGED_EMPTY).sum()),
+            roads[k][1],
+        )
+        for k, cells in counted.items()
+    ]
+    return sorted(out, key=lambda stretch: (-stretch.cells, stretch.heading_rad))
