@@ -15,7 +15,7 @@ from mapvote.cli.follow import follow_once
 from mapvote.client import MapClient
 from mapvote.core.point_map import PointMap, all_points, map_from_points
 from mapvote.core.types import F64, MapvoteError
-from mapvote.formats.maps.autoware_live import lay_version
+from mapvote.formats.maps.autoware import lay_version
 from mapvote.formats.maps.cloud import Cloud
 
 STREET = np.random.default_rng(3).uniform([-35, -35, 0], [35, 35, 4], (3000, 3)).astype(np.float32).astype(np.float64)
@@ -128,7 +128,7 @@ def test_the_metadata_never_names_a_tile_that_is_not_whole(tmp_path: Path, monke
     folder = tmp_path / "map"
     lay_version(folder, Cloud(STREET), 1)
     good = (folder / "pointcloud_map_metadata.yaml").read_bytes()
-    import mapvote.formats.maps.autoware_live as live
+    import mapvote.formats.maps.autoware as live
 
     written: list[Path] = []
 

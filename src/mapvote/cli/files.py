@@ -212,7 +212,7 @@ def _export(
 
 
 def _lay(point_map: PointMap, out: Path, older: PointMap | None, projector: str | None) -> None:
-    from mapvote.formats.maps.autoware_live import lay_version, names_of
+    from mapvote.formats.maps.autoware import lay_version, names_of
     from mapvote.formats.maps.exporting import autoware_pieces
 
     cloud = autoware_pieces(point_map, out, projector)

@@ -12,7 +12,7 @@ from mapvote.cli.options import SERVER, KeyFile, Projector, key_in
 
 if TYPE_CHECKING:
     from mapvote.client import MapClient
-    from mapvote.formats.maps.autoware_live import Change
+    from mapvote.formats.maps.autoware import Change
 
 
 def register(app: typer.Typer) -> None:
@@ -64,7 +64,7 @@ def follow_once(client: MapClient, folder: Path, projector: str | None, keep: in
 
     The frame is chosen once, with the first version, unless ``projector`` names one: a map that grows does not move.
     """
-    from mapvote.formats.maps.autoware_live import laid_version, lay_version
+    from mapvote.formats.maps.autoware import laid_version, lay_version
     from mapvote.formats.maps.exporting import autoware_pieces
 
     if laid_version(folder) == client.newest():

@@ -405,21 +405,22 @@ def _differs(d: Similarity, places: int, drive: Drive) -> list[Finding]:
     yaw = f"turned about z by {d.yaw_deg:.2f} deg (+-{d.yaw_sigma_deg:.2f})"
     tilt = f"tilted by {d.tilt_deg:.2f} deg (+-{d.tilt_sigma_deg:.2f})"
     scale = f"scaled by {d.scale:.4f} (+-{d.scale_sigma:.4f})"
-    # by how much; what no drive shows; what the prior's stated errors explain; what is an error
+    # by how much; what is worth a word; its standard error; what the prior's stated errors explain; what is an error
     rows = [
-        (shift, off_m, max(0.15, 3.0 * d.sigma_m), _SHIFT_SIGMAS * sigma_m, max(0.3, 4.0 * sigma_m)),
-        (yaw, abs(d.yaw_deg), max(_TURN_DEG, 4.0 * d.yaw_sigma_deg), _TURN_SIGMAS * sigma_deg, 2.0 * _TURN_DEG),
-        (tilt, d.tilt_deg, max(_TILT_DEG, 4.0 * d.tilt_sigma_deg), _TURN_SIGMAS * sigma_deg, 2.0 * _TILT_DEG),
-        (scale, abs(d.scale - 1.0), max(_SCALE, 4.0 * d.scale_sigma), 0.0, 0.0),
+        (shift, off_m, 0.15, 0.75 * d.sigma_m, _SHIFT_SIGMAS * sigma_m, max(0.3, 4.0 * sigma_m)),
+        (yaw, abs(d.yaw_deg), _TURN_DEG, d.yaw_sigma_deg, _TURN_SIGMAS * sigma_deg, 2.0 * _TURN_DEG),
+        (tilt, d.tilt_deg, _TILT_DEG, d.tilt_sigma_deg, _TURN_SIGMAS * sigma_deg, 2.0 * _TILT_DEG),
+        (scale, abs(d.scale - 1.0), _SCALE, d.scale_sigma, 0.0, 0.0),
     ]
-    parts = [words for words, by, least, explained, _ in rows if by > max(least, explained)]
+    surely = [(words, by, error) for words, by, least, s, within, error in rows if by > max(least, 4.0 * s, within)]
+    parts = [words for words, _, _ in surely]
     if not parts:
         what = f"prior and map agree to {off_m:.2f} m and {abs(d.yaw_deg):.2f} deg ({places} places)"
-        within = [words for words, by, least, explained, _ in rows if min(least, 0.3 * explained) < by <= explained]
-        if within:
-            what += f"; the map is {', '.join(within)}: no more than prior_sigma_m and prior_sigma_deg explain"
+        small = [words for words, by, least, *_ in rows if by > least]
+        if small:
+            what += f"; the map is {', '.join(small)}: no more than prior_sigma_m and prior_sigma_deg explain"
         return [Finding("note", what)]
-    grave = any(by > max(least, explained, error) for _, by, least, explained, error in rows)
+    grave = any(by > error for _, by, error in surely)
     what = f"the map is {', '.join(parts)} against the prior, at the middle of the drive ({places} places)"
     mend = "if the map is right, move the prior by that (--mount for a constant one, CRS and origin for the rest)"
     return [Finding("error" if grave else "warning", what, mend)]

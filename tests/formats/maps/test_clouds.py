@@ -18,8 +18,7 @@ from pypcd4 import PointCloud
 from mapvote.core.point_map import all_points, map_from_points
 from mapvote.core.types import F64, MapvoteError
 from mapvote.formats import export_map, read_cloud, read_map, stream_cloud, write_map, write_pcd
-from mapvote.formats.maps.autoware import stream_autoware, write_autoware
-from mapvote.formats.maps.autoware_live import lay_version
+from mapvote.formats.maps.autoware import lay_version, stream_autoware, write_autoware
 from mapvote.formats.maps.cloud import Cloud, CloudPieces, joined, lattice_of
 from mapvote.formats.maps.las import read_las, write_las
 from mapvote.formats.maps.pcd import ENCODINGS, read_pcd_table

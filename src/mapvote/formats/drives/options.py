@@ -213,7 +213,7 @@ def make_drive(
         i = int(late[0]) + 1
         raise MapvoteError(
             f"{where}: times are not sorted: scan {i} ({stamps_ns[i] / 1e9:.6f} s) does not come after scan {i - 1} "
-            f"({stamps_ns[i - 1] / 1e9:.6f} s); {len(late)} such places; sort the scans by time or mend times.txt"
+            f"({stamps_ns[i - 1] / 1e9:.6f} s); {len(late)} such places; sort the scans by time or correct times.txt"
         )
     chosen = parse_scans(options.scans, len(stamps_ns), where)
     rate_hz = options.rate_hz or about.rate_hz

@@ -121,7 +121,7 @@ def point_times_s(where: str, raw: NDArray[np.generic], stamp_ns: int, sensor: S
     unit = min(_UNITS_NS, key=lambda u: abs(np.log(span * _UNITS_NS[u] / revolution_ns)))
     if not revolution_ns / 20 < span * _UNITS_NS[unit] < revolution_ns * 20:
         raise MapvoteError(
-            f"{where}: spans {span:g}, which in no unit is a revolution at {sensor.rate_hz:g} Hz; check --rate, "
+            f"{where}: spans {span:g}, which is a revolution in no unit at {sensor.rate_hz:g} Hz; check --rate, "
             f"or drop the field"
         )
     # Exact for 64-bit nanoseconds: the scan's start is subtracted before anything becomes a float.
@@ -132,7 +132,7 @@ def point_times_s(where: str, raw: NDArray[np.generic], stamp_ns: int, sensor: S
     if abs(offset_ns) > 1e9:
         raise MapvoteError(
             f"{where}: points were measured {offset_ns / 1e9:.3f} s away from their scan's stamp: "
-            f"two clocks are mixed; mend the stamps, or drop the field"
+            f"two clocks are mixed; correct the stamps, or drop the field"
         )
     out += offset_ns
     out *= 1e-9

@@ -255,7 +255,7 @@ def T_first_lidar(bag: Bag, first: str, other: str) -> F64:
     reached = T_from(static_frames(bag), source)
     if target not in reached:
         raise MapvoteError(
-            f"{bag.path}: /tf_static does not say where {target} ({other}) sits to {source} ({first}); record it, or "
+            f"{bag.path}: /tf_static holds no transform from {source} ({first}) to {target} ({other}); record it, or "
             f"choose one LiDAR with --topic"
         )
     return reached[target]

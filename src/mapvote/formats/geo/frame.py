@@ -97,7 +97,7 @@ class MapFrame:
     def _transformer(self) -> Any:
         if self.is_local:
             raise MapvoteError(
-                "the map's coordinates are local: nobody said where on Earth they lie; import it with --crs EPSG:n, "
+                "the map's coordinates are local and its place on Earth is unknown; import it with --crs EPSG:n, "
                 "or with --projector map_projector_info.yaml"
             )
         return transformer(self.crs)
@@ -147,7 +147,7 @@ def _through(how: Any, points: NDArray[np.floating], *, inverse: bool) -> F64:
         for column, values in enumerate(moved):
             piece[:, column] = values
     if not np.isfinite(out[:, :2]).all():
-        raise MapvoteError("points lie where their coordinate system has no answer; is it the right one?")
+        raise MapvoteError("points lie outside the area of their coordinate system; check --crs and --from-crs")
     return out
 
 

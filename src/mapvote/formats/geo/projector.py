@@ -145,7 +145,7 @@ def _as_yaml(about: dict[str, Any]) -> str:
 def frame_wanted(crs: str | None, projector: str | None) -> MapFrame | None:
     """What ``--crs`` or ``--projector`` ask for; None if neither does. MapvoteError if both do."""
     if crs is not None and projector is not None:
-        raise MapvoteError("--crs and --projector say the same thing in two ways; give one")
+        raise MapvoteError("--crs and --projector both name the frame; give one of them")
     if projector is not None:
         return read_projector(projector)
     if crs is None:

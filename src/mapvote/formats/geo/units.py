@@ -42,7 +42,7 @@ def settle(
             if not sure:
                 _check_no_degrees(where, first)
             return stated, _as_it_is
-        log.warning("%s: does not name its coordinate system; taken to be what was asked for", where)
+        log.warning("%s: names no coordinate system: the one that was asked for is assumed", where)
         stated = replace(wanted, heights=stated.heights or wanted.heights)
         if not any(wanted.offset_m):
             wanted = None
@@ -130,7 +130,7 @@ def _units(where: str, crs: Any) -> tuple[float, float]:
     up = [a for a in crs.axis_info if a.direction.lower() in ("up", "down")]
     to_m = float(plane[0].unit_conversion_factor) if plane else 1.0
     if up and up[0].direction.lower() == "down":
-        raise MapvoteError(f"{where}: z counts downwards ({crs.name}); turn it round first")
+        raise MapvoteError(f"{where}: z counts downwards ({crs.name}); negate z first")
     z_to_m = float(up[0].unit_conversion_factor) if up else to_m
     if not up and to_m != 1.0:
         log.warning("%s: names no unit for heights: taken to be that of x and y", where)

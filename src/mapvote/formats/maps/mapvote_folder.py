@@ -1,7 +1,7 @@
 """A mapvote map on disk: a folder of tiles and one manifest, written whole, verified when read.
 
 ``manifest.json`` holds the lattice, the georeference and of every tile its file, its content hash (points), the
-hash of its known-free columns and the SHA-256 of its bytes. ``tiles/ROW_COL.tile`` is core.tilecode's envelope.
+hash of its known-free columns and the SHA-256 of its bytes. ``tiles/ROW_COL.tile``: see :mod:`mapvote.codec.tile_file`.
 """
 
 from __future__ import annotations

@@ -66,8 +66,8 @@ def _check_count(path: Path, found: int, about: MetaData, beyond: int = 0) -> No
     if beyond >= about.build_dtype().itemsize:
         more = beyond // about.build_dtype().itemsize
         raise MapvoteError(
-            f"{path}: its header says {about.points} points, but data for {more} more follow; mend WIDTH, HEIGHT and "
-            "POINTS, or export it again"
+            f"{path}: its header says {about.points} points, but data for {more} more follow; correct WIDTH, "
+            "HEIGHT and POINTS, or export it again"
         )
     if found != about.points:
         raise MapvoteError(f"{path}: cut off: {found} points, but its header says {about.points}; copy it again")

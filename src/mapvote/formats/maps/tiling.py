@@ -128,7 +128,7 @@ class _Taken:
         if self.bad > MAX_BAD_SHARE * self.total:
             raise MapvoteError(
                 f"{self.where}: {self.bad} of {self.total} points are not finite, more than {MAX_BAD_SHARE:.0%}; "
-                "mend the file"
+                "export the file again"
             )
         if self.bad:
             log.warning("%s: dropped %d of %d points that are not finite", self.where, self.bad, self.total)
