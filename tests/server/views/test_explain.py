@@ -43,9 +43,9 @@ def clock() -> Clock:
 
 
 @pytest.fixture
-def store(database_url: str, clock: Clock) -> Iterator[Store]:
+def store(tmp_path: Path, clock: Clock) -> Iterator[Store]:
     policy = Policy(fuse=FuseSettings(max_deleted_share=1.0, prior_stay_days=10.0))
-    store = Store.create(database_url, two_walls(), policy, clock=clock)
+    store = Store.create(f"sqlite:///{tmp_path / 's.db'}", two_walls(), policy, clock=clock)
     yield store
     store.close()
 

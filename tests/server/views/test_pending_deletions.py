@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -31,8 +32,8 @@ SURE, UNSURE = [20, 20, 20], [20, -MOST, 20]
 
 
 @pytest.fixture
-def store(database_url: str) -> Iterator[Store]:
-    store = Store.create(database_url, two_walls(), BUDGET)
+def store(tmp_path: Path) -> Iterator[Store]:
+    store = Store.create(f"sqlite:///{tmp_path / 's.db'}", two_walls(), BUDGET)
     yield store
     store.close()
 
@@ -133,12 +134,12 @@ def test_a_round_without_a_vehicle_waits_as_it_would_have(store: Store) -> None:
     assert not store.point_map().tiles[0, 0].obstacle_words[WALL[0]], "of the cell beside both were"
 
 
-def test_what_spilled_over_goes_with_its_wall_and_its_story_says_that_nothing_changed_there(database_url: str) -> None:
+def test_what_spilled_over_goes_with_its_wall_and_its_story_says_that_nothing_changed_there(tmp_path: Path) -> None:
     y, z = np.meshgrid(np.arange(40.05, 43.0, 0.3), np.arange(0.45, 3.0, 0.3))
     wall = np.column_stack([np.full(y.size, 30.04), y.ravel(), z.ravel()]).astype(np.float32)
     spill = wall[::3] + np.array([-0.05, 0.1, 0.0], np.float32)  # a centimetre beyond the cells' border
     point_map = make_map({(0, 0): make_tile(np.concatenate([wall, spill]))})
-    store = Store.create(database_url, point_map, Policy(fuse=FuseSettings(max_deleted_share=1.0)))
+    store = Store.create(f"sqlite:///{tmp_path / 's.db'}", point_map, Policy(fuse=FuseSettings(max_deleted_share=1.0)))
     cells = sorted({(int(p[1] // 0.3), int(p[0] // 0.3)) for p in np.concatenate([wall, spill]).tolist()})
     states, odds = states_plane(dict.fromkeys(cells, CellState.CHANGED_EMPTY)), np.full(len(cells), 20, np.int8)
     for name in "ab":
