@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import asyncio
 import re
-from collections.abc import Callable
 from contextvars import ContextVar
 from dataclasses import dataclass
 from typing import cast
@@ -183,10 +182,10 @@ _CONNECTION: ContextVar[Connection | None] = ContextVar("mapvote_connection", de
 """The connection that a request came by: uvicorn starts a request's task while it is handed the bytes."""
 
 
-def watched(inner: Callable[..., asyncio.Protocol], patience: Patience) -> Callable[..., asyncio.Protocol]:
-    """A factory of protocols as uvicorn's own, each behind a :class:`Connection`."""
+def watched(inner: type[asyncio.Protocol], patience: Patience) -> type[asyncio.Protocol]:
+    """A factory of protocols, each behind a :class:`Connection`; uvicorn calls it as the class ``inner``."""
     crowd = Crowd(patience.connections)
-    return lambda **uvicorns: Connection(inner(**uvicorns), patience, crowd)
+    return cast("type[asyncio.Protocol]", lambda **uvicorns: Connection(inner(**uvicorns), patience, crowd))
 
 
 def tracked(app: ASGIApp) -> ASGIApp:

@@ -15,6 +15,7 @@ import msgspec
 import numpy as np
 import structlog
 import uvicorn
+from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from mapvote.codec.ballot import check_states
 from mapvote.config import Settings
@@ -103,7 +104,7 @@ def serve(
     patience = Patience(most.header_timeout_s, most.body_timeout_s, most.answer_timeout_s, _room_for(most.connections))
     config = uvicorn.Config(
         tracked(app),
-        http="h11",
+        http=watched(H11Protocol, patience),
         h11_max_incomplete_event_size=HEAD_BYTES,
         ws="none",
         access_log=False,
@@ -113,8 +114,6 @@ def serve(
         server_header=False,
         headers=list(HEADERS),
     )
-    config.load()
-    config.http_protocol_class = watched(config.http_protocol_class, patience)  # type: ignore[assignment]
     sys.setswitchinterval(_SWITCH_S)
     with listener:
         _Server(config, app.state.services.stop_fusing).run(sockets=[listener])

@@ -37,7 +37,7 @@ export function showChange(id) {
     facts([
       ["area", `${p.area_m2.toFixed(2)} m\u00b2 (${p.cells} cells)`],
       ["height", `${p.height_m.toFixed(1)} m above ground`],
-      p.volume_m3 !== undefined && ["volume", `${p.volume_m3.toFixed(1)} m\u00b3, summed over its columns`],
+      p.volume_m3 !== undefined && ["column volume", `${p.volume_m3.toFixed(1)} m\u00b3`],
       ["points", `${p.points} ${p.kind === "built" ? "added" : "deleted"}`],
       ["votes for it", p.votes_median ? `${number(p.votes_median)} (fewest ${p.votes_min})` : "unknown"],
       Number.isFinite(p.probability) && ["probability", `${Math.round(100 * p.probability)} %, mean of its cells`],
