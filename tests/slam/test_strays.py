@@ -7,10 +7,21 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from hand_made import make_map, make_tile, wall
 from mapvote.core.grid import Lattice
 from mapvote.core.types import F64
 from mapvote.core.voxels import VoxelCloud, thin, voxel_downsample
-from mapvote.slam.clean_map import LARGEST_SPECK, MET_SHARE, NEAR_M, SEEN_THROUGH, seen_through, specks, strays
+from mapvote.slam.clean_map import (
+    LARGEST_SPECK,
+    MET_SHARE,
+    NEAR_M,
+    SEEN_THROUGH,
+    lone_points,
+    seen_through,
+    specks,
+    strays,
+    without_lone_points,
+)
 
 LATTICE = Lattice()
 
@@ -130,3 +141,14 @@ def test_specks_are_the_small_groups_of_touching_voxels_that_were_hit_once_each(
 def test_a_voxel_that_rays_crossed_often_and_few_scans_hit_was_a_trail() -> None:
     hit_passed_crossed = np.array([[1, 9, SEEN_THROUGH], [0, 9, SEEN_THROUGH - 1], [9, 9, 9], [2, 40, 0]])
     assert seen_through(hit_passed_crossed).tolist() == [True, False, False, False]
+
+
+def test_of_a_map_from_elsewhere_a_point_alone_in_the_air_is_dropped_and_a_wall_or_a_pole_stays() -> None:
+    ground = wall([(r, c) for r in range(10, 40) for c in range(10, 40)], [0.05])
+    pole = wall([(20, 20)], [0.45 + 0.3 * k for k in range(8)])
+    lone = np.array([[9.1, 9.1, 3.1]])
+    at_the_edge = np.array([[0.1, 9.1, 3.1]])
+    tile = make_tile(np.concatenate([ground, pole, lone, at_the_edge]).astype(np.float32))
+    assert np.flatnonzero(lone_points(tile)).tolist() == [len(ground) + len(pole)]
+    cleaned, dropped = without_lone_points(make_map({(0, 0): tile}))
+    assert (dropped, cleaned.n_points) == (1, len(tile.points) - 1)

@@ -131,6 +131,7 @@ def import_map(
         str | None,
         typer.Option(metavar="CRS", help="what the file is in, where it does not say so rightly: EPSG:n, WKT, local"),
     ] = None,
+    clean: Annotated[bool, typer.Option("--clean", help="drop points above the ground that touch no other")] = False,
 ) -> None:
     """Make a mapvote map of somebody's point cloud: in metres, cut into tiles, ground measured. Says what it drops.
 
@@ -144,6 +145,11 @@ def import_map(
     with waiting(f"reading {source}"):
         wanted = frame_wanted(crs, projector)
         point_map, told = import_cloud(source, wanted, from_crs, folder_beside(out), look_at_points(str(source)))
+    if clean:
+        from mapvote.slam.clean_map import without_lone_points
+
+        point_map, lone = without_lone_points(point_map)
+        told = [*told, f"{lone} points above the ground dropped: they touch no other"]
     with waiting(f"writing {out}"):
         write_map(point_map, out)
     print(f"{out}: {point_map.n_points} points in {len(point_map.tiles)} tiles, map {point_map.map_id}")

@@ -27,6 +27,7 @@ from mapvote.formats.geo.projector import frame_of
 from mapvote.formats.maps.cloud import Cloud, joined
 from mapvote.formats.maps.mapvote_folder import is_map_folder
 from mapvote.formats.maps.tiling import to_map
+from mapvote.slam.clean_map import lone_points
 
 Pieces = Callable[[], Iterator[NDArray[np.floating]]]
 """The points (n, 3) of a map from the start, piece by piece: as often as it is called."""
@@ -49,6 +50,8 @@ _ALOFT_M = 100.0
 """Over the ground hardly anything of a street is so high."""
 _SPARSE_M = 0.4
 """Points farther apart make patterns of their own."""
+_MOST_LONE = 0.005
+"""Of a map's points; a survey's first map has a few in a thousand."""
 _MIDDLE_POINTS = 4_000_000
 """Of a map larger than memory so many show its ground and copies."""
 
@@ -264,6 +267,7 @@ def check_map(point_map: PointMap) -> list[Finding]:
     if some is not point_map:
         what = f"ground and copies were looked at in {len(some.tiles)} tiles of {len(point_map.tiles)}, in the middle"
         found.append(Finding("note", what))
+    found += _lone(some)
     standing = points[(height > 0.5) & (height < 6.0)]
     found += check_lean(standing)
     layer = ghost_layer(height)
@@ -278,6 +282,14 @@ def check_map(point_map: PointMap) -> list[Finding]:
             what = f"walls and poles are there twice, shifted by {by}: a ghost layer"
             found.append(Finding("error", what, "two drives were laid over each other unaligned: align them"))
     return found + _frame(point_map)
+
+
+def _lone(point_map: PointMap) -> list[Finding]:
+    lone = sum(int(lone_points(tile).sum()) for tile in point_map.tiles.values())
+    if lone <= _MOST_LONE * point_map.n_points:
+        return []
+    what = f"{lone} of {point_map.n_points} points stand above the ground and touch no other"
+    return [Finding("note", what, "vehicles will deny them; mapvote import --clean drops them")]
 
 
 def _around_the_middle(point_map: PointMap) -> PointMap:

@@ -27,6 +27,8 @@ drove was hit once or twice in each place, and rays passed there before and afte
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numba
 import numpy as np
 from scipy import ndimage
@@ -34,9 +36,10 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from mapvote.core.grid import CELL_SIZE, Lattice
+from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Lattice
 from mapvote.core.heights import crossings, heights_over_ground
 from mapvote.core.point_map import PointMap
+from mapvote.core.tile import Tile
 from mapvote.core.types import F32, F64, I32, I64, Bool
 from mapvote.core.voxels import slot_of, thin, voxel_keys
 
@@ -175,6 +178,26 @@ def specks(points: F64, times: I32, lattice: Lattice, largest: int = LARGEST_SPE
     keys = voxel_keys(points, lattice.x0, lattice.y0)
     table = np.zeros(1 << max(2 * len(keys), 2).bit_length(), dtype=np.int64)
     return _specks(keys, times <= 1, largest, table, np.zeros(len(table), dtype=np.bool_))
+
+
+def lone_points(tile: Tile) -> Bool:
+    """(n,) which points of a tile of somebody's map are specks: an obstacle that is alone in its voxel, and whose voxel
+    touches no other. Points within a voxel of the tile's edge are none: what they touch may lie beyond."""
+    within = tile.points[:, :2].astype(np.float64)
+    far = (within >= CELL_SIZE).all(axis=1) & (within < (TILE_CELLS - 1) * CELL_SIZE).all(axis=1)
+    once = np.ones(len(within), dtype=np.int32)
+    return np.asarray(far & tile.columns[1] & specks(tile.points_map, once, tile.window.lattice, largest=1))
+
+
+def without_lone_points(point_map: PointMap) -> tuple[PointMap, int]:
+    """The map without its :func:`lone_points`, and how many these were. Tiles without any stay the same objects."""
+    tiles, dropped = dict(point_map.tiles), 0
+    for index, tile in point_map.tiles.items():
+        lone = lone_points(tile)
+        if lone.any():
+            tiles[index] = tile.without(lone)
+            dropped += int(lone.sum())
+    return replace(point_map, tiles=tiles), dropped
 
 
 @numba.njit(cache=True, nogil=True)
