@@ -94,7 +94,7 @@ class Launcher:
 
 def launch() -> None:
     """The launcher's own process: a line of JSON for each server, the process and the address of it for an answer."""
-    from mapvote.cli.server import serve
+    from mapvote.cli.operate import serve
     from mapvote.server.http import serve as _loaded  # noqa: F401
 
     signal.signal(signal.SIGCHLD, signal.SIG_IGN)

@@ -155,7 +155,7 @@ def closed(store: Path) -> str:
 
 
 def file_of_changes(store: Path, folder: Path) -> Path:
-    """What `mapvote changes --html` writes of the newest version."""
+    """What `mapvote log --html` writes of the newest version."""
     opened = Store.open(f"sqlite:///{store}")
     try:
         newest = opened.current()

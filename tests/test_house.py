@@ -23,7 +23,6 @@ MOST_MODULES_NAMED_TWICE = 22
 """Module names with two meanings."""
 
 CIRCLES = [
-    {"mapvote.cli.remote", "mapvote.cli.store"},
     {"mapvote.formats.drives.rosbag"},
     {"mapvote.fusion.odds", "mapvote.fusion.tile_vote"},
 ]

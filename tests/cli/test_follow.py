@@ -11,7 +11,7 @@ import yaml
 from pypcd4 import PointCloud
 
 from live_server import serving
-from mapvote.cli.follow import follow_once
+from mapvote.cli.files import follow_once
 from mapvote.client import MapClient
 from mapvote.core.point_map import PointMap, all_points, map_from_points
 from mapvote.core.types import F64, MapvoteError

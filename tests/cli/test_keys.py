@@ -8,8 +8,7 @@ from pathlib import Path
 import pytest
 
 from hand_made import Say, make_ballot, states_plane, two_walls
-from mapvote.cli.server import policy
-from mapvote.cli.store import keys
+from mapvote.cli.operate import keys, policy
 from mapvote.codec.ballot import encode
 from mapvote.core.types import CellState
 from mapvote.server.store.admission import accept, examine

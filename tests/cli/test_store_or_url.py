@@ -66,12 +66,12 @@ def test_a_server_is_looked_at_run_and_exported_like_its_store(site: tuple[str, 
     assert "spent: version 2 has changed the cell since" in told
     assert "every plane, ballot and version is what it was" in both(site, "check")
     assert re.search(r"ballots +│ 2 ", both(site, "info"))
-    assert "Compared where others agree" in both(site, "vehicles")
-    found = json.loads(both(site, "changes", "--metres"))
+    assert "Compared where others agree" in both(site, "info", "--vehicles")
+    found = json.loads(both(site, "log", "--from", 1, "--metres"))
     assert [f["properties"]["kind"] for f in found["features"]] == ["demolished"]
     pages = [tmp_path / "store.html", tmp_path / "server.html"]
     for source, page in zip(site, pages, strict=True):
-        assert "the largest of 1 changes" in say("changes", source, "--html", page)
+        assert "the largest of 1 changes" in say("log", source, "--html", page)
     assert pages[0].read_text() == pages[1].read_text()
     out = [tmp_path / "store", tmp_path / "server"]
     for source, folder in zip(site, out, strict=True):
@@ -107,7 +107,7 @@ def test_a_server_rolls_back_and_withdraws_a_drive(tmp_path: Path) -> None:
         assert "1 ballots of a withdrawn" in say("unvote", url, "a", "--drive", "d")
 
 
-@pytest.mark.parametrize("verb", [["gc"], ["keys"], ["upgrade"], ["serve"]])
+@pytest.mark.parametrize("verb", [["gc"], ["keys"], ["serve"]])
 def test_a_verb_for_the_stores_own_machine_refuses_an_address(verb: list[str]) -> None:
     result = CliRunner().invoke(app, [*verb, "http://localhost:1"])
     assert isinstance(result.exception, MapvoteError)

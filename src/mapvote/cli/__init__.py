@@ -18,20 +18,20 @@ for _threads in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     # time. Work is spread over vehicles and tiles instead. Whoever sets a number keeps it.
     os.environ.setdefault(_threads, "1")
 
-from mapvote.cli import coverage, diff, files, follow, inspect, live, server, setup, store, update, vehicle  # noqa: E402
+from mapvote.cli import coverage, diff, files, live, operate, setup, update, vehicle  # noqa: E402
 from mapvote.cli.terminal import complain  # noqa: E402
 from mapvote.core.types import MapvoteError  # noqa: E402
 
 app = typer.Typer(
     name="mapvote",
     help="Keep 3D point-cloud maps true: vehicles vote on what has changed.",
-    epilog="`mapvote COMMAND --help` is the manual of a command. `mapvote demo` shows the whole in two minutes.",
+    epilog="`mapvote COMMAND --help` is the manual of a command. `mapvote demo` shows all of it in a minute.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     rich_markup_mode="markdown",
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-for verbs in (vehicle, live, diff, files, update, server, store, coverage, follow, inspect, setup):
+for verbs in (vehicle, live, diff, files, update, operate, coverage, setup):
     verbs.register(app)
 for other_package in entry_points(group="mapvote.verbs"):
     # The laboratory (demo, simulate, evaluate) adds its verbs here; this package does not know of it.

@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from mapvote.cli.door import api_at
 from mapvote.cli.options import SERVER, KeyFile
 from mapvote.cli.terminal import print_table
 
@@ -29,18 +30,10 @@ def coverage(
 
     mapvote coverage map.db --out drive_next.geojson
     """
-    from mapvote.cli.remote import is_url, server_at
-    from mapvote.cli.store import opened_store
     from mapvote.formats.atomic import whole_file
 
-    if is_url(name):
-        with server_at(name, key_file) as server:
-            found = server.ask_json("GET", "/v1/coverage/passes")
-    else:
-        from mapvote.server.views.coverage import as_features, wanted_passes
-
-        with opened_store(name) as store:
-            found = as_features(wanted_passes(store))
+    with api_at(name, key_file) as server:
+        found = server.ask_json("GET", "/v1/coverage/passes")
     rows = []
     for feature in found["features"][:most]:
         told, line = feature["properties"], feature["geometry"]["coordinates"]

@@ -8,15 +8,16 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from mapvote.cli.door import api_at, is_store, is_url, key_in, map_at, opened_store, when
 from mapvote.cli.looks import look_at_points
 from mapvote.cli.options import DRIVE, MAP, KeyFile, Projector, Rate, Topic, with_drive_options
-from mapvote.cli.remote import is_store, is_url, map_at, overview_of
-from mapvote.cli.store import opened_store
-from mapvote.cli.terminal import stages_that_vanish, waiting
+from mapvote.cli.terminal import print_table, stages_that_vanish, waiting
 
 if TYPE_CHECKING:
+    from mapvote.client import MapClient
     from mapvote.core.point_map import PointMap
     from mapvote.doctor.finding import Finding
+    from mapvote.formats.maps.autoware import Change
 
 
 def register(app: typer.Typer) -> None:
@@ -31,23 +32,40 @@ def info(
     path: Annotated[
         str, typer.Argument(metavar="PATH|STORE|URL", help="a map, a drive or a ballot, in any format; or a store")
     ],
+    vehicles: Annotated[
+        bool, typer.Option("--vehicles", help="of a store: which vehicles contradict the others, and where")
+    ] = False,
     rate_hz: Rate = None,
     topic: Topic = None,
     key_file: KeyFile = None,
 ) -> None:
-    """Say what is in this file or folder, or in a store or behind a server.
+    """Describe a file, a folder, a store or a server's store.
 
     mapvote info my_map
+
+    mapvote info fleet.db --vehicles
     """
     from rich.console import Console
     from rich.table import Table
     from rich.text import Text
 
+    from mapvote.core.types import MapvoteError
     from mapvote.formats.describe import describe
 
-    with waiting(f"reading {path}"):
-        found = overview_of(path, key_file)
-        title, rows = describe(Path(path), rate_hz=rate_hz, topic=topic) if found is None else ("store", found)
+    in_store = is_url(path) or is_store(path)
+    if vehicles and not in_store:
+        raise MapvoteError(f"info: {path} is no STORE or URL; --vehicles needs one")
+    if in_store:
+        with api_at(path, key_file) as server, waiting(f"reading {path}"):
+            found = server.ask_json("GET", "/v1/vehicles" if vehicles else "/v1/info")
+        if vehicles:
+            _print_standings(found["vehicles"])
+            return
+        found["published"] = when(found.pop("published_ns"))
+        title, rows = "store", [(key.replace("_", " "), _readable(value)) for key, value in found.items()]
+    else:
+        with waiting(f"reading {path}"):
+            title, rows = describe(Path(path), rate_hz=rate_hz, topic=topic)
     table = Table(show_header=False)
     table.add_column(style="cyan", no_wrap=True)
     table.add_column(overflow="fold")
@@ -56,6 +74,22 @@ def info(
     console = Console(highlight=False)
     console.print(Text(f"{path}: {title}", style="bold"), soft_wrap=True)
     console.print(table)
+
+
+def _readable(value: int | str) -> str:
+    return f"{value:,}" if isinstance(value, int) else value
+
+
+def _print_standings(found: list[dict[str, Any]]) -> None:
+    rows = []
+    for s in found:
+        places = "; ".join(f"{e['says']} at {e['x']:.1f}, {e['y']:.1f} ({e['cells']} cells)" for e in s["evidence"][:3])
+        counts = str(s["cells"]), str(s["objects"]), str(s["others_objects"]), f"{s['p_value']:.2g}"
+        rows.append((s["vehicle"], s["verdict"], *counts, places))
+    print_table(("vehicle", "verdict", "cells compared", "contradictions", "of the others", "p", "the largest"), rows)
+    print(
+        "Compared where others agree both before and after a vehicle passed; the first and the last cannot be judged."
+    )
 
 
 def doctor(
@@ -173,16 +207,30 @@ def export(
     since: Annotated[
         int | None, typer.Option(metavar="N", help="Autoware: only tiles that differ from this version's")
     ] = None,
+    follow: Annotated[
+        bool, typer.Option("--follow", help="of a URL: keep a folder of Autoware tiles at the newest version")
+    ] = False,
+    keep: Annotated[int, typer.Option(min=0, metavar="N", help="--follow: older versions whose tiles stay")] = 3,
+    every: Annotated[float, typer.Option(min=0.1, metavar="SECONDS", help="--follow: how often to ask")] = 30.0,
+    once: Annotated[bool, typer.Option("--once", help="--follow: ask once and end")] = False,
     key_file: KeyFile = None,
 ) -> None:
     """Write a map's points in another format, in its own coordinate system or another. Says what it drops.
 
-    From a store or a server, Autoware tiles are named by their content: a running Autoware takes a path for what it is.
+    From a store or a server, names of Autoware tiles depend on their content, because a running Autoware reads a path
+    once.
 
-    mapvote export my_map city.pcd
+        mapvote export my_map city.pcd
+
+        mapvote export https://maps.example.org map --follow --key-file key
     """
     from mapvote.core.types import MapvoteError
 
+    if follow:
+        if not is_url(source) or out.suffix:
+            raise MapvoteError("export: --follow takes the URL of a server and a folder")
+        _follow(source, out, projector, key_file, keep=keep, every=None if once else every)
+        return
     try:
         x, y, z = (float(v) for v in offset.split(","))
     except ValueError as error:
@@ -230,3 +278,42 @@ def _lay(point_map: PointMap, out: Path, older: PointMap | None, projector: str 
         print(
             f"tiles of version {older.version} that are as they were are named, not written: copy this folder over it"
         )
+
+
+def _follow(
+    url: str, folder: Path, projector: str | None, key_file: Path | None, *, keep: int, every: float | None
+) -> None:
+    """Keep ``folder`` at the newest version, asking ``every`` so many seconds; None: ask once."""
+    import time
+
+    from mapvote.client import MapClient, Unreachable
+
+    with MapClient(url, key=key_in(key_file), home=folder / ".mapvote_cache") as client:
+        while True:
+            try:
+                change = follow_once(client, folder, projector, keep)
+                if change is not None:
+                    tiles = f"{change.tiles} tiles, {change.written} new, {change.deleted} old ones deleted"
+                    print(f"{folder}: version {change.version}, {tiles}", flush=True)
+            except Unreachable as error:
+                if every is None:
+                    raise
+                print(f"{error}; the folder stays as it is", flush=True)
+            if every is None:
+                return
+            time.sleep(every)
+
+
+def follow_once(client: MapClient, folder: Path, projector: str | None, keep: int) -> Change | None:
+    """Write the server's newest version into ``folder``; None if it is there already.
+
+    The frame is chosen once, with the first version, unless ``projector`` names one: a map that grows does not move.
+    """
+    from mapvote.formats.maps.autoware import laid_version, lay_version
+    from mapvote.formats.maps.exporting import autoware_pieces
+
+    if laid_version(folder) == client.newest():
+        return None
+    cloud = autoware_pieces(client.fetch(), folder, projector)
+    assert client.version is not None
+    return lay_version(folder, cloud, client.version, keep=keep)

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from mapvote.cli.options import DRIVE, Config, KeyFile, key_in
-from mapvote.cli.remote import client_of, is_url, map_at
+from mapvote.cli.door import client_of, is_url, key_in, map_at
+from mapvote.cli.options import DRIVE, Config, KeyFile
 
 if TYPE_CHECKING:
     from mapvote.live.drive import LiveDrive, Maps

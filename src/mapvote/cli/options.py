@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import inspect
-import os
 from collections.abc import Callable
 from functools import wraps
 from pathlib import Path
@@ -106,15 +105,3 @@ def with_drive_options(verb: Callable[..., None]) -> Callable[..., None]:
     command.__annotations__ = {p.name: p.annotation for p in parameters}
     del command.__wrapped__
     return command
-
-
-def key_in(key_file: Path | None) -> str | None:
-    """The key in a file, or in the environment: whatever is on the command line, everybody on the machine can read."""
-    from mapvote.core.types import MapvoteError
-
-    if key_file is None:
-        return os.environ.get("MAPVOTE_KEY") or None
-    try:
-        return key_file.read_text().strip() or None
-    except (OSError, UnicodeDecodeError) as error:
-        raise MapvoteError(f"{key_file}: holds no key that can be read ({error})") from error

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from mapvote.cli.door import client_of, key_in, map_at, region_in
 from mapvote.cli.looks import usable_drives
-from mapvote.cli.options import DRIVE, Config, DrivePath, KeyFile, key_in, with_drive_options
-from mapvote.cli.remote import client_of, map_at, region_in
+from mapvote.cli.options import DRIVE, Config, DrivePath, KeyFile, with_drive_options
 from mapvote.cli.terminal import progress, waiting
 
 if TYPE_CHECKING:

@@ -38,13 +38,16 @@ class Connection:
         url: str,
         *,
         key: str | None = None,
+        name: str | None = None,
         attempts: int = 4,
-        timeout_s: float = 30.0,
+        timeout_s: float | None = 30.0,
         sleep: Callable[[float], object] = time.sleep,
+        transport: httpx2.BaseTransport | None = None,
     ) -> None:
+        """``name``: what errors call the server (default: its URL). ``transport``: other than over the network."""
         headers = {"Accept-Encoding": "identity"} | ({"Authorization": f"Bearer {key}"} if key else {})
-        self._http = httpx2.Client(base_url=url.rstrip("/"), headers=headers, timeout=timeout_s)
-        self.url = url
+        self._http = httpx2.Client(base_url=url.rstrip("/"), headers=headers, timeout=timeout_s, transport=transport)
+        self.url = name or url
         self._attempts = attempts
         self._sleep = sleep
 

@@ -77,7 +77,7 @@ def test_only_operators_hear_who_contradicts_whom(town: tuple[Path, str]) -> Non
 def test_the_verb_says_the_same(town: tuple[Path, str]) -> None:
     import subprocess
 
-    done = subprocess.run(mapvote("vehicles", town[0]), capture_output=True, text=True, check=True)
+    done = subprocess.run(mapvote("info", town[0], "--vehicles"), capture_output=True, text=True, check=True)
     line = next(line for line in done.stdout.splitlines() if "liar" in line)
     assert "contradi" in line, "a narrow terminal cuts or wraps the word"
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from pypcd4 import PointCloud
 
 from hand_made import Say, make_ballot, states_plane, wall
-from mapvote.cli.follow import follow_once
+from mapvote.cli.files import follow_once
 from mapvote.client import MapClient
 from mapvote.codec.ballot import Ballot, encode
 from mapvote.codec.fields import FIELD_TYPES, pack_fields, unpack_fields

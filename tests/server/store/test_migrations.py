@@ -98,13 +98,13 @@ def test_head_is_the_last_of_one_line_of_revisions() -> None:
 
 
 def test_an_older_store_is_refused_until_it_is_upgraded_and_nothing_is_lost(next_release: str) -> None:
-    before, refusal = content(next_release), r"schema 0001 of an older mapvote.*mapvote upgrade STORE"
+    before, refusal = content(next_release), r"schema 0001 of an older mapvote.*mapvote serve STORE --upgrade"
     with pytest.raises(MapvoteError, match=refusal):
         Store.open(next_release)
     with pytest.raises(MapvoteError, match=refusal):
         Store.create(next_release, two_walls())
     for says in ("schema 0001 is now 0002", "nothing to do"):
-        done = CliRunner().invoke(app, ["upgrade", next_release], catch_exceptions=False)
+        done = CliRunner().invoke(app, ["serve", next_release, "--upgrade"], catch_exceptions=False)
         assert done.exit_code == 0
         assert says in done.output
     Store.open(next_release).close()

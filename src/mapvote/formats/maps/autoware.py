@@ -2,7 +2,7 @@
 
 Points are in the map frame, not relative to their tile, as autoware_map_loader expects them.
 
-A folder that a running stack reads (``mapvote follow``) changes while versions come and go. Autoware's differential
+A folder that a running stack reads (``mapvote export --follow``) changes while versions come and go. Autoware's differential
 loader takes the path of a tile for its identity, and reads the metadata once, when it starts. So a tile's name changes
 with its content (X_Y_HASH8.pcd), the metadata is replaced last and atomically, and tiles of the last few versions stay
 for loaders that still go by older metadata.
@@ -38,7 +38,7 @@ TILES = "pointcloud_map.pcd"
 """The folder of tiles really is called so, by Autoware's convention."""
 SIDE_M = 20
 HISTORY = ".mapvote_versions.json"
-"""Beside tiles that ``mapvote follow`` laid: which version has which."""
+"""Beside tiles that ``mapvote export --follow`` wrote: which version has which."""
 FOLLOWED = re.compile(r"-?\d+_-?\d+_[0-9a-f]{8}\.pcd")
 """How it names them: X_Y_HASH8.pcd."""
 CONTENT = "it lists x_resolution, y_resolution and NAME.pcd: [x, y] for every tile"
@@ -50,7 +50,7 @@ def is_autoware(path: Path) -> bool:
 
 def stream_autoware(path: Path) -> Iterator[Cloud]:
     """The tiles that the metadata lists, in its order; every point is checked to lie in its tile. A warning names tiles
-    that lie there unlisted, but for those that ``mapvote follow`` keeps of versions before.
+    that lie there unlisted, but for those that ``mapvote export --follow`` keeps of versions before.
 
     MapvoteError names a tile that is missing, broken, or whose points lie outside it by more than a centimetre.
     """
@@ -215,7 +215,9 @@ def lay_version(
     if the folder holds a map of somebody else.
     """
     if (folder / METADATA).is_file() and not (folder / HISTORY).is_file():
-        raise MapvoteError(f"{folder}: holds an Autoware map that mapvote follow did not make; choose another folder")
+        raise MapvoteError(
+            f"{folder}: holds an Autoware map that mapvote export --follow did not make; choose another folder"
+        )
     if keep < 0:
         raise MapvoteError(f"--keep {keep}: a number of versions, 0 or more")
     tiles = folder / TILES

@@ -1,5 +1,5 @@
-"""The schema's history: a new store gets the newest schema, ``mapvote upgrade`` upgrades an older one, a newer one is
-refused.
+"""The schema's history: a new store gets the newest schema, ``mapvote serve --upgrade`` upgrades an older one, and a
+newer one is refused.
 
 The revisions lie in ``migrations/versions``, one file each. Alembic runs them within one transaction: a store is at one
 revision or at the next, never in between. There is no way down: restore the backup instead.
@@ -38,7 +38,7 @@ def check(connection: sa.Connection) -> None:
     if revision in _known():
         raise MapvoteError(
             f"{where}: schema {revision} of an older mapvote, this one works with {HEAD}: stop the server, make a "
-            "backup, then run `mapvote upgrade STORE`"
+            "backup, then run `mapvote serve STORE --upgrade`"
         )
     raise MapvoteError(f"{where}: schema {revision} of a newer mapvote, this one knows up to {HEAD}: install that one")
 

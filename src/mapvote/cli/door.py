@@ -1,0 +1,200 @@
+"""How a verb reaches a map: a file, a STORE (a database), or the URL of a server.
+
+A STORE is opened in this process and asked by the same HTTP API as a server: a verb is written once.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Iterator
+from concurrent.futures import Executor
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from mapvote.cli.looks import sound_map
+from mapvote.cli.terminal import complain
+
+if TYPE_CHECKING:
+    from mapvote.client import MapClient
+    from mapvote.client.connection import Connection
+    from mapvote.client.map_client import Region
+    from mapvote.config import Settings
+    from mapvote.core.point_map import PointMap
+    from mapvote.server.store.store import Store
+
+_SQLITE = b"SQLite format 3\0"
+
+
+def is_url(name: str) -> bool:
+    """Whether this is a server's address."""
+    return name.startswith(("http://", "https://"))
+
+
+def is_store(name: str) -> bool:
+    """Whether this is a database's address, or an SQLite file."""
+    if name == "-" or ("://" in name and not is_url(name)):
+        return True
+    try:
+        with Path(name).open("rb") as file:
+            return file.read(len(_SQLITE)) == _SQLITE
+    except OSError:
+        return False
+
+
+def key_in(key_file: Path | None) -> str | None:
+    """The key in a file, or in $MAPVOTE_KEY: everybody on the machine can read a command line."""
+    from mapvote.core.types import MapvoteError
+
+    if key_file is None:
+        return os.environ.get("MAPVOTE_KEY") or None
+    try:
+        return key_file.read_text().strip() or None
+    except (OSError, UnicodeDecodeError) as error:
+        raise MapvoteError(f"{key_file}: holds no key that can be read ({error})") from error
+
+
+@contextmanager
+def api_at(
+    name: str, key_file: Path | None = None, settings: Settings | None = None, executor: Executor | None = None
+) -> Iterator[Connection]:
+    """The HTTP API of a server, or of a STORE within this process.
+
+    ``settings`` and ``executor`` are those of a STORE's fusion. A Ctrl-C ends the process at once: the API works in
+    other threads, and a transaction that is not finished leaves nothing behind, as after a kill -9.
+    """
+    from mapvote.client.connection import Connection
+
+    if is_url(name):
+        server = Connection(name, key=key_in(key_file), timeout_s=600.0)
+        try:
+            yield server
+        finally:
+            server.close()
+        return
+    from mapvote.server.http.in_process import URL, in_process
+    from mapvote.server.views.localisation_gate import gate_by
+
+    gate = None if settings is None else gate_by(settings.ndt)
+    with (
+        opened_store(name) as store,
+        in_process(store, settings, owner=who(), gate=gate, executor=executor) as transport,
+    ):
+        try:
+            yield Connection(URL, name=name, attempts=1, timeout_s=None, transport=transport)
+        except KeyboardInterrupt:
+            complain("interrupted; what was not finished was not written")
+            os._exit(130)
+
+
+def client_of(url: str, key: str | None) -> MapClient:
+    """A vehicle's connection to a server; its files are in the user's cache."""
+    from mapvote.client import MapClient
+    from mapvote.config import cache_folder
+
+    return MapClient(url, key=key, home=cache_folder())
+
+
+@contextmanager
+def map_at(
+    name: str,
+    key_file: Path | None,
+    version: int | None = None,
+    region: Region | None = None,
+    *,
+    or_kept: bool = False,
+) -> Iterator[PointMap]:
+    """The newest map of a store or a server, or one version of it; or a map in any file format.
+
+    Tiles of a map larger than memory are read while this is open. ``region``: only the tiles of a server's map that
+    touch it. ``or_kept``: if the server does not answer, the map that was fetched last, with a warning.
+    """
+    from mapvote.client import Unreachable
+    from mapvote.core.types import MapvoteError
+
+    if is_url(name):
+        with client_of(name, key_in(key_file)) as client:
+            try:
+                point_map = client.fetch(version, region=region)
+            except Unreachable as error:
+                if not or_kept:
+                    raise
+                point_map = client.fetch_kept(region)
+                print(f"warning: {error}. Version {point_map.version} is kept here and used", file=sys.stderr)
+            yield point_map
+        return
+    if region is not None:
+        raise MapvoteError(f"{name}: only a server sends a part of its map; leave out --region")
+    if is_store(name):
+        with opened_store(name) as store:
+            yield store.point_map(version)
+        return
+    if version is not None:
+        raise MapvoteError(f"{name}: only a store or a server has versions")
+    yield sound_map(name)
+
+
+def region_in(text: str) -> Region:
+    """X0,Y0,X1,Y1 in map metres; MapvoteError if it is none."""
+    from mapvote.core.types import MapvoteError
+
+    try:
+        x0, y0, x1, y1 = map(float, text.split(","))
+    except ValueError:
+        raise MapvoteError(f"--region {text}: give X0,Y0,X1,Y1 in map metres, lower left and upper right") from None
+    if not (x0 < x1 and y0 < y1):
+        raise MapvoteError(f"--region {text}: is empty; give the lower left corner first, then the upper right")
+    return x0, y0, x1, y1
+
+
+def store_url(name: str) -> str:
+    """The database URL of STORE on the command line. MapvoteError if it shows a password."""
+    from sqlalchemy.engine import make_url
+    from sqlalchemy.exc import ArgumentError
+
+    from mapvote.core.types import MapvoteError
+    from mapvote.server.store.store import url_of
+
+    given = os.environ.get("MAPVOTE_STORE", "") if name == "-" else name
+    if not given:
+        raise MapvoteError("STORE is -, but MAPVOTE_STORE is not set")
+    if is_url(given):
+        raise MapvoteError(f"{given}: this is a server. Name the STORE (a file or a database) on the server's machine")
+    try:
+        password = make_url(url_of(given)).password
+    except ArgumentError:
+        raise MapvoteError("STORE is no database URL: postgresql+psycopg://USER@HOST/NAME") from None
+    if password is not None and name != "-":
+        mend = "set MAPVOTE_STORE to the URL and give - as STORE, or keep the password in ~/.pgpass"
+        raise MapvoteError(f"everybody on this machine can read a password on the command line: {mend}")
+    return url_of(given)
+
+
+@contextmanager
+def opened_store(name: str) -> Iterator[Store]:
+    """An existing store, closed at the end."""
+    from mapvote.server.store.store import Store
+
+    store = Store.open(store_url(name))
+    try:
+        yield store
+    finally:
+        store.close()
+
+
+def who() -> str:
+    """The login name of the user of this machine, for a store's log."""
+    import getpass
+
+    try:
+        return getpass.getuser()
+    except (KeyError, OSError):  # no name for this number
+        return "operator"
+
+
+def when(stamp_ns: int) -> str:
+    """A time stamp as text, UTC."""
+    from datetime import UTC, datetime
+
+    return datetime.fromtimestamp(stamp_ns // 10**9, UTC).strftime("%Y-%m-%d %H:%M:%SZ")

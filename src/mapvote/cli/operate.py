@@ -1,0 +1,466 @@
+"""The operator's verbs: serve a store, publish, explain, roll back, withdraw votes, check, clear, issue keys."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, nullcontext
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, cast
+
+import typer
+
+from mapvote.cli.door import api_at, is_url, opened_store, store_url, when, who
+from mapvote.cli.looks import sound_map
+from mapvote.cli.options import SERVER, Config, KeyFile, Reason, StoreName, StoreOrUrl
+from mapvote.cli.terminal import print_table, waiting
+
+if TYPE_CHECKING:
+    from concurrent.futures import Executor
+
+    from mapvote.server.store.integrity import Damage
+    from mapvote.server.store.keys import Key, Role
+
+
+def register(app: typer.Typer) -> None:
+    """Add these verbs to ``app``."""
+    for verb in (serve, publish, policy, log, explain, rollback, unvote, check, gc, keys):
+        app.command(rich_help_panel=SERVER)(verb)
+
+
+def serve(
+    store: StoreName,
+    map_path: Annotated[Path | None, typer.Option("--map", metavar="MAP", help="first map of a new STORE")] = None,
+    host: Annotated[str, typer.Option(metavar="ADDRESS", help="where to listen")] = "127.0.0.1",
+    port: Annotated[int, typer.Option(min=0, max=65535, metavar="N", help="0: any free one")] = 8080,
+    open_: Annotated[bool, typer.Option("--open", help="need no keys, on this machine, until one is issued")] = False,
+    upgrade: Annotated[
+        bool, typer.Option("--upgrade", help="only bring the schema of an older STORE up to date, and end")
+    ] = False,
+    config: Config = None,
+) -> None:
+    """Serve a store to vehicles and operators until stopped. The first operator key of a new store is shown once.
+
+    Stop the server and make a backup before --upgrade.
+
+        mapvote serve fleet.db --map my_map
+    """
+    from mapvote.config import load_with_sources
+    from mapvote.server.http.serve import log_as_json, open_or_create
+    from mapvote.server.http.serve import serve as run
+    from mapvote.server.store.keys import issue
+    from mapvote.server.store.policy import Policy
+
+    if upgrade:
+        _upgrade(store_url(store))
+        return
+    settings, sources = load_with_sources(config)
+    first = Policy.of(settings) if config is not None or _of_policy(sources) else None
+    with waiting(f"opening {store}"):
+        opened, new = open_or_create(store_url(store), map_path, first, read=sound_map)
+    try:
+        if not new:
+            _refuse_policy(sources)
+        log_as_json()
+        if new and not open_:
+            key = issue(opened, "operator", "operator", by=who())
+            print(f"key of the operator, shown this once: {key}", flush=True)
+        run(opened, settings, host=host, port=port, opened=open_, ready=lambda url: print(f"serving {url}", flush=True))
+    finally:
+        opened.close()
+
+
+def _upgrade(url: str) -> None:
+    from mapvote.server.store.migrate import upgrade as upgrade_schema
+    from mapvote.server.store.store import existing
+
+    database = existing(url)
+    try:
+        before, after = upgrade_schema(database)
+    finally:
+        database.close()
+    print(f"schema {after}: nothing to do" if before == after else f"schema {before} is now {after}")
+
+
+def _of_policy(sources: Mapping[str, str]) -> list[str]:
+    """Settings that become a store's policy when it is created, and have no effect later."""
+    return [name for name in sources if name.partition(".")[0] in ("fuse", "gate", "voting")]
+
+
+def _refuse_policy(sources: Mapping[str, str]) -> None:
+    from mapvote.core.types import MapvoteError
+
+    for name in _of_policy(sources):
+        mend = "leave the setting out; `mapvote policy STORE` shows and changes the policy"
+        raise MapvoteError(f"{sources[name]}: {name} has no effect, because an existing store has its policy: {mend}")
+
+
+def publish(
+    store: StoreOrUrl,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="only say what would change")] = False,
+    override: Annotated[bool, typer.Option("--override", help="publish although the policy holds the version")] = False,
+    reason: Reason = "",
+    cluster: Annotated[
+        str | None, typer.Option(metavar="ADDRESS", help="Dask scheduler to fuse on, e.g. tcp://host:8786")
+    ] = None,
+    config: Config = None,
+    key_file: KeyFile = None,
+) -> None:
+    """Fuse the standing ballots and publish the next version. --cluster and --config are for a STORE only.
+
+    mapvote publish fleet.db --dry-run
+    """
+    from mapvote.config import load_with_sources
+    from mapvote.core.types import MapvoteError
+
+    settings = None
+    if not is_url(store):
+        settings, sources = load_with_sources(config)
+        _refuse_policy(sources)
+    elif cluster or config:
+        raise MapvoteError("publish: the server has its own --cluster and --config; leave these out")
+    ask = {"dry_run": dry_run, "override": override, "reason": reason}
+    with (
+        dask_cluster(cluster) if cluster else nullcontext() as executor,
+        api_at(store, key_file, settings, executor) as server,
+        waiting("deciding"),
+    ):
+        _print_outcome(server.ask_json("POST", "/v1/publish", json=ask), dry_run)
+
+
+def _print_outcome(told: Mapping[str, Any], dry_run: bool) -> None:
+    what = "published" if told["published"] else "dry run" if dry_run else "nothing changed"
+    tiles = f" in tiles {'; '.join(told['tiles'])}" if told["tiles"] else ""
+    changed = f"{told['points_added']} points added, {told['points_deleted']} deleted"
+    print(f"version {told['version']} ({what}): {changed}{tiles}")
+    for reason in told["held"]:
+        print(f"hold: {reason}")
+
+
+@contextmanager
+def dask_cluster(address: str) -> Iterator[Executor]:
+    """An executor on a Dask cluster. MapvoteError if Dask is not installed or no scheduler answers."""
+    from mapvote.core.types import MapvoteError
+
+    try:
+        from dask.distributed import Client
+    except ImportError as error:
+        raise MapvoteError("--cluster needs Dask: pip install 'mapvote[dask]'") from error
+    try:
+        client = Client(address, timeout="10s")
+    except OSError as error:
+        raise MapvoteError(f"--cluster {address}: no Dask scheduler answers there") from error
+    with client:
+        yield client.get_executor(pure=False)
+
+
+def policy(
+    store: StoreOrUrl,
+    values: Annotated[list[str] | None, typer.Argument(metavar="KEY=VALUE...", help="e.g. fuse.min_votes=3")] = None,
+    reason: Reason = "",
+    key_file: KeyFile = None,
+) -> None:
+    """Show or change the policy of a store: its round, quorum, limits and gate. A change takes effect at once.
+
+    mapvote policy fleet.db fuse.min_votes=3 --reason "more vehicles now"
+    """
+    from mapvote.core.types import MapvoteError
+
+    pairs = [value.partition("=") for value in values or ()]
+    if any(not equals for _, equals, _ in pairs):
+        raise MapvoteError("policy: give KEY=VALUE, e.g. fuse.min_votes=3; without values the policy is shown")
+    ask = {"values": {key: value for key, _, value in pairs}, "reason": reason}
+    with api_at(store, key_file) as server:
+        told = server.ask_json("PATCH", "/v1/policy", json=ask) if pairs else server.ask_json("GET", "/v1/policy")
+    print(f"policy of {when(told['at_ns'])} by {told['by']}" + (f": {told['reason']}" if told["reason"] else ""))
+    for section, entries in told["policy"].items():
+        for key, value in entries.items():
+            print(f"{section}.{key}={value}")
+
+
+def log(
+    store: StoreOrUrl,
+    events: Annotated[int, typer.Option(min=0, metavar="N", help="also the last N events")] = 0,
+    old: Annotated[
+        int | None, typer.Option("--from", metavar="VERSION", help="list what changed since this version")
+    ] = None,
+    new: Annotated[int | None, typer.Option("--to", metavar="VERSION", help="until this one; else the newest")] = None,
+    out: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="changes into a file: .geojson, or .gpkg (GeoPackage)")
+    ] = None,
+    page: Annotated[
+        Path | None,
+        typer.Option("--html", metavar="FILE", help="one page: the largest changes in 3D"),
+    ] = None,
+    min_cells: Annotated[int, typer.Option(min=1, metavar="N", help="leave out changes of fewer cells")] = 1,
+    metres: Annotated[bool, typer.Option("--metres", help="map metres instead of longitude and latitude")] = False,
+    key_file: KeyFile = None,
+) -> None:
+    """List the versions of a store, or what was built and demolished between two of them.
+
+    With --from, --out or --html: the changes, as GeoJSON in longitude and latitude, or as a GeoPackage in the map's own
+    coordinate system. A map in local metres gives metres.
+
+        mapvote log fleet.db --events 20
+
+        mapvote log fleet.db --from 1 --out changes.geojson
+    """
+    if (old, new, out, page) == (None, None, None, None):
+        with api_at(store, key_file) as server:
+            _print_versions(server.ask_json("GET", f"/v1/log?events={events}"))
+        return
+    from mapvote.formats.atomic import whole_file
+
+    local = metres or (out is not None and out.suffix.lower() == ".gpkg")
+    asked = f"from={old or 1}&min_cells={min_cells}" + ("" if new is None else f"&to={new}")
+    with api_at(store, key_file) as server, waiting("comparing versions"):
+        found = server.ask_json("GET", f"/v1/changes?{asked}&lonlat={str(not local).lower()}")
+        text = server.ask("GET", f"/v1/changes/page?{asked}").text if page is not None else ""
+    if page is not None:
+        with whole_file(page) as part:
+            part.write_text(text)
+        print(f"the largest of {len(found['features'])} changes in {page}")
+        if out is None:
+            return
+    _write_changes(found, out)
+
+
+def _print_versions(told: Mapping[str, Any]) -> None:
+    rows = []
+    for v in told["versions"]:
+        origin = v["target"] if v["target"] is not None else v["parent"]
+        made = v["kind"], str(origin or ""), when(v["created_ns"]), v["published_by"], v["reason"]
+        rows.append((str(v["number"]), *made))
+    print_table(("version", "kind", "from", "when", "by", "reason"), rows)
+    for event in told["events"]:
+        print(f"{event['seq']} {when(event['at_ns'])} {event['kind']} {event['actor']} {event['detail']}")
+
+
+def _write_changes(found: dict[str, Any], out: Path | None) -> None:
+    import json
+
+    from mapvote.formats.atomic import whole_file
+    from mapvote.formats.geo.geopackage import write_geopackage
+    from mapvote.formats.geo.projector import frame_of
+
+    if found.get("damaged"):
+        left_out = "; ".join(found["damaged"])
+        typer.echo(f"left out: tiles {left_out} are damaged (mapvote check says more)", err=True)
+    if out is None:
+        print(json.dumps(found, indent=1))
+        return
+    if out.suffix.lower() == ".gpkg":
+        write_geopackage(out, found["features"], frame_of(found["georeference"]))
+    else:
+        with whole_file(out) as part:
+            part.write_text(json.dumps(found, indent=1) + "\n")
+    print(f"{len(found['features'])} objects in {out}")
+
+
+def explain(
+    store: StoreOrUrl,
+    x: Annotated[float, typer.Argument(metavar="X", help="map metres; after -- if one is negative")],
+    y: Annotated[float, typer.Argument(metavar="Y", help="map metres")],
+    key_file: KeyFile = None,
+) -> None:
+    """Explain a cell of the map: every vote on it, and which version counted the vote or why none did.
+
+    mapvote explain fleet.db 12.5 -- -3.0
+    """
+    with api_at(store, key_file) as server:
+        told = server.ask_json("GET", f"/v1/cells?x={x}&y={y}")
+    print(f"cell {told['row']}, {told['col']}: {told['thing'] or 'empty'}")
+    for decision in told["decisions"]:
+        print(f"version {decision['version']} decided {decision['state']}")
+    if told.get("probability") is not None:
+        print(f"the last of them is right with a probability of {told['probability']:.2f}")
+    rows = []
+    for v in told["votes"]:
+        counted = ", ".join(str(number) for number in v["counted_in"])
+        counts = "counts" if v["counts"] else v["why"]
+        ended = v["end"][:19].replace("T", " ") + "Z"
+        sure = "" if v.get("sure") is None else f"{100 * v['sure']:.0f} %"
+        rows.append((v["vehicle"], v["drive"], ended, str(v["version"]), v["state"], sure, counted, counts))
+    print_table(("vehicle", "drive", "ended", "drove with", "says", "sure", "counted in", "now"), rows)
+
+
+def rollback(
+    store: StoreOrUrl,
+    to: Annotated[int, typer.Argument(metavar="VERSION", help="the version to return to")],
+    reason: Reason = "",
+    key_file: KeyFile = None,
+) -> None:
+    """Publish an older version again. The votes that led away from it do not count any more.
+
+    mapvote rollback fleet.db 1 --reason "the second was wrong"
+    """
+    with api_at(store, key_file) as server:
+        number = server.ask_json("POST", "/v1/rollback", json={"to": to, "reason": reason})["version"]
+    print(f"version {number} is version {to} again")
+
+
+def unvote(
+    store: StoreOrUrl,
+    vehicle: Annotated[str | None, typer.Argument(metavar="[VEHICLE]", help="whose votes are withdrawn")] = None,
+    everybody: Annotated[bool, typer.Option("--all", help="the votes of every vehicle: begins a new round")] = False,
+    drive: Annotated[str | None, typer.Option(metavar="NAME", help="only this drive; else all of them")] = None,
+    replay: Annotated[
+        bool, typer.Option("--replay", help="remove them from published versions too, in a new version")
+    ] = False,
+    yes: Annotated[bool, typer.Option("--yes", help="with --replay: publish; else only show the difference")] = False,
+    key_file: KeyFile = None,
+) -> None:
+    """Withdraw a vehicle's votes from later versions or, with --replay, from every version.
+
+    A URL withdraws one drive. On a STORE also: all drives of a vehicle, --all, --replay.
+
+        mapvote unvote fleet.db car_1
+    """
+    from mapvote.core.types import MapvoteError
+
+    if (vehicle is None) != everybody:
+        raise MapvoteError("unvote: name one VEHICLE, or give --all")
+    if replay and (vehicle is None or drive is not None):
+        raise MapvoteError("unvote: --replay removes one whole vehicle; leave out --drive and --all")
+    if vehicle is not None and drive is not None:
+        with api_at(store, key_file) as server:
+            count = server.ask_json("DELETE", f"/v1/ballots/{vehicle}/{drive}")["withdrawn"]
+        print(f"{count} ballots of {vehicle} withdrawn")
+        return
+    if is_url(store):
+        raise MapvoteError(f"unvote: {store} withdraws one drive: name VEHICLE and --drive, or run this on the STORE")
+    _unvote(store, vehicle, replay, yes)
+
+
+def _unvote(store: str, vehicle: str | None, replay: bool, yes: bool) -> None:
+    from mapvote.server.store.ballots import withdraw
+    from mapvote.server.store.queries import names
+    from mapvote.server.store.replay import replay as replay_without
+
+    with opened_store(store) as opened:
+        if not replay or vehicle is None:
+            whose = vehicle or "all vehicles"
+            print(f"{withdraw(opened, vehicle, by=who())} ballots of {whose} withdrawn")
+            return
+        with waiting("deciding anew"):
+            done = replay_without(opened, vehicle, by=who(), dry_run=not yes)
+    what = "published" if done.published else "only shown: --yes publishes it"
+    tiles = f" in tiles {names(done.tiles)}" if done.tiles else ""
+    print(f"version {done.version} ({what}): {done.added} points added, {done.deleted} deleted{tiles}")
+
+
+def check(
+    store: StoreOrUrl,
+    mend: Annotated[bool, typer.Option("--mend", help="set damaged parts aside; with --from replace them")] = False,
+    other: Annotated[str | None, typer.Option("--from", metavar="STORE", help="e.g. a backup of this store")] = None,
+    key_file: KeyFile = None,
+) -> None:
+    """Read every byte of a store and compare it with its checksum. Exit code 1 if something is damaged.
+
+    mapvote check fleet.db --mend --from backup.db
+    """
+    from mapvote.core.types import MapvoteError
+    from mapvote.server.store.integrity import Damage
+
+    if other is None:
+        with api_at(store, key_file) as server, waiting("reading every byte"):
+            told = server.ask_json("POST" if mend else "GET", "/v1/check")
+        found = [Damage(**damage) for damage in told["damage"]]
+    elif is_url(store):
+        raise MapvoteError("check: --from takes a STORE, on the machine where it is")
+    else:
+        found = _check_beside(store, other, mend)
+    for damage in found:
+        print(damage)
+    if found:
+        raise MapvoteError(f"{store}: {len(found)} things are damaged" + ("" if mend else "; --mend sets them aside"))
+    print("every plane, ballot and version is what it was when it was written")
+
+
+def _check_beside(store: str, other: str, mend: bool) -> list[Damage]:
+    """Check a store with the planes of another one at hand."""
+    from mapvote.codec.arrays import unpack_bytes
+    from mapvote.core.types import MapvoteError
+    from mapvote.server.store.integrity import check as look
+    from mapvote.server.store.planes import MAX_PLANE_BYTES
+
+    with opened_store(store) as opened, opened_store(other) as backup, waiting("reading every byte"):
+
+        def elsewhere(digest: str) -> bytes | None:
+            try:
+                return unpack_bytes(backup.blob(digest), MAX_PLANE_BYTES, f"tile plane {digest[:12]}")
+            except MapvoteError:
+                return None
+
+        return look(opened, mend=mend, source=elsewhere, by=who())
+
+
+def gc(
+    store: StoreName,
+    yes: Annotated[bool, typer.Option("--yes", help="delete; else only say what would be deleted")] = False,
+) -> None:
+    """Delete what the policy does not keep: old versions (keep.versions) and ballots that can decide nothing more.
+
+    mapvote gc fleet.db
+    """
+    from mapvote.server.store.retention import clear
+
+    with opened_store(store) as opened, waiting("looking for what can go"):
+        done = clear(opened, by=who(), dry_run=not yes)
+    counts = f"{done.versions} versions ({done.planes} planes, {done.decisions} decisions)"
+    print(f"{counts} and {done.ballots} ballots on tiles, {done.size:,} bytes" + ("" if yes else ": --yes clears them"))
+    print(f"the oldest version left is {done.oldest}")
+
+
+def keys(
+    store: StoreName,
+    action: Annotated[str, typer.Argument(metavar="[ACTION]", help="list, issue, rotate or revoke")] = "list",
+    name: Annotated[str | None, typer.Argument(metavar="[NAME]", help="of a vehicle or a person")] = None,
+    role: Annotated[str, typer.Option(help="vehicle, reader, reviewer or operator")] = "vehicle",
+    operator: Annotated[bool, typer.Option("--operator", help="the same as --role operator")] = False,
+    days: Annotated[float | None, typer.Option(help="the key expires after so many days")] = None,
+    overlap_days: Annotated[float, typer.Option(min=0, help="rotate: how long the old keys still work")] = 1.0,
+    keep_votes: Annotated[
+        bool | None,
+        typer.Option(
+            "--keep-votes/--end-votes",
+            help="revoke: whether standing ballots still count [default: ask on a terminal, else they do not]",
+        ),
+    ] = None,
+) -> None:
+    """List, issue, rotate or revoke keys. A new key is printed once and stored only as a hash.
+
+    mapvote keys fleet.db issue car_1
+    """
+    from mapvote.core.types import MapvoteError
+    from mapvote.server.store import keys as store_keys
+
+    with opened_store(store) as opened:
+        if action == "list":
+            for key in store_keys.listed(opened):
+                print(f"{key.role} {key.name}: issued {when(key.created_ns)}, {_state(key, opened.clock())}")
+        elif action == "issue" and name is not None:
+            print(store_keys.issue(opened, name, cast("Role", "operator" if operator else role), by=who(), days=days))
+        elif action == "rotate" and name is not None:
+            print(store_keys.rotate(opened, name, by=who(), overlap_days=overlap_days))
+        elif action == "revoke" and name is not None:
+            keep = _keep_votes(store_keys.ballots_standing(opened, name), name) if keep_votes is None else keep_votes
+            revoked, ended = store_keys.revoke(opened, name, by=who(), keep_votes=keep)
+            print(f"{revoked} keys of {name} revoked" + (f", {ended} ballots do not count any more" if ended else ""))
+        else:
+            raise MapvoteError("keys: give list, issue NAME, rotate NAME or revoke NAME")
+
+
+def _keep_votes(standing: int, name: str) -> bool:
+    """Whether the ballots of a revoked name still count: ask on a terminal, else no."""
+    import sys
+
+    if not standing or not sys.stdin.isatty():
+        return False
+    return typer.confirm(f"{standing} ballots of {name} stand. Shall they still count?", default=False)
+
+
+def _state(key: Key, now_ns: int) -> str:
+    if key.revoked_ns is not None:
+        return f"revoked {when(key.revoked_ns)}"
+    end = "" if key.expires_ns is None else f"until {when(key.expires_ns)}"
+    return f"valid {end}".strip() if key.valid_at(now_ns) else f"ended {end.removeprefix('until ')}"
