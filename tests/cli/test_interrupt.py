@@ -77,6 +77,7 @@ VERBS = {
     "log STORE": "import mapvote.server.store.store as m; m.Store.versions = wait",
     "log STORE --out new": "import mapvote.server.views.history as m; m.changes_between = wait",
     "config": "import mapvote.config as m; m.load_with_sources = wait",
+    "diff my_map city.pcd --out new": "import mapvote.formats as m; m.read_map = wait",
     "demo --out new": "import mapvote_lab.evaluation.demo as m; m.evaluate = wait",
     "evaluate tiny.toml --json new": "import mapvote_lab.evaluation.evaluate as m; m.evaluate = wait",
     "warmup": "import mapvote.warmup as m; m.warm_up = wait",

@@ -145,7 +145,7 @@ def test_a_server_sets_aside_what_is_damaged(site: tuple[str, str]) -> None:
         connection.execute(b.update().where(b.c.seq == seq).values(vehicle="c"))
     result = CliRunner().invoke(app, ["check", site[1], "--mend"])
     assert result.exit_code == 1
-    assert f"ballot {seq}: its head is not what its sum says; set aside" in result.output
+    assert f"ballot {seq}: is not what its sum says; set aside" in result.output
     with store.database.reading() as connection:
         assert ("ballot", str(seq)) in set_aside(connection)
     store.close()

@@ -79,6 +79,7 @@ def api_at(
     gate = None if settings is None else gate_by(settings.ndt)
     with (
         opened_store(name) as store,
+        _errors_only(),
         in_process(store, settings, owner=who(), gate=gate, executor=executor) as transport,
     ):
         try:
@@ -86,6 +87,24 @@ def api_at(
         except KeyboardInterrupt:
             complain("interrupted; what was not finished was not written")
             os._exit(130)
+
+
+@contextmanager
+def _errors_only() -> Iterator[None]:
+    """The API logs every request, to stdout; a verb's stdout is its answer."""
+    import logging
+
+    import structlog
+
+    before = structlog.get_config()
+    structlog.configure(
+        wrapper_class=structlog.make_filtering_bound_logger(logging.ERROR),
+        logger_factory=structlog.PrintLoggerFactory(sys.stderr),
+    )
+    try:
+        yield
+    finally:
+        structlog.configure(**before)
 
 
 def client_of(url: str, key: str | None) -> MapClient:
