@@ -2,7 +2,7 @@
 
 Points are in the map frame, not relative to their tile, as autoware_map_loader expects them.
 
-A folder that a running stack reads (``mapvote export --follow``) changes while versions come and go. Autoware's differential
+A folder that a running stack reads (``export --follow``) changes while versions come and go. Autoware's differential
 loader takes the path of a tile for its identity, and reads the metadata once, when it starts. So a tile's name changes
 with its content (X_Y_HASH8.pcd), the metadata is replaced last and atomically, and tiles of the last few versions stay
 for loaders that still go by older metadata.
