@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from mapvote.cli.options import EVALUATE, Config, Scenario, Seed
-from mapvote.cli.terminal import progress, stages
+from mapvote.cli.terminal import print_table, progress, stages
 
 if TYPE_CHECKING:
     from mapvote_lab.evaluation.evaluate import Evaluation
@@ -97,6 +97,8 @@ def evaluate(
     mapvote evaluate as_published --case 1,2,3,4,5 --readings
 
     mapvote evaluate real my_drive --out report
+
+    mapvote evaluate court FOLDER: a real place at two times (docs/diff.md)
     """
     _need_lab("evaluate")
     from rich.console import Console
@@ -115,6 +117,11 @@ def evaluate(
         if figures is not None:
             raise typer.BadParameter("of a recorded drive --out draws the pictures", param_hint="--figures")
         _evaluate_real(drive, case, scans, seed, json, out, config)
+        return
+    if scenario == "court":
+        if drive is None:
+            raise typer.BadParameter("name the folder: mapvote evaluate court FOLDER", param_hint="DRIVE")
+        _evaluate_court(drive, case, json, config)
         return
     if drive is not None:
         raise typer.BadParameter(f"{drive}: a drive follows the word real only", param_hint="DRIVE")
@@ -147,6 +154,24 @@ def _draw_figures(evaluation: Evaluation, out: Path) -> None:
     with progress("drawing"):
         drawn = gallery(evaluation, evaluation.best, out, FORMATS)
     print(f"{out}: {len(drawn)} figures, each as PNG, SVG and PDF")
+
+
+def _evaluate_court(folder: Path, case: str | None, json: Path | None, config: Path | None) -> None:
+    """The court's three sessions, as cast scans by ``case`` and as clouds."""
+    from mapvote.config import load_settings
+    from mapvote_lab.evaluation.experiments.cases import choose_cases
+    from mapvote_lab.evaluation.experiments.court import Court, court_rows, evaluate_court
+    from mapvote_lab.evaluation.reporting.tables import write_text
+    from mapvote_lab.evaluation.results import to_json
+
+    settings = load_settings(config)
+    cases, _ = choose_cases(settings, case or "1,2,3,4,5,surfaces")
+    with stages() as told:
+        scores = evaluate_court(Court.read(folder), settings, cases, told)
+    print_table(*court_rows(scores))
+    if json is not None:
+        write_text(to_json({"scores": scores}), json)
+        print(f"{json}: all numbers")
 
 
 def _evaluate_real(

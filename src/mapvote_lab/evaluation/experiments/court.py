@@ -1,0 +1,261 @@
+"""A real court that changed: one reference cloud, three later sessions, three changes that all of them agree on.
+
+There are no scans: they are cast from each session's cloud along a way through the court, as a sensor of 32 beams would
+have taken them. Cast rays pass between the points of porous crowns, which real ones would not. So only the boxes of the
+agreed changes are known; any other decided object is held against what some session's cloud shows by geometry alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy import ndimage
+from scipy.spatial import KDTree
+
+from mapvote.codec.ballot import Ballot
+from mapvote.comparison.cloud_changes import CloudChange, Kind
+from mapvote.comparison.session_votes import vote_of_session
+from mapvote.config import Settings
+from mapvote.core.grid import CELL_SIZE, Grid
+from mapvote.core.point_map import PointMap, all_points
+from mapvote.core.sensors import SENSORS
+from mapvote.core.types import F64, U8, CellState, Drive, MapvoteError, Scan
+from mapvote.formats import read_map
+from mapvote.fusion.fuse import states_over
+from mapvote.fusion.offline import update_map
+from mapvote.vehicle import vote_drive
+from mapvote_lab.evaluation.experiments.cases import Case
+
+SESSIONS = ("robot1", "robot2", "robot3")
+CHANGES: dict[str, tuple[Kind, tuple[float, float, float, float]]] = {
+    "car": ("gone", (-4.7, -3.1, -2.6, 2.3)),
+    "structure": ("new", (16.3, -31.3, 27.1, -24.7)),
+    "thing": ("new", (-6.2, 10.7, -4.4, 13.1)),
+}
+"""What all sessions agree on: x0, y0, x1, y1 in the reference's metres."""
+_WAY = ((2, 44), (2, 20), (2, 2), (10, -6), (14, -22), (22, -20), (20, 0), (18, 20), (12, 40))
+"""Over the paved middle of the court."""
+_STEP_M, _SENSOR_M = 1.6, 1.9
+_SPACING_M = 0.18
+"""Each point of a cloud is a disc so wide."""
+_MARGIN_M = 1.0
+_FAR_M = 0.6
+FALSE_M2 = 2.0
+_ENDED_NS = 1_700_000_000_000_000_000
+Tell = Callable[[str, int, int], None]
+
+
+@dataclass(frozen=True, slots=True)
+class CourtScore:
+    """What one method published."""
+
+    method: str
+    left: int
+    """Points of the car that stay, above the ground, of ``before``."""
+    before: int
+    added: tuple[int, int]
+    """Points in the boxes of the structure and of the thing that came."""
+    found: int
+    """Of the three: the car lost half of its points, or 50 points came."""
+    elsewhere: tuple[int, int]
+    """Points deleted and added outside of the boxes."""
+    others: tuple[float, ...]
+    """Areas of the objects above 2 m2 outside of the boxes, m2."""
+    false: tuple[float, ...]
+    """Of these, those that no session's cloud shows."""
+
+
+@dataclass(frozen=True, slots=True)
+class Court:
+    """The clouds, in one frame."""
+
+    reference: PointMap
+    sessions: dict[str, PointMap]
+
+    @classmethod
+    def read(cls, folder: Path) -> Court:
+        """MapvoteError naming the first file that is missing."""
+        for name in ("gtmap", *SESSIONS):
+            if not (folder / f"{name}.pcd").is_file():
+                raise MapvoteError(f"{folder}: no {name}.pcd; docs/diff.md says where the court's clouds come from")
+        return cls(read_map(folder / "gtmap.pcd"), {name: read_map(folder / f"{name}.pcd") for name in SESSIONS})
+
+
+def evaluate_court(court: Court, settings: Settings, cases: Sequence[Case], tell: Tell) -> list[CourtScore]:
+    """Scores of every case on cast scans, of the sessions' clouds as ballots, of one of them alone, and of plain
+    distances between clouds."""
+    surfaces = settings.model_copy(update={"voting": settings.voting.model_copy(update={"method": "surfaces"})})
+    as_clouds, shown = [], dict[str, list[CloudChange]]()
+    for k, (name, cloud) in enumerate(court.sessions.items()):
+        tell("voting with clouds", k, len(SESSIONS))
+        said = vote_of_session(name, name, court.reference, cloud, surfaces, end_ns=_ENDED_NS + k)
+        as_clouds.append(said.ballot)
+        shown[name] = said.changes
+    every = [change for changes in shown.values() for change in changes if change.kind != "not seen"]
+    scores = []
+    for k, case in enumerate(cases):
+        tell("voting with cast scans", k, len(cases))
+        own = settings.model_copy(update={"voting": case.voting, "paper": case.paper})
+        ballots = [
+            vote_drive(cast_drive(name, cloud), court.reference, own)[0] for name, cloud in court.sessions.items()
+        ]
+        scores.append(_fused(f"cast scans, {case.name}", court, ballots, own, max(case.min_votes, 2), every))
+    scores.append(_fused("clouds, surfaces", court, as_clouds, surfaces, 2, every))
+    scores.append(_fused("one cloud alone", court, as_clouds[:1], surfaces, 2, every))
+    scores.append(_by_distance(court, every))
+    return scores
+
+
+def cast_drive(name: str, cloud: PointMap) -> Drive:
+    """Scans of an HDL-32E along the way, cast from a session's cloud, wherever it knows the ground."""
+    points, sensor = all_points(cloud), SENSORS["hdl32e"]
+    corners = np.array(_WAY, dtype=np.float64)
+    along = np.append(0.0, np.cumsum(np.hypot(*np.diff(corners, axis=0).T)))
+    at = np.arange(0.0, along[-1], _STEP_M)
+    xy = np.column_stack([np.interp(at, along, corners[:, axis]) for axis in (0, 1)])
+    poses, scans = [], []
+    for k, place in enumerate(xy):
+        ground = points[np.hypot(*(points[:, :2] - place).T) < 2.5, 2]
+        if len(ground) < 20:
+            continue
+        ahead = xy[min(k + 1, len(xy) - 1)] - xy[max(k - 1, 0)]
+        c, s = ahead / np.linalg.norm(ahead)
+        T = np.eye(4)
+        T[:2, :2] = [[c, -s], [s, c]]
+        T[:3, 3] = *place, np.percentile(ground, 10) + _SENSOR_M
+        taken = _cast((points - T[:3, 3]) @ T[:3, :3], sensor.elevations_deg)
+        if len(taken) > 2000:
+            poses.append(T)
+            scans.append(Scan(_ENDED_NS + 100_000_000 * k, taken))
+    stamps_ns = np.array([scan.stamp_ns for scan in scans], dtype=np.int64)
+    return Drive(
+        Path(name), name, name, sensor, stamps_ns, scans.__getitem__, np.array(poses), 0.3, 1.0
+    )  # fmt: skip
+
+
+def _cast(points: F64, elevations_deg: Sequence[float]) -> np.ndarray:
+    """(m, 3) the nearest disc that each ray of a revolution meets, of points (n, 3) about the sensor."""
+    reach = np.linalg.norm(points, axis=1)
+    near = (reach > 1.5) & (reach < 70.0)
+    points, reach = points[near], reach[near]
+    beams = np.sort(np.radians(elevations_deg))
+    elevation = np.arcsin(points[:, 2] / reach)
+    half = 0.5 * _SPACING_M / reach
+    ring = np.clip(np.round(np.interp(elevation, beams, np.arange(len(beams)))).astype(np.int64), 0, len(beams) - 1)
+    hit = np.abs(elevation - beams[ring]) < np.maximum(half, 0.0015)
+    ring, reach, half, points = ring[hit], reach[hit], half[hit], points[hit]
+    step = np.radians(0.32)
+    cols = round(2 * np.pi / step)
+    col = np.floor((np.arctan2(points[:, 1], points[:, 0]) + np.pi) / step).astype(np.int64)
+    image = np.full((len(beams), cols), np.inf)
+    wide = np.minimum((half / step).astype(np.int64), 12)
+    for j in range(-int(wide.max(initial=0)), int(wide.max(initial=0)) + 1):
+        mine = np.abs(j) <= wide
+        np.minimum.at(image, (ring[mine], (col[mine] + j) % cols), reach[mine])
+    r, c = np.nonzero(np.isfinite(image))
+    azimuth, distance = (c + 0.5) * step - np.pi, image[r, c]
+    flat = distance * np.cos(beams[r])
+    taken = np.column_stack([flat * np.cos(azimuth), flat * np.sin(azimuth), distance * np.sin(beams[r])])
+    return np.asarray(taken + np.random.default_rng(0).normal(0.0, 0.01, taken.shape), dtype=np.float32)
+
+
+def _fused(
+    method: str, court: Court, ballots: Sequence[Ballot], settings: Settings, min_votes: int, shown: list[CloudChange]
+) -> CourtScore:
+    after, decisions = update_map(court.reference, ballots, settings.fuse.model_copy(update={"min_votes": min_votes}))
+    states, grid = states_over(court.reference.lattice, decisions)
+    return _score(method, _standing(court.reference), _standing(after), states, grid, shown)
+
+
+def _standing(point_map: PointMap) -> F64:
+    """(n, 3) points that are not ground."""
+    return np.concatenate([tile.points_map[tile.columns[1]] for _, tile in sorted(point_map.tiles.items())])
+
+
+def _by_distance(court: Court, shown: list[CloudChange]) -> CourtScore:
+    """Plain cloud-to-cloud: a point more than 0.6 m from every point of the other cloud is gone or new; published where
+    two sessions say so of a cell."""
+    before = _standing(court.reference)
+    lattice = court.reference.lattice
+    x, y = before[:, 0], before[:, 1]
+    low_r, low_c = (int(v[0]) for v in lattice.cells_of(np.array([[x.min() - 60, y.min() - 60]])))
+    grid = Grid(lattice, low_r, low_c, int((np.ptp(y) + 120) / CELL_SIZE), int((np.ptp(x) + 120) / CELL_SIZE))
+    votes = {"gone": np.zeros(grid.shape, np.int64), "new": np.zeros(grid.shape, np.int64)}
+    offered = []
+    reference = all_points(court.reference)
+    for cloud in court.sessions.values():
+        for kind, points, others in (
+            ("gone", before, all_points(cloud)),
+            ("new", _standing(cloud), reference),
+        ):
+            far = points[KDTree(others).query(points)[0] > _FAR_M]
+            rows, cols, inside = grid.indices_of(far)
+            cells = np.zeros(grid.shape, np.int64)
+            cells[rows[inside], cols[inside]] = 1
+            votes[kind] += cells
+            if kind == "new":
+                offered.append(far[inside])
+    states = np.full(grid.shape, 255, dtype=np.uint8)
+    states[votes["gone"] >= 2] = CellState.CHANGED_EMPTY
+    states[votes["new"] >= 2] = CellState.CHANGED_OCCUPIED
+    rows, cols, _ = grid.indices_of(before)
+    kept = before[states[rows, cols] != CellState.CHANGED_EMPTY]
+    new = np.concatenate(offered)
+    rows, cols, _ = grid.indices_of(new)
+    after = np.concatenate([kept, new[states[rows, cols] == CellState.CHANGED_OCCUPIED]])
+    return _score("cloud to cloud", before, after, states, grid, shown)
+
+
+def _in_box(points: F64, box: tuple[float, float, float, float], margin_m: float = 0.0) -> np.ndarray:
+    x0, y0, x1, y1 = box
+    x, y = points[:, 0], points[:, 1]
+    return np.asarray((x > x0 - margin_m) & (x < x1 + margin_m) & (y > y0 - margin_m) & (y < y1 + margin_m))
+
+
+def _score(method: str, before: F64, after: F64, states: U8, grid: Grid, shown: list[CloudChange]) -> CourtScore:
+    counts = {n: tuple(int(_in_box(p, box).sum()) for p in (before, after)) for n, (_, box) in CHANGES.items()}
+    gone = KDTree(after).query(before)[0] > 1e-6
+    come = KDTree(before).query(after)[0] > 1e-6
+    boxed = [np.logical_or.reduce([_in_box(p, box, _MARGIN_M) for _, box in CHANGES.values()]) for p in (before, after)]
+    others, false = [], []
+    for kind, state in (("gone", CellState.CHANGED_EMPTY), ("new", CellState.CHANGED_OCCUPIED)):
+        label, count = ndimage.label(states == state, np.ones((3, 3)))
+        for number in range(1, count + 1):
+            rows, cols = np.nonzero(label == number)
+            area_m2 = len(rows) * CELL_SIZE**2
+            xy = np.column_stack([grid.x0 + CELL_SIZE * (cols + 0.5), grid.y0 + CELL_SIZE * (rows + 0.5)])
+            if area_m2 <= FALSE_M2 or any(_in_box(xy, box, _MARGIN_M).any() for _, box in CHANGES.values()):
+                continue
+            others.append(round(area_m2, 1))
+            if not any(one.kind == kind and _in_box(xy, one.box, _MARGIN_M).any() for one in shown):
+                false.append(round(area_m2, 1))
+    added = (counts["structure"][1] - counts["structure"][0], counts["thing"][1] - counts["thing"][0])
+    found = int(counts["car"][1] < 0.5 * counts["car"][0]) + sum(more >= 50 for more in added)
+    elsewhere = int((gone & ~boxed[0]).sum()), int((come & ~boxed[1]).sum())
+    return CourtScore(
+        method, counts["car"][1], counts["car"][0], added, found, elsewhere, tuple(others), tuple(false)
+    )  # fmt: skip
+
+
+def court_rows(scores: Sequence[CourtScore]) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
+    """(headings, rows) of the table."""
+    headings = (
+        "method", "found", "car's points left", "points of structure, thing added", "deleted, added elsewhere",
+        "others > 2 m2", "of these no cloud shows",
+    )  # fmt: skip
+    rows: list[tuple[str, ...]] = [
+        (
+            one.method,
+            f"{one.found} of 3",
+            f"{one.left} of {one.before}",
+            f"{one.added[0]}, {one.added[1]}",
+            f"{one.elsewhere[0]}, {one.elsewhere[1]}",
+            f"{len(one.others)} ({sum(one.others):.0f} m2)",
+            f"{len(one.false)} ({sum(one.false):.0f} m2)",
+        )
+        for one in scores
+    ]
+    return headings, rows
