@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from mapvote.cli.door import client_of, is_url, key_in, map_at
-from mapvote.cli.options import DRIVE, Config, KeyFile
+from mapvote.cli.options import DRIVE, Config, KeyFile, Projector
 
 if TYPE_CHECKING:
     from mapvote.live.drive import LiveDrive, Maps
@@ -24,7 +24,7 @@ Domain = Annotated[int | None, typer.Option(min=0, max=232, metavar="N", help="e
 
 def register(app: typer.Typer) -> None:
     """Add the verbs to ``app``."""
-    for verb in (topics, play, drive):
+    for verb in (topics, play, drive, autoware):
         app.command(rich_help_panel=DRIVE)(verb)
 
 
@@ -206,3 +206,50 @@ def _said(vehicle: str, live: LiveDrive | None, hearing: Hearing) -> str:
         f"{c.left_out} scans left out, {c.without_pose} without odometry, {c.without_map} without map, "
         f"{c.unusable} unusable, {c.late} late, {c.missing} never came"
     )
+
+
+def autoware(
+    url: Annotated[str, typer.Argument(metavar="URL", help="the server")],
+    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="kept as the newest map, in Autoware's tiles")],
+    projector: Projector = None,
+    keep: Annotated[int, typer.Option(min=0, metavar="N", help="older versions whose tiles stay")] = 3,
+    every: Annotated[float, typer.Option(min=0.1, metavar="SECONDS", help="how often to ask")] = 5.0,
+    key_file: KeyFile = None,
+    domain: Domain = None,
+) -> None:
+    """Serve the newest map to a running Autoware on rmw_cyclonedds, in place of its map loader. No ROS is needed.
+
+    mapvote autoware https://maps.example.org map --key-file key
+    """
+    import threading
+
+    from mapvote.cli.follow import follow_once
+    from mapvote.core.types import MapvoteError
+    from mapvote.live.dds import Network
+    from mapvote.live.loader_service import LoaderService
+    from mapvote.live.map_loader import MapLoader
+
+    stopped = threading.Event()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda *_: stopped.set())
+
+    def follow() -> None:
+        with client_of(url, key_in(key_file)) as client:
+            while not stopped.is_set():
+                try:
+                    change = follow_once(client, folder, projector, keep)
+                    if change is not None:
+                        print(f"{folder}: version {change.version}, {change.written} new tiles", flush=True)
+                except MapvoteError as error:
+                    print(f"{error}; the map stays as it is", flush=True)
+                stopped.wait(every)
+
+    threading.Thread(target=follow, daemon=True).start()
+    loader = MapLoader(folder)
+    service = LoaderService(Network(domain), loader)
+    while not stopped.is_set():
+        if loader.refresh():
+            service.show()
+            print(f"serving {len(loader.cells)} tiles", flush=True)
+        service.serve(0.2)
+    print(f"{service.answered} requests answered")

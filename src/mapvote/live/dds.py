@@ -1,7 +1,8 @@
 """Topics of ROS 2 over DDS, by Cyclone DDS (extra ``ros2``): bytes of messages in and out, and who sends what.
 
 Names are ROS 2's: topic /points is ``rt/points`` on the wire, type sensor_msgs/msg/PointCloud2 is
-``sensor_msgs::msg::dds_::PointCloud2_``. The domain is ROS_DOMAIN_ID; CYCLONEDDS_URI names interfaces and peers.
+``sensor_msgs::msg::dds_::PointCloud2_``. Topics of services are ``rq/..`` and ``rr/..``, and are named so. The domain
+is ROS_DOMAIN_ID; CYCLONEDDS_URI names interfaces and peers.
 """
 
 from __future__ import annotations
@@ -113,7 +114,8 @@ class Network:
 
     def _topic_of(self, topic: str, kind: str) -> Any:
         if (topic, kind) not in self._topics:
-            self._topics[topic, kind] = self._topic.Topic(self._participant, f"rt{topic}", self._type(kind))
+            name = topic if topic.startswith(("rq/", "rr/")) else f"rt{topic}"
+            self._topics[topic, kind] = self._topic.Topic(self._participant, name, self._type(kind))
         return self._topics[topic, kind]
 
     def _type(self, kind: str) -> Any:
@@ -155,6 +157,11 @@ class Subscription:
         if isinstance(taken, int):
             raise MapvoteError(f"{self.topic}: DDS cannot read it (error {taken})")
         return [(info.source_timestamp, data) for data, info in taken if info.valid_data]
+
+    @property
+    def writers(self) -> int:
+        """How many send it now."""
+        return len(self._reader.get_matched_publications())
 
     @property
     def lost(self) -> int:
