@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
+import re
 import tomllib
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -15,22 +14,13 @@ import yaml
 from rosbags.typesys import Stores, get_typestore
 from typer.main import get_command
 
-from mapvote import MapvoteError, Scan, Sensor, map_from_points, scan_from_point_cloud2
+from mapvote import MapvoteError, Scan, Sensor, scan_from_point_cloud2
 from mapvote.cli import app
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 STORE = get_typestore(Stores.ROS2_HUMBLE)
 TYPES: dict[str, Any] = dict(STORE.types)
 SENSOR = Sensor("hdl32e", tuple(np.linspace(10.67, -30.67, 32)), 0.5)
-
-
-def node() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("ros2_node", EXAMPLES / "ros2_node.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
 
 
 def street(seed: int = 0) -> np.ndarray[Any, np.dtype[np.float64]]:
@@ -74,19 +64,6 @@ def cloud(points: np.ndarray[Any, Any], ns: int, *, cut: int = 0) -> Any:
     return STORE.deserialize_cdr(STORE.serialize_cdr(message, name), name)
 
 
-def odometry(east: float, ns: int) -> Any:
-    point, quaternion = (
-        TYPES["geometry_msgs/msg/Point"](east, 0.0, 0.0),
-        TYPES["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0),
-    )
-    pose = TYPES["geometry_msgs/msg/PoseWithCovariance"](
-        TYPES["geometry_msgs/msg/Pose"](point, quaternion), np.zeros(36)
-    )
-    zero = TYPES["geometry_msgs/msg/Vector3"](0.0, 0.0, 0.0)
-    twist = TYPES["geometry_msgs/msg/TwistWithCovariance"](TYPES["geometry_msgs/msg/Twist"](zero, zero), np.zeros(36))
-    return TYPES["nav_msgs/msg/Odometry"](header(ns, "map"), "base_link", pose, twist)
-
-
 def test_a_cloud_message_becomes_a_scan() -> None:
     points = street()[:500] + np.array([0.0, 8.0, 0.0])
     scan = scan_from_point_cloud2(cloud(points, 1_700_000_000_123_456_789), SENSOR)
@@ -97,28 +74,6 @@ def test_a_cloud_message_becomes_a_scan() -> None:
     assert np.allclose(scan.intensity, 0.2)
     with pytest.raises(MapvoteError, match="cut off"):
         scan_from_point_cloud2(cloud(points, 1, cut=7), SENSOR)
-
-
-def test_the_nodes_logic_votes_without_ros() -> None:
-    mount = np.eye(4)
-    mount[2, 3] = 1.8
-    drive = node().VotingDrive(map_from_points(street()), SENSOR, "car", "d1", mount)
-    for i in range(12):
-        ns, east = 1_700_000_000 * 10**9 + i * 10**8, -6.0 + 0.8 * i
-        drive.on_odometry(odometry(east, ns + 10**7))
-        points = street(i + 1) - np.array([east, 0.0, 1.8])
-        drive.on_points(cloud(points[np.linalg.norm(points, axis=1) < 60.0], ns))
-    drive.on_points(cloud(street(), 1_700_000_002 * 10**9, cut=5))
-    assert drive.refused == 1
-    sent: list[Any] = []
-
-    class Client:
-        def send(self, ballot: Any) -> str:
-            sent.append(ballot)
-            return "created"
-
-    assert drive.send(Client()) == "created"
-    assert (sent[0].vehicle, sent[0].drive, sent[0].scans, sent[0].scans_localised) == ("car", "d1", 12, 12)
 
 
 def test_the_notebook_runs_from_top_to_bottom() -> None:
@@ -134,11 +89,13 @@ def test_the_notebook_runs_from_top_to_bottom() -> None:
 def test_deployment_files_use_verbs_options_and_extras_that_exist() -> None:
     verbs = get_command(app).commands  # type: ignore[attr-defined]
     compose = yaml.safe_load((EXAMPLES / "compose.yaml").read_text())["services"]
-    unit = (EXAMPLES / "mapvote.service").read_text()
-    start = next(line for line in unit.splitlines() if line.startswith("ExecStart="))
-    for words in (compose["mapvote"]["command"].replace('"', " ").split(), start.split()):
-        after = words[words.index("serve") + 1 :]
-        known = {option for parameter in verbs["serve"].params for option in parameter.opts}
+    started = [(compose["mapvote"]["command"].replace('"', " ").split(), "serve")]
+    for name, verb in (("mapvote.service", "serve"), ("mapvote-drive.service", "drive")):
+        unit = (EXAMPLES / name).read_text().replace("\\\n", " ")
+        started.append((re.findall("^ExecStart=(.*)", unit, re.M)[0].split(), verb))
+    for words, verb in started:
+        after = words[words.index(verb) + 1 :]
+        known = {option for parameter in verbs[verb].params for option in parameter.opts}
         assert {word for word in after if word.startswith("--")} <= known
     extras = tomllib.loads((EXAMPLES.parent / "pyproject.toml").read_text())["project"]["optional-dependencies"]
     assert {"server", "postgres", "geo"} <= set(extras)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,6 +18,7 @@ from live.loopback_dds import LOOPBACK, domain_of
 from mapvote.codec.ballot import encode
 from mapvote.core.point_map import map_from_points
 from mapvote.core.sensors import SENSORS
+from mapvote.core.types import F64
 from mapvote.formats import open_drive, read_map, write_map
 from mapvote.vehicle import Cuts, Vehicle, vote_in_stretches
 from streets import path, street, sweep, twist_of
@@ -25,22 +27,28 @@ pytest.importorskip("cyclonedds")
 SCANS = 40
 
 
-def record(bag: Path) -> None:
+def record(
+    bag: Path,
+    world: Callable[[int], F64] = lambda i: street(1000 + i, 0.6),
+    points: str = "/points",
+    odometry: str = "/odometry",
+) -> None:
+    """A drive through ``world``, of which each scan measures other points."""
     recorder = Recorder(bag)
     poses, t = path(SCANS), recorder.types
     g, kind = "geometry_msgs/msg/", "nav_msgs/msg/Odometry"
     for i, T in enumerate(poses):
         ns = START + i * 100_000_000
-        scan = sweep(street(1000 + i, 0.6), T, twist_of(poses, i), ns)
+        scan = sweep(world(i), T, twist_of(poses, i), ns)
         pose = t[g + "Pose"](
             t[g + "Point"](*T[:3, 3].tolist()),
             t[g + "Quaternion"](*Rotation.from_matrix(T[:3, :3]).as_quat().tolist()),
         )
         zero, none = t[g + "Vector3"](0.0, 0.0, 0.0), np.zeros(36)
         twist = t[g + "TwistWithCovariance"](t[g + "Twist"](zero, zero), none)
-        odometry = t[kind](recorder.header(ns, "map"), "lidar", t[g + "PoseWithCovariance"](pose, none), twist)
-        recorder.write("/odometry", kind, ns, odometry)
-        recorder.cloud("/points", "lidar", ns, scan.points)
+        message = t[kind](recorder.header(ns, "map"), "lidar", t[g + "PoseWithCovariance"](pose, none), twist)
+        recorder.write(odometry, kind, ns, message)
+        recorder.cloud(points, "lidar", ns, scan.points)
     recorder.bag.close()
 
 
