@@ -201,10 +201,11 @@ def _said(vehicle: str, live: LiveDrive | None, hearing: Hearing) -> str:
     if live is None:
         return f"{vehicle}: no cloud came"
     c = live.counts
+    latency = ", ".join(f"{value:.2f} s" for value in c.latency_quantiles_s(0.5, 0.99)) or "none"
     return (
         f"{vehicle}: {c.ballots} ballots, {c.localised} of {c.scans} scans voted, {c.lost} lost, "
         f"{c.left_out} scans left out, {c.without_pose} without odometry, {c.without_map} without map, "
-        f"{c.unusable} unusable, {c.late} late, {c.missing} never came"
+        f"{c.unusable} unusable, {c.late} late, {c.missing} never came; latency p50, p99: {latency}"
     )
 
 

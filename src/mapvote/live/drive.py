@@ -115,6 +115,10 @@ class Counts:
     latencies_s: deque[float] = field(default_factory=lambda: deque(maxlen=_LATENCIES))
     """From stamp to vote, of the last scans."""
 
+    def latency_quantiles_s(self, *shares: float) -> list[float]:
+        """The latencies that these shares of the last scans do not exceed; empty without any."""
+        return np.quantile(self.latencies_s, shares).tolist() if self.latencies_s else []
+
 
 class Thinning:
     """Which scans are left out if there is time for some of them only: evenly, never two where one is enough."""
