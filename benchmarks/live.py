@@ -7,23 +7,42 @@ from __future__ import annotations
 
 import argparse
 import os
+import random
+import re
+import resource
+import socket
+import sqlite3
+import struct
 import subprocess
 import sys
+import tempfile
 import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 
+from mapvote.core.grid import CELL_SIZE, TILE_CELLS
+from mapvote.core.point_map import PointMap
 from mapvote.core.sensors import SENSORS
-from mapvote.core.types import Scan
+from mapvote.core.types import F64, Drive, Scan
+from mapvote.formats import open_drive, read_map
 from mapvote.formats.drives.point_fields import scan_from_point_cloud2
 from mapvote.live.cdr import from_cdr
 from mapvote.live.dds import Network
-from mapvote.live.play import cloud_message
+from mapvote.live.drive import LiveDrive, OneMap, Waiting
+from mapvote.live.outbox import Outbox
+from mapvote.live.play import cloud_message, opened
+from mapvote.vehicle import Vehicle
 
 sys.path[0] = str(Path(__file__).parents[1] / "tests")  # instead of this folder, whose live.py would hide tests/live
 from live.loopback_dds import LOOPBACK, domain_of  # noqa: E402
+from live_server import mapvote  # noqa: E402
 
+TILES = 3
+PERIOD_M = TILES * TILE_CELLS * CELL_SIZE
 CLOUD, POINTS = "sensor_msgs/msg/PointCloud2", 70_000
 
 
@@ -87,16 +106,193 @@ def read_clouds(seconds: float = 20.0) -> None:
     sender.wait()
 
 
+def laps(domain: int, drive: str, shown: Path) -> None:
+    """The other process: the drive round and round, and the stamp of the last scan in a file."""
+    network, messages = Network(domain), list(opened(Path(drive))[1]())
+    out = {m.topic: network.publish(m.topic, m.kind, transient_local=m.topic == "/tf_static") for m in messages}
+    first = messages[0].time_ns
+    lap_ns, start, k = messages[-1].time_ns - first + 100_000_000, time.monotonic(), 0
+    while True:
+        for message in messages:
+            shift_ns = k * lap_ns
+            time.sleep(max(0.0, start + 1e-9 * (message.time_ns - first + shift_ns) - time.monotonic()))
+            stamp_ns, data = message.time_ns + shift_ns, bytearray(message.data)
+            if message.topic != "/tf_static":
+                data[4:12] = struct.pack("<II", *divmod(stamp_ns, 10**9))
+                shown.write_text(str(stamp_ns))
+            elif k:
+                continue
+            out[message.topic].send(bytes(data))
+        k += 1
+
+
+class Server:
+    """mapvote serve, which can be taken away and brought back."""
+
+    def __init__(self, home: Path, map_path: str) -> None:
+        with socket.socket() as one:
+            one.bind(("127.0.0.1", 0))
+            self.port = one.getsockname()[1]
+        self.home, self.map_path = home, map_path
+        self.start()
+
+    def start(self) -> None:
+        new = [] if (self.home / "fleet.db").exists() else ["--map", self.map_path]
+        command = ["serve", self.home / "fleet.db", *new, "--open", "--port", self.port]
+        self.process = subprocess.Popen(mapvote(*command), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+
+    def stop(self) -> None:
+        self.process.terminate()
+        self.process.wait()
+
+    def ballots(self) -> list[tuple[str, int, int]]:
+        """(drive, first stamp, last stamp) of every ballot that was ever taken."""
+        with sqlite3.connect(self.home / "fleet.db") as database:
+            return database.execute("select drive, start_ns, end_ns from ballots order by start_ns").fetchall()
+
+
+def kills(drive: str, map_path: str, n: int) -> None:
+    """Kill a live drive n times, and count what is missing and what came twice."""
+    home, chance = Path(tempfile.mkdtemp()), random.Random(4)
+    os.environ |= {"CYCLONEDDS_URI": LOOPBACK, "XDG_CACHE_HOME": str(home / "cache"), "PYTHONUNBUFFERED": "1"}
+    domain, server, shown, log = domain_of("kills"), Server(home, map_path), home / "stamp", home / "log"
+    sender = subprocess.Popen(
+        [sys.executable, __file__, "laps", drive, str(shown), "--domain", str(domain)], start_new_session=True
+    )
+    url = f"http://127.0.0.1:{server.port}"
+    options = ["--map", map_path, "--send", url, "--vehicle", "car", "--name", "day", "--every-m", 150]
+    command = mapvote("drive", *options, "--domain", domain, "--sensor", "hdl32e")
+    killed_ns = []
+    with log.open("w") as out:
+        for k in range(n + 1):
+            process = subprocess.Popen(command, stdout=out, stderr=out)
+            said = log.read_text().count("listening")
+            while log.read_text().count("listening") == said:
+                time.sleep(0.2)
+            away = k % 2 == 1
+            if away:
+                server.stop()
+            time.sleep(chance.uniform(2.0, 45.0) if k < n else 20.0)
+            if k < n:
+                process.kill()
+                killed_ns.append(int(shown.read_text()))
+            else:
+                process.terminate()
+            process.wait()
+            if away:
+                server.start()
+    sender.kill()
+    server.stop()
+    told = log.read_text()
+    closed = set(re.findall(r"(day-\d+): \d+ of \d+ scans voted", told)) | set(
+        re.findall(r"(day-\d+): was cut off", told)
+    )
+    ballots = server.ballots()
+    lost = closed - {name for name, _, _ in ballots}
+    twice = len(ballots) - len({name for name, _, _ in ballots})
+    shared = sum(b[1] <= a[2] for a, b in pairwise(ballots))
+    gaps = [1e-9 * (at - max((end for _, _, end in ballots if end <= at), default=at)) for at in killed_ns]
+    print(f"{n} kills, the server away in {n // 2}: {len(ballots)} ballots, {len(closed)} said to be closed")
+    print(f"{len(lost)} lost, {twice} twice, {shared} share scans with the next")
+    print(f"road missing at a kill: median {np.median(gaps):.1f} s, at most {max(gaps):.1f} s ({log})")
+
+
+def play_and_drive(drive: str, map_path: str, rate: float) -> None:
+    """Two processes, as the two terminals of docs/live.md."""
+    home = Path(tempfile.mkdtemp())
+    os.environ |= {"CYCLONEDDS_URI": LOOPBACK, "XDG_CACHE_HOME": str(home)}
+    domain = domain_of("play")
+    player = subprocess.Popen(
+        mapvote("play", drive, "--rate", rate, "--domain", domain), stdout=subprocess.DEVNULL, start_new_session=True
+    )
+    options = ["--map", map_path, "--out", home, "--vehicle", "car", "--sensor", "hdl32e", "--idle", 5]
+    before = os.times()
+    result = subprocess.run(mapvote("drive", *options, "--domain", domain), capture_output=True, text=True, check=True)
+    after = os.times()
+    player.wait()
+    print(result.stdout.splitlines()[-1])
+    print(f"CPU of drive: {after.children_user - before.children_user:.1f} s user, start and kernels included")
+
+
+def laid_end_to_end(point_map: PointMap, copies: int) -> PointMap:
+    """The columns 0 to 2 of the map's tiles, again and again along x."""
+    tiles = {}
+    for (row, col), tile in point_map.tiles.items():
+        for k in range(copies if 0 <= col < TILES else 0):
+            index = row, col + TILES * k
+            tiles[index] = replace(tile, window=point_map.lattice.tile(index))
+    return replace(point_map, tiles=tiles, driven=())
+
+
+def long_drive(drive: Drive, x0: float, copies: int) -> Iterator[tuple[Scan, F64]]:
+    """Scans and their priors of the part of the drive from ``x0`` on, again and again."""
+    assert drive.T_map_lidar_prior is not None
+    x = drive.T_map_lidar_prior[:, 0, 3]
+    part = np.flatnonzero((x >= x0) & (x < x0 + PERIOD_M))
+    scans, step_ns = [drive.read_scan(int(i)) for i in part], int(np.median(np.diff(drive.stamps_ns)))
+    for k in range(copies):
+        for n, i in enumerate(part):
+            prior = drive.T_map_lidar_prior[i].copy()
+            prior[0, 3] += k * PERIOD_M
+            stamp_ns = int(drive.stamps_ns[0]) + step_ns * (k * len(part) + n)
+            yield replace(scans[n], stamp_ns=stamp_ns), prior
+
+
+def resident_mb() -> float:
+    return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize() / 1e6
+
+
+def hours(drive_path: str, map_path: str, length_h: float) -> None:
+    """A LiveDrive fed in one process; resident memory beside the map, and ballots."""
+    drive, street = open_drive(Path(drive_path), sensor="hdl32e"), read_map(Path(map_path))
+    assert drive.T_map_lidar_prior is not None
+    xs = drive.T_map_lidar_prior[:, 0, 3]
+    speed = float((xs.max() - xs.min()) / (1e-9 * np.ptp(drive.stamps_ns)))
+    copies = int(np.ceil(3600.0 * length_h * speed / PERIOD_M))
+    home = Path(tempfile.mkdtemp())
+    (home / "out").mkdir()
+    outbox = Outbox(home / "state", "car", folder=home / "out", say=lambda _: None)
+    maps = OneMap(laid_end_to_end(street, copies))
+    live = LiveDrive(lambda m: Vehicle("car", drive.sensor, m), maps, outbox, name="day", with_poses=True)
+    base, n, step = resident_mb(), 0, int(min(9000, 3600 * length_h))
+    print(f"base {base:.0f} MB, {copies} copies of {PERIOD_M:.0f} m")
+    print("| hours | km | scans voted | ballots | MB |\n|---|---|---|---|---|")
+    x0 = 0.5 * (xs.min() + xs.max()) - 0.5 * PERIOD_M
+    for scan, prior in long_drive(drive, x0, copies):
+        live.on_pose(scan.stamp_ns, prior)
+        live.on_scan(Waiting(scan.stamp_ns, time.time_ns(), lambda scan=scan: scan))
+        while live.step():
+            pass
+        n += 1
+        if n % step == 0:
+            c, km, mb = live.counts, 1e-3 * (prior[0, 3] - x0), resident_mb() - base
+            print(f"| {n / 36000:.2f} | {km:.1f} | {c.localised} of {n} | {c.ballots} | {mb:.0f} |", flush=True)
+    live.finish()
+    outbox.close()
+    left = [f.name for f in (home / "state/car").iterdir() if not f.name.startswith(".")]
+    ballots = len(list((home / "out").iterdir()))
+    print(f"{n} scans, {live.counts.localised} voted, {ballots} ballots; files left behind: {left}")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=["cloud", "send-clouds"])
+    parser.add_argument("what", choices=["cloud", "send-clouds", "drive", "kills", "laps", "hours"])
+    parser.add_argument("paths", nargs="*")
     parser.add_argument("--domain", type=int, default=0)
     parser.add_argument("--seconds", type=float, default=20.0)
+    parser.add_argument("--rate", type=float, default=1.0)
+    parser.add_argument("--kills", type=int, default=50)
+    parser.add_argument("--hours", type=float, default=8.0)
     options = parser.parse_args()
-    if options.what == "send-clouds":
-        send_clouds(options.domain, options.seconds)
-    else:
-        read_clouds(options.seconds)
+    runs: dict[str, Callable[[], None]] = {
+        "send-clouds": lambda: send_clouds(options.domain, options.seconds),
+        "cloud": lambda: read_clouds(options.seconds),
+        "drive": lambda: play_and_drive(options.paths[0], options.paths[1], options.rate),
+        "kills": lambda: kills(options.paths[0], options.paths[1], options.kills),
+        "laps": lambda: laps(options.domain, options.paths[0], Path(options.paths[1])),
+        "hours": lambda: hours(options.paths[0], options.paths[1], options.hours),
+    }
+    runs[options.what]()
 
 
 if __name__ == "__main__":
