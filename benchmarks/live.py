@@ -27,7 +27,7 @@ import numpy as np
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS
 from mapvote.core.point_map import PointMap
 from mapvote.core.sensors import SENSORS
-from mapvote.core.types import F64, Drive, Scan
+from mapvote.core.types import F64, Scan
 from mapvote.formats import open_drive, read_map
 from mapvote.formats.drives.point_fields import scan_from_point_cloud2
 from mapvote.live.cdr import from_cdr
@@ -224,18 +224,14 @@ def laid_end_to_end(point_map: PointMap, copies: int) -> PointMap:
     return replace(point_map, tiles=tiles, driven=())
 
 
-def long_drive(drive: Drive, x0: float, copies: int) -> Iterator[tuple[Scan, F64]]:
-    """Scans and their priors of the part of the drive from ``x0`` on, again and again."""
-    assert drive.T_map_lidar_prior is not None
-    x = drive.T_map_lidar_prior[:, 0, 3]
-    part = np.flatnonzero((x >= x0) & (x < x0 + PERIOD_M))
-    scans, step_ns = [drive.read_scan(int(i)) for i in part], int(np.median(np.diff(drive.stamps_ns)))
+def long_drive(scans: list[Scan], priors: F64, copies: int) -> Iterator[tuple[Scan, F64]]:
+    """Scans and their priors (n, 4, 4), again and again, each time farther along x and later."""
+    step_ns = int(np.median(np.diff([scan.stamp_ns for scan in scans])))
     for k in range(copies):
-        for n, i in enumerate(part):
-            prior = drive.T_map_lidar_prior[i].copy()
+        for n, scan in enumerate(scans):
+            prior = priors[n].copy()
             prior[0, 3] += k * PERIOD_M
-            stamp_ns = int(drive.stamps_ns[0]) + step_ns * (k * len(part) + n)
-            yield replace(scans[n], stamp_ns=stamp_ns), prior
+            yield replace(scan, stamp_ns=scans[0].stamp_ns + step_ns * (k * len(scans) + n)), prior
 
 
 def resident_mb() -> float:
@@ -254,11 +250,13 @@ def hours(drive_path: str, map_path: str, length_h: float) -> None:
     outbox = Outbox(home / "state", "car", folder=home / "out", say=lambda _: None)
     maps = OneMap(laid_end_to_end(street, copies))
     live = LiveDrive(lambda m: Vehicle("car", drive.sensor, m), maps, outbox, name="day", with_poses=True)
-    base, n, step = resident_mb(), 0, int(min(9000, 3600 * length_h))
-    print(f"base {base:.0f} MB, {copies} copies of {PERIOD_M:.0f} m")
-    print("| hours | km | scans voted | ballots | MB |\n|---|---|---|---|---|")
     x0 = 0.5 * (xs.min() + xs.max()) - 0.5 * PERIOD_M
-    for scan, prior in long_drive(drive, x0, copies):
+    part = np.flatnonzero((xs >= x0) & (xs < x0 + PERIOD_M))
+    scans = [drive.read_scan(int(i)) for i in part]
+    base, n, step = resident_mb(), 0, int(min(9000, 3600 * length_h))
+    print(f"base {base:.0f} MB with the scans that are fed, {copies} copies of {PERIOD_M:.0f} m")
+    print("| hours | km | scans voted | ballots | MB |\n|---|---|---|---|---|")
+    for scan, prior in long_drive(scans, drive.T_map_lidar_prior[part], copies):
         live.on_pose(scan.stamp_ns, prior)
         live.on_scan(Waiting(scan.stamp_ns, time.time_ns(), lambda scan=scan: scan))
         while live.step():

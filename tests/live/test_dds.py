@@ -33,7 +33,7 @@ def cloud(n: int = 1000) -> bytes:
     return to_cdr(CLOUD, message)
 
 
-@pytest.mark.parametrize("kind", sorted(TYPES))
+@pytest.mark.parametrize("kind", sorted(TYPES.keys() & get_typestore(Stores.ROS2_HUMBLE).types.keys()))
 def test_bytes_are_those_of_another_implementation_of_cdr(kind: str) -> None:
     store = get_typestore(Stores.ROS2_HUMBLE)
     ours = to_cdr(kind, blank_message(kind))
