@@ -14,7 +14,7 @@ import pytest
 from live.loopback_dds import LOOPBACK, domain_of
 from mapvote.core.types import F64, MapvoteError
 from mapvote.formats.geo.frame import MapFrame
-from mapvote.formats.maps.autoware_live import lay_version
+from mapvote.formats.maps.autoware import lay_version
 from mapvote.formats.maps.cloud import Cloud
 from mapvote.live.cdr import blank_message, from_cdr, to_cdr
 from mapvote.live.map_loader import DIFFERENTIAL, HASH, HASH_TOPIC, PARTIAL, SELECTED, Area, Cell, MapLoader

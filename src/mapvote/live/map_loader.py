@@ -89,7 +89,7 @@ class MapLoader:
     """The tiles of the folder's newest version."""
 
     def __init__(self, folder: Path) -> None:
-        """``folder`` as :func:`mapvote.formats.maps.autoware_live.lay_version` lays it; it may still be empty."""
+        """``folder`` as :func:`mapvote.formats.maps.autoware.lay_version` lays it; it may still be empty."""
         self.folder = folder
         self.cells: dict[str, Cell] = {}
         self._read_ns = 0
