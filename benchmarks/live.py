@@ -163,19 +163,20 @@ def kills(drive: str, map_path: str, n: int) -> None:
     options = ["--map", map_path, "--send", url, "--vehicle", "car", "--name", "day", "--every-m", 150]
     command = mapvote("drive", *options, "--domain", domain, "--sensor", "hdl32e")
     killed_ns = []
+    """(stamp when it began to listen, stamp when it was killed) of each."""
     with log.open("w") as out:
         for k in range(n + 1):
             process = subprocess.Popen(command, stdout=out, stderr=out)
             said = log.read_text().count("listening")
             while log.read_text().count("listening") == said:
                 time.sleep(0.2)
-            away = k % 2 == 1
+            began_ns, away = int(shown.read_text()), k % 2 == 1
             if away:
                 server.stop()
             time.sleep(chance.uniform(2.0, 45.0) if k < n else 20.0)
             if k < n:
                 process.kill()
-                killed_ns.append(int(shown.read_text()))
+                killed_ns.append((began_ns, int(shown.read_text())))
             else:
                 process.terminate()
             process.wait()
@@ -191,7 +192,7 @@ def kills(drive: str, map_path: str, n: int) -> None:
     lost = closed - {name for name, _, _ in ballots}
     twice = len(ballots) - len({name for name, _, _ in ballots})
     shared = sum(b[1] <= a[2] for a, b in pairwise(ballots))
-    gaps = [1e-9 * (at - max((end for _, _, end in ballots if end <= at), default=at)) for at in killed_ns]
+    gaps = [1e-9 * (at - max(began, *(end for _, _, end in ballots if end <= at))) for began, at in killed_ns]
     print(f"{n} kills, the server away in {n // 2}: {len(ballots)} ballots, {len(closed)} said to be closed")
     print(f"{len(lost)} lost, {twice} twice, {shared} share scans with the next")
     print(f"road missing at a kill: median {np.median(gaps):.1f} s, at most {max(gaps):.1f} s ({log})")

@@ -23,7 +23,7 @@ from sensor_msgs.msg import PointField
 from tier4_external_api_msgs.msg import MapHash
 
 from mapvote import MapClient, MapvoteError
-from mapvote.cli.follow import follow_once
+from mapvote.cli.files import follow_once
 from mapvote.live.map_loader import DIFFERENTIAL, PARTIAL, SELECTED, MapLoader
 
 SERVICES = {

@@ -224,7 +224,7 @@ def autoware(
     """
     import threading
 
-    from mapvote.cli.follow import follow_once
+    from mapvote.cli.files import follow_once
     from mapvote.core.types import MapvoteError
     from mapvote.live.dds import Network
     from mapvote.live.loader_service import LoaderService

@@ -31,7 +31,7 @@ _CROWDED, _RELAXED = 30, 5
 """If more scans wait some are left out, until fewer wait: a short stop of the process costs no scan."""
 _LEAST_SHARE, _MOST = 0.2, 120
 """Of five scans in turn one is admitted, unless so many wait."""
-_KEEP_S = 15.0
+_KEEP_S = 8.0
 """A tile that got votes is written to the journal after so long. With the scans that wait, and with tiles that are
 written one at a time, a crash costs less than 30 s of road."""
 _BACK_NS, _AHEAD_NS = 10**9, 3600 * 10**9
