@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -35,6 +37,28 @@ def test_files_that_a_page_names_are_there(page: Path) -> None:
     named = set(re.findall(r"`((?:[a-z_]+/)+[a-z_0-9]+\.(?:py|toml|js))`", page.read_text()))
     rooms = (ROOT, ROOT / "src/mapvote", ROOT / "src/mapvote_lab", ROOT / "docs")
     assert sorted(name for name in named if not any((room / name).exists() for room in rooms)) == []
+
+
+def test_every_page_is_reached_from_the_index_by_links() -> None:
+    reached, to_read = set(), [ROOT / "docs/index.md"]
+    while to_read:
+        page = to_read.pop()
+        if page in reached:
+            continue
+        reached.add(page)
+        links = re.findall(r"\]\(([^)#:]+\.md)(?:#[^)]*)?\)", page.read_text())
+        to_read += [(page.parent / link).resolve() for link in links]
+    assert sorted(set((ROOT / "docs").rglob("*.md")) - reached) == []
+
+
+@pytest.mark.slow
+def test_the_site_is_built_without_a_warning(tmp_path: Path) -> None:
+    pytest.importorskip("mkdocs", reason="the extra docs is not installed")
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path / "site")]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    api = (tmp_path / "site" / "api" / "index.html").read_text()
+    assert all(f".{name}" in api for name in ("build_map", "vote_drive", "update_map", "MapClient"))
 
 
 def test_no_source_refers_to_a_document_that_is_not_here() -> None:

@@ -82,6 +82,7 @@ VERBS = {
     "evaluate tiny.toml --json new": "import mapvote_lab.evaluation.evaluate as m; m.evaluate = wait",
     "warmup": "import mapvote.warmup as m; m.warm_up = wait",
     "export http://localhost:9 new --follow": "import mapvote.client as m; m.MapClient.newest = wait",
+    "coverage STORE": "import mapvote.server.views.coverage as m; m.wanted_passes = wait",
     "policy STORE": "import mapvote.server.store.store as m; m.Store.policy_changes = wait",
     "rollback STORE 1": "import mapvote.server.store.publish as m; m.rollback = wait",
     "unvote STORE car_1": "import mapvote.server.store.ballots as m; m.withdraw = wait",

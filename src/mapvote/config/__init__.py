@@ -33,40 +33,46 @@ def cache_folder() -> Path:
 class NdtSettings(Section):
     """When a scan's registration is sound (localisation/odometry.py)."""
 
-    min_inlier_share: float = Field(default=0.5, description="below it the vehicle abstains; lost scans have about .4")
-    max_sigma_m: float = Field(default=0.15, description="abstain when the pose is less certain than this")
+    min_inlier_share: float = Field(
+        default=0.5, description="abstain if fewer of the returns are inliers; scans at a wrong pose have about 0.4"
+    )
+    max_sigma_m: float = Field(default=0.15, description="abstain if the standard deviation of the position is larger")
 
 
 class MovingSettings(Section):
-    """perception/moving_objects.py ([9])."""
+    """Removal of moving objects (perception/moving_objects.py; paper [9])."""
 
-    lookahead_s: float = Field(default=1.0, ge=0, le=1.0, description="how late a scan is decided")
+    lookahead_s: float = Field(
+        default=1.0, ge=0, le=1.0, description="delay before a scan is decided, so that later scans show what moved"
+    )
 
 
 class MappingSettings(Section):
     """slam/build.py: NDT SLAM."""
 
     reach_m: float = Field(
-        default=80.0, description="farther returns do not enter the map; the moving-object filter looks as far"
+        default=80.0, description="range limit of returns for the map and for the moving-object filter"
     )
     drop_strays: bool = Field(
-        default=True, description="leave out points that are no surface of their own; false: as paper II, keep them"
+        default=True,
+        description="remove points that are not a surface of their own; false keeps them, as paper II does",
     )
 
 
 class VotingSettings(Section):
     """Surfaces, or the paper's rule, and which of its cases (paper III, V): docs/method.md."""
 
-    method: Literal["paper", "surfaces"] = "surfaces"
-    weighted: bool = Field(default=True, description="multiple votes per scan by Eq. (1); false: one vote per scan")
-    two_stage: bool = Field(default=True, description="the vehicle decides its cells; false: it sends its tally")
+    method: Literal["paper", "surfaces"] = Field(default="surfaces", description="rule by which vehicles vote")
+    weighted: bool = Field(default=True, description="several votes per scan by Eq. (1); false: one vote per scan")
+    two_stage: bool = Field(default=True, description="the vehicle decides its cells; false: it sends its vote counts")
     skip_tall_cells: bool = Field(default=True, description="case 5: no vote where the map begins above the view")
-    a: float = 2.0
-    b: float = 3.0
-    k: float = 0.5
+    a: float = Field(default=2.0, description="Eq. (1): votes of an occupied cell with n_min points")
+    b: float = Field(default=3.0, description="Eq. (1): upper bound of the votes of an occupied cell")
+    k: float = Field(default=0.5, description="Eq. (1): how fast the votes grow with the points")
     window_m: float = Field(default=80.0, description="side of the local grid (paper III-A)")
     min_height_m: float = Field(
-        default=0.6, description="surfaces: a cell whose map rises no higher than this is never changed-empty"
+        default=0.6,
+        description="surfaces: never call a cell changed-empty if its map points are lower than this above the ground",
     )
 
 
@@ -79,24 +85,29 @@ class PaperSettings(Section):
         description="what a scan does in a cell that it cannot see: abstain, or vote undetermined (votes)",
     )
     few_points: Literal["undetermined", "empty"] = Field(
-        default="undetermined", description="what a cell with 1 to n_min - 1 points is for that scan"
+        default="undetermined", description="state of a cell with 1 to n_min - 1 points in a scan"
     )
     movers: Literal["occlude", "removed"] = Field(
-        default="occlude", description="whether points of moving objects still hide what is behind them"
+        default="occlude", description="whether points of moving objects still occlude the cells behind them"
     )
     line_of_sight: Literal["points", "cells", "farthest", "column"] = Field(
         default="points",
-        description="what hides: the nearest point above the ground, the nearest in an occupied cell, the farthest "
-        "return alone, or whatever lets no ray through the heights in which the map has points",
+        description="what occludes the cells behind it: the nearest point above the ground "
+        "(points), the nearest point in an "
+        "occupied cell (cells), only the farthest return (farthest), or anything that stops every ray at the heights "
+        "of the map's points (column)",
     )
     tall_rule: Literal["bottom", "height"] = Field(
         default="bottom",
-        description="what case 5 skips: cells where the map begins above the view at that range; or, literally, where "
-        "it reaches higher than the scan's points",
+        description="cells that case 5 skips: those whose lowest map point is above the field "
+        "of view at that range (bottom), "
+        "or those whose highest map point is above the scan's points (height)",
     )
-    n_min: int = Field(default=5, ge=1, le=8, description="points that make a cell occupied, n_min of Eq. (1)")
+    n_min: int = Field(
+        default=5, ge=1, le=8, description="least number of points in an occupied cell, n_min of Eq. (1)"
+    )
     window_m: float = Field(
-        default=80.0, gt=1, description="side of the square in which scans vote; no more than voting.window_m"
+        default=80.0, gt=1, description="side of the square in which a scan votes; at most voting.window_m"
     )
 
 

@@ -11,62 +11,77 @@ class FuseSettings(Section):
     """fusion/fuse.py: which votes count, how many are enough. A version records the ones it was made by."""
 
     min_votes: int = Field(
-        default=2, ge=1, le=10_000, description="vehicles that a change needs: k + 1 against k liars"
+        default=2, ge=1, le=10_000, description="vehicles that a change needs; k + 1 resists k liars"
     )
     max_contradiction: float = Field(
         default=0.5,
         gt=0,
         le=1,
-        description="who opposes the others in more of a tile is not heard there; 1: everyone is",
+        description="ignore a vehicle on a tile if it contradicts the others in more than this "
+        "share of their cells. 1 disables this",
     )
     max_denial: float = Field(
         default=0.9,
         gt=0,
         le=1,
-        description="nor is who denies a larger share of the changes decided on the tile; 1: everyone is",
+        description="ignore a vehicle on a tile if it contradicts more than this share of the "
+        "decided changes. 1 disables this",
     )
     min_difference: float = Field(
         default=0.1,
         ge=0,
         lt=1,
-        description="two vehicles' drives whose masks differ by a smaller share of what .9 m makes are one; 0: never",
+        description="count two drives as one vehicle if their masks differ by less than this "
+        "share of the difference that a path "
+        "0.9 m to the side makes. 0 disables this",
     )
     latest_vehicles: int = Field(
-        default=9, ge=1, le=10_000, description="only the last so many vehicles on a tile count"
+        default=9, ge=1, le=10_000, description="count only this many vehicles on a tile, the latest ones"
     )
     max_age_days: float = Field(
-        default=30.0, gt=0, le=36_500, description="and drives so much older than its newest do not"
+        default=30.0,
+        gt=0,
+        le=36_500,
+        description="ignore drives that are this much older than the newest one on the tile",
     )
     min_age_s: float = Field(
-        default=0.0, ge=0, le=1e9, description="a ballot waits so long before it counts (time to un-vote)"
+        default=0.0, ge=0, le=1e9, description="a ballot counts only after this time; until then it can be withdrawn"
     )
     stay_days: float = Field(
-        default=30.0, gt=0, le=36_500, description="a new thing enters the map once it can be expected to stay so long"
+        default=30.0,
+        gt=0,
+        le=36_500,
+        description="a new object enters the map if its expected stay is at least this long",
     )
     prior_stay_days: float = Field(
         default=30.0,
         ge=0,
         le=1e6,
-        description="how long what is new is expected to stay where nothing is known to come and go; less than "
-        "stay_days: it must be seen for the difference first",
+        description="expected stay of a new object where no earlier object has come and gone. "
+        "If it is less than stay_days, "
+        "the object must first be seen for the difference",
     )
     false_deletions: float = Field(
         default=1.0,
         gt=0,
         le=1,
-        description="a cell waits that is emptied with a larger probability of deleting what stands; 1: none does",
+        description="keep the points of a cell if the probability that its deletion is wrong "
+        "exceeds this. 1 disables this",
     )
     max_deleted_share: float = Field(
-        default=0.5, ge=0, le=1, description="hold a version that deletes more of the points of any tile"
+        default=0.5, ge=0, le=1, description="hold a version that deletes more than this share of the points of a tile"
     )
     max_change_m2: float = Field(
         default=500.0,
         ge=0,
         le=1e9,
-        description="hold a version in which one connected thing is larger that comes or goes",
+        description="hold a version with a connected change larger than this",
     )
     max_freed_share: float = Field(
-        default=0.5, ge=0, le=1, description="hold one that learns free space in more of a tile that knew of some"
+        default=0.5,
+        ge=0,
+        le=1,
+        description="hold a version that adds free space to more than this share of a tile that had free space already",
     )
 
 
@@ -82,23 +97,31 @@ class GateSettings(Section):
 class ServerSettings(Section):
     """server/http/app.py: what the server lets in."""
 
-    max_body_bytes: int = Field(default=16_000_000, description="largest request body; eight such wait in memory")
-    connections: int = Field(default=2000, ge=8, description="at once; the longest silent makes room for a new one")
-    header_timeout_s: float = Field(default=10.0, gt=0, description="for the headers of a request")
-    body_timeout_s: float = Field(default=120.0, gt=0, description="for its body")
-    answer_timeout_s: float = Field(default=60.0, gt=0, description="for a client that does not take its answer")
-    ballots_per_minute: float = Field(
-        default=600.0, gt=0, description="of one vehicle, on average; a tenth of them at once"
+    max_body_bytes: int = Field(
+        default=16_000_000, description="largest request body; up to eight of this size are in memory"
     )
-    drives_a_day: int = Field(default=300, ge=1, description="that one vehicle may send")
-    tiles_a_drive: int = Field(default=1000, ge=1, description="that one ballot may vote on, of 76.8 m by 76.8 m")
-    stored_bytes: int = Field(default=2_000_000_000, ge=1, description="that one vehicle's ballots may take")
+    connections: int = Field(
+        default=2000, ge=8, description="open connections; a new one replaces the one that was silent longest"
+    )
+    header_timeout_s: float = Field(default=10.0, gt=0, description="time limit for the headers of a request")
+    body_timeout_s: float = Field(default=120.0, gt=0, description="time limit for the body of a request")
+    answer_timeout_s: float = Field(default=60.0, gt=0, description="time limit for a client to read its answer")
+    ballots_per_minute: float = Field(
+        default=600.0,
+        gt=0,
+        description="ballots of one vehicle per minute on average; a tenth of them may come at once",
+    )
+    drives_a_day: int = Field(default=300, ge=1, description="drives that one vehicle may send in a day")
+    tiles_a_drive: int = Field(default=1000, ge=1, description="tiles (76.8 m by 76.8 m) that one ballot may vote on")
+    stored_bytes: int = Field(
+        default=2_000_000_000, ge=1, description="bytes that the ballots of one vehicle may take in the store"
+    )
     hosts: tuple[str, ...] = Field(
-        default=(), description="names that this server goes by, besides localhost and addresses in digits"
+        default=(), description="host names of this server, besides localhost and numeric addresses"
     )
 
     webhook_url: str = Field(
-        default="", pattern="^(https?://.*)?$", description="where events are posted to; empty: nowhere"
+        default="", pattern="^(https?://.*)?$", description="URL that events are posted to. Empty disables this"
     )
     webhook_secret: str = Field(
         default="",
