@@ -37,9 +37,17 @@ def postgres_url(postgres_cluster: PostgresCluster, postgres_database: str) -> I
     postgres_cluster.empty(_DATABASE)
 
 
-@pytest.fixture(params=["sqlite", "postgresql"])
+def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
+    """A test of a ``database_url`` runs on SQLite and, if slow tests run or it is of the contract, on PostgreSQL."""
+    if "database_url" in metafunc.fixturenames:
+        contract = metafunc.definition.get_closest_marker("contract") is not None
+        there = pytest.param("postgresql", marks=() if contract else pytest.mark.slow)
+        metafunc.parametrize("database_url", ["sqlite", there], indirect=True)
+
+
+@pytest.fixture
 def database_url(request: pytest.FixtureRequest, tmp_path: Path) -> str:
-    """The SQLAlchemy URL of an empty database: each test that asks for it runs on SQLite and on PostgreSQL."""
+    """The SQLAlchemy URL of an empty database, see :func:`pytest_generate_tests`."""
     if request.param == "sqlite":
         return f"sqlite:///{tmp_path / 'store.db'}"
     url: str = request.getfixturevalue("postgres_url")

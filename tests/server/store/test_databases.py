@@ -8,6 +8,7 @@ import sqlalchemy as sa
 from postgres_cluster import PostgresCluster
 
 
+@pytest.mark.contract
 def test_an_empty_database_that_keeps_what_is_committed(database_url: str) -> None:
     engine = sa.create_engine(database_url)
     assert sa.inspect(engine).get_table_names() == []

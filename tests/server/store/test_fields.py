@@ -106,6 +106,7 @@ def test_every_point_that_stays_keeps_its_fields_and_new_ones_have_the_sensors_i
     assert not any(column[-2:].any() for name, column in tile.fields.items() if name != "intensity")
 
 
+@pytest.mark.contract
 def test_rolled_back_replayed_and_cleared_they_are_what_they_were_bit_for_bit(store: Store) -> None:
     first = store.manifest(1)
     vote(store)

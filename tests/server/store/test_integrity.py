@@ -111,6 +111,7 @@ def test_a_tile_whose_deciding_ballots_are_set_aside_is_decided_anew(store: Stor
     assert list(publish(store).tiles) == [(0, 0)]
 
 
+@pytest.mark.contract
 def test_a_damaged_ballot_is_left_out_and_the_others_decide(store: Store) -> None:
     t = schema.ballot_tiles
     with store.database.reading() as connection:

@@ -40,6 +40,7 @@ def opens(store: Store, secret: str) -> str | None:
     return found.role if isinstance(found, keys.Key) else None
 
 
+@pytest.mark.contract
 def test_a_key_opens_by_its_role_until_its_end(store: Store, clock: Clock) -> None:
     ann, reader = keys.issue(store, "ann", "operator"), keys.issue(store, "map-room", "reader", days=2)
     assert (opens(store, ann), opens(store, reader), opens(store, "guess")) == ("operator", "reader", None)

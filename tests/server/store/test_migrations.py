@@ -78,6 +78,7 @@ def content(url: str) -> dict[str, list[dict[str, Any]]]:
     return rows
 
 
+@pytest.mark.contract
 def test_the_tables_are_those_that_the_code_describes(old_store: str) -> None:
     engine = sa.create_engine(old_store)
     with engine.connect() as connection:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pytest
+
 from hand_made import Say, make_ballot, states_plane, two_walls
 from mapvote.codec.ballot import encode
 from mapvote.core.types import CellState
@@ -49,6 +51,7 @@ def test_so_many_tiles_a_drive(database_url: str) -> None:
     store.close()
 
 
+@pytest.mark.contract
 def test_so_many_bytes_in_all(database_url: str) -> None:
     store = Store.create(database_url, two_walls())
     one = drive("a", "d0")

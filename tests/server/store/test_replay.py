@@ -105,6 +105,7 @@ def honest(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Store]:
     store.close()
 
 
+@pytest.mark.contract
 def test_the_map_becomes_that_of_a_history_without_the_vehicle(store: Store, honest: Store) -> None:
     a_year(store, liar=True)
     newest = store.current()

@@ -79,6 +79,7 @@ def test_a_dry_run_says_what_would_go_and_takes_nothing(store: Store, clock: Clo
     assert (again.versions, again.planes, again.decisions, again.ballots, again.size) == (0, 0, 0, 0, 0)
 
 
+@pytest.mark.contract
 def test_what_is_left_is_whole_and_bit_for_bit_as_it_was(store: Store, clock: Clock) -> None:
     come_and_go(store, clock, 8)
     before = {n: [pack_tile(tile) for tile in store.point_map(n).tiles.values()] for n in (7, 8, 9)}

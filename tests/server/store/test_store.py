@@ -74,6 +74,7 @@ def heights(store: Store, cell: tuple[int, int] = CELL) -> int:
     return int((inside & (points[:, 2] > 0.3)).sum())
 
 
+@pytest.mark.contract
 def test_a_map_survives_the_store(store: Store) -> None:
     before, after = two_walls(), store.point_map()
     assert after.map_id == before.map_id
@@ -83,6 +84,7 @@ def test_a_map_survives_the_store(store: Store) -> None:
         assert after.tiles[index].ground_z.tobytes() == tile.ground_z.tobytes()
 
 
+@pytest.mark.contract
 def test_two_vehicles_take_a_wall_down_and_the_manifest_says_what_changed(store: Store) -> None:
     base = store.point_map()
     send(store, says(base, "a", EMPTY), says(base, "b", EMPTY))
@@ -102,6 +104,7 @@ def test_an_unknown_version_is_an_error_not_an_empty_list(store: Store) -> None:
             ask()
 
 
+@pytest.mark.contract
 def test_sending_twice_is_harmless_and_sending_again_replaces(store: Store) -> None:
     base = store.point_map()
     first = says(base, "a", EMPTY, drive="d")
@@ -235,6 +238,7 @@ def test_the_policy_says_how_a_round_votes_and_never_mixes(store: Store, other: 
     assert [(change.by, change.reason) for change in store.policy_changes()][-1] == ("ann", "a new release")
 
 
+@pytest.mark.contract
 def test_a_policy_is_changed_by_name_and_a_wrong_name_is_told(store: Store) -> None:
     policy = changed(store.policy(), {"fuse.min_votes": "3", "round.stage": "one-stage"})
     assert (policy.fuse.min_votes, policy.round.stage) == (3, "one-stage")
@@ -298,6 +302,7 @@ def test_the_gate_sees_both_maps(store: Store) -> None:
     assert new.tiles[0, 1] is old.tiles[0, 1]
 
 
+@pytest.mark.contract
 def test_of_64_publishers_one_wins(store: Store) -> None:
     base = store.point_map()
     send(store, says(base, "a", EMPTY), says(base, "b", EMPTY))
@@ -316,6 +321,7 @@ def test_of_64_publishers_one_wins(store: Store) -> None:
     assert store.current() == 2
 
 
+@pytest.mark.contract
 def test_readers_never_see_a_mixture(store: Store) -> None:
     """While versions appear, a manifest is always that of one version: both tiles change together or not at all."""
     stop = threading.Event()
@@ -347,6 +353,7 @@ def test_what_is_no_store_says_so(database_url: str, store: Store) -> None:
         Store.open("sqlite:////nowhere/at/all.db")
 
 
+@pytest.mark.contract
 def test_a_database_that_is_gone_is_unavailable(database_url: str) -> None:
     with pytest.raises((MapvoteError, Unavailable)):
         Store.open(database_url)
