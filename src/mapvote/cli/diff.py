@@ -1,4 +1,4 @@
-"""The verbs of whole clouds: diff."""
+"""The verbs of whole clouds: diff and merge, and how a cloud votes."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 def register(app: typer.Typer) -> None:
     """Add these verbs to ``app``."""
     app.command(rich_help_panel=DRIVE)(diff)
+    app.command(rich_help_panel=DRIVE)(merge)
 
 
 def diff(
@@ -89,6 +90,30 @@ def diff(
         with whole_file(file) as part:
             part.write_text(text)
         print(f"{file}")
+
+
+def merge(
+    paths: Annotated[list[Path], typer.Argument(metavar="MAP...", help="maps that overlap, in any format and frame")],
+    out: Annotated[Path, typer.Option(metavar="MAP", help="the map to write; a folder that does not exist yet")],
+) -> None:
+    """Several maps of one area become one, in the frame of the first: registered, adjusted together, one point a voxel.
+
+    mapvote merge north.laz south.laz --out town
+    """
+    from mapvote.comparison.merge import merge_maps
+    from mapvote.formats import read_map, write_map
+
+    if out.exists():
+        raise typer.BadParameter(f"{out} exists; name a new folder", param_hint="--out")
+    with waiting("reading"):
+        maps = [read_map(path) for path in paths]
+    with waiting("registering and merging"):
+        merged = merge_maps(maps)
+    for (i, j), far in merged.apart_m.items():
+        print(f"{paths[i]} and {paths[j]}: {far:.3f} m apart after adjustment (median)")
+    with waiting(f"writing {out}"):
+        write_map(merged.point_map, out)
+    print(f"{out}: {merged.point_map.n_points} points")
 
 
 def ballot_of_cloud(
