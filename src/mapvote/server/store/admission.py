@@ -1,4 +1,8 @@
-"""What a ballot must be to be taken in: sound, its vehicle's own, on this map, and still about something."""
+"""Admission of ballots. ``examine`` decodes a ballot and checks it without a database. ``Intake`` checks it against the
+map, the policy and the quota of its vehicle, within the transaction that writes it.
+
+Where a vehicle can have been is checked too: near the map, on one path, at heights that the map allows.
+"""
 
 from __future__ import annotations
 

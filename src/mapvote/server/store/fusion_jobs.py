@@ -1,6 +1,6 @@
-"""Fuse a round from the store, tile by tile, on any concurrent.futures.Executor: threads here, Dask on a cluster.
+"""Fusion of a round, tile by tile, on any concurrent.futures.Executor: threads, or Dask on a cluster.
 
-A worker reads ballots from the database itself; a decision and the planes that changed travel back.
+A worker reads the ballots from the database. It returns the decision and the planes that changed.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""Is every byte of a store what it was when it was written? Say what is damaged, set it aside, mend what can be mended.
+"""Integrity of a store: damage is found, put into quarantine, and repaired from another copy where there is one.
 
-What cannot be mended is set aside: a ballot's votes on that tile count no more, a tile is not fused, and all others go
-on as if nothing had happened.
+A plane of a tile is named by the SHA-256 of its values. Every other row carries a SHA-256 over what is written once.
+A ballot in quarantine does not count on its tile, and a tile with a damaged plane is not fused. All else goes on.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """New versions: publish the round, or roll back.
 
-A round is decided before the transaction and on a snapshot. Of several publishers exactly one wins, the others get
-Conflict.
+A round is decided on a snapshot, before the transaction that writes it. Of several publishers exactly one wins; the
+others get Conflict.
 """
 
 from __future__ import annotations

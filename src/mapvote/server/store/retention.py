@@ -1,7 +1,7 @@
-"""What a store need not keep for ever: planes and decisions of old versions, and ballots that can decide nothing more.
+"""Retention: deletes planes and decisions of old versions, and ballots that can decide nothing more.
 
-That a version was, by whom and why, and that a ballot was cast, stays. What is left can be published from, rolled back
-to and replayed as before, from the oldest version that is kept.
+The rows that record a version or a ballot stay. From the oldest kept version on, publish, rollback and replay work as
+before.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """The tables. One store holds one map. Times are nanoseconds since 1970, hashes SHA-256 in hex.
 
-Nothing that was voted or published is ever overwritten: a ballot that is replaced or withdrawn is marked with the
-event that did so, so that any past round can be fused again (un-vote by replay).
+Votes and versions are never overwritten. A ballot that is replaced or withdrawn is marked with the event that did so.
+Hence any past round can be fused again (un-vote by replay).
 """
 
 from __future__ import annotations

@@ -1,6 +1,8 @@
-"""Which votes count on a tile: standing at a moment, in the window, on cells where it is not spent.
+"""The votes on a tile: which count, and their planes.
 
-Everything is asked as of an event number (``mark``), so that a past round can be fused again exactly.
+A vote counts if its ballot stands at an event number (``mark``), lies in the window of the policy and is not spent in
+the cell. All queries take the mark, so that a past round can be fused again exactly. Unpacked votes are cached by the
+sum of their row: two rows of one sum say the same. The cache ends with the process.
 """
 
 from __future__ import annotations
