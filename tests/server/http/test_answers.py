@@ -38,6 +38,7 @@ ASKED: list[tuple[str, str, str, Any]] = [
     ("GET", "/v1/cells", "/v1/cells?x=3.15&y=3.15", None),
     ("GET", "/v1/coverage", "", None),
     ("GET", "/v1/coverage", "/v1/coverage?format=geojson", None),
+    ("GET", "/v1/coverage/passes", "", None),
     ("GET", "/v1/vehicles", "", None),
     ("GET", "/v1/vehicles", "/v1/vehicles?format=geojson", None),
     ("GET", "/v1/paths", "", None),
