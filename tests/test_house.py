@@ -14,6 +14,10 @@ SRC = ROOT / "src"
 SOURCES = sorted(SRC.rglob("*.py"))
 Function = ast.FunctionDef | ast.AsyncFunctionDef
 
+KERNELS = {"kernel", "allocating", "inlined"}
+"""Decorators of mapvote.core.kernel."""
+MOST_KERNELS = 150
+"""All of them, those inlined in others too: each costs a tenth of a second of `mapvote warmup`, or more."""
 MOST_LINES = 500
 MOST_FUNCTION_LINES = 60
 MOST_ARGUMENTS = 8
@@ -48,7 +52,8 @@ def arguments(function: Function) -> int:
 
 def is_kernel(function: Function) -> bool:
     """Compiled by numba: plain arrays go in, and what is handed on in a group costs more than it tells."""
-    return any("njit" in ast.unparse(decorator) for decorator in function.decorator_list)
+    decorators = {ast.unparse(decorator) for decorator in function.decorator_list}
+    return bool(decorators & KERNELS) or any("njit" in decorator for decorator in decorators)
 
 
 def is_verb(function: Function) -> bool:
@@ -132,6 +137,11 @@ def test_every_function_but_kernels_verbs_and_migrations_has_at_most_60_lines() 
 def test_every_function_but_kernels_and_verbs_has_at_most_eight_arguments() -> None:
     asked = {f"{s.relative_to(ROOT)}: {f.name}": arguments(f) for s in SOURCES for f in functions(s) if crowded(f)}
     assert asked == {}
+
+
+def test_kernels_are_few() -> None:
+    found = [f"{s.relative_to(ROOT)}: {f.name}" for s in SOURCES for f in functions(s) if is_kernel(f)]
+    assert len(found) <= MOST_KERNELS, found
 
 
 def test_few_names_mean_two_things() -> None:

@@ -11,9 +11,9 @@ from pathlib import Path
 import pytest
 
 import mapvote
-from mapvote.core.ground_growing import grow
+from mapvote.core.ground_growing import _grow
 from mapvote.core.voting import count_states
-from mapvote.fusion.copies import grouped
+from mapvote.fusion.copies import find_alike
 from mapvote.fusion.outliers import contradicts
 from mapvote.localisation.ndt_solver import align
 from mapvote.perception.range_image import look
@@ -30,10 +30,12 @@ def test_warming_up_goes_through_every_step_and_says_what_each_took() -> None:
     told = list(warm_up())
     assert len(told) == 6
     assert all(seconds > 0 for _, seconds in told)
-    for kernel in (align, count_states, look, grow, contradicts, grouped):
+    for kernel in (align, count_states, look, _grow, contradicts, find_alike):
         assert kernel.signatures
 
 
+MOST_COMPILED = 150
+"""Specialisations, with those of numba's own functions: each takes .1 to .2 s of CPU."""
 LISTENING = """
 import sys
 import numba
@@ -60,7 +62,7 @@ def test_once_warmed_up_no_verb_compiles_anything(tmp_path: Path) -> None:
         return [line for line in done.stdout.splitlines() if line.startswith("compiled")]
 
     simulate("corner", tmp_path / "street")
-    assert len(run("warmup")) > 100
+    assert 60 < len(run("warmup")) <= MOST_COMPILED
     assert not run("build", "street/survey_1", "--scans", ":40", "--out", "map")
     for vehicle in ("v1", "v2"):
         assert not run("vote", f"street/{vehicle}", "--map", "map", "--out", f"{vehicle}.ballot")

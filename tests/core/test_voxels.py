@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 
 from mapvote.core.grid import CELL_SIZE, Lattice
 from mapvote.core.types import F64
-from mapvote.core.voxels import VoxelCloud, first_of_each, voxel_downsample, voxel_keys
+from mapvote.core.voxels import VoxelCloud, grouped, voxel_downsample, voxel_keys
 
 
 @settings(max_examples=15, deadline=None)
@@ -74,4 +74,4 @@ def test_it_grows_past_its_first_table() -> None:
 @given(st.lists(st.integers(1, 40), max_size=300))
 def test_the_first_of_each_key_is_found_in_the_order_of_the_keys_coming(keys: list[int]) -> None:
     _, first = np.unique(np.array(keys, dtype=np.int64), return_index=True)
-    np.testing.assert_array_equal(first_of_each(np.array(keys, dtype=np.int64)), np.sort(first))
+    np.testing.assert_array_equal(grouped(np.array(keys, dtype=np.int64))[1], np.sort(first))

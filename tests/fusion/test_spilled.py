@@ -162,7 +162,9 @@ def test_moments_are_those_of_all_points_within_reach() -> None:
     points, cells = points[order], cells[order]
     first = np.concatenate([[0], np.cumsum(np.bincount(cells, minlength=CELLS))])
     asked = np.arange(0, 400, 7)
-    number, mean, spread = _moments(points, asked, first, cells)
+    number, mean = np.zeros(len(asked), np.int64), np.zeros((len(asked), 3))
+    spread = np.zeros((len(asked), 3, 3))
+    _moments(points, asked, first, cells, number, mean, spread)
     for k, i in enumerate(asked):
         off = points.astype(np.float64) - points[i]
         near = off[np.linalg.norm(off, axis=1) <= REACH_M]

@@ -4,13 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from scipy import ndimage
 
 from mapvote.core.types import I32, Bool
-from mapvote.perception.moving_kernels import cells_in_plane, decidable, flood, moving_components, voxels
-from mapvote.perception.range_image import BOTH_SIDES, Counts
+from mapvote.perception.moving_kernels import moving_components, voxels
 
 SIDE = 10
 
@@ -21,20 +18,28 @@ def plane(inner: Bool) -> Bool:
 
 
 @pytest.mark.parametrize("seed", range(8))
-def test_wanted_cells_are_of_one_component_that_touch_or_are_joined_by_other_wanted_ones(seed: int) -> None:
-    """As scipy labels a picture, in which a third of the cells are wanted."""
-    held, want = np.random.default_rng(seed).random((2, SIDE - 2, SIDE - 2)) < 0.55
-    cells = np.flatnonzero(plane(held))
-    wanted = plane(want).ravel()[cells]
-    expected = ndimage.label(plane(held & want), structure=np.ones((3, 3)))[0].ravel()[cells] - 1
-    np.testing.assert_array_equal(flood(cells, wanted, SIDE), expected)
+def test_cells_move_by_components_as_scipy_labels_them(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    place = np.flatnonzero(plane(rng.random((SIDE - 2, SIDE - 2)) < 0.5))
+    brief = rng.random(len(place)) < 0.5
+    moves, wanted = np.zeros(len(place), np.bool_), np.ones(len(place), np.bool_)
+    for share in (0.5, 0.6):
+        held = np.zeros(SIDE * SIDE, np.bool_)
+        held[place[wanted]] = True
+        label = ndimage.label(held.reshape(SIDE, SIDE), structure=np.ones((3, 3)))[0].ravel()[place]
+        found = [bool(k and brief[label == k].sum() >= max(2, share * (label == k).sum())) for k in label]
+        moves |= found
+        wanted = ~moves & brief
+    np.testing.assert_array_equal(
+        moving_components(place, SIDE, np.ones(len(place), np.bool_), brief, 2, 0.5, 0.6), moves
+    )
 
 
 def moving(at: list[tuple[int, int]], brief: list[bool], voxel_of: I32, min_voxels: int = 4) -> list[bool]:
     rows, cols = np.array(at).T
     seen = np.ones(len(at), np.bool_)
-    found: Bool = moving_components(rows, cols, SIDE, seen, np.array(brief), min_voxels, 0.5, 0.6, voxel_of)
-    return list(found.tolist())
+    found = moving_components(rows * SIDE + cols, SIDE, seen, np.array(brief), min_voxels, 0.5, 0.6)
+    return list(np.append(found, False)[voxel_of].tolist())
 
 
 def test_the_voxels_over_one_cell_count_together_and_all_their_points_move() -> None:
@@ -56,29 +61,6 @@ def test_a_walker_who_touches_a_wall_moves_without_it_though_something_of_the_wa
     brief = [True] + [False] * (len(touched) - 1 + len(wall)) + [True] * len(walker)
     moves = moving(touched + wall + walker, brief, np.arange(len(brief), dtype=np.int32))
     assert moves == [False] * (len(touched) + len(wall)) + [True] * len(walker)
-
-
-@given(
-    st.lists(
-        st.tuples(st.integers(0, 13), st.integers(0, 13), st.integers(0, int(BOTH_SIDES))), min_size=1, max_size=30
-    ),
-    st.integers(1, 5),
-)
-def test_what_was_brief_was_seen_often_enough_mostly_free_and_from_both_sides(
-    told: list[tuple[int, int, int]], min_free: int
-) -> None:
-    free, hit, sides = (np.array(part, np.int32) for part in zip(*told, strict=True))
-    seen, brief = decidable(Counts(free=free, hit=hit, sides=sides.astype(np.uint8)), min_free, 0.75)
-    for i, (f, h, s) in enumerate(told):
-        assert seen[i] == (f + h >= min_free)
-        assert brief[i] == (s == BOTH_SIDES and f >= min_free and f >= 0.75 * (f + h))
-
-
-def test_places_lie_in_the_cells_of_a_plane_counted_from_its_lowest() -> None:
-    places = np.array([[-0.1, 0.2, 5.0], [0.0, -0.7, 1.0], [3.05, 1.6, 0.0]])
-    rows, cols = cells_in_plane(places, np.array([-3, -5]), 0.3)
-    assert rows.tolist() == [5, 2, 10]
-    assert cols.tolist() == [2, 3, 13]
 
 
 @pytest.mark.parametrize("count", [0, 50, 20_000])

@@ -11,7 +11,6 @@ from collections.abc import Callable
 from typing import Annotated
 
 import msgspec
-import numba
 import numpy as np
 
 from mapvote.codec.arrays import pack_plane as pack_plane
@@ -107,7 +106,7 @@ def unpack_sound_states(data: bytes) -> U8:
 
 def check_states(states: U8) -> U8:
     """The same, of any shape; MapvoteError if one is no cell state."""
-    if not _all_states(states.reshape(-1)):
+    if not ((states < N_STATES) | (states == NO_VOTE)).all():
         raise MapvoteError("ballot: states holds a value that is no cell state")
     return states
 
@@ -138,14 +137,6 @@ def unpack_sureness(odds: bytes | None, states: U8 | None) -> I8 | None:
     if states is None:
         raise MapvoteError("ballot: a tile has the odds of changed cells, but no states")
     return unpack_odds(odds, len(changed_cells_of(states)))
-
-
-@numba.njit(cache=True, nogil=True)
-def _all_states(values: U8) -> bool:
-    sound = True
-    for value in values:  # without a way out: that the compiler turns into vectors
-        sound &= (value < N_STATES) | (value == NO_VOTE)
-    return sound
 
 
 def encode(ballot: Ballot) -> bytes:

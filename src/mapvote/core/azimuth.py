@@ -10,8 +10,9 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import numba
 import numpy as np
+
+from mapvote.core.kernel import inlined
 
 _SERIES = (
     3.33333333333329318027e-01, -1.99999999998764832476e-01, 1.42857142725034663711e-01, -1.11111104054623557880e-01,
@@ -34,7 +35,7 @@ def _azimuth_of(kind: type[np.floating[Any]], high: tuple[float, ...], low: tupl
     a0, a1, a2, a3, a4, a5, a6, a7, a8, a9, a10 = (kind(v) for v in _SERIES)
     last = kind(h3 + l3)
 
-    @numba.njit(inline="always", error_model="numpy")
+    @inlined
     def azimuth(y: Any, x: Any) -> Any:
         t = zero if y == zero else abs(y / x)  # at the origin itself too
         first, second, third, fourth = t < below_half, t < below_one, t < below_middle, t < below_far

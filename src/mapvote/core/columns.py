@@ -7,10 +7,10 @@ stands for everything from there upwards. Neighbouring cells are compared by shi
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
 from mapvote.core.grid import CELL_SIZE
+from mapvote.core.kernel import inlined, kernel
 from mapvote.core.types import F32, F64, I32, I64, U64, Bool
 
 GROUND_MARGIN_M = 0.3
@@ -18,38 +18,34 @@ GROUND_MARGIN_M = 0.3
 TOP_BIT = 63
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@inlined
 def height_above(z: float, ground_z: float, base: int) -> float:
     """Height of a point above the ground of its cell; where that is unknown, above the bottom of its column."""
     return z - (base * CELL_SIZE if np.isnan(ground_z) else ground_z)
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@inlined
 def layer_bit(layer: int, base: int) -> int:
     """Which bit of its column's word a layer of the world is; what lies beyond the word goes to its ends."""
     return min(max(layer - base, 0), TOP_BIT)
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@inlined
 def column_bit(z: float, base: int) -> int:
     """Which bit of its column's word a height belongs to, see :func:`layer_bit`."""
     return layer_bit(int(np.floor(z / CELL_SIZE)), base)
 
 
-@numba.njit(cache=True, nogil=True)
 def column_bits(z: F64, ground_z: F32, base: I32) -> tuple[I64, Bool]:
     """(bit (n,), obstacle (n,)) of points: ``z`` their heights, ``ground_z`` and ``base`` those of their cells.
 
     The one rule of what is an obstacle and what is ground: see :func:`height_above` and GROUND_MARGIN_M.
     """
-    bit, obstacle = np.empty(len(z), np.int64), np.empty(len(z), np.bool_)
-    for i in range(len(z)):
-        bit[i] = column_bit(z[i], base[i])
-        obstacle[i] = height_above(z[i], ground_z[i], base[i]) >= GROUND_MARGIN_M
-    return bit, obstacle
+    bit = np.clip(np.floor(z / CELL_SIZE).astype(np.int64) - base, 0, TOP_BIT)
+    return bit, z - np.where(np.isnan(ground_z), base * CELL_SIZE, ground_z) >= GROUND_MARGIN_M
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def mark_obstacles(words: U64, points: F32, cells: I64, ground_z: F32, base: I32) -> None:
     """Enter the points (n, 3) that are obstacles into the column ``words`` (cells,), by their flat ``cells`` (n,) and
     the rule of :func:`column_bits`; ``ground_z``, ``base`` (cells,)."""
@@ -59,18 +55,7 @@ def mark_obstacles(words: U64, points: F32, cells: I64, ground_z: F32, base: I32
             words[cell] |= np.uint64(1) << np.uint64(column_bit(z, base[cell]))
 
 
-@numba.njit(cache=True, nogil=True)
-def outside(words: U64, occupied: U64) -> U64:
-    """(rows, cols) the voxels of ``words`` that are not ``occupied``: in one pass over both."""
-    out = np.empty_like(words)
-    for r in range(len(words)):
-        mine, held, left = words[r], occupied[r], out[r]
-        for c in range(np.uint64(0), np.uint64(len(left))):
-            left[c] = mine[c] & ~held[c]
-    return out
-
-
-@numba.njit(cache=True, nogil=True)
+@kernel
 def fill_columns(
     rows: I64, cols: I64, z: F64, ground_z: F32, base: I32, words: U64, counts: I32, bottom_z: F32, top_z: F32
 ) -> None:
@@ -87,7 +72,7 @@ def fill_columns(
         top_z[r, c] = max(top_z[r, c], z[i])
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@inlined
 def shifted(word: np.uint64, layers: int) -> np.uint64:
     """A column seen from a base ``layers`` lower (layers > 0: bits move up, what passes bit 63 is gone)."""
     if layers >= 64 or layers <= -64:
@@ -95,7 +80,13 @@ def shifted(word: np.uint64, layers: int) -> np.uint64:
     return word << np.uint64(layers) if layers >= 0 else word >> np.uint64(-layers)
 
 
-@numba.njit(cache=True, nogil=True)
+def rebased(words: U64, layers: I32) -> U64:
+    """(...) :func:`shifted` of every word by its own number of ``layers`` (...)."""
+    up, down = np.clip(layers, 0, 63).astype(np.uint64), np.clip(-layers, 0, 63).astype(np.uint64)
+    return np.where(np.abs(layers) < 64, words << up >> down, np.uint64(0))
+
+
+@kernel
 def neighbourhood(words: U64, base: I32, r: int, c: int, reach: int) -> np.uint64:
     """Voxels of column (r, c) within ``reach`` cells (a square) and one layer of a set bit; bases may differ."""
     rows, cols = words.shape
@@ -108,20 +99,22 @@ def neighbourhood(words: U64, base: I32, r: int, c: int, reach: int) -> np.uint6
     return near | (near << np.uint64(1)) | (near >> np.uint64(1))
 
 
-@numba.njit(cache=True, nogil=True)
 def dilated(words: U64, base: I32, reach: int) -> U64:
     """:func:`neighbourhood` of every column, (rows, cols)."""
-    out = np.empty_like(words)
-    for r in range(words.shape[0]):
-        for c in range(words.shape[1]):
-            out[r, c] = neighbourhood(words, base, r, c, reach)
-    return out
+    rows, cols = words.shape
+    near = np.zeros_like(words)
+    for i in range(-reach, reach + 1):
+        for j in range(-reach, reach + 1):
+            here = slice(max(-i, 0), rows - max(i, 0)), slice(max(-j, 0), cols - max(j, 0))
+            beside = slice(max(i, 0), rows + min(i, 0)), slice(max(j, 0), cols + min(j, 0))
+            near[here] |= rebased(words[beside], base[beside] - base[here])
+    return near | (near << np.uint64(1)) | (near >> np.uint64(1))
 
 
 EVERY_BIT = ~np.uint64(0)
 
 
-@numba.njit(cache=True, nogil=True)
+@inlined
 def below_top(word: np.uint64) -> np.uint64:
     """Every bit at or below the highest set one; 0 for 0."""
     for shift in (1, 2, 4, 8, 16, 32):
@@ -129,7 +122,7 @@ def below_top(word: np.uint64) -> np.uint64:
     return word
 
 
-@numba.njit(cache=True, nogil=True)
+@inlined
 def span_of(word: np.uint64) -> np.uint64:
     """The bits from the lowest to the highest set one: the height span of a column; 0 for 0."""
     lowest = word & (~word + np.uint64(1))

@@ -6,11 +6,11 @@ radians, applied on the left (``exp(xi) @ T``). Source: Barfoot, State Estimatio
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-F64 = NDArray[np.float64]
+from mapvote.core.kernel import inlined, kernel
+from mapvote.core.types import F64, read_only
 
 
 def transform(T_a_b: F64, points_b: NDArray[np.floating]) -> F64:
@@ -19,38 +19,32 @@ def transform(T_a_b: F64, points_b: NDArray[np.floating]) -> F64:
     Not by a matrix product: BLAS wakes all its threads for so small a matrix, and on a busy machine they wait for each
     other (twice the CPU time of a whole drive).
     """
-    out: F64 = _transformed(np.asarray(T_a_b, dtype=np.float64), np.ascontiguousarray(points_b))
+    points = read_only(np.ascontiguousarray(points_b, dtype=np.float64))
+    out = np.empty((len(points), 3))
+    _transform(read_only(np.ascontiguousarray(T_a_b, dtype=np.float64)), points, out)
     return out
 
 
-@numba.njit(cache=True, nogil=True)
-def _transformed(T: F64, points: NDArray[np.floating]) -> F64:
-    out = np.empty((len(points), 3))
+@kernel
+def _transform(T: F64, points: F64, out: F64) -> None:
     for i in range(len(points)):
-        x, y, z = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
+        x, y, z = points[i, 0], points[i, 1], points[i, 2]
         for k in range(3):
             out[i, k] = T[k, 0] * x + T[k, 1] * y + T[k, 2] * z + T[k, 3]
-    return out
 
 
-@numba.njit(cache=True, nogil=True)
 def rows_from(points: F64, origin: F64) -> NDArray[np.float32]:
     """(3, n) float32: points (n, 3) from ``origin`` (3,), in rows of x, y and z, which loops over points vectorise."""
     rows = np.empty((3, len(points)), np.float32)
-    x, y, z = rows[0], rows[1], rows[2]
-    for i in range(np.uint64(0), np.uint64(len(points))):  # unsigned: an index that cannot be negative vectorises
-        x[i], y[i], z[i] = points[i, 0] - origin[0], points[i, 1] - origin[1], points[i, 2] - origin[2]
+    _rows_from(read_only(np.ascontiguousarray(points)), read_only(np.ascontiguousarray(origin)), rows)
     return rows
 
 
-@numba.njit(cache=True, nogil=True)
-def from_origin(points: F64, origin: F64) -> NDArray[np.float32]:
-    """(n, 3) float32: points (n, 3) from ``origin`` (3,). Numpy goes through rows of three one by one."""
-    out = np.empty(points.shape, np.float32)
-    for i in range(len(points)):
-        for k in range(3):
-            out[i, k] = points[i, k] - origin[k]
-    return out
+@kernel
+def _rows_from(points: F64, origin: F64, rows: NDArray[np.float32]) -> None:
+    x, y, z = rows[0], rows[1], rows[2]
+    for i in range(np.uint64(0), np.uint64(len(points))):  # unsigned: an index that cannot be negative vectorises
+        x[i], y[i], z[i] = points[i, 0] - origin[0], points[i, 1] - origin[1], points[i, 2] - origin[2]
 
 
 def inverse(T_a_b: F64) -> F64:
@@ -139,7 +133,7 @@ def is_rigid(T: F64, tolerance: float = 1e-3) -> bool:
     return bool(np.all(np.isfinite(T)) and np.allclose(R @ R.T, np.eye(3), atol=tolerance) and np.linalg.det(R) > 0)
 
 
-@numba.njit(cache=True, nogil=True, inline="always", error_model="numpy")
+@inlined
 def turn(x: np.float32, y: np.float32) -> np.float32:
     """Azimuth of (x, y) in [0, 1] turns, within 1e-5 rad (Abramowitz and Stegun 4.4.49), in float32 and without a
     branch, so that a loop over points vectorises: it sorts rays, it measures nothing. 0 for (0, 0)."""

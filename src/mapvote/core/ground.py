@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from functools import lru_cache
 
-import numba
 import numpy as np
 
 from mapvote.core.grid import CELL_SIZE, CELLS, TILE_CELLS, TileIndex
 from mapvote.core.ground_growing import SEED, STEP_M, UNREACHED, grow, tiles_around
+from mapvote.core.kernel import inlined, kernel
 from mapvote.core.types import F32, F64, I32, I64, U8, Bool, read_only
 
 KNOWN_M = 3.0
@@ -43,20 +43,10 @@ def base_layers(ground_z: F32) -> I32:
         low[~known] = np.inf
         _lower_envelope(low, 0.02 * CELL_SIZE, 0.02 * CELL_SIZE * np.sqrt(2.0))
         np.copyto(low, ground_z, where=known)
-    return _layers(low)
+    return np.floor(low / CELL_SIZE).astype(np.int32)
 
 
-@numba.njit(cache=True, nogil=True)
-def _layers(z: F64) -> I32:
-    """(rows, cols) the lattice layers of heights, every one of which is known."""
-    layers = np.empty(z.shape, dtype=np.int32)
-    for r in range(z.shape[0]):
-        for c in range(z.shape[1]):
-            layers[r, c] = np.int32(np.floor(z[r, c] / CELL_SIZE))
-    return layers
-
-
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _lower_envelope(z: F64, straight: float, diagonal: float) -> None:
     """Two-pass chamfer: z[c] = min over c' of z[c'] + grade * |c - c'|, in place (Borgefors 1986)."""
     rows, cols = z.shape
@@ -72,7 +62,7 @@ def _lower_envelope(z: F64, straight: float, diagonal: float) -> None:
             z[r, c] = min(z[r, c], z[r, c + 1] + straight)
 
 
-@numba.njit(cache=True, nogil=True)
+@inlined
 def _reach_from(beside: F64, row: F64, straight: float, diagonal: float) -> None:
     """What a row takes from the one beside it: no cell waits for another, so the compiler makes vectors of it."""
     last = len(row) - 1
@@ -83,10 +73,10 @@ def _reach_from(beside: F64, row: F64, straight: float, diagonal: float) -> None
         row[c + 1] = min(row[c + 1], beside[c] + diagonal)
 
 
-@numba.njit(cache=True, nogil=True)
-def _supported(low: F32, reach: int, grade: float, share: float, least: int) -> F32:
-    """``low`` without a rim of ``reach`` cells, and without the cells (inf instead) that too few of the known cells
-    within ``reach`` agree with.
+@kernel
+def _support(low: F32, reach: int, grade: float, share: float, least: int, out: F32) -> None:
+    """Into ``out`` ``low`` without a rim of ``reach`` cells, and without the cells (inf instead) that too few of the
+    known cells within ``reach`` agree with.
 
     Agreement: within 0.3 m, and ``grade`` (metres per cell) times the distance more; by at least ``least`` cells and a
     ``share`` of them. Reflections below the road come singly or in small clusters far below all
@@ -94,9 +84,9 @@ def _supported(low: F32, reach: int, grade: float, share: float, least: int) -> 
     """
     rows, cols = low.shape
     plenty = share * (2 * reach + 1) ** 2
-    out = np.full((rows - 2 * reach, cols - 2 * reach), np.inf, np.float32)
     for r in range(reach, rows - reach):
         for c in range(reach, cols - reach):
+            out[r - reach, c - reach] = np.inf
             if not np.isfinite(low[r, c]):
                 continue
             known, agree = 0, 0
@@ -111,7 +101,6 @@ def _supported(low: F32, reach: int, grade: float, share: float, least: int) -> 
                     break
             if agree > least and agree >= share * known:  # the cell itself is one of them
                 out[r - reach, c - reach] = low[r, c]
-    return out
 
 
 def lay_ground(
@@ -225,7 +214,10 @@ def _sow(lows: _Lows, neighbours: I32, least: int) -> None:
         if not np.isfinite(low(tile)).any():
             return nothing
         around = np.block([[low(j) if j >= 0 else nothing for j in row] for row in neighbours[tile].tolist()])
-        return _supported(around[near, near], _AROUND_CELLS, _GRADE * CELL_SIZE, _AGREEING, least)
+        out = np.empty((TILE_CELLS, TILE_CELLS), dtype=np.float32)
+        window = np.ascontiguousarray(around[near, near])
+        _support(window, _AROUND_CELLS, _GRADE * CELL_SIZE, _AGREEING, least, out)
+        return out
 
     envelope = np.empty((3 * TILE_CELLS, 3 * TILE_CELLS))
     for k in range(len(neighbours)):

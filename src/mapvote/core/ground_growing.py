@@ -11,10 +11,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-import numba
 import numpy as np
 
 from mapvote.core.grid import CELL_SIZE, CELLS, TILE_CELLS, TileIndex
+from mapvote.core.kernel import inlined, kernel
 from mapvote.core.types import F32, I32, I64, U8
 
 STEP_M = 0.5 * CELL_SIZE
@@ -45,7 +45,7 @@ _BEYOND_GAP = 2
 """Cells of them that hold points at a like height, before the ground goes on beyond a gap."""
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@inlined
 def _cell_at(tile: int, row: int, col: int, neighbours: I32) -> int:
     """Flat cell of (row, col) counted from a tile's corner; -1 if it lies in a tile that the map does not have."""
     down, right = row // TILE_CELLS, col // TILE_CELLS
@@ -53,7 +53,7 @@ def _cell_at(tile: int, row: int, col: int, neighbours: I32) -> int:
     return -1 if other < 0 else other * CELLS + (row - down * TILE_CELLS) * TILE_CELLS + col - right * TILE_CELLS
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@inlined
 def _is_within(row: int, col: int, margin: int) -> bool:
     """Whether all cells ``margin`` around one lie in its tile: then they are found by adding to its flat number, most
     of them, and quicker by far than by :func:`_cell_at`."""
@@ -61,13 +61,13 @@ def _is_within(row: int, col: int, margin: int) -> bool:
     return margin <= row < last and margin <= col < last
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@inlined
 def _placed(cell: int) -> tuple[int, int, int]:
     """(tile, row, col) of a flat cell."""
     return cell // CELLS, cell % CELLS // TILE_CELLS, cell % TILE_CELLS
 
 
-@numba.njit(cache=True, nogil=True)
+@inlined
 def _bounds(cell: int, ground: F32, gap: U8, neighbours: I32) -> tuple[float, float, float]:
     """(lowest, steeply lowest, highest) height of a point of this cell that continues the measured ground near by."""
     tile, row, col = _placed(cell)
@@ -84,7 +84,7 @@ def _bounds(cell: int, ground: F32, gap: U8, neighbours: I32) -> tuple[float, fl
     return low - _NOISE_M, steep - _NOISE_M, high + _NOISE_M
 
 
-@numba.njit(cache=True, nogil=True)
+@inlined
 def _like(
     cell: int, z: float, grade: float, below: float, clear: float, start: I32 | I64, heights: F32, neighbours: I32
 ) -> int:
@@ -108,7 +108,7 @@ def _like(
     return found
 
 
-@numba.njit(cache=True, nogil=True)
+@inlined
 def _continued(
     cell: int, expected: float, width: int, start: I32 | I64, heights: F32, ground: F32, gap: U8, neighbours: I32
 ) -> float:
@@ -143,7 +143,7 @@ def _continued(
     return best if alike >= least else np.nan
 
 
-@numba.njit(cache=True, nogil=True)
+@inlined
 def _append(queue: I32, first: I32, last: I32, following: I32, width: int, entry: int) -> None:
     """First in, first out among gaps of one width."""
     following[entry] = -1
@@ -154,7 +154,7 @@ def _append(queue: I32, first: I32, last: I32, following: I32, width: int, entry
     last[width] = entry
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _enter(
     cell: int, z: float, width: int, start: I32 | I64, heights: F32, neighbours: I32, ground: F32, gap: U8
 ) -> None:
@@ -166,7 +166,6 @@ def _enter(
         ground[cell], gap[cell] = z, width
 
 
-@numba.njit(cache=True, nogil=True)
 def grow(start: I32 | I64, heights: F32, neighbours: I32, ground: F32, gap: U8) -> None:
     """Let the ground grow from where it is known to lie: cells whose ``gap`` is SEED, at the height ``ground``.
 
@@ -176,19 +175,43 @@ def grow(start: I32 | I64, heights: F32, neighbours: I32, ground: F32, gap: U8) 
 
     Seeds are all entered before any of them is left: only the rim of what they cover waits in the queue.
     """
-    # The narrowest gap over which each cell waits in the queue: who comes over as wide a one finds it entered.
+    seeds = np.flatnonzero(gap == SEED)
     waits = np.full(len(gap), UNREACHED, np.uint8)
-    width = int(np.int64(1))  # no literal, for which all steps would be compiled once more
-    for cell in range(len(gap)):
-        if gap[cell] == SEED:
-            waits[cell] = 0
-            _enter(cell, ground[cell], width, start, heights, neighbours, ground, gap)
-    cells, expected = np.empty(1024, np.int64), np.empty(1024, np.float32)
-    following = np.empty(1024, np.int32)
-    first, last = np.full(WIDEST + 4, -1, np.int32), np.full(WIDEST + 4, -1, np.int32)
-    n, spare, looked_at = 0, -1, 0
-    width = int(np.int64(0))
+    waits[seeds] = 0
+    queue = np.empty(1024, np.int64), np.empty(1024, np.float32), np.empty(1024, np.int32)
+    ends, state = np.full((2, WIDEST + 4), -1, np.int32), np.array([0, -1, 0, 0], dtype=np.int64)
+    _enter_seeds(seeds, start, heights, neighbours, ground, gap)
+    while not _grow(start, heights, neighbours, ground, gap, waits, *queue, ends, state):
+        queue = (  # full
+            np.concatenate([queue[0], np.empty_like(queue[0])]),
+            np.concatenate([queue[1], np.empty_like(queue[1])]),
+            np.concatenate([queue[2], np.empty_like(queue[2])]),
+        )
+
+
+@kernel
+def _enter_seeds(seeds: I64, start: I32 | I64, heights: F32, neighbours: I32, ground: F32, gap: U8) -> None:
+    for cell in seeds:
+        _enter(cell, ground[cell], np.int64(1), start, heights, neighbours, ground, gap)
+
+
+@kernel
+def _grow(
+    start: I32 | I64, heights: F32, neighbours: I32, ground: F32, gap: U8, waits: U8, cells: I64, expected: F32,
+    following: I32, ends: I32, state: I64,
+) -> bool:  # fmt: skip
+    """:func:`grow` from the seeds, which are entered, until all is reached, or False once the queue is full.
+
+    The queue: ``cells``, ``expected`` heights and the entry ``following`` each (n,), ``ends`` (2, widths) the first and
+    last entry of each gap's width. ``waits`` (cells,): the narrowest gap over which each cell waits: who comes over as
+    wide a one finds it entered. ``state`` (4,): entries, first spare one, cells looked at, width; for the next call.
+    """
+    first, last = ends[0], ends[1]
+    n, spare, looked_at, width = state[0], state[1], state[2], state[3]
     while width <= WIDEST:
+        if n + 8 > len(cells):
+            state[0], state[1], state[2], state[3] = n, spare, looked_at, width
+            return False
         if looked_at < len(gap):
             cell = looked_at
             looked_at += 1
@@ -218,15 +241,12 @@ def grow(start: I32 | I64, heights: F32, neighbours: I32, ground: F32, gap: U8) 
                 if spare >= 0:
                     free, spare = spare, following[spare]
                 else:
-                    if n == len(cells):
-                        cells = np.concatenate((cells, np.empty(n, np.int64)))
-                        expected = np.concatenate((expected, np.empty(n, np.float32)))
-                        following = np.concatenate((following, np.empty(n, np.int32)))
                     free = n
                     n += 1
                 cells[free], expected[free] = other, ground[cell]
                 _append(first, first, last, following, farther, free)
                 width = min(width, farther)
+    return True
 
 
 def tiles_around(tiles: Sequence[TileIndex]) -> I32:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -85,15 +84,23 @@ class Memory:
 
     def but(self, cells: I64, values: U32) -> Memory:
         """The same, but of flat ``cells`` (m,), ascending, these ``values`` (4, m)."""
-        joined, planes, at = _joined(self.cells, self.values, cells)
+        joined, planes, at = self._joined(cells)
         planes[:, at] = values
         return _sparse(joined, planes, sure=bool(values.any(axis=0).all()))
 
     def with_changed(self, cells: I64, version: int) -> Memory:
         """The same, but flat ``cells`` (m,), ascending, changed in ``version``."""
-        joined, planes, at = _joined(self.cells, self.values, cells)
+        joined, planes, at = self._joined(cells)
         planes[0, at] = version
         return _sparse(joined, planes, sure=version > 0)
+
+    def _joined(self, cells: I64) -> tuple[I64, U32, I64]:
+        """(own cells and ``cells`` (m,), (n,) ascending; their values (4, n), zero where they are new; which of all
+        each of ``cells`` is (m,))."""
+        joined = np.union1d(self.cells, cells)
+        planes = np.zeros((PLANES, len(joined)), dtype=np.uint32)
+        planes[:, np.searchsorted(joined, self.cells)] = self.values
+        return joined, planes, np.searchsorted(joined, cells)
 
 
 def _sparse(cells: I64, values: U32, sure: bool) -> Memory:
@@ -102,24 +109,3 @@ def _sparse(cells: I64, values: U32, sure: bool) -> Memory:
         return Memory(cells, values)
     kept = np.flatnonzero(values.any(axis=0))
     return Memory(cells[kept], values[:, kept])
-
-
-@numba.njit(cache=True, nogil=True)
-def _joined(known: I64, values: U32, cells: I64) -> tuple[I64, U32, I64]:
-    """(all of the cells ``known`` (n,) and ``cells`` (m,), ascending like both; their ``values`` (4, n), zero where
-    they are new; which of all each of ``cells`` is (m,))."""
-    most = len(known) + len(cells)
-    joined, planes = np.empty(most, dtype=np.int64), np.zeros((PLANES, most), dtype=np.uint32)
-    at = np.empty(len(cells), dtype=np.int64)
-    i, k, n = 0, 0, 0
-    while i < len(known) or k < len(cells):
-        joined[n] = min(known[i] if i < len(known) else CELLS, cells[k] if k < len(cells) else CELLS)
-        if i < len(known) and known[i] == joined[n]:
-            for plane in range(PLANES):
-                planes[plane, n] = values[plane, i]
-            i += 1
-        if k < len(cells) and cells[k] == joined[n]:
-            at[k] = n
-            k += 1
-        n += 1
-    return joined[:n].copy(), planes[:, :n].copy(), at

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
+from mapvote.core.kernel import allocating, inlined
 from mapvote.core.types import F32, F64, I32, Bool, read_only
 
 
@@ -18,7 +18,7 @@ def _words(rows: F32 | F64) -> I32:
     return read_only(np.ascontiguousarray(rows).view(np.int32))
 
 
-@numba.njit(cache=True, nogil=True)
+@allocating
 def _found(rows: I32, others: I32) -> Bool:
     """By a hash table of ``others``, at most half full, with linear probing."""
     size = 16
@@ -39,7 +39,7 @@ def _found(rows: I32, others: I32) -> Bool:
     return out
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@inlined
 def _hash(row: I32) -> np.int64:
     """FNV-1a (Fowler, Noll, Vo) by words, its high half folded in."""
     h = np.int64(-3750763034362895579)
@@ -48,7 +48,7 @@ def _hash(row: I32) -> np.int64:
     return h ^ (h >> 32)
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@inlined
 def _same(a: I32, b: I32) -> bool:
     for k in range(len(a)):  # noqa: SIM110 - numba compiles no generator in a call
         if a[k] != b[k]:

@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -101,10 +100,15 @@ class Tile:
 
     def without(self, dropped: Bool) -> Tile:
         """The tile without some of its points (n,); the others keep their fields."""
-        points, cells = _left(self.points, self.cells, dropped)
-        fields = {name: column[~dropped] for name, column in self.fields.items()}
+        left = np.flatnonzero(~dropped)
+        points, cells = self.points.take(left, axis=0), self.cells.take(left)
+        fields = {name: column.take(left) for name, column in self.fields.items()}
         other, words = self._with({"points": points, "fields": fields}), self.obstacle_words.reshape(-1).copy()
-        _mark_left(words, self.points, self.cells, dropped, self.ground_z.reshape(-1), self.base.reshape(-1))
+        touched = np.zeros(CELLS, dtype=np.bool_)
+        touched[self.cells[dropped]] = True
+        words[touched] = 0
+        again = np.flatnonzero(touched[cells])
+        self._mark(words, points[again], cells[again])
         other.__dict__.update(cells=cells, obstacle_words=words.reshape(self.window.shape))
         return other
 
@@ -122,7 +126,7 @@ class Tile:
             fields[name] = np.concatenate([column, new])
         other = self._with({"points": np.concatenate([self.points, points]), "fields": fields})
         cells, words = flat_cells(self.window, points), self.obstacle_words.reshape(-1).copy()
-        mark_obstacles(words, points, cells, self.ground_z.reshape(-1), self.base.reshape(-1))
+        self._mark(words, points, cells)
         words = words.reshape(self.window.shape)
         other.__dict__.update(cells=np.concatenate([self.cells, cells]), obstacle_words=words)
         return other
@@ -164,38 +168,13 @@ class Tile:
     def obstacle_words(self) -> U64:
         """(256, 256) column words of the obstacle points."""
         words = np.zeros(CELLS, dtype=np.uint64)
-        mark_obstacles(words, self.points, self.cells, self.ground_z.reshape(-1), self.base.reshape(-1))
+        self._mark(words, self.points, self.cells)
         return words.reshape(self.window.shape)
 
-
-@numba.njit(cache=True, nogil=True)
-def _left(points: F32, cells: I64, dropped: Bool) -> tuple[F32, I64]:
-    """The points (n, 3) that are not ``dropped``, and their cells."""
-    n = 0
-    for i in range(len(cells)):
-        n += not dropped[i]
-    left, where = np.empty((n, 3), dtype=np.float32), np.empty(n, dtype=np.int64)
-    n = 0
-    for i in range(len(cells)):
-        if not dropped[i]:
-            left[n, 0], left[n, 1], left[n, 2], where[n] = points[i, 0], points[i, 1], points[i, 2], cells[i]
-            n += 1
-    return left, where
-
-
-@numba.njit(cache=True, nogil=True)
-def _mark_left(words: U64, points: F32, cells: I64, dropped: Bool, ground_z: F32, base: I32) -> None:
-    """Make column ``words`` (65536,) of points (n, 3) those of the points that are not ``dropped``, anew where any
-    is."""
-    touched = np.zeros(len(words), dtype=np.bool_)
-    for i in range(len(cells)):
-        if dropped[i]:
-            touched[cells[i]] = True
-            words[cells[i]] = 0
-    for i in range(len(cells)):
-        cell = cells[i]
-        if touched[cell] and not dropped[i]:
-            mark_obstacles(words, points[i : i + 1], cells[i : i + 1], ground_z, base)
+    def _mark(self, words: U64, points: F32, cells: I64) -> None:
+        """Enter points (n, 3) in flat ``cells`` (n,) into column ``words`` (65536,), in place."""
+        ground_z, base = self.ground_z.reshape(-1), self.base.reshape(-1)
+        mark_obstacles(words, read_only(points), read_only(cells), read_only(ground_z), read_only(base))
 
 
 def in_bytes(intensity: NDArray[Any]) -> U8:

@@ -9,10 +9,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-import numba
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
+from mapvote.core.kernel import inlined, kernel
 from mapvote.core.types import I32, N_STATES, NO_VOTE, U8, U16, CellState, read_only
 
 VOTE_UNIT = 16
@@ -42,7 +42,7 @@ def weight_table(weighted: bool, a: float, b: float, k: float, n_min: int, n_max
     return np.round(votes * VOTE_UNIT).astype(np.int32)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def cast(tally: I32, states: U8, weights: I32) -> None:
     """Add one scan: ``weights[r, c]`` VOTE_UNITs to class ``states[r, c]`` of ``tally[r, c]``; NO_VOTE adds nothing.
 
@@ -54,7 +54,7 @@ def cast(tally: I32, states: U8, weights: I32) -> None:
                 tally[r, c, states[r, c]] += weights[r, c]
 
 
-@numba.njit(cache=True, nogil=True)
+@inlined
 def verdict(uo: int, ue: int, co: int, ce: int, un: int, abstain: bool) -> int:
     """The rule: the class with most votes wins, a tie is UNDETERMINED, no votes are NO_VOTE (paper III-B, IV).
 
@@ -77,13 +77,8 @@ def verdict(uo: int, ue: int, co: int, ce: int, un: int, abstain: bool) -> int:
     return _UO if uo == best else _UE if ue == best else _UN
 
 
-@numba.njit(cache=True, nogil=True)
-def decide_cells(tally: NDArray[Any], backers: NDArray[Any], abstain: bool, min_votes: int) -> U8:
-    """:func:`verdict` of every cell; a change that fewer than ``min_votes`` back is UNDETERMINED. Numbers of any type.
-
-    ``tally`` (5, cells); ``backers`` (5, cells) in the same units as ``min_votes`` -> (cells,) uint8.
-    """
-    states = np.empty(tally.shape[1], dtype=np.uint8)
+@kernel
+def _decide_cells(tally: NDArray[Any], backers: NDArray[Any], abstain: bool, min_votes: int, states: U8) -> None:
     uos, ues, cos, ces, uns = tally[0], tally[1], tally[2], tally[3], tally[4]
     for c in range(len(states)):  # of most cells nobody says anything, or all that nothing is there: seen in vectors
         empty, more = np.int64(ues[c]), np.int64(uos[c] | cos[c] | ces[c] | uns[c])
@@ -94,6 +89,16 @@ def decide_cells(tally: NDArray[Any], backers: NDArray[Any], abstain: bool, min_
             uo, ue, co = np.int64(uos[c]), np.int64(ues[c]), np.int64(cos[c])
             s = verdict(uo, ue, co, np.int64(ces[c]), np.int64(uns[c]), abstain)
             states[c] = _UN if s in (_CO, _CE) and backers[s, c] < min_votes else s
+
+
+def decide_cells(tally: NDArray[Any], backers: NDArray[Any], abstain: bool, min_votes: int) -> U8:
+    """:func:`verdict` of every cell; a change that fewer than ``min_votes`` back is UNDETERMINED.
+
+    ``tally`` (5, cells), integers of any type; ``backers`` (5, cells) in the same units as ``min_votes`` -> (cells,)
+    uint8.
+    """
+    states = np.empty(tally.shape[1], dtype=np.uint8)
+    _decide_cells(tally, backers, abstain, min_votes, states)
     return states
 
 
@@ -134,11 +139,11 @@ def tally_of(voters: Sequence[U8], cells: int) -> NDArray[Any]:
         if counts is tally:
             tally *= np.uint8(VOTE_UNIT)
         else:
-            _add_counts(counts, tally)
+            tally += np.multiply(counts, VOTE_UNIT, dtype=tally.dtype)
     return tally
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def count_states(one: U8, two: U8, three: U8, four: U8, counts: U8) -> None:
     """Four more voters in ``counts`` (5, cells): the server's hot loop, of which the compiler makes vectors. One voter
     at a time would wait for the counts."""
@@ -156,14 +161,7 @@ def count_states(one: U8, two: U8, three: U8, four: U8, counts: U8) -> None:
                 count[i] = n
 
 
-@numba.njit(cache=True, nogil=True)
-def _add_counts(counts: U8, tally: NDArray[Any]) -> None:
-    for state in range(N_STATES):
-        for c in range(counts.shape[1]):
-            tally[state, c] += VOTE_UNIT * counts[state, c]
-
-
-@numba.njit(cache=True, nogil=True)
+@kernel
 def add_tally(votes: U16, abstain: bool, tally: I32, backers: I32) -> None:
     """Add one voter's tally ``votes`` (5, cells) to ``tally`` (5, cells), and one to ``backers`` (5, cells) for the
     class that its own votes decide: who counted a class now and then does not stand behind it."""

@@ -8,31 +8,31 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from mapvote.core.grid import CELL_SIZE, Lattice
-from mapvote.core.types import F64, I32, I64, Bool
+from mapvote.core.kernel import inlined, kernel
+from mapvote.core.types import F64, I32, I64, Bool, read_only
 
 _MIDDLE = 1 << 20
 """Indices are counted from here, so that keys are positive and never 0: within +-2^20 voxels (314 km at 0.3 m)."""
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@inlined
 def packed(ix: np.int64, iy: np.int64, iz: np.int64) -> np.int64:
     """The key of a voxel: equal keys, same voxel; ascending by x, then y, then z. Indices (counted from -2^20) >= 0."""
     return (ix << 42) | (iy << 21) | iz
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@inlined
 def voxel_key(x: float, y: float, z: float, size: float) -> np.int64:
     """The key of the voxel of side ``size`` that holds (x, y, z)."""
     ix, iy, iz = np.floor(x / size), np.floor(y / size), np.floor(z / size)
     return packed(np.int64(ix) + _MIDDLE, np.int64(iy) + _MIDDLE, np.int64(iz) + _MIDDLE)
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@inlined
 def slot_of(key: np.int64, table: I64) -> np.int64:
     """Where a hash table (2^k,) of keys holds ``key``, or the free slot (0) where it belongs: open addressing, linear
     probing; Fibonacci hashing with the high half folded in, so that the low bits depend on all three indices."""
@@ -44,29 +44,40 @@ def slot_of(key: np.int64, table: I64) -> np.int64:
     return slot
 
 
-@numba.njit(cache=True, nogil=True)
-def _gather(points: F64, skip: Bool, x0: float, y0: float, table: I64, place_of: I32, of_point: I32, keys: I64) -> int:
-    """How many voxels the points (n, 3) lie in that ``skip`` (n,) leaves: their ``keys``, in the order in which points
-    come to them, and ``of_point`` (n,) the place there of each point's, -1 where skipped.
+@kernel
+def group(keys: I64, table: I64, place: I32, of: I32, first: I64) -> int:
+    """Number equal keys (n,) > 0 in the order in which they come; a key of 0 belongs to none.
 
-    ``table`` and ``place_of`` (2^k,), 2^k > n: scratch.
+    Returns how many there are, with ``of`` (n,) the number of each key, -1 for 0, and in ``first`` (n,) the index of
+    the first of each; or -1 if they would fill more than half of ``table`` (2^k,), which holds zeros. ``place`` (2^k,):
+    scratch.
     """
-    table[:] = 0
     m = 0
-    for i in range(len(points)):
-        of_point[i] = -1
-        if skip[i]:
+    for i in range(np.uint64(0), np.uint64(len(keys))):
+        of[i] = -1
+        if keys[i] == 0:
             continue
-        key = voxel_key(points[i, 0] - x0, points[i, 1] - y0, points[i, 2], CELL_SIZE)
-        slot = slot_of(key, table)
+        slot = slot_of(keys[i], table)
         if table[slot] == 0:
-            table[slot], place_of[slot], keys[m] = key, m, key
+            if 2 * m >= len(table):
+                return -1
+            table[slot], place[slot], first[m] = keys[i], m, i
             m += 1
-        of_point[i] = place_of[slot]
+        of[i] = place[slot]
     return m
 
 
-@numba.njit(cache=True, nogil=True)
+def grouped(keys: I64, slots: int = 1 << 14) -> tuple[I32, I64]:
+    """(``of`` (n,), ``first`` (m,)) of :func:`group`, by a table of ``slots`` (2^k) or more: 16,384 fit a cache."""
+    of, first = np.empty(len(keys), dtype=np.int32), np.empty(len(keys), dtype=np.int64)
+    while True:
+        m = group(keys, np.zeros(slots, dtype=np.int64), np.empty(slots, dtype=np.int32), of, first)
+        if m >= 0:
+            return of, first[:m]
+        slots *= 4
+
+
+@kernel
 def _find(keys: I64, table_keys: I64, table_rows: I32, n: int, rows: I32) -> int:
     """The ``rows`` (m,) of voxels with ``keys`` (m,) in a cloud of n; new ones come last. Returns the new n."""
     for j in range(len(keys)):
@@ -78,7 +89,7 @@ def _find(keys: I64, table_keys: I64, table_rows: I32, n: int, rows: I32) -> int
     return n
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _add(points: F64, of_point: I32, rows: I32, sums: F64) -> None:
     """Points (n, 3) into the ``sums`` of their voxels, whose ``rows`` (m,) these are; ``of_point`` (n,) says which."""
     for j in range(len(rows)):  # all rows are asked for before any is waited for
@@ -96,22 +107,13 @@ def _add(points: F64, of_point: I32, rows: I32, sums: F64) -> None:
         sums[k, 3] += points[i, 2] - sums[k, 6]
 
 
-@numba.njit(cache=True, nogil=True)
-def _rehash(old_keys: I64, old_rows: I32, table_keys: I64, table_rows: I32) -> None:
-    for i in range(len(old_keys)):
-        if old_keys[i] != 0:
-            slot = slot_of(old_keys[i], table_keys)
-            table_keys[slot] = old_keys[i]
-            table_rows[slot] = old_rows[i]
-
-
 class _Scratch(NamedTuple):
-    """Room to gather a scan in, kept for the next one; arrays as :func:`_gather`, :func:`_find` and :func:`_add` have
-    them."""
+    """Room to group a scan's points in, kept for the next one."""
 
     table: I64
-    place_of: I32
+    place: I32
     of_point: I32
+    first: I64
     keys: I64
     rows: I32
 
@@ -123,6 +125,7 @@ def _room_for(n: int) -> _Scratch:
         np.zeros(slots, dtype=np.int64),
         np.zeros(slots, dtype=np.int32),
         np.empty(n, dtype=np.int32),
+        np.empty(n, dtype=np.int64),
         np.empty(n, dtype=np.int64),
         np.empty(n, dtype=np.int32),
     )
@@ -146,21 +149,28 @@ class VoxelCloud:
         Five points of a scan share a voxel: they are gathered before the cloud, which no cache holds, is asked.
         """
         points = np.ascontiguousarray(points_map, dtype=np.float64)
-        mask = np.zeros(len(points), dtype=np.bool_) if skip is None else skip
         if len(points) > len(self._scratch.keys):
             self._scratch = _room_for(len(points))
-        table, place_of, of_point, keys, rows = self._scratch
-        m = _gather(points, mask, self.lattice.x0, self.lattice.y0, table, place_of, of_point, keys)
+        table, place, of_point, first, keys, rows = self._scratch
+        keys = keys[: len(points)]
+        _enter_keys(points, self.lattice.x0, self.lattice.y0, CELL_SIZE, keys)
+        if skip is not None:
+            keys[skip] = 0
+        table[:] = 0
+        m = group(keys, table, place, of_point, first)
         while self._n + m > len(self._sums):
             self._grow()
-        self._n = _find(keys[:m], self._keys, self._rows, self._n, rows)
+        self._n = _find(keys[first[:m]], self._keys, self._rows, self._n, rows)
         _add(points, of_point, rows[:m], self._sums)
 
     def _grow(self) -> None:
-        keys = np.zeros(2 * len(self._keys), dtype=np.int64)
-        rows = np.zeros(2 * len(self._rows), dtype=np.int32)
-        _rehash(self._keys, self._rows, keys, rows)
-        self._keys, self._rows = keys, rows
+        """Twice the room: every voxel is entered anew, in the order of rows."""
+        filled = np.flatnonzero(self._keys)
+        by_row = np.empty(self._n, dtype=np.int64)
+        by_row[self._rows[filled]] = self._keys[filled]
+        self._keys = np.zeros(2 * len(self._keys), dtype=np.int64)
+        self._rows = np.zeros(2 * len(self._rows), dtype=np.int32)
+        _find(by_row, self._keys, self._rows, 0, np.empty(self._n, dtype=np.int32))
         sums = np.zeros((2 * len(self._sums), 8))  # rows that nobody has written to take no memory yet
         sums[: self._n] = self._sums[: self._n]
         self._sums = sums
@@ -177,63 +187,33 @@ class VoxelCloud:
         return means.take(rows, axis=0), sums[:, 7].astype(np.int32)[rows]
 
 
-@numba.njit(cache=True, nogil=True)
-def _keys(points: F64, x0: float, y0: float, size: float) -> I64:
-    out = np.empty(len(points), dtype=np.int64)
+@kernel
+def _enter_keys(points: F64, x0: float, y0: float, size: float, keys: I64) -> None:
     for i in range(len(points)):
-        out[i] = voxel_key(points[i, 0] - x0, points[i, 1] - y0, points[i, 2], size)
-    return out
+        keys[i] = voxel_key(points[i, 0] - x0, points[i, 1] - y0, points[i, 2], size)
 
 
 def voxel_keys(points: NDArray[np.floating], x0: float, y0: float, size: float = CELL_SIZE) -> I64:
     """(n,) int64 key of each point's voxel on the lattice, see :func:`packed`. Voxel layers start at z = 0."""
-    return _keys(np.ascontiguousarray(points, dtype=np.float64), x0, y0, size)
+    keys = np.empty(len(points), dtype=np.int64)
+    _enter_keys(np.array(points, dtype=np.float64, order="C"), x0, y0, size, keys)
+    return keys
 
 
 def voxel_downsample(points: NDArray[np.floating], size: float, x0: float = 0.0, y0: float = 0.0) -> I64:
     """Indices (m,) of one point per voxel, the first of each in input order, ascending. Deterministic."""
-    return first_of_each(voxel_keys(points, x0, y0, size))
+    return grouped(voxel_keys(points, x0, y0, size))[1]
 
 
-@numba.njit(cache=True, nogil=True)
-def first_of_each(keys: I64) -> I64:
-    """(m,) indices, ascending, of the first of each of the keys (n,) > 0."""
-    size = 1024
-    while size < 2 * len(keys):
-        size *= 2
-    table, first, m = np.zeros(size, np.int64), np.empty(len(keys), np.int64), 0
-    for i in range(len(keys)):
-        slot = slot_of(keys[i], table)
-        if table[slot] == 0:
-            table[slot] = keys[i]
-            first[m] = i
-            m += 1
-    return first[:m].copy()
-
-
-@numba.njit(cache=True, nogil=True)
-def _thin(points: NDArray[np.float32], every: int, size: float, table: I64) -> I64:
-    """Indices of the first of every ``every``-th point in each voxel of side ``size`` (open addressing).
-
-    ``table`` (2^k,) holds zeros; the answer is empty when it became half full and a larger one is needed.
-    """
-    keep, scale, middle = np.empty(len(table) // 2, np.int64), 1.0 / size, float(_MIDDLE)
-    m, step, n = np.uint64((len(points) + every - 1) // every), np.uint64(every), 0
-    keys = np.empty(m, np.int64)
-    for j in range(m):  # apart from the search, so that it vectorises; int32 does too, and holds what is within reach
+@kernel
+def _thin_keys(points: NDArray[np.float32], every: int, size: float, keys: I64) -> None:
+    """The key (m,) of every ``every``-th of the points (n, 3), in voxels of side ``size``."""
+    scale, middle, step = 1.0 / size, float(_MIDDLE), np.uint64(every)
+    for j in range(np.uint64(0), np.uint64(len(keys))):  # int32 vectorises, and holds what is within reach
         i = j * step
         # The middle is added first: cutting off is then rounding down, and quicker than floor.
         ix, iy = np.int32(points[i, 0] * scale + middle), np.int32(points[i, 1] * scale + middle)
         keys[j] = packed(np.int64(ix), np.int64(iy), np.int64(np.int32(points[i, 2] * scale + middle)))
-    for j in range(m):
-        slot = slot_of(keys[j], table)
-        if table[slot] == 0:
-            if n == len(keep):
-                return keep[:0]
-            table[slot] = keys[j]
-            keep[n] = j * step
-            n += 1
-    return keep[:n].copy()
 
 
 def thin(points: NDArray[np.floating], size: float, every: int = 1) -> I64:
@@ -242,10 +222,7 @@ def thin(points: NDArray[np.floating], size: float, every: int = 1) -> I64:
 
     Does in a millisecond what :func:`voxel_downsample` does on the lattice; for scans, in their own frame.
     """
-    cloud = np.ascontiguousarray(points, dtype=np.float32)
-    slots = 1 << 15
-    while True:
-        keep = _thin(cloud, every, size, np.zeros(slots, dtype=np.int64))
-        if len(keep) or len(cloud) == 0:
-            return keep
-        slots *= 2
+    cloud = read_only(np.ascontiguousarray(points, dtype=np.float32))
+    keys = np.empty((len(cloud) + every - 1) // every, dtype=np.int64)
+    _thin_keys(cloud, every, size, keys)
+    return grouped(keys, 1 << 15)[1] * every

@@ -17,11 +17,11 @@ nothing. Cells without known ground gather nothing: heights mean nothing there.
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
 from mapvote.core.columns import TOP_BIT, layer_bit
 from mapvote.core.grid import CELL_SIZE, Lattice
+from mapvote.core.kernel import allocating, inlined, kernel
 from mapvote.core.types import F32, F64, I32, U64, Bool
 from mapvote.detection.packed_tiles import Overlap, PackedTiles
 from mapvote.perception.frontend import Observation
@@ -39,7 +39,7 @@ WORDS = 2 * PLANES + 1
 """Words of a cell."""
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def is_full(planes: U64, first: int, word: np.uint64) -> bool:
     """Whether one of ``word``'s voxels has reached the highest count."""
     for k in range(first + PLANES - 1, first - 1, -1):
@@ -47,7 +47,7 @@ def is_full(planes: U64, first: int, word: np.uint64) -> bool:
     return word != 0
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def add_one(planes: U64, first: int, word: np.uint64) -> None:
     """Add 1 to the counts of ``word``'s voxels: a ripple-carry adder over 64 voxels at once."""
     for k in range(first, first + PLANES):
@@ -58,7 +58,7 @@ def add_one(planes: U64, first: int, word: np.uint64) -> None:
             break
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def halve(planes: U64) -> None:
     """Halve the counts of a cell: what is weighed against each other keeps its ratio."""
     for first in (HIT, PASSES):
@@ -67,7 +67,7 @@ def halve(planes: U64) -> None:
         planes[first + PLANES - 1] = 0
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def count_of(planes: U64, first: int, bit: int) -> int:
     """The count of one voxel; ``first`` is the counter's first plane."""
     value = 0
@@ -76,7 +76,7 @@ def count_of(planes: U64, first: int, bit: int) -> int:
     return value
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def times_crossed(cell: U64, bit: int) -> int:
     """In how many scans rays went through voxel ``bit`` of a cell (WORDS,) from side to side: what they passed least of
     it, the voxel above and the one below. The ground bounds the lowest voxel, the end of the word the highest."""
@@ -86,14 +86,14 @@ def times_crossed(cell: U64, bit: int) -> int:
     return min(least, count_of(cell, PASSES, bit - 1)) if bit > 1 else least
 
 
-@numba.njit(inline="always")
+@inlined
 def _column(cell: int, lowest: int, highest: int, base: I32) -> np.uint64:
     """The word of the layers ``lowest`` to ``highest`` of the world in one column."""
     low, high = layer_bit(lowest, base[cell]), layer_bit(highest, base[cell])
     return (np.uint64(2) << np.uint64(high)) - (np.uint64(1) << np.uint64(low))
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel
 def _mark_near(
     points: F64, cell: I32, chosen: Bool, base: I32, occupied: U64, cols: int, corner: tuple[float, float],
     reach: float, near: U64, apart: U64,
@@ -133,7 +133,7 @@ def near_hits(seen: Observation) -> tuple[U64, U64]:
     return near, apart
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _count_scan(planes: U64, part: Overlap, apart: U64, near: U64, passed: U64, occupied: U64, ground_z: F32) -> None:
     """Add to a tile's ``planes`` the ``part`` of one scan's window that lies on it."""
     for r in range(part.row, part.end_row):
@@ -169,7 +169,7 @@ class Evidence:
         return apart
 
 
-@numba.njit(cache=True, nogil=True)
+@allocating
 def free_words(planes: U64, occupied: U64) -> U64:
     """(rows, cols) voxels that two scans or more passed, none hit, and that the map does not hold."""
     out = np.zeros(occupied.shape, dtype=np.uint64)

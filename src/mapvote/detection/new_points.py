@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Callable
 
-import numba
 import numpy as np
 
 from mapvote.core.columns import GROUND_MARGIN_M, column_bit, height_above
 from mapvote.core.grid import CELL_SIZE, Grid, Lattice, TileIndex, tile_of_cells
+from mapvote.core.kernel import allocating
 from mapvote.core.types import F32, F64, I32, I64, U8, U64, Bool, Reference
-from mapvote.core.voxels import first_of_each, voxel_keys
+from mapvote.core.voxels import grouped, voxel_keys
 from mapvote.detection.shelf import Place, Shelf
 from mapvote.perception.frontend import Observation, PlacedScan
 
@@ -21,7 +21,7 @@ REACH_M = 70.0
 """New points are taken up to here, farther than votes are cast: a tile's width around the vehicle is laid out."""
 
 
-@numba.njit(cache=True, nogil=True)
+@allocating
 def select(points: F64, cell: I32, wanted: Bool, unwanted: Bool, words: U64, base: I32) -> I64:
     """Indices of the points (n, 3), ``wanted`` and not ``unwanted``, that lie in a voxel of ``words`` (cells,).
 
@@ -42,7 +42,7 @@ def select(points: F64, cell: I32, wanted: Bool, unwanted: Bool, words: U64, bas
     return chosen[:found].copy()
 
 
-@numba.njit(cache=True, nogil=True)
+@allocating
 def _beyond(
     points: F64, cell: I32, origin: F64, ground_z: F32, base: I32, occupied: U64, lattice: tuple[float, float],
     corner: tuple[int, int],
@@ -135,7 +135,7 @@ class NewPoints:
     def _one_a_voxel(self, clouds: list[F64]) -> F64:
         every = np.concatenate([np.zeros((0, 4 if self.intensity else 3)), *clouds])
         keys = voxel_keys(every, self.lattice.x0, self.lattice.y0)
-        first = first_of_each(keys)
+        first = grouped(keys)[1]
         return every[first[np.argsort(keys[first])]]
 
     def by_tile(self) -> Callable[[TileIndex], F64]:

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import NamedTuple
 
-import numba
 import numpy as np
 
 from mapvote.codec.arrays import compress, unpack_bytes
 from mapvote.core.grid import CELLS, TILE_CELLS, Grid, Lattice, TileIndex
 from mapvote.core.heap import give_back_free_pages
+from mapvote.core.kernel import kernel
 from mapvote.core.types import U64
 from mapvote.detection.shelf import Place, Shelf
 
@@ -103,7 +103,7 @@ class PackedTiles(Mapping[TileIndex, U64]):
         return planes
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _lay(packed: U64, flat: U64) -> None:
     """Words (words + 1, n), the cells first, to where they were in (cells, words)."""
     for i in range(packed.shape[1]):

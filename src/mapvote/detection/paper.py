@@ -10,12 +10,12 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator
 from functools import lru_cache
 
-import numba
 import numpy as np
 
 from mapvote.config import PaperSettings, VotingSettings
 from mapvote.core.columns import EVERY_BIT, below_top, span_of
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Grid, Lattice, TileIndex, window_around
+from mapvote.core.kernel import kernel
 from mapvote.core.point_map import PointMap
 from mapvote.core.sensors import Sensor
 from mapvote.core.types import F32, F64, I32, N_STATES, NO_VOTE, U8, U16, U64, Bool, CellState, Reference
@@ -45,7 +45,7 @@ _SIGHT = {
 _TALL = {"bottom": BEGINS_ABOVE, "height": REACHES_HIGHER}
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _of_sight(sight: U8, clear_of_cells: U8, passed: U64, occupied: U64, shift: int, words: U16) -> None:
     """The five bits of one view into ``words``, in place; all planes (rows, cols)."""
     for r in range(sight.shape[0]):
@@ -64,7 +64,7 @@ def _of_sight(sight: U8, clear_of_cells: U8, passed: U64, occupied: U64, shift: 
             words[r, c] |= np.uint16(word << shift)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _of_points(
     counts: I32, hit: U64, occupied: U64, bottom_z: F32, eye: tuple[F64, F64], x0: float, y0: float, tan_top: float,
     words: U16,

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from scipy import ndimage
 
+from mapvote.core.kernel import kernel
 from mapvote.core.types import F32, F64, I32, NO_VOTE, U8, U64, Bool, CellState
 from mapvote.detection.evidence import HIT, PASSED, PASSES, PLANES, count_of, times_crossed
 from mapvote.detection.packed_tiles import Overlap
@@ -74,7 +74,7 @@ def no_facts(shape: tuple[int, int]) -> VoxelFacts:
     return VoxelFacts(*(np.zeros(shape, kind) for kind in [np.uint64] * 6 + [np.int32] * 2))
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def weigh_voxels(planes: U64, part: Overlap, occupied: U64, known_free: U64, out: VoxelFacts) -> None:
     """Fill the ``part`` of a window that lies on a tile from its counters (256, 256, WORDS): the first lines of
     :func:`judge_window`. ``out`` comes empty (:func:`no_facts`)."""

@@ -9,12 +9,12 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from mapvote.core.grid import TileIndex
 from mapvote.core.heights import check_heights
+from mapvote.core.kernel import allocating
 from mapvote.core.lazy_tiles import LazyTiles
 from mapvote.core.point_map import PointMap, all_points
 from mapvote.core.tile import Tile
@@ -123,7 +123,7 @@ def spacing(pieces: Pieces, some: F64) -> F64:
     return _to_nearest(near[order], axis, place[:: max(1, len(near) // 2000)])
 
 
-@numba.njit(cache=True, nogil=True)
+@allocating
 def _to_nearest(points: F64, axis: int, which: I64) -> F64:
     """(m,) from those of the points (n, 3), which ascend along ``axis``, to the nearest other one: a tree would ask for
     half of scipy, whose import takes longer than all of the look."""

@@ -10,11 +10,9 @@ from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass, replace
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from mapvote.core.azimuth import azimuth_64
 from mapvote.core.types import F32, F64, I64, Drive, MapvoteError, Scan
 from mapvote.doctor.finding import Finding, Severity, usable
 from mapvote.doctor.prior import NO_PRIOR, check_prior, check_times
@@ -24,7 +22,6 @@ SECTORS = 36
 _POINTS = 12_000
 """Points of a scan that are looked at."""
 _BINS, _BIN_M = 400, 0.5
-_BLOCK = 512
 QUANTA_M = (1.0, 0.5, 0.25, 0.1, 0.05, 0.02)
 """Steps to which coordinates may have been rounded."""
 _CUT_SHARE = 0.6
@@ -152,89 +149,37 @@ _PARTS = (3, 3, 3, 3, SECTORS, 1, 3, len(QUANTA_M), 1, 1)
 _WIDTH = sum(_PARTS)
 
 
-@numba.njit(cache=True, nogil=True)
-def _is_whole(points: F32, i: int, quantum: float) -> bool:
-    """Whether all coordinates of the i-th of points (n, 3) are multiples of ``quantum``: mostly the first is not."""
-    for axis in range(3):
-        v = np.float64(points[i, axis]) / quantum
-        if not abs(v - np.round(v)) < 1e-3:
-            return False
-    return True
-
-
-@numba.njit(inline="always")
-def _put(out: F64, at: int, values: F64, share: float) -> None:
-    """``values``, each times ``share``, into ``out`` from ``at`` on. A slice would be compiled four times as long: for
-    the message of its error numba brings its strings along."""
-    for k in range(len(values)):
-        out[at + k] = values[k] * share
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _look(points: F32, stride: int, quanta: F64) -> F64:
-    """One row of :class:`Looks`, its parts one after the other; every ``stride``-th of the points (n, 3).
-
-    Block by block: first what vectors can do, then what goes point by point.
-    """
-    low, high, total = np.full(3, np.inf), np.full(3, -np.inf), np.zeros(3)
-    sectors, ranges, unit, rounded = np.zeros(36), np.zeros(_BINS), np.zeros(3), np.zeros(len(quanta))
-    near, turns, before, print_, n = 0.0, 0.0, 0.0, 0.0, 0
-    xyz, distance, azimuth = np.empty((3, _BLOCK)), np.empty(_BLOCK), np.empty(_BLOCK)
-    bin_, sector = np.empty(_BLOCK, np.int32), np.empty(_BLOCK, np.int32)
-    for start in range(0, len(points), stride * _BLOCK):
-        block = min(_BLOCK, (len(points) - start + stride - 1) // stride)
-        for i in range(block):
-            for axis in range(3):
-                xyz[axis, i] = points[start + i * stride, axis]
-        for i in range(block):
-            x, y, z = xyz[0, i], xyz[1, i], xyz[2, i]
-            distance[i] = np.sqrt(x * x + y * y + z * z)
-            azimuth[i] = azimuth_64(y, x)
-            bin_[i] = int(min(distance[i] / _BIN_M, _BINS - 1.0))
-            sector[i] = int((azimuth[i] + np.pi) / (2.0 * np.pi) * 36.0)
-        for axis in range(3):
-            least, most, whole, few = low[axis], high[axis], total[axis], 0
-            for i in range(block):
-                v = xyz[axis, i]
-                least, most = min(least, v), max(most, v)
-                whole += v
-                few += 0.0 <= v <= 1.0
-            low[axis], high[axis], total[axis] = least, most, whole
-            unit[axis] += few
-        for k in range(len(quanta)):
-            each = 1.0 / quanta[k]
-            for i in range(block):
-                steps = xyz[0, i] * each  # sieved by x, which is mostly no multiple, and without a division
-                if abs(steps - np.round(steps)) < 2e-3 and _is_whole(points, start + i * stride, quanta[k]):
-                    rounded[k] += 1.0
-        for i in range(block):
-            ranges[bin_[i]] += 1.0
-            sectors[sector[i] % 36] += 1.0
-            near += distance[i] < 2.0
-            step = azimuth[i] - before
-            step -= 2.0 * np.pi * np.round(step / (2.0 * np.pi))
-            if n > 0 and abs(step) < 1.0:
-                turns += step / (2.0 * np.pi)
-            before = azimuth[i]
-            print_ += (n % 97 + 1.0) * distance[i]
-            n += 1
-    out = np.empty(3 + 3 + 3 + 3 + 36 + 1 + 3 + len(quanta) + 1 + 1)
+    """One row of :class:`Looks`, its parts one after the other; every ``stride``-th of the points (n, 3)."""
+    xyz = points[::stride].astype(np.float64)
+    n = len(xyz)
+    distance, azimuth = np.sqrt((xyz**2).sum(axis=1)), np.arctan2(xyz[:, 1], xyz[:, 0])
+    bins = np.minimum(distance / _BIN_M, _BINS - 1.0).astype(np.int64)
+    seen = np.cumsum(np.bincount(bins, minlength=_BINS))
+    ranges = [(np.searchsorted(seen, share * n) + 0.5) * _BIN_M for share in (0.1, 0.5, 0.99)]
+    sectors = np.bincount(((azimuth + np.pi) / (2.0 * np.pi) * SECTORS).astype(np.int64) % SECTORS, minlength=SECTORS)
+    steps = np.diff(azimuth)
+    steps -= 2.0 * np.pi * np.round(steps / (2.0 * np.pi))
+    turns = steps[np.abs(steps) < 1.0].sum() / (2.0 * np.pi)
+    rounded = []
+    for quantum in quanta:
+        whole = np.abs(xyz[:, 0] / quantum - np.round(xyz[:, 0] / quantum)) < 1e-3  # of x, which is mostly no multiple
+        off = xyz[whole] / quantum
+        rounded.append((np.abs(off - np.round(off)) < 1e-3).all(axis=1).sum() / max(n, 1))
     share = 1.0 / max(n, 1)
-    _put(out, 0, low, 1.0)
-    _put(out, 3, high, 1.0)
-    _put(out, 6, total, share)
-    seen, wanted = 0.0, 0
-    for k in range(_BINS):
-        seen += ranges[k]
-        while wanted < 3 and seen >= (0.1 * n if wanted == 0 else 0.5 * n if wanted == 1 else 0.99 * n):
-            out[9 + wanted] = (k + 0.5) * _BIN_M
-            wanted += 1
-    _put(out, 12, sectors, share)
-    out[48] = near * share
-    _put(out, 49, unit, share)
-    _put(out, 52, rounded, share)
-    out[-2], out[-1] = turns, print_
-    return out
+    return np.concatenate(
+        [
+            xyz.min(axis=0, initial=np.inf),
+            xyz.max(axis=0, initial=-np.inf),
+            xyz.sum(axis=0) * share,
+            ranges,
+            sectors * share,
+            [(distance < 2.0).sum() * share],
+            ((xyz >= 0.0) & (xyz <= 1.0)).sum(axis=0) * share,
+            rounded,
+            [turns, ((np.arange(n) % 97 + 1.0) * distance).sum()],
+        ]
+    )
 
 
 def check_scans(drive: Drive, looks: Looks) -> list[Finding]:

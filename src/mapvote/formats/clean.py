@@ -5,11 +5,11 @@ from __future__ import annotations
 import logging
 from dataclasses import dataclass, field
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from mapvote.core.azimuth import azimuth_32
+from mapvote.core.kernel import allocating, kernel
 from mapvote.core.sensors import Sensor
 from mapvote.core.types import F32, I64, MapvoteError, Scan
 
@@ -70,7 +70,9 @@ def clean_scan(where: str, raw: RawScan, sensor: Sensor, bad_points: BadPoints) 
     Dropped and counted: not finite, or beyond 2 km. MapvoteError if these are more than 5 %, or if nothing is left.
     """
     points, near_m = raw.points, sensor.min_range_m - 5.0 * sensor.range_sigma_m
-    kept, measured, bad = _sort_out(np.ascontiguousarray(points), raw.zero_is_no_return, near_m, FAR_M)
+    usable = np.empty(len(points), dtype=np.int64)
+    n, measured, bad = _sort_out(np.ascontiguousarray(points), raw.zero_is_no_return, near_m, FAR_M, usable)
+    kept = usable[:n]
     if bad > MAX_BAD_SHARE * max(measured, 1):
         raise MapvoteError(
             f"{where}: {bad} of {measured} points are not finite or beyond {FAR_M:.0f} m, more than "
@@ -92,12 +94,12 @@ def clean_scan(where: str, raw: RawScan, sensor: Sensor, bad_points: BadPoints) 
     )
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _sort_out(
-    points: NDArray[np.floating], zero_is_no_return: bool, near_m: float, far_m: float
-) -> tuple[I64, int, int]:
-    """(indices of the usable points (n, 3), how many were measured, how many of these are no measurements)."""
-    kept = np.empty(len(points), dtype=np.int64)
+    points: NDArray[np.floating], zero_is_no_return: bool, near_m: float, far_m: float, kept: I64
+) -> tuple[int, int, int]:
+    """(how many of the points (n, 3) are usable, whose indices come into ``kept`` (n,), how many were measured, how
+    many of these are no measurements)."""
     n, measured, bad = 0, 0, 0
     for i in range(len(points)):
         x, y, z = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
@@ -110,7 +112,7 @@ def _sort_out(
         elif squared >= near_m * abs(near_m):
             kept[n] = i
             n += 1
-    return kept[:n], measured, bad
+    return n, measured, bad
 
 
 def _likely_cause(points: F32) -> str:
@@ -125,21 +127,11 @@ def _likely_cause(points: F32) -> str:
 
 def unit_intensity(intensity: NDArray[np.number]) -> F32:
     """Intensity in [0, 1]: 8-bit values (any above 1) are divided by 255 and cut there; not a number becomes 0."""
-    return _unit(np.ascontiguousarray(intensity, dtype=np.float32))
-
-
-@numba.njit(cache=True, nogil=True)
-def _unit(intensity: F32) -> F32:
-    out = np.empty_like(intensity)
-    scale = np.float32(1.0)
-    for value in intensity:
-        if value > 1.0 and np.isfinite(value):
-            scale = np.float32(255.0)
-            break
-    for i in range(len(intensity)):
-        value = intensity[i] / scale
-        out[i] = min(max(value, np.float32(0.0)), np.float32(1.0)) if np.isfinite(value) else np.float32(0.0)
-    return out
+    values = np.array(intensity, dtype=np.float32)
+    values[~np.isfinite(values)] = 0.0
+    if values.max(initial=0.0) > 1.0:
+        values /= np.float32(255.0)
+    return np.clip(values, 0.0, 1.0, out=values)
 
 
 def spinning_time_s(points: F32, rate_hz: float, *, clockwise: bool = True) -> F32:
@@ -150,7 +142,7 @@ def spinning_time_s(points: F32, rate_hz: float, *, clockwise: bool = True) -> F
     return _spinning_time_s(points, np.float32((-2.0 if clockwise else 2.0) * np.pi * rate_hz))
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@allocating
 def _spinning_time_s(points: F32, turn_per_s: np.float32) -> F32:
     """(n,) block by block: x and y, which lie three numbers apart, are laid side by side first, for vectors."""
     out, x, y = np.empty(len(points), np.float32), np.empty(_BLOCK, np.float32), np.empty(_BLOCK, np.float32)

@@ -17,11 +17,11 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 
 from mapvote.config import FuseSettings
 from mapvote.core.grid import TILE_CELLS
+from mapvote.core.kernel import kernel
 from mapvote.core.types import I64, U8, U64, CellState
 from mapvote.fusion.tile_vote import TileVote
 
@@ -32,9 +32,18 @@ _UN = int(CellState.UNDETERMINED)
 _LAST = TILE_CELLS - 1
 _APART = 3
 """Cells; and of so many rows one is looked at, which is enough for a share."""
-_RIM = np.int64(1)
-"""Columns on either side that are not compared. No literal, for which numba would compile once more."""
+_RIM = 1
+"""Columns on either side that are not compared."""
 _ASKED = slice(None, None, 7)
+
+
+def _inside(rim: int) -> U64:
+    """(4,) words of a row without ``rim`` columns on either side."""
+    every = ~np.uint64(0)
+    return np.array([every << np.uint64(rim), every, every, every >> np.uint64(rim)])
+
+
+_INSIDE = _inside(_RIM)
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,7 +75,8 @@ def originals(drives: Sequence[TileVote], settings: FuseSettings) -> tuple[Seque
     number = {name: i for i, name in enumerate(sorted({drive.vehicle for drive in judged}))}
     whose = np.array([number[drive.vehicle] for drive in judged])
     masks = masks_of([drive.sent for drive in judged if drive.sent is not None])
-    group = grouped(masks, whose, settings.min_difference)
+    group = np.arange(len(masks))
+    find_alike(*_look(masks), whose, settings.min_difference, group)
     copies = []
     for first in np.flatnonzero(np.bincount(group) > 1):
         alike = [drive for drive, own in zip(judged, group, strict=True) if own == first]
@@ -92,29 +102,14 @@ def difference(a: U8, b: U8) -> tuple[int, int]:
     The tile's rim is not: what lies beside it is not known.
     """
     moved, looked = _look(masks_of([a, b]))
-    return int(_differing(looked[0], looked[1], _RIM, TILE_CELLS**2)), int(moved.min())
+    return int(_differing(looked[0], looked[1], _RIM)), int(moved.min())
 
 
 def masks_of(planes: Iterable[U8]) -> U64:
     """(n, 256, 4) words of what n planes of states determined, the first column in the lowest bit."""
-    some = list(planes)
-    masks = np.empty((len(some), TILE_CELLS, TILE_CELLS // 64), dtype=np.uint64)
-    for mask, plane in zip(masks, some, strict=True):
-        _determined(np.ascontiguousarray(plane).reshape(-1).view(np.uint64), mask.reshape(-1))
-    return masks
-
-
-@numba.njit(cache=True, nogil=True)
-def _determined(eights: U64, mask: U64) -> None:
-    """The bits of ``mask`` (cells / 64,): which of the states, given eight in a word, are none of 4 and 255, the only
-    ones with the third bit set. A multiplication gathers one bit of each byte in the highest byte (Warren, Hacker's
-    Delight, 7-5)."""
-    for i in range(len(mask)):
-        word = np.uint64(0)
-        for k in range(8):
-            bits = (~eights[8 * i + k] >> np.uint64(2)) & np.uint64(0x0101010101010101)
-            word |= ((bits * np.uint64(0x0102040810204080)) >> np.uint64(56)) << np.uint64(8 * k)
-        mask[i] = word
+    # Of all states only 4 (undetermined) and 255 (no vote) have the third bit set.
+    bits = [np.packbits((plane & np.uint8(4)) == 0, bitorder="little") for plane in planes]
+    return np.stack(bits).view(np.uint64).reshape(len(bits), TILE_CELLS, TILE_CELLS // 64)
 
 
 def _agreement(drive: TileVote, others: Sequence[TileVote]) -> int:
@@ -129,83 +124,65 @@ def _agreement(drive: TileVote, others: Sequence[TileVote]) -> int:
     return total
 
 
-@numba.njit(cache=True, nogil=True)
-def grouped(masks: U64, whose: I64, least: float) -> I64:
-    """(n,) the first of all drives that are alike to a drive, or to one that is alike to it, and so on."""
-    moved, looked = _look(masks)
-    group = np.empty(len(masks), dtype=np.int64)
-    for i in range(len(masks)):
-        group[i] = i
+@kernel
+def find_alike(moved: I64, looked: U64, whose: I64, least: float, group: I64) -> None:
+    """Into ``group`` (n,), which holds 0 to n - 1, the first of all drives that are alike to a drive, or to one that is
+    alike to it, and so on. ``moved``, ``looked``: see :func:`_look`; ``whose`` (n,): the vehicles."""
+    for i in range(len(moved)):
         for k in range(i):
             whole = min(moved[i], moved[k])
             if whose[i] == whose[k] or group[i] == group[k] or whole < LEAST_MOVED:
                 continue
-            most = int(np.ceil(least * whole)) - 1
-            if _differing(looked[i], looked[k], _RIM, most) <= most:
+            most, count = int(np.ceil(least * whole)) - 1, np.int64(0)
+            for n in range(looked.shape[1]):
+                for w in range(4):
+                    set_i, some_i, every_i = looked[i, n, 0, w], looked[i, n, 1, w], looked[i, n, 2, w]
+                    set_k, some_k, every_k = looked[k, n, 0, w], looked[k, n, 1, w], looked[k, n, 2, w]
+                    word = (set_i & ~some_k) | (~set_i & every_k) | (set_k & ~some_i) | (~set_k & every_i)
+                    word &= _INSIDE[w]
+                    # How many bits are set (Warren, Hacker's Delight, 5-1).
+                    word -= (word >> np.uint64(1)) & np.uint64(0x5555555555555555)
+                    twos = np.uint64(0x3333333333333333)
+                    word = (word & twos) + ((word >> np.uint64(2)) & twos)
+                    word = (word + (word >> np.uint64(4))) & np.uint64(0x0F0F0F0F0F0F0F0F)
+                    count += np.int64((word * np.uint64(0x0101010101010101)) >> np.uint64(56))
+                if count > most:
+                    break
+            if count <= most:
                 older, newer = min(group[i], group[k]), max(group[i], group[k])
                 for other in range(i + 1):
                     if group[other] == newer:
                         group[other] = older
-    return group
 
 
-@numba.njit(cache=True, nogil=True)
 def _look(masks: U64) -> tuple[I64, U64]:
     """Of masks (n, 256, 4), in the rows looked at: by how many cells each would differ from itself (n,), and
     (n, 85, 3, 4) words: what is set, what is or has a neighbour that is, and what is and has none that is not."""
-    moved = np.zeros(len(masks), dtype=np.int64)
-    looked = np.empty((len(masks), len(range(1, _LAST, _APART)), 3, 4), dtype=np.uint64)
-    east = np.empty_like(looked[0])
-    for i in range(len(masks)):
-        for n, row in enumerate(range(1, _LAST, _APART)):
-            for w in range(4):
-                some, every = np.uint64(0), ~np.uint64(0)
-                for near in masks[i, row - 1 : row + 2]:
-                    from_east = (near[w] >> np.uint64(1)) | (near[w + 1] << np.uint64(63) if w < 3 else np.uint64(0))
-                    from_west = _from_west(near, w, 1)
-                    some |= near[w] | from_west | from_east
-                    every &= near[w] & from_west & from_east
-                looked[i, n, 0, w], looked[i, n, 1, w], looked[i, n, 2, w] = masks[i, row, w], some, every
-            for plane in range(3):
-                for w in range(4):
-                    east[n, plane, w] = _from_west(looked[i, n, plane], w, _APART)
-        moved[i] = _differing(looked[i, 1:], looked[i, :-1], _RIM, TILE_CELLS**2)
-        moved[i] += _differing(looked[i], east, _RIM + _APART, TILE_CELLS**2)
-        moved[i] //= 2
-    return moved, looked
+    rows = np.arange(1, _LAST, _APART)
+    some, every = np.zeros((len(masks), len(rows), 4), np.uint64), np.full((len(masks), len(rows), 4), ~np.uint64(0))
+    for step in (-1, 0, 1):
+        near = masks[:, rows + step]
+        west, east = _moved_east(near, 1), near >> np.uint64(1)
+        east[..., :-1] |= near[..., 1:] << np.uint64(63)
+        some |= near | west | east
+        every &= near & west & east
+    looked = np.stack([masks[:, rows], some, every], axis=2)
+    moved = _differing(looked[:, 1:], looked[:, :-1], _RIM) + _differing(
+        looked, _moved_east(looked, _APART), _RIM + _APART
+    )
+    return moved // 2, looked
 
 
-@numba.njit(cache=True, nogil=True)
-def _from_west(words: U64, w: int, by: int) -> np.uint64:
-    """A word of a row (4,) that is moved by so many columns to the east."""
-    carried = words[w - 1] >> np.uint64(64 - by) if w else np.uint64(0)
-    return (words[w] << np.uint64(by)) | carried
+def _moved_east(words: U64, by: int) -> U64:
+    """Rows of words (..., 4), moved by so many columns to the east."""
+    out = words << np.uint64(by)
+    out[..., 1:] |= words[..., :-1] >> np.uint64(64 - by)
+    return out
 
 
-@numba.njit(cache=True, nogil=True)
-def _differing(a: U64, b: U64, rim: int, most: int) -> int:
-    """In how many cells two masks (rows, 3, 4) differ, but for ``rim`` columns on either side; once they are more than
-    ``most``, so many and one."""
-    count = 0
-    for n in range(len(a)):
-        for w in range(4):
-            one = (a[n, 0, w] & ~b[n, 1, w]) | (~a[n, 0, w] & b[n, 2, w])
-            other = (b[n, 0, w] & ~a[n, 1, w]) | (~b[n, 0, w] & a[n, 2, w])
-            inside = ~np.uint64(0)
-            if w == 0:
-                inside <<= np.uint64(rim)
-            if w == 3:
-                inside >>= np.uint64(rim)
-            count += _ones((one | other) & inside)
-        if count > most:
-            return most + 1
-    return count
-
-
-@numba.njit(cache=True, nogil=True)
-def _ones(word: np.uint64) -> np.int64:
-    """How many bits are set (Warren, Hacker's Delight, 5-1)."""
-    word = word - ((word >> np.uint64(1)) & np.uint64(0x5555555555555555))
-    word = (word & np.uint64(0x3333333333333333)) + ((word >> np.uint64(2)) & np.uint64(0x3333333333333333))
-    word = (word + (word >> np.uint64(4))) & np.uint64(0x0F0F0F0F0F0F0F0F)
-    return np.int64((word * np.uint64(0x0101010101010101)) >> np.uint64(56))
+def _differing(a: U64, b: U64, rim: int) -> I64:
+    """(...) in how many cells two masks (..., rows, 3, 4) differ, but for ``rim`` columns on either side."""
+    set_a, some_a, every_a = np.moveaxis(a, -2, 0)
+    set_b, some_b, every_b = np.moveaxis(b, -2, 0)
+    words = (set_a & ~some_b) | (~set_a & every_b) | (set_b & ~some_a) | (~set_b & every_a)
+    return np.bitwise_count(words & _inside(rim)).sum(axis=(-1, -2), dtype=np.int64)

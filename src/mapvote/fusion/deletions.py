@@ -10,12 +10,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from mapvote.core.columns import EVERY_BIT, neighbourhood
-from mapvote.core.grid import TILE_CELLS
+from mapvote.core.columns import EVERY_BIT, rebased
+from mapvote.core.grid import CELLS, TILE_CELLS
 from mapvote.core.tile import Tile
 from mapvote.core.types import I32, U8, U64, Bool, CellState
 from mapvote.fusion.sparse_columns import Words, counted, nothing_reached, packed
@@ -70,12 +69,13 @@ def _remnants(
     return Words(cells, nearly_all | (most & ~_touched(cells, stays, tile.base)))
 
 
-@numba.njit(cache=True, nogil=True)
 def _touched(cells: NDArray[np.intp], stays: U64, base: I32) -> U64:
     """(n,) the voxels of flat ``cells`` that touch one of ``stays``, or the tile's edge."""
-    out = np.full(len(cells), EVERY_BIT)
-    for i in range(len(cells)):
-        row, col = cells[i] // TILE_CELLS, cells[i] % TILE_CELLS
-        if 0 < row < TILE_CELLS - 1 and 0 < col < TILE_CELLS - 1:
-            out[i] = neighbourhood(stays, base, row, col, np.int64(1))
-    return out
+    rows, cols = np.divmod(cells, TILE_CELLS)
+    edge = (rows == 0) | (cols == 0) | (rows == TILE_CELLS - 1) | (cols == TILE_CELLS - 1)
+    near = np.zeros(len(cells), dtype=np.uint64)
+    for step in (TILE_CELLS * i + j for i in (-1, 0, 1) for j in (-1, 0, 1)):
+        beside = np.clip(cells + step, 0, CELLS - 1)  # beyond the tile only for cells at its edge
+        near |= rebased(stays.reshape(-1)[beside], base.reshape(-1)[beside] - base.reshape(-1)[cells])
+    one = np.uint64(1)
+    return np.where(edge, EVERY_BIT, near | (near << one) | (near >> one))

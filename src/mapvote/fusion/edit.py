@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
-from mapvote.core.columns import EVERY_BIT, GROUND_MARGIN_M, column_bit, height_above
+from mapvote.core.columns import EVERY_BIT, column_bits
 from mapvote.core.grid import CELL_SIZE, CELLS
+from mapvote.core.kernel import inlined, kernel
 from mapvote.core.tile import Tile
 from mapvote.core.types import F32, I32, I64, U8, U64, Bool
 
@@ -20,22 +20,13 @@ def delete_points(tile: Tile, gone: U64) -> tuple[Tile, int]:
     if not tile.has_ground:
         gone = np.where(gone == 0, gone, EVERY_BIT)
     ground, base = tile.ground_z.reshape(-1), tile.base.reshape(-1)
-    dropped = _marked(tile.points, tile.cells, gone.reshape(-1), ground, base)
+    flat, dropped = gone.reshape(-1), np.zeros(len(tile.points), dtype=np.bool_)
+    asked = np.flatnonzero(flat[tile.cells])
+    cells = tile.cells[asked]
+    bit, obstacle = column_bits(tile.points[asked, 2].astype(np.float64), ground[cells], base[cells])
+    dropped[asked] = obstacle & ((flat[cells] >> bit.astype(np.uint64)) & np.uint64(1) != 0)
     deleted = int(np.count_nonzero(dropped))
     return (tile.without(dropped), deleted) if deleted else (tile, 0)
-
-
-@numba.njit(cache=True, nogil=True)
-def _marked(points: F32, cells: I64, gone: U64, ground_z: F32, base: I32) -> Bool:
-    """(n,) which points (n, 3) are obstacles in voxels that ``gone`` (cells,) marks."""
-    found = np.zeros(len(cells), dtype=np.bool_)
-    for i in range(len(cells)):
-        cell = cells[i]
-        if gone[cell]:
-            z = np.float64(points[i, 2])
-            marked = (gone[cell] >> np.uint64(column_bit(z, base[cell]))) & np.uint64(1)
-            found[i] = marked and height_above(z, ground_z[cell], base[cell]) >= GROUND_MARGIN_M
-    return found
 
 
 def add_points(tile: Tile, points: F32, intensity: U8, cells: I64, voters: I32, min_votes: int) -> tuple[Tile, int]:
@@ -49,56 +40,37 @@ def add_points(tile: Tile, points: F32, intensity: U8, cells: I64, voters: I32, 
         return tile, 0
     voxels = _voxels(cells, points)
     order = np.argsort(voxels)
-    taken = _taken(tile.points, tile.cells, voxels, order)
-    chosen = _representatives(points, intensity, voxels, voters, taken, order, min_votes)
+    asked = np.zeros(CELLS, dtype=np.bool_)
+    asked[cells] = True
+    mapped = np.flatnonzero(asked[tile.cells])
+    taken = np.isin(voxels, _voxels(tile.cells[mapped], tile.points[mapped]))
+    chosen, seen = np.empty(len(voxels), np.int64), np.full(int(voters.max()) + 1, -1, dtype=np.int64)
+    n = _represent(points, intensity, voxels, voters, taken, order, min_votes, seen, chosen)
+    chosen = chosen[:n]
     if not len(chosen):
         return tile, 0
     return tile.with_new(points[chosen], intensity[chosen]), len(chosen)
 
 
-@numba.njit(cache=True, nogil=True)
 def _voxels(cells: I64, points: F32) -> I64:
     """(n,) a number for the voxel of each point, ascending by cell, then layer; neighbours above each other differ by
     one."""
-    voxels = np.empty(len(cells), dtype=np.int64)
-    for i in range(len(cells)):
-        voxels[i] = cells[i] * (1 << 24) + int(np.floor(np.float64(points[i, 2]) / CELL_SIZE)) + (1 << 23)
-    return voxels
+    layers = np.floor(points[:, 2].astype(np.float64) / CELL_SIZE).astype(np.int64)
+    return cells * (1 << 24) + layers + (1 << 23)
 
 
-@numba.njit(cache=True, nogil=True)
-def _taken(points: F32, cells: I64, voxels: I64, order: I64) -> Bool:
-    """(n,) which of the ``voxels``, that ``order`` sorts, hold one of the ``points`` (m, 3) in ``cells`` (m,)."""
-    first = np.full(CELLS, len(order), dtype=np.int32)
-    for k in range(len(order) - 1, -1, -1):
-        first[voxels[order[k]] >> 24] = k
-    taken = np.zeros(len(voxels), dtype=np.bool_)
-    for i in range(len(cells)):
-        k = first[cells[i]]
-        if k < len(order):
-            voxel = cells[i] * (1 << 24) + int(np.floor(np.float64(points[i, 2]) / CELL_SIZE)) + (1 << 23)
-            while k < len(order) and voxels[order[k]] <= voxel:
-                taken[order[k]] |= voxels[order[k]] == voxel
-                k += 1
-    return taken
+@kernel
+def _represent(
+    points: F32, intensity: U8, voxels: I64, voters: I32, taken: Bool, order: I64, min_votes: int, seen: I64, out: I64
+) -> int:
+    """Into ``out`` (n,), returning how many, indices of one point per supported voxel, ascending by voxel: the one
+    nearest to the mean of all offered there, of several the first by x, y, z, intensity.
 
-
-@numba.njit(cache=True, nogil=True)
-def _representatives(
-    points: F32, intensity: U8, voxels: I64, voters: I32, taken: Bool, order: I64, min_votes: int
-) -> I64:
-    """Indices of one point per supported voxel, ascending by voxel: the one nearest to the mean of all offered there,
-    of several the first by x, y, z, intensity.
-
-    ``order`` sorts ``voxels``; within a voxel any order gives the same: the mean is a sum of whole micrometres.
+    ``seen`` holds -1 for each voter. ``order`` sorts ``voxels``; within a voxel any order gives the same: the mean is a
+    sum of whole micrometres.
     """
     n = len(voxels)
-    out = np.empty(n, dtype=np.int64)
-    found, last_voter = 0, -1
-    for i in range(n):
-        last_voter = max(last_voter, voters[i])
-    seen = np.full(last_voter + 1, -1, dtype=np.int64)
-    low, start = 0, 0
+    found, low, start = 0, 0, 0
     while start < n:
         voxel = voxels[order[start]]
         stop = start + 1
@@ -114,31 +86,32 @@ def _representatives(
                 support += 1
             i += 1
         if support >= min_votes and not taken[order[start]]:
-            out[found] = _nearest_to_mean(points, intensity, order[start:stop])
+            out[found] = _nearest_to_mean(points, intensity, order, start, stop)
             found += 1
         start = stop
-    return out[:found]
+    return found
 
 
-@numba.njit(cache=True, nogil=True)
-def _nearest_to_mean(points: F32, intensity: U8, some: I64) -> int:
-    mean = np.zeros(3)
-    for k in range(3):
-        total = 0
-        for i in some:
-            total += int(np.rint(np.float64(points[i, k]) * 1e6))
-        mean[k] = total / (1e6 * len(some))
-    best, nearest = some[0], np.inf
-    for i in some:
-        distance = 0.0
-        for k in range(3):
-            distance += (np.float64(points[i, k]) - mean[k]) ** 2
+@inlined
+def _nearest_to_mean(points: F32, intensity: U8, order: I64, start: int, stop: int) -> int:
+    """Of the points ``order[start:stop]``, see :func:`_represent`."""
+    x, y, z = np.int64(0), np.int64(0), np.int64(0)  # micrometres
+    for k in range(start, stop):
+        x += np.int64(np.rint(np.float64(points[order[k], 0]) * 1e6))
+        y += np.int64(np.rint(np.float64(points[order[k], 1]) * 1e6))
+        z += np.int64(np.rint(np.float64(points[order[k], 2]) * 1e6))
+    of = 1e6 * (stop - start)
+    best, nearest = order[start], np.inf
+    for k in range(start, stop):
+        i = order[k]
+        dx, dy, dz = points[i, 0] - x / of, points[i, 1] - y / of, points[i, 2] - z / of
+        distance = dx * dx + dy * dy + dz * dz
         if distance < nearest or (distance == nearest and _before(points, intensity, i, best)):
             best, nearest = i, distance
     return best
 
 
-@numba.njit(cache=True, nogil=True)
+@inlined
 def _before(points: F32, intensity: U8, one: int, other: int) -> bool:
     for k in range(3):
         if points[one, k] != points[other, k]:

@@ -27,7 +27,7 @@ from mapvote.fusion.odds import Odds, agreed_odds
 from mapvote.fusion.outliers import contradictors, deniers
 from mapvote.fusion.pending import Pending, beyond_budget
 from mapvote.fusion.persistence import denied_last, doubtful, remembered, temporary
-from mapvote.fusion.sparse_columns import learned, nothing_reached
+from mapvote.fusion.sparse_columns import nothing_reached
 from mapvote.fusion.spent import changed_in
 from mapvote.fusion.spilled import without_spilled
 from mapvote.fusion.tile_vote import TileVote, one_each
@@ -255,8 +255,8 @@ def _learn_free(tile: Tile, votes: Sequence[TileVote], min_votes: int, points_ad
     reached = nothing_reached(min_votes if len(passed) >= min_votes else 1)
     for vote in passed if len(passed) >= min_votes else []:
         vote.mark_passed(reached)
-    differs = learned(free.reshape(-1), tile.obstacle_words.reshape(-1), reached[-1])
-    return tile.but(free=reached[-1].reshape(free.shape)) if differs or tile.free is None else tile
+    learned = (reached[-1].reshape(free.shape) | free) & ~tile.obstacle_words
+    return tile.but(free=learned) if tile.free is None or (learned != free).any() else tile
 
 
 def states_over(lattice: Lattice, decisions: Mapping[TileIndex, Decision]) -> tuple[U8, Grid]:

@@ -14,13 +14,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from mapvote.config import FuseSettings
+from mapvote.core.kernel import kernel
 from mapvote.core.tile import Tile
-from mapvote.core.types import I64, N_STATES, NO_VOTE, U8, U64, Bool, CellState
+from mapvote.core.types import I64, N_STATES, NO_VOTE, U8, Bool, CellState
 from mapvote.core.voting import VOTE_UNIT
 from mapvote.fusion.tile_vote import TileVote, states_of
 
@@ -70,21 +70,13 @@ def borne_out(votes: Sequence[TileVote], tile: Tile) -> I64:
     holds = tile.obstacle_words.reshape(-1)
     for i, vote in enumerate(votes):
         if vote.unrestricted is not None and vote.states is not None:
-            found[i] = _came_true(vote.states.reshape(-1), vote.unrestricted.reshape(-1), holds)
+            sent = vote.unrestricted.reshape(-1)
+            spent = np.flatnonzero((vote.states.reshape(-1) == NO_VOTE) & ((sent == _CO) | (sent == _CE)))
+            found[i] = np.count_nonzero((sent[spent] == _CO) == (holds[spent] != 0))
     return found
 
 
-@numba.njit(cache=True, nogil=True)
-def _came_true(states: U8, sent: U8, holds: U64) -> int:
-    """In how many cells what was ``sent`` counts no more, and is so: obstacles where it ``holds`` a word, else none."""
-    count = 0
-    for c in range(len(states)):
-        if states[c] == NO_VOTE and (sent[c] == _CO or sent[c] == _CE):
-            count += (sent[c] == _CO) == (holds[c] != 0)
-    return count
-
-
-@numba.njit(cache=True, nogil=True)
+@kernel
 def contradicts(own: U8, others: U8, most: float) -> bool:
     """Whether a vehicle's ``own`` states (asked,) oppose the ``others`` (asked, 8), see :func:`others_say`, in more
     than ``most`` of the cells they agree on.
@@ -114,7 +106,6 @@ def denying(states: U8, decided: U8, most: float, came_true: I64) -> Bool:
     return np.asarray((asked >= _MIN_ASKED) & (denied > most * asked))
 
 
-@numba.njit(cache=True, nogil=True)
 def others_say(tally: NDArray[Any], quorum: int) -> U8:
     """(asked, 8) what the others say of a cell, by the last three bits of what a vehicle says there itself.
 
@@ -123,16 +114,12 @@ def others_say(tally: NDArray[Any], quorum: int) -> U8:
     Nothing to a vehicle that left the cell undetermined (4) or has no vote there (7).
     """
     said = np.zeros((tally.shape[1], 8), dtype=np.uint8)
-    for i in range(len(said)):
-        for own in range(_UN):
-            total, best, best_state = 0, 0, 0
-            for state in range(_UN):
-                votes = int(tally[state, i]) - (VOTE_UNIT if state == own else 0)
-                total += votes
-                if votes > best:
-                    best, best_state = votes, state
-            if total >= quorum * VOTE_UNIT:
-                said[i, own] = _ASKED
-                if 2 * best > total and best >= quorum * VOTE_UNIT:
-                    said[i, own] |= _AGREED if best_state == own else _AGREED | _OPPOSED
+    for own in range(_UN):
+        votes = tally[:_UN].astype(np.int64)
+        votes[own] -= VOTE_UNIT
+        total, best = votes.sum(axis=0), votes.max(axis=0)
+        asked = total >= quorum * VOTE_UNIT
+        agreed = asked & (2 * best > total) & (best >= quorum * VOTE_UNIT) & (best > 0)
+        opposed = agreed & (votes.argmax(axis=0) != own)
+        said[:, own] = _ASKED * asked + _AGREED * agreed + _OPPOSED * opposed
     return said

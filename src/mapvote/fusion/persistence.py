@@ -16,7 +16,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -28,7 +27,6 @@ from mapvote.fusion.tile_vote import TileVote
 from mapvote.fusion.turning import in_order
 
 DAY_S = 86_400
-_BLOCK = 64
 _CO, _UE, _CE = int(CellState.CHANGED_OCCUPIED), int(CellState.UNCHANGED_EMPTY), int(CellState.CHANGED_EMPTY)
 _UN = int(CellState.UNDETERMINED)
 
@@ -148,25 +146,11 @@ def remembered(
     return memory.but(cells[order], values[:, order])
 
 
-@numba.njit(cache=True, nogil=True)
 def emptied_and_filled(before: U64, after: U64) -> tuple[I64, I64]:
     """Indices of the words (n,) that are zero only after, and only before."""
-    emptied, filled = np.empty(len(before), dtype=np.int64), np.empty(len(before), dtype=np.int64)
-    n, m = 0, 0
-    for start in range(0, len(before), _BLOCK):
-        stop = min(start + _BLOCK, len(before))
-        other = np.uint64(0)
-        for c in range(start, stop):  # most are the same, and that is seen with vector instructions
-            other |= before[c] ^ after[c]
-        for c in range(start, stop if other else start):
-            if (before[c] == 0) != (after[c] == 0):
-                if after[c] == 0:
-                    emptied[n] = c
-                    n += 1
-                else:
-                    filled[m] = c
-                    m += 1
-    return emptied[:n].copy(), filled[:m].copy()
+    changed = np.flatnonzero(before != after)
+    emptied, filled = after[changed] == 0, before[changed] == 0
+    return changed[emptied], changed[filled]
 
 
 def _first_s(votes: Sequence[TileVote], cells: I64, state: int) -> NDArray[np.uint32]:
@@ -175,14 +159,6 @@ def _first_s(votes: Sequence[TileVote], cells: I64, state: int) -> NDArray[np.ui
     for vote in votes:
         if vote.states is not None:
             end_s = np.uint32(min(max(vote.end_ns // 10**9, 1), 2**32 - 2))
-            _earliest(first, end_s, vote.states, cells, state)
+            said = vote.states.reshape(-1)[cells] == state
+            first[said] = np.minimum(first[said], end_s)
     return np.where(first == np.iinfo(np.uint32).max, np.uint32(0), first)
-
-
-@numba.njit(cache=True, nogil=True)
-def _earliest(first: NDArray[np.uint32], end_s: np.uint32, states: U8, cells: I64, state: int) -> None:
-    """Of a vote that ended at ``end_s``: no later than that is ``first`` (n,) where it says ``state`` of ``cells``."""
-    states = states.reshape(-1)
-    for i in range(len(cells)):
-        if states[cells[i]] == state and end_s < first[i]:
-            first[i] = end_s

@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from mapvote.codec.words import unpack_sparse
 from mapvote.core.columns import EVERY_BIT
 from mapvote.core.grid import CELLS
-from mapvote.core.types import I32, NO_VOTE, U8, U64, Bool
+from mapvote.core.kernel import kernel
+from mapvote.core.types import I32, U64, Bool
 
 _BLOCK = 64
 _BITS = np.arange(64, dtype=np.uint64)
@@ -36,7 +36,8 @@ class Words:
     def of(cls, plane: U64) -> Words:
         """From a (256, 256) plane."""
         flat = plane.reshape(-1)
-        return cls(*_not_zero(np.ascontiguousarray(flat)))
+        cells = np.flatnonzero(flat)
+        return cls(cells, flat[cells])
 
     @classmethod
     def whole(cls, cells: Bool) -> Words:
@@ -71,10 +72,14 @@ class Words:
 
 def union(marked: Sequence[Words]) -> Words:
     """The bits that any of ``marked`` sets."""
-    both = Words.none()
-    for mine in marked:
-        both = Words(*_either(both.cells, both.words, mine.cells, mine.words)) if len(both.cells) else mine
-    return both
+    some = [mine for mine in marked if len(mine.cells)]
+    if len(some) < 2:
+        return some[0] if some else Words.none()
+    cells = np.concatenate([mine.cells for mine in some])
+    order = np.argsort(cells, kind="stable")
+    cells, words = cells[order], np.concatenate([mine.words for mine in some])[order]
+    first = np.flatnonzero(np.diff(cells, prepend=-1))
+    return Words(cells[first], np.bitwise_or.reduceat(words, first))
 
 
 def nothing_reached(k: int, cells: int = CELLS) -> U64:
@@ -95,105 +100,12 @@ def packed(bits: Bool) -> U64:
     return np.asarray((bits.astype(np.uint64) << _BITS).sum(axis=1, dtype=np.uint64))
 
 
-@numba.njit(cache=True, nogil=True)
-def _either(
-    cells_a: NDArray[np.intp], words_a: U64, cells_b: NDArray[np.intp], words_b: U64
-) -> tuple[NDArray[np.intp], U64]:
-    """Two lists of cells, ascending, and their words as one."""
-    most = len(cells_a) + len(cells_b)
-    cells, words = np.empty(most, dtype=np.intp), np.empty(most, dtype=np.uint64)
-    i, k, n = 0, 0, 0
-    while i < len(cells_a) or k < len(cells_b):
-        a = cells_a[i] if i < len(cells_a) else CELLS
-        b = cells_b[k] if k < len(cells_b) else CELLS
-        cells[n], words[n] = min(a, b), np.uint64(0)
-        if a == cells[n]:
-            words[n] |= words_a[i]
-            i += 1
-        if b == cells[n]:
-            words[n] |= words_b[k]
-            k += 1
-        n += 1
-    return cells[:n].copy(), words[:n].copy()
-
-
-@numba.njit(cache=True, nogil=True)
-def _not_zero(words: U64) -> tuple[NDArray[np.intp], U64]:
-    """Indices of the words (a multiple of 64) that are not zero, and those words."""
-    blocks = len(words) // _BLOCK
-    filled = np.zeros(blocks, dtype=np.uint64)
-    n = 0
-    for b in range(blocks):  # most blocks are empty, and that is seen with vector instructions
-        for i in range(b * _BLOCK, (b + 1) * _BLOCK):
-            filled[b] |= words[i]
-        n += _BLOCK if filled[b] else 0
-    cells, out = np.empty(n, dtype=np.intp), np.empty(n, dtype=np.uint64)
-    n = 0
-    for b in range(blocks):
-        if filled[b]:
-            for i in range(b * _BLOCK, (b + 1) * _BLOCK):
-                cells[n] = i
-                out[n] = words[i]
-                n += words[i] != 0
-    return cells[:n].copy(), out[:n].copy()
-
-
-@numba.njit(cache=True, nogil=True)
+@kernel
 def mark(reached: U64, cells: NDArray[np.intp], words: U64) -> None:
     """One more voter in ``reached`` (k, cells), a running count of bits without a loop over them: bits that
     ``reached[i]`` had are now in ``reached[i + 1]`` where it sets them too. It ends as the bits that one, two .. k
     voters set."""
     for i in range(len(cells)):
-        _mark_one(reached, cells[i], words[i])
-
-
-@numba.njit(cache=True, nogil=True)
-def mark_spoken(reached: U64, cells: NDArray[np.intp], words: U64, own: U8) -> None:
-    """:func:`mark` of the cells of which the voter's ``own`` states (256, 256) say anything."""
-    own = own.reshape(-1)
-    for i in range(len(cells)):
-        if own[cells[i]] != NO_VOTE:
-            _mark_one(reached, cells[i], words[i])
-
-
-@numba.njit(cache=True, nogil=True)
-def mark_among(reached: U64, cells: NDArray[np.intp], words: U64, own: U8, said: int, among: NDArray[np.intp]) -> None:
-    """:func:`mark` of the cells that are ``among`` these (n,), ascending too, and that the voter's ``own`` states
-    (256, 256) call ``said``; of ``reached`` (k, n) by their place among them."""
-    own, k = own.reshape(-1), 0
-    for i in range(len(cells)):
-        while k < len(among) and among[k] < cells[i]:
-            k += 1
-        if k < len(among) and among[k] == cells[i] and own[cells[i]] == said:
-            _mark_one(reached, k, words[i])
-
-
-@numba.njit(cache=True, nogil=True)
-def learned(free: U64, occupied: U64, passed: U64) -> bool:
-    """Make of the words ``passed`` (65536,) those that are ``free`` then: with what was free before, without what is
-    ``occupied``. Whether that is anything else than before."""
-    differs = np.uint64(0)
-    for c in range(len(passed)):
-        passed[c] = (passed[c] | free[c]) & ~occupied[c]
-        differs |= passed[c] ^ free[c]
-    return bool(differs)
-
-
-@numba.njit(cache=True, nogil=True)
-def agreed(cells: NDArray[np.intp], own: U8, decided: U8, state: int) -> NDArray[np.intp]:
-    """Indices of the flat ``cells`` (n,) that are ``state`` in a voter's ``own`` states and in the ``decided`` ones,
-    (256, 256) each."""
-    own, decided = own.reshape(-1), decided.reshape(-1)
-    found = np.empty(len(cells), dtype=np.intp)
-    n = 0
-    for i in range(len(cells)):
-        found[n] = i
-        n += (decided[cells[i]] == state) & (own[cells[i]] == state)
-    return found[:n]
-
-
-@numba.njit(cache=True, nogil=True)
-def _mark_one(reached: U64, cell: int, word: np.uint64) -> None:
-    for level in range(reached.shape[0] - 1, 0, -1):
-        reached[level, cell] |= reached[level - 1, cell] & word
-    reached[0, cell] |= word
+        for level in range(reached.shape[0] - 1, 0, -1):
+            reached[level, cells[i]] |= reached[level - 1, cells[i]] & words[i]
+        reached[0, cells[i]] |= words[i]

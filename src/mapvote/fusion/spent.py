@@ -9,14 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from mapvote.core.grid import CELLS, TILE_CELLS
+from mapvote.core.kernel import kernel
 from mapvote.core.memory import Memory
 from mapvote.core.tile import Tile
-from mapvote.core.types import I64, U8, U64, Bool
+from mapvote.core.types import I64, U8, Bool, read_only
 from mapvote.fusion.tile_vote import TileVote, silenced
 
 
@@ -50,22 +50,25 @@ def _other_points(a: Tile, b: Tile) -> Bool:
     if a.points is b.points:
         return np.zeros(CELLS, dtype=np.bool_)
     sides = [(tile.cells, np.ascontiguousarray(tile.points).view(np.uint32)) for tile in (a, b)]
-    missing = _out_of_step(*sides[0], *sides[1])
+    missing = np.zeros(CELLS, dtype=np.uint8)
+    (cells_a, words_a), (cells_b, words_b) = sides
+    _out_of_step(cells_a, read_only(words_a), cells_b, read_only(words_b), missing)
     differ, unsure = missing > 0, missing == 3
     if unsure.any():
-        digests = [_cell_digests(*side, unsure) for side in sides]
-        differ[unsure] = (digests[0] != digests[1])[unsure]
+        differ[unsure] = _other_sequences(*(_of_cells(*side, unsure) for side in sides))[unsure]
     return np.asarray(differ)
 
 
-@numba.njit(cache=True, nogil=True)
-def _out_of_step(cells_a: I64, words_a: NDArray[np.uint32], cells_b: I64, words_b: NDArray[np.uint32]) -> U8:
-    """(65536,) of which side a cell has points (n, 3) that do not follow in the other: 1 and 2, or 3 of both.
+@kernel
+def _out_of_step(
+    cells_a: I64, words_a: NDArray[np.uint32], cells_b: I64, words_b: NDArray[np.uint32], missing: U8
+) -> None:
+    """Into ``missing`` (65536,), zeros, of which side a cell has points (n, 3) that do not follow in the other: 1 and
+    2, or 3 of both.
 
     Each point of b is matched with at most one of a, in order. So cells of 0 hold the same points; those of 1 and 2
     hold more on one side; and of an edit few are 3.
     """
-    missing = np.zeros(CELLS, dtype=np.uint8)
     k = 0
     for i in range(len(cells_a)):
         if k < len(cells_b) and (
@@ -74,22 +77,20 @@ def _out_of_step(cells_a: I64, words_a: NDArray[np.uint32], cells_b: I64, words_
             k += 1
         else:
             missing[cells_a[i]] |= 1
-    for cell in cells_b[k:]:
-        missing[cell] |= 2
-    return missing
+    for i in range(k, len(cells_b)):
+        missing[cells_b[i]] |= 2
 
 
-@numba.njit(cache=True, nogil=True)
-def _cell_digests(cells: I64, words: NDArray[np.uint32], among: Bool) -> U64:
-    """(65536,) a 64-bit FNV-1a hash over the words of the points (n, 3) of each cell ``among`` these (65536,), 0 for
-    all others and for a cell without points."""
-    out = np.zeros(65536, dtype=np.uint64)
-    for i in range(len(cells)):
-        if among[cells[i]]:
-            h = out[cells[i]]
-            if h == 0:
-                h = np.uint64(0xCBF29CE484222325)
-            for k in range(3):
-                h = (h ^ np.uint64(words[i, k])) * np.uint64(0x100000001B3)
-            out[cells[i]] = h
-    return out
+def _of_cells(cells: I64, words: NDArray[np.uint32], among: Bool) -> tuple[I64, NDArray[np.uint32]]:
+    """Cells (m,), ascending, and words (m, 3) of the points in the cells ``among`` (65536,), each cell's in order."""
+    mine = np.flatnonzero(among[cells])
+    mine = mine[np.argsort(cells[mine], kind="stable")]
+    return cells[mine], words[mine]
+
+
+def _other_sequences(a: tuple[I64, NDArray[np.uint32]], b: tuple[I64, NDArray[np.uint32]]) -> Bool:
+    """(65536,) which cells hold other points, or as many in another order; see :func:`_of_cells`."""
+    other = np.bincount(a[0], minlength=CELLS) != np.bincount(b[0], minlength=CELLS)
+    same_a, same_b = ~other[a[0]], ~other[b[0]]
+    other[a[0][same_a][(a[1][same_a] != b[1][same_b]).any(axis=1)]] = True
+    return np.asarray(other)

@@ -11,12 +11,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import numba
 import numpy as np
 
 from mapvote.core.cells import flat_cells
 from mapvote.core.columns import column_bits
 from mapvote.core.grid import CELL_SIZE, CELLS, TILE_CELLS, Grid
+from mapvote.core.kernel import kernel
 from mapvote.core.tile import Tile
 from mapvote.core.types import F32, F64, I64, U8, Bool, CellState
 from mapvote.fusion.tile_vote import TileVote
@@ -113,7 +113,8 @@ def _on_planes(points: F32, asked: I64, first: I64, cells: I64) -> F64:
     """(k, 3) the points that are ``asked`` (k,), each moved onto the upright plane through those about it, where there
     is one and it is near."""
     about = points[asked].astype(np.float64)
-    n, mean, spread = _moments(points, asked, first, cells)
+    n, mean, spread = np.zeros(len(asked), np.int64), np.zeros((len(asked), 3)), np.zeros((len(asked), 3, 3))
+    _moments(points, asked, first, cells, n, mean, spread)
     variance, axes = np.linalg.eigh(spread)
     normal = axes[:, :, 0]
     plane = (n >= _ENOUGH) & (variance[:, 1] > _FLAT * variance[:, 0]) & (np.abs(normal[:, 2]) < _UPRIGHT)
@@ -122,30 +123,29 @@ def _on_planes(points: F32, asked: I64, first: I64, cells: I64) -> F64:
     return np.asarray(about + np.where(plane, off, 0.0)[:, None] * normal)
 
 
-@numba.njit(cache=True, nogil=True)
-def _moments(points: F32, asked: I64, first: I64, cells: I64) -> tuple[I64, F64, F64]:
-    """(n (k,), mean (k, 3) from the point itself, covariance (k, 3, 3)) of the points within REACH_M of each that is
-    ``asked`` (k,). ``points`` (m, 3) in the order of their ``cells`` (m,); ``first`` (65537,) of each cell."""
+@kernel
+def _moments(points: F32, asked: I64, first: I64, cells: I64, number: I64, mean: F64, spread: F64) -> None:
+    """Into zeros: ``number`` (k,), ``mean`` (k, 3) from the point itself and covariance ``spread`` (k, 3, 3) of the
+    points within REACH_M of each that is ``asked`` (k,). ``points`` (m, 3) in the order of their ``cells`` (m,);
+    ``first`` (65537,) of each cell."""
     reach = int(np.ceil(REACH_M / CELL_SIZE))
-    number, mean, spread = np.zeros(len(asked), np.int64), np.zeros((len(asked), 3)), np.zeros((len(asked), 3, 3))
-    away = np.empty(3)
     for k in range(len(asked)):
-        point = points[asked[k]]
+        point = asked[k]
         row, col = divmod(cells[asked[k]], TILE_CELLS)
         for r in range(max(row - reach, 0), min(row + reach + 1, TILE_CELLS)):
             left, right = max(col - reach, 0), min(col + reach, TILE_CELLS - 1)
             for i in range(first[r * TILE_CELLS + left], first[r * TILE_CELLS + right + 1]):
-                for a in range(3):
-                    away[a] = np.float64(points[i, a]) - np.float64(point[a])
-                if away[0] ** 2 + away[1] ** 2 + away[2] ** 2 <= REACH_M**2:
+                x = np.float64(points[i, 0]) - np.float64(points[point, 0])
+                y = np.float64(points[i, 1]) - np.float64(points[point, 1])
+                z = np.float64(points[i, 2]) - np.float64(points[point, 2])
+                if x * x + y * y + z * z <= REACH_M**2:
                     number[k] += 1
-                    for a in range(3):
-                        mean[k, a] += away[a]
-                        for b in range(3):
-                            spread[k, a, b] += away[a] * away[b]
+                    for a, u in enumerate((x, y, z)):
+                        mean[k, a] += u
+                        for b, v in enumerate((x, y, z)):
+                            spread[k, a, b] += u * v
         for a in range(3):
             mean[k, a] /= number[k]
         for a in range(3):
             for b in range(3):
                 spread[k, a, b] = spread[k, a, b] / number[k] - mean[k, a] * mean[k, b]
-    return number, mean, spread

@@ -9,7 +9,6 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Protocol, TypeVar
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,7 +19,7 @@ from mapvote.core.cells import flat_cells
 from mapvote.core.grid import CELLS, TILE_CELLS, Grid
 from mapvote.core.types import F32, I64, N_STATES, NO_VOTE, U8, U16, U64, Bool, CellState, read_only
 from mapvote.fusion.odds import Odds, folded
-from mapvote.fusion.sparse_columns import Words, agreed, mark, mark_among, mark_spoken, union
+from mapvote.fusion.sparse_columns import Words, mark, union
 
 DAY_NS = 86_400_000_000_000
 
@@ -146,8 +145,6 @@ class TileVote:
     def agreed(self, cells: NDArray[np.intp], decided: U8, state: CellState) -> NDArray[np.intp]:
         """Indices of those of the flat ``cells`` (n,) that are ``decided`` (256, 256) as ``state``, which this vote
         supports."""
-        if self.states is not None:
-            return np.asarray(agreed(cells, self.states, decided, int(state)))
         return np.flatnonzero((decided.reshape(-1)[cells] == state) & self.supports(state, cells))
 
     def determined(self, cells: NDArray[np.intp]) -> Bool:
@@ -160,25 +157,22 @@ class TileVote:
 
     def passed(self) -> Words:
         """The voxels that rays passed through, of cells that this vote speaks of."""
-        return Words.none() if self.free is None else self.free.within(self.spoken())
+        if self.free is None:
+            return Words.none()
+        if self.states is not None:
+            return self.free.at(self.states.reshape(-1)[self.free.cells] != NO_VOTE)
+        return self.free.within(self.spoken())
 
     def mark_passed(self, reached: U64) -> None:
         """One more voter in ``reached`` (see :func:`mapvote.fusion.sparse_columns.mark`): of what it has
         :meth:`passed`."""
-        if self.states is not None and self.free is not None:
-            mark_spoken(reached, self.free.cells, self.free.words, self.states)
-        else:
-            passed = self.passed()
-            mark(reached, passed.cells, passed.words)
+        passed = self.passed()
+        mark(reached, passed.cells, passed.words)
 
     def mark_deleted(self, emptied: Words, reached: U64) -> None:
         """One more voter in ``reached`` (k, n): of what it :meth:`deletes` among the n cells ``emptied``."""
-        if self.states is not None and self.gone is not None:
-            said = int(CellState.CHANGED_EMPTY)
-            mark_among(reached, self.gone.cells, self.gone.words, self.states, said, emptied.cells)
-        else:
-            deleted = self.deletes(emptied)
-            mark(reached, np.searchsorted(emptied.cells, deleted.cells), deleted.words)
+        deleted = self.deletes(emptied)
+        mark(reached, np.searchsorted(emptied.cells, deleted.cells), deleted.words)
 
     def deletes(self, among: Words) -> Words:
         """The voxels that this vote says are gone, of the cells that ``among`` names."""
@@ -312,14 +306,8 @@ def _laid_over(planes: Sequence[U8 | None]) -> U8:
     out = np.full(CELLS, NO_VOTE, dtype=np.uint8)
     for plane in planes:
         if plane is not None:
-            _lay(plane.reshape(-1), out)
+            np.copyto(out, plane.reshape(-1), where=plane.reshape(-1) != NO_VOTE)
     return out.reshape(TILE_CELLS, TILE_CELLS)
-
-
-@numba.njit(cache=True, nogil=True)
-def _lay(states: U8, out: U8) -> None:
-    for c in range(len(out)):
-        out[c] = states[c] if states[c] != NO_VOTE else out[c]
 
 
 def _marked(drive: TileVote, mine: Bool) -> Words:

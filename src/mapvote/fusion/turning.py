@@ -11,17 +11,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from mapvote.core.grid import CELLS
-from mapvote.core.types import I64, N_STATES, NO_VOTE, U8, CellState
+from mapvote.core.types import I64, N_STATES, NO_VOTE, U8, Bool, CellState
 from mapvote.core.voting import VOTE_UNIT
 from mapvote.fusion.tile_vote import TileVote
 
 _UN = int(CellState.UNDETERMINED)
-_BLOCK = 64
 _TURNS = (
     (CellState.UNCHANGED_OCCUPIED, CellState.CHANGED_EMPTY),
     (CellState.UNCHANGED_EMPTY, CellState.CHANGED_OCCUPIED),
@@ -60,42 +58,24 @@ def in_order(drives: Sequence[TileVote], cells: I64) -> tuple[U8, I64, I64]:
     return said, ends_ns, np.array([names[drive.vehicle] for drive in ordered], dtype=np.int64)
 
 
-@numba.njit(cache=True, nogil=True)
-def _turn(said: U8, ends_ns: I64, whose: I64, before: int, after: int) -> NDArray[np.bool_]:
+def _turn(said: U8, ends_ns: I64, whose: I64, before: int, after: int) -> Bool:
     """(n,) in which cells every vehicle's last word is ``before`` until some moment and ``after`` since."""
-    found = np.zeros(said.shape[1], dtype=np.bool_)
-    last = np.empty(len(whose), dtype=np.int64)
-    for cell in range(said.shape[1]):
-        last[:] = -1
-        for i in range(len(whose)):
-            if said[i, cell] != NO_VOTE:
-                last[whose[i]] = i
-        oldest_after, newest_before, other = np.iinfo(np.int64).max, np.iinfo(np.int64).min, False
-        for word in last:
-            if word >= 0 and said[word, cell] == after:
-                oldest_after = min(oldest_after, ends_ns[word])
-            elif word >= 0 and said[word, cell] == before:
-                newest_before = max(newest_before, ends_ns[word])
-            elif word >= 0 and said[word, cell] < _UN:
-                other = True
-        found[cell] = not other and newest_before < oldest_after
-    return found
+    n = said.shape[1]
+    oldest_after, newest_before = np.full(n, np.iinfo(np.int64).max), np.full(n, np.iinfo(np.int64).min)
+    other = np.zeros(n, dtype=np.bool_)
+    for vehicle in np.unique(whose):
+        word, end_ns = np.full(n, NO_VOTE, dtype=np.uint8), np.zeros(n, dtype=np.int64)
+        for i in np.flatnonzero(whose == vehicle):
+            speaks = said[i] != NO_VOTE
+            word[speaks], end_ns[speaks] = said[i, speaks], ends_ns[i]
+        oldest_after[word == after] = np.minimum(oldest_after, end_ns)[word == after]
+        newest_before[word == before] = np.maximum(newest_before, end_ns)[word == before]
+        other |= (word < _UN) & (word != after) & (word != before)
+    return ~other & (newest_before < oldest_after)
 
 
-@numba.njit(cache=True, nogil=True)
 def _may_turn(states: U8, votes: NDArray[Any], before: int, most: int) -> I64:
     """Flat cells that are ``before`` or undetermined though more than ``most`` VOTE_UNITs say otherwise; (65536,)
     each."""
-    found = np.empty(len(states), dtype=np.int64)
-    n = 0
-    for start in range(0, len(states), _BLOCK):
-        some = False
-        for c in range(
-            start, start + _BLOCK
-        ):  # in most blocks nobody says so, and that is seen with vector instructions
-            some |= votes[c] > most
-        for c in range(start, start + _BLOCK if some else start):
-            if votes[c] > most and (states[c] == before or states[c] == _UN):
-                found[n] = c
-                n += 1
-    return found[:n].copy()
+    found = np.flatnonzero(votes > most)
+    return found[(states[found] == before) | (states[found] == _UN)]

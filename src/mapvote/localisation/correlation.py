@@ -5,11 +5,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 
 from mapvote.core.cells import flat_cells
 from mapvote.core.grid import CELL_SIZE
+from mapvote.core.kernel import allocating, kernel
 from mapvote.core.point_map import PointMap
 from mapvote.core.types import F32, F64, I64, U8, U32, Bool, MapvoteError
 
@@ -112,7 +112,7 @@ def _dilated(words: U32) -> U32:
     return out
 
 
-@numba.njit(cache=True, nogil=True)
+@allocating
 def correlate(wide: U32, spans: I64, cols: I64, xy: F64, bits: U32, yaws: F64, hopeless: int, first: int) -> U8:
     """(places, headings) how many of the points (n <= 255) meet something of their height there; 0 where hopeless.
 
@@ -148,7 +148,7 @@ def correlate(wide: U32, spans: I64, cols: I64, xy: F64, bits: U32, yaws: F64, h
     return out
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _look_up(flat: U32, at: int, way: I64, bits: U32, begin: int, end: int, hits: U32) -> None:
     """Add to ``hits`` of each cell of the span that begins ``at`` how many points, a ``way`` off, meet something."""
     for i in range(begin, end):
@@ -157,7 +157,7 @@ def _look_up(flat: U32, at: int, way: I64, bits: U32, begin: int, end: int, hits
             hits[j] += (flat[start + j] >> bit) & np.uint32(1)
 
 
-@numba.njit(cache=True, nogil=True)
+@allocating
 def apart(x: F64, y: F64, yaw: F64, most: int, spread_m: float, spread_rad: float) -> I64:
     """Indices of the first ``most`` that lie apart from all chosen before."""
     chosen = np.empty(most, dtype=np.int64)
@@ -178,7 +178,7 @@ def apart(x: F64, y: F64, yaw: F64, most: int, spread_m: float, spread_rad: floa
     return chosen[:n]
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def sharpened(words: U32, x: float, y: float, yaw: float, xy: F64, bits: U32) -> tuple[float, float, float, float]:
     """(share, x, y, yaw) of the best place and heading around one, on single cells; x and y in cells."""
     best, at = -1.0, (x, y, yaw)

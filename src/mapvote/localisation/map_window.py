@@ -12,13 +12,13 @@ from mapvote.localisation.ndt import (
     CENTRAL_M,
     HALF_WINDOW_M,
     LEVELS,
-    MIN_POINTS,
     Level,
     NdtMap,
     entered,
+    refreshed,
     room_for_voxels,
 )
-from mapvote.localisation.ndt_voxels import Voxels, Window, refresh
+from mapvote.localisation.ndt_voxels import Voxels, Window
 
 _SLAB_M = 252.0
 """Height of what is laid out at a time, a whole number of voxels at every level: a stray point costs no tower."""
@@ -107,5 +107,5 @@ def _voxels_of(points_map: F64, level: Level) -> Voxels:
     window = Window(np.full(shape, -1, dtype=np.int32), lowest, level.voxel_m)
     voxels, n, touched = entered(points_map, window, room_for_voxels(1024), 0)
     for rows in touched:
-        refresh(voxels, rows, level.voxel_m, level.floor_m, MIN_POINTS)
+        refreshed(voxels, rows, level)
     return Voxels(voxels.place[:n].copy(), voxels.sums[:n].copy(), voxels.cells[:n].copy())

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from mapvote.core.types import F32, F64, I64, Drive, Registration, check_array
 from mapvote.core.voxels import thin
-from mapvote.localisation.ndt_kernels import likelihoods, mean_likelihood, room_for
-from mapvote.localisation.ndt_solver import Certainty, Place, align
+from mapvote.localisation.ndt_kernels import likelihoods, near_in, room_for
+from mapvote.localisation.ndt_solver import Certainty, Place, align, room_to_work
 from mapvote.localisation.ndt_voxels import Voxels, Window, enter_points, join_voxels, refresh, reindex
 
 
@@ -65,6 +65,7 @@ class NdtGrid:
         self.level = level
         self.reach = np.array([half, half, BELOW_M])
         self.window = Window(np.empty(shape, dtype=np.int32), np.zeros(3, dtype=np.int64), size)  # recentred next
+        self.near = near_in(self.window)
         self.n = 0
         self._voxels, self._stale = room_for_voxels(1024), list[I64]()
 
@@ -73,7 +74,7 @@ class NdtGrid:
         """With the distributions of all that was entered, worked out when they are asked for: of a map that grows the
         coarse levels hardly ever are."""
         for rows in self._stale:
-            refresh(self._voxels, rows, self.level.voxel_m, self.level.floor_m, MIN_POINTS)
+            refreshed(self._voxels, rows, self.level)
         self._stale.clear()
         return self._voxels
 
@@ -99,7 +100,15 @@ class NdtGrid:
             more = room_for_voxels(room - self.n)
             self._voxels = Voxels(*(np.concatenate([a[: self.n], b]) for a, b in zip(self._voxels, more, strict=True)))
         for part in others:
-            self.n = join_voxels(part, self.window, self._voxels, self.n, self.level.floor_m, MIN_POINTS)
+            shared = np.empty(len(part.place), dtype=np.int64)
+            self.n, n_shared = join_voxels(part, self.window, self._voxels, self.n, shared)
+            refreshed(self._voxels, shared[:n_shared], self.level)
+
+
+def refreshed(voxels: Voxels, rows: I64, level: Level) -> None:
+    """The distributions of ``rows`` (m,), in place, from their sums."""
+    scratch = np.empty((2, 3, 3))
+    refresh(voxels, rows, level.voxel_m, level.floor_m, MIN_POINTS, scratch[0], scratch[1])
 
 
 def entered(points_map: F64, window: Window, voxels: Voxels, n: int) -> tuple[Voxels, int, list[I64]]:
@@ -109,8 +118,9 @@ def entered(points_map: F64, window: Window, voxels: Voxels, n: int) -> tuple[Vo
     while len(left):
         if n == len(voxels.place):
             voxels = Voxels(*(np.concatenate([a, np.zeros_like(a)]) for a in voxels))
-        n, looked_at, touched = enter_points(left, window, voxels, n)
-        stale.append(touched)
+        touched = np.empty(len(left), dtype=np.int64)
+        n, looked_at, n_touched = enter_points(left, window, voxels, n, touched)
+        stale.append(touched[:n_touched].copy())
         left = left[looked_at:]
     return voxels, n, stale
 
@@ -232,15 +242,15 @@ def refine(
 ) -> Registration:
     """:func:`register` for a scan already thinned by :func:`thin_for_levels`; ``settled``: see SETTLED."""
     T = np.array(T_map_lidar_guess, dtype=np.float64)
-    iterations = 0
+    iterations, covariance, work = 0, np.empty((6, 6)), room_to_work()
     last = len(ndt_map.levels) - 1
     for i in range(first_level, last + 1):
         grid = ndt_map.levels[i]
         tolerance = max(0.001, settled[i == last] * grid.level.floor_m)
-        where = Place(grid.window, grid.voxels.cells, grid.level.iterations, tolerance)
+        where = Place(grid.window, grid.near, grid.voxels.cells, grid.level.iterations, tolerance)
         known = _known(prior if i == last else None)
         pairs = room_for(clouds[i].shape[1])
-        covariance, score, inlier_share, more, converged = align(clouds[i], T, where, known, pairs)
+        score, inlier_share, more, converged = align(clouds[i], T, where, known, pairs, work, covariance)
         iterations += more
     return Registration(T, covariance, score, inlier_share, iterations, converged)
 
@@ -254,13 +264,12 @@ def _known(prior: PosePrior | None) -> Certainty:
 
 def fitness(ndt_map: NdtMap, clouds: list[F32], T_map_lidar: F64, level: int = 0) -> float:
     """Mean likelihood of the scan at a pose, in [0, 1], at one level: to rank guesses before any is refined."""
-    grid = ndt_map.levels[level]
-    likelihood: float = mean_likelihood(clouds[level], T_map_lidar, grid.window, grid.voxels.cells)
-    return likelihood
+    return float(fitnesses(ndt_map, clouds[level], T_map_lidar[None], level)[0])
 
 
 def fitnesses(ndt_map: NdtMap, cloud: F32, T_map_lidar: F64, level: int = 0) -> F64:
     """(m,) :func:`fitness` of a cloud (3, n) at many poses (m, 4, 4)."""
     grid = ndt_map.levels[level]
-    out: F64 = likelihoods(cloud, np.ascontiguousarray(T_map_lidar), grid.window, grid.voxels.cells)
+    out = np.empty(len(T_map_lidar))
+    likelihoods(cloud, np.ascontiguousarray(T_map_lidar), grid.window, grid.near, grid.voxels.cells, out)
     return out

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
+from mapvote.core.kernel import inlined, kernel
 from mapvote.core.types import F32, F64, I32, I64
 from mapvote.localisation.ndt_voxels import Vector, Window, holds, voxel_of
 
@@ -21,9 +22,9 @@ CUTOFF_E = 25.0
 """Beyond this a voxel's pull on a point, exp(-e / 2), is nothing."""
 _BLOCK = 1024
 """Points whose sums are taken in float32 before they are added up in float64."""
-_TOGETHER = 64
+TOGETHER = 64
 """Points that are paired together."""
-_MEAN, _PRECISION, _ROWS = 0, 3, 9
+_ROWS = 9
 
 
 class Pairs(NamedTuple):
@@ -38,21 +39,31 @@ class Pairs(NamedTuple):
     """(3,) map metres: near the sensor, so that float32 suffices."""
 
 
+class Near(NamedTuple):
+    """How the voxels near one are found."""
+
+    flat: I32
+    """The window's rows, flat."""
+    offset: I64
+    """(7,) ways there to a voxel and the six beside it."""
+
+
+def near_in(window: Window) -> Near:
+    """Of a window, as it is and will be when it is moved."""
+    strides = np.array([window.rows.shape[1] * window.rows.shape[2], window.rows.shape[2], 1])
+    return Near(window.rows.reshape(-1), SEVEN @ strides)
+
+
 def room_for(n: int) -> Pairs:
     """Room for the pairs of n points."""
     return Pairs(np.empty((7, _ROWS, n), dtype=np.float32), np.empty((3, n), dtype=np.int32), np.zeros(3))
 
 
-@numba.njit(inline="always")
-def _neighbour(j: int) -> tuple[int, int, int]:
-    """Way to the j-th of seven voxels: the point's own and the six beside it (DIRECT7). Unrolled by the compiler."""
-    dx = (1 if j == 1 else 0) - (1 if j == 2 else 0)
-    dy = (1 if j == 3 else 0) - (1 if j == 4 else 0)
-    dz = (1 if j == 5 else 0) - (1 if j == 6 else 0)
-    return dx, dy, dz
+SEVEN = np.array([(0, 0, 0), (1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1)])
+"""(7, 3) ways to a point's own voxel and the six beside it (DIRECT7)."""
 
 
-@numba.njit(inline="always")
+@inlined
 def _in_map(points: F32, T: F64, i: int) -> Vector:
     """Point i in map metres."""
     x, y, z = np.float64(points[0, i]), np.float64(points[1, i]), np.float64(points[2, i])
@@ -63,57 +74,47 @@ def _in_map(points: F32, T: F64, i: int) -> Vector:
     )
 
 
-@numba.njit(cache=True, nogil=True)
-def _moved(points: F32, T: F64, window: Window, home: I32, of: range, moved: I64) -> int:
-    """Which points of a block lie in another voxel than their ``home``, which is set: into ``moved``, returns how
-    many."""
-    lowest, size = window.lowest, window.size
-    count = 0
-    for i in range(of.start, of.stop):
-        x, y, z = _in_map(points, T, i)
-        ax, ay, az = voxel_of(size, x, y, z)
-        ix, iy, iz = ax - lowest[0], ay - lowest[1], az - lowest[2]
-        moved[count] = i
-        count += 1 if (ix != home[0, i]) | (iy != home[1, i]) | (iz != home[2, i]) else 0
-        home[0, i], home[1, i], home[2, i] = ix, iy, iz
-    return count
-
-
-@numba.njit(cache=True, nogil=True)
-def pair_up(points: F32, T: F64, window: Window, cells: F64, pairs: Pairs) -> None:
+@kernel
+def pair_up(
+    points: F32, T: F64, window: Window, near: Near, cells: F64, pairs: Pairs, moved: I64, partner: I32
+) -> None:  # fmt: skip
     """Pair those of the points (3, n) that lie in another voxel at pose T (4, 4) than when they were last paired.
 
     Block by block: who has moved, where their partners are, what these say. No step waits for the memory of the one
     before, nor guesses whether there is a partner: where there is none, the first voxel's numbers are masked.
+    ``moved`` (TOGETHER,), ``partner`` (7, TOGETHER): scratch.
     """
     rows, lowest, size = window
+    flat, offset = near
     of, home, origin = pairs
-    flat, strides = rows.ravel(), (rows.shape[1] * rows.shape[2], rows.shape[2])
-    low = lowest[0] * size - origin[0], lowest[1] * size - origin[1], lowest[2] * size - origin[2]
-    moved, partner = np.empty(_TOGETHER, np.int64), np.empty((7, _TOGETHER), np.int32)
-    for first in range(0, points.shape[1], _TOGETHER):
-        m = _moved(points, T, window, home, range(first, min(first + _TOGETHER, points.shape[1])), moved)
+    stride = rows.shape[1] * rows.shape[2]
+    for first in range(0, points.shape[1], TOGETHER):
+        m = 0
+        for i in range(first, min(first + TOGETHER, points.shape[1])):
+            x, y, z = _in_map(points, T, i)
+            ax, ay, az = voxel_of(size, x, y, z)
+            ix, iy, iz = ax - lowest[0], ay - lowest[1], az - lowest[2]
+            moved[m] = i
+            m += 1 if (ix != home[0, i]) | (iy != home[1, i]) | (iz != home[2, i]) else 0
+            home[0, i], home[1, i], home[2, i] = ix, iy, iz
         for w in range(m):
             ix, iy, iz = np.int64(home[0, moved[w]]), np.int64(home[1, moved[w]]), np.int64(home[2, moved[w]])
             inside = holds(rows, ix, iy, iz, 1)
-            at = ix * strides[0] + iy * strides[1] + iz if inside else strides[0] + strides[1] + 1
+            at = ix * stride + iy * rows.shape[2] + iz if inside else stride + rows.shape[2] + 1
             for j in range(7):
-                dx, dy, dz = _neighbour(j)
-                k = flat[np.uint64(at + dx * strides[0] + dy * strides[1] + dz)]
-                partner[j, w] = k if inside else np.int32(-1)
+                partner[j, w] = flat[np.uint64(at + offset[j])] if inside else np.int32(-1)
         for j in range(7):
-            dx, dy, dz = _neighbour(j)
             for w in range(m):
                 i, k = moved[w], np.uint64(max(partner[j, w], np.int32(0)))
                 there = np.float32(1.0) if partner[j, w] >= 0 else np.float32(0.0)
-                of[j, _MEAN, i] = there * np.float32((home[0, i] + dx + 0.5) * size + low[0] + cells[k, 0])
-                of[j, _MEAN + 1, i] = there * np.float32((home[1, i] + dy + 0.5) * size + low[1] + cells[k, 1])
-                of[j, _MEAN + 2, i] = there * np.float32((home[2, i] + dz + 0.5) * size + low[2] + cells[k, 2])
-                for c in range(6):
-                    of[j, _PRECISION + c, i] = there * np.float32(cells[k, 3 + c])
+                for c in range(3):
+                    low = lowest[c] * size - origin[c]
+                    of[j, c, i] = there * np.float32((home[c, i] + SEVEN[j, c] + 0.5) * size + low + cells[k, c])
+                for c in range(3, 9):
+                    of[j, c, i] = there * np.float32(cells[k, c])
 
 
-@numba.njit(inline="always")
+@inlined
 def _likelihood(e: np.float32) -> np.float32:
     """exp(-e / 2) for e from 0 to CUTOFF_E, 0 beyond: Taylor's series at a 32nd of it, squared five times. Within
     2e-4 of itself where it is least, 1e-6 where it matters; without a call, so that loops over pairs vectorise."""
@@ -204,12 +205,14 @@ def _sum_block(points: F32, of: F32, first: int, last: int, R: F32, d: F32, sums
         sums[k] += value
 
 
-@numba.njit(cache=True, nogil=True)
-def linearise(points: F32, pairs: Pairs, T: F64, H: F64, M: F64, g: F64) -> tuple[float, float]:
+@inlined
+def linearise(
+    points: F32, pairs: Pairs, T: F64, H: F64, M: F64, g: F64, sums: F64, R: F32, d: F32
+) -> tuple[float, float]:  # fmt: skip
     """The reweighted least squares of points (3, n) at pose T, for pairs made there: fills H (6, 6), the scatter M
-    (6, 6) of the points' own gradients, and g (6, 1). Returns (mean likelihood, share of inliers)."""
-    sums = np.zeros(50)
-    R, d = np.empty((3, 3), np.float32), np.empty(3, np.float32)
+    (6, 6) of the points' own gradients, and g (6, 1). Returns (mean likelihood, share of inliers). ``sums`` (50,),
+    R (3, 3), d (3,): scratch."""
+    sums[:] = 0.0
     for r in range(3):
         d[r] = T[r, 3] - pairs.origin[r]
         for c in range(3):
@@ -227,42 +230,33 @@ def linearise(points: F32, pairs: Pairs, T: F64, H: F64, M: F64, g: F64) -> tupl
     return sums[48] / max(1, n), sums[49] / max(1, n)
 
 
-@numba.njit(inline="always")
-def _misfit(cells: F64, k: int, ux: float, uy: float, uz: float) -> float:
-    """e = u C u of a point at u from the mean of voxel k, C its precision: the squared Mahalanobis distance."""
-    vx = cells[k, 3] * ux + 2.0 * (cells[k, 4] * uy + cells[k, 5] * uz)
-    vy = cells[k, 6] * uy + 2.0 * cells[k, 7] * uz
-    return vx * ux + vy * uy + cells[k, 8] * uz * uz
-
-
-@numba.njit(cache=True, nogil=True)
-def mean_likelihood(points: F32, T: F64, window: Window, cells: F64) -> float:
-    """Of points (3, n) at pose T (4, 4), in [0, 1]: what :func:`linearise` says, for a single look without pairs."""
+@kernel
+def likelihoods(points: F32, T: F64, window: Window, near: Near, cells: F64, out: F64) -> None:
+    """Into ``out`` (m,) the mean likelihood, in [0, 1], of points (3, n) at each of the poses T (m, 4, 4): what
+    :func:`linearise` says, for a single look without pairs."""
     rows, lowest, size = window
-    total = 0.0
-    for i in range(points.shape[1]):
-        x, y, z = _in_map(points, T, i)
-        ax, ay, az = voxel_of(size, x, y, z)
-        ix, iy, iz = ax - lowest[0], ay - lowest[1], az - lowest[2]
-        if not holds(rows, ix, iy, iz, 1):
-            continue
-        x, y, z = x - (ax + 0.5) * size, y - (ay + 0.5) * size, z - (az + 0.5) * size
-        nearest = CUTOFF_E + 1.0
-        for j in range(7):
-            dx, dy, dz = _neighbour(j)
-            k = rows[ix + dx, iy + dy, iz + dz]
-            if k < 0 or cells[k, 3] + cells[k, 6] + cells[k, 8] == 0.0:
+    flat, offset = near
+    stride = rows.shape[1] * rows.shape[2]
+    for pose in range(len(T)):
+        total = 0.0
+        for i in range(points.shape[1]):
+            x, y, z = _in_map(points, T[pose], i)
+            ax, ay, az = voxel_of(size, x, y, z)
+            ix, iy, iz = ax - lowest[0], ay - lowest[1], az - lowest[2]
+            if not holds(rows, ix, iy, iz, 1):
                 continue
-            ux, uy, uz = x - dx * size - cells[k, 0], y - dy * size - cells[k, 1], z - dz * size - cells[k, 2]
-            nearest = min(nearest, _misfit(cells, k, ux, uy, uz))
-        total += np.float64(_likelihood(np.float32(nearest)))
-    return total / max(1, points.shape[1])
-
-
-@numba.njit(cache=True, nogil=True)
-def likelihoods(points: F32, T: F64, window: Window, cells: F64) -> F64:
-    """(m,) :func:`mean_likelihood` at each of many poses T (m, 4, 4)."""
-    out = np.empty(len(T))
-    for k in range(len(T)):
-        out[k] = mean_likelihood(points, T[k], window, cells)
-    return out
+            x, y, z = x - (ax + 0.5) * size, y - (ay + 0.5) * size, z - (az + 0.5) * size
+            nearest, at = CUTOFF_E + 1.0, ix * stride + iy * rows.shape[2] + iz
+            for j in range(7):
+                k = flat[at + offset[j]]
+                if k < 0 or cells[k, 3] + cells[k, 6] + cells[k, 8] == 0.0:
+                    continue
+                ux = x - SEVEN[j, 0] * size - cells[k, 0]
+                uy = y - SEVEN[j, 1] * size - cells[k, 1]
+                uz = z - SEVEN[j, 2] * size - cells[k, 2]
+                # e = u C u, C the precision: the squared Mahalanobis distance.
+                vx = cells[k, 3] * ux + 2.0 * (cells[k, 4] * uy + cells[k, 5] * uz)
+                vy = cells[k, 6] * uy + 2.0 * cells[k, 7] * uz
+                nearest = min(nearest, vx * ux + vy * uy + cells[k, 8] * uz * uz)
+            total += np.float64(_likelihood(np.float32(nearest)))
+        out[pose] = total / max(1, points.shape[1])

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numba
 import numpy as np
 
+from mapvote.core.kernel import inlined, kernel
 from mapvote.core.types import F64, I32, I64
 
 FLATNESS = 0.08
@@ -44,7 +44,7 @@ class Voxels(NamedTuple):
     """(m, 9) mean from the voxel's centre, and the precision as a :data:`Symmetric`; zero without a distribution."""
 
 
-@numba.njit(cache=True, nogil=True)
+@inlined
 def _diagonalise(A: F64, V: F64) -> None:
     """Jacobi's method on the upper triangle of a symmetric (3, 3) A, in place; the columns of V are eigenvectors."""
     for r in range(3):
@@ -74,7 +74,7 @@ def _diagonalise(A: F64, V: F64) -> None:
                 V[k, q] = s * vp + c * vq
 
 
-@numba.njit(cache=True, nogil=True)
+@inlined
 def _order(A: F64, V: F64) -> None:
     """Eigenvalues (diagonal of A) and eigenvectors (columns of V) in ascending order."""
     for p, q in ((0, 1), (1, 2), (0, 1)):
@@ -84,7 +84,7 @@ def _order(A: F64, V: F64) -> None:
                 V[k, p], V[k, q] = V[k, q], V[k, p]
 
 
-@numba.njit(cache=True, nogil=True)
+@inlined
 def _upright(V: F64) -> None:
     """The first column becomes the upward direction across the last one."""
     x, y, z = V[0, 2], V[1, 2], V[2, 2]
@@ -92,20 +92,20 @@ def _upright(V: F64) -> None:
     V[0, 0], V[1, 0], V[2, 0] = -x * z / length, -y * z / length, (1.0 - z * z) / length
 
 
-@numba.njit(inline="always")
+@inlined
 def voxel_of(size: float, x: float, y: float, z: float) -> tuple[np.int64, np.int64, np.int64]:
     """World voxel of a point, map metres."""
     return np.int64(np.floor(x / size)), np.int64(np.floor(y / size)), np.int64(np.floor(z / size))
 
 
-@numba.njit(inline="always")
+@inlined
 def holds(rows: I32, ix: np.int64, iy: np.int64, iz: np.int64, margin: int) -> bool:
     """Whether the window has this voxel (counted from its lowest), and ``margin`` more to all sides."""
     nx, ny, nz = rows.shape
     return margin <= ix < nx - margin and margin <= iy < ny - margin and margin <= iz < nz - margin
 
 
-@numba.njit(inline="always")
+@inlined
 def _add_moments(sums: F64, k: int, x: float, y: float, z: float) -> None:
     """One more point in voxel ``k``, from its centre: the sums behind Eqs. (6.2) and (6.3)."""
     sums[k, 0] += 1.0
@@ -120,7 +120,7 @@ def _add_moments(sums: F64, k: int, x: float, y: float, z: float) -> None:
     sums[k, 9] += z * z
 
 
-@numba.njit(inline="always")
+@inlined
 def _mean_and_covariance(sums: F64, k: int, A: F64) -> Vector:
     """Eqs. (6.2) and (6.3), divided by the count: the mean is returned, the upper triangle of A is the covariance."""
     m = sums[k, 0]
@@ -130,7 +130,7 @@ def _mean_and_covariance(sums: F64, k: int, A: F64) -> Vector:
     return mx, my, mz
 
 
-@numba.njit(inline="always")
+@inlined
 def _flatten(A: F64, V: F64, thin: float) -> None:
     """A flat patch knows its height only. One ring on the road is a line, thin to all sides: taken at face value it
     would hold the next scan's rings where the last ones were. ``thin``: variances below it are none; A is diagonal."""
@@ -139,7 +139,7 @@ def _flatten(A: F64, V: F64, thin: float) -> None:
     A[1, 1] = A[2, 2] = np.inf
 
 
-@numba.njit(inline="always")
+@inlined
 def _set_precision(cells: F64, k: int, A: F64, V: F64, floor_variance: float, even: float) -> None:
     """The inverse covariance of voxel ``k`` from eigenvalues (diagonal of A) and eigenvectors (columns of V).
 
@@ -159,12 +159,13 @@ def _set_precision(cells: F64, k: int, A: F64, V: F64, floor_variance: float, ev
         cells[k, 8] += b * V[2, d] * V[2, d]
 
 
-@numba.njit(cache=True, nogil=True)
-def refresh(voxels: Voxels, touched: I64, size: float, floor_m: float, min_points: int) -> None:
+@kernel
+def refresh(
+    voxels: Voxels, touched: I64, size: float, floor_m: float, min_points: int, A: F64, V: F64
+) -> None:  # fmt: skip
     """The distributions of the rows ``touched`` (m,), from their sums. A distribution needs ``min_points``, and is
-    widened by ``floor_m`` to all sides; ``size``: side of a voxel, metres."""
+    widened by ``floor_m`` to all sides; ``size``: side of a voxel, metres; A, V (3, 3): scratch."""
     sums = voxels.sums
-    A, V = np.empty((3, 3)), np.empty((3, 3))
     thin, floor_variance = (FLATNESS * size) * (FLATNESS * size), floor_m * floor_m
     for k in touched:
         sums[k, 10] = 0.0
@@ -183,17 +184,16 @@ def refresh(voxels: Voxels, touched: I64, size: float, floor_m: float, min_point
         _set_precision(voxels.cells, k, A, V, floor_variance, 1.0 / (even_variance + floor_variance))
 
 
-@numba.njit(cache=True, nogil=True)
-def enter_points(points: F64, window: Window, voxels: Voxels, n: int) -> tuple[int, int, I64]:
+@kernel
+def enter_points(points: F64, window: Window, voxels: Voxels, n: int, touched: I64) -> tuple[int, int, int]:
     """Enter points (n, 3) in map metres into the sums of their voxels.
 
-    Returns (the new number of rows, how many points were looked at, the rows (k,) to :func:`refresh` that were not
-    before): fewer points than all where ``voxels`` has no row left, so that rows are made for voxels and not for
-    points. Points outside ``window`` are left out.
+    Returns (the new number of rows, how many points were looked at, how many rows to :func:`refresh` are new in
+    ``touched`` (n,)): fewer points than all where ``voxels`` has no row left, so that rows are made for voxels and not
+    for points. Points outside ``window`` are left out.
     """
     rows, lowest, size = window
     sums = voxels.sums
-    touched = np.empty(len(points), dtype=np.int64)
     n_touched, looked_at = 0, len(points)
     for i in range(len(points)):
         ax, ay, az = voxel_of(size, points[i, 0], points[i, 1], points[i, 2])
@@ -217,17 +217,17 @@ def enter_points(points: F64, window: Window, voxels: Voxels, n: int) -> tuple[i
             n_touched += 1
         x, y, z = points[i, 0] - (ax + 0.5) * size, points[i, 1] - (ay + 0.5) * size, points[i, 2] - (az + 0.5) * size
         _add_moments(sums, k, x, y, z)
-    return n, looked_at, touched[:n_touched].copy()
+    return n, looked_at, n_touched
 
 
-@numba.njit(cache=True, nogil=True)
-def join_voxels(others: Voxels, window: Window, voxels: Voxels, n: int, floor_m: float, min_points: int) -> int:
-    """Add the voxels of points that are not in ``voxels`` yet, and refresh the distributions of those that both have.
+@kernel
+def join_voxels(others: Voxels, window: Window, voxels: Voxels, n: int, shared: I64) -> tuple[int, int]:
+    """Add the voxels (m,) of points that are not in ``voxels`` yet. ``voxels`` must have a row left for each.
 
-    ``voxels`` must have a row left for each. Returns the new number of rows. What lies outside ``window`` is left out.
+    Returns (the new number of rows, how many of ``shared`` (m,) are filled): rows that both have, to :func:`refresh`.
+    What lies outside ``window`` is left out.
     """
-    rows, lowest, size = window
-    shared = np.empty(len(others.place), dtype=np.int64)
+    rows, lowest, _ = window
     n_shared = 0
     for j in range(len(others.place)):
         ix, iy, iz = others.place[j, 0] - lowest[0], others.place[j, 1] - lowest[1], others.place[j, 2] - lowest[2]
@@ -248,11 +248,10 @@ def join_voxels(others: Voxels, window: Window, voxels: Voxels, n: int, floor_m:
         for c in range(9):
             voxels.cells[n, c] = others.cells[j, c]
         n += 1
-    refresh(voxels, shared[:n_shared], size, floor_m, min_points)
-    return n
+    return n, n_shared
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def reindex(window: Window, place: I64, n: int) -> None:
     """Find the first ``n`` voxels, whose world voxels are ``place`` (m, 3), in a window that has moved."""
     rows, lowest, _ = window

@@ -10,12 +10,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 
 from mapvote.core.geometry import from_xyz_rpy
-from mapvote.core.types import F64, I32, I64, Bool
-from mapvote.localisation.ndt import SETTLED, NdtMap, fitness, fitnesses, in_rows, refine
+from mapvote.core.types import F64, Bool
+from mapvote.localisation.ndt import SETTLED, NdtGrid, NdtMap, fitness, fitnesses, in_rows, refine
 
 MIN_FIT = 0.6
 """Of what the map leads to expect, from which a pose may be voted with; benchmarks/trust.py shows the fits of right
@@ -109,19 +108,10 @@ class Judge:
         """(mean likelihood that the standing points should have, share of them where the map has been)."""
         coarse, fine = ndt_map.levels[0], ndt_map.levels[-1]
         points = standing @ T[:3, :3].T + T[:3, 3]
-        known = _is_near_map(points, coarse.window.lowest, coarse.level.voxel_m, coarse.window.rows)
+        known = _is_near_map(points, coarse)
         if not known.any():
             return 1.0, 0.0
-        each = _self_likelihood(
-            points,
-            fine.window.lowest,
-            fine.level.voxel_m,
-            fine.window.rows,
-            fine.voxels.cells,
-            fine.voxels.sums,
-            self.range_sigma_m,
-        )
-        mapped = each[each >= 0.0]
+        mapped = _self_likelihood(points, fine, self.range_sigma_m)
         usual = float(mapped.mean()) if len(mapped) else 1.0
         return max(usual * float(known.mean()), 1e-6), float(known.mean())
 
@@ -153,88 +143,61 @@ def stands_above_ground(points_lidar: F64, T_map_lidar: F64) -> Bool:
     return height_above_lowest(points_lidar @ T_map_lidar[:3, :3].T) > _ABOVE_M
 
 
-@numba.njit(cache=True, nogil=True)
 def height_above_lowest(points: F64) -> F64:
     """(n,) height of each point (n, 3) above the lowest one within 3 to 6 m of it; -inf beyond 120 m."""
     half = 40
+    cols, rows = np.floor(points[:, :2].T / _CELL_M).astype(np.int64) + half + 1
+    here = np.flatnonzero((rows > 0) & (rows <= 2 * half) & (cols > 0) & (cols <= 2 * half))
+    rows, cols, z = rows[here], cols[here], points[here, 2]
     low = np.full((2 * half + 2, 2 * half + 2), np.inf)
+    np.minimum.at(low, (rows, cols), z)
     out = np.full(len(points), -np.inf)
-    for i in range(len(points)):
-        r = np.int64(np.floor(points[i, 1] / _CELL_M)) + half + 1
-        c = np.int64(np.floor(points[i, 0] / _CELL_M)) + half + 1
-        if 0 < r <= 2 * half and 0 < c <= 2 * half:
-            low[r, c] = min(low[r, c], points[i, 2])
-    for i in range(len(points)):
-        r = np.int64(np.floor(points[i, 1] / _CELL_M)) + half + 1
-        c = np.int64(np.floor(points[i, 0] / _CELL_M)) + half + 1
-        if 0 < r <= 2 * half and 0 < c <= 2 * half:
-            lowest = low[r, c]
-            for near in range(9):
-                lowest = min(lowest, low[r - 1 + near // 3, c - 1 + near % 3])
-            out[i] = points[i, 2] - lowest
+    out[here] = z - np.min([low[rows + i, cols + j] for i in (-1, 0, 1) for j in (-1, 0, 1)], axis=0)
     return out
 
 
-@numba.njit(cache=True, nogil=True)
-def _is_near_map(points: F64, lowest: I64, size: float, index: I32) -> Bool:
+_BESIDE = np.array([(0, 0, 0), (-1, 0, 0), (1, 0, 0), (0, -1, 0), (0, 1, 0), (0, 0, -1), (0, 0, 1)])
+
+
+def _is_near_map(points: F64, grid: NdtGrid) -> Bool:
     """(n,) whether the point's voxel, or one beside it, holds anything."""
+    rows = grid.window.rows
+    at = np.floor(points / grid.window.size).astype(np.int64) - grid.window.lowest
+    here = np.flatnonzero(((at >= 1) & (at < np.array(rows.shape) - 1)).all(axis=1))
     out = np.zeros(len(points), dtype=np.bool_)
-    nx, ny, nz = index.shape
-    for i in range(len(points)):
-        ix = np.int64(np.floor(points[i, 0] / size)) - lowest[0]
-        iy = np.int64(np.floor(points[i, 1] / size)) - lowest[1]
-        iz = np.int64(np.floor(points[i, 2] / size)) - lowest[2]
-        if 1 <= ix < nx - 1 and 1 <= iy < ny - 1 and 1 <= iz < nz - 1:
-            out[i] = (
-                index[ix, iy, iz] >= 0
-                or index[ix - 1, iy, iz] >= 0
-                or index[ix + 1, iy, iz] >= 0
-                or index[ix, iy - 1, iz] >= 0
-                or index[ix, iy + 1, iz] >= 0
-                or index[ix, iy, iz - 1] >= 0
-                or index[ix, iy, iz + 1] >= 0
-            )
+    beside = at[here, None] + _BESIDE
+    out[here] = (rows[beside[..., 0], beside[..., 1], beside[..., 2]] >= 0).any(axis=1)
     return out
 
 
-@numba.njit(cache=True, nogil=True)
-def _self_likelihood(points: F64, lowest: I64, size: float, index: I32, cells: F64, sums: F64, noise_m: float) -> F64:
-    """(n,) expected likelihood of a point drawn, with the sensor's noise, from its voxel's own distribution.
+def _self_likelihood(points: F64, grid: NdtGrid, noise_m: float) -> F64:
+    """Expected likelihood of each point (n, 3) drawn, with the sensor's noise, from its voxel's own distribution; (k,)
+    of those whose voxel has one.
 
-    For u ~ N(0, S) and precision C: E exp(-u'Cu / 2) = det(I + S C)^-1/2. -1 where the voxel has no distribution.
+    For u ~ N(0, S) and precision C: E exp(-u'Cu / 2) = det(I + S C)^-1/2.
     """
-    out = np.full(len(points), -1.0)
-    nx, ny, nz = index.shape
-    S, C, A = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
-    for i in range(len(points)):
-        ix = np.int64(np.floor(points[i, 0] / size)) - lowest[0]
-        iy = np.int64(np.floor(points[i, 1] / size)) - lowest[1]
-        iz = np.int64(np.floor(points[i, 2] / size)) - lowest[2]
-        if not (0 <= ix < nx and 0 <= iy < ny and 0 <= iz < nz):
-            continue
-        k = index[ix, iy, iz]
-        if k < 0 or cells[k, 3] + cells[k, 6] + cells[k, 8] == 0.0:
-            continue
-        m = sums[k, 0]
-        a, b, c = cells[k, 0], cells[k, 1], cells[k, 2]
-        S[0, 0], S[0, 1], S[0, 2] = sums[k, 4] / m - a * a, sums[k, 5] / m - a * b, sums[k, 6] / m - a * c
-        S[1, 1], S[1, 2], S[2, 2] = sums[k, 7] / m - b * b, sums[k, 8] / m - b * c, sums[k, 9] / m - c * c
-        S[1, 0], S[2, 0], S[2, 1] = S[0, 1], S[0, 2], S[1, 2]
-        for d in range(3):
-            S[d, d] += noise_m * noise_m
-        C[0, 0], C[0, 1], C[0, 2] = cells[k, 3], cells[k, 4], cells[k, 5]
-        C[1, 0], C[1, 1], C[1, 2] = cells[k, 4], cells[k, 6], cells[k, 7]
-        C[2, 0], C[2, 1], C[2, 2] = cells[k, 5], cells[k, 7], cells[k, 8]
-        for r in range(3):
-            for s in range(3):
-                A[r, s] = (1.0 if r == s else 0.0) + S[r, 0] * C[0, s] + S[r, 1] * C[1, s] + S[r, 2] * C[2, s]
-        out[i] = 1.0 / np.sqrt(max(_determinant(A), 1.0))
-    return out
+    rows = grid.window.rows
+    at = np.floor(points / grid.window.size).astype(np.int64) - grid.window.lowest
+    at = at[((at >= 0) & (at < rows.shape)).all(axis=1)]
+    k = rows[at[:, 0], at[:, 1], at[:, 2]]
+    k = k[k >= 0]
+    cells = grid.voxels.cells[k]
+    k, cells = (kept[cells[:, 3] + cells[:, 6] + cells[:, 8] != 0.0] for kept in (k, cells))
+    sums = grid.voxels.sums[k]
+    m, (a, b, c) = sums[:, 0], cells[:, :3].T
+    moments = sums[:, 4:10].T / m - np.stack([a * a, a * b, a * c, b * b, b * c, c * c])
+    moments[[0, 3, 5]] += noise_m * noise_m
+    S, C = _symmetric(moments), _symmetric(cells[:, 3:9].T)
+    A = [[(r == s) + S[r][0] * C[0][s] + S[r][1] * C[1][s] + S[r][2] * C[2][s] for s in range(3)] for r in range(3)]
+    determinant = (
+        A[0][0] * (A[1][1] * A[2][2] - A[1][2] * A[2][1])
+        - A[0][1] * (A[1][0] * A[2][2] - A[1][2] * A[2][0])
+        + A[0][2] * (A[1][0] * A[2][1] - A[1][1] * A[2][0])
+    )
+    return np.asarray(1.0 / np.sqrt(np.maximum(determinant, 1.0)))
 
 
-@numba.njit(cache=True, nogil=True)
-def _determinant(A: F64) -> float:
-    """Of (3, 3), along its first row."""
-    first = A[0, 0] * (A[1, 1] * A[2, 2] - A[1, 2] * A[2, 1])
-    second = A[0, 1] * (A[1, 0] * A[2, 2] - A[1, 2] * A[2, 0])
-    return first - second + A[0, 2] * (A[1, 0] * A[2, 1] - A[1, 1] * A[2, 0])
+def _symmetric(upper: F64) -> list[list[F64]]:
+    """(3, 3) of numbers (n,) from the upper triangle (6, n)."""
+    xx, xy, xz, yy, yz, zz = upper
+    return [[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]

@@ -6,19 +6,18 @@ points are drops once the scan is thinned to a point a voxel, and every right po
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from mapvote.core.geometry import inverse, log
+from mapvote.core.kernel import kernel
 from mapvote.core.types import F32, F64, I64, Scan
 from mapvote.core.voxels import slot_of, thin, voxel_key
 from mapvote.localisation.ndt import LEVELS, in_rows, thinned
 
 
-@numba.njit(cache=True, nogil=True)
-def _deskew(points: F32, time_s: F32, v: F32, w: F32) -> F32:
-    out = np.empty_like(points)
+@kernel
+def _deskew(points: F32, time_s: F32, v: F32, w: F32, out: F32) -> None:
     half = np.float32(0.5)
     for i in range(np.uint64(0), np.uint64(len(points))):  # unsigned: an index that cannot be negative vectorises
         t, x, y, z = time_s[i], points[i, 0], points[i, 1], points[i, 2]
@@ -28,7 +27,6 @@ def _deskew(points: F32, time_s: F32, v: F32, w: F32) -> F32:
         out[i, 0] = x + t * ux + h * (w[1] * uz - w[2] * uy)
         out[i, 1] = y + t * uy + h * (w[2] * ux - w[0] * uz)
         out[i, 2] = z + t * uz + h * (w[0] * uy - w[1] * ux)
-    return out
 
 
 def deskew(scan: Scan, twist: F64) -> F32:
@@ -43,7 +41,9 @@ def deskewed(points: F32, time_s: F32 | None, twist: F64) -> F32:
     """:func:`deskew` of points (n, 3) measured at ``time_s`` (n,) from the stamp."""
     if time_s is None:
         return points
-    return _deskew(points, time_s, twist[:3].astype(np.float32), twist[3:].astype(np.float32))
+    out, (v, w) = np.empty_like(points), twist.astype(np.float32).reshape(2, 3)
+    _deskew(points, time_s, v, w, out)
+    return out
 
 
 def twist_between(T_map_lidar_0: F64, T_map_lidar_1: F64, seconds: float) -> F64:
@@ -82,21 +82,20 @@ def solid_sample(points_lidar: NDArray[np.floating], size: float) -> F64:
     range2 = (few**2).sum(axis=1)
     rays = -(-len(points_lidar) // every)
     expected = rays / _SOLID_ANGLE * _VOXEL_M**2 / np.maximum(range2, _VOXEL_M**2)
-    hits = _hits_around(np.ascontiguousarray(points_lidar), every, few)
+    table = np.zeros((2, max(1024, 1 << (4 * len(few) - 1).bit_length())), dtype=np.int64)
+    hits = np.empty(len(few), dtype=np.int64)
+    _hits_around(np.ascontiguousarray(points_lidar, dtype=np.float32), every, few, table[0], table[1], hits)
     return few[(range2 > _REACH_M**2) | (hits > _SHARE * expected)]
 
 
-@numba.njit(cache=True, nogil=True)
-def _hits_around(points: NDArray[np.floating], every: int, few: F64) -> I64:
-    """(m,) how many of every ``every``-th of ``points`` (n, 3) end in the voxel of each of ``few``.
+@kernel
+def _hits_around(points: F32, every: int, few: F64, keys: I64, counts: I64, at: I64) -> None:
+    """Into ``at`` (m,) how many of every ``every``-th of ``points`` (n, 3) end in the voxel of each of ``few``.
 
-    The table holds these voxels alone, and at most a quarter of it: rays that end elsewhere leave it as it is.
+    The table (``keys``, ``counts``; zeros) holds these voxels alone, and at most a quarter of it: rays that end
+    elsewhere leave it as it is.
     """
-    size = 1024
-    while size < 4 * len(few):
-        size *= 2
-    keys, counts, far2 = np.zeros(size, np.int64), np.zeros(size, np.int64), (_REACH_M + 2.0 * _VOXEL_M) ** 2
-    at = np.empty(len(few), np.int64)
+    far2 = (_REACH_M + 2.0 * _VOXEL_M) ** 2
     for i in range(len(few)):
         key = voxel_key(few[i, 0], few[i, 1], few[i, 2], _VOXEL_M)
         at[i] = slot_of(key, keys)
@@ -107,10 +106,8 @@ def _hits_around(points: NDArray[np.floating], every: int, few: F64) -> I64:
         key = voxel_key(points[i, 0], points[i, 1], points[i, 2], _VOXEL_M)
         slot = slot_of(key, keys)
         counts[slot] += 1 if keys[slot] == key else 0
-    out = np.empty(len(few), dtype=np.int64)
     for i in range(len(few)):
-        out[i] = counts[at[i]]
-    return out
+        at[i] = counts[at[i]]
 
 
 class Sample:

@@ -10,12 +10,12 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from mapvote.core.geometry import turn
 from mapvote.core.grid import CELL_SIZE
+from mapvote.core.kernel import inlined, kernel
 from mapvote.core.types import F32, F64, I32, U64
 
 U32 = NDArray[np.uint32]
@@ -61,16 +61,21 @@ class Fans(NamedTuple):
     """(FANS, 2) mean direction of all rays, of length 1; 0 without any."""
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
 def follow_rays(rows: F32, clearance: float) -> Rays:
-    """The rays that end ``rows`` (3, n) metres from the sensor, and prove nothing from ``clearance`` before that on.
+    """The rays that end ``rows`` (3, n) metres from the sensor, and prove nothing from ``clearance`` before that on."""
+    n = rows.shape[1]
+    reach, x, y, slope, stop = np.empty((5, n), np.float32)
+    rays = Rays(reach, x, y, slope, stop, np.empty(n, np.int32))
+    _follow(rows, clearance, rays)
+    return rays
 
-    Without a branch, in float32 alone and by an index that cannot be negative, so that it vectorises.
-    """
+
+@kernel
+def _follow(rows: F32, clearance: float, rays: Rays) -> None:
+    """Without a branch, in float32 alone and by an index that cannot be negative, so that it vectorises."""
     across, along, up = rows[0], rows[1], rows[2]
+    reach, x, y, slope, stop, fan = rays
     n = len(across)
-    reach, slope, stop = np.empty(n, np.float32), np.empty(n, np.float32), np.empty(n, np.float32)
-    x, y, fan = np.empty(n, np.float32), np.empty(n, np.float32), np.empty(n, np.int32)
     clear, layer = np.float32(clearance), np.float32(CELL_SIZE)
     for i in range(np.uint64(0), np.uint64(n)):
         dx, dy, dz = across[i], along[i], up[i]
@@ -79,7 +84,6 @@ def follow_rays(rows: F32, clearance: float) -> Rays:
         slope[i] = dz / (layer * h)
         stop[i] = h - clear * h / np.sqrt(h * h + dz * dz)
         fan[i] = min(np.int32(turn(dx, dy) * np.float32(FANS)), np.int32(FANS - 1))
-    return Rays(reach, x, y, slope, stop, fan)
 
 
 def _marks_from() -> F32:
@@ -94,11 +98,20 @@ _TOO_SHORT = (_MARKS_FROM - 1.5 * CELL_SIZE).astype(np.float32)
 """A ray that ends before this comes to no cell that its fan marks: a cell is 1.42 sides across."""
 
 
-@numba.njit(cache=True, nogil=True)
 def gather_rays(rays: Rays) -> Fans:
     """Sort rays into fans. What lies in the sensor's own cell proves nothing."""
+    room = len(rays.reach) + FANS
+    first, last = np.zeros(FANS, np.int32), np.empty(FANS, np.int32)
+    slope, stop, end = np.empty(room, np.float32), np.empty(room, np.float32), np.zeros(FANS, np.float32)
+    fans = Fans(first, last, slope, stop, end, np.zeros((FANS, 2)))
+    _gather(rays, fans)
+    return fans
+
+
+@kernel
+def _gather(rays: Rays, fans: Fans) -> None:
     n, own = np.uint64(len(rays.reach)), np.float32(CELL_SIZE)
-    first, direction = np.zeros(FANS, np.int32), np.zeros((FANS, 2))
+    first, last, slope, stop, end, direction = fans
     for i in range(n):
         fan = np.uint64(rays.fan[i])
         if rays.reach[i] >= own:
@@ -107,13 +120,11 @@ def gather_rays(rays: Rays) -> Fans:
             first[fan] += 1 if rays.stop[i] > _TOO_SHORT[fan] else 0
     room = 0
     for f in range(FANS):
-        room, first[f] = room + first[f] + 1, room
+        room, first[f], last[f] = room + first[f] + 1, room, room
         norm = np.sqrt(direction[f, 0] ** 2 + direction[f, 1] ** 2)
         if norm > 0.0:
             direction[f, 0] /= norm
             direction[f, 1] /= norm
-    slope, stop, end = np.empty(room, np.float32), np.empty(room, np.float32), np.zeros(FANS, np.float32)
-    last = first.copy()
     for i in range(n):  # what is not kept is written over, so that nothing hangs on a guess
         fan, e = np.uint64(rays.fan[i]), rays.stop[i]
         keep = (rays.reach[i] >= own) & (e > _TOO_SHORT[fan])
@@ -121,7 +132,6 @@ def gather_rays(rays: Rays) -> Fans:
         slope[k], stop[k] = rays.slope[i], e
         last[fan] += 1 if keep else 0
         end[fan] = max(end[fan], e if keep else np.float32(0.0))
-    return Fans(first, last, slope, stop, end, direction)
 
 
 class Way(NamedTuple):
@@ -140,7 +150,7 @@ class Way(NamedTuple):
     width_c: float
 
 
-@numba.njit(cache=True, nogil=True)
+@inlined
 def set_out(x: float, y: float, dx: float, dy: float, at: float) -> Way:
     """The way from (x, y), in cells, in direction (dx, dy), where it has come ``at`` metres."""
     far, along = 1e18, 1e-9  # what runs along an axis never comes to the next row or column
@@ -167,24 +177,22 @@ class Crossed(NamedTuple):
     """... and of the upper."""
 
 
-@numba.njit(cache=True, nogil=True)
 def _room_for(cells: int) -> Crossed:
     room = cells + _LANES
     low, high = np.zeros(room, np.uint32), np.zeros(room, np.uint32)
     return Crossed(np.zeros(room, np.int32), np.zeros(room + 1, np.float32), np.zeros(room, np.int32), low, high)
 
 
-@numba.njit(inline="always")
+@inlined
 def _cross_cells(way: Way, ahead: tuple[int, int], end: float, base: I32, layer: int, out: Crossed) -> int:
     """Fill ``out`` with the cells of a way that steps ``ahead`` rows and columns, up to ``end`` metres or the window's
     edge. Returns how many there are. Which way a step goes is chosen, not branched to: nobody can guess it."""
     rows, cols = base.shape
     r, c, t, next_r, next_c, width_r, width_c = way
-    flat = base.ravel()
     n = 0
     while 0 <= r < rows and 0 <= c < cols and t < end:
         k = np.uint64(r * cols + c)
-        out.cell[n], out.entered[n], out.bottom[n] = k, t, flat[k] - layer
+        out.cell[n], out.entered[n], out.bottom[n] = k, t, base[r, c] - layer
         n += 1
         t = min(next_c, next_r)
         column = next_c < next_r
@@ -197,7 +205,7 @@ def _cross_cells(way: Way, ahead: tuple[int, int], end: float, base: I32, layer:
     return n
 
 
-@numba.njit(inline="always")
+@inlined
 def _pass(
     slope: np.float32, stop: np.float32, height: np.float32, up: int, n: int, crossed: Crossed, words: U32
 ) -> None:
@@ -220,7 +228,7 @@ def _pass(
         b += np.uint64(_LANES)
 
 
-@numba.njit(inline="always")
+@inlined
 def _enter(crossed: Crossed, n: int, passed: U64) -> None:
     """What a fan passed into the plane (flat), and the words empty again. Bit 63, all above, is never passed."""
     for j in range(n):
@@ -230,14 +238,18 @@ def _enter(crossed: Crossed, n: int, passed: U64) -> None:
         crossed.low[j] = crossed.high[j] = 0
 
 
-@numba.njit(cache=True, nogil=True)
 def mark_passed(fans: Fans, origin: F64, corner: tuple[float, float], base: I32, passed: U64) -> None:
     """Take every fan from where it marks to the end of its rays, and enter what they pass into ``passed`` (flat)."""
-    rows, cols = base.shape
+    _mark_passed(fans, origin, corner, base, passed, _room_for(sum(base.shape) + 1))
+
+
+@kernel
+def _mark_passed(
+    fans: Fans, origin: F64, corner: tuple[float, float], base: I32, passed: U64, crossed: Crossed
+) -> None:
     layer = int(np.floor(origin[2] / CELL_SIZE))
     height = np.float32(origin[2] / CELL_SIZE - layer)
     x, y = (origin[0] - corner[0]) / CELL_SIZE, (origin[1] - corner[1]) / CELL_SIZE
-    crossed = _room_for(rows + cols + 1)
     for f in range(FANS):
         if fans.end[f] <= _MARKS_FROM[f]:
             continue
@@ -249,7 +261,8 @@ def mark_passed(fans: Fans, origin: F64, corner: tuple[float, float], base: I32,
             lowest = min(lowest, crossed.bottom[j])
         for k in range(fans.first[f], fans.last[f]):
             slope, stop = fans.slope[k], fans.stop[k]
-            _pass(slope, stop, height, 0, n, crossed, crossed.low)
-            if height + max(slope, np.float32(0.0)) * stop >= lowest + _HALF:
-                _pass(slope, stop, height, _HALF, n, crossed, crossed.high)
+            halves = 2 if height + max(slope, np.float32(0.0)) * stop >= lowest + _HALF else 1
+            for half in range(halves):
+                words = crossed.low if half == 0 else crossed.high
+                _pass(slope, stop, height, half * _HALF, n, crossed, words)
         _enter(crossed, n, passed)

@@ -31,8 +31,8 @@ from mapvote.core.geometry import rows_from
 from mapvote.core.grid import CELL_SIZE
 from mapvote.core.sensors import Sensor
 from mapvote.core.types import F64, I32, Bool
-from mapvote.perception.moving_kernels import cells_in_plane, decidable, moving_components, voxels
-from mapvote.perception.range_image import U16, Counts, Pixels, Samples, look, range_image
+from mapvote.perception.moving_kernels import moving_components, voxels
+from mapvote.perception.range_image import BOTH_SIDES, U16, Counts, Pixels, Samples, look, range_image, room_to_look
 
 # Set on the development streets of the simulator.
 REACH_M = 57.0
@@ -141,15 +141,20 @@ class MovingFilter:
         counts = Counts(np.zeros(m, np.int32), np.zeros(m, np.int32), np.zeros(m, np.uint8))
         x, y, z = rows_from(scan.samples, scan.origin_map)
         waiting = Samples(x, y, z, np.arange(m, dtype=np.int32))
+        scratch = room_to_look(m)
         for other in self._witnesses(at):
             sensor = (other.origin_map - scan.origin_map).astype(np.float32)
-            left = look(waiting, left, other.nearest, sensor, self._pixels, (MARGIN_M, HEIGHT_M, ENOUGH), counts)
-        seen, brief = decidable(counts, MIN_FREE, FREE_SHARE)
+            rule = MARGIN_M, HEIGHT_M, ENOUGH
+            left = look(waiting, left, other.nearest.reshape(-1), sensor, self._pixels, rule, counts, scratch)
+        free, total = counts.free, counts.free + counts.hit
+        brief = (counts.sides == BOTH_SIDES) & (free >= MIN_FREE) & (free >= FREE_SHARE * total)
         half = int(np.ceil(self.reach_m / CELL_SIZE)) + 2
         lowest = np.floor(scan.origin_map[:2] / CELL_SIZE).astype(np.int64) - half
-        rows, cols = cells_in_plane(scan.samples, lowest, CELL_SIZE)
-        share = SHARE_WHOLE, SHARE_PART
-        return moving_components(rows, cols, 2 * half + 1, seen, brief, MIN_VOXELS, *share, scan.voxel_of)
+        cols, rows = np.floor(scan.samples[:, :2].T / CELL_SIZE).astype(np.int64) - lowest[:, None]
+        side = 2 * half + 1
+        shares = SHARE_WHOLE, SHARE_PART
+        moves = moving_components(rows * side + cols, side, total >= MIN_FREE, brief, MIN_VOXELS, *shares)
+        return np.append(moves, False)[scan.voxel_of]  # -1: no voxel
 
     def _witnesses(self, at: int) -> list[_Scan]:
         """Up to ``looks`` other scans spread evenly over the time before, and over the time after, scan ``at``.

@@ -9,13 +9,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from enum import IntEnum
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from mapvote.core.columns import GROUND_MARGIN_M, column_bit, height_above
 from mapvote.core.geometry import rows_from
 from mapvote.core.grid import CELL_SIZE, Grid
+from mapvote.core.kernel import kernel
 from mapvote.core.types import F32, F64, I32, U8, U64, Bool, Reference
 from mapvote.perception.fans import Rays, follow_rays, gather_rays, mark_passed
 from mapvote.perception.sight import mark_sight
@@ -52,7 +52,7 @@ class ScanView:
     """:class:`Sight` of the cell; (0, 0) where nobody asked for it."""
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _obstacles(
     points: F64, ground_z: F32, base: I32, lattice: tuple[float, float], corner: tuple[int, int],
     cell: I32, obstacle: NDArray[np.bool_],
@@ -83,7 +83,7 @@ def find_obstacles(points_map: F64, reference: Reference) -> tuple[Bool, I32]:
     return obstacle, cell
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _enter_hits(points: F64, cell: I32, keep: NDArray[np.bool_], base: I32, counts: I32, hit: U64) -> None:
     """Stationary obstacle points into counts and hit words (flat planes, in place)."""
     for i in range(len(points)):
@@ -121,9 +121,10 @@ def cast_rays(
     base = np.ascontiguousarray(reference.base)
     _enter_hits(points_map, cell, obstacle & ~moving, base.ravel(), counts.ravel(), hit.ravel())
     rays = follow_rays(rows_from(points_map, origin_map), CLEARANCE_M)
-    mark_passed(gather_rays(rays), origin_map, (grid.x0, grid.y0), base, passed.ravel())
+    fans = gather_rays(rays)
+    mark_passed(fans, origin_map, (grid.x0, grid.y0), base, passed.ravel())
     if sky is not None:
         mark_passed(gather_rays(sky(rays)), origin_map, (grid.x0, grid.y0), base, passed.ravel())
     if with_sight:
-        mark_sight(rays, obstacle, gather_rays(rays), origin_map, (grid.x0, grid.y0), sight)
+        mark_sight(rays, obstacle, fans, origin_map, (grid.x0, grid.y0), sight)
     return ScanView(grid, counts, hit, passed, sight)

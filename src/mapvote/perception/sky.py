@@ -8,12 +8,12 @@ Above a house that was pulled down, and where one was built, hardly any other ra
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
 from mapvote.core.grid import CELL_SIZE
+from mapvote.core.kernel import kernel
 from mapvote.core.sensors import Sensor
-from mapvote.core.types import F32, F64
+from mapvote.core.types import F32, F64, I32
 from mapvote.perception.fans import FANS, Rays
 
 SECTORS = 256
@@ -26,11 +26,11 @@ _EVERY = 2
 """Of the fans every second one: at 40 m they are .25 m apart."""
 
 
-@numba.njit(cache=True, nogil=True)
-def _highest(rays: Rays, lean: F64, least: float) -> F32:
-    """(SECTORS,) the steepest slope of a return in each, from the sensor's own plane; infinite where too few came."""
+@kernel
+def _highest(rays: Rays, lean: F64, least: float, top: F32, count: I32) -> None:
+    """Into ``top`` (SECTORS,), from -inf, the steepest slope of a return in each, from the sensor's own plane; infinite
+    where too few came. ``count`` (SECTORS,): scratch of zeros."""
     wide = FANS // SECTORS
-    top, count = np.full(SECTORS, -np.inf, np.float32), np.zeros(SECTORS, np.int32)
     for i in range(np.uint64(0), np.uint64(len(rays.reach))):
         sector = np.uint64(rays.fan[i] // wide)
         slope = rays.slope[i] * np.float32(CELL_SIZE) + np.float32(rays.x[i] * lean[0] + rays.y[i] * lean[1])
@@ -39,30 +39,28 @@ def _highest(rays: Rays, lean: F64, least: float) -> F32:
     for s in range(SECTORS):
         if count[s] < least:
             top[s] = np.inf
-    return top
 
 
-@numba.njit(cache=True, nogil=True)
+_FAN = np.arange(0, FANS, _EVERY, dtype=np.int32)
+_AZIMUTH = (_FAN + 0.5) * 2.0 * np.pi / FANS
+_X, _Y = np.cos(_AZIMUTH).astype(np.float32), np.sin(_AZIMUTH).astype(np.float32)
+
+
 def _into_sky(rays: Rays, slopes: F32, lean: F64, least: float) -> Rays:
-    top, wide, beams = _highest(rays, lean, least), FANS // SECTORS, len(slopes)
-    above = np.empty(SECTORS, np.int32)
-    room = 0
-    for s in range(SECTORS):
-        most = max(top[s], max(top[s - 1], top[(s + 1) % SECTORS]))
-        above[s] = min(np.searchsorted(slopes, most, side="right") + 1, beams)  # the next one may have grazed it
-        room += (beams - above[s]) * wide // _EVERY
-    x, y, slope = np.empty(room, np.float32), np.empty(room, np.float32), np.empty(room, np.float32)
-    fan = np.empty(room, np.int32)
-    k = 0
-    for s in range(SECTORS):
-        for f in range(s * wide, (s + 1) * wide, _EVERY):
-            azimuth = (f + 0.5) * 2.0 * np.pi / FANS
-            for b in range(above[s], beams):
-                x[k], y[k], fan[k] = np.cos(azimuth), np.sin(azimuth), f
-                slope[k] = (slopes[b] - x[k] * lean[0] - y[k] * lean[1]) / CELL_SIZE
-                k += 1
+    """Rays of the beams, of ascending ``slopes`` (beams,), that lie above all returns of their sector and its
+    neighbours."""
+    top = np.full(SECTORS, -np.inf, np.float32)
+    _highest(rays, lean, least, top, np.zeros(SECTORS, np.int32))
+    most = np.maximum(top, np.maximum(np.roll(top, 1), np.roll(top, -1)))
+    above = np.minimum(np.searchsorted(slopes, most, side="right") + 1, len(slopes))  # the next one may have grazed it
+    above = above[_FAN // (FANS // SECTORS)]
+    some = len(slopes) - above
+    of, room = np.repeat(np.arange(len(_FAN)), some), int(some.sum())
+    beam = np.arange(room) - np.repeat(np.cumsum(some) - some - above, some)
+    x, y = _X[of], _Y[of]
+    slope = ((slopes[beam] - x * lean[0] - y * lean[1]) / CELL_SIZE).astype(np.float32)
     far = np.full(room, np.float32(SKY_M))
-    return Rays(far, x, y, slope, far, fan)
+    return Rays(far, x, y, slope, far, _FAN[of])
 
 
 class Sky:

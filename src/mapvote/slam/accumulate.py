@@ -13,13 +13,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 
-import numba
 import numpy as np
 
 from mapvote.config import Settings
-from mapvote.core.columns import TOP_BIT, column_bits, shifted
+from mapvote.core.columns import TOP_BIT, column_bits, rebased
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, tile_of_cells
 from mapvote.core.heights import heights_over_ground
+from mapvote.core.kernel import allocating
 from mapvote.core.point_map import PointMap, map_from_points
 from mapvote.core.reference import LocalMap
 from mapvote.core.tile import Tile
@@ -112,7 +112,7 @@ class Layer:
         before = self.draft.tile(after.index).base
         free = free_words(self.evidence.tiles[after.index], np.zeros(after.window.shape, dtype=np.uint64))
         after = replace(after)  # what it works out for this alone goes with it
-        out = _rebased(free, before, after.base) & ~after.obstacle_words
+        out = rebased(free, before - after.base) & ~after.obstacle_words
         out[np.isnan(after.ground_z)] = 0
         return out
 
@@ -137,7 +137,7 @@ def _left_out(scan: PlacedScan, moving: Bool, reach_m: float) -> Bool:
     )
 
 
-@numba.njit(cache=True, nogil=True)
+@allocating
 def _no_map(
     points: F64, origin: F64, reach_squared: float, moving: Bool, obstacle: Bool, cell: I32, ground_z: F32
 ) -> Bool:
@@ -160,7 +160,7 @@ def _no_map(
     return out
 
 
-@numba.njit(cache=True, nogil=True)
+@allocating
 def _counts_of(planes: U64, rows: I64, cols: I64, bits: I64) -> I64:
     """(n, 3) of voxels (row, col, bit) of a tile: in how many scans hit, passed and crossed; 0 outside columns."""
     out = np.zeros((len(bits), 3), dtype=np.int64)
@@ -169,13 +169,4 @@ def _counts_of(planes: U64, rows: I64, cols: I64, bits: I64) -> I64:
             cell = planes[rows[i], cols[i]]
             out[i, 0], out[i, 1] = count_of(cell, HIT, bits[i]), count_of(cell, PASSES, bits[i])
             out[i, 2] = times_crossed(cell, bits[i])
-    return out
-
-
-@numba.njit(cache=True, nogil=True)
-def _rebased(words: U64, before: I32, after: I32) -> U64:
-    out = np.empty_like(words)
-    for r in range(words.shape[0]):
-        for c in range(words.shape[1]):
-            out[r, c] = shifted(words[r, c], before[r, c] - after[r, c])
     return out

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from mapvote.config import Settings
-from mapvote.core.geometry import exp, from_origin, inverse, transform
+from mapvote.core.geometry import exp, inverse, transform
 from mapvote.core.grid import Lattice
 from mapvote.core.types import F64, Bool, Drive, MapvoteError, Scan
 from mapvote.core.voxels import VoxelCloud, thin
@@ -158,7 +158,7 @@ class Surveyor:
     def _enter(self, fix: Fix, drive: Drive, i: int) -> None:
         T_map_lidar = fix.registration.T_map_lidar
         points_map, position = transform(T_map_lidar, fix.points), T_map_lidar[:3, 3]
-        spread = points_map.take(thin(from_origin(points_map, position), _POINTS_M), axis=0)
+        spread = points_map.take(thin(points_map - position, _POINTS_M), axis=0)
         self._map_around(position).enter(spread)
         if not self._all_precise:
             if self.fine_map is None:

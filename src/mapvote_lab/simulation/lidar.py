@@ -9,11 +9,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 
+from mapvote.core.kernel import allocating
 from mapvote.core.sensors import Sensor
 from mapvote.core.types import F32, F64, I32, Bool
 
@@ -47,7 +47,7 @@ class Caster:
         return (normals / (np.linalg.norm(normals, axis=1, keepdims=True) + 1e-12)).astype(np.float32)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@allocating
 def _told(far: F32, triangle: I32, normals: F32, directions: F32, owners: I32) -> tuple[F32, I32, F32]:
     """What :meth:`Caster.cast` says of rays that met a ``triangle`` each (n,), or -1."""
     n = len(far)

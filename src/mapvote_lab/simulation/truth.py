@@ -18,13 +18,13 @@ from collections.abc import Sequence
 from enum import IntEnum
 from pathlib import Path
 
-import numba
 import numpy as np
 from scipy.spatial import ConvexHull
 
 from mapvote.core.columns import GROUND_MARGIN_M
 from mapvote.core.geometry import from_xyz_rpy, inverse, transform
 from mapvote.core.grid import CELL_SIZE, Grid, Lattice
+from mapvote.core.kernel import kernel
 from mapvote.core.sensors import Sensor
 from mapvote.core.types import F32, F64, I32, U8, Bool
 from mapvote.core.voxels import voxel_downsample
@@ -90,7 +90,7 @@ def ground_cells(world: World, scenario: Scenario) -> F64:
     return world.terrain.height(street[:, 0].reshape(grid.shape), street[:, 1].reshape(grid.shape))
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def count_hits(points: F32, objects: I32, roles: I32, ground: F64, size: float, margin: float, counts: I32) -> None:
     """Add points (n, 3) in the grid's own frame to ``counts`` (roles, rows, cols) by the role of the object hit."""
     for i in range(len(points)):

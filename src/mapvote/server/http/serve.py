@@ -12,15 +12,13 @@ from collections.abc import Callable
 from pathlib import Path
 
 import msgspec
-import numpy as np
 import structlog
 import uvicorn
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
-from mapvote.codec.ballot import check_states
 from mapvote.config import Settings
 from mapvote.core.point_map import PointMap
-from mapvote.core.types import NO_VOTE, MapvoteError
+from mapvote.core.types import MapvoteError
 from mapvote.formats import read_map
 from mapvote.server.http.app import create_app
 from mapvote.server.http.connections import HEAD_BYTES, Patience, tracked, watched
@@ -120,12 +118,11 @@ def serve(
 
 
 def settle() -> None:
-    """Load what the first ballot needs, and exempt all loaded objects from garbage collection.
+    """Exempt all loaded objects from garbage collection.
 
     A collection stops every thread while it visits all objects, for a quarter of a second on a busy machine; nearly all
     of them are the libraries'.
     """
-    check_states(np.full(1, NO_VOTE, dtype=np.uint8))
     gc.collect()
     gc.freeze()
 

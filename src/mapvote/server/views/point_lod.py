@@ -14,10 +14,10 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
-import numba
 import numpy as np
 
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Lattice, TileIndex
+from mapvote.core.kernel import allocating
 from mapvote.core.rows import found_among
 from mapvote.core.tile import Tile, in_bytes
 from mapvote.core.types import F32, F64, I64, N_STATES, NO_VOTE, U8, U16, CellState, MapvoteError
@@ -114,7 +114,7 @@ def cloud_bytes(packed: U16, z0_m: float, z_step_m: float) -> bytes:
     return head.tobytes() + np.ascontiguousarray(packed, dtype="<u2").tobytes()
 
 
-@numba.njit(cache=True, nogil=True)
+@allocating
 def _levels(points: F32, low: float, sizes: F64, sides: I64, layers: I64) -> U8:
     """(n,) level of each point: the coarsest in whose voxel no point came before.
 
@@ -138,7 +138,7 @@ def _levels(points: F32, low: float, sizes: F64, sides: I64, layers: I64) -> U8:
     return out
 
 
-@numba.njit(cache=True, nogil=True)
+@allocating
 def _pack(points: F32, ground_z: F32, elsewhere: float, z0: float, step: float) -> U16:
     """(n, 4), see :class:`Levels`. ``elsewhere``: the ground where a cell knows none."""
     out = np.empty((len(points), 4), dtype=np.uint16)

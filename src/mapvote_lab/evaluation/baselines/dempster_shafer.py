@@ -11,10 +11,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import numba
 import numpy as np
 
 from mapvote.core.grid import CELL_SIZE
+from mapvote.core.kernel import kernel
 from mapvote.core.types import F32, F64, I32, NO_VOTE, U8, U16, U64, Bool, CellState, Reference
 
 LAYERS = 64
@@ -28,7 +28,7 @@ CONFLICT = 0.5
 """Change where the mass of "map and vehicles contradict each other" exceeds this."""
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _march(
     points: F64, origin: F64, hits_count: Bool, base: I32, x0: float, y0: float, reach: float,
     hits: U16, passes: U16, touched: I32,
@@ -92,7 +92,7 @@ def _march(
     return n_touched
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def dempster(o1: float, f1: float, o2: float, f2: float) -> tuple[float, float]:
     """Dempster's rule for two bodies of evidence on {occupied, free}: masses (occupied, free) of the combination.
 
@@ -111,7 +111,7 @@ def dempster(o1: float, f1: float, o2: float, f2: float) -> tuple[float, float]:
     return o, f
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _absorb(hits: U16, passes: U16, touched: I32, n: int, occupied: F32, free: F32) -> None:
     """One scan's counts into a vehicle's masses; the counts are cleared again."""
     for i in range(n):
@@ -121,7 +121,7 @@ def _absorb(hits: U16, passes: U16, touched: I32, n: int, occupied: F32, free: F
         hits[v], passes[v] = 0, 0
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _combine(occupied: F32, free: F32, other_occupied: F32, other_free: F32) -> None:
     """Another vehicle's masses into these, voxel by voxel, in place."""
     for v in range(len(occupied)):
@@ -129,7 +129,7 @@ def _combine(occupied: F32, free: F32, other_occupied: F32, other_free: F32) -> 
             occupied[v], free[v] = dempster(occupied[v], free[v], other_occupied[v], other_free[v])
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _cells(map_words: U64, occupied: F32, free: F32, states: U8) -> None:
     """Voxels to the cell states on which everything here is scored."""
     rows, cols = map_words.shape

@@ -9,12 +9,12 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from dataclasses import dataclass
 from pathlib import Path
 
-import numba
 import numpy as np
 
 from mapvote.codec.arrays import pack_plane, unpack_bytes
 from mapvote.config import PaperSettings, Settings, VotingSettings
 from mapvote.core.grid import CELL_SIZE, Grid
+from mapvote.core.kernel import kernel
 from mapvote.core.sensors import Sensor
 from mapvote.core.types import I32, N_STATES, NO_VOTE, U8, U16, Bool
 from mapvote.core.voting import decide, one_hot, to_wire
@@ -97,7 +97,7 @@ Rule = tuple[VotingSettings, PaperSettings]
 """By which a vehicle counts."""
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _cast(
     words: U16, row0: int, col0: int, margin: int, mapped: Bool, states: U8, weights: I32, no_vote: int, tally: I32
 ) -> None:
