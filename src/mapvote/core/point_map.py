@@ -153,9 +153,11 @@ _OPEN = 0.2
 
 def has_open_ground(point_map: PointMap) -> bool:
     """Whether a fifth of the cells that hold points hold ground and nothing that stands on it. Of a map whose ground
-    was cut out, the feet of walls are taken for ground, but hardly anything else is."""
+    was cut out, the feet of walls are taken for ground, but hardly anything else is. Of a map larger than memory the
+    largest tiles tell."""
     ground, any_point = 0, 0
-    for tile in point_map.tiles.values():
+    tiles = point_map.tiles
+    for tile in map(tiles.__getitem__, tiles.largest(9) if isinstance(tiles, LazyTiles) else tiles):
         held, stands = (np.zeros(tile.window.rows * tile.window.cols, dtype=np.bool_) for _ in range(2))
         held[tile.cells] = True
         stands[tile.cells[tile.columns[1]]] = True
