@@ -12,6 +12,7 @@ import numpy as np
 
 from mapvote.codec.arrays import compress, unpack_bytes
 from mapvote.core.grid import CELL_SIZE, CELLS, TILE_CELLS
+from mapvote.core.kernel import allocating
 from mapvote.core.types import F32, U8, MapvoteError
 
 MAX_POINTS_PER_CELL = 64
@@ -45,38 +46,67 @@ def unpack_sound_points(data: bytes) -> F32:
     raw = np.frombuffer(unpack_bytes(data, _MAX_BYTES, "ballot: new_points"), dtype=np.uint8)
     if len(raw) % _BYTES:
         raise MapvoteError(f"ballot: new_points has {len(raw)} bytes, which is no number of points")
-    planes = raw.reshape(_BYTES, -1)
-    points, side = _placed(planes), np.float32(TILE_CELLS * CELL_SIZE)
-    inside = (points[:, :2] >= 0).all() and (points[:, :2] < side).all() and (np.abs(points[:, 2]) <= _TOP_M).all()
-    if not inside or (planes[6:] >= _STEPS).any():
+    points = np.empty((len(raw) // _BYTES, 3), dtype=np.float32)
+    sound = _placed(raw.reshape(_BYTES, -1), points)
+    if not sound or not _all_inside(points, np.float32(TILE_CELLS * CELL_SIZE)):
         raise MapvoteError("ballot: new_points holds a point outside its tile or not finite")
     return points
 
 
+@allocating
 def _planes(points: F32) -> U8:
     """(9, m) of points (m, 3): differences modulo 2 ** 16 and 2 ** 32, lowest byte first, and steps in a voxel."""
-    place = points.T.astype(np.float64) / CELL_SIZE
-    voxel = np.floor(place).astype(np.int64)
-    voxel[:2] = np.clip(voxel[:2], 0, TILE_CELLS - 1)
-    cells, layers = np.diff(voxel[1] * TILE_CELLS + voxel[0], prepend=0), np.diff(voxel[2], prepend=0)
     planes = np.empty((_BYTES, len(points)), dtype=np.uint8)
-    for k, steps in enumerate((cells, cells >> 8, layers, layers >> 8, layers >> 16, layers >> 24)):
-        planes[k] = steps & 0xFF
-    planes[6:] = np.clip(((place - voxel) * _STEPS).astype(np.int64), 0, _STEPS - 1)
+    last_cell, last_layer = np.int64(0), np.int64(0)
+    voxel = np.empty(3, dtype=np.int64)
+    for i in range(len(points)):
+        for axis in range(3):
+            place = np.float64(points[i, axis]) / CELL_SIZE
+            voxel[axis] = int(np.floor(place))
+            if axis < 2:
+                voxel[axis] = min(max(voxel[axis], 0), TILE_CELLS - 1)
+            planes[6 + axis, i] = min(max(int((place - voxel[axis]) * _STEPS), 0), _STEPS - 1)
+        cell = voxel[1] * TILE_CELLS + voxel[0]
+        for k in range(2):
+            planes[k, i] = ((cell - last_cell) >> (8 * k)) & 0xFF
+        for k in range(4):
+            planes[2 + k, i] = ((voxel[2] - last_layer) >> (8 * k)) & 0xFF
+        last_cell, last_layer = cell, voxel[2]
     return planes
 
 
-def _placed(planes: U8) -> F32:
-    """(m, 3) the points of (9, m) bytes, see :func:`_planes`."""
-    ways = planes[:6].astype(np.int64)
-    cell = np.cumsum(ways[0] + (ways[1] << 8)) & (CELLS - 1)
-    layer = np.cumsum(ways[2] + (ways[3] << 8) + (ways[4] << 16) + (ways[5] << 24))
-    layer = ((layer + (1 << 31)) & 0xFFFFFFFF) - (1 << 31)
-    voxel = np.stack([cell % TILE_CELLS, cell // TILE_CELLS, layer])
-    return np.ascontiguousarray(((voxel + (planes[6:] + 0.5) / _STEPS) * CELL_SIZE).T, dtype=np.float32)
+@allocating
+def _placed(planes: U8, points: F32) -> bool:
+    """Fill ``points`` (m, 3) from (9, m); whether each lies in its voxel."""
+    cell, layer, sound = np.int64(0), np.int64(0), True
+    for i in range(len(points)):
+        cell = (cell + np.int64(planes[0, i]) + (np.int64(planes[1, i]) << 8)) & (CELLS - 1)
+        way = np.int64(0)
+        for k in range(4):
+            way |= np.int64(planes[2 + k, i]) << (8 * k)
+        layer = ((layer + way + (1 << 31)) & 0xFFFFFFFF) - (1 << 31)
+        for axis, voxel in enumerate((cell % TILE_CELLS, cell // TILE_CELLS, layer)):
+            points[i, axis] = (voxel + (planes[6 + axis, i] + 0.5) / _STEPS) * CELL_SIZE
+            sound &= planes[6 + axis, i] < _STEPS
+    return sound
 
 
+@allocating
+def _all_inside(points: F32, side: np.float32) -> bool:
+    """Whether all points (m, 3) are finite and within a tile; NaN fails every comparison."""
+    sound = True
+    for x, y, z in points:
+        sound &= 0 <= x < side and 0 <= y < side and abs(z) <= _TOP_M
+    return sound
+
+
+@allocating
 def most_in_a_cell(points: F32) -> int:
     """The most of these points (m, 3), from the tile's corner and inside it, that lie in one cell."""
-    cols, rows = np.minimum((points[:, :2].T.astype(np.float64) / CELL_SIZE).astype(np.int64), TILE_CELLS - 1)
-    return int(np.bincount(rows * TILE_CELLS + cols, minlength=1).max())
+    counts = np.zeros(TILE_CELLS * TILE_CELLS, dtype=np.uint16)  # one that runs over has been counted as the most
+    most = 0
+    for x, y, _ in points:
+        cell = min(int(y / CELL_SIZE), TILE_CELLS - 1) * TILE_CELLS + min(int(x / CELL_SIZE), TILE_CELLS - 1)
+        counts[cell] += 1
+        most = max(most, counts[cell])
+    return most

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from mapvote.codec.arrays import compress, unpack_bytes
 from mapvote.core.grid import CELLS, TILE_CELLS
-from mapvote.core.types import U64, MapvoteError
+from mapvote.core.kernel import allocating
+from mapvote.core.types import U8, U64, MapvoteError
 
 _WAY, _WORD = 2, 8
 """Bytes of the way to a cell, and of its word."""
@@ -31,15 +32,25 @@ def unpack_sparse(data: bytes, what: str) -> tuple[NDArray[np.intp], U64]:
     """
     raw = np.frombuffer(unpack_bytes(data, CELLS * (_WAY + _WORD), f"ballot: {what}"), dtype=np.uint8)
     n, left = divmod(len(raw), _WAY + _WORD)
-    sound = left == 0
-    if sound:
-        way = raw[:n] + 256 * raw[n : 2 * n].astype(np.intp)
-        cells = np.cumsum(way)
-        words = np.ascontiguousarray(raw[_WAY * n :].reshape(_WORD, n).T).view("<u8").reshape(n)
-        sound = bool((way[1:] > 0).all() and words.all() and (n == 0 or cells[-1] < CELLS))
-    if not sound:
+    cells, words = np.empty(n, dtype=np.intp), np.empty(n, dtype=np.uint64)
+    if left or not _ascending(raw, cells, words):
         raise MapvoteError(f"ballot: {what} is damaged ({len(raw)} bytes); fetch or send it again")
     return cells, words
+
+
+@allocating
+def _ascending(raw: U8, cells: NDArray[np.intp], words: U64) -> bool:
+    """Fill ``cells`` and ``words`` (n,); whether cells ascend within the tile, and none is without a word."""
+    n, cell, sound = len(cells), np.int64(0), True
+    for i in range(n):
+        way = np.int64(raw[i]) | (np.int64(raw[n + i]) << 8)
+        cell += way
+        word = np.uint64(0)
+        for k in range(_WORD):
+            word |= np.uint64(raw[(_WAY + k) * n + i]) << np.uint64(8 * k)
+        cells[i], words[i] = cell, word
+        sound &= (way > 0 or i == 0) and word != 0
+    return bool(sound and cell < CELLS)
 
 
 def unpack_words(data: bytes, what: str) -> U64:
