@@ -10,7 +10,7 @@ from mapvote.config import VotingSettings
 from mapvote.core.grid import Grid, Lattice
 from mapvote.core.point_map import PointMap
 from mapvote.core.types import U64
-from mapvote.detection.evidence import HIT, PASSED, PASSES
+from mapvote.detection.evidence import CROSSED, HIT, PASSED, PASSES
 from mapvote.detection.packed_tiles import PackedTiles
 from mapvote.detection.surfaces import SurfaceVoter
 
@@ -57,13 +57,12 @@ def surfaces_after_a_drive(point_map: PointMap) -> SurfaceVoter:
     for tile in point_map.tiles:
         planes, mapped = voter.evidence.tiles.near(tile), point_map.tiles[tile].obstacle_words
         fate = rng.random(mapped.shape)
-        crossed = np.where(fate < 0.4, mapped, np.uint64(0))
+        planes[..., CROSSED : CROSSED + 3] = np.where(fate < 0.4, mapped, np.uint64(0))[..., None]
+        planes[..., CROSSED] |= np.where(fate > 0.8, mapped, np.uint64(0))
         planes[..., HIT] = np.where((fate > 0.4) & (fate < 0.6), mapped, np.uint64(0))
         rose = np.where(rng.random(mapped.shape) < 0.02, np.uint64(0b111110), np.uint64(0)) & ~mapped
         planes[..., HIT + 1] |= rose
-        beside = crossed | crossed << np.uint64(1) | crossed >> np.uint64(1)
-        planes[..., PASSES : PASSES + 3] = beside[..., None]
-        planes[..., PASSES] |= rose & np.uint64(0b110)
+        planes[..., PASSES] = rose & np.uint64(0b110)
         planes[..., PASSED] = ~rose
     return voter
 

@@ -15,6 +15,7 @@ from mapvote.core.point_map import PointMap
 from mapvote.core.reference import reference_window
 from mapvote.core.types import F64
 from mapvote.detection.evidence import (
+    CROSSED,
     HIT,
     PASSED,
     PASSES,
@@ -23,8 +24,8 @@ from mapvote.detection.evidence import (
     Evidence,
     count_of,
     free_words,
+    least_passed,
     near_hits,
-    times_crossed,
 )
 from mapvote.perception.frontend import Observation
 from mapvote.perception.raycast import ScanView
@@ -49,15 +50,18 @@ def seen_from(point_map: PointMap, points: F64, seed: int) -> Observation:
     return seen
 
 
-def told_of(seen: Observation, r: int, c: int, bit: int) -> tuple[bool, bool, bool]:
-    """(hit, passes, passed) of one voxel, by the words of detection/evidence.py."""
+def told_of(seen: Observation, r: int, c: int, bit: int) -> tuple[bool, bool, bool, bool]:
+    """(crossed, hit, passes, passed) of one voxel, by the words of detection/evidence.py."""
 
-    def has(plane: np.ndarray) -> bool:
-        return bool(int(plane[r, c]) >> bit & 1)
+    def has(plane: np.ndarray, k: int = bit) -> bool:
+        return bool(int(plane[r, c]) >> k & 1)
 
     passed, (near, apart) = seen.view.passed, near_hits(seen)
+    above = bit + 1 >= TOP_BIT or has(passed, bit + 1)
+    below = bit <= 1 or has(passed, bit - 1)
+    crossed = has(passed) and above and below and not has(near)
     hit = has(near) if has(seen.reference.occupied) else has(apart)
-    return hit, has(passed) and not has(near), has(passed)
+    return crossed, hit, has(passed) and not has(near), has(passed)
 
 
 @given(
@@ -74,7 +78,7 @@ def test_a_voxel_counts_what_one_scan_tells_of_it(offsets: list[tuple[float, flo
         for c in COLS:
             cell = evidence.tiles[0, 0][r, c]
             for bit in range(1, TOP_BIT):
-                counted = [bool(count_of(cell, first, bit)) for first in (HIT, PASSES)]
+                counted = [bool(count_of(cell, first, bit)) for first in (CROSSED, HIT, PASSES)]
                 assert (*counted, bool(int(cell[PASSED]) >> bit & 1)) == told_of(seen, r, c, bit)
 
 
@@ -120,15 +124,17 @@ def cell_with(bit: int, passes: tuple[int, int, int]) -> np.ndarray:
 
 
 @given(st.integers(1, TOP_BIT - 1), st.tuples(*[st.integers(0, FULL)] * 3))
-def test_a_voxel_was_crossed_as_often_as_the_least_passed_of_three(bit: int, passes: tuple[int, int, int]) -> None:
+def test_rays_of_all_scans_together_cross_a_voxel_by_what_they_passed_least_of_three(
+    bit: int, passes: tuple[int, int, int]
+) -> None:
     below, own, above = passes
     asked = [own] + [below] * (bit > 1) + [above] * (bit + 1 < TOP_BIT)
-    assert times_crossed(cell_with(bit, passes), bit) == min(asked)
+    assert least_passed(cell_with(bit, passes), bit) == min(asked)
 
 
 def test_rays_that_only_graze_a_roof_never_cross_it_whatever_their_number() -> None:
-    assert times_crossed(cell_with(7, (0, FULL, FULL)), 7) == 0
-    assert times_crossed(cell_with(7, (FULL, FULL, 0)), 7) == 0
+    assert least_passed(cell_with(7, (0, FULL, FULL)), 7) == 0
+    assert least_passed(cell_with(7, (FULL, FULL, 0)), 7) == 0
 
 
 def test_free_is_what_two_scans_passed_none_hit_and_the_map_does_not_hold() -> None:

@@ -17,6 +17,7 @@ from mapvote.core.grid import CELL_SIZE, TILE_CELLS
 from mapvote.core.point_map import PointMap
 from mapvote.core.types import F64, I32, NO_VOTE, Bool, CellState
 from mapvote.detection.evidence import (
+    CROSSED,
     HIT,
     HIT_REACH_M,
     PASSES,
@@ -204,6 +205,19 @@ def test_a_kerb_stays_before_a_wall_that_was_pulled_down(off: int) -> None:
     assert [{int(states[cell]) for cell in cells} for cells in (WALL, kerb)] == [{CE}, {UN}]
 
 
+def test_a_roof_that_no_ray_could_reach_falls_with_the_wall_that_bore_it() -> None:
+    roof = [(ROW + k, c) for k in range(1, 5) for c in COLUMNS]
+    points = np.concatenate([wall(WALL, HEIGHTS), wall(roof, [4.65])])
+    ground = wall([(r, c) for r in range(85, 125) for c in range(85, 135)], [0.0])
+    point_map = make_map({(0, 0): make_tile(np.concatenate([points, ground]))})
+    voter = SurfaceVoter(VotingSettings(), point_map)
+    for _ in range(8):
+        seen = one_scan(point_map, standing_at(OLD_Y + 9))
+        seen.view.passed[:] &= np.uint64((1 << 12) - 1)  # no ray rises to the roof
+        voter.observe(seen)
+    assert all(voter.votes()[0, 0].states[cell] == CE for cell in roof)
+
+
 def test_a_cell_in_which_something_stands_is_not_empty_whatever_else_of_it_is_gone() -> None:
     points = standing_at(OLD_Y, HEIGHTS[:2])  # the upper half of the wall went
     votes = after(street(WALL, HEIGHTS), points)
@@ -225,39 +239,36 @@ def test_a_place_where_nothing_is_mapped_and_rays_passed_is_empty_and_one_that_n
     assert states[ROW, 100] == UO, "hits need no rays beside them"
 
 
-def weighed(mapped: int, free: int, crossed: int, hit: int, own: int = 0) -> tuple[list[np.ndarray], int]:
-    """Voxel 5 of one cell, passed ``own`` times more than its neighbours: (gone, stands, unmet, new, beyond; of what is
-    new, hits less passes)."""
+def weighed(mapped: int, free: int, **counts: int) -> tuple[list[np.ndarray], int]:
+    """Voxel 5 of one cell with these counts: (gone, stands, unmet, new, beyond; of what is new, hits less passes)."""
     planes, bit = np.zeros((1, 1, WORDS), np.uint64), 5
-    for k in range(PLANES):
-        planes[0, 0, HIT + k] = np.uint64((hit >> k & 1) << bit)
-        beside, mine = (crossed >> k & 1), (crossed + own >> k & 1)
-        planes[0, 0, PASSES + k] = np.uint64(beside << bit - 1 | mine << bit | beside << bit + 1)
+    for first, name in ((CROSSED, "crossed"), (HIT, "met"), (PASSES, "passes")):
+        for k in range(PLANES):
+            planes[0, 0, first + k] = np.uint64((counts.get(name, 0) >> k & 1) << bit)
     words_of = [np.full((1, 1), word << bit, np.uint64) for word in (mapped, free)]
     out = no_facts((1, 1))
     weigh_voxels(planes, Overlap(0, 1, 0, 1, 0, 0), *words_of, out)
     return list(out[:5]), int(out.balance[0, 0])
 
 
-@given(crossed=st.integers(0, 120), hit=st.integers(0, 20))
-def test_one_hit_outweighs_as_many_rays_as_is_said(crossed: int, hit: int) -> None:
-    (gone, stands, unmet, new, beyond), _ = weighed(1, 0, crossed, hit)
-    assert (gone[0, 0] != 0) == (crossed >= GONE_RAYS + HIT_RAYS * hit)
-    assert (stands[0, 0] != 0) == (hit > 0 and gone[0, 0] == 0)
-    assert (unmet[0, 0] != 0) == (hit == 0 and 0 < crossed < GONE_RAYS)
+@given(crossed=st.integers(0, 120), met=st.integers(0, 20))
+def test_one_hit_outweighs_as_many_rays_as_is_said(crossed: int, met: int) -> None:
+    (gone, stands, unmet, new, beyond), _ = weighed(1, 0, crossed=crossed, met=met)
+    assert (gone[0, 0] != 0) == (crossed >= GONE_RAYS + HIT_RAYS * met)
+    assert (stands[0, 0] != 0) == (met > 0 and gone[0, 0] == 0)
+    assert (unmet[0, 0] != 0) == (met == 0 and 0 < crossed < GONE_RAYS)
     assert not (new | beyond).any()
 
 
-@given(crossed=st.integers(0, 60), hit=st.integers(0, 60), own=st.integers(0, 60), free=st.booleans())
-@example(crossed=0, hit=1, own=0, free=True)
+@given(crossed=st.integers(0, 120), met=st.integers(0, 60), passes=st.integers(0, 127))
+@example(crossed=0, met=1, passes=0)
 def test_a_free_voxel_is_new_by_hits_against_crossings_and_tells_how_often_rays_passed(
-    crossed: int, hit: int, own: int, free: bool
+    crossed: int, met: int, passes: int
 ) -> None:
-    (gone, stands, unmet, new, beyond), balance = weighed(0, int(free), crossed, hit, own)
-    told, other = (new, beyond) if free else (beyond, new)
-    assert (told[0, 0] != 0) == (hit >= 1 + NEW_RAYS * crossed)
-    assert balance == (hit - crossed - own if new[0, 0] else 0)
-    assert not (gone | stands | unmet | other).any()
+    (gone, stands, unmet, new, beyond), balance = weighed(0, 1, crossed=crossed, met=met, passes=passes)
+    assert (new[0, 0] != 0) == (met >= 1 + NEW_RAYS * crossed)
+    assert balance == (met - passes if new[0, 0] else 0)
+    assert not (gone | stands | unmet | beyond).any()
 
 
 def test_what_was_met_more_often_than_rays_passed_it_lasts_and_takes_its_seldom_met_edges_along() -> None:

@@ -1,14 +1,13 @@
-"""The evidence of a drive, of a vehicle's and of a survey's alike: in how many scans each voxel was hit and passed.
+"""The evidence of a drive, a vehicle's or a survey's: in how many scans each voxel was hit, crossed and passed.
 
 A return speaks for the surfaces within its own error, HIT_REACH_M, in whichever voxel they lie, and for nothing beside
 them: a wall half a metre from where one stood is another wall. In one scan
 
 * a mapped voxel is *hit* if a return lies within HIT_REACH_M of it; any other voxel if a return lies in it that has no
   mapped voxel so near, because what the map explains is nothing new beside it;
-* a voxel is *passed* if a ray goes through it and no return lies within HIT_REACH_M of it.
-
-Over the drive a voxel is *crossed* as often as the least passed of three was: it, the one above and the one below
-(:func:`times_crossed`). A ray that grazes a slab (roof, awning, ceiling) passes only one of the two.
+* a voxel is *passed* if a ray goes through it and no return lies within HIT_REACH_M of it;
+* a voxel is *crossed* if it is passed, and rays pass the voxels above and below it too. A ray that grazes a slab (roof,
+  awning, ceiling) passes only one of the two. The ground bounds the lowest voxel, the end of the word the highest.
 
 Each count is kept as PLANES bit planes: plane k of a cell is a 64-bit word with bit k of the counts of the cell's 64
 voxels, so that one scan is added to a whole column with a few word operations. Returns of moving objects count for
@@ -31,12 +30,13 @@ HIT_REACH_M = 0.1
 """Range noise and pose sigma together, three times over (docs/decisions/evidence.md has what other reaches do)."""
 PLANES = 7
 """Counts up to 127 scans. A cell that would exceed them is halved as a whole, which keeps its ratios."""
-HIT, PASSES = 0, PLANES
+CROSSED, HIT, PASSES = 0, PLANES, 2 * PLANES
 """First plane of each counter."""
-PASSED = 2 * PLANES
+PASSED = 3 * PLANES
 """The word of voxels that any ray ever passed."""
-WORDS = 2 * PLANES + 1
+WORDS = 3 * PLANES + 1
 """Words of a cell."""
+_LOWEST, _HIGHEST = np.uint64(0b11), np.uint64(1) << np.uint64(TOP_BIT - 1)
 
 
 @kernel
@@ -61,7 +61,7 @@ def add_one(planes: U64, first: int, word: np.uint64) -> None:
 @kernel
 def halve(planes: U64) -> None:
     """Halve the counts of a cell: what is weighed against each other keeps its ratio."""
-    for first in (HIT, PASSES):
+    for first in (CROSSED, HIT, PASSES):
         for k in range(first, first + PLANES - 1):
             planes[k] = planes[k + 1]
         planes[first + PLANES - 1] = 0
@@ -77,9 +77,10 @@ def count_of(planes: U64, first: int, bit: int) -> int:
 
 
 @kernel
-def times_crossed(cell: U64, bit: int) -> int:
-    """In how many scans rays went through voxel ``bit`` of a cell (WORDS,) from side to side: what they passed least of
-    it, the voxel above and the one below. The ground bounds the lowest voxel, the end of the word the highest."""
+def least_passed(cell: U64, bit: int) -> int:
+    """In how many scans rays passed voxel ``bit`` of a cell (WORDS,), the voxel above or the one below, whichever they
+    passed least: all scans together crossed it so often. The ground bounds the lowest voxel, the word's end the
+    highest."""
     least = count_of(cell, PASSES, bit)
     if bit + 1 < TOP_BIT:
         least = min(least, count_of(cell, PASSES, bit + 1))
@@ -141,17 +142,20 @@ def _count_scan(planes: U64, part: Overlap, apart: U64, near: U64, passed: U64, 
             if np.isnan(ground_z[r, c]) or not near[r, c] | passed[r, c]:
                 continue
             cell, rays, mapped = planes[r + part.down, c + part.right], passed[r, c], occupied[r, c]
+            above, below = rays >> np.uint64(1) | _HIGHEST, rays << np.uint64(1) | _LOWEST
+            crossed = rays & above & below & ~near[r, c]
             hit = (near[r, c] & mapped) | apart[r, c]
             missed = rays & ~near[r, c]
             cell[PASSED] |= rays
-            if is_full(cell, HIT, hit) or is_full(cell, PASSES, missed):
+            if is_full(cell, CROSSED, crossed) or is_full(cell, HIT, hit) or is_full(cell, PASSES, missed):
                 halve(cell)
+            add_one(cell, CROSSED, crossed)
             add_one(cell, HIT, hit)
             add_one(cell, PASSES, missed)
 
 
 class Evidence:
-    """Counters of a drive by tile: (256, 256, WORDS) uint64: hit, passes, then what any ray passed.
+    """Counters of a drive by tile: (256, 256, WORDS) uint64: crossed, hit, passes, then what any ray passed.
 
     Memory is bounded by the tiles around the vehicle, and some hundred kilobytes for each that it has left.
     """

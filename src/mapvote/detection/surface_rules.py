@@ -9,16 +9,18 @@ from scipy import ndimage
 
 from mapvote.core.kernel import kernel
 from mapvote.core.types import F32, F64, I32, NO_VOTE, U8, U64, Bool, CellState
-from mapvote.detection.evidence import HIT, PASSED, PASSES, PLANES, count_of, times_crossed
+from mapvote.detection.evidence import CROSSED, HIT, PASSED, PASSES, PLANES, count_of, least_passed
 from mapvote.detection.packed_tiles import Overlap
 
-# With HIT_REACH_M nine numbers. docs/decisions/evidence.md says what each was set by.
-HIT_RAYS = 16
+# Set on corner 1 and 2, street 2 and KITTI 0001 in blocks of 12 and 25 scans: docs/decisions/evidence.md has each.
+HIT_RAYS = 8
 """Scans that crossed a mapped voxel, against one that hit it."""
 GONE_RAYS = 3
 """Scans that must have crossed it beyond those: two may be an error of two poses."""
-NEW_RAYS = 0.25
-"""Of the scans in which a free voxel was hit, one against four that crossed it."""
+TOGETHER = 2
+"""Scans whose rays cross it only together count as one of so many."""
+NEW_RAYS = 0.5
+"""Of the scans in which a free voxel was hit, one against two that crossed it."""
 SUPPORT = 6
 """Voxels by which something gone must be decided, in its 8-connected cells: a pole of 1.8 m, half a square metre."""
 NEW_VOXELS, NEW_A_CELL, NEW_ENOUGH = 4, 2, 40
@@ -26,6 +28,8 @@ NEW_VOXELS, NEW_A_CELL, NEW_ENOUGH = 4, 2, 40
 The bound of 40 keeps large low things."""
 MOVED_CELLS = 3
 """How far behind what went its new side may lie: .9 m."""
+FALL_CELLS = 8
+"""How far what is gone takes cells with it that no ray could decide: 2.4 m."""
 _AROUND = np.ones((3, 3))
 _LOW = np.uint64(0b1111)
 """A column that has one of these voxels begins within 1.2 m of the ground."""
@@ -71,7 +75,14 @@ class WindowStates(NamedTuple):
 
 def no_facts(shape: tuple[int, int]) -> VoxelFacts:
     """Of a window in which nothing was counted."""
-    return VoxelFacts(*(np.zeros(shape, kind) for kind in [np.uint64] * 6 + [np.int32] * 2))
+    gone, stands, unmet, new, beyond, passed = (np.zeros(shape, np.uint64) for _ in range(6))
+    return VoxelFacts(gone, stands, unmet, new, beyond, passed, np.zeros(shape, np.int32), np.zeros(shape, np.int32))
+
+
+@kernel
+def times_crossed(cell: U64, bit: int) -> int:
+    """C of :func:`judge_window` for a mapped voxel of a cell (WORDS,)."""
+    return max(count_of(cell, CROSSED, bit), least_passed(cell, bit) // TOGETHER)
 
 
 @kernel
@@ -89,15 +100,16 @@ def weigh_voxels(planes: U64, part: Overlap, occupied: U64, known_free: U64, out
                 one = np.uint64(1) << np.uint64(bit)
                 if not asked & one:
                     continue
-                hit, crossed = count_of(cell, HIT, bit), times_crossed(cell, bit)
+                hit = count_of(cell, HIT, bit)
                 if mapped & one:
+                    crossed = times_crossed(cell, bit)
                     if crossed >= GONE_RAYS + HIT_RAYS * hit:
                         out.gone[r, c] |= one
                     elif hit:
                         out.stands[r, c] |= one
                     elif crossed:
                         out.unmet[r, c] |= one
-                elif hit >= 1 + NEW_RAYS * crossed:
+                elif hit >= 1 + NEW_RAYS * count_of(cell, CROSSED, bit):
                     if known_free[r, c] & one:
                         out.new[r, c] |= one
                         out.balance[r, c] += hit - count_of(cell, PASSES, bit)
@@ -109,27 +121,26 @@ def weigh_voxels(planes: U64, part: Overlap, occupied: U64, known_free: U64, out
 def judge_window(drive: VoxelFacts, here: Mapped, min_height_m: float) -> WindowStates:
     """What a drive says of a window.
 
-    Of a voxel, over the drive's scans: h times hit, p times passed; a and b the passes of the voxels above and below it
-    (detection/evidence.py).
+    Of a voxel, over the drive's scans: h hits, c crossed, p passes (detection/evidence.py); a and b the passes of the
+    voxels above and below it.
 
-        crossed        C = min(p, a, b)
-        mapped voxel:  gone if C >= GONE_RAYS + HIT_RAYS h;  else stands if h >= 1;  else unmet if C >= 1
-        free voxel:    new if h >= 1 + NEW_RAYS C
+        C = max(c, min(p, a, b) / TOGETHER)
+        mapped voxel:  gone if C >= GONE_RAYS + HIT_RAYS h;  else stands if h >= 1
+        free voxel:    new if h >= 1 + NEW_RAYS c
 
     A cell is empty if a voxel of it is gone and none stands. Of an 8-connected group of empty cells with N gone voxels
 
-        changed-empty     if N >= SUPPORT, or it is a thing of its own on the ground
+        changed-empty  if N >= SUPPORT, or it is a thing of its own on the ground
 
-    and with it cells that touch it, directly or through each other, in which a voxel is gone or unmet and none stands.
-    Of an 8-connected group of A cells with N new voxels, among them those that were hit beyond what the map knew within
-    MOVED_CELLS of changed-empty,
+    and with it what :func:`grown` and :func:`fallen` say. Of an 8-connected group of A cells with N
+    new voxels, among them those that were hit beyond what the map knew within MOVED_CELLS of changed-empty,
 
         changed-occupied  if sum h >= sum p, and
                           N >= min(NEW_VOXELS + NEW_A_CELL A, NEW_ENOUGH) or it is a thing of its own on the ground
 
     What rises less than ``min_height_m`` is never gone.
     """
-    mapped = here.occupied != 0
+    mapped, nothing = here.occupied != 0, drive.gone | drive.stands == 0
     high = mapped & (here.height_m >= min_height_m)
     gone: U64 = np.where(high, drive.gone, NOTHING)
     beyond: U64 = np.where(mapped, NOTHING, drive.beyond)
@@ -140,9 +151,13 @@ def judge_window(drive: VoxelFacts, here: Mapped, min_height_m: float) -> Window
 
     empty = (gone != 0) & (drive.stands == 0)
     firm = supported(empty, gone, SUPPORT) | on_its_own(empty, gone, here.occupied, mapped & ~empty)
-    went = grown(firm, high & (drive.stands == 0) & ((drive.gone | drive.unmet) != 0))
+    crossed = high & (drive.stands == 0) & ((drive.gone | drive.unmet) != 0)
     states[empty] = CellState.UNDETERMINED
-    states[went] = CellState.CHANGED_EMPTY
+    states[grown(firm, crossed)] = CellState.CHANGED_EMPTY
+    states[fallen(states, high & nothing & _hollow_below(here.occupied, drive.passed), FALL_CELLS)] = (
+        CellState.CHANGED_EMPTY
+    )
+    went = states == CellState.CHANGED_EMPTY
     gone = np.where(went, here.occupied, gone)
 
     near = ndimage.maximum_filter(went, 2 * MOVED_CELLS + 1, mode="constant")
@@ -189,3 +204,29 @@ def grown(strong: Bool, weak: Bool) -> Bool:
     (Canny 1986). Few rays cross the far wall of what fell, and none of them hit it."""
     both = strong | weak
     return np.asarray(both & (_over_groups(both, strong) > 0))
+
+
+def fallen(states: U8, adrift: Bool, reach: int) -> Bool:
+    """(rows, cols) cells that fall: what stood on things that are gone, and no ray could reach, is gone with them.
+
+    The roof of a demolished house, too high for the sensor once nothing is behind it. An ``adrift`` cell goes with the
+    changed-empty or the unchanged-occupied cell that is nearer, so that of two roofs that meet only one falls; a
+    connected group of those that go falls if a changed-empty cell lies within ``reach`` cells of it.
+    """
+    gone, kept = states == CellState.CHANGED_EMPTY, states == CellState.UNCHANGED_OCCUPIED
+    if not (gone.any() and adrift.any()):
+        return np.zeros_like(adrift)
+    to_gone = _steps_to(gone)
+    goes = adrift & (to_gone < _steps_to(kept)) if kept.any() else adrift
+    return grown(goes & (to_gone <= reach), goes)
+
+
+def _steps_to(cells: Bool) -> I32:
+    """(rows, cols) how many steps, diagonal ones too, it is to the nearest of ``cells``; there must be one."""
+    return np.asarray(ndimage.distance_transform_cdt(~cells, metric="chessboard"))
+
+
+def _hollow_below(occupied: U64, passed: U64) -> Bool:
+    """(rows, cols) mapped cells with something under their lowest voxel, half of which or more rays passed."""
+    under = np.where(occupied != 0, (occupied & (~occupied + np.uint64(1))) - np.uint64(1), NOTHING)
+    return np.asarray((under != 0) & (2 * np.bitwise_count(under & passed) >= np.bitwise_count(under)))

@@ -25,7 +25,7 @@ from mapvote.core.reference import LocalMap
 from mapvote.core.tile import Tile
 from mapvote.core.types import F32, F64, I32, I64, U64, Bool, Drive
 from mapvote.core.voxels import VoxelCloud
-from mapvote.detection.evidence import HIT, PASSES, Evidence, count_of, free_words, times_crossed
+from mapvote.detection.evidence import HIT, PASSES, Evidence, count_of, free_words, least_passed
 from mapvote.localisation.localiser import GivenPoses
 from mapvote.perception.frontend import Frontend, Observation, PlacedScan
 from mapvote.perception.moving_objects import MovingFilter
@@ -168,5 +168,5 @@ def _counts_of(planes: U64, rows: I64, cols: I64, bits: I64) -> I64:
         if 0 <= bits[i] < TOP_BIT:
             cell = planes[rows[i], cols[i]]
             out[i, 0], out[i, 1] = count_of(cell, HIT, bits[i]), count_of(cell, PASSES, bits[i])
-            out[i, 2] = times_crossed(cell, bits[i])
+            out[i, 2] = least_passed(cell, bits[i])
     return out
