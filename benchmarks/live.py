@@ -1,6 +1,14 @@
 """What a live vehicle costs and keeps. Real DDS between processes, on loopback.
 
-python benchmarks/live.py cloud                          # CPU of reading clouds of 70,000 points
+    python benchmarks/live.py cloud                      # CPU of reading clouds of 70,000 points
+    python benchmarks/live.py drive DRIVE MAP --rate 1   # share of scans that voted, latency from sending to vote
+    python benchmarks/live.py kills DRIVE MAP --kills 50 # kill -9 at random moments, in half of them without a server
+    python benchmarks/live.py hours DRIVE MAP --hours 8  # memory over a long drive, in one process, as fast as it goes
+
+DRIVE is one that ``mapvote simulate`` wrote, MAP what ``mapvote build`` made of its surveys. For kills the drive goes
+round and round with stamps that go on; at the end of a lap the vehicle leaps back to the start, where some scans are
+lost. For hours the three middle tiles of the map and the part of the drive through them are laid end to end ten times,
+and driven round and round; where two copies meet, the scan shows another street than the map, and some scans are lost.
 """
 
 from __future__ import annotations
@@ -41,7 +49,8 @@ sys.path[0] = str(Path(__file__).parents[1] / "tests")  # instead of this folder
 from live.loopback_dds import LOOPBACK, domain_of  # noqa: E402
 from live_server import mapvote  # noqa: E402
 
-TILES = 3
+TILES, LOOP = 3, 10
+"""Columns of tiles that are repeated, and how often they lie end to end in the loop."""
 PERIOD_M = TILES * TILE_CELLS * CELL_SIZE
 CLOUD, POINTS = "sensor_msgs/msg/PointCloud2", 70_000
 
@@ -226,12 +235,12 @@ def laid_end_to_end(point_map: PointMap, copies: int) -> PointMap:
 
 
 def long_drive(scans: list[Scan], priors: F64, copies: int) -> Iterator[tuple[Scan, F64]]:
-    """Scans and their priors (n, 4, 4), again and again, each time farther along x and later."""
+    """Scans and their priors (n, 4, 4), again and again, each time later and farther along the loop."""
     step_ns = int(np.median(np.diff([scan.stamp_ns for scan in scans])))
     for k in range(copies):
         for n, scan in enumerate(scans):
             prior = priors[n].copy()
-            prior[0, 3] += k * PERIOD_M
+            prior[0, 3] += k % LOOP * PERIOD_M
             yield replace(scan, stamp_ns=scans[0].stamp_ns + step_ns * (k * len(scans) + n)), prior
 
 
@@ -249,13 +258,13 @@ def hours(drive_path: str, map_path: str, length_h: float) -> None:
     home = Path(tempfile.mkdtemp())
     (home / "out").mkdir()
     outbox = Outbox(home / "state", "car", folder=home / "out", say=lambda _: None)
-    maps = OneMap(laid_end_to_end(street, copies))
+    maps = OneMap(laid_end_to_end(street, LOOP))
     live = LiveDrive(lambda m: Vehicle("car", drive.sensor, m), maps, outbox, name="day", with_poses=True)
     x0 = 0.5 * (xs.min() + xs.max()) - 0.5 * PERIOD_M
     part = np.flatnonzero((xs >= x0) & (xs < x0 + PERIOD_M))
     scans = [drive.read_scan(int(i)) for i in part]
     base, n, step = resident_mb(), 0, int(min(9000, 3600 * length_h))
-    print(f"base {base:.0f} MB with the scans that are fed, {copies} copies of {PERIOD_M:.0f} m")
+    print(f"base {base:.0f} MB with the scans that are fed, {LOOP} copies of {PERIOD_M:.0f} m")
     print("| hours | km | scans voted | ballots | MB |\n|---|---|---|---|---|")
     for scan, prior in long_drive(scans, drive.T_map_lidar_prior[part], copies):
         live.on_pose(scan.stamp_ns, prior)
@@ -264,7 +273,7 @@ def hours(drive_path: str, map_path: str, length_h: float) -> None:
             pass
         n += 1
         if n % step == 0:
-            c, km, mb = live.counts, 1e-3 * (prior[0, 3] - x0), resident_mb() - base
+            c, km, mb = live.counts, 1e-3 * n / len(scans) * PERIOD_M, resident_mb() - base
             print(f"| {n / 36000:.2f} | {km:.1f} | {c.localised} of {n} | {c.ballots} | {mb:.0f} |", flush=True)
     live.finish()
     outbox.close()
