@@ -201,7 +201,7 @@ def kills(drive: str, map_path: str, n: int) -> None:
     lost = closed - {name for name, _, _ in ballots}
     twice = len(ballots) - len({name for name, _, _ in ballots})
     shared = sum(b[1] <= a[2] for a, b in pairwise(ballots))
-    gaps = [1e-9 * (at - max(began, *(end for _, _, end in ballots if end <= at))) for began, at in killed_ns]
+    gaps = [1e-9 * (at - max([began, *(end for _, _, end in ballots if end <= at)])) for began, at in killed_ns]
     print(f"{n} kills, the server away in {n // 2}: {len(ballots)} ballots, {len(closed)} said to be closed")
     print(f"{len(lost)} lost, {twice} twice, {shared} share scans with the next")
     print(f"road missing at a kill: median {np.median(gaps):.1f} s, at most {max(gaps):.1f} s ({log})")

@@ -14,6 +14,8 @@ import pytest
 from hand_made import Say, make_ballot, make_map, make_tile, states_plane, wall
 from mapvote.client import MapClient
 from mapvote.codec.ballot import Ballot, decode, encode
+from mapvote.codec.path import check_path, pack_path, unpack_path
+from mapvote.core.grid import CELL_SIZE
 from mapvote.core.types import MapvoteError
 from mapvote.formats.atomic import whole_file as really_whole_file
 from mapvote.live import outbox as outbox_module
@@ -57,6 +59,23 @@ def test_a_journal_cut_off_at_any_byte_gives_the_ballot_of_its_whole_records(tmp
         assert (found is None) == (n == 0)
         if found is not None:
             assert (found.scans, [t.tile for t in found.tiles]) == ([5, 9, 12][n - 1], [(0, 0), (0, 1)][: min(n, 2)])
+
+
+def test_the_ballot_of_a_journal_is_valid_though_its_vehicle_drove_on_beyond_the_tiles_that_were_written(
+    tmp_path: Path,
+) -> None:
+    drove = [np.array([10.0 * k, 20.0, 1.8]) for k in range(60)]
+    part = msgspec.structs.replace(ballot("a"), path=pack_path(drove, MAP.lattice))
+    with pytest.raises(MapvoteError, match="far from where the drive voted"):
+        check_path(part.path or b"", [(0, 0)])
+    journal = Journal(tmp_path / "a.journal")
+    journal.append(encode(part))
+    found = ballot_of(journal.path)
+    assert found is not None
+    assert found.path is not None
+    check_path(found.path, [(0, 0)])
+    columns = unpack_path(found.path)[:, 1] * CELL_SIZE
+    assert (columns.min(), columns.max()) == pytest.approx((0.0, 150.0), abs=CELL_SIZE)
 
 
 def test_a_damaged_record_ends_the_journal_and_what_is_written_next_takes_its_place(tmp_path: Path) -> None:

@@ -41,8 +41,20 @@ def unpack_path(data: bytes) -> I64:
 
 def check_path(data: bytes, tiles: Collection[TileIndex]) -> None:
     """MapvoteError unless the path is sound and never farther than a tile from ``tiles``, on which its drive voted."""
-    passed = np.unique(unpack_path(data) // TILE_CELLS, axis=0)
-    voted = np.array(list(tiles), dtype=np.int64).reshape(-1, 2)
-    for tile in passed:
-        if not (np.abs(voted - tile).max(axis=1, initial=0) <= 1).any():
+    for tile in np.unique(unpack_path(data) // TILE_CELLS, axis=0):
+        if not _is_near(tile, tiles):
             raise MapvoteError(f"{_WHAT} leads over tile {tile[0]},{tile[1]}, far from where the drive voted")
+
+
+def path_near(data: bytes, tiles: Collection[TileIndex]) -> bytes:
+    """The path without what is farther than a tile from ``tiles``."""
+    cells = unpack_path(data)
+    passed, which = np.unique(cells // TILE_CELLS, axis=0, return_inverse=True)
+    near = np.array([_is_near(tile, tiles) for tile in passed], dtype=np.bool_)
+    kept = cells[near[which.ravel()]]
+    return pack_plane(np.diff(kept, axis=0, prepend=np.zeros((1, 2), np.int64)).astype(np.int32))
+
+
+def _is_near(tile: I64, voted: Collection[TileIndex]) -> bool:
+    others = np.array(list(voted), dtype=np.int64).reshape(-1, 2)
+    return bool((np.abs(others - tile).max(axis=1, initial=0) <= 1).any())

@@ -29,6 +29,7 @@ import msgspec
 
 from mapvote.client import MapClient
 from mapvote.codec.ballot import Ballot, decode, encode
+from mapvote.codec.path import path_near
 from mapvote.core.types import MapvoteError
 from mapvote.formats.atomic import whole_file
 from mapvote.vehicle import stretch_name
@@ -88,7 +89,8 @@ def ballot_of(path: Path) -> Ballot | None:
         base.update(last.base)
     if last is None:
         return None
-    return msgspec.structs.replace(last, tiles=[tiles[index] for index in sorted(tiles)], base=base)
+    driven = None if last.path is None else path_near(last.path, tiles)  # the newest tiles are not in the journal yet
+    return msgspec.structs.replace(last, tiles=[tiles[index] for index in sorted(tiles)], base=base, path=driven)
 
 
 @dataclass(slots=True)
