@@ -7,12 +7,18 @@ import shutil
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from command_line import type_in
 from hand_made import Say, make_ballot, states_plane, two_walls
 from mapvote.codec.ballot import encode
-from mapvote.core.types import CellState
+from mapvote.core.geometry import from_xyz_rpy, transform
+from mapvote.core.point_map import all_points
+from mapvote.core.types import F64, CellState
+from mapvote.formats import read_map, write_pcd
+from mapvote.formats.maps.cloud import Cloud
+from mapvote.formats.maps.las import write_las
 from mapvote.server.store.admission import accept, examine
 from mapvote.server.store.publish import publish
 from mapvote.server.store.store import Store
@@ -53,6 +59,9 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
         type_in("mapvote vote tuesday --map my_map --vehicle car_2 --out car_2.ballot")
         type_in("mapvote export my_map tiles")
         type_in("mapvote export my_map city.pcd")
+        type_in("mapvote export my_map old_map.las")
+        os.symlink("tiles", "my_autoware_map")
+        make_clouds(all_points(read_map("my_map")))
         make_store(Path("STORE"))
         for copy in ("fleet.db", "BACKUP", "backup.db"):
             shutil.copy("STORE", copy)
@@ -77,6 +86,15 @@ def desk(made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callabl
         return tmp_path
 
     return lay
+
+
+def make_clouds(street: F64) -> None:
+    """Of the street (n, 3): a session's cloud in a frame of its own, and two parts that overlap by 40 m, with noise."""
+    rng = np.random.default_rng(5)
+    noisy = street + rng.normal(0.0, 0.01, street.shape)
+    write_pcd(Path("session.pcd"), Cloud(transform(from_xyz_rpy(40.0, -15.0, 2.0, yaw=0.7), noisy)))
+    write_las(Path("north.laz"), Cloud(street[street[:, 1] > 10.0]))
+    write_las(Path("south.laz"), Cloud(noisy[street[:, 1] < 50.0]))
 
 
 def make_store(path: Path) -> None:

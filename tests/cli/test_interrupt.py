@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 from typer.main import get_command
 
+from live.loopback_dds import LOOPBACK, domain_of
 from live_server import mapvote
 from mapvote.cli import app
 from mapvote.server.store.store import Store
@@ -78,6 +79,7 @@ VERBS = {
     "log STORE --out new": "import mapvote.server.views.history as m; m.changes_between = wait",
     "config": "import mapvote.config as m; m.load_with_sources = wait",
     "diff my_map city.pcd --out new": "import mapvote.formats as m; m.read_map = wait",
+    "merge my_map city.pcd --out new": "import mapvote.formats as m; m.read_map = wait",
     "demo --out new": "import mapvote_lab.evaluation.demo as m; m.evaluate = wait",
     "evaluate tiny.toml --json new": "import mapvote_lab.evaluation.evaluate as m; m.evaluate = wait",
     "warmup": "import mapvote.warmup as m; m.warm_up = wait",
@@ -91,7 +93,7 @@ VERBS = {
     "gc STORE --yes": "import mapvote.server.store.retention as m; m.clear = wait",
     "keys STORE": "import mapvote.server.store.keys as m; m.listed = wait",
 }
-ELSEWHERE = {"serve", "simulate", "topics", "play", "drive"}
+ELSEWHERE = {"serve", "simulate", "topics", "play", "drive", "autoware"}
 """Verbs with a test of their own: below, and in tests/live."""
 
 
@@ -220,6 +222,28 @@ def test_a_ctrl_c_that_comes_while_an_object_is_taken_away_is_not_lost(tmp_path:
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=30, check=False)
     assert stopped_by_a_line(done)
+
+
+@pytest.mark.slow
+def test_an_autoware_service_ends_on_ctrl_c_with_how_much_it_answered(tmp_path: Path) -> None:
+    """It runs until it is stopped, so that this is no failure; the server may be away."""
+    pytest.importorskip("cyclonedds")
+    here, log = tmp_path, tmp_path / "log"
+    words = ["autoware", "http://127.0.0.1:9", "map", "--every", "0.1", "--domain", str(domain_of("interrupt"))]
+    with log.open("w") as out:
+        process = subprocess.Popen(
+            mapvote(*words), cwd=here, stdout=out, stderr=subprocess.STDOUT, start_new_session=True,
+            env={**os.environ, "CYCLONEDDS_URI": LOOPBACK},
+        )  # fmt: skip
+        try:
+            while "the map stays as it is" not in log.read_text():
+                assert process.poll() is None, log.read_text()
+                time.sleep(0.05)
+            os.killpg(process.pid, signal.SIGINT)
+            assert process.wait(30) == 0, log.read_text()
+        finally:
+            process.kill()
+    assert log.read_text().splitlines()[-1] == "0 requests answered"
 
 
 def test_a_server_started_as_the_help_says_ends_on_ctrl_c(desk: Desk) -> None:

@@ -28,7 +28,7 @@ def coverage(
 
     A cell counts if one more vehicle that says the same as one before would decide it.
 
-    mapvote coverage map.db --out drive_next.geojson
+    mapvote coverage fleet.db --out drive_next.geojson
     """
     from mapvote.formats.atomic import whole_file
 
