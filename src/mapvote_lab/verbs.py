@@ -92,13 +92,15 @@ def evaluate(
 ) -> None:
     """Simulate, map, vote, and score: Tables II to IV of the paper with its figures beside ours.
 
+    Real data is "real", a recorded drive, or "court", a place at two times (docs/diff.md).
+
     mapvote evaluate corner --seed 2 --case 1,5,surfaces
 
     mapvote evaluate as_published --case 1,2,3,4,5 --readings
 
     mapvote evaluate real my_drive --out report
 
-    mapvote evaluate court FOLDER: a real place at two times (docs/diff.md)
+    mapvote evaluate court FOLDER
     """
     _need_lab("evaluate")
     from rich.console import Console

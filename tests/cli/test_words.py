@@ -33,6 +33,8 @@ NOT_RUN = {
     r"postgresql\+psycopg://mapvote@db": "names a machine that is not here; tests/server runs PostgreSQL",
     r"\.\./shared/data/kitti": "needs the KITTI scans: tests/evaluation/experiments/real runs it where they are",
     r"^mapvote evaluate real ": "takes minutes on a real drive: tests/evaluation/experiments/real runs it",
+    r"^mapvote evaluate court ": "needs the clouds of the real court (docs/diff.md), and takes minutes",
+    r"^mapvote demo \w*DRIVE": "needs a drive of 24 scans: tests/evaluation/test_evaluate.py runs one",
     r"maps\.example\.org": "names a server that is not here: tests/cli/test_follow.py follows a real one",
     r"^mapvote (evaluate|simulate) (street|street570|as_published)\b": (
         "takes many minutes and gigabytes: `corner` is run from the help instead"
