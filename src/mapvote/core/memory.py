@@ -97,10 +97,13 @@ class Memory:
     def _joined(self, cells: I64) -> tuple[I64, U32, I64]:
         """(own cells and ``cells`` (m,), (n,) ascending; their values (4, n), zero where they are new; which of all
         each of ``cells`` is (m,))."""
-        joined = np.union1d(self.cells, cells)
+        place = np.zeros(CELLS, dtype=np.int64)  # a plane of the tile: np.union1d takes four times as long
+        place[self.cells] = place[cells] = 1
+        joined = np.flatnonzero(place)
+        place[joined] = np.arange(len(joined))
         planes = np.zeros((PLANES, len(joined)), dtype=np.uint32)
-        planes[:, np.searchsorted(joined, self.cells)] = self.values
-        return joined, planes, np.searchsorted(joined, cells)
+        planes[:, place[self.cells]] = self.values
+        return joined, planes, place[cells]
 
 
 def _sparse(cells: I64, values: U32, sure: bool) -> Memory:

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from mapvote.codec.words import unpack_sparse
 from mapvote.core.columns import EVERY_BIT
 from mapvote.core.grid import CELLS
-from mapvote.core.kernel import kernel
-from mapvote.core.types import I32, U64, Bool
+from mapvote.core.kernel import inlined, kernel
+from mapvote.core.types import I32, NO_VOTE, U8, U64, Bool
 
 _BLOCK = 64
 _BITS = np.arange(64, dtype=np.uint64)
@@ -106,6 +106,43 @@ def mark(reached: U64, cells: NDArray[np.intp], words: U64) -> None:
     ``reached[i]`` had are now in ``reached[i + 1]`` where it sets them too. It ends as the bits that one, two .. k
     voters set."""
     for i in range(len(cells)):
-        for level in range(reached.shape[0] - 1, 0, -1):
-            reached[level, cells[i]] |= reached[level - 1, cells[i]] & words[i]
-        reached[0, cells[i]] |= words[i]
+        _mark_one(reached, cells[i], words[i])
+
+
+@kernel
+def mark_spoken(reached: U64, cells: NDArray[np.intp], words: U64, own: U8) -> None:
+    """:func:`mark` of the cells of which the voter's ``own`` flat states (65536,) say anything."""
+    for i in range(len(cells)):
+        if own[cells[i]] != NO_VOTE:
+            _mark_one(reached, cells[i], words[i])
+
+
+@kernel
+def mark_among(reached: U64, cells: NDArray[np.intp], words: U64, own: U8, said: int, among: NDArray[np.intp]) -> None:
+    """:func:`mark` of the cells that are ``among`` these (n,), ascending too, and that the voter's ``own`` flat states
+    (65536,) call ``said``; of ``reached`` (k, n) by their place among them."""
+    k = 0
+    for i in range(len(cells)):
+        while k < len(among) and among[k] < cells[i]:
+            k += 1
+        if k < len(among) and among[k] == cells[i] and own[cells[i]] == said:
+            _mark_one(reached, k, words[i])
+
+
+@kernel
+def agreeing(cells: NDArray[np.intp], own: U8, decided: U8, state: int, found: NDArray[np.intp]) -> int:
+    """How many of the flat ``cells`` (n,) are ``state`` in a voter's ``own`` states and in the ``decided`` ones,
+    (65536,) each; their indices into ``found`` (n,)."""
+    n = 0
+    for i in range(len(cells)):
+        if decided[cells[i]] == state and own[cells[i]] == state:
+            found[n] = i
+            n += 1
+    return n
+
+
+@inlined
+def _mark_one(reached: U64, cell: int, word: np.uint64) -> None:
+    for level in range(reached.shape[0] - 1, 0, -1):
+        reached[level, cell] |= reached[level - 1, cell] & word
+    reached[0, cell] |= word

@@ -19,7 +19,7 @@ from mapvote.core.cells import flat_cells
 from mapvote.core.grid import CELLS, TILE_CELLS, Grid
 from mapvote.core.types import F32, I64, N_STATES, NO_VOTE, U8, U16, U64, Bool, CellState, read_only
 from mapvote.fusion.odds import Odds, folded
-from mapvote.fusion.sparse_columns import Words, mark, union
+from mapvote.fusion.sparse_columns import Words, agreeing, mark, mark_among, mark_spoken, union
 
 DAY_NS = 86_400_000_000_000
 
@@ -145,6 +145,9 @@ class TileVote:
     def agreed(self, cells: NDArray[np.intp], decided: U8, state: CellState) -> NDArray[np.intp]:
         """Indices of those of the flat ``cells`` (n,) that are ``decided`` (256, 256) as ``state``, which this vote
         supports."""
+        if self.states is not None:
+            found = np.empty(len(cells), dtype=np.intp)
+            return found[: agreeing(cells, self.states.reshape(-1), decided.reshape(-1), int(state), found)]
         return np.flatnonzero((decided.reshape(-1)[cells] == state) & self.supports(state, cells))
 
     def determined(self, cells: NDArray[np.intp]) -> Bool:
@@ -166,13 +169,20 @@ class TileVote:
     def mark_passed(self, reached: U64) -> None:
         """One more voter in ``reached`` (see :func:`mapvote.fusion.sparse_columns.mark`): of what it has
         :meth:`passed`."""
-        passed = self.passed()
-        mark(reached, passed.cells, passed.words)
+        if self.states is not None and self.free is not None:
+            mark_spoken(reached, self.free.cells, self.free.words, self.states.reshape(-1))
+        else:
+            passed = self.passed()
+            mark(reached, passed.cells, passed.words)
 
     def mark_deleted(self, emptied: Words, reached: U64) -> None:
         """One more voter in ``reached`` (k, n): of what it :meth:`deletes` among the n cells ``emptied``."""
-        deleted = self.deletes(emptied)
-        mark(reached, np.searchsorted(emptied.cells, deleted.cells), deleted.words)
+        if self.states is not None and self.gone is not None:
+            own, said = self.states.reshape(-1), int(CellState.CHANGED_EMPTY)
+            mark_among(reached, self.gone.cells, self.gone.words, own, said, emptied.cells)
+        else:
+            deleted = self.deletes(emptied)
+            mark(reached, np.searchsorted(emptied.cells, deleted.cells), deleted.words)
 
     def deletes(self, among: Words) -> Words:
         """The voxels that this vote says are gone, of the cells that ``among`` names."""

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapvote.core.grid import CELLS
+from mapvote.core.kernel import kernel
 from mapvote.core.types import I64, N_STATES, NO_VOTE, U8, Bool, CellState
 from mapvote.core.voting import VOTE_UNIT
 from mapvote.fusion.tile_vote import TileVote
@@ -60,18 +61,30 @@ def in_order(drives: Sequence[TileVote], cells: I64) -> tuple[U8, I64, I64]:
 
 def _turn(said: U8, ends_ns: I64, whose: I64, before: int, after: int) -> Bool:
     """(n,) in which cells every vehicle's last word is ``before`` until some moment and ``after`` since."""
-    n = said.shape[1]
-    oldest_after, newest_before = np.full(n, np.iinfo(np.int64).max), np.full(n, np.iinfo(np.int64).min)
-    other = np.zeros(n, dtype=np.bool_)
-    for vehicle in np.unique(whose):
-        word, end_ns = np.full(n, NO_VOTE, dtype=np.uint8), np.zeros(n, dtype=np.int64)
-        for i in np.flatnonzero(whose == vehicle):
-            speaks = said[i] != NO_VOTE
-            word[speaks], end_ns[speaks] = said[i, speaks], ends_ns[i]
-        oldest_after[word == after] = np.minimum(oldest_after, end_ns)[word == after]
-        newest_before[word == before] = np.maximum(newest_before, end_ns)[word == before]
-        other |= (word < _UN) & (word != after) & (word != before)
-    return ~other & (newest_before < oldest_after)
+    found = np.zeros(said.shape[1], dtype=np.bool_)
+    _find_turns(said, ends_ns, whose, before, after, np.empty(len(whose), dtype=np.int64), found)
+    return found
+
+
+@kernel
+def _find_turns(said: U8, ends_ns: I64, whose: I64, before: int, after: int, last: I64, found: Bool) -> None:
+    """:func:`_turn` into ``found`` (n,). ``last`` (m,): memory for the last word of each vehicle."""
+    for cell in range(said.shape[1]):
+        for i in range(len(last)):
+            last[i] = -1
+        for i in range(len(whose)):
+            if said[i, cell] != NO_VOTE:
+                last[whose[i]] = i
+        oldest_after, newest_before, other = np.iinfo(np.int64).max, np.iinfo(np.int64).min, False
+        for i in range(len(last)):
+            word = last[i]
+            if word >= 0 and said[word, cell] == after:
+                oldest_after = min(oldest_after, ends_ns[word])
+            elif word >= 0 and said[word, cell] == before:
+                newest_before = max(newest_before, ends_ns[word])
+            elif word >= 0 and said[word, cell] < _UN:
+                other = True
+        found[cell] = not other and newest_before < oldest_after
 
 
 def _may_turn(states: U8, votes: NDArray[Any], before: int, most: int) -> I64:

@@ -9,7 +9,8 @@ from __future__ import annotations
 import hashlib
 import json
 import operator
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import cache
 from typing import Any
 
 import sqlalchemy as sa
@@ -57,7 +58,13 @@ def summed(table: sa.Table) -> Sequence[str]:
 
 def is_sound(table: sa.Table, row: Any) -> bool:
     """Whether a row with all columns of its table's sum is what was written."""
-    return bool(row.sum == sum_of(*(getattr(row, name) for name in summed(table))))
+    return bool(row.sum == sum_of(*_parts_of(table)(row)))
+
+
+@cache
+def _parts_of(table: sa.Table) -> Callable[[Any], tuple[Any, ...]]:
+    """What takes the values of the sum's columns, two or more, from a row."""
+    return operator.attrgetter(*summed(table))
 
 
 def with_sums(table: sa.Table, rows: Sequence[tuple[Any, ...]]) -> Sequence[tuple[Any, ...]]:
