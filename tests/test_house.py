@@ -21,16 +21,10 @@ MOST_KERNELS = 150
 MOST_LINES = 500
 MOST_FUNCTION_LINES = 60
 MOST_ARGUMENTS = 8
-MOST_NAMED_TWICE = 35
+MOST_NAMED_TWICE = 25
 """Public functions and classes with two meanings. The goal is 10, together with the modules."""
-MOST_MODULES_NAMED_TWICE = 22
+MOST_MODULES_NAMED_TWICE = 4
 """Module names with two meanings."""
-
-CIRCLES = [
-    {"mapvote.formats.drives.rosbag"},
-    {"mapvote.fusion.odds", "mapvote.fusion.tile_vote"},
-]
-"""Import circles that are still there. The goal is none."""
 
 
 def lines(source: Path) -> int:
@@ -158,7 +152,7 @@ def test_few_names_mean_two_things() -> None:
 
 
 def test_no_module_imports_itself_through_others() -> None:
-    assert [circle for circle in circles(imports(SOURCES, SRC)) if circle not in CIRCLES] == []
+    assert circles(imports(SOURCES, SRC)) == []
 
 
 def test_what_is_too_crowded_or_circular_is_found() -> None:

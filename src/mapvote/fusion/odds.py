@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import numpy as np
 
@@ -18,9 +18,6 @@ from mapvote.codec.arrays import unpack_plane
 from mapvote.codec.odds import UNSAID, changed_cells_of, pack_odds
 from mapvote.core.grid import CELLS
 from mapvote.core.types import I8, I64, U8, Bool
-
-if TYPE_CHECKING:
-    from mapvote.fusion.tile_vote import TileVote
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,7 +51,16 @@ class Odds:
         return Odds(self.cells[keep], self.steps[keep])
 
 
-def folded(drives: Sequence[TileVote], last: Sequence[Bool]) -> Odds | None:
+class Sure(Protocol):
+    """A vote that may say how sure its vehicle is."""
+
+    @property
+    def states(self) -> U8 | None: ...
+    @property
+    def odds(self) -> Odds | None: ...
+
+
+def folded(drives: Sequence[Sure], last: Sequence[Bool]) -> Odds | None:
     """What a vehicle's ``drives`` say, each in the flat cells (65536,) in which it has the ``last`` word; None if none
     of them says anything."""
     parts = [drive.odds.within(mine) for drive, mine in zip(drives, last, strict=True) if drive.odds is not None]
@@ -65,7 +71,7 @@ def folded(drives: Sequence[TileVote], last: Sequence[Bool]) -> Odds | None:
     return Odds(cells[order], np.concatenate([part.steps for part in parts])[order])
 
 
-def agreed_odds(votes: Sequence[TileVote], states: U8, quorum: int) -> Odds:
+def agreed_odds(votes: Sequence[Sure], states: U8, quorum: int) -> Odds:
     """Of the cells decided as changed, ``states`` (256, 256): what can be taken of what those say who voted for it, one
     of ``votes`` a vehicle. Of a cell of which fewer than ``quorum`` say how sure they are nothing is said."""
     cells = changed_cells_of(states)
