@@ -20,7 +20,7 @@ from mapvote.core.grid import TILE_CELLS
 from mapvote.core.point_map import PointMap, all_fields, all_points, map_from_points
 from mapvote.core.reference import reference_window
 from mapvote.core.sensors import SENSORS
-from mapvote.core.types import F64, CellState, Drive, MapvoteError, Registration, Scan
+from mapvote.core.types import F64, NO_VOTE, CellState, Drive, MapvoteError, Registration, Scan
 from mapvote.fusion.offline import update_map
 from mapvote.localisation.ndt import PosePrior
 from mapvote.localisation.odometry import Fix
@@ -95,7 +95,7 @@ def test_a_ballot_tells_what_was_built_and_taken_down() -> None:
     assert state_at(vehicle, 8.25, -1.5) == CellState.CHANGED_EMPTY
     assert state_at(vehicle, 20.25, -2.0) == CellState.UNCHANGED_OCCUPIED
     assert state_at(vehicle, 4.0, 0.0) == CellState.UNCHANGED_EMPTY
-    assert state_at(vehicle, 20.25, 9.0) == CellState.UNDETERMINED  # behind the new wall
+    assert state_at(vehicle, 20.25, 9.0) == NO_VOTE, "scans abstain behind the new wall"
 
 
 def test_by_surfaces_a_ballot_says_how_sure_it_is_of_every_changed_cell_and_by_no_other_method() -> None:
