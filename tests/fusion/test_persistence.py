@@ -244,14 +244,15 @@ def test_what_stands_where_nothing_new_was_decided_did_not_come() -> None:
 def entered_after(
     histories: Mapping[tuple[int, int], Sequence[tuple[float, float]]], rng: np.random.Generator, settings: FuseSettings
 ) -> dict[tuple[int, int], int]:
-    """By cell: the passes between the last thing's ``stay_days`` and its entry into the map, 0 before.
+    """By cell: the passes from the one that saw the last thing ``stay_days`` after its first sighting, that one among
+    them, until it entered the map; 0 before.
 
     ``histories``: by cell, things that stand from one day to another; the last one stands for good. Three perfect
     vehicles pass every day, each at any minute, and the server publishes after each pass. Absent: a cell that the last
     thing never enters.
     """
     entered: dict[tuple[int, int], int] = {}
-    waited = dict.fromkeys(histories, 0)
+    waited, first = dict.fromkeys(histories, 0), dict[tuple[int, int], float]()
     tile, seen, version = BARE, list[TileVote](), 1
     last = max(things[-1][0] for things in histories.values())
     for day in sorted(day + hour / 24 for day in range(int(last) + 45) for hour in rng.uniform(0, 24, 3)):
@@ -260,7 +261,8 @@ def entered_after(
             there, mapped = any(start <= day < end for start, end in things), bool(tile.obstacle_words[cell])
             says[cell] = {(True, True): UO, (True, False): CO, (False, True): CE, (False, False): UE}[there, mapped]
             new += [wall([cell], [0.75]).astype(np.float32)] if says[cell] == CO else []
-            waited[cell] += cell not in entered and day > things[-1][0] + settings.stay_days
+            if day >= things[-1][0]:
+                waited[cell] += cell not in entered and day >= first.setdefault(cell, day) + settings.stay_days
         points = np.concatenate(new) if new else None
         seen.append(replace(drive(day, says, f"v{len(seen) % 3}"), version=version, new_points=points))
         oldest = seen[-1].end_ns - history_days(settings) * DAY_NS

@@ -151,6 +151,10 @@ class RoadMap:
             except MapvoteError as error:
                 log.warning("%s", error)
                 wait_s = _RETRY_S
+            except RuntimeError:
+                if not self._ended.is_set():
+                    raise
+                return  # close() closed the client between two requests of this thread
             self._wake.wait(wait_s)
             self._wake.clear()
 
