@@ -65,7 +65,7 @@ class Traffic:
 
     def _operator(self) -> None:
         with httpx2.Client(base_url=self._url, timeout=10.0) as http:
-            while not self._over.is_set():
+            while not self._over.wait(0.05):  # without a pause no vehicle ever has the newest map on a slow machine
                 try:
                     http.request("POST", "/v1/publish", json={"override": True})
                 except httpx2.TransportError:
