@@ -87,17 +87,7 @@ def create_app(
         redoc_url=None,
     )
     app.state.services = parts
-    asked = (
-        ballot_route,
-        vehicle_routes,
-        operator_routes,
-        store_routes,
-        desk_routes,
-        cloud_routes,
-        event_routes,
-        health_routes,
-    )
-    for part in (*asked, pages):
+    for part in ROUTES:
         app.include_router(part.router)
     app.add_exception_handler(400, unreadable)
     hosts, guard = Hosts(parts.settings.server.hosts), Guard(store, parts.threads.lookups, opened=opened, owner=owner)

@@ -35,7 +35,7 @@ from mapvote_lab.simulation.processes import processes
 _SCORES_FROM = (
     *BALLOTS_FROM, "fusion", "simulation", "evaluation/scoring", "evaluation/evaluate.py", "evaluation/results.py",
     "evaluation/experiments/attacks.py", "evaluation/experiments/cases.py", "evaluation/experiments/conditions.py",
-    "evaluation/experiments/matrix.py", "evaluation/experiments/passes.py",
+    "evaluation/experiments/matrix.py",
 )  # fmt: skip
 
 
