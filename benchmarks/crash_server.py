@@ -32,7 +32,7 @@ class Traffic:
 
     def __init__(self, url: str, seed: int, home: Path) -> None:
         self.acknowledged: list[tuple[str, str]] = []
-        self.begun = threading.Event()
+        self.begun, self._news = threading.Event(), threading.Event()
         self._url, self._seed, self._home = url, seed, home
         self._over = threading.Event()
         self._threads = [threading.Thread(target=self._vehicles, args=(i,)) for i in range(VEHICLES)]
@@ -60,12 +60,15 @@ class Traffic:
                         if client.send(ballot) != "spooled":
                             self.acknowledged.append((ballot.vehicle, ballot.drive))
                             self.begun.set()
+                            self._news.set()
                 except MapvoteError:  # gone, or published meanwhile: an honest refusal
                     continue
 
     def _operator(self) -> None:
         with httpx2.Client(base_url=self._url, timeout=10.0) as http:
-            while not self._over.wait(0.05):  # without a pause no vehicle ever has the newest map on a slow machine
+            while not self._over.is_set():
+                self._news.wait(0.5)  # until a ballot is in: else no vehicle ever has the newest map on a slow machine
+                self._news.clear()
                 try:
                     http.request("POST", "/v1/publish", json={"override": True})
                 except httpx2.TransportError:
