@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import faulthandler
 import json
 import os
 import random
@@ -106,6 +107,7 @@ def launch() -> None:
         child = os.fork()
         if child == 0:
             signal.signal(signal.SIGCHLD, signal.SIG_DFL)
+            faulthandler.enable()
             os.dup2(os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND), 2)
             try:
                 serve(store, port=0, open_=True, config=Path(config))
@@ -133,7 +135,10 @@ def killed_server(url: str, seed: int, moment_s: float, cluster: PostgresCluster
         traffic = Traffic(address, seed, folder)
         try:
             if not traffic.begun.wait(60.0):
-                raise SystemExit(f"kill {seed}: nothing was acknowledged: {log.read_text()[-2000:]}")
+                with contextlib.suppress(ProcessLookupError):
+                    os.kill(process, 0)
+                    raise SystemExit(f"kill {seed}: nothing was acknowledged: {log.read_text()[-2000:]}")
+                raise SystemExit(f"kill {seed}: the server ended by itself: {log.read_text()[-4000:]}")
             time.sleep(moment_s)
             if cluster is not None:
                 cluster.stop(crash=True)

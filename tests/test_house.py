@@ -166,3 +166,17 @@ def test_what_is_too_crowded_or_circular_is_found() -> None:
     assert not crowded(kernel)
     assert circles({"a": {"b"}, "b": {"c"}, "c": {"b"}}) == [{"b", "c"}]
     assert circles({"a": {"b"}, "b": set()}) == []
+
+
+def test_decoders_of_types_are_made_when_a_module_is_loaded() -> None:
+    """Two threads of a server that decoded their first ballots at once crashed it: msgspec (0.22) makes what it knows
+    of a type at its first use, without a lock."""
+    late = [
+        f"{source.relative_to(ROOT)}:{call.lineno}"
+        for source in SOURCES
+        for call in ast.walk(ast.parse(source.read_text()))
+        if isinstance(call, ast.Call)
+        and ast.unparse(call.func) in ("msgspec.msgpack.decode", "msgspec.json.decode")
+        and any(keyword.arg == "type" for keyword in call.keywords)
+    ]
+    assert late == [], "make a Decoder of the type at the module's top level"

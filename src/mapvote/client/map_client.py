@@ -81,6 +81,9 @@ class Manifest(msgspec.Struct):
         return msgspec.structs.replace(since, tiles=tiles, removed=[])
 
 
+_MANIFEST = msgspec.json.Decoder(Manifest)  # made when the module is loaded: see codec/ballot.py
+
+
 class MapClient:
     """One vehicle's line to one server.
 
@@ -260,13 +263,13 @@ class MapClient:
 
     def _decoded(self, content: bytes) -> Manifest:
         try:
-            return msgspec.json.decode(content, type=Manifest)
+            return _MANIFEST.decode(content)
         except msgspec.DecodeError as error:
             raise MapvoteError(f"{self._url}: is no mapvote server ({error})") from error
 
     def _kept(self) -> Manifest | None:
         try:
-            return msgspec.json.decode(self._kept_manifest.read_bytes(), type=Manifest)
+            return _MANIFEST.decode(self._kept_manifest.read_bytes())
         except (OSError, msgspec.DecodeError):
             return None
 

@@ -87,6 +87,11 @@ class Ballot(msgspec.Struct, frozen=True, kw_only=True):
     tiles: list[BallotTile]
 
 
+_BALLOT = msgspec.msgpack.Decoder(Ballot)
+"""Made when the module is loaded: msgspec makes what it knows of a type at its first use, and the process crashes where
+two threads do so at once."""
+
+
 def tile_key(tile: TileIndex) -> str:
     """The name of a tile in manifests and ballots: "row,col"."""
     return f"{tile[0]},{tile[1]}"
@@ -147,7 +152,7 @@ def encode(ballot: Ballot) -> bytes:
 def decode(data: bytes) -> Ballot:
     """Check the envelope; planes are checked when they are unpacked. MapvoteError if unusable."""
     try:
-        ballot = msgspec.msgpack.decode(data, type=Ballot)
+        ballot = _BALLOT.decode(data)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:  # ValidationError is a DecodeError
         raise MapvoteError(f"ballot: not readable ({error}); was it written by this version of mapvote?") from error
     if ballot.format_version != FORMAT_VERSION:

@@ -14,6 +14,8 @@ from mapvote.core.types import MapvoteError
 
 FIELD_TYPES = ("|u1", "|i1", "<u2", "<i2", "<u4", "<i4", "<u8", "<i8", "<f4", "<f8")
 
+_FIELDS = msgspec.msgpack.Decoder(dict[str, tuple[str, bytes]])
+
 
 def pack_fields(fields: Mapping[str, NDArray[Any]]) -> bytes:
     """Columns (n,) as a msgpack map of name to (type, little-endian values), in their order: equal fields, equal
@@ -39,7 +41,7 @@ def field_names(raw: bytes, what: str) -> list[str]:
 
 def _decoded(raw: bytes, what: str) -> dict[str, tuple[str, bytes]]:
     try:
-        return msgspec.msgpack.decode(raw, type=dict[str, tuple[str, bytes]])
+        return _FIELDS.decode(raw)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise MapvoteError(f"{what}: no fields of points ({error}); fetch it again") from error
 

@@ -39,6 +39,9 @@ class _TileFile(msgspec.Struct, frozen=True, kw_only=True):
     """Type and values of each field of the points."""
 
 
+_TILE_FILE = msgspec.msgpack.Decoder(_TileFile)  # made when the module is loaded: see codec/ballot.py
+
+
 def content_hash(tile_points: F32) -> str:
     """SHA-256 of a tile's points: free space learned later changes no published point (docs/decisions/data.md)."""
     return hashlib.sha256(np.ascontiguousarray(tile_points, dtype="<f4").tobytes()).hexdigest()
@@ -88,7 +91,7 @@ def encode_tile(tile: Tile) -> bytes:
 def decode_tile(data: bytes, window: Grid, what: str = "tile") -> Tile:
     """The tile over ``window`` that :func:`encode_tile` took; ``what`` names it in a MapvoteError if it is unusable."""
     try:
-        file = msgspec.msgpack.decode(data, type=_TileFile)
+        file = _TILE_FILE.decode(data)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise MapvoteError(f"{what}: not a map tile ({error}); fetch it again") from error
     if not 1 <= file.tile_version <= TILE_VERSION:

@@ -178,6 +178,9 @@ class _Laid(msgspec.Struct):
     tiles: list[str]
 
 
+_HISTORY = msgspec.json.Decoder(list[_Laid])
+
+
 @dataclass(frozen=True, slots=True)
 class Change:
     """What laying a version did to the folder."""
@@ -254,7 +257,7 @@ def _history(folder: Path) -> list[_Laid]:
     if not file.is_file():
         return []
     try:
-        return msgspec.json.decode(file.read_bytes(), type=list[_Laid])
+        return _HISTORY.decode(file.read_bytes())
     except (OSError, msgspec.DecodeError) as error:
         raise MapvoteError(f"{file}: cannot be read ({error}); empty the folder and follow again") from error
 

@@ -29,6 +29,8 @@ STEP_M = 0.0001
 MAX_POINTS_PER_BYTE = 16
 """Real LAZ files need a byte or more for a point."""
 
+_HEAD = msgspec.json.Decoder(Head)
+
 
 def is_las(path: Path) -> bool:
     return path.is_file() and path.suffix.lower() in (".las", ".laz")
@@ -98,7 +100,7 @@ def _apart(path: Path) -> Iterator[Cloud]:
 def _decoded(line: bytes) -> Head:
     if not line:
         raise ValueError("the LAZ reader crashed on it")
-    head = msgspec.json.decode(line, type=Head)
+    head = _HEAD.decode(line)
     if head.refusal:
         raise ValueError(head.refusal)
     return head

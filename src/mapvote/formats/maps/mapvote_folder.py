@@ -58,6 +58,9 @@ class Manifest(msgspec.Struct, frozen=True, kw_only=True):
     """When the last drive that it was made of ended."""
 
 
+_MANIFEST = msgspec.json.Decoder(Manifest)
+
+
 def is_map_folder(path: Path) -> bool:
     return (path / MANIFEST).is_file()
 
@@ -103,7 +106,7 @@ def read_manifest(path: Path) -> Manifest:
     """The manifest of a map folder, checked; no tile is opened. MapvoteError if it is not one we can read."""
     file = path / MANIFEST
     try:
-        manifest = msgspec.json.decode(file.read_bytes(), type=Manifest)
+        manifest = _MANIFEST.decode(file.read_bytes())
     except (OSError, msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise MapvoteError(f"{file}: not a readable map manifest ({error}); copy the map again") from error
     if manifest.format != FORMAT or not 1 <= manifest.format_version <= FORMAT_VERSION:

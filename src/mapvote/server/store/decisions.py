@@ -62,6 +62,9 @@ class Standing(msgspec.Struct, frozen=True, array_like=True):
         return "reviewed" if cell in cells_in(self.reviewed) else ""
 
 
+_STANDINGS = msgspec.msgpack.Decoder(list[Standing])  # made when the module is loaded: see codec/ballot.py
+
+
 def packed_cells(cells: I64) -> bytes:
     """Flat cells (n,) of a tile as a :class:`Standing` holds them."""
     return cells.astype("<u2").tobytes()
@@ -81,7 +84,7 @@ def unpack_standings(data: bytes) -> list[Standing]:
     """The inverse of :func:`pack_standings`; MapvoteError if it is damaged."""
     raw = unpack_bytes(data, _MAX_STANDINGS_BYTES, "decision: standings")
     try:
-        return msgspec.msgpack.decode(raw, type=list[Standing])
+        return _STANDINGS.decode(raw)
     except msgspec.DecodeError as error:
         raise MapvoteError(f"decision: standings are damaged ({error})") from error
 

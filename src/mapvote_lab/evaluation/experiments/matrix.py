@@ -162,7 +162,7 @@ class Matrix:
             result = self._measure(EXPERIMENTS[name], seed, progress)
             with whole_file(file) as partial:
                 partial.write_text(to_json(result))
-        return msgspec.json.decode(file.read_bytes(), type=MatrixResult)
+        return msgspec.json.Decoder(MatrixResult).decode(file.read_bytes())
 
     def _measure(self, experiment: Experiment, seed: int, progress: Progress | None) -> MatrixResult:
         scene = self.scene(experiment, seed)
