@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -159,6 +161,15 @@ def test_the_order_of_ballots_does_not_decide_who_is_heard(order: list[int], by:
     assert one.copies == other.copies
     assert {copy.vehicle for copy in one.copies} == {"x", "y"}
     assert np.array_equal(one.states, other.states)
+
+
+def test_the_history_is_without_copies_whether_it_holds_the_same_drives_or_more() -> None:
+    votes = named({f"v{i}": drive_along(i) for i in range(3)} | {"copy": drive_along(0)})
+    tile = Tile.empty(Lattice().tile((0, 0)))
+    for history in (votes, [*votes, *named({"w": drive_along(4), "x": drive_along(4)})]):
+        heard = decide_tile(tile, votes, "columns", POLICY, partial(list, history))
+        assert heard.past is not None
+        assert [v.digest for v in heard.past()] == [v.digest for v in originals(history, POLICY)[0]]
 
 
 @pytest.mark.parametrize(("k", "quorum"), [(1, 2), (2, 2), (3, 2)])

@@ -21,7 +21,7 @@ import numpy as np
 
 from mapvote.config import FuseSettings
 from mapvote.core.grid import TILE_CELLS
-from mapvote.core.kernel import kernel
+from mapvote.core.kernel import inlined, kernel
 from mapvote.core.types import I64, U8, U64, CellState
 from mapvote.fusion.tile_vote import TileVote
 
@@ -35,15 +35,6 @@ _APART = 3
 _RIM = 1
 """Columns on either side that are not compared."""
 _ASKED = slice(None, None, 7)
-
-
-def _inside(rim: int) -> U64:
-    """(4,) words of a row without ``rim`` columns on either side."""
-    every = ~np.uint64(0)
-    return np.array([every << np.uint64(rim), every, every, every >> np.uint64(rim)])
-
-
-_INSIDE = _inside(_RIM)
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,8 +74,13 @@ def originals(drives: Sequence[TileVote], settings: FuseSettings) -> tuple[Seque
         others = [drive for drive, own in zip(judged, group, strict=True) if own != first]
         heard = max(alike, key=lambda drive: _agreement(drive, others))
         copies += [Copy(d.vehicle, d.digest, heard.vehicle, heard.digest) for d in alike if d is not heard]
+    return without(copies, drives), copies
+
+
+def without(copies: Sequence[Copy], drives: Sequence[TileVote]) -> Sequence[TileVote]:
+    """The ``drives`` that are none of these copies."""
     silent = {(copy.vehicle, copy.digest) for copy in copies}
-    return [drive for drive in drives if (drive.vehicle, drive.digest) not in silent], copies
+    return [drive for drive in drives if (drive.vehicle, drive.digest) not in silent]
 
 
 def liars_among(copies: Sequence[Copy], heard: Sequence[TileVote]) -> int:
@@ -102,14 +98,14 @@ def difference(a: U8, b: U8) -> tuple[int, int]:
     The tile's rim is not: what lies beside it is not known.
     """
     moved, looked = _look(masks_of([a, b]))
-    return int(_differing(looked[0], looked[1], _RIM)), int(moved.min())
+    return int(_differing(looked[0], looked[1], _RIM, TILE_CELLS**2)), int(moved.min())
 
 
 def masks_of(planes: Iterable[U8]) -> U64:
     """(n, 256, 4) words of what n planes of states determined, the first column in the lowest bit."""
     # Of all states only 4 (undetermined) and 255 (no vote) have the third bit set.
     bits = [np.packbits((plane & np.uint8(4)) == 0, bitorder="little") for plane in planes]
-    return np.stack(bits).view(np.uint64).reshape(len(bits), TILE_CELLS, TILE_CELLS // 64)
+    return np.concatenate(bits).view(np.uint64).reshape(len(bits), TILE_CELLS, TILE_CELLS // 64)
 
 
 def _agreement(drive: TileVote, others: Sequence[TileVote]) -> int:
@@ -133,22 +129,8 @@ def find_alike(moved: I64, looked: U64, whose: I64, least: float, group: I64) ->
             whole = min(moved[i], moved[k])
             if whose[i] == whose[k] or group[i] == group[k] or whole < LEAST_MOVED:
                 continue
-            most, count = int(np.ceil(least * whole)) - 1, np.int64(0)
-            for n in range(looked.shape[1]):
-                for w in range(4):
-                    set_i, some_i, every_i = looked[i, n, 0, w], looked[i, n, 1, w], looked[i, n, 2, w]
-                    set_k, some_k, every_k = looked[k, n, 0, w], looked[k, n, 1, w], looked[k, n, 2, w]
-                    word = (set_i & ~some_k) | (~set_i & every_k) | (set_k & ~some_i) | (~set_k & every_i)
-                    word &= _INSIDE[w]
-                    # How many bits are set (Warren, Hacker's Delight, 5-1).
-                    word -= (word >> np.uint64(1)) & np.uint64(0x5555555555555555)
-                    twos = np.uint64(0x3333333333333333)
-                    word = (word & twos) + ((word >> np.uint64(2)) & twos)
-                    word = (word + (word >> np.uint64(4))) & np.uint64(0x0F0F0F0F0F0F0F0F)
-                    count += np.int64((word * np.uint64(0x0101010101010101)) >> np.uint64(56))
-                if count > most:
-                    break
-            if count <= most:
+            most = int(np.ceil(least * whole)) - 1
+            if _differing(looked[i], looked[k], _RIM, most) <= most:
                 older, newer = min(group[i], group[k]), max(group[i], group[k])
                 for other in range(i + 1):
                     if group[other] == newer:
@@ -158,31 +140,59 @@ def find_alike(moved: I64, looked: U64, whose: I64, least: float, group: I64) ->
 def _look(masks: U64) -> tuple[I64, U64]:
     """Of masks (n, 256, 4), in the rows looked at: by how many cells each would differ from itself (n,), and
     (n, 85, 3, 4) words: what is set, what is or has a neighbour that is, and what is and has none that is not."""
-    rows = np.arange(1, _LAST, _APART)
-    some, every = np.zeros((len(masks), len(rows), 4), np.uint64), np.full((len(masks), len(rows), 4), ~np.uint64(0))
-    for step in (-1, 0, 1):
-        near = masks[:, rows + step]
-        west, east = _moved_east(near, 1), near >> np.uint64(1)
-        east[..., :-1] |= near[..., 1:] << np.uint64(63)
-        some |= near | west | east
-        every &= near & west & east
-    looked = np.stack([masks[:, rows], some, every], axis=2)
-    moved = _differing(looked[:, 1:], looked[:, :-1], _RIM) + _differing(
-        looked, _moved_east(looked, _APART), _RIM + _APART
-    )
-    return moved // 2, looked
+    looked = np.empty((len(masks), len(range(1, _LAST, _APART)), 3, 4), np.uint64)
+    moved, east = np.empty(len(masks), np.int64), np.empty_like(looked[0])
+    _look_at(masks, looked, moved, east)
+    return moved, looked
 
 
-def _moved_east(words: U64, by: int) -> U64:
-    """Rows of words (..., 4), moved by so many columns to the east."""
-    out = words << np.uint64(by)
-    out[..., 1:] |= words[..., :-1] >> np.uint64(64 - by)
-    return out
+@kernel
+def _look_at(masks: U64, looked: U64, moved: I64, east: U64) -> None:
+    """:func:`_look` into ``looked`` and ``moved``; ``east`` (85, 3, 4): scratch."""
+    for i in range(len(masks)):
+        for n in range(looked.shape[1]):
+            row = 1 + _APART * n
+            for w in range(4):
+                some, every = np.uint64(0), ~np.uint64(0)
+                for r in range(row - 1, row + 2):
+                    here, west = masks[i, r, w], _moved_east(masks[i, r], w, 1)
+                    right = (here >> np.uint64(1)) | (masks[i, r, w + 1] << np.uint64(63) if w < 3 else np.uint64(0))
+                    some |= here | west | right
+                    every &= here & west & right
+                looked[i, n, 0, w], looked[i, n, 1, w], looked[i, n, 2, w] = masks[i, row, w], some, every
+            for plane in range(3):
+                for w in range(4):
+                    east[n, plane, w] = _moved_east(looked[i, n, plane], w, _APART)
+        north = _differing(looked[i, 1:], looked[i, :-1], _RIM, TILE_CELLS**2)
+        moved[i] = (north + _differing(looked[i], east, _RIM + _APART, TILE_CELLS**2)) // 2
 
 
-def _differing(a: U64, b: U64, rim: int) -> I64:
-    """(...) in how many cells two masks (..., rows, 3, 4) differ, but for ``rim`` columns on either side."""
-    set_a, some_a, every_a = np.moveaxis(a, -2, 0)
-    set_b, some_b, every_b = np.moveaxis(b, -2, 0)
-    words = (set_a & ~some_b) | (~set_a & every_b) | (set_b & ~some_a) | (~set_b & every_a)
-    return np.bitwise_count(words & _inside(rim)).sum(axis=(-1, -2), dtype=np.int64)
+@inlined
+def _moved_east(row: U64, w: int, by: int) -> np.uint64:
+    """Word ``w`` of a row of words (4,) that is moved by so many columns to the east."""
+    carried = row[w - 1] >> np.uint64(64 - by) if w else np.uint64(0)
+    return (row[w] << np.uint64(by)) | carried
+
+
+@kernel
+def _differing(a: U64, b: U64, rim: int, most: int) -> int:
+    """In how many cells two masks (rows, 3, 4) differ, but for ``rim`` columns on either side; once they are more than
+    ``most``, some number above that."""
+    count = np.int64(0)
+    for n in range(len(a)):
+        for w in range(4):
+            word = (a[n, 0, w] & ~b[n, 1, w]) | (~a[n, 0, w] & b[n, 2, w])
+            word |= (b[n, 0, w] & ~a[n, 1, w]) | (~b[n, 0, w] & a[n, 2, w])
+            if w == 0:
+                word &= ~np.uint64(0) << np.uint64(rim)
+            if w == 3:
+                word &= ~np.uint64(0) >> np.uint64(rim)
+            # How many bits are set (Warren, Hacker's Delight, 5-1).
+            word -= (word >> np.uint64(1)) & np.uint64(0x5555555555555555)
+            twos = np.uint64(0x3333333333333333)
+            word = (word & twos) + ((word >> np.uint64(2)) & twos)
+            word = (word + (word >> np.uint64(4))) & np.uint64(0x0F0F0F0F0F0F0F0F)
+            count += np.int64((word * np.uint64(0x0101010101010101)) >> np.uint64(56))
+        if count > most:
+            break
+    return int(count)

@@ -20,7 +20,7 @@ from mapvote.core.grid import CELLS, TILE_CELLS, Grid, Lattice, TileIndex
 from mapvote.core.tile import Tile
 from mapvote.core.types import F32, I32, I64, N_STATES, NO_VOTE, U8, Bool, CellState, MapvoteError
 from mapvote.core.voting import VOTE_UNIT, add_tally, decide_cells, tally_of
-from mapvote.fusion.copies import Copy, liars_among, originals
+from mapvote.fusion.copies import Copy, liars_among, originals, without
 from mapvote.fusion.deletions import words_gone
 from mapvote.fusion.edit import add_points, delete_points
 from mapvote.fusion.odds import Odds, agreed_odds
@@ -117,6 +117,8 @@ class Heard:
     voted: U8 | None = None
     """(256, 256) as the points are edited, where that differs from ``states``: where noise spilled over
     (fusion/spilled.py)."""
+    past: History | None = None
+    """The votes of a longer time, without copies, read when first asked for; None if there is no history."""
 
     @property
     def edits(self) -> U8:
@@ -136,20 +138,14 @@ def fuse_tile(
     tile, give :meth:`mapvote.core.tile.Tile.empty`. ``version``: of the map that this makes; the edited tile remembers
     it. The rest as in :func:`decide_tile`.
     """
-    past = None if history is None else _once(history, settings)
-    heard = decide_tile(tile, drives, rule, settings, past)
+    heard = decide_tile(tile, drives, rule, settings, history)
     edited, added, deleted = _edit(tile, heard.votes, heard.edits, heard.quorum)
     if edited is not tile:
         memory = changed_in(version, tile, edited)
-        runs = None if past is None else (past, settings.min_votes)
+        runs = None if heard.past is None else (heard.past, settings.min_votes)
         edited = edited.but(memory=remembered(memory, tile, edited, heard.votes, heard.edits, runs))
     names, why = frozenset(vote.vehicle for vote in heard.votes), (heard.copies, heard.odds, heard.pending)
     return Decision(heard.states, heard.tally, len(names), added, deleted, *why, names), edited
-
-
-def _once(history: History, settings: FuseSettings) -> History:
-    """``history`` without copies, read when it is first asked for and kept."""
-    return cache(lambda: originals(history(), settings)[0])
 
 
 def decide_tile(
@@ -159,22 +155,23 @@ def decide_tile(
 
     ``drives`` are the votes that count on this tile (``select`` in fusion/tile_vote.py, ``unspent`` in
     fusion/spent.py), any order. ``history``: asked, where something comes and goes, for all votes that count of the
-    last ``history_days`` (fusion/persistence.py), without copies; without it all is of one moment, and everything new
-    is there to stay.
+    last ``history_days`` (fusion/persistence.py); without it all is of one moment, and everything new is there to stay.
     """
-    drives, copies = originals(list(drives), settings)
+    given = list(drives)
+    drives, copies = originals(given, settings)
+    past = None if history is None else cache(partial(_originals_of, history, given, copies, settings))
     silenced = liars_among(copies, drives)
     votes, states, tally, quorum = hear(one_each(drives, tile.window), rule, settings, silenced, tile)
     if any(vote.states is None for vote in votes):
-        return Heard(votes, states, tally, quorum)
+        return Heard(votes, states, tally, quorum, past=past)
     names = {vote.vehicle for vote in votes}
     spoken = [drive for drive in drives if drive.vehicle in names]
     states = turned(states, spoken, tally, quorum) if rule == "columns" else states
     denied = passing = None
-    if history is not None:
+    if past is not None:
         denied = denied_last(states, tile.memory, spoken)
         doubt = doubtful(states, tile.memory, settings).any()
-        passing = temporary(states, tile, history(), settings) if doubt else np.zeros_like(denied)
+        passing = temporary(states, tile, past(), settings) if doubt else np.zeros_like(denied)
         states = states.copy()
         states[denied | passing] = int(CellState.UNDETERMINED)
     odds = agreed_odds(votes, states, quorum)
@@ -183,7 +180,17 @@ def decide_tile(
         states = states.copy()
         states.reshape(-1)[pending.cells] = int(CellState.UNDETERMINED)
     told = without_spilled(states, tile, votes) if len(odds.cells) else states  # of surfaces' ballots alone
-    return Heard(votes, told, tally, quorum, denied, passing, copies, odds, pending, voted=states)
+    return Heard(votes, told, tally, quorum, denied, passing, copies, odds, pending, voted=states, past=past)
+
+
+def _originals_of(
+    history: History, drives: Sequence[TileVote], copies: Sequence[Copy], settings: FuseSettings
+) -> Sequence[TileVote]:
+    """The votes that ``history`` gives, without copies. Where they are those of the ``drives``, their ``copies`` are
+    known."""
+    votes = history()
+    same = {(vote.vehicle, vote.digest) for vote in votes} == {(drive.vehicle, drive.digest) for drive in drives}
+    return without(copies, votes) if same else originals(votes, settings)[0]
 
 
 def _edit(tile: Tile, votes: Sequence[TileVote], states: U8, quorum: int) -> tuple[Tile, int, int]:

@@ -20,7 +20,6 @@ from mapvote.core.grid import TILE_CELLS, TileIndex
 from mapvote.core.tile import Tile
 from mapvote.core.types import NO_VOTE, U8, CellState, MapvoteError
 from mapvote.core.voting import VOTE_UNIT, decide
-from mapvote.fusion.copies import originals
 from mapvote.fusion.fuse import Heard, decide_tile, rule_of
 from mapvote.fusion.persistence import expected_days
 from mapvote.fusion.probability import alike_beside, change_probability
@@ -182,7 +181,7 @@ def _as_of_now(connection: sa.Connection, tile: Tile, cell: tuple[int, int], ask
     policy, counting = asked.policy, [one.vote for one in judged if one.vote is not None]
 
     def history() -> Sequence[TileVote]:
-        return originals(recent_votes(connection, tile, asked), policy.fuse)[0]
+        return recent_votes(connection, tile, asked)
 
     past = history if policy.round.stage == "two-stage" else None
     return _Now(
