@@ -33,7 +33,6 @@ TESTS = {
     "fusion/tile_vote.py": "fusion/test_tile_vote.py fusion/test_fuse.py",
     "fusion/edit.py": "fusion/test_edit.py fusion/test_fuse.py",
     "fusion/persistence.py": "fusion/test_persistence.py",
-    "fusion/deletions.py": "fusion/test_deletions.py",
     "detection/paper.py": "detection/test_paper.py",
     "detection/evidence.py": "detection",
     "detection/surface_rules.py": "detection",

@@ -2,7 +2,7 @@
 
     python benchmarks/probability.py CACHE [--fit SCENE:SEED[:SCANS] ...] [--check ...] [--out results/probability.csv]
 
-One command: drives what CACHE lacks, prints the numbers that detection/confidence.py and fusion/probability.py hold
+One command: drives what CACHE lacks, prints the numbers that detection/confidence.py and fusion/loss_budget.py hold
 (a test does not: paste them), then what docs/measurements/probability.md shows, of the scenes that nothing was fitted
 to: ECE, Brier score and bins, beside those of the votes alone, and for each budget of false deletions what waits, what
 goes, what was promised of that and what came of it. ``--as-is`` fits nothing and checks the numbers that the program
@@ -26,7 +26,7 @@ from mapvote.config import FuseSettings, Settings
 from mapvote.core.grid import CELLS
 from mapvote.core.types import F64, I64, Bool, CellState
 from mapvote.detection import confidence
-from mapvote.fusion import probability
+from mapvote.fusion import loss_budget
 from mapvote.fusion.offline import update_map
 from mapvote.vehicle import vote_drive
 from mapvote_lab.evaluation.experiments.attacks import ATTACKS
@@ -86,17 +86,17 @@ def fit(streets: Sequence[str], cache: Path) -> None:
     for name, state in KINDS.items():
         mine = taken(said, said.states == state)
         told = np.column_stack([np.ones(len(mine.states)), mine.odds / STEPS])
-        curve = told_as("fusion/probability.py", f"{name}, said", fitted(told, mine.true, evenly(mine.scene)))
-        setattr(probability, f"_{name.upper()}_SAID", curve)
+        curve = told_as("fusion/loss_budget.py", f"{name}, said", fitted(told, mine.true, evenly(mine.scene)))
+        setattr(loss_budget, f"_{name.upper()}_SAID", curve)
     emptied = taken(every, (every.states == CellState.CHANGED_EMPTY) & (every.odds != UNSAID))
-    row = np.minimum(emptied.standing, probability.STANDING) / probability.STANDING
+    row = np.minimum(emptied.standing, loss_budget.STANDING) / loss_budget.STANDING
     told = np.column_stack([np.ones(len(row)), row, emptied.odds / STEPS])
     ones = np.ones(len(told))
     print(f"{emptied.harm.sum()} of {len(told)} emptied cells of {len(parts)} tiles and rounds lost what stands")
     alone_curve = fitted(told[:, :2], emptied.harm, ones, RIDGE)
-    probability._FALSE_DELETION = told_as("fusion/probability.py", "false deletion", alone_curve)
+    loss_budget._FALSE_DELETION = told_as("fusion/loss_budget.py", "false deletion", alone_curve)
     curve = fitted(told, emptied.harm, ones, RIDGE)
-    probability._FALSE_DELETION_SAID = told_as("fusion/probability.py", "false deletion, said", curve)
+    loss_budget._FALSE_DELETION_SAID = told_as("fusion/loss_budget.py", "false deletion, said", curve)
 
 
 def told_as(where: str, name: str, curve: F64) -> F64:
@@ -186,7 +186,7 @@ def recorded(folder: Path, block: int) -> None:
         for name, state in KINDS.items():
             mine = taken(cells, cells.states == state)
             known = mine.states, mine.votes, mine.against, mine.beside
-            means = [probability.change_probability(*known, odds).mean() for odds in (mine.odds, None) if len(known[0])]
+            means = [loss_budget.change_probability(*known, odds).mean() for odds in (mine.odds, None) if len(known[0])]
             said = f", said {means[0]:.2f}, by votes {means[1]:.2f}" if means else ""
             told.append(f"{len(known[0])} {name}{said}")
         print(f"{folder.name}, blocks of {block} | {budget:g} | {' | '.join(told)}")
@@ -195,8 +195,8 @@ def recorded(folder: Path, block: int) -> None:
 def reliability_of(scene: str, kind: str, cells: Cells) -> list[dict[str, object]]:
     """A row a bin, of decided cells of one kind."""
     known = cells.states, cells.votes, cells.against, cells.beside
-    found = binned(probability.change_probability(*known, cells.odds), cells.true)
-    before = binned(probability.change_probability(*known), cells.true)
+    found = binned(loss_budget.change_probability(*known, cells.odds), cells.true)
+    before = binned(loss_budget.change_probability(*known), cells.true)
     share = float(cells.true.mean())
     bins = [f"{p:.2f} -> {t:.2f} ({n})" for p, t, n in zip(found.predicted, found.true, found.cells, strict=True) if n]
     errors = f"{found.calibration_error:.3f}, {before.calibration_error:.3f}"
@@ -215,7 +215,7 @@ def by_range(name: str, cells: Cells) -> list[dict[str, object]]:
     """A row of decided cells of one kind at one height or distance; none of none."""
     if not len(cells.states):
         return []
-    said = probability.change_probability(cells.states, cells.votes, cells.against, cells.beside, cells.odds)
+    said = loss_budget.change_probability(cells.states, cells.votes, cells.against, cells.beside, cells.odds)
     found, true = binned(said, cells.true), float(cells.true.mean())
     print(f"{name} | {len(said)} | {true:.3f} | {said.mean():.3f} | {found.calibration_error:.3f} | {found.brier:.3f}")
     whole = {"scene": "all", "kind": name, "cells": len(said), "ece": found.calibration_error, "brier": found.brier}
@@ -224,7 +224,7 @@ def by_range(name: str, cells: Cells) -> list[dict[str, object]]:
 
 def within(budget: float, scene: str, cells: Cells) -> dict[str, object]:
     """What a budget lets go of the cells that are emptied, what was promised of these, and what came of it."""
-    said = probability.false_deletion_probability(cells.standing, cells.odds)
+    said = loss_budget.false_deletion_probability(cells.standing, cells.odds)
     goes = said <= budget
     promised = float(said[goes].mean()) if goes.any() else 0.0
     lost, n = int(cells.harm[goes].sum()), int(goes.sum())

@@ -13,8 +13,7 @@ import pytest
 import mapvote
 from mapvote.core.ground_growing import _grow
 from mapvote.core.voting import count_states
-from mapvote.fusion.copies import find_alike
-from mapvote.fusion.outliers import contradicts
+from mapvote.fusion.distrust import contradicts, find_alike
 from mapvote.localisation.ndt_solver import align
 from mapvote.perception.range_image import look
 from mapvote.warmup import warm_up

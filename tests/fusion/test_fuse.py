@@ -18,7 +18,7 @@ from mapvote.core.types import NO_VOTE, U8, CellState
 from mapvote.core.voting import VOTE_UNIT
 from mapvote.fusion.fuse import Rule, count, fuse_tile, states_over
 from mapvote.fusion.sparse_columns import Words
-from mapvote.fusion.tile_vote import DAY_NS, TileVote, fold, restrict, select
+from mapvote.fusion.tile_vote import DAY_NS, TileVote, fold, newest_votes, restrict
 
 LATTICE = Lattice()
 GRID = LATTICE.tile((0, 0))
@@ -218,9 +218,9 @@ def test_planes_follow_the_drive_that_speaks_for_the_cell() -> None:
 def test_window_in_vehicles_and_days() -> None:
     votes = [TileVote(f"v{i}", i * DAY_NS, "x", states=states_plane()) for i in range(10)]
     votes.append(TileVote("old", -40 * DAY_NS, "x", states=states_plane()))
-    chosen = select(votes, FuseSettings(latest_vehicles=3, max_age_days=30))
+    chosen = newest_votes(votes, FuseSettings(latest_vehicles=3, max_age_days=30))
     assert [v.vehicle for v in chosen] == ["v7", "v8", "v9"]
-    assert "old" not in {v.vehicle for v in select(votes, FuseSettings(latest_vehicles=99, max_age_days=30))}
+    assert "old" not in {v.vehicle for v in newest_votes(votes, FuseSettings(latest_vehicles=99, max_age_days=30))}
 
 
 def test_silenced_cells_count_for_nothing() -> None:

@@ -16,7 +16,7 @@ from mapvote.config import FuseSettings
 from mapvote.core.memory import Memory
 from mapvote.core.tile import Tile
 from mapvote.core.types import Bool, CellState
-from mapvote.fusion.fuse import fuse_tile
+from mapvote.fusion.fuse import fuse_tile, unspent
 from mapvote.fusion.persistence import (
     DAY_S,
     ages_days,
@@ -27,8 +27,7 @@ from mapvote.fusion.persistence import (
     remembered,
     temporary,
 )
-from mapvote.fusion.spent import unspent
-from mapvote.fusion.tile_vote import DAY_NS, TileVote, select
+from mapvote.fusion.tile_vote import DAY_NS, TileVote, newest_votes
 
 UO, UE, CO, CE, UN = (int(state) for state in CellState)
 CELL, OTHER = (10, 10), (200, 3)
@@ -267,7 +266,7 @@ def entered_after(
         seen.append(replace(drive(day, says, f"v{len(seen) % 3}"), version=version, new_points=points))
         oldest = seen[-1].end_ns - history_days(settings) * DAY_NS
         seen = [vote for vote in seen if vote.end_ns >= oldest]
-        votes, past = ([unspent(vote, tile) for vote in some] for some in (select(seen, settings), seen))
+        votes, past = ([unspent(vote, tile) for vote in some] for some in (newest_votes(seen, settings), seen))
         after = fuse_tile(tile, votes, "paper", settings, version + 1, partial(list, past))[1]
         if after is not tile:
             tile, version = after, version + 1

@@ -14,8 +14,8 @@ from mapvote.core.grid import CELL_SIZE
 from mapvote.core.memory import Memory
 from mapvote.core.tile import Tile
 from mapvote.core.types import NO_VOTE, CellState
+from mapvote.fusion.fuse import changed_in, differing, unspent
 from mapvote.fusion.sparse_columns import Words
-from mapvote.fusion.spent import changed_in, differing, unspent
 from mapvote.fusion.tile_vote import TileVote
 
 CE = int(CellState.CHANGED_EMPTY)

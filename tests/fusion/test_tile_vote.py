@@ -15,7 +15,7 @@ from mapvote.config import FuseSettings
 from mapvote.core.grid import TILE_CELLS, Lattice
 from mapvote.core.types import N_STATES, NO_VOTE, CellState
 from mapvote.fusion.sparse_columns import Words, nothing_reached
-from mapvote.fusion.tile_vote import DAY_NS, TileVote, fold, one_each, restrict, select
+from mapvote.fusion.tile_vote import DAY_NS, TileVote, fold, newest_votes, one_each, restrict
 
 UO, UE, CO, CE, UN = CellState
 WINDOW = Lattice().tile((0, 0))
@@ -37,24 +37,24 @@ def counted(cells: dict[tuple[int, int], list[int]]) -> TileVote:
 def test_a_drive_as_old_as_the_window_still_speaks_and_one_a_moment_older_does_not() -> None:
     policy = FuseSettings(max_age_days=2)
     votes = [drive("new", 3 * DAY_NS, {}), drive("edge", DAY_NS, {}), drive("old", DAY_NS - 1, {})]
-    assert [v.vehicle for v in select(votes, policy)] == ["new", "edge"]
-    assert select([], policy) == []
+    assert [v.vehicle for v in newest_votes(votes, policy)] == ["new", "edge"]
+    assert newest_votes([], policy) == []
 
 
 def test_the_window_is_counted_from_the_newest_drive_on_the_tile_not_from_today() -> None:
     policy = FuseSettings(max_age_days=1)
-    assert len(select([drive("a", 10, {}), drive("b", 20, {})], policy)) == 2
+    assert len(newest_votes([drive("a", 10, {}), drive("b", 20, {})], policy)) == 2
 
 
 def test_of_too_many_vehicles_those_that_passed_last_speak_with_all_their_drives() -> None:
     policy = FuseSettings(latest_vehicles=2)
     votes = [drive("a", 1, {}), drive("b", 2, {}), drive("c", 3, {}), drive("a", 4, {})]
-    assert sorted((v.vehicle, v.end_ns) for v in select(votes, policy)) == [("a", 1), ("a", 4), ("c", 3)]
+    assert sorted((v.vehicle, v.end_ns) for v in newest_votes(votes, policy)) == [("a", 1), ("a", 4), ("c", 3)]
 
 
 def test_of_vehicles_that_passed_at_the_same_moment_the_later_name_goes_first() -> None:
     votes = [drive(name, 5, {}) for name in "bac"]
-    assert sorted(v.vehicle for v in select(votes, FuseSettings(latest_vehicles=2))) == ["b", "c"]
+    assert sorted(v.vehicle for v in newest_votes(votes, FuseSettings(latest_vehicles=2))) == ["b", "c"]
 
 
 @pytest.mark.parametrize(

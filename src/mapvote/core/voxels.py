@@ -20,7 +20,7 @@ _MIDDLE = 1 << 20
 
 
 @inlined
-def packed(ix: np.int64, iy: np.int64, iz: np.int64) -> np.int64:
+def packed_key(ix: np.int64, iy: np.int64, iz: np.int64) -> np.int64:
     """The key of a voxel: equal keys, same voxel; ascending by x, then y, then z. Indices (counted from -2^20) >= 0."""
     return (ix << 42) | (iy << 21) | iz
 
@@ -29,7 +29,7 @@ def packed(ix: np.int64, iy: np.int64, iz: np.int64) -> np.int64:
 def voxel_key(x: float, y: float, z: float, size: float) -> np.int64:
     """The key of the voxel of side ``size`` that holds (x, y, z)."""
     ix, iy, iz = np.floor(x / size), np.floor(y / size), np.floor(z / size)
-    return packed(np.int64(ix) + _MIDDLE, np.int64(iy) + _MIDDLE, np.int64(iz) + _MIDDLE)
+    return packed_key(np.int64(ix) + _MIDDLE, np.int64(iy) + _MIDDLE, np.int64(iz) + _MIDDLE)
 
 
 @inlined
@@ -194,7 +194,7 @@ def _enter_keys(points: F64, x0: float, y0: float, size: float, keys: I64) -> No
 
 
 def voxel_keys(points: NDArray[np.floating], x0: float, y0: float, size: float = CELL_SIZE) -> I64:
-    """(n,) int64 key of each point's voxel on the lattice, see :func:`packed`. Voxel layers start at z = 0."""
+    """(n,) int64 key of each point's voxel on the lattice, see :func:`packed_key`. Voxel layers start at z = 0."""
     keys = np.empty(len(points), dtype=np.int64)
     _enter_keys(np.array(points, dtype=np.float64, order="C"), x0, y0, size, keys)
     return keys
@@ -213,7 +213,7 @@ def _thin_keys(points: NDArray[np.float32], every: int, size: float, keys: I64) 
         i = j * step
         # The middle is added first: cutting off is then rounding down, and quicker than floor.
         ix, iy = np.int32(points[i, 0] * scale + middle), np.int32(points[i, 1] * scale + middle)
-        keys[j] = packed(np.int64(ix), np.int64(iy), np.int64(np.int32(points[i, 2] * scale + middle)))
+        keys[j] = packed_key(np.int64(ix), np.int64(iy), np.int64(np.int32(points[i, 2] * scale + middle)))
 
 
 def thin(points: NDArray[np.floating], size: float, every: int = 1) -> I64:

@@ -1,14 +1,24 @@
-"""Delete and add points of one tile (paper IV). Everything else stays bit-identical."""
+"""How a tile's points come and go: which voxels lose their points, and which of the points offered are added.
+
+A cell that was emptied loses all that its voters saw gone; a cell that stands loses what is left of gone things. In a
+cell that stands one vehicle may have seen past what another hit: a twig, a ledge, the edge of a wall. So half of the
+vehicles can take only what stands apart. What touches something that stays goes if more than two thirds say so, those
+among them who have the whole cell empty."""
 
 from __future__ import annotations
 
-import numpy as np
+from collections.abc import Sequence
 
-from mapvote.core.columns import EVERY_BIT, column_bits
-from mapvote.core.grid import CELL_SIZE, CELLS
+import numpy as np
+from numpy.typing import NDArray
+
+from mapvote.core.columns import EVERY_BIT, column_bits, rebased
+from mapvote.core.grid import CELL_SIZE, CELLS, TILE_CELLS
 from mapvote.core.kernel import inlined, kernel
 from mapvote.core.tile import Tile
-from mapvote.core.types import F32, I32, I64, U8, U64, Bool
+from mapvote.core.types import F32, I32, I64, U8, U64, Bool, CellState
+from mapvote.fusion.sparse_columns import Words, counted, nothing_reached, words_of
+from mapvote.fusion.tile_vote import TileVote
 
 
 def delete_points(tile: Tile, gone: U64) -> tuple[Tile, int]:
@@ -117,3 +127,63 @@ def _before(points: F32, intensity: U8, one: int, other: int) -> bool:
         if points[one, k] != points[other, k]:
             return points[one, k] < points[other, k]
     return intensity[one] < intensity[other]
+
+
+def words_gone(votes: Sequence[TileVote], states: U8, quorum: int, tile: Tile) -> U64 | None:
+    """(256, 256) delete mask of ``tile``, None if there is nothing to delete; ``states`` (256, 256) as decided.
+
+    In cells decided changed-empty, the voxels that ``quorum`` voters for it mark. In cells decided unchanged-occupied
+    see :func:`_remnants`.
+    """
+    gone, emptied = None, Words.whole(states == int(CellState.CHANGED_EMPTY))
+    if len(emptied.cells):
+        reached = nothing_reached(quorum, len(emptied.cells))
+        for vote in votes:
+            vote.mark_deleted(emptied, reached)
+        gone = np.zeros(states.shape, dtype=np.uint64)
+        gone.reshape(-1)[emptied.cells] = reached[-1]
+    stands = states == int(CellState.UNCHANGED_OCCUPIED)
+    left, standing = [vote.remnants(states) for vote in votes], Words.whole(stands)
+    # A mask in one stage only tells what would go.
+    emptied_by = [vote.deletes(standing) if vote.tally is None else Words.none() for vote in votes]
+    if sum(len(a.cells) + len(b.cells) > 0 for a, b in zip(left, emptied_by, strict=True)) < quorum:
+        return gone
+    remnants = _remnants(left, emptied_by, votes, states != int(CellState.CHANGED_EMPTY), quorum, tile)
+    gone = np.zeros(states.shape, dtype=np.uint64) if gone is None else gone
+    gone.reshape(-1)[remnants.cells] |= remnants.words
+    return gone
+
+
+def _remnants(
+    left: Sequence[Words],
+    emptied_by: Sequence[Words],
+    votes: Sequence[TileVote],
+    stays_in: Bool,
+    quorum: int,
+    tile: Tile,
+) -> Words:
+    """What of cells that stand goes: the voxels that ``quorum`` vehicles or more, and more than half of those that
+    determined the cell, say are ``left`` of something, if they touch (26) nothing of the map that stays; and those that
+    more than two thirds, two at least, say are left or gone with the whole cell. What lies beyond the tile's edge stays
+    for all that is known here."""
+    cells = np.unique(np.concatenate([found.cells for found in (*left, *emptied_by)]))
+    halves = counted(cells, left)
+    marks = halves + counted(cells, emptied_by)
+    determined = np.sum([vote.determined(cells) for vote in votes], axis=0)[:, None]
+    most = words_of((halves >= quorum) & (2 * halves > determined))
+    nearly_all = words_of((marks >= max(quorum, 2)) & (3 * marks > 2 * determined))
+    stays = np.where(stays_in, tile.obstacle_words, np.uint64(0))
+    stays.reshape(-1)[cells] &= ~(most | nearly_all)
+    return Words(cells, nearly_all | (most & ~_touched(cells, stays, tile.base)))
+
+
+def _touched(cells: NDArray[np.intp], stays: U64, base: I32) -> U64:
+    """(n,) the voxels of flat ``cells`` that touch one of ``stays``, or the tile's edge."""
+    rows, cols = np.divmod(cells, TILE_CELLS)
+    edge = (rows == 0) | (cols == 0) | (rows == TILE_CELLS - 1) | (cols == TILE_CELLS - 1)
+    near = np.zeros(len(cells), dtype=np.uint64)
+    for step in (TILE_CELLS * i + j for i in (-1, 0, 1) for j in (-1, 0, 1)):
+        beside = np.clip(cells + step, 0, CELLS - 1)  # beyond the tile only for cells at its edge
+        near |= rebased(stays.reshape(-1)[beside], base.reshape(-1)[beside] - base.reshape(-1)[cells])
+    one = np.uint64(1)
+    return np.where(edge, EVERY_BIT, near | (near << one) | (near >> one))

@@ -1,8 +1,8 @@
 """Ballots of a tile -> decisions -> edited tile (paper IV). Pure: no files, no database, no clock.
 
 The order in which votes are given never matters: tallies are integer sums, and of several points for one voxel the
-same one is always taken.
-"""
+same one is always taken. A vote is spent once a version has changed its cell. That the cell looks as it did is no test:
+what came and went leaves it bit for bit as at first, and the votes that brought it would bring it again."""
 
 from __future__ import annotations
 
@@ -17,21 +17,19 @@ from numpy.typing import NDArray
 from mapvote.config import FuseSettings
 from mapvote.core.cells import flat_cells
 from mapvote.core.grid import CELLS, TILE_CELLS, Grid, Lattice, TileIndex
+from mapvote.core.kernel import kernel
+from mapvote.core.memory import Memory
 from mapvote.core.tile import Tile
-from mapvote.core.types import F32, I32, I64, N_STATES, NO_VOTE, U8, Bool, CellState, MapvoteError
+from mapvote.core.types import F32, I32, I64, N_STATES, NO_VOTE, U8, Bool, CellState, MapvoteError, read_only
 from mapvote.core.voting import VOTE_UNIT, add_tally, decide_cells, tally_of
-from mapvote.fusion.copies import Copy, liars_among, originals, without
-from mapvote.fusion.deletions import words_gone
-from mapvote.fusion.edit import add_points, delete_points
-from mapvote.fusion.odds import Odds, agreed_odds
-from mapvote.fusion.outliers import contradictors, deniers
-from mapvote.fusion.pending import Pending, beyond_budget
+from mapvote.fusion.change_time import lately_changed
+from mapvote.fusion.distrust import Copy, contradictors, deniers, liars_among, originals, without
+from mapvote.fusion.edit import add_points, delete_points, words_gone
+from mapvote.fusion.loss_budget import Odds, PendingDeletions, agreed_odds, beyond_budget
+from mapvote.fusion.neighbour_noise import without_spilled
 from mapvote.fusion.persistence import denied_last, doubtful, remembered, temporary
 from mapvote.fusion.sparse_columns import nothing_reached
-from mapvote.fusion.spent import changed_in
-from mapvote.fusion.spilled import without_spilled
-from mapvote.fusion.tile_vote import TileVote, one_each
-from mapvote.fusion.turning import turned
+from mapvote.fusion.tile_vote import TileVote, one_each, silenced
 
 Rule = Literal["paper", "columns"]
 """How votes are counted, see :func:`count`; ``columns``, after the ballots that first were, those of surfaces too."""
@@ -45,7 +43,7 @@ class Decision:
 
     states: U8
     """(256, 256) CellState or NO_VOTE; where noise spilled over what the world is, not what was voted
-    (fusion/spilled.py)."""
+    (fusion/neighbour_noise.py)."""
     tally: NDArray[Any]
     """(256, 256, 5) in VOTE_UNITs, see :func:`count`."""
     vehicles: int
@@ -57,7 +55,7 @@ class Decision:
     """Drives that are not heard because another vehicle's is, that is alike."""
     odds: Odds = field(default_factory=Odds.none)
     """How sure of the changed cells those are who voted for them, see :func:`agreed_odds`."""
-    pending: Pending = field(default_factory=Pending.none)
+    pending: PendingDeletions = field(default_factory=PendingDeletions.none)
     """Deletions that wait because they are beyond the budget; undetermined among the states."""
     heard: Collection[str] = ()
     """The vehicles whose votes were counted."""
@@ -113,10 +111,10 @@ class Heard:
     copies: Sequence[Copy] = ()
     odds: Odds = field(default_factory=Odds.none)
     """See :class:`Decision`."""
-    pending: Pending = field(default_factory=Pending.none)
+    pending: PendingDeletions = field(default_factory=PendingDeletions.none)
     voted: U8 | None = None
     """(256, 256) as the points are edited, where that differs from ``states``: where noise spilled over
-    (fusion/spilled.py)."""
+    (fusion/neighbour_noise.py)."""
     past: History | None = None
     """The votes of a longer time, without copies, read when first asked for; None if there is no history."""
 
@@ -153,8 +151,8 @@ def decide_tile(
 ) -> Heard:
     """What the votes decide: counted, then in the order of time, then within the budget of false deletions.
 
-    ``drives`` are the votes that count on this tile (``select`` in fusion/tile_vote.py, ``unspent`` in
-    fusion/spent.py), any order. ``history``: asked, where something comes and goes, for all votes that count of the
+    ``drives`` are the votes that count on this tile (``newest_votes`` in fusion/tile_vote.py, ``unspent`` in
+    fusion/fuse.py), any order. ``history``: asked, where something comes and goes, for all votes that count of the
     last ``history_days`` (fusion/persistence.py); without it all is of one moment, and everything new is there to stay.
     """
     given = list(drives)
@@ -166,7 +164,7 @@ def decide_tile(
         return Heard(votes, states, tally, quorum, past=past)
     names = {vote.vehicle for vote in votes}
     spoken = [drive for drive in drives if drive.vehicle in names]
-    states = turned(states, spoken, tally, quorum) if rule == "columns" else states
+    states = lately_changed(states, spoken, tally, quorum) if rule == "columns" else states
     denied = passing = None
     if past is not None:
         denied = denied_last(states, tile.memory, spoken)
@@ -274,3 +272,79 @@ def states_over(lattice: Lattice, decisions: Mapping[TileIndex, Decision]) -> tu
     for index, decision in decisions.items():
         states[lattice.tile(index).slices_in(grid)] = decision.states
     return states, grid
+
+
+def unspent(vote: TileVote, tile: Tile, misread: Mapping[int, Bool] | None = None) -> TileVote:
+    """The vote in the cells where it counts on ``tile``: those that have not changed since the version that its vehicle
+    drove with. ``misread``: by version, (256, 256) cells in which that version showed what no longer is history."""
+    spent = None if tile.memory is None else tile.memory.changed_after(vote.version)
+    wrong = None if misread is None else misread.get(vote.version)
+    if wrong is not None:
+        spent = np.union1d(np.flatnonzero(wrong), [] if spent is None else spent).astype(np.int64)
+    return vote if spent is None else silenced(vote, spent)
+
+
+def differing(a: Tile, b: Tile) -> Bool:
+    """(256, 256) cells in which two versions of a tile hold other points, or know other voxels to be free. Learning
+    that nothing is free is no difference."""
+    differ = _other_points(a, b).reshape(TILE_CELLS, TILE_CELLS)
+    if a.free is b.free:
+        return differ
+    nothing = np.uint64(0)
+    return np.asarray(differ | ((nothing if a.free is None else a.free) != (nothing if b.free is None else b.free)))
+
+
+def changed_in(version: int, before: Tile, after: Tile) -> Memory:
+    """What ``after`` remembers if ``version`` made it of ``before``."""
+    return (before.memory or Memory.none()).with_changed(np.flatnonzero(differing(before, after)), version)
+
+
+def _other_points(a: Tile, b: Tile) -> Bool:
+    """(65536,) cells that hold other points."""
+    if a.points is b.points:
+        return np.zeros(CELLS, dtype=np.bool_)
+    sides = [(tile.cells, np.ascontiguousarray(tile.points).view(np.uint32)) for tile in (a, b)]
+    missing = np.zeros(CELLS, dtype=np.uint8)
+    (cells_a, words_a), (cells_b, words_b) = sides
+    _out_of_step(cells_a, read_only(words_a), cells_b, read_only(words_b), missing)
+    differ, unsure = missing > 0, missing == 3
+    if unsure.any():
+        differ[unsure] = _other_sequences(*(_of_cells(*side, unsure) for side in sides))[unsure]
+    return np.asarray(differ)
+
+
+@kernel
+def _out_of_step(
+    cells_a: I64, words_a: NDArray[np.uint32], cells_b: I64, words_b: NDArray[np.uint32], missing: U8
+) -> None:
+    """Into ``missing`` (65536,), zeros, of which side a cell has points (n, 3) that do not follow in the other: 1 and
+    2, or 3 of both.
+
+    Each point of b is matched with at most one of a, in order. So cells of 0 hold the same points; those of 1 and 2
+    hold more on one side; and of an edit few are 3.
+    """
+    k = 0
+    for i in range(len(cells_a)):
+        if k < len(cells_b) and (
+            words_a[i, 0] == words_b[k, 0] and words_a[i, 1] == words_b[k, 1] and words_a[i, 2] == words_b[k, 2]
+        ):
+            k += 1
+        else:
+            missing[cells_a[i]] |= 1
+    for i in range(k, len(cells_b)):
+        missing[cells_b[i]] |= 2
+
+
+def _of_cells(cells: I64, words: NDArray[np.uint32], among: Bool) -> tuple[I64, NDArray[np.uint32]]:
+    """Cells (m,), ascending, and words (m, 3) of the points in the cells ``among`` (65536,), each cell's in order."""
+    mine = np.flatnonzero(among[cells])
+    mine = mine[np.argsort(cells[mine], kind="stable")]
+    return cells[mine], words[mine]
+
+
+def _other_sequences(a: tuple[I64, NDArray[np.uint32]], b: tuple[I64, NDArray[np.uint32]]) -> Bool:
+    """(65536,) which cells hold other points, or as many in another order; see :func:`_of_cells`."""
+    other = np.bincount(a[0], minlength=CELLS) != np.bincount(b[0], minlength=CELLS)
+    same_a, same_b = ~other[a[0]], ~other[b[0]]
+    other[a[0][same_a][(a[1][same_a] != b[1][same_b]).any(axis=1)]] = True
+    return np.asarray(other)

@@ -18,9 +18,8 @@ from mapvote.core.lazy_tiles import with_changed
 from mapvote.core.point_map import PointMap
 from mapvote.core.tile import Tile
 from mapvote.core.types import MapvoteError
-from mapvote.fusion.fuse import Decision, Rule, fuse_tile, rule_of
-from mapvote.fusion.spent import unspent
-from mapvote.fusion.tile_vote import TileVote, select
+from mapvote.fusion.fuse import Decision, Rule, fuse_tile, rule_of, unspent
+from mapvote.fusion.tile_vote import TileVote, newest_votes
 
 
 def check_round(ballots: Sequence[Ballot], point_map: PointMap) -> Rule:
@@ -87,7 +86,7 @@ def update_map(
     decisions: dict[TileIndex, Decision] = {}
     for index in sorted({tile.tile for ballot in ballots for tile in ballot.tiles}):
         tile = point_map.tile(index)
-        votes = [_unspent(vote, tile) for vote in select(_votes_on(index, unique), settings)]
+        votes = [_unspent(vote, tile) for vote in newest_votes(_votes_on(index, unique), settings)]
         decision, edited = fuse_tile(tile, votes, rule, settings, version)
         decisions[index] = decision
         if edited is not tile:

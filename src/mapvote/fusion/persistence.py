@@ -23,8 +23,8 @@ from mapvote.config import FuseSettings
 from mapvote.core.memory import Memory
 from mapvote.core.tile import Tile
 from mapvote.core.types import F64, I64, U8, U64, Bool, CellState
+from mapvote.fusion.change_time import said_in_order
 from mapvote.fusion.tile_vote import TileVote
-from mapvote.fusion.turning import in_order
 
 DAY_S = 86_400
 _CO, _UE, _CE = int(CellState.CHANGED_OCCUPIED), int(CellState.UNCHANGED_EMPTY), int(CellState.CHANGED_EMPTY)
@@ -104,7 +104,7 @@ def denied_last(states: U8, memory: Memory | None, drives: Sequence[TileVote]) -
         out.reshape(-1)[brought[states.reshape(-1)[brought] == _CE]] = True
     cells = np.flatnonzero(out)
     if len(cells):
-        said = in_order(drives, cells)[0]
+        said = said_in_order(drives, cells)[0]
         determined = said < _UN
         newest = len(said) - 1 - np.argmax(determined[::-1], axis=0)
         last = said[newest, np.arange(len(cells))]

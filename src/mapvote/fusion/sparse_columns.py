@@ -95,7 +95,7 @@ def counted(cells: NDArray[np.intp], marked: Sequence[Words]) -> I32:
     return counts
 
 
-def packed(bits: Bool) -> U64:
+def words_of(bits: Bool) -> U64:
     """(n,) words of bits (n, 64)."""
     return np.asarray((bits.astype(np.uint64) << _BITS).sum(axis=1, dtype=np.uint64))
 

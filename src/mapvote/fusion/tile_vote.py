@@ -18,13 +18,13 @@ from mapvote.config import FuseSettings
 from mapvote.core.cells import flat_cells
 from mapvote.core.grid import CELLS, TILE_CELLS, Grid
 from mapvote.core.types import F32, I64, N_STATES, NO_VOTE, U8, U16, U64, Bool, CellState, read_only
-from mapvote.fusion.odds import Odds, folded
+from mapvote.fusion.loss_budget import Odds, folded
 from mapvote.fusion.sparse_columns import Words, agreeing, mark, mark_among, mark_spoken, union
 
 DAY_NS = 86_400_000_000_000
 
 
-class Planes(Protocol):
+class PackedPlanes(Protocol):
     """A ballot's packed planes on one tile, as they travel (:class:`mapvote.codec.ballot.BallotTile`) and as a server
     stores them."""
 
@@ -79,7 +79,7 @@ class TileVote:
     @classmethod
     def unpack(
         cls,
-        planes: Planes,
+        planes: PackedPlanes,
         vehicle: str = "",
         end_ns: int = 0,
         digest: str = "",
@@ -215,7 +215,7 @@ class Dated(Protocol):
 D = TypeVar("D", bound=Dated)
 
 
-def select(votes: Iterable[D], settings: FuseSettings) -> list[D]:
+def newest_votes(votes: Iterable[D], settings: FuseSettings) -> list[D]:
     """The votes inside the window: drives within ``max_age_days`` of the newest on this tile, then those
     of the ``latest_vehicles`` vehicles that passed last. Ties between vehicles go to the later name."""
     votes = list(votes)

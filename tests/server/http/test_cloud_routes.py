@@ -20,7 +20,7 @@ from mapvote.codec.path import pack_path
 from mapvote.config import FuseSettings
 from mapvote.core.tile import Tile
 from mapvote.core.types import CellState
-from mapvote.fusion.probability import change_probability
+from mapvote.fusion.loss_budget import change_probability
 from mapvote.server.http.app import create_app
 from mapvote.server.store.admission import accept, examine
 from mapvote.server.store.publish import publish

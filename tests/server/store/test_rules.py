@@ -16,7 +16,7 @@ from hand_made import two_walls
 from histories import START_S, live
 from mapvote.config import FuseSettings
 from mapvote.fusion import fuse
-from mapvote.fusion.copies import Copy
+from mapvote.fusion.distrust import Copy
 from mapvote.fusion.tile_vote import TileVote
 from mapvote.server.store import schema, votes
 from mapvote.server.store.store import Store

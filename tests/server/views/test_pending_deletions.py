@@ -13,7 +13,7 @@ from mapvote.codec.ballot import encode
 from mapvote.codec.odds import MOST, STEPS
 from mapvote.config import FuseSettings
 from mapvote.core.types import CellState, MapvoteError
-from mapvote.fusion.probability import change_probability
+from mapvote.fusion.loss_budget import change_probability
 from mapvote.server.store import schema
 from mapvote.server.store.admission import accept, examine
 from mapvote.server.store.ballots import Receipt

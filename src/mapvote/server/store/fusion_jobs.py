@@ -20,10 +20,9 @@ from mapvote.codec.ballot import tile_key
 from mapvote.core.grid import Grid, TileIndex
 from mapvote.core.tile import Tile
 from mapvote.core.types import I64, Bool, MapvoteError
-from mapvote.fusion.copies import Copy
+from mapvote.fusion.distrust import Copy
 from mapvote.fusion.fuse import Decision, fuse_tile, rule_of
-from mapvote.fusion.odds import pack_agreed
-from mapvote.fusion.pending import Pending
+from mapvote.fusion.loss_budget import PendingDeletions, pack_agreed
 from mapvote.fusion.persistence import emptied_and_filled
 from mapvote.fusion.tile_vote import TileVote
 from mapvote.server.errors import Unavailable
@@ -65,7 +64,7 @@ class Task:
     """As it is now: in the store, at hand, or not there."""
     asked: Electorate
     misread: Mapping[int, Bool] | None = None
-    """See :func:`mapvote.fusion.spent.unspent`; in a replay only."""
+    """See :func:`mapvote.fusion.fuse.unspent`; in a replay only."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,8 +97,9 @@ class Fused:
     copies: Sequence[Copy] = ()
     """Drives that were not heard because another vehicle's was, that is alike."""
     odds: bytes | None = None
-    """How sure of the changed cells those are who voted for them, see :func:`mapvote.fusion.odds.pack_agreed`."""
-    pending: Pending = field(default_factory=Pending.none)
+    """How sure of the changed cells those are who voted for them, see
+    :func:`mapvote.fusion.loss_budget.pack_agreed`."""
+    pending: PendingDeletions = field(default_factory=PendingDeletions.none)
     """Deletions that wait because they are beyond the budget."""
     standings: bytes = b""
     """What became of every ballot that stood on the tile, see :func:`mapvote.server.store.decisions.pack_standings`."""

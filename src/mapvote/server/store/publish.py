@@ -19,7 +19,7 @@ from mapvote.core.grid import Grid, TileIndex
 from mapvote.core.memory import Memory
 from mapvote.core.tile import Tile
 from mapvote.core.types import MapvoteError
-from mapvote.fusion.spent import differing
+from mapvote.fusion.fuse import differing
 from mapvote.server.errors import Conflict, Held
 from mapvote.server.store import schema
 from mapvote.server.store.database import insert_rows

@@ -19,7 +19,7 @@ import sqlalchemy as sa
 from mapvote.core.grid import TileIndex
 from mapvote.core.tile import Tile
 from mapvote.core.types import Bool
-from mapvote.fusion.spent import differing
+from mapvote.fusion.fuse import differing
 from mapvote.server.errors import NotFound
 from mapvote.server.store import schema
 from mapvote.server.store.database import address_of

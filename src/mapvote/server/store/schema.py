@@ -261,8 +261,8 @@ decisions = sa.Table(
     sum_over("states", "tally", "odds", "standings"),
 )
 """The decision record (store/decisions.py). ``tally``: (5, 65536), compressed. ``odds``: how sure of the changed cells
-those are who voted for them, see :func:`mapvote.fusion.odds.pack_agreed`; null: nobody says. ``standings``: which
-ballots counted, and why the others did not."""
+those are who voted for them, see :func:`mapvote.fusion.loss_budget.pack_agreed`; null: nobody says. ``standings``:
+which ballots counted, and why the others did not."""
 
 reviews = sa.Table(
     "reviews",

@@ -20,9 +20,9 @@ from mapvote.config import FuseSettings
 from mapvote.core.grid import TileIndex
 from mapvote.core.tile import Tile
 from mapvote.core.types import I64, Bool
+from mapvote.fusion.fuse import unspent
 from mapvote.fusion.persistence import history_days
-from mapvote.fusion.spent import unspent
-from mapvote.fusion.tile_vote import DAY_NS, TileVote, restrict, select
+from mapvote.fusion.tile_vote import DAY_NS, TileVote, newest_votes, restrict
 from mapvote.server.store import schema
 from mapvote.server.store.database import MOST_ASKED
 from mapvote.server.store.integrity import NOT_ITS_SUM, Damage, DamagedBallots, ballot_name, set_aside
@@ -150,7 +150,7 @@ def standing_tiles(connection: sa.Connection, mark: int, since: int | None = Non
 
 def judged_votes(connection: sa.Connection, index: TileIndex, asked: Electorate) -> list[tuple[StoredVote, str]]:
     """Every standing vote on a tile, and why it does not count there at all; "" if it does, in cells where it is not
-    spent (:func:`mapvote.fusion.spent.unspent`)."""
+    spent (:func:`mapvote.fusion.fuse.unspent`)."""
     return _judged(_standing_on(connection, index[0], [index[1]], asked.mark)[index], index, asked)
 
 
@@ -158,7 +158,7 @@ def _judged(standing: Sequence[StoredVote], index: TileIndex, asked: Electorate)
     found = [vote for vote in standing if vote.vehicle not in asked.without]
     why = {vote.seq: _unready(vote, index, asked) for vote in found}
     settings = asked.settings
-    inside = {vote.seq for vote in select([vote for vote in found if not why[vote.seq]], settings)}
+    inside = {vote.seq for vote in newest_votes([vote for vote in found if not why[vote.seq]], settings)}
     outside = f"older than {settings.max_age_days:g} days or not among the last {settings.latest_vehicles} vehicles"
     return [(vote, why[vote.seq] or ("" if vote.seq in inside else outside)) for vote in found]
 
@@ -229,7 +229,7 @@ def judged_on(
 ) -> list[Judged]:
     """Every standing vote on ``tile`` as it is now, in the order of the ballots.
 
-    ``misread``: see :func:`mapvote.fusion.spent.unspent`. ``polled``: what stands there, if it was asked before.
+    ``misread``: see :func:`mapvote.fusion.fuse.unspent`. ``polled``: what stands there, if it was asked before.
     """
     index = tile.index
     polled = polled or poll(connection, index[0], [index[1]], asked)

@@ -18,8 +18,7 @@ from mapvote.core.rows import found_among
 from mapvote.core.tile import Tile
 from mapvote.core.types import F64, I8, I32, I64, U8, CellState
 from mapvote.core.voting import VOTE_UNIT
-from mapvote.fusion.odds import Odds
-from mapvote.fusion.probability import alike_beside, change_probability
+from mapvote.fusion.loss_budget import Odds, alike_beside, change_probability
 from mapvote.server.views.outlines import REACH_M, Ring, buildings, group, members, rings, widths_m
 
 Kind = Literal["built", "demolished"]
@@ -48,7 +47,7 @@ class Decided:
     drives: Sequence[tuple[int, U8]] = ()
     """(end_ns, (256, 256) states) of every ballot that counted."""
     odds: Odds = field(default_factory=Odds.none)
-    """Confidence of the votes for a change (fusion/odds.py)."""
+    """Confidence of the votes for a change (fusion/loss_budget.py)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,7 +107,7 @@ class ChangeObject:
     versions: list[int]
     """The versions that made it, ascending; empty where no decision is known."""
     probability: float | None
-    """Mean over its cells that each of them did change (fusion/probability.py); None where no decision is known."""
+    """Mean over its cells that each of them did change (fusion/loss_budget.py); None where no decision is known."""
 
     @property
     def area_m2(self) -> float:

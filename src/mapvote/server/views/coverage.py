@@ -12,7 +12,7 @@ import sqlalchemy as sa
 from mapvote.codec.path import unpack_path
 from mapvote.core.grid import CELL_SIZE, TileIndex
 from mapvote.core.types import F64
-from mapvote.fusion.coverage import Stretch, Witness, stretches
+from mapvote.fusion.next_pass import Stretch, Witness, stretches
 from mapvote.fusion.tile_vote import TileVote, one_each
 from mapvote.server.store import schema
 from mapvote.server.store.policy import policy_in

@@ -16,7 +16,7 @@ from mapvote.core.grid import CELL_SIZE, CELLS, TILE_CELLS, TileIndex
 from mapvote.core.tile import Tile
 from mapvote.core.types import Bool
 from mapvote.fusion.edit import delete_points
-from mapvote.fusion.pending import Pending
+from mapvote.fusion.loss_budget import PendingDeletions
 from mapvote.server.errors import NotFound
 from mapvote.server.store.decisions import Record
 from mapvote.server.store.fusion_jobs import Fused
@@ -190,13 +190,13 @@ def waiting_features(store: Store, version: int, fused: Sequence[Fused], budget:
     return features
 
 
-def _emptied(tile: Tile, waits: Pending) -> Tile:
+def _emptied(tile: Tile, waits: PendingDeletions) -> Tile:
     words = np.zeros(CELLS, dtype=np.uint64)
     words[waits.cells] = EVERY_BIT
     return delete_points(tile, words.reshape(TILE_CELLS, TILE_CELLS))[0]
 
 
-def _likeliest(change: ChangeObject, waits: Mapping[TileIndex, Pending]) -> float:
+def _likeliest(change: ChangeObject, waits: Mapping[TileIndex, PendingDeletions]) -> float:
     """The largest probability of its cells."""
     rows, cols = change.where
     largest = 0.0

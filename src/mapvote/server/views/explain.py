@@ -21,8 +21,8 @@ from mapvote.core.tile import Tile
 from mapvote.core.types import NO_VOTE, U8, CellState, MapvoteError
 from mapvote.core.voting import VOTE_UNIT, decide
 from mapvote.fusion.fuse import Heard, decide_tile, rule_of
+from mapvote.fusion.loss_budget import alike_beside, change_probability
 from mapvote.fusion.persistence import expected_days
-from mapvote.fusion.probability import alike_beside, change_probability
 from mapvote.fusion.tile_vote import TileVote
 from mapvote.server.store import schema
 from mapvote.server.store.decisions import REASONS, Record, Standing, records_of
@@ -91,7 +91,7 @@ class CellStory:
     decisions: list[tuple[int, str]]
     """(version, state) of every version that decided this cell."""
     probability: float | None
-    """That it changed as the last of them says (fusion/probability.py); None if that one says of no change."""
+    """That it changed as the last of them says (fusion/loss_budget.py); None if that one says of no change."""
     thing: str
     """What stands there, and whether something new is temporary; what came and went before."""
 

@@ -22,8 +22,7 @@ from mapvote.core.rows import found_among
 from mapvote.core.tile import Tile, in_bytes
 from mapvote.core.types import F32, F64, I64, N_STATES, NO_VOTE, U8, U16, CellState, MapvoteError
 from mapvote.core.voting import decide_cells
-from mapvote.fusion.odds import agreed_odds, folded
-from mapvote.fusion.probability import alike_beside, change_probability
+from mapvote.fusion.loss_budget import agreed_odds, alike_beside, change_probability, folded
 from mapvote.fusion.tile_vote import TileVote
 from mapvote.server.errors import Unavailable
 from mapvote.server.store.planes import TileHashes, unpack_fields_plane

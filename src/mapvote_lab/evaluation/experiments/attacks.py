@@ -18,7 +18,7 @@ from mapvote.codec.words import pack_words, unpack_words
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS
 from mapvote.core.point_map import PointMap
 from mapvote.core.types import F32, NO_VOTE, U8, U64, Bool, CellState
-from mapvote.fusion.odds import Odds
+from mapvote.fusion.loss_budget import Odds
 
 Attack = Callable[[Ballot, PointMap, Ballot], Ballot]
 """(the liar's honest ballot, the map, an honest vehicle's ballot) -> what the liar sends."""

@@ -11,7 +11,7 @@ from mapvote.core.grid import TILE_CELLS, Grid, Lattice, TileIndex
 from mapvote.core.types import F64, I64, U8, Bool, CellState
 from mapvote.core.voting import VOTE_UNIT
 from mapvote.fusion.fuse import Decision
-from mapvote.fusion.probability import alike_beside, change_probability
+from mapvote.fusion.loss_budget import alike_beside, change_probability
 from mapvote_lab.evaluation.scoring.cells import UNSCORED, ratio
 
 BINS = 10
@@ -39,7 +39,7 @@ def reliability(
 ) -> Reliability:
     """Hold the probabilities of the cells decided as ``state``, a changed one, against ``truth`` over ``window``.
 
-    As the server tells them (:func:`mapvote.fusion.probability.change_probability`); votes are of vehicles, so
+    As the server tells them (:func:`mapvote.fusion.loss_budget.change_probability`); votes are of vehicles, so
     ``decisions`` are two-stage ones.
     """
     rows, cols, votes, against, odds = _decided(decisions, lattice, state)

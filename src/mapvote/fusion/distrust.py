@@ -1,40 +1,151 @@
-"""Ballots that are copies: drives of two vehicles whose masks agree more than independent drives can count as one
-(docs/decisions/voting.md).
+"""Which ballots of a tile are not heard: those that oppose all others, and copies (docs/decisions/voting.md).
 
-What a drive determines of a tile ends where its rays thin out, where traffic stood in the way, where it turned off: two
-drives down one lane draw different borders. So two masks *differ* in the cells that one determined and the other did
-not determine within a cell of there, or the other way round. It is told as a share of what the lesser mask would differ
-from itself by, had it been drawn three cells (.9 m) farther north or east. A copy differs nowhere, and nowhere either
-if every cell of it was moved by one. Honest vehicles stay well above the bound (docs/measurements/votes.md).
+Outliers. A vehicle is not heard that opposes what k + 1 others agree on nearly everywhere, or denies nearly every
+change that k + 1 backed there (it replays the old street, or saw it last). Of k + 1 at least one is honest, so k
+who lie can make no honest vehicle look so. An honest vehicle differs from another in some per cent of the cells; a
+demolished block is some per cent of a tile. Whoever is found out was one of the k, which is smaller by one without
+it.
+
+Copies. Drives of two vehicles whose masks agree more than independent drives can count as one. What a drive
+determines of a tile ends where its rays thin out, where traffic stood in the way, where it turned off: two drives
+down one lane draw different borders. So two masks *differ* in the cells that one determined and the other did not
+determine within a cell of there, or the other way round. The measure is a share of what the lesser mask would
+differ from itself by, had it been drawn three cells (.9 m) farther north or east. A copy differs nowhere, and
+nowhere either if every cell of it was moved by one. Honest vehicles stay well above the bound
+(docs/measurements/votes.md).
 
 Of drives that are copies of each other one is heard, the one that agrees best with all others: what was moved, or
-added, agrees less. At most one of their vehicles is honest. So of those that are not heard all but one lie for sure,
-and the quorum, which guards against so many liars, falls by as many.
+added, agrees less. At most one of their vehicles is honest. So of those that are not heard all but one lie for
+sure, and the quorum, which guards against so many liars, falls by as many.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mapvote.config import FuseSettings
 from mapvote.core.grid import TILE_CELLS
 from mapvote.core.kernel import inlined, kernel
-from mapvote.core.types import I64, U8, U64, CellState
-from mapvote.fusion.tile_vote import TileVote
+from mapvote.core.tile import Tile
+from mapvote.core.types import I64, N_STATES, NO_VOTE, U8, U64, Bool, CellState
+from mapvote.core.voting import VOTE_UNIT
+from mapvote.fusion.tile_vote import TileVote, states_of
+
+_ASKED_CELLS = slice(None, None, 13)
+"""The flat cells asked, enough for a share; the stride divides no tile's side, so that no column is left out."""
+_MIN_ASKED = 64
+"""With fewer cells to go by nobody is judged: 75 m2 that the others agree on, or 6 m2 of changes."""
+_CO, _CE, _UN = (int(CellState[name]) for name in ("CHANGED_OCCUPIED", "CHANGED_EMPTY", "UNDETERMINED"))
+_ASKED, _AGREED, _OPPOSED = 0b1, 0b10, 0b100
+
+
+def contradictors(
+    votes: Sequence[TileVote], states: U8, tally: NDArray[Any], quorum: int, settings: FuseSettings
+) -> Bool:
+    """(n,) which of the votes :func:`contradicts` names, by all that they say; ``tally`` (256, 256, 5)
+    in VOTE_UNITs of all of them, a vote each."""
+    if settings.max_contradiction >= 1.0:
+        return np.zeros(len(votes), dtype=np.bool_)
+    planes = np.moveaxis(tally, -1, 0).reshape(N_STATES, -1)
+    others, most = others_say(planes[:, _ASKED_CELLS], quorum), settings.max_contradiction
+    own = (vote.states.reshape(-1)[_ASKED_CELLS] for vote in votes if vote.states is not None)
+    return np.array([contradicts(one, others, most) for one in own], dtype=np.bool_)
+
+
+def deniers(
+    votes: Sequence[TileVote],
+    states: U8,
+    tally: NDArray[Any],
+    quorum: int,
+    settings: FuseSettings,
+    tile: Tile | None,
+) -> Bool:
+    """(n,) which of the votes :func:`denying` names, of the changes among the decided ``states`` (256, 256); ``tile``:
+    as it is now, None if no vote on it is spent."""
+    changed = np.flatnonzero((states == _CO) | (states == _CE))
+    if settings.max_denial >= 1.0 or not len(changed):
+        return np.zeros(len(votes), dtype=np.bool_)
+    came_true = np.zeros(len(votes), dtype=np.int64) if tile is None else borne_out(votes, tile)
+    return denying(states_of(votes, changed), states.reshape(-1)[changed], settings.max_denial, came_true)
+
+
+def borne_out(votes: Sequence[TileVote], tile: Tile) -> I64:
+    """(n,) in how many cells each vote does not count any more because they are now as it said: built on, or empty."""
+    found = np.zeros(len(votes), dtype=np.int64)
+    if all(vote.unrestricted is None for vote in votes):
+        return found
+    holds = tile.obstacle_words.reshape(-1)
+    for i, vote in enumerate(votes):
+        if vote.unrestricted is not None and vote.states is not None:
+            sent = vote.unrestricted.reshape(-1)
+            spent = np.flatnonzero((vote.states.reshape(-1) == NO_VOTE) & ((sent == _CO) | (sent == _CE)))
+            found[i] = np.count_nonzero((sent[spent] == _CO) == (holds[spent] != 0))
+    return found
+
+
+@kernel
+def contradicts(own: U8, others: U8, most: float) -> bool:
+    """Whether a vehicle's ``own`` states (asked,) oppose the ``others`` (asked, 8), see :func:`others_say`, in more
+    than ``most`` of the cells they agree on.
+
+    Nothing is said of it unless a majority of the others, and at least the quorum, agree on most cells that so many of
+    them determined.
+    """
+    asked, agreed, opposed = 0, 0, 0
+    for i in range(len(others)):
+        said = others[i, own[i] & 7]
+        asked += said & 1
+        agreed += (said >> 1) & 1
+        opposed += said >> 2
+    return bool(agreed >= _MIN_ASKED and 2 * agreed > asked and opposed > most * agreed)
+
+
+def denying(states: U8, decided: U8, most: float, came_true: I64) -> Bool:
+    """(n,) which vehicles' ``states`` (n, cells) deny more than ``most`` of the changes that were ``decided`` (cells,).
+
+    The cells ``came_true`` (n,), which the map has since changed as it said, count among what each was asked, and did
+    not deny. Without them whoever backed all that was published would be judged by the few changes that are left, those
+    that wait for it. Nothing is said of a vehicle that determined fewer than 64 of these cells.
+    """
+    determined = states < _UN
+    denied = (determined & (states != decided)).sum(axis=1)
+    asked = determined.sum(axis=1) + came_true
+    return np.asarray((asked >= _MIN_ASKED) & (denied > most * asked))
+
+
+def others_say(tally: NDArray[Any], quorum: int) -> U8:
+    """(asked, 8) what the others say of a cell, by the last three bits of what a vehicle says there itself.
+
+    _ASKED if ``quorum`` of them determined it, _AGREED if more than half of those, and as many, alike, _OPPOSED if not
+    as it says.
+    Nothing to a vehicle that left the cell undetermined (4) or has no vote there (7).
+    """
+    said = np.zeros((tally.shape[1], 8), dtype=np.uint8)
+    for own in range(_UN):
+        votes = tally[:_UN].astype(np.int64)
+        votes[own] -= VOTE_UNIT
+        total, best = votes.sum(axis=0), votes.max(axis=0)
+        asked = total >= quorum * VOTE_UNIT
+        agreed = asked & (2 * best > total) & (best >= quorum * VOTE_UNIT) & (best > 0)
+        opposed = agreed & (votes.argmax(axis=0) != own)
+        said[:, own] = _ASKED * asked + _AGREED * agreed + _OPPOSED * opposed
+    return said
+
 
 LEAST_MOVED = 200
 """Cells, in the rows looked at. Masks that three cells change less are not judged: little is soon alike by chance, and
 so are masks with more holes than ground."""
-_UN = int(CellState.UNDETERMINED)
 _LAST = TILE_CELLS - 1
 _APART = 3
 """Cells; and of so many rows one is looked at, which is enough for a share."""
 _RIM = 1
 """Columns on either side that are not compared."""
-_ASKED = slice(None, None, 7)
+_COMPARED_CELLS = slice(None, None, 7)
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,10 +222,10 @@ def masks_of(planes: Iterable[U8]) -> U64:
 def _agreement(drive: TileVote, others: Sequence[TileVote]) -> int:
     """How many more of the others' votes a drive agrees with than it opposes."""
     assert drive.sent is not None
-    own, total = drive.sent.reshape(-1)[_ASKED], 0
+    own, total = drive.sent.reshape(-1)[_COMPARED_CELLS], 0
     for other in others:
         assert other.sent is not None
-        said = other.sent.reshape(-1)[_ASKED]
+        said = other.sent.reshape(-1)[_COMPARED_CELLS]
         both = (own < _UN) & (said < _UN)
         total += 2 * int((both & (own == said)).sum()) - int(both.sum())
     return total

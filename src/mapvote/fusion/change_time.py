@@ -3,8 +3,7 @@
 A majority of the latest vehicles would let a house that stood for years stand for as many passes again. But if the
 votes on a cell, in the order in which the vehicles passed, say "unchanged" and then, without exception, the same
 change, it happened in between: those before saw another world and do not speak of this one. One more than the quorum
-must have seen it, so that of k who lie not even k and an honest one that errs make such a turn.
-"""
+must have seen it, so that of k who lie not even k and an honest one that errs make such a turn."""
 
 from __future__ import annotations
 
@@ -27,7 +26,7 @@ _TURNS = (
 )
 
 
-def turned(states: U8, drives: Sequence[TileVote], tally: NDArray[Any], quorum: int) -> U8:
+def lately_changed(states: U8, drives: Sequence[TileVote], tally: NDArray[Any], quorum: int) -> U8:
     """``states`` (256, 256) with the change in cells decided unchanged, or undecided, where more than ``quorum``
     vehicles, the last ones, say it, and all before them that nothing changed.
 
@@ -39,14 +38,14 @@ def turned(states: U8, drives: Sequence[TileVote], tally: NDArray[Any], quorum: 
     for before, after in _TURNS:
         cells = _may_turn(flat, planes[int(after)], int(before), quorum * VOTE_UNIT)
         if len(cells):
-            said, ends_ns, whose = in_order(drives, cells)
+            said, ends_ns, whose = said_in_order(drives, cells)
             found = cells[_turn(said, ends_ns, whose, int(before), int(after))]
             out = out.copy() if out is states and len(found) else out
             out.reshape(-1)[found] = int(after)
     return out
 
 
-def in_order(drives: Sequence[TileVote], cells: I64) -> tuple[U8, I64, I64]:
+def said_in_order(drives: Sequence[TileVote], cells: I64) -> tuple[U8, I64, I64]:
     """What drives say of flat ``cells`` (n,), in the order in which they ended: (states (m, n), ends (m,) ns, vehicles
     (m,) as numbers)."""
     ordered = sorted(drives, key=lambda drive: (drive.end_ns, drive.digest))

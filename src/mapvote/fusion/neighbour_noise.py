@@ -4,8 +4,7 @@ A wall two centimetres from the border of its cell leaves a part of its points i
 there. When it goes, or comes, vehicles see that cell change, too, and they are right: its points have to go, or come,
 with the wall. But nothing of the world changed in it. So its points are edited as was voted, and the cell is told as
 what it was and is: empty. A plane through all points about, of both cells, tells nearly to the centimetre on which
-side the wall stands.
-"""
+side the wall stands."""
 
 from __future__ import annotations
 

@@ -8,9 +8,9 @@ import pytest
 from hand_made import states_plane, two_walls
 from mapvote.config import FuseSettings
 from mapvote.core.types import NO_VOTE, CellState
+from mapvote.fusion.change_time import _turn
 from mapvote.fusion.fuse import Rule, fuse_tile
 from mapvote.fusion.tile_vote import TileVote
-from mapvote.fusion.turning import _turn
 
 UO, UE, CO, CE, UN = (int(state) for state in list(CellState)[:5])
 CELL = (10, 10)

@@ -12,8 +12,8 @@ from mapvote.core.grid import CELL_SIZE, CELLS, TILE_CELLS, Lattice
 from mapvote.core.tile import Tile
 from mapvote.core.types import F32, F64, I64, U8, CellState
 from mapvote.fusion.fuse import fuse_tile
-from mapvote.fusion.odds import Odds
-from mapvote.fusion.spilled import REACH_M, _moments, spilled, without_spilled
+from mapvote.fusion.loss_budget import Odds
+from mapvote.fusion.neighbour_noise import REACH_M, _moments, spilled, without_spilled
 from mapvote.fusion.tile_vote import TileVote
 
 CE, CO = CellState.CHANGED_EMPTY, CellState.CHANGED_OCCUPIED

@@ -1,0 +1,256 @@
+"""How likely a decided cell changed indeed, and which deletions wait because of it.
+
+How sure. Votes decide; how sure those are who gave them (codec/odds.py) refines the probability of what was
+decided. One of them may lie, so what is taken is what the quorum says at least: of those who voted for a change the
+median, the lower one of two, and never more than so many say as the quorum has. As one of the quorum is honest,
+nobody raises a probability beyond what an honest vehicle said.
+
+Probabilities. Two logistic curves, calibrated on simulated streets, whose truth is known
+(docs/measurements/probability.md). The first is over how sure the voters are or, where they do not say, over how
+many vote so, how many vote otherwise, and how many of the eight cells around changed likewise. It judges cells: at
+the rim of a thing that did change, centimetres decide which of two cells holds its surface, and that does no harm
+to the map. The second asks for harm: whether a point is deleted that lies on a surface that still stands. Such
+cells are few, so it has few parameters; nearly all lie before a wall that stands, where range noise put some of its
+points and rays pass now.
+
+The budget. A cell is emptied if the votes say so. Where an operator sets ``fuse.false_deletions``, a cell stays for
+which the probability of a false deletion is above that: its points are kept, its votes are not spent, and it goes
+once vehicles that drive by are surer of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from mapvote.codec.arrays import unpack_plane
+from mapvote.codec.odds import UNSAID, changed_cells_of, in_nats, pack_odds
+from mapvote.config import FuseSettings
+from mapvote.core.grid import CELL_SIZE, CELLS, TILE_CELLS, Lattice, TileIndex
+from mapvote.core.types import F64, I8, I32, I64, U8, Bool, CellState
+
+
+@dataclass(frozen=True, slots=True)
+class Odds:
+    """Of some cells of a tile how sure one is of them; of all others nothing is said."""
+
+    cells: I64
+    """(n,) flat cells of the tile, ascending."""
+    steps: I8
+    """(n,) log-odds, see codec/odds.py."""
+
+    @classmethod
+    def none(cls) -> Odds:
+        """Nothing is said."""
+        return cls(np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int8))
+
+    @classmethod
+    def of(cls, states: U8, steps: I8 | None) -> Odds | None:
+        """Of the cells that ``states`` (256, 256) call changed, in their order; None where ``steps`` is."""
+        return None if steps is None else cls(changed_cells_of(states), steps)
+
+    def at(self, cells: I64) -> I8:
+        """(m,) what is said of flat ``cells`` (m,); UNSAID where nothing is."""
+        plane = np.full(CELLS, UNSAID, dtype=np.int8)
+        plane[self.cells] = self.steps
+        return plane[cells]
+
+    def within(self, mine: Bool) -> Odds:
+        """Only those of the flat cells given (65536,)."""
+        keep = mine[self.cells]
+        return Odds(self.cells[keep], self.steps[keep])
+
+
+class Sure(Protocol):
+    """A vote that may say how sure its vehicle is."""
+
+    @property
+    def states(self) -> U8 | None: ...
+    @property
+    def odds(self) -> Odds | None: ...
+
+
+def folded(drives: Sequence[Sure], last: Sequence[Bool]) -> Odds | None:
+    """What a vehicle's ``drives`` say, each in the flat cells (65536,) in which it has the ``last`` word; None if none
+    of them says anything."""
+    parts = [drive.odds.within(mine) for drive, mine in zip(drives, last, strict=True) if drive.odds is not None]
+    if not parts:
+        return None
+    cells = np.concatenate([part.cells for part in parts])
+    order = np.argsort(cells)
+    return Odds(cells[order], np.concatenate([part.steps for part in parts])[order])
+
+
+def agreed_odds(votes: Sequence[Sure], states: U8, quorum: int) -> Odds:
+    """Of the cells decided as changed, ``states`` (256, 256): what can be taken of what those say who voted for it, one
+    of ``votes`` a vehicle. Of a cell of which fewer than ``quorum`` say how sure they are nothing is said."""
+    cells = changed_cells_of(states)
+    saying = [vote for vote in votes if vote.odds is not None and vote.states is not None]
+    if len(saying) < max(quorum, 1) or not len(cells):
+        return Odds.none()
+    decided = states.reshape(-1)[cells]
+    said = np.full((len(saying), len(cells)), UNSAID, dtype=np.int8)
+    for row, vote in zip(said, saying, strict=True):
+        assert vote.odds is not None
+        assert vote.states is not None
+        row[:] = np.where(vote.states.reshape(-1)[cells] == decided, vote.odds.at(cells), UNSAID)
+    said.sort(axis=0)
+    tellers = (said != UNSAID).sum(axis=0)
+    rank = np.maximum(tellers // 2 + 1, max(quorum, 1))
+    enough = np.flatnonzero(tellers >= rank)
+    return Odds(cells[enough], said[len(saying) - rank[enough], enough])
+
+
+def pack_agreed(odds: Odds, states: U8) -> bytes | None:
+    """What is taken of the cells that ``states`` (256, 256) call changed, a byte each in their order, UNSAID among
+    them; None where nothing is said of any."""
+    steps = odds.at(changed_cells_of(states))
+    return pack_odds(steps) if (steps != UNSAID).any() else None
+
+
+def unpack_agreed(data: bytes | None, states: U8) -> Odds:
+    """The inverse of :func:`pack_agreed`; MapvoteError if damaged."""
+    cells = changed_cells_of(states)
+    return Odds.none() if data is None else Odds(cells, unpack_plane(data, "<i1", (len(cells),), "decision: odds"))
+
+
+_MOST_VOTES = 3
+"""It was fitted to three vehicles: what more of them say is told as if three did."""
+
+# By votes alone, of ballots that do not say how sure their vehicle is: of columns, and of older formats.
+_BUILT = np.array([-0.78, 1.13, -0.01, 2.96])
+_DEMOLISHED = np.array([-1.37, 1.15, -0.57, 3.18])
+"""Log-odds of a lone cell with two votes for it and none against; what a third adds, one against, eight such cells."""
+# By benchmarks/probability.py, as are those below.
+_BUILT_SAID = np.array([0.752, 1.166])
+_DEMOLISHED_SAID = np.array([0.31, 1.012])
+"""Log-odds of a cell of which they say that it is as likely as not; of each nat that they say."""
+_FALSE_DELETION = np.array([-9.03, 5.668])
+"""Log-odds that something that stands goes with a cell beside which nothing stands; what a row of STANDING adds."""
+_FALSE_DELETION_SAID = np.array([-8.481, 5.043, -0.294])
+"""The same, and of a nat that they say."""
+STANDING = 3
+"""Cells that stand beside one: so many are a row of a wall, before which noise put points; more add nothing."""
+
+
+def change_probability(
+    states: U8, votes: I32 | I64, against: I32 | I64, beside: I32 | I64, odds: I8 | None = None
+) -> F64:
+    """(n,) probability that cells decided as ``states``, CHANGED_OCCUPIED or CHANGED_EMPTY, did change: vehicles that
+    say so, vehicles that say otherwise (not: undetermined), how many of the eight cells around changed likewise, and
+    how sure they are, UNSAID where nobody says; (n,) each."""
+    built = (states == CellState.CHANGED_OCCUPIED)[:, None]
+    more = np.minimum(votes, _MOST_VOTES) - 2.0
+    told = np.column_stack([np.ones(len(states)), more, against, np.asarray(beside, dtype=np.float64) / 8.0])
+    alone = (np.where(built, _BUILT, _DEMOLISHED) * told).sum(axis=1)
+    if odds is None:
+        return _logistic(alone)
+    curve = np.where(built, _BUILT_SAID, _DEMOLISHED_SAID)
+    return _logistic(np.where(odds == UNSAID, alone, curve[:, 0] + curve[:, 1] * in_nats(odds)))
+
+
+def false_deletion_probability(standing: I32 | I64, odds: I8) -> F64:
+    """(n,) probability that of what goes with cells decided changed-empty something still stands: by how many of the
+    eight cells around are decided to stand, and how sure the vehicles are, UNSAID where nobody says; (n,) each."""
+    row = np.minimum(standing, STANDING) / STANDING
+    alone = _FALSE_DELETION[0] + _FALSE_DELETION[1] * row
+    curve = _FALSE_DELETION_SAID
+    return _logistic(np.where(odds == UNSAID, alone, curve[0] + curve[1] * row + curve[2] * in_nats(odds)))
+
+
+def _logistic(log_odds: F64) -> F64:
+    return np.asarray(1.0 / (1.0 + np.exp(-log_odds)))
+
+
+def alike_beside(rows: I64, cols: I64, kinds: I64) -> I32:
+    """(n,) how many of the eight cells around each of n different cells are among them and of the same kind."""
+    if not len(rows):
+        return np.zeros(0, dtype=np.int32)
+    high, wide = int(rows.min()), int(cols.min())
+    width = int(cols.max()) - wide + 3
+    step = int(kinds.max()) + 1
+    keys = ((rows - high + 1) * width + cols - wide + 1) * step + kinds
+    around = [(i * width + j) * step for i in (-1, 0, 1) for j in (-1, 0, 1) if i or j]
+    return np.sum([np.isin(keys + offset, keys) for offset in around], axis=0, dtype=np.int32)
+
+
+WAYPOINT_CELLS = 20
+"""6 m: who drives by sees all of it."""
+
+
+@dataclass(frozen=True, slots=True)
+class PendingDeletions:
+    """Cells of a tile that stay though the votes say that they are empty."""
+
+    cells: I64
+    """(n,) flat cells, ascending."""
+    probability: F64
+    """(n,) that something that stands would be deleted."""
+
+    @classmethod
+    def none(cls) -> PendingDeletions:
+        """Nothing waits."""
+        return cls(np.empty(0, dtype=np.int64), np.empty(0))
+
+    def at(self, cell: tuple[int, int]) -> float | None:
+        """Of one cell (row, col) of the tile; None if it does not wait."""
+        found = np.flatnonzero(self.cells == cell[0] * TILE_CELLS + cell[1])
+        return float(self.probability[found[0]]) if len(found) else None
+
+
+def beyond_budget(states: U8, odds: Odds, settings: FuseSettings) -> PendingDeletions:
+    """Of the cells that ``states`` (256, 256) empty those that are beyond the budget.
+
+    ``odds``: how sure those are who voted so, see :func:`mapvote.fusion.loss_budget.agreed_odds`.
+    """
+    if settings.false_deletions >= 1.0:
+        return PendingDeletions.none()
+    cells = np.flatnonzero(states == int(CellState.CHANGED_EMPTY))
+    probability = false_deletion_probability(standing_beside(states, cells), odds.at(cells))
+    waits = probability > settings.false_deletions
+    return PendingDeletions(cells[waits], probability[waits])
+
+
+def standing_beside(states: U8, cells: I64) -> I64:
+    """(n,) how many of the eight cells around each of the flat ``cells`` (n,) stand by ``states`` (256, 256).
+
+    Beyond the tile's border all is taken to be as just within.
+    """
+    stands = np.pad(states == int(CellState.UNCHANGED_OCCUPIED), 1, mode="edge")
+    rows, cols = cells // TILE_CELLS + 1, cells % TILE_CELLS + 1
+    beside = [stands[rows + i, cols + j] for i in (-1, 0, 1) for j in (-1, 0, 1) if i or j]
+    return np.sum(beside, axis=0, dtype=np.int64)
+
+
+@dataclass(frozen=True, slots=True)
+class Waypoint:
+    """Cells that wait near each other: somebody should drive by there."""
+
+    x: float
+    """Middle of its cells, map metres."""
+    y: float
+    cells: int
+    probability: float
+    """Of the likeliest of them."""
+
+
+def waypoints(pending: Mapping[TileIndex, PendingDeletions], lattice: Lattice) -> list[Waypoint]:
+    """What waits on some tiles, by squares of WAYPOINT_CELLS cells, those with the most cells first."""
+    found = [(tile, waits) for tile, waits in pending.items() if len(waits.cells)]
+    if not found:
+        return []
+    rows = np.concatenate([tile[0] * TILE_CELLS + waits.cells // TILE_CELLS for tile, waits in found])
+    cols = np.concatenate([tile[1] * TILE_CELLS + waits.cells % TILE_CELLS for tile, waits in found])
+    probability = np.concatenate([waits.probability for _, waits in found])
+    squares = np.stack([rows // WAYPOINT_CELLS, cols // WAYPOINT_CELLS], axis=1)
+    square, size = np.unique(squares, axis=0, return_inverse=True, return_counts=True)[1:]
+    square = square.reshape(-1)
+    x = lattice.x0 + CELL_SIZE * (np.bincount(square, weights=cols) / size + 0.5)
+    y = lattice.y0 + CELL_SIZE * (np.bincount(square, weights=rows) / size + 0.5)
+    likeliest = np.zeros(len(size))
+    np.maximum.at(likeliest, square, probability)
+    ranked = np.argsort(-size, kind="stable")
+    return [Waypoint(float(x[i]), float(y[i]), int(size[i]), float(likeliest[i])) for i in ranked]

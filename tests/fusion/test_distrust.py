@@ -1,0 +1,349 @@
+"""Which ballots are not heard: outliers, and copies against the rule in plain words."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from hand_made import SHAPE, make_tile, states_plane, wall
+from mapvote.config import FuseSettings
+from mapvote.core.grid import Lattice
+from mapvote.core.tile import Tile
+from mapvote.core.types import NO_VOTE, U8, CellState
+from mapvote.fusion.distrust import Copy, borne_out, denying, difference, liars_among, masks_of, originals
+from mapvote.fusion.fuse import count, decide_tile, fuse_tile, hear, unspent
+from mapvote.fusion.tile_vote import TileVote, restrict
+
+UO, UE, CO, CE, UN = CellState
+OPPOSITE = np.array([CE, CO, UE, UO, UN], dtype=np.uint8)
+
+
+def honest(seed: int, errors: float = 0.03) -> U8:
+    """A street of walls and road as one vehicle sees it: a tenth not determined, some per cent wrong."""
+    street = np.where(np.arange(SHAPE[1]) % 16 == 0, UO, UE).astype(np.uint8)
+    states = np.broadcast_to(street, SHAPE).copy()
+    chance = np.random.default_rng(seed).uniform(size=SHAPE)
+    states[chance < 0.1] = UN
+    wrong = chance > 1.0 - errors
+    states[wrong] = OPPOSITE[states[wrong]]
+    return states
+
+
+def named(planes: list[U8]) -> list[TileVote]:
+    return [TileVote(f"v{i}", 0, f"v{i}", states=states) for i, states in enumerate(planes)]
+
+
+def silenced(votes: list[TileVote], **policy: float) -> set[str]:
+    heard = hear(votes, "columns", FuseSettings(**policy))[0]  # type: ignore[arg-type]
+    return {vote.vehicle for vote in votes} - {vote.vehicle for vote in heard}
+
+
+@pytest.mark.parametrize("k", [1, 2, 3])
+def test_k_that_invert_everything_are_not_heard_among_k_plus_1_that_do_not(k: int) -> None:
+    planes = [honest(i) for i in range(k + 1)] + [OPPOSITE[honest(99)]] * k
+    assert silenced(named(planes)) == {f"v{i}" for i in range(k + 1, 2 * k + 1)}
+    assert silenced(named(planes), max_contradiction=1.0) == set()
+
+
+def test_a_liar_cannot_second_the_error_of_one_honest_vehicle() -> None:
+    planes = [honest(i) for i in range(2)] + [OPPOSITE[honest(2)]]
+    tile, policy = Tile.empty(Lattice().tile((0, 0))), FuseSettings(min_votes=2)
+    decided = fuse_tile(tile, named(planes), "columns", policy)[0].states
+    without = fuse_tile(tile, named(planes[:2]), "columns", policy)[0].states
+    assert np.array_equal(decided, without)
+
+
+def test_a_vehicle_that_saw_a_block_come_down_is_heard() -> None:
+    news = honest(3)
+    news[:80, ::16] = CE  # a third of all walls are gone
+    assert silenced(named([honest(1), honest(2), news])) == set()
+
+
+def test_vehicles_that_disagree_with_each_other_silence_nobody() -> None:
+    rng = np.random.default_rng(5)
+    assert silenced(named([rng.integers(0, 5, SHAPE, dtype=np.uint8) for _ in range(5)])) == set()
+
+
+def test_two_vehicles_alone_are_both_heard() -> None:
+    assert silenced(named([honest(1), OPPOSITE[honest(2)]])) == set()
+
+
+def test_a_few_cells_say_nothing_about_a_vehicle() -> None:
+    def only(states: U8) -> U8:
+        few = np.full(SHAPE, NO_VOTE, dtype=np.uint8)
+        few[:20, :20] = states[:20, :20]
+        return few
+
+    planes = [honest(1), honest(2), only(OPPOSITE[honest(3)])]
+    assert silenced(named(planes)) == set()
+
+
+@settings(max_examples=10, deadline=None)
+@given(st.permutations(range(5)))
+def test_the_order_of_ballots_does_not_decide_who_is_heard(order: list[int]) -> None:
+    votes = named([honest(1), honest(2), OPPOSITE[honest(3)], honest(4, errors=0.3), OPPOSITE[honest(5)]])
+    assert silenced([votes[i] for i in order]) == silenced(votes)
+
+
+def news_of(states: U8) -> U8:
+    """The same street after a block of walls came down."""
+    states = states.copy()
+    walls = states[:80, ::16]
+    walls[walls == UO] = CE
+    return states
+
+
+@pytest.mark.parametrize("k", [1, 2, 3])
+def test_who_denies_every_change_is_not_heard_and_the_quorum_is_what_it_would_be_without(k: int) -> None:
+    planes = [news_of(honest(i, 0.01)) for i in range(k + 1)] + [honest(50 + i, 0.01) for i in range(k)]
+    votes, policy = named(planes), FuseSettings(min_votes=k + 1)
+    heard, states, _, quorum = hear(votes, "columns", policy)
+    assert [vote.vehicle for vote in heard] == [f"v{i}" for i in range(k + 1)]
+    assert quorum == 2, "one less for each, but nobody is believed alone"
+    assert np.array_equal(states, count(votes[: k + 1], "columns", 2)[0])
+    assert len(hear(votes, "columns", policy.model_copy(update={"max_denial": 1.0}))[0]) == 2 * k + 1
+
+
+def test_who_missed_half_of_the_changes_is_heard() -> None:
+    half = honest(3)
+    half[:40] = news_of(half)[:40]
+    votes = named([news_of(honest(1)), news_of(honest(2)), half])
+    assert len(hear(votes, "columns", FuseSettings(min_votes=2))[0]) == 3
+
+
+def test_three_liars_silence_no_honest_vehicle_where_few_others_look() -> None:
+    """In half of the tile three who lie are the majority of those who determined anything."""
+    planes = [honest(i) for i in range(4)]
+    for plane in planes[1:]:
+        plane[:, 64:] = NO_VOTE
+    lies = [np.where(honest(9) == UO, CE, CO).astype(np.uint8)] * 3
+    heard, _, _, quorum = hear(named([*planes, *lies]), "columns", FuseSettings(min_votes=4))
+    assert {f"v{i}" for i in range(4)} <= {vote.vehicle for vote in heard}
+    assert quorum == max(2, 4 - (7 - len(heard)))
+
+
+def test_what_waits_for_the_last_who_looked_still_waits_when_all_else_is_published() -> None:
+    """A house fell, a car came, and left before the third passed. Once the house is gone from the map, the car is all
+    that is left to deny: that makes no denier of the third."""
+    house, car = [(r, 40) for r in range(100, 200)], [(r, c) for r in range(50, 60) for c in range(60, 68)]
+    before = make_tile(wall(house, [0.45, 0.75, 1.05]))
+    passed = states_plane(dict.fromkeys(house, CE) | dict.fromkeys(car, UE))
+    saw_it = states_plane(dict.fromkeys(house, CE) | dict.fromkeys(car, CO))
+    offered = wall(car, [0.45, 0.75])
+    votes = [TileVote(f"v{i}", i * 10**9, f"v{i}", states=saw_it, new_points=offered, version=1) for i in (1, 2)]
+    votes.append(TileVote("v3", 3 * 10**9, "v3", states=passed, version=1))
+    policy = FuseSettings(min_votes=2, min_difference=0.0)
+    decision, published = fuse_tile(before, votes, "columns", policy, 2, lambda: votes)
+    assert (decision.deleted, decision.added) == (300, 0)
+    left = [unspent(vote, published) for vote in votes]
+    assert fuse_tile(published, left, "columns", policy, 3, lambda: left)[1] is published
+    again = [*votes, TileVote("v3", 4 * 10**9, "v3b", states=passed, version=1)]
+    left = [unspent(vote, published) for vote in again]
+    assert fuse_tile(published, left, "columns", policy, 3, lambda: left)[1] is published, "drives are folded"
+
+
+def test_who_left_cells_undetermined_denied_nothing_there_and_was_not_asked() -> None:
+    decided = np.full(1000, CO, dtype=np.uint8)
+    unsure, contrary = np.full(1000, UN, dtype=np.uint8), np.full(1000, UE, dtype=np.uint8)
+    few = unsure.copy()
+    few[:64] = UE
+    found = denying(np.stack([unsure, contrary, few, decided]), decided, 0.9, np.zeros(4, dtype=np.int64))
+    assert found.tolist() == [False, True, True, False]
+
+
+def test_only_changes_that_count_no_more_can_have_come_true() -> None:
+    tile = make_tile(wall([(10, 10)], [0.5, 1.5]))
+    stands = (10, 10)
+    silent = states_plane({})
+    for sent, expected in ((CO, 1), (CE, 0), (UO, 0), (UE, 0)):
+        spent = TileVote("v", 0, "d", states=silent, unrestricted=states_plane({stands: sent}))
+        assert borne_out([spent], tile).tolist() == [expected]
+    for sent, expected in ((CO, 0), (CE, 1), (UO, 0), (UE, 0)):
+        spent = TileVote("v", 0, "d", states=silent, unrestricted=states_plane({(99, 99): sent}))
+        assert borne_out([spent], tile).tolist() == [expected]
+    counts = TileVote("v", 0, "d", states=states_plane({stands: CO}), unrestricted=states_plane({stands: CO}))
+    assert borne_out([counts], tile).tolist() == [0]
+
+
+POLICY = FuseSettings(min_votes=2)
+
+
+def drive_along(seed: int) -> U8:
+    """A corridor whose borders wander as they will, a wall in it, and holes where something stood in the way."""
+    rng = np.random.default_rng(seed)
+    reach = rng.integers(-5, 6, (2, SHAPE[1])).cumsum(axis=1).clip(-14, 14)
+    rows = np.arange(SHAPE[0])[:, None]
+    seen = (rows >= 80 + reach[0]) & (rows <= 180 + reach[1])
+    states = np.where(seen, UE, NO_VOTE).astype(np.uint8)
+    states[90:92][seen[90:92]] = UO
+    for row, col in rng.integers(80, 170, (6, 2)):
+        states[row : row + 6, col : col + 9] = UN
+    return states
+
+
+def moved(states: U8, rows: int, cols: int) -> U8:
+    out = np.full_like(states, NO_VOTE)
+    to = tuple(slice(max(by, 0), size + min(by, 0)) for by, size in zip((rows, cols), SHAPE, strict=True))
+    of = tuple(slice(max(-by, 0), size + min(-by, 0)) for by, size in zip((rows, cols), SHAPE, strict=True))
+    out[to] = states[of]
+    return out
+
+
+def by_name(planes: dict[str, U8]) -> list[TileVote]:
+    return [TileVote(name, i, f"ballot of {name}", states=states) for i, (name, states) in enumerate(planes.items())]
+
+
+def copied(votes: list[TileVote], policy: FuseSettings = POLICY) -> dict[str, str]:
+    """Who is not heard because of whom."""
+    return {copy.vehicle: copy.heard_vehicle for copy in originals(votes, policy)[1]}
+
+
+def differs(a: U8, b: U8, first: int = 1, rim: int = 1) -> int:
+    """The rule, cell by cell, in every third row."""
+    set_a, set_b, count = a < UN, b < UN, 0
+    for r in range(first, 255, 3):
+        for c in range(rim, 256 - rim):
+            near = slice(r - 1, r + 2), slice(c - 1, c + 2)
+            count += bool((set_b[near] != set_a[r, c]).all() or (set_a[near] != set_b[r, c]).all())
+    return count
+
+
+def test_the_difference_of_two_masks_is_that_of_the_rule_in_plain_words() -> None:
+    a, b = drive_along(1), drive_along(2)
+    b[np.random.default_rng(3).random(SHAPE) < 0.01] = UN
+    by_three_cells = [
+        (differs(one, moved(one, 3, 0), first=4) + differs(one, moved(one, 0, 3), rim=4)) // 2 for one in (a, b)
+    ]
+    assert difference(a, b) == (differs(a, b), min(by_three_cells))
+
+
+def test_two_drives_down_one_street_are_two() -> None:
+    assert copied(by_name({f"v{i}": drive_along(i) for i in range(6)})) == {}
+
+
+@pytest.mark.parametrize(("rows", "cols"), [(r, c) for r in (-1, 0, 1) for c in (-1, 0, 1)])
+def test_a_copy_is_found_as_it_is_and_moved_by_a_cell_and_the_original_is_heard(rows: int, cols: int) -> None:
+    planes = {"honest": drive_along(1), "other": drive_along(2), "third": drive_along(3)}
+    votes = by_name(planes | {"copy": moved(drive_along(1), rows, cols)})
+    assert copied(votes) == {"copy": "honest"}
+
+
+def test_a_copy_in_which_every_cell_was_moved_at_will_is_found() -> None:
+    rng, states = np.random.default_rng(9), drive_along(1)
+    rows, cols = np.indices(SHAPE)
+    jittered = states[
+        (rows + rng.integers(-1, 2, SHAPE)).clip(0, 255), (cols + rng.integers(-1, 2, SHAPE)).clip(0, 255)
+    ]
+    votes = by_name({"copy": jittered, "honest": states, "other": drive_along(2), "third": drive_along(3)})
+    assert copied(votes) == {"copy": "honest"}
+
+
+def test_what_somebody_adds_to_a_copy_is_not_heard() -> None:
+    lie = drive_along(1)
+    lie[120:130, 100:120] = CO
+    votes = by_name({"copy": lie, "honest": drive_along(1), "other": drive_along(2), "third": drive_along(3)})
+    assert copied(votes) == {"copy": "honest"}
+
+
+def test_all_copies_of_one_drive_count_as_one_vehicle() -> None:
+    votes = by_name({f"copy{i}": drive_along(1) for i in range(3)} | {"other": drive_along(2)})
+    kept, copies = originals(votes, POLICY)
+    assert len(kept) == 2
+    assert len({copy.heard_vehicle for copy in copies}) == 1
+
+
+def test_a_vehicle_may_drive_the_same_way_twice() -> None:
+    votes = [TileVote("v", i, f"{i}", states=drive_along(1)) for i in range(2)]
+    assert originals([*votes, *by_name({"w": drive_along(2)})], POLICY)[1] == []
+
+
+def test_a_vehicle_that_copies_one_drive_is_heard_by_its_other() -> None:
+    votes = by_name({"honest": drive_along(1), "w": drive_along(2)})
+    mixed = [TileVote("liar", 7, "copied", states=drive_along(1)), TileVote("liar", 8, "own", states=drive_along(5))]
+    kept, copies = originals([*votes, *mixed], POLICY)
+    assert [copy.digest for copy in copies] == ["copied"]
+    assert {drive.digest for drive in kept} == {"ballot of honest", "ballot of w", "own"}
+
+
+def test_little_says_nothing() -> None:
+    few = np.full(SHAPE, NO_VOTE, dtype=np.uint8)
+    few[100:110, 100:120] = UE
+    assert copied(by_name({"a": few, "b": few, "c": few})) == {}
+
+
+@pytest.mark.parametrize(("rows", "cols", "changed", "judged"), [(103, 97, 200, True), (106, 93, 199, False)])
+def test_masks_are_judged_from_200_cells_on_that_three_cells_change(
+    rows: int, cols: int, changed: int, judged: bool
+) -> None:
+    square = np.full(SHAPE, NO_VOTE, dtype=np.uint8)
+    square[100 : 100 + rows, 100 : 100 + cols] = UE
+    assert difference(square, square) == (0, changed)
+    assert copied(by_name({"a": square, "b": square})) == ({"b": "a"} if judged else {})
+
+
+def test_where_one_vehicle_may_change_the_map_and_where_it_is_not_asked_nobody_is_judged() -> None:
+    votes = by_name({"a": drive_along(1), "b": drive_along(1)})
+    assert copied(votes) == {"b": "a"}
+    assert copied(votes, FuseSettings(min_votes=1)) == {}
+    assert copied(votes, FuseSettings(min_difference=0.0)) == {}
+    tallies = [TileVote(name, 0, name, tally=np.zeros((*SHAPE, 5), dtype=np.uint16)) for name in "ab"]
+    assert copied(tallies) == {}
+
+
+def test_a_vote_that_is_spent_in_part_is_still_the_same_ballot() -> None:
+    counts = np.ones(SHAPE, dtype=np.bool_)
+    counts[100:150, 50:200] = False
+    honest, other, copy = by_name({"honest": drive_along(1), "other": drive_along(2), "copy": drive_along(1)})
+    assert copied([restrict(honest, counts), other, copy]) == {"copy": "honest"}
+
+
+@settings(max_examples=10, deadline=None)
+@given(st.permutations(range(6)), st.integers(0, 2))
+def test_the_order_of_ballots_does_not_decide_which_of_copies_is_heard(order: list[int], by: int) -> None:
+    votes = by_name({f"v{i}": drive_along(i) for i in range(4)} | {"x": moved(drive_along(0), by // 2, by % 2)})
+    votes.append(TileVote("y", 9, "ballot of y", states=drive_along(3)))
+    tile = Tile.empty(Lattice().tile((0, 0)))
+    one, other = (decide_tile(tile, given, "columns", POLICY) for given in (votes, [votes[i] for i in order]))
+    assert one.copies == other.copies
+    assert {copy.vehicle for copy in one.copies} == {"x", "y"}
+    assert np.array_equal(one.states, other.states)
+
+
+def test_the_history_is_without_copies_whether_it_holds_the_same_drives_or_more() -> None:
+    votes = by_name({f"v{i}": drive_along(i) for i in range(3)} | {"copy": drive_along(0)})
+    tile = Tile.empty(Lattice().tile((0, 0)))
+    for history in (votes, [*votes, *by_name({"w": drive_along(4), "x": drive_along(4)})]):
+        heard = decide_tile(tile, votes, "columns", POLICY, partial(list, history))
+        assert heard.past is not None
+        assert [v.digest for v in heard.past()] == [v.digest for v in originals(history, POLICY)[0]]
+
+
+@pytest.mark.parametrize(("k", "quorum"), [(1, 2), (2, 2), (3, 2)])
+def test_the_quorum_falls_by_those_who_lie_for_sure(k: int, quorum: int) -> None:
+    """k send the first vehicle's ballot: of the k + 1 that are alike one is honest, and may be one not heard."""
+    votes = by_name({f"v{i}": drive_along(i) for i in range(k + 1)} | {f"x{i}": drive_along(0) for i in range(k)})
+    heard = decide_tile(Tile.empty(Lattice().tile((0, 0))), votes, "columns", FuseSettings(min_votes=k + 1))
+    assert (len(heard.votes), heard.quorum) == (k + 1, quorum)
+
+
+def test_of_two_that_are_alike_nobody_lies_for_sure_but_of_three_one_does() -> None:
+    copies = [Copy("a", "1", "x", "10"), Copy("b", "2", "y", "20"), Copy("c", "3", "y", "20")]
+    assert liars_among(copies, by_name({"x": drive_along(0), "y": drive_along(1)})) == 1
+    assert liars_among(copies, by_name({"c": drive_along(0)})) == 0, "who is heard by another drive is not silenced"
+
+
+def test_masks_with_more_holes_than_ground_say_nothing() -> None:
+    """Within a cell of every cell there is a hole and none: any two such masks are alike."""
+    speckled = [np.where(np.random.default_rng(i).random(SHAPE) < 0.5, UE, UN).astype(np.uint8) for i in range(3)]
+    assert copied(by_name({f"v{i}": states for i, states in enumerate(speckled)})) == {}
+
+
+def test_a_mask_is_the_determined_cells_the_first_column_in_the_lowest_bit() -> None:
+    rng = np.random.default_rng(1)
+    planes = rng.choice([0, 1, 2, 3, 4, NO_VOTE], (3, *SHAPE)).astype(np.uint8)
+    bits = np.packbits(planes < CellState.UNDETERMINED, axis=-1, bitorder="little")
+    np.testing.assert_array_equal(masks_of(planes), bits.view("<u8"))

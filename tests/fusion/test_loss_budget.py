@@ -1,0 +1,238 @@
+"""How sure vehicles are, what probability that gives, and which deletions wait."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from hand_made import Say, make_ballot, make_map, make_tile, states_plane, wall
+from mapvote.codec.odds import MOST, UNSAID
+from mapvote.config import FuseSettings, load_settings
+from mapvote.core.grid import Lattice
+from mapvote.core.point_map import PointMap
+from mapvote.core.types import NO_VOTE, U8, CellState, MapvoteError
+from mapvote.fusion.loss_budget import (
+    Odds,
+    PendingDeletions,
+    agreed_odds,
+    alike_beside,
+    beyond_budget,
+    change_probability,
+    false_deletion_probability,
+    pack_agreed,
+    standing_beside,
+    unpack_agreed,
+    waypoints,
+)
+from mapvote.fusion.offline import update_map
+from mapvote.fusion.tile_vote import TileVote, fold, silenced
+
+CELL, FLAT = (10, 10), 10 * 256 + 10
+EMPTY, STANDS = CellState.CHANGED_EMPTY, CellState.UNCHANGED_OCCUPIED
+GRID = Lattice().tile((0, 0))
+DECIDED = states_plane({CELL: EMPTY})
+
+
+def vote(vehicle: str, steps: int | None, state: int = EMPTY) -> TileVote:
+    odds = None if steps is None or state != EMPTY else Odds(np.array([FLAT]), np.array([steps], np.int8))
+    return TileVote(vehicle, 0, vehicle, states=states_plane({CELL: state}), odds=odds)
+
+
+def taken(says: list[int | None], quorum: int, against: int = 0) -> int:
+    """What is taken of what voters say of CELL."""
+    votes = [vote(f"v{i}", steps) for i, steps in enumerate(says)]
+    votes += [vote(f"w{i}", None, STANDS) for i in range(against)]
+    return int(agreed_odds(votes, DECIDED, quorum).at(np.array([FLAT]))[0])
+
+
+@pytest.mark.parametrize(
+    ("says", "quorum", "told"),
+    [
+        ([10, 20, 30], 2, 20),
+        ([10, 30], 2, 10),
+        ([10, 20, 30, 40], 2, 20),
+        ([10, 20, 30, 40, 50], 2, 30),
+        ([10, 20, 30], 3, 10),
+        ([7], 1, 7),
+        ([10, None], 2, UNSAID),
+        ([10, None, 30], 2, 10),
+        ([None, None], 1, UNSAID),
+    ],
+)
+def test_the_median_is_taken_and_never_more_than_the_quorum_says(
+    says: list[int | None], quorum: int, told: int
+) -> None:
+    assert {taken(list(order), quorum) for order in itertools.permutations(says)} == {told}
+    assert taken(says, quorum, against=2) == told, "who votes otherwise is not asked"
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.integers(1, 3), st.data())
+def test_liars_fewer_than_the_quorum_never_talk_it_above_what_an_honest_vehicle_says(
+    k: int, data: st.DataObject
+) -> None:
+    honest = data.draw(st.lists(st.integers(-MOST, MOST), min_size=1, max_size=5))
+    if len(honest) + k >= k + 1:
+        assert taken([*honest, *[MOST] * k], k + 1) <= max(honest)
+
+
+def test_a_later_drive_says_how_sure_its_vehicle_is_and_a_silent_one_overrides_nothing() -> None:
+    early, late = vote("a", 5), replace(vote("a", 50), end_ns=1, digest="late")
+    silent = TileVote("a", 2, "silent", states=states_plane({}, fill=NO_VOTE))
+    folded = fold([late, silent, early], GRID)
+    assert folded.odds is not None
+    assert folded.odds.at(np.array([FLAT])).tolist() == [50]
+    assert fold([silent, replace(silent, digest="other")], GRID).odds is None
+
+
+def test_a_vote_that_is_silenced_says_nothing_either() -> None:
+    votes = [silenced(vote(name, 9), np.array([FLAT])) for name in "ab"]
+    assert agreed_odds(votes, DECIDED, 2).at(np.array([FLAT])).tolist() == [UNSAID]
+
+
+def test_what_was_taken_is_stored_a_byte_a_changed_cell() -> None:
+    other = (20, 20)
+    states = states_plane({CELL: EMPTY, other: CellState.CHANGED_OCCUPIED})
+    data = pack_agreed(Odds(np.array([FLAT]), np.array([-3], np.int8)), states)
+    assert unpack_agreed(data, states).at(np.array([FLAT, 20 * 256 + 20, 0])).tolist() == [-3, UNSAID, UNSAID]
+    assert pack_agreed(Odds.none(), states) is None
+    assert not len(unpack_agreed(None, states).cells)
+    with pytest.raises(MapvoteError, match="decision: odds"):
+        unpack_agreed(data, states_plane())
+
+
+CHANGES = [CellState.CHANGED_OCCUPIED, CellState.CHANGED_EMPTY]
+
+
+def of(state: CellState, votes: int, against: int, beside: int) -> float:
+    asked = np.array([votes]), np.array([against]), np.array([beside])
+    return float(change_probability(np.array([state], np.uint8), *asked)[0])
+
+
+@pytest.mark.parametrize("state", CHANGES)
+def test_a_vote_more_and_a_cell_more_beside_it_raise_it_and_one_against_does_not(state: CellState) -> None:
+    assert of(state, 2, 0, 3) < of(state, 3, 0, 3)
+    assert of(state, 2, 0, 3) < of(state, 2, 0, 4)
+    assert of(state, 2, 1, 3) <= of(state, 2, 0, 3)
+
+
+@pytest.mark.parametrize("state", CHANGES)
+def test_ten_vehicles_are_told_as_the_three_that_it_was_fitted_to(state: CellState) -> None:
+    assert of(state, 10, 0, 8) == of(state, 3, 0, 8) < 1.0
+
+
+@given(st.dictionaries(st.tuples(st.integers(-6, 6), st.integers(-6, 6)), st.sampled_from([2, 3]), max_size=60))
+def test_cells_of_a_kind_are_counted_around_each_as_by_hand(cells: dict[tuple[int, int], int]) -> None:
+    rows, cols = (np.array([cell[k] for cell in cells], np.int64) for k in (0, 1))
+    counted = alike_beside(rows, cols, np.array(list(cells.values()), np.int64))
+    steps = [(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1) if (i, j) != (0, 0)]
+    assert counted.tolist() == [
+        sum(cells.get((r + i, c + j)) == kind for i, j in steps) for (r, c), kind in cells.items()
+    ]
+
+
+CELLS = [(10, 10), (10, 11), (10, 12)]
+
+
+def street() -> PointMap:
+    return make_map({(0, 0): make_tile(wall(CELLS, [0.45, 0.75, 1.05]))})
+
+
+def said(sure: list[int]) -> Say:
+    """All cells of the wall are gone; how sure of each."""
+    return Say(states_plane(dict.fromkeys(CELLS, EMPTY)), odds=np.array(sure, np.int8))
+
+
+def updated(budget: float, *says: Say) -> tuple[int, PendingDeletions]:
+    """(points left, what waits) of vehicles that say so."""
+    ballots = [make_ballot(street(), {(0, 0): say}, f"v{i}") for i, say in enumerate(says)]
+    after, decisions = update_map(street(), ballots, FuseSettings(false_deletions=budget))
+    return sum(len(tile.points) for tile in after.tiles.values()), decisions[0, 0].pending
+
+
+def test_a_cell_beyond_the_budget_keeps_its_points_and_is_pending() -> None:
+    unsure = said([40, -MOST, 40])
+    left, waits = updated(0.01, unsure, unsure)
+    assert left == 3, "those of the cell in the middle"
+    assert waits.cells.tolist() == [10 * 256 + 11]
+    assert waits.probability[0] > 0.01
+    assert waits.at((10, 11)) == waits.probability[0]
+    assert waits.at((10, 10)) is None
+
+
+def test_without_a_budget_nothing_waits_however_unsure_they_are() -> None:
+    unsure = said([-MOST] * 3)
+    left, waits = updated(1.0, unsure, unsure)
+    assert left == 0
+    assert not len(waits.cells)
+
+
+def test_one_who_is_sure_does_not_carry_two_who_are_not() -> None:
+    sure, unsure = said([MOST] * 3), said([-MOST] * 3)
+    assert updated(0.01, sure, unsure, unsure)[0] == 9
+    assert updated(0.01, sure, sure, unsure)[0] == 0
+
+
+def test_of_ballots_that_do_not_say_the_votes_and_what_stands_beside_are_asked() -> None:
+    silent = Say(states_plane(dict.fromkeys(CELLS, EMPTY)))
+    before = Say(states_plane(dict.fromkeys(CELLS, EMPTY) | {(11, c): STANDS for c in range(9, 14)}))
+    assert updated(0.01, silent, silent)[0] == 0
+    assert updated(0.01, before, before)[0] == 9, "a row before a wall that stands"
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.dictionaries(st.integers(0, 65535), st.sampled_from(range(5)), max_size=60), st.floats(1e-6, 0.9))
+def test_a_smaller_budget_never_lets_more_go(cells: dict[int, int], budget: float) -> None:
+    states = states_plane().reshape(-1)
+    states[list(cells)] = list(cells.values())
+    plane: U8 = states.reshape(256, 256)
+    odds = Odds(np.array(sorted(cells), np.int64), np.array([c % 255 - MOST for c in sorted(cells)], np.int8))
+    waits = [
+        set(beyond_budget(plane, odds, FuseSettings(false_deletions=b)).cells.tolist()) for b in (budget, budget / 2)
+    ]
+    assert waits[0] <= waits[1] <= set(np.flatnonzero(states == EMPTY).tolist())
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.sets(st.tuples(st.integers(0, 255), st.integers(0, 255)), max_size=60), st.integers(0, 65535))
+def test_what_stands_beside_is_counted_as_by_hand(stands: set[tuple[int, int]], cell: int) -> None:
+    states = states_plane(dict.fromkeys(stands, int(STANDS)))
+    row, col = divmod(cell, 256)
+    rows, cols = ([min(max(at + step, 0), 255) for step in (-1, 0, 1)] for at in (row, col))
+    around = [(r, c) for i, r in enumerate(rows) for j, c in enumerate(cols) if (i, j) != (1, 1)]
+    assert standing_beside(states, np.array([cell])).tolist() == [sum(one in stands for one in around)]
+
+
+def test_what_stands_beside_raises_the_risk_and_sureness_lowers_it() -> None:
+    standing, odds = np.array([0, 1, 3, 8]), np.full(4, 8, np.int8)
+    by_standing = false_deletion_probability(standing, odds)
+    assert (np.diff(by_standing[:3]) > 0).all()
+    assert by_standing[2] == by_standing[3], "three are a row; more add nothing"
+    by_odds = false_deletion_probability(np.zeros(3, np.int64), np.array([-80, 0, 80], np.int8))
+    assert (np.diff(by_odds) < 0).all()
+    unsaid = false_deletion_probability(standing, np.full(4, UNSAID, np.int8))
+    assert ((unsaid > 0) & (unsaid < 1)).all()
+
+
+def test_waypoints_lie_in_the_middle_of_what_waits_the_largest_first() -> None:
+    lattice = Lattice(x0=100.0, y0=50.0)
+    near = PendingDeletions(np.array([5 * 256 + 5, 5 * 256 + 6, 5 * 256 + 7]), np.array([0.1, 0.3, 0.2]))
+    found = waypoints(
+        {(0, 1): PendingDeletions(np.array([0]), np.array([0.9])), (0, 0): near, (1, 0): PendingDeletions.none()},
+        lattice,
+    )
+    assert [(place.cells, place.probability) for place in found] == [(3, 0.3), (1, 0.9)]
+    assert (found[0].x, found[0].y) == pytest.approx((100.0 + 6.5 * 0.3, 50.0 + 5.5 * 0.3))
+    assert (found[1].x, found[1].y) == pytest.approx((100.0 + 256.5 * 0.3, 50.0 + 0.5 * 0.3))
+    assert waypoints({(1, 0): PendingDeletions.none()}, lattice) == []
+
+
+@pytest.mark.parametrize("value", ["0", "-0.1", "1.5", "never"])
+def test_a_budget_that_is_no_probability_is_one_clear_error(value: str) -> None:
+    with pytest.raises(MapvoteError, match=r"fuse\.false_deletions"):
+        load_settings(env={"MAPVOTE_FUSE__FALSE_DELETIONS": value})
