@@ -21,9 +21,8 @@ from rich.console import Console
 from rich.table import Table
 from scipy.spatial import cKDTree
 
-from mapvote.core.geometry import from_xyz_rpy
+from mapvote.core.geometry import from_xyz_rpy, inverses
 from mapvote.core.grid import CELL_SIZE
-from mapvote.core.motions import inverses
 from mapvote.core.point_map import PointMap
 from mapvote.core.reference import reference_window
 from mapvote.core.types import F64, Bool, Drive, MapvoteError

@@ -17,8 +17,8 @@ from mapvote.codec.ballot import Ballot, decode, encode
 from mapvote.config import Settings, choose_case
 from mapvote.core.geometry import from_xyz_rpy, inverse, transform
 from mapvote.core.grid import TILE_CELLS, Grid, Lattice
-from mapvote.core.heap import seldom_collecting
 from mapvote.core.point_map import PointMap, map_from_points
+from mapvote.core.process_memory import seldom_collecting
 from mapvote.core.sensors import SENSORS
 from mapvote.core.types import F64, Drive, Scan
 from mapvote.core.voxels import VoxelCloud

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from mapvote.core.columns import neighbourhood, shifted
+from mapvote.core.columns import dilated, shifted
 
 SIDE = 5
 
@@ -21,7 +21,7 @@ SIDE = 5
 def test_a_neighbourhood_is_the_union_over_neighbours_at_world_height(
     word: np.ndarray, base: np.ndarray, reach: int
 ) -> None:
-    out = neighbourhood(word, base, 2, 2, reach)
+    out = dilated(word, base, reach)[2, 2]
     occupied = {
         (r, c, int(base[r, c]) + bit)
         for r, c in np.ndindex(SIDE, SIDE)

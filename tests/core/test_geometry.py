@@ -1,11 +1,14 @@
 """SE(3): the group laws, and that log undoes exp."""
 
 import numpy as np
-from hypothesis import given
+import pytest
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mapvote.core import geometry
-from mapvote.core.geometry import turn
+from mapvote.core.azimuth import turn
+from mapvote.core.geometry import exp, inverse, log, rotation_angle
+from mapvote.core.types import F64
 
 metres = st.floats(-100.0, 100.0)
 angles = st.floats(-1.7, 1.7)  # |phi| < sqrt(3) * 1.7 < pi: where log is the inverse of exp
@@ -59,3 +62,32 @@ def test_turn_is_the_azimuth_in_turns_to_1e_5_rad() -> None:
     off = 2.0 * np.pi * np.array(found) - angle
     assert np.abs((off + np.pi) % (2.0 * np.pi) - np.pi).max() < 2e-5
     assert turn(np.float32(0.0), np.float32(0.0)) == 0.0
+
+
+NUMBER = st.one_of(st.floats(-3.0, 3.0), st.sampled_from([0.0, 1e-12, -1e-9, 1e-7, np.pi, 3.1415920, -3.14159265]))
+TANGENTS = st.lists(st.tuples(*[NUMBER] * 6), min_size=0, max_size=5).map(lambda xs: np.array(xs).reshape(-1, 6))
+
+
+@settings(max_examples=200, deadline=None)
+@given(TANGENTS)
+def test_of_each_of_many_motions_the_same_is_said_as_of_one(xi: F64) -> None:
+    T = geometry.exps(xi)
+    assert T.shape == (len(xi), 4, 4)
+    for k, x in enumerate(xi):
+        np.testing.assert_allclose(T[k], exp(x), atol=1e-14)
+        np.testing.assert_allclose(geometry.inverses(T)[k], inverse(T[k]), atol=1e-14)
+        np.testing.assert_allclose(geometry.logs(T)[k], log(T[k]), atol=1e-12)
+        assert geometry.rotation_angles(T)[k] == pytest.approx(rotation_angle(T[k]), abs=1e-12)
+
+
+def test_the_way_to_tangent_vectors_and_back_ends_where_it_began() -> None:
+    xi = np.random.default_rng(3).uniform(-1.7, 1.7, (200, 6))
+    np.testing.assert_allclose(geometry.logs(geometry.exps(xi)), xi, atol=1e-9)
+
+
+@settings(max_examples=30, deadline=None)
+@given(TANGENTS, st.tuples(*[st.floats(-1.0, 1.0)] * 6))
+def test_adjoints_carry_a_motion_to_the_other_side(of: F64, xi: tuple[float, ...]) -> None:
+    T = geometry.exps(of)
+    for A, one in zip(geometry.adjoints(T), T, strict=True):
+        np.testing.assert_allclose(exp(A @ np.array(xi)), one @ exp(xi) @ inverse(one), atol=1e-9)

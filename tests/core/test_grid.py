@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mapvote.core.cells import flat_cells
+from mapvote.core.columns import flat_cells
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Grid, Lattice, tile_of_cells, window_around
 
 small = st.integers(-2000, 2000)

@@ -2,21 +2,16 @@
 
 from __future__ import annotations
 
-import base64
-import io
-import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
 import pytest
-from matplotlib import image
 
 import mapvote
-from hand_made import make_map, two_walls
+from hand_made import two_walls
 from mapvote.core.grid import TILE_CELLS, Lattice
-from mapvote.core.picture import SIDE, heights, paint
 from mapvote.core.point_map import all_points, cut_tiles
 from mapvote.core.sensors import SENSORS
 from mapvote.core.tile import Tile
@@ -30,55 +25,6 @@ def test_the_repr_of_a_map_is_one_line() -> None:
 
 def test_the_repr_of_a_tile_is_one_line() -> None:
     assert repr(two_walls().tiles[0, 0]) == "Tile(0, 0: 12 points)"
-
-
-def picture_of(point_map: mapvote.PointMap) -> np.ndarray:
-    """What a browser shows, read by somebody else's decoder; RGB in [0, 1]."""
-    data = re.search(r'src="data:image/png;base64,([^"]+)"', point_map._repr_html_())
-    assert data is not None
-    return np.asarray(image.imread(io.BytesIO(base64.b64decode(data[1])), format="png"))
-
-
-def test_a_notebook_shows_a_map_from_above_north_up() -> None:
-    x, y = np.meshgrid(np.arange(0, 30, 0.2), np.arange(0, 30, 0.2))
-    floor = np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)])
-    tower = np.array([[15.0 + dx, 27.0 + dy, z] for dx in (0, 0.3) for dy in (0, 0.3) for z in np.arange(0.5, 12, 0.3)])
-    picture = picture_of(mapvote.map_from_points(np.vstack([floor, tower])))
-    assert picture.shape == (100, 100, 3)  # 30 m in pixels of 0.3 m
-    red = picture[..., 0] - picture[..., 2]
-    row, col = np.unravel_index(np.argmax(red), red.shape)
-    assert row < 15  # the north is above
-    assert 45 <= col <= 55
-
-
-def test_a_picture_stays_small_however_wide_the_map_is() -> None:
-    far = np.array([[0.0, 0.0, 0.0], [5000.0, 900.0, 0.0]])
-    rows, cols, _ = picture_of(mapvote.map_from_points(far)).shape
-    assert SIDE - 1 <= cols <= SIDE
-    assert rows == 87
-
-
-def test_an_empty_map_has_no_picture() -> None:
-    assert "<img" not in make_map({})._repr_html_()
-
-
-def test_a_name_from_outside_cannot_inject_html() -> None:
-    assert "<script>" not in mapvote.PointMap("<script>", Lattice(), {})._repr_html_()
-
-
-def test_white_is_unknown_and_higher_is_another_colour() -> None:
-    painted = paint(np.array([[np.nan, 0.0, 6.0, 20.0]], dtype=np.float32))[0]
-    assert painted[0].tolist() == [255, 255, 255]
-    assert len({tuple(pixel) for pixel in painted.tolist()}) == 4
-
-
-def test_heights_are_above_the_ground_not_above_the_sea() -> None:
-    sunk = Tile(
-        Lattice().tile((0, 0)),
-        np.array([[1, 1, 107.0]], dtype=np.float32),
-        np.full((256, 256), 100.0, dtype=np.float32),
-    )
-    assert heights([sunk]).tolist() == [[7.0]]
 
 
 POINTS = np.zeros((5, 3), dtype=np.float32)

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from mapvote.core.types import N_STATES, NO_VOTE, CellState
-from mapvote.core.voting import VOTE_UNIT, cast, decide, decide_change, one_hot, to_wire, vote_weight, weight_table
+from mapvote.core.voting import VOTE_UNIT, cast, decide_cells, one_hot, plurality, to_wire, vote_weight, weight_table
 
 UO, UE, CO, CE, UN = CellState
 states_grids = arrays(np.uint8, (4, 5), elements=st.sampled_from([*range(N_STATES), NO_VOTE]))
@@ -33,12 +33,12 @@ def test_below_n_min_a_cell_is_not_occupied() -> None:
 
 
 def test_table_i_vehicles_as_printed_by_plain_plurality_of_scans() -> None:
-    assert decide(TABLE_I.astype(np.int32)).tolist() == [CO, CO, UN]
+    assert plurality(TABLE_I.astype(np.int32)).tolist() == [CO, CO, UN]
 
 
 def test_table_i_server_row() -> None:
     decided = np.array([CO, CO, UN], dtype=np.uint8)
-    assert int(decide(one_hot(decided).sum(axis=0))) == CO
+    assert int(plurality(one_hot(decided).sum(axis=0))) == CO
 
 
 def test_table_i_contradicts_equation_1() -> None:
@@ -46,7 +46,7 @@ def test_table_i_contradicts_equation_1() -> None:
     vehicle 3's 18 are worth at least 36, which beats its 22 undetermined ones. We keep Eq. (1)."""
     assert 25 * float(vote_weight(5)) >= 50 > 33
     least = TABLE_I * np.array([2, 1, 2, 1, 1])
-    assert decide(least.astype(np.int32)).tolist() == [CO, CO, CO]
+    assert plurality(least.astype(np.int32)).tolist() == [CO, CO, CO]
 
 
 def test_ten_scans_of_the_paper() -> None:
@@ -56,33 +56,34 @@ def test_ten_scans_of_the_paper() -> None:
         for state, scans in ((UE, empty), (CE, changed)):
             for _ in range(scans):
                 cast(tally, np.array([[state]], np.uint8), np.array([[VOTE_UNIT]], np.int32))
-        assert decide(tally)[0, 0] == expected
+        assert plurality(tally)[0, 0] == expected
 
 
 def test_no_vote_adds_nothing_and_no_votes_decide_nothing() -> None:
     tally = np.zeros((1, 1, N_STATES), np.int32)
     cast(tally, np.array([[NO_VOTE]], np.uint8), np.array([[48]], np.int32))
     assert not tally.any()
-    assert decide(tally)[0, 0] == NO_VOTE
+    assert plurality(tally)[0, 0] == NO_VOTE
 
 
 @given(states_grids)
 def test_a_decided_ballot_is_a_one_hot_tally(states: np.ndarray) -> None:
-    np.testing.assert_array_equal(decide(one_hot(states)), states)
+    np.testing.assert_array_equal(plurality(one_hot(states)), states)
 
 
 @given(st.lists(tallies, min_size=1, max_size=5), st.randoms())
 def test_the_order_of_ballots_never_matters(ballots: list[np.ndarray], random: object) -> None:
     shuffled = list(ballots)
     random.shuffle(shuffled)  # type: ignore[attr-defined]
-    np.testing.assert_array_equal(decide(np.sum(ballots, axis=0)), decide(np.sum(shuffled, axis=0)))
+    np.testing.assert_array_equal(plurality(np.sum(ballots, axis=0)), plurality(np.sum(shuffled, axis=0)))
 
 
 @given(st.lists(states_grids, min_size=1, max_size=7), st.integers(1, 4))
 def test_a_change_needs_enough_votes_and_a_majority_of_those_who_determined(
     ballots: list[np.ndarray], min_votes: int
 ) -> None:
-    decided = decide_change(np.sum([one_hot(b) for b in ballots], axis=0), min_votes)
+    tally = np.moveaxis(np.sum([one_hot(b) for b in ballots], axis=0), -1, 0).reshape(len(CellState), -1)
+    decided = decide_cells(tally, tally, True, min_votes * VOTE_UNIT).reshape(ballots[0].shape)
     votes = np.array(ballots)
     for change in (CO, CE):
         support = (votes == change).sum(axis=0)

@@ -13,10 +13,9 @@ from mapvote.core.types import N_STATES, NO_VOTE, CellState
 from mapvote.core.voting import (
     VOTE_UNIT,
     add_tally,
-    decide,
     decide_cells,
-    decide_change,
     one_hot,
+    plurality,
     tally_of,
     to_wire,
     vote_weight,
@@ -43,7 +42,7 @@ def winner(votes: list[int], abstain: bool) -> int:
 
 @given(few_votes)
 def test_where_undetermined_competes_a_plain_majority_decides(votes: list[int]) -> None:
-    assert int(decide(np.array(votes, dtype=np.int32))) == winner(votes, abstain=False)
+    assert int(plurality(np.array(votes, dtype=np.int32))) == winner(votes, abstain=False)
 
 
 @given(few_votes, st.integers(1, 4))
@@ -53,13 +52,14 @@ def test_where_it_abstains_a_change_needs_more_than_half_of_the_others_and_a_quo
     expected = winner(votes, abstain=True)
     if expected in (CO, CE) and votes[expected] < quorum:
         expected = UN
-    assert int(decide_change(np.array(votes, dtype=np.int32) * VOTE_UNIT, quorum)) == expected
+    tally = np.array(votes, dtype=np.int32)[:, None] * VOTE_UNIT
+    assert decide_cells(tally, tally, True, quorum * VOTE_UNIT).tolist() == [expected]
 
 
 def test_one_vote_is_enough_for_a_change_unless_more_are_asked_for() -> None:
-    alone = np.array([0, 0, VOTE_UNIT, 0, 0], dtype=np.int32)
-    assert int(decide_change(alone)) == CO
-    assert int(decide_change(alone, 2)) == UN
+    alone = np.array([[0], [0], [VOTE_UNIT], [0], [0]], dtype=np.int32)
+    assert decide_cells(alone, alone, True, 1).tolist() == [CO]
+    assert decide_cells(alone, alone, True, 2 * VOTE_UNIT).tolist() == [UN]
 
 
 def test_a_quorum_that_is_just_reached_is_reached() -> None:

@@ -1,12 +1,16 @@
 """The growing cloud is plain bookkeeping: means and counts per voxel, whatever the order of growth."""
 
+from __future__ import annotations
+
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
 
 from mapvote.core.grid import CELL_SIZE, Lattice
 from mapvote.core.types import F64
-from mapvote.core.voxels import VoxelCloud, grouped, voxel_downsample, voxel_keys
+from mapvote.core.voxels import VoxelCloud, found_among, grouped, voxel_downsample, voxel_keys
 
 
 @settings(max_examples=15, deadline=None)
@@ -75,3 +79,21 @@ def test_it_grows_past_its_first_table() -> None:
 def test_the_first_of_each_key_is_found_in_the_order_of_the_keys_coming(keys: list[int]) -> None:
     _, first = np.unique(np.array(keys, dtype=np.int64), return_index=True)
     np.testing.assert_array_equal(grouped(np.array(keys, dtype=np.int64))[1], np.sort(first))
+
+
+FEW = st.sampled_from([0.0, -0.0, 1.0, 1.5, float("nan")])
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@given(data=st.data(), n=st.integers(0, 30), m=st.integers(0, 30))
+def test_rows_are_found_as_their_bytes_are(dtype: type, data: st.DataObject, n: int, m: int) -> None:
+    rows, others = (data.draw(arrays(dtype, (k, 3), elements=FEW)) for k in (n, m))
+    known = {row.tobytes() for row in others}
+    assert found_among(rows, others).tolist() == [row.tobytes() in known for row in rows]
+
+
+def test_an_edited_cloud_is_told_from_the_one_before() -> None:
+    old = np.random.default_rng(1).uniform(0, 76, (20_000, 3)).astype(np.float32)
+    new = np.concatenate([old[5000:], old[:300] + np.float32(0.25)])
+    assert np.flatnonzero(~found_among(old, new)).tolist() == list(range(5000))
+    assert np.flatnonzero(~found_among(new, old)).tolist() == list(range(15_000, 15_300))

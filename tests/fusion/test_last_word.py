@@ -6,8 +6,8 @@ import numpy as np
 
 from hand_made import states_plane, two_walls
 from mapvote.config import FuseSettings
-from mapvote.core.memory import Memory
 from mapvote.core.tile import Tile
+from mapvote.core.tile_history import Memory
 from mapvote.core.types import CellState
 from mapvote.fusion.fuse import fuse_tile
 from mapvote.fusion.tile_vote import TileVote

@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 
 from hand_made import SHAPE, make_tile, states_plane, wall
 from mapvote.config import FuseSettings
-from mapvote.core.memory import Memory
 from mapvote.core.tile import Tile
+from mapvote.core.tile_history import Memory
 from mapvote.core.types import Bool, CellState
 from mapvote.fusion.fuse import fuse_tile, unspent
 from mapvote.fusion.persistence import (

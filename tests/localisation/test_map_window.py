@@ -8,7 +8,7 @@ import pytest
 from hand_made import make_map, make_tile
 from mapvote.core.point_map import PointMap
 from mapvote.core.types import F64
-from mapvote.localisation.map_window import MapWindow, window_points
+from mapvote.localisation.map_window import MapWindow, tiles_within
 from mapvote.localisation.ndt import NdtGrid, NdtMap, build_ndt
 
 ROAD = [np.array([x, 40.0, 1.8]) for x in np.arange(10.0, 150.0, 5.0)]
@@ -25,6 +25,12 @@ def point_map() -> PointMap:
         return points.astype(np.float32)
 
     return make_map({(r, c): make_tile(cloud(), index=(r, c)) for r in range(2) for c in range(3)})
+
+
+def window_points(point_map: PointMap, position: F64) -> F64:
+    """Points (n, 3) in map metres of the tiles that the window around ``position`` (3,) touches."""
+    clouds = [point_map.tiles[tile].points_map for tile in tiles_within(point_map, position)]
+    return np.concatenate([np.zeros((0, 3)), *clouds])
 
 
 def by_place(grid: NdtGrid) -> dict[tuple[int, ...], F64]:

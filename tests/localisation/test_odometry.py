@@ -8,7 +8,7 @@ from mapvote.config import NdtSettings
 from mapvote.core.geometry import exp, from_xyz_rpy, inverse, rotation_angle, transform
 from mapvote.core.point_map import PointMap, map_from_points
 from mapvote.core.types import F64, Registration, Scan
-from mapvote.localisation.map_window import MapWindow, window_points
+from mapvote.localisation.map_window import MapWindow, tiles_within
 from mapvote.localisation.ndt import NdtMap, PosePrior
 from mapvote.localisation.odometry import Tracker
 from streets import path, street, sweep, twist_of
@@ -95,9 +95,8 @@ def test_a_lost_vehicle_recovers_by_its_prior(tracker: Tracker) -> None:
 
 
 def test_only_the_map_around_the_vehicle_is_held(point_map: PointMap) -> None:
-    here = window_points(point_map, np.array([0.0, 0.0, 0.0]))
-    assert len(here) == sum(len(tile.points) for tile in point_map.tiles.values())
-    assert len(window_points(point_map, np.array([900.0, 0.0, 0.0]))) == 0
+    assert tiles_within(point_map, np.array([0.0, 0.0, 0.0])) == sorted(point_map.tiles)
+    assert tiles_within(point_map, np.array([900.0, 0.0, 0.0])) == []
 
 
 def test_starts_one_metre_and_three_degrees_off_find_the_pose(point_map: PointMap) -> None:
@@ -296,16 +295,16 @@ def test_the_map_around_a_vehicle_is_built_anew_only_when_it_leaves_the_middle(p
 
 
 def test_a_window_holds_the_tiles_that_it_touches_and_no_others() -> None:
-    tiles = {(r, c): make_tile(wall([(1, 1)], [float(3 * r + c)]), index=(r, c)) for r in range(3) for c in range(3)}
-    point_map = make_map(tiles)
+    nine = [(r, c) for r in range(3) for c in range(3)]
+    point_map = make_map({tile: make_tile(wall([(1, 1)], [0.0]), index=tile) for tile in nine})
 
-    def heights(x: float, y: float, half_m: float) -> list[float]:
-        return sorted(window_points(point_map, np.array([x, y, 0.0]), half_m)[:, 2].tolist())
+    def touched(x: float, y: float, half_m: float) -> list[tuple[int, int]]:
+        return tiles_within(point_map, np.array([x, y, 0.0]), half_m)
 
-    assert heights(115.2, 115.2, 10.0) == [4.0]
-    assert heights(115.2, 115.2, 39.0) == list(range(9))
-    assert heights(115.2, 76.8, 10.0) == [1.0, 4.0]
-    assert heights(76.8, 115.2, 10.0) == [3.0, 4.0]
+    assert touched(115.2, 115.2, 10.0) == [(1, 1)]
+    assert touched(115.2, 115.2, 39.0) == nine
+    assert touched(115.2, 76.8, 10.0) == [(0, 1), (1, 1)]
+    assert touched(76.8, 115.2, 10.0) == [(1, 0), (1, 1)]
 
 
 def test_on_a_first_scan_the_speed_is_found_by_how_the_scan_is_bent(tracker: Tracker) -> None:

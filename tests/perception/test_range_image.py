@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mapvote.core.geometry import turn
+from mapvote.core.azimuth import turn
 from mapvote.core.types import F32, F64
 from mapvote.perception.range_image import NOTHING, U16, Counts, Pixels, Samples, look, range_image, room_to_look
 

@@ -10,7 +10,7 @@ from typing import Annotated, Any, get_type_hints
 
 import typer
 
-from mapvote.core.heap import seldom_collecting
+from mapvote.core.process_memory import seldom_collecting
 
 DRIVE, MAP, SERVER, EVALUATE, SETUP = "Drive", "Map", "Server", "Simulate and evaluate", "Set up"
 """Headings of ``mapvote --help``."""

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from mapvote.codec.arrays import pack_plane, unpack_plane
 from mapvote.codec.fields import check_kind, kind_of
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Grid
-from mapvote.core.memory import PLANES, Memory
 from mapvote.core.tile import Tile
+from mapvote.core.tile_history import PLANES, Memory
 from mapvote.core.types import F32, U64, MapvoteError
 
 TILE_VERSION = 1

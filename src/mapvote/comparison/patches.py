@@ -14,8 +14,7 @@ import numpy as np
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
-from mapvote.core.geometry import exp, hat, inverse
-from mapvote.core.motions import exps, logs
+from mapvote.core.geometry import exp, exps, hat, inverse, logs
 from mapvote.core.types import F64, Bool, MapvoteError
 from mapvote.core.voxels import voxel_downsample
 from mapvote.localisation.ndt import NdtMap, fitness, refine, thin_for_levels

@@ -76,3 +76,18 @@ azimuth_64 = _azimuth_of(
      1.2246467991473531772e-16),
     2.0**66,
 )  # fmt: skip
+
+
+@inlined
+def turn(x: np.float32, y: np.float32) -> np.float32:
+    """Azimuth of (x, y) in [0, 1] turns, within 1e-5 rad (Abramowitz and Stegun 4.4.49), in float32 and without a
+    branch, so that a loop over points vectorises: it sorts rays, it measures nothing. 0 for (0, 0)."""
+    ax, ay = abs(x), abs(y)
+    q = min(ax, ay) / max(max(ax, ay), np.float32(1e-30))
+    s = q * q
+    a = np.float32(-0.0851330) + s * np.float32(0.0208351)
+    a = q * (np.float32(0.9998660) + s * (np.float32(-0.3302995) + s * (np.float32(0.1801410) + s * a)))
+    a *= np.float32(0.5 / np.pi)
+    a = np.float32(0.25) - a if ay > ax else a
+    a = np.float32(0.5) - a if x < np.float32(0.0) else a
+    return np.float32(1.0) - a if y < np.float32(0.0) else a

@@ -8,10 +8,11 @@ stands for everything from there upwards. Neighbouring cells are compared by shi
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
-from mapvote.core.grid import CELL_SIZE
+from mapvote.core.grid import CELL_SIZE, Grid
 from mapvote.core.kernel import inlined, kernel
-from mapvote.core.types import F32, F64, I32, I64, U64, Bool
+from mapvote.core.types import F32, F64, I32, I64, U64, Bool, read_only
 
 GROUND_MARGIN_M = 0.3
 """Points lower than this above the ground are ground: they never make a cell occupied (docs/decisions/paper.md)."""
@@ -86,21 +87,9 @@ def rebased(words: U64, layers: I32) -> U64:
     return np.where(np.abs(layers) < 64, words << up >> down, np.uint64(0))
 
 
-@kernel
-def neighbourhood(words: U64, base: I32, r: int, c: int, reach: int) -> np.uint64:
-    """Voxels of column (r, c) within ``reach`` cells (a square) and one layer of a set bit; bases may differ."""
-    rows, cols = words.shape
-    near = np.uint64(0)
-    first, last = np.uint64(max(c - reach, 0)), np.uint64(min(c + reach + 1, cols))
-    for i in range(np.uint64(max(r - reach, 0)), np.uint64(min(r + reach + 1, rows))):
-        for j in range(first, last):
-            if words[i, j]:
-                near |= shifted(words[i, j], base[i, j] - base[r, c])
-    return near | (near << np.uint64(1)) | (near >> np.uint64(1))
-
-
 def dilated(words: U64, base: I32, reach: int) -> U64:
-    """:func:`neighbourhood` of every column, (rows, cols)."""
+    """(rows, cols) of every column the voxels within ``reach`` cells (a square) and one layer of a set bit; bases may
+    differ."""
     rows, cols = words.shape
     near = np.zeros_like(words)
     for i in range(-reach, reach + 1):
@@ -127,3 +116,24 @@ def span_of(word: np.uint64) -> np.uint64:
     """The bits from the lowest to the highest set one: the height span of a column; 0 for 0."""
     lowest = word & (~word + np.uint64(1))
     return below_top(word) & ~(lowest - np.uint64(1)) if word else np.uint64(0)
+
+
+def flat_cells(window: Grid, points: NDArray[np.float32]) -> NDArray[np.int64]:
+    """(n,) row * cols + col of points (n, 3) from the window's corner, metres; the outermost cells take what rounding
+    moved. As :meth:`Grid.indices_of` of :meth:`Grid.to_map` has them, to the last bit."""
+    corner = window.x0, window.y0, window.lattice.x0, window.lattice.y0
+    flat = np.empty(len(points), dtype=np.int64)
+    cloud = read_only(np.ascontiguousarray(points))
+    _enter_cells(cloud, *corner, window.row0, window.col0, window.rows, window.cols, flat)
+    return flat
+
+
+@kernel
+def _enter_cells(
+    points: NDArray[np.float32], x0: float, y0: float, lattice_x0: float, lattice_y0: float, row0: int, col0: int,
+    rows: int, cols: int, flat: NDArray[np.int64],
+) -> None:  # fmt: skip
+    for i in range(len(points)):
+        row = int(np.floor((np.float64(points[i, 1]) + y0 - lattice_y0) / CELL_SIZE)) - row0
+        col = int(np.floor((np.float64(points[i, 0]) + x0 - lattice_x0) / CELL_SIZE)) - col0
+        flat[i] = min(max(row, 0), rows - 1) * cols + min(max(col, 0), cols - 1)

@@ -10,11 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mapvote.core.cells import flat_cells
+from mapvote.core.columns import flat_cells
 from mapvote.core.grid import Lattice, TileIndex, tile_of_cells
 from mapvote.core.ground import Heights, lay_ground
 from mapvote.core.lazy_tiles import LazyTiles
-from mapvote.core.picture import html_picture
 from mapvote.core.tile import Tile
 from mapvote.core.types import F32, F64, I32, I64, MapvoteError
 
@@ -41,10 +40,6 @@ class PointMap:
 
     def __repr__(self) -> str:
         return f"PointMap({self.map_id!r}: {self.n_points:,} points in {len(self.tiles)} tiles)"
-
-    def _repr_html_(self) -> str:
-        """The line of ``repr`` over a small picture from above, for notebooks."""
-        return html_picture(repr(self), self.tiles.values())
 
     @property
     def n_points(self) -> int:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Generator
-from typing import NamedTuple
 
 import numpy as np
 
@@ -98,23 +97,6 @@ def cut_reference(outer: Reference, window: Grid) -> Reference:
         outer.top_z[cut],
         None if outer.free is None else outer.free[cut],
     )
-
-
-class Bordered(NamedTuple):
-    """A tile's planes, and what lies beside it."""
-
-    here: Reference
-    outer: Reference
-    """With a cell more on each side."""
-    known: U64
-    """(rows, cols) voxels that the map knows to be free, or has to be taken to know (:func:`above_ground_points`)."""
-
-
-def bordered(point_map: PointMap, window: Grid) -> Bordered:
-    """What the rules of detection ask of the map over ``window``."""
-    outer = reference_window(point_map, window.padded(1))
-    here = cut_reference(outer, window)
-    return Bordered(here, outer, here.free if here.free is not None else above_ground_points(point_map, window))
 
 
 class LocalMap:

@@ -10,11 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mapvote.core.cells import flat_cells
-from mapvote.core.columns import column_bits, mark_obstacles
+from mapvote.core.columns import column_bits, flat_cells, mark_obstacles
 from mapvote.core.grid import CELLS, Grid, TileIndex
 from mapvote.core.ground import base_layers
-from mapvote.core.memory import Memory
+from mapvote.core.tile_history import Memory
 from mapvote.core.types import F32, F64, I32, I64, U8, U64, Bool, check_array, read_only
 
 _SCALES = (1.0, 255.0, 4095.0, 65535.0)

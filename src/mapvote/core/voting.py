@@ -102,16 +102,10 @@ def decide_cells(tally: NDArray[Any], backers: NDArray[Any], abstain: bool, min_
     return states
 
 
-def decide(tally: I32) -> U8:
+def plurality(tally: I32) -> U8:
     """:func:`verdict` where UNDETERMINED competes: ``tally`` (..., 5) -> states (...) uint8."""
     planes = tally.reshape(-1, N_STATES).T
     return decide_cells(planes, planes, False, 0).reshape(tally.shape[:-1])
-
-
-def decide_change(tally: I32, min_votes: int = 1) -> U8:
-    """:func:`verdict` where UNDETERMINED abstains, and a change needs ``min_votes`` votes. For one-hot tallies."""
-    planes = tally.reshape(-1, N_STATES).T
-    return decide_cells(planes, planes, True, min_votes * VOTE_UNIT).reshape(tally.shape[:-1])
 
 
 def one_hot(states: U8) -> I32:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from mapvote.core.grid import CELL_SIZE, Lattice
 from mapvote.core.kernel import inlined, kernel
-from mapvote.core.types import F64, I32, I64, Bool, read_only
+from mapvote.core.types import F32, F64, I32, I64, Bool, read_only
 
 _MIDDLE = 1 << 20
 """Indices are counted from here, so that keys are positive and never 0: within +-2^20 voxels (314 km at 0.3 m)."""
@@ -45,7 +45,7 @@ def slot_of(key: np.int64, table: I64) -> np.int64:
 
 
 @kernel
-def group(keys: I64, table: I64, place: I32, of: I32, first: I64) -> int:
+def _group(keys: I64, table: I64, place: I32, of: I32, first: I64) -> int:
     """Number equal keys (n,) > 0 in the order in which they come; a key of 0 belongs to none.
 
     Returns how many there are, with ``of`` (n,) the number of each key, -1 for 0, and in ``first`` (n,) the index of
@@ -68,13 +68,27 @@ def group(keys: I64, table: I64, place: I32, of: I32, first: I64) -> int:
 
 
 def grouped(keys: I64, slots: int = 1 << 14) -> tuple[I32, I64]:
-    """(``of`` (n,), ``first`` (m,)) of :func:`group`, by a table of ``slots`` (2^k) or more: 16,384 fit a cache."""
+    """(``of`` (n,), ``first`` (m,)) of :func:`_group`, by a table of ``slots`` (2^k) or more: 16,384 fit a cache."""
     of, first = np.empty(len(keys), dtype=np.int32), np.empty(len(keys), dtype=np.int64)
     while True:
-        m = group(keys, np.zeros(slots, dtype=np.int64), np.empty(slots, dtype=np.int32), of, first)
+        m = _group(keys, np.zeros(slots, dtype=np.int64), np.empty(slots, dtype=np.int32), of, first)
         if m >= 0:
             return of, first[:m]
         slots *= 4
+
+
+def found_among(rows: F32 | F64, others: F32 | F64) -> Bool:
+    """(n,) whether each of ``rows`` (n, k) is, bit for bit, among ``others`` (m, k), of one dtype. -0.0 is not 0.0.
+
+    Rows are numbered word by word: equal numbers, equal words so far.
+    """
+    words = np.concatenate([others, rows]).view(np.uint32)
+    number, slots = np.zeros(len(words), dtype=np.int64), 1 << (2 * len(words)).bit_length()
+    for word in words.T:
+        number = grouped(((number << 32) | word) + 1, slots)[0].astype(np.int64)
+    known = np.zeros(len(words), dtype=np.bool_)
+    known[number[: len(others)]] = True
+    return known[number[len(others) :]]
 
 
 @kernel
@@ -157,7 +171,7 @@ class VoxelCloud:
         if skip is not None:
             keys[skip] = 0
         table[:] = 0
-        m = group(keys, table, place, of_point, first)
+        m = _group(keys, table, place, of_point, first)
         while self._n + m > len(self._sums):
             self._grow()
         self._n = _find(keys[first[:m]], self._keys, self._rows, self._n, rows)

@@ -9,8 +9,8 @@ import numpy as np
 
 from mapvote.codec.arrays import compress, unpack_bytes
 from mapvote.core.grid import CELLS, TILE_CELLS, Grid, Lattice, TileIndex
-from mapvote.core.heap import give_back_free_pages
 from mapvote.core.kernel import kernel
+from mapvote.core.process_memory import give_back_free_pages
 from mapvote.core.types import U64
 from mapvote.detection.shelf import Place, Shelf
 

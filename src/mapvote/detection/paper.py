@@ -19,7 +19,7 @@ from mapvote.core.kernel import kernel
 from mapvote.core.point_map import PointMap
 from mapvote.core.sensors import Sensor
 from mapvote.core.types import F32, F64, I32, N_STATES, NO_VOTE, U8, U16, U64, Bool, CellState, Reference
-from mapvote.core.voting import VOTE_UNIT, cast, decide, weight_table
+from mapvote.core.voting import VOTE_UNIT, cast, plurality, weight_table
 from mapvote.detection.voter import TileVotes
 from mapvote.perception.frontend import Observation
 from mapvote.perception.raycast import ScanView, Sight, cast_rays
@@ -245,4 +245,4 @@ class PaperVoter:
         for tile, tally in sorted(self._tally.tiles.items()):
             if (only is None or tile in only) and tally.any():
                 new = np.where(tally[..., CellState.CHANGED_OCCUPIED] > 0, EVERY_BIT, np.uint64(0))
-                yield tile, TileVotes(tally, decide(tally), None, None, new, None)
+                yield tile, TileVotes(tally, plurality(tally), None, None, new, None)

@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapvote.core.grid import TileIndex
-from mapvote.core.heights import check_heights
 from mapvote.core.kernel import allocating
 from mapvote.core.lazy_tiles import LazyTiles
 from mapvote.core.point_map import PointMap, all_points
+from mapvote.core.sensor_height import check_heights
 from mapvote.core.tile import Tile
 from mapvote.core.types import F64, I64, MapvoteError
 from mapvote.doctor.finding import Finding, in_order

@@ -11,8 +11,8 @@ import numpy as np
 from mapvote.codec.ballot import Ballot, decode, unpack_states
 from mapvote.codec.points import unpack_points
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS
-from mapvote.core.heights import check_heights
 from mapvote.core.point_map import PointMap
+from mapvote.core.sensor_height import check_heights
 from mapvote.core.types import CellState, Drive, MapvoteError
 from mapvote.formats import open_drive, read_map
 from mapvote.formats.maps.cloud import Cloud

@@ -3,7 +3,8 @@
 A majority of the latest vehicles would let a house that stood for years stand for as many passes again. But if the
 votes on a cell, in the order in which the vehicles passed, say "unchanged" and then, without exception, the same
 change, it happened in between: those before saw another world and do not speak of this one. One more than the quorum
-must have seen it, so that of k who lie not even k and an honest one that errs make such a turn."""
+must have seen it, so that of k who lie not even k and an honest one that errs make such a turn.
+"""
 
 from __future__ import annotations
 

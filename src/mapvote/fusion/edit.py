@@ -3,7 +3,8 @@
 A cell that was emptied loses all that its voters saw gone; a cell that stands loses what is left of gone things. In a
 cell that stands one vehicle may have seen past what another hit: a twig, a ledge, the edge of a wall. So half of the
 vehicles can take only what stands apart. What touches something that stays goes if more than two thirds say so, those
-among them who have the whole cell empty."""
+among them who have the whole cell empty.
+"""
 
 from __future__ import annotations
 

@@ -2,7 +2,8 @@
 
 The order in which votes are given never matters: tallies are integer sums, and of several points for one voxel the
 same one is always taken. A vote is spent once a version has changed its cell. That the cell looks as it did is no test:
-what came and went leaves it bit for bit as at first, and the votes that brought it would bring it again."""
+what came and went leaves it bit for bit as at first, and the votes that brought it would bring it again.
+"""
 
 from __future__ import annotations
 
@@ -15,11 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapvote.config import FuseSettings
-from mapvote.core.cells import flat_cells
+from mapvote.core.columns import flat_cells
 from mapvote.core.grid import CELLS, TILE_CELLS, Grid, Lattice, TileIndex
 from mapvote.core.kernel import kernel
-from mapvote.core.memory import Memory
 from mapvote.core.tile import Tile
+from mapvote.core.tile_history import Memory
 from mapvote.core.types import F32, I32, I64, N_STATES, NO_VOTE, U8, Bool, CellState, MapvoteError, read_only
 from mapvote.core.voting import VOTE_UNIT, add_tally, decide_cells, tally_of
 from mapvote.fusion.change_time import lately_changed

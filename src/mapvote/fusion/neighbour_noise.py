@@ -4,7 +4,8 @@ A wall two centimetres from the border of its cell leaves a part of its points i
 there. When it goes, or comes, vehicles see that cell change, too, and they are right: its points have to go, or come,
 with the wall. But nothing of the world changed in it. So its points are edited as was voted, and the cell is told as
 what it was and is: empty. A plane through all points about, of both cells, tells nearly to the centimetre on which
-side the wall stands."""
+side the wall stands.
+"""
 
 from __future__ import annotations
 
@@ -12,8 +13,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from mapvote.core.cells import flat_cells
-from mapvote.core.columns import column_bits
+from mapvote.core.columns import column_bits, flat_cells
 from mapvote.core.grid import CELL_SIZE, CELLS, TILE_CELLS, Grid
 from mapvote.core.kernel import kernel
 from mapvote.core.tile import Tile

@@ -1,7 +1,8 @@
 """Where one more pass would decide something: cells in which a change lacks one vote, and the road to see them from.
 
 A vehicle that saw a change is the witness of where it can be seen from. One more vehicle that drives the same road in
-the same direction most likely sees the same, and its vote decides the cell."""
+the same direction most likely sees the same, and its vote decides the cell.
+"""
 
 from __future__ import annotations
 

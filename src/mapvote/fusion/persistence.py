@@ -20,8 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapvote.config import FuseSettings
-from mapvote.core.memory import Memory
 from mapvote.core.tile import Tile
+from mapvote.core.tile_history import Memory
 from mapvote.core.types import F64, I64, U8, U64, Bool, CellState
 from mapvote.fusion.change_time import said_in_order
 from mapvote.fusion.tile_vote import TileVote

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from mapvote.codec.ballot import unpack_offer, unpack_sound_states, unpack_states, unpack_sureness, unpack_tally
 from mapvote.codec.points import unpack_points, unpack_sound_points
 from mapvote.config import FuseSettings
-from mapvote.core.cells import flat_cells
+from mapvote.core.columns import flat_cells
 from mapvote.core.grid import CELLS, TILE_CELLS, Grid
 from mapvote.core.types import F32, I64, N_STATES, NO_VOTE, U8, U16, U64, Bool, CellState, read_only
 from mapvote.fusion.loss_budget import Odds, folded

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mapvote.core.cells import flat_cells
+from mapvote.core.columns import flat_cells
 from mapvote.core.grid import CELL_SIZE
 from mapvote.core.kernel import allocating, kernel
 from mapvote.core.point_map import PointMap

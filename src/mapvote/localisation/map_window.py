@@ -88,12 +88,6 @@ def tiles_within(point_map: PointMap, position: F64, half_m: float = HALF_WINDOW
     return [tile for tile in window.tiles() if tile in point_map.tiles]
 
 
-def window_points(point_map: PointMap, position: F64, half_window_m: float = HALF_WINDOW_M) -> F64:
-    """Points (n, 3) in map metres of the tiles that the NDT's window around ``position`` touches."""
-    clouds = [point_map.tiles[tile].points_map for tile in tiles_within(point_map, position, half_window_m)]
-    return np.concatenate([np.zeros((0, 3)), *clouds])
-
-
 def tile_voxels(tile: Tile, level: Level) -> list[Voxels]:
     """The voxels of all points of a tile, in one piece for each slab of height."""
     points = tile.points_map

@@ -11,7 +11,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mapvote.core.geometry import rows_from, turn
+from mapvote.core.azimuth import turn
+from mapvote.core.geometry import rows_from
 from mapvote.core.kernel import inlined, kernel
 from mapvote.core.types import F32, F64, I32, U8
 

@@ -18,10 +18,10 @@ import numpy as np
 from mapvote.config import Settings
 from mapvote.core.columns import TOP_BIT, column_bits, rebased
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, tile_of_cells
-from mapvote.core.heights import heights_over_ground
 from mapvote.core.kernel import allocating
 from mapvote.core.point_map import PointMap, map_from_points
 from mapvote.core.reference import LocalMap
+from mapvote.core.sensor_height import heights_over_ground
 from mapvote.core.tile import Tile
 from mapvote.core.types import F32, F64, I32, I64, U64, Bool, Drive
 from mapvote.core.voxels import VoxelCloud

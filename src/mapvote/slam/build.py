@@ -15,9 +15,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from mapvote.config import Settings
-from mapvote.core.heights import Heights, check_heights, two_levels
-from mapvote.core.motions import inverses, rotation_angles
+from mapvote.core.geometry import inverses, rotation_angles
 from mapvote.core.point_map import PointMap, map_from_points
+from mapvote.core.sensor_height import Heights, check_heights, two_levels
 from mapvote.core.types import F64, Bool, Drive, MapvoteError
 from mapvote.slam.accumulate import Layer
 from mapvote.slam.pose_graph_all import carried_along, settle

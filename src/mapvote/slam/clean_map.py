@@ -37,8 +37,8 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Lattice
-from mapvote.core.heights import crossings, heights_over_ground
 from mapvote.core.point_map import PointMap
+from mapvote.core.sensor_height import crossings, heights_over_ground
 from mapvote.core.tile import Tile
 from mapvote.core.types import F32, F64, I32, I64, Bool
 from mapvote.core.voxels import slot_of, thin, voxel_keys

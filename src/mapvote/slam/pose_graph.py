@@ -13,7 +13,7 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse.linalg import splu, spsolve
 
-from mapvote.core.motions import adjoints, exps, inverses, logs
+from mapvote.core.geometry import adjoints, exps, inverses, logs
 from mapvote.core.types import F64, I64
 
 

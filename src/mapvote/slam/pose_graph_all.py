@@ -14,7 +14,7 @@ from itertools import pairwise
 import numpy as np
 from scipy.spatial import cKDTree
 
-from mapvote.core.motions import inverses
+from mapvote.core.geometry import inverses
 from mapvote.core.types import F64, I64, Drive
 from mapvote.slam.pose_graph import Anchors, Links, optimise, position_sigmas
 from mapvote.slam.prior_alignment import fit_to_priors, trust_in

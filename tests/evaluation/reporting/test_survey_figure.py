@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mapvote.core.heights import Heights
+from mapvote.core.sensor_height import Heights
 from mapvote.core.types import Drive
 from mapvote.plots import draw_survey
 from mapvote.slam.build import BuildReport, DriveTrack

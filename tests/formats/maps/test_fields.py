@@ -12,7 +12,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from mapvote.core.cells import flat_cells
+from mapvote.core.columns import flat_cells
 from mapvote.core.point_map import all_fields
 from mapvote.formats import export_map, read_map, write_map
 from mapvote.formats.maps.cloud import Cloud

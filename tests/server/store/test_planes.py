@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hand_made import SHAPE
-from mapvote.core.memory import PLANES, Memory
+from mapvote.core.tile_history import PLANES, Memory
 from mapvote.server.store.planes import pack_memory, unpack_memory_plane
 
 

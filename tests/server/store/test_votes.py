@@ -16,7 +16,7 @@ from mapvote.codec.ballot import encode
 from mapvote.codec.points import pack_points, unpack_points
 from mapvote.config import FuseSettings
 from mapvote.core.grid import TileIndex
-from mapvote.core.memory import Memory
+from mapvote.core.tile_history import Memory
 from mapvote.core.types import NO_VOTE, CellState
 from mapvote.fusion.tile_vote import DAY_NS, TileVote
 from mapvote.server.store import reviews

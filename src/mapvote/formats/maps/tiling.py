@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mapvote.core.cells import flat_cells
+from mapvote.core.columns import flat_cells
 from mapvote.core.grid import Lattice, TileIndex
 from mapvote.core.ground import Heights, lay_ground
 from mapvote.core.lazy_tiles import LazyTiles, in_memory_if_small

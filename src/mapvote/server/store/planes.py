@@ -15,8 +15,8 @@ from mapvote.codec.ballot import tile_key
 from mapvote.codec.fields import field_names, pack_fields, unpack_fields
 from mapvote.codec.tile_file import MAX_TILE_POINTS
 from mapvote.core.grid import CELLS, TILE_CELLS, Grid
-from mapvote.core.memory import PLANES, Memory
 from mapvote.core.tile import Tile
+from mapvote.core.tile_history import PLANES, Memory
 from mapvote.core.types import F32, U64, Bool, MapvoteError
 
 _ZSTD_LEVEL = 2

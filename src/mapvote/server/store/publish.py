@@ -16,8 +16,8 @@ from sqlalchemy.exc import IntegrityError
 
 from mapvote.config import FuseSettings
 from mapvote.core.grid import Grid, TileIndex
-from mapvote.core.memory import Memory
 from mapvote.core.tile import Tile
+from mapvote.core.tile_history import Memory
 from mapvote.core.types import MapvoteError
 from mapvote.fusion.fuse import differing
 from mapvote.server.errors import Conflict, Held

@@ -11,8 +11,8 @@ import sqlalchemy as sa
 from mapvote.codec.arrays import FRAME_HEAD
 from mapvote.codec.ballot import tile_key
 from mapvote.core.grid import Grid, TileIndex
-from mapvote.core.memory import Memory
 from mapvote.core.tile import Tile
+from mapvote.core.tile_history import Memory
 from mapvote.server.errors import NotFound
 from mapvote.server.store import schema
 from mapvote.server.store.database import MOST_ASKED, Question, insert_rows

@@ -14,10 +14,10 @@ import numpy as np
 
 from mapvote.codec.odds import UNSAID
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS
-from mapvote.core.rows import found_among
 from mapvote.core.tile import Tile
 from mapvote.core.types import F64, I8, I32, I64, U8, CellState
 from mapvote.core.voting import VOTE_UNIT
+from mapvote.core.voxels import found_among
 from mapvote.fusion.loss_budget import Odds, alike_beside, change_probability
 from mapvote.server.views.outlines import REACH_M, Ring, buildings, group, members, rings, widths_m
 

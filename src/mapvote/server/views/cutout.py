@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 
 from mapvote.core.grid import TILE_CELLS, Grid, Lattice, TileIndex
-from mapvote.core.rows import found_among
 from mapvote.core.tile import Tile
 from mapvote.core.types import F32, F64
+from mapvote.core.voxels import found_among
 from mapvote.server.views.point_lod import SIDE_M, cloud_bytes, pack
 
 AROUND_M = 10.0

@@ -19,7 +19,7 @@ from mapvote.codec.odds import UNSAID, in_nats
 from mapvote.core.grid import TILE_CELLS, TileIndex
 from mapvote.core.tile import Tile
 from mapvote.core.types import NO_VOTE, U8, CellState, MapvoteError
-from mapvote.core.voting import VOTE_UNIT, decide
+from mapvote.core.voting import VOTE_UNIT, plurality
 from mapvote.fusion.fuse import Heard, decide_tile, rule_of
 from mapvote.fusion.loss_budget import alike_beside, change_probability
 from mapvote.fusion.persistence import expected_days
@@ -149,7 +149,7 @@ def said_by(vote: TileVote) -> U8:
     if vote.states is not None:
         return vote.states
     assert vote.tally is not None
-    return decide(vote.tally.astype(np.int32))
+    return plurality(vote.tally.astype(np.int32))
 
 
 def sound_votes(

@@ -18,10 +18,10 @@ import numpy as np
 
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Lattice, TileIndex
 from mapvote.core.kernel import allocating
-from mapvote.core.rows import found_among
 from mapvote.core.tile import Tile, in_bytes
 from mapvote.core.types import F32, F64, I64, N_STATES, NO_VOTE, U8, U16, CellState, MapvoteError
 from mapvote.core.voting import decide_cells
+from mapvote.core.voxels import found_among
 from mapvote.fusion.loss_budget import agreed_odds, alike_beside, change_probability, folded
 from mapvote.fusion.tile_vote import TileVote
 from mapvote.server.errors import Unavailable

@@ -1,4 +1,4 @@
-"""Yardsticks: nearest neighbours and occupied-briefly voxels, and how all of them are run beside the vote."""
+"""Yardsticks: nearest neighbours, and how all of them are run beside the vote."""
 
 from __future__ import annotations
 
@@ -15,62 +15,18 @@ from scipy.spatial import cKDTree
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Grid
 from mapvote.core.point_map import PointMap
 from mapvote.core.reference import reference_window
-from mapvote.core.types import F64, I32, I64, N_STATES, NO_VOTE, U8, Bool, CellState
-from mapvote.core.voting import decide, one_hot
+from mapvote.core.types import F64, I32, N_STATES, NO_VOTE, U8, Bool, CellState
+from mapvote.core.voting import one_hot, plurality
 from mapvote.core.voxels import voxel_downsample
 from mapvote.formats.atomic import whole_folder
 from mapvote.localisation.localiser import GivenPoses
-from mapvote.perception.frontend import Movers, Observation
+from mapvote.perception.frontend import Observation
 from mapvote_lab.evaluation.baselines.dempster_shafer import EvidenceMap, combine
 from mapvote_lab.evaluation.experiments.cases import paper_cases
 from mapvote_lab.evaluation.experiments.passes import Pass, SharedPass
 from mapvote_lab.evaluation.experiments.scene import BALLOTS_FROM, Progress, Scene, key_of, sources_digest
 from mapvote_lab.evaluation.scoring.map_points import map_obstacles
 from mapvote_lab.simulation.processes import processes
-
-BRIEF_S = 1.0
-"""Occupied for less than this: moving."""
-GAP_S = 0.25
-"""A cell that no scan hit for longer than this was empty in between: two scans of 10 Hz may miss it."""
-
-
-class OccupiedBriefly(Movers):
-    """Decides each scan at once. Memory: the cells that were hit within the last GAP_S."""
-
-    def __init__(self, brief_s: float = BRIEF_S, gap_s: float = GAP_S) -> None:
-        self._brief_ns, self._gap_ns = round(brief_s * 1e9), round(gap_s * 1e9)
-        self._cells: I64 = np.zeros(0, dtype=np.int64)
-        """Keys, ascending; with each since when it has been occupied, and when it was last hit."""
-        self._since: I64 = np.zeros(0, dtype=np.int64)
-        self._last: I64 = np.zeros(0, dtype=np.int64)
-
-    def push(self, points_map: F64, origin_map: F64, obstacle: Bool, stamp_ns: int) -> list[Bool]:
-        """The mask of moving points (n,) of this scan; see :class:`mapvote.perception.frontend.Movers`."""
-        cells = np.floor(points_map[obstacle, :2] / CELL_SIZE).astype(np.int64)
-        hit, of_point = np.unique((cells[:, 0] << 32) + cells[:, 1], return_inverse=True)
-        since = np.full(len(hit), stamp_ns, dtype=np.int64)
-        at = np.searchsorted(self._cells, hit).clip(max=max(len(self._cells) - 1, 0))
-        if len(self._cells):
-            known = (self._cells[at] == hit) & (stamp_ns - self._last[at] <= self._gap_ns)
-            since[known] = self._since[at[known]]
-        self._remember(hit, since, stamp_ns)
-        moving = np.zeros(len(points_map), dtype=np.bool_)
-        moving[obstacle] = (stamp_ns - since < self._brief_ns)[of_point]
-        return [moving]
-
-    def _remember(self, hit: I64, since: I64, stamp_ns: int) -> None:
-        """What was hit now, and what was hit a moment ago."""
-        fresh = (stamp_ns - self._last <= self._gap_ns) & ~np.isin(self._cells, hit)
-        cells = np.concatenate([self._cells[fresh], hit])
-        order = np.argsort(cells)
-        self._cells = cells[order]
-        self._since = np.concatenate([self._since[fresh], since])[order]
-        self._last = np.concatenate([self._last[fresh], np.full(len(hit), stamp_ns)])[order]
-
-    def flush(self) -> list[Bool]:
-        """Nothing waits."""
-        return []
-
 
 DISTANCE_M = 0.5
 _MERGE_EVERY = 16
@@ -179,7 +135,7 @@ def yardsticks(
     maps = [_read_evidence(folder / "evidence.npz", EvidenceMap(reference)) for folder in folders]
     own = [combine([one], reference) for one in maps]
     return {
-        "nearest": Yardstick(decide(votes), nearest, mean["nearest"]),
+        "nearest": Yardstick(plurality(votes), nearest, mean["nearest"]),
         "evidence": Yardstick(combine(maps, reference), own, mean["evidence"]),
     }, mean["case 5"]
 

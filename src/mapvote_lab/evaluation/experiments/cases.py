@@ -18,7 +18,7 @@ from mapvote.config import CASES, FuseSettings, PaperSettings, Settings, VotingS
 from mapvote.core.grid import Grid
 from mapvote.core.point_map import PointMap
 from mapvote.core.types import NO_VOTE, U8, MapvoteError
-from mapvote.core.voting import decide
+from mapvote.core.voting import plurality
 from mapvote.fusion.fuse import states_over
 from mapvote.fusion.offline import update_map
 from mapvote_lab.evaluation.scoring.jury import CaseOutcome
@@ -113,5 +113,7 @@ def ballot_states(ballot: Ballot, point_map: PointMap) -> tuple[U8, Grid]:
 def _decided(tiles: Any) -> Iterator[U8]:
     for tile in tiles:
         yield (
-            unpack_states(tile.states) if tile.states is not None else decide(unpack_tally(tile.tally).astype(np.int32))
+            unpack_states(tile.states)
+            if tile.states is not None
+            else plurality(unpack_tally(tile.tally).astype(np.int32))
         )

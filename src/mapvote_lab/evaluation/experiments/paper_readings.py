@@ -17,7 +17,7 @@ from mapvote.core.grid import CELL_SIZE, Grid
 from mapvote.core.kernel import kernel
 from mapvote.core.sensors import Sensor
 from mapvote.core.types import I32, N_STATES, NO_VOTE, U8, U16, Bool
-from mapvote.core.voting import decide, one_hot, to_wire
+from mapvote.core.voting import one_hot, plurality, to_wire
 from mapvote.detection.paper import reading_table, sightings
 from mapvote.detection.readings import read, readings_of
 from mapvote.perception.frontend import Observation
@@ -137,7 +137,7 @@ def decided(drives: Sequence[KeptDrive], mapped: Bool, cases: Sequence[Case]) ->
     """By case's name: (what the server decides, what each vehicle does), over the truth's window."""
     rules = list(dict.fromkeys(counting_rule(case) for case in cases))
     counted = [tallies(drive, mapped, rules) for drive in drives]
-    own = {rule: [decide(one[rule]) for one in counted] for rule in rules}
+    own = {rule: [plurality(one[rule]) for one in counted] for rule in rules}
     out = {}
     for case in cases:
         rule = counting_rule(case)
@@ -145,7 +145,7 @@ def decided(drives: Sequence[KeptDrive], mapped: Bool, cases: Sequence[Case]) ->
             votes = [one_hot(states) for states in own[rule]]
         else:
             votes = [to_wire(one[rule]).astype(np.int32) for one in counted]
-        out[case.name] = decide(np.stack(votes).sum(axis=0, dtype=np.int32)), own[rule]
+        out[case.name] = plurality(np.stack(votes).sum(axis=0, dtype=np.int32)), own[rule]
     return out
 
 

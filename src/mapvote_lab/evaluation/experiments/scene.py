@@ -23,8 +23,8 @@ import mapvote
 import mapvote_lab
 from mapvote.config import Settings
 from mapvote.core.columns import GROUND_MARGIN_M
-from mapvote.core.heap import give_back_free_pages
 from mapvote.core.point_map import PointMap
+from mapvote.core.process_memory import give_back_free_pages
 from mapvote.core.types import F64, Drive
 from mapvote.core.voxels import voxel_downsample
 from mapvote.formats import open_drive, read_map, write_map

@@ -7,8 +7,8 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from mapvote.core.point_map import PointMap
-from mapvote.core.rows import found_among
 from mapvote.core.types import F64, Bool
+from mapvote.core.voxels import found_among
 from mapvote_lab.evaluation.scoring.cells import ratio
 
 

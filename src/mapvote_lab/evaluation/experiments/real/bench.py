@@ -14,8 +14,8 @@ from mapvote.config import Settings
 from mapvote.core.columns import GROUND_MARGIN_M
 from mapvote.core.geometry import inverse, transform
 from mapvote.core.grid import Grid
-from mapvote.core.heights import check_heights
 from mapvote.core.reference import LocalMap, reference_window
+from mapvote.core.sensor_height import check_heights
 from mapvote.core.types import F64, U8, Bool, CellState, Drive, MapvoteError
 from mapvote.core.voxels import VoxelCloud
 from mapvote.localisation.localiser import GivenPoses

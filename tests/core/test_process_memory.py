@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from mapvote.core.heap import give_back_free_pages
+from mapvote.core.process_memory import give_back_free_pages
 
 
 def resident_mb() -> float:

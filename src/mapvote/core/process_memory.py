@@ -1,5 +1,6 @@
 """Free memory back to the system: what comes and goes with every scan leaves holes in the heap, and they add up. And
-the collector of cycles, which has little to do here."""
+the collector of cycles, which has little to do here.
+"""
 
 from __future__ import annotations
 

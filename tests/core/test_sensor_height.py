@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from mapvote.core.heights import check_heights, heights_over_ground, two_levels
 from mapvote.core.point_map import PointMap, map_from_points
+from mapvote.core.sensor_height import check_heights, heights_over_ground, two_levels
 from mapvote.core.types import F64
 
 
