@@ -22,7 +22,7 @@ from mapvote.vehicle import Vehicle
 from mapvote_lab.evaluation.baselines.baselines import heights_above_ground
 from mapvote_lab.evaluation.experiments.cases import ballot_states
 from mapvote_lab.evaluation.scoring.cells import score_cells
-from mapvote_lab.evaluation.scoring.truth import Truth, error_summary, lay_on, rigid_between
+from mapvote_lab.evaluation.scoring.scene_truth import Truth, error_summary, lay_on, rigid_between
 
 WARM_UP = 25
 """Scans: the first leaves for the voter after some fifteen."""

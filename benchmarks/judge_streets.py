@@ -9,7 +9,7 @@ from mapvote.core.point_map import PointMap
 from mapvote.core.types import F64, Drive
 from mapvote.formats import open_drive, read_map, read_T_map_lidar, write_map
 from mapvote.slam.build import build_map
-from mapvote_lab.evaluation.scoring.truth import Truth, read_truth
+from mapvote_lab.evaluation.scoring.scene_truth import Truth, read_truth
 from mapvote_lab.simulation import simulate
 
 

@@ -31,7 +31,7 @@ from mapvote_lab.evaluation.experiments.scene import BALLOTS_FROM, Scene, key_of
 from mapvote_lab.evaluation.scoring.cells import UNSCORED
 from mapvote_lab.evaluation.scoring.jury import Jury
 from mapvote_lab.evaluation.scoring.map_points import MapJudge, map_obstacles, same_rows
-from mapvote_lab.evaluation.scoring.truth import Truth
+from mapvote_lab.evaluation.scoring.scene_truth import Truth
 
 Told = Mapping[TileIndex, tuple[F64, F64]]
 """By tile what was looked at in its changed cells (m, k), and how deep in them their surface lies (m,), metres."""

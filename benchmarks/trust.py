@@ -25,7 +25,7 @@ from mapvote.formats import open_drive, read_T_map_lidar
 from mapvote.localisation.localiser import Localiser
 from mapvote.localisation.ndt import PosePrior
 from mapvote.slam.build import build_map
-from mapvote_lab.evaluation.scoring.truth import rigid_between
+from mapvote_lab.evaluation.scoring.scene_truth import rigid_between
 from mapvote_lab.simulation import simulate
 
 SETTINGS = Settings()

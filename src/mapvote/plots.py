@@ -1,6 +1,7 @@
 """Pictures of a survey and of what the doctor found, and the look of all pictures: a colour always means the same.
 
-Needs matplotlib (extra ``plots``)."""
+Needs matplotlib (extra ``plots``).
+"""
 
 from __future__ import annotations
 

@@ -23,8 +23,8 @@ from mapvote.detection.paper import (
     BEGINS_ABOVE,
     WORDS,
     PaperVoter,
+    cell_words,
     classify_paper,
-    encode,
     reading_table,
     sightings,
     votes_in,
@@ -70,7 +70,7 @@ def vote(
 ) -> tuple[int, int]:
     """State and votes of the last cell, the paper's sentences ``read`` like that; an occluded scan votes, so that it
     shows."""
-    words = encode(view, reference, ORIGIN, SENSOR)
+    words = cell_words(view, reference, ORIGIN, SENSOR)
     voting = VotingSettings(weighted=weighted, skip_tall_cells=tall)
     states, weights = classify_paper(
         words, reference.counts > 0, voting, PaperSettings.model_validate({"occluded": "votes"} | read)
@@ -125,7 +125,7 @@ def test_case_5_knows_how_the_sensor_leans() -> None:
     view, reference = one_cell(0, Sight.CLEAR, map_bits=1 << 12, bottom_z=3.6)
     for pitch_deg, invalid in ((0.0, True), (-2.0, False), (2.0, True)):
         up = from_xyz_rpy(0, 0, 0, 0, np.radians(pitch_deg), 0)[:3, 2]
-        words = encode(view, reference, ORIGIN, SENSOR, up_map=up)
+        words = cell_words(view, reference, ORIGIN, SENSOR, up_map=up)
         assert (words[0, -1] & BEGINS_ABOVE != 0) == invalid
 
 
@@ -143,7 +143,7 @@ def test_a_map_begins_above_the_view_where_plain_trigonometry_says(
     away = np.array([12.5 * CELL_SIZE, 0.5 * CELL_SIZE, np.float32(bottom_z)]) - origin
     elevation = np.arcsin(np.clip(away @ up / np.linalg.norm(away), -1.0, 1.0))
     assume(abs(elevation - np.radians(SENSOR.fov_top_deg)) > 1e-4)
-    word = encode(view, reference, np.array(origin), SENSOR, up_map=up)[0, -1]
+    word = cell_words(view, reference, np.array(origin), SENSOR, up_map=up)[0, -1]
     assert (word & BEGINS_ABOVE != 0) == (elevation > np.radians(SENSOR.fov_top_deg))
 
 

@@ -22,7 +22,7 @@ from mapvote_lab.evaluation.experiments.scene import Scene
 from mapvote_lab.evaluation.reporting import tables
 from mapvote_lab.evaluation.reporting.sheets import ReportSection, page
 from mapvote_lab.evaluation.results import EvaluationResult, to_json
-from mapvote_lab.evaluation.scoring.truth import error_summary, pose_errors, rigid_between
+from mapvote_lab.evaluation.scoring.scene_truth import error_summary, pose_errors, rigid_between
 
 SLOWER = {"rate_hz": 4.0, "sensor": "vlp16"}
 """Fewer scans and beams than the paper has: a test asks whether it works, not how well."""
@@ -99,7 +99,7 @@ def test_a_misspelt_case_is_named() -> None:
 
 
 def test_no_truth_no_score(tmp_path: Path) -> None:
-    from mapvote_lab.evaluation.scoring.truth import read_truth
+    from mapvote_lab.evaluation.scoring.scene_truth import read_truth
 
     with pytest.raises(MapvoteError, match="no usable truth"):
         read_truth(tmp_path)

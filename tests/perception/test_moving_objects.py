@@ -3,17 +3,24 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy import ndimage
 
 from mapvote.config import MovingSettings, VotingSettings
+from mapvote.core.columns import GROUND_MARGIN_M
+from mapvote.core.geometry import transform
 from mapvote.core.grid import CELL_SIZE, Lattice, window_around
+from mapvote.core.point_map import map_from_points
+from mapvote.core.reference import reference_window
 from mapvote.core.sensors import SENSORS, Sensor
-from mapvote.core.types import F64, Bool
+from mapvote.core.types import F64, I32, Bool
+from mapvote.formats import open_drive
 from mapvote.perception import moving_objects
-from mapvote.perception.moving_kernels import voxels
-from mapvote.perception.moving_objects import REACH_M, MovingFilter
+from mapvote.perception.moving_objects import REACH_M, MovingFilter, moving_components, voxels
+from mapvote_lab.simulation import simulate
 
 LIDAR_HEIGHT = 1.9
 Box = tuple[float, float, float, float, float]
@@ -179,3 +186,113 @@ def test_stamps_must_increase() -> None:
     moving.push(*scan, 5)
     with pytest.raises(ValueError, match="stamps must increase"):
         moving.push(*scan, 5)
+
+
+SIDE = 10
+
+
+def plane(inner: Bool) -> Bool:
+    """(SIDE, SIDE) with a rim of nothing."""
+    return np.pad(inner, 1)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_cells_move_by_components_as_scipy_labels_them(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    place = np.flatnonzero(plane(rng.random((SIDE - 2, SIDE - 2)) < 0.5))
+    brief = rng.random(len(place)) < 0.5
+    moves, wanted = np.zeros(len(place), np.bool_), np.ones(len(place), np.bool_)
+    for share in (0.5, 0.6):
+        held = np.zeros(SIDE * SIDE, np.bool_)
+        held[place[wanted]] = True
+        label = ndimage.label(held.reshape(SIDE, SIDE), structure=np.ones((3, 3)))[0].ravel()[place]
+        found = [bool(k and brief[label == k].sum() >= max(2, share * (label == k).sum())) for k in label]
+        moves |= found
+        wanted = ~moves & brief
+    np.testing.assert_array_equal(
+        moving_components(place, SIDE, np.ones(len(place), np.bool_), brief, 2, 0.5, 0.6), moves
+    )
+
+
+def moving(at: list[tuple[int, int]], brief: list[bool], voxel_of: I32, min_voxels: int = 4) -> list[bool]:
+    rows, cols = np.array(at).T
+    seen = np.ones(len(at), np.bool_)
+    found = moving_components(rows * SIDE + cols, SIDE, seen, np.array(brief), min_voxels, 0.5, 0.6)
+    return list(np.append(found, False)[voxel_of].tolist())
+
+
+def test_the_voxels_over_one_cell_count_together_and_all_their_points_move() -> None:
+    walker, post = [(2, 3)] * 4, [(7, 7)] * 4
+    points = np.array([-1, 0, 3, 3, 4, 7], np.int32)
+    assert moving(walker + post, [True] * 4 + [False] * 4, points) == [False, True, True, True, False, False]
+    assert moving(post + walker, [False] * 4 + [True] * 4, points) == [False, False, False, False, True, True]
+    assert not any(moving(walker + post, [True] * 4 + [False] * 4, points, min_voxels=5))
+
+
+def test_two_things_with_a_free_cell_between_them_move_each_by_itself() -> None:
+    car, wall = [(r, c) for r in (2, 3) for c in (2, 3)], [(r, 5) for r in range(1, 9)]
+    brief = [True] * len(car) + [False] * len(wall)
+    assert moving(car + wall, brief, np.arange(len(brief), dtype=np.int32)) == brief
+
+
+def test_a_walker_who_touches_a_wall_moves_without_it_though_something_of_the_wall_was_brief_too() -> None:
+    touched, wall, walker = [(4, 4)] * 4, [(4, c) for c in range(1, 9)] * 3, [(5, 4)] * 4
+    brief = [True] + [False] * (len(touched) - 1 + len(wall)) + [True] * len(walker)
+    moves = moving(touched + wall + walker, brief, np.arange(len(brief), dtype=np.int32))
+    assert moves == [False] * (len(touched) + len(wall)) + [True] * len(walker)
+
+
+@pytest.mark.parametrize("count", [0, 50, 20_000])
+def test_voxels_are_numbered_by_their_first_points_however_many_there_are(count: int) -> None:
+    """The last has more than the table that is tried first holds."""
+    rng = np.random.default_rng(count)
+    origin = np.array([500.0, -300.0, 8.0])
+    points, obstacle = origin + rng.uniform(-12.0, 12.0, (3 * count, 3)), rng.random(3 * count) < 0.7
+    voxel_of, samples = voxels(points, obstacle, origin, 11.0, 0.3)
+    chosen = np.flatnonzero(obstacle & (np.hypot(*(points - origin)[:, :2].T) <= 11.0))
+    _, at, number = np.unique(np.floor(points[chosen] / 0.3), axis=0, return_index=True, return_inverse=True)
+    in_order = np.argsort(at)
+    np.testing.assert_array_equal(samples, points[chosen[at[in_order]]])
+    assert count < 1000 or len(samples) > 8192
+    expected = np.full(len(points), -1)
+    expected[chosen] = np.argsort(in_order)[number.ravel()]
+    np.testing.assert_array_equal(voxel_of, expected)
+
+
+def labels(street: Path, vehicle: str, stride: int) -> tuple[Bool, Bool]:
+    """(true, found) of every obstacle point of a drive, at true poses; the ground is what all its scans saw."""
+    drive = open_drive(street / vehicle, scans=f"::{stride}")
+    T_map_lidar = np.tile(np.eye(4), (len(drive), 1, 1))
+    T_map_lidar[:, :3] = np.loadtxt(street / "truth" / vehicle / "poses.txt").reshape(-1, 3, 4)[::stride]
+    clouds = [transform(T, scan.points) for T, scan in zip(T_map_lidar, drive, strict=True)]
+    middle = T_map_lidar[len(drive) // 2, :3, 3]
+    grid = window_around(Lattice(), middle[0], middle[1], 260.0)
+    ground_z = reference_window(map_from_points(np.concatenate(clouds)), grid).ground_z
+    moving = MovingFilter(drive.sensor, MovingSettings())
+    masks: list[Bool] = []
+    obstacle = []
+    for i, points_map in enumerate(clouds):
+        rows, cols, inside = grid.indices_of(points_map)
+        assert inside.all()
+        obstacle.append(points_map[:, 2] - ground_z[rows, cols] > GROUND_MARGIN_M)
+        masks += moving.push(points_map, T_map_lidar[i, :3, 3], obstacle[i], int(drive.stamps_ns[i]))
+    masks += moving.flush()
+    folder = street / "truth" / vehicle / "moving"
+    true = [np.load(folder / f"{i * stride:06d}.npy")[mask] for i, mask in enumerate(obstacle)]
+    return np.concatenate(true), np.concatenate([masks[i][mask] for i, mask in enumerate(obstacle)])
+
+
+@pytest.mark.slow
+def test_precision_and_recall_per_point_at_10_and_2_hz(tmp_path: Path) -> None:
+    simulate("corner", tmp_path / "corner", 2)
+    for stride in (1, 5):
+        right = found = moving = 0
+        for vehicle in ("v1", "v2", "v3"):
+            true, called = labels(tmp_path / "corner", vehicle, stride)
+            assert true.mean() > 0.05
+            assert (true & called).sum() >= 0.45 * true.sum()
+            right += int((true & called).sum())
+            found += int(called.sum())
+            moving += int(true.sum())
+        assert right >= 0.97 * found
+        assert right >= 0.60 * moving

@@ -7,7 +7,7 @@ import pytest
 
 from mapvote.core.azimuth import turn
 from mapvote.core.types import F32, F64
-from mapvote.perception.range_image import NOTHING, U16, Counts, Pixels, Samples, look, range_image, room_to_look
+from mapvote.perception.range_image import NOTHING, U16, LookCounts, Pixels, Samples, look, range_image, room_to_look
 
 PIXELS = Pixels(90, 60, np.float32(-0.6), np.float32(50.0))
 MARGIN_M, HEIGHT_M, ENOUGH = 0.5, 0.12, 2
@@ -32,7 +32,7 @@ def plain_image(points: F64, origin: F64) -> U16:
     return image
 
 
-def plain_look(offsets: F32, image: U16, counts: Counts) -> list[int]:
+def plain_look(offsets: F32, image: U16, counts: LookCounts) -> list[int]:
     """Which samples still wait."""
     waiting = []
     for i, (rho, a, b) in enumerate(zip(*aimed(offsets), strict=True)):
@@ -51,8 +51,8 @@ def plain_look(offsets: F32, image: U16, counts: Counts) -> list[int]:
     return waiting
 
 
-def no_counts(n: int) -> Counts:
-    return Counts(np.zeros(n, np.int32), np.zeros(n, np.int32), np.zeros(n, np.uint8))
+def no_counts(n: int) -> LookCounts:
+    return LookCounts(np.zeros(n, np.int32), np.zeros(n, np.int32), np.zeros(n, np.uint8))
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -78,7 +78,7 @@ def test_looks_count_and_settle_as_the_rule_says(seed: int) -> None:
         image = range_image(seen, sensor, PIXELS)
         rule = MARGIN_M, HEIGHT_M, ENOUGH
         n = look(samples, n, image.reshape(-1), sensor.astype(np.float32), PIXELS, rule, counts, room_to_look(n))
-        some = Counts(expected.free[wait], expected.hit[wait], expected.sides[wait])
+        some = LookCounts(expected.free[wait], expected.hit[wait], expected.sides[wait])
         left = plain_look(places[wait] - sensor.astype(np.float32), image, some)
         expected.free[wait], expected.hit[wait], expected.sides[wait] = some
         wait = wait[left]

@@ -12,7 +12,7 @@ from mapvote.core.grid import CELL_SIZE, Grid, Lattice, TileIndex, tile_of_cells
 from mapvote.core.kernel import allocating
 from mapvote.core.types import F32, F64, I32, I64, U8, U64, Bool, Reference
 from mapvote.core.voxels import grouped, voxel_keys
-from mapvote.detection.shelf import Place, Shelf
+from mapvote.detection.shelf import Shelf, Slot
 from mapvote.perception.frontend import Observation, PlacedScan
 
 _COMPACT_AT = 50_000
@@ -75,7 +75,7 @@ class NewPoints:
         does not look there: only rules that ask more of a new voxel than that a scan struck it can take it.
         ``intensity``: keep it with each point."""
         self.lattice, self.beyond, self.intensity = lattice, beyond, intensity
-        self._shelf, self._runs = Shelf(), defaultdict[TileIndex, list[Place]](list)
+        self._shelf, self._runs = Shelf(), defaultdict[TileIndex, list[Slot]](list)
         """Of each tile points in ascending order of their voxels, each run with one point a voxel."""
         self._last: F64 | None = None
         """The run that is still small."""
@@ -129,7 +129,7 @@ class NewPoints:
     def _short(self) -> list[F64]:
         return [] if self._last is None else [self._last]
 
-    def _run(self, place: Place) -> F64:
+    def _run(self, place: Slot) -> F64:
         return np.frombuffer(self._shelf.read(place)).reshape(-1, 4 if self.intensity else 3)
 
     def _one_a_voxel(self, clouds: list[F64]) -> F64:

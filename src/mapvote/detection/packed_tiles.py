@@ -12,7 +12,7 @@ from mapvote.core.grid import CELLS, TILE_CELLS, Grid, Lattice, TileIndex
 from mapvote.core.kernel import kernel
 from mapvote.core.process_memory import give_back_free_pages
 from mapvote.core.types import U64
-from mapvote.detection.shelf import Place, Shelf
+from mapvote.detection.shelf import Shelf, Slot
 
 _FAST = 1
 """zstd level: packed while driving, and read once or twice."""
@@ -39,7 +39,7 @@ class PackedTiles(Mapping[TileIndex, U64]):
     def __init__(self, lattice: Lattice, words: int) -> None:
         self.lattice, self.words = lattice, words
         self._open: dict[TileIndex, U64] = {}
-        self._shelf, self._packed = Shelf(), dict[TileIndex, Place]()
+        self._shelf, self._packed = Shelf(), dict[TileIndex, Slot]()
         self._spare: list[U64] = []
         """Planes of tiles that were left, for the next: given back, they would leave holes that the heap grows by."""
 
@@ -95,7 +95,7 @@ class PackedTiles(Mapping[TileIndex, U64]):
         planes[:] = 0
         return planes
 
-    def _unpacked(self, place: Place, planes: U64) -> U64:
+    def _unpacked(self, place: Slot, planes: U64) -> U64:
         """``planes``, which come empty, with what was packed."""
         data = self._shelf.read(place)
         raw = np.frombuffer(unpack_bytes(data, CELLS * 8 * (self.words + 1), "evidence"), dtype=np.uint64)

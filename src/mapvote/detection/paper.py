@@ -85,7 +85,7 @@ def _of_points(
             words[r, c] |= np.uint16(word)
 
 
-def encode(
+def cell_words(
     view: ScanView,
     reference: Reference,
     origin_map: F64,
@@ -132,7 +132,7 @@ def sightings(seen: Observation, sensor: Sensor, n_min: int, asked: PaperSetting
         still = ~seen.moving
         view = _cast(seen, still, seen.scan.obstacle)
         without = view, _clear_of_cells(seen, still, n_min) if by_cells else view.sight
-    words = encode(seen.view, seen.reference, seen.scan.origin_map, sensor, cells, without, seen.scan.up_map)
+    words = cell_words(seen.view, seen.reference, seen.scan.origin_map, sensor, cells, without, seen.scan.up_map)
     if asked is not None:
         words[~votes_in(seen.view.grid, seen.scan.origin_map, asked.window_m)] = 0
     return words

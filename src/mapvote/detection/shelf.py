@@ -1,5 +1,6 @@
 """Bytes that are kept to the end of a drive and asked for once or twice: the first of them in memory, the others in a
-file without a name, so that a vehicle needs no more memory for a long road than for a short one."""
+file without a name, so that a vehicle needs no more memory for a long road than for a short one.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +16,7 @@ IN_MEMORY = 16 << 20
 heap: laid among what comes and goes with every scan, each thing would keep a hole open around it."""
 
 
-class Place(NamedTuple):
+class Slot(NamedTuple):
     """Where something lies on a shelf, in bytes."""
 
     start: int
@@ -31,7 +32,7 @@ class Shelf:
         self._used = self._in_file = 0
         """Bytes in memory and in the file."""
 
-    def put(self, data: bytes | memoryview) -> Place:
+    def put(self, data: bytes | memoryview) -> Slot:
         """Where a copy of ``data`` lies. MapvoteError if it no longer fits into memory, and no file can be written."""
         if self._memory is None:
             self._memory = mmap.mmap(-1, IN_MEMORY)
@@ -40,9 +41,9 @@ class Shelf:
             return self._put_in_file(memoryview(data))
         self._memory[start:stop] = data
         self._used = stop
-        return Place(start, stop)
+        return Slot(start, stop)
 
-    def _put_in_file(self, data: memoryview) -> Place:
+    def _put_in_file(self, data: memoryview) -> Slot:
         start, stop = self._in_file, self._in_file + len(data)
         try:
             if self._file is None:
@@ -57,9 +58,9 @@ class Shelf:
                 f"({error.strerror}): make room, or name another folder in TMPDIR"
             ) from error
         self._in_file = stop
-        return Place(IN_MEMORY + start, IN_MEMORY + stop)
+        return Slot(IN_MEMORY + start, IN_MEMORY + stop)
 
-    def read(self, place: Place) -> bytes:
+    def read(self, place: Slot) -> bytes:
         """What lies there."""
         if place.stop <= IN_MEMORY:
             return b"" if self._memory is None else self._memory[place.start : place.stop]

@@ -14,28 +14,205 @@ from functools import cached_property
 import numpy as np
 
 from mapvote.config import NdtSettings
+from mapvote.core.columns import flat_cells
 from mapvote.core.geometry import inverse
+from mapvote.core.grid import CELL_SIZE
+from mapvote.core.kernel import allocating, kernel
 from mapvote.core.point_map import PointMap, all_points, has_open_ground
-from mapvote.core.types import F64, U32, Scan
+from mapvote.core.types import F32, F64, I64, U8, U32, Bool, MapvoteError, Scan
 from mapvote.localisation.coarse_search import LEAST_LEAD, place_without_prior
-from mapvote.localisation.correlation import (
-    CELL_M,
-    HIGH_M,
-    LAYER_M,
-    LOW_M,
-    MARGIN,
-    CoarseMap,
-    apart,
-    correlate,
-    highest,
-    laid_out,
-    sharpened,
-)
 from mapvote.localisation.map_window import MapWindow
 from mapvote.localisation.ndt import LEVELS, refine, thin_for_levels
 from mapvote.localisation.odometry import Tracker
 from mapvote.localisation.pose_check import MIN_FIT, MIN_KNOWN, MIN_LEAD, Judge, height_above_lowest
 from mapvote.localisation.prepare import deskew, solid_sample
+
+CELL_M = 1.0
+LAYER_M = 1.0
+LOW_M, HIGH_M = 0.8, 30.0
+"""Heights above the ground that are looked at."""
+MARGIN = 32
+"""Of every second cell: more than the 45 m within which points are looked at."""
+_SPAN = 64
+"""Cells of a row that are looked up together."""
+_MAX_CELLS = 40_000_000
+"""Of one metre: a box of 6 km by 6 km."""
+
+
+@dataclass(frozen=True, slots=True)
+class CoarseMap:
+    """The map in cells of a metre."""
+
+    x0: float
+    y0: float
+    ground_z: F32
+    """(rows, cols) map metres, NaN where unknown."""
+    words: U32
+    """(rows, cols) what stands, by layers of a metre above the ground."""
+    wide: U32
+    """(2, 2, rows / 2, cols / 2) the same, dilated, by even and odd rows and columns, with MARGIN cells and more on
+    each side: what places on every second cell look up for one point of a scan lies side by side."""
+    rows: I64
+    cols: I64
+    """Cells on a coarser raster in which a vehicle can stand, row by row."""
+    spans: I64
+    """(m, 3) row and first column in ``wide``, and the first of these cells, of each stretch of a row with any."""
+
+
+def laid_out(point_map: PointMap) -> CoarseMap:
+    """The whole map. MapvoteError if it is too large to search."""
+    windows = [tile.window for tile in point_map.tiles.values()]
+    x0, y0 = min(w.x0 for w in windows), min(w.y0 for w in windows)
+    cols = int(np.ceil((max(w.x0 + w.cols * CELL_SIZE for w in windows) - x0) / CELL_M))
+    rows = int(np.ceil((max(w.y0 + w.rows * CELL_SIZE for w in windows) - y0) / CELL_M))
+    if rows * cols > _MAX_CELLS:
+        raise MapvoteError(
+            f"map {point_map.map_id} is {cols} m by {rows} m: too large to search; give the drive a prior (--prior)"
+        )
+    words, ground_z = np.zeros((rows, cols), dtype=np.uint32), np.full((rows, cols), np.nan, dtype=np.float32)
+    for tile in point_map.tiles.values():
+        x, y = tile.window.centres()
+        known = np.nonzero(np.isfinite(tile.ground_z))
+        at = ((y[known[0]] - y0) / CELL_M).astype(np.int64), ((x[known[1]] - x0) / CELL_M).astype(np.int64)
+        ground_z[at] = tile.ground_z[known]
+        points = tile.points_map
+        height = points[:, 2] - tile.ground_z.reshape(-1)[flat_cells(tile.window, tile.points)]
+        tall = (height > LOW_M) & (height < HIGH_M)  # nowhere over unknown ground
+        bit = np.uint32(1) << np.floor(height[tall] / LAYER_M).astype(np.uint32)
+        at = ((points[tall, 1] - y0) / CELL_M).astype(np.int64), ((points[tall, 0] - x0) / CELL_M).astype(np.int64)
+        np.bitwise_or.at(words, at, bit)
+    low = _with_beside((words & np.uint32(0b11)) != 0)
+    r, c = np.nonzero((np.isfinite(ground_z) & ~low)[::2, ::2])
+    first = np.flatnonzero((np.diff(r, prepend=-1) != 0) | (np.diff(c // _SPAN, prepend=-1) != 0))
+    spans = np.column_stack([r[first] + MARGIN, c[first] + MARGIN, first])
+    return CoarseMap(x0, y0, ground_z, words, _by_parity(_dilated(words)), 2 * r, 2 * c, spans)
+
+
+def _by_parity(words: U32) -> U32:
+    """As :class:`CoarseMap` has it."""
+    rows, cols = words.shape
+    wide = np.pad(words, ((0, rows % 2), (0, cols % 2)))
+    split = wide.reshape(len(wide) // 2, 2, -1, 2).transpose(1, 3, 0, 2)
+    return np.pad(split, ((0, 0), (0, 0), (MARGIN, MARGIN), (MARGIN, MARGIN + _SPAN)))
+
+
+def highest(scores: U8, most: int) -> I64:
+    """Indices of the ``most`` highest of (n,), in descending order; of equal ones the last first."""
+    counts = np.cumsum(np.bincount(scores, minlength=256)[::-1])
+    least = 255 - int(np.searchsorted(counts, most))
+    found = np.flatnonzero(scores >= max(least, 0))
+    return found[np.argsort(scores[found], kind="stable")[::-1][:most]]
+
+
+def _with_beside(cells: Bool) -> Bool:
+    """Every cell with its four neighbours."""
+    out = cells.copy()
+    out[1:] |= cells[:-1]
+    out[:-1] |= cells[1:]
+    out[:, 1:] |= cells[:, :-1]
+    out[:, :-1] |= cells[:, 1:]
+    return out
+
+
+def _dilated(words: U32) -> U32:
+    """Every column with those of its eight neighbours, and one layer up and down."""
+    wide = words | (words << np.uint32(1)) | (words >> np.uint32(1))
+    out = wide.copy()
+    out[1:] |= wide[:-1]
+    out[:-1] |= wide[1:]
+    rows = out.copy()
+    out[:, 1:] |= rows[:, :-1]
+    out[:, :-1] |= rows[:, 1:]
+    return out
+
+
+@allocating
+def correlate(wide: U32, spans: I64, cols: I64, xy: F64, bits: U32, yaws: F64, hopeless: int, first: int) -> U8:
+    """(places, headings) how many of the points (n <= 255) meet something of their height there; 0 where hopeless.
+
+    ``cols`` (places,) in ``wide``. Span by span, point by point: what the cells of a span look up lies side by side, so
+    that all of them are sooner asked for than the places among them.
+    """
+    n, rows, width = len(xy), wide.shape[2], wide.shape[3]
+    flat = wide.reshape(-1)
+    out = np.zeros((len(cols), len(yaws)), dtype=np.uint8)
+    way = np.empty(n, dtype=np.int64)
+    hits, early = np.empty(_SPAN, dtype=np.uint32), np.empty(_SPAN, dtype=np.uint32)
+    for a in range(len(yaws)):
+        c, s = np.cos(yaws[a]), np.sin(yaws[a])
+        for i in range(n):
+            dr = np.int64(np.floor(s * xy[i, 0] + c * xy[i, 1] + 0.5))
+            dc = np.int64(np.floor(c * xy[i, 0] - s * xy[i, 1] + 0.5))
+            way[i] = ((2 * (dr & 1) + (dc & 1)) * rows + (dr >> 1)) * width + (dc >> 1)
+        for k in range(len(spans)):
+            row, col, place = spans[k, 0], spans[k, 1], spans[k, 2]
+            beyond = spans[k + 1, 2] if k + 1 < len(spans) else len(cols)
+            hits[:] = 0
+            _look_up(flat, row * width + col, way, bits, 0, first, hits)
+            hopeful = False
+            for p in range(place, beyond):
+                j = cols[p] - col
+                early[j] = hits[j]
+                hopeful |= hits[j] > hopeless
+            if hopeful:
+                _look_up(flat, row * width + col, way, bits, first, n, hits)
+                for p in range(place, beyond):
+                    j = cols[p] - col
+                    out[p, a] = hits[j] if early[j] > hopeless else 0
+    return out
+
+
+@kernel
+def _look_up(flat: U32, at: int, way: I64, bits: U32, begin: int, end: int, hits: U32) -> None:
+    """Add to ``hits`` of each cell of the span that begins ``at`` how many points, a ``way`` off, meet something."""
+    for i in range(begin, end):
+        start, bit = np.uint64(at + way[i]), bits[i]
+        for j in range(np.uint64(0), np.uint64(_SPAN)):
+            hits[j] += (flat[start + j] >> bit) & np.uint32(1)
+
+
+@allocating
+def apart(x: F64, y: F64, yaw: F64, most: int, spread_m: float, spread_rad: float) -> I64:
+    """Indices of the first ``most`` that lie apart from all chosen before."""
+    chosen = np.empty(most, dtype=np.int64)
+    n = 0
+    for i in range(len(x)):
+        fresh = True
+        for k in range(n):
+            j = chosen[k]
+            turn = abs(np.arctan2(np.sin(yaw[i] - yaw[j]), np.cos(yaw[i] - yaw[j])))
+            if (x[i] - x[j]) ** 2 + (y[i] - y[j]) ** 2 < spread_m**2 and turn < spread_rad:
+                fresh = False
+                break
+        if fresh:
+            chosen[n] = i
+            n += 1
+            if n == most:
+                break
+    return chosen[:n]
+
+
+@kernel
+def sharpened(words: U32, x: float, y: float, yaw: float, xy: F64, bits: U32) -> tuple[float, float, float, float]:
+    """(share, x, y, yaw) of the best place and heading around one, on single cells; x and y in cells."""
+    best, at = -1.0, (x, y, yaw)
+    height, width = words.shape
+    for da in range(-3, 4):
+        a = yaw + np.radians(0.75) * da
+        c, s = np.cos(a), np.sin(a)
+        for dx in range(-4, 5):
+            for dy in range(-4, 5):
+                px, py, hits = x + 0.5 * dx, y + 0.5 * dy, np.int64(0)
+                for i in range(len(xy)):
+                    r = np.int64(np.floor(py + s * xy[i, 0] + c * xy[i, 1]))
+                    k = np.int64(np.floor(px + c * xy[i, 0] - s * xy[i, 1]))
+                    if 0 <= r < height and 0 <= k < width:
+                        column = words[r, k] | (words[r, k] << np.uint32(1)) | (words[r, k] >> np.uint32(1))
+                        hits += np.int64((column >> bits[i]) & np.uint32(1))
+                if hits > best:
+                    best, at = float(hits), (px, py, a)
+    return best / len(xy), at[0], at[1], at[2]
+
 
 _REACH_M = 45.0
 _POINTS = 200

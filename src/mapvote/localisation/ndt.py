@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 
 from mapvote.core.types import F32, F64, I64, Drive, Registration, check_array
 from mapvote.core.voxels import thin
-from mapvote.localisation.ndt_kernels import likelihoods, near_in, room_for
-from mapvote.localisation.ndt_solver import Certainty, Place, align, room_to_work
+from mapvote.localisation.ndt_solver import Certainty, Target, align, likelihoods, near_in, room_for, room_to_work
 from mapvote.localisation.ndt_voxels import Voxels, Window, enter_points, join_voxels, refresh, reindex
 
 
@@ -247,7 +246,7 @@ def refine(
     for i in range(first_level, last + 1):
         grid = ndt_map.levels[i]
         tolerance = max(0.001, settled[i == last] * grid.level.floor_m)
-        where = Place(grid.window, grid.near, grid.voxels.cells, grid.level.iterations, tolerance)
+        where = Target(grid.window, grid.near, grid.voxels.cells, grid.level.iterations, tolerance)
         known = _known(prior if i == last else None)
         pairs = room_for(clouds[i].shape[1])
         score, inlier_share, more, converged = align(clouds[i], T, where, known, pairs, work, covariance)

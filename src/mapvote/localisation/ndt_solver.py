@@ -1,18 +1,268 @@
-"""Gauss-Newton on one level of an NDT map, compiled as a whole: pair up, sum, solve, move, until it stands still.
+"""One level of NDT, compiled as a whole: points are paired with the voxels around them, Gauss-Newton steps are summed
+over the pairs and solved, and the pose moves until it stands still.
 
-Pose errors are (6,) vectors (rho, phi) in map axes about the sensor: t' = t + rho, R' = exp(phi) R.
+Equation numbers are those of Magnusson, The Three-Dimensional Normal-Distributions Transform, 2009, chapter 6; where
+we deviate, mapvote.localisation.ndt says how. Pairs lie in columns, so that the sums run over vectors of them, in
+float32 about the sensor; they serve until the pose has moved by a share of a voxel. Pose errors are (6,) vectors
+(rho, phi) in map axes about the sensor: t' = t + rho, R' = exp(phi) R.
 """
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
+import numba
 import numpy as np
 
 from mapvote.core.kernel import inlined, kernel
 from mapvote.core.types import F32, F64, I32, I64
-from mapvote.localisation.ndt_kernels import TOGETHER, Near, Pairs, linearise, pair_up
-from mapvote.localisation.ndt_voxels import Window
+from mapvote.localisation.ndt_voxels import Vector, Window, holds, voxel_of
+
+INLIER_E = 7.81
+"""Squared Mahalanobis distance below which a point agrees with a voxel: 95 % of chi-square, 3 degrees of freedom."""
+CUTOFF_E = 25.0
+"""Beyond this a voxel's pull on a point, exp(-e / 2), is nothing."""
+_BLOCK = 1024
+"""Points whose sums are taken in float32 before they are added up in float64."""
+TOGETHER = 64
+"""Points that are paired together."""
+_ROWS = 9
+
+
+class Pairs(NamedTuple):
+    """Which point is compared with which voxels: each with its own and the six beside it (DIRECT7)."""
+
+    of: F32
+    """(7, 9, n) of each partner of each point: the voxel's mean from ``origin`` in map axes, and its precision xx, xy,
+    xz, yy, yz, zz; zeros where there is no partner."""
+    home: I32
+    """(3, n) the voxel that the point lay in when it was paired, as an index of the window."""
+    origin: F64
+    """(3,) map metres: near the sensor, so that float32 suffices."""
+
+
+class Near(NamedTuple):
+    """How the voxels near one are found."""
+
+    flat: I32
+    """The window's rows, flat."""
+    offset: I64
+    """(7,) ways there to a voxel and the six beside it."""
+
+
+def near_in(window: Window) -> Near:
+    """Of a window, as it is and will be when it is moved."""
+    strides = np.array([window.rows.shape[1] * window.rows.shape[2], window.rows.shape[2], 1])
+    return Near(window.rows.reshape(-1), SEVEN @ strides)
+
+
+def room_for(n: int) -> Pairs:
+    """Room for the pairs of n points."""
+    return Pairs(np.empty((7, _ROWS, n), dtype=np.float32), np.empty((3, n), dtype=np.int32), np.zeros(3))
+
+
+SEVEN = np.array([(0, 0, 0), (1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1)])
+"""(7, 3) ways to a point's own voxel and the six beside it (DIRECT7)."""
+
+
+@inlined
+def _in_map(points: F32, T: F64, i: int) -> Vector:
+    """Point i in map metres."""
+    x, y, z = np.float64(points[0, i]), np.float64(points[1, i]), np.float64(points[2, i])
+    return (
+        T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3],
+        T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3],
+        T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3],
+    )
+
+
+@kernel
+def pair_up(
+    points: F32, T: F64, window: Window, near: Near, cells: F64, pairs: Pairs, moved: I64, partner: I32
+) -> None:  # fmt: skip
+    """Pair those of the points (3, n) that lie in another voxel at pose T (4, 4) than when they were last paired.
+
+    Block by block: who has moved, where their partners are, what these say. No step waits for the memory of the one
+    before, nor guesses whether there is a partner: where there is none, the first voxel's numbers are masked.
+    ``moved`` (TOGETHER,), ``partner`` (7, TOGETHER): scratch.
+    """
+    rows, lowest, size = window
+    flat, offset = near
+    of, home, origin = pairs
+    stride = rows.shape[1] * rows.shape[2]
+    for first in range(0, points.shape[1], TOGETHER):
+        m = 0
+        for i in range(first, min(first + TOGETHER, points.shape[1])):
+            x, y, z = _in_map(points, T, i)
+            ax, ay, az = voxel_of(size, x, y, z)
+            ix, iy, iz = ax - lowest[0], ay - lowest[1], az - lowest[2]
+            moved[m] = i
+            m += 1 if (ix != home[0, i]) | (iy != home[1, i]) | (iz != home[2, i]) else 0
+            home[0, i], home[1, i], home[2, i] = ix, iy, iz
+        for w in range(m):
+            ix, iy, iz = np.int64(home[0, moved[w]]), np.int64(home[1, moved[w]]), np.int64(home[2, moved[w]])
+            inside = holds(rows, ix, iy, iz, 1)
+            at = ix * stride + iy * rows.shape[2] + iz if inside else stride + rows.shape[2] + 1
+            for j in range(7):
+                partner[j, w] = flat[np.uint64(at + offset[j])] if inside else np.int32(-1)
+        for j in range(7):
+            for w in range(m):
+                i, k = moved[w], np.uint64(max(partner[j, w], np.int32(0)))
+                there = np.float32(1.0) if partner[j, w] >= 0 else np.float32(0.0)
+                for c in range(3):
+                    low = lowest[c] * size - origin[c]
+                    of[j, c, i] = there * np.float32((home[c, i] + SEVEN[j, c] + 0.5) * size + low + cells[k, c])
+                for c in range(3, 9):
+                    of[j, c, i] = there * np.float32(cells[k, c])
+
+
+@inlined
+def _likelihood(e: np.float32) -> np.float32:
+    """exp(-e / 2) for e from 0 to CUTOFF_E, 0 beyond: Taylor's series at a 32nd of it, squared five times. Within
+    2e-4 of itself where it is least, 1e-6 where it matters; without a call, so that loops over pairs vectorise."""
+    y = np.float32(-1.0 / 64.0) * min(e, np.float32(CUTOFF_E))
+    s = np.float32(1.0 / 24.0) + y * np.float32(1.0 / 120.0)
+    s = np.float32(1.0) + y * (np.float32(1.0) + y * (np.float32(0.5) + y * (np.float32(1.0 / 6.0) + y * s)))
+    s *= s
+    s *= s
+    s *= s
+    s *= s
+    s *= s
+    return s if e <= np.float32(CUTOFF_E) else np.float32(0.0)
+
+
+@numba.njit(error_model="numpy", fastmath=True)
+def _pull(of: F32, j: int, i: int, x: np.float32, y: np.float32, z: np.float32) -> tuple[np.float32, ...]:
+    """Of the j-th partner of point i, which lies at (x, y, z) from the origin: (e, w C, w C u) with u the point from
+    the voxel's mean, C its precision, e = u C u and w = exp(-e / 2), the weight of Eq. (6.9) with d1 = d2 = 1."""
+    x, y, z = x - of[j, 0, i], y - of[j, 1, i], z - of[j, 2, i]
+    c00, c01, c02, c11, c12, c22 = of[j, 3, i], of[j, 4, i], of[j, 5, i], of[j, 6, i], of[j, 7, i], of[j, 8, i]
+    b0, b1, b2 = c00 * x + c01 * y + c02 * z, c01 * x + c11 * y + c12 * z, c02 * x + c12 * y + c22 * z
+    e = x * b0 + y * b1 + z * b2
+    w = _likelihood(e)
+    e = e if c00 + c11 + c22 > np.float32(0.0) else np.float32(1e9)
+    return e, w * c00, w * c01, w * c02, w * c11, w * c12, w * c22, w * b0, w * b1, w * b2
+
+
+@numba.njit(error_model="numpy", fastmath=True)
+def _both(p: tuple[np.float32, ...], q: tuple[np.float32, ...]) -> tuple[np.float32, ...]:
+    """The smaller e, and the sums of the rest."""
+    return (
+        min(p[0], q[0]), p[1] + q[1], p[2] + q[2], p[3] + q[3], p[4] + q[4], p[5] + q[5], p[6] + q[6], p[7] + q[7],
+        p[8] + q[8], p[9] + q[9],
+    )  # fmt: skip
+
+
+@numba.njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+def _sum_block(points: F32, of: F32, first: int, last: int, R: F32, d: F32, sums: F64) -> None:
+    """Add up points from ``first`` to ``last`` at rotation R (3, 3), the sensor at ``d`` (3,) metres from the origin.
+
+    ``sums`` (50,): the upper triangle of H = J^T w C J row by row, g = J^T w C u (the sums of Eqs. (6.13) and (6.12),
+    of which Gauss-Newton drops the other terms), the upper triangle of the sum of g_i g_i^T, likelihoods, inliers.
+    J = [I, -[p]x] is the derivative of the point by (rho, phi). One vector lane a point; no stores, no branches.
+    """
+    zero, at = np.float32(0.0), np.int64(0)  # a number: by seven literals _pull would be compiled seven times
+    h00, h01, h02, h11, h12, h22 = zero, zero, zero, zero, zero, zero
+    q00, q01, q02, q10, q11, q12, q20, q21, q22 = zero, zero, zero, zero, zero, zero, zero, zero, zero
+    r00, r01, r02, r11, r12, r22 = zero, zero, zero, zero, zero, zero
+    s0, s1, s2, s3, s4, s5, likelihood, inliers = zero, zero, zero, zero, zero, zero, zero, zero
+    m00, m01, m02, m03, m04, m05, m11, m12 = zero, zero, zero, zero, zero, zero, zero, zero
+    m13, m14, m15, m22, m23, m24, m25 = zero, zero, zero, zero, zero, zero, zero
+    m33, m34, m35, m44, m45, m55 = zero, zero, zero, zero, zero, zero
+    for i in range(np.uint64(first), np.uint64(last)):  # unsigned: an index that cannot be negative vectorises
+        x, y, z = points[0, i], points[1, i], points[2, i]
+        px = R[0, 0] * x + R[0, 1] * y + R[0, 2] * z
+        py = R[1, 0] * x + R[1, 1] * y + R[1, 2] * z
+        pz = R[2, 0] * x + R[2, 1] * y + R[2, 2] * z
+        x, y, z = px + d[0], py + d[1], pz + d[2]
+        pull = _both(_pull(of, at, i, x, y, z), _pull(of, at + 1, i, x, y, z))
+        pull = _both(pull, _both(_pull(of, at + 2, i, x, y, z), _pull(of, at + 3, i, x, y, z)))
+        pull = _both(pull, _both(_pull(of, at + 4, i, x, y, z), _pull(of, at + 5, i, x, y, z)))
+        e, c00, c01, c02, c11, c12, c22, g0, g1, g2 = _both(pull, _pull(of, at + 6, i, x, y, z))
+        likelihood += _likelihood(e)
+        inliers += np.float32(1.0) if e < np.float32(INLIER_E) else zero
+        # Columns of Q = C (-[p]x) = C times ((0, pz, -py), (-pz, 0, px), (py, -px, 0)).
+        a00, a01, a02 = c02 * py - c01 * pz, c00 * pz - c02 * px, c01 * px - c00 * py
+        a10, a11, a12 = c12 * py - c11 * pz, c01 * pz - c12 * px, c11 * px - c01 * py
+        a20, a21, a22 = c22 * py - c12 * pz, c02 * pz - c22 * px, c12 * px - c02 * py
+        h00, h01, h02, h11, h12, h22 = h00 + c00, h01 + c01, h02 + c02, h11 + c11, h12 + c12, h22 + c22
+        q00, q01, q02 = q00 + a00, q01 + a01, q02 + a02
+        q10, q11, q12 = q10 + a10, q11 + a11, q12 + a12
+        q20, q21, q22 = q20 + a20, q21 + a21, q22 + a22
+        # Rotation: (-[p]x)^T Q.
+        r00, r01, r02 = r00 + py * a20 - pz * a10, r01 + py * a21 - pz * a11, r02 + py * a22 - pz * a12
+        r11, r12, r22 = r11 + pz * a01 - px * a21, r12 + pz * a02 - px * a22, r22 + px * a12 - py * a02
+        g3, g4, g5 = py * g2 - pz * g1, pz * g0 - px * g2, px * g1 - py * g0
+        s0, s1, s2, s3, s4, s5 = s0 + g0, s1 + g1, s2 + g2, s3 + g3, s4 + g4, s5 + g5
+        m00, m01, m02, m03 = m00 + g0 * g0, m01 + g0 * g1, m02 + g0 * g2, m03 + g0 * g3
+        m04, m05, m11, m12 = m04 + g0 * g4, m05 + g0 * g5, m11 + g1 * g1, m12 + g1 * g2
+        m13, m14, m15, m22 = m13 + g1 * g3, m14 + g1 * g4, m15 + g1 * g5, m22 + g2 * g2
+        m23, m24, m25, m33 = m23 + g2 * g3, m24 + g2 * g4, m25 + g2 * g5, m33 + g3 * g3
+        m34, m35, m44, m45, m55 = m34 + g3 * g4, m35 + g3 * g5, m44 + g4 * g4, m45 + g4 * g5, m55 + g5 * g5
+    for k, value in enumerate((
+        h00, h01, h02, q00, q01, q02, h11, h12, q10, q11, q12, h22, q20, q21, q22, r00, r01, r02, r11, r12, r22,
+        s0, s1, s2, s3, s4, s5, m00, m01, m02, m03, m04, m05, m11, m12, m13, m14, m15, m22, m23, m24, m25, m33, m34,
+        m35, m44, m45, m55, likelihood, inliers,
+    )):  # fmt: skip
+        sums[k] += value
+
+
+@inlined
+def linearise(
+    points: F32, pairs: Pairs, T: F64, H: F64, M: F64, g: F64, sums: F64, R: F32, d: F32
+) -> tuple[float, float]:  # fmt: skip
+    """The reweighted least squares of points (3, n) at pose T, for pairs made there: fills H (6, 6), the scatter M
+    (6, 6) of the points' own gradients, and g (6, 1). Returns (mean likelihood, share of inliers). ``sums`` (50,),
+    R (3, 3), d (3,): scratch."""
+    sums[:] = 0.0
+    for r in range(3):
+        d[r] = T[r, 3] - pairs.origin[r]
+        for c in range(3):
+            R[r, c] = T[r, c]
+    n = points.shape[1]
+    for first in range(0, n, _BLOCK):
+        _sum_block(points, pairs.of, first, min(first + _BLOCK, n), R, d, sums)
+    k = 0
+    for r in range(6):
+        for c in range(r, 6):
+            H[r, c] = H[c, r] = sums[k]
+            M[r, c] = M[c, r] = sums[27 + k]
+            k += 1
+        g[r, 0] = sums[21 + r]
+    return sums[48] / max(1, n), sums[49] / max(1, n)
+
+
+@kernel
+def likelihoods(points: F32, T: F64, window: Window, near: Near, cells: F64, out: F64) -> None:
+    """Into ``out`` (m,) the mean likelihood, in [0, 1], of points (3, n) at each of the poses T (m, 4, 4): what
+    :func:`linearise` says, for a single look without pairs."""
+    rows, lowest, size = window
+    flat, offset = near
+    stride = rows.shape[1] * rows.shape[2]
+    for pose in range(len(T)):
+        total = 0.0
+        for i in range(points.shape[1]):
+            x, y, z = _in_map(points, T[pose], i)
+            ax, ay, az = voxel_of(size, x, y, z)
+            ix, iy, iz = ax - lowest[0], ay - lowest[1], az - lowest[2]
+            if not holds(rows, ix, iy, iz, 1):
+                continue
+            x, y, z = x - (ax + 0.5) * size, y - (ay + 0.5) * size, z - (az + 0.5) * size
+            nearest, at = CUTOFF_E + 1.0, ix * stride + iy * rows.shape[2] + iz
+            for j in range(7):
+                k = flat[at + offset[j]]
+                if k < 0 or cells[k, 3] + cells[k, 6] + cells[k, 8] == 0.0:
+                    continue
+                ux = x - SEVEN[j, 0] * size - cells[k, 0]
+                uy = y - SEVEN[j, 1] * size - cells[k, 1]
+                uz = z - SEVEN[j, 2] * size - cells[k, 2]
+                # e = u C u, C the precision: the squared Mahalanobis distance.
+                vx = cells[k, 3] * ux + 2.0 * (cells[k, 4] * uy + cells[k, 5] * uz)
+                vy = cells[k, 6] * uy + 2.0 * cells[k, 7] * uz
+                nearest = min(nearest, vx * ux + vy * uy + cells[k, 8] * uz * uz)
+            total += np.float64(_likelihood(np.float32(nearest)))
+        out[pose] = total / max(1, points.shape[1])
+
 
 _UNPAIRED = np.int32(-(1 << 30))
 """No point's home: all are to be paired."""
@@ -20,7 +270,7 @@ LEVER_M = 20.0
 """Distance at which a rotation is weighed against a shift, where one number must serve both."""
 
 
-class Place(NamedTuple):
+class Target(NamedTuple):
     """One level of the map, and when to stop on it."""
 
     window: Window
@@ -170,7 +420,7 @@ def _to_prior(T: F64, T_prior: F64, R: F64, step: F64) -> None:
 
 @kernel
 def align(
-    points: F32, T: F64, level: Place, known: Certainty, pairs: Pairs, work: Work, covariance: F64
+    points: F32, T: F64, level: Target, known: Certainty, pairs: Pairs, work: Work, covariance: F64
 ) -> tuple[float, float, int, bool]:  # fmt: skip
     """Move T (4, 4), in place, to where the points (3, n) of the lidar frame fit the level best.
 

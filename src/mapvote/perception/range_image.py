@@ -47,12 +47,13 @@ class Samples(NamedTuple):
     """(m,) which of the counts each place belongs to."""
 
 
-class Counts(NamedTuple):
+class LookCounts(NamedTuple):
     """What scans said of each place, (m,) each."""
 
     free: I32
     """Scans that saw through it."""
     hit: I32
+    """Scans that saw something in it."""
     sides: U8
     """Whether a ray went through below (1) and above (2): a ray that only ever passes over a roof proves nothing about
     the roof."""
@@ -161,8 +162,8 @@ def _read(n: int, image: U16, sought: Scratch) -> None:
 
 @kernel
 def look(
-    samples: Samples, n: int, image: U16, sensor: F32, pixels: Pixels, rule: tuple[float, float, int], counts: Counts,
-    scratch: Scratch,
+    samples: Samples, n: int, image: U16, sensor: F32, pixels: Pixels, rule: tuple[float, float, int],
+    counts: LookCounts, scratch: Scratch,
 ) -> int:  # fmt: skip
     """Ask one scan about the first ``n`` samples, by its range ``image``, flat.
 

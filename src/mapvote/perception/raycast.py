@@ -18,7 +18,7 @@ from mapvote.core.grid import CELL_SIZE, Grid
 from mapvote.core.kernel import kernel
 from mapvote.core.types import F32, F64, I32, U8, U64, Bool, Reference
 from mapvote.perception.fans import Rays, follow_rays, gather_rays, mark_passed
-from mapvote.perception.sight import mark_sight
+from mapvote.perception.free_rays import mark_sight
 
 CLEARANCE_M = 0.45
 """A ray proves emptiness only up to here before its own hit: half a voxel's diagonal, range noise and pose error."""
@@ -109,7 +109,7 @@ def cast_rays(
     (which also gives ``cell``, if it is not to be computed again). Points of ``moving`` objects occlude but do not
     occupy (docs/decisions/paper.md); the rays of ground points prove emptiness above the ground. Without ``with_sight``
     the view has none: rays are followed to their ends only. ``sky``: which rays went into the
-    sky (perception/sky.py); they are followed, too.
+    sky (perception/free_rays.py); they are followed, too.
     """
     if cell is None:
         _, cell = find_obstacles(points_map, reference)

@@ -20,7 +20,7 @@ from mapvote.core.point_map import PointMap, map_from_points
 from mapvote.core.sensor_height import Heights, check_heights, two_levels
 from mapvote.core.types import F64, Bool, Drive, MapvoteError
 from mapvote.slam.accumulate import Layer
-from mapvote.slam.pose_graph_all import carried_along, settle
+from mapvote.slam.pose_graph import carried_along, settle_poses
 from mapvote.slam.road_prior import all_roads, road_under
 from mapvote.slam.surveyor import Surveyed, Surveyor, is_precise
 
@@ -94,7 +94,7 @@ def build_map(
     count = _counter(progress, 2 * sum(len(drive) for drive in drives))
     surveyor = Surveyor(settings, all(is_precise(drive) for drive in drives))
     found = [surveyor.follow(drive, count) for drive in drives]
-    settled = settle(drives, found)
+    settled = settle_poses(drives, found)
     registered, poses = [one.registered for one in found], settled.T_map_lidar
     cloud, lattice = carried_along(surveyor.draft.points()[0], found, poses), surveyor.draft.lattice
     del surveyor  # and with it the largest part of what the first pass took

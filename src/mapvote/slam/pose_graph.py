@@ -1,20 +1,29 @@
-"""Poses that agree best with the motion measured between them and with what was known of each.
+"""Where all scans of all drives were, settled together: the shape from registration, the place from every prior.
 
-Registration to a growing map is smooth but drifts; a survey prior does not drift but is rough. Gauss-Newton on
-SE(3) over the whole trajectory keeps the shape of the one in the frame of the other. Source: Barfoot, State Estimation
-for Robotics, 8.1 and 9.
+Registration to a growing map is smooth but drifts; a prior does not drift but is rough. Gauss-Newton on SE(3) over the
+whole trajectory keeps the shape of the one in the frame of the other. Source: Barfoot, State Estimation for Robotics,
+8.1 and 9.
+
+A precise prior (RTK) holds each pose. Ordinary ones (GNSS) err alike for seconds to minutes, jump and go wild: the
+whole is first laid on the robust fit of them all (slam.prior_alignment), then the graph lets them bend it only as far
+as their number of *independent* errors says, none of them more than its distance from the others allows.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 from scipy import sparse
 from scipy.sparse.linalg import splu, spsolve
+from scipy.spatial import cKDTree
 
 from mapvote.core.geometry import adjoints, exps, inverses, logs
-from mapvote.core.types import F64, I64
+from mapvote.core.types import F64, I64, Drive
+from mapvote.slam.prior_alignment import fit_to_priors, trust_in
+from mapvote.slam.surveyor import PRECISE_PRIOR_M, Surveyed, is_precise
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,3 +113,146 @@ def _normal_equations(poses: F64, links: list[Links], anchors: list[Anchors]) ->
 def _weight(sigma_m: float, sigma_rad: float) -> F64:
     """(6,) the diagonal of an information matrix."""
     return np.array([sigma_m**-2] * 3 + [sigma_rad**-2] * 3)
+
+
+PRIOR_MEMORY_S = 20.0
+"""How long the errors of a coarser prior stay alike: those of GNSS without corrections change over such times."""
+_SLACK = 5.0
+"""Widens a precise prior's sigma: its errors are alike for a while."""
+_LINK_SIGMA_M, _LINK_SIGMA_RAD = 0.003, float(np.radians(0.01))
+"""Random error of the motion from scan to scan."""
+_REVISIT_M, _REVISIT_S = 10.0, 10.0
+"""A scan this near to one at least so much older is linked to it."""
+_REWEIGHTED = 3
+"""How often the priors' weights are taken anew."""
+_TOGETHER = 100_000
+"""Points that are moved together: each needs its own motion."""
+_ASKED = 12
+"""Poses of a drive whose covariance is worked out; the others lie between."""
+
+
+@dataclass(frozen=True, slots=True)
+class Settled:
+    """All drives' poses."""
+
+    T_map_lidar: list[F64]
+    """(n, 4, 4) of each drive."""
+    sigma_m: list[F64]
+    """(n,) standard deviation of each position in the frame of the priors; nan without any prior."""
+    bent_m: float
+    """How far the priors moved a scan at most, after the whole had been shifted and turned to fit them."""
+
+
+def settle_poses(drives: Sequence[Drive], found: Sequence[Surveyed]) -> Settled:
+    """Poses of all drives that agree with each other's motion and with all priors; as given if there are none."""
+    poses = [one.T_map_lidar for one in found]
+    starts = np.cumsum([0] + [len(T) for T in poses])
+    T, known = np.concatenate(poses), np.flatnonzero(np.concatenate([one.registered for one in found]))
+    if not any(drive.T_map_lidar_prior is not None for drive in drives):
+        return Settled(poses, [np.full(len(p), np.nan) for p in poses], 0.0)
+    if not any(is_precise(drive) for drive in drives):
+        T = _laid_on_priors(drives, T, known, starts) @ T
+    rigid = T
+    links = _links(drives, T, known, _pieces(found, starts))
+    anchors = _anchors(drives, T, starts)
+    for _ in range(_REWEIGHTED):
+        T = optimise(T, links, anchors)
+        anchors = [replace(a, weights=trust_in(_off(T, a), a.said_m)) for a in anchors]
+    bent_m = float(np.linalg.norm((T - rigid)[:, :3, 3], axis=1).max())
+    return Settled(np.split(T, starts[1:-1]), _sigmas(T, links, anchors, starts), bent_m)
+
+
+def carried_along(points: F64, found: Sequence[Surveyed], settled: Sequence[F64]) -> F64:
+    """Points (n, 3) of the draft, each moved as the nearest scan was when its drive's poses (m, 4, 4) were settled.
+
+    The draft was measured at the poses of the first pass. A road that is looked for under settled poses in a draft that
+    is not bent alike lies too high here and too low there, by all that the first pass has drifted.
+    """
+    before, after = (np.concatenate(poses) for poses in ([one.T_map_lidar for one in found], list(settled)))
+    known = np.concatenate([one.registered for one in found])
+    before, after = before[known], after[known]
+    if np.array_equal(before, after):
+        return points
+    moved, tree, out = after @ inverses(before), cKDTree(before[:, :3, 3]), np.empty_like(points)
+    for first in range(0, len(points), _TOGETHER):
+        some = points[first : first + _TOGETHER]
+        T = moved[tree.query(some)[1]]
+        out[first : first + _TOGETHER] = np.einsum("nij,nj->ni", T[:, :3, :3], some) + T[:, :3, 3]
+    return out
+
+
+def _sigmas(T: F64, links: list[Links], anchors: list[Anchors], starts: I64) -> list[F64]:
+    ends = list(pairwise(starts.tolist()))
+    asked = [np.unique(np.linspace(a, b - 1, _ASKED).round().astype(np.int64)) for a, b in ends]
+    sigmas = position_sigmas(T, links, anchors, np.concatenate(asked))
+    pieces = np.split(sigmas, np.cumsum([len(a) for a in asked])[:-1])
+    return [np.interp(np.arange(a, b), at, s) for (a, b), at, s in zip(ends, asked, pieces, strict=True)]
+
+
+def _pieces(found: Sequence[Surveyed], starts: I64) -> I64:
+    """(n,) number of the unbroken stretch that each scan belongs to."""
+    begins = np.zeros(int(starts[-1]), dtype=np.int64)
+    begins[starts[:-1]] = 1
+    for start, one in zip(starts, found, strict=False):
+        begins[start + np.array(one.broken, dtype=np.int64)] = 1
+    return np.cumsum(begins)
+
+
+def _laid_on_priors(drives: Sequence[Drive], T: F64, known: I64, starts: I64) -> F64:
+    """(4, 4) one motion of the whole, from all drives' priors."""
+    positions, priors, said = [], [], []
+    for start, drive in zip(starts, drives, strict=False):
+        if drive.T_map_lidar_prior is not None:
+            mine = known[(known >= start) & (known < start + len(drive))]
+            positions.append(T[mine, :3, 3])
+            priors.append(drive.T_map_lidar_prior[mine - start, :3, 3])
+            said.append(drive.prior_sigma_m)
+    return fit_to_priors(np.concatenate(positions), np.concatenate(priors), max(said))
+
+
+def _anchors(drives: Sequence[Drive], T: F64, starts: I64) -> list[Anchors]:
+    """All priors of all drives; of errors that last, as many scans as share one share one weight."""
+    out = []
+    for start, drive in zip(starts, drives, strict=False):
+        if drive.T_map_lidar_prior is None:
+            continue
+        slack = _SLACK
+        if not is_precise(drive):
+            seconds = 1e-9 * float(drive.stamps_ns[-1] - drive.stamps_ns[0])
+            alike = min(1.0, PRIOR_MEMORY_S / max(seconds, 1e-3)) * len(drive)
+            slack = float(np.sqrt(max(alike, 1.0)))
+        sigma_rad = _SLACK * slack * float(np.radians(drive.prior_sigma_deg))
+        anchor = Anchors(
+            np.arange(start, start + len(drive)),
+            drive.T_map_lidar_prior,
+            slack * drive.prior_sigma_m,
+            sigma_rad if not is_precise(drive) else slack * float(np.radians(drive.prior_sigma_deg)),
+            said_m=max(drive.prior_sigma_m, PRECISE_PRIOR_M),
+        )
+        out.append(replace(anchor, weights=trust_in(_off(T, anchor), anchor.said_m)))
+    return out
+
+
+def _off(T: F64, anchors: Anchors) -> F64:
+    return np.asarray(np.linalg.norm(T[anchors.pose, :3, 3] - anchors.T_map[:, :3, 3], axis=1))
+
+
+def _links(drives: Sequence[Drive], T: F64, known: I64, piece_of: I64) -> list[Links]:
+    """The motion from scan to scan, and from each scan to the nearest much older one near by: it was registered to the
+    map that the older one made."""
+    order = np.concatenate([np.asarray(drive.stamps_ns) for drive in drives])
+    consecutive = piece_of[known[:-1]] == piece_of[known[1:]]
+    pairs = [(known[:-1][consecutive], known[1:][consecutive])]
+    tree = cKDTree(T[known, :3, 3])
+    first, second = [], []
+    for j, near in zip(known, tree.query_ball_point(T[known, :3, 3], _REVISIT_M), strict=True):
+        older = [i for i in known[near] if i < j and (piece_of[i] != piece_of[j] or _apart(order, int(i), int(j)))]
+        if older:
+            first.append(min(older, key=lambda i: (float(np.linalg.norm(T[i, :3, 3] - T[j, :3, 3])), i)))
+            second.append(j)
+    pairs.append((np.array(first, dtype=np.int64), np.array(second, dtype=np.int64)))
+    return [Links(a, b, inverses(T[a]) @ T[b], _LINK_SIGMA_M, _LINK_SIGMA_RAD) for a, b in pairs]
+
+
+def _apart(stamps_ns: I64, i: int, j: int) -> bool:
+    return bool(abs(int(stamps_ns[j]) - int(stamps_ns[i])) > 1e9 * _REVISIT_S)

@@ -30,7 +30,7 @@ _LEAST_SHARE = 0.3
 
 
 @dataclass(frozen=True, slots=True)
-class Road:
+class RoadUnder:
     """The road under one drive."""
 
     points_map: F64
@@ -41,10 +41,10 @@ class Road:
     """Of the path: where points of the road lie under it."""
 
 
-def road_under(T_map_lidar: F64, registered: Bool, cloud: F64) -> Road:
+def road_under(T_map_lidar: F64, registered: Bool, cloud: F64) -> RoadUnder:
     """The road under a drive at poses (n, 4, 4), those ``registered`` (n,), from the points (m, 3) of the map."""
     path = _dense(T_map_lidar[:, :3, 3], registered)
-    none = Road(np.zeros((0, 3)), np.nan, 0.0)
+    none = RoadUnder(np.zeros((0, 3)), np.nan, 0.0)
     if len(path) == 0:
         return none
     distance, at = cKDTree(path[:, :2]).query(cloud[:, :2], distance_upper_bound=TRACK_M)
@@ -62,8 +62,8 @@ def road_under(T_map_lidar: F64, registered: Bool, cloud: F64) -> Road:
     reach = round(1.0 / _STEP_M)
     share = float((np.convolve(near, np.ones(2 * reach + 1), mode="same") > 0).mean())
     if share < _LEAST_SHARE:
-        return Road(np.zeros((0, 3)), sensor_height_m, share)
-    return Road(path - [0.0, 0.0, sensor_height_m], sensor_height_m, share)
+        return RoadUnder(np.zeros((0, 3)), sensor_height_m, share)
+    return RoadUnder(path - [0.0, 0.0, sensor_height_m], sensor_height_m, share)
 
 
 def _dense(positions: F64, registered: Bool) -> F64:
@@ -82,6 +82,6 @@ def _dense(positions: F64, registered: Bool) -> F64:
     return np.concatenate(pieces)
 
 
-def all_roads(roads: Sequence[Road]) -> F64:
+def all_roads(roads: Sequence[RoadUnder]) -> F64:
     """(n, 3) the road under all drives, map metres."""
     return np.concatenate([road.points_map for road in roads]) if roads else np.zeros((0, 3))

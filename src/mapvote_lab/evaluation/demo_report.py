@@ -20,7 +20,7 @@ from mapvote_lab.evaluation.evaluate import Evaluation
 from mapvote_lab.evaluation.experiments.scene import Scene
 from mapvote_lab.evaluation.loopback import PublishedRound
 from mapvote_lab.evaluation.reporting import birdseye
-from mapvote_lab.evaluation.reporting.gallery import MOVER, Area, areas_of
+from mapvote_lab.evaluation.reporting.gallery import MOVER, ChangedArea, areas_of
 from mapvote_lab.evaluation.reporting.sheets import ReportSection, page
 from mapvote_lab.evaluation.reporting.tables import case_name, tables
 from mapvote_lab.evaluation.results import EvaluationResult
@@ -39,7 +39,7 @@ class Story:
 
     deleted: int
     added: int
-    areas: list[tuple[Area, int, int]]
+    areas: list[tuple[ChangedArea, int, int]]
     """Area, points deleted, points added there."""
     found: int
     objects: int
@@ -60,7 +60,7 @@ def tell(evaluation: Evaluation, done: PublishedRound, *, drives_bytes: int, kep
     survived, added = same_rows(old, new)
     deleted = old[~survived]
 
-    def inside(points: np.ndarray, area: Area) -> int:
+    def inside(points: np.ndarray, area: ChangedArea) -> int:
         return int(((points[:, :2] > area.box[0]) & (points[:, :2] < area.box[1])).all(axis=1).sum())
 
     areas = [(area, inside(deleted, area), inside(added, area)) for area in areas_of(evaluation)]

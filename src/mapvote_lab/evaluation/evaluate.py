@@ -27,7 +27,7 @@ from mapvote_lab.evaluation.experiments.scene import Progress, Scene
 from mapvote_lab.evaluation.results import CaseResult, Cost, EvaluationResult, Timings
 from mapvote_lab.evaluation.scoring.cells import Scores
 from mapvote_lab.evaluation.scoring.jury import CaseOutcome, Jury
-from mapvote_lab.evaluation.scoring.truth import Truth
+from mapvote_lab.evaluation.scoring.scene_truth import Truth
 from mapvote_lab.evaluation.scoring.truths import SIDE_BY_SIDE, sizes_by_height
 
 

@@ -14,7 +14,7 @@ import msgspec
 from mapvote_lab.evaluation.scoring.cells import Scores
 from mapvote_lab.evaluation.scoring.map_points import MapScores
 from mapvote_lab.evaluation.scoring.objects import ObjectScores
-from mapvote_lab.evaluation.scoring.truth import PoseErrors
+from mapvote_lab.evaluation.scoring.scene_truth import PoseErrors
 
 
 class Judgement(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):

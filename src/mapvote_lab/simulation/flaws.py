@@ -88,7 +88,7 @@ def swallowed(wet: Bool, glass: Bool, dark: Bool, hits: Hits, sensor: Sensor, rn
     return lost
 
 
-def mirrored(
+def reflected(
     rays: Sweep, hits: Hits, smooth: Bool, casters: tuple[Caster, Caster], wanted: int, sensor: Sensor,
     rng: np.random.Generator,
 ) -> tuple[I64, F32]:  # fmt: skip
@@ -163,7 +163,7 @@ def spoil(
     false = mixed(ranges, sensor.beams, flaws.mixed_share, rng)
     wanted = round(flaws.reflection_share * np.count_nonzero(hits.ranges < sensor.max_range_m))
     if wanted:
-        index, way = mirrored(rays, hits, wet | glass | paint, casters, wanted, sensor, rng)
+        index, way = reflected(rays, hits, wet | glass | paint, casters, wanted, sensor, rng)
         ranges[index], false[index], lost[index] = way, True, False
     short = shortened(rays, ranges, tails, flaws, rng)
     return ranges, false | short, lost & ~short

@@ -1,5 +1,6 @@
 """What stands along a kerb: trees, poles, signs, guard rails, shelters, boxes. Local frame: x along the street,
-y away from the road, z up from the ground; the middle of the foot at the origin."""
+y away from the road, z up from the ground; the middle of the foot at the origin.
+"""
 
 from __future__ import annotations
 

@@ -10,7 +10,7 @@ import pytest
 from mapvote.core.grid import CELL_SIZE
 from mapvote_lab.evaluation.scoring.border import BORDER_M, border, ceiling
 from mapvote_lab.evaluation.scoring.cells import UNSCORED
-from mapvote_lab.evaluation.scoring.truth import Truth
+from mapvote_lab.evaluation.scoring.scene_truth import Truth
 
 KEPT, ADDED, REMOVED = range(3)
 

@@ -11,7 +11,7 @@ import pytest
 from mapvote.core.grid import Grid, Lattice
 from mapvote.core.types import F64, Reference
 from mapvote_lab.evaluation.scoring.cells import UNSCORED
-from mapvote_lab.evaluation.scoring.truth import Truth
+from mapvote_lab.evaluation.scoring.scene_truth import Truth
 from mapvote_lab.evaluation.scoring.truths import BANDS, TRUTHS, lowest_surface, sizes_by_height
 
 GRID = Grid(Lattice(), 0, 0, 1, 6)

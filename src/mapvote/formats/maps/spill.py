@@ -1,5 +1,6 @@
 """Arrays on disk while a map larger than memory is made: in a file without a name, gone with the process that made it,
-however that ends."""
+however that ends.
+"""
 
 from __future__ import annotations
 

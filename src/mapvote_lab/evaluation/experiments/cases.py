@@ -22,7 +22,7 @@ from mapvote.core.voting import plurality
 from mapvote.fusion.fuse import states_over
 from mapvote.fusion.offline import update_map
 from mapvote_lab.evaluation.scoring.jury import CaseOutcome
-from mapvote_lab.evaluation.scoring.truth import lay_on
+from mapvote_lab.evaluation.scoring.scene_truth import lay_on
 
 OCCLUSIONS: Mapping[str, Mapping[str, str]] = {
     "": {},

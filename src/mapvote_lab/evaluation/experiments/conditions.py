@@ -1,5 +1,6 @@
 """What drives are put through that they did not meet when they were recorded: to see what the method can bear, and
-which of its stages holds it back."""
+which of its stages holds it back.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +18,7 @@ from mapvote.localisation.localiser import Localise
 from mapvote.localisation.ndt import PosePrior
 from mapvote.localisation.odometry import Fix
 from mapvote.perception.frontend import Movers
-from mapvote_lab.evaluation.scoring.truth import Truth
+from mapvote_lab.evaluation.scoring.scene_truth import Truth
 from mapvote_lab.simulation.scenario import load_scenario
 from mapvote_lab.simulation.world import make_world
 

@@ -1,5 +1,6 @@
 """How far poses and maps are off the truth, and how well a vehicle localises where the world changed: in the old map,
-in the updated one, and in one surveyed anew."""
+in the updated one, and in one surveyed anew.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +22,7 @@ from mapvote_lab.evaluation.experiments.conditions import ar1
 from mapvote_lab.evaluation.experiments.passes import Pass
 from mapvote_lab.evaluation.experiments.scene import Progress, Scene
 from mapvote_lab.evaluation.results import MapShift
-from mapvote_lab.evaluation.scoring.truth import PoseErrors, Truth, error_summary, rigid_between
+from mapvote_lab.evaluation.scoring.scene_truth import PoseErrors, Truth, error_summary, rigid_between
 
 
 def map_shift(scene: Scene) -> MapShift:

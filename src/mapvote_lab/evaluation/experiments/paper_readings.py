@@ -1,7 +1,8 @@
 """How the paper's open sentences are read, and every reading on kept drives, without driving again (paper III-IV).
 
 The scans of a drive say one word a cell (detection/paper.py), which is kept over each scan's window. Every reading is
-then a look-up, with the product's own tables, votes and verdicts (core/voting.py)."""
+then a look-up, with the product's own tables, votes and verdicts (core/voting.py).
+"""
 
 from __future__ import annotations
 

@@ -1,7 +1,8 @@
 """The vehicles' passes, whose ballots are kept in the cache.
 
 One pass over a drive serves all cases: what a scan saw is worked out once, each voter counts by its rules. Voters that
-count alike share their counters, and those of a method share the candidates for new points."""
+count alike share their counters, and those of a method share the candidates for new points.
+"""
 
 from __future__ import annotations
 

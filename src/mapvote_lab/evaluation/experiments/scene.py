@@ -32,7 +32,7 @@ from mapvote.formats.atomic import whole_file
 from mapvote.formats.drives.options import parse_scans
 from mapvote.slam.build import build_map
 from mapvote_lab.evaluation.experiments.conditions import Conditions, with_true_ground
-from mapvote_lab.evaluation.scoring.truth import Truth, read_truth
+from mapvote_lab.evaluation.scoring.scene_truth import Truth, read_truth
 from mapvote_lab.simulation import simulate
 from mapvote_lab.simulation.scenario import load_scenario
 
@@ -148,7 +148,7 @@ class Scene:
 
     @property
     def truth(self) -> Truth:
-        """See :mod:`mapvote_lab.evaluation.scoring.truth`."""
+        """See :mod:`mapvote_lab.evaluation.scoring.scene_truth`."""
         return read_truth(self.folder)
 
     @property

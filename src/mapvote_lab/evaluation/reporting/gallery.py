@@ -25,14 +25,14 @@ from mapvote_lab.evaluation.reporting.tables import case_name
 from mapvote_lab.evaluation.scoring.cells import UNSCORED
 from mapvote_lab.evaluation.scoring.map_points import same_rows
 from mapvote_lab.evaluation.scoring.reliability import reliability
-from mapvote_lab.evaluation.scoring.truth import lay_on
+from mapvote_lab.evaluation.scoring.scene_truth import lay_on
 from mapvote_lab.simulation.scenario import load_scenario
 
 MOVER = "#e07b00"
 
 
 @dataclass(frozen=True, slots=True)
-class Area:
+class ChangedArea:
     """A place where the world changed."""
 
     name: str
@@ -42,7 +42,7 @@ class Area:
     objects: int
 
 
-def areas_of(evaluation: Evaluation) -> list[Area]:
+def areas_of(evaluation: Evaluation) -> list[ChangedArea]:
     """The scenario's changed areas, numbered in its order (the paper's Figure 6), by the footprints built there."""
     out = []
     scene = evaluation.scene
@@ -52,7 +52,7 @@ def areas_of(evaluation: Evaluation) -> list[Area]:
         if mine:
             every = np.concatenate(mine)
             box = np.array([every.min(axis=0) - 4.0, every.max(axis=0) + 4.0])
-            out.append(Area(f"area {i + 1}", change.kind, box, len(mine)))
+            out.append(ChangedArea(f"area {i + 1}", change.kind, box, len(mine)))
     return out
 
 
@@ -141,7 +141,7 @@ def _paths(evaluation: Evaluation) -> list[tuple[str, F64]]:
 
 
 def _area(
-    first_map: PointMap, area: Area, old: F64, survived: Bool, added: F64, paths: list[tuple[str, F64]]
+    first_map: PointMap, area: ChangedArea, old: F64, survived: Bool, added: F64, paths: list[tuple[str, F64]]
 ) -> Figure:
     """Before and after, from across the road; what stands on the near side of it is left out of the way."""
     road_y = float(np.mean(np.concatenate([path[:, 1] for _, path in paths])))
@@ -173,7 +173,7 @@ def _area(
     return birdseye.draw(panels, camera, paths=shown, legend=[("deleted", style.GONE), ("added", style.NEW)])
 
 
-def _scan_near(evaluation: Evaluation, areas: list[Area]) -> int:
+def _scan_near(evaluation: Evaluation, areas: list[ChangedArea]) -> int:
     """The scan of the first vehicle nearest to the first demolition (or to the first area, or its middle scan)."""
     T = evaluation.drives[0].T_map_lidar
     chosen = [a for a in areas if a.kind == "demolished"] or areas

@@ -23,7 +23,7 @@ from mapvote_lab.evaluation.experiments.real.bench import (
     score,
     unchanged_figures,
 )
-from mapvote_lab.evaluation.experiments.real.street import FalseChange, RealRun, changed, largest_false_changes
+from mapvote_lab.evaluation.experiments.real.street import FalseChange, RealRun, is_changed, largest_false_changes
 from mapvote_lab.evaluation.reporting.sheets import Sheet
 
 
@@ -159,7 +159,7 @@ def draw_false_changes(run: RealRun, case: str, found: Sequence[FalseChange], pa
 def draw_things(run: RealRun, case: str, asked: Sequence[Asked], path: Path) -> None:
     """The whole street, and a close-up of each thing, the least found first: found, missed, falsely decided."""
     picture, states = _street(run), run.states[case]
-    picture[changed(states)] = to_rgb(INK)
+    picture[is_changed(states)] = to_rgb(INK)
     share, spots = [], []
     x, y = run.street.grid.centres()
     for a in asked:

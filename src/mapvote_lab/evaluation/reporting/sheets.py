@@ -1,5 +1,6 @@
 """A table, and how it looks on a terminal, in Markdown and in HTML; and report.html, a page that needs nothing else
-(pictures inlined, no script, no request)."""
+(pictures inlined, no script, no request).
+"""
 
 from __future__ import annotations
 

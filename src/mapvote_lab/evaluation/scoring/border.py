@@ -14,7 +14,7 @@ from scipy import ndimage
 from mapvote.core.grid import CELL_SIZE
 from mapvote.core.types import F64, I32, U8, Bool, CellState
 from mapvote_lab.evaluation.scoring.cells import CLASSES, UNSCORED, Scores, score_cells
-from mapvote_lab.evaluation.scoring.truth import Truth
+from mapvote_lab.evaluation.scoring.scene_truth import Truth
 
 BORDER_M = 0.05
 NOISE_M = 0.02

@@ -16,7 +16,7 @@ from mapvote_lab.evaluation.scoring.border import ceiling
 from mapvote_lab.evaluation.scoring.cells import Scores, determined_share, score_cells
 from mapvote_lab.evaluation.scoring.map_points import MapJudge, MapScores, map_obstacles
 from mapvote_lab.evaluation.scoring.objects import score_objects
-from mapvote_lab.evaluation.scoring.truth import Truth
+from mapvote_lab.evaluation.scoring.scene_truth import Truth
 from mapvote_lab.evaluation.scoring.truths import TRUTHS
 
 

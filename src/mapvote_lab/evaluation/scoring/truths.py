@@ -12,7 +12,7 @@ from mapvote.core.grid import CELL_SIZE, Grid
 from mapvote.core.types import F32, F64, U8, Reference
 from mapvote_lab.evaluation.scoring.border import border
 from mapvote_lab.evaluation.scoring.cells import UNSCORED
-from mapvote_lab.evaluation.scoring.truth import Truth
+from mapvote_lab.evaluation.scoring.scene_truth import Truth
 
 _UNCHANGED, _OCCUPIED, _EMPTY = 0, 1, 2
 ON_SURFACE_M = 0.3

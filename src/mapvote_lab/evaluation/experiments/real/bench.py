@@ -27,7 +27,7 @@ from mapvote_lab.evaluation.experiments.real.street import (
     Edit,
     RealRun,
     Street,
-    changed,
+    is_changed,
     lay_street,
     met_cells,
     open_recording,
@@ -195,7 +195,7 @@ def precision_near(asked: Sequence[Asked], states: U8, grid: Grid) -> float:
     for a in asked:
         near |= ndimage.binary_dilation(a.cells, np.ones((3, 3)), iterations=NEAR_CELLS)
         right |= ndimage.binary_dilation(a.cells, np.ones((3, 3))) & (states == a.state)
-    return ratio(np.count_nonzero(right), np.count_nonzero(changed(states) & near))
+    return ratio(np.count_nonzero(right), np.count_nonzero(is_changed(states) & near))
 
 
 BLOCKS = (12, 25)
@@ -299,8 +299,8 @@ def bench(
     tell("real street", len(jobs), total)
     for names, cast in CASTS.items():
         try:
-            for name, changed in zip(names, cast(street, site, cases, seed, each), strict=True):
-                result.changed[name] = changed
+            for name, found in zip(names, cast(street, site, cases, seed, each), strict=True):
+                result.changed[name] = found
                 tell("real street", len(jobs) + len(result.changed), total)
         except MapvoteError as error:
             result.skipped |= {name: str(error) for name in names if name not in result.changed}

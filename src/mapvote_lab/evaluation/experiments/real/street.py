@@ -32,7 +32,7 @@ from mapvote.slam.build import BuildReport, build_map
 from mapvote_lab.evaluation.experiments.cases import Case, fuse_case
 from mapvote_lab.evaluation.experiments.passes import SharedPass
 from mapvote_lab.evaluation.scoring.cells import determined, ratio
-from mapvote_lab.evaluation.scoring.truth import pose_errors, rigid_between
+from mapvote_lab.evaluation.scoring.scene_truth import pose_errors, rigid_between
 
 VEHICLES = 3
 WRONG_M = 0.5
@@ -135,10 +135,10 @@ class RealRun:
         """
         scored = determined(self.states[case]) & (np.ones_like(self.movers) if with_movers else ~self.movers)
         scored &= self.street.mapped if of_mapped else np.ones_like(scored)
-        return ratio(np.count_nonzero(changed(self.states[case]) & scored), np.count_nonzero(scored))
+        return ratio(np.count_nonzero(is_changed(self.states[case]) & scored), np.count_nonzero(scored))
 
 
-def changed(states: U8) -> Bool:
+def is_changed(states: U8) -> Bool:
     """Cells decided changed, either way."""
     return (states == CellState.CHANGED_OCCUPIED) | (states == CellState.CHANGED_EMPTY)
 

@@ -8,18 +8,22 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hand_made import make_map, make_tile, wall
-from mapvote.core.grid import Lattice
-from mapvote.core.types import F64
+from mapvote.core.grid import CELL_SIZE, Lattice
+from mapvote.core.point_map import map_from_points
+from mapvote.core.types import F64, I64
 from mapvote.core.voxels import VoxelCloud, thin, voxel_downsample
 from mapvote.slam.clean_map import (
     LARGEST_SPECK,
     MET_SHARE,
     NEAR_M,
     SEEN_THROUGH,
+    TALL_M,
     lone_points,
+    mirrored,
     seen_through,
     specks,
     strays,
+    trails,
     without_lone_points,
 )
 
@@ -152,3 +156,116 @@ def test_of_a_map_from_elsewhere_a_point_alone_in_the_air_is_dropped_and_a_wall_
     assert np.flatnonzero(lone_points(tile)).tolist() == [len(ground) + len(pole)]
     cleaned, dropped = without_lone_points(make_map({(0, 0): tile}))
     assert (dropped, cleaned.n_points) == (1, len(tile.points) - 1)
+
+
+def cells_in_row(n: int, row: int, height_m: float = 1.0) -> F64:
+    """(n, 3) a point in each of ``n`` cells in a row."""
+    x = (np.arange(n) + 0.5) * CELL_SIZE
+    return np.column_stack([x, np.full(n, (row + 0.5) * CELL_SIZE), np.full(n, height_m)])
+
+
+def test_a_low_row_that_rays_passed_more_often_than_they_met_it_is_a_trail() -> None:
+    points = np.concatenate([cells_in_row(9, 0), cells_in_row(9, 5)])
+    balance = np.repeat(np.array([-3, 4]), 9)
+    assert trails(points, balance, points[:, 2], LATTICE).tolist() == [True] * 9 + [False] * 9
+
+
+def test_a_thing_is_judged_as_a_whole_and_keeps_the_edges_that_rays_pass() -> None:
+    points = cells_in_row(9, 0)
+    edges = np.array([-5, 4, 4, 4, 4, 4, 4, 4, -9])
+    assert not trails(points, edges, points[:, 2], LATTICE).any()
+    assert trails(points, edges - 2, points[:, 2], LATTICE).all(), "it is passed once more often than met"
+
+
+def test_what_rises_above_a_lorry_did_not_drive_and_nor_did_what_nobody_knows_the_height_of() -> None:
+    points, passed = cells_in_row(3, 0), np.full(3, -5)
+    assert trails(points, passed, np.array([1.0, TALL_M, np.nan]), LATTICE).tolist() == [True, False, False]
+    column = np.array([[0.1, 0.1, 1.0], [0.1, 0.1, 5.0]])
+    assert not trails(column, np.full(2, -5), column[:, 2], LATTICE).any(), "one cell, and it rises to five metres"
+
+
+def test_a_map_without_a_point_has_no_trail() -> None:
+    assert trails(np.zeros((0, 3)), np.zeros(0, np.int64), np.zeros(0), LATTICE).shape == (0,)
+
+
+@given(st.lists(st.tuples(st.integers(0, 12), st.integers(0, 12), st.integers(-9, 9)), min_size=1, max_size=40))
+def test_in_whichever_order_points_come_they_are_judged_alike_and_met_ones_stay(
+    cells: list[tuple[int, int, int]],
+) -> None:
+    points = np.array([[(c + 0.5) * CELL_SIZE, (r + 0.5) * CELL_SIZE, 1.0] for r, c, _ in cells])
+    balance: I64 = np.array([b for _, _, b in cells])
+    found = trails(points, balance, points[:, 2], LATTICE)
+    turned = trails(points[::-1].copy(), balance[::-1].copy(), points[:, 2], LATTICE)
+    np.testing.assert_array_equal(found, turned[::-1])
+    assert not trails(points, np.abs(balance), points[:, 2], LATTICE).any()
+
+
+def by_hand(cells: dict[tuple[int, int], int]) -> set[tuple[int, int]]:
+    """The cells whose 8-connected group has a sum below zero."""
+    left, out = set(cells), set()
+    while left:
+        group, ring = set(), {left.pop()}
+        while ring:
+            group |= ring
+            ring = {(r + i, c + k) for r, c in ring for i in (-1, 0, 1) for k in (-1, 0, 1)} & left
+            left -= ring
+        out |= group if sum(cells[cell] for cell in group) < 0 else set()
+    return out
+
+
+@given(
+    st.dictionaries(st.tuples(st.integers(-300, -290), st.integers(-6, 6)), st.integers(-9, 9), min_size=1, max_size=50)
+)
+def test_trails_are_the_groups_of_cells_that_touch_and_were_passed_more_often_on_either_side_of_the_origin(
+    cells: dict[tuple[int, int], int],
+) -> None:
+    points = np.array([[(c + 0.5) * CELL_SIZE, (r + 0.5) * CELL_SIZE, 1.0] for r, c in cells])
+    balance: I64 = np.array(list(cells.values()))
+    found = trails(points, balance, points[:, 2], LATTICE)
+    assert {cell for cell, is_trail in zip(cells, found, strict=True) if is_trail} == by_hand(cells)
+
+
+OFF_ORIGIN = Lattice(-30.0, -30.0)
+
+
+def sheet(x: tuple[float, float], y: tuple[float, float], z: float) -> F64:
+    """A level surface, a point every 0.15 m."""
+    a, b = np.meshgrid(np.arange(*x, 0.15), np.arange(*y, 0.15))
+    return np.column_stack([a.ravel(), b.ravel(), np.full(a.size, z)])
+
+
+def road_along(y: float, z: float = 0.0) -> F64:
+    along = np.arange(0.0, 30.0, 0.15)
+    return np.column_stack([along, np.full(len(along), y), np.full(len(along), z)])
+
+
+def left_out(cloud: F64, driven: F64, asked: F64) -> list[bool]:
+    """Which of the points ``asked`` are taken for reflections in a map of ``cloud`` and them."""
+    points = np.vstack([cloud, asked])
+    out = mirrored(points, map_from_points(points, lattice=OFF_ORIGIN, road=driven), driven)
+    return [bool(left) for left in out[len(cloud) :]]
+
+
+def test_points_metres_below_the_road_are_reflections_and_the_road_is_none() -> None:
+    street = sheet((0, 30), (0, 20), 0.0)
+    below = np.array([[10.0, 5.0, -1.2], [12.0, 9.0, -7.0], [12.1, 9.1, -7.1], [20.0, 5.0, -0.3], [21.0, 5.0, 0.0]])
+    assert left_out(street, road_along(5.0), below) == [True, True, True, False, False]
+    points = np.vstack([street, below])
+    assert not mirrored(points, map_from_points(points, lattice=OFF_ORIGIN, road=road_along(5.0)), road_along(5.0))[
+        :-5
+    ].any()
+
+
+def test_the_wall_down_to_a_yard_beside_the_street_stays() -> None:
+    street, yard = sheet((0, 30), (0, 10), 0.0), sheet((0, 30), (10, 20), -3.0)
+    wall = np.column_stack([np.full(10, 15.0), np.full(10, 10.0), np.linspace(-2.8, -0.2, 10)])
+    assert not any(left_out(np.vstack([street, yard]), road_along(5.0), wall))
+    assert left_out(np.vstack([street, yard]), road_along(5.0), np.array([[15.0, 15.0, -5.0]])) == [True]
+
+
+def test_where_a_vehicle_drove_below_a_bridge_nothing_is_left_out() -> None:
+    street, bridge = sheet((0, 30), (0, 30), 0.0), sheet((12, 18), (0, 30), 6.0)
+    over, under = road_along(15.0, 6.0)[:, [1, 0, 2]], road_along(15.0)
+    kerb = np.array([[15.0, 5.0, 0.1]])  # below the bridge, beside its path: there the map keeps the bridge
+    assert left_out(np.vstack([street, bridge]), np.vstack([under, over]), kerb) == [False]
+    assert left_out(np.vstack([street, bridge]), over, kerb) == [True], "one level a cell: the street was not driven"

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import json
+from pathlib import Path
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mapvote.core.point_map import PointMap, map_from_points
-from mapvote.core.types import F64, U8, U32, MapvoteError
-from mapvote.localisation import correlation
-from mapvote.localisation.correlation import MARGIN, CoarseMap, correlate, highest, laid_out
+from mapvote.config import Settings
+from mapvote.core.point_map import PointMap, has_open_ground, map_from_points
+from mapvote.core.types import F64, U8, U32, MapvoteError, Scan
+from mapvote.localisation import global_search
+from mapvote.localisation.global_search import MARGIN, CoarseMap, GlobalSearch, correlate, highest, laid_out
 
 
 def street() -> PointMap:
@@ -89,6 +93,27 @@ def test_the_highest_are_those_of_a_sort_of_all(scores: list[int], most: int) ->
 
 
 def test_a_map_too_large_to_search_asks_for_a_prior(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(correlation, "_MAX_CELLS", 1_000)
+    monkeypatch.setattr(global_search, "_MAX_CELLS", 1_000)
     with pytest.raises(MapvoteError, match=r"too large to search; give the drive a prior"):
         laid_out(street())
+
+
+CAMPUS = Path(__file__).parents[2] / "../shared/data/campus"
+
+
+@pytest.mark.slow
+def test_scans_of_another_pass_are_found_in_the_campus_map_and_none_is_wrong_and_trusted() -> None:
+    if not (CAMPUS / "map_cut.npz").is_file():
+        pytest.skip("no campus map: ../shared/data/campus is not there")
+    campus = map_from_points(np.load(CAMPUS / "map_cut.npz")["points"].astype(np.float64))
+    assert not has_open_ground(campus)
+    search = GlobalSearch(campus, Settings().ndt, 0.03)
+    frames = np.load(CAMPUS / "frames.npz")
+    off_m = []
+    for name, T in json.loads((CAMPUS / "T_map_frame.json").read_text()).items():
+        found = search(Scan(0, frames[name].astype(np.float32)))
+        if found is not None:  # heights apart: those of the reference jump by a metre along a level road
+            off_m.append(float(np.linalg.norm(found[:2, 3] - np.array(T)[:2, 3])))
+    print("off by", np.round(off_m, 2))
+    assert (np.array(off_m) < 0.5).sum() >= 8
+    assert max(off_m) < 1.0

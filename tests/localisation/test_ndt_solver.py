@@ -8,8 +8,18 @@ import pytest
 from mapvote.core.geometry import exp, from_xyz_rpy, hat, inverse, log, transform
 from mapvote.core.types import F64
 from mapvote.localisation.ndt import LEVELS, NdtGrid, NdtMap, build_ndt, fitnesses, in_rows, thin_for_levels
-from mapvote.localisation.ndt_kernels import CUTOFF_E, INLIER_E, Pairs, linearise, pair_up, room_for
-from mapvote.localisation.ndt_solver import _move, _to_prior, inverse_of, room_to_work
+from mapvote.localisation.ndt_solver import (
+    CUTOFF_E,
+    INLIER_E,
+    Pairs,
+    _move,
+    _to_prior,
+    inverse_of,
+    linearise,
+    pair_up,
+    room_for,
+    room_to_work,
+)
 from streets import street
 
 T_TRUE = from_xyz_rpy(3.0, -1.0, 1.8, 0.01, -0.015, 0.3)
