@@ -22,18 +22,11 @@ from pathlib import Path
 import numpy as np
 
 from mapvote.codec.odds import STEPS, UNSAID
-from mapvote.config import FuseSettings, Settings
-from mapvote.core.grid import CELLS
 from mapvote.core.types import F64, I64, Bool, CellState
 from mapvote.detection import confidence
 from mapvote.fusion import loss_budget
-from mapvote.fusion.offline import update_map
-from mapvote.vehicle import vote_drive
-from mapvote_lab.evaluation.experiments.attacks import ATTACKS
-from mapvote_lab.evaluation.experiments.real.street import lay_street, open_recording, part_of
-from mapvote_lab.evaluation.scoring.map_points import map_obstacles, same_rows
 from mapvote_lab.evaluation.scoring.reliability import binned
-from probability_scenes import Cells, called, decided, driven, judged, of_decision, stacked, taken
+from probability_scenes import Cells, called, decided, driven, stacked, taken
 
 FIT = ("corner:1", "corner:22", "corner:44", "corner:61", "junction:1", "street:2", "slanted:1")
 CHECK = ("corner:32", "corner:42", "corner:62", "corner:63", "corner:64", "corner:65", "junction:2", "junction:3",
@@ -42,10 +35,6 @@ BUDGETS = (1e-2, 3e-3, 1e-3, 3e-4, 1e-4)
 FEWEST = 2
 """Vehicles that a change needs."""
 KINDS = {"built": CellState.CHANGED_OCCUPIED, "demolished": CellState.CHANGED_EMPTY}
-RANGES = {"top_m": (0.0, 1.0, 2.0, 4.0, 8.0), "off_m": (0.0, 5.0, 10.0, 15.0, 20.0)}
-"""Heights of what came or went over the ground, distances from where the vehicles drove, metres: lower ends."""
-NOTHING_TRUE = np.zeros(CELLS, dtype=np.uint8)
-NOWHERE = np.zeros(CELLS, dtype=np.int64)
 RIDGE = 0.1
 """Of the harm curve: events are few, and each parameter must pay for itself."""
 
@@ -119,15 +108,6 @@ def check(names: Sequence[str], cache: Path, out: Path | None) -> None:
         print(f"\n{name}: scene | cells | true | ECE, by votes | Brier, by votes, share alone | bins")
         for scene, cells in [*zip(names, of_all, strict=True), ("all", stacked(of_all))]:
             rows += reliability_of(scene, name, cells)
-    print("\nrange | cells | true | said | ECE | Brier")
-    for name, of_all in by_kind.items():
-        mine = stacked(of_all)
-        for what, edges in RANGES.items():
-            for low, high in zip(edges, [*edges[1:], np.inf], strict=True):
-                measured = getattr(mine, what)
-                rows += by_range(
-                    f"{name}, {what} {low:g} to {high:g}", taken(mine, (measured >= low) & (measured < high))
-                )
     print(
         "\nbudget | scene | emptied | go | wait | lost what stands: before, now, promised | "
         "of what waits: lost, said | stale points that go"
@@ -152,46 +132,6 @@ def _short(value: object) -> object:
     return float(f"{value:.4g}") if isinstance(value, float) else value
 
 
-def edited(name: str, cache: Path) -> None:
-    """Print what maps lose that are edited within a budget: valid points, and the share of the stale ones; by honest
-    vehicles, and with the last of them lying in every way there is."""
-    street = driven(name, cache)
-    honest, old, points = [ballot for ballot, _ in street.drives], *judged(street)
-    for attack in (None, *ATTACKS):
-        ballots, told = list(honest), []
-        if attack is not None:
-            ballots[-1] = ATTACKS[attack](honest[-1], street.point_map, honest[0])
-        for budget in (1.0, 1e-2, 1e-3):
-            updated = update_map(street.point_map, ballots, FuseSettings(false_deletions=budget))[0]
-            gone = ~same_rows(old, map_obstacles(updated))[0]
-            stale = 100 * (points.stale & gone).sum() / points.stale.sum()
-            told.append(f"{budget:g}: {(points.valid & gone).sum()}, {stale:.1f} %")
-        print(f"{name} | {attack or 'nobody lies'} | {' | '.join(told)}")
-
-
-def recorded(folder: Path, block: int) -> None:
-    """Print what is said of a recorded street on which nothing changed: every change of it is false."""
-    settings = Settings()
-    recording, reference = open_recording(folder, settings)
-    street = lay_street(recording, settings, reference, block=block)
-    drives = [part_of(recording, scans, f"v{k + 1}") for k, scans in enumerate(street.voting)]
-    ballots = [vote_drive(drive, street.point_map, settings)[0] for drive in drives]
-    for budget in (1.0, 1e-2, 1e-3):
-        fuse = FuseSettings(min_difference=0.0, false_deletions=budget)  # they share one drive, and are no copies
-        decisions = update_map(street.point_map, ballots, fuse)[1].values()
-        cells = stacked(
-            [of_decision(0, len(ballots), d, np.zeros(CELLS, np.uint8), (NOWHERE, NOWHERE)) for d in decisions]
-        )
-        told = [f"{sum(len(d.pending.cells) for d in decisions)} wait, {sum(d.deleted for d in decisions)} points go"]
-        for name, state in KINDS.items():
-            mine = taken(cells, cells.states == state)
-            known = mine.states, mine.votes, mine.against, mine.beside
-            means = [loss_budget.change_probability(*known, odds).mean() for odds in (mine.odds, None) if len(known[0])]
-            said = f", said {means[0]:.2f}, by votes {means[1]:.2f}" if means else ""
-            told.append(f"{len(known[0])} {name}{said}")
-        print(f"{folder.name}, blocks of {block} | {budget:g} | {' | '.join(told)}")
-
-
 def reliability_of(scene: str, kind: str, cells: Cells) -> list[dict[str, object]]:
     """A row a bin, of decided cells of one kind."""
     known = cells.states, cells.votes, cells.against, cells.beside
@@ -209,17 +149,6 @@ def reliability_of(scene: str, kind: str, cells: Cells) -> list[dict[str, object
         for k, (p, t, n) in enumerate(zip(found.predicted, found.true, found.cells, strict=True))
         if n
     ]
-
-
-def by_range(name: str, cells: Cells) -> list[dict[str, object]]:
-    """A row of decided cells of one kind at one height or distance; none of none."""
-    if not len(cells.states):
-        return []
-    said = loss_budget.change_probability(cells.states, cells.votes, cells.against, cells.beside, cells.odds)
-    found, true = binned(said, cells.true), float(cells.true.mean())
-    print(f"{name} | {len(said)} | {true:.3f} | {said.mean():.3f} | {found.calibration_error:.3f} | {found.brier:.3f}")
-    whole = {"scene": "all", "kind": name, "cells": len(said), "ece": found.calibration_error, "brier": found.brier}
-    return [whole | {"predicted": float(said.mean()), "true": true}]
 
 
 def within(budget: float, scene: str, cells: Cells) -> dict[str, object]:
@@ -247,16 +176,9 @@ if __name__ == "__main__":
     parser.add_argument("--fit", nargs="*", default=FIT)
     parser.add_argument("--check", nargs="*", default=CHECK)
     parser.add_argument("--as-is", action="store_true", help="fit nothing")
-    parser.add_argument("--liars", nargs="*", default=[], help="scenes whose maps are edited, with and without liars")
-    parser.add_argument("--real", nargs="*", default=[], help="recorded drives on which nothing changed, FOLDER:BLOCK")
     parser.add_argument("--out", type=Path, help="CSV")
     asked = parser.parse_args()
     if not asked.as_is:
         fit(asked.fit, asked.cache)
     if asked.check:
         check(asked.check, asked.cache, asked.out)
-    for scene in asked.liars:
-        edited(scene, asked.cache)
-    for drive in asked.real:
-        folder, block = drive.rsplit(":", 1)
-        recorded(Path(folder), int(block))

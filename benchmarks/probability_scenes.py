@@ -5,20 +5,17 @@ from __future__ import annotations
 import itertools
 import pickle
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from pathlib import Path
 
 import numpy as np
 from msgspec import structs
-from scipy.spatial import cKDTree
 
 from mapvote.codec.ballot import Ballot, BallotTile, decode, encode, unpack_states
 from mapvote.codec.odds import changed_cells_of, in_steps, pack_odds
-from mapvote.codec.path import unpack_path
 from mapvote.config import Settings
-from mapvote.core.grid import CELL_SIZE, CELLS, TILE_CELLS, TileIndex
+from mapvote.core.grid import CELLS, TILE_CELLS, TileIndex
 from mapvote.core.point_map import PointMap
-from mapvote.core.tile import Tile
 from mapvote.core.types import F64, I8, I64, U8, Bool, CellState
 from mapvote.core.voting import VOTE_UNIT
 from mapvote.detection.confidence import depths_m
@@ -30,7 +27,7 @@ from mapvote_lab.evaluation.experiments.conditions import Conditions
 from mapvote_lab.evaluation.experiments.scene import BALLOTS_FROM, Scene, key_of, sources_digest
 from mapvote_lab.evaluation.scoring.cells import UNSCORED
 from mapvote_lab.evaluation.scoring.jury import Jury
-from mapvote_lab.evaluation.scoring.map_points import MapJudge, map_obstacles, same_rows
+from mapvote_lab.evaluation.scoring.map_points import map_obstacles, same_rows
 from mapvote_lab.evaluation.scoring.scene_truth import Truth
 
 Told = Mapping[TileIndex, tuple[F64, F64]]
@@ -71,10 +68,6 @@ class Cells:
     """Whether a point of a standing surface went with it."""
     stale: I64
     """Points that went with it, of surfaces that are gone."""
-    top_m: F64
-    """How high over the ground its highest point lay before it went, or lies since it came."""
-    off_m: F64
-    """How far the cell lies from where the vehicles drove."""
 
 
 class Telling(Vehicle):
@@ -143,8 +136,6 @@ def decided(street: Street, number: int, curves: tuple[F64, F64], fewest: int) -
     for many in range(fewest, len(ballots) + 1):
         for some in itertools.combinations(ballots, many):
             updated, decisions = update_map(street.point_map, some, settings)
-            driven_by = [unpack_path(ballot.path) for ballot in some if ballot.path is not None]
-            road = cKDTree(np.concatenate(driven_by))
             gone = ~same_rows(old, map_obstacles(updated))[0]
             for tile, decision in decisions.items():
                 here = (rows // TILE_CELLS == tile[0]) & (cols // TILE_CELLS == tile[1]) & gone
@@ -153,26 +144,7 @@ def decided(street: Street, number: int, curves: tuple[F64, F64], fewest: int) -
                     np.bincount(flat[here & kind], minlength=CELLS) for kind in (jury.points.valid, jury.points.stale)
                 ]
                 truth = _truth_of(jury, street.point_map, tile)
-                cells = of_decision(number, many, decision, truth, lost)
-                flat_cells = changed_cells_of(decision.states)
-                on_lattice = np.stack(np.divmod(flat_cells, TILE_CELLS), axis=1) + TILE_CELLS * np.array(tile)
-                tops = [_tops_m(m.tiles.get(tile))[flat_cells] for m in (street.point_map, updated)]
-                top_m = np.where(cells.states == CellState.CHANGED_EMPTY, *tops)
-                yield replace(cells, top_m=top_m, off_m=CELL_SIZE * road.query(on_lattice)[0])
-
-
-def _tops_m(tile: Tile | None) -> F64:
-    """(65536,) how high over the ground the highest point of each cell lies; 0 where there is none."""
-    top = np.zeros(CELLS)
-    if tile is not None:
-        height = tile.points[:, 2].astype(np.float64) - tile.ground_z.reshape(-1)[tile.cells]
-        np.maximum.at(top, tile.cells, np.nan_to_num(height))
-    return top
-
-
-def judged(street: Street) -> tuple[F64, MapJudge]:
-    """The obstacle points (n, 3) of its first map, and what is true of each."""
-    return map_obstacles(street.point_map), Jury(street.point_map, street.truth).points
+                yield of_decision(number, many, decision, truth, lost)
 
 
 def of_decision(number: int, vehicles: int, decision: Decision, truth: U8, lost: Sequence[I64]) -> Cells:
