@@ -17,8 +17,8 @@ from mapvote.core.types import F64, Bool
 from mapvote.localisation.ndt import SETTLED, NdtGrid, NdtMap, fitness, fitnesses, in_rows, refine
 
 MIN_FIT = 0.6
-"""Of what the map leads to expect, from which a pose may be voted with; benchmarks/localisation.py shows the fits of right
-and of wrong poses."""
+"""Of what the map leads to expect, from which a pose may be voted with; benchmarks/localisation.py shows how often
+wrong poses are trusted."""
 MIN_LEAD = 0.05
 """By how much the best other place must fit worse, in the same scale."""
 MIN_KNOWN = 0.3
