@@ -1,4 +1,4 @@
-"""What experiments measure, typed; the same structures are the JSON of ``evaluate --json`` and of the matrix.
+"""What experiments measure, typed; the same structures are the JSON of ``evaluate --json``.
 
 Lengths in metres, times in seconds and angles in degrees unless the name says otherwise; shares from 0 to 1.
 """
@@ -39,16 +39,6 @@ class CaseResult(Judgement, frozen=True, kw_only=True, omit_defaults=True):
     bytes_per_vehicle: list[int]
     state_bytes_per_vehicle: list[int] | None = None
     """Of the votes alone, without new points and other planes."""
-
-
-class RoundResult(Judgement, frozen=True, kw_only=True, omit_defaults=True):
-    """One set of ballots of the matrix."""
-
-    strict_old_unchanged: Scores
-    """As ``strict``, old surfaces that no survey saw counted as unchanged."""
-    provenance_old_unchanged: Scores
-    determined: float
-    """Share of the scored cells that the fleet determined."""
 
 
 class MapShift(msgspec.Struct, frozen=True):
@@ -110,19 +100,6 @@ class EvaluationResult(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=
     readings: dict[str, dict[str, dict[str, Scores]]] = {}
     """By reading of the paper, case and truth, if asked for."""
     timings: Timings
-
-
-class MatrixResult(msgspec.Struct, frozen=True, kw_only=True):
-    """One experiment of the matrix on one seed."""
-
-    scenario: str
-    seed: int
-    cells: int
-    map_shift: MapShift
-    localisation: dict[str, PoseErrors]
-    ceilings: dict[str, Scores]
-    """As of ``evaluate``."""
-    rounds: dict[str, RoundResult]
 
 
 def to_json(result: msgspec.Struct | Mapping[str, Any], *, sort_keys: bool = False) -> str:

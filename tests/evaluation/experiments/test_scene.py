@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from mapvote_lab.evaluation.experiments.matrix import _SCORES_FROM
 from mapvote_lab.evaluation.experiments.scene import _DRIVES_FROM, _MAP_FROM, BALLOTS_FROM, sources_digest
 
 
-@pytest.mark.parametrize("parts", [_DRIVES_FROM, _MAP_FROM, BALLOTS_FROM, _SCORES_FROM])
+@pytest.mark.parametrize("parts", [_DRIVES_FROM, _MAP_FROM, BALLOTS_FROM])
 def test_the_sources_that_a_cached_result_depends_on_exist(parts: tuple[str, ...]) -> None:
     assert len(sources_digest(parts)) == 64
 

@@ -87,15 +87,6 @@ def test_a_truth_lies_on_the_lattice_of_a_map_that_starts_on_whole_cells(truth: 
             truth.grid_on(off)
 
 
-def test_old_surfaces_that_no_survey_saw_count_as_unchanged_for_another_judge(tmp_path: Path) -> None:
-    strict, provenance, reason = (np.full((ROWS, COLS), value, dtype=np.uint8) for value in (2, 255, 0))
-    reason[3, 4], reason[5, 6] = 3, 2
-    scene = write_scene(tmp_path, strict=strict, provenance=provenance, reason=reason)
-    other_strict, other_provenance = read_truth(scene).with_old_surfaces()
-    assert np.argwhere(other_strict != 2).tolist() == np.argwhere(other_provenance != 255).tolist() == [[3, 4]]
-    assert (other_strict[3, 4], other_provenance[3, 4]) == (0, 0)
-
-
 def distance_outside(corners: F64, x: F64, y: F64) -> F64:
     """How far points lie outside the edges of a convex polygon that runs counter-clockwise; negative inside."""
     out = np.full(x.shape, -np.inf)

@@ -41,8 +41,6 @@ Progress = Callable[[str, int, int], None]
 
 _DRIVES_FROM = ("simulation", "core/geometry.py", "core/grid.py", "core/sensors.py", "formats/drives/kitti.py")
 """What the bytes of drives and truth depend on; most work on the program leaves gigabytes of drives as they are."""
-_DROPPED = "dropped"
-"""A file of this name says that the scans were deleted to free the disk."""
 _MAP_FROM = ("core", "codec", "formats", "localisation", "perception", "detection", "slam")
 BALLOTS_FROM = (
     *_MAP_FROM, "vehicle.py", "evaluation/experiments/passes.py",
@@ -100,8 +98,6 @@ class Scene:
 
     def simulate(self, progress: Progress | None = None) -> None:
         """Simulate the drives, unless the cache holds them."""
-        if (self.folder / _DROPPED).exists():
-            shutil.rmtree(self.folder)
         if not self.folder.exists():
             told = (lambda done, total: progress("simulating", done, total)) if progress else None
             partial = self.folder.with_name(f".{self.folder.name}.{os.getpid()}")
@@ -122,12 +118,6 @@ class Scene:
                 point_map = with_true_ground(point_map, self.scenario, self.seed, self.overrides)
             write_map(point_map, self.work / "map")
             give_back_free_pages()
-
-    def drop_drives(self) -> None:
-        """Free the disk: keep the truth and what was made of the drives; whoever needs them simulates them again."""
-        (self.folder / _DROPPED).touch()
-        for scans in (*self.folder.glob("*/velodyne"), *self.folder.glob("truth/*/moving")):
-            shutil.rmtree(scans)
 
     def drive_names(self, prefix: str) -> list[str]:
         """Drives of the surveys ("survey_") or of the voting vehicles ("v"), in order of their numbers."""

@@ -16,7 +16,6 @@ from mapvote.core.types import F64, NO_VOTE, U8, Bool, MapvoteError
 from mapvote.formats.drives.trajectory import read_poses
 
 _KEPT, _ADDED, _REMOVED = 0, 1, 2
-_OLD_NEVER_SURVEYED = 3
 _AROUND_M = 0.6
 """Walls stand on the outline of a footprint: cells this far outside it still belong to the object."""
 _ARM_M = 2.0
@@ -59,11 +58,6 @@ class Truth:
     def moving(self, drive: str, scan: int) -> Bool:
         """(n,) which points of the scan's file hit a body that moves."""
         return np.asarray(np.load(self.folder / drive / "moving" / f"{scan:06d}.npy"), dtype=np.bool_)
-
-    def with_old_surfaces(self) -> tuple[U8, U8]:
-        """(strict, provenance) in which old surfaces that no survey saw count as unchanged, as another judge may."""
-        old = self.reason == _OLD_NEVER_SURVEYED
-        return np.where(old, np.uint8(0), self.strict), np.where(old, np.uint8(0), self.provenance)
 
     def surfaces(self) -> tuple[F64, F64, F64]:
         """(kept, added, removed): noise-free surface samples (n, 3), map metres."""
