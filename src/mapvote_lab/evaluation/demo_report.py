@@ -171,7 +171,7 @@ def _how_good(result: EvaluationResult, drawn: Mapping[str, Picture]) -> ReportS
             f"The first map lies {100 * result.map_shift.mean_m:.1f} cm from the truth on average; "
             "the scores include what that costs at the borders of cells.",
         ],
-        [drawn[name] for name in ("table_iv", "classes", "bytes", "reliability", "ablation") if name in drawn],
+        [drawn[name] for name in ("table_iv", "reliability") if name in drawn],
         list(tables(result)),
     )
 

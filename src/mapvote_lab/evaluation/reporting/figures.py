@@ -10,7 +10,6 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Polygon
-from matplotlib.ticker import LogLocator, NullLocator
 from scipy import ndimage
 
 from mapvote import plots as style
@@ -19,7 +18,6 @@ from mapvote.core.types import F64, U8, Bool, CellState
 from mapvote.core.voting import vote_weight
 from mapvote_lab.evaluation.results import CaseResult
 from mapvote_lab.evaluation.scoring import paper_tables
-from mapvote_lab.evaluation.scoring.cells import CLASSES
 from mapvote_lab.evaluation.scoring.reliability import Reliability
 
 Outline = tuple[str, F64]
@@ -178,52 +176,6 @@ def score_bars(cases: Mapping[str, CaseResult], names: Mapping[str, str]) -> Fig
     axis.set_ylabel("F1, mean of the three classes")
     axis.spines[["top", "right"]].set_visible(False)
     figure.legend(loc="outside upper center", ncols=3, frameon=False)
-    return figure
-
-
-def class_bars(cases: Mapping[str, CaseResult], names: Mapping[str, str]) -> Figure:
-    """Precision and recall of each class by the strict truth (Tables II and III); the paper's as a tick across."""
-    shown = list(cases)
-    figure, axes = style.new_figure(max(7.5, 0.95 * len(shown) + 1.5), 5.6, 2, 1, sharex=True)
-    colours = {"unchanged": style.STANDING, "changed_occupied": style.NEW, "changed_empty": style.GONE}
-    for axis, measure in zip(axes.ravel(), ("precision", "recall"), strict=True):
-        for k, name in enumerate(CLASSES):
-            x = np.arange(len(shown)) + 0.27 * (k - 1)
-            values = [getattr(getattr(cases[case].strict, measure), name) for case in shown]
-            axis.bar(x, values, width=0.25, color=colours[name], label=name.replace("_", ", "))
-            both = [(at, paper_tables.SCORES[case]) for at, case in zip(x, shown, strict=True) if case in "12345"]
-            theirs = [(at, getattr(getattr(scores, measure), name)) for at, scores in both]
-            axis.hlines([y for _, y in theirs], [at - 0.12 for at, _ in theirs], [at + 0.12 for at, _ in theirs],
-                        color=style.INK, lw=1.6, label="paper" if k == 0 else None)  # fmt: skip
-        axis.set_ylabel(measure)
-        axis.set_ylim(0, 1.04)
-        axis.spines[["top", "right"]].set_visible(False)
-    axes[-1, 0].set_xticks(range(len(shown)), [names.get(case, case).replace(", ", ",\n") for case in shown])
-    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside upper center", ncols=4, frameon=False)
-    return figure
-
-
-def byte_bars(cases: Mapping[str, CaseResult], names: Mapping[str, str]) -> Figure:
-    """Kilobytes that a vehicle sends in all, and of its votes alone; the mean of the vehicles. Yardsticks send none."""
-    shown = [case for case in cases if cases[case].bytes_per_vehicle]
-    figure, axes = style.new_figure(max(5.0, 0.95 * len(shown) + 1.5), 3.2)
-    axis = axes[0, 0]
-    for k, (label, colour, field) in enumerate(
-        (
-            ("all that is sent", style.STANDING, "bytes_per_vehicle"),
-            ("votes alone", "#a3b6c6", "state_bytes_per_vehicle"),
-        )
-    ):
-        values = [np.mean(getattr(cases[case], field) or [np.nan]) / 1000 for case in shown]
-        axis.bar(np.arange(len(shown)) + 0.4 * (k - 0.5), values, width=0.38, color=colour, label=label)
-    axis.set_yscale("log")
-    axis.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-    axis.yaxis.set_major_formatter("{x:g}")
-    axis.yaxis.set_minor_locator(NullLocator())
-    axis.set_ylabel("kB a vehicle")
-    axis.set_xticks(range(len(shown)), [names.get(case, case).replace(", ", ",\n") for case in shown])
-    axis.spines[["top", "right"]].set_visible(False)
-    figure.legend(loc="outside upper center", ncols=2, frameon=False)
     return figure
 
 

@@ -100,8 +100,6 @@ def drawn(evaluation: Evaluation, case: str) -> Iterator[tuple[str, Figure, str]
     caption = "What the server decided, cell by cell; yellow in the truth: unscored."
     yield "states", figures.cell_states(panels, evaluation.window, outlines=outlines), caption
     yield "table_iv", figures.score_bars(shown, names), "Table IV as bars, the paper's figures beside ours."
-    yield "classes", figures.class_bars(shown, names), "Precision and recall of each class: Tables II and III."
-    yield "bytes", figures.byte_bars(shown, names), "What a vehicle sends, by case."
     yield from _of_our_own(evaluation)
 
 
