@@ -199,8 +199,23 @@ def test_the_sidewalk_begins_a_cell_behind_its_kerb_at_most_though_mixed_pixels_
     road, walk = at(street[~kerb], 0.0), at(street[kerb], 0.15)
     mixed = np.column_stack([spread(rng, 150, (0, 30), (9.9, 10.6)), rng.uniform(-0.4, -0.1, 150)])
     ground = ground_of(road, walk, mixed, road=driven((0, 30), 5.0))
-    assert np.abs(ground[:33]).max() < 0.05
+    assert np.abs(ground[:32]).max() < 0.05
+    assert ground[32:35].min() > -0.08, "gutter, sidewalk, or between"
+    assert ground[32:35].max() < 0.16
     assert np.abs(ground[35:] - 0.15).max() < 0.05
+
+
+def test_the_first_cells_behind_a_kerb_do_not_sink_to_the_gutter() -> None:
+    """A few points of the gutter fall into them by pose errors, and some hold no point at all."""
+    rng = np.random.default_rng(10)
+    street = spread(rng, 60_000, (0, 30), (0, 30))
+    kerb = street[:, 1] > 9.9
+    bare = kerb & (street[:, 1] < 10.2) & (street[:, 0] % 1.5 < 0.3)
+    strays = at(np.column_stack([np.arange(0.15, 30.0, 0.9), np.full(34, 10.05)]), 0.0)
+    ground = ground_of(at(street[~kerb], 0.0), at(street[kerb & ~bare], 0.15), strays, road=driven((0, 30), 5.0))
+    off = np.abs(ground[33, 1:-1] - 0.15)
+    assert off.max() < 0.1, "0.15 where the gutter won"
+    assert np.abs(ground[:33]).max() < 0.08
 
 
 @pytest.mark.parametrize("turn", [np.flipud, np.fliplr, np.transpose, np.rot90])

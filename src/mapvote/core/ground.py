@@ -8,7 +8,7 @@ from functools import lru_cache
 import numpy as np
 
 from mapvote.core.grid import CELL_SIZE, CELLS, TILE_CELLS, TileIndex
-from mapvote.core.ground_growing import SEED, STEP_M, UNREACHED, grow, tiles_around
+from mapvote.core.ground_growing import SEED, STEP_M, UNREACHED, grow, settle, tiles_around
 from mapvote.core.kernel import inlined, kernel
 from mapvote.core.types import F32, F64, I32, I64, U8, Bool, read_only
 
@@ -128,7 +128,8 @@ def lay_ground(
     _sow(_Lows(start, heights, gap, ground), neighbours, _BROAD if road else 2)
     grow(start, heights, neighbours, ground, gap)
     ground[gap > KNOWN_M / STEP_M] = np.nan
-    laid = dict(zip(tiles, ground.reshape(-1, TILE_CELLS, TILE_CELLS), strict=True))
+    settled = settle(start, heights, neighbours, ground, gap)
+    laid = dict(zip(tiles, settled.reshape(-1, TILE_CELLS, TILE_CELLS), strict=True))
     unknown = read_only(np.full((TILE_CELLS, TILE_CELLS), np.nan, dtype=np.float32))
     return laid if len(tiles) == len(points) else dict.fromkeys(points, unknown) | laid
 

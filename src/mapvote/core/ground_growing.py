@@ -39,6 +39,10 @@ _BROAD = 14
 step up, a surface between measurements that contradict each other. Reflections make patches of 12."""
 _KERB_M = 0.2
 """How much more than a slope a step up may rise and be ground: a kerb."""
+_PASSES = 16
+"""A gap's ground is the mean of what lies around, worked out so often: enough for gaps of some cells."""
+_MOST_AROUND = 4
+"""Of the 8 cells around: behind a kerb at least 4 lie higher, before it 3."""
 _OPEN_M = 1.0
 """Room above what lies on a kerb: a car's underside has none."""
 _BEYOND_GAP = 2
@@ -247,6 +251,74 @@ def _grow(
                 _append(first, first, last, following, farther, free)
                 width = min(width, farther)
     return True
+
+
+def settle(start: I32 | I64, heights: F32, neighbours: I32, ground: F32, gap: U8) -> F32:
+    """(cells,) the ``ground`` without the preference of the side it grew from, metres: it grows from the road, and what
+    is doubtful at a kerb came out as low as the gutter. Arguments as :func:`grow`."""
+    settled = ground.copy()
+    gaps = np.flatnonzero((gap > 0) & np.isfinite(ground))
+    level = np.empty(len(gaps), np.float32)
+    for _ in range(2):  # a cell between a gap and the gutter sees how high the gap lies the second time
+        _raise_at_kerbs(start, heights, neighbours, ground, gap, settled.copy(), settled)
+        for _ in range(_PASSES):
+            _level(gaps, neighbours, settled, level)
+            settled[gaps] = level
+    return settled
+
+
+@kernel
+def _raise_at_kerbs(
+    start: I32 | I64, heights: F32, neighbours: I32, ground: F32, gap: U8, around: F32, out: F32
+) -> None:
+    """Into ``out`` (cells,): where a cell ``around`` is up to a kerb higher, a measured cell lies at its own points
+    that are as much higher if they outnumber those at its ``ground``, and halfway if they are as many, or if a single
+    point is all that it holds and most cells around are higher: a pose error brings points of the gutter into the
+    first cell behind a kerb."""
+    for cell in range(len(ground)):
+        if gap[cell] > 0:
+            continue
+        z = ground[cell]
+        here, there, raised = 0, 0, 0.0
+        for k in range(start[cell], start[cell + 1]):
+            if abs(heights[k] - z) <= _NOISE_M:
+                here += 1
+            elif z < heights[k] <= z + _KERB_M:
+                there += 1
+                raised += heights[k]
+        if here > max(there, 1):
+            continue
+        tile, row, col = _placed(cell)
+        within = _is_within(row, col, 1)
+        above, level = 0, 0.0
+        for i in range(-1, 2):
+            for j in range(-1, 2):
+                other = cell + i * TILE_CELLS + j if within else _cell_at(tile, row + i, col + j, neighbours)
+                if other >= 0 and _NOISE_M < around[other] - z <= _KERB_M + _NOISE_M:
+                    above += 1
+                    level += around[other]
+        if there > 0 and above > 0:
+            out[cell] = raised / there if there > here else 0.5 * (z + raised / there)
+        elif above >= _MOST_AROUND:
+            out[cell] = 0.5 * (z + level / above)
+
+
+@kernel
+def _level(cells: I64, neighbours: I32, ground: F32, out: F32) -> None:
+    """Into ``out`` (n,) the mean height of each of the ``cells`` and of those around it that are at most a kerb higher
+    or lower: over a gap between kerb and gutter the ground slopes, and is off by half the kerb at most."""
+    for k in range(len(cells)):
+        cell = cells[k]
+        tile, row, col = _placed(cell)
+        within = _is_within(row, col, 1)
+        known, total = 0, 0.0
+        for i in range(-1, 2):
+            for j in range(-1, 2):
+                other = cell + i * TILE_CELLS + j if within else _cell_at(tile, row + i, col + j, neighbours)
+                if other >= 0 and abs(ground[other] - ground[cell]) <= _KERB_M + _NOISE_M:
+                    known += 1
+                    total += ground[other]
+        out[k] = total / known
 
 
 def tiles_around(tiles: Sequence[TileIndex]) -> I32:
