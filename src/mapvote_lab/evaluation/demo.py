@@ -8,6 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 from mapvote.config import Settings
+from mapvote.core.heap import give_back_free_pages
 from mapvote.core.point_map import PointMap, all_points
 from mapvote.core.types import MapvoteError
 from mapvote.formats import write_map
@@ -60,6 +61,7 @@ def demo(
         for compiled in compiling:
             compiled.result()
     evaluation = evaluate(scene, cases, progress=progress)
+    give_back_free_pages()
     if progress:
         progress("server and pictures", 0, 1)
     write_map(evaluation.first_map, out / "map_before")

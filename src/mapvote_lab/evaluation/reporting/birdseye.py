@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from mapvote import plots as style
-from mapvote.core.types import F32, F64, I64
+from mapvote.core.types import F32, F64, I64, U8
 
 WIDTH, HEIGHT = 1400, 800
 
@@ -56,8 +56,10 @@ def shades(height: F64) -> F32:
     return colours.astype(np.float32)
 
 
-def render(points: F64, colours: F32, camera: Camera, size_m: float = 0.2) -> F32:
-    """(HEIGHT, WIDTH, 3) image of points (n, 3) in their ``colours`` (n, 3), each drawn as a square of ``size_m``."""
+def render(points: F64, colours: F32, camera: Camera, size_m: float = 0.2) -> U8:
+    """(HEIGHT, WIDTH, 4) opaque image of points (n, 3) in their ``colours`` (n, 3), each a square of ``size_m``.
+
+    Bytes with a fourth channel: matplotlib resamples them as float32, an image without one as float64."""
     image = np.ones((HEIGHT, WIDTH, 3), dtype=np.float32)
     depth_image = np.full((HEIGHT, WIDTH), np.inf, dtype=np.float32)
     pixels, depth = camera.project(points)
@@ -79,7 +81,10 @@ def render(points: F64, colours: F32, camera: Camera, size_m: float = 0.2) -> F3
                 xi, yi, who = xi[nearer], yi[nearer], who[nearer]
                 image[yi, xi] = colours[who]
                 depth_image[yi, xi] = depth[who]
-    return image * _eye_dome(depth_image)[..., None]
+    image *= _eye_dome(depth_image)[..., None]
+    opaque = np.full((HEIGHT, WIDTH, 4), 255, dtype=np.uint8)
+    opaque[..., :3] = np.rint(255.0 * image)
+    return opaque
 
 
 def _eye_dome(depth: F32, radius: int = 2, strength: float = 2.2) -> F32:
