@@ -8,8 +8,8 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 from mapvote.config import Settings
-from mapvote.core.heap import give_back_free_pages
 from mapvote.core.point_map import PointMap, all_points
+from mapvote.core.process_memory import give_back_free_pages
 from mapvote.core.types import MapvoteError
 from mapvote.formats import write_map
 from mapvote.formats.atomic import whole_file
