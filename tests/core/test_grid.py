@@ -14,7 +14,7 @@ grids = st.builds(Grid, st.just(Lattice(0.9, -1.2)), small, small, sizes, sizes)
 
 
 def test_the_paper_street_has_514_900_cells() -> None:
-    """570 m x 81.3 m at 0.3 m (docs/decisions/paper.md)."""
+    """570 m x 81.3 m at 0.3 m (docs/method.md)."""
     assert round(570.0 / CELL_SIZE) * round(81.3 / CELL_SIZE) == 514_900
 
 

@@ -15,7 +15,7 @@ from mapvote.core.kernel import inlined, kernel
 from mapvote.core.types import F32, F64, I32, I64, U64, Bool, read_only
 
 GROUND_MARGIN_M = 0.3
-"""Points lower than this above the ground are ground: they never make a cell occupied (docs/decisions/paper.md)."""
+"""Points lower than this above the ground are ground: they never make a cell occupied (docs/method.md)."""
 TOP_BIT = 63
 
 

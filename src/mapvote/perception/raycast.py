@@ -107,7 +107,7 @@ def cast_rays(
 
     ``points_map`` (n, 3) and ``origin_map`` (3,) map metres; ``obstacle`` (n,) as :func:`find_obstacles` gives it
     (which also gives ``cell``, if it is not to be computed again). Points of ``moving`` objects occlude but do not
-    occupy (docs/decisions/paper.md); the rays of ground points prove emptiness above the ground. Without ``with_sight``
+    occupy (docs/method.md); the rays of ground points prove emptiness above the ground. Without ``with_sight``
     the view has none: rays are followed to their ends only. ``sky``: which rays went into the
     sky (perception/free_rays.py); they are followed, too.
     """

@@ -52,7 +52,7 @@ class Scores(msgspec.Struct, frozen=True):
     recall: ByClass
     f1: ByClass
     macro_f1: float
-    """Unweighted mean of the three F1: what Table IV holds (docs/decisions/paper.md)."""
+    """Unweighted mean of the three F1: what Table IV holds (docs/method.md)."""
     kim_f1: float
     """Harmonic mean of mean precision and mean recall, as Kim et al. [15] report it."""
 

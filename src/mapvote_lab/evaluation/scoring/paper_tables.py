@@ -21,5 +21,5 @@ RECALL: dict[str, tuple[float, float, float]] = {
 }
 """Table III."""
 F1 = {"1": 0.830, "2": 0.829, "3": 0.811, "4": 0.807, "5": 0.850}
-"""Table IV: the unweighted mean of the three classes' F1 (docs/decisions/paper.md)."""
+"""Table IV: the unweighted mean of the three classes' F1 (docs/method.md)."""
 SCORES = {case: Scores.of(ByClass(*PRECISION[case]), ByClass(*RECALL[case])) for case in PRECISION}
