@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -12,7 +13,7 @@ import pytest
 from client.test_map_client import take_down_a_wall
 from hand_made import make_map, make_tile, wall
 from live_server import serving
-from mapvote.client import MapClient, Unreachable
+from mapvote.client import Manifest, MapClient, Unreachable
 from mapvote.config import FuseSettings
 from mapvote.live.road_map import RoadMap
 from mapvote.server.store.policy import Policy
@@ -92,3 +93,23 @@ def test_without_a_network_the_vehicle_drives_on_what_it_has_and_polls_until_it_
     away.close()
     with pytest.raises(Unreachable):
         road_map(url, tmp_path / "another")
+
+
+def test_closed_in_the_middle_of_a_request_it_lets_that_end(
+    store: Store, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    asked = threading.Semaphore(0)
+
+    class Slow(MapClient):
+        def manifest(self) -> Manifest:
+            asked.release()
+            time.sleep(0.3)
+            return super().manifest()
+
+    with serving(tmp_path / "s.db", log=tmp_path / "log") as (url, _):
+        road = RoadMap(lambda: Slow(url, home=tmp_path / "home", attempts=1, timeout_s=5.0), poll_s=0.05)
+        assert asked.acquire(timeout=5.0)  # the first, before the thread starts
+        assert asked.acquire(timeout=5.0)
+        road.close()
+        assert not road._threads[0].is_alive()
+    assert not caplog.records

@@ -95,16 +95,17 @@ class RoadMap:
             log.warning("%s. Version %d is kept here and used", error, kept.version)
             manifest, self.away = kept, str(error)
         self._coming = self._current = self._used = self._version(manifest)
-        self._threads = [threading.Thread(target=work, daemon=True) for work in (self._fetch, self._listen)]
+        works = ((self._fetch, self._fetcher), (self._listen, self._listener))
+        self._threads = [threading.Thread(target=_closing, args=work, daemon=True) for work in works]
         for thread in self._threads:
             thread.start()
 
     def close(self) -> None:
-        """Ask for nothing more."""
+        """Ask for nothing more. Waits up to 5 s for a request for tiles or the manifest; each thread closes its own
+        client, that of events at the next line from the server."""
         self._ended.set()
         self._wake.set()
-        for client in (self._listener, self._fetcher, self._reader):
-            client.close()
+        self._reader.close()
         self._threads[0].join(5.0)
 
     def current(self) -> PointMap:
@@ -171,6 +172,8 @@ class RoadMap:
             return
         for version in dict.fromkeys((self._used, self._coming)):
             for tile in version.missing(self._position, AHEAD_M):
+                if self._ended.is_set():
+                    return
                 try:
                     version.get(tile)
                 except Refused:
@@ -185,14 +188,22 @@ class RoadMap:
         while not self._ended.is_set():
             try:
                 for version in self._listener.versions():
+                    if self._ended.is_set():
+                        return
                     if not self.events or version not in (None, self._coming.point_map.version):
                         self._refresh.set()  # at the start, too: something may have come since the last question
                         self._wake.set()
                     self.events = True
-            except (MapvoteError, ValueError, KeyError, RuntimeError):  # no events, no server, or closed: it is polled
+            except (MapvoteError, ValueError, KeyError):  # no events, or no server: it is polled
                 pass
             self.events = False
             self._ended.wait(self._poll_s)
+
+
+def _closing(work: Callable[[], None], client: MapClient) -> None:
+    """``work``, then close its client: closed by another thread, a request would fail or leave its socket open."""
+    with client:
+        work()
 
 
 def _index(key: str) -> TileIndex:
