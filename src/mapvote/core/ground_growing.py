@@ -272,9 +272,9 @@ def _raise_at_kerbs(
     start: I32 | I64, heights: F32, neighbours: I32, ground: F32, gap: U8, around: F32, out: F32
 ) -> None:
     """Into ``out`` (cells,): where a cell ``around`` is up to a kerb higher, a measured cell lies at its own points
-    that are as much higher if they outnumber those at its ``ground``, and halfway if they are as many, or if a single
-    point is all that it holds and most cells around are higher: a pose error brings points of the gutter into the
-    first cell behind a kerb."""
+    that are as much higher if they outnumber those at its ``ground``, and halfway if they are as many; and at the
+    mean of the cells around if a single point is all that it holds and most of them are higher. A pose error brings
+    points of the gutter into the first cell behind a kerb."""
     for cell in range(len(ground)):
         if gap[cell] > 0:
             continue
@@ -300,7 +300,7 @@ def _raise_at_kerbs(
         if there > 0 and above > 0:
             out[cell] = raised / there if there > here else 0.5 * (z + raised / there)
         elif above >= _MOST_AROUND:
-            out[cell] = 0.5 * (z + level / above)
+            out[cell] = z + (level / above - z) * above / 8.0
 
 
 @kernel
