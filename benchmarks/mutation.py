@@ -28,7 +28,7 @@ import grimp
 
 ROOT = Path(__file__).parents[1]
 TESTS = {
-    "core/voting.py": "core/test_voting.py core/test_voting_model.py fusion/test_fuse.py",
+    "core/voting.py": "core/test_voting.py core/test_voting.py fusion/test_fuse.py",
     "fusion/fuse.py": "fusion",
     "fusion/tile_vote.py": "fusion/test_tile_vote.py fusion/test_fuse.py",
     "fusion/edit.py": "fusion/test_edit.py fusion/test_fuse.py",

@@ -68,7 +68,7 @@ NUMBER = st.one_of(st.floats(-3.0, 3.0), st.sampled_from([0.0, 1e-12, -1e-9, 1e-
 TANGENTS = st.lists(st.tuples(*[NUMBER] * 6), min_size=0, max_size=5).map(lambda xs: np.array(xs).reshape(-1, 6))
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=60, deadline=None)
 @given(TANGENTS)
 def test_of_each_of_many_motions_the_same_is_said_as_of_one(xi: F64) -> None:
     T = geometry.exps(xi)

@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 
 from hand_made import make_map, make_tile, wall
-from mapvote.core.grid import TILE_CELLS
-from mapvote.core.point_map import PointMap
-from mapvote.core.reference import LocalMap, reference_window
-from mapvote.core.types import F64, Reference
+from mapvote.config import Settings, choose_case
+from mapvote.core.grid import TILE_CELLS, Grid
+from mapvote.core.point_map import PointMap, map_from_points
+from mapvote.core.reference import LocalMap, above_ground_points, reference_window
+from mapvote.core.types import F64, MapvoteError, Reference
 
 
 @pytest.fixture(scope="module")
@@ -51,3 +52,22 @@ def test_what_was_prepared_in_vain_does_no_harm(point_map: PointMap) -> None:
         cut, _ = local.at(position)
         np.testing.assert_array_equal(cut.occupied, reference_window(point_map, cut.grid).occupied)
     assert cast(Reference, local.outer).grid == point_map.lattice.tile((0, 3)).padded(TILE_CELLS)
+
+
+def test_new_things_are_believed_only_over_ground_that_the_map_measured() -> None:
+    x, y = np.meshgrid(np.arange(0.15, 6.0, 0.3), np.arange(0.15, 6.0, 0.3))
+    road = np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)])
+    sign = np.array([[9.15, 3.15, 2.0], [9.15, 3.15, 2.3], [9.45, 3.15, 2.0]])  # nobody measured the ground under it
+    point_map = map_from_points(np.vstack([road, sign]))
+    words = above_ground_points(point_map, Grid(point_map.lattice, 0, 0, 20, 40))
+    assert (words[:, :20] == ~np.uint64(0)).all()
+    assert (words[:, 20] != 0).all(), "the cell next to measured ground counts too"
+    assert not words[:, 22:28].any()
+
+
+def test_the_paper_cases_by_number_and_ours_by_name() -> None:
+    assert choose_case(Settings(), "surfaces").voting.method == "surfaces"
+    second = choose_case(Settings(), "2").voting
+    assert (second.method, second.weighted, second.two_stage, second.skip_tall_cells) == ("paper", False, True, False)
+    with pytest.raises(MapvoteError, match="choose surfaces or one of 1, 2, 3, 4, 5"):
+        choose_case(Settings(), "6")

@@ -97,3 +97,12 @@ def test_an_edited_cloud_is_told_from_the_one_before() -> None:
     new = np.concatenate([old[5000:], old[:300] + np.float32(0.25)])
     assert np.flatnonzero(~found_among(old, new)).tolist() == list(range(5000))
     assert np.flatnonzero(~found_among(new, old)).tolist() == list(range(15_000, 15_300))
+
+
+@given(st.integers(0, 2**31), st.integers(1, 400))
+def test_downsampling_keeps_one_point_of_every_voxel(seed: int, n: int) -> None:
+    points = np.random.default_rng(seed).uniform(-3.0, 3.0, (n, 3))
+    keys = voxel_keys(points, 0.0, 0.0)
+    kept = voxel_downsample(points, 0.3)
+    assert len(set(keys[kept].tolist())) == len(kept) == len(set(keys.tolist()))
+    np.testing.assert_array_equal(voxel_downsample(points[kept], 0.3), np.arange(len(kept)))

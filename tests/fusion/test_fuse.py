@@ -18,7 +18,7 @@ from mapvote.core.types import NO_VOTE, U8, CellState
 from mapvote.core.voting import VOTE_UNIT
 from mapvote.fusion.fuse import Rule, count, fuse_tile, states_over
 from mapvote.fusion.sparse_columns import Words
-from mapvote.fusion.tile_vote import DAY_NS, TileVote, fold, newest_votes, restrict
+from mapvote.fusion.tile_vote import TileVote
 
 LATTICE = Lattice()
 GRID = LATTICE.tile((0, 0))
@@ -102,14 +102,6 @@ def standing(masks: list[int], state: int = KEPT) -> list[TileVote]:
     return [vote(f"v{i}", states_plane({CELL: state}), gone=marks(mask)) for i, mask in enumerate(masks)]
 
 
-def test_a_drive_s_remnants_are_its_vehicle_s() -> None:
-    early, late = standing([0b10, 0b100])
-    late = TileVote("v0", 5, "late", states=late.states, gone=late.gone)
-    folded = fold([late, early], GRID).gone
-    assert folded is not None
-    assert folded.words.tolist() == [0b100], "of the drive that speaks for the cell"
-
-
 def test_heights_are_relative_to_the_ground_of_the_cell() -> None:
     tile = make_tile(wall([CELL], [100.1, 100.65]), ground=100.0)
     _, edited = fuse(tile, [vote("a", states_plane({CELL: EMPTY}), gone=marks(1 << 2))])
@@ -191,48 +183,10 @@ def test_free_space_is_learned_by_enough_vehicles_and_not_where_the_map_has_poin
     assert fuse(tile, votes[:1])[1].free is not None, "unless one is all that a change takes"
 
 
-def test_a_drive_that_is_silent_never_overrides_and_the_later_one_wins() -> None:
-    early = TileVote("a", 1, "x", states=states_plane({(0, 0): EMPTY, (0, 1): EMPTY}))
-    late = TileVote("a", 2, "y", states=states_plane({(0, 1): CellState.UNCHANGED_OCCUPIED}))
-    folded = fold([late, early], GRID).states
-    assert folded is not None
-    assert folded[0, 0] == EMPTY
-    assert folded[0, 1] == CellState.UNCHANGED_OCCUPIED
-
-
 def test_ten_drives_of_one_vehicle_are_one_vote() -> None:
     drives = [TileVote("a", i, str(i), states=states_plane({CELL: EMPTY})) for i in range(10)]
     other = vote("b", states_plane({CELL: CellState.UNCHANGED_OCCUPIED}))
     assert fuse(make_tile(wall([CELL], [0.45])), [*drives, other])[0][CELL] == CellState.UNDETERMINED
-
-
-def test_planes_follow_the_drive_that_speaks_for_the_cell() -> None:
-    """An old drive's new points give way when a later drive of the same vehicle speaks for the cell."""
-    early = TileVote("a", 1, "x", states=states_plane({CELL: OCCUPIED}), new_points=wall([CELL], [0.45]))
-    late = TileVote("a", 2, "y", states=states_plane({CELL: OCCUPIED}), new_points=wall([CELL], [2.0]))
-    folded = fold([early, late], GRID)
-    assert folded.new_points is not None
-    assert folded.new_points[:, 2].tolist() == pytest.approx([2.0])
-
-
-def test_window_in_vehicles_and_days() -> None:
-    votes = [TileVote(f"v{i}", i * DAY_NS, "x", states=states_plane()) for i in range(10)]
-    votes.append(TileVote("old", -40 * DAY_NS, "x", states=states_plane()))
-    chosen = newest_votes(votes, FuseSettings(latest_vehicles=3, max_age_days=30))
-    assert [v.vehicle for v in chosen] == ["v7", "v8", "v9"]
-    assert "old" not in {v.vehicle for v in newest_votes(votes, FuseSettings(latest_vehicles=99, max_age_days=30))}
-
-
-def test_silenced_cells_count_for_nothing() -> None:
-    states, free = states_plane({CELL: EMPTY, (1, 1): EMPTY}), words_plane({CELL: 7, (1, 1): 7})
-    counts = np.ones(SHAPE, dtype=np.bool_)
-    counts[CELL] = False
-    silenced = restrict(vote("a", states, free=Words.of(free)), counts)
-    assert silenced.states is not None
-    assert silenced.free is not None
-    assert silenced.states[CELL] == NO_VOTE
-    assert silenced.free.cells.tolist() == [1 * 256 + 1]
-    assert silenced.states[1, 1] == EMPTY
 
 
 def plain_rule(votes: list[int], rule: Rule, min_votes: int) -> int:

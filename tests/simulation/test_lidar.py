@@ -45,8 +45,8 @@ def triangle_ranges(origin: F64, directions: F64, triangles: F64) -> F64:
 
 def test_rays_meet_boxes_where_the_slab_method_says() -> None:
     rng = np.random.default_rng(0)
-    lows = np.column_stack([rng.uniform(-60, 60, (250, 2)), rng.uniform(-3, 4, 250)])
-    highs = lows + rng.uniform(0.3, 8.0, (250, 3))
+    lows = np.column_stack([rng.uniform(-60, 60, (80, 2)), rng.uniform(-3, 4, 80)])
+    highs = lows + rng.uniform(0.3, 8.0, (80, 3))
     away = (np.maximum(lows[:, :2], -highs[:, :2]).max(axis=1) > 1.0).nonzero()[0]
     boxes = [shapes.box(*np.column_stack([lows[i], highs[i]]).ravel()) for i in away]
     caster = Caster(shapes.join(boxes).astype(np.float32), np.repeat(np.arange(len(away)), 12).astype(np.int32))
@@ -57,7 +57,7 @@ def test_rays_meet_boxes_where_the_slab_method_says() -> None:
     )
     expected = each.min(axis=0)
     both = np.isfinite(expected) & np.isfinite(ranges)
-    assert both.mean() > 0.25
+    assert both.mean() > 0.1
     wrong = np.isfinite(expected) != np.isfinite(ranges)
     wrong[both] = np.abs(expected[both] - ranges[both]) > 0.01
     assert wrong.mean() < 0.001

@@ -71,6 +71,7 @@ def interrupted(folder: Path, task: str, tasks: int, wait_s: float = 0.0, stop: 
             process.communicate()
 
 
+@pytest.mark.slow
 def test_ctrl_c_ends_a_process_that_waits_beside_one_that_hears_nothing(tmp_path: Path) -> None:
     """The one that waited ended first, and the other, told twice at once, waited for a next task for ever."""
     assert interrupted(tmp_path, "deaf", 1, 0.1) == 130
