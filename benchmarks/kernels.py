@@ -1,4 +1,4 @@
-"""What every compiled kernel costs, and what plain numpy costs in its place: python benchmarks/kernels.py
+"""What every compiled kernel costs, and what plain numpy costs in its place: python benchmarks/kernels.py [ROOM.FILE]
 
 Each kernel that Python calls is recorded while a street is mapped, voted on, fused and shown, and while `evaluate
 corner` runs. Its call with the most bytes is then made again: compiled, and by NUMPY, the same work in plain numpy. A
@@ -36,7 +36,7 @@ def kernels() -> dict[str, dict[str, set[str]]]:
     found: dict[str, dict[str, set[str]]] = {}
     for source in sorted(SRC.rglob("*.py")):
         functions = [n for n in ast.walk(ast.parse(source.read_text())) if isinstance(n, ast.FunctionDef)]
-        mine = [f for f in functions if {ast.unparse(d) for d in f.decorator_list} & KINDS]
+        mine = [f for f in functions if any(d in KINDS or "njit" in d for d in map(ast.unparse, f.decorator_list))]
         if mine:
             names = {f.name for f in mine}
             calls = {f.name: {n.id for n in ast.walk(f) if isinstance(n, ast.Name) and n.id in names} for f in mine}
@@ -229,6 +229,9 @@ def works(folder: Path) -> list[Callable[[], object]]:
     from mapvote import warmup
     from mapvote.__main__ import main
     from mapvote.config import Settings
+    from mapvote.fusion.change_time import lately_changed
+    from mapvote.fusion.fuse import count
+    from mapvote.fusion.tile_vote import TileVote
     from mapvote.localisation.global_search import GlobalSearch
     from mapvote.server.views.point_lod import make_levels
 
@@ -238,14 +241,22 @@ def works(folder: Path) -> list[Callable[[], object]]:
     )
     tile = next(iter(point_map.tiles.values()))
 
+    def turns() -> None:
+        """Five say that a wall stands, three who come later that it is gone."""
+        says = [np.full((256, 256), 0 if i < 5 else 3, np.uint8) for i in range(8)]
+        drives = [TileVote(f"v{i}", i, f"{i}", states=states) for i, states in enumerate(says)]
+        lately_changed(says[0], drives, count(drives, "columns", 2)[1], 2)
+
     def evaluate() -> None:
-        sys.argv = ["mapvote", "evaluate", "corner", "--seed", "2", "--case", "all", "--cache", str(folder)]
+        words = ["evaluate", "corner", "--seed", "2", "--case", "1,2,3,4,5,surfaces,evidence", "--readings"]
+        sys.argv = ["mapvote", *words, "--cache", str(folder)]
         with contextlib.suppress(SystemExit):
             main()
 
     return [
         lambda: list(warmup.warm_up()),
         lambda: make_levels(tile.points, tile.ground_z),
+        turns,
         lambda: GlobalSearch(point_map, Settings().ndt, 0.02).find(drive.read_scan(0)),
         evaluate,
     ]
@@ -253,10 +264,11 @@ def works(folder: Path) -> list[Callable[[], object]]:
 
 def main() -> None:
     os.environ["OMP_NUM_THREADS"] = "1"
-    every = kernels()
+    asked = sys.argv[1:]
+    every = {m: mine for m, mine in kernels().items() if not asked or any(part in m for part in asked)}
     for module in every:
         importlib.import_module(module)
-    print("| File | Kernels | numpy: ms, compiled, times | loop: ms, compiled, times |\n|---|---|---|---|", flush=True)
+    print("| File | Kernels | numpy, compiled, times | loop, compiled, times |\n|---|---|---|---|", flush=True)
     with tempfile.TemporaryDirectory() as name:
         from mapvote.warmup import warm_up
 

@@ -28,11 +28,15 @@ import grimp
 
 ROOT = Path(__file__).parents[1]
 TESTS = {
-    "core/voting.py": "core/test_voting.py core/test_voting.py fusion/test_fuse.py",
+    "core/voting.py": "core/test_voting.py fusion/test_fuse.py",
     "fusion/fuse.py": "fusion",
     "fusion/tile_vote.py": "fusion/test_tile_vote.py fusion/test_fuse.py",
     "fusion/edit.py": "fusion/test_edit.py fusion/test_fuse.py",
     "fusion/persistence.py": "fusion/test_persistence.py",
+    "fusion/distrust.py": "fusion/test_distrust.py",
+    "fusion/loss_budget.py": "fusion/test_loss_budget.py",
+    "fusion/neighbour_noise.py": "fusion/test_neighbour_noise.py",
+    "fusion/change_time.py": "fusion/test_change_time.py",
     "detection/paper.py": "detection/test_paper.py",
     "detection/evidence.py": "detection",
     "detection/surface_rules.py": "detection",

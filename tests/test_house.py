@@ -13,6 +13,7 @@ from pathlib import Path
 ROOT = Path(__file__).parents[1]
 SRC = ROOT / "src"
 SOURCES = sorted(SRC.rglob("*.py"))
+COSTS = ROOT / "docs/measurements/kernels.md"
 Function = ast.FunctionDef | ast.AsyncFunctionDef
 
 KERNELS = {"kernel", "allocating", "inlined"}
@@ -137,6 +138,14 @@ def test_every_function_but_kernels_and_verbs_has_at_most_eight_arguments() -> N
 def test_kernels_are_few() -> None:
     found = [f"{s.relative_to(ROOT)}: {f.name}" for s in SOURCES for f in functions(s) if is_kernel(f)]
     assert len(found) <= MOST_KERNELS, found
+
+
+def test_every_kernel_has_a_line_that_says_what_numpy_costs_in_its_place() -> None:
+    """docs/measurements/kernels.md, a row for each file; benchmarks/kernels.py prints it."""
+    rows = [line.split("|") for line in COSTS.read_text().splitlines() if line.startswith("| ") and ".py" in line]
+    told = {(row[1].strip(), name) for row in rows for name in row[2].replace("`", "").split()}
+    rooms = {s: "/".join(s.relative_to(SRC).parts[1:]) for s in SOURCES}
+    assert told == {(room, f.name) for source, room in rooms.items() for f in functions(source) if is_kernel(f)}
 
 
 def test_few_names_mean_two_things() -> None:
