@@ -94,14 +94,14 @@ def changes(tree: ast.Module) -> Iterator[tuple[ast.AST, str, object]]:
 
 
 def mutant(source: str, place: int) -> tuple[str, str]:
-    """(changed source, what was changed) of one place."""
+    """(changed source, what was changed) of one place: the expression, of a constant or a name that around it."""
     tree = ast.parse(source)
     node, attribute, value = list(changes(tree))[place]
-    before = ast.parse(source)
+    around = {id(inner): outer for outer in ast.walk(tree) for inner in ast.iter_child_nodes(outer)}
+    shown = around[id(node)] if isinstance(node, ast.Constant | ast.Name) else node
+    before = ast.unparse(shown)
     setattr(node, attribute, value)
-    text, old = ast.unparse(tree), ast.unparse(before)
-    told = next((a, b) for a, b in zip(old.splitlines(), text.splitlines(), strict=False) if a != b)
-    return text + "\n", f"{told[0].strip()} -> {told[1].strip()}"
+    return ast.unparse(tree) + "\n", f"{before} -> {ast.unparse(shown)}"
 
 
 def run(house: Path, tests: str, cache: Path, limit_s: float) -> str:
