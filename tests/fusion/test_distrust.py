@@ -14,7 +14,7 @@ from mapvote.config import FuseSettings
 from mapvote.core.grid import Lattice
 from mapvote.core.tile import Tile
 from mapvote.core.types import NO_VOTE, U8, CellState
-from mapvote.fusion.distrust import Copy, borne_out, denying, difference, liars_among, masks_of, originals
+from mapvote.fusion.distrust import Copy, borne_out, contradicts, denying, difference, liars_among, masks_of, originals
 from mapvote.fusion.fuse import count, decide_tile, fuse_tile, hear, unspent
 from mapvote.fusion.tile_vote import TileVote, restrict
 
@@ -80,6 +80,27 @@ def test_a_few_cells_say_nothing_about_a_vehicle() -> None:
 
     planes = [honest(1), honest(2), only(OPPOSITE[honest(3)])]
     assert silenced(named(planes)) == set()
+
+
+@pytest.mark.parametrize(
+    ("asked", "agreed", "opposed", "named_so"),
+    [
+        (200, 101, 101, True),
+        (200, 100, 100, False),  # half is no majority
+        (64, 64, 33, True),
+        (64, 64, 32, False),  # no more than half of what they agree on
+        (64, 63, 63, False),  # too few
+    ],
+)
+def test_who_opposes_most_of_what_a_majority_agrees_on_contradicts(
+    asked: int, agreed: int, opposed: int, named_so: bool
+) -> None:
+    """By the bits of others_say: asked 1, agreed 2, opposed 4."""
+    said = np.zeros((asked, 8), dtype=np.uint8)
+    said[:, UO] = 1
+    said[:agreed, UO] = 3
+    said[:opposed, UO] = 7
+    assert contradicts(np.full(asked, UO, dtype=np.uint8), said, 0.5) == named_so
 
 
 @settings(max_examples=10, deadline=None)
