@@ -271,9 +271,9 @@ def test_what_somebody_adds_to_a_copy_is_not_heard() -> None:
 
 
 def test_of_copies_the_one_is_heard_that_opposes_others_least_not_the_one_that_says_most() -> None:
-    """A row of cells that the original could not determine is too thin for the masks to differ."""
+    """A hole that is a row wider is too little for the masks to differ."""
     fewer, more = drive_along(1), drive_along(1)
-    fewer[100, 60:200], more[100, 60:200] = UN, CO
+    fewer[99:101, 60:200], more[99, 60:200], more[100, 60:200] = UN, UN, CO
     votes = by_name({"copy": more, "honest": fewer, "other": drive_along(2), "third": drive_along(3)})
     assert copied(votes) == {"copy": "honest"}
 
