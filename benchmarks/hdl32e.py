@@ -18,6 +18,7 @@ import numpy as np
 from mapvote.core.sensors import SENSORS
 from mapvote.core.types import F64, I64, Scan
 from mapvote.formats import open_drive
+from mapvote.formats.maps.pcd import read_pcd_table
 
 _BANDS_M = ((2, 5), (5, 10), (10, 20), (20, 40), (40, 70))
 _SAME_M = 0.3
@@ -60,19 +61,11 @@ def by_beam(scan: Scan) -> Beams:
 
 
 def real_scan(file: Path) -> Scan:
-    """A binary PCD scan. The recorder padded its files: what follows the points that the header counts is left out."""
-    head, body = file.read_bytes().split(b"DATA binary\n", 1)
-    about = {line.split()[0]: line.split()[1:] for line in head.decode().splitlines() if not line.startswith("#")}
-    fields = zip(about["FIELDS"], about["TYPE"], about["SIZE"], about["COUNT"], strict=True)
-    kinds = [
-        (f"{name}{k}", {"F": "f", "U": "u", "I": "i"}[kind] + size, (int(count),))
-        for k, (name, kind, size, count) in enumerate(fields)
-    ]
-    table = np.frombuffer(body, np.dtype(kinds), int(about["POINTS"][0]))
-    columns = {name: table[kind[0]][:, 0] for name, kind in zip(about["FIELDS"], kinds, strict=True)}
-    points = np.column_stack([columns[axis] for axis in "xyz"]).astype(np.float32)
+    """A PCD scan, without what the sensor says of its own mount (returns nearer than 1 m)."""
+    table, _ = read_pcd_table(file)
+    points = np.column_stack([table[axis] for axis in "xyz"]).astype(np.float32)
     near = np.isfinite(points).all(axis=1) & (np.linalg.norm(points, axis=1) > 1.0)
-    return Scan(0, points[near], intensity=columns["intensity"][near].astype(np.float32) / np.float32(255.0))
+    return Scan(0, points[near], intensity=table["intensity"][near].astype(np.float32) / np.float32(255.0))
 
 
 def measures(scans: list[Scan]) -> dict[str, str]:
@@ -143,16 +136,22 @@ def _mixed(beams: list[Beams]) -> float:
     return mixed / max(edges, 1)
 
 
+def _spread(n: int, wanted: int) -> I64:
+    """At most ``wanted`` of n, evenly."""
+    return np.linspace(0, n - 1, min(wanted, n)).astype(np.int64)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("real", type=Path)
     parser.add_argument("simulated", type=Path)
-    parser.add_argument("--scans", type=int, default=10)
+    parser.add_argument("--scans", type=int, default=33)
     said = parser.parse_args()
     files = sorted(said.real.glob("*.pcd"))
     drive = open_drive(said.simulated, prior="none")
-    chosen = np.linspace(0, len(drive) - 1, min(said.scans, len(drive))).astype(int)
-    real, simulated = [real_scan(f) for f in files[: said.scans]], [drive.read_scan(int(i)) for i in chosen]
+    real = [real_scan(files[i]) for i in _spread(len(files), said.scans)]
+    simulated = [drive.read_scan(int(i)) for i in _spread(len(drive), said.scans)]
+    print(f"{len(real)} real scans, {len(simulated)} simulated ones")
     columns = [measures(real), measures(simulated)]
     print("| | real | simulated |\n|---|---|---|")
     for name, value in columns[0].items():

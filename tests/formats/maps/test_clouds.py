@@ -38,7 +38,8 @@ def by_row(p: NDArray[np.floating]) -> NDArray[np.floating]:
 
 @pytest.mark.parametrize("encoding", ENCODINGS)
 def test_a_pcd_longer_than_its_header_says_is_refused_and_blank_lines_are_not(tmp_path: Path, encoding: str) -> None:
-    for more, whole in ((b"1 2 3\n" * 2 if encoding == "ascii" else bytes(24), False), (b"\n\n", True)):
+    two = b"1 2 3\n" * 2 if encoding == "ascii" else b"\1" * 24
+    for more, whole in ((two, False), (b"\n\n", True)):
         write_pcd(tmp_path / "a.pcd", Cloud(points()), encoding=encoding)
         with (tmp_path / "a.pcd").open("ab") as file:
             file.write(more)
@@ -48,6 +49,19 @@ def test_a_pcd_longer_than_its_header_says_is_refused_and_blank_lines_are_not(tm
             else:
                 with pytest.raises(MapvoteError, match="its header says 500 points, but data for 2 more follow"):
                     read(tmp_path / "a.pcd")
+
+
+def test_padding_between_fields_and_the_zeros_that_old_pcl_lets_follow_are_no_points(tmp_path: Path) -> None:
+    kinds = [("xyz", "<f4", 3), ("_1", "u1", 4), ("intensity", "<f4"), ("ring", "<u2"), ("_2", "u1", 10)]
+    table = np.ones(40, dtype=kinds)
+    table["xyz"] = points(40)
+    head = (
+        b"VERSION 0.7\nFIELDS x y z _ intensity ring _\nSIZE 4 4 4 1 4 2 1\nTYPE F F F U F U U\nCOUNT 1 1 1 4 1 1 10\n"
+        b"WIDTH 40\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS 40\nDATA binary\n"
+    )
+    (tmp_path / "a.pcd").write_bytes(head + table.tobytes() + bytes(4096 - len(head)))
+    assert np.array_equal(read_cloud(tmp_path / "a.pcd")[0], table["xyz"])
+    assert len(read_pcd_table(tmp_path / "a.pcd")[0]) == 40
 
 
 def test_autoware_tiles_that_nobody_lists_are_said_aloud_but_those_kept_for_a_running_stack(

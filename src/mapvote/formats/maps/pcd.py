@@ -30,6 +30,8 @@ from mapvote.formats.maps.cloud import (
 
 _BLOCK = 500_000
 """Points read at a time."""
+_PAGE = 4096
+"""Bytes that PCL up to 1.7 reserved for the header: what the header leaves of them follows the points, as zeros."""
 NO_FIELDS: Mapping[str, NDArray[Any]] = MappingProxyType({})
 ENCODINGS = tuple(e.value for e in (Encoding.ASCII, Encoding.BINARY, Encoding.BINARY_COMPRESSED))
 
@@ -128,7 +130,8 @@ def _blocks(file: BinaryIO, about: MetaData) -> Iterator[NDArray[np.void]]:
 
 
 def _rest(file: BinaryIO, about: MetaData, *, skip: bool = False) -> int:
-    """Bytes left of a file (of text, as many as its lines would be); ``skip``: beyond the points that follow."""
+    """Bytes left of a file (of text, as many as its lines would be), a page of zeros at most not counted; ``skip``:
+    beyond the points that follow."""
     if about.data == Encoding.ASCII:
         lines = (line for line in file if line.strip())
         return about.build_dtype().itemsize * sum(1 for _ in islice(lines, about.points if skip else 0, None))
@@ -137,7 +140,11 @@ def _rest(file: BinaryIO, about: MetaData, *, skip: bool = False) -> int:
     elif skip:
         file.seek(struct.unpack("<I", file.read(8)[:4].ljust(4, b"\0"))[0], os.SEEK_CUR)
     start = file.tell()
-    return max(0, file.seek(0, os.SEEK_END) - start)
+    left = max(0, file.seek(0, os.SEEK_END) - start)
+    if left > _PAGE:
+        return left
+    file.seek(start)
+    return len(file.read().rstrip(b"\0"))
 
 
 def write_pcd(path: Path, cloud: Cloud | CloudPieces, *, encoding: str = "binary", double: bool = False) -> None:

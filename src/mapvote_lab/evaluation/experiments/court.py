@@ -1,14 +1,18 @@
 """A real court that changed: one reference cloud, three later sessions, three changes that all of them agree on.
 
 There are no scans: they are cast from each session's cloud along a way through the court, as a sensor of 32 beams would
-have taken them. Cast rays pass between the points of porous crowns, which real ones would not. So only the boxes of the
-agreed changes are known; any other decided object is held against what some session's cloud shows by geometry alone.
+have taken them. A cloud does not know its rays, so a cast ray may cross what the session never measured: places that it
+did not reach, crowns that it saw from below or between whose points there is room. A ray is kept only where the cloud
+vouches for all of its way (:func:`_steepest`, :func:`_nearest_beside`). Only the boxes of the agreed changes are known;
+any other decided object is compared with what some session's cloud shows by geometry alone.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import reduce
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -16,13 +20,13 @@ from scipy import ndimage
 from scipy.spatial import KDTree
 
 from mapvote.codec.ballot import Ballot
-from mapvote.comparison.cloud_changes import CloudChange, Kind
+from mapvote.comparison.cloud_changes import BAND_TOP_M, REACH_CELLS, CloudChange, Kind, planes_of
 from mapvote.comparison.session_votes import vote_of_session
 from mapvote.config import Settings
 from mapvote.core.grid import CELL_SIZE, Grid
 from mapvote.core.point_map import PointMap, all_points
 from mapvote.core.sensors import SENSORS
-from mapvote.core.types import F64, U8, CellState, Drive, MapvoteError, Scan
+from mapvote.core.types import F32, F64, I64, U8, CellState, Drive, MapvoteError, Scan
 from mapvote.formats import read_map
 from mapvote.fusion.fuse import states_over
 from mapvote.fusion.offline import update_map
@@ -41,6 +45,11 @@ _WAY = ((2, 44), (2, 20), (2, 2), (10, -6), (14, -22), (22, -20), (20, 0), (18, 
 _STEP_M, _SENSOR_M = 1.6, 1.9
 _SPACING_M = 0.18
 """Each point of a cloud is a disc so wide."""
+_BESIDE_M, _SAME_THING_M = 0.3, 0.5
+"""A ray passes a thing if one of its points is so near, a voxel, and the ray ends farther than _SAME_THING_M behind."""
+_COLUMNS = 1125
+_COLUMN_RAD = 2.0 * np.pi / _COLUMNS
+_STRIDE_M, _FAR_RANGE_M = 0.3, 70.0
 _MARGIN_M = 1.0
 _FAR_M = 0.6
 FALSE_M2 = 2.0
@@ -111,7 +120,9 @@ def evaluate_court(court: Court, settings: Settings, cases: Sequence[Case], tell
 
 def cast_drive(name: str, cloud: PointMap) -> Drive:
     """Scans of an HDL-32E along the way, cast from a session's cloud, wherever it knows the ground."""
-    points, sensor = all_points(cloud), SENSORS["hdl32e"]
+    points, standing, sensor = all_points(cloud), _standing(cloud), SENSORS["hdl32e"]
+    window = reduce(Grid.union, (cloud.lattice.tile(tile) for tile in cloud.tiles))
+    ceiling_z = _ceiling(cloud, window)
     corners = np.array(_WAY, dtype=np.float64)
     along = np.append(0.0, np.cumsum(np.hypot(*np.diff(corners, axis=0).T)))
     at = np.arange(0.0, along[-1], _STEP_M)
@@ -126,7 +137,9 @@ def cast_drive(name: str, cloud: PointMap) -> Drive:
         T = np.eye(4)
         T[:2, :2] = [[c, -s], [s, c]]
         T[:3, 3] = *place, np.percentile(ground, 10) + _SENSOR_M
-        taken = _cast((points - T[:3, 3]) @ T[:3, :3], sensor.elevations_deg)
+        beside = _nearest_beside((standing - T[:3, 3]) @ T[:3, :3], sensor.elevations_deg)
+        steepest = _steepest(T, window, ceiling_z)
+        taken = _cast((points - T[:3, 3]) @ T[:3, :3], sensor.elevations_deg, beside, steepest)
         if len(taken) > 2000:
             poses.append(T)
             scans.append(Scan(_ENDED_NS + 100_000_000 * k, taken))
@@ -136,10 +149,57 @@ def cast_drive(name: str, cloud: PointMap) -> Drive:
     )  # fmt: skip
 
 
-def _cast(points: F64, elevations_deg: Sequence[float]) -> np.ndarray:
-    """(m, 3) the nearest disc that each ray of a revolution meets, of points (n, 3) about the sensor."""
+def _ceiling(cloud: PointMap, window: Grid) -> F64:
+    """(rows, cols) z up to which the absence of points says that nothing is there: the top of BAND above the ground,
+    as for `mapvote diff`; -inf farther than two cells from all that the session measured."""
+    planes = planes_of(cloud, window)
+    surveyed = ndimage.maximum_filter(planes.own_ground | planes.stands, 2 * REACH_CELLS + 1, mode="constant")
+    return np.where(surveyed & np.isfinite(planes.ground_z), planes.ground_z + BAND_TOP_M, -np.inf)
+
+
+def _steepest(T: F64, window: Grid, ceiling_z: F64) -> F64:
+    """(columns, steps) of each column of the range image, at each _STRIDE_M from pose T: the slope of the steepest ray
+    that has stayed below ``ceiling_z`` until there; -inf beyond a place that the session did not measure."""
+    azimuth = (np.arange(_COLUMNS) + 0.5) * _COLUMN_RAD - np.pi
+    reach = _STRIDE_M * np.arange(1, int(_FAR_RANGE_M / _STRIDE_M) + 1)
+    ahead = np.column_stack([np.cos(azimuth), np.sin(azimuth)]) @ T[:2, :2].T
+    places = T[:2, 3] + ahead[:, None, :] * reach[None, :, None]
+    rows, cols, inside = window.indices_of(places.reshape(-1, 2))
+    ceiling = np.full(len(rows), -np.inf)
+    ceiling[inside] = ceiling_z[rows[inside], cols[inside]]
+    slope = (ceiling.reshape(len(azimuth), -1) - T[2, 3]) / reach
+    return np.asarray(np.minimum.accumulate(slope, axis=1))
+
+
+def _nearest_beside(standing: F64, elevations_deg: Sequence[float]) -> F64:
+    """(beams, columns) range of the nearest of the ``standing`` points (n, 3), about the sensor, that a ray passes
+    within _BESIDE_M: the ray may have gone through the thing, between two of its points."""
+    reach = np.linalg.norm(standing, axis=1)
+    beams = np.sort(np.radians(elevations_deg))
+    gap = float(np.median(np.diff(beams)))
+    elevation = np.arcsin(standing[:, 2] / np.maximum(reach, 0.1))
+    ring = np.round(np.interp(elevation, beams, np.arange(len(beams)))).astype(np.int64)
+    near = (reach > 1.5) & (reach < _FAR_RANGE_M)
+    near &= np.abs(elevation - beams[ring]) < np.maximum(gap, _BESIDE_M / np.maximum(reach, 0.1))
+    out = np.full((len(beams), _COLUMNS), np.inf)
+    for low, high in pairwise((1.5, 3.0, 6.0, 12.0, 24.0, _FAR_RANGE_M)):
+        some = near & (reach >= low) & (reach < high)
+        image = np.full_like(out, np.inf)
+        np.minimum.at(image, (ring[some], _column(standing[some])), reach[some])
+        wide = [2 * int(np.ceil(_BESIDE_M / (low * step) - 0.5)) + 1 for step in (gap, _COLUMN_RAD)]
+        out = np.minimum(out, ndimage.minimum_filter(image, wide, mode=("nearest", "wrap")))
+    return out
+
+
+def _column(points: F64) -> I64:
+    return np.floor((np.arctan2(points[:, 1], points[:, 0]) + np.pi) / _COLUMN_RAD).astype(np.int64) % _COLUMNS
+
+
+def _cast(points: F64, elevations_deg: Sequence[float], beside: F64, steepest: F64) -> F32:
+    """(m, 3) the nearest disc that each ray of a revolution meets, of points (n, 3) about the sensor; without the rays
+    that pass something ``beside`` them or rise above ``steepest``."""
     reach = np.linalg.norm(points, axis=1)
-    near = (reach > 1.5) & (reach < 70.0)
+    near = (reach > 1.5) & (reach < _FAR_RANGE_M)
     points, reach = points[near], reach[near]
     beams = np.sort(np.radians(elevations_deg))
     elevation = np.arcsin(points[:, 2] / reach)
@@ -147,18 +207,18 @@ def _cast(points: F64, elevations_deg: Sequence[float]) -> np.ndarray:
     ring = np.clip(np.round(np.interp(elevation, beams, np.arange(len(beams)))).astype(np.int64), 0, len(beams) - 1)
     hit = np.abs(elevation - beams[ring]) < np.maximum(half, 0.0015)
     ring, reach, half, points = ring[hit], reach[hit], half[hit], points[hit]
-    step = np.radians(0.32)
-    cols = round(2 * np.pi / step)
-    col = np.floor((np.arctan2(points[:, 1], points[:, 0]) + np.pi) / step).astype(np.int64)
-    image = np.full((len(beams), cols), np.inf)
-    wide = np.minimum((half / step).astype(np.int64), 12)
+    col = _column(points)
+    image = np.full((len(beams), _COLUMNS), np.inf)
+    wide = np.minimum((half / _COLUMN_RAD).astype(np.int64), 12)
     for j in range(-int(wide.max(initial=0)), int(wide.max(initial=0)) + 1):
         mine = np.abs(j) <= wide
-        np.minimum.at(image, (ring[mine], (col[mine] + j) % cols), reach[mine])
-    r, c = np.nonzero(np.isfinite(image))
-    azimuth, distance = (c + 0.5) * step - np.pi, image[r, c]
+        np.minimum.at(image, (ring[mine], (col[mine] + j) % _COLUMNS), reach[mine])
+    r, c = np.nonzero(np.isfinite(image) & (image < beside + _SAME_THING_M))
+    azimuth, distance = (c + 0.5) * _COLUMN_RAD - np.pi, image[r, c]
     flat = distance * np.cos(beams[r])
-    taken = np.column_stack([flat * np.cos(azimuth), flat * np.sin(azimuth), distance * np.sin(beams[r])])
+    last = np.clip((flat / _STRIDE_M).astype(np.int64) - 1, 0, steepest.shape[1] - 1)
+    known = np.tan(beams[r]) <= steepest[c, last]
+    taken = np.column_stack([flat * np.cos(azimuth), flat * np.sin(azimuth), distance * np.sin(beams[r])])[known]
     return np.asarray(taken + np.random.default_rng(0).normal(0.0, 0.01, taken.shape), dtype=np.float32)
 
 
