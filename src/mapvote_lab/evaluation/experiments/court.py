@@ -1,10 +1,11 @@
 """A real court that changed: one reference cloud, three later sessions, three changes that all of them agree on.
 
 There are no scans: they are cast from each session's cloud along a way through the court, as a sensor of 32 beams would
-have taken them. A cloud does not know its rays, so a cast ray may cross what the session never measured: places that it
-did not reach, crowns that it saw from below or between whose points there is room. A ray is kept only where the cloud
-vouches for all of its way (:func:`_steepest`, :func:`_nearest_beside`). Only the boxes of the agreed changes are known;
-any other decided object is compared with what some session's cloud shows by geometry alone.
+have taken them. A cloud does not know its rays, so a cast ray may cross what the session never measured: a place that
+it did not reach, or a crown between whose points there is room. A ray is kept only where the session surveyed all cells
+on its way (:func:`_measured_as_far`) and where it passes nothing that stands (:func:`_nearest_beside`). Only the boxes
+of the agreed changes are known; any other decided object is compared with what some session's cloud shows by geometry
+alone.
 """
 
 from __future__ import annotations
@@ -20,13 +21,13 @@ from scipy import ndimage
 from scipy.spatial import KDTree
 
 from mapvote.codec.ballot import Ballot
-from mapvote.comparison.cloud_changes import BAND_TOP_M, REACH_CELLS, CloudChange, Kind, planes_of
+from mapvote.comparison.cloud_changes import REACH_CELLS, CloudChange, Kind, planes_of
 from mapvote.comparison.session_votes import vote_of_session
 from mapvote.config import Settings
 from mapvote.core.grid import CELL_SIZE, Grid
 from mapvote.core.point_map import PointMap, all_points
 from mapvote.core.sensors import SENSORS
-from mapvote.core.types import F32, F64, I64, U8, CellState, Drive, MapvoteError, Scan
+from mapvote.core.types import F32, F64, I64, U8, Bool, CellState, Drive, MapvoteError, Scan
 from mapvote.formats import read_map
 from mapvote.fusion.fuse import states_over
 from mapvote.fusion.offline import update_map
@@ -42,7 +43,7 @@ CHANGES: dict[str, tuple[Kind, tuple[float, float, float, float]]] = {
 """What all sessions agree on: x0, y0, x1, y1 in the reference's metres."""
 _WAY = ((2, 44), (2, 20), (2, 2), (10, -6), (14, -22), (22, -20), (20, 0), (18, 20), (12, 40))
 """Over the paved middle of the court."""
-_STEP_M, _SENSOR_M = 1.6, 1.9
+_SENSOR_M = 1.9
 _SPACING_M = 0.18
 """Each point of a cloud is a disc so wide."""
 _BESIDE_M, _SAME_THING_M = 0.3, 0.5
@@ -118,14 +119,15 @@ def evaluate_court(court: Court, settings: Settings, cases: Sequence[Case], tell
     return scores
 
 
-def cast_drive(name: str, cloud: PointMap) -> Drive:
-    """Scans of an HDL-32E along the way, cast from a session's cloud, wherever it knows the ground."""
+def cast_drive(name: str, cloud: PointMap, step_m: float = 1.6) -> Drive:
+    """Scans of an HDL-32E along the way, cast from a session's cloud, wherever it knows the ground; one every
+    ``step_m``."""
     points, standing, sensor = all_points(cloud), _standing(cloud), SENSORS["hdl32e"]
     window = reduce(Grid.union, (cloud.lattice.tile(tile) for tile in cloud.tiles))
-    ceiling_z = _ceiling(cloud, window)
+    surveyed = _surveyed(cloud, window)
     corners = np.array(_WAY, dtype=np.float64)
     along = np.append(0.0, np.cumsum(np.hypot(*np.diff(corners, axis=0).T)))
-    at = np.arange(0.0, along[-1], _STEP_M)
+    at = np.arange(0.0, along[-1], step_m)
     xy = np.column_stack([np.interp(at, along, corners[:, axis]) for axis in (0, 1)])
     poses, scans = [], []
     for k, place in enumerate(xy):
@@ -138,8 +140,8 @@ def cast_drive(name: str, cloud: PointMap) -> Drive:
         T[:2, :2] = [[c, -s], [s, c]]
         T[:3, 3] = *place, np.percentile(ground, 10) + _SENSOR_M
         beside = _nearest_beside((standing - T[:3, 3]) @ T[:3, :3], sensor.elevations_deg)
-        steepest = _steepest(T, window, ceiling_z)
-        taken = _cast((points - T[:3, 3]) @ T[:3, :3], sensor.elevations_deg, beside, steepest)
+        as_far = _measured_as_far(T, window, surveyed)
+        taken = _cast((points - T[:3, 3]) @ T[:3, :3], sensor.elevations_deg, beside, as_far)
         if len(taken) > 2000:
             poses.append(T)
             scans.append(Scan(_ENDED_NS + 100_000_000 * k, taken))
@@ -149,26 +151,23 @@ def cast_drive(name: str, cloud: PointMap) -> Drive:
     )  # fmt: skip
 
 
-def _ceiling(cloud: PointMap, window: Grid) -> F64:
-    """(rows, cols) z up to which the absence of points says that nothing is there: the top of BAND above the ground,
-    as for `mapvote diff`; -inf farther than two cells from all that the session measured."""
+def _surveyed(cloud: PointMap, window: Grid) -> Bool:
+    """(rows, cols) cells within two of one in which the session measured ground or something that stands."""
     planes = planes_of(cloud, window)
-    surveyed = ndimage.maximum_filter(planes.own_ground | planes.stands, 2 * REACH_CELLS + 1, mode="constant")
-    return np.where(surveyed & np.isfinite(planes.ground_z), planes.ground_z + BAND_TOP_M, -np.inf)
+    return np.asarray(ndimage.maximum_filter(planes.own_ground | planes.stands, 2 * REACH_CELLS + 1, mode="constant"))
 
 
-def _steepest(T: F64, window: Grid, ceiling_z: F64) -> F64:
-    """(columns, steps) of each column of the range image, at each _STRIDE_M from pose T: the slope of the steepest ray
-    that has stayed below ``ceiling_z`` until there; -inf beyond a place that the session did not measure."""
+def _measured_as_far(T: F64, window: Grid, surveyed: Bool) -> F64:
+    """(columns,) of each column of the range image from pose T: horizontal metres to the first cell that the session
+    did not survey."""
     azimuth = (np.arange(_COLUMNS) + 0.5) * _COLUMN_RAD - np.pi
     reach = _STRIDE_M * np.arange(1, int(_FAR_RANGE_M / _STRIDE_M) + 1)
     ahead = np.column_stack([np.cos(azimuth), np.sin(azimuth)]) @ T[:2, :2].T
     places = T[:2, 3] + ahead[:, None, :] * reach[None, :, None]
     rows, cols, inside = window.indices_of(places.reshape(-1, 2))
-    ceiling = np.full(len(rows), -np.inf)
-    ceiling[inside] = ceiling_z[rows[inside], cols[inside]]
-    slope = (ceiling.reshape(len(azimuth), -1) - T[2, 3]) / reach
-    return np.asarray(np.minimum.accumulate(slope, axis=1))
+    known = np.zeros(len(rows), dtype=np.bool_)
+    known[inside] = surveyed[rows[inside], cols[inside]]
+    return np.asarray(_STRIDE_M * (1 + np.logical_and.accumulate(known.reshape(_COLUMNS, -1), axis=1).sum(axis=1)))
 
 
 def _nearest_beside(standing: F64, elevations_deg: Sequence[float]) -> F64:
@@ -195,9 +194,9 @@ def _column(points: F64) -> I64:
     return np.floor((np.arctan2(points[:, 1], points[:, 0]) + np.pi) / _COLUMN_RAD).astype(np.int64) % _COLUMNS
 
 
-def _cast(points: F64, elevations_deg: Sequence[float], beside: F64, steepest: F64) -> F32:
+def _cast(points: F64, elevations_deg: Sequence[float], beside: F64, as_far: F64) -> F32:
     """(m, 3) the nearest disc that each ray of a revolution meets, of points (n, 3) about the sensor; without the rays
-    that pass something ``beside`` them or rise above ``steepest``."""
+    that pass something ``beside`` them or end farther than ``as_far``."""
     reach = np.linalg.norm(points, axis=1)
     near = (reach > 1.5) & (reach < _FAR_RANGE_M)
     points, reach = points[near], reach[near]
@@ -216,9 +215,8 @@ def _cast(points: F64, elevations_deg: Sequence[float], beside: F64, steepest: F
     r, c = np.nonzero(np.isfinite(image) & (image < beside + _SAME_THING_M))
     azimuth, distance = (c + 0.5) * _COLUMN_RAD - np.pi, image[r, c]
     flat = distance * np.cos(beams[r])
-    last = np.clip((flat / _STRIDE_M).astype(np.int64) - 1, 0, steepest.shape[1] - 1)
-    known = np.tan(beams[r]) <= steepest[c, last]
-    taken = np.column_stack([flat * np.cos(azimuth), flat * np.sin(azimuth), distance * np.sin(beams[r])])[known]
+    taken = np.column_stack([flat * np.cos(azimuth), flat * np.sin(azimuth), distance * np.sin(beams[r])])
+    taken = taken[flat <= as_far[c]]
     return np.asarray(taken + np.random.default_rng(0).normal(0.0, 0.01, taken.shape), dtype=np.float32)
 
 
