@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -9,7 +11,11 @@ from made_courts import made_court
 from mapvote.comparison.patches import parts_of
 from mapvote.comparison.register import register_clouds
 from mapvote.core.geometry import from_xyz_rpy, inverse, transform
+from mapvote.core.point_map import map_from_points
 from mapvote.core.types import F64, MapvoteError
+from mapvote.doctor.diagnosis import diagnose
+from mapvote.formats import write_pcd
+from mapvote.formats.maps.cloud import Cloud
 
 
 @pytest.fixture(scope="module")
@@ -28,7 +34,7 @@ def test_a_cloud_turned_by_any_yaw_and_moved_far_off_is_found(court: F64, yaw_de
     assert found.fit.sigma_m < 0.05
 
 
-def test_the_drifted_part_of_a_session_is_named_with_how_far_it_is_off_and_can_be_moved_back() -> None:
+def test_the_drifted_part_of_a_session_is_named_with_how_far_it_is_off_and_can_be_moved_back(tmp_path: Path) -> None:
     places = np.random.default_rng(5).uniform((-30.0, -22.0, 0.8), (31.0, 23.0, 4.0), (150, 3))
     posts = tuple((x, y, x + 0.3, y + 0.3, height) for x, y, height in places.tolist())
     straight, bent = made_court(posts, seed=2), made_court(posts, seed=3)
@@ -37,6 +43,9 @@ def test_the_drifted_part_of_a_session_is_named_with_how_far_it_is_off_and_can_b
     found = register_clouds(straight, bent)
     assert found.bent[0].name.startswith("north of y = ")
     assert found.bent[0].most_m == pytest.approx(0.8, abs=0.1)
+    write_pcd(tmp_path / "session.pcd", Cloud(bent))
+    said = [one.what for one in diagnose(tmp_path / "session.pcd", point_map=map_from_points(straight)).findings]
+    assert any(one.startswith(f"bent: {found.bent[0].name} this session is off by") for one in said)
     moved = register_clouds(straight, bent, unbend=True)
     assert moved.unbent
     off = np.abs((moved.points - made_court(posts, seed=3))[drifted, 0])

@@ -97,7 +97,10 @@ def doctor(
         str, typer.Argument(metavar="DRIVE|MAP|BALLOT|STORE", help="a drive, a map or a ballot, in any format; a store")
     ],
     map_path: Annotated[
-        Path | None, typer.Option("--map", metavar="MAP", help="also say whether the drive lies on this map")
+        Path | None,
+        typer.Option(
+            "--map", metavar="MAP", help="also say whether drive or cloud lies on this map, and where it is bent"
+        ),
     ] = None,
     png: Annotated[
         Path | None, typer.Option("--png", metavar="FILE", help="a picture of a drive's scans, as read and as mended")

@@ -12,7 +12,7 @@ import numpy as np
 from mapvote.core.point_map import PointMap
 from mapvote.core.types import F32, F64, I64, Drive, MapvoteError
 from mapvote.doctor.finding import Finding, Progress, in_order
-from mapvote.doctor.map_fit import Laid, check_on_map, in_another_unit
+from mapvote.doctor.map_fit import Laid, check_cloud_on_map, check_on_map, in_another_unit
 from mapvote.doctor.maps import check_cloud, check_map, examine_map, tile_by_tile
 from mapvote.doctor.motion import (
     Road,
@@ -184,9 +184,13 @@ def diagnose(
     point_map: PointMap | None = None,
     progress: Progress | None = None,
 ) -> Diagnosis:
-    """Everything the doctor finds at ``path``: in a map, a ballot or a drive (with a map, also if it lies on it)."""
+    """Everything the doctor finds at ``path``: in a map, a ballot or a drive; with ``point_map``, also whether a drive
+    or a map lies on it."""
     if is_map_folder(path) or any(layout.recognised(path) for layout in MAPS.values()):
-        return Diagnosis(examine_map(path)[0])
+        found, cloud = examine_map(path)
+        if point_map is not None and cloud is not None:
+            found = in_order([*found, *check_cloud_on_map(point_map, cloud)])
+        return Diagnosis(found)
     if path.is_file() and not any(layout.recognised(path) for layout in DRIVES.values()):
         return Diagnosis(check_ballot(path.read_bytes()))
     options = options or DriveOptions()

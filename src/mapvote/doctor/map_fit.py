@@ -13,10 +13,11 @@ from typing import Any
 
 import numpy as np
 
+from mapvote.comparison.register import register_clouds
 from mapvote.config import NdtSettings
 from mapvote.core.geometry import from_xyz_rpy, inverse
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Lattice
-from mapvote.core.point_map import PointMap, cut_tiles
+from mapvote.core.point_map import PointMap, all_points, cut_tiles
 from mapvote.core.sensor_height import LEVEL_M, check_heights, heights_over_ground
 from mapvote.core.tile import Tile
 from mapvote.core.types import F32, F64, Drive, MapvoteError, Scan
@@ -438,3 +439,16 @@ def _heights(point_map: PointMap, T: F64, drive: Drive) -> list[Finding]:
         mend = "if the prior's heights are sound, so much is wrong with the map's ground: build it anew from its drives"
         return [Finding("warning", f"by the prior, {height.complaint}", mend)]
     return [Finding("note", f"by the prior: {height}")]
+
+
+def check_cloud_on_map(point_map: PointMap, cloud: PointMap) -> list[Finding]:
+    """Of a map or a session's ``cloud`` against another map: where it lies there, and which part of it no rigid motion
+    lays there, as `mapvote diff` says it."""
+    try:
+        registered = register_clouds(all_points(point_map), all_points(cloud))
+    except MapvoteError as error:
+        return [Finding("error", f"against the map: {error}")]
+    place, agreement = registered.told()[:2]
+    notes = [Finding("note", f"{place}; {agreement}. A is the map, B is this")]
+    mend = "mapvote diff --unbend moves it piece by piece; mapvote vote leaves it out"
+    return [Finding("warning", f"bent: {part.told()}", mend) for part in registered.bent] + notes
