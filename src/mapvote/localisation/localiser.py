@@ -2,8 +2,7 @@
 
 A scan waits until the place of its track has been confirmed by a look taken at it or after it. So nothing has to be
 recalled once a track proves wrong: its scans since the last good look have not voted yet. Where another place fits
-better the track moves there, and what waits moves along. What a look confirms together leaves one by one, so that no
-scan has the work of ten. Memory is bounded by the scans that may wait.
+better the track moves there, and what waits moves along. Memory is bounded by the scans that may wait.
 """
 
 from __future__ import annotations
@@ -30,11 +29,9 @@ LOOKS = 3
 """In turn that must hold before the first vote."""
 WAIT_SCANS = 40
 """Scans that wait at most until their track is confirmed: what a vehicle can hold, 4 s at 10 Hz."""
-_LEAVING = 20
-"""Confirmed scans that may queue up, the longest between two looks at 10 Hz: one leaves with every scan, two while more
-than this are left."""
-_EVERY_M, _EVERY_S = 10.0, 2.0
-"""A track that holds is looked at again after this distance or time, well within the 15 m that a look covers."""
+_EVERY_M, _EVERY_S = 10.0, 0.45
+"""A track that holds is looked at again after this distance, well within the 15 m that a look covers, or this time: five
+scans at 10 Hz, however their stamps jitter. A vote is up to so much later for it."""
 _JUMPS = 4
 """How often a track may move on one scan before it counts as lost there."""
 _MEMORY = 0.1
@@ -81,8 +78,6 @@ class Localiser:
         self.misfit = np.zeros(3)
         """How far trusted fixes lately lay off their priors, map metres."""
         self._waiting: deque[_Waiting] = deque()
-        self._decided: deque[Fix] = deque()
-        """What nothing can change any more, and has not left yet."""
         self._held = 0
         """Looks in turn that held."""
         self._confirmed = False
@@ -93,8 +88,7 @@ class Localiser:
         """See :class:`Localise`."""
         if not self._has_place(scan, prior):
             self._waiting.append(_Waiting(_nowhere(scan), None))
-            self._decide(len(self._waiting), False)
-            return self._leave()
+            return self._decide(len(self._waiting), False)
         fix = self.tracker.localise(scan, None if prior is None else self._corrected(prior))
         self.map_around.prepare(fix.registration.T_map_lidar[:3, 3])
         misfit = None if prior is None else fix.registration.T_map_lidar[:3, 3] - prior.T_map_lidar[:3, 3]
@@ -102,27 +96,19 @@ class Localiser:
         if self._is_due(fix):
             self._look()
             if self._confirmed and self._held:
-                self._decide(len(self._waiting), True)
-        self._decide(max(0, len(self._waiting) - WAIT_SCANS), False)
-        return self._leave()
+                return self._decide(len(self._waiting), True)
+        return self._decide(max(0, len(self._waiting) - WAIT_SCANS), False)
 
     def flush(self) -> list[Fix]:
         """See :class:`Localise`."""
         if self._waiting and self._confirmed:
             self._look()
-        self._decide(len(self._waiting), self._confirmed)
-        left = list(self._decided)
-        self._decided.clear()
-        return left
+        return self._decide(len(self._waiting), self._confirmed)
 
     def go_on_in(self, point_map: PointMap) -> None:
         """The map is another version from here on; the track goes on."""
         self.search = self.search.in_map(point_map)
         self.map_around.go_on_in(point_map)
-
-    def _leave(self) -> list[Fix]:
-        count = min(len(self._decided), 1 if len(self._decided) <= _LEAVING else 2)
-        return [self._decided.popleft() for _ in range(count)]
 
     def _has_place(self, scan: Scan, prior: PosePrior | None) -> bool:
         """Search the whole map where there is nothing else to go by, or where the track has not held for long."""
@@ -209,14 +195,17 @@ class Localiser:
         registration = newest.fix.registration
         self.tracker.move_to(registration.T_map_lidar, newest.fix.scan.stamp_ns, twist, registration.score)
 
-    def _decide(self, count: int, confirmed: bool) -> None:
-        """The oldest ``count`` scans are decided; what they say of the prior is remembered if they are trusted."""
+    def _decide(self, count: int, confirmed: bool) -> list[Fix]:
+        """The fixes of the oldest ``count`` scans, which nothing changes any more; what they say of the prior is
+        remembered if they are trusted."""
+        decided = []
         for _ in range(count):
             waiting = self._waiting.popleft()
             fix = replace(waiting.fix, trusted=waiting.fix.trusted and confirmed)
             if fix.trusted and waiting.misfit is not None:
                 self.misfit = self.misfit + _MEMORY * (waiting.misfit - self.misfit)
-            self._decided.append(fix)
+            decided.append(fix)
+        return decided
 
 
 def _nowhere(scan: Scan) -> Fix:
