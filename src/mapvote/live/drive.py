@@ -113,7 +113,7 @@ class Counts:
     clock_jumps: int = 0
     ballots: int = 0
     latencies_s: deque[float] = field(default_factory=lambda: deque(maxlen=_LATENCIES))
-    """From stamp to vote, of the last scans."""
+    """From stamp to vote, of the last scans that voted while the drive went on: the last second votes when it ends."""
 
     def latency_quantiles_s(self, *shares: float) -> list[float]:
         """The latencies that these shares of the last scans do not exceed; empty without any."""
@@ -237,7 +237,7 @@ class LiveDrive:
             pass
         if self.vehicle is not None:
             self.vehicle.finish()
-            self._count_votes(self.vehicle)
+            self._count_votes(self.vehicle, ended=True)
             self._leave(self.vehicle.ballot)
         self.vehicle = None
         self._observed.clear()
@@ -266,7 +266,7 @@ class LiveDrive:
             pass
         if self.vehicle is not None:
             self.vehicle.finish()
-            self._count_votes(self.vehicle)
+            self._count_votes(self.vehicle, ended=True)
             self.counts.ballots += 1
             self._held.append((self.drive_id, self.vehicle.ballot, None))
             self._release()
@@ -346,8 +346,8 @@ class LiveDrive:
             return np.asarray(poses[-1][:3, 3])
         return None if prior is None else np.asarray(prior[:3, 3])
 
-    def _count_votes(self, vehicle: Vehicle) -> None:
-        """Latencies of the scans that are done, and the tiles that they voted on."""
+    def _count_votes(self, vehicle: Vehicle, *, ended: bool = False) -> None:
+        """Latencies of the scans that are done, unless the drive has ended, and the tiles that they voted on."""
         report, now_ns, now_s = vehicle.report, time.time_ns(), time.monotonic()
         lost = set(report.lost) if vehicle.done > self._finished else set()
         for i in range(self._finished, vehicle.done):
@@ -358,7 +358,8 @@ class LiveDrive:
             self.counts.localised += 1
             self.fixes.append(Fixed(scan.stamp_ns, report.T_map_lidar[i], report.covariances[i]))
             since_ns = scan.stamp_ns if abs(scan.sent_ns - scan.stamp_ns) < 5 * 10**9 else scan.sent_ns
-            self.counts.latencies_s.append(1e-9 * (now_ns - since_ns))
+            if not ended:
+                self.counts.latencies_s.append(1e-9 * (now_ns - since_ns))
             x, y = report.T_map_lidar[i][:2, 3]
             window = window_around(vehicle.point_map.lattice, x, y, vehicle.settings.voting.window_m)
             for tile in window.tiles():
