@@ -12,12 +12,11 @@ from mapvote.core.reference import reference_window
 from mapvote.core.types import F64, U8, Reference
 from mapvote.fusion.fuse import Decision
 from mapvote_lab.evaluation.results import Judgement
-from mapvote_lab.evaluation.scoring.border import ceiling
 from mapvote_lab.evaluation.scoring.cells import Scores, determined_share, score_cells
 from mapvote_lab.evaluation.scoring.map_points import MapJudge, MapScores, map_obstacles
 from mapvote_lab.evaluation.scoring.objects import score_objects
 from mapvote_lab.evaluation.scoring.scene_truth import Truth
-from mapvote_lab.evaluation.scoring.truths import TRUTHS
+from mapvote_lab.evaluation.scoring.truths import TRUTHS, ceiling
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,7 +57,7 @@ class Jury:
         return self._judge(outcome.states, outcome.vehicle_states, points)
 
     def ceilings(self) -> dict[str, Scores]:
-        """By truth: what perfect labels on every measured point would score (scoring/border.py)."""
+        """By truth: what perfect labels on every measured point would score (scoring/truths.py)."""
         return {name: ceiling(self.truth, cells) for name, cells in self.truths.items()}
 
     def _judge(self, states: U8, vehicle_states: Sequence[U8], points: MapScores | None) -> Judgement:

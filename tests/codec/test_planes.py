@@ -1,0 +1,241 @@
+"""Planes <-> bytes: what is packed comes back, what is damaged is one clear error."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from hand_made import Say, make_ballot, states_plane, two_walls, unpack_all
+from mapvote.codec.arrays import compress, pack_plane, unpack_bytes, unpack_into, zstd
+from mapvote.codec.ballot import Ballot, decode, encode, unpack_states, unpack_sureness
+from mapvote.codec.odds import MOST, STEPS, UNSAID, in_nats, in_steps, pack_odds, unpack_odds
+from mapvote.codec.path import check_path, pack_path, unpack_path
+from mapvote.codec.points import MOST_OFF_M, pack_points, unpack_points, unpack_sound_points
+from mapvote.codec.words import pack_words, unpack_sparse, unpack_words
+from mapvote.core.grid import CELL_SIZE, Lattice
+from mapvote.core.types import F32, I8, U64, CellState, MapvoteError
+
+SIZE = 1000
+
+
+def unsaid(data: bytes) -> bytes:
+    """A frame that does not say how large it is."""
+    packer = zstd.ZstdCompressor()
+    return packer.compress(data) + packer.flush()
+
+
+@pytest.mark.parametrize("pack", [zstd.compress, unsaid])
+def test_what_is_unpacked_into_a_plane_is_what_was_packed(pack: Callable[[bytes], bytes]) -> None:
+    data = np.random.default_rng(1).integers(0, 6, SIZE, dtype=np.uint8).tobytes()
+    plane = np.empty(SIZE, dtype=np.uint8)
+    unpack_into(pack(data), plane, "plane")
+    assert plane.tobytes() == unpack_bytes(pack(data), SIZE, "plane") == data
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [
+        b"",
+        b"no frame",
+        zstd.compress(bytes(SIZE))[:-2],
+        zstd.compress(bytes(SIZE - 1)),
+        zstd.compress(bytes(SIZE + 1)),
+        zstd.compress(bytes(1 << 24)),
+        unsaid(bytes(SIZE - 1)),
+        unsaid(bytes(1 << 24)),
+    ],
+)
+def test_a_damaged_frame_or_one_of_another_size_is_refused(bad: bytes) -> None:
+    with pytest.raises(MapvoteError, match=r"^plane "):
+        unpack_into(bad, np.empty(SIZE, dtype=np.uint8), "plane")
+
+
+def plane_of(marked: dict[int, int]) -> U64:
+    plane = np.zeros(65536, dtype=np.uint64)
+    plane[list(marked)] = np.array(list(marked.values()), dtype=np.uint64)
+    return plane.reshape(256, 256)
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.dictionaries(st.integers(0, 65535), st.integers(0, 2**64 - 1), max_size=30))
+def test_words_come_back_as_they_went_in(marked: dict[int, int]) -> None:
+    plane = plane_of(marked)
+    data = pack_words(plane)
+    np.testing.assert_array_equal(unpack_words(data, "gone"), plane)
+    cells, words = unpack_sparse(data, "gone")
+    np.testing.assert_array_equal(cells, np.flatnonzero(plane))
+    np.testing.assert_array_equal(words, plane.reshape(-1)[cells])
+
+
+def test_a_full_plane_and_an_empty_one_travel_too() -> None:
+    for plane in (np.full((256, 256), ~np.uint64(0)), np.zeros((256, 256), np.uint64)):
+        np.testing.assert_array_equal(unpack_words(pack_words(plane), "free"), plane)
+    assert len(unpack_bytes(pack_words(plane), 10, "free")) == 0
+
+
+@pytest.mark.parametrize(
+    "raw",
+    [
+        b"x" * 9,
+        bytes([3, 0, 0, 0]) + bytes([1, 1]) + bytes(14),
+        bytes([255, 1, 255, 0]) + bytes([1, 1]) + bytes(14),
+        bytes([3, 0]) + bytes(8),
+    ],
+    ids=["half a cell", "a cell twice", "beyond the tile", "an empty word"],
+)
+def test_words_that_no_vehicle_wrote_are_refused(raw: bytes) -> None:
+    with pytest.raises(MapvoteError, match="ballot: free is damaged"):
+        unpack_sparse(compress(raw, 1), "free")
+
+
+EDGE = float(np.nextafter(np.float32(76.8), np.float32(0.0)))
+SIDE = st.one_of(st.floats(0.0, EDGE, width=32), st.sampled_from([0.0, EDGE]))
+HEIGHT = st.floats(-1e5, 1e5, width=32)
+
+
+def voxels(points: F32) -> np.ndarray:
+    return np.floor(points.astype(np.float64) / CELL_SIZE).astype(np.int64)
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.lists(st.tuples(SIDE, SIDE, st.one_of(st.floats(-30.0, 60.0, width=32), HEIGHT)), max_size=40))
+def test_a_point_stays_in_its_voxel_and_within_what_rounding_may_move_it_whatever_the_order(
+    points: list[tuple[float, float, float]],
+) -> None:
+    sent = np.array(points, dtype=np.float32).reshape(-1, 3)
+    found = unpack_sound_points(pack_points(sent))
+    assert found.dtype == np.float32
+    assert found.shape == sent.shape
+    near = np.abs(sent[:, 2]) < 1e3  # beyond, float32 itself is coarser than the steps
+    np.testing.assert_array_equal(voxels(found)[near], voxels(sent)[near])
+    np.testing.assert_allclose(found[near], sent[near], rtol=0, atol=MOST_OFF_M + 1e-4)
+    np.testing.assert_array_equal(voxels(found)[:, :2], voxels(sent)[:, :2])
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 2**32 - 1))
+def test_what_was_rounded_once_is_never_moved_again(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    sent = rng.uniform((0.0, 0.0, -50.0), (EDGE, EDGE, 150.0), (200, 3)).astype(np.float32)
+    once = unpack_points(pack_points(sent))
+    assert unpack_points(pack_points(once)).tobytes() == once.tobytes()
+
+
+def test_points_of_a_street_take_less_than_half_of_what_float32_takes() -> None:
+    rng = np.random.default_rng(1)
+    cells = np.sort(rng.choice(65536, 3000, replace=False))
+    at = np.column_stack([cells % 256, cells // 256, rng.integers(0, 9, 3000)])
+    sent = ((at + rng.random((3000, 3))) * CELL_SIZE).astype(np.float32)
+    assert 2 * len(pack_points(sent)) < len(pack_plane(sent))
+
+
+@pytest.mark.parametrize(
+    ("raw", "why"),
+    [
+        (bytes(8), "is no number of points"),
+        (bytes(6) + b"\x20" + bytes(2), "outside its tile or not finite"),
+        (bytes(4) + b"\x00\x10" + bytes(3), "outside its tile or not finite"),
+        (bytes(9 * 65), "more than 64 points in one cell"),
+    ],
+    ids=["half", "beyond its voxel", "in the sky", "too many in a cell"],
+)
+def test_points_that_no_vehicle_wrote_are_refused(raw: bytes, why: str) -> None:
+    with pytest.raises(MapvoteError, match=why):
+        unpack_points(compress(raw, 1))
+
+
+CHANGES = (CellState.CHANGED_OCCUPIED, CellState.CHANGED_EMPTY)
+
+
+def saying(cells: dict[tuple[int, int], int], odds: I8 | None) -> Ballot:
+    return make_ballot(two_walls(), {(0, 0): Say(states_plane(cells), odds=odds)})
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    st.dictionaries(
+        st.tuples(st.integers(0, 255), st.integers(0, 255)),
+        st.tuples(st.sampled_from(range(5)), st.integers(-MOST, MOST)),
+        max_size=40,
+    )
+)
+def test_every_changed_cell_gets_its_own_byte_back_and_no_other_cell_has_one(
+    said: dict[tuple[int, int], tuple[int, int]],
+) -> None:
+    bytes_of = {cell: odds for cell, (state, odds) in sorted(said.items()) if state in CHANGES}
+    sent = saying({cell: state for cell, (state, _) in said.items()}, np.array(list(bytes_of.values()), np.int8))
+    got = decode(encode(sent))
+    unpack_all(got)
+    (tile,) = got.tiles
+    assert tile.states is not None
+    odds = unpack_sureness(tile.odds, unpack_states(tile.states))
+    assert odds is not None
+    assert odds.tolist() == list(bytes_of.values())
+
+
+@given(st.lists(st.floats(-100, 100), max_size=20))
+def test_log_odds_keep_their_sign_and_lose_half_a_step_at_most(nats: list[float]) -> None:
+    back = in_nats(in_steps(np.array(nats, dtype=np.float64)))
+    within = np.clip(np.array(nats), -MOST / STEPS, MOST / STEPS)
+    assert np.abs(back - within).max(initial=0.0) <= 0.5 / STEPS
+    assert (back * within >= 0).all()
+
+
+@pytest.mark.parametrize(
+    ("data", "says"),
+    [
+        (pack_odds(np.zeros(1, np.int8)), "1 bytes, expected 2"),
+        (pack_odds(np.zeros(3, np.int8)), "larger than 2 bytes"),
+        (pack_odds(np.array([0, UNSAID], np.int8)), "no log-odds"),
+        (compress(b"x" * 100_000_000), "larger than 2 bytes"),
+        (b"not zstd", "damaged"),
+    ],
+    ids=["a cell too few", "a cell too many", "a value that nobody says", "a bomb", "no frame"],
+)
+def test_what_no_vehicle_says_is_one_clear_error(data: bytes, says: str) -> None:
+    with pytest.raises(MapvoteError, match=f"ballot: odds .*{says}"):
+        unpack_odds(data, 2)
+    sent = saying({(3, 3): CellState.CHANGED_EMPTY, (3, 4): CellState.CHANGED_OCCUPIED}, None)
+    tile = msgspec.structs.replace(sent.tiles[0], odds=data)
+    with pytest.raises(MapvoteError, match="ballot: odds"):
+        unpack_all(msgspec.structs.replace(sent, tiles=[tile]))
+
+
+def test_odds_are_of_states_and_a_tally_has_none() -> None:
+    with pytest.raises(MapvoteError, match="no states"):
+        unpack_sureness(pack_odds(np.zeros(2, np.int8)), None)
+
+
+def test_a_kilometre_is_told_every_five_metres_in_two_hundred_bytes() -> None:
+    driven = np.column_stack([np.arange(0.0, 1000.0, 1.1), np.full(910, -40.0), np.full(910, 1.9)])
+    packed = pack_path(list(driven), Lattice())
+    cells = unpack_path(packed)
+    assert len(packed) < 200
+    assert 160 <= len(cells) <= 200
+    (
+        rows,
+        cols,
+    ) = Lattice().cells_of(driven[[0, -1]])
+    assert cells[[0, -1]].tolist() == np.column_stack([rows, cols]).tolist()
+    assert (np.hypot(*np.diff(cells, axis=0)[:-1].T) * 0.3 >= 4.7).all()
+
+
+def test_nobody_drove_far_from_where_he_voted() -> None:
+    packed = pack_path([np.array([10.0, 10.0]), np.array([200.0, 10.0])], Lattice())
+    check_path(packed, [(0, 0), (0, 1)])
+    with pytest.raises(MapvoteError, match="tile 0,2, far from where the drive voted"):
+        check_path(packed, [(0, 0)])
+
+
+def test_a_path_that_is_not_whole_is_refused() -> None:
+    with pytest.raises(MapvoteError, match="not a multiple of 8"):
+        unpack_path(pack_plane(np.zeros(3, np.int32)))
+    with pytest.raises(MapvoteError, match="larger than"):
+        unpack_path(pack_plane(np.zeros((100_001, 2), np.int32)))
+    with pytest.raises(MapvoteError, match="damaged"):
+        unpack_path(b"no frame")
