@@ -51,6 +51,16 @@ def test_every_page_is_reached_from_the_index_by_links() -> None:
     assert sorted(set((ROOT / "docs").rglob("*.md")) - reached) == []
 
 
+@pytest.mark.parametrize("door", ["vehicles", "operators", "compare"])
+def test_a_door_has_commands_output_a_picture_and_at_most_four_links(door: str) -> None:
+    text = (ROOT / f"docs/{door}.md").read_text()
+    links = set(re.findall(r"\]\(([^)#:]+\.md)", text))
+    assert "```\nmapvote " in text
+    assert "```text\n" in text
+    assert "](pictures/" in text
+    assert len(links) <= 4, links
+
+
 @pytest.mark.slow
 def test_the_site_is_built_without_a_warning(tmp_path: Path) -> None:
     pytest.importorskip("mkdocs", reason="the extra docs is not installed")
