@@ -159,11 +159,11 @@ class Cuts:
 
 
 class RoadDriven:
-    """What a drive's localised scans say of its road: followed as scans are done, each looked at once."""
+    """What a drive's localised scans show of its road: updated as scans are done, each read once."""
 
     def __init__(self) -> None:
         self.followed = 0
-        """Scans looked at."""
+        """Scans read."""
         self.moved = False
         """Whether the vehicle has left the place where it began."""
         self.length_m = 0.0
@@ -173,7 +173,7 @@ class RoadDriven:
         self._place: F64 | None = None
 
     def follow(self, report: DriveReport, done: int, stop_m: float) -> None:
-        """Look at those of the first ``done`` scans of ``report`` that were not looked at yet."""
+        """Read those of the first ``done`` scans of ``report`` that were not read yet."""
         lost = set(report.lost) if done > self.followed else set()
         for i in range(self.followed, done):
             self.last_ns, position = report.stamps_ns[i], report.T_map_lidar[i][:3, 3]

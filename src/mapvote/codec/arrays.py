@@ -27,7 +27,7 @@ gain nothing above level 3."""
 
 
 def compress(raw: bytes | memoryview, level: int = ZSTD_LEVEL) -> bytes:
-    """One zstd frame that says how large its content is.
+    """One zstd frame that states the size of its content.
 
     Each thread keeps one compressor for each quick level: making one takes as long as packing a small plane. Those of
     high levels hold tens of megabytes, and are made in a hundredth of the time that a plane takes them.
@@ -86,7 +86,7 @@ def _unpack(data: bytes, limit: int, what: str) -> tuple[bytes, bytes]:
 
 
 def frame_size(head: bytes, what: str) -> int:
-    """How many bytes a frame of ours holds, which it says at its beginning; MapvoteError if it does not."""
+    """How many bytes a frame of ours holds, from its header; MapvoteError if the header does not state it."""
     try:
         size = zstd.get_frame_info(head).decompressed_size
     except zstd.ZstdError as error:

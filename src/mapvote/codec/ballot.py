@@ -56,7 +56,7 @@ class BallotTile(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Ballot(msgspec.Struct, frozen=True, kw_only=True):
-    """What one vehicle says after one drive. Self-contained."""
+    """The votes of one vehicle after one drive. Self-contained."""
 
     format_version: int = FORMAT_VERSION
     map_id: _Text
@@ -81,7 +81,7 @@ class Ballot(msgspec.Struct, frozen=True, kw_only=True):
     prior_misfit_m: float | None = None
     """Median distance, in the plane, between fix and prior of the scans that voted; None without a prior."""
     prior_sigma_m: float | None = None
-    """What the prior said of itself."""
+    """The standard deviation that the prior states."""
     path: bytes | None = None
     """Where it drove (codec/path.py); None if the ballot does not say."""
     tiles: list[BallotTile]

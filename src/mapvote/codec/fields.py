@@ -35,7 +35,7 @@ def unpack_fields(raw: bytes, n: int, what: str) -> dict[str, NDArray[Any]]:
 
 
 def field_names(raw: bytes, what: str) -> list[str]:
-    """Of packed fields; MapvoteError if they are none."""
+    """Of packed fields; MapvoteError if the bytes are no such fields."""
     return list(_decoded(raw, what))
 
 

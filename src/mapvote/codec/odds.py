@@ -16,7 +16,7 @@ STEPS = 4
 MOST = 127
 """31.75 nats: beyond all that anybody can know."""
 UNSAID = -128
-"""Where nobody says how sure he is; no ballot holds it."""
+"""Where no confidence is stated; no ballot holds it."""
 
 
 def in_steps(log_odds: F64) -> I8:

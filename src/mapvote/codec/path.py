@@ -1,4 +1,4 @@
-"""Where a vehicle drove, as its ballot tells it: a cell of the lattice every few metres, for people to look at.
+"""The path of a vehicle in its ballot: a cell of the lattice every few metres, for display.
 
 Cells as steps from one to the next, int32, under zstd: two hundred bytes for a kilometre.
 """

@@ -1,6 +1,6 @@
 """New points of a tile <-> bytes: the voxel of each, and where in it to a 32nd of its side.
 
-Half a centimetre is less than a sensor resolves and less than a vehicle knows of its position, yet as float32 three
+Half a centimetre is less than a sensor's noise and less than the error of a pose, yet as float32 three
 quarters of a ballot were such digits. So vehicles round: a point stays in its voxel and moves by at most 4.7 mm along
 each axis. Under zstd lie nine planes of bytes: the difference from each point's cell to the next (two), from each layer
 to the next (four), and the place in the voxel (three).

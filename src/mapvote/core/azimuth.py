@@ -1,4 +1,4 @@
-"""In which direction points lie: arctan2 as a kernel that vectorises, for it is asked of every point of every scan.
+"""The azimuth of points: arctan2 as a kernel that vectorises, because every point of every scan needs it.
 
 The C library works one out in 24 ns, branch by branch. Here the right branch is chosen number by number in vectors, by
 the same steps (fdlibm's, which glibc's atan2f took until 2.40): the same float32 in a ninth of the time, on every

@@ -104,7 +104,7 @@ class Grid:
         return x, y
 
     def intersection(self, other: Grid) -> Grid:
-        """The common window; rows or cols are 0 where they do not meet. Raises ValueError on different lattices."""
+        """The common window; rows or cols are 0 where they do not overlap. Raises ValueError on different lattices."""
         if self.lattice != other.lattice:
             raise ValueError(f"grids of different lattices: {self.lattice} and {other.lattice}")
         row0, col0 = max(self.row0, other.row0), max(self.col0, other.col0)

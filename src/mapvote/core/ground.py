@@ -17,7 +17,7 @@ KNOWN_M = 3.0
 _BRIDGED_M = 1.2
 """Where the ground only leapt, this far from what was measured, it may yet be found lower: a yard, an underpass."""
 _GRADE = 0.15
-"""Steepest ground that counts as agreeing, and that a thing standing on the ground is told from, metres per metre."""
+"""Steepest ground that counts as agreeing; anything steeper stands on the ground, metres per metre."""
 _AROUND_CELLS = 7
 _AGREEING = 0.5
 """Share of the measured cells within 2.1 m that must agree before the ground may start from a cell."""
@@ -27,7 +27,7 @@ _FEW_TILES, _POINTS_A_TILE, _POINTS_AROUND = 64, 4000, 1000
 """A map of more tiles than 64 and one for each 4000 points is a street with strays, or not in metres: where a tile and
 its eight neighbours hold fewer than 1000 points its ground is unknown. So memory grows with points, not with extent."""
 _NEAR_TILES = 128
-"""Planes kept, of 256 kB, while the windows around neighbouring tiles are looked at: three rows of them and more."""
+"""Planes kept, of 256 kB, while the windows around neighbouring tiles are read: three rows of them and more."""
 
 Heights = tuple[I64, F32]
 """(flat cell within its tile (n,), height (n,) in map metres) of points."""
@@ -176,13 +176,13 @@ def _lowest_of_each(cells: I64, z: F32) -> Heights:
 
 
 class _Lows:
-    """What was known before ground starts anew: planes of a tile, worked out when they are asked for."""
+    """What is known before ground grows: planes of a tile, computed when they are first read."""
 
     def __init__(self, start: I32 | I64, heights: F32, gap: U8, ground: F32) -> None:
         self._start, self._heights, self._gap, self._ground = start, heights, gap, ground
 
     def low(self, tile: int) -> F32:
-        """(256, 256) the lowest point of each cell that no measured ground is near, inf where there is none."""
+        """(256, 256) the lowest point of each cell without measured ground nearby, inf where there is none."""
         cells = slice(tile * CELLS, (tile + 1) * CELLS)
         first = self._start[tile * CELLS : (tile + 1) * CELLS + 1]
         asked = (first[:-1] < first[1:]) & (self._gap[cells] > _BRIDGED_M / STEP_M)

@@ -1,4 +1,4 @@
-"""The tiles of a map that is larger than memory: each is made when it is asked for, and the last few are kept."""
+"""The tiles of a map that is larger than memory: each is made when it is first read, and the last few are kept."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A whole map, and the one place where a cloud is cut into tiles and their ground is laid."""
+"""A whole map, and the one place where a cloud is cut into tiles and their ground is computed."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from mapvote.core.types import F32, F64, I32, I64, MapvoteError
 
 _EXTENT_M = 1e7
 _CHUNK = 1_000_000
-"""Points looked at together: a large cloud is never copied as a whole."""
+"""Points of one block: a large cloud is never copied as a whole."""
 
 
 @dataclass(frozen=True, slots=True, repr=False)
@@ -32,11 +32,11 @@ class PointMap:
     georeference: Mapping[str, str] = field(default_factory=dict)
     """Free text carried along (CRS, projector, origin)."""
     driven: tuple[F64, ...] = ()
-    """(n, 3) the sensor's positions along each drive that the map was made of, map metres; none where nobody knows."""
+    """(n, 3) the sensor's positions along each drive that the map was made of, map metres; none if unknown."""
     version: int | None = None
     """How often the map was published; ballots name it. None: of a format that does not say."""
     surveyed_ns: int | None = None
-    """When the last drive that the map was made of ended, since 1970; None where nobody knows."""
+    """When the last drive that the map was made of ended, since 1970; None if unknown."""
 
     def __repr__(self) -> str:
         return f"PointMap({self.map_id!r}: {self.n_points:,} points in {len(self.tiles)} tiles)"
@@ -50,7 +50,7 @@ class PointMap:
 
     @property
     def field_names(self) -> list[str]:
-        """Of the fields that its points have. Of a map larger than memory the largest tiles tell."""
+        """Of the fields that its points have; of a map larger than memory, those of its largest tiles."""
         asked = self.tiles.largest(3) if isinstance(self.tiles, LazyTiles) else list(self.tiles)
         return sorted({name for index in asked for name in self.tiles[index].fields})
 
@@ -92,7 +92,7 @@ def _heights(points: Mapping[TileIndex, F32], lattice: Lattice) -> dict[TileInde
 
 
 def _stored(points_map: NDArray[np.floating], lattice: Lattice) -> dict[TileIndex, F32]:
-    """The points as tiles keep them, so that the ground is laid from what a map read back holds."""
+    """The points as tiles keep them, so that the ground is computed from the points that a map read back holds."""
     return {tile: lattice.tile(tile).from_map(points_map[mine]) for tile, mine in cut_tiles(points_map, lattice)}
 
 
@@ -105,7 +105,7 @@ def map_from_points(
     road: F64 | None = None,
     fields: Mapping[str, NDArray[Any]] | None = None,
 ) -> PointMap:
-    """A PointMap of points (n, 3) in map metres: cut into tiles, every point kept in its order, ground laid.
+    """A PointMap of points (n, 3) in map metres: cut into tiles, every point kept in its order, ground computed.
 
     ``road`` (m, 3), map metres: places known to be ground, from which it grows; without, it must be found.
     ``fields``: columns (n,) that stay with the points. ``map_id`` defaults to a hash of the points and the lattice.

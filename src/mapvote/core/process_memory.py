@@ -14,8 +14,8 @@ from contextlib import contextmanager
 def give_back_free_pages() -> None:
     """Let the allocator return every whole page that nothing uses, also between things that are in use.
 
-    glibc alone holds on to them and can be asked; elsewhere nothing is done. It takes some milliseconds, and what is
-    asked for next is mapped anew: for once in a hundred scans, not for each.
+    Only glibc keeps them and has a call for it; elsewhere nothing is done. It takes some milliseconds, and the next
+    allocations map pages anew: call it once in a hundred scans, not for each.
     """
     if sys.platform == "linux" and (trim := getattr(ctypes.CDLL(None), "malloc_trim", None)):
         trim(0)

@@ -40,7 +40,7 @@ def _laid_out(point_map: PointMap, grid: Grid) -> Layout:
     base = base_layers(ground_z)
     yield
     for tile in tiles:
-        if tile.has_ground:  # by the tile alone, so that whoever edits it reads the words as they were written
+        if tile.has_ground:  # by the tile alone, so that every editor of the tile reads the words as they were written
             common = tile.window.intersection(grid)
             base[common.slices_in(grid)] = tile.base[common.slices_in(tile.window)]
     occupied = np.zeros(grid.shape, dtype=np.uint64)
@@ -68,8 +68,8 @@ def _laid_out(point_map: PointMap, grid: Grid) -> Layout:
 def above_ground_points(point_map: PointMap, grid: Grid) -> U64:
     """(rows, cols) all bits where the map holds a ground point in the cell or next to it, else none.
 
-    A stand-in for the known-free columns of a map that came without: whoever measured the ground there looked through
-    the air above it, so an obstacle would most likely be in the map. Where there is no ground point, nobody can say.
+    A substitute for the known-free columns of a map without them: the rays that measured the ground there passed the
+    air above it, so an obstacle would most likely be in the map. Where there is no ground point, this is unknown.
     """
     wide = grid.padded(1)
     seen = np.zeros(wide.shape, dtype=np.bool_)
@@ -100,16 +100,16 @@ def cut_reference(outer: Reference, window: Grid) -> Reference:
 
 
 class LocalMap:
-    """The reference around a vehicle on the move: laid out over the tiles about it, anew only when it has left them.
+    """The reference around a moving vehicle: arrays over the tiles around it, made anew only when it has left them.
 
-    The next one is laid out step by step, one for each time that is asked, while the vehicle drives through the tile
+    The next one is made step by step, one step per call, while the vehicle drives through the tile
     that will be its middle.
     """
 
     def __init__(self, point_map: PointMap, window_m: float) -> None:
         self.point_map, self.window_m = point_map, window_m
         self.outer: Reference | None = None
-        """The planes last laid out; windows are views into them."""
+        """The planes made last; windows are views into them."""
         self._middle: TileIndex | None = None
         self._next: tuple[TileIndex, Layout | Reference] | None = None
         """Another middle, and what there is of its planes."""

@@ -31,7 +31,7 @@ class Heights:
     off_share: float
     """Of the path: where the difference exceeds LEVEL_M."""
     unknown_share: float
-    """Of the path: where the map knows no ground."""
+    """Of the path: where the map has no ground."""
 
     def __str__(self) -> str:
         if np.isnan(self.median_m):
@@ -43,7 +43,7 @@ class Heights:
     def complaint(self) -> str:
         """What is wrong, in a line; empty if nothing is."""
         if np.isnan(self.median_m):
-            return "the map knows no ground under the path"
+            return "the map has no ground under the path"
         if self.off_share == 0:
             return ""
         x, y = self.worst_xy
@@ -54,7 +54,7 @@ class Heights:
 
 
 def heights_over_ground(point_map: PointMap, positions: F64) -> F64:
-    """(n,) metres from the ground up to positions (n, 3), map metres; NaN where the map knows no ground."""
+    """(n,) metres from the ground up to positions (n, 3), map metres; NaN where the map has no ground."""
     rows, cols = point_map.lattice.cells_of(positions)
     ground = np.full(len(positions), np.nan)
     for tile in point_map.tiles.values():

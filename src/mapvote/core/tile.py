@@ -31,7 +31,7 @@ _FOLLOWS_FROM: dict[str, set[str]] = {
 
 @dataclass(frozen=True, repr=False)
 class Tile:
-    """76.8 m x 76.8 m of map. ``points`` are the product; the planes are what the map knows besides.
+    """76.8 m x 76.8 m of map. ``points`` are the product; the planes hold ground and free space.
 
     Edited tiles are new tiles (``dataclasses.replace``): nothing here ever changes, so what follows from the points is
     worked out once.
@@ -54,7 +54,7 @@ class Tile:
         self._keep({"points": self.points, "ground_z": self.ground_z, "free": self.free})
 
     def _keep(self, planes: Mapping[str, Any]) -> None:
-        """These planes, as nobody can write to."""
+        """These planes, read-only."""
         for name, plane in planes.items():
             self.__dict__[name] = read_only(plane) if isinstance(plane, np.ndarray) else plane
 
@@ -152,7 +152,7 @@ class Tile:
 
     @property
     def has_ground(self) -> bool:
-        """Whether the ground is known anywhere in it; if not, nobody can say where its columns begin."""
+        """Whether the ground is known anywhere in it; if not, the start of its columns is unknown."""
         return bool(np.isfinite(self.ground_z).any())
 
     @cached_property

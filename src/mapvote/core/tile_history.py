@@ -1,4 +1,4 @@
-"""What a tile remembers of itself: when each cell last changed, and what came and went there."""
+"""The history of a tile: when each cell last changed, and the objects that appeared and disappeared there."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ class Memory:
 
     @property
     def stays(self) -> U32:
-        """(256, 256) how many things came here and went again."""
+        """(256, 256) how many objects appeared here and disappeared again."""
         return self.planes[2]
 
     @property

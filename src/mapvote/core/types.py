@@ -32,11 +32,11 @@ _Number = TypeVar("_Number", bound=np.generic)
 
 
 class MapvoteError(Exception):
-    """What a user can mend: the message says what, where and how. Printed without a traceback, exit code 1."""
+    """An error that a user can mend: the message names what, where, how. Printed without a traceback, exit code 1."""
 
 
 def read_only(array: NDArray[_Number]) -> NDArray[_Number]:
-    """The array itself, or a view of it, that nobody can write to. What a file's bytes are seen as is so anyway: all of
+    """The array itself, or a view of it, read-only. What a file's bytes are seen as is so anyway: all of
     one kind, they need one compilation of a kernel, not one each."""
     if not array.flags.writeable:
         return array
@@ -173,7 +173,7 @@ class Drive:
     prior_sigma_deg: float = 1.0
     T_base_lidar: F64 = field(default_factory=lambda: np.eye(4))
     georeference: Mapping[str, str] = field(default_factory=dict)
-    """Where on Earth the prior's frame lies, as a map carries it; empty where nobody said."""
+    """Where on Earth the prior's frame lies, as a map carries it; empty if unknown."""
     sensor_told: str = ""
     """Where the sensor's model comes from, and how sure it is."""
 

@@ -80,7 +80,7 @@ def verdict(uo: int, ue: int, co: int, ce: int, un: int, abstain: bool) -> int:
 @kernel
 def _decide_cells(tally: NDArray[Any], backers: NDArray[Any], abstain: bool, min_votes: int, states: U8) -> None:
     uos, ues, cos, ces, uns = tally[0], tally[1], tally[2], tally[3], tally[4]
-    for c in range(len(states)):  # of most cells nobody says anything, or all that nothing is there: seen in vectors
+    for c in range(len(states)):  # most cells have no vote, or only votes for empty: tested in vectors
         empty, more = np.int64(ues[c]), np.int64(uos[c] | cos[c] | ces[c] | uns[c])
         s = _UE if empty != 0 else NO_VOTE
         states[c] = _OPEN if more != 0 else s

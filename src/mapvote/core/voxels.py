@@ -106,7 +106,7 @@ def _find(keys: I64, table_keys: I64, table_rows: I32, n: int, rows: I32) -> int
 @kernel
 def _add(points: F64, of_point: I32, rows: I32, sums: F64) -> None:
     """Points (n, 3) into the ``sums`` of their voxels, whose ``rows`` (m,) these are; ``of_point`` (n,) says which."""
-    for j in range(len(rows)):  # all rows are asked for before any is waited for
+    for j in range(len(rows)):  # all rows are requested before any is waited for
         sums[rows[j], 7] += 1.0
     for i in range(len(points)):
         if of_point[i] < 0:
@@ -146,7 +146,7 @@ def _room_for(n: int) -> _Scratch:
 
 
 class VoxelCloud:
-    """Sums of points per lattice voxel, and the number of scans that met each voxel."""
+    """Sums of points per lattice voxel, and the number of scans that hit each voxel."""
 
     def __init__(self, lattice: Lattice) -> None:
         self.lattice = lattice
@@ -160,7 +160,7 @@ class VoxelCloud:
     def enter(self, points_map: F64, skip: Bool | None = None) -> None:
         """Enter one scan: points (n, 3) in map metres, those of ``skip`` (n,) left out.
 
-        Five points of a scan share a voxel: they are gathered before the cloud, which no cache holds, is asked.
+        Five points of a scan share a voxel: they are gathered before the cloud, which no cache holds, is read.
         """
         points = np.ascontiguousarray(points_map, dtype=np.float64)
         if len(points) > len(self._scratch.keys):
@@ -185,7 +185,7 @@ class VoxelCloud:
         self._keys = np.zeros(2 * len(self._keys), dtype=np.int64)
         self._rows = np.zeros(2 * len(self._rows), dtype=np.int32)
         _find(by_row, self._keys, self._rows, 0, np.empty(self._n, dtype=np.int32))
-        sums = np.zeros((2 * len(self._sums), 8))  # rows that nobody has written to take no memory yet
+        sums = np.zeros((2 * len(self._sums), 8))  # rows that were never written take no memory yet
         sums[: self._n] = self._sums[: self._n]
         self._sums = sums
 
@@ -193,10 +193,10 @@ class VoxelCloud:
         return self._n
 
     def points(self) -> tuple[F64, I32]:
-        """(mean point (m, 3) map metres, scans that met it (m,)) of every voxel, in the lattice's x, y, z order."""
+        """(mean point (m, 3) map metres, scans that hit it (m,)) of every voxel, in the lattice's x, y, z order."""
         found = np.flatnonzero(self._keys)
         rows: NDArray[np.int32] = self._rows[found[np.argsort(self._keys[found])]]
-        sums = self._sums[: self._n]  # as they came one after the other in memory; put in order when they are few
+        sums = self._sums[: self._n]  # in the order of arrival; sorted when they are few
         means = sums[:, 4:7] + sums[:, 1:4] / sums[:, :1]
         return means.take(rows, axis=0), sums[:, 7].astype(np.int32)[rows]
 
@@ -232,7 +232,7 @@ def _thin_keys(points: NDArray[np.float32], every: int, size: float, keys: I64) 
 
 def thin(points: NDArray[np.floating], size: float, every: int = 1) -> I64:
     """Indices (m,) of the first of (n, 3) points in each voxel of side ``size``, ascending. Within 2^20 voxels of 0.
-    Of a dense scan, only every ``every``-th point may be looked at.
+    Of a dense scan, only every ``every``-th point may be used.
 
     Does in a millisecond what :func:`voxel_downsample` does on the lattice; for scans, in their own frame.
     """

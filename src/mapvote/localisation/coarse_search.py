@@ -1,6 +1,6 @@
 """Where does one cloud lie in another? A search without a prior, over every shift and every yaw.
 
-Both clouds are level (z up); nothing else is asked of them: neither ground, nor a path, nor a common height. Each is
+Both clouds are level (z up); nothing else is required: neither ground, nor a path, nor a common height. Each is
 drawn from above in cells of a metre, by what stands there: the logarithm of how many layers of half a metre are
 occupied. The drawings are correlated by the fast Fourier transform, yaw by yaw. Heights follow from the cells that
 meet. Candidates are ranked by the likelihood of NDT (Magnusson 2009) and refined by it.
@@ -29,7 +29,7 @@ _MOST_CELLS = 64_000_000
 _SAMPLE = 4000
 _DZ_M = 0.25
 _HEIGHTS = (0.0, -1.5, 1.5)
-"""Beside the likeliest difference in height these are tried: walls alone tell it to a metre or two."""
+"""Besides the likeliest difference in height these are tried: walls alone give it to a metre or two."""
 LEAST_LEAD = 0.1
 """A place whose score is not ahead of every other by such a share of it is ambiguous."""
 WINDOW_M = 90.0
@@ -207,7 +207,7 @@ def _best_of(points_a: F64, local: F64, guesses: list[F64]) -> Placed:
 
 
 class _Windows:
-    """NDT of a around where b is put, laid out once for each 20 m, and what of b lies in it."""
+    """NDT of a around the pose of b, made once for each 20 m, and the part of b inside it."""
 
     def __init__(self, points_a: F64, local: F64) -> None:
         self._a, self._b = points_a, local

@@ -30,9 +30,9 @@ from mapvote.localisation.prepare import deskew, solid_sample
 CELL_M = 1.0
 LAYER_M = 1.0
 LOW_M, HIGH_M = 0.8, 30.0
-"""Heights above the ground that are looked at."""
+"""Heights above the ground that are used."""
 MARGIN = 32
-"""Of every second cell: more than the 45 m within which points are looked at."""
+"""Of every second cell: more than the 45 m within which points are used."""
 _SPAN = 64
 """Cells of a row that are looked up together."""
 _MAX_CELLS = 40_000_000
@@ -128,7 +128,7 @@ def _dilated(words: U32) -> U32:
 
 @allocating
 def correlate(wide: U32, spans: I64, cols: I64, xy: F64, bits: U32, yaws: F64, hopeless: int, first: int) -> U8:
-    """(places, headings) how many of the points (n <= 255) meet something of their height there; 0 where hopeless.
+    """(places, headings) how many of the points (n <= 255) match the map at their height there; 0 where hopeless.
 
     ``cols`` (places,) in ``wide``. Span by span, point by point: what the cells of a span look up lies side by side, so
     that all of them are sooner asked for than the places among them.
@@ -164,7 +164,7 @@ def correlate(wide: U32, spans: I64, cols: I64, xy: F64, bits: U32, yaws: F64, h
 
 @kernel
 def _look_up(flat: U32, at: int, way: I64, bits: U32, begin: int, end: int, hits: U32) -> None:
-    """Add to ``hits`` of each cell of the span that begins ``at`` how many points, a ``way`` off, meet something."""
+    """Add to ``hits`` of each cell of the span that begins ``at`` how many points, shifted by ``way``, match."""
     for i in range(begin, end):
         start, bit = np.uint64(at + way[i]), bits[i]
         for j in range(np.uint64(0), np.uint64(_SPAN)):
@@ -238,7 +238,7 @@ class Found:
 
 
 class GlobalSearch:
-    """The whole map, laid out for searching when first asked."""
+    """The whole map as arrays for the search, made at the first call."""
 
     def __init__(self, point_map: PointMap, ndt: NdtSettings, range_sigma_m: float) -> None:
         self.point_map, self.ndt = point_map, ndt
@@ -266,7 +266,7 @@ class GlobalSearch:
     def __call__(self, scan: Scan) -> F64 | None:
         """The pose (4, 4) of the scan, or None if no place holds or another fits as well.
 
-        In a map without ground nobody knows where one could drive, nor heights above it: there every shift and yaw of
+        A map without ground has neither drivable squares nor heights above ground: there every shift and yaw of
         the scan is tried (localisation/coarse_search.py), which takes some seconds for each square kilometre.
         """
         if not self._has_ground:

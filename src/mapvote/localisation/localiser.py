@@ -30,7 +30,7 @@ LOOKS = 3
 WAIT_SCANS = 40
 """Scans that wait at most until their track is confirmed: what a vehicle can hold, 4 s at 10 Hz."""
 _EVERY_M, _EVERY_S = 10.0, 0.35
-"""A track that holds is looked at again after this distance, well within the 15 m that a look covers, or this time:
+"""A track that holds is checked again after this distance, well within the 15 m of a check, or this time:
 four scans at 10 Hz, however their stamps jitter. A vote is up to so much later for it."""
 _JUMPS = 4
 """How often a track may move on one scan before it counts as lost there."""

@@ -21,14 +21,14 @@ from mapvote.localisation.ndt import (
 from mapvote.localisation.ndt_voxels import Voxels, Window
 
 _SLAB_M = 252.0
-"""Height of what is laid out at a time, a whole number of voxels at every level: a stray point costs no tower."""
+"""Height of one block, a whole number of voxels at every level: a stray point costs no tower."""
 _AHEAD_M, _KEPT_M = HALF_WINDOW_M + 2 * CENTRAL_M, HALF_WINDOW_M + 4 * CENTRAL_M
 """Tiles this near are made ready, and tiles this near are kept."""
 
 
 class MapWindow:
     """Built anew when the vehicle leaves its middle: in a millisecond or two where :meth:`prepare` has been called, and
-    in the memory of the one before, which whoever asked earlier must not use any longer.
+    in the memory of the one before, which earlier callers must not use any longer.
 
     Memory is bounded by the tiles around the vehicle.
     """

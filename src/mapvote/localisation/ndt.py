@@ -39,7 +39,7 @@ class Level:
 LEVELS = Level(3.0, 0.5, 1.0, 15), Level(2.0, 0.25, 1.0, 15), Level(1.0, 0.1, 0.7, 15)
 """Coarse to fine: voxels of the paper's 0.3 m have no basin, and denser scans gave no better median."""
 HALF_WINDOW_M, BELOW_M, ABOVE_M = 96.0, 24.0, 40.0
-"""How far the window reaches to the sides, below and above its centre: as far as a scan has points to speak of."""
+"""How far the window reaches to the sides, below and above its centre: as far as a scan has enough points."""
 CENTRAL_M = 24.0
 """A vehicle this far from the window's centre still has 72 m of map to all sides."""
 SETTLED = 0.05, 0.01
@@ -51,7 +51,7 @@ COVARIANCE_SCALE = 5.0
 MAP_SIGMA_M, MAP_SIGMA_RAD = 0.01, float(np.radians(0.03))
 """What the map itself is off by around a scan, which no residual shows."""
 _ENOUGH = 20_000
-"""Points that are thinned at least: of a dense scan every third, fifth .. is looked at. Odd, so that no beam is left
+"""Points that are thinned at least: of a dense scan every third, fifth .. is used. Odd, so that no beam is left
 out where points are stored firing by firing."""
 
 
@@ -70,7 +70,7 @@ class NdtGrid:
 
     @property
     def voxels(self) -> Voxels:
-        """With the distributions of all that was entered, worked out when they are asked for: of a map that grows the
+        """With the distributions of all entered points, computed when they are read: of a map that grows the
         coarse levels hardly ever are."""
         for rows in self._stale:
             refreshed(self._voxels, rows, self.level)

@@ -2,7 +2,7 @@
 over the pairs and solved, and the pose moves until it stands still.
 
 Equation numbers are those of Magnusson, The Three-Dimensional Normal-Distributions Transform, 2009, chapter 6; where
-we deviate, mapvote.localisation.ndt says how. Pairs lie in columns, so that the sums run over vectors of them, in
+deviations are listed in mapvote.localisation.ndt. Pairs lie in columns, so that the sums run over vectors of them, in
 float32 about the sensor; they serve until the pose has moved by a share of a voxel. Pose errors are (6,) vectors
 (rho, phi) in map axes about the sensor: t' = t + rho, R' = exp(phi) R.
 """
@@ -295,7 +295,7 @@ class Certainty(NamedTuple):
 
 
 class Work(NamedTuple):
-    """Scratch of :func:`align`, float64 unless it says otherwise: an allocation in a kernel takes 50 ms to compile."""
+    """Scratch of :func:`align`, float64 unless stated: an allocation in a kernel takes 50 ms to compile."""
 
     matrices: F64
     """(7, 6, 6)"""

@@ -1,7 +1,7 @@
 """The map side of NDT: points become a normal distribution per voxel.
 
 Equation numbers are those of Magnusson, The Three-Dimensional Normal-Distributions Transform, 2009, chapter 6; where
-we deviate, mapvote.localisation.ndt says how. Steps are inlined by numba; docs/measurements/speed.md tells the cost.
+deviations are listed in mapvote.localisation.ndt. numba inlines the steps; docs/measurements/speed.md has the cost.
 """
 
 from __future__ import annotations
@@ -132,7 +132,7 @@ def _mean_and_covariance(sums: F64, k: int, A: F64) -> Vector:
 
 @inlined
 def _flatten(A: F64, V: F64, thin: float) -> None:
-    """A flat patch knows its height only. One ring on the road is a line, thin to all sides: taken at face value it
+    """A flat patch constrains its height only. One ring on the road is a line, thin to all sides: taken literally it
     would hold the next scan's rings where the last ones were. ``thin``: variances below it are none; A is diagonal."""
     if A[1, 1] < thin:
         _upright(V)
@@ -143,7 +143,7 @@ def _flatten(A: F64, V: F64, thin: float) -> None:
 def _set_precision(cells: F64, k: int, A: F64, V: F64, floor_variance: float, even: float) -> None:
     """The inverse covariance of voxel ``k`` from eigenvalues (diagonal of A) and eigenvectors (columns of V).
 
-    Along a direction in which a voxel is filled evenly it says nothing about position. The precision of an even
+    A voxel does not constrain the position along a direction in which it is filled evenly. The precision of an even
     filling, less two standard deviations of its sample variance, is taken off (``even``); otherwise the rhythm of the
     voxels would hold a vehicle in place on a bare road.
     """
@@ -188,7 +188,7 @@ def refresh(
 def enter_points(points: F64, window: Window, voxels: Voxels, n: int, touched: I64) -> tuple[int, int, int]:
     """Enter points (n, 3) in map metres into the sums of their voxels.
 
-    Returns (the new number of rows, how many points were looked at, how many rows to :func:`refresh` are new in
+    Returns (the new number of rows, how many points were read, how many rows to :func:`refresh` are new in
     ``touched`` (n,)): fewer points than all where ``voxels`` has no row left, so that rows are made for voxels and not
     for points. Points outside ``window`` are left out.
     """

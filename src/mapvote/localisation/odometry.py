@@ -169,7 +169,7 @@ class Tracker:
         self.last_pose, self.twist = T_map_lidar, twist
 
     def is_sound(self, result: Registration) -> bool:
-        """Whether a registration converged, met the map and is certain enough; that it is the right place says more."""
+        """Whether a registration converged, overlaps the map and is certain enough; pose_check tests the place."""
         s, position = self.settings, result.covariance[:3, :3]
         if not result.converged or result.inlier_share < s.min_inlier_share:
             return False

@@ -24,7 +24,7 @@ MIN_LEAD = 0.05
 MIN_KNOWN = 0.3
 """Share of the standing points that must lie where the map has been: with fewer, what fits there proves little."""
 _POINTS = 1000
-"""Points of a scan looked at."""
+"""Points of a scan that are used."""
 _NEAR_M, _FAR_M = 2.0, 15.0
 """Other places are tried from here to there, along the street and across it: houses and parked cars repeat so."""
 _CELL_M = 3.0
@@ -59,7 +59,7 @@ _ARMS = _arms()
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """What speaks for a pose."""
+    """The evidence for a pose."""
 
     fit: float
     """Likelihood of the standing points over what the map leads to expect of them; about 1 at the right place."""
@@ -101,7 +101,7 @@ class Judge:
         return self._likelihood(ndt_map, standing, T_map_lidar) / expected if known >= MIN_KNOWN else 0.0
 
     def holds(self, verdict: Verdict) -> bool:
-        """Whether the verdict speaks for the pose."""
+        """Whether the verdict confirms the pose."""
         return verdict.fit >= MIN_FIT and verdict.known >= MIN_KNOWN and verdict.lead >= MIN_LEAD
 
     def _expected(self, ndt_map: NdtMap, standing: F64, T: F64) -> tuple[float, float]:

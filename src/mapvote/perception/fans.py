@@ -186,7 +186,7 @@ def _room_for(cells: int) -> Crossed:
 @inlined
 def _cross_cells(way: Way, ahead: tuple[int, int], end: float, base: I32, layer: int, out: Crossed) -> int:
     """Fill ``out`` with the cells of a way that steps ``ahead`` rows and columns, up to ``end`` metres or the window's
-    edge. Returns how many there are. Which way a step goes is chosen, not branched to: nobody can guess it."""
+    edge. Returns how many there are. The direction of a step needs no branch, which nothing could predict."""
     rows, cols = base.shape
     r, c, t, next_r, next_c, width_r, width_c = way
     n = 0

@@ -1,8 +1,8 @@
 """How far a scan saw: along every fan of rays to the edge of the window (paper III-A), and into the sky.
 
 A sensor reports returns only. Yet in a direction in which the road and the walls answer, and above the highest of them
-nothing does, whatever the beams up there met was farther off than they reach. That is asked of whole sectors, for
-single beams are lost on glass, on dark paint and by chance; and between returns nothing is told, for the same reason.
+nothing does, no surface up there was within range. The test uses whole sectors, because single beams are lost on
+glass, on dark paint and by chance. For the same reason a ray lost between returns proves nothing.
 Above a house that was pulled down, and where one was built, hardly any other ray goes by.
 """
 
@@ -105,14 +105,14 @@ def _into_sky(rays: Rays, slopes: F32, lean: F64, least: float) -> Rays:
 
 
 class Sky:
-    """Above which elevations a sensor's rays went into the sky."""
+    """The elevations above which a sensor's rays passed into the sky."""
 
     def __init__(self, sensor: Sensor) -> None:
-        beams = sorted(sensor.elevations_deg) if sensor.rings else []  # elsewhere nobody knows where a ray went
+        beams = sorted(sensor.elevations_deg) if sensor.rings else []  # elsewhere the end of a ray is unknown
         self._slopes = np.tan(np.radians(beams)).astype(np.float32)
         self._least = ANSWERED * len(beams) * sensor.azimuths / SECTORS
 
     def rays(self, up_map: F64, rays: Rays) -> Rays:
-        """Those of a scan that went into the sky, by ``rays``, those that came back. ``up_map`` (3,): the sensor's own
+        """The rays of a scan into the sky, from ``rays``, those that returned. ``up_map`` (3,): the sensor's
         upward axis in their frame, which may lean some degrees."""
         return _into_sky(rays, self._slopes, up_map[:2] / up_map[2], self._least)

@@ -1,6 +1,6 @@
-"""The way of a scan, for whoever drives: where was it taken, what stands above the ground, what moves, what was seen.
+"""The pipeline of a scan: its pose, obstacles above the ground, moving objects, and the voxels that its rays saw.
 
-    localise and de-skew -> to the map's frame -> tell the ground -> tell what moves -> wait -> follow the rays
+    localise and de-skew -> to the map's frame -> find the ground -> find moving objects -> wait -> cast the rays
 
 Vehicles, the making of maps and experiments all go this way. Scans go in one by one; observations come out in the same
 order, each once its place is confirmed and the moving-object filter has decided it, a second or two later.
@@ -40,7 +40,7 @@ class Movers(Protocol):
 
 @dataclass(slots=True)
 class DriveReport:
-    """How a drive went."""
+    """Statistics of a drive."""
 
     stamps_ns: list[int] = field(default_factory=list)
     """Of every scan."""
@@ -60,7 +60,7 @@ class DriveReport:
 
     @property
     def scans(self) -> int:
-        """How many scans went in."""
+        """How many scans were observed."""
         return len(self.stamps_ns)
 
     def length_m(self) -> float:
@@ -86,7 +86,7 @@ class DriveReport:
         return float(np.median(off)) if off else None
 
     def prior_sigma_m(self) -> float | None:
-        """What the priors said of themselves; None without priors."""
+        """The standard deviation that the priors state; None without priors."""
         said = [prior.sigma_m for prior in self.priors if prior is not None]
         return float(np.median(said)) if said else None
 
@@ -126,7 +126,7 @@ class PlacedScan:
     sigma_m: float
     """Standard deviation of the position, metres: the largest over all directions."""
     reference: Reference
-    """Where its points were told from the ground."""
+    """The map that separated its points from the ground."""
     outer: Reference
     """The planes around the vehicle that ``reference`` was cut from."""
     obstacle: Bool
@@ -155,7 +155,7 @@ class Observation:
 class Frontend:
     """One vehicle's sensor on one drive. Memory is bounded: the scans of a second wait, and the map around the vehicle.
 
-    ``ground`` tells points from the ground, and is where the filter looks; rays are followed in ``compared``, by
+    ``ground`` separates points from the ground, and is the filter's window; rays are cast in ``compared``, by
     default the same window, and to its edge only ``with_sight``, which surfaces do not ask for. ``localise`` and
     ``movers`` as above, with a state of their own: fresh ones for each drive. ``sensor``: follow its rays without
     return, too.
@@ -223,7 +223,7 @@ class Frontend:
             self._waiting[i] = replace(scan, reference=reference, outer=outer, obstacle=obstacle, cell=cell)
 
     def _take(self, fix: Fix) -> list[Observation]:
-        """One more scan is decided: if it is lost it says nothing."""
+        """One more scan is decided: a lost scan casts no vote."""
         report = self.report
         index = len(report.T_map_lidar)
         report.T_map_lidar.append(fix.registration.T_map_lidar)

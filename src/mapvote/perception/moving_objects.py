@@ -1,20 +1,20 @@
 """Removal of moving objects on an occupancy grid in the world frame (paper II, [9]).
 
 A voxel that is occupied only briefly belongs to a moving object, and connected cells move together.
-"Briefly" is a ratio of what could be observed, never a number of scans: each voxel of a scan is looked at
+"Briefly" is a ratio of what could be observed, never a number of scans: each voxel of a scan is looked up
 from the other scans of a short window; those that saw through it (free) are weighed against
 those that saw something in it (hit), and those that could not see it do not count. Structure that has only
 just come into view was never seen through, so it is not called moving.
 
 Whether a scan saw through a voxel is one look-up in that scan's range image. The voxel is free only if every ray
-close to it, to all sides, went on behind it, so thin things, edges and foliage stay; and only if, over the window,
-rays went through both just below and just above the place, because a ray over a roof says nothing about the roof.
+close to it, to all sides, ended behind it, so thin things, edges and foliage stay; and only if, over the window,
+rays passed both just below and just above the place, because a ray over a roof does not observe the roof.
 It needs no map, only poses, so it serves SLAM and voting alike.
 
 Online: a scan is decided after at most ``lookahead_s`` (1 s), because what a vehicle ahead of
 us hides is seen through only once it has driven on. Nothing older than ``PAST_S`` (2 s) before it is used.
 
-What it cannot tell: a car that waits through the whole window is static, one farther than ``reach_m`` is never called
+Limits: a car that waits through the whole window is static, one farther than ``reach_m`` is never called
 moving, and what only the sky lies behind is judged by the cells it is connected to (rays without return are unknown).
 """
 
@@ -39,11 +39,11 @@ from mapvote.perception.range_image import BOTH_SIDES, U16, LookCounts, Pixels, 
 REACH_M = 57.0
 """Points farther away are never called moving: the corners of the local grid are 56.7 m away."""
 PAST_S = 2.0
-"""How far back other scans are asked."""
+"""How far back other scans are used."""
 LOOKS_PAST = 6
-"""Scans asked before."""
+"""Scans used before."""
 LOOKS_AHEAD = 5
-"""Scans asked after."""
+"""Scans used after."""
 PIXEL_DEG = 0.6
 """Direction pixel of the free-space look-up."""
 TILT_DEG = 4.0
@@ -87,7 +87,7 @@ class MovingFilter:
     """
 
     def __init__(self, sensor: Sensor, settings: MovingSettings, reach_m: float | None = None) -> None:
-        """``reach_m``: how far it looks, REACH_M if nothing is said."""
+        """``reach_m``: the range of the filter, REACH_M by default."""
         self.settings, self.reach_m = settings, REACH_M if reach_m is None else reach_m
         slope_min = np.tan(np.radians(max(sensor.fov_bottom_deg - TILT_DEG, -60.0)))
         slope_max = np.tan(np.radians(min(sensor.fov_top_deg + TILT_DEG, 60.0)))

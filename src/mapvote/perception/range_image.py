@@ -1,7 +1,7 @@
 """Range images of scans, and looks into them: did a scan see through a place, did it hit it, or neither?
 
 Where something lies from a sensor is worked out for all points first, in float32 from the sensor, in loops without a
-branch that vectorise; then each point is entered, or asked for.
+branch that vectorise; then each point is entered, or looked up.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ PER_M = np.float32(500.0)
 NOTHING = np.uint16(65535)
 """Of a range image: no return in that direction."""
 NEAR_M = np.float32(0.5)
-"""What is nearer than this to the sensor in the plane has no direction to speak of."""
+"""Points nearer than this to the sensor in the plane have no usable direction."""
 
 
 class Pixels(NamedTuple):
@@ -37,7 +37,7 @@ class Pixels(NamedTuple):
 
 
 class Samples(NamedTuple):
-    """Places that are asked about, metres from a common point; compacted in place as they are settled."""
+    """Places to look up, metres from a common point; compacted in place as they are settled."""
 
     x: F32
     """(m,)"""
@@ -48,14 +48,14 @@ class Samples(NamedTuple):
 
 
 class LookCounts(NamedTuple):
-    """What scans said of each place, (m,) each."""
+    """What scans observed at each place, (m,) each."""
 
     free: I32
     """Scans that saw through it."""
     hit: I32
     """Scans that saw something in it."""
     sides: U8
-    """Whether a ray went through below (1) and above (2): a ray that only ever passes over a roof proves nothing about
+    """Whether a ray passed below (1) and above (2): a ray that only ever passes over a roof proves nothing about
     the roof."""
 
 
@@ -101,12 +101,12 @@ def range_image(points: F64, origin: F64, pixels: Pixels) -> U16:
 
 
 class Scratch(NamedTuple):
-    """Of :func:`look`, (m,) each: where samples lie as one scan saw them, and what it says of them."""
+    """Of :func:`look`, (m,) each: where samples lie as one scan saw them, and its observation of them."""
 
     steps: I32
     """Horizontal range."""
     pixel: I32
-    """Index into the flat image; 0 where the image cannot tell."""
+    """Index into the flat image; 0 where the image has no answer."""
     around: I32
     """Pixels above and below within which rays bear witness."""
     here: U16
@@ -123,9 +123,9 @@ def room_to_look(m: int) -> Scratch:
 
 
 BOTH_SIDES = np.uint8(3)
-"""Rays went through below and above."""
+"""Rays passed below and above."""
 _LEAST, _MOST = 2, 8
-"""Pixels above and below that are looked at: at 8 m and beyond the least."""
+"""Pixels above and below that are read: at 8 m and beyond the fewest."""
 
 
 @inlined

@@ -28,7 +28,7 @@ class Sight(IntEnum):
     """How far a cell could be seen, the best of all fans that cross it."""
 
     NEVER = 0
-    """No ray was fired that way: the scan says nothing."""
+    """No ray was fired in this direction: no observation."""
     BEYOND = 1
     """Behind the farthest return of every fan."""
     BEHIND = 2
@@ -49,7 +49,7 @@ class ScanView:
     passed: U64
     """Column words of voxels that a ray passed well before its own hit. Bit 63 (all above) is never passed."""
     sight: U8
-    """:class:`Sight` of the cell; (0, 0) where nobody asked for it."""
+    """:class:`Sight` of the cell; (0, 0) if not requested."""
 
 
 @kernel
@@ -108,7 +108,7 @@ def cast_rays(
     ``points_map`` (n, 3) and ``origin_map`` (3,) map metres; ``obstacle`` (n,) as :func:`find_obstacles` gives it
     (which also gives ``cell``, if it is not to be computed again). Points of ``moving`` objects occlude but do not
     occupy (docs/method.md); the rays of ground points prove emptiness above the ground. Without ``with_sight``
-    the view has none: rays are followed to their ends only. ``sky``: which rays went into the
+    the view has none: rays are followed to their ends only. ``sky``: which rays passed into the
     sky (perception/free_rays.py); they are followed, too.
     """
     if cell is None:

@@ -72,7 +72,7 @@ class Layer:
             self.evidence.count(observation)
 
     def finish(self) -> PointMap:
-        """The map of everything laid."""
+        """The map of all points added so far."""
         points, scans = self.cloud.points()
         counts = self._counts(points)
         kept = ~(_standing(points, self.draft) & seen_through(counts))

@@ -3,7 +3,7 @@
 Two passes. The first finds where the vehicles were: each scan is registered to the NDT map grown so far, drives
 one after the other into the same map; then all poses are settled together: precise priors (a survey vehicle's RTK)
 hold the map in their frame, ordinary ones (GNSS) place it where all of them together have it. The second reads the
-scans again and lays them at their settled poses: de-skewed, without moving objects, one point per 0.3 m voxel
+scans again and adds them at their settled poses: de-skewed, without moving objects, one point per 0.3 m voxel
 (slam.accumulate).
 """
 
@@ -30,7 +30,7 @@ MOST_OFF = 0.3
 (a bridge over another drive, a stretch without points); above, something is wrong with the drive."""
 
 _FIRST_DATE_NS = 946_684_800 * 10**9
-"""2000. Clocks that count from zero tell less."""
+"""2000. Clocks that count from zero are below it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,7 +45,7 @@ class Drift:
 
 @dataclass(frozen=True, slots=True)
 class DriveTrack:
-    """Where one drive went."""
+    """The trajectory of one drive."""
 
     vehicle: str
     drive_id: str
@@ -125,7 +125,7 @@ def _place_on_earth(drives: Sequence[Drive]) -> Mapping[str, str]:
 
 
 def _last_stamp(drives: Sequence[Drive]) -> int | None:
-    """When the last drive ended; None if one has a clock that tells no date."""
+    """When the last drive ended; None if the clock of one has no date."""
     ends = [int(drive.stamps_ns[-1]) for drive in drives]
     return max(ends) if min(ends) > _FIRST_DATE_NS else None
 
@@ -136,7 +136,7 @@ def _agreed_heights(drive: Drive, point_map: PointMap, positions: F64) -> Height
     if heights.off_share > MOST_OFF:
         raise MapvoteError(
             f"{drive.path}: {heights.complaint}. Such a map would be wrong without a word: do the drives' heights "
-            "agree (one datum, no drift in z), and is z up? `mapvote doctor` tells; else build the drives apart"
+            "agree (one datum, no drift in z), and is z up? `mapvote doctor` checks it; else build the drives apart"
         )
     return heights
 

@@ -89,20 +89,20 @@ def _unbroken(ground_z: F32) -> Bool:
 
 
 NEAR_M = 20.0
-"""Whoever passes nearer than this, in the plane, should meet what stands."""
+"""A scan nearer than this, in the plane, should hit a standing surface."""
 MET_SHARE = 0.03
-"""Of these places, the share from which it must be met: two scans of seventy, at 10 Hz and 40 km/h twice past."""
+"""Of these places, the share from which it must be hit: two scans of seventy, at 10 Hz and 40 km/h twice past."""
 SPILL_M = 0.06
 """Points of two voxels so near on both sides of their common face are one surface: three sigmas of range noise."""
 _PLACE_M = 1.0
 _MOST_ASKED = 16
-"""Voxels met by more scans than this are not asked: 500 places within 20 m are a survey of a dozen passes."""
+"""Voxels hit by more scans than this are not tested: 500 places within 20 m are a survey of a dozen passes."""
 
 
 def strays(points: F64, scans: I32, driven: F64, lattice: Lattice) -> Bool:
     """(n,) which of a map's points (n, 3), one a voxel, in map metres, are no surface of their own.
 
-    ``scans`` (n,): how many scans met each; ``driven`` (m, 3): where all scans were taken. Places count, a metre apart,
+    ``scans`` (n,): how many scans hit each; ``driven`` (m, 3): where all scans were taken. Places count, a metre apart,
     for who waits at a light sees the same again.
     """
     places = driven[thin(driven, _PLACE_M)]
@@ -114,7 +114,7 @@ def _hardly_met(points: F64, scans: I32, places: F64) -> Bool:
     if not len(places):
         return out
     tree = cKDTree(places[:, :2])
-    # Places near to one point are near to each other: what was met oftener than the most of them ask is not counted.
+    # Places near one point are near each other: voxels hit oftener than the largest number required are skipped.
     most = tree.query_ball_point(places[:, :2], 2.001 * NEAR_M, return_length=True).max()
     asked = np.flatnonzero(scans < min(_MOST_ASKED, MET_SHARE * most))
     if len(asked):
@@ -124,7 +124,7 @@ def _hardly_met(points: F64, scans: I32, places: F64) -> Bool:
 
 
 def _spilled(points: F64, scans: I32, lattice: Lattice) -> Bool:
-    """Points over the side of a voxel beside which more scans met a surface, less than SPILL_M off."""
+    """Points over the side of a voxel beside which more scans hit a surface, less than SPILL_M off."""
     keys = voxel_keys(points, lattice.x0, lattice.y0)
     order = np.argsort(keys)
     out = np.zeros(len(points), dtype=np.bool_)
@@ -236,9 +236,9 @@ TALL_M = 4.0
 def trails(points: F64, balance: I64, height_m: F64, lattice: Lattice) -> Bool:
     """(n,) which of the points (n, 3), one a voxel, above the ground, are trails.
 
-    ``balance`` (n,): in how many scans each point's voxel was met, less in how many rays passed it and met nothing;
-    ``height_m`` (n,) over the ground, NaN where nobody knows that. What belongs to an 8-connected group of cells that
-    was passed more often than met is a trail, but for cells that rise to TALL_M: those did not drive.
+    ``balance`` (n,): the scans that hit each point's voxel, less the scans whose rays passed it without a return;
+    ``height_m`` (n,) over the ground, NaN if unknown. What belongs to an 8-connected group of cells that
+    was passed more often than hit is a trail, but for cells that rise to TALL_M: those did not drive.
     """
     if not len(points):
         return np.zeros(0, dtype=np.bool_)

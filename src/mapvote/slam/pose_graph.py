@@ -5,8 +5,8 @@ whole trajectory keeps the shape of the one in the frame of the other. Source: B
 8.1 and 9.
 
 A precise prior (RTK) holds each pose. Ordinary ones (GNSS) err alike for seconds to minutes, jump and go wild: the
-whole is first laid on the robust fit of them all (slam.prior_alignment), then the graph lets them bend it only as far
-as their number of *independent* errors says, none of them more than its distance from the others allows.
+whole is first moved to the robust fit of them all (slam.prior_alignment), then the graph lets them bend it only as far
+as their number of *independent* errors allows, none of them more than its distance from the others allows.
 """
 
 from __future__ import annotations

@@ -23,7 +23,7 @@ def trust_in(off_m: F64, sigma_m: float) -> F64:
 
 
 def fit_to_priors(positions: F64, prior_positions: F64, sigma_m: float, yaw_rad: float = 0.0) -> F64:
-    """(4, 4) turn about z and shift that lays positions (n, 3) on their priors (n, 3), robustly.
+    """(4, 4) turn about z and shift that fits positions (n, 3) to their priors (n, 3), robustly.
 
     ``yaw_rad`` is kept where the track is too short to say anything about it.
     """

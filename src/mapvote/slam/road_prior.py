@@ -34,7 +34,7 @@ class RoadUnder:
     """The road under one drive."""
 
     points_map: F64
-    """(n, 3) map metres, every 0.15 m along the path; none if it could not be told from the points."""
+    """(n, 3) map metres, every 0.15 m along the path; none if the points do not show it."""
     sensor_height_m: float
     """Of the sensor above it, the drive's median; NaN if unknown."""
     measured_share: float

@@ -3,7 +3,7 @@
 Ordinary priors (GNSS) neither guide nor gate a registration that succeeds: they err by more than it does, and alike
 for a while, which would bend the map. They help where registration fails, moved into the frame of what was driven so
 far. A scan that would jump against the vehicle's motion is not registered; where nothing fits any more the map is
-broken, the track begins anew at the prior, and the report says where.
+broken, the track begins anew at the prior, and the report names the place.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ PRECISE_PRIOR_M, PRECISE_PRIOR_DEG = 0.1, 0.2
 """A prior at least this good, in both, is a surveyor's: it guides each registration and holds the map's frame. A place
 to 2 cm without an attitude would turn scans to where they meet it: .4 deg, .1 m at 10 m."""
 _MIN_INLIER_SHARE = 0.4
-"""As the setting of ndt, while the map is still growing: half of a scan may look at what nobody has seen yet."""
+"""As the setting of ndt, while the map is still growing: half of a scan may observe unmapped places."""
 _POINTS_M = 0.3
 """Scans enter the NDT map thinned to one point per such voxel: the paper's storage resolution."""
 _FINE = replace(LEVELS[-1], floor_m=0.03, points_m=0.5)
@@ -42,7 +42,7 @@ _PATIENCE = 5
 
 @dataclass(frozen=True, slots=True)
 class Surveyed:
-    """Where one drive went, in the frame of the draft."""
+    """The trajectory of one drive, in the frame of the draft."""
 
     T_map_lidar: F64
     """(n, 4, 4); of a scan that was not registered the best guess."""
@@ -62,7 +62,7 @@ class Surveyor:
     """The NDT map as it grows, drive after drive."""
 
     def __init__(self, settings: Settings, all_precise: bool = False) -> None:
-        """``all_precise``: only drives with a surveyor's prior will come, at which nobody takes a last look."""
+        """``all_precise``: only drives with a surveyor's prior will come; they get no final check."""
         self._all_precise = all_precise
         self.ndt = settings.ndt.model_copy(update={"min_inlier_share": _MIN_INLIER_SHARE})
         self.ndt_map: NdtMap | None = None
@@ -72,10 +72,10 @@ class Surveyor:
         """A cloud of everything, for the ground and the occupied voxels that the second pass needs."""
         self._found: list[F64] = []
         self._told: list[F64] = []
-        """Positions (3,) of registered scans and of their priors, to tell the frame of the priors by."""
+        """Positions (3,) of registered scans and of their priors, which determine the frame of the priors."""
 
     def follow(self, drive: Drive, count: Callable[[], None]) -> Surveyed:
-        """Where one drive went, each scan entered once it is registered. MapvoteError if fewer than half could be."""
+        """The trajectory of one drive; each scan is entered once registered. MapvoteError if fewer than half were."""
         tracker = Tracker(self._map_around, self.ndt)
         tracker.twist = _first_motion(drive)
         precise = is_precise(drive)
