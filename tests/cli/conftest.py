@@ -12,16 +12,15 @@ import pytest
 
 from command_line import type_in
 from hand_made import Say, make_ballot, states_plane, two_walls
-from mapvote.codec.ballot import encode
 from mapvote.core.geometry import from_xyz_rpy, transform
 from mapvote.core.point_map import all_points
 from mapvote.core.types import F64, CellState
 from mapvote.formats import read_map, write_pcd
 from mapvote.formats.maps.cloud import Cloud
 from mapvote.formats.maps.las import write_las
-from mapvote.server.store.admission import accept, examine
 from mapvote.server.store.publish import publish
 from mapvote.server.store.store import Store
+from stores import send
 
 TINY = """
 name = "tiny"
@@ -103,7 +102,7 @@ def make_store(path: Path) -> None:
     gone = {(0, 0): Say(states_plane({(10, c): CellState.CHANGED_EMPTY for c in (10, 11, 12)}))}
     stays = {(0, 1): Say(states_plane({(10, c): CellState.UNCHANGED_OCCUPIED for c in (10, 11, 12)}))}
     store = Store.create(f"sqlite:///{path}", before)
-    accept(store, [examine(encode(make_ballot(before, gone, name))) for name in ("VEHICLE", "car_1")])
+    send(store, *[make_ballot(before, gone, name) for name in ("VEHICLE", "car_1")])
     publish(store, override=True)
-    accept(store, [examine(encode(make_ballot(before, stays, name, "d2"))) for name in ("VEHICLE", "car_1")])
+    send(store, *[make_ballot(before, stays, name, "d2") for name in ("VEHICLE", "car_1")])
     store.close()

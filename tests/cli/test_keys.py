@@ -9,12 +9,11 @@ import pytest
 
 from hand_made import Say, make_ballot, states_plane, two_walls
 from mapvote.cli.operate import keys, policy
-from mapvote.codec.ballot import encode
 from mapvote.core.types import CellState
-from mapvote.server.store.admission import accept, examine
 from mapvote.server.store.keys import ballots_standing, issue
 from mapvote.server.store.store import Store
 from mapvote.server.views.events import events_after, newest_event
+from stores import send
 
 
 class Terminal(io.StringIO):
@@ -35,7 +34,7 @@ def test_who_revokes_a_key_is_asked_what_becomes_of_the_votes(
     store = Store.create(f"sqlite:///{tmp_path / 'fleet.db'}", two_walls())
     issue(store, "car_1", "vehicle")
     say = Say(states_plane({(10, 10): CellState.CHANGED_EMPTY}))
-    accept(store, [examine(encode(make_ballot(two_walls(), {(0, 0): say}, "car_1", end_ns=1_700_000_000 * 10**9)))])
+    send(store, make_ballot(two_walls(), {(0, 0): say}, "car_1", end_ns=1_700_000_000 * 10**9))
     monkeypatch.setattr("sys.stdin", typed)
     keys(str(tmp_path / "fleet.db"), "revoke", "car_1", keep_votes=said)
     assert ballots_standing(store, "car_1") == left

@@ -11,19 +11,16 @@ import pytest
 import sqlalchemy as sa
 from typer.testing import CliRunner
 
-from hand_made import Say, make_ballot, make_map, make_tile, states_plane, wall
+from hand_made import make_ballot, make_map, make_tile, wall
 from live_server import serving
 from mapvote.cli import app
-from mapvote.codec.ballot import encode
 from mapvote.config import FuseSettings
-from mapvote.core.types import CellState, MapvoteError
+from mapvote.core.types import MapvoteError
 from mapvote.server.store import schema
-from mapvote.server.store.admission import accept, examine
 from mapvote.server.store.integrity import set_aside
 from mapvote.server.store.policy import Policy
 from mapvote.server.store.store import Store
-
-WALL = [(10, 10), (10, 11), (10, 12)]
+from stores import WALL, send, wall_gone
 
 
 @pytest.fixture(scope="module")
@@ -34,8 +31,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, str]]:
     policy = Policy(fuse=FuseSettings(max_deleted_share=1.0))
     store = Store.create(f"sqlite:///{home / 's.db'}", make_map(tiles), policy)
     for vehicle in ("a", "b"):
-        say = Say(states_plane(dict.fromkeys(WALL, CellState.CHANGED_EMPTY)))
-        accept(store, [examine(encode(make_ballot(store.point_map(), {(0, 2): say}, vehicle)))])
+        send(store, make_ballot(store.point_map(), {(0, 2): wall_gone()}, vehicle))
     store.close()
     with serving(home / "s.db", log=home / "log") as (url, _):
         yield str(home / "s.db"), url
@@ -98,8 +94,7 @@ def test_only_tiles_that_changed_since_a_version_are_written(site: tuple[str, st
 def test_a_server_rolls_back_and_withdraws_a_drive(tmp_path: Path) -> None:
     point_map = make_map({(0, 0): make_tile(wall(WALL, [0.05, 0.45]))})
     store = Store.create(f"sqlite:///{tmp_path / 's.db'}", point_map)
-    gone = Say(states_plane(dict.fromkeys(WALL, CellState.CHANGED_EMPTY)))
-    accept(store, [examine(encode(make_ballot(point_map, {(0, 0): gone}, name, "d"))) for name in ("a", "b")])
+    send(store, *[make_ballot(point_map, {(0, 0): wall_gone()}, name, "d") for name in ("a", "b")])
     store.close()
     with serving(tmp_path / "s.db", log=tmp_path / "log") as (url, _):
         assert "version 2 (published)" in say("publish", url, "--override")

@@ -19,10 +19,10 @@ from mapvote.codec.ballot import encode
 from mapvote.config import FuseSettings
 from mapvote.core.types import CellState
 from mapvote.server.http.app import create_app
-from mapvote.server.store.admission import accept, examine
 from mapvote.server.store.policy import Policy
 from mapvote.server.store.publish import publish
 from mapvote.server.store.store import Store
+from stores import send
 
 BALLOT = make_ballot(two_walls(), {(0, 0): Say(states_plane({(10, 10): CellState.UNCHANGED_OCCUPIED}))}, "a", "d1")
 Answer = tuple[int, dict[str, str]]
@@ -148,7 +148,7 @@ def take_down_a_wall(store: Store, tile: tuple[int, int] = (0, 3)) -> None:
     base = store.point_map()
     for vehicle in ("a", "b"):
         say = Say(states_plane({(10, 10): CellState.CHANGED_EMPTY}))
-        accept(store, [examine(encode(make_ballot(base, {tile: say}, vehicle)))])
+        send(store, make_ballot(base, {tile: say}, vehicle))
     assert publish(store).published
 
 

@@ -14,19 +14,18 @@ from msgspec.structs import replace
 from pydantic import TypeAdapter
 
 from hand_made import Say, make_ballot, states_plane, two_walls
-from mapvote.codec.ballot import encode
+from mapvote.codec.ballot import Ballot, encode
 from mapvote.codec.path import pack_path
 from mapvote.config import FuseSettings
 from mapvote.core.types import CellState
 from mapvote.server.http.answers import Answer
 from mapvote.server.http.app import ROUTES, create_app
 from mapvote.server.http.health_routes import Probe
-from mapvote.server.store.admission import accept, examine
 from mapvote.server.store.policy import Policy
 from mapvote.server.store.publish import publish
 from mapvote.server.store.store import Store
+from stores import WALL, send
 
-WALL = [(10, 10), (10, 11), (10, 12)]
 ASKED: list[tuple[str, str, str, Any]] = [
     ("GET", "/healthz", "", None),
     ("GET", "/readyz", "", None),
@@ -64,12 +63,11 @@ NEVER_HERE = {("DELETE", "/v1/publish")}
 """Nothing is being published in this test; see test_desk.py."""
 
 
-def ballot(store: Store, vehicle: str, drive: str, gone: list[tuple[int, int]], tile: tuple[int, int]) -> bytes:
+def ballot(store: Store, vehicle: str, drive: str, gone: list[tuple[int, int]], tile: tuple[int, int]) -> Ballot:
     states = states_plane(dict.fromkeys(gone, CellState.CHANGED_EMPTY), fill=CellState.UNCHANGED_EMPTY)
     made = make_ballot(store.point_map(), {tile: Say(states)}, vehicle, drive, end_ns=store.clock())
     driven = [np.array([x + 76.8 * tile[1], 3.0]) for x in (3.0, 6.0, 9.0)]
-    made = replace(made, path=pack_path(driven, store.lattice))
-    return encode(made)
+    return replace(made, path=pack_path(driven, store.lattice))
 
 
 @pytest.fixture
@@ -78,7 +76,7 @@ def store(tmp_path: Path) -> Iterator[Store]:
     store = Store.create(f"sqlite:///{tmp_path / 's.db'}", two_walls(), Policy(fuse=FuseSettings(max_deleted_share=1)))
     for number, tile in ((1, (0, 0)), (2, (0, 1))):
         for vehicle in "ab":
-            accept(store, [examine(ballot(store, vehicle, f"d{number}", WALL, tile))])
+            send(store, ballot(store, vehicle, f"d{number}", WALL, tile))
         if number == 1:
             publish(store)
     yield store
@@ -97,7 +95,7 @@ def test_every_json_answer_is_as_openapi_declares_it(store: Store) -> None:
         for method, path, asked, sent in ASKED:
             url = (asked or path).replace("SEQ", kept.get("seq", ""))
             if sent == "BALLOT":
-                answer = client.put(url, content=ballot(store, "a", "d3", WALL, (0, 1)))
+                answer = client.put(url, content=encode(ballot(store, "a", "d3", WALL, (0, 1))))
             else:
                 body = {k: kept["pending"] if v == "PENDING" else v for k, v in sent.items()} if sent else None
                 answer = client.request(method, url, json=body)

@@ -14,19 +14,17 @@ import pytest
 from fastapi.testclient import TestClient
 from msgspec.structs import replace
 
-from hand_made import Say, make_ballot, make_map, states_plane, two_walls
-from mapvote.codec.ballot import encode
+from hand_made import make_ballot, make_map, two_walls
 from mapvote.codec.path import pack_path
 from mapvote.config import FuseSettings
 from mapvote.core.tile import Tile
 from mapvote.core.types import CellState
 from mapvote.fusion.loss_budget import change_probability
 from mapvote.server.http.app import create_app
-from mapvote.server.store.admission import accept, examine
 from mapvote.server.store.publish import publish
 from mapvote.server.store.store import Store
+from stores import send, wall_gone
 
-WALL = [(10, 10), (10, 11), (10, 12)]
 VENDORED = {
     "three.core.min.js": "e5a824c8ec97ee44aeb8ce0ab64664e1dd1777df9d0ab2345b35f9941a9fcf33",
     "three.module.min.js": "0f860495069067a103d1df99e2bb01260f250e118ed7a50537167412ba195a0a",
@@ -39,12 +37,11 @@ def client(tmp_path: Path) -> Iterator[TestClient]:
     """Two walls, one of which two vehicles saw gone."""
     store = Store.create(f"sqlite:///{tmp_path / 'store.db'}", two_walls())
     for name in ("v1", "v2"):
-        states = states_plane(dict.fromkeys(WALL, CellState.CHANGED_EMPTY), fill=CellState.UNCHANGED_EMPTY)
-        ballot = make_ballot(two_walls(), {(0, 0): Say(states)}, name, end_ns=store.clock())
+        ballot = make_ballot(two_walls(), {(0, 0): wall_gone(CellState.UNCHANGED_EMPTY)}, name, end_ns=store.clock())
         if name == "v1":
             way = [np.array([x, 6.0, 2.0]) for x in np.arange(2.0, 42.0, 0.5)]
             ballot = replace(ballot, path=pack_path(way, store.lattice))
-        accept(store, [examine(encode(ballot))])
+        send(store, ballot)
     publish(store, FuseSettings(max_deleted_share=1.0))
     with TestClient(create_app(store, opened=True), base_url="http://localhost") as found:
         yield found

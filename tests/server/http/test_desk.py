@@ -11,28 +11,25 @@ from typing import Any
 import pytest
 from fastapi.testclient import TestClient
 
-from hand_made import Say, make_ballot, states_plane, two_walls
-from mapvote.codec.ballot import encode
+from hand_made import make_ballot, two_walls
 from mapvote.config import FuseSettings
 from mapvote.core.types import CellState
 from mapvote.server.http.app import create_app
 from mapvote.server.store import keys
-from mapvote.server.store.admission import accept, examine
 from mapvote.server.store.planes import TileHashes
 from mapvote.server.store.round import round_at
 from mapvote.server.store.store import Store
 from mapvote.server.views.point_lod import Clouds
+from stores import send, wall_gone
 
-WALL = [(10, 10), (10, 11), (10, 12)]
 Server = tuple[TestClient, Store, dict[str, dict[str, str]]]
 
 
 def vote(store: Store, drive: str, vehicles: tuple[str, ...] = ("v1", "v2")) -> None:
     """These vehicles say that both walls are gone."""
     for name in vehicles:
-        states = states_plane(dict.fromkeys(WALL, CellState.CHANGED_EMPTY), fill=CellState.UNCHANGED_EMPTY)
-        says = {(0, 0): Say(states), (0, 1): Say(states)}
-        accept(store, [examine(encode(make_ballot(two_walls(), says, name, drive, end_ns=store.clock())))])
+        says = dict.fromkeys([(0, 0), (0, 1)], wall_gone(CellState.UNCHANGED_EMPTY))
+        send(store, make_ballot(two_walls(), says, name, drive, end_ns=store.clock()))
 
 
 @pytest.fixture

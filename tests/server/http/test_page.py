@@ -19,16 +19,15 @@ from msgspec.structs import replace
 from chromium import Chromium, program
 from hand_made import Say, make_ballot, make_map, make_tile, states_plane, wall
 from live_server import serving
-from mapvote.codec.ballot import encode
 from mapvote.codec.path import pack_path
 from mapvote.config import FuseSettings
 from mapvote.core.types import CellState
 from mapvote.server.http.app import create_app
-from mapvote.server.store.admission import accept, examine
 from mapvote.server.store.publish import publish
 from mapvote.server.store.store import Store
 from mapvote.server.views.cutout import whole_page
 from mapvote.server.views.history import changes_between, cutouts_between
+from stores import send
 
 HOUSE = [(r, c) for r in range(40, 60) for c in range(40, 70) if r in (40, 59) or c in (40, 69)]
 SHED = [(r, c) for r in range(150, 160) for c in range(150, 160) if r in (150, 159) or c in (150, 159)]
@@ -62,7 +61,7 @@ def village(database: str) -> None:
             base = opened.point_map()
             ballot = make_ballot(base, {(0, 0): Say(states)}, name, f"d{number}", end_ns=opened.clock())
             ballot = replace(ballot, path=pack_path([np.array([x, 30.0]) for x in range(4, 74, 5)], opened.lattice))
-            accept(opened, [examine(encode(ballot))])
+            send(opened, ballot)
         if number == 0:
             publish(opened, by="<b>boss</b>", reason="<script>alert(1)</script>")
     opened.close()

@@ -15,9 +15,9 @@ from hand_made import make_map, make_tile, wall
 from mapvote.server.store.planes import TileHashes
 from mapvote.server.store.store import Store
 from mapvote.server.views.point_lod import Clouds, came_and_went
+from stores import WALL
 
 TESTS = Path(__file__).parent / "page"
-WALL = [(10, 10), (10, 11), (10, 12)]
 
 
 def test_the_modules_of_the_page_do_what_they_say(tmp_path: Path) -> None:

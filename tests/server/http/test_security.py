@@ -10,11 +10,10 @@ import pytest
 
 from hand_made import Say, make_ballot, states_plane, two_walls
 from live_server import serving
-from mapvote.codec.ballot import encode
 from mapvote.core.types import CellState
 from mapvote.server.http.security import HEADERS
-from mapvote.server.store.admission import accept, examine
 from mapvote.server.store.store import Store
+from stores import send
 
 
 @pytest.fixture(scope="module")
@@ -23,7 +22,7 @@ def url(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     home = tmp_path_factory.mktemp("browsers")
     store = Store.create(f"sqlite:///{home / 's.db'}", two_walls())
     says = {(0, 0): Say(states_plane({(10, 10): CellState.CHANGED_EMPTY}))}
-    accept(store, [examine(encode(make_ballot(two_walls(), says, vehicle, "d1"))) for vehicle in ("a", "b")])
+    send(store, *[make_ballot(two_walls(), says, vehicle, "d1") for vehicle in ("a", "b")])
     (home / "server.toml").write_text('[server]\nhosts = ["maps.example.org"]\n')
     with serving(home / "s.db", "--config", home / "server.toml", log=home / "log") as (address, _):
         yield address

@@ -22,9 +22,9 @@ from mapvote.core.point_map import PointMap
 from mapvote.core.types import CellState, MapvoteError
 from mapvote.server.http.app import create_app
 from mapvote.server.store import keys
-from mapvote.server.store.admission import accept, examine
 from mapvote.server.store.publish import publish
 from mapvote.server.store.store import Store
+from stores import send
 
 CELL = (10, 10)
 
@@ -158,8 +158,7 @@ def test_a_manifest_is_sent_again_only_when_the_map_is_a_new_one(tmp_path: Path)
         again = http.get("/v1/map", headers=known)
         assert (again.status_code, again.content) == (304, b"")
         assert http.get("/v1/map?since=1", headers=known).json()["tiles"] == {}
-        ballots = [says(store.point_map(), vehicle) for vehicle in ("a", "b")]
-        accept(elsewhere, [examine(encode(ballot)) for ballot in ballots])
+        send(elsewhere, *[says(store.point_map(), vehicle) for vehicle in ("a", "b")])
         assert publish(elsewhere, FuseSettings(max_deleted_share=1.0)).version == 2
         new = http.get("/v1/map", headers=known)
         assert (new.status_code, new.json()["version"]) == (200, 2)

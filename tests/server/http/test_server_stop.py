@@ -17,8 +17,8 @@ from mapvote.codec.ballot import Ballot, encode
 from mapvote.core.point_map import PointMap
 from mapvote.core.types import CellState
 from mapvote.server.store import schema
-from mapvote.server.store.admission import accept, examine
 from mapvote.server.store.store import Store
+from stores import send
 
 PILLAR = (10, 10)
 TILES = [(row, col) for row in range(20) for col in range(20)]
@@ -53,7 +53,7 @@ def send_until_stopped(url: str, vehicle: str, point_map: PointMap, acknowledged
 def test_a_stop_under_load_is_soon_and_loses_nothing(tmp_path: Path, after_s: float) -> None:
     point_map = street()
     store = Store.create(f"sqlite:///{tmp_path / 's.db'}", point_map)
-    accept(store, [examine(encode(gone_everywhere(point_map, vehicle))) for vehicle in ("a", "b")])
+    send(store, *[gone_everywhere(point_map, vehicle) for vehicle in ("a", "b")])
     acknowledged: set[tuple[str, str]] = set()
     published: list[int] = []
     connected = threading.Event()

@@ -11,16 +11,14 @@ from fastapi.testclient import TestClient
 from chromium import Chromium, program
 from hand_made import Say, make_ballot, make_map, make_tile, states_plane, wall
 from live_server import mapvote, serving
-from mapvote.codec.ballot import encode
 from mapvote.config import FuseSettings
 from mapvote.core.types import CellState
 from mapvote.server.http.app import create_app
 from mapvote.server.store import keys
-from mapvote.server.store.admission import accept, examine
-from mapvote.server.store.ballots import Receipt
 from mapvote.server.store.publish import publish
 from mapvote.server.store.store import Store
 from mapvote.server.views.history import vehicle_standings
+from stores import send
 
 HOUSE = [(r, c) for r in range(40, 60) for c in range(40, 70) if r in (40, 59) or c in (40, 69)]
 GHOSTS = [(r + i, c + j) for r in range(100, 250, 30) for c in range(100, 250, 30) for i in range(3) for j in range(3)]
@@ -43,8 +41,7 @@ def town(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
                 states[cell] = CellState.CHANGED_OCCUPIED
         name = "liar" if i == 3 else f"v{i}"
         ballot = make_ballot(point_map, {(0, 0): Say(states)}, name, "d1", end_ns=now - (10 - i) * HOUR)
-        (receipt,) = accept(store, [examine(encode(ballot))])
-        assert isinstance(receipt, Receipt)
+        send(store, ballot)
     assert publish(store, FuseSettings(max_deleted_share=1.0), reason="the house is gone").version == 2
     key = keys.issue(store, "boss", "operator")
     store.close()

@@ -16,14 +16,12 @@ import sqlalchemy as sa
 
 from hand_made import Say, make_ballot, make_map, make_tile, states_plane, wall
 from live_server import mapvote
-from mapvote.codec.ballot import encode
 from mapvote.config import FuseSettings
 from mapvote.core.types import CellState
 from mapvote.server.store import schema
-from mapvote.server.store.admission import accept, examine
-from mapvote.server.store.ballots import Receipt
 from mapvote.server.store.publish import publish
 from mapvote.server.store.store import Store
+from stores import send
 
 pytestmark = pytest.mark.slow
 TILES = [(row, col) for row in range(2) for col in range(3)]
@@ -79,8 +77,7 @@ def voted(url: str) -> Store:
             jitter = rng.normal(0, 0.02, (3 * len(new), 3)).astype(np.float32)
             says[index] = Say(states, new_points=wall(new, HEIGHTS) + jitter)
         ballot = make_ballot(point_map, says, f"v{i}", "d1", end_ns=1_690_000_000_000_000_000 + i)
-        (receipt,) = accept(store, [examine(encode(ballot))])
-        assert isinstance(receipt, Receipt)
+        send(store, ballot)
     return store
 
 

@@ -12,14 +12,11 @@ import sqlalchemy as sa
 
 from hand_made import Say, make_ballot, two_walls
 from histories import START_S, WALL, History, seen_along
-from mapvote.codec.ballot import encode
 from mapvote.config import FuseSettings
 from mapvote.core.grid import CELLS
 from mapvote.core.types import CellState
 from mapvote.fusion.fuse import decide_tile, rule_of
 from mapvote.server.store import schema
-from mapvote.server.store.admission import accept, examine
-from mapvote.server.store.ballots import Receipt
 from mapvote.server.store.decisions import REASONS, Record, Standing, packed_cells, records_of
 from mapvote.server.store.policy import Policy
 from mapvote.server.store.publish import publish
@@ -28,6 +25,7 @@ from mapvote.server.store.reviews import decide
 from mapvote.server.store.store import Store, Version
 from mapvote.server.store.votes import Electorate, from_sound_ballots, judged_on, read_votes, stored_votes
 from standing_clock import Clock
+from stores import send
 
 HERE = (0, 0)
 CELL, OTHER = WALL[0], WALL[1]
@@ -55,8 +53,7 @@ def cast(store: Store, clock: Clock, vehicle: str, cell: tuple[int, int] = CELL,
     states[cell] = CE
     base = {HERE: store.manifest(1).tiles[HERE].points}
     ballot = make_ballot(two_walls(), {HERE: Say(states)}, vehicle, f"d{clock.now}", clock.now, base=base, version=1)
-    (receipt,) = accept(store, [examine(encode(ballot))])
-    assert isinstance(receipt, Receipt), receipt
+    (receipt,) = send(store, ballot)
     return receipt.seq
 
 
@@ -138,7 +135,7 @@ def heard_again(store: Store, connection: sa.Connection, version: Version) -> di
     }
 
 
-@pytest.mark.parametrize("seed", [0, 1, 3])
+@pytest.mark.parametrize("seed", [pytest.param(0, marks=pytest.mark.slow), pytest.param(1, marks=pytest.mark.slow), 3])
 def test_the_records_of_a_random_history_say_what_fusing_it_again_finds(seed: int, tmp_path: Path) -> None:
     history = History(seed, lambda clock: Store.create(f"sqlite:///{tmp_path / 'store.db'}", two_walls(), clock=clock))
     history.live(25)

@@ -19,7 +19,7 @@ from pypcd4 import PointCloud
 from hand_made import Say, make_ballot, states_plane, wall
 from mapvote.cli.files import follow_once
 from mapvote.client import MapClient
-from mapvote.codec.ballot import Ballot, encode
+from mapvote.codec.ballot import Ballot
 from mapvote.codec.fields import FIELD_TYPES, pack_fields, unpack_fields
 from mapvote.codec.points import pack_points, unpack_points
 from mapvote.codec.tile_file import encode_tile
@@ -33,7 +33,6 @@ from mapvote.formats import export_map, read_map
 from mapvote.fusion.offline import update_map
 from mapvote.server.http.app import create_app
 from mapvote.server.store import schema
-from mapvote.server.store.admission import accept, examine
 from mapvote.server.store.integrity import check, set_aside
 from mapvote.server.store.policy import Policy
 from mapvote.server.store.publish import publish, rollback
@@ -41,6 +40,7 @@ from mapvote.server.store.replay import replay
 from mapvote.server.store.retention import clear
 from mapvote.server.store.store import Store
 from mapvote.server.views.overview import overview
+from stores import send
 
 POLICY = Policy(fuse=FuseSettings(max_deleted_share=1.0))
 BUILT = unpack_points(pack_points(wall([(200, 200)], [0.45, 0.75])))
@@ -86,7 +86,7 @@ def store(database_url: str) -> Iterator[Store]:
 
 
 def vote(store: Store, vehicles: str = "ab") -> None:
-    accept(store, [examine(encode(ballot)) for ballot in ballots(store.point_map(1), vehicles)])
+    send(store, *ballots(store.point_map(1), vehicles))
 
 
 def test_every_point_that_stays_keeps_its_fields_and_new_ones_have_the_sensors_intensity(store: Store) -> None:

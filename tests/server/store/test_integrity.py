@@ -10,13 +10,10 @@ import sqlalchemy as sa
 
 from hand_made import Say, make_ballot, states_plane, two_walls
 from mapvote.codec.arrays import unpack_bytes
-from mapvote.codec.ballot import encode
 from mapvote.config import FuseSettings
 from mapvote.core.tile import Tile
 from mapvote.core.types import CellState
 from mapvote.server.store import schema
-from mapvote.server.store.admission import accept, examine
-from mapvote.server.store.ballots import Receipt
 from mapvote.server.store.integrity import ballot_name, check, set_aside
 from mapvote.server.store.planes import pack_tile
 from mapvote.server.store.policy import Policy
@@ -24,6 +21,7 @@ from mapvote.server.store.publish import publish
 from mapvote.server.store.store import Store
 from mapvote.server.views.history import changes_between, vehicle_standings
 from mapvote.server.views.point_lod import Clouds, evidence
+from stores import send
 
 CELL = (10, 10)
 POLICY = Policy(fuse=FuseSettings(max_deleted_share=1.0))
@@ -36,8 +34,7 @@ def store(database_url: str) -> Iterator[Store]:
     for vehicle in ("a", "b", "c"):
         say = Say(states_plane({CELL: CellState.CHANGED_EMPTY}))
         ballot = make_ballot(base, dict.fromkeys(base.tiles, say), vehicle)
-        (receipt,) = accept(store, [examine(encode(ballot))])
-        assert isinstance(receipt, Receipt)
+        send(store, ballot)
     yield store
     store.close()
 
@@ -102,10 +99,9 @@ def test_what_is_damaged_hides_nothing_else_from_whoever_looks(store: Store) -> 
 def test_a_tile_whose_deciding_ballots_are_set_aside_is_decided_anew(store: Store) -> None:
     base, t = store.point_map(), schema.ballot_tiles
     deny = {(0, 0): Say(states_plane({CELL: CellState.UNCHANGED_OCCUPIED}))}
-    receipts = accept(store, [examine(encode(make_ballot(base, deny, vehicle))) for vehicle in "defg"])
+    receipts = send(store, *[make_ballot(base, deny, vehicle) for vehicle in "defg"])
     assert list(publish(store).tiles) == [(0, 1)], "three against four"
     for receipt in receipts:
-        assert isinstance(receipt, Receipt)
         flip(store, t, "states", t.c.ballot == receipt.seq)
     assert len(check(store, mend=True)) == 4
     assert list(publish(store).tiles) == [(0, 0)]
@@ -149,8 +145,7 @@ def test_a_ballot_on_a_tile_whose_memory_is_damaged_is_admitted_and_waits(store:
     memory = store.manifest(2).tiles[0, 0].memory
     assert memory is not None
     flip(store, schema.blobs, "data", schema.blobs.c.hash == memory)
-    (receipt,) = accept(store, [examine(encode(late))])
-    assert isinstance(receipt, Receipt), receipt
+    send(store, late)
     assert not publish(store).published
 
 

@@ -7,16 +7,17 @@ from collections.abc import Iterator
 import pytest
 
 from hand_made import Say, make_ballot, states_plane, two_walls
-from mapvote.codec.ballot import encode
+from mapvote.codec.ballot import Ballot, encode
 from mapvote.core.types import CellState, MapvoteError
 from mapvote.fusion.tile_vote import DAY_NS
 from mapvote.server.errors import NotFound, Unauthorised
 from mapvote.server.store import keys
-from mapvote.server.store.admission import Intake, Sent, accept, examine, sound
+from mapvote.server.store.admission import Intake, Sent, sound
 from mapvote.server.store.publish import preview, publish
 from mapvote.server.store.replay import replay
 from mapvote.server.store.store import Store
 from standing_clock import Clock
+from stores import send
 
 NOON = 1_700_000_000 * 10**9
 
@@ -77,16 +78,16 @@ def test_a_pseudonym_is_always_the_same_and_tells_nothing(store: Store) -> None:
     assert not any(name in text.removeprefix("vehicle-") for name, text in shown.items())
 
 
-def takes_the_wall_down(vehicle: str) -> bytes:
+def takes_the_wall_down(vehicle: str) -> Ballot:
     say = Say(states_plane({(10, 10): CellState.CHANGED_EMPTY}))
-    return encode(make_ballot(two_walls(), {(0, 0): say}, vehicle, end_ns=NOON))
+    return make_ballot(two_walls(), {(0, 0): say}, vehicle, end_ns=NOON)
 
 
 @pytest.mark.parametrize("keep_votes", [False, True])
 def test_whose_key_is_revoked_is_not_heard_any_more_unless_one_says_so(store: Store, keep_votes: bool) -> None:
     for vehicle in ("v1", "v2"):
         keys.issue(store, vehicle, "vehicle")
-        accept(store, [examine(takes_the_wall_down(vehicle))])
+        send(store, takes_the_wall_down(vehicle))
     assert keys.revoke(store, "v1", keep_votes=keep_votes) == (1, 0 if keep_votes else 1)
     assert preview(store).deleted == (3 if keep_votes else 0)
 
@@ -94,7 +95,7 @@ def test_whose_key_is_revoked_is_not_heard_any_more_unless_one_says_so(store: St
 def test_what_a_revoked_vehicle_took_part_in_stays_published_and_can_be_replayed_without_it(store: Store) -> None:
     for vehicle in ("v1", "v2"):
         keys.issue(store, vehicle, "vehicle")
-        accept(store, [examine(takes_the_wall_down(vehicle))])
+        send(store, takes_the_wall_down(vehicle))
     assert publish(store, override=True).deleted == 3
     keys.revoke(store, "v1")
     assert not publish(store).published, "nothing comes back by itself"
@@ -103,7 +104,7 @@ def test_what_a_revoked_vehicle_took_part_in_stays_published_and_can_be_replayed
 
 def test_a_ballot_on_its_way_while_its_key_is_revoked_is_refused(store: Store) -> None:
     secret, intake = keys.issue(store, "v1", "vehicle"), Intake(store)
-    decoded = sound(Sent(takes_the_wall_down("v1"), "v1", "d1", keys.hash_of(secret)))
+    decoded = sound(Sent(encode(takes_the_wall_down("v1")), "v1", "d1", keys.hash_of(secret)))
     keys.revoke(store, "v1")
     (answer,) = intake.write([decoded])
     assert isinstance(answer, Unauthorised)

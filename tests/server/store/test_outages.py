@@ -10,15 +10,13 @@ import numpy as np
 import pytest
 
 from hand_made import Say, make_ballot, states_plane, two_walls
-from mapvote.codec.ballot import encode
 from mapvote.config import FuseSettings
 from mapvote.core.types import CellState, MapvoteError
 from mapvote.server.errors import Unavailable
-from mapvote.server.store.admission import accept, examine
-from mapvote.server.store.ballots import Receipt
 from mapvote.server.store.publish import publish
 from mapvote.server.store.store import Store
 from postgres_cluster import PostgresCluster
+from stores import send
 
 S = 1_000_000_000
 POLICY = FuseSettings(max_deleted_share=1.0)
@@ -29,8 +27,7 @@ def vote(store: Store, drive: str, vehicle: str = "v1") -> None:
     noise = np.random.default_rng(len(drive)).random((5000, 3), dtype=np.float32) * np.array([76, 76, 1], np.float32)
     say = Say(states_plane({(10, 10): CellState.CHANGED_EMPTY}), new_points=noise)
     ballot = make_ballot(two_walls(), {(0, 0): say}, vehicle, drive, end_ns=store.clock() - S)
-    (receipt,) = accept(store, [examine(encode(ballot))])
-    assert isinstance(receipt, Receipt)
+    send(store, ballot)
 
 
 def vote_until_refused(store: Store, acknowledged: list[str]) -> None:

@@ -16,16 +16,14 @@ from typer.testing import CliRunner
 
 from hand_made import Cell, Say, make_ballot, states_plane, two_walls, wall, words_plane
 from mapvote.cli import app
-from mapvote.codec.ballot import encode
 from mapvote.config import FuseSettings
 from mapvote.core.point_map import PointMap
 from mapvote.core.types import CellState, MapvoteError
 from mapvote.server.errors import Conflict, NotFound
-from mapvote.server.store.admission import accept, examine
-from mapvote.server.store.ballots import Receipt
 from mapvote.server.store.publish import publish, rollback, write_version
 from mapvote.server.store.replay import replay
 from mapvote.server.store.store import Store
+from stores import send
 
 EMPTY, BUILT, KEEPS = CellState.CHANGED_EMPTY, CellState.CHANGED_OCCUPIED, CellState.UNCHANGED_OCCUPIED
 WALL: list[Cell] = [(10, 10), (10, 11), (10, 12)]
@@ -51,10 +49,8 @@ def say(states: dict[Cell, int], shift: float = 0.0) -> Say:
     return Say(states_plane({FAR: CellState.UNCHANGED_EMPTY, **states}), new_points=points, free=free)
 
 
-def send(store: Store, base: PointMap, vehicle: str, says: Say, drive: str = "d", end_s: int = 1_700_000_000) -> None:
-    ballot = make_ballot(base, {(0, 0): says}, vehicle, drive, end_ns=end_s * 10**9)
-    (receipt,) = accept(store, [examine(encode(ballot))])
-    assert isinstance(receipt, Receipt), receipt
+def cast(store: Store, base: PointMap, vehicle: str, says: Say, drive: str = "d", end_s: int = 1_700_000_000) -> None:
+    send(store, make_ballot(base, {(0, 0): says}, vehicle, drive, end_ns=end_s * 10**9))
 
 
 def content(store: Store) -> dict[tuple[int, int], tuple[bytes, bytes, bytes | None]]:
@@ -71,7 +67,7 @@ def a_year(store: Store, liar: bool) -> None:
 
     def sends(vehicle: str, says: Say, drive: str) -> None:
         if vehicle != "liar" or liar:
-            send(store, base, vehicle, says, drive)
+            cast(store, base, vehicle, says, drive)
 
     sends("liar", say({WALL[0]: EMPTY, LAWN[0]: BUILT}, shift=0.1), "d1")
     sends("a", say({WALL[0]: EMPTY, LAWN[0]: BUILT}), "d1")
@@ -134,7 +130,7 @@ def test_afterwards_its_old_votes_are_gone_and_new_ones_count(store: Store, hone
     assert not publish(store, POLICY).published, "nothing of the liar is left to publish"
     for one in (store, honest):
         for vehicle in ("liar", "g"):
-            send(one, one.point_map(), vehicle, say({WALL[2]: EMPTY}), "later")
+            cast(one, one.point_map(), vehicle, say({WALL[2]: EMPTY}), "later")
         assert publish(one, POLICY).published
     assert content(store) == content(honest)
 
@@ -142,9 +138,9 @@ def test_afterwards_its_old_votes_are_gone_and_new_ones_count(store: Store, hone
 def test_a_second_vehicle_taken_out_leaves_the_first_one_out(store: Store, database_url: str) -> None:
     base = store.point_map(1)
     for vehicle in ("x", "y"):
-        send(store, base, vehicle, say({WALL[0]: EMPTY}))
+        cast(store, base, vehicle, say({WALL[0]: EMPTY}))
     for vehicle in ("y", "z"):
-        send(store, base, vehicle, say({WALL[1]: EMPTY}), "d2")
+        cast(store, base, vehicle, say({WALL[1]: EMPTY}), "d2")
     publish(store, POLICY)
     replay(store, "x", dry_run=False)
     assert len(store.point_map().tiles[0, 0].points) == 12 - 3
@@ -157,11 +153,11 @@ def test_votes_cast_on_the_liars_map_count_where_the_cell_is_the_same(store: Sto
     """A ballot whose base holds the liar's change still speaks about its neighbours."""
     base = store.point_map(1)
     for vehicle in ("liar", "a"):
-        send(store, base, vehicle, say({WALL[0]: EMPTY}))
+        cast(store, base, vehicle, say({WALL[0]: EMPTY}))
     publish(store, POLICY)
     wrong = store.point_map()
     for vehicle in ("b", "c"):
-        send(store, wrong, vehicle, say({WALL[1]: EMPTY}))
+        cast(store, wrong, vehicle, say({WALL[1]: EMPTY}))
     publish(store, POLICY)
     replay(store, "liar", dry_run=False)
     points = store.point_map().tiles[0, 0].points
@@ -221,7 +217,7 @@ def test_any_history(tmp_path_factory: pytest.TempPathFactory, seed: int) -> Non
         states |= {cell: BUILT for cell in LAWN if rng.random() < 0.5}
         if what == "vote":
             for store in stores if vehicle != "liar" else stores[:1]:
-                send(store, base, vehicle, say(states, shift), f"d{step}", 1_700_000_000 + step)
+                cast(store, base, vehicle, say(states, shift), f"d{step}", 1_700_000_000 + step)
         elif what == "publish":
             if publish(stores[0], POLICY).published:  # what made no version is not history
                 publish(stores[1], POLICY)

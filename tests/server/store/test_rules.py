@@ -41,7 +41,7 @@ def test_store_and_rules_agree(sqlite_stores: MakeStore) -> None:
     assert disagreements(sqlite_stores, range(4)) == []
 
 
-@pytest.mark.parametrize("seed", [0, 3])
+@pytest.mark.parametrize("seed", [pytest.param(0, marks=pytest.mark.slow), 3])
 def test_what_was_read_before_changes_nothing_that_is_decided(
     seed: int, sqlite_stores: MakeStore, monkeypatch: pytest.MonkeyPatch
 ) -> None:

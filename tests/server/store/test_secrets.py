@@ -11,14 +11,13 @@ import pytest
 import sqlalchemy as sa
 
 from hand_made import Say, make_ballot, states_plane, two_walls
-from mapvote.codec.ballot import encode
 from mapvote.config import FuseSettings
 from mapvote.core.types import CellState
 from mapvote.server.store import fusion_jobs
-from mapvote.server.store.admission import accept, examine
 from mapvote.server.store.database import address_of
 from mapvote.server.store.publish import publish
 from mapvote.server.store.store import Store
+from stores import send
 
 
 class Elsewhere(Executor):
@@ -41,7 +40,7 @@ def test_a_task_for_a_cluster_carries_no_password_its_worker_has_its_own(
     whole = sa.make_url(postgres_url).set(password="a-secret")
     store = Store.create(whole.render_as_string(hide_password=False), two_walls())
     says = {(0, 0): Say(states_plane({(10, 10): CellState.CHANGED_EMPTY}))}
-    accept(store, [examine(encode(make_ballot(two_walls(), says, vehicle, "d1"))) for vehicle in ("a", "b")])
+    send(store, *[make_ballot(two_walls(), says, vehicle, "d1") for vehicle in ("a", "b")])
     monkeypatch.setenv("MAPVOTE_STORE", whole.render_as_string(hide_password=False))
     fusion_jobs._database.cache_clear()
     cluster = Elsewhere()

@@ -12,15 +12,14 @@ import numpy as np
 import pytest
 
 from hand_made import SETTINGS, Say, make_ballot, states_plane, two_walls, wall, words_plane
-from mapvote.codec.ballot import Ballot, encode
+from mapvote.codec.ballot import Ballot
 from mapvote.config import FuseSettings
 from mapvote.core.point_map import PointMap
 from mapvote.core.types import U64, CellState, MapvoteError
 from mapvote.fusion.offline import update_map
 from mapvote.fusion.tile_vote import DAY_NS
 from mapvote.server.errors import Conflict, Held, NotFound, Unavailable
-from mapvote.server.store.admission import accept, examine
-from mapvote.server.store.ballots import Receipt, withdraw
+from mapvote.server.store.ballots import withdraw
 from mapvote.server.store.policy import (
     GatePolicy,
     Policy,
@@ -30,6 +29,7 @@ from mapvote.server.store.policy import (
 from mapvote.server.store.publish import preview, publish, rollback
 from mapvote.server.store.store import Store
 from mapvote.server.views.explain import explain_cell
+from stores import send
 
 EMPTY, KEEPS = CellState.CHANGED_EMPTY, CellState.UNCHANGED_OCCUPIED
 POLICY = FuseSettings(min_votes=2)
@@ -43,14 +43,6 @@ def store(database_url: str) -> Iterator[Store]:
     store = Store.create(database_url, two_walls())
     yield store
     store.close()
-
-
-def send(store: Store, *ballots: Ballot) -> list[Receipt]:
-    receipts = accept(store, [examine(encode(ballot)) for ballot in ballots])
-    for receipt in receipts:
-        if isinstance(receipt, MapvoteError):
-            raise receipt
-    return [receipt for receipt in receipts if isinstance(receipt, Receipt)]
 
 
 def says(

@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 
 from hand_made import SETTINGS, Say, make_ballot, states_plane, two_walls, wall, words_plane
-from mapvote.codec.ballot import encode
 from mapvote.codec.points import pack_points, unpack_points
 from mapvote.config import FuseSettings
 from mapvote.core.grid import TileIndex
@@ -20,8 +19,7 @@ from mapvote.core.tile_history import Memory
 from mapvote.core.types import NO_VOTE, CellState
 from mapvote.fusion.tile_vote import DAY_NS, TileVote
 from mapvote.server.store import reviews
-from mapvote.server.store.admission import accept, examine
-from mapvote.server.store.ballots import Receipt, withdraw
+from mapvote.server.store.ballots import withdraw
 from mapvote.server.store.integrity import ballot_name
 from mapvote.server.store.policy import Policy, RoundPolicy
 from mapvote.server.store.queries import Version
@@ -38,6 +36,7 @@ from mapvote.server.store.votes import (
     standing_tiles,
 )
 from standing_clock import Clock
+from stores import send
 
 CELL, OTHER = (10, 10), (10, 11)
 HERE, BESIDE = (0, 0), (0, 1)
@@ -80,8 +79,7 @@ def cast(
     ballot = make_ballot(two_walls(), dict.fromkeys(tiles, say), vehicle, drive, end_ns, **more)
     stage = "one-stage" if say.tally is not None else "two-stage"
     store.set_policy(Policy(round=RoundPolicy.model_validate({"method": ballot.method, "stage": stage})))
-    (receipt,) = accept(store, [examine(encode(ballot))])
-    assert isinstance(receipt, Receipt), receipt
+    (receipt,) = send(store, ballot)
     return receipt.seq
 
 

@@ -59,7 +59,8 @@ def test_who_comes_back_after_long_reads_the_log_and_misses_nothing(store: Store
     now = [0.0]
     feed = Feed(store, seconds=lambda: now[0])
     feed.after(newest_event(store))
-    told = [log(store, f"e{i}") for i in range(600)]
+    with store.database.writing() as connection:
+        told = [log_event(connection, store.clock(), "publish", "boss", f"e{i}") for i in range(600)]
     for _ in range(3):
         now[0] += 1.0
         feed.after(told[-1])

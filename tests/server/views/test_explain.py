@@ -13,15 +13,13 @@ import sqlalchemy as sa
 
 from hand_made import Say, make_ballot, states_plane, two_walls, wall
 from mapvote.codec.arrays import unpack_plane
-from mapvote.codec.ballot import encode
 from mapvote.config import FuseSettings
 from mapvote.core.types import N_STATES, NO_VOTE, CellState
 from mapvote.core.voting import VOTE_UNIT
 from mapvote.fusion.fuse import decide_tile
 from mapvote.fusion.tile_vote import DAY_NS
 from mapvote.server.store import schema
-from mapvote.server.store.admission import Intake, accept, examine
-from mapvote.server.store.ballots import Receipt, withdraw
+from mapvote.server.store.ballots import withdraw
 from mapvote.server.store.decisions import REASONS, unpack_tally_plane
 from mapvote.server.store.keys import issue, revoke
 from mapvote.server.store.policy import Policy, RoundPolicy
@@ -32,6 +30,7 @@ from mapvote.server.views.events import last_events
 from mapvote.server.views.explain import COPY, CellStory, explain_cell, story_as_json
 from mapvote.server.views.point_lod import evidence
 from standing_clock import Clock
+from stores import send
 
 WALL, LAWN = (10, 10), (20, 20)
 START_NS = 1_700_000_000 * 10**9
@@ -54,8 +53,7 @@ def say(store: Store, vehicle: str, state: CellState, cell: tuple[int, int] = WA
     points = wall([cell], [0.45, 0.75]) if state == CellState.CHANGED_OCCUPIED else None
     now, base = store.clock(), store.point_map()
     ballot = make_ballot(base, {(0, 0): Say(states_plane({cell: state}), new_points=points)}, vehicle, f"d{now}", now)
-    (receipt,) = accept(store, [examine(encode(ballot))])
-    assert isinstance(receipt, Receipt), receipt
+    send(store, ballot)
 
 
 def story(store: Store, cell: tuple[int, int] = WALL) -> CellStory:
@@ -157,7 +155,7 @@ def test_of_copies_the_story_says_that_one_counts_and_the_log_whose_they_are_onc
         states = np.where(seen, CellState.UNCHANGED_EMPTY, CellState.UNDETERMINED).astype(np.uint8)
         states[WALL] = CellState.CHANGED_EMPTY
         ballot = make_ballot(store.point_map(), {(0, 0): Say(states)}, name, "d", clock.now - ord(name[0]))
-        assert isinstance(accept(store, [examine(encode(ballot))])[0], Receipt)
+        send(store, ballot)
     assert {vote.vehicle: vote.why for vote in story(store).votes} == {"a": COPY, "b": "", "liar": ""}
     assert publish(store).published
     publish(store)
@@ -218,8 +216,7 @@ def test_a_tie_of_a_one_stage_ballot_is_undetermined_everywhere(one_stage: Store
         tally[TIE][state] = 3 * VOTE_UNIT
     tally[CLEAR][CellState.CHANGED_EMPTY] = 3 * VOTE_UNIT
     ballot = make_ballot(store.point_map(), {(0, 0): Say(tally=tally)}, end_ns=store.clock())
-    (receipt,) = Intake(store).write([examine(encode(ballot))])
-    assert isinstance(receipt, Receipt), receipt
+    send(store, ballot)
     said = [explain_cell(store, (c + 0.5) * 0.3, (r + 0.5) * 0.3).votes[0].state for r, c in (TIE, CLEAR)]
     assert said == ["undetermined", "changed_empty"]
     page = evidence(store, (0, 0))

@@ -9,14 +9,11 @@ import numpy as np
 import pytest
 
 from hand_made import Say, make_ballot, make_map, make_tile, states_plane, two_walls
-from mapvote.codec.ballot import encode
 from mapvote.codec.odds import MOST, STEPS
 from mapvote.config import FuseSettings
 from mapvote.core.types import CellState, MapvoteError
 from mapvote.fusion.loss_budget import change_probability
 from mapvote.server.store import schema
-from mapvote.server.store.admission import accept, examine
-from mapvote.server.store.ballots import Receipt
 from mapvote.server.store.integrity import check
 from mapvote.server.store.policy import Policy
 from mapvote.server.store.publish import publish
@@ -25,8 +22,8 @@ from mapvote.server.store.store import Store
 from mapvote.server.views.desk import desk, review
 from mapvote.server.views.explain import CellStory, explain_cell
 from mapvote.server.views.history import changes_between
+from stores import WALL, send, wall_gone
 
-WALL = [(10, 10), (10, 11), (10, 12)]
 BUDGET = Policy(fuse=FuseSettings(max_deleted_share=1.0, false_deletions=0.01))
 SURE, UNSURE = [20, 20, 20], [20, -MOST, 20]
 
@@ -42,10 +39,9 @@ def vote(store: Store, drive: str, sure: list[int] | None, vehicles: str = "ab")
     """These say that the wall of the first tile is gone, and how sure they are of each of its cells."""
     odds = None if sure is None else np.array(sure, dtype=np.int8)
     for name in vehicles:
-        says = {(0, 0): Say(states_plane(dict.fromkeys(WALL, CellState.CHANGED_EMPTY)), odds=odds)}
+        says = {(0, 0): wall_gone(odds=odds)}
         ballot = make_ballot(store.point_map(), says, name, drive, end_ns=store.clock())
-        (receipt,) = accept(store, [examine(encode(ballot))])
-        assert isinstance(receipt, Receipt), receipt
+        send(store, ballot)
 
 
 def middle(store: Store) -> CellStory:
@@ -77,7 +73,7 @@ def vote_middle(store: Store, drive: str, sure: int) -> None:
     for name in "ab":
         say = Say(states_plane({WALL[1]: CellState.CHANGED_EMPTY}), odds=np.array([sure], np.int8))
         ballot = make_ballot(store.point_map(), {(0, 0): say}, name, drive, end_ns=store.clock())
-        accept(store, [examine(encode(ballot))])
+        send(store, ballot)
 
 
 def test_what_waits_is_nothing_that_a_reviewer_decides_about(store: Store) -> None:
@@ -144,8 +140,7 @@ def test_what_spilled_over_goes_with_its_wall_and_its_story_says_that_nothing_ch
     states, odds = states_plane(dict.fromkeys(cells, CellState.CHANGED_EMPTY)), np.full(len(cells), 20, np.int8)
     for name in "ab":
         ballot = make_ballot(store.point_map(), {(0, 0): Say(states, odds=odds)}, name, "d1", end_ns=store.clock())
-        (receipt,) = accept(store, [examine(encode(ballot))])
-        assert isinstance(receipt, Receipt), receipt
+        send(store, ballot)
     beside, there = (explain_cell(store, x, 41.55) for x in (29.85, 30.15))
     assert "the noise of what changed in the next cell" in beside.thing
     assert "the noise of" not in there.thing

@@ -11,20 +11,20 @@ import pytest
 import sqlalchemy as sa
 
 from hand_made import Say, make_ballot, make_map, make_tile, states_plane, wall
-from mapvote.codec.ballot import encode
+from mapvote.codec.ballot import Ballot
 from mapvote.config import FuseSettings
 from mapvote.core.grid import TileIndex
 from mapvote.core.point_map import PointMap
 from mapvote.core.types import CellState
 from mapvote.server.errors import Held
 from mapvote.server.store import fusion_jobs
-from mapvote.server.store.admission import Intake, examine
-from mapvote.server.store.ballots import Receipt, withdraw
+from mapvote.server.store.ballots import withdraw
 from mapvote.server.store.policy import Policy
 from mapvote.server.store.publish import preview, publish
 from mapvote.server.store.store import Store
 from mapvote.server.views.desk import desk, review
 from standing_clock import Clock
+from stores import send
 
 MOST_STATEMENTS = 20
 FREE = FuseSettings(max_deleted_share=1.0, max_change_m2=1e6, max_freed_share=1.0)
@@ -56,16 +56,15 @@ def make(tmp_path: Path, clock: Clock) -> Iterator[Callable[..., Store]]:
         one.close()
 
 
-def vote(store: Store, tiles: list[TileIndex], vehicle: str, drive: str = "d1") -> None:
+def says(store: Store, base: PointMap, tiles: list[TileIndex], vehicle: str, drive: str = "d1") -> Ballot:
     """The vehicle says that both walls of these tiles are gone."""
     cells = [(10, 10), (10, 11), (10, 12), (99, 40), (99, 41), (99, 42)]
-    states = states_plane(dict.fromkeys(cells, CellState.CHANGED_EMPTY))
-    odds = np.full(len(cells), 20, np.int8)
-    ballot = make_ballot(
-        store.point_map(), {index: Say(states, odds=odds) for index in tiles}, vehicle, drive, end_ns=store.clock()
-    )
-    (receipt,) = Intake(store).write([examine(encode(ballot))])
-    assert isinstance(receipt, Receipt), receipt
+    say = Say(states_plane(dict.fromkeys(cells, CellState.CHANGED_EMPTY)), odds=np.full(len(cells), 20, np.int8))
+    return make_ballot(base, dict.fromkeys(tiles, say), vehicle, drive, end_ns=store.clock())
+
+
+def vote(store: Store, tiles: list[TileIndex], vehicle: str, drive: str = "d1") -> None:
+    send(store, says(store, store.point_map(), tiles, vehicle, drive))
 
 
 class Counted:
@@ -98,8 +97,8 @@ def test_a_click_with_nothing_new_fuses_nothing_on_64_tiles_with_200_ballots(
 ) -> None:
     store = make(side=8)
     every = sorted(store.manifest().tiles)
-    for k in range(200):
-        vote(store, every[k % 16 * 4 : k % 16 * 4 + 4], f"v{k // 16}", f"d{k}")
+    base = store.point_map()
+    send(store, *[says(store, base, every[k % 16 * 4 : k % 16 * 4 + 4], f"v{k // 16}", f"d{k}") for k in range(200)])
     counted = Counted(store, monkeypatch)
     assert counted.of(lambda: desk(store))[0] == 64
     ids = [feature["id"] for feature in desk(store).pending["features"]]

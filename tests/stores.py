@@ -1,0 +1,28 @@
+"""What vehicles send to a store in tests."""
+
+from __future__ import annotations
+
+from hand_made import Cell, Say, states_plane
+from mapvote.codec.ballot import Ballot, encode
+from mapvote.core.types import I8, NO_VOTE, CellState, MapvoteError
+from mapvote.server.store.admission import Intake, accept, examine
+from mapvote.server.store.ballots import Receipt
+from mapvote.server.store.store import Store
+
+WALL: list[Cell] = [(10, 10), (10, 11), (10, 12)]
+"""The cells of the wall in each tile of :func:`hand_made.two_walls`."""
+
+
+def send(store: Store | Intake, *ballots: Ballot) -> list[Receipt]:
+    """Receipts of these ballots, stored in one transaction; the first refusal is raised."""
+    examined = [examine(encode(ballot)) for ballot in ballots]
+    receipts = store.write(examined) if isinstance(store, Intake) else accept(store, examined)
+    for receipt in receipts:
+        if isinstance(receipt, MapvoteError):
+            raise receipt
+    return [receipt for receipt in receipts if isinstance(receipt, Receipt)]
+
+
+def wall_gone(fill: int = NO_VOTE, odds: I8 | None = None) -> Say:
+    """The wall is not there any more; ``fill``: the state of all other cells."""
+    return Say(states_plane(dict.fromkeys(WALL, CellState.CHANGED_EMPTY), fill), odds=odds)
