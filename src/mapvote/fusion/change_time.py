@@ -1,9 +1,9 @@
-"""When the world changed: who passed before says that all is as it was, who passed since says that it is not.
+"""When the world changed: all earlier vehicles vote "unchanged", all later ones vote the same change.
 
-A majority of the latest vehicles would let a house that stood for years stand for as many passes again. But if the
-votes on a cell, in the order in which the vehicles passed, say "unchanged" and then, without exception, the same
-change, it happened in between: those before saw another world and do not speak of this one. One more than the quorum
-must have seen it, so that of k who lie not even k and an honest one that errs make such a turn.
+With a majority of the latest vehicles alone, a house that stood for years would stand for as many passes again. But if
+the votes on a cell, in the order in which the vehicles passed, are "unchanged" and then, without exception, the same
+change, the change happened in between: the earlier vehicles saw another world and do not count. One more than the
+quorum must have seen it, so that neither k liars nor k liars and an honest vehicle that errs make such a turn.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ _TURNS = (
 
 def lately_changed(states: U8, drives: Sequence[TileVote], tally: NDArray[Any], quorum: int) -> U8:
     """``states`` (256, 256) with the change in cells decided unchanged, or undecided, where more than ``quorum``
-    vehicles, the last ones, say it, and all before them that nothing changed.
+    vehicles, the last ones, vote for it, and all before them for no change.
 
-    ``drives``: those that are heard, two-stage, each by itself; ``tally`` (256, 256, 5) of them, in VOTE_UNITs.
+    ``drives``: those that count, two-stage, each by itself; ``tally`` (256, 256, 5) of them, in VOTE_UNITs.
     """
 
     planes = np.moveaxis(tally, -1, 0).reshape(N_STATES, CELLS)

@@ -1,22 +1,19 @@
-"""Which ballots of a tile are not heard: those that oppose all others, and copies (docs/decisions/voting.md).
+"""Which ballots of a tile do not count: outliers and copies (docs/decisions/voting.md).
 
-Outliers. A vehicle is not heard that opposes what k + 1 others agree on nearly everywhere, or denies nearly every
-change that k + 1 backed there (it replays the old street, or saw it last). Of k + 1 at least one is honest, so k
-who lie can make no honest vehicle look so. An honest vehicle differs from another in some per cent of the cells; a
-demolished block is some per cent of a tile. Whoever is found out was one of the k, which is smaller by one without
-it.
+Outliers. A vehicle does not count if it contradicts, nearly everywhere, what k + 1 others agree on, or nearly every
+change that k + 1 vehicles back there (it replays the old street, or saw it last). Of k + 1 vehicles at least one is
+honest, so k liars cannot exclude an honest vehicle. An honest vehicle differs from another in some per cent of the
+cells; a demolished block is some per cent of a tile. An excluded vehicle was one of the k, so k falls by one.
 
-Copies. Drives of two vehicles whose masks agree more than independent drives can count as one. What a drive
-determines of a tile ends where its rays thin out, where traffic stood in the way, where it turned off: two drives
-down one lane draw different borders. So two masks *differ* in the cells that one determined and the other did not
-determine within a cell of there, or the other way round. The measure is a share of what the lesser mask would
-differ from itself by, had it been drawn three cells (.9 m) farther north or east. A copy differs nowhere, and
-nowhere either if every cell of it was moved by one. Honest vehicles stay well above the bound
-(docs/measurements/votes.md).
+Copies. Drives of two vehicles whose masks agree more than independent drives can count as one. The cells that a drive
+determines end where its rays thin out, where traffic stood in the way, where it turned off: two drives down one lane
+have different borders. So two masks *differ* in the cells that one determined and the other did not determine within
+one cell, or the other way round. The measure is the share of the cells by which the smaller mask would differ from
+itself if it were shifted by three cells (.9 m) north or east. A copy differs in no cell, nor does a copy of which every
+cell was moved by one. Honest vehicles stay well above the bound (docs/measurements/votes.md).
 
-Of drives that are copies of each other one is heard, the one that agrees best with all others: what was moved, or
-added, agrees less. At most one of their vehicles is honest. So of those that are not heard all but one lie for
-sure, and the quorum, which guards against so many liars, falls by as many.
+Of several copies the one counts that agrees best with all others: moved or added cells agree less. At most one of their
+vehicles is honest. So all but one of those that do not count are liars for sure, and the quorum falls by as many.
 """
 
 from __future__ import annotations
@@ -37,9 +34,9 @@ from mapvote.core.voting import VOTE_UNIT
 from mapvote.fusion.tile_vote import TileVote, states_of
 
 _ASKED_CELLS = slice(None, None, 13)
-"""The flat cells asked, enough for a share; the stride divides no tile's side, so that no column is left out."""
+"""The flat cells compared, enough for a share; the stride divides no tile's side, so that no column is left out."""
 _MIN_ASKED = 64
-"""With fewer cells to go by nobody is judged: 75 m2 that the others agree on, or 6 m2 of changes."""
+"""With fewer cells no vehicle is judged: 75 m2 that the others agree on, or 6 m2 of changes."""
 _CO, _CE, _UN = (int(CellState[name]) for name in ("CHANGED_OCCUPIED", "CHANGED_EMPTY", "UNDETERMINED"))
 _ASKED, _AGREED, _OPPOSED = 0b1, 0b10, 0b100
 
@@ -75,7 +72,7 @@ def deniers(
 
 
 def borne_out(votes: Sequence[TileVote], tile: Tile) -> I64:
-    """(n,) in how many cells each vote does not count any more because they are now as it said: built on, or empty."""
+    """(n,) in how many cells each vote no longer counts because the map is now as voted: built on, or empty."""
     found = np.zeros(len(votes), dtype=np.int64)
     if all(vote.unrestricted is None for vote in votes):
         return found
@@ -93,8 +90,8 @@ def contradicts(own: U8, others: U8, most: float) -> bool:
     """Whether a vehicle's ``own`` states (asked,) oppose the ``others`` (asked, 8), see :func:`others_say`, in more
     than ``most`` of the cells they agree on.
 
-    Nothing is said of it unless a majority of the others, and at least the quorum, agree on most cells that so many of
-    them determined.
+    It is judged only if a majority of the others, and at least the quorum, agree on most cells that so many of them
+    determined.
     """
     asked, agreed, opposed = 0, 0, 0
     for i in range(len(others)):
@@ -108,9 +105,9 @@ def contradicts(own: U8, others: U8, most: float) -> bool:
 def denying(states: U8, decided: U8, most: float, came_true: I64) -> Bool:
     """(n,) which vehicles' ``states`` (n, cells) deny more than ``most`` of the changes that were ``decided`` (cells,).
 
-    The cells ``came_true`` (n,), which the map has since changed as it said, count among what each was asked, and did
-    not deny. Without them whoever backed all that was published would be judged by the few changes that are left, those
-    that wait for it. Nothing is said of a vehicle that determined fewer than 64 of these cells.
+    The cells ``came_true`` (n,), which the map has since changed as voted, count as not denied. Without them a vehicle
+    that backed all that was published would be judged by the few remaining changes, those that wait for it. A vehicle
+    that determined fewer than 64 of these cells is not judged.
     """
     determined = states < _UN
     denied = (determined & (states != decided)).sum(axis=1)
@@ -119,11 +116,10 @@ def denying(states: U8, decided: U8, most: float, came_true: I64) -> Bool:
 
 
 def others_say(tally: NDArray[Any], quorum: int) -> U8:
-    """(asked, 8) what the others say of a cell, by the last three bits of what a vehicle says there itself.
+    """(asked, 8) what the others vote on a cell, by the last three bits of a vehicle's own vote there.
 
-    _ASKED if ``quorum`` of them determined it, _AGREED if more than half of those, and as many, alike, _OPPOSED if not
-    as it says.
-    Nothing to a vehicle that left the cell undetermined (4) or has no vote there (7).
+    _ASKED if ``quorum`` of them determined it, _AGREED if more than half of those, and as many, agree, _OPPOSED if they
+    disagree with the vehicle. None for a vehicle that left the cell undetermined (4) or has no vote there (7).
     """
     said = np.zeros((tally.shape[1], 8), dtype=np.uint8)
     for own in range(_UN):
@@ -138,11 +134,11 @@ def others_say(tally: NDArray[Any], quorum: int) -> U8:
 
 
 LEAST_MOVED = 200
-"""Cells, in the rows looked at. Masks that three cells change less are not judged: little is soon alike by chance, and
-so are masks with more holes than ground."""
+"""Cells, in the rows compared. Masks that a shift of three cells changes less are not judged: small masks, and masks
+with more holes than ground, are alike by chance."""
 _LAST = TILE_CELLS - 1
 _APART = 3
-"""Cells; and of so many rows one is looked at, which is enough for a share."""
+"""Cells; and one of so many rows is compared, which is enough for a share."""
 _RIM = 1
 """Columns on either side that are not compared."""
 _COMPARED_CELLS = slice(None, None, 7)
@@ -150,7 +146,7 @@ _COMPARED_CELLS = slice(None, None, 7)
 
 @dataclass(frozen=True, slots=True)
 class Copy:
-    """A drive that is not heard on a tile, because one is heard that is alike."""
+    """A drive that does not count on a tile, because another one that is alike does."""
 
     vehicle: str
     digest: str
@@ -165,10 +161,10 @@ class Copy:
 
 
 def originals(drives: Sequence[TileVote], settings: FuseSettings) -> tuple[Sequence[TileVote], list[Copy]]:
-    """(the ``drives`` of a tile without copies, the copies); in which order they are given never matters.
+    """(the ``drives`` of a tile without copies, the copies); their order never matters.
 
-    Drives of two vehicles that differ by less than ``min_difference`` are copies. Where one vehicle may change the map,
-    and of those that send tallies, nobody is judged.
+    Drives of two vehicles that differ by less than ``min_difference`` are copies. Nothing is judged where
+    one vehicle may change the map, nor drives that send tallies.
     """
     judged = [drive for drive in drives if drive.sent is not None]
     if settings.min_votes < 2 or settings.min_difference <= 0.0 or len({drive.vehicle for drive in judged}) < 2:
@@ -195,8 +191,8 @@ def without(copies: Sequence[Copy], drives: Sequence[TileVote]) -> Sequence[Tile
 
 
 def liars_among(copies: Sequence[Copy], heard: Sequence[TileVote]) -> int:
-    """How many vehicles that ``copies`` silence on a tile lie for sure: all but one of those that are alike. ``heard``:
-    the drives that are left."""
+    """How many vehicles excluded by ``copies`` on a tile lie for sure: all but one of those that are alike. ``heard``:
+    the remaining drives."""
     silent = {copy.vehicle for copy in copies} - {drive.vehicle for drive in heard}
     groups = {copy.heard_digest for copy in copies if copy.vehicle in silent}
     return max(0, len(silent) - len(groups))
@@ -204,9 +200,9 @@ def liars_among(copies: Sequence[Copy], heard: Sequence[TileVote]) -> int:
 
 def difference(a: U8, b: U8) -> tuple[int, int]:
     """(cells in which the masks of two planes of states (256, 256) differ, in how many the lesser would differ from
-    itself), in the rows that are looked at.
+    itself), in the rows that are compared.
 
-    The tile's rim is not: what lies beside it is not known.
+    The tile's rim is not compared: its neighbours are unknown.
     """
     moved, looked = _look(masks_of([a, b]))
     return int(_differing(looked[0], looked[1], _RIM, TILE_CELLS**2)), int(moved.min())
@@ -249,7 +245,7 @@ def find_alike(moved: I64, looked: U64, whose: I64, least: float, group: I64) ->
 
 
 def _look(masks: U64) -> tuple[I64, U64]:
-    """Of masks (n, 256, 4), in the rows looked at: by how many cells each would differ from itself (n,), and
+    """Of masks (n, 256, 4), in the rows compared: by how many cells each would differ from itself if shifted (n,), and
     (n, 85, 3, 4) words: what is set, what is or has a neighbour that is, and what is and has none that is not."""
     looked = np.empty((len(masks), len(range(1, _LAST, _APART)), 3, 4), np.uint64)
     moved, east = np.empty(len(masks), np.int64), np.empty_like(looked[0])

@@ -23,10 +23,10 @@ from mapvote.fusion.tile_vote import TileVote
 
 
 def delete_points(tile: Tile, gone: U64) -> tuple[Tile, int]:
-    """The tile without the obstacle points whose voxel is marked in ``gone`` (256, 256), and how many went.
+    """The tile without the obstacle points whose voxel is marked in ``gone`` (256, 256), and how many were deleted.
 
-    Ground points are never deleted. In a tile whose ground nobody knows, words have no agreed beginning, so any mark
-    takes the whole column.
+    Ground points are never deleted. In a tile without known ground, words have no agreed beginning, so any mark
+    deletes the whole column.
     """
     if not tile.has_ground:
         gone = np.where(gone == 0, gone, EVERY_BIT)
@@ -145,7 +145,7 @@ def words_gone(votes: Sequence[TileVote], states: U8, quorum: int, tile: Tile) -
         gone.reshape(-1)[emptied.cells] = reached[-1]
     stands = states == int(CellState.UNCHANGED_OCCUPIED)
     left, standing = [vote.remnants(states) for vote in votes], Words.whole(stands)
-    # A mask in one stage only tells what would go.
+    # A mask in one stage only names what would be deleted.
     emptied_by = [vote.deletes(standing) if vote.tally is None else Words.none() for vote in votes]
     if sum(len(a.cells) + len(b.cells) > 0 for a, b in zip(left, emptied_by, strict=True)) < quorum:
         return gone

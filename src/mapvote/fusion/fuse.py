@@ -1,8 +1,8 @@
 """Ballots of a tile -> decisions -> edited tile (paper IV). Pure: no files, no database, no clock.
 
 The order in which votes are given never matters: tallies are integer sums, and of several points for one voxel the
-same one is always taken. A vote is spent once a version has changed its cell. That the cell looks as it did is no test:
-what came and went leaves it bit for bit as at first, and the votes that brought it would bring it again.
+same one is always taken. A vote is spent once a version has changed its cell. Comparing the cell's content is no
+test: an object that appeared and disappeared leaves it bit for bit as at first, and its old votes would add it again.
 """
 
 from __future__ import annotations
@@ -53,9 +53,9 @@ class Decision:
     deleted: int
     """Points deleted from the tile."""
     copies: Sequence[Copy] = ()
-    """Drives that are not heard because another vehicle's is, that is alike."""
+    """Drives that do not count because another vehicle's, which is alike, does."""
     odds: Odds = field(default_factory=Odds.none)
-    """How sure of the changed cells those are who voted for them, see :func:`agreed_odds`."""
+    """The agreed confidence of the voters for each changed cell, see :func:`agreed_odds`."""
     pending: PendingDeletions = field(default_factory=PendingDeletions.none)
     """Deletions that wait because they are beyond the budget; undetermined among the states."""
     heard: Collection[str] = ()
@@ -98,7 +98,7 @@ def count(votes: Sequence[TileVote], rule: Rule, min_votes: int) -> tuple[U8, ND
 
 @dataclass(frozen=True, slots=True)
 class Heard:
-    """What comes of the votes on a tile, before it is edited: of those that are heard, one a vehicle."""
+    """The result of the votes on a tile before it is edited: of those that count, one a vehicle."""
 
     votes: Sequence[TileVote]
     states: U8
@@ -106,9 +106,9 @@ class Heard:
     tally: NDArray[Any]
     quorum: int
     denied: Bool | None = None
-    """Changes that wait because the last vehicle that looked says otherwise."""
+    """Changes that wait because the last vehicle that observed them disagrees."""
     passing: Bool | None = None
-    """New things that stay out because they come and go."""
+    """New objects that stay out because they are temporary."""
     copies: Sequence[Copy] = ()
     odds: Odds = field(default_factory=Odds.none)
     """See :class:`Decision`."""
@@ -117,7 +117,7 @@ class Heard:
     """(256, 256) as the points are edited, where that differs from ``states``: where noise spilled over
     (fusion/neighbour_noise.py)."""
     past: History | None = None
-    """The votes of a longer time, without copies, read when first asked for; None if there is no history."""
+    """The votes of a longer time, without copies, read at first use; None if there is no history."""
 
     @property
     def edits(self) -> U8:
@@ -153,8 +153,8 @@ def decide_tile(
     """What the votes decide: counted, then in the order of time, then within the budget of false deletions.
 
     ``drives`` are the votes that count on this tile (``newest_votes`` in fusion/tile_vote.py, ``unspent`` in
-    fusion/fuse.py), any order. ``history``: asked, where something comes and goes, for all votes that count of the
-    last ``history_days`` (fusion/persistence.py); without it all is of one moment, and everything new is there to stay.
+    fusion/fuse.py), any order. ``history``: called, where objects are temporary, for all votes that count of the last
+    ``history_days`` (fusion/persistence.py); without it all is of one moment, and everything new stays.
     """
     given = list(drives)
     drives, copies = originals(given, settings)
@@ -211,11 +211,11 @@ def hear(
     silenced: int = 0,
     tile: Tile | None = None,
 ) -> tuple[Sequence[TileVote], U8, NDArray[Any], int]:
-    """(the votes that are heard, states, tally, quorum), of one vote a vehicle on a tile; see :func:`count`.
+    """(the votes that count, states, tally, quorum), of one vote a vehicle on a tile; see :func:`count`.
 
-    The quorum falls by one for each that is not heard, for it is one of those that the quorum guards against, and by
-    the ``silenced`` of whom that was known before; but nobody is ever believed alone. Of those that send tallies nobody
-    is judged: theirs do not weigh alike. ``tile``: as it is now, see :func:`deniers`.
+    The quorum falls by one for each excluded vehicle, because it is one of those that the quorum guards against, and by
+    ``silenced``, those excluded before; but never below two. Vehicles that send tallies are not judged: their weights
+    differ. ``tile``: as it is now, see :func:`deniers`.
     """
     heard, quorum = list(votes), max(settings.min_votes - silenced, min(settings.min_votes, 2))
     states, tally = count(heard, rule, quorum)
@@ -248,9 +248,9 @@ def _offered(votes: Sequence[TileVote], states: U8, grid: Grid) -> tuple[F32, U8
 def _learn_free(tile: Tile, votes: Sequence[TileVote], min_votes: int, points_added: bool) -> Tile:
     """Known-free columns with the voxels that at least ``min_votes`` vehicles passed through, minus the occupied ones.
 
-    Only in cells that the vehicle spoke of. Free space is remembered once learned; a voxel that holds a point of the
-    map is never free. Until enough vehicles have passed, a tile that never learned stays so: no free voxel at all would
-    say that nothing new can be known there.
+    Only in cells on which the vehicle voted. Free space is remembered once learned; a voxel that holds a point of the
+    map is never free. Until enough vehicles have passed, a tile without free space stays so: a plane without any free
+    voxel would mean that nothing new can be known there.
     """
     passed = [vote for vote in votes if vote.free is not None]
     if tile.free is None and len(passed) < max(min_votes, 1):

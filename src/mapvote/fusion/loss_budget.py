@@ -1,21 +1,20 @@
-"""How likely a decided cell changed indeed, and which deletions wait because of it.
+"""The probability that a decided cell really changed, and the deletions that wait because of it.
 
-How sure. Votes decide; how sure those are who gave them (codec/odds.py) refines the probability of what was
-decided. One of them may lie, so what is taken is what the quorum says at least: of those who voted for a change the
-median, the lower one of two, and never more than so many say as the quorum has. As one of the quorum is honest,
-nobody raises a probability beyond what an honest vehicle said.
+Confidence. Votes decide; the confidence of the voters (codec/odds.py) refines the probability of the decision. One of
+them may lie, so the agreed confidence is the least that a quorum states: the median of those who voted for a change,
+the lower one of two, and never more than a quorum of them states. As one of the quorum is honest, no liar raises a
+probability above what an honest vehicle states.
 
-Probabilities. Two logistic curves, calibrated on simulated streets, whose truth is known
-(docs/measurements/probability.md). The first is over how sure the voters are or, where they do not say, over how
-many vote so, how many vote otherwise, and how many of the eight cells around changed likewise. It judges cells: at
-the rim of a thing that did change, centimetres decide which of two cells holds its surface, and that does no harm
-to the map. The second asks for harm: whether a point is deleted that lies on a surface that still stands. Such
-cells are few, so it has few parameters; nearly all lie before a wall that stands, where range noise put some of its
-points and rays pass now.
+Probabilities. Two logistic curves, calibrated on simulated streets with known truth (docs/measurements/probability.md).
+The input of the first is the confidence or, where none is stated, the numbers of votes for and against and of the eight
+neighbouring cells that changed likewise. It judges cells: at the rim of an object that did change, centimetres decide
+which of two cells holds its surface, which does no harm to the map. The second predicts harm: a deleted point lies on a
+surface that still stands. Such cells are few, so it has few parameters; nearly all lie before a wall that stands, where
+range noise put some of its points and rays pass now.
 
-The budget. A cell is emptied if the votes say so. Where an operator sets ``fuse.false_deletions``, a cell stays for
-which the probability of a false deletion is above that: its points are kept, its votes are not spent, and it goes
-once vehicles that drive by are surer of it.
+The budget. A cell is emptied if the votes decide so. With ``fuse.false_deletions`` set, a cell stays while its
+probability of a false deletion is above the budget: its points are kept, its votes are not spent, and it is emptied
+once vehicles that drive by are surer.
 """
 
 from __future__ import annotations
@@ -35,7 +34,7 @@ from mapvote.core.types import F64, I8, I32, I64, U8, Bool, CellState
 
 @dataclass(frozen=True, slots=True)
 class Odds:
-    """Of some cells of a tile how sure one is of them; of all others nothing is said."""
+    """The confidence of some cells of a tile; none is stated of all others."""
 
     cells: I64
     """(n,) flat cells of the tile, ascending."""
@@ -44,7 +43,7 @@ class Odds:
 
     @classmethod
     def none(cls) -> Odds:
-        """Nothing is said."""
+        """No cell has a stated confidence."""
         return cls(np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int8))
 
     @classmethod
@@ -53,7 +52,7 @@ class Odds:
         return None if steps is None else cls(changed_cells_of(states), steps)
 
     def at(self, cells: I64) -> I8:
-        """(m,) what is said of flat ``cells`` (m,); UNSAID where nothing is."""
+        """(m,) the confidence of flat ``cells`` (m,); UNSAID where none is stated."""
         plane = np.full(CELLS, UNSAID, dtype=np.int8)
         plane[self.cells] = self.steps
         return plane[cells]
@@ -74,8 +73,8 @@ class Sure(Protocol):
 
 
 def folded(drives: Sequence[Sure], last: Sequence[Bool]) -> Odds | None:
-    """What a vehicle's ``drives`` say, each in the flat cells (65536,) in which it has the ``last`` word; None if none
-    of them says anything."""
+    """The confidence of a vehicle's ``drives``, each in the flat cells (65536,) in which it is the ``last`` to vote;
+    None if none states any."""
     parts = [drive.odds.within(mine) for drive, mine in zip(drives, last, strict=True) if drive.odds is not None]
     if not parts:
         return None
@@ -85,8 +84,8 @@ def folded(drives: Sequence[Sure], last: Sequence[Bool]) -> Odds | None:
 
 
 def agreed_odds(votes: Sequence[Sure], states: U8, quorum: int) -> Odds:
-    """Of the cells decided as changed, ``states`` (256, 256): what can be taken of what those say who voted for it, one
-    of ``votes`` a vehicle. Of a cell of which fewer than ``quorum`` say how sure they are nothing is said."""
+    """Of the cells decided as changed, ``states`` (256, 256): the agreed confidence of those who voted for it, one of
+    ``votes`` a vehicle. None for a cell of which fewer than ``quorum`` state theirs."""
     cells = changed_cells_of(states)
     saying = [vote for vote in votes if vote.odds is not None and vote.states is not None]
     if len(saying) < max(quorum, 1) or not len(cells):
@@ -105,8 +104,8 @@ def agreed_odds(votes: Sequence[Sure], states: U8, quorum: int) -> Odds:
 
 
 def pack_agreed(odds: Odds, states: U8) -> bytes | None:
-    """What is taken of the cells that ``states`` (256, 256) call changed, a byte each in their order, UNSAID among
-    them; None where nothing is said of any."""
+    """The agreed confidence of the cells that ``states`` (256, 256) call changed, a byte each in their order, UNSAID
+    among them; None if none is stated."""
     steps = odds.at(changed_cells_of(states))
     return pack_odds(steps) if (steps != UNSAID).any() else None
 
@@ -118,7 +117,7 @@ def unpack_agreed(data: bytes | None, states: U8) -> Odds:
 
 
 _MOST_VOTES = 3
-"""It was fitted to three vehicles: what more of them say is told as if three did."""
+"""The fit used three vehicles: more of them count as three."""
 
 # By votes alone, of ballots that do not say how sure their vehicle is: of columns, and of older formats.
 _BUILT = np.array([-0.78, 1.13, -0.01, 2.96])
@@ -139,9 +138,9 @@ STANDING = 3
 def change_probability(
     states: U8, votes: I32 | I64, against: I32 | I64, beside: I32 | I64, odds: I8 | None = None
 ) -> F64:
-    """(n,) probability that cells decided as ``states``, CHANGED_OCCUPIED or CHANGED_EMPTY, did change: vehicles that
-    say so, vehicles that say otherwise (not: undetermined), how many of the eight cells around changed likewise, and
-    how sure they are, UNSAID where nobody says; (n,) each."""
+    """(n,) probability that cells decided as ``states``, CHANGED_OCCUPIED or CHANGED_EMPTY, did change: votes for
+    it, votes against it (not: undetermined), how many of the eight cells around changed likewise, and the confidence,
+    UNSAID where none is stated; (n,) each."""
     built = (states == CellState.CHANGED_OCCUPIED)[:, None]
     more = np.minimum(votes, _MOST_VOTES) - 2.0
     told = np.column_stack([np.ones(len(states)), more, against, np.asarray(beside, dtype=np.float64) / 8.0])
@@ -153,8 +152,8 @@ def change_probability(
 
 
 def false_deletion_probability(standing: I32 | I64, odds: I8) -> F64:
-    """(n,) probability that of what goes with cells decided changed-empty something still stands: by how many of the
-    eight cells around are decided to stand, and how sure the vehicles are, UNSAID where nobody says; (n,) each."""
+    """(n,) probability that emptying cells decided changed-empty deletes something that still stands: by how many of
+    the eight cells around are decided to stand, and the confidence, UNSAID where none is stated; (n,) each."""
     row = np.minimum(standing, STANDING) / STANDING
     alone = _FALSE_DELETION[0] + _FALSE_DELETION[1] * row
     curve = _FALSE_DELETION_SAID

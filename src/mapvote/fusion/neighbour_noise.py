@@ -1,10 +1,9 @@
-"""Cells that changed by noise alone: the surface that came or went stands in the cell beside them.
+"""Cells that changed by noise alone: the surface that was built or demolished stands in the neighbouring cell.
 
-A wall two centimetres from the border of its cell leaves a part of its points in the next one, which noise carried
-there. When it goes, or comes, vehicles see that cell change, too, and they are right: its points have to go, or come,
-with the wall. But nothing of the world changed in it. So its points are edited as was voted, and the cell is told as
-what it was and is: empty. A plane through all points about, of both cells, tells nearly to the centimetre on which
-side the wall stands.
+Range noise carries some points of a wall two centimetres from the border of its cell into the next cell. When the wall
+is demolished or built, vehicles see that cell change too, and they are right: its points must be deleted or added with
+the wall. But nothing of the world changed in it. So its points are edited as voted, and the cell is reported as empty,
+before and after. A plane through all points nearby, of both cells, gives the side of the wall nearly to the centimetre.
 """
 
 from __future__ import annotations
@@ -34,8 +33,8 @@ _STAY = 0.05
 
 
 def without_spilled(states: U8, tile: Tile, votes: Sequence[TileVote]) -> U8:
-    """The states (256, 256) as they are told: of cells that changed by noise alone, that they are empty. ``tile``: as
-    it was; the rest as in :func:`spilled`. The same object where there is no such cell."""
+    """The states (256, 256) as reported: cells that changed by noise alone are empty. ``tile``: before the edit; the
+    rest as in :func:`spilled`. The same object where there is no such cell."""
     cells = spilled(tile, votes, states)
     if not len(cells):
         return states
@@ -47,8 +46,8 @@ def without_spilled(states: U8, tile: Tile, votes: Sequence[TileVote]) -> U8:
 def spilled(tile: Tile, votes: Sequence[TileVote], states: U8) -> I64:
     """(n,) flat cells, ascending, that ``states`` (256, 256) call changed and that hold what spilled over.
 
-    What went is told by the points of the ``tile``, what came by those that ``votes`` offer; points in the next tile
-    are not asked. Every such cell lies beside a changed one of its kind with more points.
+    Demolished surfaces are points of the ``tile``, built ones points that ``votes`` offer; points in the next tile are
+    not used. Every such cell lies beside a changed one of its kind with more points.
     """
     flat = states.reshape(-1)
     found = [
@@ -109,7 +108,7 @@ def _at_a_fuller_one(points: F32, cells: I64, count: I64, changed: Bool) -> Bool
 
 
 def _on_planes(points: F32, asked: I64, first: I64, cells: I64) -> F64:
-    """(k, 3) the points that are ``asked`` (k,), each moved onto the upright plane through those about it, where there
+    """(k, 3) the points ``asked`` (k,), each moved onto the upright plane through those about it, where there
     is one and it is near."""
     about = points[asked].astype(np.float64)
     n, mean, spread = np.zeros(len(asked), np.int64), np.zeros((len(asked), 3)), np.zeros((len(asked), 3, 3))
@@ -125,7 +124,7 @@ def _on_planes(points: F32, asked: I64, first: I64, cells: I64) -> F64:
 @kernel
 def _moments(points: F32, asked: I64, first: I64, cells: I64, number: I64, mean: F64, spread: F64) -> None:
     """Into zeros: ``number`` (k,), ``mean`` (k, 3) from the point itself and covariance ``spread`` (k, 3, 3) of the
-    points within REACH_M of each that is ``asked`` (k,). ``points`` (m, 3) in the order of their ``cells`` (m,);
+    points within REACH_M of each of ``asked`` (k,). ``points`` (m, 3) in the order of their ``cells`` (m,);
     ``first`` (65537,) of each cell."""
     reach = int(np.ceil(REACH_M / CELL_SIZE))
     for k in range(len(asked)):

@@ -16,7 +16,7 @@ from mapvote.core.grid import Grid, TileIndex
 from mapvote.core.types import F64, NO_VOTE, U8, Bool, CellState
 
 SECTORS = 8
-"""Directions of road that are told apart, 45 deg each."""
+"""Directions of road, 45 deg each."""
 _DETERMINED = (
     CellState.UNCHANGED_OCCUPIED,
     CellState.UNCHANGED_EMPTY,
@@ -27,7 +27,7 @@ _DETERMINED = (
 
 @dataclass(frozen=True, slots=True)
 class Witness:
-    """What one vehicle said of a tile, and where it drove."""
+    """The votes of one vehicle on a tile, and its path."""
 
     states: U8
     """(256, 256) CellState or NO_VOTE."""
@@ -59,7 +59,7 @@ def one_vote_short(states: Sequence[U8], quorum: int) -> U8:
     """(rows, cols) the change that one more vote for it would decide; NO_VOTE in all other cells.
 
     ``states``: (rows, cols) of each vehicle. The rule is that of ``fuse.count``: a change needs ``quorum`` votes and a
-    majority of the vehicles that determined the cell. A change for which nobody voted is not asked for.
+    majority of the vehicles that determined the cell. A change without any vote is not listed.
     """
     said = np.stack(states)
     determined = np.isin(said, _DETERMINED).sum(axis=0)

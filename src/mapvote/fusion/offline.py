@@ -53,7 +53,7 @@ def check_round(ballots: Sequence[Ballot], point_map: PointMap) -> Rule:
 
 
 def _on_this_tile(ballot: Ballot, index: TileIndex, point_map: PointMap) -> bool:
-    """Whether a ballot was cast against the tile as it is, or says against which earlier version of the map."""
+    """Whether a ballot was cast against the current tile, or names the earlier version of the map."""
     if ballot.base[tile_key(index)] == base_hash(point_map.tiles.get(index)):
         return True
     memory = point_map.tile(index).memory

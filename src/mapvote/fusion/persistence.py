@@ -1,15 +1,14 @@
-"""Things that come and go: what is new in a cell enters the map once it can be expected to stay.
+"""Temporary objects: a new object enters the map once it is expected to stay.
 
-Every cell remembers how many things vehicles saw come and go there, and how long these stayed. A thing that stays for
-a while with no memory of how long (an exponential survival time, as in Rosen, Mason and Leonard, "Towards lifelong
-feature-based mapping in semi-static environments", 2016), of which one expects ``prior_stay_days`` beforehand, can be
-expected to stay (prior + all past stays + its own age) / (1 + number of past stays). Below ``stay_days`` it is
-*temporary* and stays out of the map. What the map holds falls by its own rule: that it stood for a year says nothing
-against a quorum that sees through it.
+Every cell remembers how many objects vehicles saw appear and disappear there, and how long these stayed. An object
+whose stay is exponentially distributed (as in Rosen, Mason and Leonard, "Towards lifelong feature-based mapping in
+semi-static environments", 2016), with ``prior_stay_days`` expected beforehand, is expected to stay (prior + all past
+stays + its own age) / (1 + number of past stays). Below ``stay_days`` it is *temporary* and stays out of the map. What
+the map holds is deleted by its own rule: that it stood for a year does not outweigh a quorum that sees through it.
 
-Where things come and go, the last who looked has the last word: two vehicles saw a car that had left before the third
-passed, so it waits, for the fourth. That is said of what is new, and of what vehicles brought; what was surveyed falls
-by a quorum alone, so that nobody who denies it can hold it up.
+Where objects appear and disappear, the last observation decides: if two vehicles saw a car that had left before the
+third passed, it waits for the fourth. This holds for new objects and for what vehicles added; what was surveyed is
+deleted by a quorum alone, so that no vehicle can delay it by denying it.
 """
 
 from __future__ import annotations
@@ -38,14 +37,14 @@ def expected_days(memory: Memory | None, cells: Bool, age_days: F64 | float, set
 
 
 def doubtful(states: U8, memory: Memory | None, settings: FuseSettings) -> Bool:
-    """(256, 256) cells decided changed-occupied in which only time can tell whether the thing will stay."""
+    """(256, 256) cells decided changed-occupied in which the object may be temporary."""
     out = np.asarray(states == _CO)  # compared with a CellState numpy would make 64-bit numbers of all of them
     out[out] = expected_days(memory, out, 0.0, settings) < settings.stay_days
     return np.asarray(out)
 
 
 def history_days(settings: FuseSettings) -> float:
-    """How far back votes tell since when a thing has been seen, days.
+    """How far back votes are read for the first sighting of an object, days.
 
     Twice ``stay_days``: vehicles pass at any minute, so a window of just ``stay_days`` never holds a first sighting
     that is ``stay_days`` older than the last one.
@@ -82,10 +81,10 @@ def ages_days(drives: Sequence[TileVote], cells: Bool, breaks: int) -> F64:
 
 
 def temporary(states: U8, tile: Tile, drives: Sequence[TileVote], settings: FuseSettings) -> Bool:
-    """(256, 256) cells decided changed-occupied by what comes and goes.
+    """(256, 256) cells decided changed-occupied by temporary objects.
 
-    ``drives``: every vote that counts on the tile and is no more than :func:`history_days` older than the newest. What
-    is seen for ``stay_days`` without a break enters the map, whatever came and went there before.
+    ``drives``: every vote that counts on the tile and is no more than :func:`history_days` older than the newest. An
+    object that is seen for ``stay_days`` without a break enters the map, whatever the history of the cell.
     """
     cells = doubtful(states, tile.memory, settings)
     if cells.any():
@@ -96,8 +95,8 @@ def temporary(states: U8, tile: Tile, drives: Sequence[TileVote], settings: Fuse
 
 
 def denied_last(states: U8, memory: Memory | None, drives: Sequence[TileVote]) -> Bool:
-    """(256, 256) cells of which something new, or the end of what vehicles brought, is decided, though the last of
-    ``drives`` that determined them says otherwise."""
+    """(256, 256) cells with a decided new object, or the decided end of what vehicles added, with which the last of
+    ``drives`` that determined them disagrees."""
     out = np.asarray(states == _CO)
     if memory is not None:
         brought = memory.brought
@@ -120,11 +119,12 @@ def remembered(
     states: U8,
     past: tuple[Callable[[], Sequence[TileVote]], int] | None = None,
 ) -> Memory:
-    """``memory`` with what came and what went between two versions of a tile, by the votes that decided it.
+    """``memory`` with the objects that appeared and disappeared between two versions of a tile, by the votes that
+    decided.
 
-    ``past``: (all votes of the last :func:`history_days`, asked for only if something came; how many drives in a row
-    that see nothing end a thing). A thing came when it was first seen without a break, which may be long before the
-    votes that decided.
+    ``past``: (all votes of the last :func:`history_days`, called only if something appeared; how many drives in a row
+    that see nothing end an object). An object appeared when it was first seen without a break, which may be long before
+    the votes that decided.
     """
     went, came = emptied_and_filled(before.obstacle_words.reshape(-1), after.obstacle_words.reshape(-1))
     went = went[memory.at(went)[1] > 0]
@@ -154,7 +154,7 @@ def emptied_and_filled(before: U64, after: U64) -> tuple[I64, I64]:
 
 
 def _first_s(votes: Sequence[TileVote], cells: I64, state: int) -> NDArray[np.uint32]:
-    """(n,) when the first of ``votes`` said ``state`` of flat ``cells`` (n,), seconds; 0 where none did."""
+    """(n,) time of the first of ``votes`` for ``state`` on flat ``cells`` (n,), seconds; 0 without one."""
     first = np.full(len(cells), np.iinfo(np.uint32).max, dtype=np.uint32)
     for vote in votes:
         if vote.states is not None:

@@ -83,7 +83,7 @@ def union(marked: Sequence[Words]) -> Words:
 
 
 def nothing_reached(k: int, cells: int = CELLS) -> U64:
-    """(k, cells) the bits that one, two .. k voters set, before any is asked; see :func:`mark`."""
+    """(k, cells) the bits that one, two .. k voters set, before the first voter; see :func:`mark`."""
     return np.zeros((k, cells), dtype=np.uint64)
 
 

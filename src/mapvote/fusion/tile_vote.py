@@ -1,6 +1,6 @@
-"""What one vehicle says of one tile (paper IV): which of its drives speak, and as one vote (docs/decisions/voting.md).
+"""The vote of one vehicle on one tile (paper IV): which of its drives count, as one vote (docs/decisions/voting.md).
 
-Pure, and in no order that matters: drives fold by a commutative rule.
+Pure, and independent of order: drives fold by a commutative rule.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class PackedPlanes(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class TileVote:
-    """What one drive, or one vehicle after :func:`fold`, says about one tile."""
+    """The vote of one drive, or of one vehicle after :func:`fold`, on one tile."""
 
     vehicle: str
     end_ns: int
@@ -57,12 +57,12 @@ class TileVote:
     tally: U16 | None = None
     """(256, 256, 5): one-stage."""
     gone: Words | None = None
-    """Column words to delete where the vote is changed-empty, and remnants where it says that the cell stands; None: no
+    """Column words to delete where the vote is changed-empty, and remnants where the cell stands; None: no
     remnants, and the whole column above ground."""
     new_points: F32 | None = None
     """(m, 3) from the tile's corner; used only where the vote is changed-occupied."""
     intensity: U8 | None = None
-    """(m,) of the new points, 255 for 1.0; None: nobody measured it."""
+    """(m,) of the new points, 255 for 1.0; None: not measured."""
     free: Words | None = None
     """Column words that rays passed through."""
     odds: Odds | None = None
@@ -87,8 +87,8 @@ class TileVote:
         *,
         sound: bool = False,
     ) -> TileVote:
-        """What a ballot says of one tile; MapvoteError if a plane is damaged. ``sound``: a server took it in, so it was
-        looked at before."""
+        """The vote of a ballot on one tile; MapvoteError if a plane is damaged. ``sound``: a server admitted it, so it
+        was checked before."""
         new_points, intensity = unpack_offer(
             planes.new_points, planes.intensity, unpack_sound_points if sound else unpack_points
         )
@@ -123,13 +123,13 @@ class TileVote:
         return self.states if self.unrestricted is None else self.unrestricted
 
     def measured(self) -> U8:
-        """(m,) the intensity of the new points; 0 where nobody measured it."""
+        """(m,) the intensity of the new points; 0 where it was not measured."""
         if self.intensity is not None:
             return self.intensity
         return np.zeros(0 if self.new_points is None else len(self.new_points), dtype=np.uint8)
 
     def spoken(self) -> Bool:
-        """(256, 256) where this vote says anything at all."""
+        """(256, 256) where this vote has a state."""
         if self.states is not None:
             return self.states != NO_VOTE
         assert self.tally is not None
@@ -151,7 +151,7 @@ class TileVote:
         return np.flatnonzero((decided.reshape(-1)[cells] == state) & self.supports(state, cells))
 
     def determined(self, cells: NDArray[np.intp]) -> Bool:
-        """(n,) at which of the flat ``cells`` this vote says anything but undetermined."""
+        """(n,) which of the flat ``cells`` this vote determines."""
         if self.states is not None:
             return np.asarray(self.states.reshape(-1)[cells] < int(CellState.UNDETERMINED))
         assert self.tally is not None
@@ -159,7 +159,7 @@ class TileVote:
         return np.asarray(counts.any(axis=-1))
 
     def passed(self) -> Words:
-        """The voxels that rays passed through, of cells that this vote speaks of."""
+        """The voxels that rays passed through, in cells with a vote."""
         if self.free is None:
             return Words.none()
         if self.states is not None:
@@ -185,12 +185,12 @@ class TileVote:
             mark(reached, np.searchsorted(emptied.cells, deleted.cells), deleted.words)
 
     def deletes(self, among: Words) -> Words:
-        """The voxels that this vote says are gone, of the cells that ``among`` names."""
+        """The voxels that this vote deletes in the cells that ``among`` names."""
         marked = among if self.gone is None else self.gone.where(among)
         return marked.at(self.supports(CellState.CHANGED_EMPTY, marked.cells))
 
     def remnants(self, decided: U8) -> Words:
-        """The voxels that this vote says are gone though the cell stands, of the (256, 256) cells ``decided`` so."""
+        """The voxels that this vote deletes though the cell stands, in the (256, 256) cells ``decided`` so."""
         if self.gone is None:
             return Words.none()
         marked = self.gone.at(self.agreed(self.gone.cells, decided, CellState.UNCHANGED_OCCUPIED))
@@ -204,7 +204,7 @@ def states_of(votes: Sequence[TileVote], cells: slice | NDArray[np.intp] = slice
 
 
 class Dated(Protocol):
-    """Anything that a vehicle said at a moment."""
+    """Anything that a vehicle stated at a moment."""
 
     @property
     def vehicle(self) -> str: ...
@@ -259,8 +259,8 @@ def _but(plane: NDArray[Any], cells: I64, value: int) -> NDArray[Any]:
 
 
 def fold(drives: Sequence[TileVote], grid: Grid) -> TileVote:
-    """One vehicle's drives as one vote: in every cell the drive that ended last speaks, ties by hash; a drive that
-    is silent there never overrides. Passed-through voxels add up. Commutative, and idempotent for one drive.
+    """One vehicle's drives as one vote: in every cell the drive that ended last counts, ties by hash; a drive
+    without a vote there never overrides. Passed-through voxels add up. Commutative, and idempotent for one drive.
 
     ``grid`` is the tile's window.
     """
@@ -303,7 +303,7 @@ def fold(drives: Sequence[TileVote], grid: Grid) -> TileVote:
 
 
 def _last_words(spoken: Sequence[Bool]) -> list[Bool]:
-    """Of drives in the order of time, in which flat cells (65536,) each has spoken, and none after it."""
+    """Of drives in the order of time, the flat cells (65536,) in which each has a vote and none after it has."""
     since, found = np.zeros(CELLS, dtype=np.bool_), []
     for mine in reversed(spoken):
         found.append(mine > since)
@@ -312,7 +312,7 @@ def _last_words(spoken: Sequence[Bool]) -> list[Bool]:
 
 
 def _laid_over(planes: Sequence[U8 | None]) -> U8:
-    """(256, 256) the last of the ``planes`` that says anything of a cell."""
+    """(256, 256) the last of the ``planes`` that has a vote on a cell."""
     out = np.full(CELLS, NO_VOTE, dtype=np.uint8)
     for plane in planes:
         if plane is not None:
