@@ -55,5 +55,5 @@ def test_maps_that_contradict_each_other_are_refused_with_how_far_and_where() ->
 def test_a_map_of_another_place_is_named() -> None:
     rng = np.random.default_rng(0)
     elsewhere = np.column_stack([rng.uniform(-30, 30, (9000, 2)), rng.normal(0, 0.01, 9000)])
-    with pytest.raises(MapvoteError, match="map 2 cannot be laid on any of the others"):
+    with pytest.raises(MapvoteError, match="map 2 cannot be registered to any of the others"):
         merge_maps([map_from_points(made_court()), map_from_points(elsewhere)])

@@ -132,7 +132,7 @@ def test_on_a_straight_street_turned_scans_swapped_axes_and_turned_headings_are_
         assert error.severity == "error"
         assert f"turned by {yaw_deg} deg about z" in error.what
         assert name in error.what
-        assert "cannot tell which" in error.what
+        assert "cannot decide which" in error.what
 
 
 def test_a_place_where_a_scan_does_not_fit_those_before_it_is_named() -> None:

@@ -26,7 +26,7 @@ def coverage(
 ) -> None:
     """Where one more pass would decide cells: by tile and direction of road, the most cells first.
 
-    A cell counts if one more vehicle that says the same as one before would decide it.
+    A cell counts if one more vehicle with the same vote as an earlier one would decide it.
 
     mapvote coverage fleet.db --out drive_next.geojson
     """

@@ -63,7 +63,7 @@ def diff(
     told.append(
         "gone and new are decided by free space and by ground that the other one shows"
         if by_free
-        else "neither knows free space: gone and new are decided by geometry alone (the other has ground there, and "
+        else "neither has free space: gone and new are decided by geometry alone (the other has ground there, and "
         "nothing that stands within two cells)"
     )
     for line in told:
@@ -119,7 +119,7 @@ def merge(
 def ballot_of_cloud(
     path: Path, point_map: PointMap, settings: Settings, vehicle: str | None, trajectory: Path | None
 ) -> Ballot:
-    """The ballot of a session's cloud; tells how it was registered and what it does not vote on. It ended when the file
+    """The ballot of a session's cloud; prints its registration and where it does not vote. It ended when the file
     was last changed."""
     from mapvote.comparison.session_votes import vote_of_session
     from mapvote.formats import read_map

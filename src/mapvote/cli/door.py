@@ -1,6 +1,6 @@
 """How a verb reaches a map: a file, a STORE (a database), or the URL of a server.
 
-A STORE is opened in this process and asked by the same HTTP API as a server: a verb is written once.
+A STORE is opened in this process behind the same HTTP API as a server: a verb is written once.
 """
 
 from __future__ import annotations

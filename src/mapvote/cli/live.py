@@ -197,7 +197,7 @@ def _outbox(vehicle: str, url: str | None, folder: Path | None, key: str | None)
 
 
 def _said(vehicle: str, live: LiveDrive | None, hearing: Hearing) -> str:
-    """How the drive went, in one line."""
+    """The result of the drive, in one line."""
     if live is None:
         return f"{vehicle}: no cloud came"
     c = live.counts

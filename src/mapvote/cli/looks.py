@@ -1,4 +1,4 @@
-"""The doctor's cheap looks at what a verb works with: an error stops it, warnings are said aloud."""
+"""The doctor's cheap checks of a verb's inputs: an error stops it, warnings go to stderr."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 @contextmanager
 def usable_drives(drives: Sequence[Drive]) -> Iterator[list[Drive]]:
-    """The drives, looked at while they are read; nothing may be written before this ends.
+    """The drives, checked while they are read; nothing may be written before this ends.
 
     MapvoteError for one that cannot be used so: at once if some of its scans show it, else at the end. Whatever else
     stops the work, what is wrong with a drive is told rather than what came of it.
@@ -57,7 +57,7 @@ def sound_map(path: Path | str) -> PointMap:
 
 
 def look_at_points(path: str) -> Look:
-    """What looks at the points of a map before ground is laid: MapvoteError if they cannot be used so."""
+    """The check of a map's points before the ground is computed: MapvoteError if they cannot be used."""
     from mapvote.doctor.finding import usable
     from mapvote.doctor.maps import check_cloud
 

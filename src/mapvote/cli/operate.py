@@ -244,7 +244,7 @@ def _write_changes(found: dict[str, Any], out: Path | None) -> None:
 
     if found.get("damaged"):
         left_out = "; ".join(found["damaged"])
-        typer.echo(f"left out: tiles {left_out} are damaged (mapvote check says more)", err=True)
+        typer.echo(f"left out: tiles {left_out} are damaged (see mapvote check)", err=True)
     if out is None:
         print(json.dumps(found, indent=1))
         return

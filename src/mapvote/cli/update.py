@@ -118,7 +118,7 @@ def _report(decisions: dict[TileIndex, Decision], vehicles: int, min_votes: int)
     print(f"{vehicles} vehicles, {len(decisions)} tiles: {added} points added, {deleted} deleted")
     for (vehicle, heard), tiles in sorted(_copies(decisions).items()):
         where = f"{tiles} tile{'s' if tiles > 1 else ''}"
-        print(f"{vehicle} sent what {heard} sent, on {where}: the two count as one vehicle there")
+        print(f"{vehicle} sent a copy of {heard}'s ballot, on {where}: the two count as one vehicle there")
     if vehicles < min_votes:
         print(f"A change needs {min_votes} vehicles and {vehicles} voted, so nothing can change: --min-votes 1")
 

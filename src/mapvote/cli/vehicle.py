@@ -62,7 +62,7 @@ def build(
         from mapvote.plots import draw_survey
 
         draw_survey(opened, report, report_png)
-        print(f"{report_png}: where the drives went, and how far off their priors")
+        print(f"{report_png}: the drives' trajectories and their distance from the priors")
 
 
 def _tell(report: BuildReport, out: Path) -> None:
@@ -167,7 +167,7 @@ def vote(
             point_map = open_map.enter_context(map_at(where, key_file, region=wanted, or_kept=True))
         if not has_open_ground(point_map):
             print(
-                "warning: the map has no ground: that a thing stands can be told, but heights above the ground are "
+                "warning: the map has no ground: objects are found, but heights above the ground are "
                 "guessed from the feet of walls, and on open ground nothing can be voted; build or import the map with "
                 "its ground",
                 file=sys.stderr,

@@ -1,4 +1,4 @@
-"""Requests to one server, repeated while the trouble may pass, as patiently as the server asks for."""
+"""Requests to one server, repeated while the trouble may pass, at the rate that the server requests."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from mapvote.core.types import MapvoteError
 _PASSING = {429, 500, 502, 503, 504}
 """Answers that may be better next time."""
 _LONGEST_WAIT_S = 60.0
-"""A server that asks for more is asked again another time."""
+"""Beyond this the request is given up for now."""
 
 
 class Unreachable(MapvoteError):
@@ -109,7 +109,7 @@ class Connection:
 
 
 def detail_of(answer: httpx2.Response) -> str:
-    """What a server says of a refusal."""
+    """A server's reason for a refusal."""
     try:
         found: Any = answer.json()["detail"]
     except (ValueError, KeyError, TypeError):

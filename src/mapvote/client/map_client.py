@@ -76,7 +76,7 @@ class Manifest(msgspec.Struct):
         return self.digest == f"{total:064x}" and self.fields_digest == (f"{fields:064x}" if fields else "")
 
     def followed_by(self, since: Manifest) -> Manifest:
-        """The newer manifest that ``since``, which tells only what changed, makes of this one."""
+        """The newer manifest: this one with the changes in ``since``."""
         tiles = {key: planes for key, planes in self.tiles.items() if key not in since.removed} | since.tiles
         return msgspec.structs.replace(since, tiles=tiles, removed=[])
 
@@ -126,7 +126,7 @@ class MapClient:
         """The newest map, or one version; only planes that ``home`` lacks are downloaded, and of the list of tiles only
         what changed.
 
-        ``region``: only tiles that meet it. A ballot may name no tile outside: leave 100 m around where you drive.
+        ``region``: only tiles that touch it. A ballot may name no tile outside: leave 100 m around where you drive.
         Unreachable if the server does not answer; MapvoteError if it refuses or what comes is damaged.
         """
         manifest = self._newest() if version is None else self._manifest(f"/v1/map/versions/{version}")

@@ -44,7 +44,7 @@ class CloudChange:
     """A thing that only one of two clouds has."""
 
     kind: Kind
-    """gone: a has it. new: b has it. not seen: one has it, and nothing tells whether the other should."""
+    """gone: a has it. new: b has it. not seen: one has it, and it is unknown whether the other should."""
     outline: list[list[Ring]]
     """Polygons, each an outer ring and its holes, in lattice corners (col, row)."""
     area_m2: float
@@ -82,7 +82,7 @@ class CloudPlanes:
     seen: Bool
     """It or one of the eight beside it has."""
     free: U64
-    """Column words known to be free; 0 where the map knows of none."""
+    """Column words known to be free; 0 where the map has none."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,12 +95,12 @@ class CellComparison:
     gone: Bool
     new: Bool
     not_seen_a: Bool
-    """a has something that b does not show, and nothing says that b should."""
+    """a has something that b does not show, and b may not have seen it."""
     not_seen_b: Bool
     left_out: Bool
     """In a bent part, or explained by its motion."""
     free: Bool
-    """One has something where the other knows free space."""
+    """One has something where the other has free space."""
 
 
 def planes_of(point_map: PointMap, window: Grid) -> CloudPlanes:
@@ -137,8 +137,8 @@ def compare_cells(map_a: PointMap, map_b: PointMap, registered: Registered | Non
     for name, one in (("A", map_a), ("B", map_b)):
         if not has_open_ground(one):
             raise MapvoteError(
-                f"{name} has no ground: nothing tells where it looked, so whether a thing is gone, new or not seen "
-                "cannot be decided by geometry alone"
+                f"{name} has no ground: the places that it saw are unknown, so whether an object is gone, new or not "
+                "seen cannot be decided by geometry alone"
             )
     apart = (np.abs(a.ground_z - b.ground_z) > GROUND_APART_M) & a.own_ground & b.own_ground  # measured, not filled in
     only_a = a.low & ~_around(b.low, REACH_CELLS)

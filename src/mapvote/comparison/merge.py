@@ -41,9 +41,9 @@ class Merged:
 
 
 def merge_maps(maps: Sequence[PointMap]) -> Merged:
-    """One map in the frame and on the lattice of the first. The ground is laid anew, from the driven paths where the
-    maps carry them; the paths stay. A voxel is free if the middle of one that a map knows to be free comes to lie in
-    it, and no map has a point there.
+    """One map in the frame and on the lattice of the first. The ground is computed anew, from the driven paths where
+    the maps carry them; the paths stay. A voxel is free if the middle of one that a map knows to be free comes to lie
+    in it, and no map has a point there.
 
     MapvoteError, with figures, if a map overlaps no other one, is bent, or contradicts another by more than 0.1 m.
     """
@@ -71,7 +71,7 @@ def _adjusted(n: int, pairs: dict[tuple[int, int], Registered], why: dict[tuple[
         if step is None:
             lost = min(set(range(n)) - placed)
             reasons = "; ".join(f"with map {min(p) + 1}: {text}" for p, text in why.items() if lost in p)
-            raise MapvoteError(f"map {lost + 1} cannot be laid on any of the others ({reasons})")
+            raise MapvoteError(f"map {lost + 1} cannot be registered to any of the others ({reasons})")
         i, j = step
         if i in placed:
             T[j] = T[i] @ pairs[step].T_a_b

@@ -1,7 +1,7 @@
-"""Is one rigid motion enough? A cloud is registered patch by patch, and the patches are asked whether they agree.
+"""Is one rigid motion enough? A cloud is registered patch by patch, and the patches are compared.
 
-A map whose SLAM has drifted is bent: no rigid motion lays it on another map. Each patch of it is small enough to be
-rigid, and is registered by NDT from the motion of the whole. A robust rigid fit (iteratively reweighted Gauss-Newton
+A map whose SLAM has drifted is bent: no rigid motion registers it to another map. Each patch of it is small enough to
+be rigid, and is registered by NDT from the motion of the whole. A robust rigid fit (iteratively reweighted Gauss-Newton
 on SE(3), weights of Geman and McClure) through these registrations has the residual of every patch. Where it is larger
 than its error allows, the cloud is bent there.
 """
@@ -24,10 +24,10 @@ STEP_M, SIDE_M = 15.0, 30.0
 _LEAST_POINTS = 150
 """Voxels of .7 m that a patch must fill."""
 _AROUND_M = 10.0
-"""How much farther than the patch the other cloud is laid out."""
+"""Margin of the other cloud around the patch."""
 _MIN_INLIERS = 0.5
 _SURE_M = 0.15
-"""A patch whose standard deviation is larger says nothing: ground alone leaves the shift along it open."""
+"""A patch whose standard deviation is larger is not used: ground alone leaves the shift along it open."""
 _FLOOR_M, _FLOOR_RAD = 0.05, np.radians(0.5)
 """What patches disagree by for other reasons than a bend: noise, voxels, what changed."""
 BENT_M = 0.25
@@ -54,7 +54,7 @@ class Patches:
     inliers: F64
     """(k,) share of the points that agree."""
     compared: Bool
-    """(k,) whether the registration tells anything."""
+    """(k,) whether the registration is certain enough."""
     points: tuple[tuple[F64, F64], ...]
     """Of each patch a's points around it, and its own from its centre."""
 

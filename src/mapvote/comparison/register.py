@@ -1,4 +1,4 @@
-"""One cloud or map laid on another: where, how surely, and which part of it does not fit a rigid motion."""
+"""One cloud or map registered to another: the pose, its error, and the parts that do not fit a rigid motion."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class Registered:
     unbent: bool
     """Whether the points were moved patch by patch."""
     why_not: str
-    """Why they were not, although it was asked for."""
+    """Why they were not, although requested."""
 
     def told(self) -> list[str]:
         """The registration in sentences."""

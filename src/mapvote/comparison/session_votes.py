@@ -1,9 +1,9 @@
-"""A session's cloud as a voter: what it says of every cell of a map, as one ballot.
+"""A session's cloud as a voter: its votes on every cell of a map, as one ballot.
 
 The cloud is registered to the map without a prior. It says that something stands where it has points; that something is
 gone or new as :mod:`mapvote.comparison.cloud_changes` decides it, by its ground or by free space; that a cell is empty
 where it has ground and nothing else; and nothing anywhere else. Free space comes from a trajectory only: a ray runs
-from each of its poses to what the cloud shows first in that direction. A bent part says nothing.
+from each of its poses to what the cloud shows first in that direction. A bent part casts no vote.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ class SessionVote:
     registered: Registered
     changes: list[CloudChange]
     by_trajectory: bool
-    """Whether rays of a trajectory told free space."""
+    """Whether rays of a trajectory gave free space."""
 
 
 def vote_of_session(
@@ -147,7 +147,7 @@ class _SessionVoter:
         raise MapvoteError("a session votes as a whole")
 
     def _rigid(self) -> Bool:
-        """(rows, cols) where a part of the session lies that one motion lays on the map."""
+        """(rows, cols) where a part of the session lies that one motion registers to the map."""
         window = self._compared.window
         x, y = window.centres()
         xy = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)

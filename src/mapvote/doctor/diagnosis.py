@@ -49,12 +49,12 @@ class Diagnosis:
     T_read: F64 | None = None
     """(n, 4, 4) its prior."""
     T_mended: F64 | None = None
-    """(n, 4, 4) what takes its points, as they are in the files, to where they belong; None where nobody knows."""
+    """(n, 4, 4) takes its points, as they are in the files, to their place in the map; None if unknown."""
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """What the checks of a drive ask for: scans, road, registrations. Each is made once, when it is first asked for."""
+    """The evidence for the checks of a drive: scans, road, registrations. Each is computed once, at first use."""
 
     drive: Drive
     progress: Progress | None = None
@@ -74,7 +74,7 @@ class Evidence:
 
     @property
     def in_map_frame(self) -> bool:
-        """Whether the points are in the map's frame: then nothing else can be said of them."""
+        """Whether the points are in the map's frame: then nothing else can be checked."""
         return self.T is not None and len(self.looks.index) > 0 and in_map_frame(self.T, self.looks)
 
     @cached_property

@@ -1,4 +1,4 @@
-"""What the doctor says."""
+"""The doctor's findings."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ class Finding:
     what: str
     mend: str = ""
     map_tells: bool = False
-    """Whether a map can tell what the drive cannot: on one that it lies well on, nothing of this is left."""
+    """Whether a map can decide what the drive cannot: on one that it lies well on, nothing of this is left."""
 
 
 def in_order(found: Iterable[Finding]) -> list[Finding]:
-    """Errors first; the same said once."""
+    """Errors first; duplicates once."""
     return sorted(dict.fromkeys(found), key=lambda f: _ORDER[f.severity])
 
 

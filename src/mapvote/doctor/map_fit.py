@@ -41,7 +41,7 @@ _POINTS_SCALE = 0.002
 _SHIFT_SIGMAS, _TURN_SIGMAS = 3.0, 2.5
 """Errors of the prior, as drive.toml states them: a shift (of three axes) or a turn of no more may be them."""
 _UNKNOWN_SCALE = 0.01
-"""By which the scale errs where points do not show it: it stands where a drive is too short to tell it."""
+"""Error of the scale where points do not show it, as on drives that are too short."""
 _OFFSETS_M = np.arange(-6.0, 6.1, 1.0)
 _YAWS = np.radians([0.0, -3.0, 3.0])
 _RANKED = 3
@@ -66,7 +66,7 @@ class Place:
     index: int
     T_map_lidar: F64
     fit: float
-    """As :class:`mapvote.localisation.pose_check.Verdict` has it; 0 where the map knows too little to say."""
+    """As :class:`mapvote.localisation.pose_check.Verdict` has it; 0 where the map has too few points."""
     known: float
     """Share of the scan's points near which the map has anything, at the guess."""
     least: float
@@ -78,7 +78,7 @@ def fitting(places: Sequence[Place]) -> list[Place]:
 
 
 def total_fit(places: Sequence[Place]) -> float:
-    """Of those that fit: tells a few good ones from many."""
+    """Of those that fit: separates a few good ones from many."""
     return sum(p.fit for p in fitting(places))
 
 
@@ -128,7 +128,7 @@ class Laid:
         return [_place_of(around or self.around, i, scaled[i], guesses[i], judge) for i in guesses]
 
     def told(self, what: str, steps: Iterable[Any]) -> Iterator[Any]:
-        """The steps, each told as begun."""
+        """The steps, each reported as it begins."""
         every = list(steps)
         for k, step in enumerate(every):
             if self.tell is not None:
@@ -158,14 +158,14 @@ def check_on_map(drive: Drive, T: F64, point_map: PointMap, tell: Progress | Non
             return [unit], T
         better, mirrored = _searched(laid)
         if mirrored:
-            what = f"the map is mirrored against the scans: {mirrored} mirrored scans fit it, as they are none does"
+            what = f"the map is mirrored against the scans: {mirrored} mirrored scans fit it, unmirrored none"
             return [*found, Finding("error", what, "negate y of the map's points, or of the scans'")], T
         places = max(places, better, key=lambda one: len(fitting(one)))
     good = fitting(places)
     if len(good) < 2:
         return [*found, _fits_nowhere(places)], T
     found += _where_not(places, good)
-    # Places far apart tell the scale as well, but no better than the prior's positions are known.
+    # Places far apart show the scale as well, but no better than the prior's positions are known.
     fit = fit_similarity(
         np.array([T[p.index] for p in good]),
         np.array([p.T_map_lidar for p in good]),
@@ -218,7 +218,7 @@ def in_another_unit(laid: Laid) -> Finding | None:
             around = MapWindow(metres)
             if 2 * len(fitting(laid.places({i: [laid.T[i]] for i in laid.some}, around))) > len(laid.some):
                 fits = len(fitting(laid.places({i: [laid.T[i]] for i in laid.scans}, around)))
-                what = f"the map is {unit.name}: made metres, it fits {fits} of {len(laid.scans)} scans looked at"
+                what = f"the map is {unit.name}: made metres, it fits {fits} of {len(laid.scans)} scans checked"
                 return Finding("error", what, unit.mend)
     return None
 
@@ -390,7 +390,7 @@ def _where_not(places: Sequence[Place], good: Sequence[Place]) -> list[Finding]:
     if empty:
         scans = ", ".join(str(p.index) for p in empty)
         grave: Severity = "error" if len(empty) >= 0.4 * len(places) else "warning"
-        what = f"the map holds nothing around {len(empty)} of {len(places)} places looked at (scans {scans})"
+        what = f"the map holds nothing around {len(empty)} of {len(places)} places checked (scans {scans})"
         return [Finding(grave, what, "part of the map is missing, or the drive leaves it: there it cannot vote")]
     if len(good) < 0.7 * len(places):
         what = f"scans fit the map at {len(good)} of {len(places)} places only"

@@ -1,6 +1,6 @@
 """A map by itself: units, axes, strays and rounding of its points; its ground, holes, frame; layers there twice.
 
-:func:`check_cloud` asks for points only, in pieces, and uses no scipy: every verb that reads a map calls it first.
+:func:`check_cloud` needs points only, in pieces, and uses no scipy: every verb that reads a map calls it first.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ _HIGHEST_M = 3000.0
 _SLENDER = 2.0
 """Times as high as it is wide a street may be."""
 _LEAST_SHEET = 0.09
-"""Of a street's points .12 to .17 lie on its ground (simulated ones and KITTI); with less nothing says what is up."""
+"""Of a street's points .12 to .17 lie on its ground (simulated ones and KITTI); with less, up is unknown."""
 _FAR_M = 50_000.0
 _SLOPE_DEG = 6.0
 _ALOFT_M = 100.0
@@ -151,7 +151,7 @@ def _units(wide: F64, apart: F64) -> list[Finding]:
         what = f"points are {apart_m:.2g} m apart, the map is {wide[2]:.0f} m high: millimetres, or centimetres?"
         return [Finding("error", what, mend)]
     if apart_m > 0.5:
-        what = f"points are {apart_m:.2f} m apart (median): too sparse to tell what stands there, or not metres"
+        what = f"points are {apart_m:.2f} m apart (median): too sparse to show what stands there, or not metres"
         return [Finding("warning", what, "a map needs a point every 0.3 m or so")]
     return []
 
@@ -258,14 +258,14 @@ def check_whole(point_map: PointMap) -> list[Finding]:
 
 
 def check_map(point_map: PointMap) -> list[Finding]:
-    """Of a map whose ground has been measured. Of one larger than memory ground and copies are looked at around the
+    """Of a map whose ground has been measured. Of one larger than memory, ground and copies are checked around the
     middle."""
     some = _around_the_middle(point_map)
     points = all_points(some)
     height = np.concatenate([_heights(some, index) for index in sorted(some.tiles)])
     found = _ground(some, points, height) + check_ground(point_map) + _missing_tiles(point_map)
     if some is not point_map:
-        what = f"ground and copies were looked at in {len(some.tiles)} tiles of {len(point_map.tiles)}, in the middle"
+        what = f"ground and copies were checked in {len(some.tiles)} tiles of {len(point_map.tiles)}, in the middle"
         found.append(Finding("note", what))
     found += _lone(some)
     standing = points[(height > 0.5) & (height < 6.0)]
@@ -273,14 +273,14 @@ def check_map(point_map: PointMap) -> list[Finding]:
     layer = ghost_layer(height)
     if layer is not None:
         what = f"the road lies there twice, {abs(layer):.2f} m apart in height: a ghost layer"
-        found.append(Finding("error", what, "two drives of different height were laid over each other: align them"))
+        found.append(Finding("error", what, "two drives of different height were merged: align them"))
     elif float(np.median(spacing(in_memory(points), points))) < _SPARSE_M:
         shift = ghost_shift(standing)
         if shift is not None:
             x, y = shift
             by = f"{np.hypot(x, y):.1f} m (x {x:+.1f}, y {y:+.1f})"
             what = f"walls and poles are there twice, shifted by {by}: a ghost layer"
-            found.append(Finding("error", what, "two drives were laid over each other unaligned: align them"))
+            found.append(Finding("error", what, "two drives were merged without alignment: align them"))
     return found + _frame(point_map)
 
 
@@ -354,7 +354,7 @@ def _thickness(height: F64) -> list[Finding]:
     if rough <= 0.12:
         return []
     what = f"the ground is {rough:.2f} m thick"
-    return [Finding("warning", what, "scans scatter, or several were laid over each other badly")]
+    return [Finding("warning", what, "scans scatter, or several were merged with bad poses")]
 
 
 def _missing_tiles(point_map: PointMap) -> list[Finding]:
@@ -369,7 +369,7 @@ def _missing_tiles(point_map: PointMap) -> list[Finding]:
         return []
     window = point_map.lattice.tile(holes[0])
     what = f"{len(holes)} tiles are missing between others, the first at ({window.x0:.0f}, {window.y0:.0f})"
-    return [Finding("warning", what, "a hole in the map: there nobody can vote")]
+    return [Finding("warning", what, "a hole in the map: no vehicle can vote there")]
 
 
 def _frame(point_map: PointMap) -> list[Finding]:
@@ -380,7 +380,7 @@ def _frame(point_map: PointMap) -> list[Finding]:
         high = np.maximum(high, points.max(axis=0, initial=-np.inf))
     told = f"x {low[0]:.0f} to {high[0]:.0f}, y {low[1]:.0f} to {high[1]:.0f}, z {low[2]:.0f} to {high[2]:.0f} m"
     if frame.is_local and max(np.abs(low[:2]).max(), np.abs(high[:2]).max()) > _FAR_M:
-        what = f"the map does not say which coordinates it is in ({told})"
+        what = f"the map does not name its coordinate system ({told})"
         return [Finding("warning", what, "import it with --from-crs EPSG:n, so that GNSS and maps find it")]
     return [Finding("note", f"{told}; {frame.told()}")]
 

@@ -291,7 +291,7 @@ def _near(points: F32) -> F32:
 def _registered(ndt_map: NdtMap, clouds: list[F32], guesses: list[F64], road: Road) -> Registration:
     """From the first guess, if that fits well; else the best of it and the likeliest of all of them.
 
-    Only what stands on the road tells guesses apart: the sensor's rings on it fit best where nothing has moved.
+    Only objects on the road distinguish guesses: the sensor's rings on it fit best where nothing has moved.
     """
     found = refine(ndt_map, clouds, guesses[0])
     if len(guesses) == 2 and found.inlier_share >= _GOOD_FIT:
@@ -352,6 +352,6 @@ def check_scan_motion(drive: Drive, runs: Sequence[Run]) -> list[Finding]:
         return [Finding("error", what, "check the times (seconds), and that the points are metres")]
     if broken:
         first, last = broken[0].indices[[0, -1]]
-        what = f"scans {first} to {last} do not fit each other ({len(broken)} of {len(runs)} places looked at)"
+        what = f"scans {first} to {last} do not fit each other ({len(broken)} of {len(runs)} places checked)"
         return [Finding("error", what, mend)]
     return []

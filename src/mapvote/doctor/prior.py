@@ -21,7 +21,7 @@ _FASTEST_MPS = 70.0
 NO_PRIOR = Finding(
     "warning",
     "no prior: the vehicle must find itself in the map",
-    "write prior.txt (3 x 4 rows T_map_lidar), or expect to be asked for the first pose",
+    "write prior.txt (3 x 4 rows T_map_lidar), or be ready to give the first pose",
 )
 CAMERA_TO_LIDAR = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 """From x right, y down, z forward to x forward, y left, z up."""
@@ -82,7 +82,7 @@ def _motion(drive: Drive, T: F64, steps_m: F64) -> list[Finding]:
     jumps = np.flatnonzero(steps_m > 5 * usual + 1.0)
     if len(jumps) and len(jumps) < 0.2 * len(steps_m) and usual > 0:
         what = f"the prior jumps {len(jumps)} times, most at scan {int(np.argmax(steps_m)) + 1} ({steps_m.max():.1f} m)"
-        # No error: a map fits all its priors, and a vehicle asks the map; both leave outliers out.
+        # No error: a map fits all its priors, and a vehicle localises in the map; both reject outliers.
         found.append(Finding("warning", what, "GNSS outliers: smooth them, or give prior_sigma_m in drive.toml"))
     stuck = steps_m < 1e-6
     if 3 <= stuck.sum() < len(steps_m) and usual > 0.05:

@@ -41,7 +41,7 @@ _FIRSTS = 6
 """Readings that are tried as the first of two faults."""
 _HEIGHT_M = (0.8, 4.0)
 """Of a LiDAR over the road."""
-CANNOT_TELL = "this drive cannot tell without a turn whether"
+CANNOT_TELL = "without a turn this drive cannot decide whether"
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,7 +145,7 @@ def _told(m: Measured) -> list[Finding]:
         return []
     what, mend = m.words
     if off <= SURE * sigma:
-        return [Finding("note", f"{what}; that may be chance", f"a longer drive tells; else: {mend}")]
+        return [Finding("note", f"{what}; that may be chance", f"a longer drive decides; else: {mend}")]
     return [Finding("error" if off > 2.0 * LEAST[m.kind] else "warning", what, mend)]
 
 
@@ -154,7 +154,7 @@ def _not_shown(whole: Whole, time: Measured | None) -> Finding:
     told = [f"{whole.scale.least:.0%} of scale", f"{whole.turn.least:.0f} deg of heading"]
     told += [f"{time.least:.1f} s"] if time is not None else []
     what = f"over {whole.length_m:.0f} m mistakes of the prior show from {', '.join(told)} on"
-    return Finding("note", what, "a longer drive with turns tells more")
+    return Finding("note", what, "a longer drive with turns shows smaller ones")
 
 
 @dataclass(frozen=True, slots=True)
@@ -260,14 +260,15 @@ def _clearly_better(best: _Held, other: _Held, length_m: float) -> bool:
 
 
 def _worse(one: _Held, best: _Held, length_m: float) -> bool:
-    """Whether the runs tell ``one`` from the best."""
+    """Whether the runs distinguish ``one`` from the best."""
     more = one.misfit - best.misfit
     error = float(more.std()) / np.sqrt(len(more)) + 0.02
     return bool(np.median(more) > max(0.05, 0.004 * length_m) and more.mean() > 2.0 * error)
 
 
 def _like_the_best(best: _Held, held: Sequence[_Held], length_m: float, runs: Sequence[Run]) -> list[_Held]:
-    """What the runs do not tell from the best. The side that breaks the custom (x is forward) goes first."""
+    """The readings that the runs do not distinguish from the best. The side that breaks convention (x is forward)
+    first."""
     group = [h for h in held if h is best or not _worse(h, best, length_m)]
     special = [h for h in group if h.special]
     wanted = "prior" if abs(forward_deg(runs)) < 15.0 else "scans"
@@ -329,7 +330,7 @@ def _scale_words(m: Measured, road: Road) -> tuple[str, str]:
 def _named(group: Sequence[_Held], as_it_is: _Held, best: _Held, length_m: float) -> Finding:
     names = "; or ".join(h.reading.name for h in group)
     mends = "; or ".join(dict.fromkeys(h.reading.mend for h in group))
-    apart = " (this drive cannot tell which: a turn would)" if len(group) > 1 else ""
+    apart = " (this drive cannot decide which: a turn would)" if len(group) > 1 else ""
     so = f": so {best.median:.2f} m remain over {length_m:.0f} m driven, else {as_it_is.median:.2f} m"
     return Finding("error", names + apart + so, mends)
 

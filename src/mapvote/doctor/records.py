@@ -35,7 +35,7 @@ _MOST_CHANGED = 0.2
 _SIGMA_M = 0.15
 _MEND = "mapvote check STORE --mend --from BACKUP"
 _TOLD = 5
-"""Damaged things of one kind that are told one by one."""
+"""Damaged records of one kind that are listed one by one."""
 
 
 def check_bag(path: Path, options: DriveOptions) -> list[Finding]:
@@ -215,6 +215,6 @@ def _keys(store: Store) -> list[Finding]:
 
     valid = Counter(key.role for key in listed(store) if key.valid_at(store.clock()))
     if not valid["operator"]:
-        what = "no operator has a valid key: nobody can run it from afar"
+        what = "no operator has a valid key: the server cannot be operated remotely"
         return [Finding("warning", what, "mapvote keys STORE issue NAME operator")]
     return [Finding("note", "keys: " + ", ".join(f"{count} {role}" for role, count in sorted(valid.items())))]

@@ -20,7 +20,7 @@ from mapvote.formats.drives.sensor_estimate import contradiction
 
 SECTORS = 36
 _POINTS = 12_000
-"""Points of a scan that are looked at."""
+"""Points of a scan that are checked."""
 _BINS, _BIN_M = 400, 0.5
 QUANTA_M = (1.0, 0.5, 0.25, 0.1, 0.05, 0.02)
 """Steps to which coordinates may have been rounded."""
@@ -34,7 +34,7 @@ _PERIOD_POINTS = 50_000
 _FAR_M = 50.0
 """The mean of the points in the sensor's frame is never so far from the origin."""
 _FIRST_LOOK = 24
-"""Scans looked at before a drive is used: what is wrong with all of them shows, and costs a tenth of a second."""
+"""Scans checked before a drive is used: defects of all scans show, for a tenth of a second."""
 IN_MAP_FRAME = Finding(
     "error",
     "the points are in the map's frame already: they move along with the prior",
@@ -83,11 +83,11 @@ class Looks:
 
 
 class Looking:
-    """A drive of which every scan is looked at when it is first read, whoever reads it."""
+    """A drive of which every scan is checked at its first read."""
 
     def __init__(self, drive: Drive) -> None:
         self.drive = replace(drive, read_scan=self._read)
-        """The same drive, looked at on the way."""
+        """The same drive, checked while it is read."""
         self._unseen = drive
         self._rows: dict[int, F64] = {}
         self._counts: dict[int, int] = {}
@@ -108,8 +108,8 @@ class Looking:
         return scan
 
     def look(self, indices: Iterable[int], progress: Callable[[int, int], None] | None = None) -> Looks:
-        """Read those scans that nobody has read yet; returns what all that were read until now show. ``progress`` is
-        told (done, in all)."""
+        """Read the scans that were not read yet; returns the findings of all that were read so far. ``progress`` gets
+        (done, in all)."""
         left = [i for i in indices if i not in self._rows and i not in self._refused]
         for done, i in enumerate(left):
             with suppress(MapvoteError):  # it is kept among the refused
@@ -141,7 +141,7 @@ class Looking:
 
 
 def look_at_all(drive: Drive, progress: Callable[[int, int], None] | None = None) -> Looks:
-    """Every scan of the drive read once. ``progress`` is told (done, in all)."""
+    """Every scan of the drive read once. ``progress`` gets (done, in all)."""
     return Looking(drive).look(range(len(drive)), progress)
 
 
@@ -411,7 +411,7 @@ class LookedAt:
         return self._looking.drive
 
     def warnings(self, progress: Callable[[int, int], None] | None = None) -> list[Finding]:
-        """What all scans show, also those that nobody has read; MapvoteError with the first error, if there is one."""
+        """The findings of all scans, read or not; MapvoteError with the first error, if there is one."""
         drive = self.drive
         found = cheap_checks(drive, self._looking.look(range(len(drive)), progress))
         return [f for f in usable(str(drive.path), found) if f != NO_PRIOR]

@@ -12,7 +12,7 @@ _FEW = 1000
 """Fewer points show nothing."""
 _BIN_M = 0.05
 _CELL_M, _SIDE = 0.2, 640
-"""A square of 128 m in cells of 0.2 m is looked at."""
+"""A square of 128 m in cells of 0.2 m is checked."""
 _NEAREST_M, _FARTHEST_M = 1.0, 8.0
 """Nearer copies are lost in the thickness of the walls themselves."""
 _PEAK = 5.3

@@ -38,7 +38,7 @@ __all__ = [
 
 
 def open_drive(path: Path | str, **said: Unpack[SaidOfDrive]) -> Drive:
-    """A recorded drive of any known format; its scans are read one by one when asked for.
+    """A recorded drive of any known format; its scans are read one by one at access.
 
     ``scans``: comma-separated START:STOP:STEP slices. ``prior``: a file of 3 x 4 rows T_map_lidar (a topic, for bags),
     or "none". ``rate_hz``, ``sensor``, ``vehicle`` and ``mount`` (T_base_lidar: 12 numbers, or x, y, z, roll, pitch,
@@ -59,7 +59,8 @@ def open_drive(path: Path | str, **said: Unpack[SaidOfDrive]) -> Drive:
 def read_map(path: Path | str, look: Look | None = None) -> PointMap:
     """A map of any known format. A format that has only points gets its ground measured and a map_id from its content.
 
-    ``look`` sees the points before ground is laid. Raises MapvoteError if there is no map at ``path`` or it is damaged.
+    ``look`` gets the points before the ground is computed. Raises MapvoteError if there is no map at ``path`` or it is
+    damaged.
     """
     path = Path(path)
     if is_map_folder(path):
@@ -73,7 +74,7 @@ def read_map(path: Path | str, look: Look | None = None) -> PointMap:
 def stream_cloud(path: Path | str) -> Iterator[Cloud]:
     """The points of a file or folder of any format of ``MAPS`` as they stand, piece by piece where the format allows.
 
-    Raises MapvoteError if there is none at ``path``, or when it comes to where it is damaged.
+    Raises MapvoteError if there is none at ``path``, or when a damaged part is read.
     """
     path = Path(path)
     for layout in MAPS.values():
@@ -83,7 +84,7 @@ def stream_cloud(path: Path | str) -> Iterator[Cloud]:
 
 
 def read_cloud(path: Path | str) -> tuple[F64, dict[str, NDArray[Any]]]:
-    """All points of a map or cloud of any known format, and their fields: no tiles are cut, no ground is laid.
+    """All points of a map or cloud of any known format, and their fields: no tiles are cut, no ground is computed.
 
     Returns points (n, 3), float64, map metres (feet become metres), and columns (n,) in the type that the file has, by
     LAS's names: intensity, red, classification ... Points that are not finite stay. Of a map in pieces only the fields

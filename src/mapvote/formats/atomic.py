@@ -16,7 +16,7 @@ def _hidden(path: Path, role: str) -> Path:
 
 
 def _sync(path: Path) -> None:
-    """Have the disk hold ``path`` before its name says so."""
+    """Sync ``path`` to disk before its name appears."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)

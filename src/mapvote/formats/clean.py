@@ -1,4 +1,5 @@
-"""What every scan passes before it becomes a Scan: points that are no measurements are dropped and counted aloud."""
+"""What every scan passes before it becomes a Scan: points that are no measurements are dropped, counted and
+reported."""
 
 from __future__ import annotations
 
@@ -24,7 +25,7 @@ _BLOCK = 512
 
 @dataclass(slots=True)
 class BadPoints:
-    """Running count over one drive. Warns at the 1st, 2nd, 4th, 8th ... scan concerned: heard, but not a flood."""
+    """Running count over one drive. Warns at the 1st, 2nd, 4th, 8th ... scan concerned: noticed, without a flood."""
 
     where: str
     scans: int = 0
@@ -49,7 +50,7 @@ class BadPoints:
 
 @dataclass(frozen=True, slots=True)
 class RawScan:
-    """One scan as a file holds it; what a format does not tell is None."""
+    """One scan as a file holds it; None for what a format lacks."""
 
     index: int
     stamp_ns: int
@@ -66,8 +67,9 @@ class RawScan:
 def clean_scan(where: str, raw: RawScan, sensor: Sensor, bad_points: BadPoints) -> Scan:
     """A Scan of the usable points, in their order.
 
-    Dropped in silence, because the format says so: rays without return, and points nearer than the sensor can measure.
-    Dropped and counted: not finite, or beyond 2 km. MapvoteError if these are more than 5 %, or if nothing is left.
+    Dropped without a message, as the format defines: rays without return, and points nearer than the sensor can
+    measure. Dropped and counted: not finite, or beyond 2 km. MapvoteError if these are more than 5 %, or if nothing is
+    left.
     """
     points, near_m = raw.points, sensor.min_range_m - 5.0 * sensor.range_sigma_m
     usable = np.empty(len(points), dtype=np.int64)
@@ -144,7 +146,7 @@ def spinning_time_s(points: F32, rate_hz: float, *, clockwise: bool = True) -> F
 
 @allocating
 def _spinning_time_s(points: F32, turn_per_s: np.float32) -> F32:
-    """(n,) block by block: x and y, which lie three numbers apart, are laid side by side first, for vectors."""
+    """(n,) block by block: x and y, which lie three numbers apart, are copied side by side first, for vectors."""
     out, x, y = np.empty(len(points), np.float32), np.empty(_BLOCK, np.float32), np.empty(_BLOCK, np.float32)
     for start in range(0, len(points), _BLOCK):
         n = min(_BLOCK, len(points) - start)

@@ -41,7 +41,7 @@ def describe(path: Path, *, rate_hz: float | None = None, topic: str | None = No
             return "ballot", _ballot(decode(data), len(data))
         except MapvoteError as error:
             raise MapvoteError(f"{path}: neither map nor drive, and no ballot: {error}") from error
-    return "", _map(read_map(path))  # raises, and says what is there
+    return "", _map(read_map(path))  # raises, and names what is there
 
 
 def _noted(pieces: Iterator[Cloud], about: dict[str, dict[str, None]]) -> Iterator[Cloud]:
@@ -102,7 +102,7 @@ def _drive(drive: Drive) -> Rows:
 
 def _foundation(ballot: Ballot) -> str:
     if ballot.length_m is None:
-        return "not said"
+        return "unknown"
     misfit = "no prior"
     if ballot.prior_misfit_m is not None and ballot.prior_sigma_m is not None:
         misfit = f"{ballot.prior_misfit_m:.2f} m off its prior (median), which claims {ballot.prior_sigma_m:.2f} m"

@@ -1,4 +1,4 @@
-"""Packages that only some formats and verbs need: asked for when they are needed, missed in one clear line."""
+"""Packages that only some formats and verbs need: imported when needed, one clear line if missing."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def require(module: str, extra: str, where: str) -> ModuleType:
 
 
 def missing_extra(error: ModuleNotFoundError) -> str | None:
-    """What to install for a module that was not found, as mapvote's own metadata says; None if no extra has it."""
+    """What to install for a module that was not found, by mapvote's own metadata; None if no extra has it."""
     module = (error.name or "").partition(".")[0]
     try:
         requirements = metadata.requires("mapvote") or []
@@ -48,5 +48,5 @@ def read_text(file: Path) -> str:
 
 
 def first_line(error: BaseException) -> str:
-    """What another library's error says, in one line."""
+    """The message of another library's error, in one line."""
     return (str(error).strip().splitlines() or [type(error).__name__])[0]

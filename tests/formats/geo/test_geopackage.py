@@ -41,6 +41,6 @@ def test_a_local_map_gives_a_package_in_local_metres_and_a_plane_none(tmp_path: 
     write_geopackage(tmp_path / "c.gpkg", [feature(kind="built")], MapFrame())
     about = pyogrio.raw.read(tmp_path / "c.gpkg", layer="changes")[0]
     assert "local map metres" in about["crs"]
-    with pytest.raises(MapvoteError, match="no GIS knows"):
+    with pytest.raises(MapvoteError, match="no GIS supports"):
         write_geopackage(tmp_path / "d.gpkg", [feature(kind="built")], enu_frame(49.0, 8.4, 0.0))
     assert not (tmp_path / "d.gpkg").exists()

@@ -24,7 +24,7 @@ ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 
 
 class SaidOfDrive(TypedDict, total=False):
-    """What may be said about a drive when it is opened, by name: :class:`DriveOptions` before any default."""
+    """Options of a drive when it is opened, by name: :class:`DriveOptions` before any default."""
 
     scans: str | None
     prior: str | None
@@ -202,7 +202,7 @@ def make_drive(
 ) -> Drive:
     """A Drive of the chosen scans. ``stamps_ns`` (n,) and the prior (n, 4, 4) are of all scans of the files.
 
-    ``frame``: where the prior's frame lies. ``T_base_lidar``: the format's own mount, where nobody says another.
+    ``frame``: where the prior's frame lies. ``T_base_lidar``: the format's own mount, unless another is given.
     The sensor is what the caller or drive.toml say, else it is measured in some of the scans.
 
     MapvoteError if stamps do not increase or a prior is not a rigid motion.

@@ -1,6 +1,6 @@
 """ROS 2 bags (sqlite3 and MCAP) and ROS 1 bags through the rosbags library (extra ``ros``): PointCloud2 as a drive.
 
-Priors are topics of odometry or GNSS fixes; where the LiDARs of one vehicle sit says /tf_static.
+Priors are topics of odometry or GNSS fixes; the mounts of a vehicle's LiDARs come from /tf_static.
 """
 
 from __future__ import annotations

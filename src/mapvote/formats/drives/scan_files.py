@@ -66,7 +66,7 @@ def read_bytes(file: Path) -> bytes:
 
 
 def layout_of(files: Sequence[Path], columns: str | None = None, dtype: str | None = None) -> BinLayout:
-    """What the user says, else four columns (KITTI), or five if the sizes and the fifth column say so (nuScenes)."""
+    """The user's columns, else four (KITTI), or five if the sizes and the fifth column fit (nuScenes)."""
     if columns is not None or dtype is not None:
         return _said(columns or ",".join(KITTI), dtype or "float32")
     for file in files[:3]:

@@ -1,6 +1,6 @@
 """Folders of numbered scan files, one a scan, and the text files beside them: which line belongs to which scan.
 
-Every such layout opens through :func:`open_scan_folder`; a new one only says where things lie.
+Every such layout opens through :func:`open_scan_folder`; a new one only locates the files.
 """
 
 from __future__ import annotations

@@ -11,7 +11,7 @@ from mapvote.core.sensors import SENSORS, Sensor
 from mapvote.core.types import F64, I64, Scan
 
 UNKNOWN = Sensor("unknown", (0.0,), 0.2, min_range_m=0.5)
-"""Reads the scans that are looked at."""
+"""Reads the scans that are used."""
 _FAR_M = 8.0
 """Nearer points are left out: the beams of large sensors do not start in one point."""
 _SURE = 0.7

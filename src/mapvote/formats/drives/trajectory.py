@@ -151,7 +151,7 @@ class Trajectory:
     times_ns: I64
     """(n,) ascending."""
     T_map: F64
-    """(n, 4, 4) T_map_lidar, or T_map_base where the file speaks of the vehicle (``of_vehicle``)."""
+    """(n, 4, 4) T_map_lidar, or T_map_base where the file describes the vehicle (``of_vehicle``)."""
     of_vehicle: bool
     frame: MapFrame
     """Where its map lies; local unless it came from latitudes and longitudes."""

@@ -15,7 +15,7 @@ from mapvote.core.types import F64, MapvoteError
 from mapvote.formats.extras import require
 
 LOCAL = "local"
-"""Metres from somewhere: nobody said where on Earth."""
+"""Metres from an unknown place on Earth."""
 ENU = "ENU "
 """``crs`` of a plane that touches the Earth: "ENU latitude longitude height" of its origin, x east, y north, z up."""
 _CHUNK = 1_000_000
@@ -34,7 +34,7 @@ class MapFrame:
     """"local", "EPSG:n", WKT, or "ENU latitude longitude height"."""
     offset_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     heights: str = ""
-    """What z counts from, e.g. "EGM2008 height", where a file said so."""
+    """What z counts from, e.g. "EGM2008 height", where a file states it."""
     projector: str = ""
     """The text of Autoware's map_projector_info.yaml, where the map has one."""
 
@@ -52,7 +52,7 @@ class MapFrame:
     def told(self) -> str:
         """In words: the coordinate system, what is subtracted, what heights count from."""
         if self.is_local:
-            name = "local metres (nobody said where on Earth)"
+            name = "local metres (place on Earth unknown)"
         elif self.crs.startswith(ENU):
             name = f"a plane at latitude, longitude, height {self.crs.removeprefix(ENU)}"
         else:

@@ -22,11 +22,11 @@ def write_geopackage(path: Path, features: Sequence[dict[str, Any]], frame: MapF
     """GeoJSON features (polygons in map metres) as one layer, whole or not at all.
 
     Coordinates are those of the frame's coordinate system (its offset added back). A local map is written in metres
-    under the name "local map metres"; a map in an ENU plane, which no GIS knows, is a MapvoteError.
+    under the name "local map metres"; a map in an ENU plane, which no GIS supports, is a MapvoteError.
     """
     shapely, pyogrio = require("shapely", "geo", str(path)), require("pyogrio.raw", "geo", str(path))
     if frame.crs.startswith(ENU):
-        raise MapvoteError(f"{path}: no GIS knows this map's plane ({frame.told()}); write .geojson instead")
+        raise MapvoteError(f"{path}: no GIS supports this map's plane ({frame.told()}); write .geojson instead")
     offset = np.array(frame.offset_m[:2])
     shapes = [shapely.transform(shapely.geometry.shape(f["geometry"]), lambda xy: xy + offset) for f in features]
     several = shapely.geometry.MultiPolygon

@@ -18,7 +18,7 @@ def poses_from_gnss(lonlat: F64, rpy: F64, frame: MapFrame | None) -> tuple[F64,
 
     ``lonlat`` (n, 3): longitude, latitude in degrees (WGS 84), height in metres. ``rpy`` (n, 3): roll, pitch and yaw
     in radians about the local east, north and up; yaw 0 is east, counter-clockwise. ``frame``: the map's; None or a
-    local one gives a plane that touches the Earth at the first place, and says so.
+    local one gives a plane that touches the Earth at the first place, with a message.
     """
     if len(lonlat) == 0 or not (np.isfinite(lonlat).all() and (np.abs(lonlat[:, 1]) <= 90).all()):
         raise MapvoteError("a prior from GNSS needs latitudes within 90 degrees and no holes")

@@ -32,17 +32,17 @@ def settle(
 ) -> tuple[MapFrame, Convert]:
     """(frame of the map, how the file's points get there).
 
-    ``stated``: what the file says of itself, in any unit. ``wanted``: the frame asked for (``--crs``,
+    ``stated``: the file's own frame, in any unit. ``wanted``: the requested frame (``--crs``,
     ``--projector``), None to stay where the file is. ``first``: some points (n, 3) of the file, to name the UTM zone.
-    ``sure``: the user himself said that the file is in local metres.
-    MapvoteError if the file is in degrees, or geocentric, and no frame is asked for.
+    ``sure``: the user stated that the file is in local metres.
+    MapvoteError if the file is in degrees, or geocentric, and no frame is requested.
     """
     if stated.is_local:
         if wanted is None or wanted.is_local:
             if not sure:
                 _check_no_degrees(where, first)
             return stated, _as_it_is
-        log.warning("%s: names no coordinate system: the one that was asked for is assumed", where)
+        log.warning("%s: names no coordinate system: the requested one is assumed", where)
         stated = replace(wanted, heights=stated.heights or wanted.heights)
         if not any(wanted.offset_m):
             wanted = None
@@ -138,7 +138,7 @@ def _units(where: str, crs: Any) -> tuple[float, float]:
 
 
 def height_name(crs: Any) -> str:
-    """What a CRS says that heights count from: the name of its vertical part, the ellipsoid, or "" for nothing."""
+    """What heights of a CRS count from: the name of its vertical part, the ellipsoid, or "" for nothing."""
     if crs.is_compound:
         return str(crs.sub_crs_list[1].name)
     return "above the ellipsoid" if len(crs.axis_info) == 3 else ""

@@ -192,7 +192,7 @@ class Change:
 
 
 def laid_version(folder: Path) -> int | None:
-    """The version that the folder's metadata shows; None if none was laid there."""
+    """The version that the folder's metadata shows; None if the folder has none."""
     history = _history(folder)
     return history[-1].version if history and (folder / METADATA).is_file() else None
 
@@ -211,8 +211,8 @@ def lay_version(
     side_m: int = SIDE_M,
     known: Collection[str] = (),
 ) -> Change:
-    """Show ``cloud`` (map metres, in a frame that Autoware knows) in ``folder``; only tiles that it lacks are written,
-    and of those none that is ``known`` where the folder goes.
+    """Show ``cloud`` (map metres, in a frame that Autoware supports) in ``folder``; only tiles that it lacks are
+    written, and of those none that is ``known`` where the folder goes.
 
     Tiles of the ``keep`` versions before stay. At every moment the metadata there names only whole tiles. MapvoteError
     if the folder holds a map of somebody else.

@@ -20,7 +20,7 @@ log = logging.getLogger("mapvote.formats")
 NEAR_ORIGIN_M = 50_000.0
 """Maps within this of (0, 0) share the lattice that starts there; farther ones (UTM) get one of their own."""
 _SOME = 1_000_000
-"""Points looked at to tell degrees from metres."""
+"""Points used to distinguish degrees from metres."""
 
 
 KEPT = (
@@ -48,7 +48,7 @@ class Cloud:
     dropped: tuple[str, ...] = ()
     """Fields of the file that a mapvote map does not keep, e.g. intensity."""
     frame: MapFrame = field(default_factory=MapFrame)
-    """What the file says about its coordinates: they may be in feet or degrees still."""
+    """The file's statement of its coordinates: they may be in feet or degrees still."""
     fields: Mapping[str, NDArray[Any]] = field(default_factory=dict)
     """Columns (n,) of ``KEPT``, with the values and in the type that the file has."""
 
@@ -67,7 +67,7 @@ def full_scale(values: NDArray[Any]) -> float:
 
 @dataclass(frozen=True, slots=True)
 class CloudPieces:
-    """The pieces of one cloud, in one frame; asked again they come again."""
+    """The pieces of one cloud, in one frame; can be iterated repeatedly."""
 
     pieces: Callable[[], Iterator[Cloud]]
     frame: MapFrame
@@ -193,7 +193,7 @@ def float32_loss_m(points: NDArray[np.floating]) -> float:
 
 
 def warn_of_float32(where: str, points: NDArray[np.floating]) -> None:
-    """Say aloud when float32 would move points by more than half a millimetre (coordinates beyond 8 km)."""
+    """Warn when float32 would move points by more than half a millimetre (coordinates beyond 8 km)."""
     loss_m = float32_loss_m(points)
     if loss_m > 0.0005:
         log.warning(

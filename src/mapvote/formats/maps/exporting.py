@@ -58,7 +58,7 @@ def export_map(
 
 
 def autoware_pieces(point_map: PointMap, folder: Path, projector: str | None) -> CloudPieces:
-    """A map's points in a frame that Autoware knows: ``projector``'s, else the one that ``folder`` has already."""
+    """A map's points in a frame that Autoware supports: ``projector``'s, else the one that ``folder`` has already."""
     stated, corners, chosen = frame_of(point_map.georeference), _corners(folder, point_map), folder / PROJECTOR
     wanted = projector or (str(chosen) if chosen.is_file() and not stated.is_local else None)
     frame, convert = settle(str(folder), stated, autoware_frame(stated, corners, wanted), corners, sure=True)

@@ -1,4 +1,4 @@
-"""Import: somebody's point cloud, in whatever coordinates, as a map; and what to tell about it."""
+"""Import: a point cloud in any coordinates becomes a map, with a report."""
 
 from __future__ import annotations
 
@@ -27,8 +27,9 @@ def import_cloud(
 ) -> tuple[PointMap, list[str]]:
     """(the map, lines that say what became of the file's coordinates, classes and fields).
 
-    ``wanted``: the frame to project to. ``from_crs``: what the file is in, where it says nothing or the wrong thing.
-    ``folder``: where temporary files may lie. ``look``: sees the points, in metres, before a map is made of them.
+    ``wanted``: the frame to project to. ``from_crs``: the file's coordinate system, where the file states none or a
+    wrong one. ``folder``: where temporary files may lie. ``look``: sees the points, in metres, before a map is made of
+    them.
     """
     pieces = stream_cloud(path)
     if from_crs is not None:
@@ -68,7 +69,7 @@ class _LeftOut:
 
 
 def without_noise(cloud: Cloud) -> tuple[Cloud, int]:
-    """The cloud without the points that its file classifies as noise, and how many went."""
+    """The cloud without the points that its file classifies as noise, and how many were dropped."""
     classes = cloud.fields.get("classification")
     if classes is None:
         return cloud, 0

@@ -34,7 +34,7 @@ class Head(msgspec.Struct):
     """What there is besides points, or why they cannot be read."""
 
     promised: int = 0
-    """What the file's header says."""
+    """The content of the file's header."""
     dimensions: tuple[str, ...] = ()
     wkt: str = ""
     geo_keys: dict[int, int] = {}

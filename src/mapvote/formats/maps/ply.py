@@ -30,7 +30,7 @@ def read_ply(path: Path) -> Cloud:
 
 def stream_ply(path: Path) -> Iterator[Cloud]:
     """The vertices of a PLY file, ascii or binary, float or double; faces are ignored. Binary vertices without lists
-    stay on disk until their piece is asked for. MapvoteError if the file is damaged or holds no element "vertex"."""
+    stay on disk until their piece is read. MapvoteError if the file is damaged or holds no element "vertex"."""
     library = require("plyfile", "ply", str(path))
     try:
         with path.open("rb") as stream:  # a file that plyfile opens stays open where it is damaged

@@ -33,11 +33,11 @@ from mapvote.formats.maps.spill import Columns, Spill
 log = logging.getLogger("mapvote.formats")
 
 _SOME = 1_000_000
-"""Points looked at to tell degrees from metres; and points in a piece."""
+"""Points used to distinguish degrees from metres; and points in a piece."""
 _XYZ = "xyz"
 
 Look = Callable[[Callable[[], Iterator[NDArray[np.floating]]]], None]
-"""Given the points (n, 3) of a map, metres, piece by piece as often as it asks; raises MapvoteError to stop."""
+"""Given the points (n, 3) of a map, metres, piece by piece, repeatable; raises MapvoteError to stop."""
 
 
 def in_map_metres(
@@ -62,11 +62,11 @@ def to_map(where: str, cloud: Cloud) -> PointMap:
 
 
 def map_of(where: str, pieces: Iterable[Cloud], folder: Path | None = None, look: Look | None = None) -> PointMap:
-    """The map of a cloud in pieces: tiles cut, ground laid, map_id from the content. Broken points are dropped and
+    """The map of a cloud in pieces: tiles cut, ground computed, map_id from the content. Broken points are dropped and
     counted. Points that the file classifies as ground are ground.
 
     ``folder``: where temporary files may lie. Of a map larger than memory the tiles are read from them.
-    ``look`` sees the points before tiles are cut and ground is laid.
+    ``look`` gets the points before tiles are cut and the ground is computed.
     MapvoteError if the cloud is empty or more than 5 % of it is not finite.
     """
     taken = _Taken(where, Spill(folder))
@@ -92,7 +92,7 @@ def map_of(where: str, pieces: Iterable[Cloud], folder: Path | None = None, look
 
 @dataclass
 class _Taken:
-    """The points of a file as they came, on disk, and what only the whole file tells."""
+    """The points of a file in its order, on disk, and facts that need the whole file."""
 
     where: str
     spill: Spill
@@ -181,7 +181,7 @@ class _Parts:
 
     @property
     def road(self) -> Mapping[TileIndex, Heights]:
-        """Of the points that the file says are ground, if it says so."""
+        """Of the points that the file classifies as ground, if it does."""
 
         def ground(index: TileIndex) -> Heights:
             columns = self.read(index)
@@ -194,7 +194,7 @@ class _Parts:
 
 
 class _Asked(Mapping[TileIndex, Heights]):
-    """A mapping that works out a value whenever it is asked."""
+    """A mapping that computes a value at every access."""
 
     def __init__(self, keys: Mapping[TileIndex, Any], ask: Callable[[TileIndex], Heights]) -> None:
         self._keys, self._ask = keys, ask
