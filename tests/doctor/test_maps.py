@@ -139,7 +139,7 @@ def test_outliers_far_above_the_road_are_an_error(points: F64) -> None:
 
 def test_coordinates_without_a_name_are_told(points: F64) -> None:
     far = map_from_points(points + np.array([367_000.0, 3_951_000.0, 20.0]))
-    assert any("does not say which coordinates" in what for what in serious(check_map(far)))
+    assert any("does not name its coordinate system" in what for what in serious(check_map(far)))
 
 
 def test_a_tile_that_is_missing_between_others_is_told(sound: PointMap, points: F64) -> None:
