@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import yaml
 from pypcd4 import PointCloud
 
-from live_server import serving
+from live_server import serving_here
 from mapvote.cli.files import follow_once
 from mapvote.client import MapClient
 from mapvote.core.point_map import PointMap, all_points, map_from_points
@@ -73,8 +74,8 @@ class Server:
     def publish(self, points: F64) -> None:
         self.maps.append(map_from_points(points, map_id="m"))
 
-    def newest(self) -> int:
-        return len(self.maps)
+    def manifest(self) -> SimpleNamespace:
+        return SimpleNamespace(version=len(self.maps))
 
     def fetch(self) -> PointMap:
         self.version = len(self.maps)
@@ -153,7 +154,7 @@ def test_a_real_server_is_followed_and_only_changed_planes_are_fetched(tmp_path:
     from mapvote.server.store.store import Store
 
     Store.create(f"sqlite:///{tmp_path / 's.db'}", map_from_points(STREET)).close()
-    with serving(tmp_path / "s.db", log=tmp_path / "log") as (url, _), MapClient(url, home=tmp_path / "home") as client:
+    with serving_here(tmp_path / "s.db", log=tmp_path / "log") as url, MapClient(url, home=tmp_path / "home") as client:
         change = follow_once(client, tmp_path / "map", None, 3)
         assert change is not None
         assert (change.version, change.deleted) == (1, 0)

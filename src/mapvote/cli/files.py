@@ -315,7 +315,7 @@ def follow_once(client: MapClient, folder: Path, projector: str | None, keep: in
     from mapvote.formats.maps.autoware import laid_version, lay_version
     from mapvote.formats.maps.exporting import autoware_pieces
 
-    if laid_version(folder) == client.newest():
+    if laid_version(folder) == client.manifest().version:
         return None
     cloud = autoware_pieces(client.fetch(), folder, projector)
     assert client.version is not None

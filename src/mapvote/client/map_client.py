@@ -129,7 +129,7 @@ class MapClient:
         ``region``: only tiles that touch it. A ballot may name no tile outside: leave 100 m around where you drive.
         Unreachable if the server does not answer; MapvoteError if it refuses or what comes is damaged.
         """
-        manifest = self._newest() if version is None else self._manifest(f"/v1/map/versions/{version}")
+        manifest = self.manifest() if version is None else self._manifest(f"/v1/map/versions/{version}")
         return self._as_map(manifest, region)
 
     def _as_map(self, manifest: Manifest, region: Region | None) -> PointMap:
@@ -137,29 +137,17 @@ class MapClient:
         wanted = {_index(key): planes for key, planes in manifest.tiles.items()}
         if region is not None:
             wanted = {index: planes for index, planes in wanted.items() if _meets(lattice.tile(index), region)}
-        tiles = made_in_turn(lambda index: self._tile(lattice.tile(index), wanted[index]), wanted)
+        tiles = made_in_turn(lambda index: self.tile(lattice.tile(index), wanted[index]), wanted)
         self._bound_cache({digest for planes in wanted.values() for digest in planes.hashes()})
         self.version = manifest.version
         return PointMap(manifest.map_id, lattice, tiles, manifest.georeference, version=manifest.version)
 
     def fetch_kept(self, region: Region | None = None) -> PointMap:
         """The map that was fetched last, without a request. Unreachable if nothing, or not all of it, is kept."""
-        manifest = self._kept()
+        manifest = self.kept_manifest()
         if manifest is None:
             raise Unreachable(f"{self._url}: is away, and no version of its map is kept here")
         return self._as_map(manifest, region)
-
-    def newest(self) -> int:
-        """The number of the newest version; no tile is downloaded. Raises as :meth:`fetch`."""
-        return self.manifest().version
-
-    def manifest(self) -> Manifest:
-        """The newest version's, of which only what changed since the last is downloaded. Raises as :meth:`fetch`."""
-        return self._newest()
-
-    def kept_manifest(self) -> Manifest | None:
-        """What :meth:`manifest` gave last, without a request; None if nothing is kept."""
-        return self._kept()
 
     def has(self, planes: Plane) -> bool:
         """Whether a tile can be read without a request."""
@@ -174,10 +162,6 @@ class MapClient:
         for digest in planes.hashes():
             if not (self._planes / digest).exists():
                 self._plane(digest)
-
-    def tile(self, window: Grid, planes: Plane) -> Tile:
-        """A tile over ``window``; what ``home`` lacks of it is downloaded. Raises as :meth:`fetch`."""
-        return self._tile(window, planes)
 
     def forget(self, needed: Iterable[Plane]) -> None:
         """Keep the cache of planes within its bound; none of ``needed`` leaves it."""
@@ -238,9 +222,9 @@ class MapClient:
         result: Sent = answer.json()["result"]
         return result
 
-    def _newest(self) -> Manifest:
-        """The newest manifest: what is kept of the last one, and what changed since."""
-        kept = self._kept()
+    def manifest(self) -> Manifest:
+        """The newest version's, of which only what changed since the last is downloaded. Raises as :meth:`fetch`."""
+        kept = self.kept_manifest()
         if kept is not None:
             tag = manifest_tag(kept.version, kept.version, (kept.digest, kept.fields_digest))
             try:
@@ -267,7 +251,8 @@ class MapClient:
         except msgspec.DecodeError as error:
             raise MapvoteError(f"{self._url}: is no mapvote server ({error})") from error
 
-    def _kept(self) -> Manifest | None:
+    def kept_manifest(self) -> Manifest | None:
+        """What :meth:`manifest` gave last, without a request; None if nothing is kept."""
         try:
             return _MANIFEST.decode(self._kept_manifest.read_bytes())
         except (OSError, msgspec.DecodeError):
@@ -278,7 +263,8 @@ class MapClient:
             part.write_bytes(msgspec.json.encode(manifest))
         return manifest
 
-    def _tile(self, window: Grid, planes: Plane) -> Tile:
+    def tile(self, window: Grid, planes: Plane) -> Tile:
+        """A tile over ``window``; what ``home`` lacks of it is downloaded. Raises as :meth:`fetch`."""
         points = np.frombuffer(self._plane(planes.points), dtype="<f4").reshape(-1, 3)
         ground_z = np.frombuffer(self._plane(planes.ground), dtype="<f4").reshape(window.shape)
         free = (

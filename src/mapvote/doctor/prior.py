@@ -222,12 +222,8 @@ def _swapped_positions(T: F64) -> F64:
     return out
 
 
-def _still(T: F64) -> F64:
-    return np.tile(np.eye(4), (len(T), 1, 1))
-
-
 def _in_map_axes(T: F64) -> F64:
-    out = _still(T)
+    out = np.tile(np.eye(4), (len(T), 1, 1))
     out[:, :3, 3] = T[:, :3, 3]
     return out
 
@@ -248,7 +244,6 @@ def _quarter_turns(yaw_deg: int) -> tuple[Reading, Reading]:
 
 
 AS_IT_IS = Reading("as it is", "", lambda T: T)
-STILL = Reading("the scans do not move against each other", "", _still, "scans")
 READINGS = (
     Reading("the prior holds inverse poses (T_lidar_map)", "write T_map_lidar, the inverse of each matrix", _inverse),
     Reading(

@@ -91,7 +91,7 @@ def test_what_is_left_is_whole_and_bit_for_bit_as_it_was(store: Store, clock: Cl
     assert rollback(store, 7).number == 10
     assert [v.number for v in store.versions()] == list(range(1, 11)), "that they were stays"
     story = explain_cell(store, 20.5 * 0.3, 20.5 * 0.3)
-    assert [version for version, _ in story.decisions] == [7, 8, 9]
+    assert [decision.version for decision in story.decisions] == [7, 8, 9]
 
 
 def test_it_goes_on_as_if_nothing_had_been_cleared(store: Store, clock: Clock, tmp_path: Path) -> None:

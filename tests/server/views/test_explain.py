@@ -27,7 +27,7 @@ from mapvote.server.store.publish import preview, publish
 from mapvote.server.store.store import Store
 from mapvote.server.views import explain
 from mapvote.server.views.events import last_events
-from mapvote.server.views.explain import COPY, CellStory, explain_cell, story_as_json
+from mapvote.server.views.explain import COPY, CellDecision, CellStory, LeftOut, explain_cell, story_as_json
 from mapvote.server.views.point_lod import evidence
 from standing_clock import Clock
 from stores import send
@@ -90,7 +90,7 @@ def test_a_vote_is_named_with_the_version_that_counted_it_or_why_it_does_not_cou
         ("a", 1, (2,), False), ("b", 1, (2,), False), ("c", 2, (), True)
     ]  # fmt: skip
     assert told.votes[0].why == "spent: version 2 has changed the cell since"
-    assert told.decisions == [(2, "changed_empty")]
+    assert told.decisions == [CellDecision(2, "changed_empty")]
     assert told.probability is not None
     assert 0.0 < told.probability < 1.0
     assert story_as_json(told)["probability"] == round(told.probability, 3)
@@ -142,7 +142,7 @@ def test_a_damaged_decision_is_told_and_hides_no_vote(store: Store) -> None:
     with store.database.writing() as connection:
         connection.execute(schema.decisions.update().values(states=b"rot"))
     told = story(store)
-    assert told.decisions == [(2, "unreadable")]
+    assert told.decisions == [CellDecision(2, "unreadable")]
     assert told.probability is None
     assert [vote.counted_in for vote in told.votes] == [(2,), (2,)]
 
@@ -161,7 +161,7 @@ def test_of_copies_the_story_says_that_one_counts_and_the_log_whose_they_are_onc
     publish(store)
     assert {vote.vehicle: vote.counted_in for vote in story(store).votes} == {"a": (), "b": (2,), "liar": (2,)}
     assert {vote.vehicle: vote.left_out_of for vote in story(store).votes} == {
-        "a": ((2, REASONS["copy"]),), "b": (), "liar": ()
+        "a": (LeftOut(2, REASONS["copy"]),), "b": (), "liar": ()
     }  # fmt: skip
     (told,) = [event for event in last_events(store) if event["kind"] == "copy"]
     assert told["detail"].startswith("a's ballot ")
@@ -186,7 +186,7 @@ def test_the_story_of_a_cell_of_many_versions_decides_its_tile_once(
     monkeypatch.setattr(explain, "decide_tile", decide)
     sa.event.listen(store.database.engine, "before_cursor_execute", lambda *given: statements.append(given[2]))
     told = story(store)
-    assert [version for version, _ in told.decisions] == [2, 3, 4, 5]
+    assert [decision.version for decision in told.decisions] == [2, 3, 4, 5]
     assert [vote.counted_in for vote in told.votes] == [(k,) for k in range(2, 6) for _ in "ab"]
     assert (decided["tile"], len(statements) <= 20) == (1, True), len(statements)
 

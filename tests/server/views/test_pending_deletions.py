@@ -146,5 +146,5 @@ def test_what_spilled_over_goes_with_its_wall_and_its_story_says_that_nothing_ch
     assert "the noise of" not in there.thing
     assert publish(store).deleted == len(wall) + len(spill)
     told = [explain_cell(store, x, 41.55).decisions for x in (29.85, 30.15)]
-    assert [[state for _, state in each] for each in told] == [["unchanged_empty"], ["changed_empty"]]
+    assert [[decision.state for decision in each] for each in told] == [["unchanged_empty"], ["changed_empty"]]
     store.close()

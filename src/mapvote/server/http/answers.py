@@ -10,8 +10,10 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from mapvote.server.store.integrity import Damage
 from mapvote.server.views.change_objects import Kind, Size
-from mapvote.server.views.consensus import Claim, Stance
+from mapvote.server.views.consensus import VehicleStanding
+from mapvote.server.views.explain import CellDecision, LeftOut
 
 
 class Answer(BaseModel):
@@ -259,13 +261,6 @@ class Places(Answer):
     features: list[PlacedFeature]
 
 
-class LeftOut(Answer):
-    """A version that did not count a ballot."""
-
-    version: int
-    why: str
-
-
 class CellVoteAnswer(Answer):
     """What one ballot says about a cell."""
 
@@ -280,13 +275,6 @@ class CellVoteAnswer(Answer):
     why: str
     counted_in: list[int]
     left_out_of: list[LeftOut]
-
-
-class CellDecision(Answer):
-    """What a version decided."""
-
-    version: int
-    state: str
 
 
 class CellAnswer(Answer):
@@ -315,33 +303,10 @@ class Coverage(Answer):
     tiles: list[CoveredTile]
 
 
-class Contradicted(Answer):
-    """Where a vehicle contradicts the others, map metres."""
-
-    x: float
-    y: float
-    cells: int
-    says: Claim
-
-
-class VehicleAnswer(Answer):
-    """How a vehicle stands to what the others say."""
-
-    vehicle: str
-    verdict: Stance
-    cells: int
-    objects: int
-    others_cells: int
-    others_objects: int
-    p_value: float
-    threshold: float
-    evidence: list[Contradicted]
-
-
 class Vehicles(Answer):
     """By name."""
 
-    vehicles: list[VehicleAnswer]
+    vehicles: list[VehicleStanding]
 
 
 class PolicyAnswer(Answer):
@@ -393,19 +358,10 @@ class Log(Answer):
     events: list[LoggedEvent]
 
 
-class DamageAnswer(Answer):
-    """One thing that is not as it was written."""
-
-    kind: str
-    name: str
-    why: str
-    mended: str
-
-
 class Checked(Answer):
     """What is damaged."""
 
-    damage: list[DamageAnswer]
+    damage: list[Damage]
 
 
 class Health(Answer):

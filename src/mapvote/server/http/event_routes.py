@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import AsyncIterator
-from dataclasses import asdict
 from typing import Annotated
 
 import msgspec
@@ -66,4 +65,4 @@ async def _told(request: Request, parts: Services, seq: int, named: bool) -> Asy
 
 def as_sse(event: Event) -> bytes:
     """One event on the wire. JSON holds no line break, so no text in it can begin another event."""
-    return b"id: %d\ndata: %b\n\n" % (event.seq, msgspec.json.encode(asdict(event)))
+    return b"id: %d\ndata: %b\n\n" % (event.seq, msgspec.json.encode(event))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from concurrent.futures import CancelledError
 from contextlib import contextmanager
-from dataclasses import asdict
+from dataclasses import replace
 from functools import partial
 from typing import Annotated, Literal
 
@@ -211,8 +211,7 @@ def vehicles(request: Request, format: Places = "json") -> Response:
         return as_table(standing_rows(found))
     if format == "geojson":
         return as_json(contradictions(found))
-    told = [asdict(s) | {"evidence": [asdict(e) for e in s.evidence[:_MOST_EVIDENCE]]} for s in found]
-    return as_json({"vehicles": told})
+    return as_json({"vehicles": [replace(standing, evidence=standing.evidence[:_MOST_EVIDENCE]) for standing in found]})
 
 
 @contextmanager

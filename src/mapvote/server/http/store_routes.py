@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
 from functools import partial
 from typing import Annotated
 
@@ -61,7 +60,7 @@ async def whole(request: Request) -> Response:
     operator(request)
     parts = services(request)
     found = await to_thread.run_sync(check, parts.store, limiter=parts.threads.deciding)
-    return as_json({"damage": [asdict(damage) for damage in found]})
+    return as_json({"damage": found})
 
 
 @router.post("/v1/check", response_model=Checked, responses=problems(403), summary="Set aside what is damaged")
@@ -69,4 +68,4 @@ async def mend(request: Request) -> Response:
     """As GET; what is damaged is set aside. Planes are mended on the server's own machine, from a backup."""
     by, parts = operator(request), services(request)
     found = await to_thread.run_sync(partial(check, parts.store, mend=True, by=by), limiter=parts.threads.deciding)
-    return as_json({"damage": [asdict(damage) for damage in found]})
+    return as_json({"damage": found})

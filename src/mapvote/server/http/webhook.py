@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Sequence
-from dataclasses import asdict
 from datetime import UTC, datetime
 from functools import partial
 
@@ -50,7 +49,7 @@ async def deliver(parts: Services) -> None:
             try:
                 events = await ask(parts.feed.after, seq)
                 if events:
-                    body = msgspec.json.encode({"map_id": parts.store.map_id, "events": [asdict(e) for e in events]})
+                    body = msgspec.json.encode({"map_id": parts.store.map_id, "events": events})
                     at = datetime.fromtimestamp(parts.store.clock() // 10**9, UTC)
                     headers = signed(asked.webhook_secret, events, at, body)
                     (await client.post(asked.webhook_url, content=body, headers=headers)).raise_for_status()

@@ -57,6 +57,22 @@ ENDED = {
 
 
 @dataclass(frozen=True, slots=True)
+class LeftOut:
+    """A version that did not count a ballot, though the ballot stood."""
+
+    version: int
+    why: str
+
+
+@dataclass(frozen=True, slots=True)
+class CellDecision:
+    """What a version decided of a cell."""
+
+    version: int
+    state: str
+
+
+@dataclass(frozen=True, slots=True)
 class CellVote:
     """What one ballot says about a cell. The ballot stands, or a version counted it and it was taken back since."""
 
@@ -77,8 +93,8 @@ class CellVote:
     """Why it does not count; empty if it does."""
     counted_in: tuple[int, ...]
     """Versions that counted it on this cell, of the last 30 that decided the cell."""
-    left_out_of: tuple[tuple[int, str], ...]
-    """Those of the 30 that did not count it though it stood, and why."""
+    left_out_of: tuple[LeftOut, ...]
+    """Those of the 30 that did not."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,8 +104,8 @@ class CellStory:
     row: int
     col: int
     votes: list[CellVote]
-    decisions: list[tuple[int, str]]
-    """(version, state) of every version that decided this cell."""
+    decisions: list[CellDecision]
+    """Of every version that decided this cell."""
     probability: float | None
     """That it changed as the last of them says (fusion/loss_budget.py); None if that one says of no change."""
     thing: str
@@ -124,18 +140,13 @@ def explain_cell(store: Store, x: float, y: float) -> CellStory:
         decisions = [(record, state) for record, state in found if state != state_name(NO_VOTE)]
         votes = _votes(connection, now, [record for record, _ in decisions[-MOST_RECORDS:]])
     probability = _probability(decisions[-1][0], cell) if decisions else None
-    by_version = [(record.version, state) for record, state in decisions]
+    by_version = [CellDecision(record.version, state) for record, state in decisions]
     return CellStory(row, col, votes, by_version, probability, _thing(now))
 
 
 def story_as_json(story: CellStory) -> dict[str, Any]:
     """A story as JSON."""
-    votes = [asdict(vote) for vote in story.votes]
-    for vote in votes:
-        vote["left_out_of"] = [{"version": version, "why": why} for version, why in vote["left_out_of"]]
-    decisions = [{"version": version, "state": state} for version, state in story.decisions]
-    told = {"row": story.row, "col": story.col, "thing": story.thing, "votes": votes, "decisions": decisions}
-    return {**told, "probability": None if story.probability is None else round(story.probability, 3)}
+    return asdict(story) | {"probability": None if story.probability is None else round(story.probability, 3)}
 
 
 def state_name(state: int) -> str:
@@ -194,13 +205,13 @@ def _votes(connection: sa.Connection, now: _Now, records: Sequence[Record]) -> l
     flat = now.cell[0] * TILE_CELLS + now.cell[1]
     past = sound_votes(connection, now.tile.index, {s.ballot for r in records for s in _standings(r)} - now.said.keys())
     said = {**now.said, **{seq: vote for seq, (_, vote) in past.items()}}
-    counted, left_out = defaultdict[int, list[int]](list), defaultdict[int, list[tuple[int, str]]](list)
+    counted, left_out = defaultdict[int, list[int]](list), defaultdict[int, list[LeftOut]](list)
     for record in records:
         for standing in _standings(record):
             if standing.ballot in said and said[standing.ballot].spoken()[now.cell]:
                 why = standing.why_not(flat)
                 if why:
-                    left_out[standing.ballot].append((record.version, REASONS[why]))
+                    left_out[standing.ballot].append(LeftOut(record.version, REASONS[why]))
                 else:
                     counted[standing.ballot].append(record.version)
     ended = _ended(connection, past.keys() & counted.keys())
@@ -242,7 +253,7 @@ def _vote(
     vote: TileVote | None,
     why: str,
     cell: tuple[int, int],
-    versions: tuple[Sequence[int], Sequence[tuple[int, str]]],
+    versions: tuple[Sequence[int], Sequence[LeftOut]],
 ) -> CellVote:
     """``versions``: those that counted it, and those that did not and why."""
     whose = stored.vehicle, stored.drive, stored.version
