@@ -12,7 +12,7 @@ import sqlalchemy as sa
 from typer.testing import CliRunner
 
 from hand_made import make_ballot, make_map, make_tile, wall
-from live_server import serving
+from live_server import serving_here
 from mapvote.cli import app
 from mapvote.config import FuseSettings
 from mapvote.core.types import MapvoteError
@@ -33,7 +33,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, str]]:
     for vehicle in ("a", "b"):
         send(store, make_ballot(store.point_map(), {(0, 2): wall_gone()}, vehicle))
     store.close()
-    with serving(home / "s.db", log=home / "log") as (url, _):
+    with serving_here(home / "s.db", log=home / "log") as url:
         yield str(home / "s.db"), url
 
 
@@ -96,7 +96,7 @@ def test_a_server_rolls_back_and_withdraws_a_drive(tmp_path: Path) -> None:
     store = Store.create(f"sqlite:///{tmp_path / 's.db'}", point_map)
     send(store, *[make_ballot(point_map, {(0, 0): wall_gone()}, name, "d") for name in ("a", "b")])
     store.close()
-    with serving(tmp_path / "s.db", log=tmp_path / "log") as (url, _):
+    with serving_here(tmp_path / "s.db", log=tmp_path / "log") as url:
         assert "version 2 (published)" in say("publish", url, "--override")
         assert "version 3 is version 1 again" in say("rollback", url, 1, "--reason", "wrong")
         assert "1 ballots of a withdrawn" in say("unvote", url, "a", "--drive", "d")

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from hand_made import make_map, make_tile
-from live_server import serving
+from live_server import serving_here
 from mapvote.server.store.store import Store
 
 CONFIG = """
@@ -34,7 +34,7 @@ def url(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     points = np.random.default_rng(1).uniform(0.0, 76.0, (POINTS, 3)).astype(np.float32)
     Store.create(f"sqlite:///{home / 's.db'}", make_map({(0, 0): make_tile(points)})).close()
     (home / "server.toml").write_text(CONFIG)
-    with serving(home / "s.db", "--config", home / "server.toml", log=home / "log") as (address, _):
+    with serving_here(home / "s.db", config=home / "server.toml", log=home / "log") as address:
         yield address
     log = (home / "log").read_text()
     assert "Traceback" not in log, log[-3000:]

@@ -19,7 +19,7 @@ import sqlalchemy as sa
 from standardwebhooks import Webhook, WebhookVerificationError
 
 from hand_made import Say, make_ballot, states_plane, two_walls
-from live_server import serving
+from live_server import serving, serving_here
 from mapvote.client import MapClient
 from mapvote.config.server import ServerSettings
 from mapvote.core.types import CellState
@@ -51,7 +51,7 @@ def vote(url: str, home: Path) -> None:
 
 
 def test_a_ballot_is_told_to_who_listens_and_again_to_who_comes_back(store: Path, tmp_path: Path) -> None:
-    with serving(store, "--open", log=tmp_path / "log") as (url, _), httpx2.Client(timeout=20.0) as http:
+    with serving_here(store, log=tmp_path / "log") as url, httpx2.Client(timeout=20.0) as http:
         with http.stream("GET", f"{url}/v1/events") as answer:
             lines = answer.iter_lines()
             assert next(lines) == ": listening"

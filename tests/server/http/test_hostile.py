@@ -16,7 +16,7 @@ import msgspec
 import pytest
 
 from hand_made import SETTINGS, Say, make_ballot, states_plane, two_walls, wall, words_plane
-from live_server import serving
+from live_server import serving_here
 from mapvote.codec.ballot import MAX_TILE_INDEX, encode
 from mapvote.core.types import CellState
 from mapvote.server.store import keys
@@ -56,7 +56,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Site]:
         f"sqlite:///{home / 'store.db'}", two_walls(), Policy(round=RoundPolicy(settings_hash=SETTINGS))
     )
     vehicle, operator = keys.issue(store, "v1", "vehicle"), keys.issue(store, "boss", "operator")
-    with serving(home / "store.db", "--config", home / "server.toml", log=home / "log") as (url, _):
+    with serving_here(home / "store.db", config=home / "server.toml", log=home / "log") as url:
         found = Site(url, vehicle, operator, store)
         yield found
         found.http.close()

@@ -9,7 +9,7 @@ import httpx2
 import pytest
 
 from hand_made import Say, make_ballot, states_plane, two_walls
-from live_server import serving
+from live_server import serving_here
 from mapvote.core.types import CellState
 from mapvote.server.http.security import HEADERS
 from mapvote.server.store.store import Store
@@ -24,7 +24,7 @@ def url(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     says = {(0, 0): Say(states_plane({(10, 10): CellState.CHANGED_EMPTY}))}
     send(store, *[make_ballot(two_walls(), says, vehicle, "d1") for vehicle in ("a", "b")])
     (home / "server.toml").write_text('[server]\nhosts = ["maps.example.org"]\n')
-    with serving(home / "s.db", "--config", home / "server.toml", log=home / "log") as (address, _):
+    with serving_here(home / "s.db", config=home / "server.toml", log=home / "log") as address:
         yield address
     assert store.current() == 1
     store.close()
