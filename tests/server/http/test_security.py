@@ -68,7 +68,9 @@ def test_its_own_page_and_the_name_that_the_operator_gave_it_are_let_in(url: str
         {"Origin": "https://MAPS.example.org"},
         {"Host": "localhost:8080"},
     ):
-        assert httpx2.post(f"{url}/v1/publish", json={"dry_run": True}, headers=headers).status_code == 200
+        assert (
+            httpx2.post(f"{url}/v1/publish", json={"dry_run": True}, headers=headers, timeout=60.0).status_code == 200
+        )
 
 
 @pytest.mark.parametrize("path", ["/", "/docs", "/viewer/app.js", "/v1/map", "/healthz", "/nothing", "/openapi.json"])
