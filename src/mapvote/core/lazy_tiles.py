@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import weakref
 from collections import OrderedDict
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from threading import RLock
 
 from mapvote.core.grid import TileIndex
@@ -27,6 +27,13 @@ class LazyTiles(Mapping[TileIndex, Tile]):
     def add(self, index: TileIndex, points: int) -> None:
         """One more tile can be had from here on."""
         self._points = dict(sorted({**self._points, index: points}.items()))
+
+    def keep_only(self, indices: Collection[TileIndex]) -> None:
+        """Let go of all other tiles, and of what they have worked out: they are made again when they are asked for."""
+        with self._lock:
+            for index in self._kept.keys() - set(indices):
+                del self._kept[index]
+                self._held -= self._points[index]
 
     @property
     def points_of(self) -> dict[TileIndex, int]:

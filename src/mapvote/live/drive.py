@@ -5,21 +5,24 @@ from __future__ import annotations
 import logging
 import time
 from collections import deque
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple, Protocol
 
 import numpy as np
 
 from mapvote.codec.ballot import Ballot
 from mapvote.core.grid import TileIndex, window_around
+from mapvote.core.lazy_tiles import LazyTiles
 from mapvote.core.point_map import PointMap
+from mapvote.core.tile import Tile
 from mapvote.core.types import F32, F64, MapvoteError, Scan
 from mapvote.doctor.finding import Finding
 from mapvote.formats.drives.trajectory import sorted_trajectory
 from mapvote.formats.geo.frame import MapFrame
 from mapvote.live.first_seconds import FirstSeconds
 from mapvote.live.outbox import Outbox
+from mapvote.localisation.map_window import tiles_within
 from mapvote.vehicle import Cuts, RoadDriven, Vehicle, stretch_name
 
 log = logging.getLogger("mapvote.live")
@@ -38,6 +41,9 @@ _BACK_NS, _AHEAD_NS = 10**9, 3600 * 10**9
 """A stamp so much before the last one, or after it: the clock has jumped."""
 _JUMPED = 3
 """Scans in turn that say so: one alone is late, or damaged."""
+KEPT_M = 300.0
+"""Tiles that touch a square reaching so far stay in memory; with those farther away their columns and words go, too."""
+_MOVED_M = 30.0
 _LATENCIES = 6000
 """Latencies that are kept: ten minutes at 10 Hz."""
 
@@ -77,15 +83,30 @@ class OneMap:
     """A map from a file or a store: all of it is here, and no other version comes."""
 
     def __init__(self, point_map: PointMap) -> None:
-        self._point_map = point_map
+        self._tiles = point_map.tiles if isinstance(point_map.tiles, LazyTiles) else _copied(point_map.tiles)
+        self._point_map = replace(point_map, tiles=self._tiles)
+        self._position: F64 | None = None
 
     def current(self) -> PointMap:
         """See :class:`Maps`."""
         return self._point_map
 
     def covers(self, position: F64 | None) -> bool:
-        """See :class:`Maps`."""
+        """See :class:`Maps`. What tiles far from there have worked out is let go."""
+        if position is not None and has_moved(position, self._position):
+            self._position = position
+            self._tiles.keep_only(tiles_within(self._point_map, position, KEPT_M))
         return True
+
+
+def _copied(tiles: Mapping[TileIndex, Tile]) -> LazyTiles:
+    """Tiles that share the arrays of these, and keep what they work out apart from them."""
+    return LazyTiles(lambda index: tiles[index].but(), {index: len(tile.points) for index, tile in tiles.items()})
+
+
+def has_moved(position: F64, since: F64 | None) -> bool:
+    """Whether the vehicle is so far from where it was that other tiles matter."""
+    return since is None or float(np.abs(position[:2] - since[:2]).max()) > _MOVED_M
 
 
 @dataclass(slots=True)

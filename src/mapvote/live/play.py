@@ -98,7 +98,9 @@ def topics_of_drive(drive: Drive) -> list[tuple[str, str]]:
 
 def messages_of_drive(drive: Drive) -> Iterator[Message]:
     """A drive as a vehicle would have sent it: its mount once, then of each scan pose and cloud."""
-    yield Message(int(drive.stamps_ns[0]), "/tf_static", TF, _tf(int(drive.stamps_ns[0]), drive.T_base_lidar))
+    start_ns = int(drive.stamps_ns[0])
+    mount = transform_message(start_ns, BASE_FRAME, LIDAR_FRAME, drive.T_base_lidar)
+    yield Message(start_ns, "/tf_static", TF, to_cdr(TF, blank_message(TF, transforms=[mount])))
     T_lidar_base = inverse(drive.T_base_lidar)
     for i, scan in enumerate(drive):
         stamp_ns = int(drive.stamps_ns[i])
@@ -156,16 +158,12 @@ def _quaternion(T: F64) -> Any:
     return blank_message("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w)
 
 
-def _tf(stamp_ns: int, T_base_lidar: F64) -> bytes:
+def transform_message(stamp_ns: int, parent: str, child: str, T_parent_child: F64) -> Any:
+    """A geometry_msgs/TransformStamped of T (4, 4)."""
     transform = blank_message(
         "geometry_msgs/msg/Transform",
-        translation=_xyz("geometry_msgs/msg/Vector3", T_base_lidar),
-        rotation=_quaternion(T_base_lidar),
+        translation=_xyz("geometry_msgs/msg/Vector3", T_parent_child),
+        rotation=_quaternion(T_parent_child),
     )
-    stamped = blank_message(
-        "geometry_msgs/msg/TransformStamped",
-        header=header_of(stamp_ns, BASE_FRAME),
-        child_frame_id=LIDAR_FRAME,
-        transform=transform,
-    )
-    return to_cdr(TF, blank_message(TF, transforms=[stamped]))
+    header = header_of(stamp_ns, parent)
+    return blank_message("geometry_msgs/msg/TransformStamped", header=header, child_frame_id=child, transform=transform)

@@ -16,6 +16,7 @@ from mapvote.core.lazy_tiles import LazyTiles
 from mapvote.core.point_map import PointMap
 from mapvote.core.tile import Tile
 from mapvote.core.types import F64, MapvoteError
+from mapvote.live.drive import KEPT_M, has_moved
 
 log = logging.getLogger("mapvote.live")
 AHEAD_M, NEEDED_M = 300.0, 160.0
@@ -115,9 +116,9 @@ class RoadMap:
 
     def covers(self, position: F64 | None) -> bool:
         """See :class:`mapvote.live.drive.Maps`: of the version that was asked for last."""
-        known = position is not None and self._position is not None
-        if not known or np.abs(position[:2] - self._position[:2]).max() > 0.1 * AHEAD_M:  # type: ignore[index]
+        if position is None or has_moved(position, self._position):
             self._position, self._located = position, True
+            self._used.tiles.keep_only(self._used.around(position, KEPT_M))
             self._wake.set()
         return not self._used.missing(position, NEEDED_M)
 
