@@ -142,6 +142,13 @@ def laps(domain: int, drive: str, shown: Path) -> None:
         k += 1
 
 
+def last_stamp(shown: Path) -> int:
+    """That of the last scan sent, once there is one."""
+    while not (shown.exists() and (text := shown.read_text())):
+        time.sleep(0.05)
+    return int(text)
+
+
 class Server:
     """mapvote serve, which can be taken away and brought back."""
 
@@ -186,13 +193,13 @@ def kills(drive: str, map_path: str, n: int) -> None:
             said = log.read_text().count("listening")
             while log.read_text().count("listening") == said:
                 time.sleep(0.2)
-            began_ns, away = int(shown.read_text()), k % 2 == 1
+            began_ns, away = last_stamp(shown), k % 2 == 1
             if away:
                 server.stop()
-            time.sleep(chance.uniform(2.0, 45.0) if k < n else 20.0)
+            time.sleep(chance.uniform(2.0, 25.0) if k < n else 20.0)
             if k < n:
                 process.kill()
-                killed_ns.append((began_ns, int(shown.read_text())))
+                killed_ns.append((began_ns, last_stamp(shown)))
             else:
                 process.terminate()
             process.wait()
@@ -214,17 +221,18 @@ def kills(drive: str, map_path: str, n: int) -> None:
     print(f"road missing at a kill: median {np.median(gaps):.1f} s, at most {max(gaps):.1f} s ({log})")
 
 
-def play_and_drive(drive: str, map_path: str, rate: float) -> None:
-    """Two processes, as the two terminals of docs/live.md."""
+def play_and_drive(drive: str, map_path: str, rate: float, sensor: str, core: str) -> None:
+    """Two processes, as the two terminals of docs/live.md; ``core``: the one that drive has, "" for any."""
     home = Path(tempfile.mkdtemp())
     os.environ |= {"CYCLONEDDS_URI": LOOPBACK, "XDG_CACHE_HOME": str(home)}
     domain = domain_of("play")
     player = subprocess.Popen(
         mapvote("play", drive, "--rate", rate, "--domain", domain), stdout=subprocess.DEVNULL, start_new_session=True
     )
-    options = ["--map", map_path, "--out", home, "--vehicle", "car", "--sensor", "hdl32e", "--idle", 5]
+    options = ["--map", map_path, "--out", home, "--vehicle", "car", "--sensor", sensor, "--idle", 5]
     before = os.times()
-    result = subprocess.run(mapvote("drive", *options, "--domain", domain), capture_output=True, text=True, check=True)
+    command = (["taskset", "-c", core] if core else []) + mapvote("drive", *options, "--domain", domain)
+    result = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True)
     after = os.times()
     player.wait()
     print(result.stdout.splitlines()[-1])
@@ -309,13 +317,15 @@ def main() -> None:
     parser.add_argument("--domain", type=int, default=0)
     parser.add_argument("--seconds", type=float, default=20.0)
     parser.add_argument("--rate", type=float, default=1.0)
+    parser.add_argument("--sensor", default="hdl32e")
+    parser.add_argument("--core", default="", help="that the process which drives is held to")
     parser.add_argument("--kills", type=int, default=50)
     parser.add_argument("--hours", type=float, default=8.0)
     options = parser.parse_args()
     runs: dict[str, Callable[[], None]] = {
         "send-clouds": lambda: send_clouds(options.domain, options.seconds),
         "cloud": lambda: read_clouds(options.seconds),
-        "drive": lambda: play_and_drive(options.paths[0], options.paths[1], options.rate),
+        "drive": lambda: play_and_drive(options.paths[0], options.paths[1], options.rate, options.sensor, options.core),
         "kills": lambda: kills(options.paths[0], options.paths[1], options.kills),
         "laps": lambda: laps(options.domain, options.paths[0], Path(options.paths[1])),
         "hours": lambda: hours(options.paths[0], options.paths[1], options.hours),

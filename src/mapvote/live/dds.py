@@ -192,6 +192,10 @@ class Publication:
         if result < 0:
             raise MapvoteError(f"DDS refuses a message of {len(data)} bytes (error {result}); is a reader too slow?")
 
+    def delivered(self, seconds: float) -> bool:
+        """Wait so long at most until every reliable reader has everything; returns whether it has."""
+        return bool(self._writer.wait_for_acks(int(seconds * 1e9)))
+
 
 def ros_type(type_name: str) -> str | None:
     """sensor_msgs/msg/PointCloud2 of ``sensor_msgs::msg::dds_::PointCloud2_``; None if it is no type of ROS 2."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
+from bisect import bisect_left
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -32,6 +33,8 @@ _DEPTH = 200
 """Messages that wait in DDS at most: while the process stands still for 20 s none is lost."""
 _MEASURED = 10
 """Scans in which a sensor is measured."""
+_POSES = 400
+"""Poses whose times of sending are kept: four seconds at 100 Hz."""
 _OTHER_CLOCK_NS = 10**9
 """Stamps of clouds and poses that come together and differ by more are of two clocks."""
 
@@ -139,7 +142,8 @@ class Hearing:
         self.base_frame, self.map_frame = "", ""
         """What odometry tracks, and in which frame."""
         self.clock_difference_ns = 0
-        """Stamp of the newest pose less that of the newest cloud, when both came."""
+        """Stamp of a pose less that of a cloud which came, or was sent, at the same time: the smaller of the two. What
+        comes is late where the process is busy, and where senders' clocks differ what is sent tells nothing."""
         self.clouds = 0
         self._edges: Edges = {}
         self._sweeps = Sweeps(len(chosen.points))
@@ -148,7 +152,8 @@ class Hearing:
         self._tf = network.subscribe("/tf_static", TF, reliable=True, transient_local=True)
         self._lost = 0
         self._mounts: list[F64] | None = None
-        self._newest_pose_ns = 0
+        self._sent_poses: deque[tuple[int, int]] = deque(maxlen=_POSES)
+        """When each of the last poses was sent, and its stamp."""
         self._looked_s = time.monotonic()
 
     def _subscribed(self, topic: SentTopic) -> Subscription:
@@ -162,14 +167,14 @@ class Hearing:
     def poses(self) -> list[tuple[int, F64]]:
         """Odometry that came: stamps, and T_map_base."""
         out = []
-        for data in [] if self._odometry is None else self._odometry.take():
+        for sent_ns, data in [] if self._odometry is None else self._odometry.take_sent():
             message = from_cdr(ODOMETRY, data)
             pose = message.pose.pose
             self.base_frame, self.map_frame = (
                 name.strip("/") for name in (message.child_frame_id, message.header.frame_id)
             )
             out.append((stamp_ns(message), matrix_of(pose.position, pose.orientation)))
-            self._newest_pose_ns = out[-1][0]
+            self._sent_poses.append((sent_ns, out[-1][0]))
         return out
 
     def scans(self) -> list[list[Cloud]]:
@@ -182,8 +187,10 @@ class Hearing:
                 self.frames[lidar] = header.frame_id.strip("/")
                 time_ns = int(header.stamp.sec) * 10**9 + int(header.stamp.nanosec)
                 self.clouds += 1
-                if self._newest_pose_ns:
-                    self.clock_difference_ns = self._newest_pose_ns - time_ns
+                if self._sent_poses:
+                    at = min(bisect_left(self._sent_poses, (sent_ns, 0)), len(self._sent_poses) - 1)
+                    together = self._sent_poses[at][1], self._sent_poses[-1][1]
+                    self.clock_difference_ns = min((pose_ns - time_ns for pose_ns in together), key=abs)
                 out += self._sweeps.add(Cloud(lidar, time_ns, sent_ns, data))
         if time.monotonic() > self._looked_s + _REVISIT_S:
             self._revisit()

@@ -24,6 +24,8 @@ from mapvote.live.topics import CLOUD, ODOMETRY, TF
 
 _SEEN_S = 0.5
 """Between the first reader and the first message, so that every reader has found every topic."""
+_REPEATED_S = 30.0
+"""How long a slow reader may take for what was sent last."""
 POINTS, POSES = "/points", "/odometry"
 MAP_FRAME, BASE_FRAME, LIDAR_FRAME = "map", "base_link", "lidar"
 
@@ -41,7 +43,7 @@ def play(path: Path, network: Network, *, rate: float = 1.0, wait_s: float = 0.0
     """Send a recorded drive; returns how many messages.
 
     ``rate``: times as fast as recorded. ``wait_s``: wait so long for a reader at most. ``loops``: so many times, with
-    the stamps of the recording each time. MapvoteError if there is nothing that can be sent.
+    the stamps of the recording each time. MapvoteError if there is nothing that can be sent, or not all was received.
     """
     topics, messages = opened(path)
     out: dict[str, Publication] = {}
@@ -60,7 +62,12 @@ def play(path: Path, network: Network, *, rate: float = 1.0, wait_s: float = 0.0
             time.sleep(max(0.0, start + 1e-9 * (message.time_ns - first) / rate - time.monotonic()))
             out[message.topic].send(message.data)
             count += 1
-    time.sleep(_SEEN_S)  # a reliable writer that is gone repeats nothing
+    late = [topic for topic, publication in out.items() if not publication.delivered(_REPEATED_S)]
+    if late:  # a reliable writer that is gone repeats nothing
+        raise MapvoteError(
+            f"{path}: a reader has not got all of {', '.join(late)} in {_REPEATED_S:.0f} s; is it too slow?"
+        )
+    time.sleep(_SEEN_S)
     return count
 
 
