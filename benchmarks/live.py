@@ -174,8 +174,9 @@ class Server:
             return database.execute("select drive, start_ns, end_ns from ballots order by start_ns").fetchall()
 
 
-def kills(drive: str, map_path: str, n: int) -> None:
-    """Kill a live drive n times, and count what is missing and what came twice."""
+def kills(drive: str, map_path: str, n: int, longest_s: float) -> None:
+    """Kill a live drive n times, each up to ``longest_s`` after its start, and count what is missing and what came
+    twice. Exit code 1 if a ballot is, or more than 30 s of road."""
     home, chance = Path(tempfile.mkdtemp()), random.Random(4)
     os.environ |= {"CYCLONEDDS_URI": LOOPBACK, "XDG_CACHE_HOME": str(home / "cache"), "PYTHONUNBUFFERED": "1"}
     domain, server, shown, log = domain_of("kills"), Server(home, map_path), home / "stamp", home / "log"
@@ -192,11 +193,12 @@ def kills(drive: str, map_path: str, n: int) -> None:
             process = subprocess.Popen(command, stdout=out, stderr=out)
             said = log.read_text().count("listening")
             while log.read_text().count("listening") == said:
+                assert process.poll() is None, log.read_text()
                 time.sleep(0.2)
-            began_ns, away = last_stamp(shown), k % 2 == 1
+            began_ns, away = last_stamp(shown), k % 2 == 1 and k < n
             if away:
                 server.stop()
-            time.sleep(chance.uniform(2.0, 25.0) if k < n else 20.0)
+            time.sleep(chance.uniform(2.0, longest_s) if k < n else 20.0)
             if k < n:
                 process.kill()
                 killed_ns.append((began_ns, last_stamp(shown)))
@@ -219,6 +221,7 @@ def kills(drive: str, map_path: str, n: int) -> None:
     print(f"{n} kills, the server away in {n // 2}: {len(ballots)} ballots, {len(closed)} said to be closed")
     print(f"{len(lost)} lost, {twice} twice, {shared} share scans with the next")
     print(f"road missing at a kill: median {np.median(gaps):.1f} s, at most {max(gaps):.1f} s ({log})")
+    sys.exit(bool(lost or twice or not ballots or max(gaps) > 30.0))
 
 
 def play_and_drive(drive: str, map_path: str, rate: float, sensor: str, core: str) -> None:
@@ -320,13 +323,14 @@ def main() -> None:
     parser.add_argument("--sensor", default="hdl32e")
     parser.add_argument("--core", default="", help="that the process which drives is held to")
     parser.add_argument("--kills", type=int, default=50)
+    parser.add_argument("--longest", type=float, default=25.0, help="seconds before a kill")
     parser.add_argument("--hours", type=float, default=8.0)
     options = parser.parse_args()
     runs: dict[str, Callable[[], None]] = {
         "send-clouds": lambda: send_clouds(options.domain, options.seconds),
         "cloud": lambda: read_clouds(options.seconds),
         "drive": lambda: play_and_drive(options.paths[0], options.paths[1], options.rate, options.sensor, options.core),
-        "kills": lambda: kills(options.paths[0], options.paths[1], options.kills),
+        "kills": lambda: kills(options.paths[0], options.paths[1], options.kills, options.longest),
         "laps": lambda: laps(options.domain, options.paths[0], Path(options.paths[1])),
         "hours": lambda: hours(options.paths[0], options.paths[1], options.hours),
     }

@@ -77,3 +77,14 @@ def test_a_live_drive_by_a_played_bag_casts_the_ballots_of_vote_on_that_bag_bit_
     assert " 0 scans left out, 0 without odometry" in said
     assert len(wanted) >= 2
     assert {p.name: p.read_bytes() for p in folder.iterdir()} == {f"car~{b.drive}.ballot": encode(b) for b in wanted}
+
+
+@pytest.mark.slow
+def test_of_kills_with_and_without_a_server_no_ballot_is_lost_or_comes_twice(tmp_path: Path) -> None:
+    record(tmp_path / "bag")
+    write_map(map_from_points(street(1)), tmp_path / "map")
+    bench = Path(__file__).parents[2] / "benchmarks/live.py"
+    arguments = ["kills", tmp_path / "bag", tmp_path / "map", "--kills", "3", "--longest", "40"]
+    result = subprocess.run([sys.executable, *map(str, [bench, *arguments])], capture_output=True, text=True)
+    assert result.returncode == 0, result.stdout + result.stderr
+    assert "0 lost, 0 twice" in result.stdout

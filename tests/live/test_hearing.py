@@ -99,7 +99,12 @@ def test_two_lidars_are_one_scan_in_the_frame_of_the_first_by_tf_static(monkeypa
     for lidar, T_base_lidar in T.items():
         seen = transform(inverse(T_base_lidar), world).astype(np.float32)
         sender.send(f"/{lidar}", CLOUD, cloud_message(Scan(START, seen), lidar))
-    _until(lambda: scans.extend(hearing.scans()) or (scans and hearing.mounts()))
+
+    def is_joined() -> bool:
+        scans.extend(hearing.scans())
+        return bool(scans and hearing.mounts())
+
+    _until(is_joined)
     scan = hearing.waiting(scans[0]).read()
     assert np.abs(transform(T["left"], scan.points) - np.concatenate([world, world])).max() < 1e-4
     ((start, origin),) = scan.others
