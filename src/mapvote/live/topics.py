@@ -9,12 +9,7 @@ from mapvote.core.types import MapvoteError
 from mapvote.live.cdr import TYPES, from_cdr
 from mapvote.live.dds import Network, SentTopic, Subscription
 
-CLOUD, ODOMETRY, TF, FIX = (
-    "sensor_msgs/msg/PointCloud2",
-    "nav_msgs/msg/Odometry",
-    "tf2_msgs/msg/TFMessage",
-    "sensor_msgs/msg/NavSatFix",
-)
+CLOUD, ODOMETRY, TF = "sensor_msgs/msg/PointCloud2", "nav_msgs/msg/Odometry", "tf2_msgs/msg/TFMessage"
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,8 +68,8 @@ def missing_for_drive(listened: list[Listened]) -> list[str]:
         ]
     if CLOUD not in sent:
         out.append(f"no {CLOUD} comes: start the LiDAR's driver")
-    if not {ODOMETRY, FIX} & sent:
-        out.append(f"no {ODOMETRY} and no {FIX} comes: without a prior the whole map is searched at the start")
+    if ODOMETRY not in sent:
+        out.append(f"no {ODOMETRY} comes: without a prior the whole map is searched at the start")
     if not any(one.heard.topic == "/tf_static" and one.messages for one in listened):
         out.append("no /tf_static comes: odometry is taken for the LiDAR's own pose")
     return out
