@@ -9,8 +9,10 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
+from hand_made import make_map, make_tile, wall
 from live.test_outbox import said
 from mapvote.codec.ballot import Ballot, decode
 from mapvote.core.point_map import PointMap, map_from_points
@@ -158,3 +160,17 @@ def test_a_new_version_of_the_map_holds_from_the_next_ballot_on(tmp_path: Path) 
     assert versions[0] == 1
     assert set(versions[1:]) == {2}
     assert live.live.counts.localised == SCANS
+
+
+def test_what_a_tile_has_worked_out_is_let_go_300_m_away_and_its_points_stay_where_they_are() -> None:
+    given = make_map({(0, c): make_tile(wall([(10, 10)], [0.05]), 0.0, (0, c)) for c in range(12)})
+    maps = OneMap(given)
+    tile, tiles = (0, 0), maps.current().tiles
+    maps.covers(np.array([38.0, 38.0, 0.0]))
+    assert "columns" not in tiles[tile].__dict__
+    worked_out = tiles[tile].columns[0]
+    maps.covers(np.array([300.0, 38.0, 0.0]))
+    assert tiles[tile].columns[0] is worked_out
+    maps.covers(np.array([800.0, 38.0, 0.0]))
+    assert "columns" not in tiles[tile].__dict__ | given.tiles[tile].__dict__
+    assert np.shares_memory(tiles[tile].points, given.tiles[tile].points)
