@@ -49,7 +49,10 @@ def simulate(
 def evaluate(
     scenario: Scenario,
     drive: Annotated[
-        Path | None, typer.Argument(metavar="[DRIVE]", help="a recorded drive, after the word real", show_default=False)
+        Path | None,
+        typer.Argument(
+            metavar="[DRIVE]", help="after real: a recorded drive; after court: its folder", show_default=False
+        ),
     ] = None,
     seed: Seed = 1,
     case: Annotated[
@@ -60,9 +63,7 @@ def evaluate(
             "real: one of them [default: by the settings]",
         ),
     ] = None,
-    poses: Annotated[
-        str, typer.Option(metavar="ndt|truth", help="whether vehicles localise, or are told where they are")
-    ] = "ndt",
+    poses: Annotated[str, typer.Option(metavar="ndt|truth", help="poses by localisation, or the true ones")] = "ndt",
     json: Annotated[Path | None, typer.Option(metavar="FILE", help="also write all numbers to this file")] = None,
     cache: Annotated[
         Path | None, typer.Option(metavar="FOLDER", help="where drives, maps and ballots are kept")
@@ -75,7 +76,7 @@ def evaluate(
     ] = None,
     reading: Annotated[
         str | None,
-        typer.Option(metavar="KEY=VALUE,..", help="how the paper's open sentences are read: keys of [paper]"),
+        typer.Option(metavar="KEY=VALUE,..", help="readings of the paper's open sentences: keys of [paper]"),
     ] = None,
     readings: Annotated[bool, typer.Option("--readings", help="every reading of the paper by case")] = False,
     out: Annotated[

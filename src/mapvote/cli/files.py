@@ -108,7 +108,7 @@ def doctor(
     *,
     drive_options: dict[str, Any],
 ) -> None:
-    """Say what is wrong with a drive, a map, a ballot or a store, and how to mend it. Exit code 1 if it is unusable.
+    """Find what is wrong with a drive, a map, a ballot or a store, and how to mend it. Exit code 1 if it is unusable.
 
     mapvote doctor MY_DRIVE --map my_map
     """
@@ -170,7 +170,7 @@ def import_map(
     ] = None,
     clean: Annotated[bool, typer.Option("--clean", help="drop points above the ground that touch no other")] = False,
 ) -> None:
-    """Make a mapvote map of somebody's point cloud: in metres, cut into tiles, ground measured. Says what it drops.
+    """Make a mapvote map of a point cloud: in metres, cut into tiles, ground measured. Reports what it drops.
 
     mapvote import city.pcd my_map
     """
@@ -218,7 +218,7 @@ def export(
     once: Annotated[bool, typer.Option("--once", help="--follow: ask once and end")] = False,
     key_file: KeyFile = None,
 ) -> None:
-    """Write a map's points in another format, in its own coordinate system or another. Says what it drops.
+    """Write a map's points in another format, in its own coordinate system or another. Reports what it drops.
 
     From a store or a server, names of Autoware tiles depend on their content, because a running Autoware reads a path
     once.

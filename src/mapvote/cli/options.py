@@ -38,13 +38,14 @@ KeyFile = Annotated[
 ]
 Reason = Annotated[str, typer.Option(metavar="TEXT", help="kept with the version")]
 MinVotes = Annotated[
-    int | None, typer.Option(min=1, metavar="N", help="vehicles that a change needs; else as the settings say")
+    int | None, typer.Option(min=1, metavar="N", help="vehicles that a change needs; default: the settings'")
 ]
 
 FalseDeletions = Annotated[
     float | None,
     typer.Option(
-        metavar="P", help="a cell waits that is emptied with a larger probability of deleting what stands, such as 0.01"
+        metavar="P",
+        help="keep a cell's points while emptying it deletes what stands with a higher probability, such as 0.01",
     ),
 ]
 
