@@ -10,7 +10,7 @@ from hypothesis.extra.numpy import arrays
 
 from mapvote.core.grid import CELL_SIZE, Lattice
 from mapvote.core.types import F64
-from mapvote.core.voxels import VoxelCloud, found_among, grouped, voxel_downsample, voxel_keys
+from mapvote.core.voxels import VoxelCloud, first_of_each, found_among, grouped, voxel_downsample, voxel_keys
 
 
 @settings(max_examples=15, deadline=None)
@@ -79,6 +79,7 @@ def test_it_grows_past_its_first_table() -> None:
 def test_the_first_of_each_key_is_found_in_the_order_of_the_keys_coming(keys: list[int]) -> None:
     _, first = np.unique(np.array(keys, dtype=np.int64), return_index=True)
     np.testing.assert_array_equal(grouped(np.array(keys, dtype=np.int64))[1], np.sort(first))
+    np.testing.assert_array_equal(first_of_each(np.array(keys, dtype=np.int64)), np.sort(first))
 
 
 FEW = st.sampled_from([0.0, -0.0, 1.0, 1.5, float("nan")])

@@ -11,7 +11,7 @@ from mapvote.core.columns import GROUND_MARGIN_M, column_bit, height_above
 from mapvote.core.grid import CELL_SIZE, Grid, Lattice, TileIndex, tile_of_cells
 from mapvote.core.kernel import allocating
 from mapvote.core.types import F32, F64, I32, I64, U8, U64, Bool, Reference
-from mapvote.core.voxels import grouped, voxel_keys
+from mapvote.core.voxels import first_of_each, voxel_keys
 from mapvote.detection.shelf import Shelf, Slot
 from mapvote.perception.frontend import Observation, PlacedScan
 
@@ -135,7 +135,7 @@ class NewPoints:
     def _one_a_voxel(self, clouds: list[F64]) -> F64:
         every = np.concatenate([np.zeros((0, 4 if self.intensity else 3)), *clouds])
         keys = voxel_keys(every, self.lattice.x0, self.lattice.y0)
-        first = grouped(keys)[1]
+        first = first_of_each(keys)
         return every[first[np.argsort(keys[first])]]
 
     def by_tile(self) -> Callable[[TileIndex], F64]:

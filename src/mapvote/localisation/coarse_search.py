@@ -15,7 +15,7 @@ from scipy import fft
 
 from mapvote.core.geometry import from_xyz_rpy, inverse, transform
 from mapvote.core.types import F32, F64, I64, MapvoteError
-from mapvote.core.voxels import grouped, voxel_downsample
+from mapvote.core.voxels import first_of_each, voxel_downsample
 from mapvote.localisation.ndt import NdtMap, build_ndt, fitness, refine, thin_for_levels
 
 _CELL_M, _LAYER_M = 1.0, 0.5
@@ -93,7 +93,7 @@ def _weights(points: F64) -> tuple[I64, F64]:
     """((k, 2) cells x, y of _CELL_M; (k,) logarithm of their occupied layers, where more than ground)."""
     voxels = np.column_stack([np.floor(points[:, :2] / _CELL_M), np.floor(points[:, 2] / _LAYER_M)]).astype(np.int64)
     keys = (voxels[:, 0] + (1 << 20) << 42) | (voxels[:, 1] + (1 << 20) << 21) | (voxels[:, 2] + (1 << 20))
-    columns, layers = np.unique(keys[grouped(keys)[1]] >> 21, return_counts=True)
+    columns, layers = np.unique(keys[first_of_each(keys)] >> 21, return_counts=True)
     tall = layers > _LOW_LAYERS
     columns, layers = columns[tall], layers[tall]
     cells = np.column_stack([(columns >> 21) - (1 << 20), (columns & ((1 << 21) - 1)) - (1 << 20)])

@@ -33,7 +33,7 @@ from mapvote.core.kernel import inlined, kernel
 from mapvote.core.sensors import Sensor
 from mapvote.core.types import F64, I32, I64, Bool
 from mapvote.core.voxels import grouped, voxel_key
-from mapvote.perception.range_image import BOTH_SIDES, U16, LookCounts, Pixels, Samples, look, range_image, room_to_look
+from mapvote.perception.range_image import BOTH_SIDES, U16, LookCounts, Pixels, Samples, look, range_image
 
 # Set on the development streets of the simulator.
 REACH_M = 57.0
@@ -142,11 +142,10 @@ class MovingFilter:
         counts = LookCounts(np.zeros(m, np.int32), np.zeros(m, np.int32), np.zeros(m, np.uint8))
         x, y, z = rows_from(scan.samples, scan.origin_map)
         waiting = Samples(x, y, z, np.arange(m, dtype=np.int32))
-        scratch = room_to_look(m)
         for other in self._witnesses(at):
             sensor = (other.origin_map - scan.origin_map).astype(np.float32)
             rule = MARGIN_M, HEIGHT_M, ENOUGH
-            left = look(waiting, left, other.nearest.reshape(-1), sensor, self._pixels, rule, counts, scratch)
+            left = look(waiting, left, other.nearest.reshape(-1), sensor, self._pixels, rule, counts)
         free, total = counts.free, counts.free + counts.hit
         brief = (counts.sides == BOTH_SIDES) & (free >= MIN_FREE) & (free >= FREE_SHARE * total)
         half = int(np.ceil(self.reach_m / CELL_SIZE)) + 2
@@ -155,7 +154,9 @@ class MovingFilter:
         side = 2 * half + 1
         shares = SHARE_WHOLE, SHARE_PART
         moves = moving_components(rows * side + cols, side, total >= MIN_FREE, brief, MIN_VOXELS, *shares)
-        return np.append(moves, False)[scan.voxel_of]  # -1: no voxel
+        out = np.empty(len(scan.voxel_of), dtype=np.bool_)
+        _gather(moves, scan.voxel_of, out)
+        return out
 
     def _witnesses(self, at: int) -> list[_Scan]:
         """Up to ``looks`` other scans spread evenly over the time before, and over the time after, scan ``at``.
@@ -190,13 +191,30 @@ def _choose(points: F64, obstacle: Bool, origin: F64, reach: float, cell: float,
     return int(count)
 
 
+@kernel
+def _scatter(chosen: I32, of: I32, voxel_of: I32) -> None:
+    """``of`` (k,) at the first k places ``chosen`` of ``voxel_of`` (n,), and -1 elsewhere."""
+    for i in range(np.uint64(0), np.uint64(len(voxel_of))):
+        voxel_of[i] = -1
+    for k in range(np.uint64(0), np.uint64(len(of))):
+        voxel_of[chosen[k]] = of[k]
+
+
+@kernel
+def _gather(moves: Bool, voxel_of: I32, out: Bool) -> None:
+    """Into ``out`` (n,) what each point's voxel does, of ``moves`` (m,); points without one stay."""
+    for i in range(np.uint64(0), np.uint64(len(voxel_of))):
+        k = voxel_of[i]
+        out[i] = k >= 0 and moves[k]
+
+
 def voxels(points: F64, obstacle: Bool, origin: F64, reach: float, cell: float) -> tuple[I32, F64]:
     """(voxel_of (n,), first point of each voxel (m, 3)), voxels in order of their first points; -1 for no voxel."""
     chosen, keys = np.empty(len(points), np.int32), np.empty(len(points), np.int64)
     count = _choose(points, obstacle, origin, reach, cell, chosen, keys)
     of, first = grouped(keys[:count])  # scans of 66,000 points have 7,000 voxels
-    voxel_of = np.full(len(points), -1, dtype=np.int32)
-    voxel_of[chosen[:count]] = of
+    voxel_of = np.empty(len(points), dtype=np.int32)
+    _scatter(chosen, of, voxel_of)
     return voxel_of, points.take(chosen[first], axis=0)
 
 
