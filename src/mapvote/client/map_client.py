@@ -22,7 +22,7 @@ from mapvote.client.connection import Connection, Refused, Unreachable
 from mapvote.client.spool import Spool, server_folder
 from mapvote.codec.ballot import Ballot, decode, encode
 from mapvote.codec.fields import unpack_fields
-from mapvote.codec.tile_file import digest_of_tiles, manifest_tag
+from mapvote.codec.manifest import Manifest, PlaneHashes
 from mapvote.core.grid import CELL_SIZE, Grid, Lattice, TileIndex
 from mapvote.core.lazy_tiles import made_in_turn
 from mapvote.core.point_map import PointMap
@@ -35,50 +35,6 @@ Region = tuple[float, float, float, float]
 """x and y of the lower left corner, x and y of the upper right one, map metres."""
 _KEEP_WAITING = {401, 403}
 """Refusals that a new key mends."""
-
-
-class Plane(msgspec.Struct):
-    """One tile of a version: the hashes of its planes."""
-
-    points: str
-    ground: str
-    free: str | None = None
-    fields: str | None = None
-    """Of what the points carry besides."""
-
-    def hashes(self) -> list[str]:
-        return [digest for digest in (self.points, self.ground, self.free, self.fields) if digest is not None]
-
-
-class _Lattice(msgspec.Struct):
-    x0: float
-    y0: float
-
-
-class Manifest(msgspec.Struct):
-    """One version of a map: its tiles by "row,col", each with the hashes of its planes."""
-
-    map_id: str
-    version: int
-    lattice: _Lattice
-    tiles: dict[str, Plane]
-    digest: str
-    """Of all tiles of the version."""
-    georeference: dict[str, str] = {}
-    fields_digest: str = ""
-    """Of the fields of their points; "" where there are none."""
-    removed: list[str] = []
-
-    def whole(self) -> bool:
-        """Whether these are all tiles of the version, and as the server has them."""
-        total = digest_of_tiles((key, p.points, p.ground, p.free) for key, p in self.tiles.items())
-        fields = digest_of_tiles((key, p.fields) for key, p in self.tiles.items() if p.fields is not None)
-        return self.digest == f"{total:064x}" and self.fields_digest == (f"{fields:064x}" if fields else "")
-
-    def followed_by(self, since: Manifest) -> Manifest:
-        """The newer manifest: this one with the changes in ``since``."""
-        tiles = {key: planes for key, planes in self.tiles.items() if key not in since.removed} | since.tiles
-        return msgspec.structs.replace(since, tiles=tiles, removed=[])
 
 
 _MANIFEST = msgspec.json.Decoder(Manifest)  # made when the module is loaded: see codec/ballot.py
@@ -138,7 +94,7 @@ class MapClient:
         if region is not None:
             wanted = {index: planes for index, planes in wanted.items() if _meets(lattice.tile(index), region)}
         tiles = made_in_turn(lambda index: self.tile(lattice.tile(index), wanted[index]), wanted)
-        self._bound_cache({digest for planes in wanted.values() for digest in planes.hashes()})
+        self._bound_cache({digest for planes in wanted.values() for digest in planes.all()})
         self.version = manifest.version
         return PointMap(manifest.map_id, lattice, tiles, manifest.georeference, version=manifest.version)
 
@@ -149,23 +105,23 @@ class MapClient:
             raise Unreachable(f"{self._url}: is away, and no version of its map is kept here")
         return self._as_map(manifest, region)
 
-    def has(self, planes: Plane) -> bool:
+    def has(self, planes: PlaneHashes) -> bool:
         """Whether a tile can be read without a request."""
-        return all((self._planes / digest).exists() for digest in planes.hashes())
+        return all((self._planes / digest).exists() for digest in planes.all())
 
-    def points_of(self, planes: Plane) -> int:
+    def points_of(self, planes: PlaneHashes) -> int:
         """How many points a tile has that :meth:`has` been downloaded."""
         return (self._planes / planes.points).stat().st_size // 12
 
-    def download(self, planes: Plane) -> None:
+    def download(self, planes: PlaneHashes) -> None:
         """Have the planes of a tile that ``home`` lacks. Raises as :meth:`fetch`."""
-        for digest in planes.hashes():
+        for digest in planes.all():
             if not (self._planes / digest).exists():
                 self._plane(digest)
 
-    def forget(self, needed: Iterable[Plane]) -> None:
+    def forget(self, needed: Iterable[PlaneHashes]) -> None:
         """Keep the cache of planes within its bound; none of ``needed`` leaves it."""
-        self._bound_cache({digest for planes in needed for digest in planes.hashes()})
+        self._bound_cache({digest for planes in needed for digest in planes.all()})
 
     def versions(self) -> Iterator[int | None]:
         """The number of the newest version, whenever something happens at the server (server-sent events), and None at
@@ -226,9 +182,10 @@ class MapClient:
         """The newest version's, of which only what changed since the last is downloaded. Raises as :meth:`fetch`."""
         kept = self.kept_manifest()
         if kept is not None:
-            tag = manifest_tag(kept.version, kept.version, (kept.digest, kept.fields_digest))
             try:
-                answer = self._server.ask("GET", f"/v1/map?since={kept.version}", headers={"If-None-Match": tag})
+                answer = self._server.ask(
+                    "GET", f"/v1/map?since={kept.version}", headers={"If-None-Match": kept.tag(since=kept.version)}
+                )
             except Refused as error:
                 if error.status != 404:
                     raise
@@ -238,7 +195,7 @@ class MapClient:
                     return kept
                 since = self._decoded(answer.content)
                 followed = kept.followed_by(since)
-                if since.map_id == kept.map_id and followed.whole():
+                if since.map_id == kept.map_id and followed.is_whole():
                     return self._keep(followed)
         return self._keep(self._manifest("/v1/map"))
 
@@ -263,7 +220,7 @@ class MapClient:
             part.write_bytes(msgspec.json.encode(manifest))
         return manifest
 
-    def tile(self, window: Grid, planes: Plane) -> Tile:
+    def tile(self, window: Grid, planes: PlaneHashes) -> Tile:
         """A tile over ``window``; what ``home`` lacks of it is downloaded. Raises as :meth:`fetch`."""
         points = np.frombuffer(self._plane(planes.points), dtype="<f4").reshape(-1, 3)
         ground_z = np.frombuffer(self._plane(planes.ground), dtype="<f4").reshape(window.shape)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable
 from typing import Any
 
 import msgspec
@@ -20,8 +19,6 @@ from mapvote.core.types import F32, U64, MapvoteError
 TILE_VERSION = 1
 MAX_TILE_POINTS = 50_000_000
 """8,000 points per square metre; 600 MB. Nothing honest is denser."""
-DIGESTS = 1 << 256
-"""Sums of hashes are taken modulo this."""
 _LEVEL = 3
 _SHAPE = (TILE_CELLS, TILE_CELLS)
 
@@ -45,22 +42,6 @@ _TILE_FILE = msgspec.msgpack.Decoder(_TileFile)  # made when the module is loade
 def content_hash(tile_points: F32) -> str:
     """SHA-256 of a tile's points: free space learned later changes no published point (docs/decisions/data.md)."""
     return hashlib.sha256(np.ascontiguousarray(tile_points, dtype="<f4").tobytes()).hexdigest()
-
-
-def digest_of_tiles(tiles: Iterable[tuple[str, *tuple[str | None, ...]]]) -> int:
-    """The sum, modulo :data:`DIGESTS`, of a SHA-256 for each tile: of its key ("row,col") and its planes' hashes
-    (points, ground, free; in a digest of their own fields, of tiles that have any), "-" for none. Who keeps a manifest
-    up to date by what changed can tell whether it still is the server's; so can the server, at little cost: sums of
-    what changed can be added and taken away."""
-    lines = (" ".join([key.replace(",", " "), *(plane or "-" for plane in planes)]) for key, *planes in tiles)
-    return sum(int.from_bytes(hashlib.sha256(line.encode()).digest()) for line in lines) % DIGESTS
-
-
-def manifest_tag(version: int, since: int | None, digests: Iterable[str]) -> str:
-    """The ETag of a manifest, or of what changed ``since`` a version: of its number and what it consists of. A server
-    that was set up anew has the numbers of the old one, and another map."""
-    told = "-".join(digest[:16] for digest in digests)
-    return f'"{version}-{told}"' if since is None else f'"{version}-{since}-{told}"'
 
 
 def base_hash(tile: Tile | None) -> str:

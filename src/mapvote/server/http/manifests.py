@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import msgspec
 
 from mapvote.codec.ballot import tile_key
-from mapvote.codec.tile_file import manifest_tag
-from mapvote.server.store.store import Manifest, Store
+from mapvote.codec.manifest import Corner, Manifest, PlaneHashes
+from mapvote.server.store.store import Manifest as Version
+from mapvote.server.store.store import Store
 
 _KEPT = 16
 
@@ -45,28 +46,22 @@ class Manifests:
         with self._lock:  # of many requests for a new version, one makes it
             made = self._made.get((number, since))
             if made is None:
-                manifest = self._store.manifest(number, since=since)
-                tag = manifest_tag(number, since, (manifest.digest, manifest.fields_digest))
-                made = Made(msgspec.json.encode(_as_json(manifest)), tag)
+                manifest = _on_the_wire(self._store.manifest(number, since=since))
+                made = Made(msgspec.json.encode(manifest), manifest.tag(since))
                 while len(self._made) >= _KEPT:
                     del self._made[next(iter(self._made))]
                 self._made[number, since] = made
         return made
 
 
-def _as_json(manifest: Manifest) -> dict[str, Any]:
-    tiles = {
-        tile_key(index): {"points": h.points, "ground": h.ground, "free": h.free}
-        | ({"fields": h.fields} if h.fields is not None else {})
-        for index, h in manifest.tiles.items()
-    }
-    fields = {"fields_digest": manifest.fields_digest} if manifest.fields_digest else {}
-    return {
-        "map_id": manifest.map_id,
-        "version": manifest.version,
-        "lattice": {"x0": manifest.lattice.x0, "y0": manifest.lattice.y0},
-        "georeference": dict(manifest.georeference),
-        "tiles": tiles,
-        "digest": manifest.digest,
-        "removed": [tile_key(index) for index in manifest.removed],
-    } | fields
+def _on_the_wire(version: Version) -> Manifest:
+    return Manifest(
+        map_id=version.map_id,
+        version=version.version,
+        lattice=Corner(version.lattice.x0, version.lattice.y0),
+        georeference=dict(version.georeference),
+        tiles={tile_key(i): PlaneHashes(h.points, h.ground, h.free, h.fields) for i, h in version.tiles.items()},
+        digest=version.digest,
+        removed=[tile_key(index) for index in version.removed],
+        fields_digest=version.fields_digest,
+    )

@@ -19,7 +19,7 @@ from typing import Any
 import sqlalchemy as sa
 
 from mapvote.codec.ballot import Id, tile_key
-from mapvote.codec.tile_file import DIGESTS, digest_of_tiles
+from mapvote.codec.manifest import DIGESTS, digests_of, shown
 from mapvote.core.grid import Lattice, TileIndex
 from mapvote.core.lazy_tiles import LazyTiles, is_small
 from mapvote.core.point_map import PointMap
@@ -59,20 +59,15 @@ class Manifest:
     georeference: Mapping[str, str]
     tiles: Mapping[TileIndex, TileHashes]
     digest: str
-    """Of all tiles of the version, see :func:`digests_of`."""
+    """Of all tiles of the version, see :func:`mapvote.codec.manifest.digests_of`."""
     fields_digest: str = ""
     """Likewise of the fields of its points; empty where no tile has any."""
     removed: Sequence[TileIndex] = ()
     """With ``since``: tiles that the older version had and this one has not."""
 
 
-def digests_of(tiles: Mapping[TileIndex, TileHashes]) -> tuple[int, int]:
-    """Of tiles, and of the fields of those that have any; see :func:`mapvote.codec.tile_file.digest_of_tiles`."""
-    fields = {index: h.fields for index, h in tiles.items() if h.fields is not None}
-    return (
-        digest_of_tiles((tile_key(index), h.points, h.ground, h.free) for index, h in tiles.items()),
-        digest_of_tiles((tile_key(index), digest) for index, digest in fields.items()),
-    )
+def _digests_of(tiles: Mapping[TileIndex, TileHashes]) -> tuple[int, int]:
+    return digests_of((tile_key(index), hashes) for index, hashes in tiles.items())
 
 
 def url_of(store: str) -> str:
@@ -212,11 +207,10 @@ class Store:
                 version_of(connection, since, cleared=True)
             if since is None:
                 tiles, removed = tiles_of(connection, number), list[TileIndex]()
-                self._digests[number] = digests_of(tiles)
+                self._digests[number] = _digests_of(tiles)
             else:
                 tiles, removed = self._changed(connection, since, number)
-            digest, fields = self._digest(connection, number)
-        told = f"{digest:064x}", f"{fields:064x}" if fields else ""
+            told = shown(*self._digest(connection, number))
         return Manifest(number, self.map_id, self.lattice, self.georeference, tiles, *told, removed)
 
     def _changed(
@@ -232,10 +226,10 @@ class Store:
         """Of a version: what is known of the last one before it, and what changed since."""
         before = max((known for known in self._digests if known <= number), default=None)
         if before is None:
-            self._digests[number] = digests_of(tiles_of(connection, number))
+            self._digests[number] = _digests_of(tiles_of(connection, number))
         elif before < number:
             touched = tiles_set_between(connection, before, number)
-            then, now = (digests_of(tiles_of(connection, version, touched)) for version in (before, number))
+            then, now = (_digests_of(tiles_of(connection, version, touched)) for version in (before, number))
             known = zip(self._digests[before], then, now, strict=True)
             tiles, fields = ((whole - old + new) % DIGESTS for whole, old, new in known)
             self._digests[number] = tiles, fields
