@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -27,7 +27,7 @@ from mapvote.doctor.motion import (
     starts_of_runs,
 )
 from mapvote.doctor.prior import NO_PRIOR
-from mapvote.doctor.prior_fit import CHAIN_SCANS, check_agreement
+from mapvote.doctor.prior_fit import CHAIN_SCANS, check_agreement, unbroken
 from mapvote.doctor.records import check_bag, check_ballot
 from mapvote.doctor.scans import IN_MAP_FRAME, Looks, cheap_checks, in_map_frame, look_at_all
 from mapvote.formats import open_drive
@@ -36,6 +36,8 @@ from mapvote.formats.drives.rosbag import is_rosbag
 from mapvote.formats.maps.mapvote_folder import is_map_folder
 from mapvote.formats.registry import DRIVES, MAPS
 
+_LOST_SCANS = 4
+"""A chain of no more has lost itself at its first step."""
 _ROAD_SCANS = 7
 _TURNED_OVER = np.diag([1.0, -1.0, -1.0]).astype(np.float32)
 
@@ -134,6 +136,16 @@ class Evidence:
         run = follow(self.points, start, len(self.readable), self.road_below, **most)
         return replace(run, indices=self.readable[run.indices])
 
+    def chain(self) -> Run:
+        """A long run, from the first scans that it can begin with: its first step tries every way and speed, and may
+        find a wrong one; the next scan then does not fit, though nothing is wrong with the drive."""
+        run = self.run(0, scans=CHAIN_SCANS)
+        for start in range(_LOST_SCANS, 3 * _LOST_SCANS, _LOST_SCANS):
+            if len(unbroken(run).indices) == len(run.indices) or len(unbroken(run).indices) > _LOST_SCANS:
+                return run
+            run = self.run(start, scans=CHAIN_SCANS)
+        return run
+
     @cached_property
     def leaps(self) -> list[Finding]:
         """What is wrong with the scans' own motion; while there is anything, a prior cannot be held against it."""
@@ -145,8 +157,7 @@ class Evidence:
         if self.T is None or not self.can_be_registered or self.leaps:
             return [], self.T
         turns = float(np.median(self.looks.turns))
-        chain = partial(self.run, 0, scans=CHAIN_SCANS)
-        found, T = check_agreement(self.drive, self.T, self.runs[0], self.road_below, turns, chain)
+        found, T = check_agreement(self.drive, self.T, self.runs[0], self.road_below, turns, self.chain)
         if self.road.up == "-z":
             # Nothing wrong with a prior shows surely in scans that are mended by a guess.
             found = [f for f in found if f.severity == "error"]
