@@ -75,6 +75,9 @@ def _tell(report: BuildReport, out: Path) -> None:
             d = track.drift
             line += f"; off its prior by {d.median_m:.3f} m (median), {d.max_m:.3f} m (most), {d.median_deg:.2f} deg"
         print(line)
+        if track.wrong_attitude is not None:
+            wrong = track.wrong_attitude
+            print(f"warning: {track.vehicle}: {wrong.what}; built with {wrong.sigma_deg:g}: {wrong.mend}")
         for i in track.broken:
             print(
                 f"warning: {track.vehicle}: the map is broken before scan {i}: nothing fitted, only priors tie it there"

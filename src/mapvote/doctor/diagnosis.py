@@ -35,6 +35,7 @@ from mapvote.formats.drives.options import DriveOptions
 from mapvote.formats.drives.rosbag import is_rosbag
 from mapvote.formats.maps.mapvote_folder import is_map_folder
 from mapvote.formats.registry import DRIVES, MAPS
+from mapvote.slam.attitude import wrong_attitude
 
 _LOST_SCANS = 4
 """A chain of no more has lost itself at its first step."""
@@ -172,11 +173,20 @@ def _ranges_and_road(e: Evidence) -> list[Finding]:
     return check_ranges(e.scatter_m) + check_road(e.road, e.scatter_m, e.T, e.readable[e.some].tolist())
 
 
+def _attitude(e: Evidence) -> list[Finding]:
+    """What ``build`` would say too: it asks by the same function."""
+    if e.T is None or not e.can_be_registered or any(f.severity == "error" for f in e.agreement[0]):
+        return []
+    wrong = wrong_attitude(e.drive, e.readable.tolist())
+    return [] if wrong is None else [Finding("warning", wrong.what, wrong.mend)]
+
+
 CHECKS: tuple[Callable[[Evidence], list[Finding]], ...] = (
     lambda e: cheap_checks(e.drive, e.looks),
     _ranges_and_road,
     lambda e: e.leaps,
     lambda e: e.agreement[0],
+    _attitude,
 )
 """Of a drive by itself, in the order in which one needs the other."""
 

@@ -20,6 +20,7 @@ from mapvote.core.point_map import PointMap, map_from_points
 from mapvote.core.sensor_height import Heights, check_heights, two_levels
 from mapvote.core.types import F64, Bool, Drive, MapvoteError
 from mapvote.slam.accumulate import Layer
+from mapvote.slam.attitude import WrongAttitude, as_precise_as_shown
 from mapvote.slam.pose_graph import carried_along, settle_poses
 from mapvote.slam.road_prior import all_roads, road_under
 from mapvote.slam.surveyor import Surveyed, Surveyor, is_precise
@@ -62,6 +63,8 @@ class DriveTrack:
     """Scans at which the track began anew because nothing fitted: there only priors tie the map together."""
     sigma_m: F64
     """(n,) standard deviation of each position in the frame of the priors, NaN without any."""
+    wrong_attitude: WrongAttitude | None = None
+    """What contradicts the precise attitude that the prior states: the drive was built with a coarser one."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,6 +94,8 @@ def build_map(
     settings = settings or Settings()
     if sum(len(drive) for drive in drives) == 0:
         raise MapvoteError("nothing to map: no drive with at least one scan")
+    shown = [as_precise_as_shown(drive) for drive in drives]
+    drives = [drive for drive, _ in shown]
     count = _counter(progress, 2 * sum(len(drive) for drive in drives))
     surveyor = Surveyor(settings, all(is_precise(drive) for drive in drives))
     found = [surveyor.follow(drive, count) for drive in drives]
@@ -108,6 +113,7 @@ def build_map(
     point_map = replace(point_map, surveyed_ns=_last_stamp(drives))
     heights = [_agreed_heights(drive, point_map, path) for drive, path in zip(drives, driven, strict=True)]
     tracks = tuple(_track(*each) for each in zip(drives, poses, found, heights, settled.sigma_m, strict=True))
+    tracks = tuple(replace(track, wrong_attitude=wrong) for track, (_, wrong) in zip(tracks, shown, strict=True))
     held = any(is_precise(drive) for drive in drives)
     points = sum(len(tile.points) for tile in point_map.tiles.values())
     return point_map, BuildReport(tracks, points, held, settled.bent_m, two_levels(road) if len(road) else None)
