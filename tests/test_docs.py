@@ -61,6 +61,13 @@ def test_a_door_has_commands_output_a_picture_and_at_most_four_links(door: str) 
     assert len(links) <= 4, links
 
 
+def test_the_site_lists_every_page() -> None:
+    """What is not in the navigation is a warning of mkdocs, and warnings are errors."""
+    listed = set(re.findall(r"(\S+\.md)$", (ROOT / "mkdocs.yml").read_text(), re.MULTILINE))
+    pages = {str(page.relative_to(ROOT / "docs")) for page in (ROOT / "docs").rglob("*.md")}
+    assert pages == listed - {"pictures/*.md"}
+
+
 @pytest.mark.slow
 def test_the_site_is_built_without_a_warning(tmp_path: Path) -> None:
     pytest.importorskip("mkdocs", reason="the extra docs is not installed")
