@@ -11,7 +11,7 @@ from scipy.spatial import KDTree
 from made_courts import made_court
 from mapvote.comparison.merge import merge_maps
 from mapvote.core.geometry import from_xyz_rpy, inverse, transform
-from mapvote.core.point_map import PointMap, all_points, map_from_points
+from mapvote.core.point_map import SOURCES, PointMap, all_points, map_from_points
 from mapvote.core.types import F64, MapvoteError
 
 
@@ -28,6 +28,12 @@ def test_two_halves_in_frames_of_their_own_become_the_whole_with_one_point_a_vox
     assert np.ptp(points[:, 0]) > 65.0
     away = KDTree(made_court()).query(points)[0]
     assert np.median(away) < 0.12
+    tiles = merged.point_map.tiles
+    sources = np.concatenate([tiles[index].fields[SOURCES] for index in tiles])
+    assert set(sources.tolist()) == {1, 2, 3}
+    x = np.concatenate([tiles[index].points_map[:, 0] for index in tiles])
+    assert (sources[x < -29.0] == 1).all()
+    assert (sources[x > 28.0] == 2).all()
     voxels = np.unique(np.floor(points / 0.3).astype(int), axis=0)
     assert len(voxels) == len(points)
 

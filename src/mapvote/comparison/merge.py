@@ -1,7 +1,8 @@
 """Overlapping maps become one: registered to each other, adjusted together, one point a voxel.
 
 The paper's first map is made so ([9]: mapping, then merging of several maps). Every pair that overlaps gives one link
-of a pose graph over the maps; the first map stays where it is. Maps that contradict each other after that are refused.
+of a pose graph over the maps. The first map stays where it is, unless all of them state one frame. Maps that contradict
+each other after that are refused.
 """
 
 from __future__ import annotations
@@ -15,18 +16,21 @@ import numpy as np
 from mapvote.comparison.patches import Patches
 from mapvote.comparison.register import Registered, register_clouds
 from mapvote.core.columns import TOP_BIT
-from mapvote.core.geometry import inverse
-from mapvote.core.grid import CELL_SIZE, TileIndex
-from mapvote.core.point_map import PointMap, all_points, cut_tiles, map_from_points
+from mapvote.core.geometry import inverse, transform
+from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Lattice, TileIndex, tile_of_cells
+from mapvote.core.point_map import SOURCES, PointMap, all_points, map_from_points
 from mapvote.core.tile import Tile
-from mapvote.core.types import F64, U64, MapvoteError
-from mapvote.core.voxels import VoxelCloud
+from mapvote.core.types import F64, U64, Bool, MapvoteError
+from mapvote.core.voxels import VoxelCloud, voxel_keys
 from mapvote.slam.pose_graph import Anchors, Links, optimise
 from mapvote.slam.road_prior import road_under
 
 MOST_APART_M = 0.1
 """By the median over the patches of a pair, after the adjustment."""
 _HELD = 1e-4
+_SAME_FRAME_M, _SAME_FRAME_RAD = 0.5, np.radians(0.5)
+_MOST_MAPS = 64
+"""Bits of a point's sources."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,14 +45,16 @@ class Merged:
 
 
 def merge_maps(maps: Sequence[PointMap]) -> Merged:
-    """One map in the frame and on the lattice of the first. The ground is computed anew, from the driven paths where
-    the maps carry them; the paths stay. A voxel is free if the middle of one that a map knows to be free comes to lie
-    in it, and no map has a point there.
+    """One map on the lattice and in the frame of the first, or in the mean of their frames if all state one.
+
+    The ground is computed anew, from the driven paths where the maps carry them; the paths stay. A voxel is free if its
+    middle lies in one that a map knows to be free, and no map has a point in it. Each point's field SOURCES has bit k
+    set where map k has a point in its voxel.
 
     MapvoteError, with figures, if a map overlaps no other one, is bent, or contradicts another by more than 0.1 m.
     """
-    if len(maps) < 2:
-        raise MapvoteError("merge: give two maps or more")
+    if not 2 <= len(maps) <= _MOST_MAPS:
+        raise MapvoteError(f"merge: give 2 to {_MOST_MAPS} maps, not {len(maps)}; merge more in steps")
     clouds = [all_points(one) for one in maps]
     pairs, why = {}, {}
     for i, j in combinations(range(len(maps)), 2):
@@ -56,14 +62,20 @@ def merge_maps(maps: Sequence[PointMap]) -> Merged:
             pairs[i, j] = register_clouds(clouds[i], clouds[j])
         except MapvoteError as error:
             why[i, j] = str(error)
-    T = _adjusted(len(maps), pairs, why)
+    T = _adjusted(maps, pairs, why, np.median(clouds[0], axis=0))
     apart_m = {(i, j): _apart_m(found.patches, inverse(T[i]) @ T[j]) for (i, j), found in pairs.items()}
     _refuse_contradictions(pairs, apart_m)
     return Merged(_laid(maps, clouds, T), T, apart_m)
 
 
-def _adjusted(n: int, pairs: dict[tuple[int, int], Registered], why: dict[tuple[int, int], str]) -> F64:
-    """(n, 4, 4) where the maps lie in the first one's frame: along the pairs, then all links together."""
+def _adjusted(
+    maps: Sequence[PointMap], pairs: dict[tuple[int, int], Registered], why: dict[tuple[int, int], str], middle: F64
+) -> F64:
+    """(n, 4, 4) where the maps lie in the first one's frame: along the pairs, then all links together.
+
+    Surveys of one lattice that lie within _SAME_FRAME_M of where they say, at ``middle`` (3,), state one frame, each
+    with the error of its own prior: then no map is right alone, and the adjusted frame is the mean of theirs."""
+    n = len(maps)
     T = np.tile(np.eye(4), (n, 1, 1))
     placed = {0}
     while len(placed) < n:
@@ -82,7 +94,12 @@ def _adjusted(n: int, pairs: dict[tuple[int, int], Registered], why: dict[tuple[
         Links(np.array([i]), np.array([j]), one.T_a_b[None], one.fit.sigma_m, float(np.radians(one.fit.sigma_deg)))
         for (i, j), one in pairs.items()
     ]
-    return optimise(T, links, [Anchors(np.array([0]), np.eye(4)[None], _HELD, _HELD)], iterations=10)
+    if any(one.lattice != maps[0].lattice or one.georeference != maps[0].georeference for one in maps) or any(
+        np.linalg.norm(T_first[:3, :3] @ middle + T_first[:3, 3] - middle) > _SAME_FRAME_M for T_first in T
+    ):
+        return optimise(T, links, [Anchors(np.array([0]), np.eye(4)[None], _HELD, _HELD)], iterations=10)
+    where_they_say = Anchors(np.arange(len(T)), np.tile(np.eye(4), (len(T), 1, 1)), _SAME_FRAME_M, _SAME_FRAME_RAD)
+    return optimise(T, links, [where_they_say], iterations=10)
 
 
 def _apart_m(patches: Patches, T_a_b: F64) -> float:
@@ -106,9 +123,11 @@ def _laid(maps: Sequence[PointMap], clouds: Sequence[F64], T: F64) -> PointMap:
     first = maps[0]
     cloud = VoxelCloud(first.lattice)
     driven = []
-    for one, points, T_first in zip(maps, clouds, T, strict=True):
-        cloud.enter(points @ T_first[:3, :3].T + T_first[:3, 3])
-        driven += [path @ T_first[:3, :3].T + T_first[:3, 3] for path in one.driven]
+    moved = [transform(T_first, points) for T_first, points in zip(T, clouds, strict=True)]
+    for points in moved:
+        cloud.enter(points)
+    for one, T_first in zip(maps, T, strict=True):
+        driven += [transform(T_first, path) for path in one.driven]
     points = cloud.points()[0]
     roads = [road_under(_poses(path), np.ones(len(path), dtype=np.bool_), points).points_map for path in driven]
     merged = map_from_points(
@@ -116,6 +135,7 @@ def _laid(maps: Sequence[PointMap], clouds: Sequence[F64], T: F64) -> PointMap:
         lattice=first.lattice,
         georeference=first.georeference,
         road=np.concatenate(roads) if roads else None,
+        fields={SOURCES: _sources(points, moved, first.lattice)},
     )
     ends = [one.surveyed_ns for one in maps]
     surveyed_ns = max(end for end in ends if end is not None) if all(end is not None for end in ends) else None
@@ -123,40 +143,55 @@ def _laid(maps: Sequence[PointMap], clouds: Sequence[F64], T: F64) -> PointMap:
     return replace(merged, tiles=tiles, driven=tuple(driven), surveyed_ns=surveyed_ns)
 
 
+def _sources(points: F64, moved: Sequence[F64], lattice: Lattice) -> U64:
+    """(n,) bit k of each point: map k has a point in its voxel. A mean lies in the voxel of what it is the mean of."""
+    keys = voxel_keys(points, lattice.x0, lattice.y0)
+    out = np.zeros(len(points), dtype=np.uint64)
+    for k, cloud in enumerate(moved):
+        out |= np.isin(keys, voxel_keys(cloud, lattice.x0, lattice.y0)).astype(np.uint64) << np.uint64(k)
+    return out
+
+
 def _with_free(merged: PointMap, maps: Sequence[PointMap], T: F64) -> dict[TileIndex, Tile]:
-    """The tiles of the merged map with what the maps know to be free."""
-    free: dict[TileIndex, U64] = {}
-    for one, T_first in zip(maps, T, strict=True):
-        for tile in one.tiles.values():
-            if tile.free is None or not tile.free.any():
-                continue
-            middles = _middles(tile) @ T_first[:3, :3].T + T_first[:3, 3]
-            if not len(middles):
-                continue
-            for index, mine in cut_tiles(middles, merged.lattice):
-                if index in merged.tiles and merged.tiles[index].has_ground:
-                    into = merged.tiles[index]
-                    rows, cols, _ = into.window.indices_of(middles[mine])
-                    bit = np.floor(middles[mine, 2] / CELL_SIZE).astype(np.int64) - into.base[rows, cols]
-                    good = (bit >= 0) & (bit < TOP_BIT)
-                    words = free.setdefault(index, np.zeros(into.window.shape, dtype=np.uint64))
-                    marks = np.uint64(1) << bit[good].astype(np.uint64)
-                    np.bitwise_or.at(words, (rows[good], cols[good]), marks)
-    return {
-        index: replace(tile, free=free[index] & ~tile.obstacle_words) if index in free else tile
-        for index, tile in merged.tiles.items()
-    }
+    """The tiles of the merged map with what the maps know to be free.
+
+    Each voxel asks the maps for its own middle: the other way round, the voxels of a turned map leave gaps."""
+    out = {}
+    x, y = np.meshgrid(np.arange(TILE_CELLS) + 0.5, np.arange(TILE_CELLS) + 0.5)
+    for index, tile in merged.tiles.items():
+        rows, cols = np.nonzero(np.isfinite(tile.ground_z))
+        words = np.zeros(len(rows), dtype=np.uint64)
+        middles = np.empty((len(rows), 3))
+        middles[:, 0] = tile.window.x0 + CELL_SIZE * x[rows, cols]
+        middles[:, 1] = tile.window.y0 + CELL_SIZE * y[rows, cols]
+        for one, T_first in zip(maps, T, strict=True):
+            T_one = inverse(T_first)
+            for bit in range(TOP_BIT):
+                middles[:, 2] = (tile.base[rows, cols] + bit + 0.5) * CELL_SIZE
+                is_free = _is_free(one, middles @ T_one[:3, :3].T + T_one[:3, 3])
+                words |= is_free.astype(np.uint64) << np.uint64(bit)
+        free = np.zeros(tile.window.shape, dtype=np.uint64)
+        free[rows, cols] = words
+        free &= ~tile.obstacle_words
+        out[index] = replace(tile, free=free) if free.any() else tile
+    return out
 
 
-def _middles(tile: Tile) -> F64:
-    """(n, 3) middles of a tile's free voxels, map metres."""
-    assert tile.free is not None
-    parts = []
-    x, y = tile.window.centres()
-    for bit in range(TOP_BIT):
-        rows, cols = np.nonzero(tile.free >> np.uint64(bit) & np.uint64(1))
-        parts.append(np.column_stack([x[cols], y[rows], (tile.base[rows, cols] + bit + 0.5) * CELL_SIZE]))
-    return np.concatenate(parts)
+def _is_free(one: PointMap, places: F64) -> Bool:
+    """(n,) whether places (n, 3) lie in voxels that the map knows to be free."""
+    out = np.zeros(len(places), dtype=np.bool_)
+    rows, cols = one.lattice.cells_of(places)
+    layers = np.floor(places[:, 2] / CELL_SIZE).astype(np.int64)
+    tile_rows, tile_cols = tile_of_cells(rows, cols)
+    for (row, col), part in one.tiles.items():
+        mine = np.flatnonzero((tile_rows == row) & (tile_cols == col))
+        if part.free is None or not len(mine):
+            continue
+        r, c = rows[mine] - row * TILE_CELLS, cols[mine] - col * TILE_CELLS
+        bit = layers[mine] - part.base[r, c]
+        words = part.free[r, c] >> np.clip(bit, 0, TOP_BIT).astype(np.uint64)
+        out[mine] = (bit >= 0) & (bit < TOP_BIT) & (words & np.uint64(1) == 1)
+    return out
 
 
 def _poses(path: F64) -> F64:

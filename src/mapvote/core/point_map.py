@@ -21,6 +21,9 @@ _EXTENT_M = 1e7
 _CHUNK = 1_000_000
 """Points of one block: a large cloud is never copied as a whole."""
 
+SOURCES = "sources"
+"""The field of a merged map's points: bit k of each is set where the k-th map has a point in its voxel."""
+
 
 @dataclass(frozen=True, slots=True, repr=False)
 class PointMap:

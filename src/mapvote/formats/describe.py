@@ -11,7 +11,7 @@ import numpy as np
 from mapvote.codec.ballot import Ballot, decode, unpack_states
 from mapvote.codec.points import unpack_points
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS
-from mapvote.core.point_map import PointMap
+from mapvote.core.point_map import SOURCES, PointMap
 from mapvote.core.sensor_height import check_heights
 from mapvote.core.types import CellState, Drive, MapvoteError
 from mapvote.formats import open_drive, read_map
@@ -73,8 +73,22 @@ def _map(point_map: PointMap) -> Rows:
         ("fields", ", ".join(fields.values()) or "none"),
         ("known free", f"learned in {learned} tiles" if learned else "never learned"),
     ]
+    rows += _sources(point_map)
     rows += [(f"drive {k}", str(check_heights(point_map, path))) for k, path in enumerate(point_map.driven, 1)]
     return rows + [(f"georeference: {name}", text.strip()) for name, text in point_map.georeference.items()]
+
+
+def _sources(point_map: PointMap) -> Rows:
+    """Of a merged map which points came from which map, in the order in which they were given to merge."""
+    columns = [tile.fields[SOURCES] for tile in point_map.tiles.values() if SOURCES in tile.fields]
+    if not columns:
+        return []
+    sources = np.concatenate(columns)
+    maps = range(int(np.bitwise_or.reduce(sources)).bit_length())
+    alone = [int((sources == np.uint64(1) << np.uint64(k)).sum()) for k in maps]
+    in_each = [int((sources >> np.uint64(k) & np.uint64(1)).sum()) for k in maps]
+    rows = [(f"source map {k + 1}", f"{in_each[k]:,} points, {alone[k]:,} of them in no other") for k in maps]
+    return [*rows, ("since the merge", f"{int((sources == 0).sum()):,} points")]
 
 
 def _drive(drive: Drive) -> Rows:
