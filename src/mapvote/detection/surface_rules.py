@@ -23,13 +23,11 @@ NEW_RAYS = 0.5
 """Of the scans in which a free voxel was hit, one against two that crossed it."""
 SUPPORT = 6
 """Voxels by which something gone must be decided, in its 8-connected cells: a pole of 1.8 m, half a square metre."""
-NEW_VOXELS, NEW_A_CELL, NEW_ENOUGH = 4, 2, 40
-"""Voxels that something new of A cells must be decided by: 4 + 2 A, or 40. What is thinner is noise beside what stands.
-The bound of 40 keeps large low things."""
-MOVED_CELLS = 3
-"""How far behind what went its new side may lie: .9 m."""
-FALL_CELLS = 8
-"""How far what is gone takes cells with it that no ray could decide: 2.4 m."""
+NEW_A_CELL, NEW_ENOUGH = 2, 40
+"""Something new needs SUPPORT voxels in its first cell, so many more in each other cell, and so many at most. What is
+thinner is noise beside what stands. The bound keeps large low things."""
+REACH_CELLS = 3
+"""How far what went reaches: .9 m. So far behind it its new side may lie, and what no ray could decide goes with it."""
 _AROUND = np.ones((3, 3))
 _LOW = np.uint64(0b1111)
 """A column that has one of these voxels begins within 1.2 m of the ground."""
@@ -52,16 +50,6 @@ class VoxelFacts(NamedTuple):
     """Over a cell's new voxels: in how many scans they were hit, less in how many they were passed."""
     hits: I32
     """Over a cell's new voxels: in how many scans they were hit."""
-
-
-class Mapped(NamedTuple):
-    """What the map knows of the same window, (rows, cols)."""
-
-    occupied: U64
-    known_free: U64
-    base: I32
-    height_m: F32
-    """How high its points rise over the ground; not finite where there are none."""
 
 
 class WindowStates(NamedTuple):
@@ -118,8 +106,9 @@ def weigh_voxels(planes: U64, part: Overlap, occupied: U64, known_free: U64, out
                         out.beyond[r, c] |= one
 
 
-def judge_window(drive: VoxelFacts, here: Mapped, min_height_m: float) -> WindowStates:
-    """What a drive says of a window.
+def judge_window(drive: VoxelFacts, occupied: U64, height_m: F32, min_height_m: float) -> WindowStates:
+    """What a drive says of a window, of which the map knows (rows, cols) the ``occupied`` voxels and how high they rise
+    over the ground, not finite where there are none.
 
     Of a voxel, over the drive's scans: h hits, c crossed, p passes (detection/evidence.py); a and b the passes of the
     voxels above and below it.
@@ -133,15 +122,15 @@ def judge_window(drive: VoxelFacts, here: Mapped, min_height_m: float) -> Window
         changed-empty  if N >= SUPPORT, or it is a thing of its own on the ground
 
     and with it what :func:`grown` and :func:`fallen` say. Of an 8-connected group of A cells with N
-    new voxels, among them those that were hit beyond what the map knew within MOVED_CELLS of changed-empty,
+    new voxels, among them those that were hit beyond what the map knew within REACH_CELLS of changed-empty,
 
         changed-occupied  if sum h >= sum p, and
-                          N >= min(NEW_VOXELS + NEW_A_CELL A, NEW_ENOUGH) or it is a thing of its own on the ground
+                          N >= min(SUPPORT + NEW_A_CELL (A - 1), NEW_ENOUGH) or it is a thing of its own on the ground
 
     What rises less than ``min_height_m`` is never gone.
     """
-    mapped, nothing = here.occupied != 0, drive.gone | drive.stands == 0
-    high = mapped & (here.height_m >= min_height_m)
+    mapped, nothing = occupied != 0, drive.gone | drive.stands == 0
+    high = mapped & (height_m >= min_height_m)
     gone: U64 = np.where(high, drive.gone, NOTHING)
     beyond: U64 = np.where(mapped, NOTHING, drive.beyond)
     states = np.full(mapped.shape, NO_VOTE, dtype=np.uint8)
@@ -150,21 +139,20 @@ def judge_window(drive: VoxelFacts, here: Mapped, min_height_m: float) -> Window
     states[drive.stands != 0] = CellState.UNCHANGED_OCCUPIED
 
     empty = (gone != 0) & (drive.stands == 0)
-    firm = supported(empty, gone, SUPPORT) | on_its_own(empty, gone, here.occupied, mapped & ~empty)
+    firm = supported(empty, gone, SUPPORT) | on_its_own(empty, gone, occupied, mapped & ~empty)
     crossed = high & (drive.stands == 0) & ((drive.gone | drive.unmet) != 0)
     states[empty] = CellState.UNDETERMINED
     states[grown(firm, crossed)] = CellState.CHANGED_EMPTY
-    states[fallen(states, high & nothing & _hollow_below(here.occupied, drive.passed), FALL_CELLS)] = (
-        CellState.CHANGED_EMPTY
-    )
+    undecided = high & nothing & _hollow_below(occupied, drive.passed)
+    states[fallen(states, undecided, REACH_CELLS)] = CellState.CHANGED_EMPTY
     went = states == CellState.CHANGED_EMPTY
-    gone = np.where(went, here.occupied, gone)
+    gone = np.where(went, occupied, gone)
 
-    near = ndimage.maximum_filter(went, 2 * MOVED_CELLS + 1, mode="constant")
+    near = ndimage.maximum_filter(went, 2 * REACH_CELLS + 1, mode="constant")
     new: U64 = np.bitwise_or(np.where(mapped, NOTHING, drive.new), np.where(near, beyond, NOTHING))
     cells = new != 0
-    enough = np.minimum(NEW_VOXELS + NEW_A_CELL * _over_groups(cells, cells), NEW_ENOUGH)
-    firm = supported(cells, new, enough) | on_its_own(cells, new, new, here.occupied & ~gone != 0)
+    enough = np.minimum(SUPPORT + NEW_A_CELL * (_over_groups(cells, cells) - 1), NEW_ENOUGH)
+    firm = supported(cells, new, enough) | on_its_own(cells, new, new, occupied & ~gone != 0)
     states[cells] = CellState.UNDETERMINED
     states[firm & lasting(cells, drive.balance)] = CellState.CHANGED_OCCUPIED
     return WindowStates(states, gone, np.where(drive.stands != 0, gone, NOTHING), new)

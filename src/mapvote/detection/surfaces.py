@@ -16,7 +16,7 @@ from mapvote.core.types import NO_VOTE, U64
 from mapvote.core.voting import one_hot
 from mapvote.detection.confidence import looks
 from mapvote.detection.evidence import Evidence, free_words
-from mapvote.detection.surface_rules import NOTHING, Mapped, judge_window, no_facts, weigh_voxels
+from mapvote.detection.surface_rules import NOTHING, judge_window, no_facts, weigh_voxels
 from mapvote.detection.voter import TileVotes
 from mapvote.perception.frontend import Observation
 
@@ -60,7 +60,7 @@ class SurfaceVoter:
                 weigh_voxels(planes, counted.overlap(tile, window), here.occupied, known, weighed)
                 if tile in tiles:
                     free[tile] = free_words(planes, np.ascontiguousarray(here.occupied[self._cut(tile, window)]))
-        said = judge_window(weighed, Mapped(here.occupied, known, here.base, height_m), self.voting.min_height_m)
+        said = judge_window(weighed, here.occupied, height_m, self.voting.min_height_m)
         amount = np.where(here.occupied != 0, np.bitwise_count(here.occupied), weighed.hits)
         told = here.free if here.free is not None else np.zeros_like(known)
         for tile in tiles:
