@@ -47,6 +47,7 @@ export const overview = async (version) => (await ask("clouds/overview", version
 export const cloudPart = async ({ points, ground, fields }, level) =>
   (await ask(`clouds/${points}/${ground}/${level}`, fields ? { fields } : {})).arrayBuffer();
 export const evidence = async (tile, vehicle) => (await ask(`evidence/${tile.replace(",", "/")}`, vehicle ? { vehicle } : {})).arrayBuffer();
+export const passes = async () => (await ask("coverage/passes")).json();
 export const paths = async (vehicle) => (await ask("paths", vehicle ? { vehicle } : {})).json();
 export const versionMap = async (number) => (await ask(`map/versions/${number}`)).json();
 export const cloudsChanged = async (from, to) => (await ask("clouds/changed", { from, to })).arrayBuffer();

@@ -24,7 +24,7 @@ export function notice(text, empty = false) {
 }
 
 // The address holds everything that is shown: whoever opens it sees the same.
-const ORDER = ["change", "cell", "from", "to", "view", "shade", "colour", "vehicle", "compare", "swipe", "slice", "paths", "open", "pending", "eye"];
+const ORDER = ["change", "cell", "from", "to", "view", "shade", "colour", "vehicle", "compare", "swipe", "slice", "paths", "next", "open", "pending", "eye"];
 const next = {};
 let waiting = null;
 

@@ -90,10 +90,10 @@ export class Stage {
     this.flat.setRaster(hash, points);
   }
 
-  // Lines of [x, y, z], map metres.
+  // Lines of [x, y, z] or, on the ground, of [x, y], map metres.
   setPaths(lines) {
     this.flat.setPaths(lines);
-    this.cloud?.setLines(lines);
+    this.cloud?.setLines(lines.map((line) => line.map(([x, y, z]) => [x, y, z ?? this.groundAt([x, y, x, y])])));
   }
 
   select(id, cell = null) {

@@ -41,33 +41,46 @@ function visit(e) {
   showCell([e.x, e.y]);
 }
 
-// Paths of the drives whose ballots stand, as lines in both pictures.
+// Lines in both pictures: paths of the drives whose ballots stand, and stretches on which one more pass would decide
+// cells.
 const GAP_M = 40;  // farther apart: the vehicle did not know where it was in between
 
-export async function showPaths() {
-  const asked = $("paths").checked;
-  address.write({ paths: asked ? "1" : null });
-  if (!asked) return draw([]);
+const LAYERS = {
+  paths: { ask: api.paths, text: driven, features: [] },
+  next: { ask: api.passes, text: wanted, features: [] },
+};
+
+async function showLayer(name) {
+  const layer = LAYERS[name];
+  const asked = $(name).checked;
+  address.write({ [name]: asked ? "1" : null });
   try {
-    const features = (await api.paths()).features;
-    if ($("paths").checked) draw(features);
+    layer.features = asked ? (await layer.ask()).features : [];
   } catch (error) {
-    notice(error.message);
+    return notice(error.message);
   }
+  if (asked !== $(name).checked) return;
+  $(`${name}-text`).textContent = asked ? layer.text(layer.features) : "";
+  state.view.setPaths(Object.values(LAYERS).flatMap((l) => l.features).flatMap((f) => unbroken(f.geometry.coordinates)));
 }
 
 // Once the server has told that it tells: as the address says, and up to date with each new ballot.
 export function offerPaths() {
-  $("paths-row").hidden = false;
-  if (address.read().paths === "1") $("paths").checked = true;
-  if ($("paths").checked) showPaths();
+  for (const name of Object.keys(LAYERS)) {
+    $(`${name}-row`).hidden = false;
+    if (address.read()[name] === "1") $(name).checked = true;
+    if ($(name).checked) showLayer(name);
+  }
 }
 
-function draw(features) {
+function driven(features) {
   const km = features.reduce((sum, f) => sum + f.properties.length_m, 0) / 1000;
-  $("paths-text").textContent = !$("paths").checked ? "" : features.length ? `${features.length} drives, ${km.toFixed(1)} km` : "no ballot carries a path";
-  const lines = features.flatMap((f) => unbroken(f.geometry.coordinates));
-  state.view.setPaths(lines);
+  return features.length ? `${features.length} drives, ${km.toFixed(1)} km` : "no ballot carries a path";
+}
+
+function wanted(features) {
+  const cells = features.reduce((sum, f) => sum + f.properties.cells, 0);
+  return features.length ? `${features.length} stretches of road, ${cells} cells` : "no cell waits for one more pass";
 }
 
 function unbroken(line) {
@@ -80,4 +93,4 @@ function unbroken(line) {
   return parts.filter((part) => part.length > 1);
 }
 
-$("paths").onchange = showPaths;
+for (const name of Object.keys(LAYERS)) $(name).onchange = () => showLayer(name);
