@@ -37,7 +37,7 @@ def test_build_draws_how_the_drives_fit_and_tells_the_height_over_the_ground(sur
     assert "car: 24 of 24 scans, 23 m; off its prior by" in said
     assert "car: sensor 1.79 m over the ground (median), off by 0.0" in said
     assert "warning" not in said
-    assert "fit.png: where the drives went, and how far off their priors" in said
+    assert "fit.png: the drives' trajectories and their distance from the priors" in said
     picture = imread("fit.png")
     assert min(picture.shape[:2]) > 400
     assert len(np.unique(picture.reshape(-1, picture.shape[2]), axis=0)) > 20, "lines, dots and words are drawn"
