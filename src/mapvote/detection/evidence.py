@@ -27,7 +27,7 @@ from mapvote.perception.frontend import Observation
 from mapvote.perception.raycast import find_obstacles
 
 HIT_REACH_M = 0.1
-"""Range noise and pose sigma together, three times over (docs/decisions/evidence.md has what other reaches do)."""
+"""Range noise and pose sigma together, three times over."""
 PLANES = 7
 """Counts up to 127 scans. A cell that would exceed them is halved as a whole, which keeps its ratios."""
 CROSSED, HIT, PASSES = 0, PLANES, 2 * PLANES
