@@ -12,7 +12,7 @@ from mapvote.core.types import F32, F64, I32, NO_VOTE, U8, U64, Bool, CellState
 from mapvote.detection.evidence import CROSSED, HIT, PASSED, PASSES, PLANES, count_of, least_passed
 from mapvote.detection.packed_tiles import Overlap
 
-# Set on corner 1 and 2, street 2 and KITTI 0001 in blocks of 12 and 25 scans: docs/method.md has the scene that needs each.
+# Set on corner 1 and 2, street 2 and KITTI 0001 in blocks of 12 and 25 scans; docs/method.md says what needs each.
 HIT_RAYS = 8
 """Scans that crossed a mapped voxel, against one that hit it."""
 GONE_RAYS = 3
