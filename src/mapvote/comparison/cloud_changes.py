@@ -28,7 +28,6 @@ from mapvote.server.views.outlines import Ring, group, pieces, rings
 Kind = Literal["gone", "new", "not seen"]
 BAND = np.uint64(0b1_1111_1100)
 """The voxels .6 to 2.7 m above the layer of the ground: what is lower is kerb, grass or a slope's error."""
-BAND_TOP_M = 2.7
 REACH_CELLS = 2
 GROUND_APART_M = 0.4
 """Grounds that lie farther apart are not one ground: a roof, a car's floor, a second level."""

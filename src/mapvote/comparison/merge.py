@@ -157,18 +157,16 @@ def _with_free(merged: PointMap, maps: Sequence[PointMap], T: F64) -> dict[TileI
 
     Each voxel asks the maps for its own middle: the other way round, the voxels of a turned map leave gaps."""
     out = {}
-    x, y = np.meshgrid(np.arange(TILE_CELLS) + 0.5, np.arange(TILE_CELLS) + 0.5)
+    from_merged = [(one, inverse(T_first)) for one, T_first in zip(maps, T, strict=True)]
     for index, tile in merged.tiles.items():
         rows, cols = np.nonzero(np.isfinite(tile.ground_z))
         words = np.zeros(len(rows), dtype=np.uint64)
-        middles = np.empty((len(rows), 3))
-        middles[:, 0] = tile.window.x0 + CELL_SIZE * x[rows, cols]
-        middles[:, 1] = tile.window.y0 + CELL_SIZE * y[rows, cols]
-        for one, T_first in zip(maps, T, strict=True):
-            T_one = inverse(T_first)
+        x, y = tile.window.centres()
+        middles = np.column_stack([x[cols], y[rows], np.zeros(len(rows))])
+        for one, T_one_merged in from_merged:
             for bit in range(TOP_BIT):
                 middles[:, 2] = (tile.base[rows, cols] + bit + 0.5) * CELL_SIZE
-                is_free = _is_free(one, middles @ T_one[:3, :3].T + T_one[:3, 3])
+                is_free = _is_free(one, transform(T_one_merged, middles))
                 words |= is_free.astype(np.uint64) << np.uint64(bit)
         free = np.zeros(tile.window.shape, dtype=np.uint64)
         free[rows, cols] = words

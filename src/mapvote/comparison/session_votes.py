@@ -19,7 +19,7 @@ from mapvote.codec.ballot import Ballot
 from mapvote.comparison.cloud_changes import BAND, CellComparison, CloudChange, compare_cells, differences
 from mapvote.comparison.register import Registered, register_clouds
 from mapvote.config import Settings
-from mapvote.core.columns import dilated
+from mapvote.core.columns import dilated, rebased
 from mapvote.core.geometry import rows_from
 from mapvote.core.grid import Grid, TileIndex, window_around
 from mapvote.core.point_map import PointMap, all_points, map_from_points
@@ -119,7 +119,7 @@ class _SessionVoter:
         found = self._compared
         mine, other = found.a, found.b
         known = np.asarray(self._rigid())
-        there = _rebased(other.words, other.base, mine.base)
+        there = rebased(other.words, other.base - mine.base)
         near = dilated(there, mine.base, 1)
         states = np.full(mine.low.shape, NO_VOTE, dtype=np.uint8)
         states[other.own_ground & ~other.stands & ~mine.stands] = CellState.UNCHANGED_EMPTY
@@ -133,7 +133,7 @@ class _SessionVoter:
                 new[change.cells] = there[change.cells] & ~mine.words[change.cells]
                 states[change.cells] = CellState.CHANGED_OCCUPIED
         states[~known] = NO_VOTE
-        free = _rebased(other.free, other.base, mine.base) & ~near & ~mine.words
+        free = rebased(other.free, other.base - mine.base) & ~near & ~mine.words
         for tile in found.window.tiles():
             window = self._map.lattice.tile(tile)
             cut = window.slices_in(found.window)
@@ -164,13 +164,6 @@ def _tile_votes(states: U8, gone: U64, new: U64, free: U64 | None) -> TileVotes:
         new=np.ascontiguousarray(new),
         free=None if free is None else np.ascontiguousarray(free),
     )
-
-
-def _rebased(words: U64, base: I32, wanted: I32) -> U64:
-    """Column words (rows, cols) that begin at ``base`` as words that begin at ``wanted``."""
-    apart = np.clip(base.astype(np.int64) - wanted, -63, 63)
-    up, down = np.maximum(apart, 0).astype(np.uint64), np.maximum(-apart, 0).astype(np.uint64)
-    return np.asarray(np.where(apart >= 0, words << up, words >> down))
 
 
 def _hanging_together(words: U64) -> U64:

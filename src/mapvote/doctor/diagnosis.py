@@ -141,9 +141,10 @@ class Evidence:
         """A long run, from the first scans that it can begin with: its first step tries every way and speed, and may
         find a wrong one; the next scan then does not fit, though nothing is wrong with the drive."""
         run = self.run(0, scans=CHAIN_SCANS)
-        for start in range(_LOST_SCANS, 3 * _LOST_SCANS, _LOST_SCANS):
-            if len(unbroken(run).indices) == len(run.indices) or len(unbroken(run).indices) > _LOST_SCANS:
-                return run
+        for start in (_LOST_SCANS, 2 * _LOST_SCANS):
+            fitting = len(unbroken(run).indices)
+            if fitting > _LOST_SCANS or fitting == len(run.indices):
+                break
             run = self.run(start, scans=CHAIN_SCANS)
         return run
 

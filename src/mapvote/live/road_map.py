@@ -19,7 +19,7 @@ from mapvote.core.types import F64, MapvoteError
 from mapvote.live.drive import KEPT_M, has_moved
 
 log = logging.getLogger("mapvote.live")
-AHEAD_M, NEEDED_M = 300.0, 160.0
+AHEAD_M, NEEDED_M = KEPT_M, 160.0
 """Tiles that touch a square reaching so far are asked for; and without those this near no scan is used. What a vehicle
 has laid out around it reaches two tiles, 154 m."""
 _POLL_S = 60.0

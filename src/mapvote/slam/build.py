@@ -112,8 +112,8 @@ def build_map(
     point_map = replace(layer.finish(), driven=driven, georeference=dict(_place_on_earth(drives)))
     point_map = replace(point_map, surveyed_ns=_last_stamp(drives))
     heights = [_agreed_heights(drive, point_map, path) for drive, path in zip(drives, driven, strict=True)]
-    tracks = tuple(_track(*each) for each in zip(drives, poses, found, heights, settled.sigma_m, strict=True))
-    tracks = tuple(replace(track, wrong_attitude=wrong) for track, (_, wrong) in zip(tracks, shown, strict=True))
+    wrong = [wrong for _, wrong in shown]
+    tracks = tuple(_track(*each) for each in zip(drives, poses, found, heights, settled.sigma_m, wrong, strict=True))
     held = any(is_precise(drive) for drive in drives)
     points = sum(len(tile.points) for tile in point_map.tiles.values())
     return point_map, BuildReport(tracks, points, held, settled.bent_m, two_levels(road) if len(road) else None)
@@ -147,7 +147,9 @@ def _agreed_heights(drive: Drive, point_map: PointMap, positions: F64) -> Height
     return heights
 
 
-def _track(drive: Drive, T_map_lidar: F64, found: Surveyed, heights: Heights, sigma_m: F64) -> DriveTrack:
+def _track(
+    drive: Drive, T_map_lidar: F64, found: Surveyed, heights: Heights, sigma_m: F64, wrong: WrongAttitude | None
+) -> DriveTrack:
     length = float(np.linalg.norm(np.diff(T_map_lidar[:, :3, 3], axis=0), axis=1).sum())
     drift = None
     if drive.T_map_lidar_prior is not None:
@@ -155,8 +157,9 @@ def _track(drive: Drive, T_map_lidar: F64, found: Surveyed, heights: Heights, si
         off = np.linalg.norm(T_map_lidar[:, :3, 3] - prior[:, :3, 3], axis=1)
         turn = rotation_angles(inverses(prior) @ T_map_lidar)
         drift = Drift(float(np.median(off)), float(off.max()), float(off[-1]), float(np.degrees(np.median(turn))))
+    registered, broken = found.registered, found.broken
     return DriveTrack(
-        drive.vehicle, drive.drive_id, T_map_lidar, found.registered, length, drift, heights, found.broken, sigma_m
+        drive.vehicle, drive.drive_id, T_map_lidar, registered, length, drift, heights, broken, sigma_m, wrong
     )
 
 
