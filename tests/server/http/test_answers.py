@@ -109,6 +109,12 @@ def test_every_json_answer_is_as_openapi_declares_it(store: Store) -> None:
     assert Probe.PATHS[1] in {path for _, path in typed}
 
 
+def test_no_request_builds_a_route(store: Store) -> None:
+    """Two first requests at once would build it in two threads; see create_app."""
+    routes = [id(route) for part in ROUTES for route in part.router.routes]
+    assert routes == [id(route) for route in create_app(store).router.routes[-len(routes) :]]
+
+
 def test_a_member_that_no_model_names_is_found() -> None:
     with pytest.raises(ValueError, match="extra"):
         TypeAdapter(Answer).validate_python({"more": 1})

@@ -88,7 +88,9 @@ def create_app(
     )
     app.state.services = parts
     for part in ROUTES:
-        app.include_router(part.router)
+        # Not include_router: that takes the routes apart again at the first request, under warnings.catch_warnings,
+        # which holds for one thread only. These were made when their module was imported.
+        app.router.routes.extend(part.router.routes)
     app.add_exception_handler(400, unreadable)
     hosts, guard = Hosts(parts.settings.server.hosts), Guard(store, parts.threads.lookups, opened=opened, owner=owner)
     probe = Probe(parts.check_ready)
