@@ -1,9 +1,12 @@
 """What differs between two clouds of one place that lie in one frame: gone, new, and not seen by the other.
 
-A cloud knows neither its rays nor free space. So a thing that one cloud has is gone from the other only where the other
-has ground and nothing that stands within two cells: who measured the ground there would have measured the thing. Where
-a map knows free space, that counts as well. Only what stands in the lowest 2.5 m is compared: crowns, wires and roofs
-are within reach of one survey and out of reach of the next, and rays pass between their points.
+An object of one cloud is gone or new where the other cloud has nothing that stands within two cells, and must have
+seen the place. A map made of scans knows free space: it saw the place if half of the object's voxels are free in it. A
+bare cloud knows no rays: it saw the place if it has ground there. Rays to the ground pass below what hangs, and through
+gaps they show ground behind a house. So the ground does not decide where free space is known.
+
+Only what stands in the lowest 2.7 m is compared: crowns, wires and roofs are in range of one survey and out of range of
+the next. If rays of the same map passed below a point, that point does not stand: it hangs, or something moved there.
 """
 
 from __future__ import annotations
@@ -18,6 +21,7 @@ from scipy.spatial import KDTree
 
 from mapvote.comparison.patches import SIDE_M
 from mapvote.comparison.register import Registered
+from mapvote.core.columns import rebased
 from mapvote.core.geometry import transform
 from mapvote.core.grid import CELL_SIZE, Grid
 from mapvote.core.point_map import PointMap, all_points, has_open_ground
@@ -34,13 +38,13 @@ GROUND_APART_M = 0.4
 _EXPLAINED_M = 0.45
 """A point so near to the other cloud under the motion of a bent patch is explained by the bend."""
 _VOXELS, _VOXELS_A_CELL, _VOXELS_ENOUGH = 4, 2, 80
-"""Occupied voxels that a thing of A cells must have: 4 + 2 A, or 80, much as new things of a drive must. What is
-thinner, one point a cell, is the fringe of a survey or the trail of something that moved."""
+"""Occupied voxels that an object of A cells must have: 4 + 2 A, or 80, much as new objects of a drive must.
+What is thinner, one point a cell, is the fringe of a survey or the trail of something that moved."""
 
 
 @dataclass(frozen=True, slots=True)
 class CloudChange:
-    """A thing that only one of two clouds has."""
+    """An object that only one of two clouds has."""
 
     kind: Kind
     """gone: a has it. new: b has it. not seen: one has it, and it is unknown whether the other should."""
@@ -54,9 +58,7 @@ class CloudChange:
     box: tuple[float, float, float, float]
     """x0, y0, x1, y1 in a's frame, metres."""
     confidence: float
-    """Share of its cells in which the other cloud has ground itself, or free space, not only beside it."""
-    by_free_space: float
-    """Share of its cells that free space of the other decides."""
+    """How surely the other cloud saw the place: mean over its cells of ``CellComparison.sure_a`` or ``sure_b``."""
     has: Literal["a", "b"]
     cells: tuple[I64, I64]
     """(rows, cols) of its cells in the window of the comparison."""
@@ -71,9 +73,9 @@ class CloudPlanes:
     words: U64
     """Column words of what stands."""
     low: Bool
-    """Something stands in BAND."""
+    """A point lies in BAND."""
     stands: Bool
-    """Something stands, at any height."""
+    """A point lies above the ground, at any height."""
     top_z: F32
     counts: F64
     own_ground: Bool
@@ -82,6 +84,8 @@ class CloudPlanes:
     """It or one of the eight beside it has."""
     free: U64
     """Column words known to be free; 0 where the map has none."""
+    has_rays: Bool
+    """The tile knows free space."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,8 +102,11 @@ class CellComparison:
     not_seen_b: Bool
     left_out: Bool
     """In a bent part, or explained by its motion."""
-    free: Bool
-    """One has something where the other has free space."""
+    sure_a: F64
+    """How surely a saw b's objects: the share of b's voxels in BAND that are free in a; where a knows no free space, 1
+    if a has ground in the cell itself, else 0."""
+    sure_b: F64
+    """The same, with a and b exchanged."""
 
 
 def planes_of(point_map: PointMap, window: Grid) -> CloudPlanes:
@@ -110,9 +117,14 @@ def planes_of(point_map: PointMap, window: Grid) -> CloudPlanes:
     own = _ground_points(point_map, window) & known
     low = here.occupied & BAND != 0
     free = np.zeros_like(here.occupied) if here.free is None else here.free
+    has_rays = np.zeros(window.shape, dtype=np.bool_)
+    for index in window.tiles():
+        tile = point_map.tiles.get(index)
+        if tile is not None and tile.free is not None and tile.free.any():
+            has_rays[tile.window.intersection(window).slices_in(window)] = True
     return CloudPlanes(
         here.ground_z, here.base, here.occupied, low, here.occupied != 0, here.top_z, here.counts.astype(np.float64),
-        own, beside, free,
+        own, beside, free, has_rays,
     )  # fmt: skip
 
 
@@ -140,14 +152,15 @@ def compare_cells(map_a: PointMap, map_b: PointMap, registered: Registered | Non
                 "seen cannot be decided by geometry alone"
             )
     apart = (np.abs(a.ground_z - b.ground_z) > GROUND_APART_M) & a.own_ground & b.own_ground  # measured, not filled in
-    only_a = a.low & ~_around(b.low, REACH_CELLS)
-    only_b = b.low & ~_around(a.low, REACH_CELLS)
+    only_a = a.low & ~_hangs(a) & ~_around(b.low, REACH_CELLS)
+    only_b = b.low & ~_hangs(b) & ~_around(a.low, REACH_CELLS)
     left_out = np.zeros(window.shape, dtype=np.bool_)
     if registered is not None:
         left_out = _left_out(window, only_a | only_b, registered)
         _explain(only_a, only_b, left_out, (map_a, map_b), window, registered)
-    free_in_b, free_in_a = _is_free(a, b), _is_free(b, a)
-    seen_by_b, seen_by_a = (b.seen & ~apart) | free_in_b, (a.seen & ~apart) | free_in_a
+    free_in_a, free_in_b = _free_share(b, a), _free_share(a, b)
+    seen_by_a = np.where(a.has_rays, free_in_a >= 0.5, a.seen & ~apart)
+    seen_by_b = np.where(b.has_rays, free_in_b >= 0.5, b.seen & ~apart)
     return CellComparison(
         window, a, b,
         only_a & seen_by_b & ~left_out,
@@ -155,17 +168,24 @@ def compare_cells(map_a: PointMap, map_b: PointMap, registered: Registered | Non
         only_a & ~seen_by_b & ~left_out,
         only_b & ~seen_by_a & ~left_out,
         left_out,
-        free_in_a | free_in_b,
+        np.where(a.has_rays, free_in_a, a.own_ground),
+        np.where(b.has_rays, free_in_b, b.own_ground),
     )  # fmt: skip
 
 
-def _is_free(owner: CloudPlanes, other: CloudPlanes) -> Bool:
-    """(rows, cols) where the other map knows half of the owner's low voxels, or more, to be free."""
-    apart = np.clip(other.base.astype(np.int64) - owner.base, -63, 63)
-    up, down = np.maximum(apart, 0).astype(np.uint64), np.maximum(-apart, 0).astype(np.uint64)
-    free = np.where(apart >= 0, other.free << up, other.free >> down)
+def _free_share(owner: CloudPlanes, other: CloudPlanes) -> F64:
+    """(rows, cols) share of the owner's voxels in BAND that the other map knows to be free; 0 where it has none."""
     low = owner.words & BAND
-    return np.asarray((low != 0) & (2 * np.bitwise_count(low & free).astype(int) >= np.bitwise_count(low)))
+    free = low & rebased(other.free, other.base - owner.base)
+    return np.asarray(np.bitwise_count(free) / np.maximum(np.bitwise_count(low), 1))
+
+
+def _hangs(planes: CloudPlanes) -> Bool:
+    """(rows, cols) where rays of the map itself passed in BAND below its highest point there."""
+    below = planes.words & BAND
+    for layers in (1, 2, 4):
+        below |= below >> np.uint64(layers)
+    return np.asarray(below & BAND & planes.free & ~planes.words != 0)
 
 
 def _around(cells: Bool, reach: int) -> Bool:
@@ -222,7 +242,7 @@ def _in_cells(points: F64, cells: Bool, window: Grid) -> F64:
 
 
 def differences(found: CellComparison, min_m2: float = 0.5) -> list[CloudChange]:
-    """Things of at least ``min_m2`` that only one cloud has: gone and new by area, then what was not seen."""
+    """Objects of at least ``min_m2`` that only one cloud has: gone and new by area, then what was not seen."""
     out = [
         *_objects(found, found.gone, "gone", "a", min_m2),
         *_objects(found, found.new, "new", "b", min_m2),
@@ -239,7 +259,7 @@ def _objects(
     if not len(rows):
         return []
     window = found.window
-    owner, other = (found.a, found.b) if has == "a" else (found.b, found.a)
+    owner, other, sure = (found.a, found.b, found.sure_b) if has == "a" else (found.b, found.a, found.sure_a)
     kinds = np.zeros(len(rows), dtype=np.int64)
     hang_together = pieces(rows, cols, kinds)
     things = group(rows, cols, kinds, hang_together.objects)
@@ -255,7 +275,6 @@ def _objects(
         voxels = int(np.bitwise_count(owner.words[r, c]).sum())
         if kind != "not seen" and voxels < min(_VOXELS + _VOXELS_A_CELL * len(mine), _VOXELS_ENOUGH):
             continue
-        direct = other.own_ground[r, c] | found.free[r, c]
         points = int(owner.counts[r, c].sum())
         out.append(
             CloudChange(
@@ -265,8 +284,7 @@ def _objects(
                 float(np.nanmax(height[mine], initial=0.0)),
                 points,
                 _box(window, r, c),
-                float(direct.mean()) if kind != "not seen" else 0.0,
-                float(found.free[r, c].mean()),
+                float(sure[r, c].mean()) if kind != "not seen" else 0.0,
                 has,
                 (r, c),
             )

@@ -22,7 +22,7 @@ _ON_PAGE = 12
 
 
 def difference_rows(found: Sequence[CloudChange]) -> list[dict[str, Any]]:
-    """One row a thing, numbered as listed."""
+    """One row per object, numbered as listed."""
     return [
         {
             "id": number,
@@ -35,7 +35,6 @@ def difference_rows(found: Sequence[CloudChange]) -> list[dict[str, Any]]:
             "height_m": round(one.height_m, 2),
             "points": one.points,
             "confidence": round(one.confidence, 2),
-            "by_free_space": round(one.by_free_space, 2),
         }
         for number, one in enumerate(found, 1)
     ]

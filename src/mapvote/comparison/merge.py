@@ -15,12 +15,11 @@ import numpy as np
 
 from mapvote.comparison.patches import Patches
 from mapvote.comparison.register import Registered, register_clouds
-from mapvote.core.columns import TOP_BIT
+from mapvote.comparison.two_maps import with_free_space_of
 from mapvote.core.geometry import inverse, transform
-from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Lattice, TileIndex, tile_of_cells
+from mapvote.core.grid import Lattice
 from mapvote.core.point_map import SOURCES, PointMap, all_points, map_from_points
-from mapvote.core.tile import Tile
-from mapvote.core.types import F64, U64, Bool, MapvoteError
+from mapvote.core.types import F64, U64, MapvoteError
 from mapvote.core.voxels import VoxelCloud, voxel_keys
 from mapvote.slam.pose_graph import Anchors, Links, optimise
 from mapvote.slam.road_prior import road_under
@@ -139,8 +138,8 @@ def _laid(maps: Sequence[PointMap], clouds: Sequence[F64], T: F64) -> PointMap:
     )
     ends = [one.surveyed_ns for one in maps]
     surveyed_ns = max(end for end in ends if end is not None) if all(end is not None for end in ends) else None
-    tiles = _with_free(merged, maps, T)
-    return replace(merged, tiles=tiles, driven=tuple(driven), surveyed_ns=surveyed_ns)
+    merged = with_free_space_of(merged, maps, T)
+    return replace(merged, driven=tuple(driven), surveyed_ns=surveyed_ns)
 
 
 def _sources(points: F64, moved: Sequence[F64], lattice: Lattice) -> U64:
@@ -149,46 +148,6 @@ def _sources(points: F64, moved: Sequence[F64], lattice: Lattice) -> U64:
     out = np.zeros(len(points), dtype=np.uint64)
     for k, cloud in enumerate(moved):
         out |= np.isin(keys, voxel_keys(cloud, lattice.x0, lattice.y0)).astype(np.uint64) << np.uint64(k)
-    return out
-
-
-def _with_free(merged: PointMap, maps: Sequence[PointMap], T: F64) -> dict[TileIndex, Tile]:
-    """The tiles of the merged map with what the maps know to be free.
-
-    Each voxel asks the maps for its own middle: the other way round, the voxels of a turned map leave gaps."""
-    out = {}
-    from_merged = [(one, inverse(T_first)) for one, T_first in zip(maps, T, strict=True)]
-    for index, tile in merged.tiles.items():
-        rows, cols = np.nonzero(np.isfinite(tile.ground_z))
-        words = np.zeros(len(rows), dtype=np.uint64)
-        x, y = tile.window.centres()
-        middles = np.column_stack([x[cols], y[rows], np.zeros(len(rows))])
-        for one, T_one_merged in from_merged:
-            for bit in range(TOP_BIT):
-                middles[:, 2] = (tile.base[rows, cols] + bit + 0.5) * CELL_SIZE
-                is_free = _is_free(one, transform(T_one_merged, middles))
-                words |= is_free.astype(np.uint64) << np.uint64(bit)
-        free = np.zeros(tile.window.shape, dtype=np.uint64)
-        free[rows, cols] = words
-        free &= ~tile.obstacle_words
-        out[index] = replace(tile, free=free) if free.any() else tile
-    return out
-
-
-def _is_free(one: PointMap, places: F64) -> Bool:
-    """(n,) whether places (n, 3) lie in voxels that the map knows to be free."""
-    out = np.zeros(len(places), dtype=np.bool_)
-    rows, cols = one.lattice.cells_of(places)
-    layers = np.floor(places[:, 2] / CELL_SIZE).astype(np.int64)
-    tile_rows, tile_cols = tile_of_cells(rows, cols)
-    for (row, col), part in one.tiles.items():
-        mine = np.flatnonzero((tile_rows == row) & (tile_cols == col))
-        if part.free is None or not len(mine):
-            continue
-        r, c = rows[mine] - row * TILE_CELLS, cols[mine] - col * TILE_CELLS
-        bit = layers[mine] - part.base[r, c]
-        words = part.free[r, c] >> np.clip(bit, 0, TOP_BIT).astype(np.uint64)
-        out[mine] = (bit >= 0) & (bit < TOP_BIT) & (words & np.uint64(1) == 1)
     return out
 
 

@@ -1,9 +1,9 @@
 """A session's cloud as a voter: its votes on every cell of a map, as one ballot.
 
-The cloud is registered to the map without a prior. It says that something stands where it has points; that something is
-gone or new as :mod:`mapvote.comparison.cloud_changes` decides it, by its ground or by free space; that a cell is empty
-where it has ground and nothing else; and nothing anywhere else. Free space comes from a trajectory only: a ray runs
-from each of its poses to what the cloud shows first in that direction. A bent part casts no vote.
+The cloud is registered to the map without a prior. It votes occupied where it has points, gone or new as
+:mod:`mapvote.comparison.cloud_changes` decides it, empty where it has ground and nothing else, and nowhere else. The
+map learns free space from a trajectory only: a ray runs from each of its poses to what the cloud shows first in that
+direction. Such rays are not measured, so they decide no change. A bent part casts no vote.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from mapvote.comparison.cloud_changes import BAND, CellComparison, CloudChange, 
 from mapvote.comparison.register import Registered, register_clouds
 from mapvote.config import Settings
 from mapvote.core.columns import dilated, rebased
-from mapvote.core.geometry import rows_from
+from mapvote.core.geometry import rows_from, transform
 from mapvote.core.grid import Grid, TileIndex, window_around
 from mapvote.core.point_map import PointMap, all_points, map_from_points
 from mapvote.core.reference import reference_window
@@ -77,13 +77,13 @@ def vote_of_session(
     session_map = map_from_points(registered.points, lattice=point_map.lattice)
     if trajectory is None and cloud.driven:
         trajectory = np.concatenate(cloud.driven)
-    driven = None
-    if trajectory is not None:
-        driven = trajectory @ registered.T_a_b[:3, :3].T + registered.T_a_b[:3, 3]
-        session_map = with_free_space(session_map, driven)
     compared = compare_cells(point_map, session_map, registered)
     changes = differences(compared)
-    voter = _SessionVoter(point_map, compared, changes, registered)
+    driven, free = None, np.zeros_like(compared.b.words)
+    if trajectory is not None:
+        driven = transform(registered.T_a_b, trajectory)
+        free = _free_words(with_free_space(session_map, driven), compared.window)
+    voter = _SessionVoter(point_map, compared, free, changes, registered)
     offered = NewPoints(point_map.lattice)
     offered.offer(registered.points)
     report = _report(registered, driven, end_ns)
@@ -111,9 +111,16 @@ class _SessionVoter:
     """The votes of a comparison, tile by tile."""
 
     def __init__(
-        self, point_map: PointMap, compared: CellComparison, changes: list[CloudChange], registered: Registered
+        self,
+        point_map: PointMap,
+        compared: CellComparison,
+        free: U64,
+        changes: list[CloudChange],
+        registered: Registered,
     ) -> None:
-        self._map, self._compared, self._changes, self._registered = point_map, compared, changes, registered
+        """``free`` (rows, cols): column words of the session's free space over the window of the comparison."""
+        self._map, self._compared, self._free = point_map, compared, free
+        self._changes, self._registered = changes, registered
 
     def each(self, only: Collection[TileIndex] | None = None) -> Iterator[tuple[TileIndex, TileVotes]]:
         found = self._compared
@@ -133,7 +140,7 @@ class _SessionVoter:
                 new[change.cells] = there[change.cells] & ~mine.words[change.cells]
                 states[change.cells] = CellState.CHANGED_OCCUPIED
         states[~known] = NO_VOTE
-        free = rebased(other.free, other.base - mine.base) & ~near & ~mine.words
+        free = rebased(self._free, other.base - mine.base) & ~near & ~mine.words
         for tile in found.window.tiles():
             window = self._map.lattice.tile(tile)
             cut = window.slices_in(found.window)
@@ -206,6 +213,11 @@ def with_free_space(session_map: PointMap, driven: F64) -> PointMap:
         for index, tile in session_map.tiles.items()
     }
     return replace(session_map, tiles=tiles)
+
+
+def _free_words(point_map: PointMap, window: Grid) -> U64:
+    known = reference_window(point_map, window).free
+    return np.zeros(window.shape, dtype=np.uint64) if known is None else known
 
 
 def _passed(points: F64, origin: F64, base: I32, window: Grid, spacing_m: float) -> U64:
