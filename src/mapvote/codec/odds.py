@@ -17,6 +17,7 @@ MOST = 127
 """31.75 nats: beyond all that anybody can know."""
 UNSAID = -128
 """Where no confidence is stated; no ballot holds it."""
+_CO, _CE = int(CellState.CHANGED_OCCUPIED), int(CellState.CHANGED_EMPTY)  # against a CellState numpy compares in int64
 
 
 def in_steps(log_odds: F64) -> I8:
@@ -31,7 +32,7 @@ def in_nats(steps: I8) -> F64:
 
 def changed_cells_of(states: U8) -> I64:
     """(m,) flat cells that the states (256, 256) call changed, ascending."""
-    return np.flatnonzero((states == CellState.CHANGED_OCCUPIED) | (states == CellState.CHANGED_EMPTY))
+    return np.flatnonzero((states == _CO) | (states == _CE))
 
 
 def pack_odds(steps: I8) -> bytes:

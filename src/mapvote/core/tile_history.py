@@ -97,13 +97,12 @@ class Memory:
     def _joined(self, cells: I64) -> tuple[I64, U32, I64]:
         """(own cells and ``cells`` (m,), (n,) ascending; their values (4, n), zero where they are new; which of all
         each of ``cells`` is (m,))."""
-        place = np.zeros(CELLS, dtype=np.int64)  # a plane of the tile: np.union1d takes four times as long
-        place[self.cells] = place[cells] = 1
-        joined = np.flatnonzero(place)
-        place[joined] = np.arange(len(joined))
+        named = np.zeros(CELLS, dtype=np.bool_)  # np.union1d takes four times as long, nonzero of numbers ten times
+        named[self.cells] = named[cells] = True
+        joined = np.flatnonzero(named)
         planes = np.zeros((PLANES, len(joined)), dtype=np.uint32)
-        planes[:, place[self.cells]] = self.values
-        return joined, planes, place[cells]
+        planes[:, np.searchsorted(joined, self.cells)] = self.values
+        return joined, planes, np.searchsorted(joined, cells)
 
 
 def _sparse(cells: I64, values: U32, sure: bool) -> Memory:

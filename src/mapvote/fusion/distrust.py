@@ -122,14 +122,15 @@ def others_say(tally: NDArray[Any], quorum: int) -> U8:
     disagree with the vehicle. None for a vehicle that left the cell undetermined (4) or has no vote there (7).
     """
     said = np.zeros((tally.shape[1], 8), dtype=np.uint8)
+    votes, least = tally[:_UN].astype(np.int32), quorum * VOTE_UNIT
+    total = votes.sum(axis=0) - VOTE_UNIT  # whatever the vehicle's own vote is
+    asked = total >= least
     for own in range(_UN):
-        votes = tally[:_UN].astype(np.int64)
         votes[own] -= VOTE_UNIT
-        total, best = votes.sum(axis=0), votes.max(axis=0)
-        asked = total >= quorum * VOTE_UNIT
-        agreed = asked & (2 * best > total) & (best >= quorum * VOTE_UNIT) & (best > 0)
-        opposed = agreed & (votes.argmax(axis=0) != own)
-        said[:, own] = _ASKED * asked + _AGREED * agreed + _OPPOSED * opposed
+        best = votes.max(axis=0)
+        agreed = asked & (2 * best > total) & (best >= max(least, 1))
+        said[:, own] = asked | agreed << 1 | (agreed & (votes[own] != best)) << 2
+        votes[own] += VOTE_UNIT
     return said
 
 

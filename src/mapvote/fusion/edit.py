@@ -32,7 +32,7 @@ def delete_points(tile: Tile, gone: U64) -> tuple[Tile, int]:
         gone = np.where(gone == 0, gone, EVERY_BIT)
     ground, base = tile.ground_z.reshape(-1), tile.base.reshape(-1)
     flat, dropped = gone.reshape(-1), np.zeros(len(tile.points), dtype=np.bool_)
-    asked = np.flatnonzero(flat[tile.cells])
+    asked = np.flatnonzero((flat != 0)[tile.cells])
     cells = tile.cells[asked]
     bit, obstacle = column_bits(tile.points[asked, 2].astype(np.float64), ground[cells], base[cells])
     dropped[asked] = obstacle & ((flat[cells] >> bit.astype(np.uint64)) & np.uint64(1) != 0)
@@ -182,9 +182,9 @@ def _touched(cells: NDArray[np.intp], stays: U64, base: I32) -> U64:
     """(n,) the voxels of flat ``cells`` that touch one of ``stays``, or the tile's edge."""
     rows, cols = np.divmod(cells, TILE_CELLS)
     edge = (rows == 0) | (cols == 0) | (rows == TILE_CELLS - 1) | (cols == TILE_CELLS - 1)
-    near = np.zeros(len(cells), dtype=np.uint64)
-    for step in (TILE_CELLS * i + j for i in (-1, 0, 1) for j in (-1, 0, 1)):
-        beside = np.clip(cells + step, 0, CELLS - 1)  # beyond the tile only for cells at its edge
-        near |= rebased(stays.reshape(-1)[beside], base.reshape(-1)[beside] - base.reshape(-1)[cells])
+    steps = [[TILE_CELLS * i + j] for i in (-1, 0, 1) for j in (-1, 0, 1)]
+    beside = (cells + steps).clip(0, CELLS - 1)  # beyond the tile only for cells at its edge
+    layers = base.reshape(-1)[beside] - base.reshape(-1)[cells]
+    near = np.bitwise_or.reduce(rebased(stays.reshape(-1)[beside], layers), axis=0)
     one = np.uint64(1)
     return np.where(edge, EVERY_BIT, near | (near << one) | (near >> one))

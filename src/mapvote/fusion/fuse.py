@@ -261,7 +261,9 @@ def _learn_free(tile: Tile, votes: Sequence[TileVote], min_votes: int, points_ad
     reached = nothing_reached(min_votes if len(passed) >= min_votes else 1)
     for vote in passed if len(passed) >= min_votes else []:
         vote.mark_passed(reached)
-    learned = (reached[-1].reshape(free.shape) | free) & ~tile.obstacle_words
+    learned = reached[-1].reshape(free.shape)
+    learned |= free
+    learned &= ~tile.obstacle_words
     return tile.but(free=learned) if tile.free is None or (learned != free).any() else tile
 
 

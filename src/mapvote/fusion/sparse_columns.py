@@ -36,7 +36,7 @@ class Words:
     def of(cls, plane: U64) -> Words:
         """From a (256, 256) plane."""
         flat = plane.reshape(-1)
-        cells = np.flatnonzero(flat)
+        cells = np.flatnonzero(flat != 0)
         return cls(cells, flat[cells])
 
     @classmethod
@@ -78,7 +78,7 @@ def union(marked: Sequence[Words]) -> Words:
     cells = np.concatenate([mine.cells for mine in some])
     order = np.argsort(cells, kind="stable")
     cells, words = cells[order], np.concatenate([mine.words for mine in some])[order]
-    first = np.flatnonzero(np.diff(cells, prepend=-1))
+    first = np.flatnonzero(np.append(True, cells[1:] != cells[:-1]))
     return Words(cells[first], np.bitwise_or.reduceat(words, first))
 
 

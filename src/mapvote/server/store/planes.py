@@ -136,7 +136,8 @@ def _packed(raw: bytes | memoryview) -> tuple[str, dict[str, bytes]]:
 def _raw_memory(memory: Memory) -> bytes:
     """The cells of which anything is remembered, for they are few: the way to each from the one before, two bytes, and
     then their values, plane by plane."""
-    ways = np.diff(memory.cells, prepend=0)
+    ways = memory.cells.copy()
+    ways[1:] -= memory.cells[:-1]
     return ways.astype("<u2").tobytes() + memory.values.astype("<u4", order="C").tobytes()
 
 
