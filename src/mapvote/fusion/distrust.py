@@ -122,14 +122,16 @@ def others_say(tally: NDArray[Any], quorum: int) -> U8:
     disagree with the vehicle. None for a vehicle that left the cell undetermined (4) or has no vote there (7).
     """
     said = np.zeros((tally.shape[1], 8), dtype=np.uint8)
-    votes, least = tally[:_UN].astype(np.int32), quorum * VOTE_UNIT
-    total = votes.sum(axis=0) - VOTE_UNIT  # whatever the vehicle's own vote is
-    asked = total >= least
+    least = quorum * VOTE_UNIT
+    total = tally[:_UN].sum(axis=0, dtype=np.int32) - VOTE_UNIT  # whatever the vehicle's own vote is
+    asked = np.flatnonzero(total >= least)
+    total = total[asked]
+    votes = tally[:_UN].take(asked, axis=1).astype(np.int32)  # class by class in memory, as indexing would not leave it
     for own in range(_UN):
         votes[own] -= VOTE_UNIT
         best = votes.max(axis=0)
-        agreed = asked & (2 * best > total) & (best >= max(least, 1))
-        said[:, own] = asked | agreed << 1 | (agreed & (votes[own] != best)) << 2
+        agreed = (2 * best > total) & (best >= max(least, 1))
+        said[asked, own] = _ASKED | _AGREED * agreed | _OPPOSED * (agreed & (votes[own] != best))
         votes[own] += VOTE_UNIT
     return said
 

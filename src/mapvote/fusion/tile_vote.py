@@ -313,11 +313,10 @@ def _last_words(spoken: Sequence[Bool]) -> list[Bool]:
 
 def _laid_over(planes: Sequence[U8 | None]) -> U8:
     """(256, 256) the last of the ``planes`` that has a vote on a cell."""
-    out = np.full((TILE_CELLS, TILE_CELLS), NO_VOTE, dtype=np.uint8)
-    for plane in planes:
-        if plane is not None:
-            # NO_VOTE has every bit, so this is np.where(plane != NO_VOTE, plane, out), at a tenth of its time.
-            out = plane & (out | -(plane != NO_VOTE).view(np.uint8))
+    out, *later = [plane for plane in planes if plane is not None]
+    for plane in later:
+        # NO_VOTE has every bit, so this is np.where(plane != NO_VOTE, plane, out), at a tenth of its time.
+        out = plane & (out | -(plane != NO_VOTE).view(np.uint8))
     return out
 
 

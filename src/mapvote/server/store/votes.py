@@ -251,7 +251,7 @@ def _cells_lost(before: TileVote, after: TileVote) -> I64:
     """(n,) flat cells of which only the vote ``before`` speaks."""
     if before is after:
         return np.empty(0, dtype=np.int64)
-    return np.flatnonzero(before.spoken() & ~after.spoken())
+    return np.flatnonzero(before.spoken() != after.spoken())
 
 
 def _obedient(vote: TileVote, first_seq: int, bars: Sequence[tuple[int | None, Bool]]) -> TileVote:
