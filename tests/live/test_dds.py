@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import time
 from collections.abc import Callable
 from typing import Any
@@ -90,6 +91,29 @@ def test_a_cloud_goes_over_dds_and_is_the_scan_that_was_sent(monkeypatch: pytest
     (data,) = _until(incoming.take)
     scan = scan_from_point_cloud2(from_cdr(CLOUD, data), SENSORS["hdl32e"])
     assert (scan.stamp_ns, len(scan.points)) == (START, 1000)
+
+
+def received(sent: list[bytes], domain: int) -> list[memoryview]:
+    """What a network that is gone by now received of ``sent``."""
+    sender, listener = Network(domain), Network(domain)
+    incoming, out = listener.subscribe("/points", CLOUD, reliable=True), sender.publish("/points", CLOUD)
+    _until(lambda: out.readers)
+    for one in sent:
+        out.send(one)
+    kept: list[memoryview] = []
+    while len(kept) < len(sent):
+        kept += _until(incoming.take)
+    incoming.close()
+    return kept
+
+
+def test_the_bytes_of_a_message_outlive_its_reader_and_its_network(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("CYCLONEDDS_URI", LOOPBACK)
+    sent = [cloud(n) for n in (1000, 1001)]
+    kept = received(sent, domain_of("outlive"))
+    gc.collect()
+    assert [bytes(data[: len(one)]) for data, one in zip(kept, sent, strict=True)] == sent
+    assert all(data.readonly for data in kept)
 
 
 def test_a_reader_that_comes_late_gets_what_a_durable_writer_sent(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -19,7 +19,7 @@ from mapvote.core.types import F64, MapvoteError, Scan
 from mapvote.live.cdr import blank_message, to_cdr
 from mapvote.live.dds import Network
 from mapvote.live.drive import OneMap
-from mapvote.live.hearing import Cloud, Hearing, Sweeps, choose_topics
+from mapvote.live.hearing import Clocks, Cloud, Hearing, Sweeps, choose_topics
 from mapvote.live.outbox import Outbox
 from mapvote.live.play import POINTS, POSES, cloud_message, odometry_message, transform_message
 from mapvote.live.service import Plan, run
@@ -48,6 +48,33 @@ def test_a_lidar_that_leaves_out_a_revolution_holds_no_other_back_for_longer() -
         [(0, 100)],
         [(0, 200), (1, 202)],
     ]
+
+
+def clocks_of(*came: tuple[str, float, float, float]) -> str:
+    """What is wrong after (pose or cloud, sent, stamp, arrived), each in seconds."""
+    clocks = Clocks()
+    for what, sent_s, stamp_s, now_s in came:
+        (clocks.pose if what == "pose" else clocks.cloud)(int(sent_s * 1e9), int(stamp_s * 1e9), now_s)
+    return clocks.trouble()
+
+
+def test_stamps_that_differ_by_more_than_a_second_are_of_two_clocks() -> None:
+    said = clocks_of(("pose", 100.0, 105.0, 7.0), ("cloud", 100.0, 100.0, 7.0))
+    assert "+5.0 s" in said
+    assert "two clocks" in said
+
+
+def test_what_a_busy_process_reads_late_is_of_one_clock() -> None:
+    late = [("pose", 100.0 + k, 100.0 + k, 30.0) for k in range(9)]
+    assert clocks_of(*late, ("cloud", 102.0, 102.0, 30.0)) == ""
+
+
+def test_stamps_of_one_clock_are_that_though_the_clocks_of_the_senders_differ() -> None:
+    assert clocks_of(("pose", 940.0, 100.0, 7.0), ("cloud", 100.0, 100.0, 7.1)) == ""
+
+
+def test_odometry_that_ended_says_nothing_of_clocks() -> None:
+    assert clocks_of(("pose", 100.0, 100.0, 7.0), ("cloud", 100.0, 100.0, 7.0), ("cloud", 104.0, 104.0, 11.0)) == ""
 
 
 class Sender:

@@ -55,7 +55,7 @@ class RawScan:
     index: int
     stamp_ns: int
     points: F32
-    """(n, 3), metres in the lidar frame."""
+    """(n, 3), metres in the lidar frame; it may be a view of a message."""
     intensity: F32 | None = None
     time_s: F32 | None = None
     """(n,) relative to the stamp."""
@@ -72,8 +72,8 @@ def clean_scan(where: str, raw: RawScan, sensor: Sensor, bad_points: BadPoints) 
     left.
     """
     points, near_m = raw.points, sensor.min_range_m - 5.0 * sensor.range_sigma_m
-    usable = np.empty(len(points), dtype=np.int64)
-    n, measured, bad = _sort_out(np.ascontiguousarray(points), raw.zero_is_no_return, near_m, FAR_M, usable)
+    usable, copied = np.empty(len(points), np.int64), np.empty((len(points), 3), np.float32)
+    n, measured, bad = _sort_out(points, raw.zero_is_no_return, near_m, FAR_M, usable, copied)
     kept = usable[:n]
     if bad > MAX_BAD_SHARE * max(measured, 1):
         raise MapvoteError(
@@ -89,7 +89,7 @@ def clean_scan(where: str, raw: RawScan, sensor: Sensor, bad_points: BadPoints) 
     keep = slice(None) if len(kept) == len(points) else kept
     return Scan(
         stamp_ns=raw.stamp_ns,
-        points=np.ascontiguousarray(points[keep], dtype=np.float32),
+        points=copied[:n],
         time_s=None if raw.time_s is None else np.ascontiguousarray(raw.time_s[keep], dtype=np.float32),
         intensity=None if raw.intensity is None else unit_intensity(raw.intensity[keep]),
         ring=None if raw.ring is None else np.clip(np.nan_to_num(raw.ring[keep]), 0, 65535).astype(np.uint16),
@@ -98,10 +98,10 @@ def clean_scan(where: str, raw: RawScan, sensor: Sensor, bad_points: BadPoints) 
 
 @kernel
 def _sort_out(
-    points: NDArray[np.floating], zero_is_no_return: bool, near_m: float, far_m: float, kept: I64
+    points: NDArray[np.floating], zero_is_no_return: bool, near_m: float, far_m: float, kept: I64, copied: F32
 ) -> tuple[int, int, int]:
-    """(how many of the points (n, 3) are usable, whose indices come into ``kept`` (n,), how many were measured, how
-    many of these are no measurements)."""
+    """(how many of the points (n, 3) are usable, how many were measured, how many of these are no measurements). The
+    indices of the usable ones come into ``kept`` (n,), they themselves into ``copied`` (n, 3)."""
     n, measured, bad = 0, 0, 0
     for i in range(len(points)):
         x, y, z = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
@@ -113,6 +113,7 @@ def _sort_out(
             bad += 1
         elif squared >= near_m * abs(near_m):
             kept[n] = i
+            copied[n, 0], copied[n, 1], copied[n, 2] = x, y, z
             n += 1
     return n, measured, bad
 

@@ -101,7 +101,7 @@ def _blank(field: Field) -> Any:
     return 0 if field.kind in NUMBERS else "" if field.kind == "string" else blank_message(field.kind)
 
 
-def from_cdr(kind: str, data: bytes) -> Any:
+def from_cdr(kind: str, data: bytes | memoryview) -> Any:
     """The message, its members as attributes; numbers of a sequence as an array that is a view of ``data``.
 
     MapvoteError if the bytes end too early or are in an encoding that ROS 2 does not use.
@@ -136,7 +136,7 @@ def header_of(time_ns: int, frame_id: str) -> Any:
 class _Reader:
     """Reads one message from front to back."""
 
-    def __init__(self, data: bytes, order: str, most_aligned: int) -> None:
+    def __init__(self, data: bytes | memoryview, order: str, most_aligned: int) -> None:
         self.data, self.order, self.most_aligned, self.at = data, order, most_aligned, 4
 
     def align(self, size: int) -> None:
@@ -155,7 +155,7 @@ class _Reader:
             raise ValueError(f"a string of {length} bytes")
         text = self.data[self.at : self.at + max(length - 1, 0)]
         self.at += length
-        return text.decode("utf-8", "replace")
+        return str(text, "utf-8", "replace")
 
     def numbers(self, code: str, count: int) -> Any:
         size = struct.calcsize(code)

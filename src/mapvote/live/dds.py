@@ -7,11 +7,14 @@ is ROS_DOMAIN_ID; CYCLONEDDS_URI names interfaces and peers.
 
 from __future__ import annotations
 
+import ctypes
 import os
 from collections import defaultdict
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
+
+import numpy as np
 
 from mapvote.core.types import MapvoteError
 from mapvote.formats.extras import first_line, require
@@ -21,6 +24,8 @@ _DEPTH = 64
 """Messages kept between two looks: six seconds of clouds."""
 _BLOCKING_NS = 10**9
 """How long a reliable writer waits for a slow reader."""
+_TAKEN = 640
+"""Messages that are taken at a time, at most."""
 _ALIVE, _ANY = 16, 0x7F
 """The instance state of a writer that exists; the mask of every sample, view and instance state."""
 
@@ -140,23 +145,58 @@ class Network:
         return types.array[one, field.length] if field.length else types.sequence[one]
 
 
+class _Span(ctypes.Structure):
+    """A piece of memory: POSIX's iovec."""
+
+    _fields_ = (("start", ctypes.c_void_p), ("length", ctypes.c_size_t))
+
+
+class _Sample:
+    """One message in the memory of Cyclone DDS. It stays there as long as this object, or an array of its bytes."""
+
+    def __init__(self, library: Any, handle: Any) -> None:
+        """``handle``: an owned reference to a ``ddsi_serdata``; it is consumed."""
+        self._span, self._handle = _Span(), ctypes.c_void_p(handle)
+        self._at, self._give_back = ctypes.byref(self._span), library.ddsi_serdata_to_ser_unref
+        size = ctypes.c_size_t(library.ddsi_serdata_size(self._handle))
+        library.ddsi_serdata_to_ser_ref(self._handle, ctypes.c_size_t(0), size, self._at)
+        library.ddsi_serdata_unref(self._handle)  # the call before took a reference of its own
+
+    @property
+    def __array_interface__(self) -> dict[str, Any]:
+        """Numpy's protocol. True: read only."""
+        return {"version": 3, "typestr": "|u1", "shape": (self._span.length,), "data": (self._span.start, True)}
+
+    def __del__(self) -> None:
+        self._give_back(self._handle, self._at)
+
+
 class Subscription:
-    """Messages of one topic, as they came."""
+    """Messages of one topic, as they came.
+
+    The Python package of Cyclone DDS copies a message twice, which costs 0.6 ms for a cloud of 70,000 points. Here its
+    C library gives the memory where the message is.
+    """
 
     def __init__(self, topic: str, kind: str, reader: Any, reliable: bool, detach: Callable[[], object]) -> None:
         self.topic, self.kind, self.reliable, self._reader, self._detach = topic, kind, reliable, reader, detach
-        self._take = require("cyclonedds._clayer", "ros2", "DDS").ddspy_take
+        internal = require("cyclonedds.internal", "ros2", "DDS")
+        self._library = internal.DDS._dll_handle
+        self._handles = (ctypes.c_void_p * _TAKEN)()
+        self._infos = (internal.dds_c_t.sample_info * _TAKEN)()
 
-    def take(self) -> list[bytes]:
+    def take(self) -> list[memoryview]:
         """The bytes of every message that came since the last call; the oldest are gone if there were too many."""
         return [data for _, data in self.take_sent()]
 
-    def take_sent(self) -> list[tuple[int, bytes]]:
+    def take_sent(self) -> list[tuple[int, memoryview]]:
         """The same, each with the time at which its writer sent it, nanoseconds since 1970 by the writer's clock."""
-        taken = self._take(self._reader._ref, _ANY, 10 * _DEPTH)
-        if isinstance(taken, int):
-            raise MapvoteError(f"{self.topic}: DDS cannot read it (error {taken})")
-        return [(info.source_timestamp, data) for data, info in taken if info.valid_data]
+        count: int = self._library.dds_takecdr(self._reader._ref, self._handles, _TAKEN, self._infos, _ANY)
+        if count < 0:
+            raise MapvoteError(f"{self.topic}: DDS cannot read it (error {count})")
+        taken = zip(self._infos[:count], self._handles[:count], strict=True)
+        samples = [(info, _Sample(self._library, handle)) for info, handle in taken]
+        return [(info.source_timestamp, np.asarray(sample).data) for info, sample in samples if info.valid_data]
 
     @property
     def writers(self) -> int:

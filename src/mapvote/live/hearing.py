@@ -37,6 +37,8 @@ _POSES = 400
 """Poses whose times of sending are kept: four seconds at 100 Hz."""
 _OTHER_CLOCK_NS = 10**9
 """Stamps of clouds and poses that come together and differ by more are of two clocks."""
+_TOGETHER_NS = 500_000_000
+"""Clouds and poses that are sent, or that arrive, within so long come together."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,7 +97,7 @@ class Cloud:
     lidar: int
     stamp_ns: int
     sent_ns: int
-    data: bytes
+    data: bytes | memoryview
 
 
 class Sweeps:
@@ -130,6 +132,47 @@ class Sweeps:
         return closed
 
 
+class Clocks:
+    """Whether odometry and LiDAR share a clock: by the stamps of what they send, or of what arrives, at one time.
+
+    The smaller difference counts. What arrives together was not sent together if the process was busy. What was sent
+    at one time by two computers whose own clocks differ was not sent together either.
+    """
+
+    def __init__(self) -> None:
+        self._poses: deque[tuple[int, int]] = deque(maxlen=_POSES)
+        """(time of sending, stamp) of the last poses, nanoseconds."""
+        self._arrived_s = -np.inf
+        self.apart_ns = 0
+        """Stamp of a pose less that of the last cloud with which it came."""
+
+    def pose(self, sent_ns: int, stamp_ns: int, now_s: float) -> None:
+        """A pose arrived at ``now_s`` of any steady clock."""
+        self._poses.append((sent_ns, stamp_ns))
+        self._arrived_s = now_s
+
+    def cloud(self, sent_ns: int, stamp_ns: int, now_s: float) -> None:
+        """A cloud arrived. Where no pose comes with it, as when odometry has ended, nothing is learnt."""
+        if not self._poses:
+            return
+        near = min(bisect_left(self._poses, (sent_ns, 0)), len(self._poses) - 1)
+        together = []
+        if abs(self._poses[near][0] - sent_ns) <= _TOGETHER_NS:
+            together.append(self._poses[near][1] - stamp_ns)
+        if now_s - self._arrived_s <= 1e-9 * _TOGETHER_NS:
+            together.append(self._poses[-1][1] - stamp_ns)
+        self.apart_ns = min(together, key=abs, default=self.apart_ns)
+
+    def trouble(self) -> str:
+        """What is wrong if they are two clocks, else ""."""
+        if abs(self.apart_ns) <= _OTHER_CLOCK_NS:
+            return ""
+        return (
+            f"odometry's stamps are {1e-9 * self.apart_ns:+.1f} s off those of the clouds that come with them: two "
+            "clocks. Synchronise them (PTP, or the driver's own time), or choose another --odometry"
+        )
+
+
 class Hearing:
     """The topics of one vehicle, read as they come. Writers may come, go and change what they offer."""
 
@@ -141,9 +184,7 @@ class Hearing:
         """Of each LiDAR, as its clouds say."""
         self.base_frame, self.map_frame = "", ""
         """What odometry tracks, and in which frame."""
-        self.clock_difference_ns = 0
-        """Stamp of a pose less that of a cloud which came, or was sent, at the same time: the smaller of the two. What
-        comes is late where the process is busy, and where senders' clocks differ what is sent tells nothing."""
+        self.clocks = Clocks()
         self.clouds = 0
         self._edges: Edges = {}
         self._sweeps = Sweeps(len(chosen.points))
@@ -152,8 +193,6 @@ class Hearing:
         self._tf = network.subscribe("/tf_static", TF, reliable=True, transient_local=True)
         self._lost = 0
         self._mounts: list[F64] | None = None
-        self._sent_poses: deque[tuple[int, int]] = deque(maxlen=_POSES)
-        """When each of the last poses was sent, and its stamp."""
         self._looked_s = time.monotonic()
 
     def _subscribed(self, topic: SentTopic) -> Subscription:
@@ -174,7 +213,7 @@ class Hearing:
                 name.strip("/") for name in (message.child_frame_id, message.header.frame_id)
             )
             out.append((stamp_ns(message), matrix_of(pose.position, pose.orientation)))
-            self._sent_poses.append((sent_ns, out[-1][0]))
+            self.clocks.pose(sent_ns, out[-1][0], time.monotonic())
         return out
 
     def scans(self) -> list[list[Cloud]]:
@@ -187,10 +226,7 @@ class Hearing:
                 self.frames[lidar] = header.frame_id.strip("/")
                 time_ns = int(header.stamp.sec) * 10**9 + int(header.stamp.nanosec)
                 self.clouds += 1
-                if self._sent_poses:
-                    at = min(bisect_left(self._sent_poses, (sent_ns, 0)), len(self._sent_poses) - 1)
-                    together = self._sent_poses[at][1], self._sent_poses[-1][1]
-                    self.clock_difference_ns = min((pose_ns - time_ns for pose_ns in together), key=abs)
+                self.clocks.cloud(sent_ns, time_ns, time.monotonic())
                 out += self._sweeps.add(Cloud(lidar, time_ns, sent_ns, data))
         if time.monotonic() > self._looked_s + _REVISIT_S:
             self._revisit()
@@ -260,13 +296,3 @@ class Hearing:
                 scan = scan.seen_from(mounts[cloud.lidar])
             scans.append(scan)
         return scans[0] if len(clouds) == 1 else Scan.sweep(min(c.stamp_ns for c in clouds), scans)
-
-    def different_clocks(self) -> str:
-        """What is wrong if odometry and LiDAR do not share a clock; "" if they do."""
-        apart_ns = self.clock_difference_ns
-        if abs(apart_ns) <= _OTHER_CLOCK_NS:
-            return ""
-        return (
-            f"odometry's stamps are {1e-9 * apart_ns:+.1f} s off those of the clouds that come with them: two clocks. "
-            "Synchronise them (PTP, or the driver's own time), or choose another --odometry"
-        )

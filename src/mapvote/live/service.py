@@ -132,7 +132,7 @@ def run(
 
 def _check(live: LiveDrive, hearing: Hearing) -> None:
     """Say what the first seconds show. MapvoteError if it is an error: the drive is useless, and leaves nothing."""
-    clocks = hearing.different_clocks() if live.unchecked else ""
+    clocks = hearing.clocks.trouble() if live.unchecked else ""
     for finding in live.first_findings():
         if finding.severity == "error":
             live.discard()

@@ -50,7 +50,7 @@ def listen(network: Network, seconds: float) -> list[Listened]:
     return out
 
 
-def _frame(kind: str, data: bytes) -> str:
+def _frame(kind: str, data: memoryview) -> str:
     try:
         return str(getattr(getattr(from_cdr(kind, data), "header", None), "frame_id", ""))
     except MapvoteError as error:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from mapvote.core.sensors import Sensor
 from mapvote.core.types import F32, F64, MapvoteError, Scan
 from mapvote.formats.clean import BadPoints, RawScan, clean_scan, spinning_time_s
-from mapvote.formats.maps.cloud import xyz
+from mapvote.formats.maps.cloud import xyz_view
 
 TIME_FIELDS = ("t", "time", "timestamp", "time_stamp", "stamp", "offset_time", "point_time_offset")
 """Ouster, Velodyne, Hesai and Livox, Autoware, Livox: what drivers call the time of a point."""
@@ -37,7 +37,7 @@ def scan_from_fields(
 
     ``zero_is_no_return`` False: they are defects. ``spinning``: points without times get them from their azimuth.
     """
-    points = xyz(where, table)
+    points = xyz_view(where, table)
     names = table.dtype.names or ()
     intensity, ring, time = (
         next((name for name in known if name in names), None) for known in (INTENSITY_FIELDS, RING_FIELDS, TIME_FIELDS)

@@ -154,15 +154,19 @@ def table_of(cloud: Cloud, kinds: Sequence[tuple[str, np.dtype[Any]]]) -> NDArra
 
 def xyz(where: str, table: NDArray[np.void]) -> NDArray[np.floating]:
     """(n, 3) of a structured array's x, y, z in their own precision; MapvoteError if one is missing."""
+    return np.ascontiguousarray(xyz_view(where, table))
+
+
+def xyz_view(where: str, table: NDArray[np.void]) -> NDArray[np.floating]:
+    """As :func:`xyz`, but a view of ``table`` where they are float32 side by side, as nearly every LiDAR has them."""
     names = table.dtype.names or ()
     missing = [axis for axis in "xyz" if axis not in names]
     if missing:
         raise MapvoteError(f"{where}: no field {', '.join(missing)} among {', '.join(names)}; points need x, y and z")
     x, y, z = (table.dtype.fields[axis] for axis in "xyz")  # type: ignore[index]
     single = x[0] == y[0] == z[0] == np.dtype("<f4") and (y[1], z[1]) == (x[1] + 4, x[1] + 8)
-    if single and table.flags.c_contiguous and len(table):  # as nearly every driver has them: one copy, not three
-        beside = np.ndarray((len(table), 3), "<f4", table.data, x[1], (table.dtype.itemsize, 4))
-        return np.ascontiguousarray(beside, np.float32)
+    if single and table.flags.c_contiguous and len(table):
+        return np.ndarray((len(table), 3), "<f4", table.data, x[1], (table.dtype.itemsize, 4))
     exact = any(table.dtype[axis] not in (np.float32, np.float16, np.int16, np.uint16) for axis in "xyz")
     out: NDArray[Any] = np.empty((len(table), 3), dtype=np.float64 if exact else np.float32)
     for column, axis in enumerate("xyz"):
