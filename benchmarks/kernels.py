@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 
 SRC = Path(__file__).parents[1] / "src"
-KINDS = {"kernel", "allocating", "inlined"}
+KINDS = {"kernel", "fast_math", "allocating", "inlined"}
 MOST_S = 20
 MOST_BYTES = 64 << 20
 CELL = 0.3

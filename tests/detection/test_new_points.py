@@ -92,7 +92,8 @@ def test_what_lies_beyond_the_local_grid_is_new_where_it_stands_near_and_unmappe
     base = np.floor(np.nan_to_num(ground_z) / CELL_SIZE).astype(np.int32)
     occupied = rng.integers(0, 2**63, (300, 300), dtype=np.uint64)
     origin = np.array([20.0, 30.0, 1.8])
-    found = _beyond(points, cell, origin, ground_z, base, occupied, (0.0, 0.0), (0, 0))
+    found = np.empty(len(points), np.int64)
+    found = found[: _beyond(points, cell, origin, ground_z, base, occupied, (0.0, 0.0), (0, 0), found)]
     cols, rows = np.floor(points[:, :2] / CELL_SIZE).astype(int).T
     inside = (rows >= 0) & (rows < 300) & (cols >= 0) & (cols < 300)
     rows, cols, z = np.clip(rows, 0, 299), np.clip(cols, 0, 299), points[:, 2]

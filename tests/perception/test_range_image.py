@@ -7,7 +7,7 @@ import pytest
 
 from mapvote.core.azimuth import turn
 from mapvote.core.types import F32, F64
-from mapvote.perception.range_image import NOTHING, U16, LookCounts, Pixels, Samples, look, range_image
+from mapvote.perception.range_image import NOTHING, U16, LookCounts, Pixels, Samples, look, range_image, room_to_look
 
 PIXELS = Pixels(90, 60, np.float32(-0.6), np.float32(50.0))
 MARGIN_M, HEIGHT_M, ENOUGH = 0.5, 0.12, 2
@@ -77,7 +77,7 @@ def test_looks_count_and_settle_as_the_rule_says(seed: int) -> None:
         seen = sensor + rng.normal(0.0, 1.0, (4000, 3)) * [15.0, 15.0, 2.0]
         image = range_image(seen, sensor, PIXELS)
         rule = MARGIN_M, HEIGHT_M, ENOUGH
-        n = look(samples, n, image.reshape(-1), sensor.astype(np.float32), PIXELS, rule, counts)
+        n = look(samples, n, image.reshape(-1), sensor.astype(np.float32), PIXELS, rule, counts, room_to_look(400))
         some = LookCounts(expected.free[wait], expected.hit[wait], expected.sides[wait])
         left = plain_look(places[wait] - sensor.astype(np.float32), image, some)
         expected.free[wait], expected.hit[wait], expected.sides[wait] = some

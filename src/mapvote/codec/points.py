@@ -12,8 +12,8 @@ import numpy as np
 
 from mapvote.codec.arrays import compress, unpack_bytes
 from mapvote.core.grid import CELL_SIZE, CELLS, TILE_CELLS
-from mapvote.core.kernel import allocating
-from mapvote.core.types import F32, U8, MapvoteError
+from mapvote.core.kernel import kernel
+from mapvote.core.types import F32, I64, U8, MapvoteError
 
 MAX_POINTS_PER_CELL = 64
 """One new point per voxel of a column: no honest ballot has more."""
@@ -28,7 +28,9 @@ _TOP_M = 1e5
 
 def pack_points(points: F32) -> bytes:
     """(m, 3) from the tile's corner, inside it, in any order."""
-    return compress(_planes(points).tobytes())
+    planes = np.empty((_BYTES, len(points)), dtype=np.uint8)
+    _enter_planes(points, np.empty(3, dtype=np.int64), planes)
+    return compress(planes.tobytes())
 
 
 def unpack_points(data: bytes) -> F32:
@@ -53,12 +55,11 @@ def unpack_sound_points(data: bytes) -> F32:
     return points
 
 
-@allocating
-def _planes(points: F32) -> U8:
-    """(9, m) of points (m, 3): differences modulo 2 ** 16 and 2 ** 32, lowest byte first, and steps in a voxel."""
-    planes = np.empty((_BYTES, len(points)), dtype=np.uint8)
+@kernel
+def _enter_planes(points: F32, voxel: I64, planes: U8) -> None:
+    """Fill ``planes`` (9, m) from points (m, 3): differences modulo 2 ** 16 and 2 ** 32, lowest byte first, and steps
+    in a voxel. ``voxel`` (3,): scratch."""
     last_cell, last_layer = np.int64(0), np.int64(0)
-    voxel = np.empty(3, dtype=np.int64)
     for i in range(len(points)):
         for axis in range(3):
             place = np.float64(points[i, axis]) / CELL_SIZE
@@ -72,10 +73,9 @@ def _planes(points: F32) -> U8:
         for k in range(4):
             planes[2 + k, i] = ((voxel[2] - last_layer) >> (8 * k)) & 0xFF
         last_cell, last_layer = cell, voxel[2]
-    return planes
 
 
-@allocating
+@kernel
 def _placed(planes: U8, points: F32) -> bool:
     """Fill ``points`` (m, 3) from (9, m); whether each lies in its voxel."""
     cell, layer, sound = np.int64(0), np.int64(0), True
@@ -91,22 +91,28 @@ def _placed(planes: U8, points: F32) -> bool:
     return sound
 
 
-@allocating
+@kernel
 def _all_inside(points: F32, side: np.float32) -> bool:
     """Whether all points (m, 3) are finite and within a tile; NaN fails every comparison."""
     sound = True
-    for x, y, z in points:
+    for i in range(len(points)):
+        x, y, z = points[i, 0], points[i, 1], points[i, 2]
         sound &= 0 <= x < side and 0 <= y < side and abs(z) <= _TOP_M
     return sound
 
 
-@allocating
 def most_in_a_cell(points: F32) -> int:
     """The most of these points (m, 3), from the tile's corner and inside it, that lie in one cell."""
-    counts = np.zeros(TILE_CELLS * TILE_CELLS, dtype=np.uint16)  # one that runs over has been counted as the most
+    return int(_most_in_a_cell(points, np.zeros(CELLS, dtype=np.int64)))
+
+
+@kernel
+def _most_in_a_cell(points: F32, counts: I64) -> int:
+    """:func:`most_in_a_cell`; ``counts`` (cells,): scratch, zeros."""
     most = 0
-    for x, y, _ in points:
-        cell = min(int(y / CELL_SIZE), TILE_CELLS - 1) * TILE_CELLS + min(int(x / CELL_SIZE), TILE_CELLS - 1)
+    for i in range(len(points)):
+        row, col = int(points[i, 1] / CELL_SIZE), int(points[i, 0] / CELL_SIZE)
+        cell = min(row, TILE_CELLS - 1) * TILE_CELLS + min(col, TILE_CELLS - 1)
         counts[cell] += 1
         most = max(most, counts[cell])
     return most

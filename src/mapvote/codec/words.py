@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from mapvote.codec.arrays import compress, unpack_bytes
 from mapvote.core.grid import CELLS, TILE_CELLS
-from mapvote.core.kernel import allocating
+from mapvote.core.kernel import kernel
 from mapvote.core.types import U8, U64, MapvoteError
 
 _WAY, _WORD = 2, 8
@@ -38,7 +38,7 @@ def unpack_sparse(data: bytes, what: str) -> tuple[NDArray[np.intp], U64]:
     return cells, words
 
 
-@allocating
+@kernel
 def _ascending(raw: U8, cells: NDArray[np.intp], words: U64) -> bool:
     """Fill ``cells`` and ``words`` (n,); whether cells ascend within the tile, and none is without a word."""
     n, cell, sound = len(cells), np.int64(0), True

@@ -232,7 +232,7 @@ def _grow(
             if gap[cell] <= width:
                 continue
             _enter(cell, expected[entry], width, start, heights, neighbours, ground, gap)
-        here = int(gap[cell])
+        here = np.int64(gap[cell])
         tile, row, col = _placed(cell)
         within = _is_within(row, col, 1)
         for i in range(-1, 2):

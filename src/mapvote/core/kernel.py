@@ -14,6 +14,8 @@ _OPTIONS = {"cache": True, "nogil": True, "error_model": "numpy", "no_cfunc_wrap
 
 kernel = numba.njit(**_OPTIONS, _nrt=False)
 """A loop that Python calls, and that allocates nothing. Its compiled form is kept on disk."""
+fast_math = numba.njit(**_OPTIONS, _nrt=False, fastmath=True)
+"""A kernel in which sums may be taken in any order, so that they vectorise."""
 allocating = numba.njit(**_OPTIONS)
 """A kernel that allocates arrays."""
 inlined = numba.njit(inline="always", error_model="numpy")

@@ -66,7 +66,7 @@ def verdict(uo: int, ue: int, co: int, ce: int, un: int, abstain: bool) -> int:
         best = max(best, un)
     if best <= 0:
         return _UN if un > 0 else NO_VOTE
-    ties = int(uo == best) + int(ue == best) + int(co == best) + int(ce == best) + int(un == best and not abstain)
+    ties = (uo == best) + (ue == best) + (co == best) + (ce == best) + (un == best and not abstain)
     if ties > 1:
         return _UN
     short = abstain and 2 * best <= uo + ue + co + ce
@@ -78,10 +78,10 @@ def verdict(uo: int, ue: int, co: int, ce: int, un: int, abstain: bool) -> int:
 
 
 @kernel
-def _decide_cells(tally: NDArray[Any], backers: NDArray[Any], abstain: bool, min_votes: int, states: U8) -> None:
+def _decide_cells(tally: I32, backers: I32, abstain: bool, min_votes: int, states: U8) -> None:
     uos, ues, cos, ces, uns = tally[0], tally[1], tally[2], tally[3], tally[4]
     for c in range(len(states)):  # most cells have no vote, or only votes for empty: tested in vectors
-        empty, more = np.int64(ues[c]), np.int64(uos[c] | cos[c] | ces[c] | uns[c])
+        empty, more = ues[c], uos[c] | cos[c] | ces[c] | uns[c]
         s = _UE if empty != 0 else NO_VOTE
         states[c] = _OPEN if more != 0 else s
     for c in range(len(states)):
@@ -98,7 +98,9 @@ def decide_cells(tally: NDArray[Any], backers: NDArray[Any], abstain: bool, min_
     uint8.
     """
     states = np.empty(tally.shape[1], dtype=np.uint8)
-    _decide_cells(tally, backers, abstain, min_votes, states)
+    planes = np.ascontiguousarray(tally, dtype=np.int32)  # one type: each other would be compiled for itself
+    own = planes if backers is tally else np.ascontiguousarray(backers, dtype=np.int32)
+    _decide_cells(planes, own, abstain, min_votes, states)
     return states
 
 

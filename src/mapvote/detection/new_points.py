@@ -9,7 +9,7 @@ import numpy as np
 
 from mapvote.core.columns import GROUND_MARGIN_M, column_bit, height_above
 from mapvote.core.grid import CELL_SIZE, Grid, Lattice, TileIndex, tile_of_cells
-from mapvote.core.kernel import allocating
+from mapvote.core.kernel import kernel
 from mapvote.core.types import F32, F64, I32, I64, U8, U64, Bool, Reference
 from mapvote.core.voxels import first_of_each, voxel_keys
 from mapvote.detection.shelf import Shelf, Slot
@@ -21,13 +21,20 @@ REACH_M = 70.0
 """New points are taken up to here, farther than votes are cast: a tile's width around the vehicle is laid out."""
 
 
-@allocating
 def select(points: F64, cell: I32, wanted: Bool, unwanted: Bool, words: U64, base: I32) -> I64:
     """Indices of the points (n, 3), ``wanted`` and not ``unwanted``, that lie in a voxel of ``words`` (cells,).
 
-    ``cell`` (n,) -1 outside. All is entered and some of it written over: nobody can guess which point is chosen.
+    ``cell`` (n,) the flat cell of each point, -1 outside; ``base`` (cells,) the lowest layer of each column.
     """
-    chosen, near = np.empty(len(points) + 1, np.int64), np.uint64(0)
+    chosen = np.empty(len(points) + 1, np.int64)
+    return chosen[: _select(points, cell, wanted, unwanted, words, base, chosen)].copy()
+
+
+@kernel
+def _select(points: F64, cell: I32, wanted: Bool, unwanted: Bool, words: U64, base: I32, chosen: I64) -> int:
+    """:func:`select` into the first of ``chosen`` (n + 1,); returns how many. Each index is written, and written over
+    if its point is not chosen: a branch could not be predicted."""
+    near = np.uint64(0)
     for i in range(np.uint64(0), np.uint64(len(points))):
         k = np.uint64(max(cell[i], np.int32(0)))
         here = wanted[i] & (not unwanted[i]) & (cell[i] >= 0)
@@ -39,23 +46,24 @@ def select(points: F64, cell: I32, wanted: Bool, unwanted: Bool, words: U64, bas
         k = np.uint64(cell[point])
         chosen[found] = point
         found += words[k] >> np.uint64(column_bit(points[point, 2], base[k])) & np.uint64(1)
-    return chosen[:found].copy()
+    return np.int64(found)
 
 
-@allocating
+@kernel
 def _beyond(
     points: F64, cell: I32, origin: F64, ground_z: F32, base: I32, occupied: U64, lattice: tuple[float, float],
-    corner: tuple[int, int],
-) -> I64:  # fmt: skip
-    """Which of the points (n, 3) outside the local grid (``cell`` -1) are obstacles, within reach, and in voxels that
-    the map does not hold; the planes (rows, cols) from ``corner`` on ``lattice`` say so."""
+    corner: tuple[int, int], found: I64,
+) -> int:  # fmt: skip
+    """Into the first of ``found`` (n,) which of the points (n, 3) outside the local grid (``cell`` -1) are obstacles,
+    within reach, and in voxels that the map does not hold; returns how many. The map is the planes (rows, cols) whose
+    first cell is ``corner`` (row, col) of the ``lattice`` with that origin (x, y)."""
     rows, cols = occupied.shape
-    found, n = np.empty(len(points), np.int64), 0
+    n, (x0, y0), (row0, col0) = 0, lattice, corner
     for i in range(len(points)):
         if cell[i] >= 0 or (points[i, 0] - origin[0]) ** 2 + (points[i, 1] - origin[1]) ** 2 >= REACH_M**2:
             continue
-        c = int(np.floor((points[i, 0] - lattice[0]) / CELL_SIZE)) - corner[1]
-        r = int(np.floor((points[i, 1] - lattice[1]) / CELL_SIZE)) - corner[0]
+        c = int(np.floor((points[i, 0] - x0) / CELL_SIZE)) - col0
+        r = int(np.floor((points[i, 1] - y0) / CELL_SIZE)) - row0
         if not (0 <= r < rows and 0 <= c < cols):
             continue
         z = points[i, 2]
@@ -64,7 +72,7 @@ def _beyond(
         if not (occupied[r, c] >> np.uint64(column_bit(z, base[r, c]))) & np.uint64(1):
             found[n] = i
             n += 1
-    return found[:n].copy()
+    return n
 
 
 class NewPoints:
@@ -101,9 +109,12 @@ class NewPoints:
         """
         grid, outer = scan.outer.grid, scan.outer
         lattice, corner = (grid.lattice.x0, grid.lattice.y0), (grid.row0, grid.col0)
-        return _beyond(
-            scan.points_map, scan.cell, scan.origin_map, outer.ground_z, outer.base, outer.occupied, lattice, corner
-        )
+        found = np.empty(len(scan.points_map), np.int64)
+        n = _beyond(
+            scan.points_map, scan.cell, scan.origin_map, outer.ground_z, outer.base, outer.occupied, lattice, corner,
+            found,
+        )  # fmt: skip
+        return found[:n].copy()
 
     def offer(self, points_map: F64, intensity: F32 | None = None) -> None:
         """Points (n, 3), map metres, and their intensity (n,); 0 where None."""

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapvote.core.grid import TileIndex
-from mapvote.core.kernel import allocating
+from mapvote.core.kernel import kernel
 from mapvote.core.lazy_tiles import LazyTiles
 from mapvote.core.point_map import PointMap, all_points
 from mapvote.core.sensor_height import check_heights
@@ -120,14 +120,16 @@ def spacing(pieces: Pieces, some: F64) -> F64:
     order = np.argsort(near[:, axis])
     place = np.empty(len(order), np.int64)
     place[order] = np.arange(len(order))
-    return _to_nearest(near[order], axis, place[:: max(1, len(near) // 2000)])
+    which = place[:: max(1, len(near) // 2000)]
+    apart = np.empty(len(which))
+    _to_nearest(near[order], axis, which, apart)
+    return apart
 
 
-@allocating
-def _to_nearest(points: F64, axis: int, which: I64) -> F64:
-    """(m,) from those of the points (n, 3), which ascend along ``axis``, to the nearest other one: a tree would ask for
-    half of scipy, whose import takes longer than all of the look."""
-    out = np.full(len(which), np.inf)
+@kernel
+def _to_nearest(points: F64, axis: int, which: I64, out: F64) -> None:
+    """Into ``out`` (m,) the distance from the points ``which`` (m,) to the nearest other one of the points (n, 3),
+    which ascend along ``axis``. A tree would import half of scipy, which takes longer than all of this check."""
     for w in range(len(which)):
         i, best = which[w], np.inf
         for way in (-1, 1):
@@ -137,7 +139,6 @@ def _to_nearest(points: F64, axis: int, which: I64) -> F64:
                 best = min(best, x * x + y * y + z * z)
                 j += way
         out[w] = np.sqrt(best)
-    return out
 
 
 def _units(wide: F64, apart: F64) -> list[Finding]:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapvote.core.azimuth import azimuth_32
-from mapvote.core.kernel import allocating, kernel
+from mapvote.core.kernel import kernel
 from mapvote.core.sensors import Sensor
 from mapvote.core.types import F32, I64, MapvoteError, Scan
 
@@ -142,20 +142,21 @@ def spinning_time_s(points: F32, rate_hz: float, *, clockwise: bool = True) -> F
 
     The sensor faces forward at the stamp: -azimuth / (2 pi rate) if it turns clockwise seen from above.
     """
-    return _spinning_time_s(points, np.float32((-2.0 if clockwise else 2.0) * np.pi * rate_hz))
+    out, (x, y) = np.empty(len(points), np.float32), np.empty((2, _BLOCK), np.float32)
+    _spinning_time_s(points, np.float32((-2.0 if clockwise else 2.0) * np.pi * rate_hz), x, y, out)
+    return out
 
 
-@allocating
-def _spinning_time_s(points: F32, turn_per_s: np.float32) -> F32:
-    """(n,) block by block: x and y, which lie three numbers apart, are copied side by side first, for vectors."""
-    out, x, y = np.empty(len(points), np.float32), np.empty(_BLOCK, np.float32), np.empty(_BLOCK, np.float32)
+@kernel
+def _spinning_time_s(points: F32, turn_per_s: np.float32, x: F32, y: F32, out: F32) -> None:
+    """:func:`spinning_time_s` into ``out`` (n,), block by block: x and y, which lie three numbers apart in ``points``,
+    are copied into ``x`` and ``y`` (_BLOCK,) first, so that the loop vectorises."""
     for start in range(0, len(points), _BLOCK):
         n = min(_BLOCK, len(points) - start)
         for i in range(n):
             x[i], y[i] = points[start + i, 0], points[start + i, 1]
         for i in range(n):
             out[start + i] = azimuth_32(y[i], x[i]) / turn_per_s
-    return out
 
 
 def stamps_from_rate(n: int, rate_hz: float, start_ns: int) -> I64:

@@ -240,7 +240,7 @@ def find_alike(moved: I64, looked: U64, whose: I64, least: float, group: I64) ->
             if whose[i] == whose[k] or group[i] == group[k] or whole < LEAST_MOVED:
                 continue
             most = int(np.ceil(least * whole)) - 1
-            if _differing(looked[i], looked[k], _RIM, most) <= most:
+            if _differing(looked[i], looked[k], np.int64(_RIM), most) <= most:
                 older, newer = min(group[i], group[k]), max(group[i], group[k])
                 for other in range(i + 1):
                     if group[other] == newer:
@@ -273,7 +273,7 @@ def _look_at(masks: U64, looked: U64, moved: I64, east: U64) -> None:
             for plane in range(3):
                 for w in range(4):
                     east[n, plane, w] = _moved_east(looked[i, n, plane], w, _APART)
-        north = _differing(looked[i, 1:], looked[i, :-1], _RIM, TILE_CELLS**2)
+        north = _differing(looked[i, 1:], looked[i, :-1], np.int64(_RIM), TILE_CELLS**2)
         moved[i] = (north + _differing(looked[i], east, _RIM + _APART, TILE_CELLS**2)) // 2
 
 
@@ -305,4 +305,4 @@ def _differing(a: U64, b: U64, rim: int, most: int) -> int:
             count += np.int64((word * np.uint64(0x0101010101010101)) >> np.uint64(56))
         if count > most:
             break
-    return int(count)
+    return count

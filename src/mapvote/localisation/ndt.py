@@ -85,6 +85,7 @@ class NdtGrid:
     def recentre(self, centre: F64) -> None:
         """Move the window; what was entered before and lies inside is found again."""
         self.window.lowest[:] = np.round((centre - self.reach) / self.level.voxel_m).astype(np.int64)
+        self.window.rows.fill(-1)
         reindex(self.window, self._voxels.place, self.n)
 
     def enter(self, points_map: F64) -> None:

@@ -11,10 +11,9 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numba
 import numpy as np
 
-from mapvote.core.kernel import inlined, kernel
+from mapvote.core.kernel import fast_math, inlined, kernel
 from mapvote.core.types import F32, F64, I32, I64
 from mapvote.localisation.ndt_voxels import Vector, Window, holds, voxel_of
 
@@ -131,7 +130,7 @@ def _likelihood(e: np.float32) -> np.float32:
     return s if e <= np.float32(CUTOFF_E) else np.float32(0.0)
 
 
-@numba.njit(error_model="numpy", fastmath=True)
+@fast_math
 def _pull(of: F32, j: int, i: int, x: np.float32, y: np.float32, z: np.float32) -> tuple[np.float32, ...]:
     """Of the j-th partner of point i, which lies at (x, y, z) from the origin: (e, w C, w C u) with u the point from
     the voxel's mean, C its precision, e = u C u and w = exp(-e / 2), the weight of Eq. (6.9) with d1 = d2 = 1."""
@@ -144,16 +143,15 @@ def _pull(of: F32, j: int, i: int, x: np.float32, y: np.float32, z: np.float32) 
     return e, w * c00, w * c01, w * c02, w * c11, w * c12, w * c22, w * b0, w * b1, w * b2
 
 
-@numba.njit(error_model="numpy", fastmath=True)
+@fast_math
 def _both(p: tuple[np.float32, ...], q: tuple[np.float32, ...]) -> tuple[np.float32, ...]:
     """The smaller e, and the sums of the rest."""
-    return (
-        min(p[0], q[0]), p[1] + q[1], p[2] + q[2], p[3] + q[3], p[4] + q[4], p[5] + q[5], p[6] + q[6], p[7] + q[7],
-        p[8] + q[8], p[9] + q[9],
-    )  # fmt: skip
+    p0, p1, p2, p3, p4, p5, p6, p7, p8, p9 = p
+    q0, q1, q2, q3, q4, q5, q6, q7, q8, q9 = q
+    return min(p0, q0), p1 + q1, p2 + q2, p3 + q3, p4 + q4, p5 + q5, p6 + q6, p7 + q7, p8 + q8, p9 + q9
 
 
-@numba.njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+@fast_math
 def _sum_block(points: F32, of: F32, first: int, last: int, R: F32, d: F32, sums: F64) -> None:
     """Add up points from ``first`` to ``last`` at rotation R (3, 3), the sensor at ``d`` (3,) metres from the origin.
 

@@ -253,9 +253,8 @@ def join_voxels(others: Voxels, window: Window, voxels: Voxels, n: int, shared: 
 
 @kernel
 def reindex(window: Window, place: I64, n: int) -> None:
-    """Find the first ``n`` voxels, whose world voxels are ``place`` (m, 3), in a window that has moved."""
+    """Enter the first ``n`` voxels, whose world voxels are ``place`` (m, 3), into a window without any."""
     rows, lowest, _ = window
-    rows.fill(-1)
     for k in range(n):
         ix, iy, iz = place[k, 0] - lowest[0], place[k, 1] - lowest[1], place[k, 2] - lowest[2]
         if holds(rows, ix, iy, iz, 0):

@@ -33,7 +33,7 @@ from mapvote.core.kernel import inlined, kernel
 from mapvote.core.sensors import Sensor
 from mapvote.core.types import F64, I32, I64, Bool
 from mapvote.core.voxels import grouped, voxel_key
-from mapvote.perception.range_image import BOTH_SIDES, U16, LookCounts, Pixels, Samples, look, range_image
+from mapvote.perception.range_image import BOTH_SIDES, U16, LookCounts, Pixels, Samples, look, range_image, room_to_look
 
 # Set on the development streets of the simulator.
 REACH_M = 57.0
@@ -141,11 +141,11 @@ class MovingFilter:
         m = left = len(scan.samples)
         counts = LookCounts(np.zeros(m, np.int32), np.zeros(m, np.int32), np.zeros(m, np.uint8))
         x, y, z = rows_from(scan.samples, scan.origin_map)
-        waiting = Samples(x, y, z, np.arange(m, dtype=np.int32))
+        waiting, sought = Samples(x, y, z, np.arange(m, dtype=np.int32)), room_to_look(m)
         for other in self._witnesses(at):
             sensor = (other.origin_map - scan.origin_map).astype(np.float32)
             rule = MARGIN_M, HEIGHT_M, ENOUGH
-            left = look(waiting, left, other.nearest.reshape(-1), sensor, self._pixels, rule, counts)
+            left = look(waiting, left, other.nearest.reshape(-1), sensor, self._pixels, rule, counts, sought)
         free, total = counts.free, counts.free + counts.hit
         brief = (counts.sides == BOTH_SIDES) & (free >= MIN_FREE) & (free >= FREE_SHARE * total)
         half = int(np.ceil(self.reach_m / CELL_SIZE)) + 2

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from mapvote.core.azimuth import turn
 from mapvote.core.geometry import rows_from
-from mapvote.core.kernel import allocating, inlined, kernel
+from mapvote.core.kernel import inlined, kernel
 from mapvote.core.types import F32, F64, I32, U8
 
 U16 = NDArray[np.uint16]
@@ -101,7 +101,7 @@ def range_image(points: F64, origin: F64, pixels: Pixels) -> U16:
 
 
 class Sought(NamedTuple):
-    """Where samples lie as one scan saw them, (n,) each."""
+    """Where samples lie as one scan saw them, and what it saw there, (n,) each: scratch of :func:`look`."""
 
     steps: I32
     """Horizontal range."""
@@ -109,6 +109,16 @@ class Sought(NamedTuple):
     """Index into the flat image; 0 where the image has no answer."""
     around: I32
     """Pixels above and below within which rays bear witness."""
+    here: U16
+    """Range at the sample's pixel, and the least range below and above it."""
+    below: U16
+    above: U16
+
+
+def room_to_look(n: int) -> Sought:
+    """Scratch for :func:`look` at up to n samples."""
+    steps, pixel, around = np.empty((3, n), np.int32)
+    return Sought(steps, pixel, around, *np.empty((3, n), np.uint16))
 
 
 BOTH_SIDES = np.uint8(3)
@@ -118,10 +128,10 @@ _LEAST, _MOST = 2, 8
 
 
 @inlined
-def _seek(samples: Samples, n: int, sensor: F32, pixels: Pixels, height_m: np.float32) -> Sought:
-    """Where the first ``n`` samples lie from the sensor."""
+def _seek(samples: Samples, n: int, sensor: F32, pixels: Pixels, height_m: np.float32, sought: Sought) -> None:
+    """Where the first ``n`` samples lie from the sensor: fills ``steps``, ``pixel`` and ``around``."""
     x, y, z, _ = samples
-    steps, pixel, around = np.empty(n, np.int32), np.empty(n, np.int32), np.empty(n, np.int32)
+    steps, pixel, around = sought.steps, sought.pixel, sought.around
     near, slopes, reach = np.int32(NEAR_M * PER_M), np.int32(pixels.slopes), height_m * pixels.per_slope
     for i in range(np.uint64(0), np.uint64(n)):
         rho, a, b = _aim(x[i] - sensor[0], y[i] - sensor[1], z[i] - sensor[2], pixels)
@@ -130,14 +140,13 @@ def _seek(samples: Samples, n: int, sensor: F32, pixels: Pixels, height_m: np.fl
         inside = (steps[i] >= near) & (b >= k) & (b + k < slopes)
         pixel[i] = np.int32(a * slopes + b) if inside else np.int32(0)
         around[i] = k
-    return Sought(steps, pixel, around)
 
 
 @inlined
-def _read(n: int, image: U16, sought: Sought) -> tuple[U16, U16, U16]:
+def _read(n: int, image: U16, sought: Sought) -> None:
     """The ranges at, below and above each sample's pixel. Most look no farther than _LEAST, so that the first loop is
     short: the more pixels it is after at once, the less it waits for memory."""
-    here, below, above = np.empty(n, np.uint16), np.empty(n, np.uint16), np.empty(n, np.uint16)
+    here, below, above = sought.here, sought.below, sought.above
     for w in range(np.uint64(0), np.uint64(n)):
         p = np.uint64(max(sought.pixel[w], np.int32(_LEAST)))
         here[w] = image[p]
@@ -148,13 +157,12 @@ def _read(n: int, image: U16, sought: Sought) -> tuple[U16, U16, U16]:
         if (sought.around[w] > _LEAST) & (p > 0):
             for s in range(np.uint64(_LEAST + 1), np.uint64(sought.around[w] + 1)):
                 below[w], above[w] = min(below[w], image[p - s]), min(above[w], image[p + s])
-    return here, below, above
 
 
-@allocating
+@kernel
 def look(
     samples: Samples, n: int, image: U16, sensor: F32, pixels: Pixels, rule: tuple[float, float, int],
-    counts: LookCounts,
+    counts: LookCounts, sought: Sought,
 ) -> int:  # fmt: skip
     """Ask one scan about the first ``n`` samples, by its range ``image``, flat.
 
@@ -163,16 +171,17 @@ def look(
     ``sensor`` (3,) where the scan was taken, from the samples' common point. ``rule``: (metres behind a place that a
     ray must end to have seen through it, metres above and below within which rays bear witness, enough > 0). A sample
     of which ``enough`` scans said the same, and none the contrary, waits no longer. No step has a branch that nobody
-    could predict.
+    could predict. ``sought``: scratch for ``n`` samples or more.
     """
     x, y, z, of = samples
     free, hit, sides = counts
-    sought = _seek(samples, n, sensor, pixels, np.float32(rule[1]))
-    here, least_below, least_above = _read(n, image, sought)
-    margin, enough, left = np.int32(rule[0] * PER_M), rule[2], np.uint64(0)
+    behind_m, height_m, enough = rule
+    _seek(samples, n, sensor, pixels, np.float32(height_m), sought)
+    _read(n, image, sought)
+    margin, left = np.int32(behind_m * PER_M), np.uint64(0)
     for w in range(np.uint64(0), np.uint64(n)):
-        below, above, steps = least_below[w], least_above[w], sought.steps[w]
-        r = np.int32(min(here[w], min(below, above)))
+        below, above, steps = sought.below[w], sought.above[w], sought.steps[w]
+        r = np.int32(min(sought.here[w], min(below, above)))
         known = (sought.pixel[w] > 0) & (r != np.int32(NOTHING)) & (r >= steps - margin)
         through = known & (r > steps + margin)
         low = np.uint8(1) if below < NOTHING else np.uint8(0)

@@ -58,9 +58,10 @@ def _obstacles(
     cell: I32, obstacle: NDArray[np.bool_],
 ) -> None:  # fmt: skip
     rows, cols = ground_z.shape
+    (x0, y0), (row0, col0) = lattice, corner
     for i in range(len(points)):  # cells as Lattice.cells_of has them, to the last bit
-        c = int(np.floor((points[i, 0] - lattice[0]) / CELL_SIZE)) - corner[1]
-        r = int(np.floor((points[i, 1] - lattice[1]) / CELL_SIZE)) - corner[0]
+        c = int(np.floor((points[i, 0] - x0) / CELL_SIZE)) - col0
+        r = int(np.floor((points[i, 1] - y0) / CELL_SIZE)) - row0
         cell[i] = -1
         obstacle[i] = False
         if r < 0 or c < 0 or r >= rows or c >= cols:

@@ -18,7 +18,7 @@ import numpy as np
 from mapvote.config import Settings
 from mapvote.core.columns import TOP_BIT, column_bits, rebased
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, tile_of_cells
-from mapvote.core.kernel import allocating
+from mapvote.core.kernel import kernel
 from mapvote.core.point_map import PointMap, map_from_points
 from mapvote.core.reference import LocalMap
 from mapvote.core.sensor_height import heights_over_ground
@@ -102,7 +102,9 @@ class Layer:
             mine = np.flatnonzero((tile_rows == tile[0]) & (tile_cols == tile[1]))
             r, c = rows[mine] - tile[0] * TILE_CELLS, cols[mine] - tile[1] * TILE_CELLS
             bits = np.floor(points[mine, 2] / CELL_SIZE).astype(np.int64) - self.draft.tile(tile).base[r, c]
-            out[mine] = _counts_of(planes, r, c, bits)
+            counts = np.zeros((len(mine), 3), dtype=np.int64)
+            _counts_of(planes, r, c, bits, counts)
+            out[mine] = counts
         return out
 
     def _free(self, after: Tile) -> U64:
@@ -132,19 +134,20 @@ def _standing(points: F64, ground: PointMap) -> Bool:
 def _left_out(scan: PlacedScan, moving: Bool, reach_m: float) -> Bool:
     """Points (n,) that do not enter the map: what moves, what is beyond ``reach_m``, and what is too low to be an
     obstacle, in or next to cells where something moves: wheels and bumpers, not road."""
-    return _no_map(
-        scan.points_map, scan.origin_map, reach_m**2, moving, scan.obstacle, scan.cell, scan.reference.ground_z
-    )
+    ground_z, out = scan.reference.ground_z, np.empty(len(moving), np.bool_)
+    beside = np.zeros(ground_z.size, np.bool_)
+    _no_map(scan.points_map, scan.origin_map, reach_m**2, moving, scan.obstacle, scan.cell, ground_z, beside, out)
+    return out
 
 
-@allocating
+@kernel
 def _no_map(
-    points: F64, origin: F64, reach_squared: float, moving: Bool, obstacle: Bool, cell: I32, ground_z: F32
-) -> Bool:
-    """(n,) which of the points (n, 3) :func:`_left_out` means; ``cell`` (n,) row * cols + col of ``ground_z`` (rows,
-    cols), -1 outside it."""
+    points: F64, origin: F64, reach_squared: float, moving: Bool, obstacle: Bool, cell: I32, ground_z: F32,
+    beside: Bool, out: Bool,
+) -> None:  # fmt: skip
+    """Into ``out`` (n,) which of the points (n, 3) :func:`_left_out` means; ``cell`` (n,) row * cols + col of
+    ``ground_z`` (rows, cols), -1 outside it. ``beside`` (rows * cols,): scratch, all False."""
     rows, cols = ground_z.shape
-    out, beside = np.empty(len(points), np.bool_), np.zeros(rows * cols, np.bool_)
     for i in range(len(points)):
         if moving[i] and cell[i] >= 0:
             r, c = divmod(cell[i], cols)
@@ -157,16 +160,14 @@ def _no_map(
         if cell[i] >= 0 and beside[cell[i]] and not obstacle[i]:
             r, c = divmod(cell[i], cols)
             out[i] |= points[i, 2] - ground_z[r, c] > ROAD_M
-    return out
 
 
-@allocating
-def _counts_of(planes: U64, rows: I64, cols: I64, bits: I64) -> I64:
-    """(n, 3) of voxels (row, col, bit) of a tile: in how many scans hit, passed and crossed; 0 outside columns."""
-    out = np.zeros((len(bits), 3), dtype=np.int64)
+@kernel
+def _counts_of(planes: U64, rows: I64, cols: I64, bits: I64, out: I64) -> None:
+    """Into ``out`` (n, 3) in how many scans the voxels (row, col, bit) of a tile were hit, passed and crossed; outside
+    columns ``out`` stays as it is."""
     for i in range(len(bits)):
         if 0 <= bits[i] < TOP_BIT:
             cell = planes[rows[i], cols[i]]
             out[i, 0], out[i, 1] = count_of(cell, HIT, bits[i]), count_of(cell, PASSES, bits[i])
             out[i, 2] = least_passed(cell, bits[i])
-    return out

@@ -29,7 +29,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import numba
 import numpy as np
 from scipy import ndimage
 from scipy.sparse import coo_matrix
@@ -37,6 +36,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Lattice
+from mapvote.core.kernel import kernel
 from mapvote.core.point_map import PointMap
 from mapvote.core.sensor_height import crossings, heights_over_ground
 from mapvote.core.tile import Tile
@@ -177,7 +177,9 @@ def specks(points: F64, times: I32, lattice: Lattice, largest: int = LARGEST_SPE
     """
     keys = voxel_keys(points, lattice.x0, lattice.y0)
     table = np.zeros(1 << max(2 * len(keys), 2).bit_length(), dtype=np.int64)
-    return _specks(keys, times <= 1, largest, table, np.zeros(len(table), dtype=np.bool_))
+    often, out = np.zeros(len(table), dtype=np.bool_), np.zeros(len(keys), dtype=np.bool_)
+    _specks(keys, times <= 1, table, often, np.empty(largest + 1, np.int64), out)
+    return out
 
 
 def lone_points(tile: Tile) -> Bool:
@@ -200,15 +202,16 @@ def without_lone_points(point_map: PointMap) -> tuple[PointMap, int]:
     return replace(point_map, tiles=tiles), dropped
 
 
-@numba.njit(cache=True, nogil=True)
-def _specks(keys: I64, once: Bool, largest: int, table: I64, often: Bool) -> Bool:
-    """(n,) by flood fill from each voxel hit ``once``, which ends as soon as the group is no speck. ``table``, a hash
-    table of the voxels, and ``often``, whether a voxel of it was hit more than once: scratch, zeros."""
+@kernel
+def _specks(keys: I64, once: Bool, table: I64, often: Bool, group: I64, out: Bool) -> None:
+    """:func:`specks` into ``out`` (n,), by flood fill from each voxel hit ``once``, which ends as soon as the group is
+    no speck. ``table``, a hash table of the voxels, and ``often``, whether a voxel of it was hit more than once:
+    scratch, zeros. ``group`` (largest + 1,): scratch."""
+    largest = len(group) - 1
     for i in range(len(keys)):
         slot = slot_of(keys[i], table)
         often[slot] |= not once[i] or table[slot] == keys[i]  # a second point in one voxel
         table[slot] = keys[i]
-    out, group = np.zeros(len(keys), np.bool_), np.empty(largest + 1, np.int64)
     for i in range(len(keys)):
         group[0], n, k = keys[i], 1, 0
         alone = not often[slot_of(keys[i], table)]
@@ -217,7 +220,10 @@ def _specks(keys: I64, once: Bool, largest: int, table: I64, often: Bool) -> Boo
                 dx, dy, dz = around // 9 - 1, around // 3 % 3 - 1, around % 3 - 1
                 beside = group[k] + (np.int64(dx) << 42) + (np.int64(dy) << 21) + dz
                 slot = slot_of(beside, table)
-                if table[slot] == 0 or (group[:n] == beside).any():
+                known = table[slot] == 0
+                for j in range(n):
+                    known |= group[j] == beside
+                if known:
                     continue
                 if often[slot] or n == largest:
                     alone = False
@@ -226,7 +232,6 @@ def _specks(keys: I64, once: Bool, largest: int, table: I64, often: Bool) -> Boo
                 n += 1
             k += 1
         out[i] = alone
-    return out
 
 
 TALL_M = 4.0
