@@ -31,7 +31,7 @@ def select(points: F64, cell: I32, wanted: Bool, unwanted: Bool, words: U64, bas
 
 
 @kernel
-def _select(points: F64, cell: I32, wanted: Bool, unwanted: Bool, words: U64, base: I32, chosen: I64) -> int:
+def _select(points: F64, cell: I32, wanted: Bool, unwanted: Bool, words: U64, base: I32, chosen: I64) -> np.int64:
     """:func:`select` into the first of ``chosen`` (n + 1,); returns how many. Each index is written, and written over
     if its point is not chosen: a branch could not be predicted."""
     near = np.uint64(0)

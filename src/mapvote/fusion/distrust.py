@@ -285,7 +285,7 @@ def _moved_east(row: U64, w: int, by: int) -> np.uint64:
 
 
 @kernel
-def _differing(a: U64, b: U64, rim: int, most: int) -> int:
+def _differing(a: U64, b: U64, rim: int, most: int) -> np.int64:
     """In how many cells two masks (rows, 3, 4) differ, but for ``rim`` columns on either side; once they are more than
     ``most``, some number above that."""
     count = np.int64(0)
