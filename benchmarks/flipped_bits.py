@@ -26,6 +26,8 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
 from hand_made import Say, make_ballot, make_map, make_tile, states_plane, wall
 from mapvote.codec.ballot import encode
+from mapvote.codec.manifest import TileHashes
+from mapvote.codec.tile_planes import unpack_points_plane
 from mapvote.config import FuseSettings
 from mapvote.core.grid import TileIndex
 from mapvote.core.types import CellState, MapvoteError
@@ -33,7 +35,6 @@ from mapvote.server.store import schema
 from mapvote.server.store.admission import accept, examine
 from mapvote.server.store.ballots import Receipt
 from mapvote.server.store.integrity import check
-from mapvote.server.store.planes import TileHashes, unpack_points_plane
 from mapvote.server.store.policy import Policy
 from mapvote.server.store.publish import publish
 from mapvote.server.store.store import Store
@@ -120,12 +121,12 @@ def try_once(url: str, rng: random.Random, every_table: bool, expected: dict[Til
     """(where, named or not, how the rest fared)."""
     store = Store.open(url)
     try:
-        before = store.manifest().tiles
+        before = store.tiles()
         place = flip(store, rng, every_table)
         where, named = f"{place[0].name}.{place[1].name}", "named" if check(store) else "not named"
         try:
             publish(store)
-            after = store.manifest().tiles
+            after = store.tiles()
             others = [index for index in TILES if not touches(place, index, before[index])]
             wrong = [index for index in others if after[index] != expected[index]]
             for index in others:
@@ -152,7 +153,7 @@ def main() -> None:
             url = _copy(cluster, first, "expected")
             store = Store.open(url)
             publish(store)
-            expected = dict(store.manifest().tiles)
+            expected = dict(store.tiles())
             store.close()
             for number in range(asked.flips):
                 url = _copy(cluster, first, f"s{number}")

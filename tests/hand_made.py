@@ -11,7 +11,7 @@ from mapvote.codec.ballot import Ballot, BallotTile, pack_plane, tile_key
 from mapvote.codec.odds import pack_odds
 from mapvote.codec.path import check_path
 from mapvote.codec.points import pack_points
-from mapvote.codec.tile_file import base_hash
+from mapvote.codec.tile_planes import base_hash
 from mapvote.codec.words import pack_words
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Lattice, TileIndex
 from mapvote.core.point_map import PointMap

@@ -47,7 +47,7 @@ class History:
         self.policy(first)
         walls = {cell: CellMap((0.05, 0.45, 0.75, 1.05)) for cell in WALL}
         self.rules = Server(walls | {cell: CellMap() for cell in LAWN}, first)
-        self.hashes = {1: self.store.manifest(1).tiles[0, 0].points}
+        self.hashes = {1: self.store.tiles(1)[0, 0].points}
         self.drives = 0
         self.published: dict[int, int] = {}
         self.verdicts: list[int] = []
@@ -244,7 +244,7 @@ class History:
             return
         tile = self.store.tile(newest, (0, 0))
         assert tile is not None
-        self.hashes[newest] = self.store.manifest(newest).tiles[0, 0].points
+        self.hashes[newest] = self.store.tiles(newest)[0, 0].points
         memory = tile.memory or Memory.none()
         expected = self.rules.versions[newest]
         assert (tile.free is not None) == expected.knows_free, f"{where}: knows of free space"

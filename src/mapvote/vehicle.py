@@ -12,7 +12,7 @@ from mapvote.codec.ballot import Ballot, BallotTile, pack_plane, tile_key
 from mapvote.codec.odds import changed_cells_of, in_steps, pack_odds
 from mapvote.codec.path import pack_path
 from mapvote.codec.points import pack_points
-from mapvote.codec.tile_file import base_hash
+from mapvote.codec.tile_planes import base_hash
 from mapvote.codec.words import pack_words
 from mapvote.config import Settings
 from mapvote.core.grid import TileIndex

@@ -175,7 +175,7 @@ def test_a_server_that_was_restored_to_another_past_is_asked_for_everything(serv
     take_down_a_wall(store)
     client().fetch()
     (manifest,) = (tmp_path / "home").rglob("manifest.json")
-    manifest.write_bytes(manifest.read_bytes().replace(store.manifest().tiles[0, 5].points.encode(), b"0" * 64))
+    manifest.write_bytes(manifest.read_bytes().replace(store.tiles()[0, 5].points.encode(), b"0" * 64))
     take_down_a_wall(store, (0, 7))
     fetched = client().fetch()
     expected = store.point_map()

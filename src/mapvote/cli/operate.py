@@ -379,9 +379,9 @@ def check(
 def _check_beside(store: str, other: str, mend: bool) -> list[Damage]:
     """Check a store with the planes of another one at hand."""
     from mapvote.codec.arrays import unpack_bytes
+    from mapvote.codec.tile_planes import MAX_PLANE_BYTES
     from mapvote.core.types import MapvoteError
     from mapvote.server.store.integrity import check as look
-    from mapvote.server.store.planes import MAX_PLANE_BYTES
 
     with opened_store(store) as opened, opened_store(other) as backup, waiting("reading every byte"):
 

@@ -5,4 +5,4 @@ from mapvote.client.connection import Unreachable as Unreachable
 from mapvote.client.map_client import MapClient as MapClient
 from mapvote.client.map_client import Region as Region
 from mapvote.codec.manifest import Manifest as Manifest
-from mapvote.codec.manifest import PlaneHashes as PlaneHashes
+from mapvote.codec.manifest import TileHashes as TileHashes

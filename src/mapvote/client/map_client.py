@@ -11,19 +11,20 @@ import hashlib
 import os
 import time
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Literal
 
 import msgspec
-import numpy as np
 
 from mapvote.client.connection import Connection, Refused, Unreachable
 from mapvote.client.spool import Spool, server_folder
-from mapvote.codec.ballot import Ballot, decode, encode
-from mapvote.codec.fields import unpack_fields
-from mapvote.codec.manifest import Manifest, PlaneHashes
-from mapvote.core.grid import CELL_SIZE, Grid, Lattice, TileIndex
+from mapvote.codec.arrays import FRAME_HEAD, compress
+from mapvote.codec.ballot import Ballot, decode, encode, tile_index
+from mapvote.codec.manifest import Manifest, TileHashes
+from mapvote.codec.tile_planes import check_plane, points_in_plane, unpack_tile
+from mapvote.core.grid import CELL_SIZE, Grid
 from mapvote.core.lazy_tiles import made_in_turn
 from mapvote.core.point_map import PointMap
 from mapvote.core.tile import Tile
@@ -89,12 +90,12 @@ class MapClient:
         return self._as_map(manifest, region)
 
     def _as_map(self, manifest: Manifest, region: Region | None) -> PointMap:
-        lattice = Lattice(manifest.lattice.x0, manifest.lattice.y0)
-        wanted = {_index(key): planes for key, planes in manifest.tiles.items()}
+        lattice = manifest.lattice
+        wanted = {tile_index(key): planes for key, planes in manifest.tiles.items()}
         if region is not None:
             wanted = {index: planes for index, planes in wanted.items() if _meets(lattice.tile(index), region)}
         tiles = made_in_turn(lambda index: self.tile(lattice.tile(index), wanted[index]), wanted)
-        self._bound_cache({digest for planes in wanted.values() for digest in planes.all()})
+        self._bound_cache({digest for planes in wanted.values() for digest in planes.planes().values()})
         self.version = manifest.version
         return PointMap(manifest.map_id, lattice, tiles, manifest.georeference, version=manifest.version)
 
@@ -105,23 +106,24 @@ class MapClient:
             raise Unreachable(f"{self._url}: is away, and no version of its map is kept here")
         return self._as_map(manifest, region)
 
-    def has(self, planes: PlaneHashes) -> bool:
+    def has(self, planes: TileHashes) -> bool:
         """Whether a tile can be read without a request."""
-        return all((self._planes / digest).exists() for digest in planes.all())
+        return all((self._planes / digest).exists() for digest in planes.planes().values())
 
-    def points_of(self, planes: PlaneHashes) -> int:
+    def points_of(self, planes: TileHashes) -> int:
         """How many points a tile has that :meth:`has` been downloaded."""
-        return (self._planes / planes.points).stat().st_size // 12
+        with (self._planes / planes.points).open("rb") as frame:
+            return points_in_plane(frame.read(FRAME_HEAD), planes.points)
 
-    def download(self, planes: PlaneHashes) -> None:
+    def download(self, planes: TileHashes) -> None:
         """Have the planes of a tile that ``home`` lacks. Raises as :meth:`fetch`."""
-        for digest in planes.all():
+        for digest in planes.planes().values():
             if not (self._planes / digest).exists():
                 self._plane(digest)
 
-    def forget(self, needed: Iterable[PlaneHashes]) -> None:
+    def forget(self, needed: Iterable[TileHashes]) -> None:
         """Keep the cache of planes within its bound; none of ``needed`` leaves it."""
-        self._bound_cache({digest for planes in needed for digest in planes.all()})
+        self._bound_cache({digest for planes in needed for digest in planes.planes().values()})
 
     def versions(self) -> Iterator[int | None]:
         """The number of the newest version, whenever something happens at the server (server-sent events), and None at
@@ -220,31 +222,26 @@ class MapClient:
             part.write_bytes(msgspec.json.encode(manifest))
         return manifest
 
-    def tile(self, window: Grid, planes: PlaneHashes) -> Tile:
+    def tile(self, window: Grid, planes: TileHashes) -> Tile:
         """A tile over ``window``; what ``home`` lacks of it is downloaded. Raises as :meth:`fetch`."""
-        points = np.frombuffer(self._plane(planes.points), dtype="<f4").reshape(-1, 3)
-        ground_z = np.frombuffer(self._plane(planes.ground), dtype="<f4").reshape(window.shape)
-        free = (
-            None if planes.free is None else np.frombuffer(self._plane(planes.free), dtype="<u8").reshape(window.shape)
-        )
-        fields = {}
-        if planes.fields is not None:
-            fields = unpack_fields(self._plane(planes.fields), len(points), f"{self._url}: {planes.fields[:12]}")
-        return Tile(window, points, ground_z, free, fields=fields)
+        return unpack_tile(window, planes, {name: self._plane(digest) for name, digest in planes.planes().items()})
 
     def _plane(self, digest: str) -> bytes:
+        """The zstd frame of a plane."""
         kept = self._planes / digest
         if kept.exists():
-            raw = kept.read_bytes()
-            if hashlib.sha256(raw).hexdigest() == digest:
+            frame = kept.read_bytes()
+            with suppress(MapvoteError):  # damaged on this disk: fetched again
+                check_plane(frame, digest)
                 os.utime(kept)
-                return raw
+                return frame
         raw = self._server.ask("GET", f"/v1/tiles/{digest}").content
         if hashlib.sha256(raw).hexdigest() != digest:
             raise MapvoteError(f"{self._url}: tile plane {digest[:12]} came damaged; fetch again")
+        frame = compress(raw, 1)
         with whole_file(kept, private=True) as part:
-            part.write_bytes(raw)
-        return raw
+            part.write_bytes(frame)
+        return frame
 
     def _bound_cache(self, needed: Iterable[str]) -> None:
         """Forget the planes that were used longest ago, beyond ``cache_bytes``; never those of the map just fetched."""
@@ -262,11 +259,6 @@ class MapClient:
 
 
 _VOTE_AGAIN = ": fetch the map and vote again with that drive"
-
-
-def _index(key: str) -> TileIndex:
-    row, _, col = key.partition(",")
-    return int(row), int(col)
 
 
 def _meets(window: Grid, region: Region) -> bool:

@@ -92,6 +92,12 @@ _BALLOT = msgspec.msgpack.Decoder(Ballot)
 two threads do so at once."""
 
 
+def tile_index(key: str) -> TileIndex:
+    """The inverse of :func:`tile_key`; ValueError if it is none."""
+    row, _, col = key.partition(",")
+    return int(row), int(col)
+
+
 def tile_key(tile: TileIndex) -> str:
     """The name of a tile in manifests and ballots: "row,col"."""
     return f"{tile[0]},{tile[1]}"

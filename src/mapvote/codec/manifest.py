@@ -1,59 +1,66 @@
-"""The manifest of a version: which planes its tiles consist of. A server sends it, and a client keeps it as it came."""
+"""The manifest of a version: which planes its tiles consist of, by hash.
+
+A version is one manifest and planes, wherever it is: a server sends them, a client keeps them as they came, a map
+folder holds them.
+"""
 
 from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterable
-from typing import Protocol
 
 import msgspec
+
+from mapvote.core.grid import Lattice
 
 DIGESTS = 1 << 256
 """Sums of hashes are taken modulo this."""
 
 
-class Hashes(Protocol):
+class TileHashes(msgspec.Struct, frozen=True, omit_defaults=True, eq=False):
     """SHA-256 of the planes of one tile; None for a plane that it has not."""
 
-    @property
-    def points(self) -> str: ...
-    @property
-    def ground(self) -> str: ...
-    @property
-    def free(self) -> str | None: ...
-    @property
-    def fields(self) -> str | None:
-        """Of what the points carry besides their place."""
-
-
-class PlaneHashes(msgspec.Struct, frozen=True, omit_defaults=True):
-    """One tile of a manifest, see :class:`Hashes`."""
-
     points: str
+    """What ballots name as their base."""
     ground: str
     free: str | None
+    memory: str | None = None
+    """What a server remembers of the tile; no part of the map, so tiles that differ in nothing else are equal."""
     fields: str | None = None
+    """What the points carry besides their place."""
 
-    def all(self) -> list[str]:
-        """Those of the planes that there are."""
-        return [digest for digest in (self.points, self.ground, self.free, self.fields) if digest is not None]
+    @classmethod
+    def none(cls) -> TileHashes:
+        """Of a tile that a version does not have any more."""
+        return cls("", "", None)
+
+    def shown(self) -> TileHashes:
+        """Without the memory, which no server tells."""
+        return msgspec.structs.replace(self, memory=None)
+
+    def planes(self) -> dict[str, str]:
+        """The planes that there are, by name."""
+        named = {name: getattr(self, name) for name in self.__struct_fields__}
+        return {name: digest for name, digest in named.items() if digest}
+
+    def _map(self) -> tuple[str | None, ...]:
+        return self.points, self.ground, self.free, self.fields
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, TileHashes) and self._map() == other._map()
+
+    def __hash__(self) -> int:
+        return hash(self._map())
 
 
-class Corner(msgspec.Struct, frozen=True):
-    """Where the lattice of cells begins, map metres."""
-
-    x0: float
-    y0: float
-
-
-class Manifest(msgspec.Struct, omit_defaults=True):
+class Manifest(msgspec.Struct, omit_defaults=True, kw_only=True):
     """One version of a map, or what changed of it since another; tiles by "row,col"."""
 
     map_id: str
     version: int
-    lattice: Corner
+    lattice: Lattice
     georeference: dict[str, str]
-    tiles: dict[str, PlaneHashes]
+    tiles: dict[str, TileHashes]
     digest: str
     """Of all tiles of the version, also where only some are listed: 64 hexadecimal digits of :func:`digests_of`."""
     removed: list[str]
@@ -77,7 +84,7 @@ class Manifest(msgspec.Struct, omit_defaults=True):
         return msgspec.structs.replace(since, tiles=tiles, removed=[])
 
 
-def digests_of(tiles: Iterable[tuple[str, Hashes]]) -> tuple[int, int]:
+def digests_of(tiles: Iterable[tuple[str, TileHashes]]) -> tuple[int, int]:
     """Of tiles by "row,col", and of the fields of those that have any: the sum, modulo :data:`DIGESTS`, of a SHA-256
     for each tile, of its key and its planes' hashes, "-" for none.
 

@@ -11,7 +11,7 @@ from mapvote.codec.ballot import (
     encode,
     tile_key,
 )
-from mapvote.codec.tile_file import base_hash
+from mapvote.codec.tile_planes import base_hash
 from mapvote.config import FuseSettings
 from mapvote.core.grid import TileIndex
 from mapvote.core.lazy_tiles import with_changed

@@ -58,7 +58,7 @@ class Version:
 
     def _load(self, index: TileIndex) -> Tile:
         planes = self.planes[index]
-        name = " ".join(planes.all())
+        name = " ".join(planes.planes().values())
         tile = self._shared.get(name)
         if tile is None:
             tile = self._shared[name] = self._client.tile(self.point_map.lattice.tile(index), planes)

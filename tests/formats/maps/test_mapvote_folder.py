@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,13 +13,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mapvote.codec.tile_file import decode_tile, encode_tile
+from mapvote.codec.manifest import TileHashes, digests_of, shown
+from mapvote.codec.tile_planes import check_plane, pack_tile, unpack_tile
 from mapvote.core.grid import TILE_CELLS, Lattice
 from mapvote.core.point_map import PointMap, all_points, map_from_points
 from mapvote.core.tile import Tile
 from mapvote.core.types import MapvoteError
 from mapvote.formats import read_map, write_map
 from mapvote.formats.describe import describe
+from mapvote.formats.maps.mapvote_folder import read_manifest
+from mapvote.server.store.store import Store
 
 
 def small_map(seed: int = 0, offset: tuple[float, float] = (0.0, 0.0)) -> PointMap:
@@ -53,15 +57,17 @@ def test_the_same_map_gives_the_same_bytes(tmp_path: Path) -> None:
 
 @settings(max_examples=25, deadline=None)
 @given(st.integers(0, 40), st.integers(0, 2**32 - 1), st.booleans())
-def test_tile_bytes_round_trip(n: int, seed: int, learned: bool) -> None:
+def test_a_tile_comes_back_from_its_planes_and_equal_tiles_have_equal_planes(n: int, seed: int, learned: bool) -> None:
     rng = np.random.default_rng(seed)
     points = (rng.random((n, 3)) * 76.7).astype(np.float32)
     ground_z = np.where(rng.random((TILE_CELLS, TILE_CELLS)) < 0.1, np.nan, 1.5).astype(np.float32)
     free = rng.integers(0, 2**63, (TILE_CELLS, TILE_CELLS), dtype=np.uint64) if learned else None
     window = Lattice().tile((2, -3))
     tile = Tile(window, points, ground_z, free)
-    assert same(decode_tile(encode_tile(tile), window), tile)
-    assert encode_tile(decode_tile(encode_tile(tile), window)) == encode_tile(tile)
+    hashes, frames = pack_tile(tile)
+    back = unpack_tile(window, hashes, {name: frames[digest] for name, digest in hashes.planes().items()})
+    assert same(back, tile)
+    assert pack_tile(back) == (hashes, frames)
 
 
 def test_an_older_map_is_replaced_but_nothing_else(tmp_path: Path) -> None:
@@ -86,25 +92,55 @@ def test_a_failed_write_leaves_the_old_map_and_no_litter(tmp_path: Path) -> None
 
 def test_one_flipped_bit_is_noticed(tmp_path: Path) -> None:
     write_map(small_map(), tmp_path / "m")
-    tile = sorted((tmp_path / "m" / "tiles").iterdir())[0]
-    data = bytearray(tile.read_bytes())
+    plane = sorted((tmp_path / "m" / "planes").iterdir())[0]
+    data = bytearray(plane.read_bytes())
     data[len(data) // 2] ^= 1
-    tile.write_bytes(data)
-    with pytest.raises(MapvoteError, match=f"{tile.name}: its bytes are not those of the manifest"):
+    plane.write_bytes(data)
+    with pytest.raises(MapvoteError, match=plane.name[:12]):
         read_map(tmp_path / "m")
 
 
-def test_a_missing_tile_is_noticed(tmp_path: Path) -> None:
+def test_a_missing_plane_is_noticed(tmp_path: Path) -> None:
     write_map(small_map(), tmp_path / "m")
-    tile = sorted((tmp_path / "m" / "tiles").iterdir())[0]
-    tile.unlink()
-    with pytest.raises(MapvoteError, match=f"{tile.name}: No such file"):
+    plane = sorted((tmp_path / "m" / "planes").iterdir())[0]
+    plane.unlink()
+    with pytest.raises(MapvoteError, match=f"{plane.name}: No such file"):
         read_map(tmp_path / "m")
+
+
+def test_planes_that_the_manifest_interchanges_are_refused(tmp_path: Path) -> None:
+    write_map(small_map(), tmp_path / "m")
+    file = tmp_path / "m" / "manifest.json"
+    told = json.loads(file.read_text())
+    planes = told["tiles"]["0,0"]
+    planes["points"], planes["ground"] = planes["ground"], planes["points"]
+    file.write_text(json.dumps(told))
+    with pytest.raises(MapvoteError, match="its tiles are not those of its digest"):
+        read_map(tmp_path / "m")
+    whole = digests_of((key, TileHashes(**{"free": None} | hashes)) for key, hashes in told["tiles"].items())
+    file.write_text(json.dumps(told | {"digest": shown(*whole)[0]}))
+    with pytest.raises(MapvoteError, match="no plane of its kind"):
+        read_map(tmp_path / "m")
+
+
+def test_a_folder_is_what_a_server_of_the_map_tells(tmp_path: Path) -> None:
+    """Its manifest and its planes, hash by hash."""
+    write_map(small_map(), tmp_path / "m")
+    with closing(Store.create(f"sqlite:///{tmp_path / 's.db'}", read_map(tmp_path / "m"))) as store:
+        told, kept = store.manifest(), read_manifest(tmp_path / "m")
+        assert (told.map_id, told.lattice, told.tiles) == (kept.map_id, kept.lattice, kept.tiles)
+        assert (told.digest, told.version) == (kept.digest, kept.version)
+        for plane in (tmp_path / "m" / "planes").iterdir():
+            assert check_plane(store.blob(plane.name), plane.name) == check_plane(plane.read_bytes(), plane.name)
 
 
 @pytest.mark.parametrize(
     ("key", "value", "message"),
-    [("format_version", 99, "update mapvote"), ("cell_size", 0.2, r"cells of 0\.2 m"), ("x0", "a", "not a readable")],
+    [
+        ("format_version", 99, "update mapvote"),
+        ("cell_size", 0.2, r"cells of 0\.2 m"),
+        ("lattice", "a", "not a readable"),
+    ],
 )
 def test_a_manifest_of_another_kind_is_refused(tmp_path: Path, key: str, value: object, message: str) -> None:
     write_map(small_map(), tmp_path / "m")

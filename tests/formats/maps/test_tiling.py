@@ -12,6 +12,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from hand_made import Say, make_ballot, states_plane, wall
+from mapvote.codec.arrays import pack_plane
 from mapvote.config import FuseSettings
 from mapvote.core import lazy_tiles
 from mapvote.core.lazy_tiles import LazyTiles
@@ -21,6 +22,7 @@ from mapvote.formats import export_map, read_map, write_map
 from mapvote.formats.maps import pcd, ply, spill
 from mapvote.formats.maps.cloud import Cloud, lattice_of
 from mapvote.formats.maps.importing import import_cloud
+from mapvote.formats.maps.mapvote_folder import read_manifest
 from mapvote.formats.maps.pcd import write_pcd
 from mapvote.formats.maps.ply import write_ply
 from mapvote.formats.maps.tiling import map_of
@@ -128,7 +130,8 @@ def test_a_large_map_on_disk_is_opened_tile_by_tile_and_updated(tmp_path: Path) 
     assert after.n_points == 4002
     assert after.tiles[0, -1] is opened.tiles[0, -1]
     before, now = files(opened, tmp_path / "a"), files(after, tmp_path / "b")
-    assert {name for name in now if now[name] != before[name]} == {"manifest.json", "tiles/0_0.tile"}
+    assert {name for name in now.keys() & before.keys() if now[name] != before[name]} == {"manifest.json"}
+    assert len(now.keys() - before.keys()) == 3, "points and fields of one tile, and what it remembers"
 
 
 @pytest.mark.parametrize("out", ["a.las", "a.laz", "a.ply", "a.pcd", "a"])
@@ -154,8 +157,9 @@ def test_a_large_map_leaves_as_the_same_file(tmp_path: Path, out: str, monkeypat
 def test_a_large_map_with_a_damaged_tile_is_refused_when_it_is_opened(tmp_path: Path) -> None:
     points, _ = street(8)
     write_map(map_of("it", [Cloud(points)]), tmp_path / "m")
-    (tmp_path / "m/tiles/0_0.tile").write_bytes(b"no tile")
-    with pytest.raises(MapvoteError, match=r"0_0\.tile: its bytes are not those of the manifest"):
+    plane = read_manifest(tmp_path / "m").tiles["0,0"].points
+    (tmp_path / "m/planes" / plane).write_bytes(pack_plane(np.zeros((4, 3), np.float32)))
+    with pytest.raises(MapvoteError, match=f"tile plane {plane[:12]} is not what its hash says"):
         read_map(tmp_path / "m")
 
 

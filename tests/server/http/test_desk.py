@@ -12,11 +12,11 @@ import pytest
 from fastapi.testclient import TestClient
 
 from hand_made import make_ballot, two_walls
+from mapvote.codec.manifest import TileHashes
 from mapvote.config import FuseSettings
 from mapvote.core.types import CellState
 from mapvote.server.http.app import create_app
 from mapvote.server.store import keys
-from mapvote.server.store.planes import TileHashes
 from mapvote.server.store.round import round_at
 from mapvote.server.store.store import Store
 from mapvote.server.views.point_lod import Clouds

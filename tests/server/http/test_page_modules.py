@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from hand_made import make_map, make_tile, wall
-from mapvote.server.store.planes import TileHashes
+from mapvote.codec.manifest import TileHashes
 from mapvote.server.store.store import Store
 from mapvote.server.views.point_lod import Clouds, came_and_went
 from stores import WALL
@@ -41,7 +41,7 @@ def write_clouds(folder: Path) -> None:
     before = make_tile(np.concatenate([ground, wall(WALL, [0.45, 0.75, 1.05])]))
     after = make_tile(np.concatenate([ground, wall(WALL[1:], [0.45, 0.75, 1.05])]))
     store = Store.create(f"sqlite:///{folder / 'store.db'}", make_map({(0, 0): before}))
-    (hashes,) = store.manifest().tiles.values()
+    (hashes,) = store.tiles().values()
     clouds = Clouds(store)
     levels = clouds.levels(TileHashes(hashes.points, hashes.ground, None))
     store.close()

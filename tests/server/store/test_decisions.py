@@ -51,7 +51,7 @@ def cast(store: Store, clock: Clock, vehicle: str, cell: tuple[int, int] = CELL,
     clock.now += 10**9
     states = seen_along(way, by)
     states[cell] = CE
-    base = {HERE: store.manifest(1).tiles[HERE].points}
+    base = {HERE: store.tiles(1)[HERE].points}
     ballot = make_ballot(two_walls(), {HERE: Say(states)}, vehicle, f"d{clock.now}", clock.now, base=base, version=1)
     (receipt,) = send(store, ballot)
     return receipt.seq

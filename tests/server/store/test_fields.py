@@ -22,7 +22,7 @@ from mapvote.client import MapClient
 from mapvote.codec.ballot import Ballot
 from mapvote.codec.fields import FIELD_TYPES, pack_fields, unpack_fields
 from mapvote.codec.points import pack_points, unpack_points
-from mapvote.codec.tile_file import encode_tile
+from mapvote.codec.tile_planes import pack_tile
 from mapvote.config import FuseSettings
 from mapvote.core import lazy_tiles
 from mapvote.core.lazy_tiles import LazyTiles
@@ -97,7 +97,7 @@ def test_every_point_that_stays_keeps_its_fields_and_new_ones_have_the_sensors_i
     assert (done.added, done.deleted > 50) == (2, True)
     after, offline = store.point_map(), update_map(before, ballots(before), POLICY.fuse)[0]
     for index, tile in offline.tiles.items():
-        assert encode_tile(tile) == encode_tile(after.tiles[index]), "as `mapvote update` makes it on files"
+        assert pack_tile(tile) == pack_tile(after.tiles[index]), "as `mapvote update` makes it on files"
     new = all_carried(after) - all_carried(before)
     assert sorted(point[1] for point in new) == sorted(map(tuple, BUILT.tolist()))
     assert len(all_carried(before) - all_carried(after)) == done.deleted
@@ -112,7 +112,7 @@ def test_rolled_back_replayed_and_cleared_they_are_what_they_were_bit_for_bit(st
     vote(store)
     publish(store)
     changed = store.manifest()
-    assert changed.tiles[0, 0].fields != first.tiles[0, 0].fields
+    assert changed.tiles["0,0"].fields != first.tiles["0,0"].fields
     assert (changed.digest, changed.fields_digest) == _digests_afresh(store)
     rollback(store, 1)
     assert store.manifest().tiles == first.tiles
@@ -133,7 +133,7 @@ def _digests_afresh(store: Store) -> tuple[str, str]:
 
 def test_a_flipped_bit_in_them_is_found_and_the_tile_waits_until_it_is_mended(store: Store) -> None:
     vote(store)
-    digest = store.manifest().tiles[0, 0].fields
+    digest = store.tiles()[0, 0].fields
     b = schema.blobs
     with store.database.writing() as connection:
         sound = bytes(connection.execute(sa.select(b.c.data).where(b.c.hash == digest)).scalar_one())

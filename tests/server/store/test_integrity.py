@@ -10,12 +10,12 @@ import sqlalchemy as sa
 
 from hand_made import Say, make_ballot, states_plane, two_walls
 from mapvote.codec.arrays import unpack_bytes
+from mapvote.codec.tile_planes import pack_tile
 from mapvote.config import FuseSettings
 from mapvote.core.tile import Tile
 from mapvote.core.types import CellState
 from mapvote.server.store import schema
 from mapvote.server.store.integrity import ballot_name, check, set_aside
-from mapvote.server.store.planes import pack_tile
 from mapvote.server.store.policy import Policy
 from mapvote.server.store.publish import publish
 from mapvote.server.store.store import Store
@@ -142,7 +142,7 @@ def test_a_turned_letter_in_a_head_is_named(store: Store, table: str, column: st
 def test_a_ballot_on_a_tile_whose_memory_is_damaged_is_admitted_and_waits(store: Store) -> None:
     late = make_ballot(two_walls(), {(0, 0): Say(states_plane({CELL: CellState.CHANGED_EMPTY}))}, "late", version=1)
     assert publish(store).version == 2
-    memory = store.manifest(2).tiles[0, 0].memory
+    memory = store.tiles(2)[0, 0].memory
     assert memory is not None
     flip(store, schema.blobs, "data", schema.blobs.c.hash == memory)
     send(store, late)
@@ -159,7 +159,7 @@ def test_a_ballot_that_ended_by_no_event_is_named(store: Store) -> None:
 
 def test_a_plane_is_mended_from_another_store(store: Store, tmp_path_factory: pytest.TempPathFactory) -> None:
     other = Store.create(f"sqlite:///{tmp_path_factory.mktemp('other') / 's.db'}", two_walls())
-    points = store.manifest().tiles[0, 0].points
+    points = store.tiles()[0, 0].points
     flip(store, schema.blobs, "data", schema.blobs.c.hash == points)
     assert not publish(store).published
 

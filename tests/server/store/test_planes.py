@@ -7,8 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hand_made import SHAPE
+from mapvote.codec.tile_planes import pack_memory, unpack_memory_plane
 from mapvote.core.tile_history import PLANES, Memory
-from mapvote.server.store.planes import pack_memory, unpack_memory_plane
 
 
 @given(seed=st.integers(0, 2**32 - 1), share=st.sampled_from([0.0, 1e-4, 0.1, 1.0]))

@@ -84,7 +84,7 @@ def test_a_ballot_is_taken_in_without_reading_the_others(store: Store) -> None:
     intake = Intake(store)
     vote(store, intake, "d3", (10, 12))
     publish(store)
-    base = {(0, 0): store.manifest().tiles[0, 0].points}
+    base = {(0, 0): store.tiles()[0, 0].points}
     say = Say(states_plane({(10, 12): CellState.UNCHANGED_EMPTY}))
     ballot = make_ballot(two_walls(), {(0, 0): say}, "c", "d4", base=base, version=store.current())
     assert scans(store, lambda: send(intake, ballot)) == []

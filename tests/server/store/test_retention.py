@@ -9,13 +9,13 @@ import pytest
 import sqlalchemy as sa
 
 from hand_made import Say, make_ballot, states_plane, two_walls, wall
+from mapvote.codec.tile_planes import pack_tile
 from mapvote.config import FuseSettings
 from mapvote.core.types import CellState
 from mapvote.fusion.tile_vote import DAY_NS
 from mapvote.server.errors import NotFound
 from mapvote.server.store import schema
 from mapvote.server.store.integrity import check
-from mapvote.server.store.planes import pack_tile
 from mapvote.server.store.policy import KeepPolicy, Policy
 from mapvote.server.store.publish import publish, rollback
 from mapvote.server.store.replay import replay

@@ -6,10 +6,13 @@ model: it has the model's members and no others.
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+import msgspec
+from pydantic import BaseModel, ConfigDict, Field, create_model
 
+from mapvote.codec.manifest import Manifest, TileHashes
 from mapvote.server.store.integrity import Damage
 from mapvote.server.views.change_objects import Kind, Size
 from mapvote.server.views.consensus import VehicleStanding
@@ -29,33 +32,18 @@ class Problem(Answer):
     reasons: list[str] | None = Field(default=None, description="of a version that the policy holds")
 
 
-class Origin(Answer):
-    """Of the cells' lattice, map metres."""
-
-    x0: float
-    y0: float
-
-
-class Planes(Answer):
-    """SHA-256 of the planes of one tile, see ``/v1/tiles/{digest}``."""
-
-    points: str
-    ground: str
-    free: str | None = None
-    fields: str | None = None
+def answer_of(kind: type[msgspec.Struct], leave_out: Collection[str] = (), **instead: Any) -> type[Answer]:
+    """The model of an answer that the codec defines, with some members of other types."""
+    members: dict[str, Any] = {}
+    for member in msgspec.structs.fields(kind):
+        if member.name not in leave_out:
+            default = ... if member.required else member.default
+            members[member.name] = instead.get(member.name, member.type), default
+    return create_model(kind.__name__, __base__=Answer, __doc__=kind.__doc__, **members)
 
 
-class ManifestAnswer(Answer):
-    """One version of the map; tiles by "row,col"."""
-
-    map_id: str
-    version: int
-    lattice: Origin
-    georeference: dict[str, str]
-    tiles: dict[str, Planes]
-    digest: str
-    removed: list[str]
-    fields_digest: str | None = None
+Planes = answer_of(TileHashes, leave_out=["memory"])
+ManifestAnswer = answer_of(Manifest, tiles=dict[str, Planes])  # type: ignore[valid-type]
 
 
 class VersionEntry(Answer):
@@ -234,6 +222,13 @@ class Pending(_Collection):
     features: list[PendingFeature]
 
 
+class Drawn(Answer):
+    """The planes of a tile that the page draws."""
+
+    points: str
+    ground: str
+
+
 class DeskAnswer(Answer):
     """The review desk."""
 
@@ -242,7 +237,7 @@ class DeskAnswer(Answer):
     pending: Pending
     waiting: list[PendingFeature]
     reviewed: list[PendingFeature]
-    tiles: dict[str, Planes | None] = Field(description="as a publish would make them; null: without points")
+    tiles: dict[str, Drawn | None] = Field(description="as a publish would make them; null: without points")
 
 
 class PlacedFeature(Answer):

@@ -7,11 +7,11 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Path, Query, Request, Response
 
 from mapvote.codec.arrays import compress
+from mapvote.codec.manifest import TileHashes
 from mapvote.server.http.answers import Places as PlacesAnswer
 from mapvote.server.http.auth import reviewer
 from mapvote.server.http.schemas import AS_CSV, From, Places, To, VersionQuery, as_json, as_table, problems
 from mapvote.server.http.services import services
-from mapvote.server.store.planes import TileHashes
 from mapvote.server.views.paths import paths
 from mapvote.server.views.point_lod import N_LEVELS, evidence
 

@@ -11,13 +11,13 @@ from fastapi import APIRouter, Path, Request, Response
 from pydantic import BaseModel, ConfigDict, Field
 
 from mapvote.codec.ballot import tile_key
+from mapvote.codec.manifest import TileHashes
 from mapvote.core.tile import Tile
 from mapvote.server.http.answers import DeskAnswer, Pending, VerdictGiven
 from mapvote.server.http.auth import reviewer
 from mapvote.server.http.cloud_routes import AS_BYTES, packed
 from mapvote.server.http.schemas import AS_CSV, PLAIN, Places, as_json, as_table, problems
 from mapvote.server.http.services import services
-from mapvote.server.store.planes import TileHashes
 from mapvote.server.store.reviews import undo
 from mapvote.server.views.desk import Desk, desk, review, verdict_of
 from mapvote.server.views.geojson import feature_rows

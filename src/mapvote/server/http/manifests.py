@@ -8,9 +8,6 @@ from typing import NamedTuple
 
 import msgspec
 
-from mapvote.codec.ballot import tile_key
-from mapvote.codec.manifest import Corner, Manifest, PlaneHashes
-from mapvote.server.store.store import Manifest as Version
 from mapvote.server.store.store import Store
 
 _KEPT = 16
@@ -46,22 +43,9 @@ class Manifests:
         with self._lock:  # of many requests for a new version, one makes it
             made = self._made.get((number, since))
             if made is None:
-                manifest = _on_the_wire(self._store.manifest(number, since=since))
+                manifest = self._store.manifest(number, since=since)
                 made = Made(msgspec.json.encode(manifest), manifest.tag(since))
                 while len(self._made) >= _KEPT:
                     del self._made[next(iter(self._made))]
                 self._made[number, since] = made
         return made
-
-
-def _on_the_wire(version: Version) -> Manifest:
-    return Manifest(
-        map_id=version.map_id,
-        version=version.version,
-        lattice=Corner(version.lattice.x0, version.lattice.y0),
-        georeference=dict(version.georeference),
-        tiles={tile_key(i): PlaneHashes(h.points, h.ground, h.free, h.fields) for i, h in version.tiles.items()},
-        digest=version.digest,
-        removed=[tile_key(index) for index in version.removed],
-        fields_digest=version.fields_digest,
-    )

@@ -12,12 +12,12 @@ from fastapi import APIRouter, Path, Request, Response
 from fastapi.concurrency import run_in_threadpool
 
 from mapvote.codec.arrays import unpack_bytes
+from mapvote.codec.tile_planes import MAX_PLANE_BYTES
 from mapvote.server.http.answers import ManifestAnswer, Versions, Withdrawn
 from mapvote.server.http.auth import own
 from mapvote.server.http.schemas import AS_CSV, Name, Number, Table, VersionQuery, as_json, as_table, iso, problems
 from mapvote.server.http.services import services
 from mapvote.server.store.ballots import withdraw
-from mapvote.server.store.planes import MAX_PLANE_BYTES
 
 _AS_YOU_HAVE: dict[int | str, dict[str, Any]] = {304: {"description": "as you have"}}
 router = APIRouter()

@@ -17,7 +17,9 @@ import numpy as np
 import sqlalchemy as sa
 
 from mapvote.codec.ballot import Ballot, decode, tile_key
+from mapvote.codec.manifest import TileHashes
 from mapvote.codec.path import check_path
+from mapvote.codec.tile_planes import unpack_ground_plane
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, TileIndex
 from mapvote.core.types import F64, Bool, MapvoteError
 from mapvote.fusion.fuse import rule_of
@@ -26,7 +28,6 @@ from mapvote.fusion.tile_vote import DAY_NS, TileVote
 from mapvote.server.errors import Conflict, TooMany, Unauthorised, Unavailable
 from mapvote.server.store import keys, schema
 from mapvote.server.store.ballots import Incoming, Receipt, Votes, write_ballots
-from mapvote.server.store.planes import TileHashes, unpack_ground_plane
 from mapvote.server.store.policy import RoundPolicy, policy_in
 from mapvote.server.store.queries import (
     current_number,

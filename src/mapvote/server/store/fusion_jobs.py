@@ -17,6 +17,8 @@ import numpy as np
 import sqlalchemy as sa
 
 from mapvote.codec.ballot import tile_key
+from mapvote.codec.manifest import TileHashes
+from mapvote.codec.tile_planes import pack_tile
 from mapvote.core.grid import Grid, TileIndex
 from mapvote.core.tile import Tile
 from mapvote.core.types import I64, Bool, MapvoteError
@@ -26,11 +28,9 @@ from mapvote.fusion.loss_budget import PendingDeletions, pack_agreed
 from mapvote.fusion.persistence import emptied_and_filled
 from mapvote.fusion.tile_vote import TileVote
 from mapvote.server.errors import Unavailable
-from mapvote.server.store import schema
 from mapvote.server.store.database import Database, address_of
 from mapvote.server.store.decisions import Standing, Why, pack_standings, pack_states, pack_tally, packed_cells
 from mapvote.server.store.integrity import Damage, DamagedBallots
-from mapvote.server.store.planes import TileHashes, pack_tile
 from mapvote.server.store.queries import load_tile, tile_as_of
 from mapvote.server.store.votes import (
     DAMAGED,
@@ -148,8 +148,7 @@ def _plane_of(task: Task, error: str) -> str:
     """Which plane an error is about: by its hash, so that mending it takes it out of quarantine."""
     if not isinstance(task.tile, TileHashes):
         return f"of tile {tile_key(task.window.tile_index)}"
-    planes = [getattr(task.tile, name) for name in schema.TILE_PLANES]
-    return next((digest for digest in planes if digest and digest[:12] in error), task.tile.points)
+    return next((digest for digest in task.tile.planes().values() if digest[:12] in error), task.tile.points)
 
 
 def _fuse(connection: sa.Connection, task: Task, polled: Polled) -> Fused:

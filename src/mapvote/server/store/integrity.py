@@ -15,11 +15,11 @@ import sqlalchemy as sa
 
 from mapvote.codec.arrays import compress, unpack_bytes
 from mapvote.codec.ballot import tile_key
+from mapvote.codec.tile_planes import MAX_PLANE_BYTES
 from mapvote.core.grid import TileIndex
 from mapvote.core.types import MapvoteError
 from mapvote.server.store import schema
 from mapvote.server.store.database import insert_rows
-from mapvote.server.store.planes import MAX_PLANE_BYTES
 from mapvote.server.store.queries import log_event, oldest_kept, shows_in_kept
 from mapvote.server.store.store import Store
 

@@ -12,8 +12,13 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 import sqlalchemy as sa
+from msgspec import structs
 from sqlalchemy.exc import IntegrityError
 
+from mapvote.codec.manifest import TileHashes
+from mapvote.codec.tile_planes import (
+    pack_memory,
+)
 from mapvote.config import FuseSettings
 from mapvote.core.grid import Grid, TileIndex
 from mapvote.core.tile import Tile
@@ -25,10 +30,6 @@ from mapvote.server.store import schema
 from mapvote.server.store.database import insert_rows
 from mapvote.server.store.fusion_jobs import Fused
 from mapvote.server.store.integrity import quarantine
-from mapvote.server.store.planes import (
-    TileHashes,
-    pack_memory,
-)
 from mapvote.server.store.queries import (
     Version,
     add_blobs,
@@ -168,7 +169,7 @@ def rollback(store: Store, to: int, *, by: str = "operator", reason: str = "") -
             if now.get(index) != then.get(index):
                 old, new = _of_two(connection, store.lattice.tile(index), number, now.get(index), then.get(index))
                 digest, plane = pack_memory(turned_back(number, old, new))
-                tiles[index] = replace(then.get(index) or TileHashes.none(), memory=digest)
+                tiles[index] = structs.replace(then.get(index) or TileHashes.none(), memory=digest)
                 planes.append(plane)
     policy = dict(target.policy)
     version = Version(number, newest.number, "rollback", to, store.clock(), by, reason[:400], newest.mark, policy)

@@ -10,19 +10,19 @@ import sqlalchemy as sa
 
 from mapvote.codec.arrays import FRAME_HEAD
 from mapvote.codec.ballot import tile_key
+from mapvote.codec.manifest import TileHashes
+from mapvote.codec.tile_planes import (
+    pack_tile,
+    points_in_plane,
+    unpack_memory_plane,
+    unpack_tile,
+)
 from mapvote.core.grid import Grid, TileIndex
 from mapvote.core.tile import Tile
 from mapvote.core.tile_history import Memory
 from mapvote.server.errors import NotFound
 from mapvote.server.store import schema
 from mapvote.server.store.database import MOST_ASKED, Question, insert_rows
-from mapvote.server.store.planes import (
-    TileHashes,
-    pack_tile,
-    points_in_plane,
-    unpack_memory_plane,
-    unpack_tile,
-)
 
 
 def current_number(connection: sa.Connection) -> int:
@@ -139,7 +139,7 @@ def load_tile(connection: sa.Connection, window: Grid, hashes: TileHashes | None
     """The tile over ``window`` by its hashes; the empty one where there are none."""
     if hashes is None:
         return Tile.empty(window)
-    named = {plane: digest for plane in schema.TILE_PLANES if (digest := getattr(hashes, plane))}
+    named = hashes.planes()
     found = {row.hash: row.data for row in _PLANES.ask(connection, **dict.fromkeys(schema.TILE_PLANES) | named)}
     return unpack_tile(window, hashes, {p: _there(found.get(digest), digest) for p, digest in named.items()})
 

@@ -15,7 +15,10 @@ from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import sqlalchemy as sa
+from msgspec import structs
 
+from mapvote.codec.manifest import TileHashes
+from mapvote.codec.tile_planes import pack_tile
 from mapvote.core.grid import TileIndex
 from mapvote.core.tile import Tile
 from mapvote.core.types import Bool
@@ -24,7 +27,6 @@ from mapvote.server.errors import NotFound
 from mapvote.server.store import schema
 from mapvote.server.store.database import address_of
 from mapvote.server.store.fusion_jobs import Task, fuse_round
-from mapvote.server.store.planes import TileHashes, pack_tile
 from mapvote.server.store.publish import NewTiles, Outcome, turned_back, write_version
 from mapvote.server.store.queries import Version, load_tile, memory_of, tile_of, tiles_of
 from mapvote.server.store.store import Store
@@ -83,7 +85,7 @@ def replay(
     for index, ours, theirs in _pairs(store, last, _State(newest.number)):
         mine, packed = pack_tile(replace(ours.tile, memory=turned_back(number, theirs.tile, ours.tile)))
         if (mine if ours.there else None) != (pack_tile(theirs.tile)[0] if theirs.there else None):
-            tiles[index] = mine if ours.there else replace(TileHashes.none(), memory=mine.memory)
+            tiles[index] = mine if ours.there else structs.replace(TileHashes.none(), memory=mine.memory)
             planes.append(packed)
             grown = len(ours.tile.points) - len(theirs.tile.points)
             added, deleted = added + max(grown, 0), deleted + max(-grown, 0)

@@ -11,11 +11,11 @@ from typing import Any, Literal
 
 import sqlalchemy as sa
 
+from mapvote.codec.tile_planes import pack_cells, unpack_cells
 from mapvote.core.grid import TileIndex
 from mapvote.core.types import Bool
 from mapvote.server.errors import Conflict, NotFound
 from mapvote.server.store import schema
-from mapvote.server.store.planes import pack_cells, unpack_cells
 from mapvote.server.store.queries import log_event
 from mapvote.server.store.store import Store
 

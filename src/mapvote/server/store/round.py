@@ -14,6 +14,7 @@ from weakref import WeakKeyDictionary
 
 import sqlalchemy as sa
 
+from mapvote.codec.tile_planes import unpack_free_plane, unpack_ground_plane, unpack_points_plane
 from mapvote.config import FuseSettings
 from mapvote.core.grid import TileIndex
 from mapvote.core.lazy_tiles import with_changed
@@ -23,7 +24,6 @@ from mapvote.server.store import schema
 from mapvote.server.store.database import address_of
 from mapvote.server.store.fusion_jobs import Fused, Task, fuse_round
 from mapvote.server.store.integrity import tiles_hurt_or_mended
-from mapvote.server.store.planes import unpack_free_plane, unpack_ground_plane, unpack_points_plane
 from mapvote.server.store.policy import GatePolicy
 from mapvote.server.store.publish_limits import hold_reasons
 from mapvote.server.store.queries import Version, current_version, tiles_of, tiles_set_by

@@ -11,15 +11,14 @@ from __future__ import annotations
 
 import secrets
 import time
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 import sqlalchemy as sa
 
 from mapvote.codec.ballot import Id, tile_key
-from mapvote.codec.manifest import DIGESTS, digests_of, shown
+from mapvote.codec.manifest import DIGESTS, Manifest, TileHashes, digests_of, shown
 from mapvote.core.grid import Lattice, TileIndex
 from mapvote.core.lazy_tiles import LazyTiles, is_small
 from mapvote.core.point_map import PointMap
@@ -28,7 +27,6 @@ from mapvote.core.types import MapvoteError
 from mapvote.server.errors import Unavailable
 from mapvote.server.store import migrate, schema
 from mapvote.server.store.database import Database
-from mapvote.server.store.planes import TileHashes
 from mapvote.server.store.policy import Policy, PolicyChange, changed, changes_of, policy_in, write_policy
 from mapvote.server.store.queries import (
     VERSION_COLUMNS,
@@ -46,24 +44,7 @@ from mapvote.server.store.queries import (
     version_of,
 )
 
-__all__ = ["Id", "Manifest", "Store", "Version", "add_blobs", "log_event", "url_of"]
-
-
-@dataclass(frozen=True, slots=True)
-class Manifest:
-    """What a version consists of: the hashes of its tiles."""
-
-    version: int
-    map_id: str
-    lattice: Lattice
-    georeference: Mapping[str, str]
-    tiles: Mapping[TileIndex, TileHashes]
-    digest: str
-    """Of all tiles of the version, see :func:`mapvote.codec.manifest.digests_of`."""
-    fields_digest: str = ""
-    """Likewise of the fields of its points; empty where no tile has any."""
-    removed: Sequence[TileIndex] = ()
-    """With ``since``: tiles that the older version had and this one has not."""
+__all__ = ["Id", "Store", "Version", "add_blobs", "log_event", "url_of"]
 
 
 def _digests_of(tiles: Mapping[TileIndex, TileHashes]) -> tuple[int, int]:
@@ -196,7 +177,8 @@ class Store:
             return [Version(**row._mapping) for row in rows]
 
     def manifest(self, number: int | None = None, *, since: int | None = None) -> Manifest:
-        """Tiles of a version (the newest by default); with ``since``, only those set after that version.
+        """A version (the newest by default) as it is told: without what tiles remember. With ``since``, only the tiles
+        set after that version.
 
         NotFound if there is no such version.
         """
@@ -210,8 +192,24 @@ class Store:
                 self._digests[number] = _digests_of(tiles)
             else:
                 tiles, removed = self._changed(connection, since, number)
-            told = shown(*self._digest(connection, number))
-        return Manifest(number, self.map_id, self.lattice, self.georeference, tiles, *told, removed)
+            digest, fields_digest = shown(*self._digest(connection, number))
+        return Manifest(
+            map_id=self.map_id,
+            version=number,
+            lattice=self.lattice,
+            georeference=dict(self.georeference),
+            tiles={tile_key(index): hashes.shown() for index, hashes in tiles.items()},
+            digest=digest,
+            fields_digest=fields_digest,
+            removed=[tile_key(index) for index in removed],
+        )
+
+    def tiles(self, number: int | None = None) -> dict[TileIndex, TileHashes]:
+        """The hashes of a version's tiles, the newest version's by default; NotFound if there is no such version."""
+        with self.database.reading() as connection:
+            number = current_number(connection) if number is None else number
+            version_of(connection, number)
+            return tiles_of(connection, number)
 
     def _changed(
         self, connection: sa.Connection, since: int, number: int

@@ -16,6 +16,7 @@ from typing import Any, TypeVar
 import numpy as np
 import sqlalchemy as sa
 
+from mapvote.codec.tile_planes import unpack_cells
 from mapvote.config import FuseSettings
 from mapvote.core.grid import TileIndex
 from mapvote.core.tile import Tile
@@ -26,7 +27,6 @@ from mapvote.fusion.tile_vote import DAY_NS, TileVote, newest_votes, restrict
 from mapvote.server.store import schema
 from mapvote.server.store.database import MOST_ASKED
 from mapvote.server.store.integrity import NOT_ITS_SUM, Damage, DamagedBallots, ballot_name, set_aside
-from mapvote.server.store.planes import unpack_cells
 from mapvote.server.store.policy import Policy, policy_in
 from mapvote.server.store.queries import Version
 

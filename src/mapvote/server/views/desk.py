@@ -11,6 +11,7 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
+from mapvote.codec.manifest import TileHashes
 from mapvote.core.columns import EVERY_BIT
 from mapvote.core.grid import CELL_SIZE, CELLS, TILE_CELLS, TileIndex
 from mapvote.core.tile import Tile
@@ -20,7 +21,6 @@ from mapvote.fusion.loss_budget import PendingDeletions
 from mapvote.server.errors import NotFound
 from mapvote.server.store.decisions import Record
 from mapvote.server.store.fusion_jobs import Fused
-from mapvote.server.store.planes import TileHashes
 from mapvote.server.store.queries import load_tile, tile_of
 from mapvote.server.store.reviews import Review, Verdict, decide, standing
 from mapvote.server.store.round import Gate, Round, edited_tile, reasons_to_hold, round_at

@@ -8,11 +8,12 @@ from typing import Any
 
 import sqlalchemy as sa
 
+from mapvote.codec.manifest import TileHashes
+from mapvote.codec.tile_planes import names_in_plane
 from mapvote.core.types import MapvoteError
 from mapvote.server.errors import Unavailable
 from mapvote.server.store import schema
 from mapvote.server.store.integrity import set_aside
-from mapvote.server.store.planes import TileHashes, names_in_plane
 from mapvote.server.store.queries import current_version, load_blob, oldest_kept, tiles_of
 from mapvote.server.store.store import Store
 from mapvote.server.views.events import last_events

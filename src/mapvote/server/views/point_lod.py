@@ -16,6 +16,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from mapvote.codec.manifest import TileHashes
+from mapvote.codec.tile_planes import unpack_fields_plane
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Lattice, TileIndex
 from mapvote.core.kernel import allocating
 from mapvote.core.tile import Tile, in_bytes
@@ -25,7 +27,6 @@ from mapvote.core.voxels import found_among
 from mapvote.fusion.loss_budget import agreed_odds, alike_beside, change_probability, folded
 from mapvote.fusion.tile_vote import TileVote
 from mapvote.server.errors import Unavailable
-from mapvote.server.store.planes import TileHashes, unpack_fields_plane
 from mapvote.server.store.policy import policy_in
 from mapvote.server.store.queries import load_blob, load_tile, tiles_of, tiles_that_differ, version_of
 from mapvote.server.store.store import Store
@@ -281,7 +282,7 @@ class Clouds:
 
 def _drawn(hashes: TileHashes) -> TileHashes:
     """Of points and ground alone."""
-    return replace(hashes, free=None, memory=None, fields=None)
+    return TileHashes(hashes.points, hashes.ground, None)
 
 
 def came_and_went(before: Tile, after: Tile, index: TileIndex | None = None) -> bytes:

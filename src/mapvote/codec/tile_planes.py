@@ -1,10 +1,10 @@
-"""A tile as content-addressed planes."""
+"""A map tile <-> content-addressed planes, each one zstd frame: in a server's store, on the wire, in a client's cache
+and in a map folder (docs/decisions/data.md)."""
 
 from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -13,33 +13,27 @@ from numpy.typing import NDArray
 from mapvote.codec.arrays import compress, frame_size, raw_plane, unpack_bytes
 from mapvote.codec.ballot import tile_key
 from mapvote.codec.fields import field_names, pack_fields, unpack_fields
-from mapvote.codec.tile_file import MAX_TILE_POINTS
+from mapvote.codec.manifest import TileHashes
 from mapvote.core.grid import CELLS, TILE_CELLS, Grid
 from mapvote.core.tile import Tile
 from mapvote.core.tile_history import PLANES, Memory
 from mapvote.core.types import F32, U64, Bool, MapvoteError
 
 _ZSTD_LEVEL = 2
+MAX_TILE_POINTS = 50_000_000
+"""8,000 points per square metre; 600 MB. Nothing honest is denser."""
 MAX_PLANE_BYTES = 16 * MAX_TILE_POINTS
 """800 MB: 16 bytes for each point of the densest tile there may be."""
 
 
-@dataclass(frozen=True, slots=True)
-class TileHashes:
-    """One tile of a manifest. ``points`` is what ballots name as their base."""
+def content_hash(tile_points: F32) -> str:
+    """SHA-256 of a tile's points: free space learned later changes no published point (docs/decisions/data.md)."""
+    return hashlib.sha256(raw_plane(tile_points, "<f4")).hexdigest()
 
-    points: str
-    ground: str
-    free: str | None
-    memory: str | None = field(default=None, compare=False)
-    """What the server remembers of the tile; no part of the map, so tiles that differ in nothing else are equal."""
-    fields: str | None = None
-    """What its points carry besides their place; None: nothing."""
 
-    @classmethod
-    def none(cls) -> TileHashes:
-        """Of a tile that a version does not have any more."""
-        return cls("", "", None)
+def base_hash(tile: Tile | None) -> str:
+    """The content hash that a ballot gives for this tile: "" where the map has none."""
+    return "" if tile is None else content_hash(tile.points)
 
 
 def pack_tile(tile: Tile, edited_from: tuple[Tile, TileHashes] | None = None) -> tuple[TileHashes, dict[str, bytes]]:
@@ -87,7 +81,7 @@ def unpack_tile(window: Grid, hashes: TileHashes, planes: Mapping[str, bytes]) -
 
 def unpack_points_plane(data: bytes, digest: str) -> F32:
     """The points plane of a tile alone."""
-    return np.frombuffer(_unpack(data, digest), dtype="<f4").reshape(-1, 3)
+    return _values(data, digest, "<f4", (-1, 3))
 
 
 def points_in_plane(head: bytes, digest: str) -> int:
@@ -98,25 +92,38 @@ def points_in_plane(head: bytes, digest: str) -> int:
 
 def unpack_ground_plane(data: bytes, digest: str) -> F32:
     """(256, 256) the ground plane of a tile alone."""
-    return np.frombuffer(_unpack(data, digest), dtype="<f4").reshape(TILE_CELLS, TILE_CELLS)
+    return _values(data, digest, "<f4", (TILE_CELLS, TILE_CELLS))
 
 
 def unpack_free_plane(data: bytes, digest: str) -> U64:
     """(256, 256) the plane of known-free column words of a tile alone."""
-    return np.frombuffer(_unpack(data, digest), dtype="<u8").reshape(TILE_CELLS, TILE_CELLS)
+    return _values(data, digest, "<u8", (TILE_CELLS, TILE_CELLS))
+
+
+def _values(data: bytes, digest: str, dtype: str, shape: tuple[int, int]) -> NDArray[Any]:
+    values = np.frombuffer(check_plane(data, digest), dtype="u1")
+    row = abs(shape[1]) * np.dtype(dtype).itemsize
+    if len(values) % row or (shape[0] >= 0 and len(values) != shape[0] * row):
+        raise _wrong_size(len(values), digest)
+    return values.view(dtype).reshape(shape)
+
+
+def _wrong_size(size: int, digest: str) -> MapvoteError:
+    return MapvoteError(f"tile plane {digest[:12]} has {size} bytes, which no plane of its kind has; fetch it again")
 
 
 def unpack_fields_plane(data: bytes, digest: str, n: int) -> dict[str, NDArray[Any]]:
     """The fields of a tile's ``n`` points alone."""
-    return unpack_fields(_unpack(data, digest), n, f"tile plane {digest[:12]}")
+    return unpack_fields(check_plane(data, digest), n, f"tile plane {digest[:12]}")
 
 
 def names_in_plane(data: bytes, digest: str) -> list[str]:
     """What a plane of fields holds."""
-    return field_names(_unpack(data, digest), f"tile plane {digest[:12]}")
+    return field_names(check_plane(data, digest), f"tile plane {digest[:12]}")
 
 
-def _unpack(data: bytes, digest: str) -> bytes:
+def check_plane(data: bytes, digest: str) -> bytes:
+    """The content of a plane; MapvoteError if it is not what its hash says."""
     raw = unpack_bytes(data, MAX_PLANE_BYTES, f"tile plane {digest[:12]}")
     if hashlib.sha256(raw).hexdigest() != digest:
         raise MapvoteError(f"tile plane {digest[:12]} is not what its hash says; fetch it again")
@@ -143,9 +150,11 @@ def _raw_memory(memory: Memory) -> bytes:
 
 def unpack_memory_plane(data: bytes, digest: str) -> Memory:
     """What a tile remembers; MapvoteError if it is not what its hash says."""
-    raw = _unpack(data, digest)
-    n = len(raw) // (2 + 4 * PLANES)
+    raw = check_plane(data, digest)
+    n, rest = divmod(len(raw), 2 + 4 * PLANES)
     cells = np.cumsum(np.frombuffer(raw, dtype="<u2", count=n), dtype=np.int64)
+    if rest or (n and cells[-1] >= CELLS):
+        raise _wrong_size(len(raw), digest)
     return Memory(cells, np.frombuffer(raw, dtype="<u4", offset=2 * n).reshape(PLANES, n))
 
 
