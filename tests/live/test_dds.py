@@ -127,8 +127,8 @@ def test_a_reader_that_comes_late_gets_what_a_durable_writer_sent(monkeypatch: p
 
 
 def _until(ask: Callable[[], Any]) -> Any:
-    end = time.monotonic() + 10.0
+    end = time.monotonic() + 60.0
     while not (found := ask()):
-        assert time.monotonic() < end, "nothing came in 10 s"
+        assert time.monotonic() < end, "nothing came in a minute"
         time.sleep(0.02)
     return found

@@ -136,6 +136,19 @@ def test_a_scan_that_cannot_be_read_is_counted_and_the_drive_goes_on(tmp_path: P
     assert live.live.counts.latencies_s
 
 
+def test_of_scans_that_wait_each_finds_its_pose_in_odometry_of_500_hz(tmp_path: Path) -> None:
+    live, period_ns = Live(tmp_path), 2_000_000
+    first_ns = 1_700_000_000 * 10**9 + live.scans[0].stamp_ns
+    live.live.on_pose(first_ns - period_ns, live.poses[0])
+    for i in range(SCANS):
+        live.give(i)
+        for k in range(1, 50):
+            live.live.on_pose(first_ns + i * 100_000_000 + k * period_ns, live.poses[i])
+    live.live.finish()
+    live.outbox.close()
+    assert (live.live.counts.without_pose, live.live.counts.observed) == (0, SCANS)
+
+
 def test_a_new_version_of_the_map_holds_from_the_next_ballot_on(tmp_path: Path) -> None:
 
     class Versions:

@@ -164,6 +164,13 @@ def test_two_processes_cannot_drive_as_one_vehicle(tmp_path: Path) -> None:
     open_outbox(tmp_path).begin("a")
 
 
+def test_an_outbox_that_never_began_closes_and_another_process_may_drive_as_its_vehicle(tmp_path: Path) -> None:
+    open_outbox(tmp_path).close()
+    again = open_outbox(tmp_path)
+    again.begin("day")
+    again.close()
+
+
 def test_no_number_is_given_twice_to_a_drive_of_one_name(tmp_path: Path) -> None:
     (tmp_path / "out").mkdir()
     numbers = []

@@ -35,7 +35,7 @@ def store(tmp_path: Path) -> Iterator[Store]:
 
 
 def until(true: Callable[[], bool], what: str) -> None:
-    end = time.monotonic() + 20.0
+    end = time.monotonic() + 60.0
     while not true():
         assert time.monotonic() < end, what
         time.sleep(0.02)

@@ -9,6 +9,7 @@ import socket
 import subprocess
 import sys
 import urllib.request
+from collections import deque
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -21,7 +22,9 @@ from rosbags.typesys import Stores, get_typestore
 
 from live.test_live_drive import SCANS, Live
 from mapvote.core.geometry import from_xyz_rpy
+from mapvote.core.types import MapvoteError
 from mapvote.live.cdr import from_cdr, stamp_ns
+from mapvote.live.drive import Fixed
 from mapvote.live.status import (
     DIAGNOSTICS,
     POSE,
@@ -39,7 +42,7 @@ class Network:
     def __init__(self) -> None:
         self.sent: dict[str, list[bytes]] = {}
 
-    def publish(self, topic: str, kind: str) -> Any:
+    def publish(self, topic: str, kind: str, *, patience_s: float) -> Any:
         kept = self.sent.setdefault(topic, [])
         return SimpleNamespace(send=kept.append)
 
@@ -138,3 +141,15 @@ def test_systemd_hears_that_the_service_is_ready_and_alive(tmp_path: Path, monke
             systemd.recv(100)
     monkeypatch.delenv("NOTIFY_SOCKET")
     Heartbeat()()
+
+
+def test_a_reader_that_takes_nothing_does_not_end_the_drive(caplog: pytest.LogCaptureFixture) -> None:
+    def refused(data: bytes) -> None:
+        raise MapvoteError("DDS refuses a message")
+
+    ros = RosStatus(SimpleNamespace(publish=lambda *_, **__: SimpleNamespace(send=refused)), "car")  # type: ignore[arg-type]
+    fixed = [Fixed(10**9, np.eye(4), np.zeros((6, 6), np.float32))] * 2
+    live = SimpleNamespace(fixes=deque(fixed), T_base_lidar=np.eye(4))
+    ros.poses(live, SimpleNamespace(map_frame="map"))  # type: ignore[arg-type]
+    assert not live.fixes
+    assert caplog.messages == ["DDS refuses a message"]

@@ -22,8 +22,6 @@ from mapvote.live.cdr import NUMBERS, TYPES, Field
 
 _DEPTH = 64
 """Messages kept between two looks: six seconds of clouds."""
-_BLOCKING_NS = 10**9
-"""How long a reliable writer waits for a slow reader."""
 _TAKEN = 640
 """Messages that are taken at a time, at most."""
 _ALIVE, _ANY = 16, 0x7F
@@ -95,23 +93,30 @@ class Network:
         self, topic: str, kind: str, *, reliable: bool, transient_local: bool = False, depth: int = _DEPTH
     ) -> Subscription:
         """Messages of ``topic`` from now on; a reader asks for no more than its writers offer, or it gets nothing."""
-        qos = self._qos(reliable, transient_local, depth, both=True)
+        qos = self._qos(reliable, transient_local, depth, 0, both=True)
         reader = self._sub.DataReader(self._participant, self._topic_of(topic, kind), qos=qos)
         condition = self._core.ReadCondition(reader, _ANY)
         self._waitset.attach(condition)
         return Subscription(topic, kind, reader, reliable, lambda: self._waitset.detach(condition))
 
     def publish(
-        self, topic: str, kind: str, *, reliable: bool = True, transient_local: bool = False, depth: int = _DEPTH
+        self,
+        topic: str,
+        kind: str,
+        *,
+        reliable: bool = True,
+        transient_local: bool = False,
+        depth: int = _DEPTH,
+        patience_s: float = 1.0,
     ) -> Publication:
-        """A writer of ``topic``."""
-        qos = self._qos(reliable, transient_local, depth, both=False)
+        """A writer of ``topic``; ``patience_s``: how long it waits for a slow reader, if it is reliable."""
+        qos = self._qos(reliable, transient_local, depth, int(1e9 * patience_s), both=False)
         return Publication(self._pub.DataWriter(self._participant, self._topic_of(topic, kind), qos=qos))
 
-    def _qos(self, reliable: bool, transient_local: bool, depth: int, *, both: bool) -> Any:
+    def _qos(self, reliable: bool, transient_local: bool, depth: int, patience_ns: int, *, both: bool) -> Any:
         policy = self._core.Policy
         return self._core.Qos(
-            policy.Reliability.Reliable(_BLOCKING_NS) if reliable else policy.Reliability.BestEffort,
+            policy.Reliability.Reliable(patience_ns) if reliable else policy.Reliability.BestEffort,
             policy.Durability.TransientLocal if transient_local else policy.Durability.Volatile,
             policy.History.KeepLast(depth),
             policy.DataRepresentation(use_cdrv0_representation=True, use_xcdrv2_representation=both),

@@ -26,8 +26,10 @@ from mapvote.localisation.map_window import tiles_within
 from mapvote.vehicle import Cuts, RoadDriven, Vehicle, stretch_name
 
 log = logging.getLogger("mapvote.live")
-_POSES = 400
-"""Poses of odometry that are kept: four seconds at 100 Hz."""
+_POSES, _FIXES = 20_000, 400
+"""Poses of odometry, and poses of scans that voted, that are kept at most."""
+_PAST_NS = 3 * 10**9
+"""Poses of odometry so much older than the oldest scan that waits are of no use."""
 _PATIENCE_NS = 300_000_000
 """A scan waits so long for a pose later than its own stamp; then the newest ones are extrapolated, or it has none."""
 _CROWDED, _RELAXED = 30, 5
@@ -154,7 +156,7 @@ class Thinning:
 
     def admits(self, came_s: float, waiting: int) -> bool:
         """Whether the scan that came at ``came_s``, by any clock, shall vote while ``waiting`` others wait."""
-        self._period_s += 0.1 * (min(came_s - self._came_s, 1.0) - self._period_s)
+        self._period_s += 0.1 * (np.clip(came_s - self._came_s, 0.0, 1.0) - self._period_s)
         self._came_s = came_s
         if self._crowded != (waiting > (_RELAXED if self._crowded else _CROWDED)):
             self._crowded, self._credit = not self._crowded, 1.0
@@ -192,8 +194,10 @@ class LiveDrive:
         self.vehicle: Vehicle | None = None
         """None until the first scan: the map around it may have to come first."""
         self._road, self._poses = RoadDriven(), deque[tuple[int, F64]](maxlen=_POSES)
-        self._waiting, self._observed = deque[Waiting](), deque[Waiting]()
-        self.fixes: deque[Fixed] = deque(maxlen=_POSES)
+        self._waiting = deque[Waiting]()
+        self._observed = deque[tuple[int, int]]()
+        """Stamp and time of sending of the scans that are observed but not done."""
+        self.fixes: deque[Fixed] = deque(maxlen=_FIXES)
         """Of the scans that voted last; whoever publishes them takes them out."""
         self._touched: dict[TileIndex, float] = {}
         """Tiles with votes that are not in the journal, and since when."""
@@ -277,7 +281,10 @@ class LiveDrive:
             self._outbox.keep(self.drive_id, self.vehicle.ballot([tile]))
         if not ready:
             return False
-        self._observe(self._waiting.popleft())
+        waiting = self._waiting.popleft()
+        while len(self._poses) > 2 and self._poses[1][0] < waiting.stamp_ns - _PAST_NS:
+            self._poses.popleft()
+        self._observe(waiting)
         self._thinning.cost(time.monotonic() - start)
         return True
 
@@ -349,7 +356,7 @@ class LiveDrive:
         vehicle = self.vehicle
         if self._first is not None:
             self.checked_now = self._first.add(scan, prior, vehicle)
-        self._observed.append(waiting)
+        self._observed.append((waiting.stamp_ns, waiting.sent_ns))
         self.counts.observed += 1
         vehicle.observe(scan, prior)
         self._count_votes(vehicle)
@@ -372,13 +379,13 @@ class LiveDrive:
         report, now_ns, now_s = vehicle.report, time.time_ns(), time.monotonic()
         lost = set(report.lost) if vehicle.done > self._finished else set()
         for i in range(self._finished, vehicle.done):
-            scan = self._observed.popleft()
+            stamp_ns, sent_ns = self._observed.popleft()
             if i in lost:
                 self.counts.lost += 1
                 continue
             self.counts.localised += 1
-            self.fixes.append(Fixed(scan.stamp_ns, report.T_map_lidar[i], report.covariances[i]))
-            since_ns = scan.stamp_ns if abs(scan.sent_ns - scan.stamp_ns) < 5 * 10**9 else scan.sent_ns
+            self.fixes.append(Fixed(stamp_ns, report.T_map_lidar[i], report.covariances[i]))
+            since_ns = stamp_ns if abs(sent_ns - stamp_ns) < 5 * 10**9 else sent_ns
             if not ended:
                 self.counts.latencies_s.append(1e-9 * (now_ns - since_ns))
             x, y = report.T_map_lidar[i][:2, 3]

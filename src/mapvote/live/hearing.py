@@ -6,7 +6,8 @@ import logging
 import time
 from bisect import bisect_left
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -82,9 +83,11 @@ def choose_topics(
 
 
 def matrix_of(position: Any, orientation: Any) -> F64:
-    """T (4, 4) of a message's position and quaternion."""
-    T = np.eye(4)
-    q = orientation
+    """T (4, 4) of a message's position and quaternion. MapvoteError if they are no pose."""
+    T, q = np.eye(4), orientation
+    length = float(np.linalg.norm([q.x, q.y, q.z, q.w]))
+    if not np.isfinite([length, position.x, position.y, position.z]).all() or length < 0.5:
+        raise MapvoteError("numbers that are not finite, or a quaternion of zeros")
     T[:3, :3] = scipy.spatial.transform.Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix()
     T[:3, 3] = position.x, position.y, position.z
     return T
@@ -104,26 +107,31 @@ class Sweeps:
     """Clouds of several LiDARs joined to scans: what they took within half a revolution."""
 
     def __init__(self, lidars: int) -> None:
-        self.lidars, self.reach_ns = lidars, 0.55e8
+        self._lidars, self._reach_ns = lidars, 0.55e8
         self._open: list[Cloud] = []
         self._firsts: deque[int] = deque(maxlen=20)
         """Stamps of the first LiDAR: they tell its period."""
 
-    def add(self, cloud: Cloud) -> list[list[Cloud]]:
-        """The scans that are whole by now, each in order of LiDARs."""
-        if self.lidars == 1:
-            return [[cloud]]
+    def add(self, clouds: Iterable[Cloud]) -> list[list[Cloud]]:
+        """Clouds that arrived together, in any order. Returns the scans that are whole by now, each in order of
+        LiDARs."""
+        if self._lidars == 1:
+            return [[cloud] for cloud in clouds]
+        in_turn = sorted(clouds, key=lambda cloud: cloud.stamp_ns)
+        return [scan for cloud in in_turn for scan in self._add(cloud)]
+
+    def _add(self, cloud: Cloud) -> list[list[Cloud]]:
         if cloud.lidar == 0:
             self._firsts.append(cloud.stamp_ns)
             if len(self._firsts) > 2:
-                self.reach_ns = _SWEEP * float(np.median(np.diff(sorted(self._firsts))))
+                self._reach_ns = _SWEEP * float(np.median(np.diff(sorted(self._firsts))))
         out = []
         start = min((c.stamp_ns for c in self._open), default=cloud.stamp_ns)
-        apart = abs(cloud.stamp_ns - start) > self.reach_ns or cloud.lidar in {c.lidar for c in self._open}
+        apart = abs(cloud.stamp_ns - start) > self._reach_ns or cloud.lidar in {c.lidar for c in self._open}
         if self._open and apart:
             out.append(self._closed())
         self._open.append(cloud)
-        if len(self._open) == self.lidars:
+        if len(self._open) == self._lidars:
             out.append(self._closed())
         return out
 
@@ -185,7 +193,8 @@ class Hearing:
         self.base_frame, self.map_frame = "", ""
         """What odometry tracks, and in which frame."""
         self.clocks = Clocks()
-        self.clouds = 0
+        self.clouds = self.unusable = 0
+        """Clouds that arrived; messages of any topic that cannot be used."""
         self._edges: Edges = {}
         self._sweeps = Sweeps(len(chosen.points))
         self._points = [self._subscribed(topic) for topic in chosen.points]
@@ -207,52 +216,78 @@ class Hearing:
         """Odometry that came: stamps, and T_map_base."""
         out = []
         for sent_ns, data in [] if self._odometry is None else self._odometry.take_sent():
-            message = from_cdr(ODOMETRY, data)
-            pose = message.pose.pose
-            self.base_frame, self.map_frame = (
-                name.strip("/") for name in (message.child_frame_id, message.header.frame_id)
-            )
-            out.append((stamp_ns(message), matrix_of(pose.position, pose.orientation)))
-            self.clocks.pose(sent_ns, out[-1][0], time.monotonic())
+            with self._some_unusable(ODOMETRY):
+                message = from_cdr(ODOMETRY, data)
+                pose = message.pose.pose
+                T = matrix_of(pose.position, pose.orientation)
+                self.base_frame, self.map_frame = (
+                    name.strip("/") for name in (message.child_frame_id, message.header.frame_id)
+                )
+                out.append((stamp_ns(message), T))
+                self.clocks.pose(sent_ns, out[-1][0], time.monotonic())
         return out
+
+    @contextmanager
+    def _some_unusable(self, kind: str) -> Iterator[None]:
+        """A message that cannot be used is left out; the 1st, 2nd, 4th, 8th ... is said."""
+        try:
+            yield
+        except MapvoteError as error:
+            self.unusable += 1
+            if self.unusable & (self.unusable - 1) == 0:
+                log.warning("%s is left out: %s (%d messages so far)", kind, error, self.unusable)
 
     def scans(self) -> list[list[Cloud]]:
         """Clouds that came, joined to scans."""
         self._take_frames()
-        out: list[list[Cloud]] = []
+        clouds: list[Cloud] = []
         for lidar, subscription in enumerate(self._points):
             for sent_ns, data in subscription.take_sent():
-                header = from_cdr("std_msgs/msg/Header", data)
-                self.frames[lidar] = header.frame_id.strip("/")
-                time_ns = int(header.stamp.sec) * 10**9 + int(header.stamp.nanosec)
-                self.clouds += 1
-                self.clocks.cloud(sent_ns, time_ns, time.monotonic())
-                out += self._sweeps.add(Cloud(lidar, time_ns, sent_ns, data))
+                with self._some_unusable(CLOUD):
+                    header = from_cdr("std_msgs/msg/Header", data)
+                    self.frames[lidar] = header.frame_id.strip("/")
+                    clouds.append(
+                        Cloud(lidar, int(header.stamp.sec) * 10**9 + int(header.stamp.nanosec), sent_ns, data)
+                    )
+                    self.clocks.cloud(sent_ns, clouds[-1].stamp_ns, time.monotonic())
+        self.clouds += len(clouds)
         if time.monotonic() > self._looked_s + _REVISIT_S:
             self._revisit()
-        return out
+        return self._sweeps.add(clouds)
 
     def _take_frames(self) -> None:
         for data in self._tf.take():
-            for t in from_cdr(TF, data).transforms:
-                T = matrix_of(t.transform.translation, t.transform.rotation)
-                parent, child = t.header.frame_id.strip("/"), t.child_frame_id.strip("/")
-                for here, there, T_here_there in ((parent, child, T), (child, parent, inverse(T))):
-                    known = [edge for edge in self._edges.get(here, []) if edge[0] != there]
-                    self._edges[here] = [*known, (there, T_here_there)]
+            with self._some_unusable(TF):
+                for t in from_cdr(TF, data).transforms:
+                    self._take_frame(t)
+
+    def _take_frame(self, t: Any) -> None:
+        """A geometry_msgs/TransformStamped, both ways."""
+        parent, child = t.header.frame_id.strip("/"), t.child_frame_id.strip("/")
+        T = matrix_of(t.transform.translation, t.transform.rotation)
+        for here, there, T_here_there in ((parent, child, T), (child, parent, inverse(T))):
+            known = [edge for edge in self._edges.get(here, []) if edge[0] != there]
+            self._edges[here] = [*known, (there, T_here_there)]
 
     def _revisit(self) -> None:
         """Read anew what is now sent with another reliability: DDS connects no reliable reader to a writer that is
         not."""
         self._looked_s = time.monotonic()
         now = {(h.topic, h.kind): h.reliable for h in self.network.heard()}
-        for k, topic in enumerate(self.chosen.points):
-            reliable = now.get((topic.topic, topic.kind), self._points[k].reliable)
-            if reliable != self._points[k].reliable:
-                log.warning("%s is now sent %s", topic.topic, "reliably" if reliable else "with best effort")
-                self._lost += self._points[k].lost
-                self._points[k].close()
-                self._points[k] = self.network.subscribe(topic.topic, topic.kind, reliable=reliable, depth=_DEPTH)
+        lost = self.lost
+        self._points = [self._as_sent(reader, now) for reader in self._points]
+        self._lost += lost - self.lost
+        if self._odometry is not None:
+            self._odometry = self._as_sent(self._odometry, now)
+
+    def _as_sent(self, reader: Subscription, now: Mapping[tuple[str, str], bool]) -> Subscription:
+        """``reader``, or a new one if its topic is now sent with another reliability."""
+        reliable = now.get((reader.topic, reader.kind), reader.reliable)
+        if reliable == reader.reliable:
+            return reader
+        log.warning("%s is now sent %s", reader.topic, "reliably" if reliable else "with best effort")
+        reader.close()
+        return self.network.subscribe(reader.topic, reader.kind, reliable=reliable, depth=_DEPTH)
 
     def T_base_lidar(self) -> F64 | None:
         """(4, 4) the first LiDAR on what odometry tracks, by /tf_static; the identity if both are one frame, or nobody
@@ -271,8 +306,8 @@ class Hearing:
 
     def measure(self, scans: Sequence[list[Cloud]]) -> bool:
         """Measure the first LiDAR in the first ``scans``, unless it is known; returns whether it is now."""
-        if self.sensor is None and len(scans) >= _MEASURED:
-            firsts = [sweep[0] for sweep in scans if sweep[0].lidar == 0]
+        firsts = [sweep[0] for sweep in scans if sweep[0].lidar == 0]
+        if self.sensor is None and len(firsts) >= _MEASURED:
             steps_ns = np.diff([cloud.stamp_ns for cloud in firsts])
             rate_hz = round(1e9 / float(np.median(steps_ns)), 1)
             read = [scan_from_point_cloud2(from_cdr(CLOUD, cloud.data), UNKNOWN) for cloud in firsts[:_MEASURED]]

@@ -41,6 +41,8 @@ _RETRY_S = 60.0
 """Between two attempts to send what waits, or to write what the disk did not take."""
 _HELD = 64
 """Closed ballots that are held in memory while the disk takes none: with cuts of 10 minutes half a day."""
+_QUEUED = 256
+"""Pieces of work that wait for the disk: tiles of the open ballot are not added to more. It is half an hour of road."""
 _NUMBERED = re.compile(r"(.+)-(\d{3,})")
 
 
@@ -146,7 +148,7 @@ class Outbox:
         """Closed ballots that the disk did not take yet, by drive."""
         self._trouble = ""
         self._broken: BaseException | None = None
-        self._to_send, self._ended = threading.Event(), threading.Event()
+        self._to_send, self._ended, self._begun = threading.Event(), threading.Event(), False
         self._writer = threading.Thread(target=self._guarded, args=(self._write,), name="outbox", daemon=True)
         self._sender = threading.Thread(target=self._guarded, args=(self._send,), name="sender", daemon=True)
 
@@ -162,22 +164,27 @@ class Outbox:
             self._recover(drive)
         self._writer.start()
         self._sender.start()
+        self._begun = True
         return number
 
     def close(self) -> None:
-        """Write what was given, try once to send what waits, and end. What could not be sent stays in the spool."""
-        self._work.put(None)
-        self._writer.join()
-        self._ended.set()
-        self._to_send.set()
-        self._sender.join()
+        """Write what was given, try once to send what waits, and end. What could not be sent stays in the spool. An
+        outbox that never began has nothing to write."""
+        if self._begun:
+            self._work.put(None)
+            self._writer.join()
+            self._ended.set()
+            self._to_send.set()
+            self._sender.join()
         self._lock.close()
         self._raise_if_broken()
 
     def keep(self, drive: str, part: Ballot) -> None:
-        """``part``: the open ballot of some tiles. Returns at once."""
+        """``part``: the open ballot of some tiles. Returns at once. It is dropped while the disk hangs: the ballot is
+        written whole when it is closed."""
         self._raise_if_broken()
-        self._work.put(lambda: self._append(drive, part))
+        if self._work.qsize() < _QUEUED:
+            self._work.put(lambda: self._append(drive, part))
 
     def leave(self, drive: str, written: Callable[[], Ballot], following: str | None = None) -> None:
         """``drive`` is closed, and ``written`` makes its ballot; the ballot ``following`` begins. Returns at once."""
@@ -186,7 +193,7 @@ class Outbox:
 
     def discard(self, drive: str) -> None:
         """Nothing of this ballot is wanted. Returns at once."""
-        self._work.put(lambda: self._end_journal(drive))
+        self._work.put(lambda: self._drop(drive))
 
     def _raise_if_broken(self) -> None:
         if self._broken is not None:
@@ -242,7 +249,7 @@ class Outbox:
         except MapvoteError as error:
             self.report.empty += 1
             self._say(f"{drive}: no ballot ({error})")
-            self._end_journal(drive)
+            self._drop(drive)
             return
         self._say(f"{drive}: {ballot.scans_localised} of {ballot.scans} scans voted")
         self._unwritten[drive] = encode(ballot)
@@ -266,6 +273,10 @@ class Outbox:
     def _put_down(self, drive: str, data: bytes) -> None:
         with whole_file(self._path(drive, "ballot"), private=True) as part:
             part.write_bytes(data)
+
+    def _drop(self, drive: str) -> None:
+        with self._disk_may_fail():
+            self._end_journal(drive)
 
     def _end_journal(self, drive: str) -> None:
         self._journals.pop(drive, None)
@@ -305,7 +316,7 @@ class Outbox:
         """A disk that takes nothing now is said once, and again when it takes something."""
         try:
             yield
-        except MapvoteError as error:
+        except (MapvoteError, OSError) as error:
             self.report.failed_writes += 1
             if not self._trouble:
                 self._say(f"{error}. The drive goes on. Closed ballots wait in memory; a crash now loses the open one")

@@ -50,11 +50,11 @@ class Version:
         """Those of :meth:`around` that are not here."""
         return [tile for tile in self.around(position, half_m) if tile not in self.tiles]
 
-    def get(self, tile: TileIndex) -> None:
+    def get(self, tile: TileIndex, client: MapClient) -> None:
         """Have a tile here. Raises as :meth:`MapClient.fetch`."""
         planes = self.planes[tile]
-        self._client.download(planes)
-        self.tiles.add(tile, self._client.points_of(planes))
+        client.download(planes)
+        self.tiles.add(tile, client.points_of(planes))
 
     def _load(self, index: TileIndex) -> Tile:
         planes = self.planes[index]
@@ -86,7 +86,7 @@ class RoadMap:
         self.events = False
         """Whether the server's events are heard."""
         self.away = ""
-        """Why the server cannot be reached now; "" while it can."""
+        """Why the server gives no tiles now; "" while it does."""
         try:
             manifest = self._fetcher.manifest()
         except Unreachable as error:
@@ -102,12 +102,12 @@ class RoadMap:
             thread.start()
 
     def close(self) -> None:
-        """Ask for nothing more. Waits up to 5 s for a request for tiles or the manifest; each thread closes its own
-        client, that of events at the next line from the server."""
+        """Ask for nothing more. Waits up to 5 s for a request for tiles or the manifest. Each thread closes its own
+        client when it ends: that of events at the next line from the server."""
         self._ended.set()
         self._wake.set()
-        self._reader.close()
         self._threads[0].join(5.0)
+        self._reader.close()
 
     def current(self) -> PointMap:
         """See :class:`mapvote.live.drive.Maps`."""
@@ -146,17 +146,10 @@ class RoadMap:
             try:
                 self._step()
                 self.away = ""
-            except Unreachable as error:
+            except (MapvoteError, OSError) as error:
                 if not self.away:
                     log.warning("%s. The vehicle drives on the %d tiles that it has", error, self.tiles)
                 self.away, wait_s = str(error), _RETRY_S
-            except MapvoteError as error:
-                log.warning("%s", error)
-                wait_s = _RETRY_S
-            except RuntimeError:
-                if not self._ended.is_set():
-                    raise
-                return  # close() closed the client between two requests of this thread
             self._wake.wait(wait_s)
             self._wake.clear()
 
@@ -176,7 +169,7 @@ class RoadMap:
                 if self._ended.is_set():
                     return
                 try:
-                    version.get(tile)
+                    version.get(tile, self._fetcher)
                 except Refused:
                     if version is self._coming:
                         raise

@@ -63,6 +63,9 @@ def prepare(hearing: Hearing, plan: Plan, ended: Callable[[], bool]) -> tuple[li
         told = hearing.chosen.odometry is None or hearing.base_frame or poses
         if scans and hearing.measure(scans) and mounted and based and told:
             break
+        if time.monotonic() > first_s + _PATIENCE_S and not hearing.frames[0]:
+            others = ", ".join(topic.topic for topic in hearing.chosen.points[1:])
+            raise MapvoteError(f"no cloud comes from {hearing.chosen.points[0].topic}, but from {others}: is it on?")
         if time.monotonic() > first_s + _PATIENCE_S and hearing.sensor is not None:
             if not mounted:
                 raise MapvoteError(
@@ -133,6 +136,9 @@ def run(
 def _check(live: LiveDrive, hearing: Hearing) -> None:
     """Say what the first seconds show. MapvoteError if it is an error: the drive is useless, and leaves nothing."""
     clocks = hearing.clocks.trouble() if live.unchecked else ""
+    if clocks:
+        live.discard()
+        raise MapvoteError(f"the first seconds: {clocks} (--unchecked votes all the same)")
     for finding in live.first_findings():
         if finding.severity == "error":
             live.discard()
@@ -140,6 +146,3 @@ def _check(live: LiveDrive, hearing: Hearing) -> None:
         log.log(
             logging.WARNING if finding.severity == "warning" else logging.INFO, "%s. %s", finding.what, finding.mend
         )
-    if clocks:
-        live.discard()
-        raise MapvoteError(f"the first seconds: {clocks} (--unchecked votes all the same)")

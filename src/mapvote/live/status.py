@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from mapvote.core.geometry import inverse
-from mapvote.core.types import F64
+from mapvote.core.types import F64, MapvoteError
 from mapvote.formats.extras import require
 from mapvote.live.cdr import blank_message, header_of, to_cdr
 from mapvote.live.dds import Network, Publication
@@ -175,8 +175,9 @@ class RosStatus:
 
     def __init__(self, network: Network, vehicle: str) -> None:
         self._vehicle = vehicle
-        self._diagnostics: Publication = network.publish("/diagnostics", DIAGNOSTICS)
-        self._poses: Publication = network.publish(POSE_TOPIC, POSE)
+        self._diagnostics: Publication = network.publish("/diagnostics", DIAGNOSTICS, patience_s=0.0)
+        self._poses: Publication = network.publish(POSE_TOPIC, POSE, patience_s=0.0)
+        self._refused = 0
 
     def diagnose(self, status: Status, live: LiveDrive, hearing: Hearing) -> None:
         """Publish how it goes."""
@@ -196,14 +197,23 @@ class RosStatus:
             for level, about, message in status.troubles()
         ]
         header = header_of(time.time_ns(), "")
-        self._diagnostics.send(to_cdr(DIAGNOSTICS, blank_message(DIAGNOSTICS, header=header, status=said)))
+        self._send(self._diagnostics, to_cdr(DIAGNOSTICS, blank_message(DIAGNOSTICS, header=header, status=said)))
 
     def poses(self, live: LiveDrive, hearing: Hearing) -> None:
         """Publish the poses of the scans that have voted since the last time: of what odometry tracks, in the map's
         frame. The covariance is that of the sensor's position and of the rotation, in map axes."""
         while live.fixes:
             T_lidar_base = inverse(live.T_base_lidar)
-            self._poses.send(pose_message(live.fixes.popleft(), T_lidar_base, hearing.map_frame or "map"))
+            self._send(self._poses, pose_message(live.fixes.popleft(), T_lidar_base, hearing.map_frame or "map"))
+
+    def _send(self, publication: Publication, data: bytes) -> None:
+        """A message that a slow reader does not take is lost: the drive waits for nobody."""
+        try:
+            publication.send(data)
+        except MapvoteError as error:
+            self._refused += 1
+            if self._refused == 1:
+                log.warning("%s", error)
 
 
 def pose_message(fixed: Fixed, T_lidar_base: F64, frame: str) -> bytes:
