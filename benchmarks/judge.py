@@ -38,10 +38,10 @@ from mapvote.localisation.prepare import deskew, motion_at
 from mapvote.perception.frontend import Observation
 from mapvote.slam.build import build_map
 from mapvote.vehicle import Vehicle
-from mapvote_lab.evaluation.baselines.baselines import heights_above_ground
+from mapvote_lab.evaluation.baselines import heights_above_ground
 from mapvote_lab.evaluation.experiments.cases import ballot_states
-from mapvote_lab.evaluation.scoring.cells import score_cells
-from mapvote_lab.evaluation.scoring.scene_truth import Truth, error_summary, lay_on, read_truth, rigid_between
+from mapvote_lab.evaluation.scores import score_cells
+from mapvote_lab.evaluation.truths import Truth, error_summary, lay_on, read_truth, rigid_between
 from mapvote_lab.simulation import simulate
 
 

@@ -22,7 +22,7 @@ from mapvote.core.types import F32, F64, NO_VOTE, U8, Bool, CellState
 VOXEL_M = 0.2
 """dufomap: at its usual 0.1 m a 32-beam scan hardly ever makes a voxel void."""
 FAR_M = 0.5
-"""A point farther than this from the other cloud is a change (evaluation/baselines/baselines.py)."""
+"""A point farther than this from the other cloud is a change (evaluation/baselines.py)."""
 LOST_M = 1.0
 MIN_POINTS = 5
 """Far points that make a cell changed-occupied: n_min of the paper."""

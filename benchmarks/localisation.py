@@ -31,7 +31,7 @@ from mapvote.localisation.ndt import PosePrior, register
 from mapvote.localisation.odometry import Tracker
 from mapvote.localisation.prepare import deskew, motion_at
 from mapvote.slam.build import build_map
-from mapvote_lab.evaluation.scoring.scene_truth import rigid_between
+from mapvote_lab.evaluation.truths import rigid_between
 from mapvote_lab.simulation import simulate
 
 SETTINGS = Settings()

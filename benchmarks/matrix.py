@@ -26,11 +26,10 @@ from mapvote.formats.atomic import whole_file
 from mapvote_lab.evaluation.experiments.attacks import ATTACKS
 from mapvote_lab.evaluation.experiments.cases import Case, choose_cases, fuse_case
 from mapvote_lab.evaluation.experiments.conditions import Conditions
-from mapvote_lab.evaluation.experiments.passes import Pass, have_voted, passes
-from mapvote_lab.evaluation.experiments.scene import Scene
-from mapvote_lab.evaluation.reporting.sheets import Sheet
+from mapvote_lab.evaluation.experiments.scene import Pass, Scene, have_voted, passes
+from mapvote_lab.evaluation.reporting.tables import Sheet
 from mapvote_lab.evaluation.results import Judgement, to_json
-from mapvote_lab.evaluation.scoring.jury import Jury
+from mapvote_lab.evaluation.truths import Jury
 
 Round = tuple[str, int, Sequence[Ballot]]
 """Name, quorum and ballots that the server is given."""

@@ -25,7 +25,7 @@ from mapvote.codec.odds import STEPS, UNSAID
 from mapvote.core.types import F64, I64, Bool, CellState
 from mapvote.detection import confidence
 from mapvote.fusion import loss_budget
-from mapvote_lab.evaluation.scoring.reliability import binned
+from mapvote_lab.evaluation.scores import binned
 from probability_scenes import Cells, called, decided, driven, stacked, taken
 
 FIT = ("corner:1", "corner:22", "corner:44", "corner:61", "junction:1", "street:2", "slanted:1")

@@ -25,10 +25,8 @@ from mapvote.fusion.offline import update_map
 from mapvote.vehicle import NOTHING, Vehicle, offered
 from mapvote_lab.evaluation.experiments.conditions import Conditions
 from mapvote_lab.evaluation.experiments.scene import BALLOTS_FROM, Scene, key_of, sources_digest
-from mapvote_lab.evaluation.scoring.cells import UNSCORED
-from mapvote_lab.evaluation.scoring.jury import Jury
-from mapvote_lab.evaluation.scoring.map_points import map_obstacles, same_rows
-from mapvote_lab.evaluation.scoring.scene_truth import Truth
+from mapvote_lab.evaluation.scores import UNSCORED, map_obstacles, same_rows
+from mapvote_lab.evaluation.truths import Jury, Truth
 
 Told = Mapping[TileIndex, tuple[F64, F64]]
 """By tile what was looked at in its changed cells (m, k), and how deep in them their surface lies (m,), metres."""

@@ -108,9 +108,8 @@ def evaluate(
 
     from mapvote.config import cache_folder, load_with_sources
     from mapvote_lab.evaluation.evaluate import evaluate as run
-    from mapvote_lab.evaluation.experiments.cases import choose_cases
+    from mapvote_lab.evaluation.experiments.cases import PUBLISHED, as_paper, choose_cases
     from mapvote_lab.evaluation.experiments.conditions import Conditions
-    from mapvote_lab.evaluation.experiments.paper_readings import PUBLISHED, as_paper
     from mapvote_lab.evaluation.experiments.scene import Scene
     from mapvote_lab.evaluation.reporting.tables import result_json, tables, write_text
 
@@ -249,7 +248,7 @@ def demo(
     if drive is not None:
         if full or keep:
             raise typer.BadParameter("a recorded drive is not simulated: leave out --full and --keep")
-        from mapvote_lab.evaluation.demo_drive import demo_drive
+        from mapvote_lab.evaluation.demo import demo_drive
 
         with stages() as told:
             lines = demo_drive(drive, out, told, show)

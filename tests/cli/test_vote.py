@@ -12,7 +12,7 @@ from mapvote.core.point_map import map_from_points
 from mapvote.core.sensors import SENSORS
 from mapvote.core.types import MapvoteError
 from mapvote.formats import DriveWriter, write_map
-from mapvote_lab.evaluation.loopback import running_server
+from mapvote_lab.evaluation.evaluate import running_server
 
 
 def street(wall_y: float) -> np.ndarray:

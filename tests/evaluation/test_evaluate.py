@@ -20,9 +20,9 @@ from mapvote_lab.evaluation.evaluate import Evaluation, evaluate
 from mapvote_lab.evaluation.experiments.cases import choose_cases
 from mapvote_lab.evaluation.experiments.scene import Scene
 from mapvote_lab.evaluation.reporting import tables
-from mapvote_lab.evaluation.reporting.sheets import ReportSection, page
+from mapvote_lab.evaluation.reporting.tables import ReportSection, page
 from mapvote_lab.evaluation.results import EvaluationResult, to_json
-from mapvote_lab.evaluation.scoring.scene_truth import error_summary, pose_errors, rigid_between
+from mapvote_lab.evaluation.truths import error_summary, pose_errors, rigid_between
 
 SLOWER = {"rate_hz": 4.0, "sensor": "vlp16"}
 """Fewer scans and beams than the paper has: a test asks whether it works, not how well."""
@@ -99,7 +99,7 @@ def test_a_misspelt_case_is_named() -> None:
 
 
 def test_no_truth_no_score(tmp_path: Path) -> None:
-    from mapvote_lab.evaluation.scoring.scene_truth import read_truth
+    from mapvote_lab.evaluation.truths import read_truth
 
     with pytest.raises(MapvoteError, match="no usable truth"):
         read_truth(tmp_path)
@@ -168,7 +168,7 @@ def test_the_demo_tells_its_story(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_a_recorded_street_is_mapped_and_voted_on_by_the_same_drive(tmp_path: Path) -> None:
-    from mapvote_lab.evaluation.demo_drive import demo_drive
+    from mapvote_lab.evaluation.demo import demo_drive
 
     drive = Path("../shared/data/kitti/2011_09_26_0001")
     if not drive.exists():

@@ -16,7 +16,7 @@ from mapvote.formats import write_map
 from mapvote.fusion.offline import update_map
 from mapvote.localisation.localiser import GivenPoses
 from mapvote.vehicle import Vehicle
-from mapvote_lab.evaluation.loopback import running_server, vote_by_http
+from mapvote_lab.evaluation.evaluate import running_server, vote_by_http
 
 
 def wall(y: float) -> np.ndarray:

@@ -20,7 +20,7 @@ from mapvote.codec.path import pack_path
 from mapvote.core.grid import TILE_CELLS, Lattice
 from mapvote.core.types import NO_VOTE, U8, CellState
 from mapvote.fusion.next_pass import Witness, one_vote_short, stretches
-from mapvote.server.http.in_process import URL, in_process
+from mapvote.server.http.app import URL, in_process
 from mapvote.server.store.store import Store
 
 CO, CE = CellState.CHANGED_OCCUPIED, CellState.CHANGED_EMPTY

@@ -10,7 +10,7 @@ import pytest
 from mapvote.core.geometry import inverse, transform
 from mapvote.core.grid import CELL_SIZE
 from mapvote.core.types import F64, U8
-from mapvote_lab.evaluation.scoring.scene_truth import Truth, read_truth
+from mapvote_lab.evaluation.truths import Truth, read_truth
 from mapvote_lab.simulation import simulate
 from mapvote_lab.simulation.scenario import load_scenario
 from mapvote_lab.simulation.truth import T_map_street, truth_grid

@@ -18,7 +18,7 @@ from mapvote.localisation.map_window import MapWindow
 from mapvote.localisation.ndt import PosePrior
 from mapvote.localisation.odometry import Tracker
 from mapvote.slam.build import BuildReport, _agreed_heights, build_map
-from mapvote_lab.evaluation.scoring.scene_truth import rigid_between
+from mapvote_lab.evaluation.truths import rigid_between
 from mapvote_lab.simulation import simulate
 from streets import drive_along, path, street
 

@@ -73,7 +73,7 @@ def api_at(
         finally:
             server.close()
         return
-    from mapvote.server.http.in_process import URL, in_process
+    from mapvote.server.http.app import URL, in_process
     from mapvote.server.views.localisation_gate import gate_by
 
     gate = None if settings is None else gate_by(settings.ndt)

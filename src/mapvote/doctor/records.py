@@ -178,7 +178,7 @@ def _counts(tiles: list[BallotTile]) -> tuple[int, int]:
 
 def check_store(store: Store) -> list[Finding]:
     """Everything that the doctor finds in an open store, errors first. Every byte is read."""
-    from mapvote.server.views.overview import overview
+    from mapvote.server.views.history import overview
 
     found = _damage(store)
     at_a_glance = overview(store)

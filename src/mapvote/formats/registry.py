@@ -24,7 +24,7 @@ from mapvote.formats.drives.datasets import (
 from mapvote.formats.drives.kitti import is_kitti_folder, open_kitti
 from mapvote.formats.drives.options import DriveOptions
 from mapvote.formats.drives.rosbag import is_rosbag, open_rosbag
-from mapvote.formats.drives.scan_files import is_cloud_scans, is_pcd_drive, open_cloud_scans, open_pcd_drive
+from mapvote.formats.drives.scan_folder import is_cloud_scans, is_pcd_drive, open_cloud_scans, open_pcd_drive
 from mapvote.formats.maps.autoware import (
     is_autoware,
     is_autoware_default,

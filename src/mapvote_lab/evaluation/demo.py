@@ -1,33 +1,177 @@
-"""``mapvote demo``: a simulated street becomes an updated map and a report, with a first picture within seconds."""
+"""``mapvote demo``: a simulated street becomes an updated map and a report, with a first picture within seconds.
+
+``mapvote demo DRIVE``: a recorded street, mapped from some of its scans and voted on by the others. Nothing changes on
+a street within one drive. So new bodies are cast into the scans of the vehicles that vote, as in ``mapvote evaluate
+real``: the vote has to find them, and has to leave the rest of the street as it is.
+"""
 
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+
+import numpy as np
+from matplotlib.colors import to_rgb
 
 from mapvote.config import Settings
 from mapvote.core.point_map import PointMap, all_points
 from mapvote.core.process_memory import give_back_free_pages
-from mapvote.core.types import MapvoteError
-from mapvote.formats import write_map
+from mapvote.core.types import F64, CellState, Drive, MapvoteError
+from mapvote.formats import open_drive, write_map
 from mapvote.formats.atomic import whole_file
 from mapvote.formats.maps.cloud import Cloud
 from mapvote.formats.maps.pcd import write_pcd
+from mapvote.plots import NEW, save
 from mapvote.server.store.store import Store, url_of
 from mapvote.server.views.cutout import Cutout
 from mapvote.server.views.history import changes_between, cutouts_between
+from mapvote.slam.build import build_map
 from mapvote.warmup import compile_for_maps, compile_for_votes
 from mapvote_lab.evaluation.demo_report import CASE, Story, draw_scans, report_page, tell
-from mapvote_lab.evaluation.evaluate import Evaluation, evaluate
+from mapvote_lab.evaluation.evaluate import Evaluation, evaluate, vote_by_http
 from mapvote_lab.evaluation.experiments.cases import choose_cases
+from mapvote_lab.evaluation.experiments.real import bench
+from mapvote_lab.evaluation.experiments.real.street import RealRun, Street, lay_street
 from mapvote_lab.evaluation.experiments.scene import Progress, Scene
-from mapvote_lab.evaluation.loopback import vote_by_http
+from mapvote_lab.evaluation.reporting import figures
 from mapvote_lab.evaluation.reporting.gallery import gallery
-from mapvote_lab.evaluation.reporting.tables import as_text, result_csv, result_json, write_text
-from mapvote_lab.evaluation.scoring.map_points import same_rows
+from mapvote_lab.evaluation.reporting.real_report import draw_things
+from mapvote_lab.evaluation.reporting.tables import ReportSection, as_text, page, result_csv, result_json, write_text
+from mapvote_lab.evaluation.scores import same_rows
 from mapvote_lab.simulation.processes import processes
+
+SCANS = 120
+"""Of the drive, at most: the demo is to take a minute."""
+SEED, EACH = 1, 2
+"""Places of the new bodies, and how many there are of each kind."""
+MISSED = "#f2c230"
+
+
+def demo_drive(folder: Path, out: Path, progress: Progress, show: Callable[[Path], None]) -> list[str]:
+    """Map a recorded drive, vote on it, draw and report; returns the lines that sum it up.
+
+    Blocks of 12 scans are the map, the blocks between them three vehicles. ``show(path)`` is called with the first
+    picture. MapvoteError if the drive cannot be read, is too short, or does not fit on itself.
+    """
+    settings = Settings()
+    cases, _ = choose_cases(settings, CASE)
+    with processes(2) as compilers:
+        compiling = [compilers.submit(compile_kernels) for compile_kernels in (compile_for_maps, compile_for_votes)]
+        recording, length = first_scans(folder)
+        scan = draw_scan(recording, out / "pictures" / "scan.png")
+        show(scan)
+        for done, compiled in enumerate(compiling):
+            progress("compiling", done, len(compiling))
+            compiled.result()
+    progress("compiling", 2, 2)
+    progress("mapping", 0, 2)
+    reference = build_map([recording], settings)[1].tracks[0].T_map_lidar
+    progress("mapping", 1, 2)
+    street = lay_street(recording, settings, reference)
+    write_map(street.point_map, out / "map")
+    progress("mapping", 2, 2)
+    progress("voting", 0, 1)
+    run, asked, things = bench.new_things(street, bench.survey_site(street), cases, SEED, EACH)
+    progress("voting", 1, 1)
+    found = bench.score(asked, run.states[CASE])
+    pictures = [
+        (scan, "One scan of the drive, coloured by height."),
+        (out / "pictures" / "street.png", "The map. Red: returns of new bodies in cells that the vote calls changed "
+         "(occupied). Yellow: returns of new bodies that the vote missed."),
+        (out / "pictures" / "from_above.png", "Every cell, and each new body from near. Red: new and found. Yellow: "
+         "missed. Black: called changed where nothing changed."),
+    ]  # fmt: skip
+    draw_street(run, [np.concatenate(thing.met) for thing in things if thing.met], pictures[1][0])
+    draw_things(run, CASE, asked, pictures[2][0])
+    facts = [
+        (f"{sum(f.half for f in found)} of {sum(f.things for f in found)}", "new bodies found by half of their cells"),
+        (
+            f"{100 * run.changed_share(CASE, with_movers=False):.2f} %",
+            "of the decided cells called changed",
+        ),
+        (f"{100 * run.lost_share:.0f} %", "of the scans abstained"),
+        (f"{100 * float(np.median(run.error_m)):.1f} cm", "median distance from the SLAM trajectory"),
+    ]
+    text = page(f"Three vehicles voted on {folder.name}", _LEAD, facts, _sections(folder, street, length, pictures))
+    write_text(text, out / "report.html")
+    lines = [f"{what}: {figure}" for figure, what in facts]
+    return [*lines, f"{out / 'report.html'}: the story with pictures", f"{out / 'map'}: the map"]
+
+
+_LEAD = (
+    "A street is mapped from a part of a recording and driven by the rest. Bodies that never stood there are cast into "
+    "the scans of the vehicles, so that the vote has something to find."
+)
+
+
+def first_scans(folder: Path) -> tuple[Drive, int]:
+    """The first SCANS scans of the drive at ``folder``, and how many it has."""
+    length = len(open_drive(folder))
+    return open_drive(folder, scans=f"0:{min(SCANS, length)}"), length
+
+
+def draw_scan(recording: Drive, path: Path) -> Path:
+    """Draw the middle scan of a drive in its own frame."""
+    scan = recording.read_scan(len(recording) // 2)
+    points = scan.points[np.linalg.norm(scan.points, axis=1) < 45.0].astype(np.float64)
+    if len(points) == 0:
+        raise MapvoteError(f"{recording.path}: the middle scan has no return within 45 m; mapvote doctor looks at it")
+    ground_z = float(np.percentile(points[:, 2], 5))
+    panel = (f"{recording.path.name}: {len(points):,} returns", points, figures.shades(points[:, 2] - ground_z))
+    save(figures.draw([panel], figures.Camera((0.0, 0.0, ground_z), 62.0, 205.0, 38.0), size_m=0.1), path)
+    return path
+
+
+def draw_street(run: RealRun, cast: Sequence[F64], path: Path) -> None:
+    """Draw the map and the returns (n, 3) of each new body, by whether the vote found their cells."""
+    street, points = run.street, all_points(run.street.point_map)
+    positions = street.T_map_lidar[:, :3, 3]
+    middle = positions[len(positions) // 2]
+    along = positions[-1] - positions[0]
+    road_z = float(np.median(positions[:, 2])) - _height_over_road(street)
+    near = np.linalg.norm(points[:, :2] - middle[:2], axis=1) < 70.0
+    clouds, colours = [points[near]], [figures.shades(points[near, 2] - road_z)]
+    for returns in cast:
+        rows, cols, inside = street.grid.indices_of(returns)
+        found = np.zeros(len(returns), dtype=np.bool_)
+        found[inside] = run.states[CASE][rows[inside], cols[inside]] == CellState.CHANGED_OCCUPIED
+        clouds.append(returns)
+        colours.append(np.where(found[:, None], to_rgb(NEW), to_rgb(MISSED)).astype(np.float32))
+    behind = float(np.degrees(np.arctan2(-along[1], -along[0]))) + 25.0
+    camera = figures.Camera((float(middle[0]), float(middle[1]), road_z), 75.0, behind, 38.0)
+    panel = (f"{len(points):,} map points", np.concatenate(clouds), np.concatenate(colours))
+    save(figures.draw([panel], camera, legend=[("new, found", NEW), ("new, missed", MISSED)]), path)
+
+
+def _height_over_road(street: Street) -> float:
+    return float(street.built.tracks[0].heights.median_m)
+
+
+def _sections(folder: Path, street: Street, length: int, pictures: Sequence[tuple[Path, str]]) -> list[ReportSection]:
+    used = len(street.recording)
+    return [
+        ReportSection(
+            "What happened",
+            [
+                f"{used} of the {length} scans were read. Blocks of 12 scans became the map; the blocks between them "
+                "are three vehicles, every third scan each.",
+                "All scans come from one drive. So this report says less than a second drive on another day would.",
+            ],
+            pictures,
+        ),
+        ReportSection(
+            "What to try next",
+            commands=(
+                f"mapvote doctor {folder}\n"
+                f"mapvote evaluate real {folder} --out bench    # more bodies, wrong priors, rain; takes minutes\n"
+                f"mapvote build {folder} --out my_map\n"
+                "mapvote vote ANOTHER_DRIVE --map my_map --vehicle car_1 --out car_1.ballot\n"
+            ),
+        ),
+    ]
+
 
 SCENARIO, FULL_SCENARIO = "corner", "street"
 SEED = 2

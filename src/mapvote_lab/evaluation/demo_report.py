@@ -16,16 +16,13 @@ from mapvote.core.types import F64, Bool
 from mapvote.localisation.localiser import GivenPoses
 from mapvote.plots import save
 from mapvote.server.views.cutout import Cutout, fragment
-from mapvote_lab.evaluation.evaluate import Evaluation
+from mapvote_lab.evaluation.evaluate import Evaluation, PublishedRound
 from mapvote_lab.evaluation.experiments.scene import Scene
-from mapvote_lab.evaluation.loopback import PublishedRound
-from mapvote_lab.evaluation.reporting import birdseye
+from mapvote_lab.evaluation.reporting import figures
 from mapvote_lab.evaluation.reporting.gallery import MOVER, ChangedArea, areas_of
-from mapvote_lab.evaluation.reporting.sheets import ReportSection, page
-from mapvote_lab.evaluation.reporting.tables import case_name, tables
+from mapvote_lab.evaluation.reporting.tables import ReportSection, case_name, page, tables
 from mapvote_lab.evaluation.results import EvaluationResult
-from mapvote_lab.evaluation.scoring import paper_tables
-from mapvote_lab.evaluation.scoring.map_points import same_rows
+from mapvote_lab.evaluation.scores import PAPER_F1, same_rows
 
 CASE = "surfaces"
 """Whose updated map the demo shows: the product's own rule; the paper's cases stand beside it in the tables."""
@@ -178,12 +175,12 @@ def _how_good(result: EvaluationResult, drawn: Mapping[str, Picture]) -> ReportS
 
 def beside_the_paper(result: EvaluationResult) -> ReportSection:
     """Why this street is harder for the paper's cases than the paper's own street."""
-    ours = {case: result.cases[case].provenance.macro_f1 for case in paper_tables.F1}
+    ours = {case: result.cases[case].provenance.macro_f1 for case in PAPER_F1}
     return ReportSection(
         "Beside the paper's own table",
         [
             f"Case 1 reaches {ours['1']:.3f} on this street (provenance truth); the paper prints "
-            f"{paper_tables.F1['1']:.3f} for its own.",
+            f"{PAPER_F1['1']:.3f} for its own.",
             *WHY_HARDER,
             "mapvote evaluate as_published repeats the paper's experiment on a street like the paper's. mapvote "
             "evaluate corner --readings compares every reading of the paper's open sentences.",
@@ -211,12 +208,12 @@ def draw_scans(scene: Scene, path: Path) -> Picture:
     panels = []
     for name, title in ((scene.drive_names("survey_")[0], "(a) The survey"), (scene.drive_names("v")[0], "(b) Later")):
         points, moving, ground_z = _measured(scene, name)
-        colours = birdseye.shades(points[:, 2] - ground_z)
+        colours = figures.shades(points[:, 2] - ground_z)
         colours[moving] = to_rgb(MOVER)
         panels.append((f"{title}: {len(points):,} returns", points, colours))
     middle = scene.true_poses(scene.drive_names("v")[0])[:, :3, 3].mean(axis=0)
-    camera = birdseye.Camera((float(middle[0]), float(middle[1]), 0.0), 62.0, 205.0, 40.0)
-    save(birdseye.draw(panels, camera, legend=[("moving", MOVER)], size_m=0.12), path)
+    camera = figures.Camera((float(middle[0]), float(middle[1]), 0.0), 62.0, 205.0, 40.0)
+    save(figures.draw(panels, camera, legend=[("moving", MOVER)], size_m=0.12), path)
     return path, "What the LiDARs measured before and after the change, at the true poses; bodies that move in orange."
 
 

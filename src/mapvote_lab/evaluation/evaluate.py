@@ -1,19 +1,29 @@
-"""``mapvote evaluate``: a scenario and a seed become Tables II-IV and what else there is to measure (paper V)."""
+"""``mapvote evaluate``: a scenario and a seed become Tables II-IV and what else there is to measure (paper V).
+
+The vehicles vote through a real server: its own process on this machine, spoken to by HTTP alone (paper, Figure 1).
+"""
 
 from __future__ import annotations
 
 import os
+import subprocess
+import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 
+import httpx2
 from msgspec.structs import asdict
 
+from mapvote.client import MapClient
 from mapvote.codec.ballot import Ballot
 from mapvote.core.grid import Grid
 from mapvote.core.point_map import PointMap
-from mapvote_lab.evaluation.baselines.baselines import yardsticks
-from mapvote_lab.evaluation.experiments.cases import Case, fuse_case
+from mapvote.core.types import MapvoteError
+from mapvote_lab.evaluation.baselines import yardsticks
+from mapvote_lab.evaluation.experiments.cases import Case, fuse_case, read_kept, swept
 from mapvote_lab.evaluation.experiments.localisation_errors import (
     T_map_world_of,
     in_changed_areas,
@@ -21,14 +31,73 @@ from mapvote_lab.evaluation.experiments.localisation_errors import (
     map_shift,
     survey_anew,
 )
-from mapvote_lab.evaluation.experiments.paper_readings import read_kept, swept
-from mapvote_lab.evaluation.experiments.passes import Pass, pass_folder, passes
-from mapvote_lab.evaluation.experiments.scene import Progress, Scene
+from mapvote_lab.evaluation.experiments.scene import Pass, Progress, Scene, pass_folder, passes
 from mapvote_lab.evaluation.results import CaseResult, Cost, EvaluationResult, Timings
-from mapvote_lab.evaluation.scoring.cells import Scores
-from mapvote_lab.evaluation.scoring.jury import CaseOutcome, Jury
-from mapvote_lab.evaluation.scoring.scene_truth import Truth
-from mapvote_lab.evaluation.scoring.truths import SIDE_BY_SIDE, sizes_by_height
+from mapvote_lab.evaluation.scores import Scores
+from mapvote_lab.evaluation.truths import SIDE_BY_SIDE, CaseOutcome, Jury, Truth, sizes_by_height
+
+_STOP_S = 20.0
+
+
+@dataclass(frozen=True, slots=True)
+class PublishedRound:
+    """What a server made of a fleet's ballots."""
+
+    updated: PointMap
+    """The newest map, as a vehicle downloads it."""
+    version: int
+    held: str
+    """Why the server held the version until the operator overrode it; "" if it did not."""
+
+
+@contextmanager
+def running_server(store: Path, first_map: Path, log: Path) -> Iterator[str]:
+    """The URL of ``mapvote serve`` on a new ``store``, on any free port; stopped on leaving. Logs go to ``log``.
+
+    MapvoteError with the server's last line if it does not come up.
+    """
+    command = [sys.executable, "-m", "mapvote", "serve", str(store), "--map", str(first_map)]
+    command += ["--port", "0", "--open"]
+    with log.open("w") as errors, subprocess.Popen(command, stdout=subprocess.PIPE, stderr=errors, text=True) as server:
+        try:
+            assert server.stdout is not None
+            said = server.stdout.readline().split()
+            if len(said) != 2 or said[0] != "serving":
+                last = (log.read_text().splitlines() or ["it said nothing"])[-1]
+                raise MapvoteError(f"the server did not start ({last}); is mapvote installed with its server extra?")
+            yield said[1]
+        finally:
+            server.terminate()
+            try:
+                server.wait(_STOP_S)
+            except subprocess.TimeoutExpired:
+                server.kill()
+
+
+def vote_by_http(ballots: Sequence[Ballot], first_map: Path, folder: Path) -> PublishedRound:
+    """Start a server, send every ballot as its vehicle would, publish, and download the newest map.
+
+    ``folder`` keeps the store, the clients' homes and the server's log. MapvoteError if the server refuses a ballot.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    store = folder / "store.db"
+    for old in folder.glob("store.db*"):
+        old.unlink()
+    with running_server(store, first_map, folder / "server.log") as url:
+        for ballot in ballots:
+            with MapClient(url, home=folder / ballot.vehicle) as client:
+                if client.send(ballot) == "spooled":
+                    raise MapvoteError(f"{url}: did not take {ballot.vehicle}'s ballot; see {folder / 'server.log'}")
+        ask = {"reason": "a round of votes on this machine"}
+        answer, held = httpx2.post(f"{url}/v1/publish", json=ask, timeout=120.0), ""
+        if answer.status_code == 409:
+            held = str(answer.json().get("detail", "for no reason given"))
+            answer = httpx2.post(f"{url}/v1/publish", json={**ask, "override": True}, timeout=120.0)
+        if answer.status_code != 200:
+            raise MapvoteError(f"{url}: publishing failed ({answer.status_code}); see {folder / 'server.log'}")
+        with MapClient(url, home=folder / "reader") as client:
+            updated = client.fetch()
+            return PublishedRound(updated, client.version or 0, held)
 
 
 @dataclass(frozen=True)

@@ -11,10 +11,18 @@ from typing import Any
 
 import msgspec
 
-from mapvote_lab.evaluation.scoring.cells import Scores
-from mapvote_lab.evaluation.scoring.map_points import MapScores
-from mapvote_lab.evaluation.scoring.objects import ObjectScores
-from mapvote_lab.evaluation.scoring.scene_truth import PoseErrors
+from mapvote_lab.evaluation.scores import MapScores, ObjectScores, Scores
+
+
+class PoseErrors(msgspec.Struct, frozen=True, kw_only=True):
+    """Of a drive's scans: over those that were localised."""
+
+    scans: int
+    localised: int
+    median_m: float
+    p99_m: float
+    max_m: float
+    median_deg: float
 
 
 class Judgement(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
@@ -28,7 +36,7 @@ class Judgement(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     """Share of the scored cells that some vehicle determined."""
     objects: ObjectScores
     also: dict[str, Scores] = {}
-    """By the further truths of ``scoring/truths.py``."""
+    """By the further truths of ``evaluation/truths.py``."""
     map: MapScores | None = None
     """None (not in the JSON) where no map was edited: the yardsticks only decide cells."""
 

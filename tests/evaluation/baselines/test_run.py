@@ -11,9 +11,8 @@ from mapvote.core.grid import Grid, Lattice
 from mapvote.core.point_map import PointMap, map_from_points
 from mapvote.core.reference import reference_window
 from mapvote.core.types import CellState
-from mapvote_lab.evaluation.baselines.baselines import NearestNeighbour
-from mapvote_lab.evaluation.baselines.dempster_shafer import EvidenceMap, combine, dempster
-from mapvote_lab.evaluation.scoring.map_points import map_obstacles
+from mapvote_lab.evaluation.baselines import EvidenceMap, NearestNeighbour, combine, dempster
+from mapvote_lab.evaluation.scores import map_obstacles
 
 GRID = Grid(Lattice(), 0, 0, 60, 100)
 ORIGIN = np.array([15.0, 2.0, 1.9])

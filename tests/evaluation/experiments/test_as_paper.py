@@ -6,7 +6,7 @@ import pytest
 
 from mapvote.config import Settings
 from mapvote.core.types import MapvoteError
-from mapvote_lab.evaluation.experiments.paper_readings import as_paper
+from mapvote_lab.evaluation.experiments.cases import as_paper
 
 
 def test_an_occluded_scan_abstains_by_default_and_the_map_of_the_papers_street_keeps_whatever_stood_still() -> None:

@@ -20,7 +20,7 @@ from mapvote_lab.evaluation.experiments.conditions import (
     ar1,
     with_true_ground,
 )
-from mapvote_lab.evaluation.scoring.scene_truth import read_truth
+from mapvote_lab.evaluation.truths import read_truth
 from mapvote_lab.simulation import simulate
 from mapvote_lab.simulation.scenario import load_scenario
 from mapvote_lab.simulation.world import make_world

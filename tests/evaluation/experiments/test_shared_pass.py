@@ -16,7 +16,7 @@ from mapvote.core.types import F64, Drive, Scan
 from mapvote.localisation.localiser import GivenPoses
 from mapvote.vehicle import vote_drive
 from mapvote_lab.evaluation.experiments.cases import choose_cases
-from mapvote_lab.evaluation.experiments.passes import SharedPass
+from mapvote_lab.evaluation.experiments.scene import SharedPass
 
 N = 8
 POSES = np.array([from_xyz_rpy(20.0 + 0.2 * i, 20.0, 1.8) for i in range(N)])

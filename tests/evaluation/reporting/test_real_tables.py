@@ -19,7 +19,7 @@ from mapvote_lab.evaluation.experiments.real.bench import (
     Ground,
 )
 from mapvote_lab.evaluation.reporting.real_report import real_tables
-from mapvote_lab.evaluation.reporting.sheets import Sheet
+from mapvote_lab.evaluation.reporting.tables import Sheet
 
 GRID = Grid(Lattice(), 0, 0, 10, 10)
 

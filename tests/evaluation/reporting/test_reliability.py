@@ -13,7 +13,7 @@ from mapvote.core.types import NO_VOTE, CellState
 from mapvote.core.voting import VOTE_UNIT
 from mapvote.fusion.fuse import Decision
 from mapvote_lab.evaluation.reporting.figures import reliability_diagram
-from mapvote_lab.evaluation.scoring.reliability import binned, reliability
+from mapvote_lab.evaluation.scores import binned, reliability
 
 
 def test_a_bin_tells_how_often_what_it_speaks_of_was_so() -> None:

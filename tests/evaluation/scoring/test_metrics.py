@@ -17,31 +17,35 @@ from hand_made import make_map, make_tile
 from hand_made import wall as tile_wall
 from mapvote.core.types import NO_VOTE, CellState
 from mapvote_lab.evaluation.results import to_json
-from mapvote_lab.evaluation.scoring import paper_tables
-from mapvote_lab.evaluation.scoring.cells import (
+from mapvote_lab.evaluation.scores import (
+    PAPER_F1,
+    PAPER_SCORES,
     UNSCORED,
     ByClass,
+    MapJudge,
+    ObjectScores,
     Scores,
     classes_of,
     confusion,
     determined_share,
     harmonic_mean,
+    map_obstacles,
     ratio,
+    same_rows,
     score_cells,
+    score_objects,
 )
-from mapvote_lab.evaluation.scoring.map_points import MapJudge, map_obstacles, same_rows
-from mapvote_lab.evaluation.scoring.objects import ObjectScores, score_objects
 
 
 @pytest.mark.parametrize("case", ["1", "2", "3", "4", "5"])
 def test_table_iv_follows_from_tables_ii_and_iii(case: str) -> None:
-    assert paper_tables.SCORES[case].macro_f1 == pytest.approx(paper_tables.F1[case], abs=0.001)
+    assert PAPER_SCORES[case].macro_f1 == pytest.approx(PAPER_F1[case], abs=0.001)
 
 
 def test_the_f1_of_kim_is_another_number() -> None:
     # 2 x .7963 x .9203 / (.7963 + .9203)
-    assert paper_tables.SCORES["5"].kim_f1 == pytest.approx(0.8539, abs=0.0001)
-    assert paper_tables.SCORES["5"].kim_f1 != pytest.approx(paper_tables.SCORES["5"].macro_f1, abs=0.001)
+    assert PAPER_SCORES["5"].kim_f1 == pytest.approx(0.8539, abs=0.0001)
+    assert PAPER_SCORES["5"].kim_f1 != pytest.approx(PAPER_SCORES["5"].macro_f1, abs=0.001)
 
 
 def test_undetermined_and_never_seen_count_as_unchanged() -> None:

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from mapvote.core.geometry import exp, from_xyz_rpy, inverse
 from mapvote.core.grid import CELL_SIZE, Grid, Lattice
 from mapvote.core.types import F64, NO_VOTE, MapvoteError
-from mapvote_lab.evaluation.scoring.scene_truth import (
+from mapvote_lab.evaluation.truths import (
     Truth,
     error_summary,
     lay_on,

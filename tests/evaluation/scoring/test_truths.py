@@ -10,12 +10,12 @@ import pytest
 
 from mapvote.core.grid import CELL_SIZE, Grid, Lattice
 from mapvote.core.types import F64, Reference
-from mapvote_lab.evaluation.scoring.cells import UNSCORED
-from mapvote_lab.evaluation.scoring.scene_truth import Truth
-from mapvote_lab.evaluation.scoring.truths import (
+from mapvote_lab.evaluation.scores import UNSCORED
+from mapvote_lab.evaluation.truths import (
     BANDS,
     BORDER_M,
     TRUTHS,
+    Truth,
     border,
     ceiling,
     lowest_surface,

@@ -19,8 +19,7 @@ from mapvote.core.sensors import SENSORS
 from mapvote.core.types import F32, F64, MapvoteError
 from mapvote.formats import open_drive
 from mapvote.formats.drives.point_fields import point_times_s
-from mapvote.formats.geo.frame import enu_frame
-from mapvote.formats.geo.gnss import poses_from_gnss
+from mapvote.formats.geo.frame import enu_frame, poses_from_gnss
 
 N, START = 5, 1_700_000_000_123_456_789
 STORE = get_typestore(Stores.ROS2_HUMBLE)

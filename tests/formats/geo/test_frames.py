@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 
 from mapvote.core.types import MapvoteError
 from mapvote.formats.geo.frame import MapFrame, enu_frame, read_crs, utm_of
-from mapvote.formats.geo.las_keys import frame_of_keys
 from mapvote.formats.geo.projector import autoware_frame, frame_of, frame_of_projector, projector_of, read_projector
 from mapvote.formats.geo.units import settle, with_units
+from mapvote.formats.maps.las import frame_of_keys
 
 TOKYO = (139.6503, 35.6762)
 PLACES = st.tuples(st.floats(-179, 179), st.floats(-75, 75), st.floats(-100, 4000))

@@ -19,7 +19,7 @@ from mapvote.core.lazy_tiles import LazyTiles
 from mapvote.core.point_map import PointMap, map_from_points
 from mapvote.core.types import F64, CellState, MapvoteError
 from mapvote.formats import export_map, read_map, write_map
-from mapvote.formats.maps import pcd, ply, spill
+from mapvote.formats.maps import pcd, ply, tiling
 from mapvote.formats.maps.cloud import Cloud, lattice_of
 from mapvote.formats.maps.importing import import_cloud
 from mapvote.formats.maps.mapvote_folder import read_manifest
@@ -78,7 +78,7 @@ def test_points_are_looked_at_before_tiles_are_cut(monkeypatch: pytest.MonkeyPat
 def large(monkeypatch: pytest.MonkeyPatch) -> None:
     """Everything counts as larger than memory."""
     monkeypatch.setattr(lazy_tiles, "KEPT_POINTS", 1500)
-    monkeypatch.setattr(spill, "_IN_MEMORY", 1)
+    monkeypatch.setattr(tiling, "_IN_MEMORY", 1)
     monkeypatch.setattr(pcd, "_BLOCK", 700)
     monkeypatch.setattr(ply, "_BLOCK", 700)
 
@@ -141,7 +141,7 @@ def test_a_large_map_leaves_as_the_same_file(tmp_path: Path, out: str, monkeypat
     small = map_of("it", [Cloud(points, fields=fields)])
     export_map(small, tmp_path / "small" / out)
     monkeypatch.setattr(lazy_tiles, "KEPT_POINTS", 1500)
-    monkeypatch.setattr(spill, "_IN_MEMORY", 1)
+    monkeypatch.setattr(tiling, "_IN_MEMORY", 1)
     large = map_of("it", [Cloud(points, fields=fields)])
     assert isinstance(large.tiles, LazyTiles)
     export_map(large, tmp_path / "large" / out)
@@ -173,7 +173,7 @@ def test_a_file_that_is_cut_off_late_leaves_no_map(tmp_path: Path, monkeypatch: 
 
 
 def test_a_full_disk_is_one_clear_error(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(spill, "_IN_MEMORY", 1)
+    monkeypatch.setattr(tiling, "_IN_MEMORY", 1)
 
     def full(**_: object) -> None:
         raise OSError(28, "No space left on device")

@@ -23,8 +23,7 @@ from live_server import serving, serving_here
 from mapvote.client import MapClient
 from mapvote.config.server import ServerSettings
 from mapvote.core.types import CellState
-from mapvote.server.http.event_routes import as_sse
-from mapvote.server.http.webhook import deliver
+from mapvote.server.http.event_routes import as_sse, deliver
 from mapvote.server.store import schema
 from mapvote.server.store.queries import log_event
 from mapvote.server.store.store import Store

@@ -13,7 +13,7 @@ from mapvote.codec.ballot import encode
 from mapvote.config import Settings
 from mapvote.config.server import ServerSettings
 from mapvote.core.types import CellState
-from mapvote.server.http.in_process import URL, in_process
+from mapvote.server.http.app import URL, in_process
 from mapvote.server.store import keys
 from mapvote.server.store.store import Store
 

@@ -39,7 +39,7 @@ from mapvote.server.store.publish import publish, rollback
 from mapvote.server.store.replay import replay
 from mapvote.server.store.retention import clear
 from mapvote.server.store.store import Store
-from mapvote.server.views.overview import overview
+from mapvote.server.views.history import overview
 from stores import send
 
 POLICY = Policy(fuse=FuseSettings(max_deleted_share=1.0))

@@ -31,13 +31,16 @@ from mapvote.core import geometry
 from mapvote.core.types import F64, I64, Drive, MapvoteError
 from mapvote.formats.clean import log
 from mapvote.formats.drives.options import DriveFile, DriveOptions, map_frame, read_drive_file
-from mapvote.formats.drives.scan_files import NUSCENES, BinLayout, layout_of, read_bytes
 from mapvote.formats.drives.scan_folder import (
+    NUSCENES,
+    BinLayout,
     ScanFolder,
+    layout_of,
     lines_of_scans,
     number_of,
     of_scans,
     open_scan_folder,
+    read_bytes,
     read_times_ns,
     scan_files,
 )
@@ -50,8 +53,7 @@ from mapvote.formats.drives.trajectory import (
     sorted_trajectory,
 )
 from mapvote.formats.extras import read_text
-from mapvote.formats.geo.frame import MapFrame, utm_of
-from mapvote.formats.geo.gnss import poses_from_gnss
+from mapvote.formats.geo.frame import MapFrame, poses_from_gnss, utm_of
 from mapvote.formats.maps.pcd import read_pcd_table
 
 _LIDAR_TOP = ("samples/LIDAR_TOP", "sweeps/LIDAR_TOP")

@@ -16,8 +16,7 @@ import tomli_w
 from mapvote.core.sensors import Sensor
 from mapvote.core.types import F32, F64, I64, Drive, MapvoteError
 from mapvote.formats.drives.options import DriveOptions, read_drive_file
-from mapvote.formats.drives.scan_files import layout_of
-from mapvote.formats.drives.scan_folder import ScanFolder, open_scan_folder, read_stamps, scan_files
+from mapvote.formats.drives.scan_folder import ScanFolder, layout_of, open_scan_folder, read_stamps, scan_files
 
 
 def is_kitti_folder(path: Path) -> bool:

@@ -30,8 +30,7 @@ from mapvote.formats.drives.trajectory import (
     sorted_trajectory,
 )
 from mapvote.formats.extras import first_line, require
-from mapvote.formats.geo.frame import MapFrame
-from mapvote.formats.geo.gnss import poses_from_gnss, yaw_from_track
+from mapvote.formats.geo.frame import MapFrame, poses_from_gnss, yaw_from_track
 
 CLOUD = "sensor_msgs/msg/PointCloud2"
 _SWEEP = 0.55

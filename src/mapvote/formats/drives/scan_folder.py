@@ -1,28 +1,38 @@
 """Folders of numbered scan files, one a scan, and the text files beside them: which line belongs to which scan.
 
-Every such layout opens through :func:`open_scan_folder`; a new one only locates the files.
+Every such layout opens through :func:`open_scan_folder`; a new one only locates the files. Some files say, or nearly
+say, what they hold: bin and npy, PLY, LAS, LAZ, PCD. Bare numbers have columns: KITTI has four float32, nuScenes five.
+A VIEWPOINT of PCD files that changes from scan to scan is the pose of the sensor, and serves as the prior. Some tools
+store the points in the map frame then: they are taken back into the sensor's frame.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
+from mapvote.core import geometry
 from mapvote.core.sensors import Sensor
 from mapvote.core.types import F64, I64, Drive, MapvoteError, Scan
-from mapvote.formats.clean import BadPoints, stamps_from_rate
-from mapvote.formats.drives.options import DriveFile, DriveOptions, make_drive, map_frame, mount_of
+from mapvote.formats.clean import BadPoints, log, stamps_from_rate
+from mapvote.formats.drives.options import DriveFile, DriveOptions, make_drive, map_frame, mount_of, read_drive_file
 from mapvote.formats.drives.point_fields import scan_from_fields
-from mapvote.formats.drives.trajectory import Trajectory, has_times, read_T_map_lidar, read_trajectory
+from mapvote.formats.drives.trajectory import Trajectory, check_rigid, has_times, read_T_map_lidar, read_trajectory
 from mapvote.formats.extras import read_text
 from mapvote.formats.geo.frame import MapFrame
+from mapvote.formats.maps.autoware import is_autoware
+from mapvote.formats.maps.cloud import Cloud, xyz
+from mapvote.formats.maps.las import read_las
+from mapvote.formats.maps.pcd import read_pcd_table
+from mapvote.formats.maps.ply import read_ply
 
 _LATEST_NS = 230 * 366 * 86_400 * 10**9
 
@@ -188,3 +198,220 @@ def prior_of(path: Path, about: DriveFile, options: DriveOptions, folder: ScanFo
         return own, MapFrame()
     T = own.at(folder.stamps_ns, str(file or path))
     return (T @ T_base_lidar if own.of_vehicle else T), own.frame
+
+
+KITTI = ("x", "y", "z", "intensity")
+NUSCENES = (*KITTI, "ring")
+_SUFFIXES = (".ply", ".las", ".laz", ".npy", ".bin")
+_FOLDERS = ("", "scans", "lidar", "points")
+
+
+@dataclass(frozen=True, slots=True)
+class BinLayout:
+    """Columns of one type, row by row."""
+
+    columns: tuple[str, ...] = KITTI
+    dtype: str = "<f4"
+
+    @property
+    def record(self) -> np.dtype[np.void]:
+        return np.dtype([(name, self.dtype) for name in self.columns])
+
+    def read(self, file: Path) -> NDArray[np.void]:
+        """A .bin file as it stands, (n,); MapvoteError if it is cut off or missing."""
+        data = read_bytes(file)
+        size = self.record.itemsize
+        if len(data) % size:
+            columns = ", ".join(self.columns)
+            raise MapvoteError(
+                f"{file}: {len(data)} bytes are not a multiple of {size} ({np.dtype(self.dtype).name} {columns}): "
+                f"the scan is cut off or has other columns; copy it again, leave it out with --scans, or name --columns"
+            )
+        return np.frombuffer(data, dtype=self.record)
+
+
+def read_bytes(file: Path) -> bytes:
+    """The bytes of a scan; MapvoteError if it is gone."""
+    try:
+        return file.read_bytes()
+    except OSError as error:
+        raise MapvoteError(f"{file}: {error.strerror}; the drive changed while it was read") from error
+
+
+def layout_of(files: Sequence[Path], columns: str | None = None, dtype: str | None = None) -> BinLayout:
+    """The user's columns, else four (KITTI), or five if the sizes and the fifth column fit (nuScenes)."""
+    if columns is not None or dtype is not None:
+        return _said(columns or ",".join(KITTI), dtype or "float32")
+    for file in files[:3]:
+        data = read_bytes(file)
+        if len(data) % 20 == 0 and _has_rings(data):
+            log.warning("%s: five columns, the fifth a ring: read as nuScenes' x, y, z, intensity, ring", file)
+            return BinLayout(NUSCENES)
+    return BinLayout()
+
+
+def _has_rings(data: bytes) -> bool:
+    """Whether the fifth of five float32 columns holds small whole numbers, more than one of them."""
+    ring = np.frombuffer(data, dtype="<f4").reshape(-1, 5)[:, 4]
+    with np.errstate(invalid="ignore"):
+        whole = (ring >= 0) & (ring < 256) & (ring == np.floor(ring))
+    return len(ring) > 1 and bool(whole.all()) and len(np.unique(ring)) > 1 and not _looks_like_four(data)
+
+
+def _looks_like_four(data: bytes) -> bool:
+    """Whether as four columns the last one looks like intensities: all within [0, 1]."""
+    if len(data) % 16:
+        return False
+    last = np.frombuffer(data, dtype="<f4").reshape(-1, 4)[:, 3]
+    return bool(((last >= 0) & (last <= 1)).all())
+
+
+def _said(columns: str, dtype: str) -> BinLayout:
+    names = tuple(name.strip() for name in columns.split(","))
+    try:
+        kind = np.dtype(dtype).newbyteorder("<") if np.dtype(dtype).byteorder != ">" else np.dtype(dtype)
+    except TypeError as error:
+        raise MapvoteError(f"--dtype {dtype!r}: no number type; for example float32, float64, int16") from error
+    if len(set(names)) != len(names) or "" in names or not {"x", "y", "z"} <= set(names) or kind.kind not in "iuf":
+        raise MapvoteError(
+            f"--columns {columns!r}: name every column once, x, y and z among them; --dtype a number type"
+        )
+    return BinLayout(names, kind.str)
+
+
+def _folder_of(path: Path) -> tuple[Path, str] | None:
+    """(folder, suffix) of two or more scans of one kind; a single file is a map, not a drive."""
+    for name in _FOLDERS:
+        for suffix in _SUFFIXES:
+            if path.is_dir() and len([*(path / name).glob(f"*{suffix}")][:2]) == 2:
+                return path / name, suffix
+    return None
+
+
+def is_cloud_scans(path: Path) -> bool:
+    return _folder_of(path) is not None
+
+
+def open_cloud_scans(path: Path, options: DriveOptions) -> Drive:
+    """The drive in ``path``; scans are read one by one. MapvoteError says what is missing or does not fit."""
+    about = read_drive_file(path)
+    found = _folder_of(path)
+    if found is None:
+        raise MapvoteError(f"{path}: no scans ({', '.join(_SUFFIXES)}) in it")
+    files = scan_files(*found)
+    columns = options.columns or about.columns
+    readers: dict[str, Callable[[Path], NDArray[np.void]]] = {
+        ".ply": lambda file: _table(read_ply(file)),
+        ".las": lambda file: _table(read_las(file)),
+        ".laz": lambda file: _table(read_las(file)),
+        ".npy": lambda file: _read_npy(file, columns),
+    }
+    read = readers.get(found[1]) or layout_of(files, columns, options.dtype or about.dtype).read
+    return open_scan_folder(path, about, options, ScanFolder(files, read_stamps(path, files, about, options), read))
+
+
+def _table(cloud: Cloud) -> NDArray[np.void]:
+    columns = {axis: cloud.points[:, i] for i, axis in enumerate("xyz")} | dict(cloud.fields)
+    table = np.empty(len(cloud.points), dtype=[(name, column.dtype) for name, column in columns.items()])
+    for name, column in columns.items():
+        table[name] = column
+    return table
+
+
+def _read_npy(file: Path, columns: str | None) -> NDArray[np.void]:
+    """An array (n, k) or a structured one; MapvoteError if it is neither."""
+    try:
+        array = np.load(file, allow_pickle=False)
+    except (OSError, ValueError, EOFError) as error:
+        raise MapvoteError(f"{file}: not a whole .npy file of numbers ({error}); copy it again") from error
+    if array.dtype.names:
+        return np.ravel(array)
+    names = tuple(columns.split(",")) if columns else NUSCENES if array.ndim == 2 and array.shape[1] == 5 else KITTI
+    if array.ndim != 2 or array.dtype.kind not in "iuf" or not (3 <= array.shape[1] <= 64):
+        raise MapvoteError(f"{file}: an array {array.shape} of {array.dtype}; a scan is (n, 3 or more) numbers")
+    if array.shape[1] > len(names):
+        raise MapvoteError(f"{file}: {array.shape[1]} columns; name them with --columns x,y,z,...")
+    table = np.empty(len(array), dtype=[(name, array.dtype) for name in names[: array.shape[1]]])
+    for i, name in enumerate(table.dtype.names or ()):
+        table[name] = array[:, i]
+    return table
+
+
+def _pcd_folder(path: Path) -> Path | None:
+    """Where the scans of a PCD drive lie: ``path``/pcd or ``path`` itself; None if it is no such drive."""
+    if not path.is_dir() or is_autoware(path):
+        return None
+    return next((folder for folder in (path / "pcd", path) if any(folder.glob("*.pcd"))), None)
+
+
+def is_pcd_drive(path: Path) -> bool:
+    return _pcd_folder(path) is not None
+
+
+def open_pcd_drive(path: Path, options: DriveOptions) -> Drive:
+    """The drive in ``path``; scans are read one by one. MapvoteError says what is missing or does not fit."""
+    about = read_drive_file(path)
+    files = scan_files(_pcd_folder(path) or path, ".pcd")
+    stamps_ns = read_stamps(path, files, about, options)
+    viewpoints = _viewpoints(files)
+    in_map_frame = viewpoints is not None and _points_lie_around(viewpoints, files)
+    if in_map_frame:
+        log.warning("%s: points lie in the map frame; taken back to the sensor by each file's VIEWPOINT", path)
+    index = {file: i for i, file in enumerate(files)}
+
+    def read(file: Path) -> NDArray[np.void]:
+        table, _ = read_pcd_table(file)
+        return (
+            _to_lidar(str(file), table, viewpoints[index[file]]) if viewpoints is not None and in_map_frame else table
+        )
+
+    def prior() -> Trajectory | F64 | None:
+        if viewpoints is not None:
+            log.warning("%s: the PCD files' VIEWPOINT is taken as prior; --prior none refuses it", path)
+        return viewpoints
+
+    return open_scan_folder(path, about, options, ScanFolder(files, stamps_ns, read, prior))
+
+
+def _viewpoints(files: list[Path]) -> F64 | None:
+    """(n, 4, 4) of the files' VIEWPOINTs; None if they are all the same, and so say nothing."""
+    rows = np.array([_viewpoint_of(f) for f in files])
+    if (rows == rows[0]).all():
+        return None
+    T = np.tile(np.eye(4), (len(rows), 1, 1))
+    T[:, :3, 3] = rows[:, :3]
+    T[:, :3, :3] = scipy.spatial.transform.Rotation.from_quat(rows[:, 3:], scalar_first=True).as_matrix()
+    check_rigid(T, f"{files[0].parent} (VIEWPOINT)")
+    return T
+
+
+def _viewpoint_of(file: Path) -> F64:
+    """tx ty tz qw qx qy qz from the header alone; no point is read."""
+    with file.open("rb") as stream:
+        for line in stream:
+            if line.startswith(b"VIEWPOINT"):
+                values = np.array([float(word) for word in line.split()[1:]])
+                if len(values) == 7 and np.linalg.norm(values[3:]) > 0.5:
+                    return values
+            if line.startswith(b"DATA"):
+                break
+    return np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
+
+
+def _points_lie_around(viewpoints: F64, files: list[Path]) -> bool:
+    """Whether points lie around the viewpoint, not around the origin, in the scan taken farthest from the origin."""
+    far = int(np.argmax(np.linalg.norm(viewpoints[:, :3, 3], axis=1)))
+    table, _ = read_pcd_table(files[far])
+    points = xyz(str(files[far]), table).astype(np.float64)
+    centre = viewpoints[far, :3, 3]
+    to_origin = np.nanmedian(np.linalg.norm(points, axis=1))
+    return bool(np.linalg.norm(centre) > 10.0 and np.nanmedian(np.linalg.norm(points - centre, axis=1)) < to_origin)
+
+
+def _to_lidar(where: str, table: np.ndarray, T_map_lidar: F64) -> np.ndarray:
+    """The table with x, y, z in the sensor's frame instead of the map's."""
+    points = geometry.transform(geometry.inverse(T_map_lidar), xyz(where, table))
+    out = table.copy()
+    for column, axis in enumerate("xyz"):
+        out[axis] = points[:, column]
+    return out

@@ -15,8 +15,7 @@ import scipy
 from mapvote.core import geometry
 from mapvote.core.types import F64, I64, MapvoteError
 from mapvote.formats.extras import read_text
-from mapvote.formats.geo.frame import MapFrame
-from mapvote.formats.geo.gnss import poses_from_gnss
+from mapvote.formats.geo.frame import MapFrame, poses_from_gnss
 
 MAX_GAP_NS = 500_000_000
 """A pose is not interpolated over a longer hole, nor taken from farther beyond the ends."""

@@ -29,7 +29,7 @@ from mapvote.formats.geo.frame import MapFrame
 from mapvote.formats.geo.projector import PROJECTOR, frame_of_projector, projector_of
 from mapvote.formats.maps.cloud import Cloud, CloudPieces, warn_of_float32
 from mapvote.formats.maps.pcd import read_pcd, save_pcd, stream_pcd
-from mapvote.formats.maps.spill import Spill
+from mapvote.formats.maps.tiling import Spill
 
 log = logging.getLogger("mapvote.formats")
 

@@ -1,45 +1,44 @@
-"""The server as a FastAPI app on an open store."""
+"""The server as a FastAPI app on an open store, for a port or within one process."""
 
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Iterator
 from concurrent.futures import Executor
-from contextlib import asynccontextmanager, suppress
+from contextlib import asynccontextmanager, contextmanager, suppress
 
+import httpx2
 import structlog
 from anyio import to_thread
+from anyio.from_thread import BlockingPortal, start_blocking_portal
 from fastapi import FastAPI
 
 from mapvote.config import Settings
 from mapvote.core.types import MapvoteError
 from mapvote.server.errors import Unavailable
 from mapvote.server.http import (
-    ballot_route,
     cloud_routes,
     desk_routes,
     event_routes,
     health_routes,
     operator_routes,
     pages,
-    store_routes,
     vehicle_routes,
 )
 from mapvote.server.http.auth import Guard
+from mapvote.server.http.event_routes import deliver
 from mapvote.server.http.health_routes import Probe
+from mapvote.server.http.limits import READING
 from mapvote.server.http.schemas import unreadable
 from mapvote.server.http.security import Hosts, Watch
-from mapvote.server.http.services import READING, Services, make_services
-from mapvote.server.http.webhook import deliver
+from mapvote.server.http.services import Services, make_services
 from mapvote.server.store.round import Gate
 from mapvote.server.store.store import Store
 
 _EVERY_S = 2.0
 ROUTES = (
-    ballot_route,
     vehicle_routes,
     operator_routes,
-    store_routes,
     desk_routes,
     cloud_routes,
     event_routes,
@@ -61,7 +60,7 @@ def create_app(
 
     ``opened``: as long as the store holds no key, no request needs one; else no route answers without a key.
     ``owner``: every request is that of an operator of this name, and no quota holds; only within a process
-    (:func:`mapvote.server.http.in_process.in_process`).
+    (:func:`mapvote.server.http.app.in_process`).
     ``gate``: see :mod:`mapvote.server.store.publish`; ``executor``: where tiles are fused, two threads by default.
     """
     parts = make_services(store, settings or Settings(), gate, executor, limited=owner is None)
@@ -118,3 +117,53 @@ async def _make(parts: Services, version: int) -> None:
         raise
     except MapvoteError as error:  # damage beyond a tile: a request for the overview gets this error
         structlog.get_logger("mapvote").warning("overview", version=version, error=str(error)[:200])
+
+
+URL = "http://localhost"
+"""The base URL of requests: the app refuses other host names."""
+
+
+@contextmanager
+def in_process(
+    store: Store,
+    settings: Settings | None = None,
+    *,
+    owner: str,
+    gate: Gate | None = None,
+    executor: Executor | None = None,
+) -> Iterator[httpx2.BaseTransport]:
+    """A transport whose requests the API answers within this process, for ``httpx2.Client(base_url=URL)``.
+
+    Every request is that of an operator named ``owner``: who can open the database needs no key. Quotas and rate limits
+    of vehicles do not hold. No overview is made ahead and no webhook is sent. The store stays the caller's to close.
+
+    ``gate`` and ``executor`` as in :func:`mapvote.server.http.app.create_app`. An exception in the app that is no
+    MapvoteError is raised to the caller. If the block ends by an exception (KeyboardInterrupt too), a publish under way
+    is given up before its next tiles.
+    """
+    app = create_app(store, settings, owner=owner, gate=gate, executor=executor)
+    parts: Services = app.state.services
+    with start_blocking_portal("asyncio") as portal:
+        try:
+            yield _Transport(app, portal)
+        except BaseException:
+            parts.stop_fusing()
+            raise
+        finally:
+            portal.call(parts.close)
+
+
+class _Transport(httpx2.BaseTransport):
+    """:class:`httpx2.ASGITransport`, which is asynchronous, for synchronous callers in any thread."""
+
+    def __init__(self, app: FastAPI, portal: BlockingPortal) -> None:
+        self._asgi, self._portal = httpx2.ASGITransport(app=app), portal
+
+    def handle_request(self, request: httpx2.Request) -> httpx2.Response:
+        return self._portal.call(self._answer, request)
+
+    async def _answer(self, request: httpx2.Request) -> httpx2.Response:
+        asked = httpx2.Request(request.method, request.url, headers=request.headers, content=request.read())
+        answer = await self._asgi.handle_async_request(asked)
+        encoded = b"".join([part async for part in answer.aiter_raw()])
+        return httpx2.Response(answer.status_code, headers=answer.headers, content=encoded)

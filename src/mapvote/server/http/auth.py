@@ -11,9 +11,8 @@ from functools import partial
 from fastapi import Request
 
 from mapvote.server.errors import Forbidden, TooMany, Unauthorised
-from mapvote.server.http.limits import RateLimit
+from mapvote.server.http.limits import Batcher, RateLimit
 from mapvote.server.http.services import services
-from mapvote.server.http.writer import Batcher
 from mapvote.server.store import keys
 from mapvote.server.store.store import Store
 

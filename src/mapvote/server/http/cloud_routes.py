@@ -12,7 +12,7 @@ from mapvote.server.http.answers import Places as PlacesAnswer
 from mapvote.server.http.auth import reviewer
 from mapvote.server.http.schemas import AS_CSV, From, Places, To, VersionQuery, as_json, as_table, problems
 from mapvote.server.http.services import services
-from mapvote.server.views.paths import paths
+from mapvote.server.views.coverage import paths
 from mapvote.server.views.point_lod import N_LEVELS, evidence
 
 AS_BYTES: dict[int | str, dict[str, Any]] = {200: {"content": {"application/octet-stream": {}}}}

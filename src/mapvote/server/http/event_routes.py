@@ -1,20 +1,28 @@
-"""Events as they happen, by server-sent events (WHATWG HTML, 9.2)."""
+"""Events as they happen: to who listens, by server-sent events (WHATWG HTML, 9.2), and to an integrator's address by
+POST, in order, repeated until they are taken, signed as Standard Webhooks.
+"""
 
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Sequence
+from datetime import UTC, datetime
+from functools import partial
 from typing import Annotated
 
+import httpx2
 import msgspec
+import structlog
 from anyio import to_thread
 from fastapi import APIRouter, Header, Query, Request
 from fastapi.responses import StreamingResponse
+from standardwebhooks import Webhook
 
+from mapvote.server.errors import Unavailable
 from mapvote.server.http.auth import sees_names
 from mapvote.server.http.schemas import problems
 from mapvote.server.http.services import Services, services
-from mapvote.server.views.events import Event, newest_event, without_names
+from mapvote.server.views.events import Event, newest_event, take, taken_up_to, without_names
 
 _EVERY_S = 1.0
 _STILL_THERE_S = 15.0
@@ -66,3 +74,49 @@ async def _told(request: Request, parts: Services, seq: int, named: bool) -> Asy
 def as_sse(event: Event) -> bytes:
     """One event on the wire. JSON holds no line break, so no text in it can begin another event."""
     return b"id: %d\ndata: %b\n\n" % (event.seq, msgspec.json.encode(event))
+
+
+_TIMEOUT_S = 10.0
+_LONGEST_S = 60.0
+
+
+def signed(secret: str, events: Sequence[Event], at: datetime, body: bytes) -> dict[str, str]:
+    """The headers of a post of some events (Standard Webhooks 1.0.0): the same events have the same id when they are
+    sent again."""
+    name = f"events_{events[0].seq}_{events[-1].seq}"
+    return {
+        "Content-Type": "application/json",
+        "webhook-id": name,
+        "webhook-timestamp": str(int(at.timestamp())),
+        "webhook-signature": Webhook(secret).sign(name, at, body.decode()),
+    }
+
+
+async def deliver(parts: Services) -> None:
+    """Post events to ``[server] webhook_url`` until it is cancelled: from the first start with that address on, and
+    after a restart from where it stopped. (A server killed between an answer and its note sends the last post again.)
+
+    A post that is not answered by 2xx is repeated, after one second, then two, four, at most sixty; none overtakes it.
+    """
+    asked = parts.settings.server
+    ask = partial(to_thread.run_sync, limiter=parts.threads.fetching)
+    seq = noted = await ask(taken_up_to, parts.store, asked.webhook_url)
+    wait = _EVERY_S
+    async with httpx2.AsyncClient(timeout=_TIMEOUT_S, follow_redirects=False) as client:
+        while True:
+            try:
+                events = await ask(parts.feed.after, seq)
+                if events:
+                    body = msgspec.json.encode({"map_id": parts.store.map_id, "events": events})
+                    at = datetime.fromtimestamp(parts.store.clock() // 10**9, UTC)
+                    headers = signed(asked.webhook_secret, events, at, body)
+                    (await client.post(asked.webhook_url, content=body, headers=headers)).raise_for_status()
+                    seq = events[-1].seq
+                if seq != noted:
+                    await ask(take, parts.store, asked.webhook_url, seq)
+                    noted = seq
+                wait = _EVERY_S
+            except (httpx2.HTTPError, Unavailable) as error:
+                structlog.get_logger("mapvote").warning("webhook", error=type(error).__name__, again_in_s=wait)
+                wait = min(2 * wait, _LONGEST_S)
+            await asyncio.sleep(wait)

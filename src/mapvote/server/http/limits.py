@@ -1,16 +1,43 @@
-"""Limits per key: requests per minute, and bytes of ballots that are being received."""
+"""What one server takes at a time: requests a minute of a key, bytes of ballots on their way, and threads for each kind
+of work. Requests that arrive while one batch is processed form the next, so a hundred ballots cost one fsync.
+"""
 
 from __future__ import annotations
 
+import asyncio
 import time
 from collections import Counter
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Sequence
+from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import dataclass, field
+from typing import Generic, TypeVar
 
+from anyio import CapacityLimiter
 from starlette.requests import ClientDisconnect
 
 from mapvote.core.types import MapvoteError
 from mapvote.server.errors import TooLarge, TooMany, Unavailable
+
+READING = 1
+"""Threads for what operators read. Python computes in one thread at a time: more would only compete with the threads
+that answer vehicles."""
+
+
+@dataclass(frozen=True, slots=True)
+class Threads:
+    """Each kind of work has its own threads, so that none blocks another.
+
+    All other work runs in FastAPI's own pool of :data:`READING` threads: what operators read.
+    """
+
+    ballots: ThreadPoolExecutor = field(default_factory=lambda: ThreadPoolExecutor(3, "ballots"))
+    lookups: ThreadPoolExecutor = field(default_factory=lambda: ThreadPoolExecutor(2, "lookups"))
+    """Keys, the newest version, health: short questions before every answer."""
+    fuse: ThreadPoolExecutor = field(default_factory=lambda: ThreadPoolExecutor(2, "fuse"))
+    fetching: CapacityLimiter = field(default_factory=lambda: CapacityLimiter(4))
+    """Manifests and tiles."""
+    deciding: CapacityLimiter = field(default_factory=lambda: CapacityLimiter(4))
+    """What takes seconds, as it fuses tiles or reads the whole store: publish, desk, check. No other request waits."""
 
 
 class RateLimit:
@@ -107,3 +134,58 @@ class Uploads:
 class _Upload:
     chunks: list[bytes] = field(default_factory=list)
     size: int = 0
+
+
+Asked = TypeVar("Asked")
+Answer = TypeVar("Answer")
+
+
+class Batcher(Generic[Asked, Answer]):
+    """Calls ``work`` in one of ``threads``, one batch of at most ``limit`` after another. Lives on one event loop.
+
+    ``work`` gives one answer for each item, in order; an exception among the answers is raised to its caller. If
+    ``work`` itself raises, every caller of the batch gets that exception.
+    """
+
+    def __init__(
+        self,
+        work: Callable[[Sequence[Asked]], Sequence[Answer | Exception]],
+        limit: int,
+        threads: Executor | None = None,
+    ) -> None:
+        self._work = work
+        self._limit = limit
+        self._threads = threads
+        self._waiting: list[tuple[Asked, asyncio.Future[Answer]]] = []
+        self._worker: asyncio.Task[None] | None = None
+
+    async def put(self, item: Asked) -> Answer:
+        """The answer to one item, once the batch that holds it is done."""
+        future: asyncio.Future[Answer] = asyncio.get_running_loop().create_future()
+        self._waiting.append((item, future))
+        if self._worker is None or self._worker.done():
+            self._worker = asyncio.create_task(self._run())
+        return await future
+
+    async def close(self) -> None:
+        """Wait until every item is done."""
+        while self._worker is not None and not self._worker.done():
+            await self._worker
+
+    async def _run(self) -> None:
+        loop = asyncio.get_running_loop()
+        while self._waiting:
+            await asyncio.sleep(0)  # requests of the same moment join
+            some, self._waiting = self._waiting[: self._limit], self._waiting[self._limit :]
+            answers: Sequence[Answer | Exception]
+            try:
+                answers = await loop.run_in_executor(self._threads, self._work, [item for item, _ in some])
+            except Exception as error:
+                answers = [error] * len(some)
+            for (_, future), answer in zip(some, answers, strict=True):
+                if future.cancelled():
+                    continue
+                if isinstance(answer, Exception):
+                    future.set_exception(answer)
+                else:
+                    future.set_result(answer)

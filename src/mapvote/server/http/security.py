@@ -20,8 +20,8 @@ from mapvote.core.types import MapvoteError
 from mapvote.server.errors import Forbidden, Unavailable
 from mapvote.server.http.auth import Guard
 from mapvote.server.http.health_routes import Probe
-from mapvote.server.http.metrics import Metrics
 from mapvote.server.http.schemas import refuse
+from mapvote.server.http.services import Metrics
 
 HEADERS = (
     ("X-Content-Type-Options", "nosniff"),

@@ -12,23 +12,74 @@ from dataclasses import dataclass, field, replace
 from threading import Lock
 from weakref import WeakKeyDictionary
 
+import numpy as np
+import scipy
 import sqlalchemy as sa
 
+from mapvote.codec.ballot import tile_key
 from mapvote.codec.tile_planes import unpack_free_plane, unpack_ground_plane, unpack_points_plane
 from mapvote.config import FuseSettings
-from mapvote.core.grid import TileIndex
+from mapvote.core.grid import CELL_SIZE, CELLS, TILE_CELLS, TileIndex
 from mapvote.core.lazy_tiles import with_changed
 from mapvote.core.point_map import PointMap
 from mapvote.core.tile import Tile
+from mapvote.core.types import I64
 from mapvote.server.store import schema
 from mapvote.server.store.database import address_of
 from mapvote.server.store.fusion_jobs import Fused, Task, fuse_round
 from mapvote.server.store.integrity import tiles_hurt_or_mended
 from mapvote.server.store.policy import GatePolicy
-from mapvote.server.store.publish_limits import hold_reasons
 from mapvote.server.store.queries import Version, current_version, tiles_of, tiles_set_by
 from mapvote.server.store.store import Store
 from mapvote.server.store.votes import Electorate, electorate_now, next_ripe_ns, standing_tiles
+
+
+def hold_reasons(changed: Sequence[Fused], settings: FuseSettings) -> list[str]:
+    """What the policy says against publishing these tiles."""
+    reasons = []
+    for fused in changed:
+        name = f"tile {tile_key(fused.index)}"
+        if fused.points and fused.deleted > settings.max_deleted_share * fused.points:
+            share = fused.deleted / fused.points
+            reasons.append(f"deletes {share:.0%} of the points of {name}, more than {settings.max_deleted_share:.0%}")
+        if fused.freed > settings.max_freed_share * CELLS:
+            freed = fused.freed / CELLS
+            reasons.append(f"learns free space in {freed:.0%} of {name}, more than {settings.max_freed_share:.0%}")
+    for what, cells in (("removes", "cells_gone"), ("adds", "cells_new")):
+        rows, cols = lattice_cells([(f, getattr(f, cells)) for f in changed])
+        areas = areas_m2(rows, cols)
+        largest = int(np.argmax(areas)) if len(areas) else 0
+        if len(areas) and areas[largest] > settings.max_change_m2:
+            about = f"{what} one connected thing of {areas[largest]:.0f} m2"
+            reasons.append(f"{about}, more than {settings.max_change_m2:.0f} m2")
+    return reasons
+
+
+def lattice_cells(found: Sequence[tuple[Fused, I64]]) -> tuple[I64, I64]:
+    """(rows, cols) on the lattice of flat cells of some tiles."""
+    rows = [f.index[0] * TILE_CELLS + cells // TILE_CELLS for f, cells in found]
+    cols = [f.index[1] * TILE_CELLS + cells % TILE_CELLS for f, cells in found]
+    nothing = np.empty(0, dtype=np.int64)
+    return np.concatenate([nothing, *rows]), np.concatenate([nothing, *cols])
+
+
+def areas_m2(rows: I64, cols: I64) -> np.ndarray:
+    """(k,) the area of each thing: cells that touch, corners included, whatever tile they are in."""
+    if not len(rows):
+        return np.empty(0)
+    keys = (rows << 32) + cols
+    order = np.argsort(keys)
+    ordered, pairs = keys[order], []
+    for step in (1, (1 << 32) - 1, 1 << 32, (1 << 32) + 1):
+        near = np.searchsorted(ordered, keys + step)
+        near[near == len(keys)] = 0
+        touching = np.flatnonzero(ordered[near] == keys + step)
+        pairs.append(np.stack([touching, order[near[touching]]]))
+    a, b = np.concatenate(pairs, axis=1)
+    links = scipy.sparse.coo_array((np.ones(len(a), dtype=np.int8), (a, b)), shape=(len(keys), len(keys)))
+    labels = scipy.sparse.csgraph.connected_components(links, directed=False)[1]
+    return np.bincount(labels) * CELL_SIZE**2
+
 
 Gate = Callable[[GatePolicy, PointMap, PointMap], Sequence[str]]
 """Compares (old map, new map) as the policy asks. Returns the reasons to hold the new one; none lets it through."""

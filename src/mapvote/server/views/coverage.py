@@ -1,21 +1,22 @@
-"""Where a fleet should drive next: stretches of road on which one more pass would decide cells, as GeoJSON."""
+"""Where vehicles have been: tiles that they saw, and the paths that they drove."""
 
 from __future__ import annotations
 
 from collections import defaultdict
-from functools import partial
+from functools import cache, partial
 from typing import Any
 
 import numpy as np
 import sqlalchemy as sa
 
 from mapvote.codec.path import unpack_path
-from mapvote.core.grid import CELL_SIZE, TileIndex
-from mapvote.core.types import F64
+from mapvote.core.grid import CELL_SIZE, TILE_CELLS, TileIndex
+from mapvote.core.types import F32, F64, I64
 from mapvote.fusion.next_pass import Stretch, Witness, stretches
 from mapvote.fusion.tile_vote import TileVote, one_each
 from mapvote.server.store import schema
 from mapvote.server.store.policy import policy_in
+from mapvote.server.store.queries import current_version, load_tile, tiles_of
 from mapvote.server.store.store import Store
 from mapvote.server.store.votes import (
     FOREVER,
@@ -26,7 +27,7 @@ from mapvote.server.store.votes import (
     standing_tiles,
 )
 from mapvote.server.views.explain import said_by
-from mapvote.server.views.geojson import MAP_METRES
+from mapvote.server.views.geojson import MAP_METRES, utc
 
 
 def wanted_passes(store: Store) -> list[Stretch]:
@@ -78,3 +79,57 @@ def as_features(wanted: list[Stretch]) -> dict[str, Any]:
         for stretch in wanted
     ]
     return {"type": "FeatureCollection", "frame": MAP_METRES, "features": features}
+
+
+MOST_PATHS = 500
+"""The last drives."""
+
+
+def paths(store: Store, vehicle: str | None = None) -> dict[str, Any]:
+    """GeoJSON lines [x, y, z] in map metres of standing ballots that carry a path, the newest drive first; of one
+    ``vehicle`` only, if named. Where the map has no ground height, the last one along the path is used."""
+    b, p = schema.ballots.c, schema.paths.c
+    query = sa.select(b.vehicle, b.drive, b.start_ns, b.end_ns, b.version, p.path)
+    query = query.join(schema.ballots, b.seq == p.ballot).where(b.gone_seq.is_(None))
+    if vehicle is not None:
+        query = query.where(b.vehicle == vehicle)
+    with store.database.reading() as connection:
+        rows = connection.execute(query.order_by(b.end_ns.desc()).limit(MOST_PATHS)).all()
+        driven = [unpack_path(row.path) for row in rows]
+        touched = {(int(r), int(c)) for path in driven for r, c in np.unique(path // TILE_CELLS, axis=0)}
+        known = tiles_of(connection, current_version(connection).number, sorted(touched)) if touched else {}
+
+        @cache
+        def ground(index: TileIndex) -> F32:
+            return load_tile(connection, store.lattice.tile(index), known.get(index)).ground_z
+
+        lines = [_line(store, path, ground) for path in driven]
+    features = [
+        {
+            "type": "Feature",
+            "geometry": {"type": "LineString", "coordinates": line},
+            "properties": {
+                "vehicle": row.vehicle,
+                "drive": row.drive,
+                "start": utc(row.start_ns),
+                "end": utc(row.end_ns),
+                "version": row.version,
+                "length_m": round(float(np.hypot(*np.diff(np.array(line)[:, :2], axis=0).T).sum()), 1),
+            },
+        }
+        for row, line in zip(rows, lines, strict=True)
+    ]
+    return {"type": "FeatureCollection", "frame": MAP_METRES, "features": features}
+
+
+def _line(store: Store, path: I64, ground: Any) -> list[list[float]]:
+    rows, cols = path.T
+    z = np.array(
+        [ground((int(r) // TILE_CELLS, int(c) // TILE_CELLS))[r % TILE_CELLS, c % TILE_CELLS] for r, c in path]
+    )
+    known = np.maximum.accumulate(np.where(np.isfinite(z), np.arange(len(z)), -1))
+    first = z[np.isfinite(z)][0] if np.isfinite(z).any() else 0.0
+    height = np.where(known >= 0, z[known], first)
+    x, y = store.lattice.x0 + (cols + 0.5) * CELL_SIZE, store.lattice.y0 + (rows + 0.5) * CELL_SIZE
+    line: list[list[float]] = np.round(np.column_stack([x, y, height]), 2).tolist()
+    return line

@@ -2,27 +2,38 @@
 
 All of them are settings of the one rule. A vehicle casts a ballot by each; the server's rule then decides, and the
 decided cells are scored.
+
+The other readings of the paper's open sentences (paper III-IV) need no drive again: the scans of a drive say one word a
+cell (detection/paper.py), which is kept over each scan's window. Every reading is then a look-up, with the product's
+own tables, votes and verdicts (core/voting.py).
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from mapvote.codec.arrays import pack_plane, unpack_bytes
 from mapvote.codec.ballot import Ballot, unpack_states, unpack_tally
 from mapvote.config import CASES, FuseSettings, PaperSettings, Settings, VotingSettings
-from mapvote.core.grid import Grid
+from mapvote.core.grid import CELL_SIZE, Grid
+from mapvote.core.kernel import kernel
 from mapvote.core.point_map import PointMap
-from mapvote.core.types import NO_VOTE, U8, MapvoteError
-from mapvote.core.voting import plurality
+from mapvote.core.sensors import Sensor
+from mapvote.core.types import I32, N_STATES, NO_VOTE, U8, U16, Bool, MapvoteError
+from mapvote.core.voting import one_hot, plurality, to_wire
+from mapvote.detection.paper import reading_table, sightings
+from mapvote.detection.readings import read, readings_of
 from mapvote.fusion.fuse import states_over
 from mapvote.fusion.offline import update_map
-from mapvote_lab.evaluation.scoring.jury import CaseOutcome
-from mapvote_lab.evaluation.scoring.scene_truth import lay_on
+from mapvote.perception.frontend import Observation
+from mapvote_lab.evaluation.scores import Scores, score_cells
+from mapvote_lab.evaluation.truths import CaseOutcome, lay_on
 
 OCCLUSIONS: Mapping[str, Mapping[str, str]] = {
     "": {},
@@ -117,3 +128,152 @@ def _decided(tiles: Any) -> Iterator[U8]:
             if tile.states is not None
             else plurality(unpack_tally(tile.tally).astype(np.int32))
         )
+
+
+_FAST = 1
+"""zstd level: written once, read for every reading."""
+
+
+@dataclass(frozen=True, slots=True)
+class KeptDrive:
+    """What the scans of one drive say of each cell."""
+
+    windows: I32
+    """(scans, 4) row0, col0, rows, cols of each scan's local grid, from the truth's corner."""
+    sizes: I32
+    """(scans,) bytes of each scan's words."""
+    packed: bytes
+
+    def words(self) -> Iterator[tuple[int, int, U16]]:
+        """(row0, col0, words (rows, cols)) of each scan, rows and columns from the truth's corner."""
+        at = 0
+        for (row0, col0, rows, cols), size in zip(self.windows.tolist(), self.sizes.tolist(), strict=True):
+            raw = unpack_bytes(self.packed[at : at + size], 2 * rows * cols, "a kept scan")
+            yield row0, col0, np.frombuffer(raw, dtype="<u2").reshape(rows, cols)
+            at += size
+
+
+class Keeper:
+    """Packs what each observation of a drive says, over ``window``."""
+
+    def __init__(self, window: Grid, sensor: Sensor, n_min: int) -> None:
+        self.window, self.sensor, self.n_min = window, sensor, n_min
+        self._windows: list[tuple[int, int, int, int]] = []
+        self._packed: list[bytes] = []
+
+    def watch(self, observations: Sequence[Observation]) -> None:
+        """Keep what these scans say."""
+        for seen in observations:
+            grid = seen.view.grid
+            self._windows.append((grid.row0 - self.window.row0, grid.col0 - self.window.col0, *grid.shape))
+            self._packed.append(pack_plane(sightings(seen, self.sensor, self.n_min), _FAST))
+
+    def write(self, folder: Path) -> None:
+        """Into two files of ``folder``."""
+        (folder / "kept.words").write_bytes(b"".join(self._packed))
+        windows = np.array(self._windows, dtype=np.int32).reshape(-1, 4)
+        np.savez(folder / "kept.npz", windows=windows, sizes=np.array(list(map(len, self._packed)), dtype=np.int32))
+
+
+def read_kept(folder: Path) -> KeptDrive:
+    """What :meth:`Keeper.write` wrote."""
+    with np.load(folder / "kept.npz") as file:
+        return KeptDrive(file["windows"], file["sizes"], (folder / "kept.words").read_bytes())
+
+
+PUBLISHED = "as_published"
+"""The scenario of the paper's street. Its first map keeps its strays: the paper's holds whatever stood still (II), and
+its cases vote on that. Both readings of an occluded scan stand side by side in its tables."""
+
+
+def as_paper(settings: Settings, scenario: str, told: Collection[str] = (), reading: str | None = None) -> Settings:
+    """``settings`` with the paper read as ``reading`` says, and with a map like the paper's on the paper's street.
+
+    ``told``: names ("mapping.drop_strays") of what the user set: that stays. MapvoteError for a reading there is not.
+    """
+    known = settings
+    if reading:
+        known = known.model_copy(update={"paper": read(known.paper, reading)})
+    if scenario == PUBLISHED and "mapping.drop_strays" not in told:
+        known = known.model_copy(update={"mapping": known.mapping.model_copy(update={"drop_strays": False})})
+    return known
+
+
+Rule = tuple[VotingSettings, PaperSettings]
+"""By which a vehicle counts."""
+
+
+@kernel
+def _cast(
+    words: U16, row0: int, col0: int, margin: int, mapped: Bool, states: U8, weights: I32, no_vote: int, tally: I32
+) -> None:
+    """Add one scan's ``words``, from (row0, col0) of the window, to ``tally`` (rows, cols, classes), in place.
+
+    ``margin``: cells at the rim of the scan's window that do not vote.
+    """
+    rows, cols = mapped.shape
+    for i in range(max(margin, -row0), min(words.shape[0] - margin, rows - row0)):
+        for j in range(max(margin, -col0), min(words.shape[1] - margin, cols - col0)):
+            r, c, word = row0 + i, col0 + j, words[i, j]
+            state = states[np.int64(mapped[r, c]), word]
+            if state != no_vote:
+                tally[r, c, state] += weights[word]
+
+
+def tallies(drive: KeptDrive, mapped: Bool, rules: Iterable[Rule]) -> dict[Rule, I32]:
+    """(rows, cols, 5) votes in VOTE_UNITs of one drive by each rule, over the truth's window.
+
+    ``mapped`` (rows, cols): where the map holds obstacle points.
+    """
+    found = {rule: np.zeros((*mapped.shape, N_STATES), dtype=np.int32) for rule in rules}
+    for row0, col0, words in drive.words():
+        for rule, tally in found.items():
+            half = round(0.5 * rule[1].window_m / CELL_SIZE)
+            margin = max(0, words.shape[0] // 2 - half)
+            _cast(words, row0, col0, margin, mapped, *reading_table(*rule), NO_VOTE, tally)
+    return found
+
+
+def counting_rule(case: Case) -> Rule:
+    """Cases that differ only in who decides count alike."""
+    return case.voting.model_copy(update={"two_stage": True}), case.paper
+
+
+def decided(drives: Sequence[KeptDrive], mapped: Bool, cases: Sequence[Case]) -> dict[str, tuple[U8, list[U8]]]:
+    """By case's name: (what the server decides, what each vehicle does), over the truth's window."""
+    rules = list(dict.fromkeys(counting_rule(case) for case in cases))
+    counted = [tallies(drive, mapped, rules) for drive in drives]
+    own = {rule: [plurality(one[rule]) for one in counted] for rule in rules}
+    out = {}
+    for case in cases:
+        rule = counting_rule(case)
+        if case.voting.two_stage:
+            votes = [one_hot(states) for states in own[rule]]
+        else:
+            votes = [to_wire(one[rule]).astype(np.int32) for one in counted]
+        out[case.name] = plurality(np.stack(votes).sum(axis=0, dtype=np.int32)), own[rule]
+    return out
+
+
+def swept(
+    drives: Sequence[KeptDrive], mapped: Bool, settings: Settings, truths: Mapping[str, U8],
+    only: str | None = None, progress: Callable[[str, int, int], None] | None = None,
+) -> dict[str, dict[str, dict[str, Scores]]]:  # fmt: skip
+    """Scores by reading, case and truth: as ``settings`` read the paper, and one sentence at a time read otherwise.
+
+    ``only``: the sentence (a setting of ``[paper]``) whose readings are wanted; None: all.
+    """
+    readings = readings_of(settings.paper, only)
+    out: dict[str, dict[str, dict[str, Scores]]] = {}
+    for k, (name, paper) in enumerate(readings.items()):
+        if progress:
+            progress("reading the paper", k, len(readings))
+        every = paper_cases(settings.model_copy(update={"paper": paper}))
+        states = decided(drives, mapped, [every[number] for number in "12345"])
+        out[name] = {
+            number: {truth: score_cells(server, cells) for truth, cells in truths.items()}
+            for number, (server, _) in states.items()
+        }
+    if progress:
+        progress("reading the paper", len(readings), len(readings))
+    return out

@@ -18,7 +18,7 @@ from mapvote.localisation.localiser import Localise
 from mapvote.localisation.ndt import PosePrior
 from mapvote.localisation.odometry import Fix
 from mapvote.perception.frontend import Movers
-from mapvote_lab.evaluation.scoring.scene_truth import Truth
+from mapvote_lab.evaluation.truths import Truth
 from mapvote_lab.simulation.scenario import load_scenario
 from mapvote_lab.simulation.world import make_world
 

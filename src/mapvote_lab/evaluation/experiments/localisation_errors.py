@@ -19,10 +19,9 @@ from mapvote.localisation.ndt import PosePrior
 from mapvote.localisation.odometry import Tracker
 from mapvote.slam.build import build_map
 from mapvote_lab.evaluation.experiments.conditions import ar1
-from mapvote_lab.evaluation.experiments.passes import Pass
-from mapvote_lab.evaluation.experiments.scene import Progress, Scene
-from mapvote_lab.evaluation.results import MapShift
-from mapvote_lab.evaluation.scoring.scene_truth import PoseErrors, Truth, error_summary, rigid_between
+from mapvote_lab.evaluation.experiments.scene import Pass, Progress, Scene
+from mapvote_lab.evaluation.results import MapShift, PoseErrors
+from mapvote_lab.evaluation.truths import Truth, error_summary, rigid_between
 
 
 def map_shift(scene: Scene) -> MapShift:

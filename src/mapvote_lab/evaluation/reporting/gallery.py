@@ -17,15 +17,13 @@ from mapvote.core.point_map import PointMap, all_points
 from mapvote.core.types import F32, F64, U8, Bool, CellState
 from mapvote.localisation.localiser import GivenPoses
 from mapvote.vehicle import Vehicle
-from mapvote_lab.evaluation.baselines.baselines import heights_above_ground
+from mapvote_lab.evaluation.baselines import heights_above_ground
 from mapvote_lab.evaluation.evaluate import Evaluation
 from mapvote_lab.evaluation.experiments.cases import YARDSTICKS, ballot_states, paper_cases
-from mapvote_lab.evaluation.reporting import birdseye, figures
+from mapvote_lab.evaluation.reporting import figures
 from mapvote_lab.evaluation.reporting.tables import case_name
-from mapvote_lab.evaluation.scoring.cells import UNSCORED
-from mapvote_lab.evaluation.scoring.map_points import same_rows
-from mapvote_lab.evaluation.scoring.reliability import reliability
-from mapvote_lab.evaluation.scoring.scene_truth import lay_on
+from mapvote_lab.evaluation.scores import UNSCORED, reliability, same_rows
+from mapvote_lab.evaluation.truths import lay_on
 from mapvote_lab.simulation.scenario import load_scenario
 
 MOVER = "#e07b00"
@@ -154,7 +152,7 @@ def _area(
 
     def coloured(points: F64, marked: Bool, colour: str) -> tuple[F64, F32]:
         here = inside(points)
-        colours = birdseye.shades(heights_above_ground(first_map, points[here]))
+        colours = figures.shades(heights_above_ground(first_map, points[here]))
         colours[marked[here]] = to_rgb(colour)
         return points[here], colours
 
@@ -162,13 +160,13 @@ def _area(
     fresh = np.arange(len(kept_first)) >= int(survived.sum())
     width = float(area.box[1, 0] - area.box[0, 0])
     target = float(middle[0]), float(0.6 * middle[1] + 0.4 * road_y), ground_z + 2.0
-    camera = birdseye.Camera(target, 30.0 + 0.85 * width, -72.0 if north else 72.0, 34.0)
+    camera = figures.Camera(target, 30.0 + 0.85 * width, -72.0 if north else 72.0, 34.0)
     shown = [(name, path[inside(path)]) for name, path in paths]
     panels = [
         ("(a) First map", *coloured(old, ~survived, style.GONE)),
         ("(b) Updated map", *coloured(kept_first, fresh, style.NEW)),
     ]
-    return birdseye.draw(panels, camera, paths=shown, legend=[("deleted", style.GONE), ("added", style.NEW)])
+    return figures.draw(panels, camera, paths=shown, legend=[("deleted", style.GONE), ("added", style.NEW)])
 
 
 def _scan_near(evaluation: Evaluation, areas: list[ChangedArea]) -> int:
@@ -187,13 +185,13 @@ def _scan(evaluation: Evaluation, index: int) -> Figure:
     scan, moving = drive.read_scan(index), evaluation.truth.moving(evaluation.drives[0].vehicle, index)
     points = transform(T_map_lidar, scan.points)
     ground_z = float(T_map_lidar[2, 3] - drive.T_base_lidar[2, 3])
-    colours = birdseye.shades(heights_above_ground(evaluation.first_map, points))
+    colours = figures.shades(heights_above_ground(evaluation.first_map, points))
     if len(moving) == len(points):
         colours[moving] = to_rgb(MOVER)
     near = np.linalg.norm(points[:, :2] - T_map_lidar[:2, 3], axis=1) < 45.0
-    camera = birdseye.Camera((*T_map_lidar[:2, 3], ground_z), 62.0, 205.0, 38.0)
+    camera = figures.Camera((*T_map_lidar[:2, 3], ground_z), 62.0, 205.0, 38.0)
     title = f"{drive.vehicle}, scan {index}: {len(points):,} points, {100 * moving.mean():.0f} % on moving bodies"
-    return birdseye.draw([(title, points[near], colours[near])], camera, size_m=0.1, legend=[("moving", MOVER)])
+    return figures.draw([(title, points[near], colours[near])], camera, size_m=0.1, legend=[("moving", MOVER)])
 
 
 def _local_grid(evaluation: Evaluation, index: int) -> Figure:

@@ -24,7 +24,7 @@ from mapvote_lab.evaluation.experiments.real.bench import (
     unchanged_figures,
 )
 from mapvote_lab.evaluation.experiments.real.street import FalseChange, RealRun, is_changed, largest_false_changes
-from mapvote_lab.evaluation.reporting.sheets import Sheet
+from mapvote_lab.evaluation.reporting.tables import Sheet
 
 
 def real_tables(bench: Bench, case: str) -> list[Sheet]:

@@ -34,7 +34,7 @@ from mapvote_lab.evaluation.experiments.real.street import (
     unedited,
     vote_on,
 )
-from mapvote_lab.evaluation.scoring.cells import determined, ratio
+from mapvote_lab.evaluation.scores import determined, ratio
 
 NEAR_CELLS = 5
 """1.5 m: precision is counted this close to the things, because over a street it depends on their number."""

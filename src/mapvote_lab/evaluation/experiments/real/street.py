@@ -30,9 +30,9 @@ from mapvote.perception.moving_objects import MovingFilter
 from mapvote.perception.raycast import find_obstacles
 from mapvote.slam.build import BuildReport, build_map
 from mapvote_lab.evaluation.experiments.cases import Case, fuse_case
-from mapvote_lab.evaluation.experiments.passes import SharedPass
-from mapvote_lab.evaluation.scoring.cells import determined, ratio
-from mapvote_lab.evaluation.scoring.scene_truth import pose_errors, rigid_between
+from mapvote_lab.evaluation.experiments.scene import SharedPass
+from mapvote_lab.evaluation.scores import determined, ratio
+from mapvote_lab.evaluation.truths import pose_errors, rigid_between
 
 VEHICLES = 3
 WRONG_M = 0.5

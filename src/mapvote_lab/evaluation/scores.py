@@ -1,0 +1,336 @@
+"""Scores against the truth: cells (paper V, Tables II-IV), points of the map, objects, probabilities.
+
+Every ratio is 0.0 where nothing is counted (0/0 = 0), so that no score is ever NaN.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+from scipy.spatial import cKDTree
+
+from mapvote.core.grid import TILE_CELLS, Grid, Lattice, TileIndex
+from mapvote.core.point_map import PointMap
+from mapvote.core.types import F64, I64, NO_VOTE, U8, Bool, CellState
+from mapvote.core.voting import VOTE_UNIT
+from mapvote.core.voxels import found_among
+from mapvote.fusion.fuse import Decision
+from mapvote.fusion.loss_budget import alike_beside, change_probability
+
+CLASSES = ("unchanged", "changed_occupied", "changed_empty")
+"""The paper's three scored classes; the position is the value in a truth grid."""
+UNSCORED = 255
+"""In a truth grid: this cell is not counted."""
+
+
+def ratio(part: float | np.integer, whole: float | np.integer) -> float:
+    """part / whole, 0.0 where whole is 0."""
+    return float(part / whole) if whole else 0.0
+
+
+def harmonic_mean(p: float, r: float) -> float:
+    """2 p r / (p + r), the F1 score of one class; 0.0 if both are 0."""
+    return ratio(2.0 * p * r, p + r)
+
+
+class ByClass(msgspec.Struct, frozen=True):
+    """A number for each of :data:`CLASSES`; iterates in their order."""
+
+    unchanged: float
+    changed_occupied: float
+    changed_empty: float
+
+    def __iter__(self) -> Iterator[float]:
+        return iter((self.unchanged, self.changed_occupied, self.changed_empty))
+
+    @property
+    def mean(self) -> float:
+        """Unweighted."""
+        return sum(self) / 3.0
+
+
+class Scores(msgspec.Struct, frozen=True):
+    """Precision and recall of the three classes, and what follows from them; made by :meth:`of`."""
+
+    precision: ByClass
+    recall: ByClass
+    f1: ByClass
+    macro_f1: float
+    """Unweighted mean of the three F1: what Table IV holds (docs/method.md)."""
+    kim_f1: float
+    """Harmonic mean of mean precision and mean recall, as Kim et al. [15] report it."""
+
+    @classmethod
+    def of(cls, precision: ByClass, recall: ByClass) -> Scores:
+        """All scores from the two."""
+        f1 = ByClass(*(harmonic_mean(p, r) for p, r in zip(precision, recall, strict=True)))
+        return cls(precision, recall, f1, f1.mean, harmonic_mean(precision.mean, recall.mean))
+
+
+def classes_of(states: U8) -> U8:
+    """Five states to the three scored classes: undetermined and never seen count as unchanged."""
+    out = np.zeros(states.shape, dtype=np.uint8)
+    out[states == CellState.CHANGED_OCCUPIED] = 1
+    out[states == CellState.CHANGED_EMPTY] = 2
+    return out
+
+
+def confusion(states: U8, truth: U8) -> NDArray[np.int64]:
+    """(3, 3) cells by [truth class, decided class]; truth 255 is not counted. ValueError on different shapes."""
+    if states.shape != truth.shape:
+        raise ValueError(f"states {states.shape} and truth {truth.shape} are not the same window")
+    scored = truth != UNSCORED
+    pairs = truth[scored].astype(np.int64) * 3 + classes_of(states)[scored]
+    return np.bincount(pairs, minlength=9).reshape(3, 3)
+
+
+def score_cells(states: U8, truth: U8) -> Scores:
+    """Precision and recall of decided ``states`` (CellState or NO_VOTE) against ``truth`` (0, 1, 2 or 255)."""
+    table = confusion(states, truth)
+    right, decided, true = np.diag(table), table.sum(axis=0), table.sum(axis=1)
+    precision = ByClass(*(ratio(right[k], decided[k]) for k in range(3)))
+    return Scores.of(precision, ByClass(*(ratio(right[k], true[k]) for k in range(3))))
+
+
+def determined(states: U8) -> Bool:
+    """Cells with one of the four states that say something: neither undetermined nor never seen."""
+    return (states != CellState.UNDETERMINED) & (states != NO_VOTE)
+
+
+def determined_share(vehicle_states: Sequence[U8], truth: U8) -> float:
+    """Share of the scored truth cells that at least one vehicle determined."""
+    seen = np.zeros(truth.shape, dtype=np.bool_)
+    for states in vehicle_states:
+        seen |= determined(states)
+    scored = truth != UNSCORED
+    return ratio(np.count_nonzero(seen & scored), np.count_nonzero(scored))
+
+
+class ObjectScores(msgspec.Struct, frozen=True):
+    """Connected changes against the truth."""
+
+    found: tuple[bool, ...]
+    """Per true object: at least half of its changed truth cells were decided so."""
+    met: tuple[bool, ...]
+    """Per true object: a connected change of ``min_m2`` was decided on its truth cells (all of them, if less)."""
+    recall: tuple[float, ...]
+    """Per true object: share of its changed truth cells decided so."""
+    false_m2: tuple[float, ...]
+    """Area of each decided object that touches no truth of its class, largest first."""
+
+
+def score_objects(
+    states: U8, truth: U8, objects: Sequence[Mapping[str, object]], cell_size: float, *, min_m2: float = 1.0
+) -> ObjectScores:
+    """``objects`` give ``cells`` (rows, cols) bool over the window and ``kind``: "built" or "demolished".
+
+    A decided object is an 8-connected group of cells of one changed class of at least ``min_m2``; it is false if
+    no truth cell of its class, nor an unscored one, lies within two cells of it (a wall one cell off is no invention).
+    Objects with no truth cell (never reachable by a ray) are not asked for.
+    """
+    decided = classes_of(states)
+    neighbours = np.ones((3, 3), dtype=np.bool_)
+    recalls, met = [], []
+    for item in objects:
+        kind = 1 if item["kind"] == "built" else 2
+        wanted = np.asarray(item["cells"], dtype=np.bool_) & (truth == kind)
+        if wanted.any():
+            right = wanted & (decided == kind)
+            recalls.append(ratio(np.count_nonzero(right), np.count_nonzero(wanted)))
+            pieces = np.bincount(ndimage.label(right, structure=neighbours)[0].ravel())[1:]
+            least = min(min_m2, np.count_nonzero(wanted) * cell_size**2)
+            met.append(bool(max(pieces, default=0) * cell_size**2 >= least))
+    false = []
+    for kind in (1, 2):
+        labels, count = ndimage.label(decided == kind, structure=neighbours)
+        near = ndimage.binary_dilation((truth == kind) | (truth == UNSCORED), structure=neighbours, iterations=2)
+        sizes = np.bincount(labels.ravel(), minlength=count + 1)[1:] * cell_size**2
+        touched = np.bincount(labels[near], minlength=count + 1)[1:] > 0
+        false += [float(size) for size, real in zip(sizes, touched, strict=True) if size >= min_m2 and not real]
+    found = tuple(share >= 0.5 for share in recalls)
+    return ObjectScores(
+        found, tuple(met), tuple(recalls), tuple(round(area, 2) for area in sorted(false, reverse=True))
+    )
+
+
+class MapScores(msgspec.Struct, frozen=True, kw_only=True):
+    """What the update did to the points (shares of points, or of surface samples for ``new_added``)."""
+
+    stale_deleted: float
+    """Old map points of removed surfaces that are gone."""
+    stale_apart_deleted: float
+    """The same, of points :data:`APART_M` or more from everything that stands: nearer ones share its voxels' reach."""
+    valid_deleted: float
+    """Old map points of standing surfaces that are gone: the damage done."""
+    new_added: float
+    """Samples of reachable new surface with a point of the updated map within reach."""
+    added_false: float
+    """Added points that lie on no surface of the new world."""
+    stale_points: int
+    valid_points: int
+    new_samples: int
+    added_points: int
+
+
+class MapJudge:
+    """Compares maps with noise-free surface samples of the two worlds; what the old map is worth is asked once.
+
+    ``old_points`` (n, 3) are the obstacle points of the map before the update. ``kept``, ``added`` and ``removed``
+    (m, 3) are surface samples, map metres: standing in both worlds, only in the new one, only in the old one. An old
+    point is stale if a removed sample lies within ``reach_m`` and no kept or added one nearer; valid if the nearest
+    sample within reach is a kept one. Points near no surface (trails, noise) are neither.
+    """
+
+    def __init__(self, old_points: F64, kept: F64, added: F64, removed: F64, *, reach_m: float = 0.3) -> None:
+        self._old, self._added, self._reach_m = old_points, added, reach_m
+        self._now = cKDTree(np.concatenate([kept, added]))
+        to_removed = _distance(old_points, cKDTree(removed))
+        to_kept, to_now = _distance(old_points, cKDTree(kept)), _distance(old_points, self._now)
+        self.stale = (to_removed <= reach_m) & (to_removed < to_now)
+        self.valid = (to_kept <= reach_m) & (to_kept <= to_removed)
+        self._apart = self.stale & (to_now >= APART_M)
+
+    def score(self, new_points: F64) -> MapScores:
+        """``new_points`` (n, 3): the obstacle points of the updated map; an old one survives if found bit for bit."""
+        survived, fresh = same_rows(self._old, new_points)
+        reached = _distance(self._added, cKDTree(new_points)) <= self._reach_m
+        return MapScores(
+            stale_deleted=ratio(np.count_nonzero(self.stale & ~survived), np.count_nonzero(self.stale)),
+            stale_apart_deleted=ratio(np.count_nonzero(self._apart & ~survived), np.count_nonzero(self._apart)),
+            valid_deleted=ratio(np.count_nonzero(self.valid & ~survived), np.count_nonzero(self.valid)),
+            new_added=ratio(np.count_nonzero(reached), len(self._added)),
+            added_false=ratio(np.count_nonzero(_distance(fresh, self._now) > self._reach_m), len(fresh)),
+            stale_points=int(np.count_nonzero(self.stale)),
+            valid_points=int(np.count_nonzero(self.valid)),
+            new_samples=len(self._added),
+            added_points=len(fresh),
+        )
+
+
+def _distance(points: F64, surface: cKDTree) -> F64:
+    """(n,) metres from each point to the nearest sample; inf beyond a metre or where there is none."""
+    if not len(points) or not surface.n:
+        return np.full(len(points), np.inf)
+    distance: F64 = surface.query(points, distance_upper_bound=1.0)[0]
+    return distance
+
+
+def same_rows(old: F64, new: F64) -> tuple[Bool, F64]:
+    """(which rows of ``old`` are in ``new``, the rows of ``new`` that are not in ``old``), compared bit for bit."""
+    a, b = (np.asarray(points, dtype=np.float64) for points in (old, new))
+    return found_among(a, b), new[~found_among(b, a)]
+
+
+APART_M = 0.6
+"""Two cells: a hit speaks for mapped voxels up to one cell away, so within two nobody can tell old from new."""
+
+
+def map_obstacles(point_map: PointMap) -> F64:
+    """The map's points (n, 3) at least GROUND_MARGIN_M above its ground, map metres, tile by tile."""
+    clouds = []
+    for tile in sorted(point_map.tiles):
+        content = point_map.tiles[tile]
+        clouds.append(content.points_map[content.columns[1]])
+    return np.concatenate(clouds) if clouds else np.zeros((0, 3))
+
+
+BINS = 10
+"""Of equal width, from 0 to 1."""
+
+
+@dataclass(frozen=True, slots=True)
+class Reliability:
+    """Of the scored cells that were decided as one kind of change. Bins without a cell have NaN."""
+
+    predicted: F64
+    """(BINS,) mean probability."""
+    true: F64
+    """(BINS,) share of the cells that did change so."""
+    cells: I64
+    """(BINS,)."""
+    calibration_error: float
+    """Mean distance of the two over the bins, weighed by their cells (ECE)."""
+    brier: float
+    """Mean square error of the probability, cell by cell."""
+
+
+def reliability(
+    decisions: Mapping[TileIndex, Decision], lattice: Lattice, truth: U8, window: Grid, state: CellState
+) -> Reliability:
+    """Hold the probabilities of the cells decided as ``state``, a changed one, against ``truth`` over ``window``.
+
+    As the server tells them (:func:`mapvote.fusion.loss_budget.change_probability`); votes are of vehicles, so
+    ``decisions`` are two-stage ones.
+    """
+    rows, cols, votes, against, odds = _decided(decisions, lattice, state)
+    kinds = np.zeros(len(rows), dtype=np.int64)
+    states = np.full(len(rows), state, dtype=np.uint8)
+    said = change_probability(states, votes, against, alike_beside(rows, cols, kinds), odds.astype(np.int8))
+    r, c = rows - window.row0, cols - window.col0
+    inside = (r >= 0) & (r < window.rows) & (c >= 0) & (c < window.cols)
+    found = truth[r[inside], c[inside]]
+    scored = found != UNSCORED
+    return binned(said[inside][scored], found[scored] == (1 if state == CellState.CHANGED_OCCUPIED else 2))
+
+
+def binned(said: F64, true: Bool) -> Reliability:
+    """Of probabilities (n,) and whether what they speak of is so (n,)."""
+    which = np.minimum((said * BINS).astype(np.int64), BINS - 1)
+    cells = np.bincount(which, minlength=BINS)
+    with np.errstate(invalid="ignore"):
+        predicted = np.bincount(which, weights=said, minlength=BINS) / cells
+        share = np.bincount(which, weights=true, minlength=BINS) / cells
+    apart = np.where(cells > 0, np.abs(np.nan_to_num(predicted) - np.nan_to_num(share)), 0.0)
+    return Reliability(
+        predicted,
+        share,
+        cells,
+        ratio(float((apart * cells).sum()), len(said)),
+        ratio(float(((said - true) ** 2).sum()), len(said)),
+    )
+
+
+def _decided(
+    decisions: Mapping[TileIndex, Decision], lattice: Lattice, state: CellState
+) -> tuple[I64, I64, I64, I64, I64]:
+    """(rows, cols on the lattice, votes for it, votes for something else; undetermined ones say nothing; how sure those
+    for it are), (n,) each."""
+    parts = [np.zeros((5, 0), dtype=np.int64)]
+    for index, decision in decisions.items():
+        tile = lattice.tile(index)
+        r, c = np.nonzero(decision.states == state)
+        told = decision.tally[r, c].astype(np.int64) // VOTE_UNIT
+        votes = told[:, state]
+        others = told[:, : CellState.UNDETERMINED].sum(axis=1) - votes
+        odds = decision.odds.at(r * TILE_CELLS + c)
+        parts.append(np.stack([tile.row0 + r, tile.col0 + c, votes, others, odds]))
+    rows, cols, votes, against, odds = np.concatenate(parts, axis=1)
+    return rows, cols, votes, against, odds
+
+
+PAPER_PRECISION: dict[str, tuple[float, float, float]] = {
+    "1": (0.996, 0.748, 0.550),
+    "2": (0.996, 0.787, 0.536),
+    "3": (0.996, 0.663, 0.556),
+    "4": (0.995, 0.768, 0.499),
+    "5": (0.996, 0.748, 0.645),
+}
+"""Table II: unchanged, changed (occupied), changed (empty)."""
+PAPER_RECALL: dict[str, tuple[float, float, float]] = {
+    "1": (0.994, 0.998, 0.767),
+    "2": (0.994, 0.954, 0.767),
+    "3": (0.994, 0.987, 0.767),
+    "4": (0.993, 0.882, 0.767),
+    "5": (0.996, 0.998, 0.767),
+}
+"""Table III."""
+PAPER_F1 = {"1": 0.830, "2": 0.829, "3": 0.811, "4": 0.807, "5": 0.850}
+"""Table IV: the unweighted mean of the three classes' F1 (docs/method.md)."""
+PAPER_SCORES = {
+    case: Scores.of(ByClass(*PAPER_PRECISION[case]), ByClass(*PAPER_RECALL[case])) for case in PAPER_PRECISION
+}

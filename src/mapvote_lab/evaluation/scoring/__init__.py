@@ -1,1 +1,0 @@
-"""How good: cells, points, objects."""

@@ -1,0 +1,412 @@
+"""What really happened, as the simulator wrote it, and the truths that decided cells are held against.
+
+The only module that opens a truth folder.
+
+A wall two centimetres from a cell's border fills one cell of a noise-free truth, and two of any cloud with two
+centimetres of range noise. **border** is a truth without the cells that change sides when the surfaces move by
+:data:`BORDER_M`. :func:`ceiling` is the score of a judge who knows of every point of such a cloud whether its surface
+came, went or stayed, but has to answer in cells.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy import ndimage
+
+from mapvote.config import PaperSettings
+from mapvote.core.columns import column_bits
+from mapvote.core.geometry import inverse
+from mapvote.core.grid import CELL_SIZE, Grid, Lattice, TileIndex
+from mapvote.core.point_map import PointMap
+from mapvote.core.reference import reference_window
+from mapvote.core.types import F32, F64, I32, NO_VOTE, U8, Bool, CellState, MapvoteError, Reference
+from mapvote.formats.drives.trajectory import read_poses
+from mapvote.fusion.fuse import Decision
+from mapvote_lab.evaluation.results import Judgement, PoseErrors
+from mapvote_lab.evaluation.scores import (
+    UNSCORED,
+    MapJudge,
+    MapScores,
+    Scores,
+    determined_share,
+    map_obstacles,
+    score_cells,
+    score_objects,
+)
+
+_KEPT, _ADDED, _REMOVED = 0, 1, 2
+_AROUND_M = 0.6
+"""Walls stand on the outline of a footprint: cells this far outside it still belong to the object."""
+_ARM_M = 2.0
+
+
+@dataclass(frozen=True, slots=True)
+class Truth:
+    """Cells, surfaces, objects and poses of one simulated scene, in the frame in which the survey's RTK speaks."""
+
+    folder: Path
+    x0: float
+    y0: float
+    strict: U8
+    provenance: U8
+    reason: U8
+    """Why a cell is unscored (docs/simulation.md)."""
+    densest: U8
+    """Most points of built bodies that one scan of a vehicle had in the cell."""
+    hit: Bool
+    """Where a vehicle recorded a point of a built body."""
+    passed: Bool
+    """Where a vehicle's ray went through the place of a demolished surface."""
+    objects: tuple[dict[str, Any], ...]
+    """``kind`` "built" or "demolished", ``footprint`` [[x, y], ..], ``height_m``."""
+
+    def grid_on(self, lattice: Lattice) -> Grid:
+        """The truth's window on a map's lattice; MapvoteError if the two do not fall on the same cells."""
+        row, col = (self.y0 - lattice.y0) / CELL_SIZE, (self.x0 - lattice.x0) / CELL_SIZE
+        if abs(row - round(row)) > 1e-6 or abs(col - round(col)) > 1e-6:
+            raise MapvoteError(
+                f"{self.folder}: its cells start at ({self.x0}, {self.y0}), off the map's lattice "
+                f"({lattice.x0}, {lattice.y0}): build the map on multiples of {CELL_SIZE} m"
+            )
+        return Grid(lattice, round(row), round(col), *self.strict.shape)
+
+    def poses(self, drive: str) -> F64:
+        """(n, 4, 4) true T_map_lidar of a drive at its stamps."""
+        return read_poses(self.folder / drive / "poses.txt")
+
+    def moving(self, drive: str, scan: int) -> Bool:
+        """(n,) which points of the scan's file hit a body that moves."""
+        return np.asarray(np.load(self.folder / drive / "moving" / f"{scan:06d}.npy"), dtype=np.bool_)
+
+    def surfaces(self) -> tuple[F64, F64, F64]:
+        """(kept, added, removed): noise-free surface samples (n, 3), map metres."""
+        with np.load(self.folder / "surface.npz") as file:
+            points, label = file["points"].astype(np.float64), file["label"]
+        return points[label == _KEPT], points[label == _ADDED], points[label == _REMOVED]
+
+    def cells_of(self, footprint: list[list[float]]) -> Bool:
+        """(rows, cols) cells whose centres lie in a convex footprint or within 0.6 m of it."""
+        corners = np.asarray(footprint)
+        turn = np.roll(corners, -1, axis=0) - corners
+        x1, y1 = np.roll(corners, -1, axis=0).T
+        area = 0.5 * float(np.sum(corners[:, 0] * y1 - corners[:, 1] * x1))
+        outward = np.column_stack([turn[:, 1], -turn[:, 0]]) * np.sign(area) / np.linalg.norm(turn, axis=1)[:, None]
+        rows, cols = self.strict.shape
+        x = self.x0 + (np.arange(cols) + 0.5) * CELL_SIZE
+        y = self.y0 + (np.arange(rows) + 0.5) * CELL_SIZE
+        inside = np.ones((rows, cols), dtype=np.bool_)
+        for (cx, cy), (nx, ny) in zip(corners, outward, strict=True):
+            inside &= (x[None, :] - cx) * nx + (y[:, None] - cy) * ny <= _AROUND_M
+        return inside
+
+
+def read_truth(scene: Path) -> Truth:
+    """The truth beside simulated drives: ``scene``/truth. MapvoteError if it is not there or not whole."""
+    folder = scene / "truth"
+    try:
+        with np.load(folder / "truth.npz") as file:
+            strict, provenance, reason = file["strict"], file["provenance"], file["reason"]
+            densest, hit, passed = file["densest"], file["hit"], file["passed"]
+            x0, y0 = float(file["x0"]), float(file["y0"])
+        objects = json.loads((folder / "objects.json").read_text())["objects"]
+    except (OSError, KeyError, ValueError) as error:
+        raise MapvoteError(f"{folder}: no usable truth ({error}); simulate the scene again") from error
+    return Truth(folder, x0, y0, strict, provenance, reason, densest, hit, passed, tuple(objects))
+
+
+def lay_on(states: U8, grid: Grid, window: Grid) -> U8:
+    """``states`` over ``grid`` as an array over ``window`` of the same lattice; NO_VOTE where they do not reach."""
+    out = np.full(window.shape, NO_VOTE, dtype=np.uint8)
+    common = grid.intersection(window)
+    if 0 in common.shape:
+        return out
+    out[common.slices_in(window)] = states[common.slices_in(grid)]
+    return out
+
+
+def rigid_between(T_map_a: F64, T_world_a: F64) -> F64:
+    """T_map_world (4, 4) that best carries one trajectory (n, 4, 4) onto the other, least squares (Kabsch 1976).
+
+    Each pose stands for its position and for points 2 m along its axes, so that a straight road, whose positions
+    leave the turn about it open, still fixes all six degrees of freedom.
+    """
+    to, of = T_map_a[:, :3, 3].mean(axis=0), T_world_a[:, :3, 3].mean(axis=0)
+    spread = (T_map_a[:, :3, 3] - to).T @ (T_world_a[:, :3, 3] - of)
+    spread += _ARM_M**2 * np.einsum("nij,nkj->ik", T_map_a[:, :3, :3], T_world_a[:, :3, :3])
+    u, _, vt = np.linalg.svd(spread)
+    T = np.eye(4)
+    T[:3, :3] = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    T[:3, 3] = to - T[:3, :3] @ of
+    return T
+
+
+def pose_errors(T_found: F64, T_true: F64) -> tuple[F64, F64]:
+    """(metres (n,), radians (n,)) between poses (n, 4, 4) in one frame."""
+    metres = np.linalg.norm(T_found[:, :3, 3] - T_true[:, :3, 3], axis=1)
+    cosines = [0.5 * (np.trace((inverse(a) @ b)[:3, :3]) - 1.0) for a, b in zip(T_found, T_true, strict=True)]
+    return metres, np.arccos(np.clip(cosines, -1.0, 1.0))
+
+
+def error_summary(T_found: F64, T_true: F64) -> PoseErrors:
+    """Of poses (n, 4, 4), both in one frame; a scan that was not localised is a row of NaN."""
+    there = np.isfinite(T_found).all(axis=(1, 2))
+    metres, radians = pose_errors(T_found[there], T_true[there])
+    if not there.any():
+        metres, radians = np.zeros(1), np.zeros(1)
+    return PoseErrors(
+        scans=len(T_found),
+        localised=int(there.sum()),
+        median_m=float(np.median(metres)),
+        p99_m=float(np.percentile(metres, 99)),
+        max_m=float(metres.max()),
+        median_deg=float(np.degrees(np.median(radians))),
+    )
+
+
+BORDER_M = 0.05
+NOISE_M = 0.02
+"""Range noise of the simulated sensors."""
+_DRAWS = 8
+_LEAST_POINTS = (1, 2, 4, 8, 16, 32, 64, 128)
+_UNCHANGED, _OCCUPIED, _EMPTY = 0, 1, 2
+
+
+def border(truth: Truth, cells: U8) -> U8:
+    """(rows, cols) ``cells``, one of the two definitions of ``truth``, with UNSCORED where :data:`BORDER_M` decide.
+
+    These are changed cells whose changed surface lies only in the rim of the cell, changed cells next to whose rim
+    something stands, and unchanged cells that no standing surface fills firmly, with a changed one at their rim.
+    Surfaces are the noise-free samples, .1 m apart (standing ones .25 m), of what rays could reach.
+    """
+    seen, added, removed = _around(truth, cells)
+    changed = np.isin(cells, (_OCCUPIED, _EMPTY))
+    moved = {kind: _rims(truth, samples) for kind, samples in ((_OCCUPIED, added), (_EMPTY, removed))}
+    stands, stands_near = _rims(truth, seen)
+    unsure = changed & stands_near
+    for kind, (firm, near) in moved.items():
+        unsure |= (cells == kind) & ~firm
+        unsure |= ~changed & near & ~stands
+    return np.where(unsure, np.uint8(UNSCORED), cells)
+
+
+def _around(truth: Truth, cells: U8) -> tuple[F64, F64, F64]:
+    """Surface samples (n, 3) that (stand, came, went); of the standing ones those that can be seen near a change."""
+    kept, added, removed = truth.surfaces()
+    changed = np.isin(cells, (_OCCUPIED, _EMPTY))
+    rim = np.ones((3, 3), dtype=np.bool_)
+    near = ndimage.binary_dilation(changed | (_count(truth, np.concatenate([added, removed])) > 0), rim)
+    beside = near & ~changed  # what a changed cell holds of what stands was hidden, or lies on the ground
+    return kept[_at(truth, kept, beside)], added, removed
+
+
+def _rims(truth: Truth, samples: F64) -> tuple[Bool, Bool]:
+    """(cells with a sample farther than BORDER_M from their rim, cells with one no farther than that outside it)."""
+    x, y = (samples[:, 0] - truth.x0) % CELL_SIZE, (samples[:, 1] - truth.y0) % CELL_SIZE
+    inner = np.abs(np.column_stack([x, y]) - CELL_SIZE / 2).max(axis=1, initial=0.0) < CELL_SIZE / 2 - BORDER_M
+    firm = _count(truth, samples[inner]) > 0
+    near = np.zeros_like(firm)
+    for dx in (-BORDER_M, BORDER_M):
+        for dy in (-BORDER_M, BORDER_M):
+            near |= _count(truth, samples + np.array([dx, dy, 0.0])) > 0
+    return firm, near
+
+
+def _at(truth: Truth, samples: F64, plane: Bool) -> Bool:
+    """(n,) what ``plane`` (rows, cols) says at samples (n, 3); False outside it."""
+    r, c, inside = _indices(truth, samples)
+    out = np.zeros(len(samples), dtype=np.bool_)
+    out[inside] = plane[r[inside], c[inside]]
+    return out
+
+
+def _count(truth: Truth, samples: F64) -> I32:
+    """(rows, cols) samples in each cell."""
+    r, c, inside = _indices(truth, samples)
+    rows, cols = truth.strict.shape
+    return np.bincount(r[inside] * cols + c[inside], minlength=rows * cols).reshape(rows, cols).astype(np.int32)
+
+
+def _indices(truth: Truth, samples: F64) -> tuple[I32, I32, Bool]:
+    c = np.floor((samples[:, 0] - truth.x0) / CELL_SIZE).astype(np.int32)
+    r = np.floor((samples[:, 1] - truth.y0) / CELL_SIZE).astype(np.int32)
+    rows, cols = truth.strict.shape
+    return r, c, (r >= 0) & (r < rows) & (c >= 0) & (c < cols)
+
+
+def ceiling(truth: Truth, cells: U8) -> Scores:
+    """The best that perfect labels on a cloud with range noise score against ``cells``.
+
+    Every surface sample is measured :data:`_DRAWS` times, :data:`NOISE_M` off in the plane. A cell is changed if it
+    holds enough points of a surface that came, or went, and none of one that stands; how many are enough is chosen on
+    the truth itself, so no method that votes in cells can be expected to do better.
+    """
+    kept, added, removed = _around(truth, cells)
+    rng = np.random.default_rng(0)
+    stands, came, went = (_measured(truth, samples, rng) for samples in (kept, added, removed))
+    best = [score_cells(_answer(stands, came, went, least), cells) for least in _LEAST_POINTS]
+    return max(best, key=lambda scores: scores.macro_f1)
+
+
+def _measured(truth: Truth, samples: F64, rng: np.random.Generator) -> I32:
+    out = np.zeros(truth.strict.shape, dtype=np.int32)
+    for _ in range(_DRAWS):
+        noise = rng.normal(0.0, NOISE_M, samples.shape)
+        noise[:, 2] = 0.0
+        out += _count(truth, samples + noise)
+    return out
+
+
+def _answer(stands: I32, came: I32, went: I32, least: int) -> U8:
+    states = np.full(stands.shape, CellState.UNCHANGED_EMPTY, dtype=np.uint8)
+    states[(went >= least) & (stands < least) & (came < least)] = CellState.CHANGED_EMPTY
+    states[(came >= least) & (stands < least) & (went < least)] = CellState.CHANGED_OCCUPIED
+    return states
+
+
+ON_SURFACE_M = 0.3
+"""A map point farther than this from every surface lies on none (as evaluation/scores.py has it)."""
+
+
+def could_be_known(truth: Truth, first_map: Reference) -> U8:
+    """Provenance, less what a vote by scans cannot know: (rows, cols).
+
+    A built surface of which no scan of any vehicle had n_min points in the cell (they count the true points, of the
+    simulator), and a demolished one of which the map holds no point. Both are unscored.
+    """
+    out = truth.provenance.copy()
+    out[(out == _OCCUPIED) & (truth.densest < PaperSettings().n_min)] = UNSCORED
+    out[(out == _EMPTY) & (first_map.counts == 0)] = UNSCORED
+    return out
+
+
+def known(truth: Truth, first_map: Reference) -> U8:
+    """``border`` of the strict truth, less the cells of which nobody could know better: (rows, cols).
+
+    Unscored besides are a built surface of which no vehicle recorded a point in the cell, a demolished one through
+    whose place no vehicle's ray went, and an unchanged cell in which the first map holds points on nothing: it has
+    points, and no surface that stood at the survey comes within ON_SURFACE_M of the cell.
+    """
+    out = border(truth, truth.strict)
+    undecided = ((out == _OCCUPIED) & ~truth.hit) | ((out == _EMPTY) & ~truth.passed)
+    kept, _, removed = truth.surfaces()
+    stood = np.zeros(out.shape, dtype=np.bool_)
+    rows, cols, inside = first_map.grid.indices_of(np.concatenate([kept, removed]))
+    stood[rows[inside], cols[inside]] = True
+    near = ndimage.binary_dilation(stood, np.ones((3, 3)), iterations=round(ON_SURFACE_M / CELL_SIZE))
+    on_nothing = (out == _UNCHANGED) & (first_map.counts > 0) & ~near
+    return np.where(undecided | on_nothing, np.uint8(UNSCORED), out)
+
+
+TRUTHS: Mapping[str, Callable[[Truth, Reference], U8]] = {
+    "known": known,
+    "strict": lambda truth, first_map: truth.strict,
+    "provenance": lambda truth, first_map: truth.provenance,
+    "could be known": could_be_known,
+    "border": lambda truth, first_map: border(truth, truth.strict),
+    "border, provenance": lambda truth, first_map: border(truth, truth.provenance),
+}
+"""What each calls a cell, over the window of the truth: 0 unchanged, 1 changed-occupied, 2 changed-empty, 255 unscored;
+``first_map`` is the map that is voted on, over the same window (docs/decisions/truth.md)."""
+
+SIDE_BY_SIDE = ("strict", "provenance", "could be known")
+"""Those that differ in what they ask for, whose sizes are told."""
+
+BANDS = ("below 1.5 m", "1.5 to 4 m", "above 4 m", "no sample")
+"""Where the lowest changed surface of a cell lies above the ground; "no sample": the noise-free survey met none."""
+_EDGES_M = (1.5, 4.0)
+
+
+def sizes_by_height(states: U8, truth: Truth, first_map: Reference) -> dict[str, dict[str, int]]:
+    """How many changed cells of a truth's ``states`` (rows, cols) lie in each of BANDS, by class."""
+    _, added, removed = truth.surfaces()
+    return {
+        name: _by_band(states == value, lowest_surface(samples, first_map.grid, first_map.ground_z))
+        for name, value, samples in (("changed_occupied", _OCCUPIED, added), ("changed_empty", _EMPTY, removed))
+    }
+
+
+def lowest_surface(samples: F64, grid: Grid, ground_z: F32) -> F64:
+    """(rows, cols) height of the lowest of ``samples`` (n, 3) above the ground by cell; inf where there is none."""
+    lowest = np.full(grid.shape, np.inf)
+    rows, cols, inside = grid.indices_of(samples)
+    rows, cols = rows[inside], cols[inside]
+    height = samples[inside, 2] - ground_z[rows, cols]
+    known = height >= 0.0
+    np.minimum.at(lowest, (rows[known], cols[known]), height[known])
+    return lowest
+
+
+def _by_band(cells: np.ndarray, lowest: F64) -> dict[str, int]:
+    heights = lowest[cells]
+    band = np.where(np.isinf(heights), len(_EDGES_M) + 1, np.digitize(heights, _EDGES_M))
+    return {name: int(np.count_nonzero(band == k)) for k, name in enumerate(BANDS)}
+
+
+@dataclass(frozen=True, slots=True)
+class CaseOutcome:
+    """What the server made of one case's ballots."""
+
+    updated: PointMap
+    states: U8
+    """Decided, over the truth's window."""
+    vehicle_states: list[U8]
+    """Each vehicle's own decision, over the truth's window."""
+    decisions: Mapping[TileIndex, Decision]
+    seconds: float
+    """Spent on fusing."""
+
+
+class Jury:
+    """Scores whatever was decided about one first map against one truth."""
+
+    def __init__(self, first_map: PointMap, truth: Truth) -> None:
+        self.truth = truth
+        self.window = truth.grid_on(first_map.lattice)
+        self.first_map = reference_window(first_map, self.window)
+        """Over the truth's window."""
+        self.truths = {name: judge(truth, self.first_map) for name, judge in TRUTHS.items()}
+        """(rows, cols) of each, by name."""
+        self.points = MapJudge(map_obstacles(first_map), *_above_ground(self.first_map, truth))
+        """What became of the first map's points."""
+        self._objects = [{"kind": o["kind"], "cells": truth.cells_of(o["footprint"])} for o in truth.objects]
+
+    def of_states(self, states: U8, vehicle_states: Sequence[U8]) -> Judgement:
+        """Scores by every truth, coverage, objects; all states over the truth's window."""
+        return self._judge(states, vehicle_states, None)
+
+    def of_update(self, outcome: CaseOutcome) -> Judgement:
+        """The same, and what became of the map's points."""
+        points = self.points.score(map_obstacles(outcome.updated))
+        return self._judge(outcome.states, outcome.vehicle_states, points)
+
+    def ceilings(self) -> dict[str, Scores]:
+        """By truth: what perfect labels on every measured point would score (evaluation/truths.py)."""
+        return {name: ceiling(self.truth, cells) for name, cells in self.truths.items()}
+
+    def _judge(self, states: U8, vehicle_states: Sequence[U8], points: MapScores | None) -> Judgement:
+        scores = {name: score_cells(states, cells) for name, cells in self.truths.items()}
+        return Judgement(
+            strict=scores.pop("strict"),
+            provenance=scores.pop("provenance"),
+            also=scores,
+            coverage=determined_share(vehicle_states, self.truths["strict"]),
+            objects=score_objects(states, self.truths["strict"], self._objects, CELL_SIZE),
+            map=points,
+        )
+
+
+def _above_ground(reference: Reference, truth: Truth) -> tuple[F64, F64, F64]:
+    """Surface samples that could be obstacle points: above the map's ground, or outside the window."""
+    chosen = []
+    for samples in truth.surfaces():
+        rows, cols, inside = reference.grid.indices_of(samples)
+        cells = rows.clip(0, reference.grid.rows - 1), cols.clip(0, reference.grid.cols - 1)
+        _, obstacle = column_bits(samples[:, 2], reference.ground_z[cells], reference.base[cells])
+        chosen.append(samples[~inside | obstacle])
+    return chosen[0], chosen[1], chosen[2]
