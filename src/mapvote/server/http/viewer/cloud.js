@@ -97,7 +97,7 @@ export class Cloud {
   }
 
   // Lines of [x, y, z], map metres, seen through everything; they take the place of those before.
-  setLines(lines) {
+  setLines(lines) {  // {colour: "path" or "next", line: of [x, y, z]}
     if (this.lines) {
       this.scene.remove(this.lines);
       this.lines.geometry.dispose();
@@ -105,12 +105,15 @@ export class Cloud {
       this.lines = null;
     }
     const local = ([x, y, z]) => [x - this.origin[0], y - this.origin[1], z - this.origin[2] + 0.3];
-    const ends = lines.flatMap((line) => line.slice(1).flatMap((at, i) => [...local(line[i]), ...local(at)]));
+    const ends = lines.flatMap(({ line }) => line.slice(1).flatMap((at, i) => [...local(line[i]), ...local(at)]));
     if (ends.length) {
+      const style = getComputedStyle(document.documentElement), made = new Color();
+      const of = (name) => made.setStyle(style.getPropertyValue(`--${name}`).trim(), "").toArray();
+      const colours = lines.flatMap(({ colour, line }) => Array(2 * (line.length - 1)).fill(of(colour)).flat());
       const geometry = new BufferGeometry();
       geometry.setAttribute("position", new BufferAttribute(new Float32Array(ends), 3));
-      this.lines = new LineSegments(geometry, new LineBasicMaterial({ depthTest: false, depthWrite: false }));
-      this.lines.material.color.setStyle(getComputedStyle(document.documentElement).getPropertyValue("--path").trim() || "#e07b00", "");
+      geometry.setAttribute("color", new BufferAttribute(new Float32Array(colours), 3));
+      this.lines = new LineSegments(geometry, new LineBasicMaterial({ vertexColors: true, depthTest: false, depthWrite: false }));
       this.lines.frustumCulled = false;
       this.lines.renderOrder = 1;
       this.scene.add(this.lines);

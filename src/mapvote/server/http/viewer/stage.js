@@ -90,10 +90,11 @@ export class Stage {
     this.flat.setRaster(hash, points);
   }
 
-  // Lines of [x, y, z] or, on the ground, of [x, y], map metres.
-  setPaths(lines) {
-    this.flat.setPaths(lines);
-    this.cloud?.setLines(lines.map((line) => line.map(([x, y, z]) => [x, y, z ?? this.groundAt([x, y, x, y])])));
+  // {colour, line}: lines of [x, y, z] or, on the ground, of [x, y], map metres.
+  setPaths(paths) {
+    this.flat.setPaths(paths);
+    const risen = (line) => line.map(([x, y, z]) => [x, y, z ?? this.groundAt([x, y, x, y])]);
+    this.cloud?.setLines(paths.map(({ colour, line }) => ({ colour, line: risen(line) })));
   }
 
   select(id, cell = null) {

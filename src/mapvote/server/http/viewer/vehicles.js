@@ -44,6 +44,7 @@ function visit(e) {
 // Lines in both pictures: paths of the drives whose ballots stand, and stretches on which one more pass would decide
 // cells.
 const GAP_M = 40;  // farther apart: the vehicle did not know where it was in between
+const HEAD_M = 4;
 
 const LAYERS = {
   paths: { ask: api.paths, text: driven, features: [] },
@@ -61,7 +62,9 @@ async function showLayer(name) {
   }
   if (asked !== $(name).checked) return;
   $(`${name}-text`).textContent = asked ? layer.text(layer.features) : "";
-  state.view.setPaths(Object.values(LAYERS).flatMap((l) => l.features).flatMap((f) => unbroken(f.geometry.coordinates)));
+  const next = LAYERS.next.features.flatMap((f) => [f.geometry.coordinates, head(f.geometry.coordinates)]);
+  const paths = LAYERS.paths.features.flatMap((f) => unbroken(f.geometry.coordinates));
+  state.view.setPaths([...next.map((line) => ({ colour: "next", line })), ...paths.map((line) => ({ colour: "path", line }))]);
 }
 
 // Once the server has told that it tells: as the address says, and up to date with each new ballot.
@@ -81,6 +84,14 @@ function driven(features) {
 function wanted(features) {
   const cells = features.reduce((sum, f) => sum + f.properties.cells, 0);
   return features.length ? `${features.length} stretches of road, ${cells} cells` : "no cell waits for one more pass";
+}
+
+// The head of an arrow at the end of a line, which says in which direction to drive.
+function head(line) {
+  const [end, before] = [line.at(-1), line.findLast((at) => Math.hypot(at[0] - line.at(-1)[0], at[1] - line.at(-1)[1]) >= HEAD_M) ?? line[0]];
+  const along = Math.atan2(end[1] - before[1], end[0] - before[0]);
+  const barb = (turn) => [end[0] - HEAD_M * Math.cos(along + turn), end[1] - HEAD_M * Math.sin(along + turn)];
+  return [barb(0.6), end, barb(-0.6)];
 }
 
 function unbroken(line) {

@@ -24,7 +24,7 @@ export class View {
   readColours() {
     const style = getComputedStyle(document.documentElement);
     const of = (name) => style.getPropertyValue(name).trim();
-    this.colours = { built: of("--built"), demolished: of("--demolished"), line: of("--line"), ink: of("--ink"), point: of("--point"), path: of("--path") };
+    this.colours = { built: of("--built"), demolished: of("--demolished"), line: of("--line"), ink: of("--ink"), point: of("--point"), path: of("--path"), next: of("--next") };
     this.rasters.clear();
     this.draw();
   }
@@ -39,7 +39,7 @@ export class View {
     this.draw();
   }
 
-  setPaths(paths) {  // lines of [x, y, ..]
+  setPaths(paths) {  // {colour: "path" or "next", line: of [x, y, ..]}
     this.paths = paths;
     this.draw();
   }
@@ -132,9 +132,9 @@ export class View {
     g.clearRect(0, 0, canvas.clientWidth, canvas.clientHeight);
     g.imageSmoothingEnabled = this.scale < 1 / CELL;
     for (const tile of this.tiles) this.paintTile(g, tile);
-    g.strokeStyle = this.colours.path;
-    g.lineWidth = 2;
-    for (const line of this.paths) {
+    for (const { colour, line } of this.paths) {
+      g.strokeStyle = this.colours[colour];
+      g.lineWidth = colour === "next" ? 4 : 2;
       g.beginPath();
       for (const at of line) g.lineTo(...this.toScreen(at));
       g.stroke();
