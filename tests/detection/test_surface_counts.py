@@ -107,7 +107,7 @@ def test_a_cell_in_which_a_count_is_full_is_halved_as_a_whole_and_its_ratios_sta
     for scan in range(FULL + 1):
         evidence.count(one_scan(point_map, hit if scan % 4 == 0 else empty))
     cell = evidence.tiles[0, 0][102, 102]
-    assert count_of(cell, PASSES, 10) == FULL // 2 + 1, "full after 127, so 63 and the last one"
+    assert count_of(cell, PASSES, 10) == (FULL + 1) // 2, "128 do not fit"
     assert count_of(cell, HIT, 3) == 32 // 2
     assert count_of(cell, PASSES, 3) == 96 // 2
     assert cell[PASSED] == ~np.uint64(0), "what rays ever passed is no count"

@@ -7,12 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mapvote.core.types import U64, Bool
-from mapvote.detection.surface_rules import (
-    SUPPORT,
-    on_its_own,
-    supported,
-)
+from mapvote.core.types import U64, Bool, CellState
+from mapvote.detection.surface_rules import NEW_A_CELL, NEW_ENOUGH, SUPPORT, enough, judge_window, no_facts
 
 SIDE = 20
 NOTHING = np.zeros((SIDE, SIDE), np.uint64)
@@ -25,11 +21,10 @@ def words(*marks: tuple[int, int, int]) -> U64:
     return out
 
 
-def alone(voxels: U64, whole: U64 | None = None, others: Bool | None = None) -> bool:
-    """Whether all cells with ``voxels`` are a thing of its own."""
+def alone(voxels: U64, others: Bool | None = None) -> bool:
+    """Whether all cells with ``voxels``, fewer than SUPPORT, are a thing of its own."""
     cells = voxels != 0
-    nobody = np.zeros((SIDE, SIDE), np.bool_)
-    found = on_its_own(cells, voxels, voxels if whole is None else whole, nobody if others is None else others)
+    found = enough(voxels, 0, np.zeros((SIDE, SIDE), np.bool_) if others is None else others)
     assert not found[~cells].any()
     return bool(found[cells].all())
 
@@ -60,14 +55,33 @@ def test_what_touches_something_else_is_no_thing_of_its_own() -> None:
     assert not alone(words((6, 6, 0b110)), others=others)
 
 
-def test_half_of_a_thing_must_have_gone_for_the_whole_to_go() -> None:
-    assert alone(words((5, 5, 0b110)), whole=words((5, 5, 0b11110)))
-    assert alone(words((5, 5, 0b1110)), whole=words((5, 5, 0b1111110)))
-    assert not alone(words((5, 5, 0b110)), whole=words((5, 5, 0b111110)))
+@given(
+    st.lists(st.tuples(st.integers(0, 9), st.integers(0, 9), st.integers(1, 2**59)), max_size=12),
+    st.sampled_from([0, NEW_A_CELL]),
+)
+def test_what_is_enough_is_asked_of_groups_and_not_of_cells(marks: list[tuple[int, int, int]], a_cell: int) -> None:
+    voxels = words(*((2 * row, 2 * col, word << 4) for row, col, word in marks))  # no two cells touch, none the ground
+    assert np.array_equal(enough(voxels, a_cell, voxels != 0), np.bitwise_count(voxels) >= SUPPORT)
 
 
-@given(st.lists(st.tuples(st.integers(0, 9), st.integers(0, 9), st.integers(1, 2**63)), max_size=12))
-def test_support_is_asked_of_groups_and_not_of_cells(marks: list[tuple[int, int, int]]) -> None:
-    voxels = words(*((2 * row, 2 * col, word) for row, col, word in marks))  # no two cells touch
-    enough = supported(voxels != 0, voxels, SUPPORT)
-    assert np.array_equal(enough, np.bitwise_count(voxels) >= SUPPORT)
+@given(st.integers(1, SIDE), st.integers(1, 8))
+def test_what_is_new_needs_more_the_more_cells_it_has_and_at_most_so_much(cells: int, voxels_a_cell: int) -> None:
+    voxels = words(*((5, col, (1 << voxels_a_cell) - 1 << 4) for col in range(cells)))
+    needed = min(SUPPORT + NEW_A_CELL * (cells - 1), NEW_ENOUGH)
+    assert enough(voxels, NEW_A_CELL, voxels != 0)[5, 0] == (cells * voxels_a_cell >= needed)
+
+
+def test_what_goes_along_touches_what_went_and_rays_passed_something_of_it_or_it_lies_near() -> None:
+    """A row of cells from a pole that went. Of the others rays passed what is mapped (P), or only below it (B), or
+    nothing (N); in S something stands."""
+    row = "PPPPPNPP", "BBBBB", "NBB", "PSPP"
+    gone_along = "PPPPP", "BBB", "", "P"
+    for cells, along in zip(row, gone_along, strict=True):
+        facts, occupied = no_facts((1, 12)), np.zeros((1, 12), np.uint64)
+        occupied[0, : len(cells) + 1] = 0b1111110000
+        facts.gone[0, 0] = facts.passed[0, 0] = 0b1111110000
+        for k, said in enumerate(cells, 1):
+            facts.passed[0, k] = {"P": 0b10000, "B": 0b1000, "N": 0, "S": 0b10000}[said]
+            facts.stands[0, k] = 0b10000 * (said == "S")
+        states = judge_window(facts, occupied, np.where(occupied != 0, np.float32(3.0), np.float32(np.nan)), 0.5).states
+        assert np.flatnonzero(states == CellState.CHANGED_EMPTY).tolist() == list(range(len(along) + 1))

@@ -30,10 +30,13 @@ from mapvote.detection.packed_tiles import Overlap
 from mapvote.detection.surface_rules import (
     GONE_RAYS,
     HIT_RAYS,
+    NEW_ENOUGH,
     NEW_RAYS,
+    REACH_CELLS,
     SUPPORT,
+    VoxelFacts,
     grown,
-    lasting,
+    judge_window,
     no_facts,
     weigh_voxels,
 )
@@ -157,8 +160,9 @@ def test_twigs_at_the_edge_of_all_that_is_known_are_no_pole_together() -> None:
     assert [int(states[0, c]) for c in (105, 107)] == [UN, UN]
 
 
-def test_what_two_scans_crossed_is_not_gone_yet() -> None:
-    gone_after = [after(street(WALL, HEIGHTS), standing_at(OLD_Y + 9), n).states[ROW, 105] for n in (2, GONE_RAYS)]
+def test_what_few_scans_crossed_is_not_gone_yet() -> None:
+    few = GONE_RAYS - 1
+    gone_after = [after(street(WALL, HEIGHTS), standing_at(OLD_Y + 9), n).states[ROW, 105] for n in (few, GONE_RAYS)]
     assert gone_after == [UN, CE]
 
 
@@ -206,7 +210,7 @@ def test_a_kerb_stays_before_a_wall_that_was_pulled_down(off: int) -> None:
 
 
 def test_a_roof_that_no_ray_could_reach_falls_with_the_wall_that_bore_it() -> None:
-    roof = [(ROW + k, c) for k in range(1, 5) for c in COLUMNS]
+    roof = [(ROW + k, c) for k in range(1, 2 * REACH_CELLS) for c in COLUMNS]
     points = np.concatenate([wall(WALL, HEIGHTS), wall(roof, [4.65])])
     ground = wall([(r, c) for r in range(85, 125) for c in range(85, 135)], [0.0])
     point_map = make_map({(0, 0): make_tile(np.concatenate([points, ground]))})
@@ -215,7 +219,8 @@ def test_a_roof_that_no_ray_could_reach_falls_with_the_wall_that_bore_it() -> No
         seen = one_scan(point_map, standing_at(OLD_Y + 9))
         seen.view.passed[:] &= np.uint64((1 << 12) - 1)  # no ray rises to the roof
         voter.observe(seen)
-    assert all(voter.votes()[0, 0].states[cell] == CE for cell in roof)
+    states = voter.votes()[0, 0].states
+    assert all((states[r, c] == CE) == (r - ROW <= REACH_CELLS) for r, c in roof), "as far as what went reaches"
 
 
 def test_a_cell_in_which_something_stands_is_not_empty_whatever_else_of_it_is_gone() -> None:
@@ -239,25 +244,24 @@ def test_a_place_where_nothing_is_mapped_and_rays_passed_is_empty_and_one_that_n
     assert states[ROW, 100] == UO, "hits need no rays beside them"
 
 
-def weighed(mapped: int, free: int, **counts: int) -> tuple[list[np.ndarray], int]:
-    """Voxel 5 of one cell with these counts: (gone, stands, unmet, new, beyond; of what is new, hits less passes)."""
+def weighed(mapped: int, free: int, **counts: int) -> VoxelFacts:
+    """Of one cell whose voxel 5 has these counts; ``passes`` of the voxels above and below it too."""
     planes, bit = np.zeros((1, 1, WORDS), np.uint64), 5
-    for first, name in ((CROSSED, "crossed"), (HIT, "met"), (PASSES, "passes")):
+    for first, name, word in ((CROSSED, "crossed", 0b010), (HIT, "met", 0b010), (PASSES, "passes", 0b111)):
         for k in range(PLANES):
-            planes[0, 0, first + k] = np.uint64((counts.get(name, 0) >> k & 1) << bit)
+            planes[0, 0, first + k] = np.uint64((counts.get(name, 0) >> k & 1) * word << bit - 1)
     words_of = [np.full((1, 1), word << bit, np.uint64) for word in (mapped, free)]
     out = no_facts((1, 1))
     weigh_voxels(planes, Overlap(0, 1, 0, 1, 0, 0), *words_of, out)
-    return list(out[:5]), int(out.balance[0, 0])
+    return out
 
 
-@given(crossed=st.integers(0, 120), met=st.integers(0, 20))
-def test_one_hit_outweighs_as_many_rays_as_is_said(crossed: int, met: int) -> None:
-    (gone, stands, unmet, new, beyond), _ = weighed(1, 0, crossed=crossed, met=met)
-    assert (gone[0, 0] != 0) == (crossed >= GONE_RAYS + HIT_RAYS * met)
-    assert (stands[0, 0] != 0) == (met > 0 and gone[0, 0] == 0)
-    assert (unmet[0, 0] != 0) == (met == 0 and 0 < crossed < GONE_RAYS)
-    assert not (new | beyond).any()
+@given(passes=st.integers(0, 120), met=st.integers(0, 20))
+def test_one_hit_outweighs_as_many_rays_as_is_said(passes: int, met: int) -> None:
+    said = weighed(1, 0, passes=passes, met=met)
+    assert (said.gone[0, 0] != 0) == (passes >= GONE_RAYS + HIT_RAYS * met)
+    assert (said.stands[0, 0] != 0) == (met > 0 and said.gone[0, 0] == 0)
+    assert not (said.new | said.beyond).any()
 
 
 @given(crossed=st.integers(0, 120), met=st.integers(0, 60), passes=st.integers(0, 127))
@@ -265,16 +269,11 @@ def test_one_hit_outweighs_as_many_rays_as_is_said(crossed: int, met: int) -> No
 def test_a_free_voxel_is_new_by_hits_against_crossings_and_tells_how_often_rays_passed(
     crossed: int, met: int, passes: int
 ) -> None:
-    (gone, stands, unmet, new, beyond), balance = weighed(0, 1, crossed=crossed, met=met, passes=passes)
-    assert (new[0, 0] != 0) == (met >= 1 + NEW_RAYS * crossed)
-    assert balance == (met - passes if new[0, 0] else 0)
-    assert not (gone | stands | unmet | beyond).any()
-
-
-def test_what_was_met_more_often_than_rays_passed_it_lasts_and_takes_its_seldom_met_edges_along() -> None:
-    cells = np.array([[1, 1, 1, 0, 1, 1]], np.bool_)
-    met, passes = np.array([[9, 9, 1, 0, 2, 1]], np.int32), np.array([[0, 3, 16, 0, 3, 1]], np.int32)
-    assert lasting(cells, met - passes).tolist() == [[True, True, True, False, False, False]]
+    said = weighed(0, 1, crossed=crossed, met=met, passes=passes)
+    new = said.new[0, 0] != 0
+    assert new == (met >= 1 + NEW_RAYS * crossed)
+    assert [said.hits[0, 0], said.balance[0, 0]] == ([met, met - passes] if new else [0, 0])
+    assert not (said.gone | said.stands | said.beyond).any()
 
 
 @given(
@@ -282,11 +281,16 @@ def test_what_was_met_more_often_than_rays_passed_it_lasts_and_takes_its_seldom_
     met=arrays(np.int32, (6, 6), elements=st.integers(0, 50)),
     passes=arrays(np.int32, (6, 6), elements=st.integers(0, 50)),
 )
-def test_of_what_lasts_more_hits_take_nothing_away_and_no_ray_leaves_anything_out(
-    cells: Bool, met: I32, passes: I32
-) -> None:
-    assert (lasting(cells, met + 1 - passes) >= lasting(cells, met - passes)).all()
-    np.testing.assert_array_equal(lasting(cells, met), cells)
+def test_what_was_passed_more_often_than_hit_is_nothing_new(cells: Bool, met: I32, passes: I32) -> None:
+    ground = np.zeros(cells.shape, np.uint64)
+    pole = np.where(cells, np.uint64(2 * (1 << NEW_ENOUGH) - 2), np.uint64(0))
+    facts = no_facts(cells.shape)._replace(new=pole, balance=np.where(cells, met - passes, 0))
+    came = judge_window(facts, ground, np.full(cells.shape, np.nan, np.float32), 0.5).states == CO
+    groups, count = ndimage.label(cells, np.ones((3, 3)))
+    for k in range(1, count + 1):
+        group = groups == k
+        assert came[group].all() if met[group].sum() >= passes[group].sum() else not came[group].any()
+    assert not came[~cells].any()
 
 
 def test_a_car_that_drove_by_far_off_is_nothing_new_and_one_that_parked_is() -> None:

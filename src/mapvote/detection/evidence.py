@@ -20,7 +20,7 @@ import numpy as np
 
 from mapvote.core.columns import TOP_BIT, layer_bit
 from mapvote.core.grid import CELL_SIZE, Lattice
-from mapvote.core.kernel import allocating, inlined, kernel
+from mapvote.core.kernel import inlined, kernel
 from mapvote.core.types import F32, F64, I32, U64, Bool
 from mapvote.detection.packed_tiles import Overlap, PackedTiles
 from mapvote.perception.frontend import Observation
@@ -29,7 +29,7 @@ from mapvote.perception.raycast import find_obstacles
 HIT_REACH_M = 0.1
 """Range noise and pose sigma together, three times over."""
 PLANES = 7
-"""Counts up to 127 scans. A cell that would exceed them is halved as a whole, which keeps its ratios."""
+"""Counts up to 127 scans."""
 CROSSED, HIT, PASSES = 0, PLANES, 2 * PLANES
 """First plane of each counter."""
 PASSED = 3 * PLANES
@@ -39,59 +39,37 @@ WORDS = 3 * PLANES + 1
 _LOWEST, _HIGHEST = np.uint64(0b11), np.uint64(1) << np.uint64(TOP_BIT - 1)
 
 
-@kernel
-def is_full(planes: U64, first: int, word: np.uint64) -> bool:
-    """Whether one of ``word``'s voxels has reached the highest count."""
-    for k in range(first + PLANES - 1, first - 1, -1):
-        word &= planes[k]
-    return word != 0
+class Evidence:
+    """Counters of a drive by tile: (256, 256, WORDS) uint64: crossed, hit, passes, then what any ray passed.
+
+    Memory is bounded by the tiles around the vehicle, and some hundred kilobytes for each that it has left.
+    """
+
+    def __init__(self, lattice: Lattice) -> None:
+        self.tiles = PackedTiles(lattice, WORDS)
+
+    def count(self, seen: Observation) -> U64:
+        """Count one scan; returns (rows, cols) words of voxels that hold a return which the map does not explain."""
+        view, here = seen.view, seen.reference
+        near, apart = near_hits(seen)
+        for planes, part in self.tiles.under(view.grid):
+            _count_scan(planes, part, apart, near, view.passed, here.occupied, here.ground_z)
+        self.tiles.leave(view.grid)
+        return apart
 
 
-@kernel
-def add_one(planes: U64, first: int, word: np.uint64) -> None:
-    """Add 1 to the counts of ``word``'s voxels: a ripple-carry adder over 64 voxels at once."""
-    for k in range(first, first + PLANES):
-        carry = planes[k] & word
-        planes[k] ^= word
-        word = carry
-        if not word:
-            break
-
-
-@kernel
-def halve(planes: U64) -> None:
-    """Halve the counts of a cell: what is weighed against each other keeps its ratio."""
-    for first in (CROSSED, HIT, PASSES):
-        for k in range(first, first + PLANES - 1):
-            planes[k] = planes[k + 1]
-        planes[first + PLANES - 1] = 0
-
-
-@kernel
-def count_of(planes: U64, first: int, bit: int) -> int:
-    """The count of one voxel; ``first`` is the counter's first plane."""
-    value = 0
-    for k in range(PLANES):
-        value |= int((planes[first + k] >> np.uint64(bit)) & np.uint64(1)) << k
-    return value
-
-
-@kernel
-def least_passed(cell: U64, bit: int) -> int:
-    """In how many scans rays passed voxel ``bit`` of a cell (WORDS,), the voxel above or the one below, whichever they
-    passed least: all scans together crossed it so often. The ground bounds the lowest voxel, the word's end the
-    highest."""
-    least = count_of(cell, PASSES, bit)
-    if bit + 1 < TOP_BIT:
-        least = min(least, count_of(cell, PASSES, bit + 1))
-    return min(least, count_of(cell, PASSES, bit - 1)) if bit > 1 else least
-
-
-@inlined
-def _column(cell: int, lowest: int, highest: int, base: I32) -> np.uint64:
-    """The word of the layers ``lowest`` to ``highest`` of the world in one column."""
-    low, high = layer_bit(lowest, base[cell]), layer_bit(highest, base[cell])
-    return (np.uint64(2) << np.uint64(high)) - (np.uint64(1) << np.uint64(low))
+def near_hits(seen: Observation) -> tuple[U64, U64]:
+    """(near, apart), (rows, cols) words each: the voxels within HIT_REACH_M of a return of a still obstacle; and those
+    that hold such a return which has no mapped voxel so near."""
+    here, scan, grid = seen.reference, seen.scan, seen.view.grid
+    near, apart = np.zeros((2, *grid.shape), dtype=np.uint64)
+    cell = scan.cell if here is scan.reference else find_obstacles(scan.points_map, here)[1]
+    chosen, reach, corner = scan.obstacle & ~seen.moving, HIT_REACH_M / CELL_SIZE, (grid.x0, grid.y0)
+    _mark_near(
+        scan.points_map, cell, chosen, here.base.ravel(), here.occupied.ravel(), grid.shape[1], corner,
+        reach, near.ravel(), apart.ravel(),
+    )  # fmt: skip
+    return near, apart
 
 
 @kernel
@@ -116,22 +94,15 @@ def _mark_near(
             near[np.uint64(column)] |= word
             mapped |= occupied[np.uint64(column)] & word
         if not mapped:
-            own, layer = np.uint64(cell[i]), int(np.floor(z))
-            apart[own] |= _column(own, layer, layer, base)
+            layer = int(np.floor(z))
+            apart[np.uint64(cell[i])] |= _column(np.uint64(cell[i]), layer, layer, base)
 
 
-def near_hits(seen: Observation) -> tuple[U64, U64]:
-    """(near, apart), (rows, cols) words each: the voxels within HIT_REACH_M of a return of a still obstacle; and those
-    that hold such a return which has no mapped voxel so near."""
-    here, scan, grid = seen.reference, seen.scan, seen.view.grid
-    near, apart = np.zeros(grid.shape, dtype=np.uint64), np.zeros(grid.shape, dtype=np.uint64)
-    cell = scan.cell if here is scan.reference else find_obstacles(scan.points_map, here)[1]
-    chosen, reach, corner = scan.obstacle & ~seen.moving, HIT_REACH_M / CELL_SIZE, (grid.x0, grid.y0)
-    _mark_near(
-        scan.points_map, cell, chosen, here.base.ravel(), here.occupied.ravel(), grid.shape[1], corner,
-        reach, near.ravel(), apart.ravel(),
-    )  # fmt: skip
-    return near, apart
+@inlined
+def _column(cell: int, lowest: int, highest: int, base: I32) -> np.uint64:
+    """The word of the layers ``lowest`` to ``highest`` of the world in one column."""
+    low, high = layer_bit(lowest, base[cell]), layer_bit(highest, base[cell])
+    return (np.uint64(2) << np.uint64(high)) - (np.uint64(1) << np.uint64(low))
 
 
 @kernel
@@ -141,48 +112,56 @@ def _count_scan(planes: U64, part: Overlap, apart: U64, near: U64, passed: U64, 
         for c in range(part.col, part.end_col):
             if np.isnan(ground_z[r, c]) or not near[r, c] | passed[r, c]:
                 continue
-            cell, rays, mapped = planes[r + part.down, c + part.right], passed[r, c], occupied[r, c]
-            above, below = rays >> np.uint64(1) | _HIGHEST, rays << np.uint64(1) | _LOWEST
-            crossed = rays & above & below & ~near[r, c]
-            hit = (near[r, c] & mapped) | apart[r, c]
-            missed = rays & ~near[r, c]
+            cell, rays, missed = planes[r + part.down, c + part.right], passed[r, c], passed[r, c] & ~near[r, c]
             cell[PASSED] |= rays
-            if is_full(cell, CROSSED, crossed) or is_full(cell, HIT, hit) or is_full(cell, PASSES, missed):
-                halve(cell)
-            add_one(cell, CROSSED, crossed)
-            add_one(cell, HIT, hit)
-            add_one(cell, PASSES, missed)
+            crossed = missed & (rays >> np.uint64(1) | _HIGHEST) & (rays << np.uint64(1) | _LOWEST)
+            full = (
+                _add_one(cell, CROSSED, crossed),
+                _add_one(cell, HIT, (near[r, c] & occupied[r, c]) | apart[r, c]),
+                _add_one(cell, PASSES, missed),
+            )
+            if full[0] | full[1] | full[2]:  # halve all counts of the cell: what is weighed keeps its ratios
+                for counter in range(3):
+                    first = counter * PLANES
+                    for k in range(first, first + PLANES - 1):
+                        cell[k] = cell[k + 1]
+                    cell[first + PLANES - 1] = full[counter]
 
 
-class Evidence:
-    """Counters of a drive by tile: (256, 256, WORDS) uint64: crossed, hit, passes, then what any ray passed.
-
-    Memory is bounded by the tiles around the vehicle, and some hundred kilobytes for each that it has left.
-    """
-
-    def __init__(self, lattice: Lattice) -> None:
-        self.tiles = PackedTiles(lattice, WORDS)
-
-    def count(self, seen: Observation) -> U64:
-        """Count one scan; returns (rows, cols) words of voxels that hold a return which the map does not explain."""
-        view, here = seen.view, seen.reference
-        near, apart = near_hits(seen)
-        for planes, part in self.tiles.under(view.grid):
-            _count_scan(planes, part, apart, near, view.passed, here.occupied, here.ground_z)
-        self.tiles.leave(view.grid)
-        return apart
+@kernel
+def _add_one(cell: U64, first: int, word: np.uint64) -> np.uint64:
+    """Add 1 to the counts of ``word``'s voxels: a ripple-carry adder over 64 voxels at once. Returns the carry: the
+    voxels whose count would exceed PLANES bits."""
+    for k in range(first, first + PLANES):
+        carry = cell[k] & word
+        cell[k] ^= word
+        word = carry
+        if not word:
+            break
+    return word
 
 
-@allocating
+@kernel
+def count_of(cell: U64, first: int, bit: int) -> int:
+    """The count of one voxel of a cell (WORDS,); ``first`` is the counter's first plane."""
+    value = 0
+    for k in range(PLANES):
+        value |= int((cell[first + k] >> np.uint64(bit)) & np.uint64(1)) << k
+    return value
+
+
+@kernel
+def least_passed(cell: U64, bit: int) -> int:
+    """In how many scans rays passed voxel ``bit`` of a cell (WORDS,), the voxel above or the one below, whichever they
+    passed least: all scans together crossed it at most so often. Its ends are bounded as in one scan."""
+    least = count_of(cell, PASSES, bit)
+    if bit + 1 < TOP_BIT:
+        least = min(least, count_of(cell, PASSES, bit + 1))
+    return min(least, count_of(cell, PASSES, bit - 1)) if bit > 1 else least
+
+
 def free_words(planes: U64, occupied: U64) -> U64:
     """(rows, cols) voxels that two scans or more passed, none hit, and that the map does not hold."""
-    out = np.zeros(occupied.shape, dtype=np.uint64)
-    for r in range(occupied.shape[0]):
-        for c in range(occupied.shape[1]):
-            struck, often = occupied[r, c], np.uint64(0)
-            for k in range(PLANES):
-                struck |= planes[r, c, HIT + k]
-                if k > 0:
-                    often |= planes[r, c, PASSES + k]
-            out[r, c] = often & ~struck
-    return out
+    hit = np.bitwise_or.reduce(planes[..., HIT : HIT + PLANES], axis=-1)
+    often = np.bitwise_or.reduce(planes[..., PASSES + 1 : PASSES + PLANES], axis=-1)
+    return np.asarray(often & ~(occupied | hit))

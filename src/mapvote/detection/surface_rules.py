@@ -1,4 +1,25 @@
-"""The rule of surfaces on one page: what a drive's counts say of every cell of a window of tiles (docs/method.md)."""
+"""The rule of surfaces on one page: what a drive's counts say of every cell of a window of tiles (docs/method.md).
+
+Of a voxel, over the drive's scans: h hits, c crossings, p passes (detection/evidence.py); a and b the passes of the
+voxels above and below it; C = min(p, a, b): all scans together crossed it at most so often.
+
+    mapped voxel:  gone if C >= GONE_RAYS + HIT_RAYS h;  else it stands if h >= 1
+    free voxel:    new if h >= 1 + NEW_RAYS c
+
+A cell is empty if a voxel of it is gone and none stands. Of an 8-connected group of A cells that are empty, or that
+have new voxels, with N such voxels, *enough* is
+
+    N >= min(SUPPORT + a (A - 1), NEW_ENOUGH),  a = 0 for what is gone, NEW_A_CELL for what is new,
+
+or that the group is a thing of its own on the ground.
+
+    changed-empty     empty cells that are enough, and with them cells in which nothing stands and that touch them
+                      directly or through each other, if rays passed a mapped voxel there, or within REACH_CELLS
+    changed-occupied  cells with new voxels that are enough, if sum h >= sum p over the group; what was hit where the
+                      map knew nothing is new within REACH_CELLS of changed-empty
+
+What rises less than ``min_height_m`` over the ground is never gone.
+"""
 
 from __future__ import annotations
 
@@ -13,21 +34,19 @@ from mapvote.detection.evidence import CROSSED, HIT, PASSED, PASSES, PLANES, cou
 from mapvote.detection.packed_tiles import Overlap
 
 # Set on corner 1 and 2, street 2 and KITTI 0001 in blocks of 12 and 25 scans; docs/method.md says what needs each.
-HIT_RAYS = 8
-"""Scans that crossed a mapped voxel, against one that hit it."""
-GONE_RAYS = 3
-"""Scans that must have crossed it beyond those: two may be an error of two poses."""
-TOGETHER = 2
-"""Scans whose rays cross it only together count as one of so many."""
+GONE_RAYS = 4
+"""Scans that must have crossed a mapped voxel that none hit: fewer may be an error of their poses."""
+HIT_RAYS = 16
+"""Scans more for each that hit it."""
 NEW_RAYS = 0.5
-"""Of the scans in which a free voxel was hit, one against two that crossed it."""
+"""Hits that a free voxel needs beside the first, for each scan whose rays crossed it."""
 SUPPORT = 6
-"""Voxels by which something gone must be decided, in its 8-connected cells: a pole of 1.8 m, half a square metre."""
+"""Voxels of a change: a pole of 1.8 m, half a square metre."""
 NEW_A_CELL, NEW_ENOUGH = 2, 40
-"""Something new needs SUPPORT voxels in its first cell, so many more in each other cell, and so many at most. What is
-thinner is noise beside what stands. The bound keeps large low things."""
+"""Voxels that something new needs for each further cell, because what is thinner is noise, and at most: the bound keeps
+large low things."""
 REACH_CELLS = 3
-"""How far what went reaches: .9 m. So far behind it its new side may lie, and what no ray could decide goes with it."""
+"""How far what went reaches: .9 m."""
 _AROUND = np.ones((3, 3))
 _LOW = np.uint64(0b1111)
 """A column that has one of these voxels begins within 1.2 m of the ground."""
@@ -35,21 +54,19 @@ NOTHING = np.uint64(0)
 
 
 class VoxelFacts(NamedTuple):
-    """What the counts say of each voxel of a window: column words (rows, cols)."""
+    """What the counts say of the voxels of a window: column words (rows, cols)."""
 
     gone: U64
     stands: U64
-    unmet: U64
-    """Mapped, crossed, but neither gone nor ever hit."""
     new: U64
     beyond: U64
     """As new, but the map did not know the voxel to be free."""
     passed: U64
     """What any ray passed."""
-    balance: I32
-    """Over a cell's new voxels: in how many scans they were hit, less in how many they were passed."""
     hits: I32
-    """Over a cell's new voxels: in how many scans they were hit."""
+    """Over a cell's new voxels: the sum of h."""
+    balance: I32
+    """Over a cell's new voxels: the sum of h - p."""
 
 
 class WindowStates(NamedTuple):
@@ -63,20 +80,13 @@ class WindowStates(NamedTuple):
 
 def no_facts(shape: tuple[int, int]) -> VoxelFacts:
     """Of a window in which nothing was counted."""
-    gone, stands, unmet, new, beyond, passed = (np.zeros(shape, np.uint64) for _ in range(6))
-    return VoxelFacts(gone, stands, unmet, new, beyond, passed, np.zeros(shape, np.int32), np.zeros(shape, np.int32))
-
-
-@kernel
-def times_crossed(cell: U64, bit: int) -> int:
-    """C of :func:`judge_window` for a mapped voxel of a cell (WORDS,)."""
-    return max(count_of(cell, CROSSED, bit), least_passed(cell, bit) // TOGETHER)
+    return VoxelFacts(*(np.zeros(shape, kind) for kind in [np.uint64] * 5 + [np.int32] * 2))
 
 
 @kernel
 def weigh_voxels(planes: U64, part: Overlap, occupied: U64, known_free: U64, out: VoxelFacts) -> None:
-    """Fill the ``part`` of a window that lies on a tile from its counters (256, 256, WORDS): the first lines of
-    :func:`judge_window`. ``out`` comes empty (:func:`no_facts`)."""
+    """Fill the ``part`` of a window that lies on a tile from the tile's counters (256, 256, WORDS), by the voxels that
+    the map holds and knows to be free (rows, cols). ``out`` comes empty (:func:`no_facts`)."""
     for r in range(part.row, part.end_row):
         for c in range(part.col, part.end_col):
             cell, mapped = planes[r + part.down, c + part.right], occupied[r, c]
@@ -88,100 +98,58 @@ def weigh_voxels(planes: U64, part: Overlap, occupied: U64, known_free: U64, out
                 one = np.uint64(1) << np.uint64(bit)
                 if not asked & one:
                     continue
-                hit = count_of(cell, HIT, bit)
+                hits = count_of(cell, HIT, bit)
                 if mapped & one:
-                    crossed = times_crossed(cell, bit)
-                    if crossed >= GONE_RAYS + HIT_RAYS * hit:
+                    if least_passed(cell, bit) >= GONE_RAYS + HIT_RAYS * hits:
                         out.gone[r, c] |= one
-                    elif hit:
+                    elif hits:
                         out.stands[r, c] |= one
-                    elif crossed:
-                        out.unmet[r, c] |= one
-                elif hit >= 1 + NEW_RAYS * count_of(cell, CROSSED, bit):
+                elif hits >= 1 + NEW_RAYS * count_of(cell, CROSSED, bit):
                     if known_free[r, c] & one:
                         out.new[r, c] |= one
-                        out.balance[r, c] += hit - count_of(cell, PASSES, bit)
-                        out.hits[r, c] += hit
+                        out.hits[r, c] += hits
+                        out.balance[r, c] += hits - count_of(cell, PASSES, bit)
                     else:
                         out.beyond[r, c] |= one
 
 
 def judge_window(drive: VoxelFacts, occupied: U64, height_m: F32, min_height_m: float) -> WindowStates:
     """What a drive says of a window, of which the map knows (rows, cols) the ``occupied`` voxels and how high they rise
-    over the ground, not finite where there are none.
-
-    Of a voxel, over the drive's scans: h hits, c crossed, p passes (detection/evidence.py); a and b the passes of the
-    voxels above and below it.
-
-        C = max(c, min(p, a, b) / TOGETHER)
-        mapped voxel:  gone if C >= GONE_RAYS + HIT_RAYS h;  else stands if h >= 1
-        free voxel:    new if h >= 1 + NEW_RAYS c
-
-    A cell is empty if a voxel of it is gone and none stands. Of an 8-connected group of empty cells with N gone voxels
-
-        changed-empty  if N >= SUPPORT, or it is a thing of its own on the ground
-
-    and with it what :func:`grown` and :func:`fallen` say. Of an 8-connected group of A cells with N
-    new voxels, among them those that were hit beyond what the map knew within REACH_CELLS of changed-empty,
-
-        changed-occupied  if sum h >= sum p, and
-                          N >= min(SUPPORT + NEW_A_CELL (A - 1), NEW_ENOUGH) or it is a thing of its own on the ground
-
-    What rises less than ``min_height_m`` is never gone.
-    """
-    mapped, nothing = occupied != 0, drive.gone | drive.stands == 0
+    over the ground, not finite where there are none."""
+    mapped, stands, passed = occupied != 0, drive.stands != 0, drive.passed != 0
     high = mapped & (height_m >= min_height_m)
     gone: U64 = np.where(high, drive.gone, NOTHING)
     beyond: U64 = np.where(mapped, NOTHING, drive.beyond)
     states = np.full(mapped.shape, NO_VOTE, dtype=np.uint8)
-    states[drive.passed != 0] = CellState.UNCHANGED_EMPTY
-    states[(mapped & (drive.passed != 0)) | (beyond != 0)] = CellState.UNDETERMINED
-    states[drive.stands != 0] = CellState.UNCHANGED_OCCUPIED
+    states[passed] = CellState.UNCHANGED_EMPTY
+    states[(mapped & passed) | (beyond != 0)] = CellState.UNDETERMINED
+    states[stands] = CellState.UNCHANGED_OCCUPIED
 
-    empty = (gone != 0) & (drive.stands == 0)
-    firm = supported(empty, gone, SUPPORT) | on_its_own(empty, gone, occupied, mapped & ~empty)
-    crossed = high & (drive.stands == 0) & ((drive.gone | drive.unmet) != 0)
-    states[empty] = CellState.UNDETERMINED
-    states[grown(firm, crossed)] = CellState.CHANGED_EMPTY
-    undecided = high & nothing & _hollow_below(occupied, drive.passed)
-    states[fallen(states, undecided, REACH_CELLS)] = CellState.CHANGED_EMPTY
-    went = states == CellState.CHANGED_EMPTY
+    empty = (gone != 0) & ~stands
+    went = enough(np.where(empty, gone, NOTHING), 0, mapped & ~empty)
+    went = grown(went, high & passed & ~stands & (near(went) | (occupied & drive.passed != 0)))
+    states[went] = CellState.CHANGED_EMPTY
     gone = np.where(went, occupied, gone)
 
-    near = ndimage.maximum_filter(went, 2 * REACH_CELLS + 1, mode="constant")
-    new: U64 = np.bitwise_or(np.where(mapped, NOTHING, drive.new), np.where(near, beyond, NOTHING))
-    cells = new != 0
-    enough = np.minimum(SUPPORT + NEW_A_CELL * (_over_groups(cells, cells) - 1), NEW_ENOUGH)
-    firm = supported(cells, new, enough) | on_its_own(cells, new, new, occupied & ~gone != 0)
-    states[cells] = CellState.UNDETERMINED
-    states[firm & lasting(cells, drive.balance)] = CellState.CHANGED_OCCUPIED
-    return WindowStates(states, gone, np.where(drive.stands != 0, gone, NOTHING), new)
+    new: U64 = np.where(mapped, NOTHING, drive.new) | np.where(near(went), beyond, NOTHING)
+    came = enough(new, NEW_A_CELL, occupied & ~gone != 0) & (over_groups(new != 0, drive.balance) >= 0)
+    states[new != 0] = CellState.UNDETERMINED
+    states[came] = CellState.CHANGED_OCCUPIED
+    return WindowStates(states, gone, np.where(stands, gone, NOTHING), new)
 
 
-def supported(cells: Bool, voxels: U64, enough: float | F64) -> Bool:
-    """(rows, cols) those of ``cells`` whose 8-connected group has ``enough`` set bits in ``voxels`` (rows, cols)."""
-    return np.asarray(cells & (_over_groups(cells, np.bitwise_count(voxels)) >= enough))
+def enough(voxels: U64, a_cell: int, others: Bool) -> Bool:
+    """(rows, cols) cells whose 8-connected group has enough ``voxels`` (rows, cols), ``a_cell`` more for each further
+    cell, or is a thing of its own on the ground, however small: a bollard. It touches none of the ``others``, each of
+    its columns begins near the ground, and two of its voxels lie on top of each other."""
+    cells = voxels != 0
+    size, count = over_groups(cells, np.bitwise_count(voxels)), over_groups(cells, cells)
+    tall = over_groups(cells, voxels & (voxels >> np.uint64(1)) != 0) > 0
+    tied = over_groups(cells, ndimage.binary_dilation(others, _AROUND) | (voxels & _LOW == 0)) > 0
+    return np.asarray(cells & ((size >= np.minimum(SUPPORT + a_cell * (count - 1), NEW_ENOUGH)) | (tall & ~tied)))
 
 
-def on_its_own(cells: Bool, voxels: U64, whole: U64, others: Bool) -> Bool:
-    """(rows, cols) those of ``cells`` whose 8-connected group is a thing of its own that stands on the ground, however
-    small: a bollard. It touches none of the ``others``, each of its columns begins near the ground, half of its voxels
-    ``whole`` are in ``voxels`` (all planes (rows, cols)), and two of these lie on top of each other."""
-    size = _over_groups(cells, np.bitwise_count(voxels))
-    tall = _over_groups(cells, voxels & (voxels >> np.uint64(1)) != 0) > 0
-    tied = ndimage.binary_dilation(others, _AROUND) | (whole & _LOW == 0)
-    alone = (_over_groups(cells, tied) == 0) & (2 * size >= _over_groups(cells, np.bitwise_count(whole)))
-    return np.asarray(cells & tall & alone)
-
-
-def lasting(cells: Bool, balance: I32) -> Bool:
-    """(rows, cols) those of ``cells`` whose 8-connected group was hit in as many scans as passed it, or more: by cell
-    the ``balance`` is of the voxels in question, what they were hit less what they were passed. What drove there was
-    hit once or twice, and passed many times before and after."""
-    return np.asarray(cells & (_over_groups(cells, balance) >= 0))
-
-
-def _over_groups(cells: Bool, amounts: U8 | I32 | Bool) -> F64:
+def over_groups(cells: Bool, amounts: U8 | I32 | Bool) -> F64:
     """(rows, cols) the sum of ``amounts`` (rows, cols) over the 8-connected group of ``cells`` that a cell is in."""
     group, count = ndimage.label(cells, structure=_AROUND)
     return np.asarray(np.bincount(group.ravel(), weights=amounts.ravel(), minlength=count + 1)[group])
@@ -189,32 +157,11 @@ def _over_groups(cells: Bool, amounts: U8 | I32 | Bool) -> F64:
 
 def grown(strong: Bool, weak: Bool) -> Bool:
     """(rows, cols) ``strong`` cells, and ``weak`` ones that touch them (8) directly or through each other: hysteresis
-    (Canny 1986). Few rays cross the far wall of what fell, and none of them hit it."""
+    (Canny 1986). Few rays cross the far wall of what fell, none reach its roof."""
     both = strong | weak
-    return np.asarray(both & (_over_groups(both, strong) > 0))
+    return np.asarray(both & (over_groups(both, strong) > 0))
 
 
-def fallen(states: U8, adrift: Bool, reach: int) -> Bool:
-    """(rows, cols) cells that fall: what stood on things that are gone, and no ray could reach, is gone with them.
-
-    The roof of a demolished house, too high for the sensor once nothing is behind it. An ``adrift`` cell goes with the
-    changed-empty or the unchanged-occupied cell that is nearer, so that of two roofs that meet only one falls; a
-    connected group of those that go falls if a changed-empty cell lies within ``reach`` cells of it.
-    """
-    gone, kept = states == CellState.CHANGED_EMPTY, states == CellState.UNCHANGED_OCCUPIED
-    if not (gone.any() and adrift.any()):
-        return np.zeros_like(adrift)
-    to_gone = _steps_to(gone)
-    goes = adrift & (to_gone < _steps_to(kept)) if kept.any() else adrift
-    return grown(goes & (to_gone <= reach), goes)
-
-
-def _steps_to(cells: Bool) -> I32:
-    """(rows, cols) how many steps, diagonal ones too, it is to the nearest of ``cells``; there must be one."""
-    return np.asarray(ndimage.distance_transform_cdt(~cells, metric="chessboard"))
-
-
-def _hollow_below(occupied: U64, passed: U64) -> Bool:
-    """(rows, cols) mapped cells with something under their lowest voxel, half of which or more rays passed."""
-    under = np.where(occupied != 0, (occupied & (~occupied + np.uint64(1))) - np.uint64(1), NOTHING)
-    return np.asarray((under != 0) & (2 * np.bitwise_count(under & passed) >= np.bitwise_count(under)))
+def near(cells: Bool) -> Bool:
+    """(rows, cols) what lies within REACH_CELLS of ``cells``."""
+    return np.asarray(ndimage.maximum_filter(cells, 2 * REACH_CELLS + 1, mode="constant"))
