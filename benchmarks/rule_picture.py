@@ -26,8 +26,9 @@ from mapvote.detection.surface_rules import VoxelFacts, judge_window, no_facts, 
 from mapvote.plots import EMPTY, FAINT, GONE, INK, NEW, STANDING, UNSURE
 
 CELLS, LAYERS = 18, 11
-COLOURS = {"gone": GONE, "stands": STANDING, "unmet": "#9cc4e4", "new": NEW, "beyond": "#f0a0ab", "passed": EMPTY}
-"""What the scans say of a voxel. A mapped voxel of which they say nothing is an outline."""
+COLOURS = {"gone": GONE, "stands": STANDING, "new": NEW, "beyond": "#f0a0ab", "passed": EMPTY}
+"""What the scans say of a voxel. A mapped voxel of which they say nothing, or that rays passed too seldom, is an
+outline."""
 BARS = {
     CellState.CHANGED_EMPTY: GONE,
     CellState.CHANGED_OCCUPIED: NEW,
@@ -50,15 +51,16 @@ SIDES: dict[str, Side] = {
         "stands": [(range(12, 13), 7, 8)],
     },
     "4  enough: six gone voxels": {"gone": [(range(4, 5), 1, 6), (range(12, 14), 7, 8)]},
-    "5  what goes along": {
+    "5  what goes along: where rays passed": {
         "gone": [(range(4, 5), 1, 8)],
-        "unmet": [(range(5, 9), 1, 8), (range(13, 15), 1, 8)],
+        "mapped": [(range(5, 9), 1, 8), (range(13, 15), 1, 8)],
+        "passed": [(range(5, 9), 2, 3), (range(13, 15), 2, 3)],
     },
-    "6  what no ray could decide: a roof": {
+    "6  what goes along: a roof": {
         "gone": [(range(2, 3), 1, 8)],
-        "mapped": [(range(3, 7), 9, 9), (range(11, 15), 9, 9)],
+        "mapped": [(range(3, 8), 9, 9), (range(11, 15), 9, 9)],
         "stands": [(range(15, 16), 1, 9)],
-        "passed": [(range(3, 7), 1, 8), (range(11, 15), 1, 8)],
+        "passed": [(range(3, 8), 1, 8), (range(11, 15), 1, 8)],
     },
     "7  what was hidden behind it": {
         "gone": [(range(3, 4), 1, 8)],
@@ -82,7 +84,8 @@ def decided(name: str) -> tuple[U64, VoxelFacts, U8]:
         for cells, first, last in where:
             plane: U64 = occupied if said == "mapped" else getattr(facts, said)
             plane[0, list(cells)] |= column(first, last)
-    occupied |= facts.gone | facts.stands | facts.unmet
+    occupied |= facts.gone | facts.stands
+    facts.passed[:] |= facts.gone
     facts.balance[0, list(DRIVEN_BY.get(name, ()))] = -1
     rise_m = np.where(occupied != 0, np.float32(3.0), np.float32(np.nan))
     return occupied, facts, judge_window(facts, occupied, rise_m, 0.3).states
@@ -113,15 +116,16 @@ def _square(x: float, z: float, fill: str, edge: str) -> Any:
 
 def weighed(*, mapped: bool, hits: int, crossings: int) -> I32:
     """(hits, crossings) what the first lines say of one voxel that was hit and crossed so often: 0 nothing, 1 gone or
-    new, 2 stands, 3 unmet."""
+    new, 2 stands."""
     planes = np.zeros((TILE_CELLS, TILE_CELLS, WORDS), np.uint64)
-    for counter, first in ((np.arange(hits)[:, None], HIT), (np.arange(crossings)[None, :], CROSSED)):
+    met, rays = np.arange(hits, dtype=np.uint64)[:, None], np.arange(crossings, dtype=np.uint64)[None, :]
+    for counter, first in ((met, HIT), (rays, CROSSED)):
         for k in range(PLANES):
-            planes[:hits, :crossings, first + k] = (counter >> k & 1).astype(np.uint64) << np.uint64(5)
+            planes[:hits, :crossings, first + k] = (counter >> np.uint64(k) & np.uint64(1)) << np.uint64(5)
     one = np.full((hits, crossings), np.uint64(1) << np.uint64(5))
     facts = no_facts(one.shape)
     weigh_voxels(planes, Overlap(0, hits, 0, crossings, 0, 0), one if mapped else one * np.uint64(0), one, facts)
-    said = (facts.gone | facts.new != 0) + 2 * (facts.stands != 0) + 3 * (facts.unmet != 0)
+    said = (facts.gone | facts.new != 0) + 2 * (facts.stands != 0)
     return np.asarray(said, np.int32)
 
 
@@ -129,7 +133,7 @@ def draw_counts(axes: Any, *, mapped: bool) -> None:
     """One panel of lines 1 and 2."""
     hits, crossings = (6, 46) if mapped else (8, 14)
     changed = GONE if mapped else NEW
-    fills = (EMPTY, changed, STANDING, COLOURS["unmet"])
+    fills = (EMPTY, changed, STANDING)
     for (h, c), said in np.ndenumerate(weighed(mapped=mapped, hits=hits, crossings=crossings)):
         axes.add_patch(_square(c, h, fills[said], "#ffffff"))
     axes.set(xlim=(0, crossings), ylim=(0, hits), xlabel="scans that crossed it", ylabel="that hit it")

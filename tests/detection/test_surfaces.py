@@ -34,6 +34,7 @@ from mapvote.detection.surface_rules import (
     NEW_RAYS,
     REACH_CELLS,
     SUPPORT,
+    TOGETHER,
     VoxelFacts,
     grown,
     judge_window,
@@ -256,10 +257,10 @@ def weighed(mapped: int, free: int, **counts: int) -> VoxelFacts:
     return out
 
 
-@given(passes=st.integers(0, 120), met=st.integers(0, 20))
-def test_one_hit_outweighs_as_many_rays_as_is_said(passes: int, met: int) -> None:
-    said = weighed(1, 0, passes=passes, met=met)
-    assert (said.gone[0, 0] != 0) == (passes >= GONE_RAYS + HIT_RAYS * met)
+@given(crossed=st.integers(0, 120), passes=st.integers(0, 120), met=st.integers(0, 20))
+def test_one_hit_outweighs_as_many_rays_as_is_said(crossed: int, passes: int, met: int) -> None:
+    said = weighed(1, 0, crossed=crossed, passes=passes, met=met)
+    assert (said.gone[0, 0] != 0) == (max(crossed, passes // TOGETHER) >= GONE_RAYS + HIT_RAYS * met)
     assert (said.stands[0, 0] != 0) == (met > 0 and said.gone[0, 0] == 0)
     assert not (said.new | said.beyond).any()
 

@@ -1,8 +1,9 @@
 """The rule of surfaces on one page: what a drive's counts say of every cell of a window of tiles (docs/method.md).
 
 Of a voxel, over the drive's scans: h hits, c crossings, p passes (detection/evidence.py); a and b the passes of the
-voxels above and below it; C = min(p, a, b): all scans together crossed it at most so often.
+voxels above and below it.
 
+    C = max(c, min(p, a, b) / TOGETHER)
     mapped voxel:  gone if C >= GONE_RAYS + HIT_RAYS h;  else it stands if h >= 1
     free voxel:    new if h >= 1 + NEW_RAYS c
 
@@ -34,10 +35,12 @@ from mapvote.detection.evidence import CROSSED, HIT, PASSED, PASSES, PLANES, cou
 from mapvote.detection.packed_tiles import Overlap
 
 # Set on corner 1 and 2, street 2 and KITTI 0001 in blocks of 12 and 25 scans; docs/method.md says what needs each.
-GONE_RAYS = 4
-"""Scans that must have crossed a mapped voxel that none hit: fewer may be an error of their poses."""
-HIT_RAYS = 16
+GONE_RAYS = 3
+"""Scans that must have crossed a mapped voxel that none hit: two may be an error of two poses."""
+HIT_RAYS = 8
 """Scans more for each that hit it."""
+TOGETHER = 2
+"""Scans whose rays cross a voxel only together count as one of so many."""
 NEW_RAYS = 0.5
 """Hits that a free voxel needs beside the first, for each scan whose rays crossed it."""
 SUPPORT = 6
@@ -100,7 +103,8 @@ def weigh_voxels(planes: U64, part: Overlap, occupied: U64, known_free: U64, out
                     continue
                 hits = count_of(cell, HIT, bit)
                 if mapped & one:
-                    if least_passed(cell, bit) >= GONE_RAYS + HIT_RAYS * hits:
+                    crossed = max(count_of(cell, CROSSED, bit), least_passed(cell, bit) // TOGETHER)
+                    if crossed >= GONE_RAYS + HIT_RAYS * hits:
                         out.gone[r, c] |= one
                     elif hits:
                         out.stands[r, c] |= one
@@ -125,13 +129,13 @@ def judge_window(drive: VoxelFacts, occupied: U64, height_m: F32, min_height_m: 
     states[(mapped & passed) | (beyond != 0)] = CellState.UNDETERMINED
     states[stands] = CellState.UNCHANGED_OCCUPIED
 
-    empty = (gone != 0) & ~stands
-    went = enough(np.where(empty, gone, NOTHING), 0, mapped & ~empty)
-    went = grown(went, high & passed & ~stands & (near(went) | (occupied & drive.passed != 0)))
+    empty: Bool = (gone != 0) & ~stands
+    firm = enough(np.where(empty, gone, NOTHING), 0, mapped & ~empty)
+    went = grown(firm, high & passed & ~stands & (near(firm) | (occupied & drive.passed != 0)))
     states[went] = CellState.CHANGED_EMPTY
     gone = np.where(went, occupied, gone)
 
-    new: U64 = np.where(mapped, NOTHING, drive.new) | np.where(near(went), beyond, NOTHING)
+    new: U64 = np.bitwise_or(np.where(mapped, NOTHING, drive.new), np.where(near(went), beyond, NOTHING))
     came = enough(new, NEW_A_CELL, occupied & ~gone != 0) & (over_groups(new != 0, drive.balance) >= 0)
     states[new != 0] = CellState.UNDETERMINED
     states[came] = CellState.CHANGED_OCCUPIED
