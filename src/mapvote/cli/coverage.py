@@ -19,9 +19,13 @@ def register(app: typer.Typer) -> None:
 
 
 def coverage(
-    name: Annotated[str, typer.Argument(metavar="STORE|URL", help="a store, or a server's address")],
-    out: Annotated[Path | None, typer.Option(metavar="FILE", help="also write all stretches as GeoJSON")] = None,
-    most: Annotated[int, typer.Option(metavar="N", min=1, help="rows of the table")] = 20,
+    name: Annotated[
+        str, typer.Argument(metavar="STORE|URL", help="a STORE (file, database URL or -), or its server's URL")
+    ],
+    out: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="also write all stretches of road as GeoJSON")
+    ] = None,
+    most: Annotated[int, typer.Option(metavar="N", min=1, help="largest number of rows")] = 20,
     key_file: KeyFile = None,
 ) -> None:
     """Where one more pass would decide cells: by tile and direction of road, the most cells first.

@@ -30,10 +30,11 @@ def register(app: typer.Typer) -> None:
 
 def info(
     path: Annotated[
-        str, typer.Argument(metavar="PATH|STORE|URL", help="a map, a drive or a ballot, in any format; or a store")
+        str,
+        typer.Argument(metavar="PATH|STORE|URL", help="a map, a drive or a ballot in any format; a store; a server"),
     ],
     vehicles: Annotated[
-        bool, typer.Option("--vehicles", help="of a store: which vehicles contradict the others, and where")
+        bool, typer.Option("--vehicles", help="for a store: list the vehicles that contradict the others, and where")
     ] = False,
     rate_hz: Rate = None,
     topic: Topic = None,
@@ -94,16 +95,17 @@ def _print_standings(found: list[dict[str, Any]]) -> None:
 
 def doctor(
     path: Annotated[
-        str, typer.Argument(metavar="DRIVE|MAP|BALLOT|STORE", help="a drive, a map or a ballot, in any format; a store")
+        str, typer.Argument(metavar="DRIVE|MAP|BALLOT|STORE", help="a drive, a map or a ballot in any format; a store")
     ],
     map_path: Annotated[
         Path | None,
         typer.Option(
-            "--map", metavar="MAP", help="also say whether drive or cloud lies on this map, and where it is bent"
+            "--map", metavar="MAP", help="also compare the drive or cloud with this map, and report where it is bent"
         ),
     ] = None,
     png: Annotated[
-        Path | None, typer.Option("--png", metavar="FILE", help="a picture of a drive's scans, as read and as mended")
+        Path | None,
+        typer.Option("--png", metavar="FILE", help="write a picture of a drive's scans, as read and as corrected"),
     ] = None,
     *,
     drive_options: dict[str, Any],
@@ -158,15 +160,21 @@ def _lines(finding: Finding) -> list[str]:
 
 
 def import_map(
-    source: Annotated[Path, typer.Argument(metavar="FILE", help="a point cloud, in any format but our own")],
+    source: Annotated[Path, typer.Argument(metavar="FILE", help="a point cloud in any format")],
     out: Annotated[Path, typer.Argument(metavar="MAP", help="the mapvote map to write, a folder")],
     crs: Annotated[
-        str | None, typer.Option(metavar="CRS", help="project to this: EPSG:32654, WKT; or say that it is in this")
+        str | None,
+        typer.Option(
+            metavar="CRS",
+            help="project to this system: EPSG:32654 or WKT; or, if the file names none, the system of the file",
+        ),
     ] = None,
     projector: Projector = None,
     from_crs: Annotated[
         str | None,
-        typer.Option(metavar="CRS", help="what the file is in, where it does not say so rightly: EPSG:n, WKT, local"),
+        typer.Option(
+            metavar="CRS", help="system of the file, if the file names none or a wrong one: EPSG:n, WKT, local"
+        ),
     ] = None,
     clean: Annotated[bool, typer.Option("--clean", help="drop points above the ground that touch no other")] = False,
 ) -> None:
@@ -202,25 +210,31 @@ def export(
         typer.Argument(metavar="FILE", help=".pcd, .las, .laz, .ply, or a folder to fill with Autoware tiles"),
     ],
     offset: Annotated[
-        str, typer.Option(metavar="X,Y,Z", help="metres to subtract from every point, for formats of float32")
+        str, typer.Option(metavar="X,Y,Z", help="metres to subtract from every point, for float32 formats")
     ] = "0,0,0",
-    crs: Annotated[str | None, typer.Option(metavar="CRS", help="the coordinates to write: EPSG:n or WKT")] = None,
+    crs: Annotated[str | None, typer.Option(metavar="CRS", help="coordinate system to write: EPSG:n or WKT")] = None,
     projector: Projector = None,
-    version: Annotated[int | None, typer.Option(metavar="N", help="of a store or server; else the newest")] = None,
+    version: Annotated[
+        int | None, typer.Option(metavar="N", help="version of a store or server; default: the newest")
+    ] = None,
     since: Annotated[
-        int | None, typer.Option(metavar="N", help="Autoware: only tiles that differ from this version's")
+        int | None, typer.Option(metavar="N", help="write only Autoware tiles that differ from this version")
     ] = None,
     follow: Annotated[
-        bool, typer.Option("--follow", help="of a URL: keep a folder of Autoware tiles at the newest version")
+        bool, typer.Option("--follow", help="keep a folder of Autoware tiles at the newest version of the server")
     ] = False,
-    keep: Annotated[int, typer.Option(min=0, metavar="N", help="--follow: older versions whose tiles stay")] = 3,
-    every: Annotated[float, typer.Option(min=0.1, metavar="SECONDS", help="--follow: how often to ask")] = 30.0,
-    once: Annotated[bool, typer.Option("--once", help="--follow: ask once and end")] = False,
+    keep: Annotated[
+        int, typer.Option(min=0, metavar="N", help="with --follow: number of older versions whose tiles stay")
+    ] = 3,
+    every: Annotated[
+        float, typer.Option(min=0.1, metavar="SECONDS", help="with --follow: seconds between two requests")
+    ] = 30.0,
+    once: Annotated[bool, typer.Option("--once", help="with --follow: write the newest version once and end")] = False,
     key_file: KeyFile = None,
 ) -> None:
     """Write a map's points in another format, in its own coordinate system or another. Reports what it drops.
 
-    From a store or a server, names of Autoware tiles depend on their content, because a running Autoware reads a path
+    Autoware tiles of a store or a server are named after their content, because a running Autoware reads each path only
     once.
 
         mapvote export my_map city.pcd

@@ -30,12 +30,12 @@ def register(app: typer.Typer) -> None:
 def serve(
     store: StoreName,
     map_path: Annotated[Path | None, typer.Option("--map", metavar="MAP", help="first map of a new STORE")] = None,
-    host: Annotated[str, typer.Option(metavar="ADDRESS", help="where to listen")] = "127.0.0.1",
-    port: Annotated[int, typer.Option(min=0, max=65535, metavar="N", help="0: any free one")] = 8080,
-    open_: Annotated[bool, typer.Option("--open", help="need no keys, on this machine, until one is issued")] = False,
-    upgrade: Annotated[
-        bool, typer.Option("--upgrade", help="only bring the schema of an older STORE up to date, and end")
+    host: Annotated[str, typer.Option(metavar="ADDRESS", help="address to listen on")] = "127.0.0.1",
+    port: Annotated[int, typer.Option(min=0, max=65535, metavar="N", help="port to listen on; 0: any free one")] = 8080,
+    open_: Annotated[
+        bool, typer.Option("--open", help="need no key, on this machine only, until the first key is issued")
     ] = False,
+    upgrade: Annotated[bool, typer.Option("--upgrade", help="only upgrade the schema of an older STORE")] = False,
     config: Config = None,
 ) -> None:
     """Serve a store to vehicles and operators until stopped. The first operator key of a new store is shown once.
@@ -96,16 +96,16 @@ def _refuse_policy(sources: Mapping[str, str]) -> None:
 
 def publish(
     store: StoreOrUrl,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="only say what would change")] = False,
-    override: Annotated[bool, typer.Option("--override", help="publish although the policy holds the version")] = False,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="only report what would change")] = False,
+    override: Annotated[bool, typer.Option("--override", help="publish even if the policy holds the version")] = False,
     reason: Reason = "",
     cluster: Annotated[
-        str | None, typer.Option(metavar="ADDRESS", help="Dask scheduler to fuse on, e.g. tcp://host:8786")
+        str | None, typer.Option(metavar="ADDRESS", help="address of a Dask scheduler that fuses, e.g. tcp://host:8786")
     ] = None,
     config: Config = None,
     key_file: KeyFile = None,
 ) -> None:
-    """Fuse the standing ballots and publish the next version. --cluster and --config are for a STORE only.
+    """Fuse the standing ballots and publish the next version. Only a STORE takes --cluster and --config.
 
     mapvote publish fleet.db --dry-run
     """
@@ -179,20 +179,25 @@ def policy(
 
 def log(
     store: StoreOrUrl,
-    events: Annotated[int, typer.Option(min=0, metavar="N", help="also the last N events")] = 0,
+    events: Annotated[int, typer.Option(min=0, metavar="N", help="also list the last N events")] = 0,
     old: Annotated[
-        int | None, typer.Option("--from", metavar="VERSION", help="list what changed since this version")
+        int | None, typer.Option("--from", metavar="VERSION", help="list the changes since this version")
     ] = None,
-    new: Annotated[int | None, typer.Option("--to", metavar="VERSION", help="until this one; else the newest")] = None,
+    new: Annotated[
+        int | None,
+        typer.Option("--to", metavar="VERSION", help="list the changes up to this version; default: the newest"),
+    ] = None,
     out: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="changes into a file: .geojson, or .gpkg (GeoPackage)")
+        Path | None, typer.Option(metavar="FILE", help="write the changes to a file: .geojson, or .gpkg (GeoPackage)")
     ] = None,
     page: Annotated[
         Path | None,
-        typer.Option("--html", metavar="FILE", help="one page: the largest changes in 3D"),
+        typer.Option("--html", metavar="FILE", help="write one page with the largest changes in 3D"),
     ] = None,
     min_cells: Annotated[int, typer.Option(min=1, metavar="N", help="leave out changes of fewer cells")] = 1,
-    metres: Annotated[bool, typer.Option("--metres", help="map metres instead of longitude and latitude")] = False,
+    metres: Annotated[
+        bool, typer.Option("--metres", help="write map metres instead of longitude and latitude")
+    ] = False,
     key_file: KeyFile = None,
 ) -> None:
     """List the versions of a store, or what was built and demolished between two of them.
@@ -272,15 +277,15 @@ def explain(
     for decision in told["decisions"]:
         print(f"version {decision['version']} decided {decision['state']}")
     if told.get("probability") is not None:
-        print(f"the last of them is right with a probability of {told['probability']:.2f}")
-    rows = []
+        print(f"probability that the last decision is right: {told['probability']:.2f}")
     for v in told["votes"]:
-        counted = ", ".join(str(number) for number in v["counted_in"])
-        counts = "counts" if v["counts"] else v["why"]
+        sure = "" if v.get("sure") is None else f", {100 * v['sure']:.0f} % sure"
         ended = v["end"][:19].replace("T", " ") + "Z"
-        sure = "" if v.get("sure") is None else f"{100 * v['sure']:.0f} %"
-        rows.append((v["vehicle"], v["drive"], ended, str(v["version"]), v["state"], sure, counted, counts))
-    print_table(("vehicle", "drive", "ended", "drove with", "says", "sure", "counted in", "now"), rows)
+        counted = ", ".join(str(number) for number in v["counted_in"])
+        before = f"counted in version {counted}" if counted else "counted in no version"
+        now = "counts now" if v["counts"] else f"does not count now: {v['why']}"
+        print(f"{v['vehicle']}: {v['state']}{sure}. Drive {v['drive']} ended {ended}, with version {v['version']}")
+        print(f"    {before}; {now}")
 
 
 def rollback(
@@ -289,7 +294,7 @@ def rollback(
     reason: Reason = "",
     key_file: KeyFile = None,
 ) -> None:
-    """Publish an older version again. The votes that led away from it do not count any more.
+    """Publish an older version again. Votes that changed it since then do not count any more.
 
     mapvote rollback fleet.db 1 --reason "the second was wrong"
     """
@@ -300,13 +305,19 @@ def rollback(
 
 def unvote(
     store: StoreOrUrl,
-    vehicle: Annotated[str | None, typer.Argument(metavar="[VEHICLE]", help="whose votes are withdrawn")] = None,
-    everybody: Annotated[bool, typer.Option("--all", help="the votes of every vehicle: begins a new round")] = False,
-    drive: Annotated[str | None, typer.Option(metavar="NAME", help="only this drive; else all of them")] = None,
-    replay: Annotated[
-        bool, typer.Option("--replay", help="remove them from published versions too, in a new version")
+    vehicle: Annotated[
+        str | None, typer.Argument(metavar="[VEHICLE]", help="the vehicle whose votes are withdrawn")
+    ] = None,
+    everybody: Annotated[
+        bool, typer.Option("--all", help="withdraw the votes of all vehicles, to begin a new round")
     ] = False,
-    yes: Annotated[bool, typer.Option("--yes", help="with --replay: publish; else only show the difference")] = False,
+    drive: Annotated[str | None, typer.Option(metavar="NAME", help="only this drive; default: all drives")] = None,
+    replay: Annotated[
+        bool, typer.Option("--replay", help="also remove the votes from published versions, in a new version")
+    ] = False,
+    yes: Annotated[
+        bool, typer.Option("--yes", help="with --replay: publish; without it only show the difference")
+    ] = False,
     key_file: KeyFile = None,
 ) -> None:
     """Withdraw a vehicle's votes from later versions or, with --replay, from every version.
@@ -350,8 +361,10 @@ def _unvote(store: str, vehicle: str | None, replay: bool, yes: bool) -> None:
 
 def check(
     store: StoreOrUrl,
-    mend: Annotated[bool, typer.Option("--mend", help="set damaged parts aside; with --from replace them")] = False,
-    other: Annotated[str | None, typer.Option("--from", metavar="STORE", help="e.g. a backup of this store")] = None,
+    mend: Annotated[bool, typer.Option("--mend", help="quarantine damaged parts; with --from replace them")] = False,
+    other: Annotated[
+        str | None, typer.Option("--from", metavar="STORE", help="a store with sound copies, e.g. a backup")
+    ] = None,
     key_file: KeyFile = None,
 ) -> None:
     """Read every byte of a store and compare it with its checksum. Exit code 1 if something is damaged.
@@ -396,7 +409,7 @@ def _check_beside(store: str, other: str, mend: bool) -> list[Damage]:
 
 def gc(
     store: StoreName,
-    yes: Annotated[bool, typer.Option("--yes", help="delete; else only say what would be deleted")] = False,
+    yes: Annotated[bool, typer.Option("--yes", help="delete; without it only list what would be deleted")] = False,
 ) -> None:
     """Delete what the policy does not keep: old versions (keep.versions) and ballots that can decide nothing more.
 
@@ -414,11 +427,13 @@ def gc(
 def keys(
     store: StoreName,
     action: Annotated[str, typer.Argument(metavar="[ACTION]", help="list, issue, rotate or revoke")] = "list",
-    name: Annotated[str | None, typer.Argument(metavar="[NAME]", help="of a vehicle or a person")] = None,
-    role: Annotated[str, typer.Option(help="vehicle, reader, reviewer or operator")] = "vehicle",
+    name: Annotated[str | None, typer.Argument(metavar="[NAME]", help="name of a vehicle or a person")] = None,
+    role: Annotated[str, typer.Option(metavar="ROLE", help="vehicle, reader, reviewer or operator")] = "vehicle",
     operator: Annotated[bool, typer.Option("--operator", help="the same as --role operator")] = False,
-    days: Annotated[float | None, typer.Option(help="the key expires after so many days")] = None,
-    overlap_days: Annotated[float, typer.Option(min=0, help="rotate: how long the old keys still work")] = 1.0,
+    days: Annotated[float | None, typer.Option(metavar="N", help="the key expires after N days")] = None,
+    overlap_days: Annotated[
+        float, typer.Option(min=0, metavar="N", help="rotate: the old keys work for N more days")
+    ] = 1.0,
     keep_votes: Annotated[
         bool | None,
         typer.Option(

@@ -15,7 +15,7 @@ from mapvote.core.process_memory import seldom_collecting
 DRIVE, MAP, SERVER, EVALUATE, SETUP = "Drive", "Map", "Server", "Simulate and evaluate", "Set up"
 """Headings of ``mapvote --help``."""
 
-Config = Annotated[Path | None, typer.Option(metavar="TOML", help="settings; `mapvote config` prints them all")]
+Config = Annotated[Path | None, typer.Option(metavar="TOML", help="settings file; `mapvote config` lists all settings")]
 DrivePath = Annotated[Path, typer.Argument(metavar="DRIVE", help="a recorded drive, in any format")]
 MapPath = Annotated[Path, typer.Argument(metavar="MAP", help="a map, in any format")]
 Scenario = Annotated[
@@ -25,32 +25,32 @@ Scenario = Annotated[
         help="street570, as_published, clear, street, slanted, junction, terrace, half_gone, corner, or a TOML file",
     ),
 ]
-Seed = Annotated[int, typer.Option(metavar="N", help="decides layout, clutter, traffic and noise")]
+Seed = Annotated[int, typer.Option(metavar="N", help="seed of layout, clutter, traffic and noise")]
 StoreName = Annotated[
     str,
     typer.Argument(metavar="STORE", help="an SQLite file, a postgresql+psycopg:// URL, or - for $MAPVOTE_STORE"),
 ]
 StoreOrUrl = Annotated[
-    str, typer.Argument(metavar="STORE|URL", help="a STORE, or the address of the server that keeps it")
+    str, typer.Argument(metavar="STORE|URL", help="a STORE (file, database URL or -), or its server's URL")
 ]
 KeyFile = Annotated[
-    Path | None, typer.Option(metavar="FILE", help="holds the key for that server; else $MAPVOTE_KEY is the key")
+    Path | None, typer.Option(metavar="FILE", help="file with the key for the server; default: the key in $MAPVOTE_KEY")
 ]
-Reason = Annotated[str, typer.Option(metavar="TEXT", help="kept with the version")]
+Reason = Annotated[str, typer.Option(metavar="TEXT", help="a comment that the log keeps")]
 MinVotes = Annotated[
-    int | None, typer.Option(min=1, metavar="N", help="vehicles that a change needs; default: the settings'")
+    int | None, typer.Option(min=1, metavar="N", help="vehicles that a change needs; default: the settings")
 ]
 
 FalseDeletions = Annotated[
     float | None,
     typer.Option(
         metavar="P",
-        help="keep a cell's points while emptying it deletes what stands with a higher probability, such as 0.01",
+        help="keep the points of a cell if the probability of a false deletion is higher than this, e.g. 0.01",
     ),
 ]
 
 Rate = Annotated[
-    float | None, typer.Option("--rate", metavar="HZ", help="revolutions per second, where the drive has no times")
+    float | None, typer.Option("--rate", metavar="HZ", help="revolutions per second, for a drive without times")
 ]
 Projector = Annotated[
     str | None,
@@ -58,37 +58,44 @@ Projector = Annotated[
 ]
 Topic = Annotated[
     str | None,
-    typer.Option(
-        metavar="TOPIC", help="which PointCloud2 topic of a bag (of one vehicle's several, with commas), or scene"
-    ),
+    typer.Option(metavar="TOPIC", help="PointCloud2 topic of a bag, several separated by commas; or scene of nuScenes"),
 ]
 DRIVE_OPTIONS = {
     "scans": Annotated[
-        str | None, typer.Option(metavar="SLICES", help="which scans: START:STOP:STEP, comma-separated: 0:12,24:36")
+        str | None, typer.Option(metavar="SLICES", help="only these scans, as START:STOP:STEP, e.g. 0:12,24:36")
     ],
     "prior": Annotated[
         str | None,
-        typer.Option(metavar="FILE|TOPIC|none", help="poses: rows of 3 x 4, TUM, CSV, GNSS; or a topic of a bag"),
+        typer.Option(
+            metavar="FILE|TOPIC|none", help="poses: a file (rows of 3 x 4, TUM, CSV, GNSS), a topic of the bag, or none"
+        ),
     ],
     "rate_hz": Rate,
     "sensor": Annotated[
-        str | None, typer.Option(metavar="NAME", help="a LiDAR model; else drive.toml, else measured in the scans")
+        str | None, typer.Option(metavar="NAME", help="LiDAR model; default: drive.toml, else measured in the scans")
     ],
     "mount": Annotated[
         str | None,
-        typer.Option(metavar="NUMBERS", help="T_base_lidar: x,y,z,roll,pitch,yaw in metres and degrees, or 12 numbers"),
+        typer.Option(
+            metavar="NUMBERS", help="T_base_lidar as x,y,z,roll,pitch,yaw in metres and degrees, or 12 numbers"
+        ),
     ],
     "topic": Topic,
     "columns": Annotated[
-        str | None, typer.Option(metavar="NAMES", help="of .bin and .npy scans: x,y,z,intensity,ring; else recognised")
+        str | None,
+        typer.Option(
+            metavar="NAMES", help="columns of .bin and .npy scans, e.g. x,y,z,intensity,ring; default: recognised"
+        ),
     ],
-    "dtype": Annotated[str | None, typer.Option(metavar="TYPE", help="of the columns of .bin scans: float32, float64")],
+    "dtype": Annotated[
+        str | None, typer.Option(metavar="TYPE", help="type of the columns of .bin scans: float32 or float64")
+    ],
 }
-"""What the command line may say about a drive, by the names of ``formats.open_drive``."""
+"""Options that describe a drive, by the argument names of ``formats.open_drive``."""
 
 
 def with_drive_options(verb: Callable[..., None]) -> Callable[..., None]:
-    """``verb`` with every one of DRIVE_OPTIONS on its command line, handed over together as its ``drive_options``."""
+    """``verb`` with all DRIVE_OPTIONS on its command line; it receives them as the dict ``drive_options``."""
 
     @wraps(verb)
     def command(**arguments: Any) -> None:

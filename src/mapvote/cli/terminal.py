@@ -6,6 +6,7 @@ Progress goes to stderr, so that stdout can be piped.
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
@@ -25,7 +26,8 @@ def complain(message: str) -> None:
 
 
 def print_table(headings: Iterable[str], rows: Iterable[Iterable[str]], title: str | None = None) -> None:
-    """A table on stdout. Text that does not fit is folded, never cut."""
+    """A table on stdout. In a terminal, text that does not fit is folded, never cut. In a pipe or a file each row is
+    one line, however wide."""
     from rich.console import Console
     from rich.table import Table
     from rich.text import Text
@@ -35,7 +37,10 @@ def print_table(headings: Iterable[str], rows: Iterable[Iterable[str]], title: s
         table.add_column(Text(heading), overflow="fold")
     for row in rows:
         table.add_row(*(Text(cell) for cell in row))
-    Console().print(table)
+    console = Console()
+    if not console.is_terminal and "COLUMNS" not in os.environ:
+        console.width = max(console.measure(table).maximum, 1)
+    console.print(table)
 
 
 @contextmanager

@@ -29,7 +29,7 @@ def update(
     map_path: MapPath,
     ballot_files: Annotated[list[Path], typer.Argument(metavar="BALLOT...", help="ballots of one round")],
     out: Annotated[Path | None, typer.Option(metavar="MAP", help="the updated map to write, a folder")] = None,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="decide and report, write no map")] = False,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="decide and report, but write no map")] = False,
     cells: Annotated[Path | None, typer.Option(metavar="NPZ", help="also write the decided states of cells")] = None,
     min_votes: MinVotes = None,
     false_deletions: FalseDeletions = None,

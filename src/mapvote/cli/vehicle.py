@@ -33,7 +33,8 @@ def build(
     drives: Annotated[list[Path], typer.Argument(metavar="DRIVE...", help="one or more drives of the same place")],
     out: Annotated[Path, typer.Option(metavar="MAP", help="the map to write; a folder that does not exist yet")],
     report_png: Annotated[
-        Path | None, typer.Option("--report", metavar="PNG", help="a picture of how the drives fit their priors")
+        Path | None,
+        typer.Option("--report", metavar="PNG", help="write a picture of the drives' distance from their priors"),
     ] = None,
     config: Config = None,
     *,
@@ -41,7 +42,8 @@ def build(
 ) -> None:
     """Build the first map from one or more drives by NDT SLAM: de-skewed, without moving objects, 0.3 m voxels.
 
-    A precise prior (RTK) holds the map in its frame, coarse ones (GNSS) place it all together, none is needed.
+    A precise prior (RTK) fixes the frame of the map. Coarse priors (GNSS) place the map as a whole. Without a prior the
+    frame is that of the first scan.
 
         mapvote build MY_DRIVE --out my_map
     """
@@ -113,39 +115,43 @@ def _frame(report: BuildReport) -> str:
 
 def vote(
     drive_path: DrivePath,
-    where: Annotated[str, typer.Option("--map", metavar="MAP|URL", help="a map in any format, or a server's")],
-    out: Annotated[Path | None, typer.Option(metavar="BALLOT", help="the ballot to write")] = None,
+    where: Annotated[str, typer.Option("--map", metavar="MAP|URL", help="a map in any format, or the URL of a server")],
+    out: Annotated[Path | None, typer.Option(metavar="BALLOT", help="write the ballot to this file")] = None,
     send: Annotated[
-        str | None, typer.Option(metavar="URL", help="the server to send it to; kept for later if that is away")
+        str | None,
+        typer.Option(
+            metavar="URL", help="send the ballot to this server; if it does not answer, the next vote sends the ballot"
+        ),
     ] = None,
     key_file: KeyFile = None,
     vehicle: Annotated[
-        str | None, typer.Option(metavar="NAME", help="whose vote; else drive.toml, else the drive's name")
+        str | None, typer.Option(metavar="NAME", help="name of the vehicle; default: drive.toml, else the drive's name")
     ] = None,
     case: Annotated[
         str | None,
-        typer.Option(metavar="CASE", help="surfaces, or the paper's 1 to 5; else by the settings"),
+        typer.Option(metavar="CASE", help="surfaces, or case 1 to 5 of the paper; default: the settings"),
     ] = None,
     trust_prior: Annotated[
-        bool, typer.Option("--trust-prior", help="take the prior for the pose, do not localise")
+        bool, typer.Option("--trust-prior", help="use the prior as the pose; do not localise")
     ] = False,
     region: Annotated[
         str | None,
-        typer.Option(metavar="X0,Y0,X1,Y1", help="of a server's map only this, 100 m around the drive; map metres"),
+        typer.Option(
+            metavar="X0,Y0,X1,Y1",
+            help="download only this part of a server's map, in map metres; leave 100 m around the drive",
+        ),
     ] = None,
     trajectory: Annotated[
         Path | None,
-        typer.Option(
-            metavar="FILE", help="of a session's cloud: the sensor's poses in its frame, rows of 3 x 4 or TUM"
-        ),
+        typer.Option(metavar="FILE", help="for a cloud: the sensor's poses in the cloud's frame, rows of 3 x 4 or TUM"),
     ] = None,
     config: Config = None,
     *,
     drive_options: dict[str, Any],
 ) -> None:
-    """Drive once: localise, remove moving objects, compare with the map, and write one ballot.
+    """Vote with a recorded drive: localise, remove moving objects, compare with the map, and write one ballot.
 
-    The cloud or map of a session votes as well, in any frame: it is registered to the map first.
+    A point cloud in any frame can vote too: it is registered to the map first.
 
     mapvote vote ANOTHER_DRIVE --map my_map --vehicle car_1 --out car_1.ballot
     """
@@ -159,7 +165,7 @@ def vote(
     from mapvote.formats.geo.projector import frame_of
 
     if out is None and send is None:
-        raise MapvoteError("vote: say where the ballot goes: --out BALLOT, --send URL, or both")
+        raise MapvoteError("vote: give --out BALLOT, --send URL, or both")
     key = key_in(key_file)
     settings = load_settings(config)
     if case is not None:

@@ -1,10 +1,10 @@
-"""How sure a vehicle is of each cell that it calls changed, by its own evidence: log-odds that the cell did change.
+"""A vehicle's confidence in each cell that it calls changed: log-odds that the cell did change, by its own evidence.
 
-Most cells that are wrongly called changed lie at the rim of what did change, where centimetres decide which of two
-cells holds a surface. What tells them apart is how large the thing is, how many of the cells around changed likewise,
-how much of it the cell holds against those, of what is gone how high it rose, and how deep in the cell its surface
-lies. How often rays crossed what is gone, or which rule decided it, tells nothing beyond (docs/measurements/
-probability.md, which also has how the numbers were fitted, and how they do).
+Most cells that are wrongly called changed lie at the rim of a true change, where centimetres decide which of two cells
+holds a surface. They are distinguished by the size of the object, the number of neighbouring cells with the same
+change, the cell's share of the object beside its neighbours', the height of a deleted object, and how deep in the cell
+the surface lies. The number of rays that crossed a deleted object, and the rule that decided it, add nothing
+(docs/measurements/probability.md, which also describes the fit and its calibration).
 """
 
 from __future__ import annotations
@@ -19,22 +19,22 @@ from mapvote.core.types import F32, F64, I32, I64, U8, Bool, CellState
 
 LOOKS = 4
 MOST_CELLS = 200
-"""A thing of more is as large as any."""
+"""Sizes of objects are cut here."""
 MOST_HEIGHT_M = 6.0
 _BESIDE = [(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1) if i or j]
 # By benchmarks/probability.py.
 _BUILT = np.array([-4.104, 0.525, 3.454, 0.382, 0.0, 21.98])
 _DEMOLISHED = np.array([-8.435, 0.982, 2.939, 0.689, 0.474, 22.654])
-"""Log-odds: of nothing; of each thing looked at in the cell; of a metre of depth."""
+"""Coefficients of the log-odds: constant; the LOOKS features of the cell; metres of depth."""
 
 
 def looks(states: U8, amount: I32, height_m: F32, tile: tuple[slice, slice]) -> F64:
-    """(m, LOOKS) of the cells of one ``tile`` of a window that its ``states`` call changed, ascending.
+    """(m, LOOKS) features of the cells of one ``tile`` of a window that its ``states`` call changed, ascending.
 
-    Of each: ln of 1 + the cells of the 8-connected thing it belongs to; which share of the eight cells around is alike;
-    ln of how much of the thing it holds against the fullest of those, by ``amount``: the voxels that the map holds,
-    else how often the new ones were hit; how high the map rises in it (``height_m``), of what is gone. The planes
-    (rows, cols) of the window reach a cell or more beyond the tile.
+    The features of a cell: ln(1 + cells of its 8-connected object); the share of its eight neighbours with the same
+    state; ln(1 + its amount) - ln(1 + the largest amount of these neighbours), where ``amount`` is the number of mapped
+    voxels, or of hits of new ones; the height of the map in the cell (``height_m``) if it is changed-empty, else 0. The
+    planes (rows, cols) of the window reach a cell or more beyond the tile.
     """
     cells = changed_cells_of(np.ascontiguousarray(states[tile]))
     rows, cols = cells // TILE_CELLS + tile[0].start, cells % TILE_CELLS + tile[1].start
@@ -50,8 +50,8 @@ def looks(states: U8, amount: I32, height_m: F32, tile: tuple[slice, slice]) -> 
 
 
 def _of_things(alike: Bool, amount: I32, rows: I64, cols: I64) -> tuple[I64, I64, F64]:
-    """Of the cells (n,): how many their 8-connected group of ``alike`` has, how many of the eight around are among
-    them, and ln of their amount against the largest of those."""
+    """For the cells (n,): the size of their 8-connected group of ``alike``, the number of their eight neighbours in
+    ``alike``, and ln(1 + their amount) - ln(1 + the largest amount of these)."""
     group, _ = ndimage.label(alike, structure=np.ones((3, 3)))
     sizes = np.bincount(group.ravel())[group[rows, cols]]
     mine = np.where(alike, amount, 0)
@@ -61,9 +61,9 @@ def _of_things(alike: Bool, amount: I32, rows: I64, cols: I64) -> tuple[I64, I64
 
 
 def depths_m(states: U8, mapped: Tile | None, new_points: F32) -> F64:
-    """(m,) metres: how deep in each cell that ``states`` (256, 256) call changed its surface lies, that is how far from
-    the nearest side that of its points is that lies farthest from all. Of what went those are the map's obstacles, of
-    what came the ``new_points`` (n, 3) from the tile's corner; 0 where there are none."""
+    """(m,) metres: how deep the surface lies in each cell that ``states`` (256, 256) call changed: the largest distance
+    of one of its points from the nearest side of the cell. The points are the map's obstacles in a changed-empty cell
+    and ``new_points`` (n, 3), from the tile's corner, in a changed-occupied one; 0 without any."""
     cells = changed_cells_of(states)
     out = _deepest_m(new_points)[cells]
     if mapped is not None:
@@ -73,7 +73,7 @@ def depths_m(states: U8, mapped: Tile | None, new_points: F32) -> F64:
 
 
 def _deepest_m(points: F32) -> F64:
-    """(65536,) of points (n, 3) from a tile's corner."""
+    """(65536,) metres: the largest distance from the nearest side of its cell of points (n, 3) from a tile's corner."""
     deep = np.zeros(CELLS)
     places = points[:, :2].astype(np.float64) / CELL_SIZE
     cell = np.clip(np.floor(places), 0, TILE_CELLS - 1)
@@ -84,8 +84,8 @@ def _deepest_m(points: F32) -> F64:
 
 
 def log_odds(states: U8, looked: F64, depth_m: F64) -> F64:
-    """(n,) nats that cells called ``states`` (n,), CHANGED_OCCUPIED or CHANGED_EMPTY, did change, by what was
-    looked at (n, k) (:func:`looks`) and how deep in them their surface lies (n,)."""
+    """(n,) log-odds, nats, that cells with ``states`` (n,), CHANGED_OCCUPIED or CHANGED_EMPTY, did change.
+    ``looked`` (n, k): the features of :func:`looks`; ``depth_m`` (n,): see :func:`depths_m`."""
     curve = np.where((states == CellState.CHANGED_OCCUPIED)[:, None], _BUILT, _DEMOLISHED)
-    told = np.column_stack([np.ones(len(states)), looked, depth_m])
-    return np.asarray((curve * told).sum(axis=1))
+    features = np.column_stack([np.ones(len(states)), looked, depth_m])
+    return np.asarray((curve * features).sum(axis=1))

@@ -16,9 +16,10 @@ from mapvote.detection.shelf import Shelf, Slot
 from mapvote.perception.frontend import Observation, PlacedScan
 
 _COMPACT_AT = 50_000
-"""Points sorted together: so many take a few milliseconds, and no scan is to wait for more."""
+"""Points sorted together: so many take a few milliseconds, so that no scan waits longer."""
 REACH_M = 70.0
-"""New points are taken up to here, farther than votes are cast: a tile's width around the vehicle is laid out."""
+"""New points are taken up to this range, farther than votes are cast: the map is at hand for a tile's width around the
+vehicle."""
 
 
 def select(points: F64, cell: I32, wanted: Bool, unwanted: Bool, words: U64, base: I32) -> I64:
@@ -76,22 +77,22 @@ def _beyond(
 
 
 class NewPoints:
-    """One point per 0.3 m voxel, the first that was offered: candidates for changed-occupied cells."""
+    """One point per 0.3 m voxel, the first one offered: candidates for changed-occupied cells."""
 
     def __init__(self, lattice: Lattice, beyond: bool = True, *, intensity: bool = False) -> None:
-        """``beyond``: also what lies outside the local grid. The paper has none of it, and the filter of moving objects
-        does not look there: only rules that ask more of a new voxel than that a scan struck it can take it.
-        ``intensity``: keep it with each point."""
+        """``beyond``: also take points outside the local grid. The paper takes none, and the filter of moving objects
+        does not reach there, so a rule that uses them must require more of a new voxel than one hit. ``intensity``:
+        keep it with each point."""
         self.lattice, self.beyond, self.intensity = lattice, beyond, intensity
         self._shelf, self._runs = Shelf(), defaultdict[TileIndex, list[Slot]](list)
-        """Of each tile points in ascending order of their voxels, each run with one point a voxel."""
+        """The sorted runs of each tile: points in ascending order of their voxels, one point per voxel."""
         self._last: F64 | None = None
-        """The run that is still small."""
+        """The last run, if it is still small."""
         self._waiting: list[F64] = []
         self._count = 0
 
     def gather(self, seen: Observation, may_be_new: U64) -> None:
-        """The points of one scan: of its view, those in voxels of ``may_be_new`` (rows, cols); and what lies beyond."""
+        """Offer the points of one scan that lie in ``may_be_new`` (rows, cols) of its view, or outside the view."""
         scan = seen.scan
         words, base = may_be_new.ravel(), _flat_base(scan.reference)
         self._offer_of(scan, select(scan.points_map, scan.cell, scan.obstacle, seen.moving, words, base))
@@ -129,7 +130,7 @@ class NewPoints:
                 self._compact()
 
     def _compact(self) -> None:
-        """Sort what came since the last run; a run that is still small is sorted in again, an older one never."""
+        """Sort the points since the last run into a new run, together with the last run if that is still small."""
         run = self._one_a_voxel([*self._short(), *self._waiting])
         self._last = run if len(run) < _COMPACT_AT else None
         if self._last is None:

@@ -1,8 +1,8 @@
-"""One scan against the reference: what it says of each cell, and the state that is (paper III-A, III-B).
+"""One scan against the reference: its observation of each cell, and the state that follows (paper III-A, III-B).
 
-What one scan says is 16 bits a cell, before any open sentence of the paper is read: how many points, who could see the
-cell under every rule of sight, whether the map is too tall there. Every reading of the paper is a look-up in a table of
-these words: kept, they answer all readings without the scan.
+An observation is 16 bits per cell and does not depend on how the paper's open sentences are read: the number of points,
+whether the cell could be seen under every rule of sight, whether the map is too tall there. Every reading of the paper
+is a look-up table over these words, so stored words answer all readings without the scan.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from mapvote.perception.frontend import Observation
 from mapvote.perception.raycast import ScanView, Sight, cast_rays
 
 MOST_POINTS = 15
-"""Points are counted up to here: Eq. (1) has reached its bound."""
+"""Points are counted up to this number, where Eq. (1) has reached its bound."""
 CLEAR, CLEAR_OF_CELLS, BEFORE_FARTHEST, THROUGH_COLUMN, FIRED = (1 << k for k in range(4, 9))
 """Nothing above the ground before the cell; nothing in an occupied cell; not behind the farthest return; a ray through
 the heights in which the map has points; any ray that way at all. Movers hide what is behind them."""

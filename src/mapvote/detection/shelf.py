@@ -1,5 +1,5 @@
-"""Bytes that are kept to the end of a drive and asked for once or twice: the first of them in memory, the others in a
-file without a name, so that a vehicle needs no more memory for a long road than for a short one.
+"""Bytes that are kept to the end of a drive and read once or twice. The first IN_MEMORY bytes stay in memory, the
+others in an unnamed file, so a long road needs no more memory than a short one.
 """
 
 from __future__ import annotations
@@ -12,8 +12,8 @@ from typing import BinaryIO, NamedTuple
 from mapvote.core.types import MapvoteError
 
 IN_MEMORY = 16 << 20
-"""Bytes held before a file is begun: a drive of a kilometre or two asks the disk for nothing. They lie apart from the
-heap: laid among what comes and goes with every scan, each thing would keep a hole open around it."""
+"""Bytes held before a file is opened: a drive of one or two kilometres writes nothing to disk. They are mapped apart
+from the heap, because between the short-lived arrays of each scan they would fragment it."""
 
 
 class Slot(NamedTuple):
@@ -24,7 +24,7 @@ class Slot(NamedTuple):
 
 
 class Shelf:
-    """Bytes are put down one after another, and never moved. What is put down is not taken away again."""
+    """Bytes are appended, never moved and never removed."""
 
     def __init__(self) -> None:
         self._memory: mmap.mmap | None = None

@@ -1,4 +1,4 @@
-"""What counts a drive, and what it says of one tile in the end."""
+"""The interface of a change rule: it takes the scans of a drive and gives the votes on each tile."""
 
 from __future__ import annotations
 
@@ -13,34 +13,33 @@ from mapvote.perception.frontend import Observation
 
 @dataclass(frozen=True, slots=True)
 class TileVotes:
-    """What a voter says of one tile."""
+    """The votes of one drive on one tile."""
 
     tally: I32
     """(256, 256, 5) votes in VOTE_UNITs."""
     states: U8
     """(256, 256) decided by this vehicle alone."""
     gone: U64 | None
-    """(256, 256) map voxels that are there no more where the cell is changed-empty; None: all of them."""
+    """(256, 256) words of the map voxels that are gone in changed-empty cells; None: all of them."""
     remnants: U64 | None
-    """(256, 256) map voxels that are there no more though the rest of the cell stands; None: not asked."""
+    """(256, 256) words of the map voxels that are gone in cells that stand; None: the rule has none."""
     new: U64
-    """(256, 256) voxels whose points are new where the cell is changed-occupied."""
+    """(256, 256) words of the voxels whose points are new in changed-occupied cells."""
     free: U64 | None
-    """(256, 256) voxels seen to be free in cells where the map knew of none; None: not asked."""
+    """(256, 256) words of the voxels that rays showed to be free and the map did not know to be; None: the rule has
+    none."""
     looked: F64 | None = None
-    """(m, k) what speaks for each changed cell, ascending (detection/confidence.py); None: not asked."""
+    """(m, k) features of each changed cell, ascending (detection/confidence.py); None: the rule has none."""
 
 
 class Voter(Protocol):
-    """The paper's votes of each scan (detection/paper.py), or surfaces (detection/surfaces.py): scan after scan goes
-    in, votes come out tile by tile."""
+    """The paper's votes of each scan (detection/paper.py), or surfaces (detection/surfaces.py)."""
 
     def observe(self, seen: Observation) -> U64:
-        """Take in one scan; returns (rows, cols) words of the voxels of its view whose points may be new."""
+        """Count one scan; returns (rows, cols) words of the voxels of its view whose points may be new."""
 
     def votes(self) -> dict[TileIndex, TileVotes]:
-        """What the scans so far amount to, of every tile that they say anything of, in ascending order. Asking changes
-        nothing."""
+        """The votes of the scans so far, for every tile with votes, in ascending order. The call changes nothing."""
 
     def each(self, only: Collection[TileIndex] | None = None) -> Iterator[tuple[TileIndex, TileVotes]]:
         """The same tile by tile, in any order: so that no drive is too long for memory. ``only``: of these tiles."""

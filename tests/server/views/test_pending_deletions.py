@@ -59,7 +59,7 @@ def test_a_cell_beyond_the_budget_keeps_its_points_until_vehicles_are_surer(stor
     assert "the policy allows 0.01" in waits["properties"]["waits"]
     assert publish(store).deleted == 6
     story = middle(store)
-    assert "pending: that emptying it deletes something that stands" in story.thing
+    assert "pending: the probability that emptying it deletes something that stands" in story.thing
     assert "stands: surveyed" in story.thing
     assert [w["id"] for w in desk(store).waiting] == [waits["id"]], "though nothing has come since"
     assert not publish(store).published

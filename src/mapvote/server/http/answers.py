@@ -26,7 +26,7 @@ class Answer(BaseModel):
 
 
 class Problem(Answer):
-    """What went wrong, and how to mend it."""
+    """An error, and how to mend it."""
 
     detail: Any
     reasons: list[str] | None = Field(default=None, description="of a version that the policy holds")
@@ -98,7 +98,7 @@ class Published(Answer):
 
 
 class Running(Answer):
-    """One publish, or one look at what it would do."""
+    """The result of a publish or of a dry run."""
 
     by: str
     dry_run: bool

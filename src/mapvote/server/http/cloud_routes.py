@@ -1,4 +1,4 @@
-"""Data of the 3D page: levels of detail, points that came and went, votes per cell, paths."""
+"""Data of the 3D page: levels of detail, points added and deleted, votes per cell, paths."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def overview(request: Request, version: VersionQuery | None = None) -> Response:
     "/v1/clouds/changed",
     responses=problems(404) | AS_BYTES,
     response_class=Response,
-    summary="Points that came and went between two versions",
+    summary="Points added and deleted between two versions",
 )
 def changed(request: Request, old: From, new: To) -> Response:
     """Tile by tile, two clouds each; the layout is in docs/viewer.md."""

@@ -179,7 +179,7 @@ class Connection(asyncio.Protocol):
 
 
 _CONNECTION: ContextVar[Connection | None] = ContextVar("mapvote_connection", default=None)
-"""The connection that a request came by: uvicorn starts a request's task while it is handed the bytes."""
+"""The connection of the current request: uvicorn starts a request's task while it receives the request's bytes."""
 
 
 def watched(inner: type[asyncio.Protocol], patience: Patience) -> type[asyncio.Protocol]:

@@ -85,7 +85,7 @@ async def _look(request: Request) -> Desk:
 
 
 def _flat(row: Mapping[str, Any]) -> dict[str, Any]:
-    """A verdict takes columns of its own."""
+    """A verdict has its own columns."""
     said = row["verdict"] or {"verdict": "", "by": "", "comment": ""}
     return dict(row) | {"verdict": said["verdict"], "by": said["by"], "comment": said["comment"]}
 

@@ -90,7 +90,7 @@ class Uploads:
 
     async def read(self, vehicle: str, stream: AsyncIterator[bytes], declared: str | None) -> bytes:
         """A whole body. TooLarge beyond the limit for one; TooMany if the vehicle sends more than it may at a time;
-        Unavailable if this one was dropped; MapvoteError if the client went away."""
+        Unavailable if this one was dropped; MapvoteError if the client disconnected."""
         if declared is not None and declared.isdigit() and int(declared) > self._each:
             raise TooLarge(f"the body has {declared[:20]} bytes, the limit is {self._each}: send a shorter drive")
         if self._of[vehicle] >= self.AT_ONCE:
@@ -103,7 +103,7 @@ class Uploads:
                 self._take(upload, chunk)
             return b"".join(upload.chunks)
         except ClientDisconnect as error:
-            raise MapvoteError("the ballot came only in part: the client went away") from error
+            raise MapvoteError("only a part of the ballot arrived: the client disconnected") from error
         finally:
             self._forget(upload)
             self._of[vehicle] -= 1

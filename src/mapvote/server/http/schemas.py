@@ -27,7 +27,7 @@ STATUS: Mapping[type[MapvoteError], int] = {
     TooMany: 429,
     Unavailable: 503,
 }
-"""A class stands for its subclasses too."""
+"""An entry also holds for the subclasses of its class."""
 LEAST, MOST = -(1 << 31), (1 << 31) - 1
 """Range of a version's number in a database."""
 PLAIN = r"^[^\x00-\x1f]*$"

@@ -55,7 +55,7 @@ MISFIT_SLACK_M = 1.0
 
 
 class Sent(NamedTuple):
-    """What came by HTTP: a ballot's bytes, what its address says, and the hash of the key that it came with."""
+    """An upload: the ballot's bytes, vehicle and drive of its URL, and the hash of the key that sent it."""
 
     data: bytes
     vehicle: str
@@ -88,7 +88,8 @@ def examine(data: bytes) -> Incoming:
 
 
 def sound(sent: Sent) -> Incoming:
-    """A ballot decoded; MapvoteError if it is unsound, or not what its address says. Its key is not looked at."""
+    """A ballot decoded; MapvoteError if it is unsound, or of another vehicle or drive than its URL. The key is not
+    checked."""
     incoming = examine(sent.data)
     if incoming.drive != (sent.vehicle, sent.drive):
         address = f"{sent.vehicle[:64]}/{sent.drive[:64]}"
@@ -231,9 +232,9 @@ def accept(store: Store, ballots: Sequence[Incoming]) -> list[Receipt | MapvoteE
 
 
 def _counts_somewhere(connection: sa.Connection, votes: Votes, version: int, now: TileHashes | None) -> bool:
-    """Whether there is a cell that a ballot speaks of and that has not changed since ``version``.
+    """Whether a ballot determines a cell that has not changed since ``version``.
 
-    Of a tile whose memory is damaged nobody knows: its votes are admitted, and wait until the plane is mended.
+    If the memory of the tile is damaged this is unknown: the votes are admitted and wait until the plane is restored.
     """
     try:
         if now is None:

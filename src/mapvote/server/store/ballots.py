@@ -35,15 +35,15 @@ class Incoming:
 
     ballot: Ballot
     votes: Sequence[Votes]
-    """Of each of its tiles."""
+    """The votes on each of its tiles."""
     digest: str
-    """SHA-256 of the ballot as it was sent."""
+    """SHA-256 of the bytes that the vehicle sent."""
     cast_by: str
     """Method and stage: all ballots of a round agree on them."""
     size: int
     """Bytes."""
     key_hash: str | None = None
-    """Of the key that it came with."""
+    """Hash of the key that sent the ballot."""
 
     @property
     def drive(self) -> tuple[str, str]:
@@ -59,7 +59,7 @@ class Receipt:
     drive: str
     created: bool
     repeated: bool
-    """The very same ballot stood already: nothing was written."""
+    """The identical ballot was stored already: nothing was written."""
     seq: int
 
 
@@ -69,8 +69,8 @@ def write_ballots(
     now: int,
     refusal: Callable[[Incoming], MapvoteError | None],
 ) -> list[Receipt | MapvoteError]:
-    """Write ballots within a transaction: a receipt each, or why ``refusal`` does not admit it. A ballot that stands
-    already is not judged again: whoever got no answer may send it once more, whatever became of the votes."""
+    """Write ballots within a transaction. Returns for each a receipt, or the error with which ``refusal`` rejects it. A
+    ballot that is stored already is not judged again, so a vehicle that got no answer may send it again."""
     first, standing = _heard_of(connection, ballots)
     seq, rows = next_seq(connection), _Rows()
     results: list[Receipt | MapvoteError] = []
@@ -95,7 +95,7 @@ def write_ballots(
 def _heard_of(
     connection: sa.Connection, ballots: Sequence[Incoming]
 ) -> tuple[dict[tuple[str, str], int], dict[tuple[str, str], tuple[int, str]]]:
-    """Of the drives of these ballots: (when each was first heard of, number and digest of the ballot that stands)."""
+    """For the drives of these ballots: ({drive: its first event}, {drive: (number, digest) of its standing ballot})."""
     b = schema.ballots
     drives = sa.tuple_(b.c.vehicle, b.c.drive).in_({incoming.drive for incoming in ballots})
     query = sa.select(b.c.vehicle, b.c.drive, b.c.seq, b.c.first_seq, b.c.gone_seq, b.c.digest).where(drives)

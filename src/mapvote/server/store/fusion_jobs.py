@@ -45,8 +45,8 @@ from mapvote.server.store.votes import (
 )
 
 _GROUP, _ROUND = 8, 8
-"""Tiles side by side that are fused within one reading of the database, at most; into how many groups a round is cut at
-the least, so that all who fuse have work and a round can be cancelled on its way, unless nobody else fuses."""
+"""Most neighbouring tiles that are fused within one database transaction; least number of groups of a round with an
+executor, so that all its workers have work and a round can be cancelled between groups."""
 _WHY: dict[str, Why] = {"": "", YOUNG: "young", OTHERWISE: "otherwise", DAMAGED: "damaged"}
 _NOWHERE = np.empty(0, dtype=np.uint64)
 
@@ -56,12 +56,12 @@ class Task:
     """One tile to fuse: everything a worker needs but the ballots."""
 
     url: str
-    """Of the database, without its password."""
+    """Address of the database, without its password."""
     window: Grid
     version: int
-    """That is to be made."""
+    """Number of the version to be made."""
     tile: TileHashes | Tile | None
-    """As it is now: in the store, at hand, or not there."""
+    """The tile of the newest version: its hashes in the store, the tile itself, or None if there is none."""
     asked: Electorate
     misread: Mapping[int, Bool] | None = None
     """See :func:`mapvote.fusion.fuse.unspent`; in a replay only."""
@@ -69,7 +69,7 @@ class Task:
 
 @dataclass(frozen=True, slots=True)
 class Fused:
-    """What came of one tile."""
+    """The result of fusing one tile."""
 
     index: TileIndex
     states: bytes
@@ -78,31 +78,32 @@ class Fused:
     """(5, 65536), a zstd frame, see :func:`mapvote.server.store.decisions.pack_tally`."""
     vehicles: int
     points: int
-    """Before."""
+    """Number of points before the edit."""
     added: int
     deleted: int
     hashes: TileHashes | None
-    """Of the edited tile; None if it stays as it is."""
+    """Hashes of the edited tile; None if the tile does not change."""
     planes: Mapping[str, bytes]
     cells_gone: I64
-    """Flat cells that hold no obstacle any more."""
+    """Flat cells whose last obstacle was deleted."""
     cells_new: I64
     """Flat cells that hold one for the first time."""
     freed: int
-    """Cells in which free space was learned, of a tile that knew of any."""
+    """Number of cells in which free space was learned; 0 for a tile without known-free columns."""
     tile: Tile | None
-    """The edited tile where the task held one at hand (replay), else None."""
+    """The edited tile if the task held the tile itself (replay), else None."""
     damaged: Sequence[Damage] = ()
-    """What could not be read, and was left out."""
+    """Damaged planes and ballots, which were left out."""
     copies: Sequence[Copy] = ()
-    """Drives that were not heard because another vehicle's was, that is alike."""
+    """Drives that did not count because another vehicle's drive is a copy of them."""
     odds: bytes | None = None
-    """How sure of the changed cells those are who voted for them, see
+    """Log-odds of the changed cells by the vehicles that voted for them, see
     :func:`mapvote.fusion.loss_budget.pack_agreed`."""
     pending: PendingDeletions = field(default_factory=PendingDeletions.none)
-    """Deletions that wait because they are beyond the budget."""
+    """Deletions that wait because their probability of a false deletion exceeds the budget."""
     standings: bytes = b""
-    """What became of every ballot that stood on the tile, see :func:`mapvote.server.store.decisions.pack_standings`."""
+    """Which of the ballots on the tile counted, and why the others did not, see
+    :func:`mapvote.server.store.decisions.pack_standings`."""
 
     @property
     def lost(self) -> bool:
@@ -210,31 +211,31 @@ def _tile(connection: sa.Connection, task: Task) -> Tile:
 
 
 class Watched(Executor):
-    """Fuses where another executor does, and tells of every tile that is done.
+    """Runs its work on another executor, and reports every tile that is done.
 
-    ``told`` is called with (tiles done, tiles in all), the first time before any; what it raises ends the round, and
-    what had not begun is never done.
+    ``report`` is called with (tiles done, tiles in all), the first time before any tile is fused. An exception that it
+    raises ends the round; tiles that have not begun are not fused.
     """
 
-    def __init__(self, within: Executor, told: Callable[[int, int], None]) -> None:
+    def __init__(self, within: Executor, report: Callable[[int, int], None]) -> None:
         self.within = within
-        self._told = told
+        self._report = report
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        """As the other does."""
+        """Run ``fn`` on the other executor."""
         return self.within.submit(fn, *args, **kwargs)
 
     def map(
         self, fn: Callable[..., Any], *iterables: Iterable[Any], timeout: float | None = None, chunksize: int = 1
     ) -> Iterator[Any]:
-        """As the other does, in order, of groups of tiles."""
+        """Results of the other executor, in order; the first of ``iterables`` holds groups of tiles."""
         groups = [list(some) for some in iterables]
         sizes = [len(group) for group in groups[0]]
-        self._told(0, sum(sizes))
+        self._report(0, sum(sizes))
         results = self.within.map(fn, *groups, timeout=timeout, chunksize=chunksize)
         for done in accumulate(sizes):
             yield next(results)
-            self._told(done, sum(sizes))
+            self._report(done, sum(sizes))
 
 
 def fuse_round(tasks: Sequence[Task], database: Database, executor: Executor | None = None) -> list[Fused]:

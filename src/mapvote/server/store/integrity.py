@@ -42,7 +42,7 @@ def check(
 
 
 def _database(connection: sa.Connection, store: Store) -> Iterator[Damage]:
-    """What the database itself says of its pages."""
+    """Damage that the database finds in its own pages."""
     if store.database.is_sqlite:
         for (said,) in connection.execute(sa.text("PRAGMA integrity_check(20)")).all():
             if said != "ok":
@@ -137,7 +137,7 @@ NOT_ITS_SUM = "is not what its sum says"
 
 @dataclass(frozen=True, slots=True)
 class Damage:
-    """One thing that is not as it was written."""
+    """One item that differs from what was written."""
 
     kind: str
     """One of KINDS."""
@@ -171,7 +171,7 @@ def set_aside(connection: sa.Connection) -> dict[tuple[str, str], str]:
 
 
 def quarantine(connection: sa.Connection, damaged: Iterable[Damage], now: int, by: str) -> None:
-    """Set aside what is not yet; each is named in the log."""
+    """Quarantine items that are not quarantined yet; each is named in the log."""
     known = set(set_aside(connection))
     for damage in damaged:
         if (damage.kind, damage.name) not in known:

@@ -87,12 +87,12 @@ def publish(
     gate: Gate | None = None,
     executor: Executor | None = None,
 ) -> Outcome:
-    """Fuse what stands, and publish it as the next version if anything changed.
+    """Fuse the standing ballots, and publish the next version if anything changed.
 
-    By the store's policy; ``settings`` take the place of its ``fuse``, in simulations of one round. ``parent``: publish
-    only if that is still the newest version. ``override``: in spite of the reasons to hold it. Raises Held with the
-    reasons, Conflict if somebody else published first, MapvoteError if the policy asks for a reference drive and there
-    is no ``gate`` to judge by it.
+    The store's policy applies; ``settings`` replace its ``fuse`` in simulations of one round. ``parent``: publish only
+    if this is still the newest version. ``override``: publish in spite of the reasons to hold the version. Raises Held
+    with the reasons, Conflict if another version was published first, MapvoteError if the policy names a reference
+    drive and there is no ``gate``.
     """
     now = store.clock()
     found = _round(store, now, settings, parent, executor)
@@ -155,7 +155,7 @@ def _log_copies(connection: sa.Connection, copies: Iterable[str], now: int, by: 
 def rollback(store: Store, to: int, *, by: str = "operator", reason: str = "") -> Version:
     """A new version that is ``to`` again. A change like any other: it spends the votes on every cell that turns back.
 
-    NotFound if there is no such version, Conflict if it is the newest or somebody publishes meanwhile.
+    NotFound if there is no such version, Conflict if it is the newest or another version is published meanwhile.
     """
     with store.database.reading() as connection:
         newest = current_version(connection)
@@ -177,7 +177,7 @@ def rollback(store: Store, to: int, *, by: str = "operator", reason: str = "") -
 
 
 def turned_back(version: int, now: Tile, then: Tile) -> Memory:
-    """What a tile remembers that is again as it was ``then``: cells that turn back forget what came and went since."""
+    """The memory of a tile that returns to its state ``then``: cells that return lose what they recorded since."""
     differ, none = np.flatnonzero(differing(now, then)), Memory.none()
     return (now.memory or none).but(differ, (then.memory or none).at(differ)).with_changed(differ, version)
 
@@ -200,7 +200,7 @@ class NewTiles:
     """A tile without points is one that the version does not have."""
     planes: Sequence[Mapping[str, bytes]]
     fused: Sequence[Fused] = field(default=(), repr=False)
-    """What was decided, also where nothing came of it."""
+    """All decided tiles, also those that do not change."""
 
 
 def write_version(store: Store, version: Version, new: NewTiles, unvoted: str | None = None) -> Version:

@@ -123,7 +123,7 @@ def tiles_set_between(connection: sa.Connection, old: int, new: int) -> list[Til
 def tiles_that_differ(
     connection: sa.Connection, old: int, new: int
 ) -> list[tuple[TileIndex, TileHashes | None, TileHashes | None]]:
-    """(index, as it was, as it is) of every tile whose points two versions do not share, ascending.
+    """(index, old hashes, new hashes) of every tile whose points differ between two versions, ascending.
 
     NotFound if one of the versions does not exist.
     """

@@ -2,9 +2,9 @@
 
 Starts from the version before its first vote and goes through every later version again, by the policy recorded in
 each and with the ballots that stood at its moment, without the vehicle. The result is published as one new version.
-Nothing is gone through again before the oldest version that is kept. A
-round that made no version because of the vehicle left no trace: the next publish makes up for it. A vote that was
-cast against a version speaks of the map that its vehicle had: it is not heard in cells that are otherwise now.
+Versions before the oldest one kept are not replayed. A round that made no version because of the vehicle left no
+record; the next publish decides its votes. A vote describes the version that its vehicle used: it does not count in
+cells that differ now.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ def replay(
 ) -> Outcome:
     """Take a vehicle's votes out of every version; with ``dry_run`` only say what would change.
 
-    NotFound if it never voted, Conflict if somebody publishes meanwhile.
+    NotFound if it never voted, Conflict if another version is published meanwhile.
     """
     history = store.versions()
     newest, number = history[-1], history[-1].number + 1

@@ -24,10 +24,10 @@ _AT_ONCE = 500
 
 @dataclass(frozen=True, slots=True)
 class Cleared:
-    """What went, or would go."""
+    """What was deleted, or would be."""
 
     oldest: int
-    """The oldest version that is left."""
+    """The oldest version that is kept."""
     versions: int
     planes: int
     decisions: int
@@ -38,7 +38,7 @@ class Cleared:
 
 
 def clear(store: Store, *, by: str = "operator", dry_run: bool = True) -> Cleared:
-    """Clear away what the policy does not keep, in one transaction; with ``dry_run`` only say what."""
+    """Delete what the policy does not keep, in one transaction; with ``dry_run`` only count it."""
     with store.database.reading() if dry_run else store.database.writing() as connection:
         oldest = _oldest_to_keep(connection)
         old_planes, old_ballots = _planes(connection, oldest), _ballots(connection, oldest)
@@ -81,8 +81,8 @@ def _decisions(connection: sa.Connection, oldest: int) -> list[Any]:
 
 
 def _ballots(connection: sa.Connection, oldest: int) -> list[Any]:
-    """Votes on a tile that no version after ``oldest`` has heard or can hear: withdrawn or replaced before it, or older
-    than every window since, counted from the newest vote on the tile that stood then and still does."""
+    """Votes on a tile that no version after ``oldest`` has counted or can count: withdrawn or replaced before it, or
+    older than every window since, counted from the newest vote on the tile that stood then and still does."""
     t, b, then = schema.ballot_tiles, schema.ballots, version_of(connection, oldest)
     newest = (
         sa.select(t.c.row, t.c.col, sa.func.max(b.c.end_ns).label("end_ns"))

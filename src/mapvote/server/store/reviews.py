@@ -32,7 +32,7 @@ class Review:
     by: str
     at_ns: int
     feature: Mapping[str, Any]
-    """The change as GeoJSON, as it was when it was decided."""
+    """The change as GeoJSON, in the state of its review."""
 
 
 def standing(store: Store) -> list[tuple[Review, dict[TileIndex, Bool]]]:

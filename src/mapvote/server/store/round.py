@@ -195,7 +195,7 @@ def _dirty(connection: sa.Connection, newest: Version, asked: Electorate) -> lis
 
 
 def _touched(connection: sa.Connection, mark: int, since: int) -> set[TileIndex]:
-    """Tiles on which votes, reviews or damage came or went after the event ``since``."""
+    """Tiles on which votes, reviews or damage were added or removed after the event ``since``."""
     return {*standing_tiles(connection, mark, since), *tiles_hurt_or_mended(connection, since)}
 
 

@@ -100,8 +100,8 @@ maps = sa.Table(
     sa.Column("surveyed_ns", sa.BigInteger),
     sum_over("map_id", "georeference", "secret", "surveyed_ns"),
 )
-"""``secret``: what vehicles' pseudonyms are made with; it never leaves the store. ``surveyed_ns``: when the last drive
-that the first version was made of ended; null where nobody knows."""
+"""``secret``: the key of vehicles' pseudonyms; it never leaves the store. ``surveyed_ns``: end of the last drive of
+which the first version was made; null if unknown."""
 
 policies = sa.Table(
     "policies",
@@ -177,9 +177,9 @@ version_tiles = sa.Table(
     sa.Column("fields", _Hash),
     sa.Index("ix_version_tiles_tile", "row", "col", "version"),
 )
-"""Only tiles that the version set; a tile that it does not name is as in its parent. Null points: no such tile.
-``memory``: for every cell the version of its last change, and what came and went; null: nothing ever did.
-``fields``: what its points carry besides (codec/fields.py); null: nothing."""
+"""Only tiles that the version sets; every other tile is that of its parent. Null points: the version has no such tile.
+``memory``: for every cell the version of its last change, and when objects were added and deleted; null: never.
+``fields``: further attributes of the points (codec/fields.py); null: none."""
 
 ballots = sa.Table(
     "ballots",
@@ -213,9 +213,9 @@ ballots = sa.Table(
     sa.Index("ix_ballots_drive", "vehicle", "drive"),
     sa.Index("ix_ballots_gone_seq", "gone_seq"),
 )
-"""``cast_by``: method and stage; ``bytes``: how large the ballot was when it came; ``version``: of
-the map that the vehicle drove with.
-``first_seq``: when this drive was first heard of; ``gone_seq``: the event that replaced or withdrew this ballot."""
+"""``cast_by``: method and stage; ``bytes``: size of the upload; ``version``: the version that the vehicle used.
+``first_seq``: the event with which this drive first arrived; ``gone_seq``: the event that replaced or withdrew this
+ballot."""
 
 ballot_tiles = sa.Table(
     "ballot_tiles",
@@ -260,9 +260,9 @@ decisions = sa.Table(
     sa.Column("standings", sa.LargeBinary, nullable=False),
     sum_over("states", "tally", "odds", "standings"),
 )
-"""The decision record (store/decisions.py). ``tally``: (5, 65536), compressed. ``odds``: how sure of the changed cells
-those are who voted for them, see :func:`mapvote.fusion.loss_budget.pack_agreed`; null: nobody says. ``standings``:
-which ballots counted, and why the others did not."""
+"""The decision record (store/decisions.py). ``tally``: (5, 65536), compressed. ``odds``: log-odds of the changed
+cells by the vehicles that voted for them, see :func:`mapvote.fusion.loss_budget.pack_agreed`; null: no vehicle sent
+any. ``standings``: which ballots counted, and why the others did not."""
 
 reviews = sa.Table(
     "reviews",
@@ -285,8 +285,8 @@ review_cells = sa.Table(
     sa.Column("cells", sa.LargeBinary, nullable=False),
     sum_over("row", "col", "review", "cells"),
 )
-"""The cells (65536 packed bits) that a review is about. Change votes on them count no more: of a rejected change those
-of drives first heard of before it was rejected, of a held one all, until it is let go."""
+"""The cells (65536 packed bits) of a reviewed change. Change votes on them do not count: for a rejected change votes of
+drives that first arrived before the rejection, for a held one all votes until the hold ends."""
 
 quarantine = sa.Table(
     "quarantine",

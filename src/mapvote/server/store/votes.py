@@ -131,8 +131,8 @@ def stored_votes(connection: sa.Connection, index: TileIndex, ballots: Collectio
 
 
 def standing_tiles(connection: sa.Connection, mark: int, since: int | None = None) -> list[TileIndex]:
-    """Tiles that standing ballots vote on, ascending; with ``since``, those where a ballot or a review came or went
-    after it."""
+    """Tiles that standing ballots vote on, ascending; with ``since``, those where a ballot or a review was added or
+    removed after it."""
     b, t = schema.ballots, schema.ballot_tiles
     if since is None:
         queries = [sa.select(t.c.row, t.c.col).distinct().join(b, b.c.seq == t.c.ballot).where(_stands_at(mark))]
@@ -166,8 +166,8 @@ def _judged(standing: Sequence[StoredVote], index: TileIndex, asked: Electorate)
 def electorate_now(
     connection: sa.Connection, now: int, mark: int = FOREVER, settings: FuseSettings | None = None
 ) -> Electorate:
-    """Whose votes count if somebody publishes at ``now``, by the newest policy, with ``settings`` in the place of its
-    ``fuse`` if given."""
+    """The votes that count in a publish at ``now``, by the newest policy; ``settings`` replace its ``fuse`` if
+    given."""
     policy = policy_in(connection)
     if settings is not None:
         policy = policy.model_copy(update={"fuse": settings})
@@ -248,14 +248,14 @@ def judged_on(
 
 
 def _cells_lost(before: TileVote, after: TileVote) -> I64:
-    """(n,) flat cells of which only the vote ``before`` speaks."""
+    """(n,) flat cells that the vote ``before`` determines and ``after`` does not."""
     if before is after:
         return np.empty(0, dtype=np.int64)
     return np.flatnonzero(before.spoken() != after.spoken())
 
 
 def _obedient(vote: TileVote, first_seq: int, bars: Sequence[tuple[int | None, Bool]]) -> TileVote:
-    """The vote without the cells of changes that reviewers held, or rejected after its drive was first heard of."""
+    """The vote without the cells of changes that reviewers held, or rejected after its drive first arrived."""
     for seq, cells in bars:
         if seq is None or first_seq < seq:
             vote = restrict(vote, ~cells)
@@ -327,8 +327,7 @@ class StoredVote:
 
 
 class Remembered:
-    """Votes as they were unpacked, by the sum of their rows; those not asked for longest go first. Threads may share
-    it."""
+    """A cache of unpacked votes, by the sum of their rows; the least recently used leave it first. Thread-safe."""
 
     def __init__(self, most_bytes: int) -> None:
         self.most_bytes, self.bytes = most_bytes, 0

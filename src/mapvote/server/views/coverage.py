@@ -51,7 +51,7 @@ def wanted_passes(store: Store) -> list[Stretch]:
 
 
 def _driven(connection: sa.Connection, store: Store) -> dict[str, list[F64]]:
-    """By vehicle: where each of its standing drives went, (n, 2) map metres."""
+    """By vehicle: the path of each of its standing drives, (n, 2) map metres."""
     b, p = schema.ballots.c, schema.paths.c
     query = sa.select(b.vehicle, p.path).join(schema.ballots, b.seq == p.ballot).where(b.gone_seq.is_(None))
     out = defaultdict[str, list[F64]](list)

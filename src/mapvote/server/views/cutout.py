@@ -117,7 +117,7 @@ def fragment(cutouts: Sequence[Cutout]) -> str:
 
 
 def whole_page(title: str, cutouts: Sequence[Cutout]) -> str:
-    """A file of its own."""
+    """One self-contained HTML file."""
     return (
         f'<!doctype html><html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width">'

@@ -120,7 +120,7 @@ def review(
 
 
 def verdict_of(review: Review) -> dict[str, Any]:
-    """A held or rejected change as GeoJSON, as it was when it was decided, with the verdict."""
+    """A held or rejected change as GeoJSON, in the state of its review, with the verdict."""
     properties = dict(review.feature["properties"]) | {"verdict": _told(review)}
     return dict(review.feature) | {"id": f"{_OF_REVIEW}{review.seq}", "properties": properties}
 

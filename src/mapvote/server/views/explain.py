@@ -99,17 +99,18 @@ class CellVote:
 
 @dataclass(frozen=True, slots=True)
 class CellStory:
-    """One cell: who says what now, and what was decided when."""
+    """One cell: every standing vote on it, and every decision about it."""
 
     row: int
     col: int
     votes: list[CellVote]
     decisions: list[CellDecision]
-    """Of every version that decided this cell."""
+    """One for each version that decided this cell."""
     probability: float | None
-    """That it changed as the last of them says (fusion/loss_budget.py); None if that one says of no change."""
+    """Probability that the cell changed as the last decision states (fusion/loss_budget.py); None if it states no
+    change."""
     thing: str
-    """What stands there, and whether something new is temporary; what came and went before."""
+    """Text: what stands in the cell, whether a new object is temporary, and how many earlier objects stood there."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,7 +122,7 @@ class _Now:
     asked: Electorate
     judged: Sequence[Judged]
     said: Mapping[int, TileVote]
-    """What each readable ballot says of the tile, by its ``seq``."""
+    """The vote of each readable ballot on the tile, by the ballot's ``seq``."""
     decided: Heard
     """What the next version would decide."""
 
@@ -155,7 +156,7 @@ def state_name(state: int) -> str:
 
 
 def said_by(vote: TileVote) -> U8:
-    """(256, 256) what a vote says of each cell: its states or, of one stage, what its tally alone decides. A tie is
+    """(256, 256) the state of each cell by one vote: its states or, in one stage, the decision of its tally. A tie is
     undetermined, as in every decision."""
     if vote.states is not None:
         return vote.states
@@ -297,7 +298,7 @@ def _probability(record: Record, cell: tuple[int, int]) -> float | None:
 
 
 def _thing(now: _Now) -> str:
-    """In words: what stands in the cell or is about to, and what came and went, by the votes that count there."""
+    """Text: what stands in the cell or will, and how many earlier objects stood there, by the votes that count."""
     tile, cell, fuse = now.tile, now.cell, now.asked.settings
     told = _waits(now)
     if tile.obstacle_words[cell]:
@@ -315,21 +316,19 @@ def _thing(now: _Now) -> str:
 
 
 def _waits(now: _Now) -> list[str]:
-    """What the votes say that does not come into the map yet, or not as they say."""
+    """Decisions that do not change the map yet, or change it otherwise than voted, with the reason."""
     found, cell, told = now.decided, now.cell, []
     if found.passing is not None and found.passing[cell]:
-        told.append("temporary: what is new here is not expected to stay, and stays out of the map")
+        told.append("temporary: a new object here is not expected to stay, so the map does not take it")
     elif found.denied is not None and found.denied[cell]:
         told.append("waits: the last vehicle that looked says otherwise")
     if found.edits[cell] != found.states[cell]:
-        told.append(
-            "unchanged: it holds the noise of what changed in the next cell, and its points come or go with that"
-        )
+        told.append("unchanged: the cell holds noise of a change in the next cell; its points follow that change")
     likely = found.pending.at(cell)
     if likely is not None:
         told.append(
-            f"pending: that emptying it deletes something that stands is likelier ({likely:.2g}) than the policy "
-            f"allows ({now.asked.settings.false_deletions:g}); it goes once vehicles that drive by are surer"
+            f"pending: the probability that emptying it deletes something that stands is {likely:.2g}, and the policy "
+            f"allows {now.asked.settings.false_deletions:g}; the cell is emptied once further votes lower it"
         )
     return told
 

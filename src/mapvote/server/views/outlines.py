@@ -104,7 +104,7 @@ WALL_CELLS = 10
 LEAST_SHARE = 0.2
 """Least share of the cells on either side of a cut: no wall is cut off its building."""
 _MOST_CUTS = 12
-"""Of a row of buildings each needs a cut of its own."""
+"""Each building of a row needs its own cut."""
 _DISK = np.hypot(*np.indices((SLOT_CELLS + 1, SLOT_CELLS + 1)) - SLOT_CELLS // 2) <= SLOT_CELLS / 2 + 0.25
 
 

@@ -1,4 +1,4 @@
-"""The 3D page's point clouds: a tile's points in levels of detail, overviews, what came and went, votes per cell.
+"""The 3D page's point clouds: a tile's points in levels of detail, overviews, points added and deleted, votes per cell.
 
 Any prefix of a tile's levels is an even, thinner picture of the tile. Each point belongs to the coarsest level in whose
 voxels it is the tile's first; within a level the order is random, and the same on every run. Levels are added to one
