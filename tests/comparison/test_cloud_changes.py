@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -48,6 +49,29 @@ def test_a_car_where_the_other_survey_has_no_ground_is_not_seen_by_it_rather_tha
     hidden = (np.abs(cloud[:, 0] + 17.8) < 4.0) & (np.abs(cloud[:, 1] + 16.1) < 3.0)
     found = compare(map_from_points(made_court()), map_from_points(cloud[~hidden]))
     assert set(at(found, -17.8, -16.1)) == {"not seen"}
+
+
+def knowing_free(point_map: PointMap, word: int) -> PointMap:
+    free = np.uint64(word)
+    return replace(
+        point_map, tiles={i: replace(t, free=free & ~t.obstacle_words) for i, t in point_map.tiles.items()}
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(("free", "kinds"), [(0x1FF, {"gone"}), (1 << 40, {"not seen"})])
+def test_where_a_map_knows_free_space_that_decides_and_its_ground_does_not(free: int, kinds: set[str]) -> None:
+    before, after = map_from_points(made_court()), map_from_points(made_court(CARS[1:], seed=2))
+    assert set(at(differences(compare_cells(before, knowing_free(after, free))), -17.8, -16.1)) == kinds
+
+
+def test_what_the_maps_own_rays_passed_below_hangs_or_moved_and_is_no_change() -> None:
+    rng = np.random.default_rng(5)
+    low, high = (-18.0, -16.0, 2.2), (-15.0, -14.5, 2.6)
+    hanging = rng.uniform(low, high, (600, 3)) - [0.0, 0.0, 0.25]
+    awning = map_from_points(np.concatenate([made_court(()), hanging]))
+    without = map_from_points(made_court((), seed=2))
+    assert at(differences(compare_cells(awning, without)), -16.5, -15.2) == ["gone"]
+    assert at(differences(compare_cells(knowing_free(awning, 0x1FF), without)), -16.5, -15.2) == []
 
 
 def test_the_page_holds_the_largest_and_the_footprints_are_closed_rings_in_metres() -> None:

@@ -11,7 +11,7 @@ from scipy.spatial import KDTree
 from made_courts import made_court
 from mapvote.comparison.merge import merge_maps
 from mapvote.core.geometry import from_xyz_rpy, inverse, transform
-from mapvote.core.point_map import SOURCES, PointMap, all_points, map_from_points
+from mapvote.core.point_map import SCANS, SOURCES, PointMap, all_points, map_from_points
 from mapvote.core.types import F64, MapvoteError
 
 
@@ -49,6 +49,28 @@ def test_free_space_of_every_map_comes_along_and_a_point_of_any_map_wins_over_it
     for tile in tiles:
         assert tile.free is not None
         assert not (tile.free & tile.obstacle_words).any()
+
+
+def test_noise_that_one_survey_hit_once_goes_when_the_other_passed_as_near_and_what_is_not_counted_stays() -> None:
+    path = np.column_stack([np.arange(-25.0, 30.0, 0.5), np.full(110, -2.0), np.full(110, 2.0)])
+    noise = np.array([[0.1, -6.0, 1.6], [5.2, -7.0, 1.9]])
+
+    def counted(cloud: F64, times: int) -> PointMap:
+        point_map = map_from_points(cloud)
+        tiles = {}
+        for index, tile in point_map.tiles.items():
+            scans = np.full(len(tile.points), 9, dtype=np.uint8)
+            scans[np.isin(tile.points_map[:, 2].astype(np.float32), noise[:, 2].astype(np.float32))] = times
+            tiles[index] = replace(tile, fields={SCANS: scans})
+        return replace(point_map, tiles=tiles, driven=(path,))
+
+    def left(times: int) -> int:
+        survey = counted(np.concatenate([made_court(()), noise]), times)
+        merged = merge_maps([survey, counted(made_court((), seed=2), times)]).point_map
+        return int((KDTree(all_points(merged)).query(noise)[0] < 0.15).sum())
+
+    assert left(times=1) == 0
+    assert left(times=0) == 2  # of an import: nobody counted
 
 
 def test_maps_that_contradict_each_other_are_refused_with_how_far_and_where() -> None:

@@ -2,7 +2,8 @@
 
 The paper's first map is made so ([9]: mapping, then merging of several maps). Every pair that overlaps gives one link
 of a pose graph over the maps. The first map stays where it is, unless all of them state one frame. Maps that contradict
-each other after that are refused.
+each other after that are refused. Built maps carry how many scans hit each voxel: noise is judged by the scans of all
+surveys together.
 """
 
 from __future__ import annotations
@@ -10,17 +11,20 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mapvote.comparison.patches import Patches
 from mapvote.comparison.register import Registered, register_clouds
 from mapvote.comparison.two_maps import with_free_space_of
 from mapvote.core.geometry import inverse, transform
 from mapvote.core.grid import Lattice
-from mapvote.core.point_map import SOURCES, PointMap, all_points, map_from_points
-from mapvote.core.types import F64, U64, MapvoteError
+from mapvote.core.point_map import SCANS, SOURCES, PointMap, all_fields, all_points, map_from_points
+from mapvote.core.types import F64, MapvoteError
 from mapvote.core.voxels import VoxelCloud, voxel_keys
+from mapvote.slam.clean_map import specks, strays
 from mapvote.slam.pose_graph import Anchors, Links, optimise
 from mapvote.slam.road_prior import road_under
 
@@ -134,21 +138,58 @@ def _laid(maps: Sequence[PointMap], clouds: Sequence[F64], T: F64) -> PointMap:
         lattice=first.lattice,
         georeference=first.georeference,
         road=np.concatenate(roads) if roads else None,
-        fields={SOURCES: _sources(points, moved, first.lattice)},
+        fields=_joint_fields(points, maps, moved, first.lattice),
     )
+    merged = _without_strays(merged, maps, T)
     ends = [one.surveyed_ns for one in maps]
     surveyed_ns = max(end for end in ends if end is not None) if all(end is not None for end in ends) else None
     merged = with_free_space_of(merged, maps, T)
     return replace(merged, driven=tuple(driven), surveyed_ns=surveyed_ns)
 
 
-def _sources(points: F64, moved: Sequence[F64], lattice: Lattice) -> U64:
-    """(n,) bit k of each point: map k has a point in its voxel. A mean lies in the voxel of what it is the mean of."""
+def _joint_fields(
+    points: F64, maps: Sequence[PointMap], moved: Sequence[F64], lattice: Lattice
+) -> dict[str, NDArray[Any]]:
+    """SOURCES and SCANS (n,) of the merged points, one a voxel. SOURCES has bit k set where map k has a point in the
+    voxel. SCANS is the sum over all maps; 0 if one of the points is not counted."""
     keys = voxel_keys(points, lattice.x0, lattice.y0)
-    out = np.zeros(len(points), dtype=np.uint64)
-    for k, cloud in enumerate(moved):
-        out |= np.isin(keys, voxel_keys(cloud, lattice.x0, lattice.y0)).astype(np.uint64) << np.uint64(k)
-    return out
+    order = np.argsort(keys)
+    sources, scans = np.zeros(len(points), dtype=np.uint64), np.zeros(len(points), dtype=np.int64)
+    uncounted = np.zeros(len(points), dtype=np.bool_)
+    for k, (one, cloud) in enumerate(zip(maps, moved, strict=True)):
+        wanted = voxel_keys(cloud, lattice.x0, lattice.y0)
+        at = order[np.minimum(np.searchsorted(keys, wanted, sorter=order), len(keys) - 1)]
+        there = keys[at] == wanted  # but where a mean was rounded into the next voxel
+        counts = all_fields(one).get(SCANS, np.zeros(len(cloud), dtype=np.uint8))
+        sources[at[there]] |= np.uint64(1) << np.uint64(k)
+        np.add.at(scans, at[there], counts[there])
+        uncounted[at[there & (counts == 0)]] = True
+    scans[uncounted] = 0
+    return {SOURCES: sources, SCANS: np.minimum(scans, 255).astype(np.uint8)}
+
+
+def _without_strays(merged: PointMap, maps: Sequence[PointMap], T: F64) -> PointMap:
+    """The map without the points that all counted surveys together show to be noise, as `build` drops them: one survey
+    hit them once, and the others passed as near and did not."""
+    driven = [
+        transform(T_first, path)
+        for one, T_first in zip(maps, T, strict=True)
+        if SCANS in one.field_names
+        for path in one.driven
+    ]
+    if not driven:
+        return merged
+    points, scans = all_points(merged), all_fields(merged)[SCANS].astype(np.int32)
+    indices = sorted(merged.tiles)
+    standing = np.concatenate([merged.tiles[index].columns[1] for index in indices])
+    asked = np.flatnonzero(standing & (scans > 0))
+    dropped = np.zeros(len(points), dtype=np.bool_)
+    dropped[asked] = strays(points[asked], scans[asked], np.concatenate(driven), merged.lattice)
+    left = np.flatnonzero(standing & ~dropped)
+    dropped[left] = specks(points[left], np.where(scans > 0, scans, 255)[left], merged.lattice)
+    ends = np.cumsum([len(merged.tiles[index].points) for index in indices])
+    parts = zip(indices, np.split(dropped, ends[:-1]), strict=True)
+    return replace(merged, tiles={index: merged.tiles[index].without(part) for index, part in parts})
 
 
 def _poses(path: F64) -> F64:

@@ -23,6 +23,9 @@ _CHUNK = 1_000_000
 
 SOURCES = "sources"
 """The field of a merged map's points: bit k of each is set where the k-th map has a point in its voxel."""
+SCANS = "scans"
+"""The field of a built map's points: how many scans hit each one's voxel, 255 for more; 0 for points that votes added.
+With it, `merge` judges strays by the scans of all surveys together."""
 
 
 @dataclass(frozen=True, slots=True, repr=False)

@@ -19,7 +19,7 @@ from mapvote.config import Settings
 from mapvote.core.columns import TOP_BIT, column_bits, rebased
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, tile_of_cells
 from mapvote.core.kernel import kernel
-from mapvote.core.point_map import PointMap, map_from_points
+from mapvote.core.point_map import SCANS, PointMap, map_from_points
 from mapvote.core.reference import LocalMap
 from mapvote.core.sensor_height import heights_over_ground
 from mapvote.core.tile import Tile
@@ -89,7 +89,8 @@ class Layer:
             dropped[left] |= trails(points[left], counts[left, 0] - counts[left, 1], height, lattice)
             left = np.flatnonzero(obstacle & ~dropped)
             dropped[left] |= specks(points[left], scans[left], lattice)
-        point_map = map_from_points(points[~dropped], lattice=lattice, road=self.road)
+        fields = {SCANS: np.minimum(scans[~dropped], 255).astype(np.uint8)}
+        point_map = map_from_points(points[~dropped], lattice=lattice, road=self.road, fields=fields)
         tiles = {tile: replace(content, free=self._free(content)) for tile, content in point_map.tiles.items()}
         return replace(point_map, tiles=tiles)
 

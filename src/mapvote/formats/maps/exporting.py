@@ -15,7 +15,7 @@ from mapvote.core.types import F64, U8, MapvoteError
 from mapvote.formats.geo.frame import MapFrame
 from mapvote.formats.geo.projector import PROJECTOR, autoware_frame, frame_of, frame_wanted
 from mapvote.formats.geo.units import settle
-from mapvote.formats.maps.cloud import GROUND, UNCLASSIFIED, Cloud, CloudPieces
+from mapvote.formats.maps.cloud import GROUND, KEPT, UNCLASSIFIED, Cloud, CloudPieces
 from mapvote.formats.registry import WRITERS
 
 Convert = Callable[[NDArray[np.floating]], NDArray[np.floating]]
@@ -68,12 +68,13 @@ def autoware_pieces(point_map: PointMap, folder: Path, projector: str | None) ->
 def _pieces(
     point_map: PointMap, frame: MapFrame, convert: Convert, offset: Offset = (0.0, 0.0, 0.0), *, classes: bool = False
 ) -> CloudPieces:
-    """One piece a tile, less ``offset``; ``classes``: with ASPRS classes where the map has none."""
+    """One piece a tile, less ``offset``; ``classes``: with ASPRS classes where the map has none. Fields that only
+    mapvote reads (scans, sources) stay behind."""
 
     def pieces() -> Iterator[Cloud]:
         for index in sorted(point_map.tiles):
             tile = point_map.tiles[index]
-            fields: dict[str, NDArray[Any]] = dict(tile.fields)
+            fields: dict[str, NDArray[Any]] = {name: tile.fields[name] for name in KEPT if name in tile.fields}
             if classes and "classification" not in fields:
                 fields["classification"] = ground_classes(tile)
             points = convert(tile.points_map)
