@@ -7,6 +7,7 @@ gaps they show ground behind a house. So the ground does not decide where free s
 
 Only what stands in the lowest 2.7 m is compared: crowns, wires and roofs are in range of one survey and out of range of
 the next. If rays of the same map passed below a point, that point does not stand: it hangs, or something moved there.
+A map that counts scans shows what walked by: few scans hit it.
 """
 
 from __future__ import annotations
@@ -23,9 +24,10 @@ from mapvote.comparison.patches import SIDE_M
 from mapvote.comparison.register import Registered
 from mapvote.core.columns import rebased
 from mapvote.core.geometry import transform
-from mapvote.core.grid import CELL_SIZE, Grid
-from mapvote.core.point_map import PointMap, all_points, has_open_ground
+from mapvote.core.grid import CELL_SIZE, CELLS, Grid
+from mapvote.core.point_map import SCANS, PointMap, all_points, has_open_ground
 from mapvote.core.reference import above_ground_points, reference_window
+from mapvote.core.tile import Tile
 from mapvote.core.types import F32, F64, I32, I64, U64, Bool, MapvoteError
 from mapvote.server.views.outlines import Ring, group, pieces, rings
 
@@ -40,6 +42,9 @@ _EXPLAINED_M = 0.45
 _VOXELS, _VOXELS_A_CELL, _VOXELS_ENOUGH = 4, 2, 80
 """Occupied voxels that an object of A cells must have: 4 + 2 A, or 80, much as new objects of a drive must.
 What is thinner, one point a cell, is the fringe of a survey or the trail of something that moved."""
+_WALKED_BY = 8.0
+"""Scans that hit a voxel (0.3 m) while a walker of 0.5 m passes it at 1 m/s, at 10 Hz. What stands in reach of a survey
+is hit by tens. An object whose cells were hit less often (median), in a map that counts scans, is not listed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,6 +91,8 @@ class CloudPlanes:
     """Column words known to be free; 0 where the map has none."""
     has_rays: Bool
     """The tile knows free space."""
+    scans: F64
+    """Mean of SCANS of the points above the ground in each cell; infinite where one of them is not counted."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,14 +125,30 @@ def planes_of(point_map: PointMap, window: Grid) -> CloudPlanes:
     low = here.occupied & BAND != 0
     free = np.zeros_like(here.occupied) if here.free is None else here.free
     has_rays = np.zeros(window.shape, dtype=np.bool_)
+    scans = np.full(window.shape, np.inf)
     for index in window.tiles():
         tile = point_map.tiles.get(index)
-        if tile is not None and tile.free is not None and tile.free.any():
-            has_rays[tile.window.intersection(window).slices_in(window)] = True
+        if tile is None:
+            continue
+        common = tile.window.intersection(window)
+        has_rays[common.slices_in(window)] = tile.free is not None and tile.free.any()
+        scans[common.slices_in(window)] = _mean_scans(tile)[common.slices_in(tile.window)]
     return CloudPlanes(
         here.ground_z, here.base, here.occupied, low, here.occupied != 0, here.top_z, here.counts.astype(np.float64),
-        own, beside, free, has_rays,
+        own, beside, free, has_rays, scans,
     )  # fmt: skip
+
+
+def _mean_scans(tile: Tile) -> F64:
+    """(256, 256) ``CloudPlanes.scans`` of a tile."""
+    if SCANS not in tile.fields:
+        return np.full(tile.window.shape, np.inf)
+    counts = tile.fields[SCANS].astype(np.float64)
+    standing = tile.columns[1]
+    weights = np.where(counts > 0, counts, np.inf)[standing]
+    number = np.bincount(tile.cells[standing], minlength=CELLS)
+    total = np.bincount(tile.cells[standing], weights=weights, minlength=CELLS)
+    return np.asarray((total / np.maximum(number, 1)).reshape(tile.window.shape))
 
 
 def _ground_points(point_map: PointMap, window: Grid) -> Bool:
@@ -274,6 +297,8 @@ def _objects(
         r, c = rows[mine], cols[mine]
         voxels = int(np.bitwise_count(owner.words[r, c]).sum())
         if kind != "not seen" and voxels < min(_VOXELS + _VOXELS_A_CELL * len(mine), _VOXELS_ENOUGH):
+            continue
+        if kind != "not seen" and np.median(owner.scans[r, c]) < _WALKED_BY:
             continue
         points = int(owner.counts[r, c].sum())
         out.append(

@@ -11,7 +11,7 @@ from mapvote.comparison.register import Registered, register_clouds
 from mapvote.core.columns import TOP_BIT
 from mapvote.core.geometry import inverse, rotation_angle, transform
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, tile_of_cells
-from mapvote.core.point_map import PointMap, all_points, map_from_points
+from mapvote.core.point_map import PointMap, all_fields, all_points, map_from_points
 from mapvote.core.types import F64, Bool
 
 _SAME_M, _SAME_DEG = 0.05, 0.1
@@ -29,7 +29,8 @@ def brought_into(map_a: PointMap, map_b: PointMap, *, unbend: bool = False) -> t
     registered = register_clouds(points_a, points_b, unbend=unbend)
     if map_a.lattice == map_b.lattice and not registered.unbent and _is_in_place(registered.T_a_b, points_b):
         return map_b, registered
-    moved = map_from_points(registered.points, lattice=map_a.lattice, map_id=map_b.map_id)
+    fields = all_fields(map_b)
+    moved = map_from_points(registered.points, lattice=map_a.lattice, map_id=map_b.map_id, fields=fields)
     return moved if registered.unbent else with_free_space_of(moved, [map_b], registered.T_a_b[None]), registered
 
 
