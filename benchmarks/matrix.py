@@ -23,9 +23,8 @@ from mapvote.codec.ballot import Ballot
 from mapvote.config import cache_folder, load_settings
 from mapvote.core.point_map import PointMap
 from mapvote.formats.atomic import whole_file
-from mapvote_lab.evaluation.experiments.attacks import ATTACKS
 from mapvote_lab.evaluation.experiments.cases import Case, choose_cases, fuse_case
-from mapvote_lab.evaluation.experiments.conditions import Conditions
+from mapvote_lab.evaluation.experiments.conditions import ATTACKS, Conditions
 from mapvote_lab.evaluation.experiments.scene import Pass, Scene, have_voted, passes
 from mapvote_lab.evaluation.reporting.tables import Sheet
 from mapvote_lab.evaluation.results import Judgement, to_json

@@ -191,7 +191,7 @@ def _evaluate_real(
 
     from mapvote.config import load_settings
     from mapvote_lab.evaluation.experiments.cases import choose_cases
-    from mapvote_lab.evaluation.experiments.real.bench import bench
+    from mapvote_lab.evaluation.experiments.real_bench import bench
     from mapvote_lab.evaluation.reporting.real_report import as_markdown, draw_worst, real_tables
     from mapvote_lab.evaluation.reporting.tables import write_text
     from mapvote_lab.evaluation.results import to_json

@@ -16,18 +16,22 @@ import scipy
 from mapvote.core.types import F64, I64, Drive
 from mapvote.doctor.finding import Finding, Severity
 from mapvote.doctor.motion import LEAST_FIT, Road, Run
-from mapvote.doctor.prior import AS_IT_IS, READINGS, Reading, drift_angle_deg, scaled
-from mapvote.doctor.prior_numbers import (
+from mapvote.doctor.prior import (
+    AS_IT_IS,
     LEAST,
     LEVER_M,
     LIKELY,
+    READINGS,
     SURE,
     Measured,
+    Reading,
     at_times,
+    drift_angle_deg,
     measure_scale,
     measure_time,
     measure_turn,
     misfits,
+    scaled,
 )
 from mapvote.doctor.similarity import fit_similarity
 

@@ -31,9 +31,9 @@ from mapvote.slam.build import build_map
 from mapvote.warmup import compile_for_maps, compile_for_votes
 from mapvote_lab.evaluation.demo_report import CASE, Story, draw_scans, report_page, tell
 from mapvote_lab.evaluation.evaluate import Evaluation, evaluate, vote_by_http
+from mapvote_lab.evaluation.experiments import real_bench
 from mapvote_lab.evaluation.experiments.cases import choose_cases
-from mapvote_lab.evaluation.experiments.real import bench
-from mapvote_lab.evaluation.experiments.real.street import RealRun, Street, lay_street
+from mapvote_lab.evaluation.experiments.real_street import RealRun, Street, lay_street
 from mapvote_lab.evaluation.experiments.scene import Progress, Scene
 from mapvote_lab.evaluation.reporting import figures
 from mapvote_lab.evaluation.reporting.gallery import gallery
@@ -73,9 +73,9 @@ def demo_drive(folder: Path, out: Path, progress: Progress, show: Callable[[Path
     write_map(street.point_map, out / "map")
     progress("mapping", 2, 2)
     progress("voting", 0, 1)
-    run, asked, things = bench.new_things(street, bench.survey_site(street), cases, SEED, EACH)
+    run, asked, things = real_bench.new_things(street, real_bench.survey_site(street), cases, SEED, EACH)
     progress("voting", 1, 1)
-    found = bench.score(asked, run.states[CASE])
+    found = real_bench.score(asked, run.states[CASE])
     pictures = [
         (scan, "One scan of the drive, coloured by height."),
         (out / "pictures" / "street.png", "The map. Red: returns of new bodies in cells that the vote calls changed "

@@ -13,7 +13,7 @@ from mapvote.config import FuseSettings
 from mapvote.core.point_map import PointMap
 from mapvote.core.types import NO_VOTE, CellState
 from mapvote.fusion.offline import update_map
-from mapvote_lab.evaluation.experiments.attacks import (
+from mapvote_lab.evaluation.experiments.conditions import (
     ATTACKS,
     SHIFT_CELLS,
     all_changed,

@@ -9,7 +9,7 @@ import numpy as np
 
 from mapvote.core.grid import Grid, Lattice
 from mapvote.core.types import CellState
-from mapvote_lab.evaluation.experiments.real.bench import (
+from mapvote_lab.evaluation.experiments.real_bench import (
     BUILT,
     BUILT_IN_RAIN,
     DEMOLISHED,

@@ -25,12 +25,11 @@ from mapvote.server.http import (
     pages,
     vehicle_routes,
 )
-from mapvote.server.http.auth import Guard
 from mapvote.server.http.event_routes import deliver
 from mapvote.server.http.health_routes import Probe
 from mapvote.server.http.limits import READING
 from mapvote.server.http.schemas import unreadable
-from mapvote.server.http.security import Hosts, Watch
+from mapvote.server.http.security import Guard, Hosts, Watch
 from mapvote.server.http.services import Services, make_services
 from mapvote.server.store.round import Gate
 from mapvote.server.store.store import Store

@@ -14,9 +14,9 @@ from mapvote.codec.ballot import tile_key
 from mapvote.codec.manifest import TileHashes
 from mapvote.core.tile import Tile
 from mapvote.server.http.answers import DeskAnswer, Pending, VerdictGiven
-from mapvote.server.http.auth import reviewer
 from mapvote.server.http.cloud_routes import AS_BYTES, packed
 from mapvote.server.http.schemas import AS_CSV, PLAIN, Places, as_json, as_table, problems
+from mapvote.server.http.security import reviewer
 from mapvote.server.http.services import services
 from mapvote.server.store.reviews import undo
 from mapvote.server.views.desk import Desk, desk, review, verdict_of

@@ -19,8 +19,8 @@ from fastapi.responses import StreamingResponse
 from standardwebhooks import Webhook
 
 from mapvote.server.errors import Unavailable
-from mapvote.server.http.auth import sees_names
 from mapvote.server.http.schemas import problems
+from mapvote.server.http.security import sees_names
 from mapvote.server.http.services import Services, services
 from mapvote.server.views.events import Event, newest_event, take, taken_up_to, without_names
 

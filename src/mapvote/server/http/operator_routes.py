@@ -32,7 +32,6 @@ from mapvote.server.http.answers import (
     Vehicles,
 )
 from mapvote.server.http.answers import Places as PlacesAnswer
-from mapvote.server.http.auth import operator, reviewer, sees_names
 from mapvote.server.http.schemas import (
     AS_CSV,
     PLAIN,
@@ -47,6 +46,7 @@ from mapvote.server.http.schemas import (
     iso,
     problems,
 )
+from mapvote.server.http.security import operator, reviewer, sees_names
 from mapvote.server.http.services import Services, services
 from mapvote.server.store.integrity import check
 from mapvote.server.store.keys import pseudonyms

@@ -17,8 +17,8 @@ from fastapi.routing import APIRoute
 from mapvote.codec.arrays import unpack_bytes
 from mapvote.codec.tile_planes import MAX_PLANE_BYTES
 from mapvote.server.http.answers import ManifestAnswer, Stored, Versions, Withdrawn
-from mapvote.server.http.auth import own
 from mapvote.server.http.schemas import AS_CSV, Name, Number, Table, VersionQuery, as_json, as_table, iso, problems
+from mapvote.server.http.security import own
 from mapvote.server.http.services import services
 from mapvote.server.store.admission import Sent, sound
 from mapvote.server.store.ballots import withdraw

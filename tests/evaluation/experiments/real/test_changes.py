@@ -6,7 +6,7 @@ import numpy as np
 
 from mapvote.core.grid import Grid, Lattice
 from mapvote.core.types import Bool, CellState
-from mapvote_lab.evaluation.experiments.real.bench import Asked, precision_near, score
+from mapvote_lab.evaluation.experiments.real_bench import Asked, precision_near, score
 
 GRID = Grid(Lattice(), 0, 0, 40, 40)
 

@@ -8,9 +8,8 @@ import pytest
 from mapvote.config import Settings
 from mapvote.core.types import MapvoteError
 from mapvote_lab.evaluation.experiments.cases import choose_cases
-from mapvote_lab.evaluation.experiments.real.bench import built, ground_of, score, survey_site
-from mapvote_lab.evaluation.experiments.real.sensing import disturbed, every_other_beam
-from mapvote_lab.evaluation.experiments.real.street import (
+from mapvote_lab.evaluation.experiments.real_bench import built, ground_of, score, survey_site
+from mapvote_lab.evaluation.experiments.real_street import (
     Edit,
     Street,
     lay_street,
@@ -19,6 +18,7 @@ from mapvote_lab.evaluation.experiments.real.street import (
     unedited,
     vote_on,
 )
+from mapvote_lab.evaluation.experiments.sensing import disturbed, every_other_beam
 
 KITTI = Path(__file__).parents[4] / "../shared/data/kitti/2011_09_26_0001"
 needs_kitti = pytest.mark.skipif(not KITTI.is_dir(), reason="the KITTI scans are not at ../shared/data (licence)")

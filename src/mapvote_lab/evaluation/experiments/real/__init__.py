@@ -1,1 +1,0 @@
-"""Anyone's recorded drive as a bench: a street that did not change, and changes cast into its scans."""
