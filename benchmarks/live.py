@@ -229,10 +229,8 @@ def play_and_drive(drive: str, map_path: str, rate: float, sensor: str, core: st
     home = Path(tempfile.mkdtemp())
     os.environ |= {"CYCLONEDDS_URI": LOOPBACK, "XDG_CACHE_HOME": str(home)}
     domain = domain_of("play")
-    player = subprocess.Popen(
-        mapvote("play", drive, "--rate", rate, "--domain", domain), stdout=subprocess.DEVNULL, start_new_session=True
-    )
-    options = ["--map", map_path, "--out", home, "--vehicle", "car", "--sensor", sensor, "--idle", 5]
+    player = subprocess.Popen(mapvote("play", drive, "--rate", rate, "--domain", domain), stdout=subprocess.DEVNULL)
+    options = ["--map", map_path, "--out", home, "--vehicle", "car", "--sensor", sensor, "--idle", 20]
     before = os.times()
     command = (["taskset", "-c", core] if core else []) + mapvote("drive", *options, "--domain", domain)
     result = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True)

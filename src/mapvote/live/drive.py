@@ -1,4 +1,4 @@
-"""A vehicle that votes while it drives: scans and poses go in as they come, ballots leave as they are closed."""
+"""A vehicle that votes while it drives: it takes scans and poses as they arrive and gives ballots as they close."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ written one at a time, a crash costs less than 30 s of road."""
 _BACK_NS, _AHEAD_NS = 10**9, 3600 * 10**9
 """A stamp so much before the last one, or after it: the clock has jumped."""
 _JUMPED = 3
-"""Scans in turn that say so: one alone is late, or damaged."""
+"""So many scans in turn make a jump. A single one is late or damaged."""
 KEPT_M = 300.0
 """Tiles that touch a square reaching so far stay in memory; with those farther away their columns and words go, too."""
 _MOVED_M = 30.0
@@ -51,7 +51,7 @@ _LATENCIES = 6000
 
 
 class Waiting(NamedTuple):
-    """A scan that came."""
+    """A scan that arrived."""
 
     stamp_ns: int
     sent_ns: int
@@ -71,7 +71,7 @@ class Fixed(NamedTuple):
 
 
 class Maps(Protocol):
-    """Where a live vehicle has its map from."""
+    """The source of a live vehicle's map."""
 
     def current(self) -> PointMap:
         """The newest version there is: the next ballot holds to it."""
@@ -82,7 +82,7 @@ class Maps(Protocol):
 
 
 class OneMap:
-    """A map from a file or a store: all of it is here, and no other version comes."""
+    """A map from a file or a store: all of it is here, and it has one version."""
 
     def __init__(self, point_map: PointMap) -> None:
         self._tiles = point_map.tiles if isinstance(point_map.tiles, LazyTiles) else _copied(point_map.tiles)
@@ -94,7 +94,7 @@ class OneMap:
         return self._point_map
 
     def covers(self, position: F64 | None) -> bool:
-        """See :class:`Maps`. What tiles far from there have worked out is let go."""
+        """See :class:`Maps`. Frees what was computed from tiles far from there."""
         if position is not None and has_moved(position, self._position):
             self._position = position
             self._tiles.keep_only(tiles_within(self._point_map, position, KEPT_M))
@@ -113,7 +113,7 @@ def has_moved(position: F64, since: F64 | None) -> bool:
 
 @dataclass(slots=True)
 class Counts:
-    """What became of the scans that came."""
+    """The outcome of every scan that arrived."""
 
     scans: int = 0
     observed: int = 0
@@ -122,9 +122,9 @@ class Counts:
     lost: int = 0
     """Scans without a sure place: they cast no vote."""
     left_out: int = 0
-    """For want of time."""
+    """Because the computer was too slow."""
     missing: int = 0
-    """Scans that never came, by the holes between the stamps of others."""
+    """Scans that never arrived: counted from the gaps between stamps."""
     unusable: int = 0
     """Damaged, or without a usable point."""
     late: int = 0
@@ -136,7 +136,7 @@ class Counts:
     clock_jumps: int = 0
     ballots: int = 0
     latencies_s: deque[float] = field(default_factory=lambda: deque(maxlen=_LATENCIES))
-    """From stamp to vote, of the last scans that voted while the drive went on: the last second votes when it ends."""
+    """From stamp to vote, of the last scans that voted during the drive. Those of its last second vote at its end."""
 
     def latency_quantiles_s(self, *shares: float) -> list[float]:
         """The latencies that these shares of the last scans do not exceed; empty without any."""
@@ -155,7 +155,7 @@ class Thinning:
         self._cost_s += 0.1 * (seconds - self._cost_s)
 
     def admits(self, came_s: float, waiting: int) -> bool:
-        """Whether the scan that came at ``came_s``, by any clock, shall vote while ``waiting`` others wait."""
+        """Whether the scan that arrived at ``came_s``, of any clock, shall vote while ``waiting`` others wait."""
         self._period_s += 0.1 * (np.clip(came_s - self._came_s, 0.0, 1.0) - self._period_s)
         self._came_s = came_s
         if self._crowded != (waiting > (_RELAXED if self._crowded else _CROWDED)):
@@ -198,15 +198,15 @@ class LiveDrive:
         self._observed = deque[tuple[int, int]]()
         """Stamp and time of sending of the scans that are observed but not done."""
         self.fixes: deque[Fixed] = deque(maxlen=_FIXES)
-        """Of the scans that voted last; whoever publishes them takes them out."""
+        """Of the scans that voted last. Whoever publishes a fix removes it."""
         self._touched: dict[TileIndex, float] = {}
         """Tiles with votes that are not in the journal, and since when."""
         self._thinning, self._last_ns, self._odd_stamps, self._finished = Thinning(), -1, 0, 0
         self._period_ns = 0
-        """Between scans, by the shortest step of late."""
+        """Between scans: the shortest recent step."""
         self._first, self._held = first, list[tuple[str, Callable[[], Ballot], str | None]]()
         self.checked_now = False
-        """Whether the first seconds are over, and nobody asked for what they show."""
+        """Whether the first seconds are over and their findings were not asked for."""
 
     @property
     def drive_id(self) -> str:
@@ -215,23 +215,23 @@ class LiveDrive:
 
     @property
     def unchecked(self) -> bool:
-        """Whether :meth:`first_findings` has something to say yet."""
+        """Whether :meth:`first_findings` was not asked yet."""
         return self._first is not None
 
     @property
     def waiting(self) -> int:
-        """Scans that came and were not observed yet."""
+        """Scans that arrived and were not observed yet."""
         return len(self._waiting)
 
     def on_pose(self, time_ns: int, T_map_base: F64) -> None:
-        """One pose of odometry in the map's frame; it may come in any order."""
+        """One pose of odometry in the map's frame, in any order."""
         if self._poses and time_ns < self._poses[-1][0] - _BACK_NS:
             log.warning("odometry's clock jumped back by %.1f s", 1e-9 * (self._poses[-1][0] - time_ns))
             self._poses.clear()
         self._poses.append((time_ns, T_map_base))
 
     def on_scan(self, scan: Waiting) -> None:
-        """One scan as it comes. One that is not later than the last is left out, as are some if too many wait."""
+        """One scan, as it arrives. It is left out if it is not later than the last one, or if too many wait."""
         self.counts.scans += 1
         step_ns = scan.stamp_ns - self._last_ns
         if self._last_ns >= 0 and (step_ns < -_BACK_NS or step_ns > _AHEAD_NS):
@@ -255,7 +255,7 @@ class LiveDrive:
             self.counts.left_out += 1
 
     def _jump(self, step_ns: int) -> None:
-        """The clock jumped: what was measured by the old one votes, its ballot is closed, and a new track begins."""
+        """The clock jumped. The scans before the jump vote, their ballot is closed, and a new track begins."""
         self.counts.clock_jumps += 1
         log.warning("the sensor's clock jumped by %.1f s: a new ballot begins", 1e-9 * step_ns)
         while self.step(ended=True):
@@ -289,7 +289,7 @@ class LiveDrive:
         return True
 
     def finish(self) -> None:
-        """The drive has ended: what waits votes, and the last ballot leaves."""
+        """The drive has ended: the scans that wait vote, and the last ballot leaves."""
         while self.step(ended=True):
             pass
         if self.vehicle is not None:
@@ -300,8 +300,8 @@ class LiveDrive:
             self._release()
 
     def first_findings(self) -> list[Finding]:
-        """What the first seconds show; with the answer, ballots that wait for it leave. Empty if it was asked before,
-        or nothing was observed."""
+        """The findings of the first seconds. Ballots that waited for them leave, unless one is an error. Empty if it
+        was asked before, or nothing was observed."""
         first, self._first, self.checked_now = self._first, None, False
         if first is None or self.vehicle is None:
             return []
@@ -316,7 +316,7 @@ class LiveDrive:
         self._held.clear()
 
     def discard(self) -> None:
-        """The drive is useless: nothing of it leaves, and nothing is kept."""
+        """The drive is useless: no ballot of it leaves, and its journal is deleted."""
         self.vehicle = None
         self._held.clear()
         for number in range(1, self.number + 1):

@@ -1,4 +1,4 @@
-"""The doctor's checks on the first ten seconds of a live drive: nothing leaves the vehicle before they are done."""
+"""The doctor's checks on the first ten seconds of a live drive: no ballot leaves the vehicle before they are done."""
 
 from __future__ import annotations
 

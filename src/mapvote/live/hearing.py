@@ -1,4 +1,4 @@
-"""What one vehicle hears on DDS: clouds of its LiDARs joined to scans, poses of its odometry, its fixed frames."""
+"""The input of one vehicle from DDS: clouds of its LiDARs joined to scans, poses of odometry, fixed frames."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ log = logging.getLogger("mapvote.live")
 _SWEEP = 0.55
 """Revolutions within which the clouds of several LiDARs are one scan, as in a recorded drive."""
 _REVISIT_S = 2.0
-"""How often it is looked whether writers came or went."""
+"""Between two checks whether writers have changed."""
 _DEPTH = 200
 """Messages that wait in DDS at most: while the process stands still for 20 s none is lost."""
 _MEASURED = 10
@@ -95,7 +95,7 @@ def matrix_of(position: Any, orientation: Any) -> F64:
 
 @dataclass(frozen=True, slots=True)
 class Cloud:
-    """A PointCloud2 as it came."""
+    """A PointCloud2 in CDR."""
 
     lidar: int
     stamp_ns: int
@@ -104,13 +104,13 @@ class Cloud:
 
 
 class Sweeps:
-    """Clouds of several LiDARs joined to scans: what they took within half a revolution."""
+    """Joins the clouds that several LiDARs measure within half a revolution to one scan."""
 
     def __init__(self, lidars: int) -> None:
         self._lidars, self._reach_ns = lidars, 0.55e8
         self._open: list[Cloud] = []
         self._firsts: deque[int] = deque(maxlen=20)
-        """Stamps of the first LiDAR: they tell its period."""
+        """Stamps of the first LiDAR, which give its period."""
 
     def add(self, clouds: Iterable[Cloud]) -> list[list[Cloud]]:
         """Clouds that arrived together, in any order. Returns the scans that are whole by now, each in order of
@@ -152,7 +152,7 @@ class Clocks:
         """(time of sending, stamp) of the last poses, nanoseconds."""
         self._arrived_s = -np.inf
         self.apart_ns = 0
-        """Stamp of a pose less that of the last cloud with which it came."""
+        """Stamp of a pose minus that of the last cloud which arrived with it."""
 
     def pose(self, sent_ns: int, stamp_ns: int, now_s: float) -> None:
         """A pose arrived at ``now_s`` of any steady clock."""
@@ -160,7 +160,7 @@ class Clocks:
         self._arrived_s = now_s
 
     def cloud(self, sent_ns: int, stamp_ns: int, now_s: float) -> None:
-        """A cloud arrived. Where no pose comes with it, as when odometry has ended, nothing is learnt."""
+        """A cloud arrived. Without a pose of the same time, as after the end of odometry, it has no effect."""
         if not self._poses:
             return
         near = min(bisect_left(self._poses, (sent_ns, 0)), len(self._poses) - 1)
@@ -182,16 +182,16 @@ class Clocks:
 
 
 class Hearing:
-    """The topics of one vehicle, read as they come. Writers may come, go and change what they offer."""
+    """The topics of one vehicle. Writers may appear, vanish and change their quality of service."""
 
     def __init__(self, network: Network, chosen: Chosen, sensor: Sensor | None) -> None:
         """``sensor``: of the first LiDAR; None: it is measured in the first scans."""
         self.network, self.chosen, self.sensor = network, chosen, sensor
         self.sensor_told = "stated" if sensor is not None else ""
         self.frames: list[str] = [""] * len(chosen.points)
-        """Of each LiDAR, as its clouds say."""
+        """The frame of each LiDAR, from its clouds."""
         self.base_frame, self.map_frame = "", ""
-        """What odometry tracks, and in which frame."""
+        """The frame that odometry tracks, and its parent."""
         self.clocks = Clocks()
         self.clouds = self.unusable = 0
         """Clouds that arrived; messages of any topic that cannot be used."""
@@ -213,7 +213,7 @@ class Hearing:
         return self._lost + sum(s.lost for s in self._points)
 
     def poses(self) -> list[tuple[int, F64]]:
-        """Odometry that came: stamps, and T_map_base."""
+        """Poses of odometry that arrived: stamps, and T_map_base."""
         out = []
         for sent_ns, data in [] if self._odometry is None else self._odometry.take_sent():
             with self._some_unusable(ODOMETRY):
@@ -229,7 +229,7 @@ class Hearing:
 
     @contextmanager
     def _some_unusable(self, kind: str) -> Iterator[None]:
-        """A message that cannot be used is left out; the 1st, 2nd, 4th, 8th ... is said."""
+        """Leaves out a message that cannot be used; logs the 1st, 2nd, 4th, 8th ..."""
         try:
             yield
         except MapvoteError as error:
@@ -238,7 +238,7 @@ class Hearing:
                 log.warning("%s is left out: %s (%d messages so far)", kind, error, self.unusable)
 
     def scans(self) -> list[list[Cloud]]:
-        """Clouds that came, joined to scans."""
+        """Clouds that arrived, joined to scans."""
         self._take_frames()
         clouds: list[Cloud] = []
         for lidar, subscription in enumerate(self._points):

@@ -1,4 +1,4 @@
-"""Ballots of a drive that goes on, on disk: the open one as a journal, closed ones until the server has them.
+"""Ballots of a live drive on disk: the open one as a journal, closed ones until the server has them.
 
 STATE/VEHICLE holds, of each ballot ``NAME-003`` of a vehicle, one of
 
@@ -97,12 +97,12 @@ def ballot_of(path: Path) -> Ballot | None:
 
 @dataclass(slots=True)
 class OutboxReport:
-    """What became of ballots and records since the start."""
+    """Outcomes of ballots and records since the start."""
 
     closed: int = 0
     """Ballots that are whole and on disk."""
     empty: int = 0
-    """Stretches of which no scan was localised: they say nothing."""
+    """Stretches without a localised scan: they have no ballot."""
     sent: int = 0
     refused: int = 0
     recovered: int = 0
@@ -192,7 +192,7 @@ class Outbox:
         self._work.put(lambda: self._close(drive, written, following))
 
     def discard(self, drive: str) -> None:
-        """Nothing of this ballot is wanted. Returns at once."""
+        """Delete the journal of this ballot. Returns at once."""
         self._work.put(lambda: self._drop(drive))
 
     def _raise_if_broken(self) -> None:
@@ -283,7 +283,7 @@ class Outbox:
         self._path(drive, "journal").unlink(missing_ok=True)
 
     def _pass_on(self) -> None:
-        """Whole ballots go where they are wanted. At every moment a file has each; one that goes twice is the same."""
+        """Move whole ballots to the folder and the spool. Each is in a file at every moment; moving twice is harmless."""
         for whole in sorted(self._state.glob("*.ballot")):
             with self._disk_may_fail():
                 data = whole.read_bytes()
@@ -313,7 +313,7 @@ class Outbox:
 
     @contextmanager
     def _disk_may_fail(self) -> Iterator[None]:
-        """A disk that takes nothing now is said once, and again when it takes something."""
+        """Reports once that the disk cannot be written, and once that it can be again."""
         try:
             yield
         except (MapvoteError, OSError) as error:

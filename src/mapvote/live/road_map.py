@@ -20,8 +20,8 @@ from mapvote.live.drive import KEPT_M, has_moved
 
 log = logging.getLogger("mapvote.live")
 AHEAD_M, NEEDED_M = KEPT_M, 160.0
-"""Tiles that touch a square reaching so far are asked for; and without those this near no scan is used. What a vehicle
-has laid out around it reaches two tiles, 154 m."""
+"""Tiles that touch a square reaching so far are asked for; and without those this near no scan is used. The local
+map of a vehicle reaches two tiles, 154 m."""
 _POLL_S = 60.0
 """Between two questions for the newest version where events do not come."""
 _RETRY_S = 5.0
@@ -84,7 +84,7 @@ class RoadMap:
         self._wake, self._refresh, self._ended = threading.Event(), threading.Event(), threading.Event()
         self._asked_s = -np.inf
         self.events = False
-        """Whether the server's events are heard."""
+        """Whether the server's events arrive."""
         self.away = ""
         """Why the server gives no tiles now; "" while it does."""
         try:

@@ -1,4 +1,4 @@
-"""A live vehicle as a service: it finds its topics, votes until it is stopped, and says how it goes."""
+"""A live vehicle as a service: it waits for sensor and frames, votes until it is stopped, and reports its status."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ _LOOP_S = 0.05
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """What is asked of a live drive."""
+    """The settings of a live drive."""
 
     vehicle: str
     name: str
     settings: Settings
     cuts: Cuts = field(default_factory=Cuts)
     T_base_lidar: F64 | None = None
-    """(4, 4) the first LiDAR on what odometry tracks; None: as /tf_static says."""
+    """(4, 4) the first LiDAR on what odometry tracks; None: from /tf_static."""
     idle_s: float = 0.0
     """End after so long without a cloud; 0: never."""
     checked: bool = True
@@ -41,11 +41,11 @@ class Plan:
 
 
 Watcher = Callable[["LiveDrive", Hearing], None]
-"""Told some times a second how the drive goes."""
+"""Called some times a second with the state of the drive."""
 
 
 def prepare(hearing: Hearing, plan: Plan, ended: Callable[[], bool]) -> tuple[list[list[Cloud]], list[tuple[int, F64]]]:
-    """Listen until the sensor is known, and where the LiDARs are: the scans and the poses that came meanwhile.
+    """Read topics until the sensor and the mounts are known. Returns the scans and poses that arrived meanwhile.
 
     MapvoteError if /tf_static does not say where they are.
     """
@@ -89,8 +89,8 @@ def run(
     ended: Callable[[], bool],
     watchers: Sequence[Watcher] = (),
 ) -> LiveDrive | None:
-    """Vote until ``ended``, or nothing came for the idle time; returns the drive, whose last ballot has left. None if
-    it ended before a cloud came. MapvoteError if the first seconds show an error: then nothing leaves."""
+    """Vote until ``ended``, or until no cloud arrived for the idle time. Returns the drive, whose last ballot has left.
+    None if it ended before a cloud arrived. MapvoteError if the first seconds show an error: then nothing leaves."""
     scans, poses = prepare(hearing, plan, ended)
     if ended() or hearing.sensor is None:
         return None
@@ -134,7 +134,7 @@ def run(
 
 
 def _check(live: LiveDrive, hearing: Hearing) -> None:
-    """Say what the first seconds show. MapvoteError if it is an error: the drive is useless, and leaves nothing."""
+    """Log the findings of the first seconds. MapvoteError if one is an error: the drive is useless, nothing leaves."""
     clocks = hearing.clocks.trouble() if live.unchecked else ""
     if clocks:
         live.discard()

@@ -1,4 +1,4 @@
-"""How a live drive goes, for others: log, /diagnostics, a topic of poses, Prometheus, systemd, a terminal."""
+"""The status of a live drive: for the log, /diagnostics, a topic of poses, Prometheus, systemd and a terminal."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class Status:
     """A live drive at one moment; rates and shares of the last minute."""
 
     scans_hz: float
-    """Scans that came."""
+    """Scans that arrived."""
     localised: float
     """Share of the decided scans that have a sure place; NaN without any."""
     sigma_m: float
@@ -75,7 +75,7 @@ class Status:
         )
 
     def troubles(self) -> list[tuple[int, str, str]]:
-        """(level of diagnostic_msgs, what it is about, what is said) for each thing that somebody may look at."""
+        """(level of diagnostic_msgs, subject, message) of each part of the drive."""
         return [
             (_ERROR, "clouds", f"none for {self.silent_s:.0f} s")
             if self.silent_s > _SILENT_S
@@ -100,7 +100,7 @@ def _metres(value: float) -> str:
 
 
 class StatusBoard:
-    """Watches a live drive, and tells those who asked, each at its own pace."""
+    """Computes the status of a live drive, and calls each listener at its own interval."""
 
     def __init__(self, maps: Maps, outbox: Outbox) -> None:
         self._maps, self._outbox = maps, outbox
@@ -112,7 +112,7 @@ class StatusBoard:
         self.status: Status | None = None
 
     def tell(self, every_s: float, listener: Callable[[Status, LiveDrive, Hearing], None]) -> None:
-        """Give ``listener`` the status every so many seconds."""
+        """Call ``listener`` with the status every so many seconds."""
         self._told.append((every_s, listener))
         self._due.append(time.monotonic() + every_s)
 
@@ -180,7 +180,7 @@ class RosStatus:
         self._refused = 0
 
     def diagnose(self, status: Status, live: LiveDrive, hearing: Hearing) -> None:
-        """Publish how it goes."""
+        """Publish the status."""
         values = [
             blank_message("diagnostic_msgs/msg/KeyValue", key=key, value=str(value))
             for key, value in asdict(status).items()
@@ -207,7 +207,7 @@ class RosStatus:
             self._send(self._poses, pose_message(live.fixes.popleft(), T_lidar_base, hearing.map_frame or "map"))
 
     def _send(self, publication: Publication, data: bytes) -> None:
-        """A message that a slow reader does not take is lost: the drive waits for nobody."""
+        """A message that a slow reader does not take is dropped: no reader delays the drive."""
         try:
             publication.send(data)
         except MapvoteError as error:
@@ -263,7 +263,7 @@ def serve_metrics(board: StatusBoard, port: int) -> int:
 
 
 def notify_systemd(text: str) -> bool:
-    """Tell systemd (sd_notify(3)) this, such as READY=1; False if it did not start this process."""
+    """Send systemd a message such as READY=1 (sd_notify(3)). False if systemd did not start this process."""
     address = os.environ.get("NOTIFY_SOCKET")
     if not address:
         return False
@@ -274,7 +274,7 @@ def notify_systemd(text: str) -> bool:
 
 
 class Heartbeat:
-    """Tells systemd that the service is ready, and once a second that its loop still goes round."""
+    """Reports to systemd that the service is ready, and once a second that its loop is alive."""
 
     def __init__(self) -> None:
         self._next_s = 0.0
