@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from mapvote.core.azimuth import azimuth_32
 from mapvote.core.kernel import kernel
 from mapvote.core.sensors import Sensor
-from mapvote.core.types import F32, I64, MapvoteError, Scan
+from mapvote.core.types import F32, I32, I64, U16, MapvoteError, Scan
 
 log = logging.getLogger("mapvote.formats")
 
@@ -56,7 +56,7 @@ class RawScan:
     stamp_ns: int
     points: F32
     """(n, 3), metres in the lidar frame; it may be a view of a message."""
-    intensity: F32 | None = None
+    intensity: NDArray[np.number] | None = None
     time_s: F32 | None = None
     """(n,) relative to the stamp."""
     ring: NDArray[np.number] | None = None
@@ -72,7 +72,7 @@ def clean_scan(where: str, raw: RawScan, sensor: Sensor, bad_points: BadPoints) 
     left.
     """
     points, near_m = raw.points, sensor.min_range_m - 5.0 * sensor.range_sigma_m
-    usable, copied = np.empty(len(points), np.int64), np.empty((len(points), 3), np.float32)
+    usable, copied = np.empty(len(points), np.int32), np.empty((len(points), 3), np.float32)
     n, measured, bad = _sort_out(points, raw.zero_is_no_return, near_m, FAR_M, usable, copied)
     kept = usable[:n]
     if bad > MAX_BAD_SHARE * max(measured, 1):
@@ -92,13 +92,20 @@ def clean_scan(where: str, raw: RawScan, sensor: Sensor, bad_points: BadPoints) 
         points=copied[:n],
         time_s=None if raw.time_s is None else np.ascontiguousarray(raw.time_s[keep], dtype=np.float32),
         intensity=None if raw.intensity is None else unit_intensity(raw.intensity[keep]),
-        ring=None if raw.ring is None else np.clip(np.nan_to_num(raw.ring[keep]), 0, 65535).astype(np.uint16),
+        ring=None if raw.ring is None else _ring(raw.ring[keep]),
     )
+
+
+def _ring(values: NDArray[np.number]) -> U16:
+    """(n,) beams; a number that uint16 cannot hold becomes the nearest that it can."""
+    if values.dtype in (np.uint8, np.uint16):
+        return values.astype(np.uint16)
+    return np.clip(np.nan_to_num(values), 0, 65535).astype(np.uint16)
 
 
 @kernel
 def _sort_out(
-    points: NDArray[np.floating], zero_is_no_return: bool, near_m: float, far_m: float, kept: I64, copied: F32
+    points: NDArray[np.floating], zero_is_no_return: bool, near_m: float, far_m: float, kept: I32, copied: F32
 ) -> tuple[int, int, int]:
     """(how many of the points (n, 3) are usable, how many were measured, how many of these are no measurements). The
     indices of the usable ones come into ``kept`` (n,), they themselves into ``copied`` (n, 3)."""

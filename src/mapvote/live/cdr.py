@@ -50,6 +50,7 @@ NUMBERS = {
 }  # fmt: skip
 _ENCODINGS = {0: (">", 8), 1: ("<", 8), 6: (">", 4), 7: ("<", 4)}
 """Byte order and largest alignment by the header's second byte: CDR, and the plain encoding of XCDR2."""
+_STRUCTS = {(order, code): struct.Struct(order + code) for order in "<>" for code in NUMBERS.values()}
 _HEADER = b"\0\1\0\0"
 """CDR, little-endian."""
 
@@ -143,10 +144,10 @@ class _Reader:
         self.at += -(self.at - 4) % min(size, self.most_aligned)
 
     def number(self, code: str) -> Any:
-        size = struct.calcsize(code)
-        self.align(size)
-        (value,) = struct.unpack_from(self.order + code, self.data, self.at)
-        self.at += size
+        one = _STRUCTS[self.order, code]
+        self.align(one.size)
+        (value,) = one.unpack_from(self.data, self.at)
+        self.at += one.size
         return value
 
     def string(self) -> str:

@@ -283,7 +283,7 @@ class Outbox:
         self._path(drive, "journal").unlink(missing_ok=True)
 
     def _pass_on(self) -> None:
-        """Move whole ballots to the folder and the spool. Each is in a file at every moment; moving twice is harmless."""
+        """Move whole ballots to the folder and the spool. Each is in a file at every moment; twice is harmless."""
         for whole in sorted(self._state.glob("*.ballot")):
             with self._disk_may_fail():
                 data = whole.read_bytes()

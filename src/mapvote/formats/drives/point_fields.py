@@ -7,8 +7,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mapvote.core.kernel import kernel
 from mapvote.core.sensors import Sensor
-from mapvote.core.types import F32, F64, MapvoteError, Scan
+from mapvote.core.types import F32, MapvoteError, Scan
 from mapvote.formats.clean import BadPoints, RawScan, clean_scan, spinning_time_s
 from mapvote.formats.maps.cloud import xyz_view
 
@@ -50,7 +51,7 @@ def scan_from_fields(
         index,
         stamp_ns,
         points,
-        intensity=None if intensity is None else table[intensity].astype(np.float32),
+        intensity=None if intensity is None else table[intensity],
         time_s=time_s,
         ring=None if ring is None else table[ring],
         zero_is_no_return=zero_is_no_return,
@@ -125,8 +126,6 @@ def point_times_s(where: str, raw: NDArray[np.generic], stamp_ns: int, sensor: S
             f"or drop the field"
         )
     # Exact for 64-bit nanoseconds: the scan's start is subtracted before anything becomes a float.
-    out: F64 = (raw - start).astype(np.float64)
-    out *= _UNITS_NS[unit]
     start_ns = int(start) if raw.dtype.kind in "iu" and unit == "ns" else round(float(start) * _UNITS_NS[unit])
     offset_ns = start_ns - stamp_ns if abs(start_ns) > _DAY_NS else start_ns
     if abs(offset_ns) > 1e9:
@@ -134,6 +133,14 @@ def point_times_s(where: str, raw: NDArray[np.generic], stamp_ns: int, sensor: S
             f"{where}: points were measured {offset_ns / 1e9:.3f} s away from their scan's stamp: "
             f"two clocks are mixed; correct the stamps, or drop the field"
         )
-    out += offset_ns
-    out *= 1e-9
-    return out.astype(np.float32)
+    out = np.empty(len(raw), np.float32)
+    _seconds_since(raw, start, _UNITS_NS[unit], float(offset_ns), out)
+    return out
+
+
+@kernel
+def _seconds_since(raw: NDArray[np.number], start: Any, unit_ns: float, offset_ns: float, out: F32) -> None:
+    """Fills ``out`` (n,): ``offset_ns`` and the time from ``start`` to ``raw`` (n,) in ``unit_ns``, in seconds. Six
+    passes of numpy take 0.1 ms more of the 1 ms in which a cloud of 70,000 points is read."""
+    for i in range(len(raw)):
+        out[i] = (np.float64(raw[i] - start) * unit_ns + offset_ns) * 1e-9
