@@ -46,7 +46,7 @@ TESTS = {
     "core/ground_growing.py": "core/test_ground.py",
     "slam/clean_map.py": "slam",
     "server/store/votes.py": "server/store/test_votes.py",
-    "server/store/round.py": "server/store/test_publish_limits.py",
+    "server/store/round.py": "server/store/test_publish_limits.py server/views/test_rounds.py",
     "localisation/odometry.py": "localisation/test_odometry.py",
     "localisation/pose_check.py": "localisation/test_pose_check.py",
 }

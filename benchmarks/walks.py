@@ -1,0 +1,188 @@
+"""Through how many files a scan, a ballot, a tile, the desk, a map and a diagnosis walk.
+
+    python benchmarks/walks.py [--show tile]
+
+A walk is what runs of mapvote's own functions, in all threads; kernels count as their caller. *Files*: those in which
+anything runs, and how many of them do more than serve (core, config, codec). *Stays*: handovers, each pair of a calling
+and a called file once, to files that do. *Returns*: handovers to a file that waits further up in the same stack.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import tempfile
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from types import FrameType
+
+import httpx2
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+
+import mapvote
+from fusion import said
+from fusion import street as two_facades
+from hand_made import make_ballot, unpack_all
+from mapvote.codec.ballot import encode
+from mapvote.config import FuseSettings
+from mapvote.core.point_map import map_from_points
+from mapvote.core.types import CellState
+from mapvote.doctor.diagnosis import diagnose
+from mapvote.formats.drives.kitti import DriveWriter
+from mapvote.fusion.fuse import fuse_tile
+from mapvote.server.http.app import URL, in_process
+from mapvote.server.store.policy import Policy
+from mapvote.server.store.store import Store
+from mapvote.slam.build import build_map
+from mapvote.vehicle import Vehicle
+from streets import drive_along, path, street
+
+SRC = str(Path(mapvote.__file__).parent) + "/"
+SERVING = "core", "config", "codec", "__init__.py"
+POLICY = FuseSettings(min_votes=2, max_deleted_share=1.0)
+
+
+class Walk:
+    """The files that run, and who hands over to whom, while it is on."""
+
+    def __init__(self) -> None:
+        self.on = False
+        self.files: set[str] = set()
+        self.stays: set[tuple[str, str]] = set()
+        self.returns: set[tuple[str, str]] = set()
+
+    def watch(self, frame: FrameType, event: str, arg: object) -> None:
+        """For :func:`sys.setprofile`."""
+        here = file_of(frame.f_code.co_filename)
+        if not self.on or event != "call" or here is None:
+            return
+        self.files.add(here)
+        above: list[str] = []
+        waiting = frame.f_back
+        while waiting is not None:
+            there = file_of(waiting.f_code.co_filename)
+            above += [] if there is None else [there]
+            waiting = waiting.f_back
+        if above and above[0] != here and not here.startswith(SERVING):
+            self.stays.add((above[0], here))
+            if here in above:
+                self.returns.add((above[0], here))
+
+
+@cache
+def file_of(source: str) -> str | None:
+    """A file of mapvote's, from its root; None for any other."""
+    return source.removeprefix(SRC) if source.startswith(SRC) else None
+
+
+@contextmanager
+def counted(walk: Walk) -> Iterator[None]:
+    walk.on = True
+    sys.setprofile(walk.watch)
+    try:
+        yield
+    finally:
+        sys.setprofile(None)
+        walk.on = False
+
+
+def scan(walk: Walk) -> None:
+    """One scan, while those of a second before it vote."""
+    poses = path(14)
+    drive = drive_along(poses, 1, poses, sigma_m=0.2)
+    vehicle = Vehicle("v", drive.sensor, map_from_points(street(0)), prior_sigma_m=0.2)
+    for i in range(len(poses) - 1):
+        vehicle.observe(drive.read_scan(i), poses[i])
+    last = drive.read_scan(len(poses) - 1)
+    with counted(walk):
+        vehicle.observe(last, poses[-1])
+
+
+def tile(walk: Walk) -> None:
+    """Three ballots take a house down and put a kiosk up."""
+    rng, point_map = np.random.default_rng(1), two_facades([(0, 0)])
+    ballots = [make_ballot(point_map, {(0, 0): said(rng)}, f"v{i}", "d", end_ns=10**18 + i) for i in range(3)]
+    votes = [replace(vote, vehicle=one.vehicle, digest=one.vehicle) for one in ballots for vote in unpack_all(one)]
+    with counted(walk):
+        decision, _ = fuse_tile(point_map.tiles[0, 0], votes, "columns", POLICY, 2, lambda: votes)
+    assert (decision.states == CellState.CHANGED_EMPTY).any(), "nothing was decided"
+
+
+def ask(walk: Walk, act: Callable[[httpx2.Client, bytes], httpx2.Response]) -> None:
+    """A request to a store with two ballots, and a third at hand."""
+    rng, point_map = np.random.default_rng(1), two_facades([(0, 0)])
+    first, second, third = (
+        encode(make_ballot(point_map, {(0, 0): said(rng)}, vehicle, "d", end_ns=10**18 + i))
+        for i, vehicle in enumerate("abc")
+    )
+    with tempfile.TemporaryDirectory() as folder:
+        store = Store.create(f"sqlite:///{folder}/s.db", point_map, Policy(fuse=POLICY))
+        with in_process(store, owner="walker") as transport, httpx2.Client(transport=transport, base_url=URL) as client:
+            for vehicle, ballot in (("a", first), ("b", second)):
+                client.put(f"/v1/ballots/{vehicle}/d", content=ballot).raise_for_status()
+            with counted(walk):
+                act(client, third).raise_for_status()
+        store.close()
+
+
+def ballot(walk: Walk) -> None:
+    """A third ballot is sent."""
+    ask(walk, lambda client, third: client.put("/v1/ballots/c/d", content=third))
+
+
+def desk(walk: Walk) -> None:
+    """The review desk is opened."""
+    ask(walk, lambda client, third: client.get("/v1/desk"))
+
+
+def build(walk: Walk) -> None:
+    """A map of a drive of 20 scans."""
+    poses = path(20)
+    with counted(walk):
+        build_map([drive_along(poses, 1, poses, sigma_m=0.2)])
+
+
+def diagnosis(walk: Walk) -> None:
+    """A drive of 20 scans on its map."""
+    poses = path(20)
+    drive = drive_along(poses, 1, poses)
+    with tempfile.TemporaryDirectory() as folder:
+        writer = DriveWriter(Path(folder) / "d", "v", drive.sensor, start_ns=0).open()
+        for i in range(len(poses)):
+            writer.write_scan(i, drive.read_scan(i).points)
+        writer.close(drive.stamps_ns, poses)
+        with counted(walk):
+            diagnose(Path(folder) / "d", None, map_from_points(street(0)))
+
+
+WALKS = (scan, tile, ballot, desk, build, diagnosis)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--show", choices=[walk.__name__ for walk in WALKS], help="print one walk's handovers")
+    options = parser.parse_args()
+    for act in WALKS:
+        if options.show in (None, act.__name__):
+            walk = Walk()
+            threading.setprofile(walk.watch)
+            act(walk)
+            threading.setprofile(None)
+            doing = [file for file in walk.files if not file.startswith(SERVING)]
+            print(
+                f"| {act.__name__} | {len(walk.files)} | {len(doing)} | {len(walk.stays)} | {len(walk.returns)} |",
+                flush=True,
+            )
+            if options.show:
+                for pair in sorted(walk.stays):
+                    print(*pair, "(returns)" if pair in walk.returns else "", sep="  ")
+
+
+if __name__ == "__main__":
+    main()
