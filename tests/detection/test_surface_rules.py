@@ -71,17 +71,17 @@ def test_what_is_new_needs_more_the_more_cells_it_has_and_at_most_so_much(cells:
     assert enough(voxels, NEW_A_CELL, voxels != 0)[5, 0] == (cells * voxels_a_cell >= needed)
 
 
-def test_what_goes_along_touches_what_went_and_rays_passed_something_of_it_or_it_lies_near() -> None:
-    """A row of cells from a pole that went. Of the others rays passed what is mapped (P), or only below it (B), or
-    nothing (N); in S something stands."""
-    row = "PPPPPNPP", "BBBBB", "NBB", "PSPP"
-    gone_along = "PPPPP", "BBB", "", "P"
+def test_a_cell_goes_along_that_touches_what_went_if_rays_passed_half_of_it_and_nothing_stands() -> None:
+    """A row of cells from a pole that went. Of the others rays passed half of what is mapped (P) or less (N); in S
+    something stands."""
+    row = "PPPPPNPP", "NPP", "PSPP"
+    gone_along = "PPPPP", "", "P"
     for cells, along in zip(row, gone_along, strict=True):
         facts, occupied = no_facts((1, 12)), np.zeros((1, 12), np.uint64)
         occupied[0, : len(cells) + 1] = 0b1111110000
         facts.gone[0, 0] = facts.passed[0, 0] = 0b1111110000
         for k, said in enumerate(cells, 1):
-            facts.passed[0, k] = {"P": 0b10000, "B": 0b1000, "N": 0, "S": 0b10000}[said]
+            facts.passed[0, k] = 0b110001111 if said == "N" else 0b111000000
             facts.stands[0, k] = 0b10000 * (said == "S")
         states = judge_window(facts, occupied, np.where(occupied != 0, np.float32(3.0), np.float32(np.nan)), 0.5).states
         assert np.flatnonzero(states == CellState.CHANGED_EMPTY).tolist() == list(range(len(along) + 1))

@@ -32,7 +32,6 @@ from mapvote.detection.surface_rules import (
     HIT_RAYS,
     NEW_ENOUGH,
     NEW_RAYS,
-    REACH_CELLS,
     SUPPORT,
     TOGETHER,
     VoxelFacts,
@@ -210,18 +209,18 @@ def test_a_kerb_stays_before_a_wall_that_was_pulled_down(off: int) -> None:
     assert [{int(states[cell]) for cell in cells} for cells in (WALL, kerb)] == [{CE}, {UN}]
 
 
-def test_a_roof_that_no_ray_could_reach_falls_with_the_wall_that_bore_it() -> None:
-    roof = [(ROW + k, c) for k in range(1, 2 * REACH_CELLS) for c in COLUMNS]
+@pytest.mark.parametrize(("layers", "state"), [(12, UN), (16, CE)])
+def test_a_roof_is_gone_with_the_wall_below_it_if_rays_passed_through_its_place(layers: int, state: CellState) -> None:
+    roof = [(ROW + k, c) for k in range(1, 5) for c in COLUMNS]
     points = np.concatenate([wall(WALL, HEIGHTS), wall(roof, [4.65])])
     ground = wall([(r, c) for r in range(85, 125) for c in range(85, 135)], [0.0])
     point_map = make_map({(0, 0): make_tile(np.concatenate([points, ground]))})
     voter = SurfaceVoter(VotingSettings(), point_map)
     for _ in range(8):
         seen = one_scan(point_map, standing_at(OLD_Y + 9))
-        seen.view.passed[:] &= np.uint64((1 << 12) - 1)  # no ray rises to the roof
+        seen.view.passed[:] &= np.uint64((1 << layers) - 1)
         voter.observe(seen)
-    states = voter.votes()[0, 0].states
-    assert all((states[r, c] == CE) == (r - ROW <= REACH_CELLS) for r, c in roof), "as far as what went reaches"
+    assert {int(voter.votes()[0, 0].states[cell]) for cell in roof} == {state}
 
 
 def test_a_cell_in_which_something_stands_is_not_empty_whatever_else_of_it_is_gone() -> None:

@@ -14,8 +14,8 @@ have new voxels, with N such voxels, *enough* is
 
 or that the group is a thing of its own on the ground.
 
-    changed-empty     empty cells that are enough, and with them cells in which nothing stands and that touch them
-                      directly or through each other, if rays passed a mapped voxel there, or within REACH_CELLS
+    changed-empty     empty cells that are enough, and cells that touch them, directly or through each other, in which
+                      nothing stands and rays passed half of the mapped voxels
     changed-occupied  cells with new voxels that are enough, if sum h >= sum p over the group; what was hit where the
                       map knew nothing is new within REACH_CELLS of changed-empty
 
@@ -49,7 +49,7 @@ NEW_A_CELL, NEW_ENOUGH = 2, 40
 """Voxels that something new needs for each further cell, because what is thinner is noise, and at most: the bound keeps
 large low things."""
 REACH_CELLS = 3
-"""How far what went reaches: .9 m."""
+"""How far behind a surface that is gone another may have been hidden: .9 m."""
 _AROUND = np.ones((3, 3))
 _LOW = np.uint64(0b1111)
 """A column that has one of these voxels begins within 1.2 m of the ground."""
@@ -131,11 +131,13 @@ def judge_window(drive: VoxelFacts, occupied: U64, height_m: F32, min_height_m: 
 
     empty: Bool = (gone != 0) & ~stands
     firm = enough(np.where(empty, gone, NOTHING), 0, mapped & ~empty)
-    went = grown(firm, high & passed & ~stands & (near(firm) | (occupied & drive.passed != 0)))
+    seen_through = 2 * np.bitwise_count(occupied & drive.passed) >= np.bitwise_count(occupied)
+    went = grown(firm, high & ~stands & seen_through)
     states[went] = CellState.CHANGED_EMPTY
     gone = np.where(went, occupied, gone)
 
-    new: U64 = np.bitwise_or(np.where(mapped, NOTHING, drive.new), np.where(near(went), beyond, NOTHING))
+    near = ndimage.maximum_filter(went, 2 * REACH_CELLS + 1, mode="constant")
+    new: U64 = np.bitwise_or(np.where(mapped, NOTHING, drive.new), np.where(near, beyond, NOTHING))
     came = enough(new, NEW_A_CELL, occupied & ~gone != 0) & (over_groups(new != 0, drive.balance) >= 0)
     states[new != 0] = CellState.UNDETERMINED
     states[came] = CellState.CHANGED_OCCUPIED
@@ -161,11 +163,6 @@ def over_groups(cells: Bool, amounts: U8 | I32 | Bool) -> F64:
 
 def grown(strong: Bool, weak: Bool) -> Bool:
     """(rows, cols) ``strong`` cells, and ``weak`` ones that touch them (8) directly or through each other: hysteresis
-    (Canny 1986). Few rays cross the far wall of what fell, none reach its roof."""
+    (Canny 1986). Few rays cross the far wall of a demolished house."""
     both = strong | weak
     return np.asarray(both & (over_groups(both, strong) > 0))
-
-
-def near(cells: Bool) -> Bool:
-    """(rows, cols) what lies within REACH_CELLS of ``cells``."""
-    return np.asarray(ndimage.maximum_filter(cells, 2 * REACH_CELLS + 1, mode="constant"))
