@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import os
 import time
 from collections.abc import Callable
 from typing import Any
@@ -91,6 +92,16 @@ def test_a_cloud_goes_over_dds_and_is_the_scan_that_was_sent(monkeypatch: pytest
     (data,) = _until(incoming.take)
     scan = scan_from_point_cloud2(from_cdr(CLOUD, data), SENSORS["hdl32e"])
     assert (scan.stamp_ns, len(scan.points)) == (START, 1000)
+
+
+def test_joining_a_domain_leaves_the_users_configuration_as_it_was(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("CYCLONEDDS_URI", LOOPBACK)
+    Network(domain_of("configured"))
+    assert os.environ["CYCLONEDDS_URI"] == LOOPBACK
+    monkeypatch.setenv("CYCLONEDDS_URI", "<Domain><NoSuchSetting/></Domain>")
+    with pytest.raises(MapvoteError, match="CYCLONEDDS_URI"):
+        Network(domain_of("misconfigured"))
+    assert os.environ["CYCLONEDDS_URI"] == "<Domain><NoSuchSetting/></Domain>"
 
 
 def received(sent: list[bytes], domain: int) -> list[memoryview]:

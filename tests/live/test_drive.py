@@ -63,14 +63,15 @@ def test_a_live_drive_by_a_played_bag_casts_the_ballots_of_vote_on_that_bag_bit_
     write_map(map_from_points(street(1)), tmp_path / "map")
     folder.mkdir()
     domain = str(domain_of("drive"))
-    player = subprocess.Popen([sys.executable, "-m", "mapvote", "play", str(bag), "--domain", domain, "--rate", "0.5"])
+    options = ["--domain", domain, "--rate", "0.5", "--wait", "3600"]
+    player = subprocess.Popen([sys.executable, "-m", "mapvote", "play", str(bag), *options])
     try:
         said = type_in(
-            f"mapvote drive --map {tmp_path}/map --sensor hdl32e --vehicle car --name day --every-m 12 --idle 12 "
+            f"mapvote drive --map {tmp_path}/map --sensor hdl32e --vehicle car --name day --every-m 12 --idle 60 "
             f"--out {folder} --domain {domain}"
         )
     finally:
-        player.wait(60)
+        player.wait(120)
     drive = open_drive(bag, sensor="hdl32e", vehicle="car", prior="/odometry")
     voter = Vehicle("car", SENSORS["hdl32e"], read_map(tmp_path / "map"), drive_id="day")
     wanted = [written() for written in vote_in_stretches(replace(drive, drive_id="day"), voter, Cuts(length_m=12.0))]

@@ -18,9 +18,9 @@ from mapvote.core.point_map import map_from_points
 from mapvote.core.sensors import SENSORS
 from mapvote.core.types import F64, MapvoteError, Scan
 from mapvote.live.cdr import blank_message, to_cdr
-from mapvote.live.dds import Network
+from mapvote.live.dds import Network, SentTopic
 from mapvote.live.drive import OneMap
-from mapvote.live.hearing import Clocks, Cloud, Hearing, Sweeps, choose_topics, matrix_of
+from mapvote.live.hearing import Chosen, Clocks, Cloud, Hearing, Sweeps, choose_topics, matrix_of
 from mapvote.live.outbox import Outbox
 from mapvote.live.play import POINTS, POSES, cloud_message, odometry_message, transform_message
 from mapvote.live.service import Plan, run
@@ -152,6 +152,18 @@ def test_two_lidars_are_one_scan_in_the_frame_of_the_first_by_tf_static(monkeypa
     ((start, origin),) = scan.others
     assert start == len(world)
     assert np.allclose(transform(T["left"], origin[None])[0], T["right"][:3, 3])
+
+
+def test_a_drive_to_which_no_cloud_comes_ends_after_the_idle_time(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("CYCLONEDDS_URI", LOOPBACK)
+    chosen = Chosen((SentTopic(POINTS, CLOUD, 1, True, False),), None)
+    hearing = Hearing(Network(domain_of("idle")), chosen, SENSORS["hdl32e"])
+    outbox = Outbox(tmp_path / "state", "car", say=lambda _: None)
+    maps = OneMap(map_from_points(street(1)))
+    assert run(Plan("car", "day", Settings(), idle_s=0.2), hearing, maps, outbox, lambda: False) is None
+    outbox.close()
 
 
 @pytest.mark.slow

@@ -10,7 +10,8 @@ from __future__ import annotations
 import ctypes
 import os
 from collections import defaultdict
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -22,6 +23,9 @@ from mapvote.live.cdr import NUMBERS, TYPES, Field
 
 _DEPTH = 64
 """Messages that a reader or a writer keeps: six seconds of clouds."""
+_DEFAULTS = '<Domain id="any"><Internal><SocketReceiveBufferSize max="8MB"/></Internal></Domain>'
+"""Cyclone DDS asks for 1 MB. A cloud of 64 beams has 3 MB, and waits in the socket while the process computes. The
+kernel gives no more than net.core.rmem_max."""
 _TAKEN = 640
 """Messages that are taken at a time, at most."""
 _ALIVE, _ANY = 16, 0x7F
@@ -53,7 +57,8 @@ class Network:
         )
         self.domain = int(os.environ.get("ROS_DOMAIN_ID") or 0) if domain is None else domain
         try:
-            self._participant = require("cyclonedds.domain", "ros2", "DDS").DomainParticipant(self.domain)
+            with _with_defaults():
+                self._participant = require("cyclonedds.domain", "ros2", "DDS").DomainParticipant(self.domain)
         except Exception as error:
             raise MapvoteError(
                 f"DDS domain {self.domain}: cannot be joined ({first_line(error)}); is the network interface up that "
@@ -148,6 +153,20 @@ class Network:
         if field.length is None:
             return one
         return types.array[one, field.length] if field.length else types.sequence[one]
+
+
+@contextmanager
+def _with_defaults() -> Iterator[None]:
+    """CYCLONEDDS_URI, which Cyclone DDS reads when a process joins a domain, with our defaults before the user's."""
+    theirs = os.environ.get("CYCLONEDDS_URI")
+    os.environ["CYCLONEDDS_URI"] = ",".join(filter(None, (_DEFAULTS, theirs)))
+    try:
+        yield
+    finally:
+        if theirs is None:
+            del os.environ["CYCLONEDDS_URI"]
+        else:
+            os.environ["CYCLONEDDS_URI"] = theirs
 
 
 class _Span(ctypes.Structure):

@@ -45,14 +45,15 @@ Watcher = Callable[["LiveDrive", Hearing], None]
 
 
 def prepare(hearing: Hearing, plan: Plan, ended: Callable[[], bool]) -> tuple[list[list[Cloud]], list[tuple[int, F64]]]:
-    """Read topics until the sensor and the mounts are known. Returns the scans and poses that arrived meanwhile.
+    """Read topics until sensor and mounts are known. Returns the scans and poses that arrived meanwhile: none if no
+    cloud arrived for the idle time.
 
     MapvoteError if /tf_static does not say where they are.
     """
     scans: list[list[Cloud]] = []
     poses: list[tuple[int, F64]] = []
-    first_s = np.inf
-    while not ended():
+    first_s, start = np.inf, time.monotonic()
+    while not ended() and (scans or not plan.idle_s or time.monotonic() < start + plan.idle_s):
         hearing.network.wait(_LOOP_S)
         poses += hearing.poses()
         scans += hearing.scans()
@@ -92,7 +93,7 @@ def run(
     """Vote until ``ended``, or until no cloud arrived for the idle time. Returns the drive, whose last ballot has left.
     None if it ended before a cloud arrived. MapvoteError if the first seconds show an error: then nothing leaves."""
     scans, poses = prepare(hearing, plan, ended)
-    if ended() or hearing.sensor is None:
+    if ended() or not scans or hearing.sensor is None:
         return None
     sensor, T = hearing.sensor, plan.T_base_lidar
     first = FirstSeconds(hearing.sensor_told) if plan.checked else None
