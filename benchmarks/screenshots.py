@@ -67,9 +67,9 @@ def of_swipe(browser: Chromium, url: str) -> None:
     settled(browser)
 
 
-def from_above(browser: Chromium, url: str) -> None:
+def from_above(browser: Chromium, url: str, also: str = "") -> None:
     """Without WebGL, or by a key."""
-    browser.open(f"{url}/#view=2d&paths=1")
+    browser.open(f"{url}/#view=2d&paths=1{also}")
     browser.wait(LISTED, 90)
     time.sleep(10.0)
 
@@ -127,6 +127,7 @@ DEMO: list[Picture] = [
     ("page_loading", while_loading, {}),
     ("page_swipe", of_swipe, {}),
     ("page_2d", from_above, {"webgl": False}),
+    ("page_next", partial(from_above, also="&next=1"), {"webgl": False}),
 ]
 
 
