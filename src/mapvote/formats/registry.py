@@ -35,7 +35,7 @@ from mapvote.formats.maps.autoware import (
 from mapvote.formats.maps.cloud import Cloud, CloudPieces
 from mapvote.formats.maps.e57 import is_e57, stream_e57
 from mapvote.formats.maps.las import is_las, stream_las, write_las
-from mapvote.formats.maps.pcd import is_pcd, stream_pcd, write_pcd
+from mapvote.formats.maps.pcd import is_pcd, is_pcd_tiles, stream_pcd, stream_pcd_tiles, write_pcd
 from mapvote.formats.maps.ply import is_ply, stream_ply, write_ply
 
 
@@ -86,6 +86,7 @@ MAPS: dict[str, MapFormat] = {
     "Autoware tile folder": MapFormat(is_autoware, stream_autoware),
     "Autoware default folder": MapFormat(is_autoware_default, stream_autoware_default),
     "PCD file": MapFormat(is_pcd, stream_pcd),
+    "folder of PCD tiles X_Y.pcd": MapFormat(is_pcd_tiles, stream_pcd_tiles),
     "LAS or LAZ file": MapFormat(is_las, stream_las),
     "PLY file": MapFormat(is_ply, stream_ply),
     "E57 file": MapFormat(is_e57, stream_e57),

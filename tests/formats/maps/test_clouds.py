@@ -211,6 +211,19 @@ def test_a_pcd_cut_between_points_is_noticed(tmp_path: Path) -> None:
         read_map(tmp_path / "a.pcd")
 
 
+def test_a_folder_of_pcd_tiles_in_any_tiling_is_a_map_and_with_stamps_it_is_a_drive(tmp_path: Path) -> None:
+    points = np.random.default_rng(1).uniform((-233.4, -754.6, 0.3), (-160.0, -700.0, 4.0), (500, 3))
+    of_tile = np.floor((points[:, :2] - (-233.49335, -754.68726)) / 25.0).astype(int)
+    for x, y in np.unique(of_tile, axis=0):
+        write_pcd(tmp_path / f"{x}_{y}.pcd", Cloud(points[(of_tile == (x, y)).all(axis=1)]))
+    read = all_points(read_map(tmp_path))
+    assert len(list(tmp_path.iterdir())) > 3
+    assert np.allclose(read[np.lexsort(read.T)], points[np.lexsort(points.T)], atol=1e-4)
+    (tmp_path / "times.txt").write_text("0.0\n" * 9)
+    with pytest.raises(MapvoteError, match="a map is one of"):
+        read_map(tmp_path)
+
+
 def test_nan_points_of_a_map_are_dropped_and_counted_or_refused(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import struct
 from collections.abc import Iterator, Mapping
 from itertools import islice
@@ -32,12 +33,26 @@ _BLOCK = 500_000
 """Points read at a time."""
 _PAGE = 4096
 """Bytes that PCL up to 1.7 reserved for the header: what the header leaves of them follows the points, as zeros."""
+_TILE = re.compile(r"-?\d{1,5}_-?\d{1,5}\.pcd")
 NO_FIELDS: Mapping[str, NDArray[Any]] = MappingProxyType({})
 ENCODINGS = tuple(e.value for e in (Encoding.ASCII, Encoding.BINARY, Encoding.BINARY_COMPRESSED))
 
 
 def is_pcd(path: Path) -> bool:
     return path.is_file() and path.suffix.lower() == ".pcd"
+
+
+def is_pcd_tiles(path: Path) -> bool:
+    """A folder whose PCD files are all called X_Y.pcd, in whatever tiling; with stamps or poses it is a drive."""
+    names = [file.name for file in path.glob("*.pcd")] if path.is_dir() else []
+    recorded = any((path / name).exists() for name in ("times.txt", "prior.txt", "drive.toml"))
+    return bool(names) and not recorded and all(_TILE.fullmatch(name) for name in names)
+
+
+def stream_pcd_tiles(path: Path) -> Iterator[Cloud]:
+    """The points of all tiles, one file after the other: points are in map metres, names say nothing about places."""
+    for file in sorted(path.glob("*.pcd")):
+        yield from stream_pcd(file)
 
 
 def read_pcd_table(path: Path) -> tuple[NDArray[np.void], F64]:
