@@ -28,7 +28,7 @@ def coverage(
     most: Annotated[int, typer.Option(metavar="N", min=1, help="largest number of rows")] = 20,
     key_file: KeyFile = None,
 ) -> None:
-    """Where one more pass would decide cells: by tile and direction of road, the most cells first.
+    """List the roads where one more pass would decide cells, by tile and direction, most cells first.
 
     A cell counts if one more vehicle with the same vote as an earlier one would decide it.
 

@@ -23,22 +23,25 @@ def register(app: typer.Typer) -> None:
 
 
 def diff(
-    path_a: Annotated[Path, typer.Argument(metavar="A", help="the older map or cloud, in any format; its frame holds")],
-    path_b: Annotated[Path, typer.Argument(metavar="B", help="the newer one, in any frame")],
-    min_area: Annotated[float, typer.Option(min=0.0, metavar="M2", help="leave out smaller things")] = 0.5,
+    path_a: Annotated[
+        Path, typer.Argument(metavar="A", help="the older map or cloud, in any format; results are in its frame")
+    ],
+    path_b: Annotated[Path, typer.Argument(metavar="B", help="the newer one, in any format and frame")],
+    min_area: Annotated[float, typer.Option(min=0.0, metavar="M2", help="leave out smaller objects")] = 0.5,
     unbend: Annotated[
-        bool, typer.Option("--unbend", help="move bent parts of B piece by piece, if they fit so")
+        bool, typer.Option("--unbend", help="correct bent parts of B piece by piece, if that makes them fit")
     ] = False,
     out: Annotated[Path | None, typer.Option(metavar="FILE", help="also write the footprints as GeoJSON")] = None,
     csv: Annotated[Path | None, typer.Option(metavar="FILE", help="also write the table as CSV")] = None,
     page: Annotated[
-        Path | None, typer.Option("--html", metavar="FILE", help="also write one page with both clouds of the largest")
+        Path | None,
+        typer.Option("--html", metavar="FILE", help="also write one page with both clouds around the largest"),
     ] = None,
     show_not_seen: Annotated[
-        bool, typer.Option("--not-seen", help="also list what one cloud has and the other could not show")
+        bool, typer.Option("--not-seen", help="also list objects of one cloud where the other has no ground")
     ] = False,
 ) -> None:
-    """What differs between two clouds or maps of one place. B is registered to A without a prior, at any heading.
+    """List the differences of two clouds or maps of one place. B is registered to A without a prior, at any heading.
 
     mapvote diff old_map.las session.pcd --html diff.html
     """
@@ -96,7 +99,7 @@ def merge(
     paths: Annotated[list[Path], typer.Argument(metavar="MAP...", help="maps that overlap, in any format and frame")],
     out: Annotated[Path, typer.Option(metavar="MAP", help="the map to write; a folder that does not exist yet")],
 ) -> None:
-    """Several maps of one area become one, in the frame of the first: registered, adjusted together, one point a voxel.
+    """Merge overlapping maps into one, in the frame of the first: registered, adjusted together, one point per voxel.
 
     mapvote merge north.laz south.laz --out town
     """

@@ -19,7 +19,9 @@ if TYPE_CHECKING:
     from mapvote.live.outbox import Outbox
     from mapvote.live.status import StatusBoard
 
-Domain = Annotated[int | None, typer.Option(min=0, max=232, metavar="N", help="else ROS_DOMAIN_ID, else 0")]
+Domain = Annotated[
+    int | None, typer.Option(min=0, max=232, metavar="N", help="DDS domain; default: $ROS_DOMAIN_ID, else 0")
+]
 
 
 def register(app: typer.Typer) -> None:
@@ -32,7 +34,7 @@ def topics(
     seconds: Annotated[float, typer.Option(min=0.5, metavar="SECONDS", help="how long to listen")] = 5.0,
     domain: Domain = None,
 ) -> None:
-    """List the ROS 2 topics that are sent on this network with types and rates, and what a vehicle lacks among them.
+    """List the ROS 2 topics on this network with types and rates, and the topics that `drive` needs and are missing.
 
     mapvote topics
     """
@@ -51,12 +53,14 @@ def topics(
 
 def play(
     path: Annotated[Path, typer.Argument(metavar="DRIVE|BAG", help="a ROS 2 bag, or a drive in any format")],
-    rate: Annotated[float, typer.Option(min=0.01, metavar="N", help="times as fast as recorded")] = 1.0,
-    wait: Annotated[float, typer.Option(min=0.0, metavar="SECONDS", help="for a first reader, at most")] = 60.0,
-    loops: Annotated[int, typer.Option(min=1, metavar="N", help="so many times, each with the same stamps")] = 1,
+    rate: Annotated[float, typer.Option(min=0.01, metavar="N", help="speed, in multiples of the recorded one")] = 1.0,
+    wait: Annotated[float, typer.Option(min=0.0, metavar="SECONDS", help="longest wait for a first reader")] = 60.0,
+    loops: Annotated[
+        int, typer.Option(min=1, metavar="N", help="send the drive N times, each time with the same stamps")
+    ] = 1,
     domain: Domain = None,
 ) -> None:
-    """Send a recorded drive on DDS, a ROS 2 bag as it was recorded: a vehicle without a vehicle.
+    """Send a recorded drive or ROS 2 bag on DDS, as a vehicle would.
 
     mapvote play my_bag
     """
@@ -67,36 +71,50 @@ def play(
 
 
 def drive(
-    where: Annotated[str, typer.Option("--map", metavar="MAP|URL", help="a map in any format, or a server's")],
-    vehicle: Annotated[str, typer.Option(metavar="NAME", help="whose ballots")],
-    sensor: Annotated[str | None, typer.Option(metavar="NAME", help="the LiDAR's model; else measured")] = None,
+    where: Annotated[str, typer.Option("--map", metavar="MAP|URL", help="a map in any format, or the URL of a server")],
+    vehicle: Annotated[str, typer.Option(metavar="NAME", help="name of the vehicle in its ballots")],
+    sensor: Annotated[
+        str | None, typer.Option(metavar="NAME", help="LiDAR model; default: measured in the first ten scans")
+    ] = None,
     points: Annotated[
-        str | None, typer.Option(metavar="TOPICS", help="of PointCloud2, several LiDARs with commas; else the only one")
+        str | None,
+        typer.Option(
+            metavar="TOPICS", help="PointCloud2 topic, several LiDARs separated by commas; default: the only one"
+        ),
     ] = None,
     odometry: Annotated[
-        str | None, typer.Option(metavar="TOPIC", help="of Odometry in the map's frame; else the only one, if any")
+        str | None,
+        typer.Option(metavar="TOPIC", help="Odometry topic in the map's frame; default: the only one, if any"),
     ] = None,
     mount: Annotated[
         str | None,
         typer.Option(
-            metavar="NUMBERS", help="the LiDAR on what odometry tracks: x,y,z,roll,pitch,yaw; else /tf_static"
+            metavar="NUMBERS",
+            help="pose of the LiDAR in the odometry's body: x,y,z,roll,pitch,yaw; default: /tf_static",
         ),
     ] = None,
-    send: Annotated[str | None, typer.Option(metavar="URL", help="the server that the ballots go to")] = None,
-    out: Annotated[Path | None, typer.Option(metavar="FOLDER", help="the folder that the ballots go to")] = None,
+    send: Annotated[str | None, typer.Option(metavar="URL", help="send the ballots to this server")] = None,
+    out: Annotated[Path | None, typer.Option(metavar="FOLDER", help="write the ballots into this folder")] = None,
     key_file: KeyFile = None,
-    name: Annotated[str | None, typer.Option(metavar="NAME", help="of the drive; else the time it began")] = None,
-    every_m: Annotated[float, typer.Option(min=1.0, metavar="METRES", help="of road a ballot, at most")] = 2000.0,
-    idle: Annotated[float, typer.Option(metavar="SECONDS", help="end after so long without a cloud; 0: never")] = 0.0,
-    metrics: Annotated[
-        int | None, typer.Option(min=0, max=65535, metavar="PORT", help="Prometheus' metrics, on 127.0.0.1 alone")
+    name: Annotated[
+        str | None, typer.Option(metavar="NAME", help="name of the drive; default: the time of its start")
     ] = None,
-    watch: Annotated[bool, typer.Option("--watch", help="a view in the terminal in place of the log")] = False,
-    unchecked: Annotated[bool, typer.Option("--unchecked", help="vote whatever the first ten seconds show")] = False,
+    every_m: Annotated[
+        float, typer.Option(min=1.0, metavar="METRES", help="longest stretch of road in one ballot")
+    ] = 2000.0,
+    idle: Annotated[float, typer.Option(metavar="SECONDS", help="end after this time without a cloud; 0: never")] = 0.0,
+    metrics: Annotated[
+        int | None,
+        typer.Option(min=0, max=65535, metavar="PORT", help="serve Prometheus metrics on this port of 127.0.0.1"),
+    ] = None,
+    watch: Annotated[bool, typer.Option("--watch", help="show a live view in the terminal instead of the log")] = False,
+    unchecked: Annotated[
+        bool, typer.Option("--unchecked", help="vote even if the checks of the first ten seconds fail")
+    ] = False,
     domain: Domain = None,
     config: Config = None,
 ) -> None:
-    """Vote while driving, from ROS 2 topics: a ballot leaves every 2 km, 10 minutes or stop of 2 minutes.
+    """Vote while driving, from ROS 2 topics. A ballot closes every 2 km, every 10 minutes and after 2 minutes at rest.
 
     mapvote drive --map URL --vehicle car_1 --send URL
     """
@@ -114,7 +132,7 @@ def drive(
     from mapvote.warmup import warm_vehicle
 
     if out is None and send is None:
-        raise MapvoteError("drive: say where the ballots go: --send URL, --out FOLDER, or both")
+        raise MapvoteError("drive: give --send URL, --out FOLDER, or both")
     logging.getLogger("mapvote.live").setLevel(logging.INFO)
     plan = Plan(
         vehicle,
@@ -155,7 +173,7 @@ def drive(
 
 @contextmanager
 def _view(board: StatusBoard, vehicle: str) -> Iterator[None]:
-    """A terminal that shows how the drive goes."""
+    """A live view of the drive in the terminal."""
     from rich.live import Live
 
     from mapvote.live.status import watched
@@ -167,7 +185,7 @@ def _view(board: StatusBoard, vehicle: str) -> Iterator[None]:
 
 @contextmanager
 def _maps(where: str, key_file: Path | None) -> Iterator[Maps]:
-    """The map on the way of a server, or all of a map at once."""
+    """The tiles around the vehicle of a server's map, or a whole map from a file or store."""
     from mapvote.live.drive import OneMap
     from mapvote.live.road_map import RoadMap
 
@@ -181,7 +199,7 @@ def _maps(where: str, key_file: Path | None) -> Iterator[Maps]:
 
 @contextmanager
 def _outbox(vehicle: str, url: str | None, folder: Path | None, key: str | None) -> Iterator[Outbox]:
-    """Where ballots wait, until what can be sent now was sent."""
+    """The outbox of the ballots; at its end it sends what can be sent now."""
     from mapvote.config import cache_folder
     from mapvote.live.outbox import Outbox
 
@@ -210,11 +228,13 @@ def _said(vehicle: str, live: LiveDrive | None, hearing: Hearing) -> str:
 
 
 def autoware(
-    url: Annotated[str, typer.Argument(metavar="URL", help="the server")],
-    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="kept as the newest map, in Autoware's tiles")],
+    url: Annotated[str, typer.Argument(metavar="URL", help="the server with the map")],
+    folder: Annotated[
+        Path, typer.Argument(metavar="FOLDER", help="folder that is kept at the newest version, in Autoware's tiles")
+    ],
     projector: Projector = None,
-    keep: Annotated[int, typer.Option(min=0, metavar="N", help="older versions whose tiles stay")] = 3,
-    every: Annotated[float, typer.Option(min=0.1, metavar="SECONDS", help="how often to ask")] = 5.0,
+    keep: Annotated[int, typer.Option(min=0, metavar="N", help="number of older versions whose tiles stay")] = 3,
+    every: Annotated[float, typer.Option(min=0.1, metavar="SECONDS", help="seconds between two requests")] = 5.0,
     key_file: KeyFile = None,
     domain: Domain = None,
 ) -> None:

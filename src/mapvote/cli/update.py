@@ -37,9 +37,9 @@ def update(
 ) -> None:
     """Fuse ballots offline and edit the map: add, delete, keep.
 
-    A change needs a majority of the vehicles that determined the cell, and --min-votes of them: by default as many as
-    the settings say, but one where the ballots were cast by the paper's rule. With --false-deletions a cell keeps its
-    points, and is told of, while deleting something that stands there is likelier than that.
+    A change needs a majority of the vehicles that determined the cell, and at least --min-votes of them. The default is
+    that of the settings, or 1 for ballots of the paper's rule. With --false-deletions P a cell keeps its points, and is
+    listed, while the probability that emptying it deletes something that stands is above P.
 
         mapvote update my_map car_1.ballot car_2.ballot --out my_map_updated
     """
@@ -51,7 +51,7 @@ def update(
     from mapvote.fusion.offline import update_map
 
     if out is None and not dry_run:
-        raise MapvoteError("update: say where the updated map goes (--out MAP), or --dry-run to only look")
+        raise MapvoteError("update: give --out MAP, or --dry-run to only report")
     ballots = []
     for file in ballot_files:
         try:
