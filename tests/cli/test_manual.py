@@ -124,3 +124,11 @@ def test_square_brackets_of_files_survive_in_tables_too(capsys: pytest.CaptureFi
     print_table(("of [las]",), [["a[bold]b"]], title="street[las]")
     shown = capsys.readouterr().out
     assert all(word in shown for word in ("of [las]", "a[bold]b", "street[las]"))
+
+
+def test_a_table_in_a_pipe_has_one_line_a_row(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("COLUMNS", raising=False)
+    print_table(("first", "second"), [["a " * 80, "b " * 80]])
+    assert len(capsys.readouterr().out.splitlines()) == 5

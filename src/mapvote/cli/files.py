@@ -11,7 +11,7 @@ import typer
 from mapvote.cli.door import api_at, is_store, is_url, key_in, map_at, opened_store, when
 from mapvote.cli.looks import look_at_points
 from mapvote.cli.options import DRIVE, MAP, KeyFile, Projector, Rate, Topic, with_drive_options
-from mapvote.cli.terminal import print_table, stages_that_vanish, waiting
+from mapvote.cli.terminal import print_table, show_table, stages_that_vanish, waiting
 
 if TYPE_CHECKING:
     from mapvote.client import MapClient
@@ -72,9 +72,8 @@ def info(
     table.add_column(overflow="fold")
     for name, value in rows:
         table.add_row(Text(name), Text(value))
-    console = Console(highlight=False)
-    console.print(Text(f"{path}: {title}", style="bold"), soft_wrap=True)
-    console.print(table)
+    Console(highlight=False).print(Text(f"{path}: {title}", style="bold"), soft_wrap=True)
+    show_table(table)
 
 
 def _readable(value: int | str) -> str:

@@ -7,6 +7,7 @@ from typing import Annotated
 import typer
 
 from mapvote.cli.options import SETUP, Config
+from mapvote.cli.terminal import show_table
 
 
 def register(app: typer.Typer) -> None:
@@ -47,7 +48,6 @@ def config(
         mapvote config --toml > settings.toml
     """
     import tomli_w
-    from rich.console import Console
     from rich.table import Table
     from rich.text import Text
 
@@ -68,6 +68,5 @@ def config(
             row = (f"{section}.{key}", str(getattr(values, key)), source, field.description or "")
             table.add_row(*(Text(cell) for cell in row), style=style)
         table.add_section()
-    console = Console()
-    console.print(table)
-    console.print(f"Digest {settings.digest()[:16]}: ballots of one round must agree on it.", highlight=False)
+    show_table(table)
+    print(f"Digest {settings.digest()[:16]}: ballots of one round must agree on it.")

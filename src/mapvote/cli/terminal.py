@@ -14,6 +14,9 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from rich.progress import TaskID
+    from rich.table import Table
+
+_ANY_WIDTH = 10_000
 
 
 def complain(message: str) -> None:
@@ -26,9 +29,7 @@ def complain(message: str) -> None:
 
 
 def print_table(headings: Iterable[str], rows: Iterable[Iterable[str]], title: str | None = None) -> None:
-    """A table on stdout. In a terminal, text that does not fit is folded, never cut. In a pipe or a file each row is
-    one line, however wide."""
-    from rich.console import Console
+    """A table of plain text on stdout, see :func:`show_table`."""
     from rich.table import Table
     from rich.text import Text
 
@@ -37,9 +38,18 @@ def print_table(headings: Iterable[str], rows: Iterable[Iterable[str]], title: s
         table.add_column(Text(heading), overflow="fold")
     for row in rows:
         table.add_row(*(Text(cell) for cell in row))
+    show_table(table)
+
+
+def show_table(table: Table) -> None:
+    """A table on stdout. In a terminal, text that does not fit is folded, never cut. In a pipe or a file each row is
+    one line, however wide."""
+    from rich.console import Console
+
     console = Console()
     if not console.is_terminal and "COLUMNS" not in os.environ:
-        console.width = max(console.measure(table).maximum, 1)
+        console.width = _ANY_WIDTH
+        console.width = console.measure(table).maximum
     console.print(table)
 
 
