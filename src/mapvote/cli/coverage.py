@@ -40,10 +40,10 @@ def coverage(
         found = server.ask_json("GET", "/v1/coverage/passes")
     rows = []
     for feature in found["features"][:most]:
-        told, line = feature["properties"], feature["geometry"]["coordinates"]
+        about, line = feature["properties"], feature["geometry"]["coordinates"]
         ends = [f"({x:.0f}, {y:.0f})" for x, y in (line[0], line[-1])]
-        counts = (str(told[what]) for what in ("cells", "built", "gone"))
-        rows.append((f"{told['row']},{told['col']}", f"{told['heading_deg']}°", *ends, *counts))
+        counts = (str(about[what]) for what in ("cells", "built", "gone"))
+        rows.append((f"{about['row']},{about['col']}", f"{about['heading_deg']}°", *ends, *counts))
     if rows:
         print_table(("tile", "heading", "from (x, y), m", "to", "cells", "built", "gone"), rows, "One more pass")
     else:

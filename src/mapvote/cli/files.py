@@ -199,7 +199,7 @@ def import_map(
     print(f"{out}: {point_map.n_points} points in {len(point_map.tiles)} tiles, map {point_map.map_id}")
     for line in told:
         print(line)
-    print("known-free columns: none yet; the fleet's drives will teach them")
+    print("known-free columns: none yet; each published version adds those that the fleet's drives saw")
 
 
 def export(

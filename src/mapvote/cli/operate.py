@@ -127,12 +127,12 @@ def publish(
         _print_outcome(server.ask_json("POST", "/v1/publish", json=ask), dry_run)
 
 
-def _print_outcome(told: Mapping[str, Any], dry_run: bool) -> None:
-    what = "published" if told["published"] else "dry run" if dry_run else "nothing changed"
-    tiles = f" in tiles {'; '.join(told['tiles'])}" if told["tiles"] else ""
-    changed = f"{told['points_added']} points added, {told['points_deleted']} deleted"
-    print(f"version {told['version']} ({what}): {changed}{tiles}")
-    for reason in told["held"]:
+def _print_outcome(answer: Mapping[str, Any], dry_run: bool) -> None:
+    what = "published" if answer["published"] else "dry run" if dry_run else "nothing changed"
+    tiles = f" in tiles {'; '.join(answer['tiles'])}" if answer["tiles"] else ""
+    changed = f"{answer['points_added']} points added, {answer['points_deleted']} deleted"
+    print(f"version {answer['version']} ({what}): {changed}{tiles}")
+    for reason in answer["held"]:
         print(f"hold: {reason}")
 
 
@@ -170,9 +170,11 @@ def policy(
         raise MapvoteError("policy: give KEY=VALUE, e.g. fuse.min_votes=3; without values the policy is shown")
     ask = {"values": {key: value for key, _, value in pairs}, "reason": reason}
     with api_at(store, key_file) as server:
-        told = server.ask_json("PATCH", "/v1/policy", json=ask) if pairs else server.ask_json("GET", "/v1/policy")
-    print(f"policy of {when(told['at_ns'])} by {told['by']}" + (f": {told['reason']}" if told["reason"] else ""))
-    for section, entries in told["policy"].items():
+        answer = server.ask_json("PATCH", "/v1/policy", json=ask) if pairs else server.ask_json("GET", "/v1/policy")
+    print(
+        f"policy of {when(answer['at_ns'])} by {answer['by']}" + (f": {answer['reason']}" if answer["reason"] else "")
+    )
+    for section, entries in answer["policy"].items():
         for key, value in entries.items():
             print(f"{section}.{key}={value}")
 
@@ -229,14 +231,14 @@ def log(
     _write_changes(found, out)
 
 
-def _print_versions(told: Mapping[str, Any]) -> None:
+def _print_versions(answer: Mapping[str, Any]) -> None:
     rows = []
-    for v in told["versions"]:
+    for v in answer["versions"]:
         origin = v["target"] if v["target"] is not None else v["parent"]
         made = v["kind"], str(origin or ""), when(v["created_ns"]), v["published_by"], v["reason"]
         rows.append((str(v["number"]), *made))
     print_table(("version", "kind", "from", "when", "by", "reason"), rows)
-    for event in told["events"]:
+    for event in answer["events"]:
         print(f"{event['seq']} {when(event['at_ns'])} {event['kind']} {event['actor']} {event['detail']}")
 
 
@@ -272,13 +274,13 @@ def explain(
     mapvote explain fleet.db 12.5 -- -3.0
     """
     with api_at(store, key_file) as server:
-        told = server.ask_json("GET", f"/v1/cells?x={x}&y={y}")
-    print(f"cell {told['row']}, {told['col']}: {told['thing'] or 'empty'}")
-    for decision in told["decisions"]:
+        answer = server.ask_json("GET", f"/v1/cells?x={x}&y={y}")
+    print(f"cell {answer['row']}, {answer['col']}: {answer['thing'] or 'empty'}")
+    for decision in answer["decisions"]:
         print(f"version {decision['version']} decided {decision['state']}")
-    if told.get("probability") is not None:
-        print(f"probability that the last decision is right: {told['probability']:.2f}")
-    for v in told["votes"]:
+    if answer.get("probability") is not None:
+        print(f"probability that the last decision is right: {answer['probability']:.2f}")
+    for v in answer["votes"]:
         sure = "" if v.get("sure") is None else f", {100 * v['sure']:.0f} % sure"
         ended = v["end"][:19].replace("T", " ") + "Z"
         counted = ", ".join(str(number) for number in v["counted_in"])
@@ -376,8 +378,8 @@ def check(
 
     if other is None:
         with api_at(store, key_file) as server, waiting("reading every byte"):
-            told = server.ask_json("POST" if mend else "GET", "/v1/check")
-        found = [Damage(**damage) for damage in told["damage"]]
+            answer = server.ask_json("POST" if mend else "GET", "/v1/check")
+        found = [Damage(**damage) for damage in answer["damage"]]
     elif is_url(store):
         raise MapvoteError("check: --from takes a STORE, on the machine where it is")
     else:

@@ -51,9 +51,9 @@ async def whole_desk(request: Request, format: Places = "json") -> Response:
     found = await _look(request)
     left_out = [verdict_of(one) for one in found.reviewed]
     if format == "json":
-        told = {"version": found.version, "held": found.held, "pending": found.pending}
+        answer = {"version": found.version, "held": found.held, "pending": found.pending}
         tiles = {tile_key(index): _hashes(*made) for index, made in found.edited.items()}
-        return as_json(told | {"waiting": found.waiting, "reviewed": left_out, "tiles": tiles})
+        return as_json(answer | {"waiting": found.waiting, "reviewed": left_out, "tiles": tiles})
     listed = found.pending | {"features": [*found.pending["features"], *found.waiting, *left_out]}
     return as_json(listed) if format == "geojson" else as_table([_flat(row) for row in feature_rows(listed)])
 

@@ -51,10 +51,10 @@ async def listen(
     if start is None:
         start = await to_thread.run_sync(newest_event, parts.store, limiter=parts.threads.fetching)
     headers = {"Cache-Control": "no-store", "X-Accel-Buffering": "no"}
-    return StreamingResponse(_told(request, parts, start, named), media_type="text/event-stream", headers=headers)
+    return StreamingResponse(_stream(request, parts, start, named), media_type="text/event-stream", headers=headers)
 
 
-async def _told(request: Request, parts: Services, seq: int, named: bool) -> AsyncIterator[bytes]:
+async def _stream(request: Request, parts: Services, seq: int, named: bool) -> AsyncIterator[bytes]:
     yield b": listening\n\n"
     silent = 0.0
     while not parts.stopping.is_set() and not await request.is_disconnected():

@@ -177,13 +177,13 @@ def changes_page(
 def cell(request: Request, x: float, y: float) -> Response:
     """What each ballot says about the cell at (x, y), map metres, whether it counts, and what each version decided."""
     parts = services(request)
-    told, known = story_as_json(explain_cell(parts.store, x, y)), sees_names(request)
-    shown = {} if known else pseudonyms(parts.store, {vote["vehicle"] for vote in told["votes"]})
-    for vote in told["votes"]:
+    answer, known = story_as_json(explain_cell(parts.store, x, y)), sees_names(request)
+    shown = {} if known else pseudonyms(parts.store, {vote["vehicle"] for vote in answer["votes"]})
+    for vote in answer["votes"]:
         vote["end"] = iso(seen(vote.pop("end_ns"), known))
         if not known:
             vote |= {"vehicle": shown[vote["vehicle"]], "drive": ""}
-    return as_json(told)
+    return as_json(answer)
 
 
 @router.get(
@@ -196,13 +196,13 @@ def fresh(request: Request, format: Places = "json") -> Response:
     """When a vehicle last passed each tile, and the number of vehicles with standing ballots there."""
     store = services(request).store
     tiles, known = coverage(store), sees_names(request)
-    told = [
+    answer = [
         {name: t[name] for name in ("row", "col", "vehicles")} | {"last_seen": iso(seen(t["last_seen_ns"], known))}
         for t in tiles
     ]
     if format == "csv":
-        return as_table(told)
-    return as_json(tile_squares(told, store.lattice) if format == "geojson" else {"tiles": told})
+        return as_table(answer)
+    return as_json(tile_squares(answer, store.lattice) if format == "geojson" else {"tiles": answer})
 
 
 @router.get("/v1/coverage/passes", response_model=PlacesAnswer, responses=problems(403), summary="Where to drive next")

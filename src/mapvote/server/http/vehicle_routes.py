@@ -46,7 +46,7 @@ def versions(request: Request, format: Table = "json") -> Response:
         entry = {name: getattr(v, name) for name in ("number", "parent", "kind", "target", "published_by", "reason")}
         listed.append(entry | {"created": iso(v.created_ns), "policy": v.policy})
     if format == "csv":
-        return as_table([{name: told for name, told in entry.items() if name != "policy"} for entry in listed])
+        return as_table([{name: value for name, value in entry.items() if name != "policy"} for entry in listed])
     return as_json({"versions": listed})
 
 

@@ -82,7 +82,7 @@ def examine(data: bytes) -> Incoming:
             raise MapvoteError(
                 f"ballot: larger than {MAX_UNPACKED_BYTES} bytes when decompressed; send a shorter drive"
             )
-        votes.append(_told_by(tile.tile, vote))
+        votes.append(_votes_of(tile.tile, vote))
     cast_by = f"{ballot.method}, {staged(ballot)}"
     return Incoming(ballot, votes, hashlib.sha256(data).hexdigest(), cast_by, len(data))
 
@@ -97,7 +97,7 @@ def sound(sent: Sent) -> Incoming:
     return replace(incoming, key_hash=sent.key_hash)
 
 
-def _told_by(tile: TileIndex, vote: TileVote) -> Votes:
+def _votes_of(tile: TileIndex, vote: TileVote) -> Votes:
     spoken = np.packbits(vote.spoken()).tobytes()
     if vote.new_points is None or not len(vote.new_points):
         return Votes(tile, spoken, None, None)

@@ -85,8 +85,8 @@ class PolicyChange:
 
     def as_json(self) -> dict[str, Any]:
         """The policy, who set it, when and why."""
-        told = {"by": self.by, "at_ns": self.at_ns, "reason": self.reason}
-        return told | {"policy": self.policy.model_dump(mode="json")}
+        entry = {"by": self.by, "at_ns": self.at_ns, "reason": self.reason}
+        return entry | {"policy": self.policy.model_dump(mode="json")}
 
 
 def policy_in(connection: sa.Connection) -> Policy:

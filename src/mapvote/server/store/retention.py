@@ -50,8 +50,8 @@ def clear(store: Store, *, by: str = "operator", dry_run: bool = True) -> Cleare
         found = Cleared(oldest, versions, len(old_planes), len(old_decisions), len(old_ballots), size)
         if dry_run or not (versions or old_planes or old_ballots or old_decisions):
             return found
-        told = f"{versions} versions before {oldest}, {len(old_ballots)} ballots on tiles, {size} bytes"
-        seq = log_event(connection, store.clock(), "cleared", by, told)
+        detail = f"{versions} versions before {oldest}, {len(old_ballots)} ballots on tiles, {size} bytes"
+        seq = log_event(connection, store.clock(), "cleared", by, detail)
         connection.execute(v.update().where(gone).values(cleared_seq=seq))
         _delete(connection, schema.decisions, ("version", "row", "col"), old_decisions)
         _delete(connection, schema.ballot_tiles, ("row", "col", "ballot"), old_ballots)

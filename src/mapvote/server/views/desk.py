@@ -80,7 +80,9 @@ def _desk_of(store: Store, found: Round) -> Desk:
     cells = {o.id: _cells_of(o) for o in objects}
     for feature in pending["features"]:
         mine = cells[feature["id"]]
-        feature["properties"]["verdict"] = next((_told(r) for r, theirs in reviews if _meet(mine, theirs)), None)
+        feature["properties"]["verdict"] = next(
+            (_verdict_json(r) for r, theirs in reviews if _meet(mine, theirs)), None
+        )
     cells |= {f"{_OF_REVIEW}{review.seq}": theirs for review, theirs in reviews}
     left_out = [review for review, _ in reviews if review.verdict != "accepted"]
     edited = {
@@ -121,11 +123,11 @@ def review(
 
 def verdict_of(review: Review) -> dict[str, Any]:
     """A held or rejected change as GeoJSON, in the state of its review, with the verdict."""
-    properties = dict(review.feature["properties"]) | {"verdict": _told(review)}
+    properties = dict(review.feature["properties"]) | {"verdict": _verdict_json(review)}
     return dict(review.feature) | {"id": f"{_OF_REVIEW}{review.seq}", "properties": properties}
 
 
-def _told(review: Review) -> dict[str, Any]:
+def _verdict_json(review: Review) -> dict[str, Any]:
     return {
         "seq": review.seq,
         "verdict": review.verdict,

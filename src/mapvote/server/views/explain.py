@@ -258,10 +258,10 @@ def _vote(
 ) -> CellVote:
     """``versions``: those that counted it, and those that did not and why."""
     whose = stored.vehicle, stored.drive, stored.version
-    told: tuple[str, int | None, float | None] = UNREADABLE, None, None
+    text: tuple[str, int | None, float | None] = UNREADABLE, None, None
     if vote is not None:
-        told = state_name(int(said_by(vote)[cell])), _marks(vote, cell), _sure(vote, cell)
-    return CellVote(*whose, *told, stored.end_ns, not why, why, tuple(versions[0]), tuple(versions[1]))
+        text = state_name(int(said_by(vote)[cell])), _marks(vote, cell), _sure(vote, cell)
+    return CellVote(*whose, *text, stored.end_ns, not why, why, tuple(versions[0]), tuple(versions[1]))
 
 
 def _standings(record: Record) -> Sequence[Standing]:
@@ -300,10 +300,10 @@ def _probability(record: Record, cell: tuple[int, int]) -> float | None:
 def _thing(now: _Now) -> str:
     """Text: what stands in the cell or will, and how many earlier objects stood there, by the votes that count."""
     tile, cell, fuse = now.tile, now.cell, now.asked.settings
-    told = _waits(now)
+    text = _waits(now)
     if tile.obstacle_words[cell]:
         brought = tile.memory is not None and tile.memory.came_s[cell] > 0
-        told.append("stands: brought by vehicles" if brought else "stands: surveyed")
+        text.append("stands: brought by vehicles" if brought else "stands: surveyed")
     stays = 0 if tile.memory is None else int(tile.memory.stays[cell])
     if stays and tile.memory is not None:
         here = np.zeros((TILE_CELLS, TILE_CELLS), dtype=np.bool_)
@@ -311,26 +311,26 @@ def _thing(now: _Now) -> str:
         days = int(tile.memory.stayed_s[cell]) / 86_400 / stays
         expected = float(expected_days(tile.memory, here, 0.0, fuse)[0])
         past = f"{stays} things came and went here, after {days:.1f} days on average"
-        told.append(f"{past}; the next can be expected to stay {expected:.1f}")
-    return "; ".join(told)
+        text.append(f"{past}; the next can be expected to stay {expected:.1f}")
+    return "; ".join(text)
 
 
 def _waits(now: _Now) -> list[str]:
     """Decisions that do not change the map yet, or change it otherwise than voted, with the reason."""
-    found, cell, told = now.decided, now.cell, []
+    found, cell, text = now.decided, now.cell, []
     if found.passing is not None and found.passing[cell]:
-        told.append("temporary: a new object here is not expected to stay, so the map does not take it")
+        text.append("temporary: a new object here is not expected to stay, so the map does not take it")
     elif found.denied is not None and found.denied[cell]:
-        told.append("waits: the last vehicle that looked says otherwise")
+        text.append("waits: the last vehicle that looked says otherwise")
     if found.edits[cell] != found.states[cell]:
-        told.append("unchanged: the cell holds noise of a change in the next cell; its points follow that change")
+        text.append("unchanged: the cell holds noise of a change in the next cell; its points follow that change")
     likely = found.pending.at(cell)
     if likely is not None:
-        told.append(
+        text.append(
             f"pending: the probability that emptying it deletes something that stands is {likely:.2g}, and the policy "
             f"allows {now.asked.settings.false_deletions:g}; the cell is emptied once further votes lower it"
         )
-    return told
+    return text
 
 
 def _marks(vote: TileVote, cell: tuple[int, int]) -> int | None:

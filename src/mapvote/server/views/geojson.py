@@ -168,7 +168,7 @@ def standing_rows(standings: Sequence[VehicleStanding]) -> list[dict[str, Any]]:
 
 
 def _collection(things: Sequence[tuple[dict[str, Any], dict[str, Any]]]) -> dict[str, Any]:
-    features = [{"type": "Feature", "geometry": geometry, "properties": told} for geometry, told in things]
+    features = [{"type": "Feature", "geometry": geometry, "properties": properties} for geometry, properties in things]
     return {"type": "FeatureCollection", "frame": MAP_METRES, "features": features}
 
 

@@ -125,7 +125,7 @@ def changes_between(
                 damaged.append(tile_key(index))
                 continue
             found.append(changed_cells(tiles[0], tiles[1], decided))
-    told = to_geojson(
+    collection = to_geojson(
         [
             replace(thing, first_seen_ns=seen(thing.first_seen_ns, known), last_seen_ns=seen(thing.last_seen_ns, known))
             for thing in change_objects(found, min_cells)
@@ -137,7 +137,7 @@ def changes_between(
         georeference=store.georeference,
         lonlat=lonlat,
     )
-    return told | ({"damaged": damaged} if damaged else {})
+    return collection | ({"damaged": damaged} if damaged else {})
 
 
 def cutouts_between(store: Store, old: int, new: int, found: Mapping[str, Any], most: int = 12) -> list[Cutout]:
