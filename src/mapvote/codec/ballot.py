@@ -63,7 +63,7 @@ class Ballot(msgspec.Struct, frozen=True, kw_only=True):
     base: dict[str, _Hash]
     """Content hash of every tile the votes were cast against, by "row,col"; "" for a tile the map lacked."""
     version: Annotated[int, msgspec.Meta(ge=1, le=(1 << 31) - 1)]
-    """Of the map that the vehicle drove with."""
+    """Version of the map that the vehicle used."""
     vehicle: Id
     drive: Id
     start_ns: int

@@ -31,7 +31,7 @@ class TileHashes(msgspec.Struct, frozen=True, omit_defaults=True, eq=False):
 
     @classmethod
     def none(cls) -> TileHashes:
-        """Of a tile that a version does not have any more."""
+        """The hashes of a tile that a version no longer has."""
         return cls("", "", None)
 
     def shown(self) -> TileHashes:

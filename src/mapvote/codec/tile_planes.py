@@ -118,7 +118,7 @@ def unpack_fields_plane(data: bytes, digest: str, n: int) -> dict[str, NDArray[A
 
 
 def names_in_plane(data: bytes, digest: str) -> list[str]:
-    """What a plane of fields holds."""
+    """The content of a plane of fields."""
     return field_names(check_plane(data, digest), f"tile plane {digest[:12]}")
 
 
@@ -131,7 +131,7 @@ def check_plane(data: bytes, digest: str) -> bytes:
 
 
 def pack_memory(memory: Memory) -> tuple[str, dict[str, bytes]]:
-    """What a tile remembers as (hash, plane by hash)."""
+    """The memory of a tile as (hash, plane by hash)."""
     return _packed(_raw_memory(memory))
 
 
@@ -149,7 +149,7 @@ def _raw_memory(memory: Memory) -> bytes:
 
 
 def unpack_memory_plane(data: bytes, digest: str) -> Memory:
-    """What a tile remembers; MapvoteError if it is not what its hash says."""
+    """The memory of a tile; MapvoteError if it does not match its hash."""
     raw = check_plane(data, digest)
     n, rest = divmod(len(raw), 2 + 4 * PLANES)
     cells = np.cumsum(np.frombuffer(raw, dtype="<u2", count=n), dtype=np.int64)

@@ -69,7 +69,7 @@ class PackedTiles(Mapping[TileIndex, U64]):
             yield self.near(tile), self.overlap(tile, view)
 
     def overlap(self, tile: TileIndex, view: Grid) -> Overlap:
-        """What ``view`` has in common with a tile."""
+        """The overlap of ``view`` and a tile."""
         window = self.lattice.tile(tile)
         rows, cols = window.intersection(view).slices_in(view)
         return Overlap(rows.start, rows.stop, cols.start, cols.stop, view.row0 - window.row0, view.col0 - window.col0)

@@ -19,12 +19,12 @@ class OpenSentence:
     """A sentence, or a silence, that a program has to decide."""
 
     setting: str
-    """Of ``[paper]``."""
+    """Name of the setting in ``[paper]``."""
     section: str
-    """Of the paper."""
+    """Section of the paper."""
     quotation: str
     readings: Mapping[str | int | float, str]
-    """What the setting can be, and what that makes of the sentence; of numbers, those that a sweep tries."""
+    """Value of the setting -> its meaning for the sentence; for numbers, the values that a sweep tries."""
 
 
 OPEN_SENTENCES: tuple[OpenSentence, ...] = (

@@ -17,7 +17,7 @@ from the heap, because between the short-lived arrays of each scan they would fr
 
 
 class Slot(NamedTuple):
-    """Where something lies on a shelf, in bytes."""
+    """The place of an item on a shelf, in bytes."""
 
     start: int
     stop: int
@@ -33,7 +33,7 @@ class Shelf:
         """Bytes in memory and in the file."""
 
     def put(self, data: bytes | memoryview) -> Slot:
-        """Where a copy of ``data`` lies. MapvoteError if it no longer fits into memory, and no file can be written."""
+        """Store a copy of ``data`` and return its place. MapvoteError if memory is full and no file can be written."""
         if self._memory is None:
             self._memory = mmap.mmap(-1, IN_MEMORY)
         start, stop = self._used, self._used + len(data)
@@ -61,7 +61,7 @@ class Shelf:
         return Slot(IN_MEMORY + start, IN_MEMORY + stop)
 
     def read(self, place: Slot) -> bytes:
-        """What lies there."""
+        """The bytes at a place."""
         if place.stop <= IN_MEMORY:
             return b"" if self._memory is None else self._memory[place.start : place.stop]
         assert self._file is not None

@@ -47,7 +47,7 @@ ManifestAnswer = answer_of(Manifest, tiles=dict[str, Planes])  # type: ignore[va
 
 
 class VersionEntry(Answer):
-    """How a version came about."""
+    """The origin of a version."""
 
     number: int
     parent: int | None
@@ -81,13 +81,13 @@ class Stored(Answer):
 
 
 class Withdrawn(Answer):
-    """How many ballots."""
+    """Number of ballots."""
 
     withdrawn: int
 
 
 class Published(Answer):
-    """What a publish did, or would do."""
+    """The result of a publish, or of a dry run."""
 
     version: int
     published: bool
@@ -113,7 +113,7 @@ class Publishes(Answer):
 
 
 class Cancelled(Answer):
-    """How many publishes."""
+    """Number of publishes."""
 
     cancelled: int
 
@@ -125,7 +125,7 @@ class RolledBack(Answer):
 
 
 class VerdictAnswer(Answer):
-    """What a reviewer said of a change."""
+    """A reviewer's verdict on a change."""
 
     seq: int
     verdict: Literal["accepted", "held", "rejected"]
@@ -141,7 +141,7 @@ class VerdictGiven(Answer):
 
 
 class Geometry(Answer):
-    """As RFC 7946 has it."""
+    """A feature collection of RFC 7946."""
 
     type: Literal["Point", "LineString", "Polygon", "MultiPolygon"]
     coordinates: list[Any]
@@ -210,14 +210,14 @@ class _Collection(Answer):
 
 
 class Changes(_Collection):
-    """What differs between two versions."""
+    """The differences between two versions."""
 
     features: list[ChangeFeature]
     damaged: list[str] | None = Field(default=None, description="tiles that cannot be read")
 
 
 class Pending(_Collection):
-    """What a publish would change."""
+    """The changes that a publish would make."""
 
     features: list[PendingFeature]
 
@@ -257,7 +257,7 @@ class Places(Answer):
 
 
 class CellVoteAnswer(Answer):
-    """What one ballot says about a cell."""
+    """One ballot's vote on a cell."""
 
     vehicle: str
     drive: str
@@ -293,7 +293,7 @@ class CoveredTile(Answer):
 
 
 class Coverage(Answer):
-    """Of all tiles of the map and of standing ballots."""
+    """Extent of all tiles of the map and of standing ballots."""
 
     tiles: list[CoveredTile]
 
@@ -314,7 +314,7 @@ class PolicyAnswer(Answer):
 
 
 class Info(Answer):
-    """What is in the store."""
+    """The content of the store."""
 
     map_id: str
     version: int
@@ -354,7 +354,7 @@ class Log(Answer):
 
 
 class Checked(Answer):
-    """What is damaged."""
+    """The damaged items."""
 
     damage: list[Damage]
 

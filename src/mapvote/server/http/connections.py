@@ -29,9 +29,9 @@ class Patience:
     """Time limits in seconds, and the number of connections."""
 
     header_s: float
-    """From the connection, or from the first byte of a later request, to the end of its headers."""
+    """Time from the connection, or from the first byte of a later request, to the end of its headers."""
     body_s: float
-    """From there to the end of its body."""
+    """Time from the end of the headers to the end of the body."""
     answer_s: float
     """For a client that does not take what it asked for."""
     connections: int
@@ -80,7 +80,7 @@ class Connection(asyncio.Protocol):
         self._unread: asyncio.TimerHandle | None = None
         """Runs while the client takes nothing of an answer."""
         self._head: bytearray | None = bytearray()
-        """What has come of a head; None from its end to the end of its request's body."""
+        """Bytes of the head so far; None from its end to the end of its request's body."""
         self._asked = self._answering = False
         self._body_left = self._refused = False
 

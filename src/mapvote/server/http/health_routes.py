@@ -22,7 +22,7 @@ router = APIRouter()
 
 
 def _damaged(store: Store) -> list[str]:
-    """What is in quarantine, "kind name: why"."""
+    """The items in quarantine, as "kind name: why"."""
     with store.database.reading() as connection:
         return [f"{kind} {name}: {why}" for (kind, name), why in sorted(set_aside(connection).items())]
 

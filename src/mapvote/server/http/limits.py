@@ -37,7 +37,7 @@ class Threads:
     fetching: CapacityLimiter = field(default_factory=lambda: CapacityLimiter(4))
     """Manifests and tiles."""
     deciding: CapacityLimiter = field(default_factory=lambda: CapacityLimiter(4))
-    """What takes seconds, as it fuses tiles or reads the whole store: publish, desk, check. No other request waits."""
+    """Threads for slow requests, which fuse tiles or read the whole store: publish, desk, check. Others do not wait."""
 
 
 class RateLimit:

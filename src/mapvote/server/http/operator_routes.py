@@ -252,7 +252,7 @@ def _unless_stopping(parts: Services) -> Iterator[None]:
 
 
 class PolicyAsk(BaseModel):
-    """What to change of the policy."""
+    """Changes of the policy."""
 
     model_config = ConfigDict(extra="forbid")
     values: dict[str, str | int | float | bool] = Field(max_length=100, description="by section.key: fuse.min_votes")
@@ -297,7 +297,7 @@ async def whole(request: Request) -> Response:
 
 @router.post("/v1/check", response_model=Checked, responses=problems(403), summary="Set aside what is damaged")
 async def mend(request: Request) -> Response:
-    """As GET; what is damaged is set aside. Planes are mended on the server's own machine, from a backup."""
+    """As GET; damaged items are also quarantined. Planes are restored on the server's machine, from a backup."""
     by, parts = operator(request), services(request)
     found = await to_thread.run_sync(partial(check, parts.store, mend=True, by=by), limiter=parts.threads.deciding)
     return as_json({"damage": found})

@@ -180,7 +180,7 @@ class Services:
     gate: Gate
     """Compares a version with the one before, before it is published."""
     fusing: Executor
-    """Where tiles are fused."""
+    """The executor that fuses tiles."""
     threads: Threads
     intake: Intake
     writer: Batcher[Incoming, Receipt]

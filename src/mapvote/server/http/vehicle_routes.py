@@ -116,7 +116,7 @@ class BallotRoute(APIRoute):
     """
 
     def get_route_handler(self) -> Callable[[Request], Coroutine[Any, Any, Response]]:
-        """What Starlette calls; see "Custom Request and APIRoute class" in FastAPI's documentation."""
+        """The handler that Starlette calls; see "Custom Request and APIRoute class" in FastAPI's documentation."""
 
         async def handle(request: Request) -> Response:
             return await vote(request, request.path_params["vehicle"], request.path_params["drive"])

@@ -261,7 +261,7 @@ _COUNTED_AGAIN_NS = DAY_NS // 24
 
 @dataclass(frozen=True, slots=True)
 class Quota:
-    """What one vehicle may leave in the store."""
+    """The quota of one vehicle."""
 
     drives_a_day: int
     """Ballots in 24 hours; one that replaces another counts too."""

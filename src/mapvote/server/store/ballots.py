@@ -19,7 +19,7 @@ from mapvote.server.store.store import Store
 
 
 class Votes(NamedTuple):
-    """What admission asks of a ballot's votes on one tile. The unpacked planes themselves are not kept."""
+    """The facts about a ballot's votes on one tile that admission needs. The unpacked planes are not kept."""
 
     tile: TileIndex
     spoken: bytes

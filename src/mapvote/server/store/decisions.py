@@ -40,7 +40,7 @@ REASONS: Mapping[Why, str] = {
 
 
 class Standing(msgspec.Struct, frozen=True, array_like=True):
-    """What became of one ballot on one tile in one version."""
+    """The standing of one ballot on one tile in one version: counted, or why not."""
 
     ballot: int
     """Its ``seq``."""
@@ -51,7 +51,7 @@ class Standing(msgspec.Struct, frozen=True, array_like=True):
     reviewed: bytes = b""
     """Likewise, cells of a change that a reviewer held or rejected."""
     alike: int = 0
-    """Of a copy, the ballot that counted for both."""
+    """For a copy: the ballot that counted for both."""
 
     def why_not(self, cell: int) -> Why:
         """Why it did not count on a flat ``cell``; "" if it did, provided that the ballot speaks of the cell."""
@@ -76,7 +76,7 @@ def cells_in(data: bytes) -> NDArray[np.uint16]:
 
 
 def pack_standings(standings: Iterable[Standing]) -> bytes:
-    """What became of every ballot on a tile, as one blob."""
+    """The standings of all ballots on a tile, as one blob."""
     return compress(msgspec.msgpack.encode(list(standings)), 1)
 
 
@@ -91,7 +91,7 @@ def unpack_standings(data: bytes) -> list[Standing]:
 
 @dataclass(frozen=True)
 class Record:
-    """What one version decided about one tile. Planes are unpacked when asked for; MapvoteError if one is damaged."""
+    """The decision of one version about one tile. Planes are unpacked on demand; MapvoteError if one is damaged."""
 
     version: int
     packed_states: bytes
@@ -111,12 +111,12 @@ class Record:
 
     @cached_property
     def odds(self) -> Odds:
-        """How sure of the changed cells those are who voted for them."""
+        """Log-odds of the changed cells by the vehicles that voted for them."""
         return unpack_agreed(self.packed_odds, self.states)
 
     @cached_property
     def standings(self) -> Sequence[Standing]:
-        """What became of every ballot that stood on the tile, in the order of the ballots."""
+        """The standing of every ballot on the tile, in the order of the ballots."""
         return unpack_standings(self.packed_standings)
 
 

@@ -112,7 +112,7 @@ class Fused:
 
     @classmethod
     def nothing(cls, index: TileIndex, damaged: Sequence[Damage]) -> Fused:
-        """Of a tile that cannot be read."""
+        """The result for a tile that cannot be read."""
         nowhere = np.empty(0, dtype=np.int64)
         return cls(index, b"", b"", 0, 0, 0, 0, None, {}, nowhere, nowhere, 0, None, damaged)
 
@@ -189,7 +189,7 @@ def _fuse(connection: sa.Connection, task: Task, polled: Polled) -> Fused:
 
 
 def _standings(judged: Sequence[Judged], decision: Decision) -> Iterator[Standing]:
-    """What became of every ballot that stood on the tile."""
+    """The standing of every ballot on the tile."""
     copies = {(copy.vehicle, copy.digest): copy for copy in decision.copies}
     seqs = {(one.stored.vehicle, one.stored.digest): one.stored.seq for one in judged}
     for one in judged:
@@ -251,6 +251,6 @@ def fuse_round(tasks: Sequence[Task], database: Database, executor: Executor | N
 
 @lru_cache(maxsize=4)
 def _database(url: str) -> Database:
-    """By the worker's own MAPVOTE_STORE if that is the same database: tasks carry no password."""
+    """Opened by the worker's own MAPVOTE_STORE if that names the same database, because tasks carry no password."""
     own = os.environ.get("MAPVOTE_STORE", "")
     return Database(own if own and address_of(sa.make_url(own)) == url else url)

@@ -100,7 +100,7 @@ def _damaged_row(kind: str, row: Any, key: Sequence[str]) -> Damage:
 
 
 def _ends(connection: sa.Connection) -> Iterator[Damage]:
-    """What was replaced, withdrawn, taken back or cleared was so by an event that there is, and after it came."""
+    """Every row that was replaced, withdrawn or deleted names an existing event that is later than the row itself."""
     b, r, v, e = schema.ballots.c, schema.reviews.c, schema.versions.c, schema.events.c
     for kind, name, came, ended in (
         ("ballot", b.seq, b.seq, b.gone_seq), ("review", r.seq, r.seq, r.gone_seq),
@@ -145,7 +145,7 @@ class Damage:
     """The plane's hash; or ballot, version and tile."""
     why: str
     mended: str = ""
-    """What was done about it; empty: nothing yet."""
+    """The repair; empty: none yet."""
 
     def __str__(self) -> str:
         return f"{self.kind} {self.name}: {self.why}" + (f"; {self.mended}" if self.mended else "")

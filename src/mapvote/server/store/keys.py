@@ -30,7 +30,7 @@ _MOST_DAYS = 36_500
 
 @dataclass(frozen=True, slots=True)
 class Key:
-    """Whose key it is."""
+    """Name of the vehicle or person."""
 
     name: str
     role: str
@@ -51,7 +51,7 @@ def issue(store: Store, name: str, role: Role, *, by: str = "operator", days: fl
 
 
 def put_in(connection: sa.Connection, now: int, name: str, role: Role, by: str, days: float | None = None) -> str:
-    """As :func:`issue`, within a transaction."""
+    """:func:`issue` within a transaction."""
     if not _NAME.fullmatch(name):
         raise MapvoteError(f"{name!r} is no name: 1-64 of letters, digits, dot, underscore, dash")
     if role not in ROLES:
@@ -98,7 +98,7 @@ def revoke(store: Store, name: str, *, by: str = "operator", keep_votes: bool = 
 
 
 def revoke_in(connection: sa.Connection, now: int, name: str, by: str, *, keep_votes: bool = False) -> tuple[int, int]:
-    """As :func:`revoke`, within a transaction."""
+    """:func:`revoke` within a transaction."""
     k = schema.keys
     valid = (k.c.name == name) & k.c.revoked_ns.is_(None) & (k.c.expires_ns.is_(None) | (k.c.expires_ns > now))
     done = connection.execute(k.update().where(valid).values(revoked_ns=now))
@@ -109,7 +109,7 @@ def revoke_in(connection: sa.Connection, now: int, name: str, by: str, *, keep_v
 
 
 def ballots_standing(store: Store, name: str) -> int:
-    """How many ballots of a name stand."""
+    """Number of standing ballots of a name."""
     b = schema.ballots.c
     query = sa.select(sa.func.count()).select_from(schema.ballots).where(b.vehicle == name, b.gone_seq.is_(None))
     with store.database.reading() as connection:
@@ -150,7 +150,7 @@ def hash_of(secret: str) -> str:
 
 
 def pseudonyms(store: Store, names: Collection[str]) -> dict[str, str]:
-    """What vehicles and readers see in the place of each vehicle's name: the same one always, of this store alone."""
+    """The pseudonym of each vehicle for vehicles and readers: constant, and specific to this store."""
     with store.database.reading() as connection:
         secret = connection.execute(sa.select(schema.maps.c.secret)).scalar_one().encode()
     return {name: "vehicle-" + hmac.digest(secret, name.encode(), "sha256").hex()[:10] for name in names}

@@ -20,7 +20,7 @@ from mapvote.server.store.queries import log_event
 
 
 class RoundPolicy(Section):
-    """How the ballots of a round are cast. Others are refused, and those that stand already do not count."""
+    """Method and settings of a round's ballots. Other ballots are refused, and standing ones do not count."""
 
     method: Literal["paper", "surfaces"] = Field(default="surfaces", description="paper or surfaces")
     stage: Literal["one-stage", "two-stage"] = "two-stage"
@@ -48,7 +48,7 @@ class GatePolicy(GateSettings):
 
 
 class KeepPolicy(Section):
-    """What is cleared away (:mod:`mapvote.server.store.retention`)."""
+    """The data that ``gc`` deletes (:mod:`mapvote.server.store.retention`)."""
 
     versions: int = Field(
         default=0, ge=0, le=1_000_000, description="older ones than the last so many may go; 0: none ever"

@@ -50,7 +50,7 @@ from mapvote.server.store.store import Store
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What a publish did, or would do."""
+    """The result of a publish, or of a dry run."""
 
     version: int
     """The new version, or the current one if nothing was published."""
@@ -72,7 +72,7 @@ def preview(
     gate: Gate | None = None,
     executor: Executor | None = None,
 ) -> Outcome:
-    """What :func:`publish` would do now. Nothing is written."""
+    """The result of :func:`publish` if it ran now. Nothing is written."""
     return _outcome(store, _round(store, store.clock(), settings, parent, executor), gate)
 
 

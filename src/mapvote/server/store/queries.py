@@ -56,7 +56,7 @@ def oldest_kept(connection: sa.Connection) -> int:
 
 
 def shows_in_kept(oldest: int) -> sa.ColumnElement[bool]:
-    """Of a row of version_tiles: whether a version from ``oldest`` on has the tile as it says."""
+    """For a row of version_tiles: whether a version from ``oldest`` on shows that tile."""
     t, later = schema.version_tiles, schema.version_tiles.alias()
     same = (later.c.row == t.c.row) & (later.c.col == t.c.col) & (later.c.version > t.c.version)
     hidden = sa.exists().where(same, later.c.version <= oldest)
@@ -86,12 +86,12 @@ def tile_of(connection: sa.Connection, number: int, index: TileIndex) -> TileHas
 
 
 def _hashes(row: Any) -> TileHashes:
-    """Of a row of version_tiles."""
+    """The hashes of a row of version_tiles."""
     return TileHashes(**{plane: getattr(row, plane) for plane in schema.TILE_PLANES})
 
 
 def points_of(connection: sa.Connection, tiles: Mapping[TileIndex, TileHashes]) -> dict[TileIndex, int]:
-    """How many points each tile holds, as their planes say at their beginning: none is unpacked."""
+    """Number of points of each tile, read from the head of its plane: no plane is unpacked."""
     b, found = schema.blobs.c, dict[str, int]()
     digests = sorted({hashes.points for hashes in tiles.values()})
     for start in range(0, len(digests), MOST_ASKED):
@@ -102,7 +102,7 @@ def points_of(connection: sa.Connection, tiles: Mapping[TileIndex, TileHashes]) 
 
 
 def memory_of(connection: sa.Connection, number: int, index: TileIndex) -> Memory | None:
-    """What is remembered of a place as of a version, also where the map has no tile any more."""
+    """The memory of a place as of a version, also where the map has no tile any more."""
     row = _TILE.ask(connection, row=index[0], col=index[1], number=number).one_or_none()
     return None if row is None or row.memory is None else load_memory(connection, row.memory)
 
@@ -153,7 +153,7 @@ def tile_as_of(connection: sa.Connection, window: Grid, number: int) -> Tile:
 
 
 def load_memory(connection: sa.Connection, digest: str) -> Memory:
-    """What a tile remembers, by its hash."""
+    """The memory of a tile, by its hash."""
     return unpack_memory_plane(load_blob(connection, digest), digest)
 
 
@@ -215,7 +215,7 @@ def version_row(version: Version) -> dict[str, Any]:
 
 
 def set_tiles(connection: sa.Connection, number: int, tiles: Mapping[TileIndex, TileHashes]) -> None:
-    """What a version sets: the rows of version_tiles."""
+    """The tiles that a version sets: rows of version_tiles."""
     rows = [(number, *i, *(getattr(h, plane) or None for plane in schema.TILE_PLANES)) for i, h in tiles.items()]
     if rows:
         insert_rows(connection, schema.version_tiles, rows)
@@ -247,7 +247,7 @@ class Version:
 
 
 VERSION_COLUMNS = [column for column in schema.versions.c if column.name != "sum"]
-"""What a :class:`Version` is made of."""
+"""The columns of a :class:`Version`."""
 _ONE_BY_ONE = 200
 """So many tiles are sooner asked for one by one than found among all of the map's."""
 _T = schema.version_tiles

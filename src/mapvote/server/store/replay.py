@@ -40,7 +40,7 @@ class _State:
     root: int
     edited: Mapping[TileIndex, Tile] = field(default_factory=dict)
     absent: frozenset[TileIndex] = frozenset()
-    """Of the edited tiles those that the map does not have: they only remember."""
+    """Edited tiles that the map does not have: they hold memory only."""
 
 
 @dataclass(slots=True)
@@ -48,10 +48,10 @@ class _History:
     """The versions gone through again so far."""
 
     out: Mapping[str, int]
-    """Who is left out, up to which version: who was taken out before speaks again after that."""
+    """Excluded vehicles, each with the version before which it is excluded: later votes count again."""
     states: dict[int, _State]
     misread: dict[TileIndex, dict[int, Bool]] = field(default_factory=dict)
-    """By tile and version, the cells that were otherwise when vehicles drove with it."""
+    """By tile and version, the cells that differed in the map that the vehicles used."""
 
 
 def replay(

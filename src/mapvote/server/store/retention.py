@@ -103,7 +103,7 @@ def _ballots(connection: sa.Connection, oldest: int) -> list[Any]:
 
 
 def _longest_window_days(connection: sa.Connection, oldest: int) -> float:
-    """By the policy that holds, and those by which the versions that are left would be made again."""
+    """The largest window of the present policy and of the policies of all kept versions."""
     v = schema.versions
     made_by = connection.execute(sa.select(v.c.policy).where(v.c.number >= oldest, v.c.kind == "publish")).scalars()
     policies = [policy_in(connection), *(Policy.model_validate(one) for one in made_by)]

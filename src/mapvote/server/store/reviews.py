@@ -1,4 +1,4 @@
-"""What people decide about a change before it is published: accept, hold, reject, and take it back.
+"""Verdicts of reviewers on a change before it is published: accept, hold, reject, and undo.
 
 Nothing is overwritten: a review that is taken back or replaced is marked with the event that did so.
 """

@@ -35,7 +35,7 @@ from mapvote.server.store.votes import Electorate, electorate_now, next_ripe_ns,
 
 
 def hold_reasons(changed: Sequence[Fused], settings: FuseSettings) -> list[str]:
-    """What the policy says against publishing these tiles."""
+    """The policy's reasons against publishing these tiles."""
     reasons = []
     for fused in changed:
         name = f"tile {tile_key(fused.index)}"
@@ -89,12 +89,12 @@ _WITHOUT_EFFECT = "held back", "copy", "key issued"
 
 @dataclass(frozen=True, slots=True, eq=False, weakref_slot=True)
 class Round:
-    """What every tile comes to, as of one event."""
+    """The decision of every tile, as of one event."""
 
     newest: Version
     asked: Electorate
     until_ns: int | None
-    """When the next vote reaches the minimum age; None: votes need none, or all have it."""
+    """Time at which the next vote reaches the minimum age; None: there is no minimum, or all votes have reached it."""
     decided: Mapping[TileIndex, Fused]
     """Tiles that may differ from what they were when they were last fused: a publish decides these."""
     beside: Mapping[TileIndex, Fused]

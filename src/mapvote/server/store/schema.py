@@ -63,7 +63,7 @@ def is_sound(table: sa.Table, row: Any) -> bool:
 
 @cache
 def _parts_of(table: sa.Table) -> Callable[[Any], tuple[Any, ...]]:
-    """What takes the values of the sum's columns, two or more, from a row."""
+    """A function that takes the values of the sum's columns, two or more, from a row."""
     return operator.attrgetter(*summed(table))
 
 
@@ -243,7 +243,7 @@ paths = sa.Table(
     sa.Column("path", sa.LargeBinary, nullable=False),
     sum_over("ballot", "path"),
 )
-"""Where vehicles drove, of ballots that say so (codec/path.py)."""
+"""Paths of vehicles, for ballots that contain one (codec/path.py)."""
 
 decisions = sa.Table(
     "decisions",
@@ -274,7 +274,7 @@ reviews = sa.Table(
     sa.Column("feature", sa.JSON, nullable=False),
     sum_over("seq", "verdict", "comment", "feature"),
 )
-"""What reviewers decided about a change, ``feature`` as they saw it; ``gone_seq``: the event that took it back."""
+"""Verdicts of reviewers. ``feature``: the change as they saw it; ``gone_seq``: the event that undid the verdict."""
 
 review_cells = sa.Table(
     "review_cells",
@@ -296,7 +296,7 @@ quarantine = sa.Table(
     sa.Column("seq", sa.BigInteger, sa.ForeignKey("events.seq"), nullable=False),
     sa.Column("why", sa.String(200), nullable=False),
 )
-"""What is damaged and takes no part: planes by hash, ballots and decisions by number and tile."""
+"""Damaged items, which are not used: planes by hash, ballots and decisions by number and tile."""
 
 deliveries = sa.Table(
     "deliveries",

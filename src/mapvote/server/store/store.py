@@ -143,7 +143,7 @@ class Store:
         self.database.close()
 
     def policy(self) -> Policy:
-        """What holds now."""
+        """The present policy."""
         with self.database.reading() as connection:
             return policy_in(connection)
 

@@ -33,7 +33,7 @@ from mapvote.server.store.queries import Version
 
 @dataclass(frozen=True, slots=True)
 class Electorate:
-    """Whose votes are asked for: standing at ``mark``, received by ``received_by_ns``, not of ``without``."""
+    """The votes that count: standing at ``mark``, received by ``received_by_ns``, not of vehicles ``without``."""
 
     mark: int
     policy: Policy
@@ -44,12 +44,12 @@ class Electorate:
 
     @property
     def settings(self) -> FuseSettings:
-        """How many votes are enough, and which are in the window."""
+        """The quorum, and the window of votes."""
         return self.policy.fuse
 
     @classmethod
     def of(cls, version: Version, without: Collection[str] = (), set_aside: Collection[str] = ()) -> Electorate:
-        """Whose votes a version asked for, by the policy that it was made by."""
+        """The votes that counted in a version, by the policy of that version."""
         policy = Policy.model_validate(version.policy)
         received_by_ns = version.created_ns - round(policy.fuse.min_age_s * 1e9)
         return cls(version.mark, policy, received_by_ns, without, set_aside)
@@ -93,14 +93,14 @@ _REVIEWS_ON = (
 
 @dataclass(frozen=True, slots=True)
 class Polled:
-    """What stands on some tiles, each read by one statement for all of them."""
+    """Standing votes, reviews and damage on some tiles, each read by one statement."""
 
     standing: Mapping[TileIndex, Sequence[StoredVote]]
     """Ballots, in the order in which they came."""
     bars: Mapping[TileIndex, Sequence[tuple[int | None, Bool]]]
     """(event, cells (256, 256)) of changes that reviewers rejected then, or hold: None."""
     rows: Rows
-    """Of the votes that count there."""
+    """Sequence numbers of the votes that count there."""
 
 
 def poll(connection: sa.Connection, row: int, cols: Sequence[int], asked: Electorate) -> Polled:
@@ -176,7 +176,7 @@ def electorate_now(
 
 
 def next_ripe_ns(connection: sa.Connection, asked: Electorate) -> int | None:
-    """When the next standing ballot reaches the policy's minimum age; None if there is no such age, or none waits."""
+    """Time at which the next standing ballot reaches the policy's minimum age; None if no ballot waits for it."""
     age_ns = round(asked.settings.min_age_s * 1e9)
     if age_ns == 0:
         return None
@@ -201,7 +201,7 @@ def counting_votes(connection: sa.Connection, tile: Tile, asked: Electorate) -> 
 
 
 def counted_votes(connection: sa.Connection, tile: Tile, asked: Electorate) -> list[tuple[StoredVote, TileVote]]:
-    """As :func:`counting_votes`, each beside its ballot."""
+    """:func:`counting_votes`, each with its ballot."""
     return [(one.stored, one.vote) for one in judged_on(connection, tile, asked) if one.vote is not None]
 
 
@@ -305,7 +305,7 @@ _PLANES_OF = _PLANES_OF.where(
     _T.c.ballot.in_(sa.bindparam("ballots", expanding=True)),
 )
 Rows = Mapping[tuple[int, int, int], Any]
-"""By tile and ballot, what is stored of its planes."""
+"""The stored planes of a vote, by tile and ballot."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -321,7 +321,7 @@ class StoredVote:
     digest: str
     base: str
     version: int
-    """Of the map that its vehicle drove with."""
+    """Version of the map that its vehicle used."""
     settings_hash: str
     cast_by: str
 
@@ -353,18 +353,18 @@ class Remembered:
                 self.bytes -= self._votes.popitem(last=False)[1].nbytes
 
     def clear(self) -> None:
-        """As a process that has just begun."""
+        """Forget everything, as in a new process."""
         with self._lock:
             self._votes.clear()
             self.bytes = 0
 
 
 remembered = Remembered(REMEMBERED_BYTES)
-"""What this process unpacked."""
+"""The cache of this process."""
 
 
 def read_rows(connection: sa.Connection, row: int, votes: Sequence[tuple[int, StoredVote]]) -> Rows:
-    """What is stored of votes on tiles of a ``row``, each beside its column."""
+    """The stored votes on tiles of a ``row``, each with its column."""
     found: dict[tuple[int, int, int], Any] = {}
     cols, ballots = sorted({col for col, _ in votes}), sorted({vote.seq for _, vote in votes})
     for start in range(0, len(ballots), MOST_ASKED):

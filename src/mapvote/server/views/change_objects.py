@@ -94,7 +94,7 @@ class ChangeObject:
     longest_m: float
     """The longer side of the box around the longest of its connected pieces."""
     width_m: float
-    """Of the widest of its connected pieces: the width of the narrowest gate that it fits through."""
+    """Width of its widest connected piece: of the narrowest gate that the piece fits through."""
     height_m: float
     volume_m3: float
     """Sum over its columns, each from the lowest to the highest voxel that was added or deleted."""

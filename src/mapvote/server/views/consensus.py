@@ -74,7 +74,7 @@ class VehicleStanding:
     p_value: float
     """Chance of as many objects or more if its rate were ``tolerated`` times that of the others; not yet adjusted."""
     threshold: float
-    """What ``p_value`` had to stay below: the significance shared out among the vehicles tested (Bonferroni)."""
+    """Upper limit of ``p_value``: the significance divided by the number of vehicles tested (Bonferroni)."""
     evidence: tuple[Contradiction, ...]
     """Largest first."""
 

@@ -20,7 +20,7 @@ from mapvote.server.views.point_lod import SIDE_M, cloud_bytes, pack
 
 AROUND_M = 10.0
 MOST_POINTS = 60_000
-"""Of one change: half a megabyte."""
+"""Most points of one change: half a megabyte."""
 _MODULES = (
     "vendor/three.core.min.js",
     "vendor/three.module.min.js",
@@ -44,7 +44,7 @@ class Cutout:
     """Lower-left corner, map metres."""
     y: float
     box: Box
-    """Of the change itself."""
+    """Bounds of the change itself."""
     height_m: float
     clouds: Mapping[str, bytes]
     """kept, removed and added, each as :func:`mapvote.server.views.point_lod.cloud_bytes`."""

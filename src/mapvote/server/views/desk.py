@@ -48,15 +48,15 @@ class Desk:
     reviewed: list[Review]
     """Held and rejected changes, which a publish leaves out."""
     cells: Mapping[str, Mapping[TileIndex, Bool]]
-    """Of every change by its id."""
+    """The cells of every change, by the change's id."""
     edited: Mapping[TileIndex, tuple[TileHashes, Tile]]
     """Tiles as a publish would make them."""
     clouds: bytes
-    """Points that would come and go, as :meth:`mapvote.server.views.point_lod.Clouds.changed` gives them."""
+    """Points that would be added and deleted, as :meth:`mapvote.server.views.point_lod.Clouds.changed` gives them."""
 
 
 _desks: WeakKeyDictionary[Round, Desk] = WeakKeyDictionary()
-"""Of the rounds that are still kept."""
+"""Desks of the rounds that are kept."""
 
 
 def desk(store: Store, executor: Executor | None = None, gate: Gate | None = None) -> Desk:

@@ -53,7 +53,7 @@ ENDED = {
     "withdraw": "withdrawn",
     "key revoked": "its vehicle's key was revoked",
 }
-"""By the kind of the event that ended a ballot."""
+"""Reasons by the kind of the event that ended a ballot."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,7 +66,7 @@ class LeftOut:
 
 @dataclass(frozen=True, slots=True)
 class CellDecision:
-    """What a version decided of a cell."""
+    """The decision of one version about a cell."""
 
     version: int
     state: str
@@ -74,12 +74,12 @@ class CellDecision:
 
 @dataclass(frozen=True, slots=True)
 class CellVote:
-    """What one ballot says about a cell. The ballot stands, or a version counted it and it was taken back since."""
+    """One ballot's vote on a cell. The ballot stands, or a version counted it and it was withdrawn since."""
 
     vehicle: str
     drive: str
     version: int
-    """Of the map that the vehicle drove with."""
+    """Version of the map that the vehicle used."""
     state: str
     """Lower case; no_vote where it says nothing."""
     marks: int | None
@@ -124,7 +124,7 @@ class _Now:
     said: Mapping[int, TileVote]
     """The vote of each readable ballot on the tile, by the ballot's ``seq``."""
     decided: Heard
-    """What the next version would decide."""
+    """The decision of the next version, if it were published now."""
 
 
 def explain_cell(store: Store, x: float, y: float) -> CellStory:
@@ -167,8 +167,7 @@ def said_by(vote: TileVote) -> U8:
 def sound_votes(
     connection: sa.Connection, index: TileIndex, ballots: Collection[int]
 ) -> dict[int, tuple[StoredVote, TileVote]]:
-    """What some ballots say of a tile, whether they stand or not, by their ``seq``; without those that are damaged or
-    were cleared away."""
+    """The votes of some ballots on a tile, standing or not, by their ``seq``; without damaged and deleted ones."""
     stored = stored_votes(connection, index, ballots) if ballots else []
     while True:
         try:
@@ -181,7 +180,7 @@ def sound_votes(
 
 
 def _as_of_now(connection: sa.Connection, tile: Tile, cell: tuple[int, int], asked: Electorate) -> _Now:
-    """What stands on a tile, without ballots that cannot be read."""
+    """The standing ballots on a tile, without those that cannot be read."""
 
     def look(asked: Electorate) -> tuple[Electorate, Sequence[Judged], Mapping[int, TileVote]]:
         judged = judged_on(connection, tile, asked)
@@ -225,7 +224,7 @@ def _votes(connection: sa.Connection, now: _Now, records: Sequence[Record]) -> l
 
 
 def _ended(connection: sa.Connection, ballots: Collection[int]) -> dict[int, str]:
-    """What ended some ballots."""
+    """The reason why each of some ballots ended."""
     b, e = schema.ballots.c, schema.events.c
     ends = sa.select(b.seq, e.kind).join(schema.events, e.seq == b.gone_seq).where(b.seq.in_(ballots))
     return {seq: ENDED.get(kind, kind) for seq, kind in connection.execute(ends)}
@@ -280,8 +279,8 @@ def _state_in(record: Record, cell: tuple[int, int]) -> str:
 
 
 def _probability(record: Record, cell: tuple[int, int]) -> float | None:
-    """That the cell changed as the record says; cells of other tiles are not asked for what changed beside it. None if
-    it decided on no change, or on what cannot be read any more."""
+    """Probability that the cell changed as the record states, without the changes in cells of other tiles. None if the
+    record states no change or cannot be read any more."""
     try:
         states, counted = record.states, record.tally[cell].astype(np.int64) // VOTE_UNIT
         odds = record.odds.at(np.array([cell[0] * TILE_CELLS + cell[1]]))

@@ -41,7 +41,7 @@ ABOVE_OFFSET_M = 10.0
 _STEPS = 65535
 _LEAST_Z_STEP_M = 0.002
 _MOST_LAYERS = 512
-"""Of voxels, upwards: beyond, heights count as one."""
+"""Number of voxel layers: all heights above share the last one."""
 _BYTES = "<u4,<u4,<f4,<f4"
 _CLOUD_MAGIC = 0x3143564D
 
@@ -157,7 +157,7 @@ def _pack(points: F32, ground_z: F32, elsewhere: float, z0: float, step: float) 
 
 
 OVERVIEW_POINTS = 150_000
-"""Of an overview at most, 1.2 MB: what a slow connection brings in a second or two."""
+"""Most points of an overview: 1.2 MB, one to two seconds of a slow connection."""
 _SPARE = 4
 """While an overview is made, a tile keeps at most this multiple of its even share: a map of any size fits in memory."""
 _AT_ONCE = 2
@@ -281,7 +281,7 @@ class Clouds:
 
 
 def _drawn(hashes: TileHashes) -> TileHashes:
-    """Of points and ground alone."""
+    """Levels of points and ground only."""
     return TileHashes(hashes.points, hashes.ground, None)
 
 

@@ -1,4 +1,4 @@
-"""What alembic runs: the revisions beside this file, on the connection and within the transaction it is given."""
+"""Run by alembic: the revisions beside this file, on a given connection and within its transaction."""
 
 from alembic import context
 
