@@ -86,6 +86,11 @@ class Ballot(msgspec.Struct, frozen=True, kw_only=True):
     """Where it drove (codec/path.py); None if the ballot does not say."""
     tiles: list[BallotTile]
 
+    @property
+    def stage(self) -> str:
+        """ "two-stage" if the vehicle decided its cells, "one-stage" if it sends its tally."""
+        return "one-stage" if any(tile.tally is not None for tile in self.tiles) else "two-stage"
+
 
 _BALLOT = msgspec.msgpack.Decoder(Ballot)
 """Made when the module is loaded: msgspec makes what it knows of a type at its first use, and the process crashes where

@@ -31,9 +31,7 @@ def check_round(ballots: Sequence[Ballot], point_map: PointMap) -> Rule:
     drives: dict[tuple[str, str], str] = {}
     for ballot in ballots:
         name = f"ballot {ballot.vehicle}/{ballot.drive}"
-        if (ballot.method, ballot.settings_hash) != (first.method, first.settings_hash) or staged(ballot) != staged(
-            first
-        ):
+        if (ballot.method, ballot.stage, ballot.settings_hash) != (first.method, first.stage, first.settings_hash):
             raise MapvoteError(
                 f"{name} was cast by {_method(ballot)}, {first.vehicle}/{first.drive} by {_method(first)}: "
                 "one round never mixes methods; vote again with the same settings"
@@ -61,13 +59,8 @@ def _on_this_tile(ballot: Ballot, index: TileIndex, point_map: PointMap) -> bool
     return older and memory is not None and len(memory.changed_after(ballot.version or 0)) > 0
 
 
-def staged(ballot: Ballot) -> str:
-    """ "two-stage" if the vehicle decided its cells, "one-stage" if it sends its tally."""
-    return "one-stage" if any(tile.tally is not None for tile in ballot.tiles) else "two-stage"
-
-
 def _method(ballot: Ballot) -> str:
-    return f"{ballot.method}, {staged(ballot)}, settings {ballot.settings_hash[:8]}"
+    return f"{ballot.method}, {ballot.stage}, settings {ballot.settings_hash[:8]}"
 
 
 def update_map(

@@ -23,7 +23,6 @@ from mapvote.codec.tile_planes import unpack_ground_plane
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, TileIndex
 from mapvote.core.types import F64, Bool, MapvoteError
 from mapvote.fusion.fuse import rule_of
-from mapvote.fusion.offline import staged
 from mapvote.fusion.tile_vote import DAY_NS, TileVote
 from mapvote.server.errors import Conflict, TooMany, Unauthorised, Unavailable
 from mapvote.server.store import keys, schema
@@ -83,7 +82,7 @@ def examine(data: bytes) -> Incoming:
                 f"ballot: larger than {MAX_UNPACKED_BYTES} bytes when decompressed; send a shorter drive"
             )
         votes.append(_votes_of(tile.tile, vote))
-    cast_by = f"{ballot.method}, {staged(ballot)}"
+    cast_by = f"{ballot.method}, {ballot.stage}"
     return Incoming(ballot, votes, hashlib.sha256(data).hexdigest(), cast_by, len(data))
 
 
