@@ -54,7 +54,7 @@ def topics(
 def play(
     path: Annotated[Path, typer.Argument(metavar="DRIVE|BAG", help="a ROS 2 bag, or a drive in any format")],
     rate: Annotated[float, typer.Option(min=0.01, metavar="N", help="speed, in multiples of the recorded one")] = 1.0,
-    wait: Annotated[float, typer.Option(min=0.0, metavar="SECONDS", help="longest wait for a first reader")] = 60.0,
+    wait: Annotated[float, typer.Option(min=0.0, metavar="SECONDS", help="longest wait for a first reader")] = 600.0,
     loops: Annotated[
         int, typer.Option(min=1, metavar="N", help="send the drive N times, each time with the same stamps")
     ] = 1,
@@ -67,7 +67,9 @@ def play(
     from mapvote.live.dds import Network
     from mapvote.live.play import play as play_drive
 
-    print(f"{path}: {play_drive(path, Network(domain), rate=rate, wait_s=wait, loops=loops)} messages sent")
+    network = Network(domain)
+    print(f"{path}: waits up to {wait:.0f} s for a first reader", flush=True)
+    print(f"{path}: {play_drive(path, network, rate=rate, wait_s=wait, loops=loops)} messages sent")
 
 
 def drive(
