@@ -18,8 +18,8 @@ from mapvote.fusion.tile_vote import TileVote
 
 CE, CO = CellState.CHANGED_EMPTY, CellState.CHANGED_OCCUPIED
 WINDOW = Lattice().tile((0, 0))
-BORDER_M = 30.0
-"""x of a border of cells, between columns 99 and 100."""
+BORDER_M = 32.1
+"""x of a border of cells, between columns 106 and 107."""
 
 
 def wall(x: float, spill: F32 | None = None, length_m: float = 3.0, height_m: float = 3.0) -> F32:
@@ -88,6 +88,16 @@ def test_of_a_wall_that_came_likewise_by_the_points_that_all_vehicles_offer() ->
     assert all_but_the_ends(found, cells_of(beyond))
 
 
+def test_a_wall_in_the_corner_of_a_tile_is_judged_as_anywhere_else() -> None:
+    points = np.concatenate([wall(BORDER_M + 0.04), spill_at(BORDER_M - 0.01)])
+    rows, cols = 133, round(BORDER_M / CELL_SIZE) - 1
+    moved = points - np.array([cols * CELL_SIZE, rows * CELL_SIZE, 0.0], np.float32)
+    assert 0 in cells_of(moved)
+    there, here = (spilled(tile_of(some), [], states_of(some, CE)) for some in (points, moved))
+    assert len(here)
+    assert (here == there - (rows * TILE_CELLS + cols)).all()
+
+
 @pytest.mark.parametrize(
     ("why", "spill"),
     [
@@ -101,9 +111,9 @@ def test_the_cell_beside_a_wall_changed_too_if(why: str, spill: F32) -> None:
 
 
 def test_what_lies_flat_or_stands_alone_spills_nothing() -> None:
-    x, y = np.meshgrid(np.arange(29.91, 30.6, 0.3), np.arange(40.05, 43.0, 0.3))
+    x, y = np.meshgrid(np.arange(BORDER_M - 0.09, BORDER_M + 0.6, 0.3), np.arange(40.05, 43.0, 0.3))
     roof = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, 3.0)]).astype(np.float32)
-    pole = np.column_stack([np.tile([29.98, 30.02, 30.03], 2), np.full(6, 40.1), np.arange(6) * 0.3 + 0.45])
+    pole = np.column_stack([np.tile(BORDER_M + np.array([-0.02, 0.02, 0.03]), 2), np.full(6, 40.1), np.arange(6) * 0.3 + 0.45])
     for points in (roof, pole.astype(np.float32)):
         assert not len(spilled(tile_of(points), [], states_of(points, CE)))
 
@@ -124,7 +134,7 @@ def test_a_wall_whose_other_cell_did_not_change_keeps_what_did() -> None:
 
 def test_ground_that_lies_in_changed_cells_says_nothing_of_them() -> None:
     there, beyond = wall(BORDER_M + 0.04), spill_at(BORDER_M - 0.01)
-    ground = np.column_stack([np.full(10, 29.75), np.arange(10) * 0.3 + 40.15, np.zeros(10)]).astype(np.float32)
+    ground = np.column_stack([np.full(10, BORDER_M - 0.25), np.arange(10) * 0.3 + 40.15, np.zeros(10)]).astype(np.float32)
     points = np.concatenate([there, beyond, ground])
     states = states_of(np.concatenate([there, beyond]), CE)
     assert all_but_the_ends(set(spilled(tile_of(points), [], states).tolist()), cells_of(beyond))
