@@ -121,9 +121,12 @@ def test_what_lies_flat_or_stands_alone_spills_nothing() -> None:
 def test_six_points_make_a_plane_and_five_do_not() -> None:
     there = wall(BORDER_M + 0.03, length_m=0.6, height_m=0.6)
     beyond = np.array([[BORDER_M - 0.01, 40.1, 0.5], [BORDER_M - 0.01, 40.3, 0.5]], np.float32)
-    for some, found in ((beyond, cells_of(beyond)), (beyond[:1], set[int]())):
-        points = np.concatenate([there, some])
-        assert set(spilled(tile_of(points), [], states_of(points, CE)).tolist()) == found
+    corner = np.array([BORDER_M - CELL_SIZE, 133 * CELL_SIZE, 0.0], np.float32)
+    for at in (np.zeros(3, np.float32), corner):
+        for some, found in ((beyond - at, cells_of(beyond - at)), (beyond[:1] - at, set[int]())):
+            points = np.concatenate([there - at, some])
+            assert set(spilled(tile_of(points), [], states_of(points, CE)).tolist()) == found
+    assert 0 in cells_of(beyond - corner)
 
 
 def test_a_wall_whose_other_cell_did_not_change_keeps_what_did() -> None:
