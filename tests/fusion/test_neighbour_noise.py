@@ -113,7 +113,8 @@ def test_the_cell_beside_a_wall_changed_too_if(why: str, spill: F32) -> None:
 def test_what_lies_flat_or_stands_alone_spills_nothing() -> None:
     x, y = np.meshgrid(np.arange(BORDER_M - 0.09, BORDER_M + 0.6, 0.3), np.arange(40.05, 43.0, 0.3))
     roof = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, 3.0)]).astype(np.float32)
-    pole = np.column_stack([np.tile(BORDER_M + np.array([-0.02, 0.02, 0.03]), 2), np.full(6, 40.1), np.arange(6) * 0.3 + 0.45])
+    x_pole = np.tile(BORDER_M + np.array([-0.02, 0.02, 0.03]), 2)
+    pole = np.column_stack([x_pole, np.full(6, 40.1), np.arange(6) * 0.3 + 0.45])
     for points in (roof, pole.astype(np.float32)):
         assert not len(spilled(tile_of(points), [], states_of(points, CE)))
 
@@ -137,8 +138,8 @@ def test_a_wall_whose_other_cell_did_not_change_keeps_what_did() -> None:
 
 def test_ground_that_lies_in_changed_cells_says_nothing_of_them() -> None:
     there, beyond = wall(BORDER_M + 0.04), spill_at(BORDER_M - 0.01)
-    ground = np.column_stack([np.full(10, BORDER_M - 0.25), np.arange(10) * 0.3 + 40.15, np.zeros(10)]).astype(np.float32)
-    points = np.concatenate([there, beyond, ground])
+    ground = np.column_stack([np.full(10, BORDER_M - 0.25), np.arange(10) * 0.3 + 40.15, np.zeros(10)])
+    points = np.concatenate([there, beyond, ground.astype(np.float32)])
     states = states_of(np.concatenate([there, beyond]), CE)
     assert all_but_the_ends(set(spilled(tile_of(points), [], states).tolist()), cells_of(beyond))
 
