@@ -138,7 +138,8 @@ def judge_window(drive: VoxelFacts, occupied: U64, height_m: F32, min_height_m: 
 
     near = ndimage.maximum_filter(went, 2 * REACH_CELLS + 1, mode="constant")
     new: U64 = np.bitwise_or(np.where(mapped, NOTHING, drive.new), np.where(near, beyond, NOTHING))
-    came = enough(new, NEW_A_CELL, occupied & ~gone != 0) & (over_groups(new != 0, drive.balance) >= 0)
+    (balance,) = over_groups(new != 0, drive.balance)
+    came = enough(new, NEW_A_CELL, occupied & ~gone != 0) & (balance >= 0)
     states[new != 0] = CellState.UNDETERMINED
     states[came] = CellState.CHANGED_OCCUPIED
     return WindowStates(states, gone, np.where(stands, gone, NOTHING), new)
@@ -149,20 +150,24 @@ def enough(voxels: U64, a_cell: int, others: Bool) -> Bool:
     cell, or is a thing of its own on the ground, however small: a bollard. It touches none of the ``others``, each of
     its columns begins near the ground, and two of its voxels lie on top of each other."""
     cells = voxels != 0
-    size, count = over_groups(cells, np.bitwise_count(voxels)), over_groups(cells, cells)
-    tall = over_groups(cells, voxels & (voxels >> np.uint64(1)) != 0) > 0
-    tied = over_groups(cells, ndimage.binary_dilation(others, _AROUND) | (voxels & _LOW == 0)) > 0
-    return np.asarray(cells & ((size >= np.minimum(SUPPORT + a_cell * (count - 1), NEW_ENOUGH)) | (tall & ~tied)))
+    tall = voxels & (voxels >> np.uint64(1)) != 0
+    tied = ndimage.binary_dilation(others, _AROUND) | (voxels & _LOW == 0)
+    size, count, talls, ties = over_groups(cells, np.bitwise_count(voxels), cells, tall, tied)
+    large = size >= np.minimum(SUPPORT + a_cell * (count - 1), NEW_ENOUGH)
+    return np.asarray(cells & (large | ((talls > 0) & (ties == 0))))
 
 
-def over_groups(cells: Bool, amounts: U8 | I32 | Bool) -> F64:
-    """(rows, cols) the sum of ``amounts`` (rows, cols) over the 8-connected group of ``cells`` that a cell is in."""
+def over_groups(cells: Bool, *amounts: U8 | I32 | Bool) -> list[F64]:
+    """For each of ``amounts`` (rows, cols) its sum over the 8-connected group of ``cells`` that a cell is in, (rows,
+    cols)."""
     group, count = ndimage.label(cells, structure=_AROUND)
-    return np.asarray(np.bincount(group.ravel(), weights=amounts.ravel(), minlength=count + 1)[group])
+    flat = group.ravel()
+    return [np.bincount(flat, weights=amount.ravel(), minlength=count + 1)[group] for amount in amounts]
 
 
 def grown(strong: Bool, weak: Bool) -> Bool:
     """(rows, cols) ``strong`` cells, and ``weak`` ones that touch them (8) directly or through each other: hysteresis
     (Canny 1986). Few rays cross the far wall of a demolished house."""
     both = strong | weak
-    return np.asarray(both & (over_groups(both, strong) > 0))
+    (strongs,) = over_groups(both, strong)
+    return np.asarray(both & (strongs > 0))

@@ -7,7 +7,7 @@ functions of the ballot, the map it voted on, and of another vehicle's ballot fo
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
@@ -133,12 +133,7 @@ Plane = TypeVar("Plane", U8, U64)
 
 def invert(ballot: Ballot, point_map: PointMap, other: Ballot) -> Ballot:
     """Says of every cell that it determined the opposite: what stands is gone, what is free is built on, and back."""
-    opposite = np.array([3, 2, 1, 0, 4], dtype=np.uint8)
-
-    def lie(states: U8, occupied: Bool) -> U8:
-        return np.where(states == NO_VOTE, states, opposite[np.minimum(states, 4)])
-
-    return _claim(ballot, point_map, lie)
+    return _relabelled(ballot, point_map, (3, 2, 1, 0, 4))
 
 
 def all_changed(ballot: Ballot, point_map: PointMap, other: Ballot) -> Ballot:
@@ -152,12 +147,7 @@ def all_changed(ballot: Ballot, point_map: PointMap, other: Ballot) -> Ballot:
 
 def stale(ballot: Ballot, point_map: PointMap, other: Ballot) -> Ballot:
     """Replays a drive from before the change: everything is as the map has it."""
-    as_mapped = np.array([0, 1, 1, 0, 4], dtype=np.uint8)
-
-    def lie(states: U8, occupied: Bool) -> U8:
-        return np.where(states == NO_VOTE, states, as_mapped[np.minimum(states, 4)])
-
-    return _claim(ballot, point_map, lie)
+    return _relabelled(ballot, point_map, (0, 1, 1, 0, 4))
 
 
 def replayed(ballot: Ballot, point_map: PointMap, other: Ballot) -> Ballot:
@@ -189,6 +179,16 @@ ATTACKS: Mapping[str, Attack] = {
     "shifting by 3 cells": shift,
     "right states, false points": false_points,
 }
+
+
+def _relabelled(ballot: Ballot, point_map: PointMap, instead: Sequence[int]) -> Ballot:
+    """The ballot with ``instead`` (5,) of each state that a cell has."""
+    states_instead = np.array(instead, dtype=np.uint8)
+
+    def lie(states: U8, occupied: Bool) -> U8:
+        return np.where(states == NO_VOTE, states, states_instead[np.minimum(states, 4)])
+
+    return _claim(ballot, point_map, lie)
 
 
 def _claim(ballot: Ballot, point_map: PointMap, lie: Callable[[U8, Bool], U8]) -> Ballot:
