@@ -51,7 +51,7 @@ def evaluate(
     drive: Annotated[
         Path | None,
         typer.Argument(
-            metavar="[DRIVE]", help="after real: a recorded drive; after court: its folder", show_default=False
+            metavar="DRIVE", help="after real: a recorded drive; after court: its folder", show_default=False
         ),
     ] = None,
     seed: Seed = 1,
@@ -221,7 +221,7 @@ def _evaluate_real(
 def demo(
     drive: Annotated[
         Path | None,
-        typer.Argument(metavar="[DRIVE]", help="a recorded drive; else a street is simulated", show_default=False),
+        typer.Argument(metavar="DRIVE", help="a recorded drive; else a street is simulated", show_default=False),
     ] = None,
     out: Annotated[Path, typer.Option(metavar="FOLDER", help="where maps, tables, pictures and report.html go")] = Path(
         "out"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import sqlite3
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -91,22 +92,81 @@ def test_only_tiles_that_changed_since_a_version_are_written(site: tuple[str, st
     assert len(delta) == 1
 
 
-def test_a_server_rolls_back_and_withdraws_a_drive(tmp_path: Path) -> None:
+@pytest.fixture
+def voted(tmp_path: Path) -> Path:
+    """A store where two vehicles, a and b, say that a wall is gone, each by the drives d and e."""
     point_map = make_map({(0, 0): make_tile(wall(WALL, [0.05, 0.45]))})
     store = Store.create(f"sqlite:///{tmp_path / 's.db'}", point_map)
-    send(store, *[make_ballot(point_map, {(0, 0): wall_gone()}, name, "d") for name in ("a", "b")])
+    for drive in ("d", "e"):
+        send(store, *[make_ballot(point_map, {(0, 0): wall_gone()}, name, drive) for name in ("a", "b")])
     store.close()
-    with serving_here(tmp_path / "s.db", log=tmp_path / "log") as url:
+    return tmp_path / "s.db"
+
+
+def test_a_server_rolls_back_withdraws_and_replays(voted: Path, tmp_path: Path) -> None:
+    with serving_here(voted, log=tmp_path / "log") as url:
         assert "version 2 (published)" in say("publish", url, "--override")
-        assert "version 3 is version 1 again" in say("rollback", url, 1, "--reason", "wrong")
-        assert "1 ballots of a withdrawn" in say("unvote", url, "a", "--drive", "d")
+        shown = say("unvote", url, "a", "--replay")
+        assert shown == say("unvote", voted, "a", "--replay")
+        assert shown.startswith("version 2 (only shown: --yes publishes it): 3 points added, 0 deleted in tiles 0,0")
+        assert "version 3 (published): 3 points added" in say("unvote", url, "a", "--replay", "--yes")
+        assert "version 4 is version 1 again" in say("rollback", url, 1, "--reason", "wrong")
+        assert say("unvote", url, "b", "--drive", "d") == "1 ballots of b withdrawn\n"
+        assert say("unvote", url, "b") == "1 ballots of b withdrawn\n"
 
 
-@pytest.mark.parametrize("verb", [["gc"], ["keys"], ["serve"]])
-def test_a_verb_for_the_stores_own_machine_refuses_an_address(verb: list[str]) -> None:
-    result = CliRunner().invoke(app, [*verb, "http://localhost:1"])
-    assert isinstance(result.exception, MapvoteError)
-    assert "on the server's machine" in str(result.exception)
+def test_a_server_clears_what_the_policy_does_not_keep(voted: Path, tmp_path: Path) -> None:
+    with serving_here(voted, log=tmp_path / "log") as url:
+        say("publish", url, "--override")
+        say("policy", url, "keep.versions=1")
+        would = say("gc", url)
+        assert "1 versions (1 planes, 0 decisions)" in would
+        assert say("gc", voted) == would
+        assert say("gc", url, "--yes") == would.replace(": --yes clears them", "")
+        assert "cleared operator" in say("log", url, "--events", 1)
+        assert say("unvote", url, "--all") == "4 ballots of all vehicles withdrawn\n"
+
+
+def test_a_servers_keys_are_issued_rotated_and_revoked_by_its_operator(
+    voted: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with serving_here(voted, log=tmp_path / "log") as url:
+        boss = say("keys", url, "issue", "boss", "--role", "operator").strip()
+        refused = CliRunner().invoke(app, ["keys", url])
+        assert "needs a key" in str(refused.exception), "the first key closes an open server"
+        monkeypatch.setenv("MAPVOTE_KEY", boss)
+        (tmp_path / "a.key").write_text(say("keys", url, "issue", "a", "--days", 3))
+        assert say("keys", url, "rotate", "a").strip() not in ("", boss)
+        assert [line.split("│")[1:3] for line in say("keys", url).splitlines() if "valid" in line] == [
+            [" operator ", " boss "], [" vehicle  ", " a    "], [" vehicle  ", " a    "]
+        ]  # fmt: skip
+        refused = CliRunner().invoke(app, ["keys", url, "issue", "x", "--key-file", str(tmp_path / "a.key")])
+        assert "only an operator can do this" in str(refused.exception)
+        assert say("keys", url, "revoke", "a") == "2 keys of a revoked, 2 ballots do not count any more\n"
+        assert "key revoked boss a" in say("log", url, "--events", 1)
+
+
+def test_a_server_is_mended_from_a_backup(voted: Path, tmp_path: Path) -> None:
+    """Its planes come from the backup; what the backup has not is set aside."""
+    backup = tmp_path / "backup.db"
+    sqlite3.connect(voted).execute("VACUUM INTO ?", [str(backup)])
+    store, b = Store.open(f"sqlite:///{voted}"), schema.blobs
+    with store.database.writing() as connection:
+        connection.execute(b.update().values(data=b"no frame"))
+        connection.execute(schema.ballots.update().where(schema.ballots.c.drive == "d").values(drive="f"))
+    store.close()
+    with serving_here(voted, log=tmp_path / "log") as url:
+        result = CliRunner().invoke(app, ["check", url, "--mend", "--from", str(backup)])
+        assert result.exit_code == 1
+        assert result.output.count(f": mended from {backup}") == 2
+        assert result.output.count("is not what its sum says; set aside") == 2
+        with pytest.raises(MapvoteError, match="give --mend too"):
+            CliRunner().invoke(app, ["check", url, "--from", str(backup)], catch_exceptions=False)
+
+
+def test_the_machine_of_a_store_serves_it() -> None:
+    with pytest.raises(MapvoteError, match="on the server's machine"):
+        CliRunner().invoke(app, ["serve", "http://localhost:1"], catch_exceptions=False)
 
 
 @pytest.mark.parametrize("verb", [["serve", "--port", "0", "--open"], ["publish", "--dry-run"]])
@@ -149,7 +209,6 @@ def test_a_server_sets_aside_what_is_damaged(site: tuple[str, str]) -> None:
 @pytest.mark.parametrize(
     ("words", "why"),
     [
-        (["check", "http://localhost:1", "--from", "b.db"], "takes a STORE"),
         (["publish", "http://localhost:1", "--cluster", "tcp://x"], "the server has its own"),
         (["vote", ".", "--map", ".", "--out", "b", "--region", "0,0,9,9"], "only a server sends a part"),
         (["vote", ".", "--map", "http://localhost:1", "--out", "b", "--region", "9,9,0,0"], "lower left corner first"),

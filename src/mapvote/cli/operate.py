@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, cast
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from mapvote.cli.door import api_at, is_url, opened_store, store_url, when, who
+from mapvote.cli.door import api_at, is_url, store_url, when, who
 from mapvote.cli.looks import sound_map
 from mapvote.cli.options import SERVER, Config, KeyFile, Reason, StoreName, StoreOrUrl
 from mapvote.cli.terminal import print_table, waiting
@@ -17,8 +17,7 @@ from mapvote.cli.terminal import print_table, waiting
 if TYPE_CHECKING:
     from concurrent.futures import Executor
 
-    from mapvote.server.store.integrity import Damage
-    from mapvote.server.store.keys import Key, Role
+    from mapvote.client.connection import Connection
 
 
 def register(app: typer.Typer) -> None:
@@ -124,11 +123,12 @@ def publish(
         api_at(store, key_file, settings, executor) as server,
         waiting("deciding"),
     ):
-        _print_outcome(server.ask_json("POST", "/v1/publish", json=ask), dry_run)
+        answer = server.ask_json("POST", "/v1/publish", json=ask)
+    _print_outcome(answer, "dry run" if dry_run else "nothing changed")
 
 
-def _print_outcome(answer: Mapping[str, Any], dry_run: bool) -> None:
-    what = "published" if answer["published"] else "dry run" if dry_run else "nothing changed"
+def _print_outcome(answer: Mapping[str, Any], otherwise: str) -> None:
+    what = "published" if answer["published"] else otherwise
     tiles = f" in tiles {'; '.join(answer['tiles'])}" if answer["tiles"] else ""
     changed = f"{answer['points_added']} points added, {answer['points_deleted']} deleted"
     print(f"version {answer['version']} ({what}): {changed}{tiles}")
@@ -308,7 +308,7 @@ def rollback(
 def unvote(
     store: StoreOrUrl,
     vehicle: Annotated[
-        str | None, typer.Argument(metavar="[VEHICLE]", help="the vehicle whose votes are withdrawn")
+        str | None, typer.Argument(metavar="VEHICLE", help="the vehicle whose votes are withdrawn")
     ] = None,
     everybody: Annotated[
         bool, typer.Option("--all", help="withdraw the votes of all vehicles, to begin a new round")
@@ -324,48 +324,36 @@ def unvote(
 ) -> None:
     """Withdraw a vehicle's votes from later versions or, with --replay, from every version.
 
-    A URL withdraws one drive. On a STORE also: all drives of a vehicle, --all, --replay.
-
-        mapvote unvote fleet.db car_1
+    mapvote unvote fleet.db car_1
     """
+    from urllib.parse import quote
+
     from mapvote.core.types import MapvoteError
 
     if (vehicle is None) != everybody:
         raise MapvoteError("unvote: name one VEHICLE, or give --all")
-    if replay and (vehicle is None or drive is not None):
+    if drive is not None and everybody:
+        raise MapvoteError("unvote: --drive is of one VEHICLE; leave out --all")
+    if replay and (everybody or drive is not None):
         raise MapvoteError("unvote: --replay removes one whole vehicle; leave out --drive and --all")
-    if vehicle is not None and drive is not None:
-        with api_at(store, key_file) as server:
-            count = server.ask_json("DELETE", f"/v1/ballots/{vehicle}/{drive}")["withdrawn"]
-        print(f"{count} ballots of {vehicle} withdrawn")
-        return
-    if is_url(store):
-        raise MapvoteError(f"unvote: {store} withdraws one drive: name VEHICLE and --drive, or run this on the STORE")
-    _unvote(store, vehicle, replay, yes)
-
-
-def _unvote(store: str, vehicle: str | None, replay: bool, yes: bool) -> None:
-    from mapvote.server.store.ballots import withdraw
-    from mapvote.server.store.queries import names
-    from mapvote.server.store.replay import replay as replay_without
-
-    with opened_store(store) as opened:
-        if not replay or vehicle is None:
-            whose = vehicle or "all vehicles"
-            print(f"{withdraw(opened, vehicle, by=who())} ballots of {whose} withdrawn")
-            return
-        with waiting("deciding anew"):
-            done = replay_without(opened, vehicle, by=who(), dry_run=not yes)
-    what = "published" if done.published else "only shown: --yes publishes it"
-    tiles = f" in tiles {names(done.tiles)}" if done.tiles else ""
-    print(f"version {done.version} ({what}): {done.added} points added, {done.deleted} deleted{tiles}")
+    with api_at(store, key_file) as server, waiting("deciding anew" if replay else "withdrawing"):
+        if replay:
+            done = server.ask_json("POST", "/v1/replay", json={"vehicle": vehicle, "dry_run": not yes})
+        else:
+            whose = "/".join(quote(name, safe="") for name in (vehicle, drive) if name is not None)
+            path = "/v1/ballots?everybody=true" if everybody else f"/v1/ballots/{whose}"
+            done = server.ask_json("DELETE", path)
+    if replay:
+        _print_outcome(done, "only shown: --yes publishes it")
+    else:
+        print(f"{done['withdrawn']} ballots of {vehicle or 'all vehicles'} withdrawn")
 
 
 def check(
     store: StoreOrUrl,
     mend: Annotated[bool, typer.Option("--mend", help="quarantine damaged parts; with --from replace them")] = False,
     other: Annotated[
-        str | None, typer.Option("--from", metavar="STORE", help="a store with sound copies, e.g. a backup")
+        str | None, typer.Option("--from", metavar="STORE|URL", help="a store with sound copies, e.g. a backup")
     ] = None,
     key_file: KeyFile = None,
 ) -> None:
@@ -374,64 +362,60 @@ def check(
     mapvote check fleet.db --mend --from backup.db
     """
     from mapvote.core.types import MapvoteError
-    from mapvote.server.store.integrity import Damage
 
-    if other is None:
-        with api_at(store, key_file) as server, waiting("reading every byte"):
-            answer = server.ask_json("POST" if mend else "GET", "/v1/check")
-        found = [Damage(**damage) for damage in answer["damage"]]
-    elif is_url(store):
-        raise MapvoteError("check: --from takes a STORE, on the machine where it is")
-    else:
-        found = _check_beside(store, other, mend)
+    if other is not None and not mend:
+        raise MapvoteError("check: --from replaces damaged parts: give --mend too")
+    with api_at(store, key_file) as server, waiting("reading every byte"):
+        if other is not None:
+            planes = {d["name"] for d in server.ask_json("GET", "/v1/check")["damage"] if d["kind"] == "plane"}
+            with api_at(other, key_file) as backup:
+                restored = [digest for digest in sorted(planes) if _restored(server, backup, digest)]
+            for digest in restored:
+                print(f"plane {digest}: mended from {other}")
+        found = server.ask_json("POST" if mend else "GET", "/v1/check")["damage"]
     for damage in found:
-        print(damage)
+        done = f"; {damage['mended']}" if damage["mended"] else ""
+        print(f"{damage['kind']} {damage['name']}: {damage['why']}{done}")
     if found:
         raise MapvoteError(f"{store}: {len(found)} things are damaged" + ("" if mend else "; --mend sets them aside"))
     print("every plane, ballot and version is what it was when it was written")
 
 
-def _check_beside(store: str, other: str, mend: bool) -> list[Damage]:
-    """Check a store with the planes of another one at hand."""
-    from mapvote.codec.arrays import unpack_bytes
-    from mapvote.codec.tile_planes import MAX_PLANE_BYTES
-    from mapvote.core.types import MapvoteError
-    from mapvote.server.store.integrity import check as look
+def _restored(server: Connection, backup: Connection, digest: str) -> bool:
+    """Put a plane back if the backup has it as it was written."""
+    from mapvote.client.connection import Refused
 
-    with opened_store(store) as opened, opened_store(other) as backup, waiting("reading every byte"):
-
-        def elsewhere(digest: str) -> bytes | None:
-            try:
-                return unpack_bytes(backup.blob(digest), MAX_PLANE_BYTES, f"tile plane {digest[:12]}")
-            except MapvoteError:
-                return None
-
-        return look(opened, mend=mend, source=elsewhere, by=who())
+    try:
+        plane = backup.ask("GET", f"/v1/tiles/{digest}").content
+        return bool(server.ask("PUT", f"/v1/tiles/{digest}", content=plane).json()["restored"])
+    except Refused as error:  # 404: the backup lacks it; 422: it is damaged there too
+        if error.status not in (404, 422):
+            raise
+        return False
 
 
 def gc(
-    store: StoreName,
+    store: StoreOrUrl,
     yes: Annotated[bool, typer.Option("--yes", help="delete; without it only list what would be deleted")] = False,
+    key_file: KeyFile = None,
 ) -> None:
     """Delete what the policy does not keep: old versions (keep.versions) and ballots that can decide nothing more.
 
     mapvote gc fleet.db
     """
-    from mapvote.server.store.retention import clear
-
-    with opened_store(store) as opened, waiting("looking for what can go"):
-        done = clear(opened, by=who(), dry_run=not yes)
-    counts = f"{done.versions} versions ({done.planes} planes, {done.decisions} decisions)"
-    print(f"{counts} and {done.ballots} ballots on tiles, {done.size:,} bytes" + ("" if yes else ": --yes clears them"))
-    print(f"the oldest version left is {done.oldest}")
+    with api_at(store, key_file) as server, waiting("looking for what can go"):
+        done = server.ask_json("POST" if yes else "GET", "/v1/gc")["cleared"]
+    counts = f"{done['versions']} versions ({done['planes']} planes, {done['decisions']} decisions)"
+    size = f"{done['ballots']} ballots on tiles, {done['size']:,} bytes"
+    print(f"{counts} and {size}" + ("" if yes else ": --yes clears them"))
+    print(f"the oldest version left is {done['oldest']}")
 
 
 def keys(
-    store: StoreName,
-    action: Annotated[str, typer.Argument(metavar="[ACTION]", help="list, issue, rotate or revoke")] = "list",
-    name: Annotated[str | None, typer.Argument(metavar="[NAME]", help="name of a vehicle or a person")] = None,
+    store: StoreOrUrl,
+    action: Annotated[str, typer.Argument(metavar="ACTION", help="list, issue, rotate or revoke")] = "list",
+    name: Annotated[str | None, typer.Argument(metavar="NAME", help="name of a vehicle or a person")] = None,
     role: Annotated[str, typer.Option(metavar="ROLE", help="vehicle, reader, reviewer or operator")] = "vehicle",
-    operator: Annotated[bool, typer.Option("--operator", help="the same as --role operator")] = False,
     days: Annotated[float | None, typer.Option(metavar="N", help="the key expires after N days")] = None,
     overlap_days: Annotated[
         float, typer.Option(min=0, metavar="N", help="rotate: the old keys work for N more days")
@@ -443,41 +427,51 @@ def keys(
             help="revoke: whether standing ballots still count [default: ask on a terminal, else they do not]",
         ),
     ] = None,
+    key_file: KeyFile = None,
 ) -> None:
     """List, issue, rotate or revoke keys. A new key is printed once and stored only as a hash.
 
     mapvote keys fleet.db issue car_1
     """
     from mapvote.core.types import MapvoteError
-    from mapvote.server.store import keys as store_keys
 
-    with opened_store(store) as opened:
+    if action not in ("list", "issue", "rotate", "revoke") or (action != "list" and name is None):
+        raise MapvoteError("keys: give list, issue NAME, rotate NAME or revoke NAME")
+    with api_at(store, key_file) as server:
         if action == "list":
-            for key in store_keys.listed(opened):
-                print(f"{key.role} {key.name}: issued {when(key.created_ns)}, {_state(key, opened.clock())}")
-        elif action == "issue" and name is not None:
-            print(store_keys.issue(opened, name, cast("Role", "operator" if operator else role), by=who(), days=days))
-        elif action == "rotate" and name is not None:
-            print(store_keys.rotate(opened, name, by=who(), overlap_days=overlap_days))
-        elif action == "revoke" and name is not None:
-            keep = _keep_votes(store_keys.ballots_standing(opened, name), name) if keep_votes is None else keep_votes
-            revoked, ended = store_keys.revoke(opened, name, by=who(), keep_votes=keep)
-            print(f"{revoked} keys of {name} revoked" + (f", {ended} ballots do not count any more" if ended else ""))
+            rows = [
+                (key["role"], key["name"], when(key["created_ns"]), _state(key))
+                for key in server.ask_json("GET", "/v1/keys")["keys"]
+            ]
+            print_table(("role", "name", "issued", "state"), rows)
+        elif action == "issue":
+            ask = {"name": name, "role": role, "days": days}
+            print(server.ask_json("POST", "/v1/keys", json=ask)["key"])
+        elif action == "rotate":
+            ask = {"name": name, "overlap_days": overlap_days}
+            print(server.ask_json("POST", "/v1/keys/rotate", json=ask)["key"])
         else:
-            raise MapvoteError("keys: give list, issue NAME, rotate NAME or revoke NAME")
+            keep = _ask_to_keep(server, name) if keep_votes is None else keep_votes
+            done = server.ask_json("POST", "/v1/keys/revoke", json={"name": name, "keep_votes": keep})
+            ended = f", {done['ballots']} ballots do not count any more" if done["ballots"] else ""
+            print(f"{done['revoked']} keys of {name} revoked{ended}")
 
 
-def _keep_votes(standing: int, name: str) -> bool:
+def _ask_to_keep(server: Connection, name: str | None) -> bool:
     """Whether the ballots of a revoked name still count: ask on a terminal, else no."""
     import sys
 
-    if not standing or not sys.stdin.isatty():
+    if not sys.stdin.isatty():
         return False
-    return typer.confirm(f"{standing} ballots of {name} stand. Shall they still count?", default=False)
+    listed = server.ask_json("GET", "/v1/keys")["keys"]
+    standing = next((key["ballots"] for key in listed if key["name"] == name), 0)
+    question = f"{standing} ballots of {name} stand. Shall they still count?"
+    return bool(standing) and typer.confirm(question, default=False)
 
 
-def _state(key: Key, now_ns: int) -> str:
-    if key.revoked_ns is not None:
-        return f"revoked {when(key.revoked_ns)}"
-    end = "" if key.expires_ns is None else f"until {when(key.expires_ns)}"
-    return f"valid {end}".strip() if key.valid_at(now_ns) else f"ended {end.removeprefix('until ')}"
+def _state(key: Mapping[str, Any]) -> str:
+    if key["revoked_ns"] is not None:
+        return f"revoked {when(key['revoked_ns'])}"
+    if key["expires_ns"] is None:
+        return "valid"
+    return f"{'valid until' if key['valid'] else 'ended'} {when(key['expires_ns'])}"

@@ -216,5 +216,5 @@ def _keys(store: Store) -> list[Finding]:
     valid = Counter(key.role for key in listed(store) if key.valid_at(store.clock()))
     if not valid["operator"]:
         what = "no operator has a valid key: the server cannot be operated remotely"
-        return [Finding("warning", what, "mapvote keys STORE issue NAME operator")]
+        return [Finding("warning", what, "mapvote keys STORE issue NAME --role operator")]
     return [Finding("note", "keys: " + ", ".join(f"{count} {role}" for role, count in sorted(valid.items())))]

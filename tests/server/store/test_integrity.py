@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Iterator
 
 import numpy as np
@@ -13,12 +14,14 @@ from mapvote.codec.arrays import unpack_bytes
 from mapvote.codec.tile_planes import pack_tile
 from mapvote.config import FuseSettings
 from mapvote.core.tile import Tile
-from mapvote.core.types import CellState
+from mapvote.core.types import CellState, MapvoteError
+from mapvote.server.errors import NotFound
 from mapvote.server.store import schema
-from mapvote.server.store.integrity import ballot_name, check, set_aside
+from mapvote.server.store.integrity import ballot_name, check, restore_plane, set_aside
 from mapvote.server.store.policy import Policy
 from mapvote.server.store.publish import publish
 from mapvote.server.store.store import Store
+from mapvote.server.views.events import last_events
 from mapvote.server.views.history import changes_between, vehicle_standings
 from mapvote.server.views.point_lod import Clouds, evidence
 from stores import send
@@ -72,7 +75,7 @@ def test_a_damaged_tile_is_named_all_others_are_published_and_once_mended_it_is_
     with store.database.reading() as connection:
         assert set_aside(connection), "and named"
     assert not publish(store).published
-    check(store, mend=True, source=lambda digest: unpack_bytes(plane, 1 << 30, digest))
+    assert restore_plane(store, ground, unpack_bytes(plane, 1 << 30, ground), by="boss")
     done = publish(store)
     assert (done.published, list(done.tiles)) == (True, [(0, 1)]), "its votes have waited"
 
@@ -157,17 +160,23 @@ def test_a_ballot_that_ended_by_no_event_is_named(store: Store) -> None:
     assert [(damage.kind, damage.name) for damage in check(store)] == [("ballot", str(seq))]
 
 
-def test_a_plane_is_mended_from_another_store(store: Store, tmp_path_factory: pytest.TempPathFactory) -> None:
+def test_a_plane_is_put_back_from_another_store_and_nothing_else_is_taken(
+    store: Store, tmp_path_factory: pytest.TempPathFactory
+) -> None:
     other = Store.create(f"sqlite:///{tmp_path_factory.mktemp('other') / 's.db'}", two_walls())
     points = store.tiles()[0, 0].points
+    sound = unpack_bytes(other.blob(points), 1 << 30, points)
+    other.close()
+    assert not restore_plane(store, points, sound, by="boss"), "it is as it was written"
     flip(store, schema.blobs, "data", schema.blobs.c.hash == points)
     assert not publish(store).published
-
-    def source(digest: str) -> bytes | None:
-        return unpack_bytes(other.blob(digest), 1 << 30, digest)
-
-    (damage,) = check(store, mend=True, source=source)
-    assert "mended" in damage.mended
+    with pytest.raises(MapvoteError, match="not what this hash says"):
+        restore_plane(store, points, sound[:-1], by="boss")
+    with pytest.raises(NotFound, match="no version here shows"):
+        restore_plane(store, hashlib.sha256(b"mine").hexdigest(), b"mine", by="boss")
+    assert len(check(store)) == 1
+    assert restore_plane(store, points, sound, by="boss")
+    (event,) = last_events(store, 1)
+    assert (event["kind"], event["actor"], event["detail"]) == ("mended", "boss", f"plane {points}")
     assert check(store) == []
     assert publish(store).published
-    other.close()

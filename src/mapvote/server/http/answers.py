@@ -14,6 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field, create_model
 
 from mapvote.codec.manifest import Manifest, TileHashes
 from mapvote.server.store.integrity import Damage
+from mapvote.server.store.retention import Cleared
 from mapvote.server.views.change_objects import Kind, Size
 from mapvote.server.views.consensus import VehicleStanding
 from mapvote.server.views.explain import CellDecision, LeftOut
@@ -357,6 +358,49 @@ class Checked(Answer):
     """The damaged items."""
 
     damage: list[Damage]
+
+
+class Restored(Answer):
+    """A plane is as it was written; ``restored``: by this request."""
+
+    restored: bool
+
+
+class ClearedAnswer(Answer):
+    """What was deleted, or would be."""
+
+    cleared: Cleared
+
+
+class KeyEntry(Answer):
+    """A key that was issued; never the key itself."""
+
+    name: str
+    role: str
+    created_ns: int
+    revoked_ns: int | None
+    expires_ns: int | None
+    valid: bool
+    ballots: int = Field(description="standing ballots of this name")
+
+
+class KeysAnswer(Answer):
+    """All keys ever issued, oldest first."""
+
+    keys: list[KeyEntry]
+
+
+class KeyIssued(Answer):
+    """The only time that the key is seen."""
+
+    key: str
+
+
+class KeysRevoked(Answer):
+    """Number of keys, and of ballots that count no more."""
+
+    revoked: int
+    ballots: int
 
 
 class Health(Answer):

@@ -1,46 +1,57 @@
-"""Routes of operators: publish, roll back, and see what changed and why."""
+"""Routes of operators: publish, roll back, see what changed and why; keys, retention, integrity."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import CancelledError
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import asdict, replace
 from functools import partial
-from typing import Annotated, Literal
+from typing import Annotated, Literal, cast
 
 import structlog
 from anyio import to_thread
 from fastapi import APIRouter, Query, Request, Response
-from pydantic import BaseModel, ConfigDict, Field
 
 from mapvote.codec.ballot import tile_key
+from mapvote.core.types import MapvoteError
 from mapvote.server.errors import Held, Unavailable
 from mapvote.server.http.answers import (
     Cancelled,
     CellAnswer,
     Changes,
     Checked,
+    ClearedAnswer,
     Coverage,
     Info,
+    KeyIssued,
+    KeysAnswer,
+    KeysRevoked,
     Log,
     PolicyAnswer,
     Published,
     Publishes,
+    Restored,
     RolledBack,
     Running,
     Vehicles,
+    Withdrawn,
 )
 from mapvote.server.http.answers import Places as PlacesAnswer
 from mapvote.server.http.schemas import (
     AS_CSV,
-    PLAIN,
+    Digest,
     From,
+    IssueAsk,
     MinCells,
     Newest,
     Places,
+    PolicyAsk,
     PublishAsk,
+    ReplayAsk,
+    RevokeAsk,
     RollbackAsk,
+    RotateAsk,
     as_json,
     as_table,
     iso,
@@ -48,10 +59,14 @@ from mapvote.server.http.schemas import (
 )
 from mapvote.server.http.security import operator, reviewer, sees_names
 from mapvote.server.http.services import Services, services
-from mapvote.server.store.integrity import check
-from mapvote.server.store.keys import pseudonyms
-from mapvote.server.store.publish import preview, publish, rollback
+from mapvote.server.store import keys
+from mapvote.server.store.ballots import withdraw
+from mapvote.server.store.integrity import check, restore_plane
+from mapvote.server.store.publish import Outcome, preview, publish, rollback
 from mapvote.server.store.queries import log_event
+from mapvote.server.store.replay import replay
+from mapvote.server.store.retention import Cleared, clear
+from mapvote.server.store.store import Store
 from mapvote.server.views.coverage import as_features, wanted_passes
 from mapvote.server.views.explain import explain_cell, story_as_json
 from mapvote.server.views.geojson import contradictions, feature_rows, standing_rows, tile_squares
@@ -111,11 +126,14 @@ def _publish(parts: Services, ask: PublishAsk, by: str) -> Published:
             )
     for damage in (damage for fused in done.fused for damage in fused.damaged):
         structlog.get_logger("mapvote").error("quarantine", kind=damage.kind, name=damage.name, why=damage.why)
-    tiles = [tile_key(tile) for tile in done.tiles]
+    return _as_answer(done)
+
+
+def _as_answer(done: Outcome) -> Published:
     return Published(
         version=done.version,
         published=done.published,
-        tiles=tiles,
+        tiles=[tile_key(tile) for tile in done.tiles],
         points_added=done.added,
         points_deleted=done.deleted,
         held=list(done.held),
@@ -178,7 +196,7 @@ def cell(request: Request, x: float, y: float) -> Response:
     """What each ballot says about the cell at (x, y), map metres, whether it counts, and what each version decided."""
     parts = services(request)
     answer, known = story_as_json(explain_cell(parts.store, x, y)), sees_names(request)
-    shown = {} if known else pseudonyms(parts.store, {vote["vehicle"] for vote in answer["votes"]})
+    shown = {} if known else keys.pseudonyms(parts.store, {vote["vehicle"] for vote in answer["votes"]})
     for vote in answer["votes"]:
         vote["end"] = iso(seen(vote.pop("end_ns"), known))
         if not known:
@@ -251,14 +269,6 @@ def _unless_stopping(parts: Services) -> Iterator[None]:
         raise Unavailable("the server is stopping, nothing was published: ask again once it is back") from error
 
 
-class PolicyAsk(BaseModel):
-    """Changes of the policy."""
-
-    model_config = ConfigDict(extra="forbid")
-    values: dict[str, str | int | float | bool] = Field(max_length=100, description="by section.key: fuse.min_votes")
-    reason: str = Field(default="", max_length=200, pattern=PLAIN)
-
-
 @router.get("/v1/policy", response_model=PolicyAnswer, responses=problems(), summary="The policy")
 def policy(request: Request) -> Response:
     """The policy in force, who set it and why."""
@@ -297,7 +307,89 @@ async def whole(request: Request) -> Response:
 
 @router.post("/v1/check", response_model=Checked, responses=problems(403), summary="Set aside what is damaged")
 async def mend(request: Request) -> Response:
-    """As GET; damaged items are also quarantined. Planes are restored on the server's machine, from a backup."""
+    """As GET; damaged items are also quarantined."""
     by, parts = operator(request), services(request)
     found = await to_thread.run_sync(partial(check, parts.store, mend=True, by=by), limiter=parts.threads.deciding)
     return as_json({"damage": found})
+
+
+@router.put("/v1/tiles/{digest}", responses=problems(403, 404, 413), summary="Put a damaged plane back")
+async def restore(request: Request, digest: Digest) -> Restored:
+    """The body is the plane as GET answers it, of another copy of the store. A sound plane stays as it is."""
+    by, parts = operator(request), services(request)
+    raw = await parts.uploads.read(by, request.stream(), request.headers.get("content-length"))
+    work = partial(restore_plane, parts.store, digest, raw, by=by)
+    return Restored(restored=await to_thread.run_sync(work, limiter=parts.threads.deciding))
+
+
+@router.delete("/v1/ballots", responses=problems(403, 404), summary="Withdraw the ballots of all vehicles")
+async def begin_anew(request: Request, everybody: bool) -> Withdrawn:
+    """To begin a new round: later versions are as if no standing ballot had been cast. Needs ``everybody=true``."""
+    by, parts = operator(request), services(request)
+    if not everybody:
+        raise MapvoteError("name a vehicle in the path, or say everybody=true")
+    work = partial(withdraw, parts.store, None, by=by)
+    return Withdrawn(withdrawn=await to_thread.run_sync(work, limiter=parts.threads.deciding))
+
+
+@router.post("/v1/replay", responses=problems(403, 404, 409), summary="The map as if a vehicle had never voted")
+async def replay_without(request: Request, ask: ReplayAsk) -> Published:
+    """Every version again without its votes; the difference to the newest is one new version."""
+    by, parts = operator(request), services(request)
+    return await to_thread.run_sync(_replay, parts, ask, by, limiter=parts.threads.deciding)
+
+
+def _replay(parts: Services, ask: ReplayAsk, by: str) -> Published:
+    with _unless_stopping(parts), parts.publishing.watched(parts.fusing, by, ask.dry_run) as executor:
+        return _as_answer(replay(parts.store, ask.vehicle, by=by, dry_run=ask.dry_run, executor=executor))
+
+
+@router.get("/v1/gc", response_model=ClearedAnswer, responses=problems(403), summary="What the policy does not keep")
+async def clearable(request: Request) -> Response:
+    """Old versions and ballots that POST would delete."""
+    operator(request)
+    return await _cleared(services(request), partial(clear, dry_run=True))
+
+
+@router.post("/v1/gc", response_model=ClearedAnswer, responses=problems(403), summary="Delete what it does not keep")
+async def clear_now(request: Request) -> Response:
+    """Deletes planes and decisions of old versions, and ballots that can decide nothing more."""
+    return await _cleared(services(request), partial(clear, dry_run=False, by=operator(request)))
+
+
+async def _cleared(parts: Services, work: Callable[[Store], Cleared]) -> Response:
+    return as_json({"cleared": await to_thread.run_sync(work, parts.store, limiter=parts.threads.deciding)})
+
+
+@router.get("/v1/keys", response_model=KeysAnswer, responses=problems(403), summary="Who holds keys")
+def listed_keys(request: Request) -> Response:
+    """All keys ever issued, revoked and expired ones too."""
+    operator(request)
+    store = services(request).store
+    standing, now = keys.ballots_standing(store), store.clock()
+    listed = [
+        asdict(key) | {"valid": key.valid_at(now), "ballots": standing.get(key.name, 0)} for key in keys.listed(store)
+    ]
+    return as_json({"keys": listed})
+
+
+@router.post("/v1/keys", responses=problems(403), summary="Issue a key")
+def issue_key(request: Request, ask: IssueAsk) -> KeyIssued:
+    """The answer is the only place where the key is ever seen: the store keeps its hash."""
+    by, role = operator(request), cast("keys.Role", ask.role)
+    return KeyIssued(key=keys.issue(services(request).store, ask.name, role, by=by, days=ask.days))
+
+
+@router.post("/v1/keys/rotate", responses=problems(403, 404), summary="Replace a key")
+def rotate_key(request: Request, ask: RotateAsk) -> KeyIssued:
+    """A new key of the same role and length for who has a valid one."""
+    by = operator(request)
+    return KeyIssued(key=keys.rotate(services(request).store, ask.name, by=by, overlap_days=ask.overlap_days))
+
+
+@router.post("/v1/keys/revoke", responses=problems(403, 404), summary="Revoke every key of a name")
+def revoke_keys(request: Request, ask: RevokeAsk) -> KeysRevoked:
+    """Its standing ballots count no more, unless ``keep_votes``."""
+    by, store = operator(request), services(request).store
+    revoked, ballots = keys.revoke(store, ask.name, by=by, keep_votes=ask.keep_votes)
+    return KeysRevoked(revoked=revoked, ballots=ballots)

@@ -14,7 +14,7 @@ from mapvote.codec.arrays import compress
 from mapvote.server.errors import NotFound
 
 _OPEN = b"""<p class="open-server" role="alert">This server is open: every user of this machine can vote, publish and
-roll back. Issue a key to close it: <code>mapvote keys STORE issue NAME --operator</code></p>"""
+roll back. Issue a key to close it: <code>mapvote keys STORE issue NAME --role operator</code></p>"""
 _DOCS = """<!doctype html><html lang="en"><head><meta charset="utf-8"><title>mapvote API</title>
 <link rel="stylesheet" href="viewer/pages.css"></head>
 <body class="plain"><h1>mapvote API</h1><p>For machines: <a href=openapi.json>openapi.json</a></p>

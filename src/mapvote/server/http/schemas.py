@@ -34,6 +34,7 @@ PLAIN = r"^[^\x00-\x1f]*$"
 """No control characters: PostgreSQL stores no NUL."""
 
 Name = Annotated[str, Path(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$")]
+Digest = Annotated[str, Path(pattern=r"^[0-9a-f]{64}$")]
 Number = Annotated[int, Path(ge=LEAST, le=MOST)]
 Table = Literal["json", "csv"]
 Places = Literal["json", "geojson", "csv"]
@@ -54,6 +55,47 @@ class PublishAsk(BaseModel):
     override: bool = Field(default=False, description="publish in spite of the reasons to hold it")
     parent: int | None = Field(default=None, ge=LEAST, le=MOST, description="only if this is still the newest version")
     reason: str = Field(default="", max_length=200, pattern=PLAIN)
+
+
+class ReplayAsk(BaseModel):
+    """Whose votes to take out of every version."""
+
+    model_config = ConfigDict(extra="forbid")
+    vehicle: str = Field(max_length=64, pattern=PLAIN)
+    dry_run: bool = Field(default=True, description="only say what would change; false publishes it")
+
+
+class PolicyAsk(BaseModel):
+    """Changes of the policy."""
+
+    model_config = ConfigDict(extra="forbid")
+    values: dict[str, str | int | float | bool] = Field(max_length=100, description="by section.key: fuse.min_votes")
+    reason: str = Field(default="", max_length=200, pattern=PLAIN)
+
+
+class IssueAsk(BaseModel):
+    """Whose key, and what it opens."""
+
+    model_config = ConfigDict(extra="forbid")
+    name: str = Field(max_length=200, description="1-64 of letters, digits, dot, underscore, dash")
+    role: str = Field(default="vehicle", max_length=20, description="vehicle, reader, reviewer or operator")
+    days: float | None = Field(default=None, description="the key expires after so many days; null: never")
+
+
+class RotateAsk(BaseModel):
+    """Whose key is replaced."""
+
+    model_config = ConfigDict(extra="forbid")
+    name: str = Field(max_length=200)
+    overlap_days: float = Field(default=1.0, ge=0, le=36_500, description="the old keys work for so many more days")
+
+
+class RevokeAsk(BaseModel):
+    """Whose keys are revoked."""
+
+    model_config = ConfigDict(extra="forbid")
+    name: str = Field(max_length=200)
+    keep_votes: bool = Field(default=False, description="whether its standing ballots still count")
 
 
 class RollbackAsk(BaseModel):

@@ -84,7 +84,7 @@ def serve(
     if opened and not is_loopback(host):
         raise MapvoteError(f"--open is for this machine alone, {host} can be reached from elsewhere: use keys instead")
     if not opened and not keys.any_issued(store):
-        mend = "issue the first (mapvote keys STORE issue NAME --operator), or say --open to need none on this machine"
+        mend = "issue the first (mapvote keys STORE issue NAME --role operator), or give --open on this machine"
         raise MapvoteError(f"this store has no keys yet: {mend}")
     app = create_app(store, settings, opened=opened)
     listener = socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET)

@@ -6,18 +6,29 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable, Coroutine
-from typing import Annotated, Any
+from typing import Any
 
 import msgspec
 from anyio import to_thread
-from fastapi import APIRouter, Path, Request, Response
+from fastapi import APIRouter, Request, Response
 from fastapi.concurrency import run_in_threadpool
 from fastapi.routing import APIRoute
 
 from mapvote.codec.arrays import unpack_bytes
 from mapvote.codec.tile_planes import MAX_PLANE_BYTES
 from mapvote.server.http.answers import ManifestAnswer, Stored, Versions, Withdrawn
-from mapvote.server.http.schemas import AS_CSV, Name, Number, Table, VersionQuery, as_json, as_table, iso, problems
+from mapvote.server.http.schemas import (
+    AS_CSV,
+    Digest,
+    Name,
+    Number,
+    Table,
+    VersionQuery,
+    as_json,
+    as_table,
+    iso,
+    problems,
+)
 from mapvote.server.http.security import own
 from mapvote.server.http.services import services
 from mapvote.server.store.admission import Sent, sound
@@ -67,7 +78,7 @@ async def one_version(request: Request, number: Number, since: VersionQuery | No
     response_class=Response,
     summary="One plane of a tile",
 )
-async def plane(request: Request, digest: Annotated[str, Path(pattern=r"^[0-9a-f]{64}$")]) -> Response:
+async def plane(request: Request, digest: Digest) -> Response:
     """Raw little-endian values (of ``fields`` a msgpack map of name to type and values), zstd on the wire where the
     client takes it. Immutable: the hash is of the values."""
     headers = {
@@ -91,6 +102,13 @@ async def unvote(request: Request, vehicle: Name, drive: Name) -> Withdrawn:
     """Withdraw a ballot: later versions are as if it had never been cast."""
     by = own(request, vehicle)
     return Withdrawn(withdrawn=await run_in_threadpool(withdraw, services(request).store, vehicle, drive, by=by))
+
+
+@router.delete("/v1/ballots/{vehicle}", responses=problems(403, 404, 429), summary="Withdraw a vehicle's ballots")
+async def unvote_all_drives(request: Request, vehicle: Name) -> Withdrawn:
+    """Withdraw the ballots of all its drives."""
+    by = own(request, vehicle)
+    return Withdrawn(withdrawn=await run_in_threadpool(withdraw, services(request).store, vehicle, by=by))
 
 
 async def _manifest(request: Request, number: int | None, since: int | None) -> Response:

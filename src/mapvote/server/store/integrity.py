@@ -1,4 +1,4 @@
-"""Integrity of a store: damage is found, put into quarantine, and repaired from another copy where there is one.
+"""Integrity of a store: damage is found, put into quarantine, and a plane is put back from another copy.
 
 A plane of a tile is named by the SHA-256 of its values. Every other row carries a SHA-256 over what is written once.
 A ballot in quarantine does not count on its tile, and a tile with a damaged plane is not fused. All else goes on.
@@ -7,7 +7,7 @@ A ballot in quarantine does not count on its tile, and a tile with a damaged pla
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -18,27 +18,48 @@ from mapvote.codec.ballot import tile_key
 from mapvote.codec.tile_planes import MAX_PLANE_BYTES
 from mapvote.core.grid import TileIndex
 from mapvote.core.types import MapvoteError
+from mapvote.server.errors import NotFound
 from mapvote.server.store import schema
 from mapvote.server.store.database import insert_rows
 from mapvote.server.store.queries import log_event, oldest_kept, shows_in_kept
 from mapvote.server.store.store import Store
 
-Source = Callable[[str], bytes | None]
-"""A plane's values by hash, from another store or a map folder; None if it is not there."""
 _BATCH = 500
 
 
-def check(
-    store: Store, *, mend: bool = False, source: Source = lambda digest: None, by: str = "operator"
-) -> list[Damage]:
-    """Everything that is damaged, and with ``mend`` what was done about it. What cannot be mended is set aside."""
+def check(store: Store, *, mend: bool = False, by: str = "operator") -> list[Damage]:
+    """Everything that is damaged; with ``mend`` it is set aside."""
     with store.database.reading() as connection:
         found = [*_database(connection, store), *_planes(connection), *_chain(connection)]
         found += [*_rows(connection), *_ends(connection)]
     if mend and found:
         with store.database.writing() as connection:
-            found = [_mend(connection, damage, source, store.clock(), by) for damage in found]
+            quarantine(connection, found, store.clock(), by)
+        return [replace(damage, mended="set aside") for damage in found]
     return found
+
+
+def restore_plane(store: Store, digest: str, raw: bytes, *, by: str) -> bool:
+    """Put the plane of a tile back where it is damaged or lost, by its values in another copy.
+
+    False if the store has it as it was written. MapvoteError if ``raw`` is not this plane, NotFound if no version shows
+    it.
+    """
+    if hashlib.sha256(raw).hexdigest() != digest:
+        raise MapvoteError(f"plane {digest[:12]}: the bytes sent are not what this hash says")
+    b, q, t = schema.blobs, schema.quarantine, schema.version_tiles
+    with store.database.writing() as connection:
+        shows = sa.or_(*(t.c[name] == digest for name in schema.TILE_PLANES))
+        if connection.execute(sa.select(t.c.version).where(shows).limit(1)).first() is None:
+            raise NotFound(f"no version here shows plane {digest[:12]}")
+        aside = connection.execute(q.delete().where(q.c.kind == "plane", q.c.name == digest)).rowcount
+        held = connection.execute(sa.select(b.c.data).where(b.c.hash == digest)).scalar_one_or_none()
+        if held is not None and not _wrong(digest, held) and not aside:
+            return False
+        connection.execute(b.delete().where(b.c.hash == digest))
+        insert_rows(connection, b, [(digest, compress(raw, 3))])
+        log_event(connection, store.clock(), MENDED, by, f"plane {digest}")
+    return True
 
 
 def _database(connection: sa.Connection, store: Store) -> Iterator[Damage]:
@@ -114,19 +135,6 @@ def _ends(connection: sa.Connection) -> Iterator[Damage]:
 def _in_batches(connection: sa.Connection, query: sa.Select[Any]) -> Iterator[Any]:
     """Rows, so many at a time: a store is larger than memory."""
     yield from connection.execution_options(yield_per=_BATCH).execute(query)
-
-
-def _mend(connection: sa.Connection, damage: Damage, source: Source, now: int, by: str) -> Damage:
-    raw = source(damage.name) if damage.kind == "plane" else None
-    if raw is None or hashlib.sha256(raw).hexdigest() != damage.name:
-        quarantine(connection, [damage], now, by)
-        return replace(damage, mended="set aside")
-    b, q = schema.blobs, schema.quarantine
-    connection.execute(b.delete().where(b.c.hash == damage.name))
-    insert_rows(connection, b, [(damage.name, compress(raw, 3))])
-    connection.execute(q.delete().where(q.c.kind == "plane", q.c.name == damage.name))
-    log_event(connection, now, MENDED, by, f"plane {damage.name}")
-    return replace(damage, mended="mended from the other store")
 
 
 MENDED = "mended"

@@ -108,12 +108,12 @@ def revoke_in(connection: sa.Connection, now: int, name: str, by: str, *, keep_v
     return int(done.rowcount), 0 if keep_votes else end_votes(connection, name, seq)
 
 
-def ballots_standing(store: Store, name: str) -> int:
-    """Number of standing ballots of a name."""
+def ballots_standing(store: Store) -> dict[str, int]:
+    """Number of standing ballots, by the name of their vehicle."""
     b = schema.ballots.c
-    query = sa.select(sa.func.count()).select_from(schema.ballots).where(b.vehicle == name, b.gone_seq.is_(None))
+    query = sa.select(b.vehicle, sa.func.count()).where(b.gone_seq.is_(None)).group_by(b.vehicle)
     with store.database.reading() as connection:
-        return int(connection.execute(query).scalar_one())
+        return {vehicle: int(count) for vehicle, count in connection.execute(query)}
 
 
 def listed(store: Store) -> list[Key]:
