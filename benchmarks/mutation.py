@@ -39,7 +39,7 @@ TESTS = {
     "fusion/change_time.py": "fusion/test_change_time.py",
     "detection/paper.py": "detection/test_paper.py",
     "detection/evidence.py": "detection",
-    "detection/surface_rules.py": "detection",
+    "detection/packed_tiles.py": "detection",
     "detection/confidence.py": "detection",
     "perception/fans.py": "perception/test_fans.py perception/test_raycast.py",
     "perception/raycast.py": "perception/test_raycast.py",

@@ -20,9 +20,8 @@ from matplotlib.patches import Patch
 
 from mapvote.core.grid import TILE_CELLS
 from mapvote.core.types import I32, U8, U64, CellState
-from mapvote.detection.evidence import CROSSED, HIT, PLANES, WORDS
-from mapvote.detection.packed_tiles import Overlap
-from mapvote.detection.surface_rules import VoxelFacts, judge_window, no_facts, weigh_voxels
+from mapvote.detection.evidence import CROSSED, HIT, WORDS, Facts, judge_window, weigh_voxels
+from mapvote.detection.packed_tiles import PLANES, Overlap
 from mapvote.plots import EMPTY, FAINT, GONE, INK, NEW, STANDING, UNSURE
 
 CELLS, LAYERS = 18, 11
@@ -71,9 +70,9 @@ DRIVEN_BY = {"7  hit as often as passed": range(12, 15)}
 """Cells whose new voxels were passed more often than hit."""
 
 
-def decided(name: str) -> tuple[U64, VoxelFacts, U8]:
+def decided(name: str) -> tuple[U64, Facts, U8]:
     """The occupied voxels of a side, what is said of its voxels, and what the rule says of its cells: (1, CELLS)."""
-    facts, occupied = no_facts((1, CELLS)), np.zeros((1, CELLS), np.uint64)
+    facts, occupied = Facts.none((1, CELLS)), np.zeros((1, CELLS), np.uint64)
     for said, where in SIDES[name].items():
         for cells, first, last in where:
             plane: U64 = occupied if said == "mapped" else getattr(facts, said)
@@ -82,7 +81,7 @@ def decided(name: str) -> tuple[U64, VoxelFacts, U8]:
     facts.passed[:] |= facts.gone
     facts.balance[0, list(DRIVEN_BY.get(name, ()))] = -1
     rise_m = np.where(occupied != 0, np.float32(3.0), np.float32(np.nan))
-    return occupied, facts, judge_window(facts, occupied, rise_m, 0.3).states
+    return occupied, facts, judge_window(facts, occupied, rise_m, 0.3)[0]
 
 
 def draw_side(axes: Any, name: str) -> None:
@@ -117,7 +116,7 @@ def weighed(*, mapped: bool, hits: int, crossings: int) -> I32:
         for k in range(PLANES):
             planes[:hits, :crossings, first + k] = (counter >> np.uint64(k) & np.uint64(1)) << np.uint64(5)
     one = np.full((hits, crossings), np.uint64(1) << np.uint64(5))
-    facts = no_facts(one.shape)
+    facts = Facts.none(one.shape)
     weigh_voxels(planes, Overlap(0, hits, 0, crossings, 0, 0), one if mapped else one * np.uint64(0), one, facts)
     said = (facts.gone | facts.new != 0) + 2 * (facts.stands != 0)
     return np.asarray(said, np.int32)

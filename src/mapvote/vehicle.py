@@ -240,15 +240,10 @@ def write_ballot(
 
 
 def _ballot_tile(point_map: PointMap, tile: TileIndex, votes: TileVotes, points: F64, two_stage: bool) -> BallotTile:
-    """One-stage, the server decides: then every cell that got such a vote may need its points and its mask."""
-    changed = {
-        change: votes.states == change if two_stage else votes.tally[..., change] > 0
-        for change in (CellState.CHANGED_OCCUPIED, CellState.CHANGED_EMPTY)
-    }
-    kept, bright = offered(point_map, tile, np.where(changed[CellState.CHANGED_OCCUPIED], votes.new, NOTHING), points)
-    gone, left = votes.gone, NOTHING if votes.remnants is None else votes.remnants
-    if gone is not None:
-        gone = np.where(changed[CellState.CHANGED_EMPTY], gone, left)
+    """One-stage, the server decides: then every cell that got a vote for changed-occupied may need its points."""
+    built = CellState.CHANGED_OCCUPIED
+    came = votes.states == built if two_stage else votes.tally[..., built] > 0
+    kept, bright = offered(point_map, tile, np.where(came, votes.new, NOTHING), points)
     odds = None
     if two_stage and votes.looked is not None:
         from mapvote.detection.confidence import depths_m, log_odds  # brings scipy, as surfaces do
@@ -260,7 +255,7 @@ def _ballot_tile(point_map: PointMap, tile: TileIndex, votes: TileVotes, points:
         tile=tile,
         states=pack_plane(votes.states) if two_stage else None,
         tally=None if two_stage else pack_plane(np.moveaxis(to_wire(votes.tally), -1, 0)),
-        gone=None if gone is None else pack_words(gone),
+        gone=None if votes.gone is None else pack_words(votes.gone),
         new_points=pack_points(kept) if len(kept) else None,
         intensity=pack_plane(bright) if len(kept) and bright is not None and bright.any() else None,
         free=None if votes.free is None else pack_words(votes.free),

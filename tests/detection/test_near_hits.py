@@ -79,16 +79,16 @@ def test_what_moves_and_what_is_ground_speaks_for_nothing() -> None:
 
 
 def test_no_hit_speaks_beyond_the_window() -> None:
-    """Hits at all four borders; behind the planes lies a row of zeros that nobody may touch."""
-    cells = SIDE * SIDE
-    base, near, apart = np.zeros(cells + SIDE, np.int32), *np.zeros((2, cells + SIDE), np.uint64)
+    """Hits at all four borders of planes that lie in larger ones, which nobody may touch."""
+    around, inner = np.zeros((2, SIDE + 2, SIDE + 2), np.uint64), np.s_[:, 1:-1, 1:-1]
+    near, apart = around[inner]
     low, high = 0.01, SIDE * CELL_SIZE - 0.01
     points = np.array([[x, y, 1.0] for x in (low, 1.0, high) for y in (low, 1.0, high)])
     cell = (points[:, :2] // CELL_SIZE).astype(np.int32) @ np.array([1, SIDE], dtype=np.int32)
     chosen, reach = np.ones(len(points), np.bool_), HIT_REACH_M / CELL_SIZE
-    mapped = np.zeros(cells, np.uint64)
-    _mark_near(points, cell, chosen, base[:cells], mapped, SIDE, (0.0, 0.0), reach, near, apart)
-    assert set(cell[cell < cells]) <= set(np.flatnonzero(near))
-    assert set(cell[cell < cells]) == set(np.flatnonzero(apart))
-    assert not near[cells:].any()
-    assert not apart[cells:].any()
+    mapped, base = np.zeros((SIDE, SIDE), np.uint64), np.zeros((SIDE, SIDE), np.int32)
+    _mark_near(points, cell, chosen, base, mapped, (0.0, 0.0), reach, near, apart)
+    assert set(cell) <= set(np.flatnonzero(near))
+    assert set(cell) == set(np.flatnonzero(apart))
+    around[inner] = 0
+    assert not around.any()

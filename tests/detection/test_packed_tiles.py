@@ -55,7 +55,7 @@ def surfaces_after_a_drive(point_map: PointMap) -> SurfaceVoter:
     """Walls were crossed seven times or met, or half of both or neither, and things rose, at random."""
     voter, rng = SurfaceVoter(VotingSettings(), point_map), np.random.default_rng(6)
     for tile in point_map.tiles:
-        planes, mapped = voter.evidence.tiles.near(tile), point_map.tiles[tile].obstacle_words
+        planes, mapped = voter.evidence.near(tile), point_map.tiles[tile].obstacle_words
         fate = rng.random(mapped.shape)
         planes[..., CROSSED : CROSSED + 3] = np.where(fate < 0.4, mapped, np.uint64(0))[..., None]
         planes[..., CROSSED] |= np.where(fate > 0.8, mapped, np.uint64(0))

@@ -263,7 +263,7 @@ def test_a_drive_s_votes_are_the_sums_of_its_scans_tile_by_tile() -> None:
     assert right.new[10, 2] == ~np.uint64(0)
     assert not left.new.any()
     assert np.count_nonzero(may_be_new) == 1
-    assert (left.gone, left.remnants, left.free) == (None, None, None), "the paper's vote is of whole cells"
+    assert (left.gone, left.free) == (None, None), "the paper's vote is of whole cells"
 
 
 def test_asking_for_votes_changes_none_and_before_any_scan_there_are_none() -> None:

@@ -19,14 +19,13 @@ from mapvote.detection.evidence import (
     HIT,
     PASSED,
     PASSES,
-    PLANES,
     WORDS,
-    Evidence,
-    count_of,
+    count_scan,
     free_words,
     least_passed,
     near_hits,
 )
+from mapvote.detection.packed_tiles import PLANES, PackedTiles, count_of
 from mapvote.perception.frontend import Observation
 from mapvote.perception.raycast import ScanView
 
@@ -72,11 +71,11 @@ def told_of(seen: Observation, r: int, c: int, bit: int) -> tuple[bool, bool, bo
 def test_a_voxel_counts_what_one_scan_tells_of_it(offsets: list[tuple[float, float, float]], seed: int) -> None:
     point_map = street()
     seen = seen_from(point_map, np.array(offsets), seed)
-    evidence = Evidence(point_map.lattice)
-    evidence.count(seen)
+    evidence = PackedTiles(point_map.lattice, WORDS)
+    count_scan(evidence, seen)
     for r in ROWS:
         for c in COLS:
-            cell = evidence.tiles[0, 0][r, c]
+            cell = evidence[0, 0][r, c]
             for bit in range(1, TOP_BIT):
                 counted = [bool(count_of(cell, first, bit)) for first in (CROSSED, HIT, PASSES)]
                 assert (*counted, bool(int(cell[PASSED]) >> bit & 1)) == told_of(seen, r, c, bit)
@@ -91,22 +90,22 @@ def test_a_window_across_tiles_counts_each_cell_where_it_lies() -> None:
     for (row, col), bit in places.items():
         passed[row + 5, col - 7] = np.uint64(1 << bit)
     view = ScanView(window, none.astype(np.int32), none, passed, np.zeros((0, 0), np.uint8))
-    evidence = Evidence(point_map.lattice)
-    evidence.count(replace(seen, view=view, reference=replace(here, ground_z=ground_z)))
+    evidence = PackedTiles(point_map.lattice, WORDS)
+    count_scan(evidence, replace(seen, view=view, reference=replace(here, ground_z=ground_z)))
     for (row, col), bit in places.items():
-        planes = evidence.tiles[row // TILE_CELLS, 0]
+        planes = evidence[row // TILE_CELLS, 0]
         assert planes[row % TILE_CELLS, col, PASSED] == np.uint64(1 << bit)
-    assert sum(np.count_nonzero(evidence.tiles[tile][..., PASSED]) for tile in evidence.tiles) == len(places)
+    assert sum(np.count_nonzero(evidence[tile][..., PASSED]) for tile in evidence) == len(places)
 
 
 def test_a_cell_in_which_a_count_is_full_is_halved_as_a_whole_and_its_ratios_stay() -> None:
     point_map = street()
-    evidence = Evidence(point_map.lattice)
+    evidence = PackedTiles(point_map.lattice, WORDS)
     hit = np.array([[102.5 * 0.3, 102.5 * 0.3, 1.05]])  # where nothing is mapped
     empty = np.array([[104.5 * 0.3, 104.5 * 0.3, 1.05]])
     for scan in range(FULL + 1):
-        evidence.count(one_scan(point_map, hit if scan % 4 == 0 else empty))
-    cell = evidence.tiles[0, 0][102, 102]
+        count_scan(evidence, one_scan(point_map, hit if scan % 4 == 0 else empty))
+    cell = evidence[0, 0][102, 102]
     assert count_of(cell, PASSES, 10) == (FULL + 1) // 2, "128 do not fit"
     assert count_of(cell, HIT, 3) == 32 // 2
     assert count_of(cell, PASSES, 3) == 96 // 2
@@ -137,20 +136,18 @@ def test_rays_that_only_graze_a_roof_never_cross_it_whatever_their_number() -> N
     assert least_passed(cell_with(7, (FULL, FULL, 0)), 7) == 0
 
 
-def test_free_is_what_two_scans_passed_none_hit_and_the_map_does_not_hold() -> None:
+def test_free_is_what_two_scans_passed_and_none_hit() -> None:
     planes = np.zeros((3, 1, WORDS), np.uint64)
     planes[2, 0, PASSES + 1] = 0b1110  # passed by two scans
     planes[2, 0, PASSES] = 0b10000  # by one
     planes[2, 0, HIT] = 0b0100
-    occupied = np.zeros((3, 1), np.uint64)
-    occupied[2] = 0b1000
-    assert free_words(planes, occupied).tolist() == [[0], [0], [0b0010]]
+    assert free_words(planes).tolist() == [[0], [0], [0b1010]]
 
 
 def test_cells_of_unknown_ground_gather_nothing() -> None:
     point_map = street()
     seen = one_scan(point_map, np.array([[30.7, 30.7, 1.05]]))
     unknown = replace(seen.reference, ground_z=np.full_like(seen.reference.ground_z, np.nan))
-    evidence = Evidence(point_map.lattice)
-    evidence.count(replace(seen, reference=unknown))
-    assert not any(planes.any() for planes in evidence.tiles.values())
+    evidence = PackedTiles(point_map.lattice, WORDS)
+    count_scan(evidence, replace(seen, reference=unknown))
+    assert not any(planes.any() for planes in evidence.values())

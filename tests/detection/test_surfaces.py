@@ -18,28 +18,22 @@ from mapvote.core.point_map import PointMap
 from mapvote.core.types import F64, I32, NO_VOTE, Bool, CellState
 from mapvote.detection.evidence import (
     CROSSED,
-    HIT,
-    HIT_REACH_M,
-    PASSES,
-    PLANES,
-    WORDS,
-    Evidence,
-    count_of,
-)
-from mapvote.detection.packed_tiles import Overlap
-from mapvote.detection.surface_rules import (
     GONE_RAYS,
+    HIT,
     HIT_RAYS,
+    HIT_REACH_M,
     NEW_ENOUGH,
     NEW_RAYS,
+    PASSES,
     SUPPORT,
     TOGETHER,
-    VoxelFacts,
-    grown,
+    WORDS,
+    Facts,
+    count_scan,
     judge_window,
-    no_facts,
     weigh_voxels,
 )
+from mapvote.detection.packed_tiles import PLANES, Overlap, PackedTiles, count_of
 from mapvote.detection.surfaces import SurfaceVoter
 from mapvote.detection.voter import TileVotes
 
@@ -187,15 +181,6 @@ def test_what_no_ray_ever_crossed_does_not_go_with_the_rest_of_its_wall() -> Non
     assert [int(states[cell]) for cell in WALL] == [CE] * 6 + [NO_VOTE] * 6
 
 
-@given(strong=arrays(np.bool_, (6, 6)), weak=arrays(np.bool_, (6, 6)))
-def test_what_is_weak_goes_along_with_what_is_strong_if_it_touches_it_directly_or_through_others(
-    strong: Bool, weak: Bool
-) -> None:
-    out = grown(strong, weak)
-    np.testing.assert_array_equal(out, ndimage.binary_propagation(strong, np.ones((3, 3)), mask=strong | weak))
-    np.testing.assert_array_equal(grown(out, weak), out)
-
-
 def test_what_is_no_higher_than_a_kerb_is_never_gone() -> None:
     assert not (after(street(WALL, [0.45]), standing_at(OLD_Y + 9)).states == CE).any()
 
@@ -227,8 +212,8 @@ def test_a_cell_in_which_something_stands_is_not_empty_whatever_else_of_it_is_go
     points = standing_at(OLD_Y, HEIGHTS[:2])  # the upper half of the wall went
     votes = after(street(WALL, HEIGHTS), points)
     assert all(votes.states[cell] == UO for cell in WALL)
-    assert votes.remnants is not None
-    assert votes.remnants[ROW, 105] == np.uint64(0b100000), "the voxel on what stands may be its upper edge"
+    assert votes.gone is not None
+    assert votes.gone[ROW, 105] == np.uint64(0b100000), "the voxel on what stands may be its upper edge"
 
 
 def test_a_place_where_nothing_is_mapped_and_rays_passed_is_empty_and_one_that_none_passed_has_no_vote() -> None:
@@ -244,14 +229,14 @@ def test_a_place_where_nothing_is_mapped_and_rays_passed_is_empty_and_one_that_n
     assert states[ROW, 100] == UO, "hits need no rays beside them"
 
 
-def weighed(mapped: int, free: int, **counts: int) -> VoxelFacts:
+def weighed(mapped: int, free: int, **counts: int) -> Facts:
     """Of one cell whose voxel 5 has these counts; ``passes`` of the voxels above and below it too."""
     planes, bit = np.zeros((1, 1, WORDS), np.uint64), 5
     for first, name, word in ((CROSSED, "crossed", 0b010), (HIT, "met", 0b010), (PASSES, "passes", 0b111)):
         for k in range(PLANES):
             planes[0, 0, first + k] = np.uint64((counts.get(name, 0) >> k & 1) * word << bit - 1)
     words_of = [np.full((1, 1), word << bit, np.uint64) for word in (mapped, free)]
-    out = no_facts((1, 1))
+    out = Facts.none((1, 1))
     weigh_voxels(planes, Overlap(0, 1, 0, 1, 0, 0), *words_of, out)
     return out
 
@@ -284,8 +269,8 @@ def test_a_free_voxel_is_new_by_hits_against_crossings_and_tells_how_often_rays_
 def test_what_was_passed_more_often_than_hit_is_nothing_new(cells: Bool, met: I32, passes: I32) -> None:
     ground = np.zeros(cells.shape, np.uint64)
     pole = np.where(cells, np.uint64(2 * (1 << NEW_ENOUGH) - 2), np.uint64(0))
-    facts = no_facts(cells.shape)._replace(new=pole, balance=np.where(cells, met - passes, 0))
-    came = judge_window(facts, ground, np.full(cells.shape, np.nan, np.float32), 0.5).states == CO
+    facts = Facts.none(cells.shape)._replace(new=pole, balance=np.where(cells, met - passes, 0))
+    came = judge_window(facts, ground, np.full(cells.shape, np.nan, np.float32), 0.5)[0] == CO
     groups, count = ndimage.label(cells, np.ones((3, 3)))
     for k in range(1, count + 1):
         group = groups == k
@@ -322,8 +307,8 @@ def test_an_upper_storey_that_no_ray_reached_stays_where_the_lower_one_stands_be
         voter.observe(seen)
     votes = voter.votes()[0, 0]
     assert all(votes.states[cell] == UO for cell in WALL)
-    assert votes.remnants is not None
-    assert not any(votes.remnants[cell] >> np.uint64(7) for cell in WALL)
+    assert votes.gone is not None
+    assert not any(votes.gone[cell] >> np.uint64(7) for cell in WALL)
 
 
 @given(st.lists(st.tuples(*[st.floats(0.6, 3.0)] * 3), min_size=1, max_size=6))
@@ -332,11 +317,11 @@ def test_a_hit_meets_exactly_the_mapped_voxels_within_its_reach(offsets: list[tu
     cells = [(r, c) for r in range(98, 114) for c in range(98, 114)]
     point_map = street(cells, [0.45 + 0.3 * k for k in range(12)])
     points = np.array(offsets) + np.array([30.0, 30.0, 0.0])
-    evidence = Evidence(point_map.lattice)
-    evidence.count(one_scan(point_map, points))
+    evidence = PackedTiles(point_map.lattice, WORDS)
+    count_scan(evidence, one_scan(point_map, points))
     for r, c in cells[::7]:
         for bit in range(1, 12):
             low = np.array([c, r, bit]) * CELL_SIZE
             apart = np.maximum(low - points, points - low - CELL_SIZE).max(axis=1).min()
             if abs(apart - HIT_REACH_M) > 1e-6 and abs(apart) > 1e-6:
-                assert count_of(evidence.tiles[0, 0][r, c], HIT, bit) == (apart < HIT_REACH_M)
+                assert count_of(evidence[0, 0][r, c], HIT, bit) == (apart < HIT_REACH_M)

@@ -166,8 +166,7 @@ def _tile_votes(states: U8, gone: U64, new: U64, free: U64 | None) -> TileVotes:
     return TileVotes(
         tally=one_hot(states),
         states=states,
-        gone=np.ascontiguousarray(gone),
-        remnants=np.zeros_like(gone),
+        gone=np.where(states == CellState.CHANGED_EMPTY, gone, np.uint64(0)),
         new=np.ascontiguousarray(new),
         free=None if free is None else np.ascontiguousarray(free),
     )

@@ -1,61 +1,86 @@
-"""The evidence of a drive, a vehicle's or a survey's: in how many scans each voxel was hit, crossed and passed.
+"""The rule of evidence on one page: what a drive counts of each voxel, and what its counts say of each cell.
 
-A return speaks for the surfaces within its own error, HIT_REACH_M, in whichever voxel they lie, and for nothing beside
-them: a wall half a metre from where one stood is another wall. In one scan
+In one scan, returns of moving objects left out:
 
-* a mapped voxel is *hit* if a return lies within HIT_REACH_M of it; any other voxel if a return lies in it that has no
-  mapped voxel so near, because what the map explains is nothing new beside it;
-* a voxel is *passed* if a ray goes through it and no return lies within HIT_REACH_M of it;
-* a voxel is *crossed* if it is passed, and rays pass the voxels above and below it too. A ray that grazes a slab (roof,
-  awning, ceiling) passes only one of the two. The ground bounds the lowest voxel, the end of the word the highest.
+    mapped voxel  hit if a return lies within HIT_REACH_M of it, in whichever voxel the return lies
+    other voxel   hit if a return lies in it that has no mapped voxel so near: what the map explains is nothing new
+    any voxel     passed if a ray goes through it and no return lies within HIT_REACH_M of it;
+                  crossed if it is passed, and rays go through the voxels above and below it too
 
-Each count is kept as PLANES bit planes: plane k of a cell is a 64-bit word with bit k of the counts of the cell's 64
-voxels, so that one scan is added to a whole column with a few word operations. Returns of moving objects count for
-nothing. Cells without known ground gather nothing: heights mean nothing there.
+A ray that grazes a slab (roof, awning, ceiling) goes through only one of the two. The ground bounds the lowest voxel,
+the end of the word the highest. Over a drive's scans a voxel has h hits, c crossings and p passes; a and b are the
+passes of the voxels above and below it.
+
+    C = max(c, min(p, a, b) / TOGETHER)
+    mapped voxel: gone if C >= GONE_RAYS + HIT_RAYS h; else it stands if h >= 1
+    free voxel:   new if h >= 1 + NEW_RAYS c
+
+A cell is empty if a voxel of it is gone and none stands. Of an 8-connected group of A cells that are empty, or that
+have new voxels, with N such voxels, *enough* is
+
+    N >= min(SUPPORT + a (A - 1), NEW_ENOUGH), a = 0 for what is gone, NEW_A_CELL for what is new,
+
+or that the group is a separate small object on the ground.
+
+    changed-empty     empty cells that are enough, and cells that touch them, directly or through each other, in which
+                      nothing stands and rays passed half of the mapped voxels
+    changed-occupied  cells with new voxels that are enough, if sum h >= sum p over the group; what was hit where the
+                      map knew nothing is new within REACH_CELLS of changed-empty
+
+What rises less than ``min_height_m`` over the ground is never gone.
 """
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
+from scipy import ndimage
 
 from mapvote.core.columns import TOP_BIT, layer_bit
-from mapvote.core.grid import CELL_SIZE, Lattice
+from mapvote.core.grid import CELL_SIZE
 from mapvote.core.kernel import inlined, kernel
-from mapvote.core.types import F32, F64, I32, U64, Bool
-from mapvote.detection.packed_tiles import Overlap, PackedTiles
+from mapvote.core.types import F32, F64, I32, NO_VOTE, U8, U64, Bool, CellState
+from mapvote.detection.packed_tiles import PLANES, Overlap, PackedTiles, add_one, count_of
 from mapvote.perception.frontend import Observation
 from mapvote.perception.raycast import find_obstacles
 
+# Set on corner 1 and 2, street 2 and KITTI 0001 in blocks of 12 and 25 scans; docs/method.md says what needs each.
 HIT_REACH_M = 0.1
 """Range noise and pose sigma together, three times over."""
-PLANES = 7
-"""Counts up to 127 scans."""
-CROSSED, HIT, PASSES = 0, PLANES, 2 * PLANES
-"""First plane of each counter."""
-PASSED = 3 * PLANES
-"""The word of voxels that any ray ever passed."""
-WORDS = 3 * PLANES + 1
-"""Words of a cell."""
+GONE_RAYS, HIT_RAYS = 3, 8
+"""Scans that must have crossed a mapped voxel that none hit (two may be an error of two poses); more for each hit."""
+TOGETHER = 2
+"""Scans whose rays cross a voxel only together count as one of so many."""
+NEW_RAYS = 0.5
+"""Hits that a free voxel needs beside the first, for each scan that crossed it."""
+SUPPORT = 6
+"""Voxels of a change: a pole of 1.8 m, half a square metre."""
+NEW_A_CELL, NEW_ENOUGH = 2, 40
+"""Voxels more that something new needs for each further cell, because what is thinner is noise; and at most, for large
+low objects."""
+REACH_CELLS = 3
+"""How far behind a surface that is gone another may have been hidden: .9 m."""
+
+CROSSED, HIT, PASSES, PASSED = 0, PLANES, 2 * PLANES, 3 * PLANES
+"""First plane of each counter of a cell, and the last of its WORDS: voxels through which any ray ever went."""
+WORDS = PASSED + 1
+NOTHING = np.uint64(0)
 _LOWEST, _HIGHEST = np.uint64(0b11), np.uint64(1) << np.uint64(TOP_BIT - 1)
+_NEAR_GROUND = np.uint64(0b1111)
+"""A column that has one of these voxels begins within 1.2 m of the ground."""
+_AROUND = np.ones((3, 3))
 
 
-class Evidence:
-    """Counters of a drive by tile: (256, 256, WORDS) uint64: crossed, hit, passes, then what any ray passed.
-
-    Memory is bounded by the tiles around the vehicle, and some hundred kilobytes for each that it has left.
-    """
-
-    def __init__(self, lattice: Lattice) -> None:
-        self.tiles = PackedTiles(lattice, WORDS)
-
-    def count(self, seen: Observation) -> U64:
-        """Count one scan; returns (rows, cols) words of voxels that hold a return which the map does not explain."""
-        view, here = seen.view, seen.reference
-        near, apart = near_hits(seen)
-        for planes, part in self.tiles.under(view.grid):
-            _count_scan(planes, part, apart, near, view.passed, here.occupied, here.ground_z)
-        self.tiles.leave(view.grid)
-        return apart
+def count_scan(evidence: PackedTiles, seen: Observation) -> U64:
+    """Count one scan in the ``evidence`` of a drive, a vehicle's or a survey's: WORDS words a cell. Returns (rows,
+    cols) words of the voxels that hold a return which the map does not explain."""
+    view, here = seen.view, seen.reference
+    near, apart = near_hits(seen)
+    for planes, part in evidence.under(view.grid):
+        _enter_scan(planes, part, apart, near, view.passed, here.occupied, here.ground_z)
+    evidence.leave(view.grid)
+    return apart
 
 
 def near_hits(seen: Observation) -> tuple[U64, U64]:
@@ -64,50 +89,45 @@ def near_hits(seen: Observation) -> tuple[U64, U64]:
     here, scan, grid = seen.reference, seen.scan, seen.view.grid
     near, apart = np.zeros((2, *grid.shape), dtype=np.uint64)
     cell = scan.cell if here is scan.reference else find_obstacles(scan.points_map, here)[1]
-    chosen, reach, corner = scan.obstacle & ~seen.moving, HIT_REACH_M / CELL_SIZE, (grid.x0, grid.y0)
-    _mark_near(
-        scan.points_map, cell, chosen, here.base.ravel(), here.occupied.ravel(), grid.shape[1], corner,
-        reach, near.ravel(), apart.ravel(),
-    )  # fmt: skip
+    still, corner = scan.obstacle & ~seen.moving, (grid.x0, grid.y0)
+    _mark_near(scan.points_map, cell, still, here.base, here.occupied, corner, HIT_REACH_M / CELL_SIZE, near, apart)
     return near, apart
 
 
 @kernel
 def _mark_near(
-    points: F64, cell: I32, chosen: Bool, base: I32, occupied: U64, cols: int, corner: tuple[float, float],
-    reach: float, near: U64, apart: U64,
+    points: F64, cell: I32, chosen: Bool, base: I32, occupied: U64, corner: tuple[float, float], reach: float,
+    near: U64, apart: U64,
 ) -> None:  # fmt: skip
-    """Enter into ``near`` the voxels that come within ``reach`` cells, along each axis, of the points, and into
-    ``apart`` the voxel of each that has none of the map's so near; the planes are flat, ``cols`` wide."""
-    last_row, last_col = len(base) // cols - 1, cols - 1
+    """Enter into ``near`` the voxels that come within ``reach`` cells, along each axis, of the points (n, 3), and into
+    ``apart`` the voxel of each that has none of the map's so near: planes (rows, cols), ``cell`` (n,) flat in them."""
+    rows, cols = occupied.shape
     for i in range(np.uint64(0), np.uint64(len(points))):
         if not chosen[i] or cell[i] < 0:
             continue
         x, y = (points[i, 0] - corner[0]) / CELL_SIZE, (points[i, 1] - corner[1]) / CELL_SIZE
-        left, right = max(int(x - reach), 0), min(int(x + reach), last_col)
-        first, last = cols * max(int(y - reach), 0), cols * min(int(y + reach), last_row)
-        z = points[i, 2] / CELL_SIZE
-        lowest, highest = int(np.floor(z - reach)), int(np.floor(z + reach))
-        mapped = np.uint64(0)
-        for column in (first + left, first + right, last + left, last + right):  # mostly the same one four times
-            word = _column(np.uint64(column), lowest, highest, base)
-            near[np.uint64(column)] |= word
-            mapped |= occupied[np.uint64(column)] & word
+        z, mapped = points[i, 2] / CELL_SIZE, np.uint64(0)
+        for r in range(max(int(y - reach), 0), min(int(y + reach), rows - 1) + 1):
+            for c in range(max(int(x - reach), 0), min(int(x + reach), cols - 1) + 1):
+                word = _layers(int(np.floor(z - reach)), int(np.floor(z + reach)), base[r, c])
+                near[r, c] |= word
+                mapped |= occupied[r, c] & word
         if not mapped:
-            layer = int(np.floor(z))
-            apart[np.uint64(cell[i])] |= _column(np.uint64(cell[i]), layer, layer, base)
+            r, c = divmod(cell[i], cols)
+            apart[r, c] |= _layers(int(np.floor(z)), int(np.floor(z)), base[r, c])
 
 
 @inlined
-def _column(cell: int, lowest: int, highest: int, base: I32) -> np.uint64:
-    """The word of the layers ``lowest`` to ``highest`` of the world in one column."""
-    low, high = layer_bit(lowest, base[cell]), layer_bit(highest, base[cell])
+def _layers(lowest: int, highest: int, base: int) -> np.uint64:
+    """The word of the layers ``lowest`` to ``highest`` of the world in a column that begins at ``base``."""
+    low, high = layer_bit(lowest, base), layer_bit(highest, base)
     return (np.uint64(2) << np.uint64(high)) - (np.uint64(1) << np.uint64(low))
 
 
 @kernel
-def _count_scan(planes: U64, part: Overlap, apart: U64, near: U64, passed: U64, occupied: U64, ground_z: F32) -> None:
-    """Add to a tile's ``planes`` the ``part`` of one scan's window that lies on it."""
+def _enter_scan(planes: U64, part: Overlap, apart: U64, near: U64, passed: U64, occupied: U64, ground_z: F32) -> None:
+    """Add to a tile's ``planes`` the ``part`` of one scan's window that lies on it. Where the ground is unknown heights
+    mean nothing, and nothing is counted."""
     for r in range(part.row, part.end_row):
         for c in range(part.col, part.end_col):
             if np.isnan(ground_z[r, c]) or not near[r, c] | passed[r, c]:
@@ -115,53 +135,116 @@ def _count_scan(planes: U64, part: Overlap, apart: U64, near: U64, passed: U64, 
             cell, rays, missed = planes[r + part.down, c + part.right], passed[r, c], passed[r, c] & ~near[r, c]
             cell[PASSED] |= rays
             crossed = missed & (rays >> np.uint64(1) | _HIGHEST) & (rays << np.uint64(1) | _LOWEST)
-            full = (
-                _add_one(cell, CROSSED, crossed),
-                _add_one(cell, HIT, (near[r, c] & occupied[r, c]) | apart[r, c]),
-                _add_one(cell, PASSES, missed),
-            )
-            if full[0] | full[1] | full[2]:  # halve all counts of the cell: what is weighed keeps its ratios
-                for counter in range(3):
-                    first = counter * PLANES
-                    for k in range(first, first + PLANES - 1):
-                        cell[k] = cell[k + 1]
-                    cell[first + PLANES - 1] = full[counter]
-
-
-@kernel
-def _add_one(cell: U64, first: int, word: np.uint64) -> np.uint64:
-    """Add 1 to the counts of ``word``'s voxels: a ripple-carry adder over 64 voxels at once. Returns the carry: the
-    voxels whose count would exceed PLANES bits."""
-    for k in range(first, first + PLANES):
-        carry = cell[k] & word
-        cell[k] ^= word
-        word = carry
-        if not word:
-            break
-    return word
-
-
-@kernel
-def count_of(cell: U64, first: int, bit: int) -> int:
-    """The count of one voxel of a cell (WORDS,); ``first`` is the counter's first plane."""
-    value = 0
-    for k in range(PLANES):
-        value |= int((cell[first + k] >> np.uint64(bit)) & np.uint64(1)) << k
-    return value
+            add_one(cell, (crossed, (near[r, c] & occupied[r, c]) | apart[r, c], missed))
 
 
 @kernel
 def least_passed(cell: U64, bit: int) -> int:
-    """In how many scans rays passed voxel ``bit`` of a cell (WORDS,), the voxel above or the one below, whichever they
-    passed least: all scans together crossed it at most so often. Its ends are bounded as in one scan."""
+    """min(p, a, b) of voxel ``bit`` of a cell (WORDS,): all scans together crossed it at most so often. Its ends are
+    bounded as in one scan."""
     least = count_of(cell, PASSES, bit)
     if bit + 1 < TOP_BIT:
         least = min(least, count_of(cell, PASSES, bit + 1))
     return min(least, count_of(cell, PASSES, bit - 1)) if bit > 1 else least
 
 
-def free_words(planes: U64, occupied: U64) -> U64:
-    """(rows, cols) voxels that two scans or more passed, none hit, and that the map does not hold."""
+def free_words(planes: U64) -> U64:
+    """(rows, cols) voxels that two scans or more passed and none hit."""
     hit = np.bitwise_or.reduce(planes[..., HIT : HIT + PLANES], axis=-1)
     often = np.bitwise_or.reduce(planes[..., PASSES + 1 : PASSES + PLANES], axis=-1)
-    return np.asarray(often & ~(occupied | hit))
+    return np.asarray(often & ~hit)
+
+
+class Facts(NamedTuple):
+    """What the counts say of a window, (rows, cols) each: words of voxels, ``beyond`` as ``new`` where the map did not
+    know them to be free, ``passed`` by any ray; and over a cell's new voxels the sums of h and of h - p."""
+
+    gone: U64
+    stands: U64
+    new: U64
+    beyond: U64
+    passed: U64
+    hits: I32
+    balance: I32
+
+    @classmethod
+    def none(cls, shape: tuple[int, int]) -> Facts:
+        """Of a window in which nothing was counted."""
+        return cls(*(np.zeros(shape, kind) for kind in [np.uint64] * 5 + [np.int32] * 2))
+
+
+@kernel
+def weigh_voxels(planes: U64, part: Overlap, occupied: U64, known_free: U64, out: Facts) -> None:
+    """Fill the ``part`` of a window that lies on a tile from the tile's counters (256, 256, WORDS), by the voxels that
+    the map holds and knows to be free (rows, cols). ``out`` comes empty."""
+    for r in range(part.row, part.end_row):
+        for c in range(part.col, part.end_col):
+            cell, mapped = planes[r + part.down, c + part.right], occupied[r, c]
+            out.passed[r, c] = cell[PASSED]
+            asked = mapped
+            for k in range(PLANES):
+                asked |= cell[HIT + k]
+            for bit in range(64 if asked else 0):
+                one = np.uint64(1) << np.uint64(bit)
+                if not asked & one:
+                    continue
+                hits, crossed = count_of(cell, HIT, bit), count_of(cell, CROSSED, bit)
+                if mapped & one:
+                    if max(crossed, least_passed(cell, bit) // TOGETHER) >= GONE_RAYS + HIT_RAYS * hits:
+                        out.gone[r, c] |= one
+                    elif hits:
+                        out.stands[r, c] |= one
+                elif hits >= 1 + NEW_RAYS * crossed:
+                    if known_free[r, c] & one:
+                        out.new[r, c] |= one
+                        out.hits[r, c] += hits
+                        out.balance[r, c] += hits - count_of(cell, PASSES, bit)
+                    else:
+                        out.beyond[r, c] |= one
+
+
+def judge_window(drive: Facts, occupied: U64, height_m: F32, min_height_m: float) -> tuple[U8, U64, U64]:
+    """(states, gone, new), (rows, cols) each, of a window of which the map knows the ``occupied`` voxels and how high
+    they rise over the ground, not finite where there are none: ``gone`` the voxels that went, of changed-empty cells
+    and of cells that stand; ``new`` those that came."""
+    mapped, stands, passed = occupied != 0, drive.stands != 0, drive.passed != 0
+    high = mapped & (height_m >= min_height_m)
+    gone: U64 = np.where(high, drive.gone, NOTHING)
+    beyond: U64 = np.where(mapped, NOTHING, drive.beyond)
+    states = np.full(mapped.shape, NO_VOTE, dtype=np.uint8)
+    states[passed] = CellState.UNCHANGED_EMPTY
+    states[(mapped & passed) | (beyond != 0)] = CellState.UNDETERMINED
+    states[stands] = CellState.UNCHANGED_OCCUPIED
+
+    empty: Bool = (gone != 0) & ~stands
+    firm = enough(np.where(empty, gone, NOTHING), 0, mapped & ~empty, np.zeros_like(drive.balance))
+    seen_through = 2 * np.bitwise_count(occupied & drive.passed) >= np.bitwise_count(occupied)
+    # Hysteresis (Canny 1986): few rays cross the far wall of a demolished house.
+    along = firm | (high & ~stands & seen_through)
+    went = along & (over_groups(along, firm)[0] > 0)
+    states[went] = CellState.CHANGED_EMPTY
+    gone = np.where(went, occupied, gone)
+
+    near = ndimage.maximum_filter(went, 2 * REACH_CELLS + 1, mode="constant")
+    new: U64 = np.bitwise_or(np.where(mapped, NOTHING, drive.new), np.where(near, beyond, NOTHING))
+    states[new != 0] = CellState.UNDETERMINED
+    states[enough(new, NEW_A_CELL, occupied & ~gone != 0, drive.balance)] = CellState.CHANGED_OCCUPIED
+    return states, np.where(went | stands, gone, NOTHING), new
+
+
+def enough(voxels: U64, a_cell: int, others: Bool, balance: I32) -> Bool:
+    """(rows, cols) cells whose 8-connected group has enough ``voxels`` (rows, cols), ``a_cell`` more for each further
+    cell, and no negative ``balance``. Of a separate small object on the ground (a bollard) any two voxels on top of
+    each other are enough: it touches none of the ``others``, and each of its columns begins near the ground."""
+    cells = voxels != 0
+    tall = voxels & (voxels >> np.uint64(1)) != 0
+    tied = ndimage.binary_dilation(others, _AROUND) | (voxels & _NEAR_GROUND == 0)
+    size, count, talls, ties, left = over_groups(cells, np.bitwise_count(voxels), cells, tall, tied, balance)
+    large = size >= np.minimum(SUPPORT + a_cell * (count - 1), NEW_ENOUGH)
+    return np.asarray(cells & (left >= 0) & (large | ((talls > 0) & (ties == 0))))
+
+
+def over_groups(cells: Bool, *amounts: U8 | I32 | Bool) -> list[F64]:
+    """For each of ``amounts`` (rows, cols) its sum over the 8-connected group of ``cells`` that a cell is in."""
+    group, count = ndimage.label(cells, structure=_AROUND)
+    return [np.bincount(group.ravel(), amount.ravel(), count + 1)[group] for amount in amounts]

@@ -1,4 +1,8 @@
-"""Counters of the tiles around a vehicle as they are, of those it has left packed: memory for a long road."""
+"""Counters of voxels by tile: open around the vehicle, packed where it has left. A long road needs little memory.
+
+A counter is PLANES bit planes: plane k of a cell is a 64-bit word with bit k of the counts of the cell's 64 voxels, so
+that one scan is added to a whole column with a few word operations.
+"""
 
 from __future__ import annotations
 
@@ -14,6 +18,8 @@ from mapvote.core.process_memory import give_back_free_pages
 from mapvote.core.types import U64
 from mapvote.detection.shelf import Shelf, Slot
 
+PLANES = 7
+"""Counts up to 127 scans."""
 _FAST = 1
 """zstd level: packed while driving, and read once or twice."""
 _FAR_CELLS = 64
@@ -117,3 +123,38 @@ def _packed(planes: U64) -> bytes:
     flat = planes.reshape(CELLS, -1)
     cells = np.flatnonzero(flat.any(axis=1))
     return compress(np.concatenate([cells.astype(np.uint64)[None], flat[cells].T]).tobytes(), _FAST)
+
+
+@kernel
+def add_one(cell: U64, words: tuple[np.uint64, np.uint64, np.uint64]) -> None:
+    """Add 1 to the counts that the first, second and third counter of a cell (words,) keep of the voxels of ``words``.
+    If one would exceed its planes, all counts of the cell are halved: what is weighed keeps its ratios."""
+    full = _carry(cell, 0, words[0]), _carry(cell, PLANES, words[1]), _carry(cell, 2 * PLANES, words[2])
+    if full[0] | full[1] | full[2]:
+        for counter in range(3):
+            first = counter * PLANES
+            for k in range(first, first + PLANES - 1):
+                cell[k] = cell[k + 1]
+            cell[first + PLANES - 1] = full[counter]
+
+
+@kernel
+def _carry(cell: U64, first: int, word: np.uint64) -> np.uint64:
+    """Add 1 to the counts of ``word``'s voxels: a ripple-carry adder over 64 voxels at once. Returns the carry: the
+    voxels whose count would exceed PLANES bits."""
+    for k in range(first, first + PLANES):
+        carry = cell[k] & word
+        cell[k] ^= word
+        word = carry
+        if not word:
+            break
+    return word
+
+
+@kernel
+def count_of(cell: U64, first: int, bit: int) -> int:
+    """The count of one voxel of a cell (words,); ``first`` is the counter's first plane."""
+    value = 0
+    for k in range(PLANES):
+        value |= int((cell[first + k] >> np.uint64(bit)) & np.uint64(1)) << k
+    return value

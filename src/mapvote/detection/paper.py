@@ -245,4 +245,4 @@ class PaperVoter:
         for tile, tally in sorted(self._tally.tiles.items()):
             if (only is None or tile in only) and tally.any():
                 new = np.where(tally[..., CellState.CHANGED_OCCUPIED] > 0, EVERY_BIT, np.uint64(0))
-                yield tile, TileVotes(tally, plurality(tally), None, None, new, None)
+                yield tile, TileVotes(tally, plurality(tally), None, new, None)

@@ -15,8 +15,8 @@ from mapvote.core.reference import above_ground_points, reference_window
 from mapvote.core.types import NO_VOTE, U64
 from mapvote.core.voting import one_hot
 from mapvote.detection.confidence import looks
-from mapvote.detection.evidence import Evidence, free_words
-from mapvote.detection.surface_rules import NOTHING, judge_window, no_facts, weigh_voxels
+from mapvote.detection.evidence import NOTHING, WORDS, Facts, count_scan, free_words, judge_window, weigh_voxels
+from mapvote.detection.packed_tiles import PackedTiles
 from mapvote.detection.voter import TileVotes
 from mapvote.perception.frontend import Observation
 
@@ -32,11 +32,11 @@ class SurfaceVoter:
 
     def __init__(self, voting: VotingSettings, point_map: PointMap) -> None:
         self.voting, self.point_map = voting, point_map
-        self.evidence = Evidence(point_map.lattice)
+        self.evidence = PackedTiles(point_map.lattice, WORDS)
 
     def observe(self, seen: Observation) -> U64:
         """Count one scan; returns (rows, cols) words of voxels whose points may be new."""
-        return self.evidence.count(seen)
+        return count_scan(self.evidence, seen)
 
     def votes(self) -> dict[TileIndex, TileVotes]:
         """Every tile with evidence, in ascending order."""
@@ -44,7 +44,7 @@ class SurfaceVoter:
 
     def each(self, only: Collection[TileIndex] | None = None) -> Iterator[tuple[TileIndex, TileVotes]]:
         """The same one by one, block by block; ``only``: of these tiles."""
-        counted = self.evidence.tiles
+        counted = self.evidence
         for tiles, window in blocks(self.point_map.lattice, counted if only is None else counted.keys() & set(only)):
             yield from self._judge(tiles, window)
 
@@ -52,31 +52,30 @@ class SurfaceVoter:
         here = reference_window(self.point_map, window)
         known = here.free if here.free is not None else above_ground_points(self.point_map, window)
         height_m = here.top_z - here.ground_z
-        weighed, counted = no_facts(window.shape), self.evidence.tiles
-        free = {}
+        weighed, counted, free = Facts.none(window.shape), self.evidence, {}
         for tile in window.tiles():
             if tile in counted:
                 planes = counted[tile]
                 weigh_voxels(planes, counted.overlap(tile, window), here.occupied, known, weighed)
                 if tile in tiles:
-                    free[tile] = free_words(planes, np.ascontiguousarray(here.occupied[self._cut(tile, window)]))
-        said = judge_window(weighed, here.occupied, height_m, self.voting.min_height_m)
+                    free[tile] = free_words(planes)
+        states, gone, new = judge_window(weighed, here.occupied, height_m, self.voting.min_height_m)
         amount = np.where(here.occupied != 0, np.bitwise_count(here.occupied), weighed.hits)
         told = here.free if here.free is not None else np.zeros_like(known)
         for tile in tiles:
             cut = self._cut(tile, window)
-            if (said.states[cut] != NO_VOTE).any():
-                states, new = np.ascontiguousarray(said.states[cut]), said.new[cut]
+            if (states[cut] != NO_VOTE).any():
+                own = np.ascontiguousarray(states[cut])
+                upwards = None if here.free is None else here.free[cut]
                 yield (
                     tile,
                     TileVotes(
-                        tally=one_hot(states),
-                        states=states,
-                        gone=np.ascontiguousarray(said.gone[cut]),
-                        remnants=np.ascontiguousarray(said.remnants[cut]),
-                        new=_with_the_unknown(new, weighed.beyond[cut], None if here.free is None else here.free[cut]),
-                        free=np.where(told[cut] != 0, NOTHING, free[tile]),
-                        looked=looks(said.states, amount, height_m, cut),
+                        tally=one_hot(own),
+                        states=own,
+                        gone=np.ascontiguousarray(gone[cut]),
+                        new=_with_the_unknown(new[cut], weighed.beyond[cut], upwards),
+                        free=np.where(told[cut] != 0, NOTHING, free[tile] & ~here.occupied[cut]),
+                        looked=looks(states, amount, height_m, cut),
                     ),
                 )
 

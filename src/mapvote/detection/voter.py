@@ -20,9 +20,8 @@ class TileVotes:
     states: U8
     """(256, 256) decided by this vehicle alone."""
     gone: U64 | None
-    """(256, 256) words of the map voxels that are gone in changed-empty cells; None: all of them."""
-    remnants: U64 | None
-    """(256, 256) words of the map voxels that are gone in cells that stand; None: the rule has none."""
+    """(256, 256) words of the map voxels that are gone: of changed-empty cells, and of cells that stand. None: all of
+    changed-empty cells."""
     new: U64
     """(256, 256) words of the voxels whose points are new in changed-occupied cells."""
     free: U64 | None

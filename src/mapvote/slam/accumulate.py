@@ -25,7 +25,8 @@ from mapvote.core.sensor_height import heights_over_ground
 from mapvote.core.tile import Tile
 from mapvote.core.types import F32, F64, I32, I64, U64, Bool, Drive
 from mapvote.core.voxels import VoxelCloud
-from mapvote.detection.evidence import HIT, PASSES, Evidence, count_of, free_words, least_passed
+from mapvote.detection.evidence import HIT, PASSES, WORDS, count_scan, free_words, least_passed
+from mapvote.detection.packed_tiles import PackedTiles, count_of
 from mapvote.localisation.localiser import GivenPoses
 from mapvote.perception.frontend import Frontend, Observation, PlacedScan
 from mapvote.perception.moving_objects import MovingFilter
@@ -42,7 +43,7 @@ class Layer:
         """``road`` (n, 3), map metres: where vehicles drove, from which the ground grows."""
         self.draft, self.road, self.settings = draft, road, settings
         self.cloud = VoxelCloud(draft.lattice)
-        self.evidence = Evidence(draft.lattice)
+        self.evidence = PackedTiles(draft.lattice, WORDS)
         self._driven: list[F64] = []
         self._around = LocalMap(draft, 2.0 * settings.mapping.reach_m)
         self._near = LocalMap(draft, settings.voting.window_m)
@@ -69,7 +70,7 @@ class Layer:
         for observation in seen:
             scan, moving = observation.scan, observation.moving
             self.cloud.enter(scan.points_map, _left_out(scan, moving, self.settings.mapping.reach_m))
-            self.evidence.count(observation)
+            count_scan(self.evidence, observation)
 
     def finish(self) -> PointMap:
         """The map of all points added so far."""
@@ -99,7 +100,7 @@ class Layer:
         out = np.zeros((len(points), 3), dtype=np.int64)
         rows, cols = self.draft.lattice.cells_of(points)
         tile_rows, tile_cols = tile_of_cells(rows, cols)
-        for tile, planes in self.evidence.tiles.items():
+        for tile, planes in self.evidence.items():
             mine = np.flatnonzero((tile_rows == tile[0]) & (tile_cols == tile[1]))
             r, c = rows[mine] - tile[0] * TILE_CELLS, cols[mine] - tile[1] * TILE_CELLS
             bits = np.floor(points[mine, 2] / CELL_SIZE).astype(np.int64) - self.draft.tile(tile).base[r, c]
@@ -110,10 +111,10 @@ class Layer:
 
     def _free(self, after: Tile) -> U64:
         """Known-free columns of one tile of the finished map, on its own ground."""
-        if after.index not in self.evidence.tiles:
+        if after.index not in self.evidence:
             return np.zeros(after.window.shape, dtype=np.uint64)
         before = self.draft.tile(after.index).base
-        free = free_words(self.evidence.tiles[after.index], np.zeros(after.window.shape, dtype=np.uint64))
+        free = free_words(self.evidence[after.index])
         after = replace(after)  # what it works out for this alone goes with it
         out = rebased(free, before - after.base) & ~after.obstacle_words
         out[np.isnan(after.ground_z)] = 0
