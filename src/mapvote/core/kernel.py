@@ -4,19 +4,90 @@ A division by zero gives infinity or NaN, as in numpy: without the branch to an 
 sooner. C code never calls a kernel, so the wrapper for C is left out: 10 ms of 80 for the smallest kernel. Most kernels
 get the arrays that they fill: an allocation takes 50 ms to compile, and without any the code that counts references
 (numba's run time, NRT) is left out: a seventh of all that is compiled.
+
+Compiled kernels are kept on disk. numba compiles a kernel again if its own file has changed. The cache below also does
+so if a kernel or a constant of another file has changed, and if an entry cannot be read: it names a type that was
+renamed since, or a power failure cut it off.
 """
 
 from __future__ import annotations
 
+import inspect
+from collections.abc import Callable, Iterator
+from types import FunctionType, ModuleType
+from typing import Any
+
 import numba
+import numpy as np
+from numba.core.caching import FunctionCache, IndexDataCacheFile
 
-_OPTIONS = {"cache": True, "nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True, "no_rewrites": True}
+_OPTIONS = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True, "no_rewrites": True}
 
-kernel = numba.njit(**_OPTIONS, _nrt=False)
-"""A loop that Python calls, and that allocates nothing. Its compiled form is kept on disk."""
-fast_math = numba.njit(**_OPTIONS, _nrt=False, fastmath=True)
+
+class _Index(IndexDataCacheFile):  # type: ignore[misc]
+    """The entries of one kernel. They hold for the kernel's file and for all that the kernel takes from other files."""
+
+    def __init__(self, function: FunctionType, path: str, name: str, file_stamp: object) -> None:
+        super().__init__(path, name, file_stamp)
+        self._function, self._file_stamp = function, file_stamp
+
+    def _load_index(self) -> dict[Any, str]:
+        # Only at a call: what a kernel calls may be declared after it.
+        self._source_stamp = (self._file_stamp, *_compiled_into(self._function, set()))
+        try:
+            return super()._load_index()
+        except Exception:  # whatever unpickling raises: the kernel is compiled again and the entry overwritten
+            return {}
+
+    def _load_data(self, name: str) -> Any:
+        try:
+            return super()._load_data(name)
+        except Exception as error:
+            raise OSError(f"{name}: {error}") from error  # which numba takes as absent
+
+
+class _Cache(FunctionCache):  # type: ignore[misc]
+    def __init__(self, function: FunctionType) -> None:
+        super().__init__(function)
+        stamp = self._impl.locator.get_source_stamp()
+        self._cache_file = _Index(function, self.cache_path, self._impl.filename_base, stamp)
+
+    def _index_key(self, sig: Any, codegen: Any) -> tuple[object, ...]:
+        # numba compares named tuples by class and types. Fields that changed places would go unnoticed.
+        return (*super()._index_key(sig, codegen), tuple(getattr(kind, "fields", None) for kind in sig))
+
+
+def _compiled_into(function: FunctionType, seen: set[FunctionType]) -> Iterator[str | bytes]:
+    """The code and the constants of a kernel and of all kernels that it calls, equal in every process."""
+    seen.add(function)
+    code, names = function.__code__, inspect.getclosurevars(function)
+    yield repr((code.co_code, code.co_consts, code.co_names, code.co_varnames))
+    for name, value in sorted({**names.globals, **names.nonlocals}.items()):
+        called = getattr(value, "py_func", None)
+        if called is None and not isinstance(value, ModuleType):
+            constant = value.tobytes() if isinstance(value, np.ndarray) else value
+            yield repr((name, constant, getattr(value, "_fields", None)))
+        elif called is not None and called not in seen:
+            yield from _compiled_into(called, seen)
+
+
+def _kept(**options: bool) -> Callable[[Any], Any]:
+    """A decorator that compiles with these options and keeps the compiled form on disk."""
+    compiled = numba.njit(**_OPTIONS, **options)
+
+    def declare(function: FunctionType) -> Any:
+        dispatcher = compiled(function)
+        dispatcher._cache = _Cache(function)  # as enable_caching() does with numba's own
+        return dispatcher
+
+    return declare
+
+
+kernel = _kept(_nrt=False)
+"""A loop that Python calls, and that allocates nothing."""
+fast_math = _kept(_nrt=False, fastmath=True)
 """A kernel in which sums may be taken in any order, so that they vectorise."""
-allocating = numba.njit(**_OPTIONS)
+allocating = _kept()
 """A kernel that allocates arrays."""
 inlined = numba.njit(inline="always", error_model="numpy")
 """A part of kernels, typed and compiled inside each of them."""

@@ -1,0 +1,98 @@
+"""Compiled kernels that are kept on disk: after a change of the program no old one is run, and none stops it."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from pathlib import Path
+
+import pytest
+
+RECORDS = """
+from typing import NamedTuple
+class Counts(NamedTuple):
+    free: int
+    hit: int
+"""
+PARTS = """
+from mapvote.core.kernel import inlined, kernel
+WEIGHT = 10
+@inlined
+def twice(value):
+    return 2 * value
+@kernel
+def tenfold(value):
+    return twice(value) * WEIGHT // 2
+"""
+LOOPS = """
+from mapvote.core.kernel import kernel
+from cached_sample.parts import tenfold
+@kernel
+def of_counts(counts):
+    return tenfold(counts.hit) + counts.free
+"""
+
+
+@pytest.fixture
+def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    folder = tmp_path / "cached_sample"
+    folder.mkdir()
+    for name, text in (("__init__", ""), ("records", RECORDS), ("parts", PARTS), ("loops", LOOPS)):
+        (folder / f"{name}.py").write_text(text)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
+    return folder
+
+
+def started_anew(record: str = "Counts") -> tuple[int, int, Path]:
+    """In a process that has just imported the package: what the kernel gives, kernels compiled for it, and its index.
+
+    Two free and three hit: 32."""
+    for name in [name for name in sys.modules if name.startswith("cached_sample")]:
+        del sys.modules[name]
+    importlib.invalidate_caches()
+    loops = importlib.import_module("cached_sample.loops")
+    counts = getattr(importlib.import_module("cached_sample.records"), record)(2, 3)
+    found = loops.of_counts(counts)
+    stats = loops.of_counts.stats
+    return found, sum(stats.cache_misses.values()), next(Path(stats.cache_path).glob("loops.of_counts*.nbi"))
+
+
+def test_without_a_change_the_kept_kernel_is_loaded(package: Path) -> None:
+    assert started_anew()[:2] == (32, 1)
+    assert started_anew()[:2] == (32, 0)
+
+
+@pytest.mark.parametrize(
+    ("file", "old", "new", "expected"),
+    [
+        pytest.param("parts", "WEIGHT = 10", "WEIGHT = 20", 62, id="a constant that a called kernel uses"),
+        pytest.param("parts", "2 * value", "4 * value", 62, id="a kernel that is inlined two files further"),
+        pytest.param("records", "free: int\n    hit", "hit: int\n    free", 23, id="the order of a record's fields"),
+    ],
+)
+def test_what_a_kernel_takes_from_another_file_changes(
+    package: Path, file: str, old: str, new: str, expected: int
+) -> None:
+    """numba looks at the kernel's own file alone."""
+    started_anew()
+    source = package / f"{file}.py"
+    source.write_text(source.read_text().replace(old, new))
+    assert started_anew()[:2] == (expected, 1)
+    assert started_anew()[:2] == (expected, 0)
+
+
+def test_an_entry_that_names_a_type_that_is_gone_is_replaced(package: Path) -> None:
+    started_anew()
+    (package / "records.py").write_text(RECORDS.replace("Counts", "LookCounts"))
+    assert started_anew("LookCounts")[:2] == (32, 1)
+    assert started_anew("LookCounts")[:2] == (32, 0)
+
+
+@pytest.mark.parametrize("kept", ["*.nbi", "*.nbc"])
+def test_a_file_that_a_power_failure_cut_off_is_replaced(package: Path, kept: str) -> None:
+    index = started_anew()[2]
+    (cut,) = index.parent.glob(f"loops.of_counts{kept}")
+    cut.write_bytes(cut.read_bytes()[:40])
+    assert started_anew()[:2] == (32, 1)
+    assert started_anew()[:2] == (32, 0)
