@@ -73,7 +73,9 @@ def false_areas(found: list[CloudChange], truth: Truth, things: tuple[dict[str, 
 def votes_score(point_map: PointMap, drives: list[Path], truth: Truth) -> float:
     """Macro-F1 of what the vehicles publish on a map."""
     settings = choose_case(Settings(), "surfaces")
-    _, decisions = update_map(point_map, [vote_drive(open_drive(d), point_map, settings)[0] for d in drives])
+    _, decisions = update_map(
+        point_map, [vote_drive(open_drive(d), point_map, settings)[0] for d in drives], settings.fuse
+    )
     states = lay_on(*states_over(point_map.lattice, decisions), truth.grid_on(point_map.lattice))
     return score_cells(states, truth.strict).macro_f1
 

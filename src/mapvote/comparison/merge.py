@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapvote.comparison.patches import Patches
-from mapvote.comparison.register import Registered, register_clouds
+from mapvote.comparison.register import Registered, register_maps
 from mapvote.comparison.two_maps import with_free_space_of
 from mapvote.core.geometry import inverse, transform
 from mapvote.core.grid import Lattice
@@ -62,7 +62,7 @@ def merge_maps(maps: Sequence[PointMap]) -> Merged:
     pairs, why = {}, {}
     for i, j in combinations(range(len(maps)), 2):
         try:
-            pairs[i, j] = register_clouds(clouds[i], clouds[j])
+            pairs[i, j] = register_maps(maps[i], maps[j])
         except MapvoteError as error:
             why[i, j] = str(error)
     T = _adjusted(maps, pairs, why, np.median(clouds[0], axis=0))

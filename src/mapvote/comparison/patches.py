@@ -8,6 +8,7 @@ than its error allows, the cloud is bent there.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,9 +30,11 @@ _MIN_INLIERS = 0.5
 _SURE_M = 0.15
 """A patch whose standard deviation is larger is not used: ground alone leaves the shift along it open."""
 _FLOOR_M, _FLOOR_RAD = 0.05, np.radians(0.5)
-"""What patches disagree by for other reasons than a bend: noise, voxels, what changed."""
+"""What patches disagree by for other reasons than a bend: noise, voxels, what changed, and the headings of the scans. At
+80 m from the path of a survey half a degree is 0.7 m."""
 BENT_M = 0.25
-"""A patch that is off by more, and by more than four standard deviations, may be bent."""
+"""A patch that is off by more, by more than four standard deviations, and by more than a scan's turn explains at its
+distance from the survey's path, may be bent."""
 _GAIN = 0.1
 """It is bent if its own place fits better than the motion of the whole by such a share: along a wall without ends every
 place fits alike."""
@@ -55,6 +58,9 @@ class Patches:
     """(k,) share of the points that agree."""
     compared: Bool
     """(k,) whether the registration is certain enough."""
+    lever_m: F64
+    """(k,) from the nearest place of the path from which a, or b, was measured, whichever is farther; 0 if no path is
+    known."""
     points: tuple[tuple[F64, F64], ...]
     """Of each patch a's points around it, and its own from its centre."""
 
@@ -77,16 +83,24 @@ class Patches:
         return 1.0 - fitness(ndt_map, clouds, other, finest) / max(own, 1e-9)
 
     @property
+    def bound_m(self) -> F64:
+        """(k,) how far a patch may be off one motion without being bent."""
+        return np.maximum.reduce([np.full(len(self.lever_m), BENT_M), 4.0 * self.sigma_m, _FLOOR_RAD * self.lever_m])
+
+    @property
     def sigma_m(self) -> F64:
         """(k,) largest standard deviation of the position."""
         return np.asarray(np.sqrt(np.linalg.eigvalsh(self.covariance[:, :3, :3])[:, -1]))
 
 
-def register_patches(points_a: F64, points_b: F64, T_a_b: F64) -> Patches:
-    """Every patch of b that overlaps a, registered from T_a_b. MapvoteError if none overlaps."""
+def register_patches(points_a: F64, points_b: F64, T_a_b: F64, paths: Sequence[F64]) -> Patches:
+    """Every patch of b that overlaps a, registered from T_a_b. MapvoteError if none overlaps.
+
+    ``paths``: (n, 3) each, from where a or b was measured, in a's frame by T_a_b."""
     thin_a, thin_b = points_a[voxel_downsample(points_a, 0.3)], points_b[voxel_downsample(points_b, 0.3)]
     tree_a, tree_b = KDTree(thin_a[:, :2]), KDTree(thin_b[:, :2])
-    centres, poses, covariances, inliers, compared, kept = [], [], [], [], [], []
+    path_trees = [KDTree(path) for path in paths]
+    centres, poses, covariances, inliers, compared, levers_m, kept = [], [], [], [], [], [], []
     T = T_a_b
     corners = np.unique(np.floor(thin_b[:, :2] / STEP_M).astype(np.int64), axis=0)
     for corner in corners:
@@ -108,12 +122,19 @@ def register_patches(points_a: F64, points_b: F64, T_a_b: F64) -> Patches:
         poses.append(found.T_map_lidar)
         covariances.append(found.covariance)
         inliers.append(found.inlier_share)
+        levers_m.append(max((tree.query(at)[0] for tree in path_trees), default=0.0))
         kept.append((near, mine - centre))
         compared.append(found.inlier_share > _MIN_INLIERS and sigma_m < _SURE_M)
     if not centres:
         raise MapvoteError("the clouds do not overlap: no piece of one lies where the other has points")
     return Patches(
-        np.array(centres), np.array(poses), np.array(covariances), np.array(inliers), np.array(compared), tuple(kept)
+        np.array(centres),
+        np.array(poses),
+        np.array(covariances),
+        np.array(inliers),
+        np.array(compared),
+        np.array(levers_m),
+        tuple(kept),
     )
 
 
@@ -160,7 +181,8 @@ def fit_rigid(patches: Patches, T_a_b: F64) -> RigidFit:
     if not patches.compared.any():
         raise MapvoteError("no piece of one cloud fits the other: are they of one place, z up, in metres?")
     T = T_a_b.copy()
-    floor = np.diag([_FLOOR_M**2] * 3 + [_FLOOR_RAD**2] * 3)
+    floor = np.tile(np.diag([_FLOOR_M**2] * 3 + [_FLOOR_RAD**2] * 3), (len(patches.lever_m), 1, 1))
+    floor[:, range(3), range(3)] += (_FLOOR_RAD * patches.lever_m[:, None]) ** 2
     information = np.linalg.inv(patches.covariance + floor) * patches.compared[:, None, None]
     weights = np.ones(len(information))
     for round_ in range(_ROUNDS):
@@ -189,10 +211,9 @@ def fit_rigid(patches: Patches, T_a_b: F64) -> RigidFit:
 
 
 def bent_under(patches: Patches, T_a_b: F64) -> Bool:
-    """(k,) compared patches that are off one motion by more than BENT_M and four of their standard deviations, and
-    that fit better where they are."""
+    """(k,) compared patches that are off one motion by more than ``bound_m``, and that fit better where they are."""
     shift = np.linalg.norm(patches.residuals(T_a_b)[:, :3], axis=1)
-    bent = patches.compared & (shift > np.maximum(BENT_M, 4.0 * patches.sigma_m))
+    bent = patches.compared & (shift > patches.bound_m)
     for k in np.flatnonzero(bent):
         bent[k] = patches.gain(int(k), T_a_b) > _GAIN
     return np.asarray(bent)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,6 +17,8 @@ from mapvote.comparison.patches import (
     register_patches,
     unbent,
 )
+from mapvote.core.geometry import transform
+from mapvote.core.point_map import PointMap, all_points
 from mapvote.core.types import F64, Bool, MapvoteError
 from mapvote.localisation.coarse_search import LEAST_LEAD, place_without_prior
 
@@ -103,19 +106,22 @@ class Registered:
         return out
 
 
-def register_clouds(points_a: F64, points_b: F64, *, unbend: bool = False) -> Registered:
-    """points_b (m, 3) registered to points_a (n, 3), metres, z up, without a prior.
+def register_maps(map_a: PointMap, map_b: PointMap, *, unbend: bool = False) -> Registered:
+    """Map or cloud b registered to a, metres, z up, without a prior.
 
     ``unbend``: move bent parts patch by patch, if that makes them fit. MapvoteError, with figures, where the place is
     ambiguous or nothing fits.
     """
+    points_a, points_b = all_points(map_a), all_points(map_b)
     placed = place_without_prior(points_a, points_b)
     if placed.lead < LEAST_LEAD:
         raise MapvoteError(
             f"the clouds fit at several places: the best one scores {placed.score:.2f}, the next one only "
             f"{placed.lead:.0%} less; are they of one place, and do they overlap by more than a street of equal houses?"
         )
-    patches = register_patches(points_a, points_b, placed.T_a_b)
+    paths = [np.concatenate(map_a.driven)] if map_a.driven else []
+    paths += [transform(placed.T_a_b, np.concatenate(map_b.driven))] if map_b.driven else []
+    patches = register_patches(points_a, points_b, placed.T_a_b, paths)
     fit = fit_rigid(patches, placed.T_a_b)
     agree = int(fit.agree.sum())
     if agree < _LEAST_FITTING * patches.compared.sum() or not patches.compared.any():
@@ -124,7 +130,7 @@ def register_clouds(points_a: F64, points_b: F64, *, unbend: bool = False) -> Re
         )
     moved, why = None, ""
     if unbend and fit.bent.any():
-        moved, why = _unbend(points_a, points_b, patches, fit)
+        moved, why = _unbend(points_a, points_b, patches, fit, paths)
     rigid = points_b @ fit.T_a_b[:3, :3].T + fit.T_a_b[:3, 3]
     points = rigid if moved is None else moved
     return Registered(fit.T_a_b, points, placed.lead, patches, fit, _bent_parts(patches, fit), moved is not None, why)
@@ -137,10 +143,12 @@ def _bent_parts(patches: Patches, fit: RigidFit) -> tuple[BentPart, ...]:
     return tuple(BentPart(name, float(fit.shift_m[shown][mine].max()), int(mine.sum())) for name, mine in parts)
 
 
-def _unbend(points_a: F64, points_b: F64, patches: Patches, fit: RigidFit) -> tuple[F64 | None, str]:
+def _unbend(
+    points_a: F64, points_b: F64, patches: Patches, fit: RigidFit, paths: Sequence[F64]
+) -> tuple[F64 | None, str]:
     """(points of b moved patch by patch, "") or (None, why that does not help)."""
     moved = unbent(points_b, patches, fit.T_a_b)
-    again = register_patches(points_a, moved, np.eye(4))
+    again = register_patches(points_a, moved, np.eye(4), paths)
     still = bent_under(again, np.eye(4))
     if still.sum() > _MOST_LEFT * again.compared.sum():
         worst = float(np.linalg.norm(again.residuals(np.eye(4))[still, :3], axis=1).max())

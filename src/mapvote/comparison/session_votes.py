@@ -17,7 +17,7 @@ from scipy.spatial import KDTree
 
 from mapvote.codec.ballot import Ballot
 from mapvote.comparison.cloud_changes import BAND, CellComparison, CloudChange, compare_cells, differences
-from mapvote.comparison.register import Registered, register_clouds
+from mapvote.comparison.register import Registered, register_maps
 from mapvote.config import Settings
 from mapvote.core.columns import dilated, rebased
 from mapvote.core.geometry import rows_from, transform
@@ -73,7 +73,7 @@ def vote_of_session(
         raise MapvoteError(
             "a cloud votes by the rule of surfaces only: the paper's rule counts scans, a cloud has none"
         )
-    registered = register_clouds(all_points(point_map), all_points(cloud))
+    registered = register_maps(point_map, cloud)
     session_map = map_from_points(registered.points, lattice=point_map.lattice)
     if trajectory is None and cloud.driven:
         trajectory = np.concatenate(cloud.driven)

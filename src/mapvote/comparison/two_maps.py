@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from mapvote.comparison.register import Registered, register_clouds
+from mapvote.comparison.register import Registered, register_maps
 from mapvote.core.columns import TOP_BIT
 from mapvote.core.geometry import inverse, rotation_angle, transform
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, tile_of_cells
@@ -25,9 +25,8 @@ def brought_into(map_a: PointMap, map_b: PointMap, *, unbend: bool = False) -> t
     Its ground is computed anew from its points; its free space comes along, unless b was unbent. A map that lies in a's
     frame already is returned as it is. MapvoteError where they do not register.
     """
-    points_a, points_b = all_points(map_a), all_points(map_b)
-    registered = register_clouds(points_a, points_b, unbend=unbend)
-    if map_a.lattice == map_b.lattice and not registered.unbent and _is_in_place(registered.T_a_b, points_b):
+    registered = register_maps(map_a, map_b, unbend=unbend)
+    if map_a.lattice == map_b.lattice and not registered.unbent and _is_in_place(registered.T_a_b, all_points(map_b)):
         return map_b, registered
     fields = all_fields(map_b)
     moved = map_from_points(registered.points, lattice=map_a.lattice, map_id=map_b.map_id, fields=fields)

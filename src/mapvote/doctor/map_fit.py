@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from mapvote.comparison.register import register_clouds
+from mapvote.comparison.register import register_maps
 from mapvote.config import NdtSettings
 from mapvote.core.geometry import from_xyz_rpy, inverse
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Lattice
@@ -445,7 +445,7 @@ def check_cloud_on_map(point_map: PointMap, cloud: PointMap) -> list[Finding]:
     """Of a map or a session's ``cloud`` against another map: where it lies there, and which part of it no rigid motion
     lays there, as `mapvote diff` says it."""
     try:
-        registered = register_clouds(all_points(point_map), all_points(cloud))
+        registered = register_maps(point_map, cloud)
     except MapvoteError as error:
         return [Finding("error", f"against the map: {error}")]
     place, agreement = registered.told()[:2]
