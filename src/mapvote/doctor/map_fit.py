@@ -17,7 +17,7 @@ from mapvote.comparison.register import register_maps
 from mapvote.config import NdtSettings
 from mapvote.core.geometry import from_xyz_rpy, inverse
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Lattice
-from mapvote.core.point_map import PointMap, all_points, cut_tiles
+from mapvote.core.point_map import PointMap, cut_tiles
 from mapvote.core.sensor_height import LEVEL_M, check_heights, heights_over_ground
 from mapvote.core.tile import Tile
 from mapvote.core.types import F32, F64, Drive, MapvoteError, Scan
