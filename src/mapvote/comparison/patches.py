@@ -30,7 +30,7 @@ _MIN_INLIERS = 0.5
 _SURE_M = 0.15
 """A patch whose standard deviation is larger is not used: ground alone leaves the shift along it open."""
 _FLOOR_M, _FLOOR_RAD = 0.05, np.radians(0.5)
-"""What patches disagree by for other reasons than a bend: noise, voxels, what changed, and how scans are turned. At 80 m
+"""What patches disagree by for other reasons than a bend: noise, voxels, what changed, and turned scans. At 80 m
 from the path of a survey half a degree is 0.7 m."""
 BENT_M = 0.25
 """A patch that is off by more, by more than four standard deviations, and by more than a scan's turn explains at its
