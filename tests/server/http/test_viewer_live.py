@@ -17,7 +17,7 @@ from mapvote.server.http.app import create_app
 from mapvote.server.store import keys
 from mapvote.server.store.publish import publish
 from mapvote.server.store.store import Store
-from mapvote.server.views.history import vehicle_standings
+from mapvote.server.views.consensus import vehicle_standings
 from stores import send
 
 HOUSE = [(r, c) for r in range(40, 60) for c in range(40, 70) if r in (40, 59) or c in (40, 69)]

@@ -44,7 +44,7 @@ def compare(
     before: PointMap, after: PointMap, decided: dict[TileIndex, list[Decided]] | None = None
 ) -> list[ChangeObject]:
     tiles = sorted(set(before.tiles) | set(after.tiles), reverse=True)
-    return change_objects(changed_cells(before.tile(t), after.tile(t), (decided or {}).get(t, ())) for t in tiles)
+    return change_objects([changed_cells(before.tile(t), after.tile(t), (decided or {}).get(t, ())) for t in tiles])
 
 
 def test_a_house_over_four_tiles_is_one_object_with_the_outline_of_the_house() -> None:

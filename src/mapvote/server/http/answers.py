@@ -17,7 +17,7 @@ from mapvote.server.store.integrity import Damage
 from mapvote.server.store.retention import Cleared
 from mapvote.server.views.change_objects import Kind, Size
 from mapvote.server.views.consensus import VehicleStanding
-from mapvote.server.views.explain import CellDecision, LeftOut
+from mapvote.server.views.explain import CellDecision, CellVote
 
 
 class Answer(BaseModel):
@@ -257,29 +257,13 @@ class Places(Answer):
     features: list[PlacedFeature]
 
 
-class CellVoteAnswer(Answer):
-    """One ballot's vote on a cell."""
-
-    vehicle: str
-    drive: str
-    version: int
-    state: str
-    marks: int | None = Field(description="voxels of the map that it says are gone")
-    sure: float | None
-    end: str
-    counts: bool
-    why: str
-    counted_in: list[int]
-    left_out_of: list[LeftOut]
-
-
 class CellAnswer(Answer):
     """One cell: who says what, what was decided, what stands there."""
 
     row: int
     col: int
     thing: str
-    votes: list[CellVoteAnswer]
+    votes: list[CellVote]
     decisions: list[CellDecision]
     probability: float | None
 

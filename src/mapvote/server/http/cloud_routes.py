@@ -9,15 +9,15 @@ from fastapi import APIRouter, Path, Query, Request, Response
 from mapvote.codec.arrays import compress
 from mapvote.codec.manifest import TileHashes
 from mapvote.server.http.answers import Places as PlacesAnswer
-from mapvote.server.http.schemas import AS_CSV, From, Places, To, VersionQuery, as_json, as_table, problems
+from mapvote.server.http.schemas import AS_CSV, Digest, From, Places, To, VersionQuery, as_json, as_table, problems
 from mapvote.server.http.security import reviewer
 from mapvote.server.http.services import services
 from mapvote.server.views.coverage import paths
-from mapvote.server.views.point_lod import N_LEVELS, evidence
+from mapvote.server.views.explain import evidence
+from mapvote.server.views.point_lod import N_LEVELS
 
 AS_BYTES: dict[int | str, dict[str, Any]] = {200: {"content": {"application/octet-stream": {}}}}
 _FOR_EVER = "private, max-age=31536000, immutable"
-Digest = Annotated[str, Path(pattern=r"^[0-9a-f]{64}$")]
 _Index = Annotated[int, Path(ge=-(1 << 22), le=1 << 22)]
 router = APIRouter()
 

@@ -67,18 +67,11 @@ from mapvote.server.store.queries import log_event
 from mapvote.server.store.replay import replay
 from mapvote.server.store.retention import Cleared, clear
 from mapvote.server.store.store import Store
-from mapvote.server.views.coverage import as_features, wanted_passes
-from mapvote.server.views.explain import explain_cell, story_as_json
-from mapvote.server.views.geojson import contradictions, feature_rows, standing_rows, tile_squares
-from mapvote.server.views.history import (
-    changes_between,
-    coverage,
-    log_of,
-    overview,
-    page_between,
-    seen,
-    vehicle_standings,
-)
+from mapvote.server.views.consensus import contradictions, standing_rows, vehicle_standings
+from mapvote.server.views.coverage import as_features, tiles_seen, wanted_passes
+from mapvote.server.views.explain import explain_cell, seen
+from mapvote.server.views.geojson import feature_rows, tile_squares
+from mapvote.server.views.history import changes_between, log_of, overview, page_between
 
 _MOST_EVIDENCE = 50
 router = APIRouter()
@@ -194,14 +187,7 @@ def changes_page(
 @router.get("/v1/cells", response_model=CellAnswer, responses=problems(), summary="The votes behind one cell")
 def cell(request: Request, x: float, y: float) -> Response:
     """What each ballot says about the cell at (x, y), map metres, whether it counts, and what each version decided."""
-    parts = services(request)
-    answer, known = story_as_json(explain_cell(parts.store, x, y)), sees_names(request)
-    shown = {} if known else keys.pseudonyms(parts.store, {vote["vehicle"] for vote in answer["votes"]})
-    for vote in answer["votes"]:
-        vote["end"] = iso(seen(vote.pop("end_ns"), known))
-        if not known:
-            vote |= {"vehicle": shown[vote["vehicle"]], "drive": ""}
-    return as_json(answer)
+    return as_json(explain_cell(services(request).store, x, y, known=sees_names(request)))
 
 
 @router.get(
@@ -213,7 +199,7 @@ def cell(request: Request, x: float, y: float) -> Response:
 def fresh(request: Request, format: Places = "json") -> Response:
     """When a vehicle last passed each tile, and the number of vehicles with standing ballots there."""
     store = services(request).store
-    tiles, known = coverage(store), sees_names(request)
+    tiles, known = tiles_seen(store), sees_names(request)
     answer = [
         {name: t[name] for name in ("row", "col", "vehicles")} | {"last_seen": iso(seen(t["last_seen_ns"], known))}
         for t in tiles

@@ -28,14 +28,14 @@ _MAX_STANDINGS_BYTES = 64 << 20
 Why = Literal["", "young", "window", "otherwise", "damaged", "copy", "opposes", "spent", "reviewed"]
 """Why a ballot did not count on a tile, or on one of its cells; "" if it did. See :data:`REASONS`."""
 REASONS: Mapping[Why, str] = {
-    "young": "had not reached the minimum age",
-    "window": "was too old, or not of the vehicles that passed last",
-    "otherwise": "was cast by another method or other settings than the policy asked for",
-    "damaged": "was damaged, and set aside",
-    "copy": "was a copy: the ballot that it is alike counted for both",
-    "opposes": "opposed the others over most of this tile, or denied nearly all that changed on it",
-    "spent": "an earlier version had changed the cell since its vehicle drove",
-    "reviewed": "a reviewer held or rejected the change",
+    "young": "younger than the minimum age",
+    "window": "too old, or not of the vehicles that passed last",
+    "otherwise": "cast by another method or other settings than the policy asks for",
+    "damaged": "damaged, and set aside",
+    "copy": "a copy: its cells on this tile equal those of another vehicle's ballot, which counts for both",
+    "opposes": "opposes the others over most of this tile, or denies nearly all that changed on it",
+    "spent": "spent: a version had changed the cell since its vehicle drove",
+    "reviewed": "of a change that a reviewer held or rejected",
 }
 
 

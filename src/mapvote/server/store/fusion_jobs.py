@@ -6,7 +6,7 @@ A worker reads the ballots from the database. It returns the decision and the pl
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
@@ -23,19 +23,16 @@ from mapvote.core.grid import Grid, TileIndex
 from mapvote.core.tile import Tile
 from mapvote.core.types import I64, Bool, MapvoteError
 from mapvote.fusion.distrust import Copy
-from mapvote.fusion.fuse import Decision, fuse_tile, rule_of
+from mapvote.fusion.fuse import fuse_tile, rule_of
 from mapvote.fusion.loss_budget import PendingDeletions, pack_agreed
 from mapvote.fusion.persistence import emptied_and_filled
 from mapvote.fusion.tile_vote import TileVote
 from mapvote.server.errors import Unavailable
 from mapvote.server.store.database import Database, address_of
-from mapvote.server.store.decisions import Standing, Why, pack_standings, pack_states, pack_tally, packed_cells
+from mapvote.server.store.decisions import Standing, pack_standings, pack_states, pack_tally, packed_cells
 from mapvote.server.store.integrity import Damage, DamagedBallots
 from mapvote.server.store.queries import load_tile, tile_as_of
 from mapvote.server.store.votes import (
-    DAMAGED,
-    OTHERWISE,
-    YOUNG,
     Electorate,
     Judged,
     Polled,
@@ -47,7 +44,6 @@ from mapvote.server.store.votes import (
 _GROUP, _ROUND = 8, 8
 """Most neighbouring tiles that are fused within one database transaction; least number of groups of a round with an
 executor, so that all its workers have work and a round can be cancelled between groups."""
-_WHY: dict[str, Why] = {"": "", YOUNG: "young", OTHERWISE: "otherwise", DAMAGED: "damaged"}
 _NOWHERE = np.empty(0, dtype=np.uint64)
 
 
@@ -184,22 +180,24 @@ def _fuse(connection: sa.Connection, task: Task, polled: Polled) -> Fused:
         copies=decision.copies,
         odds=pack_agreed(decision.odds, decision.states),
         pending=decision.pending,
-        standings=pack_standings(_standings(judged, decision)),
+        standings=pack_standings(standings_of(judged, decision.copies, decision.heard)),
     )
 
 
-def _standings(judged: Sequence[Judged], decision: Decision) -> Iterator[Standing]:
-    """The standing of every ballot on the tile."""
-    copies = {(copy.vehicle, copy.digest): copy for copy in decision.copies}
+def standings_of(judged: Sequence[Judged], copies: Iterable[Copy], heard: Collection[str]) -> list[Standing]:
+    """The standing of every ballot on a tile, by the copies among them and the vehicles that counted."""
+    copied = {(copy.vehicle, copy.digest): copy for copy in copies}
     seqs = {(one.stored.vehicle, one.stored.digest): one.stored.seq for one in judged}
+    found = []
     for one in judged:
-        seq, why, alike = one.stored.seq, _WHY.get(one.why, "window"), 0
-        copy = copies.get((one.stored.vehicle, one.stored.digest))
+        why, alike = one.why, 0
+        copy = copied.get((one.stored.vehicle, one.stored.digest))
         if copy is not None:
             why, alike = "copy", seqs[copy.heard_vehicle, copy.heard_digest]
-        elif not why and one.stored.vehicle not in decision.heard:
+        elif not why and one.stored.vehicle not in heard:
             why = "opposes"
-        yield Standing(seq, why, packed_cells(one.spent), packed_cells(one.reviewed), alike)
+        found.append(Standing(one.stored.seq, why, packed_cells(one.spent), packed_cells(one.reviewed), alike))
+    return found
 
 
 def _tile(connection: sa.Connection, task: Task) -> Tile:

@@ -26,6 +26,7 @@ from mapvote.fusion.persistence import history_days
 from mapvote.fusion.tile_vote import DAY_NS, TileVote, newest_votes, restrict
 from mapvote.server.store import schema
 from mapvote.server.store.database import MOST_ASKED
+from mapvote.server.store.decisions import Why
 from mapvote.server.store.integrity import NOT_ITS_SUM, Damage, DamagedBallots, ballot_name, set_aside
 from mapvote.server.store.policy import Policy, policy_in
 from mapvote.server.store.queries import Version
@@ -61,9 +62,6 @@ class Electorate:
 
 Read = TypeVar("Read")
 FOREVER = (1 << 63) - 1
-YOUNG = "waits for the minimum age"
-DAMAGED = "damaged, and set aside"
-OTHERWISE = "cast by another method or other settings than the policy asks for"
 
 
 def _stands_at(mark: int | sa.BindParameter[int]) -> sa.ColumnElement[bool]:
@@ -148,19 +146,17 @@ def standing_tiles(connection: sa.Connection, mark: int, since: int | None = Non
     return sorted(found)
 
 
-def judged_votes(connection: sa.Connection, index: TileIndex, asked: Electorate) -> list[tuple[StoredVote, str]]:
+def judged_votes(connection: sa.Connection, index: TileIndex, asked: Electorate) -> list[tuple[StoredVote, Why]]:
     """Every standing vote on a tile, and why it does not count there at all; "" if it does, in cells where it is not
     spent (:func:`mapvote.fusion.fuse.unspent`)."""
     return _judged(_standing_on(connection, index[0], [index[1]], asked.mark)[index], index, asked)
 
 
-def _judged(standing: Sequence[StoredVote], index: TileIndex, asked: Electorate) -> list[tuple[StoredVote, str]]:
+def _judged(standing: Sequence[StoredVote], index: TileIndex, asked: Electorate) -> list[tuple[StoredVote, Why]]:
     found = [vote for vote in standing if vote.vehicle not in asked.without]
     why = {vote.seq: _unready(vote, index, asked) for vote in found}
-    settings = asked.settings
-    inside = {vote.seq for vote in newest_votes([vote for vote in found if not why[vote.seq]], settings)}
-    outside = f"older than {settings.max_age_days:g} days or not among the last {settings.latest_vehicles} vehicles"
-    return [(vote, why[vote.seq] or ("" if vote.seq in inside else outside)) for vote in found]
+    inside = {vote.seq for vote in newest_votes([vote for vote in found if not why[vote.seq]], asked.settings)}
+    return [(vote, why[vote.seq] or ("" if vote.seq in inside else "window")) for vote in found]
 
 
 def electorate_now(
@@ -186,13 +182,13 @@ def next_ripe_ns(connection: sa.Connection, asked: Electorate) -> int | None:
     return None if first is None else int(first) + age_ns
 
 
-def _unready(vote: StoredVote, index: TileIndex, asked: Electorate) -> str:
+def _unready(vote: StoredVote, index: TileIndex, asked: Electorate) -> Why:
     cast = asked.policy.round
     if asked.set_aside and not {str(vote.seq), ballot_name(vote.seq, *index)}.isdisjoint(asked.set_aside):
-        return DAMAGED
+        return "damaged"
     if vote.cast_by != cast.cast_by or not vote.settings_hash.startswith(cast.settings_hash):
-        return OTHERWISE
-    return YOUNG if vote.received_ns > asked.received_by_ns else ""
+        return "otherwise"
+    return "young" if vote.received_ns > asked.received_by_ns else ""
 
 
 def counting_votes(connection: sa.Connection, tile: Tile, asked: Electorate) -> list[TileVote]:
@@ -210,7 +206,7 @@ class Judged:
     """One standing vote on a tile, and what becomes of it before the votes are compared with each other."""
 
     stored: StoredVote
-    why: str
+    why: Why
     """Why it does not count on the tile; "" if it does."""
     vote: TileVote | None = None
     """In the cells where it counts; None if it does not."""
@@ -274,7 +270,7 @@ def recent_votes(
     index = tile.index
     polled = polled or poll(connection, index[0], [index[1]], asked)
     judged = _judged(polled.standing[index], index, asked)
-    ready = [vote for vote, why in judged if why not in (YOUNG, OTHERWISE, DAMAGED)]
+    ready = [vote for vote, why in judged if why in ("", "window")]
     oldest = max((vote.end_ns for vote in ready), default=0) - history_days(asked.settings) * DAY_NS
     chosen = [vote for vote in ready if vote.end_ns >= oldest]
     return [unspent(vote, tile, misread) for vote in read_votes(connection, index, chosen, polled.rows)]

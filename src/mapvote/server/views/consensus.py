@@ -9,13 +9,17 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import scipy
 
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Lattice, TileIndex
 from mapvote.core.types import I64, U8, CellState
+from mapvote.server.store.policy import policy_in
+from mapvote.server.store.store import Store
+from mapvote.server.views.explain import said_by, votes_by_tile
+from mapvote.server.views.geojson import collection
 from mapvote.server.views.outlines import pieces
 
 Stance = Literal["contradicts", "consistent", "undecidable"]
@@ -113,6 +117,19 @@ def compare(index: TileIndex, votes: Iterable[Spoken]) -> list[Compared]:
     return sorted(out, key=lambda entry: entry.vehicle)
 
 
+def vehicle_standings(store: Store) -> list[VehicleStanding]:
+    """Each vehicle compared with the others, over every vote inside the window, in order of name.
+
+    The state of the world (occupied or empty now) is compared, so votes on an older base count too.
+    """
+    compared: list[Compared] = []
+    with store.database.reading() as connection:
+        for window, votes in votes_by_tile(connection, store.lattice, policy_in(connection)):
+            spoken = [Spoken(vote.vehicle, vote.end_ns, said_by(vote)) for vote in votes]
+            compared += compare(window.tile_index, spoken)
+    return standings_of(compared, store.lattice)
+
+
 def standings_of(
     compared: Iterable[Compared],
     lattice: Lattice,
@@ -181,3 +198,23 @@ def _objects(entries: Sequence[Compared], lattice: Lattice, min_cells: int) -> t
         )
         for i in ranked
     )
+
+
+def contradictions(standings: Sequence[VehicleStanding]) -> dict[str, Any]:
+    """Where vehicles contradict the others, as GeoJSON points in map metres."""
+    return collection(
+        [
+            (
+                {"type": "Point", "coordinates": [e.x, e.y]},
+                {"vehicle": s.vehicle, "verdict": s.verdict, "says": e.says, "cells": e.cells},
+            )
+            for s in standings
+            for e in s.evidence
+        ]
+    )
+
+
+def standing_rows(standings: Sequence[VehicleStanding]) -> list[dict[str, Any]]:
+    """A row per vehicle, without the places."""
+    columns = ("vehicle", "verdict", "cells", "objects", "others_cells", "others_objects", "p_value", "threshold")
+    return [{name: getattr(s, name) for name in columns} for s in standings]

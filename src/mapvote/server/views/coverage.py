@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from functools import cache, partial
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -13,40 +13,22 @@ from mapvote.codec.path import unpack_path
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, TileIndex
 from mapvote.core.types import F32, F64, I64
 from mapvote.fusion.next_pass import Stretch, Witness, stretches
-from mapvote.fusion.tile_vote import TileVote, one_each
 from mapvote.server.store import schema
 from mapvote.server.store.policy import policy_in
 from mapvote.server.store.queries import current_version, load_tile, tiles_of
 from mapvote.server.store.store import Store
-from mapvote.server.store.votes import (
-    FOREVER,
-    Electorate,
-    from_sound_ballots,
-    judged_votes,
-    read_votes,
-    standing_tiles,
-)
-from mapvote.server.views.explain import said_by
-from mapvote.server.views.geojson import MAP_METRES, utc
+from mapvote.server.views.explain import said_by, votes_by_tile
+from mapvote.server.views.geojson import collection, utc
 
 
 def wanted_passes(store: Store) -> list[Stretch]:
     """Over all tiles with standing votes, those that one more pass would do most for first."""
     found: list[Stretch] = []
     with store.database.reading() as connection:
-        policy = policy_in(connection)
-        everybody = Electorate(FOREVER, policy, FOREVER)
-        driven = _driven(connection, store)
-
-        def said_on(index: TileIndex, asked: Electorate) -> list[TileVote]:
-            chosen = [vote for vote, why in judged_votes(connection, index, asked) if not why]
-            return read_votes(connection, index, chosen)
-
-        for index in standing_tiles(connection, FOREVER):
-            window = store.lattice.tile(index)
-            votes = one_each(from_sound_ballots(connection, everybody, partial(said_on, index)), window)
+        policy, driven = policy_in(connection), _driven(connection, store)
+        for window, votes in votes_by_tile(connection, store.lattice, policy):
             witnesses = [Witness(said_by(vote), driven[vote.vehicle]) for vote in votes]
-            found += stretches(window, witnesses, everybody.settings.min_votes)
+            found += stretches(window, witnesses, policy.fuse.min_votes)
     return sorted(found, key=lambda stretch: (-stretch.cells, stretch.tile, stretch.heading_rad))
 
 
@@ -63,22 +45,38 @@ def _driven(connection: sa.Connection, store: Store) -> dict[str, list[F64]]:
 
 def as_features(wanted: list[Stretch]) -> dict[str, Any]:
     """GeoJSON lines in map metres, each in the direction to drive, with what one more pass would decide there."""
-    features = [
-        {
-            "type": "Feature",
-            "geometry": {"type": "LineString", "coordinates": np.round(stretch.path_m, 2).tolist()},
-            "properties": {
-                "row": stretch.tile[0],
-                "col": stretch.tile[1],
-                "heading_deg": round(float(np.degrees(stretch.heading_rad))),
-                "cells": stretch.cells,
-                "built": stretch.built,
-                "gone": stretch.gone,
-            },
-        }
-        for stretch in wanted
+    return collection(
+        [
+            (
+                {"type": "LineString", "coordinates": np.round(stretch.path_m, 2).tolist()},
+                {
+                    "row": stretch.tile[0],
+                    "col": stretch.tile[1],
+                    "heading_deg": round(float(np.degrees(stretch.heading_rad))),
+                    "cells": stretch.cells,
+                    "built": stretch.built,
+                    "gone": stretch.gone,
+                },
+            )
+            for stretch in wanted
+        ]
+    )
+
+
+def tiles_seen(store: Store) -> list[dict[str, Any]]:
+    """Per tile of the map or of a standing ballot: end of the last drive past it (ns), number of vehicles."""
+    b, t = schema.ballots, schema.ballot_tiles
+    last = sa.select(t.c.row, t.c.col, sa.func.max(b.c.end_ns), sa.func.count(sa.distinct(b.c.vehicle)))
+    last = last.join(b, b.c.seq == t.c.ballot).where(b.c.gone_seq.is_(None)).group_by(t.c.row, t.c.col)
+    with store.database.reading() as connection:
+        tiles: dict[TileIndex, tuple[int | None, int]] = dict.fromkeys(
+            tiles_of(connection, current_version(connection).number), (None, 0)
+        )
+        tiles |= {(row[0], row[1]): (row[2], row[3]) for row in connection.execute(last)}
+    return [
+        {"row": index[0], "col": index[1], "last_seen_ns": last_ns, "vehicles": vehicles}
+        for index, (last_ns, vehicles) in sorted(tiles.items())
     ]
-    return {"type": "FeatureCollection", "frame": MAP_METRES, "features": features}
 
 
 MOST_PATHS = 500
@@ -104,22 +102,22 @@ def paths(store: Store, vehicle: str | None = None) -> dict[str, Any]:
             return load_tile(connection, store.lattice.tile(index), known.get(index)).ground_z
 
         lines = [_line(store, path, ground) for path in driven]
-    features = [
-        {
-            "type": "Feature",
-            "geometry": {"type": "LineString", "coordinates": line},
-            "properties": {
-                "vehicle": row.vehicle,
-                "drive": row.drive,
-                "start": utc(row.start_ns),
-                "end": utc(row.end_ns),
-                "version": row.version,
-                "length_m": round(float(np.hypot(*np.diff(np.array(line)[:, :2], axis=0).T).sum()), 1),
-            },
-        }
-        for row, line in zip(rows, lines, strict=True)
-    ]
-    return {"type": "FeatureCollection", "frame": MAP_METRES, "features": features}
+    return collection(
+        [
+            (
+                {"type": "LineString", "coordinates": line},
+                {
+                    "vehicle": row.vehicle,
+                    "drive": row.drive,
+                    "start": utc(row.start_ns),
+                    "end": utc(row.end_ns),
+                    "version": row.version,
+                    "length_m": round(float(np.hypot(*np.diff(np.array(line)[:, :2], axis=0).T).sum()), 1),
+                },
+            )
+            for row, line in zip(rows, lines, strict=True)
+        ]
+    )
 
 
 def _line(store: Store, path: I64, ground: Any) -> list[list[float]]:

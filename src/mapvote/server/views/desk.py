@@ -74,7 +74,7 @@ def _desk_of(store: Store, found: Round) -> Desk:
     version, budget = found.newest.number, found.asked.settings.false_deletions
     tiles = [_before_and_after(store, version, fused) for fused in found.changed]
     decided = {f.index: _decided(f) for f in found.changed}
-    objects = change_objects(changed_cells(old, new, [decided[old.index]]) for old, new in tiles)
+    objects = change_objects([changed_cells(old, new, [decided[old.index]]) for old, new in tiles])
     pending = to_geojson(objects, store.lattice, map_id=store.map_id, from_version=version)
     reviews = standing(store)
     cells = {o.id: _cells_of(o) for o in objects}
@@ -175,7 +175,7 @@ def waiting_features(store: Store, version: int, fused: Sequence[Fused], budget:
         window = store.lattice.tile(index)
         with store.database.reading() as connection:
             tiles[index] = load_tile(connection, window, tile_of(connection, version, index))
-    objects = change_objects(changed_cells(tile, _emptied(tile, waits[index])) for index, tile in tiles.items())
+    objects = change_objects([changed_cells(tile, _emptied(tile, waits[index])) for index, tile in tiles.items()])
     features: list[dict[str, Any]] = to_geojson(objects, store.lattice, map_id=store.map_id)["features"]
     for change, feature in zip(objects, features, strict=True):
         rows, cols = change.where

@@ -1,4 +1,4 @@
-"""Why the map is as it is: the votes on a cell, which versions counted them, and what stands there.
+"""What votes say of cells: on one cell, each ballot and why it counted or not; on a tile, cell by cell.
 
 What a version counted is read from its decision record (store/decisions.py). Only what the next version would count is
 decided here, of the one tile.
@@ -8,46 +8,48 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import asdict, dataclass
-from typing import Any
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 import sqlalchemy as sa
 
 from mapvote.codec.odds import UNSAID, in_nats
-from mapvote.core.grid import TILE_CELLS, TileIndex
+from mapvote.core.grid import TILE_CELLS, Grid, Lattice, TileIndex
 from mapvote.core.tile import Tile
-from mapvote.core.types import NO_VOTE, U8, CellState, MapvoteError
-from mapvote.core.voting import VOTE_UNIT, plurality
+from mapvote.core.types import F64, I64, N_STATES, NO_VOTE, U8, CellState, MapvoteError
+from mapvote.core.voting import VOTE_UNIT, decide_cells, plurality
 from mapvote.fusion.fuse import Heard, decide_tile, rule_of
-from mapvote.fusion.loss_budget import alike_beside, change_probability
+from mapvote.fusion.loss_budget import agreed_odds, alike_beside, change_probability, folded
 from mapvote.fusion.persistence import expected_days
-from mapvote.fusion.tile_vote import TileVote
+from mapvote.fusion.tile_vote import DAY_NS, TileVote, one_each
 from mapvote.server.store import schema
-from mapvote.server.store.decisions import REASONS, Record, Standing, records_of
+from mapvote.server.store.decisions import REASONS, Record, Standing, Why, records_of
+from mapvote.server.store.fusion_jobs import standings_of
 from mapvote.server.store.integrity import DamagedBallots, ballot_name
+from mapvote.server.store.keys import pseudonyms
+from mapvote.server.store.policy import Policy, policy_in
 from mapvote.server.store.queries import current_version, tile_as_of
 from mapvote.server.store.store import Store
 from mapvote.server.store.votes import (
-    DAMAGED,
+    FOREVER,
     Electorate,
     Judged,
     StoredVote,
     electorate_now,
     from_sound_ballots,
     judged_on,
+    judged_votes,
     read_votes,
     recent_votes,
+    standing_tiles,
     stored_votes,
 )
+from mapvote.server.views.geojson import utc
 
 MOST_RECORDS = 30
 """So many of the last versions that decided a cell are asked which votes they counted."""
 UNREADABLE = "unreadable"
-REVIEWED = "of a change that a reviewer held or rejected"
-OPPOSES = "opposes the others over most of this tile, or denies nearly all that changed on it"
-COPY = "a copy: its cells on this tile equal those of another vehicle's ballot, which counts for both"
 ENDED = {
     "ballot": "replaced by a later ballot of this drive",
     "withdraw": "withdrawn",
@@ -86,7 +88,8 @@ class CellVote:
     """Voxels of the map that it says are gone here, of a changed cell or beside what stands; None: it sent no mask."""
     sure: float | None
     """Probability that the cell did change so, by its own evidence; None where it does not say."""
-    end_ns: int
+    end: str | None
+    """End of the drive, ISO 8601."""
     counts: bool
     """Whether the next version counts it."""
     why: str
@@ -121,14 +124,17 @@ class _Now:
     cell: tuple[int, int]
     asked: Electorate
     judged: Sequence[Judged]
+    standings: Sequence[Standing]
+    """Of ``judged``, in the next version."""
     said: Mapping[int, TileVote]
     """The vote of each readable ballot on the tile, by the ballot's ``seq``."""
     decided: Heard
     """The decision of the next version, if it were published now."""
 
 
-def explain_cell(store: Store, x: float, y: float) -> CellStory:
-    """The votes behind the cell that holds (x, y), map metres. MapvoteError if that is no place on earth."""
+def explain_cell(store: Store, x: float, y: float, *, known: bool = True) -> CellStory:
+    """The votes behind the cell that holds (x, y), map metres. ``known``: with the names of vehicles and exact times,
+    else see :func:`seen`. MapvoteError if (x, y) is no place on earth."""
     if not (abs(x) < 1e7 and abs(y) < 1e7):
         raise MapvoteError(f"({x}, {y}): give map metres, within 10,000 km of the map's origin")
     rows, cols = store.lattice.cells_of(np.array([[x, y]]))
@@ -139,15 +145,19 @@ def explain_cell(store: Store, x: float, y: float) -> CellStory:
         now = _as_of_now(connection, tile, cell, electorate_now(connection, store.clock()))
         found = [(record, _state_in(record, cell)) for record in records_of(connection, index)]
         decisions = [(record, state) for record, state in found if state != state_name(NO_VOTE)]
-        votes = _votes(connection, now, [record for record, _ in decisions[-MOST_RECORDS:]])
+        votes = _votes(connection, now, [record for record, _ in decisions[-MOST_RECORDS:]], known)
+    if not known:
+        shown = pseudonyms(store, {vote.vehicle for vote in votes})
+        votes = [replace(vote, vehicle=shown[vote.vehicle], drive="") for vote in votes]
     probability = _probability(decisions[-1][0], cell) if decisions else None
     by_version = [CellDecision(record.version, state) for record, state in decisions]
     return CellStory(row, col, votes, by_version, probability, _thing(now))
 
 
-def story_as_json(story: CellStory) -> dict[str, Any]:
-    """A story as JSON."""
-    return asdict(story) | {"probability": None if story.probability is None else round(story.probability, 3)}
+def seen(stamp_ns: int | None, known: bool) -> int | None:
+    """The time of a drive, or only its day for readers that may not know the vehicle (not ``known``): on a road with
+    few vehicles the minute would identify it."""
+    return stamp_ns if known or stamp_ns is None else stamp_ns // DAY_NS * DAY_NS
 
 
 def state_name(state: int) -> str:
@@ -184,7 +194,7 @@ def _as_of_now(connection: sa.Connection, tile: Tile, cell: tuple[int, int], ask
 
     def look(asked: Electorate) -> tuple[Electorate, Sequence[Judged], Mapping[int, TileVote]]:
         judged = judged_on(connection, tile, asked)
-        readable = [one.stored for one in judged if one.why != DAMAGED]
+        readable = [one.stored for one in judged if one.why != "damaged"]
         said = read_votes(connection, tile.index, readable)
         return asked, judged, {stored.seq: vote for stored, vote in zip(readable, said, strict=True)}
 
@@ -195,12 +205,12 @@ def _as_of_now(connection: sa.Connection, tile: Tile, cell: tuple[int, int], ask
         return recent_votes(connection, tile, asked)
 
     past = history if policy.round.stage == "two-stage" else None
-    return _Now(
-        tile, cell, asked, judged, said, decide_tile(tile, counting, rule_of(policy.round.method), policy.fuse, past)
-    )
+    decided = decide_tile(tile, counting, rule_of(policy.round.method), policy.fuse, past)
+    standings = standings_of(judged, decided.copies, {vote.vehicle for vote in decided.votes})
+    return _Now(tile, cell, asked, judged, standings, said, decided)
 
 
-def _votes(connection: sa.Connection, now: _Now, records: Sequence[Record]) -> list[CellVote]:
+def _votes(connection: sa.Connection, now: _Now, records: Sequence[Record], known: bool) -> list[CellVote]:
     """Every standing vote, then those that some version counted on the cell and that stand no more."""
     flat = now.cell[0] * TILE_CELLS + now.cell[1]
     past = sound_votes(connection, now.tile.index, {s.ballot for r in records for s in _standings(r)} - now.said.keys())
@@ -214,13 +224,19 @@ def _votes(connection: sa.Connection, now: _Now, records: Sequence[Record]) -> l
                     left_out[standing.ballot].append(LeftOut(record.version, REASONS[why]))
                 else:
                     counted[standing.ballot].append(record.version)
-    ended = _ended(connection, past.keys() & counted.keys())
-    everyone = [(one.stored, _why_not(one, now)) for one in now.judged]
-    everyone += [(past[seq][0], ended.get(seq, "stands no more")) for seq in sorted(past.keys() & counted.keys())]
-    return [
-        _vote(stored, said.get(stored.seq), why, now.cell, (counted[stored.seq], left_out[stored.seq]))
-        for stored, why in everyone
-    ]
+    gone = sorted(past.keys() & counted.keys())
+    ended = _ended(connection, gone)
+    everyone = [(one.stored, _why_not(standing, now)) for one, standing in zip(now.judged, now.standings, strict=True)]
+    everyone += [(past[seq][0], ended.get(seq, "stands no more")) for seq in gone]
+    found = []
+    for stored, reason in everyone:
+        vote, seq = said.get(stored.seq), stored.seq
+        text: tuple[str, int | None, float | None] = UNREADABLE, None, None
+        if vote is not None:
+            text = state_name(int(said_by(vote)[now.cell])), _marks(vote, now.cell), _sure(vote, now.cell)
+        whose, end = (stored.vehicle, stored.drive, stored.version), utc(seen(stored.end_ns, known))
+        found.append(CellVote(*whose, *text, end, not reason, reason, tuple(counted[seq]), tuple(left_out[seq])))
+    return found
 
 
 def _ended(connection: sa.Connection, ballots: Collection[int]) -> dict[int, str]:
@@ -230,37 +246,17 @@ def _ended(connection: sa.Connection, ballots: Collection[int]) -> dict[int, str
     return {seq: ENDED.get(kind, kind) for seq, kind in connection.execute(ends)}
 
 
-def _why_not(one: Judged, now: _Now) -> str:
+def _why_not(standing: Standing, now: _Now) -> str:
     """Why the next version would not count a standing ballot on the cell; "" if it would."""
-    if one.why:
-        return one.why
-    assert one.vote is not None
-    flat, sent = now.cell[0] * TILE_CELLS + now.cell[1], now.said[one.stored.seq]
-    if not sent.spoken()[now.cell]:
+    if not standing.why and not now.said[standing.ballot].spoken()[now.cell]:
         return "says nothing here"
-    if flat in one.spent:
-        assert now.tile.memory is not None
-        return f"spent: version {now.tile.memory.changed[now.cell]} has changed the cell since"
-    if flat in one.reviewed:
-        return REVIEWED
-    if any((sent.vehicle, sent.digest) == (copy.vehicle, copy.digest) for copy in now.decided.copies):
-        return COPY
-    return "" if any(sent.vehicle == other.vehicle for other in now.decided.votes) else OPPOSES
-
-
-def _vote(
-    stored: StoredVote,
-    vote: TileVote | None,
-    why: str,
-    cell: tuple[int, int],
-    versions: tuple[Sequence[int], Sequence[LeftOut]],
-) -> CellVote:
-    """``versions``: those that counted it, and those that did not and why."""
-    whose = stored.vehicle, stored.drive, stored.version
-    text: tuple[str, int | None, float | None] = UNREADABLE, None, None
-    if vote is not None:
-        text = state_name(int(said_by(vote)[cell])), _marks(vote, cell), _sure(vote, cell)
-    return CellVote(*whose, *text, stored.end_ns, not why, why, tuple(versions[0]), tuple(versions[1]))
+    why: Why = standing.why_not(now.cell[0] * TILE_CELLS + now.cell[1])
+    fuse, memory = now.asked.settings, now.tile.memory
+    if why == "window":
+        return f"older than {fuse.max_age_days:g} days or not among the last {fuse.latest_vehicles} vehicles"
+    if why == "spent" and memory is not None:
+        return f"spent: version {memory.changed[now.cell]} has changed the cell since"
+    return REASONS[why] if why else ""
 
 
 def _standings(record: Record) -> Sequence[Standing]:
@@ -293,7 +289,7 @@ def _probability(record: Record, cell: tuple[int, int]) -> float | None:
     beside = alike_beside(rows, cols, np.zeros(len(rows), np.int64))[(rows == cell[0]) & (cols == cell[1])]
     against = counted[: CellState.UNDETERMINED].sum() - counted[state]
     asked = np.array([counted[state]]), np.array([against])
-    return float(change_probability(states[cell].reshape(1), *asked, beside, odds)[0])
+    return round(float(change_probability(states[cell].reshape(1), *asked, beside, odds)[0]), 3)
 
 
 def _thing(now: _Now) -> str:
@@ -345,3 +341,84 @@ def _sure(vote: TileVote, cell: tuple[int, int]) -> float | None:
         return None
     said = vote.odds.at(np.array([cell[0] * TILE_CELLS + cell[1]]))
     return None if said[0] == UNSAID else round(1.0 / (1.0 + math.exp(-float(in_nats(said)[0]))), 4)
+
+
+def _said_on(
+    connection: sa.Connection, index: TileIndex, policy: Policy, wanted: Callable[[StoredVote, Why], bool]
+) -> list[TileVote]:
+    """The standing votes on a tile, of any age, that are ``wanted``; without damaged ones."""
+
+    def read(asked: Electorate) -> list[TileVote]:
+        chosen = [vote for vote, why in judged_votes(connection, index, asked) if wanted(vote, why)]
+        return read_votes(connection, index, chosen)
+
+    return from_sound_ballots(connection, Electorate(FOREVER, policy, FOREVER), read)
+
+
+def votes_by_tile(connection: sa.Connection, lattice: Lattice, policy: Policy) -> Iterator[tuple[Grid, list[TileVote]]]:
+    """Of each tile with standing votes: its window, and the votes inside the policy's window, one a vehicle."""
+    for index in standing_tiles(connection, FOREVER):
+        window = lattice.tile(index)
+        yield window, one_each(_said_on(connection, index, policy, lambda vote, why: not why), window)
+
+
+_NEVER_SEEN = 255
+
+
+def evidence(store: Store, index: TileIndex, vehicle: str | None = None) -> U8:
+    """(256, 256, 4) the standing votes on a tile's cells, of all vehicles or of one.
+
+    Vehicles that determined the cell (255: or more); days since the last drive that did, 254 at most (255: never);
+    probability that the cell changed, in 1/255; the most frequent state (a tie is
+    undetermined; NO_VOTE: no vote).
+    """
+    with store.database.reading() as connection:
+        policy = policy_in(connection)
+
+        def wanted(vote: StoredVote, why: Why) -> bool:
+            return why != "damaged" and vehicle in (None, vote.vehicle)
+
+        votes = _said_on(connection, index, policy, wanted)
+    silent = TileVote("", 0, "", states=np.full((TILE_CELLS, TILE_CELLS), NO_VOTE, np.uint8))
+    newest: dict[str, TileVote] = {}
+    last = np.full((TILE_CELLS, TILE_CELLS), -1, dtype=np.int64)
+    for vote in sorted(votes, key=lambda vote: (vote.end_ns, vote.digest)):
+        states, before = said_by(vote), newest.get(vote.vehicle, silent)
+        assert before.states is not None
+        spoken = (states != NO_VOTE) & (states != CellState.UNDETERMINED)
+        last[spoken] = vote.end_ns
+        odds = folded([before, vote], [~spoken.reshape(-1), spoken.reshape(-1)])
+        newest[vote.vehicle] = replace(silent, states=np.where(spoken, states, before.states), odds=odds)
+    return _summary(list(newest.values()), last, store.clock(), policy.fuse.min_votes)
+
+
+def _summary(votes: Sequence[TileVote], last: I64, now_ns: int, quorum: int) -> U8:
+    counts = np.zeros((N_STATES, TILE_CELLS**2), dtype=np.int64)
+    said = counts[:4].reshape(4, TILE_CELLS, TILE_CELLS)
+    for vote in votes:
+        for state in range(4):
+            said[state] += vote.states == state
+    total = said.sum(axis=0)
+    days = np.clip((now_ns - last) // DAY_NS, 0, _NEVER_SEEN - 1)
+    out = np.empty((TILE_CELLS, TILE_CELLS, 4), dtype=np.uint8)
+    out[..., 0] = np.minimum(total, 255)
+    out[..., 1] = np.where(last < 0, _NEVER_SEEN, days)
+    out[..., 2] = np.rint(255 * _probabilities(said, votes, quorum))
+    out[..., 3] = decide_cells(counts, counts, True, 0).reshape(total.shape)
+    return out
+
+
+def _probabilities(said: I64, vehicles: Sequence[TileVote], quorum: int) -> F64:
+    """(256, 256) probability of each cell's more frequent change. ``said``: vehicles by state (4, 256, 256). 0 where no
+    vehicle votes for a change."""
+    changes = said[CellState.CHANGED_OCCUPIED : CellState.CHANGED_EMPTY + 1]
+    rows, cols = np.nonzero(changes.any(axis=0))
+    kinds = changes[:, rows, cols].argmax(axis=0)
+    votes = changes[kinds, rows, cols]
+    states = (kinds + CellState.CHANGED_OCCUPIED).astype(np.uint8)
+    against = said[:, rows, cols].sum(axis=0) - votes
+    out, claimed = np.zeros(said.shape[1:]), np.full(said.shape[1:], NO_VOTE, dtype=np.uint8)
+    claimed[rows, cols] = states
+    odds = agreed_odds(vehicles, claimed, quorum).at(rows * TILE_CELLS + cols)
+    out[rows, cols] = change_probability(states, votes, against, alike_beside(rows, cols, kinds), odds)
+    return out

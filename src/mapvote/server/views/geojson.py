@@ -1,4 +1,4 @@
-"""Change objects, tiles and contradictions as GeoJSON, and any list of the server as CSV."""
+"""Change objects and tiles as GeoJSON, and any list of the server as CSV."""
 
 from __future__ import annotations
 
@@ -16,7 +16,6 @@ from mapvote.core.types import F64
 from mapvote.formats.geo.frame import MapFrame
 from mapvote.formats.geo.projector import frame_of
 from mapvote.server.views.change_objects import ChangeObject
-from mapvote.server.views.consensus import VehicleStanding
 from mapvote.server.views.outlines import Ring
 
 
@@ -144,30 +143,11 @@ MAP_METRES = "map metres, not the longitude and latitude of RFC 7946"
 
 def tile_squares(tiles: Sequence[Mapping[str, Any]], lattice: Lattice) -> dict[str, Any]:
     """Tiles (each with row and col) as GeoJSON polygons in map metres, with their values as properties."""
-    return _collection([(_square(lattice, tile["row"], tile["col"]), dict(tile)) for tile in tiles])
+    return collection([(_square(lattice, tile["row"], tile["col"]), dict(tile)) for tile in tiles])
 
 
-def contradictions(standings: Sequence[VehicleStanding]) -> dict[str, Any]:
-    """Where vehicles contradict the others, as GeoJSON points in map metres."""
-    return _collection(
-        [
-            (
-                {"type": "Point", "coordinates": [e.x, e.y]},
-                {"vehicle": s.vehicle, "verdict": s.verdict, "says": e.says, "cells": e.cells},
-            )
-            for s in standings
-            for e in s.evidence
-        ]
-    )
-
-
-def standing_rows(standings: Sequence[VehicleStanding]) -> list[dict[str, Any]]:
-    """A row per vehicle, without the places."""
-    columns = ("vehicle", "verdict", "cells", "objects", "others_cells", "others_objects", "p_value", "threshold")
-    return [{name: getattr(s, name) for name in columns} for s in standings]
-
-
-def _collection(things: Sequence[tuple[dict[str, Any], dict[str, Any]]]) -> dict[str, Any]:
+def collection(things: Sequence[tuple[dict[str, Any], dict[str, Any]]]) -> dict[str, Any]:
+    """Things in map metres, each (geometry, properties), as GeoJSON."""
     features = [{"type": "Feature", "geometry": geometry, "properties": properties} for geometry, properties in things]
     return {"type": "FeatureCollection", "frame": MAP_METRES, "features": features}
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
-from functools import cache, partial
+from functools import cache
 from itertools import islice
 from typing import Any
 
@@ -16,12 +16,11 @@ from mapvote.codec.tile_planes import names_in_plane
 from mapvote.core.grid import TileIndex
 from mapvote.core.tile import Tile
 from mapvote.core.types import NO_VOTE, U8, MapvoteError
-from mapvote.fusion.tile_vote import DAY_NS, TileVote, one_each
+from mapvote.fusion.tile_vote import TileVote
 from mapvote.server.errors import Unavailable
 from mapvote.server.store import schema
 from mapvote.server.store.decisions import Standing, cells_in, records_of
 from mapvote.server.store.integrity import set_aside
-from mapvote.server.store.policy import policy_in
 from mapvote.server.store.queries import (
     current_version,
     load_blob,
@@ -33,19 +32,12 @@ from mapvote.server.store.queries import (
 )
 from mapvote.server.store.store import Store
 from mapvote.server.store.votes import (
-    FOREVER,
-    Electorate,
     StoredVote,
-    from_sound_ballots,
-    judged_votes,
-    read_votes,
-    standing_tiles,
 )
 from mapvote.server.views.change_objects import Decided, change_objects, changed_cells
-from mapvote.server.views.consensus import Compared, Spoken, VehicleStanding, compare, standings_of
 from mapvote.server.views.cutout import Cutout, Tiles, of_feature, whole_page
 from mapvote.server.views.events import last_events
-from mapvote.server.views.explain import said_by, sound_votes
+from mapvote.server.views.explain import seen, sound_votes
 from mapvote.server.views.geojson import to_geojson
 
 _LOOKED_AT = 3
@@ -97,12 +89,6 @@ def log_of(store: Store, last: int) -> dict[str, Any]:
     columns = ("number", "parent", "kind", "target", "created_ns", "published_by", "reason")
     versions = [{name: getattr(version, name) for name in columns} for version in store.versions()]
     return {"versions": versions, "events": last_events(store, last) if last else []}
-
-
-def seen(stamp_ns: int | None, known: bool) -> int | None:
-    """The time of a drive, or only its day for readers that may not know the vehicle (not ``known``): on a road with
-    few vehicles the minute would identify it."""
-    return stamp_ns if known or stamp_ns is None else stamp_ns // DAY_NS * DAY_NS
 
 
 def changes_between(
@@ -189,39 +175,3 @@ def _drives(standings: Sequence[Standing], sound: Mapping[int, tuple[StoredVote,
                 states.reshape(-1)[cells_in(cells)] = NO_VOTE
             found.append((vote.end_ns, states))
     return found
-
-
-def coverage(store: Store) -> list[dict[str, Any]]:
-    """Per tile of the map or of a standing ballot: end of the last drive past it (ns), number of vehicles."""
-    b, t = schema.ballots, schema.ballot_tiles
-    seen = sa.select(t.c.row, t.c.col, sa.func.max(b.c.end_ns), sa.func.count(sa.distinct(b.c.vehicle)))
-    seen = seen.join(b, b.c.seq == t.c.ballot).where(b.c.gone_seq.is_(None)).group_by(t.c.row, t.c.col)
-    with store.database.reading() as connection:
-        tiles: dict[TileIndex, tuple[int | None, int]] = dict.fromkeys(
-            tiles_of(connection, current_version(connection).number), (None, 0)
-        )
-        tiles |= {(row[0], row[1]): (row[2], row[3]) for row in connection.execute(seen)}
-    return [
-        {"row": index[0], "col": index[1], "last_seen_ns": last, "vehicles": vehicles}
-        for index, (last, vehicles) in sorted(tiles.items())
-    ]
-
-
-def vehicle_standings(store: Store) -> list[VehicleStanding]:
-    """Each vehicle compared with the others, over every vote inside the window, in order of name.
-
-    The state of the world (occupied or empty now) is compared, so votes on an older base count too.
-    """
-    with store.database.reading() as connection:
-        everybody = Electorate(FOREVER, policy_in(connection), FOREVER)
-        compared: list[Compared] = []
-
-        def said_on(index: TileIndex, asked: Electorate) -> list[TileVote]:
-            chosen = [vote for vote, why in judged_votes(connection, index, asked) if not why]
-            return read_votes(connection, index, chosen)
-
-        for index in standing_tiles(connection, FOREVER):
-            said = from_sound_ballots(connection, everybody, partial(said_on, index))
-            folded = one_each(said, store.lattice.tile(index))
-            compared += compare(index, [Spoken(vote.vehicle, vote.end_ns, said_by(vote)) for vote in folded])
-    return standings_of(compared, store.lattice)

@@ -1,4 +1,4 @@
-"""The 3D page's point clouds: a tile's points in levels of detail, overviews, points added and deleted, votes per cell.
+"""The 3D page's point clouds: a tile's points in levels of detail, overviews, points added and deleted.
 
 Any prefix of a tile's levels is an even, thinner picture of the tile. Each point belongs to the coarsest level in whose
 voxels it is the tile's first; within a level the order is random, and the same on every run. Levels are added to one
@@ -12,7 +12,7 @@ import threading
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -21,17 +21,11 @@ from mapvote.codec.tile_planes import unpack_fields_plane
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Lattice, TileIndex
 from mapvote.core.kernel import allocating
 from mapvote.core.tile import Tile, in_bytes
-from mapvote.core.types import F32, F64, I64, N_STATES, NO_VOTE, U8, U16, CellState, MapvoteError
-from mapvote.core.voting import decide_cells
+from mapvote.core.types import F32, F64, I64, U8, U16, MapvoteError
 from mapvote.core.voxels import found_among
-from mapvote.fusion.loss_budget import agreed_odds, alike_beside, change_probability, folded
-from mapvote.fusion.tile_vote import TileVote
 from mapvote.server.errors import Unavailable
-from mapvote.server.store.policy import policy_in
 from mapvote.server.store.queries import load_blob, load_tile, tiles_of, tiles_that_differ, version_of
 from mapvote.server.store.store import Store
-from mapvote.server.store.votes import DAMAGED, FOREVER, Electorate, from_sound_ballots, judged_votes, read_votes
-from mapvote.server.views.explain import said_by
 
 SPACINGS_M = (4.8, 2.4, 1.2, 0.6, 0.3)
 """Voxel side of each level; one more level takes what is left."""
@@ -167,8 +161,6 @@ _ANYWHERE = Lattice().tile((0, 0))
 _KEPT_BYTES = 256_000_000
 _HEAD = "<i4,<i4,<i4,<u4,<f4,<f4"
 _OVERVIEW_MAGIC = 0x3143564F
-_DAY_NS = 86_400 * 10**9
-_NEVER_SEEN = 255
 
 
 class Clouds:
@@ -310,63 +302,3 @@ def _overview_bytes(made: Sequence[tuple[TileIndex, Levels]]) -> bytes:
             bright.append(bytes(points) if levels.bright is None else levels.bright[:points].tobytes())
     head = np.array([_OVERVIEW_MAGIC, len(made)], dtype="<u4").tobytes(), np.array(rows, dtype=_HEAD).tobytes()
     return b"".join([*head, *clouds, *bright])
-
-
-def evidence(store: Store, index: TileIndex, vehicle: str | None = None) -> U8:
-    """(256, 256, 4) the standing votes on a tile's cells, of all vehicles or of one.
-
-    Vehicles that determined the cell (255: or more); days since the last drive that did, 254 at most (255: never);
-    probability that the cell changed, in 1/255; the most frequent state (a tie is
-    undetermined; NO_VOTE: no vote).
-    """
-    with store.database.reading() as connection:
-        policy = policy_in(connection)
-
-        def said(asked: Electorate) -> list[TileVote]:
-            judged = [vote for vote, why in judged_votes(connection, index, asked) if why != DAMAGED]
-            return read_votes(connection, index, [v for v in judged if vehicle is None or v.vehicle == vehicle])
-
-        votes = from_sound_ballots(connection, Electorate(FOREVER, policy, FOREVER), said)
-    silent = TileVote("", 0, "", states=np.full((TILE_CELLS, TILE_CELLS), NO_VOTE, np.uint8))
-    newest: dict[str, TileVote] = {}
-    last = np.full((TILE_CELLS, TILE_CELLS), -1, dtype=np.int64)
-    for vote in sorted(votes, key=lambda vote: (vote.end_ns, vote.digest)):
-        states, before = said_by(vote), newest.get(vote.vehicle, silent)
-        assert before.states is not None
-        spoken = (states != NO_VOTE) & (states != CellState.UNDETERMINED)
-        last[spoken] = vote.end_ns
-        odds = folded([before, vote], [~spoken.reshape(-1), spoken.reshape(-1)])
-        newest[vote.vehicle] = replace(silent, states=np.where(spoken, states, before.states), odds=odds)
-    return _summary(list(newest.values()), last, store.clock(), policy.fuse.min_votes)
-
-
-def _summary(votes: Sequence[TileVote], last: I64, now_ns: int, quorum: int) -> U8:
-    counts = np.zeros((N_STATES, TILE_CELLS**2), dtype=np.int64)
-    said = counts[:4].reshape(4, TILE_CELLS, TILE_CELLS)
-    for vote in votes:
-        for state in range(4):
-            said[state] += vote.states == state
-    total = said.sum(axis=0)
-    days = np.clip((now_ns - last) // _DAY_NS, 0, _NEVER_SEEN - 1)
-    out = np.empty((TILE_CELLS, TILE_CELLS, 4), dtype=np.uint8)
-    out[..., 0] = np.minimum(total, 255)
-    out[..., 1] = np.where(last < 0, _NEVER_SEEN, days)
-    out[..., 2] = np.rint(255 * _probability(said, votes, quorum))
-    out[..., 3] = decide_cells(counts, counts, True, 0).reshape(total.shape)
-    return out
-
-
-def _probability(said: I64, vehicles: Sequence[TileVote], quorum: int) -> F64:
-    """(256, 256) probability of each cell's more frequent change. ``said``: vehicles by state (4, 256, 256). 0 where no
-    vehicle votes for a change."""
-    changes = said[CellState.CHANGED_OCCUPIED : CellState.CHANGED_EMPTY + 1]
-    rows, cols = np.nonzero(changes.any(axis=0))
-    kinds = changes[:, rows, cols].argmax(axis=0)
-    votes = changes[kinds, rows, cols]
-    states = (kinds + CellState.CHANGED_OCCUPIED).astype(np.uint8)
-    against = said[:, rows, cols].sum(axis=0) - votes
-    out, claimed = np.zeros(said.shape[1:]), np.full(said.shape[1:], NO_VOTE, dtype=np.uint8)
-    claimed[rows, cols] = states
-    odds = agreed_odds(vehicles, claimed, quorum).at(rows * TILE_CELLS + cols)
-    out[rows, cols] = change_probability(states, votes, against, alike_beside(rows, cols, kinds), odds)
-    return out
