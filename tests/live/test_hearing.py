@@ -131,7 +131,7 @@ def test_two_lidars_are_one_scan_in_the_frame_of_the_first_by_tf_static(monkeypa
     monkeypatch.setenv("CYCLONEDDS_URI", LOOPBACK)
     sender, world = Sender("lidars"), np.random.default_rng(1).uniform((4, 4, 0), (30, 30, 5), (500, 3))
     T = {"left": from_xyz_rpy(1.0, 0.7, 1.9, 0.0, 0.1, 0.4), "right": from_xyz_rpy(1.0, -0.7, 1.9, 0.0, 0.0, -1.2)}
-    sender.begin(("/left", CLOUD), ("/right", CLOUD))
+    sender.begin(("/left", CLOUD), ("/right", CLOUD), (POSES, ODOMETRY))
     sender.send("/tf_static", TF, frames(**T))
     network = Network(sender.domain)
     chosen = choose_topics(network, ["/left", "/right"], None, 60.0, lambda: False)
