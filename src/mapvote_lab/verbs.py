@@ -272,7 +272,7 @@ def demo(
     place = escape(str(out))
     console.print(f"  {place}/report.html: the story with pictures and tables")
     console.print(f"  {place}/map_before.pcd and {place}/map_after.pcd: the maps")
-    console.print(f"  {place}/tables.txt, results.json, results.csv, pictures/")
+    console.print(f"  {place}/tables.txt, results.json, pictures/")
     console.print(f"  {escape(drives_sentence(story, evaluation.scene.folder))}")
     console.print("\n[bold]What to try next[/]")
     text = commands(evaluation, out, story.kept)

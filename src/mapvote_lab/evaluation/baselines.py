@@ -12,7 +12,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -39,6 +39,7 @@ from mapvote_lab.evaluation.experiments.scene import (
     key_of,
     sources_digest,
 )
+from mapvote_lab.evaluation.results import Cost
 from mapvote_lab.evaluation.scores import map_obstacles
 from mapvote_lab.simulation.processes import processes
 
@@ -286,50 +287,33 @@ class NearestNeighbour:
         rows, cols, inside = self._grid.indices_of(points)
         cell = rows * self._grid.cols + cols
         size = self._grid.rows * self._grid.cols
-        counts = [
-            np.bincount(cell[chosen], minlength=size).reshape(self._grid.shape) for chosen in (inside & far, inside)
-        ]
+        near_and_far = (np.bincount(cell[chosen], minlength=size) for chosen in (inside & far, inside))
+        counts = [count.reshape(self._grid.shape) for count in near_and_far]
         return counts[0], counts[1]
-
-
-@dataclass(frozen=True, slots=True)
-class Yardstick:
-    """What one yardstick decided, and its cost on a vehicle."""
-
-    states: U8
-    """Over the truth's window."""
-    vehicle_states: list[U8]
-    cost: dict[str, Any]
-    """ms a scan (median), bytes of its grid."""
 
 
 def yardsticks(
     scene: Scene, drives: Sequence[Pass], workers: int, progress: Progress | None = None
-) -> tuple[dict[str, Yardstick], dict[str, Any]]:
-    """(nearest and evidence, the cost of the paper's own grid on the same scans); passes are cached like ballots."""
+) -> tuple[dict[str, tuple[U8, list[U8]]], dict[str, Cost]]:
+    """(by yardstick the states that it decides and those of each vehicle, over the truth's window; the cost of each
+    method, the paper's own grid first). Passes are cached like ballots."""
     tasks = [
         (scene, drive.vehicle, drive.T_map_lidar) for drive in drives if not _folder(scene, drive.vehicle).exists()
     ]
     if progress:
         progress("yardsticks", 0, len(tasks))
-    if workers > 1 and len(tasks) > 1:
-        with processes(workers) as pool:
-            list(pool.map(_measure, tasks))
-    else:
-        for task in tasks:
-            _measure(task)
+    with processes(workers) if workers > 1 and len(tasks) > 1 else nullcontext() as pool:
+        list(pool.map(_measure, tasks) if pool else map(_measure, tasks))
     folders = [_folder(scene, drive.vehicle) for drive in drives]
     costs = [json.loads((folder / "cost.json").read_text()) for folder in folders]
-    mean = {name: {k: float(np.mean([c[name][k] for c in costs])) for k in costs[0][name]} for name in costs[0]}
+    beams = scene.drive(drives[0].vehicle).sensor.beams
+    mean = {name: Cost(beams, *np.mean([cost[name] for cost in costs], axis=0).tolist()) for name in costs[0]}
     nearest = [np.load(folder / "nearest.npy") for folder in folders]
     votes: I32 = np.sum([one_hot(states) for states in nearest], axis=0, dtype=np.int32)
     reference = reference_window(scene.point_map, scene.truth.grid_on(scene.point_map.lattice))
     maps = [_read_evidence(folder / "evidence.npz", EvidenceMap(reference)) for folder in folders]
-    own = [combine([one], reference) for one in maps]
-    return {
-        "nearest": Yardstick(plurality(votes), nearest, mean["nearest"]),
-        "evidence": Yardstick(combine(maps, reference), own, mean["evidence"]),
-    }, mean["case 5"]
+    evidence = combine(maps, reference), [combine([one], reference) for one in maps]
+    return {"nearest": (plurality(votes), nearest), "evidence": evidence}, mean
 
 
 def _folder(scene: Scene, vehicle: str) -> Path:
@@ -364,13 +348,10 @@ def _measure(task: tuple[Scene, str, F64]) -> None:
     states = nearest.states()
     at_end = (time.thread_time() - start) / max(len(there), 1)
     tally_bytes = len(ballot.tiles) * TILE_CELLS * TILE_CELLS * N_STATES * 4
-    cost = {
-        "case 5": {"ms_per_scan": _median_ms(np.add(stages["see"], stages["vote"])), "memory_bytes": tally_bytes},
-        "nearest": {
-            "ms_per_scan": _median_ms(seconds["nearest"]) + 1000 * at_end,
-            "memory_bytes": nearest.memory_bytes,
-        },
-        "evidence": {"ms_per_scan": _median_ms(seconds["evidence"]), "memory_bytes": evidence.memory_bytes},
+    cost = {  # milliseconds a scan, bytes of its grid
+        "case 5": (_median_ms(np.add(stages["see"], stages["vote"])), tally_bytes),
+        "nearest": (_median_ms(seconds["nearest"]) + 1000 * at_end, nearest.memory_bytes),
+        "evidence": (_median_ms(seconds["evidence"]), evidence.memory_bytes),
     }
     with whole_folder(_folder(scene, name), sign="cost.json") as folder:
         np.save(folder / "nearest.npy", states)

@@ -15,7 +15,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import httpx2
-from msgspec.structs import asdict
 
 from mapvote.client import MapClient
 from mapvote.codec.ballot import Ballot
@@ -34,7 +33,7 @@ from mapvote_lab.evaluation.experiments.localisation_errors import (
 from mapvote_lab.evaluation.experiments.scene import Pass, Progress, Scene, pass_folder, passes
 from mapvote_lab.evaluation.results import CaseResult, Cost, EvaluationResult, Timings
 from mapvote_lab.evaluation.scores import Scores
-from mapvote_lab.evaluation.truths import SIDE_BY_SIDE, CaseOutcome, Jury, Truth, sizes_by_height
+from mapvote_lab.evaluation.truths import SIDE_BY_SIDE, CaseOutcome, Jury, Truth
 
 _STOP_S = 20.0
 
@@ -134,21 +133,17 @@ def evaluate(
     drives = passes(scene, cases, workers, progress, keep=readings is not None)
     voted = time.perf_counter()
     truth, first_map = scene.truth, scene.point_map
-    beams = scene.drive(drives[0].vehicle).sensor.beams
     jury = Jury(first_map, truth)
     best = _best(scene, cases)
     outcomes, entries = _scored(scene, cases, drives, jury, progress)
     T_map_world = T_map_world_of(scene)
     maps = {"old map": (first_map, T_map_world), f"updated map ({best})": (outcomes[best].updated, T_map_world)}
     scored = time.perf_counter()
-    costs = {}
+    costs: dict[str, Cost] = {}
     if with_yardsticks:
         maps["map surveyed anew"] = survey_anew(scene, drives[0].vehicle, progress)
-        measured, costs["case 5"] = yardsticks(scene, drives, workers, progress)
-        for name, yardstick in measured.items():
-            costs[name] = yardstick.cost
-            judgement = jury.of_states(yardstick.states, yardstick.vehicle_states)
-            entries[name] = CaseResult(**asdict(judgement), bytes_per_vehicle=[])
+        measured, costs = yardsticks(scene, drives, workers, progress)
+        entries |= {name: jury.of_states(*states) for name, states in measured.items()}
     result = EvaluationResult(
         scenario=scene.scenario,
         seed=scene.seed,
@@ -160,7 +155,6 @@ def evaluate(
         localisation=localisation(scene, drives),
         changed_areas=in_changed_areas(scene, truth, drives[0].vehicle, maps),
         ceilings=jury.ceilings(),
-        truth_sizes={name: sizes_by_height(jury.truths[name], truth, jury.first_map) for name in SIDE_BY_SIDE},
         cases=entries,
         readings={} if readings is None else _readings(scene, cases, jury, readings, progress),
         timings=Timings(
@@ -168,7 +162,7 @@ def evaluate(
             vote_s=voted - prepared,
             score_s=scored - voted,
             yardsticks_s=time.perf_counter() - scored,
-            methods={name: Cost(beams, cost["ms_per_scan"], cost["memory_bytes"]) for name, cost in costs.items()},
+            methods=costs,
             stages_ms={drive.vehicle: drive.stage_ms for drive in drives},
             fuse_s={name: outcome.seconds for name, outcome in outcomes.items()},
         ),
@@ -202,11 +196,8 @@ def _scored(
         ballots = [drive.ballots[case.name] for drive in drives]
         outcome = fuse_case(scene.point_map, ballots, case.min_votes, scene.settings.fuse, jury.window)
         outcomes[case.name] = outcome
-        entries[case.name] = CaseResult(
-            **asdict(jury.of_update(outcome)),
-            bytes_per_vehicle=[drive.sizes[case.name] for drive in drives],
-            state_bytes_per_vehicle=[_state_bytes(ballot) for ballot in ballots],
-        )
+        sizes = [drive.sizes[case.name] for drive in drives]
+        entries[case.name] = jury.of_update(outcome, sizes, [_state_bytes(ballot) for ballot in ballots])
     if progress:
         progress("scoring", len(cases), len(cases))
     return outcomes, entries

@@ -25,8 +25,9 @@ class PoseErrors(msgspec.Struct, frozen=True, kw_only=True):
     median_deg: float
 
 
-class Judgement(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
-    """How decided cells compare with the truth, and what became of the map."""
+class CaseResult(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """One case of ``evaluate``, or a yardstick: how decided cells compare with the truth, and what became of the
+    map."""
 
     strict: Scores
     """Against all that changed where a survey's or a vehicle's ray could reach."""
@@ -39,12 +40,8 @@ class Judgement(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     """By the further truths of ``evaluation/truths.py``."""
     map: MapScores | None = None
     """None (not in the JSON) where no map was edited: the yardsticks only decide cells."""
-
-
-class CaseResult(Judgement, frozen=True, kw_only=True, omit_defaults=True):
-    """One case of ``evaluate``, or a yardstick, which sends no ballots."""
-
     bytes_per_vehicle: list[int]
+    """Of each ballot; empty for a yardstick, which sends none."""
     state_bytes_per_vehicle: list[int] | None = None
     """Of the votes alone, without new points and other planes."""
 
@@ -102,8 +99,6 @@ class EvaluationResult(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=
     """One vehicle's scans near changes, by map."""
     ceilings: dict[str, Scores]
     """By truth: what perfect labels on every measured point would score in cells."""
-    truth_sizes: dict[str, dict[str, dict[str, int]]]
-    """By truth, class and height of the lowest surface: changed cells."""
     cases: dict[str, CaseResult]
     readings: dict[str, dict[str, dict[str, Scores]]] = {}
     """By reading of the paper, case and truth, if asked for."""

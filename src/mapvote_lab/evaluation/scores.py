@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
-from mapvote.core.grid import TILE_CELLS, Grid, Lattice, TileIndex
+from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Grid, Lattice, TileIndex
 from mapvote.core.point_map import PointMap
 from mapvote.core.types import F64, I64, NO_VOTE, U8, Bool, CellState
 from mapvote.core.voting import VOTE_UNIT
@@ -24,6 +24,8 @@ from mapvote.fusion.loss_budget import alike_beside, change_probability
 
 CLASSES = ("unchanged", "changed_occupied", "changed_empty")
 """The paper's three scored classes; the position is the value in a truth grid."""
+NEIGHBOURS = np.ones((3, 3), dtype=np.bool_)
+"""A cell and the eight around it."""
 UNSCORED = 255
 """In a truth grid: this cell is not counted."""
 
@@ -97,6 +99,22 @@ def score_cells(states: U8, truth: U8) -> Scores:
     return Scores.of(precision, ByClass(*(ratio(right[k], true[k]) for k in range(3))))
 
 
+def cells_with(points: NDArray[np.floating], grid: Grid) -> Bool:
+    """(rows, cols) cells of ``grid`` that hold one of ``points`` (n, 2+), map metres."""
+    rows, cols, inside = grid.indices_of(points)
+    cells = np.zeros(grid.shape, dtype=np.bool_)
+    cells[rows[inside], cols[inside]] = True
+    return cells
+
+
+def pieces(cells: Bool) -> Iterator[tuple[I64, I64]]:
+    """(rows, cols) of the cells of each 8-connected group."""
+    label, _ = ndimage.label(cells, NEIGHBOURS)
+    for number, (rows, cols) in enumerate(ndimage.find_objects(label), 1):
+        r, c = np.nonzero(label[rows, cols] == number)
+        yield r + rows.start, c + cols.start
+
+
 def determined(states: U8) -> Bool:
     """Cells with one of the four states that say something: neither undetermined nor never seen."""
     return (states != CellState.UNDETERMINED) & (states != NO_VOTE)
@@ -116,46 +134,38 @@ class ObjectScores(msgspec.Struct, frozen=True):
 
     found: tuple[bool, ...]
     """Per true object: at least half of its changed truth cells were decided so."""
-    met: tuple[bool, ...]
-    """Per true object: a connected change of ``min_m2`` was decided on its truth cells (all of them, if less)."""
     recall: tuple[float, ...]
     """Per true object: share of its changed truth cells decided so."""
     false_m2: tuple[float, ...]
     """Area of each decided object that touches no truth of its class, largest first."""
 
 
-def score_objects(
-    states: U8, truth: U8, objects: Sequence[Mapping[str, object]], cell_size: float, *, min_m2: float = 1.0
-) -> ObjectScores:
+LEAST_OBJECT_M2 = 1.0
+
+
+def score_objects(states: U8, truth: U8, objects: Sequence[Mapping[str, object]]) -> ObjectScores:
     """``objects`` give ``cells`` (rows, cols) bool over the window and ``kind``: "built" or "demolished".
 
-    A decided object is an 8-connected group of cells of one changed class of at least ``min_m2``; it is false if
+    A decided object is an 8-connected group of cells of one changed class of at least LEAST_OBJECT_M2; it is false if
     no truth cell of its class, nor an unscored one, lies within two cells of it (a wall one cell off is no invention).
     Objects with no truth cell (never reachable by a ray) are not asked for.
     """
     decided = classes_of(states)
-    neighbours = np.ones((3, 3), dtype=np.bool_)
-    recalls, met = [], []
+    recalls = []
     for item in objects:
         kind = 1 if item["kind"] == "built" else 2
         wanted = np.asarray(item["cells"], dtype=np.bool_) & (truth == kind)
         if wanted.any():
-            right = wanted & (decided == kind)
-            recalls.append(ratio(np.count_nonzero(right), np.count_nonzero(wanted)))
-            pieces = np.bincount(ndimage.label(right, structure=neighbours)[0].ravel())[1:]
-            least = min(min_m2, np.count_nonzero(wanted) * cell_size**2)
-            met.append(bool(max(pieces, default=0) * cell_size**2 >= least))
+            recalls.append(ratio(np.count_nonzero(wanted & (decided == kind)), np.count_nonzero(wanted)))
     false = []
     for kind in (1, 2):
-        labels, count = ndimage.label(decided == kind, structure=neighbours)
-        near = ndimage.binary_dilation((truth == kind) | (truth == UNSCORED), structure=neighbours, iterations=2)
-        sizes = np.bincount(labels.ravel(), minlength=count + 1)[1:] * cell_size**2
-        touched = np.bincount(labels[near], minlength=count + 1)[1:] > 0
-        false += [float(size) for size, real in zip(sizes, touched, strict=True) if size >= min_m2 and not real]
+        near = ndimage.binary_dilation((truth == kind) | (truth == UNSCORED), NEIGHBOURS, iterations=2)
+        for cells in pieces(decided == kind):
+            area = len(cells[0]) * CELL_SIZE**2
+            if area >= LEAST_OBJECT_M2 and not near[cells].any():
+                false.append(area)
     found = tuple(share >= 0.5 for share in recalls)
-    return ObjectScores(
-        found, tuple(met), tuple(recalls), tuple(round(area, 2) for area in sorted(false, reverse=True))
-    )
+    return ObjectScores(found, tuple(recalls), tuple(round(area, 2) for area in sorted(false, reverse=True)))
 
 
 class MapScores(msgspec.Struct, frozen=True, kw_only=True):
@@ -163,8 +173,6 @@ class MapScores(msgspec.Struct, frozen=True, kw_only=True):
 
     stale_deleted: float
     """Old map points of removed surfaces that are gone."""
-    stale_apart_deleted: float
-    """The same, of points :data:`APART_M` or more from everything that stands: nearer ones share its voxels' reach."""
     valid_deleted: float
     """Old map points of standing surfaces that are gone: the damage done."""
     new_added: float
@@ -193,7 +201,6 @@ class MapJudge:
         to_kept, to_now = _distance(old_points, cKDTree(kept)), _distance(old_points, self._now)
         self.stale = (to_removed <= reach_m) & (to_removed < to_now)
         self.valid = (to_kept <= reach_m) & (to_kept <= to_removed)
-        self._apart = self.stale & (to_now >= APART_M)
 
     def score(self, new_points: F64) -> MapScores:
         """``new_points`` (n, 3): the obstacle points of the updated map; an old one survives if found bit for bit."""
@@ -201,7 +208,6 @@ class MapJudge:
         reached = _distance(self._added, cKDTree(new_points)) <= self._reach_m
         return MapScores(
             stale_deleted=ratio(np.count_nonzero(self.stale & ~survived), np.count_nonzero(self.stale)),
-            stale_apart_deleted=ratio(np.count_nonzero(self._apart & ~survived), np.count_nonzero(self._apart)),
             valid_deleted=ratio(np.count_nonzero(self.valid & ~survived), np.count_nonzero(self.valid)),
             new_added=ratio(np.count_nonzero(reached), len(self._added)),
             added_false=ratio(np.count_nonzero(_distance(fresh, self._now) > self._reach_m), len(fresh)),
@@ -224,10 +230,6 @@ def same_rows(old: F64, new: F64) -> tuple[Bool, F64]:
     """(which rows of ``old`` are in ``new``, the rows of ``new`` that are not in ``old``), compared bit for bit."""
     a, b = (np.asarray(points, dtype=np.float64) for points in (old, new))
     return found_among(a, b), new[~found_among(b, a)]
-
-
-APART_M = 0.6
-"""Two cells: a hit speaks for mapped voxels up to one cell away, so within two nobody can tell old from new."""
 
 
 def map_obstacles(point_map: PointMap) -> F64:

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from msgspec.structs import replace
 from scipy import ndimage
 
 from mapvote.config import PaperSettings
@@ -25,15 +26,17 @@ from mapvote.core.geometry import inverse
 from mapvote.core.grid import CELL_SIZE, Grid, Lattice, TileIndex
 from mapvote.core.point_map import PointMap
 from mapvote.core.reference import reference_window
-from mapvote.core.types import F32, F64, I32, NO_VOTE, U8, Bool, CellState, MapvoteError, Reference
+from mapvote.core.types import F64, I32, NO_VOTE, U8, Bool, CellState, MapvoteError, Reference
 from mapvote.formats.drives.trajectory import read_poses
 from mapvote.fusion.fuse import Decision
-from mapvote_lab.evaluation.results import Judgement, PoseErrors
+from mapvote_lab.evaluation.results import CaseResult, PoseErrors
 from mapvote_lab.evaluation.scores import (
+    NEIGHBOURS,
     UNSCORED,
     MapJudge,
     MapScores,
     Scores,
+    cells_with,
     determined_share,
     map_obstacles,
     score_cells,
@@ -199,8 +202,7 @@ def _around(truth: Truth, cells: U8) -> tuple[F64, F64, F64]:
     """Surface samples (n, 3) that (stand, came, went); of the standing ones those that can be seen near a change."""
     kept, added, removed = truth.surfaces()
     changed = np.isin(cells, (_OCCUPIED, _EMPTY))
-    rim = np.ones((3, 3), dtype=np.bool_)
-    near = ndimage.binary_dilation(changed | (_count(truth, np.concatenate([added, removed])) > 0), rim)
+    near = ndimage.binary_dilation(changed | (_count(truth, np.concatenate([added, removed])) > 0), NEIGHBOURS)
     beside = near & ~changed  # what a changed cell holds of what stands was hidden, or lies on the ground
     return kept[_at(truth, kept, beside)], added, removed
 
@@ -295,10 +297,8 @@ def known(truth: Truth, first_map: Reference) -> U8:
     out = border(truth, truth.strict)
     undecided = ((out == _OCCUPIED) & ~truth.hit) | ((out == _EMPTY) & ~truth.passed)
     kept, _, removed = truth.surfaces()
-    stood = np.zeros(out.shape, dtype=np.bool_)
-    rows, cols, inside = first_map.grid.indices_of(np.concatenate([kept, removed]))
-    stood[rows[inside], cols[inside]] = True
-    near = ndimage.binary_dilation(stood, np.ones((3, 3)), iterations=round(ON_SURFACE_M / CELL_SIZE))
+    stood = cells_with(np.concatenate([kept, removed]), first_map.grid)
+    near = ndimage.binary_dilation(stood, NEIGHBOURS, iterations=round(ON_SURFACE_M / CELL_SIZE))
     on_nothing = (out == _UNCHANGED) & (first_map.counts > 0) & ~near
     return np.where(undecided | on_nothing, np.uint8(UNSCORED), out)
 
@@ -315,37 +315,7 @@ TRUTHS: Mapping[str, Callable[[Truth, Reference], U8]] = {
 ``first_map`` is the map that is voted on, over the same window (docs/decisions/truth.md)."""
 
 SIDE_BY_SIDE = ("strict", "provenance", "could be known")
-"""Those that differ in what they ask for, whose sizes are told."""
-
-BANDS = ("below 1.5 m", "1.5 to 4 m", "above 4 m", "no sample")
-"""Where the lowest changed surface of a cell lies above the ground; "no sample": the noise-free survey met none."""
-_EDGES_M = (1.5, 4.0)
-
-
-def sizes_by_height(states: U8, truth: Truth, first_map: Reference) -> dict[str, dict[str, int]]:
-    """How many changed cells of a truth's ``states`` (rows, cols) lie in each of BANDS, by class."""
-    _, added, removed = truth.surfaces()
-    return {
-        name: _by_band(states == value, lowest_surface(samples, first_map.grid, first_map.ground_z))
-        for name, value, samples in (("changed_occupied", _OCCUPIED, added), ("changed_empty", _EMPTY, removed))
-    }
-
-
-def lowest_surface(samples: F64, grid: Grid, ground_z: F32) -> F64:
-    """(rows, cols) height of the lowest of ``samples`` (n, 3) above the ground by cell; inf where there is none."""
-    lowest = np.full(grid.shape, np.inf)
-    rows, cols, inside = grid.indices_of(samples)
-    rows, cols = rows[inside], cols[inside]
-    height = samples[inside, 2] - ground_z[rows, cols]
-    known = height >= 0.0
-    np.minimum.at(lowest, (rows[known], cols[known]), height[known])
-    return lowest
-
-
-def _by_band(cells: np.ndarray, lowest: F64) -> dict[str, int]:
-    heights = lowest[cells]
-    band = np.where(np.isinf(heights), len(_EDGES_M) + 1, np.digitize(heights, _EDGES_M))
-    return {name: int(np.count_nonzero(band == k)) for k, name in enumerate(BANDS)}
+"""Those that differ in what they ask for: the readings of the paper are scored by each."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -376,29 +346,28 @@ class Jury:
         """What became of the first map's points."""
         self._objects = [{"kind": o["kind"], "cells": truth.cells_of(o["footprint"])} for o in truth.objects]
 
-    def of_states(self, states: U8, vehicle_states: Sequence[U8]) -> Judgement:
-        """Scores by every truth, coverage, objects; all states over the truth's window."""
-        return self._judge(states, vehicle_states, None)
-
-    def of_update(self, outcome: CaseOutcome) -> Judgement:
-        """The same, and what became of the map's points."""
-        points = self.points.score(map_obstacles(outcome.updated))
-        return self._judge(outcome.states, outcome.vehicle_states, points)
-
-    def ceilings(self) -> dict[str, Scores]:
-        """By truth: what perfect labels on every measured point would score (evaluation/truths.py)."""
-        return {name: ceiling(self.truth, cells) for name, cells in self.truths.items()}
-
-    def _judge(self, states: U8, vehicle_states: Sequence[U8], points: MapScores | None) -> Judgement:
+    def of_states(self, states: U8, vehicle_states: Sequence[U8], points: MapScores | None = None) -> CaseResult:
+        """Scores by every truth, coverage, objects; all states over the truth's window. No ballot was sent."""
         scores = {name: score_cells(states, cells) for name, cells in self.truths.items()}
-        return Judgement(
+        return CaseResult(
             strict=scores.pop("strict"),
             provenance=scores.pop("provenance"),
             also=scores,
             coverage=determined_share(vehicle_states, self.truths["strict"]),
-            objects=score_objects(states, self.truths["strict"], self._objects, CELL_SIZE),
+            objects=score_objects(states, self.truths["strict"], self._objects),
             map=points,
+            bytes_per_vehicle=[],
         )
+
+    def of_update(self, outcome: CaseOutcome, sizes: list[int], state_sizes: list[int]) -> CaseResult:
+        """The same, what became of the map's points, and the bytes of each ballot and of its votes alone."""
+        points = self.points.score(map_obstacles(outcome.updated))
+        judged = self.of_states(outcome.states, outcome.vehicle_states, points)
+        return replace(judged, bytes_per_vehicle=sizes, state_bytes_per_vehicle=state_sizes)
+
+    def ceilings(self) -> dict[str, Scores]:
+        """By truth: what perfect labels on every measured point would score (evaluation/truths.py)."""
+        return {name: ceiling(self.truth, cells) for name, cells in self.truths.items()}
 
 
 def _above_ground(reference: Reference, truth: Truth) -> tuple[F64, F64, F64]:

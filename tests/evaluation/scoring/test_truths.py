@@ -9,18 +9,9 @@ import numpy as np
 import pytest
 
 from mapvote.core.grid import CELL_SIZE, Grid, Lattice
-from mapvote.core.types import F64, Reference
+from mapvote.core.types import Reference
 from mapvote_lab.evaluation.scores import UNSCORED
-from mapvote_lab.evaluation.truths import (
-    BANDS,
-    BORDER_M,
-    TRUTHS,
-    Truth,
-    border,
-    ceiling,
-    lowest_surface,
-    sizes_by_height,
-)
+from mapvote_lab.evaluation.truths import BORDER_M, TRUTHS, Truth, border, ceiling
 
 KEPT, ADDED, REMOVED = range(3)
 
@@ -132,12 +123,3 @@ def test_a_cell_that_no_ray_decided_or_where_the_map_holds_a_point_on_nothing_is
 def test_what_could_be_known_is_never_more_than_what_left_points(truth: Truth, first_map: Reference) -> None:
     known, whole = TRUTHS["could be known"](truth, first_map), TRUTHS["provenance"](truth, first_map)
     assert np.all((known == whole) | (known == UNSCORED))
-
-
-def test_changed_cells_are_counted_by_the_height_of_their_lowest_surface(truth: Truth, first_map: Reference) -> None:
-    sizes = sizes_by_height(truth.strict, truth, first_map)
-    assert sizes["changed_occupied"] == dict(zip(BANDS, (1, 0, 1, 0), strict=True))
-    assert sizes["changed_empty"] == dict(zip(BANDS, (0, 1, 0, 1), strict=True))
-    heights: F64 = lowest_surface(truth.surfaces()[1], GRID, first_map.ground_z)
-    assert heights[0, 1] == 1.0
-    assert np.isinf(heights[0, 0])

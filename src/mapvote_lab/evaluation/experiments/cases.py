@@ -13,8 +13,8 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import reduce
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -110,24 +110,15 @@ def fuse_case(
 
 def ballot_states(ballot: Ballot, point_map: PointMap) -> tuple[U8, Grid]:
     """What the vehicle itself decided, (rows, cols) over the window of its tiles, two-stage or one-stage."""
-    tiles = {tile.tile: tile for tile in ballot.tiles}
-    grids = [point_map.lattice.tile(index) for index in tiles]
-    window = grids[0]
-    for grid in grids[1:]:
-        window = window.union(grid)
+    window = reduce(Grid.union, (point_map.lattice.tile(tile.tile) for tile in ballot.tiles))
     out = np.full(window.shape, NO_VOTE, dtype=np.uint8)
-    for grid, states in zip(grids, _decided(tiles.values()), strict=True):
-        out[grid.slices_in(window)] = states
+    for tile in ballot.tiles:
+        if tile.states is not None:
+            states = unpack_states(tile.states)
+        else:
+            states = plurality(unpack_tally(tile.tally or b"").astype(np.int32))
+        out[point_map.lattice.tile(tile.tile).slices_in(window)] = states
     return out, window
-
-
-def _decided(tiles: Any) -> Iterator[U8]:
-    for tile in tiles:
-        yield (
-            unpack_states(tile.states)
-            if tile.states is not None
-            else plurality(unpack_tally(tile.tally).astype(np.int32))
-        )
 
 
 _FAST = 1

@@ -34,7 +34,7 @@ from mapvote_lab.evaluation.experiments.real_street import (
     unedited,
     vote_on,
 )
-from mapvote_lab.evaluation.scores import determined, ratio
+from mapvote_lab.evaluation.scores import NEIGHBOURS, determined, ratio
 
 NEAR_CELLS = 5
 """1.5 m: precision is counted this close to the things, because over a street it depends on their number."""
@@ -181,7 +181,7 @@ def score(asked: Sequence[Asked], states: U8) -> list[FoundThings]:
         these = [a for a in asked if a.kind == kind and a.cells.any()]
         right = [np.count_nonzero((states == a.state) & a.cells) for a in these]
         size = [np.count_nonzero(a.cells) for a in these]
-        near = [ndimage.binary_dilation(a.cells, np.ones((3, 3))) & (states == a.state) for a in these]
+        near = [ndimage.binary_dilation(a.cells, NEIGHBOURS) & (states == a.state) for a in these]
         half = sum(bool(2 * r >= n) for r, n in zip(right, size, strict=True))
         touched = sum(bool(n.any()) for n in near)
         rays = float(np.median([a.rays for a in these] or [0]))
@@ -193,8 +193,8 @@ def precision_near(asked: Sequence[Asked], states: U8, grid: Grid) -> float:
     """Share of the cells decided changed within 1.5 m of the things that are, or lie next to, cells so changed."""
     near, right = np.zeros(grid.shape, dtype=np.bool_), np.zeros(grid.shape, dtype=np.bool_)
     for a in asked:
-        near |= ndimage.binary_dilation(a.cells, np.ones((3, 3)), iterations=NEAR_CELLS)
-        right |= ndimage.binary_dilation(a.cells, np.ones((3, 3))) & (states == a.state)
+        near |= ndimage.binary_dilation(a.cells, NEIGHBOURS, iterations=NEAR_CELLS)
+        right |= ndimage.binary_dilation(a.cells, NEIGHBOURS) & (states == a.state)
     return ratio(np.count_nonzero(right), np.count_nonzero(is_changed(states) & near))
 
 

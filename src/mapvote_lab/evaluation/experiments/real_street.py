@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import reduce
 from pathlib import Path
 
 import numpy as np
@@ -31,7 +32,7 @@ from mapvote.perception.raycast import find_obstacles
 from mapvote.slam.build import BuildReport, build_map
 from mapvote_lab.evaluation.experiments.cases import Case, fuse_case
 from mapvote_lab.evaluation.experiments.scene import SharedPass
-from mapvote_lab.evaluation.scores import determined, ratio
+from mapvote_lab.evaluation.scores import NEIGHBOURS, cells_with, determined, pieces, ratio
 from mapvote_lab.evaluation.truths import pose_errors, rigid_between
 
 VEHICLES = 3
@@ -196,7 +197,7 @@ def vote_on(street: Street, cases: Sequence[Case], *, edit: Edit = unedited, fir
         if drive.T_map_lidar_prior is not None:
             prior_metres.append(pose_errors(drive.T_map_lidar_prior, T_true)[0])
     states = {case.name: _decided(street, ballots[case.name], case) for case in cases}
-    near_movers = ndimage.binary_dilation(movers, np.ones((3, 3)))
+    near_movers = ndimage.binary_dilation(movers, NEIGHBOURS)
     off_m, off_deg, prior_m = (np.concatenate([np.zeros(0), *parts]) for parts in (metres, degrees, prior_metres))
     total = sum(report.scans for report in reports)
     return RealRun(street, states, near_movers, reports, off_m, off_deg, prior_m, total)
@@ -226,8 +227,7 @@ def _moving_cells(survey: Drive, T_map_lidar: F64, point_map: PointMap, grid: Gr
 def _note_movers(observations: list[Observation], grid: Grid, cells: Bool) -> None:
     """Mark the ``cells`` (rows, cols of ``grid``) in which the filter found moving points."""
     for seen in observations:
-        rows, cols, inside = grid.indices_of(seen.scan.points_map[seen.moving])
-        cells[rows[inside], cols[inside]] = True
+        cells |= cells_with(seen.scan.points_map[seen.moving], grid)
 
 
 def met_cells(street: Street, edit: Edit = unedited) -> Bool:
@@ -238,18 +238,13 @@ def met_cells(street: Street, edit: Edit = unedited) -> Bool:
     for i in np.concatenate(street.voting).tolist():
         T = street.T_map_lidar[i]
         points = transform(T, recording.read_scan(i).points)
-        rows, cols, inside = street.grid.indices_of(points[find_obstacles(points, around.at(T[:3, 3])[0])[0]])
-        met[rows[inside], cols[inside]] = True
+        met |= cells_with(points[find_obstacles(points, around.at(T[:3, 3])[0])[0]], street.grid)
     return met
 
 
 def _window(point_map: PointMap, reference: F64) -> Grid:
     """The window around the whole drive in which cells are counted: 40 m to every side, as a vehicle sees."""
-    ends = [window_around(point_map.lattice, T[0, 3], T[1, 3], 80.0) for T in reference]
-    window = ends[0]
-    for end in ends[1:]:
-        window = window.union(end)
-    return window
+    return reduce(Grid.union, (window_around(point_map.lattice, T[0, 3], T[1, 3], 80.0) for T in reference))
 
 
 @dataclass(frozen=True, slots=True)
@@ -268,9 +263,7 @@ def largest_false_changes(run: RealRun, case: str, most: int = 10) -> list[False
     out = []
     x, y = run.street.grid.centres()
     for state in (CellState.CHANGED_OCCUPIED, CellState.CHANGED_EMPTY):
-        label, count = ndimage.label(run.states[case] == state, structure=np.ones((3, 3)))
-        for k in range(1, count + 1):
-            rows, cols = np.nonzero(label == k)
+        for rows, cols in pieces(run.states[case] == state):
             out.append(
                 FalseChange(
                     state.name.lower(), round(float(x[cols].mean()), 1), round(float(y[rows].mean()), 1),

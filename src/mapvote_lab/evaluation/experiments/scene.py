@@ -28,7 +28,7 @@ import numpy as np
 import mapvote
 import mapvote_lab
 from mapvote.codec.ballot import Ballot, decode, encode
-from mapvote.config import PaperSettings, Settings, VotingSettings
+from mapvote.config import Settings
 from mapvote.core.columns import GROUND_MARGIN_M
 from mapvote.core.point_map import PointMap
 from mapvote.core.process_memory import give_back_free_pages
@@ -46,7 +46,7 @@ from mapvote.perception.frontend import DriveReport, Frontend, Movers, Observati
 from mapvote.perception.moving_objects import MovingFilter
 from mapvote.slam.build import build_map
 from mapvote.vehicle import make_voter, write_ballot
-from mapvote_lab.evaluation.experiments.cases import Case, Keeper
+from mapvote_lab.evaluation.experiments.cases import Case, Keeper, Rule, counting_rule
 from mapvote_lab.evaluation.experiments.conditions import Conditions, Shaken, TrueMovers, with_true_ground
 from mapvote_lab.evaluation.truths import Truth, read_truth
 from mapvote_lab.simulation import simulate
@@ -188,7 +188,7 @@ class SharedPass:
             LocalMap(point_map, settings.voting.window_m),
             sensor=drive.sensor,
         )
-        self._voters: dict[tuple[VotingSettings, PaperSettings], Voter] = {}
+        self._voters: dict[Rule, Voter] = {}
         self._observing: list[tuple[str, Voter]] = []
         """The same voters, each with its method."""
         for case in cases:
@@ -199,7 +199,7 @@ class SharedPass:
         }
 
     def _enrol(self, case: Case) -> None:
-        key = _counts_as(case)
+        key = counting_rule(case)
         if key in self._voters:
             return
         settings = self.settings.model_copy(update=dict(zip(("voting", "paper"), key, strict=True)))
@@ -234,13 +234,8 @@ class SharedPass:
         settings = self.settings.model_copy(update={"voting": case.voting, "paper": case.paper})
         return write_ballot(
             self.drive.vehicle, self.drive.drive_id, self.point_map, settings, self.report,
-            self._voters[_counts_as(case)], self._new_points[case.voting.method],
+            self._voters[counting_rule(case)], self._new_points[case.voting.method],
         )  # fmt: skip
-
-
-def _counts_as(case: Case) -> tuple[VotingSettings, PaperSettings]:
-    """Voters that differ only in who decides (one stage or two) count alike."""
-    return case.voting.model_copy(update={"two_stage": True}), case.paper
 
 
 @dataclass(frozen=True, slots=True)

@@ -22,7 +22,7 @@ from mapvote.core.grid import CELL_SIZE, Grid
 from mapvote.core.types import F32, F64, I64, U8, Bool, CellState
 from mapvote.core.voting import vote_weight
 from mapvote_lab.evaluation.results import CaseResult
-from mapvote_lab.evaluation.scores import PAPER_F1, Reliability
+from mapvote_lab.evaluation.scores import NEIGHBOURS, PAPER_F1, Reliability, cells_with
 
 WIDTH, HEIGHT = 1400, 800
 
@@ -161,7 +161,7 @@ def _from_above(points: F64, height: F64, grid: Grid) -> np.ndarray:
 
 def _thicken(cells: Bool) -> Bool:
     """A cell of a long street is finer than a pixel: a change is drawn one cell wider there, so that it is not lost."""
-    return ndimage.binary_dilation(cells, structure=np.ones((3, 3))) if cells.shape[1] > 900 else cells
+    return ndimage.binary_dilation(cells, NEIGHBOURS) if cells.shape[1] > 900 else cells
 
 
 def _panel(axis: Any, image: np.ndarray, grid: Grid, title: str, **how: Any) -> None:
@@ -210,10 +210,7 @@ def street(
         (axes[1], updated, added, style.NEW, "(b) Updated map, added points in red"),
     ):
         image = _from_above(points, height, grid)
-        rows, cols, inside = grid.indices_of(marked)
-        cells = np.zeros(grid.shape, dtype=np.bool_)
-        cells[rows[inside], cols[inside]] = True
-        image[_thicken(cells)] = to_rgb(colour)
+        image[_thicken(cells_with(marked, grid))] = to_rgb(colour)
         _panel(axis, image, grid, title)
         _outline(axis, outlines)
         for name, box in areas:

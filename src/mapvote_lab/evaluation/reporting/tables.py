@@ -1,18 +1,16 @@
-"""The results of one evaluation as tables, text, JSON and CSV; how a table looks on a terminal, in Markdown and in
+"""The results of one evaluation as tables, text and JSON; how a table looks on a terminal, in Markdown and in
 HTML; and report.html, a page that needs nothing else (pictures inlined, no script, no request).
 """
 
 from __future__ import annotations
 
 import base64
-import csv
 import io
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
 
-from msgspec.structs import asdict
 from rich import box
 from rich.console import Console
 from rich.table import Table
@@ -21,7 +19,6 @@ from rich.text import Text
 from mapvote.formats.atomic import whole_file
 from mapvote_lab.evaluation.results import CaseResult, EvaluationResult, to_json
 from mapvote_lab.evaluation.scores import CLASSES, PAPER_F1, PAPER_PRECISION, PAPER_RECALL, ByClass, Scores, ratio
-from mapvote_lab.evaluation.truths import BANDS
 
 
 @dataclass(frozen=True, slots=True)
@@ -173,7 +170,6 @@ def tables(result: EvaluationResult) -> Iterator[Sheet]:
         yield _class_table(f"Table II: precision ({truth} truth)", precision, PAPER_PRECISION)
         yield _class_table(f"Table III: recall ({truth} truth)", recall, PAPER_RECALL)
     yield _f1_table(result)
-    yield _truth_sizes(result)
     if result.readings:
         for truth in next(iter(next(iter(result.readings.values())).values())):
             yield readings_table(result.readings, truth, result.settings["paper"]["occluded"])
@@ -200,15 +196,6 @@ def _f1_table(result: EvaluationResult) -> Sheet:
     rows.append(["perfect labels", *perfect, "", "", "", ""])
     headings = ["", *result.ceilings, "paper", "Kim's F1, strict", "coverage", "kB a ballot"]
     return Sheet("Table IV: F1, mean of the three classes; coverage; upload", headings, rows, faint="paper")
-
-
-def _truth_sizes(result: EvaluationResult) -> Sheet:
-    rows = []
-    for truth, by_class in result.truth_sizes.items():
-        for name, bands in by_class.items():
-            counts = [sum(bands.values()), *(bands[band] for band in BANDS)]
-            rows.append([f"{truth}, {name.replace('_', ' ')}", *(f"{n:,}" for n in counts)])
-    return Sheet("The truths: changed cells by the height of their lowest surface", ["", "all", *BANDS], rows)
 
 
 def readings_table(readings: Mapping[str, Mapping[str, Mapping[str, Scores]]], truth: str, occluded: str) -> Sheet:
@@ -289,26 +276,6 @@ def as_text(result: EvaluationResult) -> str:
 def result_json(result: EvaluationResult) -> str:
     """The result with sorted keys; ValueError if a number is NaN or infinite."""
     return to_json(result, sort_keys=True)
-
-
-def result_csv(result: EvaluationResult) -> str:
-    """One line a number: case, truth, metric, class, value."""
-    out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
-    writer.writerow(["case", "truth", "metric", "class", "value"])
-    for case, entry in result.cases.items():
-        for truth, scores in _by_truth(entry).items():
-            for metric, values in (("precision", scores.precision), ("recall", scores.recall), ("f1", scores.f1)):
-                for name, value in zip(CLASSES, values, strict=True):
-                    writer.writerow([case, truth, metric, name, f"{value:.6f}"])
-            for metric, value in (("macro_f1", scores.macro_f1), ("kim_f1", scores.kim_f1)):
-                writer.writerow([case, truth, metric, "", f"{value:.6f}"])
-        writer.writerow([case, "", "coverage", "", f"{entry.coverage:.6f}"])
-        for size in entry.bytes_per_vehicle:
-            writer.writerow([case, "", "bytes", "", size])
-        for metric, value in asdict(entry.map).items() if entry.map else ():
-            writer.writerow([case, "", metric, "", value])
-    return out.getvalue()
 
 
 def write_text(text: str, path: Path) -> None:
