@@ -7,19 +7,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from mapvote.cli.options import DRIVE
 from mapvote.cli.terminal import print_table, waiting
 
 if TYPE_CHECKING:
     from mapvote.codec.ballot import Ballot
     from mapvote.config import Settings
     from mapvote.core.point_map import PointMap
-
-
-def register(app: typer.Typer) -> None:
-    """Add these verbs to ``app``."""
-    app.command(rich_help_panel=DRIVE)(diff)
-    app.command(rich_help_panel=DRIVE)(merge)
 
 
 def diff(

@@ -1,20 +1,21 @@
-"""How a verb reaches a map: a file, a STORE (a database), or the URL of a server.
+"""How a verb reaches drives, and a map: a file, a STORE (a database), or the URL of a server.
 
-A STORE is opened in this process behind the same HTTP API as a server: a verb is written once.
+A STORE is opened in this process behind the same HTTP API as a server: a verb is written once. Drives and maps of files
+are checked by the doctor's cheap checks: an error stops the verb, warnings go to stderr.
 """
 
 from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from mapvote.cli.looks import sound_map
-from mapvote.cli.terminal import complain
+from mapvote.cli.terminal import complain, progress
+from mapvote.core.types import MapvoteError
 
 if TYPE_CHECKING:
     from mapvote.client import MapClient
@@ -22,6 +23,10 @@ if TYPE_CHECKING:
     from mapvote.client.map_client import Region
     from mapvote.config import Settings
     from mapvote.core.point_map import PointMap
+    from mapvote.core.types import Drive
+    from mapvote.doctor.finding import Finding
+    from mapvote.doctor.scans import LookedAt
+    from mapvote.formats.maps.tiling import Look
     from mapvote.server.store.store import Store
 
 _SQLITE = b"SQLite format 3\0"
@@ -45,8 +50,6 @@ def is_store(name: str) -> bool:
 
 def key_in(key_file: Path | None) -> str | None:
     """The key in a file, or in $MAPVOTE_KEY: everybody on the machine can read a command line."""
-    from mapvote.core.types import MapvoteError
-
     if key_file is None:
         return os.environ.get("MAPVOTE_KEY") or None
     try:
@@ -130,7 +133,6 @@ def map_at(
     touch it. ``or_kept``: if the server does not answer, the map that was fetched last, with a warning.
     """
     from mapvote.client import Unreachable
-    from mapvote.core.types import MapvoteError
 
     if is_url(name):
         with client_of(name, key_in(key_file)) as client:
@@ -156,8 +158,6 @@ def map_at(
 
 def region_in(text: str) -> Region:
     """X0,Y0,X1,Y1 in map metres; MapvoteError if it is none."""
-    from mapvote.core.types import MapvoteError
-
     try:
         x0, y0, x1, y1 = map(float, text.split(","))
     except ValueError:
@@ -172,7 +172,6 @@ def store_url(name: str) -> str:
     from sqlalchemy.engine import make_url
     from sqlalchemy.exc import ArgumentError
 
-    from mapvote.core.types import MapvoteError
     from mapvote.server.store.store import url_of
 
     given = os.environ.get("MAPVOTE_STORE", "") if name == "-" else name
@@ -217,3 +216,53 @@ def when(stamp_ns: int) -> str:
     from datetime import UTC, datetime
 
     return datetime.fromtimestamp(stamp_ns // 10**9, UTC).strftime("%Y-%m-%d %H:%M:%SZ")
+
+
+@contextmanager
+def usable_drives(drives: Sequence[Drive]) -> Iterator[list[Drive]]:
+    """The drives, checked while they are read; nothing may be written before this ends.
+
+    MapvoteError for one that cannot be used so: at once if some of its scans show it, else at the end. Whatever else
+    stops the work, what is wrong with a drive is told rather than what came of it.
+    """
+    from mapvote.doctor.scans import LookedAt
+
+    watching = []
+    for drive in drives:
+        with progress(f"looking at {drive.path}") as tell:
+            watching.append(LookedAt(drive, tell))
+    try:
+        yield [one.drive for one in watching]
+    except MapvoteError:
+        _warnings_of(watching)
+        raise
+    for path, found in _warnings_of(watching):
+        _warn(path, found)
+
+
+def _warnings_of(watching: list[LookedAt]) -> list[tuple[str, list[Finding]]]:
+    found = []
+    for one in watching:
+        with progress(f"looking at {one.drive.path}") as tell:
+            found.append((str(one.drive.path), one.warnings(tell)))
+    return found
+
+
+def sound_map(path: Path | str) -> PointMap:
+    """A map in any file format; MapvoteError for one that cannot be used so."""
+    from mapvote.formats import read_map
+
+    return read_map(path, look_at_points(str(path)))
+
+
+def look_at_points(path: str) -> Look:
+    """The check of a map's points before the ground is computed: MapvoteError if they cannot be used."""
+    from mapvote.doctor.finding import usable
+    from mapvote.doctor.maps import check_cloud
+
+    return lambda pieces: _warn(path, usable(path, check_cloud(pieces)))
+
+
+def _warn(path: str, found: list[Finding]) -> None:
+    for finding in found:
+        print(f"warning: {path}: {finding.what}", file=sys.stderr)

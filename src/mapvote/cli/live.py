@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from mapvote.cli.door import client_of, is_url, key_in, map_at
-from mapvote.cli.options import DRIVE, Config, KeyFile, Projector
+from mapvote.cli.options import Config, KeyFile, Projector
 
 if TYPE_CHECKING:
     from mapvote.live.drive import LiveDrive, Maps
@@ -22,12 +22,6 @@ if TYPE_CHECKING:
 Domain = Annotated[
     int | None, typer.Option(min=0, max=232, metavar="N", help="DDS domain; default: $ROS_DOMAIN_ID, else 0")
 ]
-
-
-def register(app: typer.Typer) -> None:
-    """Add the verbs to ``app``."""
-    for verb in (topics, play, drive, autoware):
-        app.command(rich_help_panel=DRIVE)(verb)
 
 
 def topics(

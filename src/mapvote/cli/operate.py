@@ -9,21 +9,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from mapvote.cli.door import api_at, is_url, store_url, when, who
-from mapvote.cli.looks import sound_map
-from mapvote.cli.options import SERVER, Config, KeyFile, Reason, StoreName, StoreOrUrl
+from mapvote.cli.door import api_at, is_url, sound_map, store_url, when, who
+from mapvote.cli.options import Config, KeyFile, Reason, StoreName, StoreOrUrl
 from mapvote.cli.terminal import print_table, waiting
+from mapvote.core.types import MapvoteError
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor
 
     from mapvote.client.connection import Connection
-
-
-def register(app: typer.Typer) -> None:
-    """Add these verbs to ``app``."""
-    for verb in (serve, publish, policy, log, explain, rollback, unvote, check, gc, keys):
-        app.command(rich_help_panel=SERVER)(verb)
 
 
 def serve(
@@ -39,7 +33,8 @@ def serve(
 ) -> None:
     """Serve a store to vehicles and operators until stopped. The first operator key of a new store is shown once.
 
-    Stop the server and make a backup before --upgrade.
+    Only this verb needs the STORE itself; all others take the URL that it prints as well. Stop the server and make a
+    backup before --upgrade.
 
         mapvote serve fleet.db --map my_map
     """
@@ -86,8 +81,6 @@ def _of_policy(sources: Mapping[str, str]) -> list[str]:
 
 
 def _refuse_policy(sources: Mapping[str, str]) -> None:
-    from mapvote.core.types import MapvoteError
-
     for name in _of_policy(sources):
         mend = "leave the setting out; `mapvote policy STORE` shows and changes the policy"
         raise MapvoteError(f"{sources[name]}: {name} has no effect, because an existing store has its policy: {mend}")
@@ -104,12 +97,13 @@ def publish(
     config: Config = None,
     key_file: KeyFile = None,
 ) -> None:
-    """Fuse the standing ballots and publish the next version. Only a STORE takes --cluster and --config.
+    """Fuse the standing ballots and publish the next version.
+
+    Only a STORE takes --cluster and --config: a server fuses by its own.
 
     mapvote publish fleet.db --dry-run
     """
     from mapvote.config import load_with_sources
-    from mapvote.core.types import MapvoteError
 
     settings = None
     if not is_url(store):
@@ -139,8 +133,6 @@ def _print_outcome(answer: Mapping[str, Any], otherwise: str) -> None:
 @contextmanager
 def dask_cluster(address: str) -> Iterator[Executor]:
     """An executor on a Dask cluster. MapvoteError if Dask is not installed or no scheduler answers."""
-    from mapvote.core.types import MapvoteError
-
     try:
         from dask.distributed import Client
     except ImportError as error:
@@ -163,8 +155,6 @@ def policy(
 
     mapvote policy fleet.db fuse.min_votes=3 --reason "more vehicles now"
     """
-    from mapvote.core.types import MapvoteError
-
     pairs = [value.partition("=") for value in values or ()]
     if any(not equals for _, equals, _ in pairs):
         raise MapvoteError("policy: give KEY=VALUE, e.g. fuse.min_votes=3; without values the policy is shown")
@@ -290,6 +280,42 @@ def explain(
         print(f"    {before}; {now}")
 
 
+def coverage(
+    store: StoreOrUrl,
+    out: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="also write all stretches of road as GeoJSON")
+    ] = None,
+    most: Annotated[int, typer.Option(metavar="N", min=1, help="largest number of rows")] = 20,
+    key_file: KeyFile = None,
+) -> None:
+    """List the roads where one more pass would decide cells, by tile and direction, most cells first.
+
+    A cell counts if one more vehicle with the same vote as an earlier one would decide it.
+
+    mapvote coverage fleet.db --out drive_next.geojson
+    """
+    import json
+
+    from mapvote.formats.atomic import whole_file
+
+    with api_at(store, key_file) as server:
+        found = server.ask_json("GET", "/v1/coverage/passes")
+    rows = []
+    for feature in found["features"][:most]:
+        about, line = feature["properties"], feature["geometry"]["coordinates"]
+        ends = [f"({x:.0f}, {y:.0f})" for x, y in (line[0], line[-1])]
+        counts = (str(about[what]) for what in ("cells", "built", "gone"))
+        rows.append((f"{about['row']},{about['col']}", f"{about['heading_deg']}°", *ends, *counts))
+    if rows:
+        print_table(("tile", "heading", "from (x, y), m", "to", "cells", "built", "gone"), rows, "One more pass")
+    else:
+        print("no cell waits for one more pass")
+    if out is not None:
+        with whole_file(out) as partial:
+            partial.write_text(json.dumps(found) + "\n")
+        print(f"{out}: {len(found['features'])} stretches of road")
+
+
 def rollback(
     store: StoreOrUrl,
     to: Annotated[int, typer.Argument(metavar="VERSION", help="the version to return to")],
@@ -328,8 +354,6 @@ def unvote(
     """
     from urllib.parse import quote
 
-    from mapvote.core.types import MapvoteError
-
     if (vehicle is None) != everybody:
         raise MapvoteError("unvote: name one VEHICLE, or give --all")
     if drive is not None and everybody:
@@ -361,8 +385,6 @@ def check(
 
     mapvote check fleet.db --mend --from backup.db
     """
-    from mapvote.core.types import MapvoteError
-
     if other is not None and not mend:
         raise MapvoteError("check: --from replaces damaged parts: give --mend too")
     with api_at(store, key_file) as server, waiting("reading every byte"):
@@ -433,8 +455,6 @@ def keys(
 
     mapvote keys fleet.db issue car_1
     """
-    from mapvote.core.types import MapvoteError
-
     if action not in ("list", "issue", "rotate", "revoke") or (action != "list" and name is None):
         raise MapvoteError("keys: give list, issue NAME, rotate NAME or revoke NAME")
     with api_at(store, key_file) as server:

@@ -6,14 +6,8 @@ from typing import Annotated
 
 import typer
 
-from mapvote.cli.options import SETUP, Config
+from mapvote.cli.options import Config
 from mapvote.cli.terminal import show_table
-
-
-def register(app: typer.Typer) -> None:
-    """Add these verbs to ``app``."""
-    app.command(rich_help_panel=SETUP)(config)
-    app.command(rich_help_panel=SETUP)(warmup)
 
 
 def warmup() -> None:

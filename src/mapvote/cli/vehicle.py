@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from mapvote.cli.door import client_of, key_in, map_at, region_in
-from mapvote.cli.looks import usable_drives
-from mapvote.cli.options import DRIVE, Config, DrivePath, KeyFile, with_drive_options
+from mapvote.cli.door import client_of, key_in, map_at, region_in, usable_drives
+from mapvote.cli.options import Config, DrivePath, KeyFile, with_drive_options
 from mapvote.cli.terminal import progress, waiting
+from mapvote.core.types import MapvoteError
 
 if TYPE_CHECKING:
     from mapvote.codec.ballot import Ballot
@@ -23,12 +23,7 @@ if TYPE_CHECKING:
     from mapvote.slam.build import BuildReport
 
 
-def register(app: typer.Typer) -> None:
-    """Add these verbs to ``app``."""
-    app.command(rich_help_panel=DRIVE)(with_drive_options(build))
-    app.command(rich_help_panel=DRIVE)(with_drive_options(vote))
-
-
+@with_drive_options
 def build(
     drives: Annotated[list[Path], typer.Argument(metavar="DRIVE...", help="one or more drives of the same place")],
     out: Annotated[Path, typer.Option(metavar="MAP", help="the map to write; a folder that does not exist yet")],
@@ -113,6 +108,7 @@ def _frame(report: BuildReport) -> str:
     return f"{start}; {bent}; positions are good to {sigma_m:.2f} m (1 sigma)"
 
 
+@with_drive_options
 def vote(
     drive_path: DrivePath,
     where: Annotated[str, typer.Option("--map", metavar="MAP|URL", help="a map in any format, or the URL of a server")],
@@ -159,7 +155,6 @@ def vote(
     from mapvote.codec.ballot import encode
     from mapvote.config import choose_case, load_settings
     from mapvote.core.point_map import has_open_ground
-    from mapvote.core.types import MapvoteError
     from mapvote.formats import is_cloud, open_drive
     from mapvote.formats.atomic import whole_file
     from mapvote.formats.geo.projector import frame_of
@@ -198,7 +193,6 @@ def vote(
 def _drive_once(
     drive: Drive, point_map: PointMap, settings: Settings, trust_prior: bool
 ) -> tuple[Ballot, DriveReport | None]:
-    from mapvote.core.types import MapvoteError
     from mapvote.localisation.localiser import GivenPoses
     from mapvote.vehicle import vote_drive
 
