@@ -8,6 +8,7 @@ from __future__ import annotations
 import ast
 from collections import defaultdict
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
@@ -33,8 +34,13 @@ def lines(source: Path) -> int:
     return len(source.read_text().splitlines())
 
 
+@cache
+def parsed(source: Path) -> ast.Module:
+    return ast.parse(source.read_text())
+
+
 def functions(source: Path) -> Iterator[Function]:
-    for node in ast.walk(ast.parse(source.read_text())):
+    for node in ast.walk(parsed(source)):
         if isinstance(node, Function):
             yield node
 
@@ -65,7 +71,7 @@ def public_names(sources: list[Path]) -> dict[str, set[str]]:
     """Functions and classes that others may import, and where each is defined."""
     found: dict[str, set[str]] = defaultdict(set)
     for source in sources:
-        for node in ast.parse(source.read_text()).body:
+        for node in parsed(source).body:
             if isinstance(node, Function | ast.ClassDef) and not node.name.startswith("_"):
                 found[node.name].add(str(source.relative_to(ROOT)))
     return found
@@ -90,7 +96,7 @@ def imports(sources: list[Path], root: Path) -> dict[str, set[str]]:
     graph: dict[str, set[str]] = {}
     for name, source in modules.items():
         named: set[str] = set()
-        for node in ast.walk(ast.parse(source.read_text())):
+        for node in ast.walk(parsed(source)):
             if isinstance(node, ast.Import):
                 named.update(alias.name for alias in node.names)
             elif isinstance(node, ast.ImportFrom) and node.module:
@@ -184,7 +190,7 @@ def test_decoders_of_types_are_made_when_a_module_is_loaded() -> None:
     late = [
         f"{source.relative_to(ROOT)}:{call.lineno}"
         for source in SOURCES
-        for call in ast.walk(ast.parse(source.read_text()))
+        for call in ast.walk(parsed(source))
         if isinstance(call, ast.Call)
         and ast.unparse(call.func) in ("msgspec.msgpack.decode", "msgspec.json.decode")
         and any(keyword.arg == "type" for keyword in call.keywords)
