@@ -38,8 +38,7 @@ from mapvote.core.tile import Tile
 from mapvote.core.types import CellState, MapvoteError
 from mapvote.server.errors import Conflict, Unavailable
 from mapvote.server.store import schema
-from mapvote.server.store.admission import accept, examine
-from mapvote.server.store.ballots import Receipt
+from mapvote.server.store.admission import Receipt, accept, examine
 from mapvote.server.store.publish import publish
 from mapvote.server.store.store import Store
 from postgres_cluster import PostgresCluster

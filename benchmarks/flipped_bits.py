@@ -32,8 +32,7 @@ from mapvote.config import FuseSettings
 from mapvote.core.grid import TileIndex
 from mapvote.core.types import CellState, MapvoteError
 from mapvote.server.store import schema
-from mapvote.server.store.admission import accept, examine
-from mapvote.server.store.ballots import Receipt
+from mapvote.server.store.admission import Receipt, accept, examine
 from mapvote.server.store.integrity import check
 from mapvote.server.store.policy import Policy
 from mapvote.server.store.publish import publish

@@ -44,9 +44,8 @@ from mapvote.core.grid import TileIndex
 from mapvote.core.point_map import PointMap
 from mapvote.core.types import NO_VOTE, U8, CellState
 from mapvote.fusion.tile_vote import DAY_NS
-from mapvote.server.store import votes
-from mapvote.server.store.admission import accept, examine
-from mapvote.server.store.ballots import Receipt
+from mapvote.server.store import database
+from mapvote.server.store.admission import Receipt, accept, examine
 from mapvote.server.store.publish import preview
 from mapvote.server.store.store import Store
 
@@ -172,11 +171,11 @@ def measure(folder: Path, vehicles: int, n_tiles: int, planes: str, repeats: int
 
     for _ in range(repeats + 1):
         policy = FuseSettings(latest_vehicles=fleet.vehicles + 1, max_deleted_share=1.0)
-        votes.remembered.clear()
+        database.remembered.clear()
         preview(store, policy)
         fleet.vote(1)
         timed("mapvote, 1 new", partial(preview, store, policy))
-        votes.remembered.clear()
+        database.remembered.clear()
         timed("mapvote", partial(preview, store, policy))
         with closing(sqlite3.connect(file)) as connection:
             for name, peer in peers.items():

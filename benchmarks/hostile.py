@@ -42,8 +42,7 @@ from mapvote.codec.ballot import Ballot, encode
 from mapvote.config import FuseSettings
 from mapvote.core.point_map import PointMap
 from mapvote.core.types import CellState
-from mapvote.server.store.admission import accept, examine
-from mapvote.server.store.ballots import Receipt
+from mapvote.server.store.admission import Receipt, accept, examine
 from mapvote.server.store.keys import issue
 from mapvote.server.store.publish import publish
 from mapvote.server.store.store import Store

@@ -207,8 +207,8 @@ def _deskewed(points: Any, time_s: Any, v: Any, w: Any, out: Any) -> None:
 
 
 NUMPY: dict[str, Callable[..., object]] = {
-    "codec.points._placed": _points_out,
-    "codec.words._ascending": _words_out,
+    "codec.ballot._placed": _points_out,
+    "codec.ballot._ascending": _words_out,
     "core.columns._enter_cells": _flat_cells,
     "core.columns.mark_obstacles": _obstacles,
     "core.geometry._transform": _transformed,

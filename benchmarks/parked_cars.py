@@ -31,8 +31,7 @@ from mapvote.codec.ballot import encode
 from mapvote.config import FuseSettings
 from mapvote.core.point_map import PointMap
 from mapvote.core.types import CellState
-from mapvote.server.store.admission import accept, examine
-from mapvote.server.store.ballots import Receipt
+from mapvote.server.store.admission import Receipt, accept, examine
 from mapvote.server.store.policy import Policy
 from mapvote.server.store.publish import publish
 from mapvote.server.store.store import Store

@@ -21,7 +21,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mapvote.codec.odds import STEPS, UNSAID
+from mapvote.codec.ballot import STEPS_PER_NAT, UNSAID
 from mapvote.core.types import F64, I64, Bool, CellState
 from mapvote.detection import confidence
 from mapvote.fusion import loss_budget
@@ -74,12 +74,12 @@ def fit(streets: Sequence[str], cache: Path) -> None:
     said = taken(every, every.scored & (every.vehicles == every.vehicles.max()) & (every.odds != UNSAID))
     for name, state in KINDS.items():
         mine = taken(said, said.states == state)
-        told = np.column_stack([np.ones(len(mine.states)), mine.odds / STEPS])
+        told = np.column_stack([np.ones(len(mine.states)), mine.odds / STEPS_PER_NAT])
         curve = told_as("fusion/loss_budget.py", f"{name}, said", fitted(told, mine.true, evenly(mine.scene)))
         setattr(loss_budget, f"_{name.upper()}_SAID", curve)
     emptied = taken(every, (every.states == CellState.CHANGED_EMPTY) & (every.odds != UNSAID))
     row = np.minimum(emptied.standing, loss_budget.STANDING) / loss_budget.STANDING
-    told = np.column_stack([np.ones(len(row)), row, emptied.odds / STEPS])
+    told = np.column_stack([np.ones(len(row)), row, emptied.odds / STEPS_PER_NAT])
     ones = np.ones(len(told))
     print(f"{emptied.harm.sum()} of {len(told)} emptied cells of {len(parts)} tiles and rounds lost what stands")
     alone_curve = fitted(told[:, :2], emptied.harm, ones, RIDGE)

@@ -11,8 +11,16 @@ from pathlib import Path
 import numpy as np
 from msgspec import structs
 
-from mapvote.codec.ballot import Ballot, BallotTile, decode, encode, unpack_states
-from mapvote.codec.odds import changed_cells_of, in_steps, pack_odds
+from mapvote.codec.ballot import (
+    Ballot,
+    BallotTile,
+    changed_cells_of,
+    decode,
+    encode,
+    in_steps,
+    pack_odds,
+    unpack_states,
+)
 from mapvote.config import Settings
 from mapvote.core.grid import CELLS, TILE_CELLS, TileIndex
 from mapvote.core.point_map import PointMap

@@ -29,8 +29,7 @@ from mapvote.core.grid import TileIndex
 from mapvote.core.point_map import PointMap
 from mapvote.core.types import CellState
 from mapvote.fusion.tile_vote import DAY_NS
-from mapvote.server.store.admission import accept, examine
-from mapvote.server.store.ballots import Receipt
+from mapvote.server.store.admission import Receipt, accept, examine
 from mapvote.server.store.policy import Policy
 from mapvote.server.store.publish import publish
 from mapvote.server.store.store import Store

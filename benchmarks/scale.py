@@ -36,7 +36,7 @@ def as_sent(say: Any) -> Any:
 
     from hand_made import Say
     from mapvote.codec.arrays import pack_plane
-    from mapvote.codec.points import pack_points
+    from mapvote.codec.ballot import pack_points
 
     small = {"states": pack_plane(say.states), "new_points": pack_points(say.new_points)}
 

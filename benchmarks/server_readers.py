@@ -31,8 +31,7 @@ from live_server import serving
 from mapvote.codec.ballot import encode
 from mapvote.core.point_map import PointMap
 from mapvote.core.types import CellState
-from mapvote.server.store.admission import accept, examine
-from mapvote.server.store.ballots import Receipt
+from mapvote.server.store.admission import Receipt, accept, examine
 from mapvote.server.store.store import Store
 from postgres_cluster import PostgresCluster
 

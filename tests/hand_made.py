@@ -7,12 +7,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mapvote.codec.ballot import Ballot, BallotTile, pack_plane, tile_key
-from mapvote.codec.odds import pack_odds
-from mapvote.codec.path import check_path
-from mapvote.codec.points import pack_points
+from mapvote.codec.ballot import (
+    Ballot,
+    BallotTile,
+    check_path,
+    pack_odds,
+    pack_plane,
+    pack_points,
+    pack_words,
+    tile_key,
+    unpack_planes,
+)
 from mapvote.codec.tile_planes import base_hash
-from mapvote.codec.words import pack_words
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Lattice, TileIndex
 from mapvote.core.point_map import PointMap
 from mapvote.core.reference import reference_window
@@ -147,7 +153,7 @@ def unpack_all(ballot: Ballot) -> list[TileVote]:
     """Every plane unpacked; MapvoteError on the first that is damaged or impossible."""
     if ballot.path is not None:
         check_path(ballot.path, [tile.tile for tile in ballot.tiles])
-    return [TileVote.unpack(tile) for tile in ballot.tiles]
+    return [TileVote.of(unpack_planes(tile)) for tile in ballot.tiles]
 
 
 class AtOnce:

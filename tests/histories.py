@@ -17,13 +17,13 @@ from mapvote.config import FuseSettings
 from mapvote.core.tile_history import Memory
 from mapvote.core.types import NO_VOTE, U8, Bool, MapvoteError
 from mapvote.server.errors import Conflict, NotFound
-from mapvote.server.store.admission import accept, examine
-from mapvote.server.store.ballots import Receipt, withdraw
+from mapvote.server.store.admission import Receipt, accept, examine
 from mapvote.server.store.policy import Policy
 from mapvote.server.store.publish import publish, rollback
 from mapvote.server.store.replay import replay
 from mapvote.server.store.reviews import decide, undo
 from mapvote.server.store.store import Store
+from mapvote.server.store.votes import withdraw
 from plain_rules import CE, CO, DAY_S, UE, UN, UO, Cast, Cell, CellMap, Server, Spoken
 from standing_clock import Clock
 

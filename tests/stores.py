@@ -5,8 +5,7 @@ from __future__ import annotations
 from hand_made import Cell, Say, states_plane
 from mapvote.codec.ballot import Ballot, encode
 from mapvote.core.types import I8, NO_VOTE, CellState, MapvoteError
-from mapvote.server.store.admission import Intake, accept, examine
-from mapvote.server.store.ballots import Receipt
+from mapvote.server.store.admission import Intake, Receipt, accept, examine
 from mapvote.server.store.store import Store
 
 WALL: list[Cell] = [(10, 10), (10, 11), (10, 12)]

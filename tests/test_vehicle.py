@@ -12,9 +12,16 @@ import numpy as np
 import pytest
 
 from hand_made import AtOnce, unpack_all
-from mapvote.codec.ballot import decode, encode, unpack_offer, unpack_states, unpack_sureness, unpack_tally
-from mapvote.codec.points import unpack_points
-from mapvote.codec.words import unpack_words
+from mapvote.codec.ballot import (
+    decode,
+    encode,
+    unpack_offer,
+    unpack_points,
+    unpack_states,
+    unpack_sureness,
+    unpack_tally,
+    unpack_words,
+)
 from mapvote.config import FuseSettings, Settings, VotingSettings
 from mapvote.core.grid import TILE_CELLS
 from mapvote.core.point_map import PointMap, all_fields, all_points, map_from_points
@@ -112,9 +119,9 @@ def test_by_surfaces_a_ballot_says_how_sure_it_is_of_every_changed_cell_and_by_n
             states = unpack_states(tile.states)
             odds = unpack_sureness(tile.odds, states)
             assert odds is not None
-            assert len(odds) == np.isin(states, [CellState.CHANGED_OCCUPIED, CellState.CHANGED_EMPTY]).sum()
-            if len(odds) > 20:
-                assert odds.max() > 0, "in the middle of a wall"
+            assert len(odds[1]) == np.isin(states, [CellState.CHANGED_OCCUPIED, CellState.CHANGED_EMPTY]).sum()
+            if len(odds[1]) > 20:
+                assert odds[1].max() > 0, "in the middle of a wall"
     assert told.pop(("surfaces", True)) == {True}
     assert set().union(*told.values()) == {False}
 

@@ -8,12 +8,19 @@ from functools import partial
 
 import numpy as np
 
-from mapvote.codec.ballot import Ballot, BallotTile, pack_plane, tile_key
-from mapvote.codec.odds import changed_cells_of, in_steps, pack_odds
-from mapvote.codec.path import pack_path
-from mapvote.codec.points import pack_points
+from mapvote.codec.ballot import (
+    Ballot,
+    BallotTile,
+    changed_cells_of,
+    in_steps,
+    pack_odds,
+    pack_path,
+    pack_plane,
+    pack_points,
+    pack_words,
+    tile_key,
+)
 from mapvote.codec.tile_planes import base_hash
-from mapvote.codec.words import pack_words
 from mapvote.config import Settings
 from mapvote.core.grid import TileIndex
 from mapvote.core.point_map import PointMap

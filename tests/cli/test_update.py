@@ -10,8 +10,7 @@ from typer.testing import CliRunner
 
 from hand_made import make_ballot, two_walls
 from mapvote.cli import app
-from mapvote.codec.ballot import encode
-from mapvote.codec.odds import MOST
+from mapvote.codec.ballot import MOST_STEPS, encode
 from mapvote.core.types import MapvoteError
 from mapvote.formats import read_map, write_map
 from stores import WALL, wall_gone
@@ -22,7 +21,7 @@ def round_of_two(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """A map and two ballots: its first wall is gone, but of the cell in the middle nobody is sure."""
     monkeypatch.setenv("COLUMNS", "200")
     write_map(two_walls(), tmp_path / "map")
-    say = wall_gone(odds=np.array([40, -MOST, 40], np.int8))
+    say = wall_gone(odds=np.array([40, -MOST_STEPS, 40], np.int8))
     for name in "ab":
         (tmp_path / f"{name}.ballot").write_bytes(encode(make_ballot(two_walls(), {(0, 0): say}, name)))
     return [str(tmp_path / name) for name in ("map", "a.ballot", "b.ballot")]

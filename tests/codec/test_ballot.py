@@ -10,8 +10,7 @@ from hypothesis import strategies as st
 
 from hand_made import Say, make_ballot, states_plane, two_walls, unpack_all, wall
 from mapvote.codec.arrays import pack_plane
-from mapvote.codec.ballot import decode, encode, unpack_offer
-from mapvote.codec.points import pack_points, unpack_points
+from mapvote.codec.ballot import decode, encode, pack_points, unpack_offer, unpack_points
 from mapvote.core.types import MapvoteError
 
 POINTS = unpack_points(pack_points(wall([(3, 3)], [0.5, 0.8, 1.1])))

@@ -11,12 +11,30 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hand_made import Say, make_ballot, states_plane, two_walls, unpack_all
-from mapvote.codec.arrays import compress, pack_plane, unpack_bytes, unpack_into, zstd
-from mapvote.codec.ballot import Ballot, decode, encode, unpack_states, unpack_sureness
-from mapvote.codec.odds import MOST, STEPS, UNSAID, in_nats, in_steps, pack_odds, unpack_odds
-from mapvote.codec.path import check_path, pack_path, unpack_path
-from mapvote.codec.points import MOST_OFF_M, pack_points, unpack_points, unpack_sound_points
-from mapvote.codec.words import pack_words, unpack_sparse, unpack_words
+from mapvote.codec.arrays import compress, pack_plane, unpack_bytes, unpack_plane, zstd
+from mapvote.codec.ballot import (
+    MOST_OFF_M,
+    MOST_STEPS,
+    STEPS_PER_NAT,
+    UNSAID,
+    Ballot,
+    check_path,
+    decode,
+    encode,
+    in_nats,
+    in_steps,
+    pack_odds,
+    pack_path,
+    pack_points,
+    pack_words,
+    unpack_odds,
+    unpack_path,
+    unpack_points,
+    unpack_sparse,
+    unpack_states,
+    unpack_sureness,
+    unpack_words,
+)
 from mapvote.core.grid import CELL_SIZE, Lattice
 from mapvote.core.types import F32, I8, U64, CellState, MapvoteError
 
@@ -32,8 +50,7 @@ def unsaid(data: bytes) -> bytes:
 @pytest.mark.parametrize("pack", [zstd.compress, unsaid])
 def test_what_is_unpacked_into_a_plane_is_what_was_packed(pack: Callable[[bytes], bytes]) -> None:
     data = np.random.default_rng(1).integers(0, 6, SIZE, dtype=np.uint8).tobytes()
-    plane = np.empty(SIZE, dtype=np.uint8)
-    unpack_into(pack(data), plane, "plane")
+    plane = unpack_plane(pack(data), "<u1", (SIZE,), "plane")
     assert plane.tobytes() == unpack_bytes(pack(data), SIZE, "plane") == data
 
 
@@ -52,7 +69,7 @@ def test_what_is_unpacked_into_a_plane_is_what_was_packed(pack: Callable[[bytes]
 )
 def test_a_damaged_frame_or_one_of_another_size_is_refused(bad: bytes) -> None:
     with pytest.raises(MapvoteError, match=r"^plane "):
-        unpack_into(bad, np.empty(SIZE, dtype=np.uint8), "plane")
+        unpack_plane(bad, "<u1", (SIZE,), "plane")
 
 
 def plane_of(marked: dict[int, int]) -> U64:
@@ -108,7 +125,7 @@ def test_a_point_stays_in_its_voxel_and_within_what_rounding_may_move_it_whateve
     points: list[tuple[float, float, float]],
 ) -> None:
     sent = np.array(points, dtype=np.float32).reshape(-1, 3)
-    found = unpack_sound_points(pack_points(sent))
+    found = unpack_points(pack_points(sent))
     assert found.dtype == np.float32
     assert found.shape == sent.shape
     near = np.abs(sent[:, 2]) < 1e3  # beyond, float32 itself is coarser than the steps
@@ -160,7 +177,7 @@ def saying(cells: dict[tuple[int, int], int], odds: I8 | None) -> Ballot:
 @given(
     st.dictionaries(
         st.tuples(st.integers(0, 255), st.integers(0, 255)),
-        st.tuples(st.sampled_from(range(5)), st.integers(-MOST, MOST)),
+        st.tuples(st.sampled_from(range(5)), st.integers(-MOST_STEPS, MOST_STEPS)),
         max_size=40,
     )
 )
@@ -173,16 +190,16 @@ def test_every_changed_cell_gets_its_own_byte_back_and_no_other_cell_has_one(
     unpack_all(got)
     (tile,) = got.tiles
     assert tile.states is not None
-    odds = unpack_sureness(tile.odds, unpack_states(tile.states))
-    assert odds is not None
-    assert odds.tolist() == list(bytes_of.values())
+    said_of = unpack_sureness(tile.odds, unpack_states(tile.states))
+    assert said_of is not None
+    assert said_of[1].tolist() == list(bytes_of.values())
 
 
 @given(st.lists(st.floats(-100, 100), max_size=20))
 def test_log_odds_keep_their_sign_and_lose_half_a_step_at_most(nats: list[float]) -> None:
     back = in_nats(in_steps(np.array(nats, dtype=np.float64)))
-    within = np.clip(np.array(nats), -MOST / STEPS, MOST / STEPS)
-    assert np.abs(back - within).max(initial=0.0) <= 0.5 / STEPS
+    within = np.clip(np.array(nats), -MOST_STEPS / STEPS_PER_NAT, MOST_STEPS / STEPS_PER_NAT)
+    assert np.abs(back - within).max(initial=0.0) <= 0.5 / STEPS_PER_NAT
     assert (back * within >= 0).all()
 
 

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hand_made import Say, make_ballot, make_map, make_tile, states_plane, wall
-from mapvote.codec.odds import MOST, UNSAID
+from mapvote.codec.ballot import MOST_STEPS, UNSAID
 from mapvote.config import FuseSettings, load_settings
 from mapvote.core.grid import Lattice
 from mapvote.core.point_map import PointMap
@@ -76,9 +76,9 @@ def test_the_median_is_taken_and_never_more_than_the_quorum_says(
 def test_liars_fewer_than_the_quorum_never_talk_it_above_what_an_honest_vehicle_says(
     k: int, data: st.DataObject
 ) -> None:
-    honest = data.draw(st.lists(st.integers(-MOST, MOST), min_size=1, max_size=5))
+    honest = data.draw(st.lists(st.integers(-MOST_STEPS, MOST_STEPS), min_size=1, max_size=5))
     if len(honest) + k >= k + 1:
-        assert taken([*honest, *[MOST] * k], k + 1) <= max(honest)
+        assert taken([*honest, *[MOST_STEPS] * k], k + 1) <= max(honest)
 
 
 def test_a_later_drive_says_how_sure_its_vehicle_is_and_a_silent_one_overrides_nothing() -> None:
@@ -156,7 +156,7 @@ def updated(budget: float, *says: Say) -> tuple[int, PendingDeletions]:
 
 
 def test_a_cell_beyond_the_budget_keeps_its_points_and_is_pending() -> None:
-    unsure = said([40, -MOST, 40])
+    unsure = said([40, -MOST_STEPS, 40])
     left, waits = updated(0.01, unsure, unsure)
     assert left == 3, "those of the cell in the middle"
     assert waits.cells.tolist() == [10 * 256 + 11]
@@ -166,14 +166,14 @@ def test_a_cell_beyond_the_budget_keeps_its_points_and_is_pending() -> None:
 
 
 def test_without_a_budget_nothing_waits_however_unsure_they_are() -> None:
-    unsure = said([-MOST] * 3)
+    unsure = said([-MOST_STEPS] * 3)
     left, waits = updated(1.0, unsure, unsure)
     assert left == 0
     assert not len(waits.cells)
 
 
 def test_one_who_is_sure_does_not_carry_two_who_are_not() -> None:
-    sure, unsure = said([MOST] * 3), said([-MOST] * 3)
+    sure, unsure = said([MOST_STEPS] * 3), said([-MOST_STEPS] * 3)
     assert updated(0.01, sure, unsure, unsure)[0] == 9
     assert updated(0.01, sure, sure, unsure)[0] == 0
 
@@ -191,7 +191,7 @@ def test_a_smaller_budget_never_lets_more_go(cells: dict[int, int], budget: floa
     states = states_plane().reshape(-1)
     states[list(cells)] = list(cells.values())
     plane: U8 = states.reshape(256, 256)
-    odds = Odds(np.array(sorted(cells), np.int64), np.array([c % 255 - MOST for c in sorted(cells)], np.int8))
+    odds = Odds(np.array(sorted(cells), np.int64), np.array([c % 255 - MOST_STEPS for c in sorted(cells)], np.int8))
     waits = [
         set(beyond_budget(plane, odds, FuseSettings(false_deletions=b)).cells.tolist()) for b in (budget, budget / 2)
     ]

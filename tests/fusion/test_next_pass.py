@@ -15,8 +15,7 @@ from typer.testing import CliRunner
 
 from hand_made import Say, make_ballot, states_plane, two_walls
 from mapvote.cli import app
-from mapvote.codec.ballot import encode
-from mapvote.codec.path import pack_path
+from mapvote.codec.ballot import encode, pack_path
 from mapvote.core.grid import TILE_CELLS, Lattice
 from mapvote.core.types import NO_VOTE, U8, CellState
 from mapvote.fusion.next_pass import Witness, one_vote_short, stretches

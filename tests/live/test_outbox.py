@@ -13,8 +13,7 @@ import pytest
 
 from hand_made import Say, make_ballot, make_map, make_tile, states_plane, wall
 from mapvote.client import MapClient
-from mapvote.codec.ballot import Ballot, decode, encode
-from mapvote.codec.path import check_path, pack_path, unpack_path
+from mapvote.codec.ballot import Ballot, check_path, decode, encode, pack_path, unpack_path
 from mapvote.core.grid import CELL_SIZE
 from mapvote.core.types import MapvoteError
 from mapvote.formats.atomic import whole_file as really_whole_file

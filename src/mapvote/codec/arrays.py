@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from mapvote.core.types import U8, MapvoteError
+from mapvote.core.types import MapvoteError
 
 if sys.version_info >= (3, 14):
     from compression import zstd as zstd
@@ -53,25 +53,6 @@ def raw_plane(plane: NDArray[Any], dtype: DTypeLike) -> memoryview:
 def unpack_bytes(data: bytes, limit: int, what: str) -> bytes:
     """Decompress at most ``limit`` bytes of one frame. MapvoteError beyond ``limit`` (a decompression bomb stops here),
     on damage, and where something follows the frame."""
-    raw, rest = _unpack(data, limit, what)
-    if rest:
-        raise MapvoteError(f"{what} is damaged ({len(rest)} bytes follow it); fetch or send it again")
-    return raw
-
-
-def unpack_into(data: bytes, plane: U8, what: str) -> None:
-    """Fill ``plane`` (n,) with a frame's n bytes. MapvoteError if it is damaged, or smaller or larger than that.
-
-    What follows a frame is ignored: :func:`unpack_bytes` looks at that when a ballot comes in.
-    """
-    raw, _ = _unpack(data, len(plane), what)
-    if len(raw) != len(plane):
-        raise MapvoteError(f"{what} has {len(raw)} bytes, expected {len(plane)}")
-    plane[:] = np.frombuffer(raw, dtype=np.uint8)
-
-
-def _unpack(data: bytes, limit: int, what: str) -> tuple[bytes, bytes]:
-    """(the content of the first frame, the bytes that follow that frame)."""
     try:
         size = zstd.get_frame_info(data).decompressed_size
         if size is not None and size > limit:
@@ -82,7 +63,9 @@ def _unpack(data: bytes, limit: int, what: str) -> tuple[bytes, bytes]:
         raise MapvoteError(f"{what} is damaged ({error}); fetch or send it again") from error
     if len(raw) > limit or not frame.eof:
         raise MapvoteError(f"{what} is truncated or larger than {limit} bytes when decompressed")
-    return raw, frame.unused_data
+    if frame.unused_data:
+        raise MapvoteError(f"{what} is damaged ({len(frame.unused_data)} bytes follow it); fetch or send it again")
+    return raw
 
 
 def frame_size(head: bytes, what: str) -> int:

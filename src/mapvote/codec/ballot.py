@@ -1,29 +1,29 @@
 """Ballot <-> bytes: all that passes between vehicle and server (docs/decisions/data.md).
 
-A msgpack envelope of zstd-compressed planes. Reading checks every size before it allocates memory; a ballot of another
-format, or without a required field, is refused.
+A msgpack envelope of planes, each a zstd frame. Reading checks every size before it allocates memory; a ballot of
+another format, or without a required field, is refused.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from typing import Annotated
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+from typing import Annotated, Any, Protocol
 
 import msgspec
 import numpy as np
+from numpy.typing import NDArray
 
+from mapvote.codec.arrays import compress, unpack_bytes, unpack_plane
 from mapvote.codec.arrays import pack_plane as pack_plane
-from mapvote.codec.arrays import unpack_into, unpack_plane
-from mapvote.codec.odds import changed_cells_of, unpack_odds
-from mapvote.codec.points import unpack_points
-from mapvote.core.grid import TILE_CELLS, TileIndex
-from mapvote.core.types import F32, I8, N_STATES, NO_VOTE, U8, U16, MapvoteError
+from mapvote.core.grid import CELL_SIZE, CELLS, TILE_CELLS, Lattice, TileIndex
+from mapvote.core.kernel import kernel
+from mapvote.core.types import F32, F64, I8, I64, N_STATES, NO_VOTE, U8, U16, U64, Bool, CellState, MapvoteError
 
 FORMAT_VERSION = 1
 MAX_TILES = 4096
 MAX_TILE_INDEX = 1 << 20
-_CELLS = TILE_CELLS * TILE_CELLS
 
 Id = Annotated[str, msgspec.Meta(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}\Z")]
 """Vehicle and drive names: 1-64 of letters, digits, dot, underscore, dash; they appear in URLs and file names."""
@@ -34,7 +34,7 @@ _Count = Annotated[int, msgspec.Meta(ge=0, le=1 << 31)]
 
 
 class BallotTile(msgspec.Struct, frozen=True, kw_only=True):
-    """One tile's votes. Planes are compressed; see :func:`states_of` and its neighbours."""
+    """One tile's votes. Every plane is a zstd frame; see :func:`unpack_planes`."""
 
     tile: tuple[int, int]
     states: bytes | None = None
@@ -42,16 +42,15 @@ class BallotTile(msgspec.Struct, frozen=True, kw_only=True):
     tally: bytes | None = None
     """(5, 256, 256) uint16 votes in VOTE_UNITs, class-major: one-stage."""
     gone: bytes | None = None
-    """(256, 256) uint64, see codec/words.py: which voxels of a changed-empty cell are gone (delete mask)."""
+    """(256, 256) column words: which voxels of a changed-empty cell are gone (delete mask)."""
     new_points: bytes | None = None
-    """(m, 3) from the tile's corner, see codec/points.py, sorted by voxel key: one per 0.3 m voxel of changed-occupied
-    cells."""
+    """(m, 3) from the tile's corner, sorted by voxel key: one per 0.3 m voxel of changed-occupied cells."""
     intensity: bytes | None = None
     """(m,) uint8 of each of them, 255 for 1.0; None: the map holds no intensity, or the sensor measures none."""
     free: bytes | None = None
-    """(256, 256) uint64, likewise: voxels that this drive's rays passed through."""
+    """(256, 256) column words: voxels that this drive's rays passed through."""
     odds: bytes | None = None
-    """(changed cells,) int8 in the order of the states, see codec/odds.py: how sure the vehicle is of each; two-stage
+    """(changed cells,) int8 in the order of the states: how sure the vehicle is of each; two-stage
     alone. None: it does not say."""
 
 
@@ -83,7 +82,7 @@ class Ballot(msgspec.Struct, frozen=True, kw_only=True):
     prior_sigma_m: float | None = None
     """The standard deviation that the prior states."""
     path: bytes | None = None
-    """Where it drove (codec/path.py); None if the ballot does not say."""
+    """Where it drove, see :func:`pack_path`; None if the ballot does not say."""
     tiles: list[BallotTile]
 
     @property
@@ -106,53 +105,6 @@ def tile_index(key: str) -> TileIndex:
 def tile_key(tile: TileIndex) -> str:
     """The name of a tile in manifests and ballots: "row,col"."""
     return f"{tile[0]},{tile[1]}"
-
-
-def unpack_states(data: bytes) -> U8:
-    """(256, 256) uint8; MapvoteError if damaged or not a CellState."""
-    return check_states(unpack_plane(data, "<u1", (TILE_CELLS, TILE_CELLS), "ballot: states"))
-
-
-def unpack_sound_states(data: bytes) -> U8:
-    """(256, 256) uint8, of a ballot that the server took in; MapvoteError as :func:`unpack_states`."""
-    states = np.empty(_CELLS, dtype=np.uint8)
-    unpack_into(data, states, "ballot: states")
-    return check_states(states.reshape(TILE_CELLS, TILE_CELLS))
-
-
-def check_states(states: U8) -> U8:
-    """The same, of any shape; MapvoteError if one is no cell state."""
-    if not ((states < N_STATES) | (states == NO_VOTE)).all():
-        raise MapvoteError("ballot: states holds a value that is no cell state")
-    return states
-
-
-def unpack_tally(data: bytes) -> U16:
-    """(256, 256, 5) uint16; MapvoteError if damaged."""
-    return np.moveaxis(unpack_plane(data, "<u2", (N_STATES, TILE_CELLS, TILE_CELLS), "ballot: tally"), 0, -1)
-
-
-def unpack_offer(
-    new_points: bytes | None, intensity: bytes | None, unpack: Callable[[bytes], F32] = unpack_points
-) -> tuple[F32 | None, U8 | None]:
-    """The new points (m, 3) of a tile and their intensity (m,), of their planes; MapvoteError as ``unpack`` (of a
-    ballot that the server took in, :func:`unpack_sound_points`), and if there is not one for each."""
-    points = None if new_points is None else unpack(new_points)
-    if intensity is None:
-        return points, None
-    if points is None:
-        raise MapvoteError("ballot: a tile has the intensity of new points, but none of those")
-    return points, unpack_plane(intensity, "|u1", (len(points),), "ballot: intensity")
-
-
-def unpack_sureness(odds: bytes | None, states: U8 | None) -> I8 | None:
-    """(changed cells of ``states`` (256, 256),) how sure the vehicle is of each, see codec/odds.py; None if it does not
-    say. MapvoteError as :func:`mapvote.codec.odds.unpack_odds`, and if there are odds but no states."""
-    if odds is None:
-        return None
-    if states is None:
-        raise MapvoteError("ballot: a tile has the odds of changed cells, but no states")
-    return unpack_odds(odds, len(changed_cells_of(states)))
 
 
 def encode(ballot: Ballot) -> bytes:
@@ -189,3 +141,360 @@ def decode(data: bytes) -> Ballot:
         if value is not None and not 0.0 <= value < math.inf:
             raise MapvoteError(f"ballot: {name} = {value} is no distance")
     return ballot
+
+
+class PackedPlanes(Protocol):
+    """The planes of a ballot on one tile, as they travel (:class:`BallotTile`) and as a server stores them."""
+
+    @property
+    def states(self) -> bytes | None: ...
+    @property
+    def tally(self) -> bytes | None: ...
+    @property
+    def gone(self) -> bytes | None: ...
+    @property
+    def new_points(self) -> bytes | None: ...
+    @property
+    def intensity(self) -> bytes | None: ...
+    @property
+    def free(self) -> bytes | None: ...
+    @property
+    def odds(self) -> bytes | None: ...
+
+
+Sparse = tuple[NDArray[np.intp], U64]
+"""(flat cells (n,), ascending; their column words (n,), none of them 0)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Planes:
+    """:class:`PackedPlanes`, unpacked and checked."""
+
+    states: U8 | None
+    """(256, 256)"""
+    tally: U16 | None
+    """(256, 256, 5)"""
+    gone: Sparse | None
+    new_points: F32 | None
+    """(m, 3)"""
+    intensity: U8 | None
+    """(m,)"""
+    free: Sparse | None
+    odds: tuple[I64, I8] | None
+    """(flat cells that the states call changed (n,), ascending; how sure the vehicle is of each (n,))."""
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of all planes."""
+        planes: list[NDArray[Any] | None] = [self.states, self.tally, self.new_points, self.intensity]
+        planes += [*(self.gone or ()), *(self.free or ()), *(self.odds or ())]
+        return sum(plane.nbytes for plane in planes if plane is not None)
+
+    def spoken(self) -> Bool:
+        """(256, 256) the cells on which it votes."""
+        return spoken_cells(self.states, self.tally)
+
+
+def unpack_planes(packed: PackedPlanes) -> Planes:
+    """The votes on one tile; MapvoteError if a plane is damaged or impossible."""
+    new_points, intensity = unpack_offer(packed.new_points, packed.intensity)
+    states = None if packed.states is None else unpack_states(packed.states)
+    return Planes(
+        states=states,
+        tally=None if packed.tally is None else unpack_tally(packed.tally),
+        gone=None if packed.gone is None else unpack_sparse(packed.gone, "gone"),
+        new_points=new_points,
+        intensity=intensity,
+        free=None if packed.free is None else unpack_sparse(packed.free, "free"),
+        odds=unpack_sureness(packed.odds, states),
+    )
+
+
+def spoken_cells(states: U8 | None, tally: U16 | None) -> Bool:
+    """(256, 256) the cells on which a vote of two stages (``states``) or of one (``tally``) says anything."""
+    if states is not None:
+        return states != NO_VOTE
+    assert tally is not None
+    return np.asarray(tally.any(axis=-1))
+
+
+def unpack_states(data: bytes) -> U8:
+    """(256, 256) uint8; MapvoteError if damaged or not a CellState."""
+    states = unpack_plane(data, "<u1", (TILE_CELLS, TILE_CELLS), "ballot: states")
+    if not ((states < N_STATES) | (states == NO_VOTE)).all():
+        raise MapvoteError("ballot: states holds a value that is no cell state")
+    return states
+
+
+def unpack_tally(data: bytes) -> U16:
+    """(256, 256, 5) uint16; MapvoteError if damaged."""
+    return np.moveaxis(unpack_plane(data, "<u2", (N_STATES, TILE_CELLS, TILE_CELLS), "ballot: tally"), 0, -1)
+
+
+def unpack_offer(new_points: bytes | None, intensity: bytes | None) -> tuple[F32 | None, U8 | None]:
+    """The new points (m, 3) of a tile and their intensity (m,), of their planes; MapvoteError as :func:`unpack_points`,
+    and if there is not one for each."""
+    points = None if new_points is None else unpack_points(new_points)
+    if intensity is None:
+        return points, None
+    if points is None:
+        raise MapvoteError("ballot: a tile has the intensity of new points, but none of those")
+    return points, unpack_plane(intensity, "|u1", (len(points),), "ballot: intensity")
+
+
+def unpack_sureness(odds: bytes | None, states: U8 | None) -> tuple[I64, I8] | None:
+    """(changed cells of ``states`` (256, 256), how sure the vehicle is of each); None if it does not say. MapvoteError
+    as :func:`unpack_odds`, and if there are odds but no states."""
+    if odds is None:
+        return None
+    if states is None:
+        raise MapvoteError("ballot: a tile has the odds of changed cells, but no states")
+    cells = changed_cells_of(states)
+    return cells, unpack_odds(odds, len(cells))
+
+
+# Column words: only those that are not zero, for masks and free space mark few of a tile's cells. Under zstd lie the
+# ways from each cell to the next as two planes of bytes, then the words as eight: bytes that mean the same lie
+# together, which packs a fifth smaller than the words as they are.
+
+_WAY, _WORD = 2, 8
+"""Bytes of the way to a cell, and of its word."""
+
+
+def pack_words(plane: U64) -> bytes:
+    """A (256, 256) plane."""
+    flat = plane.reshape(-1)
+    cells = np.flatnonzero(flat)
+    return compress(_by_byte(np.diff(cells, prepend=0), _WAY) + _by_byte(flat[cells], _WORD))
+
+
+def unpack_sparse(data: bytes, what: str) -> tuple[NDArray[np.intp], U64]:
+    """(flat cells (n,), ascending; their words (n,), none of them 0). MapvoteError if damaged.
+
+    ``what`` names the plane in messages, e.g. "gone".
+    """
+    raw = np.frombuffer(unpack_bytes(data, CELLS * (_WAY + _WORD), f"ballot: {what}"), dtype=np.uint8)
+    n, left = divmod(len(raw), _WAY + _WORD)
+    cells, words = np.empty(n, dtype=np.intp), np.empty(n, dtype=np.uint64)
+    if left or not _ascending(raw, cells, words):
+        raise MapvoteError(f"ballot: {what} is damaged ({len(raw)} bytes); fetch or send it again")
+    return cells, words
+
+
+@kernel
+def _ascending(raw: U8, cells: NDArray[np.intp], words: U64) -> bool:
+    """Fill ``cells`` and ``words`` (n,); whether cells ascend within the tile, and none is without a word."""
+    n, cell, sound = len(cells), np.int64(0), True
+    for i in range(n):
+        way = np.int64(raw[i]) | (np.int64(raw[n + i]) << 8)
+        cell += way
+        word = np.uint64(0)
+        for k in range(_WORD):
+            word |= np.uint64(raw[(_WAY + k) * n + i]) << np.uint64(8 * k)
+        cells[i], words[i] = cell, word
+        sound &= (way > 0 or i == 0) and word != 0
+    return bool(sound and cell < CELLS)
+
+
+def unpack_words(data: bytes, what: str) -> U64:
+    """(256, 256) uint64; MapvoteError if damaged."""
+    cells, words = unpack_sparse(data, what)
+    plane = np.zeros(CELLS, dtype=np.uint64)
+    plane[cells] = words
+    return plane.reshape(TILE_CELLS, TILE_CELLS)
+
+
+def _by_byte(values: NDArray[np.integer], size: int) -> bytes:
+    """All lowest bytes first, then all that come next .."""
+    return np.ascontiguousarray(values.astype(f"<u{size}").view(np.uint8).reshape(-1, size).T).tobytes()
+
+
+# New points: the voxel of each, and where in it to a 32nd of its side. Half a centimetre is less than a sensor's noise
+# and less than the error of a pose, yet as float32 three quarters of a ballot were such digits. Under zstd lie nine
+# planes of bytes: the way from each point's cell to the next (two), from each layer to the next (four), and the place
+# in the voxel (three).
+
+MAX_POINTS_PER_CELL = 64
+"""One new point per voxel of a column: no honest ballot has more."""
+_PLACES = 32
+"""Places along a voxel's side that a point may have."""
+MOST_OFF_M = 0.5 * CELL_SIZE / _PLACES
+"""How far rounding moves a point along an axis, but for what float32 adds."""
+_POINT_BYTES = 9
+_MAX_POINT_BYTES = CELLS * MAX_POINTS_PER_CELL * _POINT_BYTES
+_TOP_M = 1e5
+
+
+def pack_points(points: F32) -> bytes:
+    """(m, 3) from the tile's corner, inside it, in any order."""
+    planes = np.empty((_POINT_BYTES, len(points)), dtype=np.uint8)
+    _enter_planes(points, np.empty(3, dtype=np.int64), planes)
+    return compress(planes.tobytes())
+
+
+def unpack_points(data: bytes) -> F32:
+    """(m, 3) float32 from the tile's corner; MapvoteError if damaged, not finite, outside the tile, or if one cell
+    holds more than it may."""
+    raw = np.frombuffer(unpack_bytes(data, _MAX_POINT_BYTES, "ballot: new_points"), dtype=np.uint8)
+    if len(raw) % _POINT_BYTES:
+        raise MapvoteError(f"ballot: new_points has {len(raw)} bytes, which is no number of points")
+    points = np.empty((len(raw) // _POINT_BYTES, 3), dtype=np.float32)
+    sound = _placed(raw.reshape(_POINT_BYTES, -1), points)
+    if not sound or not _all_inside(points, np.float32(TILE_CELLS * CELL_SIZE)):
+        raise MapvoteError("ballot: new_points holds a point outside its tile or not finite")
+    if most_in_a_cell(points) > MAX_POINTS_PER_CELL:
+        raise MapvoteError(f"ballot: new_points holds more than {MAX_POINTS_PER_CELL} points in one cell")
+    return points
+
+
+@kernel
+def _enter_planes(points: F32, voxel: I64, planes: U8) -> None:
+    """Fill ``planes`` (9, m) from points (m, 3): differences modulo 2 ** 16 and 2 ** 32, lowest byte first, and steps
+    in a voxel. ``voxel`` (3,): scratch."""
+    last_cell, last_layer = np.int64(0), np.int64(0)
+    for i in range(len(points)):
+        for axis in range(3):
+            place = np.float64(points[i, axis]) / CELL_SIZE
+            voxel[axis] = int(np.floor(place))
+            if axis < 2:
+                voxel[axis] = min(max(voxel[axis], 0), TILE_CELLS - 1)
+            planes[6 + axis, i] = min(max(int((place - voxel[axis]) * _PLACES), 0), _PLACES - 1)
+        cell = voxel[1] * TILE_CELLS + voxel[0]
+        for k in range(2):
+            planes[k, i] = ((cell - last_cell) >> (8 * k)) & 0xFF
+        for k in range(4):
+            planes[2 + k, i] = ((voxel[2] - last_layer) >> (8 * k)) & 0xFF
+        last_cell, last_layer = cell, voxel[2]
+
+
+@kernel
+def _placed(planes: U8, points: F32) -> bool:
+    """Fill ``points`` (m, 3) from (9, m); whether each lies in its voxel."""
+    cell, layer, sound = np.int64(0), np.int64(0), True
+    for i in range(len(points)):
+        cell = (cell + np.int64(planes[0, i]) + (np.int64(planes[1, i]) << 8)) & (CELLS - 1)
+        way = np.int64(0)
+        for k in range(4):
+            way |= np.int64(planes[2 + k, i]) << (8 * k)
+        layer = ((layer + way + (1 << 31)) & 0xFFFFFFFF) - (1 << 31)
+        for axis, voxel in enumerate((cell % TILE_CELLS, cell // TILE_CELLS, layer)):
+            points[i, axis] = (voxel + (planes[6 + axis, i] + 0.5) / _PLACES) * CELL_SIZE
+            sound &= planes[6 + axis, i] < _PLACES
+    return sound
+
+
+@kernel
+def _all_inside(points: F32, side: np.float32) -> bool:
+    """Whether all points (m, 3) are finite and within a tile; NaN fails every comparison."""
+    sound = True
+    for i in range(len(points)):
+        x, y, z = points[i, 0], points[i, 1], points[i, 2]
+        sound &= 0 <= x < side and 0 <= y < side and abs(z) <= _TOP_M
+    return sound
+
+
+def most_in_a_cell(points: F32) -> int:
+    """The most of these points (m, 3), from the tile's corner and inside it, that lie in one cell."""
+    return int(_most_in_a_cell(points, np.zeros(CELLS, dtype=np.int64)))
+
+
+@kernel
+def _most_in_a_cell(points: F32, counts: I64) -> int:
+    """:func:`most_in_a_cell`; ``counts`` (cells,): scratch, zeros."""
+    most = 0
+    for i in range(len(points)):
+        row, col = int(points[i, 1] / CELL_SIZE), int(points[i, 0] / CELL_SIZE)
+        cell = min(row, TILE_CELLS - 1) * TILE_CELLS + min(col, TILE_CELLS - 1)
+        counts[cell] += 1
+        most = max(most, counts[cell])
+    return most
+
+
+# Odds: how sure a vehicle is of each cell that it calls changed, log-odds, one byte a cell. The states say which cells
+# these are, so none is named again.
+
+STEPS_PER_NAT = 4
+"""To a nat: rounding moves a probability by .03 at the most, and eighths would take a fifth more bytes."""
+MOST_STEPS = 127
+"""31.75 nats: beyond all that anybody can know."""
+UNSAID = -128
+"""Where no confidence is stated; no ballot holds it."""
+_CO, _CE = int(CellState.CHANGED_OCCUPIED), int(CellState.CHANGED_EMPTY)  # against a CellState numpy compares in int64
+
+
+def in_steps(log_odds: F64) -> I8:
+    """(n,) log-odds in nats as whole steps, the nearest, no farther from 0 than MOST_STEPS."""
+    return np.clip(np.rint(log_odds * STEPS_PER_NAT), -MOST_STEPS, MOST_STEPS).astype(np.int8)
+
+
+def in_nats(steps: I8) -> F64:
+    """(n,) log-odds in nats; UNSAID has no meaning."""
+    return steps.astype(np.float64) / STEPS_PER_NAT
+
+
+def changed_cells_of(states: U8) -> I64:
+    """(m,) flat cells that the states (256, 256) call changed, ascending."""
+    return np.flatnonzero((states == _CO) | (states == _CE))
+
+
+def pack_odds(steps: I8) -> bytes:
+    """(m,) of the changed cells of a tile, in their order."""
+    return compress(np.ascontiguousarray(steps, dtype=np.int8).tobytes())
+
+
+def unpack_odds(data: bytes, cells: int) -> I8:
+    """(cells,) int8. MapvoteError if damaged, not one for each of so many changed cells, or nothing that a vehicle
+    says."""
+    steps = unpack_plane(data, "<i1", (cells,), "ballot: odds")
+    if (steps == UNSAID).any():
+        raise MapvoteError("ballot: odds holds a value that is no log-odds")
+    return steps
+
+
+# Path: a cell of the lattice every few metres, for display. Cells as steps from one to the next, int32, under zstd: two
+# hundred bytes for a kilometre.
+
+STEP_M = 5.0
+"""Between two cells of a path, at least."""
+MAX_PATH_CELLS = 100_000
+
+
+def pack_path(positions: Sequence[F64], lattice: Lattice) -> bytes:
+    """Positions (x, y, ..) in map metres, in the order driven, thinned to one every STEP_M; the first and last stay."""
+    kept: list[F64] = []
+    for position in positions:
+        if not kept or np.hypot(*(position[:2] - kept[-1][:2])) >= STEP_M:
+            kept.append(position)
+    if len(positions):
+        kept.append(positions[-1])
+    cells = np.stack(lattice.cells_of(np.reshape(kept, (len(kept), -1))[:MAX_PATH_CELLS]), axis=1)
+    return pack_plane(np.diff(cells, axis=0, prepend=0).astype(np.int32))
+
+
+def unpack_path(data: bytes) -> I64:
+    """(n, 2) rows and columns on the lattice; MapvoteError if damaged."""
+    raw = unpack_bytes(data, 8 * MAX_PATH_CELLS, "ballot: path")
+    if len(raw) % 8:
+        raise MapvoteError(f"ballot: path has {len(raw)} bytes, not a multiple of 8")
+    return np.cumsum(np.frombuffer(raw, dtype="<i4").reshape(-1, 2).astype(np.int64), axis=0)
+
+
+def check_path(data: bytes, tiles: Collection[TileIndex]) -> None:
+    """MapvoteError unless the path is sound and never farther than a tile from ``tiles``, on which its drive voted."""
+    for tile in np.unique(unpack_path(data) // TILE_CELLS, axis=0):
+        if not _is_near(tile, tiles):
+            raise MapvoteError(f"ballot: path leads over tile {tile[0]},{tile[1]}, far from where the drive voted")
+
+
+def path_near(data: bytes, tiles: Collection[TileIndex]) -> bytes:
+    """The path without what is farther than a tile from ``tiles``."""
+    cells = unpack_path(data)
+    passed, which = np.unique(cells // TILE_CELLS, axis=0, return_inverse=True)
+    near = np.array([_is_near(tile, tiles) for tile in passed], dtype=np.bool_)
+    kept = cells[near[which.ravel()]]
+    return pack_plane(np.diff(kept, axis=0, prepend=np.zeros((1, 2), np.int64)).astype(np.int32))
+
+
+def _is_near(tile: I64, voted: Collection[TileIndex]) -> bool:
+    others = np.array(list(voted), dtype=np.int64).reshape(-1, 2)
+    return bool((np.abs(others - tile).max(axis=1, initial=0) <= 1).any())

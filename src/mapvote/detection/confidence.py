@@ -12,7 +12,7 @@ from __future__ import annotations
 import numpy as np
 from scipy import ndimage
 
-from mapvote.codec.odds import changed_cells_of
+from mapvote.codec.ballot import changed_cells_of
 from mapvote.core.grid import CELL_SIZE, CELLS, TILE_CELLS
 from mapvote.core.tile import Tile
 from mapvote.core.types import F32, F64, I32, I64, U8, Bool, CellState

@@ -8,8 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mapvote.codec.ballot import Ballot, decode, unpack_states
-from mapvote.codec.points import unpack_points
+from mapvote.codec.ballot import Ballot, decode, unpack_points, unpack_states
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS
 from mapvote.core.point_map import SOURCES, PointMap
 from mapvote.core.sensor_height import check_heights

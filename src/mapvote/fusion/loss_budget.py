@@ -1,6 +1,6 @@
 """The probability that a decided cell really changed, and the deletions that wait because of it.
 
-Confidence. Votes decide; the confidence of the voters (codec/odds.py) refines the probability of the decision. One of
+Confidence. Votes decide; the confidence of the voters refines the probability of the decision. One of
 them may lie, so the agreed confidence is the least that a quorum states: the median of those who voted for a change,
 the lower one of two, and never more than a quorum of them states. As one of the quorum is honest, no liar raises a
 probability above what an honest vehicle states.
@@ -26,7 +26,7 @@ from typing import Protocol
 import numpy as np
 
 from mapvote.codec.arrays import unpack_plane
-from mapvote.codec.odds import UNSAID, changed_cells_of, in_nats, pack_odds
+from mapvote.codec.ballot import UNSAID, changed_cells_of, in_nats, pack_odds
 from mapvote.config import FuseSettings
 from mapvote.core.grid import CELL_SIZE, CELLS, TILE_CELLS, Lattice, TileIndex
 from mapvote.core.types import F64, I8, I32, I64, U8, Bool, CellState
@@ -39,17 +39,12 @@ class Odds:
     cells: I64
     """(n,) flat cells of the tile, ascending."""
     steps: I8
-    """(n,) log-odds, see codec/odds.py."""
+    """(n,) log-odds in steps, see :func:`mapvote.codec.ballot.in_steps`."""
 
     @classmethod
     def none(cls) -> Odds:
         """No cell has a stated confidence."""
         return cls(np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int8))
-
-    @classmethod
-    def of(cls, states: U8, steps: I8 | None) -> Odds | None:
-        """Of the cells that ``states`` (256, 256) call changed, in their order; None where ``steps`` is."""
-        return None if steps is None else cls(changed_cells_of(states), steps)
 
     def at(self, cells: I64) -> I8:
         """(m,) the confidence of flat ``cells`` (m,); UNSAID where none is stated."""

@@ -6,11 +6,7 @@ import hashlib
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 
-from mapvote.codec.ballot import (
-    Ballot,
-    encode,
-    tile_key,
-)
+from mapvote.codec.ballot import Ballot, encode, tile_key, unpack_planes
 from mapvote.codec.tile_planes import base_hash
 from mapvote.config import FuseSettings
 from mapvote.core.grid import TileIndex
@@ -98,4 +94,4 @@ def _votes_on(index: TileIndex, ballots: dict[str, Ballot]) -> Iterator[TileVote
     for digest, ballot in ballots.items():
         for tile in ballot.tiles:
             if tile.tile == index:
-                yield TileVote.unpack(tile, ballot.vehicle, ballot.end_ns, digest, ballot.version)
+                yield TileVote.of(unpack_planes(tile), ballot.vehicle, ballot.end_ns, digest, ballot.version)

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mapvote.codec.words import unpack_sparse
 from mapvote.core.columns import EVERY_BIT
 from mapvote.core.grid import CELLS
 from mapvote.core.kernel import inlined, kernel
@@ -44,11 +43,6 @@ class Words:
         """Every bit of the (256, 256) cells given."""
         flat = np.flatnonzero(cells)
         return cls(flat, np.full(len(flat), EVERY_BIT))
-
-    @classmethod
-    def unpack(cls, data: bytes, what: str) -> Words:
-        """From a packed plane of a ballot; MapvoteError if damaged."""
-        return cls(*unpack_sparse(data, what))
 
     def within(self, cells: Bool) -> Words:
         """Only those of the (256, 256) cells given."""

@@ -12,8 +12,7 @@ from typing import Any, Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from mapvote.codec.ballot import unpack_offer, unpack_sound_states, unpack_states, unpack_sureness, unpack_tally
-from mapvote.codec.points import unpack_points, unpack_sound_points
+from mapvote.codec.ballot import Planes, spoken_cells
 from mapvote.config import FuseSettings
 from mapvote.core.columns import flat_cells
 from mapvote.core.grid import CELLS, TILE_CELLS, Grid
@@ -22,26 +21,6 @@ from mapvote.fusion.loss_budget import Odds, folded
 from mapvote.fusion.sparse_columns import Words, agreeing, mark, mark_among, mark_spoken, union
 
 DAY_NS = 86_400_000_000_000
-
-
-class PackedPlanes(Protocol):
-    """A ballot's packed planes on one tile, as they travel (:class:`mapvote.codec.ballot.BallotTile`) and as a server
-    stores them."""
-
-    @property
-    def states(self) -> bytes | None: ...
-    @property
-    def tally(self) -> bytes | None: ...
-    @property
-    def gone(self) -> bytes | None: ...
-    @property
-    def new_points(self) -> bytes | None: ...
-    @property
-    def intensity(self) -> bytes | None: ...
-    @property
-    def free(self) -> bytes | None: ...
-    @property
-    def odds(self) -> bytes | None: ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,45 +56,21 @@ class TileVote:
             object.__setattr__(self, "states", read_only(self.states))
 
     @classmethod
-    def unpack(
-        cls,
-        planes: PackedPlanes,
-        vehicle: str = "",
-        end_ns: int = 0,
-        digest: str = "",
-        version: int = 0,
-        *,
-        sound: bool = False,
-    ) -> TileVote:
-        """The vote of a ballot on one tile; MapvoteError if a plane is damaged. ``sound``: a server admitted it, so it
-        was checked before."""
-        new_points, intensity = unpack_offer(
-            planes.new_points, planes.intensity, unpack_sound_points if sound else unpack_points
-        )
-        states = None if planes.states is None else (unpack_sound_states if sound else unpack_states)(planes.states)
-        sureness = unpack_sureness(planes.odds, states)
+    def of(cls, planes: Planes, vehicle: str = "", end_ns: int = 0, digest: str = "", version: int = 0) -> TileVote:
+        """The vote of a ballot on one tile."""
         return cls(
             vehicle=vehicle,
             end_ns=end_ns,
             digest=digest,
-            states=states,
-            tally=None if planes.tally is None else unpack_tally(planes.tally),
-            gone=None if planes.gone is None else Words.unpack(planes.gone, "gone"),
-            new_points=new_points,
-            intensity=intensity,
-            free=None if planes.free is None else Words.unpack(planes.free, "free"),
-            odds=None if states is None else Odds.of(states, sureness),
+            states=planes.states,
+            tally=planes.tally,
+            gone=None if planes.gone is None else Words(*planes.gone),
+            new_points=planes.new_points,
+            intensity=planes.intensity,
+            free=None if planes.free is None else Words(*planes.free),
+            odds=None if planes.odds is None else Odds(*planes.odds),
             version=version,
         )
-
-    @property
-    def nbytes(self) -> int:
-        """Bytes of all planes."""
-        planes: list[NDArray[Any] | None] = [self.states, self.tally, self.new_points, self.intensity]
-        for words in (self.gone, self.free):
-            planes += [] if words is None else [words.cells, words.words]
-        planes += [] if self.odds is None else [self.odds.cells, self.odds.steps]
-        return sum(plane.nbytes for plane in planes if plane is not None)
 
     @property
     def sent(self) -> U8 | None:
@@ -130,10 +85,7 @@ class TileVote:
 
     def spoken(self) -> Bool:
         """(256, 256) where this vote has a state."""
-        if self.states is not None:
-            return self.states != NO_VOTE
-        assert self.tally is not None
-        return np.asarray(self.tally.any(axis=-1))
+        return spoken_cells(self.states, self.tally)
 
     def supports(self, state: CellState, cells: NDArray[np.intp]) -> Bool:
         """(n,) at which of the flat ``cells`` this vote is, or in one stage also counts, for ``state``."""

@@ -28,8 +28,7 @@ from pathlib import Path
 import msgspec
 
 from mapvote.client import MapClient
-from mapvote.codec.ballot import Ballot, decode, encode
-from mapvote.codec.path import path_near
+from mapvote.codec.ballot import Ballot, decode, encode, path_near
 from mapvote.core.types import MapvoteError
 from mapvote.formats.atomic import whole_file
 from mapvote.vehicle import stretch_name

@@ -15,7 +15,7 @@ from fastapi.testclient import TestClient
 from msgspec.structs import replace
 
 from hand_made import make_ballot, make_map, two_walls
-from mapvote.codec.path import pack_path
+from mapvote.codec.ballot import pack_path
 from mapvote.config import FuseSettings
 from mapvote.core.tile import Tile
 from mapvote.core.types import CellState

@@ -8,7 +8,7 @@ from collections.abc import AsyncIterator
 import pytest
 
 from mapvote.server.errors import TooLarge, TooMany, Unavailable
-from mapvote.server.http.limits import RateLimit, Uploads
+from mapvote.server.http.services import RateLimit, Uploads
 
 
 class Slow:

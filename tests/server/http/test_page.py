@@ -19,7 +19,7 @@ from msgspec.structs import replace
 from chromium import Chromium, program
 from hand_made import Say, make_ballot, make_map, make_tile, states_plane, wall
 from live_server import serving
-from mapvote.codec.path import pack_path
+from mapvote.codec.ballot import pack_path
 from mapvote.config import FuseSettings
 from mapvote.core.types import CellState
 from mapvote.server.http.app import create_app

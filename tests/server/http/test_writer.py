@@ -6,7 +6,7 @@ import asyncio
 import threading
 from collections.abc import Sequence
 
-from mapvote.server.http.limits import Batcher
+from mapvote.server.http.services import Batcher
 
 
 class Ledger:

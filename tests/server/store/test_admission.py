@@ -10,8 +10,7 @@ import pytest
 from hand_made import Say, make_ballot, states_plane, two_walls, wall
 from mapvote.codec.ballot import Ballot, encode
 from mapvote.core.types import CellState, MapvoteError
-from mapvote.server.store.admission import accept, examine
-from mapvote.server.store.ballots import Receipt
+from mapvote.server.store.admission import Receipt, accept, examine
 from mapvote.server.store.store import Store
 
 

@@ -19,9 +19,8 @@ from pypcd4 import PointCloud
 from hand_made import Say, make_ballot, states_plane, wall
 from mapvote.cli.files import follow_once
 from mapvote.client import MapClient
-from mapvote.codec.ballot import Ballot
+from mapvote.codec.ballot import Ballot, pack_points, unpack_points
 from mapvote.codec.fields import FIELD_TYPES, pack_fields, unpack_fields
-from mapvote.codec.points import pack_points, unpack_points
 from mapvote.codec.tile_planes import pack_tile
 from mapvote.config import FuseSettings
 from mapvote.core import lazy_tiles

@@ -12,7 +12,7 @@ from mapvote.core.types import CellState, MapvoteError
 from mapvote.fusion.tile_vote import DAY_NS
 from mapvote.server.errors import NotFound, Unauthorised
 from mapvote.server.store import keys
-from mapvote.server.store.admission import Intake, Sent, sound
+from mapvote.server.store.admission import Intake, examine
 from mapvote.server.store.publish import preview, publish
 from mapvote.server.store.replay import replay
 from mapvote.server.store.store import Store
@@ -104,7 +104,7 @@ def test_what_a_revoked_vehicle_took_part_in_stays_published_and_can_be_replayed
 
 def test_a_ballot_on_its_way_while_its_key_is_revoked_is_refused(store: Store) -> None:
     secret, intake = keys.issue(store, "v1", "vehicle"), Intake(store)
-    decoded = sound(Sent(encode(takes_the_wall_down("v1")), "v1", "d1", keys.hash_of(secret)))
+    decoded = examine(encode(takes_the_wall_down("v1")), key_hash=keys.hash_of(secret))
     keys.revoke(store, "v1")
     (answer,) = intake.write([decoded])
     assert isinstance(answer, Unauthorised)

@@ -10,8 +10,7 @@ from mapvote.core.types import CellState
 from mapvote.fusion.tile_vote import DAY_NS
 from mapvote.server.errors import TooMany
 from mapvote.server.http.schemas import refuse
-from mapvote.server.store.admission import Intake, Quota, examine
-from mapvote.server.store.ballots import Incoming, Receipt
+from mapvote.server.store.admission import Incoming, Intake, Quota, Receipt, examine
 from mapvote.server.store.store import Store
 from standing_clock import Clock
 
@@ -35,7 +34,7 @@ def test_so_many_drives_a_day_each_vehicle_for_itself_and_a_restart_forgets_noth
         assert refuse(refused).headers["retry-after"] == "3600", "it is counted again once an hour"
         (repeated,) = again.write([drive("a", "d0")])
         assert isinstance(repeated, Receipt)
-        assert repeated.repeated
+        assert repeated.result == "repeated"
     assert isinstance(intake.write([drive("b", "d0")])[0], Receipt)
     clock.now += DAY_NS + 1
     assert isinstance(intake.write([drive("a", "d3")])[0], Receipt)

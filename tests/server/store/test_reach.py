@@ -10,8 +10,7 @@ from hand_made import Say, make_ballot, states_plane, two_walls
 from mapvote.codec.ballot import encode
 from mapvote.core.grid import TileIndex
 from mapvote.core.types import CellState
-from mapvote.server.store.admission import examine, refuse_out_of_reach
-from mapvote.server.store.ballots import Votes
+from mapvote.server.store.admission import Votes, examine, refuse_out_of_reach
 
 MAP = {(0, 0), (0, 1)}
 

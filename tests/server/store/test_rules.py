@@ -19,6 +19,7 @@ from mapvote.fusion import fuse
 from mapvote.fusion.distrust import Copy
 from mapvote.fusion.tile_vote import TileVote
 from mapvote.server.store import schema, votes
+from mapvote.server.store.database import remembered
 from mapvote.server.store.store import Store
 from standing_clock import Clock
 
@@ -46,8 +47,9 @@ def test_what_was_read_before_changes_nothing_that_is_decided(
     seed: int, sqlite_stores: MakeStore, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     written = []
-    for most_bytes in (0, 300_000, votes.REMEMBERED_BYTES):  # nothing, a few votes, all
-        monkeypatch.setattr(votes, "remembered", votes.Remembered(most_bytes))
+    for most_bytes in (0, 300_000, remembered.most_bytes):  # nothing, a few votes, all
+        remembered.clear()
+        monkeypatch.setattr(remembered, "most_bytes", most_bytes)
         stores: list[Store] = []
         live(seed, lambda clock, stores=stores: stores.append(sqlite_stores(clock)) or stores[0], 25)  # type: ignore
         with stores[0].database.reading() as connection:

@@ -19,7 +19,6 @@ from mapvote.core.types import U64, CellState, MapvoteError
 from mapvote.fusion.offline import update_map
 from mapvote.fusion.tile_vote import DAY_NS
 from mapvote.server.errors import Conflict, Held, NotFound, Unavailable
-from mapvote.server.store.ballots import withdraw
 from mapvote.server.store.policy import (
     GatePolicy,
     Policy,
@@ -28,6 +27,7 @@ from mapvote.server.store.policy import (
 )
 from mapvote.server.store.publish import preview, publish, rollback
 from mapvote.server.store.store import Store
+from mapvote.server.store.votes import withdraw
 from mapvote.server.views.explain import explain_cell
 from stores import send
 
@@ -100,11 +100,11 @@ def test_an_unknown_version_is_an_error_not_an_empty_list(store: Store) -> None:
 def test_sending_twice_is_harmless_and_sending_again_replaces(store: Store) -> None:
     base = store.point_map()
     first = says(base, "a", EMPTY, drive="d")
-    assert send(store, first)[0].created
-    assert send(store, first)[0].repeated
+    assert send(store, first)[0].result == "created"
+    assert send(store, first)[0].result == "repeated"
     send(store, says(base, "b", EMPTY))
     again = send(store, says(base, "a", KEEPS, drive="d"))[0]
-    assert (again.created, again.repeated) == (False, False)
+    assert again.result == "replaced"
     assert not publish(store, POLICY).published
 
 

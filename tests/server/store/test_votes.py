@@ -12,14 +12,13 @@ import numpy as np
 import pytest
 
 from hand_made import SETTINGS, Say, make_ballot, states_plane, two_walls, wall, words_plane
-from mapvote.codec.points import pack_points, unpack_points
+from mapvote.codec.ballot import pack_points, unpack_points
 from mapvote.config import FuseSettings
 from mapvote.core.grid import TileIndex
 from mapvote.core.tile_history import Memory
 from mapvote.core.types import NO_VOTE, CellState
 from mapvote.fusion.tile_vote import DAY_NS, TileVote
 from mapvote.server.store import reviews
-from mapvote.server.store.ballots import withdraw
 from mapvote.server.store.integrity import ballot_name
 from mapvote.server.store.policy import Policy, RoundPolicy
 from mapvote.server.store.queries import Version
@@ -31,6 +30,7 @@ from mapvote.server.store.votes import (
     read_votes,
     recent_votes,
     standing_tiles,
+    withdraw,
 )
 from standing_clock import Clock
 from stores import send

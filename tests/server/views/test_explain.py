@@ -19,12 +19,12 @@ from mapvote.core.voting import VOTE_UNIT
 from mapvote.fusion.fuse import decide_tile
 from mapvote.fusion.tile_vote import DAY_NS
 from mapvote.server.store import schema
-from mapvote.server.store.ballots import withdraw
 from mapvote.server.store.decisions import REASONS, unpack_tally_plane
 from mapvote.server.store.keys import issue, revoke
 from mapvote.server.store.policy import Policy, RoundPolicy
 from mapvote.server.store.publish import preview, publish
 from mapvote.server.store.store import Store
+from mapvote.server.store.votes import withdraw
 from mapvote.server.views import explain
 from mapvote.server.views.events import last_events
 from mapvote.server.views.explain import CellDecision, CellStory, LeftOut, evidence, explain_cell

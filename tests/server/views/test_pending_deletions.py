@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from hand_made import Say, make_ballot, make_map, make_tile, states_plane, two_walls
-from mapvote.codec.odds import MOST, STEPS
+from mapvote.codec.ballot import MOST_STEPS, STEPS_PER_NAT
 from mapvote.config import FuseSettings
 from mapvote.core.types import CellState, MapvoteError
 from mapvote.fusion.loss_budget import change_probability
@@ -25,7 +25,7 @@ from mapvote.server.views.history import changes_between
 from stores import WALL, send, wall_gone
 
 BUDGET = Policy(fuse=FuseSettings(max_deleted_share=1.0, false_deletions=0.01))
-SURE, UNSURE = [20, 20, 20], [20, -MOST, 20]
+SURE, UNSURE = [20, 20, 20], [20, -MOST_STEPS, 20]
 
 
 @pytest.fixture
@@ -99,7 +99,7 @@ def test_how_sure_they_were_is_told_of_cells_and_changes_and_outlives_the_round(
     assert publish(store).deleted == 9
     story = middle(store)
     assert [vote.sure for vote in story.votes] == [
-        pytest.approx(1 / (1 + np.exp(-steps / STEPS)), abs=1e-4) for steps in (20, 5)
+        pytest.approx(1 / (1 + np.exp(-steps / STEPS_PER_NAT)), abs=1e-4) for steps in (20, 5)
     ]
     one = np.ones(1, np.int64)
     told = change_probability(

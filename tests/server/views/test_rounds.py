@@ -18,10 +18,10 @@ from mapvote.core.point_map import PointMap
 from mapvote.core.types import CellState
 from mapvote.server.errors import Held
 from mapvote.server.store import fusion_jobs
-from mapvote.server.store.ballots import withdraw
 from mapvote.server.store.policy import Policy
 from mapvote.server.store.publish import preview, publish
 from mapvote.server.store.store import Store
+from mapvote.server.store.votes import withdraw
 from mapvote.server.views.desk import desk, review
 from standing_clock import Clock
 from stores import send

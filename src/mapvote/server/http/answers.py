@@ -71,16 +71,6 @@ class Versions(Answer):
     versions: list[DatedVersion]
 
 
-class Stored(Answer):
-    """A ballot is on disk."""
-
-    vehicle: str
-    drive: str
-    result: Literal["created", "replaced", "repeated"] = Field(
-        description="repeated: the very same ballot stood already"
-    )
-
-
 class Withdrawn(Answer):
     """Number of ballots."""
 

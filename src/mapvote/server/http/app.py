@@ -20,17 +20,14 @@ from mapvote.server.http import (
     cloud_routes,
     desk_routes,
     event_routes,
-    health_routes,
     operator_routes,
     pages,
     vehicle_routes,
 )
 from mapvote.server.http.event_routes import deliver
-from mapvote.server.http.health_routes import Probe
-from mapvote.server.http.limits import READING
 from mapvote.server.http.schemas import unreadable
-from mapvote.server.http.security import Guard, Hosts, Watch
-from mapvote.server.http.services import Services, make_services
+from mapvote.server.http.security import Guard, Hosts, Probe, Watch
+from mapvote.server.http.services import READING, Services, make_services
 from mapvote.server.store.round import Gate
 from mapvote.server.store.store import Store
 
@@ -41,7 +38,6 @@ ROUTES = (
     desk_routes,
     cloud_routes,
     event_routes,
-    health_routes,
     pages,
 )
 

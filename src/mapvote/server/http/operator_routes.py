@@ -1,4 +1,4 @@
-"""Routes of operators: publish, roll back, see what changed and why; keys, retention, integrity."""
+"""Routes of operators: publish, roll back, see what changed and why; keys, retention, integrity, health."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from typing import Annotated, Literal, cast
 import structlog
 from anyio import to_thread
 from fastapi import APIRouter, Query, Request, Response
+from prometheus_client import generate_latest
 
 from mapvote.codec.ballot import tile_key
 from mapvote.core.types import MapvoteError
@@ -23,6 +24,7 @@ from mapvote.server.http.answers import (
     Checked,
     ClearedAnswer,
     Coverage,
+    Health,
     Info,
     KeyIssued,
     KeysAnswer,
@@ -31,6 +33,7 @@ from mapvote.server.http.answers import (
     PolicyAnswer,
     Published,
     Publishes,
+    Ready,
     Restored,
     RolledBack,
     Running,
@@ -60,13 +63,13 @@ from mapvote.server.http.schemas import (
 from mapvote.server.http.security import operator, reviewer, sees_names
 from mapvote.server.http.services import Services, services
 from mapvote.server.store import keys
-from mapvote.server.store.ballots import withdraw
-from mapvote.server.store.integrity import check, restore_plane
+from mapvote.server.store.integrity import check, restore_plane, set_aside
 from mapvote.server.store.publish import Outcome, preview, publish, rollback
 from mapvote.server.store.queries import log_event
 from mapvote.server.store.replay import replay
 from mapvote.server.store.retention import Cleared, clear
 from mapvote.server.store.store import Store
+from mapvote.server.store.votes import withdraw
 from mapvote.server.views.consensus import contradictions, standing_rows, vehicle_standings
 from mapvote.server.views.coverage import as_features, tiles_seen, wanted_passes
 from mapvote.server.views.explain import explain_cell, seen
@@ -379,3 +382,45 @@ def revoke_keys(request: Request, ask: RevokeAsk) -> KeysRevoked:
     by, store = operator(request), services(request).store
     revoked, ballots = keys.revoke(store, ask.name, by=by, keep_votes=ask.keep_votes)
     return KeysRevoked(revoked=revoked, ballots=ballots)
+
+
+_NAMED = 20
+"""Damaged things that /readyz names; the log has all."""
+
+
+def _damaged(store: Store) -> list[str]:
+    """The items in quarantine, as "kind name: why"."""
+    with store.database.reading() as connection:
+        return [f"{kind} {name}: {why}" for (kind, name), why in sorted(set_aside(connection).items())]
+
+
+@router.get("/livez", responses=problems(), response_class=Response, summary="Does the server answer?")
+async def live() -> Response:
+    """200 without content. Neither this nor `/readyz` needs a key; without a key `/readyz` has no content either."""
+    return Response()
+
+
+@router.get("/healthz", responses=problems(), summary="Can the store be read?")
+async def health(request: Request) -> Health:
+    """200 with the newest version, 503 if the database does not answer."""
+    return Health(status="ok", version=await services(request).newest.put(None))
+
+
+@router.get("/readyz", responses=problems(), summary="Can ballots be taken in?")
+async def ready(request: Request) -> Ready:
+    """200 if the database can be written now; 503 with its error if not, or if the server is stopping.
+
+    ``quarantine`` names damaged ballots and planes that were set aside. Everything else goes on.
+    """
+    parts = services(request)
+    version, damaged = await parts.check_ready(), await parts.look_up(_damaged)
+    return Ready(status="ready", version=version, quarantine=damaged[:_NAMED], quarantined=len(damaged))
+
+
+@router.get("/metrics", responses=problems(), response_class=Response, summary="Prometheus metrics")
+async def metrics(request: Request) -> Response:
+    """Counters, latencies, the newest version."""
+    parts = services(request)
+    parts.metrics.version.set(await parts.newest.put(None))
+    parts.metrics.tell_damaged(await parts.look_up(_damaged))
+    return Response(generate_latest(parts.metrics.registry), media_type="text/plain; version=0.0.4; charset=utf-8")

@@ -13,20 +13,19 @@ import binascii
 import ipaddress
 import re
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Awaitable, Callable, Iterable, Sequence
 from concurrent.futures import Executor
 from functools import lru_cache, partial
 
 import structlog
 from fastapi import Request
+from starlette.responses import Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from mapvote.core.types import MapvoteError
 from mapvote.server.errors import Forbidden, TooMany, Unauthorised, Unavailable
-from mapvote.server.http.health_routes import Probe
-from mapvote.server.http.limits import Batcher, RateLimit
 from mapvote.server.http.schemas import refuse
-from mapvote.server.http.services import Metrics, services
+from mapvote.server.http.services import Batcher, Metrics, RateLimit, services
 from mapvote.server.store import keys
 from mapvote.server.store.store import Store
 
@@ -207,6 +206,36 @@ def _is_address(name: str) -> bool:
     except ValueError:
         return False
     return True
+
+
+_PROBE_S = 1.0
+
+
+class Probe:
+    """``/livez`` and ``/readyz`` for requests without a key, by any name of the server: a status without content.
+
+    ``ready`` raises Unavailable if no ballot can be taken now. It is called at most once a second.
+    """
+
+    PATHS = ("/livez", "/readyz")
+
+    def __init__(self, ready: Callable[[], Awaitable[object]]) -> None:
+        self._ready = ready
+        self._until, self._status = 0.0, 503
+
+    async def answer(self, path: str) -> Response:
+        """200, or 503 where the server is not ready."""
+        if path == "/livez":
+            return Response(status_code=200)
+        now = time.monotonic()
+        if now >= self._until:
+            self._until = now + _PROBE_S
+            try:
+                await self._ready()
+                self._status = 200
+            except Unavailable:
+                self._status = 503
+        return Response(status_code=self._status)
 
 
 log = structlog.get_logger("mapvote")

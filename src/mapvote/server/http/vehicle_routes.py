@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable, Coroutine
+from functools import partial
 from typing import Any
 
 import msgspec
@@ -16,7 +17,7 @@ from fastapi.routing import APIRoute
 
 from mapvote.codec.arrays import unpack_bytes
 from mapvote.codec.tile_planes import MAX_PLANE_BYTES
-from mapvote.server.http.answers import ManifestAnswer, Stored, Versions, Withdrawn
+from mapvote.server.http.answers import ManifestAnswer, Versions, Withdrawn
 from mapvote.server.http.schemas import (
     AS_CSV,
     Digest,
@@ -31,8 +32,8 @@ from mapvote.server.http.schemas import (
 )
 from mapvote.server.http.security import own
 from mapvote.server.http.services import services
-from mapvote.server.store.admission import Sent, sound
-from mapvote.server.store.ballots import withdraw
+from mapvote.server.store.admission import Receipt, examine
+from mapvote.server.store.votes import withdraw
 
 _AS_YOU_HAVE: dict[int | str, dict[str, Any]] = {304: {"description": "as you have"}}
 router = APIRouter()
@@ -150,13 +151,12 @@ async def vote(request: Request, vehicle: Name, drive: Name) -> Response:
     own(request, vehicle)
     parts = services(request)
     body = await parts.uploads.read(vehicle, request.stream(), request.headers.get("content-length"))
-    sent = Sent(body, vehicle, drive, request.state.key_hash)
-    incoming = await asyncio.get_running_loop().run_in_executor(parts.threads.ballots, sound, sent)
+    work = partial(examine, body, (vehicle, drive), request.state.key_hash)
+    incoming = await asyncio.get_running_loop().run_in_executor(parts.threads.ballots, work)
     receipt = await parts.writer.put(incoming)
-    result = "repeated" if receipt.repeated else "created" if receipt.created else "replaced"
-    parts.metrics.ballots.labels(result).inc()
-    answer = msgspec.json.encode({"vehicle": vehicle, "drive": drive, "result": result})
-    return Response(answer, 201 if receipt.created else 200, media_type="application/json")
+    parts.metrics.ballots.labels(receipt.result).inc()
+    created = receipt.result == "created"
+    return Response(msgspec.json.encode(receipt), 201 if created else 200, media_type="application/json")
 
 
 router.add_api_route(
@@ -164,8 +164,8 @@ router.add_api_route(
     vote,
     methods=["PUT"],
     route_class_override=BallotRoute,
-    response_model=Stored,
-    responses=problems(403, 409, 413, 429) | {201: {"model": Stored}},
+    response_model=Receipt,
+    responses=problems(403, 409, 413, 429) | {201: {"model": Receipt}},
     openapi_extra={"requestBody": {"required": True, "content": _BYTES}},
     summary="Vote",
 )

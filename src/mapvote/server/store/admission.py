@@ -1,5 +1,6 @@
-"""Admission of ballots. ``examine`` decodes a ballot and checks it without a database. ``Intake`` checks it against the
-map, the policy and the quota of its vehicle, within the transaction that writes it.
+"""Admission of ballots. :func:`examine` decodes a ballot and unpacks its planes, beside others and without a database.
+:class:`Intake` checks it against the map, the policy and the quota of its vehicle, within the transaction that writes
+it: idempotent, one standing ballot per drive, nothing overwritten.
 
 Where a vehicle can have been is checked too: near the map, on one path, at heights that the map allows.
 """
@@ -7,29 +8,24 @@ Where a vehicle can have been is checked too: near the map, on one path, at heig
 from __future__ import annotations
 
 import hashlib
-import threading
-from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import partial
-from typing import NamedTuple
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Literal
 
 import numpy as np
 import sqlalchemy as sa
 
-from mapvote.codec.ballot import Ballot, decode, tile_key
+from mapvote.codec.ballot import Ballot, BallotTile, Planes, check_path, decode, tile_key, unpack_planes
 from mapvote.codec.manifest import TileHashes
-from mapvote.codec.path import check_path
 from mapvote.codec.tile_planes import unpack_ground_plane
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, TileIndex
 from mapvote.core.types import F64, Bool, MapvoteError
-from mapvote.fusion.fuse import rule_of
-from mapvote.fusion.tile_vote import DAY_NS, TileVote
+from mapvote.fusion.tile_vote import DAY_NS
 from mapvote.server.errors import Conflict, TooMany, Unauthorised, Unavailable
 from mapvote.server.store import keys, schema
-from mapvote.server.store.ballots import Incoming, Receipt, Votes, write_ballots
-from mapvote.server.store.policy import RoundPolicy, policy_in
+from mapvote.server.store.database import insert_rows, remembered, sum_of
+from mapvote.server.store.policy import policy_in
 from mapvote.server.store.queries import (
-    current_number,
     load_blob,
     load_memory,
     memory_of,
@@ -53,55 +49,89 @@ MISFIT_SLACK_M = 1.0
 """A drive whose fixes lie steadily farther off its priors is held back: its clock, its GNSS or its place is wrong."""
 
 
-class Sent(NamedTuple):
-    """An upload: the ballot's bytes, vehicle and drive of its URL, and the hash of the key that sent it."""
+@dataclass(frozen=True, slots=True)
+class Votes:
+    """What admission needs of a ballot's votes on one tile."""
 
-    data: bytes
+    tile: TileIndex
+    spoken: bytes
+    """The cells that it votes on: 65536 bits, row by row."""
+    lowest_m: float | None = None
+    """Height of its lowest new point, map metres; None: it brings none."""
+    highest_m: float | None = None
+    stored: tuple[Any, ...] = field(default=(), repr=False)
+    """Base, planes and sum, as the last columns of ``ballot_tiles``."""
+
+
+@dataclass(frozen=True, slots=True)
+class Incoming:
+    """A ballot that is sound in itself."""
+
+    ballot: Ballot
+    votes: Sequence[Votes]
+    """The votes on each of its tiles."""
+    digest: str
+    """SHA-256 of the bytes that the vehicle sent."""
+    cast_by: str
+    """Method and stage: all ballots of a round agree on them."""
+    size: int
+    """Bytes."""
+    key_hash: str | None = None
+    """Hash of the key that sent the ballot; None: a client of this machine that needs none."""
+
+    @property
+    def drive(self) -> tuple[str, str]:
+        """(vehicle, drive)."""
+        return self.ballot.vehicle, self.ballot.drive
+
+
+@dataclass(frozen=True, slots=True)
+class Receipt:
+    """A ballot is on disk."""
+
     vehicle: str
     drive: str
-    key_hash: str | None
+    result: Literal["created", "replaced", "repeated"]
+    """``replaced``: this drive had a standing ballot before. ``repeated``: the identical one stood already, nothing was
+    written."""
+    seq: int
+    """Its number in the log."""
 
 
-def examine(data: bytes) -> Incoming:
-    """Decode a ballot and unpack every plane, once; MapvoteError on the first defect. Touches no database."""
+def examine(data: bytes, drive: tuple[str, str] | None = None, key_hash: str | None = None) -> Incoming:
+    """Decode a ballot and unpack every plane, once; MapvoteError on the first defect, or if it is of another ``drive``
+    (vehicle, drive) than its URL. The key is not checked."""
     ballot = decode(data)
     if not ballot.tiles:
         raise MapvoteError("ballot: votes on no tile")
     _check_founded(ballot)
-    rule_of(ballot.method)
     if any((tile.states is None) != (ballot.tiles[0].states is None) for tile in ballot.tiles):
         raise MapvoteError("ballot: some tiles hold states and some a tally; a ballot is either two-stage or one-stage")
     if ballot.path is not None:
         check_path(ballot.path, [tile.tile for tile in ballot.tiles])
     votes, size = [], 0
     for tile in ballot.tiles:
-        vote = TileVote.unpack(tile)
-        size += vote.nbytes
+        planes = unpack_planes(tile)
+        size += planes.nbytes
         if size > MAX_UNPACKED_BYTES:
             raise MapvoteError(
                 f"ballot: larger than {MAX_UNPACKED_BYTES} bytes when decompressed; send a shorter drive"
             )
-        votes.append(_votes_of(tile.tile, vote))
+        votes.append(_votes_of(tile, ballot.base[tile_key(tile.tile)], planes))
     cast_by = f"{ballot.method}, {ballot.stage}"
-    return Incoming(ballot, votes, hashlib.sha256(data).hexdigest(), cast_by, len(data))
+    incoming = Incoming(ballot, votes, hashlib.sha256(data).hexdigest(), cast_by, len(data), key_hash)
+    if drive not in (None, incoming.drive):
+        raise MapvoteError(f"the ballot is of {'/'.join(incoming.drive)}, not {drive[0][:64]}/{drive[1][:64]}")
+    return incoming
 
 
-def sound(sent: Sent) -> Incoming:
-    """A ballot decoded; MapvoteError if it is unsound, or of another vehicle or drive than its URL. The key is not
-    checked."""
-    incoming = examine(sent.data)
-    if incoming.drive != (sent.vehicle, sent.drive):
-        address = f"{sent.vehicle[:64]}/{sent.drive[:64]}"
-        raise MapvoteError(f"the ballot is of {'/'.join(incoming.drive)}, not {address}")
-    return replace(incoming, key_hash=sent.key_hash)
-
-
-def _votes_of(tile: TileIndex, vote: TileVote) -> Votes:
-    spoken = np.packbits(vote.spoken()).tobytes()
-    if vote.new_points is None or not len(vote.new_points):
-        return Votes(tile, spoken, None, None)
-    heights = vote.new_points[:, 2]
-    return Votes(tile, spoken, float(heights.min()), float(heights.max()))
+def _votes_of(tile: BallotTile, base: str, planes: Planes) -> Votes:
+    packed = base, *(getattr(tile, plane) for plane in schema.BALLOT_PLANES)
+    digest = sum_of(*packed)
+    remembered.put(digest, planes)
+    heights = np.empty(0) if planes.new_points is None else planes.new_points[:, 2]
+    low, high = (float(heights.min()), float(heights.max())) if len(heights) else (None, None)
+    return Votes(tile.tile, np.packbits(planes.spoken()).tobytes(), low, high, (*packed, digest))
 
 
 def _check_founded(ballot: Ballot) -> None:
@@ -122,61 +152,84 @@ def _check_founded(ballot: Ballot) -> None:
 
 
 class Intake:
-    """Admits ballots to a store: what fits the map is decided within the transaction that writes it. Remembers the
-    newest version's tiles.
-
-    ``quota``: what one vehicle may leave in the store; None: as much as it likes.
-    """
+    """Admits ballots to a store, one batch at a time. ``quota``: what one vehicle may leave there; None: no limit."""
 
     def __init__(self, store: Store, quota: Quota | None = None) -> None:
-        self._store = store
-        self._quotas = None if quota is None else Quotas(quota)
-        self._current: tuple[int, Mapping[TileIndex, TileHashes]] = (0, {})
-        self._lowest = LowestGround()
+        self._store, self._quota = store, quota
+        self._used: dict[str, _Used] = {}
+        self._newest, self._tiles = 0, dict[TileIndex, TileHashes]()
+        """The newest version, and its tiles."""
+        self._policy, self._cast_by, self._settings_hash = 0, "", ""
+        """Number of the policy, and what it asks of a round's ballots."""
+        self._lowest_m: dict[str, float] = {}
+        """Lowest ground of a tile, by its plane's hash."""
 
     def write(self, ballots: Sequence[Incoming]) -> list[Receipt | MapvoteError]:
-        """Store the ballots that are admitted, in one durable transaction: a receipt, or why not.
+        """Store the ballots that are admitted, in one durable transaction: for each a receipt, or why not.
 
         Conflict: another map, method, settings or base than the store's, or no cell that still counts. Unauthorised:
         its key was revoked meanwhile. TooMany: beyond its vehicle's quota. MapvoteError: from the future, or from where
-        its vehicle cannot have been. Unavailable is raised for all.
+        its vehicle cannot have been. Unavailable is raised for all. A ballot that is stored already is not judged
+        again, so a vehicle that got no answer may send it again.
         """
         if not ballots:
             return []
         now = self._store.clock()
+        results: list[Receipt | MapvoteError] = []
         with self._store.database.writing() as connection:
-            newest = current_number(connection)
-            self._current = newest, _brought_up(connection, newest, *self._current)
-            asked = policy_in(connection).round
+            newest, policy, seq = connection.execute(_HEAD).one()
+            self._catch_up(connection, newest, policy)
             came_with = {ballot.key_hash for ballot in ballots if ballot.key_hash is not None}
-            valid = keys.of(connection, came_with, now)
+            valid = keys.of(connection, came_with, now) if came_with else {}
+            first, standing = _heard_of(connection, ballots)
+            rows = _Rows()
+            for one in ballots:
+                old, old_digest = standing.get(one.drive, (None, ""))
+                if old is not None and old_digest == one.digest:
+                    results.append(Receipt(*one.drive, "repeated", old))
+                    continue
+                known = one.key_hash is None or one.key_hash in valid
+                why = self._refusal(connection, one, now) if known else Unauthorised(keys.UNKNOWN)
+                if why is not None:
+                    results.append(why)
+                    continue
+                seq += 1
+                rows.add(one, seq, first.setdefault(one.drive, seq), now, old)
+                standing[one.drive] = seq, one.digest
+                results.append(Receipt(*one.drive, "created" if old is None else "replaced", seq))
+            rows.insert(connection)
+        return results
 
-            def refusal(one: Incoming) -> MapvoteError | None:
-                if _unknown(one.key_hash, valid):
-                    return Unauthorised(keys.UNKNOWN)
-                misfit = _unlike(asked, one) or self._misfit(connection, one, now)
-                if misfit is None and self._quotas is not None:
-                    return self._quotas.refusal(connection, one, now)
-                return misfit
+    def _catch_up(self, connection: sa.Connection, newest: int, policy: int) -> None:
+        """Read what has changed of the map and the policy since the last ballots."""
+        if policy != self._policy:
+            asked = policy_in(connection).round
+            self._policy, self._cast_by, self._settings_hash = policy, asked.cast_by, asked.settings_hash
+        if newest != self._newest:
+            touched = tiles_set_between(connection, self._newest, newest) if self._newest else None
+            for index in touched or ():
+                self._tiles.pop(index, None)
+            self._tiles |= tiles_of(connection, newest, touched)
+            self._newest = newest
 
-            return write_ballots(connection, ballots, now, refusal)
-
-    def _misfit(self, connection: sa.Connection, one: Incoming, now: int) -> MapvoteError | None:
-        """Why a ballot does not fit the map as it is; None if it does."""
-        ballot, (newest, current) = one.ballot, self._current
+    def _refusal(self, connection: sa.Connection, one: Incoming, now: int) -> MapvoteError | None:
+        """Why a ballot does not fit the round, the map as it is, or its vehicle's quota; None if it does."""
+        ballot, newest = one.ballot, self._newest
+        if self._cast_by != one.cast_by or not ballot.settings_hash.startswith(self._settings_hash):
+            return self._unlike(one)
         if ballot.map_id != self._store.map_id:
             return Conflict(f"this server keeps map {self._store.map_id!r}, the ballot votes on {ballot.map_id!r}")
-        impossible = self._wrong_time(ballot, now) or refuse_out_of_reach(one.votes, current.keys())
-        impossible = impossible or refuse_out_of_height(one.votes, current, partial(self._lowest.look_up, connection))
+        impossible = self._wrong_time(ballot, now) or refuse_out_of_reach(one.votes, self._tiles.keys())
+        impossible = impossible or self._out_of_height(connection, one.votes)
         if impossible is not None:
             return impossible
         if ballot.version > newest:
             return Conflict(f"there is no version {ballot.version} yet; the newest is {newest}: fetch it")
         counts = ballot.version == newest
         for votes in one.votes:
-            base, now_there = ballot.base[tile_key(votes.tile)], current.get(votes.tile)
+            now_there = self._tiles.get(votes.tile)
             then = now_there if ballot.version == newest else tile_of(connection, ballot.version, votes.tile)
-            if base != ("" if then is None else then.points):
+            if ballot.base[tile_key(votes.tile)] != ("" if then is None else then.points):
                 known = f"the base of tile {tile_key(votes.tile)} is not that of version {ballot.version}"
                 return Conflict(f"{known}: fetch the map and vote again")
             counts = counts or _counts_somewhere(connection, votes, ballot.version, now_there)
@@ -185,7 +238,13 @@ class Intake:
             return Conflict(
                 f"every cell voted on has changed since version {ballot.version}: fetch tiles {stale} and vote again"
             )
-        return None
+        return None if self._quota is None else self._over_quota(connection, one, now, self._quota)
+
+    def _unlike(self, one: Incoming) -> Conflict:
+        theirs = f"{one.cast_by}, settings {one.ballot.settings_hash[:16]}"
+        ours = f"{self._cast_by}, settings {self._settings_hash[:16] or 'of any kind'}"
+        mend = "vote again with the fleet's configuration (mapvote config)"
+        return Conflict(f"this round votes by {ours}, the ballot by {theirs}: one round never mixes them; {mend}")
 
     def _wrong_time(self, ballot: Ballot, now: int) -> MapvoteError | None:
         if ballot.end_ns > now + MAX_CLOCK_AHEAD_NS:
@@ -194,40 +253,113 @@ class Intake:
             return MapvoteError("ballot: the drive ended before the map was surveyed; set the vehicle's clock")
         return None
 
+    def _out_of_height(self, connection: sa.Connection, votes: Sequence[Votes]) -> MapvoteError | None:
+        """Why a ballot brings points deeper or higher than anything on this map can be; None if it may.
 
-def _unknown(key_hash: str | None, valid: Collection[str]) -> bool:
-    """Whether a ballot came with a key that opens nothing; by a client of this machine it may come without one."""
-    return key_hash is not None and key_hash not in valid
-
-
-def _unlike(asked: RoundPolicy, incoming: Incoming) -> MapvoteError | None:
-    """Why a ballot does not fit the round that the policy asks for; None if it does."""
-    settings = incoming.ballot.settings_hash
-    if asked.cast_by == incoming.cast_by and settings.startswith(asked.settings_hash):
+        The nearest tiles tell: itself and its neighbours, else those in reach.
+        """
+        for one in votes:
+            if one.lowest_m is None or one.highest_m is None:
+                continue
+            near = _touched(one.tile, self._tiles) or [index for index in _around(one.tile) if index in self._tiles]
+            ground_m = min((self._ground_m(connection, self._tiles[index].ground) for index in near), default=np.inf)
+            low_m, high_m = ground_m - MAX_BELOW_M, ground_m + MAX_ABOVE_M
+            if np.isfinite(ground_m) and not low_m <= one.lowest_m <= one.highest_m <= high_m:
+                span = f"{one.lowest_m:.1f} to {one.highest_m:.1f} m on tile {tile_key(one.tile)}"
+                below = f"{MAX_BELOW_M:g} m below to {MAX_ABOVE_M:g} m above the map's lowest ground there"
+                return MapvoteError(
+                    f"new points at {span} are not within {below}, {ground_m:.1f} m: is the vehicle on this level?"
+                )
         return None
-    theirs = f"{incoming.cast_by}, settings {settings[:16]}"
-    ours = f"{asked.cast_by}, settings {asked.settings_hash[:16] or 'of any kind'}"
-    mend = "vote again with the fleet's configuration (mapvote config)"
-    return Conflict(f"this round votes by {ours}, the ballot by {theirs}: one round never mixes them; {mend}")
+
+    def _ground_m(self, connection: sa.Connection, ground: str) -> float:
+        """The lowest ground of a plane, map metres; inf where it is unknown, or its plane damaged."""
+        if ground not in self._lowest_m:
+            try:
+                plane = unpack_ground_plane(load_blob(connection, ground), ground)
+            except MapvoteError:
+                return np.inf
+            self._lowest_m[ground] = float(plane[np.isfinite(plane)].min(initial=np.inf))
+        return self._lowest_m[ground]
+
+    def _over_quota(self, connection: sa.Connection, one: Incoming, now: int, quota: Quota) -> MapvoteError | None:
+        """Why a ballot is too much of its vehicle; None lets it through and counts it. What a vehicle has used is
+        counted in the store once an hour and before a refusal, in between from what was let through."""
+        vehicle, tiles = one.ballot.vehicle, len(one.ballot.tiles)
+        if tiles > quota.tiles_a_drive:
+            limit = f"the drive votes on {tiles} tiles, the limit is {quota.tiles_a_drive}"
+            return MapvoteError(f"{limit}: send each part of it as a drive of its own")
+        used = self._used.get(vehicle)
+        if used is None or used.since_ns < now - _COUNTED_AGAIN_NS or _exceeded(quota, used, one) is not None:
+            used = self._used[vehicle] = _count(connection, vehicle, now)
+        why = _exceeded(quota, used, one)
+        if why is None:
+            used.ballots, used.size = used.ballots + 1, used.size + one.size
+        return why
 
 
-def _brought_up(
-    connection: sa.Connection, number: int, known: int, tiles: Mapping[TileIndex, TileHashes]
-) -> Mapping[TileIndex, TileHashes]:
-    """The tiles of a version, of those of an older one (0: none) and what was set since."""
-    if number == known:
-        return tiles
-    if known == 0:
-        return tiles_of(connection, number)
-    touched = tiles_set_between(connection, known, number)
-    changed = set(touched)
-    kept = {index: hashes for index, hashes in tiles.items() if index not in changed}
-    return kept | tiles_of(connection, number, touched)
+_HEAD = sa.select(
+    sa.select(sa.func.max(schema.versions.c.number)).scalar_subquery(),
+    sa.select(sa.func.max(schema.policies.c.seq)).scalar_subquery(),
+    sa.select(sa.func.max(schema.events.c.seq)).scalar_subquery(),
+)
+"""The newest version, policy and event."""
 
 
 def accept(store: Store, ballots: Sequence[Incoming]) -> list[Receipt | MapvoteError]:
     """:meth:`Intake.write`, once."""
     return Intake(store).write(ballots)
+
+
+def _heard_of(
+    connection: sa.Connection, ballots: Sequence[Incoming]
+) -> tuple[dict[tuple[str, str], int], dict[tuple[str, str], tuple[int, str]]]:
+    """For the drives of these ballots: ({drive: its first event}, {drive: (number, digest) of its standing ballot})."""
+    b = schema.ballots
+    drives = sa.tuple_(b.c.vehicle, b.c.drive).in_({incoming.drive for incoming in ballots})
+    query = sa.select(b.c.vehicle, b.c.drive, b.c.seq, b.c.first_seq, b.c.gone_seq, b.c.digest).where(drives)
+    first: dict[tuple[str, str], int] = {}
+    standing: dict[tuple[str, str], tuple[int, str]] = {}
+    for row in connection.execute(query.order_by(b.c.seq)):
+        first.setdefault((row.vehicle, row.drive), row.first_seq)
+        if row.gone_seq is None:
+            standing[row.vehicle, row.drive] = row.seq, row.digest
+    return first, standing
+
+
+@dataclass(slots=True)
+class _Rows:
+    """The rows of several ballots, each in the order of its table's columns."""
+
+    log: list[tuple[Any, ...]] = field(default_factory=list)
+    ballots: list[tuple[Any, ...]] = field(default_factory=list)
+    tiles: list[tuple[Any, ...]] = field(default_factory=list)
+    paths: list[tuple[Any, ...]] = field(default_factory=list)
+    replaced: list[dict[str, int]] = field(default_factory=list)
+
+    def add(self, incoming: Incoming, seq: int, first_seq: int, now: int, old: int | None) -> None:
+        """A ballot that replaces ``old``, if there is one."""
+        ballot = incoming.ballot
+        self.log.append((seq, now, "ballot", *incoming.drive))
+        times = ballot.start_ns, ballot.end_ns, now
+        how = ballot.settings_hash[:128], incoming.cast_by, incoming.size, ballot.version
+        self.ballots.append((seq, first_seq, None, *incoming.drive, incoming.digest, *times, *how))
+        self.tiles += [(*votes.tile, seq, *votes.stored) for votes in incoming.votes]
+        if ballot.path is not None:
+            self.paths.append((seq, ballot.path))
+        if old is not None:
+            self.replaced.append({"old": old, "by": seq})
+
+    def insert(self, connection: sa.Connection) -> None:
+        b = schema.ballots
+        for table, rows in (
+            (schema.events, self.log), (b, self.ballots), (schema.ballot_tiles, self.tiles), (schema.paths, self.paths)
+        ):  # fmt: skip
+            if rows:
+                insert_rows(connection, table, rows)
+        if self.replaced:
+            mark = b.update().where(b.c.seq == sa.bindparam("old")).values(gone_seq=sa.bindparam("by"))
+            connection.execute(mark, self.replaced)
 
 
 def _counts_somewhere(connection: sa.Connection, votes: Votes, version: int, now: TileHashes | None) -> bool:
@@ -276,40 +408,16 @@ class _Used:
     size: int
 
 
-class Quotas:
-    """What every vehicle has used of its quota: counted in the store once an hour and before a refusal, in between from
-    what was let through. For any number of threads."""
-
-    def __init__(self, quota: Quota) -> None:
-        self._quota = quota
-        self._lock = threading.Lock()
-        self._used: dict[str, _Used] = {}
-
-    def refusal(self, connection: sa.Connection, incoming: Incoming, now: int) -> MapvoteError | None:
-        """Why a ballot is too much of its vehicle; None lets it through and counts it."""
-        vehicle, tiles = incoming.ballot.vehicle, len(incoming.ballot.tiles)
-        if tiles > self._quota.tiles_a_drive:
-            limit = f"the drive votes on {tiles} tiles, the limit is {self._quota.tiles_a_drive}"
-            return MapvoteError(f"{limit}: send each part of it as a drive of its own")
-        with self._lock:
-            used = self._used.get(vehicle)
-            if used is None or used.since_ns < now - _COUNTED_AGAIN_NS or self._over(used, incoming) is not None:
-                used = self._used[vehicle] = _count(connection, vehicle, now)
-            refused = self._over(used, incoming)
-            if refused is None:
-                used.ballots, used.size = used.ballots + 1, used.size + incoming.size
-            return refused
-
-    def _over(self, used: _Used, incoming: Incoming) -> MapvoteError | None:
-        vehicle, quota = incoming.ballot.vehicle, self._quota
-        if used.ballots >= quota.drives_a_day:
-            said = f"{vehicle!r} has sent {used.ballots} drives in 24 hours, its limit: try again tomorrow"
-            return TooMany(said, _COUNTED_AGAIN_NS / 1e9)
-        if used.size + incoming.size > quota.stored_bytes:
-            full = f"the ballots of {vehicle!r} would take more than {quota.stored_bytes:,} bytes in the store"
-            mend = "ask the operator to clear old ones away, or for a larger quota"
-            return TooMany(f"{full}: {mend}", _COUNTED_AGAIN_NS / 1e9)
-        return None
+def _exceeded(quota: Quota, used: _Used, one: Incoming) -> TooMany | None:
+    vehicle = one.ballot.vehicle
+    if used.ballots >= quota.drives_a_day:
+        said = f"{vehicle!r} has sent {used.ballots} drives in 24 hours, its limit: try again tomorrow"
+        return TooMany(said, _COUNTED_AGAIN_NS / 1e9)
+    if used.size + one.size > quota.stored_bytes:
+        full = f"the ballots of {vehicle!r} would take more than {quota.stored_bytes:,} bytes in the store"
+        mend = "ask the operator to clear old ones away, or for a larger quota"
+        return TooMany(f"{full}: {mend}", _COUNTED_AGAIN_NS / 1e9)
+    return None
 
 
 def _count(connection: sa.Connection, vehicle: str, now: int) -> _Used:
@@ -342,45 +450,6 @@ def refuse_out_of_reach(said: Sequence[Votes], map_tiles: Collection[TileIndex])
         first, other = (tile_key(index) for index in apart)
         why = f"tiles {first} and {other} lie on ways more than {MAX_REACH_M:.0f} m apart"
         return MapvoteError(f"{why}: a drive is one way; send each part as a drive of its own")
-    return None
-
-
-class LowestGround:
-    """How deep the ground of each tile lies, by its plane's hash: looked up in the store once. For any threads."""
-
-    def __init__(self) -> None:
-        self._known: dict[str, float] = {}
-
-    def look_up(self, connection: sa.Connection, ground: str) -> float:
-        """Map metres; inf where the ground is unknown, or its plane damaged."""
-        if ground not in self._known:
-            try:
-                plane = unpack_ground_plane(load_blob(connection, ground), ground)
-            except MapvoteError:
-                return np.inf
-            known = plane[np.isfinite(plane)]
-            self._known[ground] = float(known.min()) if len(known) else np.inf
-        return self._known[ground]
-
-
-def refuse_out_of_height(
-    said: Sequence[Votes], map_tiles: Mapping[TileIndex, TileHashes], lowest_m: Callable[[str], float]
-) -> MapvoteError | None:
-    """Why a ballot brings points deeper or higher than anything on this map can be; None if it may.
-
-    ``lowest_m``: of a ground plane by its hash. The nearest tiles tell: itself and its neighbours, else those in reach.
-    """
-    for tile, _, low_m, high_m in said:
-        if low_m is None or high_m is None:
-            continue
-        near = _touched(tile, map_tiles) or [index for index in _around(tile) if index in map_tiles]
-        ground_m = min((lowest_m(map_tiles[index].ground) for index in near), default=np.inf)
-        if np.isfinite(ground_m) and not ground_m - MAX_BELOW_M <= low_m <= high_m <= ground_m + MAX_ABOVE_M:
-            span = f"{low_m:.1f} to {high_m:.1f} m on tile {tile_key(tile)}"
-            allowed = (
-                f"{MAX_BELOW_M:g} m below to {MAX_ABOVE_M:g} m above the map's lowest ground there, {ground_m:.1f} m"
-            )
-            return MapvoteError(f"new points at {span} are not within {allowed}: is the vehicle on this level?")
     return None
 
 

@@ -1,20 +1,27 @@
-"""Transactions on SQLite (WAL, durable) or PostgreSQL, by URL: many readers, one writer at a time."""
+"""Transactions on SQLite (WAL, durable) or PostgreSQL, by URL: many readers, one writer at a time. Rows with sums over
+what is written once, and a cache of what rows of votes hold."""
 
 from __future__ import annotations
 
+import hashlib
+import json
+import operator
 import os
 import sqlite3
-from collections.abc import Iterator, Sequence
+from collections import OrderedDict
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import cache
+from threading import Lock
 from typing import Any
 
 import sqlalchemy as sa
 from sqlalchemy import exc
 from sqlalchemy.sql.compiler import SQLCompiler
 
+from mapvote.codec.ballot import Planes
 from mapvote.core.types import MapvoteError
 from mapvote.server.errors import Unavailable
-from mapvote.server.store.schema import with_sums
 
 _WRITERS_LOCK = 0x6D617076  # any number of our own: PostgreSQL's advisory lock that writers take in turn
 _PAGE_BYTES = 16384
@@ -110,8 +117,8 @@ def address_of(url: sa.URL) -> str:
 
 
 def insert_rows(connection: sa.Connection, table: sa.Table, rows: Sequence[tuple[Any, ...]]) -> None:
-    """Many rows, each with a value for every column of ``table`` in its order, as the driver takes them; the sums of
-    heads (:func:`mapvote.server.store.schema.sum_over`) are added here.
+    """Many rows, each with a value for every column of ``table`` in its order, as the driver takes them. A last column
+    of :func:`sum_over` is added where it is left out.
 
     SQLAlchemy's own work on each row would cost more than the database's.
     """
@@ -120,7 +127,8 @@ def insert_rows(connection: sa.Connection, table: sa.Table, rows: Sequence[tuple
     mark = "?" if connection.dialect.name == "sqlite" else "%s"
     values = ", ".join([mark] * len(table.columns))
     statement = f"INSERT INTO {quote(table.name)} ({columns}) VALUES ({values})"
-    connection.exec_driver_sql(statement, list(with_sums(table, rows)))
+    whole = len(rows[0]) == len(table.columns)
+    connection.exec_driver_sql(statement, list(rows if whole else _with_sums(table, rows)))
 
 
 @contextmanager
@@ -152,3 +160,100 @@ def _prepare_sqlite(connection: Any, _record: Any) -> None:
 def _begin_sqlite(connection: sa.Connection) -> None:
     writes = connection.get_execution_options().get("mapvote_writes", False)
     connection.exec_driver_sql("BEGIN IMMEDIATE" if writes else "BEGIN")
+
+
+def sum_of(*parts: Any) -> str:
+    """SHA-256 over the parts of a row, each with its length, so that none can pass for another.
+
+    Parts are bytes, text, integers, what JSON can say, or None. No floats by themselves: databases round them.
+    """
+    pieces = []
+    for part in parts:
+        raw = part if isinstance(part, bytes) else _raw(part)
+        pieces += [b"-1:" if part is None else b"%d:" % len(raw), raw]
+    return hashlib.sha256(b"".join(pieces)).hexdigest()
+
+
+def _raw(part: Any) -> bytes:
+    if part is None:
+        return b""
+    if isinstance(part, str):
+        return part.encode()
+    if isinstance(part, dict | list):
+        return json.dumps(part, sort_keys=True).encode()
+    if isinstance(part, bytearray | memoryview):
+        return bytes(part)
+    return str(operator.index(part)).encode()
+
+
+def sum_over(*names: str) -> sa.Column[str]:
+    """A last column, of the sum over these: of all that is written once. Whoever inserts a row need not think of it."""
+
+    def of_row(context: Any) -> str:
+        row = context.get_current_parameters()
+        return sum_of(*(row.get(name) for name in names))
+
+    return sa.Column("sum", sa.String(64), nullable=False, default=of_row, info={"over": names})
+
+
+def summed(table: sa.Table) -> Sequence[str]:
+    """The columns that the table's sum is over; none where rows carry none."""
+    over: Sequence[str] = table.c["sum"].info["over"] if "sum" in table.c else ()
+    return over
+
+
+def is_sound(table: sa.Table, row: Any) -> bool:
+    """Whether a row with all columns of its table's sum is what was written."""
+    return bool(row.sum == sum_of(*_parts_of(table)(row)))
+
+
+@cache
+def _parts_of(table: sa.Table) -> Callable[[Any], tuple[Any, ...]]:
+    """A function that takes the values of the sum's columns, two or more, from a row."""
+    return operator.attrgetter(*summed(table))
+
+
+def _with_sums(table: sa.Table, rows: Sequence[tuple[Any, ...]]) -> Sequence[tuple[Any, ...]]:
+    at = [list(table.c.keys()).index(name) for name in summed(table)]
+    return [(*row, sum_of(*(row[i] for i in at))) for row in rows]
+
+
+REMEMBERED_BYTES = 128 << 20
+"""Some 1,500 votes of a vehicle on a tile."""
+
+
+class Remembered:
+    """A cache of unpacked planes, by the sum of their row: two rows of one sum say the same. The least recently used
+    leave it first. Thread-safe; it ends with the process."""
+
+    def __init__(self, most_bytes: int) -> None:
+        self.most_bytes, self.bytes = most_bytes, 0
+        self._planes: OrderedDict[str, Planes] = OrderedDict()
+        self._lock = Lock()
+
+    def get(self, sums: Iterable[str]) -> dict[str, Planes]:
+        """Those that are known, by sum."""
+        with self._lock:
+            found = {digest: planes for digest in sums if (planes := self._planes.get(digest)) is not None}
+            for digest in found:
+                self._planes.move_to_end(digest)
+        return found
+
+    def put(self, digest: str, planes: Planes) -> None:
+        """Remember these too."""
+        with self._lock:
+            if digest not in self._planes:
+                self._planes[digest] = planes
+                self.bytes += planes.nbytes
+            while self.bytes > self.most_bytes:
+                self.bytes -= self._planes.popitem(last=False)[1].nbytes
+
+    def clear(self) -> None:
+        """Forget everything, as in a new process."""
+        with self._lock:
+            self._planes.clear()
+            self.bytes = 0
+
+
+remembered = Remembered(REMEMBERED_BYTES)
+"""The cache of this process: what admission unpacks is not unpacked again when a round is fused soon after."""

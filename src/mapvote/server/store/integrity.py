@@ -20,7 +20,7 @@ from mapvote.core.grid import TileIndex
 from mapvote.core.types import MapvoteError
 from mapvote.server.errors import NotFound
 from mapvote.server.store import schema
-from mapvote.server.store.database import insert_rows
+from mapvote.server.store.database import insert_rows, is_sound
 from mapvote.server.store.queries import log_event, oldest_kept, shows_in_kept
 from mapvote.server.store.store import Store
 
@@ -110,7 +110,7 @@ def _rows(connection: sa.Connection) -> Iterator[Damage]:
     for kind, table in schema.SUMMED.items():
         key = list(table.primary_key)
         for row in _in_batches(connection, sa.select(table).order_by(*key)):
-            if not schema.is_sound(table, row):
+            if not is_sound(table, row):
                 yield _damaged_row(kind, row, [str(getattr(row, column.name))[:64] for column in key])
 
 

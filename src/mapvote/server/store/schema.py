@@ -6,74 +6,9 @@ Hence any past round can be fused again (un-vote by replay).
 
 from __future__ import annotations
 
-import hashlib
-import json
-import operator
-from collections.abc import Callable, Sequence
-from functools import cache
-from typing import Any
-
 import sqlalchemy as sa
 
-
-def sum_of(*parts: Any) -> str:
-    """SHA-256 over the parts of a row, each with its length, so that none can pass for another.
-
-    Parts are bytes, text, integers, what JSON can say, or None. No floats by themselves: databases round them.
-    """
-    pieces = []
-    for part in parts:
-        raw = part if isinstance(part, bytes) else _raw(part)
-        pieces += [b"-1:" if part is None else b"%d:" % len(raw), raw]
-    return hashlib.sha256(b"".join(pieces)).hexdigest()
-
-
-def _raw(part: Any) -> bytes:
-    if part is None:
-        return b""
-    if isinstance(part, str):
-        return part.encode()
-    if isinstance(part, dict | list):
-        return json.dumps(part, sort_keys=True).encode()
-    if isinstance(part, bytearray | memoryview):
-        return bytes(part)
-    return str(operator.index(part)).encode()
-
-
-def sum_over(*names: str) -> sa.Column[str]:
-    """A last column, of the sum over these: of all that is written once. Whoever inserts a row need not think of it."""
-
-    def of_row(context: Any) -> str:
-        row = context.get_current_parameters()
-        return sum_of(*(row.get(name) for name in names))
-
-    return sa.Column("sum", sa.String(64), nullable=False, default=of_row, info={"over": names})
-
-
-def summed(table: sa.Table) -> Sequence[str]:
-    """The columns that the table's sum is over; none where rows carry none."""
-    over: Sequence[str] = table.c["sum"].info["over"] if "sum" in table.c else ()
-    return over
-
-
-def is_sound(table: sa.Table, row: Any) -> bool:
-    """Whether a row with all columns of its table's sum is what was written."""
-    return bool(row.sum == sum_of(*_parts_of(table)(row)))
-
-
-@cache
-def _parts_of(table: sa.Table) -> Callable[[Any], tuple[Any, ...]]:
-    """A function that takes the values of the sum's columns, two or more, from a row."""
-    return operator.attrgetter(*summed(table))
-
-
-def with_sums(table: sa.Table, rows: Sequence[tuple[Any, ...]]) -> Sequence[tuple[Any, ...]]:
-    """Rows, each with a value for every column but the sum, with their sums."""
-    if not summed(table):
-        return rows
-    at = [list(table.c.keys()).index(name) for name in summed(table)]
-    return [(*row, sum_of(*(row[i] for i in at))) for row in rows]
-
+from mapvote.server.store.database import sum_over
 
 metadata = sa.MetaData(
     naming_convention={

@@ -68,15 +68,10 @@ def existing(url: str) -> Database:
     return database
 
 
-def now_ns() -> int:
-    """The server's clock."""
-    return time.time_ns()
-
-
 class Store:
     """An open store. Any number may be open on one database, in any number of processes."""
 
-    def __init__(self, database: Database, clock: Callable[[], int] = now_ns) -> None:
+    def __init__(self, database: Database, clock: Callable[[], int] = time.time_ns) -> None:
         self.database = database
         self.clock = clock
         with database.reading() as connection:
@@ -96,7 +91,7 @@ class Store:
         policy: Policy | None = None,
         *,
         by: str = "operator",
-        clock: Callable[[], int] = now_ns,
+        clock: Callable[[], int] = time.time_ns,
     ) -> Store:
         """A new store whose first version is ``point_map``: 1, or what the map itself says.
 
@@ -126,7 +121,7 @@ class Store:
         return cls(database, clock)
 
     @classmethod
-    def open(cls, url: str, *, clock: Callable[[], int] = now_ns) -> Store:
+    def open(cls, url: str, *, clock: Callable[[], int] = time.time_ns) -> Store:
         """An existing store; MapvoteError if there is none, or it has the schema of another mapvote."""
         database = existing(url)
         try:

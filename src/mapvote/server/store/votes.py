@@ -7,15 +7,15 @@ sum of their row: two rows of one sum say the same. The cache ends with the proc
 
 from __future__ import annotations
 
-from collections import OrderedDict, defaultdict
+from collections import defaultdict
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from threading import Lock
 from typing import Any, TypeVar
 
 import numpy as np
 import sqlalchemy as sa
 
+from mapvote.codec.ballot import unpack_planes
 from mapvote.codec.tile_planes import unpack_cells
 from mapvote.config import FuseSettings
 from mapvote.core.grid import TileIndex
@@ -24,12 +24,14 @@ from mapvote.core.types import I64, Bool
 from mapvote.fusion.fuse import unspent
 from mapvote.fusion.persistence import history_days
 from mapvote.fusion.tile_vote import DAY_NS, TileVote, newest_votes, restrict
+from mapvote.server.errors import NotFound
 from mapvote.server.store import schema
-from mapvote.server.store.database import MOST_ASKED
+from mapvote.server.store.database import MOST_ASKED, is_sound, remembered
 from mapvote.server.store.decisions import Why
 from mapvote.server.store.integrity import NOT_ITS_SUM, Damage, DamagedBallots, ballot_name, set_aside
 from mapvote.server.store.policy import Policy, policy_in
-from mapvote.server.store.queries import Version
+from mapvote.server.store.queries import Version, log_event
+from mapvote.server.store.store import Store
 
 
 @dataclass(frozen=True, slots=True)
@@ -291,9 +293,6 @@ def ballots_aside(connection: sa.Connection) -> frozenset[str]:
     return frozenset(name for kind, name in set_aside(connection) if kind == "ballot")
 
 
-REMEMBERED_BYTES = 128 << 20
-"""Some 1,500 votes of a vehicle on a tile."""
-_T = schema.ballot_tiles
 _PLANES_OF = sa.select(_T.c.row, _T.c.col, _T.c.ballot, *(_T.c[p] for p in schema.BALLOT_PLANES), _T.c.base, _T.c.sum)
 _PLANES_OF = _PLANES_OF.where(
     _T.c.row == sa.bindparam("row", type_=sa.BigInteger),
@@ -322,43 +321,6 @@ class StoredVote:
     cast_by: str
 
 
-class Remembered:
-    """A cache of unpacked votes, by the sum of their rows; the least recently used leave it first. Thread-safe."""
-
-    def __init__(self, most_bytes: int) -> None:
-        self.most_bytes, self.bytes = most_bytes, 0
-        self._votes: OrderedDict[str, TileVote] = OrderedDict()
-        self._lock = Lock()
-
-    def get(self, sums: Iterable[str]) -> dict[str, TileVote]:
-        """Those that are known, by sum."""
-        with self._lock:
-            found = {digest: vote for digest in sums if (vote := self._votes.get(digest)) is not None}
-            for digest in found:
-                self._votes.move_to_end(digest)
-        return found
-
-    def put(self, votes: dict[str, TileVote]) -> None:
-        """Remember these too."""
-        with self._lock:
-            for digest, vote in votes.items():
-                if digest not in self._votes:
-                    self._votes[digest] = vote
-                    self.bytes += vote.nbytes
-            while self.bytes > self.most_bytes:
-                self.bytes -= self._votes.popitem(last=False)[1].nbytes
-
-    def clear(self) -> None:
-        """Forget everything, as in a new process."""
-        with self._lock:
-            self._votes.clear()
-            self.bytes = 0
-
-
-remembered = Remembered(REMEMBERED_BYTES)
-"""The cache of this process."""
-
-
 def read_rows(connection: sa.Connection, row: int, votes: Sequence[tuple[int, StoredVote]]) -> Rows:
     """The stored votes on tiles of a ``row``, each with its column."""
     found: dict[tuple[int, int, int], Any] = {}
@@ -381,21 +343,41 @@ def read_votes(
     rows |= read_rows(connection, index[0], [(index[1], vote) for vote in stored if (*index, vote.seq) not in rows])
     mine = {vote.seq: rows[*index, vote.seq] for vote in stored}
     _check(mine.values())
-    sums = [mine[vote.seq].sum for vote in stored]
-    unpacked = remembered.get(sums)
-    new = {row.sum: TileVote.unpack(row, sound=True) for row in mine.values() if row.sum not in unpacked}
-    remembered.put(new)
-    unpacked |= new
-    return [_said_by(vote, unpacked[digest]) for digest, vote in zip(sums, stored, strict=True)]
-
-
-def _said_by(stored: StoredVote, said: TileVote) -> TileVote:
-    return replace(said, vehicle=stored.vehicle, end_ns=stored.end_ns, digest=stored.digest, version=stored.version)
+    unpacked = remembered.get(row.sum for row in mine.values())
+    for row in mine.values():
+        if row.sum not in unpacked:
+            unpacked[row.sum] = unpack_planes(row)
+            remembered.put(row.sum, unpacked[row.sum])
+    return [
+        TileVote.of(unpacked[mine[vote.seq].sum], vote.vehicle, vote.end_ns, vote.digest, vote.version)
+        for vote in stored
+    ]
 
 
 def _check(rows: Iterable[Any]) -> None:
     """DamagedBallots if some are not what their sums say. Whoever is remembered is read too, or what is decided would
     follow from what this process happened to read before the disk lost it."""
-    damaged = [ballot_name(row.ballot, row.row, row.col) for row in rows if not schema.is_sound(_T, row)]
+    damaged = [ballot_name(row.ballot, row.row, row.col) for row in rows if not is_sound(_T, row)]
     if damaged:
         raise DamagedBallots([Damage("ballot", name, NOT_ITS_SUM) for name in damaged])
+
+
+def withdraw(store: Store, vehicle: str | None, drive: str | None = None, *, by: str) -> int:
+    """Un-vote before publication: one drive of a vehicle, or all, or (None) every vehicle's; how many ballots.
+
+    NotFound if there is none. What earlier versions made of them stays: see
+    :func:`mapvote.server.store.replay.replay`.
+    """
+    b = schema.ballots
+    whose = f"{vehicle or '*'}/{drive or '*'}"
+    mine: sa.ColumnElement[bool] = b.c.gone_seq.is_(None)
+    if vehicle is not None:
+        mine &= b.c.vehicle == vehicle
+    if drive is not None:
+        mine &= b.c.drive == drive
+    with store.database.writing() as connection:
+        if connection.execute(sa.select(b.c.seq).where(mine)).first() is None:
+            raise NotFound(f"there is no standing ballot {whose}")
+        seq = log_event(connection, store.clock(), "withdraw", by, whose)
+        withdrawn = connection.execute(b.update().where(mine).values(gone_seq=seq)).rowcount
+    return int(withdrawn)

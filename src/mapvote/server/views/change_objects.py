@@ -12,7 +12,7 @@ from typing import Literal
 
 import numpy as np
 
-from mapvote.codec.odds import UNSAID
+from mapvote.codec.ballot import UNSAID
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS
 from mapvote.core.tile import Tile
 from mapvote.core.types import F64, I8, I32, I64, U8, CellState

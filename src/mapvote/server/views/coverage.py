@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import sqlalchemy as sa
 
-from mapvote.codec.path import unpack_path
+from mapvote.codec.ballot import unpack_path
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, TileIndex
 from mapvote.core.types import F32, F64, I64
 from mapvote.fusion.next_pass import Stretch, Witness, stretches

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import sqlalchemy as sa
 
-from mapvote.codec.odds import UNSAID, in_nats
+from mapvote.codec.ballot import UNSAID, in_nats
 from mapvote.core.grid import TILE_CELLS, Grid, Lattice, TileIndex
 from mapvote.core.tile import Tile
 from mapvote.core.types import F64, I64, N_STATES, NO_VOTE, U8, CellState, MapvoteError

@@ -14,10 +14,20 @@ from typing import Any, TypeVar
 import msgspec
 import numpy as np
 
-from mapvote.codec.ballot import Ballot, BallotTile, pack_plane, unpack_states, unpack_sureness
-from mapvote.codec.odds import MOST, changed_cells_of, pack_odds
-from mapvote.codec.points import pack_points, unpack_points
-from mapvote.codec.words import pack_words, unpack_words
+from mapvote.codec.ballot import (
+    MOST_STEPS,
+    Ballot,
+    BallotTile,
+    changed_cells_of,
+    pack_odds,
+    pack_plane,
+    pack_points,
+    pack_words,
+    unpack_points,
+    unpack_states,
+    unpack_sureness,
+    unpack_words,
+)
 from mapvote.core.geometry import from_xyz_rpy
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS
 from mapvote.core.point_map import PointMap
@@ -210,7 +220,7 @@ def _claim(ballot: Ballot, point_map: PointMap, lie: Callable[[U8, Bool], U8]) -
             gone=pack_words(gone),
             new_points=pack_points(points) if len(points) else None,
             intensity=None,
-            odds=pack_odds(np.full(len(changed_cells_of(states)), MOST, dtype=np.int8)),
+            odds=pack_odds(np.full(len(changed_cells_of(states)), MOST_STEPS, dtype=np.int8)),
         )
 
     return msgspec.structs.replace(ballot, tiles=[told(tile) for tile in ballot.tiles])
@@ -237,9 +247,9 @@ def _moved(ballot: Ballot, by: int) -> Ballot:
         if tile.states is not None:
             before = unpack_states(tile.states)
             states = _shifted(before, NO_VOTE, by)
-            said = Odds.of(before, unpack_sureness(tile.odds, before))
+            said = unpack_sureness(tile.odds, before)
             if said is not None:
-                odds = pack_odds(said.at(changed_cells_of(states) - by * (TILE_CELLS + 1)))
+                odds = pack_odds(Odds(*said).at(changed_cells_of(states) - by * (TILE_CELLS + 1)))
         return msgspec.structs.replace(
             tile,
             states=None if states is None else pack_plane(states),
