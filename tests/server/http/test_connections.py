@@ -103,7 +103,7 @@ def test_a_stalled_body_is_cut(line: socket.socket, target: str) -> None:
 
 @pytest.mark.slow
 def test_a_client_that_never_reads_is_cut(url: str, line: socket.socket) -> None:
-    plane = httpx2.get(f"{url}/v1/map").json()["tiles"]["0,0"]["points"]
+    plane = httpx2.get(f"{url}/v1/map", timeout=300.0).json()["tiles"]["0,0"]["points"]
     line.sendall(f"GET /v1/tiles/{plane} HTTP/1.1\r\nHost: localhost\r\n\r\n".encode() * 3)
     time.sleep(6.0)
     received = 0
@@ -131,7 +131,7 @@ def test_a_head_of_more_than_32_kb_is_431_and_the_end_of_the_connection(line: so
 
 
 def test_a_head_just_below_32_kb_is_read(url: str) -> None:
-    assert httpx2.get(f"{url}/healthz", headers={"X-Long": "a" * 30_000}).status_code == 200
+    assert httpx2.get(f"{url}/healthz", headers={"X-Long": "a" * 30_000}, timeout=300.0).status_code == 200
 
 
 @pytest.mark.parametrize("start", [b"a" * 20, b"1;" + b"a" * 20, b"0\r\nX-Trailer: "])
@@ -166,4 +166,4 @@ def test_a_request_under_way_is_never_what_makes_room(url: str, line: socket.soc
 
 def test_the_server_is_well_again_afterwards(url: str, tmp_path: Path) -> None:
     for _ in range(20):
-        assert httpx2.get(f"{url}/v1/map").status_code == 200
+        assert httpx2.get(f"{url}/v1/map", timeout=300.0).status_code == 200

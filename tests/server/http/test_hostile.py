@@ -175,7 +175,7 @@ def test_no_path_leads_out(site: Site, path: str) -> None:
 @pytest.mark.parametrize("key", ["x", "Bearer", "ü" * 10, "a" * 20_000])
 def test_odd_keys_are_refused(site: Site, key: str) -> None:
     header = f"Bearer {key}".encode()
-    answer = httpx2.get(site.url + "/v1/map", headers=[(b"authorization", header)])
+    answer = httpx2.get(site.url + "/v1/map", headers=[(b"authorization", header)], timeout=300.0)
     assert answer.status_code in (400, 401, 431)
 
 
@@ -193,7 +193,7 @@ def test_odd_keys_are_refused(site: Site, key: str) -> None:
 def test_an_operators_slip_is_422(site: Site, path: str, body: dict[str, Any]) -> None:
     headers = {"Authorization": f"Bearer {site.operator}"}
     before = site.commits()
-    assert httpx2.post(f"{site.url}/v1/{path}", json=body, headers=headers).status_code == 422
+    assert httpx2.post(f"{site.url}/v1/{path}", json=body, headers=headers, timeout=300.0).status_code == 422
     assert site.commits() == before
 
 

@@ -48,7 +48,7 @@ def url(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
 )
 def test_a_rebound_name_or_a_foreign_page_publishes_nothing(url: str, headers: dict[str, str]) -> None:
     for method, path, body in (("POST", "/v1/publish", {"override": True}), ("GET", "/v1/map", None)):
-        answer = httpx2.request(method, url + path, json=body, headers=headers)
+        answer = httpx2.request(method, url + path, json=body, headers=headers, timeout=300.0)
         assert answer.status_code == 403, answer.text
         assert "[server] hosts" in answer.json()["detail"]
 
@@ -75,7 +75,7 @@ def test_its_own_page_and_the_name_that_the_operator_gave_it_are_let_in(url: str
 
 @pytest.mark.parametrize("path", ["/", "/docs", "/viewer/app.js", "/v1/map", "/healthz", "/nothing", "/openapi.json"])
 def test_every_answer_tells_the_browser_to_load_nothing_from_elsewhere(url: str, path: str) -> None:
-    answer = httpx2.get(url + path)
+    answer = httpx2.get(url + path, timeout=300.0)
     for name, value in HEADERS:
         assert answer.headers[name] == value
     policy = answer.headers["content-security-policy"]

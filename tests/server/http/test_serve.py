@@ -55,9 +55,9 @@ def test_a_new_store_prints_its_first_operator_key_once_and_is_closed_from_the_s
                 lines.append(server.stdout.readline())
             url = lines[-1].split()[1]
             said.append(lines[0])
-            assert httpx2.get(f"{url}/v1/map").status_code == 401
+            assert httpx2.get(f"{url}/v1/map", timeout=300.0).status_code == 401
             secret = said[0].split()[-1]
-            assert httpx2.post(f"{url}/v1/publish", json={}, headers=with_key(secret)).status_code == 200
+            assert httpx2.post(f"{url}/v1/publish", json={}, headers=with_key(secret), timeout=300.0).status_code == 200
             server.terminate()
     assert "key of the operator, shown this once" in said[0]
     assert said[1].startswith("serving ")
@@ -149,7 +149,10 @@ def test_who_sends_wrong_keys_by_the_hundred_is_looked_up_no_more_and_the_right_
     store = Store.create(f"sqlite:///{tmp_path / 's.db'}", two_walls())
     secret = keys.issue(store, "boss", "operator")
     store.close()
-    with serving(tmp_path / "s.db", log=tmp_path / "log") as (url, _), httpx2.Client(base_url=url) as http:
+    with (
+        serving(tmp_path / "s.db", log=tmp_path / "log") as (url, _),
+        httpx2.Client(base_url=url, timeout=300.0) as http,
+    ):
         assert http.get("/v1/map", headers=with_key(secret)).status_code == 200
         answers: list[int] = []
         while len(answers) < 400 and 429 not in answers:

@@ -55,7 +55,7 @@ class Site(NamedTuple):
 
     def ask(self, method: str, path: str, key: str | None, **more: object) -> httpx2.Response:
         headers = {"Authorization": f"Bearer {key}"} if key else {}
-        return httpx2.request(method, self.url + path, headers=headers, **more)  # type: ignore[arg-type]
+        return httpx2.request(method, self.url + path, headers=headers, timeout=300.0, **more)  # type: ignore[arg-type]
 
 
 @pytest.fixture(scope="module")
@@ -135,7 +135,7 @@ def test_a_vehicle_touches_its_own_ballots_only_and_never_operates(site: Site) -
 
 
 def test_browsers_send_the_key_as_a_password(site: Site) -> None:
-    page = httpx2.get(site.url + "/", auth=("operator", site.operator))
+    page = httpx2.get(site.url + "/", auth=("operator", site.operator), timeout=300.0)
     assert page.status_code == 200
     assert "text/html" in page.headers["content-type"]
 
@@ -159,7 +159,7 @@ def test_tiles_are_immutable_and_cacheable(site: Site) -> None:
     answer = site.ask("GET", f"/v1/tiles/{digest}", site.a)
     assert "immutable" in answer.headers["cache-control"]
     headers = {"Authorization": f"Bearer {site.a}", "If-None-Match": answer.headers["etag"]}
-    assert httpx2.get(f"{site.url}/v1/tiles/{digest}", headers=headers).status_code == 304
+    assert httpx2.get(f"{site.url}/v1/tiles/{digest}", headers=headers, timeout=300.0).status_code == 304
 
 
 def test_a_manifest_is_sent_again_only_when_the_map_is_a_new_one(tmp_path: Path) -> None:
@@ -221,10 +221,10 @@ def test_an_unsent_ballot_waits_in_the_spool(site: Site, tmp_path: Path) -> None
 @pytest.mark.parametrize("headers", [{}, {"Host": "mapvote.default.svc"}])
 def test_a_probe_needs_no_key_and_no_name_and_learns_nothing_else(site: Site, headers: dict[str, str]) -> None:
     for path in ("/livez", "/readyz"):
-        answer = httpx2.get(site.url + path, headers=headers)
+        answer = httpx2.get(site.url + path, headers=headers, timeout=300.0)
         assert (answer.status_code, answer.content) == (200, b"")
-        assert httpx2.post(site.url + path, headers=headers).status_code in (401, 403)
-    assert httpx2.get(site.url + "/healthz", headers=headers).status_code in (401, 403)
+        assert httpx2.post(site.url + path, headers=headers, timeout=300.0).status_code in (401, 403)
+    assert httpx2.get(site.url + "/healthz", headers=headers, timeout=300.0).status_code in (401, 403)
     assert site.ask("GET", "/readyz", "wrong").status_code == 401
     assert site.ask("GET", "/readyz", site.a).json()["status"] == "ready"
 
@@ -232,7 +232,7 @@ def test_a_probe_needs_no_key_and_no_name_and_learns_nothing_else(site: Site, he
 def test_a_graceful_stop(tmp_path: Path) -> None:
     Store.create(f"sqlite:///{tmp_path / 's.db'}", two_walls()).close()
     with serving(tmp_path / "s.db", log=tmp_path / "log") as (url, process):
-        assert httpx2.get(url + "/healthz").json() == {"status": "ok", "version": 1}
+        assert httpx2.get(url + "/healthz", timeout=300.0).json() == {"status": "ok", "version": 1}
         process.terminate()
         assert process.wait(10) in (0, -15)
     assert "Traceback" not in (tmp_path / "log").read_text()
