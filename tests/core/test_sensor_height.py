@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from mapvote.core.point_map import PointMap, map_from_points
-from mapvote.core.sensor_height import check_heights, heights_over_ground, two_levels
+from mapvote.core.sensor_height import check_heights, two_levels
 from mapvote.core.types import F64
 
 
@@ -44,7 +44,7 @@ def test_a_stretch_where_the_ground_sank_is_named_with_its_place() -> None:
 
 def test_beyond_the_map_nothing_is_known_and_it_says_so() -> None:
     off = path(1.73) + np.array([1000.0, 0.0, 0.0])
-    assert np.isnan(heights_over_ground(street(), off)).all()
+    assert np.isnan(street().ground_under(off)).all()
     assert check_heights(street(), off).complaint == "the map has no ground under the path"
     assert "unknown under" in str(check_heights(street(), path(1.73, 120.0)))
 

@@ -11,13 +11,13 @@ from mapvote.config import Settings
 from mapvote.core.geometry import exp, from_xyz_rpy, inverse, rotation_angle
 from mapvote.core.point_map import all_points, map_from_points
 from mapvote.core.reference import reference_window
-from mapvote.core.sensors import SENSORS
-from mapvote.core.types import F64, Drive, MapvoteError, Scan
+from mapvote.core.types import F64, MapvoteError, Scan
 from mapvote.formats import open_drive, read_T_map_lidar
 from mapvote.localisation.map_window import MapWindow
 from mapvote.localisation.ndt import PosePrior
 from mapvote.localisation.odometry import Tracker
 from mapvote.slam.build import BuildReport, _agreed_heights, build_map
+from mapvote.slam.pose_graph import Track
 from mapvote_lab.evaluation.truths import rigid_between
 from mapvote_lab.simulation import simulate
 from streets import drive_along, path, street
@@ -212,12 +212,11 @@ def test_ground_that_the_path_contradicts_is_refused_with_the_place() -> None:
     """Half of a drive stands 2 m higher over the ground than the other: one of the two is wrong."""
     x, y = np.meshgrid(np.arange(0.15, 60.0, 0.3), np.arange(0.15, 12.0, 0.3))
     flat = map_from_points(np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)]))
-    along = np.arange(2.0, 58.0)
-    path = np.column_stack([along, np.full(56, 6.0), np.where(along < 34.0, 1.8, 3.8)])
-    drive = Drive(Path("survey"), "v", "d", SENSORS["vlp16"], np.arange(56), lambda i: Scan(i, np.zeros((0, 3), "f4")))
+    poses = np.array([from_xyz_rpy(x, 6.0, 1.8 if x < 34.0 else 3.8) for x in np.arange(2.0, 58.0)])
+    track = Track(drive_along(poses, 1), poses, np.ones(56, np.bool_), (), np.full(56, np.nan))
     with pytest.raises(MapvoteError, match=r"disagree by more than 0.3 m along 42.9% of the path, most by 2.00 m at"):
-        _agreed_heights(drive, flat, path)
-    assert _agreed_heights(drive, flat, path[:32]).complaint == ""
+        _agreed_heights(track, flat)
+    assert _agreed_heights(replace(track, registered=np.arange(56) < 32), flat).complaint == ""
 
 
 @pytest.mark.slow

@@ -1,6 +1,9 @@
-"""What hardly anybody met who passed by, and what range noise carried into the next voxel, is no surface of its own."""
+"""Scans become a map that holds what stands, near and far: no trails, noise or reflections."""
 
 from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -8,16 +11,20 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hand_made import make_map, make_tile, wall
+from mapvote.config import Settings
+from mapvote.core.geometry import from_xyz_rpy, inverse, transform
 from mapvote.core.grid import CELL_SIZE, Lattice
-from mapvote.core.point_map import map_from_points
-from mapvote.core.types import F64, I64
+from mapvote.core.point_map import all_points, map_from_points
+from mapvote.core.sensors import SENSORS
+from mapvote.core.types import F64, I64, Drive, Scan
 from mapvote.core.voxels import VoxelCloud, thin, voxel_downsample
 from mapvote.slam.clean_map import (
+    HIT_SHARE,
     LARGEST_SPECK,
-    MET_SHARE,
     NEAR_M,
     SEEN_THROUGH,
     TALL_M,
+    Mapper,
     lone_points,
     mirrored,
     seen_through,
@@ -26,6 +33,7 @@ from mapvote.slam.clean_map import (
     trails,
     without_lone_points,
 )
+from mapvote.slam.pose_graph import Track
 
 LATTICE = Lattice()
 
@@ -56,9 +64,9 @@ def test_wherever_it_lies_a_point_is_asked_of_all_places_within_twenty_metres() 
     points, scans = rng.uniform(-45.0, 90.0, (3000, 3)), rng.integers(1, 6, 3000).astype(np.int32)
     places = driven[thin(driven, 1.0)]
     passed = (np.hypot(*(points[:, None, :2] - places[None, :, :2]).transpose(2, 0, 1)) < NEAR_M).sum(axis=1)
-    assert 0 < (scans < MET_SHARE * passed).sum() < 3000
+    assert 0 < (scans < HIT_SHARE * passed).sum() < 3000
     apart = voxel_downsample(points, 3.0)
-    expected = (scans < MET_SHARE * passed)[apart]
+    expected = (scans < HIT_SHARE * passed)[apart]
     np.testing.assert_array_equal(strays(points[apart], scans[apart], driven, LATTICE), expected)
 
 
@@ -99,10 +107,6 @@ def test_two_walls_a_hand_apart_stay_two() -> None:
         cloud.enter(np.column_stack([np.full(100, x), np.linspace(0, 3, 100), np.full(100, 2.0)]))
     points, scans = cloud.points()
     assert not strays(points, scans, np.zeros((0, 3)), LATTICE).any()
-
-
-def test_no_points_are_no_strays() -> None:
-    assert strays(np.zeros((0, 3)), np.zeros(0, np.int32), road(60), LATTICE).shape == (0,)
 
 
 def row_of(n: int, at: int = 0) -> F64:
@@ -184,20 +188,10 @@ def test_what_rises_above_a_lorry_did_not_drive_and_nor_did_what_nobody_knows_th
     assert not trails(column, np.full(2, -5), column[:, 2], LATTICE).any(), "one cell, and it rises to five metres"
 
 
-def test_a_map_without_a_point_has_no_trail() -> None:
-    assert trails(np.zeros((0, 3)), np.zeros(0, np.int64), np.zeros(0), LATTICE).shape == (0,)
-
-
-@given(st.lists(st.tuples(st.integers(0, 12), st.integers(0, 12), st.integers(-9, 9)), min_size=1, max_size=40))
-def test_in_whichever_order_points_come_they_are_judged_alike_and_met_ones_stay(
-    cells: list[tuple[int, int, int]],
-) -> None:
-    points = np.array([[(c + 0.5) * CELL_SIZE, (r + 0.5) * CELL_SIZE, 1.0] for r, c, _ in cells])
-    balance: I64 = np.array([b for _, _, b in cells])
-    found = trails(points, balance, points[:, 2], LATTICE)
-    turned = trails(points[::-1].copy(), balance[::-1].copy(), points[:, 2], LATTICE)
-    np.testing.assert_array_equal(found, turned[::-1])
-    assert not trails(points, np.abs(balance), points[:, 2], LATTICE).any()
+def test_a_map_without_a_point_has_no_trails_and_no_strays() -> None:
+    none = np.zeros((0, 3))
+    assert trails(none, np.zeros(0, np.int64), np.zeros(0), LATTICE).shape == (0,)
+    assert strays(none, np.zeros(0, np.int32), road(60), LATTICE).shape == (0,)
 
 
 def by_hand(cells: dict[tuple[int, int], int]) -> set[tuple[int, int]]:
@@ -213,25 +207,36 @@ def by_hand(cells: dict[tuple[int, int], int]) -> set[tuple[int, int]]:
     return out
 
 
-@given(
-    st.dictionaries(st.tuples(st.integers(-300, -290), st.integers(-6, 6)), st.integers(-9, 9), min_size=1, max_size=50)
-)
+VOXELS = st.tuples(st.integers(-300, -290), st.integers(-6, 6), st.integers(-9, 9))
+
+
+@given(st.lists(VOXELS, min_size=1, max_size=50))
 def test_trails_are_the_groups_of_cells_that_touch_and_were_passed_more_often_on_either_side_of_the_origin(
-    cells: dict[tuple[int, int], int],
+    voxels: list[tuple[int, int, int]],
 ) -> None:
-    points = np.array([[(c + 0.5) * CELL_SIZE, (r + 0.5) * CELL_SIZE, 1.0] for r, c in cells])
-    balance: I64 = np.array(list(cells.values()))
-    found = trails(points, balance, points[:, 2], LATTICE)
-    assert {cell for cell, is_trail in zip(cells, found, strict=True) if is_trail} == by_hand(cells)
+    """Several voxels of a cell are one."""
+    points = np.array([[(c + 0.5) * CELL_SIZE, (r + 0.5) * CELL_SIZE, 1.0] for r, c, _ in voxels])
+    balance: I64 = np.array([hit for _, _, hit in voxels])
+    cells: dict[tuple[int, int], int] = {}
+    for r, c, hit in voxels:
+        cells[r, c] = cells.get((r, c), 0) + hit
+    trail = by_hand(cells)
+    assert trails(points, balance, points[:, 2], LATTICE).tolist() == [(r, c) in trail for r, c, _ in voxels]
 
 
 OFF_ORIGIN = Lattice(-30.0, -30.0)
 
 
+def box(*steps: tuple[float, ...]) -> F64:
+    """(n, 3) points on the grid of three ranges (from, to, step); one number is that coordinate of all points."""
+    return np.stack(np.meshgrid(*(np.arange(*s) if len(s) == 3 else np.array(s) for s in steps)), axis=-1).reshape(
+        -1, 3
+    )
+
+
 def sheet(x: tuple[float, float], y: tuple[float, float], z: float) -> F64:
     """A level surface, a point every 0.15 m."""
-    a, b = np.meshgrid(np.arange(*x, 0.15), np.arange(*y, 0.15))
-    return np.column_stack([a.ravel(), b.ravel(), np.full(a.size, z)])
+    return box((*x, 0.15), (*y, 0.15), (z,))
 
 
 def road_along(y: float, z: float = 0.0) -> F64:
@@ -269,3 +274,66 @@ def test_where_a_vehicle_drove_below_a_bridge_nothing_is_left_out() -> None:
     kerb = np.array([[15.0, 5.0, 0.1]])  # below the bridge, beside its path: there the map keeps the bridge
     assert left_out(np.vstack([street, bridge]), np.vstack([under, over]), kerb) == [False]
     assert left_out(np.vstack([street, bridge]), over, kerb) == [True], "one level a cell: the street was not driven"
+
+
+AHEAD_M = 60.0
+WALL_X = 100.0
+
+
+def scene(sensor_x: float) -> F64:
+    """A road to a wall across its end, and the back of a van that keeps 60 m ahead of the sensor."""
+    wall = box((WALL_X,), (-8.0, 8.0, 0.3), (0.1, 6.0, 0.3))
+    rest = np.concatenate([box((-20.0, WALL_X, 0.5), (-8.0, 8.0, 0.5), (0.0,)), wall])
+    hidden = (rest[:, 0] > sensor_x + AHEAD_M) & (np.abs(rest[:, 1]) < 1.7) & (rest[:, 2] < 2.6)
+    back = box((sensor_x + AHEAD_M,), (-1.0, 1.1, 0.25), (0.4, 2.6, 0.25))
+    return np.concatenate([rest[~hidden], back])
+
+
+def mapped(seen: Callable[[int], F64], x: F64, draft: F64, **mapping: object) -> F64:
+    """The points of the map of a drive at 10 m/s that ``seen`` gives the world at each scan, from ``x`` (n,)."""
+    poses = np.array([from_xyz_rpy(at, 0.0, 1.8) for at in x])
+    stamps_ns = np.arange(1, len(x) + 1) * 100_000_000
+
+    def read_scan(i: int) -> Scan:
+        return Scan(int(stamps_ns[i]), transform(inverse(poses[i]), seen(i)).astype(np.float32))
+
+    drive = Drive(Path("d"), "survey", "d", SENSORS["hdl32e"], stamps_ns, read_scan)
+    own = Settings().mapping.model_copy(update=mapping)
+    mapper = Mapper(map_from_points(draft), Settings().model_copy(update={"mapping": own}))
+    for _ in mapper.enter(Track(drive, poses, np.ones(len(x), np.bool_), (), np.full(len(x), np.nan))):
+        pass
+    return all_points(mapper.finish())
+
+
+def test_a_van_that_is_never_nearer_than_60_m_leaves_no_trail_and_a_wall_never_nearer_than_70_m_stays() -> None:
+    """Three seconds at 10 m/s behind the van, which is at 89 m when they end."""
+    points = mapped(lambda i: scene(float(i)), np.arange(30.0), np.concatenate([scene(float(x)) for x in range(30)]))
+    trail = (points[:, 0] > 61.0) & (points[:, 0] < 87.5) & (np.abs(points[:, 1]) < 1.5) & (points[:, 2] > 0.3)
+    assert not trail.any()
+    assert (np.abs(points[:, 0] - WALL_X) < 0.2).sum() > 700  # of 54 x 20 voxels, less what the van hid
+    assert points[:, 0].min() > -20.5
+
+
+def test_returns_from_farther_than_the_reach_do_not_enter_the_map() -> None:
+    points = mapped(lambda i: scene(0.0), np.zeros(2), scene(0.0), reach_m=65.0)
+    assert 60.0 < np.hypot(*points[:, :2].T).max() <= 65.0
+
+
+@pytest.mark.parametrize("drop", [True, False])
+def test_what_one_scan_of_many_hit_stays_out_of_the_map_unless_strays_are_kept(drop: bool) -> None:
+    street = box((-20.0, 80.0, 0.5), (-8.0, 8.0, 0.5), (0.0,))
+    stray = np.concatenate([street, [[30.1, 5.1, 2.0]]])
+    points = mapped(lambda i: stray if i == 50 else street, np.arange(60.0), street, drop_strays=drop)
+    assert (points[:, 2] > 1.0).any() != drop
+
+
+def test_what_drove_past_a_parked_car_leaves_no_trail_beside_it() -> None:
+    """Hits on the car strike the voxels next to it too; all scans but the two that hit the other see through those."""
+    ground, house = box((-20.0, 60.0, 0.5), (-8.0, 8.0, 0.5), (0.0,)), box((-20, 60, 0.3), (8.0,), (0.15, 6.0, 0.3))
+    parked, passing = (box((20.0, 24.0, 0.1), (y,), (0.5, 1.5, 0.1)) for y in (5.0, 4.65))
+    street = np.concatenate([ground, house, parked])
+    both = np.concatenate([street, passing])
+    points = mapped(lambda i: both if 15 <= i < 17 else street, np.arange(40.0), both)
+    standing = points[(points[:, 2] > 0.3) & (points[:, 0] > 20.5) & (points[:, 0] < 23.5)]
+    assert not (np.abs(standing[:, 1] - 4.65) < 0.1).any()
+    assert (np.abs(standing[:, 1] - 5.0) < 0.1).sum() > 30

@@ -9,10 +9,8 @@ import pytest
 
 from mapvote.core.geometry import exp, from_xyz_rpy, inverse, log, rotation_angle
 from mapvote.core.types import F64
-from mapvote.slam.pose_graph import Anchors, Links, carried_along, optimise
-from mapvote.slam.prior_alignment import fit_to_priors, trust_in
-from mapvote.slam.road_prior import road_under
-from mapvote.slam.surveyor import Surveyed, is_precise
+from mapvote.slam.driven_road import road_under
+from mapvote.slam.pose_graph import Anchors, Links, Track, carried_along, fit_to_priors, optimise, trust_in
 from streets import drive_along, path
 
 
@@ -100,15 +98,15 @@ def road_of(poses: F64, seed: int) -> F64:
     return np.concatenate([own @ T[:3, :3].T + T[:3, 3] for T in poses])
 
 
-def surveyed(poses: F64, lost: slice = slice(0, 0)) -> Surveyed:
+def surveyed(poses: F64, lost: slice = slice(0, 0)) -> Track:
     registered = np.ones(len(poses), np.bool_)
     registered[lost] = False
-    return Surveyed(poses, registered, ())
+    return Track(drive_along(poses, 1), poses, registered, (), np.full(len(poses), np.nan))
 
 
 def test_a_road_is_found_under_settled_poses_however_far_the_first_pass_drifted() -> None:
     drifted, settled = climbing(200, 1.5), climbing(200, 0.0)
-    cloud = carried_along(road_of(drifted, 1), [surveyed(drifted)], [settled])
+    cloud = carried_along(road_of(drifted, 1), [surveyed(drifted)], [surveyed(settled)])
     assert np.abs(cloud[:, 2]).max() < 0.03
     road = road_under(settled, np.ones(200, np.bool_), cloud)
     assert abs(road.sensor_height_m - SENSOR_M) < 0.02
@@ -121,14 +119,15 @@ def test_each_drive_carries_its_own_points_and_a_scan_that_was_lost_carries_none
     lost[20:25, :3, 3] += 30.0
     cloud = np.concatenate([road_of(one, 1), road_of(other, 2)])
     found = [surveyed(lost, slice(20, 25)), surveyed(other)]
-    moved = carried_along(cloud, found, [climbing(50, 0.0), climbing(50, 0.0, x0=80.0)])
+    settled = [surveyed(climbing(50, 0.0), slice(20, 25)), surveyed(climbing(50, 0.0, x0=80.0))]
+    moved = carried_along(cloud, found, settled)
     assert np.abs(moved[:, 2]).max() < 0.1
 
 
 def test_a_survey_without_priors_stays_where_it_is_to_the_last_bit() -> None:
     poses = climbing(30, 0.7)
     cloud = road_of(poses, 4)
-    assert carried_along(cloud, [surveyed(poses)], [poses]).tobytes() == cloud.tobytes()
+    assert carried_along(cloud, [surveyed(poses)], [surveyed(poses)]).tobytes() == cloud.tobytes()
 
 
 @pytest.mark.parametrize(
@@ -138,7 +137,7 @@ def test_only_a_prior_that_knows_place_and_attitude_guides_registration(
     sigma_m: float, sigma_deg: float, precise: bool
 ) -> None:
     poses = path(2)
-    assert is_precise(drive_along(poses, 1, poses, sigma_m=sigma_m, sigma_deg=sigma_deg)) is precise
+    assert drive_along(poses, 1, poses, sigma_m=sigma_m, sigma_deg=sigma_deg).has_precise_prior is precise
 
 
 def track() -> F64:

@@ -25,8 +25,8 @@ from mapvote.core.point_map import SCANS, SOURCES, PointMap, all_fields, all_poi
 from mapvote.core.types import F64, MapvoteError
 from mapvote.core.voxels import VoxelCloud, voxel_keys
 from mapvote.slam.clean_map import specks, strays
+from mapvote.slam.driven_road import road_under
 from mapvote.slam.pose_graph import Anchors, Links, optimise
-from mapvote.slam.road_prior import road_under
 
 MOST_APART_M = 0.1
 """By the median over the patches of a pair, after the adjustment."""

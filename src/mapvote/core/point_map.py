@@ -69,9 +69,27 @@ class PointMap:
         """One tile; the empty one where the map has none."""
         return self.tiles.get(index) or Tile.empty(self.lattice.tile(index))
 
+    def by_tile(self, points_map: NDArray[np.floating]) -> Iterator[tuple[Tile, I64, tuple[I64, I64]]]:
+        """(tile, indices (m,), cell) of the points (n, 3), map metres, that lie in each tile of the map; the cell is
+        (rows (m,), cols (m,)), so that ``tile.ground_z[cell]`` is the ground under them."""
+        for index, mine in cut_tiles(points_map, self.lattice):
+            if index in self.tiles:
+                tile = self.tiles[index]
+                rows, cols, _ = tile.window.indices_of(points_map[mine])
+                yield tile, mine, (rows, cols)
+
+    def ground_under(self, points_map: NDArray[np.floating]) -> F64:
+        """(n,) height of the ground in the cell of each of the points (n, 3), map metres; NaN where it is unknown."""
+        out = np.full(len(points_map), np.nan)
+        for tile, mine, cell in self.by_tile(points_map):
+            out[mine] = tile.ground_z[cell]
+        return out
+
 
 def cut_tiles(points_map: NDArray[np.floating], lattice: Lattice) -> Iterator[tuple[TileIndex, I64]]:
     """Which of the points (n, 3) lie in each tile, input order kept inside each tile; tiles in ascending order."""
+    if not len(points_map):
+        return
     tiles = np.empty((len(points_map), 2), dtype=np.int32)
     for start in range(0, len(points_map), _CHUNK):
         piece = slice(start, start + _CHUNK)

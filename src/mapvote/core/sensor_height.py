@@ -53,23 +53,15 @@ class Heights:
         )
 
 
-def heights_over_ground(point_map: PointMap, positions: F64) -> F64:
-    """(n,) metres from the ground up to positions (n, 3), map metres; NaN where the map has no ground."""
-    rows, cols = point_map.lattice.cells_of(positions)
-    ground = np.full(len(positions), np.nan)
-    for tile in point_map.tiles.values():
-        r, c = rows - tile.window.row0, cols - tile.window.col0
-        here = (r >= 0) & (c >= 0) & (r < tile.window.rows) & (c < tile.window.cols)
-        ground[here] = tile.ground_z[r[here], c[here]]
-    return positions[:, 2] - ground
+UNKNOWN = Heights(np.nan, np.nan, (np.nan, np.nan), 0.0, 1.0)
 
 
 def check_heights(point_map: PointMap, positions: F64) -> Heights:
     """The heights of one sensor's path of positions (n, 3), map metres, over the map's ground."""
-    heights = heights_over_ground(point_map, positions)
+    heights = positions[:, 2] - point_map.ground_under(positions)
     known = np.isfinite(heights)
     if not known.any():
-        return Heights(np.nan, np.nan, (np.nan, np.nan), 0.0, 1.0)
+        return UNKNOWN
     median = float(np.median(heights[known]))
     off = np.where(known, heights - median, 0.0)
     worst = int(np.argmax(np.abs(off)))

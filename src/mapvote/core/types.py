@@ -71,6 +71,9 @@ class CellState(IntEnum):
     UNDETERMINED = 4
 
 
+PRECISE_PRIOR_M, PRECISE_PRIOR_DEG = 0.1, 0.2
+"""A prior at least this good, in both, is a surveyor's: it guides each registration and holds the map's frame. A place
+to 2 cm without an attitude would turn scans to where they hit it: .4 deg, .1 m at 10 m."""
 N_STATES = len(CellState)
 NO_VOTE = 255
 """In a uint8 state grid: never seen, or invalid. Not the same as UNDETERMINED."""
@@ -182,6 +185,12 @@ class Drive:
         check_array(self.T_base_lidar, "Drive.T_base_lidar", (4, 4), np.float64)
         if self.T_map_lidar_prior is not None:
             check_array(self.T_map_lidar_prior, "Drive.T_map_lidar_prior", (len(self.stamps_ns), 4, 4), np.float64)
+
+    @property
+    def has_precise_prior(self) -> bool:
+        """Whether its prior is a surveyor's."""
+        good = self.prior_sigma_m <= PRECISE_PRIOR_M and self.prior_sigma_deg <= PRECISE_PRIOR_DEG
+        return self.T_map_lidar_prior is not None and good
 
     def __len__(self) -> int:
         return len(self.stamps_ns)

@@ -18,6 +18,9 @@ from mapvote.core.types import F32, F64, I32, I64, Bool, read_only
 _MIDDLE = 1 << 20
 """Indices are counted from here, so that keys are positive and never 0: within +-2^20 voxels (314 km at 0.3 m)."""
 
+BESIDE = (1 << 42, 1 << 21, 1)
+"""What the key of the next voxel along x, y and z is larger by."""
+
 
 @inlined
 def packed_key(ix: np.int64, iy: np.int64, iz: np.int64) -> np.int64:

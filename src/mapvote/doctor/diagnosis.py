@@ -35,7 +35,7 @@ from mapvote.formats.drives.options import DriveOptions
 from mapvote.formats.drives.rosbag import is_rosbag
 from mapvote.formats.maps.mapvote_folder import is_map_folder
 from mapvote.formats.registry import DRIVES, MAPS
-from mapvote.slam.attitude import wrong_attitude
+from mapvote.slam.driven_road import wrong_attitude
 
 _LOST_SCANS = 4
 """A chain of no more has lost itself at its first step."""

@@ -18,7 +18,7 @@ from mapvote.config import NdtSettings
 from mapvote.core.geometry import from_xyz_rpy, inverse
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Lattice
 from mapvote.core.point_map import PointMap, cut_tiles
-from mapvote.core.sensor_height import LEVEL_M, check_heights, heights_over_ground
+from mapvote.core.sensor_height import LEVEL_M, check_heights
 from mapvote.core.tile import Tile
 from mapvote.core.types import F32, F64, Drive, MapvoteError, Scan
 from mapvote.doctor.finding import Finding, Progress, Severity
@@ -370,7 +370,7 @@ def _outside(T: F64, point_map: PointMap) -> list[Finding]:
 
 def _on_ground(T: F64, point_map: PointMap, depth_m: float | None) -> list[F64]:
     """The prior's pose; and that pose over the map's ground, where the prior's height is far off it."""
-    height = float(heights_over_ground(point_map, T[None, :3, 3])[0])
+    height = float(T[2, 3] - point_map.ground_under(T[None, :3, 3])[0])
     if depth_m is None or not np.isfinite(height) or abs(height - depth_m) < 1.0:
         return [T]
     return [T, from_xyz_rpy(0, 0, depth_m - height) @ T]

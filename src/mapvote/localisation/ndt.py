@@ -154,6 +154,12 @@ class NdtMap:
         """Whether ``position`` (3,) is near enough to the middle for the window to hold what a scan reaches."""
         return bool(np.abs(np.asarray(position) - self.centre).max() <= CENTRAL_M)
 
+    def around(self, position: F64) -> NdtMap:
+        """Itself, with a window that holds what a scan from ``position`` (3,) reaches."""
+        if not self.is_central(position):
+            self.recentre(position)
+        return self
+
     def enter(self, points_map: NDArray[np.floating]) -> None:
         """Enter points (n, 3) in map metres into every level."""
         points = np.ascontiguousarray(points_map, dtype=np.float64)

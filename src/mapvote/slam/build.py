@@ -4,26 +4,25 @@ Two passes. The first finds where the vehicles were: each scan is registered to 
 one after the other into the same map; then all poses are settled together: precise priors (a survey vehicle's RTK)
 hold the map in their frame, ordinary ones (GNSS) place it where all of them together have it. The second reads the
 scans again and adds them at their settled poses: de-skewed, without moving objects, one point per 0.3 m voxel
-(slam.accumulate).
+(slam.clean_map).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 
 import numpy as np
 
 from mapvote.config import Settings
-from mapvote.core.geometry import inverses, rotation_angles
 from mapvote.core.point_map import PointMap, map_from_points
 from mapvote.core.sensor_height import Heights, check_heights, two_levels
-from mapvote.core.types import F64, Bool, Drive, MapvoteError
-from mapvote.slam.accumulate import Layer
-from mapvote.slam.attitude import WrongAttitude, as_precise_as_shown
-from mapvote.slam.pose_graph import carried_along, settle_poses
-from mapvote.slam.road_prior import all_roads, road_under
-from mapvote.slam.surveyor import Surveyed, Surveyor, is_precise
+from mapvote.core.types import Drive, MapvoteError
+from mapvote.slam.clean_map import Mapper
+from mapvote.slam.driven_road import road_under, wrong_attitude
+from mapvote.slam.pose_graph import Track, carried_along, settle_poses
+from mapvote.slam.surveyor import Surveyor
 
 Progress = Callable[[int, int], None]
 MOST_OFF = 0.3
@@ -35,52 +34,22 @@ _FIRST_DATE_NS = 946_684_800 * 10**9
 
 
 @dataclass(frozen=True, slots=True)
-class Drift:
-    """How far a drive's poses lie from its prior. With a coarse prior this is mostly the prior's own error."""
-
-    median_m: float
-    max_m: float
-    end_m: float
-    median_deg: float
-
-
-@dataclass(frozen=True, slots=True)
-class DriveTrack:
-    """The trajectory of one drive."""
-
-    vehicle: str
-    drive_id: str
-    T_map_lidar: F64
-    """(n, 4, 4) a pose per scan; that of a scan that could not be registered is the best guess."""
-    registered: Bool
-    """(n,) whether the scan could be registered; the others did not enter the map."""
-    length_m: float
-    drift: Drift | None
-    """Against the prior, where there is one."""
-    heights: Heights
-    """Of the sensor over the map's ground."""
-    broken: tuple[int, ...]
-    """Scans at which the track began anew because nothing fitted: there only priors tie the map together."""
-    sigma_m: F64
-    """(n,) standard deviation of each position in the frame of the priors, NaN without any."""
-    wrong_attitude: WrongAttitude | None = None
-    """What contradicts the precise attitude that the prior states: the drive was built with a coarser one."""
-
-
-@dataclass(frozen=True, slots=True)
 class BuildReport:
     """What came of building a map."""
 
-    tracks: tuple[DriveTrack, ...]
+    tracks: tuple[Track, ...]
     points: int
-    held_by_prior: bool
-    """Whether a precise prior fixed the map's frame; otherwise all priors together, or the first scan, did."""
     bent_m: float
     """How far the priors moved a scan at most, after the whole survey was shifted and turned to fit them; 0 without
     priors."""
     two_levels: tuple[float, float, float] | None
     """(x, y, metres apart) where drives ran above each other, the farthest apart: of the two, each cell keeps the road
     whose path is nearer, below both the lower one. None if nowhere."""
+
+    @property
+    def held_by_prior(self) -> bool:
+        """Whether a precise prior fixed the map's frame; otherwise all priors together, or the first scan, did."""
+        return any(track.drive.has_precise_prior for track in self.tracks)
 
 
 def build_map(
@@ -92,31 +61,40 @@ def build_map(
     nothing to map, or if fewer than half of a drive's scans could be registered.
     """
     settings = settings or Settings()
-    if sum(len(drive) for drive in drives) == 0:
+    scans = sum(len(drive) for drive in drives)
+    if scans == 0:
         raise MapvoteError("nothing to map: no drive with at least one scan")
-    shown = [as_precise_as_shown(drive) for drive in drives]
-    drives = [drive for drive, _ in shown]
-    count = _counter(progress, 2 * sum(len(drive) for drive in drives))
-    surveyor = Surveyor(settings, all(is_precise(drive) for drive in drives))
-    found = [surveyor.follow(drive, count) for drive in drives]
-    settled = settle_poses(drives, found)
-    registered, poses = [one.registered for one in found], settled.T_map_lidar
-    cloud, lattice = carried_along(surveyor.draft.points()[0], found, poses), surveyor.draft.lattice
+    wrong = [wrong_attitude(drive) for drive in drives]
+    drives = [
+        drive if w is None else replace(drive, prior_sigma_deg=w.sigma_deg)
+        for drive, w in zip(drives, wrong, strict=True)
+    ]
+    surveyor = Surveyor(settings, all(drive.has_precise_prior for drive in drives))
+    _go_through(chain.from_iterable(map(surveyor.follow, drives)), progress, 0, 2 * scans)
+    tracks, bent_m = settle_poses(surveyor.tracks)
+    cloud, lattice = carried_along(surveyor.draft.points()[0], surveyor.tracks, tracks), surveyor.draft.lattice
     del surveyor  # and with it the largest part of what the first pass took
-    roads = [road_under(T, mask, cloud) for T, mask in zip(poses, registered, strict=True)]
-    road = all_roads(roads)
-    layer = Layer(map_from_points(cloud, lattice=lattice, road=road), settings, road)
-    for drive, T_map_lidar, mask in zip(drives, poses, registered, strict=True):
-        layer.lay(drive, T_map_lidar, mask, count)
-    driven = tuple(T[mask][:, :3, 3] for T, mask in zip(poses, registered, strict=True))
-    point_map = replace(layer.finish(), driven=driven, georeference=dict(_place_on_earth(drives)))
-    point_map = replace(point_map, surveyed_ns=_last_stamp(drives))
-    heights = [_agreed_heights(drive, point_map, path) for drive, path in zip(drives, driven, strict=True)]
-    wrong = [wrong for _, wrong in shown]
-    tracks = tuple(_track(*each) for each in zip(drives, poses, found, heights, settled.sigma_m, wrong, strict=True))
-    held = any(is_precise(drive) for drive in drives)
-    points = sum(len(tile.points) for tile in point_map.tiles.values())
-    return point_map, BuildReport(tracks, points, held, settled.bent_m, two_levels(road) if len(road) else None)
+    road = np.concatenate([road_under(track.T_map_lidar, track.registered, cloud).points_map for track in tracks])
+    mapper = Mapper(map_from_points(cloud, lattice=lattice, road=road), settings, road)
+    _go_through(chain.from_iterable(map(mapper.enter, tracks)), progress, scans, 2 * scans)
+    point_map = replace(
+        mapper.finish(),
+        driven=tuple(track.driven for track in tracks),
+        georeference=dict(_place_on_earth(drives)),
+        surveyed_ns=_last_stamp(drives),
+    )
+    tracks = [
+        replace(track, heights=_agreed_heights(track, point_map), wrong_attitude=found)
+        for track, found in zip(tracks, wrong, strict=True)
+    ]
+    return point_map, BuildReport(tuple(tracks), point_map.n_points, bent_m, two_levels(road) if len(road) else None)
+
+
+def _go_through(scans: Iterable[None], progress: Progress | None, done: int, total: int) -> None:
+    """Let a pass enter its ``scans`` one by one."""
+    for number, _ in enumerate(scans, start=done + 1):
+        if progress:
+            progress(number, total)
 
 
 def _place_on_earth(drives: Sequence[Drive]) -> Mapping[str, str]:
@@ -136,40 +114,12 @@ def _last_stamp(drives: Sequence[Drive]) -> int | None:
     return max(ends) if min(ends) > _FIRST_DATE_NS else None
 
 
-def _agreed_heights(drive: Drive, point_map: PointMap, positions: F64) -> Heights:
-    """Heights of a drive's positions (n, 3) over the ground; MapvoteError if that cannot be the road under them."""
-    heights = check_heights(point_map, positions)
+def _agreed_heights(track: Track, point_map: PointMap) -> Heights:
+    """Heights of the driven positions over the ground; MapvoteError if that cannot be the road under them."""
+    heights = check_heights(point_map, track.driven)
     if heights.off_share > MOST_OFF:
         raise MapvoteError(
-            f"{drive.path}: {heights.complaint}. Such a map would be wrong without a word: do the drives' heights "
+            f"{track.drive.path}: {heights.complaint}. Such a map would be wrong: do the drives' heights "
             "agree (one datum, no drift in z), and is z up? `mapvote doctor` checks it; else build the drives apart"
         )
     return heights
-
-
-def _track(
-    drive: Drive, T_map_lidar: F64, found: Surveyed, heights: Heights, sigma_m: F64, wrong: WrongAttitude | None
-) -> DriveTrack:
-    length = float(np.linalg.norm(np.diff(T_map_lidar[:, :3, 3], axis=0), axis=1).sum())
-    drift = None
-    if drive.T_map_lidar_prior is not None:
-        prior = drive.T_map_lidar_prior
-        off = np.linalg.norm(T_map_lidar[:, :3, 3] - prior[:, :3, 3], axis=1)
-        turn = rotation_angles(inverses(prior) @ T_map_lidar)
-        drift = Drift(float(np.median(off)), float(off.max()), float(off[-1]), float(np.degrees(np.median(turn))))
-    registered, broken = found.registered, found.broken
-    return DriveTrack(
-        drive.vehicle, drive.drive_id, T_map_lidar, registered, length, drift, heights, broken, sigma_m, wrong
-    )
-
-
-def _counter(progress: Progress | None, total: int) -> Callable[[], None]:
-    done = 0
-
-    def count() -> None:
-        nonlocal done
-        done += 1
-        if progress:
-            progress(done, total)
-
-    return count

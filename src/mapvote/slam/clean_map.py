@@ -1,4 +1,8 @@
-"""Which points of a surveyed map are no standing surface, one function a rule:
+"""The second pass: scans at known poses become a map of points without moving objects, ground and known-free columns.
+
+A draft of the map gives the ground and the occupied voxels. Each scan is then counted as a vehicle counts it: in how
+many scans was a voxel hit, in how many did rays pass it (detection/evidence.py). At the end points that are no standing
+surface are dropped, one function a rule. Their voxels are unknown, not free.
 
 | rule | a point is dropped if | what it was |
 |---|---|---|
@@ -8,12 +12,15 @@
 | ``specks`` | it is one of a few voxels that touch no other surface, each hit by one scan | noise |
 | ``mirrored`` | it lies below unbroken ground | a reflection |
 
+Only points that passed the filter of moving objects enter the map, at whatever range: a car that drives ahead of the
+surveyor is too far off for the counting. Returns from beyond the filter's reach are left out.
+
 Reflections. A wet road, a window or the side of a car deflects a ray, and the range puts its return below the ground.
 A point below ground that is known and level on all sides is such a return. Beside a leap of the ground it may be a wall
 that goes down to a yard, and near a place where vehicles drove above each other what lies below is real: both stay.
 
 Strays. A beam that grazes an edge returns a place between two surfaces; a pane shows a room that is not there. No ray
-speaks against such points, because other scans saw the wall in front of them. A surface is hit by more than MET_SHARE
+speaks against such points, because other scans saw the wall in front of them. A surface is hit by more than HIT_SHARE
 of the scans that pass within NEAR_M of it; strays are not. A wall two centimetres from a voxel's face has points in two
 voxels: the fewer points just over the face belong to the same wall.
 
@@ -27,6 +34,7 @@ drove was hit once or twice in each place, and rays passed there before and afte
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -35,13 +43,159 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from mapvote.config import Settings
+from mapvote.core.columns import TOP_BIT, column_bits, rebased
 from mapvote.core.grid import CELL_SIZE, TILE_CELLS, Lattice
 from mapvote.core.kernel import kernel
-from mapvote.core.point_map import PointMap
-from mapvote.core.sensor_height import crossings, heights_over_ground
+from mapvote.core.point_map import SCANS, PointMap, cut_tiles, map_from_points
+from mapvote.core.reference import LocalMap
+from mapvote.core.sensor_height import crossings
 from mapvote.core.tile import Tile
-from mapvote.core.types import F32, F64, I32, I64, Bool
-from mapvote.core.voxels import slot_of, thin, voxel_keys
+from mapvote.core.types import F32, F64, I32, I64, U64, Bool
+from mapvote.core.voxels import BESIDE, VoxelCloud, slot_of, thin, voxel_keys
+from mapvote.detection.evidence import HIT, PASSES, WORDS, count_scan, free_words, least_passed
+from mapvote.detection.packed_tiles import PackedTiles, count_of
+from mapvote.localisation.localiser import GivenPoses
+from mapvote.perception.frontend import Frontend, Observation, PlacedScan
+from mapvote.perception.moving_objects import MovingFilter
+from mapvote.slam.pose_graph import Track
+
+ROAD_M = 0.1
+"""Points this low above the ground are the road itself, also under a car."""
+
+
+class Mapper:
+    """Collects the scans of all drives, then gives the map."""
+
+    def __init__(self, draft: PointMap, settings: Settings, road: F64 | None = None) -> None:
+        """``road`` (n, 3), map metres: where vehicles drove, from which the ground grows."""
+        self.draft, self.road, self.settings = draft, road, settings
+        self.cloud = VoxelCloud(draft.lattice)
+        self.evidence = PackedTiles(draft.lattice, WORDS)
+        self._driven = [np.zeros((0, 3))]
+        self._around = LocalMap(draft, 2.0 * settings.mapping.reach_m)
+        self._near = LocalMap(draft, settings.voting.window_m)
+
+    def enter(self, track: Track) -> Iterator[None]:
+        """Enter the registered scans of one drive at their poses, a scan a step."""
+        drive = track.drive
+        frontend = Frontend(
+            GivenPoses(drive.stamps_ns, track.T_map_lidar),
+            MovingFilter(drive.sensor, self.settings.moving, self.settings.mapping.reach_m),
+            self._around,
+            self._near,
+            with_sight=False,
+            sensor=drive.sensor,
+        )
+        self._driven.append(track.driven)
+        for i, scan in enumerate(drive):
+            if track.registered[i]:
+                self._add(frontend.observe(scan))
+            yield
+        self._add(frontend.finish())
+
+    def _add(self, seen: list[Observation]) -> None:
+        for observation in seen:
+            left_out = _left_out(observation.scan, observation.moving, self.settings.mapping.reach_m)
+            self.cloud.enter(observation.scan.points_map, left_out)
+            count_scan(self.evidence, observation)
+
+    def finish(self) -> PointMap:
+        """The map of all points added so far."""
+        points, scans = self.cloud.points()
+        counts = self._counts(points)
+        kept = ~(_standing(points, self.draft) & seen_through(counts))
+        points, scans, counts = points[kept], scans[kept], counts[kept]
+        # Trails lift the draft's ground; above the true one stand the undersides of cars that had passed for ground.
+        laid, lattice = map_from_points(points, lattice=self.draft.lattice, road=self.road), self.draft.lattice
+        obstacle = _standing(points, laid)
+        dropped = (obstacle & seen_through(counts)) | mirrored(points, laid, self.road)
+        if self.settings.mapping.drop_strays:
+            dropped |= obstacle & strays(points, scans, np.concatenate(self._driven), lattice)
+            left = np.flatnonzero(obstacle & ~dropped)
+            height = points[left, 2] - laid.ground_under(points[left])
+            dropped[left] |= trails(points[left], counts[left, 0] - counts[left, 1], height, lattice)
+            left = np.flatnonzero(obstacle & ~dropped)
+            dropped[left] |= specks(points[left], scans[left], lattice)
+        fields = {SCANS: np.minimum(scans[~dropped], 255).astype(np.uint8)}
+        point_map = map_from_points(points[~dropped], lattice=lattice, road=self.road, fields=fields)
+        tiles = {tile: replace(content, free=self._free(content)) for tile, content in point_map.tiles.items()}
+        return replace(point_map, tiles=tiles)
+
+    def _counts(self, points: F64) -> I64:
+        """(n, 3) in how many scans the voxels of points (n, 3) were hit, passed and crossed; 0 outside columns."""
+        out = np.zeros((len(points), 3), dtype=np.int64)
+        for index, mine in cut_tiles(points, self.draft.lattice):
+            if index in self.evidence:
+                tile = self.draft.tile(index)
+                rows, cols, _ = tile.window.indices_of(points[mine])
+                bits = np.floor(points[mine, 2] / CELL_SIZE).astype(np.int64) - tile.base[rows, cols]
+                counts = np.zeros((len(mine), 3), dtype=np.int64)
+                _counts_of(self.evidence[index], rows, cols, bits, counts)
+                out[mine] = counts
+        return out
+
+    def _free(self, after: Tile) -> U64:
+        """Known-free columns of one tile of the finished map, on its own ground."""
+        if after.index not in self.evidence:
+            return np.zeros(after.window.shape, dtype=np.uint64)
+        before = self.draft.tile(after.index).base
+        free = free_words(self.evidence[after.index])
+        after = replace(after)  # what it works out for this alone goes with it
+        out = rebased(free, before - after.base) & ~after.obstacle_words
+        out[np.isnan(after.ground_z)] = 0
+        return out
+
+
+def _standing(points: F64, ground: PointMap) -> Bool:
+    """(n,) which points (n, 3) stand above the ground of ``ground``; none outside its tiles."""
+    out = np.zeros(len(points), dtype=np.bool_)
+    for tile, mine, cell in ground.by_tile(points):
+        out[mine] = column_bits(points[mine, 2], tile.ground_z[cell], tile.base[cell])[1]
+    return out
+
+
+def _left_out(scan: PlacedScan, moving: Bool, reach_m: float) -> Bool:
+    """Points (n,) that do not enter the map: what moves, what is beyond ``reach_m``, and what is too low to be an
+    obstacle, in or next to cells where something moves: wheels and bumpers, not road."""
+    ground_z, out = scan.reference.ground_z, np.empty(len(moving), np.bool_)
+    beside = np.zeros(ground_z.size, np.bool_)
+    _no_map(scan.points_map, scan.origin_map, reach_m**2, moving, scan.obstacle, scan.cell, ground_z, beside, out)
+    return out
+
+
+@kernel
+def _no_map(
+    points: F64, origin: F64, reach_squared: float, moving: Bool, obstacle: Bool, cell: I32, ground_z: F32,
+    beside: Bool, out: Bool,
+) -> None:  # fmt: skip
+    """Into ``out`` (n,) which of the points (n, 3) :func:`_left_out` means; ``cell`` (n,) row * cols + col of
+    ``ground_z`` (rows, cols), -1 outside it. ``beside`` (rows * cols,): scratch, all False."""
+    rows, cols = ground_z.shape
+    for i in range(len(points)):
+        if moving[i] and cell[i] >= 0:
+            r, c = divmod(cell[i], cols)
+            for k in range(max(r - 1, 0), min(r + 2, rows)):
+                for j in range(max(c - 1, 0), min(c + 2, cols)):
+                    beside[k * cols + j] = True
+    for i in range(len(points)):
+        x, y = points[i, 0] - origin[0], points[i, 1] - origin[1]
+        out[i] = moving[i] | (x * x + y * y > reach_squared)
+        if cell[i] >= 0 and beside[cell[i]] and not obstacle[i]:
+            r, c = divmod(cell[i], cols)
+            out[i] |= points[i, 2] - ground_z[r, c] > ROAD_M
+
+
+@kernel
+def _counts_of(planes: U64, rows: I64, cols: I64, bits: I64, out: I64) -> None:
+    """Into ``out`` (n, 3) in how many scans the voxels (row, col, bit) of a tile were hit, passed and crossed; outside
+    columns ``out`` stays as it is."""
+    for i in range(len(bits)):
+        if 0 <= bits[i] < TOP_BIT:
+            cell = planes[rows[i], cols[i]]
+            out[i, 0], out[i, 1] = count_of(cell, HIT, bits[i]), count_of(cell, PASSES, bits[i])
+            out[i, 2] = least_passed(cell, bits[i])
+
 
 BELOW_M = 0.5
 """A point so far under the ground is no part of it, however rough."""
@@ -55,27 +209,16 @@ def mirrored(points: F64, point_map: PointMap, road: F64 | None) -> Bool:
 
     ``road`` (m, 3): the road under all drives.
     """
-    out = heights_over_ground(point_map, points) < -BELOW_M
+    out = points[:, 2] - point_map.ground_under(points) < -BELOW_M
     asked = np.flatnonzero(out)
-    out[asked] = _is_closed(points[asked], point_map)
+    for tile, mine, cell in point_map.by_tile(points[asked]):
+        out[asked[mine]] = _unbroken(tile.ground_z)[cell]
     if road is not None and len(road):
         above_each_other = road[np.unique(crossings(road))]
         if len(above_each_other):
             below = np.flatnonzero(out)
             tree = cKDTree(above_each_other[:, :2])
             out[below] = np.isinf(tree.query(points[below, :2], distance_upper_bound=_BRIDGE_M)[0])
-    return out
-
-
-def _is_closed(points: F64, point_map: PointMap) -> Bool:
-    """(n,) whether the ground around the cell of each point (n, 3) is known and level."""
-    out = np.zeros(len(points), dtype=np.bool_)
-    rows, cols = point_map.lattice.cells_of(points)
-    for tile in point_map.tiles.values():
-        r, c = rows - tile.window.row0, cols - tile.window.col0
-        here = np.flatnonzero((r >= 0) & (c >= 0) & (r < tile.window.rows) & (c < tile.window.cols))
-        if len(here):
-            out[here] = _unbroken(tile.ground_z)[r[here], c[here]]
     return out
 
 
@@ -90,7 +233,7 @@ def _unbroken(ground_z: F32) -> Bool:
 
 NEAR_M = 20.0
 """A scan nearer than this, in the plane, should hit a standing surface."""
-MET_SHARE = 0.03
+HIT_SHARE = 0.03
 """Of these places, the share from which it must be hit: two scans of seventy, at 10 Hz and 40 km/h twice past."""
 SPILL_M = 0.06
 """Points of two voxels so near on both sides of their common face are one surface: three sigmas of range noise."""
@@ -106,20 +249,20 @@ def strays(points: F64, scans: I32, driven: F64, lattice: Lattice) -> Bool:
     for who waits at a light sees the same again.
     """
     places = driven[thin(driven, _PLACE_M)]
-    return _hardly_met(points, scans, places) | _spilled(points, scans, lattice)
+    return _hardly_hit(points, scans, places) | _spilled(points, scans, lattice)
 
 
-def _hardly_met(points: F64, scans: I32, places: F64) -> Bool:
+def _hardly_hit(points: F64, scans: I32, places: F64) -> Bool:
     out = np.zeros(len(points), dtype=np.bool_)
     if not len(places):
         return out
     tree = cKDTree(places[:, :2])
     # Places near one point are near each other: voxels hit oftener than the largest number required are skipped.
     most = tree.query_ball_point(places[:, :2], 2.001 * NEAR_M, return_length=True).max()
-    asked = np.flatnonzero(scans < min(_MOST_ASKED, MET_SHARE * most))
+    asked = np.flatnonzero(scans < min(_MOST_ASKED, HIT_SHARE * most))
     if len(asked):
         passed = tree.query_ball_point(points[asked, :2], NEAR_M, return_length=True)
-        out[asked] = scans[asked] < MET_SHARE * passed
+        out[asked] = scans[asked] < HIT_SHARE * passed
     return out
 
 
@@ -132,22 +275,14 @@ def _spilled(points: F64, scans: I32, lattice: Lattice) -> Bool:
         return out
     for axis, origin in ((0, lattice.x0), (1, lattice.y0)):
         within = (points[:, axis] - origin) % CELL_SIZE
-        aside = np.zeros(3)
-        for sign in (-1.0, 1.0):
-            aside[axis] = sign * CELL_SIZE
-            wanted = voxel_keys(_middles(points, lattice) + aside, lattice.x0, lattice.y0)
+        for sign in (-1, 1):
+            wanted = keys + sign * BESIDE[axis]
             beside = order[np.minimum(np.searchsorted(keys, wanted, sorter=order), len(keys) - 1)]
             mine = CELL_SIZE - within if sign > 0 else within
             theirs = within[beside] if sign > 0 else CELL_SIZE - within[beside]
             same = (keys[beside] == wanted) & (mine + theirs < SPILL_M)
             out |= same & (mine < theirs) & (scans < scans[beside])
     return out
-
-
-def _middles(points: F64, lattice: Lattice) -> F64:
-    """(n, 3) the middle of each point's voxel: steps from there reach the next one whatever rounding does."""
-    origin = np.array([lattice.x0, lattice.y0, 0.0])
-    return np.asarray((np.floor((points - origin) / CELL_SIZE) + 0.5) * CELL_SIZE + origin)
 
 
 SEEN_THROUGH = 6
@@ -218,7 +353,7 @@ def _specks(keys: I64, once: Bool, table: I64, often: Bool, group: I64, out: Boo
         while alone and k < n:
             for around in range(27):
                 dx, dy, dz = around // 9 - 1, around // 3 % 3 - 1, around % 3 - 1
-                beside = group[k] + (np.int64(dx) << 42) + (np.int64(dy) << 21) + dz
+                beside = group[k] + dx * BESIDE[0] + dy * BESIDE[1] + dz * BESIDE[2]
                 slot = slot_of(beside, table)
                 known = table[slot] == 0
                 for j in range(n):

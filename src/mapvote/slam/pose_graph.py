@@ -4,9 +4,11 @@ Registration to a growing map is smooth but drifts; a prior does not drift but i
 whole trajectory keeps the shape of the one in the frame of the other. Source: Barfoot, State Estimation for Robotics,
 8.1 and 9.
 
-A precise prior (RTK) holds each pose. Ordinary ones (GNSS) err alike for seconds to minutes, jump and go wild: the
-whole is first moved to the robust fit of them all (slam.prior_alignment), then the graph lets them bend it only as far
-as their number of *independent* errors allows, none of them more than its distance from the others allows.
+A precise prior (RTK) holds each pose. Ordinary ones (GNSS) err alike for seconds to minutes, jump and go wild. Odometry
+keeps its shape far better than satellites keep their place, and satellites keep their place far better than one of them
+does. So the first prior founds nothing: the whole is turned about the vertical and shifted to the robust least-squares
+fit of them all. Then the graph lets the priors bend it only as far as their number of *independent* errors allows, none
+of them more than its distance from the others allows.
 """
 
 from __future__ import annotations
@@ -20,10 +22,67 @@ from scipy import sparse
 from scipy.sparse.linalg import splu, spsolve
 from scipy.spatial import cKDTree
 
-from mapvote.core.geometry import adjoints, exps, inverses, logs
-from mapvote.core.types import F64, I64, Drive
-from mapvote.slam.prior_alignment import fit_to_priors, trust_in
-from mapvote.slam.surveyor import PRECISE_PRIOR_M, Surveyed, is_precise
+from mapvote.core.geometry import adjoints, exps, from_xyz_rpy, inverses, logs, rotation_angles
+from mapvote.core.sensor_height import UNKNOWN, Heights
+from mapvote.core.types import F64, I64, PRECISE_PRIOR_M, Bool, Drive
+from mapvote.slam.driven_road import WrongAttitude
+
+
+@dataclass(frozen=True, slots=True)
+class Drift:
+    """How far a drive's poses lie from its prior. With a coarse prior this is mostly the prior's own error."""
+
+    median_m: float
+    max_m: float
+    median_deg: float
+
+
+@dataclass(frozen=True, slots=True)
+class Track:
+    """The trajectory of one drive: as surveyed, in the frame of the draft, then settled, in that of the map."""
+
+    drive: Drive
+    """As precise as its scans show it, see ``wrong_attitude``."""
+    T_map_lidar: F64
+    """(n, 4, 4) a pose per scan; that of a scan that could not be registered is the best guess."""
+    registered: Bool
+    """(n,) whether the scan could be registered; the others do not enter the map."""
+    broken: tuple[int, ...]
+    """Scans at which the track began anew because nothing fitted: there only priors tie the map together."""
+    sigma_m: F64
+    """(n,) standard deviation of each settled position in the frame of the priors, NaN without any."""
+    heights: Heights = UNKNOWN
+    """Of the sensor over the map's ground."""
+    wrong_attitude: WrongAttitude | None = None
+    """What contradicts the precise attitude that the prior states: the drive is built with a coarser one."""
+
+    @property
+    def vehicle(self) -> str:
+        return self.drive.vehicle
+
+    @property
+    def drive_id(self) -> str:
+        return self.drive.drive_id
+
+    @property
+    def driven(self) -> F64:
+        """(m, 3) the positions of its registered scans, map metres."""
+        return np.asarray(self.T_map_lidar[self.registered, :3, 3])
+
+    @property
+    def length_m(self) -> float:
+        """Of the way from scan to scan."""
+        return float(np.linalg.norm(np.diff(self.T_map_lidar[:, :3, 3], axis=0), axis=1).sum())
+
+    @property
+    def drift(self) -> Drift | None:
+        """Against the prior, where there is one."""
+        prior = self.drive.T_map_lidar_prior
+        if prior is None:
+            return None
+        off = np.linalg.norm((self.T_map_lidar - prior)[:, :3, 3], axis=1)
+        turn = np.degrees(rotation_angles(inverses(prior) @ self.T_map_lidar))
+        return Drift(float(np.median(off)), float(off.max()), float(np.median(turn)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,46 +190,35 @@ _ASKED = 12
 """Poses of a drive whose covariance is worked out; the others lie between."""
 
 
-@dataclass(frozen=True, slots=True)
-class Settled:
-    """All drives' poses."""
-
-    T_map_lidar: list[F64]
-    """(n, 4, 4) of each drive."""
-    sigma_m: list[F64]
-    """(n,) standard deviation of each position in the frame of the priors; nan without any prior."""
-    bent_m: float
-    """How far the priors moved a scan at most, after the whole had been shifted and turned to fit them."""
-
-
-def settle_poses(drives: Sequence[Drive], found: Sequence[Surveyed]) -> Settled:
-    """Poses of all drives that agree with each other's motion and with all priors; as given if there are none."""
-    poses = [one.T_map_lidar for one in found]
-    starts = np.cumsum([0] + [len(T) for T in poses])
-    T, known = np.concatenate(poses), np.flatnonzero(np.concatenate([one.registered for one in found]))
+def settle_poses(tracks: Sequence[Track]) -> tuple[list[Track], float]:
+    """(the tracks with poses that agree with each other's motion and with all priors; how far the priors moved a scan
+    at most, after the whole had been shifted and turned to fit them, metres). As given if there are no priors."""
+    drives = [track.drive for track in tracks]
+    starts = np.cumsum([0] + [len(track.T_map_lidar) for track in tracks])
+    T = np.concatenate([track.T_map_lidar for track in tracks])
+    known = np.flatnonzero(np.concatenate([track.registered for track in tracks]))
     if not any(drive.T_map_lidar_prior is not None for drive in drives):
-        return Settled(poses, [np.full(len(p), np.nan) for p in poses], 0.0)
-    if not any(is_precise(drive) for drive in drives):
+        return list(tracks), 0.0
+    if not any(drive.has_precise_prior for drive in drives):
         T = _laid_on_priors(drives, T, known, starts) @ T
     rigid = T
-    links = _links(drives, T, known, _pieces(found, starts))
+    links = _links(drives, T, known, _pieces(tracks, starts))
     anchors = _anchors(drives, T, starts)
     for _ in range(_REWEIGHTED):
         T = optimise(T, links, anchors)
         anchors = [replace(a, weights=trust_in(_off(T, a), a.said_m)) for a in anchors]
     bent_m = float(np.linalg.norm((T - rigid)[:, :3, 3], axis=1).max())
-    return Settled(np.split(T, starts[1:-1]), _sigmas(T, links, anchors, starts), bent_m)
+    settled = zip(tracks, np.split(T, starts[1:-1]), _sigmas(T, links, anchors, starts), strict=True)
+    return [replace(track, T_map_lidar=poses, sigma_m=sigma_m) for track, poses, sigma_m in settled], bent_m
 
 
-def carried_along(points: F64, found: Sequence[Surveyed], settled: Sequence[F64]) -> F64:
-    """Points (n, 3) of the draft, each moved as the nearest scan was when its drive's poses (m, 4, 4) were settled.
+def carried_along(points: F64, found: Sequence[Track], settled: Sequence[Track]) -> F64:
+    """Points (n, 3) of the draft, each moved as the nearest scan was when the tracks ``found`` were settled.
 
     The draft was measured at the poses of the first pass. A road that is looked for under settled poses in a draft that
     is not bent alike lies too high here and too low there, by all that the first pass has drifted.
     """
-    before, after = (np.concatenate(poses) for poses in ([one.T_map_lidar for one in found], list(settled)))
-    known = np.concatenate([one.registered for one in found])
-    before, after = before[known], after[known]
+    before, after = (np.concatenate([t.T_map_lidar[t.registered] for t in tracks]) for tracks in (found, settled))
     if np.array_equal(before, after):
         return points
     moved, tree, out = after @ inverses(before), cKDTree(before[:, :3, 3]), np.empty_like(points)
@@ -189,11 +237,11 @@ def _sigmas(T: F64, links: list[Links], anchors: list[Anchors], starts: I64) -> 
     return [np.interp(np.arange(a, b), at, s) for (a, b), at, s in zip(ends, asked, pieces, strict=True)]
 
 
-def _pieces(found: Sequence[Surveyed], starts: I64) -> I64:
+def _pieces(tracks: Sequence[Track], starts: I64) -> I64:
     """(n,) number of the unbroken stretch that each scan belongs to."""
     begins = np.zeros(int(starts[-1]), dtype=np.int64)
     begins[starts[:-1]] = 1
-    for start, one in zip(starts, found, strict=False):
+    for start, one in zip(starts, tracks, strict=False):
         begins[start + np.array(one.broken, dtype=np.int64)] = 1
     return np.cumsum(begins)
 
@@ -217,7 +265,7 @@ def _anchors(drives: Sequence[Drive], T: F64, starts: I64) -> list[Anchors]:
         if drive.T_map_lidar_prior is None:
             continue
         slack = _SLACK
-        if not is_precise(drive):
+        if not drive.has_precise_prior:
             seconds = 1e-9 * float(drive.stamps_ns[-1] - drive.stamps_ns[0])
             alike = min(1.0, PRIOR_MEMORY_S / max(seconds, 1e-3)) * len(drive)
             slack = float(np.sqrt(max(alike, 1.0)))
@@ -226,7 +274,7 @@ def _anchors(drives: Sequence[Drive], T: F64, starts: I64) -> list[Anchors]:
             np.arange(start, start + len(drive)),
             drive.T_map_lidar_prior,
             slack * drive.prior_sigma_m,
-            sigma_rad if not is_precise(drive) else slack * float(np.radians(drive.prior_sigma_deg)),
+            sigma_rad if not drive.has_precise_prior else slack * float(np.radians(drive.prior_sigma_deg)),
             said_m=max(drive.prior_sigma_m, PRECISE_PRIOR_M),
         )
         out.append(replace(anchor, weights=trust_in(_off(T, anchor), anchor.said_m)))
@@ -256,3 +304,52 @@ def _links(drives: Sequence[Drive], T: F64, known: I64, piece_of: I64) -> list[L
 
 def _apart(stamps_ns: I64, i: int, j: int) -> bool:
     return bool(abs(int(stamps_ns[j]) - int(stamps_ns[i])) > 1e9 * _REVISIT_S)
+
+
+_ROUNDS = 30
+WILD_SIGMAS = 2.5
+"""A prior so many sigmas off weighs half; farther off, less and less (Cauchy)."""
+
+
+def trust_in(off_m: F64, sigma_m: float) -> F64:
+    """(n,) weight in (0, 1] of priors that lie ``off_m`` (n,) from where the others have them."""
+    return np.asarray(1.0 / (1.0 + (off_m / (WILD_SIGMAS * sigma_m)) ** 2))
+
+
+def fit_to_priors(positions: F64, prior_positions: F64, sigma_m: float, yaw_rad: float = 0.0) -> F64:
+    """(4, 4) turn about z and shift that fits positions (n, 3) to their priors (n, 3), robustly.
+
+    ``yaw_rad`` is kept where the track is too short to say anything about it. Source: Umeyama 1991 for the fit, Cauchy
+    weights for the wild.
+    """
+    spread = float(np.linalg.norm(positions[:, :2].std(axis=0)))
+    T = _shifted(positions, prior_positions, yaw_rad, np.ones(len(positions)))
+    scale = max(sigma_m, float(np.median(_distances(T, positions, prior_positions))))
+    for _ in range(_ROUNDS):
+        weights = trust_in(_distances(T, positions, prior_positions), scale)
+        yaw = _yaw(positions, prior_positions, weights) if spread > 3.0 * sigma_m else yaw_rad
+        moved = _shifted(positions, prior_positions, yaw, weights)
+        # The scale comes down to the stated sigma step by step: at first the whole track may look wild.
+        scale = max(sigma_m, 0.7 * scale)
+        if scale == sigma_m and np.abs(moved - T).max() < 1e-6:
+            return moved
+        T = moved
+    return T
+
+
+def _distances(T: F64, positions: F64, priors: F64) -> F64:
+    return np.asarray(np.linalg.norm(positions @ T[:3, :3].T + T[:3, 3] - priors, axis=1))
+
+
+def _yaw(positions: F64, priors: F64, weights: F64) -> float:
+    w = weights / weights.sum()
+    a, b = positions[:, :2] - w @ positions[:, :2], priors[:, :2] - w @ priors[:, :2]
+    cross, dot = w @ (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]), w @ (a * b).sum(axis=1)
+    return float(np.arctan2(cross, dot))
+
+
+def _shifted(positions: F64, priors: F64, yaw: float, weights: F64) -> F64:
+    T = from_xyz_rpy(0.0, 0.0, 0.0, 0.0, 0.0, yaw)
+    w = weights / weights.sum()
+    T[:3, 3] = w @ priors - T[:3, :3] @ (w @ positions)
+    return T

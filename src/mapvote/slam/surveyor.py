@@ -8,24 +8,21 @@ broken, the track begins anew at the prior, and the report names the place.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 
 from mapvote.config import Settings
 from mapvote.core.geometry import exp, inverse, transform
 from mapvote.core.grid import Lattice
-from mapvote.core.types import F64, Bool, Drive, MapvoteError, Scan
+from mapvote.core.types import F64, Drive, MapvoteError, Scan
 from mapvote.core.voxels import VoxelCloud, thin
 from mapvote.localisation.ndt import LEVELS, NdtMap, PosePrior, in_rows, refine
 from mapvote.localisation.odometry import ACCELERATION_MPS2, Fix, Tracker
 from mapvote.localisation.prepare import twist_between
-from mapvote.slam.prior_alignment import fit_to_priors
+from mapvote.slam.pose_graph import Track, fit_to_priors
 
-PRECISE_PRIOR_M, PRECISE_PRIOR_DEG = 0.1, 0.2
-"""A prior at least this good, in both, is a surveyor's: it guides each registration and holds the map's frame. A place
-to 2 cm without an attitude would turn scans to where they meet it: .4 deg, .1 m at 10 m."""
 _MIN_INLIER_SHARE = 0.4
 """As the setting of ndt, while the map is still growing: half of a scan may observe unmapped places."""
 _POINTS_M = 0.3
@@ -40,24 +37,6 @@ _PATIENCE = 5
 """Scans in turn without a registration before the map counts as broken."""
 
 
-@dataclass(frozen=True, slots=True)
-class Surveyed:
-    """The trajectory of one drive, in the frame of the draft."""
-
-    T_map_lidar: F64
-    """(n, 4, 4); of a scan that was not registered the best guess."""
-    registered: Bool
-    """(n,)."""
-    broken: tuple[int, ...]
-    """Scans at which the track began anew, tied to what was before by priors alone."""
-
-
-def is_precise(drive: Drive) -> bool:
-    """Whether a drive's prior is a surveyor's."""
-    good = drive.prior_sigma_m <= PRECISE_PRIOR_M and drive.prior_sigma_deg <= PRECISE_PRIOR_DEG
-    return drive.T_map_lidar_prior is not None and good
-
-
 class Surveyor:
     """The NDT map as it grows, drive after drive."""
 
@@ -65,24 +44,27 @@ class Surveyor:
         """``all_precise``: only drives with a surveyor's prior will come; they get no final check."""
         self._all_precise = all_precise
         self.ndt = settings.ndt.model_copy(update={"min_inlier_share": _MIN_INLIER_SHARE})
-        self.ndt_map: NdtMap | None = None
+        self.ndt_map = NdtMap(np.zeros(3))
         self.fine_map: NdtMap | None = None
         """The same points in narrower distributions, of one level."""
         self.draft = VoxelCloud(Lattice())
         """A cloud of everything, for the ground and the occupied voxels that the second pass needs."""
+        self.tracks: list[Track] = []
+        """Of the drives followed so far, in the frame of the draft."""
         self._found: list[F64] = []
         self._told: list[F64] = []
         """Positions (3,) of registered scans and of their priors, which determine the frame of the priors."""
 
-    def follow(self, drive: Drive, count: Callable[[], None]) -> Surveyed:
-        """The trajectory of one drive; each scan is entered once registered. MapvoteError if fewer than half were."""
-        tracker = Tracker(self._map_around, self.ndt)
+    def follow(self, drive: Drive) -> Iterator[None]:
+        """Find the trajectory of one drive, a scan a step: each is entered once registered. At the end it is the last
+        of ``tracks``. MapvoteError if fewer than half of the scans could be registered."""
+        tracker = Tracker(self.ndt_map.around, self.ndt)
         tracker.twist = _first_motion(drive)
-        precise = is_precise(drive)
+        precise = drive.has_precise_prior
         poses, registered, broken, lost = [], [], [], 0
         for i, scan in enumerate(drive):
             prior = PosePrior.of(drive, i)
-            fix = self._locate(tracker, scan, prior if precise or self.ndt_map is None else None)
+            fix = self._locate(tracker, scan, prior if precise or not len(self.draft) else None)
             if not fix.trusted and not precise and prior is not None:
                 prior = self._in_draft(prior)
                 fix = self._locate(tracker, scan, prior)
@@ -95,17 +77,18 @@ class Surveyor:
             registered.append(fix.trusted)
             if fix.trusted:
                 self._enter(fix, drive, i)
-            count()
+            yield
         if np.mean(registered) < 0.5:
             raise MapvoteError(
                 f"{drive.path}: only {int(np.sum(registered))} of {len(drive)} scans could be registered to the map "
                 "so far; is the drive in order of time, and its prior in the same frame as the other drives'?"
             )
-        return Surveyed(np.array(poses), np.array(registered), tuple(broken))
+        unknown = np.full(len(poses), np.nan)
+        self.tracks.append(Track(drive, np.array(poses), np.array(registered), tuple(broken), unknown))
 
     def _locate(self, tracker: Tracker, scan: Scan, prior: PosePrior | None) -> Fix:
         """The scan in the map so far; untrusted if it would jump."""
-        if self.ndt_map is None:
+        if not len(self.draft):
             return tracker.begin(scan, np.eye(4) if prior is None else prior.T_map_lidar)
         before = tracker.last_pose, tracker.last_stamp_ns, tracker.twist
         moving = tracker.last_pose is not None and bool(tracker.twist.any())
@@ -129,10 +112,8 @@ class Surveyor:
         T_map_lidar = fix.registration.T_map_lidar
         if self.fine_map is None:
             return fix
-        if not self.fine_map.is_central(T_map_lidar[:3, 3]):
-            self.fine_map.recentre(T_map_lidar[:3, 3])
         points = in_rows(fix.points[thin(fix.points, _FINE.points_m)])
-        found = refine(self.fine_map, [points], T_map_lidar)
+        found = refine(self.fine_map.around(T_map_lidar[:3, 3]), [points], T_map_lidar)
         if not found.converged or np.linalg.norm(found.T_map_lidar[:3, 3] - T_map_lidar[:3, 3]) > _POLISH_M:
             return fix
         tracker.correct(found.T_map_lidar, twist_between(last_pose, found.T_map_lidar, age))
@@ -148,18 +129,11 @@ class Surveyor:
         T_map_lidar = inverse(T_prior_draft) @ prior.T_map_lidar
         return replace(prior, T_map_lidar=T_map_lidar, sigma_m=max(prior.sigma_m, float(np.median(off))))
 
-    def _map_around(self, position: F64) -> NdtMap:
-        if self.ndt_map is None:
-            self.ndt_map = NdtMap(position)
-        if not self.ndt_map.is_central(position):
-            self.ndt_map.recentre(position)
-        return self.ndt_map
-
     def _enter(self, fix: Fix, drive: Drive, i: int) -> None:
         T_map_lidar = fix.registration.T_map_lidar
         points_map, position = transform(T_map_lidar, fix.points), T_map_lidar[:3, 3]
         spread = points_map.take(thin(points_map - position, _POINTS_M), axis=0)
-        self._map_around(position).enter(spread)
+        self.ndt_map.around(position).enter(spread)
         if not self._all_precise:
             if self.fine_map is None:
                 self.fine_map = NdtMap(position, (_FINE,))
@@ -177,8 +151,8 @@ def _first_motion(drive: Drive) -> F64:
     if told is None or len(drive) < 2:
         return np.zeros(6)
     seconds = 1e-9 * (drive.stamps_ns - drive.stamps_ns[0]).astype(np.float64)
-    k = 1 if is_precise(drive) else max(1, int(np.searchsorted(seconds, 1.0)))
+    k = 1 if drive.has_precise_prior else max(1, int(np.searchsorted(seconds, 1.0)))
     k = min(k, len(drive) - 1)
-    tries = 1 if is_precise(drive) else min(k, len(drive) - k)
+    tries = 1 if drive.has_precise_prior else min(k, len(drive) - k)
     motions = [twist_between(told[i], told[i + k], float(seconds[i + k] - seconds[i])) for i in range(tries)]
     return np.asarray(np.median(motions, axis=0))

@@ -1,22 +1,95 @@
-"""A precise prior's claim to an attitude, against the road that its own scans show.
+"""The road under the driven path: it lies one sensor height below, all along, and points say how high.
 
-A prior within .1 m and .2 deg guides every registration (:mod:`mapvote.slam.surveyor`). If its attitude is pitched by a
-degree, the road ahead of each scan lies where no other scan has it, and the ground is wrong. One scan shows the pitch:
-the road along the driven path runs parallel to that path. Roll does not show: a road's own crossfall is as large.
+A vehicle is the one witness of the ground that no reflection deceives: where it drove, there is road. The height of its
+sensor is taken from the points on the driven track, of which the road is the densest layer; the mount that a drive
+states need not be known.
+
+The same road checks a prior's claim to a precise attitude, which guides every registration
+(:mod:`mapvote.slam.surveyor`). If that is pitched by a degree, the road ahead of each scan lies where no other scan has
+it, and the ground is wrong. One scan shows the pitch: the road along the driven path runs parallel to that path. Roll
+does not show: a road's own crossfall is as large.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 import scipy
 
 from mapvote.core.geometry import transform
-from mapvote.core.types import F64, Bool, Drive
-from mapvote.slam.road_prior import TRACK_M
-from mapvote.slam.surveyor import PRECISE_PRIOR_DEG, is_precise
+from mapvote.core.types import F64, PRECISE_PRIOR_DEG, Bool, Drive
+
+TRACK_M = 0.8
+"""Half the width that wheels roll over."""
+_STEP_M = 0.15
+_JUMP_M = 5.0
+"""Between scans; farther apart, nothing is known of the way between them."""
+_LAYERS_M = np.arange(0.15, 6.0, 0.05)
+"""Below the sensor, where the road of a map is looked for."""
+_ROAD_M = 0.15
+"""Points this near to the densest layer are the road."""
+_LEAST_SHARE = 0.3
+"""Of the track, along which the road must have been measured where it is expected."""
+
+
+@dataclass(frozen=True, slots=True)
+class RoadUnder:
+    """The road under one drive."""
+
+    points_map: F64
+    """(n, 3) map metres, every 0.15 m along the path; none if the points do not show it."""
+    sensor_height_m: float
+    """Of the sensor above it, the drive's median; NaN if unknown."""
+    measured_share: float
+    """Of the path: where points of the road lie under it."""
+
+
+def road_under(T_map_lidar: F64, registered: Bool, cloud: F64) -> RoadUnder:
+    """The road under a drive at poses (n, 4, 4), those ``registered`` (n,), from the points (m, 3) of the map."""
+    path = _dense(T_map_lidar[:, :3, 3], registered)
+    none = RoadUnder(np.zeros((0, 3)), np.nan, 0.0)
+    if len(path) == 0:
+        return none
+    distance, at = scipy.spatial.cKDTree(path[:, :2]).query(cloud[:, :2], distance_upper_bound=TRACK_M)
+    on_track = np.isfinite(distance)
+    at, height = at[on_track], path[at[on_track], 2] - cloud[on_track, 2]
+    densest_m = _densest(height, _LAYERS_M)
+    if np.isnan(densest_m):
+        return none
+    road = np.abs(height - densest_m) < _ROAD_M
+    sensor_height_m = float(np.median(height[road]))
+    near = np.zeros(len(path), dtype=np.bool_)
+    near[at[road]] = True
+    reach = round(1.0 / _STEP_M)
+    share = float((np.convolve(near, np.ones(2 * reach + 1), mode="same") > 0).mean())
+    if share < _LEAST_SHARE:
+        return RoadUnder(np.zeros((0, 3)), sensor_height_m, share)
+    return RoadUnder(path - [0.0, 0.0, sensor_height_m], sensor_height_m, share)
+
+
+def _densest(heights: F64, layers: F64) -> float:
+    """The middle of the layer between two of ``layers`` (k,) that, with the two beside it, holds the most of the
+    ``heights`` (n,); NaN if all are empty."""
+    count = np.histogram(heights, layers)[0]
+    densest = int(np.argmax(np.convolve(count, np.ones(3), mode="same")))
+    return float(layers[densest] + 0.5 * (layers[1] - layers[0])) if count.any() else np.nan
+
+
+def _dense(positions: F64, registered: Bool) -> F64:
+    """(m, 3) the path every 0.15 m, but for stretches on which no scan was registered."""
+    known = positions[registered]
+    if len(known) < 2:
+        return known
+    pieces = [known[:1]]
+    for a, b in pairwise(known):
+        length = float(np.linalg.norm(b - a))
+        steps = max(1, round(length / _STEP_M)) if length <= _JUMP_M else 1
+        pieces.append(a + np.arange(1, steps + 1)[:, None] / steps * (b - a))
+    return np.concatenate(pieces)
+
 
 _SCANS, _LEAST_SCANS = 24, 8
 _REACH_M = 15.0
@@ -24,8 +97,8 @@ _REACH_M = 15.0
 _SPREAD_M = 5.0
 """Along the path: a shorter piece of road shows no slope."""
 _LEAST_POINTS = 30
-_DEPTH_M, _LAYER_M, _ROAD_M = (0.3, 5.0), 0.1, 0.4
-"""Below the sensor: where the road is looked for, in layers, and how far from the fullest one it may reach."""
+_DEPTHS_M, _AROUND_M = np.arange(0.3, 5.0, 0.1), 0.4
+"""Below the sensor: where the road of one scan is looked for, in layers, and how far from the densest it may reach."""
 _SCATTER_M = 0.03
 """Of points of a road."""
 _SIGMAS, _OWN_DEG = 3.0, 0.2
@@ -63,7 +136,7 @@ def wrong_attitude(drive: Drive, scans: Sequence[int] | None = None) -> WrongAtt
 
     ``scans``: those that can be read; all unless given. A coarser prior is not looked at: it guides no registration.
     """
-    if not is_precise(drive):
+    if not drive.has_precise_prior:
         return None
     chosen = np.arange(len(drive)) if scans is None else np.asarray(scans, dtype=np.int64)
     chosen = chosen[np.unique(np.linspace(0, len(chosen) - 1, min(_SCANS, len(chosen))).astype(np.int64))]
@@ -75,12 +148,6 @@ def wrong_attitude(drive: Drive, scans: Sequence[int] | None = None) -> WrongAtt
     if abs(pitch_deg) <= _SIGMAS * drive.prior_sigma_deg + _OWN_DEG:
         return None
     return WrongAttitude(pitch_deg, drive.prior_sigma_deg)
-
-
-def as_precise_as_shown(drive: Drive) -> tuple[Drive, WrongAttitude | None]:
-    """(the drive, with the standard deviation of its attitude that the scans show; what contradicts its own)."""
-    wrong = wrong_attitude(drive)
-    return (drive, None) if wrong is None else (replace(drive, prior_sigma_deg=wrong.sigma_deg), wrong)
 
 
 def _pitch_rad(drive: Drive, i: int) -> float:
@@ -114,14 +181,12 @@ def _run_around(near: Bool, i: int) -> Bool:
 
 def _slope(along: F64, depth: F64) -> float:
     """Slope of the road in points (n,) at ``along`` and ``depth``, metres below the path; NaN if they show none."""
-    layers = np.arange(*_DEPTH_M, _LAYER_M)
-    count = np.histogram(depth, layers)[0]
-    fullest = layers[int(np.argmax(np.convolve(count, np.ones(3), mode="same")))] + 0.5 * _LAYER_M
-    road = np.abs(depth - fullest) < _ROAD_M
+    densest_m = _densest(depth, _DEPTHS_M)
+    road = np.abs(depth - densest_m) < _AROUND_M
     s, d = along[road], depth[road]
     if len(s) < _LEAST_POINTS or np.ptp(np.percentile(s, (5, 95))) < _SPREAD_M:
         return np.nan
     found = scipy.optimize.least_squares(
-        lambda p: p[0] + p[1] * s - d, np.array([fullest, 0.0]), loss="soft_l1", f_scale=_SCATTER_M
+        lambda p: p[0] + p[1] * s - d, np.array([densest_m, 0.0]), loss="soft_l1", f_scale=_SCATTER_M
     )
     return float(np.arctan(found.x[1]))
