@@ -17,7 +17,7 @@ from mapvote.localisation.map_window import MapWindow
 from mapvote.localisation.ndt import PosePrior
 from mapvote.localisation.odometry import Tracker
 from mapvote.slam.build import BuildReport, _agreed_heights, build_map
-from mapvote.slam.pose_graph import Track
+from mapvote.slam.pose_graph import DriveTrack
 from mapvote_lab.evaluation.truths import rigid_between
 from mapvote_lab.simulation import simulate
 from streets import drive_along, path, street
@@ -213,7 +213,7 @@ def test_ground_that_the_path_contradicts_is_refused_with_the_place() -> None:
     x, y = np.meshgrid(np.arange(0.15, 60.0, 0.3), np.arange(0.15, 12.0, 0.3))
     flat = map_from_points(np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)]))
     poses = np.array([from_xyz_rpy(x, 6.0, 1.8 if x < 34.0 else 3.8) for x in np.arange(2.0, 58.0)])
-    track = Track(drive_along(poses, 1), poses, np.ones(56, np.bool_), (), np.full(56, np.nan))
+    track = DriveTrack(drive_along(poses, 1), poses, np.ones(56, np.bool_), (), np.full(56, np.nan))
     with pytest.raises(MapvoteError, match=r"disagree by more than 0.3 m along 42.9% of the path, most by 2.00 m at"):
         _agreed_heights(track, flat)
     assert _agreed_heights(replace(track, registered=np.arange(56) < 32), flat).complaint == ""

@@ -33,7 +33,7 @@ from mapvote.slam.clean_map import (
     trails,
     without_lone_points,
 )
-from mapvote.slam.pose_graph import Track
+from mapvote.slam.pose_graph import DriveTrack
 
 LATTICE = Lattice()
 
@@ -300,7 +300,7 @@ def mapped(seen: Callable[[int], F64], x: F64, draft: F64, **mapping: object) ->
     drive = Drive(Path("d"), "survey", "d", SENSORS["hdl32e"], stamps_ns, read_scan)
     own = Settings().mapping.model_copy(update=mapping)
     mapper = Mapper(map_from_points(draft), Settings().model_copy(update={"mapping": own}))
-    for _ in mapper.enter(Track(drive, poses, np.ones(len(x), np.bool_), (), np.full(len(x), np.nan))):
+    for _ in mapper.enter(DriveTrack(drive, poses, np.ones(len(x), np.bool_), (), np.full(len(x), np.nan))):
         pass
     return all_points(mapper.finish())
 

@@ -10,7 +10,7 @@ import pytest
 from mapvote.core.geometry import exp, from_xyz_rpy, inverse, log, rotation_angle
 from mapvote.core.types import F64
 from mapvote.slam.driven_road import road_under
-from mapvote.slam.pose_graph import Anchors, Links, Track, carried_along, fit_to_priors, optimise, trust_in
+from mapvote.slam.pose_graph import Anchors, DriveTrack, Links, carried_along, fit_to_priors, optimise, trust_in
 from streets import drive_along, path
 
 
@@ -98,10 +98,10 @@ def road_of(poses: F64, seed: int) -> F64:
     return np.concatenate([own @ T[:3, :3].T + T[:3, 3] for T in poses])
 
 
-def surveyed(poses: F64, lost: slice = slice(0, 0)) -> Track:
+def surveyed(poses: F64, lost: slice = slice(0, 0)) -> DriveTrack:
     registered = np.ones(len(poses), np.bool_)
     registered[lost] = False
-    return Track(drive_along(poses, 1), poses, registered, (), np.full(len(poses), np.nan))
+    return DriveTrack(drive_along(poses, 1), poses, registered, (), np.full(len(poses), np.nan))
 
 
 def test_a_road_is_found_under_settled_poses_however_far_the_first_pass_drifted() -> None:

@@ -21,7 +21,7 @@ from mapvote.core.sensor_height import Heights, check_heights, two_levels
 from mapvote.core.types import Drive, MapvoteError
 from mapvote.slam.clean_map import Mapper
 from mapvote.slam.driven_road import road_under, wrong_attitude
-from mapvote.slam.pose_graph import Track, carried_along, settle_poses
+from mapvote.slam.pose_graph import DriveTrack, carried_along, settle_poses
 from mapvote.slam.surveyor import Surveyor
 
 Progress = Callable[[int, int], None]
@@ -37,7 +37,7 @@ _FIRST_DATE_NS = 946_684_800 * 10**9
 class BuildReport:
     """What came of building a map."""
 
-    tracks: tuple[Track, ...]
+    tracks: tuple[DriveTrack, ...]
     points: int
     bent_m: float
     """How far the priors moved a scan at most, after the whole survey was shifted and turned to fit them; 0 without
@@ -114,7 +114,7 @@ def _last_stamp(drives: Sequence[Drive]) -> int | None:
     return max(ends) if min(ends) > _FIRST_DATE_NS else None
 
 
-def _agreed_heights(track: Track, point_map: PointMap) -> Heights:
+def _agreed_heights(track: DriveTrack, point_map: PointMap) -> Heights:
     """Heights of the driven positions over the ground; MapvoteError if that cannot be the road under them."""
     heights = check_heights(point_map, track.driven)
     if heights.off_share > MOST_OFF:

@@ -58,7 +58,7 @@ from mapvote.detection.packed_tiles import PackedTiles, count_of
 from mapvote.localisation.localiser import GivenPoses
 from mapvote.perception.frontend import Frontend, Observation, PlacedScan
 from mapvote.perception.moving_objects import MovingFilter
-from mapvote.slam.pose_graph import Track
+from mapvote.slam.pose_graph import DriveTrack
 
 ROAD_M = 0.1
 """Points this low above the ground are the road itself, also under a car."""
@@ -76,7 +76,7 @@ class Mapper:
         self._around = LocalMap(draft, 2.0 * settings.mapping.reach_m)
         self._near = LocalMap(draft, settings.voting.window_m)
 
-    def enter(self, track: Track) -> Iterator[None]:
+    def enter(self, track: DriveTrack) -> Iterator[None]:
         """Enter the registered scans of one drive at their poses, a scan a step."""
         drive = track.drive
         frontend = Frontend(

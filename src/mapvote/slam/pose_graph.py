@@ -38,7 +38,7 @@ class Drift:
 
 
 @dataclass(frozen=True, slots=True)
-class Track:
+class DriveTrack:
     """The trajectory of one drive: as surveyed, in the frame of the draft, then settled, in that of the map."""
 
     drive: Drive
@@ -190,7 +190,7 @@ _ASKED = 12
 """Poses of a drive whose covariance is worked out; the others lie between."""
 
 
-def settle_poses(tracks: Sequence[Track]) -> tuple[list[Track], float]:
+def settle_poses(tracks: Sequence[DriveTrack]) -> tuple[list[DriveTrack], float]:
     """(the tracks with poses that agree with each other's motion and with all priors; how far the priors moved a scan
     at most, after the whole had been shifted and turned to fit them, metres). As given if there are no priors."""
     drives = [track.drive for track in tracks]
@@ -212,7 +212,7 @@ def settle_poses(tracks: Sequence[Track]) -> tuple[list[Track], float]:
     return [replace(track, T_map_lidar=poses, sigma_m=sigma_m) for track, poses, sigma_m in settled], bent_m
 
 
-def carried_along(points: F64, found: Sequence[Track], settled: Sequence[Track]) -> F64:
+def carried_along(points: F64, found: Sequence[DriveTrack], settled: Sequence[DriveTrack]) -> F64:
     """Points (n, 3) of the draft, each moved as the nearest scan was when the tracks ``found`` were settled.
 
     The draft was measured at the poses of the first pass. A road that is looked for under settled poses in a draft that
@@ -237,7 +237,7 @@ def _sigmas(T: F64, links: list[Links], anchors: list[Anchors], starts: I64) -> 
     return [np.interp(np.arange(a, b), at, s) for (a, b), at, s in zip(ends, asked, pieces, strict=True)]
 
 
-def _pieces(tracks: Sequence[Track], starts: I64) -> I64:
+def _pieces(tracks: Sequence[DriveTrack], starts: I64) -> I64:
     """(n,) number of the unbroken stretch that each scan belongs to."""
     begins = np.zeros(int(starts[-1]), dtype=np.int64)
     begins[starts[:-1]] = 1

@@ -21,7 +21,7 @@ from mapvote.core.voxels import VoxelCloud, thin
 from mapvote.localisation.ndt import LEVELS, NdtMap, PosePrior, in_rows, refine
 from mapvote.localisation.odometry import ACCELERATION_MPS2, Fix, Tracker
 from mapvote.localisation.prepare import twist_between
-from mapvote.slam.pose_graph import Track, fit_to_priors
+from mapvote.slam.pose_graph import DriveTrack, fit_to_priors
 
 _MIN_INLIER_SHARE = 0.4
 """As the setting of ndt, while the map is still growing: half of a scan may observe unmapped places."""
@@ -49,7 +49,7 @@ class Surveyor:
         """The same points in narrower distributions, of one level."""
         self.draft = VoxelCloud(Lattice())
         """A cloud of everything, for the ground and the occupied voxels that the second pass needs."""
-        self.tracks: list[Track] = []
+        self.tracks: list[DriveTrack] = []
         """Of the drives followed so far, in the frame of the draft."""
         self._found: list[F64] = []
         self._told: list[F64] = []
@@ -84,7 +84,7 @@ class Surveyor:
                 "so far; is the drive in order of time, and its prior in the same frame as the other drives'?"
             )
         unknown = np.full(len(poses), np.nan)
-        self.tracks.append(Track(drive, np.array(poses), np.array(registered), tuple(broken), unknown))
+        self.tracks.append(DriveTrack(drive, np.array(poses), np.array(registered), tuple(broken), unknown))
 
     def _locate(self, tracker: Tracker, scan: Scan, prior: PosePrior | None) -> Fix:
         """The scan in the map so far; untrusted if it would jump."""

@@ -7,12 +7,12 @@ import numpy as np
 
 from mapvote.plots import draw_survey
 from mapvote.slam.build import BuildReport
-from mapvote.slam.pose_graph import Track
+from mapvote.slam.pose_graph import DriveTrack
 from streets import drive_along, path
 
 POSES = path(10)
 DRIVE = drive_along(POSES, 1, POSES.copy())
-REPORT = BuildReport((Track(DRIVE, POSES, np.arange(10) != 4, (5,), np.full(10, 0.3)),), 1, 0.0, None)
+REPORT = BuildReport((DriveTrack(DRIVE, POSES, np.arange(10) != 4, (5,), np.full(10, 0.3)),), 1, 0.0, None)
 
 
 def test_the_picture_is_the_same_each_time(tmp_path: Path) -> None:
