@@ -51,7 +51,7 @@ from mapvote.vehicle import Vehicle
 from mapvote.warmup import warm_vehicle
 
 sys.path[0] = str(Path(__file__).parents[1] / "tests")  # instead of this folder, whose live.py would hide tests/live
-from live.loopback_dds import LOOPBACK, domain_of  # noqa: E402
+from live.loopback_dds import LOOPBACK, own_domain  # noqa: E402
 from live_server import mapvote  # noqa: E402
 
 TILES = 3
@@ -95,7 +95,7 @@ def cpu_by_thread() -> dict[str, float]:
 def read_clouds(seconds: float = 20.0) -> None:
     """CPU of this process for each cloud, received and made a scan; what an idle reader costs is in it."""
     os.environ["CYCLONEDDS_URI"] = LOOPBACK
-    domain = domain_of("benchmark")
+    domain = own_domain()
     sender = subprocess.Popen(
         [sys.executable, __file__, "send-clouds", "--domain", str(domain), "--seconds", str(seconds + 5)]
     )
@@ -179,7 +179,7 @@ def kills(drive: str, map_path: str, n: int, longest_s: float) -> None:
     twice. Exit code 1 if a ballot is, or more than 30 s of road."""
     home, chance = Path(tempfile.mkdtemp()), random.Random(4)
     os.environ |= {"CYCLONEDDS_URI": LOOPBACK, "XDG_CACHE_HOME": str(home / "cache"), "PYTHONUNBUFFERED": "1"}
-    domain, server, shown, log = domain_of("kills"), Server(home, map_path), home / "stamp", home / "log"
+    domain, server, shown, log = own_domain(), Server(home, map_path), home / "stamp", home / "log"
     sender = subprocess.Popen(
         [sys.executable, __file__, "laps", drive, str(shown), "--domain", str(domain)], start_new_session=True
     )
@@ -228,7 +228,7 @@ def play_and_drive(drive: str, map_path: str, rate: float, sensor: str, core: st
     """Two processes, as the two terminals of docs/live.md; ``core``: the one that drive has, "" for any."""
     home = Path(tempfile.mkdtemp())
     os.environ |= {"CYCLONEDDS_URI": LOOPBACK, "XDG_CACHE_HOME": str(home)}
-    domain = domain_of("play")
+    domain = own_domain()
     player = subprocess.Popen(mapvote("play", drive, "--rate", rate, "--domain", domain), stdout=subprocess.DEVNULL)
     options = ["--map", map_path, "--out", home, "--vehicle", "car", "--sensor", sensor, "--idle", 20]
     before = os.times()

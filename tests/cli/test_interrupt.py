@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 from typer.main import get_command
 
-from live.loopback_dds import LOOPBACK, domain_of
+from live.loopback_dds import LOOPBACK, own_domain
 from live_server import mapvote
 from mapvote.cli import app
 from mapvote.server.store.store import Store
@@ -229,7 +229,7 @@ def test_an_autoware_service_ends_on_ctrl_c_with_how_much_it_answered(tmp_path: 
     """It runs until it is stopped, so that this is no failure; the server may be away."""
     pytest.importorskip("cyclonedds")
     here, log = tmp_path, tmp_path / "log"
-    words = ["autoware", "http://127.0.0.1:9", "map", "--every", "0.1", "--domain", str(domain_of("interrupt"))]
+    words = ["autoware", "http://127.0.0.1:9", "map", "--every", "0.1", "--domain", str(own_domain())]
     with log.open("w") as out:
         process = subprocess.Popen(
             mapvote(*words), cwd=here, stdout=out, stderr=subprocess.STDOUT, start_new_session=True,

@@ -17,7 +17,6 @@ import numpy as np
 import pytest
 import yaml
 
-from live.loopback_dds import LOOPBACK, domain_of
 from live.test_drive import record
 from mapvote.core.types import F64, Bool
 from mapvote.formats import read_map
@@ -90,13 +89,12 @@ def tiles_of(folder: Path) -> set[str]:
 
 
 @pytest.mark.slow
-def test_the_page_works_in_its_order(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_page_works_in_its_order(tmp_path: Path, domain: int, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("cyclonedds")
     port = free_port()
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("CYCLONEDDS_URI", LOOPBACK)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    monkeypatch.setenv("ROS_DOMAIN_ID", str(domain_of("autoware page")))
+    monkeypatch.setenv("ROS_DOMAIN_ID", str(domain))
     monkeypatch.setenv("PYTHONUNBUFFERED", "1")
     text = PAGE.read_text().replace("127.0.0.1:8080", f"127.0.0.1:{port}")
     blocks = re.findall(r"^```\n(.*?)^```", text, re.MULTILINE | re.DOTALL)

@@ -4,35 +4,26 @@ from __future__ import annotations
 
 import gc
 import os
-import time
-from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 import pytest
 from rosbags.typesys import Stores, get_typestore
 
-from live.loopback_dds import LOOPBACK, domain_of
+from live.loopback_dds import LOOPBACK, own_domain, until
 from mapvote.core.sensors import SENSORS
-from mapvote.core.types import MapvoteError
+from mapvote.core.types import MapvoteError, Scan
 from mapvote.formats.drives.point_fields import scan_from_point_cloud2
-from mapvote.live.cdr import TYPES, blank_message, from_cdr, header_of, stamp_ns, to_cdr
+from mapvote.live.cdr import TYPES, blank_message, from_cdr, stamp_ns, to_cdr
 from mapvote.live.dds import Network, ros_type
+from mapvote.live.messages import CLOUD, TF, cloud_message
 
 pytest.importorskip("cyclonedds")
-CLOUD, TF, ODOMETRY = "sensor_msgs/msg/PointCloud2", "tf2_msgs/msg/TFMessage", "nav_msgs/msg/Odometry"
-POINT_FIELD = "sensor_msgs/msg/PointField"
 START = 1_700_000_000_123_456_789
 
 
 def cloud(n: int = 1000) -> bytes:
-    points = np.random.default_rng(4).uniform(5, 30, (n, 3)).astype("<f4")
-    fields = [blank_message(POINT_FIELD, name=axis, offset=4 * i, datatype=7, count=1) for i, axis in enumerate("xyz")]
-    message = blank_message(
-        CLOUD, header=header_of(START, "lidar"), height=1, width=n, fields=fields, point_step=12, row_step=12 * n
-    )
-    message.data = points.tobytes()
-    return to_cdr(CLOUD, message)
+    points = np.random.default_rng(4).uniform(5, 30, (n, 3)).astype(np.float32)
+    return cloud_message(Scan(START, points))
 
 
 @pytest.mark.parametrize("kind", sorted(TYPES.keys() & get_typestore(Stores.ROS2_HUMBLE).types.keys()))
@@ -59,7 +50,7 @@ def test_what_another_implementation_wrote_is_read_to_the_last_digit() -> None:
         second = from_cdr(TF, data).transforms[1]
         assert (second.header.frame_id, second.child_frame_id) == ("base_link", "lidar_top")
         assert (second.transform.translation.z, second.transform.rotation.w) == (2.0, 0.8)
-        assert stamp_ns(second) == 1_700_000_000_000_000_005
+        assert stamp_ns(second.header) == 1_700_000_000_000_000_005
 
 
 def test_a_message_that_is_cut_off_or_no_cdr_is_refused_and_says_so() -> None:
@@ -76,70 +67,56 @@ def test_only_types_of_ros_2_have_a_ros_2_name() -> None:
     assert ros_type("HelloWorld") is None
 
 
-def test_a_cloud_goes_over_dds_and_is_the_scan_that_was_sent(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("CYCLONEDDS_URI", LOOPBACK)
-    domain = domain_of("cloud")
-    sender, listener = Network(domain), Network(domain)
+def test_a_cloud_goes_over_dds_and_is_the_scan_that_was_sent(domain: int) -> None:
+    sender, receiver = Network(domain), Network(domain)
     out = sender.publish("/points", CLOUD)
-    heard = _until(listener.heard)
-    assert [(h.topic, h.kind, h.writers, h.reliable, h.transient_local) for h in heard] == [
+    published = until(receiver.published)
+    assert [(p.topic, p.kind, p.writers, p.reliable, p.transient_local) for p in published] == [
         ("/points", CLOUD, 1, True, False)
     ]
-    incoming = listener.subscribe("/points", CLOUD, reliable=True)
-    _until(lambda: out.readers)
+    incoming = receiver.subscribe("/points", CLOUD, reliable=True)
+    until(lambda: out.readers)
     out.send(cloud())
-    listener.wait(5.0)
-    (data,) = _until(incoming.take)
+    receiver.wait(5.0)
+    ((_, data),) = until(incoming.take)
     scan = scan_from_point_cloud2(from_cdr(CLOUD, data), SENSORS["hdl32e"])
     assert (scan.stamp_ns, len(scan.points)) == (START, 1000)
 
 
 def test_joining_a_domain_leaves_the_users_configuration_as_it_was(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("CYCLONEDDS_URI", LOOPBACK)
-    Network(domain_of("configured"))
+    Network(own_domain())
     assert os.environ["CYCLONEDDS_URI"] == LOOPBACK
     monkeypatch.setenv("CYCLONEDDS_URI", "<Domain><NoSuchSetting/></Domain>")
     with pytest.raises(MapvoteError, match="CYCLONEDDS_URI"):
-        Network(domain_of("misconfigured"))
+        Network(own_domain())
     assert os.environ["CYCLONEDDS_URI"] == "<Domain><NoSuchSetting/></Domain>"
 
 
 def received(sent: list[bytes], domain: int) -> list[memoryview]:
     """What a network that is gone by now received of ``sent``."""
-    sender, listener = Network(domain), Network(domain)
-    incoming, out = listener.subscribe("/points", CLOUD, reliable=True), sender.publish("/points", CLOUD)
-    _until(lambda: out.readers)
+    sender, receiver = Network(domain), Network(domain)
+    incoming, out = receiver.subscribe("/points", CLOUD, reliable=True), sender.publish("/points", CLOUD)
+    until(lambda: out.readers)
     for one in sent:
         out.send(one)
     kept: list[memoryview] = []
     while len(kept) < len(sent):
-        kept += _until(incoming.take)
-    incoming.close()
+        kept += [data for _, data in until(incoming.take)]
     return kept
 
 
-def test_the_bytes_of_a_message_outlive_its_reader_and_its_network(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("CYCLONEDDS_URI", LOOPBACK)
+def test_the_bytes_of_a_message_outlive_its_reader_and_its_network(domain: int) -> None:
     sent = [cloud(n) for n in (1000, 1001)]
-    kept = received(sent, domain_of("outlive"))
+    kept = received(sent, domain)
     gc.collect()
     assert [bytes(data[: len(one)]) for data, one in zip(kept, sent, strict=True)] == sent
     assert all(data.readonly for data in kept)
 
 
-def test_a_reader_that_comes_late_gets_what_a_durable_writer_sent(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("CYCLONEDDS_URI", LOOPBACK)
-    domain = domain_of("late")
-    sender, listener = Network(domain), Network(domain)
+def test_a_reader_that_comes_late_gets_what_a_durable_writer_sent(domain: int) -> None:
+    sender, receiver = Network(domain), Network(domain)
     out = sender.publish("/tf_static", TF, transient_local=True, depth=1)
     out.send(to_cdr(TF, blank_message(TF)))
-    incoming = listener.subscribe("/tf_static", TF, reliable=True, transient_local=True)
-    assert from_cdr(TF, _until(incoming.take)[0]).transforms == []
-
-
-def _until(ask: Callable[[], Any]) -> Any:
-    end = time.monotonic() + 60.0
-    while not (found := ask()):
-        assert time.monotonic() < end, "nothing came in a minute"
-        time.sleep(0.02)
-    return found
+    incoming = receiver.subscribe("/tf_static", TF, reliable=True, transient_local=True)
+    ((_, data),) = until(incoming.take)
+    assert from_cdr(TF, data).transforms == []

@@ -14,7 +14,6 @@ from scipy.spatial.transform import Rotation
 
 from bag_recorder import START, Recorder
 from command_line import type_in
-from live.loopback_dds import LOOPBACK, domain_of
 from mapvote.codec.ballot import encode
 from mapvote.core.point_map import map_from_points
 from mapvote.core.sensors import SENSORS
@@ -54,16 +53,14 @@ def record(
 
 @pytest.mark.slow
 def test_a_live_drive_by_a_played_bag_casts_the_ballots_of_vote_on_that_bag_bit_for_bit(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, domain: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setenv("CYCLONEDDS_URI", LOOPBACK)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     bag, folder = tmp_path / "bag", tmp_path / "ballots"
     record(bag)
     write_map(map_from_points(street(1)), tmp_path / "map")
     folder.mkdir()
-    domain = str(domain_of("drive"))
-    options = ["--domain", domain, "--rate", "0.5", "--wait", "3600"]
+    options = ["--domain", str(domain), "--rate", "0.5", "--wait", "3600"]
     player = subprocess.Popen([sys.executable, "-m", "mapvote", "play", str(bag), *options])
     try:
         said = type_in(

@@ -18,7 +18,7 @@ from mapvote.codec.ballot import Ballot, decode
 from mapvote.core.point_map import PointMap, map_from_points
 from mapvote.core.types import F64, Drive, MapvoteError, Scan
 from mapvote.live import drive as drive_module
-from mapvote.live.drive import LiveDrive, OneMap, Thinning, Waiting
+from mapvote.live.drive import LiveDrive, OneMap, Thinning, WaitingScan
 from mapvote.live.outbox import Outbox, ballot_of
 from mapvote.vehicle import Cuts, Vehicle
 from streets import drive_along, path, street
@@ -54,7 +54,7 @@ class Live:
         stamp_ns = 1_700_000_000 * 10**9 + scan.stamp_ns + shift_ns
         self.live.on_pose(stamp_ns, self.poses[i])
         moved = Scan(stamp_ns, scan.points, scan.time_s)
-        self.live.on_scan(Waiting(stamp_ns, stamp_ns, read or (lambda: moved)))
+        self.live.on_scan(WaitingScan(stamp_ns, stamp_ns, read or (lambda: moved)))
 
     def drain(self) -> None:
         while self.live.step():
@@ -133,7 +133,7 @@ def test_a_scan_that_cannot_be_read_is_counted_and_the_drive_goes_on(tmp_path: P
     live.live.finish()
     live.outbox.close()
     assert (live.live.counts.unusable, live.live.counts.observed) == (2, SCANS - 2)
-    assert live.live.counts.latencies_s
+    assert live.live.latencies_s
 
 
 def test_of_scans_that_wait_each_finds_its_pose_in_odometry_of_500_hz(tmp_path: Path) -> None:

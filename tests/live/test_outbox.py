@@ -219,5 +219,5 @@ def test_while_the_server_is_away_ballots_wait_in_the_spool_and_the_scan_loop_do
         name = f"day-{n:03d}"
         box.leave(name, lambda name=name: ballot(name), f"day-{n + 1:03d}")  # type: ignore[misc]
     box.close()
-    assert away.waiting("car") == box.report.waiting == 20
+    assert away.waiting("car") == box.report.spooled == 20
     assert box.report.sent == 0

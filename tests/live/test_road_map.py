@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +12,7 @@ import pytest
 
 from client.test_map_client import take_down_a_wall
 from hand_made import make_map, make_tile, wall
+from live.loopback_dds import until
 from live_server import serving
 from mapvote.client import Manifest, MapClient, Unreachable
 from mapvote.config import FuseSettings
@@ -32,13 +33,6 @@ def store(tmp_path: Path) -> Iterator[Store]:
     )
     yield made
     made.close()
-
-
-def until(true: Callable[[], bool], what: str) -> None:
-    end = time.monotonic() + 60.0
-    while not true():
-        assert time.monotonic() < end, what
-        time.sleep(0.02)
 
 
 def at(tile: int) -> np.ndarray:
@@ -63,7 +57,7 @@ def test_tiles_come_as_the_vehicle_drives_and_a_version_when_it_is_published(sto
             until(lambda tile=tile: road.covers(at(tile)), f"tile {tile} did not come")  # type: ignore[misc]
         assert set(first.tiles) <= {(0, c) for c in range(12)}
         assert len(first.tiles[0, 7].points) == 6
-        until(lambda: road.events, "no events are heard")
+        until(lambda: road.events, "no events come")
         before = first.tiles[0, 4]
         take_down_a_wall(store, (0, 7))
         until(lambda: road._current.point_map.version == 2, "the new version did not come")

@@ -32,7 +32,6 @@ from mapvote.live.status import (
     RosStatus,
     StatusBoard,
     serve_metrics,
-    watched,
 )
 
 
@@ -54,15 +53,15 @@ def driven(tmp_path: Path) -> Any:
     live = Live(tmp_path, T_base_lidar=mount)
     live.poses = live.poses @ np.linalg.inv(mount)
     board, network = StatusBoard(live.live._maps, live.outbox), Network()
-    hearing = SimpleNamespace(clouds=0, map_frame="map")
+    topics = SimpleNamespace(clouds=0, map_frame="map")
     ros = RosStatus(network, "car")  # type: ignore[arg-type]
     board.tell(0.0, ros.diagnose)
     for i in range(SCANS):
         live.give(i)
         live.drain()
-        hearing.clouds += 1
-        board(live.live, hearing)  # type: ignore[arg-type]
-        ros.poses(live.live, hearing)  # type: ignore[arg-type]
+        topics.clouds += 1
+        board(live.live, topics)  # type: ignore[arg-type]
+        ros.poses(live.live, topics)  # type: ignore[arg-type]
     live.outbox.close()
     return SimpleNamespace(live=live, board=board, sent=network.sent)
 
@@ -76,7 +75,7 @@ def test_what_is_published_is_what_ros_2_reads_and_says_how_it_goes(driven: Any)
     values = {v.key: v.value for v in said.status[0].values}
     assert values["scans"] == str(SCANS)
     voted = driven.live.live.counts.localised
-    assert values["voted"] == str(voted)
+    assert values["localised"] == str(voted)
     poses = [from_cdr(POSE, data) for data in driven.sent["/mapvote/pose"]]
     assert len(poses) == voted > 4
     for i, message in enumerate(poses):
@@ -84,7 +83,7 @@ def test_what_is_published_is_what_ros_2_reads_and_says_how_it_goes(driven: Any)
         place = message.pose.pose.position
         assert np.hypot(place.x - true[0, 3], place.y - true[1, 3]) < 0.1
         assert abs(place.z - true[2, 3]) < 0.1
-        assert stamp_ns(message) == 1_700_000_000 * 10**9 + driven.live.scans[i].stamp_ns
+        assert stamp_ns(message.header) == 1_700_000_000 * 10**9 + driven.live.scans[i].stamp_ns
         covariance = message.pose.covariance.reshape(6, 6)
         assert (np.linalg.eigvalsh(covariance) > 0).all()
         assert covariance[0, 0] < 0.01
@@ -93,12 +92,19 @@ def test_what_is_published_is_what_ros_2_reads_and_says_how_it_goes(driven: Any)
 
 def test_trouble_is_an_error_or_a_warning_and_says_why(driven: Any) -> None:
     sound = driven.board.status
-    sick = replace(sound, silent_s=5.0, localised=0.2, left_out=3, failed_writes=1, server_away="no route")
+    sick = replace(
+        sound,
+        counts=replace(sound.counts, left_out=3),
+        outbox=replace(sound.outbox, failed_writes=1),
+        silent_s=5.0,
+        localised_share=0.2,
+        server_away="no route",
+    )
     assert [level for level, _, _ in sound.troubles()] == [0, 0, 0, 0, 0]
     assert [level for level, _, _ in sick.troubles()] == [2, 1, 1, 2, 1]
     assert "no route" in sick.line()
     screen = Console(file=io.StringIO(), width=100)
-    screen.print(watched(sick, "car"))
+    screen.print(sick.table("car"))
     assert "none for 5 s" in screen.file.getvalue()  # type: ignore[attr-defined]
 
 

@@ -15,7 +15,6 @@ from mapvote.cli.options import Config, KeyFile, Projector
 
 if TYPE_CHECKING:
     from mapvote.live.drive import LiveDrive, Maps
-    from mapvote.live.hearing import Hearing
     from mapvote.live.outbox import Outbox
     from mapvote.live.status import StatusBoard
 
@@ -33,14 +32,14 @@ def topics(
     mapvote topics
     """
     from mapvote.live.dds import Network
-    from mapvote.live.topics import listen, missing_for_drive
+    from mapvote.live.topics import measure_rates, missing_for_drive
 
-    found = listen(Network(domain), seconds)
+    found = measure_rates(Network(domain), seconds)
     for one in found:
         rate = "not read here" if one.rate_hz is None else f"{one.rate_hz:.1f} Hz"
-        quality = "reliable" if one.heard.reliable else "best effort"
+        quality = "reliable" if one.published.reliable else "best effort"
         frame = f" in {one.frame}" if one.frame else ""
-        print(f"{one.heard.topic} [{one.heard.kind}] {rate}, {quality}{frame}")
+        print(f"{one.published.topic} [{one.published.kind}] {rate}, {quality}{frame}")
     for sentence in missing_for_drive(found):
         print(f"missing: {sentence}")
 
@@ -121,9 +120,10 @@ def drive(
     from mapvote.core.types import MapvoteError
     from mapvote.formats.drives.options import read_mount, read_sensor
     from mapvote.live.dds import Network
-    from mapvote.live.hearing import Hearing, choose_topics
     from mapvote.live.service import Plan, run
     from mapvote.live.status import Heartbeat, RosStatus, StatusBoard, serve_metrics
+    from mapvote.live.subscriptions import Subscriptions
+    from mapvote.live.topics import choose_topics
     from mapvote.vehicle import Cuts
     from mapvote.warmup import warm_vehicle
 
@@ -152,10 +152,10 @@ def drive(
         chosen = choose_topics(network, points.split(",") if points else [], odometry, idle or 1e9, ended)
         if chosen is None:
             return
-        topics = [t.topic for t in (*chosen.points, *filter(None, [chosen.odometry]))]
+        names = [one.topic for one in (*chosen.points, *filter(None, [chosen.odometry]))]
         warm_vehicle(plan.settings)
-        print(f"listening to {' and '.join(topics)}", flush=True)
-        hearing, ros = Hearing(network, chosen, model), RosStatus(network, vehicle)
+        print(f"listening to {' and '.join(names)}", flush=True)
+        topics, ros = Subscriptions(network, chosen, model), RosStatus(network, vehicle)
         board = StatusBoard(maps, outbox)
         board.tell(1.0, ros.diagnose)
         if metrics is not None:
@@ -163,8 +163,8 @@ def drive(
         with _view(board, vehicle) if watch else nullcontext():
             if not watch:
                 board.tell(60.0, lambda status, *_: print(status.line(), flush=True))
-            live = run(plan, hearing, maps, outbox, ended, [board, ros.poses])
-    print(_said(vehicle, live, hearing))
+            live = run(plan, topics, maps, outbox, ended, [board, ros.poses])
+    print(f"{vehicle}: {_result(live)}")
 
 
 @contextmanager
@@ -172,10 +172,8 @@ def _view(board: StatusBoard, vehicle: str) -> Iterator[None]:
     """A live view of the drive in the terminal."""
     from rich.live import Live
 
-    from mapvote.live.status import watched
-
     with Live(auto_refresh=False) as view:
-        board.tell(0.5, lambda status, *_: view.update(watched(status, vehicle), refresh=True))
+        board.tell(0.5, lambda status, *_: view.update(status.table(vehicle), refresh=True))
         yield
 
 
@@ -210,14 +208,16 @@ def _outbox(vehicle: str, url: str | None, folder: Path | None, key: str | None)
             outbox.close()
 
 
-def _said(vehicle: str, live: LiveDrive | None, hearing: Hearing) -> str:
+def _result(live: LiveDrive | None) -> str:
     """The result of the drive, in one line."""
+    import numpy as np
+
     if live is None:
-        return f"{vehicle}: no cloud came"
-    c = live.counts
-    latency = ", ".join(f"{value:.2f} s" for value in c.latency_quantiles_s(0.5, 0.99)) or "none"
+        return "no cloud came"
+    c, latencies_s = live.counts, live.latencies_s
+    latency = ", ".join(f"{s:.2f} s" for s in np.quantile(latencies_s, (0.5, 0.99))) if latencies_s else "none"
     return (
-        f"{vehicle}: {c.ballots} ballots, {c.localised} of {c.scans} scans voted, {c.lost} lost, "
+        f"{c.ballots} ballots, {c.localised} of {c.scans} scans voted, {c.lost} lost, "
         f"{c.left_out} scans left out, {c.without_pose} without odometry, {c.without_map} without map, "
         f"{c.unusable} unusable, {c.late} late, {c.missing} never came; latency p50, p99: {latency}"
     )
@@ -243,8 +243,7 @@ def autoware(
     from mapvote.cli.files import follow_once
     from mapvote.core.types import MapvoteError
     from mapvote.live.dds import Network
-    from mapvote.live.loader_service import LoaderService
-    from mapvote.live.map_loader import MapLoader
+    from mapvote.live.map_loader import LoaderService, MapLoader
 
     stopped = threading.Event()
     for number in (signal.SIGTERM, signal.SIGINT):

@@ -122,10 +122,9 @@ def to_cdr(kind: str, message: Any) -> bytes:
     return _HEADER + bytes(out) + bytes(-len(out) % 4)
 
 
-def stamp_ns(message: Any) -> int:
-    """The time in a message's header, nanoseconds."""
-    stamp = message.header.stamp
-    return int(stamp.sec) * 10**9 + int(stamp.nanosec)
+def stamp_ns(header: Any) -> int:
+    """The time in a std_msgs/Header, nanoseconds."""
+    return int(header.stamp.sec) * 10**9 + int(header.stamp.nanosec)
 
 
 def header_of(time_ns: int, frame_id: str) -> Any:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import ctypes
 import os
 from collections import defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
@@ -33,7 +33,7 @@ _ALIVE, _ANY = 16, 0x7F
 
 
 @dataclass(frozen=True, slots=True)
-class SentTopic:
+class PublishedTopic:
     """A topic of ROS 2 that has a writer."""
 
     topic: str
@@ -70,7 +70,7 @@ class Network:
         self._topics: dict[tuple[str, str], Any] = {}
         self._types: dict[str, Any] = {}
 
-    def heard(self) -> list[SentTopic]:
+    def published(self) -> list[PublishedTopic]:
         """Every topic of ROS 2 that another participant publishes now, in the order of names."""
         found: dict[tuple[str, str], list[Any]] = defaultdict(list)
         for end in self._writers.read(10_000):
@@ -81,7 +81,7 @@ class Network:
                 found[topic, kind].append(end.qos)
         policy = self._core.Policy
         return [
-            SentTopic(
+            PublishedTopic(
                 *name,
                 len(offers),
                 all(qos[policy.Reliability] != policy.Reliability.BestEffort for qos in offers),
@@ -100,9 +100,8 @@ class Network:
         """Messages of ``topic`` from now on. A reader that requests more than its writers offer receives nothing."""
         qos = self._qos(reliable, transient_local, depth, 0, both=True)
         reader = self._sub.DataReader(self._participant, self._topic_of(topic, kind), qos=qos)
-        condition = self._core.ReadCondition(reader, _ANY)
-        self._waitset.attach(condition)
-        return Subscription(topic, kind, reader, reliable, lambda: self._waitset.detach(condition))
+        self._waitset.attach(self._core.ReadCondition(reader, _ANY))
+        return Subscription(topic, reader)
 
     def publish(
         self,
@@ -202,22 +201,19 @@ class Subscription:
     library gives the memory in which the message lies.
     """
 
-    def __init__(self, topic: str, kind: str, reader: Any, reliable: bool, detach: Callable[[], object]) -> None:
-        self.topic, self.kind, self.reliable, self._reader, self._detach = topic, kind, reliable, reader, detach
+    def __init__(self, topic: str, reader: Any) -> None:
+        self._topic, self._reader = topic, reader
         internal = require("cyclonedds.internal", "ros2", "DDS")
         self._library = internal.DDS._dll_handle
         self._handles = (ctypes.c_void_p * _TAKEN)()
         self._infos = (internal.dds_c_t.sample_info * _TAKEN)()
 
-    def take(self) -> list[memoryview]:
-        """The bytes of every message that arrived since the last call. The oldest are lost if there were too many."""
-        return [data for _, data in self.take_sent()]
-
-    def take_sent(self) -> list[tuple[int, memoryview]]:
-        """The same, each with the time at which its writer sent it, nanoseconds since 1970 by the writer's clock."""
+    def take(self) -> list[tuple[int, memoryview]]:
+        """Every message that arrived since the last call: the time at which its writer sent it, nanoseconds since 1970
+        by the writer's clock, and its bytes. The oldest are lost if there were too many."""
         count: int = self._library.dds_takecdr(self._reader._ref, self._handles, _TAKEN, self._infos, _ANY)
         if count < 0:
-            raise MapvoteError(f"{self.topic}: DDS cannot read it (error {count})")
+            raise MapvoteError(f"{self._topic}: DDS cannot read it (error {count})")
         taken = zip(self._infos[:count], self._handles[:count], strict=True)
         samples = [(info, _Sample(self._library, handle)) for info, handle in taken]
         return [(info.source_timestamp, np.asarray(sample).data) for info, sample in samples if info.valid_data]
@@ -226,16 +222,6 @@ class Subscription:
     def writers(self) -> int:
         """How many send it now."""
         return len(self._reader.get_matched_publications())
-
-    @property
-    def lost(self) -> int:
-        """How many messages were lost since the start: on the network, or because the reader was full."""
-        return int(self._reader.get_sample_lost_status().total_count)
-
-    def close(self) -> None:
-        """Read no more."""
-        self._detach()
-        self._reader = None
 
 
 class Publication:

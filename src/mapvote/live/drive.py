@@ -6,7 +6,7 @@ import logging
 import time
 from collections import deque
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -50,7 +50,7 @@ _LATENCIES = 6000
 """Latencies that are kept: ten minutes at 10 Hz."""
 
 
-class Waiting(NamedTuple):
+class WaitingScan(NamedTuple):
     """A scan that arrived."""
 
     stamp_ns: int
@@ -135,12 +135,6 @@ class Counts:
     """Left out because tiles around the vehicle had not come yet."""
     clock_jumps: int = 0
     ballots: int = 0
-    latencies_s: deque[float] = field(default_factory=lambda: deque(maxlen=_LATENCIES))
-    """From stamp to vote, of the last scans that voted during the drive. Those of its last second vote at its end."""
-
-    def latency_quantiles_s(self, *shares: float) -> list[float]:
-        """The latencies that these shares of the last scans do not exceed; empty without any."""
-        return np.quantile(self.latencies_s, shares).tolist() if self.latencies_s else []
 
 
 class Thinning:
@@ -188,13 +182,16 @@ class LiveDrive:
         ``T_base_lidar`` (4, 4): the LiDAR on what odometry tracks. ``first``: no ballot leaves before
         :meth:`first_findings` was asked."""
         self.counts, self._maps, self._outbox = Counts(), maps, outbox
+        self.latencies_s: deque[float] = deque(maxlen=_LATENCIES)
+        """From stamp to vote, of the last scans that voted during the drive. Those of its last second vote at its
+        end."""
         self._make_vehicle, self._cuts, self._with_poses = make_vehicle, cuts or Cuts(), with_poses
         self.T_base_lidar = np.eye(4) if T_base_lidar is None else T_base_lidar
         self.name, self.number = name, outbox.begin(name)
         self.vehicle: Vehicle | None = None
         """None until the first scan: the map around it may have to come first."""
         self._road, self._poses = RoadDriven(), deque[tuple[int, F64]](maxlen=_POSES)
-        self._waiting = deque[Waiting]()
+        self._waiting = deque[WaitingScan]()
         self._observed = deque[tuple[int, int]]()
         """Stamp and time of sending of the scans that are observed but not done."""
         self.fixes: deque[Fixed] = deque(maxlen=_FIXES)
@@ -230,7 +227,7 @@ class LiveDrive:
             self._poses.clear()
         self._poses.append((time_ns, T_map_base))
 
-    def on_scan(self, scan: Waiting) -> None:
+    def on_scan(self, scan: WaitingScan) -> None:
         """One scan, as it arrives. It is left out if it is not later than the last one, or if too many wait."""
         self.counts.scans += 1
         step_ns = scan.stamp_ns - self._last_ns
@@ -334,7 +331,7 @@ class LiveDrive:
             return True
         return self._maps.covers(self._position(self._prior(scan.stamp_ns)))
 
-    def _observe(self, waiting: Waiting) -> None:
+    def _observe(self, waiting: WaitingScan) -> None:
         try:
             scan = waiting.read()
         except MapvoteError as error:
@@ -387,7 +384,7 @@ class LiveDrive:
             self.fixes.append(Fixed(stamp_ns, report.T_map_lidar[i], report.covariances[i]))
             since_ns = stamp_ns if abs(sent_ns - stamp_ns) < 5 * 10**9 else sent_ns
             if not ended:
-                self.counts.latencies_s.append(1e-9 * (now_ns - since_ns))
+                self.latencies_s.append(1e-9 * (now_ns - since_ns))
             x, y = report.T_map_lidar[i][:2, 3]
             window = window_around(vehicle.point_map.lattice, x, y, vehicle.settings.voting.window_m)
             for tile in window.tiles():

@@ -106,10 +106,10 @@ class OutboxReport:
     refused: int = 0
     recovered: int = 0
     """Ballots of a drive that was cut off before this one began."""
-    lost: int = 0
-    """Ballots that the disk did not take for too long."""
+    lost_ballots: int = 0
+    """The disk did not take them for too long."""
     failed_writes: int = 0
-    waiting: int = 0
+    spooled: int = 0
     """Ballots that wait for the server now."""
 
 
@@ -255,7 +255,7 @@ class Outbox:
         while len(self._unwritten) > _HELD:
             oldest = next(iter(self._unwritten))
             del self._unwritten[oldest]
-            self.report.lost += 1
+            self.report.lost_ballots += 1
             self._say(f"{oldest}: is lost; the disk has taken no ballot for too long")
         self._put_down_all()
 
@@ -308,7 +308,7 @@ class Outbox:
                 elif came != "spooled":
                     self.report.sent += 1
                     self._say(f"{name}: {came} at the server")
-            self.report.waiting = self._client.waiting(self.vehicle)
+            self.report.spooled = self._client.waiting(self.vehicle)
 
     @contextmanager
     def _disk_may_fail(self) -> Iterator[None]:

@@ -1,4 +1,4 @@
-"""A live vehicle as a service: it waits for sensor and frames, votes until it is stopped, and reports its status."""
+"""A live vehicle as a service: it waits for sensor and frames, then votes until it is stopped."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from mapvote.core.point_map import PointMap
 from mapvote.core.types import F64, MapvoteError
 from mapvote.live.drive import LiveDrive, Maps
 from mapvote.live.first_seconds import FirstSeconds
-from mapvote.live.hearing import Cloud, Hearing
 from mapvote.live.outbox import Outbox
+from mapvote.live.subscriptions import Cloud, Subscriptions
 from mapvote.vehicle import Cuts, Vehicle
 
 log = logging.getLogger("mapvote.live")
@@ -40,12 +40,14 @@ class Plan:
     """Whether the first seconds are checked, and an error among them ends the drive."""
 
 
-Watcher = Callable[["LiveDrive", Hearing], None]
+Watcher = Callable[[LiveDrive, Subscriptions], None]
 """Called some times a second with the state of the drive."""
 
 
-def prepare(hearing: Hearing, plan: Plan, ended: Callable[[], bool]) -> tuple[list[list[Cloud]], list[tuple[int, F64]]]:
-    """Read topics until sensor and mounts are known. Returns the scans and poses that arrived meanwhile: none if no
+def prepare(
+    topics: Subscriptions, plan: Plan, ended: Callable[[], bool]
+) -> tuple[list[list[Cloud]], list[tuple[int, F64]]]:
+    """Take messages until sensor and mounts are known. Returns the scans and poses that arrived meanwhile: none if no
     cloud arrived for the idle time.
 
     MapvoteError if /tf_static does not say where they are.
@@ -54,37 +56,43 @@ def prepare(hearing: Hearing, plan: Plan, ended: Callable[[], bool]) -> tuple[li
     poses: list[tuple[int, F64]] = []
     first_s, start = np.inf, time.monotonic()
     while not ended() and (scans or not plan.idle_s or time.monotonic() < start + plan.idle_s):
-        hearing.network.wait(_LOOP_S)
-        poses += hearing.poses()
-        scans += hearing.scans()
+        topics.network.wait(_LOOP_S)
+        poses += topics.take_poses()
+        scans += topics.take_scans()
         if scans:
             first_s = min(first_s, time.monotonic())
-        mounted = hearing.mounts() is not None or len(hearing.frames) == 1
-        based = plan.T_base_lidar is not None or hearing.chosen.odometry is None or hearing.T_base_lidar() is not None
-        told = hearing.chosen.odometry is None or hearing.base_frame or poses
-        if scans and hearing.measure(scans) and mounted and based and told:
+        lacking = _lacking(topics, plan)
+        tracked = topics.chosen.odometry is None or topics.base_frame or poses
+        if scans and topics.measure(scans) and not lacking and tracked:
             break
-        if time.monotonic() > first_s + _PATIENCE_S and not hearing.frames[0]:
-            others = ", ".join(topic.topic for topic in hearing.chosen.points[1:])
-            raise MapvoteError(f"no cloud comes from {hearing.chosen.points[0].topic}, but from {others}: is it on?")
-        if time.monotonic() > first_s + _PATIENCE_S and hearing.sensor is not None:
-            if not mounted:
-                raise MapvoteError(
-                    f"/tf_static does not say where {', '.join(hearing.frames[1:])} sit to {hearing.frames[0]}: start "
-                    "robot_state_publisher, or name one LiDAR with --points"
-                )
-            if not based:
-                raise MapvoteError(
-                    f"/tf_static does not say where {hearing.frames[0]} sits on {hearing.base_frame}, which odometry "
-                    "tracks: start robot_state_publisher, or say --mount"
-                )
+        if time.monotonic() > first_s + _PATIENCE_S and (topics.sensor is not None or not topics.frames[0]):
+            if lacking:
+                raise MapvoteError(lacking)
             break
     return scans, poses
 
 
+def _lacking(topics: Subscriptions, plan: Plan) -> str:
+    """What does not come of the frames that the drive needs, and how to mend it; "" if all is known."""
+    if not topics.frames[0]:
+        others = ", ".join(topic.topic for topic in topics.chosen.points[1:])
+        return f"no cloud comes from {topics.chosen.points[0].topic}, but from {others}: is it on?"
+    if topics.mounts() is None:
+        return (
+            f"/tf_static does not say where {', '.join(topics.frames[1:])} sit to {topics.frames[0]}: start "
+            "robot_state_publisher, or name one LiDAR with --points"
+        )
+    if plan.T_base_lidar is None and topics.chosen.odometry is not None and topics.T_base_lidar() is None:
+        return (
+            f"/tf_static does not say where {topics.frames[0]} sits on {topics.base_frame}, which odometry "
+            "tracks: start robot_state_publisher, or say --mount"
+        )
+    return ""
+
+
 def run(
     plan: Plan,
-    hearing: Hearing,
+    topics: Subscriptions,
     maps: Maps,
     outbox: Outbox,
     ended: Callable[[], bool],
@@ -92,11 +100,10 @@ def run(
 ) -> LiveDrive | None:
     """Vote until ``ended``, or until no cloud arrived for the idle time. Returns the drive, whose last ballot has left.
     None if it ended before a cloud arrived. MapvoteError if the first seconds show an error: then nothing leaves."""
-    scans, poses = prepare(hearing, plan, ended)
-    if ended() or not scans or hearing.sensor is None:
+    scans, poses = prepare(topics, plan, ended)
+    if ended() or not scans or topics.sensor is None:
         return None
-    sensor, T = hearing.sensor, plan.T_base_lidar
-    first = FirstSeconds(hearing.sensor_told) if plan.checked else None
+    sensor, T = topics.sensor, plan.T_base_lidar
 
     def make_vehicle(point_map: PointMap) -> Vehicle:
         return Vehicle(plan.vehicle, sensor, point_map, plan.settings)
@@ -107,43 +114,42 @@ def run(
         outbox,
         name=plan.name,
         cuts=plan.cuts,
-        with_poses=hearing.chosen.odometry is not None,
-        T_base_lidar=hearing.T_base_lidar() if T is None else T,
-        first=first,
+        with_poses=topics.chosen.odometry is not None,
+        T_base_lidar=topics.T_base_lidar() if T is None else T,
+        first=FirstSeconds(topics.sensor_told) if plan.checked else None,
     )
     last_s = time.monotonic()
     while not ended():
         for pose in poses:
             live.on_pose(*pose)
         for clouds in scans:
-            live.on_scan(hearing.waiting(clouds))
+            live.on_scan(topics.waiting(clouds))
         stepped = live.step()
         if live.checked_now:
-            _check(live, hearing)
+            _check(live, topics)
         if stepped or scans:
             last_s = time.monotonic()
         if plan.idle_s and time.monotonic() > last_s + plan.idle_s:
             break
         for watcher in watchers:
-            watcher(live, hearing)
+            watcher(live, topics)
         if not stepped:
-            hearing.network.wait(_LOOP_S)
-        poses, scans = hearing.poses(), hearing.scans()
-    _check(live, hearing)
+            topics.network.wait(_LOOP_S)
+        poses, scans = topics.take_poses(), topics.take_scans()
+    _check(live, topics)
     live.finish()
     return live
 
 
-def _check(live: LiveDrive, hearing: Hearing) -> None:
+def _check(live: LiveDrive, topics: Subscriptions) -> None:
     """Log the findings of the first seconds. MapvoteError if one is an error: the drive is useless, nothing leaves."""
-    clocks = hearing.clocks.trouble() if live.unchecked else ""
-    if clocks:
-        live.discard()
-        raise MapvoteError(f"the first seconds: {clocks} (--unchecked votes all the same)")
-    for finding in live.first_findings():
+    wrong = topics.clocks.trouble() if live.unchecked else ""
+    for finding in [] if wrong else live.first_findings():
         if finding.severity == "error":
-            live.discard()
-            raise MapvoteError(f"the first seconds: {finding.what}. {finding.mend} (--unchecked votes all the same)")
-        log.log(
-            logging.WARNING if finding.severity == "warning" else logging.INFO, "%s. %s", finding.what, finding.mend
-        )
+            wrong = f"{finding.what}. {finding.mend}"
+            break
+        level = logging.WARNING if finding.severity == "warning" else logging.INFO
+        log.log(level, "%s. %s", finding.what, finding.mend)
+    if wrong:
+        live.discard()
+        raise MapvoteError(f"the first seconds: {wrong} (--unchecked votes all the same)")

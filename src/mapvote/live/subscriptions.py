@@ -6,13 +6,12 @@ import logging
 import time
 from bisect import bisect_left
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import scipy
 
 from mapvote.core.geometry import inverse
 from mapvote.core.sensors import Sensor
@@ -21,15 +20,14 @@ from mapvote.formats.drives.point_fields import scan_from_point_cloud2
 from mapvote.formats.drives.rosbag import Edges, T_from
 from mapvote.formats.drives.sensor_estimate import UNKNOWN, estimate_sensor
 from mapvote.live.cdr import from_cdr, stamp_ns
-from mapvote.live.dds import Network, SentTopic, Subscription
-from mapvote.live.drive import Waiting
-from mapvote.live.topics import CLOUD, ODOMETRY, TF
+from mapvote.live.dds import Network
+from mapvote.live.drive import WaitingScan
+from mapvote.live.messages import CLOUD, ODOMETRY, TF, matrix_of
+from mapvote.live.topics import Chosen
 
 log = logging.getLogger("mapvote.live")
 _SWEEP = 0.55
 """Revolutions within which the clouds of several LiDARs are one scan, as in a recorded drive."""
-_REVISIT_S = 2.0
-"""Between two checks whether writers have changed."""
 _DEPTH = 200
 """Messages that wait in DDS at most: while the process stands still for 20 s none is lost."""
 _MEASURED = 10
@@ -40,57 +38,6 @@ _OTHER_CLOCK_NS = 10**9
 """Stamps of clouds and poses that come together and differ by more are of two clocks."""
 _TOGETHER_NS = 500_000_000
 """Clouds and poses that are sent, or that arrive, within so long come together."""
-
-
-@dataclass(frozen=True, slots=True)
-class Chosen:
-    """The topics of one vehicle."""
-
-    points: tuple[SentTopic, ...]
-    """The first LiDAR's is the one in whose frame scans are."""
-    odometry: SentTopic | None
-
-
-def choose_topics(
-    network: Network, points: Sequence[str], odometry: str | None, patience_s: float, ended: Callable[[], bool]
-) -> Chosen | None:
-    """The topics named, else the only ones of their types; None if ``ended`` first. MapvoteError lists what is sent if
-    they do not come."""
-    end = time.monotonic() + patience_s
-    while not ended():
-        heard = network.heard()
-        clouds = [h for h in heard if h.kind == CLOUD and (not points or h.topic in points)]
-        poses = [h for h in heard if h.kind == ODOMETRY and odometry in (None, h.topic)]
-        late = time.monotonic() > end
-        if len(clouds) >= max(len(points), 1) and (poses or late):
-            break
-        if late:
-            listed = ", ".join(f"{h.topic} [{h.kind}]" for h in heard) or "nothing"
-            wanted = ", ".join(points) or CLOUD
-            raise MapvoteError(f"no topic {wanted} in DDS domain {network.domain}; sent there: {listed}")
-        network.wait(0.1)
-    else:
-        return None
-    if not points and len(clouds) > 1:
-        names = ",".join(h.topic for h in clouds)
-        raise MapvoteError(f"several LiDARs: choose one, or join several, with --points {names}")
-    if len(poses) > 1:
-        raise MapvoteError(f"several topics; choose with --odometry: {', '.join(h.topic for h in poses)}")
-    if odometry is not None and not poses:
-        raise MapvoteError(f"no topic {odometry} of {ODOMETRY} in DDS domain {network.domain}")
-    by_name = {h.topic: h for h in clouds}
-    return Chosen(tuple(by_name[name] for name in points or by_name), poses[0] if poses else None)
-
-
-def matrix_of(position: Any, orientation: Any) -> F64:
-    """T (4, 4) of a message's position and quaternion. MapvoteError if they are no pose."""
-    T, q = np.eye(4), orientation
-    length = float(np.linalg.norm([q.x, q.y, q.z, q.w]))
-    if not np.isfinite([length, position.x, position.y, position.z]).all() or length < 0.5:
-        raise MapvoteError("numbers that are not finite, or a quaternion of zeros")
-    T[:3, :3] = scipy.spatial.transform.Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix()
-    T[:3, 3] = position.x, position.y, position.z
-    return T
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,24 +62,19 @@ class Sweeps:
     def add(self, clouds: Iterable[Cloud]) -> list[list[Cloud]]:
         """Clouds that arrived together, in any order. Returns the scans that are whole by now, each in order of
         LiDARs."""
-        if self._lidars == 1:
-            return [[cloud] for cloud in clouds]
-        in_turn = sorted(clouds, key=lambda cloud: cloud.stamp_ns)
-        return [scan for cloud in in_turn for scan in self._add(cloud)]
-
-    def _add(self, cloud: Cloud) -> list[list[Cloud]]:
-        if cloud.lidar == 0:
-            self._firsts.append(cloud.stamp_ns)
-            if len(self._firsts) > 2:
-                self._reach_ns = _SWEEP * float(np.median(np.diff(sorted(self._firsts))))
         out = []
-        start = min((c.stamp_ns for c in self._open), default=cloud.stamp_ns)
-        apart = abs(cloud.stamp_ns - start) > self._reach_ns or cloud.lidar in {c.lidar for c in self._open}
-        if self._open and apart:
-            out.append(self._closed())
-        self._open.append(cloud)
-        if len(self._open) == self._lidars:
-            out.append(self._closed())
+        for cloud in sorted(clouds, key=lambda cloud: cloud.stamp_ns):
+            if cloud.lidar == 0:
+                self._firsts.append(cloud.stamp_ns)
+                if len(self._firsts) > 2:
+                    self._reach_ns = _SWEEP * float(np.median(np.diff(sorted(self._firsts))))
+            start_ns = min((c.stamp_ns for c in self._open), default=cloud.stamp_ns)
+            apart = abs(cloud.stamp_ns - start_ns) > self._reach_ns or cloud.lidar in {c.lidar for c in self._open}
+            if self._open and apart:
+                out.append(self._closed())
+            self._open.append(cloud)
+            if len(self._open) == self._lidars:
+                out.append(self._closed())
         return out
 
     def _closed(self) -> list[Cloud]:
@@ -181,8 +123,8 @@ class Clocks:
         )
 
 
-class Hearing:
-    """The topics of one vehicle. Writers may appear, vanish and change their quality of service."""
+class Subscriptions:
+    """The topics of one vehicle. Writers may appear and vanish."""
 
     def __init__(self, network: Network, chosen: Chosen, sensor: Sensor | None) -> None:
         """``sensor``: of the first LiDAR; None: it is measured in the first scans."""
@@ -197,33 +139,22 @@ class Hearing:
         """Clouds that arrived; messages of any topic that cannot be used."""
         self._edges: Edges = {}
         self._sweeps = Sweeps(len(chosen.points))
-        self._points = [self._subscribed(topic) for topic in chosen.points]
-        self._odometry = None if chosen.odometry is None else self._subscribed(chosen.odometry)
+        self._points, self._odometry = (
+            [network.subscribe(one.topic, one.kind, reliable=one.reliable, depth=_DEPTH) for one in topics]
+            for topics in (chosen.points, [] if chosen.odometry is None else [chosen.odometry])
+        )
         self._tf = network.subscribe("/tf_static", TF, reliable=True, transient_local=True)
-        self._lost = 0
-        self._mounts: list[F64] | None = None
-        self._looked_s = time.monotonic()
 
-    def _subscribed(self, topic: SentTopic) -> Subscription:
-        return self.network.subscribe(topic.topic, topic.kind, reliable=topic.reliable, depth=_DEPTH)
-
-    @property
-    def lost(self) -> int:
-        """Clouds that were lost between their writers and here."""
-        return self._lost + sum(s.lost for s in self._points)
-
-    def poses(self) -> list[tuple[int, F64]]:
+    def take_poses(self) -> list[tuple[int, F64]]:
         """Poses of odometry that arrived: stamps, and T_map_base."""
         out = []
-        for sent_ns, data in [] if self._odometry is None else self._odometry.take_sent():
+        for sent_ns, data in (received for reader in self._odometry for received in reader.take()):
             with self._some_unusable(ODOMETRY):
                 message = from_cdr(ODOMETRY, data)
-                pose = message.pose.pose
-                T = matrix_of(pose.position, pose.orientation)
-                self.base_frame, self.map_frame = (
-                    name.strip("/") for name in (message.child_frame_id, message.header.frame_id)
-                )
-                out.append((stamp_ns(message), T))
+                T = matrix_of(message.pose.pose.position, message.pose.pose.orientation)
+                self.base_frame = message.child_frame_id.strip("/")
+                self.map_frame = message.header.frame_id.strip("/")
+                out.append((stamp_ns(message.header), T))
                 self.clocks.pose(sent_ns, out[-1][0], time.monotonic())
         return out
 
@@ -237,57 +168,30 @@ class Hearing:
             if self.unusable & (self.unusable - 1) == 0:
                 log.warning("%s is left out: %s (%d messages so far)", kind, error, self.unusable)
 
-    def scans(self) -> list[list[Cloud]]:
+    def take_scans(self) -> list[list[Cloud]]:
         """Clouds that arrived, joined to scans."""
-        self._take_frames()
+        for _, data in self._tf.take():
+            with self._some_unusable(TF):
+                for transform in from_cdr(TF, data).transforms:
+                    self._add_frame(transform)
         clouds: list[Cloud] = []
-        for lidar, subscription in enumerate(self._points):
-            for sent_ns, data in subscription.take_sent():
+        for lidar, reader in enumerate(self._points):
+            for sent_ns, data in reader.take():
                 with self._some_unusable(CLOUD):
                     header = from_cdr("std_msgs/msg/Header", data)
                     self.frames[lidar] = header.frame_id.strip("/")
-                    clouds.append(
-                        Cloud(lidar, int(header.stamp.sec) * 10**9 + int(header.stamp.nanosec), sent_ns, data)
-                    )
+                    clouds.append(Cloud(lidar, stamp_ns(header), sent_ns, data))
                     self.clocks.cloud(sent_ns, clouds[-1].stamp_ns, time.monotonic())
         self.clouds += len(clouds)
-        if time.monotonic() > self._looked_s + _REVISIT_S:
-            self._revisit()
         return self._sweeps.add(clouds)
 
-    def _take_frames(self) -> None:
-        for data in self._tf.take():
-            with self._some_unusable(TF):
-                for t in from_cdr(TF, data).transforms:
-                    self._take_frame(t)
-
-    def _take_frame(self, t: Any) -> None:
+    def _add_frame(self, t: Any) -> None:
         """A geometry_msgs/TransformStamped, both ways."""
         parent, child = t.header.frame_id.strip("/"), t.child_frame_id.strip("/")
         T = matrix_of(t.transform.translation, t.transform.rotation)
         for here, there, T_here_there in ((parent, child, T), (child, parent, inverse(T))):
             known = [edge for edge in self._edges.get(here, []) if edge[0] != there]
             self._edges[here] = [*known, (there, T_here_there)]
-
-    def _revisit(self) -> None:
-        """Read anew what is now sent with another reliability: DDS connects no reliable reader to a writer that is
-        not."""
-        self._looked_s = time.monotonic()
-        now = {(h.topic, h.kind): h.reliable for h in self.network.heard()}
-        lost = self.lost
-        self._points = [self._as_sent(reader, now) for reader in self._points]
-        self._lost += lost - self.lost
-        if self._odometry is not None:
-            self._odometry = self._as_sent(self._odometry, now)
-
-    def _as_sent(self, reader: Subscription, now: Mapping[tuple[str, str], bool]) -> Subscription:
-        """``reader``, or a new one if its topic is now sent with another reliability."""
-        reliable = now.get((reader.topic, reader.kind), reader.reliable)
-        if reliable == reader.reliable:
-            return reader
-        log.warning("%s is now sent %s", reader.topic, "reliably" if reliable else "with best effort")
-        reader.close()
-        return self.network.subscribe(reader.topic, reader.kind, reliable=reliable, depth=_DEPTH)
 
     def T_base_lidar(self) -> F64 | None:
         """(4, 4) the first LiDAR on what odometry tracks, by /tf_static; the identity if both are one frame, or nobody
@@ -298,11 +202,10 @@ class Hearing:
 
     def mounts(self) -> list[F64] | None:
         """(4, 4) each: T_first_lidar of every LiDAR; None while /tf_static does not say."""
-        if self._mounts is None and all(self.frames):
-            reached = T_from(self._edges, self.frames[0])
-            if all(frame in reached for frame in self.frames):
-                self._mounts = [reached[frame] for frame in self.frames]
-        return self._mounts
+        if len(self.frames) == 1:
+            return [np.eye(4)]
+        reached = T_from(self._edges, self.frames[0]) if all(self.frames) else {}
+        return [reached[frame] for frame in self.frames] if reached.keys() >= set(self.frames) else None
 
     def measure(self, scans: Sequence[list[Cloud]]) -> bool:
         """Measure the first LiDAR in the first ``scans``, unless it is known; returns whether it is now."""
@@ -315,9 +218,9 @@ class Hearing:
             self.sensor, self.sensor_told = found.sensor, found.told
         return self.sensor is not None
 
-    def waiting(self, clouds: list[Cloud]) -> Waiting:
+    def waiting(self, clouds: list[Cloud]) -> WaitingScan:
         """A scan that is read when its turn comes."""
-        return Waiting(min(c.stamp_ns for c in clouds), max(c.sent_ns for c in clouds), lambda: self._read(clouds))
+        return WaitingScan(min(c.stamp_ns for c in clouds), max(c.sent_ns for c in clouds), lambda: self._read(clouds))
 
     def _read(self, clouds: list[Cloud]) -> Scan:
         mounts, sensor = self.mounts(), self.sensor

@@ -1,0 +1,180 @@
+"""What a vehicle receives over DDS: LiDARs joined by /tf_static, and what its first seconds refuse."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from live.loopback_dds import until
+from mapvote.config import Settings
+from mapvote.core.geometry import from_xyz_rpy, inverse, transform
+from mapvote.core.point_map import map_from_points
+from mapvote.core.sensors import SENSORS
+from mapvote.core.types import MapvoteError, Scan
+from mapvote.live.dds import Network, PublishedTopic
+from mapvote.live.drive import OneMap
+from mapvote.live.messages import CLOUD, ODOMETRY, TF, cloud_message, frames_message, matrix_of, odometry_message
+from mapvote.live.outbox import Outbox
+from mapvote.live.play import POINTS, POSES
+from mapvote.live.service import Plan, run
+from mapvote.live.subscriptions import Clocks, Cloud, Subscriptions, Sweeps
+from mapvote.live.topics import Chosen, TopicRate, choose_topics, missing_for_drive
+from streets import drive_along, path, street
+
+pytest.importorskip("cyclonedds")
+START = 1_700_000_000 * 10**9
+STEP = 100_000_000
+
+
+def joined(*clouds: tuple[int, int], together: int = 1) -> list[list[tuple[int, int]]]:
+    """The scans that (LiDAR, milliseconds) in the order of receipt make, of which so many arrive together."""
+    sweeps, came = Sweeps(1 + max(lidar for lidar, _ in clouds)), [Cloud(k, ms * 10**6, 0, b"") for k, ms in clouds]
+    made = [scan for k in range(0, len(came), together) for scan in sweeps.add(came[k : k + together])]
+    return [[(c.lidar, c.stamp_ns // 10**6) for c in scan] for scan in made]
+
+
+def test_clouds_of_one_revolution_are_one_scan_in_the_order_of_lidars() -> None:
+    assert joined((1, 0), (0, 3), (0, 100), (1, 104)) == [[(0, 3), (1, 0)], [(0, 100), (1, 104)]]
+
+
+def test_a_lidar_that_leaves_out_a_revolution_holds_no_other_back_for_longer() -> None:
+    clouds = (0, 0), (1, 2), (0, 100), (0, 200), (1, 202)
+    assert joined(*clouds) == [[(0, 0), (1, 2)], [(0, 100)], [(0, 200), (1, 202)]]
+
+
+def test_clouds_of_several_revolutions_that_a_busy_process_reads_at_once_are_joined_as_ever() -> None:
+    clouds = [(lidar, ms + 2 * lidar) for lidar in (0, 1) for ms in (0, 100, 200)]
+    assert joined(*clouds, together=6) == [[(0, ms), (1, ms + 2)] for ms in (0, 100, 200)]
+
+
+@pytest.mark.parametrize("damage", [{"w": 0.0}, {"x": np.nan}, {"w": np.inf}])
+def test_a_pose_that_is_none_is_refused(damage: dict[str, float]) -> None:
+    identity = {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0}
+    zero = SimpleNamespace(x=0.0, y=0.0, z=0.0)
+    assert np.array_equal(matrix_of(zero, SimpleNamespace(**identity)), np.eye(4))
+    with pytest.raises(MapvoteError, match="quaternion of zeros"):
+        matrix_of(zero, SimpleNamespace(**identity | damage))
+
+
+LATE_POSES = [("pose", 100.0 + k, 100.0 + k, 30.0) for k in range(9)]
+
+
+@pytest.mark.parametrize(
+    ("came", "wrong"),
+    [
+        ([("pose", 100.0, 105.0, 7.0), ("cloud", 100.0, 100.0, 7.0)], True),
+        pytest.param([*LATE_POSES, ("cloud", 102.0, 102.0, 30.0)], False, id="read late by a busy process"),
+        pytest.param([("pose", 940.0, 100.0, 7.0), ("cloud", 100.0, 100.0, 7.1)], False, id="senders' clocks differ"),
+        pytest.param([("pose", 100, 100, 7), ("cloud", 100, 100, 7), ("cloud", 104, 104, 11)], False, id="poses ended"),
+    ],
+)
+def test_stamps_of_two_clocks_are_those_that_differ_by_sending_and_by_arrival(came: Any, wrong: bool) -> None:
+    clocks = Clocks()
+    for what, sent_s, stamp_s, now_s in came:  # seconds
+        (clocks.pose if what == "pose" else clocks.cloud)(int(sent_s * 1e9), int(stamp_s * 1e9), now_s)
+    assert ("+5.0 s" in clocks.trouble()) == wrong == ("two clocks" in clocks.trouble())
+
+
+def rate(topic: str, kind: str, messages: int = 9) -> TopicRate:
+    return TopicRate(PublishedTopic(topic, kind, 1, True, kind == TF), messages, messages / 5.0, "")
+
+
+VEHICLE = [rate("/points", CLOUD), rate("/odom", ODOMETRY), rate("/tf_static", TF, 1)]
+
+
+def test_each_topic_that_a_drive_needs_and_does_not_receive_has_a_sentence_of_its_own() -> None:
+    assert missing_for_drive(VEHICLE) == []
+    for absent, named in enumerate((CLOUD, ODOMETRY, "/tf_static")):
+        (sentence,) = missing_for_drive([one for k, one in enumerate(VEHICLE) if k != absent])
+        assert named in sentence
+    (sentence,) = missing_for_drive([rate("/points", CLOUD, 0), *VEHICLE[1:]])  # offered, but nothing is sent
+    assert CLOUD in sentence
+    (sentence,) = missing_for_drive([*VEHICLE[:2], rate("/tf", TF)])
+    assert "/tf_static" in sentence
+    (sentence,) = missing_for_drive([])
+    assert "ROS_DOMAIN_ID" in sentence
+    assert "CYCLONEDDS_URI" in sentence
+
+
+class Vehicle:
+    """The other side of the network: what it publishes is in its topics from the start."""
+
+    def __init__(self, domain: int, *topics: tuple[str, str]) -> None:
+        network = Network(domain)
+        self._out = {topic: network.publish(topic, kind, transient_local=kind == TF) for topic, kind in topics}
+
+    def send(self, topic: str, data: bytes) -> None:
+        self._out[topic].send(data)
+
+    def until_subscribed(self) -> None:
+        until(lambda: all(out.readers for out in self._out.values()))
+
+
+def subscriptions(domain: int, points: list[str]) -> Subscriptions:
+    network = Network(domain)
+    chosen = choose_topics(network, points, None, 60.0, lambda: False)
+    assert chosen is not None
+    return Subscriptions(network, chosen, SENSORS["hdl32e"])
+
+
+def test_two_lidars_are_one_scan_in_the_frame_of_the_first_by_tf_static(domain: int) -> None:
+    world = np.random.default_rng(1).uniform((4, 4, 0), (30, 30, 5), (500, 3))
+    T = {"left": from_xyz_rpy(1.0, 0.7, 1.9, 0.0, 0.1, 0.4), "right": from_xyz_rpy(1.0, -0.7, 1.9, 0.0, 0.0, -1.2)}
+    vehicle = Vehicle(domain, ("/left", CLOUD), ("/right", CLOUD), (POSES, ODOMETRY), ("/tf_static", TF))
+    vehicle.send("/tf_static", frames_message(0, T))
+    topics, scans = subscriptions(domain, ["/left", "/right"]), list[list[Cloud]]()
+    vehicle.until_subscribed()
+    for lidar, T_base_lidar in T.items():
+        seen = transform(inverse(T_base_lidar), world).astype(np.float32)
+        vehicle.send(f"/{lidar}", cloud_message(Scan(START, seen), lidar))
+
+    def is_joined() -> bool:
+        scans.extend(topics.take_scans())
+        return bool(scans and topics.mounts())
+
+    until(is_joined)
+    scan = topics.waiting(scans[0]).read()
+    assert np.abs(transform(T["left"], scan.points) - np.concatenate([world, world])).max() < 1e-4
+    ((start, origin),) = scan.others
+    assert start == len(world)
+    assert np.allclose(transform(T["left"], origin[None])[0], T["right"][:3, 3])
+
+
+def test_a_drive_to_which_no_cloud_comes_ends_after_the_idle_time(tmp_path: Path, domain: int) -> None:
+    chosen = Chosen((PublishedTopic(POINTS, CLOUD, 1, True, False),), None)
+    topics = Subscriptions(Network(domain), chosen, SENSORS["hdl32e"])
+    outbox = Outbox(tmp_path / "state", "car", say=lambda _: None)
+    maps = OneMap(map_from_points(street(1)))
+    assert run(Plan("car", "day", Settings(), idle_s=0.2), topics, maps, outbox, lambda: False) is None
+    outbox.close()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("late_ns", "wider", "said"), [(5 * 10**9, 1.0, "two clocks"), (0, 2.5, "fits the map nowhere")]
+)
+def test_a_drive_whose_first_seconds_show_an_error_ends_and_leaves_nothing(
+    tmp_path: Path, domain: int, late_ns: int, wider: float, said: str
+) -> None:
+    poses = path(46, speed_mps=5.0)
+    scans = list(drive_along(poses, 1))
+    vehicle = Vehicle(domain, (POINTS, CLOUD), (POSES, ODOMETRY), ("/tf_static", TF))
+    vehicle.send("/tf_static", frames_message(0, {"lidar": np.eye(4)}))
+    topics = subscriptions(domain, [])
+    vehicle.until_subscribed()
+    for i, (scan, T) in enumerate(zip(scans, poses, strict=True)):
+        ns = START + i * STEP
+        vehicle.send(POSES, odometry_message(ns + late_ns, T))
+        vehicle.send(POINTS, cloud_message(Scan(ns, scan.points, scan.time_s)))
+    (tmp_path / "out").mkdir()
+    outbox = Outbox(tmp_path / "state", "car", folder=tmp_path / "out", say=lambda _: None)
+    plan, maps = Plan("car", "day", Settings(), idle_s=1.0), OneMap(map_from_points(street(1) * [1.0, wider, 1.0]))
+    with pytest.raises(MapvoteError, match=f"the first seconds: .*{said}"):
+        run(plan, topics, maps, outbox, lambda: False)
+    outbox.close()
+    assert not list((tmp_path / "out").iterdir())
+    assert not list((tmp_path / "state/car").glob("*.journal"))
